@@ -1,0 +1,200 @@
+"""The one crossing between torch and Warp: zero-copy views, streams, CPU slices and hand-launched adjoints.
+
+A kernel launched from here takes ``start: int`` first and works on ``i = start + wp.tid()``.  Warp runs a CPU launch on
+one thread and releases the GIL, so a large CPU launch is cut into a fixed number of slices over a thread pool; the
+number depends on the size alone, which makes the results the same bits for any number of threads.  Outputs must be
+disjoint per ``i``.  Warp's CPU atomics are not atomic: in a backward pass every input that several ``i`` read (named in
+``shared``) gets one accumulator a slice, added up in slice order.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+import tempfile
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
+
+import torch
+import warp as wp
+from torch import Tensor
+
+SLICES = 16  # several a thread balance uneven rays on 2 to 8 cores; more only add 20 us of launch each
+SLICE_MIN = 1024  # below this many threads a slice costs about as much to launch as to run
+
+_TORCH = {
+    wp.float32: (torch.float32, ()),
+    wp.float16: (torch.float16, ()),
+    wp.bfloat16: (torch.bfloat16, ()),
+    wp.int32: (torch.int32, ()),
+    wp.int64: (torch.int64, ()),
+    wp.uint8: (torch.uint8, ()),
+    wp.bool: (torch.bool, ()),
+    wp.vec2: (torch.float32, (2,)),
+    wp.vec3: (torch.float32, (3,)),
+    wp.vec4: (torch.float32, (4,)),
+    wp.mat33: (torch.float32, (3, 3)),
+    wp.mat44: (torch.float32, (4, 4)),
+}
+
+
+@lru_cache(1)
+def initialise() -> None:
+    """Start Warp once: quiet on stdout, and with a kernel cache that can be written."""
+    wp.config.log_level = wp.LOG_WARNING
+    cache = wp.config.kernel_cache_dir or os.environ.get("WARP_CACHE_PATH")
+    try:
+        wp.init()
+    except OSError:
+        fallback = os.path.join(tempfile.gettempdir(), f"reli3d-warp-{os.getuid() if hasattr(os, 'getuid') else 0}")
+        print(f"reli3d: kernel cache {cache or '~/.cache/warp'} cannot be written; using {fallback}", file=sys.stderr)
+        os.makedirs(fallback, exist_ok=True)
+        wp.config.kernel_cache_dir = fallback
+        wp.init()
+
+
+@lru_cache(1)
+def _pool() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(max_workers=max(1, torch.get_num_threads()), thread_name_prefix="reli3d")
+
+
+def slices(n: int) -> list[tuple[int, int]]:
+    """``[(start, count), ...]`` of a CPU launch over ``n`` threads; depends on ``n`` alone."""
+    parts = max(1, min(SLICES, n // SLICE_MIN))
+    edges = [n * k // parts for k in range(parts + 1)]
+    return [(a, b - a) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+
+
+def over_slices(n: int, work) -> list:
+    """``[work(k, start, count), ...]`` for every slice of ``n``, on the thread pool where there is more than one."""
+    parts = slices(n)
+    if len(parts) == 1 or torch.get_num_threads() == 1:
+        return [work(k, *part) for k, part in enumerate(parts)]
+    return list(_pool().map(lambda item: work(item[0], *item[1]), enumerate(parts)))
+
+
+@contextlib.contextmanager
+def stream(device: torch.device):
+    """Order Warp's launches after torch's on CUDA; yields the Warp device name."""
+    initialise()
+    if device.type == "cuda":
+        with wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device))):
+            yield str(wp.device_from_torch(device))
+    else:
+        yield "cpu"
+
+
+def view(tensor: Tensor, dtype):
+    """Zero-copy Warp descriptor of a contiguous tensor, without gradient."""
+    return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
+
+
+def empty(shape: Sequence[int], dtype, device: torch.device) -> Tensor:
+    """Uninitialised torch tensor that holds an array of ``shape`` of the Warp type ``dtype``."""
+    torch_dtype, tail = _TORCH[dtype]
+    return torch.empty((*shape, *tail), dtype=torch_dtype, device=device)
+
+
+def launch(kernel, n: int, args: Sequence, device: torch.device) -> None:
+    """Run ``kernel(start, *args)`` over ``n`` threads.  ``args``: ``(tensor, warp type)`` pairs or plain values.
+
+    Tensors must be contiguous and on ``device``; nothing is copied and no gradient is recorded.
+    """
+    if n == 0:
+        return
+    with stream(device) as name:
+        values = [view(*a) if isinstance(a, tuple) else a for a in args]
+        if name != "cpu":
+            wp.launch(kernel, n, [0, *values], device=name)
+            return
+        kernel.module.load(wp.get_device("cpu"))
+        over_slices(n, lambda k, start, count: wp.launch(kernel, count, [start, *values], device="cpu"))
+
+
+class _KernelOp(torch.autograd.Function):
+    """``outs = kernel(start, *ins)``; backward launches the adjoint of the same kernel."""
+
+    @staticmethod
+    def forward(ctx, kernel, n, plain, types, shared, outs, device, *tensors):
+        tensors = [t.contiguous() for t in tensors]
+        results = [empty(shape, dtype, device) for shape, dtype in outs]
+        launch(kernel, n, _fill(plain, zip(tensors, types, strict=True)) + _typed(results, outs), device)
+        ctx.save_for_backward(*tensors, *results)
+        ctx.op = kernel, n, plain, types, shared, outs, device
+        ctx.mark_non_differentiable(*(r for r in results if not r.is_floating_point()))
+        return tuple(results)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, *g_outs):
+        kernel, n, plain, types, shared, outs, device = ctx.op
+        tensors, results = ctx.saved_tensors[: len(types)], ctx.saved_tensors[len(types) :]
+        wanted = ctx.needs_input_grad[7:]
+        parts = slices(n) if device.type == "cpu" else [(0, n)]
+        grads = [
+            torch.zeros((len(parts) if i in shared else 1, *t.shape), dtype=t.dtype, device=device) if w else None
+            for i, (t, w) in enumerate(zip(tensors, wanted, strict=True))
+        ]
+        g_results = [None if g is None else g.contiguous() for g in g_outs]
+        g_results = [torch.zeros_like(r) if g is None and r.is_floating_point() else g
+                     for g, r in zip(g_results, results, strict=True)]  # fmt: skip
+        ins = _fill(plain, zip(tensors, types, strict=True))
+        if n > 0:
+            with stream(device) as name:
+                values = [view(*a) if isinstance(a, tuple) else a for a in ins]
+                out_values = [view(*a) for a in _typed(results, outs)]
+                adj_out = [None if g is None else view(g, d) for g, (_, d) in zip(g_results, outs, strict=True)]
+
+                def adjoint(k, start, count):
+                    own = [None if g is None else (g[min(k, g.shape[0] - 1)], d)
+                           for g, d in zip(grads, types, strict=True)]  # fmt: skip
+                    adj_in = [view(*a) if isinstance(a, tuple) else None for a in _fill([None] * len(plain), own, plain)]
+                    wp.launch(kernel, count, [start, *values], out_values, adj_inputs=[None, *adj_in],
+                              adj_outputs=adj_out, adjoint=True, device=name)  # fmt: skip
+
+                if name == "cpu":
+                    kernel.module.load(wp.get_device("cpu"))
+                    over_slices(n, adjoint)
+                else:
+                    adjoint(0, 0, n)
+        return None, None, None, None, None, None, None, *(None if g is None else g.sum(0) for g in grads)
+
+
+_SLOT = object()  # marks the place of a tensor among the plain arguments
+
+
+def _fill(plain, items, pattern=None):
+    items = iter(items)
+    return [next(items) if p is _SLOT else q for p, q in zip(pattern or plain, plain, strict=True)]
+
+
+def _typed(tensors, outs):
+    return [(t, dtype) for t, (_, dtype) in zip(tensors, outs, strict=True)]
+
+
+def call(kernel, n: int, ins: Sequence, outs: Sequence, *, device: torch.device, shared: Sequence[int] = ()):
+    """Differentiable launch: new tensors ``outs = [(shape, warp type), ...]`` from ``kernel(start, *ins, *outs)``.
+
+    ``ins``: ``(tensor, warp type)`` pairs or plain values.  Gradients reach every floating-point tensor of ``ins`` that asks
+    for one, through the kernel's own adjoint (its module needs ``enable_backward``).  ``shared``: positions, counted among the
+    tensors, of inputs that more than one thread reads.
+    """
+    tensors = [a[0] for a in ins if isinstance(a, tuple)]
+    types = [a[1] for a in ins if isinstance(a, tuple)]
+    plain = [_SLOT if isinstance(a, tuple) else a for a in ins]
+    return _KernelOp.apply(kernel, n, plain, types, frozenset(shared), list(outs), device, *tensors)
+
+
+def check(name: str, value: Tensor, *, last: int | None = None, like: Tensor | None = None,
+          dtype: torch.dtype = torch.float32) -> None:  # fmt: skip
+    """Raise TypeError or ValueError as ``name: expected X, got Y`` for a wrong kind, dtype, last axis or device."""
+    if not isinstance(value, Tensor):
+        raise TypeError(f"{name}: expected a tensor, got {type(value).__name__}")
+    if value.dtype != dtype:
+        raise TypeError(f"{name}: expected {dtype}, got {value.dtype}")
+    if last is not None and (value.ndim == 0 or value.shape[-1] != last):
+        raise ValueError(f"{name}: expected shape (..., {last}), got {tuple(value.shape)}")
+    if like is not None and value.device != like.device:
+        raise ValueError(f"{name}: expected device {like.device}, got {value.device}")

@@ -1,0 +1,30 @@
+"""Fixtures shared by all tests: the device, and the folder of real data beside the checkout."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+DEVICES = ["cpu"] + (["cuda"] if torch.cuda.is_available() else [])
+SHARED = Path(__file__).parents[2] / "shared"
+
+
+@pytest.fixture(params=DEVICES)
+def device(request) -> torch.device:
+    return torch.device(request.param)
+
+
+@pytest.fixture
+def shared_data() -> Path:
+    """Folder of real meshes, maps and captures; a test that needs it skips visibly where it is absent."""
+    if not (SHARED / "data").is_dir():
+        pytest.skip("needs the data folder ../shared/data beside the checkout")
+    return SHARED / "data"
+
+
+@pytest.fixture
+def goldens() -> Path:
+    """Folder of reference inputs and outputs of the published model's modules."""
+    if not (SHARED / "reference" / "goldens").is_dir():
+        pytest.skip("needs the folder ../shared/reference/goldens beside the checkout")
+    return SHARED / "reference" / "goldens"
