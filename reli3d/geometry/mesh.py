@@ -1,0 +1,275 @@
+"""Triangle meshes: the type that the parts hand to each other, normals, components and the topology report.
+
+Faces are counter-clockwise seen from outside.  Topology (components, report) is judged on the *welded* mesh, in which
+vertices at bit-identical positions count as one, because charts and exporters split vertices that the surface does not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+import torch
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components as graph_components
+from torch import Tensor
+
+from reli3d._bridge import check
+
+NORMAL_MIN = 1.0e-20  # squared length of an area-weighted normal sum below which it counts as zero (published release)
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangle mesh on one device; knows no network and no texture.
+
+    Raises TypeError or ValueError for a wrong dtype, shape, device or a face index out of range.
+    """
+
+    vertices: Tensor  # (V, 3) float32
+    faces: Tensor  # (F, 3) int32, counter-clockwise seen from outside
+    normals: Tensor | None = None  # (V, 3) unit
+    uv: Tensor | None = None  # (V, 2) glTF: u right, v down
+    tangents: Tensor | None = None  # (V, 4) unit, w = +-1: bitangent = w * cross(normal, tangent)
+
+    def __post_init__(self) -> None:
+        _check_topology(self.vertices, self.faces)
+        for name, last in (("normals", 3), ("uv", 2), ("tangents", 4)):
+            value = getattr(self, name)
+            if value is not None:
+                check(name, value, last=last, like=self.vertices)
+                if value.shape != (self.vertices.shape[0], last):
+                    raise ValueError(f"{name}: expected shape ({len(self.vertices)}, {last}), got {tuple(value.shape)}")
+
+    def to(self, device: torch.device | str) -> Mesh:
+        """The same mesh on another device."""
+        moved = {f.name: getattr(self, f.name) for f in fields(self)}
+        return Mesh(**{name: None if value is None else value.to(device) for name, value in moved.items()})
+
+    def detach(self) -> Mesh:
+        """The same mesh without gradients."""
+        moved = {f.name: getattr(self, f.name) for f in fields(self)}
+        return Mesh(**{name: None if value is None else value.detach() for name, value in moved.items()})
+
+    def with_normals(self) -> Mesh:
+        """The same mesh with :func:`vertex_normals`."""
+        return replace(self, normals=vertex_normals(self.vertices, self.faces))
+
+
+@dataclass(frozen=True)
+class MeshReport:
+    """What :func:`report` finds.  Counts are of the welded mesh, but ``vertices`` and ``faces`` are as stored."""
+
+    vertices: int
+    faces: int
+    welded_vertices: int  # different positions that a face uses
+    components: int  # connected through shared vertices
+    euler: int  # welded vertices - edges + faces
+    boundary_edges: int  # with one face
+    nonmanifold_edges: int  # with three or more faces
+    flipped_edges: int  # with two faces that run through it in the same direction
+    nonmanifold_vertices: int  # whose faces fall apart into several fans
+    degenerate_faces: int  # with two corners at one position; left out of every other count
+    watertight: bool  # faces present, every edge has two or more faces, an even number
+    manifold: bool  # no non-manifold edge or vertex and no flipped edge; a border is allowed
+
+
+def _check_topology(vertices: Tensor, faces: Tensor) -> None:
+    check("vertices", vertices, last=3)
+    check("faces", faces, last=3, like=vertices, dtype=torch.int32)
+    for name, value in (("vertices", vertices), ("faces", faces)):
+        if value.ndim != 2:
+            raise ValueError(f"{name}: expected shape (N, 3), got {tuple(value.shape)}")
+    if faces.numel():
+        low, high = (int(v) for v in torch.aminmax(faces))
+        if low < 0 or high >= len(vertices):
+            raise ValueError(f"faces: expected indices in [0, {len(vertices)}), got [{low}, {high}]")
+
+
+def face_normals(vertices: Tensor, faces: Tensor) -> Tensor:
+    """Cross product of two sides of every face, ``(F, 3)``: outward, its length twice the area.  Differentiable."""
+    a, b, c = (vertices.index_select(0, faces[:, k]) for k in range(3))
+    return torch.linalg.cross(b - a, c - a)
+
+
+def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
+    """Area-weighted unit normals of the vertices, ``(V, 3)``; (0, 0, 1) without gradient where the sum vanishes.
+
+    vertices: ``(V, 3)``.  faces: ``(F, 3)`` int32.  Gradients reach ``vertices``.  The sum over the faces has a fixed
+    order on CPU.
+    """
+    _check_topology(vertices, faces)
+    per_face = face_normals(vertices, faces)
+    total = torch.zeros_like(vertices)
+    for k in range(3):
+        total = total.index_add(0, faces[:, k], per_face)
+    square = (total * total).sum(-1, keepdim=True)
+    valid = square > NORMAL_MIN
+    unit = total * torch.rsqrt(torch.where(valid, square, 1.0))
+    return torch.where(valid, unit, unit.new_tensor([0.0, 0.0, 1.0]))
+
+
+def weld(vertices: Tensor) -> tuple[Tensor, Tensor]:
+    """``(first (W,), label (V,))`` int64: vertices at bit-identical positions share a label.
+
+    ``first`` is the lowest vertex of a label.  Labels count up in the order of ``first``.  -0 equals +0.
+    """
+    check("vertices", vertices, last=3)
+    first, label = _weld(vertices.detach().cpu().numpy())
+    return torch.from_numpy(first).to(vertices.device), torch.from_numpy(label).to(vertices.device)
+
+
+def _weld(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    bits = np.ascontiguousarray(positions + np.float32(0.0)).view(np.uint32).astype(np.uint64)
+    key = np.zeros(len(bits), np.uint64)
+    for k in range(3):  # 64-bit mix (splitmix64): one integer to sort instead of three columns
+        key = (key ^ bits[:, k]) + np.uint64(0x9E3779B97F4A7C15)
+        key = (key ^ (key >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        key = (key ^ (key >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        key ^= key >> np.uint64(31)
+    _, first, label = np.unique(key, return_index=True, return_inverse=True)
+    if not np.array_equal(bits[first[label]], bits):  # two positions with one hash
+        _, first, label = np.unique(bits, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first, kind="stable")
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    return first[order].astype(np.int64), rank[label.reshape(-1)].astype(np.int64)
+
+
+def _welded_faces(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+    """Faces over welded labels, and which of them are not degenerate."""
+    _, label = _weld(mesh.vertices.detach().cpu().numpy())
+    faces = label[mesh.faces.cpu().numpy()].reshape(-1, 3)
+    a, b, c = faces.T
+    return faces, (a != b) & (b != c) & (c != a)
+
+
+def face_components(mesh: Mesh) -> Tensor:
+    """Component of every face, ``(F,)`` int64, numbered by their lowest face; faces that share a position connect."""
+    faces, _ = _welded_faces(mesh)
+    if not len(faces):
+        return torch.zeros(0, dtype=torch.int64, device=mesh.faces.device)
+    n = int(faces.max()) + 1
+    rows, cols = faces[:, [0, 1]].reshape(-1), faces[:, [1, 2]].reshape(-1)
+    _, label = graph_components(coo_matrix((np.ones(len(rows), np.int8), (rows, cols)), shape=(n, n)), directed=False)
+    _, first, inverse = np.unique(label[faces[:, 0]], return_index=True, return_inverse=True)
+    rank = np.argsort(np.argsort(first))
+    return torch.from_numpy(rank[inverse].astype(np.int64)).to(mesh.faces.device)
+
+
+def select_faces(mesh: Mesh, keep: Tensor) -> Mesh:
+    """The faces that the boolean ``keep (F,)`` marks and the vertices they use, in their old order, with attributes.
+
+    Gradients of the vertex attributes flow through.
+    """
+    check("keep", keep, like=mesh.faces, dtype=torch.bool)
+    if keep.shape != mesh.faces.shape[:1]:
+        raise ValueError(f"keep: expected shape ({len(mesh.faces)},), got {tuple(keep.shape)}")
+    faces = mesh.faces[keep]
+    used = torch.zeros(len(mesh.vertices), dtype=torch.bool, device=faces.device)
+    used[faces.reshape(-1).long()] = True
+    new_index = torch.cumsum(used, 0, dtype=torch.int32) - 1
+    values = {f.name: getattr(mesh, f.name) for f in fields(mesh) if f.name != "faces"}
+    kept = {name: None if value is None else value[used] for name, value in values.items()}
+    return Mesh(faces=new_index[faces.long()].reshape(-1, 3), **kept)
+
+
+def largest_components(mesh: Mesh, min_fraction: float = 0.02) -> Mesh:
+    """The components with at least ``min_fraction`` of all faces, and always the largest one.
+
+    min_fraction in [0, 1].  A mesh without faces is returned as it is.
+    """
+    if not 0.0 <= min_fraction <= 1.0:
+        raise ValueError(f"min_fraction: expected a value in [0, 1], got {min_fraction}")
+    if not len(mesh.faces):
+        return mesh
+    label = face_components(mesh)
+    count = torch.bincount(label)
+    keep = count >= min_fraction * len(label)
+    keep[count.argmax()] = True
+    return mesh if bool(keep.all()) else select_faces(mesh, keep[label])
+
+
+def report(mesh: Mesh) -> MeshReport:
+    """Topology of the welded mesh: borders, non-manifold edges and vertices, components and the Euler number."""
+    faces, sound = _welded_faces(mesh)
+    degenerate = int((~sound).sum())
+    faces = faces[sound]
+    size = {"vertices": len(mesh.vertices), "faces": len(mesh.faces), "degenerate_faces": degenerate}
+    if not len(faces):
+        return MeshReport(**size, welded_vertices=0, components=0, euler=0, boundary_edges=0, nonmanifold_edges=0,
+                          flipped_edges=0, nonmanifold_vertices=0, watertight=False, manifold=True)  # fmt: skip
+    n = int(faces.max()) + 1
+    tail, head = faces.reshape(-1), faces[:, [1, 2, 0]].reshape(-1)  # half-edge h = 3 * face + corner
+    key = np.minimum(tail, head) * n + np.maximum(tail, head)
+    order = np.argsort(key, kind="stable")
+    start = np.flatnonzero(np.diff(key[order], prepend=-1))
+    valence = np.diff(start, append=len(key))
+    forward = np.add.reduceat((tail < head)[order].astype(np.int64), start)
+    pair = start[valence == 2]
+    one, other = order[pair], order[pair + 1]
+
+    # corners around one vertex are one fan if they connect through edges with two faces
+    after = np.arange(len(tail)) // 3 * 3 + (np.arange(len(tail)) + 1) % 3
+    same = tail[one] == tail[other]
+    join_a = np.concatenate([one, after[one]])
+    join_b = np.concatenate([np.where(same, other, after[other]), np.where(same, after[other], other)])
+    graph = coo_matrix((np.ones(len(join_a), np.int8), (join_a, join_b)), shape=(len(tail), len(tail)))
+    _, fan = graph_components(graph, directed=False)
+    fan_vertex = np.unique(fan * n + tail) % n  # one entry for every fan
+    fans = np.bincount(fan_vertex, minlength=n)
+    used = fans > 0
+
+    links = coo_matrix((np.ones(len(tail), np.int8), (tail, head)), shape=(n, n))
+    _, label = graph_components(links, directed=False)
+    counts = {
+        "welded_vertices": int(used.sum()),
+        "components": len(np.unique(label[used])),
+        "euler": int(used.sum()) - len(start) + len(faces),
+        "boundary_edges": int((valence == 1).sum()),
+        "nonmanifold_edges": int((valence > 2).sum()),
+        "flipped_edges": int(((valence == 2) & (forward != 1)).sum()),
+        "nonmanifold_vertices": int((fans > 1).sum()),
+    }
+    manifold = not (counts["nonmanifold_edges"] or counts["flipped_edges"] or counts["nonmanifold_vertices"])
+    return MeshReport(**size, **counts, watertight=bool((valence % 2 == 0).all()), manifold=manifold)
+
+
+def volume(mesh: Mesh) -> Tensor:
+    """Signed volume of a closed mesh, a scalar tensor: positive for outward faces.  Differentiable."""
+    a, b, c = (mesh.vertices.index_select(0, mesh.faces[:, k]) for k in range(3))
+    return (a * torch.linalg.cross(b, c)).sum() / 6.0
+
+
+def to_trimesh(mesh: Mesh):
+    """The same mesh as an unprocessed ``trimesh.Trimesh``, ``v`` turned up as there, tangents as an attribute."""
+    import trimesh
+
+    def array(value: Tensor | None):
+        return None if value is None else value.detach().cpu().numpy()
+
+    visual = None
+    if mesh.uv is not None:
+        uv = array(mesh.uv).astype(np.float64)
+        visual = trimesh.visual.TextureVisuals(uv=np.stack([uv[:, 0], 1.0 - uv[:, 1]], -1))
+    attributes = {} if mesh.tangents is None else {"tangents": array(mesh.tangents)}
+    return trimesh.Trimesh(array(mesh.vertices), array(mesh.faces).astype(np.int64), vertex_normals=array(mesh.normals),
+                           visual=visual, vertex_attributes=attributes, process=False)  # fmt: skip
+
+
+def from_trimesh(source, *, device: torch.device | str = "cpu") -> Mesh:
+    """:class:`Mesh` from a ``trimesh.Trimesh``: float32 positions, and the normals, UV and tangents stored in it.
+
+    Normals that trimesh would first have to compute are left out.
+    """
+    def tensor(value, dtype=torch.float32):
+        return torch.from_numpy(np.array(value)).to(device=device, dtype=dtype)
+
+    uv = getattr(source.visual, "uv", None)
+    if uv is not None:
+        uv = np.asarray(uv, np.float64)
+        uv = tensor(np.stack([uv[:, 0], 1.0 - uv[:, 1]], -1))
+    normals = tensor(source.vertex_normals) if "vertex_normals" in source._cache.cache else None
+    tangents = source.vertex_attributes.get("tangents")
+    return Mesh(tensor(source.vertices), tensor(source.faces, torch.int32), normals, uv,
+                None if tangents is None else tensor(tangents))  # fmt: skip
