@@ -19,7 +19,7 @@ def tangent_frame(n: wp.vec3) -> wp.mat33:
 
     Duff et al. 2017, Building an Orthonormal Basis, Revisited: no branch on the direction, continuous but at n.z = 0-.
     """
-    s = float(1.0)
+    s = wp.float32(1.0)
     if n[2] < 0.0:
         s = -1.0
     a = -1.0 / (s + n[2])

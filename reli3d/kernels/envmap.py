@@ -1,0 +1,146 @@
+"""Lat-long environment maps: lookup, importance table, sampling.
+
+Row 0 is +Y; the centre column looks to -Z, right of it +X: with theta = 2 pi u - pi and phi = pi v the direction is
+(sin theta sin phi, cos phi, -cos theta sin phi).  A texel has its centre at ((column + .5) / W, (row + .5) / H).
+Radiance is bilinear between centres, periodic in u, constant beyond the first and last row.  Sampling is piecewise
+constant over texels with respect to solid angle; densities are per steradian.
+"""
+
+import warp as wp
+
+from reli3d.kernels.math import PI, safe_sqrt
+
+wp.set_module_options({"enable_backward": True, "cpu_compiler_flags": "-march=native"})
+
+
+@wp.func
+def direction_to_uv(d: wp.vec3) -> wp.vec2:
+    """Map coordinates in [0, 1]^2 of the unit direction ``d``; at the poles u is 0.5 and its slope stays finite."""
+    s = safe_sqrt(d[0] * d[0] + d[2] * d[2])
+    return wp.vec2(0.5 + wp.atan2(d[0], -d[2]) / (2.0 * PI), wp.atan2(s, d[1]) / PI)
+
+
+@wp.func
+def uv_to_direction(uv: wp.vec2) -> wp.vec3:
+    """Unit direction of map coordinates."""
+    theta = 2.0 * PI * uv[0] - PI
+    phi = PI * uv[1]
+    s = wp.sin(phi)
+    return wp.vec3(wp.sin(theta) * s, wp.cos(phi), -wp.cos(theta) * s)
+
+
+@wp.func
+def lookup_envmap_uv(radiance: wp.array2d(dtype=wp.vec3), uv: wp.vec2) -> wp.vec3:
+    """Bilinear radiance at map coordinates in [0, 1]^2.  Differentiable in the texels and in ``uv``."""
+    height = radiance.shape[0]
+    width = radiance.shape[1]
+    x = uv[0] * float(width) - 0.5
+    y = uv[1] * float(height) - 0.5
+    fx = x - wp.floor(x)
+    fy = y - wp.floor(y)
+    c0 = int(wp.floor(x))
+    r0 = int(wp.floor(y))
+    c1 = c0 + 1
+    r1 = wp.clamp(r0 + 1, 0, height - 1)
+    r0 = wp.clamp(r0, 0, height - 1)
+    if c0 < 0:
+        c0 = c0 + width
+    if c1 >= width:
+        c1 = c1 - width
+    c0 = wp.clamp(c0, 0, width - 1)
+    c1 = wp.clamp(c1, 0, width - 1)
+    top = radiance[r0, c0] * (1.0 - fx) + radiance[r0, c1] * fx
+    bottom = radiance[r1, c0] * (1.0 - fx) + radiance[r1, c1] * fx
+    return top * (1.0 - fy) + bottom * fy
+
+
+@wp.func
+def lookup_envmap(radiance: wp.array2d(dtype=wp.vec3), d: wp.vec3) -> wp.vec3:
+    """Bilinear radiance from the unit direction ``d``."""
+    return lookup_envmap_uv(radiance, direction_to_uv(d))
+
+
+@wp.func
+def upper_cell(cdf: wp.array2d(dtype=float), row: int, u: float) -> int:
+    """Index k with ``cdf[row, k] <= u < cdf[row, k + 1]``; such a cell has positive probability."""
+    low = wp.int32(0)
+    high = wp.int32(cdf.shape[1] - 1)
+    while high - low > 1:
+        middle = (low + high) // 2
+        if cdf[row, middle] <= u:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+@wp.func
+def sample_envmap_uv(rows: wp.array2d(dtype=float), columns: wp.array2d(dtype=float), u: wp.vec2) -> wp.vec2:
+    """Map coordinates for uniform ``u`` in [0, 1)^2; density :func:`pdf_envmap_uv`.
+
+    rows: ``(1, H + 1)`` CDF of the rows; columns: ``(H, W + 1)`` CDF within each row.  Inversion, monotone in both
+    numbers, so stratified ``u`` stay stratified.  Within a texel uniform in solid angle.
+    """
+    height = columns.shape[0]
+    width = columns.shape[1] - 1
+    r = upper_cell(rows, 0, u[0])
+    c = upper_cell(columns, r, u[1])
+    a = rows[0, r]
+    b = columns[r, c]
+    in_row = (u[0] - a) / (rows[0, r + 1] - a)
+    in_column = (u[1] - b) / (columns[r, c + 1] - b)
+    top = wp.cos(PI * float(r) / float(height))
+    bottom = wp.cos(PI * float(r + 1) / float(height))
+    y = top + (bottom - top) * in_row
+    v = wp.acos(wp.clamp(y, -1.0, 1.0)) / PI * float(height)
+    v = wp.clamp(v, float(r), float(r) + 0.99999)  # float32 acos near a pole may leave the row
+    return wp.vec2((float(c) + wp.min(in_column, 0.99999)) / float(width), v / float(height))
+
+
+@wp.func
+def pdf_envmap_uv(density: wp.array2d(dtype=float), uv: wp.vec2) -> float:
+    """Density [1/sr] of the table at map coordinates."""
+    height = density.shape[0]
+    width = density.shape[1]
+    r = wp.clamp(int(uv[1] * float(height)), 0, height - 1)
+    c = wp.clamp(int(uv[0] * float(width)), 0, width - 1)
+    return density[r, c]
+
+
+@wp.kernel
+def lookup_envmap_kernel(
+    start: int,
+    # in
+    radiance: wp.array2d(dtype=wp.vec3), directions: wp.array(dtype=wp.vec3),
+    # out
+    out: wp.array(dtype=wp.vec3),
+):  # fmt: skip
+    i = start + wp.tid()
+    out[i] = lookup_envmap(radiance, directions[i])
+
+
+@wp.kernel(enable_backward=False)
+def sample_envmap_kernel(
+    start: int,
+    # in
+    rows: wp.array2d(dtype=float), columns: wp.array2d(dtype=float), density: wp.array2d(dtype=float),
+    u: wp.array(dtype=wp.vec2),
+    # out
+    directions: wp.array(dtype=wp.vec3), pdf: wp.array(dtype=float),
+):  # fmt: skip
+    i = start + wp.tid()
+    uv = sample_envmap_uv(rows, columns, u[i])
+    directions[i] = uv_to_direction(uv)
+    pdf[i] = pdf_envmap_uv(density, uv)
+
+
+@wp.kernel(enable_backward=False)
+def pdf_envmap_kernel(
+    start: int,
+    # in
+    density: wp.array2d(dtype=float), directions: wp.array(dtype=wp.vec3),
+    # out
+    pdf: wp.array(dtype=float),
+):  # fmt: skip
+    i = start + wp.tid()
+    pdf[i] = pdf_envmap_uv(density, direction_to_uv(directions[i]))

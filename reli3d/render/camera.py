@@ -1,0 +1,116 @@
+"""Pinhole cameras.
+
+============  ==========================================================================================
+world         right-handed, +Y up; any length unit, the same for vertices and camera positions
+camera        camera-to-world 4 x 4, OpenGL axes: +X right, +Y up, looks along -Z
+intrinsics    ``fx, fy, cx, cy`` in pixels; x to the right, y DOWN, pixel centres at +0.5, (0, 0) the corner
+depth         distance along the viewing axis (-Z of the camera), not along the ray
+============  ==========================================================================================
+
+Other conventions are converted in ``reli3d.data`` and ``reli3d.io`` and nowhere else.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from reli3d._bridge import check
+
+
+@dataclass(frozen=True)
+class Camera:
+    """One camera or a batch of cameras of the same image size.
+
+    c2w: ``(..., 4, 4)``.  intrinsics: ``(..., 4)`` as ``fx, fy, cx, cy`` in pixels.  Leading axes are equal.
+    """
+
+    c2w: Tensor
+    intrinsics: Tensor
+    width: int
+    height: int
+
+    def __post_init__(self):
+        check("c2w", self.c2w, last=4)
+        check("intrinsics", self.intrinsics, last=4, like=self.c2w)
+        if self.c2w.ndim < 2 or self.c2w.shape[-2] != 4 or self.c2w.shape[:-2] != self.intrinsics.shape[:-1]:
+            raise ValueError(
+                "c2w: expected (..., 4, 4) with the batch axes of intrinsics, "
+                f"got {tuple(self.c2w.shape)} and {tuple(self.intrinsics.shape)}"
+            )
+        if self.width < 1 or self.height < 1:
+            raise ValueError(f"width, height: expected at least 1, got {self.width}, {self.height}")
+
+    @classmethod
+    def from_fov(cls, c2w: Tensor, fov_x: float, width: int, height: int) -> Camera:
+        """Camera with the horizontal field of view ``fov_x`` [rad], square pixels and the axis at the image centre."""
+        if not 0.0 < fov_x < torch.pi:
+            raise ValueError(f"fov_x: expected radians in (0, pi), got {fov_x}")
+        f = 0.5 * width / torch.tan(torch.tensor(0.5 * fov_x, dtype=torch.float64)).item()
+        row = torch.tensor([f, f, 0.5 * width, 0.5 * height], dtype=torch.float32, device=c2w.device)
+        return cls(c2w, row.expand(*c2w.shape[:-2], 4).contiguous(), width, height)
+
+    @property
+    def position(self) -> Tensor:
+        """Eye position, ``(..., 3)``."""
+        return self.c2w[..., :3, 3]
+
+    def scaled(self, factor: int) -> Camera:
+        """The same view with ``factor`` times as many pixels along each side."""
+        if factor < 1:
+            raise ValueError(f"factor: expected at least 1, got {factor}")
+        return Camera(self.c2w, self.intrinsics * factor, self.width * factor, self.height * factor)
+
+
+def camera_rays(camera: Camera) -> tuple[Tensor, Tensor]:
+    """Origins and unit directions through all pixel centres, both ``(..., H, W, 3)``, world frame.
+
+    The origins are an expanded view of the eye.  Gradients reach ``c2w`` and ``intrinsics``.
+    """
+    fx, fy, cx, cy = (v[..., None, None] for v in camera.intrinsics.unbind(-1))
+    ys = torch.arange(camera.height, dtype=torch.float32, device=camera.c2w.device)[:, None] + 0.5
+    xs = torch.arange(camera.width, dtype=torch.float32, device=camera.c2w.device)[None, :] + 0.5
+    x, y = torch.broadcast_tensors((xs - cx) / fx, -(ys - cy) / fy)
+    local = normalize(torch.stack([x, y, -torch.ones_like(x)], -1), dim=-1)
+    rotation = camera.c2w[..., None, None, :3, :3]
+    directions = normalize((rotation @ local[..., None])[..., 0], dim=-1)
+    return camera.position[..., None, None, :].expand_as(directions), directions
+
+
+def project(points: Tensor, c2w: Tensor, intrinsics: Tensor) -> tuple[Tensor, Tensor]:
+    """Pixel coordinates ``(..., 2)`` and depth along the viewing axis ``(...)`` of world points.
+
+    points: ``(..., 3)``; c2w: ``(..., 4, 4)``, a rotation and a translation; intrinsics: ``(..., 4)``.  Batch axes
+    broadcast (put ``c2w[:, None]`` against ``points (N, 3)`` for all pairs).  A point behind the camera has depth
+    < 0 and its pixel is the mirrored one; depth 0 gives inf.  Gradients reach all three.
+    """
+    check("points", points, last=3)
+    check("c2w", c2w, last=4, like=points)
+    check("intrinsics", intrinsics, last=4, like=points)
+    local = ((points - c2w[..., :3, 3])[..., None, :] @ c2w[..., :3, :3])[..., 0, :]  # row vector: the inverse rotation
+    depth = -local[..., 2]
+    fx, fy, cx, cy = intrinsics.unbind(-1)
+    pixels = torch.stack([fx * local[..., 0] / depth + cx, -fy * local[..., 1] / depth + cy], -1)
+    return pixels, depth
+
+
+def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:
+    """Camera-to-world ``(..., 4, 4)`` at ``eye`` looking to ``target``, image up towards ``up``; all ``(..., 3)``.
+
+    Batch axes broadcast.  ``up`` parallel to the view raises ValueError.
+    """
+    check("eye", eye, last=3)
+    check("target", target, last=3, like=eye)
+    check("up", up, last=3, like=eye)
+    eye, target, up = torch.broadcast_tensors(eye, target, up)
+    z = normalize(eye - target, dim=-1)
+    x = torch.linalg.cross(normalize(up, dim=-1), z)
+    if eye.numel() and float(x.norm(dim=-1).min()) < 1e-6:  # sine of the angle; float32 noise of unit vectors is 1e-7
+        raise ValueError("up: expected a direction not parallel to the view, got a parallel one")
+    x = normalize(x, dim=-1)
+    rows = torch.stack([x, torch.linalg.cross(z, x), z, eye], -1)
+    last = rows.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*rows.shape[:-2], 1, 4)
+    return torch.cat([rows, last], -2)

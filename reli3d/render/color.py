@@ -1,0 +1,52 @@
+"""Colour transfer: sRGB both ways and the AgX display transform.  Linear values are Rec. 709."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+# AgX with Rec. 709 primaries as the published model was trained with: rows of the inset matrix and its inverse
+_AGX_IN = (
+    (0.842479062253094, 0.0784335999999992, 0.0792237451477643),
+    (0.0423282422610123, 0.878468636469772, 0.0791661274605434),
+    (0.0423756549057051, 0.0784336, 0.879142973793104),
+)
+_AGX_OUT = (
+    (1.19687900512017, -0.0980208811401368, -0.0990297440797205),
+    (-0.0528968517574562, 1.15190312990417, -0.0989611768448433),
+    (-0.0529716355144438, -0.0980434501171241, 1.15107367264116),
+)
+_AGX_EV = (-12.47393, 4.026069)  # log2 range mapped to [0, 1]
+
+
+def srgb_to_linear(value: Tensor) -> Tensor:
+    """Linear radiance of an sRGB-encoded value, any shape (IEC 61966-2-1; toe below 0.04045).
+
+    Not clamped: values above 1 follow the power, negative ones the toe.  Gradients everywhere.
+    """
+    power = ((value.clamp(min=0.04045) + 0.055) / 1.055) ** 2.4  # the clamp keeps a NaN slope out of the unused branch
+    return torch.where(value <= 0.04045, value / 12.92, power)
+
+
+def linear_to_srgb(value: Tensor) -> Tensor:
+    """sRGB encoding of linear radiance, any shape; inverse of :func:`srgb_to_linear`, not clamped."""
+    power = 1.055 * value.clamp(min=0.0031308) ** (1.0 / 2.4) - 0.055
+    return torch.where(value <= 0.0031308, value * 12.92, power)
+
+
+def agx(radiance: Tensor) -> Tensor:
+    """Display value in [0, 1], sRGB-encoded, of linear radiance ``(..., 3)``: AgX, default look.
+
+    Inset matrix, log2 between -12.47 and 4.03 stops, sigmoid contrast, outset matrix, power 2.2, then the sRGB
+    transfer.  Gradients to ``radiance``, exactly 0 where a clamp holds.  Source: AgX (T. Sobotka) with the constants
+    of the published model's display transform.
+    """
+    if radiance.ndim == 0 or radiance.shape[-1] != 3:
+        raise ValueError(f"radiance: expected shape (..., 3), got {tuple(radiance.shape)}")
+    low, high = _AGX_EV
+    inset = radiance @ radiance.new_tensor(_AGX_IN).T
+    stops = torch.log2(inset.clamp(min=0.0) + 1e-8).clamp(low, high)
+    x = (stops - low) / (high - low)
+    curve = (-0.01 + 1.053 / (1.0 + torch.exp(-8.1282 * (x - 0.6152)))).clamp(min=0.0)
+    linear = (curve @ radiance.new_tensor(_AGX_OUT).T).clamp(0.0, 1.0) ** 2.2
+    return linear_to_srgb(linear)

@@ -1,0 +1,146 @@
+"""Distant light as a lat-long map: lookup with gradients, importance table, sampling.
+
+The direction mapping stands in ``reli3d.kernels.envmap``: row 0 is +Y, the centre column -Z, right of it +X.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from reli3d._bridge import call, check, empty, launch
+from reli3d.kernels import envmap as kernels
+
+_LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709
+
+
+@dataclass(frozen=True)
+class EnvironmentTable:
+    """Piecewise-constant density over the texels.
+
+    rows: ``(1, H + 1)`` CDF over rows.  columns: ``(H, W + 1)`` CDF within each row.  density: ``(H, W)`` [1/sr].
+    """
+
+    rows: Tensor
+    columns: Tensor
+    density: Tensor
+
+
+def texel_solid_angles(height: int, width: int, device: torch.device | None = None) -> Tensor:
+    """Solid angle [sr] of a texel in each row, ``(H,)`` float64; times W they sum to 4 pi."""
+    edges = torch.cos(torch.linspace(0.0, torch.pi, height + 1, dtype=torch.float64, device=device))
+    return (edges[:-1] - edges[1:]) * (2.0 * torch.pi / width)
+
+
+@dataclass(frozen=True)
+class Environment:
+    """Radiance from infinitely far, ``radiance (H, W, 3)``, normally W = 2 H; linear Rec. 709.
+
+    The sampling table is made once, on first use; do not edit ``radiance`` in place afterwards.
+    """
+
+    radiance: Tensor
+
+    def __post_init__(self):
+        check("radiance", self.radiance, last=3)
+        if self.radiance.ndim != 3 or self.radiance.numel() == 0:
+            raise ValueError(f"radiance: expected (H, W, 3), got {tuple(self.radiance.shape)}")
+
+    @classmethod
+    def constant(cls, rgb: Tensor, height: int = 16) -> Environment:
+        """The same radiance ``rgb (3,)`` from everywhere."""
+        check("rgb", rgb, last=3)
+        return cls(rgb.expand(height, 2 * height, 3).contiguous())
+
+    def lookup(self, directions: Tensor) -> Tensor:
+        """Radiance ``(..., 3)`` from unit ``directions (..., 3)``: bilinear between texel centres, periodic in azimuth.
+
+        Gradients reach the texels and the directions (not at a pole, where the azimuth has none).
+        """
+        check("directions", directions, last=3, like=self.radiance)
+        flat = directions.reshape(-1, 3)
+        n = flat.shape[0]
+        (out,) = call(
+            kernels.lookup_envmap_kernel, n, [(self.radiance, wp.vec3), (flat, wp.vec3)], [((n,), wp.vec3)],
+            device=flat.device, shared=(0,),
+        )  # fmt: skip
+        return out.reshape(directions.shape)
+
+    def rotated(self, yaw: float) -> Environment:
+        """The light turned by ``yaw`` [rad] about +Y, counter-clockwise seen from above: -Z light moves towards -X.
+
+        A multiple of 2 pi / W moves whole texels; in between, columns are blended linearly.
+        """
+        width = self.radiance.shape[1]
+        shift = yaw * width / (2.0 * torch.pi)
+        whole = round(shift) if abs(shift - round(shift)) < 1e-6 * width else int(shift // 1)  # rounding of yaw itself
+        part = shift - whole
+        radiance = torch.roll(self.radiance, -whole, 1)
+        if abs(part) >= 1e-6 * width:
+            radiance = (1.0 - part) * radiance + part * torch.roll(radiance, -1, 1)
+        return Environment(radiance)
+
+    def resized(self, height: int) -> Environment:
+        """Map of ``height`` x 2 ``height`` texels by area averaging (bilinear where it grows)."""
+        planes = self.radiance.permute(2, 0, 1)[None]
+        mode = "area" if height <= self.radiance.shape[0] else "bilinear"
+        out = torch.nn.functional.interpolate(planes, size=(height, 2 * height), mode=mode)
+        return Environment(out[0].permute(1, 2, 0).contiguous())
+
+    @cached_property
+    def table(self) -> EnvironmentTable:
+        """Importance table; a texel's weight is the integral of the bilinear luminance over it.
+
+        That integral is the map filtered by (1/8, 3/4, 1/8) along each axis, so wherever the lookup is positive the
+        density is too.  A black map gives the uniform sphere.  Raises ValueError for a texel that is not finite.
+        """
+        radiance = self.radiance.detach().double()
+        if not bool(torch.isfinite(radiance).all()):
+            raise ValueError("radiance: expected finite texels, got NaN or infinity")
+        value = radiance.clamp(min=0.0) @ radiance.new_tensor(_LUMINANCE)
+        value = 0.75 * value + 0.125 * (value.roll(1, 1) + value.roll(-1, 1))
+        above, below = torch.cat([value[:1], value[:-1]]), torch.cat([value[1:], value[-1:]])
+        value = 0.75 * value + 0.125 * (above + below)
+        height, width = value.shape
+        angle = texel_solid_angles(height, width, value.device)
+        if not bool(value.max() > 0.0):
+            value = torch.ones_like(value)
+        weight = value * angle[:, None]
+        per_row = weight.sum(1)
+        weight = torch.where(per_row[:, None] > 0.0, weight, torch.ones_like(weight))  # an empty row is never chosen
+        columns, rows = _cdf(weight), _cdf(per_row[None])
+        # from the rounded tables, so that density and samples agree to the last bit
+        density = rows.double().diff()[0][:, None] * columns.double().diff() / angle[:, None]
+        return EnvironmentTable(rows, columns, density.float())
+
+    def sample(self, u: Tensor) -> tuple[Tensor, Tensor]:
+        """Directions ``(..., 3)`` and density ``(...)`` [1/sr] for uniform ``u (..., 2)`` in [0, 1).  No gradient."""
+        check("u", u, last=2, like=self.radiance)
+        flat, table = u.detach().reshape(-1, 2).contiguous(), self.table
+        n = flat.shape[0]
+        directions, pdf = empty((n,), wp.vec3, flat.device), empty((n,), wp.float32, flat.device)
+        args = [(table.rows, wp.float32), (table.columns, wp.float32), (table.density, wp.float32), (flat, wp.vec2),
+                (directions, wp.vec3), (pdf, wp.float32)]  # fmt: skip
+        launch(kernels.sample_envmap_kernel, n, args, flat.device)
+        return directions.reshape(*u.shape[:-1], 3), pdf.reshape(u.shape[:-1])
+
+    def pdf(self, directions: Tensor) -> Tensor:
+        """Density ``(...)`` [1/sr] of :meth:`sample` at unit ``directions (..., 3)``.  No gradient."""
+        check("directions", directions, last=3, like=self.radiance)
+        flat = directions.detach().reshape(-1, 3).contiguous()
+        pdf = empty((flat.shape[0],), wp.float32, flat.device)
+        args = [(self.table.density, wp.float32), (flat, wp.vec3), (pdf, wp.float32)]
+        launch(kernels.pdf_envmap_kernel, flat.shape[0], args, flat.device)
+        return pdf.reshape(directions.shape[:-1])
+
+
+def _cdf(weight: Tensor) -> Tensor:
+    """Float32 CDF ``(R, n + 1)`` along the last axis of float64 weights; ends are exactly 0 and 1."""
+    total = torch.cat([torch.zeros_like(weight[:, :1]), weight.cumsum(1)], 1)
+    out = (total / total[:, -1:]).float()
+    out[:, -1] = 1.0
+    return out.contiguous()
