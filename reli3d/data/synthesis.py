@@ -1,0 +1,164 @@
+"""Training samples: one object under one light, seen by a few cameras, with what is true at points of its volume and surface.
+
+A sample is a dictionary of tensors (one safetensors file on disk).  ``V`` views of ``S`` by ``S`` pixels, cropped to the object as
+the network's input is; world +Y up, object centred, longest side 1; radiance is scaled so that the first view is well exposed.
+
+=================  =====================  ==============================================================================
+images             (V, S, S, 4) uint8     sRGB with straight alpha; the light's background is kept under it
+silhouette         (V, S, S) float16      signed distance to the mask's contour in pixels, positive inside
+c2w, intrinsics    (V, 4, 4), (V, 4)      OpenGL camera to world; fx, fy, cx, cy in pixels
+environment        (32, 64, 3) float16    linear radiance of the light, exposed as the images are
+points, distance   (P, 3), (P,) float16   volume points (first half near the surface) and signed distance, positive outside
+surface            (N, 3, 3) float16      position, geometric normal, bumped normal of surface points
+material           (N, 5) uint8           base colour (sRGB-encoded), roughness, metallic
+visible            (N, V) uint8           1 where the surface point is seen by the view
+pixels             (V, M, 3, 3) float16   position, bumped normal, direction to the camera of seen points, and ...
+pixel_radiance     (V, M, 3) float16      ... the linear radiance that left them
+=================  =====================  ==============================================================================
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from reli3d.data.distance import signed_distance
+from reli3d.data.procedural import ProceduralObject, sample_cameras
+from reli3d.geometry.hull import mask_distance
+from reli3d.geometry.rays import RayScene, offset_origin
+from reli3d.render.camera import Camera, camera_rays, project
+from reli3d.render.color import linear_to_srgb
+from reli3d.render.environment import Environment
+from reli3d.render.shading import shade
+
+SAMPLES = (16, 12, 4)  # light, GGX and cosine samples a pixel: the noise left is below that of a photograph
+EXPOSED = 0.6  # linear value of the 90th percentile of the object in the first view
+VOLUME_POINTS, SURFACE_POINTS, PIXELS = 16384, 8192, 1024
+
+
+def crop_camera(vertices: Tensor, c2w: Tensor, size: int, padding: float) -> Tensor:
+    """Intrinsics ``(4,)`` that fit the projection of ``vertices`` into a ``size`` square with a relative ``padding``."""
+    unit = torch.tensor([1.0, 1.0, 0.0, 0.0])
+    xy, _ = project(vertices, c2w, unit)
+    low, high = xy.amin(0), xy.amax(0)
+    focal = size * (1 - 2 * padding) / (high - low).max()
+    centre = size / 2 - focal * (low + high) / 2
+    return torch.stack([focal, focal, centre[0], centre[1]])
+
+
+class _Surface:
+    """The object as the renderer sees it: rays in, geometry and material at the hits out."""
+
+    def __init__(self, shape: ProceduralObject):
+        self.shape = shape
+        self.vertices = torch.as_tensor(shape.vertices)
+        self.faces = torch.as_tensor(shape.faces)
+        self.corner_normals = torch.as_tensor(shape.normals)
+        self.part = torch.as_tensor(shape.part)
+        self.scene = RayScene(self.vertices, self.faces)
+
+    def at(self, face: Tensor, bary: Tensor) -> dict[str, Tensor]:
+        weights = torch.stack([1 - bary.sum(-1), bary[:, 0], bary[:, 1]], -1)[..., None]
+        corners = self.vertices[self.faces[face].long()]
+        ng = torch.nn.functional.normalize(torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), dim=-1)
+        normal = torch.nn.functional.normalize((self.corner_normals[face] * weights).sum(1), dim=-1)
+        position = (corners * weights).sum(1)
+        base, rough, metal, bump = self.shape.material(position.numpy(), normal.numpy(), self.part[face].numpy())
+        as_float = lambda x: torch.as_tensor(np.ascontiguousarray(x), dtype=torch.float32)  # noqa: E731
+        return {"position": position, "normal": normal, "ng": ng, "bump": as_float(bump), "base_color": as_float(base),
+                "roughness": as_float(rough), "metallic": as_float(metal)}  # fmt: skip
+
+
+def _render(surface: _Surface, camera: Camera, light: Environment, seed: int):
+    """Linear image ``(S, S, 3)``, coverage, the pixels that hit and what is at the hits."""
+    origins, directions = (r.reshape(-1, 3) for r in camera_rays(camera))
+    hits = surface.scene.closest(origins, directions)
+    seen = (hits.face >= 0).nonzero()[:, 0]
+    at = surface.at(hits.face[seen].long(), hits.bary[seen])
+    wo = -directions[seen]
+    radiance = shade(at["position"], at["bump"], at["ng"], wo, at["base_color"], at["roughness"], at["metallic"], light,
+                     samples=SAMPLES, scene=surface.scene, seed=seed)  # fmt: skip
+    image = light.lookup(directions)
+    image[seen] = radiance
+    return image, seen, at, wo, radiance
+
+
+def synthesize(shape: ProceduralObject, light: Tensor, rng: np.random.Generator, *, size: int = 192, views: int = 6) -> dict[str, Tensor]:
+    """One sample of ``shape`` under the lat-long map ``light`` ``(H, 2H, 3)``, turned by a random yaw; see the table above."""
+    surface = _Surface(shape)
+    environment = Environment(torch.roll(light, int(rng.integers(light.shape[1])), 1).contiguous())
+    c2w = torch.as_tensor(np.asarray(sample_cameras(rng, views)[0]), dtype=torch.float32)
+    intrinsics = torch.stack([crop_camera(surface.vertices, m, size, rng.uniform(0.04, 0.12)) for m in c2w])
+    sample, exposure, images, pixels, pixel_radiance = {}, None, [], [], []
+    for k in range(views):
+        camera = Camera(c2w[k], intrinsics[k], size, size)
+        image, seen, at, wo, radiance = _render(surface, camera, environment, int(rng.integers(1 << 30)))
+        if exposure is None:
+            exposure = EXPOSED / max(float(radiance.mean(-1).quantile(0.9)), 1e-3) * float(np.exp(rng.normal(0, 0.25)))
+        alpha = _coverage(surface.scene, c2w[k], intrinsics[k], size)
+        encoded = torch.cat([linear_to_srgb((image * exposure).clamp(0, 1)).reshape(size, size, 3), alpha[..., None]], -1)
+        images.append((encoded * 255 + 0.5).to(torch.uint8))
+        pick = torch.as_tensor(rng.integers(len(seen), size=PIXELS))
+        pixels.append(torch.stack([at["position"], at["bump"], wo], 1)[pick])
+        pixel_radiance.append((radiance[pick] * exposure).clamp(max=64.0))
+    images = torch.stack(images)
+    silhouette = mask_distance(images[..., 3] / 255.0)
+    sample.update(images=images, silhouette=silhouette.half(), c2w=c2w, intrinsics=intrinsics,
+                  pixels=torch.stack(pixels).half(), pixel_radiance=torch.stack(pixel_radiance).half())  # fmt: skip
+    pooled = torch.nn.functional.interpolate((environment.radiance * exposure).permute(2, 0, 1)[None], (32, 64), mode="area")
+    sample["environment"] = pooled[0].permute(1, 2, 0).clamp(max=6e4).half()
+    sample.update(_volume(surface, rng), **_surface_points(surface, c2w, intrinsics, size, rng))
+    return {k: v.contiguous() for k, v in sample.items()}
+
+
+def _coverage(scene: RayScene, c2w: Tensor, intrinsics: Tensor, size: int, grid: int = 3) -> Tensor:
+    """Antialiased alpha ``(S, S)``: share of ``grid**2`` sub-pixel rays that hit."""
+    fine = Camera(c2w, intrinsics * grid, size * grid, size * grid)
+    origins, directions = camera_rays(fine)
+    hit = scene.occluded(origins, directions).float()
+    return torch.nn.functional.avg_pool2d(hit[None, None], grid)[0, 0]
+
+
+def _random_faces(surface: _Surface, count: int, rng: np.random.Generator):
+    corners = surface.vertices[surface.faces.long()].numpy()
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1)
+    face = rng.choice(len(area), count, p=area / area.sum())
+    u = np.sqrt(rng.random(count))
+    v = rng.random(count)
+    return torch.as_tensor(face), torch.as_tensor(np.stack([u * (1 - v), u * v], -1), dtype=torch.float32)
+
+
+def _volume(surface: _Surface, rng: np.random.Generator) -> dict[str, Tensor]:
+    """Half the points beside the surface (normal offsets of 0.01 and 0.05), half uniform in a box slightly larger than the object."""
+    near = surface.at(*_random_faces(surface, VOLUME_POINTS // 2, rng))["position"].numpy()
+    near = near + rng.normal(size=near.shape) * rng.choice([0.01, 0.05], (len(near), 1))
+    box = np.abs(surface.shape.vertices).max(0) + 0.12
+    points = torch.as_tensor(np.concatenate([near, rng.uniform(-box, box, (VOLUME_POINTS // 2, 3))]), dtype=torch.float32)
+    points = points.half().float()  # the distance must belong to the point as it is stored
+    return {"points": points.half(), "distance": signed_distance(surface.vertices, surface.faces, points).half()}
+
+
+def _surface_points(surface: _Surface, c2w: Tensor, intrinsics: Tensor, size: int, rng: np.random.Generator) -> dict[str, Tensor]:
+    at = surface.at(*_random_faces(surface, SURFACE_POINTS, rng))
+    visible = []
+    for m, k in zip(c2w, intrinsics, strict=True):
+        visible.append(visibility(surface.scene, at["position"], at["ng"], m, k, size))
+    encoded = torch.cat([linear_to_srgb(at["base_color"].clamp(0, 1)), at["roughness"][:, None], at["metallic"][:, None]], -1)
+    return {
+        "surface": torch.stack([at["position"], at["ng"], at["bump"]], 1).half(),
+        "material": (encoded * 255 + 0.5).to(torch.uint8),
+        "visible": torch.stack(visible, -1).to(torch.uint8),
+    }
+
+
+def visibility(scene: RayScene, position: Tensor, ng: Tensor, c2w: Tensor, intrinsics: Tensor, size: int) -> Tensor:
+    """Whether surface points ``(N, 3)`` face the camera, lie in its square image and are not hidden: ``(N,)`` bool."""
+    to_camera = c2w[:3, 3] - position
+    distance = to_camera.norm(dim=-1)
+    direction = to_camera / distance[:, None]
+    xy, depth = project(position, c2w, intrinsics)
+    faced = ((direction * ng).sum(-1) > 0.05) & (depth > 0) & (xy > 0).all(-1) & (xy < size).all(-1)
+    hidden = scene.occluded(offset_origin(position, ng, direction), direction, t_max=distance)
+    return faced & ~hidden
+

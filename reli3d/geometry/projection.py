@@ -1,0 +1,30 @@
+"""Values of posed images at points in space."""
+
+from __future__ import annotations
+
+import warp as wp
+from torch import Tensor
+
+from reli3d._bridge import call, check
+from reli3d.kernels.projection import gather_views_kernel
+
+
+def gather_views(maps: Tensor, points: Tensor, c2w: Tensor, intrinsics: Tensor) -> tuple[Tensor, Tensor]:
+    """Bilinear values ``(N, V, C)`` of ``maps`` where ``points`` project, and pixel x, y and depth ``(N, V, 3)``.
+
+    maps: ``(V, H, W, C)``, at least 2 by 2 pixels.  points: ``(N, 3)`` world.  c2w: ``(V, 4, 4)`` OpenGL.  intrinsics: ``(V, 4)`` fx, fy,
+    cx, cy in pixels of ``maps``.  Outside a map its border value is taken.  Gradients reach ``maps`` and ``points``; the pixels
+    carry the gradient of the points too.  Raises TypeError unless float32, ValueError on wrong shapes or mixed devices.
+    """
+    check("maps", maps), check("points", points, last=3, like=maps)
+    check("c2w", c2w, last=4, like=maps), check("intrinsics", intrinsics, last=4, like=maps)
+    if maps.ndim != 4 or maps.shape[1] < 2 or maps.shape[2] < 2:
+        raise ValueError(f"maps: expected (V, H, W, C) of at least 2 by 2 pixels, got {tuple(maps.shape)}")
+    views, n = maps.shape[0], len(points)
+    if points.ndim != 2:
+        raise ValueError(f"points: expected (N, 3), got {tuple(points.shape)}")
+    if c2w.shape != (views, 4, 4) or intrinsics.shape != (views, 4):
+        raise ValueError(f"c2w, intrinsics: expected {views} cameras, got {tuple(c2w.shape)} and {tuple(intrinsics.shape)}")
+    ins = [(maps, wp.float32), (points, wp.vec3), (c2w.detach(), wp.mat44), (intrinsics.detach(), wp.vec4)]
+    outs = [((n, views, maps.shape[3]), wp.float32), ((n, views), wp.vec3)]
+    return call(gather_views_kernel, n * views, ins, outs, device=maps.device, shared=(0, 1))

@@ -1,0 +1,53 @@
+"""Look-up of points in posed feature maps: pinhole projection and a bilinear gather, one thread a point and view.
+
+Cameras are OpenGL (look along -Z, +Y up); pixel centres lie at +0.5; outside the image the border value is taken.
+"""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": True, "cpu_compiler_flags": "-march=native"})
+
+NEAR = wp.constant(1.0e-3)  # a point closer than this to the camera plane is treated as being on it
+
+
+@wp.func
+def project_point(p: wp.vec3, c2w: wp.mat44, k: wp.vec4) -> wp.vec3:
+    """Pixel x, y and depth of ``p``; the pixel of a point behind the camera is that of depth NEAR."""
+    d = wp.vec3(p[0] - c2w[0, 3], p[1] - c2w[1, 3], p[2] - c2w[2, 3])
+    x = d[0] * c2w[0, 0] + d[1] * c2w[1, 0] + d[2] * c2w[2, 0]
+    y = d[0] * c2w[0, 1] + d[1] * c2w[1, 1] + d[2] * c2w[2, 1]
+    depth = -(d[0] * c2w[0, 2] + d[1] * c2w[1, 2] + d[2] * c2w[2, 2])
+    z = wp.max(depth, NEAR)
+    return wp.vec3(k[0] * x / z + k[2], k[3] - k[1] * y / z, depth)
+
+
+@wp.kernel
+def gather_views_kernel(
+    start: int,
+    # in
+    maps: wp.array4d[float],  # (V, H, W, C)
+    points: wp.array[wp.vec3],  # (N,)
+    c2w: wp.array[wp.mat44],  # (V,)
+    intrinsics: wp.array[wp.vec4],  # (V,) in units of the maps' pixels
+    # out
+    features: wp.array3d[float],  # (N, V, C)
+    pixels: wp.array2d[wp.vec3],  # (N, V)
+):
+    i = start + wp.tid()
+    views = maps.shape[0]
+    n = i // views
+    v = i - n * views
+    q = project_point(points[n], c2w[v], intrinsics[v])
+    pixels[n, v] = q
+    h = maps.shape[1]
+    w = maps.shape[2]
+    x = wp.clamp(q[0] - 0.5, 0.0, float(w - 1))
+    y = wp.clamp(q[1] - 0.5, 0.0, float(h - 1))
+    x0 = wp.min(int(x), w - 2)
+    y0 = wp.min(int(y), h - 2)
+    fx = x - float(x0)
+    fy = y - float(y0)
+    for c in range(maps.shape[3]):
+        top = maps[v, y0, x0, c] * (1.0 - fx) + maps[v, y0, x0 + 1, c] * fx
+        bottom = maps[v, y0 + 1, x0, c] * (1.0 - fx) + maps[v, y0 + 1, x0 + 1, c] * fx
+        features[n, v, c] = top * (1.0 - fy) + bottom * fy
