@@ -1,0 +1,74 @@
+"""Reading and writing files safely: one-line errors, size limits, whole files or none."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import stat
+from pathlib import Path
+
+
+class InputError(ValueError):
+    """What a user gave cannot be used.  The text is one line that names the file, the field, the value and the fix."""
+
+    def __init__(self, where: object, problem: str):
+        super().__init__(" ".join(f"{_plain(str(where))}: {_plain(problem)}".split()))
+
+
+def _plain(text: str) -> str:
+    return "".join(c if c.isprintable() else c.encode("unicode_escape", "replace").decode() for c in text)
+
+
+def shown(value: object, limit: int = 60) -> str:
+    """``value`` as it stands in a message: its repr on one line, cut after ``limit`` characters."""
+    try:
+        long = isinstance(value, list | dict) and len(value) > 16
+        text = f"{type(value).__name__} of {len(value)}" if long else repr(value)
+    except (ValueError, RecursionError):  # an int of more digits than Python prints, a list nested without end
+        text = type(value).__name__
+    return text if len(text) <= limit else text[: limit - 3] + "..."
+
+
+def read_bytes(path: str | os.PathLike, limit: int) -> bytes:
+    """Content of a regular file of at most ``limit`` bytes.  Raises InputError otherwise; a pipe never blocks."""
+    size = file_size(path)
+    if size > limit:
+        raise InputError(path, f"expected at most {limit} bytes, got {size}; give a smaller file")
+    try:
+        with open(path, "rb") as file:
+            return file.read(limit + 1)[:limit]
+    except OSError as error:
+        raise InputError(path, f"cannot be read ({error.strerror or error}); check its permissions") from None
+
+
+def file_size(path: str | os.PathLike) -> int:
+    """Bytes of a regular file.  Raises InputError where there is none."""
+    try:
+        info = os.stat(path)
+    except FileNotFoundError:
+        raise InputError(path, "file not found; check the path") from None
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(path, f"cannot be opened ({reason}); check the path") from None
+    if not stat.S_ISREG(info.st_mode):
+        raise InputError(path, "expected a regular file, got a folder, pipe or device; check the path")
+    return info.st_size
+
+
+def write_bytes(path: str | os.PathLike, data: bytes) -> None:
+    """Write a whole file or nothing: a temporary file beside it, then a rename.  Raises OSError."""
+    with replacing(path) as temporary:
+        temporary.write_bytes(data)
+
+
+@contextlib.contextmanager
+def replacing(path: str | os.PathLike):
+    """Yield a temporary path beside ``path``; it takes the place of ``path`` when the block ends without an error."""
+    path = Path(path)
+    temporary = path.with_name(f".{path.stem[:80]}.{os.getpid()}.{os.urandom(4).hex()}{path.suffix}")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise

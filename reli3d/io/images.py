@@ -1,0 +1,100 @@
+"""Photographs and masks in, PNG out.
+
+Colour is sRGB in [0, 1] as stored; alpha is straight (not premultiplied), and the colour under alpha 0 is kept.  Pixels
+are used as stored: an EXIF orientation is noted and not applied, because calibrated cameras refer to the stored pixels.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import warnings
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from reli3d.io.files import InputError, file_size, shown, write_bytes
+
+MAX_PIXELS = 1 << 26  # 64 MP: 256 MiB of RGBA, above any camera this is meant for
+MAX_BYTES = 1 << 29  # an uncompressed 16-bit RGBA image of MAX_PIXELS
+FORMATS = ("PNG", "JPEG", "WEBP", "TIFF")  # nothing that runs a program or unpacks streams of its own
+_GREY = ("1", "L", "LA", "I;16", "I;16B", "I;16L", "I")
+_COLOUR = ("RGB", "RGBA", "P", "PA", "CMYK", "YCbCr")
+
+
+def read_image(path: str | os.PathLike, *, notes: list[str] | None = None) -> tuple[Tensor, Tensor | None]:
+    """Colour ``(H, W, 3)`` in [0, 1], sRGB-encoded as stored, and straight alpha ``(H, W)`` in [0, 1] or None.
+
+    PNG, JPEG, WebP or TIFF; 8 bit, palette, grey, 16-bit grey; 16-bit colour comes down to 8 bit.  The size is checked
+    before a pixel is decoded.  What was done to the pixels is appended to ``notes``.
+    Raises InputError on anything else: another format, more than 64 MP, several frames, a truncated file.
+    """
+    size = file_size(path)
+    if size > MAX_BYTES:
+        raise InputError(path, f"expected at most {MAX_BYTES} bytes, got {size}; give a smaller image")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            warnings.simplefilter("ignore", UserWarning)  # broken EXIF or TIFF tags that the pixels do not need
+            with Image.open(path, formats=FORMATS) as image:
+                return _decoded(path, image, notes if notes is not None else [])
+    except InputError:
+        raise
+    except (Image.DecompressionBombError, Image.DecompressionBombWarning):
+        raise InputError(path, f"expected at most {MAX_PIXELS} pixels; scale the image down") from None
+    except Image.UnidentifiedImageError:
+        raise InputError(path, "expected a PNG, JPEG, WebP or TIFF image, got something else; convert it") from None
+    except MemoryError:
+        raise InputError(path, "does not fit into memory; scale the image down") from None
+    except Exception as error:  # on a broken file decoders raise almost anything: struct.error, IndexError ...
+        raise InputError(path, f"cannot be decoded ({shown(str(error))}); save the image again") from None
+
+
+def _decoded(path, image: Image.Image, notes: list[str]) -> tuple[Tensor, Tensor | None]:
+    width, height = image.size
+    if width * height > MAX_PIXELS:
+        raise InputError(path, f"expected at most {MAX_PIXELS} pixels, got {width} x {height}; scale the image down")
+    if width < 1 or height < 1:
+        raise InputError(path, f"expected at least one pixel, got {width} x {height}; save the image again")
+    if image.format != "MPO" and getattr(image, "n_frames", 1) > 1:  # MPO: JPEG of many phones, the photo comes first
+        raise InputError(path, f"expected one picture, got {image.n_frames} frames; save a single frame")
+    if image.mode not in _GREY + _COLOUR:
+        raise InputError(path, f"expected 8 or 16 bit grey or colour, got mode {image.mode}; save as 8 bit PNG")
+    orientation = image.getexif().get(0x0112, 1)
+    if orientation not in (0, 1):
+        name = os.path.basename(path)
+        notes.append(f"{name}: EXIF orientation {shown(orientation)} not applied, cameras refer to stored pixels")
+    if image.mode.startswith("I"):
+        grey = np.asarray(image).astype(np.float32)
+        if image.mode == "I" and (grey.min() < 0 or grey.max() > 65535):
+            raise InputError(path, "expected 8 or 16 bit grey, got 32 bit; save as 8 bit PNG")
+        grey = torch.from_numpy(grey / 65535.0)
+        return grey[..., None].expand(-1, -1, 3).contiguous(), None
+    transparent = image.mode in ("LA", "PA", "RGBA") or "transparency" in image.info
+    pixels = np.asarray(image.convert("RGBA" if transparent else "RGB"))
+    rgb = torch.from_numpy(pixels[..., :3].astype(np.float32)).div_(255.0)
+    alpha = torch.from_numpy(pixels[..., 3].astype(np.float32)).div_(255.0) if transparent else None
+    return rgb, alpha
+
+
+def png_bytes(pixels: Tensor | np.ndarray) -> bytes:
+    """PNG file of ``(H, W)``, ``(H, W, 3)`` or ``(H, W, 4)`` pixels: uint8, or float in [0, 1] (clamped, rounded)."""
+    array = pixels.detach().cpu().numpy() if isinstance(pixels, Tensor) else np.asarray(pixels)
+    if array.dtype not in (np.uint8, np.float32, np.float64):
+        raise TypeError(f"pixels: expected uint8 or float32, got {array.dtype}")
+    if array.ndim not in (2, 3) or 0 in array.shape or (array.ndim == 3 and array.shape[2] not in (3, 4)):
+        raise ValueError(f"pixels: expected shape (H, W), (H, W, 3) or (H, W, 4), got {array.shape}")
+    if array.dtype != np.uint8:
+        if not np.isfinite(array).all():
+            raise ValueError("pixels: expected finite values, got NaN or infinity")
+        array = np.rint(np.clip(array, 0.0, 1.0) * 255.0).astype(np.uint8)
+    buffer = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(array)).save(buffer, "PNG", compress_level=4)  # level 6 takes twice as long
+    return buffer.getvalue()
+
+
+def write_png(path: str | os.PathLike, pixels: Tensor | np.ndarray) -> None:
+    """Write :func:`png_bytes` of ``pixels``: the whole file or nothing.  Raises OSError where it cannot be written."""
+    write_bytes(path, png_bytes(pixels))
