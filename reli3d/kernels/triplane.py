@@ -1,0 +1,202 @@
+"""Bilinear gather from three axis-aligned feature planes, and its two adjoints.
+
+Planes are channel-last, ``(P = 3 * batch, H, W, Q)`` of :data:`vec8` blocks, flattened: texel (y, x), block q of
+plane ``p`` stands at ``((p * H + y) * W + x) * Q + q``.  Plane 0 takes (x, y) of a point, plane 1 (x, z), plane 2 (y,
+z), the first along W.  A coordinate in [-1, 1] spans the texel borders (align_corners False); texels outside the
+plane are zero.
+"""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
+
+vec8 = wp.types.vector(length=8, dtype=wp.float32)  # one AVX register; a plane's channels are padded to blocks of it
+
+
+@wp.func
+def texel_position(point: wp.vec3, plane: int, height: int, width: int) -> wp.vec2:
+    """Column and row of ``point`` in texel centres, as far outside as needed: -1 and below has no texel."""
+    a = point[0]
+    b = point[1]
+    if plane == 1:
+        b = point[2]
+    if plane == 2:
+        a = point[1]
+        b = point[2]
+    return wp.vec2(((a + 1.0) * float(width) - 1.0) * 0.5, ((b + 1.0) * float(height) - 1.0) * 0.5)
+
+
+@wp.func
+def touches(at: wp.vec2, height: int, width: int) -> bool:
+    """Whether any texel has a weight; False for NaN, so that the conversion to int below is defined."""
+    return at[0] > -1.0 and at[0] < float(width) and at[1] > -1.0 and at[1] < float(height)
+
+
+@wp.func
+def texel(planes: wp.array[vec8], base: int, x: int, y: int, height: int, width: int, blocks: int) -> vec8:
+    """Block of texel (y, x), zero outside; ``base`` is that of texel (0, 0)."""
+    if x < 0 or x >= width or y < 0 or y >= height:
+        return vec8()
+    return planes[base + (y * width + x) * blocks]
+
+
+@wp.kernel
+def sample_kernel(
+    start: int,
+    # in
+    planes: wp.array[vec8], points: wp.array[wp.vec3], per_batch: int, height: int, width: int, blocks: int, split: int,
+    # out
+    features: wp.array[vec8],
+):  # fmt: skip
+    """A thread is a point, a plane and every ``split``-th block."""
+    i = start + wp.tid()
+    row = i // split  # point * 3 + plane
+    point = row // 3
+    plane = row % 3
+    at = texel_position(points[point], plane, height, width)
+    first = i % split
+    out = row * blocks
+    if touches(at, height, width):
+        x = int(wp.floor(at[0]))
+        y = int(wp.floor(at[1]))
+        u = at[0] - float(x)
+        v = at[1] - float(y)
+        w00 = (1.0 - u) * (1.0 - v)
+        w01 = u * (1.0 - v)
+        w10 = (1.0 - u) * v
+        w11 = u * v
+        base = ((point // per_batch) * 3 + plane) * height * width * blocks
+        if x >= 0 and y >= 0 and x + 1 < width and y + 1 < height:
+            top = base + (y * width + x) * blocks
+            bottom = top + width * blocks
+            for q in range(first, blocks, split):
+                features[out + q] = (planes[top + q] * w00 + planes[top + blocks + q] * w01
+                                     + planes[bottom + q] * w10 + planes[bottom + blocks + q] * w11)  # fmt: skip
+        else:
+            for q in range(first, blocks, split):
+                features[out + q] = (texel(planes, base + q, x, y, height, width, blocks) * w00
+                                     + texel(planes, base + q, x + 1, y, height, width, blocks) * w01
+                                     + texel(planes, base + q, x, y + 1, height, width, blocks) * w10
+                                     + texel(planes, base + q, x + 1, y + 1, height, width, blocks) * w11)  # fmt: skip
+    else:
+        for q in range(first, blocks, split):
+            features[out + q] = vec8()
+
+
+@wp.kernel
+def points_adjoint_kernel(
+    start: int,
+    # in
+    planes: wp.array[vec8], points: wp.array[wp.vec3], g_features: wp.array[vec8],
+    per_batch: int, height: int, width: int, blocks: int,
+    # out
+    g_points: wp.array[wp.vec3],
+):  # fmt: skip
+    """Gradient of the features with respect to a point; one-sided, towards +, at a texel centre."""
+    point = start + wp.tid()
+    g = wp.vec3()
+    for plane in range(3):
+        at = texel_position(points[point], plane, height, width)
+        if touches(at, height, width):
+            x = int(wp.floor(at[0]))
+            y = int(wp.floor(at[1]))
+            u = at[0] - float(x)
+            v = at[1] - float(y)
+            base = ((point // per_batch) * 3 + plane) * height * width * blocks
+            across = vec8()
+            down = vec8()
+            for q in range(blocks):
+                g_out = g_features[(point * 3 + plane) * blocks + q]
+                c00 = texel(planes, base + q, x, y, height, width, blocks)
+                c01 = texel(planes, base + q, x + 1, y, height, width, blocks)
+                c10 = texel(planes, base + q, x, y + 1, height, width, blocks)
+                c11 = texel(planes, base + q, x + 1, y + 1, height, width, blocks)
+                across += wp.cw_mul(g_out, (c01 - c00) * (1.0 - v) + (c11 - c10) * v)
+                down += wp.cw_mul(g_out, (c10 - c00) * (1.0 - u) + (c11 - c01) * u)
+            one = vec8(1.0)
+            g_first = wp.dot(across, one) * 0.5 * float(width)
+            g_second = wp.dot(down, one) * 0.5 * float(height)
+            if plane == 0:
+                g += wp.vec3(g_first, g_second, 0.0)
+            elif plane == 1:
+                g += wp.vec3(g_first, 0.0, g_second)
+            else:
+                g += wp.vec3(0.0, g_first, g_second)
+    g_points[point] = g
+
+
+@wp.kernel
+def cell_row_kernel(
+    start: int,
+    # in
+    points: wp.array[wp.vec3], per_batch: int, height: int, width: int,
+    # out
+    rows: wp.array[wp.int16],
+):  # fmt: skip
+    """Row of cells ``floor(y) + 1`` in [0, height] of a point in a plane, ``height + 1`` if it misses the plane."""
+    i = start + wp.tid()
+    point = i // 3
+    plane = i % 3
+    at = texel_position(points[point], plane, height, width)
+    row = height + 1
+    if touches(at, height, width):
+        row = int(wp.floor(at[1])) + 1
+    batch = point // per_batch
+    rows[(batch * 3 + plane) * per_batch + point % per_batch] = wp.int16(row)
+
+
+@wp.func
+def add_texel(g_planes: wp.array[vec8], base: int, x: int, y: int, height: int, width: int, blocks: int, value: vec8):
+    """Plain addition: the caller owns the rows of the texel."""
+    if x >= 0 and x < width and y >= 0 and y < height:
+        at = base + (y * width + x) * blocks
+        g_planes[at] = g_planes[at] + value
+
+
+@wp.kernel
+def planes_adjoint_kernel(
+    start: int,
+    # in
+    points: wp.array[wp.vec3], g_features: wp.array[vec8], order: wp.array[wp.int32], edges: wp.array[wp.int32],
+    parity: int, repeat: int, per_batch: int, height: int, width: int, blocks: int,
+    # out
+    g_planes: wp.array[vec8],
+):  # fmt: skip
+    """A thread is a row of cells of a plane and a block: it adds that row's points in order to two rows of texels.
+
+    Only rows of one ``parity`` run in a launch, so no two threads share a row of texels.  ``order`` lists the points of
+    every plane by row of cells, ``edges (P, height + 2)`` where each begins.  Only every ``repeat``-th thread works.
+    """
+    i = start + wp.tid()
+    if i % repeat != 0:
+        return
+    i = i // repeat
+    block = i % blocks
+    i = i // blocks
+    rows = (height + 2 - parity) // 2
+    row = (i % rows) * 2 + parity
+    slab = i // rows  # batch * 3 + plane
+    plane = slab % 3
+    base = slab * height * width * blocks + block
+    for k in range(edges[slab * (height + 2) + row], edges[slab * (height + 2) + row + 1]):
+        point = (slab // 3) * per_batch + order[slab * per_batch + k]
+        at = texel_position(points[point], plane, height, width)
+        x = int(wp.floor(at[0]))
+        y = row - 1
+        u = at[0] - float(x)
+        v = at[1] - float(y)
+        g = g_features[(point * 3 + plane) * blocks + block]
+        if x >= 0 and y >= 0 and x + 1 < width and y + 1 < height:
+            top = base + (y * width + x) * blocks
+            bottom = top + width * blocks
+            g_top = g * (1.0 - v)
+            g_bottom = g * v
+            g_planes[top] = g_planes[top] + g_top * (1.0 - u)
+            g_planes[top + blocks] = g_planes[top + blocks] + g_top * u
+            g_planes[bottom] = g_planes[bottom] + g_bottom * (1.0 - u)
+            g_planes[bottom + blocks] = g_planes[bottom + blocks] + g_bottom * u
+        else:
+            add_texel(g_planes, base, x, y, height, width, blocks, g * ((1.0 - u) * (1.0 - v)))
+            add_texel(g_planes, base, x + 1, y, height, width, blocks, g * (u * (1.0 - v)))
+            add_texel(g_planes, base, x, y + 1, height, width, blocks, g * ((1.0 - u) * v))
+            add_texel(g_planes, base, x + 1, y + 1, height, width, blocks, g * (u * v))

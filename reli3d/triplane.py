@@ -1,0 +1,124 @@
+"""Features of points from a triplane: three feature planes over XY, XZ and YZ of the cube [-1, 1]^3."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from reli3d._bridge import check, launch
+from reli3d.kernels import triplane as kernels
+
+BLOCK = 8  # channels of a kernels.vec8
+REPEAT = 8  # threads a row of cells in the backward launch, which is sliced over the pool by its number of threads
+
+
+class _SampleTriplane(torch.autograd.Function):
+    """Own backward: a scatter per point would need atomics, which Warp's CPU launches lack and CUDA does in any order.
+
+    Points are sorted by their row of cells instead, and one thread owns the rows of texels it adds to.
+    """
+
+    @staticmethod
+    def forward(ctx, planes: Tensor, points: Tensor) -> Tensor:
+        batch, _, channels, height, width = planes.shape
+        n = points.shape[1]
+        packed, points = _packed(planes), points.contiguous()
+        blocks = packed.shape[-1] // BLOCK
+        features = packed.new_empty(batch, n, 3, blocks * BLOCK)
+        split = blocks if planes.is_cuda else 1  # neighbouring GPU threads read neighbouring blocks
+        launch(kernels.sample_kernel, batch * n * 3 * split, [
+            (packed.view(-1, BLOCK), kernels.vec8), (points.view(-1, 3), kernels.wp.vec3), n, height, width, blocks,
+            split, (features.view(-1, BLOCK), kernels.vec8)], planes.device)  # fmt: skip
+        ctx.save_for_backward(points, packed if ctx.needs_input_grad[1] else None)
+        ctx.shape, ctx.dtype = planes.shape, planes.dtype
+        return features[..., :channels].reshape(batch, n, 3 * channels)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, g_out: Tensor):
+        points, packed = ctx.saved_tensors
+        channels = ctx.shape[2]
+        g = g_out.reshape(*points.shape[:2], 3, channels)
+        g = torch.nn.functional.pad(g, (0, -channels % BLOCK)).contiguous()
+        g_planes = _planes_adjoint(points, g, ctx.shape).to(ctx.dtype) if ctx.needs_input_grad[0] else None
+        g_points = _points_adjoint(packed, points, g) if ctx.needs_input_grad[1] else None
+        return g_planes, g_points
+
+
+def _packed(planes: Tensor) -> Tensor:
+    """``(B, 3, H, W, C')`` float32, C' the next multiple of 8; no copy where float32 planes lie in memory so."""
+    packed = planes.detach().permute(0, 1, 3, 4, 2)
+    packed = torch.nn.functional.pad(packed, (0, -planes.shape[2] % BLOCK)) if planes.shape[2] % BLOCK else packed
+    return packed.to(torch.float32).contiguous()
+
+
+def _points_adjoint(packed: Tensor, points: Tensor, g: Tensor) -> Tensor:
+    batch, n, _ = points.shape
+    _, _, height, width, channels = packed.shape
+    g_points = torch.empty_like(points)
+    launch(kernels.points_adjoint_kernel, batch * n, [
+        (packed.view(-1, BLOCK), kernels.vec8), (points.view(-1, 3), kernels.wp.vec3),
+        (g.view(-1, BLOCK), kernels.vec8),
+        n, height, width, channels // BLOCK, (g_points.view(-1, 3), kernels.wp.vec3)], points.device)  # fmt: skip
+    return g_points
+
+
+def _planes_adjoint(points: Tensor, g: Tensor, shape: torch.Size) -> Tensor:
+    batch, n, _ = points.shape
+    channels, height, width = shape[2:]
+    blocks = g.shape[-1] // BLOCK
+    slabs, device = batch * 3, points.device
+    flat = (points.view(-1, 3), kernels.wp.vec3)
+    rows = torch.empty(slabs, n, dtype=torch.int16, device=device)
+    launch(kernels.cell_row_kernel, slabs * n, [flat, n, height, width, (rows.view(-1), kernels.wp.int16)], device)
+    if device.type == "cpu":  # numpy sorts 16-bit keys by radix, ten times faster than torch.sort
+        order = torch.from_numpy(np.argsort(rows.numpy(), axis=1, kind="stable").astype(np.int32))
+    else:
+        order = torch.argsort(rows, dim=1, stable=True).to(torch.int32)
+    count = torch.zeros(slabs, height + 2, dtype=torch.int32, device=device)
+    count.scatter_add_(1, rows.long(), torch.ones((), dtype=torch.int32, device=device).expand(slabs, n))
+    edges = torch.nn.functional.pad(count[:, :-1].cumsum(1, dtype=torch.int32), (1, 0)).contiguous()
+    g_planes = torch.zeros(batch, 3, height, width, blocks * BLOCK, device=device)
+    for parity in (0, 1):
+        work = slabs * ((height + 2 - parity) // 2) * blocks
+        launch(kernels.planes_adjoint_kernel, work * REPEAT, [
+            flat, (g.view(-1, BLOCK), kernels.vec8), (order.view(-1), kernels.wp.int32),
+            (edges.view(-1), kernels.wp.int32), parity, REPEAT, n, height, width, blocks,
+            (g_planes.view(-1, BLOCK), kernels.vec8)], device)  # fmt: skip
+    return g_planes[..., :channels].permute(0, 1, 4, 2, 3)
+
+
+def sample_triplane(planes: Tensor, points: Tensor) -> Tensor:
+    """Features of ``points``, ``(B, N, 3 * C)`` float32: bilinear from the planes XY, XZ, YZ, concatenated in that
+    order.
+
+    planes: ``(B, 3, C, H, W)`` float32, or bfloat16 / float16 (summed in float32).  The first coordinate of a plane
+    runs along W, the second along H; [-1, 1] spans the outer texel borders (align_corners False); outside the planes
+    the texels are zero, so a point on the border sees half.  points: ``(B, N, 3)`` float32; NaN gives zeros.
+
+    Gradients reach ``planes`` (in their dtype) and ``points`` (one-sided at texel centres) and are the same bits for
+    any number of CPU threads.  Work in memory is channel-last: planes with those strides (``planes.movedim(2,
+    -1).contiguous() .movedim(-1, 2)``, C a multiple of 8, float32) are read in place, others are copied on every
+    call.
+
+    Raises TypeError on another dtype, ValueError on shapes that do not fit, mixed devices or sizes beyond 32-bit
+    indices.
+    """
+    if not isinstance(planes, Tensor):
+        raise TypeError(f"planes: expected a tensor, got {type(planes).__name__}")
+    if planes.dtype not in (torch.float32, torch.bfloat16, torch.float16):
+        raise TypeError(f"planes: expected float32, bfloat16 or float16, got {planes.dtype}")
+    if planes.ndim != 5 or planes.shape[1] != 3 or 0 in planes.shape[2:]:
+        raise ValueError(f"planes: expected shape (B, 3, C, H, W), got {tuple(planes.shape)}")
+    check("points", points, last=3, like=planes)
+    if points.ndim != 3 or points.shape[0] != planes.shape[0]:
+        raise ValueError(f"points: expected shape ({planes.shape[0]}, N, 3), got {tuple(points.shape)}")
+    batch, _, channels, height, width = planes.shape
+    if max(height, width) > 32000:
+        raise ValueError(f"planes: expected at most 32000 rows and columns, got {(height, width)}")  # int16
+    blocks = -(-channels // BLOCK)
+    largest = 3 * batch * max(height * width * blocks, (height + 2) * blocks * REPEAT, points.shape[1] * blocks)
+    if largest >= 2**31:
+        raise ValueError(f"planes, points: expected fewer than 2**31 blocks of 8 channels, got {largest}")
+    return _SampleTriplane.apply(planes, points)
