@@ -13,6 +13,7 @@ import contextlib
 import os
 import sys
 import tempfile
+import threading
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
@@ -44,20 +45,33 @@ _TORCH = {
 def initialise() -> None:
     """Start Warp once: quiet on stdout, and with a kernel cache that can be written."""
     wp.config.log_level = wp.LOG_WARNING
-    cache = wp.config.kernel_cache_dir or os.environ.get("WARP_CACHE_PATH")
     try:
         wp.init()
+        writable = os.access(wp.config.kernel_cache_dir, os.W_OK)
     except OSError:
-        fallback = os.path.join(tempfile.gettempdir(), f"reli3d-warp-{os.getuid() if hasattr(os, 'getuid') else 0}")
-        print(f"reli3d: kernel cache {cache or '~/.cache/warp'} cannot be written; using {fallback}", file=sys.stderr)
-        os.makedirs(fallback, exist_ok=True)
+        writable = False
+    if not writable:
+        fallback = _private_folder()
+        print(f"reli3d: kernel cache {wp.config.kernel_cache_dir} cannot be written; using {fallback}", file=sys.stderr)
         wp.config.kernel_cache_dir = fallback
         wp.init()
 
 
+def _private_folder() -> str:
+    """Folder for compiled kernels that no other user can have filled: the same one in the next process."""
+    user = os.getuid() if hasattr(os, "getuid") else 0
+    folder = os.path.join(tempfile.gettempdir(), f"reli3d-warp-{user}")
+    os.makedirs(folder, mode=0o700, exist_ok=True)
+    return folder if os.name == "nt" or os.lstat(folder).st_uid == user else tempfile.mkdtemp(prefix="reli3d-warp-")
+
+
 @lru_cache(1)
 def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(max_workers=max(1, torch.get_num_threads()), thread_name_prefix="reli3d")
+    return ThreadPoolExecutor(max_workers=max(1, torch.get_num_threads()), thread_name_prefix="reli3d-slice")
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_pool.cache_clear)  # a fork copies no threads: the child starts its own
 
 
 def slices(n: int) -> list[tuple[int, int]]:
@@ -70,7 +84,8 @@ def slices(n: int) -> list[tuple[int, int]]:
 def over_slices(n: int, work) -> list:
     """``[work(k, start, count), ...]`` for every slice of ``n``, on the thread pool where there is more than one."""
     parts = slices(n)
-    if len(parts) == 1 or torch.get_num_threads() == 1:
+    inside = threading.current_thread().name.startswith("reli3d-slice")  # waiting for its own pool would never end
+    if len(parts) == 1 or torch.get_num_threads() == 1 or inside:
         return [work(k, *part) for k, part in enumerate(parts)]
     return list(_pool().map(lambda item: work(item[0], *item[1]), enumerate(parts)))
 
@@ -150,7 +165,8 @@ class _KernelOp(torch.autograd.Function):
                 def adjoint(k, start, count):
                     own = [None if g is None else (g[min(k, g.shape[0] - 1)], d)
                            for g, d in zip(grads, types, strict=True)]  # fmt: skip
-                    adj_in = [view(*a) if isinstance(a, tuple) else None for a in _fill([None] * len(plain), own, plain)]
+                    own = _fill([None] * len(plain), own, plain)
+                    adj_in = [view(*a) if isinstance(a, tuple) else None for a in own]
                     wp.launch(kernel, count, [start, *values], out_values, adj_inputs=[None, *adj_in],
                               adj_outputs=adj_out, adjoint=True, device=name)  # fmt: skip
 
@@ -177,9 +193,9 @@ def _typed(tensors, outs):
 def call(kernel, n: int, ins: Sequence, outs: Sequence, *, device: torch.device, shared: Sequence[int] = ()):
     """Differentiable launch: new tensors ``outs = [(shape, warp type), ...]`` from ``kernel(start, *ins, *outs)``.
 
-    ``ins``: ``(tensor, warp type)`` pairs or plain values.  Gradients reach every floating-point tensor of ``ins`` that asks
-    for one, through the kernel's own adjoint (its module needs ``enable_backward``).  ``shared``: positions, counted among the
-    tensors, of inputs that more than one thread reads.
+    ``ins``: ``(tensor, warp type)`` pairs or plain values.  Gradients reach every floating-point tensor of ``ins`` that
+    asks for one, through the kernel's own adjoint (its module needs ``enable_backward``).  ``shared``: positions,
+    counted among the tensors, of inputs that more than one thread reads.
     """
     tensors = [a[0] for a in ins if isinstance(a, tuple)]
     types = [a[1] for a in ins if isinstance(a, tuple)]
