@@ -10,13 +10,15 @@ from reli3d._bridge import check, launch
 from reli3d.kernels import triplane as kernels
 
 BLOCK = 8  # channels of a kernels.vec8
+CACHED = 1 << 16  # floats of a plane that stay in a core's second-level cache whatever the order of the points
 REPEAT = 8  # threads a row of cells in the backward launch, which is sliced over the pool by its number of threads
 
 
 class _SampleTriplane(torch.autograd.Function):
     """Own backward: a scatter per point would need atomics, which Warp's CPU launches lack and CUDA does in any order.
 
-    Points are sorted by their row of cells instead, and one thread owns the rows of texels it adds to.
+    Points are sorted by their row of cells instead, and one thread owns the rows of texels it adds to.  On CPU the
+    forward pass walks the same order, as rows of a large plane stay in the cache.
     """
 
     @staticmethod
@@ -25,24 +27,28 @@ class _SampleTriplane(torch.autograd.Function):
         n = points.shape[1]
         packed, points = _packed(planes), points.contiguous()
         blocks = packed.shape[-1] // BLOCK
+        sort = ctx.needs_input_grad[0] or (not planes.is_cuda and packed[0, 0].numel() > CACHED)
+        order, edges = _by_cell_row(points, height, width) if sort else (points.new_empty(0, dtype=torch.int32), None)
         features = packed.new_empty(batch, n, 3, blocks * BLOCK)
         split = blocks if planes.is_cuda else 1  # neighbouring GPU threads read neighbouring blocks
         launch(kernels.sample_kernel, batch * n * 3 * split, [
-            (packed.view(-1, BLOCK), kernels.vec8), (points.view(-1, 3), kernels.wp.vec3), n, height, width, blocks,
-            split, (features.view(-1, BLOCK), kernels.vec8)], planes.device)  # fmt: skip
-        ctx.save_for_backward(points, packed if ctx.needs_input_grad[1] else None)
+            (packed.view(-1, BLOCK), kernels.vec8), (points.view(-1, 3), kernels.wp.vec3),
+            (order.view(-1), kernels.wp.int32), n, height, width, blocks, split,
+            (features.view(-1, BLOCK), kernels.vec8)], planes.device)  # fmt: skip
+        sorted_points = (order, edges) if ctx.needs_input_grad[0] else (None, None)
+        ctx.save_for_backward(points, packed if ctx.needs_input_grad[1] else None, *sorted_points)
         ctx.shape, ctx.dtype = planes.shape, planes.dtype
         return features[..., :channels].reshape(batch, n, 3 * channels)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, g_out: Tensor):
-        points, packed = ctx.saved_tensors
+        points, packed, order, edges = ctx.saved_tensors
         channels = ctx.shape[2]
         g = g_out.reshape(*points.shape[:2], 3, channels)
-        g = torch.nn.functional.pad(g, (0, -channels % BLOCK)).contiguous()
-        g_planes = _planes_adjoint(points, g, ctx.shape).to(ctx.dtype) if ctx.needs_input_grad[0] else None
-        g_points = _points_adjoint(packed, points, g) if ctx.needs_input_grad[1] else None
+        g = torch.nn.functional.pad(g, (0, -channels % BLOCK)).contiguous() if channels % BLOCK else g.contiguous()
+        g_planes = _planes_adjoint(points, g, order, edges, ctx.shape).to(ctx.dtype) if order is not None else None
+        g_points = _points_adjoint(packed, points, g) if packed is not None else None
         return g_planes, g_points
 
 
@@ -53,39 +59,45 @@ def _packed(planes: Tensor) -> Tensor:
     return packed.to(torch.float32).contiguous()
 
 
+def _by_cell_row(points: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
+    """Points of every plane by row of cells, ``(3 * B, N)`` int32, stable, and the start of every row and their end,
+    ``(3 * B, height + 2)``; points that miss the plane come last."""
+    slabs, n = points.shape[0] * 3, points.shape[1]
+    rows = torch.empty(slabs, n, dtype=torch.int16, device=points.device)
+    launch(kernels.cell_row_kernel, slabs * n, [(points.view(-1, 3), kernels.wp.vec3), n, height, width,
+                                                (rows.view(-1), kernels.wp.int16)], points.device)  # fmt: skip
+    if points.is_cuda:
+        order = torch.argsort(rows, dim=1, stable=True).to(torch.int32)
+    else:  # numpy sorts 16-bit keys by radix, ten times faster than torch.sort
+        order = torch.from_numpy(np.argsort(rows.numpy(), axis=1, kind="stable").astype(np.int32))
+    bins = torch.arange(slabs, device=points.device)[:, None] * (height + 2) + rows
+    count = torch.bincount(bins.view(-1), minlength=slabs * (height + 2)).view(slabs, height + 2)
+    edges = torch.nn.functional.pad(count[:, :-1].cumsum(1), (1, 0)).to(torch.int32)
+    return order, edges
+
+
 def _points_adjoint(packed: Tensor, points: Tensor, g: Tensor) -> Tensor:
     batch, n, _ = points.shape
     _, _, height, width, channels = packed.shape
     g_points = torch.empty_like(points)
     launch(kernels.points_adjoint_kernel, batch * n, [
         (packed.view(-1, BLOCK), kernels.vec8), (points.view(-1, 3), kernels.wp.vec3),
-        (g.view(-1, BLOCK), kernels.vec8),
-        n, height, width, channels // BLOCK, (g_points.view(-1, 3), kernels.wp.vec3)], points.device)  # fmt: skip
+        (g.view(-1, BLOCK), kernels.vec8), n, height, width, channels // BLOCK,
+        (g_points.view(-1, 3), kernels.wp.vec3)], points.device)  # fmt: skip
     return g_points
 
 
-def _planes_adjoint(points: Tensor, g: Tensor, shape: torch.Size) -> Tensor:
+def _planes_adjoint(points: Tensor, g: Tensor, order: Tensor, edges: Tensor, shape: torch.Size) -> Tensor:
     batch, n, _ = points.shape
     channels, height, width = shape[2:]
     blocks = g.shape[-1] // BLOCK
-    slabs, device = batch * 3, points.device
-    flat = (points.view(-1, 3), kernels.wp.vec3)
-    rows = torch.empty(slabs, n, dtype=torch.int16, device=device)
-    launch(kernels.cell_row_kernel, slabs * n, [flat, n, height, width, (rows.view(-1), kernels.wp.int16)], device)
-    if device.type == "cpu":  # numpy sorts 16-bit keys by radix, ten times faster than torch.sort
-        order = torch.from_numpy(np.argsort(rows.numpy(), axis=1, kind="stable").astype(np.int32))
-    else:
-        order = torch.argsort(rows, dim=1, stable=True).to(torch.int32)
-    count = torch.zeros(slabs, height + 2, dtype=torch.int32, device=device)
-    count.scatter_add_(1, rows.long(), torch.ones((), dtype=torch.int32, device=device).expand(slabs, n))
-    edges = torch.nn.functional.pad(count[:, :-1].cumsum(1, dtype=torch.int32), (1, 0)).contiguous()
-    g_planes = torch.zeros(batch, 3, height, width, blocks * BLOCK, device=device)
+    g_planes = torch.zeros(batch, 3, height, width, blocks * BLOCK, device=points.device)
     for parity in (0, 1):
-        work = slabs * ((height + 2 - parity) // 2) * blocks
+        work = batch * 3 * ((height + 2 - parity) // 2) * blocks
         launch(kernels.planes_adjoint_kernel, work * REPEAT, [
-            flat, (g.view(-1, BLOCK), kernels.vec8), (order.view(-1), kernels.wp.int32),
-            (edges.view(-1), kernels.wp.int32), parity, REPEAT, n, height, width, blocks,
-            (g_planes.view(-1, BLOCK), kernels.vec8)], device)  # fmt: skip
+            (points.view(-1, 3), kernels.wp.vec3), (g.view(-1, BLOCK), kernels.vec8),
+            (order.view(-1), kernels.wp.int32), (edges.view(-1), kernels.wp.int32), parity, REPEAT, n, height, width,
+            blocks, (g_planes.view(-1, BLOCK), kernels.vec8)], points.device)  # fmt: skip
     return g_planes[..., :channels].permute(0, 1, 4, 2, 3)
 
 

@@ -44,18 +44,23 @@ def texel(planes: wp.array[vec8], base: int, x: int, y: int, height: int, width:
 def sample_kernel(
     start: int,
     # in
-    planes: wp.array[vec8], points: wp.array[wp.vec3], per_batch: int, height: int, width: int, blocks: int, split: int,
+    planes: wp.array[vec8], points: wp.array[wp.vec3], order: wp.array[wp.int32],
+    per_batch: int, height: int, width: int, blocks: int, split: int,
     # out
     features: wp.array[vec8],
 ):  # fmt: skip
-    """A thread is a point, a plane and every ``split``-th block."""
+    """A thread is a plane, a point and every ``split``-th block; points come by ``order`` if that has entries."""
     i = start + wp.tid()
-    row = i // split  # point * 3 + plane
-    point = row // 3
-    plane = row % 3
-    at = texel_position(points[point], plane, height, width)
     first = i % split
-    out = row * blocks
+    i = i // split
+    slab = i // per_batch  # batch * 3 + plane
+    plane = slab % 3
+    point = i % per_batch
+    if order.shape[0] > 0:
+        point = order[i]
+    point += (slab // 3) * per_batch
+    at = texel_position(points[point], plane, height, width)
+    out = (point * 3 + plane) * blocks
     if touches(at, height, width):
         x = int(wp.floor(at[0]))
         y = int(wp.floor(at[1]))
@@ -65,7 +70,7 @@ def sample_kernel(
         w01 = u * (1.0 - v)
         w10 = (1.0 - u) * v
         w11 = u * v
-        base = ((point // per_batch) * 3 + plane) * height * width * blocks
+        base = slab * height * width * blocks
         if x >= 0 and y >= 0 and x + 1 < width and y + 1 < height:
             top = base + (y * width + x) * blocks
             bottom = top + width * blocks
