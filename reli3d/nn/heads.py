@@ -1,0 +1,135 @@
+"""What a point of the triplane is: small independent MLPs on its features, and the merging of FlexiCubes weights.
+
+Sizes are the published ones; names are spelt as Python names, :mod:`reli3d.nn.weights` has the table.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+ROUGHNESS_MIN = 0.1  # range [0.1, 1] of the published head
+NORMALIZE_EPS = 1.0e-7
+WEIGHT_SCALE = 0.5  # of the FlexiCubes weights: how far alpha and beta may leave 1
+MERGED_MULTIPLIER = 0.1  # on the merging MLP's output: starts the weights near neutral
+DEFORMATION_LIMIT = 1.0 - 1.0e-8  # of half a cell, so that two grid vertices never meet
+
+
+@dataclass(frozen=True)
+class Head:
+    outputs: int
+    hidden: int  # hidden layers
+
+
+HEADS = {
+    "density": Head(1, 2),
+    "base_color": Head(3, 3),
+    "normal": Head(3, 3),
+    "deformation": Head(3, 2),
+    "roughness": Head(1, 2),
+    "metallic": Head(1, 2),
+    "flexicubes": Head(16, 1),
+}
+CORNERS = 8
+MERGED = 21  # 12 edges, 8 corners, 1 cube
+
+
+def mlp(inputs: int, width: int, outputs: int, hidden: int) -> nn.Sequential:
+    """Linear layers with SiLU between them, ``hidden`` of them ``width`` wide."""
+    widths = [inputs, *[width] * hidden, outputs]
+    layers: list[nn.Module] = []
+    for a, b in zip(widths[:-1], widths[1:], strict=True):
+        layers += [nn.Linear(a, b), nn.SiLU()]
+    return nn.Sequential(*layers[:-1])
+
+
+def activate(name: str, raw: Tensor) -> Tensor:
+    """The named head's value from its MLP's output.
+
+    ``density``, ``deformation``, ``flexicubes``: as they are.  ``base_color`` (sRGB-encoded), ``metallic``: [0, 1].
+    ``roughness``: [0.1, 1].  ``normal``: unit, around +z of the surface's frame.
+    """
+    if name in ("base_color", "metallic"):
+        return raw.sigmoid()
+    if name == "roughness":
+        return ROUGHNESS_MIN + (1.0 - ROUGHNESS_MIN) * raw.sigmoid()
+    if name == "normal":
+        return functional.normalize(raw + raw.new_tensor((0.0, 0.0, 1.0)), dim=-1, eps=NORMALIZE_EPS)
+    return raw
+
+
+class Heads(nn.ModuleDict):
+    """One MLP a head, on the same features."""
+
+    def __init__(self, features: int, width: int):
+        super().__init__({name: mlp(features, width, head.outputs, head.hidden) for name, head in HEADS.items()})
+
+    def forward(self, features: Tensor, names: Sequence[str]) -> dict[str, Tensor]:
+        """``{name: (..., outputs)}`` of features ``(..., features)``; values as :func:`activate` describes them."""
+        for name in names:
+            if name not in self:
+                raise ValueError(f"heads: expected some of {', '.join(self)}, got {name}")
+        return {name: activate(name, self[name](features)) for name in names}
+
+
+class _TruncatedExp(torch.autograd.Function):
+    """exp whose slope stops growing at exp(15), so that one point far inside cannot drown the batch."""
+
+    @staticmethod
+    def forward(ctx, x: Tensor) -> Tensor:
+        ctx.save_for_backward(x)
+        return x.exp()
+
+    @staticmethod
+    def backward(ctx, grad: Tensor) -> Tensor:
+        (x,) = ctx.saved_tensors
+        return grad * x.clamp(max=15.0).exp()
+
+
+def truncated_exp(x: Tensor) -> Tensor:
+    """exp(x), with exp(min(x, 15)) as its derivative."""
+    return _TruncatedExp.apply(x)
+
+
+@dataclass(frozen=True)
+class CubeWeights:
+    """FlexiCubes weights of cubes (Shen et al. 2023, arXiv 2308.05371): beta in (0.5, 1.5), alpha likewise, gamma in
+    (0.25, 0.75)."""
+
+    beta: Tensor  # (..., 12) of the edges
+    alpha: Tensor  # (..., 8) of the corners
+    gamma: Tensor  # (...) of the cube
+
+
+class WeightMerger(nn.Module):
+    """The eight corners' vectors of a cube to its FlexiCubes weights."""
+
+    def __init__(self, width: int):
+        super().__init__()
+        self.mlp = mlp(CORNERS * HEADS["flexicubes"].outputs, width, MERGED, 2)
+
+    def merged(self, corners: Tensor) -> Tensor:
+        """``(..., 8, 16)`` to the 21 numbers of each cube before their activation.
+
+        Corner k lies at x = k & 1, y = k >> 1 & 1, z = k >> 2 of the cube.
+        """
+        return MERGED_MULTIPLIER * self.mlp(corners.flatten(-2))
+
+    def forward(self, corners: Tensor) -> CubeWeights:
+        """Weights of cubes whose corners have the ``flexicubes`` head's values ``(..., 8, 16)``."""
+        beta, alpha, gamma = self.merged(corners).split((12, 8, 1), dim=-1)
+        return CubeWeights(
+            1.0 + WEIGHT_SCALE * beta.tanh(),
+            1.0 + WEIGHT_SCALE * alpha.tanh(),
+            (0.25 + WEIGHT_SCALE * gamma.sigmoid()).squeeze(-1),
+        )
+
+
+def deformation(raw: Tensor, resolution: int) -> Tensor:
+    """Displacement of grid vertices, from the head's values: less than half a cell of a unit cube of ``resolution``
+    cells a side."""
+    return raw.tanh() * (DEFORMATION_LIMIT / (2 * resolution))

@@ -1,0 +1,114 @@
+"""The illumination path: what the views and the triplane say about the light, as RENI++ latents.
+
+The views are tokenized a second time together with their masks, so that hidden background (mask 0) differs from
+black; a bank of learned tokens reads them and the triplane.  Parameter names are the published checkpoint's.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from reli3d.nn.presets import IlluminationSizes
+from reli3d.nn.reni import rotation_from_6d
+from reli3d.nn.tokenizers import ImageTokenizer
+from reli3d.nn.transformer import GROUP_NORM_EPS, FeedForward, attention
+
+STRENGTH_BIAS = 1.0  # natural logarithm of the radiance factor where the network says nothing
+
+
+class _CrossAttention(nn.Module):
+    def __init__(self, width: int, context: int, heads: int):
+        super().__init__()
+        self.heads = heads
+        self.to_q = nn.Linear(width, width, bias=False)
+        self.to_k, self.to_v = (nn.Linear(context, width, bias=False) for _ in range(2))
+        self.to_out = nn.Sequential(nn.Linear(width, width))
+
+    def forward(self, x: Tensor, context: Tensor) -> Tensor:
+        return self.to_out(attention(self.to_q(x), self.to_k(context), self.to_v(context), self.heads))
+
+
+class _Block(nn.Module):
+    def __init__(self, width: int, context: int, heads: int):
+        super().__init__()
+        self.norm1, self.norm2, self.norm3 = (nn.LayerNorm(width) for _ in range(3))
+        self.attn1 = _CrossAttention(width, width, heads)
+        self.attn2 = _CrossAttention(width, context, heads)
+        self.ff = FeedForward(width)
+
+    def forward(self, x: Tensor, context: Tensor) -> Tensor:
+        h = self.norm1(x)
+        x = x + self.attn1(h, h)
+        x = x + self.attn2(self.norm2(x), context)
+        return x + self.ff(self.norm3(x))
+
+
+class Transformer1D(nn.Module):
+    """Tokens that read each other and a context; the outer residual is the input before its GroupNorm."""
+
+    def __init__(self, sizes: IlluminationSizes):
+        super().__init__()
+        self.norm = nn.GroupNorm(sizes.groups, sizes.token_width, eps=GROUP_NORM_EPS)
+        self.proj_in = nn.Linear(sizes.token_width, sizes.width)
+        self.transformer_blocks = nn.ModuleList(
+            _Block(sizes.width, sizes.encoder.hidden, sizes.heads) for _ in range(sizes.layers)
+        )
+        self.proj_out = nn.Linear(sizes.width, sizes.token_width)
+
+    def forward(self, tokens: Tensor, context: Tensor) -> Tensor:
+        """tokens: ``(B, C, N)``, channels before tokens.  context: ``(B, M, K)``.  Returns ``(B, C, N)``."""
+        x = self.proj_in(self.norm(tokens).transpose(1, 2))
+        for block in self.transformer_blocks:
+            x = block(x, context)
+        return self.proj_out(x).transpose(1, 2) + tokens
+
+
+class _TokenBank(nn.Module):
+    def __init__(self, tokens: int, width: int):
+        super().__init__()
+        self.embeddings = nn.Parameter(torch.zeros(tokens, width))
+
+
+class _PlaneTokens(nn.Module):
+    def __init__(self, inputs: int, outputs: int):
+        super().__init__()
+        self.output_projection = nn.Linear(inputs, outputs)
+
+    def forward(self, planes: Tensor) -> Tensor:
+        """``(B, 3, C, S, S)`` to ``(B, 3*S*S, outputs)``, plane by plane and row by row."""
+        return self.output_projection(planes.movedim(2, -1).flatten(1, 3))
+
+
+class Illumination(nn.Module):
+    """RENI++ latents, rotation and strength of the views."""
+
+    def __init__(self, sizes: IlluminationSizes, latents: int, camera_width: int, plane_width: int):
+        super().__init__()
+        self.latents = latents
+        self.encoder = ImageTokenizer(sizes.encoder, camera_width)
+        self.bank = _TokenBank(sizes.tokens, sizes.token_width)
+        self.plane_tokens = _PlaneTokens(plane_width, sizes.encoder.hidden)
+        self.transformer = Transformer1D(sizes)
+
+    def forward(self, images: Tensor, extra: Tensor | None, camera: Tensor, planes: Tensor) -> tuple[Tensor, ...]:
+        """Latents ``(B, L, 3)``, rotation ``(B, 3, 3)``, strength ``(B,)``, float32.
+
+        images: ``(B, V, S, S, 3)`` sRGB, hidden background black.  extra: ``(B, V, K, S, S)``, the mask (all ones where
+        the background is shown) and ray maps as the preset says.  camera: ``(B, V, W)``.
+        planes: ``(B, 3, C, P, P)`` before upsampling.
+        """
+        views = self.encoder(images, camera, extra).flatten(1, 2)
+        context = torch.cat([views, self.plane_tokens(planes)], dim=1)
+        tokens = self.bank.embeddings.t().expand(len(images), -1, -1)
+        return unpack(self.transformer(tokens, context).float(), self.latents)
+
+
+def unpack(tokens: Tensor, latents: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Latents ``(B, L, 3)``, rotation ``(B, 3, 3)`` and strength ``(B,)`` from the first numbers of ``(B, C, N)``.
+
+    The numbers are read channel by channel, as published: with 78 tokens and 49 latents that is channel 0 and most of
+    channel 1; the others are not used.
+    """
+    latent, strength, rotation = tokens.flatten(1)[:, : 3 * latents + 7].split((3 * latents, 1, 6), dim=1)
+    return latent.unflatten(1, (latents, 3)), rotation_from_6d(rotation), strength.squeeze(1) + STRENGTH_BIAS

@@ -1,0 +1,177 @@
+"""The network as one module: views in; a triplane that can be queried at points and an environment out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor, nn
+
+from reli3d.nn.camera import CameraEmbedder, ray_maps
+from reli3d.nn.heads import HEADS, Heads, WeightMerger, truncated_exp
+from reli3d.nn.illumination import Illumination
+from reli3d.nn.initialise import initialise
+from reli3d.nn.presets import Preset
+from reli3d.nn.reni import EnvironmentDecoder, reni_frame
+from reli3d.nn.tokenizers import ImageTokenizer, TriplaneBank, patch_grid
+from reli3d.nn.transformer import TwoStreamTransformer
+from reli3d.nn.upsample import PixelShuffleUpsampler
+from reli3d.triplane import sample_triplane
+
+BACKGROUND = 0.5  # grey behind the object in the object encoder's images, sRGB
+
+
+@dataclass(frozen=True)
+class Code:
+    """What the network knows about B objects."""
+
+    triplane: Tensor  # (B, 3, C, H, W) float32; planes XY, XZ, YZ, the first coordinate along W
+    view_tokens: Tensor  # (B, V, P, P, D) the encoder's patch tokens, in the trunk's dtype
+    latent: Tensor  # (B, L, 3) RENI++ latents
+    rotation: Tensor  # (B, 3, 3) turns the latents
+    strength: Tensor  # (B,) natural logarithm of the radiance factor
+
+    def of(self, b: int) -> Code:
+        """Object ``b`` alone, as a batch of one."""
+        return Code(*(getattr(self, field.name)[b : b + 1] for field in fields(self)))
+
+
+class ToneMappingConstants(nn.Module):
+    """Identity colour decision list: the published checkpoint stores it, and it has no effect there either."""
+
+    def __init__(self):
+        super().__init__()
+        self.register_buffer("cdl_slope", torch.ones(3))
+        self.register_buffer("cdl_offset", torch.zeros(3))
+        self.register_buffer("cdl_power", torch.ones(3))
+        self.register_buffer("cdl_saturation", torch.ones(()))
+
+
+class Reconstructor(nn.Module):
+    """The ReLi3D network with the sizes of ``preset``, its parameters ready for training from scratch.
+
+    Built under ``torch.device("meta")`` it allocates nothing.  The trunk computes in its parameters' dtype (see
+    :meth:`to_compute`); heads, environment decoder and every output are float32.
+    """
+
+    def __init__(self, preset: Preset):
+        super().__init__()
+        self.preset = preset
+        width = preset.encoder.hidden
+        self.camera = CameraEmbedder(preset.camera_width)
+        self.encoder = ImageTokenizer(preset.encoder, preset.camera_width)
+        self.bank = TriplaneBank(width, preset.plane_size)
+        self.backbone = TwoStreamTransformer(preset.backbone, width)
+        self.upsampler = PixelShuffleUpsampler(preset.upsampler, width)
+        self.illumination = Illumination(preset.illumination, preset.reni.latents, preset.camera_width, width)
+        self.environment = EnvironmentDecoder(preset.reni)
+        self.heads = Heads(3 * preset.upsampler.channels + preset.view_feature_width, preset.head_width)
+        self.merger = WeightMerger(preset.head_width)
+        if preset.tone_mapping:
+            self.tone_mapping = ToneMappingConstants()
+        initialise(self)
+
+    def to_compute(self, dtype: torch.dtype) -> Reconstructor:
+        """Cast the trunk (encoders, transformers, upsampler) to ``dtype``, in place; the rest stays float32."""
+        for part in self.trunk():
+            part.to(dtype)
+        return self
+
+    def trunk(self) -> Iterator[nn.Module]:
+        yield from (self.encoder, self.bank, self.backbone, self.upsampler, self.illumination)
+
+    def encode(self, images: Tensor, masks: Tensor, c2w: Tensor, intrinsics: Tensor, *,
+               background_visible: Tensor | None = None) -> Code:  # fmt: skip
+        """Read posed views of B objects, each in the model's frame; the first view is the hero.
+
+        images: ``(B, V, S, S, 3)`` sRGB in [0, 1], straight (not multiplied by the mask), S the preset's image size.
+        masks: ``(B, V, S, S)`` in [0, 1].  c2w: ``(B, V, 4, 4)`` OpenGL axes.  intrinsics: ``(B, V, 4)`` fx, fy, cx, cy
+        in pixels of the S by S image.  background_visible: ``(B,)`` bool, whether the illumination path may look at the
+        background of an object's views; default none may, as published.
+
+        Gradients reach every parameter on the way and the inputs.  Raises TypeError unless float32, ValueError on
+        shapes that do not belong together and on another device than the parameters'.
+        """
+        check_views(images, masks, c2w, intrinsics, self.preset.image_size, self.camera.linear.weight.device)
+        camera = self.camera(c2w, intrinsics, images.shape[2])
+        dtype = self.bank.embeddings.dtype
+        sizes, light = self.preset.encoder, self.preset.illumination.encoder
+        rays = None
+        if sizes.ray_maps or light.ray_maps:
+            rays = ray_maps(c2w, intrinsics, images.shape[2]).to(dtype)
+
+        def extra(encoder, mask):
+            parts = [mask.unsqueeze(2).to(dtype)] if encoder.mask_channel else []
+            parts += [rays] if encoder.ray_maps else []
+            return torch.cat(parts, dim=2) if parts else None
+
+        composite = torch.lerp(torch.full_like(images, BACKGROUND), images, masks.unsqueeze(-1))
+        tokens = self.encoder(composite, camera, extra(sizes, masks))
+        planes = self.bank.planes(self.backbone(self.bank.tokens(), tokens))
+        shown = masks
+        if background_visible is not None:
+            shown = torch.where(background_visible[:, None, None, None], torch.ones_like(masks), masks)
+        lit = images * shown.unsqueeze(-1)
+        latent, rotation, strength = self.illumination(lit, extra(light, shown), camera, planes)
+        triplane = self.upsampler(planes).float()
+        return Code(triplane, patch_grid(tokens), latent, rotation, strength)
+
+    def decode_environment(self, code: Code, height: int | None = None) -> Tensor:
+        """Linear radiance ``(B, H, 2H, 3)``, row 0 is +Y, the centre column -Z; default height the preset's."""
+        return self.environment(code.latent, code.rotation, code.strength, height)
+
+    def radiance(self, code: Code, directions: Tensor) -> Tensor:
+        """Linear radiance ``(B, N, 3)`` from world directions ``(B or 1, N, 3)``, unit, y up.
+
+        Gradients reach the latents, the rotation, the strength, the decoder and the directions.
+        """
+        return self.environment.radiance(code.latent, code.rotation, code.strength, reni_frame(directions))
+
+    def query(self, code: Code, points: Tensor, heads: Sequence[str] = tuple(HEADS),
+              view_features: Tensor | None = None) -> dict[str, Tensor]:  # fmt: skip
+        """Values of the named heads at points of the model's cube, ``{name: (B, N, outputs)}``, float32.
+
+        points: ``(B, N, 3)``, inside plus or minus the preset's radius; features fade to zero outside.
+        view_features: ``(B, N, K)`` where the preset has ``view_feature_width`` K, else None.
+        ``density`` is the raw value, see :meth:`level`; ``base_color`` is sRGB-encoded; ``roughness`` is perceptual;
+        ``normal`` is unit in the frame of :mod:`reli3d.geometry.bake`; ``deformation`` and ``flexicubes`` are raw, see
+        :mod:`reli3d.nn.heads`.  Gradients reach the triplane, the points, the view features and the heads.
+        """
+        width = 0 if view_features is None else view_features.shape[-1]
+        if width != self.preset.view_feature_width:
+            raise ValueError(f"view_features: expected (B, N, {self.preset.view_feature_width}), got width {width}")
+        with torch.autocast(points.device.type, enabled=False):
+            features = sample_triplane(code.triplane, points / self.preset.radius)
+            if view_features is not None:
+                features = torch.cat([features, view_features.float()], dim=-1)
+            values = self.heads(features, heads)
+            if self.preset.roughness_is_alpha and "roughness" in values:
+                values["roughness"] = values["roughness"].sqrt()
+        return values
+
+    def level(self, density: Tensor) -> Tensor:
+        """Surface level of the ``density`` head's raw values: negative inside, zero on the surface."""
+        return self.preset.density_threshold - truncated_exp(density + self.preset.density_bias)
+
+    @property
+    def surface_density(self) -> float:
+        """Raw density on the surface: :meth:`level` is zero there."""
+        return math.log(self.preset.density_threshold) - self.preset.density_bias
+
+
+def check_views(images: Tensor, masks: Tensor, c2w: Tensor, intrinsics: Tensor, size: int,
+                device: torch.device) -> None:  # fmt: skip
+    """Raise TypeError or ValueError, ``name: expected X, got Y``, where the inputs are not what ``encode`` asks for."""
+    tails = {"images": (size, size, 3), "masks": (size, size), "c2w": (4, 4), "intrinsics": (4,)}
+    lead = images.shape[:2]
+    for (name, tail), value in zip(tails.items(), (images, masks, c2w, intrinsics), strict=True):
+        if value.dtype != torch.float32:
+            raise TypeError(f"{name}: expected torch.float32, got {value.dtype}")
+        if value.shape[2:] != tail or value.shape[:2] != lead or 0 in value.shape:
+            lead = tuple(lead) if name != "images" and len(lead) == 2 else ("B", "V")
+            expected = ", ".join(map(str, (*lead, *tail)))
+            raise ValueError(f"{name}: expected shape ({expected}), got {tuple(value.shape)}")
+        if value.device != device:
+            raise ValueError(f"{name}: expected device {device}, got {value.device}")

@@ -1,0 +1,163 @@
+"""Sizes and switches of the network: two presets of one code path, as plain numbers.
+
+``official`` has the sizes of the published checkpoint (1.574 billion parameters).  ``small`` is the embedded default:
+the same modules, fewer numbers, and aids that let a small network learn geometry from little data (ray maps, image
+features sampled at the query points).  Where the paper and its release differ the release is followed, so that its
+weights load.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import typing
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class EncoderSizes:
+    """An image tokenizer of the DINOv2 form whose norms are modulated by the camera."""
+
+    hidden: int
+    layers: int
+    heads: int
+    patch: int  # pixels; a remainder of image size / patch is cut off at the right and below
+    grid: int  # side of the stored position grid; resampled for another number of patches
+    mask_channel: bool  # the mask as input channel after RGB
+    ray_maps: bool  # Pluecker coordinates of every pixel's ray as 6 more input channels
+
+    @property
+    def channels(self) -> int:
+        return 3 + int(self.mask_channel) + 6 * int(self.ray_maps)
+
+
+@dataclass(frozen=True)
+class BackboneSizes:
+    """The two-stream transformer; its width is also the width of encoder and triplane bank."""
+
+    heads: int
+    latents: int  # learned latent tokens, beside the hero view's own
+    blocks: int
+    basic_blocks: int  # in each block
+    experts: int  # 0: none
+    experts_from: int  # first block, from 0, whose basic blocks mix experts
+    groups: int  # of the GroupNorm over the triplane bank
+
+
+@dataclass(frozen=True)
+class UpsamplerSizes:
+    convolutions: int
+    scale: int
+    channels: int  # of the triplane that is sampled
+
+
+@dataclass(frozen=True)
+class IlluminationSizes:
+    encoder: EncoderSizes
+    tokens: int  # tokens * token_width numbers come out, of which latents*3 + 1 + 6 are read
+    token_width: int
+    width: int
+    heads: int
+    layers: int
+    groups: int
+
+
+@dataclass(frozen=True)
+class ReniSizes:
+    """The RENI++ decoder; 49 latent vectors, 128 wide, 6 layers are the published file's sizes."""
+
+    latents: int
+    width: int
+    layers: int
+    heads: int
+    height: int  # rows of the map that the network itself decodes
+
+
+@dataclass(frozen=True)
+class Preset:
+    name: str
+    image_size: int  # square network input, pixels
+    camera_width: int  # of the camera embedding
+    encoder: EncoderSizes
+    plane_size: int  # side of the triplane of tokens
+    backbone: BackboneSizes
+    upsampler: UpsamplerSizes
+    head_width: int
+    view_feature_width: int  # features a caller adds to the triplane's at each query point; 0: none
+    illumination: IlluminationSizes
+    reni: ReniSizes
+    resolution: int  # cubes along each side of the surface grid
+    radius: float = 0.87  # half side of the model's cube
+    density_threshold: float = 10.0  # the surface is where exp(raw + density_bias) has this value
+    density_bias: float = -1.0
+    roughness_is_alpha: bool = False  # the roughness head predicts the GGX width; query() returns its square root
+    tone_mapping: bool = False  # carry the published tone-mapping constants, which nothing here reads
+
+    def to_json(self) -> str:
+        return json.dumps(dataclasses.asdict(self), sort_keys=True)
+
+    @classmethod
+    def from_json(cls, text: str) -> Preset:
+        """The preset that :meth:`to_json` wrote.  Raises ValueError for anything else."""
+        try:
+            return _build(cls, json.loads(text))
+        except (json.JSONDecodeError, AttributeError, KeyError, TypeError) as error:
+            raise ValueError(f"preset: expected the JSON of a Preset, got {error}") from None
+
+
+def _build(kind, values: dict):
+    """``kind(**values)``, nested dataclasses from nested dictionaries; TypeError for a value of another type."""
+    fields = typing.get_type_hints(kind)
+    built = {}
+    for key, value in values.items():
+        expected = fields[key]
+        if dataclasses.is_dataclass(expected):
+            built[key] = _build(expected, value)
+        elif isinstance(value, bool) == (expected is bool) and isinstance(value, expected):
+            built[key] = value
+        else:
+            raise TypeError(f"{key} = {value!r}")
+    return kind(**built)
+
+
+OFFICIAL = Preset(
+    name="official",
+    image_size=512,
+    camera_width=1024,
+    encoder=EncoderSizes(hidden=1024, layers=24, heads=16, patch=14, grid=37, mask_channel=False, ray_maps=False),
+    plane_size=96,
+    backbone=BackboneSizes(
+        heads=16, latents=1792, blocks=4, basic_blocks=3, experts=8, experts_from=2, groups=32
+    ),
+    upsampler=UpsamplerSizes(convolutions=4, scale=4, channels=40),
+    head_width=64,
+    view_feature_width=0,
+    illumination=IlluminationSizes(
+        encoder=EncoderSizes(hidden=384, layers=12, heads=6, patch=14, grid=37, mask_channel=True, ray_maps=False),
+        tokens=78, token_width=256, width=1024, heads=16, layers=4, groups=16,
+    ),
+    reni=ReniSizes(latents=49, width=128, layers=6, heads=8, height=64),
+    resolution=80,
+    roughness_is_alpha=True,
+    tone_mapping=True,
+)  # fmt: skip
+
+SMALL = Preset(
+    name="small",
+    image_size=192,
+    camera_width=256,
+    encoder=EncoderSizes(hidden=256, layers=4, heads=8, patch=16, grid=12, mask_channel=True, ray_maps=True),
+    plane_size=16,
+    backbone=BackboneSizes(heads=8, latents=256, blocks=2, basic_blocks=2, experts=0, experts_from=0, groups=16),
+    upsampler=UpsamplerSizes(convolutions=2, scale=4, channels=24),
+    head_width=64,
+    view_feature_width=0,
+    illumination=IlluminationSizes(
+        encoder=EncoderSizes(hidden=128, layers=3, heads=4, patch=16, grid=12, mask_channel=True, ray_maps=True),
+        tokens=78, token_width=64, width=256, heads=8, layers=2, groups=16,
+    ),
+    reni=ReniSizes(latents=49, width=128, layers=6, heads=8, height=64),
+    resolution=64,
+)  # fmt: skip
+
+PRESETS = {preset.name: preset for preset in (SMALL, OFFICIAL)}

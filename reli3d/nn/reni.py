@@ -1,0 +1,212 @@
+"""RENI++: a decoder of natural illumination, equivariant to turns about the vertical axis.
+
+Source: Gardner, Egger and Smith 2023, "RENI++", arXiv 2311.09361, in the form and with the parameter names of the file
+published with ReLi3D.  An environment is a set of latent 3-vectors; turning them about the vertical turns the map.  The
+decoder works in a z-up frame, D = (z, x, y) of the y-up world direction (x, y, z).  All of it runs in float32.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from reli3d.nn.heads import truncated_exp
+from reli3d.nn.presets import ReniSizes
+
+FREQUENCIES = (1.0, 4.0)  # of the positional encoding, without a factor of pi
+VN_EPS = 1.0e-6  # floor of the published vector-neuron ReLU
+NORM2_MIN = 1.0e-20  # squared length: keeps the slope of the square root finite at a zero latent
+
+
+def map_directions(height: int, device: torch.device | str = "cpu") -> Tensor:
+    """Unit world directions of the pixel centres of a lat-long map, ``(height, 2*height, 3)``.
+
+    Row 0 is +Y; the centre column looks along -Z, the one right of it towards +X.
+    """
+    theta = 2.0 * math.pi * (torch.arange(2 * height, dtype=torch.float64) + 0.5) / (2 * height) - math.pi
+    phi = math.pi * (torch.arange(height, dtype=torch.float64) + 0.5) / height
+    sin_phi = phi.sin()[:, None]
+    up = phi.cos()[:, None].expand(height, 2 * height)
+    directions = torch.stack([theta.sin() * sin_phi, up, -theta.cos() * sin_phi], dim=-1)
+    return directions.to(device=device, dtype=torch.float32)
+
+
+def reni_frame(directions: Tensor) -> Tensor:
+    """World directions ``(..., 3)``, y up, in the decoder's z-up frame."""
+    return directions.roll(1, dims=-1)
+
+
+class _VnLinear(nn.Module):
+    """Mixes vector channels; acts on the scalar weights of one vector that every channel is a multiple of."""
+
+    def __init__(self, inputs: int, outputs: int):
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(outputs, inputs))
+
+
+class _VnRelu(nn.Module):
+    def __init__(self, channels: int):
+        super().__init__()
+        self.W, self.U = (nn.Parameter(torch.eye(channels)) for _ in range(2))
+
+
+class _VnInvariant(nn.Module):
+    """Two numbers of a plane vector p that do not change when p turns: <p, out_o> of a small vector-neuron network.
+
+    Every channel of that network is a multiple of p, so only the factors are computed: with alpha = W a, beta = U a and
+    n = |p| the result is alpha n^2, less the part along k = beta p where alpha and beta differ in sign.  The
+    published network multiplies by k itself there and not by its unit vector, and so does this.
+    """
+
+    def __init__(self):
+        super().__init__()
+        self.mlp = nn.Sequential(_VnLinear(1, 2), _VnRelu(2))
+
+    def forward(self, p: Tensor) -> Tensor:
+        """``(..., 2)`` to ``(..., 2)``."""
+        a = self.mlp[0].weight[:, 0]
+        alpha, beta = self.mlp[1].W @ a, self.mlp[1].U @ a
+        n2 = p.square().sum(-1, keepdim=True)
+        k = beta.abs() * n2.clamp_min(NORM2_MIN).sqrt()
+        cut = 1.0 - k.square() / k.clamp_min(VN_EPS)
+        return alpha * n2 * torch.where(alpha * beta >= 0.0, torch.ones_like(cut), cut)
+
+
+class _Conditioning(nn.Module):
+    """The published attention of a ray over one single conditioning token.
+
+    A softmax over one key is 1, so the result is ``fc_out(value(condition))`` for every ray: query and key have their
+    place in the file and no effect.
+    """
+
+    def __init__(self, width: int, condition: int):
+        super().__init__()
+        self.query = nn.Linear(width, width)
+        self.key, self.value = nn.Linear(condition, width), nn.Linear(condition, width)
+        self.fc_out = nn.Linear(width, width)
+
+    def forward(self, condition: Tensor) -> Tensor:
+        return self.fc_out(self.value(condition))
+
+
+class _DecoderLayer(nn.Module):
+    def __init__(self, width: int, condition: int):
+        super().__init__()
+        self.mha = _Conditioning(width, condition)
+        self.norm1, self.norm2 = nn.LayerNorm(width), nn.LayerNorm(width)
+        self.fc = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, width))
+
+    def forward(self, x: Tensor, condition: Tensor) -> Tensor:
+        x = self.norm1(x + self.mha(condition))
+        return self.norm2(x + self.fc(x))
+
+
+class _Decoder(nn.Module):
+    def __init__(self, sizes: ReniSizes):
+        super().__init__()
+        features = (1 + 2 * len(FREQUENCIES)) * (sizes.latents + 2)
+        self.residual_projection = nn.Linear(features, sizes.width)
+        self.layers = nn.ModuleList(_DecoderLayer(sizes.width, 3 * sizes.latents) for _ in range(sizes.layers))
+        self.fc = nn.Linear(sizes.width, 3)
+
+    def forward(self, features: Tensor, condition: Tensor) -> Tensor:
+        x = self.residual_projection(positional_encoding(features))
+        for layer in self.layers:
+            x = layer(x, condition)
+        return self.fc(x)
+
+
+def positional_encoding(x: Tensor) -> Tensor:
+    """``(..., F)`` to ``(..., 5 F)``: sines, sines shifted by a quarter turn, then ``x``; frequencies run fastest."""
+    s = (x.unsqueeze(-1) * x.new_tensor(FREQUENCIES)).flatten(-2)
+    return torch.cat([s.sin(), (s + 0.5 * math.pi).sin(), x], dim=-1)
+
+
+class ReniField(nn.Module):
+    """Radiance of latent vectors in given directions."""
+
+    def __init__(self, sizes: ReniSizes):
+        super().__init__()
+        self.vn_proj_in = nn.Sequential(nn.Identity(), _VnLinear(1, 1))
+        self.vn_invar = _VnInvariant()
+        self.network = _Decoder(sizes)
+
+    def conditioning(self, latent: Tensor) -> Tensor:
+        """``(B, L, 3)`` to ``(B, 3 L)``: for each latent two invariants of its horizontal part, then its height."""
+        invariants = self.vn_invar(self.vn_proj_in[1].weight[0, 0] * latent[..., :2])
+        return torch.cat([invariants, latent[..., 2:]], dim=-1).flatten(-2)
+
+    @staticmethod
+    def directional(latent: Tensor, directions: Tensor) -> Tensor:
+        """``(B, L, 3)`` and ``(B or 1, N, 3)`` to ``(B, N, L + 2)``: horizontal products, height, horizontal length."""
+        horizontal = directions[..., :2]
+        length = horizontal.square().sum(-1, keepdim=True).clamp_min(NORM2_MIN).sqrt()
+        rest = torch.cat([directions[..., 2:], length], dim=-1).expand(len(latent), -1, -1)
+        return torch.cat([horizontal @ latent[..., :2].transpose(1, 2), rest], dim=-1)
+
+    def forward(self, latent: Tensor, directions: Tensor) -> Tensor:
+        """Logarithm of the radiance, ``(B, N, 3)``.
+
+        latent: ``(B, L, 3)``.  directions: ``(B or 1, N, 3)`` unit; both in the decoder's frame.  Gradients reach both.
+        """
+        return self.network(self.directional(latent, directions), self.conditioning(latent).unsqueeze(1))
+
+
+class EnvironmentDecoder(nn.Module):
+    """Latents, their rotation and a strength to an environment map."""
+
+    def __init__(self, sizes: ReniSizes):
+        super().__init__()
+        self.height = sizes.height
+        self.field = ReniField(sizes)
+        self.register_buffer("sample_directions", reni_frame(map_directions(sizes.height)).flatten(0, 1))
+
+    def forward(self, latent: Tensor, rotation: Tensor, strength: Tensor, height: int | None = None, *,
+                z_rotation: Tensor | None = None) -> Tensor:  # fmt: skip
+        """Linear radiance ``(B, H, 2H, 3)``, row 0 up, laid out as :func:`map_directions`.
+
+        latent: ``(B, L, 3)``.  rotation: ``(B, 3, 3)`` applied to every latent.  strength: ``(B,)``, natural logarithm
+        of a factor.  z_rotation: ``(B,)`` radians; turns the map by twice this angle, as published.
+        """
+        height = height or self.height
+        if height == self.height:
+            directions = self.sample_directions.unsqueeze(0)
+        else:
+            directions = reni_frame(map_directions(height, latent.device)).reshape(1, -1, 3)
+        if z_rotation is not None:
+            directions = directions @ _turn(-2.0 * z_rotation)
+        radiance = self.radiance(latent, rotation, strength, directions)
+        return radiance.unflatten(1, (height, 2 * height))
+
+    def radiance(self, latent: Tensor, rotation: Tensor, strength: Tensor, directions: Tensor) -> Tensor:
+        """Linear radiance ``(B, N, 3)`` in directions ``(B or 1, N, 3)`` of the decoder's frame, :func:`reni_frame`."""
+        with torch.autocast(latent.device.type, enabled=False):
+            turned = latent.float() @ rotation.float().transpose(1, 2)
+            log_radiance = self.field(turned, directions.float())
+            return truncated_exp(log_radiance) * truncated_exp(strength.float())[:, None, None]
+
+
+def _turn(angle: Tensor) -> Tensor:
+    """``(B,)`` to ``(B, 3, 3)``: rows ``(c, -s, 0), (s, c, 0), (0, 0, 1)``."""
+    c, s, zero, one = angle.cos(), angle.sin(), torch.zeros_like(angle), torch.ones_like(angle)
+    return torch.stack([c, -s, zero, s, c, zero, zero, zero, one], dim=-1).unflatten(-1, (3, 3))
+
+
+def rotation_from_6d(d: Tensor) -> Tensor:
+    """Rotation matrices ``(..., 3, 3)`` of ``(..., 6)``: two columns, made orthonormal, and their cross product.
+
+    Source: Zhou et al. 2019, arXiv 1812.07035.  Zero input gives a zero matrix.
+    """
+    eps = 1.0e-7 if d.dtype != torch.float64 else 1.0e-8  # the published floors
+    a, b = d[..., :3], d[..., 3:]
+    x = functional.normalize(a, dim=-1, eps=eps)
+    y = functional.normalize(b - (x * b).sum(-1, keepdim=True) * x, dim=-1, eps=eps)
+    return torch.stack([x, y, torch.linalg.cross(x, y)], dim=-1)
+
+
+def rotation_to_6d(matrix: Tensor) -> Tensor:
+    """The first two columns, ``(..., 6)``, of rotation matrices ``(..., 3, 3)``."""
+    return torch.cat([matrix[..., 0], matrix[..., 1]], dim=-1)

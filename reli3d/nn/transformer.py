@@ -1,0 +1,154 @@
+"""The two-stream transformer: a stream of triplane tokens and a stream of latents that read each other in turns.
+
+Source: section 3 of the paper, in the form of its release (the hero view's tokens join the latents, all views' tokens
+are read by cross attention, the last blocks mix experts).  Parameter names are the published checkpoint's.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from reli3d.nn.presets import BackboneSizes
+
+GROUP_NORM_EPS = 1.0e-6
+FEED_FORWARD_RATIO = 4
+CHUNK_NUMBERS = 1 << 25  # widest intermediate without gradient: 128 MiB in float32, far above what a matrix unit needs
+
+
+def attention(q: Tensor, k: Tensor, v: Tensor, heads: int) -> Tensor:
+    """Multi-head attention ``(B, N, C)`` of queries ``(B, N, C)`` over keys and values ``(B, M, C)``.
+
+    A batch axis of 1 on either side is shared by the other side's batch.
+    """
+    batch = max(len(q), len(k))
+    q, k, v = (x.unflatten(-1, (heads, -1)).transpose(1, 2).expand(batch, -1, -1, -1) for x in (q, k, v))
+    return functional.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2)
+
+
+class Attention(nn.Module):
+    def __init__(self, width: int, heads: int):
+        super().__init__()
+        self.heads = heads
+        self.wq, self.wk, self.wv = (nn.Linear(width, width, bias=False) for _ in range(3))
+        self.proj = nn.Linear(width, width)
+
+    def forward(self, x: Tensor, context: Tensor) -> Tensor:
+        """x: ``(B, N, C)`` gives the queries, context: ``(B, M, C)`` keys and values."""
+        return self.proj(attention(self.wq(x), self.wk(context), self.wv(context), self.heads))
+
+
+class _GatedGelu(nn.Module):
+    def __init__(self, width: int, inner: int):
+        super().__init__()
+        self.proj = nn.Linear(width, 2 * inner)
+
+    def forward(self, x: Tensor) -> Tensor:
+        value, gate = self.proj(x).chunk(2, dim=-1)
+        return value * functional.gelu(gate)
+
+
+class FeedForward(nn.Module):
+    """GEGLU feed-forward (Shazeer 2020, arXiv 2002.05202); without gradient long inputs run in chunks of tokens."""
+
+    def __init__(self, width: int):
+        super().__init__()
+        inner = FEED_FORWARD_RATIO * width
+        self.net = nn.Sequential(_GatedGelu(width, inner), nn.Identity(), nn.Linear(inner, width))
+        self.rows = max(1, CHUNK_NUMBERS // (2 * inner))
+
+    def forward(self, x: Tensor) -> Tensor:
+        if torch.is_grad_enabled() or x.shape[0] * x.shape[1] <= self.rows:
+            return self.net(x)
+        return torch.cat([self.net(part) for part in x.split(max(1, self.rows // len(x)), dim=1)], dim=1)
+
+
+class Experts(nn.Module):
+    """Half the sum of a shared feed-forward and of the softly weighted experts; every expert sees every token."""
+
+    def __init__(self, width: int, count: int):
+        super().__init__()
+        self.shared_expert = FeedForward(width)
+        self.experts = nn.ModuleList(FeedForward(width) for _ in range(count))
+        self.routing_network = nn.Linear(width, count)
+
+    def forward(self, x: Tensor) -> Tensor:
+        weight = self.routing_network(x).softmax(dim=-1)
+        y = self.shared_expert(x)
+        for k, expert in enumerate(self.experts):
+            y = torch.addcmul(y, weight[..., k, None], expert(x))
+        return 0.5 * y
+
+
+class BasicBlock(nn.Module):
+    """Latents: self attention, cross attention to the raw tokens of all views, feed-forward or experts."""
+
+    def __init__(self, width: int, heads: int, experts: int):
+        super().__init__()
+        self.norm1, self.norm2, self.norm3 = (nn.LayerNorm(width) for _ in range(3))
+        self.attn1, self.attn2 = Attention(width, heads), Attention(width, heads)
+        self.ff = Experts(width, experts) if experts else FeedForward(width)
+
+    def forward(self, z: Tensor, views: Tensor) -> Tensor:
+        h = self.norm1(z)
+        z = z + self.attn1(h, h)
+        z = z + self.attn2(self.norm2(z), views)
+        return z + self.ff(self.norm3(z))
+
+
+class FuseBlock(nn.Module):
+    """One stream reads the other, which enters without a norm."""
+
+    def __init__(self, width: int, heads: int):
+        super().__init__()
+        self.attn = Attention(width, heads)
+        self.norm_z1, self.norm_z2 = nn.LayerNorm(width), nn.LayerNorm(width)
+        self.ff = FeedForward(width)
+
+    def forward(self, z: Tensor, context: Tensor) -> Tensor:
+        z = z + self.attn(self.norm_z1(z), context)
+        return z + self.ff(self.norm_z2(z))
+
+
+class MainBlock(nn.Module):
+    """Latents read the triplane, think, and are read by the triplane."""
+
+    def __init__(self, width: int, heads: int, basic_blocks: int, experts: int):
+        super().__init__()
+        self.fuse_block_in = FuseBlock(width, heads)
+        self.transformer_block = nn.ModuleList(BasicBlock(width, heads, experts) for _ in range(basic_blocks))
+        self.fuse_block_out = FuseBlock(width, heads)
+
+    def forward(self, latents: Tensor, planes: Tensor, views: Tensor) -> tuple[Tensor, Tensor]:
+        latents = self.fuse_block_in(latents, planes)
+        for block in self.transformer_block:
+            latents = block(latents, views)
+        return latents, self.fuse_block_out(planes, latents)
+
+
+class TwoStreamTransformer(nn.Module):
+    """Triplane tokens from the learned bank and the views' tokens."""
+
+    def __init__(self, sizes: BackboneSizes, width: int):
+        super().__init__()
+        self.latent_init = nn.Parameter(torch.zeros(1, sizes.latents, width))
+        self.norm_triplane = nn.GroupNorm(sizes.groups, width, eps=GROUP_NORM_EPS)
+        self.norm_image, self.norm_latent = nn.LayerNorm(width), nn.LayerNorm(width)
+        self.proj_triplane, self.proj_image, self.proj_latent = (nn.Linear(width, width) for _ in range(3))
+        self.main_blocks = nn.ModuleList(
+            MainBlock(width, sizes.heads, sizes.basic_blocks, sizes.experts if i >= sizes.experts_from else 0)
+            for i in range(sizes.blocks)
+        )
+        self.proj_out = nn.Linear(width, width)
+
+    def forward(self, bank: Tensor, views: Tensor) -> Tensor:
+        """``(B, C, N)`` from the bank ``(B or 1, C, N)``, channels before tokens, and ``(B, V, T, C)``, hero first."""
+        planes = self.proj_triplane(self.norm_triplane(bank).transpose(1, 2))
+        hero = self.proj_image(self.norm_image(views[:, 0]))
+        latents = self.proj_latent(self.norm_latent(self.latent_init)).expand(len(views), -1, -1)
+        latents = torch.cat([hero, latents], dim=1)
+        context = views.flatten(1, 2)
+        for block in self.main_blocks:
+            latents, planes = block(latents, planes, context)
+        return self.proj_out(planes).transpose(1, 2) + bank
