@@ -1,0 +1,165 @@
+"""Run the cases of the modules beside this one: ``python -m bench.run [NAME ...]``.
+
+A module holds ``CASES = {"name": (builder, arguments)}``; ``builder(device, **arguments)`` builds the inputs and
+returns ``(step, work)``: the function to time, and how much one call of it does, e.g. ``{"rays": 1 << 20}``.  It may
+hold ``PEERS = {"name": peer_builder}`` with the same arguments, for a named other implementation of the same work that
+is timed in turn with ours.  A builder returns None on a device that its case does not run on.
+
+Each result is one line of JSON in ``bench/results/<machine>.jsonl``.  ``--record`` writes the ratios, our time by the
+peer's, to ``bench/baseline.json``, which ``pytest bench/`` compares with.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import os
+import platform
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from datetime import datetime, timezone
+from importlib import metadata
+from pathlib import Path
+
+import torch
+
+from bench.timing import Timing, time_steps
+
+HERE = Path(__file__).parent
+BASELINE = HERE / "baseline.json"
+PACKAGES = ("reli3d", "torch", "warp-lang", "numpy", "embreex", "mitsuba", "xatlas", "trimesh", "manifold3d")
+
+
+@dataclass(frozen=True)
+class Case:
+    builder: Callable
+    arguments: dict
+    peer: Callable | None
+
+
+@dataclass(frozen=True)
+class Result:
+    work: dict
+    ours: Timing
+    peer: Timing | None
+
+    @property
+    def ratio(self) -> float | None:
+        """Our median time by the peer's: below 1 is faster."""
+        return None if self.peer is None else self.ours.median / self.peer.median
+
+
+def collect() -> dict[str, Case]:
+    """All cases as ``{"module.name": case}``."""
+    found = {}
+    for path in sorted(HERE.glob("*.py")):
+        if path.stem in ("__init__", "timing", "run", "conftest") or path.stem.startswith("test_"):
+            continue
+        module = importlib.import_module(f"bench.{path.stem}")
+        peers = getattr(module, "PEERS", {})
+        for name, (builder, arguments) in module.CASES.items():
+            found[f"{path.stem}.{name}"] = Case(builder, arguments, peers.get(name))
+    return found
+
+
+def measure(case: Case, device: torch.device, *, seconds: float) -> Result | None:
+    """Build and time a case beside its peer; None where it does not run on ``device``."""
+    ours = case.builder(device, **case.arguments)
+    if ours is None:
+        return None
+    peer = case.peer(device, **case.arguments) if case.peer else None
+    timings = time_steps([ours[0]] + ([peer[0]] if peer else []), device, seconds=seconds)
+    return Result(ours[1], timings[0], timings[1] if peer else None)
+
+
+def line(name: str, result: Result) -> str:
+    """One row for a person: time, deciles, work a second, memory, ratio."""
+    t = result.ours
+    text = f"{name:32s} {1e3 * t.median:10.3f} ms [{1e3 * t.p10:.3f}, {1e3 * t.p90:.3f}]"
+    text += "".join(f"  {_short(n / t.median)} {unit}/s" for unit, n in result.work.items())
+    text += "" if t.peak_bytes is None else f"  +{t.peak_bytes / 2**20:.0f} MiB"
+    text += "" if result.ratio is None else f"  {result.ratio:.3f} x peer ({1e3 * result.peer.median:.3f} ms)"
+    return text + "".join(f"\n    {stage:28s} {1e3 * s:10.3f} ms" for stage, s in t.stages.items())
+
+
+def _short(rate: float) -> str:
+    for unit, size in (("G", 1e9), ("M", 1e6), ("k", 1e3)):
+        if rate >= size:
+            return f"{rate / size:.3g} {unit}"
+    return f"{rate:.3g} "
+
+
+def machine(device: torch.device) -> str:
+    """Name of the processor and its count (and of the GPU), fit for a file name."""
+    cpu = platform.processor() or platform.machine()
+    info = Path("/proc/cpuinfo")
+    if info.exists():
+        found = re.search(r"^model name\s*:\s*(.+)$", info.read_text(), re.MULTILINE)
+        cpu = found.group(1) if found else cpu
+    name = f"{cpu} {os.cpu_count()} cpu"
+    if device.type == "cuda":
+        name += " " + torch.cuda.get_device_name(device)
+    return re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")
+
+
+def context(device: torch.device) -> dict:
+    """What a number depends on besides the code: versions, commit, machine, threads."""
+    versions = {"python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            versions[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            continue
+    git = ["git", "-C", str(HERE)]
+    commit = subprocess.run([*git, "rev-parse", "--short=12", "HEAD"], capture_output=True, text=True).stdout.strip()
+    changed = subprocess.run([*git, "status", "--porcelain", "-uno", "--", "../reli3d", "*.py"],
+                             capture_output=True, text=True).stdout.strip()  # fmt: skip
+    return {"time": datetime.now(timezone.utc).isoformat(timespec="seconds"), "device": device.type,
+            "machine": machine(device), "threads": torch.get_num_threads(), "versions": versions,
+            "commit": (commit or "none") + ("+changes" if changed else "")}  # fmt: skip
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="python -m bench.run", description="Time the cases and note the results.")
+    parser.add_argument("names", nargs="*", help="modules (triplane) or cases (triplane.gather); all when left out")
+    parser.add_argument("--device", default="cpu", choices=["cpu", "cuda"])
+    parser.add_argument("--seconds", type=float, default=3.0, help="time spent on each step, about")
+    parser.add_argument("--record", action="store_true", help="also write the ratios to baseline.json")
+    parser.add_argument("--no-results", action="store_true", help="print only; append nothing to results/")
+    options = parser.parse_args(argv)
+    cases = collect()
+    unknown = [n for n in options.names if not any(n in (c, c.split(".")[0]) for c in cases)]
+    if unknown:
+        parser.error(f"names: expected some of {', '.join(cases)}, got {', '.join(unknown)}")
+    device = torch.device(options.device)
+    about, results = context(device), HERE / "results"
+    baseline = json.loads(BASELINE.read_text()) if BASELINE.exists() else {}
+    for name, case in cases.items():
+        if options.names and name not in options.names and name.split(".")[0] not in options.names:
+            continue
+        result = measure(case, device, seconds=options.seconds)
+        if result is None:
+            sys.stdout.write(f"{name:32s} does not run on {device}\n")
+            continue
+        sys.stdout.write(line(name, result) + "\n")
+        sys.stdout.flush()
+        if not options.no_results:
+            results.mkdir(exist_ok=True)
+            row = {"case": name, "work": result.work, **asdict(result.ours), "ratio": result.ratio,
+                   "peer": None if result.peer is None else asdict(result.peer),
+                   "arguments": case.arguments, **about}  # fmt: skip
+            with open(results / f"{about['machine']}.jsonl", "a") as file:
+                file.write(json.dumps(row) + "\n")
+        if options.record and result.ratio is not None:
+            baseline.setdefault(device.type, {})[name] = round(result.ratio, 4)
+    if options.record:
+        BASELINE.write_text(json.dumps(baseline, indent=2, sort_keys=True) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

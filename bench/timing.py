@@ -1,0 +1,100 @@
+"""Wall-clock time and memory of a step: a function without arguments, warmed up, synchronised, repeated.
+
+Several steps are timed in turn (A B A B ...), so that whatever else the machine does falls on all of them alike and the
+ratio of their medians holds where a single time does not.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+
+import torch
+
+MIN_RUNS = 5  # below that a decile is a guess
+MAX_RUNS = 200
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Seconds of ``runs`` repetitions, and bytes at the highest point above the memory held before."""
+
+    median: float
+    p10: float
+    p90: float
+    runs: int
+    peak_bytes: int | None  # None where the system does not tell
+    stages: dict[str, float]  # medians, for a step that returns ``{stage: seconds}``
+
+
+def time_steps(steps: Sequence[Callable], device: torch.device, *, seconds: float, warmup: int = 2) -> list[Timing]:
+    """Time every step within about ``seconds`` each, at least :data:`MIN_RUNS` times, in turn."""
+    for step in steps:
+        for _ in range(warmup):
+            step()
+    peaks = [peak_bytes(step, device) for step in steps]
+    runs: list[list[float]] = [[] for _ in steps]
+    returned: list[list] = [[] for _ in steps]
+    gc.collect()
+    begin = time.perf_counter()
+    while len(runs[0]) < MIN_RUNS or (
+        len(runs[0]) < MAX_RUNS and time.perf_counter() - begin < seconds * len(steps)
+    ):  # fmt: skip
+        for k, step in enumerate(steps):
+            synchronise(device)
+            start = time.perf_counter()
+            value = step()
+            synchronise(device)
+            runs[k].append(time.perf_counter() - start)
+            returned[k].append(value if isinstance(value, dict) else None)
+            del value
+    return [summary(r, peak, values) for r, peak, values in zip(runs, peaks, returned, strict=True)]
+
+
+def summary(runs: list[float], peak: int | None, returned: list) -> Timing:
+    ordered = sorted(runs)
+    last = len(ordered) - 1
+    stages = {}
+    if returned and all(isinstance(value, dict) for value in returned):
+        stages = {key: median(value[key] for value in returned) for key in returned[0]}
+    return Timing(median(ordered), ordered[round(0.1 * last)], ordered[round(0.9 * last)], len(ordered), peak, stages)
+
+
+def synchronise(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def peak_bytes(step: Callable, device: torch.device) -> int | None:
+    """Memory that one call of ``step`` needs beyond what is held before it; None where the system does not tell.
+
+    On CUDA the allocator of torch counts it.  On Linux the kernel does, in pages of the process, once what is free has
+    been given back and the mark is reset.
+    """
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+        torch.cuda.reset_peak_memory_stats(device)
+        held = torch.cuda.memory_allocated(device)
+        step()
+        torch.cuda.synchronize(device)
+        return torch.cuda.max_memory_allocated(device) - held
+    try:
+        ctypes.CDLL(None).malloc_trim(0)  # glibc keeps freed blocks of up to 32 MiB
+        Path("/proc/self/clear_refs").write_text("5")
+    except (OSError, AttributeError, TypeError):
+        return None
+    held = _status("VmRSS")
+    step()
+    return max(0, _status("VmHWM") - held)
+
+
+def _status(field: str) -> int:
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith(field + ":"):
+            return int(line.split()[1]) * 1024
+    return 0
