@@ -37,7 +37,6 @@ def time_steps(steps: Sequence[Callable], device: torch.device, *, seconds: floa
     for step in steps:
         for _ in range(warmup):
             step()
-    peaks = [peak_bytes(step, device) for step in steps]
     runs: list[list[float]] = [[] for _ in steps]
     returned: list[list] = [[] for _ in steps]
     gc.collect()
@@ -53,6 +52,7 @@ def time_steps(steps: Sequence[Callable], device: torch.device, *, seconds: floa
             runs[k].append(time.perf_counter() - start)
             returned[k].append(value if isinstance(value, dict) else None)
             del value
+    peaks = [peak_bytes(step, device) for step in steps]  # last: giving memory back would slow the next runs
     return [summary(r, peak, values) for r, peak, values in zip(runs, peaks, returned, strict=True)]
 
 
