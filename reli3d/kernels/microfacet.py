@@ -1,0 +1,111 @@
+"""GGX microfacet distribution in the local frame: surface normal +z, ``wo`` and ``wi`` unit and leaving the surface."""
+
+import warp as wp
+
+from reli3d.kernels.math import INV_PI, safe_sqrt
+from reli3d.kernels.sampling import mirror, sample_cap
+
+wp.set_module_options({"enable_backward": True, "cpu_compiler_flags": "-march=native"})
+
+ALPHA_MIN = wp.constant(1.0e-3)  # roughness 0.032: the lobe is 0.1 degree wide, a tenth of a pixel; Mitsuba's floor too
+COS_MIN = wp.constant(1.0e-6)  # about 10 ulp of a unit vector; below it a direction counts as in the surface
+
+
+@wp.func
+def ggx_ndf(wm: wp.vec3, alpha: float) -> float:
+    """GGX density of microfacet normals, projected: integral of D cos = 1.  Walter et al. 2007, eq. 33.
+
+    Written with sin^2 from x and y, which keeps float32 exact digits near the peak where 1 - cos^2 cancels.
+    """
+    a2 = alpha * alpha
+    k = a2 * wm[2] * wm[2] + wm[0] * wm[0] + wm[1] * wm[1]
+    return a2 * INV_PI / (k * k)
+
+
+@wp.func
+def ggx_root(w: wp.vec3, alpha: float) -> float:
+    """``sqrt(alpha^2 sin^2 + cos^2)``: (1 + 2 Lambda) cos, the common part of all Smith terms."""
+    return safe_sqrt(alpha * alpha * (w[0] * w[0] + w[1] * w[1]) + w[2] * w[2])
+
+
+@wp.func
+def smith_g1(w: wp.vec3, alpha: float) -> float:
+    """Smith masking of one direction with ``w.z > 0``.  Heitz 2014, eq. 43 with the GGX Lambda of eq. 72."""
+    return 2.0 * w[2] / (w[2] + ggx_root(w, alpha))
+
+
+@wp.func
+def smith_visibility(wo: wp.vec3, wi: wp.vec3, alpha: float) -> float:
+    """Height-correlated Smith G2 over ``4 cos_o cos_i``; both cosines positive.  Heitz 2014, eq. 99."""
+    return 0.5 / (wi[2] * ggx_root(wo, alpha) + wo[2] * ggx_root(wi, alpha))
+
+
+@wp.func
+def sample_ggx_vndf(wo: wp.vec3, alpha: float, u: wp.vec2) -> wp.vec3:
+    """Visible normal for uniform ``u`` in [0, 1)^2; density :func:`pdf_ggx_vndf`.
+
+    Spherical caps, Dupuy and Benyoub 2023, doi 10.1111/cgf.14867: stretch ``wo``, take a point of the cap z in
+    [-w.z, 1], add, unstretch.
+    """
+    w = wp.normalize(wp.vec3(alpha * wo[0], alpha * wo[1], wo[2]))
+    h = w + sample_cap(w, u)
+    return wp.normalize(wp.vec3(alpha * h[0], alpha * h[1], wp.max(h[2], COS_MIN)))
+
+
+@wp.func
+def pdf_ggx_vndf(wo: wp.vec3, alpha: float, wm: wp.vec3) -> float:
+    """Density [1/sr of ``wm``] of visible normals; 0 for normals that face away from ``wo``.  Heitz 2018, eq. 3."""
+    cos_m = wp.dot(wo, wm)
+    pdf = wp.float32(0.0)
+    if wo[2] > 0.0 and wm[2] > 0.0 and cos_m > 0.0:
+        pdf = 2.0 * cos_m * ggx_ndf(wm, alpha) / (wo[2] + ggx_root(wo, alpha))
+    return pdf
+
+
+@wp.func
+def pdf_vndf_reflection(wo: wp.vec3, alpha: float, wm: wp.vec3) -> float:
+    """Density [1/sr of ``wi``] of ``wo`` reflected at a visible normal, ``wm`` the half vector.
+
+    pdf_ggx_vndf / (4 wo.wm), Walter et al. 2007, eq. 14."""
+    pdf = wp.float32(0.0)
+    if wo[2] > 0.0 and wm[2] > 0.0 and wp.dot(wo, wm) > 0.0:
+        pdf = 0.5 * ggx_ndf(wm, alpha) / (wo[2] + ggx_root(wo, alpha))
+    return pdf
+
+
+@wp.func
+def pdf_vndf_partner(wo: wp.vec3, alpha: float, wm: wp.vec3) -> float:
+    """Density [1/sr of ``wi``] of ``wo`` reflected at the mirrored visible normal, ``wm`` the half vector of ``wi``.
+
+    The mirrored normal has the density of its original, and the Jacobian of the reflection is that of ``wm`` itself:
+    pdf_ggx_vndf(mirror(wm)) / (4 wo.wm).
+    """
+    cos_m = wp.dot(wo, wm)
+    pdf = wp.float32(0.0)
+    if cos_m > 0.0:
+        pdf = pdf_ggx_vndf(wo, alpha, mirror(wm)) / (4.0 * wp.max(cos_m, COS_MIN))
+    return pdf
+
+
+@wp.kernel
+def sample_ggx_vndf_kernel(
+    start: int,
+    # in
+    wo: wp.array(dtype=wp.vec3), alpha: wp.array(dtype=float), u: wp.array(dtype=wp.vec2),
+    # out
+    wm: wp.array(dtype=wp.vec3),
+):  # fmt: skip
+    i = start + wp.tid()
+    wm[i] = sample_ggx_vndf(wo[i], wp.max(alpha[i], ALPHA_MIN), u[i])
+
+
+@wp.kernel
+def pdf_ggx_vndf_kernel(
+    start: int,
+    # in
+    wo: wp.array(dtype=wp.vec3), alpha: wp.array(dtype=float), wm: wp.array(dtype=wp.vec3),
+    # out
+    pdf: wp.array(dtype=float),
+):  # fmt: skip
+    i = start + wp.tid()
+    pdf[i] = pdf_ggx_vndf(wo[i], wp.max(alpha[i], ALPHA_MIN), wm[i])

@@ -1,0 +1,66 @@
+"""Hemisphere sampling in the local frame: normal +z, directions unit and leaving the surface."""
+
+import warp as wp
+
+from reli3d.kernels.math import INV_PI, PI, safe_sqrt
+
+wp.set_module_options({"enable_backward": True, "cpu_compiler_flags": "-march=native"})
+
+
+@wp.func
+def sample_cosine(u: wp.vec2) -> wp.vec3:
+    """Direction for uniform ``u`` in [0, 1)^2; density :func:`pdf_cosine`.  Malley: a lifted disk point."""
+    r = wp.sqrt(u[0])
+    phi = 2.0 * PI * u[1]
+    return wp.vec3(r * wp.cos(phi), r * wp.sin(phi), wp.sqrt(1.0 - u[0]))
+
+
+@wp.func
+def pdf_cosine(wi: wp.vec3) -> float:
+    """Density [1/sr]; 0 below the horizon."""
+    return wp.max(wi[2], 0.0) * INV_PI
+
+
+@wp.func
+def sample_cap(w: wp.vec3, u: wp.vec2) -> wp.vec3:
+    """Point of the unit sphere with z in [-w.z, 1], uniform in area."""
+    phi = 2.0 * PI * u[0]
+    z = (1.0 - u[1]) * (1.0 + w[2]) - w[2]
+    r = safe_sqrt(1.0 - z * z)
+    return wp.vec3(r * wp.cos(phi), r * wp.sin(phi), z)
+
+
+@wp.func
+def mirror(wm: wp.vec3) -> wp.vec3:
+    """The antithetic partner of a microfacet normal: turned by pi about the surface normal."""
+    return wp.vec3(-wm[0], -wm[1], wm[2])
+
+
+@wp.func
+def reflect(wo: wp.vec3, wm: wp.vec3) -> wp.vec3:
+    """``wo`` mirrored at the microfacet normal ``wm``."""
+    return wm * (2.0 * wp.dot(wo, wm)) - wo
+
+
+@wp.kernel
+def sample_cosine_kernel(
+    start: int,
+    # in
+    u: wp.array(dtype=wp.vec2),
+    # out
+    wi: wp.array(dtype=wp.vec3),
+):  # fmt: skip
+    i = start + wp.tid()
+    wi[i] = sample_cosine(u[i])
+
+
+@wp.kernel
+def pdf_cosine_kernel(
+    start: int,
+    # in
+    wi: wp.array(dtype=wp.vec3),
+    # out
+    pdf: wp.array(dtype=float),
+):  # fmt: skip
+    i = start + wp.tid()
+    pdf[i] = pdf_cosine(wi[i])

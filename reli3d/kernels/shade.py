@@ -1,0 +1,230 @@
+"""Direct light of a hit by multiple importance sampling: all strategies in one loop, no per-sample arrays in memory.
+
+Strategies in the order of the sample index: environment table, visible normals (antithetic pairs: even index the
+original, odd its partner mirrored about the normal), cosine.  Every sample counts ``f L cos w / (n p)`` with the
+densities of all strategies in the weight.  A face seen from behind is shaded as its other side.
+"""
+
+import warp as wp
+
+from reli3d.kernels.bsdf import eval_bsdf, pdf_lobes
+from reli3d.kernels.envmap import direction_to_uv, lookup_envmap_uv, pdf_envmap_uv, sample_envmap_uv, uv_to_direction
+from reli3d.kernels.intersect import hit_occluded, offset_origin
+from reli3d.kernels.math import tangent_frame
+from reli3d.kernels.microfacet import ALPHA_MIN, COS_MIN, sample_ggx_vndf
+from reli3d.kernels.mis import mis_factor
+from reli3d.kernels.random import random_pair, rotate_point
+from reli3d.kernels.sampling import mirror, reflect, sample_cosine
+
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
+
+COS_VIEW_MIN = wp.constant(1.0e-3)  # an interpolated normal that turns away is bent until the view is this far above it
+
+
+@wp.struct
+class Surface:
+    """What the samples of one hit share; ``wo`` in the local frame, whose axes are the rows of ``frame``."""
+
+    frame: wp.mat33
+    ng: wp.vec3
+    wo: wp.vec3
+    base_color: wp.vec3
+    alpha: float
+    metallic: float
+
+
+@wp.struct
+class Plan:
+    """How to sample: counts of the strategies, generator, options."""
+
+    n_environment: int
+    n_visible: int
+    n_cosine: int
+    antithetic: int
+    power: int
+    rotate: int
+    seed: int
+    clamp: float
+    scale: float
+
+
+@wp.struct
+class Contribution:
+    """One sample: direction in world space and what it adds if nothing is in its way."""
+
+    direction: wp.vec3
+    value: wp.vec3
+
+
+@wp.func
+def bend_normal(n: wp.vec3, wo: wp.vec3) -> wp.vec3:
+    """``n``, or the nearest normal on the way to ``wo`` that has the view above its horizon."""
+    out = n
+    cos_o = wp.dot(n, wo)
+    if cos_o < COS_VIEW_MIN:
+        out = wp.normalize(n + wo * (COS_VIEW_MIN - cos_o))
+    return out
+
+
+@wp.func
+def make_surface(
+    normal: wp.vec3, ng: wp.vec3, wo: wp.vec3, base_color: wp.vec3, alpha: float, metallic: float
+) -> Surface:
+    """Local frame of a hit, on the side of the viewer."""
+    side = wp.float32(1.0)
+    if wp.dot(ng, wo) < 0.0:
+        side = -1.0
+    surface = Surface()
+    surface.frame = tangent_frame(bend_normal(normal * side, wo))
+    surface.ng = ng * side
+    surface.wo = surface.frame * wo
+    surface.base_color = base_color
+    surface.alpha = wp.max(alpha, ALPHA_MIN)
+    surface.metallic = metallic
+    return surface
+
+
+@wp.func
+def draw_pair(plan: Plan, points: wp.array(dtype=wp.vec2), pixel: int, index: int, strategy: int) -> wp.vec2:
+    """Uniform pair of a sample: independent, or the rotated point of an even set."""
+    u = random_pair(plan.seed, pixel, index * (1 - plan.rotate), strategy)
+    if plan.rotate != 0:
+        u = rotate_point(points[index], u)
+    return u
+
+
+@wp.func
+def draw_contribution(
+    surface: Surface,
+    plan: Plan,
+    points: wp.array(dtype=wp.vec2),
+    radiance: wp.array2d(dtype=wp.vec3),
+    rows: wp.array2d(dtype=float),
+    columns: wp.array2d(dtype=float),
+    density: wp.array2d(dtype=float),
+    pixel: int,
+    sample: int,
+) -> Contribution:
+    """Sample ``sample`` of a hit."""
+    out = Contribution()
+    out.value = wp.vec3(0.0, 0.0, 0.0)
+    wi = wp.vec3(0.0, 0.0, 0.0)
+    uv = wp.vec2(0.0, 0.0)
+    strategy = wp.int32(0)
+    count = wp.int32(plan.n_environment)
+    if sample < plan.n_environment:
+        uv = sample_envmap_uv(rows, columns, draw_pair(plan, points, pixel, sample, 0))
+        out.direction = uv_to_direction(uv)
+        wi = surface.frame * out.direction
+    else:
+        k = sample - plan.n_environment
+        if k < plan.n_visible:
+            strategy = 1
+            count = plan.n_visible
+            if plan.antithetic != 0:
+                wm = sample_ggx_vndf(surface.wo, surface.alpha, draw_pair(plan, points, pixel, k // 2, 1))
+                if k % 2 == 1:
+                    strategy = 2
+                    wm = mirror(wm)
+            else:
+                wm = sample_ggx_vndf(surface.wo, surface.alpha, draw_pair(plan, points, pixel, k, 1))
+            if wp.dot(surface.wo, wm) > COS_MIN:
+                wi = reflect(surface.wo, wm)
+        else:
+            strategy = 3
+            count = plan.n_cosine
+            wi = sample_cosine(draw_pair(plan, points, pixel, k - plan.n_visible, 2))
+        out.direction = wp.transpose(surface.frame) * wi
+        if wi[2] > COS_MIN:
+            uv = direction_to_uv(out.direction)
+    if wi[2] > COS_MIN:
+        lobes = pdf_lobes(surface.wo, wi, surface.alpha)
+        partners = float(plan.antithetic * (plan.n_visible // 2))
+        all = wp.vec4(
+            float(plan.n_environment) * pdf_envmap_uv(density, uv),
+            (float(plan.n_visible) - partners) * lobes[0],
+            partners * lobes[1],
+            float(plan.n_cosine) * lobes[2],
+        )
+        factor = mis_factor(all[strategy], all, plan.power) * wi[2]
+        value = eval_bsdf(surface.wo, wi, surface.base_color, surface.alpha, surface.metallic) * factor
+        value = wp.cw_mul(value, lookup_envmap_uv(radiance, uv))
+        top = plan.clamp / float(count)
+        out.value = wp.vec3(wp.min(value[0], top), wp.min(value[1], top), wp.min(value[2], top))
+    return out
+
+
+@wp.kernel
+def shade_kernel(
+    start: int,
+    # in
+    position: wp.array(dtype=wp.vec3), normal: wp.array(dtype=wp.vec3), ng: wp.array(dtype=wp.vec3),
+    wo: wp.array(dtype=wp.vec3), base_color: wp.array(dtype=wp.vec3), alpha: wp.array(dtype=float),
+    metallic: wp.array(dtype=float), radiance: wp.array2d(dtype=wp.vec3), rows: wp.array2d(dtype=float),
+    columns: wp.array2d(dtype=float), density: wp.array2d(dtype=float), points: wp.array(dtype=wp.vec2),
+    plan: Plan, mesh: wp.uint64, shadows: int,
+    # out
+    out: wp.array(dtype=wp.vec3),
+):  # fmt: skip
+    """The fused estimator; shadow rays through Warp's BVH."""
+    i = start + wp.tid()
+    surface = make_surface(normal[i], ng[i], wo[i], base_color[i], alpha[i], metallic[i])
+    total = wp.vec3(0.0, 0.0, 0.0)
+    for s in range(plan.n_environment + plan.n_visible + plan.n_cosine):
+        c = draw_contribution(surface, plan, points, radiance, rows, columns, density, i, s)
+        if c.value[0] + c.value[1] + c.value[2] > 0.0:
+            lit = wp.bool(True)
+            if shadows != 0:
+                origin = offset_origin(position[i], surface.ng, c.direction, plan.scale)
+                lit = not hit_occluded(mesh, origin, c.direction, wp.inf)
+            if lit:
+                total = total + c.value
+    out[i] = total
+
+
+@wp.kernel
+def shade_rays_kernel(
+    start: int,
+    # in
+    first: int, position: wp.array(dtype=wp.vec3), normal: wp.array(dtype=wp.vec3), ng: wp.array(dtype=wp.vec3),
+    wo: wp.array(dtype=wp.vec3), base_color: wp.array(dtype=wp.vec3), alpha: wp.array(dtype=float),
+    metallic: wp.array(dtype=float), radiance: wp.array2d(dtype=wp.vec3), rows: wp.array2d(dtype=float),
+    columns: wp.array2d(dtype=float), density: wp.array2d(dtype=float), points: wp.array(dtype=wp.vec2),
+    plan: Plan,
+    # out
+    origins: wp.array(dtype=wp.vec3), directions: wp.array(dtype=wp.vec3), t_max: wp.array(dtype=float),
+    values: wp.array(dtype=wp.vec3),
+):  # fmt: skip
+    """First half of the estimator for a chunk of hits: shadow rays (``t_max`` < 0 where none is needed) and values."""
+    j = start + wp.tid()
+    i = first + j
+    surface = make_surface(normal[i], ng[i], wo[i], base_color[i], alpha[i], metallic[i])
+    count = plan.n_environment + plan.n_visible + plan.n_cosine
+    for s in range(count):
+        c = draw_contribution(surface, plan, points, radiance, rows, columns, density, i, s)
+        k = j * count + s
+        reach = wp.float32(-1.0)
+        if c.value[0] + c.value[1] + c.value[2] > 0.0:
+            reach = wp.inf
+            origins[k] = offset_origin(position[i], surface.ng, c.direction, plan.scale)
+            directions[k] = c.direction
+        t_max[k] = reach
+        values[k] = c.value
+
+
+@wp.kernel
+def accumulate_kernel(
+    start: int,
+    # in
+    first: int, count: int, values: wp.array(dtype=wp.vec3), occluded: wp.array(dtype=wp.int32),
+    # out
+    out: wp.array(dtype=wp.vec3),
+):  # fmt: skip
+    """Second half: the sum of the values of a hit that are not ``occluded`` (Embree: 0 for a hit, -1 for none)."""
+    j = start + wp.tid()
+    total = wp.vec3(0.0, 0.0, 0.0)
+    for s in range(count):
+        k = j * count + s
+        if occluded[k] != 0:
+            total = total + values[k]
+    out[first + j] = total
