@@ -14,6 +14,7 @@ from torch.nn import functional
 
 ROUGHNESS_MIN = 0.1  # range [0.1, 1] of the published head
 NORMALIZE_EPS = 1.0e-7
+COLOR_MARGIN = 0.02  # keeps the logit of black and of clipped highlights within reach of a correction
 WEIGHT_SCALE = 0.5  # of the FlexiCubes weights: how far alpha and beta may leave 1
 MERGED_MULTIPLIER = 0.1  # on the merging MLP's output: starts the weights near neutral
 DEFORMATION_LIMIT = 1.0 - 1.0e-8  # of half a cell, so that two grid vertices never meet
@@ -68,12 +69,18 @@ class Heads(nn.ModuleDict):
     def __init__(self, features: int, width: int):
         super().__init__({name: mlp(features, width, head.outputs, head.hidden) for name, head in HEADS.items()})
 
-    def forward(self, features: Tensor, names: Sequence[str]) -> dict[str, Tensor]:
-        """``{name: (..., outputs)}`` of features ``(..., features)``; values as :func:`activate` describes them."""
+    def forward(self, features: Tensor, names: Sequence[str], color: Tensor | None = None) -> dict[str, Tensor]:
+        """``{name: (..., outputs)}`` of features ``(..., features)``; values as :func:`activate` describes them.
+
+        color: ``(..., 3)`` a guess of the base colour, sRGB in [0, 1]; its head then predicts a correction of the guess's logit.
+        """
         for name in names:
             if name not in self:
                 raise ValueError(f"heads: expected some of {', '.join(self)}, got {name}")
-        return {name: activate(name, self[name](features)) for name in names}
+        raw = {name: self[name](features) for name in names}
+        if color is not None and "base_color" in raw:
+            raw["base_color"] = raw["base_color"] + color.clamp(COLOR_MARGIN, 1.0 - COLOR_MARGIN).logit()
+        return {name: activate(name, value) for name, value in raw.items()}
 
 
 class _TruncatedExp(torch.autograd.Function):

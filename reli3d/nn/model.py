@@ -18,6 +18,7 @@ from reli3d.nn.reni import EnvironmentDecoder, reni_frame
 from reli3d.nn.tokenizers import ImageTokenizer, TriplaneBank, patch_grid
 from reli3d.nn.transformer import TwoStreamTransformer
 from reli3d.nn.upsample import PixelShuffleUpsampler
+from reli3d.nn.view_features import ViewFeatures
 from reli3d.triplane import sample_triplane
 
 BACKGROUND = 0.5  # grey behind the object in the object encoder's images, sRGB
@@ -69,6 +70,8 @@ class Reconstructor(nn.Module):
         self.environment = EnvironmentDecoder(preset.reni)
         self.heads = Heads(3 * preset.upsampler.channels + preset.view_feature_width, preset.head_width)
         self.merger = WeightMerger(preset.head_width)
+        if preset.view_feature_width:
+            self.view_features = ViewFeatures(width, width=preset.view_feature_width)
         if preset.tone_mapping:
             self.tone_mapping = ToneMappingConstants()
         initialise(self)
@@ -130,11 +133,12 @@ class Reconstructor(nn.Module):
         return self.environment.radiance(code.latent, code.rotation, code.strength, reni_frame(directions))
 
     def query(self, code: Code, points: Tensor, heads: Sequence[str] = tuple(HEADS),
-              view_features: Tensor | None = None) -> dict[str, Tensor]:  # fmt: skip
+              view_features: Tensor | None = None, color: Tensor | None = None) -> dict[str, Tensor]:  # fmt: skip
         """Values of the named heads at points of the model's cube, ``{name: (B, N, outputs)}``, float32.
 
         points: ``(B, N, 3)``, inside plus or minus the preset's radius; features fade to zero outside.
-        view_features: ``(B, N, K)`` where the preset has ``view_feature_width`` K, else None.
+        view_features: ``(B, N, K)`` where the preset has ``view_feature_width`` K, else None.  color: ``(B, N, 3)`` sRGB, what the views
+        show at the points; the base colour is then a correction of it.
         ``density`` is the raw value, see :meth:`level`; ``base_color`` is sRGB-encoded; ``roughness`` is perceptual;
         ``normal`` is unit in the frame of :mod:`reli3d.geometry.bake`; ``deformation`` and ``flexicubes`` are raw, see
         :mod:`reli3d.nn.heads`.  Gradients reach the triplane, the points, the view features and the heads.
@@ -146,13 +150,15 @@ class Reconstructor(nn.Module):
             features = sample_triplane(code.triplane, points / self.preset.radius)
             if view_features is not None:
                 features = torch.cat([features, view_features.float()], dim=-1)
-            values = self.heads(features, heads)
+            values = self.heads(features, heads, color)
             if self.preset.roughness_is_alpha and "roughness" in values:
                 values["roughness"] = values["roughness"].sqrt()
         return values
 
     def level(self, density: Tensor) -> Tensor:
         """Surface level of the ``density`` head's raw values: negative inside, zero on the surface."""
+        if self.preset.log_level:
+            return self.surface_density - density
         return self.preset.density_threshold - truncated_exp(density + self.preset.density_bias)
 
     @property

@@ -91,6 +91,9 @@ class Preset:
     density_threshold: float = 10.0  # the surface is where exp(raw + density_bias) has this value
     density_bias: float = -1.0
     roughness_is_alpha: bool = False  # the roughness head predicts the GGX width; query() returns its square root
+    log_level: bool = False  # the surface level is linear in the raw density (a signed distance) instead of in the density
+    softness: float = 0.02  # model units over which occupancy goes from 1/2 to 0.73: unit of log_level and of the silhouettes' bound
+    silhouette_bound: bool = False  # the density is bounded by the views' masks
     tone_mapping: bool = False  # carry the published tone-mapping constants, which nothing here reads
 
     def to_json(self) -> str:
@@ -145,19 +148,21 @@ OFFICIAL = Preset(
 SMALL = Preset(
     name="small",
     image_size=192,
-    camera_width=256,
-    encoder=EncoderSizes(hidden=256, layers=4, heads=8, patch=16, grid=12, mask_channel=True, ray_maps=True),
+    camera_width=192,
+    encoder=EncoderSizes(hidden=192, layers=4, heads=6, patch=16, grid=12, mask_channel=True, ray_maps=True),
     plane_size=16,
-    backbone=BackboneSizes(heads=8, latents=256, blocks=2, basic_blocks=2, experts=0, experts_from=0, groups=16),
+    backbone=BackboneSizes(heads=6, latents=128, blocks=2, basic_blocks=2, experts=0, experts_from=0, groups=16),
     upsampler=UpsamplerSizes(convolutions=2, scale=4, channels=24),
     head_width=64,
-    view_feature_width=0,
+    view_feature_width=48,
     illumination=IlluminationSizes(
         encoder=EncoderSizes(hidden=128, layers=3, heads=4, patch=16, grid=12, mask_channel=True, ray_maps=True),
         tokens=78, token_width=64, width=256, heads=8, layers=2, groups=16,
     ),
     reni=ReniSizes(latents=49, width=128, layers=6, heads=8, height=64),
     resolution=64,
+    log_level=True,
+    silhouette_bound=True,
 )  # fmt: skip
 
 PRESETS = {preset.name: preset for preset in (SMALL, OFFICIAL)}

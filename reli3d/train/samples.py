@@ -11,7 +11,7 @@ import torch
 from safetensors import safe_open
 from torch import Tensor
 
-from reli3d.render.environment import directions_of
+from reli3d.nn.reni import map_directions
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ def load_sample(path: Path, views: int, points: int, rng: np.random.Generator, *
         "images": images[..., :3], "masks": images[..., 3], "silhouette": every["silhouette"][chosen].float(),
         "c2w": c2w, "intrinsics": every["intrinsics"][chosen], "points": volume @ turn.T, "distance": distance,
         "surface": surface @ turn.T, "material": material, "visible": every["visible"][s][:, chosen].float(),
-        "light_directions": directions_of(light.shape[0]).reshape(-1, 3) @ turn.T, "light": light.reshape(-1, 3),
+        "light_directions": map_directions(light.shape[0]).reshape(-1, 3) @ turn.T, "light": light.reshape(-1, 3),
         "pixels": pixels @ turn.T, "pixel_radiance": pixel_radiance,
     }  # fmt: skip
 

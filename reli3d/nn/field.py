@@ -1,0 +1,48 @@
+"""The field of one object: surface level at points of its volume, material at points of its surface.
+
+This is where the aids of a small preset meet the network: features of the views at the points, colours seen there, and the bound that
+the silhouettes put on the density.  Without them (``official``) a point's triplane features are all there is.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from reli3d.geometry.hull import hull_distance
+from reli3d.nn.model import Code, Reconstructor
+from reli3d.nn.view_features import ViewMaps
+
+MATERIAL = ("base_color", "roughness", "metallic", "normal")
+
+
+def surface_level(model: Reconstructor, code: Code, maps: ViewMaps, points: Tensor) -> Tensor:
+    """Level ``(N,)`` of ``points (N, 3)`` [model frame]: negative inside, zero on the surface; gradients reach the network.
+
+    With the preset's ``silhouette_bound`` a point is no further inside than its worst silhouette has it.
+    """
+    features = model.view_features(maps, points)[0][None] if model.preset.view_feature_width else None
+    density = model.query(code, points[None], ("density",), features)["density"][0, :, 0]
+    level = model.level(density)
+    if model.preset.silhouette_bound:
+        level = torch.maximum(level, bound_level(model, maps, points))
+    return level
+
+
+def bound_level(model: Reconstructor, maps: ViewMaps, points: Tensor) -> Tensor:
+    """Level ``(N,)`` of the soft visual hull of the views' silhouettes at ``points``; no gradient."""
+    silhouette = maps.images[..., 3].contiguous()
+    return -hull_distance(points, silhouette, maps.c2w, maps.intrinsics) / model.preset.softness
+
+
+def surface_material(model: Reconstructor, code: Code, maps: ViewMaps, position: Tensor, normal: Tensor,
+                     visible: Tensor) -> dict[str, Tensor]:  # fmt: skip
+    """Base colour (sRGB-encoded), roughness, metallic and bump normal, ``{name: (N, k)}``, at surface points.
+
+    position, normal: ``(N, 3)``, the geometric normal unit.  visible: ``(N, V)``, 1 where a view sees the point.
+    """
+    features = color = None
+    if model.preset.view_feature_width:
+        features, color = (x[None] for x in model.view_features(maps, position, visible, normal))
+    values = model.query(code, position[None], MATERIAL, features, color)
+    return {name: value[0] for name, value in values.items()}

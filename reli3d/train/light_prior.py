@@ -1,0 +1,127 @@
+"""Training of the environment prior: a RENI++ decoder and one latent code for each map, fitted together.
+
+The decoder is equivariant to turns about the vertical, so maps need no augmentation by yaw; blends of two maps under a relative turn
+and a tint stand in for the many environments that a small collection lacks.  Maps are scaled to a geometric mean of 1: the
+network's strength carries the exposure.  Source: Gardner et al. 2023, RENI++, arXiv 2311.09361, section 4.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+from safetensors.torch import save_file
+from torch import Tensor
+
+from reli3d.nn.presets import SMALL
+from reli3d.nn.reni import EnvironmentDecoder, map_directions, reni_frame
+
+ROWS = 64
+FLOOR = 1e-2  # of the geometric mean: darker is black
+PEAK = 2e3  # of the geometric mean: the sun of a clear sky is 1e4 to 1e5, out of reach of a smooth decoder
+HELD_BACK = 6  # every sixth map is left out of the fit and of all training
+
+
+def load_maps(path: Path) -> tuple[Tensor, list[str]]:
+    """Maps ``(n, 64, 128, 3)`` linear, row 0 up, area-averaged, and their names, from an .npz of ``env`` and ``names``."""
+    data = np.load(path)
+    maps = torch.as_tensor(data["env"].astype(np.float32)).permute(0, 3, 1, 2)
+    maps = torch.nn.functional.interpolate(maps, (ROWS, 2 * ROWS), mode="area").permute(0, 2, 3, 1)
+    return maps.contiguous(), [str(n) for n in data["names"]]
+
+
+def held_back(names: list[str]) -> list[bool]:
+    """Which maps no training may see: every sixth by alphabetical order."""
+    rank = {n: i for i, n in enumerate(sorted(names))}
+    return [rank[n] % HELD_BACK == HELD_BACK - 1 for n in names]
+
+
+def scale_free(maps: Tensor) -> Tensor:
+    """Maps over their solid-angle-weighted geometric mean."""
+    weight = torch.sin((torch.arange(maps.shape[1]) + 0.5) * torch.pi / maps.shape[1])[:, None]
+    log = (maps.mean(-1) + 1e-4).log()
+    mean = (log * weight).sum((1, 2)) / (weight.sum() * maps.shape[2])
+    return (maps / mean.exp()[:, None, None, None]).clamp(max=PEAK)
+
+
+def blends(maps: Tensor, count: int, rng: np.random.Generator) -> Tensor:
+    """``count`` mixtures of two maps, one mirrored or turned, with a tint."""
+    out = []
+    for _ in range(count):
+        a, b = (maps[int(rng.integers(len(maps)))] for _ in range(2))
+        b = torch.roll(b.flip(1) if rng.random() < 0.5 else b, int(rng.integers(maps.shape[2])), 1)
+        t = rng.beta(0.5, 0.5)
+        tint = torch.as_tensor(np.exp(rng.normal(0, 0.15, 3)), dtype=torch.float32)
+        out.append((a ** (1 - t) * b**t if rng.random() < 0.5 else a * (1 - t) + b * t) * tint)
+    return torch.stack(out)
+
+
+def fit(decoder: EnvironmentDecoder, maps: Tensor, *, steps: int, minutes: float, rays: int = 512, batch: int = 16,
+        seed: int = 0, train_decoder: bool = True, log=sys.stderr) -> Tensor:  # fmt: skip
+    """Latents ``(n, L, 3)`` that decode to ``maps``; the decoder is fitted with them in place unless ``train_decoder`` is False."""
+    generator = torch.Generator().manual_seed(seed)
+    latents = torch.nn.Parameter(0.1 * torch.randn(len(maps), decoder.field.network.layers[0].mha.key.in_features // 3, 3, generator=generator))
+    groups = [{"params": [latents], "lr": 1e-2}]
+    if train_decoder:
+        groups.append({"params": [p for p in decoder.field.parameters()], "lr": 1e-3})
+    optimizer = torch.optim.Adam(groups)
+    base = [g["lr"] for g in groups]
+    directions, flat = reni_frame(map_directions(ROWS)).reshape(-1, 3), maps.reshape(len(maps), -1, 3)
+    height = torch.sin((torch.arange(ROWS) + 0.5) * torch.pi / ROWS).repeat_interleave(2 * ROWS)
+    began, mean = time.monotonic(), 0.0
+    for step in range(steps):
+        done = max(step / steps, (time.monotonic() - began) / (60 * minutes))
+        if done >= 1:
+            break
+        for group, rate in zip(optimizer.param_groups, base, strict=True):
+            group["lr"] = rate * min(1, (step + 1) / 100) * 0.5 * (1 + np.cos(np.pi * done)) + 1e-6
+        pick = torch.randint(len(maps), (min(batch, len(maps)),), generator=generator)
+        ray = torch.multinomial(height, rays, generator=generator)  # uniform over the sphere
+        log_radiance = decoder.field(latents[pick], directions[ray][None])
+        target = (flat[pick][:, ray] + FLOOR).log()
+        predicted = torch.logaddexp(log_radiance, torch.full_like(log_radiance, float(np.log(FLOOR))))
+        cosine = 1 - torch.nn.functional.cosine_similarity(log_radiance.exp() + FLOOR, flat[pick][:, ray] + FLOOR, dim=-1).mean()
+        loss = (predicted - target).abs().mean() + 0.3 * cosine + 1e-4 * latents[pick].square().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        mean += float(loss) / 200
+        if step % 200 == 199:
+            print(f"light prior: step {step + 1}, {time.monotonic() - began:.0f} s, loss {mean:.4f}", file=log, flush=True)
+            mean = 0.0
+    return latents.detach()
+
+
+def main() -> None:
+    """Fit the prior and write the decoder, the latents of the real maps and their names."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("maps", type=Path, help=".npz with env (n, H, 2H, 3) and names")
+    parser.add_argument("output", type=Path, help="safetensors file to write")
+    parser.add_argument("--steps", type=int, default=8000)
+    parser.add_argument("--minutes", type=float, default=12.0)
+    parser.add_argument("--blends", type=int, default=400)
+    args = parser.parse_args()
+    torch.manual_seed(0)
+    maps, names = load_maps(args.maps)
+    kept = scale_free(maps[[not h for h in held_back(names)]])
+    decoder = EnvironmentDecoder(SMALL.reni)
+    every = torch.cat([kept, scale_free(blends(kept, args.blends, np.random.default_rng(0)))])
+    latents = fit(decoder, every, steps=args.steps, minutes=args.minutes)
+    state = {k: v.contiguous() for k, v in decoder.state_dict().items()}
+    save_file({**state, "latents": latents}, args.output)
+    test = scale_free(maps[held_back(names)])
+    own = fit(decoder, test, steps=600, minutes=2.0, train_decoder=False)
+    with torch.no_grad():
+        radiance = decoder.field(own, reni_frame(map_directions(ROWS)).reshape(1, -1, 3)).exp().reshape(test.shape)
+    error = ((radiance + FLOOR).log() - (test + FLOOR).log()).abs().mean((1, 2, 3))
+    mean_map = every[: len(kept)].log1p().mean(0).expm1()
+    base = ((mean_map + FLOOR).log() - (test + FLOOR).log()).abs().mean((1, 2, 3))
+    print(f"held-back maps: log error {error.mean():.3f}, of the mean map {base.mean():.3f}", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,114 @@
+"""Supervised training of a reconstructor on synthetic samples: one visible loop, resumable at any step."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import sys
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from reli3d.nn.model import Reconstructor
+from reli3d.train.losses import losses
+from reli3d.train.pictures import write_curves
+from reli3d.train.samples import batches
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    samples: str  # folder of *.safetensors made by reli3d.data.synthesis
+    output: str  # folder of checkpoints, log.jsonl and pictures
+    steps: int = 20000
+    minutes: float = math.inf  # the schedule follows whichever of steps and minutes runs out first
+    batch: int = 4  # objects a step
+    points: int = 2048  # volume points an object; half as many surface points, a quarter of pixels
+    max_views: int = 4  # a step draws 1 to this many views
+    rate: float = 6.0e-4  # peak learning rate; a small network from scratch takes ten times the paper's 5e-5
+    warmup: int = 300  # steps
+    weight_decay: float = 0.02
+    clip: float = 1.0  # of the gradient norm
+    average: float = 0.999  # decay of the averaged weights that are saved for use
+    checkpoint_seconds: float = 300.0
+    seed: int = 0
+
+
+WEIGHTS = {"occupancy": 1.0, "base_color": 10.0, "roughness": 2.0, "metallic": 2.0, "normal": 1.0, "light": 0.5, "image": 0.5}
+
+
+def progress(config: TrainConfig, step: int, seconds: float) -> float:
+    """Share of the training that is done, by steps or by time, whichever is further."""
+    return min(1.0, max(step / config.steps, seconds / (60 * config.minutes)))
+
+
+def rate_at(config: TrainConfig, step: int, done: float) -> float:
+    """Linear warm-up, then a cosine to 2 % of the peak."""
+    return config.rate * min(1.0, (step + 1) / config.warmup) * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * done)))
+
+
+def train(model: Reconstructor, config: TrainConfig) -> None:
+    """Train ``model`` in place until the schedule ends; continue from ``output/state.pt`` where there is one.
+
+    Writes ``state.pt`` (all that resuming needs), ``log.jsonl`` and ``curves.png``.
+    """
+    folder = Path(config.output)
+    folder.mkdir(parents=True, exist_ok=True)
+    groups = [{"params": [p for p in model.parameters() if p.requires_grad and p.ndim > 1], "weight_decay": config.weight_decay},
+              {"params": [p for p in model.parameters() if p.requires_grad and p.ndim <= 1], "weight_decay": 0.0}]  # fmt: skip
+    optimizer = torch.optim.AdamW(groups, lr=config.rate, betas=(0.9, 0.98))
+    average = {k: v.detach().clone() for k, v in model.state_dict().items()}
+    step, seconds = 0, 0.0
+    if (folder / "state.pt").exists():
+        state = torch.load(folder / "state.pt", weights_only=True)
+        model.load_state_dict(state["model"]), optimizer.load_state_dict(state["optimizer"])
+        average, step, seconds = state["average"], state["step"], state["seconds"]
+    log = open(folder / "log.jsonl", "a", buffering=1)  # noqa: SIM115 - open for the whole run
+    log.write(json.dumps({"step": step, "config": asdict(config)}) + "\n")
+    source = batches(Path(config.samples), size=config.batch, points=config.points, max_views=config.max_views,
+                     seed=config.seed, start=step)  # fmt: skip
+    began, saved = time.monotonic() - seconds, time.monotonic()
+    sums: dict[str, float] = {}
+    while progress(config, step, seconds) < 1.0:
+        done = progress(config, step, seconds)
+        for group in optimizer.param_groups:
+            group["lr"] = rate_at(config, step, done)
+        terms = losses(model, next(source))
+        loss = sum(WEIGHTS[k] * v for k, v in terms.items())
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        norm = torch.nn.utils.clip_grad_norm_(model.parameters(), config.clip)
+        if torch.isfinite(norm):
+            optimizer.step()
+        update_average(average, model, min(config.average, (1 + step) / (10 + step)))
+        step, seconds = step + 1, time.monotonic() - began
+        for k, v in {**terms, "norm": norm, "bad": float(not torch.isfinite(norm))}.items():
+            sums[k] = sums.get(k, 0.0) + float(v)
+        if step % 50 == 0:
+            means = {k: round(v / 50, 5) for k, v in sums.items()}
+            log.write(json.dumps({"step": step, "seconds": round(seconds), "rate": optimizer.param_groups[0]["lr"], **means}) + "\n")
+            print(f"step {step} {seconds:.0f} s {means}", file=sys.stderr, flush=True)
+            sums = {}
+        if time.monotonic() - saved > config.checkpoint_seconds:
+            save(folder, model, optimizer, average, step, seconds)
+            saved = time.monotonic()
+    save(folder, model, optimizer, average, step, seconds)
+    log.close()
+
+
+def update_average(average: dict[str, Tensor], model: Reconstructor, decay: float) -> None:
+    with torch.no_grad():
+        for key, value in model.state_dict().items():
+            if value.is_floating_point():
+                average[key].lerp_(value, 1 - decay)
+
+
+def save(folder: Path, model, optimizer, average, step: int, seconds: float) -> None:
+    """Replace the checkpoint and the curves whole: a stop in the middle leaves the old ones."""
+    state = {"model": model.state_dict(), "optimizer": optimizer.state_dict(), "average": average, "step": step, "seconds": seconds}
+    torch.save(state, folder / "state.tmp")
+    os.replace(folder / "state.tmp", folder / "state.pt")
+    write_curves(folder / "log.jsonl", folder / "curves.png")

@@ -1,0 +1,57 @@
+"""What a step of training asks of the network: the field at points, the material at the surface, the light, and images."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from reli3d.nn.field import surface_level, surface_material
+from reli3d.nn.model import Code, Reconstructor
+from reli3d.nn.view_features import ViewMaps
+from reli3d.render.bump import radial_bump
+from reli3d.train.samples import Batch
+
+LIGHT_DIRECTIONS = 384  # of the 2048 of a sample's map: enough for one step's mean, a fifth of the decoder's time
+
+
+def losses(model: Reconstructor, batch: Batch) -> dict[str, Tensor]:
+    """Unweighted terms, each a scalar mean over the batch; gradients reach every parameter that took part."""
+    code = model.encode(batch.images, batch.masks, batch.c2w, batch.intrinsics)
+    fields = [_object_losses(model, code.of(b), batch, b) for b in range(len(batch.images))]
+    terms = {k: torch.stack([f[k] for f in fields]).mean() for k in fields[0]}
+    terms["light"] = light_loss(model, code, batch)
+    return terms
+
+
+def maps_of(code: Code, images: Tensor, silhouette: Tensor, c2w: Tensor, intrinsics: Tensor) -> ViewMaps:
+    return ViewMaps(code.view_tokens[0], torch.cat([images, silhouette[..., None]], -1).contiguous(), c2w, intrinsics)
+
+
+def _object_losses(model: Reconstructor, code: Code, batch: Batch, b: int) -> dict[str, Tensor]:
+    maps = maps_of(code, batch.images[b], batch.silhouette[b], batch.c2w[b], batch.intrinsics[b])
+    level = surface_level(model, code, maps, batch.points[b])
+    target = (-batch.distance[b] / model.preset.softness).sigmoid()
+    out = {"occupancy": functional.binary_cross_entropy_with_logits(-level, target)}
+
+    position, normal, bumped = batch.surface[b].unbind(1)
+    normal = functional.normalize(normal, dim=-1)
+    got = surface_material(model, code, maps, position, normal, batch.visible[b])
+    out["base_color"] = functional.mse_loss(got["base_color"], batch.material[b, :, :3])
+    out["roughness"] = functional.mse_loss(got["roughness"][:, 0], batch.material[b, :, 3])
+    out["metallic"] = functional.mse_loss(got["metallic"][:, 0], batch.material[b, :, 4])
+    world = radial_bump(position, normal, got["normal"])
+    out["normal"] = (1 - functional.cosine_similarity(world, bumped, dim=-1)).mean()
+    return out
+
+
+def light_loss(model: Reconstructor, code: Code, batch: Batch) -> Tensor:
+    """Absolute difference of log radiance over directions, weighted by solid angle; 0.01 keeps black from mattering."""
+    count = batch.light.shape[1]
+    pick = torch.randperm(count)[:LIGHT_DIRECTIONS]
+    directions, target = batch.light_directions[:, pick], batch.light[:, pick]
+    rows = int((count // 2) ** 0.5)
+    weight = torch.sin((pick // (2 * rows) + 0.5) * torch.pi / rows)
+    radiance = model.radiance(code, directions)
+    error = (torch.log(radiance + 0.01) - torch.log(target + 0.01)).abs().mean(-1)
+    return (error * weight).sum() / (weight.sum() * len(error))
