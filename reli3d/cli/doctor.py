@@ -1,0 +1,132 @@
+"""``reli3d doctor``: what is installed, where it runs, and whether it can."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from importlib import metadata
+from pathlib import Path
+
+import reli3d
+
+REQUIRED = ("torch", "warp-lang", "numpy", "scipy", "pillow", "safetensors", "trimesh", "embreex", "OpenEXR",
+            "manifold3d", "xatlas", "tqdm")  # fmt: skip
+ASSETS = Path(reli3d.__file__).parent / "assets"
+PROBLEM = "PROBLEM: "  # starts the value of a line that keeps the package from working
+
+
+def report() -> str:
+    """The report as aligned text: what must be mended says ``PROBLEM``, the last line is the verdict."""
+    return examine()[0]
+
+
+def examine() -> tuple[str, bool]:
+    """``(report, usable)``.  Compiles one kernel where the cache has none, which takes some seconds the first time."""
+    rows = []
+    for part in (_versions, _devices, _cache, _kernels, _files, _tools):
+        try:
+            rows += list(part())
+        except Exception as error:  # the doctor reports what fails, whatever it is, and goes on
+            rows.append((part.__name__[1:], f"{PROBLEM}{type(error).__name__}: {error}"))
+    problems = sum(value.startswith(PROBLEM) for _, value in rows)
+    verdict = "usable" if problems == 0 else f"not usable: {problems} problem{'s' if problems > 1 else ''}"
+    return "\n".join(f"{name:16s} {value}" for name, value in [*rows, ("verdict", verdict)]), problems == 0
+
+
+def _versions() -> Iterator[tuple[str, str]]:
+    yield "reli3d", f"{reli3d.__version__} in {Path(reli3d.__file__).parent}"
+    yield "python", f"{platform.python_version()} on {platform.platform()}"
+    for package in REQUIRED:
+        try:
+            yield package, metadata.version(package)
+        except metadata.PackageNotFoundError:
+            yield package, f"{PROBLEM}not installed: pip install {package}"
+
+
+def _devices() -> Iterator[tuple[str, str]]:
+    import torch
+
+    yield "cpu", f"{os.cpu_count()} cores, {torch.get_num_threads()} threads of torch"
+    if torch.version.cuda is None:
+        yield "cuda", "none: this torch is built without CUDA"
+    elif not torch.cuda.is_available():
+        yield "cuda", f"none: torch is built for CUDA {torch.version.cuda} but finds no usable driver and device"
+    else:
+        for k in range(torch.cuda.device_count()):
+            p = torch.cuda.get_device_properties(k)
+            yield f"cuda:{k}", f"{p.name}, {p.total_memory / 2**30:.0f} GiB, compute {p.major}.{p.minor}"
+
+
+def _cache() -> Iterator[tuple[str, str]]:
+    import warp as wp
+
+    from reli3d import _bridge
+
+    _bridge.initialise()
+    folder = Path(wp.config.kernel_cache_dir)
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            compiled = sum(entry.is_dir() for entry in folder.iterdir())
+        yield "kernel cache", f"{folder}, writable, {compiled} modules compiled"
+    except OSError as error:
+        yield "kernel cache", f"{PROBLEM}{folder} cannot be written ({error}); set WARP_CACHE_PATH to a folder that can"
+
+
+def _kernels() -> Iterator[tuple[str, str]]:
+    import torch
+
+    from reli3d.triplane import sample_triplane
+
+    for device in ["cpu"] + (["cuda"] if torch.cuda.is_available() else []):
+        start = time.perf_counter()
+        value = sample_triplane(torch.ones(1, 3, 2, 4, 4, device=device), torch.zeros(1, 5, 3, device=device))
+        seconds = time.perf_counter() - start
+        right = bool((value == 1).all())
+        yield f"kernels, {device}", f"run ({seconds:.1f} s)" if right else f"{PROBLEM}a triplane of ones is not 1"
+
+
+def _files() -> Iterator[tuple[str, str]]:
+    weights = ASSETS / "weights" / "small.safetensors"
+    if weights.is_file():
+        digest = hashlib.sha256(weights.read_bytes()).hexdigest()
+        yield "weights, small", f"{weights}, {weights.stat().st_size / 2**20:.1f} MiB, sha256 {digest}"
+    else:
+        yield "weights, small", f"{PROBLEM}{weights} is missing: install the package again"
+    example = ASSETS / "example"
+    found = (example / "transforms.json").is_file()
+    yield "example", str(example) if found else f"{PROBLEM}{example} is missing: install the package again"
+
+
+def _tools() -> Iterator[tuple[str, str]]:
+    node = shutil.which("node")
+    if node is None:
+        yield "node", "none (only the glTF validator of the tests uses it)"
+        return
+    done = subprocess.run([node, "--version"], capture_output=True, text=True, timeout=20)
+    yield "node", done.stdout.strip() or f"{node} does not run"
+
+
+def main(argv: list[str] | None = None) -> int:
+    """The command ``reli3d``; returns 0 when usable, 1 when something must be mended, 2 for a wrong call."""
+    parser = argparse.ArgumentParser(
+        prog="reli3d", description="Looks after the installation. The work is done by reli3d-infer and reli3d-train."
+    )
+    parser.add_argument("--version", action="version", version=f"reli3d {reli3d.__version__}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    commands.add_parser("doctor", help="print versions, devices, kernel cache and weights, and whether all is usable")
+    parser.parse_args(argv)
+    text, usable = examine()
+    sys.stdout.write(text + "\n")
+    return 0 if usable else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
