@@ -134,6 +134,15 @@ def test_gradients_are_the_same_bits_for_any_number_of_threads(threads):
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
 
 
+def test_no_addition_is_lost_between_threads(threads):
+    threads(2)
+    n = 1 << 20  # every index adds 1 to the same row, at the same time from two threads; the sums are exact in float32
+    table, index = torch.ones(1, 3, requires_grad=True), torch.zeros(n, dtype=torch.int32)
+    value, _ = gather_scale(table, index, torch.ones(n), 1.0)
+    (g,) = torch.autograd.grad(value, table, torch.ones(n, 3))
+    assert torch.equal(g, torch.full((1, 3), float(n)))
+
+
 def test_empty_launch_gives_empty_results_and_zero_gradients(device):
     table, index, weight, g = operands(0, device)
     value, parity = gather_scale(table, index, weight, 1.0)
