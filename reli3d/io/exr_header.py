@@ -51,7 +51,7 @@ def _header(path, data: bytes) -> ExrHeader:
         (size,) = struct.unpack_from("<i", data, at)
         at += 4
         if size < 0 or at + size > len(data):
-            raise InputError(path, f"EXR attribute {shown(name)}: expected a size in the file, got {size}; save it again")
+            raise InputError(path, f"EXR attribute {shown(name)}: expected a size in the file, got {size}; resave it")
         if kind == "idmanifest" or len(attributes) >= _ATTRIBUTES:
             raise InputError(path, f"EXR attribute {shown(name)}: expected a plain header; save without extra metadata")
         attributes[name] = (kind, data[at : at + size])
@@ -91,7 +91,7 @@ def _channels(path, data: bytes) -> dict[str, str]:
         kind, _, step_x, step_y = struct.unpack_from("<iIii", data, at)
         at += 16
         if kind not in _TYPES or (step_x, step_y) != (1, 1) or name in channels or len(channels) >= 32:
-            raise InputError(path, f"EXR channel {shown(name)}: expected half or float, not subsampled; save as plain RGB")
+            raise InputError(path, f"EXR channel {shown(name)}: expected half or float, not subsampled; save as RGB")
         channels[name] = _TYPES[kind]
     if not channels:
         raise InputError(path, "EXR channels: expected R, G, B, got none; save as plain RGB")

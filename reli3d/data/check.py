@@ -1,0 +1,274 @@
+"""Are these cameras right?  Lines that say so, the likely mistake where they are not, and a picture of the rig.
+
+The test is the visual hull: with right cameras its silhouettes fill the masks.  Where they do not, the usual
+mistakes are undone one after the other, and the one that makes the hull fill the masks is named.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import replace
+
+import numpy as np
+import torch
+from PIL import Image, ImageDraw
+from torch import Tensor
+from torch.nn.functional import max_pool2d, pad
+
+from reli3d.data.normalize import RADIUS, Hull, centre_rays, meeting_point, normalize, visual_hull
+from reli3d.data.views import Views
+from reli3d.io.images import write_png
+from reli3d.render.camera import project
+
+GOOD = 0.8  # share of every mask that the hull of right cameras fills; masks a few pixels off still reach 0.9
+CLEAN = 0.97  # mean share from which no mistake is looked for
+BETTER = 3.0  # an alternative is named where it leaves that many times less of the masks unfilled
+BORDER = 0.6  # share of the image border inside the mask from which the mask looks inverted
+
+_FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
+_HALF_TURN = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0]))
+
+
+def explain_cameras(views: Views) -> list[str]:
+    """One line per view, then one line that says ``cameras agree`` or names the suspected cause of what is wrong."""
+    hull, shares = agreement(views)
+    c2w, intrinsics = views.c2w.double().cpu(), views.intrinsics.double().cpu()
+    rays = centre_rays([m.cpu() for m in views.masks], c2w, intrinsics)
+    target = hull.points.mean(0) if len(hull.points) else meeting_point(c2w[:, :3, 3], rays)[0]
+    lines = []
+    for i, name in enumerate(views.names):
+        height, width = views.masks[i].shape
+        away = target - c2w[i, :3, 3]
+        angle = math.degrees(math.acos(max(-1.0, min(1.0, float(away @ rays[i] / away.norm().clamp_min(1e-12))))))
+        fov = [math.degrees(2 * math.atan(0.5 * s / float(f))) for s, f in zip((width, height), intrinsics[i, :2])]
+        side = "behind the camera" if angle > 90 else f"{angle:.1f} deg off the object's middle"
+        cover = float((views.masks[i] > 0.5).float().mean())
+        lines.append(
+            f"view {i} {name}: {width} x {height}, field of view {fov[0]:.1f} x {fov[1]:.1f} deg, "
+            f"eye {_triple(c2w[i, :3, 3])}, {float(away.norm()):.3g} from the meeting point ({side}), "
+            f"mask {100 * cover:.0f} % of the image, hull fills {100 * shares[i]:.0f} % of it"
+        )
+    return [*lines, _verdict(views, hull, shares)]
+
+
+def _triple(values: Tensor) -> str:
+    return "(" + ", ".join(f"{v:.3g}" for v in values.tolist()) + ")"
+
+
+def agreement(views: Views) -> tuple[Hull, list[float]]:
+    """The visual hull and the share of each mask that its silhouette fills, all 0 where the hull is empty."""
+    hull = visual_hull(views)
+    if len(hull.points) == 0:
+        return hull, [0.0] * len(views)
+    return hull, [_filled(hull, *view) for view in zip(views.masks, views.c2w.double(), views.intrinsics.double())]
+
+
+def _filled(hull: Hull, mask: Tensor, pose: Tensor, camera: Tensor) -> float:
+    pixels, depth = project(hull.points.float(), pose.float().cpu(), camera.float().cpu())
+    step = max(1, math.ceil(float(camera[:2].max()) * hull.cell / float(depth.median())))  # a cell's footprint
+    height, width = mask.shape
+    blocks = max_pool2d(pad(mask.cpu(), (0, -width % step, 0, -height % step))[None], step)[0] > 0.5
+    inside = (pixels >= 0).all(-1) & (pixels[:, 0] < width) & (pixels[:, 1] < height)
+    hit = torch.zeros(blocks.shape)
+    x, y = (pixels[inside] / step).long().unbind(-1)
+    hit[y, x] = 1.0
+    hit = max_pool2d(hit[None], 3, 1, 1)[0] > 0  # cells and blocks do not line up: allow a block on each side
+    return float((hit & blocks).sum() / blocks.sum().clamp_min(1))
+
+
+def _quarter_turn(views: Views, sign: float) -> Views:
+    """The views as if every image had been turned by 90 degrees without its camera."""
+    turn = torch.tensor([[0.0, sign, 0.0, 0.0], [-sign, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+    return replace(views, c2w=views.c2w @ turn.to(views.c2w))
+
+
+def _alternatives(views: Views):
+    """``(what is wrong, what to do, views with it undone)`` for the usual mistakes."""
+    c2w, flip, half = views.c2w, _FLIP.to(views.c2w), _HALF_TURN.to(views.c2w)
+    inverse = torch.linalg.inv(c2w.double()).to(c2w)
+    turned = c2w.clone()
+    turned[:, :3, :3] = c2w[:, :3, :3].transpose(1, 2)
+    cases = [
+        ("the camera axes look flipped: OpenCV (+Y down, looking along +Z) given, OpenGL expected",
+         "negate the second and third column of each matrix", c2w @ flip),
+        ("the matrices look like world-to-camera", "store their inverses", inverse),
+        ("the matrices look like world-to-camera in OpenCV axes (as COLMAP has them)",
+         "store their inverses with the second and third column negated", inverse @ flip),
+        ("the rotations look transposed (world-to-camera) beside camera positions", "transpose the 3x3 blocks", turned),
+        ("the rotations look transposed and in OpenCV axes beside camera positions",
+         "transpose the 3x3 blocks, then negate their second and third column", turned @ flip),
+        ("the images look upside down", "turn them by 180 degrees", c2w @ half),
+    ]  # fmt: skip
+    for what, fix, poses in cases:
+        yield what, fix, replace(views, c2w=poses)
+    what = "the images look turned by 90 degrees (an EXIF orientation that was applied or lost?)"
+    for sign in (1.0, -1.0):
+        yield what, "store them as they were calibrated", _quarter_turn(views, sign)
+
+
+def _verdict(views: Views, hull: Hull, shares: list[float]) -> str:
+    border = min(float((torch.cat([m[0], m[-1], m[:, 0], m[:, -1]]) > 0.5).float().mean()) for m in views.masks)
+    if border > BORDER:
+        return (
+            f"suspect: the masks look inverted (they cover {100 * border:.0f} % of the image border); "
+            "make the object white, the background black"
+        )
+    if len(views) == 1:
+        return _single(views, hull)
+    given = sum(shares) / len(shares)
+    cause, fix, best = "", "", 1.0 - (1.0 - given) / BETTER
+    for what, how, other in _alternatives(views) if given < CLEAN else ():
+        score = sum(agreement(other)[1]) / len(views)
+        if score >= max(best, GOOD):
+            cause, fix, best = what, how, score
+    if cause:
+        return (
+            f"suspect: {cause}; {fix} (the hull then fills {100 * best:.0f} % of the masks instead of "
+            f"{100 * given:.0f} %)"
+        )
+    if min(shares) >= GOOD:
+        low, high = hull.box()
+        size = " x ".join(f"{v:.3g}" for v in (high - low).tolist())
+        return (
+            f"cameras agree: the visual hull fills at least {100 * min(shares):.0f} % of every mask; its box is {size} "
+            f"about {_triple((low + high) / 2)}; {_scaling(views)}"
+        )
+    for i in range(len(views) if len(views) > 2 else 0):
+        if min(agreement(views.select([j for j in range(len(views)) if j != i]))[1]) >= GOOD:
+            return (
+                f"suspect: view {i} ({views.names[i]}) does not agree with the others, which agree without it; "
+                "check its camera and mask, or leave it out"
+            )
+    if len(hull.points) == 0:
+        return (
+            "suspect: no point lies inside all masks (the visual hull is empty): the cameras do not look at a common "
+            "object, or the masks show different things"
+        )
+    return (
+        f"suspect: the visual hull fills only {100 * min(shares):.0f} % of a mask: cameras or masks are inaccurate, or "
+        "the object moved; look at the picture of the rig"
+    )
+
+
+def _single(views: Views, hull: Hull) -> str:
+    pose = views.c2w[0].double().cpu()
+    if float(pose[:3, 3] @ pose[:3, 2]) < 0:  # positive where the origin lies before an OpenGL camera
+        return (
+            "suspect: the camera looks away from the origin: its axes may be flipped (OpenCV given, OpenGL expected), "
+            "or its matrix world-to-camera; one view cannot tell"
+        )
+    if len(hull.points) == 0:
+        return "suspect: no point lies inside the mask; check the field of view and the mask"
+    return f"one view: nothing to compare it with; the object is taken to be as deep as wide; {_scaling(views)}"
+
+
+def _scaling(views: Views) -> str:
+    similarity = normalize(views)
+    if similarity.is_identity():
+        return "left as it is for the network"
+    return f"scaled by {similarity.scale:.4g} and centred for the network"
+
+
+PANEL, THUMB, MARGIN = 560, 184, 12
+_COLOURS = ("#d62728", "#1f77b4", "#2ca02c", "#ff7f0e", "#9467bd", "#17becf", "#e377c2", "#8c564b")
+
+
+def rig_picture(views: Views, path: str | os.PathLike) -> None:
+    """Write a PNG of the rig: frustums, visual hull and the network's cube from two sides, and thumbnails.
+
+    On the thumbnails the mask's outline is green and the hull's cells are red dots.  Raises OSError where ``path``
+    cannot be written.
+    """
+    hull, shares = agreement(views)
+    c2w, intrinsics = views.c2w.double().cpu(), views.intrinsics.double().cpu()
+    target = hull.points.mean(0) if len(hull.points) else hull.aim
+    reach = float((c2w[:, :3, 3] - target).norm(dim=-1).max()) * 1.15
+    frustums = [_frustum(c, k, m.shape, 0.16 * reach) for c, k, m in zip(c2w, intrinsics, views.masks)]
+    spread = np.concatenate([*frustums, hull.points.numpy(), target[None].numpy(), np.zeros((1, 3))])
+    middle, reach = (spread.min(0) + spread.max(0)) / 2, 0.55 * float((spread.max(0) - spread.min(0)).max())
+    columns = max(1, (2 * PANEL + MARGIN) // (THUMB + MARGIN))
+    rows = -(-len(views) // columns)
+    size = (2 * PANEL + 3 * MARGIN, PANEL + 2 * MARGIN + rows * (THUMB + 18 + MARGIN))
+    canvas = Image.new("RGB", size, "white")
+    titles = ("from above: x right, z down", "from the front: x right, y up")
+    for panel, (title, across, down) in enumerate(zip(titles, (0, 0), ((2, 1.0), (1, -1.0)))):
+        corner = (MARGIN + panel * (PANEL + MARGIN), MARGIN)
+        canvas.paste(_panel(views, hull, middle, reach, frustums, title, across, *down), corner)
+    for i in range(len(views)):
+        at = (MARGIN + i % columns * (THUMB + MARGIN), PANEL + 2 * MARGIN + i // columns * (THUMB + 18 + MARGIN))
+        canvas.paste(_thumbnail(views, hull, i), at)
+        label = f"{i} {os.path.basename(views.names[i])[:18]}  {100 * shares[i]:.0f} %"
+        ImageDraw.Draw(canvas).text((at[0], at[1] + THUMB + 2), _latin(label), fill=_COLOURS[i % len(_COLOURS)])
+    write_png(path, np.asarray(canvas))
+
+
+def _latin(text: str) -> str:
+    return text.encode("latin-1", "replace").decode("latin-1")  # Pillow's built-in font has no more
+
+
+def _frustum(pose: Tensor, camera: Tensor, shape: tuple[int, int], length: float) -> np.ndarray:
+    """``(5, 3)`` world points: the eye and the four image corners at depth ``length``."""
+    corners = torch.tensor([[0, 0], [shape[1], 0], [shape[1], shape[0]], [0, shape[0]]], dtype=torch.float64)
+    x, y = ((corners - camera[2:]) / camera[:2]).unbind(-1)
+    local = length * torch.stack([x, -y, -torch.ones_like(x)], -1)
+    return torch.cat([pose[:3, 3][None], local @ pose[:3, :3].T + pose[:3, 3]]).numpy()
+
+
+def _panel(views, hull, middle, reach, frustums, title, across, down, sign) -> Image.Image:
+    picture = Image.new("RGB", (PANEL, PANEL), "#f4f4f4")
+    draw = ImageDraw.Draw(picture)
+    zoom = 0.5 * PANEL / reach
+
+    def at(points) -> list[tuple[float, float]]:
+        p = (np.asarray(points, dtype=np.float64).reshape(-1, 3) - middle) * zoom
+        return [(PANEL / 2 + a, PANEL / 2 + sign * b) for a, b in zip(p[:, across], p[:, down])]
+
+    if len(hull.points):
+        points = hull.points.numpy()
+        order = np.argsort(points[:, 3 - across - down])  # the beholder sits on the positive side of the third axis
+        shade = np.linspace(90, 190, len(order)).astype(int)[::-1]
+        half = max(1.0, 0.5 * hull.cell * zoom)
+        for (x, y), grey in zip(at(points[order]), shade):
+            draw.rectangle((x - half, y - half, x + half, y + half), fill=(int(grey),) * 2 + (int(grey) + 30,))
+        inverse = normalize(views).inverse()
+        cube = RADIUS * torch.tensor([[a, b, c] for a in (-1.0, 1.0) for b in (-1.0, 1.0) for c in (-1.0, 1.0)])
+        flat = at(inverse.apply(cube.double()).numpy())
+        xs, ys = [p[0] for p in flat], [p[1] for p in flat]
+        draw.rectangle((min(xs), min(ys), max(xs), max(ys)), outline="#606060")
+    origin = at(np.zeros((1, 3)))[0]
+    draw.line((origin[0] - 5, origin[1], origin[0] + 5, origin[1]), fill="black")
+    draw.line((origin[0], origin[1] - 5, origin[0], origin[1] + 5), fill="black")
+    for i, frustum in enumerate(frustums):
+        colour = _COLOURS[i % len(_COLOURS)]
+        eye, *corners = at(frustum)
+        for k in range(4):
+            draw.line((*eye, *corners[k]), fill=colour, width=2)
+            draw.line((*corners[k], *corners[(k + 1) % 4]), fill=colour, width=4 if k == 0 else 2)  # bold: the top
+        draw.line((*eye, *at(hull.points.mean(0).numpy() if len(hull.points) else hull.aim.numpy())[0]), fill="#c8c8c8")
+        draw.text((eye[0] + 4, eye[1] + 4), str(i), fill=colour)
+    draw.text((6, 4), f"{title}; square: the network's cube, cross: origin", fill="black")
+    scale = 10 ** math.floor(math.log10(reach))
+    draw.line((8, PANEL - 12, 8 + scale * zoom, PANEL - 12), fill="black", width=2)
+    draw.text((10, PANEL - 26), f"{scale:g}", fill="black")
+    return picture
+
+
+def _thumbnail(views: Views, hull: Hull, i: int) -> Image.Image:
+    height, width = views.masks[i].shape
+    zoom = THUMB / max(height, width)
+    size = (max(1, round(width * zoom)), max(1, round(height * zoom)))
+    image = Image.fromarray((views.images[i].cpu().numpy() * 255).astype(np.uint8)).resize(size, Image.Resampling.BOX)
+    mask = Image.fromarray((views.masks[i].cpu().numpy() * 255).astype(np.uint8)).resize(size, Image.Resampling.BOX)
+    pixels, inside = np.array(image), np.asarray(mask) > 127
+    grown = np.pad(inside, 1)
+    near = grown[:-2, 1:-1] | grown[2:, 1:-1] | grown[1:-1, :-2] | grown[1:-1, 2:]
+    if len(hull.points):
+        at, _ = project(hull.points[::7].float(), views.c2w[i].cpu(), views.intrinsics[i].cpu())
+        x, y = (at * zoom).floor().long().unbind(-1)
+        keep = (x >= 0) & (y >= 0) & (x < size[0]) & (y < size[1])
+        pixels[y[keep].numpy(), x[keep].numpy()] = (220, 30, 30)
+    pixels[near & ~inside] = (0, 200, 0)
+    thumbnail = Image.new("RGB", (THUMB, THUMB), "white")
+    thumbnail.paste(Image.fromarray(pixels), ((THUMB - size[0]) // 2, (THUMB - size[1]) // 2))
+    return thumbnail

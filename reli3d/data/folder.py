@@ -1,0 +1,183 @@
+"""A folder of posed photographs -> Views.
+
+Read are: an object folder as published (``transforms.json`` with per-frame ``camera_fov``), a Blender or nerfstudio
+``transforms.json``, and a COLMAP text model (``sparse/0`` beside ``images``).  The object is told from the background
+by the images' alpha, by ``mask_path``, or by a ``masks`` folder with a file of the same stem for each image.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from reli3d.data.colmap import find_colmap, read_colmap
+from reli3d.data.shots import Lens, Shot, inside
+from reli3d.data.transforms import read_transforms
+from reli3d.data.views import Views
+from reli3d.io.files import InputError
+from reli3d.io.images import read_image
+
+MAX_VIEWS = 16
+MIN_SIDE = 8  # pixels; below it there is nothing to see, and a mistake is likely
+MIN_OBJECT = 16  # pixels of the mask
+ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".PNG", ".JPG", ".JPEG")
+ASPECT = 0.01  # relative difference of the image's aspect and the camera's up to which the intrinsics are rescaled
+
+
+def load_views(
+    folder: str | os.PathLike,
+    *,
+    views: int | None = None,
+    masks: str | os.PathLike | None = None,
+    allow_outside: bool = False,
+) -> Views:
+    """The first ``views`` photographs (all up to 16 if None) of an object folder, with their cameras and masks.
+
+    masks: folder of mask images with the stems of the images; it goes before the images' own alpha.  Otherwise
+    ``mask_path`` of a frame counts, then alpha, then a folder ``masks`` or ``mask`` beside the cameras.
+    allow_outside: let the camera file name images outside ``folder``.
+    Raises InputError, one line that names the file, the field, the value and the fix.
+    """
+    if views is not None and (isinstance(views, bool) or not isinstance(views, int) or not 1 <= views <= MAX_VIEWS):
+        raise InputError("views", f"expected 1 to {MAX_VIEWS}, got {views!r}; give a number in that range")
+    root = Path(folder)
+    try:
+        is_folder = root.is_dir()
+    except (OSError, ValueError):
+        is_folder = False
+    if not is_folder:
+        raise InputError(folder, "expected a folder with transforms.json or a COLMAP text model; check the path")
+    if masks is not None and not Path(masks).is_dir():
+        raise InputError(masks, "masks: expected a folder of mask images, got none; check the path")
+    count, system = views or MAX_VIEWS, None
+    if (root / "transforms.json").exists() or (root / "transforms.json").is_symlink():
+        cameras = inside(root, str(root), "transforms.json", "transforms.json", outside=allow_outside)
+        shots, notes, system = read_transforms(cameras, count, outside=allow_outside)
+    else:
+        model = find_colmap(root)
+        if model is None:
+            raise InputError(folder, "expected transforms.json or a COLMAP text model (sparse/0/cameras.txt, "
+                             "images.txt), "
+                                     "got neither; see the input formats in the documentation")  # fmt: skip
+        shots, notes = read_colmap(root, model, count, outside=allow_outside)
+    loaded = [_load(root, shot, masks, notes, allow_outside) for shot in shots]
+    return Views(
+        images=tuple(image for image, _, _ in loaded),
+        masks=tuple(mask for _, mask, _ in loaded),
+        c2w=torch.from_numpy(np.stack([s.c2w for s in shots]).astype(np.float32)),
+        intrinsics=torch.tensor([k for _, _, k in loaded], dtype=torch.float32),
+        names=tuple(s.name for s in shots),
+        notes=tuple(dict.fromkeys(notes)),
+        coordinate_system=system,
+    )
+
+
+def _load(root: Path, shot: Shot, masks, notes: list[str], outside: bool) -> tuple[Tensor, Tensor, list[float]]:
+    path = _existing(shot.image)
+    if path is None:
+        raise InputError(shot.where, f"file_path: expected an image, got {shot.name!r} which does not exist; "
+                                     "paths are relative to the camera file and use /")  # fmt: skip
+    _still_inside(root, path, shot, outside)
+    image, alpha = read_image(path, notes=notes)
+    height, width = image.shape[:2]
+    if min(height, width) < MIN_SIDE:
+        raise InputError(path, f"expected at least {MIN_SIDE} pixels a side, got {width} x {height}; give a larger "
+                         "image")  # fmt: skip
+    mask = _mask(root, shot, path, alpha, masks, notes, outside)
+    if mask.shape != (height, width):
+        got = f"{mask.shape[1]} x {mask.shape[0]}"
+        raise InputError(path, f"mask: expected {width} x {height} pixels as the image, got {got}; save it at that "
+                         "size")  # fmt: skip
+    if int((mask > 0.5).sum()) < MIN_OBJECT:
+        raise InputError(path, "mask: expected the object to be opaque (white), got a mask that is empty; "
+                               "check that it is neither blank nor inverted")  # fmt: skip
+    return image, mask, intrinsics_of(shot.lens, width, height, shot.where, notes)
+
+
+def _mask(root: Path, shot: Shot, path: Path, alpha: Tensor | None, masks, notes: list[str], outside: bool) -> Tensor:
+    if masks is not None:
+        found = _beside(Path(masks), path)
+        if found is None:
+            raise InputError(masks, f"masks: expected a file for {path.name!r} with its stem, got none; add the mask")
+        return _grey(found, notes)
+    if shot.mask is not None:
+        found = _existing(shot.mask)
+        if found is None:
+            raise InputError(shot.where, f"mask_path: expected an image, got {shot.mask.name!r} which does not exist; "
+                                         "correct the path")  # fmt: skip
+        _still_inside(root, found, shot, outside)
+        return _grey(found, notes)
+    if alpha is not None and float(alpha.min()) < 0.5:
+        return alpha
+    for name in ("masks", "mask"):
+        found = _beside(root / name, path)
+        if found is not None:
+            _still_inside(root, found, shot, outside)
+            return _grey(found, notes)
+    got = "no alpha" if alpha is None else "alpha that is opaque everywhere"
+    raise InputError(path, f"expected alpha or a mask that tells the object from the background, got {got}; save RGBA "
+                           "images, or put white-on-black masks of the same names into a folder 'masks'")  # fmt: skip
+
+
+def _grey(path: Path, notes: list[str]) -> Tensor:
+    """Mask ``(H, W)``: the alpha of a mask file that has one which is used, else its grey value."""
+    colour, alpha = read_image(path, notes=notes)
+    return alpha if alpha is not None and float(alpha.min()) < 0.5 else colour.amax(-1)
+
+
+def _existing(path: Path) -> Path | None:
+    """``path``, or ``path`` with the ending of an image that exists (Blender's exporter leaves it out)."""
+    try:
+        for candidate in (path, *(path.with_name(path.name + ending) for ending in ENDINGS)):
+            if candidate.is_file():
+                return candidate
+        return path if path.exists() else None
+    except (OSError, ValueError):
+        return None
+
+
+def _beside(folder: Path, image: Path) -> Path | None:
+    """The mask of ``image`` in ``folder``: the same stem or the full name (COLMAP), with the ending of an image."""
+    names = (image.name, *(stem + ending for stem in (image.stem, image.name) for ending in ENDINGS))
+    return next((folder / name for name in names if (folder / name).is_file()), None)
+
+
+def _still_inside(root: Path, path: Path, shot: Shot, outside: bool) -> None:
+    if not outside and not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(root)):
+        raise InputError(shot.where, f"file_path: expected a file within the folder, got {path.name!r} which links "
+                         "out of "
+                                     "it; copy the file in")  # fmt: skip
+
+
+def intrinsics_of(lens: Lens, width: int, height: int, where: str, notes: list[str]) -> list[float]:
+    """``[fx, fy, cx, cy]`` in pixels of the stored image of ``width`` x ``height``.
+
+    A camera calibrated at another size of the same aspect is scaled, with a note; InputError if the aspects differ.
+    """
+    sx = sy = 1.0
+    if lens.size is not None and lens.size != (width, height):
+        sx, sy = width / lens.size[0], height / lens.size[1]
+        if abs(sx / sy - 1.0) > ASPECT:
+            raise InputError(where, f"w, h: expected the image's size {width} x {height}, got {lens.size[0]} x "
+                                    f"{lens.size[1]}; calibrate on these images")  # fmt: skip
+        notes.append(f"{where}: intrinsics scaled from {lens.size[0]} x {lens.size[1]} to {width} x {height}")
+    if lens.focal is not None:
+        fx, fy = lens.focal[0] * sx, lens.focal[1] * sy
+    else:
+        fx = 0.5 * width / math.tan(0.5 * lens.fov[0])
+        fy = fx if math.isnan(lens.fov[1]) else 0.5 * height / math.tan(0.5 * lens.fov[1])
+    cx, cy = (0.5 * width, 0.5 * height) if lens.centre is None else (lens.centre[0] * sx, lens.centre[1] * sy)
+    for name, value, side in (("cx", cx, width), ("cy", cy, height)):
+        if not -side < value < 2 * side:
+            raise InputError(where, f"{name}: expected a principal point near the image of {side} pixels, got "
+                             f"{value:.6g}; "
+                                    "give pixels of the stored image")  # fmt: skip
+    if min(fx / width, fy / height) < 0.05 or max(fx / width, fy / height) > 1000:
+        raise InputError(where, f"focal length: expected 0.05 to 1000 image sides, got {fx:.6g} pixels for {width}; "
+                                "give pixels (or radians for an angle)")  # fmt: skip
+    return [fx, fy, cx, cy]

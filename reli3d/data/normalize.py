@@ -1,0 +1,179 @@
+"""From the frame of the input cameras to the frame of the network: the coarse visual hull says where the object is."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import max_pool2d, pad
+
+from reli3d.data.views import Views, mask_box
+
+RADIUS = 0.87  # half side of the network's cube
+SLACK = 1.1  # a hull of few views exceeds its object by about a tenth, so it may exceed the cube by as much
+LONGEST = 0.55  # longest side from which an object in the cube needs no rescaling; in training it is 1
+OFF_CENTRE = 0.25  # as far as the hull's centre of such an object may lie from the origin
+GRIDS = (24, 44)  # cells a side, coarse and refined: the last is 2 to 3 % of the object
+BALL = 1.3  # diameter of the ball that limits the hull, in mask widths: a generic view shows 0.8 of the longest side
+PARALLEL = 0.01  # mean squared sine between the axes (6 degrees) below which depth is guessed, not triangulated
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """``x -> scale * rotation @ x + translation``; float64."""
+
+    scale: float
+    rotation: Tensor  # (3, 3)
+    translation: Tensor  # (3,)
+
+    @staticmethod
+    def identity() -> Similarity:
+        """The map that changes nothing."""
+        return Similarity(1.0, torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
+
+    @staticmethod
+    def from_matrix(matrix: Tensor) -> Similarity:
+        """The map of a 4x4 ``matrix``.  Raises ValueError unless it is a rotation with one positive scale."""
+        m = torch.as_tensor(matrix, dtype=torch.float64)
+        if m.shape != (4, 4) or not bool(torch.isfinite(m).all()):
+            raise ValueError(f"matrix: expected finite numbers of shape (4, 4), got {tuple(m.shape)}")
+        determinant = float(torch.linalg.det(m[:3, :3]))
+        scale = determinant ** (1 / 3) if determinant > 0 else 0.0
+        gram = m[:3, :3].T @ m[:3, :3]
+        last = m[3] - m.new_tensor([0.0, 0.0, 0.0, 1.0])
+        # 1e-5: a matrix that was stored in float32
+        if scale == 0 or float((gram - scale**2 * torch.eye(3)).abs().max()) > 1e-5 * scale**2 or bool(last.any()):
+            raise ValueError("matrix: expected a rotation times a positive scale, got a shear, a mirror or worse")
+        return Similarity(scale, m[:3, :3] / scale, m[:3, 3].clone())
+
+    def matrix(self) -> Tensor:
+        """``(4, 4)`` float64 matrix on column vectors."""
+        rows = torch.cat([self.scale * self.rotation, self.translation[:, None]], -1)
+        return torch.cat([rows, rows.new_tensor([[0.0, 0.0, 0.0, 1.0]])])
+
+    def apply(self, points: Tensor) -> Tensor:
+        """Mapped ``points (..., 3)``, in their dtype and on their device.  Gradients reach the points."""
+        return self.scale * points @ self.rotation.to(points).T + self.translation.to(points)
+
+    def inverse(self) -> Similarity:
+        """The map back."""
+        return Similarity(1 / self.scale, self.rotation.T, -(self.rotation.T @ self.translation) / self.scale)
+
+    def compose(self, first: Similarity) -> Similarity:
+        """``first``, then this map."""
+        return Similarity(self.scale * first.scale, self.rotation @ first.rotation, self.apply(first.translation))
+
+    def is_identity(self) -> bool:
+        """Whether the map changes nothing, to the last bit."""
+        same = torch.equal(self.rotation, torch.eye(3, dtype=torch.float64))
+        return self.scale == 1.0 and same and not bool(self.translation.any())
+
+
+@dataclass(frozen=True)
+class Hull:
+    """Cells of a grid that project into every mask; empty where the cameras and masks agree on nothing."""
+
+    points: Tensor  # (N, 3) float64 cell centres
+    cell: float  # side of a cell
+    aim: Tensor  # (3,) where the views look
+    extent: float  # longest lateral side of the masks at ``aim``
+
+    def box(self) -> tuple[Tensor, Tensor]:
+        """Lower and upper corner ``(3,)``.  ValueError on an empty hull."""
+        if len(self.points) == 0:
+            raise ValueError("hull: expected a point inside all masks, got none; run --check to see the cameras")
+        return self.points.amin(0) - self.cell / 2, self.points.amax(0) + self.cell / 2
+
+
+def normalize(views: Views, mode: str = "auto") -> Similarity:
+    """The map from the frame of the input cameras to the network's frame (no rotation).
+
+    mode ``none``: identity.  ``hull``: the box of the visual hull is centred and its longest side becomes 1, as in
+    training.  ``auto``: identity where the hull already sits well in the network's cube of half side 0.87, else
+    ``hull``.  One view (or views from one direction) has no scale: the depth of the object is guessed as its width, at
+    the point of the ray that is nearest to the origin.  Raises ValueError where no point lies inside all masks.
+    """
+    if mode not in ("auto", "none", "hull"):
+        raise ValueError(f"mode: expected auto, none or hull, got {mode!r}")
+    if mode == "none":
+        return Similarity.identity()
+    low, high = visual_hull(views).box()
+    longest, centre = float((high - low).max()), (low + high) / 2
+    inside = float(torch.maximum(-low, high).max()) <= SLACK * RADIUS
+    if mode == "auto" and inside and longest >= LONGEST and float(centre.norm()) <= OFF_CENTRE:
+        return Similarity.identity()
+    return Similarity(1.0 / longest, torch.eye(3, dtype=torch.float64), -centre / longest)
+
+
+def visual_hull(views: Views) -> Hull:
+    """Coarse visual hull of ``views``, on the CPU: a grid where the views meet, refined once to the box of its cells.
+
+    A cell counts where the masks' maximum over its footprint exceeds one half, so that thin parts are not lost; beyond
+    the border of an image the mask goes on as at the border.  The hull is limited to the ball that the masks' width
+    suggests, which bounds it along rays that no other view crosses.
+    """
+    c2w, intrinsics = views.c2w.double().cpu(), views.intrinsics.double().cpu()
+    masks = [m.cpu() for m in views.masks]
+    origins, rays = c2w[:, :3, 3], centre_rays(masks, c2w, intrinsics)
+    aim, spread = meeting_point(origins, rays)
+    depth = ((aim - origins)[:, None] @ -c2w[:, :3, 2:3])[:, 0, 0]  # along the viewing axes
+    if bool((depth <= 0).any()):
+        return Hull(origins.new_zeros(0, 3), 0.0, aim, 0.0)
+    boxes = torch.tensor([mask_box(m) for m in masks], dtype=torch.float64)
+    sides = (boxes[:, 2:] - boxes[:, :2]) / intrinsics[:, :2] * depth[:, None]
+    extent = float(sides.max())
+    ball = 0.5 * extent * (BALL if spread >= PARALLEL else 1.0)  # views from one side: as deep as wide
+    low, high = aim - ball, aim + ball
+    for grid in GRIDS:
+        cell = float((high - low).max()) / grid
+        axes = [torch.arange(math.ceil(float(h - l) / cell), dtype=torch.float64) for l, h in zip(low, high)]
+        points = low + (torch.cartesian_prod(*axes) + 0.5) * cell
+        points = points[(points - aim).norm(dim=-1) <= ball]
+        for mask, pose, camera in zip(masks, c2w, intrinsics):
+            points = points[_covered(points, mask, pose, camera, cell)]
+        if len(points) == 0:
+            break
+        low, high = points.amin(0) - cell, points.amax(0) + cell
+    return Hull(points, cell, aim, extent)
+
+
+def centre_rays(masks: list[Tensor], c2w: Tensor, intrinsics: Tensor) -> Tensor:
+    """Unit rays ``(V, 3)`` through the middle of each mask's box, world frame."""
+    boxes = torch.tensor([mask_box(m) for m in masks], dtype=c2w.dtype)
+    middle = (boxes[:, :2] + boxes[:, 2:]) / 2
+    x, y = ((middle - intrinsics[:, 2:]) / intrinsics[:, :2]).unbind(-1)
+    local = torch.stack([x, -y, -torch.ones_like(x)], -1)
+    return torch.nn.functional.normalize((c2w[:, :3, :3] @ local[..., None])[..., 0], dim=-1)
+
+
+def meeting_point(origins: Tensor, rays: Tensor) -> tuple[Tensor, float]:
+    """The point ``(3,)`` nearest to all rays, and how well they fix it: the smallest mean squared sine, 0 if parallel.
+
+    Below PARALLEL it is, along the mean ray, the point nearest to the world origin, or at unit distance if that lies
+    behind a camera.
+    """
+    across = torch.eye(3, dtype=rays.dtype) - rays[:, :, None] * rays[:, None]
+    system = across.mean(0)
+    spread = float(torch.linalg.eigvalsh(system)[0])
+    if spread >= PARALLEL:
+        return torch.linalg.solve(system, (across @ origins[..., None]).mean(0)[:, 0]), spread
+    eye, ray = origins.mean(0), torch.nn.functional.normalize(rays.mean(0), dim=-1)
+    distance = float(-(eye @ ray))
+    return eye + ray * (distance if distance > 0 else 1.0), spread
+
+
+def _covered(points: Tensor, mask: Tensor, pose: Tensor, camera: Tensor, cell: float) -> Tensor:
+    """Whether the footprint of a cell of side ``cell`` about each point touches the mask; False behind the camera."""
+    local = (points - pose[:3, 3]) @ pose[:3, :3]
+    depth = (-local[:, 2]).clamp_min(1e-12)
+    step = int(max(1.0, float((camera[:2] * cell / depth.median()).max()) // 2)) if len(points) else 1
+    height, width = mask.shape
+    if step > 1:  # maximum over blocks of half a footprint: the thin part that one sample would miss
+        mask = pad(mask, (0, -width % step, 0, -height % step))
+        mask = max_pool2d(mask[None], step)[0]
+    scaled = torch.stack([camera[0] * local[:, 0], -camera[1] * local[:, 1]], -1) / depth[:, None] + camera[2:]
+    limit = torch.tensor([width - 1, height - 1], dtype=torch.float64)
+    pixel = torch.minimum(scaled.floor().clamp_min(0), limit).long() // step
+    return (mask[pixel[:, 1], pixel[:, 0]] > 0.5) & (local[:, 2] < 0)

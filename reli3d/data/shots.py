@@ -1,0 +1,147 @@
+"""One photograph as a camera file describes it, before its image is read: pose, lens and file, checked."""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import dataclass
+from pathlib import Path, PureWindowsPath
+
+import numpy as np
+
+from reli3d.io.files import InputError, shown
+
+MAX_PATH = 1024
+ORTHONORMAL = 1e-3  # largest entry of R^T R - 1: four digits in a text file; beyond it is a shear or a scale
+MAX_DISTANCE = 1e6  # float32 poses keep a tenth of a unit there
+BEND = 1.0  # pixels a lens may bend a corner of the image and still count as straight
+
+@dataclass(frozen=True)
+class Lens:
+    """Either a field of view in radians, or focal lengths in pixels of an image of ``size`` (None: as stored)."""
+
+    fov: tuple[float, float] | None = None  # (x, y); y is NaN where the focal length is that of x
+    focal: tuple[float, float] | None = None
+    centre: tuple[float, float] | None = None  # None: the middle
+    size: tuple[int, int] | None = None
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A posed image file.  ``where`` names it in error messages: the camera file and the frame."""
+
+    where: str
+    name: str
+    image: Path
+    mask: Path | None
+    c2w: np.ndarray  # (4, 4) float64, OpenGL axes
+    lens: Lens
+
+
+def number(where: str, field: str, value: object, low: float = -math.inf, high: float = math.inf) -> float:
+    """``value`` as a finite float strictly between ``low`` and ``high``.  Raises InputError."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise InputError(where, f"{field}: expected a number, got {shown(value)}; write it without quotes")
+    try:
+        result = float(value)
+    except OverflowError:
+        result = math.inf
+    if not math.isfinite(result):
+        raise InputError(where, f"{field}: expected a finite number, got {shown(value)}; correct the camera file")
+    if not low < result < high:
+        hint = "give radians" if high == math.pi else "correct the camera file"
+        raise InputError(where, f"{field}: expected a number between {low:g} and {high:g}, got {shown(value)}; {hint}")
+    return result
+
+
+def rigid(where: str, field: str, value: object) -> np.ndarray:
+    """``(4, 4)`` float64 rotation and translation from nested lists.  Raises InputError; rounding is cleaned up."""
+    if not isinstance(value, list) or len(value) != 4 or any(not isinstance(r, list) or len(r) != 4 for r in value):
+        raise InputError(where, f"{field}: expected a 4x4 matrix as four lists of four numbers, got {shape_of(value)}; "
+                                "write the camera-to-world matrix row by row")  # fmt: skip
+    matrix = np.array([[number(where, field, v) for v in row] for row in value], dtype=np.float64)
+    if np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-6:
+        transposed = np.abs(matrix[:, 3] - (0, 0, 0, 1)).max() <= 1e-6
+        fix = "transpose it" if transposed else "write the camera-to-world matrix row by row"
+        raise InputError(where, f"{field}: expected the last row 0 0 0 1, got {shown(matrix[3].tolist())}; {fix}")
+    return cleaned(where, field, matrix)
+
+
+def cleaned(where: str, field: str, matrix: np.ndarray) -> np.ndarray:
+    """``matrix`` with the nearest rotation in place of its upper left block.  Raises InputError if that is far."""
+    block = matrix[:3, :3]
+    with np.errstate(over="ignore", invalid="ignore"):
+        determinant, gram = float(np.linalg.det(block)), block.T @ block
+    if not np.isfinite(gram).all() or not determinant > 0:
+        raise InputError(where, f"{field}: expected a rotation (determinant 1), got determinant {determinant:.3g}; "
+                                "a mirrored or flat camera cannot be used, export it again")  # fmt: skip
+    if np.abs(gram - np.eye(3)).max() > ORTHONORMAL:
+        scale = determinant ** (1 / 3)
+        if np.abs(gram / scale**2 - np.eye(3)).max() <= ORTHONORMAL:
+            raise InputError(where, f"{field}: expected a rotation without scale, got scale {scale:.4g}; "
+                                    "divide the 3x3 block by it")  # fmt: skip
+        raise InputError(where, f"{field}: expected a rotation, got axes that are not at right angles or not of length "
+                                "1; export rotation and translation only")  # fmt: skip
+    if np.abs(matrix[:3, 3]).max() > MAX_DISTANCE:
+        raise InputError(where, f"{field}: expected a position within {MAX_DISTANCE:g} of the origin, got "
+                                f"{shown(matrix[:3, 3].tolist())}; shift or scale the cameras")  # fmt: skip
+    u, _, vt = np.linalg.svd(block)
+    result = matrix.copy()
+    result[:3, :3] = u @ vt
+    return result
+
+
+def shape_of(value: object) -> str:
+    """What a value that should be a matrix is, in a few words."""
+    if not isinstance(value, list):
+        return shown(value)
+    return f"{len(value)} rows of {sorted({len(r) if isinstance(r, list) else 'no list' for r in value}, key=str)[:4]}"
+
+
+def inside(root: Path, where: str, field: str, value: object, *, outside: bool = False) -> Path:
+    """Path of the file that ``value`` names relative to ``root``.  Raises InputError if it leaves ``root``.
+
+    Refused: anything but text, URLs, NUL, absolute paths, and (through ``..`` or a link) files outside, unless
+    ``outside`` allows the last two.  The file need not exist.
+    """
+    if not isinstance(value, str) or not value.strip():
+        raise InputError(where, f"{field}: expected the path of a file, got {shown(value)}; correct the camera file")
+    if len(value) > MAX_PATH or "\0" in value:
+        raise InputError(where, f"{field}: expected a path of at most {MAX_PATH} characters without NUL, got "
+                                f"{shown(value)}; correct the camera file")  # fmt: skip
+    if "://" in value or value.lower().startswith(("file:", "data:")):
+        raise InputError(where, f"{field}: expected a file of the folder, got the URL {shown(value)}; download it "
+                         "first")  # fmt: skip
+    absolute = Path(value).is_absolute() or bool(PureWindowsPath(value).drive) or value.startswith(("\\", "~"))
+    if absolute and not outside:
+        raise InputError(where, f"{field}: expected a path within the folder, got the absolute {shown(value)}; "
+                                "copy the file in and write a relative path")  # fmt: skip
+    path = root / value
+    try:
+        real, base = Path(os.path.realpath(path)), Path(os.path.realpath(root))
+    except (OSError, ValueError):
+        raise InputError(where, f"{field}: expected the path of a file, got {shown(value)}; correct it") from None
+    if not outside and not real.is_relative_to(base):
+        raise InputError(where, f"{field}: expected a file within the folder, got {shown(value)} which leads out "
+                         "of it; "
+                                "copy the file in")  # fmt: skip
+    return path
+
+
+def straight(where: str, name: str, bend: float) -> str | None:
+    """Check that a lens bends the image corner by ``bend`` pixels at most BEND; a note where it bends at all."""
+    if bend > BEND or not math.isfinite(bend):
+        raise InputError(where, f"distortion: expected an undistorted lens, got {bend:.3g} pixels at the corner of "
+                                f"{name}; undistort the images (colmap image_undistorter)")  # fmt: skip
+    return f"{where}: lens distortion of {bend:.2g} pixels at the corner ignored" if bend > 0 else None
+
+
+def bend_of(focal: float, width: float, height: float, radial: list[float], tangential: list[float]) -> float:
+    """Pixels by which a polynomial lens moves the image corner: radial k1, k2, k3 and tangential p1, p2 (OpenCV)."""
+    x, y = 0.5 * width / focal, 0.5 * height / focal
+    r2 = x * x + y * y
+    factor = sum(k * r2 ** (i + 1) for i, k in enumerate(radial))
+    p1, p2 = (tangential + [0.0, 0.0])[:2]
+    dx = x * factor + abs(2 * p1 * x * y) + abs(p2 * (r2 + 2 * x * x))
+    dy = y * factor + abs(p1 * (r2 + 2 * y * y)) + abs(2 * p2 * x * y)
+    return focal * math.hypot(dx, dy)

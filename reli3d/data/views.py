@@ -1,0 +1,153 @@
+"""Posed photographs of one object: what every reader of a folder gives and every stage of the pipeline takes.
+
+Colour is sRGB in [0, 1] with straight alpha, the background kept under it.  Cameras are camera-to-world in OpenGL axes
+(+X right, +Y up, looking along -Z), intrinsics (fx, fy, cx, cy) in pixels with pixel centres at +0.5.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from reli3d._bridge import check
+
+if TYPE_CHECKING:
+    from reli3d.data.normalize import Similarity
+
+MASK_EDGE = 0.1  # alpha from which a pixel counts into the bounding box: keeps hair and thin wires, drops codec noise
+
+
+@dataclass(frozen=True)
+class ViewBatch:
+    """Views resampled to one size: ``images (V, S, S, 3)``, ``masks (V, S, S)``, their cameras and names."""
+
+    images: Tensor
+    masks: Tensor
+    c2w: Tensor  # (V, 4, 4)
+    intrinsics: Tensor  # (V, 4) of the resampled images
+    names: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return self.images.shape[0]
+
+    def to(self, device: torch.device | str) -> ViewBatch:
+        """The same batch with its tensors on ``device``."""
+        moved = (t.to(device) for t in (self.images, self.masks, self.c2w, self.intrinsics))
+        return ViewBatch(*moved, self.names)
+
+
+@dataclass(frozen=True)
+class Views:
+    """``V`` posed images of any sizes; view 0 is the hero view of the network.
+
+    images: ``(H, W, 3)`` each, float32 sRGB in [0, 1].  masks: ``(H, W)`` each, float32 alpha in [0, 1].
+    c2w: ``(V, 4, 4)`` rotations and translations.  intrinsics: ``(V, 4)``.  All on one device, without gradient.
+    Raises TypeError or ValueError where shapes, kinds or devices disagree.
+    """
+
+    images: tuple[Tensor, ...]
+    masks: tuple[Tensor, ...]
+    c2w: Tensor
+    intrinsics: Tensor
+    names: tuple[str, ...]
+    notes: tuple[str, ...] = ()  # what reading changed or guessed, one line each
+    coordinate_system: str | None = None  # as the folder states it; recorded only, it turns nothing
+
+    def __post_init__(self):
+        count = len(self.images)
+        check("c2w", self.c2w, last=4)
+        check("intrinsics", self.intrinsics, last=4, like=self.c2w)
+        if count == 0:
+            raise ValueError("images: expected at least one view, got none")
+        if self.c2w.shape != (count, 4, 4):
+            raise ValueError(f"c2w: expected shape ({count}, 4, 4), got {tuple(self.c2w.shape)}")
+        if self.intrinsics.shape != (count, 4):
+            raise ValueError(f"intrinsics: expected shape ({count}, 4), got {tuple(self.intrinsics.shape)}")
+        if len(self.masks) != count or len(self.names) != count:
+            raise ValueError(f"masks, names: expected {count} each, got {len(self.masks)} and {len(self.names)}")
+        for i, (image, mask) in enumerate(zip(self.images, self.masks)):
+            check(f"images[{i}]", image, last=3, like=self.c2w)
+            check(f"masks[{i}]", mask, like=self.c2w)
+            if image.ndim != 3 or image.numel() == 0:
+                raise ValueError(f"images[{i}]: expected shape (H, W, 3), got {tuple(image.shape)}")
+            if mask.shape != image.shape[:2]:
+                raise ValueError(f"masks[{i}]: expected shape {tuple(image.shape[:2])}, got {tuple(mask.shape)}")
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def select(self, which: int | Sequence[int]) -> Views:
+        """The first ``which`` views, or the views of these indices in this order.  ValueError where there are none."""
+        indices = list(range(which)) if isinstance(which, int) else list(which)
+        if not indices or min(indices) < 0 or max(indices) >= len(self):
+            raise ValueError(f"which: expected 1 to {len(self)} views of {len(self)}, got {which}")
+        images, masks, names = (tuple(t[i] for i in indices) for t in (self.images, self.masks, self.names))
+        return replace(
+            self, images=images, masks=masks, names=names, c2w=self.c2w[indices], intrinsics=self.intrinsics[indices]
+        )
+
+    def transformed(self, similarity: Similarity) -> Views:
+        """The same photographs with the cameras in another frame: eyes mapped, axes turned, intrinsics as they are."""
+        c2w = self.c2w.double()
+        rotation = similarity.rotation.to(c2w) @ c2w[:, :3, :3]
+        rows = torch.cat([rotation, similarity.apply(c2w[:, :3, 3])[..., None]], -1)
+        return replace(self, c2w=torch.cat([rows, c2w[:, 3:]], -2).to(self.c2w.dtype))
+
+    def to(self, device: torch.device | str) -> Views:
+        """The same views with their tensors on ``device``."""
+        images, masks = (tuple(t.to(device) for t in group) for group in (self.images, self.masks))
+        return replace(
+            self, images=images, masks=masks, c2w=self.c2w.to(device), intrinsics=self.intrinsics.to(device)
+        )
+
+    def resampled(self, size: int, *, crop: bool = True, padding: float = 0.08) -> ViewBatch:
+        """All views at ``size`` x ``size`` pixels, with the intrinsics of the new pixels.
+
+        crop: cut a square around the mask, ``padding`` of its side left free on each side; it may reach over the
+        border, where the mask is 0 and the colour that of the nearest edge.  Otherwise the whole image is stretched to
+        the square.  Pixels are filtered over the area they cover (triangle filter of its width); where the new pixels
+        are smaller, bilinear.  Raises ValueError on a size below 1 or, with ``crop``, an empty mask.
+        """
+        if size < 1:
+            raise ValueError(f"size: expected at least 1, got {size}")
+        images, masks, intrinsics = [], [], []
+        for image, mask, camera in zip(self.images, self.masks, self.intrinsics.double()):
+            x, y, width, height = _window(mask, padding) if crop else (0, 0, mask.shape[1], mask.shape[0])
+            pixels = _cut(image, mask, x, y, width, height).permute(2, 0, 1)[None]
+            pixels = interpolate(pixels, (size, size), mode="bilinear", align_corners=False, antialias=True)[0]
+            images.append(pixels[:3].permute(1, 2, 0).clamp(0.0, 1.0))
+            masks.append(pixels[3].clamp(0.0, 1.0))
+            scale = camera.new_tensor([size / width, size / height])
+            origin = camera.new_tensor([x, y])
+            intrinsics.append(torch.cat([camera[:2] * scale, (camera[2:] - origin) * scale]))
+        cameras = torch.stack(intrinsics).to(self.intrinsics.dtype)
+        return ViewBatch(torch.stack(images), torch.stack(masks), self.c2w, cameras, self.names)
+
+
+def mask_box(mask: Tensor) -> tuple[int, int, int, int]:
+    """Pixel box ``(x0, y0, x1, y1)``, ends exclusive, of ``mask (H, W)`` above MASK_EDGE; ValueError if empty."""
+    inside = mask > MASK_EDGE
+    columns, rows = inside.any(0).nonzero()[:, 0], inside.any(1).nonzero()[:, 0]
+    if len(rows) == 0:
+        raise ValueError(f"mask: expected a pixel above {MASK_EDGE}, got an empty mask")
+    return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
+
+
+def _window(mask: Tensor, padding: float) -> tuple[int, int, int, int]:
+    x0, y0, x1, y1 = mask_box(mask)
+    side = max(1, round(max(x1 - x0, y1 - y0) * (1.0 + 2.0 * padding)))
+    return (x0 + x1 - side) // 2, (y0 + y1 - side) // 2, side, side
+
+
+def _cut(image: Tensor, mask: Tensor, x: int, y: int, width: int, height: int) -> Tensor:
+    """``(height, width, 4)`` colour and mask of a window that may reach over the border."""
+    rows = torch.arange(y, y + height, device=mask.device)
+    columns = torch.arange(x, x + width, device=mask.device)
+    r, c = rows.clamp(0, mask.shape[0] - 1), columns.clamp(0, mask.shape[1] - 1)
+    inside = (rows == r)[:, None] & (columns == c)[None]
+    return torch.cat([image[r][:, c], (mask[r][:, c] * inside)[..., None]], -1)
