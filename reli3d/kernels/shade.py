@@ -162,7 +162,7 @@ def shade_kernel(
     wo: wp.array(dtype=wp.vec3), base_color: wp.array(dtype=wp.vec3), alpha: wp.array(dtype=float),
     metallic: wp.array(dtype=float), radiance: wp.array2d(dtype=wp.vec3), rows: wp.array2d(dtype=float),
     columns: wp.array2d(dtype=float), density: wp.array2d(dtype=float), points: wp.array(dtype=wp.vec2),
-    plan: Plan, mesh: wp.uint64, shadows: int,
+    pixels: wp.array(dtype=wp.int32), plan: Plan, mesh: wp.uint64, shadows: int,
     # out
     out: wp.array(dtype=wp.vec3),
 ):  # fmt: skip
@@ -171,7 +171,7 @@ def shade_kernel(
     surface = make_surface(normal[i], ng[i], wo[i], base_color[i], alpha[i], metallic[i])
     total = wp.vec3(0.0, 0.0, 0.0)
     for s in range(plan.n_environment + plan.n_visible + plan.n_cosine):
-        c = draw_contribution(surface, plan, points, radiance, rows, columns, density, i, s)
+        c = draw_contribution(surface, plan, points, radiance, rows, columns, density, pixels[i], s)
         if c.value[0] + c.value[1] + c.value[2] > 0.0:
             lit = wp.bool(True)
             if shadows != 0:
@@ -190,7 +190,7 @@ def shade_rays_kernel(
     wo: wp.array(dtype=wp.vec3), base_color: wp.array(dtype=wp.vec3), alpha: wp.array(dtype=float),
     metallic: wp.array(dtype=float), radiance: wp.array2d(dtype=wp.vec3), rows: wp.array2d(dtype=float),
     columns: wp.array2d(dtype=float), density: wp.array2d(dtype=float), points: wp.array(dtype=wp.vec2),
-    plan: Plan,
+    pixels: wp.array(dtype=wp.int32), plan: Plan,
     # out
     origins: wp.array(dtype=wp.vec3), directions: wp.array(dtype=wp.vec3), t_max: wp.array(dtype=float),
     values: wp.array(dtype=wp.vec3),
@@ -201,7 +201,7 @@ def shade_rays_kernel(
     surface = make_surface(normal[i], ng[i], wo[i], base_color[i], alpha[i], metallic[i])
     count = plan.n_environment + plan.n_visible + plan.n_cosine
     for s in range(count):
-        c = draw_contribution(surface, plan, points, radiance, rows, columns, density, i, s)
+        c = draw_contribution(surface, plan, points, radiance, rows, columns, density, pixels[i], s)
         k = j * count + s
         reach = wp.float32(-1.0)
         if c.value[0] + c.value[1] + c.value[2] > 0.0:

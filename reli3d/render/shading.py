@@ -36,6 +36,7 @@ def shade(
     points: str = "halton",
     alpha: str = "squared",
     clamp: float | None = None,
+    pixels: Tensor | None = None,
 ) -> Tensor:
     """Radiance ``(N, 3)`` that leaves surface points towards ``wo``, lit by ``environment``; linear Rec. 709.
 
@@ -48,8 +49,10 @@ def shade(
     strategy) or ``random``.  alpha: GGX width from roughness, ``squared`` or, as in the published model's shader,
     ``linear``.  clamp: largest value of one sample times its strategy's count, per channel.
 
-    Random numbers are a function of ``seed`` and the row, so the result has the same bits for any number of threads.
-    Estimator: Veach and Guibas 1995 over the material of ``reli3d.kernels.bsdf``.
+    pixels: ``(N,)`` int32 counters of the random numbers, by default the row.
+
+    Random numbers are a function of ``seed`` and the counter, so the result has the same bits for any number of
+    threads. Estimator: Veach and Guibas 1995 over the material of ``reli3d.kernels.bsdf``.
     """
     n = _check(position, normal, ng, wo, base_color, roughness, metallic, environment)
     if scene is not None and scene.device != position.device:
@@ -61,7 +64,12 @@ def shade(
                (width, wp.float32), (metallic, wp.float32)]  # fmt: skip
     light = [(environment.radiance, wp.vec3), (table.rows, wp.float32), (table.columns, wp.float32),
              (table.density, wp.float32), (offsets.to(device), wp.vec2)]  # fmt: skip
-    ins = [(t.detach().contiguous(), kind) for t, kind in surface + light]
+    if pixels is None:
+        pixels = torch.arange(n, dtype=torch.int32, device=device)
+    check("pixels", pixels, like=position, dtype=torch.int32)
+    if pixels.shape != (n,):
+        raise ValueError(f"pixels: expected shape ({n},), got {tuple(pixels.shape)}")
+    ins = [(t.detach().contiguous(), kind) for t, kind in [*surface, *light, (pixels, wp.int32)]]
     out = empty((n,), wp.vec3, device)
     if scene is not None and scene.backend == "embree" and scene.faces.shape[0]:
         _shade_embree(n, ins, plan, sum(samples), scene, out)

@@ -1,0 +1,150 @@
+"""Values at known hits: vertex attributes, geometric normals and textures, all with gradients.
+
+``bary`` are the weights of vertices 1 and 2 of a face.  Face -1 is a miss: value 0, no gradient.  Textures are bilinear
+between texel centres at ((column + .5) / T, (row + .5) / T) and repeat in both axes (glTF's default wrap).
+"""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": True, "cpu_compiler_flags": "-march=native"})
+
+AREA_TINY = wp.constant(1.0e-30)  # squared cross product of a face that has no normal
+
+
+@wp.func
+def face_cross(vertices: wp.array(dtype=wp.vec3), faces: wp.array2d(dtype=wp.int32), f: int) -> wp.vec3:
+    """Outward normal of a counter-clockwise face, its length twice the area."""
+    a = vertices[faces[f, 0]]
+    return wp.cross(vertices[faces[f, 1]] - a, vertices[faces[f, 2]] - a)
+
+
+@wp.func
+def wrap(k: int, size: int) -> int:
+    """``k`` modulo ``size``, never negative."""
+    m = k % size
+    if m < 0:
+        m = m + size
+    return m
+
+
+@wp.kernel
+def interpolate2_kernel(
+    start: int,
+    # in
+    values: wp.array(dtype=wp.vec2), faces: wp.array2d(dtype=wp.int32), face: wp.array(dtype=wp.int32),
+    bary: wp.array(dtype=wp.vec2),
+    # out
+    out: wp.array(dtype=wp.vec2),
+):  # fmt: skip
+    i = start + wp.tid()
+    f = face[i]
+    if f >= 0:
+        b = bary[i]
+        out[i] = values[faces[f, 0]] * (1.0 - b[0] - b[1]) + values[faces[f, 1]] * b[0] + values[faces[f, 2]] * b[1]
+    else:
+        out[i] = wp.vec2(0.0, 0.0)
+
+
+@wp.kernel
+def interpolate3_kernel(
+    start: int,
+    # in
+    values: wp.array(dtype=wp.vec3), faces: wp.array2d(dtype=wp.int32), face: wp.array(dtype=wp.int32),
+    bary: wp.array(dtype=wp.vec2),
+    # out
+    out: wp.array(dtype=wp.vec3),
+):  # fmt: skip
+    i = start + wp.tid()
+    f = face[i]
+    if f >= 0:
+        b = bary[i]
+        out[i] = values[faces[f, 0]] * (1.0 - b[0] - b[1]) + values[faces[f, 1]] * b[0] + values[faces[f, 2]] * b[1]
+    else:
+        out[i] = wp.vec3(0.0, 0.0, 0.0)
+
+
+@wp.kernel
+def interpolate4_kernel(
+    start: int,
+    # in
+    values: wp.array(dtype=wp.vec4), faces: wp.array2d(dtype=wp.int32), face: wp.array(dtype=wp.int32),
+    bary: wp.array(dtype=wp.vec2),
+    # out
+    out: wp.array(dtype=wp.vec4),
+):  # fmt: skip
+    i = start + wp.tid()
+    f = face[i]
+    if f >= 0:
+        b = bary[i]
+        out[i] = values[faces[f, 0]] * (1.0 - b[0] - b[1]) + values[faces[f, 1]] * b[0] + values[faces[f, 2]] * b[1]
+    else:
+        out[i] = wp.vec4(0.0, 0.0, 0.0, 0.0)
+
+
+@wp.kernel
+def hit_normal_kernel(
+    start: int,
+    # in
+    vertices: wp.array(dtype=wp.vec3), faces: wp.array2d(dtype=wp.int32), face: wp.array(dtype=wp.int32),
+    # out
+    out: wp.array(dtype=wp.vec3),
+):  # fmt: skip
+    i = start + wp.tid()
+    f = face[i]
+    out[i] = wp.vec3(0.0, 0.0, 0.0)
+    if f >= 0:
+        c = face_cross(vertices, faces, f)
+        square = wp.dot(c, c)
+        if square > AREA_TINY:
+            out[i] = c / wp.sqrt(square)
+
+
+@wp.kernel
+def reevaluate_kernel(
+    start: int,
+    # in
+    vertices: wp.array(dtype=wp.vec3), faces: wp.array2d(dtype=wp.int32), face: wp.array(dtype=wp.int32),
+    origins: wp.array(dtype=wp.vec3), directions: wp.array(dtype=wp.vec3),
+    # out
+    t: wp.array(dtype=float), bary: wp.array(dtype=wp.vec2),
+):  # fmt: skip
+    """Ray against the plane of a known face.  Moller and Trumbore 1997, without their early exits."""
+    i = start + wp.tid()
+    f = face[i]
+    t[i] = wp.inf
+    bary[i] = wp.vec2(0.0, 0.0)
+    if f >= 0:
+        a = vertices[faces[f, 0]]
+        d = directions[i]
+        e1 = vertices[faces[f, 1]] - a
+        e2 = vertices[faces[f, 2]] - a
+        s = origins[i] - a
+        p = wp.cross(d, e2)
+        q = wp.cross(s, e1)
+        inverse = 1.0 / wp.dot(e1, p)
+        t[i] = wp.dot(e2, q) * inverse
+        bary[i] = wp.vec2(wp.dot(s, p) * inverse, wp.dot(d, q) * inverse)
+
+
+@wp.kernel
+def sample_texture_kernel(
+    start: int,
+    # in
+    texture: wp.array2d(dtype=wp.vec3), uv: wp.array(dtype=wp.vec2),
+    # out
+    out: wp.array(dtype=wp.vec3),
+):  # fmt: skip
+    i = start + wp.tid()
+    height = texture.shape[0]
+    width = texture.shape[1]
+    x = uv[i][0] * float(width) - 0.5
+    y = uv[i][1] * float(height) - 0.5
+    fx = x - wp.floor(x)
+    fy = y - wp.floor(y)
+    c0 = wrap(int(wp.floor(x)), width)
+    r0 = wrap(int(wp.floor(y)), height)
+    c1 = wrap(c0 + 1, width)
+    r1 = wrap(r0 + 1, height)
+    top = texture[r0, c0] * (1.0 - fx) + texture[r0, c1] * fx
+    bottom = texture[r1, c0] * (1.0 - fx) + texture[r1, c1] * fx
+    out[i] = top * (1.0 - fy) + bottom * fy

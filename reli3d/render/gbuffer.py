@@ -1,0 +1,179 @@
+"""Primary visibility and what is seen there: hits of a camera, attributes and textures at hits, with gradients.
+
+Which face is hit has no gradient; everything evaluated at the hit has one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import warp as wp
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from reli3d._bridge import call, check
+from reli3d.geometry.mesh import Mesh
+from reli3d.geometry.rays import Hits, RayScene
+from reli3d.kernels import attributes as kernels
+from reli3d.render.asset import TextureSet
+from reli3d.render.camera import Camera, camera_rays
+from reli3d.render.color import srgb_to_linear
+
+_INTERPOLATE = {2: (kernels.interpolate2_kernel, wp.vec2), 3: (kernels.interpolate3_kernel, wp.vec3),
+                4: (kernels.interpolate4_kernel, wp.vec4)}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class SurfacePoints:
+    """What the shader needs of N points; normals unit, ``base_color`` linear."""
+
+    position: Tensor  # (N, 3)
+    ng: Tensor  # (N, 3) geometric normal, outward
+    normal: Tensor  # (N, 3) shading normal
+    base_color: Tensor  # (N, 3)
+    roughness: Tensor  # (N,) perceptual
+    metallic: Tensor  # (N,)
+
+
+def primary_hits(scene: RayScene, camera: Camera) -> tuple[Hits, Tensor, Tensor]:
+    """Closest hits ``(..., H, W)`` through the pixel centres, and the rays' origins and unit directions."""
+    origins, directions = camera_rays(camera)
+    return scene.closest(origins, directions), origins, directions
+
+
+def interpolate(values: Tensor, faces: Tensor, face: Tensor, bary: Tensor) -> Tensor:
+    """Vertex attribute ``(V, C)``, C = 2, 3 or 4, at hits: ``(..., C)``, 0 at a miss.
+
+    faces: ``(F, 3)`` int32.  face: ``(...)`` int32, -1 for a miss.  bary: ``(..., 2)``.  Gradients reach ``values`` and
+    ``bary``.  Raises ValueError for an index out of range.
+    """
+    check("values", values)
+    if values.ndim != 2 or values.shape[1] not in _INTERPOLATE:
+        raise ValueError(f"values: expected shape (V, C) with C = 2, 3 or 4, got {tuple(values.shape)}")
+    _check_faces(values.shape[0], faces, face, values)
+    check("bary", bary, last=2, like=values)
+    kernel, kind = _INTERPOLATE[values.shape[1]]
+    n = face.numel()
+    ins = [(values, kind), (faces, wp.int32), (face.reshape(-1), wp.int32), (bary.reshape(-1, 2), wp.vec2)]
+    (out,) = call(kernel, n, ins, [((n,), kind)], device=values.device, shared=(0,))
+    return out.reshape(*face.shape, values.shape[1])
+
+
+def hit_normals(vertices: Tensor, faces: Tensor, face: Tensor) -> Tensor:
+    """Unit geometric normals ``(..., 3)`` of hit faces ``(...)``, 0 at a miss or on a face without area.
+
+    Gradients reach ``vertices (V, 3)``.
+    """
+    check("vertices", vertices, last=3)
+    _check_faces(vertices.shape[0], faces, face, vertices)
+    n = face.numel()
+    ins = [(vertices, wp.vec3), (faces, wp.int32), (face.reshape(-1), wp.int32)]
+    (out,) = call(kernels.hit_normal_kernel, n, ins, [((n,), wp.vec3)], device=vertices.device, shared=(0,))
+    return out.reshape(*face.shape, 3)
+
+
+def evaluate_hits(vertices: Tensor, faces: Tensor, hits: Hits, origins: Tensor, directions: Tensor) -> Hits:
+    """The hits with ``t`` and ``bary`` re-evaluated from their faces, so that gradients flow.
+
+    vertices: ``(V, 3)``.  faces: ``(F, 3)`` int32.  origins, directions: ``(..., 3)`` of the rays that gave ``hits``.
+    Gradients reach vertices, origins and directions; which face is hit has none.  Moller and Trumbore 1997.
+    """
+    check("vertices", vertices, last=3)
+    _check_faces(vertices.shape[0], faces, hits.face, vertices)
+    check("origins", origins, last=3, like=vertices)
+    check("directions", directions, last=3, like=vertices)
+    shape = hits.face.shape
+    o, d = (v.expand(*shape, 3).reshape(-1, 3) for v in (origins, directions))
+    n = o.shape[0]
+    ins = [(vertices, wp.vec3), (faces, wp.int32), (hits.face.reshape(-1), wp.int32), (o, wp.vec3), (d, wp.vec3)]
+    outs = [((n,), wp.float32), ((n,), wp.vec2)]
+    t, bary = call(kernels.reevaluate_kernel, n, ins, outs, device=vertices.device, shared=(0,))
+    return Hits(hits.face, t.reshape(shape), bary.reshape(*shape, 2))
+
+
+def sample_texture(texture: Tensor, uv: Tensor) -> Tensor:
+    """Bilinear values ``(..., 3)`` of ``texture (H, W, 3)`` at ``uv (..., 2)``, repeating; v counts rows downwards.
+
+    Gradients reach the texels and ``uv``.  A coordinate that is not finite, or beyond a million, raises ValueError.
+    """
+    check("texture", texture, last=3)
+    check("uv", uv, last=2, like=texture)
+    if texture.ndim != 3 or texture.numel() == 0:
+        raise ValueError(f"texture: expected shape (H, W, 3), got {tuple(texture.shape)}")
+    if uv.numel() and not float(uv.detach().abs().max()) < 1e6:  # beyond, float32 has no texel resolution left
+        raise ValueError("uv: expected finite coordinates of magnitude below 1e6, got others")
+    flat = uv.reshape(-1, 2)
+    n = flat.shape[0]
+    ins = [(texture, wp.vec3), (flat, wp.vec2)]
+    (out,) = call(kernels.sample_texture_kernel, n, ins, [((n,), wp.vec3)], device=uv.device, shared=(0,))
+    return out.reshape(*uv.shape[:-1], 3)
+
+
+def tangent_normals(mesh: Mesh, face: Tensor, bary: Tensor, normal: Tensor, mapped: Tensor) -> Tensor:
+    """World normals ``(N, 3)`` of tangent-space normals ``mapped (N, 3)`` around ``normal (N, 3)``.
+
+    Takes the mesh's tangents; without them those of the face's uv, made orthogonal to ``normal``.  The bitangent
+    points up in the texture (glTF 2.0, 3.7.2.1: v is down, +Y is up).
+    """
+    if mesh.tangents is not None:
+        tangent = interpolate(mesh.tangents, mesh.faces, face, bary)
+        tangent, sign = tangent[:, :3], torch.where(tangent[:, 3:] < 0.0, -1.0, 1.0)
+    else:
+        tangent, sign = _uv_tangent(mesh, face)
+    tangent = normalize(tangent - (tangent * normal).sum(-1, keepdim=True) * normal, dim=-1)
+    bitangent = sign * torch.linalg.cross(normal, tangent)
+    world = mapped[:, :1] * tangent + mapped[:, 1:2] * bitangent + mapped[:, 2:] * normal
+    return normalize(world, dim=-1)
+
+
+def surface_points(mesh: Mesh, textures: TextureSet | None, face: Tensor, bary: Tensor) -> SurfacePoints:
+    """Geometry and material of hits: ``face (N,)`` int32, none missing, and ``bary (N, 2)``.
+
+    Without vertex normals the shading normal is the geometric one.  Without textures the base colour is 0.5,
+    roughness 0.5, metallic 0.  Gradients reach the mesh's arrays, the textures and ``bary``.
+    """
+    position = interpolate(mesh.vertices, mesh.faces, face, bary)
+    ng = hit_normals(mesh.vertices, mesh.faces, face)
+    normal = ng
+    if mesh.normals is not None:
+        smooth = interpolate(mesh.normals, mesh.faces, face, bary)
+        square = (smooth * smooth).sum(-1, keepdim=True)
+        normal = torch.where(square > 1e-8, smooth * torch.rsqrt(square.clamp(min=1e-8)), ng)  # opposed normals cancel
+    if textures is None:
+        grey = position.new_full((len(position),), 0.5)
+        return SurfacePoints(position, ng, normal, grey[:, None].expand(-1, 3), grey, torch.zeros_like(grey))
+    if mesh.uv is None:
+        raise ValueError("mesh.uv: expected texture coordinates for a textured asset, got None")
+    uv = interpolate(mesh.uv, mesh.faces, face, bary)
+    orm = sample_texture(textures.orm, uv)
+    mapped = sample_texture(textures.normal, uv) * 2.0 - 1.0
+    return SurfacePoints(
+        position, ng, tangent_normals(mesh, face, bary, normal, mapped),
+        sample_texture(srgb_to_linear(textures.base_color), uv), orm[:, 1], orm[:, 2],
+    )  # fmt: skip
+
+
+def _uv_tangent(mesh: Mesh, face: Tensor) -> tuple[Tensor, Tensor]:
+    """Tangent ``(N, 3)`` along u and handedness ``(N, 1)`` of faces, from the gradients of uv; no gradient."""
+    corners = mesh.faces[face.long()].long()
+    p, uv = mesh.vertices.detach()[corners], mesh.uv.detach()[corners]
+    e1, e2 = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
+    d1, d2 = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+    area = d1[:, :1] * d2[:, 1:] - d1[:, 1:] * d2[:, :1]
+    side = torch.where(area < 0.0, -1.0, 1.0)
+    along_u = side * (e1 * d2[:, 1:] - e2 * d1[:, 1:])
+    fallback = torch.linalg.cross(torch.linalg.cross(e1, e2), e1)  # any tangent serves a face without uv area
+    along_u = torch.where(area.abs() > 1e-20, along_u, fallback)
+    # v is down, so the up bitangent is -dp/dv: a chart that is not mirrored has area < 0 in these coordinates
+    return along_u, -side
+
+
+def _check_faces(count: int, faces: Tensor, face: Tensor, like: Tensor) -> None:
+    check("faces", faces, last=3, like=like, dtype=torch.int32)
+    check("face", face, like=like, dtype=torch.int32)
+    for name, value, high in (("faces", faces, count), ("face", face, faces.shape[0])):
+        if value.numel():
+            low, top = (int(v) for v in torch.aminmax(value))
+            if low < (-1 if name == "face" else 0) or top >= high:
+                raise ValueError(f"{name}: expected indices below {high}, got [{low}, {top}]")

@@ -1,0 +1,119 @@
+"""Images of an asset: primary visibility, materials, direct light with shadows, background, resolve."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from reli3d.geometry.rays import RayScene
+from reli3d.render.asset import Asset
+from reli3d.render.camera import Camera, camera_rays
+from reli3d.render.environment import Environment
+from reli3d.render.gbuffer import surface_points
+from reli3d.render.shading import SAMPLES, shade
+
+BAND_RAYS = 1 << 18  # rays of one band of rows: bounds memory at about 40 MB whatever the image size
+
+
+@dataclass(frozen=True)
+class Render:
+    """One image.  Values are means over the covered subpixels, but ``radiance``, which is over all of them.
+
+    radiance: ``(H, W, 3)`` linear, premultiplied by alpha unless the background was asked for.  alpha: ``(H, W)``.
+    base_color: ``(H, W, 3)`` LINEAR.  roughness, metallic: ``(H, W)``.  normal: ``(H, W, 3)`` unit, world.  position:
+    ``(H, W, 3)`` world.  depth: ``(H, W)`` along the viewing axis, inf where nothing is.  The others are 0 there.
+    """
+
+    radiance: Tensor
+    alpha: Tensor
+    base_color: Tensor
+    roughness: Tensor
+    metallic: Tensor
+    normal: Tensor
+    position: Tensor
+    depth: Tensor
+
+
+def render(
+    asset: Asset,
+    camera: Camera,
+    environment: Environment | None = None,
+    *,
+    samples: tuple[int, int, int] = SAMPLES,
+    supersampling: int = 1,
+    seed: int = 0,
+    shadows: bool = True,
+    background: str = "transparent",
+    scene: RayScene | None = None,
+    clamp: float | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Render:
+    """Image of ``asset`` under ``environment`` (default: the asset's own) with direct light and shadows.
+
+    camera: one camera, no batch.  supersampling: side of the subpixel grid; ``samples`` are per subpixel.  background:
+    ``transparent`` or ``environment``.  scene: rays against the asset's mesh, made here if None.  progress: called
+    with the fraction done.  Gradients reach textures, mesh attributes and environment where
+    :func:`reli3d.render.shading.shade` has them; silhouettes have none.  Raises ValueError without any environment.
+    """
+    environment = environment if environment is not None else asset.environment
+    if environment is None:
+        raise ValueError("environment: expected one, got None from the argument and from the asset")
+    if camera.c2w.ndim != 2:
+        raise ValueError(f"camera.c2w: expected one camera (4, 4), got {tuple(camera.c2w.shape)}")
+    if background not in ("transparent", "environment"):
+        raise ValueError(f"background: expected transparent or environment, got {background}")
+    scene = scene if scene is not None else RayScene(asset.mesh.vertices, asset.mesh.faces)
+    fine = camera.scaled(supersampling)
+    band = max(1, BAND_RAYS // (fine.width * supersampling)) * supersampling
+    parts = []
+    for row in range(0, fine.height, band):
+        rows = min(band, fine.height - row)
+        part = Camera(fine.c2w, fine.intrinsics - fine.intrinsics.new_tensor([0.0, 0.0, 0.0, row]), fine.width, rows)
+        layers = _band(asset, part, environment, scene, row * fine.width, samples, seed, shadows, background, clamp)
+        parts.append([_resolve(layer, supersampling) for layer in layers])
+        if progress is not None:
+            progress((row + rows) / fine.height)
+    radiance, alpha, base_color, orm, normal, position, depth = (torch.cat(p) for p in zip(*parts))
+    cover = alpha.clamp(min=1e-6)  # alpha is 0 or at least 1 / supersampling^2
+    roughness, metallic = (orm / cover).unbind(-1)
+    inside = alpha[..., 0] > 0.0
+    depth = torch.where(inside, (depth / cover)[..., 0], torch.inf)
+    return Render(radiance, alpha[..., 0], base_color / cover, roughness, metallic, normalize(normal, dim=-1),
+                  position / cover, depth)  # fmt: skip
+
+
+def _band(asset, camera, environment, scene, first, samples, seed, shadows, background, clamp) -> list[Tensor]:
+    """Premultiplied layers ``(rows, W, C)`` of one band of subpixels, in the order that :func:`render` takes apart."""
+    origins, directions = (v.reshape(-1, 3) for v in camera_rays(camera))
+    hits = scene.closest(origins, directions)
+    index = torch.nonzero(hits.face >= 0)[:, 0]
+    points = surface_points(asset.mesh, asset.textures, hits.face[index], hits.bary[index])
+    lit = shade(
+        points.position, points.normal, points.ng, -directions[index], points.base_color, points.roughness,
+        points.metallic, environment, samples=samples, scene=scene if shadows else None, seed=seed, clamp=clamp,
+        pixels=(index + first).int(),
+    )  # fmt: skip
+    axis = -camera.c2w[:3, 2]
+    depth = ((points.position - camera.position) * axis).sum(-1, keepdim=True)
+    layers = [lit, torch.ones_like(depth), points.base_color, torch.stack([points.roughness, points.metallic], -1),
+              points.normal, points.position, depth]  # fmt: skip
+    full = []
+    for layer in layers:
+        image = layer.new_zeros(directions.shape[0], layer.shape[1])
+        full.append(image.index_copy(0, index, layer).reshape(camera.height, camera.width, -1))
+    if background == "environment":
+        behind = environment.lookup(directions).reshape(camera.height, camera.width, 3)
+        full[0] = torch.where(full[1] > 0.0, full[0], behind)
+    return full
+
+
+def _resolve(layer: Tensor, factor: int) -> Tensor:
+    """Box mean over ``factor`` x ``factor`` subpixels of ``(H, W, C)``."""
+    if factor == 1:
+        return layer
+    height, width, channels = layer.shape
+    return layer.reshape(height // factor, factor, width // factor, factor, channels).mean((1, 3))
