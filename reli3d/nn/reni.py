@@ -21,17 +21,18 @@ VN_EPS = 1.0e-6  # floor of the published vector-neuron ReLU
 NORM2_MIN = 1.0e-20  # squared length: keeps the slope of the square root finite at a zero latent
 
 
-def map_directions(height: int, device: torch.device | str = "cpu") -> Tensor:
+def map_directions(height: int, device: torch.device | None = None) -> Tensor:
     """Unit world directions of the pixel centres of a lat-long map, ``(height, 2*height, 3)``.
 
     Row 0 is +Y; the centre column looks along -Z, the one right of it towards +X.
     """
-    theta = 2.0 * math.pi * (torch.arange(2 * height, dtype=torch.float64) + 0.5) / (2 * height) - math.pi
-    phi = math.pi * (torch.arange(height, dtype=torch.float64) + 0.5) / height
+    column, row = (torch.arange(n, dtype=torch.float64, device=device) + 0.5 for n in (2 * height, height))
+    theta = math.pi * column / height - math.pi
+    phi = math.pi * row / height
     sin_phi = phi.sin()[:, None]
     up = phi.cos()[:, None].expand(height, 2 * height)
     directions = torch.stack([theta.sin() * sin_phi, up, -theta.cos() * sin_phi], dim=-1)
-    return directions.to(device=device, dtype=torch.float32)
+    return directions.to(torch.float32)
 
 
 def reni_frame(directions: Tensor) -> Tensor:

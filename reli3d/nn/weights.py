@@ -1,0 +1,266 @@
+"""Weights in files: safetensors whose manifest is checked before anything is allocated; published files converted.
+
+A file of ours carries its preset, its licence and what else the writer states in the header, so it loads by itself.  A
+pickle checkpoint is only ever read by torch's restricted reader and turned into such a file.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import pickle
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from safetensors import SafetensorError, safe_open
+from torch import Tensor
+
+from reli3d.io.files import InputError, file_size, replacing
+from reli3d.nn.model import Reconstructor
+from reli3d.nn.presets import OFFICIAL, Preset
+from reli3d.nn.published import CHECKPOINT_PREFIX, our_key
+
+FORMAT = "reli3d 1"
+HEADER_LIMIT = 100 << 20  # bytes, the safetensors library's own bound
+_DTYPES = {"F64": torch.float64, "F32": torch.float32, "F16": torch.float16, "BF16": torch.bfloat16}
+_NAMES = {dtype: name for name, dtype in _DTYPES.items()}
+
+
+class WeightsError(InputError):
+    """A file of weights cannot be used; one line that names the file and what is wrong with it."""
+
+
+@dataclass(frozen=True)
+class Stored:
+    dtype: torch.dtype
+    shape: tuple[int, ...]
+    start: int  # bytes from the first tensor
+    end: int
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """What a safetensors file says it holds."""
+
+    path: str
+    tensors: dict[str, Stored]
+    metadata: dict[str, str]  # of our files: format, preset, licence, and what the writer added
+
+    @property
+    def licence(self) -> str:
+        return self.metadata.get("licence", "not stated")
+
+    def preset(self) -> Preset:
+        """The preset in the file's header.  Raises WeightsError where there is none."""
+        try:
+            return Preset.from_json(self.metadata["preset"])
+        except KeyError:
+            raise WeightsError(self.path, "has no preset in its header; it is not a file of this package") from None
+        except ValueError as error:
+            raise WeightsError(self.path, str(error)) from None
+
+
+def sha256(path: str | os.PathLike) -> str:
+    """Hash of a file's bytes in hexadecimal."""
+    file_size(path)
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def read_manifest(path: str | os.PathLike) -> Manifest:
+    """Names, shapes and metadata of a safetensors file; reads the header only.
+
+    Raises WeightsError unless the header is whole and the file as long as the header says.
+    """
+    size = _size(path)
+    with open(path, "rb") as file:
+        length = int.from_bytes(file.read(8), "little")
+        if size < 8 or length > min(HEADER_LIMIT, size - 8):
+            raise WeightsError(path, "is not a safetensors file, or it is cut off in its header; fetch it again")
+        text = file.read(length)
+    try:
+        header = json.loads(text)
+        metadata = {str(k): str(v) for k, v in header.pop("__metadata__", {}).items()}
+        tensors = {name: _stored(entry) for name, entry in header.items()}
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        raise WeightsError(path, "has a header that is not safetensors'; fetch it again") from None
+    end = 0
+    for name, entry in sorted(tensors.items(), key=lambda item: item[1].start):
+        if entry.start != end or entry.end - entry.start != math.prod(entry.shape) * entry.dtype.itemsize:
+            raise WeightsError(path, f"{name}: shape and place in the file do not agree; fetch it again")
+        end = entry.end
+    if size != 8 + length + end:
+        raise WeightsError(path, f"expected {8 + length + end} bytes, got {size}: cut off or overlong; fetch it again")
+    return Manifest(os.fspath(path), tensors, metadata)
+
+
+def _stored(entry: dict) -> Stored:
+    start, end = (int(value) for value in entry["data_offsets"])
+    shape = tuple(int(value) for value in entry["shape"])
+    if min((start, *shape)) < 0:
+        raise ValueError("negative")
+    return Stored(_DTYPES[entry["dtype"]], shape, start, end)
+
+
+def _size(path: str | os.PathLike) -> int:
+    try:
+        return file_size(path)
+    except InputError as error:
+        raise WeightsError(path, str(error).split(": ", 1)[1]) from None
+
+
+def shapes(preset: Preset) -> dict[str, tuple[int, ...]]:
+    """Name and shape of every stored tensor of the network; allocates nothing."""
+    with torch.device("meta"):
+        return {name: tuple(value.shape) for name, value in Reconstructor(preset).state_dict().items()}
+
+
+def check_keys(where: object, got: Mapping[str, tuple[int, ...]], expected: Mapping[str, tuple[int, ...]]) -> None:
+    """Raise WeightsError where names or shapes differ; the text counts them and names the first."""
+    missing, extra = sorted(expected.keys() - got.keys()), sorted(got.keys() - expected.keys())
+    wrong = sorted(name for name in expected.keys() & got.keys() if tuple(got[name]) != tuple(expected[name]))
+    if missing:
+        raise WeightsError(where, f"lacks {len(missing)} of {len(expected)} tensors, first {missing[0]}")
+    if extra:
+        raise WeightsError(where, f"has {len(extra)} tensors that the preset does not know, first {extra[0]}")
+    if wrong:
+        name = wrong[0]
+        found = f"expected shape {tuple(expected[name])}, got {tuple(got[name])}"
+        raise WeightsError(where, f"{name}: {found}" + (f", and {len(wrong) - 1} more" if len(wrong) > 1 else ""))
+
+
+def load(
+    path: str | os.PathLike,
+    preset: Preset | None = None,
+    *,
+    trunk: torch.dtype = torch.float32,
+    device: torch.device | str = "cpu",
+    expected_sha256: str | None = None,
+) -> tuple[Reconstructor, Manifest]:
+    """The network in a safetensors file, in evaluation mode, and the file's manifest.
+
+    preset: what the file must hold; default the one in its header.  trunk: dtype of the trunk's parameters, the rest
+    is float32.  A tensor that is stored in the dtype asked for stays mapped from the file on a CPU: it takes memory
+    when it is read.  Names, shapes, length and, where given, the hash are checked before anything is allocated.
+    Raises WeightsError.
+    """
+    manifest = read_manifest(path)
+    preset = preset or manifest.preset()
+    check_keys(path, {name: entry.shape for name, entry in manifest.tensors.items()}, shapes(preset))
+    if expected_sha256 is not None:
+        found = sha256(path)
+        if found != expected_sha256:
+            raise WeightsError(path, f"expected SHA-256 {expected_sha256}, got {found}; fetch it again")
+    with torch.device("meta"):
+        model = Reconstructor(preset).to_compute(trunk)
+    wanted = {name: value.dtype for name, value in model.state_dict().items()}
+    model.load_state_dict(read_tensors(path, wanted, device), strict=True, assign=True)
+    return model.eval(), manifest
+
+
+def read_tensors(
+    path: str | os.PathLike, wanted: Mapping[str, torch.dtype], device: torch.device | str = "cpu"
+) -> dict[str, Tensor]:
+    """The tensors named in ``wanted`` as the dtypes it gives; mapped where the file has that dtype and a CPU asks.
+
+    Raises WeightsError.
+    """
+    try:
+        with safe_open(path, "pt", device=str(device)) as file:
+            return {name: file.get_tensor(name).to(dtype) for name, dtype in wanted.items()}
+    except (SafetensorError, OSError) as error:
+        raise WeightsError(path, f"cannot be read ({error})") from None
+
+
+def save(path: str | os.PathLike, model: Reconstructor, *, licence: str, dtype: torch.dtype = torch.float16,
+         metadata: Mapping[str, str] | None = None) -> Manifest:  # fmt: skip
+    """Write the network's parameters as ``dtype`` (buffers as they are), its preset and licence; whole or not at all.
+
+    Raises WeightsError where a value is not finite in ``dtype``: such a file would only fail later.
+    """
+    parameters = {name for name, _ in model.named_parameters()}
+    state = {k: v.detach().to("cpu", dtype if k in parameters else v.dtype) for k, v in model.state_dict().items()}
+    for name, value in state.items():
+        if not torch.isfinite(value).all():
+            raise WeightsError(path, f"{name}: expected finite values in {dtype}; nothing was written")
+    header = {"format": FORMAT, "preset": model.preset.to_json(), "licence": licence, **(metadata or {})}
+    write(path, state, header)
+    return read_manifest(path)
+
+
+def write(path: str | os.PathLike, state: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
+    """Write CPU tensors as safetensors, one after the other, so that mapped ones never lie in memory together."""
+    header: dict[str, object] = {"__metadata__": dict(metadata)}
+    end = 0
+    for name in sorted(state):
+        size = state[name].numel() * state[name].dtype.itemsize
+        header[name] = {"dtype": _NAMES[state[name].dtype], "shape": list(state[name].shape),
+                        "data_offsets": [end, end + size]}  # fmt: skip
+        end += size
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 8)  # the format asks for tensors that start at a multiple of 8
+    with replacing(path) as temporary, open(temporary, "wb") as file:
+        file.write(len(text).to_bytes(8, "little") + text)
+        for name in sorted(state):
+            file.write(state[name].contiguous().reshape(-1).view(torch.uint8).numpy().data)
+
+
+def convert_checkpoint(source: str | os.PathLike, target: str | os.PathLike, *, licence: str,
+                       preset: Preset = OFFICIAL) -> Manifest:  # fmt: skip
+    """Turn a published training checkpoint into a safetensors file of ours, float32 as it is.
+
+    The checkpoint's tensors stay mapped; names go through :mod:`reli3d.nn.published`; a parameter that is stored under
+    two names must be the same under both.  Only torch's restricted reader touches the pickle: anything that would run
+    code is refused.  Raises WeightsError, and then leaves no file.
+    """
+    state = published_state(read_checkpoint(source), source)
+    check_keys(source, {name: tuple(value.shape) for name, value in state.items()}, shapes(preset))
+    header = {"format": FORMAT, "preset": preset.to_json(), "licence": licence, "converted_from": sha256(source)}
+    write(target, state, header)
+    return read_manifest(target)
+
+
+def read_checkpoint(path: str | os.PathLike) -> dict[str, Tensor]:
+    """Tensors of the training system in a Lightning checkpoint, by their published names.  Raises WeightsError."""
+    _size(path)
+    try:
+        content = torch.load(path, weights_only=True, mmap=True, map_location="cpu")
+    except pickle.UnpicklingError as error:
+        reason = " ".join(str(error).split()).split(". ")[-1][:160]
+        raise WeightsError(path, f"holds more than tensors and is refused, nothing was run ({reason})") from None
+    except (RuntimeError, ValueError, EOFError, KeyError, OSError) as error:
+        reason = str(error).splitlines()[0][:160] if str(error) else type(error).__name__
+        raise WeightsError(path, f"is not a torch checkpoint, or it is cut off ({reason}); fetch it again") from None
+    state = content.get("state_dict") if isinstance(content, dict) else None
+    if not isinstance(state, dict) or not all(isinstance(k, str) and isinstance(v, Tensor) for k, v in state.items()):
+        raise WeightsError(path, "expected tensors under state_dict; it is not a training checkpoint")
+    return {k[len(CHECKPOINT_PREFIX) :]: v for k, v in state.items() if k.startswith(CHECKPOINT_PREFIX)}
+
+
+def published_state(published: Mapping[str, Tensor], where: object) -> dict[str, Tensor]:
+    """Tensors by our names from published ones.  Raises WeightsError for an unknown name or unequal aliases."""
+    state: dict[str, Tensor] = {}
+    for name, value in published.items():
+        ours = our_key(name)
+        if ours is None:
+            raise WeightsError(where, f"{name}: not a tensor of the published model")
+        if value.dtype not in _NAMES:
+            raise WeightsError(where, f"{name}: expected floating-point values, got {value.dtype}")
+        other = state.setdefault(ours, value)
+        if other is not value and not (other.data_ptr() == value.data_ptr() or torch.equal(other, value)):
+            raise WeightsError(where, f"{name}: expected the values of the same parameter's other name")
+    return state
+
+
+def load_environment(path: str | os.PathLike, model: Reconstructor) -> Manifest:
+    """Fill the environment decoder in place from the published RENI++ file.  Raises WeightsError."""
+    manifest = read_manifest(path)
+    field = model.environment.field
+    expected = {name: tuple(value.shape) for name, value in field.state_dict().items()}
+    check_keys(path, {name: entry.shape for name, entry in manifest.tensors.items()}, expected)
+    device = model.environment.sample_directions.device
+    field.load_state_dict(read_tensors(path, {name: torch.float32 for name in expected}, device), strict=True)
+    return manifest

@@ -1,0 +1,226 @@
+"""Modules of the network against inputs, parameters and outputs of the published model's modules."""
+
+import numpy as np
+import pytest
+import torch
+
+from reli3d.nn.camera import CameraEmbedder, camera_vector, ray_maps
+from reli3d.nn.heads import HEADS, Heads, WeightMerger
+from reli3d.nn.illumination import Illumination, Transformer1D
+from reli3d.nn.presets import BackboneSizes, EncoderSizes, IlluminationSizes, UpsamplerSizes
+from reli3d.nn.published import our_key
+from reli3d.nn.reni import rotation_from_6d, rotation_to_6d
+from reli3d.nn.tokenizers import ImageTokenizer, patch_grid, resample_positions
+from reli3d.nn.transformer import TwoStreamTransformer
+from reli3d.nn.upsample import PixelShuffleUpsampler
+from reli3d.triplane import sample_triplane
+
+SHALLOW = dict(rtol=1e-5, atol=1e-5)  # one to four float32 layers with sums of at most a few hundred terms
+DEEP = dict(rtol=1e-4, atol=2e-5)  # blocks of attention and norms; the goldens say about 1e-5 of the largest value
+
+
+class Golden:
+    """One golden file: tensors by name, and the parameters of its module under our names."""
+
+    def __init__(self, path):
+        with np.load(path) as file:
+            self.values = {k: torch.from_numpy(file[k]) for k in file.files if file[k].dtype.kind in "fi"}
+
+    def __getitem__(self, name):
+        return self.values[name]
+
+    def load(self, module, published, ours, part=""):
+        """Fill ``module``: the file's ``param.<part>*``, whose full published name starts with ``published``."""
+        parameters = {k[len("param.") :]: v for k, v in self.values.items() if k.startswith("param." + part)}
+        named = {our_key(published + k): v for k, v in parameters.items()}
+        module.load_state_dict({k[len(ours) :]: v for k, v in named.items()}, strict=True)
+        return module.eval()
+
+
+@pytest.fixture
+def golden(goldens):
+    return lambda name: Golden(goldens / f"{name}.npz")
+
+
+def assert_relative(got, expected, bound):
+    """Largest difference over the largest value, the measure in which the goldens state their agreement."""
+    error = (got - expected).abs().max() / expected.abs().max()
+    assert error < bound, f"relative error {error:.2e}, bound {bound:.0e}"
+
+
+@torch.no_grad()
+def test_camera_embedding_matches_published(golden):
+    g = golden("camera_embedder")
+    module = g.load(CameraEmbedder(64), "preprocessor.1.", "camera.")
+    numbers = torch.cat([g["c2w"].flatten(-2), g["intrinsics_normed"].flatten(-2)], dim=-1)
+    torch.testing.assert_close(module.linear(numbers), g["out"], **SHALLOW)
+
+
+def test_camera_vector_holds_both_matrices_row_by_row():
+    c2w = torch.arange(16.0).reshape(1, 1, 4, 4)
+    vector = camera_vector(c2w, torch.tensor([[[512.0, 256.0, 250.0, 260.0]]]), 500)[0, 0]
+    expected = [1.024, 0, 0.5, 0, 0.512, 0.52, 0, 0, 1]
+    torch.testing.assert_close(vector, torch.cat([torch.arange(16.0), torch.tensor(expected)]))
+
+
+def test_ray_maps_are_pluecker_coordinates_of_the_pixels():
+    generator = torch.Generator().manual_seed(0)
+    c2w = torch.eye(4).repeat(2, 3, 1, 1)
+    c2w[..., :3, :3] = torch.linalg.qr(torch.randn(2, 3, 3, 3, generator=generator))[0]
+    c2w[..., :3, 3] = torch.randn(2, 3, 3, generator=generator)
+    intrinsics = torch.tensor([30.0, 25.0, 7.0, 9.0]).expand(2, 3, 4)
+    maps = ray_maps(c2w, intrinsics, 16)
+    direction, moment = maps[:, :, :3], maps[:, :, 3:]
+    torch.testing.assert_close(direction.norm(dim=2), torch.ones(2, 3, 16, 16))
+    # a point on the ray of pixel (row 4, column 11), 2.5 along: its projection is that pixel's centre
+    point = c2w[..., :3, 3] + 2.5 * direction[..., 4, 11]
+    local = torch.einsum("bvij,bvi->bvj", c2w[..., :3, :3], point - c2w[..., :3, 3])
+    column = 30.0 * local[..., 0] / -local[..., 2] + 7.0
+    row = -25.0 * local[..., 1] / -local[..., 2] + 9.0
+    torch.testing.assert_close(column, torch.full((2, 3), 11.5))
+    torch.testing.assert_close(row, torch.full((2, 3), 4.5))
+    torch.testing.assert_close(torch.linalg.cross(point, direction[..., 4, 11]), moment[..., 4, 11], **SHALLOW)
+
+
+DINO = EncoderSizes(hidden=48, layers=2, heads=3, patch=14, grid=7, mask_channel=False, ray_maps=False)
+
+
+@torch.no_grad()
+def test_image_tokens_match_published(golden):
+    g = golden("dinov2_tokenizer_small")
+    module = g.load(ImageTokenizer(DINO, 48), "tokenizer.0.", "encoder.")
+    tokens = module(g["image"], g["camera_embedding"])
+    assert_relative(tokens, g["out"], 1e-5)
+    assert patch_grid(tokens).shape == (1, 2, 5, 5, 48)
+    torch.testing.assert_close(patch_grid(tokens)[0, 1, 2, 3], tokens[0, 1, 1 + 2 * 5 + 3])
+
+
+@torch.no_grad()
+def test_image_tokens_in_bfloat16_stay_near(golden):
+    g = golden("dinov2_tokenizer_small")
+    module = g.load(ImageTokenizer(DINO, 48), "tokenizer.0.", "encoder.").to(torch.bfloat16)
+    assert_relative(module(g["image"], g["camera_embedding"]).float(), g["out"], 3e-2)  # 8 bits, some 20 roundings deep
+
+
+@torch.no_grad()
+def test_position_resampling_uses_the_published_factor(golden):
+    g = golden("dinov2_pos_resample_512")
+    torch.testing.assert_close(resample_positions(g["position_embeddings"], 36, 36), g["out"], **SHALLOW)
+    same = resample_positions(g["position_embeddings"], 37, 37)
+    assert same is g["position_embeddings"]
+
+
+@torch.no_grad()
+def test_two_streams_match_published(golden):
+    g = golden("two_stream_small")
+    sizes = BackboneSizes(heads=4, latents=12, blocks=3, basic_blocks=2, experts=3, experts_from=1, groups=8)
+    module = g.load(TwoStreamTransformer(sizes, 32), "backbone.", "backbone.")
+    logits = []
+    router = module.main_blocks[1].transformer_block[0].ff.routing_network
+    router.register_forward_hook(lambda _module, _inputs, output: logits.append(output))
+    out = module(g["input"].squeeze(1), g["cross"])
+    assert_relative(out, g["out"].squeeze(1), 1e-5)
+    assert_relative(logits[0], g["router_logits_block1_basic0"], 1e-5)
+    shared = module(g["input"][:1].squeeze(1), g["cross"])  # one bank for the whole batch: the same as repeating it
+    repeated = module(g["input"][:1].squeeze(1).repeat(2, 1, 1), g["cross"])
+    torch.testing.assert_close(shared, repeated, **SHALLOW)
+
+
+@torch.no_grad()
+def test_feed_forward_in_chunks_is_the_same(golden):
+    g = golden("two_stream_small")
+    sizes = BackboneSizes(heads=4, latents=12, blocks=3, basic_blocks=2, experts=3, experts_from=1, groups=8)
+    module = g.load(TwoStreamTransformer(sizes, 32), "backbone.", "backbone.")
+    for part in module.modules():
+        if hasattr(part, "rows"):
+            part.rows = 5
+    assert_relative(module(g["input"].squeeze(1), g["cross"]), g["out"].squeeze(1), 1e-5)
+
+
+def illumination_sizes(**changes):
+    encoder = EncoderSizes(hidden=24, layers=2, heads=2, patch=14, grid=7, mask_channel=True, ray_maps=False)
+    values = dict(encoder=encoder, tokens=78, token_width=32, width=32, heads=4, layers=2, groups=4)
+    return IlluminationSizes(**{**values, **changes})
+
+
+@torch.no_grad()
+def test_token_transformer_matches_published(golden):
+    g = golden("transformer1d_small")
+    module = Transformer1D(illumination_sizes(layers=3))
+    g.load(module, "postprocessor.1.backbone.", "illumination.transformer.")
+    assert_relative(module(g["input"], g["cross"]), g["out"], 1e-5)
+
+
+@torch.no_grad()
+def test_illumination_path_matches_published(golden):
+    g = golden("env_postprocessor_small")
+    module = g.load(Illumination(illumination_sizes(groups=16), 49, 40, 16), "postprocessor.1.", "illumination.")
+    images, mask = g["image"] * g["mask"], g["mask"].movedim(-1, 2)
+    latent, rotation, strength = module(images, mask, g["camera_embedding"], g["triplane_raw"])
+    assert_relative(latent, g["reni_latent"], 1e-5)
+    torch.testing.assert_close(rotation, g["rotation"], **DEEP)
+    torch.testing.assert_close(strength, g["strength"].squeeze(1), **DEEP)
+
+
+@torch.no_grad()
+def test_upsampling_matches_published(golden):
+    g = golden("pixel_shuffle_small")
+    module = PixelShuffleUpsampler(UpsamplerSizes(convolutions=4, scale=4, channels=5), 16)
+    g.load(module, "postprocessor.0.", "upsampler.")
+    assert_relative(module(g["triplane"]), g["out"], 1e-5)
+
+
+def test_rotations_match_published_and_return(golden):
+    g = golden("rotation_6d")
+    torch.testing.assert_close(rotation_from_6d(g["d6"]), g["matrix"], **SHALLOW)
+    torch.testing.assert_close(rotation_to_6d(rotation_from_6d(g["d6"])), g["back"], **SHALLOW)
+    torch.testing.assert_close(rotation_from_6d(torch.zeros(1, 6)), g["zeros_out"])
+    matrix = rotation_from_6d(g["d6"].double())
+    torch.testing.assert_close(matrix @ matrix.mT, torch.eye(3, dtype=torch.float64).expand(16, 3, 3))
+    assert (torch.linalg.det(matrix) > 0).all()
+
+
+PUBLISHED_HEADS = {
+    "density": "density_raw",
+    "base_color": "basecolor",
+    "normal": "surface-normal",
+    "deformation": "vertex-offset",
+    "flexicubes": "flexicubes-weight",
+}
+
+
+def published_heads(g):
+    return g.load(Heads(120, 64), "object_representation.", "heads.", "net.heads.")
+
+
+@torch.no_grad()
+def test_heads_match_published(golden):
+    g = golden("object_representation_heads")
+    heads = published_heads(g)
+    values = heads(g["features"], list(HEADS))
+    for name, value in values.items():
+        shift = -1.0 if name == "density" else 0.0  # the published raw density has its bias added
+        torch.testing.assert_close(value + shift, g["out." + PUBLISHED_HEADS.get(name, name)], **SHALLOW)
+    with pytest.raises(ValueError, match="heads: expected some of density"):
+        heads(g["features"], ["colour"])
+
+
+@torch.no_grad()
+def test_merged_cube_weights_match_published(golden):
+    """The first 64 cubes of a 16^3 grid lie along z, then y: their corners are gathered here, index by index."""
+    g, h = golden("object_representation_mesh16"), golden("object_representation_heads")
+    heads = published_heads(h)
+    merger = h.load(WeightMerger(64), "object_representation.", "merger.", "indices_merging_mlp.")
+    axis = torch.linspace(-1.0, 1.0, 17)
+    points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1).reshape(1, -1, 3)
+    values = heads(sample_triplane(g["triplane"], points), ["flexicubes", "deformation", "density"])
+    torch.testing.assert_close(values["deformation"][0], g["vertex_offset"], **DEEP)
+    torch.testing.assert_close((values["density"][0, :, 0] - 1.0).exp(), g["density_grid"], **DEEP)
+    grid = values["flexicubes"].reshape(17, 17, 17, 16)
+    steps = [(k & 1, k >> 1 & 1, k >> 2) for k in range(8)]
+    corners = torch.stack(
+        [torch.stack([grid[x, c // 16 + y, c % 16 + z] for x, y, z in steps]) for c in range(64)]
+    )
+    assert_relative(merger.merged(corners), g["weight21_first64"], 1e-5)
+    weights = merger(corners)
+    assert weights.beta.shape == (64, 12) and weights.alpha.shape == (64, 8) and weights.gamma.shape == (64,)

@@ -1,0 +1,139 @@
+"""The RENI++ decoder with its published weights, against maps that the published code made and against its symmetry."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from reli3d.nn.presets import OFFICIAL
+from reli3d.nn.reni import EnvironmentDecoder, map_directions, reni_frame
+from reli3d.nn.weights import WeightsError, read_manifest, read_tensors
+
+# Float32 through six norms, then exp; measured 6e-6 of the value.  The bound is the one asked for.
+MAP = dict(rtol=1e-4, atol=1e-6)
+
+
+@pytest.fixture
+def decoder(goldens):
+    decoder = EnvironmentDecoder(OFFICIAL.reni)
+    path = goldens.parent / "reni++L49.safetensors"
+    decoder.field.load_state_dict(read_tensors(path, {k: v.dtype for k, v in decoder.field.state_dict().items()}))
+    return decoder.eval()
+
+
+@pytest.fixture
+def golden(goldens):
+    def read(name):
+        with np.load(goldens / f"{name}.npz") as file:
+            return {k: torch.from_numpy(file[k]) for k in file.files}
+
+    return read
+
+
+@torch.no_grad()
+def test_maps_match_published(decoder, golden):
+    g = golden("reni_decoder")
+    out = decoder(g["latent"], g["rotation"], g["strength"])
+    torch.testing.assert_close(out, g["env_map"], **MAP)
+
+
+@torch.no_grad()
+def test_intermediate_features_match_published(decoder, golden):
+    g = golden("reni_decoder")
+    torch.testing.assert_close(decoder.sample_directions, g["sample_directions"], rtol=0, atol=5e-7)  # its angles are float32
+    turned = g["latent"] @ g["rotation"].mT
+    torch.testing.assert_close(decoder.field.conditioning(turned), g["conditioning"], rtol=1e-5, atol=1e-6)
+    features = decoder.field.directional(turned, g["sample_directions"][None, ::512])
+    torch.testing.assert_close(features, g["directional_first16"], rtol=1e-5, atol=2e-6)
+
+
+@torch.no_grad()
+def test_map_turned_about_the_vertical_matches_published(decoder, golden):
+    g = golden("reni_decoder_zrot")
+    out = decoder(g["latent"], g["rotation"], g["strength"], z_rotation=g["z_rotation_rads"].reshape(1))
+    torch.testing.assert_close(out, g["env_map"], **MAP)
+
+
+@torch.no_grad()
+def test_turning_the_latents_turns_the_map(decoder):
+    """A turn of the latents about the vertical by a quarter moves every column by a quarter of the width."""
+    generator = torch.Generator().manual_seed(2)
+    latent = torch.randn(1, 49, 3, generator=generator)
+    quarter = torch.tensor([[[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]])
+    zero = torch.zeros(1)
+    plain = decoder(latent, torch.eye(3)[None], zero, 16)
+    turned = decoder(latent, quarter, zero, 16)
+    # z up: counter-clockwise from above.  In the map the right is clockwise seen from above, so columns move left.
+    torch.testing.assert_close(turned, plain.roll(-8, dims=2), **MAP)
+    assert (turned - plain).abs().max() > 0.1 * plain.mean()
+
+
+@torch.no_grad()
+def test_zero_latent_is_a_sky(decoder):
+    sky = decoder(torch.zeros(1, 49, 3), torch.eye(3)[None], torch.zeros(1))
+    torch.testing.assert_close(sky[0, 0].mean(0), torch.tensor([0.216, 0.287, 0.355]), rtol=5e-3, atol=0)  # 3 digits
+    assert sky[0, 0].mean() > 20 * sky[0, -1].mean()
+
+
+@torch.no_grad()
+def test_strength_is_the_logarithm_of_a_factor(decoder):
+    latent, eye = torch.randn(1, 49, 3, generator=torch.Generator().manual_seed(1)), torch.eye(3)[None]
+    plain, doubled = (decoder(latent, eye, torch.tensor([s]), 8) for s in (0.0, math.log(2.0)))
+    torch.testing.assert_close(doubled, 2.0 * plain)
+
+
+@torch.no_grad()
+def test_any_height_samples_the_same_function(decoder):
+    latent = torch.randn(1, 49, 3, generator=torch.Generator().manual_seed(3))
+    args = latent, torch.eye(3)[None], torch.zeros(1)
+    tall = decoder(*args, 128)
+    directions = reni_frame(map_directions(128)).reshape(1, -1, 3)[:, 1000:1010]
+    torch.testing.assert_close(decoder.radiance(*args, directions), tall.reshape(1, -1, 3)[:, 1000:1010])
+
+
+def test_map_directions_follow_the_documented_layout():
+    d = map_directions(64)
+    torch.testing.assert_close(d.norm(dim=-1), torch.ones(64, 128))
+    assert (d[0, :, 1] > 0.999).all() and (d[-1, :, 1] < -0.999).all()
+    near = dict(rtol=0, atol=0.05)  # half a pixel is 0.025 rad
+    torch.testing.assert_close(d[32, 64], torch.tensor([0.0, 0.0, -1.0]), **near)
+    torch.testing.assert_close(d[32, 96], torch.tensor([1.0, 0.0, 0.0]), **near)
+    torch.testing.assert_close(d[32, 0], torch.tensor([0.0, 0.0, 1.0]), **near)
+
+
+def test_gradients_are_finite_at_a_zero_latent_and_match_differences(decoder):
+    decoder.double()
+    latent = torch.zeros(1, 49, 3, dtype=torch.float64)
+    latent[0, 20:] = torch.randn(29, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    latent.requires_grad_()
+    directions = reni_frame(map_directions(4)).reshape(1, -1, 3).double()
+
+    def total(latent):
+        return decoder.field(latent, directions).square().sum()
+
+    (gradient,) = torch.autograd.grad(total(latent), latent)
+    assert gradient.isfinite().all()
+    step = torch.randn(1, 49, 3, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    step[0, :20] = 0.0  # the published ReLU has a kink at zero
+    with torch.no_grad():
+        difference = (total(latent + 1e-6 * step) - total(latent - 1e-6 * step)) / 2e-6
+    torch.testing.assert_close((gradient * step).sum(), difference, rtol=1e-6, atol=1e-6)  # float64 central difference
+
+
+def test_published_file_has_every_tensor_and_no_other(goldens):
+    manifest = read_manifest(goldens.parent / "reni++L49.safetensors")
+    with torch.device("meta"):
+        field = EnvironmentDecoder(OFFICIAL.reni).field
+    assert {k: tuple(v.shape) for k, v in field.state_dict().items()} == {
+        k: v.shape for k, v in manifest.tensors.items()
+    }
+    assert sum(p.numel() for p in field.parameters()) == 659_854
+
+
+def test_a_cut_off_file_is_one_line(goldens, tmp_path):
+    data = (goldens.parent / "reni++L49.safetensors").read_bytes()
+    cut = tmp_path / "cut.safetensors"
+    cut.write_bytes(data[:-100])
+    with pytest.raises(WeightsError, match="cut.safetensors: expected 2649352 bytes, got 2649252"):
+        read_manifest(cut)
