@@ -26,7 +26,8 @@ from torch import Tensor
 from reli3d.data.distance import signed_distance
 from reli3d.data.procedural import ProceduralObject, sample_cameras
 from reli3d.geometry.hull import mask_distance
-from reli3d.geometry.rays import RayScene, offset_origin
+from reli3d.geometry.rays import RayScene
+from reli3d.geometry.visibility import visible_from
 from reli3d.render.camera import Camera, camera_rays, project
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
@@ -141,24 +142,10 @@ def _volume(surface: _Surface, rng: np.random.Generator) -> dict[str, Tensor]:
 
 def _surface_points(surface: _Surface, c2w: Tensor, intrinsics: Tensor, size: int, rng: np.random.Generator) -> dict[str, Tensor]:
     at = surface.at(*_random_faces(surface, SURFACE_POINTS, rng))
-    visible = []
-    for m, k in zip(c2w, intrinsics, strict=True):
-        visible.append(visibility(surface.scene, at["position"], at["ng"], m, k, size))
+    visible = visible_from(surface.scene, at["position"], at["ng"], c2w, intrinsics, size)
     encoded = torch.cat([linear_to_srgb(at["base_color"].clamp(0, 1)), at["roughness"][:, None], at["metallic"][:, None]], -1)
     return {
         "surface": torch.stack([at["position"], at["ng"], at["bump"]], 1).half(),
         "material": (encoded * 255 + 0.5).to(torch.uint8),
-        "visible": torch.stack(visible, -1).to(torch.uint8),
+        "visible": visible.to(torch.uint8),
     }
-
-
-def visibility(scene: RayScene, position: Tensor, ng: Tensor, c2w: Tensor, intrinsics: Tensor, size: int) -> Tensor:
-    """Whether surface points ``(N, 3)`` face the camera, lie in its square image and are not hidden: ``(N,)`` bool."""
-    to_camera = c2w[:3, 3] - position
-    distance = to_camera.norm(dim=-1)
-    direction = to_camera / distance[:, None]
-    xy, depth = project(position, c2w, intrinsics)
-    faced = ((direction * ng).sum(-1) > 0.05) & (depth > 0) & (xy > 0).all(-1) & (xy < size).all(-1)
-    hidden = scene.occluded(offset_origin(position, ng, direction), direction, t_max=distance)
-    return faced & ~hidden
-

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from reli3d.geometry.projection import gather_views
 
 HIDDEN_WEIGHT = 0.02  # share of a view that does not see the point: enough to say something where no view does
-EDGE_PIXELS = 2.0  # colours closer than this to the silhouette mix with the background
+EDGE = 0.01  # of the image: colours closer than this to the silhouette mix with the background
 OUTSIDE = 0.15  # silhouette distances beyond this share of the image say no more
 
 
@@ -60,9 +60,10 @@ class ViewFeatures(nn.Module):
             seen = visible[..., None].to(rgb.dtype) * 2 - 1
             facing = (to_camera * normal[:, None]).sum(-1, keepdim=True).clamp(min=0)
             share = inside * (HIDDEN_WEIGHT + visible[..., None] * facing.square())
-        share = share * (silhouette / EDGE_PIXELS).clamp(0.05, 1) + 1e-4
+        edge = silhouette / (EDGE * size)
+        share = share * edge.clamp(0.05, 1) + 1e-4
         distance = (silhouette / size).clamp(-OUTSIDE, OUTSIDE) / OUTSIDE
-        own = torch.cat([tokens, rgb, distance, depth, inside, seen, facing, (distance * size).clamp(-1, 1)], -1)
+        own = torch.cat([tokens, rgb, distance, depth, inside, seen, facing, edge.clamp(-1, 1)], -1)
         weight = share / share.sum(1, keepdim=True)
         pooled = (self.per_view(own) * weight).sum(1)
         color = (rgb * weight).sum(1)

@@ -1,0 +1,82 @@
+"""``reli3d-data``: make training samples of procedural objects."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from multiprocessing import get_context
+from pathlib import Path
+
+
+def parser() -> argparse.ArgumentParser:
+    p = argparse.ArgumentParser(prog="reli3d-data", description="Make training samples of procedural objects.")
+    p.add_argument("output", type=Path, help="folder for NNNNNNNNNN.safetensors; those that exist are kept")
+    p.add_argument("--maps", type=Path, required=True, help=".npz of environment maps: env (n, H, 2H, 3) linear, names")
+    p.add_argument("--first", type=int, default=0, help="first seed")
+    p.add_argument("--count", type=int, default=1000)
+    p.add_argument("--views", type=int, default=6)
+    p.add_argument("--size", type=int, default=192, help="pixels")
+    p.add_argument("--held-back", action="store_true", help="validation objects under maps that no training sees")
+    p.add_argument("--workers", type=int, default=os.cpu_count() or 1)
+    return p
+
+
+_LIGHTS = None  # maps of this worker process
+
+
+def _start(maps: Path, held: bool) -> None:
+    global _LIGHTS
+    import torch
+
+    from reli3d.train.light_prior import held_back, load_maps
+
+    torch.set_num_threads(1)
+    lights, names = load_maps(maps)
+    _LIGHTS = [m for m, h in zip(lights, held_back(names), strict=True) if h == held]
+
+
+def _make(seed: int, target: Path, size: int, views: int) -> str | None:
+    """Write one sample; the reason instead where the object could not be made."""
+    import numpy as np
+    from safetensors.torch import save_file
+
+    from reli3d.data.procedural import make_object
+    from reli3d.data.synthesis import synthesize
+
+    rng = np.random.default_rng((seed, 1))
+    try:
+        sample = synthesize(make_object(seed), _LIGHTS[int(rng.integers(len(_LIGHTS)))], rng, size=size, views=views)
+    except ValueError as error:
+        return f"seed {seed}: {error}"
+    temporary = target.with_suffix(f".tmp{os.getpid()}")
+    save_file(sample, temporary)
+    os.replace(temporary, target)
+    return None
+
+
+def main(argv: list[str] | None = None) -> int:
+    args = parser().parse_args(argv)
+    from tqdm import tqdm
+
+    from reli3d.data.procedural import VALIDATION_SEEDS
+
+    first = VALIDATION_SEEDS.start if args.held_back else args.first
+    args.output.mkdir(parents=True, exist_ok=True)
+    jobs = [(s, args.output / f"{s:010d}.safetensors") for s in range(first, first + args.count)]
+    jobs = [j for j in jobs if not j[1].exists()]
+    context = get_context("spawn")
+    failed = 0
+    with ProcessPoolExecutor(args.workers, context, _start, (args.maps, args.held_back)) as pool:
+        futures = [pool.submit(_make, seed, target, args.size, args.views) for seed, target in jobs]
+        for future in tqdm(as_completed(futures), total=len(futures), file=sys.stderr, unit="object"):
+            reason = future.result()
+            failed += reason is not None
+            if reason:
+                tqdm.write(reason, file=sys.stderr)
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,211 @@
+"""From posed photographs to a relightable asset: one function a stage, and :func:`reconstruct` that runs them in order."""
+
+from __future__ import annotations
+
+import time
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from reli3d.data.normalize import Similarity, normalize
+from reli3d.data.views import ViewBatch, Views
+from reli3d.geometry.bake import bake
+from reli3d.geometry.hull import mask_distance
+from reli3d.geometry.mesh import Mesh, largest_components, vertex_normals
+from reli3d.geometry.rays import RayScene
+from reli3d.geometry.surface import extract_surface
+from reli3d.geometry.tangents import encode_normals, vertex_tangents
+from reli3d.geometry.uv import unwrap, unwrap_xatlas
+from reli3d.geometry.visibility import visible_from
+from reli3d.nn.field import bound_level, surface_level, surface_material
+from reli3d.nn.model import Code, Reconstructor
+from reli3d.nn.reni import map_directions
+from reli3d.nn.view_features import ViewMaps
+from reli3d.nn.weights import load_model
+from reli3d.render.asset import Asset, TextureSet
+from reli3d.render.bump import radial_bump
+from reli3d.render.environment import Environment
+
+DETAIL = 512  # pixels of the views that colours and silhouettes are read from; the network's own input is smaller
+SMALLEST_PART = 0.01  # share of the faces below which a separate piece is dropped
+CHUNK = 1 << 17  # points a query: 200 MB of features
+OUTSIDE = 1.0  # level given to grid points that the silhouettes exclude
+MARGIN_CELLS = 2.5  # cells around the silhouettes' hull in which the field is still asked
+UP = {"y": torch.eye(3), "z": torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), "x": torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]),
+      "-y": torch.diag(torch.tensor([1.0, -1, -1])), "-z": torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
+      "-x": torch.tensor([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """Views in the model's frame: the network's input, and maps of ``DETAIL`` pixels for what is read from the views."""
+
+    batch: ViewBatch
+    images: Tensor  # (V, D, D, 4) sRGB and signed silhouette distance
+    intrinsics: Tensor  # (V, 4) of ``images``
+
+
+def prepare(model: Reconstructor, views: Views, model_from_input: Similarity) -> Prepared:
+    """Resample ``views`` for ``model``: cropped to the object where the preset sees rays, whole as published where it does not."""
+    moved = views.transformed(model_from_input).to(model.device)
+    crop = model.preset.encoder.ray_maps
+    batch = moved.resampled(model.preset.image_size, crop=crop)
+    detail = moved.resampled(DETAIL, crop=crop)
+    silhouette = mask_distance(detail.masks)
+    return Prepared(batch, torch.cat([detail.images, silhouette[..., None]], -1).contiguous(), detail.intrinsics)
+
+
+def encode(model: Reconstructor, prepared: Prepared) -> tuple[Code, ViewMaps]:
+    """Run the network; the maps carry the encoder's tokens beside the images."""
+    batch = prepared.batch
+    code = model.encode(batch.images[None], batch.masks[None], batch.c2w[None], batch.intrinsics[None])
+    return code, ViewMaps(code.view_tokens[0].float(), prepared.images, batch.c2w, prepared.intrinsics)
+
+
+def extract(model: Reconstructor, code: Code, maps: ViewMaps, resolution: int) -> Mesh:
+    """Closed surface of the field on ``resolution`` cubes a side, without small loose pieces; model frame.
+
+    Raises ValueError where the field has no surface.
+    """
+    radius = model.preset.radius
+    grid = _grid(resolution, radius, maps.c2w.device)
+    flat = grid.reshape(-1, 3)
+    if model.preset.silhouette_bound:
+        bound = bound_level(model, maps, flat)
+        inside = (bound < 0).nonzero()[:, 0]
+        if len(inside) == 0:
+            raise ValueError("masks: expected masks that overlap in space, got none inside all of them; run --check")
+        radius = min(radius, float(flat[inside].abs().max()) + 2 * MARGIN_CELLS * radius / resolution)
+        grid = _grid(resolution, radius, flat.device)  # the same cubes on the part of space that matters
+        flat = grid.reshape(-1, 3)
+        bound = bound_level(model, maps, flat)
+        asked = (bound < MARGIN_CELLS * 2 * radius / resolution / model.preset.softness).nonzero()[:, 0]
+        level = bound.clamp(min=OUTSIDE)
+    else:
+        asked, level = torch.arange(len(flat), device=flat.device), flat.new_empty(len(flat))
+    for part in asked.split(CHUNK):
+        level[part] = surface_level(model, code, maps, flat[part])
+    weights = {} if model.preset.log_level else _cube_weights(model, code, flat, resolution)
+    mesh = extract_surface(level.reshape(grid.shape[:3]), radius=radius, **weights)
+    mesh = largest_components(mesh, SMALLEST_PART)
+    return replace(mesh, normals=vertex_normals(mesh.vertices, mesh.faces))
+
+
+def _grid(resolution: int, radius: float, device: torch.device) -> Tensor:
+    axis = torch.linspace(-radius, radius, resolution + 1, device=device)
+    return torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
+
+
+def _cube_weights(model: Reconstructor, code: Code, flat: Tensor, resolution: int) -> dict[str, Tensor]:
+    from reli3d.nn.heads import deformation
+
+    raw = [model.query(code, part[None], ("deformation", "flexicubes")) for part in flat.split(CHUNK)]
+    vertices = (resolution + 1,) * 3
+    offset = deformation(torch.cat([r["deformation"][0] for r in raw]), resolution).reshape(*vertices, 3)
+    corner = torch.cat([r["flexicubes"][0] for r in raw]).reshape(*vertices, -1)
+    n = resolution
+    corners = [corner[i : i + n, j : j + n, k : k + n] for k in (0, 1) for j in (0, 1) for i in (0, 1)]
+    weights = model.merger(torch.stack(corners, -2).reshape(n**3, 8, -1))
+    return {"deformation": offset, "alpha": weights.alpha, "beta": weights.beta, "gamma": weights.gamma}
+
+
+def texture(model: Reconstructor, code: Code, maps: ViewMaps, mesh: Mesh, size: int, *, uv: str = "project") -> tuple[Mesh, TextureSet]:
+    """The mesh with an atlas, normals and tangents, and its maps of ``size`` texels."""
+    scene = RayScene(mesh.vertices, mesh.faces)
+    if uv not in ("project", "xatlas"):
+        raise ValueError(f"uv: expected project or xatlas, got {uv}")
+    mesh = unwrap(mesh, texture_size=size) if uv == "project" else unwrap_xatlas(mesh, texture_size=size)
+    mesh = replace(mesh, tangents=vertex_tangents(mesh))
+
+    def surface(position: Tensor, normal: Tensor, tangent: Tensor) -> dict[str, Tensor]:
+        visible = visible_from(scene, position, normal, maps.c2w, maps.intrinsics, DETAIL).float()
+        got = surface_material(model, code, maps, position, normal, visible)
+        orm = torch.cat([torch.ones_like(got["roughness"]), got["roughness"], got["metallic"]], -1)
+        shading = radial_bump(position, normal, got["normal"])
+        return {"base_color": got["base_color"], "orm": orm, "normal": encode_normals(shading, normal, tangent)}
+
+    baked = bake(mesh, size, surface, chunk=CHUNK, tangents=True)
+    return mesh, TextureSet(**{k: v.clamp(0, 1).contiguous() for k, v in baked.items()})
+
+
+def light(model: Reconstructor, code: Code) -> Environment:
+    """The decoded environment, in the world's axes."""
+    return Environment(model.decode_environment(code)[0].contiguous())
+
+
+def turned(asset: Asset, similarity: Similarity) -> Asset:
+    """``asset`` moved by ``similarity``; normals, tangents and the light turn with it."""
+    mesh, rotation = asset.mesh, similarity.rotation.to(asset.mesh.vertices)
+    moved = replace(mesh, vertices=similarity.apply(mesh.vertices), normals=mesh.normals @ rotation.T,
+                    tangents=torch.cat([mesh.tangents[:, :3] @ rotation.T, mesh.tangents[:, 3:]], -1))  # fmt: skip
+    environment = asset.environment
+    if environment is not None and not torch.equal(rotation, torch.eye(3).to(rotation)):
+        rows = environment.radiance.shape[0]
+        environment = Environment(environment.lookup((map_directions(rows).to(rotation) @ rotation).contiguous()))
+    return replace(asset, mesh=moved, environment=environment)
+
+
+class Stopwatch:
+    """Seconds of each stage, in the order they ran; waits for the device before it reads the clock."""
+
+    def __init__(self, device: torch.device, report=None):
+        self.seconds: dict[str, float] = {}
+        self._device, self._report = device, report
+
+    @contextmanager
+    def stage(self, name: str):
+        if self._report:
+            self._report(name)
+        began = time.perf_counter()
+        yield
+        if self._device.type == "cuda":
+            torch.cuda.synchronize(self._device)
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - began
+
+
+@torch.no_grad()
+def reconstruct(views: Views, *, weights: str | Reconstructor = "small", device: str = "cpu", texture_size: int = 1024,
+                resolution: int | None = None, normalization: str | Similarity = "auto", frame: str = "input", up: str = "y",
+                uv: str = "project", seed: int = 0, timings: dict[str, float] | None = None, progress=None) -> Asset:  # fmt: skip
+    """A relightable asset from posed photographs of one object.
+
+    views: 1 to 16, the first is the hero (see :func:`reli3d.data.folder.load_views`).  weights: ``small`` (in the package), a
+    safetensors file, or a loaded :class:`~reli3d.nn.model.Reconstructor`.  texture_size: 256 to 4096 texels.  resolution: cubes a
+    side of the surface grid, default the preset's.  normalization: ``auto``, ``hull``, ``none``, or the map from the input frame to
+    the model's.  frame: ``input`` (that of the cameras) or ``model``.  up: the axis of that frame that shall become +Y.
+    timings: filled with seconds of each stage.  progress: called with the name of each stage.  The same input and seed give the
+    same asset.  Raises ValueError on options out of range and where the masks or the field hold no surface.
+    """
+    if frame not in ("input", "model"):
+        raise ValueError(f"frame: expected input or model, got {frame}")
+    if up not in UP:
+        raise ValueError(f"up: expected one of {', '.join(UP)}, got {up}")
+    if not 256 <= texture_size <= 4096:
+        raise ValueError(f"texture_size: expected 256 to 4096, got {texture_size}")
+    model = weights if isinstance(weights, Reconstructor) else load_model(weights, device)
+    resolution = resolution or model.preset.resolution
+    if not 16 <= resolution <= 256:
+        raise ValueError(f"resolution: expected 16 to 256, got {resolution}")
+    torch.manual_seed(seed)
+    watch = Stopwatch(model.device, progress)
+    with watch.stage("normalize"):
+        to_model = normalization if isinstance(normalization, Similarity) else normalize(views, normalization)
+    with watch.stage("prepare"):
+        prepared = prepare(model, views, to_model)
+    with watch.stage("network"):
+        code, maps = encode(model, prepared)
+    with watch.stage("surface"):
+        mesh = extract(model, code, maps, resolution)
+    with watch.stage("textures"):
+        mesh, textures = texture(model, code, maps, mesh, texture_size, uv=uv)
+    with watch.stage("light"):
+        asset = Asset(mesh, textures, light(model, code))
+    with watch.stage("frame"):
+        back = to_model.inverse() if frame == "input" else Similarity.identity()
+        turn = Similarity(1.0, UP[up].double(), torch.zeros(3, dtype=torch.float64))
+        asset = turned(asset, turn.compose(back))
+    if timings is not None:
+        timings.update(watch.seconds)
+    return asset
