@@ -1,0 +1,125 @@
+"""Tangent frames of a mesh with UV, and normals written in them.
+
+MikkTSpace convention as glTF uses it: the tangent follows +u, bitangent = w * cross(normal, tangent) points up on the
+image, which is -v; w is +1 where the texture is not mirrored.  A normal map holds n * 0.5 + 0.5 with red along
+the tangent and green along the bitangent.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from reli3d._bridge import check
+from reli3d.geometry.mesh import Mesh, weld
+
+PARALLEL = 1.0e-12  # length of a projected direction, relative, below which it has no direction in float64
+
+
+def _unit(v: Tensor) -> tuple[Tensor, Tensor]:
+    """``v`` with unit last axis, 0 where it is shorter than PARALLEL, and its length ``(..., 1)``."""
+    length = torch.linalg.vector_norm(v, dim=-1, keepdim=True)
+    return torch.where(length > PARALLEL, v / length.clamp(min=1e-300), 0.0), length
+
+
+def _flat(v: Tensor, n: Tensor) -> Tensor:
+    """``v`` without its part along the unit ``n``."""
+    return v - n * (n * v).sum(-1, keepdim=True)
+
+
+def vertex_tangents(mesh: Mesh) -> Tensor:
+    """Tangents ``(V, 4)`` float32: unit, orthogonal to the normal, w = +-1.
+
+    Mikkelsen 2008 (Simulation of wrinkled surfaces revisited), as in mikktspace.c: every corner adds the direction of +u of
+    its face, made flat to the vertex normal and unit, times the angle of the corner; corners count as one vertex where
+    position, normal and UV are equal.  A vertex that joins mirrored and plain faces, which MikkTSpace would
+    split, takes the side with the larger angle; :func:`unwrap` makes none.  Without any direction (no UV area) the tangent
+    is some vector orthogonal to the normal.  No gradient.  Raises ValueError without normals or UV.
+    """
+    if not isinstance(mesh, Mesh):
+        raise TypeError(f"mesh: expected Mesh, got {type(mesh).__name__}")
+    for name, fix in (("normals", "Mesh.with_normals"), ("uv", "unwrap")):
+        if getattr(mesh, name) is None:
+            raise ValueError(f"mesh.{name}: expected a tensor, got None (see {fix})")
+    faces = mesh.faces.long()
+    p, uv = mesh.vertices.detach().double()[faces], mesh.uv.detach().double()[faces]
+    n = _unit(mesh.normals.detach().double())[0]
+    d1, d2 = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
+    s, t = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+    along_u = t[:, 1:] * d1 - s[:, 1:] * d2
+    area = s[:, :1] * t[:, 1:] - s[:, 1:] * t[:, :1]  # v is down: a face that is not mirrored is clockwise here
+    along_u = _unit(along_u * area.sign())[0]
+    same = _merged(mesh)
+    count = len(mesh.vertices)
+    side = same[faces] + torch.where(area < 0, 0, count)  # two accumulators a vertex: plain, mirrored
+    total = torch.zeros(2 * count, 4, dtype=torch.float64, device=p.device)
+    for k in range(3):
+        normal = n[faces[:, k]]
+        e1 = _unit(_flat(p[:, (k + 1) % 3] - p[:, k], normal))[0]
+        e2 = _unit(_flat(p[:, (k + 2) % 3] - p[:, k], normal))[0]
+        angle = torch.acos((e1 * e2).sum(-1, keepdim=True).clamp(-1.0, 1.0)) * (area != 0)
+        total.index_add_(0, side[:, k], torch.cat([_unit(_flat(along_u, normal))[0] * angle, angle], 1))
+    plain, mirrored = total[:count][same], total[count:][same]
+    flip = mirrored[:, 3:] > plain[:, 3:]
+    tangent, length = _unit(torch.where(flip, mirrored, plain)[:, :3])
+    tangent = torch.where(length > PARALLEL, _unit(_flat(tangent, n))[0], _any_orthogonal(n))
+    return torch.cat([tangent, torch.where(flip, -1.0, 1.0).to(tangent)], 1).to(torch.float32)
+
+
+def _merged(mesh: Mesh) -> Tensor:
+    """First vertex with the same position, normal and UV, for every vertex, ``(V,)``."""
+    flat_uv = torch.cat([mesh.uv.detach(), torch.zeros_like(mesh.uv[:, :1])], 1)
+    label = weld(mesh.vertices.detach())[1]
+    for part in (mesh.normals.detach(), flat_uv):
+        label = torch.unique(label * len(flat_uv) + weld(part)[1], return_inverse=True)[1]
+    order = torch.sort(label, stable=True)
+    first = torch.searchsorted(order.values, torch.arange(int(label.max()) + 1 if len(label) else 0, device=label.device))
+    return order.indices[first][label]
+
+
+def _any_orthogonal(n: Tensor) -> Tensor:
+    axis = torch.zeros_like(n).scatter_(1, n.abs().argmin(1, keepdim=True), 1.0)
+    return _unit(_flat(axis, n))[0]
+
+
+def with_tangents(mesh: Mesh) -> Mesh:
+    """The same mesh with :func:`vertex_tangents`."""
+    return replace(mesh, tangents=vertex_tangents(mesh))
+
+
+def _frame(normal: Tensor, tangent: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    check("normal", normal, last=3), check("tangent", tangent, last=4, like=normal)
+    t, n = tangent[..., :3], normal
+    b = torch.linalg.cross(n, t) * tangent[..., 3:]
+    return t, b, n
+
+
+def encode_normals(world: Tensor, normal: Tensor, tangent: Tensor) -> Tensor:
+    """Normal map values ``(..., 3)`` in [0, 1] of the unit world-space normals ``world`` ``(..., 3)``.
+
+    normal: ``(..., 3)`` unit, tangent: ``(..., 4)`` with unit direction, both interpolated at the texel.  The frame is
+    inverted, not transposed: interpolated tangents are not quite orthogonal, and :func:`decode_normals` must give ``world``
+    back.  A normal below the surface is bent to it, because viewers have no use for it.  Gradients reach ``world``.
+    """
+    t, b, n = _frame(normal, tangent)
+    check("world", world, last=3, like=normal)
+    tt, tn = (t * t).sum(-1, keepdim=True), (t * n).sum(-1, keepdim=True)
+    nn = (n * n).sum(-1, keepdim=True)
+    wt, wn = (world * t).sum(-1, keepdim=True), (world * n).sum(-1, keepdim=True)
+    determinant = (tt * nn - tn * tn).clamp(min=1e-6)  # b is orthogonal to both, so that two equations remain
+    x = (nn * wt - tn * wn) / determinant
+    z = (tt * wn - tn * wt) / determinant
+    y = (world * b).sum(-1, keepdim=True) / (b * b).sum(-1, keepdim=True).clamp(min=1e-6)
+    local = torch.cat([x, y, z.clamp(min=0.0)], -1)
+    return torch.nn.functional.normalize(local, dim=-1, eps=1e-6) * 0.5 + 0.5
+
+
+def decode_normals(encoded: Tensor, normal: Tensor, tangent: Tensor) -> Tensor:
+    """Unit world-space normals ``(..., 3)`` of normal map values ``(..., 3)``; the inverse of :func:`encode_normals`."""
+    t, b, n = _frame(normal, tangent)
+    check("encoded", encoded, last=3, like=normal)
+    local = encoded * 2.0 - 1.0
+    world = local[..., :1] * t + local[..., 1:2] * b + local[..., 2:] * n
+    return torch.nn.functional.normalize(world, dim=-1, eps=1e-6)

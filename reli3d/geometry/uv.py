@@ -1,0 +1,274 @@
+"""UV atlas: charts by projection, packed with a guard band; xatlas in a process of its own as the other choice.
+
+UV follow glTF: u right, v down, [0, 1].  Seen from outside the charts are not mirrored: in (u, 1 - v) every face is
+counter-clockwise.  The atlas is a discrete choice made on the CPU; no gradient reaches ``uv``, while vertices and normals
+of the result are a gather of the input and pass theirs on.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import warp as wp
+from torch import Tensor
+
+from reli3d import _bridge
+from reli3d.geometry import charts as parts
+from reli3d.geometry.mesh import Mesh, vertex_normals, weld
+from reli3d.kernels import uv as kernels
+
+FILL = 0.62  # share of the atlas that charts are expected to cover; sets the unit of the chart step only
+ROUNDS = 10  # packings tried in the search for the scale; it stops earlier within 1 %
+CELLS = 512  # resolution of the packing: cells along the atlas
+SLIVER_PITCH, SLIVER_SIDE = 3.0, 2.0  # texels: a face without area gets a right triangle of this side
+SLIVER_SHARE = 0.1  # of the atlas at most goes to faces without area
+XATLAS = """
+import sys, numpy, xatlas
+data = numpy.load(sys.argv[1])
+atlas = xatlas.Atlas()
+atlas.add_mesh(data["vertices"], data["faces"])
+pack = xatlas.PackOptions()
+pack.resolution, pack.padding, pack.bilinear = int(data["size"]), int(data["guard"]), True
+atlas.generate(pack_options=pack)
+source, faces, uv = atlas[0]
+numpy.savez(sys.argv[2], source=source, faces=faces, uv=uv)
+"""
+
+
+@dataclass(frozen=True)
+class AtlasReport:
+    """What :func:`atlas_report` measures; areas are of the unit square of UV."""
+
+    charts: int  # connected through equal UV vertices
+    utilisation: float  # share of the square that faces cover, overlap counted once
+    overlap: float  # share of the covered samples with more than one face
+    stretch: float  # L2 of Sander et al. 2001 over the surface, 1 where lengths are kept; scale of the atlas removed
+    stretch_max: float  # largest length on the surface per UV length of any face, relative to the mean; slivers left out
+    smallest_area: float  # of a face, in UV units
+    texels_per_unit: float  # square root of UV area over surface area, times the texture size
+
+
+def guard_band(texture_size: int) -> int:
+    """Texels kept free between charts: 4 at 512 and 1024, more for larger textures, 2 at least for small ones."""
+    return max(4, texture_size // 256) if texture_size >= 512 else max(2, texture_size // 128)
+
+
+def _check(mesh: Mesh, texture_size: int) -> None:
+    if not isinstance(mesh, Mesh):
+        raise TypeError(f"mesh: expected Mesh, got {type(mesh).__name__}")
+    if not isinstance(texture_size, int) or not 16 <= texture_size <= 16384:
+        raise ValueError(f"texture_size: expected an integer in [16, 16384], got {texture_size!r}")
+    if len(mesh.faces) == 0:
+        raise ValueError("mesh.faces: expected at least one face, got 0")
+    if not bool(torch.isfinite(mesh.vertices.detach()).all()):
+        raise ValueError("mesh.vertices: expected finite coordinates, got NaN or infinity")
+
+
+def unwrap(mesh: Mesh, *, texture_size: int = 1024) -> Mesh:
+    """The mesh with ``uv``; vertices are split at chart borders, the faces keep their order.
+
+    Every face has positive UV area and faces of different charts are a guard band apart (:func:`guard_band`, less only if
+    the charts are too many for the texture).  Normals are taken over, or computed on the mesh before the split so that
+    shading is smooth across charts.  Any triangle mesh will do: open, non-manifold, in pieces, with faces without area.
+    The same input gives the same bits.  Raises TypeError or ValueError for a wrong mesh, no faces, or NaN.
+    """
+    _check(mesh, texture_size)
+    source_faces = mesh.faces.cpu().numpy()
+    first, label = (t.cpu().numpy() for t in weld(mesh.vertices.detach()))
+    positions = mesh.vertices.detach().cpu().numpy().astype(np.float64)[first]
+    guard = guard_band(texture_size)
+    charts = parts.make_charts(positions, label[source_faces], texels=FILL * texture_size**2,
+                               least_texels=9.0 * guard * guard, sliver=4.0e-6 * texture_size)  # fmt: skip
+    uv = _pack(charts, texture_size, guard)
+    flat = _area(uv) <= 0.0
+    while flat.any():  # rounding to float32 took a face's area: it moves to the slivers
+        charts.chart[flat] = -1
+        uv = _pack(charts, texture_size, guard)
+        flat = _area(uv) <= 0.0
+    return _joined(mesh, source_faces, charts, uv)
+
+
+def _area(uv: np.ndarray) -> np.ndarray:
+    """Area of the float32 triangles ``(F, 3, 2)`` of (u, v down), positive if they are not mirrored."""
+    a, b, c = (uv[:, k].astype(np.float64) for k in range(3))
+    return 0.5 * ((c - a)[:, 0] * (b - a)[:, 1] - (c - a)[:, 1] * (b - a)[:, 0])
+
+
+def _joined(mesh: Mesh, faces: np.ndarray, charts: parts.Charts, uv: np.ndarray) -> Mesh:
+    """Corners of one source vertex in one chart become one vertex; a sliver keeps its three for itself."""
+    count = len(mesh.vertices)
+    alone = charts.chart < 0
+    own = charts.count + np.cumsum(alone) - 1
+    chart = np.where(alone, own, charts.chart).astype(np.int64)
+    corner = (chart[:, None] * count + faces).ravel()
+    order, first = parts.group(corner)
+    rank = np.zeros(len(order), np.int64)
+    rank[first[1:]] = 1
+    vertex = np.empty(len(order), np.int32)
+    vertex[order] = np.cumsum(rank)
+    corners = order[first]
+    device = mesh.vertices.device
+    source = torch.from_numpy(faces.ravel()[corners].astype(np.int64)).to(device)
+    normals = mesh.normals if mesh.normals is not None else vertex_normals(mesh.vertices, mesh.faces)
+    return Mesh(
+        vertices=mesh.vertices[source],
+        faces=torch.from_numpy(vertex.reshape(-1, 3)).to(device),
+        normals=normals[source],
+        uv=torch.from_numpy(uv.reshape(-1, 2)[corners]).to(device),
+    )
+
+
+def _pack(charts: parts.Charts, size: int, guard: float) -> np.ndarray:
+    """UV of the corners, ``(F, 3, 2)`` float32: all charts at one scale, the largest at which they fit."""
+    uv = np.zeros((len(charts.chart), 3, 2))
+    slivers = np.flatnonzero(charts.chart < 0)
+    pitch = min(SLIVER_PITCH, size * np.sqrt(SLIVER_SHARE / max(len(slivers), 1)))
+    columns = int((size - 1) // pitch)
+    if len(slivers):
+        legs = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]) * (pitch * SLIVER_SIDE / SLIVER_PITCH)
+        rank = np.arange(len(slivers))
+        uv[slivers] = np.stack([rank % columns, rank // columns], -1)[:, None] * pitch + 0.5 + legs
+    reserved = -(-len(slivers) // columns) * pitch + 0.5 if len(slivers) else 0.0
+    normal = np.flatnonzero(charts.chart >= 0)
+    if len(normal):
+        number, chart = np.unique(charts.chart[normal], return_inverse=True)
+        corners = parts.shift_to_zero(charts.corners[normal].astype(np.float64), chart, len(number))
+        uv[normal] = _place(charts, normal, chart.reshape(-1), corners, size, guard, reserved)
+    uv /= size
+    uv[..., 1] = 1.0 - uv[..., 1]
+    return uv.astype(np.float32)
+
+
+def _place(charts: parts.Charts, faces: np.ndarray, chart: np.ndarray, corners: np.ndarray, size: int, guard: float,
+           reserved: float) -> np.ndarray:  # fmt: skip
+    """Corners in texels of the atlas, y up, above the ``reserved`` strip."""
+    count = int(chart.max()) + 1
+    near = charts.neighbours[faces]
+    border = (near < 0) | (charts.chart[near] != charts.chart[faces][:, None])
+    order, _ = parts.group(np.repeat(chart, 3)[border.ravel()].astype(np.int64))
+    edges = np.stack([corners, np.roll(corners, -1, 1)], 2)[border][order].astype(np.float32)  # (E, 2, 2)
+    owner = np.repeat(chart, 3)[border.ravel()][order]
+    edge_start = np.searchsorted(owner, np.arange(count + 1)).astype(np.int32)
+    extent = np.maximum.reduceat(edges.max(1), edge_start[:-1], axis=0).astype(np.float64)
+    cell = max(1.0, size / CELLS)
+    cells = int(size / cell)
+    sequence = torch.from_numpy(np.lexsort((np.arange(count), -extent[:, 0], -extent[:, 1])).astype(np.int32))
+    inputs = (torch.from_numpy(edge_start), wp.int32), (torch.from_numpy(edges), wp.vec2)
+    place, top_cell = torch.empty(count, 2, dtype=torch.int32), torch.empty(1, dtype=torch.int32)
+    horizon = torch.empty(cells, dtype=torch.int32)
+    strip = int(np.ceil((reserved + 0.5 * guard) / cell)) if reserved else 0
+
+    def drop(scale: float, guard: float) -> int:
+        margin = 0.5 * guard
+        width = np.ceil((extent[:, 0] * scale + 2 * margin) / cell).astype(np.int64)
+        if width.max() > cells:
+            return 1 << 30
+        column_start = np.concatenate([[0], np.cumsum(width)]).astype(np.int32)
+        start = torch.from_numpy(column_start), wp.int32
+        bottom, top = torch.empty(2, int(column_start[-1]), dtype=torch.int32)
+        outline = (bottom, wp.int32), (top, wp.int32)
+        _bridge.launch(kernels.outline_kernel, count,
+                       [*inputs, start, scale / cell, margin / cell, *outline], parts.CPU)  # fmt: skip
+        _bridge.launch(kernels.pack_serial_kernel, 1, [(sequence, wp.int32), start, *outline, strip,
+                       (horizon, wp.int32), (place, wp.int32), (top_cell, wp.int32)], parts.CPU)  # fmt: skip
+        return int(top_cell)
+
+    while True:
+        best, best_place = 0.0, None
+        low, high, scale = 0.0, float(cells / max(extent.max() / cell, 1e-9)), 1.0
+        scale = min(scale, 0.98 * high)
+        for _ in range(ROUNDS):
+            reached = drop(scale, guard)
+            if reached <= cells:
+                low, best, best_place = scale, scale, place.numpy().copy()
+            else:
+                high = scale
+            if best and high < 1.01 * low:
+                break
+            ratio = np.sqrt(cells / reached) if reached < 1 << 30 else 0.5
+            scale = scale * ratio
+            if not low * 1.002 < scale < high * 0.998:
+                scale = 0.5 * (low + high) if low else 0.7 * high
+        area = float((np.maximum(extent, 0) * best + guard).prod(1).sum())
+        if best and (best >= 0.5 or area < 4.0 * float((extent * best).prod(1).sum())):
+            break
+        if guard < 0.1 and best:
+            break
+        guard *= 0.5  # too many charts: the guard band would take most of the atlas
+    return corners * best + 0.5 * guard + (best_place * cell)[chart][:, None]
+
+
+def atlas_report(mesh: Mesh, *, texture_size: int = 1024) -> AtlasReport:
+    """Quality of the UV of a mesh.  Overlap and utilisation are sampled at 4 x 4 points a texel of ``texture_size``, up to 4096."""
+    from reli3d.geometry.bake import coverage
+
+    if mesh.uv is None:
+        raise ValueError("mesh.uv: expected UV coordinates, got None (see unwrap)")
+    _check(mesh, texture_size)
+    hits = coverage(mesh, min(4 * texture_size, 4096))
+    faces = mesh.faces.cpu().numpy()
+    p, q = mesh.vertices.detach().cpu().numpy().astype(np.float64)[faces], mesh.uv.cpu().numpy().astype(np.float64)[faces]
+    e1, e2, d1, d2 = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0], q[:, 1] - q[:, 0], q[:, 2] - q[:, 0]
+    twice = d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0]
+    area = 0.5 * np.linalg.norm(np.cross(e1, e2), axis=1)
+    solid = (np.abs(twice) > 0) & (area > 1e-9 * area.sum() / len(area))
+    e1, e2, d1, d2, t = e1[solid], e2[solid], d1[solid], d2[solid], twice[solid, None]
+    du, dv = (e1 * d2[:, 1:] - e2 * d1[:, 1:]) / t, (e2 * d1[:, :1] - e1 * d2[:, :1]) / t
+    a, b, c = (du * du).sum(1), (du * dv).sum(1), (dv * dv).sum(1)
+    square = area[solid] @ (0.5 * (a + c)) / max(area[solid].sum(), 1e-300)
+    longest = np.sqrt(0.5 * (a + c + np.sqrt((a - c) ** 2 + 4 * b * b)))
+    mean = np.sqrt(area.sum() / max(0.5 * np.abs(twice).sum(), 1e-300))
+    _, chart_count = parts.components(parts.face_neighbours(faces.astype(np.int64)), np.zeros(len(faces), np.int32))
+    covered = max(int((hits > 0).sum()), 1)
+    return AtlasReport(
+        charts=chart_count,
+        utilisation=float((hits > 0).float().mean()),
+        overlap=int((hits > 1).sum()) / covered,
+        stretch=float(np.sqrt(square) / mean),
+        stretch_max=float(longest.max() / mean) if len(longest) else 1.0,
+        smallest_area=float(0.5 * np.abs(twice).min()),
+        texels_per_unit=texture_size / float(mean),
+    )
+
+
+def unwrap_xatlas(mesh: Mesh, *, texture_size: int = 1024, timeout_s: float = 120.0) -> Mesh:
+    """As :func:`unwrap` with the charts of xatlas (Young 2018), in a process of its own that ends after ``timeout_s``.
+
+    Its time grows with the square of the number of charts and it can crash; here that is a TimeoutError or RuntimeError
+    instead of a hang.  Faces xatlas could not chart may share UV; :func:`atlas_report` tells.
+    """
+    _check(mesh, texture_size)
+    with tempfile.TemporaryDirectory() as folder:
+        job, result = os.path.join(folder, "job.npz"), os.path.join(folder, "result.npz")
+        np.savez(job, vertices=mesh.vertices.detach().cpu().numpy(), faces=mesh.faces.cpu().numpy().astype(np.uint32),
+                 size=texture_size, guard=guard_band(texture_size))  # fmt: skip
+        try:
+            done = subprocess.run([sys.executable, "-c", XATLAS, job, result], capture_output=True, timeout=timeout_s)
+        except subprocess.TimeoutExpired:
+            raise TimeoutError(f"unwrap_xatlas: no atlas of {len(mesh.faces)} faces in {timeout_s:g} s; "
+                               "use unwrap, or raise timeout_s") from None  # fmt: skip
+        if done.returncode != 0:
+            tail = done.stderr.decode(errors="replace").strip().splitlines()[-1:] or ["no message"]
+            raise RuntimeError(f"unwrap_xatlas: xatlas ended with code {done.returncode} ({tail[0]}); use unwrap")
+        with np.load(result) as data:
+            source, faces, uv = data["source"], data["faces"], data["uv"]
+    device = mesh.vertices.device
+    index = torch.from_numpy(source.astype(np.int64)).to(device)
+    normals = mesh.normals if mesh.normals is not None else vertex_normals(mesh.vertices, mesh.faces)
+    return Mesh(
+        vertices=mesh.vertices[index],
+        faces=torch.from_numpy(faces.astype(np.int32)).to(device),
+        normals=normals[index],
+        uv=torch.from_numpy(uv.astype(np.float32)).to(device),
+    )
+
+
+def uv_faces(mesh: Mesh) -> Tensor:
+    """UV of the corners of every face, ``(F, 3, 2)``."""
+    return mesh.uv[mesh.faces.long()]

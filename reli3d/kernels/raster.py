@@ -1,0 +1,309 @@
+"""Texels of an atlas: which face covers each, attributes there, and the nearest covered texel of every other.
+
+Texel (row y, column x) has its centre at (x + 0.5, y + 0.5) in texel units, v down.  A thread owns a tile, a strip or a row of
+the output and gathers, so that the result does not depend on the number of threads or the size of the tiles.
+"""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
+
+ROUNDING = wp.constant(4.0e-7)  # relative error of a float32 cross product, twice over: neighbours leave no crack
+
+
+@wp.func
+def cross2(a: wp.vec2, b: wp.vec2) -> float:
+    return a[0] * b[1] - a[1] * b[0]
+
+
+@wp.func
+def cross2_error(a: wp.vec2, b: wp.vec2) -> float:
+    """Bound of the rounding of ``cross2(a, b)``."""
+    return ROUNDING * (wp.abs(a[0] * b[1]) + wp.abs(a[1] * b[0]))
+
+
+@wp.func
+def weight_on_segment(a: wp.vec2, b: wp.vec2, p: wp.vec2) -> float:
+    """Weight in [0, 1] of ``b`` at the point of the segment nearest to ``p``."""
+    e = b - a
+    return wp.clamp(wp.dot(p - a, e) / wp.max(wp.dot(e, e), 1.0e-20), 0.0, 1.0)
+
+
+@wp.kernel
+def texels_kernel(
+    start: int,
+    # in
+    corners: wp.array2d(dtype=wp.vec2), face_start: wp.array(dtype=wp.int32), face_list: wp.array(dtype=wp.int32),
+    segment_start: wp.array(dtype=wp.int32), segment_list: wp.array(dtype=wp.int32), segments: wp.array(dtype=wp.int32),
+    size: int, tile: int, reach: float,
+    # scratch
+    distance: wp.array2d(dtype=wp.float32),
+    # out
+    face: wp.array2d(dtype=wp.int32), bary: wp.array2d(dtype=wp.vec2),
+):  # fmt: skip
+    """Fill tile ``i``: the first face over the centre of a texel; else the nearest border segment within ``reach`` texels.
+
+    ``segments`` holds 3 * face + corner of each edge on a border.  ``bary`` weighs vertices 1 and 2.
+    """
+    i = start + wp.tid()
+    tiles = (size + tile - 1) / tile
+    x0 = (i % tiles) * tile
+    y0 = (i / tiles) * tile
+    x1 = wp.min(x0 + tile, size) - 1
+    y1 = wp.min(y0 + tile, size) - 1
+    far = reach * reach * 1.0001 + 1.0
+    for y in range(y0, y1 + 1):
+        for x in range(x0, x1 + 1):
+            face[y, x] = -1
+            bary[y, x] = wp.vec2(0.0, 0.0)
+            distance[y, x] = far
+    for s in range(face_start[i], face_start[i + 1]):
+        f = face_list[s]
+        a = corners[f, 0]
+        b = corners[f, 1] - a
+        c = corners[f, 2] - a
+        area = cross2(b, c)
+        if area != 0.0:
+            inverse = 1.0 / area
+            left = wp.max(int(wp.ceil(a[0] + wp.min(0.0, wp.min(b[0], c[0])) - 0.5)), x0)
+            right = wp.min(int(wp.floor(a[0] + wp.max(0.0, wp.max(b[0], c[0])) - 0.5)), x1)
+            high = wp.max(int(wp.ceil(a[1] + wp.min(0.0, wp.min(b[1], c[1])) - 0.5)), y0)
+            low = wp.min(int(wp.floor(a[1] + wp.max(0.0, wp.max(b[1], c[1])) - 0.5)), y1)
+            for y in range(high, low + 1):
+                for x in range(left, right + 1):
+                    if distance[y, x] > 0.0:
+                        p = wp.vec2(float(x) + 0.5, float(y) + 0.5) - a
+                        w1 = cross2(p, c) * inverse
+                        w2 = cross2(b, p) * inverse
+                        w0 = 1.0 - w1 - w2
+                        slack = (cross2_error(p, c) + cross2_error(b, p)) * wp.abs(inverse)
+                        if w1 >= -slack and w2 >= -slack and w0 >= -slack:
+                            face[y, x] = f
+                            w1 = wp.clamp(w1, 0.0, 1.0)
+                            bary[y, x] = wp.vec2(w1, wp.clamp(w2, 0.0, 1.0 - w1))
+                            distance[y, x] = 0.0
+    for s in range(segment_start[i], segment_start[i + 1]):
+        code = segments[segment_list[s]]
+        f = code / 3
+        k = code % 3
+        a = corners[f, k]
+        b = corners[f, (k + 1) % 3]
+        left = wp.max(int(wp.floor(wp.min(a[0], b[0]) - 0.5 - reach)), x0)
+        right = wp.min(int(wp.ceil(wp.max(a[0], b[0]) - 0.5 + reach)), x1)
+        high = wp.max(int(wp.floor(wp.min(a[1], b[1]) - 0.5 - reach)), y0)
+        low = wp.min(int(wp.ceil(wp.max(a[1], b[1]) - 0.5 + reach)), y1)
+        for y in range(high, low + 1):
+            for x in range(left, right + 1):
+                if distance[y, x] > 0.0:
+                    p = wp.vec2(float(x) + 0.5, float(y) + 0.5)
+                    t = weight_on_segment(a, b, p)
+                    d = wp.length_sq(a + t * (b - a) - p)
+                    if d <= reach * reach and d < distance[y, x]:
+                        # an exact 0 would lock the texel; it is on the border, any face of it will do
+                        distance[y, x] = wp.max(d, 1.0e-12)
+                        face[y, x] = f
+                        w1 = float(0.0)
+                        w2 = float(0.0)
+                        if k == 0:
+                            w1 = t
+                        elif k == 1:
+                            w1 = 1.0 - t
+                            w2 = t
+                        else:
+                            w2 = 1.0 - t
+                        bary[y, x] = wp.vec2(w1, w2)
+
+
+@wp.kernel
+def coverage_kernel(
+    start: int,
+    # in
+    corners: wp.array2d(dtype=wp.vec2), face_start: wp.array(dtype=wp.int32), face_list: wp.array(dtype=wp.int32),
+    size: int, tile: int,
+    # out
+    hits: wp.array2d(dtype=wp.uint8),
+):  # fmt: skip
+    """Number of faces, 255 at most, whose interior holds each centre of tile ``i``."""
+    i = start + wp.tid()
+    tiles = (size + tile - 1) / tile
+    x0 = (i % tiles) * tile
+    y0 = (i / tiles) * tile
+    x1 = wp.min(x0 + tile, size) - 1
+    y1 = wp.min(y0 + tile, size) - 1
+    for y in range(y0, y1 + 1):
+        for x in range(x0, x1 + 1):
+            hits[y, x] = wp.uint8(0)
+    for s in range(face_start[i], face_start[i + 1]):
+        f = face_list[s]
+        a = corners[f, 0]
+        b = corners[f, 1] - a
+        c = corners[f, 2] - a
+        turn = float(1.0)
+        if cross2(b, c) < 0.0:
+            turn = -1.0
+        left = wp.max(int(wp.ceil(a[0] + wp.min(0.0, wp.min(b[0], c[0])) - 0.5)), x0)
+        right = wp.min(int(wp.floor(a[0] + wp.max(0.0, wp.max(b[0], c[0])) - 0.5)), x1)
+        high = wp.max(int(wp.ceil(a[1] + wp.min(0.0, wp.min(b[1], c[1])) - 0.5)), y0)
+        low = wp.min(int(wp.floor(a[1] + wp.max(0.0, wp.max(b[1], c[1])) - 0.5)), y1)
+        for y in range(high, low + 1):
+            for x in range(left, right + 1):
+                p = wp.vec2(float(x) + 0.5, float(y) + 0.5) - a
+                if turn * cross2(p, c) > cross2_error(p, c) and turn * cross2(b, p) > cross2_error(b, p):
+                    if turn * cross2(c - b, p - b) > cross2_error(c - b, p - b):
+                        hits[y, x] = wp.uint8(wp.min(int(hits[y, x]) + 1, 255))
+
+
+@wp.kernel
+def attributes_kernel(
+    start: int,
+    # in
+    texel: wp.array(dtype=wp.int64), face: wp.array(dtype=wp.int32), bary: wp.array(dtype=wp.vec2),
+    faces: wp.array2d(dtype=wp.int32), vertices: wp.array(dtype=wp.vec3), normals: wp.array(dtype=wp.vec3),
+    # out
+    position: wp.array(dtype=wp.vec3), normal: wp.array(dtype=wp.vec3),
+):  # fmt: skip
+    """Position and unit normal at the listed texels, by barycentric interpolation; the normal of vertex 0 where they cancel."""
+    i = start + wp.tid()
+    t = texel[i]
+    f = face[t]
+    w = bary[t]
+    w0 = 1.0 - w[0] - w[1]
+    a = faces[f, 0]
+    b = faces[f, 1]
+    c = faces[f, 2]
+    position[i] = w0 * vertices[a] + w[0] * vertices[b] + w[1] * vertices[c]
+    n = w0 * normals[a] + w[0] * normals[b] + w[1] * normals[c]
+    if wp.length_sq(n) < 1.0e-12:
+        n = normals[a]
+    normal[i] = wp.normalize(n)
+
+
+@wp.kernel
+def tangents_kernel(
+    start: int,
+    # in
+    texel: wp.array(dtype=wp.int64), face: wp.array(dtype=wp.int32), bary: wp.array(dtype=wp.vec2),
+    faces: wp.array2d(dtype=wp.int32), tangents: wp.array(dtype=wp.vec4),
+    # out
+    tangent: wp.array(dtype=wp.vec4),
+):  # fmt: skip
+    """Interpolated unit tangent at the listed texels with the sign w of vertex 0."""
+    i = start + wp.tid()
+    t = texel[i]
+    f = face[t]
+    w = bary[t]
+    a = tangents[faces[f, 0]]
+    m = (1.0 - w[0] - w[1]) * a + w[0] * tangents[faces[f, 1]] + w[1] * tangents[faces[f, 2]]
+    d = wp.vec3(m[0], m[1], m[2])
+    if wp.length_sq(d) < 1.0e-12:
+        d = wp.vec3(a[0], a[1], a[2])
+    d = wp.normalize(d)
+    tangent[i] = wp.vec4(d[0], d[1], d[2], a[3])
+
+
+@wp.kernel
+def nearest_row_kernel(
+    start: int,
+    # in
+    valid: wp.array2d(dtype=wp.uint8), strip: int, lanes: int,
+    # out
+    row: wp.array2d(dtype=wp.int32),
+):  # fmt: skip
+    """Row of the nearest valid texel of the same column, the upper of two; -1 without one.
+
+    One thread of ``lanes`` works, on ``strip`` columns: contiguous reads, and still enough threads for a launch to be cut.
+    """
+    i = start + wp.tid()
+    if i % lanes != 0:
+        return
+    i = i / lanes
+    height = valid.shape[0]
+    x0 = i * strip
+    x1 = wp.min(x0 + strip, valid.shape[1])
+    for x in range(x0, x1):
+        row[0, x] = -1
+        if valid[0, x] != wp.uint8(0):
+            row[0, x] = 0
+    for y in range(1, height):
+        for x in range(x0, x1):
+            if valid[y, x] != wp.uint8(0):
+                row[y, x] = y
+            else:
+                row[y, x] = row[y - 1, x]
+    for s in range(1, height):
+        y = height - 1 - s
+        for x in range(x0, x1):
+            below = row[y + 1, x]
+            above = row[y, x]
+            if below > y and (above < 0 or below - y < y - above):
+                row[y, x] = below
+
+
+@wp.kernel
+def nearest_texel_kernel(
+    start: int,
+    # in
+    row: wp.array2d(dtype=wp.int32), lanes: int,
+    # scratch
+    site: wp.array2d(dtype=wp.int32), border: wp.array2d(dtype=wp.float32),
+    # out
+    source: wp.array2d(dtype=wp.int32), square: wp.array2d(dtype=wp.float32),
+):  # fmt: skip
+    """Flat index and squared distance of the nearest valid texel for every texel of row ``i``; -1 and inf without one.
+
+    Lower envelope of parabolas, Felzenszwalb and Huttenlocher 2012 (Distance transforms of sampled functions).
+    One thread of ``lanes`` works, on one row.
+    """
+    i = start + wp.tid()
+    if i % lanes != 0:
+        return
+    i = i / lanes
+    width = row.shape[1]
+    top = int(-1)
+    for q in range(width):
+        r = row[i, q]
+        if r >= 0:
+            h = float(r - i) * float(r - i)
+            s = float(0.0)
+            keep = int(1)
+            while top >= 0 and keep == 1:
+                v = site[i, top]
+                g = float(row[i, v] - i)
+                s = ((h - g * g) / float(q - v) + float(q + v)) * 0.5
+                if s <= border[i, top]:
+                    top -= 1
+                else:
+                    keep = 0
+            top += 1
+            site[i, top] = q
+            border[i, top] = s
+            if top == 0:
+                border[i, 0] = -1.0e30
+    k = int(0)
+    for x in range(width):
+        if top < 0:
+            source[i, x] = -1
+            square[i, x] = wp.inf
+        else:
+            while k < top and border[i, wp.min(k + 1, width - 1)] < float(x):
+                k += 1
+            v = site[i, k]
+            r = row[i, v]
+            source[i, x] = r * width + v
+            square[i, x] = float((r - i) * (r - i) + (x - v) * (x - v))
+
+
+@wp.kernel
+def fill_kernel(
+    start: int,
+    # in
+    source: wp.array(dtype=wp.int32), square: wp.array(dtype=wp.float32), limit: float, channels: int,
+    # in and out
+    values: wp.array2d(dtype=wp.float32),
+):  # fmt: skip
+    """Copy the channels of ``source[i]`` to texel ``i``, which differ where the texel is not valid, up to a distance."""
+    i = start + wp.tid()
+    j = source[i]
+    if j >= 0 and j != i and square[i] <= limit:
+        for c in range(channels):
+            values[i, c] = values[j, c]
