@@ -5,7 +5,6 @@ the network's input is; world +Y up, object centred, longest side 1; radiance is
 
 =================  =====================  ==============================================================================
 images             (V, S, S, 4) uint8     sRGB with straight alpha; the light's background is kept under it
-silhouette         (V, S, S) float16      signed distance to the mask's contour in pixels, positive inside
 c2w, intrinsics    (V, 4, 4), (V, 4)      OpenGL camera to world; fx, fy, cx, cy in pixels
 environment        (32, 64, 3) float16    linear radiance of the light, exposed as the images are
 points, distance   (P, 3), (P,) float16   volume points (first half near the surface) and signed distance, positive outside
@@ -25,7 +24,6 @@ from torch import Tensor
 
 from reli3d.data.distance import signed_distance
 from reli3d.data.procedural import ProceduralObject, sample_cameras
-from reli3d.geometry.hull import mask_distance
 from reli3d.geometry.rays import RayScene
 from reli3d.geometry.visibility import visible_from
 from reli3d.render.camera import Camera, camera_rays, project
@@ -103,9 +101,7 @@ def synthesize(shape: ProceduralObject, light: Tensor, rng: np.random.Generator,
         pick = torch.as_tensor(rng.integers(len(seen), size=PIXELS))
         pixels.append(torch.stack([at["position"], at["bump"], wo], 1)[pick])
         pixel_radiance.append((radiance[pick] * exposure).clamp(max=64.0))
-    images = torch.stack(images)
-    silhouette = mask_distance(images[..., 3] / 255.0)
-    sample.update(images=images, silhouette=silhouette.half(), c2w=c2w, intrinsics=intrinsics,
+    sample.update(images=torch.stack(images), c2w=c2w, intrinsics=intrinsics,
                   pixels=torch.stack(pixels).half(), pixel_radiance=torch.stack(pixel_radiance).half())  # fmt: skip
     pooled = torch.nn.functional.interpolate((environment.radiance * exposure).permute(2, 0, 1)[None], (32, 64), mode="area")
     sample["environment"] = pooled[0].permute(1, 2, 0).clamp(max=6e4).half()

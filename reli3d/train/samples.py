@@ -11,6 +11,7 @@ import torch
 from safetensors import safe_open
 from torch import Tensor
 
+from reli3d.geometry.hull import mask_distance
 from reli3d.nn.reni import map_directions
 
 
@@ -54,7 +55,7 @@ def load_sample(path: Path, views: int, points: int, rng: np.random.Generator, *
         total = file.get_slice("c2w").get_shape()[0]
         order = rng.permutation(total) if augment else np.arange(total)
         chosen = torch.as_tensor(order[:views].copy())
-        every = {k: file.get_tensor(k) for k in ("images", "silhouette", "c2w", "intrinsics", "visible", "environment")}
+        every = {k: file.get_tensor(k) for k in ("images", "c2w", "intrinsics", "visible", "environment")}
 
         def part(key: str, count: int) -> Tensor:
             n = file.get_slice(key).get_shape()[0]
@@ -81,7 +82,7 @@ def load_sample(path: Path, views: int, points: int, rng: np.random.Generator, *
     images = every["images"][chosen].float() / 255
     light = every["environment"].float()
     return {
-        "images": images[..., :3], "masks": images[..., 3], "silhouette": every["silhouette"][chosen].float(),
+        "images": images[..., :3], "masks": images[..., 3], "silhouette": mask_distance(images[..., 3].contiguous()),
         "c2w": c2w, "intrinsics": every["intrinsics"][chosen], "points": volume @ turn.T, "distance": distance,
         "surface": surface @ turn.T, "material": material, "visible": every["visible"][s][:, chosen].float(),
         "light_directions": map_directions(light.shape[0]).reshape(-1, 3) @ turn.T, "light": light.reshape(-1, 3),
