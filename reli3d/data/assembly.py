@@ -1,0 +1,107 @@
+"""The bench on which a procedural object is put together: solids with part numbers, deformed and joined at the end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from manifold3d import Manifold, Mesh, OpType
+
+SCRAP = 2e-3  # share of the volume below which a loose piece left by a cut is dropped
+
+
+class Assembly:
+    """Solids that are joined, cutters that are taken away, and the role (a hint for the material) of every part.
+
+    Roles: ``wood metal plastic paint fabric leather ceramic stone skin rubber accent any``.
+    """
+
+    def __init__(self, rng: np.random.Generator):
+        self.rng = rng
+        self.roles: list[str] = []
+        self._solids: list[Manifold] = []
+        self._cutters: list[Manifold] = []
+        self._part_of: dict[int, int] = {}
+
+    def part(self, role: str) -> int:
+        """Number of a new part."""
+        self.roles.append(role)
+        return len(self.roles) - 1
+
+    def add(self, solid: Manifold, part: int, at: Sequence[float] | None = None) -> None:
+        """Join ``solid``, moved by ``at``."""
+        self._solids.append(self._tagged(solid, part, at))
+
+    def add_labelled(self, vertices: np.ndarray, faces: np.ndarray, part: np.ndarray) -> None:
+        """Join a closed mesh ``(V, 3)``, ``(F, 3)`` whose faces belong to several parts ``(F,)``."""
+        order = np.argsort(part, kind="stable")
+        numbers, starts = np.unique(part[order], return_index=True)
+        first = Manifold.reserve_ids(len(numbers))
+        self._part_of.update({first + k: int(n) for k, n in enumerate(numbers)})
+        mesh = Mesh(np.array(vertices, dtype=np.float32, order="C"), np.array(faces[order], dtype=np.uint32, order="C"),
+                    run_index=np.append(starts, len(faces)).astype(np.uint32) * 3,
+                    run_original_id=np.arange(first, first + len(numbers), dtype=np.uint32))  # fmt: skip
+        self._solids.append(Manifold(mesh))
+
+    def cut(self, solid: Manifold, part: int, at: Sequence[float] | None = None) -> None:
+        """Take ``solid`` away from all that has been added so far; the cut faces belong to ``part``."""
+        self._solids = [self.joined() - self._tagged(solid, part, at)]
+
+    def keep_inside(self, solid: Manifold, part: int) -> None:
+        """Keep only what lies inside ``solid``."""
+        self._solids = [self.joined() ^ self._tagged(solid, part, None)]
+
+    def transform(self, matrix: np.ndarray) -> None:
+        """Apply the linear map ``(3, 3)`` to all that has been added so far."""
+        affine = np.concatenate([np.asarray(matrix, dtype=float), np.zeros((3, 1))], 1)
+        self._solids = [s.transform(affine) for s in self._solids]
+
+    def warp(self, move: Callable[[np.ndarray], np.ndarray], edge: float) -> None:
+        """Move the points ``(N, 3)`` of the joined solid by ``move`` after splitting edges longer than ``edge``."""
+        self._solids = [self.joined().refine_to_length(edge).warp_batch(move)]
+
+    def copy_turned(self, solid: Manifold, part: int, count: int, *, about: str = "y") -> None:
+        """Join ``count`` copies of ``solid``, turned evenly about an axis through the origin."""
+        axis = "xyz".index(about)
+        for k in range(count):
+            angles = [0.0, 0.0, 0.0]
+            angles[axis] = 360.0 * k / count
+            self.add(solid.rotate(tuple(angles)), part)
+
+    def joined(self) -> Manifold:
+        """Union of everything."""
+        if not self._solids:
+            raise ValueError("assembly: expected at least one solid, got none")
+        solid = self._solids[0] if len(self._solids) == 1 else Manifold.batch_boolean(self._solids, OpType.Add)
+        self._solids = [solid]
+        return solid
+
+    def finish(self, max_faces: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Vertices ``(V, 3)`` float64, faces ``(F, 3)`` and part of each face ``(F,)`` of the union without scraps.
+
+        Raises ValueError if nothing is left.
+        """
+        solid = self.joined()
+        pieces = solid.decompose()
+        if len(pieces) > 1:
+            volume = np.array([p.volume() for p in pieces])
+            solid = Manifold.compose([p for p, v in zip(pieces, volume) if v > SCRAP * volume.sum()])
+        if solid.num_tri() == 0 or solid.volume() <= 0:
+            raise ValueError("assembly: expected a solid, got nothing after the cuts")
+        box = np.array(solid.bounding_box()).reshape(2, 3)
+        tolerance = 2e-4 * float((box[1] - box[0]).max())
+        while solid.num_tri() > max_faces:
+            solid = solid.simplify(tolerance)
+            tolerance *= 1.6
+        mesh = solid.to_mesh64()
+        part = np.empty(len(mesh.tri_verts), dtype=np.int32)
+        starts = np.asarray(mesh.run_index) // 3
+        for k, original in enumerate(mesh.run_original_id):
+            part[starts[k] : starts[k + 1]] = self._part_of[int(original)]
+        vertices = np.asarray(mesh.vert_properties)[:, :3]
+        return vertices, np.asarray(mesh.tri_verts).astype(np.int32), part
+
+    def _tagged(self, solid: Manifold, part: int, at: Sequence[float] | None) -> Manifold:
+        solid = (solid if at is None else solid.translate(tuple(map(float, at)))).as_original()
+        self._part_of[solid.original_id()] = part
+        return solid

@@ -1,0 +1,51 @@
+"""Signed distance to closed meshes, as the truth of volume points in training."""
+
+from __future__ import annotations
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from reli3d import _bridge
+from reli3d.kernels import distance as kernels
+
+
+def signed_distance(vertices: Tensor, faces: Tensor, points: Tensor) -> Tensor:
+    """Distance ``(N,)`` from ``points`` ``(N, 3)`` to a closed, outward oriented mesh, negative inside, in the units
+    of the mesh.
+
+    vertices: ``(V, 3)`` float32; faces: ``(F, 3)`` int32.  No autograd.  On a mesh with holes the sign has no
+    meaning; a NaN point gives NaN.  Raises TypeError on a wrong dtype, ValueError on an empty mesh, an index out of
+    range, a wrong shape or device.
+    """
+    _bridge.check("vertices", vertices, last=3)
+    _bridge.check("faces", faces, last=3, like=vertices, dtype=torch.int32)
+    _bridge.check("points", points, last=3, like=vertices)
+    for name, value in (("vertices", vertices), ("faces", faces), ("points", points)):
+        if value.ndim != 2:
+            raise ValueError(f"{name}: expected shape (N, 3), got {tuple(value.shape)}")
+    if len(faces) == 0:
+        raise ValueError("faces: expected at least one, got none")
+    if int(faces.min()) < 0 or int(faces.max()) >= len(vertices):
+        raise ValueError(
+            f"faces: expected indices 0 to {len(vertices) - 1}, got {int(faces.min())} to {int(faces.max())}"
+        )
+    if not torch.isfinite(vertices).all():
+        raise ValueError("vertices: expected finite coordinates, got NaN or infinity")
+    vertices, faces, points = vertices.detach().contiguous(), faces.contiguous(), points.detach().contiguous()
+    finite = torch.isfinite(points).all(-1)
+    distance = points.new_empty(len(points))
+    with _bridge.stream(points.device):
+        mesh = wp.Mesh(
+            points=wp.from_torch(vertices, dtype=wp.vec3, requires_grad=False),
+            indices=wp.from_torch(faces.reshape(-1), dtype=wp.int32, requires_grad=False),
+        )
+    safe = torch.where(finite[:, None], points, torch.zeros_like(points))
+    reach = 4.0 * float(torch.cat([vertices, safe]).abs().max()) + 1.0  # longer than any distance that can occur
+    _bridge.launch(
+        kernels.signed_distance_kernel,
+        len(points),
+        [mesh.id, (safe, wp.vec3), reach, (distance, wp.float32)],
+        points.device,
+    )
+    return torch.where(finite, distance, torch.full_like(distance, float("nan")))

@@ -1,0 +1,88 @@
+"""Materials that vary over a surface: coats of colour, roughness and metal laid over each other by solid patterns.
+
+Base colours are linear Rec. 709, 0.02 to 0.9; roughness is perceptual.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from reli3d.data.noise import fbm
+
+ALBEDO_RANGE = (0.02, 0.9)  # coal to fresh snow
+ROUGHNESS_RANGE = (0.08, 1.0)
+STEEPEST = 0.6  # largest slope of a bump, 31 degrees: steeper ones shade below the horizon
+
+
+@dataclass(frozen=True)
+class Coat:
+    """One uniform layer of material."""
+
+    color: tuple[float, float, float]  # linear base colour
+    roughness: float
+    metallic: float = 0.0
+
+
+@dataclass(frozen=True)
+class Material:
+    """A coat, further coats where their patterns say, a slow drift of colour and roughness, and bumps."""
+
+    base: Coat
+    layers: tuple[tuple[Coat, object], ...] = ()
+    bumps: tuple[object, ...] = ()
+    drift: float = 0.0  # relative standard deviation of the colour, by noise
+    drift_roughness: float = 0.0
+    drift_scale: float = 3.0  # cycles a unit
+    seed: int = 0
+
+    def at(self, points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Base colour ``(N, 3)``, roughness ``(N,)``, metallic ``(N,)``, bumped normal ``(N, 3)``."""
+        coat = points.new_tensor([*self.base.color, self.base.roughness, self.base.metallic])
+        value = coat.expand(len(points), 5)
+        for layer, pattern in self.layers:
+            other = points.new_tensor([*layer.color, layer.roughness, layer.metallic])
+            value = torch.lerp(value, other.expand_as(value), pattern.weight(points, normals)[:, None])
+        color, roughness = value[:, :3], value[:, 3]
+        if self.drift > 0 or self.drift_roughness > 0:
+            noise = fbm(points * self.drift_scale, octaves=3, seed=self.seed)[0] * 2
+            color = color * torch.exp(self.drift * noise)[:, None]
+            roughness = roughness + self.drift_roughness * noise
+        bumped = normals
+        if self.bumps:
+            slope = torch.stack([bump.slope(points, normals) for bump in self.bumps]).sum(0)
+            slope = slope - normals * (slope * normals).sum(-1, keepdim=True)
+            size = slope.norm(dim=-1, keepdim=True)
+            slope = slope * (STEEPEST * torch.tanh(size / STEEPEST) / size.clamp(min=1e-8))
+            bumped = torch.nn.functional.normalize(normals - slope, dim=-1)
+        return color.clamp(*ALBEDO_RANGE), roughness.clamp(*ROUGHNESS_RANGE), value[:, 4].clamp(0, 1), bumped
+
+
+def evaluate(materials: Sequence[Material], points, normals, part):
+    """Materials of the parts ``(N,)`` at ``points`` ``(N, 3)`` with unit ``normals`` ``(N, 3)``.
+
+    Gives base colour ``(N, 3)``, roughness ``(N,)``, metallic ``(N,)``, bumped normal ``(N, 3)``, float32.
+    Arguments are all tensors on one device or all numpy arrays, and the results are of the same kind.  Raises
+    TypeError, ValueError on others.
+    """
+    as_array = isinstance(points, np.ndarray)
+    if as_array:
+        points, normals, part = (torch.from_numpy(np.ascontiguousarray(x)) for x in (points, normals, part))
+    for name, value in (("points", points), ("normals", normals)):
+        if value.dtype != torch.float32:
+            raise TypeError(f"{name}: expected float32, got {value.dtype}")
+        if value.ndim != 2 or value.shape[1] != 3 or len(value) != len(part):
+            raise ValueError(f"{name}: expected shape ({len(part)}, 3), got {tuple(value.shape)}")
+    if len(part) and not (int(part.min()) >= 0 and int(part.max()) < len(materials)):
+        raise ValueError(f"part: expected 0 to {len(materials) - 1}, got {int(part.min())} to {int(part.max())}")
+    color, bumped = torch.empty_like(points), torch.empty_like(points)
+    roughness, metallic = points.new_empty(len(points)), points.new_empty(len(points))
+    for k in torch.unique(part).tolist():
+        own = (part == k).nonzero()[:, 0]
+        color[own], roughness[own], metallic[own], bumped[own] = materials[k].at(points[own], normals[own])
+    results = color, roughness, metallic, bumped
+    return tuple(r.numpy() for r in results) if as_array else results

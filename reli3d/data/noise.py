@@ -1,0 +1,58 @@
+"""Solid noise at points, on the device of the points: summed gradient noise and cellular noise, with gradients."""
+
+from __future__ import annotations
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from reli3d import _bridge
+from reli3d.kernels import noise as kernels
+
+
+def fbm(
+    points: Tensor, *, octaves: int = 4, gain: float = 0.5, ridged: bool = False, seed: int = 0
+) -> tuple[Tensor, Tensor]:
+    """Fractal sum of gradient noise at ``points`` ``(N, 3)``: value ``(N,)`` and gradient with respect to the points
+    ``(N, 3)``.
+
+    One octave has mean 0 and standard deviation 0.5; ``ridged`` sums absolute values (turbulence, Perlin 1985).  No
+    autograd. Raises TypeError unless float32, ValueError on a wrong shape or ``octaves`` outside 1 to 16.
+    """
+    points = _points(points)
+    if not 1 <= octaves <= 16:
+        raise ValueError(f"octaves: expected 1 to 16, got {octaves}")
+    value = points.new_empty(len(points))
+    gradient = torch.empty_like(points)
+    args = [
+        (points, wp.vec3),
+        int(octaves),
+        float(gain),
+        int(ridged),
+        int(seed) & 0xFFFFFF,
+        (value, wp.float32),
+        (gradient, wp.vec3),
+    ]
+    _bridge.launch(kernels.fbm_kernel, len(points), args, points.device)
+    return value, gradient
+
+
+def cells(points: Tensor, *, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
+    """Cellular noise (Worley 1996) at ``points`` ``(N, 3)``: distances to the nearest two of one jittered point a
+    lattice cell ``(N, 2)``, a number in [0, 1) of the nearest ``(N,)``, gradient of second minus first distance
+    ``(N, 3)``.  No autograd.
+    """
+    points = _points(points)
+    distance = points.new_empty((len(points), 2))
+    cell = points.new_empty(len(points))
+    gradient = torch.empty_like(points)
+    args = [(points, wp.vec3), int(seed) & 0xFFFFFF, (distance, wp.vec2), (cell, wp.float32), (gradient, wp.vec3)]
+    _bridge.launch(kernels.cells_kernel, len(points), args, points.device)
+    return distance, cell, gradient
+
+
+def _points(points: Tensor) -> Tensor:
+    _bridge.check("points", points, last=3)
+    if points.ndim != 2:
+        raise ValueError(f"points: expected shape (N, 3), got {tuple(points.shape)}")
+    return points.contiguous()

@@ -1,0 +1,185 @@
+"""Procedural objects without end, for training: a closed mesh, its parts and their materials from one seed.
+
+Seeds are disjoint by use: training draws from ``TRAINING_SEEDS``, the objects on which progress is judged are
+``VALIDATION_SEEDS``, and :func:`example_object` is a fixed thing that no family can make.  The same seed gives the
+same object. Frame: right-handed, +Y up, as it rests, centred, longest side 1 (so inside the radius 0.87 of the
+network's frame).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from reli3d.data import furniture, manmade, organic, vessels
+from reli3d.data.assembly import Assembly
+from reli3d.data.finishes import draw_materials
+from reli3d.data.materials import Material, evaluate
+from reli3d.render.camera import look_at
+
+TRAINING_SEEDS = range(0, 1_000_000_000)
+VALIDATION_SEEDS = range(1_000_000_000, 1_000_000_032)
+MAX_FACES = 30_000
+CREASE_DEG = 38.0  # rounded edges turn at most 30 degrees a facet and must look smooth, edges of boxes turn 90
+FRAME_RADIUS = 0.87  # half diagonal of the unit cube: objects of longest side 1 lie inside
+
+FAMILIES = (
+    (manmade.csg, 0.2), (vessels.vessel, 0.12), (vessels.lamp, 0.05), (manmade.device, 0.12), (vessels.container, 0.08),
+    (manmade.tool, 0.05), (manmade.profile, 0.05), (furniture.table, 0.05), (furniture.chair, 0.06), (furniture.sofa,
+    0.03), (furniture.shelf, 0.04), (furniture.vehicle, 0.03), (organic.creature, 0.045), (organic.figure, 0.04),
+    (organic.shoe, 0.025), (organic.fruit, 0.025), (organic.stone, 0.035),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class ProceduralObject:
+    """Closed surface with materials.  Arrays are numpy; ``normals`` are those of shading, one for each corner of a
+    face.
+    """
+
+    vertices: np.ndarray  # (V, 3) float32
+    faces: np.ndarray  # (F, 3) int32, counter-clockwise seen from outside
+    normals: np.ndarray  # (F, 3, 3) float32 unit
+    part: np.ndarray  # (F,) int32 index into materials
+    materials: tuple[Material, ...]
+    name: str  # the family it is drawn from
+
+    def material(self, points: np.ndarray, normals: np.ndarray, part: np.ndarray):
+        """Base colour ``(N, 3)`` linear, roughness ``(N,)``, metallic ``(N,)``, bumped normal ``(N, 3)`` at surface
+        points.
+
+        points ``(N, 3)``, normals ``(N, 3)`` unit, part ``(N,)``: numpy arrays, or tensors on any one device; the
+        same kind comes back, float32.
+        """
+        return evaluate(self.materials, points, normals, part)
+
+
+def make_object(seed: int) -> ProceduralObject:
+    """The object of ``seed``: a family, a deformation, a pose at rest and materials, all drawn from it."""
+    rng = np.random.default_rng(seed)
+    weights = np.array([w for _, w in FAMILIES])
+    family = FAMILIES[int(rng.choice(len(FAMILIES), p=weights / weights.sum()))][0]
+    assembly = Assembly(rng)
+    family(assembly)
+    _deform(assembly)
+    _pose(assembly)
+    return assemble(assembly, family.__name__)
+
+
+def assemble(assembly: Assembly, name: str) -> ProceduralObject:
+    """Close ``assembly``: union, at most ``MAX_FACES`` faces, centre, scale, normals, materials."""
+    vertices, faces, part = assembly.finish(MAX_FACES)
+    low, high = vertices.min(0), vertices.max(0)
+    vertices = ((vertices - (low + high) / 2) / (high - low).max()).astype(np.float32)
+    used, part = np.unique(part, return_inverse=True)
+    part = part.reshape(-1).astype(np.int32)
+    bounds = np.array(
+        [[vertices[faces[part == k]].min((0, 1)), vertices[faces[part == k]].max((0, 1))] for k in range(len(used))]
+    )
+    materials = draw_materials(assembly.rng, [assembly.roles[k] for k in used], bounds)
+    return ProceduralObject(vertices, faces, corner_normals(vertices, faces), part, materials, name)
+
+
+def corner_normals(vertices: np.ndarray, faces: np.ndarray, crease_deg: float = CREASE_DEG) -> np.ndarray:
+    """Shading normals ``(F, 3, 3)`` float32, one for each corner: smooth across edges that turn less than
+    ``crease_deg``.
+
+    Corners of a vertex that smooth edges connect share the mean of their faces' normals, weighted by area and angle:
+    the area keeps flat sides flat beside narrow bevels, the angle makes the mean free of how a flat side is cut into
+    triangles.
+    """
+    p = vertices[faces].astype(np.float64)
+    edge = np.roll(p, -1, 1) - p
+    normal = np.cross(edge[:, 0], -edge[:, 2])
+    area = np.linalg.norm(normal, axis=1)
+    normal /= np.maximum(area, 1e-30)[:, None]
+    a, b = edge, -np.roll(edge, 1, 1)
+    angle = np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), (a * b).sum(-1))
+    count, last = len(faces), int(faces.max()) + 1
+    start, end = faces.reshape(-1).astype(np.int64), np.roll(faces, -1, 1).reshape(-1).astype(np.int64)
+    key, mirrored = start * last + end, end * last + start
+    order = np.argsort(key)
+    twin = order[np.minimum(np.searchsorted(key[order], mirrored), len(order) - 1)]  # half-edge on the other side
+    half = np.arange(3 * count)
+    smooth = (normal[half // 3] * normal[twin // 3]).sum(-1) > np.cos(np.radians(crease_deg))
+    # an edge joins the corner at its start with the corner at its end across the edge; a sliver has no normal of its
+    # own
+    smooth |= (area[half // 3] < 1e-12) | (area[twin // 3] < 1e-12)
+    here, there = half[smooth], (twin - twin % 3 + (twin + 1) % 3)[smooth]
+    graph = coo_matrix((np.ones(len(here), dtype=np.int8), (here, there)), shape=(3 * count, 3 * count))
+    groups, label = connected_components(graph, directed=False)
+    weight = np.repeat(normal * area[:, None], 3, axis=0) * angle.reshape(-1, 1)
+    total = np.stack([np.bincount(label, weights=weight[:, k], minlength=groups) for k in range(3)], -1)
+    size = np.linalg.norm(total, axis=1, keepdims=True)
+    own = np.repeat(normal, 3, axis=0)
+    result = np.where(size[label] > 1e-20, total[label] / np.maximum(size[label], 1e-20), own)
+    result[np.linalg.norm(result, axis=1) < 0.5] = (0.0, 1.0, 0.0)  # a sliver by itself: any unit vector
+    return result.reshape(count, 3, 3).astype(np.float32)
+
+
+def _deform(a: Assembly) -> None:
+    """Stretch along the axes, and with chance one of: taper, twist, bend, low waves."""
+    rng, u = a.rng, a.rng.uniform
+    a.transform(np.diag(np.exp(rng.normal(0, 0.12, 3))))
+    if rng.random() > 0.16:
+        return
+    box = np.array(a.joined().bounding_box()).reshape(2, 3)
+    centre, size = box.mean(0), float((box[1] - box[0]).max())
+    kind, k, wave = int(rng.integers(4)), u(-1, 1), rng.normal(0, 1, (4, 3)) * 4
+    phase = u(0, 6.28, (4, 3))
+
+    def move(q: np.ndarray) -> np.ndarray:
+        r = (q - centre) / size
+        if kind == 0:
+            r = r * np.stack([1 + 0.7 * k * r[:, 1], np.ones(len(r)), 1 + 0.7 * k * r[:, 1]], -1)
+        elif kind == 1:
+            c, s = np.cos(1.2 * k * r[:, 1]), np.sin(1.2 * k * r[:, 1])
+            r = np.stack([c * r[:, 0] + s * r[:, 2], r[:, 1], c * r[:, 2] - s * r[:, 0]], -1)
+        elif kind == 2:
+            r = r + np.stack([0.35 * k * r[:, 1] ** 2, np.zeros(len(r)), np.zeros(len(r))], -1)
+        else:
+            r = r + 0.025 * abs(k) * sum(np.sin(r @ w[:, None] + f) for w, f in zip(wave, phase))
+        return r * size + centre
+
+    a.warp(move, size / 18)
+
+
+def _pose(a: Assembly) -> None:
+    """Half of the objects face an axis, the others any way about +Y; some lie on a side."""
+    rng = a.rng
+    if rng.random() < 0.06:
+        a.transform(
+            np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0.0]])
+            if rng.random() < 0.5
+            else np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])
+        )
+    yaw = rng.uniform(0, 2 * np.pi) if rng.random() < 0.5 else np.pi / 2 * rng.choice(4, p=[0.55, 0.15, 0.15, 0.15])
+    c, s = np.cos(yaw), np.sin(yaw)
+    a.transform(np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]))
+
+
+def sample_cameras(rng: np.random.Generator, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Camera-to-world matrices ``(n, 4, 4)`` (OpenGL) and full fields of view ``(n,)`` in radians, float32.
+
+    The rendering protocol of the paper: field of view normal about 29.5 degrees (deviation 3.5), clipped to 22 to
+    37; distance 0.87 / sin(fov / 2) times 0.8 to 1.05, so that the object fills the frame.  Azimuths are spread
+    evenly with jitter and come in random order: the first k views are random but apart.  One set in six covers only
+    an arc.
+    """
+    if n < 1:
+        raise ValueError(f"n: expected at least 1, got {n}")
+    fov = np.radians(np.clip(rng.normal(29.5, 3.5, n), 22.0, 37.0))
+    arc = 2 * np.pi if rng.random() > 1 / 6 else rng.uniform(0.4, 1.2) * np.pi
+    azimuth = rng.uniform(0, 2 * np.pi) + arc * (rng.permutation(n) + rng.uniform(-0.35, 0.35, n)) / n
+    elevation = np.radians(np.where(rng.random(n) < 0.9, rng.uniform(-20, 55, n), rng.uniform(-35, 75, n)))
+    distance = FRAME_RADIUS / np.sin(fov / 2) * rng.uniform(0.8, 1.05, n)
+    target = rng.normal(0, 0.02, (n, 3))
+    level = np.cos(elevation)
+    direction = np.stack([level * np.sin(azimuth), np.sin(elevation), level * np.cos(azimuth)], -1)
+    eye = torch.from_numpy((target + distance[:, None] * direction).astype(np.float32))
+    c2w = look_at(eye, torch.from_numpy(target.astype(np.float32)), torch.tensor([0.0, 1.0, 0.0]))
+    return c2w.numpy(), fov.astype(np.float32)
