@@ -1,0 +1,292 @@
+"""Triangle mesh of the zero level of a grid: FlexiCubes (Shen et al. 2023, Flexible Isosurface Extraction, SIGGRAPH).
+
+A grid of X * Y * Z cubes fills the box [-radius, radius]^3; its vertices are ``(X + 1, Y + 1, Z + 1)`` with x first
+and z fastest, its cubes ``(X, Y, Z)`` in the same order.  The level is negative inside.  Corners of a cube are
+numbered x first, (0,0,0), (1,0,0), (0,1,0), (1,1,0), (0,0,1), ...; edges as ``kernels.flexicubes_tables.EDGES``.  The
+work after one pass over the grid is proportional to the surface.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from reli3d._bridge import check, launch
+from reli3d.geometry.mesh import Mesh
+from reli3d.kernels import flexicubes as kernels
+from reli3d.kernels.flexicubes_tables import tables
+
+I32 = wp.int32
+
+
+@dataclass(frozen=True)
+class _Topology:
+    """Integers that say what is connected; constants of the extraction."""
+
+    shape: tuple[int, int, int]  # vertices of the grid, padded
+    cubes: tuple[int, int, int]  # before padding
+    pad: int
+    cells: Tensor  # (S,) surface cubes, by index of their lowest vertex
+    rows: Tensor  # (S,) their row in the weights, -1 for a cube of the padding
+    resolved: Tensor  # (S,) case whose groups they use
+    counts: Tensor  # (S,) dual vertices
+    base: Tensor  # (S,) the first one
+    slot: Tensor  # (vertices of the grid,) surface cube of a cell; undefined elsewhere
+
+
+@lru_cache(8)
+def _tables(device: torch.device) -> dict[str, Tensor]:
+    return {name: torch.from_numpy(value.reshape(-1)).to(device) for name, value in tables()._asdict().items()}
+
+
+def surface_cubes(level: Tensor) -> Tensor:
+    """Cubes with a sign change, ``(K,)`` int64 ascending, ``(x * Y + y) * Z + z``: the only ones whose weights matter.
+
+    level: ``(X + 1, Y + 1, Z + 1)`` float32.
+    """
+    _check_level(level)
+    case, _ = _classify(level.detach().contiguous())
+    return case[:-1, :-1, :-1].reshape(-1).nonzero().squeeze(1)
+
+
+def extract_surface(
+    level: Tensor,
+    *,
+    radius: float | Sequence[float],
+    deformation: Tensor | None = None,
+    alpha: Tensor | None = None,
+    beta: Tensor | None = None,
+    gamma: Tensor | None = None,
+    cubes: Tensor | None = None,
+    closed: bool = True,
+    centre: bool = False,
+) -> Mesh:
+    """Mesh of ``level == 0`` inside the box, faces counter-clockwise from the positive side.
+
+    level: ``(X + 1, Y + 1, Z + 1)``, negative inside (0 is outside).  radius: half extent of the box, one or three
+    numbers. deformation: ``(X + 1, Y + 1, Z + 1, 3)`` offsets of the grid vertices in units of the box's extent; keep
+    it below half a cube.  Weights, already activated, positive: alpha ``(cubes, 8)`` of the corners, beta ``(cubes,
+    12)`` of the edges, gamma ``(cubes,)`` of the quads' split; None is 1.  cubes: where given, the weights have only
+    the rows of these cubes, which must be :func:`surface_cubes` of ``level``.
+
+    closed: where the inside reaches the border of the box, a flat cap closes the surface; False leaves it open there,
+    as the published release does.  Away from the border both give the same.  centre: split every quad into four
+    triangles around the mean of its diagonals weighted by gamma, as training wants it (gradients reach gamma); else
+    into two.
+
+    Vertices and faces come in the order of the published release (for ``centre``, centres follow the dual vertices).
+    Gradients reach level, deformation, alpha, beta and with ``centre`` gamma, by an own adjoint; the same bits for
+    any number of CPU threads.
+
+    Raises TypeError or ValueError on a wrong dtype, shape or device, on a level that is not finite or has one sign
+    only, on weights that are not positive.
+    """
+    _check_level(level)
+    low, high = (float(v) for v in torch.aminmax(level.detach()))
+    if not low < 0.0 <= high:
+        raise ValueError(f"level: expected values on both sides of 0, got [{low:.4g}, {high:.4g}]: no surface")
+    size = tuple(n - 1 for n in level.shape)
+    extent = [radius] * 3 if isinstance(radius, (int, float)) else list(radius)
+    if len(extent) != 3 or not all(0.0 < r < float("inf") for r in extent):
+        raise ValueError(f"radius: expected one or three positive numbers, got {radius}")
+    n_cubes = size[0] * size[1] * size[2]
+    if cubes is not None:
+        check("cubes", cubes, like=level, dtype=torch.int64)
+    for name, value, shape in (
+        ("deformation", deformation, (*level.shape, 3)),
+        ("alpha", alpha, (n_cubes if cubes is None else len(cubes), 8)),
+        ("beta", beta, (n_cubes if cubes is None else len(cubes), 12)),
+        ("gamma", gamma, (n_cubes if cubes is None else len(cubes),)),
+    ):
+        if value is not None:
+            check(name, value, like=level)
+            if tuple(value.shape) != tuple(shape):
+                raise ValueError(f"{name}: expected shape {tuple(shape)}, got {tuple(value.shape)}")
+
+    topology, padded, crossed = _topology(level.detach().contiguous(), cubes, closed)
+    scale = tuple(2.0 * float(r) for r in extent)
+    vertices = _DualVertices.apply(topology, scale, padded, level, deformation, alpha, beta)
+    if not bool(torch.isfinite(vertices.detach()).all()):
+        raise ValueError("alpha, beta, deformation: expected positive weights and finite offsets, got others")
+    quads, split = _quads(topology, padded, crossed, gamma)
+    if centre:
+        return _with_centres(vertices, quads, split if gamma is None else _gamma_of(topology, quads, gamma))
+    first = split[:, 0] * split[:, 2] > split[:, 1] * split[:, 3]
+    faces = torch.where(first[:, None], quads[:, [0, 1, 2, 0, 2, 3]], quads[:, [0, 1, 3, 3, 1, 2]])
+    return Mesh(vertices, faces.reshape(-1, 3))
+
+
+def _check_level(level: Tensor) -> None:
+    check("level", level)
+    if level.ndim != 3 or min(level.shape) < 2:
+        raise ValueError(f"level: expected shape (X + 1, Y + 1, Z + 1) with a cube at least, got {tuple(level.shape)}")
+    if (level.shape[0] + 2) * (level.shape[1] + 2) * (level.shape[2] + 2) >= 2**31:
+        raise ValueError(f"level: expected fewer than 2**31 grid vertices, got {tuple(level.shape)}")
+    if not bool(torch.isfinite(level.detach()).all()):
+        raise ValueError("level: expected finite values, got NaN or infinity")
+
+
+def _classify(level: Tensor) -> tuple[Tensor, Tensor]:
+    case, crossed = torch.empty_like(level, dtype=torch.uint8), torch.empty_like(level, dtype=torch.uint8)
+    launch(kernels.classify_kernel, level.numel(), [
+        (level.view(-1), wp.float32), *level.shape, (case.view(-1), wp.uint8), (crossed.view(-1), wp.uint8)],
+        level.device)  # fmt: skip
+    return case, crossed
+
+
+def _topology(level: Tensor, cubes: Tensor | None, closed: bool) -> tuple[_Topology, Tensor, Tensor]:
+    """Topology, the padded level and the crossed edges of its vertices."""
+    device, size = level.device, tuple(n - 1 for n in level.shape)
+    border = [level[0], level[-1], level[:, 0], level[:, -1], level[:, :, 0], level[:, :, -1]]
+    pad = int(closed and any(bool((side < 0).any()) for side in border))
+    if pad:
+        level = torch.nn.functional.pad(level, (1,) * 6, value=1.0)
+    case, crossed = _classify(level)
+    cells = case.view(-1).nonzero().squeeze(1)
+    i, j, k = cells // (level.shape[1] * level.shape[2]) - pad, cells // level.shape[2] % level.shape[1] - pad, \
+        cells % level.shape[2] - pad  # fmt: skip
+    rows = (i * size[1] + j) * size[2] + k
+    if pad:
+        real = (i >= 0) & (j >= 0) & (k >= 0) & (i < size[0]) & (j < size[1]) & (k < size[2])
+        rows = torch.where(real, rows, -1)
+    if cubes is not None:
+        own = rows if not pad else rows[real]
+        if not torch.equal(own, cubes):
+            raise ValueError(f"cubes: expected surface_cubes(level), {len(own)} of them, got {len(cubes)} others")
+        index = torch.cumsum(real, 0) - 1 if pad else torch.arange(len(cells), device=device)
+        rows = torch.where(real, index, -1) if pad else index
+    cells, rows = cells.to(torch.int32), rows.to(torch.int32)
+    resolved, counts = torch.empty_like(cells), torch.empty_like(cells)
+    slot = torch.empty(level.numel(), dtype=torch.int32, device=device)
+    table = _tables(device)
+    launch(kernels.resolve_kernel, len(cells), [
+        (cells, I32), (case.view(-1), wp.uint8), (table["neighbour"], I32), (table["count"], I32), *level.shape[1:],
+        (resolved, I32), (counts, I32), (slot, I32)], device)  # fmt: skip
+    base = torch.zeros_like(counts)
+    start = 0
+    for n in range(1, 5):  # the published order: cubes with one dual vertex first, then those with two, ...
+        mine = counts == n
+        base += torch.where(mine, (torch.cumsum(mine, 0, dtype=torch.int32) - 1) * n + start, 0)
+        start += n * int(mine.sum())
+    return _Topology(tuple(level.shape), size, pad, cells, rows, resolved, counts, base, slot), level, crossed
+
+
+def _scatter(index: Tensor, values: Tensor, length: int) -> Tensor:
+    """Sum of ``values (M, C)`` by ``index (M,)`` into ``(length, C)``; on CPU in the order of the list."""
+    out = values.new_zeros(length, values.shape[1])
+    return out.scatter_add_(0, index[:, None].expand_as(values), values)
+
+
+class _DualVertices(torch.autograd.Function):
+    """Own adjoint: the topology is discrete, and a thread a cube with a gather by vertex needs no atomics."""
+
+    @staticmethod
+    def forward(ctx, topology, scale, padded, level, deformation, alpha, beta):
+        t, device = topology, level.device
+        counts = t.counts.long()
+        order = torch.argsort(t.base)
+        owner = torch.repeat_interleave(order, counts[order]).to(torch.int32)
+        group = torch.arange(len(owner), dtype=torch.int32, device=device) - t.base[owner.long()]
+        vertices = torch.empty(len(owner), 3, device=device)
+        inputs = [None if v is None else v.detach().contiguous() for v in (deformation, alpha, beta)]
+        launch(kernels.dual_vertex_kernel, len(owner), [
+            (owner, I32), (group, I32), *_DualVertices.arguments(t, padded, inputs, scale), (vertices, wp.vec3)],
+            device)  # fmt: skip
+        ctx.topology, ctx.scale, ctx.given = topology, scale, [v is not None for v in (deformation, alpha, beta)]
+        ctx.save_for_backward(padded, vertices, level, *(v for v in (deformation, alpha, beta) if v is not None))
+        return vertices
+
+    @staticmethod
+    def arguments(t: _Topology, padded: Tensor, inputs: list, scale: tuple, *more) -> list:
+        table, none = _tables(padded.device), padded.new_empty(0)
+        shift, alpha, beta = (none if v is None else v.view(-1) for v in inputs)
+        return [(t.cells, I32), (t.resolved, I32), (t.rows, I32), *more, (table["group"], I32), (table["ends"], I32),
+                (padded.view(-1), wp.float32), (shift.view(-1, 3), wp.vec3), (alpha, wp.float32), (beta, wp.float32),
+                t.shape[1], t.shape[2], wp.vec3i(*t.cubes), t.pad, wp.vec3(*scale)]  # fmt: skip
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, g_vertices):
+        from reli3d.kernels import flexicubes_adjoint
+
+        t, device = ctx.topology, g_vertices.device
+        padded, vertices, level, *rest = ctx.saved_tensors
+        rest = iter(rest)
+        inputs = [next(rest).contiguous() if given else None for given in ctx.given]
+        n = len(t.cells)
+        g_level, g_alpha, g_beta = (torch.zeros(n, width, device=device) for width in (8, 8, 12))
+        g_shift = torch.zeros(n, 8, 3, device=device)
+        launch(flexicubes_adjoint.dual_vertex_adjoint_kernel, n, [
+            *_DualVertices.arguments(t, padded, inputs, ctx.scale, (t.counts, I32), (t.base, I32)),
+            (vertices, wp.vec3), (g_vertices.contiguous(), wp.vec3), (g_level.view(-1), wp.float32),
+            (g_shift.view(-1, 3), wp.vec3), (g_alpha.view(-1), wp.float32), (g_beta.view(-1), wp.float32)],
+            device)  # fmt: skip
+        corner = _corner_vertices(t).view(-1)
+        grads = [None, None, None, None]
+        if ctx.needs_input_grad[3]:
+            grads[0] = _scatter(corner, g_level.view(-1, 1), level.numel()).view(level.shape)
+        if ctx.needs_input_grad[4]:
+            grads[1] = _scatter(corner, g_shift.view(-1, 3), level.numel()).view(*level.shape, 3)
+        real = t.rows >= 0
+        for i, value, g in ((2, inputs[1], g_alpha), (3, inputs[2], g_beta)):
+            if ctx.needs_input_grad[3 + i]:
+                grads[i] = torch.zeros_like(value)
+                grads[i][t.rows[real].long()] = g[real]
+        return None, None, None, *grads
+
+
+def _corner_vertices(t: _Topology) -> Tensor:
+    """Grid vertex before padding at every corner of the surface cubes, ``(S, 8)``; a padding's one is the border's it
+    stands at."""
+    cells = t.cells.long()
+    at = torch.stack([cells // (t.shape[1] * t.shape[2]), cells // t.shape[2] % t.shape[1], cells % t.shape[2]], -1)
+    k = torch.arange(8, device=cells.device)
+    at = at[:, None] + torch.stack([k & 1, k >> 1 & 1, k >> 2], -1) - t.pad
+    at = torch.minimum(at.clamp(min=0), torch.tensor(t.cubes, device=cells.device))
+    return (at[..., 0] * (t.cubes[1] + 1) + at[..., 1]) * (t.cubes[2] + 1) + at[..., 2]
+
+
+def _quads(t: _Topology, padded: Tensor, crossed: Tensor, gamma: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Dual vertices of every quad ``(Q, 4)`` and the gammas of their cubes ``(Q, 4)``, in the published order."""
+    device = padded.device
+    own = crossed.view(-1).nonzero().squeeze(1)
+    bits = torch.tensor([1, 2, 4], dtype=torch.uint8, device=device)
+    which, direction = (crossed.view(-1)[own][:, None] & bits).nonzero(as_tuple=True)
+    origin, direction = own[which].to(torch.int32), direction.to(torch.int32)
+    quads = torch.empty(len(origin), 4, dtype=torch.int32, device=device)
+    split = torch.empty(len(origin), 4, device=device)
+    table = _tables(device)
+    launch(kernels.quad_kernel, len(origin), [
+        (origin, I32), (direction, I32), (t.slot, I32), (t.resolved, I32), (t.base, I32), (t.rows, I32),
+        (table["group"], I32), (table["around"], I32), (padded.view(-1), wp.float32),
+        (padded.new_empty(0) if gamma is None else gamma.detach().contiguous(), wp.float32), t.shape[1], t.shape[2],
+        (quads.view(-1), I32), (split.view(-1), wp.float32)], device)  # fmt: skip
+    return quads, split
+
+
+def _gamma_of(t: _Topology, quads: Tensor, gamma: Tensor) -> Tensor:
+    """Gamma of the cubes of every quad, ``(Q, 4)``, with its gradient; 1 in the padding."""
+    rows = torch.repeat_interleave(t.rows.long(), t.counts.long())
+    first = torch.repeat_interleave(t.base.long(), t.counts.long())
+    inner = torch.arange(len(first), device=first.device)
+    inner = inner - torch.repeat_interleave(torch.cumsum(t.counts.long(), 0) - t.counts, t.counts.long())
+    row_of = torch.empty_like(rows)
+    row_of[first + inner] = rows
+    rows = row_of[quads.long()]
+    return torch.where(rows >= 0, gamma[rows.clamp(min=0)], 1.0)
+
+
+def _with_centres(vertices: Tensor, quads: Tensor, gamma: Tensor) -> Mesh:
+    """Four triangles a quad around the mean of its diagonals' midpoints, each weighted by the gammas at its ends."""
+    corner = vertices[quads.long()]
+    one, other = gamma[:, 0] * gamma[:, 2], gamma[:, 1] * gamma[:, 3]
+    share = (one / (one + other))[:, None]
+    middle = share * (corner[:, 0] + corner[:, 2]) * 0.5 + (1.0 - share) * (corner[:, 1] + corner[:, 3]) * 0.5
+    index = torch.arange(len(quads), dtype=torch.int32, device=quads.device) + len(vertices)
+    faces = torch.stack([torch.stack([quads[:, k], quads[:, (k + 1) % 4], index], -1) for k in range(4)], 1)
+    return Mesh(torch.cat([vertices, middle]), faces.reshape(-1, 3))

@@ -1,0 +1,200 @@
+"""FlexiCubes (Shen et al. 2023), forward: classify the grid, resolve ambiguous cubes, place dual vertices, emit
+quads.
+
+The grid has ``nx * ny * nz`` vertices, index ``(i * ny + j) * nz + k``; a cube has the index of its lowest vertex, so
+the last layers of indices are no cubes.  Inside is level < 0.  ``pad`` is 1 where the grid was padded by one layer of
+outside vertices that stand *at* the border vertices: cubes of no thickness that close the surface flat on the box.
+"""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
+
+
+@wp.func
+def split_index(index: int, ny: int, nz: int) -> wp.vec3i:
+    return wp.vec3i(index // (ny * nz), (index // nz) % ny, index % nz)
+
+
+@wp.func
+def corner_index(cell: int, corner: int, ny: int, nz: int) -> int:
+    return cell + (corner & 1) * ny * nz + (corner >> 1 & 1) * nz + (corner >> 2)
+
+
+@wp.func
+def inside_bit(level: wp.array[float], index: int) -> int:
+    if level[index] < 0.0:
+        return 1
+    return 0
+
+
+@wp.func
+def grid_position(at: wp.vec3i, shift: wp.array[wp.vec3], cubes: wp.vec3i, pad: int) -> wp.vec3:
+    """Position of a grid vertex in [-0.5, 0.5]^3 plus deformation; ``cubes`` counts those before padding."""
+    i = wp.clamp(at[0] - pad, 0, cubes[0])
+    j = wp.clamp(at[1] - pad, 0, cubes[1])
+    k = wp.clamp(at[2] - pad, 0, cubes[2])
+    p = wp.vec3(float(i) / float(cubes[0]) - 0.5, float(j) / float(cubes[1]) - 0.5, float(k) / float(cubes[2]) - 0.5)
+    if shift.shape[0] > 0:
+        p += shift[(i * (cubes[1] + 1) + j) * (cubes[2] + 1) + k]
+    return p
+
+
+@wp.func
+def weight(values: wp.array[float], row: int, width: int, column: int) -> float:
+    """Entry of a weight; 1 for the padding's cubes (row -1) and where no weights are given."""
+    if row < 0 or values.shape[0] == 0:
+        return 1.0
+    return values[row * width + column]
+
+
+@wp.kernel
+def classify_kernel(
+    start: int,
+    # in
+    level: wp.array[float], nx: int, ny: int, nz: int,
+    # out
+    codes: wp.array[wp.uint8], crossed: wp.array[wp.uint8],
+):  # fmt: skip
+    """Case of every cube (0 where it is all inside), and which edges of a vertex have a quad: bit 0 y, 1 z, 2 x.
+
+    An edge belongs to the end that comes first in EDGES: the low end along x and z, the high end along y.
+    """
+    v = start + wp.tid()
+    at = split_index(v, ny, nz)
+    code = wp.int32(0)
+    if at[0] + 1 < nx and at[1] + 1 < ny and at[2] + 1 < nz:
+        for corner in range(8):
+            code += inside_bit(level, corner_index(v, corner, ny, nz)) << corner
+        if code == 255:
+            code = 0
+    codes[v] = wp.uint8(code)
+    edges = wp.int32(0)
+    own = inside_bit(level, v)
+    inner_x = at[0] > 0 and at[0] + 1 < nx
+    inner_y = at[1] > 0 and at[1] + 1 < ny
+    inner_z = at[2] > 0 and at[2] + 1 < nz
+    if inner_x and inner_z and at[1] > 0:
+        edges += own ^ inside_bit(level, v - nz)
+    if inner_x and inner_y and at[2] + 1 < nz:
+        edges += (own ^ inside_bit(level, v + 1)) << 1
+    if inner_y and inner_z and at[0] + 1 < nx:
+        edges += (own ^ inside_bit(level, v + ny * nz)) << 2
+    crossed[v] = wp.uint8(edges)
+
+
+@wp.kernel
+def resolve_kernel(
+    start: int,
+    # in
+    cells: wp.array[wp.int32], codes: wp.array[wp.uint8], neighbour: wp.array[wp.int32], count: wp.array[wp.int32],
+    ny: int, nz: int,
+    # out
+    resolved: wp.array[wp.int32], counts: wp.array[wp.int32], slot: wp.array[wp.int32],
+):  # fmt: skip
+    """Case whose groups a surface cube uses: the complement's if both cubes at its ambiguous face would join there."""
+    s = start + wp.tid()
+    cell = cells[s]
+    code = int(codes[cell])
+    face = neighbour[code]
+    if face >= 0:
+        axis = face // 2
+        at = split_index(cell, ny, nz)
+        step = wp.int32(1)
+        if axis == 1:
+            step = nz
+        if axis == 0:
+            step = ny * nz
+        if face % 2 == 1:
+            if neighbour[int(codes[cell + step])] == face - 1:
+                code = 255 - code
+        elif at[axis] > 0 and neighbour[int(codes[cell - step])] == face + 1:
+            code = 255 - code
+    resolved[s] = code
+    counts[s] = count[code]
+    slot[cell] = s
+
+
+@wp.kernel
+def dual_vertex_kernel(
+    start: int,
+    # in
+    owner: wp.array[wp.int32], own_group: wp.array[wp.int32],
+    cells: wp.array[wp.int32], resolved: wp.array[wp.int32], rows: wp.array[wp.int32],
+    group: wp.array[wp.int32], ends: wp.array[wp.int32],
+    level: wp.array[float], shift: wp.array[wp.vec3], alpha: wp.array[float], beta: wp.array[float],
+    ny: int, nz: int, cubes: wp.vec3i, pad: int, scale: wp.vec3,
+    # out
+    vertices: wp.array[wp.vec3],
+):  # fmt: skip
+    """Mean of the crossings of a group of edges, weighted by beta; NaN if a weight it uses is not positive."""
+    v = start + wp.tid()
+    s = owner[v]
+    cell = cells[s]
+    code = resolved[s]
+    row = rows[s]
+    at = split_index(cell, ny, nz)
+    total = wp.float32(0.0)
+    point = wp.vec3()
+    for e in range(12):
+        if group[code * 12 + e] == own_group[v]:
+            a = ends[2 * e]
+            b = ends[2 * e + 1]
+            alpha_a = weight(alpha, row, 8, a)
+            alpha_b = weight(alpha, row, 8, b)
+            beta_e = weight(beta, row, 12, e)
+            level_a = alpha_a * level[corner_index(cell, a, ny, nz)]
+            level_b = alpha_b * level[corner_index(cell, b, ny, nz)]
+            t = level_a / (level_a - level_b)
+            x_a = grid_position(at + wp.vec3i(a & 1, a >> 1 & 1, a >> 2), shift, cubes, pad)
+            x_b = grid_position(at + wp.vec3i(b & 1, b >> 1 & 1, b >> 2), shift, cubes, pad)
+            if not (alpha_a > 0.0 and alpha_b > 0.0 and beta_e > 0.0):
+                beta_e = wp.nan
+            point += (x_a + t * (x_b - x_a)) * beta_e
+            total += beta_e
+    vertices[v] = wp.cw_mul(point / total, scale)
+
+
+@wp.kernel
+def quad_kernel(
+    start: int,
+    # in
+    origin: wp.array[wp.int32], direction: wp.array[wp.int32], slot: wp.array[wp.int32], resolved: wp.array[wp.int32],
+    base: wp.array[wp.int32], rows: wp.array[wp.int32], group: wp.array[wp.int32], around: wp.array[wp.int32],
+    level: wp.array[float], gamma: wp.array[float], ny: int, nz: int,
+    # out
+    quads: wp.array[wp.int32], split: wp.array[float],
+):  # fmt: skip
+    """Dual vertices around a crossed edge, counter-clockwise seen from outside, and the gammas of their cubes.
+
+    ``direction``: 0 y (downwards), 1 z, 2 x, as the bits of :func:`classify_kernel`.
+    """
+    q = start + wp.tid()
+    v = origin[q]
+    first = ny * nz  # steps across the edge; the larger first
+    second = nz
+    lowest = v
+    axis = 2
+    if direction[q] == 0:
+        second = 1
+        lowest = v - nz
+        axis = 1
+    if direction[q] == 2:
+        first = nz
+        second = 1
+        axis = 0
+    outward = level[v] < 0.0
+    for corner in range(4):
+        # positions 0, 1, 3, 2 run around the edge; seen from the other end 2, 3, 1, 0
+        turn = corner
+        if outward:
+            turn = 3 - corner
+        n = turn
+        if turn == 2:
+            n = 3
+        if turn == 3:
+            n = 2
+        cell = lowest - first * (1 - (n >> 1)) - second * (1 - (n & 1))
+        s = slot[cell]
+        quads[q * 4 + corner] = base[s] + group[resolved[s] * 12 + around[axis * 4 + n]]
+        split[q * 4 + corner] = weight(gamma, rows[s], 1, 0)
