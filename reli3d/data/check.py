@@ -18,6 +18,7 @@ from torch.nn.functional import max_pool2d, pad
 
 from reli3d.data.normalize import RADIUS, Hull, centre_rays, meeting_point, normalize, visual_hull
 from reli3d.data.views import Views
+from reli3d.io.files import printable
 from reli3d.io.images import write_png
 from reli3d.render.camera import project
 
@@ -45,7 +46,7 @@ def explain_cameras(views: Views) -> list[str]:
         side = "behind the camera" if angle > 90 else f"{angle:.1f} deg off the object's middle"
         cover = float((views.masks[i] > 0.5).float().mean())
         lines.append(
-            f"view {i} {name}: {width} x {height}, field of view {fov[0]:.1f} x {fov[1]:.1f} deg, "
+            f"view {i} {printable(name)}: {width} x {height}, field of view {fov[0]:.1f} x {fov[1]:.1f} deg, "
             f"eye {_triple(c2w[i, :3, 3])}, {float(away.norm()):.3g} from the meeting point ({side}), "
             f"mask {100 * cover:.0f} % of the image, hull fills {100 * shares[i]:.0f} % of it"
         )
@@ -137,8 +138,8 @@ def _verdict(views: Views, hull: Hull, shares: list[float]) -> str:
     for i in range(len(views) if len(views) > 2 else 0):
         if min(agreement(views.select([j for j in range(len(views)) if j != i]))[1]) >= GOOD:
             return (
-                f"suspect: view {i} ({views.names[i]}) does not agree with the others, which agree without it; "
-                "check its camera and mask, or leave it out"
+                f"suspect: view {i} ({printable(views.names[i])}) does not agree with the others, which agree without "
+                "it; check its camera and mask, or leave it out"
             )
     if len(hull.points) == 0:
         return (
@@ -185,7 +186,8 @@ def rig_picture(views: Views, path: str | os.PathLike) -> None:
     target = hull.points.mean(0) if len(hull.points) else hull.aim
     reach = float((c2w[:, :3, 3] - target).norm(dim=-1).max()) * 1.15
     frustums = [_frustum(c, k, m.shape, 0.16 * reach) for c, k, m in zip(c2w, intrinsics, views.masks)]
-    spread = np.concatenate([*frustums, hull.points.numpy(), target[None].numpy(), np.zeros((1, 3))])
+    cube = _cube(views) if len(hull.points) else target[None].numpy()
+    spread = np.concatenate([*frustums, cube, np.zeros((1, 3))])
     middle, reach = (spread.min(0) + spread.max(0)) / 2, 0.55 * float((spread.max(0) - spread.min(0)).max())
     columns = max(1, (2 * PANEL + MARGIN) // (THUMB + MARGIN))
     rows = -(-len(views) // columns)
@@ -215,6 +217,12 @@ def _frustum(pose: Tensor, camera: Tensor, shape: tuple[int, int], length: float
     return torch.cat([pose[:3, 3][None], local @ pose[:3, :3].T + pose[:3, 3]]).numpy()
 
 
+def _cube(views: Views) -> np.ndarray:
+    """``(8, 3)`` corners of the network's cube in the frame of the cameras."""
+    corners = torch.cartesian_prod(*[torch.tensor([-RADIUS, RADIUS], dtype=torch.float64)] * 3)
+    return normalize(views).inverse().apply(corners).numpy()
+
+
 def _panel(views, hull, middle, reach, frustums, title, across, down, sign) -> Image.Image:
     picture = Image.new("RGB", (PANEL, PANEL), "#f4f4f4")
     draw = ImageDraw.Draw(picture)
@@ -231,9 +239,7 @@ def _panel(views, hull, middle, reach, frustums, title, across, down, sign) -> I
         half = max(1.0, 0.5 * hull.cell * zoom)
         for (x, y), grey in zip(at(points[order]), shade):
             draw.rectangle((x - half, y - half, x + half, y + half), fill=(int(grey),) * 2 + (int(grey) + 30,))
-        inverse = normalize(views).inverse()
-        cube = RADIUS * torch.tensor([[a, b, c] for a in (-1.0, 1.0) for b in (-1.0, 1.0) for c in (-1.0, 1.0)])
-        flat = at(inverse.apply(cube.double()).numpy())
+        flat = at(_cube(views))
         xs, ys = [p[0] for p in flat], [p[1] for p in flat]
         draw.rectangle((min(xs), min(ys), max(xs), max(ys)), outline="#606060")
     origin = at(np.zeros((1, 3)))[0]

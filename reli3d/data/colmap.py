@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from reli3d.data.shots import Lens, Shot, bend_of, cleaned, inside, number, straight
+from reli3d.data.shots import Lens, Shot, cleaned, inside, number
 from reli3d.io.files import InputError, file_size, shown
 
 MAX_BYTES = 1 << 28  # images.txt lists every matched point
@@ -43,7 +43,7 @@ def read_colmap(folder: Path, model: Path, count: int, *, outside: bool = False)
     Raises InputError naming the line and the field.
     """
     notes = ["COLMAP models have no up direction and no scale: the mesh comes out as the cameras stand"]
-    lenses = _cameras(model / "cameras.txt", notes)
+    lenses = _cameras(model / "cameras.txt")
     path, entries = model / "images.txt", []
     lines = _lines(path)
     for n, line in lines:
@@ -85,7 +85,7 @@ def _pose(where: str, words: list[str]) -> np.ndarray:
     return cleaned(where, "QVEC TVEC", c2w)
 
 
-def _cameras(path: Path, notes: list[str]) -> dict[str, Lens]:
+def _cameras(path: Path) -> dict[str, Lens]:
     lenses = {}
     for n, line in _lines(path):
         where, words = f"{path}: line {n}", line.split()
@@ -109,14 +109,12 @@ def _cameras(path: Path, notes: list[str]) -> dict[str, Lens]:
         if min(values[:focals]) <= 0 or min(size) < 1 or max(size) > 1e6:
             raise InputError(where, f"PARAMS: expected a positive size and focal length, got {shown(line)}; export "
                              "it again")  # fmt: skip
-        k, p = values[focals + 2 : focals + 2 + radial], values[focals + 2 + radial :]
-        if any(k + p):
-            note = straight(where, f"camera {words[0]}", bend_of(values[0], *size, k, p))
-            notes.extend([note] if note else [])
         lenses[words[0]] = Lens(
             focal=(values[0], values[focals - 1]),
             centre=(values[focals], values[focals + 1]),
             size=(int(size[0]), int(size[1])),
+            radial=tuple(values[focals + 2 : focals + 2 + radial]),
+            tangential=tuple(values[focals + 2 + radial :]),
         )
     if not lenses:
         raise InputError(path, "expected at least one camera, got none; export the model again")

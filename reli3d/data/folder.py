@@ -16,10 +16,10 @@ import torch
 from torch import Tensor
 
 from reli3d.data.colmap import find_colmap, read_colmap
-from reli3d.data.shots import Lens, Shot, inside
+from reli3d.data.shots import Lens, Shot, inside, straight
 from reli3d.data.transforms import read_transforms
 from reli3d.data.views import Views
-from reli3d.io.files import InputError
+from reli3d.io.files import InputError, shown
 from reli3d.io.images import read_image
 
 MAX_VIEWS = 16
@@ -80,7 +80,7 @@ def load_views(
 def _load(root: Path, shot: Shot, masks, notes: list[str], outside: bool) -> tuple[Tensor, Tensor, list[float]]:
     path = _existing(shot.image)
     if path is None:
-        raise InputError(shot.where, f"file_path: expected an image, got {shot.name!r} which does not exist; "
+        raise InputError(shot.where, f"file_path: expected an image, got {shown(shot.name)} which does not exist; "
                                      "paths are relative to the camera file and use /")  # fmt: skip
     _still_inside(root, path, shot, outside)
     image, alpha = read_image(path, notes=notes)
@@ -103,13 +103,13 @@ def _mask(root: Path, shot: Shot, path: Path, alpha: Tensor | None, masks, notes
     if masks is not None:
         found = _beside(Path(masks), path)
         if found is None:
-            raise InputError(masks, f"masks: expected a file for {path.name!r} with its stem, got none; add the mask")
+            raise InputError(masks, f"masks: expected a file with the stem of {shown(path.name)}, got none; add it")
         return _grey(found, notes)
     if shot.mask is not None:
         found = _existing(shot.mask)
         if found is None:
-            raise InputError(shot.where, f"mask_path: expected an image, got {shot.mask.name!r} which does not exist; "
-                                         "correct the path")  # fmt: skip
+            raise InputError(shot.where, f"mask_path: expected an image, got {shown(shot.mask.name)} which does not "
+                                         "exist; correct the path")  # fmt: skip
         _still_inside(root, found, shot, outside)
         return _grey(found, notes)
     if alpha is not None and float(alpha.min()) < 0.5:
@@ -149,9 +149,8 @@ def _beside(folder: Path, image: Path) -> Path | None:
 
 def _still_inside(root: Path, path: Path, shot: Shot, outside: bool) -> None:
     if not outside and not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(root)):
-        raise InputError(shot.where, f"file_path: expected a file within the folder, got {path.name!r} which links "
-                         "out of "
-                                     "it; copy the file in")  # fmt: skip
+        raise InputError(shot.where, f"file_path: expected a file within the folder, got {shown(path.name)} which "
+                                     "links out of it; copy the file in")  # fmt: skip
 
 
 def intrinsics_of(lens: Lens, width: int, height: int, where: str, notes: list[str]) -> list[float]:
@@ -171,6 +170,8 @@ def intrinsics_of(lens: Lens, width: int, height: int, where: str, notes: list[s
     else:
         fx = 0.5 * width / math.tan(0.5 * lens.fov[0])
         fy = fx if math.isnan(lens.fov[1]) else 0.5 * height / math.tan(0.5 * lens.fov[1])
+    note = straight(where, lens, fx, width, height)
+    notes.extend([note] if note else [])
     cx, cy = (0.5 * width, 0.5 * height) if lens.centre is None else (lens.centre[0] * sx, lens.centre[1] * sy)
     for name, value, side in (("cx", cx, width), ("cy", cy, height)):
         if not -side < value < 2 * side:

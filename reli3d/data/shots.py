@@ -24,6 +24,8 @@ class Lens:
     focal: tuple[float, float] | None = None
     centre: tuple[float, float] | None = None  # None: the middle
     size: tuple[int, int] | None = None
+    radial: tuple[float, ...] = ()  # k1, k2, ... of OpenCV's polynomial; accepted where it does not matter
+    tangential: tuple[float, ...] = ()  # p1, p2
 
 
 @dataclass(frozen=True)
@@ -128,20 +130,23 @@ def inside(root: Path, where: str, field: str, value: object, *, outside: bool =
     return path
 
 
-def straight(where: str, name: str, bend: float) -> str | None:
-    """Check that a lens bends the image corner by ``bend`` pixels at most BEND; a note where it bends at all."""
-    if bend > BEND or not math.isfinite(bend):
-        raise InputError(where, f"distortion: expected an undistorted lens, got {bend:.3g} pixels at the corner of "
-                                f"{name}; undistort the images (colmap image_undistorter)")  # fmt: skip
-    return f"{where}: lens distortion of {bend:.2g} pixels at the corner ignored" if bend > 0 else None
+def straight(where: str, lens: Lens, focal: float, width: int, height: int) -> str | None:
+    """Check that ``lens`` moves the corner of its image by at most BEND pixels; a note where it moves it at all."""
+    if not any(lens.radial + lens.tangential):
+        return None
+    bend = bend_of(focal, width, height, lens.radial, lens.tangential)
+    if not bend <= BEND:
+        raise InputError(where, f"distortion: expected an undistorted lens, got {bend:.3g} pixels at the corner of the "
+                                "image; undistort the images (colmap image_undistorter)")  # fmt: skip
+    return f"{where}: lens distortion of {bend:.2g} pixels at the corner ignored"
 
 
-def bend_of(focal: float, width: float, height: float, radial: list[float], tangential: list[float]) -> float:
-    """Pixels by which a polynomial lens moves the image corner: radial k1, k2, k3 and tangential p1, p2 (OpenCV)."""
+def bend_of(focal: float, width: int, height: int, radial: tuple[float, ...], tangential: tuple[float, ...]) -> float:
+    """Pixels by which a polynomial lens moves the image corner: radial k1, k2, ..., tangential p1, p2 (OpenCV)."""
     x, y = 0.5 * width / focal, 0.5 * height / focal
     r2 = x * x + y * y
-    factor = sum(k * r2 ** (i + 1) for i, k in enumerate(radial))
-    p1, p2 = (tangential + [0.0, 0.0])[:2]
+    factor = abs(sum(k * r2 ** (i + 1) for i, k in enumerate(radial)))
+    p1, p2 = tangential or (0.0, 0.0)
     dx = x * factor + abs(2 * p1 * x * y) + abs(p2 * (r2 + 2 * x * x))
     dy = y * factor + abs(p1 * (r2 + 2 * y * y)) + abs(2 * p2 * x * y)
     return focal * math.hypot(dx, dy)

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
-from reli3d.data.shots import Lens, Shot, bend_of, inside, number, rigid, straight
+from reli3d.data.shots import Lens, Shot, inside, number, rigid
 from reli3d.io.files import InputError, read_bytes, shown
 
 MAX_BYTES = 1 << 24
@@ -32,24 +33,30 @@ def read_json(path: Path) -> dict:
     except RecursionError:
         raise InputError(path, "expected a flat JSON file, got one nested too deep; export the cameras again") from None
     except json.JSONDecodeError as error:
-        raise InputError(path, f"line {error.lineno}: expected JSON, got {error.msg}; correct the file") from None
-    except ValueError as error:  # _refuse, _unique, an int of thousands of digits
+        raise InputError(path, f"line {error.lineno}: expected JSON ({error.msg}); correct the file") from None
+    except _Refused as error:
         raise InputError(path, f"{error}; correct the file") from None
+    except ValueError:
+        raise InputError(path, "expected numbers, got an integer of thousands of digits; correct the file") from None
     if not isinstance(value, dict):
         raise InputError(path, f"expected a JSON object with frames, got {type(value).__name__}; export the "
                          "cameras again")  # fmt: skip
     return value
 
 
+class _Refused(ValueError):
+    """JSON that Python would read and we do not."""
+
+
 def _refuse(word: str):
-    raise ValueError(f"expected finite numbers, got {word}")
+    raise _Refused(f"expected finite numbers, got {word}")
 
 
 def _unique(pairs: list) -> dict:
     result = dict(pairs)
     if len(result) != len(pairs):
         keys = [k for k, _ in pairs]
-        raise ValueError(f"expected every key once, got {shown(next(k for k in keys if keys.count(k) > 1))} twice")
+        raise _Refused(f"expected every key once, got {shown(next(k for k in keys if keys.count(k) > 1))} twice")
     return result
 
 
@@ -124,14 +131,9 @@ def _lens(where: str, frame: dict, data: dict, notes: list[str]) -> Lens:
         point = frame.get("camera_principal_point")
         point = centre if point is None else _pair(where, "camera_principal_point", point, -1e6, 1e6)
         lens = Lens(fov=(DEFAULT_FOV, DEFAULT_FOV), centre=point)
-    radial = [found(k) or 0.0 for k in ("k1", "k2", "k3", "k4")]
-    tangential = [found(k) or 0.0 for k in ("p1", "p2")]
-    if any(radial + tangential):
-        w, h = size or (1024, 1024)
-        focal = lens.focal[0] if lens.focal else 0.5 * w / math.tan(0.5 * lens.fov[0])
-        note = straight(where, str(frame.get("file_path")), bend_of(focal, w, h, radial, tangential))
-        notes.extend([note] if note else [])
-    return lens
+    radial = tuple(found(k, -1e6, 1e6) or 0.0 for k in ("k1", "k2", "k3", "k4"))
+    tangential = tuple(found(k, -1e6, 1e6) or 0.0 for k in ("p1", "p2"))
+    return replace(lens, radial=radial, tangential=tangential)
 
 
 def _fov(where: str, key: str, value: object) -> tuple[float, float]:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from reli3d.io.files import InputError, read_bytes, shown
 
-MAX_BYTES = 1 << 30
+MAX_BYTES = 1 << 29  # MAX_SAMPLES in float32, which ZIP never exceeds
 MAX_SAMPLES = 1 << 27  # 8192 x 4096 with four channels
 _ATTRIBUTES = 256  # a render with every metadata field has about 60
 _BLOCK = {0: 1, 1: 1, 2: 1, 3: 16, 4: 32, 5: 16, 6: 32, 7: 32, 8: 32, 9: 256}  # scanlines a chunk, by compression

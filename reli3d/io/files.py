@@ -12,10 +12,11 @@ class InputError(ValueError):
     """What a user gave cannot be used.  The text is one line that names the file, the field, the value and the fix."""
 
     def __init__(self, where: object, problem: str):
-        super().__init__(" ".join(f"{_plain(str(where))}: {_plain(problem)}".split()))
+        super().__init__(" ".join(f"{printable(str(where))}: {printable(problem)}".split()))
 
 
-def _plain(text: str) -> str:
+def printable(text: str) -> str:
+    """``text`` with control characters and what no terminal can show as escapes."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape", "replace").decode() for c in text)
 
 
@@ -36,7 +37,7 @@ def read_bytes(path: str | os.PathLike, limit: int) -> bytes:
         raise InputError(path, f"expected at most {limit} bytes, got {size}; give a smaller file")
     try:
         with open(path, "rb") as file:
-            return file.read(limit + 1)[:limit]
+            return file.read(size)  # not the limit: Python would allocate it
     except OSError as error:
         raise InputError(path, f"cannot be read ({error.strerror or error}); check its permissions") from None
 
