@@ -37,7 +37,7 @@ def gradient_noise(q: wp.vec3, seed: wp.uint32) -> wp.vec4:
         t = f[k]
         s[k] = t * t * t * (t * (t * 6.0 - 15.0) + 10.0)
         ds[k] = 30.0 * t * t * (t - 1.0) * (t - 1.0)
-    value = 0.0
+    value = wp.float32(0.0)
     grad = wp.vec3()
     for i in range(2):
         hx = mix(seed ^ wp.uint32(int(cell[0]) + i))
@@ -77,13 +77,13 @@ def fbm_kernel(
 ):  # fmt: skip
     i = start + wp.tid()
     q = points[i]
-    total = 0.0
+    total = wp.float32(0.0)
     slope = wp.vec3()
-    weight = 1.0
-    scale = 1.0
+    weight = wp.float32(1.0)
+    scale = wp.float32(1.0)
     for octave in range(octaves):
         n = gradient_noise(q * scale, mix(wp.uint32(seed * 64 + octave)))
-        sign = 1.0
+        sign = wp.float32(1.0)
         if ridged == 1 and n[0] < 0.0:
             sign = -1.0
         total += sign * weight * n[0]
@@ -105,8 +105,8 @@ def cells_kernel(
     i = start + wp.tid()
     q = points[i]
     base = wp.vec3(wp.floor(q[0]), wp.floor(q[1]), wp.floor(q[2]))
-    first = 1.0e9
-    second = 1.0e9
+    first = wp.float32(1.0e9)
+    second = wp.float32(1.0e9)
     to_first = wp.vec3()
     to_second = wp.vec3()
     name = wp.uint32(0)
