@@ -17,8 +17,8 @@ MAP = dict(rtol=1e-4, atol=1e-6)
 @pytest.fixture
 def decoder(goldens):
     decoder = EnvironmentDecoder(OFFICIAL.reni)
-    path = goldens.parent / "reni++L49.safetensors"
-    decoder.field.load_state_dict(read_tensors(path, {k: v.dtype for k, v in decoder.field.state_dict().items()}))
+    manifest = read_manifest(goldens.parent / "reni++L49.safetensors")
+    decoder.field.load_state_dict(read_tensors(manifest, {name: torch.float32 for name in manifest.tensors}))
     return decoder.eval()
 
 
@@ -41,7 +41,8 @@ def test_maps_match_published(decoder, golden):
 @torch.no_grad()
 def test_intermediate_features_match_published(decoder, golden):
     g = golden("reni_decoder")
-    torch.testing.assert_close(decoder.sample_directions, g["sample_directions"], rtol=0, atol=5e-7)  # its angles are float32
+    # the published angles are float32
+    torch.testing.assert_close(decoder.sample_directions, g["sample_directions"], rtol=0, atol=5e-7)
     turned = g["latent"] @ g["rotation"].mT
     torch.testing.assert_close(decoder.field.conditioning(turned), g["conditioning"], rtol=1e-5, atol=1e-6)
     features = decoder.field.directional(turned, g["sample_directions"][None, ::512])

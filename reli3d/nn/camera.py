@@ -44,6 +44,6 @@ class CameraEmbedder(nn.Module):
         super().__init__()
         self.linear = nn.Linear(25, width)
 
-    def forward(self, c2w: Tensor, intrinsics: Tensor, size: int) -> Tensor:
-        """``(..., 4, 4)`` and ``(..., 4)`` to ``(..., width)``."""
-        return self.linear(camera_vector(c2w, intrinsics, size).to(self.linear.weight.dtype))
+    def forward(self, vector: Tensor) -> Tensor:
+        """``(..., 25)`` to ``(..., width)``."""
+        return self.linear(vector)

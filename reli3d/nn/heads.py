@@ -1,6 +1,6 @@
 """What a point of the triplane is: small independent MLPs on its features, and the merging of FlexiCubes weights.
 
-Sizes are the published ones; names are spelt as Python names, :mod:`reli3d.nn.weights` has the table.
+Sizes are the published ones; names are spelt as Python names, :mod:`reli3d.nn.published` has the table.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class Heads(nn.ModuleDict):
     def forward(self, features: Tensor, names: Sequence[str], color: Tensor | None = None) -> dict[str, Tensor]:
         """``{name: (..., outputs)}`` of features ``(..., features)``; values as :func:`activate` describes them.
 
-        color: ``(..., 3)`` a guess of the base colour, sRGB in [0, 1]; its head then predicts a correction of the guess's logit.
+        color: ``(..., 3)`` a guess of the base colour, sRGB in [0, 1]; its head then corrects the guess's logit.
         """
         for name in names:
             if name not in self:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor, nn
 
-from reli3d.nn.camera import CameraEmbedder, ray_maps
+from reli3d.nn.camera import CameraEmbedder, camera_vector, ray_maps
 from reli3d.nn.heads import HEADS, Heads, WeightMerger, truncated_exp
 from reli3d.nn.illumination import Illumination
 from reli3d.nn.initialise import initialise
@@ -76,6 +76,10 @@ class Reconstructor(nn.Module):
             self.tone_mapping = ToneMappingConstants()
         initialise(self)
 
+    @property
+    def device(self) -> torch.device:
+        return self.camera.linear.weight.device
+
     def to_compute(self, dtype: torch.dtype) -> Reconstructor:
         """Cast the trunk (encoders, transformers, upsampler) to ``dtype``, in place; the rest stays float32."""
         for part in self.trunk():
@@ -97,8 +101,8 @@ class Reconstructor(nn.Module):
         Gradients reach every parameter on the way and the inputs.  Raises TypeError unless float32, ValueError on
         shapes that do not belong together and on another device than the parameters'.
         """
-        check_views(images, masks, c2w, intrinsics, self.preset.image_size, self.camera.linear.weight.device)
-        camera = self.camera(c2w, intrinsics, images.shape[2])
+        check_views(images, masks, c2w, intrinsics, self.preset.image_size, self.device)
+        camera = self.camera(camera_vector(c2w, intrinsics, images.shape[2]))
         dtype = self.bank.embeddings.dtype
         sizes, light = self.preset.encoder, self.preset.illumination.encoder
         rays = None
@@ -137,8 +141,8 @@ class Reconstructor(nn.Module):
         """Values of the named heads at points of the model's cube, ``{name: (B, N, outputs)}``, float32.
 
         points: ``(B, N, 3)``, inside plus or minus the preset's radius; features fade to zero outside.
-        view_features: ``(B, N, K)`` where the preset has ``view_feature_width`` K, else None.  color: ``(B, N, 3)`` sRGB, what the views
-        show at the points; the base colour is then a correction of it.
+        view_features: ``(B, N, K)`` where the preset has ``view_feature_width`` K, else None.  color: ``(B, N, 3)``
+        sRGB, what the views show at the points; the base colour is then a correction of it.
         ``density`` is the raw value, see :meth:`level`; ``base_color`` is sRGB-encoded; ``roughness`` is perceptual;
         ``normal`` is unit in the frame of :mod:`reli3d.geometry.bake`; ``deformation`` and ``flexicubes`` are raw, see
         :mod:`reli3d.nn.heads`.  Gradients reach the triplane, the points, the view features and the heads.

@@ -91,8 +91,8 @@ class Preset:
     density_threshold: float = 10.0  # the surface is where exp(raw + density_bias) has this value
     density_bias: float = -1.0
     roughness_is_alpha: bool = False  # the roughness head predicts the GGX width; query() returns its square root
-    log_level: bool = False  # the surface level is linear in the raw density (a signed distance) instead of in the density
-    softness: float = 0.02  # model units over which occupancy goes from 1/2 to 0.73: unit of log_level and of the silhouettes' bound
+    log_level: bool = False  # the surface level is linear in the raw density (a distance) instead of in the density
+    softness: float = 0.02  # model units from occupancy 1/2 to 0.73: unit of log_level and of the silhouettes' bound
     silhouette_bound: bool = False  # the density is bounded by the views' masks
     tone_mapping: bool = False  # carry the published tone-mapping constants, which nothing here reads
 

@@ -13,9 +13,9 @@ import os
 import pickle
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
-from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from reli3d.io.files import InputError, file_size, replacing
@@ -24,6 +24,7 @@ from reli3d.nn.presets import OFFICIAL, Preset
 from reli3d.nn.published import CHECKPOINT_PREFIX, our_key
 
 FORMAT = "reli3d 1"
+SMALL = Path(__file__).parents[1] / "assets" / "weights" / "small.safetensors"
 HEADER_LIMIT = 100 << 20  # bytes, the safetensors library's own bound
 _DTYPES = {"F64": torch.float64, "F32": torch.float32, "F16": torch.float16, "BF16": torch.bfloat16}
 _NAMES = {dtype: name for name, dtype in _DTYPES.items()}
@@ -46,6 +47,7 @@ class Manifest:
     """What a safetensors file says it holds."""
 
     path: str
+    start: int  # of the first tensor in the file, bytes
     tensors: dict[str, Stored]
     metadata: dict[str, str]  # of our files: format, preset, licence, and what the writer added
 
@@ -94,7 +96,7 @@ def read_manifest(path: str | os.PathLike) -> Manifest:
         end = entry.end
     if size != 8 + length + end:
         raise WeightsError(path, f"expected {8 + length + end} bytes, got {size}: cut off or overlong; fetch it again")
-    return Manifest(os.fspath(path), tensors, metadata)
+    return Manifest(os.fspath(path), 8 + length, tensors, metadata)
 
 
 def _stored(entry: dict) -> Stored:
@@ -132,6 +134,31 @@ def check_keys(where: object, got: Mapping[str, tuple[int, ...]], expected: Mapp
         raise WeightsError(where, f"{name}: {found}" + (f", and {len(wrong) - 1} more" if len(wrong) > 1 else ""))
 
 
+def locate(weights: str | os.PathLike) -> Path:
+    """File of the weights called ``small``, which the package brings, or ``official``, or of a path.
+
+    The official file is what :func:`convert_checkpoint` wrote into the folder ``RELI3D_WEIGHTS`` (default
+    ``~/.cache/reli3d``).  Raises WeightsError where there is no such file.
+    """
+    if os.fspath(weights) == "small":
+        path, fix = SMALL, "install the package again"
+    elif os.fspath(weights) == "official":
+        path = Path(os.environ.get("RELI3D_WEIGHTS") or Path.home() / ".cache" / "reli3d") / "official.safetensors"
+        fix = "convert the published checkpoint into it, or give the path of a converted file"
+    else:
+        path, fix = Path(weights), "check the path"
+    if not path.is_file():
+        raise WeightsError(path, f"no such file of weights; {fix}")
+    return path
+
+
+def load_model(
+    weights: str | os.PathLike, device: torch.device | str = "cpu", *, trunk: torch.dtype = torch.float32
+) -> Reconstructor:
+    """The network of :func:`locate`'s file, see :func:`load`.  Raises WeightsError."""
+    return load(locate(weights), trunk=trunk, device=device)[0]
+
+
 def load(
     path: str | os.PathLike,
     preset: Preset | None = None,
@@ -157,22 +184,27 @@ def load(
     with torch.device("meta"):
         model = Reconstructor(preset).to_compute(trunk)
     wanted = {name: value.dtype for name, value in model.state_dict().items()}
-    model.load_state_dict(read_tensors(path, wanted, device), strict=True, assign=True)
+    model.load_state_dict(read_tensors(manifest, wanted, device), strict=True, assign=True)
     return model.eval(), manifest
 
 
 def read_tensors(
-    path: str | os.PathLike, wanted: Mapping[str, torch.dtype], device: torch.device | str = "cpu"
+    manifest: Manifest, wanted: Mapping[str, torch.dtype], device: torch.device | str = "cpu"
 ) -> dict[str, Tensor]:
-    """The tensors named in ``wanted`` as the dtypes it gives; mapped where the file has that dtype and a CPU asks.
+    """The tensors named in ``wanted`` as the dtypes it gives.
 
-    Raises WeightsError.
+    On a CPU a tensor of the dtype in the file is a part of the file's mapping: read when used, never written back.
     """
-    try:
-        with safe_open(path, "pt", device=str(device)) as file:
-            return {name: file.get_tensor(name).to(dtype) for name, dtype in wanted.items()}
-    except (SafetensorError, OSError) as error:
-        raise WeightsError(path, f"cannot be read ({error})") from None
+    end = manifest.start + max((entry.end for entry in manifest.tensors.values()), default=0)
+    body = torch.from_file(manifest.path, shared=False, size=end, dtype=torch.uint8)
+    result = {}
+    for name, dtype in wanted.items():
+        entry = manifest.tensors[name]
+        start = manifest.start + entry.start
+        raw = body[start : manifest.start + entry.end]
+        raw = raw if start % entry.dtype.itemsize == 0 else raw.clone()  # others' headers may end anywhere
+        result[name] = raw.view(entry.dtype).reshape(entry.shape).to(device, dtype)
+    return result
 
 
 def save(path: str | os.PathLike, model: Reconstructor, *, licence: str, dtype: torch.dtype = torch.float16,
@@ -262,5 +294,5 @@ def load_environment(path: str | os.PathLike, model: Reconstructor) -> Manifest:
     expected = {name: tuple(value.shape) for name, value in field.state_dict().items()}
     check_keys(path, {name: entry.shape for name, entry in manifest.tensors.items()}, expected)
     device = model.environment.sample_directions.device
-    field.load_state_dict(read_tensors(path, {name: torch.float32 for name in expected}, device), strict=True)
+    field.load_state_dict(read_tensors(manifest, {name: torch.float32 for name in expected}, device), strict=True)
     return manifest
