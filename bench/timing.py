@@ -17,6 +17,7 @@ from statistics import median
 import torch
 
 MIN_RUNS = 5  # below that a decile is a guess
+MIN_SLOW = 3  # of steps above a second, which vary little and would make a full run last for ever
 MAX_RUNS = 200
 
 
@@ -32,37 +33,44 @@ class Timing:
     stages: dict[str, float]  # medians, for a step that returns ``{stage: seconds}``
 
 
-def time_steps(steps: Sequence[Callable], device: torch.device, *, seconds: float, warmup: int = 2) -> list[Timing]:
-    """Time every step within about ``seconds`` each, at least :data:`MIN_RUNS` times, in turn."""
+def time_steps(steps: Sequence[Callable], device: torch.device, *, seconds: float) -> list[Timing]:
+    """Time every step within about ``seconds`` each, at least :data:`MIN_RUNS` times, in turn, after a warm-up."""
     for step in steps:
-        for _ in range(warmup):
-            step()
+        step()  # compiles
+    least = MIN_RUNS if max(_clock(step, device)[0] for step in steps) < 1.0 else MIN_SLOW
     runs: list[list[float]] = [[] for _ in steps]
     returned: list[list] = [[] for _ in steps]
     gc.collect()
     begin = time.perf_counter()
-    while len(runs[0]) < MIN_RUNS or (
-        len(runs[0]) < MAX_RUNS and time.perf_counter() - begin < seconds * len(steps)
-    ):  # fmt: skip
+    while len(runs[0]) < least or (len(runs[0]) < MAX_RUNS and time.perf_counter() - begin < seconds * len(steps)):
         for k, step in enumerate(steps):
-            synchronise(device)
-            start = time.perf_counter()
-            value = step()
-            synchronise(device)
-            runs[k].append(time.perf_counter() - start)
-            returned[k].append(value if isinstance(value, dict) else None)
+            elapsed, value = _clock(step, device)
+            runs[k].append(elapsed)
+            returned[k].append(value if _is_stages(value) else None)
             del value
     peaks = [peak_bytes(step, device) for step in steps]  # last: giving memory back would slow the next runs
     return [summary(r, peak, values) for r, peak, values in zip(runs, peaks, returned, strict=True)]
+
+
+def _clock(step: Callable, device: torch.device) -> tuple[float, object]:
+    synchronise(device)
+    start = time.perf_counter()
+    value = step()
+    synchronise(device)
+    return time.perf_counter() - start, value
 
 
 def summary(runs: list[float], peak: int | None, returned: list) -> Timing:
     ordered = sorted(runs)
     last = len(ordered) - 1
     stages = {}
-    if returned and all(isinstance(value, dict) for value in returned):
+    if returned and None not in returned:
         stages = {key: median(value[key] for value in returned) for key in returned[0]}
     return Timing(median(ordered), ordered[round(0.1 * last)], ordered[round(0.9 * last)], len(ordered), peak, stages)
+
+
+def _is_stages(value: object) -> bool:
+    return isinstance(value, dict) and all(isinstance(v, float) for v in value.values())
 
 
 def synchronise(device: torch.device) -> None:
