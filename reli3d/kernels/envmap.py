@@ -8,7 +8,7 @@ constant over texels with respect to solid angle; densities are per steradian.
 
 import warp as wp
 
-from reli3d.kernels.math import PI, safe_sqrt
+from reli3d.kernels.math import safe_sqrt, turn_atan2, turn_cos_sin
 
 wp.set_module_options({"enable_backward": True, "cpu_compiler_flags": "-march=native"})
 
@@ -17,16 +17,15 @@ wp.set_module_options({"enable_backward": True, "cpu_compiler_flags": "-march=na
 def direction_to_uv(d: wp.vec3) -> wp.vec2:
     """Map coordinates in [0, 1]^2 of the unit direction ``d``; at the poles u is 0.5 and its slope stays finite."""
     s = safe_sqrt(d[0] * d[0] + d[2] * d[2])
-    return wp.vec2(0.5 + wp.atan2(d[0], -d[2]) / (2.0 * PI), wp.atan2(s, d[1]) / PI)
+    return wp.vec2(0.5 + turn_atan2(d[0], -d[2]), 2.0 * turn_atan2(s, d[1]))
 
 
 @wp.func
 def uv_to_direction(uv: wp.vec2) -> wp.vec3:
     """Unit direction of map coordinates."""
-    theta = 2.0 * PI * uv[0] - PI
-    phi = PI * uv[1]
-    s = wp.sin(phi)
-    return wp.vec3(wp.sin(theta) * s, wp.cos(phi), -wp.cos(theta) * s)
+    a = turn_cos_sin(uv[0])
+    p = turn_cos_sin(0.5 * uv[1])
+    return wp.vec3(-a[1] * p[1], p[0], a[0] * p[1])
 
 
 @wp.func
@@ -61,21 +60,26 @@ def lookup_envmap(radiance: wp.array2d(dtype=wp.vec3), d: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def upper_cell(cdf: wp.array2d(dtype=float), row: int, u: float) -> int:
-    """Index k with ``cdf[row, k] <= u < cdf[row, k + 1]``; such a cell has positive probability."""
-    low = wp.int32(0)
-    high = wp.int32(cdf.shape[1] - 1)
-    while high - low > 1:
-        middle = (low + high) // 2
-        if cdf[row, middle] <= u:
-            low = middle
-        else:
-            high = middle
-    return low
+def upper_cell(cdf: wp.array2d(dtype=float), guide: wp.array2d(dtype=wp.int32), row: int, u: float) -> int:
+    """Index k with ``cdf[row, k] <= u < cdf[row, k + 1]``; such a cell has positive probability.
+
+    Chen and Asau 1974: ``guide[row, j]`` is the cell of u = j / n, from which two steps are expected for any CDF.
+    """
+    n = guide.shape[1]
+    k = guide[row, wp.min(int(u * float(n)), n - 1)]
+    while k < n - 1 and cdf[row, k + 1] <= u:
+        k = k + 1
+    return k
 
 
 @wp.func
-def sample_envmap_uv(rows: wp.array2d(dtype=float), columns: wp.array2d(dtype=float), u: wp.vec2) -> wp.vec2:
+def sample_envmap_uv(
+    rows: wp.array2d(dtype=float),
+    columns: wp.array2d(dtype=float),
+    row_guide: wp.array2d(dtype=wp.int32),
+    column_guide: wp.array2d(dtype=wp.int32),
+    u: wp.vec2,
+) -> wp.vec2:
     """Map coordinates for uniform ``u`` in [0, 1)^2; density :func:`pdf_envmap_uv`.
 
     rows: ``(1, H + 1)`` CDF of the rows; columns: ``(H, W + 1)`` CDF within each row.  Inversion, monotone in both
@@ -83,17 +87,17 @@ def sample_envmap_uv(rows: wp.array2d(dtype=float), columns: wp.array2d(dtype=fl
     """
     height = columns.shape[0]
     width = columns.shape[1] - 1
-    r = upper_cell(rows, 0, u[0])
-    c = upper_cell(columns, r, u[1])
+    r = upper_cell(rows, row_guide, 0, u[0])
+    c = upper_cell(columns, column_guide, r, u[1])
     a = rows[0, r]
     b = columns[r, c]
     in_row = (u[0] - a) / (rows[0, r + 1] - a)
     in_column = (u[1] - b) / (columns[r, c + 1] - b)
-    top = wp.cos(PI * float(r) / float(height))
-    bottom = wp.cos(PI * float(r + 1) / float(height))
+    top = turn_cos_sin(0.5 * float(r) / float(height))[0]
+    bottom = turn_cos_sin(0.5 * float(r + 1) / float(height))[0]
     y = top + (bottom - top) * in_row
-    v = wp.acos(wp.clamp(y, -1.0, 1.0)) / PI * float(height)
-    v = wp.clamp(v, float(r), float(r) + 0.99999)  # float32 acos near a pole may leave the row
+    v = 2.0 * turn_atan2(safe_sqrt(1.0 - y * y), y) * float(height)
+    v = wp.clamp(v, float(r), float(r) + 0.99999)  # float32 arc cosine near a pole may leave the row
     return wp.vec2((float(c) + wp.min(in_column, 0.99999)) / float(width), v / float(height))
 
 
@@ -123,13 +127,13 @@ def lookup_envmap_kernel(
 def sample_envmap_kernel(
     start: int,
     # in
-    rows: wp.array2d(dtype=float), columns: wp.array2d(dtype=float), density: wp.array2d(dtype=float),
-    u: wp.array(dtype=wp.vec2),
+    rows: wp.array2d(dtype=float), columns: wp.array2d(dtype=float), row_guide: wp.array2d(dtype=wp.int32),
+    column_guide: wp.array2d(dtype=wp.int32), density: wp.array2d(dtype=float), u: wp.array(dtype=wp.vec2),
     # out
     directions: wp.array(dtype=wp.vec3), pdf: wp.array(dtype=float),
 ):  # fmt: skip
     i = start + wp.tid()
-    uv = sample_envmap_uv(rows, columns, u[i])
+    uv = sample_envmap_uv(rows, columns, row_guide, column_guide, u[i])
     directions[i] = uv_to_direction(uv)
     pdf[i] = pdf_envmap_uv(density, uv)
 

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from reli3d.kernels.math import INV_PI, PI, safe_sqrt
+from reli3d.kernels.math import INV_PI, safe_sqrt, turn_cos_sin
 
 wp.set_module_options({"enable_backward": True, "cpu_compiler_flags": "-march=native"})
 
@@ -11,8 +11,8 @@ wp.set_module_options({"enable_backward": True, "cpu_compiler_flags": "-march=na
 def sample_cosine(u: wp.vec2) -> wp.vec3:
     """Direction for uniform ``u`` in [0, 1)^2; density :func:`pdf_cosine`.  Malley: a lifted disk point."""
     r = wp.sqrt(u[0])
-    phi = 2.0 * PI * u[1]
-    return wp.vec3(r * wp.cos(phi), r * wp.sin(phi), wp.sqrt(1.0 - u[0]))
+    a = turn_cos_sin(u[1])
+    return wp.vec3(r * a[0], r * a[1], wp.sqrt(1.0 - u[0]))
 
 
 @wp.func
@@ -24,10 +24,10 @@ def pdf_cosine(wi: wp.vec3) -> float:
 @wp.func
 def sample_cap(w: wp.vec3, u: wp.vec2) -> wp.vec3:
     """Point of the unit sphere with z in [-w.z, 1], uniform in area."""
-    phi = 2.0 * PI * u[0]
+    a = turn_cos_sin(u[0])
     z = (1.0 - u[1]) * (1.0 + w[2]) - w[2]
     r = safe_sqrt(1.0 - z * z)
-    return wp.vec3(r * wp.cos(phi), r * wp.sin(phi), z)
+    return wp.vec3(r * a[0], r * a[1], z)
 
 
 @wp.func

@@ -101,6 +101,8 @@ def draw_contribution(
     radiance: wp.array2d(dtype=wp.vec3),
     rows: wp.array2d(dtype=float),
     columns: wp.array2d(dtype=float),
+    row_guide: wp.array2d(dtype=wp.int32),
+    column_guide: wp.array2d(dtype=wp.int32),
     density: wp.array2d(dtype=float),
     pixel: int,
     sample: int,
@@ -113,7 +115,8 @@ def draw_contribution(
     strategy = wp.int32(0)
     count = wp.int32(plan.n_environment)
     if sample < plan.n_environment:
-        uv = sample_envmap_uv(rows, columns, draw_pair(plan, points, pixel, sample, 0))
+        u = draw_pair(plan, points, pixel, sample, 0)
+        uv = sample_envmap_uv(rows, columns, row_guide, column_guide, u)
         out.direction = uv_to_direction(uv)
         wi = surface.frame * out.direction
     else:
@@ -161,8 +164,9 @@ def shade_kernel(
     position: wp.array(dtype=wp.vec3), normal: wp.array(dtype=wp.vec3), ng: wp.array(dtype=wp.vec3),
     wo: wp.array(dtype=wp.vec3), base_color: wp.array(dtype=wp.vec3), alpha: wp.array(dtype=float),
     metallic: wp.array(dtype=float), radiance: wp.array2d(dtype=wp.vec3), rows: wp.array2d(dtype=float),
-    columns: wp.array2d(dtype=float), density: wp.array2d(dtype=float), points: wp.array(dtype=wp.vec2),
-    pixels: wp.array(dtype=wp.int32), plan: Plan, mesh: wp.uint64, shadows: int,
+    columns: wp.array2d(dtype=float), row_guide: wp.array2d(dtype=wp.int32), column_guide: wp.array2d(dtype=wp.int32),
+    density: wp.array2d(dtype=float), points: wp.array(dtype=wp.vec2), pixels: wp.array(dtype=wp.int32), plan: Plan,
+    mesh: wp.uint64, shadows: int,
     # out
     out: wp.array(dtype=wp.vec3),
 ):  # fmt: skip
@@ -171,7 +175,9 @@ def shade_kernel(
     surface = make_surface(normal[i], ng[i], wo[i], base_color[i], alpha[i], metallic[i])
     total = wp.vec3(0.0, 0.0, 0.0)
     for s in range(plan.n_environment + plan.n_visible + plan.n_cosine):
-        c = draw_contribution(surface, plan, points, radiance, rows, columns, density, pixels[i], s)
+        c = draw_contribution(
+            surface, plan, points, radiance, rows, columns, row_guide, column_guide, density, pixels[i], s
+        )
         if c.value[0] + c.value[1] + c.value[2] > 0.0:
             lit = wp.bool(True)
             if shadows != 0:
@@ -189,8 +195,8 @@ def shade_rays_kernel(
     first: int, position: wp.array(dtype=wp.vec3), normal: wp.array(dtype=wp.vec3), ng: wp.array(dtype=wp.vec3),
     wo: wp.array(dtype=wp.vec3), base_color: wp.array(dtype=wp.vec3), alpha: wp.array(dtype=float),
     metallic: wp.array(dtype=float), radiance: wp.array2d(dtype=wp.vec3), rows: wp.array2d(dtype=float),
-    columns: wp.array2d(dtype=float), density: wp.array2d(dtype=float), points: wp.array(dtype=wp.vec2),
-    pixels: wp.array(dtype=wp.int32), plan: Plan,
+    columns: wp.array2d(dtype=float), row_guide: wp.array2d(dtype=wp.int32), column_guide: wp.array2d(dtype=wp.int32),
+    density: wp.array2d(dtype=float), points: wp.array(dtype=wp.vec2), pixels: wp.array(dtype=wp.int32), plan: Plan,
     # out
     origins: wp.array(dtype=wp.vec3), directions: wp.array(dtype=wp.vec3), t_max: wp.array(dtype=float),
     values: wp.array(dtype=wp.vec3),
@@ -201,7 +207,9 @@ def shade_rays_kernel(
     surface = make_surface(normal[i], ng[i], wo[i], base_color[i], alpha[i], metallic[i])
     count = plan.n_environment + plan.n_visible + plan.n_cosine
     for s in range(count):
-        c = draw_contribution(surface, plan, points, radiance, rows, columns, density, pixels[i], s)
+        c = draw_contribution(
+            surface, plan, points, radiance, rows, columns, row_guide, column_guide, density, pixels[i], s
+        )
         k = j * count + s
         reach = wp.float32(-1.0)
         if c.value[0] + c.value[1] + c.value[2] > 0.0:

@@ -22,12 +22,21 @@ _LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709
 class EnvironmentTable:
     """Piecewise-constant density over the texels.
 
-    rows: ``(1, H + 1)`` CDF over rows.  columns: ``(H, W + 1)`` CDF within each row.  density: ``(H, W)`` [1/sr].
+    rows: ``(1, H + 1)`` CDF over rows.  columns: ``(H, W + 1)`` CDF within each row.  row_guide ``(1, H)`` and
+    column_guide ``(H, W)``: int32, where to start the search.  density: ``(H, W)`` [1/sr].
     """
 
     rows: Tensor
     columns: Tensor
+    row_guide: Tensor
+    column_guide: Tensor
     density: Tensor
+
+    @property
+    def sampler(self) -> list[tuple[Tensor, type]]:
+        """The four arrays that ``sample_envmap_uv`` takes, with their Warp types."""
+        return [(self.rows, wp.float32), (self.columns, wp.float32), (self.row_guide, wp.int32),
+                (self.column_guide, wp.int32)]  # fmt: skip
 
 
 def texel_solid_angles(height: int, width: int, device: torch.device | None = None) -> Tensor:
@@ -115,7 +124,7 @@ class Environment:
         columns, rows = _cdf(weight), _cdf(per_row[None])
         # from the rounded tables, so that density and samples agree to the last bit
         density = rows.double().diff()[0][:, None] * columns.double().diff() / angle[:, None]
-        return EnvironmentTable(rows, columns, density.float())
+        return EnvironmentTable(rows, columns, _guide(rows), _guide(columns), density.float())
 
     def sample(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """Directions ``(..., 3)`` and density ``(...)`` [1/sr] for uniform ``u (..., 2)`` in [0, 1).  No gradient."""
@@ -123,8 +132,7 @@ class Environment:
         flat, table = u.detach().reshape(-1, 2).contiguous(), self.table
         n = flat.shape[0]
         directions, pdf = empty((n,), wp.vec3, flat.device), empty((n,), wp.float32, flat.device)
-        args = [(table.rows, wp.float32), (table.columns, wp.float32), (table.density, wp.float32), (flat, wp.vec2),
-                (directions, wp.vec3), (pdf, wp.float32)]  # fmt: skip
+        args = [*table.sampler, (table.density, wp.float32), (flat, wp.vec2), (directions, wp.vec3), (pdf, wp.float32)]
         launch(kernels.sample_envmap_kernel, n, args, flat.device)
         return directions.reshape(*u.shape[:-1], 3), pdf.reshape(u.shape[:-1])
 
@@ -144,3 +152,11 @@ def _cdf(weight: Tensor) -> Tensor:
     out = (total / total[:, -1:]).float()
     out[:, -1] = 1.0
     return out.contiguous()
+
+
+def _guide(cdf: Tensor) -> Tensor:
+    """Cell of u = j / n, ``(R, n)`` int32, for each row of a CDF ``(R, n + 1)``."""
+    n = cdf.shape[1] - 1
+    u = torch.arange(n, dtype=torch.float32, device=cdf.device).div(n).expand(cdf.shape[0], n).contiguous()
+    # one cell back: the kernel's float product u n may round up to j from below
+    return (torch.searchsorted(cdf, u, right=True) - 2).clamp(0, n - 1).int()

@@ -62,8 +62,8 @@ def shade(
     table, device = environment.table, position.device
     surface = [(position, wp.vec3), (normal, wp.vec3), (ng, wp.vec3), (wo, wp.vec3), (base_color, wp.vec3),
                (width, wp.float32), (metallic, wp.float32)]  # fmt: skip
-    light = [(environment.radiance, wp.vec3), (table.rows, wp.float32), (table.columns, wp.float32),
-             (table.density, wp.float32), (offsets.to(device), wp.vec2)]  # fmt: skip
+    light = [(environment.radiance, wp.vec3), *table.sampler, (table.density, wp.float32),
+             (offsets.to(device), wp.vec2)]  # fmt: skip
     if pixels is None:
         pixels = torch.arange(n, dtype=torch.int32, device=device)
     check("pixels", pixels, like=position, dtype=torch.int32)
