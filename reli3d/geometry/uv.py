@@ -81,9 +81,9 @@ def unwrap(mesh: Mesh, *, texture_size: int = 1024) -> Mesh:
     _check(mesh, texture_size)
     source_faces = mesh.faces.cpu().numpy()
     first, label = (t.cpu().numpy() for t in weld(mesh.vertices.detach()))
-    positions = mesh.vertices.detach().cpu().numpy().astype(np.float64)[first]
+    points = mesh.vertices.detach().cpu().numpy()[first]
     guard = guard_band(texture_size)
-    charts = parts.make_charts(positions, label[source_faces], texels=FILL * texture_size**2,
+    charts = parts.make_charts(points, label[source_faces].astype(np.int32), texels=FILL * texture_size**2,
                                least_texels=9.0 * guard * guard, sliver=4.0e-6 * texture_size)  # fmt: skip
     uv = _pack(charts, texture_size, guard)
     flat = _area(uv) <= 0.0
@@ -137,25 +137,26 @@ def _pack(charts: parts.Charts, size: int, guard: float) -> np.ndarray:
     reserved = -(-len(slivers) // columns) * pitch + 0.5 if len(slivers) else 0.0
     normal = np.flatnonzero(charts.chart >= 0)
     if len(normal):
-        number, chart = np.unique(charts.chart[normal], return_inverse=True)
-        corners = parts.shift_to_zero(charts.corners[normal].astype(np.float64), chart, len(number))
-        uv[normal] = _place(charts, normal, chart.reshape(-1), corners, size, guard, reserved)
+        uv[normal] = _place(charts, normal, size, guard, reserved)
     uv /= size
     uv[..., 1] = 1.0 - uv[..., 1]
     return uv.astype(np.float32)
 
 
-def _place(charts: parts.Charts, faces: np.ndarray, chart: np.ndarray, corners: np.ndarray, size: int, guard: float,
-           reserved: float) -> np.ndarray:  # fmt: skip
-    """Corners in texels of the atlas, y up, above the ``reserved`` strip."""
-    count = int(chart.max()) + 1
-    near = charts.neighbours[faces]
-    border = (near < 0) | (charts.chart[near] != charts.chart[faces][:, None])
-    order, _ = parts.group(np.repeat(chart, 3)[border.ravel()].astype(np.int64))
-    edges = np.stack([corners, np.roll(corners, -1, 1)], 2)[border][order].astype(np.float32)  # (E, 2, 2)
-    owner = np.repeat(chart, 3)[border.ravel()][order]
-    edge_start = np.searchsorted(owner, np.arange(count + 1)).astype(np.int32)
-    extent = np.maximum.reduceat(edges.max(1), edge_start[:-1], axis=0).astype(np.float64)
+def _place(charts: parts.Charts, faces: np.ndarray, size: int, guard: float, reserved: float) -> np.ndarray:
+    """Corners of the ``faces`` that have a chart, in texels of the atlas, y up, above the ``reserved`` strip."""
+    used = np.zeros(charts.count, bool)
+    used[charts.chart[faces]] = True
+    chart, count = (np.cumsum(used) - 1)[charts.chart[faces]], int(used.sum())
+    face, corner = np.nonzero(parts.border_edges(charts.chart, charts.neighbours)[faces])
+    order, start = parts.group(chart[face])
+    face, corner = face[order], corner[order]
+    edges = np.stack([charts.corners[faces[face], corner], charts.corners[faces[face], (corner + 1) % 3]], 1)
+    low = np.minimum.reduceat(edges.min(1), start, axis=0)
+    edges -= low[chart[face]][:, None]
+    edge_start = np.append(start, len(edges)).astype(np.int32)
+    extent = np.maximum.reduceat(edges.max(1), start, axis=0).astype(np.float64)
+    corners = charts.corners[faces].astype(np.float64) - low[chart][:, None]
     cell = max(1.0, size / CELLS)
     cells = int(size / cell)
     sequence = torch.from_numpy(np.lexsort((np.arange(count), -extent[:, 0], -extent[:, 1])).astype(np.int32))

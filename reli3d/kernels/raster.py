@@ -6,6 +6,7 @@ the output and gathers, so that the result does not depend on the number of thre
 
 import warp as wp
 
+# ruff: noqa: UP018  (int(0) is a variable to Warp, 0 a constant)
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
 
 ROUNDING = wp.constant(4.0e-7)  # relative error of a float32 cross product, twice over: neighbours leave no crack
@@ -148,9 +149,11 @@ def coverage_kernel(
         for y in range(high, low + 1):
             for x in range(left, right + 1):
                 p = wp.vec2(float(x) + 0.5, float(y) + 0.5) - a
-                if turn * cross2(p, c) > cross2_error(p, c) and turn * cross2(b, p) > cross2_error(b, p):
-                    if turn * cross2(c - b, p - b) > cross2_error(c - b, p - b):
-                        hits[y, x] = wp.uint8(wp.min(int(hits[y, x]) + 1, 255))
+                w0 = turn * cross2(c - b, p - b) - cross2_error(c - b, p - b)
+                w1 = turn * cross2(p, c) - cross2_error(p, c)
+                w2 = turn * cross2(b, p) - cross2_error(b, p)
+                if wp.min(w0, wp.min(w1, w2)) > 0.0:
+                    hits[y, x] = wp.uint8(wp.min(int(hits[y, x]) + 1, 255))
 
 
 @wp.kernel

@@ -6,7 +6,137 @@ Coordinates of a chart are plane units with x right and y up; packing works in c
 
 import warp as wp
 
+# ruff: noqa: UP018  (int(0) is a variable to Warp, 0 a constant)
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
+
+
+@wp.kernel
+def normals_kernel(
+    start: int,
+    # in
+    points: wp.array(dtype=wp.vec3), faces: wp.array2d(dtype=wp.int32),
+    # out
+    normal: wp.array(dtype=wp.vec3),
+):  # fmt: skip
+    """Normals of the faces, length twice the area."""
+    i = start + wp.tid()
+    a = points[faces[i, 0]]
+    normal[i] = wp.cross(points[faces[i, 1]] - a, points[faces[i, 2]] - a)
+
+
+@wp.kernel
+def smooth_kernel(
+    start: int,
+    # in
+    neighbours: wp.array2d(dtype=wp.int32), normal: wp.array(dtype=wp.vec3),
+    # out
+    smoothed: wp.array(dtype=wp.vec3),
+):  # fmt: skip
+    """Sum of the normals of a face and its neighbours."""
+    i = start + wp.tid()
+    total = normal[i]
+    for k in range(3):
+        j = neighbours[i, k]
+        if j >= 0:
+            total += normal[j]
+    smoothed[i] = total
+
+
+@wp.func
+def along(n: wp.vec3, axis: int) -> float:
+    """Component of ``n`` on axis 0..5: +x, +y, +z, -x, -y, -z."""
+    if axis < 3:
+        return n[axis]
+    return -n[axis - 3]
+
+
+@wp.func
+def nearest_axis(n: wp.vec3) -> int:
+    """Axis of the largest component, the first of equals."""
+    best = int(0)
+    for k in range(1, 6):
+        if along(n, k) > along(n, best):
+            best = k
+    return best
+
+
+@wp.kernel
+def labels_kernel(
+    start: int,
+    # in
+    normal: wp.array(dtype=wp.vec3), smoothed: wp.array(dtype=wp.vec3), cosine: float,
+    # out
+    label: wp.array(dtype=wp.int32),
+):  # fmt: skip
+    """Axis nearest to the smoothed normal, or to the face's own where the first is off by more than ``cosine``."""
+    i = start + wp.tid()
+    axis = nearest_axis(smoothed[i])
+    if along(normal[i], axis) < cosine * wp.length(normal[i]):
+        axis = nearest_axis(normal[i])
+    label[i] = axis
+
+
+@wp.kernel
+def majority_kernel(
+    start: int,
+    # in
+    neighbours: wp.array2d(dtype=wp.int32), normal: wp.array(dtype=wp.vec3), label: wp.array(dtype=wp.int32), cosine: float,
+    # out
+    voted: wp.array(dtype=wp.int32),
+):  # fmt: skip
+    """The label of two or three neighbours of a face, if the face is within ``cosine`` of that axis."""
+    i = start + wp.tid()
+    vote = wp.vec3i(-1, -1, -1)
+    for k in range(3):
+        j = neighbours[i, k]
+        if j >= 0:
+            vote[k] = label[j]
+    winner = vote[0]
+    if vote[0] != vote[1] and vote[0] != vote[2]:
+        winner = -1
+        if vote[1] == vote[2]:
+            winner = vote[1]
+    voted[i] = label[i]
+    if winner >= 0 and along(normal[i], winner) >= cosine * wp.length(normal[i]):
+        voted[i] = winner
+
+
+@wp.kernel
+def oblique_kernel(
+    start: int,
+    # in
+    normal: wp.array(dtype=wp.vec3), chart: wp.array(dtype=wp.int32), toward: wp.array(dtype=wp.vec3), cosine: float,
+    # out
+    oblique: wp.array(dtype=wp.uint8),
+):  # fmt: skip
+    """Mark charts with a face more oblique than ``cosine`` to their direction.  Every writer writes the same 1."""
+    i = start + wp.tid()
+    if wp.dot(normal[i], toward[chart[i]]) < cosine * wp.length(normal[i]):
+        oblique[chart[i]] = wp.uint8(1)
+
+
+@wp.kernel
+def project_kernel(
+    start: int,
+    # in
+    points: wp.array(dtype=wp.vec3), faces: wp.array2d(dtype=wp.int32), chart: wp.array(dtype=wp.int32),
+    right: wp.array(dtype=wp.vec3), up: wp.array(dtype=wp.vec3), low: wp.array(dtype=wp.vec2), least: float,
+    # out
+    corners: wp.array2d(dtype=wp.vec2), flat: wp.array(dtype=wp.uint8),
+):  # fmt: skip
+    """Corners of a face in the plane of its chart; ``flat`` marks a face with a height below ``least`` or turned over."""
+    i = start + wp.tid()
+    c = chart[i]
+    p = wp.vec3()
+    for k in range(3):
+        p = points[faces[i, k]]
+        corners[i, k] = wp.vec2(wp.dot(p, right[c]), wp.dot(p, up[c])) - low[c]
+    a = corners[i, 1] - corners[i, 0]
+    b = corners[i, 2] - corners[i, 0]
+    longest = wp.max(wp.length(a), wp.max(wp.length(b), wp.length(b - a)))
+    flat[i] = wp.uint8(0)
+    if not (a[0] * b[1] - a[1] * b[0] > least * longest):
+        flat[i] = wp.uint8(1)
 
 
 @wp.func
@@ -33,14 +163,13 @@ def components_serial_kernel(
     for i in range(count):
         for k in range(3):
             j = neighbours[i, k]
-            if j > i:
-                if group[j] == group[i]:
-                    a = root_of(parent, i)
-                    b = root_of(parent, j)
-                    if a < b:
-                        parent[b] = a
-                    elif b < a:
-                        parent[a] = b
+            if j > i and group[j] == group[i]:
+                a = root_of(parent, i)
+                b = root_of(parent, j)
+                if a < b:
+                    parent[b] = a
+                elif b < a:
+                    parent[a] = b
     for i in range(count):  # every parent is smaller and already final
         parent[i] = parent[parent[i]]
 
@@ -84,26 +213,32 @@ def overlap(corners: wp.array2d(dtype=wp.vec2), i: int, j: int, slack: float) ->
 def overlaps_kernel(
     start: int,
     # in
-    bvh: wp.uint64, lower: wp.array(dtype=wp.vec3), upper: wp.array(dtype=wp.vec3), corners: wp.array2d(dtype=wp.vec2),
-    chart: wp.array(dtype=wp.int32), slack: float, offset: wp.array(dtype=wp.int64), emit: int,
+    bvh: wp.uint64, boxes: wp.array(dtype=wp.int32), query: wp.array(dtype=wp.int32),
+    corners: wp.array2d(dtype=wp.vec2), chart: wp.array(dtype=wp.int32), slack: float,
+    offset: wp.array(dtype=wp.int64), emit: int,
     # out
     count: wp.array(dtype=wp.int32), partner: wp.array(dtype=wp.int32),
 ):  # fmt: skip
-    """Count (``emit`` 0) or list (1, from ``offset[i]``) the faces of the same chart that overlap face ``i``.
+    """Count (``emit`` 0) or list (1, from ``offset[i]``) the faces of the same chart that overlap face ``query[i]``.
 
-    ``bvh`` holds the boxes of the faces with the chart number as z, so that charts never meet.
+    ``bvh`` holds the boxes of the faces ``boxes`` with the chart number as z, so that charts never meet.
     """
     i = start + wp.tid()
     if emit == 1 and count[i] == 0:
         return
+    f = query[i]
     found = int(0)
-    query = wp.bvh_query_aabb(bvh, lower[i], upper[i])
-    j = int(0)
-    while wp.bvh_query_next(query, j):
-        if j != i and chart[j] == chart[i] and chart[i] >= 0:
-            if overlap(corners, i, j, slack):
+    if chart[f] >= 0:
+        low = wp.min(corners[f, 0], wp.min(corners[f, 1], corners[f, 2]))
+        high = wp.max(corners[f, 0], wp.max(corners[f, 1], corners[f, 2]))
+        z = float(chart[f])
+        search = wp.bvh_query_aabb(bvh, wp.vec3(low[0], low[1], z), wp.vec3(high[0], high[1], z))
+        b = int(0)
+        while wp.bvh_query_next(search, b):
+            g = boxes[b]
+            if g != f and chart[g] == chart[f] and overlap(corners, f, g, slack):
                 if emit == 1:
-                    partner[int(offset[i]) + found] = j
+                    partner[int(offset[i]) + found] = g
                 found += 1
     if emit == 0:
         count[i] = found
@@ -142,10 +277,9 @@ def split_serial_kernel(
                         owner[f] = current
                         for k in range(3):
                             g = neighbours[f, k]
-                            if g >= 0:
-                                if owner[g] < 0 and chart[g] == chart[f]:
-                                    queue[tail] = g
-                                    tail += 1
+                            if g >= 0 and owner[g] < 0 and chart[g] == chart[f]:
+                                queue[tail] = g
+                                tail += 1
             current += 1
 
 
