@@ -142,13 +142,14 @@ def _frames(normal: torch.Tensor, label: np.ndarray, chart: np.ndarray, count: i
     """Right and up vectors ``(N, 3)`` of the plane of each chart, with the factor that keeps its area."""
     array = normal.numpy()
     total = np.stack([np.bincount(chart, array[:, k], count) for k in range(3)], 1)
-    toward = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    toward = total / np.maximum(length, 1e-300)
     oblique = torch.zeros(count, dtype=torch.uint8)
     _bridge.launch(kernels.oblique_kernel, len(chart), [
         (normal, wp.vec3), _ints(chart), _floats(toward, wp.vec3), COS_TILT, (oblique, wp.uint8)], CPU)  # fmt: skip
     axis = np.zeros((count, 3))
     axis[chart] = AXES[label]  # one label in a chart
-    toward = np.where(oblique.numpy()[:, None] > 0, axis, toward)
+    toward = np.where((oblique.numpy()[:, None] > 0) | (length < 1e-20), axis, toward)
     helper = AXES[np.where(np.abs(toward[:, 1]) < 0.9, 1, 0)]  # world up on the page where there is one
     right = np.cross(helper, toward)
     right /= np.linalg.norm(right, axis=1, keepdims=True)

@@ -104,9 +104,8 @@ def _joined(mesh: Mesh, faces: np.ndarray, charts: parts.Charts, uv: np.ndarray)
     """Corners of one source vertex in one chart become one vertex; a sliver keeps its three for itself."""
     count = len(mesh.vertices)
     alone = charts.chart < 0
-    own = charts.count + np.cumsum(alone) - 1
-    chart = np.where(alone, own, charts.chart).astype(np.int64)
-    corner = (chart[:, None] * count + faces).ravel()
+    own = charts.count + 3 * (np.cumsum(alone) - 1)[:, None] + np.arange(3)
+    corner = (np.where(alone[:, None], own, charts.chart[:, None]).astype(np.int64) * count + faces).ravel()
     order, first = parts.group(corner)
     rank = np.zeros(len(order), np.int64)
     rank[first[1:]] = 1
