@@ -19,6 +19,7 @@ import platform
 import re
 import subprocess
 import sys
+import traceback
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from datetime import datetime, timezone
@@ -136,12 +137,18 @@ def main(argv: list[str] | None = None) -> int:
     if unknown:
         parser.error(f"names: expected some of {', '.join(cases)}, got {', '.join(unknown)}")
     device = torch.device(options.device)
-    about, results = context(device), HERE / "results"
+    about, results, failed = context(device), HERE / "results", 0
     baseline = json.loads(BASELINE.read_text()) if BASELINE.exists() else {}
     for name, case in cases.items():
         if options.names and name not in options.names and name.split(".")[0] not in options.names:
             continue
-        result = measure(case, device, seconds=options.seconds)
+        try:
+            result = measure(case, device, seconds=options.seconds)
+        except Exception:  # a case that fails does not stop the rest
+            traceback.print_exc()
+            sys.stdout.write(f"{name:32s} failed\n")
+            failed += 1
+            continue
         if result is None:
             sys.stdout.write(f"{name:32s} does not run on {device}\n")
             continue
@@ -158,7 +165,7 @@ def main(argv: list[str] | None = None) -> int:
             baseline.setdefault(device.type, {})[name] = round(result.ratio, 4)
     if options.record:
         BASELINE.write_text(json.dumps(baseline, indent=2, sort_keys=True) + "\n")
-    return 0
+    return 1 if failed else 0
 
 
 if __name__ == "__main__":
