@@ -22,7 +22,7 @@ LAYERS = [
     {"io", "data"},
     {"nn"},
     {"pipeline"},
-    {"train", "eval"},
+    {"train", "eval", "results"},
     {"cli"},
 ]
 LEVEL = {part: level for level, layer in enumerate(LAYERS) for part in layer}

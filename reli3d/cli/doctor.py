@@ -120,8 +120,8 @@ def main(argv: list[str] | None = None) -> int:
         prog="reli3d", description="Looks after the installation. The work is done by reli3d-infer and reli3d-train."
     )
     parser.add_argument("--version", action="version", version=f"reli3d {reli3d.__version__}")
-    parser.add_argument("command", nargs="?", choices=["doctor"], default="doctor", help="print versions, devices, kernel "
-                        "cache and weights, and whether all is usable (the default)")  # fmt: skip
+    parser.add_argument("command", nargs="?", choices=["doctor"], default="doctor",
+                        help="print versions, devices, kernel cache and weights, and the verdict")  # fmt: skip
     parser.parse_args(argv)
     text, usable = examine()
     sys.stdout.write(text + "\n")
