@@ -1,63 +1,79 @@
-"""Soft visual hull of posed masks: a bound on the density that any reconstruction has to keep."""
+"""Visual hull of an object from the masks of posed images, as a signed distance; positive inside throughout."""
 
 from __future__ import annotations
 
-import numpy as np
+import math
+
 import torch
 import warp as wp
-from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from reli3d._bridge import check, launch
-from reli3d.kernels.hull import hull_distance_kernel
-
-PARTIAL = 0.02  # alpha within this of 0 or 1 is a full pixel
+from reli3d.kernels import hull as kernels
 
 
 def mask_distance(masks: Tensor) -> Tensor:
-    """Signed distance in pixels ``(V, H, W)`` to the contour alpha = 0.5 of ``masks (V, H, W)`` in [0, 1], positive inside.
+    """Signed distance of every pixel centre to the mask's contour, ``(V, H, W)`` in pixels, positive inside.
 
-    Partly covered pixels give their own coverage less one half; the others the exact Euclidean distance to the nearest pixel of the
-    other side, corrected by that pixel's coverage.  A mask without a contour is everywhere as far as the image is wide.
-    No gradient.  Raises TypeError unless float32, ValueError on another shape.
+    masks: ``(V, H, W)`` float32 coverage in [0, 1].  The contour is where the mask, bilinear between pixel centres,
+    is 0.5, as straight segments (marching squares): sub-pixel for a soft mask, half way between pixels for a hard
+    one. Exact to that contour near it; elsewhere at most a fraction of a pixel too long, since only the segments
+    around the nearest cell with a contour are measured.  The image border is no contour: a mask cut by it goes on
+    beyond.  A view without contour is the image diagonal deep inside or outside.  No gradient.
     """
     check("masks", masks)
-    if masks.ndim != 3 or masks.numel() == 0:
-        raise ValueError(f"masks: expected (V, H, W), got {tuple(masks.shape)}")
-    return torch.as_tensor(np.stack([_signed(m) for m in masks.detach().cpu().numpy()]), device=masks.device)
+    if masks.ndim != 3 or min(masks.shape[1:]) < 2 or max(masks.shape[1:]) > 8192:
+        raise ValueError(f"masks: expected shape (V, H, W) with H and W in [2, 8192], got {tuple(masks.shape)}")
+    masks = masks.detach().contiguous()
+    views, height, width = masks.shape
+    if views and not (bool((masks >= 0).all()) and bool((masks <= 1).all())):
+        raise ValueError("masks: expected values in [0, 1], got others")
+    distance = torch.empty_like(masks)
+    launch(kernels.mask_distance_kernel, masks.numel(), [
+        (masks, wp.float32), *_nearest_crossing(masks), *_nearest_crossing(masks.transpose(1, 2).contiguous()),
+        math.hypot(height, width), (distance, wp.float32)], masks.device)  # fmt: skip
+    return distance
 
 
-def _signed(alpha: np.ndarray) -> np.ndarray:
-    inside = alpha > 0.5
-    if inside.all() or not inside.any():
-        return np.full_like(alpha, max(alpha.shape) if inside.all() else -max(alpha.shape))
-    out = np.empty_like(alpha)
-    for side, sign in ((inside, 1.0), (~inside, -1.0)):
-        distance, (row, column) = distance_transform_edt(side, return_indices=True)
-        reach = distance - np.abs(alpha[row, column] - 0.5)
-        out[side] = sign * reach[side]
-    partial = (np.abs(alpha - 0.5) < 0.5 - PARTIAL) & (np.abs(out) < 1.5)
-    out[partial] = alpha[partial] - 0.5
-    return out
+def _nearest_crossing(masks: Tensor) -> list:
+    """Kernel arguments: the nearest row at which the contour crosses a pixel's column, and which column's is
+    nearest.
+    """
+    views, height, width = masks.shape
+    rows, begin = torch.empty_like(masks), torch.empty_like(masks)
+    apex, nearest = (torch.empty_like(masks, dtype=torch.int32) for _ in range(2))
+    launch(kernels.column_kernel, views * width, [(masks, wp.float32), (rows, wp.float32)], masks.device)
+    launch(kernels.row_kernel, views * height, [
+        (rows, wp.float32), (apex, wp.int32), (begin, wp.float32), (nearest, wp.int32)], masks.device)  # fmt: skip
+    return [(rows, wp.float32), (nearest, wp.int32)]
 
 
 def hull_distance(points: Tensor, distance: Tensor, c2w: Tensor, intrinsics: Tensor) -> Tensor:
-    """Signed distance ``(N,)`` to the visual hull in world units, positive inside, as the least over the views.
+    """Signed distance of points to the visual hull, ``(N,)`` world units, positive inside: the least over the views.
 
-    points: ``(N, 3)`` world.  distance: ``(V, H, W)`` of :func:`mask_distance`.  c2w: ``(V, 4, 4)`` OpenGL.  intrinsics: ``(V, 4)`` pixels.
-    A pixel distance becomes a length at the point's depth, so it is exact at the hull and approximate away from it.  Beyond the
-    border of an image its border value holds: an object cut by the border stays unbounded there.  Behind a camera it is -1000.
-    No gradient.  Raises TypeError unless float32, ValueError on wrong shapes or mixed devices.
+    points: ``(N, 3)``.  distance: ``(V, H, W)`` from :func:`mask_distance`.  c2w: ``(V, 4, 4)`` rigid, OpenGL (looks
+    along -Z, +Y up).  intrinsics: ``(V, 4)`` fx, fy, cx, cy in pixels, pixel centres at +0.5.  A view's distance is
+    the pixel distance at the point's image (bilinear, clamped at the image border) times depth / focal length: exact
+    where the cone of sight through the contour is seen at a right angle, up to 1 / cos^2 of the angle to the optical
+    axis too long.  Outside the image the border's value holds, so an object cut by the border is unbounded there and
+    only there.  A point at or behind a camera's plane gets -1000.  Without views every point gets +1000.  No
+    gradient.
     """
-    check("points", points, last=3), check("distance", distance, like=points)
-    check("c2w", c2w, last=4, like=points), check("intrinsics", intrinsics, last=4, like=points)
+    check("points", points, last=3)
+    check("distance", distance, like=points)
+    check("c2w", c2w, last=4, like=points)
+    check("intrinsics", intrinsics, last=4, like=points)
+    if points.ndim != 2:
+        raise ValueError(f"points: expected shape (N, 3), got {tuple(points.shape)}")
+    if distance.ndim != 3 or min(distance.shape[1:]) < 2:
+        raise ValueError(f"distance: expected shape (V, H, W) with H and W above 1, got {tuple(distance.shape)}")
     views = distance.shape[0]
-    if points.ndim != 2 or distance.ndim != 3 or distance.numel() == 0:
-        raise ValueError(f"points, distance: expected (N, 3) and (V, H, W), got {tuple(points.shape)}, {tuple(distance.shape)}")
-    if c2w.shape != (views, 4, 4) or intrinsics.shape != (views, 4):
-        raise ValueError(f"c2w, intrinsics: expected {views} cameras, got {tuple(c2w.shape)} and {tuple(intrinsics.shape)}")
-    out = points.new_empty(len(points))
-    inputs = zip((points, distance, c2w, intrinsics), (wp.vec3, wp.float32, wp.mat44, wp.vec4), strict=True)
-    args = [(t.detach().contiguous(), kind) for t, kind in inputs]
-    launch(hull_distance_kernel, len(points), [*args, (out, wp.float32)], points.device)
-    return out
+    if c2w.shape != (views, 4, 4):
+        raise ValueError(f"c2w: expected shape {(views, 4, 4)}, got {tuple(c2w.shape)}")
+    if intrinsics.shape != (views, 4):
+        raise ValueError(f"intrinsics: expected shape {(views, 4)}, got {tuple(intrinsics.shape)}")
+    hull = torch.empty(len(points), device=points.device)
+    inputs = [v.detach().contiguous() for v in (points, distance, c2w, intrinsics)]
+    types = (wp.vec3, wp.float32, wp.mat44, wp.vec4)
+    launch(kernels.hull_distance_kernel, len(points), [*zip(inputs, types), (hull, wp.float32)], points.device)
+    return hull

@@ -1,44 +1,261 @@
-"""Soft visual hull: the least of a point's signed distances to the silhouettes of all views."""
+"""Signed distance of pixels to a mask's contour, and of points to the visual hull of several masks.
+
+Pixel (row y, column x) has its centre at (x + 0.5, y + 0.5).  The contour is where the mask, bilinear between pixel
+centres, is 0.5: in a *cell* of four neighbouring centres one or two segments (marching squares).  Cell (y, x) has the
+pixels (y, x), (y, x + 1), (y + 1, x), (y + 1, x + 1); there are (H - 1) * (W - 1).
+"""
 
 import warp as wp
 
-from reli3d.kernels.projection import NEAR, project_point
-
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
 
-BEHIND = wp.constant(-1.0e3)  # distance given to a point behind a camera: further outside than any silhouette
+NEVER = wp.constant(65536.0)  # rows to a crossing where a column has none: beyond any image
+NEAR = wp.constant(4.0)  # pixels: beyond, a segment away from the nearest crossing is at most sqrt(16.5) - 4 = 0.06 nearer
+BEHIND = wp.constant(-1.0e3)  # distance of a point that a camera cannot see, in world units: below that of any other
+DEPTH_MIN = wp.constant(1.0e-4)  # a point this close to a camera's plane counts as behind it
+
+
+@wp.func
+def crosses(mask: wp.array3d[float], view: int, y: int, x: int) -> bool:
+    """Whether the contour runs through a cell."""
+    count = wp.int32(0)
+    for k in range(4):
+        if mask[view, y + k // 2, x + k % 2] >= 0.5:
+            count += 1
+    return count > 0 and count < 4
+
+
+@wp.func
+def squared_to_segment(p: wp.vec2, a: wp.vec2, b: wp.vec2) -> float:
+    ab = b - a
+    t = wp.clamp(wp.dot(p - a, ab) / wp.max(wp.dot(ab, ab), 1.0e-12), 0.0, 1.0)
+    away = p - a - ab * t
+    return wp.dot(away, away)
+
+
+@wp.func
+def crossing(a: float, b: float) -> float:
+    """Where between 0 and 1 a value that runs from ``a`` to ``b`` is 0.5."""
+    return wp.clamp((0.5 - a) / (b - a), 0.0, 1.0)
+
+
+@wp.func
+def squared_to_contour(mask: wp.array3d[float], view: int, y: int, x: int, p: wp.vec2) -> float:
+    """Squared distance of ``p`` (column, row in pixel centres) to the contour inside cell (y, x), which it crosses."""
+    m00 = mask[view, y, x]
+    m01 = mask[view, y, x + 1]
+    m10 = mask[view, y + 1, x]
+    m11 = mask[view, y + 1, x + 1]
+    q = p - wp.vec2(float(x), float(y))
+    top = (m00 >= 0.5) != (m01 >= 0.5)
+    bottom = (m10 >= 0.5) != (m11 >= 0.5)
+    left = (m00 >= 0.5) != (m10 >= 0.5)
+    right = (m01 >= 0.5) != (m11 >= 0.5)
+    t = wp.vec2()
+    b = wp.vec2()
+    l = wp.vec2()
+    r = wp.vec2()
+    if top:
+        t = wp.vec2(crossing(m00, m01), 0.0)
+    if bottom:
+        b = wp.vec2(crossing(m10, m11), 1.0)
+    if left:
+        l = wp.vec2(0.0, crossing(m00, m10))
+    if right:
+        r = wp.vec2(1.0, crossing(m01, m11))
+    if top and bottom and left and right:
+        # saddle: the corners with the sign of the centre are joined, the other two are cut off
+        if (0.25 * (m00 + m01 + m10 + m11) >= 0.5) == (m00 >= 0.5):
+            return wp.min(squared_to_segment(q, t, r), squared_to_segment(q, l, b))
+        return wp.min(squared_to_segment(q, t, l), squared_to_segment(q, r, b))
+    one = t
+    other = b
+    if left and top:
+        other = l
+    if right and top:
+        other = r
+    if left and bottom:
+        one = l
+    if right and bottom:
+        one = r
+    if left and right:
+        one = l
+        other = r
+    return squared_to_segment(q, one, other)
+
+
+@wp.kernel
+def column_kernel(
+    start: int,
+    # in
+    mask: wp.array3d[float],
+    # out
+    row: wp.array3d[float],
+):
+    """Row of the nearest crossing of the contour with a pixel's column, ``NEVER`` away without one; a thread is a
+    column."""
+    i = start + wp.tid()
+    height = mask.shape[1]
+    width = mask.shape[2]
+    view = i // width
+    x = i % width
+    last = wp.float32(-NEVER)
+    for y in range(height):
+        row[view, y, x] = last
+        if y + 1 < height:
+            a = mask[view, y, x]
+            b = mask[view, y + 1, x]
+            if (a >= 0.5) != (b >= 0.5):
+                last = float(y) + crossing(a, b)
+    last = wp.float32(2.0 * NEVER)
+    for k in range(height):
+        y = height - 1 - k
+        if y + 1 < height:
+            a = mask[view, y, x]
+            b = mask[view, y + 1, x]
+            if (a >= 0.5) != (b >= 0.5):
+                last = float(y) + crossing(a, b)
+        if last - float(y) < float(y) - row[view, y, x]:
+            row[view, y, x] = last
+
+
+@wp.kernel
+def row_kernel(
+    start: int,
+    # in
+    row: wp.array3d[float],
+    # scratch
+    apex: wp.array3d[wp.int32], begin: wp.array3d[float],
+    # out
+    nearest: wp.array3d[wp.int32],
+):  # fmt: skip
+    """Column whose crossing, at its ``row``, is the nearest one of all columns; -1 without any.  A thread is a row.
+
+    Lower envelope of parabolas, Felzenszwalb and Huttenlocher 2012, Distance Transforms of Sampled Functions.
+    """
+    i = start + wp.tid()
+    height = row.shape[1]
+    width = row.shape[2]
+    view = i // height
+    y = i % height
+    top = wp.int32(-1)
+    for x in range(width):
+        dy = row[view, y, x] - float(y)
+        if wp.abs(dy) < 0.5 * NEVER:
+            height_x = dy * dy + float(x * x)
+            at = wp.float32(-1.0e9)
+            search = top >= 0
+            while search:
+                other = apex[view, y, top]
+                dy = row[view, y, other] - float(y)
+                at = (height_x - (dy * dy + float(other * other))) / float(2 * (x - other))
+                if at > begin[view, y, top]:
+                    search = False
+                else:
+                    top -= 1
+                    if top < 0:
+                        at = -1.0e9
+                        search = False
+            top += 1
+            apex[view, y, top] = x
+            begin[view, y, top] = at
+    k = wp.int32(0)
+    for x in range(width):
+        while k < top and begin[view, y, k + 1] < float(x):
+            k += 1
+        if top < 0:
+            nearest[view, y, x] = -1
+        else:
+            nearest[view, y, x] = apex[view, y, k]
+
+
+@wp.kernel
+def mask_distance_kernel(
+    start: int,
+    # in
+    mask: wp.array3d[float], row: wp.array3d[float], nearest_x: wp.array3d[wp.int32],
+    column: wp.array3d[float], nearest_y: wp.array3d[wp.int32], far: float,
+    # out
+    distance: wp.array3d[float],
+):  # fmt: skip
+    """Signed distance to the contour, ``far`` without one.
+
+    The nearest crossing with any column (``row``, ``nearest_x``) or row (``column``, ``nearest_y``, both transposed)
+    is an end of a segment; measured are the segments of the cells beside it, and of their neighbours where it is
+    near.
+    """
+    i = start + wp.tid()
+    height = mask.shape[1]
+    width = mask.shape[2]
+    view = i // (height * width)
+    y = (i // width) % height
+    x = i % width
+    p = wp.vec2(float(x), float(y))
+    best = far * far
+    cell_x = wp.int32(-9)
+    cell_y = wp.int32(-9)
+    near_x = nearest_x[view, y, x]
+    near_y = nearest_y[view, x, y]
+    if near_x >= 0:
+        at = wp.vec2(float(near_x), row[view, y, near_x])
+        cell_x = near_x
+        cell_y = int(at[1])
+        best = wp.length_sq(at - p)
+    if near_y >= 0:
+        at = wp.vec2(column[view, x, near_y], float(near_y))
+        if wp.length_sq(at - p) < best:
+            cell_x = int(at[0])
+            cell_y = near_y
+            best = wp.length_sq(at - p)
+    reach = wp.int32(1)  # the cell's lower neighbours, which share the crossing
+    if best < NEAR * NEAR:
+        reach = 2
+    for v in range(cell_y - 1, cell_y + reach):
+        for u in range(cell_x - 1, cell_x + reach):
+            inner = v >= 0 and v < height - 1 and u >= 0 and u < width - 1
+            if inner and crosses(mask, view, v, u):
+                best = wp.min(best, squared_to_contour(mask, view, v, u, p))
+    if mask[view, y, x] >= 0.5:
+        distance[view, y, x] = wp.sqrt(best)
+    else:
+        distance[view, y, x] = -wp.sqrt(best)
+
+
+@wp.func
+def lookup(values: wp.array3d[float], view: int, x: float, y: float) -> float:
+    """Bilinear value at pixel coordinates, the border's beyond it."""
+    u = wp.clamp(x - 0.5, 0.0, float(values.shape[2] - 1))
+    v = wp.clamp(y - 0.5, 0.0, float(values.shape[1] - 1))
+    i = wp.min(int(u), values.shape[2] - 2)
+    j = wp.min(int(v), values.shape[1] - 2)
+    s = u - float(i)
+    t = v - float(j)
+    top = values[view, j, i] * (1.0 - s) + values[view, j, i + 1] * s
+    bottom = values[view, j + 1, i] * (1.0 - s) + values[view, j + 1, i + 1] * s
+    return top * (1.0 - t) + bottom * t
 
 
 @wp.kernel
 def hull_distance_kernel(
     start: int,
     # in
-    points: wp.array[wp.vec3],  # (N,)
-    distance: wp.array3d[float],  # (V, H, W) pixels
-    c2w: wp.array[wp.mat44],  # (V,)
-    intrinsics: wp.array[wp.vec4],  # (V,)
+    points: wp.array[wp.vec3], distance: wp.array3d[float], c2w: wp.array[wp.mat44], intrinsics: wp.array[wp.vec4],
     # out
-    hull: wp.array[float],  # (N,)
-):
+    hull: wp.array[float],
+):  # fmt: skip
+    """Least over the views of the pixel distance at a point's image times the size of a pixel at its depth."""
     i = start + wp.tid()
-    h = distance.shape[1]
-    w = distance.shape[2]
-    least = float(1.0e30)
-    for v in range(distance.shape[0]):
-        k = intrinsics[v]
-        q = project_point(points[i], c2w[v], k)
-        d = float(BEHIND)
-        if q[2] > NEAR:
-            x = wp.clamp(q[0] - 0.5, 0.0, float(w - 1))
-            y = wp.clamp(q[1] - 0.5, 0.0, float(h - 1))
-            x0 = wp.min(int(x), wp.max(w - 2, 0))
-            y0 = wp.min(int(y), wp.max(h - 2, 0))
-            x1 = wp.min(x0 + 1, w - 1)
-            y1 = wp.min(y0 + 1, h - 1)
-            fx = x - float(x0)
-            fy = y - float(y0)
-            top = distance[v, y0, x0] * (1.0 - fx) + distance[v, y0, x1] * fx
-            bottom = distance[v, y1, x0] * (1.0 - fx) + distance[v, y1, x1] * fx
-            d = (top * (1.0 - fy) + bottom * fy) * q[2] / wp.sqrt(k[0] * k[1])
-        least = wp.min(least, d)
-    hull[i] = least
+    best = wp.float32(-BEHIND)
+    for view in range(c2w.shape[0]):
+        m = c2w[view]
+        away = points[i] - wp.vec3(m[0, 3], m[1, 3], m[2, 3])
+        right = m[0, 0] * away[0] + m[1, 0] * away[1] + m[2, 0] * away[2]
+        up = m[0, 1] * away[0] + m[1, 1] * away[1] + m[2, 1] * away[2]
+        depth = -(m[0, 2] * away[0] + m[1, 2] * away[1] + m[2, 2] * away[2])
+        if depth > DEPTH_MIN:  # False for NaN too
+            k = intrinsics[view]
+            value = lookup(distance, view, k[2] + k[0] * right / depth, k[3] - k[1] * up / depth)
+            best = wp.min(best, value * depth * 2.0 / (k[0] + k[1]))
+        else:
+            best = BEHIND
+    hull[i] = best

@@ -1,0 +1,174 @@
+"""Mask distance and visual hull against closed forms: half planes, discs, spheres."""
+
+import math
+
+import pytest
+import torch
+from scipy.spatial import cKDTree
+
+from reli3d.geometry.hull import hull_distance, mask_distance
+
+
+def pixel_grid(height, width, device="cpu"):
+    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    return x.to(device), y.to(device)
+
+
+def disc(size, centre, radius):
+    x, y = pixel_grid(size, size)
+    true = radius - torch.hypot(x - centre[0], y - centre[1])
+    return (true + 0.5).clamp(0, 1), true
+
+
+def test_half_plane_is_exact_for_an_unsaturated_ramp(device):
+    x, y = pixel_grid(40, 50)
+    a, b = math.cos(0.7), math.sin(0.7)
+    true = a * (x - 23.3) + b * (y - 19.1)
+    mask = (true / 100 + 0.5).clamp(0, 1)  # linear everywhere, so bilinear interpolation has the exact contour
+    got = mask_distance(mask[None].to(device))[0].cpu()
+    foot_x, foot_y = x - a * true, y - b * true
+    inner = (foot_x > 1) & (foot_x < 49) & (foot_y > 1) & (foot_y < 39)  # the others' foot has no contour
+    # beyond 4 px only the segments beside the nearest crossing are measured, whose ends are at most sqrt(1/2) off
+    torch.testing.assert_close(got[inner], true[inner], rtol=0, atol=math.sqrt(16.5) - 4)
+    near = inner & (true.abs() < 3)
+    torch.testing.assert_close(got[near], true[near], rtol=0, atol=2e-5)  # float32 of coordinates up to 50
+
+
+def test_disc_is_sub_pixel(device):
+    mask, true = disc(128, (63.3, 66.8), 37.2)
+    got = mask_distance(mask[None].to(device))[0].cpu()
+    # a coverage that saturates one pixel from the contour moves the linear crossing by at most 0.09 pixels
+    assert (got - true).abs().max() < 0.1
+    assert bool(((got > 0) == (mask >= 0.5)).all())
+
+
+def test_hard_mask_is_within_half_a_pixel():
+    _, true = disc(128, (63.3, 66.8), 37.2)
+    got = mask_distance((true > 0).float()[None])[0]
+    assert (got - true).abs().max() < 0.75  # the staircase's corners stand half a pixel diagonal off at most
+
+
+def test_two_blobs_and_a_hole_against_brute_force(device):
+    one, _ = disc(64, (18.2, 20.4), 10.3)
+    two, _ = disc(64, (44.6, 40.1), 14.7)
+    hole, _ = disc(64, (46.0, 41.0), 5.5)
+    mask = torch.maximum(one, two) - hole
+    got = mask_distance(mask[None].to(device))[0].cpu()
+    fine = torch.nn.functional.interpolate(mask[None, None].double(), scale_factor=32, mode="bilinear")[0, 0] >= 0.5
+    points = []
+    for axis in (0, 1):  # sign changes of the bilinear mask at 1/32 pixel
+        a, b = (fine[:-1], fine[1:]) if axis == 0 else (fine[:, :-1], fine[:, 1:])
+        at = (a != b).nonzero().double()
+        at[:, axis] += 0.5
+        points.append((at + 0.5) / 32)
+    x, y = pixel_grid(64, 64)
+    true = cKDTree(torch.cat(points).numpy()).query(torch.stack([y, x], -1).reshape(-1, 2).numpy())[0].reshape(64, 64)
+    # segments against the bilinear mask's hyperbolas: under 0.1 px at these radii, plus the sampling of 1/32
+    assert (got.abs() - torch.from_numpy(true)).abs().max() < 0.13
+
+
+def test_views_without_contour_are_deep_inside_or_outside(device):
+    got = mask_distance(torch.stack([torch.zeros(6, 8), torch.ones(6, 8)]).to(device))
+    torch.testing.assert_close(got[0], torch.full_like(got[0], -10.0))  # diagonal of 6 x 8
+    torch.testing.assert_close(got[1], torch.full_like(got[1], 10.0))
+    assert mask_distance(torch.zeros(0, 6, 8)).shape == (0, 6, 8)
+
+
+def sphere_views(device, n=8, distance=3.0, radius=0.5, size=256, focal=300.0):
+    """Exact coverage-like masks of a sphere at the origin from ``n`` cameras around it."""
+    c2w = []
+    for k in range(n):
+        direction = torch.tensor([math.cos(k * 2.4), 0.7 * math.sin(1.7 * k), math.sin(k * 2.4)], dtype=torch.float64)
+        back = direction / direction.norm()
+        right = torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64), back)
+        right = right / right.norm()
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[:3, :4] = torch.stack([right, torch.linalg.cross(back, right), back, back * distance], -1)
+        c2w.append(pose)
+    # on the axis a sphere projects to a disc of radius f tan(asin(r / d))
+    outline = focal * math.tan(math.asin(radius / distance))
+    mask, _ = disc(size, (size / 2, size / 2), outline)
+    intrinsics = torch.tensor([focal, focal, size / 2, size / 2]).expand(n, 4)
+    return mask.expand(n, size, size).to(device), torch.stack(c2w).float().to(device), intrinsics.to(device)
+
+
+def cone_distance(points, c2w, distance=3.0, radius=0.5):
+    """Signed distance to the nearest cone of sight that touches the sphere, in float64, positive inside."""
+    angle = math.asin(radius / distance)
+    eye = c2w[:, :3, 3].double()
+    axis = -c2w[:, :3, 2].double()
+    away = points.double()[:, None] - eye
+    along = (away * axis).sum(-1)
+    across = (away - along[..., None] * axis).norm(dim=-1)
+    return (along * math.tan(angle) - across).mul(math.cos(angle)).min(1).values
+
+
+def test_sphere_seen_by_eight_cameras(device):
+    masks, c2w, intrinsics = sphere_views(device)
+    points = (torch.rand(4000, 3, generator=torch.Generator().manual_seed(1)) * 1.4 - 0.7).to(device)
+    got = hull_distance(points, mask_distance(masks), c2w, intrinsics).cpu()
+    true = cone_distance(points.cpu(), c2w.cpu())
+    # a pixel at depth 3 is 0.01 wide, its contour 0.1 px off; the slant of the rays stretches by up to 6 % off the axis
+    near = true.abs() < 0.05
+    assert near.sum() > 200
+    assert (got - true)[near].abs().max() < 0.001 + 0.05 * 0.06
+    assert bool((got[true > 0.002] > 0).all())
+    assert bool((got[true < -0.002] < 0).all())
+
+
+def test_behind_a_camera_is_far_outside_and_no_view_bounds_nothing(device):
+    masks, c2w, intrinsics = sphere_views(device, n=1)
+    behind = c2w[:, :3, 3] + c2w[:, :3, 2]
+    assert hull_distance(behind, mask_distance(masks), c2w, intrinsics).item() == -1000.0
+    nan = torch.full((1, 3), math.nan, device=device)
+    assert hull_distance(nan, mask_distance(masks), c2w, intrinsics).item() == -1000.0
+    empty = hull_distance(behind, masks[:0], c2w[:0], intrinsics[:0])
+    assert empty.item() == 1000.0
+
+
+def test_object_cut_by_the_border_is_unbounded_only_there(device):
+    x, y = pixel_grid(64, 64)
+    mask = ((20 - (y - 32).abs()) + 0.5).clamp(0, 1)
+    mask = torch.minimum(mask, (x - 9.5).clamp(0, 1))  # a bar that leaves the image on the right only
+    c2w = torch.eye(4)[None].to(device)
+    intrinsics = torch.tensor([[64.0, 64.0, 32.0, 32.0]], device=device)
+    points = torch.tensor([[5.0, 0.0, -2.0], [-5.0, 0.0, -2.0], [0.0, 5.0, -2.0]], device=device)
+    got = hull_distance(points, mask_distance(mask[None].to(device)), c2w, intrinsics)
+    assert [bool(v > 0) for v in got] == [True, False, False]
+
+
+@pytest.mark.parametrize(
+    "change, error",
+    [
+        (dict(points=torch.zeros(3)), ValueError),
+        (dict(points=torch.zeros(4, 3, dtype=torch.float64)), TypeError),
+        (dict(distance=torch.zeros(8, 1, 5)), ValueError),
+        (dict(c2w=torch.zeros(7, 4, 4)), ValueError),
+        (dict(intrinsics=torch.zeros(8, 3)), ValueError),
+    ],
+)
+def test_wrong_input_is_named(change, error):
+    masks, c2w, intrinsics = sphere_views("cpu", size=16)
+    inputs = dict(points=torch.zeros(4, 3), distance=mask_distance(masks), c2w=c2w, intrinsics=intrinsics) | change
+    with pytest.raises(error, match=next(iter(change))):
+        hull_distance(**inputs)
+
+
+@pytest.mark.parametrize("mask", [torch.full((1, 4, 4), 2.0), torch.full((1, 4, 4), math.nan), torch.zeros(4, 4)])
+def test_wrong_mask_is_named(mask):
+    with pytest.raises(ValueError, match="masks"):
+        mask_distance(mask)
+
+
+def test_result_does_not_depend_on_the_number_of_threads():
+    masks, c2w, intrinsics = sphere_views("cpu", size=64)
+    points = torch.rand(5000, 3, generator=torch.Generator().manual_seed(2)) - 0.5
+    before = torch.get_num_threads()
+    results = []
+    try:
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            results.append(hull_distance(points, mask_distance(masks), c2w, intrinsics))
+    finally:
+        torch.set_num_threads(before)
+    assert torch.equal(*results)
