@@ -1,4 +1,6 @@
-"""From posed photographs to a relightable asset: one function a stage, and :func:`reconstruct` that runs them in order."""
+"""From posed photographs to a relightable asset: one function a stage, and :func:`reconstruct` that runs them in
+order.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +42,9 @@ UP = {"y": torch.eye(3), "z": torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 
 @dataclass(frozen=True)
 class Prepared:
-    """Views in the model's frame: the network's input, and maps of ``DETAIL`` pixels for what is read from the views."""
+    """Views in the model's frame: the network's input, and maps of ``DETAIL`` pixels for what is read from the
+    views.
+    """
 
     batch: ViewBatch
     images: Tensor  # (V, D, D, 4) sRGB and signed silhouette distance
@@ -48,7 +52,9 @@ class Prepared:
 
 
 def prepare(model: Reconstructor, views: Views, model_from_input: Similarity) -> Prepared:
-    """Resample ``views`` for ``model``: cropped to the object where the preset sees rays, whole as published where it does not."""
+    """Resample ``views`` for ``model``: cropped to the object where the preset sees rays, whole as published where
+    it does not.
+    """
     moved = views.transformed(model_from_input).to(model.device)
     crop = model.preset.encoder.ray_maps
     batch = moved.resampled(model.preset.image_size, crop=crop)
@@ -111,7 +117,9 @@ def _cube_weights(model: Reconstructor, code: Code, flat: Tensor, resolution: in
     return {"deformation": offset, "alpha": weights.alpha, "beta": weights.beta, "gamma": weights.gamma}
 
 
-def texture(model: Reconstructor, code: Code, maps: ViewMaps, mesh: Mesh, size: int, *, uv: str = "project") -> tuple[Mesh, TextureSet]:
+def texture(
+    model: Reconstructor, code: Code, maps: ViewMaps, mesh: Mesh, size: int, *, uv: str = "project"
+) -> tuple[Mesh, TextureSet]:
     """The mesh with an atlas, normals and tangents, and its maps of ``size`` texels."""
     scene = RayScene(mesh.vertices, mesh.faces)
     if uv not in ("project", "xatlas"):
@@ -133,6 +141,16 @@ def texture(model: Reconstructor, code: Code, maps: ViewMaps, mesh: Mesh, size: 
 def light(model: Reconstructor, code: Code) -> Environment:
     """The decoded environment, in the world's axes."""
     return Environment(model.decode_environment(code)[0].contiguous())
+
+
+def output_frame(model_from_input: Similarity, frame: str, up: str) -> Similarity:
+    """The frame of the asset from the frame of the input cameras.  Raises ValueError on a name that is none."""
+    if frame not in ("input", "model"):
+        raise ValueError(f"frame: expected input or model, got {frame}")
+    if up not in UP:
+        raise ValueError(f"up: expected one of {', '.join(UP)}, got {up}")
+    turn = Similarity(1.0, UP[up].double(), torch.zeros(3, dtype=torch.float64))
+    return turn.compose(model_from_input) if frame == "model" else turn
 
 
 def turned(asset: Asset, similarity: Similarity) -> Asset:
@@ -165,33 +183,36 @@ class Stopwatch:
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - began
 
 
+def check_options(texture_size: int, resolution: int | None) -> None:
+    """Raise ValueError where a size is out of range; None is the preset's own."""
+    if not 256 <= texture_size <= 4096:
+        raise ValueError(f"texture_size: expected 256 to 4096 texels, got {texture_size}")
+    if resolution is not None and not 16 <= resolution <= 256:
+        raise ValueError(f"resolution: expected 16 to 256 cubes, got {resolution}")
+
+
 @torch.no_grad()
 def reconstruct(views: Views, *, weights: str | Reconstructor = "small", device: str = "cpu", texture_size: int = 1024,
-                resolution: int | None = None, normalization: str | Similarity = "auto", frame: str = "input", up: str = "y",
-                uv: str = "project", seed: int = 0, timings: dict[str, float] | None = None, progress=None) -> Asset:  # fmt: skip
+                resolution: int | None = None, normalization: str | Similarity = "auto", frame: str = "input", up: str
+                = "y", uv: str = "project", seed: int = 0, timings: dict[str, float] | None = None, progress=None) -> Asset:  # fmt: skip
     """A relightable asset from posed photographs of one object.
 
-    views: 1 to 16, the first is the hero (see :func:`reli3d.data.folder.load_views`).  weights: ``small`` (in the package), a
-    safetensors file, or a loaded :class:`~reli3d.nn.model.Reconstructor`.  texture_size: 256 to 4096 texels.  resolution: cubes a
-    side of the surface grid, default the preset's.  normalization: ``auto``, ``hull``, ``none``, or the map from the input frame to
-    the model's.  frame: ``input`` (that of the cameras) or ``model``.  up: the axis of that frame that shall become +Y.
-    timings: filled with seconds of each stage.  progress: called with the name of each stage.  The same input and seed give the
-    same asset.  Raises ValueError on options out of range and where the masks or the field hold no surface.
+    views: 1 to 16, the first is the hero (see :func:`reli3d.data.folder.load_views`).  weights: ``small`` (in the
+    package), a safetensors file, or a loaded :class:`~reli3d.nn.model.Reconstructor`.  texture_size: 256 to 4096
+    texels. resolution: cubes a side of the surface grid, default the preset's.  normalization: ``auto``, ``hull``,
+    ``none``, or the map from the input frame to the model's.  frame: ``input`` (that of the cameras) or ``model``. 
+    up: the axis of that frame that shall become +Y. timings: filled with seconds of each stage.  progress: called
+    with the name of each stage.  The same input and seed give the same asset.  Raises ValueError on options out of
+    range and where the masks or the field hold no surface.
     """
-    if frame not in ("input", "model"):
-        raise ValueError(f"frame: expected input or model, got {frame}")
-    if up not in UP:
-        raise ValueError(f"up: expected one of {', '.join(UP)}, got {up}")
-    if not 256 <= texture_size <= 4096:
-        raise ValueError(f"texture_size: expected 256 to 4096, got {texture_size}")
+    check_options(texture_size, resolution)
     model = weights if isinstance(weights, Reconstructor) else load_model(weights, device)
     resolution = resolution or model.preset.resolution
-    if not 16 <= resolution <= 256:
-        raise ValueError(f"resolution: expected 16 to 256, got {resolution}")
     torch.manual_seed(seed)
     watch = Stopwatch(model.device, progress)
     with watch.stage("normalize"):
         to_model = normalization if isinstance(normalization, Similarity) else normalize(views, normalization)
+        output = output_frame(to_model, frame, up)
     with watch.stage("prepare"):
         prepared = prepare(model, views, to_model)
     with watch.stage("network"):
@@ -203,9 +224,7 @@ def reconstruct(views: Views, *, weights: str | Reconstructor = "small", device:
     with watch.stage("light"):
         asset = Asset(mesh, textures, light(model, code))
     with watch.stage("frame"):
-        back = to_model.inverse() if frame == "input" else Similarity.identity()
-        turn = Similarity(1.0, UP[up].double(), torch.zeros(3, dtype=torch.float64))
-        asset = turned(asset, turn.compose(back))
+        asset = turned(asset, output.compose(to_model.inverse()))
     if timings is not None:
         timings.update(watch.seconds)
     return asset

@@ -1,14 +1,16 @@
-"""Training samples: one object under one light, seen by a few cameras, with what is true at points of its volume and surface.
+"""Training samples: one object under one light, seen by a few cameras, with what is true at points of its volume and
+surface.
 
-A sample is a dictionary of tensors (one safetensors file on disk).  ``V`` views of ``S`` by ``S`` pixels, cropped to the object as
-the network's input is; world +Y up, object centred, longest side 1; radiance is scaled so that the first view is well exposed.
+A sample is a dictionary of tensors (one safetensors file on disk).  ``V`` views of ``S`` by ``S`` pixels, cropped to
+the object as the network's input is; world +Y up, object centred, longest side 1; radiance is scaled so that the
+first view is well exposed.
 
 =================  =====================  ==============================================================================
 images             (V, S, S, 4) uint8     sRGB with straight alpha; the light's background is kept under it
 c2w, intrinsics    (V, 4, 4), (V, 4)      OpenGL camera to world; fx, fy, cx, cy in pixels
 environment        (32, 64, 3) float16    linear radiance of the light, exposed as the images are
-points, distance   (P, 3), (P,) float16   volume points (first half near the surface) and signed distance, positive outside
-surface            (N, 3, 3) float16      position, geometric normal, bumped normal of surface points
+points, distance   (P, 3), (P,) float16   volume points (first half near the surface) and signed distance, positive
+outside surface            (N, 3, 3) float16      position, geometric normal, bumped normal of surface points
 material           (N, 5) uint8           base colour (sRGB-encoded), roughness, metallic
 visible            (N, V) uint8           1 where the surface point is seen by the view
 pixels             (V, M, 3, 3) float16   position, bumped normal, direction to the camera of seen points, and ...
@@ -37,7 +39,9 @@ VOLUME_POINTS, SURFACE_POINTS, PIXELS = 16384, 8192, 1024
 
 
 def crop_camera(vertices: Tensor, c2w: Tensor, size: int, padding: float) -> Tensor:
-    """Intrinsics ``(4,)`` that fit the projection of ``vertices`` into a ``size`` square with a relative ``padding``."""
+    """Intrinsics ``(4,)`` that fit the projection of ``vertices`` into a ``size`` square with a relative
+    ``padding``.
+    """
     unit = torch.tensor([1.0, 1.0, 0.0, 0.0])
     xy, _ = project(vertices, c2w, unit)
     low, high = xy.amin(0), xy.amax(0)
@@ -60,7 +64,9 @@ class _Surface:
     def at(self, face: Tensor, bary: Tensor) -> dict[str, Tensor]:
         weights = torch.stack([1 - bary.sum(-1), bary[:, 0], bary[:, 1]], -1)[..., None]
         corners = self.vertices[self.faces[face].long()]
-        ng = torch.nn.functional.normalize(torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), dim=-1)
+        ng = torch.nn.functional.normalize(
+            torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), dim=-1
+        )
         normal = torch.nn.functional.normalize((self.corner_normals[face] * weights).sum(1), dim=-1)
         position = (corners * weights).sum(1)
         base, rough, metal, bump = self.shape.material(position.numpy(), normal.numpy(), self.part[face].numpy())
@@ -83,8 +89,12 @@ def _render(surface: _Surface, camera: Camera, light: Environment, seed: int):
     return image, seen, at, wo, radiance
 
 
-def synthesize(shape: ProceduralObject, light: Tensor, rng: np.random.Generator, *, size: int = 192, views: int = 6) -> dict[str, Tensor]:
-    """One sample of ``shape`` under the lat-long map ``light`` ``(H, 2H, 3)``, turned by a random yaw; see the table above."""
+def synthesize(
+    shape: ProceduralObject, light: Tensor, rng: np.random.Generator, *, size: int = 192, views: int = 6
+) -> dict[str, Tensor]:
+    """One sample of ``shape`` under the lat-long map ``light`` ``(H, 2H, 3)``, turned by a random yaw; see the table
+    above.
+    """
     surface = _Surface(shape)
     environment = Environment(torch.roll(light, int(rng.integers(light.shape[1])), 1).contiguous())
     c2w = torch.as_tensor(np.asarray(sample_cameras(rng, views)[0]), dtype=torch.float32)
@@ -96,14 +106,18 @@ def synthesize(shape: ProceduralObject, light: Tensor, rng: np.random.Generator,
         if exposure is None:
             exposure = EXPOSED / max(float(radiance.mean(-1).quantile(0.9)), 1e-3) * float(np.exp(rng.normal(0, 0.25)))
         alpha = _coverage(surface.scene, c2w[k], intrinsics[k], size)
-        encoded = torch.cat([linear_to_srgb((image * exposure).clamp(0, 1)).reshape(size, size, 3), alpha[..., None]], -1)
+        encoded = torch.cat(
+            [linear_to_srgb((image * exposure).clamp(0, 1)).reshape(size, size, 3), alpha[..., None]], -1
+        )
         images.append((encoded * 255 + 0.5).to(torch.uint8))
         pick = torch.as_tensor(rng.integers(len(seen), size=PIXELS))
         pixels.append(torch.stack([at["position"], at["bump"], wo], 1)[pick])
         pixel_radiance.append((radiance[pick] * exposure).clamp(max=64.0))
     sample.update(images=torch.stack(images), c2w=c2w, intrinsics=intrinsics,
                   pixels=torch.stack(pixels).half(), pixel_radiance=torch.stack(pixel_radiance).half())  # fmt: skip
-    pooled = torch.nn.functional.interpolate((environment.radiance * exposure).permute(2, 0, 1)[None], (32, 64), mode="area")
+    pooled = torch.nn.functional.interpolate(
+        (environment.radiance * exposure).permute(2, 0, 1)[None], (32, 64), mode="area"
+    )
     sample["environment"] = pooled[0].permute(1, 2, 0).clamp(max=6e4).half()
     sample.update(_volume(surface, rng), **_surface_points(surface, c2w, intrinsics, size, rng))
     return {k: v.contiguous() for k, v in sample.items()}
@@ -127,19 +141,27 @@ def _random_faces(surface: _Surface, count: int, rng: np.random.Generator):
 
 
 def _volume(surface: _Surface, rng: np.random.Generator) -> dict[str, Tensor]:
-    """Half the points beside the surface (normal offsets of 0.01 and 0.05), half uniform in a box slightly larger than the object."""
+    """Half the points beside the surface (normal offsets of 0.01 and 0.05), half uniform in a box slightly larger
+    than the object.
+    """
     near = surface.at(*_random_faces(surface, VOLUME_POINTS // 2, rng))["position"].numpy()
     near = near + rng.normal(size=near.shape) * rng.choice([0.01, 0.05], (len(near), 1))
     box = np.abs(surface.shape.vertices).max(0) + 0.12
-    points = torch.as_tensor(np.concatenate([near, rng.uniform(-box, box, (VOLUME_POINTS // 2, 3))]), dtype=torch.float32)
+    points = torch.as_tensor(
+        np.concatenate([near, rng.uniform(-box, box, (VOLUME_POINTS // 2, 3))]), dtype=torch.float32
+    )
     points = points.half().float()  # the distance must belong to the point as it is stored
     return {"points": points.half(), "distance": signed_distance(surface.vertices, surface.faces, points).half()}
 
 
-def _surface_points(surface: _Surface, c2w: Tensor, intrinsics: Tensor, size: int, rng: np.random.Generator) -> dict[str, Tensor]:
+def _surface_points(
+    surface: _Surface, c2w: Tensor, intrinsics: Tensor, size: int, rng: np.random.Generator
+) -> dict[str, Tensor]:
     at = surface.at(*_random_faces(surface, SURFACE_POINTS, rng))
     visible = visible_from(surface.scene, at["position"], at["ng"], c2w, intrinsics, size)
-    encoded = torch.cat([linear_to_srgb(at["base_color"].clamp(0, 1)), at["roughness"][:, None], at["metallic"][:, None]], -1)
+    encoded = torch.cat(
+        [linear_to_srgb(at["base_color"].clamp(0, 1)), at["roughness"][:, None], at["metallic"][:, None]], -1
+    )
     return {
         "surface": torch.stack([at["position"], at["ng"], at["bump"]], 1).half(),
         "material": (encoded * 255 + 0.5).to(torch.uint8),

@@ -12,9 +12,10 @@ from reli3d.kernels.projection import gather_views_kernel
 def gather_views(maps: Tensor, points: Tensor, c2w: Tensor, intrinsics: Tensor) -> tuple[Tensor, Tensor]:
     """Bilinear values ``(N, V, C)`` of ``maps`` where ``points`` project, and pixel x, y and depth ``(N, V, 3)``.
 
-    maps: ``(V, H, W, C)``, at least 2 by 2 pixels.  points: ``(N, 3)`` world.  c2w: ``(V, 4, 4)`` OpenGL.  intrinsics: ``(V, 4)`` fx, fy,
-    cx, cy in pixels of ``maps``.  Outside a map its border value is taken.  Gradients reach ``maps`` and ``points``; the pixels
-    carry the gradient of the points too.  Raises TypeError unless float32, ValueError on wrong shapes or mixed devices.
+    maps: ``(V, H, W, C)``, at least 2 by 2 pixels.  points: ``(N, 3)`` world.  c2w: ``(V, 4, 4)`` OpenGL.
+    intrinsics: ``(V, 4)`` fx, fy, cx, cy in pixels of ``maps``.  Outside a map its border value is taken.  Gradients
+    reach ``maps`` and ``points``; the pixels carry the gradient of the points too.  Raises TypeError unless float32,
+    ValueError on wrong shapes or mixed devices.
     """
     check("maps", maps), check("points", points, last=3, like=maps)
     check("c2w", c2w, last=4, like=maps), check("intrinsics", intrinsics, last=4, like=maps)
@@ -24,7 +25,9 @@ def gather_views(maps: Tensor, points: Tensor, c2w: Tensor, intrinsics: Tensor) 
     if points.ndim != 2:
         raise ValueError(f"points: expected (N, 3), got {tuple(points.shape)}")
     if c2w.shape != (views, 4, 4) or intrinsics.shape != (views, 4):
-        raise ValueError(f"c2w, intrinsics: expected {views} cameras, got {tuple(c2w.shape)} and {tuple(intrinsics.shape)}")
+        raise ValueError(
+            f"c2w, intrinsics: expected {views} cameras, got {tuple(c2w.shape)} and {tuple(intrinsics.shape)}"
+        )
     ins = [(maps, wp.float32), (points, wp.vec3), (c2w.detach(), wp.mat44), (intrinsics.detach(), wp.vec4)]
     outs = [((n, views, maps.shape[3]), wp.float32), ((n, views), wp.vec3)]
     return call(gather_views_kernel, n * views, ins, outs, device=maps.device, shared=(0, 1))

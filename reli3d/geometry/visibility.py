@@ -11,10 +11,14 @@ from reli3d.render.camera import project
 GRAZING = 0.05  # cosine below which a pixel smears over 20 times its width of surface and says nothing about the point
 
 
-def visible_from(scene: RayScene, position: Tensor, normal: Tensor, c2w: Tensor, intrinsics: Tensor, size: int) -> Tensor:
-    """``(N, V)`` bool: the point faces the camera, projects into its ``size`` by ``size`` image and nothing stands between.
+def visible_from(
+    scene: RayScene, position: Tensor, normal: Tensor, c2w: Tensor, intrinsics: Tensor, size: int
+) -> Tensor:
+    """``(N, V)`` bool: the point faces the camera, projects into its ``size`` by ``size`` image and nothing stands
+    between.
 
-    position, normal: ``(N, 3)`` world, the normal unit.  c2w: ``(V, 4, 4)``.  intrinsics: ``(V, 4)`` pixels.  No gradient.
+    position, normal: ``(N, 3)`` world, the normal unit.  c2w: ``(V, 4, 4)``.  intrinsics: ``(V, 4)`` pixels.  No
+    gradient.
     """
     columns = []
     for pose, camera in zip(c2w, intrinsics, strict=True):

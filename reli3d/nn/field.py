@@ -1,7 +1,8 @@
 """The field of one object: surface level at points of its volume, material at points of its surface.
 
-This is where the aids of a small preset meet the network: features of the views at the points, colours seen there, and the bound that
-the silhouettes put on the density.  Without them (``official``) a point's triplane features are all there is.
+This is where the aids of a small preset meet the network: features of the views at the points, colours seen there,
+and the bound that the silhouettes put on the density.  Without them (``official``) a point's triplane features are
+all there is.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ MATERIAL = ("base_color", "roughness", "metallic", "normal")
 
 
 def surface_level(model: Reconstructor, code: Code, maps: ViewMaps, points: Tensor) -> Tensor:
-    """Level ``(N,)`` of ``points (N, 3)`` [model frame]: negative inside, zero on the surface; gradients reach the network.
+    """Level ``(N,)`` of ``points (N, 3)`` [model frame]: negative inside, zero on the surface; gradients reach the
+    network.
 
     With the preset's ``silhouette_bound`` a point is no further inside than its worst silhouette has it.
     """

@@ -1,8 +1,9 @@
 """What the input views say about a point: the aid that lets a small network keep the detail of the photographs.
 
-The published network answers a point from its triplane alone.  Here the point is also looked up in every view: patch tokens, colour,
-distance to the silhouette and depth go through a small network per view and are pooled over the views, so any number of views
-in any order is one width of features (Yu et al. 2021, pixelNeRF, with pooling as in Wang et al. 2021, IBRNet).
+The published network answers a point from its triplane alone.  Here the point is also looked up in every view: patch
+tokens, colour, distance to the silhouette and depth go through a small network per view and are pooled over the
+views, so any number of views in any order is one width of features (Yu et al. 2021, pixelNeRF, with pooling as in
+Wang et al. 2021, IBRNet).
 """
 
 from __future__ import annotations
@@ -21,7 +22,9 @@ OUTSIDE = 0.15  # silhouette distances beyond this share of the image say no mor
 
 @dataclass(frozen=True)
 class ViewMaps:
-    """Posed maps of one object: ``tokens (V, P, P, C)``, ``images (V, S, S, 4)`` = sRGB and signed silhouette distance in pixels."""
+    """Posed maps of one object: ``tokens (V, P, P, C)``, ``images (V, S, S, 4)`` = sRGB and signed silhouette
+    distance in pixels.
+    """
 
     tokens: Tensor
     images: Tensor
@@ -41,8 +44,8 @@ class ViewFeatures(nn.Module):
     def forward(self, maps: ViewMaps, points: Tensor, visible: Tensor | None = None, normal: Tensor | None = None):
         """Features of ``points (N, 3)`` [model frame].
 
-        visible: ``(N, V)``, 1 where the view sees the surface point, 0 where it is hidden; without it the points are in free space.
-        normal: ``(N, 3)`` unit, outward, beside ``visible``.  Gradients reach the tokens.
+        visible: ``(N, V)``, 1 where the view sees the surface point, 0 where it is hidden; without it the points are
+        in free space. normal: ``(N, 3)`` unit, outward, beside ``visible``.  Gradients reach the tokens.
         """
         size, grid = maps.images.shape[1], maps.tokens.shape[1]
         tokens, _ = gather_views(self.tokens(maps.tokens), points, maps.c2w, maps.intrinsics * (grid / size))

@@ -1,8 +1,9 @@
 """Training of the environment prior: a RENI++ decoder and one latent code for each map, fitted together.
 
-The decoder is equivariant to turns about the vertical, so maps need no augmentation by yaw; blends of two maps under a relative turn
-and a tint stand in for the many environments that a small collection lacks.  Maps are scaled to a geometric mean of 1: the
-network's strength carries the exposure.  Source: Gardner et al. 2023, RENI++, arXiv 2311.09361, section 4.
+The decoder is equivariant to turns about the vertical, so maps need no augmentation by yaw; blends of two maps under
+a relative turn and a tint stand in for the many environments that a small collection lacks.  Maps are scaled to a
+geometric mean of 1: the network's strength carries the exposure.  Source: Gardner et al. 2023, RENI++, arXiv
+2311.09361, section 4.
 """
 
 from __future__ import annotations
@@ -27,7 +28,9 @@ HELD_BACK = 6  # every sixth map is left out of the fit and of all training
 
 
 def load_maps(path: Path) -> tuple[Tensor, list[str]]:
-    """Maps ``(n, 64, 128, 3)`` linear, row 0 up, area-averaged, and their names, from an .npz of ``env`` and ``names``."""
+    """Maps ``(n, 64, 128, 3)`` linear, row 0 up, area-averaged, and their names, from an .npz of ``env`` and
+    ``names``.
+    """
     data = np.load(path)
     maps = torch.as_tensor(data["env"].astype(np.float32)).permute(0, 3, 1, 2)
     maps = torch.nn.functional.interpolate(maps, (ROWS, 2 * ROWS), mode="area").permute(0, 2, 3, 1)
@@ -62,9 +65,13 @@ def blends(maps: Tensor, count: int, rng: np.random.Generator) -> Tensor:
 
 def fit(decoder: EnvironmentDecoder, maps: Tensor, *, steps: int, minutes: float, rays: int = 512, batch: int = 16,
         seed: int = 0, train_decoder: bool = True, log=sys.stderr) -> Tensor:  # fmt: skip
-    """Latents ``(n, L, 3)`` that decode to ``maps``; the decoder is fitted with them in place unless ``train_decoder`` is False."""
+    """Latents ``(n, L, 3)`` that decode to ``maps``; the decoder is fitted with them in place unless
+    ``train_decoder`` is False.
+    """
     generator = torch.Generator().manual_seed(seed)
-    latents = torch.nn.Parameter(0.1 * torch.randn(len(maps), decoder.field.network.layers[0].mha.key.in_features // 3, 3, generator=generator))
+    latents = torch.nn.Parameter(
+        0.1 * torch.randn(len(maps), decoder.field.network.layers[0].mha.key.in_features // 3, 3, generator=generator)
+    )
     groups = [{"params": [latents], "lr": 1e-2}]
     if train_decoder:
         groups.append({"params": [p for p in decoder.field.parameters()], "lr": 1e-3})
@@ -84,14 +91,21 @@ def fit(decoder: EnvironmentDecoder, maps: Tensor, *, steps: int, minutes: float
         log_radiance = decoder.field(latents[pick], directions[ray][None])
         target = (flat[pick][:, ray] + FLOOR).log()
         predicted = torch.logaddexp(log_radiance, torch.full_like(log_radiance, float(np.log(FLOOR))))
-        cosine = 1 - torch.nn.functional.cosine_similarity(log_radiance.exp() + FLOOR, flat[pick][:, ray] + FLOOR, dim=-1).mean()
+        cosine = (
+            1
+            - torch.nn.functional.cosine_similarity(
+                log_radiance.exp() + FLOOR, flat[pick][:, ray] + FLOOR, dim=-1
+            ).mean()
+        )
         loss = (predicted - target).abs().mean() + 0.3 * cosine + 1e-4 * latents[pick].square().mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
         mean += float(loss) / 200
         if step % 200 == 199:
-            print(f"light prior: step {step + 1}, {time.monotonic() - began:.0f} s, loss {mean:.4f}", file=log, flush=True)
+            print(
+                f"light prior: step {step + 1}, {time.monotonic() - began:.0f} s, loss {mean:.4f}", file=log, flush=True
+            )
             mean = 0.0
     return latents.detach()
 

@@ -37,7 +37,15 @@ class TrainConfig:
     seed: int = 0
 
 
-WEIGHTS = {"occupancy": 1.0, "base_color": 10.0, "roughness": 2.0, "metallic": 2.0, "normal": 1.0, "light": 0.5, "image": 0.5}
+WEIGHTS = {
+    "occupancy": 1.0,
+    "base_color": 10.0,
+    "roughness": 2.0,
+    "metallic": 2.0,
+    "normal": 1.0,
+    "light": 0.5,
+    "image": 0.5,
+}
 
 
 def progress(config: TrainConfig, step: int, seconds: float) -> float:
@@ -89,7 +97,10 @@ def train(model: Reconstructor, config: TrainConfig) -> None:
             sums[k] = sums.get(k, 0.0) + float(v)
         if step % 50 == 0:
             means = {k: round(v / 50, 5) for k, v in sums.items()}
-            log.write(json.dumps({"step": step, "seconds": round(seconds), "rate": optimizer.param_groups[0]["lr"], **means}) + "\n")
+            log.write(
+                json.dumps({"step": step, "seconds": round(seconds), "rate": optimizer.param_groups[0]["lr"], **means})
+                + "\n"
+            )
             print(f"step {step} {seconds:.0f} s {means}", file=sys.stderr, flush=True)
             sums = {}
         if time.monotonic() - saved > config.checkpoint_seconds:
@@ -108,7 +119,13 @@ def update_average(average: dict[str, Tensor], model: Reconstructor, decay: floa
 
 def save(folder: Path, model, optimizer, average, step: int, seconds: float) -> None:
     """Replace the checkpoint and the curves whole: a stop in the middle leaves the old ones."""
-    state = {"model": model.state_dict(), "optimizer": optimizer.state_dict(), "average": average, "step": step, "seconds": seconds}
+    state = {
+        "model": model.state_dict(),
+        "optimizer": optimizer.state_dict(),
+        "average": average,
+        "step": step,
+        "seconds": seconds,
+    }
     torch.save(state, folder / "state.tmp")
     os.replace(folder / "state.tmp", folder / "state.pt")
     write_curves(folder / "log.jsonl", folder / "curves.png")

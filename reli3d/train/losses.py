@@ -1,4 +1,6 @@
-"""What a step of training asks of the network: the field at points, the material at the surface, the light, and images."""
+"""What a step of training asks of the network: the field at points, the material at the surface, the light, and
+images.
+"""
 
 from __future__ import annotations
 

@@ -13,7 +13,9 @@ WIDTH, HEIGHT, MARGIN = 420, 180, 34
 
 
 def write_curves(log: Path, target: Path) -> None:
-    """One panel a logged quantity over the steps, logarithmic where it is positive; nothing is written without two points."""
+    """One panel a logged quantity over the steps, logarithmic where it is positive; nothing is written without two
+    points.
+    """
     rows = [r for r in map(json.loads, log.read_text().splitlines()) if "config" not in r]
     if len(rows) < 2:
         return

@@ -1,4 +1,6 @@
-"""Batches from the sample files of :mod:`reli3d.data.synthesis`: a choice of views and points, and one random turn of the world."""
+"""Batches from the sample files of :mod:`reli3d.data.synthesis`: a choice of views and points, and one random turn
+of the world.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,9 @@ from reli3d.nn.reni import map_directions
 
 @dataclass(frozen=True)
 class Batch:
-    """``B`` objects, ``V`` input views; float32; ``visible`` speaks of the input views; ``pixels`` come from all views."""
+    """``B`` objects, ``V`` input views; float32; ``visible`` speaks of the input views; ``pixels`` come from all
+    views.
+    """
 
     images: Tensor  # (B, V, S, S, 3) sRGB
     masks: Tensor  # (B, V, S, S)
@@ -49,8 +53,12 @@ def random_turn(rng: np.random.Generator) -> Tensor:
     return torch.as_tensor(yaw, dtype=torch.float32)
 
 
-def load_sample(path: Path, views: int, points: int, rng: np.random.Generator, *, augment: bool = True) -> dict[str, Tensor]:
-    """One object: ``views`` random views (the first ones without ``augment``), ``points`` of each kind, turned at random."""
+def load_sample(
+    path: Path, views: int, points: int, rng: np.random.Generator, *, augment: bool = True
+) -> dict[str, Tensor]:
+    """One object: ``views`` random views (the first ones without ``augment``), ``points`` of each kind, turned at
+    random.
+    """
     with safe_open(path, "pt") as file:
         total = file.get_slice("c2w").get_shape()[0]
         order = rng.permutation(total) if augment else np.arange(total)
@@ -91,7 +99,9 @@ def load_sample(path: Path, views: int, points: int, rng: np.random.Generator, *
 
 
 def batches(folder: Path, *, size: int, points: int, max_views: int, seed: int, start: int = 0) -> Iterator[Batch]:
-    """Endless batches of ``size`` objects; step ``k`` is a function of ``seed`` and ``k`` alone for a fixed folder, so training resumes."""
+    """Endless batches of ``size`` objects; step ``k`` is a function of ``seed`` and ``k`` alone for a fixed folder,
+    so training resumes.
+    """
     files, step = sorted(folder.glob("*.safetensors")), start
     if not files:
         raise ValueError(f"samples: expected *.safetensors files, got none in {folder}")

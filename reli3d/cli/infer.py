@@ -1,0 +1,222 @@
+"""``reli3d-infer``: posed photographs to a relightable asset."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from pathlib import Path
+
+STARTED = time.monotonic()
+EXAMPLE = Path(__file__).parents[1] / "assets" / "example"
+
+
+def parser() -> argparse.ArgumentParser:
+    p = argparse.ArgumentParser(
+        prog="reli3d-infer",
+        description="Turn a few posed photographs of an object into a relightable GLB and an HDR environment.",
+        epilog="Exit code: 0 all done, 1 some objects failed, 2 wrong input.  Results go to stdout, progress to stderr.",
+    )
+    p.add_argument("folder", nargs="*", type=Path, help="object folders: transforms.json or a COLMAP text model with images; "
+                   "default the bundled example")  # fmt: skip
+    p.add_argument(
+        "--output", type=Path, default=Path("outputs"), help="files land in OUTPUT/<object>/ (default outputs)"
+    )
+    p.add_argument("--views", type=int, help="use the first N views (1 to 16)")
+    p.add_argument("--masks", type=Path, help="folder of masks with the names of the images, instead of their alpha")
+    p.add_argument("--weights", default="small", help="small (in the package), official, or a safetensors file")
+    p.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="auto: cuda where there is one")
+    p.add_argument("--texture-size", type=int, default=1024, help="texels, 256 to 4096 (default 1024)")
+    p.add_argument(
+        "--resolution", type=int, help="cubes along a side of the surface grid, 16 to 256 (default the preset's)"
+    )
+    p.add_argument(
+        "--uv", choices=("project", "xatlas"), default="project", help="atlas: own projection or xatlas (slow)"
+    )
+    p.add_argument("--normalize", choices=("auto", "hull", "none"), default="auto",
+                   help="auto: centre and scale by the visual hull unless it sits in the model's cube")  # fmt: skip
+    p.add_argument(
+        "--frame", choices=("input", "model"), default="input", help="frame of the mesh (default the cameras')"
+    )
+    p.add_argument(
+        "--up", choices=("x", "y", "z", "-x", "-y", "-z"), default="y", help="axis of that frame to turn to +Y"
+    )
+    p.add_argument("--seed", type=int, default=0)
+    p.add_argument("--skip-existing", action="store_true", help="leave objects alone whose files are all there")
+    p.add_argument(
+        "--warm", action="store_true", help="reconstruct every object twice and record the second time as well"
+    )
+    p.add_argument("--allow-outside", action="store_true", help="let a camera file name images outside its folder")
+    p.add_argument("--check", action="store_true", help="explain the cameras and draw the rig; reconstruct nothing")
+    p.add_argument("--doctor", action="store_true", help="say what is installed and where it runs")
+    return p
+
+
+def main(argv: list[str] | None = None) -> int:
+    args = parser().parse_args(argv)
+    if args.doctor:
+        from reli3d.cli import doctor
+
+        return doctor.main([])
+    folders = args.folder or [EXAMPLE]
+    names = object_names(folders)
+    try:
+        device = choose_device(args.device)
+        job = None if args.check else Job(args, device)
+    except (ValueError, OSError) as error:
+        return _fail(error)
+    wrong = failed = done = 0
+    for folder, name in zip(folders, names, strict=True):
+        target = args.output / name
+        try:
+            if args.check:
+                check(folder, target, args)
+            elif args.skip_existing and job.complete(target):
+                print(f"{name}: all files are there, skipped", file=sys.stderr)
+            else:
+                job.run(folder, name, target)
+            done += 1
+        except ValueError as error:
+            wrong += 1
+            _fail(error)
+        except (OSError, RuntimeError, MemoryError) as error:
+            failed += 1
+            _fail(error, name)
+    if wrong + failed == 0:
+        return 0
+    return 2 if wrong and done == 0 and failed == 0 else 1
+
+
+def _fail(error: BaseException, name: str | None = None) -> int:
+    text = " ".join(str(error).split()) or type(error).__name__
+    print(f"reli3d-infer: {name + ': ' if name else ''}{text}", file=sys.stderr)
+    return 2
+
+
+def object_names(folders: list[Path]) -> list[str]:
+    """A name for each folder: its own, with a number where two are alike."""
+    names: list[str] = []
+    for folder in folders:
+        base = name = Path(os.path.abspath(folder)).name or "object"
+        k = 2
+        while name in names:
+            name, k = f"{base}-{k}", k + 1
+        names.append(name)
+    return names
+
+
+def choose_device(wanted: str) -> str:
+    """``cpu`` or ``cuda``.  Raises ValueError where cuda is asked for and missing: nothing falls back silently."""
+    import torch
+
+    if wanted == "cuda" and not torch.cuda.is_available():
+        raise ValueError("device: expected a CUDA device for --device cuda, got none; use --device cpu")
+    return "cuda" if wanted != "cpu" and torch.cuda.is_available() else "cpu"
+
+
+def check(folder: Path, target: Path, args: argparse.Namespace) -> None:
+    """Print what the cameras look like, one line a view, and write the picture of the rig."""
+    from reli3d.data.check import explain_cameras, rig_picture
+    from reli3d.data.folder import load_views
+
+    views = load_views(folder, views=args.views, masks=args.masks, allow_outside=args.allow_outside)
+    for line in (*views.notes, *explain_cameras(views)):
+        print(line)
+    target.mkdir(parents=True, exist_ok=True)
+    rig_picture(views, target / "rig.png")
+    print(target / "rig.png")
+
+
+class Job:
+    """What all objects of one command share: options and the loaded network."""
+
+    def __init__(self, args: argparse.Namespace, device: str):
+        from reli3d import results
+        from reli3d.nn import weights
+        from reli3d.pipeline import check_options
+
+        check_options(args.texture_size, args.resolution)
+        self.args, self.device, self.complete = args, device, results.complete
+        path = weights.locate(args.weights)
+        self.model, self.manifest = weights.load(path, device=device)
+        self.digest = weights.sha256(path)
+        self.cold = True
+
+    def run(self, folder: Path, name: str, target: Path) -> None:
+        from reli3d import results
+        from reli3d.data.folder import load_views
+        from reli3d.data.normalize import normalize
+        from reli3d.eval.preview import preview
+        from reli3d.pipeline import output_frame, reconstruct
+
+        args, steps = self.args, Progress(name)
+        began = time.perf_counter()
+        steps("reading")
+        views = load_views(folder, views=args.views, masks=args.masks, allow_outside=args.allow_outside)
+        for note in views.notes:
+            print(f"{name}: {note}", file=sys.stderr)
+        reading = time.perf_counter() - began
+        to_model = normalize(views, args.normalize)
+        seconds: dict[str, dict[str, float]] = {}
+        for label in ["cold" if self.cold else "warm", *(["warm"] if args.warm else [])]:
+            stages: dict[str, float] = {"read": reading}
+            asset = reconstruct(views, weights=self.model, texture_size=args.texture_size, resolution=args.resolution,
+                                normalization=args.normalize, frame=args.frame, up=args.up, uv=args.uv, seed=args.seed,
+                                timings=stages, progress=steps)  # fmt: skip
+            seconds[label] = {k: round(v, 4) for k, v in stages.items()}
+        self.cold = False
+        steps("preview")
+        output = output_frame(to_model, args.frame, args.up)
+        picture = preview(asset, views.transformed(output).to(self.device))
+        info = {
+            "object": name, "views": list(views.names), "coordinate_system": views.coordinate_system, "notes": list(views.notes),
+            **results.frame_record(to_model, output, args.frame, args.up),
+            "weights": results.weights_record(self.manifest, self.digest), "preset": self.model.preset.name,
+            "texture_size": args.texture_size, "resolution": args.resolution or self.model.preset.resolution, "seed": args.seed,
+            "device": self.device, "mesh": results.mesh_statistics(asset.mesh), "seconds": seconds,
+            "seconds_since_start": round(time.monotonic() - STARTED, 3), "peak_memory_mib": round(results.peak_memory_mib(), 1),
+            "versions": results.versions(),
+        }  # fmt: skip
+        steps("writing")
+        results.write_results(target, asset, picture, info)
+        steps.close()
+        print(target / "mesh.glb")
+
+
+class Progress:
+    """A bar over the stages of one object, on stderr."""
+
+    STAGES = (
+        "reading",
+        "normalize",
+        "prepare",
+        "network",
+        "surface",
+        "textures",
+        "light",
+        "frame",
+        "preview",
+        "writing",
+    )
+
+    def __init__(self, name: str):
+        from tqdm import tqdm
+
+        self.bar = tqdm(
+            total=len(self.STAGES), desc=name, file=sys.stderr, bar_format="{desc}: {bar:20} {postfix} {elapsed}"
+        )
+
+    def __call__(self, stage: str) -> None:
+        self.bar.set_postfix_str(stage, refresh=False)
+        self.bar.n = self.STAGES.index(stage)
+        self.bar.refresh()
+
+    def close(self) -> None:
+        self.bar.n = len(self.STAGES)
+        self.bar.set_postfix_str("done", refresh=True)
+        self.bar.close()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

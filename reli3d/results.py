@@ -1,0 +1,75 @@
+"""The files of one reconstruction: written beside their place first, then moved, so that none is ever half there."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import shutil
+import sys
+from dataclasses import asdict
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+
+from reli3d.data.normalize import Similarity
+from reli3d.geometry.mesh import Mesh, report
+from reli3d.io.glb import write_glb
+from reli3d.io.hdr import write_exr, write_hdr
+from reli3d.io.images import write_png
+from reli3d.nn.weights import Manifest
+from reli3d.render.asset import Asset
+
+FILES = ("mesh.glb", "environment.exr", "environment.hdr", "preview.png", "run_info.json")
+
+
+def complete(folder: Path) -> bool:
+    """Whether ``folder`` holds every file of a reconstruction."""
+    return all((folder / name).is_file() for name in FILES)
+
+
+def mesh_statistics(mesh: Mesh) -> dict:
+    """The report of the mesh welded across its UV seams, as plain values."""
+    return asdict(report(mesh))
+
+
+def peak_memory_mib() -> float:
+    """Most memory that this process has held, MiB."""
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20
+
+
+def write_results(folder: Path, asset: Asset, picture: np.ndarray, info: dict) -> None:
+    """Write :data:`FILES` into ``folder``; an error leaves what was there before.  Raises OSError, ValueError."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    temporary = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
+    temporary.mkdir()
+    try:
+        extras = {k: info[k] for k in ("output_from_input", "model_from_input", "weights")}
+        write_glb(temporary / "mesh.glb", asset, extras=extras)
+        write_exr(temporary / "environment.exr", asset.environment.radiance)
+        write_hdr(temporary / "environment.hdr", asset.environment.radiance)
+        write_png(temporary / "preview.png", picture)
+        (temporary / "run_info.json").write_text(json.dumps(info, indent=1) + "\n")
+        folder.mkdir(exist_ok=True)
+        for name in FILES:
+            os.replace(temporary / name, folder / name)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def frame_record(model_from_input: Similarity, output_from_input: Similarity, frame: str, up: str) -> dict:
+    """The frames of the output, as matrices on column vectors."""
+    return {"frame": frame, "up": up, "model_from_input": model_from_input.matrix().tolist(),
+            "output_from_input": output_from_input.matrix().tolist()}  # fmt: skip
+
+
+def weights_record(manifest: Manifest, digest: str) -> dict:
+    """Name, hash and licence of the weights."""
+    return {"file": Path(manifest.path).name, "sha256": digest, "licence": manifest.licence}
+
+
+def versions() -> dict[str, str]:
+    """Versions of this package and of those that compute."""
+    return {name: version(name) for name in ("reli3d", "torch", "warp-lang", "embreex", "numpy")}
