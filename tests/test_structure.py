@@ -1,6 +1,8 @@
 """The layout of the package: who imports whom, how long a file may be, and that importing it is cheap and silent."""
 
 import ast
+import importlib
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -148,3 +150,10 @@ def test_every_lent_name_lives_where_the_table_says():
         assert getattr(reli3d, name).__module__ == home
     with pytest.raises(AttributeError, match="no_such_name"):
         reli3d.no_such_name  # noqa: B018
+
+
+def test_every_command_of_the_package_exists():
+    commands = re.findall(r'^reli3d[\w-]* = "([\w.]+):(\w+)"', (ROOT / "pyproject.toml").read_text(), re.MULTILINE)
+    assert len(commands) >= 3
+    for module, function in commands:
+        assert callable(getattr(importlib.import_module(module), function)), module
