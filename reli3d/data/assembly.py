@@ -76,6 +76,14 @@ class Assembly:
         self._solids = [solid]
         return solid
 
+    def solid_share(self) -> float:
+        """Volume over the cube of the longest side, 0 if nothing is left."""
+        solid = self.joined()
+        if solid.num_tri() == 0:
+            return 0.0
+        box = np.array(solid.bounding_box()).reshape(2, 3)
+        return solid.volume() / float((box[1] - box[0]).max()) ** 3
+
     def finish(self, max_faces: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Vertices ``(V, 3)`` float64, faces ``(F, 3)`` and part of each face ``(F,)`` of the union without scraps.
 

@@ -54,7 +54,7 @@ def color(rng: np.random.Generator, kind: str) -> tuple[float, float, float]:
         kind = str(
             rng.choice(
                 ["grey", "white", "dark", "wood", "muted", "vivid", "earth"],
-                p=[0.14, 0.15, 0.14, 0.1, 0.19, 0.16, 0.12],
+                p=[0.17, 0.17, 0.15, 0.1, 0.2, 0.1, 0.11],
             )
         )
     match kind:
@@ -73,7 +73,7 @@ def color(rng: np.random.Generator, kind: str) -> tuple[float, float, float]:
         case "earth":
             rgb = _linear_of_hsv(u(0.02, 0.17), u(0.25, 0.75), u(0.2, 0.8))
         case "muted":
-            rgb = _linear_of_hsv(u(), u(0.12, 0.5), u(0.25, 0.85))
+            rgb = _linear_of_hsv(u(), u(0.08, 0.42), u(0.25, 0.88))
         case _:
             rgb = _linear_of_hsv(u(), u(0.6, 0.97), u(0.35, 0.95))
     return tuple(float(x) for x in np.clip(rgb, 0.02, 0.88))
@@ -128,7 +128,7 @@ def _draw(rng: np.random.Generator, role: str, box: np.ndarray) -> Material:
                 layers.append((Coat(_near(rng, base.color, 0.35), base.roughness), pt.Weave(thread)))
                 bumps.append(pt.Weave(thread, u(0.1, 0.35) / np.linalg.norm(thread[0])))
             else:
-                bumps.append(_noise_bump(rng, 15, 50, u(0.1, 0.3)))
+                bumps.append(_noise_bump(rng, 15, 50, u(0.04, 0.15)))
         case "leather":
             base = Coat(
                 color(rng, str(rng.choice(["wood", "dark", "earth", "vivid", "white"], p=[0.35, 0.3, 0.2, 0.1, 0.05]))),
@@ -164,7 +164,7 @@ def _draw(rng: np.random.Generator, role: str, box: np.ndarray) -> Material:
                     )
                 )
             if rng.random() < 0.5:
-                bumps.append(_noise_bump(rng, 10, 40, u(0.05, 0.25)))
+                bumps.append(_noise_bump(rng, 10, 40, u(0.02, 0.12)))
         case "rubber":
             base = Coat(color(rng, "dark" if rng.random() < 0.8 else "any"), u(0.45, 0.95))
         case "plastic":
@@ -175,10 +175,10 @@ def _draw(rng: np.random.Generator, role: str, box: np.ndarray) -> Material:
             base = Coat(
                 color(rng, "vivid" if role == "accent" and rng.random() < 0.5 else "any"), _roughness(rng, 0.2, 0.85)
             )
-            if rng.random() < 0.35:
+            if rng.random() < 0.22:
                 layers += _wear(rng, base)
     layers[:0] = _decor(rng, base, box, 0.42 if role in ("paint", "ceramic", "any") else 0.25)
-    if rng.random() < 0.35:
+    if rng.random() < 0.2:
         layers.append(_dirt(rng, base))
     return Material(base, tuple(layers), tuple(bumps), u(0, 0.12), u(0, 0.06), u(2, 8), _seed(rng))
 
@@ -192,7 +192,7 @@ def _decor(rng: np.random.Generator, base: Coat, box: np.ndarray, chance: float)
         centre = box.mean(0)
         match int(rng.choice(7, p=[0.25, 0.08, 0.1, 0.17, 0.2, 0.1, 0.1])):
             case 0:
-                frame = _frame(rng, 1.5 / size, 14, turned=0.15)
+                frame = _frame(rng, min(1.5 / size, 10), 14, turned=0.15)
                 if rng.random() < 0.5:
                     frame = frame[[int(np.argmax(np.abs(frame[:, 1]))), 0, 1]]  # level bands
                 layers.append(
@@ -329,7 +329,7 @@ def _metal(rng: np.random.Generator, box: np.ndarray) -> Material:
         layers.append(
             (rust, pt.Blotches(_frame(rng, 2, 7), _seed(rng), u(-0.4, 0.8), u(0.05, 0.35), octaves=5, gain=0.6))
         )
-        bumps.append(_noise_bump(rng, 12, 40, u(0.05, 0.25)))
+        bumps.append(_noise_bump(rng, 12, 40, u(0.02, 0.12)))
     elif kind < 0.5:  # brushed: long noise across one axis
         frame = _frame(rng, 60, 120, stretch=30.0, turned=0.05)
         bumps.append(pt.Emboss(frame, _seed(rng), u(0.05, 0.16) / float(np.linalg.norm(frame[0])), octaves=1))
@@ -340,7 +340,7 @@ def _metal(rng: np.random.Generator, box: np.ndarray) -> Material:
             )
         )
     elif kind < 0.65:  # hammered or cast
-        bumps.append(_noise_bump(rng, 6, 20, u(0.1, 0.35)))
+        bumps.append(_noise_bump(rng, 6, 20, u(0.05, 0.18)))
     elif kind < 0.85:  # painted, worn to the metal
         paint = Coat(color(rng, "any"), u(0.25, 0.8), 0.0)
         layers.append(
@@ -380,7 +380,7 @@ def _stone(rng: np.random.Generator) -> Material:
     else:
         layers.append((other, pt.Mosaic(_frame(rng, 10, 30), _seed(rng), share=u(0.2, 0.5))))
     if rng.random() < 0.6:
-        bumps.append(_noise_bump(rng, 8, 30, u(0.05, 0.35)))
+        bumps.append(_noise_bump(rng, 8, 30, u(0.02, 0.16)))
     if rng.random() < 0.3:
         layers.append((Coat(_near(rng, (0.12, 0.16, 0.05), 0.4), 0.95), pt.Facing((0, 1, 0), 0.3, 0.9, _seed(rng))))
     return Material(base, tuple(layers), tuple(bumps), u(0.03, 0.2), u(0, 0.08), u(2, 8), _seed(rng))

@@ -81,7 +81,7 @@ def evaluate(materials: Sequence[Material], points, normals, part):
         raise ValueError(f"part: expected 0 to {len(materials) - 1}, got {int(part.min())} to {int(part.max())}")
     color, bumped = torch.empty_like(points), torch.empty_like(points)
     roughness, metallic = points.new_empty(len(points)), points.new_empty(len(points))
-    for k in torch.unique(part).tolist():
+    for k in torch.bincount(part, minlength=1).nonzero()[:, 0].tolist():
         own = (part == k).nonzero()[:, 0]
         color[own], roughness[own], metallic[own], bumped[own] = materials[k].at(points[own], normals[own])
     results = color, roughness, metallic, bumped

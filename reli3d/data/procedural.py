@@ -15,7 +15,7 @@ import torch
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from reli3d.data import furniture, manmade, organic, vessels
+from reli3d.data import example, furniture, manmade, organic, vessels
 from reli3d.data.assembly import Assembly
 from reli3d.data.finishes import draw_materials
 from reli3d.data.materials import Material, evaluate
@@ -25,6 +25,7 @@ TRAINING_SEEDS = range(0, 1_000_000_000)
 VALIDATION_SEEDS = range(1_000_000_000, 1_000_000_032)
 MAX_FACES = 30_000
 CREASE_DEG = 38.0  # rounded edges turn at most 30 degrees a facet and must look smooth, edges of boxes turn 90
+THINNEST = 2e-4  # volume over cubed longest side: a sword has 1e-3, less is a sheet that no view shows
 FRAME_RADIUS = 0.87  # half diagonal of the unit cube: objects of longest side 1 lie inside
 
 FAMILIES = (
@@ -60,27 +61,44 @@ class ProceduralObject:
 
 def make_object(seed: int) -> ProceduralObject:
     """The object of ``seed``: a family, a deformation, a pose at rest and materials, all drawn from it."""
-    rng = np.random.default_rng(seed)
+    if seed < 0:
+        raise ValueError(f"seed: expected at least 0, got {seed}")
     weights = np.array([w for _, w in FAMILIES])
-    family = FAMILIES[int(rng.choice(len(FAMILIES), p=weights / weights.sum()))][0]
-    assembly = Assembly(rng)
-    family(assembly)
-    _deform(assembly)
-    _pose(assembly)
-    return assemble(assembly, family.__name__)
+    attempt = 0
+    while True:  # a cut may leave nothing, or a sheet: then the object is drawn anew from the next stream of the seed
+        rng = np.random.default_rng((seed, attempt))
+        family = FAMILIES[int(rng.choice(len(FAMILIES), p=weights / weights.sum()))][0]
+        assembly = Assembly(rng)
+        family(assembly)
+        if assembly.solid_share() > THINNEST:
+            _deform(assembly)
+            _pose(assembly)
+            return assemble(assembly, family.__name__)
+        attempt += 1
 
 
-def assemble(assembly: Assembly, name: str) -> ProceduralObject:
-    """Close ``assembly``: union, at most ``MAX_FACES`` faces, centre, scale, normals, materials."""
+def example_object() -> ProceduralObject:
+    """The fixed example of the package, see ``example.py``: an enamelled kettle on a board."""
+    assembly = Assembly(np.random.default_rng(0))
+    example.kettle(assembly)
+    return assemble(assembly, "kettle", example.finish())
+
+
+def assemble(assembly: Assembly, name: str, materials: tuple[Material, ...] | None = None) -> ProceduralObject:
+    """Close ``assembly``: union, at most ``MAX_FACES`` faces, centre, scale, normals, materials (drawn if not
+    given).
+    """
     vertices, faces, part = assembly.finish(MAX_FACES)
     low, high = vertices.min(0), vertices.max(0)
     vertices = ((vertices - (low + high) / 2) / (high - low).max()).astype(np.float32)
     used, part = np.unique(part, return_inverse=True)
     part = part.reshape(-1).astype(np.int32)
-    bounds = np.array(
-        [[vertices[faces[part == k]].min((0, 1)), vertices[faces[part == k]].max((0, 1))] for k in range(len(used))]
-    )
-    materials = draw_materials(assembly.rng, [assembly.roles[k] for k in used], bounds)
+    if materials is None:
+        own = [vertices[faces[part == k]].reshape(-1, 3) for k in range(len(used))]
+        bounds = np.array([[points.min(0), points.max(0)] for points in own])
+        materials = draw_materials(assembly.rng, [assembly.roles[k] for k in used], bounds)
+    else:
+        materials = tuple(materials[k] for k in used)
     return ProceduralObject(vertices, faces, corner_normals(vertices, faces), part, materials, name)
 
 
