@@ -184,7 +184,8 @@ def rig_picture(views: Views, path: str | os.PathLike) -> None:
     hull, shares = agreement(views)
     c2w, intrinsics = views.c2w.double().cpu(), views.intrinsics.double().cpu()
     target = hull.points.mean(0) if len(hull.points) else hull.aim
-    reach = float((c2w[:, :3, 3] - target).norm(dim=-1).max()) * 1.15
+    eyes = c2w[:, :3, 3]
+    reach = max(float((eyes - target).norm(dim=-1).max()), float(eyes.norm(dim=-1).max()))
     frustums = [_frustum(c, k, m.shape, 0.16 * reach) for c, k, m in zip(c2w, intrinsics, views.masks)]
     cube = _cube(views) if len(hull.points) else target[None].numpy()
     spread = np.concatenate([*frustums, cube, np.zeros((1, 3))])

@@ -81,10 +81,10 @@ class Hull:
     extent: float  # longest lateral side of the masks at ``aim``
 
     def box(self) -> tuple[Tensor, Tensor]:
-        """Lower and upper corner ``(3,)``.  ValueError on an empty hull."""
+        """Lower and upper corner ``(3,)``, to half a cell.  ValueError on an empty hull."""
         if len(self.points) == 0:
             raise ValueError("hull: expected a point inside all masks, got none; run --check to see the cameras")
-        return self.points.amin(0) - self.cell / 2, self.points.amax(0) + self.cell / 2
+        return self.points.amin(0), self.points.amax(0)  # the border runs through the outermost cells
 
 
 def normalize(views: Views, mode: str = "auto") -> Similarity:
@@ -168,11 +168,11 @@ def _covered(points: Tensor, mask: Tensor, pose: Tensor, camera: Tensor, cell: f
     """Whether the footprint of a cell of side ``cell`` about each point touches the mask; False behind the camera."""
     local = (points - pose[:3, 3]) @ pose[:3, :3]
     depth = (-local[:, 2]).clamp_min(1e-12)
-    step = int(max(1.0, float((camera[:2] * cell / depth.median()).max()) // 2)) if len(points) else 1
-    height, width = mask.shape
-    if step > 1:  # maximum over blocks of half a footprint: the thin part that one sample would miss
-        mask = pad(mask, (0, -width % step, 0, -height % step))
-        mask = max_pool2d(mask[None], step)[0]
+    footprint = float((camera[:2] * cell / depth.median()).max()) if len(points) else 0.0
+    step, (height, width) = max(1, int(footprint // 3)), mask.shape
+    if footprint > 1:  # maximum over 3 x 3 blocks of a third of a footprint: the thin part that one sample would miss
+        mask = max_pool2d(pad(mask, (0, -width % step, 0, -height % step))[None], step)
+        mask = max_pool2d(mask, 3, 1, 1)[0]
     scaled = torch.stack([camera[0] * local[:, 0], -camera[1] * local[:, 1]], -1) / depth[:, None] + camera[2:]
     limit = torch.tensor([width - 1, height - 1], dtype=torch.float64)
     pixel = torch.minimum(scaled.floor().clamp_min(0), limit).long() // step

@@ -1,0 +1,119 @@
+import os
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from reli3d.io.files import InputError, printable, read_bytes, shown, write_bytes
+from reli3d.io.images import png_bytes, read_image, write_png
+
+NOISE = np.random.default_rng(3).integers(0, 256, (9, 14, 4), np.uint8)
+
+
+def saved(tmp_path, image: Image.Image, name: str, **options):
+    image.save(tmp_path / name, **options)
+    return tmp_path / name
+
+
+@pytest.mark.parametrize("name, options", [("a.png", {}), ("a.webp", {"lossless": True, "exact": True}), ("a.tif", {})])
+def test_straight_alpha_and_the_colour_under_it_are_kept(tmp_path, name, options):
+    rgb, alpha = read_image(saved(tmp_path, Image.fromarray(NOISE), name, **options))
+    # 8-bit values over 255 in float32: exact to one rounding
+    torch.testing.assert_close(rgb, torch.from_numpy(NOISE[..., :3] / 255).float(), rtol=0, atol=6e-8)
+    torch.testing.assert_close(alpha, torch.from_numpy(NOISE[..., 3] / 255).float(), rtol=0, atol=6e-8)
+
+
+def test_grey_palette_and_cmyk_come_out_as_colour(tmp_path):
+    grey, alpha = read_image(saved(tmp_path, Image.fromarray(NOISE[..., 0]), "grey.png"))
+    assert alpha is None
+    assert torch.equal((grey * 255).round().byte(), torch.from_numpy(NOISE[..., :1]).expand(-1, -1, 3))
+    flat = Image.fromarray(np.repeat(NOISE[:1, :5, :3], 7, 0))
+    palette, alpha = read_image(saved(tmp_path, flat.quantize(8), "palette.png"))
+    assert alpha is None
+    # 5 colours in 8 slots: the palette is exact up to the quantiser's averaging in 5-bit bins
+    assert float((palette * 255 - torch.from_numpy(np.array(flat)).float()).abs().max()) <= 8
+    indexed = flat.quantize(8)
+    _, alpha = read_image(saved(tmp_path, indexed, "key.png", transparency=indexed.getpixel((0, 0))))
+    assert float(alpha[0, 0]) == 0.0
+    assert float(alpha.max()) == 1.0
+    cmyk, _ = read_image(saved(tmp_path, Image.new("CMYK", (16, 16), (0, 255, 255, 0)), "ink.jpg", quality=95))
+    assert (cmyk[8, 8] - torch.tensor([1.0, 0.0, 0.0])).abs().max() < 0.03  # JPEG of a flat colour: a few levels
+
+
+def test_16_bit_grey_keeps_its_precision(tmp_path):
+    ramp = np.arange(0, 65536, 257, dtype=np.uint16).reshape(16, 16) + 5
+    rgb, _ = read_image(saved(tmp_path, Image.fromarray(ramp), "deep.png"))
+    torch.testing.assert_close(rgb[..., 1], torch.from_numpy(ramp.astype(np.float32) / 65535), rtol=0, atol=6e-8)
+
+
+def test_exif_orientation_is_noted_and_not_applied(tmp_path):
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    notes: list[str] = []
+    rgb, _ = read_image(saved(tmp_path, Image.fromarray(NOISE[..., :3]), "photo.jpg", exif=exif), notes=notes)
+    assert rgb.shape == (9, 14, 3)
+    assert len(notes) == 1
+    assert "orientation 6" in notes[0]
+
+
+def test_the_size_limit_holds_before_decoding(tmp_path):
+    path = saved(tmp_path, Image.new("1", (9000, 9000)), "large.png")  # 81 MP in 10 kB: below Pillow's own limit
+    with pytest.raises(InputError, match="67108864 pixels, got 9000 x 9000"):
+        read_image(path)
+
+
+def test_png_round_trip(tmp_path):
+    write_png(tmp_path / "a.png", NOISE)
+    assert np.array_equal(np.asarray(Image.open(tmp_path / "a.png")), NOISE)
+    values = torch.tensor([[[-1.0, 0.0, 0.4999], [0.5001, 1.0, 7.0]]]) / torch.tensor([1.0, 1.0, 1.0])
+    write_png(tmp_path / "b.png", values)  # clamped, and rounded to the nearest of 255 steps
+    assert np.asarray(Image.open(tmp_path / "b.png")).tolist() == [[[0, 0, 127], [128, 255, 255]]]
+
+
+@pytest.mark.parametrize("pixels, error", [
+    (torch.zeros(4, 4, 2), ValueError), (torch.zeros(0, 4, 3), ValueError), (torch.zeros(4, 4, 3).long(), TypeError),
+    (torch.full((4, 4, 3), float("nan")), ValueError), (torch.zeros(4), ValueError),
+])  # fmt: skip
+def test_png_refuses(pixels, error):
+    with pytest.raises(error, match="pixels: expected"):
+        png_bytes(pixels)
+
+
+def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):
+    write_png(tmp_path / "a.png", NOISE)
+    old = (tmp_path / "a.png").read_bytes()
+
+    def full_disk(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", full_disk)
+    with pytest.raises(OSError, match="No space"):
+        write_png(tmp_path / "a.png", NOISE[::-1])
+    assert [p.name for p in tmp_path.iterdir()] == ["a.png"]
+    assert (tmp_path / "a.png").read_bytes() == old
+    with pytest.raises(OSError):
+        write_bytes(tmp_path / "no folder" / "a.png", b"x")
+
+
+def test_files_are_written_with_the_usual_permissions(tmp_path):
+    write_bytes(tmp_path / "a", b"x")
+    (tmp_path / "b").write_bytes(b"x")
+    assert (tmp_path / "a").stat().st_mode == (tmp_path / "b").stat().st_mode
+
+
+def test_reading_takes_regular_files_within_the_limit(tmp_path):
+    write_bytes(tmp_path / "a", b"12345")
+    assert read_bytes(tmp_path / "a", 5) == b"12345"
+    for path, limit in ((tmp_path / "a", 4), (tmp_path, 9), (tmp_path / "none", 9), ("a\0b", 9), ("/dev/null", 9)):
+        with pytest.raises(InputError):
+            read_bytes(path, limit)
+
+
+def test_messages_are_one_printable_line():
+    assert str(InputError("a\nb", "c\x1b[31m\ud800 d")) == "a\\nb: c\\x1b[31m\\ud800 d"
+    assert printable("naïve\t") == "naïve\\t"
+    assert len(shown("x" * 999)) <= 60
+    nested: list = []
+    nested.append(nested)
+    assert shown(nested) == "[[...]]"
