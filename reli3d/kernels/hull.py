@@ -10,7 +10,7 @@ import warp as wp
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
 
 NEVER = wp.constant(65536.0)  # rows to a crossing where a column has none: beyond any image
-NEAR = wp.constant(4.0)  # pixels: beyond, a segment away from the nearest crossing is at most sqrt(16.5) - 4 = 0.06 nearer
+NEAR = wp.constant(4.0)  # pixels; beyond, other segments are at most sqrt(16.5) - 4 = 0.06 pixels nearer
 BEHIND = wp.constant(-1.0e3)  # distance of a point that a camera cannot see, in world units: below that of any other
 DEPTH_MIN = wp.constant(1.0e-4)  # a point this close to a camera's plane counts as behind it
 

@@ -1,0 +1,178 @@
+"""Mesh type, normals, components and report against closed forms and trimesh."""
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from reli3d.geometry.mesh import (
+    Mesh,
+    face_components,
+    from_trimesh,
+    largest_components,
+    report,
+    select_faces,
+    to_trimesh,
+    vertex_normals,
+    volume,
+    weld,
+)
+
+
+def mesh_of(source, device="cpu"):
+    return from_trimesh(source, device=device)
+
+
+def joined(*sources):
+    return mesh_of(trimesh.util.concatenate(sources))
+
+
+def test_normals_of_a_sphere_are_radial_and_unit(device):
+    sphere = mesh_of(trimesh.creation.icosphere(4), device).with_normals()
+    # area weights on an icosphere of 2562 vertices: the worst vertex leans by about a tenth of an edge angle
+    torch.testing.assert_close(sphere.normals, sphere.vertices, rtol=0, atol=0.01)
+    torch.testing.assert_close(sphere.normals.norm(dim=-1), torch.ones(2562, device=device), rtol=0, atol=1e-6)
+
+
+def test_normals_are_weighted_by_area():
+    # two faces at a right angle along x = 0, one three times as large
+    vertices = torch.tensor([[0.0, 0, 0], [0, 1, 0], [-3, 0, 0], [0, 0, 1]])
+    faces = torch.tensor([[0, 1, 2], [0, 3, 1]], dtype=torch.int32)
+    got = vertex_normals(vertices, faces)
+    torch.testing.assert_close(got[0], torch.tensor([-1.0, 0.0, 3.0]) / 10**0.5)
+
+
+def test_normal_gradient_matches_float64(device):
+    rng = torch.Generator().manual_seed(0)
+    source = mesh_of(trimesh.creation.icosphere(2), device)
+    vertices = (source.vertices + 0.05 * torch.randn(162, 3, generator=rng).to(device)).requires_grad_()
+    weights = torch.randn(162, 3, generator=rng).to(device)
+    (got,) = torch.autograd.grad((vertex_normals(vertices, source.faces) * weights).sum(), vertices)
+    double = vertices.detach().double().requires_grad_()
+    f = source.faces.long()
+    cross = torch.linalg.cross(double[f[:, 1]] - double[f[:, 0]], double[f[:, 2]] - double[f[:, 0]])
+    total = sum(torch.zeros_like(double).index_add(0, f[:, k], cross) for k in range(3))
+    unit = total / total.norm(dim=-1, keepdim=True)
+    (want,) = torch.autograd.grad((unit * weights.double()).sum(), double)
+    torch.testing.assert_close(got.double(), want, rtol=1e-4, atol=1e-4)  # gradients up to 20, float32 sums of 6 faces
+
+
+def test_unused_and_flat_vertices_get_a_unit_normal_without_gradient():
+    vertices = torch.tensor([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [5, 5, 5]]).requires_grad_()
+    normals = vertex_normals(vertices, torch.tensor([[0, 1, 2]], dtype=torch.int32))
+    assert normals.tolist() == [[0.0, 0.0, 1.0]] * 4
+    assert bool((torch.autograd.grad(normals.sum(), vertices)[0] == 0).all())
+
+
+def test_weld_groups_equal_positions_in_order():
+    vertices = torch.tensor([[1.0, 2, 3], [0, 0, 0], [1, 2, 3], [-0.0, 0, 0], [1, 2, 3.0000002]])
+    first, label = weld(vertices)
+    assert first.tolist() == [0, 1, 4]
+    assert label.tolist() == [0, 1, 0, 1, 2]
+
+
+@pytest.mark.parametrize(
+    "source, euler",
+    [(trimesh.creation.icosphere(2), 2), (trimesh.creation.torus(1.0, 0.3), 0), (trimesh.creation.box(), 2)],
+)
+def test_closed_surfaces_and_their_euler_number(source, euler):
+    got = report(mesh_of(source))
+    assert got.watertight and got.manifold
+    assert (got.euler, got.components, got.faces) == (euler, 1, len(source.faces))
+    soup = source.copy()
+    soup.unmerge_vertices()  # three vertices a face: the welded mesh is the same
+    again = report(mesh_of(soup))
+    assert again.vertices == 3 * len(source.faces)
+    assert (again.euler, again.watertight, again.manifold) == (euler, True, True)
+    assert again.welded_vertices == len(source.vertices)
+
+
+def test_defects_are_counted():
+    cap = mesh_of(trimesh.creation.icosphere(1))
+    opened = report(select_faces(cap, torch.arange(80) > 0))
+    assert (opened.boundary_edges, opened.watertight, opened.manifold) == (3, False, True)
+    flipped = cap.faces.clone()
+    flipped[0] = flipped[0].flip(0)
+    got = report(Mesh(cap.vertices, flipped))
+    assert (got.flipped_edges, got.manifold, got.watertight) == (3, False, True)
+    two = [trimesh.creation.box(), trimesh.creation.box().apply_translation([1, 1, 1])]  # meet in a corner
+    got = report(joined(*two))
+    assert (got.nonmanifold_vertices, got.nonmanifold_edges, got.components) == (1, 0, 1)
+    # two tetrahedra that share an edge
+    v = torch.tensor([[0.0, 0, 0], [0, 0, 1], [1, 0, 0], [1, 1, 0], [-1, 0, 0], [-1, -1, 0]])
+    tetra = [[0, 2, 1], [0, 3, 2], [0, 1, 3], [1, 2, 3], [0, 4, 1], [0, 5, 4], [0, 1, 5], [1, 4, 5]]
+    got = report(Mesh(v, torch.tensor(tetra, dtype=torch.int32)))
+    assert (got.nonmanifold_edges, got.watertight, got.manifold) == (1, True, False)
+    got = report(Mesh(v, torch.tensor([[0, 0, 1], [0, 1, 2]], dtype=torch.int32)))
+    assert (got.degenerate_faces, got.boundary_edges, got.faces) == (1, 3, 2)
+    got = report(Mesh(v, torch.zeros(0, 3, dtype=torch.int32)))
+    assert (got.components, got.watertight) == (0, False)
+
+
+def test_components_and_the_largest():
+    big, small = trimesh.creation.icosphere(3), trimesh.creation.icosphere(1).apply_translation([3, 0, 0])
+    mesh = joined(small, big)
+    label = face_components(mesh)
+    assert label.tolist() == [0] * 80 + [1] * 1280
+    kept = largest_components(mesh, 0.1).with_normals()
+    assert (len(kept.faces), len(kept.vertices)) == (1280, 642)
+    assert len(largest_components(mesh, 0.01).faces) == 1360
+    assert len(largest_components(mesh, 1.0).faces) == 1280  # the largest stays whatever the fraction
+    assert abs(float(volume(kept)) - big.volume) < 1e-4  # float32 sum of 1280 terms around 3e-3
+
+
+def test_select_faces_keeps_attributes_and_gradients():
+    source = mesh_of(trimesh.creation.icosphere(1))
+    v = source.vertices.requires_grad_()
+    uv = torch.rand(len(v), 2, generator=torch.Generator().manual_seed(0))
+    kept = select_faces(Mesh(v, source.faces, uv=uv), torch.arange(80) < 5)
+    assert kept.uv.shape == (len(kept.vertices), 2)
+    torch.testing.assert_close(kept.vertices[kept.faces.long()], v[source.faces[:5].long()])
+    torch.testing.assert_close(kept.uv[kept.faces.long()], uv[source.faces[:5].long()])
+    assert torch.autograd.grad(kept.vertices.sum(), v)[0].sum() == 3 * len(kept.vertices)
+
+
+def test_trimesh_round_trip_is_exact():
+    rng = torch.Generator().manual_seed(0)
+    source = mesh_of(trimesh.creation.icosphere(1)).with_normals()
+    n = len(source.vertices)
+    direction = torch.nn.functional.normalize(torch.randn(n, 3, generator=rng), dim=-1)
+    tangents = torch.cat([direction, torch.ones(n, 1)], -1)
+    mesh = Mesh(source.vertices, source.faces, source.normals, torch.rand(n, 2, generator=rng), tangents)
+    there = to_trimesh(mesh)
+    np.testing.assert_allclose(there.visual.uv[:, 1], 1 - mesh.uv[:, 1].numpy().astype(np.float64), rtol=0, atol=0)
+    back = from_trimesh(there)
+    for name in ("vertices", "faces", "normals", "uv", "tangents"):
+        assert torch.equal(getattr(back, name), getattr(mesh, name)), name
+    assert from_trimesh(trimesh.creation.icosphere(1)).normals is None
+
+
+@pytest.mark.parametrize(
+    "change, error",
+    [
+        (dict(vertices=torch.zeros(3, 3, dtype=torch.float64)), TypeError),
+        (dict(faces=torch.zeros(1, 3, dtype=torch.int64)), TypeError),
+        (dict(faces=torch.tensor([[0, 1, 3]], dtype=torch.int32)), ValueError),
+        (dict(faces=torch.tensor([[0, 1, -1]], dtype=torch.int32)), ValueError),
+        (dict(faces=torch.zeros(3, dtype=torch.int32)), ValueError),
+        (dict(normals=torch.zeros(2, 3)), ValueError),
+        (dict(uv=torch.zeros(3, 3)), ValueError),
+        (dict(tangents=torch.zeros(3, 3)), ValueError),
+    ],
+)
+def test_wrong_input_is_named(change, error):
+    arguments = dict(vertices=torch.zeros(3, 3), faces=torch.tensor([[0, 1, 2]], dtype=torch.int32)) | change
+    with pytest.raises(error, match=f"^{next(iter(change))}: expected"):
+        Mesh(**arguments)
+
+
+def test_real_meshes_report_the_same_as_trimesh(shared_data):
+    files = sorted((shared_data / "meshes").rglob("*.glb"))[:3]
+    for file in files:
+        source = trimesh.load(file, force="mesh")
+        got = report(from_trimesh(source))
+        merged = trimesh.Trimesh(np.asarray(source.vertices, np.float32), source.faces, process=False)
+        merged.merge_vertices(merge_tex=True, merge_norm=True, digits_vertex=12)
+        assert got.faces == len(source.faces)
+        if got.degenerate_faces == 0:
+            assert got.euler == merged.euler_number
