@@ -10,9 +10,9 @@ from torch import Tensor
 
 from reli3d._bridge import check, empty, launch, over_slices
 from reli3d.geometry.rays import RayScene
-from reli3d.kernels import random as random_kernels
 from reli3d.kernels import shade as kernels
 from reli3d.render.environment import Environment
+from reli3d.render.sampling import halton
 
 SAMPLES = (20, 40, 4)  # environment, visible normals, cosine: the published counts
 CHUNK_RAYS = 65536  # shadow rays of a chunk and their values take 2.6 MB a thread: near the cache, far above call costs
@@ -138,12 +138,9 @@ def _plan(samples, seed, antithetic, heuristic, points, clamp, scene):
     plan.seed = int(seed) & 0x7FFFFFFF
     plan.clamp = float("inf") if clamp is None else float(clamp)
     plan.scale = 0.0 if scene is None else scene.scale
-    return plan, halton(max(1, *samples))
+    return plan, _halton(max(1, *samples))
 
 
 @lru_cache(16)
-def halton(count: int, first: int = 1) -> Tensor:
-    """Points ``first`` to ``first + count - 1`` of the Halton sequence in bases 2 and 3, ``(count, 2)`` on CPU."""
-    out = torch.empty(count, 2)
-    launch(random_kernels.halton_kernel, count, [first, (out, wp.vec2)], out.device)
-    return out
+def _halton(count: int) -> Tensor:
+    return halton(count)

@@ -1,0 +1,96 @@
+"""Samplers of directions in the local frame (normal +z) and their densities, and the random numbers they take.
+
+``u`` is uniform in [0, 1)^2 and belongs to the caller.  Leading axes broadcast; tensors are float32 on one device.
+"""
+
+from __future__ import annotations
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from reli3d._bridge import call, check, empty, launch
+from reli3d.kernels import microfacet, random
+from reli3d.kernels import sampling as kernels
+
+
+def sample_cosine(u: Tensor) -> Tensor:
+    """Directions ``(..., 3)`` for ``u (..., 2)``; density cos / pi (:func:`pdf_cosine`).  No gradient."""
+    check("u", u, last=2)
+    flat = u.detach().reshape(-1, 2).contiguous()
+    out = empty((flat.shape[0],), wp.vec3, u.device)
+    launch(kernels.sample_cosine_kernel, flat.shape[0], [(flat, wp.vec2), (out, wp.vec3)], u.device)
+    return out.reshape(*u.shape[:-1], 3)
+
+
+def pdf_cosine(wi: Tensor) -> Tensor:
+    """Density ``(...)`` [1/sr] of :func:`sample_cosine` at ``wi (..., 3)``; 0 below the horizon."""
+    check("wi", wi, last=3)
+    return wi[..., 2].clamp(min=0.0) / torch.pi
+
+
+def sample_ggx_vndf(wo: Tensor, alpha: Tensor, u: Tensor) -> Tensor:
+    """GGX microfacet normals visible from ``wo``, ``(..., 3)`` unit.
+
+    wo: ``(..., 3)`` unit, z > 0.  alpha: ``(...)`` GGX width in (0, 1], floored at 1e-3.  u: ``(..., 2)``.  Gradients
+    reach ``wo`` and ``alpha``.  Source: Dupuy and Benyoub 2023, spherical caps.  Density: :func:`pdf_ggx_vndf`.
+    """
+    check("wo", wo, last=3)
+    check("alpha", alpha, like=wo)
+    check("u", u, last=2, like=wo)
+    batch = torch.broadcast_shapes(wo.shape[:-1], alpha.shape, u.shape[:-1])
+    ins = [(wo.expand(*batch, 3).reshape(-1, 3), wp.vec3), (alpha.expand(batch).reshape(-1), wp.float32),
+           (u.detach().expand(*batch, 2).reshape(-1, 2), wp.vec2)]  # fmt: skip
+    n = batch.numel()
+    (wm,) = call(microfacet.sample_ggx_vndf_kernel, n, ins, [((n,), wp.vec3)], device=wo.device)
+    return wm.reshape(*batch, 3)
+
+
+def pdf_ggx_vndf(wo: Tensor, alpha: Tensor, wm: Tensor) -> Tensor:
+    """Density ``(...)`` [1/sr of ``wm``] of visible normals; 0 where ``wm`` faces away from ``wo``.
+
+    Shapes and gradients as in :func:`sample_ggx_vndf`; gradients also reach ``wm``.
+    """
+    check("wo", wo, last=3)
+    check("alpha", alpha, like=wo)
+    check("wm", wm, last=3, like=wo)
+    batch = torch.broadcast_shapes(wo.shape[:-1], alpha.shape, wm.shape[:-1])
+    ins = [(wo.expand(*batch, 3).reshape(-1, 3), wp.vec3), (alpha.expand(batch).reshape(-1), wp.float32),
+           (wm.expand(*batch, 3).reshape(-1, 3), wp.vec3)]  # fmt: skip
+    n = batch.numel()
+    (pdf,) = call(microfacet.pdf_ggx_vndf_kernel, n, ins, [((n,), wp.float32)], device=wo.device)
+    return pdf.reshape(batch)
+
+
+def mirror(wm: Tensor) -> Tensor:
+    """Antithetic partner of microfacet normals ``(..., 3)``: turned by pi about the surface normal."""
+    check("wm", wm, last=3)
+    return wm * wm.new_tensor([-1.0, -1.0, 1.0])
+
+
+def reflect(wo: Tensor, wm: Tensor) -> Tensor:
+    """``wo`` mirrored at ``wm``, ``(..., 3)``."""
+    check("wo", wo, last=3)
+    check("wm", wm, last=3, like=wo)
+    return 2.0 * (wo * wm).sum(-1, keepdim=True) * wm - wo
+
+
+def random_pairs(count: int, *, seed: int = 0, sample: int = 0, dimension: int = 0,
+                 device: torch.device | str = "cpu") -> Tensor:  # fmt: skip
+    """Uniform ``u (count, 2)`` in [0, 1): row i is a hash of (i, sample, dimension, seed) alone.
+
+    pcg4d, Jarzynski and Olano 2020.  The first two of its four words, 24 bits each.
+    """
+    out = empty((count,), wp.vec2, torch.device(device))
+    args = [int(seed) & 0x7FFFFFFF, int(sample), int(dimension), (out, wp.vec2)]
+    launch(random.random_pair_kernel, count, args, out.device)
+    return out
+
+
+def halton(count: int, *, first: int = 1, device: torch.device | str = "cpu") -> Tensor:
+    """Points ``first`` to ``first + count - 1`` of the Halton sequence in bases 2 and 3, ``(count, 2)`` in [0, 1)."""
+    if first < 0 or count < 0:
+        raise ValueError(f"first, count: expected at least 0, got {first}, {count}")
+    out = empty((count,), wp.vec2, torch.device(device))
+    launch(random.halton_kernel, count, [int(first), (out, wp.vec2)], out.device)
+    return out

@@ -1,0 +1,67 @@
+"""Chi-square test of samples on the sphere against a density [1/sr]."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from scipy.special import gammaincc
+from torch import Tensor
+
+EXPECTED_MIN = 5.0  # below this count the normal limit behind chi-square fails (Cochran 1954)
+
+
+def p_value(directions: Tensor, pdf: Callable[[Tensor], Tensor], *, total: int | None = None, res: int = 51, ires: int
+= 4,
+            up: int = 2) -> float:  # fmt: skip
+    """Probability of counts as uneven as those of unit ``directions (N, 3)`` under ``pdf``; 0 for impossible ones.
+
+    Cells are (phi, cos theta) about axis ``up``, ``2 res`` by ``res`` (odd, so that the equator is on no border),
+    their mass the mean of ``pdf`` on ``ires`` x ``ires`` midpoints.  ``total`` counts samples drawn; those not in
+    ``directions`` are invalid and must make up the mass that ``pdf`` lacks.
+    """
+    total = len(directions) if total is None else total
+    d = directions.detach().cpu().double().numpy()
+    a, b = d[:, (up + 1) % 3], d[:, (up + 2) % 3]
+    x = np.clip((np.arctan2(b, a) / (2 * np.pi) % 1.0 * 2 * res).astype(int), 0, 2 * res - 1)
+    y = np.clip(((d[:, up] * 0.5 + 0.5) * res).astype(int), 0, res - 1)
+    observed = np.bincount(y * 2 * res + x, minlength=2 * res * res).astype(float)
+    expected = cell_masses(pdf, res, ires, up, directions.device) * total
+    if abs(np.linalg.norm(d, axis=1) - 1.0).max(initial=0.0) > 1e-5 or observed[expected == 0.0].sum() > 0:
+        return 0.0
+    if expected.sum() > 1.01 * total:
+        return 0.0
+    lacking = total - expected.sum()
+    if lacking > EXPECTED_MIN or len(d) < total:
+        observed, expected = np.append(observed, total - len(d)), np.append(expected, max(lacking, 1e-9))
+    order = np.argsort(expected)
+    observed, expected = observed[order], expected[order]
+    pool = np.floor(np.cumsum(expected) / EXPECTED_MIN).astype(int)
+    first = int(np.searchsorted(expected, EXPECTED_MIN))  # cells from here stand alone
+    label = np.where(np.arange(len(expected)) < first, np.minimum(pool, pool[first - 1] - 1 if first else 0), -1)
+    label = np.maximum(label, 0)
+    label[first:] = label[:first].max(initial=-1) + 1 + np.arange(len(expected) - first)
+    o, e = np.bincount(label, observed), np.bincount(label, expected)
+    o, e = o[e > 0], e[e > 0]
+    if len(e) < 2:
+        return 1.0 if abs(o.sum() - e.sum()) < 1e-3 * total else 0.0
+    return float(gammaincc((len(e) - 1) / 2.0, (((o - e) ** 2) / e).sum() / 2.0))
+
+
+def cell_masses(pdf: Callable[[Tensor], Tensor], res: int, ires: int, up: int = 2, device=None) -> np.ndarray:
+    """Integral of ``pdf`` over each cell, ``(res * 2 res,)`` float64."""
+    phi = (np.arange(2 * res * ires) + 0.5) / (2 * res * ires) * 2 * np.pi
+    z = (np.arange(res * ires) + 0.5) / (res * ires) * 2 - 1
+    z, phi = np.meshgrid(z, phi, indexing="ij")
+    s = np.sqrt(1 - z * z)
+    d = np.empty((*z.shape, 3), np.float32)
+    d[..., up], d[..., (up + 1) % 3], d[..., (up + 2) % 3] = z, s * np.cos(phi), s * np.sin(phi)
+    value = pdf(torch.from_numpy(d.reshape(-1, 3)).to(device)).detach().cpu().double().numpy()
+    value = value.reshape(res, ires, 2 * res, ires).mean((1, 3)).reshape(-1)
+    return value * (4 * np.pi / (2 * res * res))
+
+
+def sidak(tests: int, level: float = 0.01) -> float:
+    """Level of one of ``tests`` independent tests for the family to have ``level``."""
+    return 1.0 - (1.0 - level) ** (1.0 / tests)

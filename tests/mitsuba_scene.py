@@ -1,0 +1,107 @@
+"""Mitsuba 3 as an outside judge of images: same mesh, same rays, same material formula, its own geometry and light."""
+
+from __future__ import annotations
+
+import glob
+import os
+
+import numpy as np
+import pytest
+import torch
+
+
+def load():
+    """The mitsuba module in its LLVM variant, or a visible skip."""
+    if "DRJIT_LIBLLVM_PATH" not in os.environ:
+        found = sorted(glob.glob("/usr/lib/*/libLLVM-19.so*") + glob.glob("/usr/lib/*/libLLVM-2?.so*"))
+        if not found:
+            pytest.skip("needs LLVM 19 or newer for mitsuba's llvm variant (DRJIT_LIBLLVM_PATH)")
+        os.environ["DRJIT_LIBLLVM_PATH"] = found[0]
+    mi = pytest.importorskip("mitsuba")
+    mi.set_variant("llvm_ad_rgb")
+    return mi
+
+
+def environment(mi, radiance: torch.Tensor) -> dict:
+    """Mitsuba's envmap with the same bilinear function.
+
+    Its rows are nodes at v = r / (H' - 1), ours texel centres: with H' = 2 H + 1 all our kinks fall on its nodes.
+    Its columns are texel centres as ours.  Its centre column looks to +Z: half a turn.
+    """
+    height = radiance.shape[0]
+    rows = np.arange(2 * height + 1) / 2 - 0.5
+    low = np.clip(np.floor(rows).astype(int), 0, height - 1)
+    high = np.clip(low + 1, 0, height - 1)
+    part = (rows - np.floor(rows))[:, None, None]
+    part = np.where((rows < 0)[:, None, None], 0.0, part)
+    data = radiance.numpy()
+    data = data[low] * (1 - part) + data[high] * part
+    bitmap = mi.Bitmap(np.ascontiguousarray(data, np.float32))
+    return {"type": "envmap", "bitmap": bitmap, "to_world": mi.ScalarTransform4f().rotate([0, 1, 0], 180)}
+
+
+def material(mi, base_color, alpha, metallic):
+    """A Mitsuba BSDF that evaluates the metallic-roughness formula; sampled by cosine and visible normals."""
+    import drjit as dr
+
+    base = mi.Color3f(*base_color)
+
+    class MetallicRoughness(mi.BSDF):
+        def __init__(self, props):
+            mi.BSDF.__init__(self, props)
+            flags = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide
+            self.m_components = [flags]
+            self.m_flags = flags
+
+        def sample(self, ctx, si, sample1, sample2, active):
+            distribution = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, alpha, alpha)
+            h, _ = distribution.sample(si.wi, sample2)
+            cosine = mi.warp.square_to_cosine_hemisphere(sample2)
+            bs = mi.BSDFSample3f()
+            bs.wo = dr.select(sample1 < 0.5, cosine, mi.reflect(si.wi, h))
+            bs.pdf = self.pdf(ctx, si, bs.wo, active)
+            bs.eta = 1.0
+            bs.sampled_type = mi.UInt32(+mi.BSDFFlags.GlossyReflection)
+            bs.sampled_component = mi.UInt32(0)
+            return bs, dr.select(bs.pdf > 0, self.eval(ctx, si, bs.wo, active) / bs.pdf, 0)
+
+        def eval(self, ctx, si, wo, active):
+            i, o = si.wi, wo
+            distribution = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, alpha, alpha)
+            h = dr.normalize(i + o)
+            d = distribution.eval(h)  # Mitsuba's own density and masking; G2 from the two G1 is height-correlated Smith
+            g = 1.0 / (dr.rcp(distribution.smith_g1(i, h)) + dr.rcp(distribution.smith_g1(o, h)) - 1.0)
+            f0 = 0.04 * (1 - metallic) + base * metallic
+            f = f0 + (1 - f0) * (1 - dr.dot(i, h)) ** 5
+            value = (1 - f) * base * (1 - metallic) / dr.pi + f * d * g / (4 * i.z * o.z)
+            return dr.select((i.z > 0) & (o.z > 0), value * o.z, 0)
+
+        def pdf(self, ctx, si, wo, active):
+            distribution = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, alpha, alpha)
+            h = dr.normalize(si.wi + wo)
+            lobe = distribution.pdf(si.wi, h) / (4 * dr.dot(si.wi, h))
+            both = 0.5 * mi.warp.square_to_cosine_hemisphere_pdf(wo) + 0.5 * lobe
+            return dr.select((si.wi.z > 0) & (wo.z > 0), both, 0)
+
+        def eval_pdf(self, ctx, si, wo, active):
+            return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
+
+        def to_string(self):
+            return "MetallicRoughness[]"
+
+    mi.register_bsdf("reli3d_metallic_roughness", lambda props: MetallicRoughness(props))
+    return {"type": "reli3d_metallic_roughness"}
+
+
+def radiance(mi, scene, origins: torch.Tensor, directions: torch.Tensor, samples: int, passes: int):
+    """Mean ``(N, 3)`` and its variance of direct light along rays, from ``passes`` independent estimates."""
+    integrator = mi.load_dict({"type": "direct", "emitter_samples": samples, "bsdf_samples": samples,
+                               "hide_emitters": True})  # fmt: skip
+    ray = mi.RayDifferential3f(mi.Point3f(origins.numpy().T), mi.Vector3f(directions.numpy().T))
+    values = []
+    for k in range(passes):
+        sampler = mi.load_dict({"type": "independent"})
+        sampler.seed(k + 1, len(origins))
+        values.append(np.array(integrator.sample(scene, sampler, ray)[0]).T)
+    values = np.stack(values)
+    return values.mean(0), values.var(0, ddof=1) / passes

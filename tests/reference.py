@@ -1,0 +1,82 @@
+"""Float64 twins of the renderer's formulas in plain torch, written from the papers, differentiable by autograd.
+
+Directions are in the local frame, normal +z.  Shapes ``(..., 3)`` and ``(...)``; everything float64.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def ggx_ndf(wm: Tensor, alpha: Tensor) -> Tensor:
+    """Walter et al. 2007, eq. 33, in the tangent form."""
+    cos2 = wm[..., 2] ** 2
+    tan2 = (1.0 - cos2) / cos2
+    return alpha**2 / (torch.pi * cos2**2 * (alpha**2 + tan2) ** 2)
+
+
+def smith_lambda(w: Tensor, alpha: Tensor) -> Tensor:
+    """Heitz 2014, eq. 72."""
+    tan2 = (1.0 - w[..., 2] ** 2) / w[..., 2] ** 2
+    return 0.5 * (torch.sqrt(1.0 + alpha**2 * tan2) - 1.0)
+
+
+def pdf_ggx_vndf(wo: Tensor, alpha: Tensor, wm: Tensor) -> Tensor:
+    """Heitz 2018, eq. 3."""
+    g1 = 1.0 / (1.0 + smith_lambda(wo, alpha))
+    return g1 * (wo * wm).sum(-1).clamp(min=0.0) * ggx_ndf(wm, alpha) / wo[..., 2]
+
+
+def sample_ggx_vndf(wo: Tensor, alpha: Tensor, u: Tensor) -> Tensor:
+    """Dupuy and Benyoub 2023, listing 1."""
+    stretch = torch.stack([alpha, alpha, torch.ones_like(alpha)], -1)
+    w = torch.nn.functional.normalize(wo * stretch, dim=-1)
+    phi, z = 2.0 * torch.pi * u[..., 0], (1.0 - u[..., 1]) * (1.0 + w[..., 2]) - w[..., 2]
+    r = torch.sqrt((1.0 - z * z).clamp(min=0.0))
+    h = w + torch.stack([r * torch.cos(phi), r * torch.sin(phi), z], -1)
+    return torch.nn.functional.normalize(h * stretch, dim=-1)
+
+
+def eval_bsdf(wo: Tensor, wi: Tensor, base_color: Tensor, alpha: Tensor, metallic: Tensor) -> Tensor:
+    """Lambert below Schlick, GGX with height-correlated Smith; directions above the horizon."""
+    wm = torch.nn.functional.normalize(wo + wi, dim=-1)
+    f0 = 0.04 * (1.0 - metallic[..., None]) + base_color * metallic[..., None]
+    fresnel = f0 + (1.0 - f0) * (1.0 - (wo * wm).sum(-1, keepdim=True)) ** 5
+    g2 = 1.0 / (1.0 + smith_lambda(wo, alpha) + smith_lambda(wi, alpha))
+    specular = ggx_ndf(wm, alpha) * g2 / (4.0 * wo[..., 2] * wi[..., 2])
+    return (1.0 - fresnel) * (1.0 - metallic[..., None]) * base_color / torch.pi + fresnel * specular[..., None]
+
+
+def sphere_grid(height: int) -> tuple[Tensor, Tensor]:
+    """Midpoints ``(2 height^2, 3)`` in cos theta and phi about +y, and the solid angle of each."""
+    y = (torch.arange(height, dtype=torch.float64) + 0.5) / height * 2 - 1
+    phi = (torch.arange(2 * height, dtype=torch.float64) + 0.5) / height * torch.pi
+    y, phi = torch.meshgrid(y, phi, indexing="ij")
+    s = torch.sqrt(1 - y * y)
+    d = torch.stack([s * torch.cos(phi), y, s * torch.sin(phi)], -1).reshape(-1, 3)
+    return d, torch.tensor(4 * torch.pi / len(d), dtype=torch.float64)
+
+
+def lookup_envmap(radiance: Tensor, d: Tensor) -> Tensor:
+    """Bilinear lat-long lookup by grid_sample on a map padded by its own wrap; row 0 +Y, centre column -Z."""
+    height, width = radiance.shape[:2]
+    u = (torch.atan2(d[..., 0], -d[..., 2]) / (2 * torch.pi) + 0.5) * width + 1.0
+    v = torch.acos(d[..., 1].clamp(-1, 1)) / torch.pi * height
+    padded = torch.cat([radiance[:, -1:], radiance, radiance[:, :1]], 1).permute(2, 0, 1)[None]
+    grid = torch.stack([u / (width + 2) * 2 - 1, v / height * 2 - 1], -1).reshape(1, 1, -1, 2)
+    out = torch.nn.functional.grid_sample(padded, grid, align_corners=False, padding_mode="border")
+    return out[0, :, 0].T.reshape(*d.shape)
+
+
+def direct_light(normal: Tensor, wo: Tensor, base_color: Tensor, alpha: Tensor, metallic: Tensor, radiance: Tensor,
+                 height: int = 256) -> Tensor:  # fmt: skip
+    """Radiance ``(3,)`` of one unshadowed point by midpoint quadrature over the sphere."""
+    d, angle = sphere_grid(height)
+    d = d[(d @ normal) > 1e-6]
+    helper = torch.eye(3, dtype=torch.float64)[normal.abs().argmin()]
+    t = torch.nn.functional.normalize(torch.linalg.cross(helper, normal), dim=-1)
+    frame = torch.stack([t, torch.linalg.cross(normal, t), normal])
+    wi, o = d @ frame.T, (frame @ wo).expand(len(d), 3)
+    value = eval_bsdf(o, wi, base_color.expand(len(d), 3), alpha.expand(len(d)), metallic.expand(len(d)))
+    return (value * wi[:, 2:] * lookup_envmap(radiance, d)).sum(0) * angle

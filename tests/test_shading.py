@@ -1,0 +1,220 @@
+"""The estimator of direct light: against quadrature, against Mitsuba, and what must hold for any light."""
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from scipy.special import erfc
+
+from reli3d.geometry.rays import RayScene
+from reli3d.render.camera import Camera, camera_rays, look_at
+from reli3d.render.environment import Environment
+from reli3d.render.gbuffer import hit_normals, interpolate
+from reli3d.render.shading import shade
+from tests import mitsuba_scene, reference
+
+
+def sky(height=16, seed=0, power=3.0):
+    g = torch.Generator().manual_seed(seed)
+    return Environment(torch.rand(height, 2 * height, 3, generator=g) ** power * 2.0)
+
+
+def points(n, seed=1):
+    g = torch.Generator().manual_seed(seed)
+    normal = torch.nn.functional.normalize(torch.randn(n, 3, generator=g), dim=-1)
+    wo = torch.nn.functional.normalize(normal + 0.6 * torch.randn(n, 3, generator=g), dim=-1)
+    wo = torch.where((wo * normal).sum(-1, keepdim=True) < 0.05, normal, wo)
+    return normal, wo
+
+
+def repeat(count, *rows):
+    return [r.expand(count, *r.shape[1:]).contiguous() for r in rows]
+
+
+COUNTS = [(64, 0, 0), (0, 64, 0), (0, 63, 0), (0, 0, 64), (20, 40, 4), (20, 7, 0)]
+
+
+@pytest.mark.parametrize("counts", COUNTS)
+@pytest.mark.parametrize("roughness, metallic", [(0.9, 0.0), (0.45, 0.3), (0.6, 1.0)])
+def test_every_strategy_and_mix_converges_to_the_quadrature(device, counts, roughness, metallic):
+    if counts[0] == 0 and counts[2] == 0:
+        metallic = 1.0  # visible normals alone reach the diffuse part with rare, heavy samples
+    env, (normal, wo) = sky(), points(3)
+    for k in range(2):
+        base = torch.tensor([0.8, 0.5, 0.2])
+        truth = reference.direct_light(
+            normal[k].double(), wo[k].double(), base.double(), torch.tensor(roughness**2).double(),
+            torch.tensor(metallic).double(), env.radiance.double(),
+        )  # fmt: skip
+        n = 3000
+        args = repeat(
+            n, normal[k : k + 1], wo[k : k + 1], base[None], torch.tensor([roughness]), torch.tensor([metallic])
+        )
+        args = [a.to(device) for a in args]
+        light = Environment(env.radiance.to(device))
+        for extra in ({}, {"points": "random", "heuristic": "power"}, {"antithetic": False}):
+            got = shade(args[0], args[0], args[0], args[1], args[2], args[3], args[4], light, samples=counts, **extra)
+            error = got.std(0) / n**0.5 + 2e-4 * truth.float().to(device)  # second term: quadrature error, 256 rows
+            z = ((got.mean(0) - truth.to(device)) / error).abs().max()
+            assert z < 4.5, (extra, got.mean(0), truth)  # 6e-6 a number, about 300 numbers in the family
+
+
+def test_white_furnace_never_gains_energy(device):
+    n = 3000
+    for roughness in (0.1, 0.4, 1.0):
+        for cos_o in (0.05, 0.4, 1.0):
+            normal = torch.tensor([[0.0, 0.0, 1.0]], device=device).expand(n, 3).contiguous()
+            wo = torch.tensor([[(1 - cos_o**2) ** 0.5, 0.0, cos_o]], device=device).expand(n, 3).contiguous()
+            one, width = torch.ones(n, device=device), torch.full((n,), roughness, device=device)
+            env = Environment.constant(torch.ones(3, device=device))
+            got = shade(normal, normal, normal, wo, one[:, None].expand(n, 3).contiguous(), width, one, env)
+            mean, error = got.mean(), got[:, 0].std() / n**0.5
+            assert mean - 4 * error <= 1.0 + 1e-4  # 1e-4: float32 sum of 64 terms of the weights
+            truth = reference.direct_light(
+                normal[0].cpu().double(), wo[0].cpu().double(), torch.ones(3).double(),
+                torch.tensor(roughness**2).double(), torch.tensor(1.0).double(), torch.ones(4, 8, 3).double(),
+                height=512,
+            )  # fmt: skip
+            slack = 4 * error + 2e-3  # quadrature of the lobe at roughness 0.1, alpha 0.01: 0.2 % with 512 rows
+            assert roughness < 0.3 or abs(mean - truth[0]) < slack
+
+
+def test_lambert_under_constant_light_is_its_closed_form(device):
+    """With base 0 only the coat is left, so the difference to base 1 is the diffuse part: kd (1 - F) averaged."""
+    n = 20000
+    normal = torch.tensor([[0.0, 1.0, 0.0]], device=device).expand(n, 3).contiguous()
+    env = Environment.constant(torch.full((3,), 2.0, device=device))
+    zero, one = torch.zeros(n, device=device), torch.ones(n, device=device)
+    lit = [
+        shade(normal, normal, normal, normal, c[:, None].expand(n, 3).contiguous(), one, zero, env) for c in (zero, one)
+    ]
+    d, angle = reference.sphere_grid(512)
+    d = d[d[:, 1] > 0]
+    cos_m = torch.sqrt((1 + d[:, 1]) / 2)  # half angle between the normal view and the light
+    truth = 2.0 * ((1 - 0.04) * (1 - (1 - cos_m) ** 5) * d[:, 1]).sum() * angle / torch.pi
+    error = (lit[1] - lit[0])[:, 0].std() / n**0.5
+    assert abs((lit[1] - lit[0]).mean() - truth) < 4 * error + 1e-4  # midpoint rule at the horizon
+
+
+def test_edge_inputs_are_finite_and_not_negative(device):
+    g = torch.Generator().manual_seed(5)
+    n = 20000
+    normal, ng, wo = (
+        torch.nn.functional.normalize(torch.randn(n, 3, generator=g), dim=-1).to(device) for _ in range(3)
+    )
+    pick = lambda *v: torch.tensor(v)[torch.randint(len(v), (n,), generator=g)].to(device)  # noqa: E731
+    env = sky(power=30.0)
+    env = Environment((env.radiance * 1e4).to(device))
+    got = shade(normal, normal, ng, wo, torch.rand(n, 3, generator=g).to(device), pick(0.0, 1e-3, 1.0, 0.5),
+                pick(0.0, 1.0, 0.3), env)  # fmt: skip
+    assert bool(torch.isfinite(got).all()) and float(got.min()) >= 0.0
+    black = shade(normal, normal, ng, wo, torch.rand(n, 3).to(device), pick(0.2), pick(0.5),
+                  Environment.constant(torch.zeros(3, device=device)))  # fmt: skip
+    assert float(black.abs().max()) == 0.0
+    none = shade(normal, normal, ng, wo, torch.rand(n, 3).to(device), pick(0.2), pick(0.5), env, samples=(0, 0, 0))
+    assert float(none.abs().max()) == 0.0
+    empty = shade(
+        *(torch.zeros(0, 3, device=device),) * 5, torch.zeros(0, device=device), torch.zeros(0, device=device), env
+    )
+    assert empty.shape == (0, 3)
+
+
+def test_bits_do_not_depend_on_threads_or_chunks(device):
+    normal, wo = points(5000)
+    mesh = trimesh.creation.icosphere(subdivisions=2, radius=0.5)
+    vertices, faces = torch.tensor(mesh.vertices).float().to(device), torch.tensor(mesh.faces).int().to(device)
+    scene = RayScene(vertices, faces)
+    args = [normal, normal, normal, wo, torch.rand(5000, 3), torch.rand(5000), torch.rand(5000)]
+    args = [a.to(device) for a in args]
+    light = Environment(sky().radiance.to(device))
+    threads = torch.get_num_threads()
+    try:
+        results = []
+        for k in (1, 2):
+            torch.set_num_threads(k)
+            results.append(shade(*args, light, scene=scene))
+    finally:
+        torch.set_num_threads(threads)
+    assert torch.equal(*results)
+    part = [a[700:900] for a in args]
+    ids = torch.arange(700, 900, dtype=torch.int32, device=device)
+    assert torch.equal(shade(*part, light, scene=scene, pixels=ids), results[0][700:900])
+
+
+def test_embree_and_warp_cast_the_same_shadows():
+    normal, wo = points(3000)
+    mesh = trimesh.creation.icosphere(subdivisions=3, radius=0.4)
+    mesh.apply_translation([0, 1.2, 0])
+    vertices, faces = torch.tensor(mesh.vertices).float(), torch.tensor(mesh.faces).int()
+    args = [normal * 0.5, normal, normal, wo, torch.full((3000, 3), 0.7), torch.full((3000,), 0.5), torch.zeros(3000)]
+    a, b, free = (shade(*args, sky(), scene=s) for s in (RayScene(vertices, faces, "embree"),
+                                                         RayScene(vertices, faces, "warp"), None))  # fmt: skip
+    assert float((free - a).max()) > 0.01  # the shadow is there
+    changed = ((a - b).abs() > 1e-5).any(-1).float().mean()
+    assert changed < 2e-3  # 64 rays a point: a silhouette ray differs with probability of about 1e-5
+
+
+def test_bad_input_is_named(device):
+    normal, wo = (v.to(device) for v in points(4))
+    one, env = torch.ones(4, device=device), Environment(sky().radiance.to(device))
+    args = dict(position=normal, normal=normal, ng=normal, wo=wo, base_color=normal.abs(), roughness=one, metallic=one,
+                environment=env)  # fmt: skip
+    for change, kind, name in [
+        ({"normal": normal.double()}, TypeError, "normal"), ({"roughness": one[:3]}, ValueError, "roughness"),
+        ({"samples": (1, 2)}, ValueError, "samples"), ({"samples": (-1, 2, 3)}, ValueError, "samples"),
+        ({"heuristic": "x"}, ValueError, "heuristic"), ({"clamp": 0.0}, ValueError, "clamp"),
+        ({"pixels": torch.arange(3, dtype=torch.int32, device=device)}, ValueError, "pixels"),
+    ]:  # fmt: skip
+        with pytest.raises(kind, match=f"{name}: expected"):
+            shade(**{**args, **change})
+
+
+@pytest.mark.slow  # Mitsuba compiles its kernels for half a minute
+@pytest.mark.parametrize("alpha, metallic, power", [(0.64, 0.0, 2.0), (0.09, 0.5, 1.0), (0.09, 1.0, 12.0)])
+def test_lit_sphere_with_shadow_equals_mitsuba(alpha, metallic, power):
+    mi = mitsuba_scene.load()
+    base = (0.8, 0.4, 0.1)
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.5)
+    ring = trimesh.creation.torus(0.75, 0.15, major_sections=40, minor_sections=16)
+    mesh = trimesh.util.concatenate([ball, ring])
+    vertices, faces = torch.tensor(mesh.vertices).float(), torch.tensor(mesh.faces).int()
+    normals = torch.tensor(np.array(mesh.vertex_normals)).float()
+    env = sky(16, seed=3, power=power)
+    camera = Camera.from_fov(
+        look_at(torch.tensor([1.2, 1.6, 1.9]), torch.zeros(3), torch.tensor([0.0, 1, 0])), 0.6, 48, 48
+    )
+    origins, directions = (v.reshape(-1, 3).contiguous() for v in camera_rays(camera))
+    scene = RayScene(vertices, faces)
+    hits = scene.closest(origins, directions)
+    normal = torch.nn.functional.normalize(interpolate(normals, faces, hits.face, hits.bary), dim=-1)
+    index = torch.nonzero((hits.face >= 0) & ((normal * -directions).sum(-1) > 0.05))[:, 0]  # Mitsuba bends no normals
+    judge = mi.Mesh("mesh", len(vertices), len(faces), has_vertex_normals=True,
+                    props=_mesh_props(mi, mitsuba_scene.material(mi, base, alpha, metallic)))  # fmt: skip
+    params = mi.traverse(judge)
+    params["vertex_positions"], params["faces"] = vertices.numpy().ravel(), faces.numpy().ravel().astype(np.uint32)
+    params["vertex_normals"] = normals.numpy().ravel()
+    params.update()
+    world = mi.load_dict({"type": "scene", "light": mitsuba_scene.environment(mi, env.radiance), "mesh": judge})
+    want, want_var = mitsuba_scene.radiance(mi, world, origins[index], directions[index], 32, 12)
+    n = len(index)
+    color = torch.tensor(base).expand(n, 3).contiguous()
+    position = interpolate(vertices, faces, hits.face[index], hits.bary[index])
+    ng = hit_normals(vertices, faces, hits.face[index])
+    runs = torch.stack([
+        shade(position, normal[index], ng, -directions[index], color, torch.full((n,), alpha**0.5),
+              torch.full((n,), metallic), env, scene=scene, seed=k) for k in range(12)
+    ]).double().numpy()  # fmt: skip
+    got, got_var = runs.mean(0), runs.var(0, ddof=1) / len(runs)
+    z = np.abs(got - want) / np.sqrt(got_var + want_var + (1e-4 * want) ** 2 + 1e-12)  # float32 on both sides
+    # 12 runs give Student's t with about 20 degrees; the normal limit at 1 % Sidak over the pixels is widened to 6
+    assert (z < 6.0).mean() >= 0.9975
+    relative = np.abs(got.mean(0) - want.mean(0)) / want.mean(0)
+    noise = np.sqrt((got_var + want_var).sum(0)) / n / want.mean(0)
+    assert (relative < 3.5 * noise + 1e-3).all(), (relative, noise)  # 1e-3: shadow edges of float32 geometry
+    assert erfc(np.median(z) / 2**0.5) > 0.35  # the typical pixel sits within its noise
+
+
+def _mesh_props(mi, bsdf):
+    props = mi.Properties()
+    props["bsdf"] = mi.load_dict(bsdf)
+    return props
