@@ -177,8 +177,8 @@ def test_noise_gradient_is_the_slope_of_its_value(device):
             step[axis] = 1e-2
             above, below = (fbm(points + s * step, octaves=octaves, ridged=ridged, seed=9)[0] for s in (1, -1))
             error = ((above - below) / 0.02 - gradient[:, axis]).abs()
-            # truncation h^2 f''' / 6 of the third octave (f''' up to 2e3) and, where ridged, folds within the step
-            assert float(error.median()) < 0.02 and float((error > 0.2).float().mean()) < (0.06 if ridged else 0.01)
+            # truncation h^2 f''' / 6 of the third octave (f''' up to 2e3); where ridged, folds within 1e-2 of a point
+            assert float(error.median()) < 0.02 and float((error > 0.2).float().mean()) < (0.15 if ridged else 0.02)
 
 
 def test_cells_are_nearest_and_second_nearest(device):

@@ -174,13 +174,7 @@ def container(a: Assembly) -> None:
         a.cut(p.box((w - 2 * t, h, d - 2 * t), 0.02), body, (0, 2 * t, 0))
         for s in (-1, 1):
             a.cut(p.box((4 * t, 0.12 * h, 0.35 * d), 0.05 * h), frame, (s * w / 2, 0.25 * h, 0))
-    if rng.random() < 0.3:
-        a.add(
-            p.tube(
-                p.curve(np.array([[-0.15, 0, 0], [-0.14, 0.12, 0], [0.14, 0.12, 0], [0.15, 0, 0]]), 16),
-                0.022,
-                segments=10,
-            ),
-            frame,
-            (0, h / 2, 0),
-        )
+    if rng.random() < 0.3:  # it must reach the walls of an open box
+        span = w / 2 - 0.015 if kind >= 0.85 else 0.15
+        arch = np.array([[-span, -0.02, 0], [-0.93 * span, 0.12, 0], [0.93 * span, 0.12, 0], [span, -0.02, 0]])
+        a.add(p.tube(p.curve(arch, 16), 0.022, segments=10), frame, (0, h / 2, 0))
