@@ -224,3 +224,29 @@ def test_merged_cube_weights_match_published(golden):
     assert_relative(merger.merged(corners), g["weight21_first64"], 1e-5)
     weights = merger(corners)
     assert weights.beta.shape == (64, 12) and weights.alpha.shape == (64, 8) and weights.gamma.shape == (64,)
+
+
+@torch.no_grad()
+def test_cube_weights_are_bounded_around_neutral():
+    """Closed form: the MLP is made to return 0.1 times its last bias for every cube."""
+    merger = WeightMerger(8)
+    for value, beta, gamma in ((0.0, 1.0, 0.5), (10.0, 1.380797, 0.615529), (-1e4, 0.5, 0.25), (1e4, 1.5, 0.75)):
+        for layer in (merger.mlp[0], merger.mlp[2], merger.mlp[4]):
+            torch.nn.init.zeros_(layer.weight)
+            torch.nn.init.constant_(layer.bias, value)
+        weights = merger(torch.zeros(2, 3, 8, 16))
+        torch.testing.assert_close(weights.beta, torch.full((2, 3, 12), beta), **SHALLOW)
+        torch.testing.assert_close(weights.alpha, torch.full((2, 3, 8), beta), **SHALLOW)
+        torch.testing.assert_close(weights.gamma, torch.full((2, 3), gamma), **SHALLOW)
+
+
+def test_gradients_of_a_shared_bank_are_those_of_its_copies_added_up(golden):
+    """The stem and the first keys and values are computed once for a batch; a float64 copy of everything is the truth."""
+    g = golden("two_stream_small")
+    sizes = BackboneSizes(heads=4, latents=12, blocks=3, basic_blocks=2, experts=3, experts_from=1, groups=8)
+    module = g.load(TwoStreamTransformer(sizes, 32), "backbone.", "backbone.")
+    bank, views = g["input"][:1].squeeze(1).requires_grad_(), g["cross"]
+    (shared,) = torch.autograd.grad(module(bank, views).square().sum(), bank)
+    copies = bank.detach().double().repeat(2, 1, 1).requires_grad_()
+    (apart,) = torch.autograd.grad(module.double()(copies, views.double()).square().sum(), copies)
+    assert_relative(shared.double(), apart.sum(0, keepdim=True), 1e-4)  # float32 backward through three blocks

@@ -67,9 +67,12 @@ class Manifest:
 
 def sha256(path: str | os.PathLike) -> str:
     """Hash of a file's bytes in hexadecimal."""
-    file_size(path)
+    _size(path)
+    digest = hashlib.sha256()
     with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+        while block := file.read(1 << 20):
+            digest.update(block)
+    return digest.hexdigest()
 
 
 def read_manifest(path: str | os.PathLike) -> Manifest:
