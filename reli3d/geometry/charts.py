@@ -24,6 +24,12 @@ COS_TILT = 0.3  # a chart is projected along its mean normal if no face is seen 
 SMOOTHING = 2  # rounds in which the normal takes up those of the neighbours
 MAJORITY = 4  # rounds of the majority vote along label borders
 MERGING = 4  # rounds in which small charts join their neighbours
+CUTTING = 4  # rounds in which charts that fill their box badly are cut in two
+CUT_WASTE = 0.004  # of the atlas: empty share of its box that makes a chart worth a cut
+CUT_FILL = 0.45  # of its box: a chart that covers more is left whole
+CUT_GAIN = 0.75  # boxes of the two pieces over the box of the chart, at most ...
+CUT_HOLLOW, CUT_HOLLOW_GAIN = 0.25, 1.02  # ... but a ring gains by the second cut only: no gain asked below this fill
+CUT_ANGLES = 8  # directions in [0, 180) degrees of the cut, and of the boxes that judge it
 ANGLES = 24  # directions in [0, 90) degrees tried for the smallest bounding box of a chart: within 2 degrees of it
 GROW_MAX = 2.0  # a chart seen obliquely is enlarged to its area on the surface, up to this factor
 SLACK = 2.0e-3  # texels: overlap below this width is rounding
@@ -115,20 +121,20 @@ def axis_labels(normal: torch.Tensor, neighbours: np.ndarray) -> np.ndarray:
 def merge_small(label: np.ndarray, normal: np.ndarray, neighbours: np.ndarray, least: float) -> np.ndarray:
     """Labels in which charts with less area than ``least`` take the label of a neighbour that all their faces can bear.
 
-    Of several such labels the one with the most common edges; several rounds, from neighbours that are not small.
+    Of several such labels the one with the most common edges; several rounds, each from larger neighbours.
     """
     area = np.sqrt(np.einsum("fk,fk->f", normal, normal)) * 0.5
     for _ in range(MERGING):
         chart, count = components(neighbours, label)
-        small = np.bincount(chart, area, count) < least
-        faces = np.flatnonzero(small[chart])
+        total = np.bincount(chart, area, count)
+        faces = np.flatnonzero((total < least)[chart])
         if not len(faces):
             break
         cosine = normal[faces] * (0.5 / np.maximum(area[faces], 1e-30))[:, None]
         worst = np.full((count, 6), 1.0)
         np.minimum.at(worst, chart[faces], np.concatenate([cosine, -cosine], 1))
         near = neighbours[faces]
-        border = (near >= 0) & (label[near] != label[faces, None]) & ~small[chart[near]]
+        border = (near >= 0) & (label[near] != label[faces, None]) & (total[chart[near]] > total[chart[faces]][:, None])
         votes = np.bincount(np.repeat(chart[faces], 3)[border.ravel()] * 6 + label[near][border], minlength=count * 6)
         votes = np.where(worst >= COS_MERGE, votes.reshape(count, 6), 0)
         taken = votes.max(1) > 0
@@ -181,6 +187,58 @@ def _upright(right: np.ndarray, up: np.ndarray, points: np.ndarray, chart: np.nd
     low = np.stack([np.minimum.reduceat(x, start), np.minimum.reduceat(y, start)], 1)
     cos, sin = cos[:, None], sin[:, None]
     return right * cos - up * sin, right * sin + up * cos, low
+
+
+def _cut_bulky(points: np.ndarray, chart: np.ndarray, right: np.ndarray, up: np.ndarray, area: np.ndarray, waste: float,
+               neighbours: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:  # fmt: skip
+    """Charts with rings, bows and crosses cut in two where that saves room: ``(chart, parent of each chart)``, or None.
+
+    points: ``(F, 3)`` centres of the faces.  area: of each chart.  waste: empty area [texels] that is worth a cut.
+    """
+    outer = outer_faces(chart, neighbours)
+    order, start = group(chart[outer])
+    outer = outer[order]
+    x, y = (np.einsum("pk,pk->p", points[outer], v[chart[outer]]) for v in (right, up))
+    angles = np.arange(CUT_ANGLES) * (np.pi / CUT_ANGLES)
+    along = [x * np.cos(a) + y * np.sin(a) for a in angles]
+
+    def boxes(begin: np.ndarray, values: list[np.ndarray]) -> np.ndarray:
+        extent = np.stack([np.maximum.reduceat(v, begin) - np.minimum.reduceat(v, begin) for v in values])
+        return (extent * np.roll(extent, CUT_ANGLES // 2, 0)).min(0)
+
+    box = boxes(start, along)
+    bulky = (box - area > waste) & (area < CUT_FILL * box)
+    if not bulky.any():
+        return None
+    keep = bulky[chart[outer]]
+    outer, along = outer[keep], [v[keep] for v in along]
+    owner = (np.cumsum(bulky) - 1)[chart[outer]]
+    count = int(bulky.sum())
+    least = np.where(area < CUT_HOLLOW * box, CUT_HOLLOW_GAIN, CUT_GAIN) * box
+    best, best_angle, best_at = least[bulky], np.full(count, -1), np.zeros(count)
+    start = np.searchsorted(owner, np.arange(count))
+    for k, v in enumerate(along):
+        middle = 0.5 * (np.maximum.reduceat(v, start) + np.minimum.reduceat(v, start))
+        mean = np.bincount(owner, v, count) / np.bincount(owner, minlength=count)
+        for at in (middle, mean):
+            side = 2 * owner + (v > at[owner])
+            rows, begin = group(side)
+            total = np.bincount(side[rows[begin]] // 2, boxes(begin, [w[rows] for w in along]), count)
+            better = total < best * (1 - 1e-6)
+            best, best_angle, best_at = (np.where(better, new, old) for new, old in
+                                         ((total, best), (k, best_angle), (at, best_at)))  # fmt: skip
+    cut = np.flatnonzero(bulky)[best_angle >= 0]
+    if not len(cut):
+        return None
+    direction, level = np.zeros((len(area), 3)), np.full(len(area), np.inf)
+    turn = angles[best_angle[best_angle >= 0]][:, None]
+    direction[cut] = right[cut] * np.cos(turn) + up[cut] * np.sin(turn)
+    level[cut] = best_at[best_angle >= 0]
+    upper = np.einsum("fk,fk->f", points, direction[chart]) > level[chart]
+    pieces, number = components(neighbours, 2 * chart + upper)
+    parent = np.zeros(number, np.int64)
+    parent[pieces] = chart
+    return pieces, parent
 
 
 def _overlaps(charts: Charts, boxes: np.ndarray, query: np.ndarray):
@@ -268,6 +326,14 @@ def make_charts(points: np.ndarray, faces: np.ndarray, *, texels: float, least_t
     label = merge_small(axis_labels(normal, neighbours), normal.numpy(), neighbours, least_texels)
     chart, count = components(neighbours, label)
     right, up = _frames(normal, label, chart, count)
+    centres = local[faces].mean(1).astype(np.float64)
+    size = 0.5 * normal.double().norm(dim=1).numpy()
+    for _ in range(CUTTING):
+        cut = _cut_bulky(centres, chart, right, up, np.bincount(chart, size, count), CUT_WASTE * texels, neighbours)
+        if cut is None:
+            break
+        chart, parent = cut
+        right, up, count = right[parent], up[parent], len(parent)
     outer = outer_faces(chart, neighbours)
     right, up, low = _upright(right, up, local[faces[outer]].reshape(-1, 3).astype(np.float64), np.repeat(chart[outer], 3))
     corners, flat = torch.empty(len(faces), 3, 2), torch.empty(len(faces), dtype=torch.uint8)

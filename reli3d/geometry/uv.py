@@ -26,6 +26,7 @@ from reli3d.kernels import uv as kernels
 FILL = 0.62  # share of the atlas that charts are expected to cover; sets the unit of the chart step only
 ROUNDS = 10  # packings tried in the search for the scale; it stops earlier within 1 %
 CELLS = 512  # resolution of the packing: cells along the atlas
+GUARD_MOST = 3.0  # boxes with guard band over boxes without: above, the charts are too many and the band is halved
 SLIVER_PITCH, SLIVER_SIDE = 3.0, 2.0  # texels: a face without area gets a right triangle of this side
 SLIVER_SHARE = 0.1  # of the atlas at most goes to faces without area
 XATLAS = """
@@ -160,7 +161,7 @@ def _place(charts: parts.Charts, faces: np.ndarray, size: int, guard: float, res
     cells = int(size / cell)
     sequence = torch.from_numpy(np.lexsort((np.arange(count), -extent[:, 0], -extent[:, 1])).astype(np.int32))
     inputs = (torch.from_numpy(edge_start), wp.int32), (torch.from_numpy(edges), wp.vec2)
-    place, top_cell = torch.empty(count, 2, dtype=torch.int32), torch.empty(1, dtype=torch.int32)
+    place, top_cell = torch.empty(count, 4, dtype=torch.int32), torch.empty(1, dtype=torch.int32)
     horizon = torch.empty(cells, dtype=torch.int32)
     strip = int(np.ceil((reserved + 0.5 * guard) / cell)) if reserved else 0
 
@@ -195,13 +196,14 @@ def _place(charts: parts.Charts, faces: np.ndarray, size: int, guard: float, res
             scale = scale * ratio
             if not low * 1.002 < scale < high * 0.998:
                 scale = 0.5 * (low + high) if low else 0.7 * high
-        area = float((np.maximum(extent, 0) * best + guard).prod(1).sum())
-        if best and (best >= 0.5 or area < 4.0 * float((extent * best).prod(1).sum())):
-            break
-        if guard < 0.1 and best:
+        if best and ((extent * best + guard).prod(1).sum() < GUARD_MOST * (extent * best).prod(1).sum() or guard < 0.1):
             break
         guard *= 0.5  # too many charts: the guard band would take most of the atlas
-    return corners * best + 0.5 * guard + (best_place * cell)[chart][:, None]
+    inside = corners * best + 0.5 * guard
+    width = np.ceil((extent[:, 0] * best + guard) / cell)
+    whole = np.stack([width, best_place[:, 3]], 1) * cell
+    inside = np.where((best_place[:, 2] == 1)[chart][:, None, None], whole[chart][:, None] - inside, inside)
+    return inside + (best_place[:, :2] * cell)[chart][:, None]
 
 
 def atlas_report(mesh: Mesh, *, texture_size: int = 1024) -> AtlasReport:

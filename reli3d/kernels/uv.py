@@ -338,8 +338,9 @@ def pack_serial_kernel(
 ):  # fmt: skip
     """Drop charts one after the other onto the horizon, each where it comes to rest lowest; leftmost among equals.
 
-    Levy et al. 2002 (Least squares conformal maps), section 4.2, with the resting height instead of the lost area.
-    ``height`` is the final highest cell, 2^30 if a chart is wider than the horizon.
+    Levy et al. 2002 (Least squares conformal maps), section 4.2, with the resting height instead of the lost area, and
+    each chart also turned by 180 degrees.  ``place``: x, y, 1 if turned, height of the chart.  ``height``: highest cell,
+    2^30 if a chart is wider than the horizon.
     """
     size = horizon.shape[0]
     for x in range(size):
@@ -352,8 +353,12 @@ def pack_serial_kernel(
         if width > size:
             height[0] = 1 << 30
             return
+        tall = int(0)
+        for c in range(width):
+            tall = wp.max(tall, top[base + c])
         best = int(1 << 30)
         best_x = int(0)
+        turned = int(0)
         for x in range(size - width + 1):
             y = int(0)
             c = int(0)
@@ -365,10 +370,26 @@ def pack_serial_kernel(
             if y < best:
                 best = y
                 best_x = x
+                turned = 0
+            y = int(0)
+            c = int(0)
+            while c < width:
+                y = wp.max(y, horizon[x + c] - (tall - top[base + width - 1 - c]))
+                c += 1
+                if y >= best:
+                    c = width
+            if y < best:
+                best = y
+                best_x = x
+                turned = 1
         place[i, 0] = best_x
         place[i, 1] = best
+        place[i, 2] = turned
+        place[i, 3] = tall
         for c in range(width):
-            t = best + top[base + c]
-            horizon[best_x + c] = wp.max(horizon[best_x + c], t)
-            highest = wp.max(highest, t)
+            t = top[base + c]
+            if turned == 1:
+                t = tall - bottom[base + width - 1 - c]
+            horizon[best_x + c] = wp.max(horizon[best_x + c], best + t)
+            highest = wp.max(highest, best + t)
     height[0] = highest
