@@ -1,4 +1,4 @@
-"""``reli3d-data``: make training samples of procedural objects."""
+"""``reli3d-data``: make training samples of procedural objects, or of textured meshes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ from pathlib import Path
 
 
 def parser() -> argparse.ArgumentParser:
-    p = argparse.ArgumentParser(prog="reli3d-data", description="Make training samples of procedural objects.")
+    p = argparse.ArgumentParser(
+        prog="reli3d-data", description="Make training samples of procedural objects, or of textured meshes."
+    )
     p.add_argument("output", type=Path, help="folder for NNNNNNNNNN.safetensors; those that exist are kept")
     p.add_argument("--maps", type=Path, required=True, help=".npz of environment maps: env (n, H, 2H, 3) linear, names")
     p.add_argument("--first", type=int, default=0, help="first seed")
@@ -19,6 +21,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--views", type=int, default=6)
     p.add_argument("--size", type=int, default=192, help="pixels")
     p.add_argument("--held-back", action="store_true", help="validation objects under maps that no training sees")
+    p.add_argument("--meshes", type=Path, nargs="+", help="GLB files to draw from instead of procedural objects")
     p.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     return p
 
@@ -37,17 +40,19 @@ def _start(maps: Path, held: bool) -> None:
     _LIGHTS = [m for m, h in zip(lights, held_back(names), strict=True) if h == held]
 
 
-def _make(seed: int, target: Path, size: int, views: int) -> str | None:
+def _make(seed: int, target: Path, size: int, views: int, mesh: Path | None) -> str | None:
     """Write one sample; the reason instead where the object could not be made."""
     import numpy as np
     from safetensors.torch import save_file
 
     from reli3d.data.procedural import make_object
-    from reli3d.data.synthesis import synthesize
+    from reli3d.data.scanned import ScannedSurface
+    from reli3d.data.synthesis import ObjectSurface, synthesize
 
     rng = np.random.default_rng((seed, 1))
     try:
-        sample = synthesize(make_object(seed), _LIGHTS[int(rng.integers(len(_LIGHTS)))], rng, size=size, views=views)
+        surface = ScannedSurface(mesh, rng) if mesh else ObjectSurface(make_object(seed))
+        sample = synthesize(surface, _LIGHTS[int(rng.integers(len(_LIGHTS)))], rng, size=size, views=views)
     except ValueError as error:
         return f"seed {seed}: {error}"
     temporary = target.with_suffix(f".tmp{os.getpid()}")
@@ -64,12 +69,13 @@ def main(argv: list[str] | None = None) -> int:
 
     first = VALIDATION_SEEDS.start if args.held_back else args.first
     args.output.mkdir(parents=True, exist_ok=True)
+    mesh_of = lambda seed: args.meshes[seed % len(args.meshes)] if args.meshes else None  # noqa: E731
     jobs = [(s, args.output / f"{s:010d}.safetensors") for s in range(first, first + args.count)]
     jobs = [j for j in jobs if not j[1].exists()]
     context = get_context("spawn")
     failed = 0
     with ProcessPoolExecutor(args.workers, context, _start, (args.maps, args.held_back)) as pool:
-        futures = [pool.submit(_make, seed, target, args.size, args.views) for seed, target in jobs]
+        futures = [pool.submit(_make, seed, target, args.size, args.views, mesh_of(seed)) for seed, target in jobs]
         for future in tqdm(as_completed(futures), total=len(futures), file=sys.stderr, unit="object"):
             reason = future.result()
             failed += reason is not None

@@ -20,6 +20,8 @@ pixel_radiance     (V, M, 3) float16      ... the linear radiance that left them
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -50,8 +52,24 @@ def crop_camera(vertices: Tensor, c2w: Tensor, size: int, padding: float) -> Ten
     return torch.stack([focal, focal, centre[0], centre[1]])
 
 
-class _Surface:
-    """The object as the renderer sees it: rays in, geometry and material at the hits out."""
+class Surface(Protocol):
+    """An object as the renderer sees it: rays in, geometry and material at the hits out."""
+
+    vertices: Tensor  # (V, 3)
+    faces: Tensor  # (F, 3) int32
+    scene: RayScene
+
+    def distance(self, points: Tensor) -> Tensor:
+        """Signed distance ``(N,)`` of points ``(N, 3)``, positive outside."""
+
+    def at(self, face: Tensor, bary: Tensor) -> dict[str, Tensor]:
+        """Position, shading, geometric and bumped normal, LINEAR base colour, roughness and metallic of hits
+        ``(N,)``.
+        """
+
+
+class ObjectSurface:
+    """A procedural object."""
 
     def __init__(self, shape: ProceduralObject):
         self.shape = shape
@@ -60,6 +78,9 @@ class _Surface:
         self.corner_normals = torch.as_tensor(shape.normals)
         self.part = torch.as_tensor(shape.part)
         self.scene = RayScene(self.vertices, self.faces)
+
+    def distance(self, points: Tensor) -> Tensor:
+        return signed_distance(self.vertices, self.faces, points)
 
     def at(self, face: Tensor, bary: Tensor) -> dict[str, Tensor]:
         weights = torch.stack([1 - bary.sum(-1), bary[:, 0], bary[:, 1]], -1)[..., None]
@@ -75,7 +96,7 @@ class _Surface:
                 "roughness": as_float(rough), "metallic": as_float(metal)}  # fmt: skip
 
 
-def _render(surface: _Surface, camera: Camera, light: Environment, seed: int):
+def _render(surface: Surface, camera: Camera, light: Environment, seed: int):
     """Linear image ``(S, S, 3)``, coverage, the pixels that hit and what is at the hits."""
     origins, directions = (r.reshape(-1, 3) for r in camera_rays(camera))
     hits = surface.scene.closest(origins, directions)
@@ -90,12 +111,11 @@ def _render(surface: _Surface, camera: Camera, light: Environment, seed: int):
 
 
 def synthesize(
-    shape: ProceduralObject, light: Tensor, rng: np.random.Generator, *, size: int = 192, views: int = 6
+    surface: Surface, light: Tensor, rng: np.random.Generator, *, size: int = 192, views: int = 6
 ) -> dict[str, Tensor]:
-    """One sample of ``shape`` under the lat-long map ``light`` ``(H, 2H, 3)``, turned by a random yaw; see the table
+    """One sample of an object under the lat-long map ``light`` ``(H, 2H, 3)``, turned by a random yaw; see the table
     above.
     """
-    surface = _Surface(shape)
     environment = Environment(torch.roll(light, int(rng.integers(light.shape[1])), 1).contiguous())
     c2w = torch.as_tensor(np.asarray(sample_cameras(rng, views)[0]), dtype=torch.float32)
     intrinsics = torch.stack([crop_camera(surface.vertices, m, size, rng.uniform(0.04, 0.12)) for m in c2w])
@@ -131,7 +151,7 @@ def _coverage(scene: RayScene, c2w: Tensor, intrinsics: Tensor, size: int, grid:
     return torch.nn.functional.avg_pool2d(hit[None, None], grid)[0, 0]
 
 
-def _random_faces(surface: _Surface, count: int, rng: np.random.Generator):
+def _random_faces(surface: Surface, count: int, rng: np.random.Generator):
     corners = surface.vertices[surface.faces.long()].numpy()
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1)
     face = rng.choice(len(area), count, p=area / area.sum())
@@ -140,22 +160,22 @@ def _random_faces(surface: _Surface, count: int, rng: np.random.Generator):
     return torch.as_tensor(face), torch.as_tensor(np.stack([u * (1 - v), u * v], -1), dtype=torch.float32)
 
 
-def _volume(surface: _Surface, rng: np.random.Generator) -> dict[str, Tensor]:
+def _volume(surface: Surface, rng: np.random.Generator) -> dict[str, Tensor]:
     """Half the points beside the surface (normal offsets of 0.01 and 0.05), half uniform in a box slightly larger
     than the object.
     """
     near = surface.at(*_random_faces(surface, VOLUME_POINTS // 2, rng))["position"].numpy()
     near = near + rng.normal(size=near.shape) * rng.choice([0.01, 0.05], (len(near), 1))
-    box = np.abs(surface.shape.vertices).max(0) + 0.12
+    box = surface.vertices.abs().amax(0).numpy() + 0.12
     points = torch.as_tensor(
         np.concatenate([near, rng.uniform(-box, box, (VOLUME_POINTS // 2, 3))]), dtype=torch.float32
     )
     points = points.half().float()  # the distance must belong to the point as it is stored
-    return {"points": points.half(), "distance": signed_distance(surface.vertices, surface.faces, points).half()}
+    return {"points": points.half(), "distance": surface.distance(points).half()}
 
 
 def _surface_points(
-    surface: _Surface, c2w: Tensor, intrinsics: Tensor, size: int, rng: np.random.Generator
+    surface: Surface, c2w: Tensor, intrinsics: Tensor, size: int, rng: np.random.Generator
 ) -> dict[str, Tensor]:
     at = surface.at(*_random_faces(surface, SURFACE_POINTS, rng))
     visible = visible_from(surface.scene, at["position"], at["ng"], c2w, intrinsics, size)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from reli3d.nn.model import Reconstructor
 from reli3d.train.losses import losses
-from reli3d.train.pictures import write_curves
+from reli3d.train.pictures import write_curves, write_validation
 from reli3d.train.samples import batches
 
 
@@ -35,6 +35,10 @@ class TrainConfig:
     average: float = 0.999  # decay of the averaged weights that are saved for use
     checkpoint_seconds: float = 300.0
     seed: int = 0
+    validation: str = ""  # folder of held-back samples; the first ones are drawn at every checkpoint
+
+
+PICTURED = 3  # validation objects in the picture, from one and from four views
 
 
 WEIGHTS = {
@@ -104,9 +108,9 @@ def train(model: Reconstructor, config: TrainConfig) -> None:
             print(f"step {step} {seconds:.0f} s {means}", file=sys.stderr, flush=True)
             sums = {}
         if time.monotonic() - saved > config.checkpoint_seconds:
-            save(folder, model, optimizer, average, step, seconds)
+            save(folder, model, optimizer, average, step, seconds, config)
             saved = time.monotonic()
-    save(folder, model, optimizer, average, step, seconds)
+    save(folder, model, optimizer, average, step, seconds, config)
     log.close()
 
 
@@ -117,8 +121,8 @@ def update_average(average: dict[str, Tensor], model: Reconstructor, decay: floa
                 average[key].lerp_(value, 1 - decay)
 
 
-def save(folder: Path, model, optimizer, average, step: int, seconds: float) -> None:
-    """Replace the checkpoint and the curves whole: a stop in the middle leaves the old ones."""
+def save(folder: Path, model, optimizer, average, step: int, seconds: float, config: TrainConfig) -> None:
+    """Replace the checkpoint and the pictures whole: a stop in the middle leaves the old ones."""
     state = {
         "model": model.state_dict(),
         "optimizer": optimizer.state_dict(),
@@ -129,3 +133,13 @@ def save(folder: Path, model, optimizer, average, step: int, seconds: float) -> 
     torch.save(state, folder / "state.tmp")
     os.replace(folder / "state.tmp", folder / "state.pt")
     write_curves(folder / "log.jsonl", folder / "curves.png")
+    if config.validation:
+        averaged = Reconstructor(model.preset)
+        averaged.load_state_dict(average)
+        write_validation(averaged.eval(), sorted(Path(config.validation).glob("*.safetensors"))[:PICTURED], folder)
+
+
+def averaged_model(state: Path, model: Reconstructor) -> Reconstructor:
+    """``model`` with the averaged weights of a checkpoint, for use."""
+    model.load_state_dict(torch.load(state, weights_only=True)["average"])
+    return model.eval()

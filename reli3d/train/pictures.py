@@ -1,4 +1,4 @@
-"""Curves of a training run, drawn with Pillow."""
+"""Curves and validation pictures of a training run, drawn with Pillow."""
 
 from __future__ import annotations
 
@@ -8,6 +8,13 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image, ImageDraw
+from safetensors.torch import load_file
+
+from reli3d.data.views import Views
+from reli3d.eval.preview import preview
+from reli3d.io.images import write_png
+from reli3d.nn.model import Reconstructor
+from reli3d.pipeline import reconstruct
 
 WIDTH, HEIGHT, MARGIN = 420, 180, 34
 
@@ -40,3 +47,37 @@ def write_curves(log: Path, target: Path) -> None:
     temporary = target.with_suffix(".tmp.png")
     sheet.save(temporary)
     os.replace(temporary, target)
+
+
+def sample_views(sample: dict, count: int) -> Views:
+    """The first ``count`` views of a training sample, as the pipeline takes them."""
+    images = sample["images"][:count].float() / 255
+    return Views(
+        tuple(images[..., :3].contiguous()),
+        tuple(images[..., 3].contiguous()),
+        sample["c2w"][:count],
+        sample["intrinsics"][:count],
+        tuple(f"{i:04d}" for i in range(count)),
+    )
+
+
+def write_validation(model: Reconstructor, samples: list[Path], folder: Path) -> None:
+    """``validation.png``: previews of the samples reconstructed from one and from four views; an empty field leaves
+    a gap.
+    """
+    rows = []
+    for path in samples:
+        sample = load_file(path)
+        row = []
+        for count in (1, 4):
+            views = sample_views(sample, count)
+            try:
+                row.append(preview(reconstruct(views, weights=model, texture_size=256), sample_views(sample, 4)))
+            except ValueError:  # early in training a field may hold no surface
+                continue
+        if row:
+            rows.append(np.concatenate(row, 1))
+    if rows:
+        width = max(r.shape[1] for r in rows)
+        padded = [np.pad(r, ((0, 0), (0, width - r.shape[1]), (0, 0)), constant_values=255) for r in rows]
+        write_png(folder / "validation.png", np.concatenate(padded, 0))

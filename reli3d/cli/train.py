@@ -1,0 +1,62 @@
+"""``reli3d-train``: train the small network on samples that ``reli3d-data`` made."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+LICENCE = "Apache-2.0; trained by the reli3d authors, see docs/weights.md for the data"
+
+
+def parser() -> argparse.ArgumentParser:
+    p = argparse.ArgumentParser(prog="reli3d-train", description="Train the small network; continues where it stopped.")
+    p.add_argument("samples", type=Path, help="folder of samples made by reli3d-data")
+    p.add_argument("output", type=Path, help="folder of the checkpoint, the log, the curves and validation pictures")
+    p.add_argument("--light-prior", type=Path, help="environment decoder made by python -m reli3d.train.light_prior; "
+                   "kept as it is")  # fmt: skip
+    p.add_argument("--steps", type=int, default=20000)
+    p.add_argument("--minutes", type=float, default=float("inf"), help="end of the schedule in minutes of training")
+    p.add_argument("--batch", type=int, default=4, help="objects a step")
+    p.add_argument("--points", type=int, default=2048, help="volume points an object")
+    p.add_argument("--max-views", type=int, default=4)
+    p.add_argument("--rate", type=float, default=6e-4, help="peak learning rate")
+    p.add_argument("--seed", type=int, default=0)
+    p.add_argument("--validation", type=Path, help="folder of held-back samples to draw at every checkpoint")
+    p.add_argument("--export", type=Path, help="write the averaged weights of the checkpoint to this file and stop")
+    return p
+
+
+def main(argv: list[str] | None = None) -> int:
+    args = parser().parse_args(argv)
+    import torch
+    from safetensors.torch import load_file
+
+    from reli3d.nn import weights
+    from reli3d.nn.model import Reconstructor
+    from reli3d.nn.presets import SMALL
+    from reli3d.train.loop import TrainConfig, averaged_model, train
+
+    torch.manual_seed(args.seed)
+    model = Reconstructor(SMALL)
+    try:
+        if args.export:
+            manifest = weights.save(args.export, averaged_model(args.output / "state.pt", model), licence=LICENCE)
+            print(manifest.path)
+            return 0
+        if args.light_prior:
+            prior = load_file(args.light_prior)
+            model.environment.load_state_dict({k: v for k, v in prior.items() if k != "latents"})
+            model.environment.requires_grad_(False)
+        train(model, TrainConfig(samples=str(args.samples), output=str(args.output), steps=args.steps,
+                                 minutes=args.minutes, batch=args.batch, points=args.points, max_views=args.max_views,
+                                 rate=args.rate, seed=args.seed,
+                                 validation=str(args.validation or "")))  # fmt: skip
+    except (ValueError, OSError) as error:
+        print(f"reli3d-train: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

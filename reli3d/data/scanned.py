@@ -1,0 +1,86 @@
+"""Textured meshes of the real world as training objects, beside the procedural ones."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from reli3d.data.distance import signed_distance
+from reli3d.geometry.mesh import Mesh
+from reli3d.geometry.rays import RayScene
+from reli3d.io.glb import read_glb
+from reli3d.render.gbuffer import surface_points
+
+ESCAPES = 48  # directions in which a point may see the sky: enough for an opening of a tenth of the sphere
+STRETCH = 0.18  # standard deviation of the logarithm of the scale along each axis
+GAIN = 0.2  # the same of the base colour's factor
+
+
+def outside_distance(vertices: Tensor, faces: Tensor, points: Tensor, scene: RayScene) -> Tensor:
+    """Distance ``(N,)`` to a mesh with holes and inner walls: positive where a point sees the sky in some direction.
+
+    For a scan "inside" is what no light reaches; the parity or winding of its faces does not say it.
+    """
+    z = 1 - (2 * torch.arange(ESCAPES) + 1) / ESCAPES
+    phi = torch.arange(ESCAPES) * (np.pi * (3 - 5**0.5))
+    radius = (1 - z * z).sqrt()
+    sphere = torch.stack([radius * phi.cos(), z, radius * phi.sin()], -1).float()
+    hidden = torch.ones(len(points), dtype=torch.bool)
+    for direction in sphere:
+        index = hidden.nonzero()[:, 0]
+        hidden[index] = scene.occluded(points[index], direction.expand(len(index), 3).contiguous())
+    distance = signed_distance(vertices, faces, points).abs()
+    return torch.where(hidden, -distance, distance)
+
+
+class ScannedSurface:
+    """One GLB, centred, longest side 1, stretched and tinted at random; a :class:`~reli3d.data.synthesis.Surface`."""
+
+    def __init__(self, path: Path, rng: np.random.Generator):
+        self.assets = read_glb(path)
+        points = torch.cat([a.mesh.vertices for a in self.assets])
+        stretch = torch.as_tensor(np.exp(rng.normal(0, STRETCH, 3)), dtype=torch.float32)
+        low, high = (points * stretch).amin(0), (points * stretch).amax(0)
+        size = float((high - low).max())
+        self.gain = torch.as_tensor(np.exp(rng.normal(0, GAIN, 3) + rng.normal(0, GAIN)), dtype=torch.float32)
+        self.assets = [replace(a, mesh=_moved(a.mesh, (low + high) / 2, stretch, size)) for a in self.assets]
+        counts = np.cumsum([0] + [len(a.mesh.vertices) for a in self.assets])
+        self.vertices = torch.cat([a.mesh.vertices for a in self.assets])
+        self.faces = torch.cat([a.mesh.faces + int(n) for a, n in zip(self.assets, counts)])
+        self.starts = torch.as_tensor(np.cumsum([0] + [len(a.mesh.faces) for a in self.assets]))
+        self.scene = RayScene(self.vertices, self.faces)
+
+    def distance(self, points: Tensor) -> Tensor:
+        return outside_distance(self.vertices, self.faces, points, self.scene)
+
+    def at(self, face: Tensor, bary: Tensor) -> dict[str, Tensor]:
+        names = ("position", "normal", "ng", "bump", "base_color", "roughness", "metallic")
+        out = {n: torch.empty(len(face), *((3,) if k < 5 else ())) for k, n in enumerate(names)}
+        part = torch.searchsorted(self.starts, face, right=True) - 1
+        for k, asset in enumerate(self.assets):
+            index = (part == k).nonzero()[:, 0]
+            if len(index) == 0:
+                continue
+            local = (face[index] - self.starts[k]).to(torch.int32)
+            got = surface_points(replace(asset.mesh), asset.textures, local, bary[index])
+            smooth = surface_points(asset.mesh, None, local, bary[index]).normal
+            color = (got.base_color * self.gain).clamp(0.0, 1.0)
+            values = (got.position, smooth, got.ng, got.normal, color, got.roughness, got.metallic)
+            for name, value in zip(names, values, strict=True):
+                out[name][index] = value
+        return out
+
+
+def _moved(mesh: Mesh, centre: Tensor, stretch: Tensor, size: float) -> Mesh:
+    normals = torch.nn.functional.normalize(mesh.normals / stretch, dim=-1)
+    tangents = mesh.tangents
+    if tangents is not None:
+        along = tangents[:, :3] * stretch
+        along = torch.nn.functional.normalize(along - (along * normals).sum(-1, keepdim=True) * normals, dim=-1)
+        tangents = torch.cat([along, tangents[:, 3:]], -1)
+    vertices = (mesh.vertices * stretch - centre) / size
+    return replace(mesh, vertices=vertices.contiguous(), normals=normals.contiguous(), tangents=tangents)

@@ -1,0 +1,134 @@
+"""How well the network reconstructs procedural objects that no training has seen, under light that no training has
+seen.
+
+For every validation sample: silhouette IoU and base colour PSNR from cameras that were not input, beside what the
+best single colour scores there, and the error of the environment beside that of the mean environment of the training
+maps.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import torch
+from safetensors.torch import load_file
+from torch import Tensor
+
+from reli3d.data.procedural import make_object
+from reli3d.data.synthesis import ObjectSurface
+from reli3d.geometry.rays import RayScene
+from reli3d.nn.model import Reconstructor
+from reli3d.nn.weights import load_model
+from reli3d.pipeline import reconstruct
+from reli3d.render.camera import Camera, camera_rays
+from reli3d.render.color import linear_to_srgb
+from reli3d.render.environment import Environment
+from reli3d.render.gbuffer import surface_points
+from reli3d.train.light_prior import held_back, load_maps, scale_free
+from reli3d.train.pictures import sample_views
+
+INPUTS, UNSEEN = 4, 8  # the first views are input, the next are looked at
+BLACK = 0.01  # added to radiance before the logarithm
+
+
+def truth_colors(seed: int, cameras: list[Camera]) -> list[tuple[Tensor, Tensor]]:
+    """Coverage ``(H, W)`` bool and base colour ``(H, W, 3)``, sRGB-encoded, of the object of ``seed`` in each
+    camera.
+    """
+    surface = ObjectSurface(make_object(seed))
+    out = []
+    for camera in cameras:
+        origins, directions = (r.reshape(-1, 3) for r in camera_rays(camera))
+        hits = surface.scene.closest(origins, directions)
+        seen = (hits.face >= 0).nonzero()[:, 0]
+        color = torch.zeros(len(origins), 3)
+        color[seen] = linear_to_srgb(surface.at(hits.face[seen].long(), hits.bary[seen])["base_color"].clamp(0, 1))
+        shape = (camera.height, camera.width)
+        out.append(((hits.face >= 0).reshape(shape), color.reshape(*shape, 3)))
+    return out
+
+
+def asset_colors(asset, scene: RayScene, camera: Camera) -> tuple[Tensor, Tensor]:
+    """The same of a reconstruction."""
+    origins, directions = (r.reshape(-1, 3) for r in camera_rays(camera))
+    hits = scene.closest(origins, directions)
+    seen = (hits.face >= 0).nonzero()[:, 0]
+    color = torch.zeros(len(origins), 3)
+    color[seen] = linear_to_srgb(
+        surface_points(asset.mesh, asset.textures, hits.face[seen], hits.bary[seen]).base_color
+    )
+    shape = (camera.height, camera.width)
+    return (hits.face >= 0).reshape(shape), color.reshape(*shape, 3)
+
+
+def psnr(error: Tensor) -> float:
+    """Of squared errors of values in [0, 1]."""
+    return float(-10 * torch.log10(error.mean().clamp(min=1e-10)))
+
+
+def light_error(predicted: Tensor, target: Tensor) -> float:
+    """Mean absolute difference of log radiance over the sphere of two maps ``(H, 2H, 3)``, up to one exposure."""
+    weight = torch.sin((torch.arange(len(target)) + 0.5) * torch.pi / len(target))[:, None, None].expand_as(target)
+    difference = torch.log(predicted + BLACK) - torch.log(target + BLACK)
+    difference = difference - (difference * weight).sum() / weight.sum()
+    return float((difference.abs() * weight).sum() / weight.sum())
+
+
+def evaluate(
+    model: Reconstructor, sample: dict[str, Tensor], seed: int, count: int, mean_light: Tensor
+) -> dict[str, float]:
+    """Figures of one object reconstructed from ``count`` views; both colours are compared where truth or result is
+    seen.
+    """
+    asset = reconstruct(sample_views(sample, count), weights=model, texture_size=512)
+    scene, size = RayScene(asset.mesh.vertices, asset.mesh.faces), sample["images"].shape[1]
+    chosen = range(INPUTS, INPUTS + UNSEEN)
+    cameras = [Camera(sample["c2w"][i], sample["intrinsics"][i], size, size) for i in chosen]
+    ious, got_all, want_all = [], [], []
+    for camera, (mask, want) in zip(cameras, truth_colors(seed, cameras), strict=True):
+        got_mask, got = asset_colors(asset, scene, camera)
+        ious.append(float((mask & got_mask).sum() / (mask | got_mask).sum().clamp(min=1)))
+        both = mask & got_mask
+        got_all.append(got[both]), want_all.append(want[both])
+    got, want = torch.cat(got_all), torch.cat(want_all)
+    target = sample["environment"].float()
+    predicted = asset.environment.resized(len(target)).radiance
+    exposure = target.mean() / mean_light.mean()
+    return {"iou": float(np.mean(ious)), "base_color_psnr": psnr((got - want).square()),
+            "single_color_psnr": psnr((want.mean(0) - want).square()), "light_error": light_error(predicted, target),
+            "mean_light_error": light_error(mean_light * exposure, target)}  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("samples", type=Path, help="folder of reli3d-data --held-back --views 12")
+    parser.add_argument("--maps", type=Path, required=True, help=".npz of environment maps that the training drew from")
+    parser.add_argument("--weights", default="small")
+    parser.add_argument("--json", type=Path)
+    args = parser.parse_args()
+    maps, names = load_maps(args.maps)
+    kept = scale_free(maps[[not h for h in held_back(names)]])
+    mean_light = (
+        Environment(kept.log().mean((0, 2), keepdim=True)[0].exp().expand(-1, 128, -1).contiguous())
+        .resized(32)
+        .radiance
+    )
+    model, table = load_model(args.weights), {}
+    for count in (1, 2, INPUTS):
+        rows = []
+        for path in sorted(args.samples.glob("*.safetensors")):
+            rows.append(evaluate(model, load_file(path), int(path.stem), count, mean_light))
+            print(f"{count} views, {path.stem}: {rows[-1]}", file=sys.stderr)
+        table[count] = {k: round(float(np.mean([r[k] for r in rows])), 4) for k in rows[0]} | {"objects": len(rows)}
+    text = json.dumps(table, indent=1)
+    print(text)
+    if args.json:
+        args.json.write_text(text + "\n")
+
+
+if __name__ == "__main__":
+    main()
