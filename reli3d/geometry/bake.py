@@ -1,7 +1,7 @@
 """Baking: texels of an atlas to points of the surface, a function evaluated there, every texel filled.
 
 Maps are ``(T, T, C)``; row 0 is v = 0 (glTF: v down); texel (row, column) is sampled at its centre ((column + 0.5) / T,
-(row + 0.5) / T).  Nothing here is differentiable but ``fn`` itself and :func:`interpolate`'s torch twin in the tests.
+(row + 0.5) / T).  Nothing here passes a gradient on.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 import warp as wp
 from torch import Tensor
@@ -63,19 +64,29 @@ def _bins(lower: Tensor, upper: Tensor, size: int, tile: int) -> tuple[Tensor, T
     local = torch.arange(len(item), device=item.device) - (torch.cumsum(count, 0) - count)[item]
     wide = extent[:, 0][item]
     tile_of = (first[:, 1][item] + local // wide) * tiles + first[:, 0][item] + local % wide
-    order = torch.sort(tile_of * len(lower) + item).values  # keys are unique: any sort gives the same order
+    order = _sorted(tile_of * len(lower) + item)
     start = torch.searchsorted(order, torch.arange(tiles * tiles + 1, device=item.device) * max(len(lower), 1))
     return start.to(torch.int32), (order % max(len(lower), 1)).to(torch.int32)
 
 
+def _sorted(keys: Tensor) -> Tensor:
+    """Ascending int64 values; numpy's vector sort is 5 times faster than torch's, which carries indices."""
+    return torch.sort(keys).values if keys.is_cuda else torch.from_numpy(np.sort(keys.numpy()))
+
+
 def _border_segments(faces: Tensor) -> Tensor:
     """``3 * face + corner``, ascending, of the edges that only one face has."""
-    ends = torch.stack([faces, faces.roll(-1, 1)], -1).reshape(-1, 2).long()
-    key = ends.amin(1) * (int(faces.max()) + 1) + ends.amax(1)
-    ordered, order = torch.sort(key)
-    new = torch.ones(len(key) + 1, dtype=torch.bool, device=key.device)
+    head, tail = faces.long().reshape(-1), faces[:, [1, 2, 0]].long().reshape(-1)
+    vertices = int(head.max()) + 1
+    key, n = torch.minimum(head, tail) * vertices + torch.maximum(head, tail), len(head)
+    if vertices * vertices * n < 1 << 62:
+        packed = _sorted(key * n + torch.arange(n, device=key.device))
+        ordered, order = packed // n, packed % n
+    else:
+        ordered, order = torch.sort(key)
+    new = torch.ones(n + 1, dtype=torch.bool, device=key.device)
     new[1:-1] = ordered[1:] != ordered[:-1]
-    return torch.sort(order[new[1:] & new[:-1]]).values.to(torch.int32)
+    return _sorted(order[new[1:] & new[:-1]]).to(torch.int32)
 
 
 def rasterize_texels(mesh: Mesh, size: int) -> Texels:
