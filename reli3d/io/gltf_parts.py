@@ -104,7 +104,9 @@ def _unit(v: np.ndarray) -> np.ndarray:
 
 
 def _tensor(values: np.ndarray) -> Tensor:
-    return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
+    with np.errstate(over="ignore"):  # an infinity is reported by the caller
+        values = values.astype(np.float32)
+    return torch.from_numpy(np.ascontiguousarray(values))
 
 
 class _Materials:

@@ -1,0 +1,310 @@
+"""GLB files judged from outside: the Khronos validator, trimesh and pygltflib, and hostile input.
+
+The validator is npm's ``gltf-validator``: ``npm install gltf-validator`` in any folder outside the checkout, then set
+RELI3D_GLTF_VALIDATOR to its ``node_modules``.
+"""
+
+import io
+import json
+import os
+import shutil
+import struct
+import subprocess
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from PIL import Image
+
+from reli3d.geometry.bake import bake
+from reli3d.geometry.mesh import Mesh
+from reli3d.geometry.tangents import encode_normals, with_tangents
+from reli3d.geometry.uv import unwrap
+from reli3d.io.glb import glb_bytes, read_glb, write_glb
+from reli3d.render.asset import Asset, TextureSet
+
+SIZE = 128
+STEP = 1 / 255
+JUDGE = """
+const fs = require('fs'), path = require('path');
+const validator = require(path.join(process.argv[1], 'gltf-validator'));
+validator.validateBytes(new Uint8Array(fs.readFileSync(process.argv[2])), {format: 'glb', maxIssues: 50})
+  .then(report => console.log(JSON.stringify(report.issues)));
+"""
+
+
+def color(p):
+    return 0.5 + 0.4 * torch.sin(3.0 * p)
+
+
+@pytest.fixture(scope="module")
+def asset() -> Asset:
+    ball = trimesh.creation.icosphere(3)
+    mesh = Mesh(torch.tensor(ball.vertices, dtype=torch.float32), torch.tensor(ball.faces, dtype=torch.int32))
+    mesh = with_tangents(unwrap(mesh, texture_size=SIZE))
+
+    def fn(p, n, t):
+        bumped = torch.nn.functional.normalize(n + 0.2 * torch.sin(6 * p), dim=1)
+        orm = torch.tensor([1.0, 0.25, 0.75]).expand(len(p), 3)
+        return {"base_color": color(p), "orm": orm, "normal": encode_normals(bumped, n, t)}
+
+    return Asset(mesh, TextureSet(**bake(mesh, SIZE, fn, tangents=True)))
+
+
+def parsed(data: bytes) -> tuple[dict, bytes]:
+    size = struct.unpack_from("<I", data, 12)[0]
+    return json.loads(data[20 : 20 + size]), data[28 + size :]
+
+
+def packed(document: dict, binary: bytes) -> bytes:
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    return b"".join([struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(binary)), struct.pack("<I4s", len(text), b"JSON"),
+                     text, struct.pack("<I4s", len(binary), b"BIN\0"), binary])  # fmt: skip
+
+
+def judged(path) -> dict:
+    modules = os.environ.get("RELI3D_GLTF_VALIDATOR", "")
+    if not shutil.which("node") or not os.path.isdir(os.path.join(modules, "gltf-validator")):
+        pytest.skip("needs node, and RELI3D_GLTF_VALIDATOR pointing to a node_modules with gltf-validator")
+    done = subprocess.run(["node", "-e", JUDGE, modules, str(path)], capture_output=True, text=True, timeout=60, check=True)
+    return json.loads(done.stdout)
+
+
+def test_khronos_validator_finds_nothing(asset, tmp_path):
+    write_glb(tmp_path / "a.glb", asset, extras={"licence": "CC0-1.0", "world_from_model": np.eye(4).tolist()})
+    issues = judged(tmp_path / "a.glb")
+    assert issues["numErrors"] == issues["numWarnings"] == 0, issues["messages"]
+
+
+def test_khronos_validator_on_a_real_mesh(shared_data, tmp_path):
+    shape = trimesh.load(shared_data / "meshes" / "scifi_crate.glb", force="mesh", process=False)
+    mesh = Mesh(torch.tensor(shape.vertices, dtype=torch.float32), torch.tensor(shape.faces, dtype=torch.int32))
+    mesh = with_tangents(unwrap(mesh, texture_size=64))
+    plain = torch.full((64, 64, 3), 0.5)
+    write_glb(tmp_path / "a.glb", Asset(mesh, TextureSet(plain, plain, plain)))
+    issues = judged(tmp_path / "a.glb")
+    assert issues["numErrors"] == issues["numWarnings"] == 0, issues["messages"]
+
+
+def test_container_and_accessors_follow_the_standard(asset):
+    data = glb_bytes(asset)
+    magic, version, length = struct.unpack_from("<4sII", data)
+    assert (magic, version, length) == (b"glTF", 2, len(data)) and len(data) % 4 == 0
+    document, binary = parsed(data)
+    for view in document["bufferViews"]:
+        assert view["byteOffset"] % 4 == 0 and view["byteOffset"] + view["byteLength"] <= len(binary)
+    attributes = document["meshes"][0]["primitives"][0]["attributes"]
+    assert sorted(attributes) == ["NORMAL", "POSITION", "TANGENT", "TEXCOORD_0"]
+    position = document["accessors"][attributes["POSITION"]]
+    assert position["min"] == asset.mesh.vertices.min(0).values.tolist()
+    assert position["max"] == asset.mesh.vertices.max(0).values.tolist()
+    material = document["materials"][0]
+    assert material["pbrMetallicRoughness"]["metallicFactor"] == material["pbrMetallicRoughness"]["roughnessFactor"] == 1.0
+    assert material["doubleSided"] is False and document["asset"]["generator"].startswith("reli3d ")
+    assert document["samplers"] == [{"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}]
+    assert "extensionsUsed" not in document and "matrix" not in document["nodes"][0]
+
+
+def test_an_open_mesh_is_double_sided(asset):
+    half = Mesh(asset.mesh.vertices, asset.mesh.faces[:100], asset.mesh.normals, asset.mesh.uv, asset.mesh.tangents)
+    assert parsed(glb_bytes(Asset(half, asset.textures)))[0]["materials"][0]["doubleSided"] is True
+    assert parsed(glb_bytes(Asset(half, asset.textures), double_sided=False))[0]["materials"][0]["doubleSided"] is False
+
+
+def test_trimesh_reads_the_same_surface_and_colours(asset, tmp_path):
+    write_glb(tmp_path / "a.glb", asset)
+    shape = trimesh.load(tmp_path / "a.glb", force="mesh", process=False)
+    assert np.array_equal(shape.vertices.astype(np.float32), asset.mesh.vertices.numpy())
+    assert np.array_equal(shape.faces, asset.mesh.faces.numpy())
+    assert np.allclose(shape.visual.uv[:, 1], 1 - asset.mesh.uv[:, 1].numpy(), atol=1e-6)  # trimesh turns v up
+    image = np.asarray(shape.visual.material.baseColorTexture.convert("RGB")) / 255.0
+    rng = np.random.default_rng(1)
+    w = rng.dirichlet((1, 1, 1), 20_000)[:, :, None]
+    face = asset.mesh.faces.numpy()[rng.integers(0, len(asset.mesh.faces), len(w))]
+    uv, p = (asset.mesh.uv.numpy()[face] * w).sum(1), (asset.mesh.vertices.numpy()[face] * w).sum(1)
+    at = uv * SIZE - 0.5
+    low, error = np.floor(at).astype(int), 0.0
+    for dx, dy in ((0, 0), (1, 0), (0, 1), (1, 1)):
+        f = np.abs(1 - np.array([dx, dy]) - (at - low)).prod(1)
+        error = error + f[:, None] * image[np.clip(low[:, 1] + dy, 0, SIZE - 1), np.clip(low[:, 0] + dx, 0, SIZE - 1)]
+    assert np.abs(error - color(torch.from_numpy(p)).numpy()).mean() < STEP
+
+
+@pytest.mark.parametrize("level", [0, 1, 37, 128, 254, 255])
+def test_pygltflib_reads_constants_back_exactly(asset, tmp_path, level):
+    pygltflib = pytest.importorskip("pygltflib")
+    flat = torch.full((8, 8, 3), level * STEP)
+    orm = torch.tensor([1.0, 0.2, 0.6]).expand(8, 8, 3)
+    write_glb(tmp_path / "a.glb", Asset(asset.mesh, TextureSet(flat, orm, flat)))
+    document = pygltflib.GLTF2().load(str(tmp_path / "a.glb"))
+
+    def pixels(texture):
+        view = document.bufferViews[document.images[document.textures[texture.index].source].bufferView]
+        blob = document.binary_blob()[view.byteOffset : view.byteOffset + view.byteLength]
+        return np.asarray(Image.open(io.BytesIO(blob)))
+
+    material = document.materials[0]
+    assert (pixels(material.pbrMetallicRoughness.baseColorTexture) == level).all()
+    assert (pixels(material.pbrMetallicRoughness.metallicRoughnessTexture) == [255, 51, 153]).all()  # G rough, B metal
+    assert (pixels(material.normalTexture) == level).all()
+
+
+def test_own_reader_gives_the_asset_back(asset, tmp_path):
+    write_glb(tmp_path / "a.glb", asset)
+    (back,) = read_glb(tmp_path / "a.glb")
+    for name in ("vertices", "faces", "uv"):
+        assert torch.equal(getattr(back.mesh, name), getattr(asset.mesh, name))
+    for name in ("normals", "tangents"):
+        torch.testing.assert_close(getattr(back.mesh, name), getattr(asset.mesh, name), rtol=0, atol=1e-6)
+    for name in ("base_color", "orm", "normal"):
+        difference = getattr(back.textures, name) - getattr(asset.textures, name)
+        assert float(difference.abs().max()) <= 0.5 * STEP + 1e-4  # 8 bit; the colour passes through linear and back
+
+
+def test_an_unsymmetric_arrow_keeps_its_axes(tmp_path, asset):
+    arrow = Mesh(torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]]),
+                 torch.tensor([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]).int())  # fmt: skip
+    write_glb(tmp_path / "a.glb", Asset(with_tangents(unwrap(arrow, texture_size=64)), asset.textures))
+    shape = trimesh.load(tmp_path / "a.glb", force="mesh")
+    assert np.allclose(shape.bounds, [[0, 0, 0], [1, 2, 3]]) and shape.volume == pytest.approx(1.0, rel=1e-6)
+
+
+def test_node_transforms_reach_positions_normals_and_mirrors(asset, tmp_path):
+    document, binary = parsed(glb_bytes(asset))
+    document["nodes"] = [{"children": [1], "translation": [1, 2, 3]},
+                         {"mesh": 0, "scale": [-2, 1, 1], "rotation": [0, 0, 0.5**0.5, 0.5**0.5]}]  # fmt: skip
+    (tmp_path / "a.glb").write_bytes(packed(document, binary))
+    (part,) = read_glb(tmp_path / "a.glb")
+    p = asset.mesh.vertices
+    want = torch.stack([1 - p[:, 1], 2 - 2 * p[:, 0], 3 + p[:, 2]], 1)  # mirrored, then a quarter turn about z
+    torch.testing.assert_close(part.mesh.vertices, want, rtol=0, atol=1e-5)
+    a, b, c = (part.mesh.vertices[part.mesh.faces[:, k].long()] for k in range(3))
+    outward = torch.linalg.cross(b - a, c - a)
+    centre = (a + b + c) / 3 - torch.tensor([1.0, 2, 3])
+    assert bool(((outward * centre).sum(1) > 0).all())
+    assert bool((part.mesh.tangents[:, 3] == -1).all())
+    face_normal = outward / outward.norm(dim=1, keepdim=True)
+    assert float((part.mesh.normals[part.mesh.faces[:, 0].long()] * face_normal).sum(1).min()) > 0.9
+    assert trimesh.load(tmp_path / "a.glb", force="mesh").bounds == pytest.approx(
+        np.stack([part.mesh.vertices.min(0).values, part.mesh.vertices.max(0).values]), abs=1e-5)  # fmt: skip
+
+
+def test_factors_and_missing_parts(asset, tmp_path):
+    document, binary = parsed(glb_bytes(asset))
+    document["materials"][0] = {"pbrMetallicRoughness": {"baseColorFactor": [0.5, 0.25, 1.0, 1.0], "roughnessFactor": 0.5}}
+    for name in ("NORMAL", "TANGENT", "TEXCOORD_0"):
+        del document["meshes"][0]["primitives"][0]["attributes"][name]
+    (tmp_path / "a.glb").write_bytes(packed(document, binary))
+    (part,) = read_glb(tmp_path / "a.glb")
+    # sRGB encoding of 0.5 and 0.25 (IEC 61966-2-1)
+    torch.testing.assert_close(part.textures.base_color[0, 0], torch.tensor([0.735357, 0.537099, 1.0]), rtol=0, atol=1e-5)
+    torch.testing.assert_close(part.textures.orm[0, 0], torch.tensor([1.0, 0.5, 1.0]))
+    a, b, c = (part.mesh.vertices[part.mesh.faces[:, k].long()] for k in range(3))
+    flat = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=1)
+    torch.testing.assert_close(part.mesh.normals[part.mesh.faces[:, 0].long()], flat, rtol=0, atol=1e-5)
+
+
+def test_real_files_are_read_as_trimesh_reads_them(shared_data):
+    for name in ("scifi_crate", "wicker_sphere"):
+        path = shared_data / "meshes" / f"{name}.glb"
+        parts = read_glb(path)
+        shape = trimesh.load(path, force="mesh", process=False)
+        assert sum(len(p.mesh.faces) for p in parts) == len(shape.faces)
+        low = torch.stack([p.mesh.vertices.min(0).values for p in parts]).min(0).values
+        assert np.allclose(low, shape.bounds[0], atol=1e-5)
+
+
+def change(path, value):
+    def apply(document):
+        node = document
+        for key in path[:-1]:
+            node = node[key]
+        if value is None:
+            del node[path[-1]]
+        else:
+            node[path[-1]] = value
+
+    return apply
+
+
+HOSTILE = {
+    "count": (change(["accessors", 0, "count"], 10**9), "accessors[0].count: expected at most"),
+    "range": (change(["accessors", 0, "count"], 10**6), "accessors[0].count: expected a range within"),
+    "negative": (change(["accessors", 0, "byteOffset"], -4), "accessors[0].count: expected a range"),
+    "view": (change(["bufferViews", 0, "byteLength"], 2**40), "bufferViews[0].byteLength: expected a range within"),
+    "type": (change(["accessors", 0, "type"], "VEC2"), "accessors[0].type: expected VEC3"),
+    "component": (change(["accessors", 0, "componentType"], 7), "accessors[0].componentType"),
+    "index": (change(["meshes", 0, "primitives", 0, "indices"], 0), "accessors[0].type: expected SCALAR"),
+    "no mesh": (change(["nodes", 0, "mesh"], 9), "nodes[0].mesh: expected an index into 1 meshes"),
+    "cycle": (change(["nodes", 0, "children"], [0]), "nodes[0]: expected a tree"),
+    "uri": (change(["buffers", 0, "uri"], "../../etc/passwd"), "buffers[0].uri: expected data inside the file"),
+    "url": (change(["images", 0], {"uri": "https://a.b/c.png"}), "images[0].uri: expected data inside the file"),
+    "draco": (change(["extensionsRequired"], ["KHR_draco_mesh_compression"]), "extensionsRequired: expected none"),
+    "huge": (change(["nodes", 0, "scale"], [1e300, 1, 1]), "expected values within the range of float32"),
+    "text": (change(["nodes", 0, "scale"], ["1", 1, 1]), "nodes[0].scale: expected float"),
+    "image": (change(["images", 0, "bufferView"], 0), "images[0]: expected a PNG, JPEG or WebP image"),
+    "version": (change(["asset", "version"], "1.0"), "asset.version: expected 2.x"),
+    "nothing": (change(["scenes", 0, "nodes"], []), "expected triangles in its scene"),
+    "sparse": (change(["accessors", 0, "sparse"], {"count": 1}), "accessors[0].sparse: expected a dense accessor"),
+    "points": (change(["meshes", 0, "primitives", 0, "mode"], 0), "expected triangles in its scene"),
+}
+
+
+@pytest.mark.parametrize("case", HOSTILE)
+def test_hostile_files_are_refused_by_name(asset, tmp_path, case):
+    apply, message = HOSTILE[case]
+    document, binary = parsed(glb_bytes(asset))
+    apply(document)
+    (tmp_path / "a.glb").write_bytes(packed(document, binary))
+    with pytest.raises(ValueError) as error:
+        read_glb(tmp_path / "a.glb")
+    assert message in str(error.value) and "\n" not in str(error.value)
+
+
+def test_indices_and_nan_in_the_buffer_are_refused(asset, tmp_path):
+    document, binary = parsed(glb_bytes(asset))
+    for view, value, message in ((4, struct.pack("<I", 10**6), "indices below"), (0, struct.pack("<f", np.nan), "finite values")):
+        at = document["bufferViews"][view]["byteOffset"]
+        (tmp_path / "a.glb").write_bytes(packed(document, binary[:at] + value + binary[at + 4 :]))
+        with pytest.raises(ValueError, match=message):
+            read_glb(tmp_path / "a.glb")
+
+
+def test_random_damage_never_escapes_as_another_error(asset, tmp_path):
+    data = bytearray(glb_bytes(asset))
+    rng = np.random.default_rng(0)
+    size = struct.unpack_from("<I", data, 12)[0]
+    for k in range(150):
+        broken = bytearray(data[: rng.integers(0, len(data))]) if k % 5 == 0 else bytearray(data)
+        for at in rng.integers(0, min(len(broken), 20 + size) or 1, 3):
+            if at < len(broken):
+                broken[at] = rng.integers(0, 256)
+        (tmp_path / "a.glb").write_bytes(broken)
+        try:
+            read_glb(tmp_path / "a.glb", max_bytes=1 << 24, max_vertices=100_000, max_pixels=1 << 20)
+        except ValueError as error:
+            assert str(error)
+
+
+def test_limits_are_kept(asset, tmp_path):
+    write_glb(tmp_path / "a.glb", asset)
+    with pytest.raises(ValueError, match="expected at most 1000 bytes"):
+        read_glb(tmp_path / "a.glb", max_bytes=1000)
+    with pytest.raises(ValueError, match="more pixels"):
+        read_glb(tmp_path / "a.glb", max_pixels=SIZE * SIZE + 1)
+    with pytest.raises(ValueError, match="vertices in all"):
+        read_glb(tmp_path / "a.glb", max_vertices=100)
+
+
+def test_what_an_asset_lacks_is_named(asset, tmp_path):
+    m = asset.mesh
+    with pytest.raises(ValueError, match="asset.mesh.tangents: expected a tensor, got None"):
+        write_glb(tmp_path / "a.glb", Asset(Mesh(m.vertices, m.faces, m.normals, m.uv), asset.textures))
+    with pytest.raises(ValueError, match="asset.mesh.normals: expected unit length"):
+        write_glb(tmp_path / "a.glb", Asset(Mesh(m.vertices, m.faces, m.normals * 2, m.uv, m.tangents), asset.textures))
+    bad = TextureSet(asset.textures.base_color + 1, asset.textures.orm, asset.textures.normal)
+    with pytest.raises(ValueError, match="asset.textures.base_color: expected values in"):
+        write_glb(tmp_path / "a.glb", Asset(m, bad))
+    assert os.listdir(tmp_path) == []  # nothing half-written stays behind
