@@ -9,7 +9,7 @@ import pytest
 from reli3d.data.folder import load_views
 from reli3d.io.files import InputError
 from reli3d.io.hdr import read_environment
-from tests import evil
+from tests import evil, evil_maps
 
 
 def listing(folder: Path) -> list:
@@ -33,7 +33,7 @@ def test_the_untouched_folders_load(tmp_path):
     evil.good(tmp_path / "json")
     evil.colmap(tmp_path / "colmap")
     assert len(load_views(tmp_path / "json")) == len(load_views(tmp_path / "colmap")) == 3
-    (tmp_path / "good.exr").write_bytes(evil.exr_bytes())
+    (tmp_path / "good.exr").write_bytes(evil_maps.exr_bytes())
     assert read_environment(tmp_path / "good.exr").shape == (16, 32, 3)
 
 
@@ -48,7 +48,7 @@ def test_an_evil_folder_gives_one_line(tmp_path, capfd, name, make):
     assert capfd.readouterr() == ("", "")  # the error is all there is to say
 
 
-@pytest.mark.parametrize("name, content", evil.map_cases(), ids=[name for name, _ in evil.map_cases()])
+@pytest.mark.parametrize("name, content", evil_maps.cases(), ids=[name for name, _ in evil_maps.cases()])
 def test_an_evil_map_gives_one_line(tmp_path, capfd, name, content):
     path = tmp_path / "map.hdr"
     path.write_bytes(content)
@@ -66,14 +66,14 @@ torch.set_num_threads(1)
 from reli3d.data.folder import load_views
 from reli3d.io.files import InputError
 from reli3d.io.hdr import read_environment
-from tests import evil
+from tests import evil, evil_maps
 used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
 resource.setrlimit(resource.RLIMIT_AS, (used + (1 << 30),) * 2)
 root, random = Path(sys.argv[1]), random.Random(5)
 evil.good(root / "object", views=1)
 seeds = [(root / "object/transforms.json", load_views, root / "object"),
          (root / "object/rgba/0.png", load_views, root / "object")]
-for name, content in (("a.exr", evil.exr_bytes()), ("b.hdr", Path(sys.argv[2]).read_bytes())):
+for name, content in (("a.exr", evil_maps.exr_bytes()), ("b.hdr", Path(sys.argv[2]).read_bytes())):
     (root / name).write_bytes(content)
     seeds.append((root / name, read_environment, root / name))
 accepted = refused = 0

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import os
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -65,19 +66,23 @@ def load_views(
                              "images.txt), "
                                      "got neither; see the input formats in the documentation")  # fmt: skip
         shots, notes = read_colmap(root, model, count, outside=allow_outside)
-    loaded = [_load(root, shot, masks, notes, allow_outside) for shot in shots]
+    with ThreadPoolExecutor(max_workers=min(4, os.cpu_count() or 1)) as pool:  # decoding releases the GIL
+        loaded = list(pool.map(lambda shot: _load(root, shot, masks, allow_outside), shots))
+    notes += [note for *_, found in loaded for note in found]
     return Views(
-        images=tuple(image for image, _, _ in loaded),
-        masks=tuple(mask for _, mask, _ in loaded),
+        images=tuple(image for image, *_ in loaded),
+        masks=tuple(mask for _, mask, *_ in loaded),
         c2w=torch.from_numpy(np.stack([s.c2w for s in shots]).astype(np.float32)),
-        intrinsics=torch.tensor([k for _, _, k in loaded], dtype=torch.float32),
+        intrinsics=torch.tensor([k for _, _, k, _ in loaded], dtype=torch.float32),
         names=tuple(s.name for s in shots),
         notes=tuple(dict.fromkeys(notes)),
         coordinate_system=system,
     )
 
 
-def _load(root: Path, shot: Shot, masks, notes: list[str], outside: bool) -> tuple[Tensor, Tensor, list[float]]:
+def _load(root: Path, shot: Shot, masks, outside: bool) -> tuple[Tensor, Tensor, list[float], list[str]]:
+    """Image, mask, intrinsics and notes of one shot."""
+    notes: list[str] = []
     path = _existing(shot.image)
     if path is None:
         raise InputError(shot.where, f"file_path: expected an image, got {shown(shot.name)} which does not exist; "
@@ -96,7 +101,7 @@ def _load(root: Path, shot: Shot, masks, notes: list[str], outside: bool) -> tup
     if int((mask > 0.5).sum()) < MIN_OBJECT:
         raise InputError(path, "mask: expected the object to be opaque (white), got a mask that is empty; "
                                "check that it is neither blank nor inverted")  # fmt: skip
-    return image, mask, intrinsics_of(shot.lens, width, height, shot.where, notes)
+    return image, mask, intrinsics_of(shot.lens, width, height, shot.where, notes), notes
 
 
 def _mask(root: Path, shot: Shot, path: Path, alpha: Tensor | None, masks, notes: list[str], outside: bool) -> Tensor:

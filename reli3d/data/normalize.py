@@ -14,7 +14,7 @@ from reli3d.data.views import Views, mask_box
 RADIUS = 0.87  # half side of the network's cube
 SLACK = 1.1  # a hull of few views exceeds its object by about a tenth, so it may exceed the cube by as much
 LONGEST = 0.55  # longest side from which an object in the cube needs no rescaling; in training it is 1
-OFF_CENTRE = 0.25  # as far as the hull's centre of such an object may lie from the origin
+OFF_CENTRE = 0.3  # as far as the hull's centre of such an object may lie from the origin
 GRIDS = (24, 44)  # cells a side, coarse and refined: the last is 2 to 3 % of the object
 BALL = 1.3  # diameter of the ball that limits the hull, in mask widths: a generic view shows 0.8 of the longest side
 PARALLEL = 0.01  # mean squared sine between the axes (6 degrees) below which depth is guessed, not triangulated

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
-from torch.nn.functional import interpolate
+from torch.nn.functional import interpolate, pad
 
 from reli3d._bridge import check
 
@@ -118,7 +118,7 @@ class Views:
         images, masks, intrinsics = [], [], []
         for image, mask, camera in zip(self.images, self.masks, self.intrinsics.double()):
             x, y, width, height = _window(mask, padding) if crop else (0, 0, mask.shape[1], mask.shape[0])
-            pixels = _cut(image, mask, x, y, width, height).permute(2, 0, 1)[None]
+            pixels = _cut(image, mask, x, y, width, height)[None]
             pixels = interpolate(pixels, (size, size), mode="bilinear", align_corners=False, antialias=True)[0]
             images.append(pixels[:3].permute(1, 2, 0).clamp(0.0, 1.0))
             masks.append(pixels[3].clamp(0.0, 1.0))
@@ -145,9 +145,18 @@ def _window(mask: Tensor, padding: float) -> tuple[int, int, int, int]:
 
 
 def _cut(image: Tensor, mask: Tensor, x: int, y: int, width: int, height: int) -> Tensor:
-    """``(height, width, 4)`` colour and mask of a window that may reach over the border."""
-    rows = torch.arange(y, y + height, device=mask.device)
-    columns = torch.arange(x, x + width, device=mask.device)
-    r, c = rows.clamp(0, mask.shape[0] - 1), columns.clamp(0, mask.shape[1] - 1)
-    inside = (rows == r)[:, None] & (columns == c)[None]
-    return torch.cat([image[r][:, c], (mask[r][:, c] * inside)[..., None]], -1)
+    """``(4, height, width)`` colour and mask of a window that may reach over the border."""
+    rows, columns = mask.shape
+    left, top = max(0, -x), max(0, -y)
+    right, bottom = max(0, x + width - columns), max(0, y + height - rows)
+    inner = slice(y + top, y + height - bottom), slice(x + left, x + width - right)
+    pixels = torch.empty((4, height - top - bottom, width - left - right), device=image.device)
+    pixels[:3] = image[inner].permute(2, 0, 1)
+    pixels[3] = mask[inner]
+    if not (left or top or right or bottom):
+        return pixels
+    pixels = pad(pixels[None], (left, right, top, bottom), mode="replicate")[0]
+    outside = torch.ones((height, width), dtype=torch.bool, device=mask.device)
+    outside[top : height - bottom, left : width - right] = False
+    pixels[3][outside] = 0.0
+    return pixels

@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import os
 import warnings
+from threading import Lock
 
 import numpy as np
 import torch
@@ -20,6 +21,7 @@ from reli3d.io.files import InputError, file_size, shown, write_bytes
 MAX_PIXELS = 1 << 26  # 64 MP: 256 MiB of RGBA, above any camera this is meant for
 MAX_BYTES = 1 << 29  # an uncompressed 16-bit RGBA image of MAX_PIXELS
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF")  # nothing that runs a program or unpacks streams of its own
+_OPENING = Lock()  # Python's warning filters are global; decoding runs outside
 _GREY = ("1", "L", "LA", "I;16", "I;16B", "I;16L", "I")
 _COLOUR = ("RGB", "RGBA", "P", "PA", "CMYK", "YCbCr")
 
@@ -35,11 +37,12 @@ def read_image(path: str | os.PathLike, *, notes: list[str] | None = None) -> tu
     if size > MAX_BYTES:
         raise InputError(path, f"expected at most {MAX_BYTES} bytes, got {size}; give a smaller image")
     try:
-        with warnings.catch_warnings():
+        with _OPENING, warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
             warnings.simplefilter("ignore", UserWarning)  # broken EXIF or TIFF tags that the pixels do not need
-            with Image.open(path, formats=FORMATS) as image:
-                return _decoded(path, image, notes if notes is not None else [])
+            image = Image.open(path, formats=FORMATS)  # reads the header only
+        with image:
+            return _decoded(path, image, notes if notes is not None else [])
     except InputError:
         raise
     except (Image.DecompressionBombError, Image.DecompressionBombWarning):
@@ -73,10 +76,10 @@ def _decoded(path, image: Image.Image, notes: list[str]) -> tuple[Tensor, Tensor
         grey = torch.from_numpy(grey / 65535.0)
         return grey[..., None].expand(-1, -1, 3).contiguous(), None
     transparent = image.mode in ("LA", "PA", "RGBA") or "transparency" in image.info
-    pixels = np.asarray(image.convert("RGBA" if transparent else "RGB"))
-    rgb = torch.from_numpy(pixels[..., :3].astype(np.float32)).div_(255.0)
-    alpha = torch.from_numpy(pixels[..., 3].astype(np.float32)).div_(255.0) if transparent else None
-    return rgb, alpha
+    wanted = "RGBA" if transparent else "RGB"
+    pixels = torch.from_numpy(np.array(image if image.mode == wanted else image.convert(wanted)))
+    rgb = pixels[..., :3].to(torch.float32, memory_format=torch.contiguous_format).div_(255.0)
+    return rgb, pixels[..., 3].float().div_(255.0) if transparent else None
 
 
 def png_bytes(pixels: Tensor | np.ndarray) -> bytes:
