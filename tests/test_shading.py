@@ -218,3 +218,99 @@ def _mesh_props(mi, bsdf):
     props = mi.Properties()
     props["bsdf"] = mi.load_dict(bsdf)
     return props
+
+
+def gradient_inputs(device, n=400):
+    normal, wo = points(n, seed=4)
+    g = torch.Generator().manual_seed(9)
+    values = [normal, 0.1 + 0.8 * torch.rand(n, 3, generator=g), 0.3 + 0.6 * torch.rand(n, generator=g),
+              torch.rand(n, generator=g), sky(8).radiance]  # fmt: skip
+    return wo.to(device), [v.to(device).requires_grad_() for v in values]
+
+
+def test_gradient_is_that_of_the_estimator_where_the_samples_stand_still(device):
+    """With environment samples alone nothing drawn depends on the material, so finite differences see the same
+    samples."""
+    wo, inputs = gradient_inputs(device)
+    weight = torch.rand(len(wo), 3, generator=torch.Generator().manual_seed(2)).to(device)
+
+    def loss(normal, base, roughness, metallic, radiance):
+        env = Environment(radiance)
+        object.__setattr__(env, "table", table)  # the light's own change must not move the samples either
+        got = shade(normal, normal, normal, wo, base, roughness, metallic, env, samples=(48, 0, 0))
+        return (got * weight).double().sum()
+
+    table = Environment(inputs[4].detach()).table
+    grads = torch.autograd.grad(loss(*inputs), inputs)
+    generator = torch.Generator().manual_seed(3)
+    for k, (value, grad) in enumerate(zip(inputs, grads, strict=True)):
+        direction = torch.randn(value.shape, generator=generator).to(device)
+        if k == 0:  # stay on the sphere, where the shading is defined
+            direction = direction - (direction * value).sum(-1, keepdim=True) * value
+        eps = 1e-3
+        shifted = []
+        for sign in (1, -1):
+            moved = [v.detach() for v in inputs]
+            moved[k] = value.detach() + sign * eps * direction
+            if k == 0:
+                moved[k] = torch.nn.functional.normalize(moved[k], dim=-1)
+            shifted.append(loss(*moved))
+        slope = (shifted[0] - shifted[1]) / (2 * eps)
+        got = (grad.double() * direction).sum()
+        scale = (grad.double() * direction).abs().sum()
+        # central difference of float32 sums: 1e-7 of the loss over eps, and eps^2 of the curvature
+        assert abs(got - slope) < 2e-3 * scale, (k, got, slope, scale)
+
+
+@pytest.mark.parametrize("counts", [(20, 40, 4), (0, 0, 64), (0, 64, 0)])
+def test_mean_gradient_is_that_of_the_integral(device, counts):
+    normal, wo = points(3, seed=11)
+    n, env = 6000, sky(8)
+    metallic = 1.0 if counts == (0, 64, 0) else 0.4
+    for k in range(2):
+        truth_in = [normal[k].double(), torch.tensor([0.7, 0.4, 0.2]).double(), torch.tensor(0.6).double(),
+                    torch.tensor(metallic).double(), env.radiance.double()]  # fmt: skip
+        truth_in = [v.requires_grad_() for v in truth_in]
+        value = reference.direct_light(
+            truth_in[0] / truth_in[0].norm(),
+            wo[k].double(),
+            truth_in[1],
+            truth_in[2] ** 2,
+            truth_in[3],
+            truth_in[4],
+            192,
+        )
+        truth = torch.autograd.grad(value.sum(), truth_in)
+        rows = repeat(
+            n, normal[k : k + 1], truth_in[1][None].detach().float(), torch.tensor([0.6]), torch.tensor([metallic])
+        )
+        rows = [r.to(device).requires_grad_() for r in rows]
+        light = env.radiance.to(device).requires_grad_()
+        view = wo[k : k + 1].expand(n, 3).contiguous().to(device)
+        got = shade(rows[0], rows[0], rows[0], view, *rows[1:], Environment(light), samples=counts)
+        *grads, g_light = torch.autograd.grad(got.sum(), [*rows, light])
+        tangent = grads[0] - (grads[0] * rows[0]).sum(-1, keepdim=True) * rows[0]
+        for g, t in zip([tangent, *grads[1:]], truth[:4], strict=True):
+            error = g.std(0) / n**0.5 + 1e-3 * t.abs().max().float().to(device)  # second term: the quadrature's
+            assert ((g.mean(0) - t.to(device)) / error).abs().max() < 4.5
+        noise = 4.5 * float(got.detach().std()) / n**0.5  # a texel's gradient varies less than the radiance it is a part of
+        assert (g_light.cpu() / n - truth[4]).abs().max() < noise + 1e-3
+
+
+def test_gradients_have_the_same_bits_for_any_number_of_threads_and_none_unasked(device):
+    wo, inputs = gradient_inputs(device, n=5000)
+    threads = torch.get_num_threads()
+    results = []
+    try:
+        for k in (1, 2):
+            torch.set_num_threads(k)
+            got = shade(inputs[0], inputs[0], inputs[0], wo, *inputs[1:4], Environment(inputs[4]))
+            results.append(torch.autograd.grad(got.square().sum(), inputs))
+    finally:
+        torch.set_num_threads(threads)
+    assert device.type == "cuda" or all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+    normal, base = inputs[0].detach(), inputs[1]
+    plain = [v.detach() for v in inputs[2:4]]
+    got = shade(normal, normal, normal, wo, base, *plain, Environment(inputs[4].detach()), clamp=1e-6)
+    clamped = torch.autograd.grad(got.sum(), base)[0].abs().max()
+    assert float(clamped) < 1e-4 * float(results[0][1].abs().max())  # only grazing samples stay below such a clamp

@@ -3,6 +3,8 @@
 Strategies in the order of the sample index: environment table, visible normals (antithetic pairs: even index the
 original, odd its partner mirrored about the normal), cosine.  Every sample counts ``f L cos w / (n p)`` with the
 densities of all strategies in the weight.  A face seen from behind is shaded as its other side.
+
+``visible`` keeps one bit a sample for the adjoint: lit, and above the horizon.  Without columns nothing is kept.
 """
 
 import warp as wp
@@ -49,11 +51,15 @@ class Plan:
 
 
 @wp.struct
-class Contribution:
-    """One sample: direction in world space and what it adds if nothing is in its way."""
+class Draw:
+    """One sample: its direction in world space, in the local frame and on the map; ``factor`` is w / (n p), 0 for
+    none."""
 
     direction: wp.vec3
-    value: wp.vec3
+    wi: wp.vec3
+    uv: wp.vec2
+    factor: float
+    count: int
 
 
 @wp.func
@@ -94,11 +100,10 @@ def draw_pair(plan: Plan, points: wp.array(dtype=wp.vec2), pixel: int, index: in
 
 
 @wp.func
-def draw_contribution(
+def draw_sample(
     surface: Surface,
     plan: Plan,
     points: wp.array(dtype=wp.vec2),
-    radiance: wp.array2d(dtype=wp.vec3),
     rows: wp.array2d(dtype=float),
     columns: wp.array2d(dtype=float),
     row_guide: wp.array2d(dtype=wp.int32),
@@ -106,12 +111,12 @@ def draw_contribution(
     density: wp.array2d(dtype=float),
     pixel: int,
     sample: int,
-) -> Contribution:
-    """Sample ``sample`` of a hit."""
-    out = Contribution()
-    out.value = wp.vec3(0.0, 0.0, 0.0)
+) -> Draw:
+    """Sample ``sample`` of a hit; a direction below the horizon has factor 0."""
+    out = Draw()
     wi = wp.vec3(0.0, 0.0, 0.0)
     uv = wp.vec2(0.0, 0.0)
+    factor = wp.float32(0.0)
     strategy = wp.int32(0)
     count = wp.int32(plan.n_environment)
     if sample < plan.n_environment:
@@ -149,12 +154,21 @@ def draw_contribution(
             partners * lobes[1],
             float(plan.n_cosine) * lobes[2],
         )
-        factor = mis_factor(all[strategy], all, plan.power) * wi[2]
-        value = eval_bsdf(surface.wo, wi, surface.base_color, surface.alpha, surface.metallic) * factor
-        value = wp.cw_mul(value, lookup_envmap_uv(radiance, uv))
-        top = plan.clamp / float(count)
-        out.value = wp.vec3(wp.min(value[0], top), wp.min(value[1], top), wp.min(value[2], top))
+        factor = mis_factor(all[strategy], all, plan.power)
+    out.wi = wi
+    out.uv = uv
+    out.factor = factor
+    out.count = count
     return out
+
+
+@wp.func
+def sample_value(surface: Surface, draw: Draw, light: wp.vec3, clamp: float) -> wp.vec3:
+    """What a sample adds if nothing is in its way; at most ``clamp`` over its strategy's count."""
+    value = eval_bsdf(surface.wo, draw.wi, surface.base_color, surface.alpha, surface.metallic)
+    value = wp.cw_mul(value, light) * (draw.factor * draw.wi[2])
+    top = clamp / float(draw.count)
+    return wp.vec3(wp.min(value[0], top), wp.min(value[1], top), wp.min(value[2], top))
 
 
 @wp.kernel
@@ -168,23 +182,28 @@ def shade_kernel(
     density: wp.array2d(dtype=float), points: wp.array(dtype=wp.vec2), pixels: wp.array(dtype=wp.int32), plan: Plan,
     mesh: wp.uint64, shadows: int,
     # out
-    out: wp.array(dtype=wp.vec3),
+    out: wp.array(dtype=wp.vec3), visible: wp.array2d(dtype=wp.int32),
 ):  # fmt: skip
     """The fused estimator; shadow rays through Warp's BVH."""
     i = start + wp.tid()
     surface = make_surface(normal[i], ng[i], wo[i], base_color[i], alpha[i], metallic[i])
     total = wp.vec3(0.0, 0.0, 0.0)
-    for s in range(plan.n_environment + plan.n_visible + plan.n_cosine):
-        c = draw_contribution(
-            surface, plan, points, radiance, rows, columns, row_guide, column_guide, density, pixels[i], s
-        )
-        if c.value[0] + c.value[1] + c.value[2] > 0.0:
+    word = wp.int32(0)
+    count = plan.n_environment + plan.n_visible + plan.n_cosine
+    for s in range(count):
+        d = draw_sample(surface, plan, points, rows, columns, row_guide, column_guide, density, pixels[i], s)
+        if d.factor > 0.0:
             lit = wp.bool(True)
             if shadows != 0:
-                origin = offset_origin(position[i], surface.ng, c.direction, plan.scale)
-                lit = not hit_occluded(mesh, origin, c.direction, wp.inf)
+                origin = offset_origin(position[i], surface.ng, d.direction, plan.scale)
+                lit = not hit_occluded(mesh, origin, d.direction, wp.inf)
             if lit:
-                total = total + c.value
+                total = total + sample_value(surface, d, lookup_envmap_uv(radiance, d.uv), plan.clamp)
+                word = word | (1 << (s & 31))
+        if (s & 31) == 31 or s == count - 1:
+            if s // 32 < visible.shape[1]:
+                visible[i, s // 32] = word
+            word = 0
     out[i] = total
 
 
@@ -207,17 +226,14 @@ def shade_rays_kernel(
     surface = make_surface(normal[i], ng[i], wo[i], base_color[i], alpha[i], metallic[i])
     count = plan.n_environment + plan.n_visible + plan.n_cosine
     for s in range(count):
-        c = draw_contribution(
-            surface, plan, points, radiance, rows, columns, row_guide, column_guide, density, pixels[i], s
-        )
+        d = draw_sample(surface, plan, points, rows, columns, row_guide, column_guide, density, pixels[i], s)
         k = j * count + s
-        reach = wp.float32(-1.0)
-        if c.value[0] + c.value[1] + c.value[2] > 0.0:
-            reach = wp.inf
-            origins[k] = offset_origin(position[i], surface.ng, c.direction, plan.scale)
-            directions[k] = c.direction
-        t_max[k] = reach
-        values[k] = c.value
+        t_max[k] = -1.0
+        if d.factor > 0.0:
+            t_max[k] = wp.inf
+            origins[k] = offset_origin(position[i], surface.ng, d.direction, plan.scale)
+            directions[k] = d.direction
+            values[k] = sample_value(surface, d, lookup_envmap_uv(radiance, d.uv), plan.clamp)
 
 
 @wp.kernel
@@ -226,13 +242,19 @@ def accumulate_kernel(
     # in
     first: int, count: int, values: wp.array(dtype=wp.vec3), occluded: wp.array(dtype=wp.int32),
     # out
-    out: wp.array(dtype=wp.vec3),
+    out: wp.array(dtype=wp.vec3), visible: wp.array2d(dtype=wp.int32),
 ):  # fmt: skip
     """Second half: the sum of the values of a hit that are not ``occluded`` (Embree: 0 for a hit, -1 for none)."""
     j = start + wp.tid()
     total = wp.vec3(0.0, 0.0, 0.0)
+    word = wp.int32(0)
     for s in range(count):
         k = j * count + s
         if occluded[k] != 0:
             total = total + values[k]
+            word = word | (1 << (s & 31))
+        if (s & 31) == 31 or s == count - 1:
+            if s // 32 < visible.shape[1]:
+                visible[first + j, s // 32] = word
+            word = 0
     out[first + j] = total

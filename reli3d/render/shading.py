@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 
 import torch
 import warp as wp
 from torch import Tensor
 
-from reli3d._bridge import check, empty, launch, over_slices
+from reli3d._bridge import SLICE_MIN, check, empty, launch, over_slices, slices
 from reli3d.geometry.rays import RayScene
 from reli3d.kernels import shade as kernels
+from reli3d.kernels import shade_adjoint as adjoint
 from reli3d.render.environment import Environment
 from reli3d.render.sampling import halton
 
@@ -51,8 +53,10 @@ def shade(
 
     pixels: ``(N,)`` int32 counters of the random numbers, by default the row.
 
-    Random numbers are a function of ``seed`` and the counter, so the result has the same bits for any number of
-    threads. Estimator: Veach and Guibas 1995 over the material of ``reli3d.kernels.bsdf``.
+    Gradients reach normal, base_color, roughness, metallic and the texels of ``environment``, with detached sampling:
+    directions, densities and visibility are constants.  Once differentiable.  Random numbers are a function of
+    ``seed`` and the counter, so the result has the same bits for any number of threads. Estimator: Veach and Guibas
+    1995 over the material of ``reli3d.kernels.bsdf``.
     """
     n = _check(position, normal, ng, wo, base_color, roughness, metallic, environment)
     if scene is not None and scene.device != position.device:
@@ -60,31 +64,89 @@ def shade(
     plan, offsets = _plan(samples, seed, antithetic, heuristic, points, clamp, scene)
     width = roughness * roughness if _choice("alpha", alpha, ("squared", "linear")) == 0 else roughness
     table, device = environment.table, position.device
-    surface = [(position, wp.vec3), (normal, wp.vec3), (ng, wp.vec3), (wo, wp.vec3), (base_color, wp.vec3),
-               (width, wp.float32), (metallic, wp.float32)]  # fmt: skip
-    light = [(environment.radiance, wp.vec3), *table.sampler, (table.density, wp.float32),
-             (offsets.to(device), wp.vec2)]  # fmt: skip
+    tables = [*table.sampler, (table.density, wp.float32), (offsets.to(device), wp.vec2)]
     if pixels is None:
         pixels = torch.arange(n, dtype=torch.int32, device=device)
     check("pixels", pixels, like=position, dtype=torch.int32)
     if pixels.shape != (n,):
         raise ValueError(f"pixels: expected shape ({n},), got {tuple(pixels.shape)}")
-    ins = [(t.detach().contiguous(), kind) for t, kind in [*surface, *light, (pixels, wp.int32)]]
-    out = empty((n,), wp.vec3, device)
-    if scene is not None and scene.backend == "embree" and scene.faces.shape[0]:
-        _shade_embree(n, ins, plan, sum(samples), scene, out)
-    else:
-        mesh = scene.mesh_id if scene is not None else 0
-        launch(kernels.shade_kernel, n, [*ins, plan, mesh, int(mesh != 0), (out, wp.vec3)], device)
-    return out
+    job = _Job(plan, sum(samples), scene, [*tables, (pixels.contiguous(), wp.int32)])
+    return _Shade.apply(job, position, normal, ng, wo, base_color, width, metallic, environment.radiance)
 
 
-def _shade_embree(n: int, ins: list, plan, count: int, scene: RayScene, out: Tensor) -> None:
+@dataclass(frozen=True)
+class _Job:
+    """What a call has besides its differentiable inputs."""
+
+    plan: object
+    count: int
+    scene: RayScene | None
+    tables: list
+
+
+class _Shade(torch.autograd.Function):
+    """Own backward: the samples are detached, and Warp's adjoint would differentiate through their drawing."""
+
+    @staticmethod
+    def forward(ctx, job: _Job, *tensors: Tensor) -> Tensor:
+        tensors = [t.contiguous() for t in tensors]
+        position, n = tensors[0], tensors[0].shape[0]
+        words = -(-job.count // 32) if any(ctx.needs_input_grad[1:]) else 0
+        visible = torch.zeros(n, words, dtype=torch.int32, device=position.device)
+        out = empty((n,), wp.vec3, position.device)
+        ins = _inputs(tensors, job)
+        outs = [(out, wp.vec3), (visible, wp.int32)]
+        if job.scene is not None and job.scene.backend == "embree" and job.scene.faces.shape[0]:
+            _shade_embree(n, ins, job, outs)
+        else:
+            mesh = job.scene.mesh_id if job.scene is not None else 0
+            launch(kernels.shade_kernel, n, [*ins, job.plan, mesh, int(mesh != 0), *outs], position.device)
+        ctx.job = job
+        ctx.save_for_backward(*tensors, visible)
+        return out
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, g_out: Tensor):
+        *tensors, visible = ctx.saved_tensors
+        n, device, radiance = g_out.shape[0], g_out.device, tensors[-1]
+        parts = len(slices(n)) if device.type == "cpu" else 1
+        height = radiance.shape[0] if ctx.needs_input_grad[8] else 0
+        g_radiance = torch.zeros(parts, height, *radiance.shape[1:], device=device)
+        g_normal, g_base, g_alpha, g_metallic = (torch.zeros_like(t) for t in (tensors[1], *tensors[4:7]))
+        ins = _inputs(tensors, ctx.job)[1:]  # all but the position
+        ins += [ctx.job.plan, (visible, wp.int32), (g_out.contiguous(), wp.vec3)]
+        outs = [(g_normal, wp.vec3), (g_base, wp.vec3), (g_alpha, wp.float32), (g_metallic, wp.float32)]
+
+        def work(k, start, length):
+            size = SLICE_MIN if device.type == "cpu" else length  # a launch this small stays in its thread
+            for first in range(start, start + length, size):
+                hits = min(size, start + length - first)
+                args = [first, *ins, *outs, (g_radiance[k], wp.vec3)]
+                launch(adjoint.shade_adjoint_kernel, hits, args, device)
+
+        if n and ctx.job.count:
+            if device.type == "cpu":
+                adjoint.shade_adjoint_kernel.module.load(wp.get_device("cpu"))
+                over_slices(n, work)
+            else:
+                work(0, 0, n)
+        grads = [None, g_normal, None, None, g_base, g_alpha, g_metallic, g_radiance.sum(0)]
+        return None, *(g if w else None for g, w in zip(grads, ctx.needs_input_grad[1:], strict=True))
+
+
+def _inputs(tensors: list[Tensor], job: _Job) -> list:
+    kinds = [wp.vec3] * 5 + [wp.float32] * 2 + [wp.vec3]
+    return [*zip(tensors, kinds, strict=True), *job.tables]
+
+
+def _shade_embree(n: int, ins: list, job: _Job, outs: list) -> None:
     """Chunks of hits: one kernel makes the rays and values, Embree tests the rays, another sums what is lit."""
+    out, count, scene = outs[0][0], job.count, job.scene
     if count == 0:
         out.zero_()
         return
-    size = max(1, CHUNK_RAYS // count)
+    size = max(1, min(SLICE_MIN, CHUNK_RAYS // count))
 
     def work(_, start, length):
         rays = [torch.empty(min(size, length) * count, 3) for _ in range(3)]
@@ -92,13 +154,14 @@ def _shade_embree(n: int, ins: list, plan, count: int, scene: RayScene, out: Ten
         for first in range(start, start + length, size):
             hits = min(size, start + length - first)
             buffers = [(rays[0], wp.vec3), (rays[1], wp.vec3), (far, wp.float32), (rays[2], wp.vec3)]
-            launch(kernels.shade_rays_kernel, hits, [first, *ins, plan, *buffers], out.device)
+            launch(kernels.shade_rays_kernel, hits, [first, *ins, job.plan, *buffers], out.device)
             k = hits * count
             blocked = scene.embree_blocked(rays[0][:k], rays[1][:k], far[:k])
-            args = [first, count, (rays[2], wp.vec3), (blocked, wp.int32), (out, wp.vec3)]
+            args = [first, count, (rays[2], wp.vec3), (blocked, wp.int32), *outs]
             launch(kernels.accumulate_kernel, hits, args, out.device)
 
     if n:
+        kernels.shade_rays_kernel.module.load(wp.get_device("cpu"))
         over_slices(n, work)
 
 

@@ -1,0 +1,148 @@
+"""Gradient of the estimator of ``reli3d.kernels.shade``, written out by hand.
+
+Detached sampling: directions, densities, weights and visibility are those of the forward pass and constants, which
+leaves the gradient unbiased because the integrand's domain, the sphere, does not depend on the parameters (Zeltner et
+al. 2021, Monte Carlo Estimators for Differential Light Transport, detached sampling).  The samples are drawn again
+from their counters, so nothing per sample is in memory but the visibility bits.
+"""
+
+import warp as wp
+
+from reli3d.kernels.bsdf import F0_DIELECTRIC, base_reflectance, schlick
+from reli3d.kernels.envmap import lookup_envmap_uv
+from reli3d.kernels.math import INV_PI
+from reli3d.kernels.microfacet import ALPHA_MIN, ggx_ndf, ggx_root, smith_visibility
+from reli3d.kernels.shade import COS_VIEW_MIN, Plan, draw_sample, make_surface
+
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
+
+
+@wp.struct
+class SurfaceGradient:
+    """Adjoints of one hit; ``n`` in the local frame, of the bent normal."""
+
+    n: wp.vec3
+    base_color: wp.vec3
+    alpha: float
+    metallic: float
+
+
+@wp.func
+def add_sample_gradient(
+    total: SurfaceGradient,
+    wo: wp.vec3,
+    wi: wp.vec3,
+    base_color: wp.vec3,
+    alpha: float,
+    metallic: float,
+    weight: wp.vec3,
+) -> SurfaceGradient:
+    """``total`` plus the adjoint of ``dot(weight, f cos_i)``; ``weight`` holds the output's adjoint, light and
+    factor."""
+    out = total
+    one = wp.vec3(1.0, 1.0, 1.0)
+    wm = wp.normalize(wo + wi)
+    f0 = base_reflectance(base_color, metallic)
+    fresnel = schlick(f0, wp.dot(wo, wm))
+    rest = wp.max(1.0 - wp.dot(wo, wm), 0.0)
+    slope = 1.0 - rest * rest * rest * rest * rest  # dF / dF0
+    ndf = ggx_ndf(wm, alpha)
+    visibility = smith_visibility(wo, wi, alpha)
+    specular = ndf * visibility
+    diffuse = (1.0 - metallic) * INV_PI
+    value = wp.cw_mul(one - fresnel, base_color) * diffuse + fresnel * specular
+    g = weight * wi[2]
+    g_fresnel = wp.cw_mul(g, one * specular - base_color * diffuse) * slope  # to F0
+    out.base_color = out.base_color + wp.cw_mul(g, one - fresnel) * diffuse + g_fresnel * metallic
+    out.metallic = out.metallic + wp.dot(g_fresnel, base_color - one * F0_DIELECTRIC)
+    out.metallic = out.metallic - wp.dot(g, wp.cw_mul(one - fresnel, base_color)) * INV_PI
+    g_specular = wp.dot(g, fresnel)
+    a2 = alpha * alpha
+    k = a2 * wm[2] * wm[2] + wm[0] * wm[0] + wm[1] * wm[1]
+    root_o = ggx_root(wo, alpha)
+    root_i = ggx_root(wi, alpha)
+    log_e = 2.0 * visibility  # 1 / E with V = 1 / (2 E), E = cos_i root_o + cos_o root_i
+    sin2_o = wo[0] * wo[0] + wo[1] * wo[1]
+    sin2_i = wi[0] * wi[0] + wi[1] * wi[1]
+    d_alpha = 2.0 / alpha - 4.0 * alpha * wm[2] * wm[2] / k
+    d_alpha = d_alpha - log_e * alpha * (wi[2] * sin2_o / root_o + wo[2] * sin2_i / root_i)
+    out.alpha = out.alpha + g_specular * specular * d_alpha
+    d_m = 4.0 * wm[2] * (1.0 - a2) / k
+    d_o = -log_e * (wi[2] * wo[2] * (1.0 - a2) / root_o + root_i)
+    d_i = -log_e * (wo[2] * wi[2] * (1.0 - a2) / root_i + root_o)
+    along = g_specular * specular
+    out.n = out.n + wm * (along * d_m) + wo * (along * d_o) + wi * (along * d_i + wp.dot(weight, value))
+    return out
+
+
+@wp.kernel
+def shade_adjoint_kernel(
+    start: int,
+    # in
+    first: int, normal: wp.array(dtype=wp.vec3), ng: wp.array(dtype=wp.vec3), wo: wp.array(dtype=wp.vec3),
+    base_color: wp.array(dtype=wp.vec3), alpha: wp.array(dtype=float), metallic: wp.array(dtype=float),
+    radiance: wp.array2d(dtype=wp.vec3), rows: wp.array2d(dtype=float), columns: wp.array2d(dtype=float),
+    row_guide: wp.array2d(dtype=wp.int32), column_guide: wp.array2d(dtype=wp.int32), density: wp.array2d(dtype=float),
+    points: wp.array(dtype=wp.vec2), pixels: wp.array(dtype=wp.int32), plan: Plan,
+    visible: wp.array2d(dtype=wp.int32), g_out: wp.array(dtype=wp.vec3),
+    # out
+    g_normal: wp.array(dtype=wp.vec3), g_base_color: wp.array(dtype=wp.vec3), g_alpha: wp.array(dtype=float),
+    g_metallic: wp.array(dtype=float), g_radiance: wp.array2d(dtype=wp.vec3),
+):  # fmt: skip
+    """Adjoints of the hits from ``first``; ``g_radiance`` is added to, or without texels left out."""
+    i = first + start + wp.tid()
+    surface = make_surface(normal[i], ng[i], wo[i], base_color[i], alpha[i], metallic[i])
+    total = SurfaceGradient()
+    g = g_out[i]
+    height = radiance.shape[0]
+    width = radiance.shape[1]
+    for s in range(plan.n_environment + plan.n_visible + plan.n_cosine):
+        if (visible[i, s // 32] >> (s & 31)) & 1 != 0:
+            d = draw_sample(surface, plan, points, rows, columns, row_guide, column_guide, density, pixels[i], s)
+            light = lookup_envmap_uv(radiance, d.uv)
+            value = wp.vec3(0.0, 0.0, 0.0)
+            wm = wp.normalize(surface.wo + d.wi)
+            fresnel = schlick(base_reflectance(surface.base_color, surface.metallic), wp.dot(surface.wo, wm))
+            specular = ggx_ndf(wm, surface.alpha) * smith_visibility(surface.wo, d.wi, surface.alpha)
+            for c in range(3):
+                diffuse = (1.0 - fresnel[c]) * surface.base_color[c] * (1.0 - surface.metallic) * INV_PI
+                value[c] = (diffuse + fresnel[c] * specular) * d.factor * d.wi[2]
+            top = plan.clamp / float(d.count)
+            own = wp.vec3(0.0, 0.0, 0.0)  # the output's adjoint, 0 where the clamp held
+            for c in range(3):
+                if value[c] * light[c] < top:
+                    own[c] = g[c]
+            total = add_sample_gradient(total, surface.wo, d.wi, surface.base_color, surface.alpha, surface.metallic,
+                                        wp.cw_mul(own, light) * d.factor)  # fmt: skip
+            if g_radiance.shape[0] != 0:
+                x = d.uv[0] * float(width) - 0.5
+                y = d.uv[1] * float(height) - 0.5
+                fx = x - wp.floor(x)
+                fy = y - wp.floor(y)
+                c0 = (int(wp.floor(x)) + width) % width
+                c1 = (c0 + 1) % width
+                r0 = wp.clamp(int(wp.floor(y)), 0, height - 1)
+                r1 = wp.clamp(int(wp.floor(y)) + 1, 0, height - 1)
+                part = wp.cw_mul(own, value)
+                wp.atomic_add(g_radiance, r0, c0, part * ((1.0 - fx) * (1.0 - fy)))
+                wp.atomic_add(g_radiance, r0, c1, part * (fx * (1.0 - fy)))
+                wp.atomic_add(g_radiance, r1, c0, part * ((1.0 - fx) * fy))
+                wp.atomic_add(g_radiance, r1, c1, part * (fx * fy))
+    side = wp.float32(1.0)
+    if wp.dot(ng[i], wo[i]) < 0.0:
+        side = -1.0
+    g_n = wp.transpose(surface.frame) * total.n
+    facing = normal[i] * side
+    cos_o = wp.dot(facing, wo[i])
+    if cos_o < COS_VIEW_MIN:  # through normalize(n + wo (c - n.wo))
+        m = facing + wo[i] * (COS_VIEW_MIN - cos_o)
+        length = wp.length(m)
+        m = m / length
+        g_n = (g_n - m * wp.dot(m, g_n)) / length
+        g_n = g_n - wo[i] * wp.dot(wo[i], g_n)
+    g_normal[i] = g_n * side
+    g_base_color[i] = total.base_color
+    g_metallic[i] = total.metallic
+    g_alpha[i] = total.alpha
+    if alpha[i] < ALPHA_MIN:
+        g_alpha[i] = 0.0
