@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,11 @@ from reli3d.render.gbuffer import surface_points
 ESCAPES = 48  # directions in which a point may see the sky: enough for an opening of a tenth of the sphere
 STRETCH = 0.18  # standard deviation of the logarithm of the scale along each axis
 GAIN = 0.2  # the same of the base colour's factor
+
+
+@lru_cache(16)  # decoding a texture takes as long as rendering a view
+def _read(path: Path):
+    return read_glb(path)
 
 
 def outside_distance(vertices: Tensor, faces: Tensor, points: Tensor, scene: RayScene) -> Tensor:
@@ -41,7 +47,7 @@ class ScannedSurface:
     """One GLB, centred, longest side 1, stretched and tinted at random; a :class:`~reli3d.data.synthesis.Surface`."""
 
     def __init__(self, path: Path, rng: np.random.Generator):
-        self.assets = read_glb(path)
+        self.assets = _read(path)
         points = torch.cat([a.mesh.vertices for a in self.assets])
         stretch = torch.as_tensor(np.exp(rng.normal(0, STRETCH, 3)), dtype=torch.float32)
         low, high = (points * stretch).amin(0), (points * stretch).amax(0)

@@ -1,0 +1,72 @@
+"""Make the object folder that the package brings: a procedural kettle in a procedural room, seen by four cameras.
+
+usage: python examples/bundled_example.py reli3d/assets/example
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from reli3d.data.procedural import example_object, sample_cameras
+from reli3d.data.synthesis import EXPOSED, ObjectSurface
+from reli3d.io.images import write_png
+from reli3d.nn.reni import map_directions
+from reli3d.render.camera import Camera, camera_rays
+from reli3d.render.color import linear_to_srgb
+from reli3d.render.environment import Environment
+from reli3d.render.shading import shade
+
+SIZE, SUBPIXELS, VIEWS = 512, 2, 4
+SAMPLES = (24, 24, 4)
+
+
+def room() -> Environment:
+    """Warm walls, a dark floor, a bluish window on one side and two lamps in the ceiling."""
+    d = map_directions(128)
+    x, y, z = d.unbind(-1)
+    light = torch.lerp(torch.tensor([0.10, 0.08, 0.06]), torch.tensor([0.55, 0.50, 0.44]), (y[..., None] + 1) / 2)
+    light = light * (1 + 0.3 * torch.sin(3 * torch.atan2(x, -z))[..., None])
+    window = ((x > 0.55) & (y.abs() < 0.45) & (z.abs() < 0.5)).float()[..., None]
+    bars = 1 - ((torch.remainder(z * 4, 1) < 0.12) | (torch.remainder(y * 4, 1) < 0.12)).float()[..., None]
+    light = light + window * bars * torch.tensor([7.0, 8.0, 10.0])
+    for at, size in (((-0.5, 0.8, -0.33), 0.975), ((-0.1, 0.75, 0.65), 0.985)):
+        axis = torch.nn.functional.normalize(torch.tensor(at), dim=0)
+        light = light + ((d @ axis) > size).float()[..., None] * torch.tensor([30.0, 24.0, 17.0])
+    return Environment(light.contiguous())
+
+
+def main(folder: Path) -> None:
+    surface, light, rng = ObjectSurface(example_object()), room(), np.random.default_rng(11)
+    poses, fovs = sample_cameras(rng, VIEWS)
+    (folder / "rgba").mkdir(parents=True, exist_ok=True)
+    frames, exposure = [], None
+    for i, (pose, fov) in enumerate(zip(poses, fovs, strict=True)):
+        c2w = torch.as_tensor(np.asarray(pose), dtype=torch.float32)
+        camera = Camera.from_fov(c2w, float(fov), SIZE, SIZE)
+        origins, directions = (r.reshape(-1, 3) for r in camera_rays(camera.scaled(SUBPIXELS)))
+        hits = surface.scene.closest(origins, directions)
+        seen = (hits.face >= 0).nonzero()[:, 0]
+        at = surface.at(hits.face[seen].long(), hits.bary[seen])
+        image = light.lookup(directions)
+        image[seen] = shade(at["position"], at["bump"], at["ng"], -directions[seen], at["base_color"], at["roughness"],
+                            at["metallic"], light, samples=SAMPLES, scene=surface.scene, seed=i)  # fmt: skip
+        if exposure is None:
+            exposure = EXPOSED / float(image[seen].mean(-1).quantile(0.9))
+        planes = torch.cat([(image * exposure).clamp(0, 1), (hits.face >= 0).float()[:, None]], -1)
+        planes = planes.reshape(SIZE, SUBPIXELS, SIZE, SUBPIXELS, 4).mean((1, 3))
+        rgba = torch.cat([linear_to_srgb(planes[..., :3]), planes[..., 3:]], -1)
+        write_png(folder / f"rgba/{i:04d}.png", rgba)
+        frames.append({"view_index": i, "file_path": f"rgba/{i:04d}.png", "width": SIZE, "height": SIZE,
+                       "transform_matrix": c2w.tolist(), "camera_fov": [float(fov), float(fov)],
+                       "camera_principal_point": [SIZE / 2, SIZE / 2]})  # fmt: skip
+    record = {"object_uid": "kettle", "coordinate_system": "ogl", "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(record, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
