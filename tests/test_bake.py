@@ -74,7 +74,8 @@ def test_texels_match_brute_force(device):
 
     w = np.stack([cross(p - a, c - a), cross(b - a, p - a)], -1) / cross(b - a, c - a)[:, None]
     inside = (w.min(-1) >= 0) & (w.sum(-1) <= 1)
-    clear = np.abs(np.concatenate([w, 1 - w.sum(-1, keepdims=True)], -1)).min(-1) > 1e-5  # not within float32 of an edge
+    # not within float32 of an edge
+    clear = np.abs(np.concatenate([w, 1 - w.sum(-1, keepdims=True)], -1)).min(-1) > 1e-5
     first = np.where(inside.any(1), inside.argmax(1), -1)
     same = clear.all(1)
     got_first = torch.where(got.inside, got.face, -1).cpu().numpy().ravel()
@@ -216,11 +217,13 @@ def test_tangents_of_a_cylinder_follow_u(device):
     mesh = Mesh(vertices, faces, normals, uv).to(device)
     want = torch.stack([-angle.sin(), torch.zeros(k + 1), -angle.cos()], 1).repeat(2, 1)
     for flip, w in ((1.0, 1.0), (-1.0, -1.0)):
-        t = vertex_tangents(Mesh(mesh.vertices, mesh.faces, mesh.normals, mesh.uv * mesh.uv.new_tensor([flip, 1.0]))).cpu()
+        turned = mesh.uv * mesh.uv.new_tensor([flip, 1.0])
+        t = vertex_tangents(Mesh(mesh.vertices, mesh.faces, mesh.normals, turned)).cpu()
         assert torch.equal(t[:, 3], torch.full((2 * k + 2,), w))
         cosine = (t[:, :3] * want).sum(1) * flip
         inner = torch.arange(2 * k + 2) % (k + 1) % k > 0
-        assert float(cosine[inner].min()) > 1 - 1e-6  # float32; the rim sees one side only: half a facet, projected flat
+        # float32; the rim sees one side only: half a facet, projected flat
+        assert float(cosine[inner].min()) > 1 - 1e-6
         assert float(cosine.min()) > math.cos(math.pi / k) - 1e-6
 
 
@@ -282,5 +285,6 @@ def test_encoding_bends_normals_up_and_gives_exact_ones_back():
     n = torch.tensor([[0.0, 0, 1]] * 3)
     t = torch.tensor([[1.0, 0, 0, 1], [1, 0, 0, -1], [1, 0, 0, 1]])
     world = torch.tensor([[0.6, 0, 0.8], [0, 0.6, 0.8], [0.6, 0.0, -0.8]])
-    want = torch.tensor([[0.8, 0.5, 0.9], [0.5, 0.2, 0.9], [1.0, 0.5, 0.5]])  # w = -1 turns green; below: on the horizon
+    # w = -1 turns green; below: on the horizon
+    want = torch.tensor([[0.8, 0.5, 0.9], [0.5, 0.2, 0.9], [1.0, 0.5, 0.5]])
     torch.testing.assert_close(encode_normals(world, n, t), want)

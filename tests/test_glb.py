@@ -60,16 +60,16 @@ def parsed(data: bytes) -> tuple[dict, bytes]:
 def packed(document: dict, binary: bytes) -> bytes:
     text = json.dumps(document).encode()
     text += b" " * (-len(text) % 4)
-    return b"".join([struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(binary)), struct.pack("<I4s", len(text), b"JSON"),
-                     text, struct.pack("<I4s", len(binary), b"BIN\0"), binary])  # fmt: skip
+    head = struct.pack("<4sIII4s", b"glTF", 2, 28 + len(text) + len(binary), len(text), b"JSON")
+    return b"".join([head, text, struct.pack("<I4s", len(binary), b"BIN\0"), binary])  # fmt: skip
 
 
 def judged(path) -> dict:
     modules = os.environ.get("RELI3D_GLTF_VALIDATOR", "")
     if not shutil.which("node") or not os.path.isdir(os.path.join(modules, "gltf-validator")):
         pytest.skip("needs node, and RELI3D_GLTF_VALIDATOR pointing to a node_modules with gltf-validator")
-    done = subprocess.run(["node", "-e", JUDGE, modules, str(path)], capture_output=True, text=True, timeout=60, check=True)
-    return json.loads(done.stdout)
+    command = ["node", "-e", JUDGE, modules, str(path)]
+    return json.loads(subprocess.run(command, capture_output=True, text=True, timeout=60, check=True).stdout)
 
 
 def test_khronos_validator_finds_nothing(asset, tmp_path):
@@ -101,7 +101,8 @@ def test_container_and_accessors_follow_the_standard(asset):
     assert position["min"] == asset.mesh.vertices.min(0).values.tolist()
     assert position["max"] == asset.mesh.vertices.max(0).values.tolist()
     material = document["materials"][0]
-    assert material["pbrMetallicRoughness"]["metallicFactor"] == material["pbrMetallicRoughness"]["roughnessFactor"] == 1.0
+    pbr = material["pbrMetallicRoughness"]
+    assert pbr["metallicFactor"] == pbr["roughnessFactor"] == 1.0
     assert material["doubleSided"] is False and document["asset"]["generator"].startswith("reli3d ")
     assert document["samplers"] == [{"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}]
     assert "extensionsUsed" not in document and "matrix" not in document["nodes"][0]
@@ -193,13 +194,15 @@ def test_node_transforms_reach_positions_normals_and_mirrors(asset, tmp_path):
 
 def test_factors_and_missing_parts(asset, tmp_path):
     document, binary = parsed(glb_bytes(asset))
-    document["materials"][0] = {"pbrMetallicRoughness": {"baseColorFactor": [0.5, 0.25, 1.0, 1.0], "roughnessFactor": 0.5}}
+    pbr = {"baseColorFactor": [0.5, 0.25, 1.0, 1.0], "roughnessFactor": 0.5}
+    document["materials"][0] = {"pbrMetallicRoughness": pbr}
     for name in ("NORMAL", "TANGENT", "TEXCOORD_0"):
         del document["meshes"][0]["primitives"][0]["attributes"][name]
     (tmp_path / "a.glb").write_bytes(packed(document, binary))
     (part,) = read_glb(tmp_path / "a.glb")
     # sRGB encoding of 0.5 and 0.25 (IEC 61966-2-1)
-    torch.testing.assert_close(part.textures.base_color[0, 0], torch.tensor([0.735357, 0.537099, 1.0]), rtol=0, atol=1e-5)
+    want = torch.tensor([0.735357, 0.537099, 1.0])
+    torch.testing.assert_close(part.textures.base_color[0, 0], want, rtol=0, atol=1e-5)
     torch.testing.assert_close(part.textures.orm[0, 0], torch.tensor([1.0, 0.5, 1.0]))
     a, b, c = (part.mesh.vertices[part.mesh.faces[:, k].long()] for k in range(3))
     flat = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=1)
@@ -265,7 +268,8 @@ def test_hostile_files_are_refused_by_name(asset, tmp_path, case):
 
 def test_indices_and_nan_in_the_buffer_are_refused(asset, tmp_path):
     document, binary = parsed(glb_bytes(asset))
-    for view, value, message in ((4, struct.pack("<I", 10**6), "indices below"), (0, struct.pack("<f", np.nan), "finite values")):
+    damage = (4, struct.pack("<I", 10**6), "indices below"), (0, struct.pack("<f", np.nan), "finite values")
+    for view, value, message in damage:
         at = document["bufferViews"][view]["byteOffset"]
         (tmp_path / "a.glb").write_bytes(packed(document, binary[:at] + value + binary[at + 4 :]))
         with pytest.raises(ValueError, match=message):
@@ -294,7 +298,7 @@ def test_limits_are_kept(asset, tmp_path):
         read_glb(tmp_path / "a.glb", max_bytes=1000)
     with pytest.raises(ValueError, match="more pixels"):
         read_glb(tmp_path / "a.glb", max_pixels=SIZE * SIZE + 1)
-    with pytest.raises(ValueError, match="vertices in all"):
+    with pytest.raises(ValueError, match="at most 100 vertices"):
         read_glb(tmp_path / "a.glb", max_vertices=100)
 
 

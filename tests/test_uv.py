@@ -12,8 +12,8 @@ from reli3d.geometry.uv import atlas_report, guard_band, unwrap, unwrap_xatlas
 
 QUICK = ["avocado", "suzanne", "scifi_crate", "plastic_monobloc_chair_01", "abalone_shell"]
 SLOW = ["boombox", "coffee_grinder", "dutch_ship_medium", "exploding_barrel", "french_horn", "horse_statue_01",
-        "numeric_keypad", "painted_wooden_cabinet_02", "painted_wooden_stool", "rune_sword", "shader_ball", "sheen_chair",
-        "sofa_03", "wicker_sphere", "wooden_table_02"]  # fmt: skip
+        "numeric_keypad", "painted_wooden_cabinet_02", "painted_wooden_stool", "rune_sword", "shader_ball",
+        "sheen_chair", "sofa_03", "wicker_sphere", "wooden_table_02"]  # fmt: skip
 
 
 def mesh_of(vertices, faces) -> Mesh:
@@ -37,7 +37,8 @@ def ramp(turns: int, steps: int = 12) -> Mesh:
     rim = [np.stack([r * np.cos(angle), 0.1 * angle, r * np.sin(angle)], 1) for r in (1.0, 2.0)]
     k = np.arange(turns * steps)
     n = len(angle)
-    return mesh_of(np.concatenate(rim), np.concatenate([np.stack([k, k + 1, n + k], 1), np.stack([k + 1, n + k + 1, n + k], 1)]))
+    faces = np.concatenate([np.stack([k, k + 1, n + k], 1), np.stack([k + 1, n + k + 1, n + k], 1)])
+    return mesh_of(np.concatenate(rim), faces)
 
 
 def areas(mesh: Mesh) -> np.ndarray:
@@ -72,12 +73,13 @@ def test_sphere_fills_the_atlas_with_little_stretch():
     found = atlas_report(result, texture_size=512)
     assert found.charts == 6
     assert found.utilisation > 0.55
-    # a cap of 54.7 degrees seen along its axis: stretch at the tip 1 / cos = 1.73, less what the common scale gives back
+    # a cap of 54.7 degrees seen along its axis: stretch at the tip 1 / cos = 1.73, less the common scale
     assert found.stretch < 1.05 and found.stretch_max < 1.74
 
 
 def test_stretch_of_a_plane_is_one_and_of_a_squeezed_one_is_known():
-    square = Mesh(torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), torch.tensor([[0, 1, 2], [0, 2, 3]]).int(),
+    corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    square = Mesh(corners, torch.tensor([[0, 1, 2], [0, 2, 3]]).int(),
                   uv=torch.tensor([[0.0, 1], [1, 1], [1, 0], [0, 0]]))  # fmt: skip
     assert atlas_report(square, texture_size=64).stretch == pytest.approx(1.0, abs=1e-6)  # float32 coordinates
     half = Mesh(square.vertices, square.faces, uv=square.uv * torch.tensor([1.0, 0.25]))
@@ -122,7 +124,7 @@ def test_a_slab_folded_over_itself_is_told_apart():
 def test_degenerate_non_manifold_and_repeated_faces(device):
     vertices = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0, -1, 0], [0.5, 0, 0], [5, 5, 5]]
     faces = [[0, 1, 2], [0, 1, 3], [0, 1, 4], [0, 1, 2], [0, 2, 1],  # five faces at one edge, one twice, one turned
-             [0, 5, 1], [3, 3, 1], [2, 2, 2]]  # no area: in line, two corners, one corner; vertex 6 is not used  # fmt: skip
+             [0, 5, 1], [3, 3, 1], [2, 2, 2]]  # in line, two corners, one corner; vertex 6 unused  # fmt: skip
     mesh = mesh_of(vertices, faces)
     check_atlas(mesh, unwrap(mesh, texture_size=256), size=1024)
 
@@ -166,7 +168,7 @@ def test_normals_are_taken_over_and_gradients_reach_the_vertices():
     mesh = icosphere(2)
     vertices = mesh.vertices.clone().requires_grad_()
     result = unwrap(Mesh(vertices, mesh.faces), texture_size=128)
-    # a unit sphere's area-weighted normals point along its vertices: exact by symmetry up to the subdivision's unevenness
+    # a unit sphere's area-weighted normals point along its vertices: exact up to the subdivision's unevenness
     assert float((result.normals * result.vertices).detach().sum(1).min()) > 0.998
     result.vertices.sum().backward()
     split = torch.bincount(torch.cdist(result.vertices.detach(), mesh.vertices).argmin(1), minlength=len(mesh.vertices))

@@ -92,9 +92,10 @@ def _border_segments(faces: Tensor) -> Tensor:
 def rasterize_texels(mesh: Mesh, size: int) -> Texels:
     """Face and barycentrics of every texel of a ``size`` x ``size`` map over the UV of ``mesh``.
 
-    A texel whose centre lies in a face takes it (the lowest face where several do); one whose centre is within 1.5 texels
-    of a chart takes the nearest point of the chart's border, so that bilinear lookup on the surface reads texels of the
-    surface only.  The same bits for any number of threads.  Peak memory 24 bytes a texel.  Raises ValueError without UV.
+    A texel whose centre lies in a face takes it (the lowest face where several do); one whose centre is within 1.5
+    texels of a chart takes the nearest point of the chart's border, so that bilinear lookup on the surface reads texels
+    of the surface only.  The same bits for any number of threads.  Peak memory 24 bytes a texel.  Raises ValueError
+    without UV.
     """
     corners = _corners(mesh, size)
     device = corners.device
@@ -165,9 +166,10 @@ def bake(mesh: Mesh, size: int, fn: Callable[..., Tensor | Mapping[str, Tensor]]
          texels: Texels | None = None, tangents: bool = False, fill: bool = True) -> dict[str, Tensor]:  # fmt: skip
     """Maps ``{name: (size, size, C)}`` of ``fn(position (N, 3), normal (N, 3))`` over the surface.
 
-    fn: returns ``{name: (N, C)}`` or one tensor (named "value"), float32; with ``tangents`` it takes the tangents ``(N, 4)``
-    as third argument.  It is called at the valid texels only, at most ``chunk`` at a time, without gradient; the result
-    does not depend on ``chunk`` if ``fn`` works point by point.  texels: of :func:`rasterize_texels`, to reuse them.
+    fn: returns ``{name: (N, C)}`` or one tensor (named "value"), float32; with ``tangents`` it takes the tangents ``(N,
+    4)`` as third argument.  It is called at the valid texels only, at most ``chunk`` at a time, without gradient; the
+    result does not depend on ``chunk`` if ``fn`` works point by point.  texels: of :func:`rasterize_texels`, to reuse
+    them.
     fill: copy to every other texel the value of the nearest valid one (:func:`dilate`); they stay 0 otherwise.
     Raises ValueError if the surface covers no texel or ``fn`` changes its outputs from chunk to chunk.
     """
@@ -224,7 +226,8 @@ def nearest_valid(valid: Tensor) -> tuple[Tensor, Tensor]:
     return source, square
 
 
-def dilate(maps: Mapping[str, Tensor] | Tensor, valid: Tensor, *, iterations: int | None = None) -> dict[str, Tensor] | Tensor:
+def dilate(maps: Mapping[str, Tensor] | Tensor, valid: Tensor, *,
+           iterations: int | None = None) -> dict[str, Tensor] | Tensor:  # fmt: skip
     """Maps in which every texel that is not ``valid`` takes the value of the nearest valid one.
 
     maps: ``(H, W, C)`` float32, or a dictionary of them.  valid: ``(H, W)`` bool.  iterations: fill up to this distance
@@ -241,8 +244,10 @@ def dilate(maps: Mapping[str, Tensor] | Tensor, valid: Tensor, *, iterations: in
         if value.ndim != 3 or value.shape[:2] != valid.shape:
             raise ValueError(f"{name}: expected shape {(*valid.shape, 'C')}, got {tuple(value.shape)}")
         result = value.detach().clone(memory_format=torch.contiguous_format)
-        _bridge.launch(kernels.fill_kernel, valid.numel(), [(source.reshape(-1), wp.int32), (square.reshape(-1), wp.float32),
-                       limit, value.shape[2], (result.view(-1, value.shape[2]), wp.float32)], value.device)  # fmt: skip
+        nearest = (source.reshape(-1), wp.int32), (square.reshape(-1), wp.float32)
+        channels = value.shape[2]
+        _bridge.launch(kernels.fill_kernel, valid.numel(), [
+            *nearest, limit, channels, (result.view(-1, channels), wp.float32)], value.device)  # fmt: skip
         return result
 
     if isinstance(maps, Tensor):

@@ -1,8 +1,8 @@
 """Charts of a surface: regions that project onto a plane without overlap.
 
 A face takes the axis (of six) nearest to its smoothed normal; connected faces of one axis are a chart, projected along
-its own mean normal.  Topology is that of the welded mesh (equal positions are one vertex); an edge with one face or more
-than two is a border.  Every step costs a sort or less: the time is bounded by the number of faces and of overlaps.
+its own mean normal.  Topology is that of the welded mesh (equal positions are one vertex); an edge with one face or
+more than two is a border.  Every step costs a sort or less: the time is bounded by the number of faces and of overlaps.
 All on the CPU; per-face and sequential steps in Warp, per-chart ones in numpy.
 """
 
@@ -51,7 +51,8 @@ def group(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """``(order, first)``: stable order that sorts ``keys`` >= 0, and where in it each run of equal keys begins."""
     n = len(keys)
     low = max(1, int(n - 1).bit_length())
-    if n and int(keys.max()).bit_length() + low <= 63:  # sorting key and index as one number: 5 times faster than argsort
+    # sorting key and index as one number: 5 times faster than argsort
+    if n and int(keys.max()).bit_length() + low <= 63:
         packed = np.sort((keys.astype(np.int64) << low) | np.arange(n, dtype=np.int64))
         order, ordered = packed & ((1 << low) - 1), packed >> low
     else:
@@ -109,7 +110,8 @@ def axis_labels(normal: torch.Tensor, neighbours: np.ndarray) -> np.ndarray:
         rough, smoothed = smoothed, torch.empty_like(normal)
         _bridge.launch(kernels.smooth_kernel, n, [links, (rough, wp.vec3), (smoothed, wp.vec3)], CPU)
     label = torch.empty(n, dtype=torch.int32)
-    _bridge.launch(kernels.labels_kernel, n, [(normal, wp.vec3), (smoothed, wp.vec3), COS_LABEL, (label, wp.int32)], CPU)
+    _bridge.launch(kernels.labels_kernel, n, [
+        (normal, wp.vec3), (smoothed, wp.vec3), COS_LABEL, (label, wp.int32)], CPU)  # fmt: skip
     for _ in range(MAJORITY):
         voted = torch.empty_like(label)
         _bridge.launch(kernels.majority_kernel, n, [
@@ -242,7 +244,7 @@ def _cut_bulky(points: np.ndarray, chart: np.ndarray, right: np.ndarray, up: np.
 
 
 def _overlaps(charts: Charts, boxes: np.ndarray, query: np.ndarray):
-    """``find(emit, offset, partner)`` -> number of faces of ``boxes`` that overlap each face of ``query``, ``(Q,)`` int32."""
+    """``find(emit, offset, partner)``: number of faces of ``boxes`` that overlap each of ``query``, ``(Q,)`` int32."""
     corners = torch.from_numpy(charts.corners)
     tips = torch.from_numpy(charts.corners[boxes])
     z = torch.from_numpy(charts.chart[boxes]).float()[:, None]
@@ -294,7 +296,8 @@ def split_overlaps(charts: Charts) -> bool:
     rank[members] = np.arange(len(members), dtype=np.int32)
     near = charts.neighbours[members]
     near = np.where(near >= 0, rank[near], -1)
-    seeds = np.lexsort((np.arange(len(members)), count.numpy() > 0))  # faces without overlap first: they grow large charts
+    # faces without overlap first: they grow large charts
+    seeds = np.lexsort((np.arange(len(members)), count.numpy() > 0))
     owner = torch.full((len(members),), -1, dtype=torch.int32)
     _bridge.launch(kernels.split_serial_kernel, 1, [
         _ints(near), _ints(charts.chart[members]), _ints(seeds), (offset, wp.int64), (count, wp.int32),
@@ -311,7 +314,8 @@ def split_overlaps(charts: Charts) -> bool:
 def make_charts(points: np.ndarray, faces: np.ndarray, *, texels: float, least_texels: float, sliver: float) -> Charts:
     """Charts of a welded mesh.
 
-    points: ``(V, 3)`` float32.  faces: ``(F, 3)`` int32.  texels: area to fill [texels]: it sets the unit of ``corners``.
+    points: ``(V, 3)`` float32.  faces: ``(F, 3)`` int32.  texels: area to fill [texels]: it sets the unit of
+    ``corners``.
     least_texels: charts below this area are merged where possible.  sliver: height [texels] of a face without a chart.
     """
     centre = 0.5 * (points.min(0).astype(np.float64) + points.max(0))
@@ -335,7 +339,8 @@ def make_charts(points: np.ndarray, faces: np.ndarray, *, texels: float, least_t
         chart, parent = cut
         right, up, count = right[parent], up[parent], len(parent)
     outer = outer_faces(chart, neighbours)
-    right, up, low = _upright(right, up, local[faces[outer]].reshape(-1, 3).astype(np.float64), np.repeat(chart[outer], 3))
+    tips = local[faces[outer]].reshape(-1, 3).astype(np.float64)
+    right, up, low = _upright(right, up, tips, np.repeat(chart[outer], 3))
     corners, flat = torch.empty(len(faces), 3, 2), torch.empty(len(faces), dtype=torch.uint8)
     _bridge.launch(kernels.project_kernel, len(faces), [
         _floats(local, wp.vec3), _ints(faces), _ints(chart), _floats(right, wp.vec3), _floats(up, wp.vec3),

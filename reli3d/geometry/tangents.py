@@ -32,11 +32,11 @@ def _flat(v: Tensor, n: Tensor) -> Tensor:
 def vertex_tangents(mesh: Mesh) -> Tensor:
     """Tangents ``(V, 4)`` float32: unit, orthogonal to the normal, w = +-1.
 
-    Mikkelsen 2008 (Simulation of wrinkled surfaces revisited), as in mikktspace.c: every corner adds the direction of +u of
-    its face, made flat to the vertex normal and unit, times the angle of the corner; corners count as one vertex where
-    position, normal and UV are equal.  A vertex that joins mirrored and plain faces, which MikkTSpace would
-    split, takes the side with the larger angle; :func:`unwrap` makes none.  Without any direction (no UV area) the tangent
-    is some vector orthogonal to the normal.  No gradient.  Raises ValueError without normals or UV.
+    Mikkelsen 2008 (Simulation of wrinkled surfaces revisited), as in mikktspace.c: every corner adds the direction of
+    +u of its face, made flat to the vertex normal and unit, times the angle of the corner; corners count as one vertex
+    where position, normal and UV are equal.  A vertex that joins mirrored and plain faces, which MikkTSpace would
+    split, takes the side with the larger angle; :func:`unwrap` makes none.  Without any direction (no UV area) the
+    tangent is some vector orthogonal to the normal.  No gradient.  Raises ValueError without normals or UV.
     """
     if not isinstance(mesh, Mesh):
         raise TypeError(f"mesh: expected Mesh, got {type(mesh).__name__}")
@@ -75,7 +75,8 @@ def _merged(mesh: Mesh) -> Tensor:
     for part in (mesh.normals.detach(), flat_uv):
         label = torch.unique(label * len(flat_uv) + weld(part)[1], return_inverse=True)[1]
     order = torch.sort(label, stable=True)
-    first = torch.searchsorted(order.values, torch.arange(int(label.max()) + 1 if len(label) else 0, device=label.device))
+    labels = torch.arange(int(label.max()) + 1 if len(label) else 0, device=label.device)
+    first = torch.searchsorted(order.values, labels)
     return order.indices[first][label]
 
 
@@ -100,8 +101,9 @@ def encode_normals(world: Tensor, normal: Tensor, tangent: Tensor) -> Tensor:
     """Normal map values ``(..., 3)`` in [0, 1] of the unit world-space normals ``world`` ``(..., 3)``.
 
     normal: ``(..., 3)`` unit, tangent: ``(..., 4)`` with unit direction, both interpolated at the texel.  The frame is
-    inverted, not transposed: interpolated tangents are not quite orthogonal, and :func:`decode_normals` must give ``world``
-    back.  A normal below the surface is bent to it, because viewers have no use for it.  Gradients reach ``world``.
+    inverted, not transposed: interpolated tangents are not quite orthogonal, and :func:`decode_normals` must give
+    ``world`` back.  A normal below the surface is bent to it, because viewers have no use for it.  Gradients reach
+    ``world``.
     """
     t, b, n = _frame(normal, tangent)
     check("world", world, last=3, like=normal)
@@ -117,7 +119,7 @@ def encode_normals(world: Tensor, normal: Tensor, tangent: Tensor) -> Tensor:
 
 
 def decode_normals(encoded: Tensor, normal: Tensor, tangent: Tensor) -> Tensor:
-    """Unit world-space normals ``(..., 3)`` of normal map values ``(..., 3)``; the inverse of :func:`encode_normals`."""
+    """Unit world-space normals ``(..., 3)`` of normal map values ``(..., 3)``: inverse of :func:`encode_normals`."""
     t, b, n = _frame(normal, tangent)
     check("encoded", encoded, last=3, like=normal)
     local = encoded * 2.0 - 1.0

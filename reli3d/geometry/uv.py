@@ -1,8 +1,8 @@
 """UV atlas: charts by projection, packed with a guard band; xatlas in a process of its own as the other choice.
 
 UV follow glTF: u right, v down, [0, 1].  Seen from outside the charts are not mirrored: in (u, 1 - v) every face is
-counter-clockwise.  The atlas is a discrete choice made on the CPU; no gradient reaches ``uv``, while vertices and normals
-of the result are a gather of the input and pass theirs on.
+counter-clockwise.  The atlas is a discrete choice made on the CPU; no gradient reaches ``uv``, while vertices and
+normals of the result are a gather of the input and pass theirs on.
 """
 
 from __future__ import annotations
@@ -50,7 +50,8 @@ class AtlasReport:
     utilisation: float  # share of the square that faces cover, overlap counted once
     overlap: float  # share of the covered samples with more than one face
     stretch: float  # L2 of Sander et al. 2001 over the surface, 1 where lengths are kept; scale of the atlas removed
-    stretch_max: float  # largest length on the surface per UV length of any face, relative to the mean; slivers left out
+    # largest length on the surface per UV length of any face, relative to the mean; slivers left out
+    stretch_max: float
     smallest_area: float  # of a face, in UV units
     texels_per_unit: float  # square root of UV area over surface area, times the texture size
 
@@ -74,10 +75,10 @@ def _check(mesh: Mesh, texture_size: int) -> None:
 def unwrap(mesh: Mesh, *, texture_size: int = 1024) -> Mesh:
     """The mesh with ``uv``; vertices are split at chart borders, the faces keep their order.
 
-    Every face has positive UV area and faces of different charts are a guard band apart (:func:`guard_band`, less only if
-    the charts are too many for the texture).  Normals are taken over, or computed on the mesh before the split so that
-    shading is smooth across charts.  Any triangle mesh will do: open, non-manifold, in pieces, with faces without area.
-    The same input gives the same bits.  Raises TypeError or ValueError for a wrong mesh, no faces, or NaN.
+    Every face has positive UV area and faces of different charts are a guard band apart (:func:`guard_band`, less only
+    if the charts are too many for the texture).  Normals are taken over, or computed on the mesh before the split so
+    that shading is smooth across charts.  Any triangle mesh will do: open, non-manifold, in pieces, with faces without
+    area. The same input gives the same bits.  Raises TypeError or ValueError for a wrong mesh, no faces, or NaN.
     """
     _check(mesh, texture_size)
     source_faces = mesh.faces.cpu().numpy()
@@ -207,7 +208,7 @@ def _place(charts: parts.Charts, faces: np.ndarray, size: int, guard: float, res
 
 
 def atlas_report(mesh: Mesh, *, texture_size: int = 1024) -> AtlasReport:
-    """Quality of the UV of a mesh.  Overlap and utilisation are sampled at 4 x 4 points a texel of ``texture_size``, up to 4096."""
+    """Quality of the UV of a mesh.  Overlap and utilisation are sampled at 16 points a texel, 4096 x 4096 at most."""
     from reli3d.geometry.bake import coverage
 
     if mesh.uv is None:
@@ -215,7 +216,7 @@ def atlas_report(mesh: Mesh, *, texture_size: int = 1024) -> AtlasReport:
     _check(mesh, texture_size)
     hits = coverage(mesh, min(4 * texture_size, 4096))
     faces = mesh.faces.cpu().numpy()
-    p, q = mesh.vertices.detach().cpu().numpy().astype(np.float64)[faces], mesh.uv.cpu().numpy().astype(np.float64)[faces]
+    p, q = (t.detach().cpu().numpy().astype(np.float64)[faces] for t in (mesh.vertices, mesh.uv))
     e1, e2, d1, d2 = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0], q[:, 1] - q[:, 0], q[:, 2] - q[:, 0]
     twice = d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0]
     area = 0.5 * np.linalg.norm(np.cross(e1, e2), axis=1)

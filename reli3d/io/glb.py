@@ -1,7 +1,8 @@
 """GLB out: one mesh, one metallic-roughness material, three PNG textures (glTF 2.0, Khronos).
 
 Axes and units are glTF's own (+Y up, right-handed), so that nothing is rotated.  Base colour is sRGB 8 bit; roughness
-is green and metallic is blue of one linear texture; all factors are written out as 1.  :func:`read_glb` is the way back.
+is green and metallic is blue of one linear texture; all factors are written out as 1.  :func:`read_glb` is the way
+back.
 """
 
 from __future__ import annotations
@@ -140,8 +141,8 @@ def write_glb(path: str | os.PathLike, asset: Asset, *, extras: Mapping | None =
               double_sided: bool | None = None) -> None:  # fmt: skip
     """Write ``asset`` (its mesh with normals, UV and tangents, and its textures) as a GLB: the whole file or nothing.
 
-    extras: JSON values kept in ``asset.extras``, such as the recorded transform and the licence.  double_sided: None writes
-    false for a watertight mesh, true otherwise.  Raises TypeError, ValueError for an asset that lacks something
+    extras: JSON values kept in ``asset.extras``, such as the recorded transform and the licence.  double_sided: None
+    writes false for a watertight mesh, true otherwise.  Raises TypeError, ValueError for an asset that lacks something
     or is not finite, OSError where the file cannot be written.
     """
     write_bytes(path, glb_bytes(asset, extras=extras, double_sided=double_sided))
@@ -151,7 +152,9 @@ def read_glb(path: str | os.PathLike, **limits: int) -> list[Asset]:
     """The surfaces of a GLB file, one :class:`Asset` for each primitive, in the axes of its scene; no environment.
 
     Node transforms are applied.  Textures come out square and of one size with all factors multiplied in; occlusion,
-    emission, alpha, animation, points and lines are left out.  Missing normals are flat ones, missing tangents MikkTSpace's.
-    limits: see :func:`reli3d.io.gltf_parts.read_parts`.  Raises InputError, a ValueError that names field, value and fix.
+    emission, alpha, animation, points and lines are left out.  Missing normals are flat ones, missing tangents
+    MikkTSpace's.
+    limits: see :func:`reli3d.io.gltf_parts.read_parts`.  Raises InputError, a ValueError that names field, value and
+    fix.
     """
     return read_parts(path, **limits)

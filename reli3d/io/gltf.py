@@ -49,7 +49,7 @@ class Document:
         raise InputError(self.path, f"{field}: {expected}, got {shown(got)}; {fix}")
 
     def get(self, node: dict, key: str, kind: type, field: str, default=None):
-        """``node[key]`` of the given kind (int and float are numbers; bool is not), or ``default`` if it is not None."""
+        """``node[key]`` of the given kind (an int is a float too, a bool is neither), or ``default`` if not None."""
         value = node.get(key, default)
         if kind is float and isinstance(value, int) and not isinstance(value, bool):
             try:
@@ -87,7 +87,7 @@ class Document:
         if version != 2:
             self.fail("header.version", "expected 2", version, "export as glTF 2.0")
         if length > len(data):
-            self.fail("header.length", f"expected at most the {len(data)} bytes of the file", length, "the file is cut off")
+            self.fail("header.length", f"expected at most {len(data)}, the file's size", length, "the file is cut off")
         chunks: dict[bytes, bytes] = {}
         at = 12
         while at + 8 <= length:
@@ -157,7 +157,7 @@ class Document:
         count = self.get(entry, "count", int, f"{where}.count")
         self.taken += max(count, 0)
         if count < 0 or self.taken > 8 * self.max_vertices:
-            self.fail(f"{where}.count", f"expected at most {self.max_vertices} vertices in all", count, "simplify the mesh")
+            self.fail(f"{where}.count", f"expected at most {self.max_vertices} vertices", count, "simplify the mesh")
         if "sparse" in entry:
             self.fail(f"{where}.sparse", "expected a dense accessor", "sparse", "export without sparse accessors")
         dtype, width = np.dtype(DTYPES[code]), SHAPES[kind]
@@ -227,7 +227,8 @@ class Document:
             if not np.isfinite(world).all():
                 self.fail(f"nodes[{number}]", "expected a finite transform", "an overflow")
             if "mesh" in node:
-                found.append((self.item("meshes", node["mesh"], f"nodes[{number}].mesh"), world, f"meshes[{node['mesh']}]"))
+                mesh = self.item("meshes", node["mesh"], f"nodes[{number}].mesh")
+                found.append((mesh, world, f"meshes[{node['mesh']}]"))
             children = self.get(node, "children", list, f"nodes[{number}].children", [])
             stack += [(c, world, depth + 1) for c in reversed(children)]
         return found

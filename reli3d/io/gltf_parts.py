@@ -42,7 +42,8 @@ def read_parts(path: str | os.PathLike, *, max_bytes: int = 1 << 29, max_vertice
                 parts.append(part)
                 vertices += len(part.mesh.vertices)
                 if vertices > max_vertices:
-                    document.fail(field, f"expected at most {max_vertices} vertices in all", vertices, "simplify the mesh")
+                    document.fail(field, f"expected at most {max_vertices} vertices in all", vertices,
+                                  "simplify the mesh")  # fmt: skip
     if not parts:
         raise InputError(path, "expected triangles in its scene, got none; export a mesh")
     return parts
@@ -148,7 +149,8 @@ class _Materials:
             texture = self.document.item("textures", info.get("index"), f"{place}.{key}.index")
             images.append(self._image(texture.get("source"), f"textures[{info['index']}].source"))
         if len(channels) > 1:
-            self.document.fail(field, "expected one UV channel for all textures", sorted(channels), "bake to one UV channel")
+            self.document.fail(field, "expected one UV channel for all textures", sorted(channels),
+                               "bake to one UV channel")  # fmt: skip
         size = max((max(i.shape[:2]) for i in images if i is not None), default=PLAIN)
         base, orm, normal = (_square(i, size) for i in images)
         factor = torch.tensor(color).clamp(0.0, 1.0)
@@ -184,8 +186,8 @@ class _Materials:
         except InputError:
             raise
         except Exception as error:  # on a broken file decoders raise almost anything: struct.error, IndexError ...
-            raise InputError(self.document.path, f"{where}: expected a PNG, JPEG or WebP image, got {shown(str(error))}; "
-                             "save the image again") from None  # fmt: skip
+            raise InputError(self.document.path, f"{where}: expected a PNG, JPEG or WebP image, "
+                             f"got {shown(str(error))}; save the image again") from None  # fmt: skip
         self.images[index] = torch.from_numpy(pixels.astype(np.float32)) / 255.0
         return self.images[index]
 

@@ -1,7 +1,7 @@
 """Texels of an atlas: which face covers each, attributes there, and the nearest covered texel of every other.
 
-Texel (row y, column x) has its centre at (x + 0.5, y + 0.5) in texel units, v down.  A thread owns a tile, a strip or a row of
-the output and gathers, so that the result does not depend on the number of threads or the size of the tiles.
+Texel (row y, column x) has its centre at (x + 0.5, y + 0.5) in texel units, v down.  A thread owns a tile, a strip or a
+row of the output and gathers, so that the result does not depend on the number of threads or the size of the tiles.
 """
 
 import warp as wp
@@ -42,7 +42,7 @@ def texels_kernel(
     # out
     face: wp.array2d(dtype=wp.int32), bary: wp.array2d(dtype=wp.vec2),
 ):  # fmt: skip
-    """Fill tile ``i``: the first face over the centre of a texel; else the nearest border segment within ``reach`` texels.
+    """Fill tile ``i``: the first face over a texel's centre; else the nearest border segment within ``reach`` texels.
 
     ``segments`` holds 3 * face + corner of each edge on a border.  ``bary`` weighs vertices 1 and 2.
     """
@@ -165,7 +165,7 @@ def attributes_kernel(
     # out
     position: wp.array(dtype=wp.vec3), normal: wp.array(dtype=wp.vec3),
 ):  # fmt: skip
-    """Position and unit normal at the listed texels, by barycentric interpolation; the normal of vertex 0 where they cancel."""
+    """Interpolated position and unit normal at the listed texels; the normal of vertex 0 where they cancel."""
     i = start + wp.tid()
     t = texel[i]
     f = face[t]
@@ -214,7 +214,8 @@ def nearest_row_kernel(
 ):  # fmt: skip
     """Row of the nearest valid texel of the same column, the upper of two; -1 without one.
 
-    One thread of ``lanes`` works, on ``strip`` columns: contiguous reads, and still enough threads for a launch to be cut.
+    One thread of ``lanes`` works, on ``strip`` columns: contiguous reads, and still enough threads for a launch to be
+    cut.
     """
     i = start + wp.tid()
     if i % lanes != 0:
@@ -304,7 +305,7 @@ def fill_kernel(
     # in and out
     values: wp.array2d(dtype=wp.float32),
 ):  # fmt: skip
-    """Copy the channels of ``source[i]`` to texel ``i``, which differ where the texel is not valid, up to a distance."""
+    """Copy the channels of ``source[i]`` to texel ``i``, which differ where it is not valid, up to a distance."""
     i = start + wp.tid()
     j = source[i]
     if j >= 0 and j != i and square[i] <= limit:

@@ -80,7 +80,8 @@ def labels_kernel(
 def majority_kernel(
     start: int,
     # in
-    neighbours: wp.array2d(dtype=wp.int32), normal: wp.array(dtype=wp.vec3), label: wp.array(dtype=wp.int32), cosine: float,
+    neighbours: wp.array2d(dtype=wp.int32), normal: wp.array(dtype=wp.vec3), label: wp.array(dtype=wp.int32),
+    cosine: float,
     # out
     voted: wp.array(dtype=wp.int32),
 ):  # fmt: skip
@@ -124,7 +125,7 @@ def project_kernel(
     # out
     corners: wp.array2d(dtype=wp.vec2), flat: wp.array(dtype=wp.uint8),
 ):  # fmt: skip
-    """Corners of a face in the plane of its chart; ``flat`` marks a face with a height below ``least`` or turned over."""
+    """Corners of a face in the plane of its chart; ``flat`` marks a face lower than ``least`` or turned over."""
     i = start + wp.tid()
     c = chart[i]
     p = wp.vec3()
@@ -157,7 +158,7 @@ def components_serial_kernel(
     # out
     parent: wp.array(dtype=wp.int32),
 ):  # fmt: skip
-    """Faces joined across an edge where both have the same ``group``; ``parent`` becomes the smallest face of each set."""
+    """Join faces of one ``group`` across their edges; ``parent`` becomes the smallest face of each set."""
     for i in range(count):
         parent[i] = i
     for i in range(count):
@@ -176,7 +177,7 @@ def components_serial_kernel(
 
 @wp.func
 def side(a: wp.vec2, b: wp.vec2, p: wp.vec2) -> float:
-    """Distance of ``p`` to the right of the line from ``a`` to ``b``; positive is outside of a counter-clockwise triangle."""
+    """Distance of ``p`` to the right of the line from ``a`` to ``b``: outside of a counter-clockwise triangle."""
     e = b - a
     return ((p[0] - a[0]) * e[1] - (p[1] - a[1]) * e[0]) / wp.max(wp.length(e), 1.0e-20)
 
@@ -257,7 +258,8 @@ def split_serial_kernel(
 ):  # fmt: skip
     """Grow connected charts without overlap, breadth first, from ``seeds`` in order; they are numbered from ``first``.
 
-    ``owner`` is -1 for the faces to share out.  A face joins unless one of its overlap partners is in the same new chart.
+    ``owner`` is -1 for the faces to share out.  A face joins unless one of its overlap partners is in the same new
+    chart.
     """
     current = int(first)
     for s in range(seeds.shape[0]):
@@ -294,7 +296,8 @@ def outline_kernel(
 ):  # fmt: skip
     """Lowest and highest cell that chart ``i`` or its margin touches in each of its columns.
 
-    Its border ``edges`` have minimum 0 on both axes; ``scale`` takes them to cells, ``margin`` [cells] is kept on every side.
+    Its border ``edges`` have minimum 0 on both axes; ``scale`` takes them to cells, ``margin`` [cells] is kept on every
+    side.
     """
     i = start + wp.tid()
     base = column_start[i]
@@ -339,8 +342,8 @@ def pack_serial_kernel(
     """Drop charts one after the other onto the horizon, each where it comes to rest lowest; leftmost among equals.
 
     Levy et al. 2002 (Least squares conformal maps), section 4.2, with the resting height instead of the lost area, and
-    each chart also turned by 180 degrees.  ``place``: x, y, 1 if turned, height of the chart.  ``height``: highest cell,
-    2^30 if a chart is wider than the horizon.
+    each chart also turned by 180 degrees.  ``place``: x, y, 1 if turned, height of the chart.  ``height``: highest
+    cell, 2^30 if a chart is wider than the horizon.
     """
     size = horizon.shape[0]
     for x in range(size):

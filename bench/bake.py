@@ -1,0 +1,75 @@
+"""Texels of an atlas, dilation beside scipy's distance transform, a bake with its normal map, and the GLB."""
+
+import torch
+import trimesh
+from scipy import ndimage
+
+from reli3d.geometry.bake import bake, dilate, rasterize_texels
+from reli3d.geometry.mesh import Mesh
+from reli3d.geometry.tangents import encode_normals, vertex_tangents, with_tangents
+from reli3d.geometry.uv import unwrap
+from reli3d.io.glb import glb_bytes
+from reli3d.render.asset import Asset, TextureSet
+
+
+def sphere(device, subdivisions, size) -> Mesh:
+    ball = trimesh.creation.icosphere(subdivisions)
+    mesh = Mesh(torch.tensor(ball.vertices, dtype=torch.float32), torch.tensor(ball.faces, dtype=torch.int32))
+    return with_tangents(unwrap(mesh, texture_size=size)).to(device)
+
+
+def colors(p, n, t):
+    orm = torch.stack([torch.ones_like(p[:, 0]), 0.5 + 0.2 * p[:, 1], 0.5 + 0.2 * p[:, 2]], 1)
+    return {"base_color": 0.5 + 0.4 * torch.sin(5 * p), "orm": orm, "normal": encode_normals(n, n, t)}
+
+
+def texels(device, subdivisions, size):
+    """Face and barycentrics of every texel."""
+    mesh = sphere(device, subdivisions, size)
+    return lambda: rasterize_texels(mesh, size), {"texels": size * size}
+
+
+def filling(device, subdivisions, size):
+    """Nine channels filled from the nearest valid texel."""
+    valid = rasterize_texels(sphere(device, subdivisions, size), size).valid
+    maps = torch.rand(size, size, 9, device=device)
+    return lambda: dilate(maps, valid), {"texels": size * size}
+
+
+def scipy_filling(device, subdivisions, size):
+    valid = rasterize_texels(sphere("cpu", subdivisions, size), size).valid
+    maps = torch.rand(size, size, 9).numpy()
+
+    def step():
+        y, x = ndimage.distance_transform_edt(~valid.numpy(), return_distances=False, return_indices=True)
+        return maps[y, x]
+
+    return step, {"texels": size * size}
+
+
+def whole(device, subdivisions, size):
+    """Texels, three maps of a cheap function, dilation."""
+    mesh = sphere(device, subdivisions, size)
+    return lambda: bake(mesh, size, colors, tangents=True), {"texels": size * size}
+
+
+def tangents(device, subdivisions, size):
+    mesh = sphere(device, subdivisions, size)
+    return lambda: vertex_tangents(mesh), {"faces": len(mesh.faces)}
+
+
+def glb(device, subdivisions, size):
+    """The file in memory: three PNG, geometry, JSON."""
+    mesh = sphere(device, subdivisions, size)
+    asset = Asset(mesh, TextureSet(**bake(mesh, size, colors, tangents=True)))
+    return lambda: glb_bytes(asset), {"texels": 3 * size * size}
+
+
+CASES = {
+    "texels": (texels, dict(subdivisions=5, size=1024)),
+    "dilate": (filling, dict(subdivisions=5, size=1024)),
+    "bake": (whole, dict(subdivisions=5, size=1024)),
+    "tangents": (tangents, dict(subdivisions=5, size=1024)),
+    "glb": (glb, dict(subdivisions=5, size=1024)),
+}
+PEERS = {"dilate": scipy_filling}
