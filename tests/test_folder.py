@@ -208,6 +208,19 @@ def test_real_captures(shared_data, name, system, count):
         np.testing.assert_allclose(views.intrinsics[i], [fx, fy, *frame["camera_principal_point"]], rtol=1e-6)
 
 
+def test_premultiplied_alpha_is_noted(tmp_path):
+    """A bright disk with a soft edge on black, its colour multiplied by alpha or not."""
+    y, x = np.mgrid[:64, :64] - 31.5
+    alpha = np.clip((24 - np.hypot(x, y)) / 6, 0, 1)
+    frame = {"file_path": "a.png", "transform_matrix": evil.pose(0), "camera_fov": 0.6}
+    transforms(tmp_path, [frame])
+    flat = np.full_like(alpha, 0.8)
+    for colour, noted in ((np.where(alpha > 0, flat, 0.0), False), (flat * alpha, True), (flat, False)):
+        pixels = np.stack([colour, colour * 0.7, colour * 0.5, alpha], -1)
+        Image.fromarray(np.rint(pixels * 255).astype(np.uint8)).save(tmp_path / "a.png")
+        assert bool(load_views(tmp_path).notes) == noted
+
+
 def test_lens_defaults():
     assert Lens().size is None
     assert Lens(fov=(0.5, math.nan)).centre is None

@@ -64,7 +64,7 @@ def load_views(
         if model is None:
             raise InputError(folder, "expected transforms.json or a COLMAP text model (sparse/0/cameras.txt, "
                              "images.txt), "
-                                     "got neither; see the input formats in the documentation")  # fmt: skip
+                                     "got neither; see docs/inputs.md")  # fmt: skip
         shots, notes = read_colmap(root, model, count, outside=allow_outside)
     with ThreadPoolExecutor(max_workers=min(4, os.cpu_count() or 1)) as pool:  # decoding releases the GIL
         loaded = list(pool.map(lambda shot: _load(root, shot, masks, allow_outside), shots))
@@ -101,7 +101,22 @@ def _load(root: Path, shot: Shot, masks, outside: bool) -> tuple[Tensor, Tensor,
     if int((mask > 0.5).sum()) < MIN_OBJECT:
         raise InputError(path, "mask: expected the object to be opaque (white), got a mask that is empty; "
                                "check that it is neither blank nor inverted")  # fmt: skip
+    if looks_premultiplied(image, mask):
+        notes.append(f"{path.name}: the colour looks multiplied by alpha, edges will be dark; save straight alpha")
     return image, mask, intrinsics_of(shot.lens, width, height, shot.where, notes), notes
+
+
+def looks_premultiplied(image: Tensor, mask: Tensor) -> bool:
+    """Whether no edge pixel of ``image (H, W, 3)`` is brighter than its alpha, and only black lies outside.
+
+    Of a straight image with a bright object the faint edge pixels are brighter than their alpha.
+    """
+    value = image.amax(-1)
+    bright = float(value[mask > 0.98].median()) if bool((mask > 0.98).any()) else 0.0
+    faint = (mask > 0.02) & (mask < 0.5 * bright)
+    if int(faint.sum()) < MIN_OBJECT or bool((value[mask < 0.02] > 0.02).any()):
+        return False
+    return bool((value[faint] <= mask[faint] + 1 / 255).all())  # both are rounded to 8 bits
 
 
 def _mask(root: Path, shot: Shot, path: Path, alpha: Tensor | None, masks, notes: list[str], outside: bool) -> Tensor:
