@@ -16,12 +16,12 @@ def parser() -> argparse.ArgumentParser:
     p = argparse.ArgumentParser(
         prog="reli3d-infer",
         description="Turn a few posed photographs of an object into a relightable GLB and an HDR environment.",
-        epilog="Exit code: 0 all done, 1 some objects failed, 2 wrong input.  Results go to stdout, progress to stderr.",
+        epilog="Exit code: 0 all done, 1 some objects failed, 2 wrong input.  Results go to stdout.",
     )
-    p.add_argument("folder", nargs="*", type=Path, help="object folders: transforms.json or a COLMAP text model with images; "
+    p.add_argument("folder", nargs="*", type=Path, help="object folders: transforms.json or a COLMAP text model; "
                    "default the bundled example")  # fmt: skip
     p.add_argument(
-        "--output", type=Path, default=Path("outputs"), help="files land in OUTPUT/<object>/ (default outputs)"
+        "--output", type=Path, default=Path("outputs"), help="files land in OUTPUT/<object>/"
     )
     p.add_argument("--views", type=int, help="use the first N views (1 to 16)")
     p.add_argument("--masks", type=Path, help="folder of masks with the names of the images, instead of their alpha")
@@ -170,14 +170,23 @@ class Job:
         output = output_frame(to_model, args.frame, args.up)
         picture = preview(asset, views.transformed(output).to(self.device))
         info = {
-            "object": name, "views": list(views.names), "coordinate_system": views.coordinate_system, "notes": list(views.notes),
+            "object": name,
+            "views": list(views.names),
+            "coordinate_system": views.coordinate_system,
+            "notes": list(views.notes),
             **results.frame_record(to_model, output, args.frame, args.up),
-            "weights": results.weights_record(self.manifest, self.digest), "preset": self.model.preset.name,
-            "texture_size": args.texture_size, "resolution": args.resolution or self.model.preset.resolution, "seed": args.seed,
-            "device": self.device, "mesh": results.mesh_statistics(asset.mesh), "seconds": seconds,
-            "seconds_since_start": round(time.monotonic() - STARTED, 3), "peak_memory_mib": round(results.peak_memory_mib(), 1),
+            "weights": results.weights_record(self.manifest, self.digest),
+            "preset": self.model.preset.name,
+            "texture_size": args.texture_size,
+            "resolution": args.resolution or self.model.preset.resolution,
+            "seed": args.seed,
+            "device": self.device,
+            "mesh": results.mesh_statistics(asset.mesh),
+            "seconds": seconds,
+            "seconds_since_start": round(time.monotonic() - STARTED, 3),
+            "peak_memory_mib": round(results.peak_memory_mib(), 1),
             "versions": results.versions(),
-        }  # fmt: skip
+        }
         steps("writing")
         results.write_results(target, asset, picture, info)
         steps.close()

@@ -8,9 +8,7 @@ maps.
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -22,13 +20,12 @@ from reli3d.data.procedural import make_object
 from reli3d.data.synthesis import ObjectSurface
 from reli3d.geometry.rays import RayScene
 from reli3d.nn.model import Reconstructor
-from reli3d.nn.weights import load_model
 from reli3d.pipeline import reconstruct
 from reli3d.render.camera import Camera, camera_rays
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import surface_points
-from reli3d.train.light_prior import held_back, load_maps, scale_free
+from reli3d.train.light_prior import scale_free
 from reli3d.train.pictures import sample_views
 
 INPUTS, UNSEEN = 4, 8  # the first views are input, the next are looked at
@@ -103,32 +100,22 @@ def evaluate(
             "mean_light_error": light_error(mean_light * exposure, target)}  # fmt: skip
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("samples", type=Path, help="folder of reli3d-data --held-back --views 12")
-    parser.add_argument("--maps", type=Path, required=True, help=".npz of environment maps that the training drew from")
-    parser.add_argument("--weights", default="small")
-    parser.add_argument("--json", type=Path)
-    args = parser.parse_args()
-    maps, names = load_maps(args.maps)
-    kept = scale_free(maps[[not h for h in held_back(names)]])
-    mean_light = (
-        Environment(kept.log().mean((0, 2), keepdim=True)[0].exp().expand(-1, 128, -1).contiguous())
-        .resized(32)
-        .radiance
-    )
-    model, table = load_model(args.weights), {}
+def mean_environment(maps: Tensor) -> Tensor:
+    """The geometric mean ``(32, 64, 3)`` of maps ``(n, H, 2H, 3)`` over all turns about the vertical: what a guess
+    can know.
+    """
+    rows = scale_free(maps).log().mean((0, 2))
+    wide = rows.exp()[:, None].expand(-1, 2 * len(rows), -1)
+    return Environment(wide.contiguous()).resized(32).radiance
+
+
+def table(model: Reconstructor, folder: Path, mean_light: Tensor, progress: Callable[[str], None]) -> dict[int, dict]:
+    """Means over the samples in ``folder`` for 1, 2 and 4 views; ``progress`` gets a line an object."""
+    out = {}
     for count in (1, 2, INPUTS):
         rows = []
-        for path in sorted(args.samples.glob("*.safetensors")):
+        for path in sorted(folder.glob("*.safetensors")):
             rows.append(evaluate(model, load_file(path), int(path.stem), count, mean_light))
-            print(f"{count} views, {path.stem}: {rows[-1]}", file=sys.stderr)
-        table[count] = {k: round(float(np.mean([r[k] for r in rows])), 4) for k in rows[0]} | {"objects": len(rows)}
-    text = json.dumps(table, indent=1)
-    print(text)
-    if args.json:
-        args.json.write_text(text + "\n")
-
-
-if __name__ == "__main__":
-    main()
+            progress(f"{count} views, {path.stem}: " + ", ".join(f"{k} {v:.3f}" for k, v in rows[-1].items()))
+        out[count] = {k: round(float(np.mean([r[k] for r in rows])), 4) for k in rows[0]} | {"objects": len(rows)}
+    return out
