@@ -48,7 +48,7 @@ WEIGHTS = {
     "metallic": 2.0,
     "normal": 1.0,
     "light": 0.5,
-    "image": 0.5,
+    "image": 0.3,
 }
 
 
@@ -98,7 +98,7 @@ def train(model: Reconstructor, config: TrainConfig) -> None:
         update_average(average, model, min(config.average, (1 + step) / (10 + step)))
         step, seconds = step + 1, time.monotonic() - began
         for k, v in {**terms, "norm": norm, "bad": float(not torch.isfinite(norm))}.items():
-            sums[k] = sums.get(k, 0.0) + float(v)
+            sums[k] = sums.get(k, 0.0) + float(torch.as_tensor(v).detach())
         if step % 50 == 0:
             means = {k: round(v / 50, 5) for k, v in sums.items()}
             log.write(

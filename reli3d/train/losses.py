@@ -12,15 +12,21 @@ from reli3d.nn.field import surface_level, surface_material
 from reli3d.nn.model import Code, Reconstructor
 from reli3d.nn.view_features import ViewMaps
 from reli3d.render.bump import radial_bump
+from reli3d.render.color import srgb_to_linear
+from reli3d.render.environment import Environment
+from reli3d.render.shading import shade
 from reli3d.train.samples import Batch
 
+IMAGE_SAMPLES = (12, 8, 2)  # light, GGX and cosine samples a pixel of the image loss
+LIGHT_ROWS = 16  # height of the decoded map that the image loss shades with
 LIGHT_DIRECTIONS = 384  # of the 2048 of a sample's map: enough for one step's mean, a fifth of the decoder's time
 
 
 def losses(model: Reconstructor, batch: Batch) -> dict[str, Tensor]:
     """Unweighted terms, each a scalar mean over the batch; gradients reach every parameter that took part."""
     code = model.encode(batch.images, batch.masks, batch.c2w, batch.intrinsics)
-    fields = [_object_losses(model, code.of(b), batch, b) for b in range(len(batch.images))]
+    lights = model.decode_environment(code, LIGHT_ROWS)
+    fields = [_object_losses(model, code.of(b), batch, b, lights[b]) for b in range(len(batch.images))]
     terms = {k: torch.stack([f[k] for f in fields]).mean() for k in fields[0]}
     terms["light"] = light_loss(model, code, batch)
     return terms
@@ -30,7 +36,7 @@ def maps_of(code: Code, images: Tensor, silhouette: Tensor, c2w: Tensor, intrins
     return ViewMaps(code.view_tokens[0], torch.cat([images, silhouette[..., None]], -1).contiguous(), c2w, intrinsics)
 
 
-def _object_losses(model: Reconstructor, code: Code, batch: Batch, b: int) -> dict[str, Tensor]:
+def _object_losses(model: Reconstructor, code: Code, batch: Batch, b: int, light: Tensor) -> dict[str, Tensor]:
     maps = maps_of(code, batch.images[b], batch.silhouette[b], batch.c2w[b], batch.intrinsics[b])
     level = surface_level(model, code, maps, batch.points[b])
     target = (-batch.distance[b] / model.preset.softness).sigmoid()
@@ -44,7 +50,29 @@ def _object_losses(model: Reconstructor, code: Code, batch: Batch, b: int) -> di
     out["metallic"] = functional.mse_loss(got["metallic"][:, 0], batch.material[b, :, 4])
     world = radial_bump(position, normal, got["normal"])
     out["normal"] = (1 - functional.cosine_similarity(world, bumped, dim=-1)).mean()
+    out["image"] = _image_loss(model, code, maps, batch, b, light)
     return out
+
+
+def _image_loss(model: Reconstructor, code: Code, maps: ViewMaps, batch: Batch, b: int, light: Tensor) -> Tensor:
+    """Difference of log(1 + radiance) of pixels of a view, mostly one that was not input, shaded with what is
+    predicted.
+
+    Shadows and what other surfaces reflect are missing from the prediction: the term teaches which material and light
+    explain a colour together, and weighs little.  Gradients reach material, bump normal and light.
+    """
+    position, _, wo = batch.pixels[b].unbind(1)
+    wo = functional.normalize(wo, dim=-1)
+    near = torch.cdist(position, batch.surface[b, :, 0]).argmin(1)  # the sample knows who sees its surface points
+    normal = functional.normalize(batch.surface[b, near, 1], dim=-1)
+    normal = torch.where(
+        (normal * wo).sum(-1, keepdim=True) > 0, normal, wo
+    )  # the nearest point may lie round a corner
+    got = surface_material(model, code, maps, position, normal, batch.visible[b, near])
+    shading = radial_bump(position, normal, got["normal"])
+    radiance = shade(position, shading, normal, wo, srgb_to_linear(got["base_color"]), got["roughness"][:, 0],
+                     got["metallic"][:, 0], Environment(light), samples=IMAGE_SAMPLES, seed=b)  # fmt: skip
+    return (torch.log1p(radiance) - torch.log1p(batch.pixel_radiance[b])).abs().mean()
 
 
 def light_loss(model: Reconstructor, code: Code, batch: Batch) -> Tensor:
