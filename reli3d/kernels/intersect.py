@@ -56,8 +56,9 @@ def closest_kernel(
     face[i] = -1
     t[i] = wp.inf
     bary[i] = wp.vec2(0.0, 0.0)
-    if ray_is_valid(o, d):
-        hit = wp.mesh_query_ray(mesh, o, d, wp.min(t_max[i % t_max.shape[0]], T_FAR))
+    far = t_max[i % t_max.shape[0]]
+    if ray_is_valid(o, d) and far > 0.0:  # false for NaN
+        hit = wp.mesh_query_ray(mesh, o, d, wp.min(far, T_FAR))
         if hit.result:
             face[i] = hit.face
             t[i] = hit.t
@@ -77,8 +78,9 @@ def occluded_kernel(
     o = origins[i]
     d = directions[i]
     occluded[i] = False
-    if ray_is_valid(o, d):
-        occluded[i] = hit_occluded(mesh, o, d, t_max[i % t_max.shape[0]])
+    far = t_max[i % t_max.shape[0]]
+    if ray_is_valid(o, d) and far > 0.0:  # false for NaN
+        occluded[i] = hit_occluded(mesh, o, d, far)
 
 
 @wp.kernel

@@ -1,0 +1,139 @@
+"""Environment maps: orientation, lookup with gradients, importance table."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.special import gammaincc
+
+from reli3d.render.environment import Environment, texel_solid_angles
+from tests import chi2, mitsuba_scene, reference
+
+
+def directions(n, seed=0):
+    return torch.nn.functional.normalize(torch.randn(n, 3, generator=torch.Generator().manual_seed(seed)), dim=-1)
+
+
+def maps():
+    g = torch.Generator().manual_seed(3)
+    one = torch.zeros(10, 100, 3)
+    one[4, 37] = 1.0
+    sun = torch.rand(32, 64, 3, generator=g)
+    sun[5, 9] = 1e6
+    gap = torch.rand(32, 64, 3, generator=g)
+    gap[10:14] = 0.0
+    return {"one texel": one, "constant": torch.ones(100, 100, 3), "3 x 2": torch.ones(2, 3, 3), "sun": sun,
+            "black rows": gap, "odd": torch.rand(17, 33, 3, generator=g) ** 4}  # fmt: skip
+
+
+def test_axes_are_those_of_the_convention(device):
+    marks = torch.zeros(4, 8, 3, device=device)
+    marks[:, 3:5, 0] = 1.0  # centre: -Z
+    marks[:, 5:7, 1] = 1.0  # right of it: +X
+    marks[0, :, 2] = 1.0  # first row: +Y
+    env = Environment(marks)
+    axes = torch.tensor([[0.0, 0, -1], [1, 0, 0], [0, 0, 1], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], device=device)
+    want = torch.tensor([[1.0, 0, 0], [0, 1, 0], [0, 0, 0], [0, 0, 0], [1, 0, 1], [1, 0, 0]], device=device)
+    torch.testing.assert_close(env.lookup(axes), want, atol=1e-5, rtol=0)  # at a pole u is 0.5
+
+
+def test_directions_of_the_published_parametrisation(goldens):
+    data = np.load(goldens / "env_parametrisation.npz")
+    uv, want = data["uv"].reshape(-1, 2), torch.from_numpy(data["uv_direction"].reshape(-1, 3))
+    ramp = torch.zeros(64, 128, 3)
+    ramp[..., 0] = (torch.arange(128) + 0.5) / 128
+    ramp[..., 1] = ((torch.arange(64) + 0.5) / 64)[:, None]
+    got = Environment(ramp).lookup(want)[:, :2].numpy()
+    inside = (uv[:, 0] > 0.01) & (uv[:, 0] < 0.99) & (uv[:, 1] > 0.01) & (uv[:, 1] < 0.99)
+    assert np.abs(got - uv)[inside].max() < 1e-5
+
+
+def test_lookup_and_its_gradient_equal_the_float64_twin(device):
+    g = torch.Generator().manual_seed(1)
+    radiance, d = torch.rand(9, 18, 3, generator=g), directions(3000)
+    weight = torch.randn(3000, 3, generator=g)
+    ins = [radiance.to(device).requires_grad_(), d.to(device).requires_grad_()]
+    got = Environment(ins[0]).lookup(ins[1])
+    twin = [radiance.double().requires_grad_(), d.double().requires_grad_()]
+    want = reference.lookup_envmap(*twin)
+    torch.testing.assert_close(got.cpu().double(), want, rtol=0, atol=2e-5)  # 1e-7 of u times 18 texels, with margin
+    grads = torch.autograd.grad((got * weight.to(device)).sum(), ins)
+    truth = torch.autograd.grad((want * weight.double()).sum(), twin)
+    torch.testing.assert_close(grads[0].cpu().double(), truth[0], rtol=1e-4, atol=1e-3)  # sums of 3000 float32 terms
+    project = lambda v: v - (v * d).sum(-1, keepdim=True) * d  # noqa: E731  only the tangent part is defined
+    off = (project(grads[1].cpu().double()) - project(truth[1])).norm(dim=-1) / (1.0 + project(truth[1]).norm(dim=-1))
+    assert (off < 1e-3).double().mean() > 0.999  # a direction may sit on a kink between texels
+
+
+@pytest.mark.parametrize("name", maps())
+def test_samples_fall_on_texels_as_their_density_says(device, name):
+    env = Environment(maps()[name].to(device))
+    height, width = env.radiance.shape[:2]
+    n = 200_000
+    u = torch.rand(n, 2, generator=torch.Generator().manual_seed(5)).to(device)
+    d, pdf = env.sample(u)
+    torch.testing.assert_close(d.norm(dim=-1), torch.ones(n, device=device), atol=1e-6, rtol=0)
+    # a sample on a texel border may round to the neighbour on its way through the direction
+    assert ((env.pdf(d) / pdf - 1).abs() > 1e-5).float().mean() < 1e-3
+    mass = (env.table.density.double() * texel_solid_angles(height, width, d.device)[:, None]).cpu().numpy()
+    assert abs(mass.sum() - 1.0) < 1e-5
+    d = d.cpu().double().numpy()
+    v = np.arccos(np.clip(d[:, 1], -1, 1)) / np.pi * height
+    w = (np.arctan2(d[:, 0], -d[:, 2]) / (2 * np.pi) + 0.5) * width
+    row, column = np.clip(v.astype(int), 0, height - 1), np.clip(w.astype(int), 0, width - 1)
+    # halves of each texel in azimuth and in height: uniform in solid angle inside
+    top, bottom = np.cos(np.pi * row / height), np.cos(np.pi * (row + 1) / height)
+    part = 2 * (w - column > 0.5) + ((top - d[:, 1]) / (top - bottom) > 0.5)
+    observed = np.bincount((row * width + column) * 4 + part, minlength=4 * height * width).astype(float)
+    expected = np.repeat(mass.ravel() / mass.sum() * n / 4, 4)
+    assert observed[expected == 0].sum() <= 1e-5 * n
+    keep = expected >= 5
+    o, e = np.append(observed[keep], observed[~keep].sum()), np.append(expected[keep], expected[~keep].sum())
+    o, e = o[e > 5], e[e > 5]
+    p = gammaincc((len(e) - 1) / 2, ((o - e) ** 2 / e).sum() / 2)
+    assert p > chi2.sidak(len(maps()))
+
+
+@pytest.mark.parametrize("name", maps())
+def test_weights_are_bounded_so_no_sample_is_a_firefly(device, name):
+    env = Environment(maps()[name].to(device))
+    d, pdf = env.sample(torch.rand(50_000, 2, generator=torch.Generator().manual_seed(6)).to(device))
+    weight = env.lookup(d) @ torch.tensor([0.2126, 0.7152, 0.0722], device=device) / pdf
+    # a bilinear value is at most its texel's four corners; the table holds at least (1/8)^2 of each
+    assert float(weight.max()) <= 16.5 * float(weight.mean())
+
+
+def test_table_of_a_black_map_is_the_uniform_sphere_and_bad_texels_are_named(device):
+    d, pdf = Environment(torch.zeros(4, 8, 3, device=device)).sample(torch.rand(1000, 2, device=device))
+    torch.testing.assert_close(pdf, torch.full_like(pdf, 1 / (4 * math.pi)), rtol=1e-5, atol=0)
+    bad = torch.zeros(4, 8, 3, device=device)
+    bad[1, 2, 0] = float("nan")
+    with pytest.raises(ValueError, match="radiance: expected finite"):
+        _ = Environment(bad).table
+    with pytest.raises(ValueError, match="radiance: expected"):
+        Environment(torch.zeros(0, 8, 3, device=device))
+    assert Environment(torch.ones(2, 4, 3, device=device)).lookup(torch.zeros(0, 3, device=device)).shape == (0, 3)
+
+
+def test_rotation_turns_the_light_about_y(device):
+    env = Environment(torch.rand(16, 32, 3, generator=torch.Generator().manual_seed(2)).to(device))
+    yaw = 2 * math.pi * 5 / 32
+    c, s = math.cos(yaw), math.sin(yaw)
+    turn = torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]], device=device)
+    d = directions(500).to(device)
+    torch.testing.assert_close(env.rotated(yaw).lookup(d @ turn.T), env.lookup(d), atol=1e-4, rtol=0)
+    there_and_back = env.rotated(0.3).rotated(-0.3).radiance.mean((0, 1))
+    torch.testing.assert_close(there_and_back, env.radiance.mean((0, 1)), rtol=1e-5, atol=0)
+
+
+@pytest.mark.slow  # Mitsuba starts its compiler
+def test_lookup_equals_mitsubas_map():
+    mi = mitsuba_scene.load()
+    env = Environment(torch.rand(8, 16, 3, generator=torch.Generator().manual_seed(2)))
+    d = directions(4000)
+    scene = mi.load_dict({"type": "scene", "light": mitsuba_scene.environment(mi, env.radiance)})
+    ray = mi.Ray3f(mi.Point3f(0, 0, 0), mi.Vector3f(d.numpy().T.copy()))
+    si = scene.ray_intersect(ray)
+    got = np.array(scene.environment().eval(si)).T
+    assert np.abs(got - env.lookup(d).numpy()).max() < 2e-3  # Mitsuba's map stores half floats

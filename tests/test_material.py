@@ -1,0 +1,86 @@
+"""The material's value against a float64 twin, Mitsuba's distribution, reciprocity and energy."""
+
+import pytest
+import torch
+
+from reli3d.render.material import eval_bsdf, pdf_lobes, sample_bsdf
+from tests import mitsuba_scene, reference
+
+
+def pairs(n, seed=0, low=0.02):
+    g = torch.Generator().manual_seed(seed)
+    d = torch.nn.functional.normalize(torch.randn(2, n, 3, generator=g), dim=-1)
+    d[..., 2] = d[..., 2].abs().clamp(min=low)
+    wo, wi = torch.nn.functional.normalize(d, dim=-1)
+    return wo, wi, torch.rand(n, 3, generator=g), 0.01 + 0.99 * torch.rand(n, generator=g), torch.rand(n, generator=g)
+
+
+def test_value_and_gradients_equal_the_float64_twin(device):
+    ins = pairs(4000)
+    leaf = [v.to(device).requires_grad_() for v in ins]
+    twin = [v.double().requires_grad_() for v in ins]
+    got, want = eval_bsdf(*leaf), reference.eval_bsdf(*twin)
+    assert ((got.cpu().double() / want - 1).abs() < 2e-4).all()  # 1e-7 in cos against alpha^2 = 1e-4 at the peak
+    weight = torch.randn(got.shape, generator=torch.Generator().manual_seed(1))
+    grads = torch.autograd.grad((got * weight.to(device)).sum(), leaf)
+    truth = torch.autograd.grad((want * weight.double()).sum(), twin)
+    # the two write cosines differently off the unit sphere: only the tangent part of a direction's gradient is defined
+    grads, truth = list(grads), list(truth)
+    for k in range(2):
+        w = twin[k].detach()
+        grads[k] = grads[k].cpu().double() - (grads[k].cpu().double() * w).sum(-1, keepdim=True) * w
+        truth[k] = truth[k] - (truth[k] * w).sum(-1, keepdim=True) * w
+    for g, t in zip(grads, truth, strict=True):
+        off = (g.cpu().double() - t).abs() / (t.abs() + 1e-2 * t.abs().mean() + 1e-3)
+        assert (off < 2e-3).double().mean() > 0.999  # lobes of alpha 0.01 lose three digits more
+
+
+def test_reciprocity(device):
+    wo, wi, base, alpha, metallic = (v.to(device) for v in pairs(100_000, 1))
+    a, b = eval_bsdf(wo, wi, base, alpha, metallic), eval_bsdf(wi, wo, base, alpha, metallic)
+    torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-7)
+
+
+def test_energy_is_never_created(device):
+    g = torch.Generator().manual_seed(2)
+    n = 40_000
+    for alpha in (1e-3, 0.05, 0.3, 1.0):
+        for cos_o in (1e-3, 0.3, 1.0):
+            wo = torch.tensor([(1 - cos_o**2) ** 0.5, 0.0, cos_o], device=device)
+            a, one = torch.tensor(alpha, device=device), torch.ones((), device=device)
+            wi = sample_bsdf(wo, a, torch.rand(n, 2, generator=g).to(device), "visible")
+            pdf = pdf_lobes(wo, wi, a)[:, 0]
+            value = eval_bsdf(wo, wi, torch.ones(3, device=device), a, one)[:, 0] * wi[:, 2] / pdf.clamp(min=1e-20)
+            weight = torch.where(pdf > 0, value, 0.0)
+            assert float(weight.max()) <= 1.0 + 1e-3  # G2 / G1 of a metal of reflectance 1
+            assert float(weight.mean()) <= 1.0
+
+
+def test_directions_below_the_horizon_and_extreme_parameters(device):
+    for z in (1e-3, 0.0, -0.1):
+        wo = torch.tensor([(1 - z * z) ** 0.5, 0.0, z], device=device)
+        wi = torch.nn.functional.normalize(torch.randn(100, 3, generator=torch.Generator().manual_seed(3)), dim=-1).to(
+            device
+        )
+        for alpha in (0.0, 1.0):
+            out = eval_bsdf(
+                wo, wi, torch.ones(3, device=device), torch.tensor(alpha, device=device), wi.new_tensor(0.5)
+            )
+            assert bool(torch.isfinite(out).all()) and float(out.min()) >= 0.0
+            assert z > 0 or float(out.max()) == 0.0
+            assert float(out[wi[:, 2] <= 0].abs().sum()) == 0.0
+
+
+@pytest.mark.slow  # Mitsuba starts its compiler
+def test_distribution_equals_mitsubas():
+    mi = mitsuba_scene.load()
+    wo, wi, *_ = pairs(2000, 4)
+    wm = torch.nn.functional.normalize(wo + wi, dim=-1)
+    one, alpha = torch.ones(2000), 0.2
+    got = eval_bsdf(wo, wi, torch.ones(2000, 3), one * alpha, one)[:, 0]  # white metal: D G2 / (4 cos cos)
+    judge = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, alpha, alpha)
+    h, o, i = (mi.Vector3f(v.numpy().T.copy()) for v in (wm, wo, wi))
+    d = torch.from_numpy(judge.eval(h).numpy())
+    g1 = [torch.from_numpy(judge.smith_g1(v, h).numpy()) for v in (o, i)]
+    g2 = 1 / (1 / g1[0] + 1 / g1[1] - 1)
+    torch.testing.assert_close(got, d * g2 / (4 * wo[:, 2] * wi[:, 2]), rtol=2e-4, atol=0)

@@ -1,0 +1,203 @@
+"""Rays against float64 brute force, Embree against Warp, and every input that must not crash."""
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from reli3d.geometry.rays import RayScene, offset_origin
+from reli3d.render.gbuffer import evaluate_hits, hit_normals, interpolate
+
+BACKENDS = ["embree", "warp"]
+
+
+def make(vertices, faces, backend, device):
+    if backend == "embree" and device.type != "cpu":
+        pytest.skip("Embree runs on CPU only")
+    v = torch.as_tensor(np.asarray(vertices), dtype=torch.float32, device=device)
+    return RayScene(v, torch.as_tensor(np.asarray(faces), dtype=torch.int32, device=device), backend)
+
+
+def soup(seed, count=60):
+    rng = np.random.default_rng(seed)
+    centre = rng.uniform(-1, 1, (count, 1, 3))
+    vertices = (centre + rng.normal(0, 0.3, (count, 3, 3))).reshape(-1, 3).astype(np.float32)
+    return vertices, np.arange(3 * count, dtype=np.int32).reshape(-1, 3)
+
+
+def rays(n, seed=0, reach=2.0):
+    rng = np.random.default_rng(seed)
+    o, d = rng.uniform(-reach, reach, (n, 3)), rng.normal(size=(n, 3))
+    return torch.tensor(o, dtype=torch.float32), torch.tensor(d, dtype=torch.float32)
+
+
+def brute_force(vertices, faces, o, d):
+    """Closest t of every ray in float64, over all faces; inf for a miss."""
+    a, b, c = (np.asarray(vertices, np.float64)[np.asarray(faces)[:, k]] for k in range(3))
+    o, d = o.double().numpy()[:, None], d.double().numpy()[:, None]
+    p = np.cross(d, c - a)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = 1 / ((b - a) * p).sum(-1)
+        s = o - a
+        q = np.cross(s, b - a)
+        u, v, t = (s * p).sum(-1) * inverse, (d * q).sum(-1) * inverse, ((c - a) * q).sum(-1) * inverse
+        hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (t >= 0)
+    return np.where(hit, t, np.inf), np.stack([u, v], -1)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("scale, shift", [(1.0, 0.0), (1e-4, 0.0), (1.0, 1e3)])
+def test_hits_are_those_of_float64_brute_force(device, backend, scale, shift):
+    for seed in range(3):
+        vertices, faces = soup(seed)
+        vertices = (vertices * scale + shift).astype(np.float32)
+        o, d = rays(3000, seed)
+        o = o * scale + shift
+        scene = make(vertices, faces, backend, device)
+        hits = scene.closest(o.to(device), d.to(device))
+        t, bary = brute_force(vertices, faces, o, d)
+        first = t.argmin(1)
+        best = np.where(np.isinf(t.min(1)), 1e30, t.min(1))
+        face, got = hits.face.cpu().numpy(), hits.t.cpu().double().clamp(max=1e30).numpy()
+        same = face == np.where(best < 1e30, first, -1)
+        tolerance = 1e-5 * scale + 4e-7 * abs(shift)  # the second: float32 positions far from the origin
+        agree = same | (np.abs(got - best) <= tolerance)
+        assert agree.mean() >= 1 - (1e-3 if shift == 0 else 0.02)  # a ray may pass an edge within rounding
+        sure = same & (face >= 0)
+        assert np.quantile(np.abs(got - best)[sure], 0.999) <= 10 * tolerance  # grazing rays stretch the error
+        off = np.abs(hits.bary.cpu().numpy() - bary[np.arange(len(o)), first])[sure]
+        assert np.quantile(off, 0.99) < (2e-4 if shift == 0 else 5e-2)  # 6e-5 of a position 1e3 away over faces of 0.3
+        assert np.isinf(hits.t.cpu().numpy()[face < 0]).all() and (hits.bary.cpu().numpy()[face < 0] == 0).all()
+        assert np.array_equal(scene.occluded(o.to(device), d.to(device)).cpu().numpy(), face >= 0)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_rays_at_edges_and_vertices_of_a_closed_mesh_do_not_leak(device, backend):
+    mesh = trimesh.creation.icosphere(subdivisions=4)
+    scene = make(mesh.vertices, mesh.faces, backend, device)
+    rng = np.random.default_rng(1)
+    origin = rng.uniform(-0.3, 0.3, (40_000, 3))
+    vertex = mesh.vertices[rng.integers(0, len(mesh.vertices), len(origin))]
+    pair = mesh.vertices[mesh.edges_unique[rng.integers(0, len(mesh.edges_unique), len(origin))]]
+    edge = pair[:, 0] + (pair[:, 1] - pair[:, 0]) * rng.random((len(origin), 1))
+    for target, limit in ((vertex, 5e-3), (edge, 3e-4)):  # measured: 0.4 % of either backend, 0.006 % of Warp
+        d = torch.tensor(target - origin, dtype=torch.float32, device=device)
+        hits = scene.closest(torch.tensor(origin, dtype=torch.float32, device=device), d)
+        assert (hits.face < 0).float().mean() <= limit
+
+
+def test_backends_agree_on_a_million_ray_queries(device):
+    if device.type != "cpu":
+        pytest.skip("Embree runs on CPU only")
+    mesh = trimesh.creation.icosphere(subdivisions=4)
+    o, d = rays(200_000, 3)
+    a, b = (make(mesh.vertices, mesh.faces, k, device).closest(o, d) for k in BACKENDS)
+    assert (a.face != b.face).float().mean() <= 5e-5
+    both = (a.face == b.face) & (a.face >= 0)
+    assert float((a.t - b.t)[both].abs().max()) < 1e-4
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_not_finite_and_zero_rays_miss(device, backend):
+    mesh = trimesh.creation.icosphere(subdivisions=1)
+    scene = make(mesh.vertices, mesh.faces, backend, device)
+    inf, nan = float("inf"), float("nan")
+    o = torch.zeros(9, 3, device=device)
+    d = torch.ones(9, 3, device=device)
+    d[0, 0], d[1, 1], d[2, 2], o[3, 0], o[4, 1], o[5, 2] = nan, inf, -inf, nan, inf, -inf
+    d[6] = 0.0
+    d[7] = 1e-30
+    hits = scene.closest(o, d)
+    assert hits.face.tolist()[:7] == [-1] * 7 and hits.face.tolist()[7] >= 0 and hits.face.tolist()[8] >= 0
+    assert scene.occluded(o, d).tolist() == [False] * 7 + [True, True]
+    for far in (nan, -1.0, 0.0):
+        assert scene.closest(o[8:], d[8:], t_max=far).face.tolist() == [-1]
+        assert not bool(scene.occluded(o[8:], d[8:], t_max=far)[0])
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_limits_shapes_and_refit(device, backend):
+    square = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    scene = make(square, [[0, 1, 2], [0, 2, 3]], backend, device)
+    o = torch.tensor([0.2, 0.1, 2.0], device=device)
+    d = torch.tensor([0.0, 0.0, -0.5], device=device)
+    hit = scene.closest(o, d)  # no batch axis
+    assert hit.face.shape == () and float(hit.t) == 4.0 and hit.bary.shape == (2,)
+    assert int(scene.closest(o, d, t_max=4.0).face) == -1 and int(scene.closest(o, d, t_max=4.001).face) >= 0
+    assert not bool(scene.occluded(o, d, t_max=4.0)) and bool(scene.occluded(o, d, t_max=4.001))
+    many = scene.closest(o.expand(2, 1, 3), d.expand(1, 5, 3), t_max=torch.full((2, 5), 9.0, device=device))
+    assert many.face.shape == (2, 5) and bool((many.face >= 0).all())
+    assert scene.closest(o.expand(0, 3), d.expand(0, 3)).face.shape == (0,)
+    moved = torch.as_tensor(square, dtype=torch.float32, device=device) + torch.tensor([0, 0, 1.0], device=device)
+    scene.refit(moved)
+    assert float(scene.closest(o, d).t) == 2.0
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_degenerate_meshes_are_data_and_broken_ones_are_named(device, backend):
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [2, 0, 0]], np.float32)
+    o, d = torch.tensor([[0.2, 0.2, 1.0]], device=device), torch.tensor([[0.0, 0.0, -1.0]], device=device)
+    scene = make(vertices, [[0, 1, 3], [1, 1, 2], [0, 1, 2], [0, 1, 2]], backend, device)
+    assert int(scene.closest(o, d).face) in (2, 3)
+    for empty in (np.zeros((0, 3), np.int32), np.zeros((0, 3), np.int32)[:0]):
+        nothing = make(vertices, empty, backend, device)
+        assert int(nothing.closest(o, d).face) == -1 and not bool(nothing.occluded(o, d)[0])
+    for faces in ([[0, 1, 4]], [[0, 1, -1]]):
+        with pytest.raises(ValueError, match="faces: expected indices"):
+            make(vertices, faces, backend, device)
+    with pytest.raises(ValueError, match="vertices: expected finite"):
+        make(np.where(vertices == 2, np.nan, vertices), [[0, 1, 2]], backend, device)
+    with pytest.raises(ValueError, match="backend: expected"):
+        make(vertices, [[0, 1, 2]], "optix", device)
+    with pytest.raises(TypeError, match="origins: expected"):
+        scene.closest(o.double(), d)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("scale, shift", [(1.0, 0.0), (1e-4, 0.0), (1e3, 0.0), (1.0, 50.0)])
+def test_offset_rays_do_not_hit_their_own_face(device, backend, scale, shift):
+    vertices, faces = soup(5, 400)
+    vertices = (vertices * scale + shift).astype(np.float32)
+    scene = make(vertices, faces, backend, device)
+    rng = np.random.default_rng(2)
+    n = 100_000
+    face = torch.tensor(rng.integers(0, len(faces), n), dtype=torch.int32, device=device)
+    b = rng.random((n, 2))
+    b = np.where(b.sum(1, keepdims=True) > 1, 1 - b, b)
+    bary = torch.tensor(b, dtype=torch.float32, device=device)
+    v, f = scene.vertices, scene.faces
+    position, ng = interpolate(v, f, face, bary), hit_normals(v, f, face)
+    d = torch.tensor(rng.normal(size=(n, 3)), dtype=torch.float32, device=device)
+    d = torch.nn.functional.normalize(d, dim=-1)
+    hits = scene.closest(offset_origin(position, ng, d, scale=scene.scale), d)
+    assert int((hits.face == face).sum()) == 0
+
+
+def test_reevaluated_hit_and_its_gradients_equal_float64(device):
+    vertices, faces = soup(7, 30)
+    o, d = rays(4000, 4)
+    v, f = torch.tensor(vertices, device=device), torch.tensor(faces, device=device)
+    hits = RayScene(v, f).closest(o.to(device), d.to(device))
+    p = torch.cross(d, (v[f[hits.face.long(), 2].long()] - v[f[hits.face.long(), 0].long()]).cpu(), dim=-1)
+    e = (v[f[hits.face.long(), 1].long()] - v[f[hits.face.long(), 0].long()]).cpu()
+    steep = (hits.face >= 0).cpu() & ((p * e).sum(-1).abs() > 0.05)  # at grazing rays float32 has no digits left
+    face, o, d = hits.face[steep.to(device)], o[steep], d[steep]
+    ins = [t.to(device).requires_grad_() for t in (torch.tensor(vertices), o, d)]
+    some = type(hits)(face, hits.t[steep.to(device)], hits.bary[steep.to(device)])
+    got = evaluate_hits(ins[0], f, some, ins[1], ins[2])
+    torch.testing.assert_close(got.t, some.t, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(got.bary, some.bary, rtol=0, atol=1e-4)
+    position = interpolate(ins[0], f, face, got.bary)
+    twin = [t.detach().cpu().double().requires_grad_() for t in ins]
+    a, b, c = (twin[0][f.cpu().long()[face.cpu().long(), k]] for k in range(3))
+    system = torch.stack([b - a, c - a, -twin[2]], -1)  # a + u e1 + v e2 = o + t d
+    uvt = torch.linalg.solve(system, twin[1] - a)
+    spot = twin[1] + uvt[:, 2:] * twin[2]
+    weight = torch.randn(len(o), 6, generator=torch.Generator().manual_seed(1))
+    total = torch.cat([got.t[:, None], got.bary, position], -1)
+    want = torch.cat([uvt[:, 2:], uvt[:, :2], spot], -1)
+    torch.testing.assert_close(total.cpu().double(), want, rtol=1e-4, atol=1e-4)
+    grads = torch.autograd.grad((total * weight.to(device)).sum(), ins)
+    truth = torch.autograd.grad((want * weight.double()).sum(), twin)
+    for g, t in zip(grads, truth, strict=True):
+        torch.testing.assert_close(g.cpu().double(), t, rtol=2e-3, atol=2e-3 * float(t.abs().mean()) + 1e-3)

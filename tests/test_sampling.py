@@ -1,0 +1,136 @@
+"""Samplers of directions against their densities, and the random numbers."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from reli3d.render.material import pdf_lobes, sample_bsdf
+from reli3d.render.sampling import halton, pdf_cosine, pdf_ggx_vndf, random_pairs, sample_cosine, sample_ggx_vndf
+from tests import chi2, reference
+
+QUICK = [(alpha, deg) for alpha in (0.1, 0.5, 1.0) for deg in (0, 45, 80)]
+FULL = [(alpha, deg) for alpha in (0.05, 0.1, 0.25, 0.5, 1.0) for deg in (0, 15, 45, 80, 89)]
+LEVEL = chi2.sidak(3 * len(FULL) + 10)  # three samplers a lobe, and the rest of this file
+N = 100_000
+
+
+def view(deg, device, phi=0.4):
+    t = math.radians(deg)
+    return torch.tensor([math.sin(t) * math.cos(phi), math.sin(t) * math.sin(phi), math.cos(t)], device=device)
+
+
+def uniform(n, device, seed=7):
+    return torch.rand(n, 2, generator=torch.Generator().manual_seed(seed)).to(device)
+
+
+def grid(alpha):
+    """Cells and quadrature: narrow lobes need both finer; axis x, so that no lobe sits in the fan around the pole."""
+    return {"res": 41, "ires": 8, "up": 0} if alpha > 0.2 else {"res": 81, "ires": 8, "up": 0}
+
+
+def check_lobe(alpha, deg, device, n):
+    wo, a, u = view(deg, device), torch.tensor(alpha, device=device), uniform(n, device)
+    p = chi2.p_value(sample_ggx_vndf(wo, a, u), lambda m: pdf_ggx_vndf(wo, a, m), **grid(alpha))
+    assert p > LEVEL, f"half vector, p = {p}"
+    for k, lobe in enumerate(("visible", "partner", "cosine")):
+        wi = sample_bsdf(wo, a, u, lobe)
+        above = wi[:, 2] > 1e-6
+        p = chi2.p_value(wi[above], lambda d, k=k: pdf_lobes(wo, d, a)[:, k], total=n, **grid(alpha))
+        assert p > LEVEL, f"{lobe}, p = {p}"
+
+
+@pytest.mark.parametrize("alpha, deg", QUICK)
+def test_lobes_follow_their_densities(device, alpha, deg):
+    check_lobe(alpha, deg, device, N)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("alpha, deg", FULL)
+def test_lobes_follow_their_densities_with_a_million_samples(device, alpha, deg):
+    check_lobe(alpha, deg, device, 1_000_000)
+
+
+def test_cosine_follows_its_density(device):
+    assert chi2.p_value(sample_cosine(uniform(N, device)), pdf_cosine) > LEVEL
+
+
+def test_the_test_has_power(device):
+    """A density 3 % off along one axis, swapped axes and the original's density for the partner are all refused."""
+    wo, a, u = view(60, device), torch.tensor(0.5, device=device), uniform(1_000_000, device)
+    wm = sample_ggx_vndf(wo, a, u)
+    tilted = lambda m: pdf_ggx_vndf(wo, a, m) * (1.0 + 0.03 * m[:, 0])  # noqa: E731
+    assert chi2.p_value(wm, tilted, res=15, ires=24) < LEVEL
+    assert chi2.p_value(wm[:, [1, 0, 2]], lambda m: pdf_ggx_vndf(wo, a, m)) < LEVEL
+    wi = sample_bsdf(wo, a, u, "partner")
+    above = wi[:, 2] > 1e-6
+    assert chi2.p_value(wi[above], lambda d: pdf_lobes(wo, d, a)[:, 0], total=len(u)) < LEVEL
+
+
+@pytest.mark.parametrize("alpha, deg", QUICK)
+def test_visible_normal_density_integrates_to_one(device, alpha, deg):
+    wo, a = view(deg, device), torch.tensor(alpha, device=device)
+    mass = chi2.cell_masses(lambda m: pdf_ggx_vndf(wo, a, m), 151, 6, 0, device).sum()
+    assert abs(mass - 1.0) < 1e-3  # midpoint rule on 0.2 degree cells against a lobe of 6 degrees and the cut wo.wm = 0
+
+
+def test_visible_normals_equal_their_float64_twin(device):
+    g = torch.Generator().manual_seed(1)
+    n = 4000
+    wo = torch.nn.functional.normalize(torch.rand(n, 3, generator=g) + torch.tensor([-0.5, -0.5, 0.02]), dim=-1)
+    wo[:, 2] = wo[:, 2].abs().clamp(min=0.01)
+    wo = torch.nn.functional.normalize(wo, dim=-1)
+    alpha, u = 0.02 + 0.98 * torch.rand(n, generator=g), torch.rand(n, 2, generator=g)
+    u[:, 1] = u[:, 1] * 0.98  # the rim of the cap, where a root has infinite slope, is left out of the gradient
+    ins = [wo.to(device).requires_grad_(), alpha.to(device).requires_grad_()]
+    got = sample_ggx_vndf(*ins, u.to(device))
+    twin = [wo.double().requires_grad_(), alpha.double().requires_grad_()]
+    want = reference.sample_ggx_vndf(*twin, u.double())
+    # float32: 1e-7 grows by 1 / alpha where the lobe is stretched
+    torch.testing.assert_close(got.cpu().double(), want, rtol=0, atol=2e-5)
+    weight = torch.randn(n, 3, generator=g)
+    grads = torch.autograd.grad((got * weight.to(device)).sum(), ins)
+    truth = torch.autograd.grad((want * weight.double()).sum(), twin)
+    for a, b in zip(grads, truth, strict=True):
+        off = (a.cpu().double() - b).abs() / (b.abs() + 0.1)
+        assert (off < 1e-3).double().mean() > 0.995  # the rest lies at the root's floor, cap height near 1
+
+
+def test_density_equals_its_float64_twin(device):
+    g = torch.Generator().manual_seed(2)
+    n = 4000
+    wo, wm = (torch.nn.functional.normalize(torch.rand(n, 3, generator=g) + 0.02, dim=-1) for _ in range(2))
+    alpha = 0.02 + 0.98 * torch.rand(n, generator=g)
+    got = pdf_ggx_vndf(wo.to(device), alpha.to(device), wm.to(device)).cpu().double()
+    want = reference.pdf_ggx_vndf(wo.double(), alpha.double(), wm.double())
+    assert ((got / want - 1).abs() < 1e-4).all()  # relative, from 1e-7 in the cosine of wm against alpha^2 = 4e-4
+
+
+def test_random_pairs_are_uniform_independent_and_addressed(device):
+    u = random_pairs(200_000, seed=3, sample=5, dimension=1, device=device).cpu().numpy()
+    assert u.min() >= 0.0 and u.max() < 1.0
+    counts, _, _ = np.histogram2d(u[:, 0], u[:, 1], bins=32, range=[[0, 1], [0, 1]])
+    stat = ((counts - counts.mean()) ** 2 / counts.mean()).sum()
+    assert abs(stat - 1023) < 4.5 * (2 * 1023) ** 0.5  # chi-square of 1024 cells
+    for other in ({"seed": 4}, {"sample": 6}, {"dimension": 2}):
+        v = random_pairs(200_000, **{"seed": 3, "sample": 5, "dimension": 1, **other}, device=device).cpu().numpy()
+        assert abs(np.corrcoef(u.ravel(), v.ravel())[0, 1]) < 4.5 / 400_000**0.5
+    assert np.array_equal(u[:100], random_pairs(100, seed=3, sample=5, dimension=1, device=device).cpu().numpy())
+    assert len(np.unique(u, axis=0)) > 200_000 * 0.999  # 48 bits a pair: no stream runs into another
+
+
+def test_halton_points_are_the_radical_inverses(device):
+    want = [[1 / 2, 1 / 3], [1 / 4, 2 / 3], [3 / 4, 1 / 9], [1 / 8, 4 / 9], [5 / 8, 7 / 9], [3 / 8, 2 / 9]]
+    torch.testing.assert_close(halton(6, device=device).cpu(), torch.tensor(want), rtol=0, atol=1e-7)
+
+
+def test_bad_input_is_named(device):
+    wo, alpha, u = torch.rand(4, 3, device=device), torch.rand(4, device=device), torch.rand(4, 2, device=device)
+    with pytest.raises(TypeError, match="wo: expected torch.float32"):
+        sample_ggx_vndf(wo.double(), alpha, u)
+    with pytest.raises(ValueError, match="u: expected shape"):
+        sample_ggx_vndf(wo, alpha, wo)
+    with pytest.raises(ValueError, match="lobe: expected"):
+        sample_bsdf(wo, alpha, u, "other")
+    assert sample_ggx_vndf(wo[:0], alpha[:0], u[:0]).shape == (0, 3)
