@@ -11,7 +11,6 @@ from reli3d.kernels import triplane as kernels
 
 BLOCK = 8  # channels of a kernels.vec8
 CACHED = 1 << 16  # floats of a plane that stay in a core's second-level cache whatever the order of the points
-REPEAT = 8  # threads a row of cells in the backward launch, which is sliced over the pool by its number of threads
 
 
 class _SampleTriplane(torch.autograd.Function):
@@ -60,18 +59,19 @@ def _packed(planes: Tensor) -> Tensor:
 
 
 def _by_cell_row(points: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
-    """Points of every plane by row of cells, ``(3 * B, N)`` int32, stable, and the start of every row and their end,
-    ``(3 * B, height + 2)``; points that miss the plane come last."""
+    """Points of every plane by row of cells, ``(3 * B, N)`` int32, and the start of every row and their end,
+    ``(3 * B, height + 2)``; along a row roughly by column, points that miss the plane last."""
     slabs, n = points.shape[0] * 3, points.shape[1]
-    rows = torch.empty(slabs, n, dtype=torch.int16, device=points.device)
-    launch(kernels.cell_row_kernel, slabs * n, [(points.view(-1, 3), kernels.wp.vec3), n, height, width,
-                                                (rows.view(-1), kernels.wp.int16)], points.device)  # fmt: skip
+    bins = 2**16 // (height + 2)
+    keys = torch.empty(slabs, n, dtype=torch.int32, device=points.device)
+    launch(kernels.cell_key_kernel, slabs * n, [(points.view(-1, 3), kernels.wp.vec3), n, height, width, bins,
+                                                (keys.view(-1), kernels.wp.int32)], points.device)  # fmt: skip
     if points.is_cuda:
-        order = torch.argsort(rows, dim=1, stable=True).to(torch.int32)
+        order = torch.argsort(keys, dim=1, stable=True).to(torch.int32)
     else:  # numpy sorts 16-bit keys by radix, ten times faster than torch.sort
-        order = torch.from_numpy(np.argsort(rows.numpy(), axis=1, kind="stable").astype(np.int32))
-    bins = torch.arange(slabs, device=points.device)[:, None] * (height + 2) + rows
-    count = torch.bincount(bins.view(-1), minlength=slabs * (height + 2)).view(slabs, height + 2)
+        order = torch.from_numpy(np.argsort(keys.numpy().astype(np.uint16), axis=1, kind="stable").astype(np.int32))
+    rows = keys // bins + torch.arange(slabs, device=points.device)[:, None] * (height + 2)
+    count = torch.bincount(rows.view(-1), minlength=slabs * (height + 2)).view(slabs, height + 2)
     edges = torch.nn.functional.pad(count[:, :-1].cumsum(1), (1, 0)).to(torch.int32)
     return order, edges
 
@@ -92,12 +92,13 @@ def _planes_adjoint(points: Tensor, g: Tensor, order: Tensor, edges: Tensor, sha
     channels, height, width = shape[2:]
     blocks = g.shape[-1] // BLOCK
     g_planes = torch.zeros(batch, 3, height, width, blocks * BLOCK, device=points.device)
+    # a row is as much work as 32 threads elsewhere, and launch() slices by their number: on CPU the others rest
+    work, split = (32, 1) if points.device.type == "cpu" else (blocks, blocks)
     for parity in (0, 1):
-        work = batch * 3 * ((height + 2 - parity) // 2) * blocks
-        launch(kernels.planes_adjoint_kernel, work * REPEAT, [
+        launch(kernels.planes_adjoint_kernel, batch * 3 * ((height + 2 - parity) // 2) * work, [
             (points.view(-1, 3), kernels.wp.vec3), (g.view(-1, BLOCK), kernels.vec8),
-            (order.view(-1), kernels.wp.int32), (edges.view(-1), kernels.wp.int32), parity, REPEAT, n, height, width,
-            blocks, (g_planes.view(-1, BLOCK), kernels.vec8)], points.device)  # fmt: skip
+            (order.view(-1), kernels.wp.int32), (edges.view(-1), kernels.wp.int32), parity, work, split, n, height,
+            width, blocks, (g_planes.view(-1, BLOCK), kernels.vec8)], points.device)  # fmt: skip
     return g_planes[..., :channels].permute(0, 1, 4, 2, 3)
 
 
@@ -128,9 +129,9 @@ def sample_triplane(planes: Tensor, points: Tensor) -> Tensor:
         raise ValueError(f"points: expected shape ({planes.shape[0]}, N, 3), got {tuple(points.shape)}")
     batch, _, channels, height, width = planes.shape
     if max(height, width) > 32000:
-        raise ValueError(f"planes: expected at most 32000 rows and columns, got {(height, width)}")  # int16
+        raise ValueError(f"planes: expected at most 32000 rows and columns, got {(height, width)}")  # 16-bit keys
     blocks = -(-channels // BLOCK)
-    largest = 3 * batch * max(height * width * blocks, (height + 2) * blocks * REPEAT, points.shape[1] * blocks)
+    largest = 3 * batch * max(height * width * blocks, (height + 2) * 32 * blocks, points.shape[1] * blocks)
     if largest >= 2**31:
         raise ValueError(f"planes, points: expected fewer than 2**31 blocks of 8 channels, got {largest}")
     return _SampleTriplane.apply(planes, points)
