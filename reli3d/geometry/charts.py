@@ -246,10 +246,10 @@ def _cut_bulky(points: np.ndarray, chart: np.ndarray, right: np.ndarray, up: np.
 def _overlaps(charts: Charts, boxes: np.ndarray, query: np.ndarray):
     """``find(emit, offset, partner)``: number of faces of ``boxes`` that overlap each of ``query``, ``(Q,)`` int32."""
     corners = torch.from_numpy(charts.corners)
-    tips = torch.from_numpy(charts.corners[boxes])
-    z = torch.from_numpy(charts.chart[boxes]).float()[:, None]
-    lower, upper = torch.aminmax(tips, dim=1)
-    lower, upper = torch.cat([lower, z], 1), torch.cat([upper, z], 1)
+    a, b, c = (charts.corners[boxes, k] for k in range(3))
+    z = charts.chart[boxes].astype(np.float32)
+    lower = torch.from_numpy(np.column_stack([np.minimum(np.minimum(a, b), c), z]))
+    upper = torch.from_numpy(np.column_stack([np.maximum(np.maximum(a, b), c), z]))
     _bridge.initialise()
     bvh = wp.Bvh(wp.from_torch(lower, wp.vec3), wp.from_torch(upper, wp.vec3))
     count = torch.zeros(len(query), dtype=torch.int32)
@@ -323,15 +323,16 @@ def make_charts(points: np.ndarray, faces: np.ndarray, *, texels: float, least_t
     local = ((points - centre) / reach).astype(np.float32)  # at most 1: products cannot overflow
     normal = torch.empty(len(faces), 3)
     _bridge.launch(kernels.normals_kernel, len(faces), [_floats(local, wp.vec3), _ints(faces), (normal, wp.vec3)], CPU)
-    area = 0.5 * float(normal.double().norm(dim=1).sum())
+    size = 0.5 * np.sqrt(np.einsum("fk,fk->f", normal.numpy(), normal.numpy(), dtype=np.float64))
+    area = float(size.sum())
     unit = np.sqrt(texels / area) if area > 1e-30 else 0.0
-    local, normal = local * np.float32(unit), normal * (unit * unit)
+    local, size = local * np.float32(unit), size * unit**2
+    normal = torch.from_numpy(normal.numpy() * np.float32(unit * unit))
     neighbours = face_neighbours(faces)
     label = merge_small(axis_labels(normal, neighbours), normal.numpy(), neighbours, least_texels)
     chart, count = components(neighbours, label)
     right, up = _frames(normal, label, chart, count)
     centres = local[faces].mean(1).astype(np.float64)
-    size = 0.5 * normal.double().norm(dim=1).numpy()
     for _ in range(CUTTING):
         cut = _cut_bulky(centres, chart, right, up, np.bincount(chart, size, count), CUT_WASTE * texels, neighbours)
         if cut is None:

@@ -68,7 +68,7 @@ def _check(mesh: Mesh, texture_size: int) -> None:
         raise ValueError(f"texture_size: expected an integer in [16, 16384], got {texture_size!r}")
     if len(mesh.faces) == 0:
         raise ValueError("mesh.faces: expected at least one face, got 0")
-    if not bool(torch.isfinite(mesh.vertices.detach()).all()):
+    if not np.isfinite(mesh.vertices.detach().cpu().numpy()).all():
         raise ValueError("mesh.vertices: expected finite coordinates, got NaN or infinity")
 
 
