@@ -69,9 +69,12 @@ def train(model: Reconstructor, config: TrainConfig) -> None:
     """
     folder = Path(config.output)
     folder.mkdir(parents=True, exist_ok=True)
-    groups = [{"params": [p for p in model.parameters() if p.requires_grad and p.ndim > 1], "weight_decay": config.weight_decay},
-              {"params": [p for p in model.parameters() if p.requires_grad and p.ndim <= 1], "weight_decay": 0.0}]  # fmt: skip
-    optimizer = torch.optim.AdamW(groups, lr=config.rate, betas=(0.9, 0.98))
+    trained = [p for p in model.parameters() if p.requires_grad]
+    groups = [
+        {"params": [p for p in trained if p.ndim > 1], "weight_decay": config.weight_decay},
+        {"params": [p for p in trained if p.ndim <= 1], "weight_decay": 0.0},
+    ]
+    optimizer = torch.optim.AdamW(groups, lr=config.rate, betas=(0.9, 0.98), fused=True)
     average = {k: v.detach().clone() for k, v in model.state_dict().items()}
     step, seconds = 0, 0.0
     if (folder / "state.pt").exists():
