@@ -146,3 +146,44 @@ def test_bad_input_is_named(device):
                     torch.zeros(1, 2, device=device))  # fmt: skip
     with pytest.raises(ValueError, match="uv: expected"):
         sample_texture(asset.textures.orm, torch.tensor([[np.nan, 0.0]], dtype=torch.float32, device=device))
+
+
+def test_command_writes_views_layers_and_turntable(tmp_path, capsys):
+    from PIL import Image
+
+    from reli3d.cli.render import main
+    from reli3d.io.glb import write_glb
+
+    asset = ball(torch.device("cpu"), (0.9, 0.1, 0.1))
+    n = asset.mesh.normals
+    tangent = torch.linalg.cross(n.new_tensor([0.3, 0.5, 0.81]).expand_as(n), n)
+    tangent = torch.cat([torch.nn.functional.normalize(tangent, dim=-1), torch.ones(len(n), 1)], -1)
+    mesh = Mesh(asset.mesh.vertices, asset.mesh.faces, n, asset.mesh.uv, tangent)
+    write_glb(tmp_path / "ball.glb", Asset(mesh, asset.textures))
+    common = [str(tmp_path / "ball.glb"), "--output", str(tmp_path / "out"), "--size", "24", "--supersampling", "1"]
+    assert main([*common, "--aovs"]) == 0
+    picture = np.asarray(Image.open(tmp_path / "out" / "ball.png"))
+    assert picture.shape == (24, 24, 4) and picture[0, 0, 3] == 0 and picture[12, 12, 3] == 255
+    assert picture[12, 12, 0] > 2 * picture[12, 12, 1]  # red
+    assert (tmp_path / "out" / "ball_normal.exr").exists()
+    assert main([*common, "--frames", "3", "--turn", "light", "--format", "webp"]) == 0
+    assert Image.open(tmp_path / "out" / "ball.webp").n_frames >= 1  # equal frames of a uniform light are merged
+    capsys.readouterr()
+    for wrong in (["--size", "0"], ["--elevation", "90"], ["--light", str(tmp_path / "none.hdr")]):
+        assert main([*common, *wrong]) == 2
+    assert "reli3d-render:" in capsys.readouterr().err
+
+
+def test_parts_shadow_each_other_and_keep_their_paint(device):
+    floor = square(device)
+    flat = floor.vertices[:, [0, 2, 1]] * torch.tensor([2.0, 1.0, -2.0], device=device)
+    floor = Mesh(flat + torch.tensor([0, -0.6, 0], device=device), floor.faces, None, floor.uv)
+    parts = [ball(device, (0.9, 0.1, 0.1)), Asset(floor, textures(4, device, (0.1, 0.1, 0.9)))]
+    camera = Camera.from_fov(eye(device, 0.0, 2.0, 3.0), 0.9, 48, 48)
+    image = render(parts, camera, Environment.constant(torch.ones(3, device=device)))
+    assert image.base_color[24, 24, 0] > 10 * image.base_color[24, 24, 2]
+    below = image.position[..., 1] < -0.59
+    assert bool(below.any()) and bool((image.base_color[below][:, 2] > 10 * image.base_color[below][:, 0]).all())
+    alone = render(parts[1:], camera, Environment.constant(torch.ones(3, device=device)))
+    near = below & (image.position.norm(dim=-1) < 0.9)
+    assert float(image.radiance[near].mean()) < 0.9 * float(alone.radiance[near].mean())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -13,7 +13,7 @@ from reli3d.geometry.rays import RayScene
 from reli3d.render.asset import Asset
 from reli3d.render.camera import Camera, camera_rays
 from reli3d.render.environment import Environment
-from reli3d.render.gbuffer import surface_points
+from reli3d.render.gbuffer import SurfacePoints, surface_points
 from reli3d.render.shading import SAMPLES, shade
 
 BAND_RAYS = 1 << 18  # rays of one band of rows: bounds memory at about 40 MB whatever the image size
@@ -39,7 +39,7 @@ class Render:
 
 
 def render(
-    asset: Asset,
+    asset: Asset | Sequence[Asset],
     camera: Camera,
     environment: Environment | None = None,
     *,
@@ -54,30 +54,33 @@ def render(
 ) -> Render:
     """Image of ``asset`` under ``environment`` (default: the asset's own) with direct light and shadows.
 
-    camera: one camera, no batch.  supersampling: side of the subpixel grid; ``samples`` are per subpixel.  background:
-    ``transparent`` or ``environment``.  scene: rays against the asset's mesh, made here if None.  progress: called
-    with the fraction done.  Gradients reach textures, mesh attributes and environment where
-    :func:`reli3d.render.shading.shade` has them; silhouettes have none.  Raises ValueError without any environment.
+    asset: one, or the parts of one that cast shadows on each other.  camera: one camera, no batch.  supersampling:
+    side of the subpixel grid; ``samples`` are per subpixel.  background: ``transparent`` or ``environment``.  scene:
+    rays against :func:`joined_scene`, made here if None.  progress: called with the fraction done.  Gradients reach
+    textures, mesh attributes and environment where :func:`reli3d.render.shading.shade` has them; silhouettes have
+    none.  Raises ValueError without any environment.
     """
-    environment = environment if environment is not None else asset.environment
+    parts = [asset] if isinstance(asset, Asset) else list(asset)
+    if environment is None:
+        environment = next((p.environment for p in parts if p.environment is not None), None)
     if environment is None:
         raise ValueError("environment: expected one, got None from the argument and from the asset")
     if camera.c2w.ndim != 2:
         raise ValueError(f"camera.c2w: expected one camera (4, 4), got {tuple(camera.c2w.shape)}")
     if background not in ("transparent", "environment"):
         raise ValueError(f"background: expected transparent or environment, got {background}")
-    scene = scene if scene is not None else RayScene(asset.mesh.vertices, asset.mesh.faces)
+    scene = scene if scene is not None else joined_scene(parts)
     fine = camera.scaled(supersampling)
     band = max(1, BAND_RAYS // (fine.width * supersampling)) * supersampling
-    parts = []
+    bands = []
     for row in range(0, fine.height, band):
         rows = min(band, fine.height - row)
         part = Camera(fine.c2w, fine.intrinsics - fine.intrinsics.new_tensor([0.0, 0.0, 0.0, row]), fine.width, rows)
-        layers = _band(asset, part, environment, scene, row * fine.width, samples, seed, shadows, background, clamp)
-        parts.append([_resolve(layer, supersampling) for layer in layers])
+        layers = _band(parts, part, environment, scene, row * fine.width, samples, seed, shadows, background, clamp)
+        bands.append([_resolve(layer, supersampling) for layer in layers])
         if progress is not None:
             progress((row + rows) / fine.height)
-    radiance, alpha, base_color, orm, normal, position, depth = (torch.cat(p) for p in zip(*parts))
+    radiance, alpha, base_color, orm, normal, position, depth = (torch.cat(p) for p in zip(*bands))
     cover = alpha.clamp(min=1e-6)  # alpha is 0 or at least 1 / supersampling^2
     roughness, metallic = (orm / cover).unbind(-1)
     inside = alpha[..., 0] > 0.0
@@ -86,12 +89,38 @@ def render(
                   position / cover, depth)  # fmt: skip
 
 
-def _band(asset, camera, environment, scene, first, samples, seed, shadows, background, clamp) -> list[Tensor]:
+def joined_scene(parts: Sequence[Asset]) -> RayScene:
+    """Rays against all ``parts`` together; their faces count on from one part to the next."""
+    if not parts:
+        raise ValueError("parts: expected at least one asset, got none")
+    first = [0]
+    for part in parts:
+        first.append(first[-1] + len(part.mesh.vertices))
+    faces = torch.cat([part.mesh.faces + k for part, k in zip(parts, first)])
+    return RayScene(torch.cat([part.mesh.vertices.detach() for part in parts]), faces)
+
+
+def _points(parts: Sequence[Asset], face: Tensor, bary: Tensor) -> SurfacePoints:
+    """Surface points of hits on :func:`joined_scene`, in the order of the hits."""
+    if len(parts) == 1:
+        return surface_points(parts[0].mesh, parts[0].textures, face, bary)
+    first, pieces, order = 0, [], []
+    for part in parts:
+        count = len(part.mesh.faces)
+        chosen = torch.nonzero((face >= first) & (face < first + count))[:, 0]
+        pieces.append(surface_points(part.mesh, part.textures, face[chosen] - first, bary[chosen]))
+        order.append(chosen)
+        first += count
+    back = torch.argsort(torch.cat(order))
+    return SurfacePoints(*(torch.cat(columns)[back] for columns in zip(*(vars(p).values() for p in pieces))))
+
+
+def _band(parts, camera, environment, scene, first, samples, seed, shadows, background, clamp) -> list[Tensor]:
     """Premultiplied layers ``(rows, W, C)`` of one band of subpixels, in the order that :func:`render` takes apart."""
     origins, directions = (v.reshape(-1, 3) for v in camera_rays(camera))
     hits = scene.closest(origins, directions)
     index = torch.nonzero(hits.face >= 0)[:, 0]
-    points = surface_points(asset.mesh, asset.textures, hits.face[index], hits.bary[index])
+    points = _points(parts, hits.face[index], hits.bary[index])
     lit = shade(
         points.position, points.normal, points.ng, -directions[index], points.base_color, points.roughness,
         points.metallic, environment, samples=samples, scene=scene if shadows else None, seed=seed, clamp=clamp,

@@ -1,0 +1,173 @@
+"""``reli3d-render``: views and turntables of any GLB under any lat-long light."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from pathlib import Path
+
+FORMATS = ("png", "exr", "webp")
+
+
+def parser() -> argparse.ArgumentParser:
+    p = argparse.ArgumentParser(
+        prog="reli3d-render",
+        description="Render a GLB with direct light and shadows under an HDR environment.",
+        epilog="Exit code: 0 done, 2 wrong input.  The files' names go to stdout, progress to stderr.",
+    )
+    p.add_argument("glb", type=Path)
+    p.add_argument("--light", type=Path, help="lat-long .hdr or .exr; default uniform white")
+    p.add_argument("--output", type=Path, default=Path("renders"), help="folder (default renders)")
+    p.add_argument("--format", choices=FORMATS, default="png", help="png, exr (linear radiance), webp (animation)")
+    p.add_argument("--frames", type=int, default=1, help="views on a full turn around +Y")
+    p.add_argument("--turn", choices=("camera", "light"), default="camera", help="what turns between frames")
+    p.add_argument("--azimuth", type=float, default=30.0, help="of the first view, degrees from +Z towards +X")
+    p.add_argument("--elevation", type=float, default=20.0, help="degrees above the horizon, within 89")
+    p.add_argument("--fov", type=float, default=32.0, help="horizontal field of view in degrees")
+    p.add_argument("--distance", type=float, help="from the centre of the object (default: it fills the view)")
+    p.add_argument("--size", type=int, default=512, help="pixels along a side (default 512)")
+    p.add_argument("--samples", type=int, nargs=3, default=(20, 40, 4), metavar=("ENV", "GGX", "COS"),
+                   help="per subpixel, by strategy (default 20 40 4)")  # fmt: skip
+    p.add_argument("--supersampling", type=int, default=2, help="subpixels along a side of a pixel (default 2)")
+    p.add_argument("--background", choices=("transparent", "environment"), default="transparent")
+    p.add_argument("--tone", choices=("srgb", "agx"), default="srgb", help="display transform of png and webp")
+    p.add_argument("--exposure", type=float, default=0.0, help="stops")
+    p.add_argument("--aovs", action="store_true", help="also EXR files of base colour, material (0, roughness, "
+                   "metallic), normal (n / 2 + 1 / 2) and depth (depth, depth, alpha)")  # fmt: skip
+    p.add_argument("--no-shadows", action="store_true")
+    p.add_argument("--seed", type=int, default=0)
+    p.add_argument("--device", default="cpu", help="cpu or cuda")
+    return p
+
+
+def main(argv: list[str] | None = None) -> int:
+    args = parser().parse_args(argv)
+    try:
+        _check(args)
+        for path in render_files(args):
+            print(path)
+    except (OSError, ValueError, TypeError) as error:
+        print(f"reli3d-render: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def _check(args: argparse.Namespace) -> None:
+    for name, low, high in (("frames", 1, 3600), ("size", 1, 8192), ("supersampling", 1, 16)):
+        if not low <= getattr(args, name) <= high:
+            raise ValueError(f"--{name}: expected {low} to {high}, got {getattr(args, name)}")
+    if not 1.0 <= args.fov <= 150.0:
+        raise ValueError(f"--fov: expected 1 to 150 degrees, got {args.fov}")
+    if not abs(args.elevation) <= 89.0:
+        raise ValueError(f"--elevation: expected -89 to 89 degrees, got {args.elevation}")
+    if args.distance is not None and not args.distance > 0.0:
+        raise ValueError(f"--distance: expected a positive length, got {args.distance}")
+
+
+def render_files(args: argparse.Namespace) -> list[Path]:
+    """Render all frames and write them; returns what was written."""
+    import torch
+    from tqdm import tqdm
+
+    from reli3d.io.glb import read_glb
+    from reli3d.io.hdr import read_environment, write_exr
+    from reli3d.render.asset import Asset, TextureSet
+    from reli3d.render.camera import Camera, look_at
+    from reli3d.render.environment import Environment
+    from reli3d.render.render import joined_scene, render
+
+    device = torch.device(args.device)
+    parts = []
+    for part in read_glb(args.glb):
+        maps = part.textures and TextureSet(*(m.to(device) for m in vars(part.textures).values()))
+        parts.append(Asset(part.mesh.to(device), maps))
+    light = torch.ones(8, 16, 3) if args.light is None else read_environment(args.light)
+    environment = Environment(light.to(device))
+    scene = joined_scene(parts)
+    low, high = scene.vertices.amin(0), scene.vertices.amax(0)
+    centre, radius = (low + high) / 2, float((high - low).norm()) / 2
+    distance = args.distance or 1.02 * radius / math.sin(math.radians(args.fov) / 2)
+    up = torch.tensor([0.0, 1.0, 0.0], device=device)
+    args.output.mkdir(parents=True, exist_ok=True)
+    written, animation = [], []
+    bar = tqdm(total=args.frames, unit="frame", file=sys.stderr, disable=not sys.stderr.isatty())
+    for frame in range(args.frames):
+        turn = 2.0 * math.pi * frame / args.frames
+        azimuth = math.radians(args.azimuth) + (turn if args.turn == "camera" else 0.0)
+        lift = math.radians(args.elevation)
+        offset = [math.cos(lift) * math.sin(azimuth), math.sin(lift), math.cos(lift) * math.cos(azimuth)]
+        eye = centre + distance * torch.tensor(offset, device=device)
+        camera = Camera.from_fov(look_at(eye, centre, up), math.radians(args.fov), args.size, args.size)
+        image = render(
+            parts, camera, environment if args.turn == "camera" else environment.rotated(turn),
+            samples=tuple(args.samples), supersampling=args.supersampling, seed=args.seed + frame,
+            shadows=not args.no_shadows, background=args.background, scene=scene,
+        )  # fmt: skip
+        stem = args.output / (args.glb.stem if args.frames == 1 else f"{args.glb.stem}_{frame:04d}")
+        if args.format == "exr":
+            written.append(stem.with_name(stem.name + ".exr"))
+            write_exr(written[-1], image.radiance.cpu())
+        else:
+            animation.append(_picture(image, args))
+            if args.format == "png":
+                written.append(stem.with_name(stem.name + ".png"))
+                _save(written[-1], animation.pop(), format="PNG")
+        if args.aovs:
+            written += _write_aovs(stem, image)
+        bar.update(1)
+    bar.close()
+    if animation:
+        written.append(args.output / f"{args.glb.stem}.webp")
+        _save(written[-1], animation[0], format="WEBP", save_all=True, append_images=animation[1:], duration=42, loop=0)
+    return written
+
+
+def _picture(image, args):
+    """Display image: RGBA with straight alpha, or RGB in front of the environment."""
+    import torch
+    from PIL import Image
+
+    from reli3d.render.color import agx, linear_to_srgb
+
+    radiance = image.radiance * 2.0**args.exposure
+    if args.background == "transparent":  # the transform is not linear: it takes the colour, not the premultiplied one
+        radiance = radiance / image.alpha[..., None].clamp(min=1e-6)
+    shown = agx(radiance) if args.tone == "agx" else linear_to_srgb(radiance).clamp(0.0, 1.0)
+    if args.background == "transparent":
+        shown = torch.cat([shown, image.alpha[..., None]], -1)
+    return Image.fromarray((shown * 255.0 + 0.5).to(torch.uint8).cpu().numpy())
+
+
+def _save(path: Path, picture, **options) -> None:
+    from io import BytesIO
+
+    from reli3d.io.files import write_bytes
+
+    data = BytesIO()
+    picture.save(data, **options)
+    write_bytes(path, data.getvalue())
+
+
+def _write_aovs(stem: Path, image) -> list[Path]:
+    import torch
+
+    from reli3d.io.hdr import write_exr
+
+    zero = torch.zeros_like(image.alpha)
+    depth = torch.where(torch.isinf(image.depth), 0.0, image.depth)
+    layers = {
+        "base_color": image.base_color,
+        "material": torch.stack([zero, image.roughness, image.metallic], -1),
+        "normal": (image.normal * 0.5 + 0.5) * image.alpha.gt(0.0)[..., None],
+        "depth": torch.stack([depth, depth, image.alpha], -1),
+    }
+    paths = []
+    for name, layer in layers.items():
+        paths.append(stem.with_name(f"{stem.name}_{name}.exr"))
+        write_exr(paths[-1], layer.cpu(), half=False)
+    return paths
+
+
+if __name__ == "__main__":
+    sys.exit(main())
