@@ -1,26 +1,61 @@
-"""Surface of a level set on a grid, with the gradient of its vertices to the level; reported without a peer."""
+"""FlexiCubes of a bumpy sphere with all weights, and what it feeds: the topology report and the visual hull."""
+
+import math
 
 import torch
 
+from reli3d.geometry.hull import hull_distance, mask_distance
+from reli3d.geometry.mesh import largest_components
 from reli3d.geometry.surface import extract_surface
 
 
-def extract(device, resolution, backward):
-    """A bumpy torus on ``resolution`` cubes a side."""
-    axis = torch.linspace(-1, 1, resolution + 1, device=device)
-    x, y, z = torch.meshgrid(axis, axis, axis, indexing="ij")
-    ring = (x**2 + z**2).sqrt() - 0.6
-    level = (ring**2 + y**2).sqrt() - 0.28 + 0.02 * torch.sin(9 * x) * torch.cos(8 * y) * torch.sin(7 * z)
-    level.requires_grad_(backward)
+def field(n, device):
+    """Level on ``(n + 1)^3`` vertices; at n = 80 its surface has about 25,000 faces."""
+    axis = torch.linspace(-1, 1, n + 1, device=device)
+    p = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
+    return p.norm(dim=-1) - 0.62 + 0.05 * torch.sin(9 * p).sum(-1)
+
+
+def extraction(device, n, backward):
+    """Mesh of a field at resolution ``n``, with gradients to level, deformation, alpha and beta if ``backward``."""
+    rng = torch.Generator(device).manual_seed(0)
+    level = field(n, device).requires_grad_(backward)
+    weights = dict(
+        deformation=(torch.rand(*level.shape, 3, generator=rng, device=device) - 0.5) * 0.9 / n,
+        alpha=torch.rand(n**3, 8, generator=rng, device=device) + 0.5,
+        beta=torch.rand(n**3, 12, generator=rng, device=device) + 0.5,
+    )
+    gamma = torch.rand(n**3, generator=rng, device=device) * 0.5 + 0.25
+    leaves = [level, *(v.requires_grad_(backward) for v in weights.values())]
 
     def step():
-        mesh = extract_surface(level, radius=1.0)
-        return torch.autograd.grad(mesh.vertices.square().sum(), level) if backward else mesh
+        mesh = extract_surface(level, radius=0.87, gamma=gamma, **weights)
+        return torch.autograd.grad(mesh.vertices.square().sum(), leaves) if backward else mesh
 
-    return step, {"cubes": resolution**3}
+    return step, {"faces": len(extract_surface(level.detach(), radius=0.87).faces)}
 
 
-CASES = {
-    "extract": (extract, dict(resolution=80, backward=False)),
-    "extract_grad": (extract, dict(resolution=80, backward=True)),
-}
+def components(device, n):
+    """Component filter on the mesh of the field."""
+    mesh = extract_surface(field(n, device), radius=0.87)
+    return (lambda: largest_components(mesh)), {"faces": len(mesh.faces)}
+
+
+def hull(device, size, n):
+    """Distances to the masks of four views, and of the vertices of a grid to their hull."""
+    axis = torch.arange(size, device=device) + 0.5 - size / 2
+    radius = 0.3 * size * (1 + 0.1 * torch.sin(7 * torch.atan2(axis[:, None], axis)))
+    masks = (radius - torch.hypot(axis[:, None], axis) + 0.5).clamp(0, 1).expand(4, size, size)
+    c2w = torch.eye(4, device=device).repeat(4, 1, 1)
+    for k in range(4):
+        c, s = math.cos(k * math.pi / 2), math.sin(k * math.pi / 2)
+        c2w[k, :3] = torch.tensor([[c, 0, s, 3 * s], [0, 1, 0, 0], [-s, 0, c, 3 * c]])
+    intrinsics = torch.tensor([1.2 * size, 1.2 * size, size / 2, size / 2], device=device).expand(4, 4)
+    axis = torch.linspace(-0.87, 0.87, n + 1, device=device)
+    points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).view(-1, 3)
+    return (lambda: hull_distance(points, mask_distance(masks), c2w, intrinsics)), {"points": len(points)}
+
+
+CASES = {f"extract_{n}": (extraction, dict(n=n, backward=False)) for n in (32, 80, 128, 256)}
+CASES |= {f"extract_grad_{n}": (extraction, dict(n=n, backward=True)) for n in (32, 80, 128)}
+CASES |= {"components_80": (components, dict(n=80)), "hull_80": (hull, dict(size=512, n=80))}

@@ -1,41 +1,42 @@
-"""Gather from three planes beside ``torch.nn.functional.grid_sample``, at the published size."""
+"""Triplane sampling at the published size, 3 x 40 x 384^2 and 200,000 points, beside torch's grid_sample."""
 
 import torch
-from torch.nn.functional import grid_sample
 
 from reli3d.triplane import sample_triplane
 
 
-def inputs(device, n, channels, size, backward):
-    rng = torch.Generator().manual_seed(0)
-    planes = torch.randn(1, 3, channels, size, size, generator=rng).to(device).requires_grad_(backward)
-    points = (2 * torch.rand(1, n, 3, generator=rng) - 1).to(device)
-    return planes, points
+def grid_sample(planes, points):
+    """The same features from torch."""
+    out = []
+    for k, axes in enumerate(([0, 1], [0, 2], [1, 2])):
+        got = torch.nn.functional.grid_sample(planes[:, k], points[..., axes].unsqueeze(1), align_corners=False)
+        out.append(got.squeeze(2).transpose(1, 2))
+    return torch.cat(out, -1)
 
 
-def gather(device, n, channels, size, backward):
-    """Features of ``n`` random points, with the gradient of their sum to the planes if ``backward``."""
-    planes, points = inputs(device, n, channels, size, backward)
+def triplane(device, sample, n, size, channel_last, backward):
+    """Features of ``n`` random points, with the gradient to the planes if ``backward``."""
+    rng = torch.Generator(device).manual_seed(0)
+    planes = torch.randn(1, 3, 40, size, size, generator=rng, device=device)
+    if channel_last:
+        planes = planes.movedim(2, -1).contiguous().movedim(-1, 2)
+    planes.requires_grad_(backward)
+    points = torch.rand(1, n, 3, generator=rng, device=device) * 2 - 1
+    weights = torch.randn(1, n, 120, generator=rng, device=device)
 
     def step():
-        features = sample_triplane(planes, points)
-        return torch.autograd.grad(features.sum(), planes) if backward else features
+        features = sample(planes, points)
+        return torch.autograd.grad(features, planes, weights) if backward else features
 
     return step, {"points": n}
 
 
-def torch_gather(device, n, channels, size, backward):
-    planes, points = inputs(device, n, channels, size, backward)
-
-    def step():
-        grid = points[0, :, [[0, 1], [0, 2], [1, 2]]].transpose(0, 1)[:, None]  # (3, 1, n, 2)
-        features = grid_sample(planes[0], grid, align_corners=True)
-        features = features[:, :, 0].permute(2, 0, 1).reshape(1, n, 3 * channels)
-        return torch.autograd.grad(features.sum(), planes) if backward else features
-
-    return step, {"points": n}
-
-
-SIZES = dict(n=200_000, channels=40, size=384)
-CASES = {"gather": (gather, dict(**SIZES, backward=False)), "gather_grad": (gather, dict(**SIZES, backward=True))}
-PEERS = dict.fromkeys(CASES, torch_gather)
+_SIZE = dict(n=200_000, size=384)
+CASES = {
+    "sample": (triplane, dict(sample=sample_triplane, channel_last=False, backward=False, **_SIZE)),
+    "sample_channel_last": (triplane, dict(sample=sample_triplane, channel_last=True, backward=False, **_SIZE)),
+    "sample_grad": (triplane, dict(sample=sample_triplane, channel_last=False, backward=True, **_SIZE)),
+    "sample_grad_channel_last": (triplane, dict(sample=sample_triplane, channel_last=True, backward=True, **_SIZE)),
+    "torch_grid_sample": (triplane, dict(sample=grid_sample, channel_last=False, backward=False, **_SIZE)),
+    "torch_grid_sample_grad": (triplane, dict(sample=grid_sample, channel_last=False, backward=True, **_SIZE)),
+}
