@@ -1,0 +1,143 @@
+"""Training: samples are what they say, losses reach the network, a run resumes where it stopped."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from reli3d.data.procedural import make_object
+from reli3d.data.synthesis import ObjectSurface, synthesize
+from reli3d.geometry.hull import hull_distance
+from reli3d.nn.model import Reconstructor
+from reli3d.nn.presets import SMALL
+from reli3d.nn.reni import map_directions
+from reli3d.train.light_prior import fit, scale_free
+from reli3d.train.loop import TrainConfig, averaged_model, progress, rate_at, train
+from reli3d.train.losses import losses
+from reli3d.train.samples import batches, random_turn
+
+SEEDS = (3, 12)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Two samples under a sky that is bright towards +X."""
+    out = tmp_path_factory.mktemp("samples")
+    light = 0.2 + 3.0 * map_directions(32)[..., :1].clamp(min=0).expand(-1, -1, 3).contiguous()
+    for seed in SEEDS:
+        sample = synthesize(ObjectSurface(make_object(seed)), light, np.random.default_rng(seed), views=3)
+        save_file(sample, out / f"{seed:010d}.safetensors")
+    return out
+
+
+@pytest.fixture(scope="module")
+def batch(folder):
+    return next(batches(folder, size=2, points=512, max_views=2, seed=1))
+
+
+def test_surface_points_lie_in_every_silhouette(batch):
+    for b in range(2):
+        distance = hull_distance(
+            batch.surface[b, :, 0].contiguous(), batch.silhouette[b], batch.c2w[b], batch.intrinsics[b]
+        )
+        pixel = 3.0 / float(
+            batch.intrinsics[b, :, 0].min()
+        )  # world size of a pixel at the farthest camera, about 3 away
+        assert float(distance.min()) > -pixel  # the contour is known to a pixel
+
+
+def test_signed_distance_is_zero_on_the_surface_and_positive_outside_the_hull(batch):
+    for b in range(2):
+        hull = hull_distance(batch.points[b].contiguous(), batch.silhouette[b], batch.c2w[b], batch.intrinsics[b])
+        outside = hull < -0.05
+        assert bool(outside.any()) and bool((batch.distance[b][outside] > 0).all())
+
+
+def test_seen_surface_points_face_the_camera(folder):
+    batch = next(batches(folder, size=1, points=4096, max_views=1, seed=2))
+    seen = batch.visible[0, :, 0] > 0
+    assert 0.05 < float(seen.float().mean()) < 0.9
+    toward = torch.nn.functional.normalize(batch.c2w[0, 0, :3, 3] - batch.surface[0, :, 0], dim=-1)
+    cosine = (toward * batch.surface[0, :, 1]).sum(-1)
+    assert float(cosine[seen].min()) > 0.0
+
+
+def test_a_turn_carries_light_and_surface_together(folder):
+    """+X is bright: whatever the turn, pixels whose normal faces the bright side are brighter."""
+    for batch, _ in zip(batches(folder, size=1, points=2048, max_views=1, seed=5), range(4)):
+        bright = batch.light_directions[0][batch.light[0].sum(-1).argmax()]
+        normal = batch.pixels[0, :, 1]
+        lit, dark = (normal @ bright) > 0.3, (normal @ bright) < -0.3
+        if int(lit.sum()) > 30 and int(dark.sum()) > 30:
+            radiance = batch.pixel_radiance[0].mean(-1)
+            assert float(radiance[lit].median()) > float(radiance[dark].median())
+
+
+def test_turns_are_rotations():
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        turn = random_turn(rng)
+        torch.testing.assert_close(turn @ turn.T, torch.eye(3), rtol=0, atol=1e-6)
+        assert float(torch.linalg.det(turn)) > 0
+
+
+def test_batches_are_a_function_of_seed_and_step(folder):
+    source = batches(folder, size=1, points=256, max_views=2, seed=7)
+    first = [next(source) for _ in range(3)]
+    again = next(batches(folder, size=1, points=256, max_views=2, seed=7, start=2))
+    for field in dataclasses.fields(again):
+        assert torch.equal(getattr(first[2], field.name), getattr(again, field.name))
+
+
+def test_every_trained_parameter_gets_a_gradient(batch):
+    torch.manual_seed(0)
+    model = Reconstructor(SMALL)
+    terms = losses(model, batch)
+    assert all(bool(torch.isfinite(v)) for v in terms.values())
+    sum(terms.values()).backward()
+    unused = {"heads.deformation", "heads.flexicubes", "merger"}  # for presets that train through the surface
+    degenerate = ("query", "key")  # of RENI's attention over one key
+    for name, p in model.named_parameters():
+        if not name.startswith(tuple(unused)) and not any(f".mha.{k}." in name for k in degenerate):
+            assert p.grad is not None and bool(torch.isfinite(p.grad).all()), name
+
+
+def test_training_learns_logs_and_resumes(folder, tmp_path):
+    torch.manual_seed(0)
+    config = TrainConfig(str(folder), str(tmp_path), steps=50, batch=1, points=256, max_views=1, warmup=5, seed=3)
+    train(Reconstructor(SMALL), config)
+    rows = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    first = {
+        k: float(v.detach())
+        for k, v in losses(Reconstructor(SMALL), next(batches(folder, size=1, points=256, max_views=1, seed=3))).items()
+    }
+    assert rows[-1]["step"] == 50 and rows[-1]["occupancy"] < first["occupancy"]
+    train(Reconstructor(SMALL), dataclasses.replace(config, steps=52))
+    state = torch.load(tmp_path / "state.pt", weights_only=True)
+    assert state["step"] == 52
+    model = averaged_model(tmp_path / "state.pt", Reconstructor(SMALL))
+    assert torch.equal(model.state_dict()["heads.density.0.weight"], state["average"]["heads.density.0.weight"])
+
+
+def test_the_rate_warms_up_and_ends_low():
+    config = TrainConfig("", "", steps=1000, warmup=100)
+    assert rate_at(config, 0, 0.0) == pytest.approx(config.rate / 100)
+    assert rate_at(config, 999, progress(config, 999, 0)) < 0.03 * config.rate
+    assert progress(dataclasses.replace(config, minutes=10.0), 1, 600.0) == 1.0
+
+
+def test_the_light_prior_fits_a_map():
+    torch.manual_seed(0)
+    from reli3d.nn.reni import EnvironmentDecoder
+
+    maps = scale_free(0.3 + map_directions(64)[None, ..., 1:2].clamp(min=0).expand(-1, -1, -1, 3) * 2.0)
+    decoder = EnvironmentDecoder(SMALL.reni)
+    latents = fit(decoder, maps, steps=60, minutes=5.0, rays=256, batch=1)
+    with torch.no_grad():
+        got = decoder.radiance(latents, torch.eye(3)[None], torch.zeros(1), decoder.sample_directions[None])
+    error = (got.log() - maps.reshape(1, -1, 3).log()).abs().mean()
+    spread = (maps.log() - maps.log().mean()).abs().mean()
+    assert float(error) < 0.5 * float(spread)  # 60 steps are enough to know up from down
