@@ -66,7 +66,8 @@ def load_views(
                              "images.txt), "
                                      "got neither; see docs/inputs.md")  # fmt: skip
         shots, notes = read_colmap(root, model, count, outside=allow_outside)
-    with ThreadPoolExecutor(max_workers=min(4, os.cpu_count() or 1)) as pool:  # decoding releases the GIL
+    # decoding releases the GIL; torch is not used there, as each of these threads would start threads of its own
+    with ThreadPoolExecutor(max_workers=min(4, os.cpu_count() or 1)) as pool:
         loaded = list(pool.map(lambda shot: _load(root, shot, masks, allow_outside), shots))
     notes += [note for *_, found in loaded for note in found]
     return Views(
@@ -98,22 +99,27 @@ def _load(root: Path, shot: Shot, masks, outside: bool) -> tuple[Tensor, Tensor,
         got = f"{mask.shape[1]} x {mask.shape[0]}"
         raise InputError(path, f"mask: expected {width} x {height} pixels as the image, got {got}; save it at that "
                          "size")  # fmt: skip
-    if int((mask > 0.5).sum()) < MIN_OBJECT:
+    if int((mask.numpy() > 0.5).sum()) < MIN_OBJECT:
         raise InputError(path, "mask: expected the object to be opaque (white), got a mask that is empty; "
                                "check that it is neither blank nor inverted")  # fmt: skip
-    if looks_premultiplied(image, mask):
+    if looks_premultiplied(image.numpy(), mask.numpy()):
         notes.append(f"{path.name}: the colour looks multiplied by alpha, edges will be dark; save straight alpha")
     return image, mask, intrinsics_of(shot.lens, width, height, shot.where, notes), notes
 
 
-def looks_premultiplied(image: Tensor, mask: Tensor) -> bool:
+def looks_premultiplied(image: np.ndarray, mask: np.ndarray) -> bool:
     """Whether no edge pixel of ``image (H, W, 3)`` is brighter than its alpha, and only black lies outside.
 
     Of a straight image with a bright object the faint edge pixels are brighter than their alpha.
     """
-    value = image.amax(-1)
-    bright = float(value[mask > 0.98].median()) if bool((mask > 0.98).any()) else 0.0
-    faint = (mask > 0.02) & (mask < 0.5 * bright)
+    if (image[::8, ::8].max(-1)[mask[::8, ::8] < 0.02] > 0.02).any():  # a background: the usual case, told by a few
+        return False
+    edge = mask > 0.02
+    if not (edge & (mask < 0.5)).any():  # a binary mask
+        return False
+    value, opaque = image.max(-1), mask > 0.98
+    bright = float(np.median(value[opaque])) if opaque.any() else 0.0
+    faint = edge & (mask < 0.5 * bright)
     if int(faint.sum()) < MIN_OBJECT or bool((value[mask < 0.02] > 0.02).any()):
         return False
     return bool((value[faint] <= mask[faint] + 1 / 255).all())  # both are rounded to 8 bits
@@ -132,7 +138,7 @@ def _mask(root: Path, shot: Shot, path: Path, alpha: Tensor | None, masks, notes
                                          "exist; correct the path")  # fmt: skip
         _still_inside(root, found, shot, outside)
         return _grey(found, notes)
-    if alpha is not None and float(alpha.min()) < 0.5:
+    if alpha is not None and float(alpha.numpy().min()) < 0.5:
         return alpha
     for name in ("masks", "mask"):
         found = _beside(root / name, path)
@@ -147,7 +153,9 @@ def _mask(root: Path, shot: Shot, path: Path, alpha: Tensor | None, masks, notes
 def _grey(path: Path, notes: list[str]) -> Tensor:
     """Mask ``(H, W)``: the alpha of a mask file that has one which is used, else its grey value."""
     colour, alpha = read_image(path, notes=notes)
-    return alpha if alpha is not None and float(alpha.min()) < 0.5 else colour.amax(-1)
+    if alpha is not None and float(alpha.numpy().min()) < 0.5:
+        return alpha
+    return torch.from_numpy(colour.numpy().max(-1))
 
 
 def _existing(path: Path) -> Path | None:

@@ -73,13 +73,13 @@ def _decoded(path, image: Image.Image, notes: list[str]) -> tuple[Tensor, Tensor
         grey = np.asarray(image).astype(np.float32)
         if image.mode == "I" and (grey.min() < 0 or grey.max() > 65535):
             raise InputError(path, "expected 8 or 16 bit grey, got 32 bit; save as 8 bit PNG")
-        grey = torch.from_numpy(grey / 65535.0)
-        return grey[..., None].expand(-1, -1, 3).contiguous(), None
+        return torch.from_numpy(np.repeat(grey[..., None] / np.float32(65535), 3, -1)), None
     transparent = image.mode in ("LA", "PA", "RGBA") or "transparency" in image.info
     wanted = "RGBA" if transparent else "RGB"
-    pixels = torch.from_numpy(np.array(image if image.mode == wanted else image.convert(wanted)))
-    rgb = pixels[..., :3].to(torch.float32, memory_format=torch.contiguous_format).div_(255.0)
-    return rgb, pixels[..., 3].float().div_(255.0) if transparent else None
+    pixels = np.asarray(image if image.mode == wanted else image.convert(wanted))
+    # by numpy: this runs on several threads at once, each of which would start torch's own threads
+    rgb, alpha = (np.divide(part, np.float32(255), dtype=np.float32) for part in (pixels[..., :3], pixels[..., 3:]))
+    return torch.from_numpy(rgb), torch.from_numpy(alpha[..., 0]).contiguous() if transparent else None
 
 
 def png_bytes(pixels: Tensor | np.ndarray) -> bytes:
