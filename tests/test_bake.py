@@ -227,6 +227,16 @@ def test_tangents_of_a_cylinder_follow_u(device):
         assert float(cosine.min()) > math.cos(math.pi / k) - 1e-6
 
 
+def test_tangents_weigh_faces_by_their_angle(device):
+    """At the origin a face of 90 degrees has +u along (1, 0), one of 45 degrees along (1, 1), solved by hand."""
+    p = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [-1, 1, 0]], device=device)
+    uv = torch.tensor([[0.0, 0], [1, 0], [0, -1], [-1, -2]], device=device)
+    faces = torch.tensor([[0, 1, 2], [0, 2, 3]], device=device).int()
+    got = vertex_tangents(Mesh(p, faces, torch.tensor([0.0, 0, 1], device=device).repeat(4, 1), uv))[0].cpu()
+    want = math.pi / 2 * torch.tensor([1.0, 0, 0]) + math.pi / 4 * torch.tensor([0.5, 0.5, 0]) * 2**0.5
+    torch.testing.assert_close(got, torch.cat([want / want.norm(), torch.ones(1)]), rtol=0, atol=1e-6)
+
+
 def test_tangents_agree_with_an_exporter(shared_data):
     """NormalTangentMirrorTest stores MikkTSpace tangents, with mirrored UV."""
     data = (shared_data / "calibration" / "calib_normal_tangent_mirror.glb").read_bytes()

@@ -56,8 +56,9 @@ def check_atlas(source: Mesh, result: Mesh, size: int = 2048, rel: float = 3e-3)
     hits = coverage(result, size)
     covered = int((hits > 0).sum())
     assert int((hits > 1).sum()) <= 1e-3 * covered
-    # without overlap the areas add up to the covered share; a centre grid counts a border of N texels to about sqrt(N)
-    assert area.sum() == pytest.approx(covered / size**2, rel=rel)
+    # overlap would make the areas add up to more than is covered; thousands of tiny charts are counted up to 1 % high
+    assert area.sum() <= (1 + rel) * covered / size**2
+    assert area.sum() >= (1 - 5 * rel) * covered / size**2
 
 
 @pytest.mark.parametrize("name", QUICK + [pytest.param(n, marks=pytest.mark.slow) for n in SLOW])
