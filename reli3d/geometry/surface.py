@@ -133,7 +133,7 @@ def _check_level(level: Tensor) -> None:
 
 def _classify(level: Tensor) -> tuple[Tensor, Tensor]:
     case, crossed = torch.empty_like(level, dtype=torch.uint8), torch.empty_like(level, dtype=torch.uint8)
-    launch(kernels.classify_kernel, level.numel(), [
+    launch(kernels.classify_kernel, level.shape[0] * level.shape[1], [
         (level.view(-1), wp.float32), *level.shape, (case.view(-1), wp.uint8), (crossed.view(-1), wp.uint8)],
         level.device)  # fmt: skip
     return case, crossed

@@ -48,6 +48,19 @@ def weight(values: wp.array[float], row: int, width: int, column: int) -> float:
     return values[row * width + column]
 
 
+@wp.func
+def column_bits(level: wp.array[float], index: int, step_x: int, step_y: int, has_x: bool, has_y: bool) -> int:
+    """Inside bits of four grid vertices of one height, as corners 0 to 3 of a cube; 0 beyond the grid."""
+    bits = inside_bit(level, index)
+    if has_x:
+        bits += inside_bit(level, index + step_x) << 1
+    if has_y:
+        bits += inside_bit(level, index + step_y) << 2
+    if has_x and has_y:
+        bits += inside_bit(level, index + step_x + step_y) << 3
+    return bits
+
+
 @wp.kernel
 def classify_kernel(
     start: int,
@@ -58,29 +71,39 @@ def classify_kernel(
 ):  # fmt: skip
     """Case of every cube (0 where it is all inside), and which edges of a vertex have a quad: bit 0 y, 1 z, 2 x.
 
-    An edge belongs to the end that comes first in EDGES: the low end along x and z, the high end along y.
+    An edge belongs to the end that comes first in EDGES: the low end along x and z, the high end along y.  A thread is
+    a column of vertices along z, so that a cube hands four of its corners to the next.
     """
-    v = start + wp.tid()
-    at = split_index(v, ny, nz)
-    code = wp.int32(0)
-    if at[0] + 1 < nx and at[1] + 1 < ny and at[2] + 1 < nz:
-        for corner in range(8):
-            code += inside_bit(level, corner_index(v, corner, ny, nz)) << corner
-        if code == 255:
+    i = start + wp.tid()
+    base = i * nz
+    step = ny * nz
+    x = i // ny
+    y = i % ny
+    has_x = x + 1 < nx
+    has_y = y + 1 < ny
+    inner_x = x > 0 and has_x
+    inner_y = y > 0 and has_y
+    low = column_bits(level, base, step, nz, has_x, has_y)
+    for z in range(nz):
+        v = base + z
+        has_z = z + 1 < nz
+        inner_z = z > 0 and has_z
+        high = wp.int32(0)
+        if has_z:
+            high = column_bits(level, v + 1, step, nz, has_x, has_y)
+        code = low + (high << 4)
+        if code == 255 or not (has_x and has_y and has_z):
             code = 0
-    codes[v] = wp.uint8(code)
-    edges = wp.int32(0)
-    own = inside_bit(level, v)
-    inner_x = at[0] > 0 and at[0] + 1 < nx
-    inner_y = at[1] > 0 and at[1] + 1 < ny
-    inner_z = at[2] > 0 and at[2] + 1 < nz
-    if inner_x and inner_z and at[1] > 0:
-        edges += own ^ inside_bit(level, v - nz)
-    if inner_x and inner_y and at[2] + 1 < nz:
-        edges += (own ^ inside_bit(level, v + 1)) << 1
-    if inner_y and inner_z and at[0] + 1 < nx:
-        edges += (own ^ inside_bit(level, v + ny * nz)) << 2
-    crossed[v] = wp.uint8(edges)
+        codes[v] = wp.uint8(code)
+        edges = wp.int32(0)
+        if inner_x and inner_z and y > 0:
+            edges += (low & 1) ^ inside_bit(level, v - nz)
+        if inner_x and inner_y and has_z:
+            edges += ((low ^ high) & 1) << 1
+        if inner_y and inner_z and has_x:
+            edges += ((low ^ (low >> 1)) & 1) << 2
+        crossed[v] = wp.uint8(edges)
+        low = high
 
 
 @wp.kernel
