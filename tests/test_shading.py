@@ -293,7 +293,8 @@ def test_mean_gradient_is_that_of_the_integral(device, counts):
         for g, t in zip([tangent, *grads[1:]], truth[:4], strict=True):
             error = g.std(0) / n**0.5 + 1e-3 * t.abs().max().float().to(device)  # second term: the quadrature's
             assert ((g.mean(0) - t.to(device)) / error).abs().max() < 4.5
-        noise = 4.5 * float(got.detach().std()) / n**0.5  # a texel's gradient varies less than the radiance it is a part of
+        # a texel's gradient varies less than the radiance it is a part of
+        noise = 4.5 * float(got.detach().std()) / n**0.5
         assert (g_light.cpu() / n - truth[4]).abs().max() < noise + 1e-3
 
 
