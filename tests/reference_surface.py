@@ -46,8 +46,8 @@ def joined_face(case):
     return None
 
 
-def flexicubes_vertices(level, deformation, alpha, beta, scale):
-    """Dual vertices by (cube, loop), ``(V, 3)``, and those keys; inside is level < 0."""
+def flexicubes_polygons(level, deformation, alpha, beta):
+    """``[((cube, loop), crossings (E, 3), their beta (E,)), ...]``; inside is level < 0."""
     shape = level.shape
     index = torch.arange(level.numel()).view(shape)
     offsets = [tuple(slice(o, n - 1 + o) for o, n in zip(c, shape)) for c in CORNERS]
@@ -66,7 +66,7 @@ def flexicubes_vertices(level, deformation, alpha, beta, scale):
     u = (x[..., 0, :] * s[..., 1, None] - x[..., 1, :] * s[..., 0, None]) / weight[..., None]
     b = beta[surface]
     grid = case.view([n - 1 for n in shape])
-    vertices, keys = [], []
+    found = []
     for row, cube in enumerate(surface.tolist()):
         own = int(case[cube])
         face = joined_face(own)
@@ -78,6 +78,21 @@ def flexicubes_vertices(level, deformation, alpha, beta, scale):
                 groups = loops(own, apart=False)
         for loop in groups:
             e = sorted(loop)
-            vertices.append((u[row, e] * b[row, e, None]).sum(0) / b[row, e].sum())
-            keys.append((cube, loop))
-    return torch.stack(vertices) * scale, keys
+            found.append(((cube, loop), u[row, e], b[row, e]))
+    return found
+
+
+def flexicubes_vertices(level, deformation, alpha, beta, scale):
+    """Dual vertices by (cube, loop), ``(V, 3)``, and those keys."""
+    polygons = flexicubes_polygons(level, deformation, alpha, beta)
+    vertices = torch.stack([(u * b[:, None]).sum(0) / b.sum() for _, u, b in polygons])
+    return vertices * scale, [key for key, _, _ in polygons]
+
+
+def flexicubes_deviation(level, deformation, alpha, beta, scale):
+    """Mean absolute deviation of the distances from a dual vertex to its crossings, ``(V,)``."""
+    spread = []
+    for _, u, b in flexicubes_polygons(level, deformation, alpha, beta):
+        distance = ((u - (u * b[:, None]).sum(0) / b.sum()) * scale).norm(dim=-1)
+        spread.append((distance - distance.mean()).abs().mean())
+    return torch.stack(spread)

@@ -40,7 +40,7 @@ class _Topology:
 
 
 @lru_cache(8)
-def _tables(device: torch.device) -> dict[str, Tensor]:
+def tables_on(device: torch.device) -> dict[str, Tensor]:
     return {name: torch.from_numpy(value.reshape(-1)).to(device) for name, value in tables()._asdict().items()}
 
 
@@ -83,9 +83,53 @@ def extract_surface(
     Gradients reach level, deformation, alpha, beta and with ``centre`` gamma, by an own adjoint; the same bits for
     any number of CPU threads.
 
+    Left out: the tetrahedral volume mesh of the paper's section 4.5; the output is the surface alone, which a
+    tetrahedraliser (TetGen, fTetWild) fills where a simulation needs it.  :mod:`reli3d.geometry.regularize` has the
+    losses that keep a fitted surface sound.
+
     Raises TypeError or ValueError on a wrong dtype, shape or device, on a level that is not finite or has one sign
     only, on weights that are not positive.
     """
+    extent = check_fields(level, radius, deformation, alpha, beta, gamma, cubes)
+    topology, padded, crossed = topology_of(level.detach().contiguous(), cubes, closed)
+    scale = tuple(2.0 * float(r) for r in extent)
+    vertices = _DualVertices.apply(topology, scale, padded, level, deformation, alpha, beta)
+    if not bool(torch.isfinite(vertices.detach()).all()):
+        raise ValueError("alpha, beta, deformation: expected positive weights and finite offsets, got others")
+    quads, split = _quads(topology, padded, crossed, gamma)
+    if centre:
+        return _with_centres(vertices, quads, split if gamma is None else _gamma_of(topology, quads, gamma))
+    first = split[:, 0] * split[:, 2] > split[:, 1] * split[:, 3]
+    faces = torch.where(first[:, None], quads[:, [0, 1, 2, 0, 2, 3]], quads[:, [0, 1, 3, 3, 1, 2]])
+    return Mesh(vertices, faces.reshape(-1, 3))
+
+
+def extract_surfaces(levels: Tensor | Sequence[Tensor], *, radius: float | Sequence[float], closed: bool = True,
+                     centre: bool = False, **fields: Tensor | Sequence[Tensor] | None) -> list[Mesh]:  # fmt: skip
+    """:func:`extract_surface` of every field of a batch.
+
+    levels: ``(B, X + 1, Y + 1, Z + 1)``, or a sequence of grids that may differ in shape.  fields: deformation,
+    alpha, beta, gamma, cubes, each with a leading axis B or as a sequence of B.  Meshes differ in size, so there is
+    one for every field and no padding; each is the same bits as alone.  Raises as the single function, and ValueError
+    where the batch sizes differ or the batch is empty.
+    """
+    unknown = sorted(set(fields) - {"deformation", "alpha", "beta", "gamma", "cubes"})
+    if unknown:
+        raise TypeError(f"fields: expected deformation, alpha, beta, gamma or cubes, got {', '.join(unknown)}")
+    if not len(levels):
+        raise ValueError("levels: expected at least one field, got none")
+    given = {name: value for name, value in fields.items() if value is not None}
+    for name, value in given.items():
+        if len(value) != len(levels):
+            raise ValueError(f"{name}: expected {len(levels)} fields, got {len(value)}")
+    return [extract_surface(level, radius=radius, closed=closed, centre=centre,
+                            **{name: value[i] for name, value in given.items()})
+            for i, level in enumerate(levels)]  # fmt: skip
+
+
+def check_fields(level: Tensor, radius: float | Sequence[float], deformation: Tensor | None, alpha: Tensor | None,
+                 beta: Tensor | None, gamma: Tensor | None, cubes: Tensor | None) -> list[float]:  # fmt: skip
+    """Raise for what :func:`extract_surface` cannot take; returns the three radii."""
     _check_level(level)
     low, high = (float(v) for v in torch.aminmax(level.detach()))
     if not low < 0.0 <= high:
@@ -107,18 +151,7 @@ def extract_surface(
             check(name, value, like=level)
             if tuple(value.shape) != tuple(shape):
                 raise ValueError(f"{name}: expected shape {tuple(shape)}, got {tuple(value.shape)}")
-
-    topology, padded, crossed = _topology(level.detach().contiguous(), cubes, closed)
-    scale = tuple(2.0 * float(r) for r in extent)
-    vertices = _DualVertices.apply(topology, scale, padded, level, deformation, alpha, beta)
-    if not bool(torch.isfinite(vertices.detach()).all()):
-        raise ValueError("alpha, beta, deformation: expected positive weights and finite offsets, got others")
-    quads, split = _quads(topology, padded, crossed, gamma)
-    if centre:
-        return _with_centres(vertices, quads, split if gamma is None else _gamma_of(topology, quads, gamma))
-    first = split[:, 0] * split[:, 2] > split[:, 1] * split[:, 3]
-    faces = torch.where(first[:, None], quads[:, [0, 1, 2, 0, 2, 3]], quads[:, [0, 1, 3, 3, 1, 2]])
-    return Mesh(vertices, faces.reshape(-1, 3))
+    return extent
 
 
 def _check_level(level: Tensor) -> None:
@@ -139,7 +172,7 @@ def _classify(level: Tensor) -> tuple[Tensor, Tensor]:
     return case, crossed
 
 
-def _topology(level: Tensor, cubes: Tensor | None, closed: bool) -> tuple[_Topology, Tensor, Tensor]:
+def topology_of(level: Tensor, cubes: Tensor | None, closed: bool) -> tuple[_Topology, Tensor, Tensor]:
     """Topology, the padded level and the crossed edges of its vertices."""
     device, size = level.device, tuple(n - 1 for n in level.shape)
     border = [level[0], level[-1], level[:, 0], level[:, -1], level[:, :, 0], level[:, :, -1]]
@@ -163,7 +196,7 @@ def _topology(level: Tensor, cubes: Tensor | None, closed: bool) -> tuple[_Topol
     cells, rows = cells.to(torch.int32), rows.to(torch.int32)
     resolved, counts = torch.empty_like(cells), torch.empty_like(cells)
     slot = torch.empty(level.numel(), dtype=torch.int32, device=device)
-    table = _tables(device)
+    table = tables_on(device)
     launch(kernels.resolve_kernel, len(cells), [
         (cells, I32), (case.view(-1), wp.uint8), (table["neighbour"], I32), (table["count"], I32), *level.shape[1:],
         (resolved, I32), (counts, I32), (slot, I32)], device)  # fmt: skip
@@ -203,7 +236,7 @@ class _DualVertices(torch.autograd.Function):
 
     @staticmethod
     def arguments(t: _Topology, padded: Tensor, inputs: list, scale: tuple, *more) -> list:
-        table, none = _tables(padded.device), padded.new_empty(0)
+        table, none = tables_on(padded.device), padded.new_empty(0)
         shift, alpha, beta = (none if v is None else v.view(-1) for v in inputs)
         return [(t.cells, I32), (t.resolved, I32), (t.rows, I32), *more, (table["group"], I32), (table["ends"], I32),
                 (padded.view(-1), wp.float32), (shift.view(-1, 3), wp.vec3), (alpha, wp.float32), (beta, wp.float32),
@@ -226,7 +259,7 @@ class _DualVertices(torch.autograd.Function):
             (vertices, wp.vec3), (g_vertices.contiguous(), wp.vec3), (g_level.view(-1), wp.float32),
             (g_shift.view(-1, 3), wp.vec3), (g_alpha.view(-1), wp.float32), (g_beta.view(-1), wp.float32)],
             device)  # fmt: skip
-        corner = _corner_vertices(t).view(-1)
+        corner = corner_vertices(t).view(-1)
         grads = [None, None, None, None]
         if ctx.needs_input_grad[3]:
             grads[0] = _scatter(corner, g_level.view(-1, 1), level.numel()).view(level.shape)
@@ -240,7 +273,7 @@ class _DualVertices(torch.autograd.Function):
         return None, None, None, *grads
 
 
-def _corner_vertices(t: _Topology) -> Tensor:
+def corner_vertices(t: _Topology) -> Tensor:
     """Grid vertex before padding at every corner of the surface cubes, ``(S, 8)``; a padding's one is the border's it
     stands at."""
     cells = t.cells.long()
@@ -260,7 +293,7 @@ def _quads(t: _Topology, padded: Tensor, crossed: Tensor, gamma: Tensor | None) 
     origin, direction = own[which].to(torch.int32), direction.to(torch.int32)
     quads = torch.empty(len(origin), 4, dtype=torch.int32, device=device)
     split = torch.empty(len(origin), 4, device=device)
-    table = _tables(device)
+    table = tables_on(device)
     launch(kernels.quad_kernel, len(origin), [
         (origin, I32), (direction, I32), (t.slot, I32), (t.resolved, I32), (t.base, I32), (t.rows, I32),
         (table["group"], I32), (table["around"], I32), (padded.view(-1), wp.float32),
