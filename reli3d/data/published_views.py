@@ -1,0 +1,96 @@
+"""Views as the published network was shown them, and what it lets a user choose beside.
+
+The release stores its training views as JPEG and sends every input the same way: a round trip through JPEG, a plain
+bilinear resize, a mask that is cut at one half after it.  A network that was trained on such pictures gets such
+pictures; every step stands in docs/network.md.
+"""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from reli3d.data.views import ViewBatch, Views
+
+JPEG_QUALITY = 95  # with JPEG_CHROMA the defaults of OpenCV's encoder, which the release leaves as they are
+JPEG_CHROMA = "4:2:0"
+MASK_THRESHOLD = 0.5
+BACKGROUNDS = ("auto", "masked", "visible")
+CLEAR = 0.02  # alpha below which a pixel is background alone
+BACKGROUND_RANGE = 4 / 255  # between the 10th and the 90th percentile; a cut-out's ringing stays near its silhouette
+
+
+def published_views(views: Views, size: int) -> ViewBatch:
+    """All views at ``size`` x ``size`` pixels as the release prepares them; cameras stay as they are.
+
+    The whole image is stretched to the square; colours keep the background; masks are 0 or 1.  The 8-bit pixels of the
+    files are what is encoded, so colours of 16 bits are rounded first.  Agrees with the published tensors to float32
+    rounding (2e-7), masks exactly.  Raises ValueError on a size below 1 and for views that are not on the CPU, where
+    the codec runs.
+    """
+    if size < 1:
+        raise ValueError(f"size: expected at least 1, got {size}")
+    if views.c2w.device.type != "cpu":
+        raise ValueError(f"views: expected views on the CPU, got {views.c2w.device}")
+    images, masks, intrinsics = [], [], []
+    for image, mask, camera in zip(views.images, views.masks, views.intrinsics.double(), strict=True):
+        images.append(_resized(jpeg_round_trip(image), size))
+        alpha = _resized(jpeg_round_trip(mask[..., None].expand(-1, -1, 3)), size)[..., 2]
+        masks.append((alpha > MASK_THRESHOLD).float())
+        height, width = mask.shape
+        intrinsics.append(camera * camera.new_tensor([size / width, size / height] * 2))
+    cameras = torch.stack(intrinsics).to(views.intrinsics.dtype)
+    return ViewBatch(torch.stack(images), torch.stack(masks), views.c2w, cameras, views.names)
+
+
+def jpeg_round_trip(pixels: Tensor) -> Tensor:
+    """``pixels (H, W, 3)`` in [0, 1] after encoding and decoding as JPEG, multiples of 1/255, float32."""
+    array = np.rint(pixels.numpy().clip(0.0, 1.0) * np.float32(255)).astype(np.uint8)
+    buffer = io.BytesIO()
+    Image.fromarray(array).save(buffer, "JPEG", quality=JPEG_QUALITY, subsampling=JPEG_CHROMA)
+    with Image.open(buffer, formats=("JPEG",)) as decoded:
+        return torch.from_numpy(np.asarray(decoded).astype(np.float32) / np.float32(255))
+
+
+def _resized(pixels: Tensor, size: int) -> Tensor:
+    """Bilinear between pixel centres, without filtering: what OpenCV's resize does by default."""
+    moved = interpolate(pixels.permute(2, 0, 1)[None], (size, size), mode="bilinear", align_corners=False)
+    return moved[0].permute(1, 2, 0)
+
+
+def hero_first(views: Views, hero: int | str, seed: int = 0) -> Views:
+    """``views`` with the one of index ``hero`` first and the rest in their order; ``random``: the one ``seed`` draws.
+
+    Raises ValueError on an index that is none.
+    """
+    count = len(views)
+    if hero == "random":
+        hero = int(np.random.default_rng(seed).integers(count))
+    if isinstance(hero, bool) or not isinstance(hero, int) or not 0 <= hero < count:
+        raise ValueError(f"hero: expected random or 0 to {count - 1} with {count} views, got {hero}")
+    return views if hero == 0 else views.select([hero, *(i for i in range(count) if i != hero)])
+
+
+def background_shown(views: Views, background: str, *, readable: bool) -> bool:
+    """Whether the illumination path may look at the background: never if ``masked``, always if ``visible``, and if
+    ``auto`` where the weights were trained to (``readable``) and every view has one.  ValueError on another word.
+    """
+    if background not in BACKGROUNDS:
+        raise ValueError(f"background: expected {', '.join(BACKGROUNDS)}, got {background}")
+    if background != "auto":
+        return background == "visible"
+    return readable and all(has_background(i, m) for i, m in zip(views.images, views.masks, strict=True))
+
+
+def has_background(image: Tensor, mask: Tensor) -> bool:
+    """Whether ``image (H, W, 3)`` shows something outside ``mask (H, W)``: a cut-out has one flat colour there."""
+    outside = image[mask < CLEAR]
+    if len(outside) == 0:
+        return False
+    low, high = np.percentile(outside.cpu().numpy(), (10, 90), axis=0)
+    return bool((high - low).max() > BACKGROUND_RANGE)
