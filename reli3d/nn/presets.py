@@ -94,6 +94,8 @@ class Preset:
     log_level: bool = False  # the surface level is linear in the raw density (a distance) instead of in the density
     softness: float = 0.02  # model units from occupancy 1/2 to 0.73: unit of log_level and of the silhouettes' bound
     silhouette_bound: bool = False  # the density is bounded by the views' masks
+    published_input: bool = False  # views prepared as by the release: JPEG, not cropped, poses as stored unless asked
+    reads_background: bool = False  # the illumination path was trained with visible backgrounds too
     tone_mapping: bool = False  # carry the published tone-mapping constants, which nothing here reads
 
     def to_json(self) -> str:
@@ -142,6 +144,8 @@ OFFICIAL = Preset(
     reni=ReniSizes(latents=49, width=128, layers=6, heads=8, height=64),
     resolution=80,
     roughness_is_alpha=True,
+    published_input=True,
+    reads_background=True,
     tone_mapping=True,
 )  # fmt: skip
 
