@@ -7,6 +7,8 @@ all there is.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -14,6 +16,7 @@ from reli3d.geometry.hull import hull_distance
 from reli3d.nn.model import Code, Reconstructor
 from reli3d.nn.view_features import ViewMaps
 
+ROWS = 8192  # points at a time without gradient: their features stay in the cache, which halves the time of the heads
 MATERIAL = ("base_color", "roughness", "metallic", "normal")
 
 
@@ -23,12 +26,25 @@ def surface_level(model: Reconstructor, code: Code, maps: ViewMaps, points: Tens
 
     With the preset's ``silhouette_bound`` a point is no further inside than its worst silhouette has it.
     """
-    features = model.view_features(maps, points)[0][None] if model.preset.view_feature_width else None
-    density = model.query(code, points[None], ("density",), features)["density"][0, :, 0]
-    level = model.level(density)
+
+    def density(points: Tensor) -> dict[str, Tensor]:
+        features = model.view_features(maps, points)[0][None] if model.preset.view_feature_width else None
+        return {"density": model.query(code, points[None], ("density",), features)["density"][0, :, 0]}
+
+    level = model.level(in_rows(density, points)["density"])
     if model.preset.silhouette_bound:
         level = torch.maximum(level, bound_level(model, maps, points))
     return level
+
+
+def in_rows(evaluate: Callable[..., dict[str, Tensor]], *inputs: Tensor) -> dict[str, Tensor]:
+    """``evaluate(*inputs)`` on ROWS rows of the inputs at a time, put together again; all at once where gradients
+    are recorded.
+    """
+    if torch.is_grad_enabled() or len(inputs[0]) <= ROWS:
+        return evaluate(*inputs)
+    parts = [evaluate(*rows) for rows in zip(*(x.split(ROWS) for x in inputs), strict=True)]
+    return {name: torch.cat([p[name] for p in parts]) for name in parts[0]}
 
 
 def bound_level(model: Reconstructor, maps: ViewMaps, points: Tensor) -> Tensor:
@@ -43,8 +59,12 @@ def surface_material(model: Reconstructor, code: Code, maps: ViewMaps, position:
 
     position, normal: ``(N, 3)``, the geometric normal unit.  visible: ``(N, V)``, 1 where a view sees the point.
     """
-    features = color = None
-    if model.preset.view_feature_width:
-        features, color = (x[None] for x in model.view_features(maps, position, visible, normal))
-    values = model.query(code, position[None], MATERIAL, features, color)
-    return {name: value[0] for name, value in values.items()}
+
+    def material(position: Tensor, normal: Tensor, visible: Tensor) -> dict[str, Tensor]:
+        features = color = None
+        if model.preset.view_feature_width:
+            features, color = (x[None] for x in model.view_features(maps, position, visible, normal))
+        values = model.query(code, position[None], MATERIAL, features, color)
+        return {name: value[0] for name, value in values.items()}
+
+    return in_rows(material, position, normal, visible)

@@ -68,7 +68,8 @@ class ViewFeatures(nn.Module):
         distance = (silhouette / size).clamp(-OUTSIDE, OUTSIDE) / OUTSIDE
         own = torch.cat([tokens, rgb, distance, depth, inside, seen, facing, edge.clamp(-1, 1)], -1)
         weight = share / share.sum(1, keepdim=True)
-        pooled = (self.per_view(own) * weight).sum(1)
+        first, activation, last = self.per_view
+        pooled = last((activation(first(own)) * weight).sum(1))  # pooled before the last layer: it is linear
         color = (rgb * weight).sum(1)
         spread = ((rgb - color[:, None]).square() * weight).sum(1).mean(-1, keepdim=True).sqrt()
         summary = torch.cat([color, spread, distance.amin(1), share.amax(1), points], -1)

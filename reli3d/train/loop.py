@@ -29,7 +29,7 @@ class TrainConfig:
     points: int = 2048  # volume points an object; half as many surface points, a quarter of pixels
     max_views: int = 4  # a step draws 1 to this many views
     rate: float = 6.0e-4  # peak learning rate; a small network from scratch takes ten times the paper's 5e-5
-    warmup: int = 300  # steps
+    warmup: int = 100  # steps
     weight_decay: float = 0.02
     clip: float = 1.0  # of the gradient norm
     average: float = 0.999  # decay of the averaged weights that are saved for use
