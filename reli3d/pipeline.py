@@ -12,17 +12,20 @@ import torch
 from torch import Tensor
 
 from reli3d.data.normalize import Similarity, normalize
+from reli3d.data.published_views import background_shown, hero_first, published_views
 from reli3d.data.views import ViewBatch, Views
 from reli3d.geometry.bake import bake
 from reli3d.geometry.hull import mask_distance
 from reli3d.geometry.mesh import Mesh, largest_components, vertex_normals
 from reli3d.geometry.rays import RayScene
-from reli3d.geometry.surface import extract_surface
+from reli3d.geometry.surface import extract_surface, surface_cubes
 from reli3d.geometry.tangents import encode_normals, vertex_tangents
 from reli3d.geometry.uv import unwrap, unwrap_xatlas
 from reli3d.geometry.visibility import visible_from
 from reli3d.nn.field import bound_level, surface_level, surface_material
+from reli3d.nn.heads import deformation
 from reli3d.nn.model import Code, Reconstructor
+from reli3d.nn.presets import Preset
 from reli3d.nn.reni import map_directions
 from reli3d.nn.view_features import ViewMaps
 from reli3d.nn.weights import load_model
@@ -52,21 +55,26 @@ class Prepared:
 
 
 def prepare(model: Reconstructor, views: Views, model_from_input: Similarity) -> Prepared:
-    """Resample ``views`` for ``model``: cropped to the object where the preset sees rays, whole as published where
-    it does not.
-    """
+    """Resample ``views`` for ``model``: cropped to the object, or as the release does where the preset says so."""
     moved = views.transformed(model_from_input).to(model.device)
-    crop = model.preset.encoder.ray_maps
-    batch = moved.resampled(model.preset.image_size, crop=crop)
-    detail = moved.resampled(DETAIL, crop=crop)
+    if model.preset.published_input:
+        batch = published_views(moved.to("cpu"), model.preset.image_size).to(model.device)  # the codec runs there
+    else:
+        batch = moved.resampled(model.preset.image_size)
+    detail = moved.resampled(DETAIL, crop=not model.preset.published_input)
     silhouette = mask_distance(detail.masks)
     return Prepared(batch, torch.cat([detail.images, silhouette[..., None]], -1).contiguous(), detail.intrinsics)
 
 
-def encode(model: Reconstructor, prepared: Prepared) -> tuple[Code, ViewMaps]:
-    """Run the network; the maps carry the encoder's tokens beside the images."""
+def encode(model: Reconstructor, prepared: Prepared, *, background: bool = False) -> tuple[Code, ViewMaps]:
+    """Run the network; the maps carry the encoder's tokens beside the images.
+
+    background: whether the illumination path may look past the masks.
+    """
     batch = prepared.batch
-    code = model.encode(batch.images[None], batch.masks[None], batch.c2w[None], batch.intrinsics[None])
+    shown = torch.tensor([background], device=batch.images.device)
+    code = model.encode(batch.images[None], batch.masks[None], batch.c2w[None], batch.intrinsics[None],
+                        background_visible=shown)  # fmt: skip
     return code, ViewMaps(code.view_tokens[0].float(), prepared.images, batch.c2w, prepared.intrinsics)
 
 
@@ -93,7 +101,7 @@ def extract(model: Reconstructor, code: Code, maps: ViewMaps, resolution: int) -
         asked, level = torch.arange(len(flat), device=flat.device), flat.new_empty(len(flat))
     for part in asked.split(CHUNK):
         level[part] = surface_level(model, code, maps, flat[part])
-    weights = {} if model.preset.log_level else _cube_weights(model, code, flat, resolution)
+    weights = {} if model.preset.log_level else _cube_weights(model, code, flat, level.reshape(grid.shape[:3]))
     mesh = extract_surface(level.reshape(grid.shape[:3]), radius=radius, **weights)
     mesh = largest_components(mesh, SMALLEST_PART)
     return replace(mesh, normals=vertex_normals(mesh.vertices, mesh.faces))
@@ -104,17 +112,31 @@ def _grid(resolution: int, radius: float, device: torch.device) -> Tensor:
     return torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
 
 
-def _cube_weights(model: Reconstructor, code: Code, flat: Tensor, resolution: int) -> dict[str, Tensor]:
-    from reli3d.nn.heads import deformation
+def _cube_weights(model: Reconstructor, code: Code, flat: Tensor, level: Tensor) -> dict[str, Tensor]:
+    """Deformation and weights for ``extract_surface``, asked for only where the surface passes.
 
-    raw = [model.query(code, part[None], ("deformation", "flexicubes")) for part in flat.split(CHUNK)]
-    vertices = (resolution + 1,) * 3
-    offset = deformation(torch.cat([r["deformation"][0] for r in raw]), resolution).reshape(*vertices, 3)
-    corner = torch.cat([r["flexicubes"][0] for r in raw]).reshape(*vertices, -1)
-    n = resolution
-    corners = [corner[i : i + n, j : j + n, k : k + n] for k in (0, 1) for j in (0, 1) for i in (0, 1)]
-    weights = model.merger(torch.stack(corners, -2).reshape(n**3, 8, -1))
-    return {"deformation": offset, "alpha": weights.alpha, "beta": weights.beta, "gamma": weights.gamma}
+    flat: ``(N, 3)`` the grid's points, in the order of ``level``.
+    """
+    cubes, (y, z) = surface_cubes(level), level.shape[1:]
+    i, rest = cubes // ((y - 1) * (z - 1)), cubes % ((y - 1) * (z - 1))
+    lowest = (i * y + rest // (z - 1)) * z + rest % (z - 1)
+    k = torch.arange(8, device=flat.device)
+    corners = lowest[:, None] + ((k & 1) * y + (k >> 1 & 1)) * z + (k >> 2)
+    needed = torch.zeros_like(level, dtype=torch.bool)
+    for side in range(3):  # where the inside reaches the box, the cap stands on the border's vertices
+        for end in (0, -1):
+            needed.select(side, end)[level.select(side, end) < 0] = True
+    needed.view(-1)[corners] = True
+    at = needed.view(-1).nonzero()[:, 0]
+    raw = [model.query(code, flat[part][None], ("deformation", "flexicubes")) for part in at.split(CHUNK)]
+    offset = flat.new_zeros(len(flat), 3)
+    offset[at] = deformation(torch.cat([r["deformation"][0] for r in raw]), level.shape[0] - 1)
+    corner = torch.cat([r["flexicubes"][0] for r in raw])
+    row = torch.cumsum(needed.view(-1), 0) - 1
+    merged = [model.merger(corner[row[part]]) for part in corners.split(CHUNK)]
+    alpha, beta, gamma = (torch.cat([getattr(m, name) for m in merged]) for name in ("alpha", "beta", "gamma"))
+    return {"deformation": offset.reshape(*level.shape, 3), "alpha": alpha, "beta": beta, "gamma": gamma,
+            "cubes": cubes}  # fmt: skip
 
 
 def texture(
@@ -128,7 +150,9 @@ def texture(
     mesh = replace(mesh, tangents=vertex_tangents(mesh))
 
     def surface(position: Tensor, normal: Tensor, tangent: Tensor) -> dict[str, Tensor]:
-        visible = visible_from(scene, position, normal, maps.c2w, maps.intrinsics, DETAIL).float()
+        visible = position.new_zeros(len(position), len(maps.c2w))
+        if model.preset.view_feature_width:  # nothing else asks which view sees a point
+            visible = visible_from(scene, position, normal, maps.c2w, maps.intrinsics, DETAIL).float()
         got = surface_material(model, code, maps, position, normal, visible)
         orm = torch.cat([torch.ones_like(got["roughness"]), got["roughness"], got["metallic"]], -1)
         shading = radial_bump(position, normal, got["normal"])
@@ -183,6 +207,11 @@ class Stopwatch:
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - began
 
 
+def default_normalization(preset: Preset) -> str:
+    """``none`` where views go in as the release prepares them, poses as stored; else ``auto``."""
+    return "none" if preset.published_input else "auto"
+
+
 def check_options(texture_size: int, resolution: int | None) -> None:
     """Raise ValueError where a size is out of range; None is the preset's own."""
     if not 256 <= texture_size <= 4096:
@@ -193,21 +222,28 @@ def check_options(texture_size: int, resolution: int | None) -> None:
 
 @torch.no_grad()
 def reconstruct(views: Views, *, weights: str | Reconstructor = "small", device: str = "cpu", texture_size: int = 1024,
-                resolution: int | None = None, normalization: str | Similarity = "auto", frame: str = "input", up: str
-                = "y", uv: str = "project", seed: int = 0, timings: dict[str, float] | None = None, progress=None) -> Asset:  # fmt: skip
+                resolution: int | None = None, normalization: str | Similarity | None = None, frame: str = "input",
+                up: str = "y", uv: str = "project", hero: int | str = 0, background: str = "masked", seed: int = 0,
+                timings: dict[str, float] | None = None, progress=None) -> Asset:  # fmt: skip
     """A relightable asset from posed photographs of one object.
 
     views: 1 to 16, the first is the hero (see :func:`reli3d.data.folder.load_views`).  weights: ``small`` (in the
     package), a safetensors file, or a loaded :class:`~reli3d.nn.model.Reconstructor`.  texture_size: 256 to 4096
     texels. resolution: cubes a side of the surface grid, default the preset's.  normalization: ``auto``, ``hull``,
-    ``none``, or the map from the input frame to the model's.  frame: ``input`` (that of the cameras) or ``model``. 
-    up: the axis of that frame that shall become +Y. timings: filled with seconds of each stage.  progress: called
-    with the name of each stage.  The same input and seed give the same asset.  Raises ValueError on options out of
-    range and where the masks or the field hold no surface.
+    ``none``, or the map from the input frame to the model's; default :func:`default_normalization`.  frame: ``input``
+    (that of the cameras) or ``model``.  up: the axis of that frame that shall become +Y.  hero: index of another view
+    that comes first, or ``random``.  background: ``masked``, ``visible`` or ``auto``, see
+    :func:`~reli3d.data.published_views.background_shown`.  timings: filled with seconds of each stage.  progress:
+    called with the name of each stage.  The same input and seed give the same asset.  Raises ValueError on options
+    out of range and where the masks or the field hold no surface.
     """
     check_options(texture_size, resolution)
     model = weights if isinstance(weights, Reconstructor) else load_model(weights, device)
     resolution = resolution or model.preset.resolution
+    if normalization is None:
+        normalization = default_normalization(model.preset)
+    views = hero_first(views, hero, seed)
+    shown = background_shown(views, background, readable=model.preset.reads_background)
     torch.manual_seed(seed)
     watch = Stopwatch(model.device, progress)
     with watch.stage("normalize"):
@@ -216,7 +252,7 @@ def reconstruct(views: Views, *, weights: str | Reconstructor = "small", device:
     with watch.stage("prepare"):
         prepared = prepare(model, views, to_model)
     with watch.stage("network"):
-        code, maps = encode(model, prepared)
+        code, maps = encode(model, prepared, background=shown)
     with watch.stage("surface"):
         mesh = extract(model, code, maps, resolution)
     with watch.stage("textures"):
