@@ -11,13 +11,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+import warp as wp
 from torch import Tensor, nn
+from torch.nn.functional import linear
 
+from reli3d._bridge import check, launch
 from reli3d.geometry.projection import gather_views
+from reli3d.kernels.view_features import view_summary_kernel
 
-HIDDEN_WEIGHT = 0.02  # share of a view that does not see the point: enough to say something where no view does
-EDGE = 0.01  # of the image: colours closer than this to the silhouette mix with the background
-OUTSIDE = 0.15  # silhouette distances beyond this share of the image say no more
+OWN = 9  # numbers that a view says of a point besides its tokens, and as many that sum up all views
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,7 @@ class ViewFeatures(nn.Module):
     def __init__(self, token_width: int, channels: int = 16, hidden: int = 48, width: int = 48):
         super().__init__()
         self.tokens = nn.Linear(token_width, channels)
-        self.per_view = nn.Sequential(nn.Linear(channels + 9, hidden), nn.SiLU(), nn.Linear(hidden, width - 9))
+        self.per_view = nn.Sequential(nn.Linear(channels + OWN, hidden), nn.SiLU(), nn.Linear(hidden, width - OWN))
         self.width = width
 
     def forward(self, maps: ViewMaps, points: Tensor, visible: Tensor | None = None, normal: Tensor | None = None):
@@ -49,28 +51,43 @@ class ViewFeatures(nn.Module):
         """
         size, grid = maps.images.shape[1], maps.tokens.shape[1]
         tokens, _ = gather_views(self.tokens(maps.tokens), points, maps.c2w, maps.intrinsics * (grid / size))
-        image, pixel = gather_views(maps.images, points, maps.c2w, maps.intrinsics)
-        rgb, silhouette = image[..., :3], image[..., 3:]
-        centre = (maps.c2w[:, :3, 3] * maps.c2w[:, :3, 2]).sum(-1)  # depth of the origin in each view
-        depth = (pixel[..., 2] - centre)[..., None]
-        inside = ((pixel[..., :2] > 0) & (pixel[..., :2] < size)).all(-1, keepdim=True) & (pixel[..., 2:] > 0)
-        inside = inside.to(rgb.dtype)
-        to_camera = torch.nn.functional.normalize(maps.c2w[:, :3, 3] - points[:, None], dim=-1)
-        if visible is None:
-            seen, facing = torch.zeros_like(depth), torch.ones_like(depth)
-            share = inside
-        else:
-            seen = visible[..., None].to(rgb.dtype) * 2 - 1
-            facing = (to_camera * normal[:, None]).sum(-1, keepdim=True).clamp(min=0)
-            share = inside * (HIDDEN_WEIGHT + visible[..., None] * facing.square())
-        edge = silhouette / (EDGE * size)
-        share = share * edge.clamp(0.05, 1) + 1e-4
-        distance = (silhouette / size).clamp(-OUTSIDE, OUTSIDE) / OUTSIDE
-        own = torch.cat([tokens, rgb, distance, depth, inside, seen, facing, edge.clamp(-1, 1)], -1)
-        weight = share / share.sum(1, keepdim=True)
+        own, weight, summary = view_summary(maps, points, visible, normal)
         first, activation, last = self.per_view
-        pooled = last((activation(first(own)) * weight).sum(1))  # pooled before the last layer: it is linear
-        color = (rgb * weight).sum(1)
-        spread = ((rgb - color[:, None]).square() * weight).sum(1).mean(-1, keepdim=True).sqrt()
-        summary = torch.cat([color, spread, distance.amin(1), share.amax(1), points], -1)
-        return torch.cat([pooled, summary], -1), color
+        channels = tokens.shape[-1]
+        hidden = linear(tokens, first.weight[:, :channels]) + linear(own, first.weight[:, channels:], first.bias)
+        pooled = last((weight[:, None] @ activation(hidden))[:, 0])  # pooled before the last layer: it is linear
+        return torch.cat([pooled, summary], -1), summary[:, :3]
+
+
+def view_summary(
+    maps: ViewMaps, points: Tensor, visible: Tensor | None, normal: Tensor | None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """What the images show of ``points (N, 3)``: ``(N, V, 9)`` a view, its weight ``(N, V)``, ``(N, 9)`` in sum.
+
+    See :mod:`reli3d.kernels.view_features` for the numbers.  visible and normal as in :class:`ViewFeatures`.  No
+    gradient.  Raises TypeError unless float32, ValueError on wrong shapes or mixed devices.
+    """
+    views, n = len(maps.images), len(points)
+    check("images", maps.images, last=4), check("points", points, last=3, like=maps.images)
+    if maps.images.ndim != 4 or maps.images.shape[1] != maps.images.shape[2] or maps.images.shape[1] < 2:
+        raise ValueError(f"images: expected (V, S, S, 4) with S of at least 2, got {tuple(maps.images.shape)}")
+    if (visible is None) != (normal is None):
+        raise ValueError("visible, normal: expected both or none, got one")
+    if visible is None:
+        visible, normal, surface = points.new_empty(0, views), points.new_empty(0, 3), 0
+    else:
+        check("visible", visible, last=views, like=points), check("normal", normal, last=3, like=points)
+        surface = 1
+        if len(visible) != n or len(normal) != n:
+            raise ValueError(f"visible, normal: expected {n} rows, got {len(visible)} and {len(normal)}")
+    out = [points.new_empty(n, views, OWN), points.new_empty(n, views), points.new_empty(n, OWN)]
+    inputs = (maps.images, maps.c2w, maps.intrinsics, points, normal, visible)
+    images, c2w, intrinsics, points, normal, visible = (t.detach().contiguous() for t in inputs)
+    launch(
+        view_summary_kernel,
+        n,
+        [(images, wp.vec4), (c2w, wp.mat44), (intrinsics, wp.vec4), (points, wp.vec3), surface, (normal, wp.vec3),
+         (visible, wp.float32), *((t, wp.float32) for t in out)],
+        points.device,
+    )  # fmt: skip
+    return out[0], out[1], out[2]
