@@ -1,0 +1,189 @@
+"""Antialiased outlines whose gradient reaches the vertices, for any image that was made through the pixel centres.
+
+After Laine et al. 2020, Modular Primitives for High-Performance Differentiable Rendering, section 3.4: where an outline
+passes between two neighbouring pixel centres, the two are blended by the place where it crosses the line between them.
+There the edge is looked for in the triangle that a pixel shows, which misses it when triangles are smaller than pixels.
+Here every edge of the mesh is judged, its crossings with the rows or columns of pixel centres are listed, and a ray
+tells whether a crossing is seen; triangles of any size take part.  The sum over an image whose contrast is constant
+along the outline then has the derivative of the area by the midpoint rule, one crossing a row.  A single pixel is not
+the exact share of its area, because an oblique edge changes one pixel of a row where its true coverage changes two:
+values err by 0.1 on average there, gradients of squared differences by some 10 %.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from reli3d._bridge import check, launch
+from reli3d.geometry.rays import RayScene
+from reli3d.kernels import silhouette as kernels
+from reli3d.render.camera import Camera, project
+
+OUTSIDE = 0.01  # pixels that the visibility ray passes beside the edge, so as not to graze its own faces
+IN_FRONT = 1e-3  # share of the distance by which something must be nearer to hide an edge; spares folds of float32
+
+
+@dataclass(frozen=True)
+class Crossings:
+    """Where visible outlines pass between pixel centres; M pairs of neighbours, each at most once a direction.
+
+    inner, outer: ``(M,)`` int64 pixel (row * W + column) on the surface's side and beyond.  place: ``(M,)`` in [0, 1],
+    distance of the crossing from the inner centre in pixels.  Gradients reach the vertices and the camera.
+    """
+
+    inner: Tensor
+    outer: Tensor
+    place: Tensor
+
+
+def mesh_edges(vertices: Tensor, faces: Tensor) -> Tensor:
+    """Edges ``(E, 4)`` int32: two ends and the opposite vertices of the two faces, -1 where there is only one.
+
+    vertices: ``(V, 3)`` float32.  faces: ``(F, 3)`` int32.  Vertices at exactly the same place count as one (an atlas
+    splits them), of which the first stands in the table and gets the gradient.  An edge of three or more faces is
+    listed once a face.
+    """
+    check("vertices", vertices, last=3)
+    check("faces", faces, last=3, like=vertices, dtype=torch.int32)
+    if vertices.ndim != 2 or faces.ndim != 2:
+        got = f"{tuple(vertices.shape)}, {tuple(faces.shape)}"
+        raise ValueError(f"vertices, faces: expected (V, 3) and (F, 3), got {got}")
+    if faces.numel() == 0:
+        return faces.new_empty(0, 4)
+    low, high = (int(v) for v in torch.aminmax(faces))
+    if low < 0 or high >= len(vertices):
+        raise ValueError(f"faces: expected indices in [0, {len(vertices)}), got [{low}, {high}]")
+    _, place = torch.unique(vertices.detach(), dim=0, return_inverse=True)
+    own = torch.arange(len(vertices), device=faces.device)
+    first = torch.full_like(own, len(vertices)).scatter_reduce(0, place, own, "amin")
+    corners = first[place[faces.long()]]
+    corners = corners[(corners != corners.roll(1, 1)).all(1)]  # a face that welding closes has no edge to show
+    ends = torch.cat([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]).sort(1).values
+    opposite = torch.cat([corners[:, 2], corners[:, 0], corners[:, 1]])
+    order = torch.argsort(ends[:, 0] * len(vertices) + ends[:, 1], stable=True)
+    ends, opposite = ends[order], opposite[order]
+    _, times = torch.unique_consecutive(ends, dim=0, return_counts=True)
+    begin = times.cumsum(0) - times
+    pair = begin[times == 2]
+    alone = torch.ones(len(ends), dtype=torch.bool, device=faces.device)
+    alone[pair] = alone[pair + 1] = False
+    both = torch.cat([ends[pair], opposite[pair, None], opposite[pair + 1, None]], 1)
+    single = torch.cat([ends[alone], opposite[alone, None], opposite.new_full((int(alone.sum()), 1), -1)], 1)
+    return torch.cat([both, single]).int()
+
+
+def outline_crossings(vertices: Tensor, edges: Tensor, camera: Camera, scene: RayScene) -> Crossings:
+    """Crossings of the visible outlines of ``vertices (V, 3)`` and ``edges`` (of :func:`mesh_edges`) with pixel lines.
+
+    camera: one, no batch.  scene: what may hide an edge, normally the mesh itself and anything beside it.  An edge
+    with an end behind the eye is left out.  Of several crossings of one pair in one direction the outermost stays.
+    """
+    check("vertices", vertices, last=3)
+    check("edges", edges, last=4, like=vertices, dtype=torch.int32)
+    if camera.c2w.ndim != 2:
+        raise ValueError(f"camera.c2w: expected one camera (4, 4), got {tuple(camera.c2w.shape)}")
+    if edges.ndim != 2 or (edges.numel() and not -1 <= int(edges.min()) <= int(edges.max()) < len(vertices)):
+        raise ValueError(f"edges: expected (E, 4) indices below {len(vertices)}, got others")
+    if scene.device != vertices.device:
+        raise ValueError(f"scene: expected device {vertices.device}, got {scene.device}")
+    edge, line, steep, outward = _lines(vertices, edges, camera)
+    ends = [vertices.index_select(0, k) for k in edges.long()[edge, :2].unbind(1)]
+    (a, za), (b, zb) = (project(p, camera.c2w, camera.intrinsics) for p in ends)
+    a, b = (torch.where(steep[:, None], p.flip(1), p) for p in (a, b))  # the coordinate that runs over lines first
+    centre = line + 0.5
+    part = (centre - a[:, 0]) / (b[:, 0] - a[:, 0])
+    across = a[:, 1] + part * (b[:, 1] - a[:, 1])
+    low = torch.floor(across.detach() - 0.5)
+    size = torch.where(steep, camera.width, camera.height)
+    inner_at = torch.where(outward > 0.0, low, low + 1.0)
+    place = (across - inner_at - 0.5) * outward
+    keep = (low >= 0.0) & (low < size - 1)
+    depth = 1.0 / ((1.0 - part) / za + part / zb)
+    beside = torch.stack([centre, across + OUTSIDE * outward], 1).detach()
+    keep &= _seen(torch.where(steep[:, None], beside.flip(1), beside), depth.detach(), camera, scene)
+    stride = torch.where(steep, 1, camera.width)
+    inner = torch.where(steep, line * camera.width + inner_at.long(), inner_at.long() * camera.width + line)
+    outer = inner + stride * outward.long()
+    chosen = _outermost(keep, inner * 4 + 2 * steep + (outward > 0.0), place.detach(), 4 * camera.width * camera.height)
+    return Crossings(inner[chosen], outer[chosen], place.index_select(0, chosen))
+
+
+def blend_outlines(image: Tensor, crossings: Crossings) -> Tensor:
+    """``image (H, W, C)`` with each pair of pixels at an outline blended by where the outline passes.
+
+    The outline's side of a pixel border decides which of the two changes; several pairs add up, their weights scaled
+    down where they exceed 1, so a value stays between its neighbours'.  Gradients reach the image and the crossings.
+    """
+    check("image", image, like=crossings.place)
+    if image.ndim != 3:
+        raise ValueError(f"image: expected shape (H, W, C), got {tuple(image.shape)}")
+    flat = image.reshape(-1, image.shape[2])
+    grows = crossings.place.detach() > 0.5  # the surface spills into the outer pixel
+    into = torch.where(grows, crossings.outer, crossings.inner)
+    other = torch.where(grows, crossings.inner, crossings.outer)
+    if into.numel() and int(torch.maximum(into, other).max()) >= len(flat):
+        raise ValueError(f"image: expected the size that the crossings were made for, got {tuple(image.shape)}")
+    weight = (crossings.place - 0.5).abs()
+    total = weight.new_zeros(len(flat)).index_add(0, into, weight).clamp(min=1.0)
+    contrast = flat.index_select(0, other) - flat.index_select(0, into)
+    return flat.index_add(0, into, (weight / total.index_select(0, into))[:, None] * contrast).reshape(image.shape)
+
+
+def antialias(image: Tensor, vertices: Tensor, faces: Tensor, camera: Camera, scene: RayScene | None = None, *,
+              edges: Tensor | None = None) -> Tensor:  # fmt: skip
+    """``image (H, W, C)`` with antialiased outlines of the mesh; float32, any number of layers (mask, colour, normal).
+
+    image: values at the first hits of the camera's rays through the pixel centres.  vertices: ``(V, 3)``.  faces:
+    ``(F, 3)`` int32.  camera: one of the image's size.  scene: what hides edges, made of the mesh here if None.
+    edges: of :func:`mesh_edges`, made here if None; they hold for as long as the faces do.
+
+    Gradients reach the image, the vertices and the camera; they are the same bits for any number of CPU threads.
+    Values inside faces are the caller's: only outlines move with the vertices here, not seams of colour or lines where
+    faces cut through each other.
+    """
+    check("image", image, like=vertices)
+    if image.ndim != 3 or image.shape[:2] != (camera.height, camera.width):
+        raise ValueError(f"image: expected ({camera.height}, {camera.width}, C), got {tuple(image.shape)}")
+    edges = mesh_edges(vertices, faces) if edges is None else edges
+    scene = RayScene(vertices, faces) if scene is None else scene
+    return blend_outlines(image, outline_crossings(vertices, edges, camera, scene))
+
+
+def _lines(vertices: Tensor, edges: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Edge, pixel line, steepness and direction away from the surface (1 or -1) of every crossing, each ``(M,)``."""
+    n, device = len(edges), vertices.device
+    first, count = (torch.empty(n, dtype=torch.int32, device=device) for _ in range(2))
+    outward = torch.empty(n, device=device)
+    steep = torch.empty(n, dtype=torch.bool, device=device)
+    c2w, intrinsics = camera.c2w.detach().tolist(), camera.intrinsics.detach().tolist()
+    launch(kernels.outline_kernel, n, [
+        (vertices.contiguous(), wp.vec3), (edges.contiguous(), wp.int32), wp.mat44(*sum(c2w, [])), wp.vec4(*intrinsics),
+        camera.width, camera.height, (outward, wp.float32), (steep, wp.bool), (first, wp.int32), (count, wp.int32),
+    ], device)  # fmt: skip
+    count = count.long()
+    edge = torch.repeat_interleave(torch.arange(n, device=device), count)
+    begin = count.cumsum(0) - count
+    line = first.long()[edge] + torch.arange(len(edge), device=device) - begin[edge]
+    return edge, line, steep[edge], outward[edge]
+
+
+def _seen(pixels: Tensor, depth: Tensor, camera: Camera, scene: RayScene) -> Tensor:
+    """Whether nothing lies before ``depth (M,)`` at ``pixels (M, 2)``."""
+    fx, fy, cx, cy = camera.intrinsics.detach().unbind(-1)
+    local = torch.stack([(pixels[:, 0] - cx) / fx, (cy - pixels[:, 1]) / fy, -torch.ones_like(depth)], -1)
+    directions = local @ camera.c2w.detach()[:3, :3].T  # of depth 1: the ray's t is the depth
+    return ~scene.occluded(camera.position.detach(), directions, t_max=depth * (1.0 - IN_FRONT))
+
+
+def _outermost(keep: Tensor, key: Tensor, place: Tensor, keys: int) -> Tensor:
+    """Rows that hold the largest ``place`` of their ``key`` among those to ``keep``, the first of equals; sorted."""
+    rows = torch.nonzero(keep)[:, 0]
+    key, place = key[rows], place[rows]
+    best = place.new_full((keys,), -1.0).scatter_reduce(0, key, place, "amax")
+    rows, key = rows[place == best[key]], key[place == best[key]]
+    first = torch.full((keys,), len(keep), device=key.device).scatter_reduce(0, key, rows, "amin")
+    return rows[rows == first[key]]
