@@ -136,7 +136,7 @@ def _weld(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return first[order].astype(np.int64), rank[label.reshape(-1)].astype(np.int64)
 
 
-def _welded_faces(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+def welded_faces(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
     """Faces over welded labels, and which of them are not degenerate."""
     _, label = _weld(mesh.vertices.detach().cpu().numpy())
     faces = label[mesh.faces.cpu().numpy()].reshape(-1, 3)
@@ -146,7 +146,7 @@ def _welded_faces(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
 
 def face_components(mesh: Mesh) -> Tensor:
     """Component of every face, ``(F,)`` int64, numbered by their lowest face; faces that share a position connect."""
-    faces, _ = _welded_faces(mesh)
+    faces, _ = welded_faces(mesh)
     if not len(faces):
         return torch.zeros(0, dtype=torch.int64, device=mesh.faces.device)
     n = int(faces.max()) + 1
@@ -192,7 +192,7 @@ def largest_components(mesh: Mesh, min_fraction: float = 0.02) -> Mesh:
 
 def report(mesh: Mesh) -> MeshReport:
     """Topology of the welded mesh: borders, non-manifold edges and vertices, components and the Euler number."""
-    faces, sound = _welded_faces(mesh)
+    faces, sound = welded_faces(mesh)
     degenerate = int((~sound).sum())
     faces = faces[sound]
     size = {"vertices": len(mesh.vertices), "faces": len(mesh.faces), "degenerate_faces": degenerate}

@@ -1,0 +1,101 @@
+"""Smoothing of a mesh's positions with the umbrella operator: every vertex moves towards the mean of its neighbours.
+
+Neighbours are those of the welded mesh, so a surface does not tear where charts or exporters split its vertices.
+Only positions move: UV coordinates stay, normals and tangents, which no longer fit, are left out of the result.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from reli3d.geometry.mesh import Mesh, weld
+
+BORDERS = ("fixed", "along")
+
+
+@dataclass(frozen=True)
+class _Umbrella:
+    """The sparse operator ``mean of the neighbours - own position`` of the welded mesh."""
+
+    label: Tensor  # (V,) welded vertex of every vertex
+    share: Tensor  # (V, 1) 1 / copies of a vertex
+    ends: tuple[Tensor, Tensor]  # (E,) each: the vertex that moves and a neighbour
+    inverse: Tensor  # (W, 1) 1 / neighbours, 0 for what stays
+
+    def welded(self, values: Tensor) -> Tensor:
+        out = values.new_zeros(len(self.inverse), values.shape[1])
+        return out.index_add(0, self.label, values * self.share)
+
+    def __call__(self, positions: Tensor) -> Tensor:
+        moved, neighbour = self.ends
+        return torch.zeros_like(positions).index_add(0, moved, (positions[neighbour] - positions[moved])) * self.inverse
+
+
+def _umbrella(mesh: Mesh, border: str) -> _Umbrella:
+    first, label = weld(mesh.vertices)
+    n = len(first)
+    faces = label[mesh.faces.long()]
+    tail, head = faces.reshape(-1), faces[:, [1, 2, 0]].reshape(-1)
+    real = tail != head
+    tail, head = tail[real], head[real]
+    key, count = torch.unique(torch.minimum(tail, head) * n + torch.maximum(tail, head), return_counts=True)
+    a, b, open_edge = key // n, key % n, count == 1
+    at_border = torch.zeros(n, dtype=torch.bool, device=key.device)
+    at_border[a[open_edge]] = at_border[b[open_edge]] = True
+    moved, neighbour = torch.cat([a, b]), torch.cat([b, a])
+    keep = ~at_border[moved]
+    if border == "along":
+        keep |= torch.cat([open_edge, open_edge])
+    moved, neighbour = moved[keep], neighbour[keep]
+    degree = torch.bincount(moved, minlength=n)[:, None].to(mesh.vertices.dtype)
+    inverse = torch.where(degree > 0, 1.0 / degree.clamp(min=1.0), 0.0)
+    share = 1.0 / torch.bincount(label, minlength=n)[label][:, None].to(mesh.vertices.dtype)
+    return _Umbrella(label, share, (moved, neighbour), inverse)
+
+
+def _smoothed(mesh: Mesh, steps: list[float], border: str) -> Mesh:
+    if border not in BORDERS:
+        raise ValueError(f"border: expected one of {', '.join(BORDERS)}, got {border}")
+    if not steps or not len(mesh.faces):
+        return replace(mesh, normals=None, tangents=None)
+    operator = _umbrella(mesh, border)
+    start = positions = operator.welded(mesh.vertices)
+    for step in steps:
+        positions = positions + step * operator(positions)
+    vertices = mesh.vertices + (positions - start)[operator.label]
+    return replace(mesh, vertices=vertices, normals=None, tangents=None)
+
+
+def _check_steps(iterations: int, step: float) -> None:
+    if iterations < 0:
+        raise ValueError(f"iterations: expected at least 0, got {iterations}")
+    if not 0.0 < step <= 1.0:
+        raise ValueError(f"step: expected a value in (0, 1], got {step}")
+
+
+def laplacian_smooth(mesh: Mesh, *, iterations: int = 10, step: float = 0.5, border: str = "fixed") -> Mesh:
+    """The mesh after ``iterations`` of moving every vertex by ``step`` of its umbrella vector; it shrinks.
+
+    step in (0, 1].  border: "fixed" keeps the vertices of open borders, "along" smooths them as a curve among
+    themselves.  Gradients reach the vertices; sums over neighbours have a fixed order on CPU.  Raises ValueError for
+    values out of range.
+    """
+    _check_steps(iterations, step)
+    return _smoothed(mesh, [step] * iterations, border)
+
+
+def taubin_smooth(mesh: Mesh, *, iterations: int = 10, step: float = 0.5, pass_band: float = 0.1,
+                  border: str = "fixed") -> Mesh:  # fmt: skip
+    """The mesh after ``iterations`` pairs of a shrinking and an inflating step: noise goes, the volume stays.
+
+    Taubin 1995, A signal processing approach to fair surface design: steps ``step`` and ``mu`` with ``1 / step + 1 /
+    mu = pass_band``; frequencies of the umbrella operator below ``pass_band`` are kept or raised a little.  pass_band
+    in (0, 1 / step), small.  The rest as :func:`laplacian_smooth`.
+    """
+    _check_steps(iterations, step)
+    if not 0.0 < pass_band < 1.0 / step:
+        raise ValueError(f"pass_band: expected a value in (0, {1.0 / step:.4g}), got {pass_band}")
+    return _smoothed(mesh, [step, 1.0 / (pass_band - 1.0 / step)] * iterations, border)
