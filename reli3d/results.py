@@ -22,11 +22,12 @@ from reli3d.nn.weights import Manifest
 from reli3d.render.asset import Asset
 
 FILES = ("mesh.glb", "environment.exr", "environment.hdr", "preview.png", "run_info.json")
+COPIES = {"illumination.hdr": "environment.hdr"}  # names of the published release, and what they hold
 
 
-def complete(folder: Path) -> bool:
-    """Whether ``folder`` holds every file of a reconstruction."""
-    return all((folder / name).is_file() for name in FILES)
+def complete(folder: Path, *, compatible: bool = False) -> bool:
+    """Whether ``folder`` holds every file of a reconstruction, with ``compatible`` the copies too."""
+    return all((folder / name).is_file() for name in (*FILES, *(COPIES if compatible else ())))
 
 
 def mesh_statistics(mesh: Mesh) -> dict:
@@ -40,8 +41,14 @@ def peak_memory_mib() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20
 
 
-def write_results(folder: Path, asset: Asset, picture: np.ndarray, info: dict) -> None:
-    """Write :data:`FILES` into ``folder``; an error leaves what was there before.  Raises OSError, ValueError."""
+def write_results(
+    folder: Path, asset: Asset, picture: np.ndarray, info: dict, *, compatible: bool = False
+) -> None:
+    """Write :data:`FILES` into ``folder``; an error leaves what was there before.  Raises OSError, ValueError.
+
+    compatible: write :data:`COPIES` as well.
+    """
+    copies = COPIES if compatible else {}
     folder.parent.mkdir(parents=True, exist_ok=True)
     temporary = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
     temporary.mkdir()
@@ -52,8 +59,10 @@ def write_results(folder: Path, asset: Asset, picture: np.ndarray, info: dict) -
         write_hdr(temporary / "environment.hdr", asset.environment.radiance)
         write_png(temporary / "preview.png", picture)
         (temporary / "run_info.json").write_text(json.dumps(info, indent=1) + "\n")
+        for name, source in copies.items():
+            shutil.copyfile(temporary / source, temporary / name)
         folder.mkdir(exist_ok=True)
-        for name in FILES:
+        for name in (*FILES, *copies):
             os.replace(temporary / name, folder / name)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)

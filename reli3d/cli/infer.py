@@ -26,6 +26,8 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--views", type=int, help="use the first N views (1 to 16)")
     p.add_argument("--masks", type=Path, help="folder of masks with the names of the images, instead of their alpha")
     p.add_argument("--weights", default="small", help="small (in the package), official, or a safetensors file")
+    p.add_argument("--download", action="store_true", help="with --weights official: fetch and convert the published "
+                   "checkpoint where it is not there yet; nothing else ever uses the network")  # fmt: skip
     p.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="auto: cuda where there is one")
     p.add_argument("--texture-size", type=int, default=1024, help="texels, 256 to 4096 (default 1024)")
     p.add_argument(
@@ -34,8 +36,14 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--uv", choices=("project", "xatlas"), default="project", help="atlas: own projection or xatlas (slow)"
     )
-    p.add_argument("--normalize", choices=("auto", "hull", "none"), default="auto",
-                   help="auto: centre and scale by the visual hull unless it sits in the model's cube")  # fmt: skip
+    p.add_argument("--normalize", choices=("auto", "hull", "none"),
+                   help="auto: centre and scale by the visual hull unless it sits in the model's cube; default auto, "
+                   "with official weights none: poses as stored")  # fmt: skip
+    p.add_argument("--hero", default="0", metavar="N", help="view that the network takes as its main one, counted "
+                   "from 0 (the default), or random")  # fmt: skip
+    p.add_argument("--background", choices=("auto", "masked", "visible"), default="masked",
+                   help="what the light is read from: masked (default): the object alone; visible: the background "
+                   "too; auto: visible where all views have one and the weights know how")  # fmt: skip
     p.add_argument(
         "--frame", choices=("input", "model"), default="input", help="frame of the mesh (default the cameras')"
     )
@@ -43,6 +51,8 @@ def parser() -> argparse.ArgumentParser:
         "--up", choices=("x", "y", "z", "-x", "-y", "-z"), default="y", help="axis of that frame to turn to +Y"
     )
     p.add_argument("--seed", type=int, default=0)
+    p.add_argument("--compatible-names", action="store_true", help="write illumination.hdr, the published release's "
+                   "name, beside environment.hdr")  # fmt: skip
     p.add_argument("--skip-existing", action="store_true", help="leave objects alone whose files are all there")
     p.add_argument(
         "--warm", action="store_true", help="reconstruct every object twice and record the second time as well"
@@ -72,7 +82,7 @@ def main(argv: list[str] | None = None) -> int:
         try:
             if args.check:
                 check(folder, target, args)
-            elif args.skip_existing and job.complete(target):
+            elif args.skip_existing and job.complete(target, compatible=args.compatible_names):
                 print(f"{name}: all files are there, skipped", file=sys.stderr)
             else:
                 job.run(folder, name, target)
@@ -128,6 +138,14 @@ def check(folder: Path, target: Path, args: argparse.Namespace) -> None:
     print(target / "rig.png")
 
 
+def _fetch(weights: str) -> None:
+    from reli3d.nn import hub
+
+    if weights != "official":
+        raise ValueError(f"download: expected --weights official with it, got {weights}")
+    hub.fetch_official()
+
+
 class Job:
     """What all objects of one command share: options and the loaded network."""
 
@@ -137,6 +155,8 @@ class Job:
         from reli3d.pipeline import check_options
 
         check_options(args.texture_size, args.resolution)
+        if args.download:
+            _fetch(args.weights)
         self.args, self.device, self.complete = args, device, results.complete
         path = weights.locate(args.weights)
         self.model, self.manifest = weights.load(path, device=device)
@@ -147,8 +167,9 @@ class Job:
         from reli3d import results
         from reli3d.data.folder import load_views
         from reli3d.data.normalize import normalize
+        from reli3d.data.published_views import hero_first
         from reli3d.eval.preview import preview
-        from reli3d.pipeline import output_frame, reconstruct
+        from reli3d.pipeline import default_normalization, output_frame, reconstruct
 
         args, steps = self.args, Progress(name)
         began = time.perf_counter()
@@ -156,14 +177,17 @@ class Job:
         views = load_views(folder, views=args.views, masks=args.masks, allow_outside=args.allow_outside)
         for note in views.notes:
             print(f"{name}: {note}", file=sys.stderr)
+        hero = int(args.hero) if args.hero.isdecimal() and args.hero.isascii() else args.hero
+        views = hero_first(views, hero, args.seed)
         reading = time.perf_counter() - began
-        to_model = normalize(views, args.normalize)
+        normalization = args.normalize or default_normalization(self.model.preset)
+        to_model = normalize(views, normalization)
         seconds: dict[str, dict[str, float]] = {}
         for label in ["cold" if self.cold else "warm", *(["warm"] if args.warm else [])]:
             stages: dict[str, float] = {"read": reading}
             asset = reconstruct(views, weights=self.model, texture_size=args.texture_size, resolution=args.resolution,
-                                normalization=args.normalize, frame=args.frame, up=args.up, uv=args.uv, seed=args.seed,
-                                timings=stages, progress=steps)  # fmt: skip
+                                normalization=normalization, frame=args.frame, up=args.up, uv=args.uv, seed=args.seed,
+                                background=args.background, timings=stages, progress=steps)  # fmt: skip
             seconds[label] = {k: round(v, 4) for k, v in stages.items()}
         self.cold = False
         steps("preview")
@@ -179,6 +203,7 @@ class Job:
             "preset": self.model.preset.name,
             "texture_size": args.texture_size,
             "resolution": args.resolution or self.model.preset.resolution,
+            "background": args.background,
             "seed": args.seed,
             "device": self.device,
             "mesh": results.mesh_statistics(asset.mesh),
@@ -188,7 +213,7 @@ class Job:
             "versions": results.versions(),
         }
         steps("writing")
-        results.write_results(target, asset, picture, info)
+        results.write_results(target, asset, picture, info, compatible=args.compatible_names)
         steps.close()
         print(target / "mesh.glb")
 

@@ -137,17 +137,21 @@ def check_keys(where: object, got: Mapping[str, tuple[int, ...]], expected: Mapp
         raise WeightsError(where, f"{name}: {found}" + (f", and {len(wrong) - 1} more" if len(wrong) > 1 else ""))
 
 
+def official_path() -> Path:
+    """Where the converted official weights lie: in the folder ``RELI3D_WEIGHTS``, default ``~/.cache/reli3d``."""
+    return Path(os.environ.get("RELI3D_WEIGHTS") or Path.home() / ".cache" / "reli3d") / "official.safetensors"
+
+
 def locate(weights: str | os.PathLike) -> Path:
     """File of the weights called ``small``, which the package brings, or ``official``, or of a path.
 
-    The official file is what :func:`convert_checkpoint` wrote into the folder ``RELI3D_WEIGHTS`` (default
-    ``~/.cache/reli3d``).  Raises WeightsError where there is no such file.
+    Nothing is fetched: :mod:`reli3d.nn.hub` does, where asked.  Raises WeightsError where there is no such file.
     """
     if os.fspath(weights) == "small":
         path, fix = SMALL, "install the package again"
     elif os.fspath(weights) == "official":
-        path = Path(os.environ.get("RELI3D_WEIGHTS") or Path.home() / ".cache" / "reli3d") / "official.safetensors"
-        fix = "convert the published checkpoint into it, or give the path of a converted file"
+        path = official_path()
+        fix = "fetch them with --download (about 7 GB, Stability AI Community License), or give a converted file"
     else:
         path, fix = Path(weights), "check the path"
     if not path.is_file():
