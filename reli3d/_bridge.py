@@ -2,9 +2,9 @@
 
 A kernel launched from here takes ``start: int`` first and works on ``i = start + wp.tid()``.  Warp runs a CPU launch on
 one thread and releases the GIL, so a large CPU launch is cut into a fixed number of slices over a thread pool; the
-number depends on the size alone, which makes the results the same bits for any number of threads.  Outputs must be
-disjoint per ``i``.  Warp's CPU atomics are not atomic: in a backward pass every input that several ``i`` read (named in
-``shared``) gets one accumulator a slice, added up in slice order.
+number depends on the size and the operation alone, which makes the results the same bits for any number of threads.
+Outputs must be disjoint per ``i``.  Warp's CPU atomics are not atomic: in a backward pass every input that several
+``i`` read (named in ``shared``) gets one accumulator a slice, added up in slice order.
 """
 
 from __future__ import annotations
@@ -74,16 +74,16 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_pool.cache_clear)  # a fork copies no threads: the child starts its own
 
 
-def slices(n: int) -> list[tuple[int, int]]:
-    """``[(start, count), ...]`` of a CPU launch over ``n`` threads; depends on ``n`` alone."""
-    parts = max(1, min(SLICES, n // SLICE_MIN))
+def slices(n: int, slice_min: int = SLICE_MIN) -> list[tuple[int, int]]:
+    """``[(start, count), ...]`` of a CPU launch over ``n`` threads; depends on ``n`` and ``slice_min`` alone."""
+    parts = max(1, min(SLICES, n // slice_min))
     edges = [n * k // parts for k in range(parts + 1)]
     return [(a, b - a) for a, b in zip(edges[:-1], edges[1:], strict=True)]
 
 
-def over_slices(n: int, work) -> list:
+def over_slices(n: int, work, *, slice_min: int = SLICE_MIN) -> list:
     """``[work(k, start, count), ...]`` for every slice of ``n``, on the thread pool where there is more than one."""
-    parts = slices(n)
+    parts = slices(n, slice_min)
     inside = threading.current_thread().name.startswith("reli3d-slice")  # waiting for its own pool would never end
     if len(parts) == 1 or torch.get_num_threads() == 1 or inside:
         return [work(k, *part) for k, part in enumerate(parts)]
@@ -112,10 +112,11 @@ def empty(shape: Sequence[int], dtype, device: torch.device) -> Tensor:
     return torch.empty((*shape, *tail), dtype=torch_dtype, device=device)
 
 
-def launch(kernel, n: int, args: Sequence, device: torch.device) -> None:
+def launch(kernel, n: int, args: Sequence, device: torch.device, *, slice_min: int = SLICE_MIN) -> None:
     """Run ``kernel(start, *args)`` over ``n`` threads.  ``args``: ``(tensor, warp type)`` pairs or plain values.
 
-    Tensors must be contiguous and on ``device``; nothing is copied and no gradient is recorded.
+    Tensors must be contiguous and on ``device``; nothing is copied and no gradient is recorded.  slice_min: fewest
+    threads of a CPU slice; small where each of few threads does much, so that their launch is cut too.
     """
     if n == 0:
         return
@@ -125,29 +126,31 @@ def launch(kernel, n: int, args: Sequence, device: torch.device) -> None:
             wp.launch(kernel, n, [0, *values], device=name)
             return
         kernel.module.load(wp.get_device("cpu"))
-        over_slices(n, lambda k, start, count: wp.launch(kernel, count, [start, *values], device="cpu"))
+        over_slices(n, lambda k, start, count: wp.launch(kernel, count, [start, *values], device="cpu"),
+                    slice_min=slice_min)  # fmt: skip
 
 
 class _KernelOp(torch.autograd.Function):
     """``outs = kernel(start, *ins)``; backward launches the adjoint of the same kernel."""
 
     @staticmethod
-    def forward(ctx, kernel, n, plain, types, shared, outs, device, *tensors):
+    def forward(ctx, kernel, n, slice_min, plain, types, shared, outs, device, *tensors):
         tensors = [t.contiguous() for t in tensors]
         results = [empty(shape, dtype, device) for shape, dtype in outs]
-        launch(kernel, n, _fill(plain, zip(tensors, types, strict=True)) + _typed(results, outs), device)
+        launch(kernel, n, _fill(plain, zip(tensors, types, strict=True)) + _typed(results, outs), device,
+               slice_min=slice_min)  # fmt: skip
         ctx.save_for_backward(*tensors, *results)
-        ctx.op = kernel, n, plain, types, shared, outs, device
+        ctx.op = kernel, n, slice_min, plain, types, shared, outs, device
         ctx.mark_non_differentiable(*(r for r in results if not r.is_floating_point()))
         return tuple(results)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, *g_outs):
-        kernel, n, plain, types, shared, outs, device = ctx.op
+        kernel, n, slice_min, plain, types, shared, outs, device = ctx.op
         tensors, results = ctx.saved_tensors[: len(types)], ctx.saved_tensors[len(types) :]
-        wanted = ctx.needs_input_grad[7:]
-        parts = slices(n) if device.type == "cpu" else [(0, n)]
+        wanted = ctx.needs_input_grad[8:]
+        parts = slices(n, slice_min) if device.type == "cpu" else [(0, n)]
         grads = [
             torch.zeros((len(parts) if i in shared else 1, *t.shape), dtype=t.dtype, device=device) if w else None
             for i, (t, w) in enumerate(zip(tensors, wanted, strict=True))
@@ -172,10 +175,10 @@ class _KernelOp(torch.autograd.Function):
 
                 if name == "cpu":
                     kernel.module.load(wp.get_device("cpu"))
-                    over_slices(n, adjoint)
+                    over_slices(n, adjoint, slice_min=slice_min)
                 else:
                     adjoint(0, 0, n)
-        return None, None, None, None, None, None, None, *(None if g is None else g.sum(0) for g in grads)
+        return None, None, None, None, None, None, None, None, *(None if g is None else g.sum(0) for g in grads)
 
 
 _SLOT = object()  # marks the place of a tensor among the plain arguments
@@ -190,17 +193,18 @@ def _typed(tensors, outs):
     return [(t, dtype) for t, (_, dtype) in zip(tensors, outs, strict=True)]
 
 
-def call(kernel, n: int, ins: Sequence, outs: Sequence, *, device: torch.device, shared: Sequence[int] = ()):
+def call(kernel, n: int, ins: Sequence, outs: Sequence, *, device: torch.device, shared: Sequence[int] = (),
+         slice_min: int = SLICE_MIN):  # fmt: skip
     """Differentiable launch: new tensors ``outs = [(shape, warp type), ...]`` from ``kernel(start, *ins, *outs)``.
 
     ``ins``: ``(tensor, warp type)`` pairs or plain values.  Gradients reach every floating-point tensor of ``ins`` that
     asks for one, through the kernel's own adjoint (its module needs ``enable_backward``).  ``shared``: positions,
-    counted among the tensors, of inputs that more than one thread reads.
+    counted among the tensors, of inputs that more than one thread reads.  ``slice_min``: as for :func:`launch`.
     """
     tensors = [a[0] for a in ins if isinstance(a, tuple)]
     types = [a[1] for a in ins if isinstance(a, tuple)]
     plain = [_SLOT if isinstance(a, tuple) else a for a in ins]
-    return _KernelOp.apply(kernel, n, plain, types, frozenset(shared), list(outs), device, *tensors)
+    return _KernelOp.apply(kernel, n, slice_min, plain, types, frozenset(shared), list(outs), device, *tensors)
 
 
 def check(name: str, value: Tensor, *, last: int | None = None, like: Tensor | None = None,

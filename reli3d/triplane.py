@@ -10,6 +10,7 @@ from reli3d._bridge import check, launch
 from reli3d.kernels import triplane as kernels
 
 BLOCK = 8  # channels of a kernels.vec8
+ROWS_MIN = 8  # rows of cells a CPU slice of the planes' adjoint: each adds all the points that fall in it
 CACHED = 1 << 16  # floats of a plane that stay in a core's second-level cache whatever the order of the points
 
 
@@ -92,13 +93,12 @@ def _planes_adjoint(points: Tensor, g: Tensor, order: Tensor, edges: Tensor, sha
     channels, height, width = shape[2:]
     blocks = g.shape[-1] // BLOCK
     g_planes = torch.zeros(batch, 3, height, width, blocks * BLOCK, device=points.device)
-    # a row is as much work as 32 threads elsewhere, and launch() slices by their number: on CPU the others rest
-    work, split = (32, 1) if points.device.type == "cpu" else (blocks, blocks)
+    split = 1 if points.device.type == "cpu" else blocks
     for parity in (0, 1):
-        launch(kernels.planes_adjoint_kernel, batch * 3 * ((height + 2 - parity) // 2) * work, [
+        launch(kernels.planes_adjoint_kernel, batch * 3 * ((height + 2 - parity) // 2) * split, [
             (points.view(-1, 3), kernels.wp.vec3), (g.view(-1, BLOCK), kernels.vec8),
-            (order.view(-1), kernels.wp.int32), (edges.view(-1), kernels.wp.int32), parity, work, split, n, height,
-            width, blocks, (g_planes.view(-1, BLOCK), kernels.vec8)], points.device)  # fmt: skip
+            (order.view(-1), kernels.wp.int32), (edges.view(-1), kernels.wp.int32), parity, split, n, height,
+            width, blocks, (g_planes.view(-1, BLOCK), kernels.vec8)], points.device, slice_min=ROWS_MIN)  # fmt: skip
     return g_planes[..., :channels].permute(0, 1, 4, 2, 3)
 
 
@@ -131,7 +131,7 @@ def sample_triplane(planes: Tensor, points: Tensor) -> Tensor:
     if max(height, width) > 32000:
         raise ValueError(f"planes: expected at most 32000 rows and columns, got {(height, width)}")  # 16-bit keys
     blocks = -(-channels // BLOCK)
-    largest = 3 * batch * max(height * width * blocks, (height + 2) * 32 * blocks, points.shape[1] * blocks)
+    largest = 3 * batch * max(height * width * blocks, (height + 2) * blocks, points.shape[1] * blocks)
     if largest >= 2**31:
         raise ValueError(f"planes, points: expected fewer than 2**31 blocks of 8 channels, got {largest}")
     return _SampleTriplane.apply(planes, points)

@@ -100,6 +100,28 @@ def test_slices_depend_on_the_size_alone(threads):
     assert counts[0] == counts[1] == counts[2]
 
 
+@pytest.mark.parametrize("n, slice_min, parts", [(5, 1, 5), (64, 1, 16), (64, 8, 8), (7, 8, 1), (1 << 20, 8, 16)])
+def test_few_heavy_threads_are_cut_by_their_own_minimum(device, threads, n, slice_min, parts):
+    assert len(_bridge.slices(n, slice_min)) == parts
+    threads(2)
+    seen = _bridge.over_slices(n, lambda k, start, count: (start, count), slice_min=slice_min)
+    assert seen == _bridge.slices(n, slice_min)
+    visits = torch.ones(n, dtype=torch.int32, device=device)
+    _bridge.launch(count_kernel, n, [(visits, wp.int32)], device, slice_min=slice_min)
+    assert torch.equal(visits, 1 + torch.arange(n, dtype=torch.int32, device=device))
+
+
+def test_gradients_follow_the_minimum_of_their_launch(device):
+    table, index, weight, g = operands(50, device)
+    ins = [(table, wp.vec3), (index, wp.int32), (weight, wp.float32), 1.7]
+    results = []
+    for slice_min in (_bridge.SLICE_MIN, 3):  # one slice, sixteen
+        value, _ = _bridge.call(gather_scale_kernel, 50, ins, [((50,), wp.vec3), ((50,), wp.int32)], device=device,
+                                shared=(0,), slice_min=slice_min)  # fmt: skip
+        results.append(torch.autograd.grad(value, (table, weight), g))
+    torch.testing.assert_close(*results, rtol=0, atol=1e-5)  # sums of five float32 terms in another order
+
+
 @pytest.mark.parametrize("n", SIZES)
 def test_launch_visits_every_index_once(device, n):
     visits = torch.ones(n, dtype=torch.int32, device=device)

@@ -22,7 +22,8 @@ from reli3d.kernels import raster as kernels
 REACH = 1.5  # texels: a bilinear tap of a point of the surface has its centre within sqrt(2)
 TILE = {"cpu": 16, "cuda": 4}  # a thread a tile: large ones share set-up, small ones fill a GPU; results are the same
 STRIP = 64  # columns a thread sweeps in the column pass: one cache line of the mask
-LAUNCH = 16384  # threads a sweep asks for, so that the bridge cuts it into all its slices
+ROWS_MIN = 16  # rows of texels a CPU slice of the row pass
+TILES_MIN = 16  # tiles a CPU slice: each of them walks its list of faces for 256 texels
 
 
 @dataclass(frozen=True)
@@ -113,7 +114,7 @@ def rasterize_texels(mesh: Mesh, size: int) -> Texels:
     segment_start, segment_list = _bins(lower - REACH, upper + REACH, size, tile)
     ints = [(t, wp.int32) for t in (face_start, face_list, segment_start, segment_list, segments)]
     _bridge.launch(kernels.texels_kernel, (-(-size // tile)) ** 2, [(corners, wp.vec2), *ints, size, tile, REACH,
-                   (distance, wp.float32), (face, wp.int32), (bary, wp.vec2)], device)  # fmt: skip
+                   (distance, wp.float32), (face, wp.int32), (bary, wp.vec2)], device, slice_min=TILES_MIN)  # fmt: skip
     return Texels(face, bary, distance == 0.0)
 
 
@@ -126,7 +127,8 @@ def coverage(mesh: Mesh, size: int) -> Tensor:
         lower, upper = torch.aminmax(corners, dim=1)
         face_start, face_list = _bins(lower, upper, size, tile)
         _bridge.launch(kernels.coverage_kernel, (-(-size // tile)) ** 2, [(corners, wp.vec2), (face_start, wp.int32),
-                       (face_list, wp.int32), size, tile, (hits, wp.uint8)], corners.device)  # fmt: skip
+                       (face_list, wp.int32), size, tile, (hits, wp.uint8)], corners.device,
+                       slice_min=TILES_MIN)  # fmt: skip
     return hits
 
 
@@ -216,13 +218,11 @@ def nearest_valid(valid: Tensor) -> tuple[Tensor, Tensor]:
     if valid.numel() == 0:
         return source, square
     strips = -(-w // STRIP)
-    lanes = -(-LAUNCH // strips)
-    _bridge.launch(kernels.nearest_row_kernel, strips * lanes, [
-        (valid.contiguous().view(torch.uint8), wp.uint8), STRIP, lanes, (row, wp.int32)], device)  # fmt: skip
-    lanes = -(-LAUNCH // h)
-    _bridge.launch(kernels.nearest_texel_kernel, h * lanes, [
-        (row, wp.int32), lanes, (site, wp.int32), (border, wp.float32), (source, wp.int32), (square, wp.float32)],
-        device)  # fmt: skip
+    _bridge.launch(kernels.nearest_row_kernel, strips, [
+        (valid.contiguous().view(torch.uint8), wp.uint8), STRIP, (row, wp.int32)], device, slice_min=1)  # fmt: skip
+    _bridge.launch(kernels.nearest_texel_kernel, h, [
+        (row, wp.int32), (site, wp.int32), (border, wp.float32), (source, wp.int32), (square, wp.float32)],
+        device, slice_min=ROWS_MIN)  # fmt: skip
     return source, square
 
 

@@ -208,19 +208,15 @@ def tangents_kernel(
 def nearest_row_kernel(
     start: int,
     # in
-    valid: wp.array2d(dtype=wp.uint8), strip: int, lanes: int,
+    valid: wp.array2d(dtype=wp.uint8), strip: int,
     # out
     row: wp.array2d(dtype=wp.int32),
 ):  # fmt: skip
     """Row of the nearest valid texel of the same column, the upper of two; -1 without one.
 
-    One thread of ``lanes`` works, on ``strip`` columns: contiguous reads, and still enough threads for a launch to be
-    cut.
+    A thread works on ``strip`` columns: contiguous reads.
     """
     i = start + wp.tid()
-    if i % lanes != 0:
-        return
-    i = i / lanes
     height = valid.shape[0]
     x0 = i * strip
     x1 = wp.min(x0 + strip, valid.shape[1])
@@ -247,7 +243,7 @@ def nearest_row_kernel(
 def nearest_texel_kernel(
     start: int,
     # in
-    row: wp.array2d(dtype=wp.int32), lanes: int,
+    row: wp.array2d(dtype=wp.int32),
     # scratch
     site: wp.array2d(dtype=wp.int32), border: wp.array2d(dtype=wp.float32),
     # out
@@ -256,12 +252,9 @@ def nearest_texel_kernel(
     """Flat index and squared distance of the nearest valid texel for every texel of row ``i``; -1 and inf without one.
 
     Lower envelope of parabolas, Felzenszwalb and Huttenlocher 2012 (Distance transforms of sampled functions).
-    One thread of ``lanes`` works, on one row.
+    A thread works on one row.
     """
     i = start + wp.tid()
-    if i % lanes != 0:
-        return
-    i = i / lanes
     width = row.shape[1]
     top = int(-1)
     for q in range(width):

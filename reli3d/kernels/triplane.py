@@ -167,47 +167,46 @@ def planes_adjoint_kernel(
     start: int,
     # in
     points: wp.array[wp.vec3], g_features: wp.array[vec8], order: wp.array[wp.int32], edges: wp.array[wp.int32],
-    parity: int, threads: int, split: int, per_batch: int, height: int, width: int, blocks: int,
+    parity: int, split: int, per_batch: int, height: int, width: int, blocks: int,
     # out
     g_planes: wp.array[vec8],
 ):  # fmt: skip
     """A thread is a row of cells of a plane and every ``split``-th block; it adds that row's points to two texel rows.
 
-    Of ``threads`` a row ``split`` work.  Only rows of one ``parity`` run in a launch, so no two threads share a row
-    of texels.  ``order`` lists the points of every plane by row of cells, ``edges (P, height + 2)`` where each begins.
+    Only rows of one ``parity`` run in a launch, so no two threads share a row of texels.  ``order`` lists the points
+    of every plane by row of cells, ``edges (P, height + 2)`` where each begins.
     """
     i = start + wp.tid()
-    first = i % threads
-    i = i // threads
+    first = i % split
+    i = i // split
     rows = (height + 2 - parity) // 2
     row = (i % rows) * 2 + parity
     slab = i // rows  # batch * 3 + plane
     plane = slab % 3
     y = row - 1
     base = slab * height * width * blocks
-    if first < split:
-        for k in range(edges[slab * (height + 2) + row], edges[slab * (height + 2) + row + 1]):
-            point = (slab // 3) * per_batch + order[slab * per_batch + k]
-            at = texel_position(points[point], plane, height, width)
-            x = int(wp.floor(at[0]))
-            u = at[0] - float(x)
-            v = at[1] - float(y)
-            source = (point * 3 + plane) * blocks
-            if x >= 0 and y >= 0 and x + 1 < width and y + 1 < height:
-                top = base + (y * width + x) * blocks
-                bottom = top + width * blocks
-                for q in range(first, blocks, split):
-                    g = g_features[source + q]
-                    g_top = g * (1.0 - v)
-                    g_bottom = g * v
-                    g_planes[top + q] = g_planes[top + q] + g_top * (1.0 - u)
-                    g_planes[top + blocks + q] = g_planes[top + blocks + q] + g_top * u
-                    g_planes[bottom + q] = g_planes[bottom + q] + g_bottom * (1.0 - u)
-                    g_planes[bottom + blocks + q] = g_planes[bottom + blocks + q] + g_bottom * u
-            else:
-                for q in range(first, blocks, split):
-                    g = g_features[source + q]
-                    add_texel(g_planes, base + q, x, y, height, width, blocks, g * ((1.0 - u) * (1.0 - v)))
-                    add_texel(g_planes, base + q, x + 1, y, height, width, blocks, g * (u * (1.0 - v)))
-                    add_texel(g_planes, base + q, x, y + 1, height, width, blocks, g * ((1.0 - u) * v))
-                    add_texel(g_planes, base + q, x + 1, y + 1, height, width, blocks, g * (u * v))
+    for k in range(edges[slab * (height + 2) + row], edges[slab * (height + 2) + row + 1]):
+        point = (slab // 3) * per_batch + order[slab * per_batch + k]
+        at = texel_position(points[point], plane, height, width)
+        x = int(wp.floor(at[0]))
+        u = at[0] - float(x)
+        v = at[1] - float(y)
+        source = (point * 3 + plane) * blocks
+        if x >= 0 and y >= 0 and x + 1 < width and y + 1 < height:
+            top = base + (y * width + x) * blocks
+            bottom = top + width * blocks
+            for q in range(first, blocks, split):
+                g = g_features[source + q]
+                g_top = g * (1.0 - v)
+                g_bottom = g * v
+                g_planes[top + q] = g_planes[top + q] + g_top * (1.0 - u)
+                g_planes[top + blocks + q] = g_planes[top + blocks + q] + g_top * u
+                g_planes[bottom + q] = g_planes[bottom + q] + g_bottom * (1.0 - u)
+                g_planes[bottom + blocks + q] = g_planes[bottom + blocks + q] + g_bottom * u
+        else:
+            for q in range(first, blocks, split):
+                g = g_features[source + q]
+                add_texel(g_planes, base + q, x, y, height, width, blocks, g * ((1.0 - u) * (1.0 - v)))
+                add_texel(g_planes, base + q, x + 1, y, height, width, blocks, g * (u * (1.0 - v)))
+                add_texel(g_planes, base + q, x, y + 1, height, width, blocks, g * ((1.0 - u) * v))
+                add_texel(g_planes, base + q, x + 1, y + 1, height, width, blocks, g * (u * v))
