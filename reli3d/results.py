@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+import reli3d
 from reli3d.data.normalize import Similarity
 from reli3d.geometry.mesh import Mesh, report
 from reli3d.io.glb import write_glb
@@ -81,4 +82,5 @@ def weights_record(manifest: Manifest, digest: str) -> dict:
 
 def versions() -> dict[str, str]:
     """Versions of this package and of those that compute."""
-    return {name: version(name) for name in ("reli3d", "torch", "warp-lang", "embreex", "numpy")}
+    others = {name: version(name) for name in ("torch", "warp-lang", "embreex", "numpy")}
+    return {"reli3d": reli3d.__version__, **others}  # also from a checkout that is not installed

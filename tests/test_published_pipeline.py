@@ -1,12 +1,14 @@
 """The way of the published model from views to files, at sizes that run in seconds."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from reli3d import pipeline
+from reli3d import pipeline, results
+from reli3d.cli import infer
 from reli3d.data.folder import load_views
 from reli3d.data.normalize import Similarity
 from reli3d.data.published_views import published_views
@@ -15,11 +17,11 @@ from reli3d.geometry.surface import extract_surface, surface_cubes
 from reli3d.nn.heads import deformation
 from reli3d.nn.model import Code, Reconstructor
 from reli3d.nn.published import our_key
-from reli3d.nn.weights import read_manifest, read_tensors
+from reli3d.nn.weights import read_manifest, read_tensors, save
 from reli3d.pipeline import default_normalization, prepare, reconstruct
 from tests.test_nn_model import NANO, TINY, views
 
-EXAMPLE = load_views(pipeline.__file__.replace("pipeline.py", "assets/example"), views=2)
+EXAMPLE = load_views(infer.EXAMPLE, views=2)
 
 
 @pytest.fixture(scope="module")
@@ -121,9 +123,14 @@ def test_hero_background_and_frame_reach_the_network(tiny, monkeypatch):
         reconstruct(EXAMPLE, weights=tiny, background="grey")
 
 
-def test_views_become_an_asset_without_looking_at_them_again(tiny, monkeypatch):
-    monkeypatch.setattr(pipeline, "visible_from", None)  # nothing asks which view sees a point
-    asset = reconstruct(EXAMPLE, weights=tiny, texture_size=256, resolution=16)
+@pytest.fixture(scope="module")
+def asset(tiny):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pipeline, "visible_from", None)  # nothing asks which view sees a point
+        return reconstruct(EXAMPLE, weights=tiny, texture_size=256, resolution=16)
+
+
+def test_views_become_an_asset_without_looking_at_them_again(asset):
     found = report(asset.mesh)
     assert found.watertight and found.manifold
     roughness = asset.textures.orm[..., 1]
@@ -140,8 +147,7 @@ def test_an_empty_field_is_an_error_and_not_a_box(tiny):
         reconstruct(EXAMPLE, weights=empty, texture_size=256, resolution=16)
 
 
-def test_exported_roughness_is_the_root_of_the_published_number(tiny):
-    asset = reconstruct(EXAMPLE, weights=tiny, texture_size=256, resolution=16)
+def test_exported_roughness_is_the_root_of_the_published_number(tiny, asset):
     same = Reconstructor(replace(TINY, roughness_is_alpha=False)).eval()
     same.load_state_dict(tiny.state_dict())
     release = reconstruct(EXAMPLE, weights=same, texture_size=256, resolution=16)
@@ -149,3 +155,25 @@ def test_exported_roughness_is_the_root_of_the_published_number(tiny):
     # the same width alpha in a viewer that squares, after baking means roots of texels beyond the charts as well
     torch.testing.assert_close(ours.square(), theirs, rtol=0, atol=1e-5)
     assert float((ours - theirs).max()) > 0.05  # shown as it is, the release's number is too glossy
+
+
+def test_the_command_takes_published_weights_and_writes_published_names(tiny, tmp_path, capsys):
+    weights = tmp_path / "tiny.safetensors"
+    save(weights, tiny, licence="of the test", dtype=torch.float32)
+    arguments = [str(infer.EXAMPLE), "--weights", str(weights), "--output", str(tmp_path / "out"), "--device", "cpu",
+                 "--views", "2", "--texture-size", "256", "--resolution", "16", "--compatible-names"]  # fmt: skip
+    assert infer.main([*arguments, "--hero", "1", "--background", "visible"]) == 0
+    folder = tmp_path / "out" / "example"
+    assert sorted(p.name for p in folder.iterdir()) == sorted((*results.FILES, "illumination.hdr"))
+    assert (folder / "illumination.hdr").read_bytes() == (folder / "environment.hdr").read_bytes()
+    info = json.loads((folder / "run_info.json").read_text())
+    assert info["views"] == list(EXAMPLE.names[::-1]) and info["background"] == "visible"
+    assert info["model_from_input"] == torch.eye(4).tolist()  # poses as stored
+    capsys.readouterr()
+    assert infer.main([*arguments, "--skip-existing"]) == 0
+    assert "skipped" in capsys.readouterr().err
+    (folder / "illumination.hdr").unlink()
+    assert not results.complete(folder, compatible=True) and results.complete(folder)
+    for hero in ("2", "-1", "first"):
+        assert infer.main([*arguments, f"--hero={hero}"]) == 2
+        assert "hero: expected random or 0 to 1 with 2 views" in capsys.readouterr().err
