@@ -10,7 +10,11 @@ LICENCE = "Apache-2.0; trained by the reli3d authors, see docs/weights.md for th
 
 
 def parser() -> argparse.ArgumentParser:
-    p = argparse.ArgumentParser(prog="reli3d-train", description="Train the small network; continues where it stopped.")
+    p = argparse.ArgumentParser(
+        prog="reli3d-train",
+        description="Train the small network; continues where it stopped.  Under torchrun the processes share "
+        "each batch.",
+    )
     p.add_argument("samples", type=Path, help="folder of samples made by reli3d-data")
     p.add_argument("output", type=Path, help="folder of the checkpoint, the log, the curves and validation pictures")
     p.add_argument("--light-prior", type=Path, help="environment decoder made by python -m reli3d.train.light_prior; "
@@ -36,6 +40,7 @@ def main(argv: list[str] | None = None) -> int:
     from reli3d.nn.model import Reconstructor
     from reli3d.nn.presets import SMALL
     from reli3d.train.loop import TrainConfig, averaged_model, train
+    from reli3d.train.workers import Workers
 
     torch.manual_seed(args.seed)
     model = Reconstructor(SMALL)
@@ -48,10 +53,12 @@ def main(argv: list[str] | None = None) -> int:
             prior = load_file(args.light_prior)
             model.environment.load_state_dict({k: v for k, v in prior.items() if k != "latents"})
             model.environment.requires_grad_(False)
+        workers = Workers.join()
         train(model, TrainConfig(samples=str(args.samples), output=str(args.output), steps=args.steps,
                                  minutes=args.minutes, batch=args.batch, points=args.points, max_views=args.max_views,
                                  rate=args.rate, seed=args.seed,
-                                 validation=str(args.validation or "")))  # fmt: skip
+                                 validation=str(args.validation or "")), workers)  # fmt: skip
+        workers.leave()
     except (ValueError, OSError) as error:
         print(f"reli3d-train: {' '.join(str(error).split())}", file=sys.stderr)
         return 2

@@ -17,6 +17,7 @@ from reli3d.nn.model import Reconstructor
 from reli3d.train.losses import losses
 from reli3d.train.pictures import write_curves, write_validation
 from reli3d.train.samples import batches
+from reli3d.train.workers import Workers
 
 
 @dataclass(frozen=True)
@@ -62,11 +63,15 @@ def rate_at(config: TrainConfig, step: int, done: float) -> float:
     return config.rate * min(1.0, (step + 1) / config.warmup) * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * done)))
 
 
-def train(model: Reconstructor, config: TrainConfig) -> None:
+def train(model: Reconstructor, config: TrainConfig, workers: Workers | None = None) -> None:
     """Train ``model`` in place until the schedule ends; continue from ``output/state.pt`` where there is one.
 
-    Writes ``state.pt`` (all that resuming needs), ``log.jsonl`` and ``curves.png``.
+    Writes ``state.pt`` (all that resuming needs), ``log.jsonl`` and the pictures.  workers: processes that share the
+    batch; all start from the same parameters, the first one writes.
     """
+    workers = workers or Workers()
+    if config.batch % workers.count:
+        raise ValueError(f"batch: expected a multiple of the {workers.count} processes, got {config.batch}")
     folder = Path(config.output)
     folder.mkdir(parents=True, exist_ok=True)
     trained = [p for p in model.parameters() if p.requires_grad]
@@ -81,10 +86,12 @@ def train(model: Reconstructor, config: TrainConfig) -> None:
         state = torch.load(folder / "state.pt", weights_only=True)
         model.load_state_dict(state["model"]), optimizer.load_state_dict(state["optimizer"])
         average, step, seconds = state["average"], state["step"], state["seconds"]
-    log = open(folder / "log.jsonl", "a", buffering=1)  # noqa: SIM115 - open for the whole run
-    log.write(json.dumps({"step": step, "config": asdict(config)}) + "\n")
-    source = batches(Path(config.samples), size=config.batch, points=config.points, max_views=config.max_views,
-                     seed=config.seed, start=step)  # fmt: skip
+    log = None
+    if workers.rank == 0:
+        log = open(folder / "log.jsonl", "a", buffering=1)  # noqa: SIM115 - open for the whole run
+        log.write(json.dumps({"step": step, "config": asdict(config), "processes": workers.count}) + "\n")
+    source = batches(Path(config.samples), size=config.batch // workers.count, points=config.points,
+                     max_views=config.max_views, seed=config.seed, start=step, rank=workers.rank)  # fmt: skip
     began, saved = time.monotonic() - seconds, time.monotonic()
     sums: dict[str, float] = {}
     while progress(config, step, seconds) < 1.0:
@@ -95,26 +102,29 @@ def train(model: Reconstructor, config: TrainConfig) -> None:
         loss = sum(WEIGHTS[k] * v for k, v in terms.items())
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        norm = torch.nn.utils.clip_grad_norm_(model.parameters(), config.clip)
+        names = list(terms)
+        values = torch.stack([*(terms[k].detach() for k in names), torch.tensor(time.monotonic() - began)])
+        values = workers.average(trained, values)  # one clock for all: they must agree when to stop
+        norm = torch.nn.utils.clip_grad_norm_(trained, config.clip)
         if torch.isfinite(norm):
             optimizer.step()
         update_average(average, model, min(config.average, (1 + step) / (10 + step)))
-        step, seconds = step + 1, time.monotonic() - began
-        for k, v in {**terms, "norm": norm, "bad": float(not torch.isfinite(norm))}.items():
-            sums[k] = sums.get(k, 0.0) + float(torch.as_tensor(v).detach())
+        step, seconds = step + 1, float(values[-1])
+        for k, v in zip([*names, "norm", "bad"], [*values[:-1].tolist(), float(norm), float(not torch.isfinite(norm))]):
+            sums[k] = sums.get(k, 0.0) + v
         if step % 50 == 0:
             means = {k: round(v / 50, 5) for k, v in sums.items()}
-            log.write(
-                json.dumps({"step": step, "seconds": round(seconds), "rate": optimizer.param_groups[0]["lr"], **means})
-                + "\n"
-            )
-            print(f"step {step} {seconds:.0f} s {means}", file=sys.stderr, flush=True)
             sums = {}
-        if time.monotonic() - saved > config.checkpoint_seconds:
+            if log:
+                row = {"step": step, "seconds": round(seconds), "rate": optimizer.param_groups[0]["lr"], **means}
+                log.write(json.dumps(row) + "\n")
+                print(f"step {step} {seconds:.0f} s {means}", file=sys.stderr, flush=True)
+        if log and time.monotonic() - saved > config.checkpoint_seconds:
             save(folder, model, optimizer, average, step, seconds, config)
             saved = time.monotonic()
-    save(folder, model, optimizer, average, step, seconds, config)
-    log.close()
+    if log:
+        save(folder, model, optimizer, average, step, seconds, config)
+        log.close()
 
 
 def update_average(average: dict[str, Tensor], model: Reconstructor, decay: float) -> None:

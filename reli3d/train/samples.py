@@ -98,9 +98,11 @@ def load_sample(
     }  # fmt: skip
 
 
-def batches(folder: Path, *, size: int, points: int, max_views: int, seed: int, start: int = 0) -> Iterator[Batch]:
+def batches(
+    folder: Path, *, size: int, points: int, max_views: int, seed: int, start: int = 0, rank: int = 0
+) -> Iterator[Batch]:
     """Endless batches of ``size`` objects; step ``k`` is a function of ``seed`` and ``k`` alone for a fixed folder,
-    so training resumes.
+    so training resumes; ``rank`` tells processes apart that share a step.
     """
     files, step = sorted(folder.glob("*.safetensors")), start
     if not files:
@@ -108,8 +110,8 @@ def batches(folder: Path, *, size: int, points: int, max_views: int, seed: int, 
     while True:
         if step % 100 == 0:  # samples may still be arriving
             files = sorted(folder.glob("*.safetensors"))
-        rng = np.random.default_rng((seed, step))
-        views = int(rng.choice(np.arange(1, max_views + 1)))
+        views = int(np.random.default_rng((seed, step)).choice(np.arange(1, max_views + 1)))  # the same in all ranks
+        rng = np.random.default_rng((seed, step, rank))
         loaded = [load_sample(files[int(rng.integers(len(files)))], views, points, rng) for _ in range(size)]
         yield Batch(**{k: torch.stack([s[k] for s in loaded]) for k in loaded[0]})
         step += 1
