@@ -223,6 +223,7 @@ def spoil_header(edit):
         (lambda p: p.write_bytes(p.read_bytes()[:100]), "cut off in its header"),
         (lambda p: p.write_bytes(b"\xff" * 64), "is not a safetensors file"),
         (lambda p: p.write_bytes(b""), "is not a safetensors file"),
+        (lambda p: torch.save({"state_dict": {}}, p), "is a torch checkpoint, expected safetensors; convert it first"),
         (lambda p: p.write_bytes((2).to_bytes(8, "little") + b"[]"), "header that is not safetensors'"),
         (spoil_header(lambda h: h["backbone.latent_init"].update(shape=[1, 8, 31])), "shape and place"),
         (spoil_header(lambda h: h["backbone.latent_init"].update(dtype="I64")), "header that is not safetensors'"),

@@ -82,7 +82,11 @@ def read_manifest(path: str | os.PathLike) -> Manifest:
     """
     size = _size(path)
     with open(path, "rb") as file:
-        length = int.from_bytes(file.read(8), "little")
+        start = file.read(8)
+        if start.startswith(b"PK\x03\x04"):
+            raise WeightsError(path, "is a torch checkpoint, expected safetensors; convert it first, docs/network.md "
+                                     "tells how")  # fmt: skip
+        length = int.from_bytes(start, "little")
         if size < 8 or length > min(HEADER_LIMIT, size - 8):
             raise WeightsError(path, "is not a safetensors file, or it is cut off in its header; fetch it again")
         text = file.read(length)
