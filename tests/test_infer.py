@@ -59,19 +59,17 @@ def test_both_environments_hold_the_same_light(example):
     assert bool(((exr - hdr).abs() <= peak / 100).all())  # RGBE keeps 8 bits of the largest channel
 
 
-def test_the_mesh_follows_the_frame_of_the_cameras(example, tmp_path):
+def test_the_mesh_follows_the_frame_of_the_cameras(tmp_path):
     matrix = torch.eye(4, dtype=torch.float64)
     matrix[:3, :3] *= 7.0
     matrix[:3, 3] = torch.tensor([30.0, -4.0, 11.0])
     folder = moved_example(tmp_path / "moved", matrix)
-    assert command(tmp_path, folder) == 0
-    here, there = (
-        read_glb(p)[0].mesh.vertices.double() for p in (example / "mesh.glb", tmp_path / "out/moved/mesh.glb")
-    )
+    assert command(tmp_path, infer.EXAMPLE, folder, "--normalize", "hull") == 0
+    here, there = (read_glb(tmp_path / "out" / n / "mesh.glb")[0].mesh.vertices.double() for n in ("example", "moved"))
     box = torch.stack([here.amin(0), here.amax(0)]) * 7 + matrix[:3, 3]
     got = torch.stack([there.amin(0), there.amax(0)])
-    # the hull grid that centres the object starts elsewhere: two of its cells, 4 % of the longest side
-    assert float((box - got).abs().max()) < 0.04 * float((box[1] - box[0]).max())
+    # the hull's grid starts at another place: its box moves by up to a cell of 3 %, and the network's input with it
+    assert float((box - got).abs().max()) < 0.06 * float((box[1] - box[0]).max())
 
 
 def test_the_same_input_gives_the_same_bits(example, tmp_path):

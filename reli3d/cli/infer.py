@@ -164,6 +164,12 @@ class Job:
         self.cold = True
 
     def run(self, folder: Path, name: str, target: Path) -> None:
+        """Reconstruct one object and write its files; the bar goes before an error is told."""
+        with Progress(name) as steps:
+            self._run(folder, name, target, steps)
+        print(target / "mesh.glb")
+
+    def _run(self, folder: Path, name: str, target: Path, steps: Progress) -> None:
         from reli3d import results
         from reli3d.data.folder import load_views
         from reli3d.data.normalize import normalize
@@ -171,24 +177,25 @@ class Job:
         from reli3d.eval.preview import preview
         from reli3d.pipeline import default_normalization, output_frame, reconstruct
 
-        args, steps = self.args, Progress(name)
+        args = self.args
         began = time.perf_counter()
         steps("reading")
         views = load_views(folder, views=args.views, masks=args.masks, allow_outside=args.allow_outside)
         for note in views.notes:
-            print(f"{name}: {note}", file=sys.stderr)
+            steps.bar.write(f"{name}: {note}", file=sys.stderr)
         hero = int(args.hero) if args.hero.isdecimal() and args.hero.isascii() else args.hero
         views = hero_first(views, hero, args.seed)
-        reading = time.perf_counter() - began
-        normalization = args.normalize or default_normalization(self.model.preset)
-        to_model = normalize(views, normalization)
+        read = time.perf_counter()
+        steps("normalize")
+        to_model = normalize(views, args.normalize or default_normalization(self.model.preset))
+        before = {"read": read - began, "normalize": time.perf_counter() - read}
         seconds: dict[str, dict[str, float]] = {}
         for label in ["cold" if self.cold else "warm", *(["warm"] if args.warm else [])]:
-            stages: dict[str, float] = {"read": reading}
+            stages: dict[str, float] = {}
             asset = reconstruct(views, weights=self.model, texture_size=args.texture_size, resolution=args.resolution,
-                                normalization=normalization, frame=args.frame, up=args.up, uv=args.uv, seed=args.seed,
+                                normalization=to_model, frame=args.frame, up=args.up, uv=args.uv, seed=args.seed,
                                 background=args.background, timings=stages, progress=steps)  # fmt: skip
-            seconds[label] = {k: round(v, 4) for k, v in stages.items()}
+            seconds[label] = {k: round(v, 4) for k, v in {**stages, **before}.items()}
         self.cold = False
         steps("preview")
         output = output_frame(to_model, args.frame, args.up)
@@ -214,8 +221,6 @@ class Job:
         }
         steps("writing")
         results.write_results(target, asset, picture, info, compatible=args.compatible_names)
-        steps.close()
-        print(target / "mesh.glb")
 
 
 class Progress:
@@ -246,9 +251,14 @@ class Progress:
         self.bar.n = self.STAGES.index(stage)
         self.bar.refresh()
 
-    def close(self) -> None:
-        self.bar.n = len(self.STAGES)
-        self.bar.set_postfix_str("done", refresh=True)
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(self, kind, error, trace) -> None:
+        self.bar.leave = error is None
+        if error is None:
+            self.bar.n = len(self.STAGES)
+            self.bar.set_postfix_str("done", refresh=True)
         self.bar.close()
 
 
