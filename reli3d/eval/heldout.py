@@ -22,7 +22,7 @@ from reli3d.geometry.rays import RayScene
 from reli3d.nn.model import Reconstructor
 from reli3d.pipeline import reconstruct
 from reli3d.render.camera import Camera, camera_rays
-from reli3d.render.color import linear_to_srgb
+from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import surface_points
 from reli3d.train.light_prior import scale_free
@@ -62,9 +62,19 @@ def asset_colors(asset, scene: RayScene, camera: Camera) -> tuple[Tensor, Tensor
     return (hits.face >= 0).reshape(shape), color.reshape(*shape, 3)
 
 
-def psnr(error: Tensor) -> float:
-    """Of squared errors of values in [0, 1]."""
-    return float(-10 * torch.log10(error.mean().clamp(min=1e-10)))
+def psnr(color: Tensor, truth: Tensor) -> float:
+    """Of sRGB values ``(N, 3)`` in [0, 1], in dB."""
+    return float(-10 * torch.log10((color - truth).square().mean().clamp(min=1e-10)))
+
+
+def scaled_psnr(color: Tensor, truth: Tensor) -> float:
+    """The same after the best factor for each channel in linear light: how bright an albedo is no image can tell,
+    since a
+    longer exposure looks the same.
+    """
+    p, t = srgb_to_linear(color), srgb_to_linear(truth)
+    factor = (p * t).sum(0) / (p * p).sum(0).clamp(min=1e-9)
+    return psnr(linear_to_srgb((p * factor).clamp(0, 1)), truth)
 
 
 def light_error(predicted: Tensor, target: Tensor) -> float:
@@ -95,8 +105,11 @@ def evaluate(
     target = sample["environment"].float()
     predicted = asset.environment.resized(len(target)).radiance
     exposure = target.mean() / mean_light.mean()
-    return {"iou": float(np.mean(ious)), "base_color_psnr": psnr((got - want).square()),
-            "single_color_psnr": psnr((want.mean(0) - want).square()), "light_error": light_error(predicted, target),
+    return {"iou": float(np.mean(ious)), "base_color_psnr": psnr(got, want), "base_color_psnr_scaled":
+    scaled_psnr(got, want),
+            "single_color_psnr": psnr(want.mean(0), want),
+        "single_color_psnr_scaled": scaled_psnr(torch.ones_like(want), want), "light_error": light_error(predicted,
+        target),
             "mean_light_error": light_error(mean_light * exposure, target)}  # fmt: skip
 
 
