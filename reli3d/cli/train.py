@@ -27,7 +27,11 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--rate", type=float, default=6e-4, help="peak learning rate")
     p.add_argument("--seed", type=int, default=0)
     p.add_argument("--validation", type=Path, help="folder of held-back samples to draw at every checkpoint")
-    p.add_argument("--export", type=Path, help="write the averaged weights of the checkpoint to this file and stop")
+    p.add_argument(
+        "--export",
+        type=Path,
+        help="write the averaged weights of the checkpoint, calibrated on the samples, to this file and stop",
+    )
     return p
 
 
@@ -39,6 +43,7 @@ def main(argv: list[str] | None = None) -> int:
     from reli3d.nn import weights
     from reli3d.nn.model import Reconstructor
     from reli3d.nn.presets import SMALL
+    from reli3d.train.calibrate import calibrate
     from reli3d.train.loop import TrainConfig, averaged_model, train
     from reli3d.train.workers import Workers
 
@@ -46,8 +51,11 @@ def main(argv: list[str] | None = None) -> int:
     model = Reconstructor(SMALL)
     try:
         if args.export:
-            manifest = weights.save(args.export, averaged_model(args.output / "state.pt", model), licence=LICENCE)
-            print(manifest.path)
+            averaged_model(args.output / "state.pt", model)
+            tried = calibrate(model, args.samples)
+            best = max(tried, key=tried.get)
+            print(f"surface offset {best:.2f}: IoU {tried[best]:.4f}, without {tried[0.0]:.4f}", file=sys.stderr)
+            print(weights.save(args.export, model, licence=LICENCE).path)
             return 0
         if args.light_prior:
             prior = load_file(args.light_prior)
