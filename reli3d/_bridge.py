@@ -17,12 +17,15 @@ import threading
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
+from types import ModuleType
 
 import torch
 import warp as wp
 from torch import Tensor
 
 SLICES = 16  # several a thread balance uneven rays on 2 to 8 cores; more only add 20 us of launch each
+CPU_BLOCK = 1  # block size of Warp's CPU launches; loading a module for its default one would compile it once more
+COMPILERS = 4  # modules compiled at once; each thread builds its own precompiled header, 1.5 CPU seconds
 SLICE_MIN = 1024  # below this many threads a slice costs about as much to launch as to run
 
 _TORCH = {
@@ -112,6 +115,25 @@ def empty(shape: Sequence[int], dtype, device: torch.device) -> Tensor:
     return torch.empty((*shape, *tail), dtype=torch_dtype, device=device)
 
 
+def compiled(modules: Sequence[ModuleType], device: torch.device) -> bool:
+    """Whether the kernel cache has all of these kernel modules for ``device``, so that loading them takes no time."""
+    initialise()
+    block = CPU_BLOCK if device.type == "cpu" else None
+    names = [wp.get_module(m.__name__).get_module_identifier(block_dim=block) for m in modules]
+    return all(os.path.isdir(os.path.join(wp.config.kernel_cache_dir, name)) for name in names)
+
+
+def load_modules(modules: Sequence[ModuleType], device: torch.device) -> None:
+    """Load kernel modules (:mod:`reli3d.kernels`), compiling several at once what the kernel cache lacks.
+
+    Without it every module compiles at its first launch, one after the other.  The compiler releases the GIL.
+    """
+    with stream(device) as name:
+        wp.force_load(name, [wp.get_module(m.__name__) for m in modules],
+                      block_dim=CPU_BLOCK if name == "cpu" else None,
+                      max_workers=min(os.cpu_count() or 1, COMPILERS))  # fmt: skip
+
+
 def launch(kernel, n: int, args: Sequence, device: torch.device, *, slice_min: int = SLICE_MIN) -> None:
     """Run ``kernel(start, *args)`` over ``n`` threads.  ``args``: ``(tensor, warp type)`` pairs or plain values.
 
@@ -125,7 +147,7 @@ def launch(kernel, n: int, args: Sequence, device: torch.device, *, slice_min: i
         if name != "cpu":
             wp.launch(kernel, n, [0, *values], device=name)
             return
-        kernel.module.load(wp.get_device("cpu"))
+        kernel.module.load(wp.get_device("cpu"), block_dim=CPU_BLOCK)
         over_slices(n, lambda k, start, count: wp.launch(kernel, count, [start, *values], device="cpu"),
                     slice_min=slice_min)  # fmt: skip
 
@@ -174,7 +196,7 @@ class _KernelOp(torch.autograd.Function):
                               adj_outputs=adj_out, adjoint=True, device=name)  # fmt: skip
 
                 if name == "cpu":
-                    kernel.module.load(wp.get_device("cpu"))
+                    kernel.module.load(wp.get_device("cpu"), block_dim=CPU_BLOCK)
                     over_slices(n, adjoint, slice_min=slice_min)
                 else:
                     adjoint(0, 0, n)

@@ -303,3 +303,18 @@ def test_a_forked_child_can_launch_after_its_parent():
     )
     done = run(code)
     assert done.returncode == 0, done.stderr
+
+
+def test_a_cpu_launch_compiles_its_module_once():
+    square(torch.ones(3))
+    cpu = wp.get_device("cpu").context
+    assert {block for context, block in square_kernel.module.execs if context == cpu} == {_bridge.CPU_BLOCK}
+
+
+def test_modules_load_together_and_are_known_as_compiled(tmp_path, monkeypatch, device):
+    from reli3d.kernels import distance, noise
+
+    _bridge.load_modules([distance, noise], device)
+    assert _bridge.compiled([distance, noise], device)
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+    assert not _bridge.compiled([distance, noise], device)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import os
 import sys
 import time
@@ -10,6 +11,8 @@ from pathlib import Path
 
 STARTED = time.monotonic()
 EXAMPLE = Path(__file__).parents[1] / "assets" / "example"
+KERNELS = ("hull", "projection", "view_features", "triplane", "flexicubes", "uv", "raster", "intersect", "attributes",
+           "random", "shade")  # modules of reli3d.kernels that one object needs  # fmt: skip
 
 
 def parser() -> argparse.ArgumentParser:
@@ -221,6 +224,18 @@ class Job:
         }
         steps("writing")
         results.write_results(target, asset, picture, info, compatible=args.compatible_names)
+
+
+def ready_kernels(device: str) -> None:
+    """Compile side by side what the first run would compile piece by piece; says so on stderr if there is something."""
+    import torch
+
+    from reli3d._bridge import compiled, load_modules
+
+    modules = [importlib.import_module(f"reli3d.kernels.{name}") for name in KERNELS]
+    if not compiled(modules, torch.device(device)):
+        print("compiling kernels (first run only)", file=sys.stderr)
+        load_modules(modules, torch.device(device))
 
 
 class Progress:
