@@ -1,5 +1,7 @@
 """The published network's inputs against the release's own tensors, and the choices that a user has beside."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -8,7 +10,14 @@ from torch.nn.functional import interpolate
 
 from reli3d.data import published_views as module
 from reli3d.data.folder import load_views
-from reli3d.data.published_views import background_shown, hero_first, jpeg_round_trip, published_views
+from reli3d.data.normalize import Similarity
+from reli3d.data.published_views import (
+    background_shown,
+    hero_first,
+    jpeg_round_trip,
+    placement_notes,
+    published_views,
+)
 from reli3d.data.views import Views
 
 # bilinear weights and the division by 255 in float32, summed in another order: 2 units in the last place of 1
@@ -116,3 +125,11 @@ def test_the_background_is_shown_where_there_is_one():
     assert background_shown(cut, "visible", readable=False) and not background_shown(views, "masked", readable=True)
     with pytest.raises(ValueError, match="background: expected auto, masked, visible, got black"):
         background_shown(views, "black", readable=True)
+
+
+def test_an_object_off_the_cube_is_noted():
+    views = load_views(Path(module.__file__).parents[1] / "assets" / "example")
+    assert placement_notes(views) == ()
+    away = Similarity(4.0, torch.eye(3, dtype=torch.float64), torch.tensor([3.0, 0.0, 0.0], dtype=torch.float64))
+    (note,) = placement_notes(views.transformed(away))
+    assert "--normalize auto" in note

@@ -7,6 +7,7 @@ import importlib
 import os
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 STARTED = time.monotonic()
@@ -176,7 +177,7 @@ class Job:
         from reli3d import results
         from reli3d.data.folder import load_views
         from reli3d.data.normalize import normalize
-        from reli3d.data.published_views import hero_first
+        from reli3d.data.published_views import hero_first, placement_notes
         from reli3d.eval.preview import preview
         from reli3d.pipeline import default_normalization, output_frame, reconstruct
 
@@ -184,13 +185,16 @@ class Job:
         began = time.perf_counter()
         steps("reading")
         views = load_views(folder, views=args.views, masks=args.masks, allow_outside=args.allow_outside)
+        normalization = args.normalize or default_normalization(self.model.preset)
+        if normalization == "none" and args.normalize is None:
+            views = replace(views, notes=(*views.notes, *placement_notes(views)))
         for note in views.notes:
             steps.bar.write(f"{name}: {note}", file=sys.stderr)
         hero = int(args.hero) if args.hero.isdecimal() and args.hero.isascii() else args.hero
         views = hero_first(views, hero, args.seed)
         read = time.perf_counter()
         steps("normalize")
-        to_model = normalize(views, args.normalize or default_normalization(self.model.preset))
+        to_model = normalize(views, normalization)
         before = {"read": read - began, "normalize": time.perf_counter() - read}
         seconds: dict[str, dict[str, float]] = {}
         for label in ["cold" if self.cold else "warm", *(["warm"] if args.warm else [])]:

@@ -15,6 +15,7 @@ from PIL import Image
 from torch import Tensor
 from torch.nn.functional import interpolate
 
+from reli3d.data.normalize import normalize
 from reli3d.data.views import ViewBatch, Views
 
 JPEG_QUALITY = 95  # with JPEG_CHROMA the defaults of OpenCV's encoder, which the release leaves as they are
@@ -94,3 +95,13 @@ def has_background(image: Tensor, mask: Tensor) -> bool:
         return False
     low, high = np.percentile(outside.cpu().numpy(), (10, 90), axis=0)
     return bool((high - low).max() > BACKGROUND_RANGE)
+
+
+def placement_notes(views: Views) -> tuple[str, ...]:
+    """What to tell who leaves poses as stored: nothing where the object fills the network's cube, else one line."""
+    try:
+        placed = normalize(views, "auto").is_identity()
+    except ValueError:  # masks that do not meet
+        placed = False
+    return () if placed else ("poses go in as stored, but the object does not sit in the network's cube of half side "
+                              "0.87 about the origin; try --normalize auto",)  # fmt: skip
