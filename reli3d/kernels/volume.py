@@ -1,0 +1,235 @@
+"""Ray marching through an occupancy grid and compositing of its samples, forward and adjoint.
+
+The grid fills the cube [-radius, radius]^3 with R^3 cells, index (x, y, z).  Samples of a ray stand at the middles of
+equal steps from where it enters the cube, shifted by a share of a step, and are kept where their cell is occupied.  A
+ray is one thread; its samples lie side by side, ``first[i]`` to ``first[i + 1]``.
+
+Optical depth is summed, not a product of transmittances carried: ``T = exp(-sum)``.  The adjoint is written out.
+"""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
+
+STEPS_MAX = wp.constant(1 << 24)  # float32 counts steps exactly up to here
+OPAQUE = wp.constant(80.0)  # optical depth behind which nothing is seen: exp(-80) is 2e-35
+PARALLEL = wp.constant(1.0e-12)  # a direction's component below it never leaves its slab of cells
+
+
+@wp.func
+def cube_range(origin: wp.vec3, direction: wp.vec3, radius: float, near: float, far: float) -> wp.vec2:
+    """Entry and exit of a ray in the cube, within [near, far]; entry >= exit for none.  Kay and Kajiya 1986."""
+    low = wp.float32(near)
+    high = wp.float32(far)
+    if not (wp.isfinite(origin) and wp.isfinite(direction)) or wp.length_sq(direction) < PARALLEL * PARALLEL:
+        high = -1.0
+    for k in range(3):
+        if wp.abs(direction[k]) > PARALLEL:
+            a = (-radius - origin[k]) / direction[k]
+            b = (radius - origin[k]) / direction[k]
+            low = wp.max(low, wp.min(a, b))
+            high = wp.min(high, wp.max(a, b))
+        else:
+            if wp.abs(origin[k]) > radius:
+                high = -1.0
+    return wp.vec2(low, high)
+
+
+@wp.func
+def cell_of(p: float, radius: float, size: int) -> int:
+    """Cell of a coordinate, clamped to the grid."""
+    return wp.clamp(int(wp.floor((p + radius) * (0.5 * float(size) / radius))), 0, size - 1)
+
+
+@wp.func
+def cell_exit(origin: wp.vec3, direction: wp.vec3, radius: float, size: int, x: int, y: int, z: int) -> float:
+    """Distance at which a ray leaves a cell."""
+    edge = 2.0 * radius / float(size)
+    cell = wp.vec3(float(x), float(y), float(z))
+    t = wp.float32(3.0e38)
+    for k in range(3):
+        if wp.abs(direction[k]) > PARALLEL:
+            face = cell[k]
+            if direction[k] > 0.0:
+                face = face + 1.0
+            t = wp.min(t, (face * edge - radius - origin[k]) / direction[k])
+    return t
+
+
+@wp.func
+def next_sample(
+    occupied: wp.array3d(dtype=wp.uint8),
+    origin: wp.vec3,
+    direction: wp.vec3,
+    range_: wp.vec2,
+    radius: float,
+    step: float,
+    shift: float,
+    index: int,
+) -> int:
+    """First step from ``index`` on whose sample lies in an occupied cell, or -1; empty cells are stepped over whole."""
+    size = occupied.shape[0]
+    k = index
+    found = wp.int32(-1)
+    t = range_[0] + (float(k) + shift) * step
+    while found < 0 and t < range_[1] and k < STEPS_MAX:
+        p = origin + direction * t
+        x = cell_of(p[0], radius, size)
+        y = cell_of(p[1], radius, size)
+        z = cell_of(p[2], radius, size)
+        if occupied[x, y, z] != wp.uint8(0):
+            found = k
+        else:
+            leave = cell_exit(origin, direction, radius, size, x, y, z)
+            ahead = wp.min((leave - range_[0]) / step - shift, 2.0e7)
+            # a step less than the exit, so that rounding skips no sample of the next cell
+            k = wp.max(k + 1, int(wp.ceil(ahead)) - 1)
+            t = range_[0] + (float(k) + shift) * step
+    return found
+
+
+@wp.func
+def absorbed(thickness: float) -> float:
+    """``1 - exp(-thickness)`` without its cancellation."""
+    x = thickness
+    value = x * (1.0 - x * (0.5 - x * (1.0 / 6.0 - x / 24.0)))
+    if x > 0.05:  # where the series' next term, x^4 / 120, is a last digit
+        value = 1.0 - wp.exp(-x)
+    return value
+
+
+@wp.func
+def own_thickness(density: float, step: float) -> float:
+    """Optical depth of one step, in [0, OPAQUE]."""
+    return wp.clamp(density * step, 0.0, OPAQUE)
+
+
+@wp.kernel
+def count_samples_kernel(
+    start: int,
+    # in
+    occupied: wp.array3d(dtype=wp.uint8), origins: wp.array(dtype=wp.vec3), directions: wp.array(dtype=wp.vec3),
+    shift: wp.array(dtype=float), radius: float, step: float, near: float, far: float,
+    # out
+    count: wp.array(dtype=wp.int32),
+):  # fmt: skip
+    i = start + wp.tid()
+    o = origins[i]
+    d = directions[i]
+    total = wp.int32(0)
+    s = shift[i % shift.shape[0]]
+    r = cube_range(o, d, radius, near, far)
+    k = next_sample(occupied, o, d, r, radius, step, s, 0)
+    while k >= 0:
+        total = total + 1
+        k = next_sample(occupied, o, d, r, radius, step, s, k + 1)
+    count[i] = total
+
+
+@wp.kernel
+def emit_samples_kernel(
+    start: int,
+    # in
+    occupied: wp.array3d(dtype=wp.uint8), origins: wp.array(dtype=wp.vec3), directions: wp.array(dtype=wp.vec3),
+    shift: wp.array(dtype=float), radius: float, step: float, near: float, far: float,
+    first: wp.array(dtype=wp.int32),
+    # out
+    ray: wp.array(dtype=wp.int32), t: wp.array(dtype=float),
+):  # fmt: skip
+    i = start + wp.tid()
+    row = first[i]
+    end = first[i + 1]
+    if row < end:
+        o = origins[i]
+        d = directions[i]
+        s = shift[i % shift.shape[0]]
+        r = cube_range(o, d, radius, near, far)
+        k = next_sample(occupied, o, d, r, radius, step, s, 0)
+        while k >= 0 and row < end:
+            ray[row] = i
+            t[row] = r[0] + (float(k) + s) * step
+            row = row + 1
+            k = next_sample(occupied, o, d, r, radius, step, s, k + 1)
+
+
+@wp.kernel
+def composite_kernel(
+    start: int,
+    # in
+    density: wp.array(dtype=float), color: wp.array(dtype=wp.vec3), t: wp.array(dtype=float),
+    first: wp.array(dtype=wp.int32), step: float,
+    # out
+    out: wp.array(dtype=wp.vec3), opacity: wp.array(dtype=float), depth: wp.array(dtype=float),
+):  # fmt: skip
+    """Emission and absorption, Max 1995: a sample counts ``T (1 - exp(-density step))`` of its colour and distance."""
+    i = start + wp.tid()
+    thickness = wp.float32(0.0)
+    total = wp.vec3(0.0, 0.0, 0.0)
+    distance = wp.float32(0.0)
+    k = first[i]
+    while k < first[i + 1] and thickness < OPAQUE:
+        own = own_thickness(density[k], step)
+        weight = wp.exp(-thickness) * absorbed(own)
+        total = total + color[k] * weight
+        distance = distance + t[k] * weight
+        thickness = thickness + own
+        k = k + 1
+    out[i] = total
+    opacity[i] = absorbed(thickness)
+    depth[i] = distance
+
+
+@wp.kernel
+def weights_kernel(
+    start: int,
+    # in
+    density: wp.array(dtype=float), first: wp.array(dtype=wp.int32), step: float,
+    # out
+    weight: wp.array(dtype=float),
+):  # fmt: skip
+    """Only as far as light comes through: ``weight`` holds zeros before."""
+    i = start + wp.tid()
+    thickness = wp.float32(0.0)
+    k = first[i]
+    while k < first[i + 1] and thickness < OPAQUE:
+        own = own_thickness(density[k], step)
+        weight[k] = wp.exp(-thickness) * absorbed(own)
+        thickness = thickness + own
+        k = k + 1
+
+
+@wp.kernel
+def composite_adjoint_kernel(
+    start: int,
+    # in
+    density: wp.array(dtype=float), color: wp.array(dtype=wp.vec3), t: wp.array(dtype=float),
+    first: wp.array(dtype=wp.int32), step: float, g_out: wp.array(dtype=wp.vec3), g_opacity: wp.array(dtype=float),
+    g_depth: wp.array(dtype=float),
+    # out
+    g_density: wp.array(dtype=float), g_color: wp.array(dtype=wp.vec3),
+):  # fmt: skip
+    """Back to front: with e the adjoint of a sample's weight, d loss / d own thickness = T_after e - sum behind of w e.
+
+    The thickness before a sample comes from the whole one by taking samples away; that one is below 2 OPAQUE, so the
+    rounding of it is below 1e-5.  Samples that no light passes keep the zeros that the gradients hold before.
+    """
+    i = start + wp.tid()
+    begin = first[i]
+    end = begin
+    thickness = wp.float32(0.0)
+    while end < first[i + 1] and thickness < OPAQUE:
+        thickness = thickness + own_thickness(density[end], step)
+        end = end + 1
+    last = wp.exp(-thickness)
+    behind = wp.float32(0.0)
+    for j in range(begin, end):
+        k = begin + end - 1 - j
+        own = own_thickness(density[k], step)
+        after = wp.exp(-thickness)
+        thickness = wp.max(thickness - own, 0.0)
+        weight = wp.exp(-thickness) * absorbed(own)
+        e = wp.dot(g_out[i], color[k]) + g_depth[i] * t[k]
+        g_color[k] = g_out[i] * weight
+        if density[k] > 0.0:
+            g_density[k] = step * (after * e - behind + g_opacity[i] * last)
+        behind = behind + weight * e
