@@ -18,6 +18,7 @@ from reli3d.geometry.bake import bake
 from reli3d.geometry.hull import mask_distance
 from reli3d.geometry.mesh import Mesh, largest_components, vertex_normals
 from reli3d.geometry.rays import RayScene
+from reli3d.geometry.smooth import taubin_smooth
 from reli3d.geometry.surface import extract_surface, surface_cubes
 from reli3d.geometry.tangents import encode_normals, vertex_tangents
 from reli3d.geometry.uv import unwrap, unwrap_xatlas
@@ -38,9 +39,14 @@ SMALLEST_PART = 0.01  # share of the faces below which a separate piece is dropp
 CHUNK = 1 << 17  # points a query: 200 MB of features
 OUTSIDE = 1.0  # level given to grid points that the silhouettes exclude
 MARGIN_CELLS = 2.5  # cells around the silhouettes' hull in which the field is still asked
-UP = {"y": torch.eye(3), "z": torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), "x": torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]),
-      "-y": torch.diag(torch.tensor([1.0, -1, -1])), "-z": torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
-      "-x": torch.tensor([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])}  # fmt: skip
+UP = {  # rotations that carry an axis to +Y
+    "y": torch.eye(3),
+    "-y": torch.diag(torch.tensor([1.0, -1.0, -1.0])),
+    "x": torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
+    "-x": torch.tensor([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
+    "z": torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
+    "-z": torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
+}
 
 
 @dataclass(frozen=True)
@@ -84,26 +90,29 @@ def extract(model: Reconstructor, code: Code, maps: ViewMaps, resolution: int) -
     Raises ValueError where the field has no surface.
     """
     radius = model.preset.radius
-    grid = _grid(resolution, radius, maps.c2w.device)
-    flat = grid.reshape(-1, 3)
+    flat = _grid(resolution, radius, maps.c2w.device).reshape(-1, 3)
+    bound = None
     if model.preset.silhouette_bound:
-        bound = bound_level(model, maps, flat)
-        inside = (bound < 0).nonzero()[:, 0]
+        inside = (bound_level(model, maps, flat) < 0).nonzero()[:, 0]
         if len(inside) == 0:
             raise ValueError("masks: expected masks that overlap in space, got none inside all of them; run --check")
         radius = min(radius, float(flat[inside].abs().max()) + 2 * MARGIN_CELLS * radius / resolution)
-        grid = _grid(resolution, radius, flat.device)  # the same cubes on the part of space that matters
-        flat = grid.reshape(-1, 3)
+        flat = _grid(resolution, radius, flat.device).reshape(-1, 3)  # as many cubes on the space that matters
         bound = bound_level(model, maps, flat)
-        asked = (bound < MARGIN_CELLS * 2 * radius / resolution / model.preset.softness).nonzero()[:, 0]
-        level = bound.clamp(min=OUTSIDE)
+        margin = MARGIN_CELLS * 2 * radius / resolution / model.preset.softness
+        asked, level = (bound < margin).nonzero()[:, 0], bound.clamp(min=OUTSIDE)
     else:
         asked, level = torch.arange(len(flat), device=flat.device), flat.new_empty(len(flat))
     for part in asked.split(CHUNK):
         level[part] = surface_level(model, code, maps, flat[part])
-    weights = {} if model.preset.log_level else _cube_weights(model, code, flat, level.reshape(grid.shape[:3]))
-    mesh = extract_surface(level.reshape(grid.shape[:3]), radius=radius, **weights)
+    level = level.reshape((resolution + 1,) * 3)
+    if bound is not None:
+        level = torch.maximum(level, bound.reshape(level.shape))
+    weights = {} if model.preset.log_level else _cube_weights(model, code, flat, level)
+    mesh = extract_surface(level, radius=radius, **weights)
     mesh = largest_components(mesh, SMALLEST_PART)
+    if model.preset.smoothing:
+        mesh = taubin_smooth(mesh, iterations=model.preset.smoothing)
     return replace(mesh, normals=vertex_normals(mesh.vertices, mesh.faces))
 
 

@@ -21,20 +21,17 @@ MATERIAL = ("base_color", "roughness", "metallic", "normal")
 
 
 def surface_level(model: Reconstructor, code: Code, maps: ViewMaps, points: Tensor) -> Tensor:
-    """Level ``(N,)`` of ``points (N, 3)`` [model frame]: negative inside, zero on the surface; gradients reach the
-    network.
+    """Level ``(N,)`` that the network gives ``points (N, 3)`` [model frame]: negative inside, zero on the surface.
 
-    With the preset's ``silhouette_bound`` a point is no further inside than its worst silhouette has it.
+    Gradients reach the network.  Where the preset has ``silhouette_bound`` the object's level is the greater one of
+    this and :func:`bound_level`: no point is further inside than its worst silhouette has it.
     """
 
     def density(points: Tensor) -> dict[str, Tensor]:
         features = model.view_features(maps, points)[0][None] if model.preset.view_feature_width else None
         return {"density": model.query(code, points[None], ("density",), features)["density"][0, :, 0]}
 
-    level = model.level(in_rows(density, points)["density"])
-    if model.preset.silhouette_bound:
-        level = torch.maximum(level, bound_level(model, maps, points))
-    return level
+    return model.level(in_rows(density, points)["density"])
 
 
 def in_rows(evaluate: Callable[..., dict[str, Tensor]], *inputs: Tensor) -> dict[str, Tensor]:

@@ -93,6 +93,7 @@ class Preset:
     roughness_is_alpha: bool = False  # the roughness head predicts the GGX width; query() returns its square root
     log_level: bool = False  # the surface level is linear in the raw density (a distance) instead of in the density
     softness: float = 0.02  # model units from occupancy 1/2 to 0.73: unit of log_level and of the silhouettes' bound
+    smoothing: int = 0  # iterations of Taubin smoothing of the extracted surface
     silhouette_bound: bool = False  # the density is bounded by the views' masks
     published_input: bool = False  # views prepared as by the release: JPEG, not cropped, poses as stored unless asked
     reads_background: bool = False  # the illumination path was trained with visible backgrounds too
@@ -164,7 +165,8 @@ SMALL = Preset(
         tokens=78, token_width=64, width=256, heads=8, layers=2, groups=16,
     ),
     reni=ReniSizes(latents=49, width=128, layers=6, heads=8, height=64),
-    resolution=64,
+    resolution=80,
+    smoothing=8,
     log_level=True,
     silhouette_bound=True,
 )  # fmt: skip

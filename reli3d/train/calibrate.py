@@ -10,7 +10,7 @@ from pathlib import Path
 
 import torch
 
-from reli3d.nn.field import bound_level
+from reli3d.nn.field import bound_level, surface_level
 from reli3d.nn.model import Reconstructor
 from reli3d.train.losses import maps_of
 from reli3d.train.samples import batches
@@ -33,8 +33,7 @@ def calibrate(model: Reconstructor, samples: Path, *, steps: int = 40, seed: int
             maps = maps_of(own, batch.images[b], batch.silhouette[b], batch.c2w[b], batch.intrinsics[b])
             half = batch.points.shape[1] // 2
             points, inside = batch.points[b, half:].contiguous(), batch.distance[b, half:] < 0
-            features = model.view_features(maps, points)[0][None]
-            level = model.level(model.query(own, points[None], ("density",), features)["density"][0, :, 0])
+            level = surface_level(model, own, maps, points)
             bound = bound_level(model, maps, points)
             for k, offset in enumerate(OFFSETS):
                 got = torch.maximum(level - offset, bound) < 0

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from reli3d.nn.field import surface_level, surface_material
+from reli3d.nn.field import bound_level, surface_level, surface_material
 from reli3d.nn.model import Code, Reconstructor
 from reli3d.nn.view_features import ViewMaps
 from reli3d.render.bump import radial_bump
@@ -39,6 +39,8 @@ def maps_of(code: Code, images: Tensor, silhouette: Tensor, c2w: Tensor, intrins
 def _object_losses(model: Reconstructor, code: Code, batch: Batch, b: int, light: Tensor) -> dict[str, Tensor]:
     maps = maps_of(code, batch.images[b], batch.silhouette[b], batch.c2w[b], batch.intrinsics[b])
     level = surface_level(model, code, maps, batch.points[b])
+    if model.preset.silhouette_bound:
+        level = torch.maximum(level, bound_level(model, maps, batch.points[b]))
     target = (-batch.distance[b] / model.preset.softness).sigmoid()
     out = {"occupancy": functional.binary_cross_entropy_with_logits(-level, target)}
 
