@@ -4,8 +4,9 @@ import pytest
 import torch
 from torch.nn.functional import grid_sample, normalize
 
+from reli3d.geometry.projection import summarize_views
 from reli3d.kernels import view_features as kernels
-from reli3d.nn.view_features import ViewFeatures, ViewMaps, view_summary
+from reli3d.nn.view_features import ViewFeatures, ViewMaps
 from reli3d.render.camera import look_at, project
 
 SIZE, GRID, WIDTH = 24, 4, 6
@@ -70,7 +71,10 @@ def test_the_kernel_matches_plain_torch(device, views, on_surface):
     points, visible, normal = surface(700, views, device)
     if not on_surface:
         visible = normal = None
-    got, want = view_summary(maps, points, visible, normal), plain(maps, points, visible, normal)
+    got, want = (
+        summarize_views(maps.images, maps.c2w, maps.intrinsics, points, visible, normal),
+        plain(maps, points, visible, normal),
+    )
     for g, w in zip(got, want, strict=True):
         # projection in float32: 1e-5 pixel on values that change by up to 12 a pixel; 0.2 % of them divide by EDGE *
         # size
@@ -105,4 +109,4 @@ def test_half_of_the_arguments_of_a_surface_is_an_error(device):
     maps = rig(2, device)
     points, visible, _ = surface(8, 2, device)
     with pytest.raises(ValueError, match="expected both or none"):
-        view_summary(maps, points, visible, None)
+        summarize_views(maps.images, maps.c2w, maps.intrinsics, points, visible, None)

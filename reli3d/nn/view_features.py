@@ -11,15 +11,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-import warp as wp
 from torch import Tensor, nn
 from torch.nn.functional import linear
 
-from reli3d._bridge import check, launch
-from reli3d.geometry.projection import gather_views
-from reli3d.kernels.view_features import view_summary_kernel
-
-OWN = 9  # numbers that a view says of a point besides its tokens, and as many that sum up all views
+from reli3d.geometry.projection import OWN, gather_views, summarize_views
 
 
 @dataclass(frozen=True)
@@ -51,43 +46,9 @@ class ViewFeatures(nn.Module):
         """
         size, grid = maps.images.shape[1], maps.tokens.shape[1]
         tokens, _ = gather_views(self.tokens(maps.tokens), points, maps.c2w, maps.intrinsics * (grid / size))
-        own, weight, summary = view_summary(maps, points, visible, normal)
+        own, weight, summary = summarize_views(maps.images, maps.c2w, maps.intrinsics, points, visible, normal)
         first, activation, last = self.per_view
         channels = tokens.shape[-1]
         hidden = linear(tokens, first.weight[:, :channels]) + linear(own, first.weight[:, channels:], first.bias)
         pooled = last((weight[:, None] @ activation(hidden))[:, 0])  # pooled before the last layer: it is linear
         return torch.cat([pooled, summary], -1), summary[:, :3]
-
-
-def view_summary(
-    maps: ViewMaps, points: Tensor, visible: Tensor | None, normal: Tensor | None
-) -> tuple[Tensor, Tensor, Tensor]:
-    """What the images show of ``points (N, 3)``: ``(N, V, 9)`` a view, its weight ``(N, V)``, ``(N, 9)`` in sum.
-
-    See :mod:`reli3d.kernels.view_features` for the numbers.  visible and normal as in :class:`ViewFeatures`.  No
-    gradient.  Raises TypeError unless float32, ValueError on wrong shapes or mixed devices.
-    """
-    views, n = len(maps.images), len(points)
-    check("images", maps.images, last=4), check("points", points, last=3, like=maps.images)
-    if maps.images.ndim != 4 or maps.images.shape[1] != maps.images.shape[2] or maps.images.shape[1] < 2:
-        raise ValueError(f"images: expected (V, S, S, 4) with S of at least 2, got {tuple(maps.images.shape)}")
-    if (visible is None) != (normal is None):
-        raise ValueError("visible, normal: expected both or none, got one")
-    if visible is None:
-        visible, normal, surface = points.new_empty(0, views), points.new_empty(0, 3), 0
-    else:
-        check("visible", visible, last=views, like=points), check("normal", normal, last=3, like=points)
-        surface = 1
-        if len(visible) != n or len(normal) != n:
-            raise ValueError(f"visible, normal: expected {n} rows, got {len(visible)} and {len(normal)}")
-    out = [points.new_empty(n, views, OWN), points.new_empty(n, views), points.new_empty(n, OWN)]
-    inputs = (maps.images, maps.c2w, maps.intrinsics, points, normal, visible)
-    images, c2w, intrinsics, points, normal, visible = (t.detach().contiguous() for t in inputs)
-    launch(
-        view_summary_kernel,
-        n,
-        [(images, wp.vec4), (c2w, wp.mat44), (intrinsics, wp.vec4), (points, wp.vec3), surface, (normal, wp.vec3),
-         (visible, wp.float32), *((t, wp.float32) for t in out)],
-        points.device,
-    )  # fmt: skip
-    return out[0], out[1], out[2]

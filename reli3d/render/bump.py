@@ -12,8 +12,9 @@ EPS = 1.0e-7  # of the published normalisation; on the vertical axis, where the 
 def radial_bump(position: Tensor, normal: Tensor, bump: Tensor) -> Tensor:
     """Unit shading normal ``(..., 3)`` of a tangent-space ``bump (..., 3)`` in the frame that circles the +Y axis.
 
-    position: ``(..., 3)`` model frame.  normal: ``(..., 3)`` unit, geometric.  The tangent is ``y x position`` made orthogonal to the
-    normal, the bitangent ``normal x tangent``.  Gradients reach ``bump`` only, as published: the frame is data.
+    position: ``(..., 3)`` model frame.  normal: ``(..., 3)`` unit, geometric.  The tangent is ``y x position`` made
+    orthogonal to the normal, the bitangent ``normal x tangent``.  Gradients reach ``bump`` only, as published: the
+    frame is data.
     """
     position, normal = position.detach(), normal.detach()
     around = torch.stack([position[..., 2], torch.zeros_like(position[..., 0]), -position[..., 0]], -1)
