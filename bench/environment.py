@@ -1,0 +1,87 @@
+"""Lookup of a lat-long map beside torch's grid_sample; sampling its table; spherical Gaussians beside plain torch."""
+
+import torch
+
+from reli3d.render.environment import Environment
+from reli3d.render.gaussians import SphericalGaussians
+
+
+def inputs(device, n, height):
+    rng = torch.Generator(device).manual_seed(0)
+    radiance = torch.rand(height, 2 * height, 3, generator=rng, device=device)
+    directions = torch.nn.functional.normalize(torch.randn(n, 3, generator=rng, device=device), dim=-1)
+    return radiance, directions, torch.rand(n, 3, generator=rng, device=device)
+
+
+def with_grad(function, radiance, weight, backward):
+    radiance.requires_grad_(backward)
+
+    def step():
+        out = function(radiance)
+        return torch.autograd.grad(out, radiance, weight) if backward else out
+
+    return step, {"lookups": len(weight)}
+
+
+def lookup(device, n, height, backward):
+    """Radiance from ``n`` random directions, with the gradient to the texels if ``backward``."""
+    radiance, directions, weight = inputs(device, n, height)
+    return with_grad(lambda r: Environment(r).lookup(directions), radiance, weight, backward)
+
+
+def torch_lookup(device, n, height, backward):
+    """The same from grid_sample on a map with its neighbouring columns appended on both sides."""
+    radiance, directions, weight = inputs(device, n, height)
+
+    def function(r):
+        x = torch.atan2(directions[:, 0], -directions[:, 2]) / torch.pi * (height / (height + 1))
+        y = torch.acos(directions[:, 1].clamp(-1, 1)) / torch.pi * 2 - 1
+        planes = torch.cat([r[:, -1:], r, r[:, :1]], 1).permute(2, 0, 1)[None]
+        got = torch.nn.functional.grid_sample(planes, torch.stack([x, y], -1)[None, None], padding_mode="border",
+                                              align_corners=False)  # fmt: skip
+        return got[0, :, 0].T
+
+    return with_grad(function, radiance, weight, backward)
+
+
+def sample(device, n, height):
+    """Directions and densities of ``n`` uniform pairs from the importance table."""
+    environment = Environment(inputs(device, 1, height)[0])
+    u = torch.rand(n, 2, generator=torch.Generator(device).manual_seed(1), device=device)
+    return lambda: environment.sample(u), {"samples": n}
+
+
+def lobes(device, count):
+    rng = torch.Generator(device).manual_seed(2)
+    axis = torch.nn.functional.normalize(torch.randn(count, 3, generator=rng, device=device), dim=-1)
+    return [axis, torch.rand(count, generator=rng, device=device) * 50 + 1, axis.abs().clone()]
+
+
+def gaussians(device, n, count):
+    """Value and gradient of ``count`` lobes at ``n`` directions."""
+    values = [v.requires_grad_() for v in lobes(device, count)]
+    _, directions, weight = inputs(device, n, 4)
+    light = SphericalGaussians(*values)
+    return lambda: torch.autograd.grad(light.lookup(directions), values, weight), {"lobes": n * count}
+
+
+def torch_gaussians(device, n, count):
+    """The same from a matrix product and an exponential."""
+    axis, sharpness, amplitude = values = [v.requires_grad_() for v in lobes(device, count)]
+    _, directions, weight = inputs(device, n, 4)
+
+    def step():
+        value = torch.exp(sharpness * (directions @ axis.T - 1.0)) @ amplitude
+        return torch.autograd.grad(value, values, weight)
+
+    return step, {"lobes": n * count}
+
+
+_SIZE = dict(n=1 << 20, height=256)
+CASES = {
+    "lookup": (lookup, dict(backward=False, **_SIZE)),
+    "lookup_grad": (lookup, dict(backward=True, **_SIZE)),
+    "sample": (sample, _SIZE),
+    "gaussians": (gaussians, dict(n=8192, count=128)),
+}
+PEERS = {"lookup": torch_lookup, "lookup_grad": torch_lookup, "gaussians": torch_gaussians}

@@ -1,0 +1,121 @@
+"""Direct light of a sphere of 82 thousand triangles with shadows, and its outline, beside Mitsuba's llvm variant.
+
+Mitsuba renders its own ``principled`` material with as many samples a pixel in two strategies (``direct``: emitter and
+BSDF), primary rays included on both sides: the same amount of work, not the same estimator.  Its film pays for nothing
+here: rays are given and radiance is returned.
+"""
+
+import glob
+import os
+
+import numpy as np
+import torch
+import trimesh
+
+from reli3d.geometry.rays import RayScene
+from reli3d.render.camera import Camera, camera_rays, look_at
+from reli3d.render.environment import Environment
+from reli3d.render.shading import shade
+from reli3d.render.silhouette import antialias, mesh_edges
+
+SAMPLES = (20, 40, 4)  # the published counts: 64
+
+
+def geometry():
+    mesh = trimesh.creation.icosphere(subdivisions=6, radius=0.8)
+    return mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32)
+
+
+def view(device, size):
+    eye = torch.tensor([0.0, 0.5, 2.2], device=device)
+    pose = look_at(eye, torch.zeros(3, device=device), torch.tensor([0.0, 1.0, 0.0], device=device))
+    return Camera.from_fov(pose, 0.8, size, size)
+
+
+def sky(device):
+    return torch.rand(64, 128, 3, generator=torch.Generator().manual_seed(0)).to(device)
+
+
+def direct(device, size, roughness, backward):
+    """Primary rays and 64 samples with shadow rays per hit, with gradients to material and light if ``backward``."""
+    vertices, faces = (torch.from_numpy(a).to(device) for a in geometry())
+    scene, camera = RayScene(vertices, faces), view(device, size)
+    origins, directions = (v.reshape(-1, 3) for v in camera_rays(camera))
+    hit = int((scene.closest(origins, directions).face >= 0).sum())
+    base = torch.tensor([0.7, 0.4, 0.2], device=device).requires_grad_(backward)
+    light = sky(device).requires_grad_(backward)
+    environment = Environment(light)
+    _ = environment.table  # Mitsuba's is made when its scene loads
+
+    def step():
+        found = scene.closest(origins, directions)
+        index = torch.nonzero(found.face >= 0)[:, 0]
+        wo, n = -directions[index], len(index)
+        position = origins[index] + directions[index] * found.t[index, None]
+        normal = torch.nn.functional.normalize(position, dim=-1)
+        rough = torch.full((n,), roughness, device=device)
+        out = shade(position, normal, normal, wo, base.expand(n, 3), rough, torch.zeros_like(rough), environment,
+                    samples=SAMPLES, scene=scene)  # fmt: skip
+        return torch.autograd.grad(out.sum(), (base, light)) if backward else out
+
+    return step, {"samples": hit * sum(SAMPLES)}
+
+
+def mitsuba_direct(device, size, roughness, backward):
+    """The same image from Mitsuba; forward and CPU only, None without LLVM 19 or newer."""
+    found = sorted(glob.glob("/usr/lib/*/libLLVM-19.so*") + glob.glob("/usr/lib/*/libLLVM-2?.so*"))
+    if backward or device.type != "cpu" or not ("DRJIT_LIBLLVM_PATH" in os.environ or found):
+        return None
+    os.environ.setdefault("DRJIT_LIBLLVM_PATH", found[0] if found else "")
+    try:
+        import mitsuba as mi
+    except ImportError:
+        return None
+    import drjit as dr
+
+    mi.set_variant("llvm_ad_rgb")
+    vertices, faces = geometry()
+    mesh = mi.Mesh("ball", len(vertices), len(faces))
+    params = mi.traverse(mesh)
+    params["vertex_positions"], params["faces"] = vertices.ravel(), faces.ravel().astype(np.uint32)
+    params.update()
+    material = mi.load_dict({"type": "principled", "base_color": {"type": "rgb", "value": [0.7, 0.4, 0.2]},
+                             "roughness": roughness, "metallic": 0.0, "specular": 0.5})  # fmt: skip
+    mesh.set_bsdf(material)
+    bitmap = mi.Bitmap(sky(device).numpy())
+    scene = mi.load_dict({"type": "scene", "mesh": mesh, "light": {"type": "envmap", "bitmap": bitmap},
+                          "integrator": {"type": "direct", "emitter_samples": 32, "bsdf_samples": 32,
+                                         "hide_emitters": True}})  # fmt: skip
+    origins, directions = (v.reshape(-1, 3).contiguous().numpy().T for v in camera_rays(view(device, size)))
+    ray = mi.RayDifferential3f(mi.Point3f(origins), mi.Vector3f(directions))
+
+    def step():
+        sampler = mi.load_dict({"type": "independent"})
+        sampler.seed(0, size * size)
+        color, _, _ = scene.integrator().sample(scene, sampler, ray)
+        dr.eval(color)
+        dr.sync_thread()
+
+    return step, {"samples": size * size * 64}
+
+
+def outline(device, size):
+    """Antialiasing of a mask and its gradient to 41 thousand vertices."""
+    vertices, faces = (torch.from_numpy(a).to(device) for a in geometry())
+    scene, camera, edges = RayScene(vertices, faces), view(device, size), mesh_edges(vertices, faces)
+    mask = (scene.closest(*camera_rays(camera)).face >= 0).float()[..., None]
+    moving = vertices.clone().requires_grad_()
+
+    def step():
+        out = antialias(mask, moving, faces, camera, scene, edges=edges)
+        return torch.autograd.grad(out.sum(), moving)
+
+    return step, {"pixels": size * size}
+
+
+CASES = {
+    "direct": (direct, dict(size=128, roughness=0.4, backward=False)),
+    "direct_grad": (direct, dict(size=128, roughness=0.4, backward=True)),
+    "outline_grad": (outline, dict(size=512)),
+}
+PEERS = {"direct": mitsuba_direct}
