@@ -6,8 +6,8 @@ even remeshing (``pyacvd``, MIT, on VTK, BSD, and pykdtree, LGPL) are optional i
 
 Decimation compared on the two test meshes that both take, at a fifth of their faces: quadrics of
 ``fast-simplification`` left 5 and 30 times less surface distance than ``manifold3d``'s ``simplify`` (which takes a
-tolerance, not a count, and solids only) in less than a hundredth of the time.  Left out for even remeshing: PyMeshLab is GPL, gpytoolbox's wheel carries GPL parts and the
-``geogram`` wheel has no remeshing.
+tolerance, not a count, and solids only) in less than a hundredth of the time.  Left out for even remeshing: PyMeshLab
+is GPL, gpytoolbox's wheel carries GPL parts and the ``geogram`` wheel has no remeshing.
 """
 
 from __future__ import annotations
