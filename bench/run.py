@@ -160,7 +160,7 @@ def main(argv: list[str] | None = None) -> int:
                    "peer": None if result.peer is None else asdict(result.peer),
                    "arguments": case.arguments, **about}  # fmt: skip
             with open(results / f"{about['machine']}.jsonl", "a") as file:
-                file.write(json.dumps(row) + "\n")
+                file.write(json.dumps(row, default=lambda o: o.__name__) + "\n")
         if options.record and result.ratio is not None:
             baseline.setdefault(device.type, {})[name] = round(result.ratio, 4)
     if options.record:
