@@ -42,9 +42,7 @@ def peak_memory_mib() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20
 
 
-def write_results(
-    folder: Path, asset: Asset, picture: np.ndarray, info: dict, *, compatible: bool = False
-) -> None:
+def write_results(folder: Path, asset: Asset, picture: np.ndarray, info: dict, *, compatible: bool = False) -> None:
     """Write :data:`FILES` into ``folder``; an error leaves what was there before.  Raises OSError, ValueError.
 
     compatible: write :data:`COPIES` as well.

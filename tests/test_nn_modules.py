@@ -218,9 +218,7 @@ def test_merged_cube_weights_match_published(golden):
     torch.testing.assert_close((values["density"][0, :, 0] - 1.0).exp(), g["density_grid"], **DEEP)
     grid = values["flexicubes"].reshape(17, 17, 17, 16)
     steps = [(k & 1, k >> 1 & 1, k >> 2) for k in range(8)]
-    corners = torch.stack(
-        [torch.stack([grid[x, c // 16 + y, c % 16 + z] for x, y, z in steps]) for c in range(64)]
-    )
+    corners = torch.stack([torch.stack([grid[x, c // 16 + y, c % 16 + z] for x, y, z in steps]) for c in range(64)])
     assert_relative(merger.merged(corners), g["weight21_first64"], 1e-5)
     weights = merger(corners)
     assert weights.beta.shape == (64, 12) and weights.alpha.shape == (64, 8) and weights.gamma.shape == (64,)

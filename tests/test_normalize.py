@@ -66,9 +66,7 @@ def test_the_hull_of_many_views_is_the_object(spheres, low, high):
 def test_an_object_anywhere_is_centred_and_scaled(count, scale, centre):
     """A ball of diameter 1.  One view finds its middle if it is the point of the ray nearest to the origin."""
     centre = torch.tensor(centre, dtype=torch.float64)
-    views = sphere_views(BALL, count).transformed(
-        Similarity(scale, torch.eye(3, dtype=torch.float64), centre)
-    )
+    views = sphere_views(BALL, count).transformed(Similarity(scale, torch.eye(3, dtype=torch.float64), centre))
     similarity = normalize(views, "hull")
     middle = similarity.apply(centre)
     radius = similarity.scale * 0.5 * scale

@@ -156,4 +156,3 @@ def test_points_of_a_half_precision_triplane_keep_their_place():
     release = sample_triplane(ramp, points.half().float())[0, :, 0].double()
     assert (ours - truth).abs().max() < 1e-3  # float32 of 384
     assert (release - truth).abs().max() > 0.04
-

@@ -24,9 +24,7 @@ def parser() -> argparse.ArgumentParser:
     )
     p.add_argument("folder", nargs="*", type=Path, help="object folders: transforms.json or a COLMAP text model; "
                    "default the bundled example")  # fmt: skip
-    p.add_argument(
-        "--output", type=Path, default=Path("outputs"), help="files land in OUTPUT/<object>/"
-    )
+    p.add_argument("--output", type=Path, default=Path("outputs"), help="files land in OUTPUT/<object>/")
     p.add_argument("--views", type=int, help="use the first N views (1 to 16)")
     p.add_argument("--masks", type=Path, help="folder of masks with the names of the images, instead of their alpha")
     p.add_argument("--weights", default="small", help="small (in the package), official, or a safetensors file")

@@ -16,6 +16,7 @@ ORTHONORMAL = 1e-3  # largest entry of R^T R - 1: four digits in a text file; be
 MAX_DISTANCE = 1e6  # float32 poses keep a tenth of a unit there
 BEND = 1.0  # pixels a lens may bend a corner of the image and still count as straight
 
+
 @dataclass(frozen=True)
 class Lens:
     """Either a field of view in radians, or focal lengths in pixels of an image of ``size`` (None: as stored)."""

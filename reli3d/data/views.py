@@ -101,9 +101,7 @@ class Views:
     def to(self, device: torch.device | str) -> Views:
         """The same views with their tensors on ``device``."""
         images, masks = (tuple(t.to(device) for t in group) for group in (self.images, self.masks))
-        return replace(
-            self, images=images, masks=masks, c2w=self.c2w.to(device), intrinsics=self.intrinsics.to(device)
-        )
+        return replace(self, images=images, masks=masks, c2w=self.c2w.to(device), intrinsics=self.intrinsics.to(device))
 
     def resampled(self, size: int, *, crop: bool = True, padding: float = 0.08) -> ViewBatch:
         """All views at ``size`` x ``size`` pixels, with the intrinsics of the new pixels.

@@ -262,6 +262,7 @@ def from_trimesh(source, *, device: torch.device | str = "cpu") -> Mesh:
 
     Normals that trimesh would first have to compute are left out.
     """
+
     def tensor(value, dtype=torch.float32):
         return torch.from_numpy(np.array(value)).to(device=device, dtype=dtype)
 

@@ -17,7 +17,6 @@ import numpy as np
 EDGES = ((0, 1), (1, 5), (4, 5), (0, 4), (2, 3), (3, 7), (6, 7), (2, 6), (2, 0), (3, 1), (7, 5), (6, 4))
 
 
-
 class Tables(NamedTuple):
     """Everything the kernels look up, int32."""
 
