@@ -23,7 +23,7 @@ from reli3d.geometry.surface import extract_surface, surface_cubes
 from reli3d.geometry.tangents import encode_normals, vertex_tangents
 from reli3d.geometry.uv import unwrap, unwrap_xatlas
 from reli3d.geometry.visibility import visible_from
-from reli3d.nn.field import bound_level, surface_level, surface_material
+from reli3d.nn.field import bound_level, irradiance, surface_level, surface_material
 from reli3d.nn.heads import deformation
 from reli3d.nn.model import Code, Reconstructor
 from reli3d.nn.presets import Preset
@@ -158,11 +158,13 @@ def texture(
     mesh = unwrap(mesh, texture_size=size) if uv == "project" else unwrap_xatlas(mesh, texture_size=size)
     mesh = replace(mesh, tangents=vertex_tangents(mesh))
 
+    facing = irradiance(model, code)
+
     def surface(position: Tensor, normal: Tensor, tangent: Tensor) -> dict[str, Tensor]:
         visible = position.new_zeros(len(position), len(maps.c2w))
         if model.preset.view_feature_width:  # nothing else asks which view sees a point
             visible = visible_from(scene, position, normal, maps.c2w, maps.intrinsics, DETAIL).float()
-        got = surface_material(model, code, maps, position, normal, visible)
+        got = surface_material(model, code, maps, position, normal, visible, facing)
         orm = torch.cat([torch.ones_like(got["roughness"]), got["roughness"], got["metallic"]], -1)
         shading = radial_bump(position, normal, got["normal"])
         return {"base_color": got["base_color"], "orm": orm, "normal": encode_normals(shading, normal, tangent)}

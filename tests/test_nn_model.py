@@ -148,7 +148,7 @@ def test_gradients_reach_every_parameter_that_has_an_effect(device):
     model = Reconstructor(NANO).to(device)
     code = model.encode(*(t.to(device) for t in views(2, 2, 32)))
     points = torch.rand(2, 50, 3, device=device) * 1.6 - 0.8
-    features = torch.rand(2, 50, NANO.view_feature_width, device=device)
+    features = torch.rand(2, 50, NANO.point_features, device=device)
     values = model.query(code, points, list(HEADS), features)
     weights = model.merger(values["flexicubes"][:, :48].unflatten(1, (6, 8)))
     loss = sum(v.square().sum() for v in (*values.values(), weights.alpha, weights.beta, weights.gamma))
@@ -212,7 +212,7 @@ def test_inputs_that_do_not_belong_together_are_named():
     with pytest.raises(TypeError, match="c2w: expected torch.float32, got torch.float64"):
         model.encode(images, masks, c2w.double(), intrinsics)
     code = model.encode(images, masks, c2w, intrinsics)
-    with pytest.raises(ValueError, match="view_features: expected"):
+    with pytest.raises(ValueError, match="point_features: expected"):
         model.query(code, torch.zeros(1, 1, 3), ["density"])
 
 

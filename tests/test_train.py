@@ -14,10 +14,12 @@ from reli3d.geometry.hull import hull_distance
 from reli3d.nn.model import Reconstructor
 from reli3d.nn.presets import SMALL
 from reli3d.nn.reni import map_directions
+from reli3d.render.camera import project
+from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.train.light_prior import fit, scale_free
 from reli3d.train.loop import TrainConfig, averaged_model, progress, rate_at, train
-from reli3d.train.losses import losses
-from reli3d.train.samples import batches, random_turn
+from reli3d.train.losses import losses, pattern_loss
+from reli3d.train.samples import batches, load_sample, mirrored, random_turn, recolored
 
 SEEDS = (3, 12)
 
@@ -74,6 +76,40 @@ def test_a_turn_carries_light_and_surface_together(folder):
         if int(lit.sum()) > 30 and int(dark.sum()) > 30:
             radiance = batch.pixel_radiance[0].mean(-1)
             assert float(radiance[lit].median()) > float(radiance[dark].median())
+
+
+def test_the_mirror_shows_the_same_points_in_flipped_pictures(folder):
+    """A camera that is mirrored with the object must see its mirror image: every projection moves to the other side."""
+    sample = load_sample(next(folder.glob("*.safetensors")), 2, 512, np.random.default_rng(0), augment=False)
+    other = mirrored(sample)
+    width = sample["images"].shape[2]
+    for v in range(2):
+        xy, depth = project(sample["surface"][:, 0], sample["c2w"][v], sample["intrinsics"][v])
+        xy_other, depth_other = project(other["surface"][:, 0], other["c2w"][v], other["intrinsics"][v])
+        expected = torch.stack([width - xy[:, 0], xy[:, 1]], -1)
+        torch.testing.assert_close(xy_other, expected, rtol=0, atol=1e-3)  # float32 on pixels up to 192
+        torch.testing.assert_close(depth_other, depth, rtol=1e-5, atol=1e-5)
+        assert torch.linalg.det(other["c2w"][v, :3, :3]) == pytest.approx(1.0, abs=1e-5)
+    assert torch.equal(other["images"][:, :, 5], sample["images"][:, :, width - 6])
+    assert torch.equal(other["light"], sample["light"])
+    assert torch.equal(other["light_directions"][:, 0], -sample["light_directions"][:, 0])
+    torch.testing.assert_close(mirrored(other)["c2w"], sample["c2w"])
+
+
+def test_exchanged_colours_agree_in_light_material_and_images(folder):
+    sample = load_sample(next(folder.glob("*.safetensors")), 1, 512, np.random.default_rng(0), augment=False)
+    other = recolored(sample, torch.tensor([2, 0, 1]))
+    for key in ("images", "light", "pixel_radiance", "material"):
+        assert torch.equal(other[key][..., 0], sample[key][..., 2])
+        assert torch.equal(other[key][..., 1], sample[key][..., 0])
+    assert torch.equal(other["material"][:, 3:], sample["material"][:, 3:])
+
+
+def test_the_pattern_loss_forgives_exposure_and_nothing_else():
+    target = torch.rand(500, 3) * 0.6 + 0.1
+    darker = linear_to_srgb(srgb_to_linear(target) * torch.tensor([0.3, 0.7, 0.5]))
+    assert float(pattern_loss(darker, target)) < 1e-9
+    assert float(pattern_loss(target.flip(0), target)) > 0.02  # unrelated values: about twice the variance, 0.06
 
 
 def test_turns_are_rotations():

@@ -11,12 +11,16 @@ from collections.abc import Callable
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from reli3d.geometry.hull import hull_distance
 from reli3d.nn.model import Code, Reconstructor
 from reli3d.nn.view_features import ViewMaps
+from reli3d.render.environment import Environment
 
 ROWS = 8192  # points at a time without gradient: their features stay in the cache, which halves the time of the heads
+LIGHT_ROWS = 16  # of the decoded map whose irradiance the material is told
+BLACK = 0.01  # added to a radiance before its logarithm
 MATERIAL = ("base_color", "roughness", "metallic", "normal")
 
 
@@ -28,7 +32,10 @@ def surface_level(model: Reconstructor, code: Code, maps: ViewMaps, points: Tens
     """
 
     def density(points: Tensor) -> dict[str, Tensor]:
-        features = model.view_features(maps, points)[0][None] if model.preset.view_feature_width else None
+        features = None
+        if model.preset.view_feature_width:
+            features = model.view_features(maps, points)[0][None]
+            features = functional.pad(features, (0, model.preset.point_features - features.shape[-1]))  # no surface yet
         return {"density": model.query(code, points[None], ("density",), features)["density"][0, :, 0]}
 
     return model.level(in_rows(density, points)["density"])
@@ -50,17 +57,32 @@ def bound_level(model: Reconstructor, maps: ViewMaps, points: Tensor) -> Tensor:
     return -hull_distance(points, silhouette, maps.c2w, maps.intrinsics) / model.preset.softness
 
 
+def irradiance(model: Reconstructor, code: Code) -> Environment | None:
+    """Irradiance of the light that the network sees, as a map over the normal; None where the preset asks for none.
+
+    No gradient.  It tells a dark paint in the light from a bright one in the shade.
+    """
+    if not model.preset.shading_features:
+        return None
+    with torch.no_grad():
+        return Environment(model.decode_environment(code, LIGHT_ROWS)[0].contiguous()).irradiance()
+
+
 def surface_material(model: Reconstructor, code: Code, maps: ViewMaps, position: Tensor, normal: Tensor,
-                     visible: Tensor) -> dict[str, Tensor]:  # fmt: skip
+                     visible: Tensor, facing: Environment | None) -> dict[str, Tensor]:  # fmt: skip
     """Base colour (sRGB-encoded), roughness, metallic and bump normal, ``{name: (N, k)}``, at surface points.
 
     position, normal: ``(N, 3)``, the geometric normal unit.  visible: ``(N, V)``, 1 where a view sees the point.
+    facing: :func:`irradiance`.
     """
 
     def material(position: Tensor, normal: Tensor, visible: Tensor) -> dict[str, Tensor]:
         features = color = None
         if model.preset.view_feature_width:
             features, color = (x[None] for x in model.view_features(maps, position, visible, normal))
+            if facing is not None:
+                light = torch.log(facing.lookup(normal.contiguous()) / torch.pi + BLACK)
+                features = torch.cat([features, normal[None], light[None]], -1)
         values = model.query(code, position[None], MATERIAL, features, color)
         return {name: value[0] for name, value in values.items()}
 

@@ -68,7 +68,7 @@ class Reconstructor(nn.Module):
         self.upsampler = PixelShuffleUpsampler(preset.upsampler, width)
         self.illumination = Illumination(preset.illumination, preset.reni.latents, preset.camera_width, width)
         self.environment = EnvironmentDecoder(preset.reni)
-        self.heads = Heads(3 * preset.upsampler.channels + preset.view_feature_width, preset.head_width)
+        self.heads = Heads(3 * preset.upsampler.channels + preset.point_features, preset.head_width)
         self.merger = WeightMerger(preset.head_width)
         if preset.view_feature_width:
             self.view_features = ViewFeatures(width, width=preset.view_feature_width)
@@ -137,23 +137,23 @@ class Reconstructor(nn.Module):
         return self.environment.radiance(code.latent, code.rotation, code.strength, reni_frame(directions))
 
     def query(self, code: Code, points: Tensor, heads: Sequence[str] = tuple(HEADS),
-              view_features: Tensor | None = None, color: Tensor | None = None) -> dict[str, Tensor]:  # fmt: skip
+              point_features: Tensor | None = None, color: Tensor | None = None) -> dict[str, Tensor]:  # fmt: skip
         """Values of the named heads at points of the model's cube, ``{name: (B, N, outputs)}``, float32.
 
         points: ``(B, N, 3)``, inside plus or minus the preset's radius; features fade to zero outside.
-        view_features: ``(B, N, K)`` where the preset has ``view_feature_width`` K, else None.  color: ``(B, N, 3)``
+        point_features: ``(B, N, K)`` where the preset has ``point_features`` K, else None.  color: ``(B, N, 3)``
         sRGB, what the views show at the points; the base colour is then a correction of it.
         ``density`` is the raw value, see :meth:`level`; ``base_color`` is sRGB-encoded; ``roughness`` is perceptual;
         ``normal`` is unit in the frame of :mod:`reli3d.geometry.bake`; ``deformation`` and ``flexicubes`` are raw, see
-        :mod:`reli3d.nn.heads`.  Gradients reach the triplane, the points, the view features and the heads.
+        :mod:`reli3d.nn.heads`.  Gradients reach the triplane, the points, their features and the heads.
         """
-        width = 0 if view_features is None else view_features.shape[-1]
-        if width != self.preset.view_feature_width:
-            raise ValueError(f"view_features: expected (B, N, {self.preset.view_feature_width}), got width {width}")
+        width = 0 if point_features is None else point_features.shape[-1]
+        if width != self.preset.point_features:
+            raise ValueError(f"point_features: expected (B, N, {self.preset.point_features}), got width {width}")
         with torch.autocast(points.device.type, enabled=False):
             features = sample_triplane(code.triplane, points / self.preset.radius)
-            if view_features is not None:
-                features = torch.cat([features, view_features.float()], dim=-1)
+            if point_features is not None:
+                features = torch.cat([features, point_features.float()], dim=-1)
             values = self.heads(features, heads, color)
             if self.preset.roughness_is_alpha and "roughness" in values:
                 values["roughness"] = values["roughness"].sqrt()

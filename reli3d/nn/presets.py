@@ -13,6 +13,8 @@ import json
 import typing
 from dataclasses import dataclass
 
+SHADING_FEATURES = 6  # normal, logarithm of the irradiance
+
 
 @dataclass(frozen=True)
 class EncoderSizes:
@@ -83,7 +85,7 @@ class Preset:
     backbone: BackboneSizes
     upsampler: UpsamplerSizes
     head_width: int
-    view_feature_width: int  # features a caller adds to the triplane's at each query point; 0: none
+    view_feature_width: int  # features of the views that join the triplane's at each query point; 0: none
     illumination: IlluminationSizes
     reni: ReniSizes
     resolution: int  # cubes along each side of the surface grid
@@ -97,7 +99,14 @@ class Preset:
     silhouette_bound: bool = False  # the density is bounded by the views' masks
     published_input: bool = False  # views prepared as by the release: JPEG, not cropped, poses as stored unless asked
     reads_background: bool = False  # the illumination path was trained with visible backgrounds too
+    shading_features: bool = False  # beside view features: the normal and the predicted irradiance it faces
     tone_mapping: bool = False  # carry the published tone-mapping constants, which nothing here reads
+
+    @property
+    def point_features(self) -> int:
+        """Features that a caller adds to the triplane's at each query point."""
+        shading = SHADING_FEATURES if self.shading_features else 0
+        return self.view_feature_width + shading if self.view_feature_width else 0
 
     def to_json(self) -> str:
         return json.dumps(dataclasses.asdict(self), sort_keys=True)
@@ -169,6 +178,7 @@ SMALL = Preset(
     smoothing=8,
     log_level=True,
     silhouette_bound=True,
+    shading_features=True,
 )  # fmt: skip
 
 PRESETS = {preset.name: preset for preset in (SMALL, OFFICIAL)}

@@ -79,6 +79,21 @@ class Environment:
         )  # fmt: skip
         return out.reshape(directions.shape)
 
+    def irradiance(self) -> Environment:
+        """Irradiance [radiance times sr] on a surface of each normal, as a map of the same size: pi times a constant.
+
+        The sum over the texels by their solid angles: n^2 terms for n texels, meant for maps of at most 32 rows.
+        Gradients reach the texels.
+        """
+        height, width = self.radiance.shape[:2]
+        phi = (torch.arange(width, dtype=torch.float64) + 0.5) * (2 * torch.pi / width)
+        theta = (torch.arange(height, dtype=torch.float64) + 0.5) * (torch.pi / height)
+        across = theta.sin()[:, None] * torch.stack([phi.cos(), phi.sin()])[:, None]  # (2, H, W), any zero of azimuth
+        directions = torch.cat([across.reshape(2, -1), theta.cos()[:, None].expand(-1, width).reshape(1, -1)])
+        angle = texel_solid_angles(height, width)[:, None].expand(-1, width).reshape(-1)
+        weight = ((directions.T @ directions).clamp(min=0.0) * angle).to(self.radiance)
+        return Environment((weight @ self.radiance.reshape(-1, 3)).reshape(self.radiance.shape))
+
     def rotated(self, yaw: float) -> Environment:
         """The light turned by ``yaw`` [rad] about +Y, counter-clockwise seen from above: -Z light moves towards -X.
 

@@ -8,17 +8,16 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from reli3d.nn.field import bound_level, surface_level, surface_material
+from reli3d.nn.field import LIGHT_ROWS, bound_level, surface_level, surface_material
 from reli3d.nn.model import Code, Reconstructor
 from reli3d.nn.view_features import ViewMaps
 from reli3d.render.bump import radial_bump
-from reli3d.render.color import srgb_to_linear
+from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.render.environment import Environment
 from reli3d.render.shading import shade
 from reli3d.train.samples import Batch
 
 IMAGE_SAMPLES = (12, 8, 2)  # light, GGX and cosine samples a pixel of the image loss
-LIGHT_ROWS = 16  # height of the decoded map that the image loss shades with
 LIGHT_DIRECTIONS = 384  # of the 2048 of a sample's map: enough for one step's mean, a fifth of the decoder's time
 
 
@@ -46,17 +45,30 @@ def _object_losses(model: Reconstructor, code: Code, batch: Batch, b: int, light
 
     position, normal, bumped = batch.surface[b].unbind(1)
     normal = functional.normalize(normal, dim=-1)
-    got = surface_material(model, code, maps, position, normal, batch.visible[b])
+    facing = Environment(light.detach()).irradiance() if model.preset.shading_features else None
+    got = surface_material(model, code, maps, position, normal, batch.visible[b], facing)
     out["base_color"] = functional.mse_loss(got["base_color"], batch.material[b, :, :3])
+    out["pattern"] = pattern_loss(got["base_color"], batch.material[b, :, :3])
     out["roughness"] = functional.mse_loss(got["roughness"][:, 0], batch.material[b, :, 3])
     out["metallic"] = functional.mse_loss(got["metallic"][:, 0], batch.material[b, :, 4])
     world = radial_bump(position, normal, got["normal"])
     out["normal"] = (1 - functional.cosine_similarity(world, bumped, dim=-1)).mean()
-    out["image"] = _image_loss(model, code, maps, batch, b, light)
+    out["image"] = _image_loss(model, code, maps, batch, b, light, facing)
     return out
 
 
-def _image_loss(model: Reconstructor, code: Code, maps: ViewMaps, batch: Batch, b: int, light: Tensor) -> Tensor:
+def pattern_loss(color: Tensor, target: Tensor) -> Tensor:
+    """Mean square difference of base colours ``(N, 3)``, sRGB, after each channel's best factor in linear light.
+
+    How bright an albedo is no image tells: a longer exposure looks the same.  How it varies over the surface, they do.
+    """
+    p, t = srgb_to_linear(color), srgb_to_linear(target)
+    factor = (p * t).sum(0) / p.square().sum(0).clamp(min=1e-4)
+    return functional.mse_loss(linear_to_srgb((p * factor.detach()).clamp(0.0, 1.0)), target)
+
+
+def _image_loss(model: Reconstructor, code: Code, maps: ViewMaps, batch: Batch, b: int, light: Tensor,
+                facing: Environment | None) -> Tensor:  # fmt: skip
     """Difference of log(1 + radiance) of pixels of a view, mostly one that was not input, shaded with what is
     predicted.
 
@@ -70,7 +82,7 @@ def _image_loss(model: Reconstructor, code: Code, maps: ViewMaps, batch: Batch, 
     normal = torch.where(
         (normal * wo).sum(-1, keepdim=True) > 0, normal, wo
     )  # the nearest point may lie round a corner
-    got = surface_material(model, code, maps, position, normal, batch.visible[b, near])
+    got = surface_material(model, code, maps, position, normal, batch.visible[b, near], facing)
     shading = radial_bump(position, normal, got["normal"])
     radiance = shade(position, shading, normal, wo, srgb_to_linear(got["base_color"]), got["roughness"][:, 0],
                      got["metallic"][:, 0], Environment(light), samples=IMAGE_SAMPLES, seed=b)  # fmt: skip

@@ -53,11 +53,35 @@ def random_turn(rng: np.random.Generator) -> Tensor:
     return torch.as_tensor(yaw, dtype=torch.float32)
 
 
+def mirrored(sample: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The sample seen in a mirror at the plane x = 0: another object under another light, as true as the first."""
+    flip = torch.tensor([-1.0, 1.0, 1.0])
+    out = dict(sample)
+    for key in ("points", "surface", "light_directions", "pixels"):
+        out[key] = sample[key] * flip
+    out["c2w"] = sample["c2w"].clone()
+    out["c2w"][:, :3] *= flip[:, None]
+    out["c2w"][:, :, 0] *= -1  # the camera stays right-handed, its picture is flipped
+    out["intrinsics"] = sample["intrinsics"].clone()
+    out["intrinsics"][:, 2] = sample["images"].shape[2] - sample["intrinsics"][:, 2]
+    out["images"] = sample["images"].flip(2)
+    out["masks"], out["silhouette"] = sample["masks"].flip(2), sample["silhouette"].flip(2)
+    return out
+
+
+def recolored(sample: dict[str, Tensor], order: Tensor) -> dict[str, Tensor]:
+    """The sample with its colour channels exchanged, ``order (3,)``, in material, light and images alike."""
+    out = {k: sample[k][..., order] if k in ("images", "light", "pixel_radiance") else v for k, v in sample.items()}
+    out["material"] = torch.cat([sample["material"][:, order], sample["material"][:, 3:]], -1)
+    return out
+
+
 def load_sample(
     path: Path, views: int, points: int, rng: np.random.Generator, *, augment: bool = True
 ) -> dict[str, Tensor]:
-    """One object: ``views`` random views (the first ones without ``augment``), ``points`` of each kind, turned at
-    random.
+    """One object: ``views`` random views, ``points`` of each kind; turned, mirrored and recoloured at random.
+
+    Without ``augment`` the first views, as they are.
     """
     with safe_open(path, "pt") as file:
         total = file.get_slice("c2w").get_shape()[0]
@@ -89,13 +113,18 @@ def load_sample(
     c2w[:, :3] = turn @ c2w[:, :3]
     images = every["images"][chosen].float() / 255
     light = every["environment"].float()
-    return {
+    sample = {
         "images": images[..., :3], "masks": images[..., 3], "silhouette": mask_distance(images[..., 3].contiguous()),
         "c2w": c2w, "intrinsics": every["intrinsics"][chosen], "points": volume @ turn.T, "distance": distance,
         "surface": surface @ turn.T, "material": material, "visible": every["visible"][s][:, chosen].float(),
         "light_directions": map_directions(light.shape[0]).reshape(-1, 3) @ turn.T, "light": light.reshape(-1, 3),
         "pixels": pixels @ turn.T, "pixel_radiance": pixel_radiance,
     }  # fmt: skip
+    if augment and rng.random() < 0.5:
+        sample = mirrored(sample)
+    if augment:
+        sample = recolored(sample, torch.as_tensor(rng.permutation(3)))
+    return sample
 
 
 def batches(
