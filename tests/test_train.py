@@ -8,6 +8,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
+from reli3d.data.distance import signed_distance
 from reli3d.data.procedural import make_object
 from reli3d.data.synthesis import ObjectSurface, synthesize
 from reli3d.geometry.hull import hull_distance
@@ -16,6 +17,7 @@ from reli3d.nn.presets import SMALL
 from reli3d.nn.reni import map_directions
 from reli3d.render.camera import project
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
+from reli3d.train.calibrate import calibrate
 from reli3d.train.light_prior import fit, scale_free
 from reli3d.train.loop import TrainConfig, averaged_model, progress, rate_at, train
 from reli3d.train.losses import losses, pattern_loss
@@ -26,11 +28,11 @@ SEEDS = (3, 12)
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Two samples under a sky that is bright towards +X."""
+    """Two samples of six views under a sky that is bright towards +X."""
     out = tmp_path_factory.mktemp("samples")
     light = 0.2 + 3.0 * map_directions(32)[..., :1].clamp(min=0).expand(-1, -1, 3).contiguous()
     for seed in SEEDS:
-        sample = synthesize(ObjectSurface(make_object(seed)), light, np.random.default_rng(seed), views=3)
+        sample = synthesize(ObjectSurface(make_object(seed)), light, np.random.default_rng(seed), views=6)
         save_file(sample, out / f"{seed:010d}.safetensors")
     return out
 
@@ -177,3 +179,29 @@ def test_the_light_prior_fits_a_map():
     error = (got.log() - maps.reshape(1, -1, 3).log()).abs().mean()
     spread = (maps.log() - maps.log().mean()).abs().mean()
     assert float(error) < 0.5 * float(spread)  # 60 steps are enough to know up from down
+
+
+class _Thin(Reconstructor):
+    """Knows the shape of one object exactly, and draws it 1.5 units too thin."""
+
+    def query(self, code, points, heads=("density",), point_features=None, color=None):
+        distance = signed_distance(*self.shape, points[0].contiguous())
+        return {"density": (self.surface_density - 1.5 - distance / self.preset.softness)[None, :, None]}
+
+
+def test_calibration_gives_back_what_is_missing(folder, tmp_path):
+    """The best offset is the one that was taken away, from one view and from many, to a step of the offsets."""
+    seed = SEEDS[0]
+    (tmp_path / f"{seed}.safetensors").write_bytes((folder / f"{seed:010d}.safetensors").read_bytes())
+    shape = make_object(seed)
+    torch.manual_seed(0)
+    model = _Thin(dataclasses.replace(SMALL, resolution=40)).eval()
+    model.shape = torch.from_numpy(shape.vertices), torch.from_numpy(shape.faces)
+    tried = calibrate(model, tmp_path, objects=1)
+    preset = model.preset
+    assert set(tried) == {1, 4} and max(tried[1].values()) > 0.9
+    assert tried[1][1.5] > tried[1][0.0] + 0.02
+    assert abs(preset.offset_one_view - 1.5) <= 0.25
+    assert abs(preset.offset_many_views - 1.5) <= 0.5  # the bound of four silhouettes hides part of an excess
+    with pytest.raises(ValueError, match="samples: expected"):
+        calibrate(model, tmp_path / "none")

@@ -17,10 +17,11 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("output", type=Path, help="folder for NNNNNNNNNN.safetensors; those that exist are kept")
     p.add_argument("--maps", type=Path, required=True, help=".npz of environment maps: env (n, H, 2H, 3) linear, names")
     p.add_argument("--first", type=int, default=0, help="first seed")
-    p.add_argument("--count", type=int, default=1000)
+    p.add_argument("--count", type=int, default=1000, help="seeds, without --held-back")
     p.add_argument("--views", type=int, default=6)
     p.add_argument("--size", type=int, default=192, help="pixels")
-    p.add_argument("--held-back", action="store_true", help="validation objects under maps that no training sees")
+    p.add_argument("--held-back", choices=("validation", "test"),
+                   help="objects to choose by or to report on, under maps that no training sees")  # fmt: skip
     p.add_argument("--meshes", type=Path, nargs="+", help="GLB files to draw from instead of procedural objects")
     p.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     return p
@@ -65,16 +66,18 @@ def main(argv: list[str] | None = None) -> int:
     args = parser().parse_args(argv)
     from tqdm import tqdm
 
-    from reli3d.data.procedural import VALIDATION_SEEDS
+    from reli3d.data.procedural import TEST_SEEDS, VALIDATION_SEEDS
 
-    first = VALIDATION_SEEDS.start if args.held_back else args.first
+    seeds = range(args.first, args.first + args.count)
+    if args.held_back:
+        seeds = {"validation": VALIDATION_SEEDS, "test": TEST_SEEDS}[args.held_back]
     args.output.mkdir(parents=True, exist_ok=True)
     mesh_of = lambda seed: args.meshes[seed % len(args.meshes)] if args.meshes else None  # noqa: E731
-    jobs = [(s, args.output / f"{s:010d}.safetensors") for s in range(first, first + args.count)]
+    jobs = [(s, args.output / f"{s:010d}.safetensors") for s in seeds]
     jobs = [j for j in jobs if not j[1].exists()]
     context = get_context("spawn")
     failed = 0
-    with ProcessPoolExecutor(args.workers, context, _start, (args.maps, args.held_back)) as pool:
+    with ProcessPoolExecutor(args.workers, context, _start, (args.maps, bool(args.held_back))) as pool:
         futures = [pool.submit(_make, seed, target, args.size, args.views, mesh_of(seed)) for seed, target in jobs]
         for future in tqdm(as_completed(futures), total=len(futures), file=sys.stderr, unit="object"):
             reason = future.result()

@@ -10,9 +10,12 @@ from pathlib import Path
 
 def parser() -> argparse.ArgumentParser:
     p = argparse.ArgumentParser(prog="reli3d-eval", description="Measure the network on held-back procedural objects.")
-    p.add_argument("samples", type=Path, help="folder made by reli3d-data --held-back --views 12")
+    p.add_argument("samples", type=Path, help="folder made by reli3d-data --held-back test --views 12")
     p.add_argument("--maps", type=Path, required=True, help=".npz of environment maps that the training drew from")
     p.add_argument("--weights", default="small", help="small, or a safetensors file")
+    p.add_argument(
+        "--views", type=int, nargs="+", choices=(1, 2, 3, 4), default=(1, 2, 4), help="numbers of input views"
+    )
     p.add_argument("--json", type=Path, help="also write the table to this file")
     return p
 
@@ -27,7 +30,7 @@ def main(argv: list[str] | None = None) -> int:
         maps, names = load_maps(args.maps)
         mean = mean_environment(maps[[not h for h in held_back(names)]])
         model = load_model(args.weights)
-        figures = table(model, args.samples, mean, lambda line: print(line, file=sys.stderr))
+        figures = table(model, args.samples, mean, args.views, lambda line: print(line, file=sys.stderr))
     except (ValueError, OSError) as error:
         print(f"reli3d-eval: {' '.join(str(error).split())}", file=sys.stderr)
         return 2

@@ -35,6 +35,10 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
+def report(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)
+
+
 def main(argv: list[str] | None = None) -> int:
     args = parser().parse_args(argv)
     import torch
@@ -52,9 +56,9 @@ def main(argv: list[str] | None = None) -> int:
     try:
         if args.export:
             averaged_model(args.output / "state.pt", model)
-            tried = calibrate(model, args.samples)
-            best = max(tried, key=tried.get)
-            print(f"surface offset {best:.2f}: IoU {tried[best]:.4f}, without {tried[0.0]:.4f}", file=sys.stderr)
+            for views, tried in calibrate(model, args.samples, progress=report).items():
+                row = ", ".join(f"{offset:g}: {iou:.4f}" for offset, iou in tried.items())
+                report(f"silhouette IoU by surface offset, {views} views: {row}")
             print(weights.save(args.export, model, licence=LICENCE).path)
             return 0
         if args.light_prior:

@@ -1,9 +1,9 @@
 """Procedural objects without end, for training: a closed mesh, its parts and their materials from one seed.
 
-Seeds are disjoint by use: training draws from ``TRAINING_SEEDS``, the objects on which progress is judged are
-``VALIDATION_SEEDS``, and :func:`example_object` is a fixed thing that no family can make.  The same seed gives the
-same object. Frame: right-handed, +Y up, as it rests, centred, longest side 1 (so inside the radius 0.87 of the
-network's frame).
+Seeds are disjoint by use: training draws from ``TRAINING_SEEDS``, choices are made on ``VALIDATION_SEEDS``, figures
+are reported on ``TEST_SEEDS``, and :func:`example_object` is a fixed thing that no family can make.  The same seed
+gives the same object.  Frame: right-handed, +Y up, as it rests, centred, longest side 1 (so inside the radius 0.87 of
+the network's frame).
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from reli3d.render.camera import look_at
 
 TRAINING_SEEDS = range(0, 1_000_000_000)
 VALIDATION_SEEDS = range(1_000_000_000, 1_000_000_032)
+TEST_SEEDS = range(1_000_000_032, 1_000_000_064)
 MAX_FACES = 30_000
 CREASE_DEG = 38.0  # rounded edges turn at most 30 degrees a facet and must look smooth, edges of boxes turn 90
 THINNEST = 2e-4  # volume over cubed longest side: a sword has 1e-3, less is a sheet that no view shows

@@ -8,7 +8,7 @@ maps.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -62,19 +62,18 @@ def asset_colors(asset, scene: RayScene, camera: Camera) -> tuple[Tensor, Tensor
     return (hits.face >= 0).reshape(shape), color.reshape(*shape, 3)
 
 
-def psnr(color: Tensor, truth: Tensor) -> float:
-    """Of sRGB values ``(N, 3)`` in [0, 1], in dB."""
-    return float(-10 * torch.log10((color - truth).square().mean().clamp(min=1e-10)))
+def square_error(color: Tensor, truth: Tensor) -> float:
+    """Mean square difference of sRGB values ``(N, 3)`` in [0, 1]."""
+    return float((color - truth).square().mean().clamp(min=1e-10))
 
 
-def scaled_psnr(color: Tensor, truth: Tensor) -> float:
+def scaled_square_error(color: Tensor, truth: Tensor) -> float:
     """The same after the best factor for each channel in linear light: how bright an albedo is no image can tell,
-    since a
-    longer exposure looks the same.
+    since a longer exposure looks the same.
     """
     p, t = srgb_to_linear(color), srgb_to_linear(truth)
     factor = (p * t).sum(0) / (p * p).sum(0).clamp(min=1e-9)
-    return psnr(linear_to_srgb((p * factor).clamp(0, 1)), truth)
+    return square_error(linear_to_srgb((p * factor).clamp(0, 1)), truth)
 
 
 def light_error(predicted: Tensor, target: Tensor) -> float:
@@ -88,8 +87,9 @@ def light_error(predicted: Tensor, target: Tensor) -> float:
 def evaluate(
     model: Reconstructor, sample: dict[str, Tensor], seed: int, count: int, mean_light: Tensor
 ) -> dict[str, float]:
-    """Figures of one object reconstructed from ``count`` views; both colours are compared where truth or result is
-    seen.
+    """Figures of one object reconstructed from ``count`` views; colours are compared where truth and result are seen.
+
+    ``*_mse`` are square errors of the base colour, ``single_*`` those of the best single colour of this very object.
     """
     asset = reconstruct(sample_views(sample, count), weights=model, texture_size=512)
     scene, size = RayScene(asset.mesh.vertices, asset.mesh.faces), sample["images"].shape[1]
@@ -105,12 +105,31 @@ def evaluate(
     target = sample["environment"].float()
     predicted = asset.environment.resized(len(target)).radiance
     exposure = target.mean() / mean_light.mean()
-    return {"iou": float(np.mean(ious)), "base_color_psnr": psnr(got, want), "base_color_psnr_scaled":
-    scaled_psnr(got, want),
-            "single_color_psnr": psnr(want.mean(0), want),
-        "single_color_psnr_scaled": scaled_psnr(torch.ones_like(want), want), "light_error": light_error(predicted,
-        target),
-            "mean_light_error": light_error(mean_light * exposure, target)}  # fmt: skip
+    return {
+        "iou": float(np.mean(ious)),
+        "base_color_mse": square_error(got, want),
+        "base_color_scaled_mse": scaled_square_error(got, want),
+        "single_color_mse": square_error(want.mean(0), want),
+        "single_color_scaled_mse": scaled_square_error(torch.ones_like(want), want),
+        "light_error": light_error(predicted, target),
+        "mean_light_error": light_error(mean_light * exposure, target),
+    }
+
+
+def summary(rows: list[dict[str, float]]) -> dict[str, float]:
+    """Means over objects.  A square error becomes two PSNRs [dB]: the mean over objects (``_psnr``), which objects of
+    nearly one colour rule, and that of the mean error (``_psnr_pooled``), which the colourful ones rule.
+    """
+    out = {"objects": len(rows)}
+    for key in rows[0]:
+        values = np.array([row[key] for row in rows])
+        if key.endswith("_mse"):
+            name = key.removesuffix("_mse")
+            out[f"{name}_psnr"] = round(float(np.mean(-10 * np.log10(values))), 4)
+            out[f"{name}_psnr_pooled"] = round(float(-10 * np.log10(np.mean(values))), 4)
+        else:
+            out[key] = round(float(np.mean(values)), 4)
+    return out
 
 
 def mean_environment(maps: Tensor) -> Tensor:
@@ -122,13 +141,19 @@ def mean_environment(maps: Tensor) -> Tensor:
     return Environment(wide.contiguous()).resized(32).radiance
 
 
-def table(model: Reconstructor, folder: Path, mean_light: Tensor, progress: Callable[[str], None]) -> dict[int, dict]:
-    """Means over the samples in ``folder`` for 1, 2 and 4 views; ``progress`` gets a line an object."""
+def table(model: Reconstructor, folder: Path, mean_light: Tensor, counts: Sequence[int],
+          progress: Callable[[str], None]) -> dict[int, dict]:  # fmt: skip
+    """:func:`summary` of the samples in ``folder`` for each number of views (at most ``INPUTS``); ``progress`` gets a
+    line an object.  Raises ValueError where the folder holds no samples.
+    """
+    files = sorted(folder.glob("*.safetensors"))
+    if not files:
+        raise ValueError(f"samples: expected *.safetensors files, got none in {folder}")
     out = {}
-    for count in (1, 2, INPUTS):
+    for count in counts:
         rows = []
-        for path in sorted(folder.glob("*.safetensors")):
+        for path in files:
             rows.append(evaluate(model, load_file(path), int(path.stem), count, mean_light))
-            progress(f"{count} views, {path.stem}: " + ", ".join(f"{k} {v:.3f}" for k, v in rows[-1].items()))
-        out[count] = {k: round(float(np.mean([r[k] for r in rows])), 4) for k in rows[0]} | {"objects": len(rows)}
+            progress(f"{count} views, {path.stem}: " + ", ".join(f"{k} {v:.4f}" for k, v in rows[-1].items()))
+        out[count] = summary(rows)
     return out

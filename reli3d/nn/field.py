@@ -38,7 +38,9 @@ def surface_level(model: Reconstructor, code: Code, maps: ViewMaps, points: Tens
             features = functional.pad(features, (0, model.preset.point_features - features.shape[-1]))  # no surface yet
         return {"density": model.query(code, points[None], ("density",), features)["density"][0, :, 0]}
 
-    return model.level(in_rows(density, points)["density"])
+    preset, views = model.preset, len(maps.c2w)
+    offset = preset.offset_many_views + (preset.offset_one_view - preset.offset_many_views) / views
+    return model.level(in_rows(density, points)["density"] + offset)
 
 
 def in_rows(evaluate: Callable[..., dict[str, Tensor]], *inputs: Tensor) -> dict[str, Tensor]:

@@ -94,6 +94,8 @@ class Preset:
     density_bias: float = -1.0
     roughness_is_alpha: bool = False  # the roughness head predicts the GGX width; query() returns its square root
     log_level: bool = False  # the surface level is linear in the raw density (a distance) instead of in the density
+    offset_one_view: float = 0.0  # of the surface, in raw density, outward; see reli3d.train.calibrate
+    offset_many_views: float = 0.0  # the same in the limit of many views; in between by the inverse of their number
     softness: float = 0.02  # model units from occupancy 1/2 to 0.73: unit of log_level and of the silhouettes' bound
     smoothing: int = 0  # iterations of Taubin smoothing of the extracted surface
     silhouette_bound: bool = False  # the density is bounded by the views' masks

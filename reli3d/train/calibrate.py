@@ -1,43 +1,76 @@
-"""The one number that training leaves open: at which density the surface is drawn.
+"""The two numbers that training leaves open: at which density the surface is drawn, from one view and from many.
 
 Trained on a soft occupancy, a network that is not sure says a little less than one half where it means a surface, and
-the shape comes out thin.  A constant on the density, chosen on whole objects, takes that back.
+the shape comes out thin.  A constant on the density, chosen by the silhouettes of whole objects in views that were not
+input, takes that back.  How sure it is depends on the number of views, so one view and four have their own.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import torch
+from safetensors.torch import load_file
+from torch import Tensor
 
-from reli3d.nn.field import bound_level, surface_level
+from reli3d.data.normalize import Similarity
+from reli3d.geometry.mesh import Mesh
+from reli3d.geometry.rays import RayScene
 from reli3d.nn.model import Reconstructor
-from reli3d.train.losses import maps_of
-from reli3d.train.samples import batches
+from reli3d.pipeline import encode, extract, prepare
+from reli3d.render.camera import Camera, camera_rays
+from reli3d.train.pictures import sample_views
 
-OFFSETS = tuple(k / 10 for k in range(-5, 21))  # in units of the logit
+OFFSETS = tuple(k / 4 for k in range(-1, 8))  # in units of the logit
+FEW, MANY = 1, 4  # numbers of views that are tried
+SIDE = 96  # pixels of the silhouettes that are compared
 
 
 @torch.no_grad()
-def calibrate(model: Reconstructor, samples: Path, *, steps: int = 40, seed: int = 1) -> dict[float, float]:
-    """Add to the density's bias the offset with the best mean IoU of the volume over random objects and view counts.
+def calibrate(model: Reconstructor, samples: Path, *, objects: int = 16, seed: int = 1,
+              progress: Callable[[str], None] = lambda line: None) -> dict[int, dict[float, float]]:  # fmt: skip
+    """Set the preset's surface offsets to those with the best mean silhouette IoU over random ``samples``.
 
-    Returns the mean IoU of every offset tried.  The volume's uniform points alone are counted: they measure the shape.
+    samples: a folder of training samples with more than ``MANY`` views.  Gives the mean IoU of every offset for each
+    number of views; ``progress`` gets a line an object.  Raises ValueError where the folder holds no samples.
     """
-    source = batches(samples, size=4, points=4096, max_views=4, seed=seed)
-    totals = torch.zeros(len(OFFSETS), dtype=torch.float64)
-    for _, batch in zip(range(steps), source):
-        code = model.encode(batch.images, batch.masks, batch.c2w, batch.intrinsics)
-        for b in range(len(batch.images)):
-            own = code.of(b)
-            maps = maps_of(own, batch.images[b], batch.silhouette[b], batch.c2w[b], batch.intrinsics[b])
-            half = batch.points.shape[1] // 2
-            points, inside = batch.points[b, half:].contiguous(), batch.distance[b, half:] < 0
-            level = surface_level(model, own, maps, points)
-            bound = bound_level(model, maps, points)
-            for k, offset in enumerate(OFFSETS):
-                got = torch.maximum(level - offset, bound) < 0
-                totals[k] += float((got & inside).sum() / (got | inside).sum().clamp(min=1))
-    best = OFFSETS[int(totals.argmax())]
-    model.heads["density"][-1].bias += best
-    return dict(zip(OFFSETS, (totals / (4 * steps)).tolist(), strict=True))
+    files = sorted(samples.glob("*.safetensors"))
+    if not files:
+        raise ValueError(f"samples: expected *.safetensors files, got none in {samples}")
+    chosen = np.random.default_rng(seed).permutation(len(files))[:objects]
+    plain, scores = model.preset, {FEW: [], MANY: []}
+    for k in chosen:
+        sample = load_file(files[k])
+        for count, rows in scores.items():
+            code, maps = encode(model, prepare(model, sample_views(sample, count), Similarity.identity()))
+            rows.append([])
+            for offset in OFFSETS:
+                model.preset = replace(plain, offset_one_view=offset, offset_many_views=offset)
+                try:
+                    mesh = extract(model, code, maps, plain.resolution)
+                    rows[-1].append(silhouette_iou(mesh, sample, range(count, len(sample["images"]))))
+                except ValueError:  # nothing is left of the object
+                    rows[-1].append(0.0)
+        progress(f"{files[k].stem}: {max(scores[FEW][-1]):.3f}, {max(scores[MANY][-1]):.3f}")
+    tried = {count: dict(zip(OFFSETS, np.mean(rows, 0).tolist(), strict=True)) for count, rows in scores.items()}
+    one, many = (max(tried[count], key=tried[count].get) for count in (FEW, MANY))
+    model.preset = replace(plain, offset_one_view=one, offset_many_views=many + (many - one) / (MANY - 1))
+    return tried
+
+
+def silhouette_iou(mesh: Mesh, sample: dict[str, Tensor], views: range) -> float:
+    """Mean IoU of the silhouettes of ``mesh`` and the masks of ``sample`` in ``views``, at ``SIDE`` pixels."""
+    scene, size = RayScene(mesh.vertices, mesh.faces), sample["images"].shape[1]
+    step = size // SIDE
+    ious = []
+    for v in views:
+        intrinsics = sample["intrinsics"][v] / step
+        origins, directions = camera_rays(Camera(sample["c2w"][v], intrinsics, size // step, size // step))
+        got = scene.closest(origins, directions).face >= 0
+        alpha = sample["images"][v, ..., 3].float()[None, None]
+        want = torch.nn.functional.avg_pool2d(alpha, step)[0, 0] > 127.5
+        ious.append(float((got & want).sum() / (got | want).sum().clamp(min=1)))
+    return float(np.mean(ious))
