@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from reli3d.nn.presets import EncoderSizes
-from reli3d.nn.transformer import attention
+from reli3d.nn.transformer import attention, by_tokens
 
 IMAGE_MEAN = (0.485, 0.456, 0.406)  # of ImageNet in sRGB, as DINOv2 was trained
 IMAGE_STD = (0.229, 0.224, 0.225)
@@ -74,7 +74,7 @@ class _Mlp(nn.Module):
         self.fc2 = nn.Linear(4 * hidden, hidden)
 
     def forward(self, x: Tensor) -> Tensor:
-        return self.fc2(functional.gelu(self.fc1(x)))
+        return by_tokens(lambda part: self.fc2(functional.gelu(self.fc1(part))), x, self.fc1.out_features)
 
 
 class _Layer(nn.Module):
