@@ -211,8 +211,8 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--views", type=int, nargs="+", default=[1, 4])
     parser.add_argument("--precision", choices=("float32", "bfloat16"), default="float32", help="of the trunk")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
-    parser.add_argument("--weights", type=Path, help="file to use; where it is missing random weights are written there "
-                        "(6.3 GB) and kept; default a temporary one")  # fmt: skip
+    parser.add_argument("--weights", type=Path, help="file to use; where it is missing random weights are written "
+                        "there (6.3 GB) and kept; default a temporary one")  # fmt: skip
     parser.add_argument("--runs", type=int, default=1)
     parser.add_argument("--table", action="store_true", help="only count parameters and operations")
     options = parser.parse_args(argv)
