@@ -152,7 +152,8 @@ def texture(
     model: Reconstructor, code: Code, maps: ViewMaps, mesh: Mesh, size: int, *, uv: str = "project"
 ) -> tuple[Mesh, TextureSet]:
     """The mesh with an atlas, normals and tangents, and its maps of ``size`` texels."""
-    scene = RayScene(mesh.vertices, mesh.faces)
+    # nothing else asks which view sees a point
+    scene = RayScene(mesh.vertices, mesh.faces) if model.preset.view_feature_width else None
     if uv not in ("project", "xatlas"):
         raise ValueError(f"uv: expected project or xatlas, got {uv}")
     mesh = unwrap(mesh, texture_size=size) if uv == "project" else unwrap_xatlas(mesh, texture_size=size)
@@ -162,7 +163,7 @@ def texture(
 
     def surface(position: Tensor, normal: Tensor, tangent: Tensor) -> dict[str, Tensor]:
         visible = position.new_zeros(len(position), len(maps.c2w))
-        if model.preset.view_feature_width:  # nothing else asks which view sees a point
+        if scene is not None:
             visible = visible_from(scene, position, normal, maps.c2w, maps.intrinsics, DETAIL).float()
         got = surface_material(model, code, maps, position, normal, visible, facing)
         orm = torch.cat([torch.ones_like(got["roughness"]), got["roughness"], got["metallic"]], -1)

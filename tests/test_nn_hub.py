@@ -2,6 +2,7 @@
 
 import hashlib
 import http.server
+import io
 import re
 import socket
 import threading
@@ -262,17 +263,51 @@ def test_the_command_asks_no_network_without_download(server, tmp_path, capsys):
     assert server.requests == [] and not (tmp_path / "out").exists() and left() == []
 
 
-def test_the_command_ends_with_2_and_one_line_where_fetching_fails(server, checkpoint, tmp_path, capsys):
+def test_the_command_ends_with_2_and_one_line_where_fetching_fails(server, checkpoint, tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(hub.fetch_official.__kwdefaults__, "preset", TINY)
+    crater, content = tmp_path / "crater", checkpoint[0]
+    lacking = torch.load(io.BytesIO(content), weights_only=True)
+    lacking["state_dict"].pop("system.backbone.latent_init")
+
+    def saved(value) -> bytes:
+        torch.save(value, buffer := io.BytesIO())
+        return buffer.getvalue()
+
+    def ended(message: str) -> None:
+        assert run(tmp_path, "--weights", "official", "--download") == 2
+        err = capsys.readouterr().err
+        lines = [line for line in err.split("\n") if line.startswith("reli3d-infer: ")]
+        assert len(lines) == 1 and re.search(message, lines[0]), (err, message)
+        assert left() == [] and not (tmp_path / "out").exists()
+
     for edit, message in [
         (dict(status=401), "accept the licence"),
         (dict(status=0, content=b"not a pickle"), "is not a torch checkpoint"),
-        (dict(content=checkpoint[0]), "expected shape|lacks"),  # of other sizes than the official one
-        (dict(sha256="f" * 64), "expected SHA-256"),
+        (dict(content=content[: len(content) // 2]), "is not a torch checkpoint, or it is cut off"),
+        (dict(content=saved({"state_dict": {}, "hook": Bomb(crater)})), "refused, nothing was run"),
+        (dict(content=saved(lacking)), "lacks 1 of .* tensors, first backbone.latent_init"),
+        (dict(content=content, sha256="f" * 64), "expected SHA-256 f{64}, got [0-9a-f]{64}"),
+        (dict(sha256=None, linked=False, ranges=False, cut=1000), "ended after 1000 of"),
     ]:
         vars(server).update(edit)
-        assert run(tmp_path, "--weights", "official", "--download") == 2
-        lines = [line for line in capsys.readouterr().err.split("\n") if line.startswith("reli3d-infer: ")]
-        assert len(lines) == 1 and re.search(message, lines[0]), (lines, message)
-        assert left() == [] and not (tmp_path / "out").exists()
+        ended(message)
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    ended("HF_HUB_OFFLINE forbids")
+    monkeypatch.delenv("HF_HUB_OFFLINE")
+    server.shutdown()
+    server.socket.close()
+    ended("cannot be fetched .*; check the network")
+    assert not crater.exists()
     assert run(tmp_path, "--weights", "small", "--download") == 2
     assert "download: expected --weights official" in capsys.readouterr().err
+
+
+def test_the_command_ends_with_2_where_the_converted_file_is_cut_off(server, checkpoint, tmp_path, capsys):
+    server.content = checkpoint[0]
+    path = hub.fetch_official(preset=TINY)
+    path.write_bytes(path.read_bytes()[:-100])
+    capsys.readouterr()
+    assert run(tmp_path, "--weights", "official") == 2
+    out, err = capsys.readouterr()
+    assert out == "" and err.count("\n") == 1 and "official.safetensors: expected" in err and "fetch it again" in err
+    assert left() == [path.name] and not (tmp_path / "out").exists()

@@ -9,12 +9,15 @@ import pytest
 import torch
 from safetensors import safe_open
 
+from reli3d.nn import weights
 from reli3d.nn.model import Reconstructor
-from reli3d.nn.presets import OFFICIAL
+from reli3d.nn.presets import OFFICIAL, SMALL
 from reli3d.nn.published import our_key
 from reli3d.nn.weights import (
     WeightsError,
     convert_checkpoint,
+    default_trunk,
+    known_sha256,
     load,
     load_environment,
     load_model,
@@ -259,6 +262,35 @@ def test_another_preset_or_hash_is_refused(saved):
         load(path, TINY)
     with pytest.raises(WeightsError, match="expected SHA-256 0000, got [0-9a-f]{64}"):
         load(path, expected_sha256="0000")
+
+
+def test_a_large_file_is_hashed_once_and_a_check_always(saved, monkeypatch):
+    path, _ = saved
+    note, digest, hashed = path.with_name(path.name + ".sha256"), sha256(path), []
+    monkeypatch.setattr(weights, "sha256", lambda p: hashed.append(p) or sha256(p))
+    assert known_sha256(path) == digest and not note.exists()  # a small one leaves nothing
+    monkeypatch.setattr(weights, "LARGE", 1)
+    assert known_sha256(path) == known_sha256(path) == digest and len(hashed) == 2
+    note.write_text(note.read_text().replace(digest, "0" * 64))
+    assert known_sha256(path) == "0" * 64  # it is the note that is read, and so no check:
+    with pytest.raises(WeightsError, match=f"expected SHA-256 0{{64}}, got {digest}"):
+        load(path, expected_sha256="0" * 64)
+    path.write_bytes(path.read_bytes())  # another time of change
+    os.utime(path, ns=(1, 1))
+    assert known_sha256(path) == digest
+    note.write_text("spoilt")
+    assert known_sha256(path) == digest and len(hashed) == 5
+    monkeypatch.setattr(weights, "replacing", lambda p: (_ for _ in ()).throw(PermissionError("read-only folder")))
+    note.unlink()
+    assert known_sha256(path) == digest and not note.exists()
+
+
+def test_bfloat16_is_the_default_for_the_published_sizes_on_cuda_alone(saved):
+    assert [default_trunk(p, d) for p in (OFFICIAL, SMALL) for d in ("cpu", "cuda")] == [
+        torch.float32, torch.bfloat16, torch.float32, torch.float32
+    ]  # fmt: skip
+    path, _ = saved
+    assert load_model(path).dtype == torch.float32 and load_model(path, trunk=torch.bfloat16).dtype == torch.bfloat16
 
 
 def test_published_environment_weights_load(goldens, saved):

@@ -17,7 +17,7 @@ from reli3d.geometry.surface import extract_surface, surface_cubes
 from reli3d.nn.heads import deformation
 from reli3d.nn.model import Code, Reconstructor
 from reli3d.nn.published import our_key
-from reli3d.nn.weights import read_manifest, read_tensors, save
+from reli3d.nn.weights import load_model, read_manifest, read_tensors, save
 from reli3d.pipeline import default_normalization, prepare, reconstruct
 from tests.test_nn_model import NANO, TINY, views
 
@@ -127,6 +127,7 @@ def test_hero_background_and_frame_reach_the_network(tiny, monkeypatch):
 def asset(tiny):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pipeline, "visible_from", None)  # nothing asks which view sees a point
+        patch.setattr(pipeline, "RayScene", None)
         return reconstruct(EXAMPLE, weights=tiny, texture_size=256, resolution=16)
 
 
@@ -162,12 +163,13 @@ def test_the_command_takes_published_weights_and_writes_published_names(tiny, tm
     save(weights, tiny, licence="of the test", dtype=torch.float32)
     arguments = [str(infer.EXAMPLE), "--weights", str(weights), "--output", str(tmp_path / "out"), "--device", "cpu",
                  "--views", "2", "--texture-size", "256", "--resolution", "16", "--compatible-names"]  # fmt: skip
-    assert infer.main([*arguments, "--hero", "1", "--background", "visible"]) == 0
+    assert infer.main([*arguments, "--hero", "1", "--background", "visible", "--precision", "bfloat16"]) == 0
     folder = tmp_path / "out" / "example"
     assert sorted(p.name for p in folder.iterdir()) == sorted((*results.FILES, "illumination.hdr"))
     assert (folder / "illumination.hdr").read_bytes() == (folder / "environment.hdr").read_bytes()
     info = json.loads((folder / "run_info.json").read_text())
     assert info["views"] == list(EXAMPLE.names[::-1]) and info["background"] == "visible"
+    assert info["precision"] == "bfloat16" and load_model(weights).dtype == torch.float32
     assert info["model_from_input"] == torch.eye(4).tolist()  # poses as stored
     capsys.readouterr()
     assert infer.main([*arguments, "--skip-existing"]) == 0

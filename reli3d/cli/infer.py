@@ -31,6 +31,8 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--download", action="store_true", help="with --weights official: fetch and convert the published "
                    "checkpoint where it is not there yet; nothing else ever uses the network")  # fmt: skip
     p.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="auto: cuda where there is one")
+    p.add_argument("--precision", choices=("float32", "bfloat16"), help="of the network's large parts; default "
+                   "float32, for official weights on CUDA bfloat16")  # fmt: skip
     p.add_argument("--texture-size", type=int, default=1024, help="texels, 256 to 4096 (default 1024)")
     p.add_argument(
         "--resolution", type=int, help="cubes along a side of the surface grid, 16 to 256 (default the preset's)"
@@ -152,6 +154,8 @@ class Job:
     """What all objects of one command share: options and the loaded network."""
 
     def __init__(self, args: argparse.Namespace, device: str):
+        import torch
+
         from reli3d import results
         from reli3d.nn import weights
         from reli3d.pipeline import check_options
@@ -161,8 +165,9 @@ class Job:
             _fetch(args.weights)
         self.args, self.device, self.complete = args, device, results.complete
         path = weights.locate(args.weights)
-        self.model, self.manifest = weights.load(path, device=device)
-        self.digest = weights.sha256(path)
+        trunk = args.precision and {"float32": torch.float32, "bfloat16": torch.bfloat16}[args.precision]
+        self.model, self.manifest = weights.load(path, trunk=trunk, device=device)
+        self.digest = weights.known_sha256(path)
         self.cold = True
 
     def run(self, folder: Path, name: str, target: Path) -> None:
@@ -213,6 +218,7 @@ class Job:
             **results.frame_record(to_model, output, args.frame, args.up),
             "weights": results.weights_record(self.manifest, self.digest),
             "preset": self.model.preset.name,
+            "precision": str(self.model.dtype).removeprefix("torch."),
             "texture_size": args.texture_size,
             "resolution": args.resolution or self.model.preset.resolution,
             "background": args.background,

@@ -80,6 +80,11 @@ class Reconstructor(nn.Module):
     def device(self) -> torch.device:
         return self.camera.linear.weight.device
 
+    @property
+    def dtype(self) -> torch.dtype:
+        """Of the trunk's parameters, in which it computes."""
+        return self.bank.embeddings.dtype
+
     def to_compute(self, dtype: torch.dtype) -> Reconstructor:
         """Cast the trunk (encoders, transformers, upsampler) to ``dtype``, in place; the rest stays float32."""
         for part in self.trunk():
@@ -103,7 +108,7 @@ class Reconstructor(nn.Module):
         """
         check_views(images, masks, c2w, intrinsics, self.preset.image_size, self.device)
         camera = self.camera(camera_vector(c2w, intrinsics, images.shape[2]))
-        dtype = self.bank.embeddings.dtype
+        dtype = self.dtype
         sizes, light = self.preset.encoder, self.preset.illumination.encoder
         rays = None
         if sizes.ray_maps or light.ray_maps:

@@ -16,8 +16,8 @@ from reli3d.nn.presets import BackboneSizes
 
 GROUP_NORM_EPS = 1.0e-6
 FEED_FORWARD_RATIO = 4
-# Widest intermediate on a CPU without gradient: 28 MiB in float32.  A tenth faster than 64 MiB at 1024 wide: it stays in
-# the cache, and below 32 MiB glibc hands the same pages out again instead of fresh ones.
+# Widest intermediate on a CPU without gradient: 28 MiB in float32.  A tenth faster than 64 MiB at 1024 wide: it stays
+# in the cache, and below 32 MiB glibc hands the same pages out again instead of fresh ones.
 CHUNK_NUMBERS = 7 << 20
 CONFLICT = 1024  # numbers: rows of heads that lie this far apart share cache sets
 

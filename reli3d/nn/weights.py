@@ -6,11 +6,13 @@ pickle checkpoint is only ever read by torch's restricted reader and turned into
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import math
 import os
 import pickle
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +27,7 @@ from reli3d.nn.published import CHECKPOINT_PREFIX, our_key
 
 FORMAT = "reli3d 1"
 SMALL = Path(__file__).parents[1] / "assets" / "weights" / "small.safetensors"
+LARGE = 1 << 30  # bytes; hashing less takes about a second
 HEADER_LIMIT = 100 << 20  # bytes, the safetensors library's own bound
 _DTYPES = {"F64": torch.float64, "F32": torch.float32, "F16": torch.float16, "BF16": torch.bfloat16}
 _NAMES = {dtype: name for name, dtype in _DTYPES.items()}
@@ -73,6 +76,26 @@ def sha256(path: str | os.PathLike) -> str:
         while block := file.read(1 << 20):
             digest.update(block)
     return digest.hexdigest()
+
+
+def known_sha256(path: str | os.PathLike) -> str:
+    """:func:`sha256` of a large file, for the record, read once: a note ``<file>.sha256`` beside it keeps the hash with
+    the file's size and time of change, and counts as long as both are the same.
+
+    It never stands in for a check: :func:`load` and the download hash what they are told to compare.
+    """
+    path = Path(path)
+    if _size(path) < LARGE:
+        return sha256(path)
+    note, about = path.with_name(path.name + ".sha256"), f"{path.stat().st_size} {path.stat().st_mtime_ns}"
+    with contextlib.suppress(OSError, ValueError):
+        digest, _, rest = note.read_text().strip().partition(" ")
+        if rest == about and re.fullmatch("[0-9a-f]{64}", digest):
+            return digest
+    digest = sha256(path)
+    with contextlib.suppress(OSError), replacing(note) as temporary:  # a folder that is read-only is hashed each time
+        Path(temporary).write_text(f"{digest} {about}\n")
+    return digest
 
 
 def read_manifest(path: str | os.PathLike) -> Manifest:
@@ -164,25 +187,31 @@ def locate(weights: str | os.PathLike) -> Path:
 
 
 def load_model(
-    weights: str | os.PathLike, device: torch.device | str = "cpu", *, trunk: torch.dtype = torch.float32
+    weights: str | os.PathLike, device: torch.device | str = "cpu", *, trunk: torch.dtype | None = None
 ) -> Reconstructor:
     """The network of :func:`locate`'s file, see :func:`load`.  Raises WeightsError."""
     return load(locate(weights), trunk=trunk, device=device)[0]
+
+
+def default_trunk(preset: Preset, device: torch.device | str) -> torch.dtype:
+    """bfloat16 for the published sizes on CUDA, whose matrix units are made for it; float32 everywhere else."""
+    return torch.bfloat16 if preset.name == "official" and torch.device(device).type == "cuda" else torch.float32
 
 
 def load(
     path: str | os.PathLike,
     preset: Preset | None = None,
     *,
-    trunk: torch.dtype = torch.float32,
+    trunk: torch.dtype | None = None,
     device: torch.device | str = "cpu",
     expected_sha256: str | None = None,
 ) -> tuple[Reconstructor, Manifest]:
     """The network in a safetensors file, in evaluation mode, and the file's manifest.
 
-    preset: what the file must hold; default the one in its header.  trunk: dtype of the trunk's parameters, the rest
-    is float32.  A tensor that is stored in the dtype asked for stays mapped from the file on a CPU: it takes memory
-    when it is read.  Names, shapes, length and, where given, the hash are checked before anything is allocated.
+    preset: what the file must hold; default the one in its header.  trunk: dtype of the trunk's parameters, default
+    :func:`default_trunk`; the rest is float32.  A tensor that is stored in the dtype asked for stays mapped from the
+    file on a CPU: it takes memory when it is read.  Names, shapes, length and, where given, the hash are checked before
+    anything is allocated.
     Raises WeightsError.
     """
     manifest = read_manifest(path)
@@ -193,7 +222,7 @@ def load(
         if found != expected_sha256:
             raise WeightsError(path, f"expected SHA-256 {expected_sha256}, got {found}; fetch it again")
     with torch.device("meta"):
-        model = Reconstructor(preset).to_compute(trunk)
+        model = Reconstructor(preset).to_compute(trunk or default_trunk(preset, device))
     wanted = {name: value.dtype for name, value in model.state_dict().items()}
     model.load_state_dict(read_tensors(manifest, wanted, device), strict=True, assign=True)
     return model.eval(), manifest
