@@ -24,7 +24,7 @@ from reli3d.pipeline import encode, extract, prepare
 from reli3d.render.camera import Camera, camera_rays
 from reli3d.train.pictures import sample_views
 
-OFFSETS = tuple(k / 4 for k in range(-1, 8))  # in units of the logit
+OFFSETS = (0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 3.0, 5.0)  # of the logit; the last: the hull
 FEW, MANY = 1, 4  # numbers of views that are tried
 SIDE = 96  # pixels of the silhouettes that are compared
 
