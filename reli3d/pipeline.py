@@ -23,11 +23,12 @@ from reli3d.geometry.surface import extract_surface, surface_cubes
 from reli3d.geometry.tangents import encode_normals, vertex_tangents
 from reli3d.geometry.uv import unwrap, unwrap_xatlas
 from reli3d.geometry.visibility import visible_from
-from reli3d.nn.field import bound_level, irradiance, surface_level, surface_material
+from reli3d.nn.field import LIGHT_ROWS, bound_level, object_shading, surface_level, surface_material
 from reli3d.nn.heads import deformation
 from reli3d.nn.model import Code, Reconstructor
 from reli3d.nn.presets import Preset
 from reli3d.nn.reni import map_directions
+from reli3d.nn.shading import Shading
 from reli3d.nn.view_features import ViewMaps
 from reli3d.nn.weights import load_model
 from reli3d.render.asset import Asset, TextureSet
@@ -37,6 +38,7 @@ from reli3d.render.environment import Environment
 DETAIL = 512  # pixels of the views that colours and silhouettes are read from; the network's own input is smaller
 SMALLEST_PART = 0.01  # share of the faces below which a separate piece is dropped
 CHUNK = 1 << 17  # points a query: 200 MB of features
+SHADING_POINTS = 4096  # vertices by which the light on the object is judged
 OUTSIDE = 1.0  # level given to grid points that the silhouettes exclude
 MARGIN_CELLS = 2.5  # cells around the silhouettes' hull in which the field is still asked
 UP = {  # rotations that carry an axis to +Y
@@ -156,22 +158,32 @@ def texture(
     scene = RayScene(mesh.vertices, mesh.faces) if model.preset.view_feature_width else None
     if uv not in ("project", "xatlas"):
         raise ValueError(f"uv: expected project or xatlas, got {uv}")
+    shading = _shading(model, code, maps, mesh, scene)
     mesh = unwrap(mesh, texture_size=size) if uv == "project" else unwrap_xatlas(mesh, texture_size=size)
     mesh = replace(mesh, tangents=vertex_tangents(mesh))
-
-    facing = irradiance(model, code)
 
     def surface(position: Tensor, normal: Tensor, tangent: Tensor) -> dict[str, Tensor]:
         visible = position.new_zeros(len(position), len(maps.c2w))
         if scene is not None:
             visible = visible_from(scene, position, normal, maps.c2w, maps.intrinsics, DETAIL).float()
-        got = surface_material(model, code, maps, position, normal, visible, facing)
+        got = surface_material(model, code, maps, position, normal, visible, shading)
         orm = torch.cat([torch.ones_like(got["roughness"]), got["roughness"], got["metallic"]], -1)
-        shading = radial_bump(position, normal, got["normal"])
-        return {"base_color": got["base_color"], "orm": orm, "normal": encode_normals(shading, normal, tangent)}
+        bumped = radial_bump(position, normal, got["normal"])
+        return {"base_color": got["base_color"], "orm": orm, "normal": encode_normals(bumped, normal, tangent)}
 
     baked = bake(mesh, size, surface, chunk=CHUNK, tangents=True)
     return mesh, TextureSet(**{k: v.clamp(0, 1).contiguous() for k, v in baked.items()})
+
+
+def _shading(model: Reconstructor, code: Code, maps: ViewMaps, mesh: Mesh, scene: RayScene | None) -> Shading | None:
+    """What the network is told of the light, from the views and some vertices of the mesh."""
+    if scene is None or not model.preset.shading_features:
+        return None
+    some = slice(None, None, max(1, len(mesh.vertices) // SHADING_POINTS))
+    position, normal = mesh.vertices[some].contiguous(), mesh.normals[some].contiguous()
+    visible = visible_from(scene, position, normal, maps.c2w, maps.intrinsics, DETAIL).float()
+    light = model.decode_environment(code, LIGHT_ROWS)[0]
+    return object_shading(model, light, maps, position, normal, visible)
 
 
 def light(model: Reconstructor, code: Code) -> Environment:

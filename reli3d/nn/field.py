@@ -15,12 +15,13 @@ from torch.nn import functional
 
 from reli3d.geometry.hull import hull_distance
 from reli3d.nn.model import Code, Reconstructor
+from reli3d.nn.shading import Shading, brightness_over_normal
 from reli3d.nn.view_features import ViewMaps
+from reli3d.render.color import srgb_to_linear
 from reli3d.render.environment import Environment
 
 ROWS = 8192  # points at a time without gradient: their features stay in the cache, which halves the time of the heads
-LIGHT_ROWS = 16  # of the decoded map whose irradiance the material is told
-BLACK = 0.01  # added to a radiance before its logarithm
+LIGHT_ROWS = 16  # of the decoded map from which the material is told its irradiance
 MATERIAL = ("base_color", "roughness", "metallic", "normal")
 
 
@@ -59,32 +60,35 @@ def bound_level(model: Reconstructor, maps: ViewMaps, points: Tensor) -> Tensor:
     return -hull_distance(points, silhouette, maps.c2w, maps.intrinsics) / model.preset.softness
 
 
-def irradiance(model: Reconstructor, code: Code) -> Environment | None:
-    """Irradiance of the light that the network sees, as a map over the normal; None where the preset asks for none.
+def object_shading(model: Reconstructor, light: Tensor, maps: ViewMaps, position: Tensor, normal: Tensor,
+                   visible: Tensor) -> Shading | None:  # fmt: skip
+    """What is known of the light on the object's surface; None where the preset asks for none.  No gradient.
 
-    No gradient.  It tells a dark paint in the light from a bright one in the shade.
+    light: ``(H, 2H, 3)`` the predicted environment, about ``LIGHT_ROWS`` high.  position, normal, visible: of some
+    thousand points all over the surface, as :func:`surface_material` takes them.
     """
     if not model.preset.shading_features:
         return None
     with torch.no_grad():
-        return Environment(model.decode_environment(code, LIGHT_ROWS)[0].contiguous()).irradiance()
+        color = srgb_to_linear(model.view_features(maps, position, visible, normal)[1])
+        observed = brightness_over_normal(color, visible.amax(1), normal)
+        return Shading(Environment(light.detach().contiguous()).irradiance(), observed)
 
 
 def surface_material(model: Reconstructor, code: Code, maps: ViewMaps, position: Tensor, normal: Tensor,
-                     visible: Tensor, facing: Environment | None) -> dict[str, Tensor]:  # fmt: skip
+                     visible: Tensor, shading: Shading | None) -> dict[str, Tensor]:  # fmt: skip
     """Base colour (sRGB-encoded), roughness, metallic and bump normal, ``{name: (N, k)}``, at surface points.
 
     position, normal: ``(N, 3)``, the geometric normal unit.  visible: ``(N, V)``, 1 where a view sees the point.
-    facing: :func:`irradiance`.
+    shading: :func:`object_shading`.
     """
 
     def material(position: Tensor, normal: Tensor, visible: Tensor) -> dict[str, Tensor]:
         features = color = None
         if model.preset.view_feature_width:
             features, color = (x[None] for x in model.view_features(maps, position, visible, normal))
-            if facing is not None:
-                light = torch.log(facing.lookup(normal.contiguous()) / torch.pi + BLACK)
-                features = torch.cat([features, normal[None], light[None]], -1)
+            if shading is not None:
+                features = torch.cat([features, shading.features(normal)[None]], -1)
         values = model.query(code, position[None], MATERIAL, features, color)
         return {name: value[0] for name, value in values.items()}
 

@@ -13,7 +13,7 @@ import json
 import typing
 from dataclasses import dataclass
 
-SHADING_FEATURES = 6  # normal, logarithm of the irradiance
+SHADING_FEATURES = 9  # see reli3d.nn.shading
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ class Preset:
     silhouette_bound: bool = False  # the density is bounded by the views' masks
     published_input: bool = False  # views prepared as by the release: JPEG, not cropped, poses as stored unless asked
     reads_background: bool = False  # the illumination path was trained with visible backgrounds too
-    shading_features: bool = False  # beside view features: the normal and the predicted irradiance it faces
+    shading_features: bool = False  # beside view features: the normal and the light on it
     tone_mapping: bool = False  # carry the published tone-mapping constants, which nothing here reads
 
     @property

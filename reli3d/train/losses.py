@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from reli3d.nn.field import LIGHT_ROWS, bound_level, surface_level, surface_material
+from reli3d.nn.field import LIGHT_ROWS, bound_level, object_shading, surface_level, surface_material
 from reli3d.nn.model import Code, Reconstructor
+from reli3d.nn.shading import Shading
 from reli3d.nn.view_features import ViewMaps
 from reli3d.render.bump import radial_bump
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
@@ -45,15 +46,15 @@ def _object_losses(model: Reconstructor, code: Code, batch: Batch, b: int, light
 
     position, normal, bumped = batch.surface[b].unbind(1)
     normal = functional.normalize(normal, dim=-1)
-    facing = Environment(light.detach()).irradiance() if model.preset.shading_features else None
-    got = surface_material(model, code, maps, position, normal, batch.visible[b], facing)
+    shading = object_shading(model, light, maps, position, normal, batch.visible[b])
+    got = surface_material(model, code, maps, position, normal, batch.visible[b], shading)
     out["base_color"] = functional.mse_loss(got["base_color"], batch.material[b, :, :3])
     out["pattern"] = pattern_loss(got["base_color"], batch.material[b, :, :3])
     out["roughness"] = functional.mse_loss(got["roughness"][:, 0], batch.material[b, :, 3])
     out["metallic"] = functional.mse_loss(got["metallic"][:, 0], batch.material[b, :, 4])
     world = radial_bump(position, normal, got["normal"])
     out["normal"] = (1 - functional.cosine_similarity(world, bumped, dim=-1)).mean()
-    out["image"] = _image_loss(model, code, maps, batch, b, light, facing)
+    out["image"] = _image_loss(model, code, maps, batch, b, light, shading)
     return out
 
 
@@ -68,7 +69,7 @@ def pattern_loss(color: Tensor, target: Tensor) -> Tensor:
 
 
 def _image_loss(model: Reconstructor, code: Code, maps: ViewMaps, batch: Batch, b: int, light: Tensor,
-                facing: Environment | None) -> Tensor:  # fmt: skip
+                known: Shading | None) -> Tensor:  # fmt: skip
     """Difference of log(1 + radiance) of pixels of a view, mostly one that was not input, shaded with what is
     predicted.
 
@@ -82,7 +83,7 @@ def _image_loss(model: Reconstructor, code: Code, maps: ViewMaps, batch: Batch, 
     normal = torch.where(
         (normal * wo).sum(-1, keepdim=True) > 0, normal, wo
     )  # the nearest point may lie round a corner
-    got = surface_material(model, code, maps, position, normal, batch.visible[b, near], facing)
+    got = surface_material(model, code, maps, position, normal, batch.visible[b, near], known)
     shading = radial_bump(position, normal, got["normal"])
     radiance = shade(position, shading, normal, wo, srgb_to_linear(got["base_color"]), got["roughness"][:, 0],
                      got["metallic"][:, 0], Environment(light), samples=IMAGE_SAMPLES, seed=b)  # fmt: skip
