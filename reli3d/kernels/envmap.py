@@ -8,9 +8,9 @@ constant over texels with respect to solid angle; densities are per steradian.
 
 import warp as wp
 
-from reli3d.kernels.math import safe_sqrt, turn_atan2, turn_cos_sin
+from reli3d.kernels.math import INLINE, INV_PI, TINY, safe_sqrt, turn_atan2, turn_cos_sin
 
-wp.set_module_options({"enable_backward": True, "cpu_compiler_flags": "-march=native"})
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native " + INLINE})
 
 
 @wp.func
@@ -28,29 +28,60 @@ def uv_to_direction(uv: wp.vec2) -> wp.vec3:
     return wp.vec3(-a[1] * p[1], p[0], a[0] * p[1])
 
 
+@wp.struct
+class Texels:
+    """The four texels about a point of the map: rows, columns, and the point's place between them in [0, 1]."""
+
+    r0: int
+    r1: int
+    c0: int
+    c1: int
+    fx: float
+    fy: float
+
+
 @wp.func
-def lookup_envmap_uv(radiance: wp.array2d(dtype=wp.vec3), uv: wp.vec2) -> wp.vec3:
-    """Bilinear radiance at map coordinates in [0, 1]^2.  Differentiable in the texels and in ``uv``."""
-    height = radiance.shape[0]
-    width = radiance.shape[1]
+def four_texels(height: int, width: int, uv: wp.vec2) -> Texels:
+    """Neighbours for bilinear lookup: periodic in u, the border's row beyond the first and the last."""
     x = uv[0] * float(width) - 0.5
     y = uv[1] * float(height) - 0.5
-    fx = x - wp.floor(x)
-    fy = y - wp.floor(y)
-    c0 = int(wp.floor(x))
-    r0 = int(wp.floor(y))
-    c1 = c0 + 1
-    r1 = wp.clamp(r0 + 1, 0, height - 1)
-    r0 = wp.clamp(r0, 0, height - 1)
+    column = int(wp.floor(x))
+    row = int(wp.floor(y))
+    out = Texels()
+    out.fx = x - float(column)
+    out.fy = y - float(row)
+    c0 = wp.int32(column)
+    c1 = wp.int32(column + 1)
     if c0 < 0:
         c0 = c0 + width
     if c1 >= width:
         c1 = c1 - width
-    c0 = wp.clamp(c0, 0, width - 1)
-    c1 = wp.clamp(c1, 0, width - 1)
-    top = radiance[r0, c0] * (1.0 - fx) + radiance[r0, c1] * fx
-    bottom = radiance[r1, c0] * (1.0 - fx) + radiance[r1, c1] * fx
-    return top * (1.0 - fy) + bottom * fy
+    out.c0 = wp.clamp(c0, 0, width - 1)
+    out.c1 = wp.clamp(c1, 0, width - 1)
+    out.r0 = wp.clamp(row, 0, height - 1)
+    out.r1 = wp.clamp(row + 1, 0, height - 1)
+    return out
+
+
+@wp.func
+def lookup_envmap_uv(radiance: wp.array2d(dtype=wp.vec3), uv: wp.vec2) -> wp.vec3:
+    """Bilinear radiance at map coordinates in [0, 1]^2."""
+    at = four_texels(radiance.shape[0], radiance.shape[1], uv)
+    top = radiance[at.r0, at.c0] * (1.0 - at.fx) + radiance[at.r0, at.c1] * at.fx
+    bottom = radiance[at.r1, at.c0] * (1.0 - at.fx) + radiance[at.r1, at.c1] * at.fx
+    return top * (1.0 - at.fy) + bottom * at.fy
+
+
+@wp.func
+def add_texels(g_radiance: wp.array2d(dtype=wp.vec3), uv: wp.vec2, g: wp.vec3):
+    """Adjoint of :func:`lookup_envmap_uv` in the texels: ``g`` is spread over the four."""
+    at = four_texels(g_radiance.shape[0], g_radiance.shape[1], uv)
+    top = g * (1.0 - at.fy)
+    bottom = g * at.fy
+    wp.atomic_add(g_radiance, at.r0, at.c0, top * (1.0 - at.fx))
+    wp.atomic_add(g_radiance, at.r0, at.c1, top * at.fx)
+    wp.atomic_add(g_radiance, at.r1, at.c0, bottom * (1.0 - at.fx))
+    wp.atomic_add(g_radiance, at.r1, at.c1, bottom * at.fx)
 
 
 @wp.func
@@ -123,7 +154,45 @@ def lookup_envmap_kernel(
     out[i] = lookup_envmap(radiance, directions[i])
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
+def lookup_adjoint_kernel(
+    start: int,
+    # in
+    first: int, radiance: wp.array2d(dtype=wp.vec3), directions: wp.array(dtype=wp.vec3),
+    g_out: wp.array(dtype=wp.vec3),
+    # out
+    g_radiance: wp.array2d(dtype=wp.vec3), g_directions: wp.array(dtype=wp.vec3),
+):  # fmt: skip
+    """Adjoints of the lookups from ``first``; an output without rows is left out.  ``g_radiance`` is added to.
+
+    u and v are angles: their slopes are those of atan2(x, -z) / 2 pi and atan2(sqrt(x^2 + z^2), y) / pi.
+    """
+    i = first + start + wp.tid()
+    d = directions[i]
+    uv = direction_to_uv(d)
+    g = g_out[i]
+    if g_radiance.shape[0] != 0:
+        add_texels(g_radiance, uv, g)
+    if g_directions.shape[0] != 0:
+        height = radiance.shape[0]
+        width = radiance.shape[1]
+        at = four_texels(height, width, uv)
+        a = wp.dot(g, radiance[at.r0, at.c0])
+        b = wp.dot(g, radiance[at.r0, at.c1])
+        c = wp.dot(g, radiance[at.r1, at.c0])
+        e = wp.dot(g, radiance[at.r1, at.c1])
+        g_u = ((b - a) * (1.0 - at.fy) + (e - c) * at.fy) * float(width) * 0.5 * INV_PI
+        g_v = ((c - a) * (1.0 - at.fx) + (e - b) * at.fx) * float(height) * INV_PI
+        square = d[0] * d[0] + d[2] * d[2]
+        s = safe_sqrt(square)
+        around = g_u / wp.max(square, TINY)
+        along = g_v / (s * s + d[1] * d[1])
+        g_directions[i] = wp.vec3(
+            d[0] * d[1] / s * along - d[2] * around, -s * along, d[2] * d[1] / s * along + d[0] * around
+        )
+
+
+@wp.kernel
 def sample_envmap_kernel(
     start: int,
     # in
@@ -138,7 +207,7 @@ def sample_envmap_kernel(
     pdf[i] = pdf_envmap_uv(density, uv)
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def pdf_envmap_kernel(
     start: int,
     # in

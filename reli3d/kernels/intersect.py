@@ -93,3 +93,29 @@ def offset_origin_kernel(
 ):  # fmt: skip
     i = start + wp.tid()
     origin[i] = offset_origin(position[i], ng[i], direction[i], scale)
+
+
+@wp.kernel
+def ray_key_kernel(
+    start: int,
+    # in
+    origins: wp.array(dtype=wp.vec3), directions: wp.array(dtype=wp.vec3), low: wp.vec3, per_cell: wp.vec3,
+    # out
+    key: wp.array(dtype=wp.int16),
+):  # fmt: skip
+    """16 bits alike for rays that visit the same part of the tree: the direction's cell of 32 x 32 on an octahedron,
+    then the origin's of 4 x 4 x 4 above ``low``."""
+    i = start + wp.tid()
+    d = directions[i]
+    reach = wp.max(wp.abs(d[0]) + wp.abs(d[1]) + wp.abs(d[2]), 1.0e-37)
+    x = d[0] / reach
+    y = d[1] / reach
+    if d[2] < 0.0:  # the lower half is folded over the upper one's corners
+        a = x
+        x = (1.0 - wp.abs(y)) * wp.sign(a)
+        y = (1.0 - wp.abs(a)) * wp.sign(y)
+    place = wp.cw_mul(origins[i] - low, per_cell)
+    k = int(wp.clamp(16.0 * x + 16.0, 0.0, 31.0)) * 32 + int(wp.clamp(16.0 * y + 16.0, 0.0, 31.0))
+    for axis in range(3):
+        k = k * 4 + int(wp.clamp(place[axis], 0.0, 3.0))
+    key[i] = wp.int16(k - 32768)

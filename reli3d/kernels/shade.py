@@ -12,13 +12,13 @@ import warp as wp
 from reli3d.kernels.bsdf import eval_bsdf, pdf_lobes
 from reli3d.kernels.envmap import direction_to_uv, lookup_envmap_uv, pdf_envmap_uv, sample_envmap_uv, uv_to_direction
 from reli3d.kernels.intersect import hit_occluded, offset_origin
-from reli3d.kernels.math import tangent_frame
+from reli3d.kernels.math import INLINE, tangent_frame
 from reli3d.kernels.microfacet import ALPHA_MIN, COS_MIN, sample_ggx_vndf
 from reli3d.kernels.mis import mis_factor
 from reli3d.kernels.random import random_pair, rotate_point
 from reli3d.kernels.sampling import mirror, reflect, sample_cosine
 
-wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native " + INLINE})
 
 COS_VIEW_MIN = wp.constant(1.0e-3)  # an interpolated normal that turns away is bent until the view is this far above it
 

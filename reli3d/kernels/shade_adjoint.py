@@ -9,12 +9,12 @@ from their counters, so nothing per sample is in memory but the visibility bits.
 import warp as wp
 
 from reli3d.kernels.bsdf import F0_DIELECTRIC, base_reflectance, schlick
-from reli3d.kernels.envmap import lookup_envmap_uv
-from reli3d.kernels.math import INV_PI
+from reli3d.kernels.envmap import add_texels, lookup_envmap_uv
+from reli3d.kernels.math import INLINE, INV_PI
 from reli3d.kernels.microfacet import ALPHA_MIN, ggx_ndf, ggx_root, smith_visibility
 from reli3d.kernels.shade import COS_VIEW_MIN, Plan, draw_sample, make_surface
 
-wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native " + INLINE})
 
 
 @wp.struct
@@ -94,8 +94,6 @@ def shade_adjoint_kernel(
     surface = make_surface(normal[i], ng[i], wo[i], base_color[i], alpha[i], metallic[i])
     total = SurfaceGradient()
     g = g_out[i]
-    height = radiance.shape[0]
-    width = radiance.shape[1]
     for s in range(plan.n_environment + plan.n_visible + plan.n_cosine):
         if (visible[i, s // 32] >> (s & 31)) & 1 != 0:
             d = draw_sample(surface, plan, points, rows, columns, row_guide, column_guide, density, pixels[i], s)
@@ -115,19 +113,7 @@ def shade_adjoint_kernel(
             total = add_sample_gradient(total, surface.wo, d.wi, surface.base_color, surface.alpha, surface.metallic,
                                         wp.cw_mul(own, light) * d.factor)  # fmt: skip
             if g_radiance.shape[0] != 0:
-                x = d.uv[0] * float(width) - 0.5
-                y = d.uv[1] * float(height) - 0.5
-                fx = x - wp.floor(x)
-                fy = y - wp.floor(y)
-                c0 = (int(wp.floor(x)) + width) % width
-                c1 = (c0 + 1) % width
-                r0 = wp.clamp(int(wp.floor(y)), 0, height - 1)
-                r1 = wp.clamp(int(wp.floor(y)) + 1, 0, height - 1)
-                part = wp.cw_mul(own, value)
-                wp.atomic_add(g_radiance, r0, c0, part * ((1.0 - fx) * (1.0 - fy)))
-                wp.atomic_add(g_radiance, r0, c1, part * (fx * (1.0 - fy)))
-                wp.atomic_add(g_radiance, r1, c0, part * ((1.0 - fx) * fy))
-                wp.atomic_add(g_radiance, r1, c1, part * (fx * fy))
+                add_texels(g_radiance, d.uv, wp.cw_mul(own, value))
     side = wp.float32(1.0)
     if wp.dot(ng[i], wo[i]) < 0.0:
         side = -1.0

@@ -12,7 +12,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from reli3d._bridge import call, check, empty, launch
+from reli3d._bridge import SLICE_MIN, check, empty, launch, load_modules, over_slices, slices
 from reli3d.kernels import envmap as kernels
 
 _LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709
@@ -71,13 +71,7 @@ class Environment:
         Gradients reach the texels and the directions (not at a pole, where the azimuth has none).
         """
         check("directions", directions, last=3, like=self.radiance)
-        flat = directions.reshape(-1, 3)
-        n = flat.shape[0]
-        (out,) = call(
-            kernels.lookup_envmap_kernel, n, [(self.radiance, wp.vec3), (flat, wp.vec3)], [((n,), wp.vec3)],
-            device=flat.device, shared=(0,),
-        )  # fmt: skip
-        return out.reshape(directions.shape)
+        return _Lookup.apply(self.radiance, directions.reshape(-1, 3)).reshape(directions.shape)
 
     def irradiance(self) -> Environment:
         """Irradiance [radiance times sr] on a surface of each normal, as a map of the same size: pi times a constant.
@@ -159,6 +153,42 @@ class Environment:
         args = [(self.table.density, wp.float32), (flat, wp.vec3), (pdf, wp.float32)]
         launch(kernels.pdf_envmap_kernel, flat.shape[0], args, flat.device)
         return pdf.reshape(directions.shape[:-1])
+
+
+class _Lookup(torch.autograd.Function):
+    """Own backward: Warp's adjoint would go through the direction's angles where only texels are asked for."""
+
+    @staticmethod
+    def forward(ctx, radiance: Tensor, directions: Tensor) -> Tensor:
+        radiance, directions = radiance.contiguous(), directions.contiguous()
+        out = empty((directions.shape[0],), wp.vec3, directions.device)
+        args = [(radiance, wp.vec3), (directions, wp.vec3), (out, wp.vec3)]
+        launch(kernels.lookup_envmap_kernel, directions.shape[0], args, directions.device)
+        ctx.save_for_backward(radiance, directions)
+        return out
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, g_out: Tensor):
+        radiance, directions = ctx.saved_tensors
+        n, device, wanted = directions.shape[0], directions.device, ctx.needs_input_grad
+        height, width = radiance.shape[:2]
+        least = max(SLICE_MIN, height * width)  # a slice's own accumulator must not cost more than its lookups
+        parts = slices(n, least) if device.type == "cpu" else [(0, n)]
+        g_radiance = torch.zeros(len(parts), height if wanted[0] else 0, width, 3, device=device)
+        g_directions = torch.empty(n if wanted[1] else 0, 3, device=device)
+        ins = [(radiance, wp.vec3), (directions, wp.vec3), (g_out.contiguous(), wp.vec3)]
+
+        def work(k, start, count):
+            outs = [(g_radiance[k], wp.vec3), (g_directions, wp.vec3)]
+            launch(kernels.lookup_adjoint_kernel, count, [start, *ins, *outs], device, slice_min=count)
+
+        if n and device.type == "cpu":
+            load_modules([kernels], device)  # before the pool's threads would, one by one
+            over_slices(n, work, slice_min=least)
+        elif n:
+            work(0, 0, n)
+        return g_radiance.sum(0) if wanted[0] else None, g_directions if wanted[1] else None
 
 
 def _cdf(weight: Tensor) -> Tensor:
