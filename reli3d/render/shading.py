@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Protocol
 
 import torch
 import warp as wp
@@ -17,6 +18,7 @@ from reli3d.render.environment import Environment
 from reli3d.render.sampling import halton
 
 SAMPLES = (20, 40, 4)  # environment, visible normals, cosine: the published counts
+LIGHT_RAYS = 1 << 20  # directions asked of a light at once: 45 MB of rays
 CHUNK_RAYS = 65536  # shadow rays of a chunk and their values take 2.6 MB a thread: near the cache, far above call costs
 
 
@@ -72,6 +74,60 @@ def shade(
         raise ValueError(f"pixels: expected shape ({n},), got {tuple(pixels.shape)}")
     job = _Job(plan, sum(samples), scene, [*tables, (pixels.contiguous(), wp.int32)])
     return _Shade.apply(job, position, normal, ng, wo, base_color, width, metallic, environment.radiance)
+
+
+class Light(Protocol):
+    """Distant light that can be asked: ``Environment``, ``SphericalGaussians``, ``ReniLight``."""
+
+    def lookup(self, directions: Tensor) -> Tensor: ...
+
+
+@torch.no_grad()
+def shade_light(
+    position: Tensor,
+    normal: Tensor,
+    ng: Tensor,
+    wo: Tensor,
+    base_color: Tensor,
+    roughness: Tensor,
+    metallic: Tensor,
+    light: Light,
+    proposal: Environment,
+    *,
+    samples: tuple[int, int, int] = SAMPLES,
+    scene: RayScene | None = None,
+    seed: int = 0,
+    points: str = "halton",
+) -> Tensor:
+    """:func:`shade` with radiance asked of ``light`` in each sample's direction instead of read from a map, ``(N, 3)``.
+
+    The other arguments are those of :func:`shade`.  proposal: a coarse map of the light, whose table the
+    environment strategy draws from; where it is dark and the light is not, the other strategies stand in, so the mean
+    does not depend on it.  No gradient.
+    """
+    n = _check(position, normal, ng, wo, base_color, roughness, metallic, proposal)
+    plan, offsets = _plan(samples, seed, True, "balance", points, None, scene)
+    device, count, table = position.device, sum(samples), proposal.table
+    pixels = torch.arange(n, dtype=torch.int32, device=device)
+    tables = [*table.sampler, (table.density, wp.float32), (offsets.to(device), wp.vec2), (pixels, wp.int32)]
+    values = (position, normal, ng, wo, base_color, roughness * roughness, metallic)
+    white = torch.ones(1, 2, 3, device=device)  # what a sample adds under unit light; the light's radiance comes after
+    ins = _inputs([v.contiguous() for v in (*values, white)], _Job(plan, count, scene, tables))
+    out = torch.zeros(n, 3, device=device)
+    size = max(1, LIGHT_RAYS // max(1, count))
+    for first in range(0, n if count else 0, size):
+        hits = min(size, n - first)
+        origins, directions, value = (torch.empty(hits * count, 3, device=device) for _ in range(3))
+        far = torch.empty(hits * count, device=device)
+        buffers = [(origins, wp.vec3), (directions, wp.vec3), (far, wp.float32), (value, wp.vec3)]
+        launch(kernels.shade_rays_kernel, hits, [first, *ins, plan, *buffers], device)
+        lit = (far > 0.0).nonzero()[:, 0]
+        if scene is not None and scene.faces.shape[0]:
+            lit = lit[~scene.occluded(origins[lit], directions[lit])]
+        added = torch.zeros_like(value)
+        added[lit] = value[lit] * light.lookup(directions[lit])
+        out[first : first + hits] = added.view(hits, count, 3).sum(1)
+    return out
 
 
 @dataclass(frozen=True)

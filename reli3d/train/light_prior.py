@@ -20,6 +20,7 @@ from torch import Tensor
 
 from reli3d.nn.presets import SMALL
 from reli3d.nn.reni import EnvironmentDecoder, map_directions, reni_frame
+from reli3d.nn.reni_fit import fit_latent
 
 ROWS = 64
 FLOOR = 1e-2  # of the geometric mean: darker is black
@@ -64,17 +65,13 @@ def blends(maps: Tensor, count: int, rng: np.random.Generator) -> Tensor:
 
 
 def fit(decoder: EnvironmentDecoder, maps: Tensor, *, steps: int, minutes: float, rays: int = 512, batch: int = 16,
-        seed: int = 0, train_decoder: bool = True, log=sys.stderr) -> Tensor:  # fmt: skip
-    """Latents ``(n, L, 3)`` that decode to ``maps``; the decoder is fitted with them in place unless
-    ``train_decoder`` is False.
-    """
+        seed: int = 0, log=sys.stderr) -> Tensor:  # fmt: skip
+    """Latents ``(n, L, 3)`` that decode to ``maps``; the decoder is fitted with them in place."""
     generator = torch.Generator().manual_seed(seed)
     latents = torch.nn.Parameter(
         0.1 * torch.randn(len(maps), decoder.field.network.layers[0].mha.key.in_features // 3, 3, generator=generator)
     )
-    groups = [{"params": [latents], "lr": 1e-2}]
-    if train_decoder:
-        groups.append({"params": [p for p in decoder.field.parameters()], "lr": 1e-3})
+    groups = [{"params": [latents], "lr": 1e-2}, {"params": [p for p in decoder.field.parameters()], "lr": 1e-3}]
     optimizer = torch.optim.Adam(groups)
     base = [g["lr"] for g in groups]
     directions, flat = reni_frame(map_directions(ROWS)).reshape(-1, 3), maps.reshape(len(maps), -1, 3)
@@ -128,9 +125,9 @@ def main() -> None:
     state = {k: v.contiguous() for k, v in decoder.state_dict().items()}
     save_file({**state, "latents": latents}, args.output)
     test = scale_free(maps[held_back(names)])
-    own = fit(decoder, test, steps=600, minutes=2.0, train_decoder=False)
+    own = [fit_latent(decoder, radiance) for radiance in test]
     with torch.no_grad():
-        radiance = decoder.field(own, reni_frame(map_directions(ROWS)).reshape(1, -1, 3)).exp().reshape(test.shape)
+        radiance = torch.cat([decoder(f.latent[None], f.rotation[None], f.strength[None], ROWS) for f in own])
     error = ((radiance + FLOOR).log() - (test + FLOOR).log()).abs().mean((1, 2, 3))
     mean_map = every[: len(kept)].log1p().mean(0).expm1()
     base = ((mean_map + FLOOR).log() - (test + FLOOR).log()).abs().mean((1, 2, 3))

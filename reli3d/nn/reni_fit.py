@@ -1,0 +1,85 @@
+"""Latents of a given map, found without an encoder: descent through the frozen RENI++ decoder."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from reli3d.nn.reni import EnvironmentDecoder, map_directions, reni_frame
+
+FLOOR = 1e-2  # of the geometric mean: darker counts as this dark
+RATES = 0.1, 1e-3  # step of Adam at the start and the end
+COSINE = 0.3  # weight of the colours' direction beside the logarithm
+PRIOR = 1e-4  # of a squared latent: the decoder was fitted with normal ones
+
+
+@dataclass(frozen=True)
+class LightFit:
+    """What ``EnvironmentDecoder`` takes; ``error`` is the mean over the sphere of |log radiance - log map|."""
+
+    latent: Tensor  # (L, 3)
+    rotation: Tensor  # (3, 3), the identity: a turn is in the latents
+    strength: Tensor  # ()
+    error: float
+
+
+def fit_latent(decoder: EnvironmentDecoder, radiance: Tensor, *, steps: int = 500, rays: int = 512,
+               seed: int = 0) -> LightFit:  # fmt: skip
+    """Latents and strength whose decoded map is nearest to ``radiance``.
+
+    radiance: ``(H, 2H, 3)`` linear, at least 0, row 0 up, laid out as :func:`~reli3d.nn.reni.map_directions`, on the
+    decoder's device; H at least 8.  steps: of Adam, each on ``rays`` texels of the map, drawn evenly over the sphere.
+    The strength starts at the logarithm of the geometric mean; colour and contrast are the latents'.  The loss is that
+    of the training of the decoder: the difference of logarithms, floored at a hundredth of the mean, and one minus
+    the cosine of the colours, which sees the lamps.  The decoder is left as it is, gradients included.  Raises
+    TypeError unless float32, ValueError for another shape, a map that is not finite, negative or black.
+    Source: Gardner and others 2023, RENI++, section 4, with Adam's steps falling as a cosine.
+    """
+    directions, target, weight = _rays(decoder, radiance)
+    shade = target.mean(-1)
+    mean = (((shade + 1e-4 * shade.mean()).log() * weight).sum() / weight.sum()).exp()
+    target, floor = target / mean, radiance.new_tensor(math.log(FLOOR))
+    generator = torch.Generator().manual_seed(seed)
+    start = 0.1 * torch.randn(decoder.latents, 3, generator=generator)
+    latent = start.to(radiance.device).requires_grad_()
+    strength = torch.zeros((), device=radiance.device, requires_grad=True)
+    optimizer = torch.optim.Adam([latent, strength], lr=RATES[0])
+
+    def logarithm(directions: Tensor) -> Tensor:
+        return decoder.field(latent[None], directions[None])[0] + strength
+
+    with torch.enable_grad():
+        for step in range(steps):
+            rate = RATES[1] + (RATES[0] - RATES[1]) * 0.5 * (1.0 + math.cos(math.pi * step / steps))
+            optimizer.param_groups[0]["lr"] = rate
+            pick = torch.multinomial(weight.cpu(), rays, replacement=True, generator=generator).to(radiance.device)
+            log, true = logarithm(directions[pick]), target[pick]
+            cosine = torch.nn.functional.cosine_similarity(log.exp() + FLOOR, true + FLOOR, dim=-1).mean()
+            distance = (torch.logaddexp(log, floor) - (true + FLOOR).log()).abs().mean()
+            loss = distance + COSINE * (1.0 - cosine) + PRIOR * latent.square().mean()
+            latent.grad, strength.grad = torch.autograd.grad(loss, (latent, strength))
+            optimizer.step()
+    with torch.no_grad():
+        difference = (torch.logaddexp(logarithm(directions), floor) - (target + FLOOR).log()).abs().mean(-1)
+        error = float((difference * weight).sum() / weight.sum())
+        eye = torch.eye(3, device=radiance.device)
+        return LightFit(latent.detach(), eye, strength.detach() + mean.log(), error)
+
+
+def _rays(decoder: EnvironmentDecoder, radiance: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Directions ``(N, 3)`` in the decoder's frame, radiance ``(N, 3)`` and solid angle up to a factor ``(N,)``."""
+    if radiance.dtype != torch.float32:
+        raise TypeError(f"radiance: expected torch.float32, got {radiance.dtype}")
+    height = radiance.shape[0] if radiance.ndim == 3 else 0
+    if height < 8 or radiance.shape != (height, 2 * height, 3):
+        raise ValueError(f"radiance: expected (H, 2H, 3) with H at least 8, got {tuple(radiance.shape)}")
+    if radiance.device != decoder.sample_directions.device:
+        raise ValueError(f"radiance: expected device {decoder.sample_directions.device}, got {radiance.device}")
+    if not bool(radiance.isfinite().all()) or bool((radiance < 0).any()) or not bool(radiance.any()):
+        raise ValueError("radiance: expected finite light of at least 0, got NaN, infinity, negative or black")
+    directions = reni_frame(map_directions(height, radiance.device)).reshape(-1, 3)
+    rows = torch.sin((torch.arange(height, device=radiance.device) + 0.5) * math.pi / height)
+    return directions, radiance.detach().reshape(-1, 3), rows.repeat_interleave(2 * height)
