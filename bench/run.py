@@ -62,7 +62,7 @@ def collect() -> dict[str, Case]:
             continue
         module = importlib.import_module(f"bench.{path.stem}")
         peers = getattr(module, "PEERS", {})
-        for name, (builder, arguments) in module.CASES.items():
+        for name, (builder, arguments) in getattr(module, "CASES", {}).items():
             found[f"{path.stem}.{name}"] = Case(builder, arguments, peers.get(name))
     return found
 

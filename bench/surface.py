@@ -1,9 +1,10 @@
-"""FlexiCubes of a bumpy sphere with all weights, and what it feeds: the topology report and the visual hull."""
+"""FlexiCubes of a bumpy sphere with all weights beside plain torch, and what it feeds: components, the visual hull."""
 
 import math
 
 import torch
 
+from bench.flexicubes_torch import cube_list, flexicubes
 from reli3d.geometry.hull import hull_distance, mask_distance
 from reli3d.geometry.mesh import largest_components
 from reli3d.geometry.surface import extract_surface
@@ -16,8 +17,8 @@ def field(n, device):
     return p.norm(dim=-1) - 0.62 + 0.05 * torch.sin(9 * p).sum(-1)
 
 
-def extraction(device, n, backward):
-    """Mesh of a field at resolution ``n``, with gradients to level, deformation, alpha and beta if ``backward``."""
+def fields(device, n, backward):
+    """Level, the weights that gradients reach, and gamma."""
     rng = torch.Generator(device).manual_seed(0)
     level = field(n, device).requires_grad_(backward)
     weights = dict(
@@ -26,13 +27,33 @@ def extraction(device, n, backward):
         beta=torch.rand(n**3, 12, generator=rng, device=device) + 0.5,
     )
     gamma = torch.rand(n**3, generator=rng, device=device) * 0.5 + 0.25
-    leaves = [level, *(v.requires_grad_(backward) for v in weights.values())]
+    return level, {name: v.requires_grad_(backward) for name, v in weights.items()}, gamma
+
+
+def extraction(device, n, backward):
+    """Mesh of a field at resolution ``n``, with gradients to level, deformation, alpha and beta if ``backward``."""
+    level, weights, gamma = fields(device, n, backward)
+    leaves = [level, *weights.values()]
 
     def step():
         mesh = extract_surface(level, radius=0.87, gamma=gamma, **weights)
         return torch.autograd.grad(mesh.vertices.square().sum(), leaves) if backward else mesh
 
     return step, {"faces": len(extract_surface(level.detach(), radius=0.87).faces)}
+
+
+def torch_extraction(device, n, backward):
+    """The same from plain torch, its list of cubes made before."""
+    if device.type != "cpu":
+        return None
+    level, weights, gamma = fields(device, n, backward)
+    cubes, leaves = cube_list(level.shape), [level, *weights.values()]
+
+    def step():
+        vertices, faces = flexicubes(level, *weights.values(), gamma, cubes, 1.74)
+        return torch.autograd.grad(vertices.square().sum(), leaves) if backward else faces
+
+    return step, {}
 
 
 def components(device, n):
@@ -59,3 +80,4 @@ def hull(device, size, n):
 CASES = {f"extract_{n}": (extraction, dict(n=n, backward=False)) for n in (32, 80, 128, 256)}
 CASES |= {f"extract_grad_{n}": (extraction, dict(n=n, backward=True)) for n in (32, 80, 128)}
 CASES |= {"components_80": (components, dict(n=80)), "hull_80": (hull, dict(size=512, n=80))}
+PEERS = {"extract_80": torch_extraction, "extract_grad_80": torch_extraction}

@@ -5,6 +5,7 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
+from bench.flexicubes_torch import cube_list, flexicubes
 from reli3d.geometry.mesh import face_components, face_normals, report, vertex_normals, volume
 from reli3d.geometry.surface import extract_surface, surface_cubes
 from reli3d.triplane import sample_triplane
@@ -198,6 +199,22 @@ def test_gradients_match_the_plain_float64_formulation(device):
         scale = b.abs().max()
         # quotients by level differences down to 1e-3 of the level amplify float32 rounding to 1e-5
         torch.testing.assert_close(a.cpu().double() / scale, b / scale, rtol=1e-4, atol=2e-5, msg=name)
+
+
+def test_the_peer_that_is_timed_gives_the_same_surface():
+    level = F.pad(torch.randn(9, 8, 10, generator=torch.Generator().manual_seed(8)), (1,) * 6, value=0.7)
+    weights = random_weights(level.shape, 2, spread=0.5)
+    mesh = extract_surface(level, radius=0.8, **weights)
+    vertices, faces = flexicubes(level, *(weights[k] for k in ("deformation", "alpha", "beta", "gamma")),
+                                 cube_list(level.shape), 1.6)  # fmt: skip
+    distance, match = cKDTree(mesh.vertices.numpy()).query(vertices.numpy())
+    assert len(vertices) == len(mesh.vertices) and distance.max() < 1e-6  # float32 quotients of coordinates below 1
+
+    def listed(faces):
+        turned = np.stack([np.roll(f, -int(f.argmin())) for f in faces])
+        return turned[np.lexsort(turned.T)]
+
+    assert np.array_equal(listed(match[faces.numpy()]), listed(mesh.faces.numpy()))
 
 
 def test_gradients_match_finite_differences_of_the_kernel(device):

@@ -192,10 +192,11 @@ def _upright(right: np.ndarray, up: np.ndarray, points: np.ndarray, chart: np.nd
 
 
 def _cut_bulky(points: np.ndarray, chart: np.ndarray, right: np.ndarray, up: np.ndarray, area: np.ndarray, waste: float,
-               neighbours: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:  # fmt: skip
+               longest: float, neighbours: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:  # fmt: skip
     """Charts with rings, bows and crosses cut in two where that saves room: ``(chart, parent of each chart)``, or None.
 
     points: ``(F, 3)`` centres of the faces.  area: of each chart.  waste: empty area [texels] that is worth a cut.
+    longest: [texels] a chart above is halved across, whatever its fill: it would hold down the scale of all the others.
     """
     outer = outer_faces(chart, neighbours)
     order, start = group(chart[outer])
@@ -204,12 +205,15 @@ def _cut_bulky(points: np.ndarray, chart: np.ndarray, right: np.ndarray, up: np.
     angles = np.arange(CUT_ANGLES) * (np.pi / CUT_ANGLES)
     along = [x * np.cos(a) + y * np.sin(a) for a in angles]
 
-    def boxes(begin: np.ndarray, values: list[np.ndarray]) -> np.ndarray:
-        extent = np.stack([np.maximum.reduceat(v, begin) - np.minimum.reduceat(v, begin) for v in values])
+    def extents(begin: np.ndarray, values: list[np.ndarray]) -> np.ndarray:
+        return np.stack([np.maximum.reduceat(v, begin) - np.minimum.reduceat(v, begin) for v in values])
+
+    def boxes(extent: np.ndarray) -> np.ndarray:
         return (extent * np.roll(extent, CUT_ANGLES // 2, 0)).min(0)
 
-    box = boxes(start, along)
-    bulky = (box - area > waste) & (area < CUT_FILL * box)
+    extent = extents(start, along)
+    box, axis, long = boxes(extent), extent.argmax(0), extent.max(0) > longest
+    bulky = (box - area > waste) & (area < CUT_FILL * box) | long
     if not bulky.any():
         return None
     keep = bulky[chart[outer]]
@@ -218,6 +222,7 @@ def _cut_bulky(points: np.ndarray, chart: np.ndarray, right: np.ndarray, up: np.
     count = int(bulky.sum())
     least = np.where(area < CUT_HOLLOW * box, CUT_HOLLOW_GAIN, CUT_GAIN) * box
     best, best_angle, best_at = least[bulky], np.full(count, -1), np.zeros(count)
+    axis = np.where(long, axis, -1)[bulky]
     start = np.searchsorted(owner, np.arange(count))
     for k, v in enumerate(along):
         middle = 0.5 * (np.maximum.reduceat(v, start) + np.minimum.reduceat(v, start))
@@ -225,7 +230,8 @@ def _cut_bulky(points: np.ndarray, chart: np.ndarray, right: np.ndarray, up: np.
         for at in (middle, mean):
             side = 2 * owner + (v > at[owner])
             rows, begin = group(side)
-            total = np.bincount(side[rows[begin]] // 2, boxes(begin, [w[rows] for w in along]), count)
+            total = np.bincount(side[rows[begin]] // 2, boxes(extents(begin, [w[rows] for w in along])), count)
+            total = np.where(axis < 0, total, np.where(axis == k, 0.0, np.inf))
             better = total < best * (1 - 1e-6)
             best, best_angle, best_at = (np.where(better, new, old) for new, old in
                                          ((total, best), (k, best_angle), (at, best_at)))  # fmt: skip
@@ -311,12 +317,14 @@ def split_overlaps(charts: Charts) -> bool:
     return True
 
 
-def make_charts(points: np.ndarray, faces: np.ndarray, *, texels: float, least_texels: float, sliver: float) -> Charts:
+def make_charts(points: np.ndarray, faces: np.ndarray, *, texels: float, least_texels: float, longest: float,
+                sliver: float) -> Charts:  # fmt: skip
     """Charts of a welded mesh.
 
     points: ``(V, 3)`` float32.  faces: ``(F, 3)`` int32.  texels: area to fill [texels]: it sets the unit of
     ``corners``.
-    least_texels: charts below this area are merged where possible.  sliver: height [texels] of a face without a chart.
+    least_texels: charts below this area are merged where possible.
+    longest: charts beyond are cut [texels].  sliver: height [texels] of a face without a chart.
     """
     centre = 0.5 * (points.min(0).astype(np.float64) + points.max(0))
     reach = np.abs(points - centre).max() or 1.0
@@ -334,7 +342,8 @@ def make_charts(points: np.ndarray, faces: np.ndarray, *, texels: float, least_t
     right, up = _frames(normal, label, chart, count)
     centres = local[faces].mean(1).astype(np.float64)
     for _ in range(CUTTING):
-        cut = _cut_bulky(centres, chart, right, up, np.bincount(chart, size, count), CUT_WASTE * texels, neighbours)
+        cut = _cut_bulky(centres, chart, right, up, np.bincount(chart, size, count), CUT_WASTE * texels, longest,
+                         neighbours)  # fmt: skip
         if cut is None:
             break
         chart, parent = cut

@@ -24,8 +24,9 @@ from reli3d.geometry.mesh import Mesh, vertex_normals, weld
 from reli3d.kernels import uv as kernels
 
 FILL = 0.62  # share of the atlas that charts are expected to cover; sets the unit of the chart step only
+LONGEST = 1.0  # of the atlas's side at the expected scale: a longer chart is cut
 ROUNDS = 10  # packings tried in the search for the scale; it stops earlier within 1 %
-CELLS = 512  # resolution of the packing: cells along the atlas
+CELLS = 1024  # resolution of the packing: cells along the atlas
 GUARD_MOST = 3.0  # boxes with guard band over boxes without: above, the charts are too many and the band is halved
 SLIVER_PITCH, SLIVER_SIDE = 3.0, 2.0  # texels: a face without area gets a right triangle of this side
 SLIVER_SHARE = 0.1  # of the atlas at most goes to faces without area
@@ -86,7 +87,8 @@ def unwrap(mesh: Mesh, *, texture_size: int = 1024) -> Mesh:
     points = mesh.vertices.detach().cpu().numpy()[first]
     guard = guard_band(texture_size)
     charts = parts.make_charts(points, label[source_faces].astype(np.int32), texels=FILL * texture_size**2,
-                               least_texels=9.0 * guard * guard, sliver=4.0e-6 * texture_size)  # fmt: skip
+                               least_texels=9.0 * guard * guard, longest=LONGEST * texture_size,
+                               sliver=4.0e-6 * texture_size)  # fmt: skip
     uv = _pack(charts, texture_size, guard)
     flat = _area(uv) <= 0.0
     while flat.any():  # rounding to float32 took a face's area: it moves to the slivers
@@ -227,7 +229,8 @@ def atlas_report(mesh: Mesh, *, texture_size: int = 1024) -> AtlasReport:
     square = area[solid] @ (0.5 * (a + c)) / max(area[solid].sum(), 1e-300)
     longest = np.sqrt(0.5 * (a + c + np.sqrt((a - c) ** 2 + 4 * b * b)))
     mean = np.sqrt(area.sum() / max(0.5 * np.abs(twice).sum(), 1e-300))
-    _, chart_count = parts.components(parts.face_neighbours(faces.astype(np.int64)), np.zeros(len(faces), np.int32))
+    joined = weld(torch.nn.functional.pad(mesh.uv.detach(), (0, 1)))[1].cpu().numpy()[faces]  # equal UV, split or not
+    _, chart_count = parts.components(parts.face_neighbours(joined), np.zeros(len(faces), np.int32))
     covered = max(int((hits > 0).sum()), 1)
     return AtlasReport(
         charts=chart_count,

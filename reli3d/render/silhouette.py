@@ -19,6 +19,7 @@ import warp as wp
 from torch import Tensor
 
 from reli3d._bridge import check, launch
+from reli3d.geometry.mesh import weld
 from reli3d.geometry.rays import RayScene
 from reli3d.kernels import silhouette as kernels
 from reli3d.render.camera import Camera, project
@@ -57,16 +58,14 @@ def mesh_edges(vertices: Tensor, faces: Tensor) -> Tensor:
     low, high = (int(v) for v in torch.aminmax(faces))
     if low < 0 or high >= len(vertices):
         raise ValueError(f"faces: expected indices in [0, {len(vertices)}), got [{low}, {high}]")
-    _, place = torch.unique(vertices.detach(), dim=0, return_inverse=True)
-    own = torch.arange(len(vertices), device=faces.device)
-    first = torch.full_like(own, len(vertices)).scatter_reduce(0, place, own, "amin")
-    corners = first[place[faces.long()]]
+    first, label = weld(vertices)
+    corners = first[label[faces.long()]]
     corners = corners[(corners != corners.roll(1, 1)).all(1)]  # a face that welding closes has no edge to show
     ends = torch.cat([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]).sort(1).values
     opposite = torch.cat([corners[:, 2], corners[:, 0], corners[:, 1]])
-    order = torch.argsort(ends[:, 0] * len(vertices) + ends[:, 1], stable=True)
+    key, order = torch.sort(ends[:, 0] * len(vertices) + ends[:, 1], stable=True)
     ends, opposite = ends[order], opposite[order]
-    _, times = torch.unique_consecutive(ends, dim=0, return_counts=True)
+    _, times = torch.unique_consecutive(key, return_counts=True)
     begin = times.cumsum(0) - times
     pair = begin[times == 2]
     alone = torch.ones(len(ends), dtype=torch.bool, device=faces.device)
