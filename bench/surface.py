@@ -10,11 +10,15 @@ from reli3d.geometry.mesh import largest_components
 from reli3d.geometry.surface import extract_surface
 
 
+def offset(p):
+    """Level ``(...)`` of a bumpy sphere at ``(..., 3)`` in the cube [-1, 1]."""
+    return p.norm(dim=-1) - 0.62 + 0.05 * torch.sin(9 * p).sum(-1)
+
+
 def field(n, device):
     """Level on ``(n + 1)^3`` vertices; at n = 80 its surface has about 25,000 faces."""
     axis = torch.linspace(-1, 1, n + 1, device=device)
-    p = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
-    return p.norm(dim=-1) - 0.62 + 0.05 * torch.sin(9 * p).sum(-1)
+    return offset(torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1))
 
 
 def fields(device, n, backward):

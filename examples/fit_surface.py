@@ -5,8 +5,8 @@ usage: python examples/fit_surface.py OUTPUT_FOLDER [--mesh FILE] [--resolution 
 (a) The grid starts with the signed distance at its vertices.  Random points of the extracted surface are pulled onto
 the zero set, whose place and direction come from more values of the distance; the weights and offsets of FlexiCubes
 learn the features that lie between the grid's vertices.
-(b) The grid starts with a ball around everything and knows 32 views of mask and depth only.  Gradients reach it through
-the depth of the hits and, where outlines move, through their antialiasing.
+(b) The grid knows 32 views of mask and depth only and starts with the visual hull of the masks.  Gradients reach it
+through the depth of the hits and, where outlines move, through their antialiasing.
 
 Without ``--mesh`` it looks for Keenan Crane's spot in ``../shared/data`` and says so where it is not there.  Writes
 ``fitted.png``: truth, (a) and (b) from two sides.  Chamfer distance: exact distances between 30,000 random points of
@@ -27,6 +27,7 @@ import trimesh
 from torch import Tensor
 
 from reli3d.data.distance import signed_distance
+from reli3d.geometry.hull import hull_distance, mask_distance
 from reli3d.geometry.mesh import Mesh, report, vertex_normals
 from reli3d.geometry.rays import RayScene
 from reli3d.geometry.regularize import sign_entropy, vertex_deviation
@@ -160,9 +161,13 @@ def fit_images(truth: Mesh, resolution: int, steps: int) -> Grid:
     rig = cameras()
     with torch.no_grad():
         targets = layers(truth, rig)
-    grid = Grid(vertices_of(resolution).norm(dim=-1) - 0.97)
+    c2w, intrinsics = torch.stack([c.c2w for c in rig]), torch.stack([c.intrinsics for c in rig])
+    masks = mask_distance(torch.stack([t[..., 0] for t in targets]))
+    hull = hull_distance(vertices_of(resolution).reshape(-1, 3), masks, c2w, intrinsics)
+    grid = Grid(-hull.reshape((resolution + 1,) * 3))
     cell = 2 * RADIUS / resolution
-    optimizer = torch.optim.Adam([{"params": [grid.level], "lr": 0.4 * cell},
+    sys.stdout.write(f"visual hull of the masks: Chamfer {chamfer(grid.mesh(), truth):.5f}\n")
+    optimizer = torch.optim.Adam([{"params": [grid.level], "lr": 0.2 * cell},
                                   {"params": [grid.offset, grid.weights], "lr": 0.02}])  # fmt: skip
     schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda i: 0.02 ** (i / steps))
     order = torch.Generator().manual_seed(0)

@@ -5,11 +5,14 @@ import pytest
 import torch
 import trimesh
 
+from bench.surface import field
 from reli3d.geometry import charts, uv
 from reli3d.geometry.bake import coverage, nearest_valid
 from reli3d.geometry.mesh import Mesh
+from reli3d.geometry.surface import extract_surface
 from reli3d.geometry.uv import atlas_report, guard_band, unwrap, unwrap_xatlas
 
+slow = pytest.mark.slow
 QUICK = ["avocado", "suzanne", "scifi_crate", "plastic_monobloc_chair_01", "abalone_shell"]
 SLOW = ["boombox", "coffee_grinder", "dutch_ship_medium", "exploding_barrel", "french_horn", "horse_statue_01",
         "numeric_keypad", "painted_wooden_cabinet_02", "painted_wooden_stool", "rune_sword", "shader_ball",
@@ -61,7 +64,7 @@ def check_atlas(source: Mesh, result: Mesh, size: int = 2048, rel: float = 3e-3)
     assert area.sum() >= (1 - 5 * rel) * covered / size**2
 
 
-@pytest.mark.parametrize("name", QUICK + [pytest.param(n, marks=pytest.mark.slow) for n in SLOW])
+@pytest.mark.parametrize("name", QUICK + [pytest.param(n, marks=slow) for n in SLOW])
 def test_real_meshes_have_area_everywhere_and_no_overlap(shared_data, name):
     mesh = loaded(shared_data / "meshes" / f"{name}.glb")
     check_atlas(mesh, unwrap(mesh, texture_size=1024))
@@ -76,6 +79,28 @@ def test_sphere_fills_the_atlas_with_little_stretch():
     assert found.utilisation > 0.55
     # a cap of 54.7 degrees seen along its axis: stretch at the tip 1 / cos = 1.73, less the common scale
     assert found.stretch < 1.05 and found.stretch_max < 1.74
+
+
+@pytest.mark.parametrize("n", [32, pytest.param(80, marks=slow), pytest.param(160, marks=slow)])
+def test_extracted_surfaces_up_to_a_hundred_thousand_faces(n):
+    mesh = extract_surface(field(n, "cpu"), radius=0.87)
+    assert n < 160 or len(mesh.faces) > 100_000
+    check_atlas(mesh, unwrap(mesh, texture_size=1024))
+
+
+def test_a_long_part_does_not_hold_down_the_scale():
+    bar = trimesh.creation.box((30.0, 1.0, 1.0)).subdivide().subdivide().subdivide()
+    mesh = mesh_of(bar.vertices, bar.faces)
+    result = unwrap(mesh, texture_size=512)
+    check_atlas(mesh, result)
+    # 122 units of area; uncut, the longest chart's 30 units would span the side and use 122 / 900 of it
+    assert atlas_report(result, texture_size=512).utilisation > 0.5
+
+
+def test_charts_are_counted_by_their_uv_whether_vertices_are_split_or_not():
+    mesh = icosphere(3)
+    loose = Mesh(mesh.vertices[mesh.faces.reshape(-1).long()], torch.arange(3 * len(mesh.faces)).reshape(-1, 3).int())
+    assert atlas_report(unwrap(loose, texture_size=256), texture_size=256).charts == 6
 
 
 def test_stretch_of_a_plane_is_one_and_of_a_squeezed_one_is_known():

@@ -1,0 +1,99 @@
+"""The mesh stage of ``reli3d-infer`` at the published sizes: a triplane in memory to a textured GLB in memory.
+
+Grid query of the density, deformation and weight heads, extraction, atlas, bake with the material heads, dilation, GLB:
+the pipeline's own functions on the published preset's triplane and heads with random weights.  The network before them
+is cut to a stub that never runs.  The density's output is replaced by the bench's field, of 25,000 faces at resolution
+80, so that there is a surface to texture; its head is evaluated all the same.
+
+``python -m bench.mesh_stage`` prints the stages for resolutions 32 to 256 and textures of 512 to 4096.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import replace
+
+import torch
+
+from bench.surface import offset
+from reli3d.io.glb import glb_bytes
+from reli3d.nn.model import Code, Reconstructor
+from reli3d.nn.presets import OFFICIAL, SMALL
+from reli3d.nn.view_features import ViewMaps
+from reli3d.pipeline import extract, texture
+from reli3d.render.asset import Asset
+
+PLANE = 384  # texels along a plane of the published triplane
+
+
+class KnownSurface(Reconstructor):
+    """The published heads; ``query`` evaluates them all and then gives the bench's field as density."""
+
+    def query(self, code, points, heads, view_features=None, color=None):
+        values = super().query(code, points, heads, view_features, color)
+        if "density" in values:
+            level = offset(points / self.preset.radius) * 20.0
+            values["density"] = self.surface_density - level[..., None] + 0.0 * values["density"]
+        return values
+
+
+def model_and_code(device):
+    """The heads of the published preset and a random channel-last triplane of its size."""
+    torch.manual_seed(0)
+    small = {part: getattr(SMALL, part) for part in ("encoder", "backbone", "illumination", "camera_width")}
+    preset = replace(OFFICIAL, plane_size=12, **small)
+    model = KnownSurface(preset).to(device).eval()
+    planes = torch.randn(1, 3, PLANE, PLANE, preset.upsampler.channels, device=device).movedim(-1, 2)
+    nothing = torch.zeros(1, 4, device=device)
+    maps = ViewMaps(nothing[None, None], nothing[None, None], torch.eye(4, device=device)[None], nothing)
+    return model, Code(planes, nothing[None, None], nothing[None], nothing, nothing[:, :1]), maps
+
+
+@torch.no_grad()
+def stages(model, code, maps, resolution, size) -> dict[str, float]:
+    """Seconds of each part."""
+    clock = [time.perf_counter()]
+
+    def tick():
+        if code.triplane.is_cuda:
+            torch.cuda.synchronize()
+        clock.append(time.perf_counter())
+
+    mesh = extract(model, code, maps, resolution)
+    tick()
+    mesh, textures = texture(model, code, maps, mesh, size)
+    tick()
+    glb_bytes(Asset(mesh, textures))
+    tick()
+    return dict(zip(("surface", "textures", "glb"), (b - a for a, b in zip(clock[:-1], clock[1:]))))
+
+
+def mesh_stage(device, resolution, size):
+    model, code, maps = model_and_code(device)
+    return lambda: stages(model, code, maps, resolution, size), {"texels": size * size}
+
+
+CASES = {"published_sizes": (mesh_stage, dict(resolution=80, size=1024))}
+
+
+def main() -> int:
+    device = torch.device("cpu")
+    model, code, maps = model_and_code(device)
+    stages(model, code, maps, 32, 512)
+    sys.stdout.write(
+        f"{'resolution':>10s} {'texture':>8s} {'surface':>9s} {'textures':>9s} {'glb':>9s} {'all, ms':>9s}\n"
+    )
+    for resolution, size in ((32, 1024), (80, 1024), (128, 1024), (256, 1024), (80, 512), (80, 2048), (80, 4096)):
+        best = None
+        for _ in range(3 if resolution < 256 and size < 4096 else 1):
+            found = stages(model, code, maps, resolution, size)
+            best = found if best is None or sum(found.values()) < sum(best.values()) else best
+        row = " ".join(f"{1e3 * s:9.1f}" for s in (*best.values(), sum(best.values())))
+        sys.stdout.write(f"{resolution:10d} {size:8d} {row}\n")
+        sys.stdout.flush()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
