@@ -153,12 +153,44 @@ def launch(kernel, n: int, args: Sequence, device: torch.device, *, slice_min: i
                     slice_min=slice_min)  # fmt: skip
 
 
+class _Once(torch.autograd.Function):
+    """A gradient that refuses to be differentiated again; ``sources`` are what it depends on."""
+
+    @staticmethod
+    def forward(ctx, grad: Tensor, *sources: Tensor) -> Tensor:
+        return grad.view_as(grad)
+
+    @staticmethod
+    def backward(ctx, *_):
+        raise RuntimeError("second derivative: expected a first one, this function is once_differentiable")
+
+
+def once_differentiable(backward):
+    """Decorator of a ``backward`` without gradient: a second derivative raises RuntimeError.
+
+    Torch's own decorator refuses only where the incoming gradient has one; for a loss linear in the result the inputs'
+    share of the second derivative would silently be missing.  Tensors saved for backward must be the inputs themselves
+    (made contiguous before ``apply``, where that is recorded).
+    """
+
+    def wrapper(ctx, *g_outs):
+        with torch.no_grad():
+            grads = backward(ctx, *g_outs)
+        if not torch.is_grad_enabled():
+            return grads
+        several = isinstance(grads, tuple)
+        sources = [t for t in (*ctx.saved_tensors, *g_outs) if t is not None and t.requires_grad]
+        held = [g if g is None or not sources else _Once.apply(g, *sources) for g in (grads if several else (grads,))]
+        return tuple(held) if several else held[0]
+
+    return wrapper
+
+
 class _KernelOp(torch.autograd.Function):
     """``outs = kernel(start, *ins)``; backward launches the adjoint of the same kernel."""
 
     @staticmethod
     def forward(ctx, kernel, n, slice_min, plain, types, shared, outs, device, *tensors):
-        tensors = [t.contiguous() for t in tensors]
         results = [empty(shape, dtype, device) for shape, dtype in outs]
         launch(kernel, n, _fill(plain, zip(tensors, types, strict=True)) + _typed(results, outs), device,
                slice_min=slice_min)  # fmt: skip
@@ -168,7 +200,7 @@ class _KernelOp(torch.autograd.Function):
         return tuple(results)
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @once_differentiable
     def backward(ctx, *g_outs):
         kernel, n, slice_min, plain, types, shared, outs, device = ctx.op
         tensors, results = ctx.saved_tensors[: len(types)], ctx.saved_tensors[len(types) :]
@@ -224,7 +256,7 @@ def call(kernel, n: int, ins: Sequence, outs: Sequence, *, device: torch.device,
     asks for one, through the kernel's own adjoint (its module needs ``enable_backward``).  ``shared``: positions,
     counted among the tensors, of inputs that more than one thread reads.  ``slice_min``: as for :func:`launch`.
     """
-    tensors = [a[0] for a in ins if isinstance(a, tuple)]
+    tensors = [a[0].contiguous() for a in ins if isinstance(a, tuple)]
     types = [a[1] for a in ins if isinstance(a, tuple)]
     plain = [_SLOT if isinstance(a, tuple) else a for a in ins]
     return _KernelOp.apply(kernel, n, slice_min, plain, types, frozenset(shared), list(outs), device, *tensors)

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from reli3d._bridge import check, launch
+from reli3d._bridge import check, launch, once_differentiable
 from reli3d.kernels import triplane as kernels
 
 BLOCK = 8  # channels of a kernels.vec8
@@ -41,7 +41,7 @@ class _SampleTriplane(torch.autograd.Function):
         return features[..., :channels].reshape(batch, n, 3 * channels)
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @once_differentiable
     def backward(ctx, g_out: Tensor):
         points, packed, order, edges = ctx.saved_tensors
         channels = ctx.shape[2]

@@ -28,23 +28,25 @@ def environment(mi, radiance: torch.Tensor) -> dict:
     Its rows are nodes at v = r / (H' - 1), ours texel centres: with H' = 2 H + 1 all our kinks fall on its nodes.
     Its columns are texel centres as ours.  Its centre column looks to +Z: half a turn.
     """
-    height = radiance.shape[0]
-    rows = np.arange(2 * height + 1) / 2 - 0.5
-    low = np.clip(np.floor(rows).astype(int), 0, height - 1)
-    high = np.clip(low + 1, 0, height - 1)
-    part = (rows - np.floor(rows))[:, None, None]
-    part = np.where((rows < 0)[:, None, None], 0.0, part)
-    data = radiance.numpy()
-    data = data[low] * (1 - part) + data[high] * part
-    bitmap = mi.Bitmap(np.ascontiguousarray(data, np.float32))
+    bitmap = mi.Bitmap(np.ascontiguousarray(node_rows(radiance).numpy(), np.float32))
     return {"type": "envmap", "bitmap": bitmap, "to_world": mi.ScalarTransform4f().rotate([0, 1, 0], 180)}
+
+
+def node_rows(radiance: torch.Tensor) -> torch.Tensor:
+    """The map ``(H, W, 3)`` on the ``2 H + 1`` rows of Mitsuba's nodes; differentiable."""
+    height = radiance.shape[0]
+    rows = torch.arange(2 * height + 1) / 2 - 0.5
+    low = rows.floor().long().clamp(0, height - 1)
+    high = (low + 1).clamp(max=height - 1)
+    part = (rows.clamp(min=0.0) - rows.clamp(min=0.0).floor())[:, None, None]
+    return radiance[low] * (1 - part) + radiance[high] * part
 
 
 def material(mi, base_color, alpha, metallic):
     """A Mitsuba BSDF that evaluates the metallic-roughness formula; sampled by cosine and visible normals."""
     import drjit as dr
 
-    base = mi.Color3f(*base_color)
+    base, alpha = mi.Color3f(*base_color), mi.Float(alpha)
 
     class MetallicRoughness(mi.BSDF):
         def __init__(self, props):
@@ -54,6 +56,11 @@ def material(mi, base_color, alpha, metallic):
             self.m_flags = flags
 
         def sample(self, ctx, si, sample1, sample2, active):
+            with dr.suspend_grad():  # samples and densities are constants; the value has the gradient
+                bs = self.draw(ctx, si, sample1, sample2, active)
+            return bs, dr.select(bs.pdf > 0, self.eval(ctx, si, bs.wo, active) / bs.pdf, 0)
+
+        def draw(self, ctx, si, sample1, sample2, active):
             distribution = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, alpha, alpha)
             h, _ = distribution.sample(si.wi, sample2)
             cosine = mi.warp.square_to_cosine_hemisphere(sample2)
@@ -63,7 +70,7 @@ def material(mi, base_color, alpha, metallic):
             bs.eta = 1.0
             bs.sampled_type = mi.UInt32(+mi.BSDFFlags.GlossyReflection)
             bs.sampled_component = mi.UInt32(0)
-            return bs, dr.select(bs.pdf > 0, self.eval(ctx, si, bs.wo, active) / bs.pdf, 0)
+            return bs
 
         def eval(self, ctx, si, wo, active):
             i, o = si.wi, wo
@@ -77,7 +84,7 @@ def material(mi, base_color, alpha, metallic):
             return dr.select((i.z > 0) & (o.z > 0), value * o.z, 0)
 
         def pdf(self, ctx, si, wo, active):
-            distribution = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, alpha, alpha)
+            distribution = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, dr.detach(alpha), dr.detach(alpha))
             h = dr.normalize(si.wi + wo)
             lobe = distribution.pdf(si.wi, h) / (4 * dr.dot(si.wi, h))
             both = 0.5 * mi.warp.square_to_cosine_hemisphere_pdf(wo) + 0.5 * lobe
@@ -91,6 +98,18 @@ def material(mi, base_color, alpha, metallic):
 
     mi.register_bsdf("reli3d_metallic_roughness", lambda props: MetallicRoughness(props))
     return {"type": "reli3d_metallic_roughness"}
+
+
+def smooth_mesh(mi, vertices: torch.Tensor, faces: torch.Tensor, normals: torch.Tensor, bsdf: dict):
+    """A mesh with vertex normals and the material."""
+    props = mi.Properties()
+    props["bsdf"] = mi.load_dict(bsdf)
+    mesh = mi.Mesh("mesh", len(vertices), len(faces), has_vertex_normals=True, props=props)
+    params = mi.traverse(mesh)
+    params["vertex_positions"], params["faces"] = vertices.numpy().ravel(), faces.numpy().ravel().astype(np.uint32)
+    params["vertex_normals"] = normals.numpy().ravel()
+    params.update()
+    return mesh
 
 
 def radiance(mi, scene, origins: torch.Tensor, directions: torch.Tensor, samples: int, passes: int):

@@ -219,6 +219,11 @@ def test_second_derivative_is_refused_not_zero(device):
     (g,) = torch.autograd.grad(square(x).square().sum(), x, create_graph=True)
     with pytest.raises(RuntimeError, match="once_differentiable"):
         g.sum().backward()
+    for strided in (False, True):  # torch's own decorator lets a loss pass that is linear in the result
+        x = torch.ones(8, 2, device=device, requires_grad=True)
+        (g,) = torch.autograd.grad(square(x[:, 0] if strided else x.reshape(-1)).sum(), x, create_graph=True)
+        with pytest.raises(RuntimeError, match="once_differentiable"):
+            torch.autograd.grad(g.sum() + x.square().sum(), x)
 
 
 def test_backward_twice_gives_the_same(device):

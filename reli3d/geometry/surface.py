@@ -16,7 +16,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from reli3d._bridge import check, launch
+from reli3d._bridge import check, launch, once_differentiable
 from reli3d.geometry.mesh import Mesh
 from reli3d.kernels import flexicubes as kernels
 from reli3d.kernels.flexicubes_tables import tables
@@ -243,7 +243,7 @@ class _DualVertices(torch.autograd.Function):
                 t.shape[1], t.shape[2], wp.vec3i(*t.cubes), t.pad, wp.vec3(*scale)]  # fmt: skip
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @once_differentiable
     def backward(ctx, g_vertices):
         from reli3d.kernels import flexicubes_adjoint
 

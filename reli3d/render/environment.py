@@ -12,7 +12,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from reli3d._bridge import SLICE_MIN, check, empty, launch, load_modules, over_slices, slices
+from reli3d._bridge import SLICE_MIN, check, empty, launch, load_modules, once_differentiable, over_slices, slices
 from reli3d.kernels import envmap as kernels
 
 _LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709
@@ -71,7 +71,8 @@ class Environment:
         Gradients reach the texels and the directions (not at a pole, where the azimuth has none).
         """
         check("directions", directions, last=3, like=self.radiance)
-        return _Lookup.apply(self.radiance, directions.reshape(-1, 3)).reshape(directions.shape)
+        flat = directions.reshape(-1, 3).contiguous()
+        return _Lookup.apply(self.radiance.contiguous(), flat).reshape(directions.shape)
 
     def irradiance(self) -> Environment:
         """Irradiance [radiance times sr] on a surface of each normal, as a map of the same size: pi times a constant.
@@ -160,7 +161,6 @@ class _Lookup(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, radiance: Tensor, directions: Tensor) -> Tensor:
-        radiance, directions = radiance.contiguous(), directions.contiguous()
         out = empty((directions.shape[0],), wp.vec3, directions.device)
         args = [(radiance, wp.vec3), (directions, wp.vec3), (out, wp.vec3)]
         launch(kernels.lookup_envmap_kernel, directions.shape[0], args, directions.device)
@@ -168,7 +168,7 @@ class _Lookup(torch.autograd.Function):
         return out
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @once_differentiable
     def backward(ctx, g_out: Tensor):
         radiance, directions = ctx.saved_tensors
         n, device, wanted = directions.shape[0], directions.device, ctx.needs_input_grad

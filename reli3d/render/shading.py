@@ -10,7 +10,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from reli3d._bridge import SLICE_MIN, check, empty, launch, over_slices, slices
+from reli3d._bridge import SLICE_MIN, check, empty, launch, once_differentiable, over_slices, slices
 from reli3d.geometry.rays import RayScene
 from reli3d.kernels import shade as kernels
 from reli3d.kernels import shade_adjoint as adjoint
@@ -73,7 +73,8 @@ def shade(
     if pixels.shape != (n,):
         raise ValueError(f"pixels: expected shape ({n},), got {tuple(pixels.shape)}")
     job = _Job(plan, sum(samples), scene, [*tables, (pixels.contiguous(), wp.int32)])
-    return _Shade.apply(job, position, normal, ng, wo, base_color, width, metallic, environment.radiance)
+    values = (position, normal, ng, wo, base_color, width, metallic, environment.radiance)
+    return _Shade.apply(job, *(v.contiguous() for v in values))
 
 
 class Light(Protocol):
@@ -145,7 +146,6 @@ class _Shade(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, job: _Job, *tensors: Tensor) -> Tensor:
-        tensors = [t.contiguous() for t in tensors]
         position, n = tensors[0], tensors[0].shape[0]
         words = -(-job.count // 32) if any(ctx.needs_input_grad[1:]) else 0
         visible = torch.zeros(n, words, dtype=torch.int32, device=position.device)
@@ -162,7 +162,7 @@ class _Shade(torch.autograd.Function):
         return out
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @once_differentiable
     def backward(ctx, g_out: Tensor):
         *tensors, visible = ctx.saved_tensors
         n, device, radiance = g_out.shape[0], g_out.device, tensors[-1]

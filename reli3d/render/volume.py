@@ -14,7 +14,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from reli3d._bridge import check, empty, launch
+from reli3d._bridge import check, empty, launch, once_differentiable
 from reli3d.kernels import volume as kernels
 
 CHUNK = 1 << 18  # points a call when a field is asked over a whole grid: 3 MB of positions
@@ -136,7 +136,7 @@ def composite(density: Tensor, color: Tensor, samples: RaySamples) -> Composite:
     check("color", color, last=3, like=density)
     if color.shape != (len(density), 3):
         raise ValueError(f"color: expected shape ({len(density)}, 3), got {tuple(color.shape)}")
-    return Composite(*_Composite.apply(samples, density, color))
+    return Composite(*_Composite.apply(samples, density.contiguous(), color.contiguous()))
 
 
 def sample_weights(density: Tensor, samples: RaySamples) -> Tensor:
@@ -159,7 +159,6 @@ class _Composite(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, samples: RaySamples, density: Tensor, color: Tensor):
-        density, color = density.contiguous(), color.contiguous()
         n, device = len(samples.first) - 1, density.device
         outs = [(empty((n,), kind, device), kind) for kind in (wp.vec3, wp.float32, wp.float32)]
         launch(kernels.composite_kernel, n, [*_inputs(samples, density, color), *outs], device)
@@ -168,7 +167,7 @@ class _Composite(torch.autograd.Function):
         return tuple(out for out, _ in outs)
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @once_differentiable
     def backward(ctx, g_color: Tensor, g_opacity: Tensor, g_depth: Tensor):
         density, color = ctx.saved_tensors
         outs = [(torch.zeros_like(density), wp.float32), (torch.zeros_like(color), wp.vec3)]

@@ -1,0 +1,136 @@
+"""Images and gradients of the estimator against Mitsuba 3: same mesh, rays, formula and map, all else its own."""
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from scipy.special import erfc
+
+from reli3d.geometry.rays import RayScene
+from reli3d.render.camera import Camera, camera_rays, look_at
+from reli3d.render.environment import Environment
+from reli3d.render.gbuffer import hit_normals, interpolate
+from reli3d.render.shading import shade
+from tests import mitsuba_scene
+
+pytestmark = pytest.mark.slow  # Mitsuba compiles its kernels for half a minute a case
+
+BASE = (0.8, 0.4, 0.1)
+MATERIALS = {"diffuse": (0.64, 0.0), "glossy": (0.04, 0.0), "metal": (0.09, 1.0)}  # GGX width, metallic
+
+
+def light(name):
+    map_ = torch.rand(16, 32, 3, generator=torch.Generator().manual_seed(3)) ** 3 * 2.0
+    if name == "constant":
+        map_ = torch.full((16, 32, 3), 0.7)
+    if name == "sun":
+        map_[4, 20] = 400.0
+    return Environment(map_)
+
+
+class Stage:
+    """A ball inside a ring that shadows it, and the primary hits of one camera that both sides share."""
+
+    def __init__(self, size):
+        ball = trimesh.creation.icosphere(subdivisions=3, radius=0.5)
+        ring = trimesh.creation.torus(0.75, 0.15, major_sections=40, minor_sections=16)
+        mesh = trimesh.util.concatenate([ball, ring])
+        self.vertices, self.faces = torch.tensor(mesh.vertices).float(), torch.tensor(mesh.faces).int()
+        self.normals = torch.tensor(np.array(mesh.vertex_normals)).float()
+        pose = look_at(torch.tensor([1.2, 1.6, 1.9]), torch.zeros(3), torch.tensor([0.0, 1, 0]))
+        camera = Camera.from_fov(pose, 0.6, size, size)
+        origins, directions = (v.reshape(-1, 3).contiguous() for v in camera_rays(camera))
+        self.scene = RayScene(self.vertices, self.faces)
+        hits = self.scene.closest(origins, directions)
+        normal = interpolate(self.normals, self.faces, hits.face, hits.bary)
+        normal = torch.nn.functional.normalize(normal, dim=-1)
+        # Mitsuba bends no normals
+        index = torch.nonzero((hits.face >= 0) & ((normal * -directions).sum(-1) > 0.05))[:, 0]
+        self.origins, self.directions, self.normal = origins[index], directions[index], normal[index]
+        self.position = interpolate(self.vertices, self.faces, hits.face[index], hits.bary[index])
+        self.ng = hit_normals(self.vertices, self.faces, hits.face[index])
+
+    def world(self, mi, environment, bsdf):
+        mesh = mitsuba_scene.smooth_mesh(mi, self.vertices, self.faces, self.normals, bsdf)
+        return mi.load_dict(
+            {"type": "scene", "light": mitsuba_scene.environment(mi, environment.radiance), "mesh": mesh}
+        )
+
+    def shade(self, base, roughness, metallic, environment, seed):
+        n = len(self.position)
+        return shade(self.position, self.normal, self.ng, -self.directions, base.expand(n, 3), roughness.expand(n),
+                     torch.full((n,), metallic), environment, scene=self.scene, seed=seed)  # fmt: skip
+
+
+@pytest.mark.parametrize("material", MATERIALS)
+@pytest.mark.parametrize("sky", ["constant", "sky", "sun"])
+def test_image_with_shadows_equals_mitsubas(material, sky):
+    mi = mitsuba_scene.load()
+    (alpha, metallic), environment, stage = MATERIALS[material], light(sky), Stage(48)
+    world = stage.world(mi, environment, mitsuba_scene.material(mi, BASE, alpha, metallic))
+    want, want_var = mitsuba_scene.radiance(mi, world, stage.origins, stage.directions, 32, 12)
+    base, rough = torch.tensor(BASE), torch.tensor(alpha**0.5)
+    runs = torch.stack([stage.shade(base, rough, metallic, environment, k) for k in range(12)]).double().numpy()
+    got, got_var = runs.mean(0), runs.var(0, ddof=1) / len(runs)
+    z = np.abs(got - want) / np.sqrt(got_var + want_var + (1e-4 * want) ** 2 + 1e-12)  # float32 on both sides
+    # 12 runs give Student's t with about 20 degrees; the normal limit at 1 % Sidak over the pixels is widened to 6
+    assert (z < 6.0).mean() >= 0.9975
+    relative = np.abs(got.mean(0) - want.mean(0)) / want.mean(0)
+    noise = np.sqrt((got_var + want_var).sum(0)) / len(got) / want.mean(0)
+    assert (relative < 3.5 * noise + 1e-3).all(), (relative, noise)  # 1e-3: shadow edges of float32 geometry
+    assert erfc(np.median(z) / 2**0.5) > 0.35  # the typical pixel sits within its noise
+
+
+@pytest.mark.parametrize("material", MATERIALS)
+def test_gradients_with_shadows_equal_mitsubas(material):
+    """Base colour, GGX width and texels: means of 24 runs against means of 24 of Mitsuba's reverse mode."""
+    import math
+
+    mi = mitsuba_scene.load()
+    import drjit as dr
+
+    (alpha, metallic), environment, stage, runs = MATERIALS[material], light("sky"), Stage(32), 24
+    g = torch.Generator().manual_seed(8)
+    weight = torch.rand(len(stage.position), 3, generator=g)
+    probes = torch.randn(6, *environment.radiance.shape, generator=g)  # directions in the space of maps
+    probes[0] = 1.0
+    base, width = mi.Color3f(*BASE), mi.Float(alpha)
+    dr.enable_grad(base, width)
+    world = stage.world(mi, environment, mitsuba_scene.material(mi, base, width, metallic))
+    params = mi.traverse(world)
+    nodes = mi.TensorXf(params["light.data"])
+    integrator = mi.load_dict({"type": "direct", "emitter_samples": 32, "bsdf_samples": 32, "hide_emitters": True})
+    ray = mi.RayDifferential3f(mi.Point3f(stage.origins.numpy().T), mi.Vector3f(stage.directions.numpy().T))
+    want = []
+    for k in range(runs):
+        dr.enable_grad(nodes)
+        params["light.data"] = nodes
+        params.update()
+        for v in (base, width, nodes):
+            dr.set_grad(v, 0.0)
+        sampler = mi.load_dict({"type": "independent"})
+        sampler.seed(k + 1, len(weight))
+        color = integrator.sample(world, sampler, ray)[0]
+        dr.backward(dr.sum(dr.sum(color * mi.Color3f(weight.numpy().T))))
+        slopes = torch.from_numpy(np.array(dr.grad(nodes)))
+        folded = slopes[:, 1:-1].clone()  # a column of the other end is repeated on either side
+        folded[:, -1] += slopes[:, 0]
+        folded[:, 0] += slopes[:, -1]
+        leaf = environment.radiance.clone().requires_grad_()
+        (texels,) = torch.autograd.grad(mitsuba_scene.node_rows(leaf), leaf, folded)
+        row = [*np.array(dr.grad(base)).ravel(), float(np.array(dr.grad(width))[0])]
+        want.append(row + [float((texels * p).sum()) for p in probes])
+    got = []
+    for k in range(runs):
+        paint, rough = torch.tensor(BASE).requires_grad_(), torch.tensor(math.sqrt(alpha)).requires_grad_()
+        map_ = environment.radiance.clone().requires_grad_()
+        out = stage.shade(paint, rough, metallic, Environment(map_), k)
+        grads = torch.autograd.grad((out * weight).sum(), (paint, rough, map_))
+        to_alpha = float(grads[1]) / (2.0 * math.sqrt(alpha))
+        got.append([*grads[0].tolist(), to_alpha, *((grads[2] * p).sum().item() for p in probes)])
+    got, want = np.array(got), np.array(want)
+    error = np.sqrt((got.var(0, ddof=1) + want.var(0, ddof=1)) / runs) + 2e-4 * np.abs(want.mean(0))
+    # second term: shadow edges of float32 geometry, and the half floats of Mitsuba's map
+    z = (got.mean(0) - want.mean(0)) / error
+    assert np.abs(z).max() < 4.0, (z, got.mean(0), want.mean(0))  # 30 numbers in the family, t with 40 degrees
+    assert (np.abs(want.mean(0)) > 5 * error)[:5].all()  # the noise is far below what is compared
