@@ -112,20 +112,23 @@ def specified_flops(preset: Preset, count: int) -> dict[str, float]:
             "heads": 0.0, "merger": 0.0, "view_features": 0.0}  # fmt: skip
 
 
-def table(preset: Preset, count: int) -> str:
-    """Parameters and operations of each part beside the specification's, as rows of Markdown."""
+def parameters(preset: Preset) -> dict[str, int]:
+    """Parameters of each part that the preset has, buffers not counted."""
     with torch.device("meta"):
         model = Reconstructor(preset)
-    parameters = {part: sum(p.numel() for p in getattr(model, part).parameters()) for part in PARTS
-                  if hasattr(model, part)}  # fmt: skip
+    return {part: sum(p.numel() for p in getattr(model, part).parameters()) for part in PARTS if hasattr(model, part)}
+
+
+def table(preset: Preset, count: int) -> str:
+    """Parameters and operations of each part beside the specification's, as rows of Markdown."""
     flops, formula = counted(preset, count), specified_flops(preset, count)
-    stated = SPECIFIED if preset.name == "official" else {}
+    own, stated = parameters(preset), SPECIFIED if preset.name == "official" else {}
     rows = [f"| part | parameters | specification | GFLOP, {count} views | closed form |", "|---|---|---|---|---|"]
-    for part, number in parameters.items():
+    for part, number in own.items():
         rows.append(f"| {part} | {number:,} | {f'{stated[part]:,}' if part in stated else '-'} | "
                     f"{flops[part] / 1e9:.3f} | {formula[part] / 1e9:.3f} |")  # fmt: skip
     whole = f"{sum(stated.values()):,}" if stated else "-"
-    rows.append(f"| sum | {sum(parameters.values()):,} | {whole} | {sum(flops.values()) / 1e9:.1f} | "
+    rows.append(f"| sum | {sum(own.values()):,} | {whole} | {sum(flops.values()) / 1e9:.1f} | "
                 f"{sum(formula.values()) / 1e9:.1f} |")  # fmt: skip
     return "\n".join(rows)
 
