@@ -25,6 +25,7 @@ from reli3d.nn.field import surface_level
 from reli3d.nn.model import Reconstructor
 from reli3d.nn.presets import PRESETS, EncoderSizes, Preset
 from reli3d.nn.reni import EnvironmentDecoder
+from reli3d.nn.view_features import ViewMaps
 
 CASES: dict = {}
 PARTS = ("camera", "encoder", "bank", "backbone", "upsampler", "illumination", "environment", "heads", "merger",
@@ -195,11 +196,12 @@ def forward(path: Path, count: int, trunk: torch.dtype, device: torch.device, ru
         for name, seconds in clock.seconds.items():
             rate = f"{flops[name] / seconds / 1e9:8.0f} GFLOP/s" if flops.get(name) else ""
             print(f"  {name:16s} {seconds:8.3f} s {rate}")
-        if not model.preset.view_feature_width:
-            began, side = time.perf_counter(), torch.linspace(-0.87, 0.87, model.preset.resolution + 1, device=device)
-            surface_level(model, code, None, torch.cartesian_prod(side, side, side))
-            synchronise(device)
-            print(f"  {'density, grid':16s} {time.perf_counter() - began:8.3f} s")
+        images, masks, c2w, intrinsics = (t[0] for t in inputs)
+        maps = ViewMaps(code.view_tokens[0].float(), torch.cat([images, masks[..., None]], -1), c2w, intrinsics)
+        began, side = time.perf_counter(), torch.linspace(-0.87, 0.87, model.preset.resolution + 1, device=device)
+        surface_level(model, code, maps, torch.cartesian_prod(side, side, side))
+        synchronise(device)
+        print(f"  {'level, grid':16s} {time.perf_counter() - began:8.3f} s")
         if device.type == "cuda":
             print(f"  peak {torch.cuda.max_memory_allocated(device) / 2**30:.2f} GiB of the device")
         elif peak := _status("VmHWM"):
