@@ -7,6 +7,8 @@ pixels (y, x), (y, x + 1), (y + 1, x), (y + 1, x + 1); there are (H - 1) * (W - 
 
 import warp as wp
 
+from reli3d.kernels.bilinear import between_pixels, blend
+
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
 
 NEVER = wp.constant(65536.0)  # rows to a crossing where a column has none: beyond any image
@@ -224,15 +226,10 @@ def mask_distance_kernel(
 @wp.func
 def lookup(values: wp.array3d[float], view: int, x: float, y: float) -> float:
     """Bilinear value at pixel coordinates, the border's beyond it."""
-    u = wp.clamp(x - 0.5, 0.0, float(values.shape[2] - 1))
-    v = wp.clamp(y - 0.5, 0.0, float(values.shape[1] - 1))
-    i = wp.min(int(u), values.shape[2] - 2)
-    j = wp.min(int(v), values.shape[1] - 2)
-    s = u - float(i)
-    t = v - float(j)
-    top = values[view, j, i] * (1.0 - s) + values[view, j, i + 1] * s
-    bottom = values[view, j + 1, i] * (1.0 - s) + values[view, j + 1, i + 1] * s
-    return top * (1.0 - t) + bottom * t
+    at = between_pixels(x, y, values.shape[1], values.shape[2])
+    i = int(at[0])
+    j = int(at[1])
+    return blend(values[view, j, i], values[view, j, i + 1], values[view, j + 1, i], values[view, j + 1, i + 1], at)
 
 
 @wp.kernel

@@ -5,6 +5,8 @@ Cameras are OpenGL (look along -Z, +Y up); pixel centres lie at +0.5; outside th
 
 import warp as wp
 
+from reli3d.kernels.bilinear import between_pixels, blend
+
 wp.set_module_options({"enable_backward": True, "cpu_compiler_flags": "-march=native"})
 
 NEAR = wp.constant(1.0e-3)  # a point closer than this to the camera plane is treated as being on it
@@ -39,15 +41,10 @@ def gather_views_kernel(
     v = i - n * views
     q = project_point(points[n], c2w[v], intrinsics[v])
     pixels[n, v] = q
-    h = maps.shape[1]
-    w = maps.shape[2]
-    x = wp.clamp(q[0] - 0.5, 0.0, float(w - 1))
-    y = wp.clamp(q[1] - 0.5, 0.0, float(h - 1))
-    x0 = wp.min(int(x), w - 2)
-    y0 = wp.min(int(y), h - 2)
-    fx = x - float(x0)
-    fy = y - float(y0)
+    at = between_pixels(q[0], q[1], maps.shape[1], maps.shape[2])
+    x = int(at[0])
+    y = int(at[1])
     for c in range(maps.shape[3]):
-        top = maps[v, y0, x0, c] * (1.0 - fx) + maps[v, y0, x0 + 1, c] * fx
-        bottom = maps[v, y0 + 1, x0, c] * (1.0 - fx) + maps[v, y0 + 1, x0 + 1, c] * fx
-        features[n, v, c] = top * (1.0 - fy) + bottom * fy
+        features[n, v, c] = blend(
+            maps[v, y, x, c], maps[v, y, x + 1, c], maps[v, y + 1, x, c], maps[v, y + 1, x + 1, c], at
+        )

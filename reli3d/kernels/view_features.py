@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from reli3d.kernels.bilinear import between_pixels, blend
 from reli3d.kernels.projection import project_point
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
@@ -16,17 +17,10 @@ OUTSIDE = wp.constant(0.15)  # silhouette distances beyond this share of the ima
 @wp.func
 def look_up(image: wp.array3d[wp.vec4], view: int, x: float, y: float) -> wp.vec4:
     """Bilinear value at pixel coordinates, the border's value outside."""
-    h = image.shape[1]
-    w = image.shape[2]
-    cx = wp.clamp(x - 0.5, 0.0, float(w - 1))
-    cy = wp.clamp(y - 0.5, 0.0, float(h - 1))
-    x0 = wp.min(int(cx), w - 2)
-    y0 = wp.min(int(cy), h - 2)
-    fx = cx - float(x0)
-    fy = cy - float(y0)
-    top = image[view, y0, x0] * (1.0 - fx) + image[view, y0, x0 + 1] * fx
-    bottom = image[view, y0 + 1, x0] * (1.0 - fx) + image[view, y0 + 1, x0 + 1] * fx
-    return top * (1.0 - fy) + bottom * fy
+    at = between_pixels(x, y, image.shape[1], image.shape[2])
+    i = int(at[0])
+    j = int(at[1])
+    return blend(image[view, j, i], image[view, j, i + 1], image[view, j + 1, i], image[view, j + 1, i + 1], at)
 
 
 @wp.kernel
