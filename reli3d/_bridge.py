@@ -14,7 +14,7 @@ import os
 import sys
 import tempfile
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from types import ModuleType
@@ -23,6 +23,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
+WORKER = "reli3d-slice"  # how the threads of the pool are called
 SLICES = 16  # several a thread balance uneven rays on 2 to 8 cores; more only add 20 us of launch each
 CPU_BLOCK = 1  # block size of Warp's CPU launches; loading a module for its default one would compile it once more
 COMPILERS = 4  # modules compiled at once; each thread builds its own precompiled header, 1.5 CPU seconds
@@ -71,7 +72,18 @@ def _private_folder() -> str:
 
 @lru_cache(1)
 def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(max_workers=max(1, torch.get_num_threads()), thread_name_prefix="reli3d-slice")
+    """Threads for slices and blocks; torch inside each of them uses that one thread alone."""
+    threads = max(1, torch.get_num_threads())
+    pool = ThreadPoolExecutor(max_workers=threads, thread_name_prefix=WORKER)
+    started = threading.Barrier(threads)
+
+    def start(_) -> None:
+        started.wait()  # so that every task has a thread of its own
+        torch.set_num_threads(1)
+
+    list(pool.map(start, range(threads)))
+    torch.set_num_threads(threads)  # what torch gives to threads that start later; each keeps its own number
+    return pool
 
 
 if hasattr(os, "register_at_fork"):
@@ -88,10 +100,34 @@ def slices(n: int, slice_min: int = SLICE_MIN) -> list[tuple[int, int]]:
 def over_slices(n: int, work, *, slice_min: int = SLICE_MIN) -> list:
     """``[work(k, start, count), ...]`` for every slice of ``n``, on the thread pool where there is more than one."""
     parts = slices(n, slice_min)
-    inside = threading.current_thread().name.startswith("reli3d-slice")  # waiting for its own pool would never end
-    if len(parts) == 1 or torch.get_num_threads() == 1 or inside:
-        return [work(k, *part) for k, part in enumerate(parts)]
-    return list(_pool().map(lambda item: work(item[0], *item[1]), enumerate(parts)))
+    if len(parts) == 1:
+        return [work(0, *parts[0])]
+    return _mapped(lambda item: work(item[0], *item[1]), enumerate(parts))
+
+
+def over_rows(n: int, rows: int, work) -> list:
+    """``[work(start, stop), ...]`` for blocks of ``rows`` of ``n`` rows, on the thread pool; no gradient is recorded.
+
+    For chains of torch operations whose intermediate values of a block stay in a core's cache.  Torch computes a block
+    in one thread, so the bits do not depend on the number of threads.
+    """
+
+    def block(start: int):
+        with torch.no_grad():  # the mode belongs to the thread
+            return work(start, min(start + rows, n))
+
+    return _mapped(block, range(0, n, rows))
+
+
+def _mapped(work, items: Iterable) -> list:
+    return [work(item) for item in items] if _serial() else list(_pool().map(work, items))
+
+
+def _serial() -> bool:
+    """Whether the calling thread computes alone: torch has one thread, or this is a thread of the pool, which would
+    never end waiting for itself.
+    """
+    return torch.get_num_threads() == 1 or threading.current_thread().name.startswith(WORKER)
 
 
 @contextlib.contextmanager
@@ -149,6 +185,9 @@ def launch(kernel, n: int, args: Sequence, device: torch.device, *, slice_min: i
             wp.launch(kernel, n, [0, *values], device=name)
             return
         kernel.module.load(wp.get_device("cpu"), block_dim=CPU_BLOCK)
+        if _serial():
+            wp.launch(kernel, n, [0, *values], device="cpu")  # no thread would take a slice
+            return
         over_slices(n, lambda k, start, count: wp.launch(kernel, count, [start, *values], device="cpu"),
                     slice_min=slice_min)  # fmt: skip
 

@@ -23,7 +23,7 @@ from reli3d.geometry.surface import extract_surface, surface_cubes
 from reli3d.geometry.tangents import encode_normals, vertex_tangents
 from reli3d.geometry.uv import unwrap, unwrap_xatlas
 from reli3d.geometry.visibility import visible_from
-from reli3d.nn.field import LIGHT_ROWS, bound_level, object_shading, surface_level, surface_material
+from reli3d.nn.field import LIGHT_ROWS, bound_level, in_rows, object_shading, surface_level, surface_material
 from reli3d.nn.heads import deformation
 from reli3d.nn.model import Code, Reconstructor
 from reli3d.nn.presets import Preset
@@ -171,7 +171,7 @@ def texture(
         bumped = radial_bump(position, normal, got["normal"])
         return {"base_color": got["base_color"], "orm": orm, "normal": encode_normals(bumped, normal, tangent)}
 
-    baked = bake(mesh, size, surface, chunk=CHUNK, tangents=True)
+    baked = bake(mesh, size, lambda *at: in_rows(surface, *at), chunk=CHUNK, tangents=True)
     return mesh, TextureSet(**{k: v.clamp(0, 1).contiguous() for k, v in baked.items()})
 
 

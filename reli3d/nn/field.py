@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from reli3d._bridge import over_rows
 from reli3d.geometry.hull import hull_distance
 from reli3d.nn.model import Code, Reconstructor
 from reli3d.nn.shading import Shading, brightness_over_normal
@@ -45,12 +46,14 @@ def surface_level(model: Reconstructor, code: Code, maps: ViewMaps, points: Tens
 
 
 def in_rows(evaluate: Callable[..., dict[str, Tensor]], *inputs: Tensor) -> dict[str, Tensor]:
-    """``evaluate(*inputs)`` on ROWS rows of the inputs at a time, put together again; all at once where gradients
-    are recorded.
+    """``evaluate(*inputs)``; on CPU, where no gradient is recorded, block by block of ROWS rows of the inputs.
+
+    The blocks run on the threads of the bridge's pool, so ``evaluate`` must work row by row and keep no state.
     """
-    if torch.is_grad_enabled() or len(inputs[0]) <= ROWS:
+    n = len(inputs[0])
+    if torch.is_grad_enabled() or inputs[0].is_cuda or n == 0:
         return evaluate(*inputs)
-    parts = [evaluate(*rows) for rows in zip(*(x.split(ROWS) for x in inputs), strict=True)]
+    parts = over_rows(n, ROWS, lambda start, stop: evaluate(*(x[start:stop] for x in inputs)))
     return {name: torch.cat([p[name] for p in parts]) for name in parts[0]}
 
 

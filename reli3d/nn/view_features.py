@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import linear
 
-from reli3d.geometry.projection import OWN, gather_views, summarize_views
+from reli3d.geometry.projection import OWN, gather_views, pool_views, summarize_views
 
 
 @dataclass(frozen=True)
@@ -44,11 +44,16 @@ class ViewFeatures(nn.Module):
         visible: ``(N, V)``, 1 where the view sees the surface point, 0 where it is hidden; without it the points are
         in free space. normal: ``(N, 3)`` unit, outward, beside ``visible``.  Gradients reach the tokens.
         """
-        size, grid = maps.images.shape[1], maps.tokens.shape[1]
-        tokens, _ = gather_views(self.tokens(maps.tokens), points, maps.c2w, maps.intrinsics * (grid / size))
-        own, weight, summary = summarize_views(maps.images, maps.c2w, maps.intrinsics, points, visible, normal)
         first, activation, last = self.per_view
-        channels = tokens.shape[-1]
-        hidden = linear(tokens, first.weight[:, :channels]) + linear(own, first.weight[:, channels:], first.bias)
-        pooled = last((weight[:, None] @ activation(hidden))[:, 0])  # pooled before the last layer: it is linear
-        return torch.cat([pooled, summary], -1), summary[:, :3]
+        tokens, channels = self.tokens(maps.tokens), self.tokens.out_features
+        of_tokens, of_own = first.weight[:, :channels], first.weight[:, channels:]
+        if torch.is_grad_enabled():
+            scale = maps.tokens.shape[1] / maps.images.shape[1]
+            gathered, _ = gather_views(tokens, points, maps.c2w, maps.intrinsics * scale)
+            own, weight, summary = summarize_views(maps.images, maps.c2w, maps.intrinsics, points, visible, normal)
+            hidden = linear(gathered, of_tokens) + linear(own, of_own, first.bias)
+            pooled = (weight[:, None] @ activation(hidden))[:, 0]
+        else:  # bilinear weights sum to 1: the layer and its bias may come before the look-up
+            pooled, summary = pool_views(maps.images, linear(tokens, of_tokens, first.bias), of_own.T, maps.c2w,
+                                         maps.intrinsics, points, visible, normal)  # fmt: skip
+        return torch.cat([last(pooled), summary], -1), summary[:, :3]  # pooled before the last layer: it is linear
