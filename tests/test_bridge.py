@@ -323,3 +323,24 @@ def test_modules_load_together_and_are_known_as_compiled(tmp_path, monkeypatch, 
     assert _bridge.compiled([distance, noise], device)
     monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
     assert not _bridge.compiled([distance, noise], device)
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_blocks_of_rows_come_in_order_without_gradient_and_with_one_torch_thread(threads, count):
+    threads(count)
+    weight = torch.ones(3, requires_grad=True)
+    seen = _bridge.over_rows(10, 4, lambda a, b: (a, b, torch.get_num_threads(), (weight * 2).requires_grad))
+    assert seen == [(0, 4, 1, False), (4, 8, 1, False), (8, 10, 1, False)]
+    assert torch.get_num_threads() == count and torch.is_grad_enabled()
+    assert _bridge.over_rows(0, 4, lambda a, b: (a, b)) == []
+
+
+def test_bits_of_a_block_of_torch_do_not_depend_on_the_threads(threads):
+    g = torch.Generator().manual_seed(0)
+    x, w = torch.randn(3000, 120, generator=g), torch.randn(120, 64, generator=g)
+    results = []
+    for count in (1, 2, 5):
+        threads(count)
+        parts = _bridge.over_rows(len(x), 700, lambda a, b: torch.nn.functional.silu(x[a:b] @ w))
+        results.append(torch.cat(parts))
+    assert all(torch.equal(results[0], other) for other in results[1:])

@@ -101,6 +101,23 @@ class RayScene:
             launch(kernels.occluded_kernel, o.shape[0], args, self.device)
         return out.reshape(shape)
 
+    def clear(self, origins: Tensor, directions: Tensor, t_max: Tensor) -> Tensor:
+        """Whether nothing lies on a ray before its ``t_max``, ``(N,)`` bool; False where ``t_max`` is below 0.
+
+        For rays that a kernel has made, ``(N, 3)``, ``(N, 3)`` and ``(N,)`` on the device: their values are not checked.
+        """
+        if self._embree is None:
+            return (t_max >= 0.0) & ~self.occluded(origins, directions, t_max=t_max)
+        out = torch.empty(len(origins), dtype=torch.bool)
+
+        def work(_, start, count):
+            part = slice(start, start + count)
+            out[part] = self.embree_blocked(origins[part], directions[part], t_max[part]) < 0
+
+        if len(origins):
+            over_slices(len(origins), work)
+        return out
+
     @property
     def mesh_id(self) -> int:
         """Handle of Warp's mesh for kernels that trace rays themselves; 0 without faces or with Embree."""

@@ -7,6 +7,8 @@ only.  A ray with a NaN, an infinity or no direction misses.  ``t`` counts in le
 
 import warp as wp
 
+from reli3d.kernels.projection import project_point
+
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
 
 OFFSET = wp.constant(3.814697265625e-06)  # 2^-18: 64 ulp; interpolation errs by some 7 ulp of the largest coordinate
@@ -119,3 +121,34 @@ def ray_key_kernel(
     for axis in range(3):
         k = k * 4 + int(wp.clamp(place[axis], 0.0, 3.0))
     key[i] = wp.int16(k - 32768)
+
+
+@wp.kernel
+def sight_kernel(
+    start: int,
+    # in
+    position: wp.array(dtype=wp.vec3), normal: wp.array(dtype=wp.vec3), c2w: wp.array(dtype=wp.mat44),
+    intrinsics: wp.array(dtype=wp.vec4), size: float, grazing: float,
+    # out
+    origin: wp.array(dtype=wp.vec3), direction: wp.array(dtype=wp.vec3), t_max: wp.array(dtype=float),
+):  # fmt: skip
+    """Ray from a point of a surface to a camera; ``t_max`` is -1 where the point looks away or lies off the image.
+
+    A thread is a point and a camera, the camera running faster.
+    """
+    i = start + wp.tid()
+    point = i // c2w.shape[0]
+    camera = i % c2w.shape[0]
+    p = position[point]
+    n = normal[point]
+    pose = c2w[camera]
+    away = wp.vec3(pose[0, 3], pose[1, 3], pose[2, 3]) - p
+    distance = wp.length(away)
+    toward = away / distance
+    q = project_point(p, pose, intrinsics[camera])
+    t_max[i] = -1.0
+    if wp.dot(toward, n) > grazing and q[2] > 0.0:
+        if q[0] > 0.0 and q[0] < size and q[1] > 0.0 and q[1] < size:
+            t_max[i] = distance
+    direction[i] = toward
+    origin[i] = offset_origin(p, n, toward, 1.0)

@@ -48,6 +48,13 @@ def mlp(inputs: int, width: int, outputs: int, hidden: int) -> nn.Sequential:
     return nn.Sequential(*layers[:-1])
 
 
+def _rest(layers: nn.Sequential, x: Tensor) -> Tensor:
+    """What :func:`mlp` makes of its first activation ``x``; without gradient."""
+    for layer in layers[2:]:
+        x = functional.silu(x, inplace=True) if isinstance(layer, nn.SiLU) else layer(x)
+    return x
+
+
 def activate(name: str, raw: Tensor) -> Tensor:
     """The named head's value from its MLP's output.
 
@@ -77,7 +84,14 @@ class Heads(nn.ModuleDict):
         for name in names:
             if name not in self:
                 raise ValueError(f"heads: expected some of {', '.join(self)}, got {name}")
-        raw = {name: self[name](features) for name in names}
+        if torch.is_grad_enabled():
+            raw = {name: self[name](features) for name in names}
+        else:  # one matrix for the first layers of all heads; what nobody will ask again is overwritten
+            first = [self[name][0] for name in names]
+            hidden = functional.linear(features, torch.cat([layer.weight for layer in first]),
+                                       torch.cat([layer.bias for layer in first]))  # fmt: skip
+            parts = functional.silu(hidden, inplace=True).split([layer.out_features for layer in first], -1)
+            raw = {name: _rest(self[name], part) for name, part in zip(names, parts, strict=True)}
         if color is not None and "base_color" in raw:
             raw["base_color"] = raw["base_color"] + color.clamp(COLOR_MARGIN, 1.0 - COLOR_MARGIN).logit()
         return {name: activate(name, value) for name, value in raw.items()}

@@ -74,7 +74,8 @@ class Reconstructor(nn.Module):
             self.view_features = ViewFeatures(width, width=preset.view_feature_width)
         if preset.tone_mapping:
             self.tone_mapping = ToneMappingConstants()
-        initialise(self)
+        if self.device.type != "meta":  # there are no values there, and torch would import its compiler to say so
+            initialise(self)
 
     @property
     def device(self) -> torch.device:
@@ -127,7 +128,7 @@ class Reconstructor(nn.Module):
             shown = torch.where(background_visible[:, None, None, None], torch.ones_like(masks), masks)
         lit = images * shown.unsqueeze(-1)
         latent, rotation, strength = self.illumination(lit, extra(light, shown), camera, planes)
-        triplane = self.upsampler(planes).float()
+        triplane = self.upsampler(planes).float().movedim(2, -1).contiguous().movedim(-1, 2)  # as sample_triplane reads
         return Code(triplane, patch_grid(tokens), latent, rotation, strength)
 
     def decode_environment(self, code: Code, height: int | None = None) -> Tensor:

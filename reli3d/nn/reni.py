@@ -52,7 +52,8 @@ class _VnLinear(nn.Module):
 class _VnRelu(nn.Module):
     def __init__(self, channels: int):
         super().__init__()
-        self.W, self.U = (nn.Parameter(torch.eye(channels)) for _ in range(2))
+        # not torch.eye: on the meta device, where weights.load builds, it imports all of torch's compiler, for 2 seconds
+        self.W, self.U = (nn.Parameter(torch.zeros(channels, channels).fill_diagonal_(1.0)) for _ in range(2))
 
 
 class _VnInvariant(nn.Module):
@@ -164,7 +165,8 @@ class EnvironmentDecoder(nn.Module):
         super().__init__()
         self.height, self.latents = sizes.height, sizes.latents
         self.field = ReniField(sizes)
-        self.register_buffer("sample_directions", reni_frame(map_directions(sizes.height)).flatten(0, 1))
+        directions = reni_frame(map_directions(sizes.height, torch.device("cpu"))).flatten(0, 1)  # arange: as torch.eye
+        self.register_buffer("sample_directions", directions.to(torch.empty(0).device))
 
     def forward(self, latent: Tensor, rotation: Tensor, strength: Tensor, height: int | None = None, *,
                 z_rotation: Tensor | None = None) -> Tensor:  # fmt: skip
