@@ -1,6 +1,8 @@
 """The command from folders to files: what it writes, what it refuses, and how it ends."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -11,6 +13,7 @@ from reli3d.cli import infer
 from reli3d.data.folder import load_views
 from reli3d.io.glb import read_glb
 from reli3d.io.hdr import read_environment
+from reli3d.nn.weights import load_model
 from tests import evil
 
 QUICK = ["--texture-size", "256", "--resolution", "40", "--device", "cpu"]
@@ -124,3 +127,25 @@ def test_check_explains_the_example_and_draws_the_rig(tmp_path, capsys):
     lines = capsys.readouterr().out.splitlines()
     assert len(load_views(infer.EXAMPLE)) == 4 and any("agree" in line for line in lines)
     assert (tmp_path / "example" / "rig.png").stat().st_size > 10_000
+
+
+def test_the_first_run_compiles_what_it_needs_side_by_side(tmp_path):
+    """A module missing from KERNELS would compile alone, at its first launch; one too many costs every first run."""
+    code = f"""
+import sys
+from pathlib import Path
+from reli3d.cli import infer
+infer.ready_kernels = lambda device: None
+assert infer.main(["--output", {str(tmp_path)!r}, *{QUICK!r}]) == 0
+import warp
+names = [p.stem for p in (Path(infer.__file__).parents[1] / "kernels").glob("*.py") if p.stem != "__init__"]
+loaded = [n for n in names if f"reli3d.kernels.{{n}}" in sys.modules and warp.get_module(f"reli3d.kernels.{{n}}").execs]
+sys.stdout.write("loaded " + " ".join(sorted(loaded)))
+compiler = [n for n in ("torch._dynamo", "sympy", "trimesh", "matplotlib") if n in sys.modules]
+sys.stdout.write("; heavy " + " ".join(compiler))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    shading = load_model("small").preset.shading_features  # without them nobody looks the light up by normal
+    expected = sorted(set(infer.KERNELS) - (set() if shading else {"envmap"}))
+    assert done.stdout.splitlines()[-1] == f"loaded {' '.join(expected)}; heavy "

@@ -12,8 +12,8 @@ from pathlib import Path
 
 STARTED = time.monotonic()
 EXAMPLE = Path(__file__).parents[1] / "assets" / "example"
-KERNELS = ("hull", "projection", "view_features", "triplane", "flexicubes", "uv", "raster", "intersect", "attributes",
-           "random", "shade")  # modules of reli3d.kernels that one object needs  # fmt: skip
+KERNELS = ("hull", "view_features", "triplane", "flexicubes", "uv", "raster", "intersect", "attributes", "random",
+           "shade", "envmap")  # modules of reli3d.kernels that one object needs  # fmt: skip
 
 
 def parser() -> argparse.ArgumentParser:
@@ -163,6 +163,7 @@ class Job:
         check_options(args.texture_size, args.resolution)
         if args.download:
             _fetch(args.weights)
+        ready_kernels(device)
         self.args, self.device, self.complete = args, device, results.complete
         path = weights.locate(args.weights)
         trunk = args.precision and {"float32": torch.float32, "bfloat16": torch.bfloat16}[args.precision]

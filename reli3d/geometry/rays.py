@@ -104,7 +104,7 @@ class RayScene:
     def clear(self, origins: Tensor, directions: Tensor, t_max: Tensor) -> Tensor:
         """Whether nothing lies on a ray before its ``t_max``, ``(N,)`` bool; False where ``t_max`` is below 0.
 
-        For rays that a kernel has made, ``(N, 3)``, ``(N, 3)`` and ``(N,)`` on the device: their values are not checked.
+        For rays that a kernel has made, ``(N, 3)``, ``(N, 3)`` and ``(N,)`` on the device: values are not checked.
         """
         if self._embree is None:
             return (t_max >= 0.0) & ~self.occluded(origins, directions, t_max=t_max)

@@ -147,8 +147,7 @@ def sight_kernel(
     toward = away / distance
     q = project_point(p, pose, intrinsics[camera])
     t_max[i] = -1.0
-    if wp.dot(toward, n) > grazing and q[2] > 0.0:
-        if q[0] > 0.0 and q[0] < size and q[1] > 0.0 and q[1] < size:
-            t_max[i] = distance
+    if wp.dot(toward, n) > grazing and q[2] > 0.0 and q[0] > 0.0 and q[0] < size and q[1] > 0.0 and q[1] < size:
+        t_max[i] = distance
     direction[i] = toward
     origin[i] = offset_origin(p, n, toward, 1.0)

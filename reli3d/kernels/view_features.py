@@ -61,7 +61,7 @@ def view_numbers(
 def surface_point(surface: int, visible: wp.array2d[float], normal: wp.array[wp.vec3], n: int, view: int):
     """Visibility and normal of point ``n``; of no meaning for a point in space."""
     if surface == 0:
-        return float(0.0), wp.vec3()
+        return 0.0, wp.vec3()
     return visible[n, view], normal[n]
 
 

@@ -52,7 +52,7 @@ class _VnLinear(nn.Module):
 class _VnRelu(nn.Module):
     def __init__(self, channels: int):
         super().__init__()
-        # not torch.eye: on the meta device, where weights.load builds, it imports all of torch's compiler, for 2 seconds
+        # not torch.eye: on the meta device, where weights.load builds, it imports torch's compiler, for 2 seconds
         self.W, self.U = (nn.Parameter(torch.zeros(channels, channels).fill_diagonal_(1.0)) for _ in range(2))
 
 
