@@ -141,7 +141,7 @@ import warp
 names = [p.stem for p in (Path(infer.__file__).parents[1] / "kernels").glob("*.py") if p.stem != "__init__"]
 loaded = [n for n in names if f"reli3d.kernels.{{n}}" in sys.modules and warp.get_module(f"reli3d.kernels.{{n}}").execs]
 sys.stdout.write("loaded " + " ".join(sorted(loaded)))
-compiler = [n for n in ("torch._dynamo", "sympy", "trimesh", "matplotlib") if n in sys.modules]
+compiler = [n for n in ("torch._dynamo", "trimesh", "matplotlib") if n in sys.modules]
 sys.stdout.write("; heavy " + " ".join(compiler))
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path)
