@@ -176,7 +176,7 @@ class RayScene:
             far = t_max.detach()
         else:
             far = torch.tensor(float(t_max), device=self.device)
-        shape = torch.broadcast_shapes(origins.shape[:-1], directions.shape[:-1], far.shape)
+        shape = np.broadcast_shapes(origins.shape[:-1], directions.shape[:-1], far.shape)
         o = origins.detach().expand(*shape, 3).reshape(-1, 3).contiguous()
         d = directions.detach().expand(*shape, 3).reshape(-1, 3).contiguous()
         far = far.reshape(1) if far.numel() == 1 else far.expand(shape).reshape(-1).contiguous()
@@ -263,7 +263,7 @@ def offset_origin(position: Tensor, ng: Tensor, direction: Tensor, *, scale: flo
     check("position", position, last=3)
     check("ng", ng, last=3, like=position)
     check("direction", direction, last=3, like=position)
-    shape = torch.broadcast_shapes(position.shape, ng.shape, direction.shape)
+    shape = np.broadcast_shapes(position.shape, ng.shape, direction.shape)
     ins = [(v.detach().expand(shape).reshape(-1, 3).contiguous(), wp.vec3) for v in (position, ng, direction)]
     out = empty((ins[0][0].shape[0],), wp.vec3, position.device)
     launch(kernels.offset_origin_kernel, out.shape[0], [*ins, float(scale), (out, wp.vec3)], position.device)
