@@ -12,7 +12,7 @@ from bench.run import BASELINE, collect, line, measure
 from reli3d.nn.presets import PRESETS
 
 TOLERANCE = 1.5  # other work on the machine moved a ratio of medians by up to 1.25 between runs; a lost factor is 2
-QUICK = 0.5  # seconds a step
+QUICK = 0.1  # seconds a step, or as many as its fewest runs take
 AGAIN = 3.0  # seconds a step when the quick look says slower
 
 CASES = collect()
