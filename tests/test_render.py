@@ -168,6 +168,10 @@ def test_command_writes_views_layers_and_turntable(tmp_path, capsys):
     assert (tmp_path / "out" / "ball_normal.exr").exists()
     assert main([*common, "--frames", "3", "--turn", "light", "--format", "webp"]) == 0
     assert Image.open(tmp_path / "out" / "ball.webp").n_frames >= 1  # equal frames of a uniform light are merged
+    assert main([*common, "--tone", "none"]) == 0
+    linear = np.asarray(Image.open(tmp_path / "out" / "ball.png")).astype(float)[12, 12, 0] / 255
+    encoded = picture[12, 12, 0] / 255
+    assert abs(((encoded + 0.055) / 1.055) ** 2.4 - linear) < 0.02  # of 0.6; 8 bits in a curve of slope up to 2
     capsys.readouterr()
     for wrong in (["--size", "0"], ["--elevation", "90"], ["--light", str(tmp_path / "none.hdr")]):
         assert main([*common, *wrong]) == 2

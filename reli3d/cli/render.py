@@ -31,7 +31,8 @@ def parser() -> argparse.ArgumentParser:
                    help="per subpixel, by strategy (default 20 40 4)")  # fmt: skip
     p.add_argument("--supersampling", type=int, default=2, help="subpixels along a side of a pixel (default 2)")
     p.add_argument("--background", choices=("transparent", "environment"), default="transparent")
-    p.add_argument("--tone", choices=("srgb", "agx"), default="srgb", help="display transform of png and webp")
+    p.add_argument("--tone", choices=("srgb", "agx", "none"), default="srgb",
+                   help="display transform of png and webp; none writes linear values")  # fmt: skip
     p.add_argument("--exposure", type=float, default=0.0, help="stops")
     p.add_argument("--aovs", action="store_true", help="also EXR files of base colour, material (0, roughness, "
                    "metallic), normal (n / 2 + 1 / 2) and depth (depth, depth, alpha)")  # fmt: skip
@@ -133,7 +134,8 @@ def _picture(image, args):
     radiance = image.radiance * 2.0**args.exposure
     if args.background == "transparent":  # the transform is not linear: it takes the colour, not the premultiplied one
         radiance = radiance / image.alpha[..., None].clamp(min=1e-6)
-    shown = agx(radiance) if args.tone == "agx" else linear_to_srgb(radiance).clamp(0.0, 1.0)
+    tone = {"srgb": linear_to_srgb, "agx": agx, "none": lambda v: v}[args.tone]
+    shown = tone(radiance).clamp(0.0, 1.0)
     if args.background == "transparent":
         shown = torch.cat([shown, image.alpha[..., None]], -1)
     return Image.fromarray((shown * 255.0 + 0.5).to(torch.uint8).cpu().numpy())
