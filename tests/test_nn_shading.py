@@ -1,10 +1,12 @@
 """What the material is told of the light: against Lambert's law under lights whose irradiance is known."""
 
+import pytest
 import torch
 from torch.nn.functional import normalize
 
 from reli3d.nn.presets import SHADING_FEATURES
-from reli3d.nn.shading import DARKEST, Shading, brightness_over_normal, harmonics
+from reli3d.nn.shading import DARKEST, MARGIN, Shading, brightness_over_normal, harmonics, palette_of, unshaded
+from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.render.environment import Environment
 
 
@@ -60,14 +62,36 @@ def test_nothing_seen_and_black_give_one():
     assert torch.isfinite(brightness_over_normal(torch.rand(3, 3), torch.ones(3), normals(3))).all()
 
 
-def test_features_are_normal_irradiance_and_brightness():
-    n = normals(50)
+def test_the_palette_is_weighted_by_what_is_seen():
+    color = torch.cat([torch.full((30, 3), 0.25), torch.full((10, 3), 0.9)])
+    seen = (torch.arange(40) < 30).float()
+    got = palette_of(color, color.sqrt(), seen)
+    torch.testing.assert_close(got[:3], torch.full((3,), 0.25).logit(), rtol=0, atol=1e-4)
+    torch.testing.assert_close(got[3:6], torch.full((3,), 0.5).logit(), rtol=0, atol=1e-4)
+    assert float(got[6:].max()) < 1e-2  # all seen points have one colour
+    both = palette_of(color, color, torch.ones(40))
+    values = color.logit()[:, 0]
+    assert float(both[6]) == pytest.approx(float(values.std(correction=0)), rel=1e-4)
+
+
+def test_shade_divides_in_linear_light():
+    paint = torch.rand(100, 3) * 0.6 + 0.1
+    shaded = linear_to_srgb(srgb_to_linear(paint) * 0.3)
+    torch.testing.assert_close(unshaded(shaded, torch.full_like(paint, 0.3)), paint, rtol=1e-4, atol=1e-5)
+
+
+def test_features_in_their_order():
+    n, color = normals(50), torch.rand(50, 3)
     observed = torch.zeros(9, 3)
     observed[0], observed[2] = 1.0, 2.0  # 1 + 2 y, negative below
-    shading = Shading(Environment.constant(torch.tensor([1.0, 2.0, 3.0])).irradiance(), observed)
-    got = shading.features(n)
+    light = Environment.constant(torch.tensor([1.0, 2.0, 3.0])).irradiance()
+    got = Shading(light, observed, torch.arange(12.0)).features(n, color)
     assert got.shape == (50, SHADING_FEATURES)
     torch.testing.assert_close(got[:, :3], n)
     expected = torch.log(torch.tensor([1.0, 2.0, 3.0]) + 0.01)
     torch.testing.assert_close(got[:, 3:6], expected.expand(50, 3), rtol=0, atol=5e-3)  # the map's 16 rows
-    torch.testing.assert_close(got[:, 6], torch.log((1 + 2 * n[:, 1]).clamp(min=DARKEST)), rtol=1e-4, atol=1e-5)
+    brightness = (1 + 2 * n[:, 1]).clamp(min=DARKEST)
+    torch.testing.assert_close(got[:, 6], torch.log(brightness), rtol=1e-4, atol=1e-5)
+    plain = unshaded(color, brightness[:, None].expand(-1, 3)).clamp(MARGIN, 1 - MARGIN)
+    torch.testing.assert_close(got[:, 9:12], plain.logit(), rtol=1e-3, atol=1e-3)
+    assert torch.equal(got[:, 12:], torch.arange(12.0).expand(50, 12))

@@ -18,6 +18,7 @@ from reli3d.nn.reni import map_directions
 from reli3d.render.camera import project
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.train.calibrate import calibrate
+from reli3d.train.heads import train_heads
 from reli3d.train.light_prior import fit, scale_free
 from reli3d.train.loop import TrainConfig, averaged_model, progress, rate_at, train
 from reli3d.train.losses import losses, pattern_loss
@@ -179,6 +180,32 @@ def test_the_light_prior_fits_a_map():
     error = (got.log() - maps.reshape(1, -1, 3).log()).abs().mean()
     spread = (maps.log() - maps.log().mean()).abs().mean()
     assert float(error) < 0.5 * float(spread)  # 60 steps are enough to know up from down
+
+
+def test_heads_learn_on_the_codes_of_a_trunk_that_stays(folder, tmp_path):
+    config = TrainConfig(str(folder), str(tmp_path), minutes=0.1, batch=2, points=256, max_views=2, rate=1e-3)
+    with pytest.raises(ValueError, match="output: expected a folder with state.pt"):
+        train_heads(Reconstructor(SMALL), config)
+    torch.manual_seed(0)
+    start = Reconstructor(SMALL)
+    before = {k: v.clone() for k, v in start.state_dict().items()}
+    torch.save({"model": before, "average": before, "step": 7}, tmp_path / "state.pt")
+    model = Reconstructor(SMALL)
+    train_heads(model, config)
+    state = torch.load(tmp_path / "state.pt", weights_only=True)
+    assert state["step"] == 7
+    for key, value in state["average"].items():
+        moves = key.startswith(("heads.", "view_features.")) and not key.startswith(("heads.deform", "heads.flexi"))
+        assert torch.equal(value, before[key]) != moves, key
+    fixed = next(batches(folder, size=1, points=512, max_views=1, seed=9))
+    with torch.no_grad():
+        torch.manual_seed(0)
+        old = losses(start, fixed)
+        torch.manual_seed(0)
+        new = losses(model, fixed)
+    assert float(new["occupancy"]) < float(old["occupancy"])
+    with pytest.raises(ValueError, match="minutes: expected"):
+        train_heads(model, dataclasses.replace(config, minutes=float("inf")))
 
 
 class _Thin(Reconstructor):

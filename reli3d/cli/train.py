@@ -19,6 +19,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("output", type=Path, help="folder of the checkpoint, the log, the curves and validation pictures")
     p.add_argument("--light-prior", type=Path, help="environment decoder made by python -m reli3d.train.light_prior; "
                    "kept as it is")  # fmt: skip
+    p.add_argument("--heads", action="store_true", help="train the heads alone, --minutes on, with the trunk of OUTPUT")
     p.add_argument("--steps", type=int, default=20000)
     p.add_argument("--minutes", type=float, default=float("inf"), help="end of the schedule in minutes of training")
     p.add_argument("--batch", type=int, default=4, help="objects a step")
@@ -48,6 +49,7 @@ def main(argv: list[str] | None = None) -> int:
     from reli3d.nn.model import Reconstructor
     from reli3d.nn.presets import SMALL
     from reli3d.train.calibrate import calibrate
+    from reli3d.train.heads import train_heads
     from reli3d.train.loop import TrainConfig, averaged_model, train
     from reli3d.train.workers import Workers
 
@@ -66,7 +68,8 @@ def main(argv: list[str] | None = None) -> int:
             model.environment.load_state_dict({k: v for k, v in prior.items() if k != "latents"})
             model.environment.requires_grad_(False)
         workers = Workers.join()
-        train(model, TrainConfig(samples=str(args.samples), output=str(args.output), steps=args.steps,
+        run = train_heads if args.heads else train
+        run(model, TrainConfig(samples=str(args.samples), output=str(args.output), steps=args.steps,
                                  minutes=args.minutes, batch=args.batch, points=args.points, max_views=args.max_views,
                                  rate=args.rate, seed=args.seed,
                                  validation=str(args.validation or "")), workers)  # fmt: skip

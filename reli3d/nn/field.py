@@ -16,7 +16,7 @@ from torch.nn import functional
 from reli3d._bridge import over_rows
 from reli3d.geometry.hull import hull_distance
 from reli3d.nn.model import Code, Reconstructor
-from reli3d.nn.shading import Shading, brightness_over_normal
+from reli3d.nn.shading import DARKEST, Shading, brightness_over_normal, harmonics, palette_of, unshaded
 from reli3d.nn.view_features import ViewMaps
 from reli3d.render.color import srgb_to_linear
 from reli3d.render.environment import Environment
@@ -73,9 +73,11 @@ def object_shading(model: Reconstructor, light: Tensor, maps: ViewMaps, position
     if not model.preset.shading_features:
         return None
     with torch.no_grad():
-        color = srgb_to_linear(model.view_features(maps, position, visible, normal)[1])
-        observed = brightness_over_normal(color, visible.amax(1), normal)
-        return Shading(Environment(light.detach().contiguous()).irradiance(), observed)
+        color, seen = model.view_features(maps, position, visible, normal)[1], visible.amax(1)
+        observed = brightness_over_normal(srgb_to_linear(color), seen, normal)
+        plain = unshaded(color, (harmonics(normal) @ observed).clamp(min=DARKEST))
+        irradiance = Environment(light.detach().contiguous()).irradiance()
+        return Shading(irradiance, observed, palette_of(color, plain, seen))
 
 
 def surface_material(model: Reconstructor, code: Code, maps: ViewMaps, position: Tensor, normal: Tensor,
@@ -91,7 +93,7 @@ def surface_material(model: Reconstructor, code: Code, maps: ViewMaps, position:
         if model.preset.view_feature_width:
             features, color = (x[None] for x in model.view_features(maps, position, visible, normal))
             if shading is not None:
-                features = torch.cat([features, shading.features(normal)[None]], -1)
+                features = torch.cat([features, shading.features(normal, color[0])[None]], -1)
         values = model.query(code, position[None], MATERIAL, features, color)
         return {name: value[0] for name, value in values.items()}
 

@@ -13,7 +13,7 @@ import json
 import typing
 from dataclasses import dataclass
 
-SHADING_FEATURES = 9  # see reli3d.nn.shading
+SHADING_FEATURES = 24  # see reli3d.nn.shading
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.render.environment import Environment
 
 BLACK = 0.01  # added to a radiance before its logarithm
 RIDGE = 0.02  # of the fit: holds harmonics that the visible normals do not determine near zero
+MARGIN = 0.02  # of colours before their logit
 DARKEST = 0.05  # of the mean brightness: the fit may ring below zero where no point was seen
 
 
@@ -23,15 +25,38 @@ DARKEST = 0.05  # of the mean brightness: the fit may ring below zero where no p
 class Shading:
     irradiance: Environment  # of the predicted light, over the normal
     observed: Tensor  # (9, 3) harmonics of the photographs' linear brightness over the normal, its mean 1
+    palette: Tensor  # (12,) see :func:`palette_of`
 
-    def features(self, normal: Tensor) -> Tensor:
-        """Normal, logarithm of the irradiance over pi, logarithm of the observed brightness, ``(N, 9)``.
+    def features(self, normal: Tensor, color: Tensor) -> Tensor:
+        """Normal, logarithms of the irradiance over pi and of the observed brightness, logit of the colour without
+        shade, palette: ``(N, 24)``.
 
-        normal: ``(N, 3)`` unit, world.  No gradient.
+        normal: ``(N, 3)`` unit, world.  color: ``(N, 3)`` sRGB, what the views show there.  No gradient.
         """
         predicted = torch.log(self.irradiance.lookup(normal.contiguous()) / torch.pi + BLACK)
-        observed = torch.log((harmonics(normal) @ self.observed).clamp(min=DARKEST))
-        return torch.cat([normal, predicted, observed], -1)
+        brightness = (harmonics(normal) @ self.observed).clamp(min=DARKEST)
+        plain = logit(unshaded(color, brightness))
+        return torch.cat([normal, predicted, brightness.log(), plain, self.palette.expand(len(normal), -1)], -1)
+
+
+def logit(color: Tensor) -> Tensor:
+    """Of colours in [0, 1], kept within reach: black and white are not infinite."""
+    return color.clamp(MARGIN, 1.0 - MARGIN).logit()
+
+
+def unshaded(color: Tensor, brightness: Tensor) -> Tensor:
+    """sRGB colours ``(N, 3)`` divided, in linear light, by the ``brightness (N, 3)`` of the shade they lie in."""
+    return linear_to_srgb((srgb_to_linear(color) / brightness).clamp(0.0, 1.0))
+
+
+def palette_of(color: Tensor, plain: Tensor, seen: Tensor) -> Tensor:
+    """``(12,)`` means and deviations, over the points that are ``seen (N,)``, of the logits of the colours that the
+    views show and of those without shade: what an object looks like as a whole tells its paint from a stain.
+    """
+    weight = ((seen + 1e-6) / (seen + 1e-6).sum())[:, None]
+    values = torch.cat([logit(color), logit(plain)], -1)
+    mean = (values * weight).sum(0)
+    return torch.cat([mean, ((values - mean).square() * weight).sum(0).sqrt()])
 
 
 def harmonics(normal: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from reli3d.nn.model import Reconstructor
 from reli3d.train.losses import losses
@@ -128,7 +128,7 @@ def train(model: Reconstructor, config: TrainConfig, workers: Workers | None = N
         log.close()
 
 
-def update_average(average: dict[str, Tensor], model: Reconstructor, decay: float) -> None:
+def update_average(average: dict[str, Tensor], model: nn.Module, decay: float) -> None:
     with torch.no_grad():
         for key, value in model.state_dict().items():
             if value.is_floating_point():

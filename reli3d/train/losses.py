@@ -26,7 +26,13 @@ def losses(model: Reconstructor, batch: Batch) -> dict[str, Tensor]:
     """Unweighted terms, each a scalar mean over the batch; gradients reach every parameter that took part."""
     code = model.encode(batch.images, batch.masks, batch.c2w, batch.intrinsics)
     lights = model.decode_environment(code, LIGHT_ROWS)
-    fields = [_object_losses(model, code.of(b), batch, b, lights[b]) for b in range(len(batch.images))]
+    fields = []
+    for b in range(len(batch.images)):
+        own = code.of(b)
+        maps = maps_of(own, batch.images[b], batch.silhouette[b], batch.c2w[b], batch.intrinsics[b])
+        shading = sample_shading(model, lights[b], maps, batch, b)
+        fields.append(field_losses(model, own, maps, batch, b, shading))
+        fields[-1]["image"] = _image_loss(model, own, maps, batch, b, lights[b], shading)
     terms = {k: torch.stack([f[k] for f in fields]).mean() for k in fields[0]}
     terms["light"] = light_loss(model, code, batch)
     return terms
@@ -36,8 +42,16 @@ def maps_of(code: Code, images: Tensor, silhouette: Tensor, c2w: Tensor, intrins
     return ViewMaps(code.view_tokens[0], torch.cat([images, silhouette[..., None]], -1).contiguous(), c2w, intrinsics)
 
 
-def _object_losses(model: Reconstructor, code: Code, batch: Batch, b: int, light: Tensor) -> dict[str, Tensor]:
-    maps = maps_of(code, batch.images[b], batch.silhouette[b], batch.c2w[b], batch.intrinsics[b])
+def sample_shading(model: Reconstructor, light: Tensor, maps: ViewMaps, batch: Batch, b: int) -> Shading | None:
+    """What is known of the light on object ``b`` of the batch, from its surface points."""
+    position, normal, _ = batch.surface[b].unbind(1)
+    return object_shading(model, light, maps, position.contiguous(), functional.normalize(normal, dim=-1),
+                          batch.visible[b])  # fmt: skip
+
+
+def field_losses(model: Reconstructor, code: Code, maps: ViewMaps, batch: Batch, b: int,
+                 shading: Shading | None) -> dict[str, Tensor]:  # fmt: skip
+    """The terms of object ``b`` that ask for no image: occupancy at its points, material at its surface."""
     level = surface_level(model, code, maps, batch.points[b])
     if model.preset.silhouette_bound:
         level = torch.maximum(level, bound_level(model, maps, batch.points[b]))
@@ -46,7 +60,6 @@ def _object_losses(model: Reconstructor, code: Code, batch: Batch, b: int, light
 
     position, normal, bumped = batch.surface[b].unbind(1)
     normal = functional.normalize(normal, dim=-1)
-    shading = object_shading(model, light, maps, position, normal, batch.visible[b])
     got = surface_material(model, code, maps, position, normal, batch.visible[b], shading)
     out["base_color"] = functional.mse_loss(got["base_color"], batch.material[b, :, :3])
     out["pattern"] = pattern_loss(got["base_color"], batch.material[b, :, :3])
@@ -54,7 +67,6 @@ def _object_losses(model: Reconstructor, code: Code, batch: Batch, b: int, light
     out["metallic"] = functional.mse_loss(got["metallic"][:, 0], batch.material[b, :, 4])
     world = radial_bump(position, normal, got["normal"])
     out["normal"] = (1 - functional.cosine_similarity(world, bumped, dim=-1)).mean()
-    out["image"] = _image_loss(model, code, maps, batch, b, light, shading)
     return out
 
 
