@@ -147,7 +147,7 @@ def spread(roughness, metallic, environment, runs=256, **options):
 @pytest.mark.parametrize("name", SKIES[:2])
 def test_pairs_still_the_slope_in_the_normal_and_double_that_in_roughness(device, name):
     """Zhang et al. 2021: partners cancel what is odd about the normal.  The slope in roughness is even: a pair tells it
-    once.  The table in docs/renderer.md comes from here."""
+    once.  docs/renderer.md has the whole table."""
     env = light(name, device)
     pair, alone = (spread(0.1, 1.0, env, samples=(0, 40, 0), antithetic=a)[0] for a in (True, False))
     assert pair[2] < 0.05 * alone[2]  # measured 0.006
