@@ -40,6 +40,7 @@ SMALLEST_PART = 0.01  # share of the faces below which a separate piece is dropp
 CHUNK = 1 << 17  # points a query: 200 MB of features
 SHADING_POINTS = 4096  # vertices by which the light on the object is judged
 OUTSIDE = 1.0  # level given to grid points that the silhouettes exclude
+COARSE = 4  # cells of the surface grid along a cell of the one that looks for the silhouettes' hull first
 MARGIN_CELLS = 2.5  # cells around the silhouettes' hull in which the field is still asked
 UP = {  # rotations that carry an axis to +Y
     "y": torch.eye(3),
@@ -92,18 +93,15 @@ def extract(model: Reconstructor, code: Code, maps: ViewMaps, resolution: int) -
     Raises ValueError where the field has no surface.
     """
     radius = model.preset.radius
-    flat = _grid(resolution, radius, maps.c2w.device).reshape(-1, 3)
     bound = None
     if model.preset.silhouette_bound:
-        inside = (bound_level(model, maps, flat) < 0).nonzero()[:, 0]
-        if len(inside) == 0:
-            raise ValueError("masks: expected masks that overlap in space, got none inside all of them; run --check")
-        radius = min(radius, float(flat[inside].abs().max()) + 2 * MARGIN_CELLS * radius / resolution)
-        flat = _grid(resolution, radius, flat.device).reshape(-1, 3)  # as many cubes on the space that matters
+        radius = min(radius, _hull_reach(model, maps, resolution) + 2 * MARGIN_CELLS * radius / resolution)
+        flat = _grid(resolution, radius, maps.c2w.device).reshape(-1, 3)  # as many cubes on the space that matters
         bound = bound_level(model, maps, flat)
         margin = MARGIN_CELLS * 2 * radius / resolution / model.preset.softness
         asked, level = (bound < margin).nonzero()[:, 0], bound.clamp(min=OUTSIDE)
     else:
+        flat = _grid(resolution, radius, maps.c2w.device).reshape(-1, 3)
         asked, level = torch.arange(len(flat), device=flat.device), flat.new_empty(len(flat))
     for part in asked.split(CHUNK):
         level[part] = surface_level(model, code, maps, flat[part])
@@ -116,6 +114,25 @@ def extract(model: Reconstructor, code: Code, maps: ViewMaps, resolution: int) -
     if model.preset.smoothing:
         mesh = taubin_smooth(mesh, iterations=model.preset.smoothing)
     return replace(mesh, normals=vertex_normals(mesh.vertices, mesh.faces))
+
+
+def _hull_reach(model: Reconstructor, maps: ViewMaps, resolution: int) -> float:
+    """Largest coordinate of the points of the model's grid that lie inside all silhouettes.
+
+    Asked coarsely first: a point inside has a coarse neighbour that is outside by no more than their distance.
+    """
+    radius, device = model.preset.radius, maps.c2w.device
+    coarse = -(-resolution // COARSE)
+    apart = 2 * radius / coarse
+    level = bound_level(model, maps, _grid(coarse, radius, device).reshape(-1, 3))
+    slack = 2 * 0.5 * 3**0.5 * apart / model.preset.softness  # twice: the distance is stretched away from the axis
+    near = (level < slack).reshape((coarse + 1,) * 3)
+    k = ((torch.linspace(-radius, radius, resolution + 1, device=device) + radius) / apart).round().long()
+    flat = _grid(resolution, radius, device)[near[k][:, k][:, :, k]]
+    inside = flat[bound_level(model, maps, flat) < 0]
+    if len(inside) == 0:
+        raise ValueError("masks: expected masks that overlap in space, got none inside all of them; run --check")
+    return float(inside.abs().max())
 
 
 def _grid(resolution: int, radius: float, device: torch.device) -> Tensor:

@@ -1,12 +1,18 @@
 """Mask distance and visual hull against closed forms: half planes, discs, spheres."""
 
 import math
+from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
 from scipy.spatial import cKDTree
 
+from reli3d import pipeline
 from reli3d.geometry.hull import hull_distance, mask_distance
+from reli3d.nn.field import bound_level
+from reli3d.nn.presets import SMALL
+from reli3d.nn.view_features import ViewMaps
 
 
 def pixel_grid(height, width, device="cpu"):
@@ -172,3 +178,25 @@ def test_result_does_not_depend_on_the_number_of_threads():
     finally:
         torch.set_num_threads(before)
     assert torch.equal(*results)
+
+
+@pytest.mark.parametrize("radius, views", [(0.5, 8), (0.06, 3), (0.3, 1)])
+def test_the_coarse_look_finds_the_reach_of_the_dense_one(device, radius, views):
+    """Also of a ball thinner than a coarse cell (0.087), and of one view's cone that runs to the end of the grid."""
+    masks, c2w, intrinsics = sphere_views(device, n=views, radius=radius)
+    images = torch.cat([torch.zeros(*masks.shape, 3, device=device), mask_distance(masks)[..., None]], -1)
+    maps = ViewMaps(images.new_empty(views, 1, 1, 1), images, c2w, intrinsics)
+    model = SimpleNamespace(preset=SMALL)
+    grid = pipeline._grid(80, SMALL.radius, device).reshape(-1, 3)
+    dense = float(grid[bound_level(model, maps, grid) < 0].abs().max())
+    assert pipeline._hull_reach(model, maps, 80) == dense
+    empty = replace(maps, images=images - 1000.0)
+    with pytest.raises(ValueError, match="masks: expected masks that overlap"):
+        pipeline._hull_reach(model, empty, 80)
+
+
+def test_far_from_the_contour_the_ends_of_segments_will_do(device):
+    """Beyond 16 pixels 0.25 / 16 too far at most; the disc itself is known to 0.1 pixels (above)."""
+    mask, true = disc(256, (127.3, 130.8), 60.2)
+    got = mask_distance(mask[None].to(device))[0].cpu()
+    assert (got - true).abs().max() < 0.1 + 0.25 / 16

@@ -13,6 +13,7 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=n
 
 NEVER = wp.constant(65536.0)  # rows to a crossing where a column has none: beyond any image
 NEAR = wp.constant(4.0)  # pixels; beyond, other segments are at most sqrt(16.5) - 4 = 0.06 pixels nearer
+FAR = wp.constant(16.0)  # pixels; beyond, the end of a segment is at most 0.25 / 16 pixels farther than the segment
 BEHIND = wp.constant(-1.0e3)  # distance of a point that a camera cannot see, in world units: below that of any other
 DEPTH_MIN = wp.constant(1.0e-4)  # a point this close to a camera's plane counts as behind it
 
@@ -212,6 +213,8 @@ def mask_distance_kernel(
     reach = wp.int32(1)  # the cell's lower neighbours, which share the crossing
     if best < NEAR * NEAR:
         reach = 2
+    if best > FAR * FAR:
+        reach = -1  # no cell
     for v in range(cell_y - 1, cell_y + reach):
         for u in range(cell_x - 1, cell_x + reach):
             inner = v >= 0 and v < height - 1 and u >= 0 and u < width - 1
