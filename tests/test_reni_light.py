@@ -122,7 +122,7 @@ def test_shading_by_a_latent_is_shading_by_its_fine_map(device):
     assert (rough - fine).abs().mean() > 4 * (got - fine).abs().mean()  # a stored map of 16 rows shows
 
 
-@pytest.mark.parametrize("height", [32, 20])
+@pytest.mark.parametrize("height", [20, pytest.param(32, marks=pytest.mark.slow)])
 def test_a_decoded_map_is_found_again(decoder, height):
     device = decoder.sample_directions.device
     latent, _, _ = code(7, device)
