@@ -172,6 +172,11 @@ def load_modules(modules: Sequence[ModuleType], device: torch.device) -> None:
                       max_workers=min(os.cpu_count() or 1, COMPILERS))  # fmt: skip
 
 
+def load_kernel(kernel) -> None:
+    """Have a kernel's module ready on the CPU before several threads launch it."""
+    kernel.module.load(wp.get_device("cpu"), block_dim=CPU_BLOCK)
+
+
 def launch(kernel, n: int, args: Sequence, device: torch.device, *, slice_min: int = SLICE_MIN) -> None:
     """Run ``kernel(start, *args)`` over ``n`` threads.  ``args``: ``(tensor, warp type)`` pairs or plain values.
 
@@ -185,7 +190,7 @@ def launch(kernel, n: int, args: Sequence, device: torch.device, *, slice_min: i
         if name != "cpu":
             wp.launch(kernel, n, [0, *values], device=name)
             return
-        kernel.module.load(wp.get_device("cpu"), block_dim=CPU_BLOCK)
+        load_kernel(kernel)
         if _serial():
             wp.launch(kernel, n, [0, *values], device="cpu")  # no thread would take a slice
             return
@@ -269,7 +274,7 @@ class _KernelOp(torch.autograd.Function):
                               adj_outputs=adj_out, adjoint=True, device=name)  # fmt: skip
 
                 if name == "cpu":
-                    kernel.module.load(wp.get_device("cpu"), block_dim=CPU_BLOCK)
+                    load_kernel(kernel)
                     over_slices(n, adjoint, slice_min=slice_min)
                 else:
                     adjoint(0, 0, n)

@@ -4,8 +4,9 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
+from reli3d.nn.heads import COLOR_MARGIN
 from reli3d.nn.presets import SHADING_FEATURES
-from reli3d.nn.shading import DARKEST, MARGIN, Shading, brightness_over_normal, harmonics, palette_of, unshaded
+from reli3d.nn.shading import DARKEST, Shading, brightness_over_normal, harmonics, palette_of, unshaded
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.render.environment import Environment
 
@@ -92,6 +93,6 @@ def test_features_in_their_order():
     torch.testing.assert_close(got[:, 3:6], expected.expand(50, 3), rtol=0, atol=5e-3)  # the map's 16 rows
     brightness = (1 + 2 * n[:, 1]).clamp(min=DARKEST)
     torch.testing.assert_close(got[:, 6], torch.log(brightness), rtol=1e-4, atol=1e-5)
-    plain = unshaded(color, brightness[:, None].expand(-1, 3)).clamp(MARGIN, 1 - MARGIN)
+    plain = unshaded(color, brightness[:, None].expand(-1, 3)).clamp(COLOR_MARGIN, 1 - COLOR_MARGIN)
     torch.testing.assert_close(got[:, 9:12], plain.logit(), rtol=1e-3, atol=1e-3)
     assert torch.equal(got[:, 12:], torch.arange(12.0).expand(50, 12))

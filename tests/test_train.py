@@ -222,14 +222,14 @@ def test_calibration_gives_back_what_is_missing(folder, tmp_path):
     (tmp_path / f"{seed}.safetensors").write_bytes((folder / f"{seed:010d}.safetensors").read_bytes())
     shape = make_object(seed)
     torch.manual_seed(0)
-    model = _Thin(dataclasses.replace(SMALL, resolution=40)).eval()
+    # the cells of a coarser grid shift the best offset by a step
+    model = _Thin(dataclasses.replace(SMALL, resolution=64)).eval()
     model.shape = torch.from_numpy(shape.vertices), torch.from_numpy(shape.faces)
     tried = calibrate(model, tmp_path, objects=1)
     preset = model.preset
     assert set(tried) == {1, 4} and max(tried[1].values()) > 0.9
     assert tried[1][1.5] > tried[1][0.0] + 0.02
-    # the next offset is 2; cells of 40 a side are 0.04 wide, two units of the offset
-    assert abs(preset.offset_one_view - 1.5) <= 0.5
-    assert abs(preset.offset_many_views - 1.5) <= 0.5
+    assert abs(preset.offset_one_view - 1.5) <= 0.25
+    assert abs(preset.offset_many_views - 1.5) <= 0.25
     with pytest.raises(ValueError, match="samples: expected"):
         calibrate(model, tmp_path / "none")

@@ -26,3 +26,12 @@ def blend(upper_left: Any, upper_right: Any, lower_left: Any, lower_right: Any, 
     top = upper_left * (1.0 - at[2]) + upper_right * at[2]
     bottom = lower_left * (1.0 - at[2]) + lower_right * at[2]
     return top * (1.0 - at[3]) + bottom * at[3]
+
+
+@wp.func
+def look_up(images: wp.array3d(dtype=Any), view: int, x: float, y: float) -> Any:
+    """Value of image ``view`` of ``images (V, H, W)`` at pixel coordinates, the border's value outside."""
+    at = between_pixels(x, y, images.shape[1], images.shape[2])
+    i = int(at[0])
+    j = int(at[1])
+    return blend(images[view, j, i], images[view, j, i + 1], images[view, j + 1, i], images[view, j + 1, i + 1], at)

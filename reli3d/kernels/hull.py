@@ -7,7 +7,7 @@ pixels (y, x), (y, x + 1), (y + 1, x), (y + 1, x + 1); there are (H - 1) * (W - 
 
 import warp as wp
 
-from reli3d.kernels.bilinear import between_pixels, blend
+from reli3d.kernels.bilinear import look_up
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
 
@@ -226,15 +226,6 @@ def mask_distance_kernel(
         distance[view, y, x] = -wp.sqrt(best)
 
 
-@wp.func
-def lookup(values: wp.array3d[float], view: int, x: float, y: float) -> float:
-    """Bilinear value at pixel coordinates, the border's beyond it."""
-    at = between_pixels(x, y, values.shape[1], values.shape[2])
-    i = int(at[0])
-    j = int(at[1])
-    return blend(values[view, j, i], values[view, j, i + 1], values[view, j + 1, i], values[view, j + 1, i + 1], at)
-
-
 @wp.kernel
 def hull_distance_kernel(
     start: int,
@@ -254,7 +245,7 @@ def hull_distance_kernel(
         depth = -(m[0, 2] * away[0] + m[1, 2] * away[1] + m[2, 2] * away[2])
         if depth > DEPTH_MIN:  # False for NaN too
             k = intrinsics[view]
-            value = lookup(distance, view, k[2] + k[0] * right / depth, k[3] - k[1] * up / depth)
+            value = look_up(distance, view, k[2] + k[0] * right / depth, k[3] - k[1] * up / depth)
             best = wp.min(best, value * depth * 2.0 / (k[0] + k[1]))
         else:
             best = BEHIND

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from reli3d.kernels.bilinear import between_pixels, blend
+from reli3d.kernels.bilinear import between_pixels, look_up
 from reli3d.kernels.projection import project_point
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
@@ -16,15 +16,6 @@ EDGE = wp.constant(0.01)  # of the image: colours closer than this to the silhou
 EDGE_MIN = wp.constant(0.05)
 OUTSIDE = wp.constant(0.15)  # silhouette distances beyond this share of the image say no more
 TANH_FLAT = wp.constant(8.3)  # where tanh is 1 but for 1.2e-7, a float32 rounding
-
-
-@wp.func
-def look_up(image: wp.array3d[wp.vec4], view: int, x: float, y: float) -> wp.vec4:
-    """Bilinear value at pixel coordinates, the border's value outside."""
-    at = between_pixels(x, y, image.shape[1], image.shape[2])
-    i = int(at[0])
-    j = int(at[1])
-    return blend(image[view, j, i], image[view, j, i + 1], image[view, j + 1, i], image[view, j + 1, i + 1], at)
 
 
 @wp.func
@@ -63,6 +54,18 @@ def surface_point(surface: int, visible: wp.array2d[float], normal: wp.array[wp.
     if surface == 0:
         return 0.0, wp.vec3()
     return visible[n, view], normal[n]
+
+
+@wp.func
+def write_summary(
+    summary: wp.array2d[float], n: int, color: wp.vec3, spread: float, least: float, greatest: float, p: wp.vec3
+):
+    for k in range(3):
+        summary[n, k] = color[k]
+        summary[n, 6 + k] = p[k]
+    summary[n, 3] = wp.sqrt(wp.max(spread, 0.0) / 3.0)
+    summary[n, 4] = least
+    summary[n, 5] = greatest
 
 
 @wp.kernel
@@ -106,12 +109,7 @@ def view_summary_kernel(
         weight[n, v] = share
         away = wp.vec3(own[n, v, 0], own[n, v, 1], own[n, v, 2]) - color
         spread += share * wp.dot(away, away)
-    for k in range(3):
-        summary[n, k] = color[k]
-        summary[n, 6 + k] = p[k]
-    summary[n, 3] = wp.sqrt(spread / 3.0)
-    summary[n, 4] = least
-    summary[n, 5] = greatest
+    write_summary(summary, n, color, spread, least, greatest, p)
 
 
 @wp.func
@@ -171,19 +169,16 @@ def pool_views_kernel(
         away = wp.vec3(numbers[0], numbers[1], numbers[2]) - color
         color += away * (share / total)  # Welford's update: no cancellation, no second look at the views
         spread += share * wp.dot(away, wp.vec3(numbers[0], numbers[1], numbers[2]) - color)
-        x = wp.clamp(q[0] * scale - 0.5, 0.0, float(tokens.shape[2] - 1))
-        y = wp.clamp(q[1] * scale - 0.5, 0.0, float(tokens.shape[1] - 1))
-        x0 = wp.min(int(x), tokens.shape[2] - 2)
-        y0 = wp.min(int(y), tokens.shape[1] - 2)
-        fx = x - float(x0)
-        fy = y - float(y0)
-        w00 = (1.0 - fx) * (1.0 - fy)
-        w01 = fx * (1.0 - fy)
-        w10 = (1.0 - fx) * fy
-        w11 = fx * fy
+        at = between_pixels(q[0] * scale, q[1] * scale, tokens.shape[1], tokens.shape[2])
+        i = int(at[0])
+        j = int(at[1])
+        w00 = (1.0 - at[2]) * (1.0 - at[3])  # four products a block; kernels.bilinear.blend takes twice the time here
+        w01 = at[2] * (1.0 - at[3])
+        w10 = (1.0 - at[2]) * at[3]
+        w11 = at[2] * at[3]
         for b in range(blocks):
-            h = tokens[v, y0, x0, b] * w00 + tokens[v, y0, x0 + 1, b] * w01
-            h += tokens[v, y0 + 1, x0, b] * w10 + tokens[v, y0 + 1, x0 + 1, b] * w11
+            h = tokens[v, j, i, b] * w00 + tokens[v, j, i + 1, b] * w01
+            h += tokens[v, j + 1, i, b] * w10 + tokens[v, j + 1, i + 1, b] * w11
             g = own[0, b] * numbers[0] + own[1, b] * numbers[1]
             h += own[2, b] * numbers[2] + own[3, b] * numbers[3]
             g += own[4, b] * numbers[4] + own[5, b] * numbers[5]
@@ -192,9 +187,4 @@ def pool_views_kernel(
             pooled[n, b] = pooled[n, b] + silu(h) * share
     for b in range(blocks):
         pooled[n, b] = pooled[n, b] / total
-    for k in range(3):
-        summary[n, k] = color[k]
-        summary[n, 6 + k] = p[k]
-    summary[n, 3] = wp.sqrt(wp.max(spread / total, 0.0) / 3.0)
-    summary[n, 4] = least
-    summary[n, 5] = greatest
+    write_summary(summary, n, color, spread / total, least, greatest, p)

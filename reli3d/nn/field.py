@@ -16,7 +16,7 @@ from torch.nn import functional
 from reli3d._bridge import over_rows
 from reli3d.geometry.hull import hull_distance
 from reli3d.nn.model import Code, Reconstructor
-from reli3d.nn.shading import DARKEST, Shading, brightness_over_normal, harmonics, palette_of, unshaded
+from reli3d.nn.shading import Shading, brightness_at, brightness_over_normal, palette_of, unshaded
 from reli3d.nn.view_features import ViewMaps
 from reli3d.render.color import srgb_to_linear
 from reli3d.render.environment import Environment
@@ -75,7 +75,7 @@ def object_shading(model: Reconstructor, light: Tensor, maps: ViewMaps, position
     with torch.no_grad():
         color, seen = model.view_features(maps, position, visible, normal)[1], visible.amax(1)
         observed = brightness_over_normal(srgb_to_linear(color), seen, normal)
-        plain = unshaded(color, (harmonics(normal) @ observed).clamp(min=DARKEST))
+        plain = unshaded(color, brightness_at(normal, observed))
         irradiance = Environment(light.detach().contiguous()).irradiance()
         return Shading(irradiance, observed, palette_of(color, plain, seen))
 

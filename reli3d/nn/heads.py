@@ -70,6 +70,11 @@ def activate(name: str, raw: Tensor) -> Tensor:
     return raw
 
 
+def color_logit(color: Tensor) -> Tensor:
+    """Of colours in [0, 1], kept within reach: black and white are not infinite."""
+    return color.clamp(COLOR_MARGIN, 1.0 - COLOR_MARGIN).logit()
+
+
 class Heads(nn.ModuleDict):
     """One MLP a head, on the same features."""
 
@@ -93,7 +98,7 @@ class Heads(nn.ModuleDict):
             parts = functional.silu(hidden, inplace=True).split([layer.out_features for layer in first], -1)
             raw = {name: _rest(self[name], part) for name, part in zip(names, parts, strict=True)}
         if color is not None and "base_color" in raw:
-            raw["base_color"] = raw["base_color"] + color.clamp(COLOR_MARGIN, 1.0 - COLOR_MARGIN).logit()
+            raw["base_color"] = raw["base_color"] + color_logit(color)
         return {name: activate(name, value) for name, value in raw.items()}
 
 

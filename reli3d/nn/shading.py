@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from reli3d.nn.heads import color_logit
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.render.environment import Environment
 
 BLACK = 0.01  # added to a radiance before its logarithm
 RIDGE = 0.02  # of the fit: holds harmonics that the visible normals do not determine near zero
-MARGIN = 0.02  # of colours before their logit
 DARKEST = 0.05  # of the mean brightness: the fit may ring below zero where no point was seen
 
 
@@ -34,14 +34,9 @@ class Shading:
         normal: ``(N, 3)`` unit, world.  color: ``(N, 3)`` sRGB, what the views show there.  No gradient.
         """
         predicted = torch.log(self.irradiance.lookup(normal.contiguous()) / torch.pi + BLACK)
-        brightness = (harmonics(normal) @ self.observed).clamp(min=DARKEST)
-        plain = logit(unshaded(color, brightness))
+        brightness = brightness_at(normal, self.observed)
+        plain = color_logit(unshaded(color, brightness))
         return torch.cat([normal, predicted, brightness.log(), plain, self.palette.expand(len(normal), -1)], -1)
-
-
-def logit(color: Tensor) -> Tensor:
-    """Of colours in [0, 1], kept within reach: black and white are not infinite."""
-    return color.clamp(MARGIN, 1.0 - MARGIN).logit()
 
 
 def unshaded(color: Tensor, brightness: Tensor) -> Tensor:
@@ -54,7 +49,7 @@ def palette_of(color: Tensor, plain: Tensor, seen: Tensor) -> Tensor:
     views show and of those without shade: what an object looks like as a whole tells its paint from a stain.
     """
     weight = ((seen + 1e-6) / (seen + 1e-6).sum())[:, None]
-    values = torch.cat([logit(color), logit(plain)], -1)
+    values = torch.cat([color_logit(color), color_logit(plain)], -1)
     mean = (values * weight).sum(0)
     return torch.cat([mean, ((values - mean).square() * weight).sum(0).sqrt()])
 
@@ -63,6 +58,11 @@ def harmonics(normal: Tensor) -> Tensor:
     """The polynomials ``(N, 9)`` that span spherical harmonics up to order two; the first is 1."""
     x, y, z = normal.unbind(-1)
     return torch.stack([torch.ones_like(x), x, y, z, x * y, y * z, z * x, x * x - y * y, 3 * z * z - 1], -1)
+
+
+def brightness_at(normal: Tensor, observed: Tensor) -> Tensor:
+    """What :func:`brightness_over_normal` found, ``(9, 3)``, at unit ``normal (N, 3)``; kept from zero."""
+    return (harmonics(normal) @ observed).clamp(min=DARKEST)
 
 
 def brightness_over_normal(color: Tensor, seen: Tensor, normal: Tensor) -> Tensor:

@@ -98,7 +98,7 @@ def fit(decoder: EnvironmentDecoder, maps: Tensor, *, steps: int, minutes: float
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-        mean += float(loss) / 200
+        mean += float(loss.detach()) / 200
         if step % 200 == 199:
             print(
                 f"light prior: step {step + 1}, {time.monotonic() - began:.0f} s, loss {mean:.4f}", file=log, flush=True
