@@ -21,7 +21,7 @@ from reli3d.train.calibrate import calibrate
 from reli3d.train.heads import train_heads
 from reli3d.train.light_prior import fit, scale_free
 from reli3d.train.loop import TrainConfig, averaged_model, progress, rate_at, train
-from reli3d.train.losses import losses, pattern_loss
+from reli3d.train.losses import ASTRAY, astray, losses, pattern_loss
 from reli3d.train.samples import batches, load_sample, mirrored, random_turn, recolored
 
 SEEDS = (3, 12)
@@ -233,3 +233,22 @@ def test_calibration_gives_back_what_is_missing(folder, tmp_path):
     assert abs(preset.offset_many_views - 1.5) <= 0.25
     with pytest.raises(ValueError, match="samples: expected"):
         calibrate(model, tmp_path / "none")
+
+
+def test_points_go_astray_along_their_normals_as_far_as_stated():
+    """Over many draws the mean squares are a third of the greatest deviation's: its share is uniform in [0, 1]."""
+    torch.manual_seed(0)
+    normal = torch.nn.functional.normalize(torch.randn(256, 3), dim=-1)
+    position = torch.rand(256, 3) - 0.5
+    moved, angle = [], []
+    for _ in range(400):
+        p, n = astray(position, normal)
+        away = p - position
+        assert float((away - (away * normal).sum(-1, keepdim=True) * normal).abs().max()) < 1e-6  # float32 of unit size
+        assert float((n.norm(dim=-1) - 1).abs().max()) < 1e-6
+        moved.append(away.square().sum(-1).mean())
+        angle.append((n - normal).square().sum(-1).mean())
+    # the mean of 400 squares of uniform numbers is known to 4.5 % (standard error 0.30 / sqrt(400) of 1/3): four of it
+    assert abs(float(torch.stack(moved).mean()) / (ASTRAY[0] ** 2 / 3) - 1) < 0.18
+    # a tilt of length t turns the normal by atan t, the chord is shorter still: less than t^2, by a tenth at these tilts
+    assert 0.75 < float(torch.stack(angle).mean()) / (ASTRAY[1] ** 2 / 3) < 1.0

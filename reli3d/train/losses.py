@@ -20,6 +20,7 @@ from reli3d.train.samples import Batch
 
 IMAGE_SAMPLES = (12, 8, 2)  # light, GGX and cosine samples a pixel of the image loss
 LIGHT_DIRECTIONS = 384  # of the 2048 of a sample's map: enough for one step's mean, a fifth of the decoder's time
+ASTRAY = 0.04, 0.4  # greatest deviation of position [model's cube] and normal [radian] of an extracted surface
 
 
 def losses(model: Reconstructor, batch: Batch) -> dict[str, Tensor]:
@@ -60,7 +61,7 @@ def field_losses(model: Reconstructor, code: Code, maps: ViewMaps, batch: Batch,
 
     position, normal, bumped = batch.surface[b].unbind(1)
     normal = functional.normalize(normal, dim=-1)
-    got = surface_material(model, code, maps, position, normal, batch.visible[b], shading)
+    got = surface_material(model, code, maps, *astray(position, normal), batch.visible[b], shading)
     out["base_color"] = functional.mse_loss(got["base_color"], batch.material[b, :, :3])
     out["pattern"] = pattern_loss(got["base_color"], batch.material[b, :, :3])
     out["roughness"] = functional.mse_loss(got["roughness"][:, 0], batch.material[b, :, 3])
@@ -68,6 +69,18 @@ def field_losses(model: Reconstructor, code: Code, maps: ViewMaps, batch: Batch,
     world = radial_bump(position, normal, got["normal"])
     out["normal"] = (1 - functional.cosine_similarity(world, bumped, dim=-1)).mean()
     return out
+
+
+def astray(position: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
+    """Points ``(N, 3)`` moved along their normals, and the normals tilted, as far as an extracted surface errs.
+
+    The material is asked for where the extracted surface lies, not where the object's does; how far they are apart is
+    drawn for all points together, for it differs from object to object.
+    """
+    share = torch.rand((), device=position.device)
+    distance = ASTRAY[0] * share * torch.randn_like(position[:, :1])
+    tilt = ASTRAY[1] * share * torch.randn_like(normal) / 2**0.5  # two of its three components turn the normal
+    return position + distance * normal, functional.normalize(normal + tilt, dim=-1)
 
 
 def pattern_loss(color: Tensor, target: Tensor) -> Tensor:
