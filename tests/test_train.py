@@ -17,7 +17,7 @@ from reli3d.nn.presets import SMALL
 from reli3d.nn.reni import map_directions
 from reli3d.render.camera import project
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
-from reli3d.train.calibrate import calibrate
+from reli3d.train.calibrate import ALIKE, LOST, calibrate, mismatch
 from reli3d.train.heads import train_heads
 from reli3d.train.light_prior import fit, scale_free
 from reli3d.train.loop import TrainConfig, averaged_model, progress, rate_at, train
@@ -251,3 +251,16 @@ def test_points_go_astray_along_their_normals_as_far_as_stated():
     # the mean of 400 squares of uniform numbers is known to 4.5 % (standard error 0.30 / sqrt(400) of 1/3): four of it
     assert abs(float(torch.stack(moved).mean()) / (ASTRAY[0] ** 2 / 3) - 1) < 0.18
     assert abs(float(torch.stack(angle).mean()) / (ASTRAY[1] ** 2 / 3) - 1) < 0.18  # chords of small angles
+
+
+def test_mismatch_is_the_error_of_a_picture_in_one_colour_at_its_best_brightness():
+    rng = np.random.default_rng(0)
+    for share in (0.1, 0.5, 0.9):
+        want = rng.random(5000) < 0.4
+        got = np.where(rng.random(5000) < share, want, rng.random(5000) < 0.5)
+        both = (want & got).sum()
+        _, residual, _, _ = np.linalg.lstsq(got[:, None].astype(float), want.astype(float), rcond=None)
+        value = mismatch(int(both), int(got.sum()), int(want.sum()))
+        assert abs(value - np.log(residual[0] / both)) < 1e-9
+    assert mismatch(0, 10, 10) == mismatch(1, 1000, 1000) == LOST
+    assert mismatch(10, 10, 10) == np.log(ALIKE)

@@ -27,11 +27,16 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--max-views", type=int, default=4)
     p.add_argument("--rate", type=float, default=6e-4, help="peak learning rate")
     p.add_argument("--seed", type=int, default=0)
-    p.add_argument("--validation", type=Path, help="folder of held-back samples to draw at every checkpoint")
+    p.add_argument(
+        "--validation",
+        type=Path,
+        help="folder of held-back samples: drawn at every checkpoint; what --export calibrates on",
+    )
     p.add_argument(
         "--export",
         type=Path,
-        help="write the averaged weights of the checkpoint, calibrated on the samples, to this file and stop",
+        help="write the averaged weights of the checkpoint, calibrated on --validation or else the samples, to this "
+        "file and stop",
     )
     return p
 
@@ -58,9 +63,10 @@ def main(argv: list[str] | None = None) -> int:
     try:
         if args.export:
             averaged_model(args.output / "state.pt", model)
-            for views, tried in calibrate(model, args.samples, progress=report).items():
+            for views, tried in calibrate(model, args.validation or args.samples, progress=report).items():
                 row = ", ".join(f"{offset:g}: {iou:.4f}" for offset, iou in tried.items())
                 report(f"silhouette IoU by surface offset, {views} views: {row}")
+            report(f"chosen: {model.preset.offset_one_view:g}, of many views {model.preset.offset_many_views:g}")
             print(weights.save(args.export, model, licence=LICENCE).path)
             return 0
         if args.light_prior:

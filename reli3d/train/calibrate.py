@@ -7,6 +7,7 @@ input, takes that back.  How sure it is depends on the number of views, so one v
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -27,15 +28,18 @@ from reli3d.train.pictures import sample_views
 OFFSETS = (0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 3.0, 5.0)  # of the logit; the last: the hull
 FEW, MANY = 1, 4  # numbers of views that are tried
 SIDE = 96  # pixels of the silhouettes that are compared
+ALIKE = 1e-3  # of 1 / recall - precision: a few pixels of a silhouette of some thousand; less is chance
+LOST = math.log(20.0)  # a twentieth of the object is all that is found
 
 
 @torch.no_grad()
-def calibrate(model: Reconstructor, samples: Path, *, objects: int = 16, seed: int = 1,
+def calibrate(model: Reconstructor, samples: Path, *, objects: int = 32, seed: int = 1,
               progress: Callable[[str], None] = lambda line: None) -> dict[int, dict[float, float]]:  # fmt: skip
-    """Set the preset's surface offsets to those with the best mean silhouette IoU over random ``samples``.
+    """Set the preset's surface offsets to those with the least mean :func:`mismatch` over random ``samples``.
 
-    samples: a folder of training samples with more than ``MANY`` views.  Gives the mean IoU of every offset for each
-    number of views; ``progress`` gets a line an object.  Raises ValueError where the folder holds no samples.
+    samples: a folder of samples with more than ``MANY`` views, best of objects that no training saw: of those it knows
+    a network is surer.  Gives the mean IoU of every offset for each number of views; ``progress`` gets a line an
+    object.  Raises ValueError where the folder holds no samples.
     """
     files = sorted(samples.glob("*.safetensors"))
     if not files:
@@ -51,26 +55,42 @@ def calibrate(model: Reconstructor, samples: Path, *, objects: int = 16, seed: i
                 model.preset = replace(plain, offset_one_view=offset, offset_many_views=offset)
                 try:
                     mesh = extract(model, code, maps, plain.resolution)
-                    rows[-1].append(silhouette_iou(mesh, sample, range(count, len(sample["images"]))))
+                    rows[-1].append(agreement(mesh, sample, range(count, len(sample["images"]))))
                 except ValueError:  # nothing is left of the object
-                    rows[-1].append(0.0)
-        progress(f"{files[k].stem}: {max(scores[FEW][-1]):.3f}, {max(scores[MANY][-1]):.3f}")
-    tried = {count: dict(zip(OFFSETS, np.mean(rows, 0).tolist(), strict=True)) for count, rows in scores.items()}
-    one, many = (max(tried[count], key=tried[count].get) for count in (FEW, MANY))
+                    rows[-1].append((0.0, LOST))
+        progress(f"{files[k].stem}: IoU {max(scores[FEW][-1])[0]:.3f}, {max(scores[MANY][-1])[0]:.3f}")
+    means = {count: np.mean(rows, 0) for count, rows in scores.items()}  # (offsets, 2)
+    tried = {count: dict(zip(OFFSETS, mean[:, 0].tolist(), strict=True)) for count, mean in means.items()}
+    one, many = (OFFSETS[int(means[count][:, 1].argmin())] for count in (FEW, MANY))
     model.preset = replace(plain, offset_one_view=one, offset_many_views=many + (many - one) / (MANY - 1))
     return tried
 
 
-def silhouette_iou(mesh: Mesh, sample: dict[str, Tensor], views: range) -> float:
-    """Mean IoU of the silhouettes of ``mesh`` and the masks of ``sample`` in ``views``, at ``SIDE`` pixels."""
+def agreement(mesh: Mesh, sample: dict[str, Tensor], views: range) -> tuple[float, float]:
+    """Mean IoU and :func:`mismatch` of silhouettes of ``mesh`` and masks of ``sample`` in ``views``, ``SIDE`` pixels
+    wide.
+    """
     scene, size = RayScene(mesh.vertices, mesh.faces), sample["images"].shape[1]
     step = size // SIDE
-    ious = []
+    rows = []
     for v in views:
         intrinsics = sample["intrinsics"][v] / step
         origins, directions = camera_rays(Camera(sample["c2w"][v], intrinsics, size // step, size // step))
         got = scene.closest(origins, directions).face >= 0
         alpha = sample["images"][v, ..., 3].float()[None, None]
         want = torch.nn.functional.avg_pool2d(alpha, step)[0, 0] > 127.5
-        ious.append(float((got & want).sum() / (got | want).sum().clamp(min=1)))
-    return float(np.mean(ious))
+        both = int((got & want).sum())
+        rows.append((both / max(int((got | want).sum()), 1), mismatch(both, int(got.sum()), int(want.sum()))))
+    return tuple(np.mean(rows, 0).tolist())
+
+
+def mismatch(both: int, got: int, want: int) -> float:
+    """Logarithm of ``1 / recall - precision`` of ``both`` pixels in common of ``got`` and ``want``, at most ``LOST``.
+
+    The square error of a picture in one colour at its best brightness, for each pixel in common.  Unlike IoU it weighs
+    how much of the object is missing more than what is too much, the more so the less is right: a shape that is guessed
+    from one view had better be full.
+    """
+    if both == 0:
+        return LOST
+    return min(LOST, math.log(max(want / both - both / got, ALIKE)))
