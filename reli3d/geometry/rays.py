@@ -18,7 +18,9 @@ from reli3d._bridge import check, empty, launch, over_slices, stream
 from reli3d.kernels import intersect as kernels
 
 BACKENDS = ("auto", "embree", "warp")
-SLICE_RAYS = 16384  # of a CPU slice: the more rays are ordered together, the closer are neighbours
+EMBREE_HIT = (("primID", wp.int32), ("tfar", wp.float32), ("u", wp.float32), ("v", wp.float32))
+SLICE_RAYS = 16384  # fewest of an Embree slice: the more rays are ordered together, the closer are neighbours
+THREAD_SLICES = 4  # of a large call for each thread, so that they end together; a ray's hit depends on no slice
 ORDERED = 4096  # rays of a slice from which ordering them pays
 
 
@@ -80,14 +82,15 @@ class RayScene:
         """First hit of every ray: origins and directions ``(..., 3)`` broadcast; ``t_max`` a number or ``(...)``."""
         shape, o, d, far = self._rays(origins, directions, t_max)
         n = o.shape[0]
-        face, t = torch.full((n,), -1, dtype=torch.int32, device=self.device), o.new_full((n,), torch.inf)
-        bary = o.new_zeros((n, 2))
+        face, t, bary = (empty((n,), kind, self.device) for kind in (wp.int32, wp.float32, wp.vec2))
+        outs = [(face, wp.int32), (t, wp.float32), (bary, wp.vec2)]
         if self._embree is not None:
-            self._embree_closest(o, d, far, face, t, bary)
+            self._embree_closest(o, d, far, outs)
         elif self._warp is not None:
-            args = [self._warp.id, (o, wp.vec3), (d, wp.vec3), (far, wp.float32), (face, wp.int32), (t, wp.float32),
-                    (bary, wp.vec2)]  # fmt: skip
+            args = [self._warp.id, (o, wp.vec3), (d, wp.vec3), (far, wp.float32), *outs]
             launch(kernels.closest_kernel, n, args, self.device)
+        else:
+            face.fill_(-1), t.fill_(torch.inf), bary.zero_()
         return Hits(face.reshape(shape), t.reshape(shape), bary.reshape(*shape, 2))
 
     def occluded(self, origins: Tensor, directions: Tensor, *, t_max: Tensor | float = float("inf")) -> Tensor:
@@ -182,72 +185,69 @@ class RayScene:
         far = far.reshape(1) if far.numel() == 1 else far.expand(shape).reshape(-1).contiguous()
         return shape, o, d, far
 
-    def _embree_closest(self, o, d, far, face, t, bary) -> None:
-        def work(_, start, count):
-            part = slice(start, start + count)
-            o_part, d_part = o[part].numpy(), d[part].numpy()
-            limit = embree_limits(o[part], d[part], far if far.numel() == 1 else far[part])
-            order = self._order(o[part], d[part])
-            if order is not None:
-                o_part, d_part = (
-                    np.take(o_part, order, 0),
-                    np.take(d_part, order, 0),
-                )  # fancy indexing takes 4 times as long
-                limit = None if limit is None else limit[order]
-            hit = self._embree.run(o_part, d_part, limit, output=1)
-            found = hit["primID"] >= 0
-            if limit is not None:
-                found &= limit >= 0.0
-            # misses hold what the arrays were made with
-            rows = np.flatnonzero(found) if order is None else order[found]
-            everywhere = order is None and len(rows) == count
-            rows, pick = (slice(None), slice(None)) if everywhere else (rows, found)
-            face[part].numpy()[rows] = hit["primID"][pick]
-            t[part].numpy()[rows] = hit["tfar"][pick]
-            weights = bary[part].numpy()
-            weights[rows, 0], weights[rows, 1] = hit["u"][pick], hit["v"][pick]
+    def _embree_closest(self, o, d, far, outs) -> None:
+        def store(part, order, limit, hit):
+            count = part.stop - part.start
+            ins = [(torch.empty(0, dtype=torch.int64) if order is None else torch.from_numpy(order), wp.int64),
+                   (torch.empty(0) if limit is None else torch.from_numpy(limit), wp.float32)]  # fmt: skip
+            ins += [(torch.from_numpy(hit[name]), kind) for name, kind in EMBREE_HIT]
+            own = [(tensor[part], kind) for tensor, kind in outs]
+            launch(kernels.place_hits_kernel, count, [*ins, *own], o.device, slice_min=count)
 
-        if o.shape[0]:
-            over_slices(o.shape[0], work, slice_min=SLICE_RAYS)
+        self._embree_slices(o, d, far, store, output=1)
 
     def _embree_occluded(self, o, d, far, out) -> None:
+        def store(part, order, limit, found):
+            blocked = found >= 0
+            if limit is not None:
+                blocked &= limit >= 0.0
+            out[part].numpy()[slice(None) if order is None else order] = blocked
+
+        self._embree_slices(o, d, far, store, query="OCCLUDED")
+
+    def _embree_slices(self, o, d, far, store, **query) -> None:
+        """``store(part, order, limit, result)`` of Embree for every slice, whose rays went to it in ``order``."""
+
         def work(_, start, count):
             part = slice(start, start + count)
-            limit = embree_limits(o[part], d[part], far if far.numel() == 1 else far[part])
-            o_part, d_part, order = o[part].numpy(), d[part].numpy(), self._order(o[part], d[part])
-            if order is not None:
-                o_part, d_part = np.take(o_part, order, 0), np.take(d_part, order, 0)
-                limit = None if limit is None else limit[order]
-            found = self._embree.run(o_part, d_part, limit, query="OCCLUDED") >= 0
-            if limit is not None:
-                found &= limit >= 0.0
-            out[part].numpy()[slice(None) if order is None else order] = found
+            rays, limit = (o[part], d[part]), far if far.numel() == 1 else far[part]
+            order, odd = self._order(*rays)
+            limit = embree_limits(*rays, limit, odd)
+            if order is None:
+                result = self._embree.run(*(v.numpy() for v in rays), limit, **query)
+            else:  # np.take: indexing with the order takes 4 times as long
+                limit = None if limit is None else np.take(limit, order)
+                result = self._embree.run(*(np.take(v.numpy(), order, 0) for v in rays), limit, **query)
+            store(part, order, limit, result)
 
-        if o.shape[0]:
-            over_slices(o.shape[0], work, slice_min=SLICE_RAYS)
+        n = o.shape[0]
+        if n:
+            over_slices(n, work, slice_min=max(SLICE_RAYS, n // (THREAD_SLICES * torch.get_num_threads())))
 
-    def _order(self, o: Tensor, d: Tensor) -> np.ndarray | None:
-        """Permutation that brings like rays together, None where they are few or come in such an order already.
+    def _order(self, o: Tensor, d: Tensor) -> tuple[np.ndarray | None, bool]:
+        """Permutation that brings like rays together, None where they are few or come in such an order already; and
+        whether a ray may not be valid.
 
         Embree traces one ray after the other; neighbours that visit the same nodes find them in the cache.
         """
         n = o.shape[0]
         if n < ORDERED:
-            return None
-        key = empty((n,), wp.int16, o.device)
-        args = [(o, wp.vec3), (d, wp.vec3), *self._cells, (key, wp.int16)]
+            return None, True
+        key, odd = empty((n,), wp.int16, o.device), torch.zeros(1, dtype=torch.bool)
+        args = [(o, wp.vec3), (d, wp.vec3), *self._cells, (key, wp.int16), (odd, wp.bool)]
         launch(kernels.ray_key_kernel, n, args, o.device, slice_min=n)
         keys = key.numpy()
         if np.count_nonzero(keys[1:] != keys[:-1]) < 0.5 * n:
-            return None
-        return np.argsort(keys, kind="stable")  # a radix sort for 16 bits
+            return None, bool(odd)
+        return np.argsort(keys, kind="stable"), bool(odd)  # a radix sort for 16 bits
 
 
-def embree_limits(o: Tensor, d: Tensor, far: Tensor) -> np.ndarray | None:
-    """Far limits for Embree, whose own is inclusive, or None for unlimited; -1 turns an invalid ray off."""
-    plain = far.numel() == 1 and float(far) == float("inf")
-    # one pass over the sums: any NaN or infinity shows in them; the exact test runs only then
-    if plain and bool(torch.isfinite(o.sum() + d.sum())) and bool((d.abs().amax(-1) > 0.0).all()):
+def embree_limits(o: Tensor, d: Tensor, far: Tensor, odd: bool) -> np.ndarray | None:
+    """Far limits for Embree, whose own is inclusive, or None for unlimited; -1 turns an invalid ray off.
+
+    odd: whether there may be an invalid ray.
+    """
+    if not odd and far.numel() == 1 and float(far) == float("inf"):
         return None
     limit = np.nextafter(far.numpy(), np.float32(-np.inf))
     valid = torch.isfinite(o).all(-1) & torch.isfinite(d).all(-1) & (d != 0.0).any(-1)

@@ -97,16 +97,24 @@ def offset_origin_kernel(
     origin[i] = offset_origin(position[i], ng[i], direction[i], scale)
 
 
+@wp.func
+def spread_bits(x: int) -> int:
+    """The lowest 8 bits of ``x`` on the even places (Morton 1966)."""
+    a = (x | (x << 4)) & 0x0F0F
+    a = (a | (a << 2)) & 0x3333
+    return (a | (a << 1)) & 0x5555
+
+
 @wp.kernel
 def ray_key_kernel(
     start: int,
     # in
     origins: wp.array(dtype=wp.vec3), directions: wp.array(dtype=wp.vec3), low: wp.vec3, per_cell: wp.vec3,
     # out
-    key: wp.array(dtype=wp.int16),
+    key: wp.array(dtype=wp.int16), odd: wp.array(dtype=wp.bool),
 ):  # fmt: skip
-    """16 bits alike for rays that visit the same part of the tree: the direction's cell of 32 x 32 on an octahedron,
-    then the origin's of 4 x 4 x 4 above ``low``."""
+    """16 bits alike for rays that visit the same part of the tree: the direction's cell of 32 x 32 on an octahedron in
+    Morton order, then the origin's of 4 x 4 x 4 above ``low``.  ``odd`` becomes True if any ray is not valid."""
     i = start + wp.tid()
     d = directions[i]
     reach = wp.max(wp.abs(d[0]) + wp.abs(d[1]) + wp.abs(d[2]), 1.0e-37)
@@ -117,10 +125,40 @@ def ray_key_kernel(
         x = (1.0 - wp.abs(y)) * wp.sign(a)
         y = (1.0 - wp.abs(a)) * wp.sign(y)
     place = wp.cw_mul(origins[i] - low, per_cell)
-    k = int(wp.clamp(16.0 * x + 16.0, 0.0, 31.0)) * 32 + int(wp.clamp(16.0 * y + 16.0, 0.0, 31.0))
+    k = spread_bits(int(wp.clamp(16.0 * x + 16.0, 0.0, 31.0)))
+    k = k + 2 * spread_bits(int(wp.clamp(16.0 * y + 16.0, 0.0, 31.0)))
     for axis in range(3):
         k = k * 4 + int(wp.clamp(place[axis], 0.0, 3.0))
     key[i] = wp.int16(k - 32768)
+    if not ray_is_valid(origins[i], d):
+        odd[0] = True
+
+
+@wp.kernel
+def place_hits_kernel(
+    start: int,
+    # in
+    order: wp.array(dtype=wp.int64), limit: wp.array(dtype=float), found: wp.array(dtype=wp.int32),
+    tfar: wp.array(dtype=float), u: wp.array(dtype=float), v: wp.array(dtype=float),
+    # out
+    face: wp.array(dtype=wp.int32), t: wp.array(dtype=float), bary: wp.array(dtype=wp.vec2),
+):  # fmt: skip
+    """Embree's hits in the rays' own order: entry j belongs to ray ``order[j]`` (j where ``order`` is empty) and is a
+    miss where ``limit[j]`` (if there are any) is below 0."""
+    j = start + wp.tid()
+    i = j
+    if order.shape[0] != 0:
+        i = int(order[j])
+    hit = found[j] >= 0
+    if limit.shape[0] != 0:
+        hit = hit and limit[j] >= 0.0
+    face[i] = -1
+    t[i] = wp.inf
+    bary[i] = wp.vec2(0.0, 0.0)
+    if hit:
+        face[i] = found[j]
+        t[i] = tfar[j]
+        bary[i] = wp.vec2(u[j], v[j])
 
 
 @wp.kernel
