@@ -19,9 +19,8 @@ from reli3d.kernels import intersect as kernels
 
 BACKENDS = ("auto", "embree", "warp")
 EMBREE_HIT = (("primID", wp.int32), ("tfar", wp.float32), ("u", wp.float32), ("v", wp.float32))
-SLICE_RAYS = 16384  # fewest of an Embree slice: the more rays are ordered together, the closer are neighbours
-THREAD_SLICES = 4  # of a large call for each thread, so that they end together; a ray's hit depends on no slice
-ORDERED = 4096  # rays of a slice from which ordering them pays
+SLICE_RAYS = 4096  # fewest of an Embree slice, and of one whose rays are ordered: below it costs more than it gains
+THREAD_SLICES = 4  # of a large call for each thread: the more rays are ordered together, the closer are neighbours
 
 
 @dataclass(frozen=True)
@@ -187,7 +186,7 @@ class RayScene:
 
     def _embree_closest(self, o, d, far, outs) -> None:
         def store(part, order, limit, hit):
-            count = part.stop - part.start
+            count = len(hit["primID"])
             ins = [(torch.empty(0, dtype=torch.int64) if order is None else torch.from_numpy(order), wp.int64),
                    (torch.empty(0) if limit is None else torch.from_numpy(limit), wp.float32)]  # fmt: skip
             ins += [(torch.from_numpy(hit[name]), kind) for name, kind in EMBREE_HIT]
@@ -231,7 +230,7 @@ class RayScene:
         Embree traces one ray after the other; neighbours that visit the same nodes find them in the cache.
         """
         n = o.shape[0]
-        if n < ORDERED:
+        if n < SLICE_RAYS:
             return None, True
         key, odd = empty((n,), wp.int16, o.device), torch.zeros(1, dtype=torch.bool)
         args = [(o, wp.vec3), (d, wp.vec3), *self._cells, (key, wp.int16), (odd, wp.bool)]

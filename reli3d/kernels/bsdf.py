@@ -10,7 +10,8 @@ from reli3d.kernels.math import INV_PI
 from reli3d.kernels.microfacet import (
     ALPHA_MIN,
     COS_MIN,
-    ggx_ndf,
+    Facet,
+    facet_between,
     pdf_vndf_partner,
     pdf_vndf_reflection,
     smith_visibility,
@@ -37,26 +38,18 @@ def base_reflectance(base_color: wp.vec3, metallic: float) -> wp.vec3:
 
 
 @wp.func
-def eval_bsdf(wo: wp.vec3, wi: wp.vec3, base_color: wp.vec3, alpha: float, metallic: float) -> wp.vec3:
-    """The value of the material [1/sr]; 0 where either direction is below the horizon."""
-    value = wp.vec3(0.0, 0.0, 0.0)
-    if wo[2] > COS_MIN and wi[2] > COS_MIN:
-        wm = wp.normalize(wo + wi)
-        fresnel = schlick(base_reflectance(base_color, metallic), wp.dot(wo, wm))
-        specular = ggx_ndf(wm, alpha) * smith_visibility(wo, wi, alpha)
-        diffuse = wp.cw_mul(wp.vec3(1.0, 1.0, 1.0) - fresnel, base_color) * ((1.0 - metallic) * INV_PI)
-        value = diffuse + fresnel * specular
-    return value
+def eval_bsdf(facet: Facet, wo: wp.vec3, wi: wp.vec3, base_color: wp.vec3, metallic: float) -> wp.vec3:
+    """The value of the material [1/sr] for two directions above the horizon and the facet between them."""
+    fresnel = schlick(base_reflectance(base_color, metallic), facet.cos_m)
+    specular = facet.ndf * smith_visibility(facet, wo, wi)
+    diffuse = wp.cw_mul(wp.vec3(1.0, 1.0, 1.0) - fresnel, base_color) * ((1.0 - metallic) * INV_PI)
+    return diffuse + fresnel * specular
 
 
 @wp.func
-def pdf_lobes(wo: wp.vec3, wi: wp.vec3, alpha: float) -> wp.vec3:
+def pdf_lobes(facet: Facet, wo: wp.vec3, wi: wp.vec3) -> wp.vec3:
     """Densities [1/sr] of the material strategies at ``wi``: visible normals, their mirrored partners, cosine."""
-    pdf = wp.vec3(0.0, 0.0, 0.0)
-    if wo[2] > COS_MIN and wi[2] > COS_MIN:
-        wm = wp.normalize(wo + wi)
-        pdf = wp.vec3(pdf_vndf_reflection(wo, alpha, wm), pdf_vndf_partner(wo, alpha, wm), pdf_cosine(wi))
-    return pdf
+    return wp.vec3(pdf_vndf_reflection(facet, wo), pdf_vndf_partner(facet, wo), pdf_cosine(wi))
 
 
 @wp.kernel
@@ -69,7 +62,10 @@ def eval_bsdf_kernel(
     value: wp.array(dtype=wp.vec3),
 ):  # fmt: skip
     i = start + wp.tid()
-    value[i] = eval_bsdf(wo[i], wi[i], base_color[i], wp.max(alpha[i], ALPHA_MIN), metallic[i])
+    value[i] = wp.vec3(0.0, 0.0, 0.0)
+    if wo[i][2] > COS_MIN and wi[i][2] > COS_MIN:
+        facet = facet_between(wo[i], wi[i], wp.max(alpha[i], ALPHA_MIN))
+        value[i] = eval_bsdf(facet, wo[i], wi[i], base_color[i], metallic[i])
 
 
 @wp.kernel(enable_backward=False)
@@ -81,4 +77,6 @@ def pdf_lobes_kernel(
     pdf: wp.array(dtype=wp.vec3),
 ):  # fmt: skip
     i = start + wp.tid()
-    pdf[i] = pdf_lobes(wo[i], wi[i], wp.max(alpha[i], ALPHA_MIN))
+    pdf[i] = wp.vec3(0.0, 0.0, 0.0)
+    if wo[i][2] > COS_MIN and wi[i][2] > COS_MIN:
+        pdf[i] = pdf_lobes(facet_between(wo[i], wi[i], wp.max(alpha[i], ALPHA_MIN)), wo[i], wi[i])

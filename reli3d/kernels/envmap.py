@@ -103,15 +103,23 @@ def upper_cell(cdf: wp.array2d(dtype=float), guide: wp.array2d(dtype=wp.int32), 
     return k
 
 
+@wp.struct
+class MapSample:
+    """A drawn point of the map and its unit direction."""
+
+    uv: wp.vec2
+    direction: wp.vec3
+
+
 @wp.func
-def sample_envmap_uv(
+def sample_envmap(
     rows: wp.array2d(dtype=float),
     columns: wp.array2d(dtype=float),
     row_guide: wp.array2d(dtype=wp.int32),
     column_guide: wp.array2d(dtype=wp.int32),
     u: wp.vec2,
-) -> wp.vec2:
-    """Map coordinates for uniform ``u`` in [0, 1)^2; density :func:`pdf_envmap_uv`.
+) -> MapSample:
+    """Point of the map for uniform ``u`` in [0, 1)^2; density :func:`pdf_envmap_uv`.
 
     rows: ``(1, H + 1)`` CDF of the rows; columns: ``(H, W + 1)`` CDF within each row.  Inversion, monotone in both
     numbers, so stratified ``u`` stay stratified.  Within a texel uniform in solid angle.
@@ -127,9 +135,14 @@ def sample_envmap_uv(
     top = turn_cos_sin(0.5 * float(r) / float(height))[0]
     bottom = turn_cos_sin(0.5 * float(r + 1) / float(height))[0]
     y = top + (bottom - top) * in_row
-    v = 2.0 * turn_atan2(safe_sqrt(1.0 - y * y), y) * float(height)
+    s = safe_sqrt(1.0 - y * y)
+    v = 2.0 * turn_atan2(s, y) * float(height)
     v = wp.clamp(v, float(r), float(r) + 0.99999)  # float32 arc cosine near a pole may leave the row
-    return wp.vec2((float(c) + wp.min(in_column, 0.99999)) / float(width), v / float(height))
+    out = MapSample()
+    out.uv = wp.vec2((float(c) + wp.min(in_column, 0.99999)) / float(width), v / float(height))
+    turn = turn_cos_sin(out.uv[0])
+    out.direction = wp.vec3(-turn[1] * s, y, turn[0] * s)
+    return out
 
 
 @wp.func
@@ -202,9 +215,9 @@ def sample_envmap_kernel(
     directions: wp.array(dtype=wp.vec3), pdf: wp.array(dtype=float),
 ):  # fmt: skip
     i = start + wp.tid()
-    uv = sample_envmap_uv(rows, columns, row_guide, column_guide, u[i])
-    directions[i] = uv_to_direction(uv)
-    pdf[i] = pdf_envmap_uv(density, uv)
+    drawn = sample_envmap(rows, columns, row_guide, column_guide, u[i])
+    directions[i] = drawn.direction
+    pdf[i] = pdf_envmap_uv(density, drawn.uv)
 
 
 @wp.kernel

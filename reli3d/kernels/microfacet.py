@@ -3,7 +3,7 @@
 import warp as wp
 
 from reli3d.kernels.math import INV_PI, safe_sqrt
-from reli3d.kernels.sampling import mirror, sample_cap
+from reli3d.kernels.sampling import sample_cap
 
 wp.set_module_options({"enable_backward": True, "cpu_compiler_flags": "-march=native"})
 
@@ -28,16 +28,33 @@ def ggx_root(w: wp.vec3, alpha: float) -> float:
     return safe_sqrt(alpha * alpha * (w[0] * w[0] + w[1] * w[1]) + w[2] * w[2])
 
 
-@wp.func
-def smith_g1(w: wp.vec3, alpha: float) -> float:
-    """Smith masking of one direction with ``w.z > 0``.  Heitz 2014, eq. 43 with the GGX Lambda of eq. 72."""
-    return 2.0 * w[2] / (w[2] + ggx_root(w, alpha))
+@wp.struct
+class Facet:
+    """The microfacet that reflects ``wo`` into ``wi``, with what value and densities of the pair share."""
+
+    wm: wp.vec3
+    cos_m: float  # wo.wm
+    ndf: float
+    root_o: float
+    root_i: float
 
 
 @wp.func
-def smith_visibility(wo: wp.vec3, wi: wp.vec3, alpha: float) -> float:
+def facet_between(wo: wp.vec3, wi: wp.vec3, alpha: float) -> Facet:
+    """Facet of two directions above the horizon; its normal and both cosines with it are then positive."""
+    facet = Facet()
+    facet.wm = wp.normalize(wo + wi)
+    facet.cos_m = wp.dot(wo, facet.wm)
+    facet.ndf = ggx_ndf(facet.wm, alpha)
+    facet.root_o = ggx_root(wo, alpha)
+    facet.root_i = ggx_root(wi, alpha)
+    return facet
+
+
+@wp.func
+def smith_visibility(facet: Facet, wo: wp.vec3, wi: wp.vec3) -> float:
     """Height-correlated Smith G2 over ``4 cos_o cos_i``; both cosines positive.  Heitz 2014, eq. 99."""
-    return 0.5 / (wi[2] * ggx_root(wo, alpha) + wo[2] * ggx_root(wi, alpha))
+    return 0.5 / (wi[2] * facet.root_o + wo[2] * facet.root_i)
 
 
 @wp.func
@@ -63,28 +80,23 @@ def pdf_ggx_vndf(wo: wp.vec3, alpha: float, wm: wp.vec3) -> float:
 
 
 @wp.func
-def pdf_vndf_reflection(wo: wp.vec3, alpha: float, wm: wp.vec3) -> float:
-    """Density [1/sr of ``wi``] of ``wo`` reflected at a visible normal, ``wm`` the half vector.
+def pdf_vndf_reflection(facet: Facet, wo: wp.vec3) -> float:
+    """Density [1/sr of ``wi``] of ``wo`` reflected at a visible normal: pdf_ggx_vndf / (4 wo.wm).
 
-    pdf_ggx_vndf / (4 wo.wm), Walter et al. 2007, eq. 14."""
-    pdf = wp.float32(0.0)
-    if wo[2] > 0.0 and wm[2] > 0.0 and wp.dot(wo, wm) > 0.0:
-        pdf = 0.5 * ggx_ndf(wm, alpha) / (wo[2] + ggx_root(wo, alpha))
-    return pdf
+    Walter et al. 2007, eq. 14."""
+    return 0.5 * facet.ndf / (wo[2] + facet.root_o)
 
 
 @wp.func
-def pdf_vndf_partner(wo: wp.vec3, alpha: float, wm: wp.vec3) -> float:
-    """Density [1/sr of ``wi``] of ``wo`` reflected at the mirrored visible normal, ``wm`` the half vector of ``wi``.
+def pdf_vndf_partner(facet: Facet, wo: wp.vec3) -> float:
+    """Density [1/sr of ``wi``] of ``wo`` reflected at the mirrored visible normal: pdf_ggx_vndf(mirror(wm)) / (4
+    wo.wm).
 
-    The mirrored normal has the density of its original, and the Jacobian of the reflection is that of ``wm`` itself:
-    pdf_ggx_vndf(mirror(wm)) / (4 wo.wm).
+    The mirrored normal has the density of its original, in which D is the same and wo.wm that of the original, and the
+    Jacobian of the reflection is that of ``wm`` itself.
     """
-    cos_m = wp.dot(wo, wm)
-    pdf = wp.float32(0.0)
-    if cos_m > 0.0:
-        pdf = pdf_ggx_vndf(wo, alpha, mirror(wm)) / (4.0 * wp.max(cos_m, COS_MIN))
-    return pdf
+    cos_own = wp.max(2.0 * wo[2] * facet.wm[2] - facet.cos_m, 0.0)  # wo.mirror(wm)
+    return pdf_vndf_reflection(facet, wo) * cos_own / wp.max(facet.cos_m, COS_MIN)
 
 
 @wp.kernel

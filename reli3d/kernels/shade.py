@@ -10,10 +10,10 @@ densities of all strategies in the weight.  A face seen from behind is shaded as
 import warp as wp
 
 from reli3d.kernels.bsdf import eval_bsdf, pdf_lobes
-from reli3d.kernels.envmap import direction_to_uv, lookup_envmap_uv, pdf_envmap_uv, sample_envmap_uv, uv_to_direction
+from reli3d.kernels.envmap import direction_to_uv, lookup_envmap_uv, pdf_envmap_uv, sample_envmap
 from reli3d.kernels.intersect import hit_occluded, offset_origin
 from reli3d.kernels.math import INLINE, tangent_frame
-from reli3d.kernels.microfacet import ALPHA_MIN, COS_MIN, sample_ggx_vndf
+from reli3d.kernels.microfacet import ALPHA_MIN, COS_MIN, Facet, facet_between, sample_ggx_vndf
 from reli3d.kernels.mis import mis_factor
 from reli3d.kernels.random import random_pair, rotate_point
 from reli3d.kernels.sampling import mirror, reflect, sample_cosine
@@ -25,8 +25,15 @@ COS_VIEW_MIN = wp.constant(1.0e-3)  # an interpolated normal that turns away is 
 
 @wp.struct
 class Surface:
-    """What the samples of one hit share; ``wo`` in the local frame, whose axes are the rows of ``frame``."""
+    """What the samples of one hit share; ``wo`` in the local frame, whose axes are the rows of ``frame``.
 
+    The shifts turn the even points of each strategy (Cranley and Patterson); unused where points are independent.
+    """
+
+    pixel: int
+    shift_environment: wp.vec2
+    shift_visible: wp.vec2
+    shift_cosine: wp.vec2
     frame: wp.mat33
     ng: wp.vec3
     wo: wp.vec3
@@ -53,11 +60,12 @@ class Plan:
 @wp.struct
 class Draw:
     """One sample: its direction in world space, in the local frame and on the map; ``factor`` is w / (n p), 0 for
-    none."""
+    none, which then has no facet."""
 
     direction: wp.vec3
     wi: wp.vec3
     uv: wp.vec2
+    facet: Facet
     factor: float
     count: int
 
@@ -74,9 +82,16 @@ def bend_normal(n: wp.vec3, wo: wp.vec3) -> wp.vec3:
 
 @wp.func
 def make_surface(
-    normal: wp.vec3, ng: wp.vec3, wo: wp.vec3, base_color: wp.vec3, alpha: float, metallic: float
+    plan: Plan,
+    pixel: int,
+    normal: wp.vec3,
+    ng: wp.vec3,
+    wo: wp.vec3,
+    base_color: wp.vec3,
+    alpha: float,
+    metallic: float,
 ) -> Surface:
-    """Local frame of a hit, on the side of the viewer."""
+    """Local frame of a hit, on the side of the viewer, and its random numbers."""
     side = wp.float32(1.0)
     if wp.dot(ng, wo) < 0.0:
         side = -1.0
@@ -87,15 +102,23 @@ def make_surface(
     surface.base_color = base_color
     surface.alpha = wp.max(alpha, ALPHA_MIN)
     surface.metallic = metallic
+    surface.pixel = pixel
+    surface.shift_environment = random_pair(plan.seed, pixel, 0, 0)
+    surface.shift_visible = random_pair(plan.seed, pixel, 0, 1)
+    surface.shift_cosine = random_pair(plan.seed, pixel, 0, 2)
     return surface
 
 
 @wp.func
-def draw_pair(plan: Plan, points: wp.array(dtype=wp.vec2), pixel: int, index: int, strategy: int) -> wp.vec2:
-    """Uniform pair of a sample: independent, or the rotated point of an even set."""
-    u = random_pair(plan.seed, pixel, index * (1 - plan.rotate), strategy)
+def draw_pair(
+    plan: Plan, points: wp.array(dtype=wp.vec2), shift: wp.vec2, pixel: int, index: int, strategy: int
+) -> wp.vec2:
+    """Uniform pair of a sample: independent, or the shifted point of an even set."""
+    u = wp.vec2(0.0, 0.0)
     if plan.rotate != 0:
-        u = rotate_point(points[index], u)
+        u = rotate_point(points[index], shift)
+    else:
+        u = random_pair(plan.seed, pixel, index, strategy)
     return u
 
 
@@ -109,7 +132,6 @@ def draw_sample(
     row_guide: wp.array2d(dtype=wp.int32),
     column_guide: wp.array2d(dtype=wp.int32),
     density: wp.array2d(dtype=float),
-    pixel: int,
     sample: int,
 ) -> Draw:
     """Sample ``sample`` of a hit; a direction below the horizon has factor 0."""
@@ -120,33 +142,35 @@ def draw_sample(
     strategy = wp.int32(0)
     count = wp.int32(plan.n_environment)
     if sample < plan.n_environment:
-        u = draw_pair(plan, points, pixel, sample, 0)
-        uv = sample_envmap_uv(rows, columns, row_guide, column_guide, u)
-        out.direction = uv_to_direction(uv)
+        u = draw_pair(plan, points, surface.shift_environment, surface.pixel, sample, 0)
+        drawn = sample_envmap(rows, columns, row_guide, column_guide, u)
+        uv = drawn.uv
+        out.direction = drawn.direction
         wi = surface.frame * out.direction
     else:
         k = sample - plan.n_environment
         if k < plan.n_visible:
             strategy = 1
             count = plan.n_visible
-            if plan.antithetic != 0:
-                wm = sample_ggx_vndf(surface.wo, surface.alpha, draw_pair(plan, points, pixel, k // 2, 1))
-                if k % 2 == 1:
-                    strategy = 2
-                    wm = mirror(wm)
-            else:
-                wm = sample_ggx_vndf(surface.wo, surface.alpha, draw_pair(plan, points, pixel, k, 1))
+            index = k >> plan.antithetic
+            u = draw_pair(plan, points, surface.shift_visible, surface.pixel, index, 1)
+            wm = sample_ggx_vndf(surface.wo, surface.alpha, u)
+            if plan.antithetic != 0 and (k & 1) == 1:
+                strategy = 2
+                wm = mirror(wm)
             if wp.dot(surface.wo, wm) > COS_MIN:
                 wi = reflect(surface.wo, wm)
         else:
             strategy = 3
             count = plan.n_cosine
-            wi = sample_cosine(draw_pair(plan, points, pixel, k - plan.n_visible, 2))
+            u = draw_pair(plan, points, surface.shift_cosine, surface.pixel, k - plan.n_visible, 2)
+            wi = sample_cosine(u)
         out.direction = wp.transpose(surface.frame) * wi
         if wi[2] > COS_MIN:
             uv = direction_to_uv(out.direction)
     if wi[2] > COS_MIN:
-        lobes = pdf_lobes(surface.wo, wi, surface.alpha)
+        out.facet = facet_between(surface.wo, wi, surface.alpha)
+        lobes = pdf_lobes(out.facet, surface.wo, wi)
         partners = float(plan.antithetic * (plan.n_visible // 2))
         all = wp.vec4(
             float(plan.n_environment) * pdf_envmap_uv(density, uv),
@@ -165,7 +189,7 @@ def draw_sample(
 @wp.func
 def sample_value(surface: Surface, draw: Draw, light: wp.vec3, clamp: float) -> wp.vec3:
     """What a sample adds if nothing is in its way; at most ``clamp`` over its strategy's count."""
-    value = eval_bsdf(surface.wo, draw.wi, surface.base_color, surface.alpha, surface.metallic)
+    value = eval_bsdf(draw.facet, surface.wo, draw.wi, surface.base_color, surface.metallic)
     value = wp.cw_mul(value, light) * (draw.factor * draw.wi[2])
     top = clamp / float(draw.count)
     return wp.vec3(wp.min(value[0], top), wp.min(value[1], top), wp.min(value[2], top))
@@ -186,12 +210,12 @@ def shade_kernel(
 ):  # fmt: skip
     """The fused estimator; shadow rays through Warp's BVH."""
     i = start + wp.tid()
-    surface = make_surface(normal[i], ng[i], wo[i], base_color[i], alpha[i], metallic[i])
+    surface = make_surface(plan, pixels[i], normal[i], ng[i], wo[i], base_color[i], alpha[i], metallic[i])
     total = wp.vec3(0.0, 0.0, 0.0)
     word = wp.int32(0)
     count = plan.n_environment + plan.n_visible + plan.n_cosine
     for s in range(count):
-        d = draw_sample(surface, plan, points, rows, columns, row_guide, column_guide, density, pixels[i], s)
+        d = draw_sample(surface, plan, points, rows, columns, row_guide, column_guide, density, s)
         if d.factor > 0.0:
             lit = wp.bool(True)
             if shadows != 0:
@@ -223,10 +247,10 @@ def shade_rays_kernel(
     """First half of the estimator for a chunk of hits: shadow rays (``t_max`` < 0 where none is needed) and values."""
     j = start + wp.tid()
     i = first + j
-    surface = make_surface(normal[i], ng[i], wo[i], base_color[i], alpha[i], metallic[i])
+    surface = make_surface(plan, pixels[i], normal[i], ng[i], wo[i], base_color[i], alpha[i], metallic[i])
     count = plan.n_environment + plan.n_visible + plan.n_cosine
     for s in range(count):
-        d = draw_sample(surface, plan, points, rows, columns, row_guide, column_guide, density, pixels[i], s)
+        d = draw_sample(surface, plan, points, rows, columns, row_guide, column_guide, density, s)
         k = j * count + s
         t_max[k] = -1.0
         if d.factor > 0.0:

@@ -8,10 +8,10 @@ from their counters, so nothing per sample is in memory but the visibility bits.
 
 import warp as wp
 
-from reli3d.kernels.bsdf import F0_DIELECTRIC, base_reflectance, schlick
+from reli3d.kernels.bsdf import F0_DIELECTRIC, base_reflectance, eval_bsdf, schlick
 from reli3d.kernels.envmap import add_texels, lookup_envmap_uv
 from reli3d.kernels.math import INLINE, INV_PI
-from reli3d.kernels.microfacet import ALPHA_MIN, ggx_ndf, ggx_root, smith_visibility
+from reli3d.kernels.microfacet import ALPHA_MIN, Facet, smith_visibility
 from reli3d.kernels.shade import COS_VIEW_MIN, Plan, draw_sample, make_surface
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native " + INLINE})
@@ -30,48 +30,46 @@ class SurfaceGradient:
 @wp.func
 def add_sample_gradient(
     total: SurfaceGradient,
+    facet: Facet,
     wo: wp.vec3,
     wi: wp.vec3,
     base_color: wp.vec3,
     alpha: float,
     metallic: float,
+    value: wp.vec3,
     weight: wp.vec3,
 ) -> SurfaceGradient:
-    """``total`` plus the adjoint of ``dot(weight, f cos_i)``; ``weight`` holds the output's adjoint, light and
-    factor."""
+    """``total`` plus the adjoint of ``dot(weight, value cos_i)``; ``value`` is the material's, ``weight`` holds the
+    output's adjoint, light and factor."""
     out = total
     one = wp.vec3(1.0, 1.0, 1.0)
-    wm = wp.normalize(wo + wi)
-    f0 = base_reflectance(base_color, metallic)
-    fresnel = schlick(f0, wp.dot(wo, wm))
-    rest = wp.max(1.0 - wp.dot(wo, wm), 0.0)
+    wm = facet.wm
+    fresnel = schlick(base_reflectance(base_color, metallic), facet.cos_m)
+    rest = wp.max(1.0 - facet.cos_m, 0.0)
     slope = 1.0 - rest * rest * rest * rest * rest  # dF / dF0
-    ndf = ggx_ndf(wm, alpha)
-    visibility = smith_visibility(wo, wi, alpha)
-    specular = ndf * visibility
+    visibility = smith_visibility(facet, wo, wi)
+    specular = facet.ndf * visibility
     diffuse = (1.0 - metallic) * INV_PI
-    value = wp.cw_mul(one - fresnel, base_color) * diffuse + fresnel * specular
     g = weight * wi[2]
     g_fresnel = wp.cw_mul(g, one * specular - base_color * diffuse) * slope  # to F0
     out.base_color = out.base_color + wp.cw_mul(g, one - fresnel) * diffuse + g_fresnel * metallic
     out.metallic = out.metallic + wp.dot(g_fresnel, base_color - one * F0_DIELECTRIC)
     out.metallic = out.metallic - wp.dot(g, wp.cw_mul(one - fresnel, base_color)) * INV_PI
-    g_specular = wp.dot(g, fresnel)
+    g_specular = wp.dot(g, fresnel) * specular
     a2 = alpha * alpha
-    k = a2 * wm[2] * wm[2] + wm[0] * wm[0] + wm[1] * wm[1]
-    root_o = ggx_root(wo, alpha)
-    root_i = ggx_root(wi, alpha)
+    inverse_k = 1.0 / (a2 * wm[2] * wm[2] + wm[0] * wm[0] + wm[1] * wm[1])
+    inverse_o = 1.0 / facet.root_o
+    inverse_i = 1.0 / facet.root_i
     log_e = 2.0 * visibility  # 1 / E with V = 1 / (2 E), E = cos_i root_o + cos_o root_i
     sin2_o = wo[0] * wo[0] + wo[1] * wo[1]
     sin2_i = wi[0] * wi[0] + wi[1] * wi[1]
-    d_alpha = 2.0 / alpha - 4.0 * alpha * wm[2] * wm[2] / k
-    d_alpha = d_alpha - log_e * alpha * (wi[2] * sin2_o / root_o + wo[2] * sin2_i / root_i)
-    out.alpha = out.alpha + g_specular * specular * d_alpha
-    d_m = 4.0 * wm[2] * (1.0 - a2) / k
-    d_o = -log_e * (wi[2] * wo[2] * (1.0 - a2) / root_o + root_i)
-    d_i = -log_e * (wo[2] * wi[2] * (1.0 - a2) / root_i + root_o)
-    along = g_specular * specular
-    out.n = out.n + wm * (along * d_m) + wo * (along * d_o) + wi * (along * d_i + wp.dot(weight, value))
+    d_alpha = 2.0 / alpha - 4.0 * alpha * wm[2] * wm[2] * inverse_k
+    d_alpha = d_alpha - log_e * alpha * (wi[2] * sin2_o * inverse_o + wo[2] * sin2_i * inverse_i)
+    out.alpha = out.alpha + g_specular * d_alpha
+    d_m = 4.0 * wm[2] * (1.0 - a2) * inverse_k
+    d_o = -log_e * (wi[2] * wo[2] * (1.0 - a2) * inverse_o + facet.root_i)
+    d_i = -log_e * (wo[2] * wi[2] * (1.0 - a2) * inverse_i + facet.root_o)
+    out.n = out.n + wm * (g_specular * d_m) + wo * (g_specular * d_o) + wi * (g_specular * d_i + wp.dot(weight, value))
     return out
 
 
@@ -91,29 +89,24 @@ def shade_adjoint_kernel(
 ):  # fmt: skip
     """Adjoints of the hits from ``first``; ``g_radiance`` is added to, or without texels left out."""
     i = first + start + wp.tid()
-    surface = make_surface(normal[i], ng[i], wo[i], base_color[i], alpha[i], metallic[i])
+    surface = make_surface(plan, pixels[i], normal[i], ng[i], wo[i], base_color[i], alpha[i], metallic[i])
     total = SurfaceGradient()
     g = g_out[i]
     for s in range(plan.n_environment + plan.n_visible + plan.n_cosine):
         if (visible[i, s // 32] >> (s & 31)) & 1 != 0:
-            d = draw_sample(surface, plan, points, rows, columns, row_guide, column_guide, density, pixels[i], s)
+            d = draw_sample(surface, plan, points, rows, columns, row_guide, column_guide, density, s)
             light = lookup_envmap_uv(radiance, d.uv)
-            value = wp.vec3(0.0, 0.0, 0.0)
-            wm = wp.normalize(surface.wo + d.wi)
-            fresnel = schlick(base_reflectance(surface.base_color, surface.metallic), wp.dot(surface.wo, wm))
-            specular = ggx_ndf(wm, surface.alpha) * smith_visibility(surface.wo, d.wi, surface.alpha)
-            for c in range(3):
-                diffuse = (1.0 - fresnel[c]) * surface.base_color[c] * (1.0 - surface.metallic) * INV_PI
-                value[c] = (diffuse + fresnel[c] * specular) * d.factor * d.wi[2]
+            value = eval_bsdf(d.facet, surface.wo, d.wi, surface.base_color, surface.metallic)
+            scale = d.factor * d.wi[2]
             top = plan.clamp / float(d.count)
             own = wp.vec3(0.0, 0.0, 0.0)  # the output's adjoint, 0 where the clamp held
             for c in range(3):
-                if value[c] * light[c] < top:
+                if value[c] * scale * light[c] < top:
                     own[c] = g[c]
-            total = add_sample_gradient(total, surface.wo, d.wi, surface.base_color, surface.alpha, surface.metallic,
-                                        wp.cw_mul(own, light) * d.factor)  # fmt: skip
+            total = add_sample_gradient(total, d.facet, surface.wo, d.wi, surface.base_color, surface.alpha,
+                                        surface.metallic, value, wp.cw_mul(own, light) * d.factor)  # fmt: skip
             if g_radiance.shape[0] != 0:
-                add_texels(g_radiance, d.uv, wp.cw_mul(own, value))
+                add_texels(g_radiance, d.uv, wp.cw_mul(own, value) * scale)
     side = wp.float32(1.0)
     if wp.dot(ng[i], wo[i]) < 0.0:
         side = -1.0

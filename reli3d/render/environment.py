@@ -34,7 +34,7 @@ class EnvironmentTable:
 
     @property
     def sampler(self) -> list[tuple[Tensor, type]]:
-        """The four arrays that ``sample_envmap_uv`` takes, with their Warp types."""
+        """The four arrays that ``sample_envmap`` takes, with their Warp types."""
         return [(self.rows, wp.float32), (self.columns, wp.float32), (self.row_guide, wp.int32),
                 (self.column_guide, wp.int32)]  # fmt: skip
 
