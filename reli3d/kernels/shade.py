@@ -114,10 +114,8 @@ def draw_pair(
     plan: Plan, points: wp.array(dtype=wp.vec2), shift: wp.vec2, pixel: int, index: int, strategy: int
 ) -> wp.vec2:
     """Uniform pair of a sample: independent, or the shifted point of an even set."""
-    u = wp.vec2(0.0, 0.0)
-    if plan.rotate != 0:
-        u = rotate_point(points[index], shift)
-    else:
+    u = rotate_point(points[index], shift)
+    if plan.rotate == 0:
         u = random_pair(plan.seed, pixel, index, strategy)
     return u
 
