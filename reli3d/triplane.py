@@ -12,13 +12,15 @@ from reli3d.kernels import triplane as kernels
 BLOCK = 8  # channels of a kernels.vec8
 ROWS_MIN = 8  # rows of cells a CPU slice of the planes' adjoint: each adds all the points that fall in it
 CACHED = 1 << 16  # floats of a plane that stay in a core's second-level cache whatever the order of the points
+PROBED, NEAR, WALK = 4096, 8.0, 0.8  # points looked at, texels from one to the next, and the share that makes a walk
 
 
 class _SampleTriplane(torch.autograd.Function):
     """Own backward: a scatter per point would need atomics, which Warp's CPU launches lack and CUDA does in any order.
 
     Points are sorted by their row of cells instead, and one thread owns the rows of texels it adds to.  On CPU the
-    forward pass walks the same order, as rows of a large plane stay in the cache.
+    forward pass walks the same order, as rows of a large plane stay in the cache; points that come as a walk over
+    neighbours (a grid, texels of an atlas) need no order for that.
     """
 
     @staticmethod
@@ -27,8 +29,11 @@ class _SampleTriplane(torch.autograd.Function):
         n = points.shape[1]
         packed, points = _packed(planes), points.contiguous()
         blocks = packed.shape[-1] // BLOCK
-        sort = ctx.needs_input_grad[0] or (not planes.is_cuda and packed[0, 0].numel() > CACHED)
-        order, edges = _by_cell_row(points, height, width) if sort else (points.new_empty(0, dtype=torch.int32), None)
+        order, edges = points.new_empty(0, dtype=torch.int32), None
+        if ctx.needs_input_grad[0]:
+            order, edges = _by_cell_row(points, height, width)
+        elif not planes.is_cuda and packed[0, 0].numel() > CACHED and not _is_walk(points, max(height, width)):
+            order = _cell_order(points, height, width)[1]
         features = packed.new_empty(batch, n, 3, blocks * BLOCK)
         split = blocks if planes.is_cuda else 1  # neighbouring GPU threads read neighbouring blocks
         launch(kernels.sample_kernel, batch * n * 3 * split, [
@@ -59,9 +64,16 @@ def _packed(planes: Tensor) -> Tensor:
     return packed.to(torch.float32).contiguous()
 
 
-def _by_cell_row(points: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
-    """Points of every plane by row of cells, ``(3 * B, N)`` int32, and the start of every row and their end,
-    ``(3 * B, height + 2)``; along a row roughly by column, points that miss the plane last."""
+def _is_walk(points: Tensor, size: int) -> bool:
+    """Whether the first points mostly lie within a few texels, ``size`` along a plane, of those before them."""
+    some = points[:, :PROBED]
+    near = (some[:, 1:] - some[:, :-1]).abs().amax(-1) < NEAR * 2.0 / size
+    return bool(near.sum() > WALK * near.numel())
+
+
+def _cell_order(points: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
+    """Cells ``keys`` of the points and the points in their order, both ``(3 * B, N)`` int32: by row of cells, along a
+    row roughly by column, points that miss the plane last."""
     slabs, n = points.shape[0] * 3, points.shape[1]
     bins = 2**16 // (height + 2)
     keys = torch.empty(slabs, n, dtype=torch.int32, device=points.device)
@@ -71,6 +83,14 @@ def _by_cell_row(points: Tensor, height: int, width: int) -> tuple[Tensor, Tenso
         order = torch.argsort(keys, dim=1, stable=True).to(torch.int32)
     else:  # numpy sorts 16-bit keys by radix, ten times faster than torch.sort
         order = torch.from_numpy(np.argsort(keys.numpy().astype(np.uint16), axis=1, kind="stable").astype(np.int32))
+    return keys, order
+
+
+def _by_cell_row(points: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
+    """Points of every plane by :func:`_cell_order`, ``(3 * B, N)`` int32, and the start of every row and their end,
+    ``(3 * B, height + 2)``."""
+    keys, order = _cell_order(points, height, width)
+    slabs, bins = len(keys), 2**16 // (height + 2)
     rows = keys // bins + torch.arange(slabs, device=points.device)[:, None] * (height + 2)
     count = torch.bincount(rows.view(-1), minlength=slabs * (height + 2)).view(slabs, height + 2)
     edges = torch.nn.functional.pad(count[:, :-1].cumsum(1), (1, 0)).to(torch.int32)

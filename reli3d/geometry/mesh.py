@@ -101,8 +101,8 @@ def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     _check_topology(vertices, faces)
     per_face = face_normals(vertices, faces)
     total = torch.zeros_like(vertices)
-    for k in range(3):
-        total = total.index_add(0, faces[:, k], per_face)
+    for corner in faces.long().T.contiguous():  # index_add takes ten times as long with int32
+        total = total.index_add(0, corner, per_face)
     square = (total * total).sum(-1, keepdim=True)
     valid = square > NORMAL_MIN
     unit = total * torch.rsqrt(torch.where(valid, square, 1.0))
@@ -115,30 +115,52 @@ def weld(vertices: Tensor) -> tuple[Tensor, Tensor]:
     ``first`` is the lowest vertex of a label.  Labels count up in the order of ``first``.  -0 equals +0.
     """
     check("vertices", vertices, last=3)
-    first, label = _weld(vertices.detach().cpu().numpy())
+    first, label = weld_rows(vertices.detach().cpu().numpy())
     return torch.from_numpy(first).to(vertices.device), torch.from_numpy(label).to(vertices.device)
 
 
-def _weld(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    bits = np.ascontiguousarray(positions + np.float32(0.0)).view(np.uint32).astype(np.uint64)
+def weld_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """As :func:`weld` for rows ``(N, K)`` of float32."""
+    bits = np.ascontiguousarray(rows + np.float32(0.0)).view(np.uint32).astype(np.uint64)
     key = np.zeros(len(bits), np.uint64)
-    for k in range(3):  # 64-bit mix (splitmix64): one integer to sort instead of three columns
+    for k in range(bits.shape[1]):  # 64-bit mix (splitmix64): one integer to sort instead of the columns
         key = (key ^ bits[:, k]) + np.uint64(0x9E3779B97F4A7C15)
         key = (key ^ (key >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
         key = (key ^ (key >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
         key ^= key >> np.uint64(31)
-    _, first, label = np.unique(key, return_index=True, return_inverse=True)
-    if not np.array_equal(bits[first[label]], bits):  # two positions with one hash
+    spare = np.uint64(1 + max(1, len(bits).bit_length()))  # room for the index beside the key
+    order, start = group((key >> spare).astype(np.int64))
+    lowest = np.empty(len(bits), np.int64)
+    lowest[order] = np.repeat(order[start], np.diff(start, append=len(order)))
+    if not np.array_equal(bits[lowest], bits):  # two rows with one hash
         _, first, label = np.unique(bits, axis=0, return_index=True, return_inverse=True)
-    order = np.argsort(first, kind="stable")
-    rank = np.empty_like(order)
-    rank[order] = np.arange(len(order))
-    return first[order].astype(np.int64), rank[label.reshape(-1)].astype(np.int64)
+        lowest = first[label.reshape(-1)]
+    leads = lowest == np.arange(len(bits))
+    return np.flatnonzero(leads), (np.cumsum(leads) - 1)[lowest]
+
+
+def group(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """``(order, first)``: stable order that sorts ``keys`` >= 0, and where in it each run of equal keys begins."""
+    n = len(keys)
+    low = max(1, int(n - 1).bit_length())
+    # sorting key and index as one number: 5 times faster than argsort
+    if n and int(keys.max()).bit_length() + low <= 63:
+        packed = np.sort((keys.astype(np.int64) << low) | np.arange(n, dtype=np.int64))
+        order, ordered = packed & ((1 << low) - 1), packed >> low
+    else:
+        order = np.argsort(keys, kind="stable")
+        ordered = keys[order]
+    return order, np.flatnonzero(np.concatenate([[True], ordered[1:] != ordered[:-1]])) if n else np.zeros(0, np.int64)
+
+
+def sorted_keys(keys: Tensor) -> Tensor:
+    """Ascending int64 values; numpy's vector sort is 5 times faster than torch's, which carries indices."""
+    return torch.sort(keys).values if keys.is_cuda else torch.from_numpy(np.sort(keys.numpy()))
 
 
 def welded_faces(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
     """Faces over welded labels, and which of them are not degenerate."""
-    _, label = _weld(mesh.vertices.detach().cpu().numpy())
+    _, label = weld_rows(mesh.vertices.detach().cpu().numpy())
     faces = label[mesh.faces.cpu().numpy()].reshape(-1, 3)
     a, b, c = faces.T
     return faces, (a != b) & (b != c) & (c != a)
@@ -152,6 +174,8 @@ def face_components(mesh: Mesh) -> Tensor:
     n = int(faces.max()) + 1
     rows, cols = faces[:, [0, 1]].reshape(-1), faces[:, [1, 2]].reshape(-1)
     _, label = graph_components(coo_matrix((np.ones(len(rows), np.int8), (rows, cols)), shape=(n, n)), directed=False)
+    if not label.any():
+        return torch.zeros(len(faces), dtype=torch.int64, device=mesh.faces.device)
     _, first, inverse = np.unique(label[faces[:, 0]], return_index=True, return_inverse=True)
     rank = np.argsort(np.argsort(first))
     return torch.from_numpy(rank[inverse].astype(np.int64)).to(mesh.faces.device)
@@ -200,11 +224,7 @@ def report(mesh: Mesh) -> MeshReport:
         return MeshReport(**size, welded_vertices=0, components=0, euler=0, boundary_edges=0, nonmanifold_edges=0,
                           flipped_edges=0, nonmanifold_vertices=0, watertight=False, manifold=True)  # fmt: skip
     n = int(faces.max()) + 1
-    tail, head = faces.reshape(-1), faces[:, [1, 2, 0]].reshape(-1)  # half-edge h = 3 * face + corner
-    key = np.minimum(tail, head) * n + np.maximum(tail, head)
-    order = np.argsort(key, kind="stable")
-    start = np.flatnonzero(np.diff(key[order], prepend=-1))
-    valence = np.diff(start, append=len(key))
+    tail, head, order, start, valence = _edges(faces)
     forward = np.add.reduceat((tail < head)[order].astype(np.int64), start)
     pair = start[valence == 2]
     one, other = order[pair], order[pair + 1]
@@ -233,6 +253,21 @@ def report(mesh: Mesh) -> MeshReport:
     }
     manifold = not (counts["nonmanifold_edges"] or counts["flipped_edges"] or counts["nonmanifold_vertices"])
     return MeshReport(**size, **counts, watertight=bool((valence % 2 == 0).all()), manifold=manifold)
+
+
+def watertight(mesh: Mesh) -> bool:
+    """Whether the mesh has faces and every edge an even number of them; :func:`report` without the rest."""
+    faces, sound = welded_faces(mesh)
+    return bool(sound.any() and (_edges(faces[sound])[-1] % 2 == 0).all())
+
+
+def _edges(faces: np.ndarray) -> tuple[np.ndarray, ...]:
+    """``(tail, head, order, start, valence)``: ends of the half-edges 3 * face + corner, their order by edge, where in
+    it each edge begins, and the number of its half-edges.
+    """
+    tail, head = faces.reshape(-1), faces[:, [1, 2, 0]].reshape(-1)
+    order, start = group(np.minimum(tail, head) * (int(faces.max()) + 1) + np.maximum(tail, head))
+    return tail, head, order, start, np.diff(start, append=len(order))
 
 
 def volume(mesh: Mesh) -> Tensor:

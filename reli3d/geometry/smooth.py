@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from reli3d.geometry.mesh import Mesh, weld
+from reli3d.geometry.mesh import Mesh, sorted_keys, weld
 
 BORDERS = ("fixed", "along")
 
@@ -22,7 +22,8 @@ class _Umbrella:
 
     label: Tensor  # (V,) welded vertex of every vertex
     share: Tensor  # (V, 1) 1 / copies of a vertex
-    ends: tuple[Tensor, Tensor]  # (E,) each: the vertex that moves and a neighbour
+    neighbours: Tensor  # (E,) of every welded vertex that moves, one after the other
+    start: Tensor  # (W,) where those of a vertex begin
     inverse: Tensor  # (W, 1) 1 / neighbours, 0 for what stays
 
     def welded(self, values: Tensor) -> Tensor:
@@ -30,8 +31,8 @@ class _Umbrella:
         return out.index_add(0, self.label, values * self.share)
 
     def __call__(self, positions: Tensor) -> Tensor:
-        moved, neighbour = self.ends
-        return torch.zeros_like(positions).index_add(0, moved, (positions[neighbour] - positions[moved])) * self.inverse
+        total = torch.nn.functional.embedding_bag(self.neighbours, positions, self.start, mode="sum")
+        return total * self.inverse - positions * (self.inverse > 0)
 
 
 def _umbrella(mesh: Mesh, border: str) -> _Umbrella:
@@ -41,19 +42,20 @@ def _umbrella(mesh: Mesh, border: str) -> _Umbrella:
     tail, head = faces.reshape(-1), faces[:, [1, 2, 0]].reshape(-1)
     real = tail != head
     tail, head = tail[real], head[real]
-    key, count = torch.unique(torch.minimum(tail, head) * n + torch.maximum(tail, head), return_counts=True)
-    a, b, open_edge = key // n, key % n, count == 1
+    both = sorted_keys(torch.cat([tail * n + head, head * n + tail]))
+    key, count = torch.unique_consecutive(both, return_counts=True)  # every edge from both its ends
+    moved, open_edge = key // n, count == 1
     at_border = torch.zeros(n, dtype=torch.bool, device=key.device)
-    at_border[a[open_edge]] = at_border[b[open_edge]] = True
-    moved, neighbour = torch.cat([a, b]), torch.cat([b, a])
+    at_border[moved[open_edge]] = True
     keep = ~at_border[moved]
     if border == "along":
-        keep |= torch.cat([open_edge, open_edge])
-    moved, neighbour = moved[keep], neighbour[keep]
-    degree = torch.bincount(moved, minlength=n)[:, None].to(mesh.vertices.dtype)
-    inverse = torch.where(degree > 0, 1.0 / degree.clamp(min=1.0), 0.0)
+        keep |= open_edge
+    key, moved = key[keep], moved[keep]
+    degree = torch.bincount(moved, minlength=n)
+    start = torch.cumsum(degree, 0) - degree
+    inverse = torch.where(degree > 0, 1.0 / degree.clamp(min=1), 0.0)[:, None].to(mesh.vertices.dtype)
     share = 1.0 / torch.bincount(label, minlength=n)[label][:, None].to(mesh.vertices.dtype)
-    return _Umbrella(label, share, (moved, neighbour), inverse)
+    return _Umbrella(label, share, key - moved * n, start, inverse)
 
 
 def _smoothed(mesh: Mesh, steps: list[float], border: str) -> Mesh:

@@ -13,20 +13,20 @@ import torch
 from torch import Tensor
 
 from reli3d._bridge import check
-from reli3d.geometry.mesh import Mesh, weld
+from reli3d.geometry.mesh import Mesh, weld_rows
 
 PARALLEL = 1.0e-12  # length of a projected direction, relative, below which it has no direction in float64
 
 
 def _unit(v: Tensor) -> tuple[Tensor, Tensor]:
-    """``v`` with unit last axis, 0 where it is shorter than PARALLEL, and its length ``(..., 1)``."""
-    length = torch.linalg.vector_norm(v, dim=-1, keepdim=True)
-    return torch.where(length > PARALLEL, v / length.clamp(min=1e-300), 0.0), length
+    """The columns of ``v (3, N)`` with unit length, 0 where shorter than PARALLEL, and their lengths ``(N,)``."""
+    length = (v * v).sum(0).sqrt()
+    return v * torch.where(length > PARALLEL, 1.0 / length.clamp(min=1e-300), 0.0), length
 
 
 def _flat(v: Tensor, n: Tensor) -> Tensor:
-    """``v`` without its part along the unit ``n``."""
-    return v - n * (n * v).sum(-1, keepdim=True)
+    """The columns of ``v`` without their parts along the unit columns of ``n``."""
+    return v - n * (n * v).sum(0)
 
 
 def vertex_tangents(mesh: Mesh) -> Tensor:
@@ -43,51 +43,50 @@ def vertex_tangents(mesh: Mesh) -> Tensor:
     for name, fix in (("normals", "Mesh.with_normals"), ("uv", "unwrap")):
         if getattr(mesh, name) is None:
             raise ValueError(f"mesh.{name}: expected a tensor, got None (see {fix})")
-    faces = mesh.faces.long()
-    p, uv = mesh.vertices.detach().double()[faces], mesh.uv.detach().double()[faces]
-    n = _unit(mesh.normals.detach().double())[0]
-    d1, d2 = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
-    s, t = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
-    along_u = t[:, 1:] * d1 - s[:, 1:] * d2
-    area = s[:, :1] * t[:, 1:] - s[:, 1:] * t[:, :1]  # v is down: a face that is not mirrored is clockwise here
-    along_u = _unit(along_u * area.sign())[0]
+    corners = mesh.faces.long().T.contiguous()  # vectors are columns: torch sums a short last axis slowly
+    vertices, uv, normals = (x.detach().double().T.contiguous() for x in (mesh.vertices, mesh.uv, mesh.normals))
+    p, n = [vertices[:, c] for c in corners], _unit(normals)[0]
+    s, t = (uv[:, c] - uv[:, corners[0]] for c in corners[1:])
+    area = s[0] * t[1] - s[1] * t[0]  # v is down: a face that is not mirrored is clockwise here
+    along_u = _unit((t[1] * (p[1] - p[0]) - s[1] * (p[2] - p[0])) * area.sign())[0]
     same = _merged(mesh)
     count = len(mesh.vertices)
-    side = same[faces] + torch.where(area < 0, 0, count)  # two accumulators a vertex: plain, mirrored
-    total = torch.zeros(2 * count, 4, dtype=torch.float64, device=p.device)
+    side = same[corners] + torch.where(area < 0, 0, count)  # two accumulators a vertex: plain, mirrored
+    total = torch.zeros(2 * count, 4, dtype=torch.float64, device=n.device)
     for k in range(3):
-        normal = n[faces[:, k]]
-        e1 = _unit(_flat(p[:, (k + 1) % 3] - p[:, k], normal))[0]
-        e2 = _unit(_flat(p[:, (k + 2) % 3] - p[:, k], normal))[0]
-        angle = torch.acos((e1 * e2).sum(-1, keepdim=True).clamp(-1.0, 1.0)) * (area != 0)
-        total.index_add_(0, side[:, k], torch.cat([_unit(_flat(along_u, normal))[0] * angle, angle], 1))
-    plain, mirrored = total[:count][same], total[count:][same]
-    flip = mirrored[:, 3:] > plain[:, 3:]
-    tangent, length = _unit(torch.where(flip, mirrored, plain)[:, :3])
+        normal = n[:, corners[k]]
+        e1 = _unit(_flat(p[(k + 1) % 3] - p[k], normal))[0]
+        e2 = _unit(_flat(p[(k + 2) % 3] - p[k], normal))[0]
+        angle = torch.acos((e1 * e2).sum(0).clamp(-1.0, 1.0)) * (area != 0)
+        share = torch.cat([_unit(_flat(along_u, normal))[0] * angle, angle[None]])
+        total.index_add_(0, side[k], share.T.contiguous())
+    plain, mirrored = total[:count][same].T, total[count:][same].T
+    flip = mirrored[3] > plain[3]
+    tangent, length = _unit(torch.where(flip, mirrored, plain)[:3])
     tangent = torch.where(length > PARALLEL, _unit(_flat(tangent, n))[0], _any_orthogonal(n))
-    return torch.cat([tangent, torch.where(flip, -1.0, 1.0).to(tangent)], 1).to(torch.float32)
+    return torch.cat([tangent, torch.where(flip, -1.0, 1.0).to(tangent)[None]]).T.to(torch.float32).contiguous()
 
 
 def _merged(mesh: Mesh) -> Tensor:
     """First vertex with the same position, normal and UV, for every vertex, ``(V,)``."""
-    flat_uv = torch.cat([mesh.uv.detach(), torch.zeros_like(mesh.uv[:, :1])], 1)
-    label = weld(mesh.vertices.detach())[1]
-    for part in (mesh.normals.detach(), flat_uv):
-        label = torch.unique(label * len(flat_uv) + weld(part)[1], return_inverse=True)[1]
-    order = torch.sort(label, stable=True)
-    labels = torch.arange(int(label.max()) + 1 if len(label) else 0, device=label.device)
-    first = torch.searchsorted(order.values, labels)
-    return order.indices[first][label]
+    first, label = weld_rows(torch.cat([mesh.vertices, mesh.normals, mesh.uv], 1).detach().cpu().numpy())
+    return torch.from_numpy(first[label]).to(mesh.vertices.device)
 
 
 def _any_orthogonal(n: Tensor) -> Tensor:
-    axis = torch.zeros_like(n).scatter_(1, n.abs().argmin(1, keepdim=True), 1.0)
+    axis = torch.zeros_like(n).scatter_(0, n.abs().argmin(0, keepdim=True), 1.0)
     return _unit(_flat(axis, n))[0]
 
 
 def with_tangents(mesh: Mesh) -> Mesh:
     """The same mesh with :func:`vertex_tangents`."""
     return replace(mesh, tangents=vertex_tangents(mesh))
+
+
+def _dot(a: Tensor, b: Tensor) -> Tensor:
+    """Products of vectors along the last axis, ``(...)``; a sum over so short an axis takes three times as long."""
+    product = a * b
+    return product[..., 0] + product[..., 1] + product[..., 2]
 
 
 def _frame(normal: Tensor, tangent: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -107,14 +106,13 @@ def encode_normals(world: Tensor, normal: Tensor, tangent: Tensor) -> Tensor:
     """
     t, b, n = _frame(normal, tangent)
     check("world", world, last=3, like=normal)
-    tt, tn = (t * t).sum(-1, keepdim=True), (t * n).sum(-1, keepdim=True)
-    nn = (n * n).sum(-1, keepdim=True)
-    wt, wn = (world * t).sum(-1, keepdim=True), (world * n).sum(-1, keepdim=True)
+    tt, tn, nn = _dot(t, t), _dot(t, n), _dot(n, n)
+    wt, wn = _dot(world, t), _dot(world, n)
     determinant = (tt * nn - tn * tn).clamp(min=1e-6)  # b is orthogonal to both, so that two equations remain
     x = (nn * wt - tn * wn) / determinant
     z = (tt * wn - tn * wt) / determinant
-    y = (world * b).sum(-1, keepdim=True) / (b * b).sum(-1, keepdim=True).clamp(min=1e-6)
-    local = torch.cat([x, y, z.clamp(min=0.0)], -1)
+    y = _dot(world, b) / _dot(b, b).clamp(min=1e-6)
+    local = torch.stack([x, y, z.clamp(min=0.0)], -1)
     return torch.nn.functional.normalize(local, dim=-1, eps=1e-6) * 0.5 + 0.5
 
 

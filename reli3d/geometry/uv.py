@@ -20,7 +20,7 @@ from torch import Tensor
 
 from reli3d import _bridge
 from reli3d.geometry import charts as parts
-from reli3d.geometry.mesh import Mesh, vertex_normals, weld
+from reli3d.geometry.mesh import Mesh, group, vertex_normals, weld
 from reli3d.kernels import uv as kernels
 
 FILL = 0.62  # share of the atlas that charts are expected to cover; sets the unit of the chart step only
@@ -110,7 +110,7 @@ def _joined(mesh: Mesh, faces: np.ndarray, charts: parts.Charts, uv: np.ndarray)
     alone = charts.chart < 0
     own = charts.count + 3 * (np.cumsum(alone) - 1)[:, None] + np.arange(3)
     corner = (np.where(alone[:, None], own, charts.chart[:, None]).astype(np.int64) * count + faces).ravel()
-    order, first = parts.group(corner)
+    order, first = group(corner)
     rank = np.zeros(len(order), np.int64)
     rank[first[1:]] = 1
     vertex = np.empty(len(order), np.int32)
@@ -152,7 +152,7 @@ def _place(charts: parts.Charts, faces: np.ndarray, size: int, guard: float, res
     used[charts.chart[faces]] = True
     chart, count = (np.cumsum(used) - 1)[charts.chart[faces]], int(used.sum())
     face, corner = np.nonzero(parts.border_edges(charts.chart, charts.neighbours)[faces])
-    order, start = parts.group(chart[face])
+    order, start = group(chart[face])
     face, corner = face[order], corner[order]
     edges = np.stack([charts.corners[faces[face], corner], charts.corners[faces[face], (corner + 1) % 3]], 1)
     low = np.minimum.reduceat(edges.min(1), start, axis=0)
