@@ -49,9 +49,10 @@ def mlp(inputs: int, width: int, outputs: int, hidden: int) -> nn.Sequential:
 
 
 def _rest(layers: nn.Sequential, x: Tensor) -> Tensor:
-    """What :func:`mlp` makes of its first activation ``x``; without gradient."""
+    """What :func:`mlp` makes of its first activation ``x (width, N)``, ``(outputs, N)``; without gradient."""
     for layer in layers[2:]:
-        x = functional.silu(x, inplace=True) if isinstance(layer, nn.SiLU) else layer(x)
+        silu = isinstance(layer, nn.SiLU)
+        x = functional.silu(x, inplace=True) if silu else torch.addmm(layer.bias[:, None], layer.weight, x)
     return x
 
 
@@ -91,15 +92,23 @@ class Heads(nn.ModuleDict):
                 raise ValueError(f"heads: expected some of {', '.join(self)}, got {name}")
         if torch.is_grad_enabled():
             raw = {name: self[name](features) for name in names}
-        else:  # one matrix for the first layers of all heads; what nobody will ask again is overwritten
-            first = [self[name][0] for name in names]
-            hidden = functional.linear(features, torch.cat([layer.weight for layer in first]),
-                                       torch.cat([layer.bias for layer in first]))  # fmt: skip
-            parts = functional.silu(hidden, inplace=True).split([layer.out_features for layer in first], -1)
-            raw = {name: _rest(self[name], part) for name, part in zip(names, parts, strict=True)}
+        else:
+            raw = self._inferred(features, names)
         if color is not None and "base_color" in raw:
             raw["base_color"] = raw["base_color"] + color_logit(color)
         return {name: activate(name, value) for name, value in raw.items()}
+
+    def _inferred(self, features: Tensor, names: Sequence[str]) -> dict[str, Tensor]:
+        """The MLPs without gradient: one matrix for all first layers, what nobody will ask again is overwritten.
+
+        A point is a column: products with 64 by 64 weights take half the time of points as rows.
+        """
+        first = [self[name][0] for name in names]
+        hidden = torch.mm(torch.cat([layer.weight for layer in first]), features.reshape(-1, features.shape[-1]).T)
+        hidden = functional.silu(hidden.add_(torch.cat([layer.bias for layer in first])[:, None]), inplace=True)
+        parts = hidden.split([layer.out_features for layer in first])
+        raw = {name: _rest(self[name], part) for name, part in zip(names, parts, strict=True)}
+        return {name: value.T.reshape(*features.shape[:-1], -1) for name, value in raw.items()}
 
 
 class _TruncatedExp(torch.autograd.Function):
