@@ -146,6 +146,37 @@ def test_genus_and_components(device):
     assert found.watertight and found.manifold and found.euler < 0
 
 
+@pytest.mark.parametrize("shape", ["sphere", "torus", "two spheres"])
+def test_the_distance_to_the_analytic_surface_is_below_a_cube_both_ways(device, shape):
+    n = 32
+    u, v = (torch.rand(4000, generator=torch.Generator().manual_seed(k)) * 2 * np.pi for k in (0, 1))
+    direction = F.normalize(torch.randn(4000, 3, generator=torch.Generator().manual_seed(2)), dim=1)
+    centre = torch.tensor([0.5, 0.0, 0.0])
+    if shape == "torus":
+        mesh, radius = extract_surface(torus(n, device), radius=1.0), 0.6 + 0.22 * v.cos()
+        points = torch.stack([radius * u.cos(), radius * u.sin(), 0.22 * v.sin()], -1)
+        away = torch.hypot(torch.hypot(*mesh.vertices.cpu().T[:2]) - 0.6, mesh.vertices.cpu()[:, 2]) - 0.22
+    elif shape == "sphere":
+        mesh, points = extract_surface(sphere(n, device=device), radius=1.0), 0.6 * direction
+        away = mesh.vertices.cpu().norm(dim=-1) - 0.6
+    else:
+        p = grid(n, device=device)
+        level = torch.minimum((p - centre.to(device)).norm(dim=-1), (p + centre.to(device)).norm(dim=-1)) - 0.35
+        mesh, points = (
+            extract_surface(level, radius=1.0),
+            0.35 * direction + torch.where(u[:, None] > 3, centre, -centre),
+        )
+        at = mesh.vertices.cpu()
+        away = torch.minimum((at - centre).norm(dim=-1), (at + centre).norm(dim=-1)) - 0.35
+    cube = 2 / n
+    assert float(away.abs().max()) < cube
+    corners = mesh.vertices[mesh.faces.long()].cpu()
+    samples = torch.cat(
+        [corners.reshape(-1, 3), corners.mean(1)]
+    )  # no point of a face is further from one than half a cube
+    assert cKDTree(samples.numpy()).query(points.numpy())[0].max() < cube
+
+
 def test_sphere_converges_with_second_order(device):
     errors = []
     for n in (16, 32, 64):
@@ -199,6 +230,56 @@ def test_gradients_match_the_plain_float64_formulation(device):
         scale = b.abs().max()
         # quotients by level differences down to 1e-3 of the level amplify float32 rounding to 1e-5
         torch.testing.assert_close(a.cpu().double() / scale, b / scale, rtol=1e-4, atol=2e-5, msg=name)
+
+
+def test_the_float64_formulation_has_the_gradients_of_finite_differences():
+    level = F.pad(torch.randn(3, 4, 3, generator=torch.Generator().manual_seed(6)), (1,) * 6, value=0.7)
+    weights = random_weights(level.shape, 5, spread=0.5)
+    leaves = [v.double().requires_grad_() for v in (level, *(weights[k] for k in ("deformation", "alpha", "beta")))]
+    assert torch.autograd.gradcheck(lambda *x: reference_surface.flexicubes_vertices(*x, 1.6)[0], leaves, eps=1e-6,
+                                    atol=1e-5, rtol=1e-3, fast_mode=True)  # fmt: skip
+
+
+def test_layout_of_the_inputs_does_not_matter_and_gradients_stop_where_none_is_asked(device):
+    level = torus(10, device)
+    weights = random_weights(level.shape, 4, device)
+    weights["alpha"] = weights["alpha"][:1].expand(1000, 8)
+    want = extract_surface(level, radius=1.0, **weights)
+    strided = {name: torch.stack([value, value], -1)[..., 1] for name, value in weights.items()}
+    beta = strided["beta"] = strided["beta"].requires_grad_()
+    turned = level.permute(2, 0, 1).contiguous().permute(1, 2, 0)
+    assert not turned.is_contiguous() and not beta.is_contiguous()
+    got = extract_surface(turned, radius=1.0, **strided)
+    assert torch.equal(got.vertices.detach(), want.vertices) and torch.equal(got.faces, want.faces)
+    loss = got.vertices.square().sum()
+    (first,) = torch.autograd.grad(loss, beta, retain_graph=True)
+    assert torch.equal(first, torch.autograd.grad(loss, beta, retain_graph=True)[0]) and first.shape == beta.shape
+    (twice,) = torch.autograd.grad(loss, beta, create_graph=True)
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        twice.sum().backward()
+    leaf = level.clone().requires_grad_()
+    held = leaf * 1.0
+    mesh = extract_surface(held, radius=1.0)
+    held.mul_(2.0)
+    with pytest.raises(RuntimeError, match="inplace"):
+        mesh.vertices.sum().backward()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_levels_and_weights_of_any_size_give_finite_vertices_and_gradients(device, seed):
+    rng = torch.Generator().manual_seed(seed)
+    shape = (12, 11, 10)
+    level = torch.randn(shape, generator=rng) * 10.0 ** torch.randint(-6, 7, shape, generator=rng)
+    level[torch.rand(shape, generator=rng) < 0.1] = 0.0
+    level[torch.rand(shape, generator=rng) < 0.1] = -0.0
+    cubes = 11 * 10 * 9
+    alpha, beta = (10.0 ** torch.randint(-3, 4, (cubes, n), generator=rng) for n in (8, 12))
+    leaves = [v.to(device).requires_grad_() for v in (level, alpha, beta)]
+    mesh = extract_surface(leaves[0], radius=1.0, alpha=leaves[1], beta=leaves[2])
+    found = report(mesh.detach())
+    assert found.boundary_edges == 0 and float(mesh.vertices.detach().abs().max()) <= 1.0 + 1e-6  # rounding of a mean
+    grads = torch.autograd.grad(mesh.vertices.sum(), leaves)
+    assert all(bool(torch.isfinite(g).all()) for g in grads) and all(float(g.abs().max()) > 0 for g in grads)
 
 
 def test_the_peer_that_is_timed_gives_the_same_surface():
