@@ -108,7 +108,7 @@ class Heads(nn.ModuleDict):
         hidden = functional.silu(hidden.add_(torch.cat([layer.bias for layer in first])[:, None]), inplace=True)
         parts = hidden.split([layer.out_features for layer in first])
         raw = {name: _rest(self[name], part) for name, part in zip(names, parts, strict=True)}
-        return {name: value.T.reshape(*features.shape[:-1], -1) for name, value in raw.items()}
+        return {name: value.T.reshape(*features.shape[:-1], len(value)) for name, value in raw.items()}
 
 
 class _TruncatedExp(torch.autograd.Function):
