@@ -7,15 +7,16 @@ back.
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import struct
-import zlib
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import torch
+from PIL import Image
 from torch import Tensor
 
 import reli3d
@@ -26,30 +27,16 @@ from reli3d.render.asset import Asset
 
 UNIT = 1.0e-3  # deviation from length 1 that readers accept
 PNG_LEVEL = 1  # zlib level: 2 is 1.3 times slower for 2 % less; baked maps are smooth
-PNG_UP = 2  # filter that stores the difference to the row above
 FLOAT, UINT = 5126, 5125
 LINEAR, LINEAR_MIPMAP_LINEAR, CLAMP_TO_EDGE = 9729, 9987, 33071
 
 
 def encode_png(values: Tensor) -> bytes:
-    """PNG file (ISO/IEC 15948), 8 bit RGB, of ``(H, W, 3)`` values in [0, 1], rounded to the nearest step.
-
-    One filter for all rows and run-length matches: on baked maps 2.4 times faster than Pillow's search for the best
-    filter of each row, in a tenth less space.
-    """
-    height, width, _ = values.shape
-    pixels = (values.detach() * 255.0).round_().to(torch.uint8).cpu().reshape(height, -1).numpy()
-    rows = np.full((height, 1 + 3 * width), PNG_UP, np.uint8)
-    rows[0, 1:] = pixels[0]
-    np.subtract(pixels[1:], pixels[:-1], out=rows[1:, 1:])
-    packer = zlib.compressobj(PNG_LEVEL, strategy=zlib.Z_RLE)
-    data = packer.compress(rows) + packer.flush()
-
-    def chunk(kind: bytes, body: bytes) -> bytes:
-        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
-
-    head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)  # 8 bit, RGB, not interlaced
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
+    """PNG file, 8 bit RGB, of ``(H, W, 3)`` values in [0, 1], rounded to the nearest step."""
+    pixels = (values.detach() * 255.0).round_().to(torch.uint8).cpu().numpy()
+    buffer = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(pixels)).save(buffer, "PNG", compress_level=PNG_LEVEL)
+    return buffer.getvalue()
 
 
 def _checked(asset: Asset) -> None:
