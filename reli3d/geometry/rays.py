@@ -1,8 +1,8 @@
 """Rays against a triangle mesh: closest hit and occlusion, on Embree (CPU) or Warp's BVH (CPU and CUDA).
 
 Directions need not be unit; ``t`` counts in their lengths, from 0 inclusive to ``t_max`` exclusive.  A ray that
-misses, or that holds a NaN, an infinity or a zero direction, has ``face = -1``, ``t = inf``, ``bary = 0``.  Nothing
-here has a gradient: the hit is re-evaluated from its face by :func:`evaluate_hits`.
+misses, that holds a NaN, an infinity or a zero direction, or whose ``t`` leaves float32 has ``face = -1``, ``t = inf``,
+``bary = 0``.  Nothing here has a gradient: the hit is re-evaluated from its face by :func:`evaluate_hits`.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from reli3d._bridge import check, empty, launch, over_slices, stream
 from reli3d.kernels import intersect as kernels
 
 BACKENDS = ("auto", "embree", "warp")
+LENGTHEN = 2.0**100  # exact in float32, and brings a length of 2^-149 to 2^-50 near 1
 EMBREE_HIT = (("primID", wp.int32), ("tfar", wp.float32), ("u", wp.float32), ("v", wp.float32))
 SLICE_RAYS = 4096  # fewest of an Embree slice, and of one whose rays are ordered: below it costs more than it gains
 THREAD_SLICES = 4  # of a large call for each thread: the more rays are ordered together, the closer are neighbours
@@ -185,18 +186,20 @@ class RayScene:
         return shape, o, d, far
 
     def _embree_closest(self, o, d, far, outs) -> None:
-        def store(part, order, limit, hit):
+        def store(part, order, limit, short, hit):
             count = len(hit["primID"])
             ins = [(torch.empty(0, dtype=torch.int64) if order is None else torch.from_numpy(order), wp.int64),
                    (torch.empty(0) if limit is None else torch.from_numpy(limit), wp.float32)]  # fmt: skip
             ins += [(torch.from_numpy(hit[name]), kind) for name, kind in EMBREE_HIT]
             own = [(tensor[part], kind) for tensor, kind in outs]
             launch(kernels.place_hits_kernel, count, [*ins, *own], o.device, slice_min=count)
+            if short is not None:
+                own[1][0][short] *= LENGTHEN
 
         self._embree_slices(o, d, far, store, output=1)
 
     def _embree_occluded(self, o, d, far, out) -> None:
-        def store(part, order, limit, found):
+        def store(part, order, limit, short, found):
             blocked = found >= 0
             if limit is not None:
                 blocked &= limit >= 0.0
@@ -205,19 +208,18 @@ class RayScene:
         self._embree_slices(o, d, far, store, query="OCCLUDED")
 
     def _embree_slices(self, o, d, far, store, **query) -> None:
-        """``store(part, order, limit, result)`` of Embree for every slice, whose rays went to it in ``order``."""
+        """``store(part, order, limit, short, result)`` of Embree for every slice; its rays went there in ``order``."""
 
         def work(_, start, count):
             part = slice(start, start + count)
-            rays, limit = (o[part], d[part]), far if far.numel() == 1 else far[part]
-            order, odd = self._order(*rays)
-            limit = embree_limits(*rays, limit, odd)
-            if order is None:
-                result = self._embree.run(*(v.numpy() for v in rays), limit, **query)
-            else:  # np.take: indexing with the order takes 4 times as long
+            order, odd = self._order(o[part], d[part])
+            rays = [o[part], d[part]]
+            rays[1], limit, short = embree_rays(*rays, far if far.numel() == 1 else far[part], odd)
+            rays = [v.numpy() for v in rays]
+            if order is not None:  # np.take: indexing with the order takes 4 times as long
+                rays = [np.take(v, order, 0) for v in rays]
                 limit = None if limit is None else np.take(limit, order)
-                result = self._embree.run(*(np.take(v.numpy(), order, 0) for v in rays), limit, **query)
-            store(part, order, limit, result)
+            store(part, order, limit, short, self._embree.run(*rays, limit, **query))
 
         n = o.shape[0]
         if n:
@@ -225,7 +227,7 @@ class RayScene:
 
     def _order(self, o: Tensor, d: Tensor) -> tuple[np.ndarray | None, bool]:
         """Permutation that brings like rays together, None where they are few or come in such an order already; and
-        whether a ray may not be valid.
+        whether a ray may be odd as :func:`embree_rays` means it.
 
         Embree traces one ray after the other; neighbours that visit the same nodes find them in the cache.
         """
@@ -241,23 +243,31 @@ class RayScene:
         return np.argsort(keys, kind="stable"), bool(odd)  # a radix sort for 16 bits
 
 
-def embree_limits(o: Tensor, d: Tensor, far: Tensor, odd: bool) -> np.ndarray | None:
-    """Far limits for Embree, whose own is inclusive, or None for unlimited; -1 turns an invalid ray off.
+def embree_rays(o: Tensor, d: Tensor, far: Tensor, odd: bool) -> tuple[Tensor, np.ndarray | None, Tensor | None]:
+    """Directions and far limits for Embree (None: all unlimited), and which directions were lengthened (None: none).
 
-    odd: whether there may be an invalid ray.
+    Embree's limit is inclusive; -1 turns an invalid ray off.  Directions shorter than ``SHORT`` go in ``LENGTHEN``
+    times as long.  odd: whether there may be any of the two.
     """
     if not odd and far.numel() == 1 and float(far) == float("inf"):
-        return None
-    limit = np.nextafter(far.numpy(), np.float32(-np.inf))
-    valid = torch.isfinite(o).all(-1) & torch.isfinite(d).all(-1) & (d != 0.0).any(-1)
-    return np.where(valid.numpy() & (limit >= 0.0), limit, np.float32(-1.0)).astype(np.float32)
+        return d, None, None
+    limit = torch.from_numpy(np.nextafter(far.numpy(), np.float32(-np.inf))).expand(len(o))
+    reach = d.abs().amax(-1)
+    short = (reach > 0.0) & (reach < float(kernels.SHORT))
+    if bool(short.any()):
+        d = torch.where(short[:, None], d * LENGTHEN, d)
+        limit = torch.where(short, limit.clamp(max=torch.finfo(torch.float32).max) / LENGTHEN, limit)
+    else:
+        short = None
+    valid = torch.isfinite(o).all(-1) & torch.isfinite(reach) & (reach > 0.0) & (limit >= 0.0)
+    return d, torch.where(valid, limit, -1.0).numpy(), short
 
 
 def offset_origin(position: Tensor, ng: Tensor, direction: Tensor, *, scale: float = 1.0) -> Tensor:
     """Origins ``(..., 3)`` for rays from a surface that cannot hit the face they start on.
 
-    position: ``(..., 3)`` on the face.  ng: ``(..., 3)`` unit geometric normal, either side.  direction: ``(...,
-    3)``, of the ray to come.  scale: largest coordinate of the mesh (``RayScene.scale``).  No gradient.
+    position: ``(..., 3)`` on the face.  ng: ``(..., 3)`` unit geometric normal, either side; 0, of a face without area,
+    moves nothing.  direction: ``(..., 3)``, of the ray to come.  scale: largest coordinate of the mesh (``RayScene.scale``).  No gradient.
     """
     check("position", position, last=3)
     check("ng", ng, last=3, like=position)

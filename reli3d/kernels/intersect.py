@@ -13,6 +13,7 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=n
 
 OFFSET = wp.constant(3.814697265625e-06)  # 2^-18: 64 ulp; interpolation errs by some 7 ulp of the largest coordinate
 T_FAR = wp.constant(3.0e38)
+SHORT = wp.constant(2.0**-50)  # Embree takes components of a direction below 1e-18 for 0
 
 
 @wp.func
@@ -114,7 +115,8 @@ def ray_key_kernel(
     key: wp.array(dtype=wp.int16), odd: wp.array(dtype=wp.bool),
 ):  # fmt: skip
     """16 bits alike for rays that visit the same part of the tree: the direction's cell of 32 x 32 on an octahedron in
-    Morton order, then the origin's of 4 x 4 x 4 above ``low``.  ``odd`` becomes True if any ray is not valid."""
+    Morton order, then the origin's of 4 x 4 x 4 above ``low``.  ``odd`` becomes True if any ray is not valid or has a
+    direction shorter than ``SHORT``."""
     i = start + wp.tid()
     d = directions[i]
     reach = wp.max(wp.abs(d[0]) + wp.abs(d[1]) + wp.abs(d[2]), 1.0e-37)
@@ -130,7 +132,7 @@ def ray_key_kernel(
     for axis in range(3):
         k = k * 4 + int(wp.clamp(place[axis], 0.0, 3.0))
     key[i] = wp.int16(k - 32768)
-    if not ray_is_valid(origins[i], d):
+    if not ray_is_valid(origins[i], d) or reach < SHORT:
         odd[0] = True
 
 

@@ -1,0 +1,212 @@
+"""What renderers break on: rays at edges and vertices, spawned rays, thin gaps, moved meshes, odd numbers.
+
+After Embree's ``verify`` and pbrt's ``shapes_test``; the oracle is float64 brute force over all faces, or closed form.
+"""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from reli3d.geometry.rays import offset_origin
+from reli3d.render.gbuffer import hit_normals, interpolate
+from tests.test_rays import BACKENDS, make, rays, soup
+
+
+def bumpy(seed, subdivisions=2, height=0.25):
+    """Closed, star-shaped about the origin: every radius of a sphere changed at random."""
+    mesh = trimesh.creation.icosphere(subdivisions=subdivisions)
+    radius = 1.0 + height * np.random.default_rng(seed).uniform(-1, 1, (len(mesh.vertices), 1))
+    return (mesh.vertices * radius).astype(np.float32), np.asarray(mesh.faces, np.int32)
+
+
+def oracle(vertices, faces, o, d):
+    """Every face for every ray in float64: t ``(N, F)``, inf for a miss, and how far inside its edges a hit lies,
+    ``(N, F)`` as the least barycentric weight."""
+    v = torch.as_tensor(vertices, dtype=torch.float64)[torch.as_tensor(faces, dtype=torch.long)]
+    e1, e2 = (v[:, 1] - v[:, 0])[None], (v[:, 2] - v[:, 0])[None]
+    o, d = o.cpu().double()[:, None], d.cpu().double()[:, None]
+    p, s = torch.linalg.cross(d, e2), o - v[None, :, 0]
+    q = torch.linalg.cross(s, e1.expand_as(s))
+    det = (e1 * p).sum(-1)
+    u, w, t = (s * p).sum(-1) / det, (d * q).sum(-1) / det, (e2 * q).sum(-1) / det
+    inside = torch.minimum(torch.minimum(u, w), 1 - u - w)
+    return torch.where((inside >= 0) & (t >= 0), t, torch.inf), torch.where(t >= 0, inside, -torch.inf)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_twenty_meshes_and_twenty_thousand_rays_against_every_face(device, backend):
+    """The same face, or a distance within 1e-5 of the mesh's size; a ray that tells otherwise passes an edge within
+    rounding."""
+    apart = 0
+    for seed in range(20):
+        vertices, faces = bumpy(seed) if seed % 2 else soup(seed, 40 + 10 * seed)
+        scene = make(vertices, faces, backend, device)
+        for k in range(20):
+            o, d = rays(1000, 100 * seed + k, 1.5)
+            hits = scene.closest(o.to(device), d.to(device))
+            t, inside = oracle(vertices, faces, o, d)
+            best, first = t.min(1)
+            face, got = hits.face.cpu().long(), hits.t.cpu().double()
+            same = face == torch.where(best.isinf(), -1, first)
+            near = (got - best).abs() <= 1e-5 * 3.0 / d.norm(dim=-1)  # t counts in lengths of d, the mesh is 3 across
+            odd = torch.nonzero(~(same | near))[:, 0]
+            apart += len(odd)
+            for i in odd.tolist():  # both faces in question: an edge of either is within 1e-5 of its size
+                margins = [float(inside[i, f]) for f in (int(face[i]), int(first[i])) if f >= 0 and not best[i].isinf()]
+                assert min(abs(m) for m in margins) < 1e-5, (seed, k, i)
+    assert apart <= 1e-5 * 20 * 20_000
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_bumpy_closed_mesh_holds_rays_at_random_at_edges_and_at_vertices(device, backend):
+    """pbrt's watertight test; and where such a ray hits, it hits what it was aimed at."""
+    vertices, faces = bumpy(3, subdivisions=3)
+    scene, rng, n = make(vertices, faces, backend, device), np.random.default_rng(4), 100_000
+    o = torch.tensor(rng.uniform(-0.1, 0.1, (n, 3)), dtype=torch.float32)
+    anywhere = torch.tensor(rng.normal(size=(n, 3)), dtype=torch.float32)
+    assert int((scene.closest(o.to(device), anywhere.to(device)).face < 0).sum()) == 0
+    v = torch.from_numpy(vertices)
+    corner = v[torch.from_numpy(rng.integers(0, len(v), n))]
+    f = torch.from_numpy(faces[rng.integers(0, len(faces), n)]).long()
+    edge = torch.lerp(v[f[:, 0]], v[f[:, 1]], torch.tensor(rng.random((n, 1)), dtype=torch.float32))
+    for target, limit in ((corner, 5e-3), (edge, 2e-4)):  # measured: 0.4 % of vertices on either backend; edges 6e-5
+        hits = scene.closest(o.to(device), (target - o).to(device))
+        missed = hits.face < 0
+        assert float(missed.float().mean()) <= limit
+        # the origin sees all of the surface only where no bump hides it: nearer is allowed, farther is a leak
+        assert float(hits.t[~missed].max()) <= 1.0 + 1e-4
+        assert torch.equal(scene.occluded(o.to(device), (target - o).to(device)), ~missed)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_small_triangles_are_hit_where_they_are_aimed_at(device, backend):
+    """Embree's SmallTriangleHit: a plane of 100 x 100 squares; and both ways to the point agree to 16 ulp."""
+    grid = np.stack(np.meshgrid(np.arange(101.0), np.arange(101.0), indexing="ij"), -1).reshape(-1, 2)
+    vertices = np.concatenate([grid, np.zeros((len(grid), 1))], 1).astype(np.float32)
+    a = (np.arange(100)[:, None] * 101 + np.arange(100)).reshape(-1)
+    faces = np.concatenate([np.stack([a, a + 101, a + 1], 1), np.stack([a + 1, a + 101, a + 102], 1)]).astype(np.int32)
+    scene, rng = make(vertices, faces, backend, device), np.random.default_rng(0)
+    target = (vertices[faces] * np.float32([[0.5], [0.3], [0.2]])).sum(1)  # off the centroid, where no weights are equal
+    target = torch.from_numpy(target).to(device)
+    o = torch.tensor(rng.uniform([0, 0, 20], [100, 100, 90], (len(faces), 3)), dtype=torch.float32, device=device)
+    hits = scene.closest(o, target - o)
+    assert float((hits.face.cpu() != torch.arange(len(faces), dtype=torch.int32)).float().mean()) <= 2e-5
+    along = o + hits.t[:, None] * (target - o)
+    across = interpolate(scene.vertices, scene.faces, hits.face, hits.bary)
+    assert float((along - across).abs().max()) <= 16 * 2.0**-24 * 128  # ulp of coordinates up to 100
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_hits_of_uniform_directions_measure_the_solid_angle(device, backend):
+    """pbrt's test; the closed form is that of van Oosterom and Strackee 1983."""
+    n = 200_000
+    d = torch.nn.functional.normalize(rays(n, 12)[1], dim=-1).to(device)
+    for seed in range(6):
+        corners = np.random.default_rng(seed).uniform(-1, 1, (3, 3)) + [0.3, 0.2, 1.5]
+        hit = make(corners, [[0, 1, 2]], backend, device).occluded(torch.zeros(3, device=device), d)
+        a, b, c = (p / np.linalg.norm(p) for p in corners)
+        angle = 2 * abs(math.atan2(np.dot(a, np.cross(b, c)), 1 + a @ b + b @ c + c @ a))
+        share = angle / (4 * math.pi)
+        assert abs(float(hit.float().mean()) - share) < 4 * (share * (1 - share) / n) ** 0.5
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_moved_mesh_is_hit_as_if_built_anew(device, backend):
+    vertices, faces = bumpy(5, subdivisions=3)
+    scene = make(vertices, faces, backend, device)
+    o, d = (v.to(device) for v in rays(20_000, 8, 1.2))
+    for seed in (6, 7):
+        moved, _ = bumpy(seed, subdivisions=3, height=0.4)
+        moved = moved * np.float32([1.0, 1.5, 0.7]) + np.float32(0.2)
+        scene.refit(torch.from_numpy(moved).to(device))
+        got, want = scene.closest(o, d), make(moved, faces, backend, device).closest(o, d)
+        # two faces at one edge may be found in another order, at the same distance
+        assert float((got.face != want.face).float().mean()) <= 1e-4
+        torch.testing.assert_close(got.t, want.t, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_no_light_comes_into_a_closed_box_nor_through_a_gap_of_1e_5(device, backend):
+    """Shadow leaks.  A room: what starts on a wall, also at its edges and corners, is blocked.  Two walls 1e-5 apart:
+    what starts between them on the one is blocked by the other, so the offset is small enough."""
+    rng, n = np.random.default_rng(1), 250_000
+    box = trimesh.creation.box((2.0, 2.0, 2.0))
+    box = box.subdivide().subdivide()
+    scene = make(box.vertices, box.faces, backend, device)
+    d = torch.nn.functional.normalize(rays(n, 3)[1], dim=-1).to(device)
+    face = torch.tensor(rng.integers(0, len(box.faces), n), dtype=torch.int32, device=device)
+    weights = torch.tensor(rng.dirichlet((1, 1, 1), n), dtype=torch.float32, device=device)
+    for place, limit in (("wall", 0), ("edge", 5e-5), ("corner", 2e-3)):
+        w = weights.clone()
+        if place == "edge":
+            w[:, 2] = 0.0
+        if place == "corner":
+            w[:, 1:] = 0.0
+        w = w / w.sum(1, keepdim=True)
+        position = interpolate(scene.vertices, scene.faces, face, w[:, 1:].contiguous())
+        ng = hit_normals(scene.vertices, scene.faces, face)
+        inward = torch.where((d * ng).sum(-1, keepdim=True) > 0.0, -d, d)
+        o = offset_origin(position, ng, inward, scale=scene.scale)
+        within = (position + 1e-3 * inward).abs().amax(-1) < 1.0  # not along the other wall of an edge
+        leaks = ~scene.occluded(o, inward) & within
+        assert float(leaks.sum()) <= limit * float(within.sum()), (place, int(leaks.sum()))
+    plane = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32)
+    walls = np.concatenate([plane * 0.1, plane + np.float32([0, 0, 1e-5])])
+    scene = make(walls, [[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], backend, device)
+    o = torch.tensor(rng.uniform(-0.1, 0.1, (n, 3)) * [1, 1, 0], dtype=torch.float32, device=device)
+    up = d * torch.sign(d[:, 2:])
+    up = up[up[:, 2] > 0.1]
+    o, ng = o[: len(up)], torch.tensor([0.0, 0, 1], device=device).expand(len(up), 3)
+    assert bool(scene.occluded(offset_origin(o, ng, up, scale=scene.scale), up).all())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_million_spawned_rays_never_meet_their_triangle(device, backend):
+    """pbrt's Triangle.Reintersect at its own size: 1000 triangles of coordinates 1e-8 to 1e8, 1000 rays each.
+
+    Magnitudes differ by coordinate, as pbrt draws them.  Where they differ by corner, one triangle in 40 is so thin that
+    its float32 edges are parallel: it has no normal to leave along, and 0.08 % of the rays meet it again.
+    """
+    rng, again = np.random.default_rng(9), 0
+    for _ in range(1000):
+        corners = (rng.uniform(-1, 1, (3, 3)) * 10.0 ** rng.uniform(-8, 8, (3, 3))).astype(np.float32)
+        scene = make(corners, [[0, 1, 2]], backend, device)
+        b = torch.tensor(rng.dirichlet((1, 1, 1), 1000)[:, 1:], dtype=torch.float32, device=device)
+        face = torch.zeros(1000, dtype=torch.int32, device=device)
+        position, ng = interpolate(scene.vertices, scene.faces, face, b), hit_normals(scene.vertices, scene.faces, face)
+        d = torch.nn.functional.normalize(torch.tensor(rng.normal(size=(1000, 3)), dtype=torch.float32, device=device))
+        again += int(scene.occluded(offset_origin(position, ng, d, scale=scene.scale), d).sum())
+    assert again == 0
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_tiny_huge_and_invalid_rays_come_to_an_end(device, backend):
+    """Directions of any float32 length: the right hit or, where t leaves float32, a miss.  Invalid rays among valid ones
+    leave those as they were."""
+    vertices, faces = bumpy(1)
+    scene = make(vertices, faces, backend, device)
+    o, d = rays(6000, 2, 0.2)  # so many that Embree's are ordered
+    o, d = o.to(device), torch.nn.functional.normalize(d, dim=-1).to(device)
+    want = scene.closest(o, d)
+    for length in (1e-45, 1e-40, 1e-30, 1e-17, 1e-10, 1e10, 1e30, 3e37):
+        hits = scene.closest(o, d * length)
+        hit = hits.face >= 0
+        assert bool(hit.all()) if length > 1e-38 else not bool(hit.any())
+        assert float((hits.face == want.face)[hit].float().sum()) >= 0.999 * float(hit.sum())
+        torch.testing.assert_close(hits.t[hit].double() * length, want.t[hit].double(), rtol=1e-4, atol=0)
+        assert bool(torch.isinf(hits.t[~hit]).all()) and torch.equal(scene.occluded(o, d * length), hit)
+        far = torch.full((len(o),), float(want.t.median()) / length if hit.any() else 1e38, device=device)
+        near = want.t < float(want.t.median()) * (1 - 1e-5)
+        assert not hit.any() or bool(scene.occluded(o, d * length, t_max=far)[near].all())
+    for value in (float("nan"), float("inf"), -float("inf")):
+        for part in (0, 1):
+            mixed = [o.clone(), d.clone()]
+            mixed[part][1::2, 1] = value
+            hits = scene.closest(*mixed)
+            assert bool((hits.face[1::2] == -1).all()) and torch.equal(hits.face[::2], want.face[::2])
+            assert torch.equal(scene.occluded(*mixed), hits.face >= 0)
