@@ -90,7 +90,7 @@ def test_small_triangles_are_hit_where_they_are_aimed_at(device, backend):
     a = (np.arange(100)[:, None] * 101 + np.arange(100)).reshape(-1)
     faces = np.concatenate([np.stack([a, a + 101, a + 1], 1), np.stack([a + 1, a + 101, a + 102], 1)]).astype(np.int32)
     scene, rng = make(vertices, faces, backend, device), np.random.default_rng(0)
-    target = (vertices[faces] * np.float32([[0.5], [0.3], [0.2]])).sum(1)  # off the centroid, where no weights are equal
+    target = (vertices[faces] * np.float32([[0.5], [0.3], [0.2]])).sum(1)  # no two weights are equal
     target = torch.from_numpy(target).to(device)
     o = torch.tensor(rng.uniform([0, 0, 20], [100, 100, 90], (len(faces), 3)), dtype=torch.float32, device=device)
     hits = scene.closest(o, target - o)
@@ -169,8 +169,8 @@ def test_no_light_comes_into_a_closed_box_nor_through_a_gap_of_1e_5(device, back
 def test_a_million_spawned_rays_never_meet_their_triangle(device, backend):
     """pbrt's Triangle.Reintersect at its own size: 1000 triangles of coordinates 1e-8 to 1e8, 1000 rays each.
 
-    Magnitudes differ by coordinate, as pbrt draws them.  Where they differ by corner, one triangle in 40 is so thin that
-    its float32 edges are parallel: it has no normal to leave along, and 0.08 % of the rays meet it again.
+    Magnitudes differ by coordinate, as pbrt draws them.  Where they differ by corner, one triangle in 40 is so thin
+    that its float32 edges are parallel: it has no normal to leave along, and 0.08 % of the rays meet it again.
     """
     rng, again = np.random.default_rng(9), 0
     for _ in range(1000):
@@ -186,8 +186,8 @@ def test_a_million_spawned_rays_never_meet_their_triangle(device, backend):
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_tiny_huge_and_invalid_rays_come_to_an_end(device, backend):
-    """Directions of any float32 length: the right hit or, where t leaves float32, a miss.  Invalid rays among valid ones
-    leave those as they were."""
+    """Directions of any float32 length: the right hit or, where t leaves float32, a miss.  Invalid rays among valid
+    ones leave those as they were."""
     vertices, faces = bumpy(1)
     scene = make(vertices, faces, backend, device)
     o, d = rays(6000, 2, 0.2)  # so many that Embree's are ordered
