@@ -1,5 +1,6 @@
 """The material's value against a float64 twin, Mitsuba's distribution, reciprocity and energy."""
 
+import numpy as np
 import pytest
 import torch
 
@@ -84,3 +85,41 @@ def test_distribution_equals_mitsubas():
     g1 = [torch.from_numpy(judge.smith_g1(v, h).numpy()) for v in (o, i)]
     g2 = 1 / (1 / g1[0] + 1 / g1[1] - 1)
     torch.testing.assert_close(got, d * g2 / (4 * wo[:, 2] * wi[:, 2]), rtol=2e-4, atol=0)
+
+
+@pytest.mark.slow  # Mitsuba starts its compiler
+@pytest.mark.parametrize("alpha", [0.01, 0.05, 0.2, 0.6, 1.0])
+def test_value_equals_mitsubas_materials(alpha):
+    """``roughconductor`` (reflectance 1), ``principled`` as a metal, and its coat over black as a dielectric.
+
+    Mitsuba masks with the product of both G1, which float64 turns into the height-correlated G2, and its coat reflects
+    by Fresnel's equations where ours has Schlick's.  Else they are the same formula.
+    """
+    mi = mitsuba_scene.load()
+    n = 4000
+    wo, wi, *_ = pairs(n, 5, low=0.05)
+    o, i = wo.double(), wi.double()
+    lam = [reference.smith_lambda(w, torch.tensor(alpha).double()) for w in (o, i)]
+    correlated = (1 + lam[0]) * (1 + lam[1]) / (1 + lam[0] + lam[1])
+    cos_m = (o * torch.nn.functional.normalize(o + i, dim=-1)).sum(-1)
+    t = torch.sqrt(1.5**2 - 1 + cos_m**2)  # Fresnel's equations at refractive index 1.5
+    exact = 0.5 * (((cos_m - t) / (cos_m + t)) ** 2 + ((2.25 * cos_m - t) / (2.25 * cos_m + t)) ** 2)
+    fresnel = exact / (0.04 + 0.96 * (1 - cos_m) ** 5)
+    gold = (0.9, 0.6, 0.2)
+    rough = {"roughness": alpha**0.5, "specular": 0.5}
+    paint = {"type": "rgb", "value": list(gold)}
+    black = {"type": "rgb", "value": [0.0, 0.0, 0.0]}
+    conductor = {"type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": alpha}
+    cases = [
+        (conductor, (1.0, 1.0, 1.0), 1.0, 1.0),
+        ({"type": "principled", "base_color": paint, "metallic": 1.0, **rough}, gold, 1.0, 1.0),
+        ({"type": "principled", "base_color": black, "metallic": 0.0, **rough}, (0.0, 0.0, 0.0), 0.0, fresnel[:, None]),
+    ]
+    si = mi.SurfaceInteraction3f()
+    si.wi = mi.Vector3f(wo.numpy().T.copy())
+    for plugin, base, metallic, factor in cases:
+        theirs = mi.load_dict(plugin).eval(mi.BSDFContext(), si, mi.Vector3f(wi.numpy().T.copy()))
+        want = torch.from_numpy(np.array(theirs).T).double() * correlated[:, None] / i[:, 2:]
+        got = eval_bsdf(wo, wi, torch.tensor(base), torch.tensor(alpha), torch.tensor(metallic)).double() * factor
+        off = (got / want - 1).abs()
+        assert float(off.max()) < (1e-3 if alpha <= 0.05 else 1e-4), plugin["type"]

@@ -267,7 +267,8 @@ def offset_origin(position: Tensor, ng: Tensor, direction: Tensor, *, scale: flo
     """Origins ``(..., 3)`` for rays from a surface that cannot hit the face they start on.
 
     position: ``(..., 3)`` on the face.  ng: ``(..., 3)`` unit geometric normal, either side; 0, of a face without area,
-    moves nothing.  direction: ``(..., 3)``, of the ray to come.  scale: largest coordinate of the mesh (``RayScene.scale``).  No gradient.
+    moves nothing.  direction: ``(..., 3)``, of the ray to come.  scale: largest coordinate of the mesh
+    (``RayScene.scale``).  No gradient.
     """
     check("position", position, last=3)
     check("ng", ng, last=3, like=position)
