@@ -1,4 +1,10 @@
-"""Incoherent rays from within a closed mesh of 82 thousand triangles, beside one call of embreex."""
+"""Incoherent rays from within a closed mesh of 82 thousand triangles, beside one call of embreex.
+
+``python -m bench.rays`` prints how the time of a ray grows with rays and triangles, and where it goes.
+"""
+
+import sys
+import time
 
 import numpy as np
 import torch
@@ -6,11 +12,12 @@ import trimesh
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
+from bench.timing import time_steps
 from reli3d.geometry.rays import RayScene
 
 
-def inputs(n):
-    mesh = trimesh.creation.icosphere(subdivisions=6)
+def inputs(n, subdivisions=6):
+    mesh = trimesh.creation.icosphere(subdivisions=subdivisions)
     rng = np.random.default_rng(0)
     origins = rng.uniform(-0.4, 0.4, (n, 3)).astype(np.float32)
     directions = rng.normal(size=(n, 3)).astype(np.float32)
@@ -18,19 +25,19 @@ def inputs(n):
     return mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32), origins, directions
 
 
-def cast(device, n, query):
+def cast(device, n, query, subdivisions=6):
     """``n`` rays through :class:`RayScene`, closest hit or occlusion."""
-    vertices, faces, origins, directions = (torch.from_numpy(a).to(device) for a in inputs(n))
+    vertices, faces, origins, directions = (torch.from_numpy(a).to(device) for a in inputs(n, subdivisions))
     scene = RayScene(vertices, faces)
     call = scene.closest if query == "closest" else scene.occluded
     return lambda: call(origins, directions), {"rays": n}
 
 
-def embree_cast(device, n, query):
+def embree_cast(device, n, query, subdivisions=6):
     """The same with embreex alone, one call on one thread; CPU only."""
     if device.type != "cpu":
         return None
-    vertices, faces, origins, directions = inputs(n)
+    vertices, faces, origins, directions = inputs(n, subdivisions)
     scene = EmbreeScene(robust=True)
     TriangleMesh(scene, vertices, faces)
     if query == "closest":
@@ -38,5 +45,63 @@ def embree_cast(device, n, query):
     return lambda: scene.run(origins, directions, query="OCCLUDED"), {"rays": n}
 
 
-CASES = {"closest": (cast, dict(n=1 << 20, query="closest")), "occluded": (cast, dict(n=1 << 20, query="occluded"))}
-PEERS = dict.fromkeys(CASES, embree_cast)
+def invalid(device, n, value):
+    """Closest hits where every second ray holds ``value``; Embree's verification allows 2.5 times the valid ones'."""
+    vertices, faces, origins, directions = (torch.from_numpy(a).to(device) for a in inputs(n))
+    directions[::2, 1] = value
+    scene = RayScene(vertices, faces)
+    return lambda: scene.closest(origins, directions), {"rays": n}
+
+
+def valid(device, n, value):
+    """The same rays before ``value`` was written into them."""
+    return cast(device, n, "closest")
+
+
+_N = 1 << 20
+CASES = {
+    "closest": (cast, dict(n=_N, query="closest")),
+    "occluded": (cast, dict(n=_N, query="occluded")),
+    "nan": (invalid, dict(n=_N, value=float("nan"))),
+    "infinity": (invalid, dict(n=_N, value=float("inf"))),
+}
+PEERS = {"closest": embree_cast, "occluded": embree_cast, "nan": valid, "infinity": valid}
+
+
+def study() -> None:
+    """Print growth with rays and triangles beside embreex, and the parts of a ray's time; CPU."""
+    device, say = torch.device("cpu"), sys.stdout.write
+    for query in ("closest", "occluded"):
+        for n, subdivisions in [(1 << k, 6) for k in (10, 14, 17, 20, 22)] + [(1 << 18, k) for k in (2, 4, 6, 8)]:
+            steps = [f(device, n, query, subdivisions)[0] for f in (cast, embree_cast)]
+            ours, theirs = time_steps(steps, device, seconds=0.7)
+            say(f"{query}, {n} rays, {20 * 4**subdivisions} triangles: {1e9 * ours.median / n:.0f} ns a ray, embreex "
+                f"{1e9 * theirs.median / n:.0f}, {theirs.median / ours.median:.2f} times\n")  # fmt: skip
+    n, torch_threads = 1 << 18, torch.get_num_threads()
+    torch.set_num_threads(1)
+    vertices, faces, origins, directions = inputs(n)
+    scene = RayScene(torch.from_numpy(vertices), torch.from_numpy(faces))
+    o, d = torch.from_numpy(origins), torch.from_numpy(directions)
+    order = scene._order(o, d)[0]
+    sorted_o, sorted_d = np.take(origins, order, 0), np.take(directions, order, 0)
+    parts = {
+        "one call of embreex": lambda: scene._embree.run(origins, directions, output=1),
+        "ours, one thread": lambda: scene.closest(o, d),
+        "of it Embree on ordered rays": lambda: scene._embree.run(sorted_o, sorted_d, output=1),
+        "of it the order": lambda: scene._order(o, d),
+        "of it rays into that order": lambda: (np.take(origins, order, 0), np.take(directions, order, 0)),
+    }
+    for name, step in parts.items():
+        best = min(_cpu_seconds(step) for _ in range(6))
+        say(f"{name}: {1e9 * best / n:.0f} ns a ray\n")
+    torch.set_num_threads(torch_threads)
+
+
+def _cpu_seconds(step) -> float:
+    begin = time.thread_time()
+    step()
+    return time.thread_time() - begin
+
+
+if __name__ == "__main__":
+    study()

@@ -119,11 +119,16 @@ def test_cosine_follows_its_density(device):
 
 
 def test_the_test_has_power(device):
-    """A density 3 % off along one axis, swapped axes and the original's density for the partner are all refused."""
+    """A density 2 % too large, small or wide, 3 % off along one axis, swapped axes and the original's density for the
+    partner are all refused; the true one is not."""
     wo, a, u = view(60, device), torch.tensor(0.5, device=device), uniform(1_000_000, device)
     wm = sample_ggx_vndf(wo, a, u)
     tilted = lambda m: pdf_ggx_vndf(wo, a, m) * (1.0 + 0.03 * m[:, 0])  # noqa: E731
-    assert chi2.p_value(wm, tilted, res=15, ires=24) < LEVEL
+    assert chi2.p_value(wm, tilted, res=15, ires=96) < LEVEL  # ires 24 lacks 1e-4 of the mass: refuses anything
+    for scale, width in ((1.02, 1.0), (0.98, 1.0), (1.0, 1.02), (1.0, 0.98)):
+        wrong = lambda m, s=scale, b=a * width: s * pdf_ggx_vndf(wo, b, m)  # noqa: E731
+        assert chi2.p_value(wm, wrong, res=15, ires=96) < LEVEL, (scale, width)
+    assert chi2.p_value(wm, lambda m: pdf_ggx_vndf(wo, a, m), res=15, ires=96) > LEVEL
     assert chi2.p_value(wm[:, [1, 0, 2]], lambda m: pdf_ggx_vndf(wo, a, m)) < LEVEL
     wi = sample_bsdf(wo, a, u, "partner")
     above = wi[:, 2] > 1e-6

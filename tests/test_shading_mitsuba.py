@@ -28,13 +28,17 @@ def light(name):
     return Environment(map_)
 
 
-class Stage:
-    """A ball inside a ring that shadows it, and the primary hits of one camera that both sides share."""
+def ball_in_ring():
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.5)
+    ring = trimesh.creation.torus(0.75, 0.15, major_sections=40, minor_sections=16)
+    return trimesh.util.concatenate([ball, ring])
 
-    def __init__(self, size):
-        ball = trimesh.creation.icosphere(subdivisions=3, radius=0.5)
-        ring = trimesh.creation.torus(0.75, 0.15, major_sections=40, minor_sections=16)
-        mesh = trimesh.util.concatenate([ball, ring])
+
+class Stage:
+    """A mesh that shadows itself, and the primary hits of one camera that both sides share."""
+
+    def __init__(self, size, mesh=None):
+        mesh = ball_in_ring() if mesh is None else mesh
         self.vertices, self.faces = torch.tensor(mesh.vertices).float(), torch.tensor(mesh.faces).int()
         self.normals = torch.tensor(np.array(mesh.vertex_normals)).float()
         pose = look_at(torch.tensor([1.2, 1.6, 1.9]), torch.zeros(3), torch.tensor([0.0, 1, 0]))
@@ -65,8 +69,20 @@ class Stage:
 @pytest.mark.parametrize("material", MATERIALS)
 @pytest.mark.parametrize("sky", ["constant", "sky", "sun"])
 def test_image_with_shadows_equals_mitsubas(material, sky):
+    compare_image(material, sky, Stage(48))
+
+
+@pytest.mark.parametrize("material", MATERIALS)
+def test_image_of_a_cow_equals_mitsubas(material, shared_data):
+    cow = trimesh.load(shared_data / "classic" / "spot" / "spot.obj", process=False)
+    cow = trimesh.Trimesh(cow.vertices, cow.faces)  # without uv: vertices of the same place become one
+    cow.apply_translation(-cow.bounds.mean(0))
+    compare_image(material, "sky", Stage(48, cow))
+
+
+def compare_image(material, sky, stage):
     mi = mitsuba_scene.load()
-    (alpha, metallic), environment, stage = MATERIALS[material], light(sky), Stage(48)
+    (alpha, metallic), environment = MATERIALS[material], light(sky)
     world = stage.world(mi, environment, mitsuba_scene.material(mi, BASE, alpha, metallic))
     want, want_var = mitsuba_scene.radiance(mi, world, stage.origins, stage.directions, 32, 12)
     base, rough = torch.tensor(BASE), torch.tensor(alpha**0.5)
