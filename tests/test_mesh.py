@@ -5,18 +5,26 @@ import pytest
 import torch
 import trimesh
 
+from reli3d.geometry import mesh as module
 from reli3d.geometry.mesh import (
     Mesh,
     face_components,
     from_trimesh,
     largest_components,
-    report,
     select_faces,
     to_trimesh,
     vertex_normals,
     volume,
+    watertight,
     weld,
+    weld_rows,
 )
+
+
+def report(mesh):
+    found = module.report(mesh)
+    assert watertight(mesh) is found.watertight  # the short way says the same
+    return found
 
 
 def mesh_of(source, device="cpu"):
@@ -69,6 +77,18 @@ def test_weld_groups_equal_positions_in_order():
     first, label = weld(vertices)
     assert first.tolist() == [0, 1, 4]
     assert label.tolist() == [0, 1, 0, 1, 2]
+
+
+@pytest.mark.parametrize("columns", [1, 3, 8])
+def test_rows_are_welded_as_numpy_does_even_where_all_hashes_collide(monkeypatch, columns):
+    rows = np.random.default_rng(0).integers(0, 2 if columns == 8 else 4, (500, columns)).astype(np.float32)
+    _, index, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    lowest = index[inverse.reshape(-1)]
+    assert all(len(part) == 0 for part in weld_rows(rows[:0]))
+    for _ in range(2):
+        first, label = weld_rows(rows)
+        assert np.array_equal(first, np.unique(lowest)) and np.array_equal(first[label], lowest)
+        monkeypatch.setattr(module, "group", lambda keys: (np.arange(len(keys)), np.zeros(1, np.int64)))
 
 
 @pytest.mark.parametrize(
