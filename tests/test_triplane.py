@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from reli3d.triplane import sample_triplane
+from reli3d.triplane import CACHED, _is_walk, sample_triplane
 
 
 def twin(planes, points):
@@ -86,6 +86,17 @@ def test_layouts_give_the_same_bits(device):
     assert not strided.is_contiguous()
     assert torch.equal(sample_triplane(planes, strided), want)
     assert torch.equal(sample_triplane(planes[:1].expand(2, -1, -1, -1, -1), points)[0], want[0])
+
+
+def test_a_walk_is_read_as_it_comes_and_shuffled_points_by_row_with_the_same_bits():
+    planes, _, _ = inputs(1, 8, 100, 100)
+    assert planes[0, 0].numel() > CACHED
+    t = torch.linspace(0, 300, 6000)
+    walk = torch.stack([0.9 * (0.11 * t).sin(), t / 160 - 0.9, 0.9 * (0.13 * t).cos()], -1)[None]
+    shuffled = torch.randperm(6000, generator=torch.Generator().manual_seed(0))
+    assert _is_walk(walk, 100) and not _is_walk(walk[:, shuffled], 100)
+    assert not _is_walk(torch.full((1, 100, 3), float("nan")), 100) and not _is_walk(walk[:, :0], 100)
+    assert torch.equal(sample_triplane(planes, walk[:, shuffled]), sample_triplane(planes, walk)[:, shuffled])
 
 
 def test_the_same_bits_for_any_number_of_threads():
