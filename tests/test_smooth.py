@@ -128,3 +128,21 @@ def test_nothing_to_do_changes_nothing():
     assert torch.equal(laplacian_smooth(mesh, iterations=0).vertices, mesh.vertices)
     empty = Mesh(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.int32))
     assert len(taubin_smooth(empty).vertices) == 0
+    alone = Mesh(torch.rand(3, 3).requires_grad_(), torch.tensor([[0, 1, 2]], dtype=torch.int32))  # all of it border
+    got = taubin_smooth(alone).vertices
+    assert torch.equal(got, alone.vertices)
+    assert torch.equal(torch.autograd.grad(got.sum(), alone.vertices)[0], torch.ones(3, 3))
+
+
+def test_the_same_bits_for_any_number_of_threads():
+    mesh, threads, found = ball(subdivisions=5, noise=0.02), torch.get_num_threads(), []
+    try:
+        for n in (1, 2, 5):
+            torch.set_num_threads(n)
+            leaf = mesh.vertices.clone().requires_grad_()
+            got = taubin_smooth(Mesh(leaf, mesh.faces)).vertices
+            found.append((got.detach(), torch.autograd.grad(got.square().sum(), leaf)[0]))
+    finally:
+        torch.set_num_threads(threads)
+    for other in found[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(found[0], other, strict=True))
