@@ -20,7 +20,7 @@ from reli3d.kernels import intersect as kernels
 BACKENDS = ("auto", "embree", "warp")
 LENGTHEN = 2.0**100  # exact in float32, and brings a length of 2^-149 to 2^-50 near 1
 EMBREE_HIT = (("primID", wp.int32), ("tfar", wp.float32), ("u", wp.float32), ("v", wp.float32))
-SLICE_RAYS = 4096  # fewest of an Embree slice, and of one whose rays are ordered: below it costs more than it gains
+SLICE_RAYS = 8192  # fewest of an Embree slice, and of one whose rays are ordered: below it costs more than it gains
 THREAD_SLICES = 4  # of a large call for each thread: the more rays are ordered together, the closer are neighbours
 
 
@@ -232,8 +232,9 @@ class RayScene:
         Embree traces one ray after the other; neighbours that visit the same nodes find them in the cache.
         """
         n = o.shape[0]
-        if n < SLICE_RAYS:
-            return None, True
+        if n < SLICE_RAYS:  # any NaN or infinity shows in the sums
+            plain = bool(torch.isfinite(o.sum() + d.sum())) and float(d.abs().amax(-1).min()) >= float(kernels.SHORT)
+            return None, not plain
         key, odd = empty((n,), wp.int16, o.device), torch.zeros(1, dtype=torch.bool)
         args = [(o, wp.vec3), (d, wp.vec3), *self._cells, (key, wp.int16), (odd, wp.bool)]
         launch(kernels.ray_key_kernel, n, args, o.device, slice_min=n)
