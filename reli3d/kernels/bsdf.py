@@ -2,6 +2,7 @@
 
 f = (1 - F) (1 - metallic) base / pi + D G2 F / (4 cos_o cos_i), F = F0 + (1 - F0)(1 - wo.wm)^5 (Schlick 1994),
 F0 = 0.04 for dielectrics and the base colour for metals.  Linear Rec. 709; values are 1/sr and lack the cosine.
+As in the published model, paint and coat of a white dielectric together exceed 1 at grazing views (docs/renderer.md).
 """
 
 import warp as wp

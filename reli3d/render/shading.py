@@ -57,8 +57,9 @@ def shade(
 
     Gradients reach normal, base_color, roughness, metallic and the texels of ``environment``, with detached sampling:
     directions, densities and visibility are constants.  Once differentiable.  Random numbers are a function of
-    ``seed`` and the counter, so the result has the same bits for any number of threads. Estimator: Veach and Guibas
-    1995 over the material of ``reli3d.kernels.bsdf``.
+    ``seed`` and the counter, so the result has the same bits for any number of threads.  Raises TypeError for a wrong
+    dtype, ValueError for a shape, device, count or choice.  Estimator: Veach and Guibas 1995 over the material of
+    ``reli3d.kernels.bsdf``.
     """
     n = _check(position, normal, ng, wo, base_color, roughness, metallic, environment)
     if scene is not None and scene.device != position.device:
