@@ -17,7 +17,7 @@ from reli3d.nn.presets import SMALL
 from reli3d.nn.reni import map_directions
 from reli3d.render.camera import project
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
-from reli3d.train.calibrate import ALIKE, LOST, calibrate, mismatch
+from reli3d.train.calibrate import ALIKE, LOST, calibrate, first_of_the_best, mismatch
 from reli3d.train.heads import train_heads
 from reli3d.train.light_prior import fit, scale_free
 from reli3d.train.loop import TrainConfig, averaged_model, progress, rate_at, train
@@ -264,3 +264,13 @@ def test_mismatch_is_the_error_of_a_picture_in_one_colour_at_its_best_brightness
         assert abs(value - np.log(residual[0] / both)) < 1e-9
     assert mismatch(0, 10, 10) == mismatch(1, 1000, 1000) == LOST
     assert mismatch(10, 10, 10) == np.log(ALIKE)
+
+
+def test_the_first_choice_within_a_standard_error_of_the_best_is_taken():
+    rng = np.random.default_rng(0)
+    level = rng.normal(0, 5, (32, 1))  # objects differ far more than choices do: differences count, not means
+    noise = rng.normal(0, 1, (32, 4))
+    errors = level + np.array([1.0, 0.02, 0.0, 0.4]) + 0.3 * (noise - noise.mean(0))
+    assert first_of_the_best(errors) == 1  # 0.02 is within 0.3 sqrt(2 / 32) = 0.075, 1.0 is not
+    assert first_of_the_best(level + np.array([0.2, 0.1, 0.0, 0.4])) == 2  # no noise, no tie
+    assert first_of_the_best(np.array([[3.0, 1.0, 2.0]])) == 1

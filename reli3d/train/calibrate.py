@@ -35,7 +35,7 @@ LOST = math.log(20.0)  # a twentieth of the object is all that is found
 @torch.no_grad()
 def calibrate(model: Reconstructor, samples: Path, *, objects: int = 32, seed: int = 1,
               progress: Callable[[str], None] = lambda line: None) -> dict[int, dict[float, float]]:  # fmt: skip
-    """Set the preset's surface offsets to those with the least mean :func:`mismatch` over random ``samples``.
+    """Set the preset's surface offsets to the least that do as well as any by :func:`mismatch` over random ``samples``.
 
     samples: a folder of samples with more than ``MANY`` views, best of objects that no training saw: of those it knows
     a network is surer.  Gives the mean IoU of every offset for each number of views; ``progress`` gets a line an
@@ -59,11 +59,21 @@ def calibrate(model: Reconstructor, samples: Path, *, objects: int = 32, seed: i
                 except ValueError:  # nothing is left of the object
                     rows[-1].append((0.0, LOST))
         progress(f"{files[k].stem}: IoU {max(scores[FEW][-1])[0]:.3f}, {max(scores[MANY][-1])[0]:.3f}")
-    means = {count: np.mean(rows, 0) for count, rows in scores.items()}  # (offsets, 2)
-    tried = {count: dict(zip(OFFSETS, mean[:, 0].tolist(), strict=True)) for count, mean in means.items()}
-    one, many = (OFFSETS[int(means[count][:, 1].argmin())] for count in (FEW, MANY))
+    found = {count: np.array(rows) for count, rows in scores.items()}  # (objects, offsets, 2)
+    tried = {count: dict(zip(OFFSETS, rows[..., 0].mean(0).tolist(), strict=True)) for count, rows in found.items()}
+    one, many = (OFFSETS[first_of_the_best(found[count][..., 1])] for count in (FEW, MANY))
     model.preset = replace(plain, offset_one_view=one, offset_many_views=many + (many - one) / (MANY - 1))
     return tried
+
+
+def first_of_the_best(errors: np.ndarray) -> int:
+    """First column of ``errors (objects, choices)`` whose mean is above the least by no more than the standard error of
+    that difference (the rule of one standard error, Breiman et al. 1984): what objects do not tell apart stays as the
+    network has it.
+    """
+    more = errors - errors[:, [errors.mean(0).argmin()]]
+    noise = more.std(0, ddof=1) / len(more) ** 0.5 if len(more) > 1 else 0.0
+    return int(np.flatnonzero(more.mean(0) <= noise)[0])
 
 
 def agreement(mesh: Mesh, sample: dict[str, Tensor], views: range) -> tuple[float, float]:

@@ -45,7 +45,7 @@ PICTURED = 3  # validation objects in the picture, from one and from four views
 WEIGHTS = {
     "occupancy": 1.0,
     "base_color": 4.0,
-    "pattern": 20.0,  # what a photograph tells; most of the error of base_color is brightness, which none does
+    "pattern": 10.0,
     "roughness": 2.0,
     "metallic": 2.0,
     "normal": 1.0,
