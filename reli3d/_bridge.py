@@ -29,6 +29,8 @@ CPU_BLOCK = 1  # block size of Warp's CPU launches; loading a module for its def
 COMPILERS = 4  # modules compiled at once; each thread builds its own precompiled header, 1.5 CPU seconds
 SLICE_MIN = 1024  # below this many threads a slice costs about as much to launch as to run
 
+_LOADING = threading.Lock()
+
 _TORCH = {
     wp.float32: (torch.float32, ()),
     wp.float16: (torch.float16, ()),
@@ -172,9 +174,10 @@ def load_modules(modules: Sequence[ModuleType], device: torch.device) -> None:
                       max_workers=min(os.cpu_count() or 1, COMPILERS))  # fmt: skip
 
 
-def load_kernel(kernel) -> None:
-    """Have a kernel's module ready on the CPU before several threads launch it."""
-    kernel.module.load(wp.get_device("cpu"), block_dim=CPU_BLOCK)
+def _load(kernel) -> None:
+    """Have a kernel's module ready on the CPU.  Warp has no lock: two threads would both compile it."""
+    with _LOADING:
+        kernel.module.load(wp.get_device("cpu"), block_dim=CPU_BLOCK)
 
 
 def launch(kernel, n: int, args: Sequence, device: torch.device, *, slice_min: int = SLICE_MIN) -> None:
@@ -190,7 +193,7 @@ def launch(kernel, n: int, args: Sequence, device: torch.device, *, slice_min: i
         if name != "cpu":
             wp.launch(kernel, n, [0, *values], device=name)
             return
-        load_kernel(kernel)
+        _load(kernel)
         if _serial():
             wp.launch(kernel, n, [0, *values], device="cpu")  # no thread would take a slice
             return
@@ -274,7 +277,7 @@ class _KernelOp(torch.autograd.Function):
                               adj_outputs=adj_out, adjoint=True, device=name)  # fmt: skip
 
                 if name == "cpu":
-                    load_kernel(kernel)
+                    _load(kernel)
                     over_slices(n, adjoint, slice_min=slice_min)
                 else:
                     adjoint(0, 0, n)

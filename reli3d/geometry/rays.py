@@ -14,7 +14,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from reli3d._bridge import check, empty, launch, load_kernel, over_slices, stream
+from reli3d._bridge import check, empty, launch, over_slices, stream
 from reli3d.kernels import intersect as kernels
 
 BACKENDS = ("auto", "embree", "warp")
@@ -223,8 +223,6 @@ class RayScene:
 
         n = o.shape[0]
         if n:
-            with stream(o.device):
-                load_kernel(kernels.ray_key_kernel)  # before several threads would
             over_slices(n, work, slice_min=max(SLICE_RAYS, n // (THREAD_SLICES * torch.get_num_threads())))
 
     def _order(self, o: Tensor, d: Tensor) -> tuple[np.ndarray | None, bool]:

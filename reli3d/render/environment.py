@@ -12,7 +12,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from reli3d._bridge import SLICE_MIN, check, empty, launch, load_modules, once_differentiable, over_slices, slices
+from reli3d._bridge import SLICE_MIN, check, empty, launch, once_differentiable, over_slices, slices
 from reli3d.kernels import envmap as kernels
 
 _LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709
@@ -184,7 +184,6 @@ class _Lookup(torch.autograd.Function):
             launch(kernels.lookup_adjoint_kernel, count, [start, *ins, *outs], device, slice_min=count)
 
         if n and device.type == "cpu":
-            load_modules([kernels], device)  # before the pool's threads would, one by one
             over_slices(n, work, slice_min=least)
         elif n:
             work(0, 0, n)

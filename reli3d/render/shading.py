@@ -10,7 +10,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from reli3d._bridge import SLICE_MIN, check, empty, launch, load_kernel, once_differentiable, over_slices, slices
+from reli3d._bridge import SLICE_MIN, check, empty, launch, once_differentiable, over_slices, slices
 from reli3d.geometry.rays import RayScene
 from reli3d.kernels import shade as kernels
 from reli3d.kernels import shade_adjoint as adjoint
@@ -184,7 +184,6 @@ class _Shade(torch.autograd.Function):
 
         if n and ctx.job.count:
             if device.type == "cpu":
-                load_kernel(adjoint.shade_adjoint_kernel)
                 over_slices(n, work)
             else:
                 work(0, 0, n)
@@ -218,7 +217,6 @@ def _shade_embree(n: int, ins: list, job: _Job, outs: list) -> None:
             launch(kernels.accumulate_kernel, hits, args, out.device)
 
     if n:
-        load_kernel(kernels.shade_rays_kernel)
         over_slices(n, work)
 
 
