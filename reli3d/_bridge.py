@@ -29,7 +29,7 @@ CPU_BLOCK = 1  # block size of Warp's CPU launches; loading a module for its def
 COMPILERS = 4  # modules compiled at once; each thread builds its own precompiled header, 1.5 CPU seconds
 SLICE_MIN = 1024  # below this many threads a slice costs about as much to launch as to run
 
-_LOADING = threading.Lock()
+_LOADING = threading.Lock()  # Warp has none: it would be started, and a module compiled, by two threads at once
 
 _TORCH = {
     wp.float32: (torch.float32, ()),
@@ -48,9 +48,14 @@ _TORCH = {
 }
 
 
-@lru_cache(1)
 def initialise() -> None:
     """Start Warp once: quiet on stdout, and with a kernel cache that can be written."""
+    with _LOADING:
+        _start()
+
+
+@lru_cache(1)
+def _start() -> None:
     wp.config.log_level = wp.LOG_WARNING
     try:
         wp.init()
@@ -175,7 +180,7 @@ def load_modules(modules: Sequence[ModuleType], device: torch.device) -> None:
 
 
 def _load(kernel) -> None:
-    """Have a kernel's module ready on the CPU.  Warp has no lock: two threads would both compile it."""
+    """Have a kernel's module ready on the CPU."""
     with _LOADING:
         kernel.module.load(wp.get_device("cpu"), block_dim=CPU_BLOCK)
 

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -370,3 +371,13 @@ def test_threads_load_a_kernel_one_after_the_other(threads, monkeypatch):
     _bridge.over_slices(len(visits), work)
     assert beside_the_first == [0] and len(began) >= 8
     assert torch.equal(visits, torch.arange(len(visits), dtype=torch.int32) % _bridge.SLICE_MIN)
+
+
+def test_threads_start_warp_once(monkeypatch):
+    """Warp forgets its modules' hashes while it starts; a thread that already loads one would stumble over that."""
+    started = []
+    monkeypatch.setattr(wp, "init", lambda: (time.sleep(0.05), started.append(1)))
+    _bridge._start.cache_clear()
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(lambda _: (_bridge.initialise(), started.append(0)), range(4)))
+    assert started == [1, 0, 0, 0, 0]
