@@ -1,4 +1,4 @@
-"""Straightforward FlexiCubes in plain torch, any dtype, after the paper's equations.
+"""Straightforward FlexiCubes in plain torch, any dtype, after the paper's equations, and fields to try it on.
 
 The truth for gradients: every cube listed, every edge gathered.  Its grouping of edges walks the
 loops on the cube's faces here, independent of the generated tables.
@@ -96,3 +96,30 @@ def flexicubes_deviation(level, deformation, alpha, beta, scale):
         distance = ((u - (u * b[:, None]).sum(0) / b.sum()) * scale).norm(dim=-1)
         spread.append((distance - distance.mean()).abs().mean())
     return torch.stack(spread)
+
+
+def grid(n, radius=1.0, device="cpu"):
+    axis = torch.linspace(-radius, radius, n + 1, device=device)
+    return torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
+
+
+def sphere(n, radius=0.6, device="cpu"):
+    return grid(n, device=device).norm(dim=-1) - radius
+
+
+def torus(n, device="cpu"):
+    p = grid(n, device=device)
+    return torch.hypot(torch.hypot(p[..., 0], p[..., 1]) - 0.6, p[..., 2]) - 0.22
+
+
+def random_weights(shape, seed, device="cpu", spread=0.9):
+    """Weights over more than the range of the published activations, and deformations of nearly half a cube."""
+    rng = torch.Generator().manual_seed(seed)
+    n = (shape[0] - 1) * (shape[1] - 1) * (shape[2] - 1)
+    made = dict(
+        alpha=1 + spread * (2 * torch.rand(n, 8, generator=rng) - 1),
+        beta=1 + spread * (2 * torch.rand(n, 12, generator=rng) - 1),
+        gamma=0.01 + torch.rand(n, generator=rng),
+        deformation=(torch.rand(*shape, 3, generator=rng) - 0.5) * 0.98 / (torch.tensor(shape) - 1),
+    )
+    return {name: value.to(device) for name, value in made.items()}
