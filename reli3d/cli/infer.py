@@ -163,12 +163,12 @@ class Job:
         check_options(args.texture_size, args.resolution)
         if args.download:
             _fetch(args.weights)
-        ready_kernels(device)
-        self.args, self.device, self.complete = args, device, results.complete
         path = weights.locate(args.weights)
+        self.args, self.device, self.complete = args, device, results.complete
         trunk = args.precision and {"float32": torch.float32, "bfloat16": torch.bfloat16}[args.precision]
         self.model, self.manifest = weights.load(path, trunk=trunk, device=device)
         self.digest = weights.known_sha256(path)
+        ready_kernels(device)  # takes half a minute the first time: not before the weights are known to be good
         self.cold = True
 
     def run(self, folder: Path, name: str, target: Path) -> None:
