@@ -38,14 +38,24 @@ def sample_ggx_vndf(wo: Tensor, alpha: Tensor, u: Tensor) -> Tensor:
     return torch.nn.functional.normalize(h * stretch, dim=-1)
 
 
-def eval_bsdf(wo: Tensor, wi: Tensor, base_color: Tensor, alpha: Tensor, metallic: Tensor) -> Tensor:
-    """Lambert below Schlick, GGX with height-correlated Smith; directions above the horizon."""
+def eval_bsdf(wo: Tensor, wi: Tensor, base_color: Tensor, alpha: Tensor, metallic: Tensor,
+              paint: str = "published") -> Tensor:  # fmt: skip
+    """Lambert below Schlick, GGX with height-correlated Smith; directions above the horizon.
+
+    The paint loses what the microfacet reflects, or, ``conserving``, what the surface does on the way in and out, with
+    1 - cos divided by 1 + alpha.
+    """
     wm = torch.nn.functional.normalize(wo + wi, dim=-1)
     f0 = 0.04 * (1.0 - metallic[..., None]) + base_color * metallic[..., None]
-    fresnel = f0 + (1.0 - f0) * (1.0 - (wo * wm).sum(-1, keepdim=True)) ** 5
+    schlick = lambda cos: f0 + (1.0 - f0) * (1.0 - cos) ** 5  # noqa: E731
+    fresnel = schlick((wo * wm).sum(-1, keepdim=True))
+    left = 1.0 - fresnel
+    if paint == "conserving":
+        left_o, left_i = (1.0 - schlick((w[..., 2:] + alpha[..., None]) / (1.0 + alpha[..., None])) for w in (wo, wi))
+        left = left_o * left_i
     g2 = 1.0 / (1.0 + smith_lambda(wo, alpha) + smith_lambda(wi, alpha))
     specular = ggx_ndf(wm, alpha) * g2 / (4.0 * wo[..., 2] * wi[..., 2])
-    return (1.0 - fresnel) * (1.0 - metallic[..., None]) * base_color / torch.pi + fresnel * specular[..., None]
+    return left * (1.0 - metallic[..., None]) * base_color / torch.pi + fresnel * specular[..., None]
 
 
 def sphere_grid(height: int) -> tuple[Tensor, Tensor]:
@@ -70,7 +80,7 @@ def lookup_envmap(radiance: Tensor, d: Tensor) -> Tensor:
 
 
 def direct_light(normal: Tensor, wo: Tensor, base_color: Tensor, alpha: Tensor, metallic: Tensor, radiance: Tensor,
-                 height: int = 256) -> Tensor:  # fmt: skip
+                 height: int = 256, paint: str = "published") -> Tensor:  # fmt: skip
     """Radiance ``(3,)`` of one unshadowed point by midpoint quadrature over the sphere."""
     d, angle = sphere_grid(height)
     d = d[(d @ normal) > 1e-6]
@@ -78,5 +88,5 @@ def direct_light(normal: Tensor, wo: Tensor, base_color: Tensor, alpha: Tensor, 
     t = torch.nn.functional.normalize(torch.linalg.cross(helper, normal), dim=-1)
     frame = torch.stack([t, torch.linalg.cross(normal, t), normal])
     wi, o = d @ frame.T, (frame @ wo).expand(len(d), 3)
-    value = eval_bsdf(o, wi, base_color.expand(len(d), 3), alpha.expand(len(d)), metallic.expand(len(d)))
+    value = eval_bsdf(o, wi, base_color.expand(len(d), 3), alpha.expand(len(d)), metallic.expand(len(d)), paint)
     return (value * wi[:, 2:] * lookup_envmap(radiance, d)).sum(0) * angle

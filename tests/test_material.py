@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from reli3d.render.material import eval_bsdf, pdf_lobes, sample_bsdf
+from reli3d.render.material import PAINTS, eval_bsdf, pdf_lobes, sample_bsdf
 from tests import mitsuba_scene, reference
 
 
@@ -16,11 +16,12 @@ def pairs(n, seed=0, low=0.02):
     return wo, wi, torch.rand(n, 3, generator=g), 0.01 + 0.99 * torch.rand(n, generator=g), torch.rand(n, generator=g)
 
 
-def test_value_and_gradients_equal_the_float64_twin(device):
+@pytest.mark.parametrize("paint", PAINTS)
+def test_value_and_gradients_equal_the_float64_twin(device, paint):
     ins = pairs(4000)
     leaf = [v.to(device).requires_grad_() for v in ins]
     twin = [v.double().requires_grad_() for v in ins]
-    got, want = eval_bsdf(*leaf), reference.eval_bsdf(*twin)
+    got, want = eval_bsdf(*leaf, paint=paint), reference.eval_bsdf(*twin, paint)
     assert ((got.cpu().double() / want - 1).abs() < 2e-4).all()  # 1e-7 in cos against alpha^2 = 1e-4 at the peak
     weight = torch.randn(got.shape, generator=torch.Generator().manual_seed(1))
     grads = torch.autograd.grad((got * weight.to(device)).sum(), leaf)
@@ -36,9 +37,10 @@ def test_value_and_gradients_equal_the_float64_twin(device):
         assert (off < 2e-3).double().mean() > 0.999  # lobes of alpha 0.01 lose three digits more
 
 
-def test_reciprocity(device):
-    wo, wi, base, alpha, metallic = (v.to(device) for v in pairs(100_000, 1))
-    a, b = eval_bsdf(wo, wi, base, alpha, metallic), eval_bsdf(wi, wo, base, alpha, metallic)
+@pytest.mark.parametrize("paint", PAINTS)
+def test_reciprocity(device, paint):
+    wo, wi, *rest = (v.to(device) for v in pairs(100_000, 1))
+    a, b = eval_bsdf(wo, wi, *rest, paint=paint), eval_bsdf(wi, wo, *rest, paint=paint)
     torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-7)
 
 
@@ -57,19 +59,25 @@ def test_energy_is_never_created(device):
             assert float(weight.mean()) <= 1.0
 
 
-def test_directions_below_the_horizon_and_extreme_parameters(device):
-    for z in (1e-3, 0.0, -0.1):
-        wo = torch.tensor([(1 - z * z) ** 0.5, 0.0, z], device=device)
-        wi = torch.nn.functional.normalize(torch.randn(100, 3, generator=torch.Generator().manual_seed(3)), dim=-1).to(
-            device
-        )
-        for alpha in (0.0, 1.0):
-            out = eval_bsdf(
-                wo, wi, torch.ones(3, device=device), torch.tensor(alpha, device=device), wi.new_tensor(0.5)
-            )
-            assert bool(torch.isfinite(out).all()) and float(out.min()) >= 0.0
-            assert z > 0 or float(out.max()) == 0.0
-            assert float(out[wi[:, 2] <= 0].abs().sum()) == 0.0
+@pytest.mark.parametrize("paint", PAINTS)
+def test_directions_in_and_below_the_horizon_and_extreme_parameters(device, paint):
+    """Both cosines 1e-3, 0 and -0.1 with any other; metallic, base colour and width at both ends, and width 0."""
+    z = torch.tensor([1e-3, 0.0, -0.1, 1e-8, 0.3, 1.0, -1.0])
+    turn = torch.tensor([0.0, 1e-3, 2.0, torch.pi])
+    s = (1 - z * z).clamp(min=0.0).sqrt()
+    d = torch.stack([torch.outer(turn.cos(), s), torch.outer(turn.sin(), s), z.expand(4, 7)], -1)
+    d, ends = d.reshape(-1, 3).to(device), torch.tensor([0.0, 1.0], device=device)
+    wo, wi = d[:, None, None, None, None], d[:, None, None, None]
+    alpha, metallic = torch.tensor([0.0, 1e-3, 0.5, 1.0], device=device)[:, None, None], ends[:, None]
+    out = eval_bsdf(wo, wi, ends[:, None].expand(2, 3), alpha, metallic, paint=paint)
+    assert bool(torch.isfinite(out).all()) and float(out.min()) >= 0.0
+    below = (wo[..., 2] <= 0.0) | (wi[..., 2] <= 0.0)
+    assert float(out[below.expand(out.shape[:-1])].abs().max()) == 0.0 < float(out.max())
+
+
+def test_bad_paint_is_named(device):
+    with pytest.raises(ValueError, match="paint: expected one of published, conserving, got white"):
+        eval_bsdf(*(v.to(device) for v in pairs(4)), paint="white")
 
 
 @pytest.mark.slow  # Mitsuba starts its compiler

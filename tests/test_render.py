@@ -12,6 +12,7 @@ from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.camera import Camera, camera_rays, look_at, project
 from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import interpolate, sample_texture, surface_points
+from reli3d.render.material import PAINTS
 from reli3d.render.render import render
 
 
@@ -134,12 +135,28 @@ def test_image_gradient_reaches_textures_and_light(device):
     assert float(grads[0].min()) >= 0.0 and float(grads[3].min()) >= 0.0  # more paint and more light are brighter
 
 
+def test_white_paint_gains_light_at_the_rim_and_conserving_paint_does_not(device):
+    """A smooth white ball in a furnace.  Rays from below the horizon never hit it, so it shadows nothing itself."""
+    asset = ball(device, (1.0, 1.0, 1.0))
+    camera, white = Camera.from_fov(eye(device, 0.0, 0.5, 2.0), 0.8, 40, 40), Environment.constant(
+        torch.ones(3, device=device))  # fmt: skip
+    asset = Asset(asset.mesh, textures(4, device, (1.0, 1.0, 1.0), roughness=0.2))
+    images = {paint: render(asset, camera, white, paint=paint, samples=(64, 64, 64)) for paint in PAINTS}
+    inside = images["published"].alpha > 0
+    bright = {paint: image.radiance[inside] for paint, image in images.items()}
+    assert float(bright["published"].max()) > 1.1
+    assert float(bright["conserving"].max()) < 1.05 and float(bright["conserving"].mean()) > 0.85  # 192 samples' noise
+    assert torch.equal(images["published"].radiance, render(asset, camera, white, samples=(64, 64, 64)).radiance)
+
+
 def test_bad_input_is_named(device):
     asset, camera = ball(device), Camera.from_fov(eye(device, 0.0, 0.5, 2.0), 0.8, 4, 4)
     with pytest.raises(ValueError, match="environment: expected"):
         render(asset, camera)
     with pytest.raises(ValueError, match="background: expected"):
         render(asset, camera, Environment.constant(torch.ones(3, device=device)), background="pink")
+    with pytest.raises(ValueError, match="paint: expected"):
+        render(asset, camera, Environment.constant(torch.ones(3, device=device)), paint="white")
     faces, values = asset.mesh.faces, asset.mesh.vertices
     with pytest.raises(ValueError, match="face: expected"):
         interpolate(values, faces, torch.tensor([len(faces)], dtype=torch.int32, device=device),
@@ -172,6 +189,12 @@ def test_command_writes_views_layers_and_turntable(tmp_path, capsys):
     linear = np.asarray(Image.open(tmp_path / "out" / "ball.png")).astype(float)[12, 12, 0] / 255
     encoded = picture[12, 12, 0] / 255
     assert abs(((encoded + 0.055) / 1.055) ** 2.4 - linear) < 0.02  # of 0.6; 8 bits in a curve of slope up to 2
+    assert main([*common, "--paint", "conserving"]) == 0
+    changed = np.asarray(Image.open(tmp_path / "out" / "ball.png"))[..., :3].astype(int) - picture[..., :3]
+    assert changed.min() < -3 and changed.max() <= 1  # less light at the rim, the same noise
+    with pytest.raises(SystemExit) as stopped:
+        main([*common, "--paint", "white"])
+    assert stopped.value.code == 2
     capsys.readouterr()
     for wrong in (["--size", "0"], ["--elevation", "90"], ["--light", str(tmp_path / "none.hdr")]):
         assert main([*common, *wrong]) == 2

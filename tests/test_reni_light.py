@@ -12,6 +12,7 @@ from reli3d.nn.reni import EnvironmentDecoder, map_directions, reni_frame
 from reli3d.nn.reni_fit import fit_latent
 from reli3d.nn.weights import load_model, read_manifest, read_tensors
 from reli3d.render.environment import Environment
+from reli3d.render.material import PAINTS
 from reli3d.render.shading import shade, shade_light
 from tests.test_shading import points
 
@@ -105,10 +106,12 @@ def test_shading_that_asks_a_map_is_shading_by_the_map(device, backend):
         triangle = torch.tensor([[-2.0, 0.7, -2.0], [2.0, 0.7, -2.0], [0.0, 0.7, 3.0]], device=device)
         scene = RayScene(triangle, torch.tensor([[0, 1, 2]], dtype=torch.int32, device=device), backend=backend)
     args = surfaces(500, device)
-    got, wanted = shade_light(*args, light, light, scene=scene, seed=5), shade(*args, light, scene=scene, seed=5)
-    torch.testing.assert_close(got, wanted, rtol=1e-4, atol=1e-5)  # 64 numbers in another order
+    for paint in PAINTS:
+        got, wanted = (shade_light(*args, light, light, scene=scene, seed=5, paint=paint),
+                       shade(*args, light, scene=scene, seed=5, paint=paint))  # fmt: skip
+        torch.testing.assert_close(got, wanted, rtol=1e-4, atol=1e-5)  # 64 numbers in another order
     if backend:
-        assert (wanted - shade(*args, light, seed=5)).abs().max() > 0.1  # the triangle is in the way
+        assert (wanted - shade(*args, light, seed=5, paint=paint)).abs().max() > 0.1  # the triangle is in the way
 
 
 def test_shading_by_a_latent_is_shading_by_its_fine_map(device):

@@ -6,6 +6,7 @@ import trimesh
 
 from reli3d.geometry.rays import RayScene
 from reli3d.render.environment import Environment
+from reli3d.render.material import PAINTS
 from reli3d.render.shading import shade
 from tests import reference
 
@@ -159,6 +160,7 @@ def test_bad_input_is_named(device):
         ({"normal": normal.double()}, TypeError, "normal"), ({"roughness": one[:3]}, ValueError, "roughness"),
         ({"samples": (1, 2)}, ValueError, "samples"), ({"samples": (-1, 2, 3)}, ValueError, "samples"),
         ({"heuristic": "x"}, ValueError, "heuristic"), ({"clamp": 0.0}, ValueError, "clamp"),
+        ({"paint": "white"}, ValueError, "paint"),
         ({"pixels": torch.arange(3, dtype=torch.int32, device=device)}, ValueError, "pixels"),
     ]:  # fmt: skip
         with pytest.raises(kind, match=f"{name}: expected"):
@@ -173,7 +175,8 @@ def gradient_inputs(device, n=400):
     return wo.to(device), [v.to(device).requires_grad_() for v in values]
 
 
-def test_gradient_is_that_of_the_estimator_where_the_samples_stand_still(device):
+@pytest.mark.parametrize("paint", PAINTS)
+def test_gradient_is_that_of_the_estimator_where_the_samples_stand_still(device, paint):
     """With environment samples alone nothing drawn depends on the material, so finite differences see the same
     samples."""
     wo, inputs = gradient_inputs(device)
@@ -182,7 +185,7 @@ def test_gradient_is_that_of_the_estimator_where_the_samples_stand_still(device)
     def loss(normal, base, roughness, metallic, radiance):
         env = Environment(radiance)
         object.__setattr__(env, "table", table)  # the light's own change must not move the samples either
-        got = shade(normal, normal, normal, wo, base, roughness, metallic, env, samples=(48, 0, 0))
+        got = shade(normal, normal, normal, wo, base, roughness, metallic, env, samples=(48, 0, 0), paint=paint)
         return (got * weight).double().sum()
 
     table = Environment(inputs[4].detach()).table
@@ -207,8 +210,9 @@ def test_gradient_is_that_of_the_estimator_where_the_samples_stand_still(device)
         assert abs(got - slope) < 2e-3 * scale, (k, got, slope, scale)
 
 
-@pytest.mark.parametrize("counts", [(20, 40, 4), (0, 0, 64), (0, 64, 0)])
-def test_mean_gradient_is_that_of_the_integral(device, counts):
+@pytest.mark.parametrize("counts, paint", [((20, 40, 4), "published"), ((0, 0, 64), "published"),
+                                           ((0, 64, 0), "published"), ((20, 40, 4), "conserving")])  # fmt: skip
+def test_mean_gradient_is_that_of_the_integral(device, counts, paint):
     normal, wo = points(3, seed=11)
     n, env = 6000, sky(8)
     metallic = 1.0 if counts == (0, 64, 0) else 0.4
@@ -224,6 +228,7 @@ def test_mean_gradient_is_that_of_the_integral(device, counts):
             truth_in[3],
             truth_in[4],
             192,
+            paint,
         )
         truth = torch.autograd.grad(value.sum(), truth_in)
         rows = repeat(
@@ -232,7 +237,9 @@ def test_mean_gradient_is_that_of_the_integral(device, counts):
         rows = [r.to(device).requires_grad_() for r in rows]
         light = env.radiance.to(device).requires_grad_()
         view = wo[k : k + 1].expand(n, 3).contiguous().to(device)
-        got = shade(rows[0], rows[0], rows[0], view, *rows[1:], Environment(light), samples=counts)
+        got = shade(rows[0], rows[0], rows[0], view, *rows[1:], Environment(light), samples=counts, paint=paint)
+        error = got.detach().std(0) / n**0.5 + 5e-4 * value.detach().float().to(device)  # 192 rows of quadrature
+        assert ((got.detach().mean(0) - value.detach().to(device)) / error).abs().max() < 4.5
         *grads, g_light = torch.autograd.grad(got.sum(), [*rows, light])
         tangent = grads[0] - (grads[0] * rows[0]).sum(-1, keepdim=True) * rows[0]
         for g, t in zip([tangent, *grads[1:]], truth[:4], strict=True):

@@ -52,6 +52,7 @@ class Plan:
     antithetic: int
     power: int
     rotate: int
+    conserving: int
     seed: int
     clamp: float
     scale: float
@@ -185,11 +186,13 @@ def draw_sample(
 
 
 @wp.func
-def sample_value(surface: Surface, draw: Draw, light: wp.vec3, clamp: float) -> wp.vec3:
-    """What a sample adds if nothing is in its way; at most ``clamp`` over its strategy's count."""
-    value = eval_bsdf(draw.facet, surface.wo, draw.wi, surface.base_color, surface.metallic)
+def sample_value(surface: Surface, plan: Plan, draw: Draw, light: wp.vec3) -> wp.vec3:
+    """What a sample adds if nothing is in its way; at most the plan's clamp over its strategy's count."""
+    value = eval_bsdf(
+        draw.facet, surface.wo, draw.wi, surface.base_color, surface.alpha, surface.metallic, plan.conserving
+    )
     value = wp.cw_mul(value, light) * (draw.factor * draw.wi[2])
-    top = clamp / float(draw.count)
+    top = plan.clamp / float(draw.count)
     return wp.vec3(wp.min(value[0], top), wp.min(value[1], top), wp.min(value[2], top))
 
 
@@ -220,7 +223,7 @@ def shade_kernel(
                 origin = offset_origin(position[i], surface.ng, d.direction, plan.scale)
                 lit = not hit_occluded(mesh, origin, d.direction, wp.inf)
             if lit:
-                total = total + sample_value(surface, d, lookup_envmap_uv(radiance, d.uv), plan.clamp)
+                total = total + sample_value(surface, plan, d, lookup_envmap_uv(radiance, d.uv))
                 word = word | (1 << (s & 31))
         if (s & 31) == 31 or s == count - 1:
             if s // 32 < visible.shape[1]:
@@ -255,7 +258,7 @@ def shade_rays_kernel(
             t_max[k] = wp.inf
             origins[k] = offset_origin(position[i], surface.ng, d.direction, plan.scale)
             directions[k] = d.direction
-            values[k] = sample_value(surface, d, lookup_envmap_uv(radiance, d.uv), plan.clamp)
+            values[k] = sample_value(surface, plan, d, lookup_envmap_uv(radiance, d.uv))
 
 
 @wp.kernel

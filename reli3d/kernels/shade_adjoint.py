@@ -8,7 +8,7 @@ from their counters, so nothing per sample is in memory but the visibility bits.
 
 import warp as wp
 
-from reli3d.kernels.bsdf import F0_DIELECTRIC, base_reflectance, eval_bsdf, schlick
+from reli3d.kernels.bsdf import F0_DIELECTRIC, base_reflectance, coat_cosine, eval_bsdf, schlick
 from reli3d.kernels.envmap import add_texels, lookup_envmap_uv
 from reli3d.kernels.math import INLINE, INV_PI
 from reli3d.kernels.microfacet import ALPHA_MIN, Facet, smith_visibility
@@ -28,6 +28,20 @@ class SurfaceGradient:
 
 
 @wp.func
+def schlick_slope(cos: float) -> float:
+    """dF / dF0 of :func:`schlick`: 1 - (1 - cos)^5."""
+    rest = wp.max(1.0 - cos, 0.0)
+    return 1.0 - rest * rest * rest * rest * rest
+
+
+@wp.func
+def schlick_turn(cos: float) -> float:
+    """-dF / dcos of :func:`schlick` over 1 - F0: 5 (1 - cos)^4."""
+    rest = wp.max(1.0 - cos, 0.0)
+    return 5.0 * rest * rest * rest * rest
+
+
+@wp.func
 def add_sample_gradient(
     total: SurfaceGradient,
     facet: Facet,
@@ -36,6 +50,7 @@ def add_sample_gradient(
     base_color: wp.vec3,
     alpha: float,
     metallic: float,
+    conserving: int,
     value: wp.vec3,
     weight: wp.vec3,
 ) -> SurfaceGradient:
@@ -44,17 +59,32 @@ def add_sample_gradient(
     out = total
     one = wp.vec3(1.0, 1.0, 1.0)
     wm = facet.wm
-    fresnel = schlick(base_reflectance(base_color, metallic), facet.cos_m)
-    rest = wp.max(1.0 - facet.cos_m, 0.0)
-    slope = 1.0 - rest * rest * rest * rest * rest  # dF / dF0
+    f0 = base_reflectance(base_color, metallic)
+    fresnel = schlick(f0, facet.cos_m)
+    slope = schlick_slope(facet.cos_m)
     visibility = smith_visibility(facet, wo, wi)
     specular = facet.ndf * visibility
     diffuse = (1.0 - metallic) * INV_PI
     g = weight * wi[2]
-    g_fresnel = wp.cw_mul(g, one * specular - base_color * diffuse) * slope  # to F0
-    out.base_color = out.base_color + wp.cw_mul(g, one - fresnel) * diffuse + g_fresnel * metallic
-    out.metallic = out.metallic + wp.dot(g_fresnel, base_color - one * F0_DIELECTRIC)
-    out.metallic = out.metallic - wp.dot(g, wp.cw_mul(one - fresnel, base_color)) * INV_PI
+    g_left = wp.cw_mul(g, base_color) * diffuse  # to what the coat leaves to the paint
+    left = one - fresnel
+    d_left = one * (-slope)  # to F0
+    if conserving != 0:
+        c_o = coat_cosine(wo[2], alpha)
+        c_i = coat_cosine(wi[2], alpha)
+        left_o = one - schlick(f0, c_o)
+        left_i = one - schlick(f0, c_i)
+        left = wp.cw_mul(left_o, left_i)
+        d_left = left_o * (-schlick_slope(c_i)) - left_i * schlick_slope(c_o)
+        g_c = wp.cw_mul(g_left, one - f0) * (1.0 / (1.0 + alpha))
+        g_o = wp.dot(g_c, left_i) * schlick_turn(c_o)  # to cos_o
+        g_i = wp.dot(g_c, left_o) * schlick_turn(c_i)
+        out.n = out.n + wo * g_o + wi * g_i
+        out.alpha = out.alpha + g_o * (1.0 - c_o) + g_i * (1.0 - c_i)
+    g_f0 = g * (specular * slope) + wp.cw_mul(g_left, d_left)
+    out.base_color = out.base_color + wp.cw_mul(g, left) * diffuse + g_f0 * metallic
+    out.metallic = out.metallic + wp.dot(g_f0, base_color - one * F0_DIELECTRIC)
+    out.metallic = out.metallic - wp.dot(g, wp.cw_mul(left, base_color)) * INV_PI
     g_specular = wp.dot(g, fresnel) * specular
     a2 = alpha * alpha
     inverse_k = 1.0 / (a2 * wm[2] * wm[2] + wm[0] * wm[0] + wm[1] * wm[1])
@@ -96,7 +126,8 @@ def shade_adjoint_kernel(
         if (visible[i, s // 32] >> (s & 31)) & 1 != 0:
             d = draw_sample(surface, plan, points, rows, columns, row_guide, column_guide, density, s)
             light = lookup_envmap_uv(radiance, d.uv)
-            value = eval_bsdf(d.facet, surface.wo, d.wi, surface.base_color, surface.metallic)
+            value = eval_bsdf(d.facet, surface.wo, d.wi, surface.base_color, surface.alpha, surface.metallic,
+                              plan.conserving)  # fmt: skip
             scale = d.factor * d.wi[2]
             top = plan.clamp / float(d.count)
             own = wp.vec3(0.0, 0.0, 0.0)  # the output's adjoint, 0 where the clamp held
@@ -104,7 +135,8 @@ def shade_adjoint_kernel(
                 if value[c] * scale * light[c] < top:
                     own[c] = g[c]
             total = add_sample_gradient(total, d.facet, surface.wo, d.wi, surface.base_color, surface.alpha,
-                                        surface.metallic, value, wp.cw_mul(own, light) * d.factor)  # fmt: skip
+                                        surface.metallic, plan.conserving, value,
+                                        wp.cw_mul(own, light) * d.factor)  # fmt: skip
             if g_radiance.shape[0] != 0:
                 add_texels(g_radiance, d.uv, wp.cw_mul(own, value) * scale)
     side = wp.float32(1.0)

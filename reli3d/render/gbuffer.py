@@ -77,7 +77,8 @@ def evaluate_hits(vertices: Tensor, faces: Tensor, hits: Hits, origins: Tensor, 
     """The hits with ``t`` and ``bary`` re-evaluated from their faces, so that gradients flow.
 
     vertices: ``(V, 3)``.  faces: ``(F, 3)`` int32.  origins, directions: ``(..., 3)`` of the rays that gave ``hits``.
-    Gradients reach vertices, origins and directions; which face is hit has none.  Moller and Trumbore 1997.
+    Gradients reach vertices, origins and directions; which face is hit has none.  A face thinner, or seen more edge on,
+    than float32 can tell keeps the hit as it was, with gradient 0.  Moller and Trumbore 1997.
     """
     check("vertices", vertices, last=3)
     _check_faces(vertices.shape[0], faces, hits.face, vertices)
@@ -86,7 +87,8 @@ def evaluate_hits(vertices: Tensor, faces: Tensor, hits: Hits, origins: Tensor, 
     shape = hits.face.shape
     o, d = (v.expand(*shape, 3).reshape(-1, 3) for v in (origins, directions))
     n = o.shape[0]
-    ins = [(vertices, wp.vec3), (faces, wp.int32), (hits.face.reshape(-1), wp.int32), (o, wp.vec3), (d, wp.vec3)]
+    ins = [(vertices, wp.vec3), (faces, wp.int32), (hits.face.reshape(-1), wp.int32), (o, wp.vec3), (d, wp.vec3),
+           (hits.t.detach().reshape(-1), wp.float32), (hits.bary.detach().reshape(-1, 2), wp.vec2)]  # fmt: skip
     outs = [((n,), wp.float32), ((n,), wp.vec2)]
     t, bary = call(kernels.reevaluate_kernel, n, ins, outs, device=vertices.device, shared=(0,))
     return Hits(hits.face, t.reshape(shape), bary.reshape(*shape, 2))

@@ -13,6 +13,8 @@ from reli3d._bridge import call, check, empty, launch
 from reli3d.kernels import bsdf as kernels
 from reli3d.render.sampling import mirror, reflect, sample_cosine, sample_ggx_vndf
 
+PAINTS = ("published", "conserving")  # what the coat leaves to the paint: reli3d.kernels.bsdf
+
 
 def _flat(items: list[tuple[str, Tensor, int]]) -> tuple[torch.Size, list[Tensor]]:
     """Checked and broadcast operands, flattened to ``(N, k)`` or ``(N,)``; ``items`` hold name, value and last axis."""
@@ -24,17 +26,29 @@ def _flat(items: list[tuple[str, Tensor, int]]) -> tuple[torch.Size, list[Tensor
     return batch, flat
 
 
-def eval_bsdf(wo: Tensor, wi: Tensor, base_color: Tensor, alpha: Tensor, metallic: Tensor) -> Tensor:
+def choice(name: str, value: str, allowed: tuple[str, ...]) -> int:
+    """Place of ``value`` in ``allowed``; ValueError where it is none of them."""
+    if value not in allowed:
+        raise ValueError(f"{name}: expected one of {', '.join(allowed)}, got {value}")
+    return allowed.index(value)
+
+
+def eval_bsdf(
+    wo: Tensor, wi: Tensor, base_color: Tensor, alpha: Tensor, metallic: Tensor, *, paint: str = "published"
+) -> Tensor:
     """Value ``(..., 3)`` [1/sr] without the cosine; 0 below the horizon on either side.
 
     wo, wi: ``(..., 3)`` unit.  base_color: ``(..., 3)`` linear in [0, 1].  alpha, metallic: ``(...)``.  Leading axes
-    broadcast.  Gradients reach all five; that of ``alpha`` is 0 below ``ALPHA_MIN`` = 1e-3.
+    broadcast.  paint: what the coat leaves to the paint below it, ``published`` (1 - F of the microfacet) or
+    ``conserving`` (1 - F of the surface on the way in and out), which never sends out more than comes in.  Gradients
+    reach all five; that of ``alpha`` is 0 below ``ALPHA_MIN`` = 1e-3.  Raises ValueError for another ``paint``.
     """
+    conserving = choice("paint", paint, PAINTS)
     batch, flat = _flat([("wo", wo, 3), ("wi", wi, 3), ("base_color", base_color, 3), ("alpha", alpha, 0),
                          ("metallic", metallic, 0)])  # fmt: skip
     kinds = (wp.vec3, wp.vec3, wp.vec3, wp.float32, wp.float32)
     n = flat[0].shape[0]
-    (out,) = call(kernels.eval_bsdf_kernel, n, list(zip(flat, kinds)), [((n,), wp.vec3)], device=wo.device)
+    (out,) = call(kernels.eval_bsdf_kernel, n, [*zip(flat, kinds), conserving], [((n,), wp.vec3)], device=wo.device)
     return out.reshape(*batch, 3)
 
 

@@ -50,15 +50,17 @@ def render(
     background: str = "transparent",
     scene: RayScene | None = None,
     clamp: float | None = None,
+    paint: str = "published",
     progress: Callable[[float], None] | None = None,
 ) -> Render:
     """Image of ``asset`` under ``environment`` (default: the asset's own) with direct light and shadows.
 
     asset: one, or the parts of one that cast shadows on each other.  camera: one camera, no batch.  supersampling:
     side of the subpixel grid; ``samples`` are per subpixel.  background: ``transparent`` or ``environment``.  scene:
-    rays against :func:`joined_scene`, made here if None.  progress: called with the fraction done.  Gradients reach
-    textures, mesh attributes and environment where :func:`reli3d.render.shading.shade` has them; silhouettes have
-    none.  Raises ValueError without any environment.
+    rays against :func:`joined_scene`, made here if None.  samples, seed, clamp, paint (``published`` or
+    ``conserving``): as for :func:`reli3d.render.shading.shade`.  progress: called with the fraction done.  Gradients
+    reach textures, mesh attributes and environment where ``shade`` has them; silhouettes have none.  Raises ValueError
+    without any environment.
     """
     parts = [asset] if isinstance(asset, Asset) else list(asset)
     if environment is None:
@@ -72,11 +74,11 @@ def render(
     scene = scene if scene is not None else joined_scene(parts)
     fine = camera.scaled(supersampling)
     band = max(1, BAND_RAYS // (fine.width * supersampling)) * supersampling
-    bands = []
+    bands, options = [], {"samples": samples, "seed": seed, "clamp": clamp, "paint": paint}
     for row in range(0, fine.height, band):
         rows = min(band, fine.height - row)
         part = Camera(fine.c2w, fine.intrinsics - fine.intrinsics.new_tensor([0.0, 0.0, 0.0, row]), fine.width, rows)
-        layers = _band(parts, part, environment, scene, row * fine.width, samples, seed, shadows, background, clamp)
+        layers = _band(parts, part, environment, scene, row * fine.width, shadows, background, **options)
         bands.append([_resolve(layer, supersampling) for layer in layers])
         if progress is not None:
             progress((row + rows) / fine.height)
@@ -115,16 +117,18 @@ def _points(parts: Sequence[Asset], face: Tensor, bary: Tensor) -> SurfacePoints
     return SurfacePoints(*(torch.cat(columns)[back] for columns in zip(*(vars(p).values() for p in pieces))))
 
 
-def _band(parts, camera, environment, scene, first, samples, seed, shadows, background, clamp) -> list[Tensor]:
-    """Premultiplied layers ``(rows, W, C)`` of one band of subpixels, in the order that :func:`render` takes apart."""
+def _band(parts, camera, environment, scene, first, shadows, background, **options) -> list[Tensor]:
+    """Premultiplied layers ``(rows, W, C)`` of one band of subpixels, in the order that :func:`render` takes apart.
+
+    options: of :func:`reli3d.render.shading.shade`.
+    """
     origins, directions = (v.reshape(-1, 3) for v in camera_rays(camera))
     hits = scene.closest(origins, directions)
     index = torch.nonzero(hits.face >= 0)[:, 0]
     points = _points(parts, hits.face[index], hits.bary[index])
     lit = shade(
         points.position, points.normal, points.ng, -directions[index], points.base_color, points.roughness,
-        points.metallic, environment, samples=samples, scene=scene if shadows else None, seed=seed, clamp=clamp,
-        pixels=(index + first).int(),
+        points.metallic, environment, scene=scene if shadows else None, pixels=(index + first).int(), **options,
     )  # fmt: skip
     axis = -camera.c2w[:3, 2]
     depth = ((points.position - camera.position) * axis).sum(-1, keepdim=True)

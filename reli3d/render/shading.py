@@ -15,6 +15,7 @@ from reli3d.geometry.rays import RayScene
 from reli3d.kernels import shade as kernels
 from reli3d.kernels import shade_adjoint as adjoint
 from reli3d.render.environment import Environment
+from reli3d.render.material import PAINTS, choice
 from reli3d.render.sampling import halton
 
 SAMPLES = (20, 40, 4)  # environment, visible normals, cosine: the published counts
@@ -39,6 +40,7 @@ def shade(
     heuristic: str = "balance",
     points: str = "halton",
     alpha: str = "squared",
+    paint: str = "published",
     clamp: float | None = None,
     pixels: Tensor | None = None,
 ) -> Tensor:
@@ -51,7 +53,9 @@ def shade(
     that casts shadows, None for none.  antithetic: visible normals in pairs, the partner mirrored about the normal,
     weighted with its own density.  heuristic: ``balance`` or ``power``.  points: ``halton`` (rotated per point and
     strategy) or ``random``.  alpha: GGX width from roughness, ``squared`` or, as in the published model's shader,
-    ``linear``.  clamp: largest value of one sample times its strategy's count, per channel.
+    ``linear``.  paint: what the coat leaves to the paint, ``published`` or ``conserving``, as in
+    :func:`reli3d.render.material.eval_bsdf`.  clamp: largest value of one sample times its strategy's count, per
+    channel.
 
     pixels: ``(N,)`` int32 counters of the random numbers, by default the row.
 
@@ -64,8 +68,8 @@ def shade(
     n = _check(position, normal, ng, wo, base_color, roughness, metallic, environment)
     if scene is not None and scene.device != position.device:
         raise ValueError(f"scene: expected device {position.device}, got {scene.device}")
-    plan, offsets = _plan(samples, seed, antithetic, heuristic, points, clamp, scene)
-    width = roughness * roughness if _choice("alpha", alpha, ("squared", "linear")) == 0 else roughness
+    plan, offsets = _plan(samples, seed, antithetic, heuristic, points, paint, clamp, scene)
+    width = roughness * roughness if choice("alpha", alpha, ("squared", "linear")) == 0 else roughness
     table, device = environment.table, position.device
     tables = [*table.sampler, (table.density, wp.float32), (offsets.to(device), wp.vec2)]
     if pixels is None:
@@ -100,6 +104,7 @@ def shade_light(
     scene: RayScene | None = None,
     seed: int = 0,
     points: str = "halton",
+    paint: str = "published",
 ) -> Tensor:
     """:func:`shade` with radiance asked of ``light`` in each sample's direction instead of read from a map, ``(N, 3)``.
 
@@ -108,7 +113,7 @@ def shade_light(
     does not depend on it.  No gradient.
     """
     n = _check(position, normal, ng, wo, base_color, roughness, metallic, proposal)
-    plan, offsets = _plan(samples, seed, True, "balance", points, None, scene)
+    plan, offsets = _plan(samples, seed, True, "balance", points, paint, None, scene)
     device, count, table = position.device, sum(samples), proposal.table
     pixels = torch.arange(n, dtype=torch.int32, device=device)
     tables = [*table.sampler, (table.density, wp.float32), (offsets.to(device), wp.vec2), (pixels, wp.int32)]
@@ -237,13 +242,7 @@ def _check(position, normal, ng, wo, base_color, roughness, metallic, environmen
     return n
 
 
-def _choice(name: str, value: str, allowed: tuple[str, ...]) -> int:
-    if value not in allowed:
-        raise ValueError(f"{name}: expected one of {', '.join(allowed)}, got {value}")
-    return allowed.index(value)
-
-
-def _plan(samples, seed, antithetic, heuristic, points, clamp, scene):
+def _plan(samples, seed, antithetic, heuristic, points, paint, clamp, scene):
     if len(samples) != 3 or any(int(k) != k or k < 0 for k in samples):
         raise ValueError(f"samples: expected three counts of at least 0, got {samples}")
     if clamp is not None and not clamp > 0.0:
@@ -251,8 +250,9 @@ def _plan(samples, seed, antithetic, heuristic, points, clamp, scene):
     plan = kernels.Plan()
     plan.n_environment, plan.n_visible, plan.n_cosine = (int(k) for k in samples)
     plan.antithetic = int(antithetic)
-    plan.power = _choice("heuristic", heuristic, ("balance", "power"))
-    plan.rotate = 1 - _choice("points", points, ("halton", "random"))
+    plan.power = choice("heuristic", heuristic, ("balance", "power"))
+    plan.rotate = 1 - choice("points", points, ("halton", "random"))
+    plan.conserving = choice("paint", paint, PAINTS)
     plan.seed = int(seed) & 0x7FFFFFFF
     plan.clamp = float("inf") if clamp is None else float(clamp)
     plan.scale = 0.0 if scene is None else scene.scale
