@@ -23,7 +23,16 @@ from reli3d.geometry.surface import extract_surface, surface_cubes
 from reli3d.geometry.tangents import encode_normals, vertex_tangents
 from reli3d.geometry.uv import unwrap, unwrap_xatlas
 from reli3d.geometry.visibility import visible_from
-from reli3d.nn.field import LIGHT_ROWS, bound_level, in_rows, object_shading, surface_level, surface_material
+from reli3d.nn.field import (
+    CHUNK,
+    LIGHT_ROWS,
+    bound_level,
+    grid_level,
+    in_rows,
+    object_shading,
+    surface_level,
+    surface_material,
+)
 from reli3d.nn.heads import deformation
 from reli3d.nn.model import Code, Reconstructor
 from reli3d.nn.presets import Preset
@@ -37,7 +46,6 @@ from reli3d.render.environment import Environment
 
 DETAIL = 512  # pixels of the views that colours and silhouettes are read from; the network's own input is smaller
 SMALLEST_PART = 0.01  # share of the faces below which a separate piece is dropped
-CHUNK = 1 << 17  # points a query: 200 MB of features
 SHADING_POINTS = 4096  # vertices by which the light on the object is judged
 OUTSIDE = 1.0  # level given to grid points that the silhouettes exclude
 COARSE = 4  # cells of the surface grid along a cell of the one that looks for the silhouettes' hull first
@@ -92,22 +100,18 @@ def extract(model: Reconstructor, code: Code, maps: ViewMaps, resolution: int) -
 
     Raises ValueError where the field has no surface.
     """
-    radius = model.preset.radius
-    bound = None
-    if model.preset.silhouette_bound:
+    radius, masked = model.preset.radius, model.preset.silhouette_bound
+    if masked:  # as many cubes on the space that matters
         radius = min(radius, _hull_reach(model, maps, resolution) + 2 * MARGIN_CELLS * radius / resolution)
-        flat = _grid(resolution, radius, maps.c2w.device).reshape(-1, 3)  # as many cubes on the space that matters
-        bound = bound_level(model, maps, flat)
-        margin = MARGIN_CELLS * 2 * radius / resolution / model.preset.softness
-        asked, level = (bound < margin).nonzero()[:, 0], bound.clamp(min=OUTSIDE)
+    flat = _grid(resolution, radius, maps.c2w.device).reshape(-1, 3)
+    bound = bound_level(model, maps, flat) if masked else torch.full_like(flat[:, 0], -torch.inf)
+    if model.preset.point_features:
+        level, margin = bound.clamp(min=OUTSIDE), MARGIN_CELLS * 2 * radius / resolution / model.preset.softness
+        for part in (bound < margin).nonzero()[:, 0].split(CHUNK):
+            level[part] = surface_level(model, code, maps, flat[part])
     else:
-        flat = _grid(resolution, radius, maps.c2w.device).reshape(-1, 3)
-        asked, level = torch.arange(len(flat), device=flat.device), flat.new_empty(len(flat))
-    for part in asked.split(CHUNK):
-        level[part] = surface_level(model, code, maps, flat[part])
-    level = level.reshape((resolution + 1,) * 3)
-    if bound is not None:
-        level = torch.maximum(level, bound.reshape(level.shape))
+        level = grid_level(model, code, maps, flat[: resolution + 1, 2])
+    level = torch.maximum(level.view(-1), bound).view((resolution + 1,) * 3)
     weights = {} if model.preset.log_level else _cube_weights(model, code, flat, level)
     mesh = extract_surface(level, radius=radius, **weights)
     mesh = largest_components(mesh, SMALLEST_PART)

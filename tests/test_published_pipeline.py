@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from reli3d.data.normalize import Similarity
 from reli3d.data.published_views import published_views
 from reli3d.geometry.mesh import report
 from reli3d.geometry.surface import extract_surface, surface_cubes
+from reli3d.nn import field
 from reli3d.nn.heads import deformation
 from reli3d.nn.model import Code, Reconstructor
 from reli3d.nn.published import our_key
@@ -82,6 +84,23 @@ def test_weights_near_the_surface_are_those_of_the_whole_grid(tiny, half_space):
     assert torch.equal(got.faces, want.faces)
     # products of other shapes sum in another order: a few units in the last place of 0.87
     torch.testing.assert_close(got.vertices, want.vertices, rtol=0, atol=2e-6)
+
+
+@torch.no_grad()
+def test_the_grid_is_asked_by_planes_and_gives_the_level_of_its_points(tiny, monkeypatch):
+    """Also in pieces that do not divide it, with the box of one axis away from the middle."""
+    monkeypatch.setattr(tiny, "preset", replace(tiny.preset, offset_many_views=0.03))
+    code, maps = tiny.encode(*views(1, 2, 76)), SimpleNamespace(c2w=torch.zeros(2, 4, 4))
+    axis = torch.linspace(-0.8, 0.6, 15)
+    want = field.surface_level(tiny, code, maps, torch.cartesian_prod(axis, axis, axis)).view(15, 15, 15)
+    assert float(want.min()) < 0 < float(want.max())
+    for chunk, rows in ((1 << 17, 8192), (400, 100), (1, 1)):
+        monkeypatch.setattr(field, "CHUNK", chunk)
+        monkeypatch.setattr(field, "ROWS", rows)
+        # sums of 24 float32 products in another order, behind exp
+        torch.testing.assert_close(field.grid_level(tiny, code, maps, axis), want, rtol=1e-4, atol=1e-4)
+    with pytest.raises(ValueError, match="preset: expected one without point features"):
+        Reconstructor(NANO).grid_query(code, axis, ["density"])
 
 
 @torch.no_grad()

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from bench.flexicubes_torch import cube_list, flexicubes
@@ -80,6 +81,28 @@ def test_every_sign_pattern_is_a_closed_outward_manifold(device):
     assert bool((volumes > 0).all())
 
 
+def test_every_sign_pattern_has_a_ball_for_every_connected_part(device):
+    """Corners inside that no edge of the cube joins are apart; nothing has a hole or a bridge: Euler number 2 each."""
+    blocks = [F.pad(sign_pattern(case), (1,) * 6, value=0.5) for case in range(256)]
+    parts = sum(ndimage.label(block.numpy() < 0)[1] for block in blocks)
+    level = torch.cat([torch.cat(blocks[16 * k : 16 * k + 16], 0) for k in range(16)], 1).to(device)
+    found = report(extract_surface(level, radius=1.0, **random_weights(level.shape, 0, device)))
+    assert (found.components, found.euler) == (parts, 2 * parts)
+
+
+def test_one_inside_vertex_has_the_eight_dual_vertices_of_the_closed_form(device):
+    """Level -0.8 among 0.2: every edge is crossed at 0.8 of a cube of 1/4, a dual vertex is the mean of three."""
+    level = torch.full((5, 5, 5), 0.2, device=device)
+    level[2, 2, 2] = -0.8
+    mesh = extract_surface(level, radius=0.5)
+    assert mesh.faces.shape == (12, 3) and report(mesh).watertight
+    sign = torch.tensor([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * 0.8 / 4 / 3
+    got = mesh.vertices.cpu()
+    order = torch.from_numpy(np.lexsort(got.sign().numpy().T[::-1]))
+    torch.testing.assert_close(got[order], sign, rtol=0, atol=1e-7)  # float32 of 0.0667
+    assert float(volume(mesh)) == pytest.approx((2 * 0.8 / 12) ** 3, rel=1e-5)  # a cube of that half side
+
+
 @pytest.mark.parametrize("case", range(1, 255, 11))
 def test_one_cube_is_closed_at_the_box(device, case):
     level = sign_pattern(case).contiguous().to(device)
@@ -113,10 +136,36 @@ def test_genus_and_components(device):
     two = torch.minimum((p - centre).norm(dim=-1), (p + centre).norm(dim=-1)) - 0.35
     found = report(extract_surface(two, radius=1.0))
     assert (found.components, found.euler) == (2, 4)
-    x, y, z = (4 * grid(40, device=device)).unbind(-1)
-    gyroid = x.sin() * y.cos() + y.sin() * z.cos() + z.sin() * x.cos()
-    found = report(extract_surface(gyroid, radius=1.0))
-    assert found.watertight and found.manifold and found.euler < 0
+
+
+def gyroid(p):
+    """Level and gradient of the gyroid, in its own units."""
+    s, c = p.sin(), p.cos()
+    level = s[..., 0] * c[..., 1] + s[..., 1] * c[..., 2] + s[..., 2] * c[..., 0]
+    return level, c * c.roll(-1, -1) - s * s.roll(1, -1)
+
+
+def test_gyroid_is_within_a_cube_both_ways_and_of_one_genus_at_any_resolution(device):
+    scale, euler = 4.0, []
+    for n in (32, 48, 64):
+        mesh = extract_surface(gyroid(scale * grid(n, device=device))[0], radius=1.0)
+        found = report(mesh)
+        assert found.watertight and found.manifold
+        euler.append(found.euler)
+        cube = 2 / n
+        inner = mesh.vertices[mesh.vertices.abs().amax(-1) < 1 - cube].cpu().double()  # not the caps at the box
+        level, slope = gyroid(scale * inner)
+        assert float((level.abs() / (scale * slope.norm(dim=-1))).max()) < cube  # to first order, and 0.1 cubes in fact
+        points = torch.rand(4000, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 1.6 - 0.8
+        for _ in range(20):  # Newton: onto the surface
+            level, slope = gyroid(scale * points)
+            points = points - slope * (level / (scale * slope.square().sum(-1).clamp(min=0.1)))[:, None]
+        points = points[(points.abs().amax(-1) < 0.9) & (gyroid(scale * points)[0].abs() < 1e-9)]
+        assert len(points) > 3000
+        corners = mesh.vertices[mesh.faces.long()].cpu()
+        samples = torch.cat([corners.reshape(-1, 3), corners.mean(1)])
+        assert cKDTree(samples.numpy()).query(points.numpy())[0].max() < cube
+    assert len(set(euler)) == 1 and euler[0] < 0, euler
 
 
 @pytest.mark.parametrize("shape", ["sphere", "torus", "two spheres"])
@@ -150,16 +199,19 @@ def test_the_distance_to_the_analytic_surface_is_below_a_cube_both_ways(device, 
     assert cKDTree(samples.numpy()).query(points.numpy())[0].max() < cube
 
 
-def test_sphere_converges_with_second_order(device):
+@pytest.mark.parametrize("shape", ["sphere", "torus"])
+def test_the_volume_converges_with_second_order(device, shape):
     errors = []
-    for n in (16, 32, 64):
-        mesh = extract_surface(sphere(n, device=device), radius=1.0)
-        assert (mesh.vertices.norm(dim=-1) - 0.6).abs().max() < 2 / n  # within a cube
-        outward = (face_normals(mesh.vertices, mesh.faces) * mesh.vertices[mesh.faces[:, 0].long()]).sum(-1)
-        assert bool((outward > 0).all())
-        errors.append(abs(float(volume(mesh)) - 4 / 3 * np.pi * 0.6**3))
-    slopes = np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
-    assert slopes.min() > 1.8, slopes
+    for n in (16, 32, 64) if shape == "sphere" else (32, 64, 96):  # the tube needs some cubes across
+        mesh = extract_surface(sphere(n, device=device) if shape == "sphere" else torus(n, device), radius=1.0)
+        if shape == "sphere":
+            assert (mesh.vertices.norm(dim=-1) - 0.6).abs().max() < 2 / n  # within a cube
+            outward = (face_normals(mesh.vertices, mesh.faces) * mesh.vertices[mesh.faces[:, 0].long()]).sum(-1)
+            assert bool((outward > 0).all())
+        exact = 4 / 3 * np.pi * 0.6**3 if shape == "sphere" else 2 * np.pi**2 * 0.6 * 0.22**2
+        errors.append((n, abs(float(volume(mesh)) - exact)))
+    slopes = [np.log(a[1] / b[1]) / np.log(b[0] / a[0]) for a, b in zip(errors[:-1], errors[1:])]
+    assert min(slopes) > 1.8, slopes
 
 
 def test_a_half_space_is_closed_flat_at_the_box(device):

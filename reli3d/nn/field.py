@@ -22,6 +22,7 @@ from reli3d.render.color import srgb_to_linear
 from reli3d.render.environment import Environment
 
 ROWS = 8192  # points at a time without gradient: their features stay in the cache, which halves the time of the heads
+CHUNK = 1 << 17  # points a query: 200 MB of features
 LIGHT_ROWS = 16  # of the decoded map from which the material is told its irradiance
 MATERIAL = ("base_color", "roughness", "metallic", "normal")
 
@@ -40,20 +41,36 @@ def surface_level(model: Reconstructor, code: Code, maps: ViewMaps, points: Tens
             features = functional.pad(features, (0, model.preset.point_features - features.shape[-1]))  # no surface yet
         return {"density": model.query(code, points[None], ("density",), features)["density"][0, :, 0]}
 
+    return model.level(in_rows(density, points)["density"] + _offset(model, maps))
+
+
+@torch.no_grad()
+def grid_level(model: Reconstructor, code: Code, maps: ViewMaps, axis: Tensor) -> Tensor:
+    """:func:`surface_level` at ``(axis[i], axis[j], axis[k])``, ``(n, n, n)``, of a preset without point features.
+
+    In a fifth of the time: see :meth:`Reconstructor.grid_query`.  axis: ``(n,)``.  No gradient.
+    """
+    n, ask = len(axis), model.grid_query(code, axis, ("density",))
+    lines = torch.arange(n * n, device=axis.device)
+    parts = [in_rows(ask, part, rows=max(1, ROWS // n))["density"] for part in lines.split(max(1, CHUNK // n))]
+    return model.level(torch.cat(parts).view(n, n, n) + _offset(model, maps))
+
+
+def _offset(model: Reconstructor, maps: ViewMaps) -> float:
+    """Added to the raw density: moves the surface outward."""
     preset, views = model.preset, len(maps.c2w)
-    offset = preset.offset_many_views + (preset.offset_one_view - preset.offset_many_views) / views
-    return model.level(in_rows(density, points)["density"] + offset)
+    return preset.offset_many_views + (preset.offset_one_view - preset.offset_many_views) / views
 
 
-def in_rows(evaluate: Callable[..., dict[str, Tensor]], *inputs: Tensor) -> dict[str, Tensor]:
-    """``evaluate(*inputs)``; on CPU, where no gradient is recorded, block by block of ROWS rows of the inputs.
+def in_rows(evaluate: Callable[..., dict[str, Tensor]], *inputs: Tensor, rows: int = ROWS) -> dict[str, Tensor]:
+    """``evaluate(*inputs)``; on CPU, where no gradient is recorded, block by block of ``rows`` rows of the inputs.
 
     The blocks run on the threads of the bridge's pool, so ``evaluate`` must work row by row and keep no state.
     """
     n = len(inputs[0])
     if torch.is_grad_enabled() or inputs[0].is_cuda or n == 0:
         return evaluate(*inputs)
-    parts = over_rows(n, ROWS, lambda start, stop: evaluate(*(x[start:stop] for x in inputs)))
+    parts = over_rows(n, rows, lambda start, stop: evaluate(*(x[start:stop] for x in inputs)))
     return {name: torch.cat([p[name] for p in parts]) for name in parts[0]}
 
 

@@ -99,16 +99,26 @@ class Heads(nn.ModuleDict):
         return {name: activate(name, value) for name, value in raw.items()}
 
     def _inferred(self, features: Tensor, names: Sequence[str]) -> dict[str, Tensor]:
-        """The MLPs without gradient: one matrix for all first layers, what nobody will ask again is overwritten.
+        """The MLPs without gradient: one matrix for all first layers, what nobody will ask again is overwritten."""
+        weight, bias = self.first_layer(names)
+        hidden = torch.mm(weight, features.reshape(-1, features.shape[-1]).T).add_(bias[:, None])
+        raw = self.after_first(hidden, names)
+        return {name: value.reshape(*features.shape[:-1], value.shape[-1]) for name, value in raw.items()}
+
+    def first_layer(self, names: Sequence[str]) -> tuple[Tensor, Tensor]:
+        """Weight ``(K, features)`` and bias ``(K,)`` of the first layers of the named heads, one below the other."""
+        first = [self[name][0] for name in names]
+        return torch.cat([layer.weight for layer in first]), torch.cat([layer.bias for layer in first])
+
+    def after_first(self, hidden: Tensor, names: Sequence[str]) -> dict[str, Tensor]:
+        """Outputs ``(N, outputs)`` before :func:`activate`, from what the first layers give, ``(K, N)``, which is
+        overwritten; no gradient.
 
         A point is a column: products with 64 by 64 weights take half the time of points as rows.
         """
-        first = [self[name][0] for name in names]
-        hidden = torch.mm(torch.cat([layer.weight for layer in first]), features.reshape(-1, features.shape[-1]).T)
-        hidden = functional.silu(hidden.add_(torch.cat([layer.bias for layer in first])[:, None]), inplace=True)
-        parts = hidden.split([layer.out_features for layer in first])
-        raw = {name: _rest(self[name], part) for name, part in zip(names, parts, strict=True)}
-        return {name: value.T.reshape(*features.shape[:-1], len(value)) for name, value in raw.items()}
+        functional.silu(hidden, inplace=True)
+        parts = hidden.split([self[name][0].out_features for name in names])
+        return {name: _rest(self[name], part).T for name, part in zip(names, parts, strict=True)}
 
 
 class _TruncatedExp(torch.autograd.Function):

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor, nn
 
 from reli3d.nn.camera import CameraEmbedder, camera_vector, ray_maps
-from reli3d.nn.heads import HEADS, Heads, WeightMerger, truncated_exp
+from reli3d.nn.heads import HEADS, Heads, WeightMerger, activate, truncated_exp
 from reli3d.nn.illumination import Illumination
 from reli3d.nn.initialise import initialise
 from reli3d.nn.presets import Preset
@@ -164,6 +164,31 @@ class Reconstructor(nn.Module):
             if self.preset.roughness_is_alpha and "roughness" in values:
                 values["roughness"] = values["roughness"].sqrt()
         return values
+
+    def grid_query(self, code: Code, axis: Tensor, heads: Sequence[str]) -> Callable[[Tensor], dict[str, Tensor]]:
+        """:meth:`query` at the points ``(axis[i], axis[j], axis[k])`` of one object, without gradient: a function of
+        the numbers ``i * n + j`` of lines ``(L,)`` that gives ``{name: (L, n, outputs)}``.
+
+        axis: ``(n,)``.  A plane of features has ``n * n`` different points, and the heads' first layers are linear:
+        they are done on the three planes' points and added up.  Values differ from :meth:`query`'s by rounding.
+        """
+        if self.preset.point_features:
+            raise ValueError(f"preset: expected one without point features, got {self.preset.point_features} of them")
+        n, channels, at = len(axis), code.triplane.shape[2], axis / self.preset.radius
+        a, b = (c.reshape(-1) for c in torch.meshgrid(at, at, indexing="ij"))
+        xy, xz, _ = sample_triplane(code.triplane, torch.stack([a, b, b], -1)[None])[0].split(channels, -1)
+        yz = sample_triplane(code.triplane, torch.stack([b, a, b], -1)[None])[0][:, 2 * channels :]
+        weight, bias = self.heads.first_layer(heads)
+        of_xy, of_xz, of_yz = (torch.mm(w, f.T) for w, f in zip(weight.split(channels, 1), (xy, xz, yz), strict=True))
+        of_xy += bias[:, None]
+        of_xz, of_yz = of_xz.view(-1, n, n), of_yz.view(-1, n, n)
+
+        def ask(lines: Tensor) -> dict[str, Tensor]:
+            hidden = (of_xz[:, lines // n] + of_yz[:, lines % n]).add_(of_xy[:, lines, None])
+            raw = self.heads.after_first(hidden.view(len(hidden), -1), heads)
+            return {name: activate(name, value).reshape(len(lines), n, -1) for name, value in raw.items()}
+
+        return ask
 
     def level(self, density: Tensor) -> Tensor:
         """Surface level of the ``density`` head's raw values: negative inside, zero on the surface."""
