@@ -33,11 +33,11 @@ class KnownSurface(Reconstructor):
 
     def grid_query(self, code, axis, heads):
         ask, n = super().grid_query(code, axis, heads), len(axis)
-        level = _field(n - 1, axis.device).view(n * n, n, 1)
+        level = _field(n - 1, axis.device)[..., None]
 
-        def known(lines):
-            values = ask(lines)
-            values["density"] = self.surface_density - 20.0 * level[lines] + 0.0 * values["density"]
+        def known(i, j):
+            values = ask(i, j)
+            values["density"] = self.surface_density - 20.0 * level[i, j] + 0.0 * values["density"]
             return values
 
         return known

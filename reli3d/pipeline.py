@@ -24,7 +24,6 @@ from reli3d.geometry.tangents import encode_normals, vertex_tangents
 from reli3d.geometry.uv import unwrap, unwrap_xatlas
 from reli3d.geometry.visibility import visible_from
 from reli3d.nn.field import (
-    CHUNK,
     LIGHT_ROWS,
     bound_level,
     grid_level,
@@ -47,6 +46,7 @@ from reli3d.render.environment import Environment
 DETAIL = 512  # pixels of the views that colours and silhouettes are read from; the network's own input is smaller
 SMALLEST_PART = 0.01  # share of the faces below which a separate piece is dropped
 SHADING_POINTS = 4096  # vertices by which the light on the object is judged
+CHUNK = 1 << 17  # points a query: 200 MB of features
 OUTSIDE = 1.0  # level given to grid points that the silhouettes exclude
 COARSE = 4  # cells of the surface grid along a cell of the one that looks for the silhouettes' hull first
 MARGIN_CELLS = 2.5  # cells around the silhouettes' hull in which the field is still asked

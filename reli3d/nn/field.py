@@ -22,7 +22,6 @@ from reli3d.render.color import srgb_to_linear
 from reli3d.render.environment import Environment
 
 ROWS = 8192  # points at a time without gradient: their features stay in the cache, which halves the time of the heads
-CHUNK = 1 << 17  # points a query: 200 MB of features
 LIGHT_ROWS = 16  # of the decoded map from which the material is told its irradiance
 MATERIAL = ("base_color", "roughness", "metallic", "normal")
 
@@ -51,8 +50,14 @@ def grid_level(model: Reconstructor, code: Code, maps: ViewMaps, axis: Tensor) -
     In a fifth of the time: see :meth:`Reconstructor.grid_query`.  axis: ``(n,)``.  No gradient.
     """
     n, ask = len(axis), model.grid_query(code, axis, ("density",))
-    lines = torch.arange(n * n, device=axis.device)
-    parts = [in_rows(ask, part, rows=max(1, ROWS // n))["density"] for part in lines.split(max(1, CHUNK // n))]
+    lines = max(1, ROWS // n)
+    blocks = [(i, slice(j, j + lines)) for i in range(n) for j in range(0, n, lines)]
+
+    def density(start: int, _stop: int) -> Tensor:
+        return ask(*blocks[start])["density"]
+
+    every = range(len(blocks))
+    parts = [density(k, k + 1) for k in every] if axis.is_cuda else over_rows(len(blocks), 1, density)
     return model.level(torch.cat(parts).view(n, n, n) + _offset(model, maps))
 
 
@@ -62,15 +67,15 @@ def _offset(model: Reconstructor, maps: ViewMaps) -> float:
     return preset.offset_many_views + (preset.offset_one_view - preset.offset_many_views) / views
 
 
-def in_rows(evaluate: Callable[..., dict[str, Tensor]], *inputs: Tensor, rows: int = ROWS) -> dict[str, Tensor]:
-    """``evaluate(*inputs)``; on CPU, where no gradient is recorded, block by block of ``rows`` rows of the inputs.
+def in_rows(evaluate: Callable[..., dict[str, Tensor]], *inputs: Tensor) -> dict[str, Tensor]:
+    """``evaluate(*inputs)``; on CPU, where no gradient is recorded, block by block of ROWS rows of the inputs.
 
     The blocks run on the threads of the bridge's pool, so ``evaluate`` must work row by row and keep no state.
     """
     n = len(inputs[0])
     if torch.is_grad_enabled() or inputs[0].is_cuda or n == 0:
         return evaluate(*inputs)
-    parts = over_rows(n, rows, lambda start, stop: evaluate(*(x[start:stop] for x in inputs)))
+    parts = over_rows(n, ROWS, lambda start, stop: evaluate(*(x[start:stop] for x in inputs)))
     return {name: torch.cat([p[name] for p in parts]) for name in parts[0]}
 
 

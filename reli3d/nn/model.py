@@ -165,9 +165,10 @@ class Reconstructor(nn.Module):
                 values["roughness"] = values["roughness"].sqrt()
         return values
 
-    def grid_query(self, code: Code, axis: Tensor, heads: Sequence[str]) -> Callable[[Tensor], dict[str, Tensor]]:
-        """:meth:`query` at the points ``(axis[i], axis[j], axis[k])`` of one object, without gradient: a function of
-        the numbers ``i * n + j`` of lines ``(L,)`` that gives ``{name: (L, n, outputs)}``.
+    def grid_query(self, code: Code, axis: Tensor,
+                   heads: Sequence[str]) -> Callable[[int, slice], dict[str, Tensor]]:  # fmt: skip
+        """:meth:`query` at the points ``(axis[i], axis[j], axis[k])`` of one object, without gradient: a function of a
+        number ``i`` and a slice of ``j`` that gives ``{name: (J, n, outputs)}``.
 
         axis: ``(n,)``.  A plane of features has ``n * n`` different points, and the heads' first layers are linear:
         they are done on the three planes' points and added up.  Values differ from :meth:`query`'s by rounding.
@@ -179,14 +180,14 @@ class Reconstructor(nn.Module):
         xy, xz, _ = sample_triplane(code.triplane, torch.stack([a, b, b], -1)[None])[0].split(channels, -1)
         yz = sample_triplane(code.triplane, torch.stack([b, a, b], -1)[None])[0][:, 2 * channels :]
         weight, bias = self.heads.first_layer(heads)
-        of_xy, of_xz, of_yz = (torch.mm(w, f.T) for w, f in zip(weight.split(channels, 1), (xy, xz, yz), strict=True))
-        of_xy += bias[:, None]
-        of_xz, of_yz = of_xz.view(-1, n, n), of_yz.view(-1, n, n)
+        of_xy, of_xz, of_yz = (torch.mm(w, f.T).view(-1, n, n)
+                               for w, f in zip(weight.split(channels, 1), (xy, xz, yz), strict=True))  # fmt: skip
+        of_xy += bias[:, None, None]
 
-        def ask(lines: Tensor) -> dict[str, Tensor]:
-            hidden = (of_xz[:, lines // n] + of_yz[:, lines % n]).add_(of_xy[:, lines, None])
-            raw = self.heads.after_first(hidden.view(len(hidden), -1), heads)
-            return {name: activate(name, value).reshape(len(lines), n, -1) for name, value in raw.items()}
+        def ask(i: int, j: slice) -> dict[str, Tensor]:
+            hidden = (of_yz[:, j] + of_xz[:, i, None]).add_(of_xy[:, i, j, None])
+            raw = self.heads.after_first(hidden.flatten(1), heads)
+            return {name: activate(name, value).reshape(-1, n, value.shape[-1]) for name, value in raw.items()}
 
         return ask
 
