@@ -22,7 +22,9 @@ def test_value_and_gradients_equal_the_float64_twin(device, paint):
     leaf = [v.to(device).requires_grad_() for v in ins]
     twin = [v.double().requires_grad_() for v in ins]
     got, want = eval_bsdf(*leaf, paint=paint), reference.eval_bsdf(*twin, paint)
-    assert ((got.cpu().double() / want - 1).abs() < 2e-4).all()  # 1e-7 in cos against alpha^2 = 1e-4 at the peak
+    off = (got.cpu().double() / want - 1).abs().amax(-1)
+    assert float(off.max()) < 1e-3  # 1e-7 in cos against alpha^2 = 1e-4 at the peak
+    assert float(off[ins[3] > 0.05].max()) < 2e-5
     weight = torch.randn(got.shape, generator=torch.Generator().manual_seed(1))
     grads = torch.autograd.grad((got * weight.to(device)).sum(), leaf)
     truth = torch.autograd.grad((want * weight.double()).sum(), twin)
@@ -35,6 +37,24 @@ def test_value_and_gradients_equal_the_float64_twin(device, paint):
     for g, t in zip(grads, truth, strict=True):
         off = (g.cpu().double() - t).abs() / (t.abs() + 1e-2 * t.abs().mean() + 1e-3)
         assert (off < 2e-3).double().mean() > 0.999  # lobes of alpha 0.01 lose three digits more
+
+
+@pytest.mark.parametrize("paint", PAINTS)
+def test_the_twins_have_the_gradients_of_finite_differences(paint):
+    """What the kernels' adjoints are held against."""
+    wo, wi, base, alpha, metallic = (v.double() for v in pairs(8, 6, low=0.2))
+    alpha = 0.1 + 0.8 * alpha
+    unit = lambda v: torch.nn.functional.normalize(v, dim=-1)  # noqa: E731
+    leaves = [v.requires_grad_() for v in (wo, wi, base, alpha, metallic)]
+    options = {"eps": 1e-6, "atol": 1e-5, "rtol": 1e-3}
+    assert torch.autograd.gradcheck(
+        lambda o, i, *m: reference.eval_bsdf(unit(o), unit(i), *m, paint), leaves, **options
+    )
+    u = torch.rand(8, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(2)) * 0.9 + 0.05
+    sample = lambda o, a: reference.sample_ggx_vndf(unit(o), a, u)  # noqa: E731
+    assert torch.autograd.gradcheck(sample, (leaves[0], leaves[3]), **options)
+    texels = torch.rand(4, 8, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(3)).requires_grad_()
+    assert torch.autograd.gradcheck(lambda t, d: reference.lookup_envmap(t, unit(d)), (texels, leaves[1]), **options)
 
 
 @pytest.mark.parametrize("paint", PAINTS)
