@@ -6,12 +6,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from reli3d._bridge import check, launch, once_differentiable
+from reli3d._bridge import check, launch, once_differentiable, over_rows
 from reli3d.kernels import triplane as kernels
 
 BLOCK = 8  # channels of a kernels.vec8
 ROWS_MIN = 8  # rows of cells a CPU slice of the planes' adjoint: each adds all the points that fall in it
 CACHED = 1 << 16  # floats of a plane that stay in a core's second-level cache whatever the order of the points
+BANDS = 16  # of the rows of a plane, a CPU thread each: more copy more rows twice
 PROBED, NEAR, WALK = 4096, 8.0, 0.8  # points looked at, texels from one to the next, and the share that makes a walk
 
 
@@ -19,27 +20,38 @@ class _SampleTriplane(torch.autograd.Function):
     """Own backward: a scatter per point would need atomics, which Warp's CPU launches lack and CUDA does in any order.
 
     Points are sorted by their row of cells instead, and one thread owns the rows of texels it adds to.  On CPU the
-    forward pass walks the same order, as rows of a large plane stay in the cache; points that come as a walk over
-    neighbours (a grid, texels of an atlas) need no order for that.
+    forward pass walks the same order, as rows of a large plane stay in the cache, and makes channel-first rows
+    channel-last as it comes to them; points that come as a walk over neighbours (a grid, texels of an atlas) need no
+    order.
     """
 
     @staticmethod
     def forward(ctx, planes: Tensor, points: Tensor) -> Tensor:
         batch, _, channels, height, width = planes.shape
-        n = points.shape[1]
-        packed, points = _packed(planes), points.contiguous()
-        blocks = packed.shape[-1] // BLOCK
+        n, points = points.shape[1], points.contiguous()
+        blocks = -(-channels // BLOCK)
         order, edges = points.new_empty(0, dtype=torch.int32), None
-        if ctx.needs_input_grad[0]:
+        scattered = not planes.is_cuda and height * width * blocks * BLOCK > CACHED \
+            and not _is_walk(points, max(height, width))  # fmt: skip
+        by_rows = scattered and planes.dtype == torch.float32 and planes.is_contiguous() \
+            and not ctx.needs_input_grad[1] and planes.numel() < 2**31  # fmt: skip
+        if ctx.needs_input_grad[0] or scattered:
             order, edges = _by_cell_row(points, height, width)
-        elif not planes.is_cuda and packed[0, 0].numel() > CACHED and not _is_walk(points, max(height, width)):
-            order = _cell_order(points, height, width)[1]
-        features = packed.new_empty(batch, n, 3, blocks * BLOCK)
-        split = blocks if planes.is_cuda else 1  # neighbouring GPU threads read neighbouring blocks
-        launch(kernels.sample_kernel, batch * n * 3 * split, [
-            (packed.view(-1, BLOCK), kernels.vec8), (points.view(-1, 3), kernels.wp.vec3),
-            (order.view(-1), kernels.wp.int32), n, height, width, blocks, split,
-            (features.view(-1, BLOCK), kernels.vec8)], planes.device)  # fmt: skip
+        features = points.new_empty(batch, n, 3, blocks * BLOCK)
+        packed = None if by_rows else _packed(planes)
+        inputs = (points.view(-1, 3), kernels.wp.vec3), (order.view(-1), kernels.wp.int32)
+        out = features.view(-1, BLOCK), kernels.vec8
+        if by_rows:
+            scratch = points.new_empty(batch * 3 * BANDS * 2 * (width + 2) * blocks, BLOCK)
+            launch(kernels.sample_rows_kernel, batch * 3 * BANDS, [
+                (planes.detach().view(-1), kernels.wp.float32), *inputs, (edges.view(-1), kernels.wp.int32), n,
+                channels, height, width, blocks, BANDS, (scratch, kernels.vec8), out],
+                planes.device, slice_min=1)  # fmt: skip
+        else:
+            split = blocks if planes.is_cuda else 1  # neighbouring GPU threads read neighbouring blocks
+            launch(kernels.sample_kernel, batch * n * 3 * split, [
+                (packed.view(-1, BLOCK), kernels.vec8), *inputs, n, height, width, blocks, split, out],
+                planes.device)  # fmt: skip
         sorted_points = (order, edges) if ctx.needs_input_grad[0] else (None, None)
         ctx.save_for_backward(points, packed if ctx.needs_input_grad[1] else None, *sorted_points)
         ctx.shape, ctx.dtype = planes.shape, planes.dtype
@@ -71,29 +83,29 @@ def _is_walk(points: Tensor, size: int) -> bool:
     return bool(near.sum() > WALK * near.numel())
 
 
-def _cell_order(points: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
-    """Cells ``keys`` of the points and the points in their order, both ``(3 * B, N)`` int32: by row of cells, along a
-    row roughly by column, points that miss the plane last."""
+def _by_cell_row(points: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
+    """Points of every plane ``(3 * B, N)`` int32 by row of cells, along a row roughly by column, points that miss the
+    plane last; and the start of every row and their end, ``(3 * B, height + 2)`` int32."""
     slabs, n = points.shape[0] * 3, points.shape[1]
     bins = 2**16 // (height + 2)
     keys = torch.empty(slabs, n, dtype=torch.int32, device=points.device)
     launch(kernels.cell_key_kernel, slabs * n, [(points.view(-1, 3), kernels.wp.vec3), n, height, width, bins,
                                                 (keys.view(-1), kernels.wp.int32)], points.device)  # fmt: skip
+    edges = keys.new_zeros(slabs, height + 2)
     if points.is_cuda:
         order = torch.argsort(keys, dim=1, stable=True).to(torch.int32)
-    else:  # numpy sorts 16-bit keys by radix, ten times faster than torch.sort
-        order = torch.from_numpy(np.argsort(keys.numpy().astype(np.uint16), axis=1, kind="stable").astype(np.int32))
-    return keys, order
+        rows = keys // bins + torch.arange(slabs, device=points.device)[:, None] * (height + 2)
+        count = torch.bincount(rows.view(-1), minlength=slabs * (height + 2)).view(slabs, height + 2)
+        edges[:, 1:] = count[:, :-1].cumsum(1)
+        return order, edges
+    order = torch.empty_like(keys)
 
+    def sort(slab: int, _stop: int) -> None:  # numpy sorts 16-bit keys by radix, ten times faster than torch.sort
+        key = keys[slab].numpy().astype(np.uint16)
+        order[slab] = torch.from_numpy(np.argsort(key, kind="stable"))
+        edges[slab, 1:] = torch.from_numpy(np.bincount(key // bins, minlength=height + 2)[:-1].cumsum())
 
-def _by_cell_row(points: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
-    """Points of every plane by :func:`_cell_order`, ``(3 * B, N)`` int32, and the start of every row and their end,
-    ``(3 * B, height + 2)``."""
-    keys, order = _cell_order(points, height, width)
-    slabs, bins = len(keys), 2**16 // (height + 2)
-    rows = keys // bins + torch.arange(slabs, device=points.device)[:, None] * (height + 2)
-    count = torch.bincount(rows.view(-1), minlength=slabs * (height + 2)).view(slabs, height + 2)
-    edges = torch.nn.functional.pad(count[:, :-1].cumsum(1), (1, 0)).to(torch.int32)
+    over_rows(slabs, 1, sort)
     return order, edges
 
 

@@ -99,6 +99,21 @@ def test_a_walk_is_read_as_it_comes_and_shuffled_points_by_row_with_the_same_bit
     assert torch.equal(sample_triplane(planes, walk[:, shuffled]), sample_triplane(planes, walk)[:, shuffled])
 
 
+@pytest.mark.parametrize("channels, height, width", [(40, 120, 90), (13, 64, 200)])
+def test_channel_first_planes_are_read_by_rows_with_the_same_bits(channels, height, width):
+    """Scattered points, some outside; rows of cells without any, whole bands of them, and a batch."""
+    planes, points, weights = inputs(2, channels, height, width, 3000)
+    points[1, :, 1] = points[1, :, 1].abs() * 0.3 + 0.4
+    points[0, 5] = float("nan")
+    assert planes[0, 0].numel() > CACHED and not _is_walk(points, max(height, width))
+    channel_last = planes.movedim(2, -1).contiguous().movedim(-1, 2)
+    p, q = planes.requires_grad_(), channel_last.requires_grad_()
+    got, want = sample_triplane(p, points), sample_triplane(q, points)
+    assert torch.equal(got, want)
+    assert torch.equal(*(torch.autograd.grad(f, x, weights)[0] for f, x in ((got, p), (want, q))))
+    assert torch.equal(sample_triplane(planes.detach(), points), want)
+
+
 def test_the_same_bits_for_any_number_of_threads():
     planes, points, weights = inputs(1, 40, 80, 80, 20000)
     before = torch.get_num_threads()
@@ -108,7 +123,8 @@ def test_the_same_bits_for_any_number_of_threads():
             torch.set_num_threads(threads)
             p, q = planes.clone().requires_grad_(), points.clone().requires_grad_()
             out = sample_triplane(p, q)
-            results.append((out.detach(), *torch.autograd.grad(out, (p, q), weights)))
+            by_rows = sample_triplane(planes, points)
+            results.append((out.detach(), by_rows, *torch.autograd.grad(out, (p, q), weights)))
     finally:
         torch.set_num_threads(before)
     for other in results[1:]:

@@ -88,6 +88,77 @@ def sample_kernel(
             features[out + q] = vec8()
 
 
+@wp.func
+def copy_row(planes: wp.array[float], slab: int, y: int, channels: int, height: int, width: int, blocks: int,
+             scratch: wp.array[vec8], to: int):  # fmt: skip
+    """Texel row ``y`` of channel-first planes to ``to``, channel-last with a zero texel at both ends, or all zero."""
+    for q in range(blocks):
+        for x in range(width + 2):
+            value = vec8()
+            if y >= 0 and y < height and x > 0 and x <= width:
+                at = ((slab * channels + q * 8) * height + y) * width + x - 1
+                for c in range(8):
+                    if q * 8 + c < channels:
+                        value[c] = planes[at + c * height * width]
+            scratch[to + x * blocks + q] = value
+
+
+@wp.kernel
+def sample_rows_kernel(
+    start: int,
+    # in
+    planes: wp.array[float], points: wp.array[wp.vec3], order: wp.array[wp.int32], edges: wp.array[wp.int32],
+    per_batch: int, channels: int, height: int, width: int, blocks: int, bands: int,
+    # scratch
+    scratch: wp.array[vec8],
+    # out
+    features: wp.array[vec8],
+):  # fmt: skip
+    """As :func:`sample_kernel` from channel-first planes: a thread is a band of rows of cells of a plane.
+
+    It keeps the two rows of texels that a row of cells needs, channel-last, in its own ``scratch``, which stays in the
+    cache.  ``order`` and ``edges`` as for :func:`planes_adjoint_kernel`.
+    """
+    i = start + wp.tid()
+    slab = i // bands
+    band = i % bands
+    plane = slab % 3
+    offset = (slab // 3) * per_batch
+    stride = (width + 2) * blocks
+    held = wp.int32(-2)
+    for row in range(band * (height + 1) // bands, (band + 1) * (height + 1) // bands):
+        begin = edges[slab * (height + 2) + row]
+        end = edges[slab * (height + 2) + row + 1]
+        if begin < end:
+            top = (2 * i + row % 2) * stride
+            bottom = (2 * i + (row + 1) % 2) * stride
+            if held != row - 1:
+                copy_row(planes, slab, row - 1, channels, height, width, blocks, scratch, top)
+            copy_row(planes, slab, row, channels, height, width, blocks, scratch, bottom)
+            held = row
+            for k in range(begin, end):
+                point = order[slab * per_batch + k] + offset
+                at = texel_position(points[point], plane, height, width)
+                x = int(wp.floor(at[0]))
+                u = at[0] - float(x)
+                v = at[1] - float(row - 1)
+                w00 = (1.0 - u) * (1.0 - v)
+                w01 = u * (1.0 - v)
+                w10 = (1.0 - u) * v
+                w11 = u * v
+                one = top + (x + 1) * blocks
+                other = bottom + (x + 1) * blocks
+                out = (point * 3 + plane) * blocks
+                for q in range(blocks):
+                    features[out + q] = (scratch[one + q] * w00 + scratch[one + blocks + q] * w01
+                                         + scratch[other + q] * w10 + scratch[other + blocks + q] * w11)  # fmt: skip
+    if band == bands - 1:
+        for k in range(edges[slab * (height + 2) + height + 1], per_batch):
+            out = ((order[slab * per_batch + k] + offset) * 3 + plane) * blocks
+            for q in range(blocks):
+                features[out + q] = vec8()
+
+
 @wp.kernel
 def points_adjoint_kernel(
     start: int,
