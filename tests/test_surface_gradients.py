@@ -5,7 +5,10 @@ import torch
 from scipy.spatial import cKDTree
 
 from reli3d.geometry.mesh import report
+from reli3d.geometry.regularize import vertex_deviation
+from reli3d.geometry.smooth import taubin_smooth
 from reli3d.geometry.surface import extract_surface
+from reli3d.geometry.uv import unwrap
 from tests import reference_surface
 from tests.reference_surface import grid, random_weights, sphere, torus
 
@@ -87,6 +90,29 @@ def test_levels_and_weights_of_any_size_give_finite_vertices_and_gradients(devic
     assert found.boundary_edges == 0 and float(mesh.vertices.detach().abs().max()) <= 1.0 + 1e-6  # rounding of a mean
     grads = torch.autograd.grad(mesh.vertices.sum(), leaves)
     assert all(bool(torch.isfinite(g).all()) for g in grads) and all(float(g.abs().max()) > 0 for g in grads)
+
+
+def test_gradients_behind_the_mesh_are_the_same_bits_for_any_number_of_threads():
+    """Centre vertices, deviation, normals, smoothing, atlas: torch's own scatters add up in any order."""
+    level = torus(40) + 0.01 * torch.randn(41, 41, 41, generator=torch.Generator().manual_seed(0))
+    weights = {"level": level, **random_weights(level.shape, 0, spread=0.5)}
+    before, results = torch.get_num_threads(), []
+    try:
+        for threads in (1, 2, 5, 5):
+            torch.set_num_threads(threads)
+            leaves = {k: v.clone().requires_grad_() for k, v in weights.items()}
+            given = {k: v for k, v in leaves.items() if k not in ("level", "gamma")}
+            mesh = extract_surface(leaves["level"], radius=1.0, centre=True, gamma=leaves["gamma"], **given)
+            shown = unwrap(taubin_smooth(mesh.with_normals(), iterations=2), texture_size=64)
+            spread = vertex_deviation(leaves["level"], radius=1.0, **given)
+            seen = [mesh.vertices, shown.vertices, shown.normals, spread]
+            rng = torch.Generator().manual_seed(1)
+            share = [torch.randn(v.shape, generator=rng) for v in seen]
+            results.append([*seen, *torch.autograd.grad(seen, list(leaves.values()), share)])
+    finally:
+        torch.set_num_threads(before)
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
 
 
 def test_gradients_match_finite_differences_of_the_kernel(device):

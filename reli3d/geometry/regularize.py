@@ -49,18 +49,22 @@ def vertex_deviation(
     def weight(values: Tensor | None, column: Tensor) -> Tensor:
         if values is None:
             return level.new_ones(len(row))
-        return torch.where(row >= 0, values[row.clamp(min=0), column], 1.0)
+        # index_select, here and below: its gradient adds up in the order of the list, that of brackets in any
+        at = row.clamp(min=0) * values.shape[1] + column
+        return torch.where(row >= 0, values.reshape(-1).index_select(0, at), 1.0)
 
     values, positions = [], []
     for end in table["ends"].view(12, 2).long()[edge].unbind(1):
         offset = torch.stack([end & 1, end >> 1 & 1, end >> 2], -1)
         at_padded = t.cells.long()[cell] + (offset * step).sum(-1)
-        values.append(padded.reshape(-1)[at_padded] * weight(alpha, end))
+        values.append(padded.reshape(-1).index_select(0, at_padded) * weight(alpha, end))
         vertex = corner[cell, end]
         nz = t.cubes[2] + 1
         at = torch.stack([vertex // ((t.cubes[1] + 1) * nz), vertex // nz % (t.cubes[1] + 1), vertex % nz], -1)
         position = at / size - 0.5
-        positions.append(position if deformation is None else position + deformation.reshape(-1, 3)[vertex])
+        positions.append(
+            position if deformation is None else position + deformation.reshape(-1, 3).index_select(0, vertex)
+        )
     share = values[0] / (values[0] - values[1])
     crossing = torch.lerp(*positions, share[:, None]) * (2.0 * level.new_tensor(extent))
 
@@ -71,9 +75,9 @@ def vertex_deviation(
     if not bool(torch.isfinite(vertex.detach()).all()):
         raise ValueError("alpha, beta, deformation: expected positive weights and finite offsets, got others")
     count = torch.bincount(owner, minlength=total).to(level.dtype)
-    distance = torch.linalg.vector_norm(vertex[owner] - crossing, dim=-1)
+    distance = torch.linalg.vector_norm(vertex.index_select(0, owner) - crossing, dim=-1)
     mean = level.new_zeros(total).index_add(0, owner, distance) / count
-    return level.new_zeros(total).index_add(0, owner, (distance - mean[owner]).abs()) / count
+    return level.new_zeros(total).index_add(0, owner, (distance - mean.index_select(0, owner)).abs()) / count
 
 
 def sign_entropy(level: Tensor) -> Tensor:

@@ -67,7 +67,7 @@ def _smoothed(mesh: Mesh, steps: list[float], border: str) -> Mesh:
     start = positions = operator.welded(mesh.vertices)
     for step in steps:
         positions = positions + step * operator(positions)
-    vertices = mesh.vertices + (positions - start)[operator.label]
+    vertices = mesh.vertices + (positions - start).index_select(0, operator.label)
     return replace(mesh, vertices=vertices, normals=None, tangents=None)
 
 

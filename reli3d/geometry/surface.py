@@ -84,8 +84,9 @@ def extract_surface(
     any number of CPU threads.
 
     Left out: the tetrahedral volume mesh of the paper's section 4.5; the output is the surface alone, which a
-    tetrahedraliser (TetGen, fTetWild) fills where a simulation needs it.  :mod:`reli3d.geometry.regularize` has the
-    losses that keep a fitted surface sound.
+    tetrahedraliser (TetGen, fTetWild) fills where a simulation needs it; and dual vertices placed by the field's
+    gradient (the quadric error that the authors' code offers without weights).
+    :mod:`reli3d.geometry.regularize` has the losses that keep a fitted surface sound.
 
     Raises TypeError or ValueError on a wrong dtype, shape or device, on a level that is not finite or has one sign
     only, on weights that are not positive.
@@ -311,12 +312,13 @@ def _gamma_of(t: _Topology, quads: Tensor, gamma: Tensor) -> Tensor:
     row_of = torch.empty_like(rows)
     row_of[first + inner] = rows
     rows = row_of[quads.long()]
-    return torch.where(rows >= 0, gamma[rows.clamp(min=0)], 1.0)
+    return torch.where(rows >= 0, gamma.index_select(0, rows.clamp(min=0).view(-1)).view_as(rows), 1.0)
 
 
 def _with_centres(vertices: Tensor, quads: Tensor, gamma: Tensor) -> Mesh:
     """Four triangles a quad around the mean of its diagonals' midpoints, each weighted by the gammas at its ends."""
-    corner = vertices[quads.long()]
+    # the gradient of index_select adds up in the order of the list, that of indexing with brackets in any
+    corner = vertices.index_select(0, quads.view(-1).long()).view(-1, 4, 3)
     one, other = gamma[:, 0] * gamma[:, 2], gamma[:, 1] * gamma[:, 3]
     share = (one / (one + other))[:, None]
     middle = share * (corner[:, 0] + corner[:, 2]) * 0.5 + (1.0 - share) * (corner[:, 1] + corner[:, 3]) * 0.5

@@ -120,9 +120,9 @@ def _joined(mesh: Mesh, faces: np.ndarray, charts: parts.Charts, uv: np.ndarray)
     source = torch.from_numpy(faces.ravel()[corners].astype(np.int64)).to(device)
     normals = mesh.normals if mesh.normals is not None else vertex_normals(mesh.vertices, mesh.faces)
     return Mesh(
-        vertices=mesh.vertices[source],
+        vertices=mesh.vertices.index_select(0, source),  # a gradient that adds up in a fixed order
         faces=torch.from_numpy(vertex.reshape(-1, 3)).to(device),
-        normals=normals[source],
+        normals=normals.index_select(0, source),
         uv=torch.from_numpy(uv.reshape(-1, 2)[corners]).to(device),
     )
 
@@ -268,9 +268,9 @@ def unwrap_xatlas(mesh: Mesh, *, texture_size: int = 1024, timeout_s: float = 12
     index = torch.from_numpy(source.astype(np.int64)).to(device)
     normals = mesh.normals if mesh.normals is not None else vertex_normals(mesh.vertices, mesh.faces)
     return Mesh(
-        vertices=mesh.vertices[index],
+        vertices=mesh.vertices.index_select(0, index),
         faces=torch.from_numpy(faces.astype(np.int32)).to(device),
-        normals=normals[index],
+        normals=normals.index_select(0, index),
         uv=torch.from_numpy(uv.astype(np.float32)).to(device),
     )
 
