@@ -15,6 +15,7 @@ from reli3d.kernels.microfacet import (
     COS_MIN,
     Facet,
     facet_between,
+    ggx_root,
     pdf_vndf_partner,
     pdf_vndf_reflection,
     smith_visibility,
@@ -85,7 +86,7 @@ def eval_bsdf_kernel(
     value[i] = wp.vec3(0.0, 0.0, 0.0)
     if wo[i][2] > COS_MIN and wi[i][2] > COS_MIN:
         width = wp.max(alpha[i], ALPHA_MIN)
-        facet = facet_between(wo[i], wi[i], width)
+        facet = facet_between(wo[i], wi[i], width, ggx_root(wo[i], width))
         value[i] = eval_bsdf(facet, wo[i], wi[i], base_color[i], width, metallic[i], conserving)
 
 
@@ -100,4 +101,5 @@ def pdf_lobes_kernel(
     i = start + wp.tid()
     pdf[i] = wp.vec3(0.0, 0.0, 0.0)
     if wo[i][2] > COS_MIN and wi[i][2] > COS_MIN:
-        pdf[i] = pdf_lobes(facet_between(wo[i], wi[i], wp.max(alpha[i], ALPHA_MIN)), wo[i], wi[i])
+        width = wp.max(alpha[i], ALPHA_MIN)
+        pdf[i] = pdf_lobes(facet_between(wo[i], wi[i], width, ggx_root(wo[i], width)), wo[i], wi[i])

@@ -50,14 +50,8 @@ def four_texels(height: int, width: int, uv: wp.vec2) -> Texels:
     out = Texels()
     out.fx = x - float(column)
     out.fy = y - float(row)
-    c0 = wp.int32(column)
-    c1 = wp.int32(column + 1)
-    if c0 < 0:
-        c0 = c0 + width
-    if c1 >= width:
-        c1 = c1 - width
-    out.c0 = wp.clamp(c0, 0, width - 1)
-    out.c1 = wp.clamp(c1, 0, width - 1)
+    out.c0 = wp.min(wp.where(column < 0, width - 1, column), width - 1)
+    out.c1 = wp.where(out.c0 == width - 1, 0, out.c0 + 1)
     out.r0 = wp.clamp(row, 0, height - 1)
     out.r1 = wp.clamp(row + 1, 0, height - 1)
     return out
@@ -94,10 +88,13 @@ def lookup_envmap(radiance: wp.array2d(dtype=wp.vec3), d: wp.vec3) -> wp.vec3:
 def upper_cell(cdf: wp.array2d(dtype=float), guide: wp.array2d(dtype=wp.int32), row: int, u: float) -> int:
     """Index k with ``cdf[row, k] <= u < cdf[row, k + 1]``; such a cell has positive probability.
 
-    Chen and Asau 1974: ``guide[row, j]`` is the cell of u = j / n, from which two steps are expected for any CDF.
+    Chen and Asau 1974: ``guide[row, j]`` is the cell of u = j / n, from which one step is expected for any CDF.  The
+    first two are looked at without a branch, which a processor could not foresee, and side by side.
     """
     n = guide.shape[1]
     k = guide[row, wp.min(int(u * float(n)), n - 1)]
+    steps = wp.where(cdf[row, k + 1] <= u, 1, 0) + wp.where(cdf[row, wp.min(k + 2, n)] <= u, 1, 0)
+    k = wp.min(k + steps, n - 1)
     while k < n - 1 and cdf[row, k + 1] <= u:
         k = k + 1
     return k
@@ -121,8 +118,8 @@ def sample_envmap(
 ) -> MapSample:
     """Point of the map for uniform ``u`` in [0, 1)^2; density :func:`pdf_envmap_uv`.
 
-    rows: ``(1, H + 1)`` CDF of the rows; columns: ``(H, W + 1)`` CDF within each row.  Inversion, monotone in both
-    numbers, so stratified ``u`` stay stratified.  Within a texel uniform in solid angle.
+    rows: ``(2, H + 1)``, CDF of the rows and height of their edges; columns: ``(H, W + 1)`` CDF within each row.
+    Inversion, monotone in both numbers, so stratified ``u`` stay stratified.  Within a texel uniform in solid angle.
     """
     height = columns.shape[0]
     width = columns.shape[1] - 1
@@ -132,8 +129,8 @@ def sample_envmap(
     b = columns[r, c]
     in_row = (u[0] - a) / (rows[0, r + 1] - a)
     in_column = (u[1] - b) / (columns[r, c + 1] - b)
-    top = turn_cos_sin(0.5 * float(r) / float(height))[0]
-    bottom = turn_cos_sin(0.5 * float(r + 1) / float(height))[0]
+    top = rows[1, r]
+    bottom = rows[1, r + 1]
     y = top + (bottom - top) * in_row
     s = safe_sqrt(1.0 - y * y)
     v = 2.0 * turn_atan2(s, y) * float(height)

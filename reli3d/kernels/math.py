@@ -2,8 +2,9 @@
 
 import warp as wp
 
-# Warp's own thresholds, for modules whose functions hand structs and tables on: 1.4 times faster, longer to compile
-INLINE = "-mllvm=-inline-threshold=9000 -mllvm=-inline-cold-callsite-threshold=3000"
+# Warp's own thresholds, for modules whose functions hand structs and tables on: 1.4 times faster, longer to compile;
+# and products added in one rounding, as CUDA does: a tenth faster
+INLINE = "-mllvm=-inline-threshold=9000 -mllvm=-inline-cold-callsite-threshold=3000 -ffp-contract=fast"
 
 PI = wp.constant(3.14159265358979)
 INV_PI = wp.constant(0.318309886183791)
@@ -65,10 +66,10 @@ def turn_atan2(y: float, x: float) -> float:
     ay = wp.abs(y)
     a = wp.min(ax, ay) / wp.max(wp.max(ax, ay), 1.0e-30)
     s = a * a
-    t = 0.00347958921 - s * 0.0006453017162
-    t = 0.01534602811 + s * (-0.008898712858 + s * t)
-    t = 0.03174594531 + s * (-0.02213627035 + s * t)
-    t = a * (0.1591548373 + s * (-0.05304612102 + s * t))
+    s2 = s * s  # in pairs of terms, which a processor computes side by side (Estrin)
+    low = (0.1591548373 - s * 0.05304612102) + s2 * (0.03174594531 - s * 0.02213627035)
+    high = (0.01534602811 - s * 0.008898712858) + s2 * (0.00347958921 - s * 0.0006453017162)
+    t = a * (low + s2 * s2 * high)
     if ay > ax:
         t = 0.25 - t
     if x < 0.0:

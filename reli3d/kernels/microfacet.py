@@ -34,19 +34,26 @@ class Facet:
 
     wm: wp.vec3
     cos_m: float  # wo.wm
+    per_cos_m: float
     ndf: float
     root_o: float
     root_i: float
 
 
 @wp.func
-def facet_between(wo: wp.vec3, wi: wp.vec3, alpha: float) -> Facet:
-    """Facet of two directions above the horizon; its normal and both cosines with it are then positive."""
+def facet_between(wo: wp.vec3, wi: wp.vec3, alpha: float, root_o: float) -> Facet:
+    """Facet of two directions above the horizon; its normal and both cosines with it are then positive.
+
+    root_o: ``ggx_root(wo, alpha)``, which many directions ``wi`` share.
+    """
     facet = Facet()
-    facet.wm = wp.normalize(wo + wi)
+    h = wo + wi
+    per_length = 1.0 / wp.sqrt(wp.dot(h, h))  # above the horizon the sum is not 0
+    facet.wm = h * per_length
     facet.cos_m = wp.dot(wo, facet.wm)
+    facet.per_cos_m = 2.0 * per_length  # the sum of two unit vectors is 2 wo.wm long
     facet.ndf = ggx_ndf(facet.wm, alpha)
-    facet.root_o = ggx_root(wo, alpha)
+    facet.root_o = root_o
     facet.root_i = ggx_root(wi, alpha)
     return facet
 
@@ -58,15 +65,24 @@ def smith_visibility(facet: Facet, wo: wp.vec3, wi: wp.vec3) -> float:
 
 
 @wp.func
-def sample_ggx_vndf(wo: wp.vec3, alpha: float, u: wp.vec2) -> wp.vec3:
-    """Visible normal for uniform ``u`` in [0, 1)^2; density :func:`pdf_ggx_vndf`.
+def stretch_view(wo: wp.vec3, alpha: float) -> wp.vec3:
+    """``wo`` over the surface stretched until it is a hemisphere; unit."""
+    return wp.normalize(wp.vec3(alpha * wo[0], alpha * wo[1], wo[2]))
 
-    Spherical caps, Dupuy and Benyoub 2023, doi 10.1111/cgf.14867: stretch ``wo``, take a point of the cap z in
-    [-w.z, 1], add, unstretch.
+
+@wp.func
+def sample_ggx_vndf(w: wp.vec3, alpha: float, u: wp.vec2) -> wp.vec3:
+    """Normal visible from ``wo`` for uniform ``u`` in [0, 1)^2, ``w`` its ``stretch_view``; density
+    :func:`pdf_ggx_vndf`.
+
+    Spherical caps, Dupuy and Benyoub 2023, doi 10.1111/cgf.14867: take a point of the cap z in [-w.z, 1] above the
+    stretched surface, add, unstretch.
     """
-    w = wp.normalize(wp.vec3(alpha * wo[0], alpha * wo[1], wo[2]))
     h = w + sample_cap(w, u)
-    return wp.normalize(wp.vec3(alpha * h[0], alpha * h[1], wp.max(h[2], COS_MIN)))
+    x = alpha * h[0]
+    y = alpha * h[1]
+    z = wp.max(h[2], COS_MIN)
+    return wp.vec3(x, y, z) * (1.0 / wp.sqrt(x * x + y * y + z * z))
 
 
 @wp.func
@@ -84,7 +100,7 @@ def pdf_vndf_reflection(facet: Facet, wo: wp.vec3) -> float:
     """Density [1/sr of ``wi``] of ``wo`` reflected at a visible normal: pdf_ggx_vndf / (4 wo.wm).
 
     Walter et al. 2007, eq. 14."""
-    return 0.5 * facet.ndf / (wo[2] + facet.root_o)
+    return facet.ndf * (0.5 / (wo[2] + facet.root_o))  # the bracket is the same for all wi
 
 
 @wp.func
@@ -96,7 +112,7 @@ def pdf_vndf_partner(facet: Facet, wo: wp.vec3) -> float:
     Jacobian of the reflection is that of ``wm`` itself.
     """
     cos_own = wp.max(2.0 * wo[2] * facet.wm[2] - facet.cos_m, 0.0)  # wo.mirror(wm)
-    return pdf_vndf_reflection(facet, wo) * cos_own / wp.max(facet.cos_m, COS_MIN)
+    return pdf_vndf_reflection(facet, wo) * cos_own * facet.per_cos_m
 
 
 @wp.kernel
@@ -108,7 +124,8 @@ def sample_ggx_vndf_kernel(
     wm: wp.array(dtype=wp.vec3),
 ):  # fmt: skip
     i = start + wp.tid()
-    wm[i] = sample_ggx_vndf(wo[i], wp.max(alpha[i], ALPHA_MIN), u[i])
+    width = wp.max(alpha[i], ALPHA_MIN)
+    wm[i] = sample_ggx_vndf(stretch_view(wo[i], width), width, u[i])
 
 
 @wp.kernel

@@ -13,7 +13,15 @@ from reli3d.kernels.bsdf import eval_bsdf, pdf_lobes
 from reli3d.kernels.envmap import direction_to_uv, lookup_envmap_uv, pdf_envmap_uv, sample_envmap
 from reli3d.kernels.intersect import hit_occluded, offset_origin
 from reli3d.kernels.math import INLINE, tangent_frame
-from reli3d.kernels.microfacet import ALPHA_MIN, COS_MIN, Facet, facet_between, sample_ggx_vndf
+from reli3d.kernels.microfacet import (
+    ALPHA_MIN,
+    COS_MIN,
+    Facet,
+    facet_between,
+    ggx_root,
+    sample_ggx_vndf,
+    stretch_view,
+)
 from reli3d.kernels.mis import mis_factor
 from reli3d.kernels.random import random_pair, rotate_point
 from reli3d.kernels.sampling import mirror, reflect, sample_cosine
@@ -37,6 +45,8 @@ class Surface:
     frame: wp.mat33
     ng: wp.vec3
     wo: wp.vec3
+    stretched: wp.vec3  # the view as visible normals are drawn from it
+    root_o: float
     base_color: wp.vec3
     alpha: float
     metallic: float
@@ -103,6 +113,8 @@ def make_surface(
     surface.base_color = base_color
     surface.alpha = wp.max(alpha, ALPHA_MIN)
     surface.metallic = metallic
+    surface.stretched = stretch_view(surface.wo, surface.alpha)
+    surface.root_o = ggx_root(surface.wo, surface.alpha)
     surface.pixel = pixel
     surface.shift_environment = random_pair(plan.seed, pixel, 0, 0)
     surface.shift_visible = random_pair(plan.seed, pixel, 0, 1)
@@ -122,6 +134,25 @@ def draw_pair(
 
 
 @wp.func
+def visible_normal(
+    surface: Surface, plan: Plan, points: wp.array(dtype=wp.vec2), sample: int, last: wp.vec3
+) -> wp.vec3:
+    """Microfacet normal of a sample of the visible normals, ``last`` for those of other strategies.
+
+    The second of an antithetic pair mirrors the first's, which is the ``last``: so all samples are asked in order.
+    """
+    wm = last
+    k = sample - plan.n_environment
+    if k >= 0 and k < plan.n_visible:
+        if plan.antithetic != 0 and (k & 1) == 1:
+            wm = mirror(last)
+        else:
+            u = draw_pair(plan, points, surface.shift_visible, surface.pixel, k >> plan.antithetic, 1)
+            wm = sample_ggx_vndf(surface.stretched, surface.alpha, u)
+    return wm
+
+
+@wp.func
 def draw_sample(
     surface: Surface,
     plan: Plan,
@@ -132,8 +163,9 @@ def draw_sample(
     column_guide: wp.array2d(dtype=wp.int32),
     density: wp.array2d(dtype=float),
     sample: int,
+    wm: wp.vec3,
 ) -> Draw:
-    """Sample ``sample`` of a hit; a direction below the horizon has factor 0."""
+    """Sample ``sample`` of a hit; a direction below the horizon has factor 0.  wm: its :func:`visible_normal`."""
     out = Draw()
     wi = wp.vec3(0.0, 0.0, 0.0)
     uv = wp.vec2(0.0, 0.0)
@@ -151,12 +183,8 @@ def draw_sample(
         if k < plan.n_visible:
             strategy = 1
             count = plan.n_visible
-            index = k >> plan.antithetic
-            u = draw_pair(plan, points, surface.shift_visible, surface.pixel, index, 1)
-            wm = sample_ggx_vndf(surface.wo, surface.alpha, u)
             if plan.antithetic != 0 and (k & 1) == 1:
                 strategy = 2
-                wm = mirror(wm)
             if wp.dot(surface.wo, wm) > COS_MIN:
                 wi = reflect(surface.wo, wm)
         else:
@@ -168,7 +196,7 @@ def draw_sample(
         if wi[2] > COS_MIN:
             uv = direction_to_uv(out.direction)
     if wi[2] > COS_MIN:
-        out.facet = facet_between(surface.wo, wi, surface.alpha)
+        out.facet = facet_between(surface.wo, wi, surface.alpha, surface.root_o)
         lobes = pdf_lobes(out.facet, surface.wo, wi)
         partners = float(plan.antithetic * (plan.n_visible // 2))
         all = wp.vec4(
@@ -177,7 +205,14 @@ def draw_sample(
             partners * lobes[1],
             float(plan.n_cosine) * lobes[2],
         )
-        factor = mis_factor(all[strategy], all, plan.power)
+        own = all[0]  # not all[strategy], which would send the vector through memory
+        if strategy == 1:
+            own = all[1]
+        elif strategy == 2:
+            own = all[2]
+        elif strategy == 3:
+            own = all[3]
+        factor = mis_factor(own, all, plan.power)
     out.wi = wi
     out.uv = uv
     out.factor = factor
@@ -215,8 +250,10 @@ def shade_kernel(
     total = wp.vec3(0.0, 0.0, 0.0)
     word = wp.int32(0)
     count = plan.n_environment + plan.n_visible + plan.n_cosine
+    wm = wp.vec3(0.0, 0.0, 1.0)
     for s in range(count):
-        d = draw_sample(surface, plan, points, rows, columns, row_guide, column_guide, density, s)
+        wm = visible_normal(surface, plan, points, s, wm)
+        d = draw_sample(surface, plan, points, rows, columns, row_guide, column_guide, density, s, wm)
         if d.factor > 0.0:
             lit = wp.bool(True)
             if shadows != 0:
@@ -250,8 +287,10 @@ def shade_rays_kernel(
     i = first + j
     surface = make_surface(plan, pixels[i], normal[i], ng[i], wo[i], base_color[i], alpha[i], metallic[i])
     count = plan.n_environment + plan.n_visible + plan.n_cosine
+    wm = wp.vec3(0.0, 0.0, 1.0)
     for s in range(count):
-        d = draw_sample(surface, plan, points, rows, columns, row_guide, column_guide, density, s)
+        wm = visible_normal(surface, plan, points, s, wm)
+        d = draw_sample(surface, plan, points, rows, columns, row_guide, column_guide, density, s, wm)
         k = j * count + s
         t_max[k] = -1.0
         if d.factor > 0.0:

@@ -22,8 +22,9 @@ _LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709
 class EnvironmentTable:
     """Piecewise-constant density over the texels.
 
-    rows: ``(1, H + 1)`` CDF over rows.  columns: ``(H, W + 1)`` CDF within each row.  row_guide ``(1, H)`` and
-    column_guide ``(H, W)``: int32, where to start the search.  density: ``(H, W)`` [1/sr].
+    rows: ``(2, H + 1)``, CDF over rows and the height (cosine with +Y) of their edges.  columns: ``(H, W + 1)`` CDF
+    within each row.  row_guide ``(1, H)`` and column_guide ``(H, W)``: int32, where to start the search.  density:
+    ``(H, W)`` [1/sr].
     """
 
     rows: Tensor
@@ -132,9 +133,11 @@ class Environment:
         per_row = weight.sum(1)
         weight = torch.where(per_row[:, None] > 0.0, weight, torch.ones_like(weight))  # an empty row is never chosen
         columns, rows = _cdf(weight), _cdf(per_row[None])
+        heights = torch.cos(torch.linspace(0.0, torch.pi, height + 1, dtype=torch.float64, device=value.device))
         # from the rounded tables, so that density and samples agree to the last bit
         density = rows.double().diff()[0][:, None] * columns.double().diff() / angle[:, None]
-        return EnvironmentTable(rows, columns, _guide(rows), _guide(columns), density.float())
+        return EnvironmentTable(torch.cat([rows, heights[None].float()]), columns, _guide(rows), _guide(columns),
+                                density.float())  # fmt: skip
 
     def sample(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """Directions ``(..., 3)`` and density ``(...)`` [1/sr] for uniform ``u (..., 2)`` in [0, 1).  No gradient."""
@@ -201,6 +204,6 @@ def _cdf(weight: Tensor) -> Tensor:
 def _guide(cdf: Tensor) -> Tensor:
     """Cell of u = j / n, ``(R, n)`` int32, for each row of a CDF ``(R, n + 1)``."""
     n = cdf.shape[1] - 1
-    u = torch.arange(n, dtype=torch.float32, device=cdf.device).div(n).expand(cdf.shape[0], n).contiguous()
-    # one cell back: the kernel's float product u n may round up to j from below
-    return (torch.searchsorted(cdf, u, right=True) - 2).clamp(0, n - 1).int()
+    u = torch.arange(n, dtype=torch.float64, device=cdf.device).div(n) * (1.0 - 2.0**-22)
+    u = u.expand(cdf.shape[0], n).contiguous()  # a little less: the kernel's float product u n may round up to j
+    return (torch.searchsorted(cdf.double(), u, right=True) - 1).clamp(0, n - 1).int()
