@@ -72,7 +72,7 @@ def stages(model, code, maps, resolution, size) -> dict[str, float]:
 
     mesh = extract(model, code, maps, resolution)
     tick()
-    mesh, textures = texture(model, code, maps, mesh, size)
+    mesh, textures = texture(model, code, maps, mesh, size, None)
     tick()
     glb_bytes(Asset(mesh, textures))
     tick()

@@ -41,9 +41,12 @@ from reli3d.nn.view_features import ViewMaps
 from reli3d.nn.weights import load_model
 from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.bump import radial_bump
+from reli3d.render.camera import Camera
 from reli3d.render.environment import Environment
+from reli3d.render.exposure import photograph_ratio
 
 DETAIL = 512  # pixels of the views that colours and silhouettes are read from; the network's own input is smaller
+INSIDE = 2.0  # pixels of such a view that a silhouette's edge may spill over
 SMALLEST_PART = 0.01  # share of the faces below which a separate piece is dropped
 SHADING_POINTS = 4096  # vertices by which the light on the object is judged
 CHUNK = 1 << 17  # points a query: 200 MB of features
@@ -172,11 +175,13 @@ def _cube_weights(model: Reconstructor, code: Code, flat: Tensor, level: Tensor)
 
 
 def texture(
-    model: Reconstructor, code: Code, maps: ViewMaps, mesh: Mesh, size: int, *, uv: str = "project"
-) -> tuple[Mesh, TextureSet]:
-    """The mesh with an atlas, normals and tangents, and its maps of ``size`` texels."""
-    # nothing else asks which view sees a point
-    scene = RayScene(mesh.vertices, mesh.faces) if model.preset.view_feature_width else None
+    model: Reconstructor, code: Code, maps: ViewMaps, mesh: Mesh, size: int, scene: RayScene | None, *,
+    uv: str = "project",
+) -> tuple[Mesh, TextureSet]:  # fmt: skip
+    """The mesh with an atlas, normals and tangents, and its maps of ``size`` texels; the faces keep their order.
+
+    scene: rays against ``mesh``, for a network that asks which view sees a point, else None.
+    """
     if uv not in ("project", "xatlas"):
         raise ValueError(f"uv: expected project or xatlas, got {uv}")
     shading = _shading(model, code, maps, mesh, scene)
@@ -210,6 +215,16 @@ def _shading(model: Reconstructor, code: Code, maps: ViewMaps, mesh: Mesh, scene
 def light(model: Reconstructor, code: Code) -> Environment:
     """The decoded environment, in the world's axes."""
     return Environment(model.decode_environment(code)[0].contiguous())
+
+
+def as_bright_as_seen(asset: Asset, maps: ViewMaps, scene: RayScene) -> Asset:
+    """``asset`` with a light that shows it as bright as the views that ``maps`` hold.
+
+    Paint times light is all that photographs tell: where the network guesses one of them too dark, this makes it up.
+    """
+    camera = Camera(maps.c2w, maps.intrinsics, maps.images.shape[2], maps.images.shape[1])
+    ratio = photograph_ratio(asset, maps.images[..., :3], maps.images[..., 3] > INSIDE, camera, scene)
+    return replace(asset, environment=Environment(asset.environment.radiance * ratio))
 
 
 def output_frame(model_from_input: Similarity, frame: str, up: str) -> Similarity:
@@ -301,9 +316,12 @@ def reconstruct(views: Views, *, weights: str | Reconstructor = "small", device:
     with watch.stage("surface"):
         mesh = extract(model, code, maps, resolution)
     with watch.stage("textures"):
-        mesh, textures = texture(model, code, maps, mesh, texture_size, uv=uv)
+        scene = RayScene(mesh.vertices, mesh.faces) if model.preset.view_feature_width else None
+        mesh, textures = texture(model, code, maps, mesh, texture_size, scene, uv=uv)
     with watch.stage("light"):
         asset = Asset(mesh, textures, light(model, code))
+        if scene is not None:
+            asset = as_bright_as_seen(asset, maps, scene)
     with watch.stage("frame"):
         asset = turned(asset, output.compose(to_model.inverse()))
     if timings is not None:

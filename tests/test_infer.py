@@ -14,6 +14,10 @@ from reli3d.data.folder import load_views
 from reli3d.io.glb import read_glb
 from reli3d.io.hdr import read_environment
 from reli3d.nn.weights import load_model
+from reli3d.render.camera import Camera
+from reli3d.render.color import srgb_to_linear
+from reli3d.render.environment import Environment
+from reli3d.render.render import render
 from tests import evil
 
 QUICK = ["--texture-size", "256", "--resolution", "40", "--device", "cpu"]
@@ -60,6 +64,21 @@ def test_both_environments_hold_the_same_light(example):
     assert exr.shape == (64, 128, 3) and bool((exr > 0).all())
     peak = exr.amax(-1, keepdim=True)
     assert bool(((exr - hdr).abs() <= peak / 100).all())  # RGBE keeps 8 bits of the largest channel
+
+
+def test_its_light_shows_it_as_bright_as_the_photographs(example):
+    views, light = load_views(infer.EXAMPLE, views=4), Environment(read_environment(example / "environment.exr"))
+    (asset,) = read_glb(example / "mesh.glb")
+    seen, shown = [], []
+    for image, mask, c2w, intrinsics in zip(views.images, views.masks, views.c2w, views.intrinsics, strict=True):
+        height, width = mask.shape
+        picture = render(asset, Camera(c2w, intrinsics / 8, width // 8, height // 8), light)
+        image = torch.nn.functional.avg_pool2d(srgb_to_linear(image).movedim(-1, 0), 8).movedim(0, -1)
+        inside = torch.nn.functional.avg_pool2d(mask[None], 8)[0] > 0.999
+        both = inside & (picture.alpha > 0) & (image.amax(-1) < 0.97)
+        seen.append(image[both]), shown.append(picture.radiance[both])
+    # without the correction it is half as bright; 10 %: other pixels, of which others are overexposed
+    assert float(torch.cat(shown).mean() / torch.cat(seen).mean()) == pytest.approx(1.0, abs=0.1)
 
 
 def test_the_mesh_follows_the_frame_of_the_cameras(tmp_path):
