@@ -67,7 +67,8 @@ def activate(name: str, raw: Tensor) -> Tensor:
     if name == "roughness":
         return ROUGHNESS_MIN + (1.0 - ROUGHNESS_MIN) * raw.sigmoid()
     if name == "normal":
-        return functional.normalize(raw + raw.new_tensor((0.0, 0.0, 1.0)), dim=-1, eps=NORMALIZE_EPS)
+        normal = raw + raw.new_tensor((0.0, 0.0, 1.0))  # functional.normalize takes ten times as long for columns
+        return normal / (normal * normal).sum(-1, keepdim=True).clamp(min=NORMALIZE_EPS**2).sqrt()
     return raw
 
 
