@@ -19,12 +19,12 @@ TILE = 192  # pixels
 COLUMNS = 4
 SAMPLES = (24, 16, 4)  # light, GGX and cosine samples a pixel: little noise for a quarter of a second a view
 PAPER = 0.93  # background of the tiles, sRGB
+MEAN = 0.25  # of the environment as it is drawn, linear
 
 
 def preview(asset: Asset, views: Views) -> np.ndarray:
     """Picture ``(H, W, 3)`` uint8: up to four input views, the asset rendered from the same cameras under its own
-    light, the maps of the
-    first view, and the environment (row 0 up, centre -Z).
+    light, the maps of the first view, and the environment (row 0 up, centre -Z), exposed so that its mean is ``MEAN``.
 
     views: in the frame of ``asset``.
     """
@@ -49,8 +49,9 @@ def preview(asset: Asset, views: Views) -> np.ndarray:
         draw.text((3, r * height + 1), title, fill="black")
         for c, tile in enumerate(tiles):
             sheet.paste(_image(tile), (c * TILE, r * height + 14))
-    draw.text((3, len(rows) * height + 1), "environment", fill="black")
-    light = linear_to_srgb(asset.environment.radiance.clamp(0, 1)).permute(2, 0, 1)[None]
+    draw.text((3, len(rows) * height + 1), "environment, its mean at a quarter", fill="black")
+    light = asset.environment.radiance
+    light = linear_to_srgb((light * (MEAN / light.mean().clamp(min=1e-6))).clamp(0, 1)).permute(2, 0, 1)[None]
     light = interpolate(light, (2 * TILE, 4 * TILE), mode="bilinear", align_corners=False)[0].permute(1, 2, 0)
     sheet.paste(_image(light), (0, len(rows) * height + 14))
     return np.asarray(sheet)
