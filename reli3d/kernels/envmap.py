@@ -8,9 +8,9 @@ constant over texels with respect to solid angle; densities are per steradian.
 
 import warp as wp
 
-from reli3d.kernels.math import INLINE, INV_PI, TINY, safe_sqrt, turn_atan2, turn_cos_sin
+from reli3d.kernels.math import CONTRACT, INLINE, INV_PI, TINY, safe_sqrt, turn_atan2, turn_cos_sin
 
-wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native " + INLINE})
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": f"-march=native {INLINE} {CONTRACT}"})
 
 
 @wp.func

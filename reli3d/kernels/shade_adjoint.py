@@ -10,11 +10,11 @@ import warp as wp
 
 from reli3d.kernels.bsdf import F0_DIELECTRIC, base_reflectance, coat_cosine, eval_bsdf, schlick
 from reli3d.kernels.envmap import add_texels, lookup_envmap_uv
-from reli3d.kernels.math import INLINE, INV_PI
+from reli3d.kernels.math import CONTRACT, INLINE, INV_PI
 from reli3d.kernels.microfacet import ALPHA_MIN, Facet, smith_visibility
 from reli3d.kernels.shade import COS_VIEW_MIN, Plan, draw_sample, make_surface, visible_normal
 
-wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native " + INLINE})
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": f"-march=native {INLINE} {CONTRACT}"})
 
 
 @wp.struct
@@ -127,20 +127,21 @@ def shade_adjoint_kernel(
         wm = visible_normal(surface, plan, points, s, wm)
         if (visible[i, s // 32] >> (s & 31)) & 1 != 0:
             d = draw_sample(surface, plan, points, rows, columns, row_guide, column_guide, density, s, wm)
-            light = lookup_envmap_uv(radiance, d.uv)
-            value = eval_bsdf(d.facet, surface.wo, d.wi, surface.base_color, surface.alpha, surface.metallic,
-                              plan.conserving)  # fmt: skip
-            scale = d.factor * d.wi[2]
-            top = plan.clamp / float(d.count)
-            own = wp.vec3(0.0, 0.0, 0.0)  # the output's adjoint, 0 where the clamp held
-            for c in range(3):
-                if value[c] * scale * light[c] < top:
-                    own[c] = g[c]
-            total = add_sample_gradient(total, d.facet, surface.wo, d.wi, surface.base_color, surface.alpha,
-                                        surface.metallic, plan.conserving, value,
-                                        wp.cw_mul(own, light) * d.factor)  # fmt: skip
-            if g_radiance.shape[0] != 0:
-                add_texels(g_radiance, d.uv, wp.cw_mul(own, value) * scale)
+            if d.factor > 0.0:  # one in the horizon may have been above it as the forward kernel rounds
+                light = lookup_envmap_uv(radiance, d.uv)
+                value = eval_bsdf(d.facet, surface.wo, d.wi, surface.base_color, surface.alpha, surface.metallic,
+                                  plan.conserving)  # fmt: skip
+                scale = d.factor * d.wi[2]
+                top = plan.clamp / float(d.count)
+                own = wp.vec3(0.0, 0.0, 0.0)  # the output's adjoint, 0 where the clamp held
+                for c in range(3):
+                    if value[c] * scale * light[c] < top:
+                        own[c] = g[c]
+                total = add_sample_gradient(total, d.facet, surface.wo, d.wi, surface.base_color, surface.alpha,
+                                            surface.metallic, plan.conserving, value,
+                                            wp.cw_mul(own, light) * d.factor)  # fmt: skip
+                if g_radiance.shape[0] != 0:
+                    add_texels(g_radiance, d.uv, wp.cw_mul(own, value) * scale)
     side = wp.float32(1.0)
     if wp.dot(ng[i], wo[i]) < 0.0:
         side = -1.0

@@ -14,6 +14,7 @@ from reli3d._bridge import SLICE_MIN, check, empty, launch, once_differentiable,
 from reli3d.geometry.rays import RayScene
 from reli3d.kernels import shade as kernels
 from reli3d.kernels import shade_adjoint as adjoint
+from reli3d.kernels import shade_rays as halves
 from reli3d.render.environment import Environment
 from reli3d.render.material import PAINTS, choice
 from reli3d.render.sampling import halton
@@ -127,7 +128,7 @@ def shade_light(
         origins, directions, value = (torch.empty(hits * count, 3, device=device) for _ in range(3))
         far = torch.empty(hits * count, device=device)
         buffers = [(origins, wp.vec3), (directions, wp.vec3), (far, wp.float32), (value, wp.vec3)]
-        launch(kernels.shade_rays_kernel, hits, [first, *ins, plan, *buffers], device)
+        launch(halves.shade_rays_kernel, hits, [first, *ins, plan, *buffers], device)
         lit = (far > 0.0).nonzero()[:, 0]
         if scene is not None and scene.faces.shape[0]:
             lit = lit[~scene.occluded(origins[lit], directions[lit])]
@@ -215,11 +216,11 @@ def _shade_embree(n: int, ins: list, job: _Job, outs: list) -> None:
         for first in range(start, start + length, size):
             hits = min(size, start + length - first)
             buffers = [(rays[0], wp.vec3), (rays[1], wp.vec3), (far, wp.float32), (rays[2], wp.vec3)]
-            launch(kernels.shade_rays_kernel, hits, [first, *ins, job.plan, *buffers], out.device)
+            launch(halves.shade_rays_kernel, hits, [first, *ins, job.plan, *buffers], out.device)
             k = hits * count
             blocked = scene.embree_blocked(rays[0][:k], rays[1][:k], far[:k])
             args = [first, count, (rays[2], wp.vec3), (blocked, wp.int32), *outs]
-            launch(kernels.accumulate_kernel, hits, args, out.device)
+            launch(halves.accumulate_kernel, hits, args, out.device)
 
     if n:
         over_slices(n, work)

@@ -1,0 +1,65 @@
+"""The estimator of ``reli3d.kernels.shade`` in two halves, between which another tracer tests the shadow rays."""
+
+import warp as wp
+
+from reli3d.kernels.envmap import lookup_envmap_uv
+from reli3d.kernels.intersect import offset_origin
+from reli3d.kernels.math import CONTRACT, INLINE
+from reli3d.kernels.shade import Plan, draw_sample, make_surface, sample_value, visible_normal
+
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": f"-march=native {INLINE} {CONTRACT}"})
+
+
+@wp.kernel
+def shade_rays_kernel(
+    start: int,
+    # in
+    first: int, position: wp.array(dtype=wp.vec3), normal: wp.array(dtype=wp.vec3), ng: wp.array(dtype=wp.vec3),
+    wo: wp.array(dtype=wp.vec3), base_color: wp.array(dtype=wp.vec3), alpha: wp.array(dtype=float),
+    metallic: wp.array(dtype=float), radiance: wp.array2d(dtype=wp.vec3), rows: wp.array2d(dtype=float),
+    columns: wp.array2d(dtype=float), row_guide: wp.array2d(dtype=wp.int32), column_guide: wp.array2d(dtype=wp.int32),
+    density: wp.array2d(dtype=float), points: wp.array(dtype=wp.vec2), pixels: wp.array(dtype=wp.int32), plan: Plan,
+    # out
+    origins: wp.array(dtype=wp.vec3), directions: wp.array(dtype=wp.vec3), t_max: wp.array(dtype=float),
+    values: wp.array(dtype=wp.vec3),
+):  # fmt: skip
+    """First half of the estimator for a chunk of hits: shadow rays (``t_max`` < 0 where none is needed) and values."""
+    j = start + wp.tid()
+    i = first + j
+    surface = make_surface(plan, pixels[i], normal[i], ng[i], wo[i], base_color[i], alpha[i], metallic[i])
+    count = plan.n_environment + plan.n_visible + plan.n_cosine
+    wm = wp.vec3(0.0, 0.0, 1.0)
+    for s in range(count):
+        wm = visible_normal(surface, plan, points, s, wm)
+        d = draw_sample(surface, plan, points, rows, columns, row_guide, column_guide, density, s, wm)
+        k = j * count + s
+        t_max[k] = -1.0
+        if d.factor > 0.0:
+            t_max[k] = wp.inf
+            origins[k] = offset_origin(position[i], surface.ng, d.direction, plan.scale)
+            directions[k] = d.direction
+            values[k] = sample_value(surface, plan, d, lookup_envmap_uv(radiance, d.uv))
+
+
+@wp.kernel
+def accumulate_kernel(
+    start: int,
+    # in
+    first: int, count: int, values: wp.array(dtype=wp.vec3), occluded: wp.array(dtype=wp.int32),
+    # out
+    out: wp.array(dtype=wp.vec3), visible: wp.array2d(dtype=wp.int32),
+):  # fmt: skip
+    """Second half: the sum of the values of a hit that are not ``occluded`` (Embree: 0 for a hit, -1 for none)."""
+    j = start + wp.tid()
+    total = wp.vec3(0.0, 0.0, 0.0)
+    word = wp.int32(0)
+    for s in range(count):
+        k = j * count + s
+        if occluded[k] != 0:
+            total = total + values[k]
+            word = word | (1 << (s & 31))
+        if (s & 31) == 31 or s == count - 1:
+            if s // 32 < visible.shape[1]:
+                visible[first + j, s // 32] = word
+            word = 0
+    out[first + j] = total
