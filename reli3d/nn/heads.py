@@ -102,7 +102,7 @@ class Heads(nn.ModuleDict):
     def _inferred(self, features: Tensor, names: Sequence[str]) -> dict[str, Tensor]:
         """The MLPs without gradient: one matrix for all first layers, what nobody will ask again is overwritten."""
         weight, bias = self.first_layer(names)
-        hidden = torch.mm(weight, features.reshape(-1, features.shape[-1]).T).add_(bias[:, None])
+        hidden = torch.addmm(bias[:, None], weight, features.reshape(-1, features.shape[-1]).T)
         raw = self.after_first(hidden, names)
         return {name: value.reshape(*features.shape[:-1], value.shape[-1]) for name, value in raw.items()}
 
