@@ -32,6 +32,7 @@ CUT_GAIN = 0.85  # boxes of the two pieces over the box of the chart, at most ..
 CUT_HOLLOW, CUT_HOLLOW_GAIN = 0.25, 1.02  # ... but a ring gains by the second cut only: no gain asked below this fill
 CUT_ANGLES = 8  # directions in [0, 180) degrees of the cut, and of the boxes that judge it
 ANGLES = 24  # directions in [0, 90) degrees tried for the smallest bounding box of a chart: within 2 degrees of it
+LIGHT = 8192  # faces a CPU slice of the steps that take a few nanoseconds a face: less costs more to launch than to run
 GROW_MAX = 2.0  # a chart seen obliquely is enlarged to its area on the surface, up to this factor
 SLACK = 2.0e-3  # texels: overlap below this width is rounding
 PAIRS_MAX = 1 << 24  # overlapping pairs listed at once (64 MB); charts above are halved first
@@ -95,14 +96,15 @@ def axis_labels(normal: torch.Tensor, neighbours: np.ndarray) -> np.ndarray:
     smoothed = normal
     for _ in range(SMOOTHING):
         rough, smoothed = smoothed, torch.empty_like(normal)
-        _bridge.launch(kernels.smooth_kernel, n, [links, (rough, wp.vec3), (smoothed, wp.vec3)], CPU)
+        _bridge.launch(kernels.smooth_kernel, n, [links, (rough, wp.vec3), (smoothed, wp.vec3)], CPU, slice_min=LIGHT)
     label = torch.empty(n, dtype=torch.int32)
     _bridge.launch(kernels.labels_kernel, n, [
-        (normal, wp.vec3), (smoothed, wp.vec3), COS_LABEL, (label, wp.int32)], CPU)  # fmt: skip
+        (normal, wp.vec3), (smoothed, wp.vec3), COS_LABEL, (label, wp.int32)], CPU, slice_min=LIGHT)  # fmt: skip
     for _ in range(MAJORITY):
         voted = torch.empty_like(label)
         _bridge.launch(kernels.majority_kernel, n, [
-            links, (normal, wp.vec3), (label, wp.int32), COS_LABEL, (voted, wp.int32)], CPU)  # fmt: skip
+            links, (normal, wp.vec3), (label, wp.int32), COS_LABEL, (voted, wp.int32)], CPU,
+            slice_min=LIGHT)  # fmt: skip
         label = voted
     return label.numpy()
 
@@ -141,7 +143,8 @@ def _frames(normal: torch.Tensor, label: np.ndarray, chart: np.ndarray, count: i
     toward = total / np.maximum(length, 1e-300)
     oblique = torch.zeros(count, dtype=torch.uint8)
     _bridge.launch(kernels.oblique_kernel, len(chart), [
-        (normal, wp.vec3), _ints(chart), _floats(toward, wp.vec3), COS_TILT, (oblique, wp.uint8)], CPU)  # fmt: skip
+        (normal, wp.vec3), _ints(chart), _floats(toward, wp.vec3), COS_TILT, (oblique, wp.uint8)], CPU,
+        slice_min=LIGHT)  # fmt: skip
     axis = np.zeros((count, 3))
     axis[chart] = AXES[label]  # one label in a chart
     toward = np.where((oblique.numpy()[:, None] > 0) | (length < 1e-20), axis, toward)
@@ -317,7 +320,8 @@ def make_charts(points: np.ndarray, faces: np.ndarray, *, texels: float, least_t
     reach = np.abs(points - centre).max() or 1.0
     local = ((points - centre) / reach).astype(np.float32)  # at most 1: products cannot overflow
     normal = torch.empty(len(faces), 3)
-    _bridge.launch(kernels.normals_kernel, len(faces), [_floats(local, wp.vec3), _ints(faces), (normal, wp.vec3)], CPU)
+    _bridge.launch(kernels.normals_kernel, len(faces), [_floats(local, wp.vec3), _ints(faces), (normal, wp.vec3)], CPU,
+                   slice_min=LIGHT)  # fmt: skip
     size = 0.5 * np.sqrt(np.einsum("fk,fk->f", normal.numpy(), normal.numpy(), dtype=np.float64))
     area = float(size.sum())
     unit = np.sqrt(texels / area) if area > 1e-30 else 0.0
@@ -341,7 +345,7 @@ def make_charts(points: np.ndarray, faces: np.ndarray, *, texels: float, least_t
     corners, flat = torch.empty(len(faces), 3, 2), torch.empty(len(faces), dtype=torch.uint8)
     _bridge.launch(kernels.project_kernel, len(faces), [
         _floats(local, wp.vec3), _ints(faces), _ints(chart), _floats(right, wp.vec3), _floats(up, wp.vec3),
-        _floats(low, wp.vec2), sliver, (corners, wp.vec2), (flat, wp.uint8)], CPU)  # fmt: skip
+        _floats(low, wp.vec2), sliver, (corners, wp.vec2), (flat, wp.uint8)], CPU, slice_min=LIGHT)  # fmt: skip
     charts = Charts(np.where(flat.numpy() > 0, -1, chart).astype(np.int32), corners.numpy(), neighbours, count)
     split_overlaps(charts)
     return charts
