@@ -154,6 +154,11 @@ def view(tensor: Tensor, dtype):
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
 
 
+def views(args: Sequence) -> list:
+    """What :func:`launch` makes of its ``args``, for those that go to many launches; the caller keeps the tensors."""
+    return [view(*a) if isinstance(a, tuple) else a for a in args]
+
+
 def empty(shape: Sequence[int], dtype, device: torch.device) -> Tensor:
     """Uninitialised torch tensor that holds an array of ``shape`` of the Warp type ``dtype``."""
     torch_dtype, tail = _TORCH[dtype]
@@ -194,7 +199,7 @@ def launch(kernel, n: int, args: Sequence, device: torch.device, *, slice_min: i
     if n == 0:
         return
     with stream(device) as name:
-        values = [view(*a) if isinstance(a, tuple) else a for a in args]
+        values = views(args)
         if name != "cpu":
             wp.launch(kernel, n, [0, *values], device=name)
             return
@@ -269,8 +274,7 @@ class _KernelOp(torch.autograd.Function):
         ins = _fill(plain, zip(tensors, types, strict=True))
         if n > 0:
             with stream(device) as name:
-                values = [view(*a) if isinstance(a, tuple) else a for a in ins]
-                out_values = [view(*a) for a in _typed(results, outs)]
+                values, out_values = views(ins), views(_typed(results, outs))
                 adj_out = [None if g is None else view(g, d) for g, (_, d) in zip(g_results, outs, strict=True)]
 
                 def adjoint(k, start, count):
