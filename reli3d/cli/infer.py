@@ -13,7 +13,8 @@ from pathlib import Path
 STARTED = time.monotonic()
 EXAMPLE = Path(__file__).parents[1] / "assets" / "example"
 KERNELS = ("hull", "view_features", "triplane", "flexicubes", "uv", "raster", "intersect", "attributes", "random",
-           "shade", "envmap")  # modules of reli3d.kernels that one object needs  # fmt: skip
+           "envmap")  # modules of reli3d.kernels that one object needs  # fmt: skip
+SHADER = {"cpu": "shade_rays", "cuda": "shade"}  # and the shader's, whose shadow rays Embree traces or Warp
 
 
 def parser() -> argparse.ArgumentParser:
@@ -241,7 +242,8 @@ def ready_kernels(device: str) -> None:
 
     from reli3d._bridge import compiled, load_modules
 
-    modules = [importlib.import_module(f"reli3d.kernels.{name}") for name in KERNELS]
+    names = (*KERNELS, SHADER[torch.device(device).type])
+    modules = [importlib.import_module(f"reli3d.kernels.{name}") for name in names]
     if not compiled(modules, torch.device(device)):
         print("compiling kernels (first run only)", file=sys.stderr)
         load_modules(modules, torch.device(device))
