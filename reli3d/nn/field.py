@@ -50,7 +50,7 @@ def grid_level(model: Reconstructor, code: Code, maps: ViewMaps, axis: Tensor) -
     In a fifth of the time: see :meth:`Reconstructor.grid_query`.  axis: ``(n,)``.  No gradient.
     """
     n, ask = len(axis), model.grid_query(code, axis, ("density",))
-    lines = max(1, ROWS // n)
+    lines = n if axis.is_cuda else max(1, ROWS // n)
     blocks = [(i, slice(j, j + lines)) for i in range(n) for j in range(0, n, lines)]
 
     def density(start: int, _stop: int) -> Tensor:
