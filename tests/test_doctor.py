@@ -28,7 +28,9 @@ def test_report_names_versions_devices_cache_and_weights(assets):
     rows = dict(re.match(r"(.{16}) (.*)", row).groups() for row in text.splitlines())
     rows = {name.strip(): value for name, value in rows.items()}
     assert rows["reli3d"].startswith(reli3d.__version__)
-    assert rows["torch"] == torch.__version__ and rows["warp-lang"] == warp.__version__
+    # the CUDA wheel of the package index does not name its build in its metadata
+    assert rows["torch"] in (torch.__version__, torch.__version__.split("+")[0])
+    assert rows["warp-lang"] == warp.__version__
     assert str(warp.config.kernel_cache_dir) in rows["kernel cache"] and "writable" in rows["kernel cache"]
     assert hashlib.sha256(b"weights").hexdigest() in rows["weights, small"]
     assert rows["kernels, cpu"].startswith("run") and rows["verdict"] == "usable"
