@@ -31,16 +31,9 @@ PLANE = 384  # texels along a plane of the published triplane
 class KnownSurface(Reconstructor):
     """The published heads; the grid's query evaluates them and then gives the bench's field as density."""
 
-    def grid_query(self, code, axis, heads):
-        ask, n = super().grid_query(code, axis, heads), len(axis)
-        level = _field(n - 1, axis.device)[..., None]
-
-        def known(i, j):
-            values = ask(i, j)
-            values["density"] = self.surface_density - 20.0 * level[i, j] + 0.0 * values["density"]
-            return values
-
-        return known
+    def grid_density(self, code, axis):
+        ask, level = super().grid_density(code, axis), _field(len(axis) - 1, axis.device)
+        return lambda i, j: self.surface_density - 20.0 * level[i, j] + 0.0 * ask(i, j)
 
 
 @lru_cache(1)

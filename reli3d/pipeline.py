@@ -48,8 +48,8 @@ from reli3d.render.exposure import photograph_ratio
 DETAIL = 512  # pixels of the views that colours and silhouettes are read from; the network's own input is smaller
 INSIDE = 2.0  # pixels of such a view that a silhouette's edge may spill over
 SMALLEST_PART = 0.01  # share of the faces below which a separate piece is dropped
-SHADING_POINTS = 4096  # vertices by which the light on the object is judged
 CHUNK = 1 << 17  # points a query: 200 MB of features
+SHADING_POINTS = 4096  # vertices by which the light on the object is judged
 OUTSIDE = 1.0  # level given to grid points that the silhouettes exclude
 COARSE = 4  # cells of the surface grid along a cell of the one that looks for the silhouettes' hull first
 MARGIN_CELLS = 2.5  # cells around the silhouettes' hull in which the field is still asked

@@ -99,7 +99,7 @@ def test_the_grid_is_asked_by_planes_and_gives_the_level_of_its_points(tiny, mon
         # sums of 24 float32 products in another order, behind exp
         torch.testing.assert_close(field.grid_level(tiny, code, maps, axis), want, rtol=1e-4, atol=1e-4)
     with pytest.raises(ValueError, match="preset: expected one without point features"):
-        Reconstructor(NANO).grid_query(code, axis, ["density"])
+        Reconstructor(NANO).grid_density(code, axis)
 
 
 @torch.no_grad()

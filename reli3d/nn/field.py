@@ -47,14 +47,14 @@ def surface_level(model: Reconstructor, code: Code, maps: ViewMaps, points: Tens
 def grid_level(model: Reconstructor, code: Code, maps: ViewMaps, axis: Tensor) -> Tensor:
     """:func:`surface_level` at ``(axis[i], axis[j], axis[k])``, ``(n, n, n)``, of a preset without point features.
 
-    In a fifth of the time: see :meth:`Reconstructor.grid_query`.  axis: ``(n,)``.  No gradient.
+    In a fifth of the time: see :meth:`Reconstructor.grid_density`.  axis: ``(n,)``.  No gradient.
     """
-    n, ask = len(axis), model.grid_query(code, axis, ("density",))
+    n, ask = len(axis), model.grid_density(code, axis)
     lines = n if axis.is_cuda else max(1, ROWS // n)
     blocks = [(i, slice(j, j + lines)) for i in range(n) for j in range(0, n, lines)]
 
     def density(start: int, _stop: int) -> Tensor:
-        return ask(*blocks[start])["density"]
+        return ask(*blocks[start])
 
     every = range(len(blocks))
     parts = [density(k, k + 1) for k in every] if axis.is_cuda else over_rows(len(blocks), 1, density)

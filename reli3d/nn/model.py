@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from reli3d.nn.camera import CameraEmbedder, camera_vector, ray_maps
-from reli3d.nn.heads import HEADS, Heads, WeightMerger, activate, truncated_exp
+from reli3d.nn.heads import HEADS, Heads, WeightMerger, truncated_exp
 from reli3d.nn.illumination import Illumination
 from reli3d.nn.initialise import initialise
 from reli3d.nn.presets import Preset
@@ -165,13 +165,13 @@ class Reconstructor(nn.Module):
                 values["roughness"] = values["roughness"].sqrt()
         return values
 
-    def grid_query(self, code: Code, axis: Tensor,
-                   heads: Sequence[str]) -> Callable[[int, slice], dict[str, Tensor]]:  # fmt: skip
-        """:meth:`query` at the points ``(axis[i], axis[j], axis[k])`` of one object, without gradient: a function of a
-        number ``i`` and a slice of ``j`` that gives ``{name: (J, n, outputs)}``.
+    def grid_density(self, code: Code, axis: Tensor) -> Callable[[int, slice], Tensor]:
+        """The ``density`` of :meth:`query` at the points ``(axis[i], axis[j], axis[k])`` of one object, without
+        gradient: a function of a number ``i`` and a slice of ``j`` that gives ``(J, n)``.
 
-        axis: ``(n,)``.  A plane of features has ``n * n`` different points, and the heads' first layers are linear:
-        they are done on the three planes' points and added up.  Values differ from :meth:`query`'s by rounding.
+        axis: ``(n,)``, model units.  A plane of features has ``n * n`` different points, and the head's first layer is
+        linear: it is done on the three planes' points and added up.  Values differ from :meth:`query`'s by rounding.
+        Raises ValueError for a preset with point features, which belong to no plane.
         """
         if self.preset.point_features:
             raise ValueError(f"preset: expected one without point features, got {self.preset.point_features} of them")
@@ -179,15 +179,14 @@ class Reconstructor(nn.Module):
         a, b = (c.reshape(-1) for c in torch.meshgrid(at, at, indexing="ij"))
         xy, xz, _ = sample_triplane(code.triplane, torch.stack([a, b, b], -1)[None])[0].split(channels, -1)
         yz = sample_triplane(code.triplane, torch.stack([b, a, b], -1)[None])[0][:, 2 * channels :]
-        weight, bias = self.heads.first_layer(heads)
+        weight, bias = self.heads.first_layer(("density",))
         of_xy, of_xz, of_yz = (torch.mm(w, f.T).view(-1, n, n)
                                for w, f in zip(weight.split(channels, 1), (xy, xz, yz), strict=True))  # fmt: skip
         of_xy += bias[:, None, None]
 
-        def ask(i: int, j: slice) -> dict[str, Tensor]:
+        def ask(i: int, j: slice) -> Tensor:
             hidden = (of_yz[:, j] + of_xz[:, i, None]).add_(of_xy[:, i, j, None])
-            raw = self.heads.after_first(hidden.flatten(1), heads)
-            return {name: activate(name, value).reshape(-1, n, value.shape[-1]) for name, value in raw.items()}
+            return self.heads.after_first(hidden.flatten(1), ("density",))["density"].reshape(-1, n)
 
         return ask
 

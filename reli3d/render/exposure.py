@@ -24,7 +24,7 @@ def photograph_ratio(asset: Asset, images: Tensor, inside: Tensor, camera: Camer
 
     images: ``(V, H, W, 3)`` sRGB, at least ``STEP`` pixels a side.  inside: ``(V, H, W)`` bool, pixels that show
     nothing but the object.  camera: of all V.  scene: rays against the asset's faces.  Over a regular grid of pixels
-    at which the asset is hit and the photograph is not overexposed.  No gradient.
+    at which the asset is hit and the photograph is not overexposed.  No gradient.  Raises ValueError for fewer pixels.
     """
     first = STEP // 2
     seen, inside = srgb_to_linear(images[:, first::STEP, first::STEP]), inside[:, first::STEP, first::STEP]
