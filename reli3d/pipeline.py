@@ -63,6 +63,10 @@ UP = {  # rotations that carry an axis to +Y
 }
 
 
+class NoSurface(ValueError):
+    """The field of an object has one sign in its whole box."""
+
+
 @dataclass(frozen=True)
 class Prepared:
     """Views in the model's frame: the network's input, and maps of ``DETAIL`` pixels for what is read from the
@@ -101,7 +105,7 @@ def encode(model: Reconstructor, prepared: Prepared, *, background: bool = False
 def extract(model: Reconstructor, code: Code, maps: ViewMaps, resolution: int) -> Mesh:
     """Closed surface of the field on ``resolution`` cubes a side, without small loose pieces; model frame.
 
-    Raises ValueError where the field has no surface.
+    Raises NoSurface, a ValueError, where the field has none.
     """
     radius, masked = model.preset.radius, model.preset.silhouette_bound
     if masked:  # as many cubes on the space that matters
@@ -115,6 +119,9 @@ def extract(model: Reconstructor, code: Code, maps: ViewMaps, resolution: int) -
     else:
         level = grid_level(model, code, maps, flat[: resolution + 1, 2])
     level = torch.maximum(level.view(-1), bound).view((resolution + 1,) * 3)
+    low, high = (float(v) for v in torch.aminmax(level))
+    if low >= 0.0 or high < 0.0:
+        raise NoSurface(f"level: expected values on both sides of 0, got [{low:.4g}, {high:.4g}]: no surface")
     weights = {} if model.preset.log_level else _cube_weights(model, code, flat, level)
     mesh = extract_surface(level, radius=radius, **weights)
     mesh = largest_components(mesh, SMALLEST_PART)
@@ -295,7 +302,7 @@ def reconstruct(views: Views, *, weights: str | Reconstructor = "small", device:
     that comes first, or ``random``.  background: ``masked``, ``visible`` or ``auto``, see
     :func:`~reli3d.data.published_views.background_shown`.  timings: filled with seconds of each stage.  progress:
     called with the name of each stage.  The same input and seed give the same asset.  Raises ValueError on options
-    out of range and where the masks or the field hold no surface.
+    out of range and where the masks hold no object, NoSurface where the field holds none.
     """
     check_options(texture_size, resolution)
     model = weights if isinstance(weights, Reconstructor) else load_model(weights, device)

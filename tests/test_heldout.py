@@ -1,16 +1,22 @@
 """The measures on held-back objects: each against a case whose answer is known."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
 
 from reli3d.data.procedural import make_object
 from reli3d.data.synthesis import ObjectSurface, synthesize
+from reli3d.eval import heldout
 from reli3d.eval.heldout import evaluate, light_error, mean_environment, scaled_square_error, square_error, summary
 from reli3d.eval.heldout import table as table_of
+from reli3d.geometry.mesh import Mesh
 from reli3d.nn.reni import map_directions
 from reli3d.nn.weights import load_model
+from reli3d.pipeline import NoSurface
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
+from reli3d.render.environment import Environment
 
 
 def test_a_factor_a_channel_is_forgiven_and_a_pattern_is_not():
@@ -32,6 +38,26 @@ def test_two_ways_to_average():
     got = summary(rows)
     assert got["x_psnr"] == pytest.approx(30.0) and got["iou"] == pytest.approx(0.75) and got["objects"] == 2
     assert got["x_psnr_pooled"] == pytest.approx(-10 * np.log10((1e-2 + 1e-4) / 2), abs=1e-3)
+
+
+def test_an_empty_field_counts_as_nothing_found_and_spoils_no_mean(monkeypatch):
+    """A network without surface, then one whose object no camera sees where the truth is."""
+    seed = 1_000_000_002
+    sample = synthesize(ObjectSurface(make_object(seed)), torch.ones(32, 64, 3), np.random.default_rng(seed), views=12)
+
+    def none(*args, **kwargs):
+        raise NoSurface("level")
+
+    monkeypatch.setattr(heldout, "reconstruct", none)
+    row = evaluate(None, sample, seed, 4, torch.ones(32, 64, 3))
+    assert row == {"empty": 1.0, "iou": 0.0}
+    got = summary([row, {"empty": 0.0, "iou": 1.0, "x_mse": 1e-3}])
+    assert (got["objects"], got["empty"], got["iou"]) == (2, 0.5, 0.5) and got["x_psnr"] == pytest.approx(30.0)
+    mesh = Mesh(torch.eye(3) * 1e-3 + 50.0, torch.tensor([[0, 1, 2]], dtype=torch.int32))
+    away = SimpleNamespace(mesh=mesh, textures=None, environment=Environment(torch.ones(32, 64, 3)))
+    monkeypatch.setattr(heldout, "reconstruct", lambda *args, **kwargs: away)
+    row = evaluate(None, sample, seed, 4, torch.ones(32, 64, 3))
+    assert (row["empty"], row["iou"]) == (0.0, 0.0) and not any(key.endswith("mse") for key in row)
 
 
 @pytest.mark.slow

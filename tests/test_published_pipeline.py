@@ -20,7 +20,7 @@ from reli3d.nn.heads import deformation
 from reli3d.nn.model import Code, Reconstructor
 from reli3d.nn.published import our_key
 from reli3d.nn.weights import load_model, read_manifest, read_tensors, save
-from reli3d.pipeline import default_normalization, prepare, reconstruct
+from reli3d.pipeline import NoSurface, default_normalization, prepare, reconstruct
 from tests.test_nn_model import NANO, TINY, views
 
 EXAMPLE = load_views(infer.EXAMPLE, views=2)
@@ -157,12 +157,13 @@ def test_views_become_an_asset_without_looking_at_them_again(asset):
     assert bool(asset.environment.radiance.isfinite().all()) and asset.environment.radiance.shape == (64, 128, 3)
 
 
-def test_an_empty_field_is_an_error_and_not_a_box(tiny):
+@pytest.mark.parametrize("bias", [-50.0, 50.0])
+def test_a_field_of_one_sign_is_an_error_and_not_a_box(tiny, bias):
     empty = Reconstructor(TINY).eval()
     empty.load_state_dict(tiny.state_dict())
     with torch.no_grad():
-        empty.heads["density"][-1].bias.fill_(-50.0)
-    with pytest.raises(ValueError, match="no surface"):
+        empty.heads["density"][-1].bias.fill_(bias)
+    with pytest.raises(NoSurface, match=r"^level: expected values on both sides of 0, got \[.*\]: no surface$"):
         reconstruct(EXAMPLE, weights=empty, texture_size=256, resolution=16)
 
 

@@ -122,7 +122,7 @@ def test_a_batch_is_the_fields_one_by_one(device):
         (lambda: sign_entropy(torch.ones(3, 3, 1)), ValueError, "level"),
         (lambda: sign_entropy(torch.ones(3, 3, 3, dtype=torch.float64)), TypeError, "level"),
         (lambda: sign_entropy(torch.full((3, 3, 3), float("nan"))), ValueError, "level"),
-        (lambda: vertex_deviation(torch.ones(3, 3, 3), radius=1.0), ValueError, "level"),
+        (lambda: vertex_deviation(torch.ones(3, 3), radius=1.0), ValueError, "level"),
         (lambda: vertex_deviation(sphere(4), radius=-1.0), ValueError, "radius"),
         (lambda: vertex_deviation(sphere(4), radius=1.0, beta=torch.zeros(64, 12)), ValueError, "beta"),
         (lambda: vertex_deviation(sphere(4), radius=1.0, alpha=torch.ones(9, 8)), ValueError, "alpha"),

@@ -15,7 +15,7 @@ from PIL import Image
 from torch.nn.functional import grid_sample, normalize
 
 from reli3d.geometry.bake import bake, rasterize_texels
-from reli3d.geometry.mesh import Mesh
+from reli3d.geometry.mesh import Mesh, volume
 from reli3d.geometry.surface import extract_surface
 from reli3d.geometry.tangents import decode_normals, encode_normals, with_tangents
 from reli3d.geometry.uv import unwrap
@@ -99,12 +99,14 @@ def test_normal_and_material_maps_are_stored_without_loss(ball, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["allpos", "allneg"])
-def test_a_field_of_one_sign_is_an_error(goldens, name):
+def test_an_empty_field_has_no_faces_and_a_full_one_is_an_outward_box(goldens, name):
     data = np.load(goldens / "flexicubes_16.npz")
     assert len(data[f"{name}.f"]) > 0  # the release makes a box of it
     level = torch.from_numpy(data[f"{name}.level"]).view(17, 17, 17)
-    with pytest.raises(ValueError, match="no surface"):
-        extract_surface(level, radius=0.87)
+    release = Mesh(torch.from_numpy(data[f"{name}.v"]), torch.from_numpy(data[f"{name}.f"]).int())
+    assert float(volume(release)) < 0.0  # inward
+    ours = extract_surface(level, radius=0.5)
+    assert len(ours.faces) == 0 if name == "allpos" else float(volume(ours)) > 0.95  # of a box of volume 1
 
 
 def release_lookup(radiance: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:

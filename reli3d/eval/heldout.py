@@ -20,7 +20,7 @@ from reli3d.data.procedural import make_object
 from reli3d.data.synthesis import ObjectSurface
 from reli3d.geometry.rays import RayScene
 from reli3d.nn.model import Reconstructor
-from reli3d.pipeline import reconstruct
+from reli3d.pipeline import NoSurface, reconstruct
 from reli3d.render.camera import Camera, camera_rays
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.render.environment import Environment
@@ -90,8 +90,13 @@ def evaluate(
     """Figures of one object reconstructed from ``count`` views; colours are compared where truth and result are seen.
 
     ``*_mse`` are square errors of the base colour, ``single_*`` those of the best single colour of this very object.
+    ``empty`` is 1 where the field has no surface: IoU 0 and nothing else to compare.  Without a pixel that both cover
+    there are no colours.
     """
-    asset = reconstruct(sample_views(sample, count), weights=model, texture_size=512)
+    try:
+        asset = reconstruct(sample_views(sample, count), weights=model, texture_size=512)
+    except NoSurface:
+        return {"empty": 1.0, "iou": 0.0}
     scene, size = RayScene(asset.mesh.vertices, asset.mesh.faces), sample["images"].shape[1]
     chosen = range(INPUTS, INPUTS + UNSEEN)
     cameras = [Camera(sample["c2w"][i], sample["intrinsics"][i], size, size) for i in chosen]
@@ -105,24 +110,30 @@ def evaluate(
     target = sample["environment"].float()
     predicted = asset.environment.resized(len(target)).radiance
     exposure = target.mean() / mean_light.mean()
-    return {
+    found = {
+        "empty": 0.0,
         "iou": float(np.mean(ious)),
-        "base_color_mse": square_error(got, want),
-        "base_color_scaled_mse": scaled_square_error(got, want),
-        "single_color_mse": square_error(want.mean(0), want),
-        "single_color_scaled_mse": scaled_square_error(torch.ones_like(want), want),
         "light_error": light_error(predicted, target),
         "mean_light_error": light_error(mean_light * exposure, target),
     }
+    if len(got):
+        found |= {
+            "base_color_mse": square_error(got, want),
+            "base_color_scaled_mse": scaled_square_error(got, want),
+            "single_color_mse": square_error(want.mean(0), want),
+            "single_color_scaled_mse": scaled_square_error(torch.ones_like(want), want),
+        }
+    return found
 
 
 def summary(rows: list[dict[str, float]]) -> dict[str, float]:
-    """Means over objects.  A square error becomes two PSNRs [dB]: the mean over objects (``_psnr``), which objects of
-    nearly one colour rule, and that of the mean error (``_psnr_pooled``), which the colourful ones rule.
+    """Means over the objects that have the figure.  A square error becomes two PSNRs [dB]: the mean over objects
+    (``_psnr``), which objects of nearly one colour rule, and that of the mean error (``_psnr_pooled``), which the
+    colourful ones rule.
     """
     out = {"objects": len(rows)}
-    for key in rows[0]:
-        values = np.array([row[key] for row in rows])
+    for key in dict.fromkeys(key for row in rows for key in row):
+        values = np.array([row[key] for row in rows if key in row])
         if key.endswith("_mse"):
             name = key.removesuffix("_mse")
             out[f"{name}_psnr"] = round(float(np.mean(-10 * np.log10(values))), 4)

@@ -288,7 +288,8 @@ def to_trimesh(mesh: Mesh):
         uv = array(mesh.uv).astype(np.float64)
         visual = trimesh.visual.TextureVisuals(uv=np.stack([uv[:, 0], 1.0 - uv[:, 1]], -1))
     attributes = {} if mesh.tangents is None else {"tangents": array(mesh.tangents)}
-    return trimesh.Trimesh(array(mesh.vertices), array(mesh.faces).astype(np.int64), vertex_normals=array(mesh.normals),
+    normals = array(mesh.normals) if len(mesh.vertices) else None  # trimesh takes no normals of no vertices
+    return trimesh.Trimesh(array(mesh.vertices), array(mesh.faces).astype(np.int64), vertex_normals=normals,
                            visual=visual, vertex_attributes=attributes, process=False)  # fmt: skip
 
 

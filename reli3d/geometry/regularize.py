@@ -29,7 +29,8 @@ def vertex_deviation(
     The mean absolute deviation of the distances between a dual vertex and the zero crossings that it averages, which
     keeps the mean well inside its polygon and the faces free of folds; its mean is the loss.  Arguments, their checks
     and the order of the vertices (without centres) are those of :func:`reli3d.geometry.surface.extract_surface`.
-    Gradients reach level, deformation, alpha and beta; a distance of 0 gives none.
+    Gradients reach level, deformation, alpha and beta; a distance of 0 gives none.  A field without surface has no
+    vertex, so the result is empty and its mean NaN.
     """
     extent = surface.check_fields(level, radius, deformation, alpha, beta, None, cubes)
     t, padded, _ = surface.topology_of(level.detach().contiguous(), cubes, closed)

@@ -83,13 +83,17 @@ def extract_surface(
     Gradients reach level, deformation, alpha, beta and with ``centre`` gamma, by an own adjoint; the same bits for
     any number of CPU threads.
 
+    A level of one sign is no error.  All outside gives no vertices and no faces, with gradients of zero; all inside
+    gives the box with its edges cut off half a cube wide, like everything that reaches the border, or nothing where
+    ``closed`` is False.
+
     Left out: the tetrahedral volume mesh of the paper's section 4.5; the output is the surface alone, which a
     tetrahedraliser (TetGen, fTetWild) fills where a simulation needs it; and dual vertices placed by the field's
     gradient (the quadric error that the authors' code offers without weights).
     :mod:`reli3d.geometry.regularize` has the losses that keep a fitted surface sound.
 
-    Raises TypeError or ValueError on a wrong dtype, shape or device, on a level that is not finite or has one sign
-    only, on weights that are not positive.
+    Raises TypeError or ValueError on a wrong dtype, shape or device, on a level that is not finite, on weights that
+    are not positive.
     """
     extent = check_fields(level, radius, deformation, alpha, beta, gamma, cubes)
     topology, padded, crossed = topology_of(level.detach().contiguous(), cubes, closed)
@@ -132,9 +136,6 @@ def check_fields(level: Tensor, radius: float | Sequence[float], deformation: Te
                  beta: Tensor | None, gamma: Tensor | None, cubes: Tensor | None) -> list[float]:  # fmt: skip
     """Raise for what :func:`extract_surface` cannot take; returns the three radii."""
     _check_level(level)
-    low, high = (float(v) for v in torch.aminmax(level.detach()))
-    if not low < 0.0 <= high:
-        raise ValueError(f"level: expected values on both sides of 0, got [{low:.4g}, {high:.4g}]: no surface")
     size = tuple(n - 1 for n in level.shape)
     extent = [radius] * 3 if isinstance(radius, (int, float)) else list(radius)
     if len(extent) != 3 or not all(0.0 < r < float("inf") for r in extent):

@@ -21,7 +21,7 @@ from reli3d.data.normalize import Similarity
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene
 from reli3d.nn.model import Reconstructor
-from reli3d.pipeline import encode, extract, prepare
+from reli3d.pipeline import NoSurface, encode, extract, prepare
 from reli3d.render.camera import Camera, camera_rays
 from reli3d.train.pictures import sample_views
 
@@ -56,7 +56,7 @@ def calibrate(model: Reconstructor, samples: Path, *, objects: int = 32, seed: i
                 try:
                     mesh = extract(model, code, maps, plain.resolution)
                     rows[-1].append(agreement(mesh, sample, range(count, len(sample["images"]))))
-                except ValueError:  # nothing is left of the object
+                except NoSurface:  # nothing is left of the object
                     rows[-1].append((0.0, LOST))
         progress(f"{files[k].stem}: IoU {max(scores[FEW][-1])[0]:.3f}, {max(scores[MANY][-1])[0]:.3f}")
     found = {count: np.array(rows) for count, rows in scores.items()}  # (objects, offsets, 2)

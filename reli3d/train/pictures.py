@@ -14,7 +14,7 @@ from reli3d.data.views import Views
 from reli3d.eval.preview import preview
 from reli3d.io.images import write_png
 from reli3d.nn.model import Reconstructor
-from reli3d.pipeline import reconstruct
+from reli3d.pipeline import NoSurface, reconstruct
 
 WIDTH, HEIGHT, MARGIN = 420, 180, 34
 
@@ -73,7 +73,7 @@ def write_validation(model: Reconstructor, samples: list[Path], folder: Path) ->
             views = sample_views(sample, count)
             try:
                 row.append(preview(reconstruct(views, weights=model, texture_size=256), sample_views(sample, 4)))
-            except ValueError:  # early in training a field may hold no surface
+            except NoSurface:  # early in training
                 continue
         if row:
             rows.append(np.concatenate(row, 1))
