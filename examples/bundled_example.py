@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from reli3d.data.procedural import example_object, sample_cameras
-from reli3d.data.synthesis import EXPOSED, ObjectSurface
+from reli3d.data.synthesis import EXPOSED, PAINT, ObjectSurface
 from reli3d.io.images import write_png
 from reli3d.nn.reni import map_directions
 from reli3d.render.camera import Camera, camera_rays
@@ -54,7 +54,8 @@ def main(folder: Path) -> None:
         at = surface.at(hits.face[seen].long(), hits.bary[seen])
         image = light.lookup(directions)
         image[seen] = shade(at["position"], at["bump"], at["ng"], -directions[seen], at["base_color"], at["roughness"],
-                            at["metallic"], light, samples=SAMPLES, scene=surface.scene, seed=i)  # fmt: skip
+                            at["metallic"], light, samples=SAMPLES, scene=surface.scene, seed=i,
+                            paint=PAINT)  # fmt: skip
         if exposure is None:
             exposure = EXPOSED / float(image[seen].mean(-1).quantile(0.9))
         planes = torch.cat([(image * exposure).clamp(0, 1), (hits.face >= 0).float()[:, None]], -1)

@@ -39,11 +39,11 @@ def sample_ggx_vndf(wo: Tensor, alpha: Tensor, u: Tensor) -> Tensor:
 
 
 def eval_bsdf(wo: Tensor, wi: Tensor, base_color: Tensor, alpha: Tensor, metallic: Tensor,
-              paint: str = "published") -> Tensor:  # fmt: skip
+              paint: str = "conserving") -> Tensor:  # fmt: skip
     """Lambert below Schlick, GGX with height-correlated Smith; directions above the horizon.
 
-    The paint loses what the microfacet reflects, or, ``conserving``, what the surface does on the way in and out, with
-    1 - cos divided by 1 + alpha.
+    The paint loses what the surface reflects on the way in and out, with 1 - cos divided by 1 + alpha, or,
+    ``published``, what the microfacet does.
     """
     wm = torch.nn.functional.normalize(wo + wi, dim=-1)
     f0 = 0.04 * (1.0 - metallic[..., None]) + base_color * metallic[..., None]
@@ -80,7 +80,7 @@ def lookup_envmap(radiance: Tensor, d: Tensor) -> Tensor:
 
 
 def direct_light(normal: Tensor, wo: Tensor, base_color: Tensor, alpha: Tensor, metallic: Tensor, radiance: Tensor,
-                 height: int = 256, paint: str = "published") -> Tensor:  # fmt: skip
+                 height: int = 256, paint: str = "conserving") -> Tensor:  # fmt: skip
     """Radiance ``(3,)`` of one unshadowed point by midpoint quadrature over the sphere."""
     d, angle = sphere_grid(height)
     d = d[(d @ normal) > 1e-6]

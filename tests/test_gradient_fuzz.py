@@ -183,7 +183,7 @@ def test_gradients_of_the_estimator(device, strategy, paint):
     assert float((got[4].cpu() - g_texels).norm() / g_texels.norm()) < 1e-3
 
 
-@pytest.mark.parametrize("options", [{}, {"paint": "conserving", "heuristic": "power", "points": "random"},
+@pytest.mark.parametrize("options", [{}, {"paint": "published", "heuristic": "power", "points": "random"},
                                      {"antithetic": False, "clamp": 0.5}])  # fmt: skip
 @pytest.mark.parametrize("light", ["sun", "black"])
 def test_all_strategies_together_keep_their_gradients_finite(device, light, options):

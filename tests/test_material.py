@@ -96,7 +96,7 @@ def test_directions_in_and_below_the_horizon_and_extreme_parameters(device, pain
 
 
 def test_bad_paint_is_named(device):
-    with pytest.raises(ValueError, match="paint: expected one of published, conserving, got white"):
+    with pytest.raises(ValueError, match="paint: expected one of conserving, published, got white"):
         eval_bsdf(*(v.to(device) for v in pairs(4)), paint="white")
 
 

@@ -30,9 +30,9 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--samples", type=int, nargs=3, default=(20, 40, 4), metavar=("ENV", "GGX", "COS"),
                    help="per subpixel, by strategy (default 20 40 4)")  # fmt: skip
     p.add_argument("--supersampling", type=int, default=2, help="subpixels along a side of a pixel (default 2)")
-    p.add_argument("--paint", choices=("published", "conserving"), default="published",
-                   help="what the coat leaves to the paint: published (white paint gains light at grazing angles) or "
-                   "conserving (no surface sends out more than it gets)")  # fmt: skip
+    p.add_argument("--paint", choices=("conserving", "published"), default="conserving",
+                   help="what the coat leaves to the paint: conserving (default; no surface sends out more than it "
+                   "gets) or published (glTF viewers' formula; white paint gains light at grazing angles)")  # fmt: skip
     p.add_argument("--background", choices=("transparent", "environment"), default="transparent")
     p.add_argument("--tone", choices=("srgb", "agx", "none"), default="srgb",
                    help="display transform of png and webp; none writes linear values")  # fmt: skip

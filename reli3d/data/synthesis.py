@@ -36,6 +36,7 @@ from reli3d.render.environment import Environment
 from reli3d.render.shading import shade
 
 SAMPLES = (16, 12, 4)  # light, GGX and cosine samples a pixel: the noise left is below that of a photograph
+PAINT = "published"  # what the shipped weights learned from, and what viewers show of an asset
 EXPOSED = 0.6  # linear value of the 90th percentile of the object in the first view
 VOLUME_POINTS, SURFACE_POINTS, PIXELS = 16384, 8192, 1024
 
@@ -104,7 +105,7 @@ def _render(surface: Surface, camera: Camera, light: Environment, seed: int):
     at = surface.at(hits.face[seen].long(), hits.bary[seen])
     wo = -directions[seen]
     radiance = shade(at["position"], at["bump"], at["ng"], wo, at["base_color"], at["roughness"], at["metallic"], light,
-                     samples=SAMPLES, scene=surface.scene, seed=seed)  # fmt: skip
+                     samples=SAMPLES, scene=surface.scene, seed=seed, paint=PAINT)  # fmt: skip
     image = light.lookup(directions)
     image[seen] = radiance
     return image, seen, at, wo, radiance

@@ -1,10 +1,11 @@
 """Metallic-roughness material in the local frame: normal +z, ``wo`` to the viewer, ``wi`` to the light, both unit.
 
-f = (1 - F) (1 - metallic) base / pi + D G2 F / (4 cos_o cos_i), F = F0 + (1 - F0)(1 - wo.wm)^5 (Schlick 1994),
+f = T (1 - metallic) base / pi + D G2 F / (4 cos_o cos_i), F = F0 + (1 - F0)(1 - wo.wm)^5 (Schlick 1994),
 F0 = 0.04 for dielectrics and the base colour for metals.  Linear Rec. 709; values are 1/sr and lack the cosine.
-This is the published model's, in which paint and coat of a white dielectric together exceed 1 at grazing views
-(docs/renderer.md).  ``conserving`` takes what the coat leaves to the paint at the surface instead, once on the way in
-and once on the way out, after Shirley et al. 1997: (1 - F(c_o)) (1 - F(c_i)), 1 - c = (1 - cos) / (1 + alpha).
+T is what the coat leaves to the paint.  ``conserving`` takes it at the surface, once on the way in and once on the way
+out, after Shirley et al. 1997: T = (1 - F(c_o)) (1 - F(c_i)), 1 - c = (1 - cos) / (1 + alpha).  The published model
+and glTF 2.0's appendix B take T = 1 - F of the microfacet, with which paint and coat of a white dielectric together
+exceed 1 at grazing views (docs/renderer.md).
 """
 
 import warp as wp

@@ -13,7 +13,7 @@ from reli3d._bridge import call, check, empty, launch
 from reli3d.kernels import bsdf as kernels
 from reli3d.render.sampling import mirror, reflect, sample_cosine, sample_ggx_vndf
 
-PAINTS = ("published", "conserving")  # what the coat leaves to the paint: reli3d.kernels.bsdf
+PAINTS = ("conserving", "published")  # what the coat leaves to the paint: reli3d.kernels.bsdf
 
 
 def _flat(items: list[tuple[str, Tensor, int]]) -> tuple[torch.Size, list[Tensor]]:
@@ -34,16 +34,17 @@ def choice(name: str, value: str, allowed: tuple[str, ...]) -> int:
 
 
 def eval_bsdf(
-    wo: Tensor, wi: Tensor, base_color: Tensor, alpha: Tensor, metallic: Tensor, *, paint: str = "published"
+    wo: Tensor, wi: Tensor, base_color: Tensor, alpha: Tensor, metallic: Tensor, *, paint: str = "conserving"
 ) -> Tensor:
     """Value ``(..., 3)`` [1/sr] without the cosine; 0 below the horizon on either side.
 
     wo, wi: ``(..., 3)`` unit.  base_color: ``(..., 3)`` linear in [0, 1].  alpha, metallic: ``(...)``.  Leading axes
-    broadcast.  paint: what the coat leaves to the paint below it, ``published`` (1 - F of the microfacet) or
-    ``conserving`` (1 - F of the surface on the way in and out), which never sends out more than comes in.  Gradients
-    reach all five; that of ``alpha`` is 0 below ``ALPHA_MIN`` = 1e-3.  Raises ValueError for another ``paint``.
+    broadcast.  paint: what the coat leaves to the paint below it, ``conserving`` (1 - F of the surface on the way in
+    and out), which never sends out more than comes in, or ``published`` (1 - F of the microfacet), the formula of the
+    published model's shader and of glTF 2.0's appendix B.  Gradients reach all five; that of ``alpha`` is 0 below
+    ``ALPHA_MIN`` = 1e-3.  Raises ValueError for another ``paint``.
     """
-    conserving = choice("paint", paint, PAINTS)
+    conserving = int(choice("paint", paint, PAINTS) == 0)
     batch, flat = _flat([("wo", wo, 3), ("wi", wi, 3), ("base_color", base_color, 3), ("alpha", alpha, 0),
                          ("metallic", metallic, 0)])  # fmt: skip
     kinds = (wp.vec3, wp.vec3, wp.vec3, wp.float32, wp.float32)

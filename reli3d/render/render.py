@@ -50,15 +50,15 @@ def render(
     background: str = "transparent",
     scene: RayScene | None = None,
     clamp: float | None = None,
-    paint: str = "published",
+    paint: str = "conserving",
     progress: Callable[[float], None] | None = None,
 ) -> Render:
     """Image of ``asset`` under ``environment`` (default: the asset's own) with direct light and shadows.
 
     asset: one, or the parts of one that cast shadows on each other.  camera: one camera, no batch.  supersampling:
     side of the subpixel grid; ``samples`` are per subpixel.  background: ``transparent`` or ``environment``.  scene:
-    rays against :func:`joined_scene`, made here if None.  samples, seed, clamp, paint (``published`` or
-    ``conserving``): as for :func:`reli3d.render.shading.shade`.  progress: called with the fraction done.  Gradients
+    rays against :func:`joined_scene`, made here if None.  samples, seed, clamp, paint (``conserving`` or
+    ``published``): as for :func:`reli3d.render.shading.shade`.  progress: called with the fraction done.  Gradients
     reach textures, mesh attributes and environment where ``shade`` has them; silhouettes have none.  Raises ValueError
     without any environment.
     """

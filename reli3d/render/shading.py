@@ -41,7 +41,7 @@ def shade(
     heuristic: str = "balance",
     points: str = "halton",
     alpha: str = "squared",
-    paint: str = "published",
+    paint: str = "conserving",
     clamp: float | None = None,
     pixels: Tensor | None = None,
 ) -> Tensor:
@@ -54,7 +54,7 @@ def shade(
     that casts shadows, None for none.  antithetic: visible normals in pairs, the partner mirrored about the normal,
     weighted with its own density.  heuristic: ``balance`` or ``power``.  points: ``halton`` (rotated per point and
     strategy) or ``random``.  alpha: GGX width from roughness, ``squared`` or, as in the published model's shader,
-    ``linear``.  paint: what the coat leaves to the paint, ``published`` or ``conserving``, as in
+    ``linear``.  paint: what the coat leaves to the paint, ``conserving`` or ``published``, as in
     :func:`reli3d.render.material.eval_bsdf`.  clamp: largest value of one sample times its strategy's count, per
     channel.
 
@@ -105,7 +105,7 @@ def shade_light(
     scene: RayScene | None = None,
     seed: int = 0,
     points: str = "halton",
-    paint: str = "published",
+    paint: str = "conserving",
 ) -> Tensor:
     """:func:`shade` with radiance asked of ``light`` in each sample's direction instead of read from a map, ``(N, 3)``.
 
@@ -254,7 +254,7 @@ def _plan(samples, seed, antithetic, heuristic, points, paint, clamp, scene):
     plan.antithetic = int(antithetic)
     plan.power = choice("heuristic", heuristic, ("balance", "power"))
     plan.rotate = 1 - choice("points", points, ("halton", "random"))
-    plan.conserving = choice("paint", paint, PAINTS)
+    plan.conserving = int(choice("paint", paint, PAINTS) == 0)
     plan.seed = int(seed) & 0x7FFFFFFF
     plan.clamp = float("inf") if clamp is None else float(clamp)
     plan.scale = 0.0 if scene is None else scene.scale

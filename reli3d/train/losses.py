@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from reli3d.data.synthesis import PAINT
 from reli3d.nn.field import LIGHT_ROWS, bound_level, object_shading, surface_level, surface_material
 from reli3d.nn.model import Code, Reconstructor
 from reli3d.nn.shading import Shading
@@ -111,7 +112,7 @@ def _image_loss(model: Reconstructor, code: Code, maps: ViewMaps, batch: Batch, 
     got = surface_material(model, code, maps, position, normal, batch.visible[b, near], known)
     shading = radial_bump(position, normal, got["normal"])
     radiance = shade(position, shading, normal, wo, srgb_to_linear(got["base_color"]), got["roughness"][:, 0],
-                     got["metallic"][:, 0], Environment(light), samples=IMAGE_SAMPLES, seed=b)  # fmt: skip
+                     got["metallic"][:, 0], Environment(light), samples=IMAGE_SAMPLES, seed=b, paint=PAINT)  # fmt: skip
     return (torch.log1p(radiance) - torch.log1p(batch.pixel_radiance[b])).abs().mean()
 
 
