@@ -39,6 +39,7 @@ from reli3d.render.shading import shade
 VIEWS, TEXELS, LIGHT_ROWS = 16, 192, 32
 BATCH = 12288  # pixels a step
 SAMPLES = (16, 16, 4)  # a pixel and step; the noise of a step is that of its pixels' subpixel places anyway
+PAINT = "published"  # nearer to Mitsuba's ``principled`` than the default: true maps relit at 32.6 instead of 28.5 dB
 CAPTURE, UNSEEN = "aerodynamics_workshop", "leadenhall_market"
 
 
@@ -183,7 +184,7 @@ def fit(asset: Asset, views: list[Camera], images: torch.Tensor, steps: int, rep
 
         def image(seed, points=points, wo=wo, light=light):
             return shade(points.position, points.normal, points.ng, wo, points.base_color, points.roughness,
-                         points.metallic, light, samples=SAMPLES, scene=scene, seed=seed)  # fmt: skip
+                         points.metallic, light, samples=SAMPLES, scene=scene, seed=seed, paint=PAINT)  # fmt: skip
 
         slope = image(2 * step)
         with torch.no_grad():
@@ -216,8 +217,8 @@ def scale_to(got: torch.Tensor, want: torch.Tensor) -> torch.Tensor:
 
 def row_of_picture(asset: Asset, camera: Camera, unseen: Environment, own: Environment, exposures, size: int):
     """Tiles of one row: base colour, roughness, metallic, under its own light, under the unseen one, its light."""
-    image = render(asset, camera, own, samples=(64, 64, 8), supersampling=2)
-    relit = render(asset, camera, unseen, samples=(64, 64, 8), supersampling=2)
+    image = render(asset, camera, own, samples=(64, 64, 8), supersampling=2, paint=PAINT)
+    relit = render(asset, camera, unseen, samples=(64, 64, 8), supersampling=2, paint=PAINT)
     grey = lambda v: v[..., None].expand(-1, -1, 3) * (image.alpha > 0)[..., None]  # noqa: E731
     sky = torch.nn.functional.interpolate(own.radiance.permute(2, 0, 1)[None], (size // 2, size), mode="area")[0]
     sky = torch.nn.functional.pad(sky.permute(1, 2, 0), (0, 0, 0, 0, size // 4, size - size // 2 - size // 4))
@@ -287,7 +288,7 @@ def judge_results(args, asset, judge, images, unknowns, capture, unseen) -> int:
         values = []
         for v in tests:
             want = judge.image(v, unseen, args.truth_samples)
-            got = render(subject, v, unseen, samples=(64, 64, 8), supersampling=3)
+            got = render(subject, v, unseen, samples=(64, 64, 8), supersampling=3, paint=PAINT)
             values.append(
                 psnr(shown(got.radiance, exposure[1]), shown(want[..., :3], exposure[1]), want[..., 3] > 0.999)
             )

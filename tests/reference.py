@@ -9,6 +9,17 @@ import torch
 from torch import Tensor
 
 
+def share_within(got: Tensor, want: Tensor, relative: float = 1e-4) -> float:
+    """Share of the entries of ``got`` that lie within ``relative`` of the float64 ``want``.
+
+    Entries below a thousandth of the mean magnitude are judged as if they had that: float32 sums leave them no digits.
+    """
+    got, want = (v.detach().cpu().double().reshape(-1) for v in (got, want))
+    floor = 1e-3 * float(want.abs().mean()) if want.numel() else 0.0
+    near = (got - want).abs() <= relative * want.abs().clamp(min=floor)
+    return float(near.double().mean()) if want.numel() else 1.0
+
+
 def ggx_ndf(wm: Tensor, alpha: Tensor) -> Tensor:
     """Walter et al. 2007, eq. 33, in the tangent form."""
     cos2 = wm[..., 2] ** 2

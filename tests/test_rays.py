@@ -8,8 +8,9 @@ import torch
 import trimesh
 
 from reli3d import kernels
-from reli3d.geometry.rays import RayScene, offset_origin
+from reli3d.geometry.rays import Hits, RayScene, offset_origin
 from reli3d.render.gbuffer import evaluate_hits, hit_normals, interpolate
+from tests import reference
 
 BACKENDS = ["embree", "warp"]
 
@@ -76,17 +77,29 @@ def test_hits_are_those_of_float64_brute_force(device, backend, scale, shift):
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_rays_at_edges_and_vertices_of_a_closed_mesh_do_not_leak(device, backend):
-    mesh = trimesh.creation.icosphere(subdivisions=4)
-    scene = make(mesh.vertices, mesh.faces, backend, device)
-    rng = np.random.default_rng(1)
-    origin = rng.uniform(-0.3, 0.3, (40_000, 3))
-    vertex = mesh.vertices[rng.integers(0, len(mesh.vertices), len(origin))]
-    pair = mesh.vertices[mesh.edges_unique[rng.integers(0, len(mesh.edges_unique), len(origin))]]
-    edge = pair[:, 0] + (pair[:, 1] - pair[:, 0]) * rng.random((len(origin), 1))
-    for target, limit in ((vertex, 5e-3), (edge, 3e-4)):  # measured: 0.4 % of either backend, 0.006 % of Warp
-        d = torch.tensor(target - origin, dtype=torch.float32, device=device)
-        hits = scene.closest(torch.tensor(origin, dtype=torch.float32, device=device), d)
-        assert (hits.face < 0).float().mean() <= limit
+    """Aimed in float64 at the float32 mesh.  At most 0.5 % of the rays at vertices and 0.02 % of those at edges miss
+    (the exact ray, rounded, passes beside one face and may pass beside its neighbour too); every hit is where it was
+    aimed at, on a face that the float64 oracle hits there."""
+    mesh, n = trimesh.creation.icosphere(subdivisions=4), 200_000
+    scene, rng = make(mesh.vertices, mesh.faces, backend, device), np.random.default_rng(1)
+    v = np.asarray(mesh.vertices, np.float32).astype(np.float64)
+    origin = rng.uniform(-0.3, 0.3, (n, 3)).astype(np.float32)
+    pair = v[mesh.edges_unique[rng.integers(0, len(mesh.edges_unique), n)]]
+    edge = pair[:, 0] + (pair[:, 1] - pair[:, 0]) * rng.random((n, 1))
+    for target, limit in ((v[rng.integers(0, len(v), n)], 5e-3), (edge, 2e-4)):  # measured: 0.37 %; 0 and 0.004 %
+        o, d = torch.tensor(origin), torch.tensor(target - origin, dtype=torch.float32)
+        hits = scene.closest(o.to(device), d.to(device))
+        face, t, bary = hits.face.cpu(), hits.t.cpu().double(), hits.bary.cpu()
+        hit = face >= 0
+        assert float((~hit).float().mean()) <= limit
+        assert float((t[hit] - 1.0).abs().max()) < 1e-5
+        assert torch.equal(scene.occluded(o.to(device), d.to(device)).cpu(), hit)
+        a, b, c = (torch.tensor(v)[torch.tensor(mesh.faces)[face[hit].long(), k]] for k in range(3))
+        system = torch.stack([b - a, c - a, -d[hit].double()], -1)
+        u, w, exact = torch.linalg.solve(system, o[hit].double() - a).unbind(-1)
+        assert float(torch.stack([u, w, 1 - u - w]).min()) > -1e-5  # 1e-7 of a position over faces of 0.07
+        assert float((exact - t[hit]).abs().max()) < 1e-5
+        torch.testing.assert_close(torch.stack([u, w], -1).float(), bary[hit], rtol=0, atol=1e-4)
 
 
 def test_backends_agree_on_a_million_ray_queries(device):
@@ -176,34 +189,43 @@ def test_offset_rays_do_not_hit_their_own_face(device, backend, scale, shift):
     assert int((hits.face == face).sum()) == 0
 
 
-def test_reevaluated_hit_and_its_gradients_equal_float64(device):
-    vertices, faces = soup(7, 30)
-    o, d = rays(4000, 4)
+def test_reevaluated_hits_and_their_gradients_equal_float64(device):
+    """Any hit, grazing ones too, to 1e-4 in 99.9 % of the entries of values and of slopes in vertices, origins and
+    directions; judged each for itself, because a sum of several lets an error hide behind another's size."""
+    vertices, faces = soup(7, 400)
+    o, d = rays(40_000, 4)
     v, f = torch.tensor(vertices, device=device), torch.tensor(faces, device=device)
     hits = RayScene(v, f).closest(o.to(device), d.to(device))
-    p = torch.cross(d, (v[f[hits.face.long(), 2].long()] - v[f[hits.face.long(), 0].long()]).cpu(), dim=-1)
-    e = (v[f[hits.face.long(), 1].long()] - v[f[hits.face.long(), 0].long()]).cpu()
-    steep = (hits.face >= 0).cpu() & ((p * e).sum(-1).abs() > 0.05)  # at grazing rays float32 has no digits left
-    face, o, d = hits.face[steep.to(device)], o[steep], d[steep]
-    ins = [t.to(device).requires_grad_() for t in (torch.tensor(vertices), o, d)]
-    some = type(hits)(face, hits.t[steep.to(device)], hits.bary[steep.to(device)])
-    got = evaluate_hits(ins[0], f, some, ins[1], ins[2])
-    torch.testing.assert_close(got.t, some.t, rtol=1e-4, atol=1e-5)
-    torch.testing.assert_close(got.bary, some.bary, rtol=0, atol=1e-4)
-    position = interpolate(ins[0], f, face, got.bary)
+    seen = hits.face >= 0
+    hits = Hits(hits.face[seen], hits.t[seen], hits.bary[seen])
+    ins = [t.to(device).requires_grad_() for t in (v, o[seen.cpu()], d[seen.cpu()])]
+    got = evaluate_hits(ins[0], f, hits, ins[1], ins[2])
+    own = {"t": got.t[:, None], "bary": got.bary, "position": ins[1] + got.t[:, None] * ins[2],
+           "interpolated": interpolate(ins[0], f, hits.face, got.bary),
+           "normal": hit_normals(ins[0], f, hits.face)}  # fmt: skip
     twin = [t.detach().cpu().double().requires_grad_() for t in ins]
-    a, b, c = (twin[0][f.cpu().long()[face.cpu().long(), k]] for k in range(3))
-    system = torch.stack([b - a, c - a, -twin[2]], -1)  # a + u e1 + v e2 = o + t d
-    uvt = torch.linalg.solve(system, twin[1] - a)
+    a, b, c = (twin[0][f.cpu().long()[hits.face.cpu().long(), k]] for k in range(3))
+    uvt = torch.linalg.solve(torch.stack([b - a, c - a, -twin[2]], -1), twin[1] - a)  # a + u e1 + v e2 = o + t d
     spot = twin[1] + uvt[:, 2:] * twin[2]
-    weight = torch.randn(len(o), 6, generator=torch.Generator().manual_seed(1))
-    total = torch.cat([got.t[:, None], got.bary, position], -1)
-    want = torch.cat([uvt[:, 2:], uvt[:, :2], spot], -1)
-    torch.testing.assert_close(total.cpu().double(), want, rtol=1e-4, atol=1e-4)
-    grads = torch.autograd.grad((total * weight.to(device)).sum(), ins)
-    truth = torch.autograd.grad((want * weight.double()).sum(), twin)
-    for g, t in zip(grads, truth, strict=True):
-        torch.testing.assert_close(g.cpu().double(), t, rtol=2e-3, atol=2e-3 * float(t.abs().mean()) + 1e-3)
+    want = {"t": uvt[:, 2:], "bary": uvt[:, :2], "position": spot, "interpolated": spot,
+            "normal": torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1)}  # fmt: skip
+    sine = (torch.linalg.det(torch.stack([b - a, c - a, twin[2]], -1)).abs() / ((b - a).norm(dim=-1)
+            * (c - a).norm(dim=-1) * twin[2].norm(dim=-1))).detach()  # fmt: skip
+    steep = sine > 0.01  # what the ray query itself says of t and bary errs by 1e-7 over that
+    torch.testing.assert_close(got.t.cpu()[steep], hits.t.cpu()[steep], rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(got.bary.cpu()[steep], hits.bary.cpu()[steep], rtol=0, atol=2e-4)
+    assert len(sine) > 10_000 and float(sine.min()) < 2e-3
+    weight = torch.randn(len(sine), 3, generator=torch.Generator().manual_seed(1))
+    for name, value in own.items():
+        assert reference.share_within(value, want[name]) >= 0.999, name
+        w = weight[:, : value.shape[1]]
+        grads = torch.autograd.grad((value * w.to(device)).sum(), ins, retain_graph=True, allow_unused=True)
+        truth = torch.autograd.grad((want[name] * w.double()).sum(), twin, retain_graph=True, allow_unused=True)
+        assert (grads[1] is None) == (name == "normal")
+        # interpolated: two float32 paths to a vertex, along and across the face, whose large parts cancel
+        limit = 5e-4 if name == "interpolated" else 1e-4
+        for k, (g, t) in enumerate(zip(grads, truth, strict=True)):
+            assert g is None or reference.share_within(g, t, limit if k == 0 else 1e-4) >= 0.999, (name, k)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

@@ -1,5 +1,8 @@
 """Values at known hits: vertex attributes, geometric normals and textures, all with gradients.
 
+Normals and re-evaluated hits are computed in float64, and their adjoints too: differences of float32 positions cancel,
+and a slope goes with the square of what is left.
+
 ``bary`` are the weights of vertices 1 and 2 of a face.  Face -1 is a miss: value 0, no gradient.  Textures are bilinear
 between texel centres at ((column + .5) / T, (row + .5) / T) and repeat in both axes (glTF's default wrap).
 """
@@ -8,15 +11,9 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": True, "cpu_compiler_flags": "-march=native"})
 
-EDGE_ON = wp.constant(1.0e-6)  # sine of a ray to a face times that of its angle; float32 leaves 2e-8 over it of t
-AREA_TINY = wp.constant(1.0e-30)  # squared cross product of a face that has no normal
-
-
-@wp.func
-def face_cross(vertices: wp.array(dtype=wp.vec3), faces: wp.array2d(dtype=wp.int32), f: int) -> wp.vec3:
-    """Outward normal of a counter-clockwise face, its length twice the area."""
-    a = vertices[faces[f, 0]]
-    return wp.cross(vertices[faces[f, 1]] - a, vertices[faces[f, 2]] - a)
+EDGE_ON = wp.constant(wp.float64(1.0e-6))  # sine of a ray to a face times that of its angle: below, a ray query cannot
+AREA_TINY = wp.constant(wp.float64(1.0e-30))  # squared cross product of a face that has no normal
+ONE = wp.constant(wp.float64(1.0))
 
 
 @wp.func
@@ -90,14 +87,16 @@ def hit_normal_kernel(
     # out
     out: wp.array(dtype=wp.vec3),
 ):  # fmt: skip
+    """Outward normal of a counter-clockwise face."""
     i = start + wp.tid()
     f = face[i]
     out[i] = wp.vec3(0.0, 0.0, 0.0)
     if f >= 0:
-        c = face_cross(vertices, faces, f)
+        a = wp.vec3d(vertices[faces[f, 0]])
+        c = wp.cross(wp.vec3d(vertices[faces[f, 1]]) - a, wp.vec3d(vertices[faces[f, 2]]) - a)
         square = wp.dot(c, c)
         if square > AREA_TINY:
-            out[i] = c / wp.sqrt(square)
+            out[i] = wp.vec3(c / wp.sqrt(square))
 
 
 @wp.kernel
@@ -112,24 +111,24 @@ def reevaluate_kernel(
 ):  # fmt: skip
     """Ray against the plane of a known face.  Moller and Trumbore 1997, without their early exits.
 
-    A miss, and a face that float32 cannot tell from one seen edge on, keep what the hit has, without gradient."""
+    A miss, and a face that the ray query cannot tell from one seen edge on, keep what the hit has, without gradient."""
     i = start + wp.tid()
     f = face[i]
     t[i] = hit_t[i]
     bary[i] = hit_bary[i]
     if f >= 0:
-        a = vertices[faces[f, 0]]
-        d = directions[i]
-        e1 = vertices[faces[f, 1]] - a
-        e2 = vertices[faces[f, 2]] - a
-        s = origins[i] - a
+        a = wp.vec3d(vertices[faces[f, 0]])
+        d = wp.vec3d(directions[i])
+        e1 = wp.vec3d(vertices[faces[f, 1]]) - a
+        e2 = wp.vec3d(vertices[faces[f, 2]]) - a
+        s = wp.vec3d(origins[i]) - a
         p = wp.cross(d, e2)
         q = wp.cross(s, e1)
         det = wp.dot(e1, p)
         if wp.abs(det) > EDGE_ON * wp.length(e1) * wp.length(e2) * wp.length(d):
-            inverse = 1.0 / det
-            t[i] = wp.dot(e2, q) * inverse
-            bary[i] = wp.vec2(wp.dot(s, p) * inverse, wp.dot(d, q) * inverse)
+            inverse = ONE / det
+            t[i] = wp.float32(wp.dot(e2, q) * inverse)
+            bary[i] = wp.vec2(wp.float32(wp.dot(s, p) * inverse), wp.float32(wp.dot(d, q) * inverse))
 
 
 @wp.kernel

@@ -77,8 +77,10 @@ def evaluate_hits(vertices: Tensor, faces: Tensor, hits: Hits, origins: Tensor, 
     """The hits with ``t`` and ``bary`` re-evaluated from their faces, so that gradients flow.
 
     vertices: ``(V, 3)``.  faces: ``(F, 3)`` int32.  origins, directions: ``(..., 3)`` of the rays that gave ``hits``.
-    Gradients reach vertices, origins and directions; which face is hit has none.  A face thinner, or seen more edge on,
-    than float32 can tell keeps the hit as it was, with gradient 0.  Moller and Trumbore 1997.
+    Gradients reach vertices, origins and directions; which face is hit has none.  Computed in float64, the adjoint too;
+    a face thinner, or seen more edge on, than a ray query can tell keeps the hit as it was, with gradient 0.  The point
+    is ``origins + t directions``; its slope in the vertices has more digits than that of interpolated positions, whose
+    parts along the face cancel.  Moller and Trumbore 1997.
     """
     check("vertices", vertices, last=3)
     _check_faces(vertices.shape[0], faces, hits.face, vertices)
