@@ -27,8 +27,11 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--fov", type=float, default=32.0, help="horizontal field of view in degrees")
     p.add_argument("--distance", type=float, help="from the centre of the object (default: it fills the view)")
     p.add_argument("--size", type=int, default=512, help="pixels along a side (default 512)")
-    p.add_argument("--samples", type=int, nargs=3, default=(20, 40, 4), metavar=("ENV", "GGX", "COS"),
-                   help="per subpixel, by strategy (default 20 40 4)")  # fmt: skip
+    counts = p.add_mutually_exclusive_group()
+    counts.add_argument("--samples", type=int, nargs=3, default=(20, 40, 4), metavar=("ENV", "GGX", "COS"),
+                        help="per subpixel, by strategy (default 20 40 4)")  # fmt: skip
+    counts.add_argument("--plan", type=int, metavar="TOTAL", help="so many per subpixel, shared among the strategies "
+                        "for the least noise of the first view; the counts go to stderr")  # fmt: skip
     p.add_argument("--supersampling", type=int, default=2, help="subpixels along a side of a pixel (default 2)")
     p.add_argument("--paint", choices=("conserving", "published"), default="conserving",
                    help="what the coat leaves to the paint: conserving (default; no surface sends out more than it "
@@ -58,8 +61,8 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _check(args: argparse.Namespace) -> None:
-    for name, low, high in (("frames", 1, 3600), ("size", 1, 8192), ("supersampling", 1, 16)):
-        if not low <= getattr(args, name) <= high:
+    for name, low, high in (("frames", 1, 3600), ("size", 1, 8192), ("supersampling", 1, 16), ("plan", 1, 65536)):
+        if getattr(args, name) is not None and not low <= getattr(args, name) <= high:
             raise ValueError(f"--{name}: expected {low} to {high}, got {getattr(args, name)}")
     if not 1.0 <= args.fov <= 150.0:
         raise ValueError(f"--fov: expected 1 to 150 degrees, got {args.fov}")
@@ -79,7 +82,7 @@ def render_files(args: argparse.Namespace) -> list[Path]:
     from reli3d.render.asset import Asset, TextureSet
     from reli3d.render.camera import Camera, look_at
     from reli3d.render.environment import Environment
-    from reli3d.render.render import joined_scene, render
+    from reli3d.render.render import joined_scene, plan_render, render
 
     device = torch.device(args.device)
     parts = []
@@ -94,7 +97,7 @@ def render_files(args: argparse.Namespace) -> list[Path]:
     distance = args.distance or 1.02 * radius / math.sin(math.radians(args.fov) / 2)
     up = torch.tensor([0.0, 1.0, 0.0], device=device)
     args.output.mkdir(parents=True, exist_ok=True)
-    written, animation = [], []
+    written, animation, counts = [], [], {"samples": tuple(args.samples)}
     bar = tqdm(total=args.frames, unit="frame", file=sys.stderr, disable=not sys.stderr.isatty())
     for frame in range(args.frames):
         turn = 2.0 * math.pi * frame / args.frames
@@ -103,10 +106,14 @@ def render_files(args: argparse.Namespace) -> list[Path]:
         offset = [math.cos(lift) * math.sin(azimuth), math.sin(lift), math.cos(lift) * math.cos(azimuth)]
         eye = centre + distance * torch.tensor(offset, device=device)
         camera = Camera.from_fov(look_at(eye, centre, up), math.radians(args.fov), args.size, args.size)
+        shown = {"scene": scene, "shadows": not args.no_shadows, "paint": args.paint}
+        if args.plan is not None and frame == 0:
+            plan = plan_render(parts, camera, environment, total=args.plan, seed=args.seed, **shown)
+            counts = {"samples": plan.samples, "antithetic": False}
+            print("reli3d-render: samples by strategy", *plan.samples, file=sys.stderr)
         image = render(
-            parts, camera, environment if args.turn == "camera" else environment.rotated(turn),
-            samples=tuple(args.samples), supersampling=args.supersampling, seed=args.seed + frame,
-            shadows=not args.no_shadows, background=args.background, scene=scene, paint=args.paint,
+            parts, camera, environment if args.turn == "camera" else environment.rotated(turn), **counts, **shown,
+            supersampling=args.supersampling, seed=args.seed + frame, background=args.background,
         )  # fmt: skip
         stem = args.output / (args.glb.stem if args.frames == 1 else f"{args.glb.stem}_{frame:04d}")
         if args.format == "exr":

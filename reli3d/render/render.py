@@ -10,12 +10,14 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from reli3d.geometry.rays import RayScene
+from reli3d.render.allocation import SamplePlan, plan_samples, spread_rows
 from reli3d.render.asset import Asset
 from reli3d.render.camera import Camera, camera_rays
 from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import SurfacePoints, surface_points
 from reli3d.render.shading import SAMPLES, shade
 
+PLAN_RAYS = 4096  # of a view, to find the points of a plan's pilot among
 BAND_RAYS = 1 << 18  # rays of one band of rows: bounds memory at about 40 MB whatever the image size
 
 
@@ -46,6 +48,7 @@ def render(
     samples: tuple[int, int, int] = SAMPLES,
     supersampling: int = 1,
     seed: int = 0,
+    antithetic: bool = True,
     shadows: bool = True,
     background: str = "transparent",
     scene: RayScene | None = None,
@@ -57,24 +60,18 @@ def render(
 
     asset: one, or the parts of one that cast shadows on each other.  camera: one camera, no batch.  supersampling:
     side of the subpixel grid; ``samples`` are per subpixel.  background: ``transparent`` or ``environment``.  scene:
-    rays against :func:`joined_scene`, made here if None.  samples, seed, clamp, paint (``conserving`` or
+    rays against :func:`joined_scene`, made here if None.  samples, seed, antithetic, clamp, paint (``conserving`` or
     ``published``): as for :func:`reli3d.render.shading.shade`.  progress: called with the fraction done.  Gradients
     reach textures, mesh attributes and environment where ``shade`` has them; silhouettes have none.  Raises ValueError
     without any environment.
     """
-    parts = [asset] if isinstance(asset, Asset) else list(asset)
-    if environment is None:
-        environment = next((p.environment for p in parts if p.environment is not None), None)
-    if environment is None:
-        raise ValueError("environment: expected one, got None from the argument and from the asset")
-    if camera.c2w.ndim != 2:
-        raise ValueError(f"camera.c2w: expected one camera (4, 4), got {tuple(camera.c2w.shape)}")
+    parts, environment = _checked(asset, camera, environment)
     if background not in ("transparent", "environment"):
         raise ValueError(f"background: expected transparent or environment, got {background}")
     scene = scene if scene is not None else joined_scene(parts)
     fine = camera.scaled(supersampling)
     band = max(1, BAND_RAYS // (fine.width * supersampling)) * supersampling
-    bands, options = [], {"samples": samples, "seed": seed, "clamp": clamp, "paint": paint}
+    bands, options = [], {"samples": samples, "seed": seed, "antithetic": antithetic, "clamp": clamp, "paint": paint}
     for row in range(0, fine.height, band):
         rows = min(band, fine.height - row)
         part = Camera(fine.c2w, fine.intrinsics - fine.intrinsics.new_tensor([0.0, 0.0, 0.0, row]), fine.width, rows)
@@ -89,6 +86,51 @@ def render(
     depth = torch.where(inside, (depth / cover)[..., 0], torch.inf)
     return Render(radiance, alpha[..., 0], base_color / cover, roughness, metallic, normalize(normal, dim=-1),
                   position / cover, depth)  # fmt: skip
+
+
+def plan_render(
+    asset: Asset | Sequence[Asset],
+    camera: Camera,
+    environment: Environment | None = None,
+    *,
+    total: int = 64,
+    seed: int = 0,
+    shadows: bool = True,
+    scene: RayScene | None = None,
+    paint: str = "conserving",
+) -> SamplePlan:
+    """Counts of ``total`` samples for :func:`render` of this view, to be given to it with ``antithetic=False``.
+
+    Arguments as for :func:`render`.  It plans for points among those that 4096 rays of the camera hit, as
+    :func:`reli3d.render.allocation.plan_samples` says, and costs less than a twentieth of 512 x 512 pixels.  No
+    gradient.  Raises ValueError without any environment and where the camera sees nothing.
+    """
+    parts, environment = _checked(asset, camera, environment)
+    scene = scene if scene is not None else joined_scene(parts)
+    origins, directions = (v.reshape(-1, 3) for v in camera_rays(camera))
+    rays = spread_rows(len(directions), min(len(directions), PLAN_RAYS), seed).to(directions.device)
+    directions = directions[rays]
+    hits = scene.closest(origins[rays], directions)
+    seen = hits.face >= 0
+    if not bool(seen.any()):
+        raise ValueError(f"camera: expected one that sees the asset, got none of {len(rays)} rays that hits it")
+    p = _points(parts, hits.face[seen], hits.bary[seen])
+    return plan_samples(
+        p.position, p.normal, p.ng, -directions[seen], p.base_color, p.roughness, p.metallic, environment,
+        total=total, scene=scene if shadows else None, seed=seed, paint=paint,
+    )  # fmt: skip
+
+
+def _checked(asset, camera: Camera, environment: Environment | None) -> tuple[list[Asset], Environment]:
+    """The parts, and the light: the argument or the first part's own."""
+    parts = [asset] if isinstance(asset, Asset) else list(asset)
+    if environment is None:
+        environment = next((p.environment for p in parts if p.environment is not None), None)
+    if environment is None:
+        raise ValueError("environment: expected one, got None from the argument and from the asset")
+    if camera.c2w.ndim != 2:
+        raise ValueError(f"camera.c2w: expected one camera (4, 4), got {tuple(camera.c2w.shape)}")
+    return parts, environment
 
 
 def joined_scene(parts: Sequence[Asset]) -> RayScene:

@@ -66,10 +66,10 @@ def shade(
     dtype, ValueError for a shape, device, count or choice.  Estimator: Veach and Guibas 1995 over the material of
     ``reli3d.kernels.bsdf``.
     """
-    n = _check(position, normal, ng, wo, base_color, roughness, metallic, environment)
+    n = check_hits(position, normal, ng, wo, base_color, roughness, metallic, environment)
     if scene is not None and scene.device != position.device:
         raise ValueError(f"scene: expected device {position.device}, got {scene.device}")
-    plan, offsets = _plan(samples, seed, antithetic, heuristic, points, paint, clamp, scene)
+    plan, offsets = sampling_plan(samples, seed, antithetic, heuristic, points, paint, clamp, scene)
     width = roughness * roughness if choice("alpha", alpha, ("squared", "linear")) == 0 else roughness
     table, device = environment.table, position.device
     tables = [*table.sampler, (table.density, wp.float32), (offsets.to(device), wp.vec2)]
@@ -113,8 +113,8 @@ def shade_light(
     environment strategy draws from; where it is dark and the light is not, the other strategies stand in, so the mean
     does not depend on it.  No gradient.
     """
-    n = _check(position, normal, ng, wo, base_color, roughness, metallic, proposal)
-    plan, offsets = _plan(samples, seed, True, "balance", points, paint, None, scene)
+    n = check_hits(position, normal, ng, wo, base_color, roughness, metallic, proposal)
+    plan, offsets = sampling_plan(samples, seed, True, "balance", points, paint, None, scene)
     device, count, table = position.device, sum(samples), proposal.table
     pixels = torch.arange(n, dtype=torch.int32, device=device)
     tables = [*table.sampler, (table.density, wp.float32), (offsets.to(device), wp.vec2), (pixels, wp.int32)]
@@ -227,7 +227,7 @@ def _shade_embree(n: int, ins: list, job: _Job, outs: list) -> None:
         over_slices(n, work)
 
 
-def _check(position, normal, ng, wo, base_color, roughness, metallic, environment) -> int:
+def check_hits(position, normal, ng, wo, base_color, roughness, metallic, environment) -> int:
     check("position", position, last=3)
     if position.ndim != 2:
         raise ValueError(f"position: expected shape (N, 3), got {tuple(position.shape)}")
@@ -244,7 +244,7 @@ def _check(position, normal, ng, wo, base_color, roughness, metallic, environmen
     return n
 
 
-def _plan(samples, seed, antithetic, heuristic, points, paint, clamp, scene):
+def sampling_plan(samples, seed, antithetic, heuristic, points, paint, clamp, scene):
     if len(samples) != 3 or any(int(k) != k or k < 0 for k in samples):
         raise ValueError(f"samples: expected three counts of at least 0, got {samples}")
     if clamp is not None and not clamp > 0.0:

@@ -1,0 +1,198 @@
+"""Counts planned for the scene: their variance against quadrature, and against what each strategy alone has."""
+
+import pytest
+import torch
+import trimesh
+
+from reli3d.geometry.rays import RayScene
+from reli3d.render.allocation import plan_samples
+from reli3d.render.camera import Camera
+from reli3d.render.environment import Environment
+from reli3d.render.render import plan_render, render
+from reli3d.render.shading import shade
+from tests import reference
+from tests.test_estimator import SKIES, inputs, interval, light
+from tests.test_render import ball, eye
+
+SINGLE = (64, 0, 0), (0, 64, 0), (0, 0, 64)
+GRID = [(name, r, m) for name in SKIES for r in (0.05, 0.3, 1.0) for m in (0.0, 1.0)]
+MIXED = {("constant", 0.05, 0.0), ("constant", 0.3, 0.0), ("sky", 0.05, 0.0), ("sky", 0.3, 0.0), ("sun", 0.05, 0.0),
+         ("sun", 0.3, 0.0), ("sun", 0.05, 1.0), ("sun", 0.3, 1.0)}  # fmt: skip
+
+
+def surface(device, roughness, metallic, points=24):
+    """Arguments of ``shade`` up to the light: points with their own colours, one finish."""
+    normal, wo, base, *_ = inputs(points, device)
+    flat = torch.ones(points, device=device)
+    return normal, normal, normal, wo, base, flat * roughness, flat * metallic
+
+
+def quadrature(arguments, environment, counts, inside=None, height=256):
+    """Variance of each point under each of ``counts (C, 3)``, ``(N, C)``, summed over the channels: int f^2 / q - sum
+    n_k (int f p_k / q)^2 by midpoints in float64, ``inside (M,)`` or over the whole sphere."""
+    _, _, normal, wo, base, roughness, metallic = (v.double().cpu() for v in arguments)
+    d, angle = reference.sphere_grid(height)
+    radiance = reference.lookup_envmap(environment.radiance.double().cpu(), d)
+    table = environment.pdf(d.float().to(environment.radiance.device)).double().cpu()
+    rows = []
+    for k in range(len(normal)):
+        up = ((d @ normal[k]) > 1e-6) & (radiance.sum(1) > 0.0) & (True if inside is None else inside)
+        helper = torch.eye(3, dtype=torch.float64)[normal[k].abs().argmin()]
+        t = torch.nn.functional.normalize(torch.linalg.cross(helper, normal[k]), dim=-1)
+        frame = torch.stack([t, torch.linalg.cross(normal[k], t), normal[k]])
+        wi = d[up] @ frame.T
+        o, alpha = (frame @ wo[k]).expand(len(wi), 3), (roughness[k] ** 2).expand(len(wi))
+        f = reference.eval_bsdf(o, wi, base[k].expand(len(wi), 3), alpha, metallic[k].expand(len(wi)))
+        f = f * wi[:, 2:] * radiance[up]
+        wm = torch.nn.functional.normalize(o + wi, dim=-1)
+        visible = reference.pdf_ggx_vndf(o, alpha, wm) / (4.0 * (o * wm).sum(1))
+        p = torch.stack([table[up], visible, wi[:, 2] / torch.pi], 1)
+        weight = angle / (p @ counts.T).clamp(min=1e-30)  # (M, C)
+        square = f.square().sum(1) @ weight
+        mean = torch.einsum("mk,mc,mr->ckr", p, weight, f)
+        rows.append(square - (counts[..., None] * mean.square()).sum((1, 2)))
+    return torch.stack(rows)
+
+
+def runs_of(arguments, environment, counts, runs=256, **options):
+    """``(runs, points, 3)`` float64: independent values of ``shade``."""
+    n = len(arguments[0])
+    repeated = [v.repeat(runs, *[1] * (v.ndim - 1)) for v in arguments]
+    return shade(*repeated, environment, samples=counts, **options).double().reshape(runs, n, 3)
+
+
+@pytest.mark.parametrize("name, roughness, metallic", [("sky", 0.3, 0.0), ("sun", 0.3, 1.0), ("sun", 0.6, 0.0)])
+def test_the_plan_is_the_best_split_and_its_variance_that_of_quadrature(device, name, roughness, metallic):
+    arguments, env = surface(device, roughness, metallic, points=6), light(name, device)
+    splits = [(8 * a, 8 * b, 64 - 8 * a - 8 * b) for a in range(9) for b in range(9 - a)]
+    for seed in range(3):
+        plan = plan_samples(*arguments, env, seed=seed)
+        assert sum(plan.samples) == 64
+        truth = quadrature(arguments, env, torch.tensor([plan.samples, *splits], dtype=torch.float64)).mean(0)
+        assert float(truth[0]) < 1.05 * float(truth[1:].amin())  # what a twentieth of noise in the estimate may choose
+        assert abs(plan.variance / float(truth[0]) - 1.0) < 0.1  # 1365 samples of each strategy a point: 3 % measured
+
+
+@pytest.mark.parametrize("points", ["random", "halton"])
+def test_the_promised_variance_is_what_shade_has(device, points):
+    """With independent numbers it is equal, with even points less; the mean is that of the published counts."""
+    arguments, env = surface(device, 0.3, 1.0), light("sun", device)
+    plan = plan_samples(*arguments, env)
+    got = runs_of(arguments, env, plan.samples, points=points, antithetic=False)
+    ratio = float(got.var(0).sum(1).mean()) / plan.variance
+    assert 0.8 < ratio < 1.25 if points == "random" else ratio < 1.0  # 256 runs: 5 % noise, the sun's tail some more
+    other = runs_of(arguments, env, (20, 40, 4), points=points, seed=1)
+    z = (got.mean(0) - other.mean(0)) / ((got.var(0) + other.var(0)) / len(got)).sqrt()
+    assert float(z.abs().max()) < 4.5  # 72 numbers
+
+
+def sun_part(arguments, environment):
+    """Least variance of each single strategy: what the sun's part of the sphere adds, by quadrature.
+
+    Runs that never drew the sun know nothing of it: where a lobe is narrow, that is most sets of 256.
+    """
+    d, _ = reference.sphere_grid(512)
+    bright = reference.lookup_envmap(environment.radiance.double().cpu(), d).amax(1) > 10.0
+    alone = torch.tensor(SINGLE, dtype=torch.float64)
+    return quadrature(arguments, environment, alone, inside=bright, height=512).mean(0)
+
+
+def compare(case, points, device, runs=256):
+    """Variance of the plan over that of the best single strategy, its 95 % interval, and the plan."""
+    name, roughness, metallic = case
+    arguments, env = surface(device, roughness, metallic), light(name, device)
+    plan = plan_samples(*arguments, env)
+    options = {"points": points, "antithetic": False, "runs": runs}
+    mixed = runs_of(arguments, env, plan.samples, **options).flatten(1).cpu()
+    alone = [runs_of(arguments, env, counts, **options).flatten(1).cpu() for counts in SINGLE]
+    variance = torch.stack([v.var(0).mean() for v in alone]) * 3.0
+    hidden = sun_part(arguments, env) if name == "sun" else torch.zeros(3)
+    best = int(torch.maximum(variance, hidden).argmin())
+    own = float(mixed.var(0).mean()) * 3.0
+    if float(hidden[best]) > float(variance[best]):
+        return own / float(hidden[best]), [own / float(hidden[best])] * 2, plan
+    return own / float(variance[best]), interval(mixed, alone[best]), plan
+
+
+def check_case(case, points, device):
+    """Protocol: at most 1.05 of the best strategy.  Where the plan is that strategy both have the same numbers."""
+    ratio, (low, high), plan = compare(case, points, device)
+    assert ratio <= 1.05 and low <= 1.05, (case, points, ratio, low, high, plan)
+    if case in MIXED:
+        assert high < 1.0, (case, points, ratio, low, high, plan)
+
+
+@pytest.mark.parametrize("points", ["random", "halton"])
+@pytest.mark.parametrize("case", [("sky", 0.3, 0.0), ("constant", 1.0, 1.0), ("sun", 0.3, 1.0)])
+def test_no_strategy_alone_is_better_than_the_plan(device, case, points):
+    check_case(case, points, device)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("points", ["random", "halton"])
+@pytest.mark.parametrize("case", GRID)
+def test_no_strategy_alone_is_better_than_the_plan_anywhere_on_the_grid(device, case, points):
+    check_case(case, points, device)
+
+
+def test_the_pilot_sees_shadows(device):
+    """A ball before the sun: samples towards it are wasted, and the plan gives the other strategies more."""
+    arguments, env = surface(device, 0.5, 1.0), light("sun", device)
+    sun = torch.tensor([[20.5 / 64.0, 7.5 / 32.0]], dtype=torch.float64) * torch.pi
+    theta, phi = 2.0 * sun[0, 0] - torch.pi, sun[0, 1]
+    where = torch.stack([theta.sin() * phi.sin(), phi.cos(), -theta.cos() * phi.sin()])
+    mesh = trimesh.creation.icosphere(subdivisions=3, radius=1.5)
+    vertices = torch.tensor(mesh.vertices) + 3.0 * where
+    scene = RayScene(vertices.float().to(device), torch.tensor(mesh.faces, dtype=torch.int32, device=device))
+    arguments = (torch.zeros_like(arguments[0]), *arguments[1:])
+    free, shaded = plan_samples(*arguments, env), plan_samples(*arguments, env, scene=scene)
+    assert free.samples[0] >= 40 > 8 >= shaded.samples[0]
+    got = runs_of(arguments, env, shaded.samples, scene=scene, points="random", antithetic=False)
+    assert 0.8 < float(got.var(0).sum(1).mean()) / shaded.variance < 1.25  # 5 % noise of 256 runs, 3 % of the pilot
+
+
+def test_the_plan_depends_on_inputs_and_seed_alone_and_takes_any_size(device):
+    env = light("sky", device)
+    many = surface(device, 0.4, 0.5, points=3000)
+    assert plan_samples(*many, env, seed=3) == plan_samples(*many, env, seed=3)
+    assert plan_samples(*many, env, seed=3).variance != plan_samples(*many, env, seed=4).variance
+    for total in (1, 3, 7, 64, 1001):
+        one = plan_samples(*(v[:1] for v in many), env, total=total)
+        assert sum(one.samples) == total and min(one.samples) >= 0 and one.variance > 0.0
+    black = plan_samples(*many, Environment(torch.zeros(4, 8, 3, device=device)))
+    assert sum(black.samples) == 64 and black.variance == 0.0
+
+
+def test_bad_input_is_named(device):
+    arguments, env = surface(device, 0.4, 0.5), light("sky", device)
+    for total in (0, 2.5):
+        with pytest.raises(ValueError, match="total: expected"):
+            plan_samples(*arguments, env, total=total)
+    with pytest.raises(ValueError, match="position: expected at least one"):
+        plan_samples(*(v[:0] for v in arguments), env)
+    with pytest.raises(ValueError, match="alpha: expected one of"):
+        plan_samples(*arguments, env, alpha="cubed")
+    with pytest.raises(TypeError, match="metallic: expected"):
+        plan_samples(*arguments[:6], arguments[6].double(), env)
+    with pytest.raises(ValueError, match="got NaN"):
+        plan_samples(*arguments[:4], arguments[4] * torch.nan, *arguments[5:], env)
+    camera = Camera.from_fov(eye(device, 0.0, 0.0, 2.0), 0.8, 8, 8)
+    away = Camera(eye(device, 0.0, 0.0, 2.0), camera.intrinsics.new_tensor([9.0, 9.0, 900.0, 4.0]), 8, 8)
+    with pytest.raises(ValueError, match="camera: expected one that sees"):
+        plan_render(ball(device), away, env)
+    with pytest.raises(ValueError, match="environment: expected one"):
+        plan_render(ball(device), camera)
+
+
+def test_an_image_has_less_noise_by_its_plan(device):
+    """A white ball in the sun: against the published counts, whose environment samples are 20."""
+    asset, env = ball(device), light("sun", device)
+    camera = Camera.from_fov(eye(device, 0.0, 0.5, 2.0), 0.8, 48, 48)
+    plan = plan_render(asset, camera, env)
+    images = {
+        counts: torch.stack([render(asset, camera, env, samples=counts, antithetic=pairs, seed=k).radiance
+                             for k in range(12)])
+        for counts, pairs in ((plan.samples, False), ((20, 40, 4), True))
+    }  # fmt: skip
+    planned, published = (v.var(0).mean() for v in images.values())
+    assert float(planned) < 0.7 * float(published)
