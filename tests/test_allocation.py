@@ -4,8 +4,12 @@ import pytest
 import torch
 import trimesh
 
+from reli3d.cli.render import main
 from reli3d.geometry.rays import RayScene
+from reli3d.geometry.tangents import with_tangents
+from reli3d.io.glb import write_glb
 from reli3d.render.allocation import plan_samples
+from reli3d.render.asset import Asset
 from reli3d.render.camera import Camera
 from reli3d.render.environment import Environment
 from reli3d.render.render import plan_render, render
@@ -196,3 +200,17 @@ def test_an_image_has_less_noise_by_its_plan(device):
     }  # fmt: skip
     planned, published = (v.var(0).mean() for v in images.values())
     assert float(planned) < 0.7 * float(published)
+
+
+def test_the_command_plans_its_first_view(tmp_path, capsys):
+    asset = ball(torch.device("cpu"))
+    write_glb(tmp_path / "ball.glb", Asset(with_tangents(asset.mesh), asset.textures))
+    common = [str(tmp_path / "ball.glb"), "--output", str(tmp_path), "--size", "16", "--supersampling", "1"]
+    assert main([*common, "--plan", "16", "--frames", "2", "--format", "webp"]) == 0
+    said = capsys.readouterr().err.strip().splitlines()
+    assert len(said) == 1 and said[0].startswith("reli3d-render: samples by strategy ")
+    assert sum(int(word) for word in said[0].split()[-3:]) == 16
+    assert main([*common, "--plan", "0"]) == 2
+    with pytest.raises(SystemExit) as stopped:
+        main([*common, "--plan", "16", "--samples", "1", "2", "3"])
+    assert stopped.value.code == 2
