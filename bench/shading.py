@@ -5,13 +5,14 @@ BSDF), primary rays included on both sides: the same amount of work, not the sam
 here: rays are given and radiance is returned.  With gradients both sides differentiate the sum of the image with
 respect to one base colour and all texels of the map.
 
-``python -m bench.shading`` prints what the cases do not: variance at equal samples, hence the ratio at equal variance,
-memory a pixel, and how time grows with pixels, samples and triangles.
+``python -m bench.shading`` prints what the cases do not: variance at equal samples and of one formula on both sides,
+hence the ratio at equal variance, memory a pixel, and how time grows with pixels, samples and triangles.
 """
 
 import glob
 import os
 import sys
+from functools import partial
 
 import numpy as np
 import torch
@@ -67,8 +68,9 @@ def direct(device, size, roughness, backward, samples=SAMPLES, subdivisions=6):
     return step, {"samples": hit * sum(samples)}
 
 
-def mitsuba_direct(device, size, roughness, backward):
-    """The same image from Mitsuba; CPU only, None without LLVM 19 or newer."""
+def mitsuba_direct(device, size, roughness, backward, formula=None):
+    """The same image from Mitsuba; CPU only, None without LLVM 19 or newer.  formula: ``(mi)`` to a material's
+    dictionary instead of ``principled``."""
     found = sorted(glob.glob("/usr/lib/*/libLLVM-19.so*") + glob.glob("/usr/lib/*/libLLVM-2?.so*"))
     if device.type != "cpu" or not ("DRJIT_LIBLLVM_PATH" in os.environ or found):
         return None
@@ -85,9 +87,9 @@ def mitsuba_direct(device, size, roughness, backward):
     params = mi.traverse(mesh)
     params["vertex_positions"], params["faces"] = vertices.ravel(), faces.ravel().astype(np.uint32)
     params.update()
-    material = mi.load_dict({"type": "principled", "base_color": {"type": "rgb", "value": [0.7, 0.4, 0.2]},
-                             "roughness": roughness, "metallic": 0.0, "specular": 0.5})  # fmt: skip
-    mesh.set_bsdf(material)
+    principled = {"type": "principled", "base_color": {"type": "rgb", "value": [0.7, 0.4, 0.2]},
+                  "roughness": roughness, "metallic": 0.0, "specular": 0.5}  # fmt: skip
+    mesh.set_bsdf(mi.load_dict(formula(mi) if formula else principled))
     bitmap = mi.Bitmap(sky(device).numpy())
     scene = mi.load_dict({"type": "scene", "mesh": mesh, "light": {"type": "envmap", "bitmap": bitmap},
                           "integrator": {"type": "direct", "emitter_samples": 32, "bsdf_samples": 32,
@@ -95,10 +97,11 @@ def mitsuba_direct(device, size, roughness, backward):
     origins, directions = (v.reshape(-1, 3).contiguous().numpy().T for v in camera_rays(view(device, size)))
     ray = mi.RayDifferential3f(mi.Point3f(origins), mi.Vector3f(directions))
 
-    params = mi.traverse(scene)
-    color_key = next(k for k in params.keys() if k.endswith("base_color.value"))  # noqa: SIM118  not a dict
-    leaves = [mi.Color3f(params[color_key]), mi.TensorXf(params["light.data"])]
+    leaves = []
     if backward:
+        params = mi.traverse(scene)
+        color_key = next(k for k in params.keys() if k.endswith("base_color.value"))  # noqa: SIM118  not a dict
+        leaves = [mi.Color3f(params[color_key]), mi.TensorXf(params["light.data"])]
         for key, leaf in zip((color_key, "light.data"), leaves, strict=True):
             dr.enable_grad(leaf)
             params[key] = leaf
@@ -146,11 +149,19 @@ CASES = {
 PEERS = {"direct": mitsuba_direct, "direct_grad": mitsuba_direct}
 
 
+def _own_formula(roughness, mi):
+    """Our material as a Mitsuba one: variances are compared of one integrand."""
+    from tests import mitsuba_scene
+
+    return mitsuba_scene.material(mi, (0.7, 0.4, 0.2), roughness**2, 0.0)
+
+
 def study() -> None:
     """Print variance, memory and growth; CPU."""
     device, size, say = torch.device("cpu"), 64, sys.stdout.write
     for roughness in (0.1, 0.4, 0.9):
-        ours, theirs = (f(device, size, roughness, False)[0] for f in (direct, mitsuba_direct))
+        ours, _ = direct(device, size, roughness, False)
+        theirs, _ = mitsuba_direct(device, size, roughness, False, partial(_own_formula, roughness))
         a = np.stack([ours(k).numpy() for k in range(32)])
         b = np.stack([np.array(theirs(k + 1)).T for k in range(32)])
         b = b[:, b.mean((0, 2)) > 0.0]

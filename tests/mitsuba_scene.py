@@ -42,11 +42,12 @@ def node_rows(radiance: torch.Tensor) -> torch.Tensor:
     return radiance[low] * (1 - part) + radiance[high] * part
 
 
-def material(mi, base_color, alpha, metallic):
+def material(mi, base_color, alpha, metallic, paint="conserving"):
     """A Mitsuba BSDF that evaluates the metallic-roughness formula; sampled by cosine and visible normals."""
     import drjit as dr
 
-    base, alpha = mi.Color3f(*base_color), mi.Float(alpha)
+    base, alpha, metallic = mi.Color3f(*base_color), mi.Float(alpha), mi.Float(metallic)
+    dr.make_opaque(base, alpha, metallic)  # not literals: materials share a compiled kernel
 
     class MetallicRoughness(mi.BSDF):
         def __init__(self, props):
@@ -79,8 +80,12 @@ def material(mi, base_color, alpha, metallic):
             d = distribution.eval(h)  # Mitsuba's own density and masking; G2 from the two G1 is height-correlated Smith
             g = 1.0 / (dr.rcp(distribution.smith_g1(i, h)) + dr.rcp(distribution.smith_g1(o, h)) - 1.0)
             f0 = 0.04 * (1 - metallic) + base * metallic
-            f = f0 + (1 - f0) * (1 - dr.dot(i, h)) ** 5
-            value = (1 - f) * base * (1 - metallic) / dr.pi + f * d * g / (4 * i.z * o.z)
+            schlick = lambda cos: f0 + (1 - f0) * (1 - cos) ** 5  # noqa: E731
+            f = schlick(dr.dot(i, h))
+            left = 1 - f
+            if paint == "conserving":
+                left = (1 - schlick((i.z + alpha) / (1 + alpha))) * (1 - schlick((o.z + alpha) / (1 + alpha)))
+            value = left * base * (1 - metallic) / dr.pi + f * d * g / (4 * i.z * o.z)
             return dr.select((i.z > 0) & (o.z > 0), value * o.z, 0)
 
         def pdf(self, ctx, si, wo, active):
@@ -113,14 +118,19 @@ def smooth_mesh(mi, vertices: torch.Tensor, faces: torch.Tensor, normals: torch.
 
 
 def radiance(mi, scene, origins: torch.Tensor, directions: torch.Tensor, samples: int, passes: int):
-    """Mean ``(N, 3)`` and its variance of direct light along rays, from ``passes`` independent estimates."""
-    integrator = mi.load_dict({"type": "direct", "emitter_samples": samples, "bsdf_samples": samples,
-                               "hide_emitters": True})  # fmt: skip
-    ray = mi.RayDifferential3f(mi.Point3f(origins.numpy().T), mi.Vector3f(directions.numpy().T))
-    values = []
+    """Mean ``(N, 3)`` of direct light along rays by ``path`` of depth 2, and the variance of one of its samples.
+
+    ``passes`` times ``samples`` samples a ray, each one draw of the light and one of the material.
+    """
+    integrator = mi.load_dict({"type": "path", "max_depth": 2, "hide_emitters": True})
+    o, d = (v.repeat_interleave(samples, 0).numpy().T for v in (origins, directions))
+    ray = mi.RayDifferential3f(mi.Point3f(o), mi.Vector3f(d))
+    total, square = 0.0, 0.0
     for k in range(passes):
         sampler = mi.load_dict({"type": "independent"})
-        sampler.seed(k + 1, len(origins))
-        values.append(np.array(integrator.sample(scene, sampler, ray)[0]).T)
-    values = np.stack(values)
-    return values.mean(0), values.var(0, ddof=1) / passes
+        sampler.seed(k + 1, len(origins) * samples)
+        value = np.array(integrator.sample(scene, sampler, ray)[0]).T.reshape(-1, samples, 3).astype(np.float64)
+        total, square = total + value.sum(1), square + (value**2).sum(1)
+    count = samples * passes
+    mean = total / count
+    return mean, np.maximum(square / count - mean**2, 0.0) * count / (count - 1)
