@@ -7,7 +7,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from bench.flexicubes_torch import cube_list, flexicubes
-from reli3d.geometry.mesh import face_components, face_normals, report, vertex_normals, volume
+from reli3d.geometry.mesh import face_components, report, vertex_normals, volume
 from reli3d.geometry.surface import extract_surface, surface_cubes
 from reli3d.triplane import sample_triplane
 from tests.reference_surface import grid, random_weights, sphere, torus
@@ -127,91 +127,6 @@ def test_noise_is_a_closed_manifold_with_the_inside_on_the_inner_side(device, se
     plain = extract_surface(level, radius=(0.5, 1.0, 2.0))
     inside_volume = (level < 0).float().mean()
     assert 0.3 < float(volume(plain)) / (8 * 0.5 * 1.0 * 2.0) / float(inside_volume) < 1.7
-
-
-def test_genus_and_components(device):
-    assert report(extract_surface(torus(32, device), radius=1.0)).euler == 0
-    p = grid(32, device=device)
-    centre = torch.tensor([0.5, 0.0, 0.0], device=device)
-    two = torch.minimum((p - centre).norm(dim=-1), (p + centre).norm(dim=-1)) - 0.35
-    found = report(extract_surface(two, radius=1.0))
-    assert (found.components, found.euler) == (2, 4)
-
-
-def gyroid(p):
-    """Level and gradient of the gyroid, in its own units."""
-    s, c = p.sin(), p.cos()
-    level = s[..., 0] * c[..., 1] + s[..., 1] * c[..., 2] + s[..., 2] * c[..., 0]
-    return level, c * c.roll(-1, -1) - s * s.roll(1, -1)
-
-
-def test_gyroid_is_within_a_cube_both_ways_and_of_one_genus_at_any_resolution(device):
-    scale, euler = 4.0, []
-    for n in (32, 48, 64):
-        mesh = extract_surface(gyroid(scale * grid(n, device=device))[0], radius=1.0)
-        found = report(mesh)
-        assert found.watertight and found.manifold
-        euler.append(found.euler)
-        cube = 2 / n
-        inner = mesh.vertices[mesh.vertices.abs().amax(-1) < 1 - cube].cpu().double()  # not the caps at the box
-        level, slope = gyroid(scale * inner)
-        assert float((level.abs() / (scale * slope.norm(dim=-1))).max()) < cube  # to first order, and 0.1 cubes in fact
-        points = torch.rand(4000, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 1.6 - 0.8
-        for _ in range(20):  # Newton: onto the surface
-            level, slope = gyroid(scale * points)
-            points = points - slope * (level / (scale * slope.square().sum(-1).clamp(min=0.1)))[:, None]
-        points = points[(points.abs().amax(-1) < 0.9) & (gyroid(scale * points)[0].abs() < 1e-9)]
-        assert len(points) > 3000
-        corners = mesh.vertices[mesh.faces.long()].cpu()
-        samples = torch.cat([corners.reshape(-1, 3), corners.mean(1)])
-        assert cKDTree(samples.numpy()).query(points.numpy())[0].max() < cube
-    assert len(set(euler)) == 1 and euler[0] < 0, euler
-
-
-@pytest.mark.parametrize("shape", ["sphere", "torus", "two spheres"])
-def test_the_distance_to_the_analytic_surface_is_below_a_cube_both_ways(device, shape):
-    n = 32
-    u, v = (torch.rand(4000, generator=torch.Generator().manual_seed(k)) * 2 * np.pi for k in (0, 1))
-    direction = F.normalize(torch.randn(4000, 3, generator=torch.Generator().manual_seed(2)), dim=1)
-    centre = torch.tensor([0.5, 0.0, 0.0])
-    if shape == "torus":
-        mesh, radius = extract_surface(torus(n, device), radius=1.0), 0.6 + 0.22 * v.cos()
-        points = torch.stack([radius * u.cos(), radius * u.sin(), 0.22 * v.sin()], -1)
-        away = torch.hypot(torch.hypot(*mesh.vertices.cpu().T[:2]) - 0.6, mesh.vertices.cpu()[:, 2]) - 0.22
-    elif shape == "sphere":
-        mesh, points = extract_surface(sphere(n, device=device), radius=1.0), 0.6 * direction
-        away = mesh.vertices.cpu().norm(dim=-1) - 0.6
-    else:
-        p = grid(n, device=device)
-        level = torch.minimum((p - centre.to(device)).norm(dim=-1), (p + centre.to(device)).norm(dim=-1)) - 0.35
-        mesh, points = (
-            extract_surface(level, radius=1.0),
-            0.35 * direction + torch.where(u[:, None] > 3, centre, -centre),
-        )
-        at = mesh.vertices.cpu()
-        away = torch.minimum((at - centre).norm(dim=-1), (at + centre).norm(dim=-1)) - 0.35
-    cube = 2 / n
-    assert float(away.abs().max()) < cube
-    corners = mesh.vertices[mesh.faces.long()].cpu()
-    samples = torch.cat(
-        [corners.reshape(-1, 3), corners.mean(1)]
-    )  # no point of a face is further from one than half a cube
-    assert cKDTree(samples.numpy()).query(points.numpy())[0].max() < cube
-
-
-@pytest.mark.parametrize("shape", ["sphere", "torus"])
-def test_the_volume_converges_with_second_order(device, shape):
-    errors = []
-    for n in (16, 32, 64) if shape == "sphere" else (32, 64, 96):  # the tube needs some cubes across
-        mesh = extract_surface(sphere(n, device=device) if shape == "sphere" else torus(n, device), radius=1.0)
-        if shape == "sphere":
-            assert (mesh.vertices.norm(dim=-1) - 0.6).abs().max() < 2 / n  # within a cube
-            outward = (face_normals(mesh.vertices, mesh.faces) * mesh.vertices[mesh.faces[:, 0].long()]).sum(-1)
-            assert bool((outward > 0).all())
-        exact = 4 / 3 * np.pi * 0.6**3 if shape == "sphere" else 2 * np.pi**2 * 0.6 * 0.22**2
-        errors.append((n, abs(float(volume(mesh)) - exact)))
-    slopes = [np.log(a[1] / b[1]) / np.log(b[0] / a[0]) for a, b in zip(errors[:-1], errors[1:])]
-    assert min(slopes) > 1.8, slopes
 
 
 def test_a_half_space_is_closed_flat_at_the_box(device):
