@@ -46,8 +46,28 @@ def joined_face(case):
     return None
 
 
-def flexicubes_polygons(level, deformation, alpha, beta):
-    """``[((cube, loop), crossings (E, 3), their beta (E,)), ...]``; inside is level < 0."""
+@lru_cache(None)
+def loop_tables():
+    """``(2, 256, 12)`` loop of every crossed edge, -1 elsewhere, outside corners apart and inside ones; and the joined
+    face of every case or -1.  Loops are numbered as the release does: by their first edge, edges by higher, then lower
+    corner.
+    """
+    table = torch.full((2, 256, 12), -1)
+    for apart in (0, 1):
+        for case in range(256):
+            found = sorted(loops(case, bool(apart)), key=lambda loop: min(sorted(EDGES[e], reverse=True) for e in loop))
+            for n, loop in enumerate(found):
+                table[apart, case, list(loop)] = n
+    faces = [joined_face(case) for case in range(256)]
+    return table, torch.tensor([-1 if face is None else face for face in faces])
+
+
+def flexicubes_crossings(level, deformation, alpha, beta, tiny=0.0):
+    """Crossings ``(E, 3)`` in [-0.5, 0.5], their beta ``(E,)``, dual vertex ``(E,)``, and the cube of every dual vertex
+    ``(V,)``, dual vertices in the release's order; inside is level < 0.  An edge whose levels are both below ``tiny``
+    passes no gradient to them.
+    """
+    table, face_of = loop_tables()
     shape = level.shape
     index = torch.arange(level.numel()).view(shape)
     offsets = [tuple(slice(o, n - 1 + o) for o, n in zip(c, shape)) for c in CORNERS]
@@ -57,45 +77,45 @@ def flexicubes_polygons(level, deformation, alpha, beta):
     inside = (level.view(-1) < 0)[cubes]
     case = (inside.long() << torch.arange(8)).sum(-1)
     surface = ((case > 0) & (case < 255)).nonzero().squeeze(1)
-    ends = torch.tensor(EDGES)
-    s = (level.view(-1)[cubes[surface]] * alpha[surface])[:, ends]  # (S, 12, 2)
-    x = position[cubes[surface]][:, ends]  # (S, 12, 2, 3)
-    cross = inside[surface][:, ends]
-    cross = cross[..., 0] != cross[..., 1]
-    weight = torch.where(cross, s[..., 1] - s[..., 0], 1.0)
-    u = (x[..., 0, :] * s[..., 1, None] - x[..., 1, :] * s[..., 0, None]) / weight[..., None]
-    b = beta[surface]
-    grid = case.view([n - 1 for n in shape])
-    found = []
-    for row, cube in enumerate(surface.tolist()):
-        own = int(case[cube])
-        face = joined_face(own)
-        groups = loops(own)
-        if face is not None:
-            at = list(torch.unravel_index(torch.tensor(cube), grid.shape))
-            at[face // 2] = at[face // 2] + (1 if face % 2 else -1)
-            if all(0 <= int(a) < n for a, n in zip(at, grid.shape)) and joined_face(int(grid[tuple(at)])) == face ^ 1:
-                groups = loops(own, apart=False)
-        for loop in groups:
-            e = sorted(loop)
-            found.append(((cube, loop), u[row, e], b[row, e]))
-    return found
+    own, grid_of = case[surface], case.view([n - 1 for n in shape])
+    face = face_of[own]
+    at = torch.stack(torch.unravel_index(surface, grid_of.shape), -1)
+    axis = (face // 2).clamp(min=0)[:, None]
+    at = at.scatter_add(1, axis, torch.where(face % 2 == 1, 1, -1)[:, None])
+    ahead = at.gather(1, axis)[:, 0]
+    there = (face >= 0) & (ahead >= 0) & (ahead < torch.tensor(grid_of.shape)[axis[:, 0]])
+    beyond = face_of[grid_of[tuple(torch.where(there[:, None], at, 0).T)]]
+    group = torch.where((there & (beyond == face ^ 1))[:, None], table[0][own], table[1][own])  # (S, 12)
+    count = group.amax(1) + 1
+    order = torch.argsort(count, stable=True)  # cubes with one dual vertex first
+    base = torch.empty_like(count)
+    base[order] = count[order].cumsum(0) - count[order]
+    row, edge = (group >= 0).nonzero(as_tuple=True)
+    ends = torch.tensor(EDGES)[edge]
+    corner = cubes[surface][row[:, None], ends]  # (E, 2)
+    value = level.view(-1)[corner]
+    value = torch.where((value.detach().abs().amax(1) < tiny)[:, None], value.detach(), value)
+    s, x = value * alpha[surface][row[:, None], ends], position[corner]
+    u = (x[:, 0] * s[:, 1:] - x[:, 1] * s[:, :1]) / (s[:, 1:] - s[:, :1])
+    cube_of = torch.repeat_interleave(surface[order], count[order])
+    return u, beta[surface][row, edge], base[row] + group[row, edge], cube_of
 
 
-def flexicubes_vertices(level, deformation, alpha, beta, scale):
-    """Dual vertices by (cube, loop), ``(V, 3)``, and those keys."""
-    polygons = flexicubes_polygons(level, deformation, alpha, beta)
-    vertices = torch.stack([(u * b[:, None]).sum(0) / b.sum() for _, u, b in polygons])
-    return vertices * scale, [key for key, _, _ in polygons]
+def flexicubes_vertices(level, deformation, alpha, beta, scale, tiny=0.0):
+    """Dual vertices ``(V, 3)`` in the release's order, and their cubes."""
+    u, b, owner, cube_of = flexicubes_crossings(level, deformation, alpha, beta, tiny)
+    mass = b.new_zeros(len(cube_of)).index_add(0, owner, b)
+    return u.new_zeros(len(cube_of), 3).index_add(0, owner, u * (b / mass[owner])[:, None]) * scale, cube_of
 
 
-def flexicubes_deviation(level, deformation, alpha, beta, scale):
+def flexicubes_deviation(level, deformation, alpha, beta, scale, tiny=0.0):
     """Mean absolute deviation of the distances from a dual vertex to its crossings, ``(V,)``."""
-    spread = []
-    for _, u, b in flexicubes_polygons(level, deformation, alpha, beta):
-        distance = ((u - (u * b[:, None]).sum(0) / b.sum()) * scale).norm(dim=-1)
-        spread.append((distance - distance.mean()).abs().mean())
-    return torch.stack(spread)
+    u, _, owner, cube_of = flexicubes_crossings(level, deformation, alpha, beta, tiny)
+    vertices = flexicubes_vertices(level, deformation, alpha, beta, scale, tiny)[0]
+    distance = (vertices[owner] - u * scale).norm(dim=-1)
+    none, count = u.new_zeros(len(cube_of)), torch.bincount(owner)
+    mean = none.index_add(0, owner, distance) / count
+    return none.index_add(0, owner, (distance - mean[owner]).abs()) / count
 
 
 def grid(n, radius=1.0, device="cpu"):

@@ -208,6 +208,7 @@ def test_the_same_bits_for_any_number_of_threads():
         (dict(radius=(1.0, 2.0)), ValueError, "radius"),
         (dict(alpha=torch.ones(63, 8)), ValueError, "alpha"),
         (dict(beta=torch.ones(64, 8)), ValueError, "beta"),
+        (dict(gamma=torch.zeros(64)), ValueError, "gamma"),
         (dict(gamma=torch.ones(64, 1)), ValueError, "gamma"),
         (dict(gamma=torch.ones(64, dtype=torch.float16)), TypeError, "gamma"),
         (dict(deformation=torch.zeros(4, 4, 4, 3)), ValueError, "deformation"),

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from reli3d._bridge import check
 from reli3d.geometry import surface
+from reli3d.kernels.flexicubes import LEVEL_MIN
 
 
 def vertex_deviation(
@@ -54,11 +55,12 @@ def vertex_deviation(
         at = row.clamp(min=0) * values.shape[1] + column
         return torch.where(row >= 0, values.reshape(-1).index_select(0, at), 1.0)
 
-    values, positions = [], []
+    levels, weights, positions = [], [], []
     for end in table["ends"].view(12, 2).long()[edge].unbind(1):
         offset = torch.stack([end & 1, end >> 1 & 1, end >> 2], -1)
         at_padded = t.cells.long()[cell] + (offset * step).sum(-1)
-        values.append(padded.reshape(-1).index_select(0, at_padded) * weight(alpha, end))
+        levels.append(padded.reshape(-1).index_select(0, at_padded))
+        weights.append(weight(alpha, end))
         vertex = corner[cell, end]
         nz = t.cubes[2] + 1
         at = torch.stack([vertex // ((t.cubes[1] + 1) * nz), vertex // nz % (t.cubes[1] + 1), vertex % nz], -1)
@@ -66,7 +68,10 @@ def vertex_deviation(
         positions.append(
             position if deformation is None else position + deformation.reshape(-1, 3).index_select(0, vertex)
         )
-    share = values[0] / (values[0] - values[1])
+    tiny = torch.maximum(*(v.detach().abs() for v in levels)) < LEVEL_MIN
+    # float64: products of levels and weights of any size would leave float32
+    values = [torch.where(tiny, v.detach(), v).double() * a for v, a in zip(levels, weights, strict=True)]
+    share = (values[0] / (values[0] - values[1])).float()
     crossing = torch.lerp(*positions, share[:, None]) * (2.0 * level.new_tensor(extent))
 
     total = int(t.counts.sum())

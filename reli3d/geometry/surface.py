@@ -81,7 +81,8 @@ def extract_surface(
 
     Vertices and faces come in the order of the published release (for ``centre``, centres follow the dual vertices).
     Gradients reach level, deformation, alpha, beta and with ``centre`` gamma, by an own adjoint; the same bits for
-    any number of CPU threads.
+    any number of CPU threads.  They are finite for levels of any size and weights in [1e-6, 1e6]; a slope goes with
+    1 / level, and an edge between levels below 1e-20 passes none on to them.
 
     A level of one sign is no error.  All outside gives no vertices and no faces, with gradients of zero; all inside
     gives the box with its edges cut off half a cube wide, like everything that reaches the border, or nothing where
@@ -101,6 +102,8 @@ def extract_surface(
     vertices = _DualVertices.apply(topology, scale, padded, level, deformation, alpha, beta)
     if not bool(torch.isfinite(vertices.detach()).all()):
         raise ValueError("alpha, beta, deformation: expected positive weights and finite offsets, got others")
+    if gamma is not None and not bool((gamma.detach() > 0).all()):
+        raise ValueError("gamma: expected positive weights, got others")
     quads, split = _quads(topology, padded, crossed, gamma)
     if centre:
         return _with_centres(vertices, quads, split if gamma is None else _gamma_of(topology, quads, gamma))
@@ -233,7 +236,7 @@ class _DualVertices(torch.autograd.Function):
             (owner, I32), (group, I32), *_DualVertices.arguments(t, padded, inputs, scale), (vertices, wp.vec3)],
             device)  # fmt: skip
         ctx.topology, ctx.scale, ctx.given = topology, scale, [v is not None for v in (deformation, alpha, beta)]
-        ctx.save_for_backward(padded, vertices, level, *(v for v in (deformation, alpha, beta) if v is not None))
+        ctx.save_for_backward(padded, level, *(v for v in (deformation, alpha, beta) if v is not None))
         return vertices
 
     @staticmethod
@@ -250,7 +253,7 @@ class _DualVertices(torch.autograd.Function):
         from reli3d.kernels import flexicubes_adjoint
 
         t, device = ctx.topology, g_vertices.device
-        padded, vertices, level, *rest = ctx.saved_tensors
+        padded, level, *rest = ctx.saved_tensors
         rest = iter(rest)
         inputs = [next(rest).contiguous() if given else None for given in ctx.given]
         n = len(t.cells)
@@ -258,7 +261,7 @@ class _DualVertices(torch.autograd.Function):
         g_shift = torch.zeros(n, 8, 3, device=device)
         launch(flexicubes_adjoint.dual_vertex_adjoint_kernel, n, [
             *_DualVertices.arguments(t, padded, inputs, ctx.scale, (t.counts, I32), (t.base, I32)),
-            (vertices, wp.vec3), (g_vertices.contiguous(), wp.vec3), (g_level.view(-1), wp.float32),
+            (g_vertices.contiguous(), wp.vec3), (g_level.view(-1), wp.float32),
             (g_shift.view(-1, 3), wp.vec3), (g_alpha.view(-1), wp.float32), (g_beta.view(-1), wp.float32)],
             device)  # fmt: skip
         corner = corner_vertices(t).view(-1)
@@ -320,8 +323,9 @@ def _with_centres(vertices: Tensor, quads: Tensor, gamma: Tensor) -> Mesh:
     """Four triangles a quad around the mean of its diagonals' midpoints, each weighted by the gammas at its ends."""
     # the gradient of index_select adds up in the order of the list, that of indexing with brackets in any
     corner = vertices.index_select(0, quads.view(-1).long()).view(-1, 4, 3)
+    gamma = gamma.double()  # products of small weights would vanish
     one, other = gamma[:, 0] * gamma[:, 2], gamma[:, 1] * gamma[:, 3]
-    share = (one / (one + other))[:, None]
+    share = (one / (one + other)).float()[:, None]
     middle = share * (corner[:, 0] + corner[:, 2]) * 0.5 + (1.0 - share) * (corner[:, 1] + corner[:, 3]) * 0.5
     index = torch.arange(len(quads), dtype=torch.int32, device=quads.device) + len(vertices)
     faces = torch.stack([torch.stack([quads[:, k], quads[:, (k + 1) % 4], index], -1) for k in range(4)], 1)

@@ -10,6 +10,8 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
 
+LEVEL_MIN = wp.constant(1.0e-20)  # slopes are 1 / level: an edge whose levels are both smaller passes none to them
+
 
 @wp.func
 def split_index(index: int, ny: int, nz: int) -> wp.vec3i:
@@ -41,11 +43,39 @@ def grid_position(at: wp.vec3i, shift: wp.array[wp.vec3], cubes: wp.vec3i, pad: 
 
 
 @wp.func
+def cell_position(at: wp.vec3i, corner: int, shift: wp.array[wp.vec3], cubes: wp.vec3i, pad: int) -> wp.vec3:
+    """Position of a cube's corner as :func:`grid_position` has it, from the cube's lowest corner: differences of these
+    keep the digits that differences of positions lose.
+    """
+    i0 = wp.clamp(at[0] - pad, 0, cubes[0])
+    j0 = wp.clamp(at[1] - pad, 0, cubes[1])
+    k0 = wp.clamp(at[2] - pad, 0, cubes[2])
+    i = wp.clamp(at[0] - pad + (corner & 1), 0, cubes[0])
+    j = wp.clamp(at[1] - pad + (corner >> 1 & 1), 0, cubes[1])
+    k = wp.clamp(at[2] - pad + (corner >> 2), 0, cubes[2])
+    p = wp.vec3(float(i - i0) / float(cubes[0]), float(j - j0) / float(cubes[1]), float(k - k0) / float(cubes[2]))
+    if shift.shape[0] > 0:
+        p += shift[(i * (cubes[1] + 1) + j) * (cubes[2] + 1) + k]
+    return p
+
+
+@wp.func
 def weight(values: wp.array[float], row: int, width: int, column: int) -> float:
     """Entry of a weight; 1 for the padding's cubes (row -1) and where no weights are given."""
     if row < 0 or values.shape[0] == 0:
         return 1.0
     return values[row * width + column]
+
+
+@wp.func
+def end_shares(alpha_a: float, level_a: float, alpha_b: float, level_b: float) -> wp.vec3d:
+    """The crossing's way from a, its way from b, in parts of the edge, and the sum of the weighted levels' sizes.
+
+    In float64: products and sums of weighted levels would leave float32, and 1 - way loses what is near an end.
+    """
+    a = wp.float64(alpha_a) * wp.abs(wp.float64(level_a))
+    b = wp.float64(alpha_b) * wp.abs(wp.float64(level_b))
+    return wp.vec3d(a / (a + b), b / (a + b), a + b)
 
 
 @wp.func
@@ -166,9 +196,9 @@ def dual_vertex_kernel(
             alpha_a = weight(alpha, row, 8, a)
             alpha_b = weight(alpha, row, 8, b)
             beta_e = weight(beta, row, 12, e)
-            level_a = alpha_a * level[corner_index(cell, a, ny, nz)]
-            level_b = alpha_b * level[corner_index(cell, b, ny, nz)]
-            t = level_a / (level_a - level_b)
+            level_a = level[corner_index(cell, a, ny, nz)]
+            level_b = level[corner_index(cell, b, ny, nz)]
+            t = float(end_shares(alpha_a, level_a, alpha_b, level_b)[0])
             x_a = grid_position(at + wp.vec3i(a & 1, a >> 1 & 1, a >> 2), shift, cubes, pad)
             x_b = grid_position(at + wp.vec3i(b & 1, b >> 1 & 1, b >> 2), shift, cubes, pad)
             if not (alpha_a > 0.0 and alpha_b > 0.0 and beta_e > 0.0):
