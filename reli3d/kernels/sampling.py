@@ -52,15 +52,3 @@ def sample_cosine_kernel(
 ):  # fmt: skip
     i = start + wp.tid()
     wi[i] = sample_cosine(u[i])
-
-
-@wp.kernel
-def pdf_cosine_kernel(
-    start: int,
-    # in
-    wi: wp.array(dtype=wp.vec3),
-    # out
-    pdf: wp.array(dtype=float),
-):  # fmt: skip
-    i = start + wp.tid()
-    pdf[i] = pdf_cosine(wi[i])
