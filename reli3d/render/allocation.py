@@ -13,12 +13,14 @@ from reli3d.geometry.rays import RayScene
 from reli3d.kernels import allocation as kernels
 from reli3d.render.environment import Environment
 from reli3d.render.material import choice
-from reli3d.render.shading import check_hits, sampling_plan
+from reli3d.render.shading import check_hits, sampling_plan, shade
 
-PILOT_SAMPLES = 24576  # in all; an image of 512 x 512, half of it covered, takes 8.4 million
+SCOUTED = 16384  # points looked at with one sample of each strategy, to find those that matter
+PILOT_SAMPLES = 24576  # then, in all; an image of 512 x 512, half of it covered, takes 8.4 million
 PILOT_POINTS = 256  # so at least 32 samples of each strategy for each of them
-PREFER_ONE = 0.9  # of the best strategy's variance: a mixture has to promise less.  Even points, of which the estimate
-# knows nothing, serve one strategy better than few points of each: up to 6 % of the variance where nothing was to gain
+TRIED = 1024  # points, some of them more than once, that a mixture and its rival are tried at
+RIVAL = 2.0  # times the mixture's variance, at most, of a rival: rare events that a trial misses then cost that much
+PREFER_ONE = 0.9  # of the rival's variance, tried, is what a mixture must stay below: the trial's noise is 7 %
 BLOCK = 1 << 17  # samples times candidates evaluated at once: arrays of 1 MB
 
 
@@ -47,25 +49,30 @@ def plan_samples(
     total: int = 64,
     scene: RayScene | None = None,
     seed: int = 0,
+    points: str = "halton",
     alpha: str = "squared",
     paint: str = "conserving",
 ) -> SamplePlan:
     """Counts of the three strategies, ``total`` together, with the least variance for these points under this light.
 
-    The points, environment, scene, alpha and paint are those of :func:`reli3d.render.shading.shade`; N is at least 1.
+    Arguments are those of :func:`reli3d.render.shading.shade`, but ``total``; N is at least 1.
     One plan is made for all points: the one with the least sum of their variances, and of the channels', so the
     brightest points weigh most.  Other materials or another light want another plan.
 
-    A pilot takes 24576 samples, a third from each strategy, spread over at most 256 of the points.  With counts n_k,
-    densities p_k and q = sum n_k p_k the balance heuristic has the variance ``int f^2 / q - sum n_k (int f p_k /
-    q)^2`` (Veach and Guibas 1995; Sbert et al. 2016, Variance Analysis of Multi-sample and One-sample Multiple
+    At most 16384 of the points get one sample of each strategy, which tells where the light is.  A pilot takes 24576
+    more, a third from each strategy, at 256 points, half of them drawn evenly and half in proportion to squared values:
+    small highlights may hold most of an image's variance.  With counts n_k, densities p_k and q = sum n_k p_k the
+    balance heuristic has the variance ``int f^2 / q - sum n_k (int f p_k / q)^2`` (Veach and Guibas 1995; Sbert,
+    Havran and Szirmay-Kalos 2016, Variance Analysis of Multi-sample and One-sample Multiple
     Importance Sampling).  The pilot's samples over the pilot's own q estimate both integrals for any n_k, as He and
     Owen 2014 (Optimal mixture weights in multiple importance sampling) do for mixtures.  So what one strategy would
     meet once in a thousand runs, a small sun in a broad lobe, another has drawn, and no candidate looks better than it
-    is.  Compared are splits by eighths, and by sixteenths about the best; one strategy alone is taken where no mixture
-    promises a tenth less.  Visible normals are taken to be independent: pairs (``antithetic``) help slopes in a
-    normal, hardly ever the value (docs/renderer.md).  A gradient to texels where the map is black needs a strategy
-    that reaches them: not the environment table alone.
+    is.  Compared are splits by eighths, and by sixteenths about the best.  That holds for independent numbers; even
+    ones serve one strategy better than few points of each, so where one strategy alone comes within twice the variance
+    of the best mixture, both are tried as they will be drawn, at 1024 points, and a gain below a tenth leaves the one.
+    Visible normals are independent: pairs (``antithetic``) help slopes in a normal, hardly ever the value
+    (docs/renderer.md).  A gradient to texels where the map is black needs a strategy that reaches them: not the
+    environment table alone.
 
     No gradient.  The result depends on the inputs and ``seed`` alone.  Raises TypeError for a wrong dtype, ValueError
     for a shape, device, count, choice or a value that is not finite.
@@ -77,29 +84,48 @@ def plan_samples(
         raise ValueError(f"total: expected a count of at least 1, got {total}")
     if scene is not None and scene.device != position.device:
         raise ValueError(f"scene: expected device {position.device}, got {scene.device}")
+    choice("points", points, ("halton", "random"))
     width = roughness * roughness if choice("alpha", alpha, ("squared", "linear")) == 0 else roughness
-    points = min(n, PILOT_POINTS)
-    rows = spread_rows(n, points, seed).to(position.device)
-    values = [v[rows].contiguous() for v in (position, normal, ng, wo, base_color, width, metallic)]
-    pilot = _draw(values, environment, PILOT_SAMPLES // (3 * points), scene, seed, paint)
+    values = [v.detach() for v in (position, normal, ng, wo, base_color, width, metallic)]
+    rows, share = _pilot_points(values, environment, scene, seed, paint)
+    values = [v[rows] for v in values]
+    pilot = *_draw(values, environment, PILOT_SAMPLES // (3 * len(rows)), scene, seed, paint), share
     counts = _splits(int(total)).to(position.device)
     variance = _variances(*pilot, counts)
     finer = counts[variance.argmin()] + _MOVES.to(counts) * max(1, int(total) // 16)
     finer = finer[(finer >= 0.0).all(1)]
     counts, variance = torch.cat([counts, finer]), torch.cat([variance, _variances(*pilot, finer)])
-    if not bool(torch.isfinite(variance).all()):
-        raise ValueError("points: expected finite positions, directions, materials and light, got NaN or infinity")
     alone = (counts > 0.0).sum(1) == 1
     best, single = int(variance.argmin()), int(torch.where(alone, variance, torch.inf).argmin())
-    if not float(variance[best]) < PREFER_ONE * float(variance[single]):
-        best = single
-    return SamplePlan(tuple(int(k) for k in counts[best]), float(variance[best]))
+    if best != single and float(variance[single]) < RIVAL * float(variance[best]):
+        options = {"scene": scene, "seed": seed, "points": points, "paint": paint}
+        mixture, one = (_tried(values, share, environment, counts[k], **options) for k in (best, single))
+        best = best if mixture < PREFER_ONE * one else single
+    return SamplePlan(_whole(counts[best]), float(variance[best]))
 
 
 def spread_rows(n: int, count: int, seed: int) -> Tensor:
     """One row of each of ``count`` equal stretches of ``n`` rows, at random within it; int64."""
+    return (_spread(count, seed) * n).long().clamp(max=n - 1)
+
+
+def _spread(count: int, seed: int) -> Tensor:
+    """A number at random in each of ``count`` equal parts of [0, 1), float64."""
     jitter = torch.rand(count, dtype=torch.float64, generator=torch.Generator().manual_seed(int(seed)))
-    return ((torch.arange(count) + jitter) * (n / count)).long().clamp(max=n - 1)
+    return (torch.arange(count) + jitter) / count
+
+
+def _pilot_points(values: list[Tensor], environment, scene, seed: int, paint: str) -> tuple[Tensor, Tensor]:
+    """Rows of the pilot's points and what each counts in the mean over all points, both ``(P,)``."""
+    n, device = len(values[0]), values[0].device
+    if n <= PILOT_POINTS:
+        return torch.arange(n, device=device), torch.full((n,), 1.0 / n, dtype=torch.float64, device=device)
+    rows = spread_rows(n, min(n, SCOUTED), seed).to(device)
+    square = _draw([v[rows] for v in values], environment, 1, scene, seed + 1, paint)[0].square().sum((1, 2))
+    chance = 0.5 / len(rows) + 0.5 * square / square.sum().clamp(min=1e-30)
+    edges = chance.cumsum(0)
+    chosen = torch.searchsorted(edges, _spread(PILOT_POINTS, seed + 2).to(device) * edges[-1]).clamp(max=len(rows) - 1)
+    return rows[chosen], edges[-1] / (chance[chosen] * (len(rows) * PILOT_POINTS))
 
 
 def _draw(
@@ -115,15 +141,30 @@ def _draw(
     plan, offsets = sampling_plan(samples, seed, False, "balance", "halton", paint, None, scene)
     table = environment.table
     light = [(environment.radiance.contiguous(), wp.vec3), *table.sampler, (table.density, wp.float32)]
-    ins = [*zip(values, [wp.vec3] * 5 + [wp.float32] * 2), *light, (offsets.to(device), wp.vec2), plan]
+    points = zip([v.contiguous() for v in values], [wp.vec3] * 5 + [wp.float32] * 2)
+    ins = [*points, *light, (offsets.to(device), wp.vec2), plan]
     origins, directions, value, density = (torch.empty(n, count, 3, device=device) for _ in range(4))
     outs = [(v, wp.vec3) for v in (origins, directions, value, density)]
     launch(kernels.pilot_kernel, n, [*ins, *outs], device, slice_min=8)
     if scene is not None and scene.faces.shape[0]:
         value[scene.occluded(origins, directions)] = 0.0
+    if not bool(torch.isfinite(value).all()):
+        raise ValueError("points: expected finite positions, directions, materials and light, got NaN or infinity")
     density = density.double()
     lost = (density == 0.0).all(2).unflatten(1, (3, each)).double().mean(2)
     return value.double(), density, density / (density.sum(1) + lost)[:, None]
+
+
+def _tried(values: list[Tensor], share: Tensor, environment: Environment, counts: Tensor, **options) -> float:
+    """Variance of a point, mean by ``share (P,)``, that :func:`reli3d.render.shading.shade` has with ``counts``."""
+    runs = TRIED // len(share)
+    many = [v.repeat(runs, *[1] * (v.ndim - 1)) for v in values]
+    drawn = shade(*many, environment, samples=_whole(counts), antithetic=False, alpha="linear", **options)
+    return float(share @ drawn.double().unflatten(0, (runs, -1)).var(0).sum(1))
+
+
+def _whole(counts: Tensor) -> tuple[int, int, int]:
+    return tuple(int(k) for k in counts)
 
 
 def _splits(total: int) -> Tensor:
@@ -136,8 +177,8 @@ def _splits(total: int) -> Tensor:
 _MOVES = torch.tensor([[1, -1, 0], [-1, 1, 0], [1, 0, -1], [-1, 0, 1], [0, 1, -1], [0, -1, 1]])
 
 
-def _variances(value: Tensor, density: Tensor, weight: Tensor, counts: Tensor) -> Tensor:
-    """Variance of a point, mean over the points, for each of ``counts (C, 3)``; the others from :func:`_draw`."""
+def _variances(value: Tensor, density: Tensor, weight: Tensor, share: Tensor, counts: Tensor) -> Tensor:
+    """Variance of a point, mean by ``share (P,)``, for each of ``counts (C, 3)``; the others from :func:`_draw`."""
     points, samples = value.shape[:2]
     total = torch.zeros(len(counts), dtype=torch.float64, device=counts.device)
     size = max(1, BLOCK // (samples * len(counts)))
@@ -146,5 +187,5 @@ def _variances(value: Tensor, density: Tensor, weight: Tensor, counts: Tensor) -
         inverse = 1.0 / (counts @ p.mT).clamp(min=1e-30)  # (P, C, S): the pilot's q over the candidate's
         square = (counts @ (w * v.square().sum(2, keepdim=True)).mT * inverse.square()).sum(2)
         mean = (inverse @ (w[..., None] * v[:, :, None]).flatten(2)).unflatten(2, (3, 3))  # strategy, channel
-        total += (square - (counts * mean.square().sum(3)).sum(2)).sum(0)
-    return total / points
+        total += share[first : first + size] @ (square - (counts * mean.square().sum(3)).sum(2))
+    return total

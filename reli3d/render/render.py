@@ -17,7 +17,7 @@ from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import SurfacePoints, surface_points
 from reli3d.render.shading import SAMPLES, shade
 
-PLAN_RAYS = 4096  # of a view, to find the points of a plan's pilot among
+PLAN_RAYS = 32768  # of a view, to find the points of a plan's pilot among
 BAND_RAYS = 1 << 18  # rays of one band of rows: bounds memory at about 40 MB whatever the image size
 
 
@@ -101,9 +101,9 @@ def plan_render(
 ) -> SamplePlan:
     """Counts of ``total`` samples for :func:`render` of this view, to be given to it with ``antithetic=False``.
 
-    Arguments as for :func:`render`.  It plans for points among those that 4096 rays of the camera hit, as
-    :func:`reli3d.render.allocation.plan_samples` says, and costs less than a twentieth of 512 x 512 pixels.  No
-    gradient.  Raises ValueError without any environment and where the camera sees nothing.
+    Arguments as for :func:`render`.  It plans for points among those that 32768 rays of the camera hit, as
+    :func:`reli3d.render.allocation.plan_samples` says.  No gradient.  Raises ValueError without any environment and
+    where the camera sees nothing.
     """
     parts, environment = _checked(asset, camera, environment)
     scene = scene if scene is not None else joined_scene(parts)
