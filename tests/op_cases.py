@@ -194,7 +194,7 @@ def textured(n: int) -> dict[str, Tensor]:
     maps = {name: uniform(6, 6, 3, seed=k) for k, name in enumerate(("base_color", "orm", "normal"), 10)}
     maps["normal"] = 0.5 + 0.5 * above(36, 13).reshape(6, 6, 3)
     v = corners(60)
-    return {"vertices": v, "normals": units(len(v), 8), "uv": uniform(len(v), 2, seed=9, high=2.0), **maps,
+    return {"vertices": v, "normals": above(len(v), 8), "uv": uniform(len(v), 2, seed=9, high=2.0), **maps,
             "bary": weights(n)}  # fmt: skip
 
 

@@ -51,19 +51,19 @@ def test_directions_of_the_published_parametrisation(goldens):
 
 def test_lookup_and_its_gradient_equal_the_float64_twin(device):
     g = torch.Generator().manual_seed(1)
-    radiance, d = torch.rand(9, 18, 3, generator=g), directions(3000)
-    weight = torch.randn(3000, 3, generator=g)
+    radiance, d = torch.rand(9, 18, 3, generator=g), directions(20_000)
+    weight = torch.rand(20_000, 3, generator=g)  # of one sign: sums that cancel have no digits left
     ins = [radiance.to(device).requires_grad_(), d.to(device).requires_grad_()]
     got = Environment(ins[0]).lookup(ins[1])
     twin = [radiance.double().requires_grad_(), d.double().requires_grad_()]
     want = reference.lookup_envmap(*twin)
     torch.testing.assert_close(got.cpu().double(), want, rtol=0, atol=2e-5)  # 1e-7 of u times 18 texels, with margin
+    assert reference.share_within(got, want) >= 0.999
     grads = torch.autograd.grad((got * weight.to(device)).sum(), ins)
     truth = torch.autograd.grad((want * weight.double()).sum(), twin)
-    torch.testing.assert_close(grads[0].cpu().double(), truth[0], rtol=1e-4, atol=1e-3)  # sums of 3000 float32 terms
-    project = lambda v: v - (v * d).sum(-1, keepdim=True) * d  # noqa: E731  only the tangent part is defined
-    off = (project(grads[1].cpu().double()) - project(truth[1])).norm(dim=-1) / (1.0 + project(truth[1]).norm(dim=-1))
-    assert (off < 1e-3).double().mean() > 0.999  # a direction may sit on a kink between texels
+    assert reference.share_within(grads[0], truth[0]) >= 0.999
+    # a direction may sit on a kink between texels
+    assert reference.rows_within(*(reference.across(v, d) for v in (grads[1], truth[1]))) >= 0.999
 
 
 @pytest.mark.parametrize("name", maps())

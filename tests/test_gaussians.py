@@ -47,10 +47,10 @@ def test_value_and_gradients_match_the_definition(device):
     grads = torch.autograd.grad((got * weight).sum(), [*own, d])
     truth = torch.autograd.grad((want * weight.double()).sum(), [*twin, at])
     # the squared chord and the cosine differ in derivative by multiples of the unit vectors: compare across them
-    across = [lambda g, v: g - (g * v).sum(-1, keepdim=True) * v, lambda g, v: g, lambda g, v: g]
-    for f, g, t, v in zip([*across, across[0]], grads, truth, [*own, d], strict=True):
-        g, t = f(g.double(), v.detach().double()), f(t, v.detach().double())
-        torch.testing.assert_close(g, t, rtol=1e-3, atol=1e-4 * float(t.abs().max()))
+    for k, v in ((0, own[0]), (3, d)):
+        assert reference.rows_within(*(reference.across(g[k], v) for g in (grads, truth))) >= 0.999, k
+    for k in (1, 2):
+        assert reference.share_within(grads[k], truth[k]) >= 0.999, k
 
 
 def test_irradiance_and_gradients_match_quadrature(device):

@@ -14,6 +14,7 @@ from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import interpolate, sample_texture, surface_points
 from reli3d.render.material import PAINTS
 from reli3d.render.render import render
+from tests import reference
 
 
 def eye(device, *position):
@@ -64,17 +65,17 @@ def test_texture_lookup_is_bilinear_and_repeats(device):
     grid = torch.stack(torch.meshgrid(k, k, indexing="ij")[::-1], -1)
     torch.testing.assert_close(sample_texture(t, grid), t, rtol=0, atol=1e-6)
     torch.testing.assert_close(sample_texture(t, grid + torch.tensor([3.0, -2.0], device=device)), t, rtol=0, atol=1e-5)
-    uv = torch.rand(500, 2, generator=torch.Generator().manual_seed(1)).to(device).requires_grad_()
-    padded = torch.nn.functional.pad(t.permute(2, 0, 1)[None], (1, 1, 1, 1), mode="circular").double()
+    uv = torch.rand(5000, 2, generator=torch.Generator().manual_seed(1)).to(device).requires_grad_()
+    padded = torch.nn.functional.pad(t.double().permute(2, 0, 1)[None], (1, 1, 1, 1), mode="circular")
     want = torch.nn.functional.grid_sample(
-        padded, ((uv * 8 + 1) / 10 * 2 - 1)[None, None].double(), align_corners=False
+        padded, ((uv.double() * 8 + 1) / 10 * 2 - 1)[None, None], align_corners=False
     )
     got = sample_texture(t, uv)
     torch.testing.assert_close(got.double(), want[0, :, 0].T, rtol=0, atol=1e-5)
-    weight = torch.randn(500, 3, generator=torch.Generator().manual_seed(2)).to(device)
+    weight = torch.randn(5000, 3, generator=torch.Generator().manual_seed(2)).to(device)
     for a, b in zip(torch.autograd.grad((got * weight).sum(), (t, uv)),
                     torch.autograd.grad((want[0, :, 0].T * weight.double()).sum(), (t, uv)), strict=True):  # fmt: skip
-        torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-3)  # float32 weights against float64 ones
+        assert reference.share_within(a, b) >= 0.999
 
 
 @pytest.mark.parametrize("explicit", [True, False])

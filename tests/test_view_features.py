@@ -4,10 +4,11 @@ import pytest
 import torch
 from torch.nn.functional import grid_sample, normalize
 
-from reli3d.geometry.projection import pool_views, summarize_views
+from reli3d.geometry.projection import gather_views, pool_views, summarize_views
 from reli3d.kernels import view_features as kernels
 from reli3d.nn.view_features import ViewFeatures, ViewMaps
 from reli3d.render.camera import look_at, project
+from tests import reference
 
 SIZE, GRID, WIDTH = 24, 4, 6
 
@@ -79,6 +80,31 @@ def test_the_kernel_matches_plain_torch(device, views, on_surface):
         # projection in float32: 1e-5 pixel on values that change by up to 12 a pixel; 0.2 % of them divide by EDGE *
         # size
         torch.testing.assert_close(g.double(), w, rtol=1e-4, atol=5e-4)
+
+
+def test_gathered_values_and_gradients_equal_their_float64_twin(device):
+    """Border values outside, any channels; the slope of a point by its length, because image and pixels pull apart."""
+    g, n = torch.Generator().manual_seed(3), 20_000
+    maps, points = torch.rand(3, 24, 20, 5, generator=g), torch.rand(n, 3, generator=g) * 1.6 - 0.8
+    poses = rig(3, device)
+    ins = [v.to(device).requires_grad_() for v in (maps, points)]
+    values, pixels = gather_views(*ins, poses.c2w, poses.intrinsics)
+    twin, rows = [v.double().requires_grad_() for v in (maps, points)], []
+    for v in range(3):
+        c2w, intrinsics = poses.c2w[v].cpu().double(), poses.intrinsics[v].cpu().double()
+        local = (twin[1] - c2w[:3, 3]) @ c2w[:3, :3]
+        fx, fy, cx, cy = intrinsics
+        x, y = fx * local[:, 0] / -local[:, 2] + cx, fy * local[:, 1] / local[:, 2] + cy
+        grid = torch.stack([x / 20 * 2 - 1, y / 24 * 2 - 1], -1)[None, None]
+        image = grid_sample(twin[0][v].permute(2, 0, 1)[None], grid, align_corners=False, padding_mode="border")
+        rows.append(torch.cat([image[0, :, 0].T, torch.stack([x, y, -local[:, 2]], -1)], -1))
+    got, want = torch.cat([values, pixels], -1), torch.stack(rows, 1)
+    assert reference.share_within(got, want) >= 0.999
+    weight = torch.rand(want.shape, generator=g)  # of one sign: sums that cancel have no digits left
+    grads = torch.autograd.grad((got * weight.to(device)).sum(), ins)
+    truth = torch.autograd.grad((want * weight.double()).sum(), twin)
+    assert reference.share_within(grads[0], truth[0]) >= 0.999
+    assert reference.rows_within(grads[1], truth[1]) >= 0.999
 
 
 def test_the_order_of_the_views_does_not_matter(device):

@@ -13,23 +13,35 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=n
 vec8 = wp.types.vector(length=8, dtype=wp.float32)  # one AVX register; a plane's channels are padded to blocks of it
 
 
+ONE, HALF, MINUS = (wp.constant(wp.float64(v)) for v in (1.0, 0.5, -1.0))
+
+
 @wp.func
-def texel_position(point: wp.vec3, plane: int, height: int, width: int) -> wp.vec2:
-    """Column and row of ``point`` in texel centres, as far outside as needed: -1 and below has no texel."""
-    a = point[0]
-    b = point[1]
+def texel_position(point: wp.vec3, plane: int, height: int, width: int) -> wp.vec2d:
+    """Column and row of ``point`` in texel centres, as far outside as needed: -1 and below has no texel.
+
+    In float64: float32 would leave 1.5e-5 of a texel of 300, and a value of that part of what neighbours differ by.
+    """
+    a = wp.float64(point[0])
+    b = wp.float64(point[1])
     if plane == 1:
-        b = point[2]
+        b = wp.float64(point[2])
     if plane == 2:
-        a = point[1]
-        b = point[2]
-    return wp.vec2(((a + 1.0) * float(width) - 1.0) * 0.5, ((b + 1.0) * float(height) - 1.0) * 0.5)
+        a = wp.float64(point[1])
+        b = wp.float64(point[2])
+    return wp.vec2d(((a + ONE) * wp.float64(width) - ONE) * HALF, ((b + ONE) * wp.float64(height) - ONE) * HALF)
 
 
 @wp.func
-def touches(at: wp.vec2, height: int, width: int) -> bool:
+def beyond(at: wp.float64, k: int) -> float:
+    """Place between texel centres ``k`` and ``k + 1``, in [0, 1]."""
+    return wp.float32(at - wp.float64(k))
+
+
+@wp.func
+def touches(at: wp.vec2d, height: int, width: int) -> bool:
     """Whether any texel has a weight; False for NaN, so that the conversion to int below is defined."""
-    return at[0] > -1.0 and at[0] < float(width) and at[1] > -1.0 and at[1] < float(height)
+    return at[0] > MINUS and at[0] < wp.float64(width) and at[1] > MINUS and at[1] < wp.float64(height)
 
 
 @wp.func
@@ -64,8 +76,8 @@ def sample_kernel(
     if touches(at, height, width):
         x = int(wp.floor(at[0]))
         y = int(wp.floor(at[1]))
-        u = at[0] - float(x)
-        v = at[1] - float(y)
+        u = beyond(at[0], x)
+        v = beyond(at[1], y)
         w00 = (1.0 - u) * (1.0 - v)
         w01 = u * (1.0 - v)
         w10 = (1.0 - u) * v
@@ -140,8 +152,8 @@ def sample_rows_kernel(
                 point = order[slab * per_batch + k] + offset
                 at = texel_position(points[point], plane, height, width)
                 x = int(wp.floor(at[0]))
-                u = at[0] - float(x)
-                v = at[1] - float(row - 1)
+                u = beyond(at[0], x)
+                v = beyond(at[1], row - 1)
                 w00 = (1.0 - u) * (1.0 - v)
                 w01 = u * (1.0 - v)
                 w10 = (1.0 - u) * v
@@ -176,8 +188,8 @@ def points_adjoint_kernel(
         if touches(at, height, width):
             x = int(wp.floor(at[0]))
             y = int(wp.floor(at[1]))
-            u = at[0] - float(x)
-            v = at[1] - float(y)
+            u = beyond(at[0], x)
+            v = beyond(at[1], y)
             base = ((point // per_batch) * 3 + plane) * height * width * blocks
             across = vec8()
             down = vec8()
@@ -220,7 +232,7 @@ def cell_key_kernel(
     key = (height + 1) * bins
     if touches(at, height, width):
         key = (int(wp.floor(at[1])) + 1) * bins
-        key += wp.min(int((at[0] + 1.0) * float(bins) / float(width + 1)), bins - 1)
+        key += wp.min(int(wp.float32(at[0] + ONE) * float(bins) / float(width + 1)), bins - 1)
     batch = point // per_batch
     keys[(batch * 3 + plane) * per_batch + point % per_batch] = key
 
@@ -260,8 +272,8 @@ def planes_adjoint_kernel(
         point = (slab // 3) * per_batch + order[slab * per_batch + k]
         at = texel_position(points[point], plane, height, width)
         x = int(wp.floor(at[0]))
-        u = at[0] - float(x)
-        v = at[1] - float(y)
+        u = beyond(at[0], x)
+        v = beyond(at[1], y)
         source = (point * 3 + plane) * blocks
         if x >= 0 and y >= 0 and x + 1 < width and y + 1 < height:
             top = base + (y * width + x) * blocks
