@@ -23,7 +23,7 @@ CUBES = 47  # a side: 103,823 cubes
 # Of the change by a relative step of an input, where an edge of 0.02 and a random share of 1 give up to 0.02: digits
 # that float32 lacks where terms of that size cancel, and float64 in the twin's differences of shares.  Centres are
 # means of vertices that are rounded in the box of 1, not in a cube.
-FLOOR = {"level": 3e-9, "deformation": 1e-9, "alpha": 3e-9, "beta": 2e-8, "gamma": 1e-7}
+FLOOR = {"level": 3e-9, "deformation": 1e-9, "alpha": 3e-9, "beta": 3e-9, "gamma": 1e-7}
 
 
 def agree(got, want, floor=0.0, share=0.999, within=1e-4):

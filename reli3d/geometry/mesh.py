@@ -88,6 +88,7 @@ def _check_topology(vertices: Tensor, faces: Tensor) -> None:
 
 def face_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     """Cross product of two sides of every face, ``(F, 3)``: outward, its length twice the area.  Differentiable."""
+    _check_topology(vertices, faces)
     a, b, c = (vertices.index_select(0, faces[:, k]) for k in range(3))
     return torch.linalg.cross(b - a, c - a)
 
@@ -98,7 +99,6 @@ def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     vertices: ``(V, 3)``.  faces: ``(F, 3)`` int32.  Gradients reach ``vertices``.  The sum over the faces has a fixed
     order on CPU.
     """
-    _check_topology(vertices, faces)
     per_face = face_normals(vertices, faces)
     total = torch.zeros_like(vertices)
     for corner in faces.long().T.contiguous():  # index_add takes ten times as long with int32

@@ -39,7 +39,7 @@ def vertex_deviation(
         padded = torch.nn.functional.pad(level, (1,) * 6, value=1.0)
     elif level.requires_grad:
         padded = level
-    device, size = level.device, level.new_tensor(t.cubes)
+    device, size = level.device, torch.tensor(t.cubes, dtype=torch.float64, device=level.device)
     table = surface.tables_on(device)
     group = table["group"].view(256, 12)[t.resolved.long()]
     cell, edge = (group >= 0).nonzero(as_tuple=True)
@@ -69,21 +69,21 @@ def vertex_deviation(
             position if deformation is None else position + deformation.reshape(-1, 3).index_select(0, vertex)
         )
     tiny = torch.maximum(*(v.detach().abs() for v in levels)) < LEVEL_MIN
-    # float64: products of levels and weights of any size would leave float32
+    # float64 from here on: levels and weights have any size, and distances are differences of positions
     values = [torch.where(tiny, v.detach(), v).double() * a for v, a in zip(levels, weights, strict=True)]
-    share = (values[0] / (values[0] - values[1])).float()
-    crossing = torch.lerp(*positions, share[:, None]) * (2.0 * level.new_tensor(extent))
+    share = values[0] / (values[0] - values[1])
+    crossing = torch.lerp(*positions, share[:, None]) * (2.0 * size.new_tensor(extent))
 
     total = int(t.counts.sum())
-    share = weight(beta, edge)
-    mass = level.new_zeros(total).index_add(0, owner, share)
-    vertex = level.new_zeros(total, 3).index_add(0, owner, crossing * share[:, None]) / mass[:, None]
+    share, none = weight(beta, edge).double(), size.new_zeros(total)
+    mass = none.index_add(0, owner, share)
+    vertex = size.new_zeros(total, 3).index_add(0, owner, crossing * share[:, None]) / mass[:, None]
     if not bool(torch.isfinite(vertex.detach()).all()):
         raise ValueError("alpha, beta, deformation: expected positive weights and finite offsets, got others")
-    count = torch.bincount(owner, minlength=total).to(level.dtype)
+    count = torch.bincount(owner, minlength=total)
     distance = torch.linalg.vector_norm(vertex.index_select(0, owner) - crossing, dim=-1)
-    mean = level.new_zeros(total).index_add(0, owner, distance) / count
-    return level.new_zeros(total).index_add(0, owner, (distance - mean.index_select(0, owner)).abs()) / count
+    mean = none.index_add(0, owner, distance) / count
+    return (none.index_add(0, owner, (distance - mean.index_select(0, owner)).abs()) / count).float()
 
 
 def sign_entropy(level: Tensor) -> Tensor:

@@ -14,6 +14,7 @@ wp.set_module_options({"enable_backward": True, "cpu_compiler_flags": "-march=na
 EDGE_ON = wp.constant(wp.float64(1.0e-6))  # sine of a ray to a face times that of its angle: below, a ray query cannot
 AREA_TINY = wp.constant(wp.float64(1.0e-30))  # squared cross product of a face that has no normal
 ONE = wp.constant(wp.float64(1.0))
+HALF = wp.constant(wp.float64(0.5))
 
 
 @wp.func
@@ -142,10 +143,10 @@ def sample_texture_kernel(
     i = start + wp.tid()
     height = texture.shape[0]
     width = texture.shape[1]
-    x = uv[i][0] * float(width) - 0.5
-    y = uv[i][1] * float(height) - 0.5
-    fx = x - wp.floor(x)
-    fy = y - wp.floor(y)
+    x = wp.float64(uv[i][0]) * wp.float64(width) - HALF  # a place between texels has few digits left in float32
+    y = wp.float64(uv[i][1]) * wp.float64(height) - HALF
+    fx = wp.float32(x - wp.floor(x))
+    fy = wp.float32(y - wp.floor(y))
     c0 = wrap(int(wp.floor(x)), width)
     r0 = wrap(int(wp.floor(y)), height)
     c1 = wrap(c0 + 1, width)

@@ -43,19 +43,15 @@ def grid_position(at: wp.vec3i, shift: wp.array[wp.vec3], cubes: wp.vec3i, pad: 
 
 
 @wp.func
-def cell_position(at: wp.vec3i, corner: int, shift: wp.array[wp.vec3], cubes: wp.vec3i, pad: int) -> wp.vec3:
-    """Position of a cube's corner as :func:`grid_position` has it, from the cube's lowest corner: differences of these
-    keep the digits that differences of positions lose.
-    """
-    i0 = wp.clamp(at[0] - pad, 0, cubes[0])
-    j0 = wp.clamp(at[1] - pad, 0, cubes[1])
-    k0 = wp.clamp(at[2] - pad, 0, cubes[2])
-    i = wp.clamp(at[0] - pad + (corner & 1), 0, cubes[0])
-    j = wp.clamp(at[1] - pad + (corner >> 1 & 1), 0, cubes[1])
-    k = wp.clamp(at[2] - pad + (corner >> 2), 0, cubes[2])
-    p = wp.vec3(float(i - i0) / float(cubes[0]), float(j - j0) / float(cubes[1]), float(k - k0) / float(cubes[2]))
+def exact_position(at: wp.vec3i, shift: wp.array[wp.vec3], cubes: wp.vec3i, pad: int) -> wp.vec3d:
+    """:func:`grid_position` in float64, for differences."""
+    i = wp.clamp(at[0] - pad, 0, cubes[0])
+    j = wp.clamp(at[1] - pad, 0, cubes[1])
+    k = wp.clamp(at[2] - pad, 0, cubes[2])
+    p = wp.vec3d(wp.float64(i) / wp.float64(cubes[0]), wp.float64(j) / wp.float64(cubes[1]),
+                 wp.float64(k) / wp.float64(cubes[2]))  # fmt: skip
     if shift.shape[0] > 0:
-        p += shift[(i * (cubes[1] + 1) + j) * (cubes[2] + 1) + k]
+        p += wp.vec3d(shift[(i * (cubes[1] + 1) + j) * (cubes[2] + 1) + k])
     return p
 
 

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from reli3d.kernels.flexicubes import LEVEL_MIN, cell_position, corner_index, end_shares, split_index, weight
+from reli3d.kernels.flexicubes import LEVEL_MIN, corner_index, end_shares, exact_position, split_index, weight
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
 
@@ -19,49 +19,52 @@ def dual_vertex_adjoint_kernel(
     # out, zeroed
     g_level: wp.array[float], g_shift: wp.array[wp.vec3], g_alpha: wp.array[float], g_beta: wp.array[float],
 ):  # fmt: skip
-    """A thread is a surface cube and owns its 8 entries of g_level, g_shift, g_alpha and its 12 of g_beta."""
+    """A thread is a surface cube and owns its 8 entries of g_level, g_shift, g_alpha and its 12 of g_beta.
+
+    In float64: a point less the mean, and ends of an edge, are differences of a small part of their size.
+    """
     s = start + wp.tid()
     cell = cells[s]
     row = rows[s]
     at = split_index(cell, ny, nz)
     for own in range(counts[s]):
-        total = wp.float32(0.0)
-        mean = wp.vec3()
+        total = wp.float64(0.0)
+        mean = wp.vec3d()
         for e in range(12):
             if group[resolved[s] * 12 + e] == own:
                 a = ends[2 * e]
                 b = ends[2 * e + 1]
                 ways = end_shares(weight(alpha, row, 8, a), level[corner_index(cell, a, ny, nz)],
                                   weight(alpha, row, 8, b), level[corner_index(cell, b, ny, nz)])  # fmt: skip
-                x_a = cell_position(at, a, shift, cubes, pad)
-                x_b = cell_position(at, b, shift, cubes, pad)
-                beta_e = weight(beta, row, 12, e)
-                mean += (x_a + float(ways[0]) * (x_b - x_a)) * beta_e
+                x_a = exact_position(at + wp.vec3i(a & 1, a >> 1 & 1, a >> 2), shift, cubes, pad)
+                x_b = exact_position(at + wp.vec3i(b & 1, b >> 1 & 1, b >> 2), shift, cubes, pad)
+                beta_e = wp.float64(weight(beta, row, 12, e))
+                mean += (x_a * ways[1] + x_b * ways[0]) * beta_e
                 total += beta_e
         mean = mean / total
-        g = wp.cw_mul(g_vertices[base[s] + own], scale)
+        g = wp.vec3d(wp.cw_mul(g_vertices[base[s] + own], scale)) / total
         for e in range(12):
             if group[resolved[s] * 12 + e] == own:
                 a = ends[2 * e]
                 b = ends[2 * e + 1]
-                alpha_a = weight(alpha, row, 8, a)
-                alpha_b = weight(alpha, row, 8, b)
+                alpha_a = wp.float64(weight(alpha, row, 8, a))
+                alpha_b = wp.float64(weight(alpha, row, 8, b))
                 level_a = level[corner_index(cell, a, ny, nz)]
                 level_b = level[corner_index(cell, b, ny, nz)]
-                ways = end_shares(alpha_a, level_a, alpha_b, level_b)
-                t = float(ways[0])
-                rest = float(ways[1])
-                x_a = cell_position(at, a, shift, cubes, pad)
-                x_b = cell_position(at, b, shift, cubes, pad)
-                g_beta[s * 12 + e] = wp.dot(x_a + t * (x_b - x_a) - mean, g) / total
-                g_point = weight(beta, row, 12, e) / total * g
+                ways = end_shares(float(alpha_a), level_a, float(alpha_b), level_b)
+                x_a = exact_position(at + wp.vec3i(a & 1, a >> 1 & 1, a >> 2), shift, cubes, pad)
+                x_b = exact_position(at + wp.vec3i(b & 1, b >> 1 & 1, b >> 2), shift, cubes, pad)
+                g_beta[s * 12 + e] = float(wp.dot(x_a * ways[1] + x_b * ways[0] - mean, g))
+                g_point = g * wp.float64(weight(beta, row, 12, e))
                 g_t = wp.dot(x_b - x_a, g_point)
-                g_alpha[s * 8 + a] = g_alpha[s * 8 + a] + t * rest / alpha_a * g_t
-                g_alpha[s * 8 + b] = g_alpha[s * 8 + b] - t * rest / alpha_b * g_t
+                g_size = g_t * ways[0] * ways[1]  # of the logarithms of the two sizes, with opposite signs
+                g_alpha[s * 8 + a] = g_alpha[s * 8 + a] + float(g_size / alpha_a)
+                g_alpha[s * 8 + b] = g_alpha[s * 8 + b] - float(g_size / alpha_b)
                 if wp.max(wp.abs(level_a), wp.abs(level_b)) >= LEVEL_MIN:
+                    g_t = g_t / ways[2]
                     if level_a < 0.0:
                         g_t = -g_t
-                    g_level[s * 8 + a] = g_level[s * 8 + a] + float(wp.float64(alpha_a) * ways[1] / ways[2]) * g_t
-                    g_level[s * 8 + b] = g_level[s * 8 + b] + float(wp.float64(alpha_b) * ways[0] / ways[2]) * g_t
-                g_shift[s * 8 + a] = g_shift[s * 8 + a] + rest * g_point
-                g_shift[s * 8 + b] = g_shift[s * 8 + b] + t * g_point
+                    g_level[s * 8 + a] = g_level[s * 8 + a] + float(alpha_a * ways[1] * g_t)
+                    g_level[s * 8 + b] = g_level[s * 8 + b] + float(alpha_b * ways[0] * g_t)
+                g_shift[s * 8 + a] = g_shift[s * 8 + a] + wp.vec3(g_point * ways[1])
+                g_shift[s * 8 + b] = g_shift[s * 8 + b] + wp.vec3(g_point * ways[0])
