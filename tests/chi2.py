@@ -56,16 +56,22 @@ def p_value(directions: Tensor, pdf: Callable[[Tensor], Tensor], *, total: int |
 def cell_masses(pdf: Callable[[Tensor], Tensor], res: int, ires: int, up: int = 2, device=None) -> np.ndarray:
     """Integral of ``pdf`` over each cell, ``(res * 2 res,)`` float64."""
     phi = (np.arange(2 * res * ires) + 0.5) / (2 * res * ires) * 2 * np.pi
-    z = (np.arange(res * ires) + 0.5) / (res * ires) * 2 - 1
-    z, phi = np.meshgrid(z, phi, indexing="ij")
-    s = np.sqrt(1 - z * z)
-    d = np.empty((*z.shape, 3), np.float32)
-    d[..., up], d[..., (up + 1) % 3], d[..., (up + 2) % 3] = z, s * np.cos(phi), s * np.sin(phi)
-    value = pdf(torch.from_numpy(d.reshape(-1, 3)).to(device)).detach().cpu().double().numpy()
-    value = value.reshape(res, ires, 2 * res, ires).mean((1, 3)).reshape(-1)
-    return value * (4 * np.pi / (2 * res * res))
+    height = (np.arange(res * ires) + 0.5) / (res * ires) * 2 - 1
+    value = np.empty((res, 2 * res))
+    rows = max(1, (1 << 20) // (2 * res * ires * ires))  # of cells at once: 50 MB
+    for first in range(0, res, rows):
+        z, turn = np.meshgrid(height[first * ires : (first + rows) * ires], phi, indexing="ij")
+        s = np.sqrt(1 - z * z)
+        d = np.empty((*z.shape, 3), np.float32)
+        d[..., up], d[..., (up + 1) % 3], d[..., (up + 2) % 3] = z, s * np.cos(turn), s * np.sin(turn)
+        part = pdf(torch.from_numpy(d.reshape(-1, 3)).to(device)).detach().cpu().double().numpy()
+        value[first : first + rows] = part.reshape(-1, ires, 2 * res, ires).mean((1, 3))
+    return value.reshape(-1) * (4 * np.pi / (2 * res * res))
 
 
-def sidak(tests: int, level: float = 0.01) -> float:
+TESTS = 8 * 30 + 30  # of the suite: four samplers at two azimuths for each of 30 lobes, and the rest
+
+
+def sidak(tests: int = TESTS, level: float = 0.01) -> float:
     """Level of one of ``tests`` independent tests for the family to have ``level``."""
     return 1.0 - (1.0 - level) ** (1.0 / tests)

@@ -3,13 +3,11 @@
 import numpy as np
 import pytest
 import torch
-from scipy.special import erfcinv
 
 from reli3d.render.environment import Environment
 from reli3d.render.material import eval_bsdf, pdf_lobes, sample_bsdf
 from reli3d.render.sampling import halton
 from reli3d.render.shading import shade
-from tests import chi2
 
 ROUGHNESS = np.linspace(0.05, 1.0, 8)
 QUADRATURE = 2e-5  # what the last halving of its step moves the albedo by
@@ -57,7 +55,7 @@ def test_white_metal_sends_out_its_directional_albedo(device):
             z.append(float((out.mean() - truth) / (out.std() / n**0.5 + QUADRATURE)))
             assert truth <= 1.0
     z = np.array(z)
-    assert np.abs(z).max() < np.sqrt(2) * erfcinv(chi2.sidak(len(z)))
+    assert np.abs(z).max() < 3.0  # of 64 numbers with these seeds; measured 1.9
 
 
 def albedo(wo, alpha, base, metallic, u, **paint):

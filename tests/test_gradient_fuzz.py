@@ -172,14 +172,18 @@ def test_gradients_of_the_estimator(device, strategy, paint):
         part, *(v[smooth] for v in exact), [d[smooth] for d in draws], [p[smooth] for p in density], light, paint
     )
     *truth, g_texels = torch.autograd.grad((want * weight.double()[smooth]).sum(), [*part, radiance])
-    assert close(value[smooth], want.detach(), 0.995)
+    assert reference.share_within(value[smooth], want) >= 0.999
+    wide = alpha[smooth] > 0.3
     for k, (g, t) in enumerate(zip(got, truth)):
         g = g.cpu()[smooth].double()
         if k == 0:
-            g, t = (v - (v * part[0].detach()).sum(-1, keepdim=True) * part[0].detach() for v in (g, t))
-        assert close(g, t, 0.99), k
-    # one sum of 4e4 float32 terms
-    assert float((got[4].cpu() - g_texels).norm() / g_texels.norm()) < 1e-3
+            g, t = (reference.across(v, part[0]) for v in (g, t))
+        if strategy == "visible" and k in (0, 2):
+            # a lobe's own sample rounds by 1e-7, which its slopes in normal and width see over alpha^2
+            assert close(g, t, 0.99)
+            g, t = g[wide], t[wide]
+        assert reference.rows_within(g, t) >= 0.999, k
+    assert reference.share_within(got[4], g_texels) >= 0.999
 
 
 @pytest.mark.parametrize("options", [{}, {"paint": "published", "heuristic": "power", "points": "random"},

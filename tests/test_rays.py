@@ -189,6 +189,17 @@ def test_offset_rays_do_not_hit_their_own_face(device, backend, scale, shift):
     assert int((hits.face == face).sum()) == 0
 
 
+def solved(a, b, c, o, d):
+    """u, v, t of ``a + u (b - a) + v (c - a) = o + t d``."""
+    return torch.linalg.solve(torch.stack([b - a, c - a, -d], -1), o - a)
+
+
+def test_the_twin_of_hits_has_the_gradients_of_finite_differences():
+    rng = torch.Generator().manual_seed(3)
+    leaves = [torch.randn(6, 3, generator=rng, dtype=torch.float64).requires_grad_() for _ in range(5)]
+    assert torch.autograd.gradcheck(solved, leaves, eps=1e-6, atol=1e-5, rtol=1e-3)
+
+
 def test_reevaluated_hits_and_their_gradients_equal_float64(device):
     """Any hit, grazing ones too, to 1e-4 in 99.9 % of the entries of values and of slopes in vertices, origins and
     directions; judged each for itself, because a sum of several lets an error hide behind another's size."""
@@ -205,7 +216,7 @@ def test_reevaluated_hits_and_their_gradients_equal_float64(device):
            "normal": hit_normals(ins[0], f, hits.face)}  # fmt: skip
     twin = [t.detach().cpu().double().requires_grad_() for t in ins]
     a, b, c = (twin[0][f.cpu().long()[hits.face.cpu().long(), k]] for k in range(3))
-    uvt = torch.linalg.solve(torch.stack([b - a, c - a, -twin[2]], -1), twin[1] - a)  # a + u e1 + v e2 = o + t d
+    uvt = solved(a, b, c, twin[1], twin[2])
     spot = twin[1] + uvt[:, 2:] * twin[2]
     want = {"t": uvt[:, 2:], "bary": uvt[:, :2], "position": spot, "interpolated": spot,
             "normal": torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1)}  # fmt: skip

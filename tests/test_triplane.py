@@ -42,6 +42,12 @@ def test_values_and_gradients_match_grid_sample_in_float64(device, channels, hei
         assert share_within(a, b) >= 0.999
 
 
+def test_the_twin_has_the_gradients_of_finite_differences():
+    planes, points, _ = inputs(1, 2, 4, 5, 6)
+    leaves = [v.double().requires_grad_() for v in (planes, points)]
+    assert torch.autograd.gradcheck(twin, leaves, eps=1e-6, atol=1e-5, rtol=1e-3)
+
+
 def test_features_match_the_published_release(goldens, device):
     data = np.load(goldens / "object_representation_heads.npz")
     planes, points = (torch.from_numpy(data[k]).to(device) for k in ("triplane", "positions"))

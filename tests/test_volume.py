@@ -125,6 +125,12 @@ def test_composite_and_gradients_match_the_float64_twin(device):
     torch.testing.assert_close(sums, out.opacity.detach(), rtol=1e-5, atol=1e-6)
 
 
+def test_the_twin_has_the_gradients_of_finite_differences():
+    samples, density, color = packed([0, 3, 5], torch.device("cpu"))
+    leaves = [v.double().requires_grad_() for v in (density, color)]
+    assert torch.autograd.gradcheck(lambda *v: twin(samples, *v), leaves, eps=1e-6, atol=1e-5, rtol=1e-3)
+
+
 def test_faint_and_opaque_media_keep_their_digits(device):
     for scale in (1e-6, 1e-3, 30.0, 1e4, 1e30, math.inf):
         samples, density, color = packed([40, 3], device)
