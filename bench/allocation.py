@@ -3,21 +3,31 @@
 ``python -m bench.allocation`` renders the ball of ``bench.shading`` with shadows, 128 x 128, in 18 scenes, with 64
 samples a pixel by the plan's counts, by the published counts (visible normals in pairs) and by each strategy alone, and
 prints variance times time: CPU time of one thread, least of the runs; the plan's own is added to the plan's.
+
+``python -m bench.allocation MESH.glb LIGHT.hdr``: variance of an image of 256 x 256 by both kinds of plan over that by
+the published counts, of the radiance and of the picture (sRGB, mean brightness at 0.18).
 """
 
+import math
 import sys
 import time
+from pathlib import Path
 
 import torch
 
 from bench.shading import SAMPLES, geometry, view
 from reli3d.geometry.rays import RayScene
+from reli3d.io.glb import read_glb
+from reli3d.io.hdr import read_environment
 from reli3d.render.allocation import plan_samples
-from reli3d.render.camera import camera_rays
+from reli3d.render.asset import Asset
+from reli3d.render.camera import Camera, camera_rays, look_at
+from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
+from reli3d.render.render import joined_scene, plan_render, render
 from reli3d.render.shading import shade
 
-RUNS = 4  # of 10 thousand pixels each
+RUNS = 3  # of 10 thousand pixels each
 SINGLE = (64, 0, 0), (0, 64, 0), (0, 0, 64)
 
 
@@ -74,7 +84,7 @@ def study() -> None:
             for metallic in (0.0, 1.0):
                 surface = arguments(points, roughness, metallic)
                 planned, pilot = [], float("inf")
-                for _ in range(2):
+                for _ in range(3):
                     start = time.process_time()
                     planned.append(plan_samples(*surface, environment, scene=points[3]))
                     pilot = min(pilot, time.process_time() - start)
@@ -89,14 +99,44 @@ def study() -> None:
                         spent[counts] = min(spent[counts], time.process_time() - start)
                 variance = {c: float(torch.stack(v).double().var(0).sum(1).mean()) for c, v in work.items()}
                 cost = {c: variance[c] * spent[c] for c in work}
-                own = variance[chosen] * (spent[chosen] + pilot)
+                whole = 1.0 + pilot / spent[chosen]
                 best = min(SINGLE, key=cost.get)
+                over = [cost[chosen] / cost[c] for c in (SAMPLES, best)]
                 per = 1e9 / len(points[0]) / 64
-                say(f"{name} {roughness} {metallic}: {chosen} variance {variance[chosen]:.2e}, plan "
-                    f"{1e3 * pilot:.0f} ms, image {1e3 * spent[chosen]:.0f} ms; variance x time, plan over "
-                    f"published {own / cost[SAMPLES]:.2g}, over the best strategy {best} {own / cost[best]:.3g}; ns a "
-                    f"sample {[round(per * spent[c]) for c in (SAMPLES, *SINGLE)]}\n")  # fmt: skip
+                say(f"{name} {roughness} {metallic}: {chosen} variance {variance[chosen]:.2e}, plan {1e3 * pilot:.0f} "
+                    f"ms, image {1e3 * spent[chosen]:.0f} ms; variance x time with and without the plan's: over the "
+                    f"published counts' {whole * over[0]:.2g} {over[0]:.2g}, over the best strategy's {best} "
+                    f"{whole * over[1]:.2g} {over[1]:.2g}; ns a sample "
+                    f"{[round(per * spent[c]) for c in (SAMPLES, *SINGLE)]}\n")  # fmt: skip
+
+
+def images(glb: Path, light: Path) -> None:
+    """Print how a picture of a real mesh under a real map gains; CPU."""
+    torch.set_num_threads(1)
+    parts, environment = [Asset(p.mesh, p.textures) for p in read_glb(glb)], Environment(read_environment(light))
+    scene = joined_scene(parts)
+    low, high = scene.vertices.amin(0), scene.vertices.amax(0)
+    centre, radius = (low + high) / 2, float((high - low).norm()) / 2
+    pose = look_at(centre + radius * torch.tensor([1.6, 1.3, 2.5]), centre, torch.tensor([0.0, 1.0, 0.0]))
+    camera = Camera.from_fov(pose, math.radians(34.0), 256, 256)
+
+    def variances(samples, antithetic):
+        runs = [render(parts, camera, environment, scene=scene, samples=samples, antithetic=antithetic, seed=seed)
+                for seed in range(RUNS)]  # fmt: skip
+        radiance = torch.stack([r.radiance for r in runs])
+        shown = linear_to_srgb(radiance * (0.18 / radiance[:, runs[0].alpha > 0.0].mean())).clamp(0.0, 1.0)
+        return [float(v.double().var(0).mean()) for v in (radiance, shown)]
+
+    published = variances(SAMPLES, True)
+    for relative in (False, True):
+        start = time.process_time()
+        counts = plan_render(parts, camera, environment, scene=scene, relative=relative).samples
+        spent = time.process_time() - start
+        radiance, shown = (a / b for a, b in zip(variances(counts, False), published, strict=True))
+        kind = "relative" if relative else "absolute"
+        sys.stdout.write(f"{glb.stem} {light.stem} {kind} {counts}: variance over the published counts' "
+                         f"{radiance:.2f}, of the picture {shown:.2f}; plan {1e3 * spent:.0f} ms\n")  # fmt: skip
 
 
 if __name__ == "__main__":
-    study()
+    images(*map(Path, sys.argv[1:3])) if len(sys.argv) > 1 else study()

@@ -167,6 +167,20 @@ def test_the_pilot_sees_shadows(device):
     assert 0.8 < float(got.var(0).sum(1).mean()) / shaded.variance < 1.25  # 5 % noise of 256 runs, 3 % of the pilot
 
 
+def test_the_relative_plan_is_for_what_is_seen(device):
+    """Metal beside white paint in the sun: the paint is brighter, the metal needs its visible normals."""
+    arguments, env = surface(device, 0.3, 1.0), light("sun", device)
+    metallic = torch.arange(24, device=device) % 2 * 1.0
+    arguments = (*arguments[:5], 1.0 - 0.7 * metallic, metallic)
+    plans = [plan_samples(*arguments, env, points="random", relative=r) for r in (False, True)]
+    runs = [runs_of(arguments, env, p.samples, points="random", antithetic=False) for p in plans]
+    mean = torch.cat(runs).mean((0, 2))
+    scale = 1.0 / (mean.square() + (0.1 * mean.mean()) ** 2)
+    plain, relative = ([float((r.var(0).sum(1) * w).mean()) for r in runs] for w in (torch.ones_like(scale), scale))
+    assert plain[0] < 0.9 * plain[1] and relative[1] < 0.9 * relative[0]
+    assert 0.8 < relative[1] / plans[1].variance < 1.25  # as above
+
+
 def test_the_plan_depends_on_inputs_and_seed_alone_and_takes_any_size(device):
     env = light("sky", device)
     many = surface(device, 0.4, 0.5, points=3000)
@@ -175,8 +189,9 @@ def test_the_plan_depends_on_inputs_and_seed_alone_and_takes_any_size(device):
     for total in (1, 3, 7, 64, 1001):
         one = plan_samples(*(v[:1] for v in many), env, total=total)
         assert sum(one.samples) == total and min(one.samples) >= 0 and one.variance > 0.0
-    black = plan_samples(*many, Environment(torch.zeros(4, 8, 3, device=device)))
-    assert sum(black.samples) == 64 and black.variance == 0.0
+    for relative in (False, True):
+        black = plan_samples(*many, Environment(torch.zeros(4, 8, 3, device=device)), relative=relative)
+        assert sum(black.samples) == 64 and black.variance == 0.0
 
 
 def test_bad_input_is_named(device):

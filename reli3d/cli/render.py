@@ -31,7 +31,8 @@ def parser() -> argparse.ArgumentParser:
     counts.add_argument("--samples", type=int, nargs=3, default=(20, 40, 4), metavar=("ENV", "GGX", "COS"),
                         help="per subpixel, by strategy (default 20 40 4)")  # fmt: skip
     counts.add_argument("--plan", type=int, metavar="TOTAL", help="so many per subpixel, shared among the strategies "
-                        "for the least noise of the first view; the counts go to stderr")  # fmt: skip
+                        "for the least noise of the first view (relative noise; with exr absolute); the counts go to "
+                        "stderr")  # fmt: skip
     p.add_argument("--supersampling", type=int, default=2, help="subpixels along a side of a pixel (default 2)")
     p.add_argument("--paint", choices=("conserving", "published"), default="conserving",
                    help="what the coat leaves to the paint: conserving (default; no surface sends out more than it "
@@ -108,7 +109,8 @@ def render_files(args: argparse.Namespace) -> list[Path]:
         camera = Camera.from_fov(look_at(eye, centre, up), math.radians(args.fov), args.size, args.size)
         shown = {"scene": scene, "shadows": not args.no_shadows, "paint": args.paint}
         if args.plan is not None and frame == 0:
-            plan = plan_render(parts, camera, environment, total=args.plan, seed=args.seed, **shown)
+            plan = plan_render(parts, camera, environment, total=args.plan, seed=args.seed,
+                               relative=args.format != "exr", **shown)  # fmt: skip
             counts = {"samples": plan.samples, "antithetic": False}
             print("reli3d-render: samples by strategy", *plan.samples, file=sys.stderr)
         image = render(

@@ -21,6 +21,7 @@ PILOT_POINTS = 256  # so at least 32 samples of each strategy for each of them
 TRIED = 1024  # points, some of them more than once, that a mixture and its rival are tried at
 RIVAL = 2.0  # times the mixture's variance, at most, of a rival: rare events that a trial misses then cost that much
 PREFER_ONE = 0.9  # of the rival's variance, tried, is what a mixture must stay below: the trial's noise is 7 %
+DARK = 0.1  # of the mean radiance: below it relative variances count as if there, or black points would decide alone
 BLOCK = 1 << 17  # samples times candidates evaluated at once: arrays of 1 MB
 
 
@@ -28,7 +29,8 @@ BLOCK = 1 << 17  # samples times candidates evaluated at once: arrays of 1 MB
 class SamplePlan:
     """Counts ``samples`` for :func:`reli3d.render.shading.shade` with ``antithetic=False``, and what they should give.
 
-    variance: of a point's radiance with independent samples, summed over the channels, mean over the pilot's points.
+    variance: of a point's radiance with independent samples, summed over the channels, mean over the points; over its
+    squared radiance where the plan is ``relative``.
     """
 
     samples: tuple[int, int, int]
@@ -52,24 +54,28 @@ def plan_samples(
     points: str = "halton",
     alpha: str = "squared",
     paint: str = "conserving",
+    relative: bool = False,
 ) -> SamplePlan:
     """Counts of the three strategies, ``total`` together, with the least variance for these points under this light.
 
-    Arguments are those of :func:`reli3d.render.shading.shade`, but ``total``; N is at least 1.
-    One plan is made for all points: the one with the least sum of their variances, and of the channels', so the
-    brightest points weigh most.  Other materials or another light want another plan.
+    Arguments are those of :func:`reli3d.render.shading.shade`, but ``total`` and ``relative``; N is at least 1.  One
+    plan is made for all points: the one with the least sum of their variances, and of the channels', in which the
+    brightest points weigh most; with ``relative`` of the variances over the squared radiance (or over that of a tenth
+    of the mean, where it is less), which is nearer to the noise that is seen.  Other materials or another light want
+    another plan.
 
     At most 16384 of the points get one sample of each strategy, which tells where the light is.  A pilot takes 24576
     more, a third from each strategy, at 256 points, half of them drawn evenly and half in proportion to squared values:
     small highlights may hold most of an image's variance.  With counts n_k, densities p_k and q = sum n_k p_k the
     balance heuristic has the variance ``int f^2 / q - sum n_k (int f p_k / q)^2`` (Veach and Guibas 1995; Sbert,
-    Havran and Szirmay-Kalos 2016, Variance Analysis of Multi-sample and One-sample Multiple
-    Importance Sampling).  The pilot's samples over the pilot's own q estimate both integrals for any n_k, as He and
-    Owen 2014 (Optimal mixture weights in multiple importance sampling) do for mixtures.  So what one strategy would
-    meet once in a thousand runs, a small sun in a broad lobe, another has drawn, and no candidate looks better than it
-    is.  Compared are splits by eighths, and by sixteenths about the best.  That holds for independent numbers; even
-    ones serve one strategy better than few points of each, so where one strategy alone comes within twice the variance
-    of the best mixture, both are tried as they will be drawn, at 1024 points, and a gain below a tenth leaves the one.
+    Havran and Szirmay-Kalos 2016, Variance Analysis of Multi-sample and One-sample Multiple Importance Sampling).  The
+    pilot's samples over the pilot's own q estimate both integrals for any n_k, as He and Owen 2014 (Optimal mixture
+    weights in multiple importance sampling) do for mixtures.  So what one strategy would meet once in a thousand runs,
+    a small sun in a broad lobe, another has drawn, and no candidate looks better than it is.
+
+    Compared are splits by eighths, and by sixteenths about the best.  This is for independent numbers; even ones serve
+    one strategy better than few points of each.  So where one strategy alone comes within twice the variance of the
+    best mixture, both are tried as they will be drawn, at 1024 points, and a gain below a tenth leaves the one.
     Visible normals are independent: pairs (``antithetic``) help slopes in a normal, hardly ever the value
     (docs/renderer.md).  A gradient to texels where the map is black needs a strategy that reaches them: not the
     environment table alone.
@@ -89,7 +95,11 @@ def plan_samples(
     values = [v.detach() for v in (position, normal, ng, wo, base_color, width, metallic)]
     rows, share = _pilot_points(values, environment, scene, seed, paint)
     values = [v[rows] for v in values]
-    pilot = *_draw(values, environment, PILOT_SAMPLES // (3 * len(rows)), scene, seed, paint), share
+    drawn = _draw(values, environment, PILOT_SAMPLES // (3 * len(rows)), scene, seed, paint)
+    if relative:
+        radiance = drawn[0].sum(1).mean(1)
+        share = share / (radiance.square() + (DARK * (share @ radiance)) ** 2).clamp(min=1e-30)
+    pilot = *drawn, share
     counts = _splits(int(total)).to(position.device)
     variance = _variances(*pilot, counts)
     finer = counts[variance.argmin()] + _MOVES.to(counts) * max(1, int(total) // 16)

@@ -98,11 +98,12 @@ def plan_render(
     shadows: bool = True,
     scene: RayScene | None = None,
     paint: str = "conserving",
+    relative: bool = False,
 ) -> SamplePlan:
     """Counts of ``total`` samples for :func:`render` of this view, to be given to it with ``antithetic=False``.
 
-    Arguments as for :func:`render`.  It plans for points among those that 32768 rays of the camera hit, as
-    :func:`reli3d.render.allocation.plan_samples` says.  No gradient.  Raises ValueError without any environment and
+    Arguments as for :func:`render`; relative: as for :func:`reli3d.render.allocation.plan_samples`, which plans for
+    points among those that 32768 rays of the camera hit.  No gradient.  Raises ValueError without any environment and
     where the camera sees nothing.
     """
     parts, environment = _checked(asset, camera, environment)
@@ -117,7 +118,7 @@ def plan_render(
     p = _points(parts, hits.face[seen], hits.bary[seen])
     return plan_samples(
         p.position, p.normal, p.ng, -directions[seen], p.base_color, p.roughness, p.metallic, environment,
-        total=total, scene=scene if shadows else None, seed=seed, paint=paint,
+        total=total, scene=scene if shadows else None, seed=seed, paint=paint, relative=relative,
     )  # fmt: skip
 
 
