@@ -65,8 +65,11 @@ def runs_of(arguments, environment, counts, runs=256, **options):
     return shade(*repeated, environment, samples=counts, **options).double().reshape(runs, n, 3)
 
 
-@pytest.mark.parametrize("name, roughness, metallic", [("sky", 0.3, 0.0), ("sun", 0.3, 1.0), ("sun", 0.6, 0.0)])
-def test_the_plan_is_the_best_split_and_its_variance_that_of_quadrature(device, name, roughness, metallic):
+@pytest.mark.parametrize(
+    "name, roughness, metallic, error",  # twice what six seeds measured; the sun's foot is few of the pilot's samples
+    [("sky", 0.3, 0.0, 0.01), ("sun", 0.3, 1.0, 0.25), ("sun", 0.6, 0.0, 0.25)],
+)
+def test_the_plan_is_the_best_split_and_its_variance_that_of_quadrature(device, name, roughness, metallic, error):
     arguments, env = surface(device, roughness, metallic, points=6), light(name, device)
     splits = [(8 * a, 8 * b, 64 - 8 * a - 8 * b) for a in range(9) for b in range(9 - a)]
     plans = [plan_samples(*arguments, env, seed=seed) for seed in range(3)]
@@ -74,8 +77,8 @@ def test_the_plan_is_the_best_split_and_its_variance_that_of_quadrature(device, 
     truth = quadrature(arguments, env, counts).mean(0).tolist()
     for plan, true in zip(plans, truth):
         assert sum(plan.samples) == 64
-        assert true < 1.05 * min(truth[3:])  # what a twentieth of noise in the estimate may choose
-        assert abs(plan.variance / true - 1.0) < 0.1  # 1365 samples of each strategy a point: 3 % measured
+        assert true < 1.05 * min(truth[3:])  # measured 1.00: the variance is flat about its minimum
+        assert abs(plan.variance / true - 1.0) < error
 
 
 @pytest.mark.parametrize("points", ["random", "halton"])

@@ -76,9 +76,9 @@ def plan_samples(
     Compared are splits by eighths, and by sixteenths about the best.  This is for independent numbers; even ones serve
     one strategy better than few points of each.  So where one strategy alone comes within twice the variance of the
     best mixture, both are tried as they will be drawn, at 1024 points, and a gain below a tenth leaves the one.
-    Visible normals are independent: pairs (``antithetic``) help slopes in a normal, hardly ever the value
-    (docs/renderer.md).  A gradient to texels where the map is black needs a strategy that reaches them: not the
-    environment table alone.
+    A plan is for images.  For fits the published counts are better: what a plan leaves out may hold the slopes (those
+    in a normal get up to 10^4 times the variance, docs/renderer.md), and the environment table alone gives black texels
+    no gradient.  Visible normals are independent in a plan: pairs (``antithetic``) are for slopes, too.
 
     No gradient.  The result depends on the inputs and ``seed`` alone.  Raises TypeError for a wrong dtype, ValueError
     for a shape, device, count, choice or a value that is not finite.
