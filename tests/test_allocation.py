@@ -170,6 +170,25 @@ def test_the_pilot_sees_shadows(device):
     assert 0.8 < float(got.var(0).sum(1).mean()) / shaded.variance < 1.25  # 5 % noise of 256 runs, 3 % of the pilot
 
 
+def test_few_bright_points_count_as_many_as_they_are(device):
+    """A tenth of the points bright, so drawn more often by the pilot: its mean is that over all points still."""
+    arguments, env = surface(device, 0.4, 1.0, points=1000), light("sky", device)
+    bright = torch.arange(1000, device=device) % 10 == 0
+    arguments = (*arguments[:4], torch.where(bright, 0.9, 0.03)[:, None].expand(-1, 3), *arguments[5:])
+    plan = plan_samples(*arguments, env, points="random")
+    got = runs_of(arguments, env, plan.samples, runs=64, points="random", antithetic=False)
+    # 10 % noise of 128 bright points in the pilot; drawn evenly in the mean they would count 5 times
+    assert 0.7 < plan.variance / float(got.var(0).sum(1).mean()) < 1.4
+
+
+def test_a_mirror_under_even_light_has_no_variance(device):
+    """Nor a negative one: the pilot's weights have mass 1 for each strategy, whatever their noise."""
+    arguments, env = surface(device, 0.05, 1.0), light("constant", device)
+    for seed in range(5):
+        plan = plan_samples(*arguments, env, seed=seed)
+        assert plan.samples == (0, 64, 0) and 0.0 < plan.variance < 3e-6  # of values about 1; 2e-8 but for rare facets
+
+
 def test_the_relative_plan_is_for_what_is_seen(device):
     """Metal beside white paint in the sun: the paint is brighter, the metal needs its visible normals."""
     arguments, env = surface(device, 0.3, 1.0), light("sun", device)
