@@ -15,6 +15,7 @@ from reli3d.data.normalize import Similarity, normalize
 from reli3d.data.published_views import background_shown, hero_first, published_views
 from reli3d.data.views import ViewBatch, Views
 from reli3d.geometry.bake import bake
+from reli3d.geometry.cover import cover_silhouettes
 from reli3d.geometry.hull import mask_distance
 from reli3d.geometry.mesh import Mesh, largest_components, vertex_normals
 from reli3d.geometry.rays import RayScene
@@ -119,6 +120,9 @@ def extract(model: Reconstructor, code: Code, maps: ViewMaps, resolution: int) -
     else:
         level = grid_level(model, code, maps, flat[: resolution + 1, 2])
     level = torch.maximum(level.view(-1), bound).view((resolution + 1,) * 3)
+    if masked:
+        silhouette = maps.images[..., 3].contiguous()
+        level = cover_silhouettes(level, bound.view_as(level), silhouette, maps.c2w, maps.intrinsics, radius=radius)
     low, high = (float(v) for v in torch.aminmax(level))
     if low >= 0.0 or high < 0.0:
         raise NoSurface(f"level: expected values on both sides of 0, got [{low:.4g}, {high:.4g}]: no surface")

@@ -6,6 +6,7 @@ import torch
 from torch.nn.functional import normalize
 
 from reli3d.geometry import bake, hull, projection
+from reli3d.geometry.cover import cover_silhouettes
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene, offset_origin
 from reli3d.geometry.tangents import vertex_tangents
@@ -92,6 +93,15 @@ def hulls(masks, points):
     return distance, hull.hull_distance(points, distance, c2w, intrinsics)
 
 
+def hull_masks():
+    y, x = torch.meshgrid(torch.arange(24.0), torch.arange(20.0), indexing="ij")
+    return ((y - 12.5).square() + (x - 10.5).square() < 60.0).float().expand(3, 24, 20).contiguous()
+
+
+def covered(level, bound, masks):
+    return (cover_silhouettes(level, bound, hull.mask_distance(masks), *rig(level.device), radius=0.7),)
+
+
 def drawn(u, radiance, wo, alpha):
     light = Environment(radiance)
     directions, density = light.sample(u)
@@ -130,6 +140,9 @@ CASES = {
                   rows=("points", "normal")),
     "hull": Case(lambda n: {"masks": (uniform(3, 24, 20, seed=1) > 0.6).float(), "points": uniform(n, 3, low=-0.8)},
                  hulls, rows=("points",)),
+    "cover_silhouettes": Case(
+        lambda n: {"level": uniform(12, 11, 10, seed=1, low=0.1, high=2.0), "bound": uniform(12, 11, 10, low=-3.0),
+                   "masks": hull_masks()}, covered),
     "ReniLight": Case(lambda n: {"directions": units(n, 1)}, asked_of_reni, rows=("directions",)),
     "interpolate tangents": Case(
         lambda n: {"values": uniform(180, 4, seed=1), "bary": weights(n)}, four, ("values", "bary"), ("bary",)),

@@ -12,8 +12,8 @@ from pathlib import Path
 
 STARTED = time.monotonic()
 EXAMPLE = Path(__file__).parents[1] / "assets" / "example"
-KERNELS = ("hull", "view_features", "triplane", "flexicubes", "uv", "raster", "intersect", "attributes", "random",
-           "envmap")  # modules of reli3d.kernels that one object needs  # fmt: skip
+KERNELS = ("hull", "cover", "view_features", "triplane", "flexicubes", "uv", "raster", "intersect", "attributes",
+           "random", "envmap")  # modules of reli3d.kernels that one object needs  # fmt: skip
 SHADER = {"cpu": "shade_rays", "cuda": "shade"}  # and the shader's, whose shadow rays Embree traces or Warp
 
 

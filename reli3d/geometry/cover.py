@@ -1,0 +1,62 @@
+"""A surface for every line of sight: levels lowered where a pixel inside a silhouette would see nothing."""
+
+from __future__ import annotations
+
+import torch
+import warp as wp
+from torch import Tensor
+from torch.nn.functional import max_pool2d
+
+from reli3d._bridge import check, launch
+from reli3d.kernels import cover as kernels
+
+STRIDE = 4  # pixels between rays
+DEPTH = 0.05  # level below the surface that a ray reaches: enough to make one; more thickens what was right already
+REACH = (
+    3.0  # a ray whose least level is this high has no surface near it: masks disagree, or a rod is thinner than cells
+)
+
+
+def cover_silhouettes(level: Tensor, bound: Tensor, distance: Tensor, c2w: Tensor, intrinsics: Tensor, *,
+                      radius: float) -> Tensor:  # fmt: skip
+    """``level (X, Y, Z)`` lowered so that the views' rays inside their silhouettes meet a surface; no gradient.
+
+    level: negative inside, on a grid over [-radius, radius]^3 as :func:`reli3d.geometry.surface.extract_surface` takes
+    it, nowhere below ``bound (X, Y, Z)``, nor is the result.  distance, c2w, intrinsics: silhouettes as
+    :func:`reli3d.geometry.hull.hull_distance` takes them, at least ``STRIDE`` pixels a side.
+
+    A field that is not sure of a thin part stays outside by little all along the lines of sight that show the part.
+    Every ``STRIDE``-th pixel's ray takes the least level it meets; what that lacks of ``-DEPTH`` is taken off
+    everywhere along the ray, so the surface appears where the field comes nearest to one and is as thick as the field
+    is unsure.  Rays that miss by ``REACH`` are left.  Raises TypeError unless float32, ValueError on shapes or
+    devices.
+    """
+    check("level", level)
+    if level.ndim != 3 or min(level.shape) < 2:
+        raise ValueError(f"level: expected shape (X, Y, Z) of at least 2 points a side, got {tuple(level.shape)}")
+    for name, value, last in (("bound", bound, None), ("distance", distance, None), ("c2w", c2w, 4),
+                              ("intrinsics", intrinsics, 4)):  # fmt: skip
+        check(name, value, last=last, like=level)
+    if bound.shape != level.shape:
+        raise ValueError(f"bound: expected shape {tuple(level.shape)}, got {tuple(bound.shape)}")
+    if distance.ndim != 3 or min(distance.shape[1:]) < 2 * STRIDE:
+        expected = f"(V, H, W) with H and W of at least {2 * STRIDE}"
+        raise ValueError(f"distance: expected shape {expected}, got {tuple(distance.shape)}")
+    views, height, width = distance.shape
+    if c2w.shape != (views, 4, 4) or intrinsics.shape != (views, 4):
+        got = f"{tuple(c2w.shape)} and {tuple(intrinsics.shape)}"
+        raise ValueError(f"c2w, intrinsics: expected {views} cameras, got {got}")
+    level, bound, distance, c2w, intrinsics = (
+        v.detach().contiguous() for v in (level, bound, distance, c2w, intrinsics)
+    )
+    lacking = level.new_empty(views, height // STRIDE, width // STRIDE)
+    cameras = [(c2w, wp.mat44), (intrinsics, wp.vec4)]
+    launch(kernels.lacking_kernel, lacking.numel(), [
+        (level, wp.float32), (distance, wp.float32), *cameras, radius, DEPTH, REACH, STRIDE, (lacking, wp.float32)],
+        level.device)  # fmt: skip
+    lacking = max_pool2d(lacking, 3, 1, 1)  # as far as the silhouette's edge, between two rays
+    lowered = torch.empty_like(level)
+    launch(kernels.lower_kernel, level.numel(), [
+        (level, wp.float32), (bound, wp.float32), (lacking, wp.float32), *cameras, radius, REACH, STRIDE,
+        (lowered, wp.float32)], level.device)  # fmt: skip
+    return lowered

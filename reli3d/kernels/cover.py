@@ -1,0 +1,107 @@
+"""Rays of a picture through a grid of levels, and the grid lowered where they met no surface.
+
+The grid ``(X, Y, Z)`` fills the cube [-radius, radius]^3, its outermost points on the faces; negative is inside.
+"""
+
+import warp as wp
+
+from reli3d.kernels.bilinear import look_up
+from reli3d.kernels.projection import project_point
+from reli3d.kernels.volume import cube_range
+
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
+
+STEP = wp.constant(0.5)  # of a cell, between two looks at the level along a ray
+INNER = wp.constant(1.0)  # pixels that a point must lie inside a silhouette, whose edge pixels are half background
+
+
+@wp.func
+def level_at(level: wp.array3d[float], cell: wp.vec3) -> float:
+    """Trilinear value at ``cell``, a point in units of cells, clamped to the grid."""
+    x = wp.clamp(cell[0], 0.0, float(level.shape[0] - 1))
+    y = wp.clamp(cell[1], 0.0, float(level.shape[1] - 1))
+    z = wp.clamp(cell[2], 0.0, float(level.shape[2] - 1))
+    i = wp.min(int(x), level.shape[0] - 2)
+    j = wp.min(int(y), level.shape[1] - 2)
+    k = wp.min(int(z), level.shape[2] - 2)
+    x -= float(i)
+    y -= float(j)
+    z -= float(k)
+    v00 = wp.lerp(level[i, j, k], level[i, j, k + 1], z)
+    v01 = wp.lerp(level[i, j + 1, k], level[i, j + 1, k + 1], z)
+    v10 = wp.lerp(level[i + 1, j, k], level[i + 1, j, k + 1], z)
+    v11 = wp.lerp(level[i + 1, j + 1, k], level[i + 1, j + 1, k + 1], z)
+    return wp.lerp(wp.lerp(v00, v01, y), wp.lerp(v10, v11, y), x)
+
+
+@wp.kernel
+def lacking_kernel(
+    start: int,
+    # in
+    level: wp.array3d[float], distance: wp.array3d[float], c2w: wp.array[wp.mat44], intrinsics: wp.array[wp.vec4],
+    radius: float, depth: float, reach: float, stride: int,
+    # out
+    lacking: wp.array3d[float],  # (V, H // stride, W // stride)
+):  # fmt: skip
+    """By how much the least level along a pixel's ray exceeds ``-depth``; 0 outside the silhouette, and where it
+    exceeds 0 by ``reach``.
+    """
+    n = start + wp.tid()
+    rows = lacking.shape[1]
+    columns = lacking.shape[2]
+    view = n // (rows * columns)
+    i = (n // columns) % rows
+    j = n % columns
+    x = (float(j) + 0.5) * float(stride)
+    y = (float(i) + 0.5) * float(stride)
+    lacking[view, i, j] = 0.0
+    if look_up(distance, view, x, y) > INNER:
+        k = intrinsics[view]
+        pose = c2w[view]
+        origin = wp.vec3(pose[0, 3], pose[1, 3], pose[2, 3])
+        direction = wp.normalize(wp.transform_vector(pose, wp.vec3((x - k[2]) / k[0], (k[3] - y) / k[1], -1.0)))
+        size = wp.vec3(float(level.shape[0] - 1), float(level.shape[1] - 1), float(level.shape[2] - 1))
+        scale = size * (0.5 / radius)  # cells a unit
+        step = STEP / wp.max(wp.max(scale[0], scale[1]), scale[2])
+        span = cube_range(origin, direction, radius, 0.0, 3.0e38)
+        t = span[0]
+        least = wp.float32(reach)
+        while t < span[1] and least > -depth:
+            p = origin + direction * t
+            cell = wp.cw_mul(p + wp.vec3(radius, radius, radius), scale)
+            least = wp.min(least, level_at(level, cell))
+            t += step
+        if least < reach:
+            lacking[view, i, j] = wp.max(least + depth, 0.0)
+
+
+@wp.kernel
+def lower_kernel(
+    start: int,
+    # in
+    level: wp.array3d[float], bound: wp.array3d[float], lacking: wp.array3d[float], c2w: wp.array[wp.mat44],
+    intrinsics: wp.array[wp.vec4], radius: float, reach: float, stride: int,
+    # out
+    lowered: wp.array3d[float],
+):  # fmt: skip
+    """Level less the most that the views' rays through a point lack, but not below the bound."""
+    n = start + wp.tid()
+    z = n % level.shape[2]
+    y = (n // level.shape[2]) % level.shape[1]
+    x = n // (level.shape[2] * level.shape[1])
+    value = level[x, y, z]
+    if wp.abs(value) < reach:
+        edge = 2.0 * radius
+        p = wp.vec3(
+            edge * float(x) / float(level.shape[0] - 1) - radius,
+            edge * float(y) / float(level.shape[1] - 1) - radius,
+            edge * float(z) / float(level.shape[2] - 1) - radius,
+        )
+        most = wp.float32(0.0)
+        for view in range(c2w.shape[0]):
+            q = project_point(p, c2w[view], intrinsics[view]) / float(stride)
+            inside = q[0] > 0.0 and q[0] < float(lacking.shape[2]) and q[1] > 0.0 and q[1] < float(lacking.shape[1])
+            if inside and q[2] > 0.0:
+                most = wp.max(most, look_up(lacking, view, q[0], q[1]))
+        value = wp.max(value - most, bound[x, y, z])
+    lowered[x, y, z] = value

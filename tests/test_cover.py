@@ -1,0 +1,162 @@
+"""Levels lowered where a pixel of a silhouette would see no surface: closed forms, and a twin in torch's float64."""
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from torch.nn.functional import grid_sample, max_pool2d
+
+import reli3d
+from reli3d import pipeline
+from reli3d.data.folder import load_views
+from reli3d.geometry.cover import DEPTH, REACH, STRIDE, cover_silhouettes
+from reli3d.geometry.hull import hull_distance, mask_distance
+from reli3d.geometry.rays import RayScene
+from reli3d.geometry.surface import extract_surface
+from reli3d.nn.weights import load_model
+from reli3d.render.camera import Camera, camera_rays, look_at, project
+
+RADIUS = 0.6
+FREE = -10.0  # bound of a grid without silhouettes
+
+
+def grid(counts, dtype=torch.float32):
+    axes = [torch.linspace(-RADIUS, RADIUS, n, dtype=dtype) for n in counts]
+    return torch.stack(torch.meshgrid(*axes, indexing="ij"), -1)
+
+
+def far_camera(size=128, height=0.9):
+    """On +z, 200 units away: its rays are parallel to z but for 0.3 % and ``height`` units high at the origin."""
+    c2w = look_at(torch.tensor([0.0, 0.0, 200.0]), torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))
+    focal = size * 200.0 / height
+    return c2w[None], torch.tensor([[focal, focal, size / 2, size / 2]])
+
+
+def disc(size, radius):
+    """Signed distance in pixels to a centred disc, positive inside."""
+    y, x = torch.meshgrid(torch.arange(size) + 0.5, torch.arange(size) + 0.5, indexing="ij")
+    return (radius - torch.hypot(x - size / 2, y - size / 2))[None]
+
+
+def test_an_unsure_sheet_becomes_a_surface_as_thick_as_it_is_unsure(device):
+    """Level 0.5 + (z / s)^2 has no inside; lowered to (z / s)^2 - DEPTH it has one for |z| < s sqrt(DEPTH)."""
+    points, s = grid((41, 41, 41)), 0.4
+    level = 0.5 + (points[..., 2] / s).square()
+    args = [v.to(device) for v in (level, torch.full_like(level, FREE), disc(128, 40.0), *far_camera())]
+    got = cover_silhouettes(*args, radius=RADIUS).cpu()
+    radius = points[..., :2].norm(dim=-1)
+    inner, outer = radius < (40 - STRIDE) * 0.9 / 128, radius > (40 + 2 * STRIDE) * 0.9 / 128
+    want = torch.where(level < REACH, level - 0.5 - DEPTH, level)
+    # a ray looks every half cell, so it may miss the lowest point by a quarter of a cell of 0.03
+    torch.testing.assert_close(got[inner], want[inner], rtol=0, atol=(0.0075 / s) ** 2 + 1e-4)
+    assert torch.equal(got[outer], level[outer])
+    mesh = extract_surface(got, radius=RADIUS)
+    assert abs(float(mesh.vertices[:, 2].max()) - s * math.sqrt(DEPTH)) < 0.003  # a tenth of a cell
+    beyond = float(mesh.vertices[:, :2].norm(dim=-1).max()) - 40 * 0.9 / 128
+    assert 0.0 < beyond < 2 * STRIDE * 0.9 / 128  # nothing bounds it here but the next ray without a surface
+
+
+def test_a_surface_that_covers_its_silhouettes_stays_as_it_is(device):
+    points = grid((31, 33, 35))
+    level = (points.norm(dim=-1) - 0.4) / 0.02
+    args = [v.to(device) for v in (level, torch.full_like(level, FREE), disc(128, 0.385 * 128 / 0.9), *far_camera())]
+    assert torch.equal(cover_silhouettes(*args, radius=RADIUS).cpu(), level)
+
+
+def test_the_bound_holds_and_hopeless_rays_are_left(device):
+    points = grid((31, 31, 31))
+    camera = [v.to(device) for v in far_camera()]
+    mask = disc(128, 40.0).to(device)
+    level = torch.full(points.shape[:3], 0.4).to(device)
+    bound = -hull_distance(points.reshape(-1, 3).to(device), mask, *camera).view_as(level) / 0.02
+    start = torch.maximum(level, bound)
+    got = cover_silhouettes(start, bound, mask, *camera, radius=RADIUS)
+    assert bool((got >= bound).all()) and bool((got <= start).all()) and float(got.min()) <= -DEPTH
+    high = torch.full_like(level, REACH + 0.1)
+    assert torch.equal(cover_silhouettes(high, high - 5.0, mask, *camera, radius=RADIUS), high)
+
+
+def twin(level, bound, distance, c2w, intrinsics):
+    """Rays by ``camera_rays``, trilinear and bilinear values by ``grid_sample``, all steps of a ray at once."""
+    rows, columns = (k // STRIDE for k in distance.shape[1:])
+    step = RADIUS / (max(level.shape) - 1)  # half a cell
+    points = grid(level.shape, torch.float64).reshape(-1, 3)
+    most = torch.zeros(len(points), dtype=torch.float64)
+    for v in range(len(c2w)):
+        camera = Camera(c2w[v], intrinsics[v] / STRIDE, columns, rows)
+        o, d = (r.reshape(-1, 3).double() for r in camera_rays(camera))
+        ends = torch.stack([(-RADIUS - o) / d, (RADIUS - o) / d])
+        near, far = ends.amin(0).amax(1).clamp(min=0.0), ends.amax(0).amin(1)
+        t = near[:, None] + step * torch.arange(int(4 * RADIUS / step))
+        at = (o[:, None] + t[..., None] * d[:, None]) / RADIUS
+        value = grid_sample(level[None, None], at.flip(-1)[None, :, :, None], align_corners=True,
+                            padding_mode="border")[0, 0, :, :, 0]  # fmt: skip
+        least = torch.where(t < far[:, None], value, torch.inf).amin(1)
+        x, y = torch.meshgrid(torch.arange(columns), torch.arange(rows), indexing="xy")
+        centre = (torch.stack([x, y], -1) + 0.5) * STRIDE * 2 / torch.tensor([distance.shape[2], distance.shape[1]]) - 1
+        inside = grid_sample(distance[None, v : v + 1], centre[None].double(), align_corners=False)[0, 0].reshape(-1)
+        lacks = torch.where((inside > 1.0) & (least < REACH), (least + DEPTH).clamp(min=0.0), 0.0).view(
+            1, 1, rows, columns
+        )
+        pixel, _ = project(points.float(), c2w[v], intrinsics[v])
+        place = pixel.double() / STRIDE * 2 / torch.tensor([columns, rows]) - 1
+        value = grid_sample(max_pool2d(lacks, 3, 1, 1), place[None, :, None], align_corners=False,
+                            padding_mode="border")[0, 0, :, 0]  # fmt: skip
+        most = torch.maximum(most, torch.where((place.abs() < 1.0).all(1), value, 0.0))
+    flat = level.reshape(-1)
+    return torch.where(flat.abs() < REACH, torch.maximum(flat - most, bound.reshape(-1)), flat).view_as(level)
+
+
+def test_equals_its_twin_on_a_rough_field(device):
+    g = torch.Generator().manual_seed(3)
+    coarse = torch.randn(1, 1, 6, 6, 6, generator=g)
+    level = torch.nn.functional.interpolate(coarse, (25, 23, 27), mode="trilinear", align_corners=True)[0, 0] * 2 + 1.0
+    bound = level - 2.0 * torch.rand(level.shape, generator=g)
+    eyes = torch.tensor([[1.5, 0.4, 1.0], [-1.2, 0.3, 1.4], [0.3, -1.5, 0.8]])
+    c2w = torch.stack([look_at(e, torch.zeros(3), torch.tensor([0.0, 1.0, 0.0])) for e in eyes])
+    intrinsics = torch.tensor([[70.0, 75.0, 31.0, 33.0]]).expand(3, 4).contiguous()
+    masks = (torch.rand(3, 8, 8, generator=g) > 0.3).float().repeat_interleave(8, 1).repeat_interleave(8, 2)
+    distance = mask_distance(masks)
+    args = [v.to(device) for v in (level, bound, distance, c2w, intrinsics)]
+    got = cover_silhouettes(*args, radius=RADIUS).cpu()
+    want = twin(level.double(), bound.double(), distance.double(), c2w, intrinsics)
+    assert float((want != level).double().mean()) > 0.2
+    # float32 has rays enter the cube 1e-5 of a step aside; one whose least level is REACH falls to either side
+    assert float(((got - want).abs() < 2e-4).double().mean()) > 0.999
+
+
+def seen_share(model, views):
+    """Share of the pixels inside the silhouettes whose rays meet the mesh; and of the mesh's that lie inside."""
+    code, maps = pipeline.encode(model, pipeline.prepare(model, views, pipeline.normalize(views, "auto")))
+    mesh = pipeline.extract(model, code, maps, model.preset.resolution)
+    scene, size = RayScene(mesh.vertices, mesh.faces), maps.images.shape[1]
+    hit = torch.stack([scene.closest(*camera_rays(Camera(c, k, size, size))).face >= 0
+                       for c, k in zip(maps.c2w, maps.intrinsics, strict=True)])  # fmt: skip
+    inside = maps.images[..., 3] > 0
+    return float((hit & inside).sum() / inside.sum()), float((hit & inside).sum() / hit.sum())
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("count, least", [(1, 0.95), (4, 0.975)])
+def test_the_mesh_shows_what_the_photographs_show(count, least, monkeypatch):
+    """What is left lies at the outline, where smoothing takes a fraction of a cell: more of it bulges from one view."""
+    model = load_model("small", "cpu")
+    views = load_views(Path(reli3d.__file__).parent / "assets/example", views=count)
+    share, exact = seen_share(model, views)
+    assert share > least and exact > 0.975
+    monkeypatch.setattr(pipeline, "cover_silhouettes", lambda level, *args, **options: level)
+    assert seen_share(model, views)[0] < least
+
+
+def test_bad_input_is_named():
+    level, (c2w, intrinsics) = torch.zeros(4, 4, 4), far_camera()
+    good = {"level": level, "bound": level, "distance": disc(32, 9.0), "c2w": c2w, "intrinsics": intrinsics}
+    for change, message in (({"level": torch.zeros(4, 4)}, r"level: expected shape \(X, Y, Z\)"),
+                            ({"bound": torch.zeros(4, 4, 5)}, r"bound: expected shape \(4, 4, 4\)"),
+                            ({"distance": torch.zeros(1, 4, 40)}, r"distance: expected shape \(V, H, W\)"),
+                            ({"c2w": c2w[0]}, "c2w, intrinsics: expected 1 cameras")):  # fmt: skip
+        with pytest.raises(ValueError, match=message):
+            cover_silhouettes(**{**good, **change}, radius=1.0)
+    with pytest.raises(TypeError, match="bound: expected torch.float32"):
+        cover_silhouettes(**{**good, "bound": level.double()}, radius=1.0)
