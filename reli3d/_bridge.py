@@ -133,8 +133,11 @@ def _mapped(work, items: Iterable) -> list:
 
 def _serial() -> bool:
     """Whether the calling thread computes alone: torch has one thread, or this is a thread of the pool, which would
-    never end waiting for itself.
+    never end waiting for itself, or kernels run in Warp's debug mode, where two at a time crash over a static pointer
+    that only the optimiser takes away (``shared_tile_storage`` in Warp's tile.h).
     """
+    if wp.config.mode == "debug":
+        return True
     return torch.get_num_threads() == 1 or threading.current_thread().name.startswith(WORKER)
 
 
