@@ -149,6 +149,12 @@ def test_the_mesh_shows_what_the_photographs_show(count, least, monkeypatch):
     assert seen_share(model, views)[0] < least
 
 
+def test_without_views_the_level_comes_back(device):
+    level = grid((5, 6, 7)).sum(-1).to(device)
+    none = torch.zeros(0, 16, 16, device=device), torch.zeros(0, 4, 4, device=device), torch.zeros(0, 4, device=device)
+    assert torch.equal(cover_silhouettes(level, level - 1.0, *none, radius=RADIUS), level)
+
+
 def test_bad_input_is_named():
     level, (c2w, intrinsics) = torch.zeros(4, 4, 4), far_camera()
     good = {"level": level, "bound": level, "distance": disc(32, 9.0), "c2w": c2w, "intrinsics": intrinsics}
@@ -158,5 +164,8 @@ def test_bad_input_is_named():
                             ({"c2w": c2w[0]}, "c2w, intrinsics: expected 1 cameras")):  # fmt: skip
         with pytest.raises(ValueError, match=message):
             cover_silhouettes(**{**good, **change}, radius=1.0)
+    for radius in (0.0, math.nan):
+        with pytest.raises(ValueError, match="radius: expected a positive number"):
+            cover_silhouettes(**good, radius=radius)
     with pytest.raises(TypeError, match="bound: expected torch.float32"):
         cover_silhouettes(**{**good, "bound": level.double()}, radius=1.0)

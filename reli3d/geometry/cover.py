@@ -12,9 +12,7 @@ from reli3d.kernels import cover as kernels
 
 STRIDE = 4  # pixels between rays
 DEPTH = 0.05  # level below the surface that a ray reaches: enough to make one; more thickens what was right already
-REACH = (
-    3.0  # a ray whose least level is this high has no surface near it: masks disagree, or a rod is thinner than cells
-)
+REACH = 3.0  # rays whose least level is this high meet nothing: masks disagree, or a rod is thinner than a cell
 
 
 def cover_silhouettes(level: Tensor, bound: Tensor, distance: Tensor, c2w: Tensor, intrinsics: Tensor, *,
@@ -22,14 +20,17 @@ def cover_silhouettes(level: Tensor, bound: Tensor, distance: Tensor, c2w: Tenso
     """``level (X, Y, Z)`` lowered so that the views' rays inside their silhouettes meet a surface; no gradient.
 
     level: negative inside, on a grid over [-radius, radius]^3 as :func:`reli3d.geometry.surface.extract_surface` takes
-    it, nowhere below ``bound (X, Y, Z)``, nor is the result.  distance, c2w, intrinsics: silhouettes as
-    :func:`reli3d.geometry.hull.hull_distance` takes them, at least ``STRIDE`` pixels a side.
+    it, in units of the field's doubt: logits of occupancy, or distances over the softness of the edge.  It is nowhere
+    below ``bound (X, Y, Z)``, nor is the result.  distance, c2w, intrinsics: silhouettes as
+    :func:`reli3d.geometry.hull.hull_distance` takes them, at least ``2 STRIDE`` pixels a side; without views ``level``
+    comes back.
 
     A field that is not sure of a thin part stays outside by little all along the lines of sight that show the part.
     Every ``STRIDE``-th pixel's ray takes the least level it meets; what that lacks of ``-DEPTH`` is taken off
     everywhere along the ray, so the surface appears where the field comes nearest to one and is as thick as the field
-    is unsure.  Rays that miss by ``REACH`` are left.  Raises TypeError unless float32, ValueError on shapes or
-    devices.
+    is unsure.  Rays that miss by ``REACH`` are left.  Source: own; the counterpart of the bound by a visual hull
+    (Laurentini 1994), which keeps a surface inside the silhouettes.  Raises TypeError unless float32, ValueError on
+    shapes, devices or a ``radius`` that is not positive.
     """
     check("level", level)
     if level.ndim != 3 or min(level.shape) < 2:
@@ -46,6 +47,10 @@ def cover_silhouettes(level: Tensor, bound: Tensor, distance: Tensor, c2w: Tenso
     if c2w.shape != (views, 4, 4) or intrinsics.shape != (views, 4):
         got = f"{tuple(c2w.shape)} and {tuple(intrinsics.shape)}"
         raise ValueError(f"c2w, intrinsics: expected {views} cameras, got {got}")
+    if not 0.0 < radius < float("inf"):
+        raise ValueError(f"radius: expected a positive number, got {radius}")
+    if views == 0:
+        return level.detach().clone()
     level, bound, distance, c2w, intrinsics = (
         v.detach().contiguous() for v in (level, bound, distance, c2w, intrinsics)
     )
