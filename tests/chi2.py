@@ -10,6 +10,7 @@ from scipy.special import gammaincc
 from torch import Tensor
 
 EXPECTED_MIN = 5.0  # below this count the normal limit behind chi-square fails (Cochran 1954)
+IRES = 8  # midpoints a side of a window's cell
 
 
 def p_value(directions: Tensor, pdf: Callable[[Tensor], Tensor], *, total: int | None = None, res: int = 51, ires: int
@@ -27,7 +28,11 @@ def p_value(directions: Tensor, pdf: Callable[[Tensor], Tensor], *, total: int |
     x = np.clip((np.arctan2(b, a) / (2 * np.pi) % 1.0 * 2 * res).astype(int), 0, 2 * res - 1)
     y = np.clip(((d[:, up] * 0.5 + 0.5) * res).astype(int), 0, res - 1)
     observed = np.bincount(y * 2 * res + x, minlength=2 * res * res).astype(float)
-    expected = cell_masses(pdf, res, ires, up, directions.device) * total
+    return pooled_p_value(d, observed, cell_masses(pdf, res, ires, up, directions.device) * total, total)
+
+
+def pooled_p_value(d: np.ndarray, observed: np.ndarray, expected: np.ndarray, total: int) -> float:
+    """Probability of counts ``observed`` of ``d`` where ``expected`` are due; of ``total`` the rest is one cell."""
     if abs(np.linalg.norm(d, axis=1) - 1.0).max(initial=0.0) > 1e-5:
         return 0.0
     if (
@@ -36,9 +41,9 @@ def p_value(directions: Tensor, pdf: Callable[[Tensor], Tensor], *, total: int |
         return 0.0
     if expected.sum() > 1.01 * total:
         return 0.0
-    lacking = total - expected.sum()
-    if lacking > EXPECTED_MIN or len(d) < total:
-        observed, expected = np.append(observed, total - len(d)), np.append(expected, max(lacking, 1e-9))
+    lacking, missing = total - expected.sum(), total - observed.sum()
+    if lacking > EXPECTED_MIN or missing > 0:
+        observed, expected = np.append(observed, missing), np.append(expected, max(lacking, 1e-9))
     order = np.argsort(expected)
     observed, expected = observed[order], expected[order]
     pool = np.floor(np.cumsum(expected) / EXPECTED_MIN).astype(int)
@@ -67,6 +72,39 @@ def cell_masses(pdf: Callable[[Tensor], Tensor], res: int, ires: int, up: int = 
         part = pdf(torch.from_numpy(d.reshape(-1, 3)).to(device)).detach().cpu().double().numpy()
         value[first : first + rows] = part.reshape(-1, ires, 2 * res, ires).mean((1, 3))
     return value.reshape(-1) * (4 * np.pi / (2 * res * res))
+
+
+def window_p_value(
+    directions: Tensor, pdf: Callable[[Tensor], Tensor], wo: Tensor, alpha: float, *, total: int, res: int = 64
+) -> float:
+    """:func:`p_value` in a window that resolves what GGX of width ``alpha`` reflects from a grazing ``wo (3,)``.
+
+    Such a lobe is less than a degree high and narrower yet across, thinner than the cells of any affordable grid on the
+    sphere, and the horizon cuts it.  Here the sphere is projected from its centre onto the plane that touches the
+    horizon opposite ``wo``; cells are steps of the height ``v`` there and of ``s = u / (v + v_o)``, ``v_o`` the height
+    of ``wo``: nearly the half vector's slope across, so the lobe is as wide at every height.  The horizon is the
+    window's border; what lies outside or is invalid is one cell.
+    """
+    x, y, z = wo.double().tolist()
+    flat = (x * x + y * y) ** 0.5
+    level, across = np.array([-x, -y, 0.0]) / flat, np.array([y, -x, 0.0]) / flat
+    wide, high = 6.0 * alpha, np.tan(12.0 * alpha + np.arctan(z / flat))  # in slopes of the half vector 6 alpha
+    d = directions.detach().cpu().double().numpy()
+    with np.errstate(divide="ignore", invalid="ignore"):
+        v = d[:, 2] / (d @ level)
+        s = d @ across / (d @ level) / (v + z / flat)
+    inside = (d @ level > 0.0) & (v >= 0.0) & (v < high) & (abs(s) < wide)
+    column = ((s[inside] / wide * 0.5 + 0.5) * res).astype(int)
+    observed = np.bincount((v[inside] / high * res).astype(int) * res + column, minlength=res * res).astype(float)
+    middle = (np.arange(res * IRES) + 0.5) / (res * IRES)
+    v, s = np.meshgrid(middle * high, (middle * 2 - 1) * wide, indexing="ij")
+    u = s * (v + z / flat)
+    at = level + u[..., None] * across + v[..., None] * np.array([0.0, 0.0, 1.0])
+    length = np.linalg.norm(at, axis=-1)
+    density = pdf(torch.from_numpy((at / length[..., None]).reshape(-1, 3)).float().to(directions.device))
+    density = density.cpu().double().numpy().reshape(u.shape) * (v + z / flat) / length**3  # [1/sr] to [1 / (s v)]
+    mass = density.reshape(res, IRES, res, IRES).mean((1, 3)).reshape(-1) * (high * 2.0 * wide / res**2)
+    return pooled_p_value(d, observed, mass * total, total)
 
 
 TESTS = 8 * 30 + 30  # of the suite: four samplers at two azimuths for each of 30 lobes, and the rest

@@ -10,7 +10,6 @@ from reli3d.render.environment import Environment
 from reli3d.render.material import pdf_lobes, sample_bsdf
 from reli3d.render.sampling import (
     halton,
-    mirror,
     pdf_cosine,
     pdf_ggx_vndf,
     random_pairs,
@@ -48,15 +47,12 @@ def check_lobe(alpha, deg, device, n, phi=0.4):
     grazing = deg > 85 and alpha < 0.3  # a reflected lobe is then less than a degree wide beside the horizon
     for k, lobe in enumerate(("visible", "partner", "cosine")):
         wi = sample_bsdf(wo, a, u, lobe)
-        above = wi[:, 2] > 1e-6
-        if grazing and alpha < 0.1 and lobe != "cosine":  # too narrow for any grid: the half vector's test is exact
-            wm = torch.nn.functional.normalize(wo + wi[above], dim=-1)
-            half = pdf_ggx_vndf(wo, a, mirror(wm) if lobe == "partner" else wm) / (4.0 * (wo * wm).sum(-1))
-            # the half vector of two grazing directions loses 1e-7 over their sum of some 0.03, alpha 0.02 squares it
-            assert ((pdf_lobes(wo, wi[above], a)[:, k] / half - 1.0).abs() < 1e-3).all()
-            continue
-        cells = {"res": 41, "ires": 48, "up": 0} if grazing else grid(alpha)
-        p = chi2.p_value(wi[above], lambda d, k=k: pdf_lobes(wo, d, a)[:, k], total=n, **cells)
+        wi = wi[wi[:, 2] > 1e-6]
+        pdf = lambda d, k=k: pdf_lobes(wo, d, a)[:, k]  # noqa: E731
+        if grazing and alpha < 0.1 and lobe != "cosine":  # too narrow for a grid on the sphere
+            p = chi2.window_p_value(wi, pdf, wo, alpha, total=n)
+        else:
+            p = chi2.p_value(wi, pdf, total=n, **({"res": 41, "ires": 48, "up": 0} if grazing else grid(alpha)))
         assert p > LEVEL, f"{lobe}, p = {p}"
 
 
@@ -157,6 +153,22 @@ def test_the_test_has_power(device):
     wi = sample_bsdf(wo, a, u, "partner")
     above = wi[:, 2] > 1e-6
     assert chi2.p_value(wi[above], lambda d: pdf_lobes(wo, d, a)[:, 0], total=len(u)) < LEVEL
+
+
+@pytest.mark.parametrize("alpha", [0.02, 0.05])
+def test_the_window_on_a_grazing_lobe_has_power(device, alpha):
+    wo, a, u = view(89, device), torch.tensor(alpha, device=device), uniform(2_000_000, device)
+    wi = [v[v[:, 2] > 1e-6] for v in (sample_bsdf(wo, a, u, lobe) for lobe in ("visible", "partner"))]
+
+    def p(drawn, lobe, scale=1.0, width=1.0, seen=wo):
+        pdf = lambda d: scale * pdf_lobes(seen, d, a * width)[:, lobe]  # noqa: E731
+        return chi2.window_p_value(wi[drawn], pdf, wo, alpha, total=len(u), res=24)
+
+    for lobe in (0, 1):
+        assert p(lobe, lobe) > LEVEL
+        assert p(lobe, 1 - lobe) < LEVEL  # the other's density
+        for wrong in ({"scale": 1.02}, {"scale": 0.98}, {"width": 1.02}, {"width": 0.98}, {"seen": view(89.1, device)}):
+            assert p(lobe, lobe, **wrong) < LEVEL, (lobe, wrong)
 
 
 @pytest.mark.parametrize("alpha, deg", QUICK)
