@@ -136,7 +136,7 @@ def spread(roughness, metallic, environment, runs=256, **options):
     facing, view = normal.repeat(runs, 1).requires_grad_(), wo.repeat(runs, 1)
     fixed = facing.detach()
     out = shade(fixed, facing, fixed, view, base.repeat(runs, 1), rough, torch.full_like(rough, metallic).detach(),
-                environment, points="random", **options).mean(1)  # fmt: skip
+                environment, **{"points": "random", **options}).mean(1)  # fmt: skip
     slope, turn = torch.autograd.grad(out.sum(), (rough, facing))
     turn = turn - (turn * fixed).sum(-1, keepdim=True) * fixed
     rows = [v.detach().double().reshape(runs, 24, -1) for v in (out, slope, turn)]
@@ -152,6 +152,25 @@ def test_pairs_still_the_slope_in_the_normal_and_double_that_in_roughness(device
     pair, alone = (spread(0.1, 1.0, env, samples=(0, 40, 0), antithetic=a)[0] for a in (True, False))
     assert pair[2] < 0.05 * alone[2]  # measured 0.006
     assert 1.6 < pair[1] / alone[1] < 2.4  # measured 1.9 to 2.0; 20 draws instead of 40
+
+
+VARIANCE_FLOOR = 1e-4  # Mitsuba's: its image tests tell no pixel apart by less
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SKIES)
+@pytest.mark.parametrize("metallic", [0.0, 1.0])
+def test_pairs_as_shipped_are_less_noisy_than_as_many_independent_samples(device, name, metallic):
+    """The published counts with pairs from rotated Halton points, in value and both slopes.  Measured 0.0001 to 0.60;
+    a pair from independent numbers would be 1.0 to 2.2 in value and slope in roughness."""
+    env = light(name, device)
+    for roughness in (0.05, 0.3, 1.0):
+        pairs, _ = spread(roughness, metallic, env, points="halton", seed=1)
+        alone, _ = spread(roughness, metallic, env, antithetic=False, seed=2)
+        if max(pairs[0], alone[0]) < VARIANCE_FLOOR:  # metal of 0.05 with 1e-5, and 1.3 times that: docs/renderer.md
+            assert (roughness, metallic) == (0.05, 1.0)
+            pairs, alone = pairs[1:], alone[1:]
+        assert all(a < 0.8 * b for a, b in zip(pairs, alone, strict=True)), (roughness, pairs, alone)
 
 
 @pytest.mark.slow
