@@ -217,7 +217,7 @@ class RayScene:
             rays[1], limit, short = embree_rays(*rays, far if far.numel() == 1 else far[part], odd)
             rays = [v.numpy() for v in rays]
             if order is not None:  # np.take: indexing with the order takes 4 times as long
-                rays = [np.take(v, order, 0) for v in rays]
+                rays = [np.take(v, order, 0, mode="clip") for v in rays]
                 limit = None if limit is None else np.take(limit, order)
             store(part, order, limit, short, self._embree.run(*rays, limit, **query))
 

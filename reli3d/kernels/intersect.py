@@ -7,9 +7,10 @@ only.  A ray with a NaN, an infinity or no direction misses.  ``t`` counts in le
 
 import warp as wp
 
+from reli3d.kernels.math import INLINE
 from reli3d.kernels.projection import project_point
 
-wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native " + INLINE})
 
 OFFSET = wp.constant(3.814697265625e-06)  # 2^-18: 64 ulp; interpolation errs by some 7 ulp of the largest coordinate
 T_FAR = wp.constant(3.0e38)
@@ -99,11 +100,13 @@ def offset_origin_kernel(
 
 
 @wp.func
-def spread_bits(x: int) -> int:
-    """The lowest 8 bits of ``x`` on the even places (Morton 1966)."""
-    a = (x | (x << 4)) & 0x0F0F
-    a = (a | (a << 2)) & 0x3333
-    return (a | (a << 1)) & 0x5555
+def interleave(x: int, y: int) -> int:
+    """The lowest 8 bits of ``x`` on the even places and those of ``y`` on the odd ones (Morton 1966)."""
+    a = x | (y << 16)
+    a = (a | (a << 4)) & 0x0F0F0F0F
+    a = (a | (a << 2)) & 0x33333333
+    a = (a | (a << 1)) & 0x55555555
+    return (a & 0xFFFF) + 2 * (a >> 16)
 
 
 @wp.kernel
@@ -116,23 +119,23 @@ def ray_key_kernel(
 ):  # fmt: skip
     """16 bits alike for rays that visit the same part of the tree: the direction's cell of 32 x 32 on an octahedron in
     Morton order, then the origin's of 4 x 4 x 4 above ``low``.  ``odd`` becomes True if any ray is not valid or has a
-    direction shorter than ``SHORT``."""
+    direction shorter than ``SHORT``; one whose components add up to infinity counts as such."""
     i = start + wp.tid()
+    o = origins[i]
     d = directions[i]
-    reach = wp.max(wp.abs(d[0]) + wp.abs(d[1]) + wp.abs(d[2]), 1.0e-37)
-    x = d[0] / reach
-    y = d[1] / reach
-    if d[2] < 0.0:  # the lower half is folded over the upper one's corners
-        a = x
-        x = (1.0 - wp.abs(y)) * wp.sign(a)
-        y = (1.0 - wp.abs(a)) * wp.sign(y)
-    place = wp.cw_mul(origins[i] - low, per_cell)
-    k = spread_bits(int(wp.clamp(16.0 * x + 16.0, 0.0, 31.0)))
-    k = k + 2 * spread_bits(int(wp.clamp(16.0 * y + 16.0, 0.0, 31.0)))
+    reach = wp.abs(d[0]) + wp.abs(d[1]) + wp.abs(d[2])
+    scale = 16.0 / wp.max(reach, 1.0e-37)
+    x = d[0] * scale
+    y = d[1] * scale
+    lower = d[2] < 0.0  # that half is folded over the upper one's corners
+    across = wp.where(lower, (16.0 - wp.abs(y)) * wp.sign(x), x)
+    along = wp.where(lower, (16.0 - wp.abs(x)) * wp.sign(y), y)
+    k = interleave(int(wp.min(across + 16.0, 31.0)), int(wp.min(along + 16.0, 31.0)))
+    place = wp.cw_mul(o - low, per_cell)
     for axis in range(3):
         k = k * 4 + int(wp.clamp(place[axis], 0.0, 3.0))
     key[i] = wp.int16(k - 32768)
-    if not ray_is_valid(origins[i], d) or reach < SHORT:
+    if not (reach >= SHORT and reach + wp.abs(o[0]) + wp.abs(o[1]) + wp.abs(o[2]) < wp.inf):  # true for NaN
         odd[0] = True
 
 
@@ -154,13 +157,9 @@ def place_hits_kernel(
     hit = found[j] >= 0
     if limit.shape[0] != 0:
         hit = hit and limit[j] >= 0.0
-    face[i] = -1
-    t[i] = wp.inf
-    bary[i] = wp.vec2(0.0, 0.0)
-    if hit:
-        face[i] = found[j]
-        t[i] = tfar[j]
-        bary[i] = wp.vec2(u[j], v[j])
+    face[i] = wp.where(hit, found[j], -1)
+    t[i] = wp.where(hit, tfar[j], wp.inf)
+    bary[i] = wp.where(hit, wp.vec2(u[j], v[j]), wp.vec2(0.0, 0.0))
 
 
 @wp.kernel
