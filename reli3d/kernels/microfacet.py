@@ -48,10 +48,11 @@ def facet_between(wo: wp.vec3, wi: wp.vec3, alpha: float, root_o: float) -> Face
     """
     facet = Facet()
     h = wo + wi
-    per_length = 1.0 / wp.sqrt(wp.dot(h, h))  # above the horizon the sum is not 0
+    length = wp.sqrt(wp.dot(h, h))  # 2 wo.wm for unit vectors, and the same from both; above the horizon not 0
+    per_length = 1.0 / length
     facet.wm = h * per_length
-    facet.cos_m = wp.dot(wo, facet.wm)
-    facet.per_cos_m = 2.0 * per_length  # the sum of two unit vectors is 2 wo.wm long
+    facet.cos_m = 0.5 * length
+    facet.per_cos_m = 2.0 * per_length
     facet.ndf = ggx_ndf(facet.wm, alpha)
     facet.root_o = root_o
     facet.root_i = ggx_root(wi, alpha)
