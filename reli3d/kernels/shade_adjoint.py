@@ -117,8 +117,9 @@ def shade_adjoint_kernel(
     g_normal: wp.array(dtype=wp.vec3), g_base_color: wp.array(dtype=wp.vec3), g_alpha: wp.array(dtype=float),
     g_metallic: wp.array(dtype=float), g_radiance: wp.array2d(dtype=wp.vec3),
 ):  # fmt: skip
-    """Adjoints of the hits from ``first``; ``g_radiance`` is added to, or without texels left out."""
+    """Adjoints of the hits from ``first``; ``g_radiance`` is added to.  An output without rows is left out."""
     i = first + start + wp.tid()
+    material = g_normal.shape[0] + g_base_color.shape[0] + g_alpha.shape[0] + g_metallic.shape[0]
     surface = make_surface(plan, pixels[i], normal[i], ng[i], wo[i], base_color[i], alpha[i], metallic[i])
     total = SurfaceGradient()
     g = g_out[i]
@@ -137,26 +138,29 @@ def shade_adjoint_kernel(
                 for c in range(3):
                     if value[c] * scale * light[c] < top:
                         own[c] = g[c]
-                total = add_sample_gradient(total, d.facet, surface.wo, d.wi, surface.base_color, surface.alpha,
-                                            surface.metallic, plan.conserving, value,
-                                            wp.cw_mul(own, light) * d.factor)  # fmt: skip
+                if material != 0:
+                    total = add_sample_gradient(total, d.facet, surface.wo, d.wi, surface.base_color, surface.alpha,
+                                                surface.metallic, plan.conserving, value,
+                                                wp.cw_mul(own, light) * d.factor)  # fmt: skip
                 if g_radiance.shape[0] != 0:
                     add_texels(g_radiance, d.uv, wp.cw_mul(own, value) * scale)
-    side = wp.float32(1.0)
-    if wp.dot(ng[i], wo[i]) < 0.0:
-        side = -1.0
-    g_n = wp.transpose(surface.frame) * total.n
-    facing = normal[i] * side
-    cos_o = wp.dot(facing, wo[i])
-    if cos_o < COS_VIEW_MIN:  # through normalize(n + wo (c - n.wo))
-        m = facing + wo[i] * (COS_VIEW_MIN - cos_o)
-        length = wp.length(m)
-        m = m / length
-        g_n = (g_n - m * wp.dot(m, g_n)) / length
-        g_n = g_n - wo[i] * wp.dot(wo[i], g_n)
-    g_normal[i] = g_n * side
-    g_base_color[i] = total.base_color
-    g_metallic[i] = total.metallic
-    g_alpha[i] = total.alpha
-    if alpha[i] < ALPHA_MIN:
-        g_alpha[i] = 0.0
+    if g_normal.shape[0] != 0:
+        side = wp.float32(1.0)
+        if wp.dot(ng[i], wo[i]) < 0.0:
+            side = -1.0
+        g_n = wp.transpose(surface.frame) * total.n
+        facing = normal[i] * side
+        cos_o = wp.dot(facing, wo[i])
+        if cos_o < COS_VIEW_MIN:  # through normalize(n + wo (c - n.wo))
+            m = facing + wo[i] * (COS_VIEW_MIN - cos_o)
+            length = wp.length(m)
+            m = m / length
+            g_n = (g_n - m * wp.dot(m, g_n)) / length
+            g_n = g_n - wo[i] * wp.dot(wo[i], g_n)
+        g_normal[i] = g_n * side
+    if g_base_color.shape[0] != 0:
+        g_base_color[i] = total.base_color
+    if g_metallic.shape[0] != 0:
+        g_metallic[i] = total.metallic
+    if g_alpha.shape[0] != 0 and alpha[i] >= ALPHA_MIN:
+        g_alpha[i] = total.alpha

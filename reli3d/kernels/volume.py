@@ -211,7 +211,8 @@ def composite_adjoint_kernel(
     """Back to front: with e the adjoint of a sample's weight, d loss / d own thickness = T_after e - sum behind of w e.
 
     The thickness before a sample comes from the whole one by taking samples away; that one is below 2 OPAQUE, so the
-    rounding of it is below 1e-5.  Samples that no light passes keep the zeros that the gradients hold before.
+    rounding of it is below 1e-5.  Samples that no light passes keep the zeros that the gradients hold before; an output
+    without rows is left out.
     """
     i = start + wp.tid()
     begin = first[i]
@@ -229,7 +230,8 @@ def composite_adjoint_kernel(
         thickness = wp.max(thickness - own, 0.0)
         weight = wp.exp(-thickness) * absorbed(own)
         e = wp.dot(g_out[i], color[k]) + g_depth[i] * t[k]
-        g_color[k] = g_out[i] * weight
-        if density[k] > 0.0:
+        if g_color.shape[0] != 0:
+            g_color[k] = g_out[i] * weight
+        if g_density.shape[0] != 0 and density[k] > 0.0:
             g_density[k] = step * (after * e - behind + g_opacity[i] * last)
         behind = behind + weight * e

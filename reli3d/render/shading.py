@@ -78,9 +78,8 @@ def shade(
     check("pixels", pixels, like=position, dtype=torch.int32)
     if pixels.shape != (n,):
         raise ValueError(f"pixels: expected shape ({n},), got {tuple(pixels.shape)}")
-    job = _Job(plan, sum(samples), scene, [*tables, (pixels.contiguous(), wp.int32)])
-    values = (position, normal, ng, wo, base_color, width, metallic, environment.radiance)
-    return _Shade.apply(job, *(v.contiguous() for v in values))
+    values = (position, normal, ng, wo, base_color, width, metallic, environment.radiance, pixels)
+    return _Shade.apply(_Job(plan, sum(samples), scene, tables), *(v.contiguous() for v in values))
 
 
 class Light(Protocol):
@@ -117,10 +116,10 @@ def shade_light(
     plan, offsets = sampling_plan(samples, seed, True, "balance", points, paint, None, scene)
     device, count, table = position.device, sum(samples), proposal.table
     pixels = torch.arange(n, dtype=torch.int32, device=device)
-    tables = [*table.sampler, (table.density, wp.float32), (offsets.to(device), wp.vec2), (pixels, wp.int32)]
+    tables = [*table.sampler, (table.density, wp.float32), (offsets.to(device), wp.vec2)]
     values = (position, normal, ng, wo, base_color, roughness * roughness, metallic)
     white = torch.ones(1, 2, 3, device=device)  # what a sample adds under unit light; the light's radiance comes after
-    ins = _inputs([v.contiguous() for v in (*values, white)], _Job(plan, count, scene, tables))
+    ins = _inputs([v.contiguous() for v in (*values, white, pixels)], _Job(plan, count, scene, tables))
     out = torch.zeros(n, 3, device=device)
     size = max(1, LIGHT_RAYS // max(1, count))
     for first in range(0, n if count else 0, size):
@@ -172,11 +171,12 @@ class _Shade(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, g_out: Tensor):
         *tensors, visible = ctx.saved_tensors
-        n, device, radiance = g_out.shape[0], g_out.device, tensors[-1]
+        n, device, wanted = g_out.shape[0], g_out.device, ctx.needs_input_grad[1:]
         parts = len(slices(n)) if device.type == "cpu" else 1
-        height = radiance.shape[0] if ctx.needs_input_grad[8] else 0
-        g_radiance = torch.zeros(parts, height, *radiance.shape[1:], device=device)
-        g_normal, g_base, g_alpha, g_metallic = (torch.zeros_like(t) for t in (tensors[1], *tensors[4:7]))
+        # what nobody asks for has no rows: the kernel leaves it out
+        g_normal, g_base, g_alpha, g_metallic, texels = (
+            torch.zeros_like(tensors[k] if wanted[k] else tensors[k][:0]) for k in (1, 4, 5, 6, 7))  # fmt: skip
+        g_radiance = texels.repeat(parts, 1, 1, 1)  # of each slice
         ins = _inputs(tensors, ctx.job)[1:]  # all but the position
         ins += [ctx.job.plan, (visible, wp.int32), (g_out.contiguous(), wp.vec3)]
         outs = [(g_normal, wp.vec3), (g_base, wp.vec3), (g_alpha, wp.float32), (g_metallic, wp.float32)]
@@ -193,13 +193,14 @@ class _Shade(torch.autograd.Function):
                 over_slices(n, work)
             else:
                 work(0, 0, n)
-        grads = [None, g_normal, None, None, g_base, g_alpha, g_metallic, g_radiance.sum(0)]
-        return None, *(g if w else None for g, w in zip(grads, ctx.needs_input_grad[1:], strict=True))
+        grads = [None, g_normal, None, None, g_base, g_alpha, g_metallic, g_radiance.sum(0), None]
+        return None, *(g if w else None for g, w in zip(grads, wanted, strict=True))
 
 
 def _inputs(tensors: list[Tensor], job: _Job) -> list:
+    *values, pixels = tensors
     kinds = [wp.vec3] * 5 + [wp.float32] * 2 + [wp.vec3]
-    return [*zip(tensors, kinds, strict=True), *job.tables]
+    return [*zip(values, kinds, strict=True), *job.tables, (pixels, wp.int32)]
 
 
 def _shade_embree(n: int, ins: list, job: _Job, outs: list) -> None:

@@ -161,21 +161,25 @@ class _Composite(torch.autograd.Function):
     def forward(ctx, samples: RaySamples, density: Tensor, color: Tensor):
         n, device = len(samples.first) - 1, density.device
         outs = [(empty((n,), kind, device), kind) for kind in (wp.vec3, wp.float32, wp.float32)]
-        launch(kernels.composite_kernel, n, [*_inputs(samples, density, color), *outs], device)
-        ctx.samples = samples
-        ctx.save_for_backward(density, color)
+        tensors = (density, color, samples.t, samples.first)
+        launch(kernels.composite_kernel, n, [*_inputs(tensors, samples.step), *outs], device)
+        ctx.step = samples.step
+        ctx.save_for_backward(*tensors)
         return tuple(out for out, _ in outs)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, g_color: Tensor, g_opacity: Tensor, g_depth: Tensor):
-        density, color = ctx.saved_tensors
-        outs = [(torch.zeros_like(density), wp.float32), (torch.zeros_like(color), wp.vec3)]
+        tensors, (_, *wanted) = ctx.saved_tensors, ctx.needs_input_grad
+        # what nobody asks for has no rows: the kernel leaves it out
+        outs = [(torch.zeros_like(v if w else v[:0]), kind)
+                for v, w, kind in zip(tensors, wanted, (wp.float32, wp.vec3), strict=False)]  # fmt: skip
         gs = [(g_color.contiguous(), wp.vec3), (g_opacity.contiguous(), wp.float32), (g_depth.contiguous(), wp.float32)]
-        n = len(ctx.samples.first) - 1
-        launch(kernels.composite_adjoint_kernel, n, [*_inputs(ctx.samples, density, color), *gs, *outs], density.device)
-        return None, outs[0][0], outs[1][0]
+        args = [*_inputs(tensors, ctx.step), *gs, *outs]
+        launch(kernels.composite_adjoint_kernel, len(tensors[3]) - 1, args, g_color.device)
+        return None, *(g if w else None for (g, _), w in zip(outs, wanted, strict=True))
 
 
-def _inputs(samples: RaySamples, density: Tensor, color: Tensor) -> list:
-    return [(density, wp.float32), (color, wp.vec3), (samples.t, wp.float32), (samples.first, wp.int32), samples.step]
+def _inputs(tensors: tuple[Tensor, ...], step: float) -> list:
+    kinds = (wp.float32, wp.vec3, wp.float32, wp.int32)  # density, colour, t, first
+    return [*zip(tensors, kinds, strict=True), step]
