@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+import warp as wp
 
 from reli3d import kernels
 from reli3d.geometry.rays import Hits, RayScene, offset_origin
@@ -49,14 +50,24 @@ def brute_force(vertices, faces, o, d):
     return np.where(hit, t, np.inf), np.stack([u, v], -1)
 
 
+# stretch and shift of meshes and rays: plain, tiny, long, flat, far
+PLACES = [((1.0, 1.0, 1.0), 0.0), ((1e-4, 1e-4, 1e-4), 0.0), ((1.0, 1.0, 1e3), 0.0), ((1.0, 1e-3, 1.0), 0.0),
+          ((1.0, 1.0, 1.0), 1e3), ((1.0, 1.0, 1.0), 1e5)]  # fmt: skip
+
+
+def placed(vertices, o, d, stretch, shift):
+    """Rounded to float32 as the scene gets them: at 1e5 coordinates are a grid of 0.008, for the oracle too."""
+    by = torch.tensor(stretch)
+    return (vertices * stretch + shift).astype(np.float32), (o * by + shift).float(), (d * by).float()
+
+
 @pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("scale, shift", [(1.0, 0.0), (1e-4, 0.0), (1.0, 1e3)])
-def test_hits_are_those_of_float64_brute_force(device, backend, scale, shift):
+@pytest.mark.parametrize("stretch, shift", PLACES)
+def test_hits_are_those_of_float64_brute_force(device, backend, stretch, shift):
+    """Directions are stretched as the mesh is, so that ``t`` has the same size everywhere."""
     for seed in range(3):
         vertices, faces = soup(seed)
-        vertices = (vertices * scale + shift).astype(np.float32)
-        o, d = rays(3000, seed)
-        o = o * scale + shift
+        vertices, o, d = placed(vertices, *rays(3000, seed), stretch, shift)
         scene = make(vertices, faces, backend, device)
         hits = scene.closest(o.to(device), d.to(device))
         t, bary = brute_force(vertices, faces, o, d)
@@ -64,13 +75,11 @@ def test_hits_are_those_of_float64_brute_force(device, backend, scale, shift):
         best = np.where(np.isinf(t.min(1)), 1e30, t.min(1))
         face, got = hits.face.cpu().numpy(), hits.t.cpu().double().clamp(max=1e30).numpy()
         same = face == np.where(best < 1e30, first, -1)
-        tolerance = 1e-5 * scale + 4e-7 * abs(shift)  # the second: float32 positions far from the origin
-        agree = same | (np.abs(got - best) <= tolerance)
-        assert agree.mean() >= 1 - (1e-3 if shift == 0 else 0.02)  # a ray may pass an edge within rounding
+        assert (same | (np.abs(got - best) <= 1e-5)).mean() >= 0.999  # a ray may pass an edge within rounding
         sure = same & (face >= 0)
-        assert np.quantile(np.abs(got - best)[sure], 0.999) <= 10 * tolerance  # grazing rays stretch the error
+        assert np.quantile(np.abs(got - best)[sure], 0.999) <= 1e-5  # the rest: grazing rays stretch the error
         off = np.abs(hits.bary.cpu().numpy() - bary[np.arange(len(o)), first])[sure]
-        assert np.quantile(off, 0.99) < (2e-4 if shift == 0 else 5e-2)  # 6e-5 of a position 1e3 away over faces of 0.3
+        assert np.quantile(off, 0.999) < 1e-5
         assert np.isinf(hits.t.cpu().numpy()[face < 0]).all() and (hits.bary.cpu().numpy()[face < 0] == 0).all()
         assert np.array_equal(scene.occluded(o.to(device), d.to(device)).cpu().numpy(), face >= 0)
 
@@ -100,6 +109,14 @@ def test_rays_at_edges_and_vertices_of_a_closed_mesh_do_not_leak(device, backend
         assert float(torch.stack([u, w, 1 - u - w]).min()) > -1e-5  # 1e-7 of a position over faces of 0.07
         assert float((exact - t[hit]).abs().max()) < 1e-5
         torch.testing.assert_close(torch.stack([u, w], -1).float(), bary[hit], rtol=0, atol=1e-4)
+
+
+def test_warps_tree_is_split_by_surface_area(device, monkeypatch):
+    """On CUDA too, where Warp's own choice is another: the leak rates above are those of this tree."""
+    made, plain = [], wp.Mesh
+    monkeypatch.setattr(wp, "Mesh", lambda **options: made.append(options["bvh_constructor"]) or plain(**options))
+    make(*soup(0), "warp", device)
+    assert made == ["sah"]
 
 
 def test_backends_agree_on_a_million_ray_queries(device):
@@ -237,24 +254,6 @@ def test_reevaluated_hits_and_their_gradients_equal_float64(device):
         limit = 5e-4 if name == "interpolated" else 1e-4
         for k, (g, t) in enumerate(zip(grads, truth, strict=True)):
             assert g is None or reference.share_within(g, t, limit if k == 0 else 1e-4) >= 0.999, (name, k)
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("stretch, shift", [((1.0, 1.0, 1e3), 0.0), ((1.0, 1e-3, 1.0), 0.0), ((1.0, 1.0, 1.0), 1e5)])
-def test_stretched_and_far_meshes_keep_their_hits(device, backend, stretch, shift):
-    """Against float64 brute force on the rounded vertices; a face counts as right within float32 of the position."""
-    vertices, faces = soup(11)
-    vertices = (vertices * stretch + shift).astype(np.float32)
-    o, d = rays(3000, 5)
-    o, d = ((o * torch.tensor(stretch) + shift).float(), (d * torch.tensor(stretch)).float())
-    hits = make(vertices, faces, backend, device).closest(o.to(device), d.to(device))
-    t, _ = brute_force(vertices, faces, o, d)
-    best, got = t.min(1), hits.t.cpu().double().numpy()
-    agree = (hits.face.cpu().numpy() == np.where(np.isinf(best), -1, t.argmin(1))) | (
-        np.abs(np.minimum(got, 1e30) - np.minimum(best, 1e30)) < 1e-4
-    )
-    # at 1e5 a float32 position is a grid of 0.008 and faces are 0.3 wide: one ray in 40 passes an edge within it
-    assert agree.mean() >= (0.999 if shift == 0 else 0.95)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

@@ -4,6 +4,9 @@ After Embree's ``verify`` and pbrt's ``shapes_test``; the oracle is float64 brut
 """
 
 import math
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,8 +14,11 @@ import torch
 import trimesh
 
 from reli3d.geometry.rays import offset_origin
+from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import hit_normals, interpolate
-from tests.test_rays import BACKENDS, make, rays, soup
+from reli3d.render.shading import shade
+from tests.test_rays import BACKENDS, PLACES, make, placed, rays, soup
+from tests.test_shading import sky
 
 
 def bumpy(seed, subdivisions=2, height=0.25):
@@ -38,27 +44,48 @@ def oracle(vertices, faces, o, d):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_twenty_meshes_and_twenty_thousand_rays_against_every_face(device, backend):
+@pytest.mark.parametrize("stretch, shift", PLACES)
+def test_twenty_meshes_and_twenty_thousand_rays_against_every_face(device, backend, stretch, shift):
     """The same face, or a distance within 1e-5 of the mesh's size; a ray that tells otherwise passes an edge within
-    rounding."""
-    apart = 0
-    for seed in range(20):
-        vertices, faces = bumpy(seed) if seed % 2 else soup(seed, 40 + 10 * seed)
+    rounding.  Five meshes where they are stretched or far."""
+    apart, meshes = 0, 20 if (stretch, shift) == PLACES[0] else 5
+    for seed in range(meshes):
+        mesh, faces = bumpy(seed) if seed % 2 else soup(seed, 40 + 10 * seed)
+        vertices = placed(mesh, *rays(1), stretch, shift)[0]
         scene = make(vertices, faces, backend, device)
         for k in range(20):
-            o, d = rays(1000, 100 * seed + k, 1.5)
+            plain = rays(1000, 100 * seed + k, 1.5)
+            _, o, d = placed(mesh, *plain, stretch, shift)
             hits = scene.closest(o.to(device), d.to(device))
             t, inside = oracle(vertices, faces, o, d)
             best, first = t.min(1)
             face, got = hits.face.cpu().long(), hits.t.cpu().double()
             same = face == torch.where(best.isinf(), -1, first)
-            near = (got - best).abs() <= 1e-5 * 3.0 / d.norm(dim=-1)  # t counts in lengths of d, the mesh is 3 across
+            # t counts in lengths of d, which is stretched as the mesh is; the mesh was 3 across
+            near = (got - best).abs() <= 1e-5 * 3.0 / plain[1].norm(dim=-1)
             odd = torch.nonzero(~(same | near))[:, 0]
             apart += len(odd)
             for i in odd.tolist():  # both faces in question: an edge of either is within 1e-5 of its size
                 margins = [float(inside[i, f]) for f in (int(face[i]), int(first[i])) if f >= 0 and not best[i].isinf()]
                 assert min(abs(m) for m in margins) < 1e-5, (seed, k, i)
-    assert apart <= 1e-5 * 20 * 20_000
+    assert apart <= 1e-5 * meshes * 20_000
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_any_hit_is_the_closest_hit_before_the_limit(device, backend):
+    """Limits of every ray's own: any, exactly at the closest hit, which is then none, and the next number above it."""
+    vertices, faces = soup(4, 200)
+    scene, n = make(vertices, faces, backend, device), 120_000
+    o, d = (v.to(device) for v in rays(n, 9, 0.8))
+    first = scene.closest(o, d).t
+    far = torch.rand(n, generator=torch.Generator().manual_seed(3)).to(device) * 2.0
+    far[1::3] = first[1::3]
+    far[2::3] = torch.nextafter(first[2::3], torch.full_like(first[2::3], torch.inf))
+    found = scene.occluded(o, d, t_max=far)
+    assert torch.equal(found, first < far)
+    assert float(found[::3].float().mean()) > 0.1 and float(found[2::3].float().mean()) > 0.3
+    limited = scene.closest(o, d, t_max=far)
+    assert torch.equal(limited.t, torch.where(found, first, torch.inf)) and torch.equal(limited.face >= 0, found)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -114,19 +141,91 @@ def test_hits_of_uniform_directions_measure_the_solid_angle(device, backend):
         assert abs(float(hit.float().mean()) - share) < 4 * (share * (1 - share) / n) ** 0.5
 
 
+def shaded(scene, face, bary):
+    """Radiance of points of the scene's own surface under its own shadows."""
+    n, device = len(face), face.device
+    position, ng = interpolate(scene.vertices, scene.faces, face, bary), hit_normals(scene.vertices, scene.faces, face)
+    white, half = torch.full((n, 3), 0.8, device=device), torch.full((n,), 0.5, device=device)
+    return shade(position, ng, ng, ng, white, half, half, Environment(sky().radiance.to(device)), scene=scene)
+
+
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_a_moved_mesh_is_hit_as_if_built_anew(device, backend):
     vertices, faces = bumpy(5, subdivisions=3)
     scene = make(vertices, faces, backend, device)
     o, d = (v.to(device) for v in rays(20_000, 8, 1.2))
-    for seed in (6, 7):
+    far = torch.rand(20_000, generator=torch.Generator().manual_seed(1)).to(device) * 2.0
+    rng = np.random.default_rng(2)
+    face = torch.tensor(rng.integers(0, len(faces), 500), dtype=torch.int32, device=device)
+    bary = torch.tensor(rng.dirichlet((1, 1, 1), 500)[:, 1:], dtype=torch.float32, device=device)
+    for seed, place in ((6, 0.2), (7, 0.2), (8, 40.0)):  # the last one needs a larger scale than the first
         moved, _ = bumpy(seed, subdivisions=3, height=0.4)
-        moved = moved * np.float32([1.0, 1.5, 0.7]) + np.float32(0.2)
+        moved = moved * np.float32([1.0, 1.5, 0.7]) + np.float32(place)
+        before = shaded(scene, face, bary)
         scene.refit(torch.from_numpy(moved).to(device))
-        got, want = scene.closest(o, d), make(moved, faces, backend, device).closest(o, d)
+        fresh = make(moved, faces, backend, device)
+        assert scene.scale == fresh.scale and (scene.mesh_id == 0) == (backend == "embree")
+        start = o + place - 0.2
+        got, want = scene.closest(start, d), fresh.closest(start, d)
         # two faces at one edge may be found in another order, at the same distance
         assert float((got.face != want.face).float().mean()) <= 1e-4
         torch.testing.assert_close(got.t, want.t, rtol=0, atol=1e-5)
+        for limit in (float("inf"), far):
+            blocked = scene.occluded(start, d, t_max=limit)
+            assert torch.equal(blocked, fresh.occluded(start, d, t_max=limit)) and float(blocked.float().mean()) > 0.1
+        after = shaded(scene, face, bary)
+        assert torch.equal(after, shaded(fresh, face, bary)) and float((after - before).abs().max()) > 0.1
+
+
+HOSTILE = """
+import torch
+from reli3d.geometry.rays import RayScene
+o, d = torch.tensor([[0.2, 0.2, 1.0]]), torch.tensor([[0.0, 0.0, -1.0]])
+corners, one = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), torch.tensor([[0, 1, 2]], dtype=torch.int32)
+
+def ask(scene):
+    many = o.expand(20_000, 3), d.expand(20_000, 3)
+    return (float(scene.closest(o, d).t), bool(scene.occluded(o, d)), int((scene.closest(*many).face >= 0).sum()),
+            bool(scene.clear(o, d, torch.ones(1) * 9.0)))
+
+def refused(name, act):
+    try:
+        act()
+    except ValueError as error:
+        assert str(error).startswith(name + ": expected"), error
+    else:
+        raise AssertionError("accepted: " + name)
+
+for backend in ("embree", "warp"):
+    for index in (3, -1, 2**31 - 1, -(2**31)):
+        wrong = torch.tensor([[0, 1, 2], [0, index, 2]], dtype=torch.int32)
+        refused("faces", lambda: RayScene(corners, wrong, backend))
+    refused("faces", lambda: RayScene(corners[:0], one, backend))
+    single = RayScene(corners, one, backend)
+    assert ask(single) == (1.0, True, 20_000, False)
+    for value in (float("nan"), float("inf")):
+        broken = corners.clone()
+        broken[1, 1] = value
+        refused("vertices", lambda: RayScene(broken, one, backend))
+        refused("vertices", lambda: single.refit(broken))
+        assert ask(single) == (1.0, True, 20_000, False) and single.scale == 1.0  # as it was
+    refused("vertices", lambda: single.refit(corners[:2]))
+    single.refit(corners - torch.tensor([0.0, 0.0, 1.0]))
+    assert ask(single) == (2.0, True, 20_000, False)
+    for vertices in (corners, corners[:0]):
+        empty = RayScene(vertices, one[:0], backend)
+        for _ in range(2):
+            assert ask(empty) == (float("inf"), False, 0, True) and empty.mesh_id == 0
+            empty.refit(vertices.clone())
+print("all refused or answered")
+"""
+
+
+def test_wrong_indices_and_odd_meshes_end_in_an_error_and_never_in_a_crash():
+    """In a process of its own: a wrong index that came through would end it with a signal."""
+    done = subprocess.run([sys.executable, "-c", HOSTILE], capture_output=True, text=True, timeout=300,
+                          cwd=Path(__file__).parents[1])  # fmt: skip
+    assert done.returncode == 0 and done.stdout == "all refused or answered\n", done.stderr
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
