@@ -1,9 +1,11 @@
-"""Fixtures shared by all tests: the device, and the folder of real data beside the checkout."""
+"""Fixtures shared by all tests: the device, the number of threads, and the folder of real data beside the checkout."""
 
 from pathlib import Path
 
 import pytest
 import torch
+
+from reli3d import _bridge
 
 DEVICES = ["cpu"] + (["cuda"] if torch.cuda.is_available() else [])
 SHARED = Path(__file__).parents[2] / "shared"
@@ -12,6 +14,19 @@ SHARED = Path(__file__).parents[2] / "shared"
 @pytest.fixture(params=DEVICES)
 def device(request) -> torch.device:
     return torch.device(request.param)
+
+
+@pytest.fixture
+def threads():
+    """Sets the number of torch threads and of those that share a launch; both are restored after the test."""
+    before = torch.get_num_threads()
+
+    def use(n):
+        torch.set_num_threads(n)
+        _bridge._pool.cache_clear()  # it is made once, for the number of its first call
+
+    yield use
+    use(before)
 
 
 @pytest.fixture

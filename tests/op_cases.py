@@ -33,7 +33,7 @@ from reli3d.render.silhouette import antialias
 from reli3d.render.volume import RaySamples, composite
 from reli3d.triplane import sample_triplane
 
-N = 3000  # rows: more than one slice of a CPU launch
+N = 5200  # rows: five slices of a CPU launch
 
 
 @dataclass(frozen=True)
@@ -132,14 +132,15 @@ def shaded(n: int) -> dict[str, Tensor]:
             "roughness": uniform(n, seed=3, low=0.2), "radiance": uniform(8, 16, 3, seed=5) ** 3 * 2.0}  # fmt: skip
 
 
-def lit(shadows: bool, **options):
+def lit(shadows: str | None = None, **options):
     def run(normal, base_color, metallic, roughness, radiance):
         ng = normal.detach()
         wo = normalize(ng + 0.5 * units(len(ng), 6).to(ng), dim=-1)
         scene = None
         if shadows:
             vertices, faces = ball(normal.device)
-            scene = RayScene(vertices + torch.tensor([0.0, 1.0, 0.0], device=normal.device), faces, "warp")
+            scene = RayScene(vertices + torch.tensor([0.0, 1.0, 0.0], device=normal.device), faces,
+                             shadows if normal.device.type == "cpu" else "warp")  # fmt: skip
         return (shade(0.2 * ng, normal, ng, wo, base_color, roughness, metallic, Environment(radiance), scene=scene,
                       seed=3, **options),)  # fmt: skip
 
@@ -272,9 +273,10 @@ CASES = {
         lambda normal, wo, base_color, roughness, metallic, **g: (
             shade_gaussians(normal, wo, base_color, roughness, metallic, SphericalGaussians(**g)),),
         (*SG, "wo", *MAP), ("wo", *MAP)),
-    "shade": Case(shaded, lit(False), (*MAP, "radiance"), MAP),
+    "shade": Case(shaded, lit(), (*MAP, "radiance"), MAP),
+    "shade, shadows by Embree": Case(shaded, lit("embree"), (*MAP, "radiance"), MAP),
     "shade, shadows, power, random": Case(
-        shaded, lit(True, heuristic="power", points="random", clamp=5.0), (*MAP, "radiance"), MAP),
+        shaded, lit("warp", heuristic="power", points="random", clamp=5.0), (*MAP, "radiance"), MAP),
     "composite": Case(
         lambda n: {"density": uniform(n, seed=1, low=-3.0, high=27.0), "color": uniform(n, 3, seed=2)}, composited,
         ("density", "color"), ("density", "color")),

@@ -73,19 +73,6 @@ def operands(n, device, rows=11):
     return table, index, weight, g
 
 
-@pytest.fixture
-def threads():
-    """Sets the number of torch threads; the number and the pool are restored after the test."""
-    before = torch.get_num_threads()
-
-    def use(n):
-        torch.set_num_threads(n)
-        _bridge._pool.cache_clear()
-
-    yield use
-    use(before)
-
-
 @pytest.mark.parametrize("n", [1, 2, 1023, 1024, 2047, 2048, 16384, 16385, 1_000_003])
 def test_slices_cover_the_range_once_in_order(n):
     parts = _bridge.slices(n)

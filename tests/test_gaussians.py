@@ -205,17 +205,15 @@ def test_fit_of_a_real_sky_holds_its_light(device, shared_data):
     assert float((light.irradiance(normals) / want - 1.0).abs().max()) < 0.03  # measured 0.018
 
 
-def test_same_bits_for_any_number_of_threads(device):
-    before, results = torch.get_num_threads(), []
-    try:
-        for threads in (1, 2):
-            torch.set_num_threads(threads)
-            asked = ask([*shading_inputs(device, 3000), *lobes(device, 6)])
-            out = shade_gaussians(*asked[:5], SphericalGaussians(*asked[5:]))
-            results.append([out.detach(), *torch.autograd.grad(out.square().sum(), asked)])
-    finally:
-        torch.set_num_threads(before)
-    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+def test_same_bits_for_any_number_of_threads(device, threads):
+    results = []
+    for count in (1, 2, 5):
+        threads(count)
+        asked = ask([*shading_inputs(device, 6000), *lobes(device, 6)])
+        out = shade_gaussians(*asked[:5], SphericalGaussians(*asked[5:]))
+        results.append([out.detach(), *torch.autograd.grad(out.square().sum(), asked)])
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
 
 
 def test_bad_input_and_empty_batches(device):

@@ -104,22 +104,18 @@ def test_edge_inputs_are_finite_and_not_negative(device):
     assert empty.shape == (0, 3)
 
 
-def test_bits_do_not_depend_on_threads_or_chunks(device):
-    normal, wo = points(5000)
+def test_bits_do_not_depend_on_threads_or_chunks(device, threads):
+    normal, wo = points(6000)
     mesh = trimesh.creation.icosphere(subdivisions=2, radius=0.5)
     vertices, faces = torch.tensor(mesh.vertices).float().to(device), torch.tensor(mesh.faces).int().to(device)
     scene = RayScene(vertices, faces)
-    args = [normal, normal, normal, wo, torch.rand(5000, 3), torch.rand(5000), torch.rand(5000)]
+    args = [normal, normal, normal, wo, torch.rand(6000, 3), torch.rand(6000), torch.rand(6000)]
     args = [a.to(device) for a in args]
     light = Environment(sky().radiance.to(device))
-    threads = torch.get_num_threads()
-    try:
-        results = []
-        for k in (1, 2, 5):
-            torch.set_num_threads(k)
-            results.append(shade(*args, light, scene=scene))
-    finally:
-        torch.set_num_threads(threads)
+    results = []
+    for k in (1, 2, 5):
+        threads(k)
+        results.append(shade(*args, light, scene=scene))
     assert torch.equal(results[0], results[1]) and torch.equal(results[0], results[2])
     part = [a[700:900] for a in args]
     ids = torch.arange(700, 900, dtype=torch.int32, device=device)
@@ -238,17 +234,13 @@ def test_mean_gradient_is_that_of_the_integral(device, counts, paint):
         assert (g_light.cpu() / n - truth[4]).abs().max() < noise + 1e-3
 
 
-def test_gradients_have_the_same_bits_for_any_number_of_threads_and_none_unasked(device):
-    wo, inputs = gradient_inputs(device, n=5000)
-    threads = torch.get_num_threads()
+def test_gradients_have_the_same_bits_for_any_number_of_threads_and_none_unasked(device, threads):
+    wo, inputs = gradient_inputs(device, n=6000)
     results = []
-    try:
-        for k in (1, 2, 5):
-            torch.set_num_threads(k)
-            got = shade(inputs[0], inputs[0], inputs[0], wo, *inputs[1:4], Environment(inputs[4]))
-            results.append(torch.autograd.grad(got.square().sum(), inputs))
-    finally:
-        torch.set_num_threads(threads)
+    for k in (1, 2, 5):
+        threads(k)
+        got = shade(inputs[0], inputs[0], inputs[0], wo, *inputs[1:4], Environment(inputs[4]))
+        results.append(torch.autograd.grad(got.square().sum(), inputs))
     assert device.type == "cuda" or all(torch.equal(a, b) for r in results[1:] for a, b in zip(results[0], r))
     normal, base = inputs[0].detach(), inputs[1]
     plain = [v.detach() for v in inputs[2:4]]

@@ -178,20 +178,16 @@ def test_weights_of_surface_cubes_only(device):
             extract_surface(level, radius=1.0, cubes=cubes.flip(0), **rows)
 
 
-def test_the_same_bits_for_any_number_of_threads():
+def test_the_same_bits_for_any_number_of_threads(threads):
     level = torus(40) + 0.01 * torch.randn(41, 41, 41, generator=torch.Generator().manual_seed(0))
     weights = random_weights(level.shape, 0)
-    before = torch.get_num_threads()
     results = []
-    try:
-        for threads in (1, 2, 5):
-            torch.set_num_threads(threads)
-            leaves = [level.clone().requires_grad_(), weights["deformation"].clone().requires_grad_()]
-            mesh = extract_surface(leaves[0], radius=1.0, **{**weights, "deformation": leaves[1]})
-            grads = torch.autograd.grad(mesh.vertices.square().sum(), leaves)
-            results.append((mesh.vertices.detach(), mesh.faces, *grads))
-    finally:
-        torch.set_num_threads(before)
+    for count in (1, 2, 5):
+        threads(count)
+        leaves = [level.clone().requires_grad_(), weights["deformation"].clone().requires_grad_()]
+        mesh = extract_surface(leaves[0], radius=1.0, **{**weights, "deformation": leaves[1]})
+        grads = torch.autograd.grad(mesh.vertices.square().sum(), leaves)
+        results.append((mesh.vertices.detach(), mesh.faces, *grads))
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
 

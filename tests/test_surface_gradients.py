@@ -91,25 +91,22 @@ def test_levels_and_weights_of_any_size_give_finite_vertices_and_gradients(devic
     assert all(bool(torch.isfinite(g).all()) for g in grads) and all(float(g.abs().max()) > 0 for g in grads)
 
 
-def test_gradients_behind_the_mesh_are_the_same_bits_for_any_number_of_threads():
+def test_gradients_behind_the_mesh_are_the_same_bits_for_any_number_of_threads(threads):
     """Centre vertices, deviation, normals, smoothing, atlas: torch's own scatters add up in any order."""
     level = torus(40) + 0.01 * torch.randn(41, 41, 41, generator=torch.Generator().manual_seed(0))
     weights = {"level": level, **random_weights(level.shape, 0, spread=0.5)}
-    before, results = torch.get_num_threads(), []
-    try:
-        for threads in (1, 2, 5, 5):
-            torch.set_num_threads(threads)
-            leaves = {k: v.clone().requires_grad_() for k, v in weights.items()}
-            given = {k: v for k, v in leaves.items() if k not in ("level", "gamma")}
-            mesh = extract_surface(leaves["level"], radius=1.0, centre=True, gamma=leaves["gamma"], **given)
-            shown = unwrap(taubin_smooth(mesh.with_normals(), iterations=2), texture_size=64)
-            spread = vertex_deviation(leaves["level"], radius=1.0, **given)
-            seen = [mesh.vertices, shown.vertices, shown.normals, spread]
-            rng = torch.Generator().manual_seed(1)
-            share = [torch.randn(v.shape, generator=rng) for v in seen]
-            results.append([*seen, *torch.autograd.grad(seen, list(leaves.values()), share)])
-    finally:
-        torch.set_num_threads(before)
+    results = []
+    for count in (1, 2, 5, 5):
+        threads(count)
+        leaves = {k: v.clone().requires_grad_() for k, v in weights.items()}
+        given = {k: v for k, v in leaves.items() if k not in ("level", "gamma")}
+        mesh = extract_surface(leaves["level"], radius=1.0, centre=True, gamma=leaves["gamma"], **given)
+        shown = unwrap(taubin_smooth(mesh.with_normals(), iterations=2), texture_size=64)
+        spread = vertex_deviation(leaves["level"], radius=1.0, **given)
+        seen = [mesh.vertices, shown.vertices, shown.normals, spread]
+        rng = torch.Generator().manual_seed(1)
+        share = [torch.randn(v.shape, generator=rng) for v in seen]
+        results.append([*seen, *torch.autograd.grad(seen, list(leaves.values()), share)])
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
 

@@ -120,19 +120,15 @@ def test_channel_first_planes_are_read_by_rows_with_the_same_bits(channels, heig
     assert torch.equal(sample_triplane(planes.detach(), points), want)
 
 
-def test_the_same_bits_for_any_number_of_threads():
+def test_the_same_bits_for_any_number_of_threads(threads):
     planes, points, weights = inputs(1, 40, 80, 80, 20000)
-    before = torch.get_num_threads()
     results = []
-    try:
-        for threads in (1, 2, 5):
-            torch.set_num_threads(threads)
-            p, q = planes.clone().requires_grad_(), points.clone().requires_grad_()
-            out = sample_triplane(p, q)
-            by_rows = sample_triplane(planes, points)
-            results.append((out.detach(), by_rows, *torch.autograd.grad(out, (p, q), weights)))
-    finally:
-        torch.set_num_threads(before)
+    for count in (1, 2, 5):
+        threads(count)
+        p, q = planes.clone().requires_grad_(), points.clone().requires_grad_()
+        out = sample_triplane(p, q)
+        by_rows = sample_triplane(planes, points)
+        results.append((out.detach(), by_rows, *torch.autograd.grad(out, (p, q), weights)))
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
 

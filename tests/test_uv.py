@@ -178,14 +178,11 @@ def test_a_soup_of_triangles_fits():
     check_atlas(mesh, unwrap(mesh, texture_size=512), rel=2e-2)  # all border: 3,000 triangles of about 150 samples
 
 
-def test_same_bits_again_and_for_any_number_of_threads():
-    mesh, results, threads = icosphere(5), [], torch.get_num_threads()
-    try:
-        for n in (1, 2, 1):
-            torch.set_num_threads(n)
-            results.append(unwrap(mesh, texture_size=512))
-    finally:
-        torch.set_num_threads(threads)
+def test_same_bits_again_and_for_any_number_of_threads(threads):
+    mesh, results = icosphere(5), []
+    for n in (1, 2, 5, 1):
+        threads(n)
+        results.append(unwrap(mesh, texture_size=512))
     for other in results[1:]:
         assert torch.equal(results[0].uv, other.uv) and torch.equal(results[0].faces, other.faces)
 
