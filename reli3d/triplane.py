@@ -28,8 +28,7 @@ class _SampleTriplane(torch.autograd.Function):
     @staticmethod
     def forward(ctx, planes: Tensor, points: Tensor) -> Tensor:
         batch, _, channels, height, width = planes.shape
-        n, points = points.shape[1], points.contiguous()
-        blocks = -(-channels // BLOCK)
+        n, blocks = points.shape[1], -(-channels // BLOCK)
         order, edges = points.new_empty(0, dtype=torch.int32), None
         scattered = not planes.is_cuda and height * width * blocks * BLOCK > CACHED \
             and not _is_walk(points, max(height, width))  # fmt: skip
@@ -53,14 +52,15 @@ class _SampleTriplane(torch.autograd.Function):
                 (packed.view(-1, BLOCK), kernels.vec8), *inputs, n, height, width, blocks, split, out],
                 planes.device)  # fmt: skip
         sorted_points = (order, edges) if ctx.needs_input_grad[0] else (None, None)
-        ctx.save_for_backward(points, packed if ctx.needs_input_grad[1] else None, *sorted_points)
+        source = planes if all(ctx.needs_input_grad) else None  # refuses a second derivative: packed is a copy
+        ctx.save_for_backward(points, packed if ctx.needs_input_grad[1] else None, *sorted_points, source)
         ctx.shape, ctx.dtype = planes.shape, planes.dtype
         return features[..., :channels].reshape(batch, n, 3 * channels)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, g_out: Tensor):
-        points, packed, order, edges = ctx.saved_tensors
+        points, packed, order, edges, _ = ctx.saved_tensors
         channels = ctx.shape[2]
         g = g_out.reshape(*points.shape[:2], 3, channels)
         g = torch.nn.functional.pad(g, (0, -channels % BLOCK)).contiguous() if channels % BLOCK else g.contiguous()
@@ -166,4 +166,4 @@ def sample_triplane(planes: Tensor, points: Tensor) -> Tensor:
     largest = 3 * batch * max(height * width * blocks, (height + 2) * blocks, points.shape[1] * blocks)
     if largest >= 2**31:
         raise ValueError(f"planes, points: expected fewer than 2**31 blocks of 8 channels, got {largest}")
-    return _SampleTriplane.apply(planes, points)
+    return _SampleTriplane.apply(planes, points.contiguous())

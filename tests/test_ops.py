@@ -1,15 +1,17 @@
 """What holds for every public operation, over the table of ``tests/op_cases.py``."""
 
 import importlib
+import itertools
 import pkgutil
 
 import pytest
 import torch
 import warp as wp
 
+import reli3d
 from reli3d import kernels
 from tests import op_cases, op_cases_plain, reference
-from tests.op_cases import Case, N
+from tests.op_cases import Case, N, rng
 
 CASES = {**op_cases.CASES, **op_cases_plain.CASES}
 DIFFERENTIABLE = [name for name, case in CASES.items() if case.grads]
@@ -20,6 +22,12 @@ STEP = 3e-5  # of a difference of slopes: longer ones cross kinks of the mean ab
 def leaves_of(case: Case, device, n: int = FEW, asked=None) -> dict:
     asked = case.grads if asked is None else asked
     return {k: v.to(device).requires_grad_(k in asked) for k, v in case.inputs(n).items()}
+
+
+def strided(leaves: dict) -> dict:
+    """The same values, no two of a tensor side by side."""
+    return {k: torch.stack([v.detach(), -v.detach()], -1)[..., 0].requires_grad_(v.requires_grad)
+            for k, v in leaves.items()}  # fmt: skip
 
 
 def loss_of(outs) -> torch.Tensor:
@@ -46,13 +54,12 @@ def same(a: torch.Tensor, b: torch.Tensor) -> bool:
 def test_strides_do_not_matter(device, name):
     case = CASES[name]
     plain = leaves_of(case, device)
-    strided = {k: torch.stack([v.detach(), -v.detach()], -1)[..., 0].requires_grad_(k in case.grads)
-               for k, v in plain.items()}  # fmt: skip
-    assert all(v.numel() < 2 or not v.is_contiguous() for v in strided.values())
-    outs, others = case.run(**plain), case.run(**strided)
+    spread = strided(plain)
+    assert all(v.numel() < 2 or not v.is_contiguous() for v in spread.values())
+    outs, others = case.run(**plain), case.run(**spread)
     assert all(same(a, b) for a, b in zip(outs, others, strict=True))
     if case.grads:
-        first, second = gradients(case, plain, outs), gradients(case, strided, others)
+        first, second = gradients(case, plain, outs), gradients(case, spread, others)
         assert all(same(first[k], second[k]) for k in first)
 
 
@@ -112,7 +119,56 @@ def test_an_edit_in_place_is_an_error_or_harmless(device, name):
             continue
         for a, other in zip(got, case.grads, strict=True):
             torch.testing.assert_close(a, truth[other], rtol=1e-5, atol=1e-6 * float(truth[other].abs().max()))
-    assert refused or case.second or name == "taubin_smooth"  # plain torch may keep copies of what it needs
+    assert (
+        refused or case.second == case.grads or name == "taubin_smooth"
+    )  # plain torch may keep copies of what it needs
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_nothing_given_is_written_to_and_nothing_of_it_is_given_back(device, name):
+    """What ``torch.library.opcheck`` asks of a schema: no input and no incoming gradient has other bits or another
+    version afterwards, and no output lies in the memory of an input."""
+    case = CASES[name]
+    given = leaves_of(case, device)
+    before = {k: (v.detach().clone(), v._version) for k, v in given.items()}
+    outs = case.run(**given)
+    owned = {v.untyped_storage().data_ptr() for v in given.values()}
+    # a ray's origin is a view of its pose, which torch keeps count of
+    assert name == "camera_rays" or not any(out.untyped_storage().data_ptr() in owned for out in outs)
+    if case.grads:
+        out = [v for v in outs if v.requires_grad]
+        incoming = {f"gradient {k}": torch.randn(v.shape, generator=rng(k)).to(v) for k, v in enumerate(out)}
+        before |= {k: (v.clone(), v._version) for k, v in incoming.items()}
+        torch.autograd.grad(out, [given[k] for k in case.grads], list(incoming.values()))
+        given |= incoming
+    for k, (bits, version) in before.items():
+        assert torch.equal(given[k], bits) and given[k]._version == version, k
+
+
+def test_no_operator_of_torch_library_is_registered():
+    """The operations are autograd functions: no schema, no fake tensor, nothing that ``opcheck`` could take."""
+    for module in pkgutil.walk_packages(reli3d.__path__, "reli3d."):
+        if not module.name.endswith("__main__"):
+            importlib.import_module(module.name)
+    assert not [name for name in torch._C._dispatch_get_all_op_names() if name.startswith("reli3d")]
+
+
+@pytest.mark.slow  # 20 s of tracing
+@pytest.mark.parametrize("held_out", [True, False])
+def test_a_compiled_function_around_an_operation_gives_the_same_bits(device, held_out):
+    case = CASES["shade"]
+    run = torch.compiler.disable(case.run) if held_out else case.run
+
+    def image(**leaves):
+        return run(**{**leaves, "base_color": leaves["base_color"].square()})[0].square() + 1.0
+
+    results = []
+    for f in (image, torch.compile(image, backend="eager")):
+        leaves = leaves_of(case, device)
+        out = f(**leaves)
+        results.append([out, *torch.autograd.grad(out.sum(), [leaves[k] for k in case.grads])])
+    torch._dynamo.reset()
+    assert all(same(a, b) for a, b in zip(*results, strict=True))
 
 
 @pytest.mark.parametrize("kind", [torch.float64, torch.float16])
@@ -139,29 +195,43 @@ def test_no_rows_are_data(device, name):
             assert g.shape == leaves[k].shape and not bool(g.any()), k
 
 
+@pytest.mark.parametrize("of", [torch.clone, torch.square])
 @pytest.mark.parametrize("name", DIFFERENTIABLE)
-def test_second_derivatives_are_right_or_refused(device, name):
-    """Those of kernels raise; those of plain torch equal differences of the first."""
-    case = CASES[name]
-    leaves = leaves_of(case, device)
-    loss = loss_of(tuple(out.square() for out in case.run(**leaves) if out.is_floating_point()))
-    k = case.grads[0]
-    (slope,) = torch.autograd.grad(loss, leaves[k], create_graph=True)
-    step = torch.randn(slope.shape, generator=torch.Generator().manual_seed(4)).to(device)
-    if not case.second:
-        with pytest.raises(RuntimeError, match="once_differentiable|not implemented"):
-            torch.autograd.grad((slope * step).sum(), leaves[k])
-        return
-    (bend,) = torch.autograd.grad((slope * step).sum(), leaves[k])
-    ends = []
-    for sign in (1.0, -1.0):
-        moved = leaves_of(case, device)
-        moved[k] = (moved[k].detach() + sign * STEP * step).requires_grad_()
-        value = loss_of(tuple(out.square() for out in case.run(**moved) if out.is_floating_point()))
-        ends.append((torch.autograd.grad(value, moved[k])[0] * step).double().sum())
-    want = (ends[0] - ends[1]) / (2.0 * STEP)
-    got = (bend * step).double()
-    assert abs(float(got.sum() - want)) < 2e-2 * float(got.abs().sum()) + 1e-3  # float32 slopes over the step
+def test_second_derivatives_are_right_or_refused(device, name, of):
+    """Of every gradient in every input: those of kernels raise, those of plain torch equal differences of the first.
+    Of a loss that is linear in the results too: then the incoming gradient is a constant."""
+    case, noise = CASES[name], rng(4)
+    moves = {k: torch.randn(v.shape, generator=noise).to(device) for k, v in leaves_of(case, device).items()}
+
+    def slope(leaves, k, **options):
+        """Along a random direction of the input ``k``."""
+        loss = loss_of(tuple(of(out) for out in case.run(**leaves) if out.is_floating_point()))
+        return (torch.autograd.grad(loss, leaves[k], **options)[0] * moves[k]).double()
+
+    def bend(k, other):
+        leaves = strided(leaves_of(case, device))  # a copy of an input is not what the second derivative is asked of
+        along = slope(leaves, k, create_graph=True).sum()
+        return torch.autograd.grad(along, leaves[other], allow_unused=True)[0] if along.requires_grad else None
+
+    for k, other in itertools.product(case.grads, repeat=2):
+        try:
+            got = bend(k, other)
+        except RuntimeError as error:
+            refused = "once_differentiable" in str(error) or isinstance(error, NotImplementedError)  # ours; torch's
+            assert refused and k not in case.second, (k, other)
+            continue
+        ends = []
+        for sign in (1.0, -1.0):
+            moved = leaves_of(case, device)
+            moved[other] = (moved[other].detach() + sign * STEP * moves[other]).requires_grad_()
+            ends.append(slope(moved, k))
+        if got is None:  # linear, or no output depends on both
+            assert torch.equal(*ends), (k, other)
+            continue
+        got, want = (got * moves[other]).double(), float((ends[0] - ends[1]).sum()) / (2.0 * STEP)
+        assert k in case.second, (k, other)
+        # float32 slopes over the step
+        assert abs(float(got.sum()) - want) < 2e-2 * float(got.abs().sum()) + 1e-3, (k, other)
 
 
 def shares(case: Case, first, second, spoil=lambda tensor: tensor) -> dict[str, float]:
