@@ -122,17 +122,49 @@ def test_bits_do_not_depend_on_threads_or_chunks(device, threads):
     assert torch.equal(shade(*part, light, scene=scene, pixels=ids), results[0][700:900])
 
 
-def test_embree_and_warp_cast_the_same_shadows():
-    normal, wo = points(3000)
+def shadow_caster(device, backend="auto"):
     mesh = trimesh.creation.icosphere(subdivisions=3, radius=0.4)
     mesh.apply_translation([0, 1.2, 0])
-    vertices, faces = torch.tensor(mesh.vertices).float(), torch.tensor(mesh.faces).int()
-    args = [normal * 0.5, normal, normal, wo, torch.full((3000, 3), 0.7), torch.full((3000,), 0.5), torch.zeros(3000)]
-    a, b, free = (shade(*args, sky(), scene=s) for s in (RayScene(vertices, faces, "embree"),
-                                                         RayScene(vertices, faces, "warp"), None))  # fmt: skip
-    assert float((free - a).max()) > 0.01  # the shadow is there
-    changed = ((a - b).abs() > 1e-5).any(-1).float().mean()
+    vertices, faces = torch.tensor(mesh.vertices).float().to(device), torch.tensor(mesh.faces).int().to(device)
+    return RayScene(vertices, faces, backend)
+
+
+def test_embree_and_warp_cast_the_same_shadows_in_values_and_gradients():
+    wo, inputs = gradient_inputs(torch.device("cpu"), n=3000)
+    weight = torch.rand(3000, 3, generator=torch.Generator().manual_seed(2))
+    results = []
+    for scene in (shadow_caster("cpu", "embree"), shadow_caster("cpu", "warp"), None):
+        still = inputs[0].detach()
+        got = shade(still * 0.5, inputs[0], still, wo, *inputs[1:4], Environment(inputs[4]), scene=scene)
+        results.append([got.detach(), *torch.autograd.grad((got * weight).sum(), inputs)])
+    a, b, free = results
+    changed = ((a[0] - b[0]).abs() > 1e-5).any(-1).float().mean()
     assert changed < 2e-3  # 64 rays a point: a silhouette ray differs with probability of about 1e-5
+    for one, other, unshadowed in zip(a, b, free, strict=True):  # normal, base colour, roughness, metallic, texels
+        assert reference.share_within(one, other) >= 0.998  # those points; where no ray differs all are the same bits
+        assert reference.share_within(one, unshadowed) < 0.9  # the shadow is there
+
+
+@pytest.mark.parametrize("shadows", [False, True])
+@pytest.mark.parametrize("counts", [(1, 0, 0), (0, 1, 0), (0, 0, 1)])
+def test_a_single_sample_is_cut_at_the_clamp(device, counts, shadows):
+    """With one sample of one strategy the clamp is the least of the value and it, and the mean over many seeds too."""
+    wo, inputs = gradient_inputs(device, n=2000)
+    normal, *values = (v.detach() for v in inputs)
+    scene = shadow_caster(device) if shadows else None
+    args, light = (normal * 0.5, normal, normal, wo, *values[:3]), Environment(values[3])
+    for seed in range(8):
+        options = {"samples": counts, "scene": scene, "seed": seed, "points": "random"}
+        free = shade(*args, light, **options)
+        clamp = float(free[free > 0].median())
+        assert torch.equal(shade(*args, light, clamp=clamp, **options), free.clamp(max=clamp))
+        assert torch.equal(shade(*args, light, clamp=1e30, **options), free)
+        # of four samples each is cut at a quarter: none adds up to more, and what stays below a quarter is whole
+        options["samples"] = tuple(4 * k for k in counts)
+        whole, cut = shade(*args, light, **options), shade(*args, light, clamp=clamp, **options)
+        assert float(cut.max()) <= clamp * (1 + 1e-6) and bool((cut <= whole).all())
+        low = whole <= clamp / 4
+        assert torch.equal(cut[low], whole[low]) and 0.01 < float((cut < whole).float().mean()) < 0.99
 
 
 def test_bad_input_is_named(device):
@@ -159,27 +191,32 @@ def gradient_inputs(device, n=400):
     return wo.to(device), [v.to(device).requires_grad_() for v in values]
 
 
-@pytest.mark.parametrize("paint", PAINTS)
-def test_gradient_is_that_of_the_estimator_where_the_samples_stand_still(device, paint):
+@pytest.mark.parametrize("paint, clamped", [*((paint, False) for paint in PAINTS), (PAINTS[0], True)])
+def test_gradient_is_that_of_the_estimator_where_the_samples_stand_still(device, paint, clamped):
     """With environment samples alone nothing drawn depends on the material, so finite differences see the same
-    samples."""
+    samples, and the same ones are cut by a clamp that half of them reach."""
     wo, inputs = gradient_inputs(device)
     weight = torch.rand(len(wo), 3, generator=torch.Generator().manual_seed(2)).to(device)
 
     def loss(normal, base, roughness, metallic, radiance):
         env = Environment(radiance)
         object.__setattr__(env, "table", table)  # the light's own change must not move the samples either
-        got = shade(normal, normal, normal, wo, base, roughness, metallic, env, samples=(48, 0, 0), paint=paint)
+        got = shade(normal, normal, normal, wo, base, roughness, metallic, env, samples=(48, 0, 0), paint=paint,
+                    clamp=clamp)  # fmt: skip
         return (got * weight).double().sum()
 
-    table = Environment(inputs[4].detach()).table
+    table, clamp = Environment(inputs[4].detach()).table, None
+    if clamped:  # the middle one of single samples
+        normal, *rest = (v.detach() for v in inputs)
+        single = shade(normal, normal, normal, wo, *rest[:3], Environment(rest[3]), samples=(1, 0, 0), paint=paint)
+        clamp = float(single[single > 0].median())
     grads = torch.autograd.grad(loss(*inputs), inputs)
     generator = torch.Generator().manual_seed(3)
     for k, (value, grad) in enumerate(zip(inputs, grads, strict=True)):
         direction = torch.randn(value.shape, generator=generator).to(device)
         if k == 0:  # stay on the sphere, where the shading is defined
             direction = direction - (direction * value).sum(-1, keepdim=True) * value
-        eps = 1e-3
+        eps = 1e-4 if clamped else 1e-3  # over 1e-3 one sample in a thousand comes to the clamp or leaves it
         shifted = []
         for sign in (1, -1):
             moved = [v.detach() for v in inputs]
