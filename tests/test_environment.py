@@ -96,6 +96,35 @@ def test_samples_fall_on_texels_as_their_density_says(device, name):
 
 
 @pytest.mark.parametrize("name", maps())
+def test_density_is_the_light_of_a_texel_by_its_solid_angle(device, name):
+    """Per sr: the mean of the bilinear luminance over the texel, by the integral of it over the sphere.  Each quarter
+    of a texel is bilinear, so its mean is the value in its middle.  A constant map gives the uniform sphere."""
+    map_ = maps()[name]
+    height, width = map_.shape[:2]
+    light = (map_.double() @ torch.tensor([0.2126, 0.7152, 0.0722]).double())[..., None].expand(-1, -1, 3)
+    mean = torch.zeros(height, width, dtype=torch.float64)
+    for a, b in ((0.25, 0.25), (0.25, 0.75), (0.75, 0.25), (0.75, 0.75)):
+        phi = ((torch.arange(width).double() + a) / width - 0.5) * 2.0 * math.pi
+        theta = (torch.arange(height).double()[:, None] + b) / height * math.pi
+        axes = [theta.sin() * phi.sin(), theta.cos().expand(height, width), -theta.sin() * phi.cos()]
+        mean += reference.lookup_envmap(light, torch.stack(axes, -1))[..., 0] / 4.0
+    edge = torch.cos(torch.arange(height + 1).double() / height * math.pi)
+    angle = (edge[:-1] - edge[1:])[:, None] * 2.0 * math.pi / width
+    d = directions(20_000, 4).double()
+    across = (torch.atan2(d[:, 0], -d[:, 2]) / (2.0 * math.pi) + 0.5) * width
+    down = torch.acos(d[:, 1]) / math.pi * height
+    inside = ((across - across.round()).abs() > 1e-4) & ((down - down.round()).abs() > 1e-4)  # off a texel's border
+    d, column, row = d[inside], across[inside].long(), down[inside].long()
+    got = Environment(map_.to(device)).pdf(d.float().to(device)).cpu().double()
+    off = got - (mean / (mean * angle).sum())[row, column]
+    # mass of a texel: two differences of float32 sums of up to 1, a rounding of 3e-8 at either end
+    assert float((off * angle[row, 0]).abs().max()) < 1.2e-7
+    if name in ("constant", "3 x 2"):  # the first row of 100 holds 2.5e-4 of the mass
+        limit = {"constant": 2.5e-4, "3 x 2": 1e-6}[name]
+        assert float((got * 4.0 * math.pi - 1.0).abs().max()) < limit
+
+
+@pytest.mark.parametrize("name", maps())
 def test_weights_are_bounded_so_no_sample_is_a_firefly(device, name):
     env = Environment(maps()[name].to(device))
     d, pdf = env.sample(torch.rand(50_000, 2, generator=torch.Generator().manual_seed(6)).to(device))
