@@ -115,16 +115,36 @@ def test_mask_loss_gradient_matches_differences_of_sampled_coverage(device, name
         assert abs(got - want) < 0.15 * largest, key
 
 
-def test_descent_moves_a_sphere_onto_its_target(device):
+def picture_of(vertices, faces, camera, colors, background):
+    """Colours ``(F, 3)`` of faces before ``background (H, W, 3)``: none of them moves, but the outline."""
+    scene = RayScene(vertices.detach(), faces)
+    seen = layer_of_hits(scene, camera)
+    image = layer_of_hits(scene, camera, colors) + (1.0 - seen) * background
+    return antialias(image, vertices, faces, camera, scene)
+
+
+@pytest.mark.parametrize("layer", ["mask", "picture"])
+def test_descent_moves_a_sphere_onto_its_target(device, layer):
+    """By its mask, and by its colours alone, some of them darker and some brighter than what is behind them."""
     vertices, faces = shape("sphere", device)
     camera = camera_of(device)
+    ramp = torch.linspace(0.0, 1.0, SIZE, device=device)
+    across, down = ramp.expand(SIZE, SIZE), ramp[:, None].expand(SIZE, SIZE)
+    background = torch.stack([across, down, 0.5 * across], -1)
+    colors = 0.5 + 0.5 * torch.nn.functional.normalize(vertices[faces.long()].mean(1), dim=-1)
+
+    def draw(moved):
+        if layer == "mask":
+            return mask_of(moved, faces, camera)
+        return picture_of(moved, faces, camera, colors, background)
+
     aim = torch.tensor([0.15, -0.1, 0.05], device=device)
-    target = mask_of(vertices * 0.8 + aim, faces, camera)
+    target = draw(vertices * 0.8 + aim)
     offset, log_scale = (torch.zeros(k, device=device, requires_grad=True) for k in (3, 1))
     optimizer = torch.optim.Adam([offset, log_scale], lr=0.02)
     losses = []
     for _ in range(60):
-        loss = (mask_of(vertices * log_scale.exp() + offset, faces, camera) - target).square().sum()
+        loss = (draw(vertices * log_scale.exp() + offset) - target).square().sum()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
