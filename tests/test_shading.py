@@ -4,6 +4,7 @@ import pytest
 import torch
 import trimesh
 
+from bench.timing import peak_bytes
 from reli3d.geometry.rays import RayScene
 from reli3d.render.environment import Environment
 from reli3d.render.material import PAINTS
@@ -292,3 +293,30 @@ def test_gradients_have_the_same_bits_for_any_number_of_threads_and_none_unasked
     got = shade(normal, normal, normal, wo, base, *plain, Environment(inputs[4].detach()), clamp=1e-6)
     clamped = torch.autograd.grad(got.sum(), base)[0].abs().max()
     assert float(clamped) < 1e-4 * float(results[0][1].abs().max())  # only grazing samples stay below such a clamp
+
+
+@pytest.mark.parametrize("shadows", [False, True])
+def test_memory_does_not_grow_with_samples(device, shadows):
+    """Forward and backward of 2048 points: 1024 samples each need 30 words of visibility more than 64, and no array of
+    2 million of anything, of which the smallest, a byte each, would be twice the slack."""
+    wo, inputs = gradient_inputs(device, n=2048)
+    mesh = trimesh.creation.icosphere(subdivisions=2, radius=0.5)
+    vertices, faces = torch.tensor(mesh.vertices).float().to(device), torch.tensor(mesh.faces).int().to(device)
+    scene, environment = RayScene(vertices, faces) if shadows else None, Environment(inputs[4])
+
+    def peak(samples):
+        def step():
+            out = shade(inputs[0], inputs[0], inputs[0], wo, *inputs[1:4], environment, samples=samples, scene=scene)
+            torch.autograd.grad(out.sum(), inputs)
+
+        step()  # what is made once
+        peaks = [peak_bytes(step, device) for _ in range(2)]
+        return pytest.skip("the system does not tell the peak of memory") if None in peaks else min(peaks)
+
+    threads, words = torch.get_num_threads(), 2048 * (1024 - 64) // 32 * 4
+    torch.set_num_threads(1)  # each has its own buffers, not always at the same time
+    try:
+        few, many = peak((20, 40, 4)), peak((320, 640, 64))
+    finally:
+        torch.set_num_threads(threads)
+    assert many - few < words + 2**20  # measured: the words and 20 kB
