@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from reli3d.render.material import PAINTS, eval_bsdf, pdf_lobes, sample_bsdf
+from reli3d.render.sampling import pdf_ggx_vndf, sample_ggx_vndf
 from tests import mitsuba_scene, reference
 
 
@@ -85,7 +86,10 @@ def test_energy_is_never_created(device):
 
 @pytest.mark.parametrize("paint", PAINTS)
 def test_directions_in_and_below_the_horizon_and_extreme_parameters(device, paint):
-    """Both cosines 1e-3, 0 and -0.1 with any other; metallic, base colour and width at both ends, and width 0."""
+    """Both cosines 1e-3, 0 and -0.1 with any other; metallic, base colour and width at both ends, and width 0.
+
+    Densities too, and draws for the corners of the unit square.
+    """
     z = torch.tensor([1e-3, 0.0, -0.1, 1e-8, 0.3, 1.0, -1.0])
     turn = torch.tensor([0.0, 1e-3, 2.0, torch.pi])
     s = (1 - z * z).clamp(min=0.0).sqrt()
@@ -97,6 +101,16 @@ def test_directions_in_and_below_the_horizon_and_extreme_parameters(device, pain
     assert bool(torch.isfinite(out).all()) and float(out.min()) >= 0.0
     below = (wo[..., 2] <= 0.0) | (wi[..., 2] <= 0.0)
     assert float(out[below.expand(out.shape[:-1])].abs().max()) == 0.0 < float(out.max())
+    for pdf in (pdf_lobes(wo, wi, alpha), pdf_ggx_vndf(wo, alpha, wi)[..., None]):
+        assert bool(torch.isfinite(pdf).all()) and float(pdf.min()) >= 0.0
+        assert float(pdf[below.expand(pdf.shape[:-1])].abs().max()) == 0.0 < float(pdf.max())
+    end = 1.0 - 2.0**-24
+    u = torch.tensor([[0.0, 0.0], [0.0, end], [end, 0.0], [end, end]], device=device)
+    wm = sample_ggx_vndf(wo, alpha, u)
+    assert float(wm[..., 2].min()) > 0.0
+    for drawn in (wm, *(sample_bsdf(wo, alpha, u, lobe) for lobe in ("visible", "partner", "cosine"))):
+        torch.testing.assert_close(drawn.norm(dim=-1), torch.ones_like(drawn[..., 0]), atol=1e-5, rtol=0)
+        assert bool(torch.isfinite(pdf_lobes(wo, drawn, alpha)).all())
 
 
 def test_bad_paint_is_named(device):
