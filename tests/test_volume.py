@@ -7,6 +7,8 @@ import torch
 from torch.nn.functional import normalize
 
 from reli3d.render.volume import OccupancyGrid, RaySamples, composite, march_rays, sample_weights
+from reli3d.triplane import sample_triplane
+from tests.reference import share_within
 
 
 def rays(device, n=64, seed=0, radius=0.8):
@@ -123,6 +125,48 @@ def test_composite_and_gradients_match_the_float64_twin(device):
     weights = sample_weights(density, samples)
     sums = torch.zeros(len(COUNTS), device=device).index_add(0, samples.ray.long(), weights)
     torch.testing.assert_close(sums, out.opacity.detach(), rtol=1e-5, atol=1e-6)
+
+
+def planes_read(planes, points):
+    """Float64 twin of :func:`reli3d.triplane.sample_triplane`, ``(S, 3 C)``."""
+    out = []
+    for plane, axes in zip(planes[0], ((0, 1), (0, 2), (1, 2)), strict=True):
+        grid = points[:, axes][None, None]
+        out.append(torch.nn.functional.grid_sample(plane[None], grid, align_corners=False)[0, :, 0].T)
+    return torch.cat(out, 1)
+
+
+def test_a_triplane_is_marched_and_composited_as_in_float64(device):
+    """The first training stage: occupancy of the field, samples, features, heads, colour and opacity of rays; values
+    and gradients to planes and heads, as docs/renderer.md joins them."""
+    rng = torch.Generator().manual_seed(8)
+    radius = 0.8
+    leaves = [torch.randn(1, 3, 4, 6, 6, generator=rng), torch.randn(4, 12, generator=rng) * 0.7]
+    planes, heads = (v.to(device).requires_grad_() for v in leaves)
+
+    def field(points, planes, heads, read):
+        value = read(planes, points / radius) @ heads.T
+        return torch.nn.functional.softplus(6.0 * value[:, 0] - 12.0), torch.sigmoid(value[:, 1:])
+
+    read = lambda planes, points: sample_triplane(planes, points[None])[0]  # noqa: E731
+    density_at = lambda points: field(points, planes, heads, read)[0]  # noqa: E731
+    grid = OccupancyGrid.of_density(density_at, 16, radius, threshold=1.0, device=device)
+    origins, directions = rays(device, 300, 9)
+    samples = march_rays(origins, directions, grid, 0.02)
+    assert 0.2 < float(grid.occupied.float().mean()) < 0.9 and len(samples.t) > 3000
+    out = composite(*field(samples.positions(origins, directions), planes, heads, read), samples)
+    far = [v.double().requires_grad_() for v in leaves]
+    o, d, t, ray = (v.cpu() for v in (origins.double(), directions.double(), samples.t.double(), samples.ray.long()))
+    want = twin(samples, *field(o[ray] + t[:, None] * d[ray], *far, planes_read))
+    weight = [torch.rand(v.shape, generator=rng) for v in want[:2]]
+    loss = ref = 0.0
+    for got, truth, w in zip((out.color, out.opacity), want, weight):
+        torch.testing.assert_close(got.detach().cpu().double(), truth.detach(), rtol=1e-4, atol=1e-6)
+        loss, ref = loss + (got * w.to(device)).sum(), ref + (truth * w.double()).sum()
+    opacity = out.opacity.detach()
+    assert float(opacity.max()) > 0.9 and float(opacity.std()) > 0.1
+    for g, t in zip(torch.autograd.grad(loss, (planes, heads)), torch.autograd.grad(ref, far), strict=True):
+        assert share_within(g, t) >= 0.999
 
 
 def test_the_twin_has_the_gradients_of_finite_differences():
