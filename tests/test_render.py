@@ -166,42 +166,6 @@ def test_bad_input_is_named(device):
         sample_texture(asset.textures.orm, torch.tensor([[np.nan, 0.0]], dtype=torch.float32, device=device))
 
 
-def test_command_writes_views_layers_and_turntable(tmp_path, capsys):
-    from PIL import Image
-
-    from reli3d.cli.render import main
-    from reli3d.io.glb import write_glb
-
-    asset = ball(torch.device("cpu"), (0.9, 0.1, 0.1))
-    n = asset.mesh.normals
-    tangent = torch.linalg.cross(n.new_tensor([0.3, 0.5, 0.81]).expand_as(n), n)
-    tangent = torch.cat([torch.nn.functional.normalize(tangent, dim=-1), torch.ones(len(n), 1)], -1)
-    mesh = Mesh(asset.mesh.vertices, asset.mesh.faces, n, asset.mesh.uv, tangent)
-    write_glb(tmp_path / "ball.glb", Asset(mesh, asset.textures))
-    common = [str(tmp_path / "ball.glb"), "--output", str(tmp_path / "out"), "--size", "24", "--supersampling", "1"]
-    assert main([*common, "--aovs"]) == 0
-    picture = np.asarray(Image.open(tmp_path / "out" / "ball.png"))
-    assert picture.shape == (24, 24, 4) and picture[0, 0, 3] == 0 and picture[12, 12, 3] == 255
-    assert picture[12, 12, 0] > 2 * picture[12, 12, 1]  # red
-    assert (tmp_path / "out" / "ball_normal.exr").exists()
-    assert main([*common, "--frames", "3", "--turn", "light", "--format", "webp"]) == 0
-    assert Image.open(tmp_path / "out" / "ball.webp").n_frames >= 1  # equal frames of a uniform light are merged
-    assert main([*common, "--tone", "none"]) == 0
-    linear = np.asarray(Image.open(tmp_path / "out" / "ball.png")).astype(float)[12, 12, 0] / 255
-    encoded = picture[12, 12, 0] / 255
-    assert abs(((encoded + 0.055) / 1.055) ** 2.4 - linear) < 0.02  # of 0.6; 8 bits in a curve of slope up to 2
-    assert main([*common, "--paint", "published"]) == 0
-    changed = np.asarray(Image.open(tmp_path / "out" / "ball.png"))[..., :3].astype(int) - picture[..., :3]
-    assert changed.max() > 3 and changed.min() >= -1  # more light at the rim, the same noise
-    with pytest.raises(SystemExit) as stopped:
-        main([*common, "--paint", "white"])
-    assert stopped.value.code == 2
-    capsys.readouterr()
-    for wrong in (["--size", "0"], ["--elevation", "90"], ["--light", str(tmp_path / "none.hdr")]):
-        assert main([*common, *wrong]) == 2
-    assert "reli3d-render:" in capsys.readouterr().err
-
-
 def test_parts_shadow_each_other_and_keep_their_paint(device):
     floor = square(device)
     flat = floor.vertices[:, [0, 2, 1]] * torch.tensor([2.0, 1.0, -2.0], device=device)

@@ -40,7 +40,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--background", choices=("transparent", "environment"), default="transparent")
     p.add_argument("--tone", choices=("srgb", "agx", "none"), default="srgb",
                    help="display transform of png and webp; none writes linear values")  # fmt: skip
-    p.add_argument("--exposure", type=float, default=0.0, help="stops")
+    p.add_argument("--exposure", type=float, default=0.0, help="stops, of every format (not of AOVs), within 32")
     p.add_argument("--aovs", action="store_true", help="also EXR files of base colour, material (0, roughness, "
                    "metallic), normal (n / 2 + 1 / 2) and depth (depth, depth, alpha)")  # fmt: skip
     p.add_argument("--no-shadows", action="store_true")
@@ -67,9 +67,10 @@ def _check(args: argparse.Namespace) -> None:
             raise ValueError(f"--{name}: expected {low} to {high}, got {getattr(args, name)}")
     if not 1.0 <= args.fov <= 150.0:
         raise ValueError(f"--fov: expected 1 to 150 degrees, got {args.fov}")
-    if not abs(args.elevation) <= 89.0:
-        raise ValueError(f"--elevation: expected -89 to 89 degrees, got {args.elevation}")
-    if args.distance is not None and not args.distance > 0.0:
+    for name, limit in (("elevation", 89.0), ("azimuth", 3600.0), ("exposure", 32.0)):
+        if not abs(getattr(args, name)) <= limit:
+            raise ValueError(f"--{name}: expected {-limit:g} to {limit:g}, got {getattr(args, name)}")
+    if args.distance is not None and not 0.0 < args.distance < math.inf:
         raise ValueError(f"--distance: expected a positive length, got {args.distance}")
 
 
@@ -120,7 +121,7 @@ def render_files(args: argparse.Namespace) -> list[Path]:
         stem = args.output / (args.glb.stem if args.frames == 1 else f"{args.glb.stem}_{frame:04d}")
         if args.format == "exr":
             written.append(stem.with_name(stem.name + ".exr"))
-            write_exr(written[-1], image.radiance.cpu())
+            write_exr(written[-1], (image.radiance * 2.0**args.exposure).cpu())
         else:
             animation.append(_picture(image, args))
             if args.format == "png":
