@@ -65,7 +65,8 @@ class RayScene:
     def refit(self, vertices: Tensor) -> None:
         """Move the vertices, ``(V, 3)``, keeping the faces.
 
-        Warp refits its boxes, which traverse slower after large motion; Embree builds anew.
+        Warp refits its boxes, which traverse slower after large motion; Embree builds anew.  Raises as the constructor
+        does, and then leaves the scene as it was.
         """
         if vertices.shape != self.vertices.shape:
             raise ValueError(f"vertices: expected shape {tuple(self.vertices.shape)}, got {tuple(vertices.shape)}")
@@ -138,7 +139,7 @@ class RayScene:
         return torch.from_numpy(found)
 
     def _set_vertices(self, vertices: Tensor) -> None:
-        """Check and keep a copy; what does not pass leaves the scene as it was."""
+        """Keep a copy, once all checks have passed."""
         check("vertices", vertices, last=3, like=self.faces)
         if vertices.ndim != 2:
             raise ValueError(f"vertices: expected shape (V, 3), got {tuple(vertices.shape)}")
