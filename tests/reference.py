@@ -89,6 +89,69 @@ def eval_bsdf(wo: Tensor, wi: Tensor, base_color: Tensor, alpha: Tensor, metalli
     return left * (1.0 - metallic[..., None]) * base_color / torch.pi + fresnel * specular[..., None]
 
 
+def reflected_visible_normal(wo: Tensor, alpha: Tensor, u: Tensor, partner: bool) -> Tensor:
+    """``wo`` mirrored at a visible normal or at that turned by pi; below the horizon where the latter looks away."""
+    wm = sample_ggx_vndf(wo, alpha, u) * wo.new_tensor([-1.0, -1.0, 1.0] if partner else [1.0, 1.0, 1.0])
+    cos = (wo * wm).sum(-1, keepdim=True)
+    wi = 2.0 * cos * wm - wo
+    under = wi * wi.new_tensor([1.0, 1.0, -1.0]) * torch.where(wi[..., 2:] < 0.0, wi.new_tensor([1.0, 1.0, -1.0]), 1.0)
+    return torch.where((cos <= 0.0) & torch.tensor(partner), under, wi)
+
+
+def sg_ends(sharpness: Tensor) -> tuple[Tensor, Tensor]:
+    """Integrals over 2 pi of a lobe times the clamped cosine, its axis along the normal and against it."""
+    s, e = sharpness, torch.exp(-sharpness)
+    return (s - 1.0 + e) / s**2, e * (1.0 - e * (1.0 + s)) / s**2
+
+
+def sg_cosine_integral(sharpness: Tensor, cos: Tensor) -> Tensor:
+    """After Tokuyoshi et al. 2024, with the width that ``reli3d.kernels.sg`` fits."""
+    s = sharpness
+    t = torch.sqrt(0.5 * s * (s**2 + 2.978423 * s) / (s**2 + 3.05127513 * s + 14.27419507))
+    bell = (torch.exp(-(t**2)) - torch.exp(-((t * cos) ** 2))) / t
+    part = 0.5 * (cos * torch.erfc(-t * cos) + torch.erfc(t) - bell / torch.pi**0.5)
+    along, against = sg_ends(s)
+    return 2.0 * torch.pi * (against + (along - against) * part.clamp(0.0, 1.0))
+
+
+def sg_irradiance(normal: Tensor, axis: Tensor, sharpness: Tensor, amplitude: Tensor) -> Tensor:
+    """``(N, 3)`` at unit normals from K lobes."""
+    return sg_cosine_integral(sharpness, (normal @ axis.T).clamp(-1.0, 1.0)) @ amplitude
+
+
+# (1 + x)^-2 as a sum of weight exp(-rate x): GGX's slopes as a mixture of normals, fitted in reli3d.kernels.sg
+GGX_NORMALS = ((0.01271983, 0.08227587), (0.15480422, 0.41751521), (0.51788954, 1.38313102), (0.31433217, 3.80806021))
+
+
+def shade_gaussians(normal: Tensor, wo: Tensor, base_color: Tensor, alpha: Tensor, metallic: Tensor, axis: Tensor,
+                    sharpness: Tensor, amplitude: Tensor) -> Tensor:  # fmt: skip
+    """``(N, 3)``: Wang et al. 2009, section 4, for each of four lobes of normals and K of light, and the diffuse part
+    with one Fresnel factor, at the axis of the light's product with the cosine (a lobe of sharpness 2.133)."""
+    dot = lambda a, b: (a * b).sum(-1, keepdim=True)  # noqa: E731
+    n, o, base, alpha, metallic = (v[:, None] for v in (normal, wo, base_color, alpha[:, None], metallic[:, None]))
+    s = sharpness[:, None]  # everything (N, K, .) from here
+    f0 = 0.04 * (1.0 - metallic) + base * metallic
+    schlick = lambda p: f0 + (1.0 - f0) * (1.0 - dot(o, torch.nn.functional.normalize(o + p, dim=-1))) ** 5  # noqa: E731
+    middle = torch.nn.functional.normalize(axis * s + n * 2.133, dim=-1)
+    cos_l = dot(n, axis.expand(len(n), -1, -1)).clamp(-1.0, 1.0)
+    out = (1.0 - schlick(middle)) * base * (1.0 - metallic) / torch.pi * sg_cosine_integral(s, cos_l)
+    cos_o = dot(n, o).clamp(min=1e-6)
+    mirror = 2.0 * cos_o * n - o
+    root = lambda cos: torch.sqrt(alpha**2 + (1.0 - alpha**2) * cos**2)  # noqa: E731
+    for weight, rate in GGX_NORMALS:
+        own = 2.0 * rate / alpha**2
+        scale = weight / rate / (2.0 * torch.pi * sg_ends(own)[0])
+        warped = own / (4.0 * cos_o)
+        product = axis * s + mirror * warped
+        length = product.norm(dim=-1, keepdim=True)
+        p = product / length
+        cos_i = dot(n, p).clamp(min=0.0)
+        visibility = 0.5 / (cos_i * root(cos_o) + cos_o * root(cos_i))
+        peak = torch.exp(length - s - warped)
+        out = out + schlick(p) * scale * peak * sg_cosine_integral(length, dot(n, p)) * visibility
+    return (out * amplitude).sum(1)
+
+
 def sphere_grid(height: int) -> tuple[Tensor, Tensor]:
     """Midpoints ``(2 height^2, 3)`` in cos theta and phi about +y, and the solid angle of each."""
     y = (torch.arange(height, dtype=torch.float64) + 0.5) / height * 2 - 1

@@ -1,4 +1,7 @@
-"""Spherical Gaussians against quadrature over the sphere in float64, values and gradients, and fits of maps."""
+"""Spherical Gaussians against quadrature over the sphere in float64, and fits of maps.
+
+Slopes of irradiance and of shading are held against float64 twins in ``tests/test_adjoints.py``.
+"""
 
 import pytest
 import torch
@@ -74,17 +77,21 @@ def test_irradiance_and_gradients_match_quadrature(device):
         assert float((g - t).norm() / t.norm()) < 0.02  # slope of the fit: a few times its error of 0.2 %
 
 
-@pytest.mark.parametrize("sharpness", [0.02, 0.29, 0.31, 1.0, 10.0, 300.0])
+@pytest.mark.parametrize("sharpness", [0.02, 0.29, 0.49, 0.51, 1.0, 10.0, 300.0])
 def test_irradiance_is_exact_along_the_axis(device, sharpness):
-    s = torch.tensor([sharpness], dtype=torch.float64)
+    s = torch.tensor([sharpness], dtype=torch.float64, requires_grad=True)
     want = 2 * torch.pi * (s - 1 + torch.exp(-s)) / s**2, 2 * torch.pi * torch.exp(-s) * (
         1 - torch.exp(-s) * (1 + s)) / s**2  # fmt: skip
     axis = torch.tensor([[0.0, 0, 1]], device=device)
-    light = SphericalGaussians(axis, s.float().to(device), torch.ones(1, 3, device=device))
+    own = s.detach().float().to(device).requires_grad_()
+    light = SphericalGaussians(axis, own, torch.ones(1, 3, device=device))
     for sign, value in zip((1.0, -1.0), want, strict=True):
         got = light.irradiance(sign * axis)
         # float32, and at 300 the far side is 1e-131: 0
         torch.testing.assert_close(got.cpu().double(), value.expand(1, 3), rtol=2e-5, atol=1e-6)
+        slopes = torch.autograd.grad(got.sum() / 3.0, own), torch.autograd.grad(value, s, retain_graph=True)
+        # 1e-5 of the closed forms' cancellation and of the series' end; the slope of the far side at 10 is 1e-5
+        torch.testing.assert_close(slopes[0][0].cpu().double(), slopes[1][0], rtol=3e-5, atol=2e-8)
 
 
 def reflected(wo, base, alpha, metallic, axis, sharpness):
@@ -130,27 +137,6 @@ def shading_inputs(device, n=6, seed=3):
     return [t.to(device) for t in (normal, wo, base, 0.25 + 0.7 * rough[:, 0], 0.1 + 0.8 * metal[:, 0])]
 
 
-def test_shading_gradients_match_finite_differences(device):
-    """Along one random direction in every argument: float32 differences, so steps of 1e-2 and a per cent."""
-    own, rng = [*shading_inputs(device), *lobes(device, 7, 2.0, 40.0)], torch.Generator().manual_seed(4)
-    weight = torch.rand(6, 3, generator=rng).to(device)
-
-    def value(tensors):
-        return (shade_gaussians(*tensors[:5], SphericalGaussians(*tensors[5:])) * weight).sum()
-
-    asked = ask(own)
-    grads = torch.autograd.grad(value(asked), asked)
-    for k, g in enumerate(grads):
-        step = torch.randn(own[k].shape, generator=rng).to(device) * (own[k] if k == 6 else 1.0)
-        h, both = 4e-3, []
-        for sign in (1.0, -1.0):
-            moved = list(own)
-            moved[k] = own[k] + sign * h * step
-            both.append(float(value(moved)))
-        want, got = (both[0] - both[1]) / (2 * h), float((g * step).sum())
-        assert abs(got - want) < 0.02 * abs(want) + 0.02, k  # rounding of values of 10 over a step of 8e-3, curvature
-
-
 def test_gradients_stay_finite_at_the_edges(device):
     rng = torch.Generator().manual_seed(5)
     for k in range(30):
@@ -164,7 +150,7 @@ def test_gradients_stay_finite_at_the_edges(device):
         asked = ask([normal, wo, base, rough, metal, axis, sharpness, amplitude])
         out = shade_gaussians(*asked[:5], SphericalGaussians(*asked[5:]))
         grads = torch.autograd.grad(out.sum(), asked)
-        assert bool(torch.isfinite(out).all()) and float(out.min()) >= 0.0
+        assert bool(torch.isfinite(out).all()) and float(out.detach().min()) >= 0.0
         assert all(bool(torch.isfinite(g).all()) for g in grads), k
 
 

@@ -41,14 +41,6 @@ def test_gradients_match_the_plain_float64_formulation(device):
         torch.testing.assert_close(a.cpu().double(), b, rtol=1e-5, atol=1e-7 * float(b.abs().max()), msg=name)
 
 
-def test_the_float64_formulation_has_the_gradients_of_finite_differences():
-    level = F.pad(torch.randn(3, 4, 3, generator=torch.Generator().manual_seed(6)), (1,) * 6, value=0.7)
-    weights = random_weights(level.shape, 5, spread=0.5)
-    leaves = [v.double().requires_grad_() for v in (level, *(weights[k] for k in ("deformation", "alpha", "beta")))]
-    assert torch.autograd.gradcheck(lambda *x: reference_surface.flexicubes_vertices(*x, 1.6)[0], leaves, eps=1e-6,
-                                    atol=1e-5, rtol=1e-3, fast_mode=True)  # fmt: skip
-
-
 def test_layout_of_the_inputs_does_not_matter_and_gradients_stop_where_none_is_asked(device):
     level = torus(10, device)
     weights = random_weights(level.shape, 4, device)
