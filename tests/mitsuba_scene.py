@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import glob
+import math
 import os
 
 import numpy as np
 import pytest
 import torch
+
+from reli3d.render.asset import TextureSet
+from reli3d.render.color import srgb_to_linear
 
 
 def load():
@@ -42,12 +46,25 @@ def node_rows(radiance: torch.Tensor) -> torch.Tensor:
     return radiance[low] * (1 - part) + radiance[high] * part
 
 
-def material(mi, base_color, alpha, metallic, paint="conserving"):
-    """A Mitsuba BSDF that evaluates the metallic-roughness formula; sampled by cosine and visible normals."""
+def material(mi, base_color, alpha, metallic, paint="conserving", maps: TextureSet | None = None):
+    """A Mitsuba BSDF that evaluates the metallic-roughness formula; sampled by cosine and visible normals.
+
+    maps: in place of the numbers, looked up by Mitsuba's own ``bitmap``.
+    """
     import drjit as dr
 
-    base, alpha, metallic = mi.Color3f(*base_color), mi.Float(alpha), mi.Float(metallic)
-    dr.make_opaque(base, alpha, metallic)  # not literals: materials share a compiled kernel
+    numbers = mi.Color3f(*base_color), mi.Float(alpha), mi.Float(metallic)
+    dr.make_opaque(*numbers)  # not literals: materials share a compiled kernel
+    if maps is not None:
+        planes = srgb_to_linear(maps.base_color), maps.orm[..., 1:2], maps.orm[..., 2:]
+        bitmaps = [mi.Bitmap(np.ascontiguousarray(v.cpu().numpy(), np.float32)) for v in planes]
+        textures = [mi.load_dict({"type": "bitmap", "bitmap": b, "raw": True}) for b in bitmaps]
+
+    def values(si, active):
+        """Base colour, GGX width and metallic."""
+        if maps is None:
+            return numbers
+        return textures[0].eval(si, active), textures[1].eval_1(si, active) ** 2, textures[2].eval_1(si, active)
 
     class MetallicRoughness(mi.BSDF):
         def __init__(self, props):
@@ -62,6 +79,7 @@ def material(mi, base_color, alpha, metallic, paint="conserving"):
             return bs, dr.select(bs.pdf > 0, self.eval(ctx, si, bs.wo, active) / bs.pdf, 0)
 
         def draw(self, ctx, si, sample1, sample2, active):
+            _, alpha, _ = values(si, active)
             distribution = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, alpha, alpha)
             h, _ = distribution.sample(si.wi, sample2)
             cosine = mi.warp.square_to_cosine_hemisphere(sample2)
@@ -75,6 +93,7 @@ def material(mi, base_color, alpha, metallic, paint="conserving"):
 
         def eval(self, ctx, si, wo, active):
             i, o = si.wi, wo
+            base, alpha, metallic = values(si, active)
             distribution = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, alpha, alpha)
             h = dr.normalize(i + o)
             d = distribution.eval(h)  # Mitsuba's own density and masking; G2 from the two G1 is height-correlated Smith
@@ -89,7 +108,8 @@ def material(mi, base_color, alpha, metallic, paint="conserving"):
             return dr.select((i.z > 0) & (o.z > 0), value * o.z, 0)
 
         def pdf(self, ctx, si, wo, active):
-            distribution = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, dr.detach(alpha), dr.detach(alpha))
+            alpha = dr.detach(values(si, active)[1])
+            distribution = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, alpha, alpha)
             h = dr.normalize(si.wi + wo)
             lobe = distribution.pdf(si.wi, h) / (4 * dr.dot(si.wi, h))
             both = 0.5 * mi.warp.square_to_cosine_hemisphere_pdf(wo) + 0.5 * lobe
@@ -105,16 +125,35 @@ def material(mi, base_color, alpha, metallic, paint="conserving"):
     return {"type": "reli3d_metallic_roughness"}
 
 
-def smooth_mesh(mi, vertices: torch.Tensor, faces: torch.Tensor, normals: torch.Tensor, bsdf: dict):
-    """A mesh with vertex normals and the material."""
+def smooth_mesh(mi, vertices: torch.Tensor, faces: torch.Tensor, normals: torch.Tensor, bsdf: dict, uv=None):
+    """A mesh with vertex normals and the material; uv: ``(V, 2)``, v down, or None."""
     props = mi.Properties()
     props["bsdf"] = mi.load_dict(bsdf)
-    mesh = mi.Mesh("mesh", len(vertices), len(faces), has_vertex_normals=True, props=props)
+    mesh = mi.Mesh("mesh", len(vertices), len(faces), props=props, has_vertex_normals=True,
+                   has_vertex_texcoords=uv is not None)  # fmt: skip
     params = mi.traverse(mesh)
     params["vertex_positions"], params["faces"] = vertices.numpy().ravel(), faces.numpy().ravel().astype(np.uint32)
     params["vertex_normals"] = normals.numpy().ravel()
+    if uv is not None:
+        params["vertex_texcoords"] = uv.numpy().ravel()
     params.update()
     return mesh
+
+
+def sensor(mi, eye, target, fov_x: float, width: int, height: int):
+    """``perspective`` with +Y up and a box filter; fov_x in radians."""
+    film = {"type": "hdrfilm", "width": width, "height": height, "pixel_format": "rgba", "rfilter": {"type": "box"}}
+    pose = mi.ScalarTransform4f().look_at(origin=list(eye), target=list(target), up=[0, 1, 0])
+    return mi.load_dict({"type": "perspective", "fov": math.degrees(fov_x), "to_world": pose, "film": film})
+
+
+def rays_through_pixel_centres(mi, sensor):
+    """The sensor's own rays, row by row from the top: origins and directions ``(H W, 3)``."""
+    width, height = (int(v) for v in sensor.film().size())
+    y, x = np.meshgrid((np.arange(height) + 0.5) / height, (np.arange(width) + 0.5) / width, indexing="ij")
+    place = mi.Point2f(x.ravel().astype(np.float32), y.ravel().astype(np.float32))
+    ray, _ = sensor.sample_ray(0.0, 0.5, place, mi.Point2f(0.5))
+    return tuple(torch.from_numpy(np.array(v).T.copy()) for v in (ray.o, ray.d))
 
 
 def radiance(mi, scene, origins: torch.Tensor, directions: torch.Tensor, samples: int, passes: int):

@@ -1,15 +1,22 @@
 """Images and gradients of the estimator against Mitsuba 3: same mesh, rays, formula and map, all else its own."""
 
+from dataclasses import replace
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
 import trimesh
 from scipy.special import erfc
 
+from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene
+from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.camera import Camera, camera_rays, look_at
+from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import hit_normals, interpolate
+from reli3d.render.render import render
 from reli3d.render.shading import SAMPLES, shade
 from tests import mitsuba_scene
 
@@ -37,15 +44,16 @@ def ball_in_ring():
 class Stage:
     """A mesh that shadows itself, and the primary hits of one camera that both sides share."""
 
-    def __init__(self, size, mesh=None):
+    def __init__(self, size, mesh=None, device="cpu", backend="auto"):
+        """backend: of our shadows; on ``device``, where only ``shade`` computes."""
         mesh = ball_in_ring() if mesh is None else mesh
         self.vertices, self.faces = torch.tensor(mesh.vertices).float(), torch.tensor(mesh.faces).int()
         self.normals = torch.tensor(np.array(mesh.vertex_normals)).float()
         pose = look_at(torch.tensor([1.2, 1.6, 1.9]), torch.zeros(3), torch.tensor([0.0, 1, 0]))
         camera = Camera.from_fov(pose, 0.6, size, size)
         origins, directions = (v.reshape(-1, 3).contiguous() for v in camera_rays(camera))
-        self.scene = RayScene(self.vertices, self.faces)
-        hits = self.scene.closest(origins, directions)
+        self.device, self.scene = device, RayScene(self.vertices.to(device), self.faces.to(device), backend)
+        hits = RayScene(self.vertices, self.faces).closest(origins, directions)
         normal = interpolate(self.normals, self.faces, hits.face, hits.bary)
         normal = torch.nn.functional.normalize(normal, dim=-1)
         # Mitsuba bends no normals
@@ -62,22 +70,30 @@ class Stage:
 
     def shade(self, base, roughness, metallic, environment, seed):
         n = len(self.position)
-        return shade(self.position, self.normal, self.ng, -self.directions, base.expand(n, 3), roughness.expand(n),
-                     torch.full((n,), metallic), environment, scene=self.scene, seed=seed)  # fmt: skip
+        values = (self.position, self.normal, self.ng, -self.directions, base.expand(n, 3), roughness.expand(n),
+                  torch.full((n,), metallic))  # fmt: skip
+        light = Environment(environment.radiance.to(self.device))
+        return shade(*(v.to(self.device) for v in values), light, scene=self.scene, seed=seed).cpu()
 
 
 @pytest.mark.parametrize("material", MATERIALS)
 @pytest.mark.parametrize("sky", ["constant", "sky", "sun"])
-def test_image_with_shadows_equals_mitsubas(material, sky):
-    compare_image(material, sky, Stage(48))
+def test_image_with_shadows_equals_mitsubas(device, material, sky):
+    compare_image(material, sky, Stage(48, device=device))
+
+
+@pytest.mark.parametrize("material, sky", [("diffuse", "sun"), ("glossy", "sky")])
+def test_image_with_warps_shadows_equals_mitsubas(device, material, sky):
+    """The fused kernel, which asks for shadows inside; Embree's are asked for between two kernels."""
+    compare_image(material, sky, Stage(48, device=device, backend="warp"))
 
 
 @pytest.mark.parametrize("material", MATERIALS)
-def test_image_of_a_cow_equals_mitsubas(material, shared_data):
+def test_image_of_a_cow_equals_mitsubas(device, material, shared_data):
     cow = trimesh.load(shared_data / "classic" / "spot" / "spot.obj", process=False)
     cow = trimesh.Trimesh(cow.vertices, cow.faces)  # without uv: vertices of the same place become one
     cow.apply_translation(-cow.bounds.mean(0))
-    compare_image(material, "sky", Stage(48, cow))
+    compare_image(material, "sky", Stage(48, cow, device))
 
 
 BUDGET = 2_000_000  # light samples of our image; Mitsuba's own image tests spend as many
@@ -95,34 +111,125 @@ def rejected(got, want, variance, samples):
 
 
 def compare_image(material, sky, stage):
-    """The z-test of Mitsuba's ``test_renders.py``, against eight times as many samples of Mitsuba's; and the mean."""
+    """The z-test of Mitsuba's ``test_renders.py``, against at least eight times as many samples of Mitsuba's."""
     mi = mitsuba_scene.load()
     (alpha, metallic), environment = MATERIALS[material], light(sky)
     world = stage.world(mi, environment, mitsuba_scene.material(mi, BASE, alpha, metallic))
-    pixels = len(stage.position)
-    count = -(-BUDGET // (pixels * sum(SAMPLES)))
-    draws, passes = 64, count * 4  # a sample of its path draws one direction by the light and one by the material
+    count = runs_for(len(stage.position))
+    draws, passes = 64, count * (16 if sky == "sun" else 4)  # its own noise counts where few samples find the sun
     want, variance = mitsuba_scene.radiance(mi, world, stage.origins, stage.directions, draws, passes)
-    variance = 2.0 * variance  # of one drawn direction
     base, rough = torch.tensor(BASE), torch.tensor(alpha**0.5)
     runs = torch.stack([stage.shade(base, rough, metallic, environment, k) for k in range(count)]).double().numpy()
-    got, spp = runs.mean(0), count * sum(SAMPLES)
-    assert 1.0 - rejected(got, want, variance, spp).mean() >= ACCEPT
-    own = runs.mean((1, 2)).var(ddof=1) / count
-    sigma = np.sqrt(own + variance.sum() / (2 * draws * passes) / got.size**2)
+    compare(runs, want, 2.0 * variance, 2 * draws * passes)
+
+
+def runs_for(rays):
+    """How often ``rays`` points are shaded to spend the budget."""
+    return -(-BUDGET // (rays * sum(SAMPLES)))
+
+
+def compare(runs, want, variance, theirs):
+    """The z-test of pixels ``(P, 3)``; one of all of them with the noise of both sides; and one of their mean.  In the
+    last two an error of 2 % must show: of every pixel, and up and down in turn, so that the mean stays.
+
+    runs: ``(K, P, 3)``.  variance: of one drawn direction of the reference, which is the mean of ``theirs``; a sample
+    of Mitsuba's path draws two, one by the light and one by the material.
+    """
+    got = runs.mean(0)
+    assert 1.0 - rejected(got, want, variance, len(runs) * sum(SAMPLES)).mean() >= ACCEPT
+    own = runs.mean((1, 2)).var(ddof=1) / len(runs)
+    sigma = np.sqrt(own + variance.sum() / theirs / got.size**2)
+    stripes = 1.0 + 0.02 * np.where(np.arange(len(got)) % 2, 1.0, -1.0)[:, None]
+    error = np.sqrt(runs.var(0, ddof=1) / len(runs) + variance / theirs)
+    square = lambda v: (((v - want) / error) ** 2).mean() * (len(runs) - 3) / (len(runs) - 1)  # noqa: E731
+    # the square of Student's t with K - 1 degrees is (K - 1) / (K - 3) in the mean; measured 0.93 to 1.04, stripes 1.24
+    assert square(got) < 1.15 < square(got * stripes)
     assert abs(got.mean() - want.mean()) < 3.0 * sigma
     assert sigma < 0.005 * want.mean()  # so that the mean tells 1.5 % from none; measured 0.03 to 0.25 %
+    assert min(abs(k * got.mean() - want.mean()) for k in (0.98, 1.02)) > 3.0 * sigma
+
+
+def mapped_ball_in_ring():
+    """With maps of 8 texels a side that differ in every channel; their picture lies flat in x and -y."""
+    mesh = ball_in_ring()
+    vertices, faces = torch.tensor(mesh.vertices).float(), torch.tensor(mesh.faces).int()
+    normals = torch.tensor(np.array(mesh.vertex_normals)).float()
+    uv = vertices[:, :2] * torch.tensor([0.5, -0.5]) + 0.5
+    g = torch.Generator().manual_seed(12)
+    base, orm = 0.1 + 0.8 * torch.rand(8, 8, 3, generator=g), torch.rand(8, 8, 3, generator=g)
+    orm[..., 1] = 0.3 + 0.7 * orm[..., 1]
+    flat = torch.tensor([0.5, 0.5, 1.0]).expand(8, 8, 3).contiguous()
+    return Asset(Mesh(vertices, faces, normals, uv), TextureSet(linear_to_srgb(base), orm, flat))
+
+
+def test_render_equals_mitsubas_sensor_textures_and_light(device):
+    """All of ``render``: camera, rows of the image, subpixels, what is hit, maps, shadows; seen by Mitsuba's own
+    ``perspective``, whose rays through the same subpixels give the reference, and whose film the coverage."""
+    mi = mitsuba_scene.load()
+    asset, environment, (width, height, fine, fov) = mapped_ball_in_ring(), light("sky"), (40, 32, 2, 0.75)
+    eye, target = (1.2, 1.6, 1.9), (0.1, -0.1, 0.05)
+    bsdf, m = mitsuba_scene.material(mi, BASE, 0.0, 0.0, maps=asset.textures), asset.mesh
+    mesh = mitsuba_scene.smooth_mesh(mi, m.vertices, m.faces, m.normals, bsdf, m.uv)
+    world = mi.load_dict({"type": "scene", "light": mitsuba_scene.environment(mi, environment.radiance), "mesh": mesh})
+    sensor = mitsuba_scene.sensor(mi, eye, target, fov, fine * width, fine * height)
+    origins, directions = mitsuba_scene.rays_through_pixel_centres(mi, sensor)
+    si = world.ray_intersect(mi.Ray3f(*(mi.Vector3f(v.numpy().T) for v in (origins, directions))))
+    hit, cos = np.array(si.is_valid()), np.array(si.wi.z)
+    count = runs_for(hit.sum())
+    draws, passes = 64, 4 * count
+    values = np.zeros((2, len(hit), 3))
+    index = np.nonzero(hit)[0]
+    values[:, index] = mitsuba_scene.radiance(mi, world, origins[index], directions[index], draws, passes)
+
+    def pixels(v):
+        """The subpixels of every pixel: ``(height, width, fine^2, C)``."""
+        return v.reshape(height, fine, width, fine, -1).swapaxes(1, 2).reshape(height, width, fine**2, -1)
+
+    bent = pixels(hit & (cos < 0.05)).any((2, 3))  # Mitsuba bends no normals
+    kept = pixels(hit).any((2, 3)) & ~bent
+    assert kept.sum() > 600
+    want, variance = (pixels(v)[kept].mean(1) for v in values)
+    variance = 2.0 * variance / fine**2  # as in compare_image; a pixel is the mean of its subpixels
+
+    sky = Environment(environment.radiance.to(device))
+    pose = look_at(*(torch.tensor(v, device=device) for v in (eye, target, (0.0, 1.0, 0.0))))
+    camera = Camera.from_fov(pose, fov, width, height)
+    asset = Asset(Mesh(*(getattr(m, k).to(device) for k in ("vertices", "faces", "normals", "uv"))),
+                  TextureSet(*(v.to(device) for v in vars(asset.textures).values())))  # fmt: skip
+
+    def runs(asset, camera):
+        images = (render(asset, camera, sky, supersampling=fine, seed=k).radiance for k in range(count))
+        return np.stack([v.cpu().double().numpy()[kept] for v in images])
+
+    compare(runs(asset, camera), want, variance, 2 * draws * passes)
+    samples = count * sum(SAMPLES)
+    aside = replace(camera, intrinsics=camera.intrinsics + torch.tensor([0.0, 0.0, 0.05, 0.0], device=device))
+    raw = replace(asset, textures=replace(asset.textures, base_color=srgb_to_linear(asset.textures.base_color)))
+    turned = replace(asset, textures=TextureSet(*(v.flip(0) for v in vars(asset.textures).values())))
+    for wrong in ((asset, aside), (raw, camera), (turned, camera)):  # what the z-test is there to see
+        assert rejected(runs(*wrong).mean(0), want, variance, samples).mean() > 4 * (1.0 - ACCEPT)  # measured 3 to 98 %
+
+    full = partial(render, asset, camera, sky, samples=(1, 0, 0), shadows=False)
+    off = full(supersampling=fine).alpha.cpu().numpy() - pixels(hit).mean((2, 3))
+    assert (off != 0.0).mean() < 2e-3  # rays that graze the outline; measured 0
+    film = mitsuba_scene.sensor(mi, eye, target, fov, width, height)
+    integrator = mi.load_dict({"type": "direct", "hide_emitters": True})
+    cover = np.array(mi.render(world, sensor=film, integrator=integrator, spp=4096))[..., 3]
+    off = np.abs(full(supersampling=8).alpha.cpu().numpy() - cover)
+    edge = (cover > 0) & (cover < 1)
+    # 8 subpixels a side place an edge to 1/16 of a pixel, Mitsuba's noise is 0.008 at most
+    assert edge.sum() > 100 and off.max() < 0.1 and off[edge].mean() < 0.02  # measured 0.04, 0.009
 
 
 @pytest.mark.parametrize("material", MATERIALS)
-def test_gradients_with_shadows_equal_mitsubas(material):
+def test_gradients_with_shadows_equal_mitsubas(device, material):
     """Base colour, GGX width and texels: means of 24 runs against means of 24 of Mitsuba's reverse mode."""
     import math
 
     mi = mitsuba_scene.load()
     import drjit as dr
 
-    (alpha, metallic), environment, stage, runs = MATERIALS[material], light("sky"), Stage(32), 24
+    (alpha, metallic), environment, stage, runs = MATERIALS[material], light("sky"), Stage(32, device=device), 24
     g = torch.Generator().manual_seed(8)
     weight = torch.rand(len(stage.position), 3, generator=g)
     probes = torch.randn(6, *environment.radiance.shape, generator=g)  # directions in the space of maps
