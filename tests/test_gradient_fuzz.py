@@ -5,11 +5,13 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from reli3d.geometry.rays import RayScene
+from reli3d.geometry.mesh import Mesh
+from reli3d.geometry.rays import Hits
 from reli3d.kernels.microfacet import ALPHA_MIN, COS_MIN
 from reli3d.kernels.shade import COS_VIEW_MIN
+from reli3d.render.asset import TextureSet
 from reli3d.render.environment import Environment
-from reli3d.render.gbuffer import evaluate_hits, hit_normals, interpolate
+from reli3d.render.gbuffer import evaluate_hits, hit_normals, interpolate, surface_points
 from reli3d.render.material import PAINTS, eval_bsdf, sample_bsdf
 from reli3d.render.sampling import random_pairs
 from reli3d.render.shading import shade
@@ -84,7 +86,7 @@ def test_gradients_of_the_material(device, paint):
         g = g.cpu()[keep].double()
         if k < 2:  # only the tangent part of a direction's gradient is defined
             g, t = (reference.across(v, twin[k]) for v in (g, t))
-        assert reference.share_within(g, t) >= (0.998 if k < 2 else 0.999), k
+        assert reference.share_within(g, t) >= 0.999, k
 
 
 def bent(normal, ng, wo):
@@ -203,30 +205,82 @@ def test_all_strategies_together_keep_their_gradients_finite(device, light, opti
     assert float(grads[4].abs().max()) > 0.0
 
 
-def test_hits_of_slivers_have_finite_gradients(device):
-    """A hundred thousand rays into triangles up to 1e-7 thin, and faces without area."""
-    rng = torch.Generator().manual_seed(6)
-    count = 400
-    corners = torch.rand(count, 3, 3, generator=rng) * 2.0 - 1.0
-    thin = 10.0 ** (-7.0 * torch.rand(count, 1, generator=rng))
-    along = torch.rand(count, 1, generator=rng)
+def slivers(g, count=400):
+    """Corners ``(count, 3, 3)`` of triangles up to 1e-7 thin; the first 60 have no area: two corners, or all, in one
+    place, or all in a line."""
+    corners = torch.rand(count, 3, 3, generator=g) * 2.0 - 1.0
+    thin = 10.0 ** (-7.0 * torch.rand(count, 1, generator=g))
+    along = torch.rand(count, 1, generator=g)
     corners[:, 2] = corners[:, 0].lerp(corners[:, 1], along).lerp(corners[:, 2], thin)
-    corners[:20, 2] = corners[:20, 1]  # no area
-    vertices = corners.reshape(-1, 3).to(device)
-    faces = torch.arange(3 * count, dtype=torch.int32, device=device).reshape(-1, 3)
-    aim = torch.randint(count, (N,), generator=rng)
-    bary = torch.rand(N, 3, generator=rng)
-    target = (corners[aim] * (bary / bary.sum(1, keepdim=True))[..., None]).sum(1).to(device)
-    o = (torch.rand(N, 3, generator=rng) * 6.0 - 3.0).to(device)
-    leaves = [v.requires_grad_() for v in (vertices, o, (target - o).contiguous())]
-    scene = RayScene(vertices, faces)
-    hits = scene.closest(leaves[1], leaves[2])
-    assert float((hits.face < 0).float().mean()) < 0.1 and len(hits.face.unique()) > 0.8 * count
+    corners[:20, 2] = corners[:20, 1]
+    corners[20:40] = corners[20:40, :1]
+    corners[40:60] = corners[40:60, :1] * torch.tensor([1.0, -3.0, 2.0])[:, None]
+    return corners
+
+
+def weighed(outs, seed=0):
+    """All components at random."""
+    g = torch.Generator().manual_seed(seed)
+    return sum((v * torch.randn(v.shape, generator=g).to(v.device)).sum() for v in outs)
+
+
+def test_hits_of_slivers_and_of_faces_without_area_have_finite_gradients(device):
+    """A hundred thousand rays at points of any face.  A ray query never gives faces without area: these hits are made
+    by hand.  There the evaluation keeps what it is given, and nothing has a slope."""
+    g = torch.Generator().manual_seed(6)
+    corners = slivers(g)
+    faces = torch.arange(corners.numel() // 3, dtype=torch.int32, device=device).reshape(-1, 3)
+    aim = torch.randint(len(corners), (N,), generator=g)
+    bary = torch.rand(N, 3, generator=g)
+    bary /= bary.sum(1, keepdim=True)
+    target = (corners[aim] * bary[..., None]).sum(1)
+    o = torch.rand(N, 3, generator=g) * 6.0 - 3.0
+    o[::7] = target[::7]  # from within the face
+    leaves = [v.to(device).requires_grad_() for v in (corners.reshape(-1, 3), o, target - o)]
+    hits = Hits(aim.int().to(device), torch.ones(N, device=device), bary[:, 1:].contiguous().to(device))
     again = evaluate_hits(leaves[0], faces, hits, leaves[1], leaves[2])
-    seen = hits.face >= 0
-    normal = hit_normals(leaves[0], faces, aim.int().to(device))  # of faces without area too
+    normal = hit_normals(leaves[0], faces, hits.face)
     place = interpolate(leaves[0], faces, hits.face, again.bary)
-    total = again.t[seen].sum() + again.bary.sum() + place.sum() + normal[:, 0].sum()
-    assert bool(torch.isfinite(total)) and all(
-        bool(torch.isfinite(g).all()) for g in torch.autograd.grad(total, leaves)
-    )
+    outs = (again.t, again.bary, place, normal)
+    assert all(bool(torch.isfinite(v).all()) for v in outs)
+    grads = torch.autograd.grad(weighed(outs), leaves, retain_graph=True)
+    assert all(bool(torch.isfinite(v).all()) and float(v.abs().max()) > 0.0 for v in grads)
+    flat = (aim < 40).to(device)  # exactly; in a line rounding leaves some of them an area
+    assert torch.equal(again.t[flat], hits.t[flat]) and torch.equal(again.bary[flat], hits.bary[flat])
+    assert not bool(normal[flat].any())
+    none = torch.autograd.grad(weighed(v[flat] for v in (again.t, again.bary, normal)), leaves)
+    assert not any(bool(v.any()) for v in none)
+
+
+def test_shaded_points_of_slivers_have_finite_gradients(device):
+    """The whole way from the arrays of a mesh and its textures to light, at a hundred thousand points: faces without
+    area in space or in uv, vertex normals that cancel or are 0, tangents along the normal, views from anywhere."""
+    g = torch.Generator().manual_seed(7)
+    corners = slivers(g).reshape(-1, 3)
+    count = len(corners)
+    normals, tangents = (normalize(torch.randn(count, 3, generator=g), dim=-1) for _ in range(2))
+    uv = torch.rand(count, 2, generator=g) * 4.0 - 2.0
+    for k, array in enumerate((normals, tangents, uv)):
+        array.view(-1, 3, array.shape[1])[60 + 20 * k : 80 + 20 * k] = 0.0
+    normals.view(-1, 3, 3)[120:140, 1:] = -normals.view(-1, 3, 3)[120:140, :1]
+    tangents[420:480] = normals[420:480]
+    maps = [torch.rand(16, 16, 3, generator=g) for _ in range(3)]
+    maps[1][:4], maps[1][4:8], maps[2][:4] = 0.0, 1.0, 0.5  # smooth, rough and metal; no normal
+    texels = torch.rand(8, 16, 3, generator=g) ** 3 * 2.0
+    face = torch.randint(count // 3, (N,), generator=g, dtype=torch.int32).to(device)
+    bary = torch.rand(N, 3, generator=g)
+    bary[::5, 0] = 0.0
+    bary = (bary / bary.sum(1, keepdim=True))[:, 1:].contiguous().to(device)
+    wo = normalize(torch.randn(N, 3, generator=g), dim=-1).to(device)
+    faces = torch.arange(count, dtype=torch.int32, device=device).reshape(-1, 3)
+    signed = torch.nn.functional.pad(tangents, (0, 1), value=1.0)
+    for own in (signed, None):
+        leaves = [v.to(device).requires_grad_() for v in (corners, normals, uv, *maps, texels)]
+        own = None if own is None else own.to(device).requires_grad_()
+        at = surface_points(Mesh(leaves[0], faces, leaves[1], leaves[2], own), TextureSet(*leaves[3:6]), face, bary)
+        out = shade(at.position, at.normal, at.ng, wo, at.base_color, at.roughness, at.metallic,
+                    Environment(leaves[6]), samples=(2, 4, 1))  # fmt: skip
+        leaves += [] if own is None else [own]
+        grads = torch.autograd.grad(weighed([*vars(at).values(), out]), leaves)
+        for k, v in enumerate((*vars(at).values(), out, *grads)):
+            assert bool(torch.isfinite(v).all()) and float(v.detach().abs().max()) > 0.0, k
