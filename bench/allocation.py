@@ -1,8 +1,11 @@
 """Planning the counts of direct light's strategies, and what it gains at equal time.
 
-``python -m bench.allocation`` renders the ball of ``bench.shading`` with shadows, 128 x 128, in 18 scenes, with 64
-samples a pixel by the plan's counts, by the published counts (visible normals in pairs) and by each strategy alone, and
-prints variance times time: CPU time of one thread, least of the runs; the plan's own is added to the plan's.
+``python -m bench.allocation [LIGHT ...]`` renders the ball of ``bench.shading`` with shadows, 128 x 128, in 18 scenes,
+with 64 samples a pixel by the plan's counts, by the published counts (visible normals in pairs) and by each strategy
+alone, and prints variance times time: CPU time of one thread, least of three images in turn; the plan's own is added to
+the plan's.  Variance is of 256 runs at 256 pixels, half of them drawn evenly and half where the image is bright, each
+counted for as many as it stands for; its 95 % interval is of a bootstrap over the runs.  Where a strategy's runs have
+missed the sun, a pixel has what the sun alone makes by quadrature, as in ``tests/test_allocation.py``.
 
 ``python -m bench.allocation MESH.glb LIGHT.hdr``: variance of an image of 256 x 256 by both kinds of plan over that by
 the published counts, of the radiance and of the picture (sRGB, mean brightness at 0.18).
@@ -11,6 +14,7 @@ the published counts, of the radiance and of the picture (sRGB, mean brightness 
 import math
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -19,7 +23,7 @@ from bench.shading import SAMPLES, geometry, view
 from reli3d.geometry.rays import RayScene
 from reli3d.io.glb import read_glb
 from reli3d.io.hdr import read_environment
-from reli3d.render.allocation import plan_samples
+from reli3d.render.allocation import _pilot_points, plan_samples
 from reli3d.render.asset import Asset
 from reli3d.render.camera import Camera, camera_rays, look_at
 from reli3d.render.color import linear_to_srgb
@@ -27,7 +31,8 @@ from reli3d.render.environment import Environment
 from reli3d.render.render import joined_scene, plan_render, render
 from reli3d.render.shading import shade
 
-RUNS = 3  # of 10 thousand pixels each
+RUNS = 256  # of a variance
+IMAGES = 3  # timed; and of a variance over all pixels of a picture
 SINGLE = (64, 0, 0), (0, 64, 0), (0, 0, 64)
 
 
@@ -74,40 +79,65 @@ def plan(device, size):
 CASES = {"plan": (plan, dict(size=128))}
 
 
-def study() -> None:
-    """Print the table; CPU."""
+def study(names: list[str]) -> None:
+    """Print the table for the lights of these names; CPU."""
     torch.set_num_threads(1)
-    device, say = torch.device("cpu"), sys.stdout.write
-    points = seen(device, 128)
-    for name, environment in lights(device).items():
+    device, points = torch.device("cpu"), seen(torch.device("cpu"), 128)
+    found = lights(device)
+    for name in names:
         for roughness in (0.05, 0.3, 1.0):
             for metallic in (0.0, 1.0):
-                surface = arguments(points, roughness, metallic)
-                planned, pilot = [], float("inf")
-                for _ in range(3):
-                    start = time.process_time()
-                    planned.append(plan_samples(*surface, environment, scene=points[3]))
-                    pilot = min(pilot, time.process_time() - start)
-                chosen = planned[0].samples
-                work = {chosen: [], SAMPLES: [], **{counts: [] for counts in SINGLE}}
-                spent = {counts: float("inf") for counts in work}
-                for seed in range(RUNS):
-                    for counts, images in work.items():
-                        start = time.process_time()
-                        images.append(shade(*surface, environment, samples=counts, scene=points[3], seed=seed,
-                                            antithetic=counts == SAMPLES))  # fmt: skip
-                        spent[counts] = min(spent[counts], time.process_time() - start)
-                variance = {c: float(torch.stack(v).double().var(0).sum(1).mean()) for c, v in work.items()}
-                cost = {c: variance[c] * spent[c] for c in work}
-                whole = 1.0 + pilot / spent[chosen]
-                best = min(SINGLE, key=cost.get)
-                over = [cost[chosen] / cost[c] for c in (SAMPLES, best)]
-                per = 1e9 / len(points[0]) / 64
-                say(f"{name} {roughness} {metallic}: {chosen} variance {variance[chosen]:.2e}, plan {1e3 * pilot:.0f} "
-                    f"ms, image {1e3 * spent[chosen]:.0f} ms; variance x time with and without the plan's: over the "
-                    f"published counts' {whole * over[0]:.2g} {over[0]:.2g}, over the best strategy's {best} "
-                    f"{whole * over[1]:.2g} {over[1]:.2g}; ns a sample "
-                    f"{[round(per * spent[c]) for c in (SAMPLES, *SINGLE)]}\n")  # fmt: skip
+                row = measured(arguments(points, roughness, metallic), found[name], points[3])
+                sys.stdout.write(f"{name} {roughness} {metallic}: {row}\n")
+                sys.stdout.flush()
+
+
+def measured(surface, environment, scene) -> str:
+    """Variance times time of one scene, as text."""
+    plans = [timed(lambda: plan_samples(*surface, environment, scene=scene)) for _ in range(IMAGES)]
+    pilot, chosen = min(t for t, _ in plans), plans[0][1].samples
+    spent = {counts: float("inf") for counts in (chosen, SAMPLES, *SINGLE)}
+    for seed in range(IMAGES):
+        for counts in spent:
+            options = {"samples": counts, "scene": scene, "seed": seed, "antithetic": counts == SAMPLES}
+            spent[counts] = min(spent[counts], timed(partial(shade, *surface, environment, **options))[0])
+    drawn = variances(surface, environment, scene, list(spent))
+    variance = {counts: float(v[0]) for counts, v in drawn.items()}
+    best = min(SINGLE, key=lambda c: variance[c] * spent[c])
+    text = f"{chosen} variance {variance[chosen]:.2e}, plan {1e3 * pilot:.0f} ms, image {1e3 * spent[chosen]:.0f} ms"
+    for what, other in (("published", SAMPLES), ("best strategy", best)):
+        ratio, whole = drawn[chosen] / drawn[other], (spent[chosen] + pilot) / spent[other]
+        low, high = (whole * ratio[1:].quantile(ratio.new_tensor([0.025, 0.975]))).tolist()
+        text += f"; variance x time over {what} {other} {whole * float(ratio[0]):.2g} ({low:.2g} to {high:.2g}), "
+        text += f"without the plan's {spent[chosen] / spent[other] * float(ratio[0]):.2g}"
+    return text + f"; ns a sample {[round(1e9 * spent[c] / len(surface[0]) / 64) for c in (SAMPLES, *SINGLE)]}"
+
+
+def variances(surface, environment, scene, choices) -> dict[tuple[int, int, int], torch.Tensor]:
+    """Variance of a pixel, mean over the image, and as 400 bootstraps over the runs see it: ``(401,)`` float64."""
+    from tests.test_allocation import runs_of, sun_part
+
+    rows, share = _pilot_points(list(surface), environment, scene, 1, "conserving")
+    some, found = [v[rows] for v in surface], {}
+    hidden = sun_part(some, environment) if bool(environment.radiance.max() > 10.0) else torch.zeros(len(rows), 3)
+    picks = torch.randint(RUNS, (400, RUNS), generator=torch.Generator().manual_seed(0))
+    weight = torch.zeros(400, RUNS, dtype=torch.float64).scatter_add_(1, picks, torch.ones(400, RUNS).double())
+    weight = torch.cat([torch.ones(1, RUNS).double(), weight]) / RUNS
+    for counts in choices:
+        runs = runs_of(some, environment, counts, runs=RUNS, scene=scene, antithetic=counts == SAMPLES)
+        runs = (runs - runs.mean(0)).flatten(1)
+        each = (weight @ runs.square() - (weight @ runs).square()).unflatten(1, (-1, 3)).sum(2) * (RUNS / (RUNS - 1))
+        if counts in SINGLE:
+            unseen = hidden[:, SINGLE.index(counts)]
+            each = torch.where(each[0] < 0.01 * unseen, unseen, each)
+        found[counts] = each @ share
+    return found
+
+
+def timed(step) -> tuple[float, object]:
+    start = time.process_time()
+    value = step()
+    return time.process_time() - start, value
 
 
 def images(glb: Path, light: Path) -> None:
@@ -122,7 +152,7 @@ def images(glb: Path, light: Path) -> None:
 
     def variances(samples, antithetic):
         runs = [render(parts, camera, environment, scene=scene, samples=samples, antithetic=antithetic, seed=seed)
-                for seed in range(RUNS)]  # fmt: skip
+                for seed in range(IMAGES)]  # fmt: skip
         radiance = torch.stack([r.radiance for r in runs])
         shown = linear_to_srgb(radiance * (0.18 / radiance[:, runs[0].alpha > 0.0].mean())).clamp(0.0, 1.0)
         return [float(v.double().var(0).mean()) for v in (radiance, shown)]
@@ -139,4 +169,6 @@ def images(glb: Path, light: Path) -> None:
 
 
 if __name__ == "__main__":
-    images(*map(Path, sys.argv[1:3])) if len(sys.argv) > 1 else study()
+    names = sys.argv[1:]
+    known = ["constant", "sky", "sun"]
+    study(names or known) if set(names) <= set(known) else images(*map(Path, names))

@@ -107,11 +107,11 @@ def test_the_plan_changes_no_mean(device, case):
 
 
 def sun_part(arguments, environment):
-    """What the sun's part of the sphere adds to the variance of each single strategy, by quadrature."""
+    """What the sun's part of the sphere adds to each point's variance by each single strategy, by quadrature."""
     d, _ = reference.sphere_grid(512)
     bright = reference.lookup_envmap(environment.radiance.double().cpu(), d).amax(1) > 10.0
     alone = torch.tensor(SINGLE, dtype=torch.float64)
-    return quadrature(arguments, environment, alone, inside=bright, height=512).mean(0)
+    return quadrature(arguments, environment, alone, inside=bright, height=512)
 
 
 def compare(case, points, device, runs=256):
@@ -126,7 +126,7 @@ def compare(case, points, device, runs=256):
     options = {"points": points, "antithetic": False, "runs": runs}
     mixed, *alone = (runs_of(arguments, env, c, **options).flatten(1).cpu() for c in (plan.samples, *SINGLE))
     own, *variance = (3.0 * float(v.var(0).mean()) for v in (mixed, *alone))  # the three channels' sum
-    hidden = sun_part(arguments, env).tolist() if name == "sun" else [0.0] * 3
+    hidden = sun_part(arguments, env).mean(0).tolist() if name == "sun" else [0.0] * 3
     true = [h if v < 0.01 * h else v for v, h in zip(variance, hidden)]
     best = true.index(min(true))
     ratio = own / true[best]
