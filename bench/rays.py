@@ -1,4 +1,4 @@
-"""Incoherent rays from within a closed mesh of 82 thousand triangles, beside one call of embreex.
+"""Incoherent rays from within a closed mesh of 82 thousand triangles, and a camera's, beside one call of embreex.
 
 ``python -m bench.rays`` prints how the time of a ray grows with rays and triangles, and where it goes.
 """
@@ -14,6 +14,7 @@ from embreex.rtcore_scene import EmbreeScene
 
 from bench.timing import time_steps
 from reli3d.geometry.rays import RayScene
+from reli3d.render.camera import Camera, camera_rays, look_at
 
 
 def inputs(n, subdivisions=6):
@@ -45,6 +46,31 @@ def embree_cast(device, n, query, subdivisions=6):
     return lambda: scene.run(origins, directions, query="OCCLUDED"), {"rays": n}
 
 
+def camera_inputs(size, subdivisions=6):
+    """``size^2`` rays of a camera in order of its rows, before the same mesh, which covers half of the picture."""
+    mesh = trimesh.creation.icosphere(subdivisions=subdivisions)
+    pose = look_at(torch.tensor([0.0, 0.5, 2.2]), torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))
+    origins, directions = (v.reshape(-1, 3).numpy() for v in camera_rays(Camera.from_fov(pose, 1.1, size, size)))
+    return mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32), origins.copy(), directions.copy()
+
+
+def primary(device, size):
+    """Closest hits of a camera's rays through :class:`RayScene`: coherent, as embreex likes them."""
+    vertices, faces, origins, directions = (torch.from_numpy(a).to(device) for a in camera_inputs(size))
+    scene = RayScene(vertices, faces)
+    return lambda: scene.closest(origins, directions), {"rays": size * size}
+
+
+def embree_primary(device, size):
+    """The same with embreex alone, one call on one thread; CPU only."""
+    if device.type != "cpu":
+        return None
+    vertices, faces, origins, directions = camera_inputs(size)
+    scene = EmbreeScene(robust=True)
+    TriangleMesh(scene, vertices, faces)
+    return lambda: scene.run(origins, directions, query="INTERSECT", output=True), {"rays": size * size}
+
+
 def invalid(device, n, value):
     """Closest hits where every second ray holds ``value``; Embree's verification allows 2.5 times the valid ones'."""
     vertices, faces, origins, directions = (torch.from_numpy(a).to(device) for a in inputs(n))
@@ -62,10 +88,11 @@ _N = 1 << 20
 CASES = {
     "closest": (cast, dict(n=_N, query="closest")),
     "occluded": (cast, dict(n=_N, query="occluded")),
+    "primary": (primary, dict(size=1024)),
     "nan": (invalid, dict(n=_N, value=float("nan"))),
     "infinity": (invalid, dict(n=_N, value=float("inf"))),
 }
-PEERS = {"closest": embree_cast, "occluded": embree_cast, "nan": valid, "infinity": valid}
+PEERS = {"closest": embree_cast, "occluded": embree_cast, "primary": embree_primary, "nan": valid, "infinity": valid}
 
 
 def study() -> None:

@@ -5,8 +5,9 @@ BSDF), primary rays included on both sides: the same amount of work, not the sam
 here: rays are given and radiance is returned.  With gradients both sides differentiate the sum of the image with
 respect to one base colour and all texels of the map.
 
-``python -m bench.shading`` prints what the cases do not: variance at equal samples and of one formula on both sides,
-hence the ratio at equal variance, memory a pixel, and how time grows with pixels, samples and triangles.
+``python -m bench.shading`` prints what the cases do not: variance of the image and of its gradients at equal samples
+and of one formula on both sides, with the ratio of times at equal variance; memory a pixel; how time grows with pixels,
+samples and triangles; and how near the fused kernel comes to what the device can do.
 """
 
 import glob
@@ -69,8 +70,8 @@ def direct(device, size, roughness, backward, samples=SAMPLES, subdivisions=6):
 
 
 def mitsuba_direct(device, size, roughness, backward, formula=None):
-    """The same image from Mitsuba; CPU only, None without LLVM 19 or newer.  formula: ``(mi)`` to a material's
-    dictionary instead of ``principled``."""
+    """The same image from Mitsuba; CPU only, None without LLVM 19 or newer.  formula: ``(mi, base colour)`` to a
+    material's dictionary instead of ``principled``."""
     found = sorted(glob.glob("/usr/lib/*/libLLVM-19.so*") + glob.glob("/usr/lib/*/libLLVM-2?.so*"))
     if device.type != "cpu" or not ("DRJIT_LIBLLVM_PATH" in os.environ or found):
         return None
@@ -89,7 +90,10 @@ def mitsuba_direct(device, size, roughness, backward, formula=None):
     params.update()
     principled = {"type": "principled", "base_color": {"type": "rgb", "value": [0.7, 0.4, 0.2]},
                   "roughness": roughness, "metallic": 0.0, "specular": 0.5}  # fmt: skip
-    mesh.set_bsdf(mi.load_dict(formula(mi) if formula else principled))
+    color = mi.Color3f(0.7, 0.4, 0.2)
+    if formula and backward:
+        dr.enable_grad(color)
+    mesh.set_bsdf(mi.load_dict(formula(mi, color) if formula else principled))
     bitmap = mi.Bitmap(sky(device).numpy())
     scene = mi.load_dict({"type": "scene", "mesh": mesh, "light": {"type": "envmap", "bitmap": bitmap},
                           "integrator": {"type": "direct", "emitter_samples": 32, "bsdf_samples": 32,
@@ -100,9 +104,11 @@ def mitsuba_direct(device, size, roughness, backward, formula=None):
     leaves = []
     if backward:
         params = mi.traverse(scene)
-        color_key = next(k for k in params.keys() if k.endswith("base_color.value"))  # noqa: SIM118  not a dict
-        leaves = [mi.Color3f(params[color_key]), mi.TensorXf(params["light.data"])]
-        for key, leaf in zip((color_key, "light.data"), leaves, strict=True):
+        leaves, keys = [color, mi.TensorXf(params["light.data"])], ["light.data"]
+        if not formula:
+            keys.insert(0, next(k for k in params.keys() if k.endswith("base_color.value")))  # noqa: SIM118  not a dict
+            leaves[0] = mi.Color3f(params[keys[0]])
+        for key, leaf in zip(keys, leaves[-len(keys) :], strict=True):
             dr.enable_grad(leaf)
             params[key] = leaf
         params.update()
@@ -149,24 +155,98 @@ CASES = {
 PEERS = {"direct": mitsuba_direct, "direct_grad": mitsuba_direct}
 
 
-def _own_formula(roughness, mi):
+def _own_formula(roughness, mi, base):
     """Our material as a Mitsuba one: variances are compared of one integrand."""
     from tests import mitsuba_scene
 
-    return mitsuba_scene.material(mi, (0.7, 0.4, 0.2), roughness**2, 0.0)
+    return mitsuba_scene.material(mi, base, roughness**2, 0.0)
+
+
+def _noise(runs) -> float:
+    """Sum of variances over the sum of squared means, of runs ``(R, ...)``."""
+    runs = np.stack(runs).astype(np.float64)
+    return float(runs.var(0, ddof=1).sum() / (runs.mean(0) ** 2).sum())
+
+
+def _folded(texels: np.ndarray) -> np.ndarray:
+    """Mitsuba keeps a column of the other end on either side of its map; their slopes belong to one texel."""
+    out = texels[:, 1:-1].copy()
+    out[:, -1] += texels[:, 0]
+    out[:, 0] += texels[:, -1]
+    return out
+
+
+def equal_variance(say) -> None:
+    """Print variances of 64 runs at 64 samples on either side, and times, ours by Mitsuba's, equal in either."""
+    device, size, runs = torch.device("cpu"), 64, 64
+    for roughness in (0.1, 0.4, 0.9):
+        formula, pairs = partial(_own_formula, roughness), {}
+        ours, theirs = (
+            direct(device, size, roughness, False)[0],
+            mitsuba_direct(device, size, roughness, False, formula)[0],
+        )
+        b = np.stack([np.array(theirs(k + 1)).T for k in range(runs)])
+        pairs["image"] = _noise([ours(k).numpy() for k in range(runs)]), _noise(b[:, b.mean((0, 2)) > 0.0])
+        ours, theirs = (
+            direct(device, size, roughness, True)[0],
+            mitsuba_direct(device, size, roughness, True, formula)[0],
+        )
+        a, b = ([step(k + 1) for k in range(runs)] for step in (ours, theirs))
+        pairs["base colour"] = _noise([g[0].numpy() for g in a]), _noise([np.array(g[0]).ravel() for g in b])
+        pairs["texels"] = _noise([g[1].numpy() for g in a]), _noise([_folded(np.array(g[1])) for g in b])
+        time = {}
+        for backward in (False, True):  # Mitsuba's own material: the other is traced by Python
+            steps = [f(device, 128, roughness, backward)[0] for f in (direct, mitsuba_direct)]
+            ours, theirs = time_steps(steps, device, seconds=2.0)
+            time[backward] = theirs.median / ours.median
+        for what, (ours, theirs) in pairs.items():
+            faster = time[what != "image"]
+            say(f"roughness {roughness}, {what}: variance over squared mean, 64 samples: ours {ours:.3e}, Mitsuba "
+                f"{theirs:.3e}, {theirs / ours:.2f} times; time {faster:.2f} times less at equal samples, "
+                f"{faster * theirs / ours:.2f} at equal variance\n")  # fmt: skip
+
+
+# Floating-point operations of a sample above the horizon in ``reli3d.kernels.shade``, counted by hand from the source:
+# sums, products, quotients, roots, minima, roundings, one each; no integers (random numbers, table search), no choices.
+OPERATIONS = {
+    "direction and place on the map": 116,  # table 102, visible normal 123 (half of them mirrored), cosine 121; 20:40:4
+    "facet and GGX": 38,
+    "densities and weight": 21,
+    "light": 37,
+    "material": 89,
+    "value and sum": 14,
+}
+HIT_BYTES = 84  # seven inputs and a counter read, radiance written, once; tables and a small map stay in caches
+
+
+def floor(device, say) -> None:
+    """Print the fused kernel's share of what the device can do: its peaks are measured by torch in the same run.
+
+    Without shadow rays, whose traversal is not counted.  A sample below the horizon does less than is counted for it.
+    """
+    n, g = 1 << (14 if device.type == "cpu" else 19), torch.Generator().manual_seed(0)
+    normal = torch.nn.functional.normalize(torch.randn(n, 3, generator=g), dim=-1).to(device)
+    flat, environment = torch.full((n,), 0.4, device=device), Environment(sky(device))
+    square, block = torch.rand(2048, 2048, generator=g).to(device), torch.zeros(1 << 26, device=device)
+    into = torch.empty_like(block)
+    steps = [lambda: shade(normal, normal, normal, normal, normal.abs(), flat, flat, environment),
+             lambda: square @ square, lambda: into.copy_(block)]  # fmt: skip
+    kernel, product, copy = (t.median for t in time_steps(steps, device, seconds=2.0))
+    rate, width = 2 * 2048**3 / product, 2 * 4 * block.numel() / copy
+    count = sum(OPERATIONS.values())
+    took, least, read = (1e9 * v for v in (kernel / (n * 64), count / rate, HIT_BYTES / 64 / width))
+    say(f"fused kernel on {device.type}, 64 samples, no shadows: {took:.3g} ns a sample, {count / took:.3g} GFLOP/s; "
+        f"floor {least:.3g} ns by {count} operations at {rate / 1e9:.0f} GFLOP/s (float32 matrix product), "
+        f"{read:.3g} ns by {HIT_BYTES / 64:.1f} bytes at {width / 1e9:.0f} GB/s (copy): "
+        f"{max(least, read) / took:.1%} of it\n")  # fmt: skip
 
 
 def study() -> None:
-    """Print variance, memory and growth; CPU."""
-    device, size, say = torch.device("cpu"), 64, sys.stdout.write
-    for roughness in (0.1, 0.4, 0.9):
-        ours, _ = direct(device, size, roughness, False)
-        theirs, _ = mitsuba_direct(device, size, roughness, False, partial(_own_formula, roughness))
-        a = np.stack([ours(k).numpy() for k in range(32)])
-        b = np.stack([np.array(theirs(k + 1)).T for k in range(32)])
-        b = b[:, b.mean((0, 2)) > 0.0]
-        ours, theirs = (v.var(0, ddof=1).mean() / v.mean() ** 2 for v in (a, b))
-        say(f"roughness {roughness}: variance over squared mean, 64 samples: ours {ours:.3e}, Mitsuba {theirs:.3e}\n")
+    """Print the floor, variance, memory and growth; all but the floor on CPU."""
+    device, say = torch.device("cpu"), sys.stdout.write
+    for kind in ["cpu"] + ["cuda"] * torch.cuda.is_available():
+        floor(torch.device(kind), say)
+    equal_variance(say)
     base = dict(size=128, roughness=0.4, backward=False)
     changes = [{}, {"size": 256}, {"size": 512}, {"samples": (5, 10, 1)}, {"samples": (80, 160, 16)}]
     changes += [{"subdivisions": 4}, {"subdivisions": 7}, {"backward": True}, {"backward": True, "size": 256}]
