@@ -10,7 +10,7 @@ import pytest
 pytestmark = pytest.mark.slow  # all kernels compile again: two minutes a mode
 
 ROOT = Path(__file__).parents[1]
-# each runs the table of operations, which launches every kernel but three (tests/test_ops.py)
+# each runs the table of operations, which launches every kernel but two (tests/test_ops.py)
 TABLE = "tests/test_ops.py -q -x -p no:cacheprovider -k"
 SELECTED = "strides or left_out"
 MODES = {
