@@ -119,9 +119,8 @@ def test_an_edit_in_place_is_an_error_or_harmless(device, name):
             continue
         for a, other in zip(got, case.grads, strict=True):
             torch.testing.assert_close(a, truth[other], rtol=1e-5, atol=1e-6 * float(truth[other].abs().max()))
-    assert (
-        refused or case.second == case.grads or name == "taubin_smooth"
-    )  # plain torch may keep copies of what it needs
+    # plain torch may keep copies of what it needs
+    assert refused or case.second == case.grads or name == "taubin_smooth"
 
 
 @pytest.mark.parametrize("name", CASES)
