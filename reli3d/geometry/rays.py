@@ -21,7 +21,7 @@ BACKENDS = ("auto", "embree", "warp")
 LENGTHEN = 2.0**100  # exact in float32, and brings a length of 2^-149 to 2^-50 near 1
 EMBREE_HIT = (("primID", wp.int32), ("tfar", wp.float32), ("u", wp.float32), ("v", wp.float32))
 SLICE_RAYS = 8192  # fewest of an Embree slice, and of one whose rays are ordered: below it costs more than it gains
-THREAD_SLICES = 4  # of a large call for each thread: the more rays are ordered together, the closer are neighbours
+THREAD_SLICES = 2  # of a large call for each thread: the more rays are ordered together, the closer are neighbours
 
 
 @dataclass(frozen=True)
