@@ -30,7 +30,7 @@ def eval_lobe(axis: wp.vec3, sharpness: float, direction: wp.vec3) -> float:
 
 @wp.func
 def cosine_integral_ends(sharpness: float) -> wp.vec2:
-    """Integrals of a lobe times the clamped cosine, its axis along the normal and against it, over 2 pi."""
+    """Integrals of a lobe times the clamped cosine, its axis along the normal and against it, over 2 pi / sharpness."""
     s = sharpness
     e = wp.exp(-s)
     # sums over k from 2 to 8 of (-x)^(k - 2) / k! and of (k - 1) (-x)^(k - 2) / k!
@@ -41,10 +41,24 @@ def cosine_integral_ends(sharpness: float) -> wp.vec2:
     against = 1.0 / 2.0 - x * (
         1.0 / 3.0 - x * (1.0 / 8.0 - x * (1.0 / 30.0 - x * (1.0 / 144.0 - x * (1.0 / 840.0 - x / 5760.0))))
     )
+    along = along * x
+    against = against * x
     if s > SERIES:
-        along = (s - 1.0 + e) / (s * s)
-        against = (1.0 - e * (1.0 + s)) / (s * s)
+        along = 1.0 - (1.0 - e) / s
+        against = (1.0 - e) / s - e
     return wp.vec2(along, e * against)
+
+
+@wp.func
+def cosine_share(sharpness: float, cos_axis: float) -> float:
+    """``cosine_integral`` over 2 pi / sharpness, from the smallest sharpness on: the cosine itself for narrow lobes."""
+    s = sharpness
+    c = wp.clamp(cos_axis, -1.0, 1.0)
+    t = wp.sqrt(0.5 * s * (s * s + 2.978423 * s) / (s * s + 3.05127513 * s + 14.27419507))
+    bell = wp.exp(-t * t) - wp.exp(-t * t * c * c)
+    part = 0.5 * (c * wp.erfc(-t * c) + wp.erfc(t)) - 0.28209479 * bell / t
+    ends = cosine_integral_ends(s)
+    return ends[1] + (ends[0] - ends[1]) * wp.clamp(part, 0.0, 1.0)
 
 
 @wp.func
@@ -56,12 +70,7 @@ def cosine_integral(sharpness: float, cos_axis: float) -> float:
     function; its width ``t`` is fitted here to quadrature over sharpness 0.05 to 3000.
     """
     s = wp.max(sharpness, SHARPNESS_MIN)
-    c = wp.clamp(cos_axis, -1.0, 1.0)
-    t = wp.sqrt(0.5 * s * (s * s + 2.978423 * s) / (s * s + 3.05127513 * s + 14.27419507))
-    bell = wp.exp(-t * t) - wp.exp(-t * t * c * c)
-    part = 0.5 * (c * wp.erfc(-t * c) + wp.erfc(t)) - 0.28209479 * bell / t
-    ends = cosine_integral_ends(s)
-    return 2.0 * PI * (ends[1] + (ends[0] - ends[1]) * wp.clamp(part, 0.0, 1.0))
+    return 2.0 * PI / s * cosine_share(s, cos_axis)
 
 
 @wp.func
@@ -73,25 +82,28 @@ def specular_lobe(
     Wang et al. 2009, All-Frequency Rendering of Dynamic, Spatially-Varying Reflectance, section 4: the microfacet lobe
     is warped to the mirror direction, its product with the light is again a lobe, and the smooth factors are taken at
     that lobe's axis.  The cosine is integrated with the product instead of taken there, so horizons stay smooth.
+    A narrow lobe's height goes with alpha^-2 and its area with alpha^2: sharpnesses are taken over the warped one's,
+    so that neither is there to lose the other's digits, in the slope least of all.
     """
     cos_o = wp.max(wp.dot(n, wo), COS_MIN)
     of_normals = 2.0 * rate / (alpha * alpha)
-    scale = weight / (rate * 2.0 * PI * cosine_integral_ends(of_normals)[0])  # projected integral: weight / rate
     warped = of_normals / (4.0 * cos_o)
+    ratio = sharpness / warped
     mirror = n * (2.0 * cos_o) - wo
-    v = axis * sharpness + mirror * warped
-    length = wp.max(wp.length(v), SHARPNESS_MIN)
+    v = axis * ratio + mirror
+    length = wp.max(wp.length(v), SHARPNESS_MIN / warped)  # of the product, over that of the warped lobe
     p = v / length
     chord = axis - mirror
-    # sharpness + warped - length, without its cancellation
-    drop = sharpness * warped * wp.dot(chord, chord) / (sharpness + warped + length)
+    drop = sharpness * wp.dot(chord, chord) / (ratio + 1.0 + length)  # sharpness + warped - that of the product
+    scale = weight / rate / cosine_integral_ends(of_normals)[0]  # the projected integral of normals: weight / rate
+    height = scale * 4.0 * cos_o / length * wp.exp(-drop)
     cos_i = wp.max(wp.dot(n, p), 0.0)
     h = wp.normalize(wo + p)
     a2 = alpha * alpha
     root_o = wp.sqrt(a2 + (1.0 - a2) * cos_o * cos_o)
     root_i = wp.sqrt(a2 + (1.0 - a2) * cos_i * cos_i)
     visibility = 0.5 / (cos_i * root_o + cos_o * root_i)
-    total = scale * wp.exp(-drop) * cosine_integral(length, wp.dot(n, p)) * visibility
+    total = height * cosine_share(length * warped, wp.dot(n, p)) * visibility
     return schlick(f0, wp.max(wp.dot(wo, h), 0.0)) * total
 
 
