@@ -225,28 +225,23 @@ def test_pairs_still_the_slope_in_the_normal_and_double_that_in_roughness(device
     assert 1.6 < pair[1] / alone[1] < 2.4  # measured 1.9 to 2.0; 20 draws instead of 40
 
 
-VARIANCE_FLOOR = 1e-4  # Mitsuba's: its image tests tell no pixel apart by less
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SKIES)
 @pytest.mark.parametrize("metallic", [0.0, 1.0])
 def test_pairs_as_shipped_are_less_noisy_than_as_many_independent_samples(device, name, metallic):
     """The published counts with pairs from rotated Halton points, in value and in slopes of the surface: measured
-    0.0001 to 0.60; a pair from independent numbers would be 1.0 to 2.2 in value and slope in roughness.  Slopes in
-    single texels, where neither pairs nor even points help, 0.28 to 1.31."""
+    0.0006 to 0.75, and 0.85 to 0.87 in value and base colour of metal of 0.05 (1.3 if pairs were mirrored in the tail
+    too); a pair from independent numbers would be 1.0 to 2.2 in value and slope in roughness.  Slopes in single
+    texels, where neither pairs nor even points help, 0.28 to 1.31."""
     env = light(name, device)
-    for roughness in (0.05, 0.3, 1.0):
+    for roughness in (0.05, 0.1, 0.3, 1.0):
         pairs, alone = (
             [variance(v) for v in (*spread(roughness, metallic, env, **o), texel_spread(roughness, metallic, env, **o))]
             for o in ({"points": "halton", "seed": 1}, {"antithetic": False, "seed": 2})
         )
         ratio = dict(zip(COLUMNS, (a / b for a, b in zip(pairs, alone)), strict=True))
         assert ratio.pop("texels") < 1.4, (roughness, ratio)
-        if (roughness, metallic) == (0.05, 1.0):  # 1e-5, and 1.3 times that: docs/renderer.md
-            assert max(pairs[0], alone[0], pairs[3], alone[3]) < VARIANCE_FLOOR
-            del ratio["value"], ratio["base colour"]
-        assert max(ratio.values()) < 0.8, (roughness, ratio)
+        assert max(ratio.values()) < (0.95 if (roughness, metallic) == (0.05, 1.0) else 0.8), (roughness, ratio)
 
 
 @pytest.mark.slow

@@ -7,15 +7,17 @@ import pytest
 import torch
 
 from reli3d.render.environment import Environment
-from reli3d.render.material import pdf_lobes, sample_bsdf
+from reli3d.render.material import eval_bsdf, pdf_lobes, sample_bsdf
 from reli3d.render.sampling import (
     halton,
+    partner_point,
     pdf_cosine,
     pdf_ggx_vndf,
     random_pairs,
     sample_cosine,
     sample_ggx_vndf,
 )
+from reli3d.render.shading import shade
 from tests import chi2, reference
 
 N = 1_000_000
@@ -74,6 +76,43 @@ def test_cosine_follows_its_density(device):
                        sample_cosine(uniform(9, device)))  # fmt: skip
     wo, wi, a = view(60, device), sample_cosine(uniform(1000, device)), torch.tensor(0.3, device=device)
     torch.testing.assert_close(pdf_lobes(wo, wi, a)[:, 2], pdf_cosine(wi), rtol=1e-6, atol=0)  # 1 / pi is rounded
+
+
+def test_partners_in_the_tail_stay_uniform_and_do_not_come_in_twos(device):
+    """The last 32nd of the 2^24 numbers is turned onto itself, by half; the rest stands."""
+    tail = 1.0 - torch.arange(1, 2**19 + 1, dtype=torch.float64) / 2**24
+    rest = torch.rand(1000, generator=torch.Generator().manual_seed(1)) * (31 / 32)
+    u = torch.cat([tail.float(), rest])
+    u = torch.stack([u.flip(0), u], -1).to(device)
+    got = partner_point(u)
+    assert torch.equal(got[:, 0], u[:, 0]) and torch.equal(got[2**19 :], u[2**19 :])
+    moved = got[: 2**19, 1].cpu().double()
+    assert torch.equal(moved.sort().values, tail.flip(0)) and bool(((moved - tail).abs() == 2**-6).all())
+
+
+@pytest.mark.parametrize("points", ["random", "halton"])
+def test_pairs_of_the_shader_are_those_of_the_samplers(device, points):
+    """One pair a point under even light: value over the sum of both densities, of which each is its own sample's."""
+    n, seed = 20_000, 3
+    g = torch.Generator().manual_seed(5)
+    up = torch.tensor([0.0, 0.0, 1.0], device=device).expand(n, 3)  # whose frame is the world
+    wo = torch.nn.functional.normalize(torch.rand(n, 3, generator=g) - torch.tensor([0.5, 0.5, -0.1]), dim=-1).to(
+        device
+    )
+    base, rough, metal = (torch.rand(n, *k, generator=g).to(device) for k in ((3,), (), ()))
+    u = random_pairs(n, seed=seed, sample=0, dimension=1, device=device)
+    if points == "halton":
+        u = (u + halton(1, device=device)) % 1.0
+    want = torch.zeros(n, 3, device=device)
+    for lobe in ("visible", "partner"):
+        wi = sample_bsdf(wo, rough**2, u, lobe)
+        density = pdf_lobes(wo, wi, rough**2)[:, :2].sum(1, keepdim=True)
+        want += torch.where(wi[:, 2:] > 1e-6, eval_bsdf(wo, wi, base, rough**2, metal) * wi[:, 2:] / density, 0.0)
+    env = Environment(torch.full((4, 8, 3), 0.7, device=device))
+    got = shade(up, up, up, wo, base, rough, metal, env, samples=(0, 2, 0), seed=seed, points=points)
+    assert int((u[:, 1] >= 31 / 32).sum()) > 500
+    # sharp lobes have few digits of the half vector
+    assert reference.share_within(got.cpu(), 0.7 * want.cpu()) > 0.999
 
 
 MIX = (20, 20, 20, 4)  # map, visible normals, their partners, cosine

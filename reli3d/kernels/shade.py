@@ -24,7 +24,7 @@ from reli3d.kernels.microfacet import (
 )
 from reli3d.kernels.mis import mis_factor
 from reli3d.kernels.random import random_pair, rotate_point
-from reli3d.kernels.sampling import mirror, reflect, sample_cosine
+from reli3d.kernels.sampling import mirror, partner_point, reflect, sample_cosine
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native " + INLINE})
 
@@ -139,16 +139,21 @@ def visible_normal(
 ) -> wp.vec3:
     """Microfacet normal of a sample of the visible normals, ``last`` for those of other strategies.
 
-    The second of an antithetic pair mirrors the first's, which is the ``last``: so all samples are asked in order.
+    The second of an antithetic pair mirrors the first's, which is the ``last``: so all samples are asked in order.  In
+    the tail of the lobe it mirrors another normal of the tail.
     """
     wm = last
     k = sample - plan.n_environment
     if k >= 0 and k < plan.n_visible:
-        if plan.antithetic != 0 and (k & 1) == 1:
-            wm = mirror(last)
-        else:
-            u = draw_pair(plan, points, surface.shift_visible, surface.pixel, k >> plan.antithetic, 1)
-            wm = sample_ggx_vndf(surface.stretched, surface.alpha, u)
+        second = plan.antithetic != 0 and (k & 1) == 1
+        u = draw_pair(plan, points, surface.shift_visible, surface.pixel, k >> plan.antithetic, 1)
+        own = u
+        if second:
+            own = partner_point(u)
+        if not second or own[1] != u[1]:
+            wm = sample_ggx_vndf(surface.stretched, surface.alpha, own)
+        if second:
+            wm = mirror(wm)
     return wm
 
 

@@ -62,8 +62,21 @@ def pdf_ggx_vndf(wo: Tensor, alpha: Tensor, wm: Tensor) -> Tensor:
     return pdf.reshape(batch)
 
 
+def partner_point(u: Tensor) -> Tensor:
+    """Numbers ``(..., 2)`` of the antithetic partners of samples drawn with ``u (..., 2)``.  No gradient.
+
+    ``u`` itself, but where its second is in the last 32nd (the lobe's tail) that moves half of the 32nd on, round to
+    its begin: rare samples far out do not come in twos.  Uniform if ``u`` is.
+    """
+    check("u", u, last=2)
+    flat = u.detach().reshape(-1, 2).contiguous()
+    out = empty((flat.shape[0],), wp.vec2, u.device)
+    launch(kernels.partner_point_kernel, flat.shape[0], [(flat, wp.vec2), (out, wp.vec2)], u.device)
+    return out.reshape(u.shape)
+
+
 def mirror(wm: Tensor) -> Tensor:
-    """Antithetic partner of microfacet normals ``(..., 3)``: turned by pi about the surface normal."""
+    """Microfacet normals ``(..., 3)`` turned by pi about the surface normal, as antithetic partners are."""
     check("wm", wm, last=3)
     return wm * wm.new_tensor([-1.0, -1.0, 1.0])
 
