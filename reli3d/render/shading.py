@@ -51,12 +51,12 @@ def shade(
     ``(N, 3)`` LINEAR.  roughness, metallic: ``(N,)`` in [0, 1].  A face seen from behind is shaded as its other side.
 
     samples: counts from the environment table, from visible normals and from the cosine; zero is allowed.  scene: mesh
-    that casts shadows, None for none.  antithetic: visible normals in pairs, the partner mirrored about the normal,
-    weighted with its own density.  heuristic: ``balance`` or ``power``.  points: ``halton`` (rotated per point and
-    strategy) or ``random``.  alpha: GGX width from roughness, ``squared`` or, as in the published model's shader,
-    ``linear``.  paint: what the coat leaves to the paint, ``conserving`` or ``published``, as in
-    :func:`reli3d.render.material.eval_bsdf`.  clamp: largest value of one sample times its strategy's count, per
-    channel.
+    that casts shadows, None for none.  antithetic: visible normals in pairs, the partner mirrored about the normal (in
+    the lobe's tail another one, mirrored: :func:`reli3d.render.sampling.partner_point`), weighted with its own density.
+    heuristic: ``balance`` or ``power``.  points: ``halton`` (rotated per point and strategy) or ``random``.  alpha: GGX
+    width from roughness, ``squared`` or, as in the published model's shader, ``linear``.  paint: what the coat leaves
+    to the paint, ``conserving`` or ``published``, as in :func:`reli3d.render.material.eval_bsdf`.  clamp: largest value
+    of one sample times its strategy's count, per channel.
 
     pixels: ``(N,)`` int32 counters of the random numbers, by default the row.
 
