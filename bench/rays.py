@@ -107,14 +107,15 @@ def study() -> None:
     n, torch_threads = 1 << 18, torch.get_num_threads()
     torch.set_num_threads(1)
     vertices, faces, origins, directions = inputs(n)
-    scene = RayScene(torch.from_numpy(vertices), torch.from_numpy(faces))
+    scene, peer = RayScene(torch.from_numpy(vertices), torch.from_numpy(faces)), EmbreeScene(robust=True)
+    TriangleMesh(peer, vertices, faces)
     o, d = torch.from_numpy(origins), torch.from_numpy(directions)
-    order = scene._order(o, d)[0]
-    sorted_o, sorted_d = np.take(origins, order, 0), np.take(directions, order, 0)
+    order = scene._order(o, d)
+    in_order = [torch.from_numpy(np.take(v, order, 0)) for v in (origins, directions)]
     parts = {
-        "one call of embreex": lambda: scene._embree.run(origins, directions, output=1),
+        "one call of embreex": lambda: peer.run(origins, directions, output=1),
         "ours, one thread": lambda: scene.closest(o, d),
-        "of it Embree on ordered rays": lambda: scene._embree.run(sorted_o, sorted_d, output=1),
+        "ours, rays that come in order": lambda: scene.closest(*in_order),
         "of it the order": lambda: scene._order(o, d),
         "of it rays into that order": lambda: (np.take(origins, order, 0), np.take(directions, order, 0)),
     }

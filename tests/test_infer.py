@@ -166,5 +166,5 @@ sys.stdout.write("; heavy " + " ".join(compiler))
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     shading = load_model("small").preset.shading_features  # without them nobody looks the light up by normal
-    expected = sorted({*infer.KERNELS, infer.SHADER["cpu"]} - (set() if shading else {"envmap"}))
+    expected = sorted({*infer.KERNELS, *infer.SHADER["cpu"]} - (set() if shading else {"envmap"}))
     assert done.stdout.splitlines()[-1] == f"loaded {' '.join(expected)}; heavy "

@@ -14,7 +14,7 @@ STARTED = time.monotonic()
 EXAMPLE = Path(__file__).parents[1] / "assets" / "example"
 KERNELS = ("hull", "cover", "view_features", "triplane", "flexicubes", "uv", "raster", "intersect", "attributes",
            "random", "envmap")  # modules of reli3d.kernels that one object needs  # fmt: skip
-SHADER = {"cpu": "shade_rays", "cuda": "shade"}  # and the shader's, whose shadow rays Embree traces or Warp
+SHADER = {"cpu": ("shade_rays", "embree"), "cuda": ("shade",)}  # and the shader's: Embree traces its rays, or Warp
 
 
 def parser() -> argparse.ArgumentParser:
@@ -242,7 +242,7 @@ def ready_kernels(device: str) -> None:
 
     from reli3d._bridge import compiled, load_modules
 
-    names = (*KERNELS, SHADER[torch.device(device).type])
+    names = (*KERNELS, *SHADER[torch.device(device).type])
     modules = [importlib.import_module(f"reli3d.kernels.{name}") for name in names]
     if not compiled(modules, torch.device(device)):
         print("compiling kernels (first run only)", file=sys.stderr)

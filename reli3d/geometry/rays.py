@@ -15,11 +15,11 @@ import warp as wp
 from torch import Tensor
 
 from reli3d._bridge import check, empty, launch, over_slices, stream
+from reli3d.geometry import embree
+from reli3d.kernels import embree as embree_kernels
 from reli3d.kernels import intersect as kernels
 
 BACKENDS = ("auto", "embree", "warp")
-LENGTHEN = 2.0**100  # exact in float32, and brings a length of 2^-149 to 2^-50 near 1
-EMBREE_HIT = (("primID", wp.int32), ("tfar", wp.float32), ("u", wp.float32), ("v", wp.float32))
 SLICE_RAYS = 8192  # fewest of an Embree slice, and of one whose rays are ordered: below it costs more than it gains
 THREAD_SLICES = 2  # of a large call for each thread: the more rays are ordered together, the closer are neighbours
 
@@ -88,7 +88,7 @@ class RayScene:
         face, t, bary = (empty((n,), kind, self.device) for kind in (wp.int32, wp.float32, wp.vec2))
         outs = [(face, wp.int32), (t, wp.float32), (bary, wp.vec2)]
         if self._embree is not None:
-            self._embree_closest(o, d, far, outs)
+            self._trace(embree_kernels.embree_closest_kernel, "rtcIntersect1", o, d, far, outs)
         elif self._warp is not None:
             args = [self._warp.id, (o, wp.vec3), (d, wp.vec3), (far, wp.float32), *outs]
             launch(kernels.closest_kernel, n, args, self.device)
@@ -101,7 +101,7 @@ class RayScene:
         shape, o, d, far = self._rays(origins, directions, t_max)
         out = torch.zeros(o.shape[0], dtype=torch.bool, device=self.device)
         if self._embree is not None:
-            self._embree_occluded(o, d, far, out)
+            self._trace(embree_kernels.embree_occluded_kernel, "rtcOccluded1", o, d, far, [(out, wp.bool)])
         elif self._warp is not None:
             args = [self._warp.id, (o, wp.vec3), (d, wp.vec3), (far, wp.float32), (out, wp.bool)]
             launch(kernels.occluded_kernel, o.shape[0], args, self.device)
@@ -110,33 +110,27 @@ class RayScene:
     def clear(self, origins: Tensor, directions: Tensor, t_max: Tensor) -> Tensor:
         """Whether nothing lies on a ray before its ``t_max``, ``(N,)`` bool; False where ``t_max`` is below 0.
 
-        For rays that a kernel has made, ``(N, 3)``, ``(N, 3)`` and ``(N,)`` on the device: values are not checked.
+        For rays that a kernel has made, ``(N, 3)``, ``(N, 3)`` and ``(N,)`` on the device, several in a row from about
+        one place: values are not checked.
         """
         if self._embree is None:
             return (t_max >= 0.0) & ~self.occluded(origins, directions, t_max=t_max)
-        out = torch.empty(len(origins), dtype=torch.bool)
-
-        def work(_, start, count):
-            part = slice(start, start + count)
-            out[part] = self.embree_blocked(origins[part], directions[part], t_max[part]) < 0
-
-        if len(origins):
-            over_slices(len(origins), work)
-        return out
+        left, group = t_max.clone(memory_format=torch.contiguous_format), embree_kernels.GROUP
+        args = [(origins.contiguous(), wp.vec3), (directions.contiguous(), wp.vec3), (left, wp.float32)]
+        args = [embree.query("rtcOccluded16"), self._embree.scene, *args]
+        launch(embree_kernels.embree_clear_kernel, -(-len(left) // group), args, self.device,
+               slice_min=SLICE_RAYS // group)  # fmt: skip
+        return left >= 0.0
 
     @property
     def mesh_id(self) -> int:
         """Handle of Warp's mesh for kernels that trace rays themselves; 0 without faces or with Embree."""
         return 0 if self._warp is None else self._warp.id
 
-    def embree_blocked(self, origins: Tensor, directions: Tensor, limit: Tensor) -> Tensor:
-        """Raw any-hit of prepared CPU rays, ``(N,)`` int32: -1 where free, 0 where blocked or ``limit`` < 0.
-
-        For callers that slice over threads themselves: nothing is checked, it runs in the calling thread and in the
-        given order (rays from a few points are near each other already: ordering them cost the shader 15 %).
-        """
-        found = self._embree.run(origins.numpy(), directions.numpy(), limit.numpy(), query="OCCLUDED")
-        return torch.from_numpy(found)
+    @property
+    def embree_scene(self) -> int:
+        """Handle of Embree's scene for kernels that trace rays themselves; 0 without faces or with Warp."""
+        return 0 if self._embree is None else self._embree.scene
 
     def _set_vertices(self, vertices: Tensor) -> None:
         """Keep a copy, once all checks have passed."""
@@ -169,13 +163,7 @@ class RayScene:
                     bvh_constructor="sah",  # Warp's own choice on CUDA is "lbvh"
                 )
             return
-        from embreex.mesh_construction import TriangleMesh
-        from embreex.rtcore_scene import EmbreeScene
-
-        self._embree = EmbreeScene(robust=True)
-        TriangleMesh(self._embree, self.vertices.numpy(), self.faces.numpy())
-        nothing = np.ones((1, 3), np.float32)
-        self._embree.run(nothing, nothing)  # builds the tree; later calls from several threads only read it
+        self._embree = embree.Tree(self.vertices.numpy(), self.faces.numpy())
 
     def _rays(self, origins, directions, t_max):
         check("origins", origins, last=3, like=self.faces)
@@ -191,83 +179,46 @@ class RayScene:
         far = far.reshape(1) if far.numel() == 1 else far.expand(shape).reshape(-1).contiguous()
         return shape, o, d, far
 
-    def _embree_closest(self, o, d, far, outs) -> None:
-        def store(part, order, limit, short, hit):
-            count = len(hit["primID"])
-            ins = [(torch.empty(0, dtype=torch.int64) if order is None else torch.from_numpy(order), wp.int64),
-                   (torch.empty(0) if limit is None else torch.from_numpy(limit), wp.float32)]  # fmt: skip
-            ins += [(torch.from_numpy(hit[name]), kind) for name, kind in EMBREE_HIT]
-            own = [(tensor[part], kind) for tensor, kind in outs]
-            launch(kernels.place_hits_kernel, count, [*ins, *own], o.device, slice_min=count)
-            if short is not None:
-                own[1][0][short] *= LENGTHEN
-
-        self._embree_slices(o, d, far, store, output=1)
-
-    def _embree_occluded(self, o, d, far, out) -> None:
-        def store(part, order, limit, short, found):
-            blocked = found >= 0
-            if limit is not None:
-                blocked &= limit >= 0.0
-            out[part].numpy()[slice(None) if order is None else order] = blocked
-
-        self._embree_slices(o, d, far, store, query="OCCLUDED")
-
-    def _embree_slices(self, o, d, far, store, **query) -> None:
-        """``store(part, order, limit, short, result)`` of Embree for every slice; its rays went there in ``order``."""
+    def _trace(self, kernel, query: str, o: Tensor, d: Tensor, far: Tensor, outs: list) -> None:
+        """Embree's ``query`` of all rays, those of a slice in the order that brings like rays together."""
+        address, n = embree.query(query), o.shape[0]
 
         def work(_, start, count):
             part = slice(start, start + count)
-            order, odd = self._order(o[part], d[part])
-            rays = [o[part], d[part]]
-            rays[1], limit, short = embree_rays(*rays, far if far.numel() == 1 else far[part], odd)
-            rays = [v.numpy() for v in rays]
-            if order is not None:  # np.take: indexing with the order takes 4 times as long
-                rays = [np.take(v, order, 0, mode="clip") for v in rays]
-                limit = None if limit is None else np.take(limit, order)
-            store(part, order, limit, short, self._embree.run(*rays, limit, **query))
+            rays, answers = [o[part], d[part], far if far.numel() == 1 else far[part]], [v[part] for v, _ in outs]
+            order, found = self._order(*rays[:2]), answers
+            if order is not None:  # numpy's take and its assignment: torch's take 4 times as long
+                rays = [v if len(v) == 1 else torch.from_numpy(np.take(v.numpy(), order, 0, mode="clip")) for v in rays]
+                found = [torch.empty_like(v) for v in answers]
+            args = [*zip(rays, (wp.vec3, wp.vec3, wp.float32)), *zip(found, (kind for _, kind in outs))]
+            launch(kernel, count, [address, self._embree.scene, *args], o.device, slice_min=count)
+            if order is not None:
+                for own, v in zip(answers, found, strict=True):
+                    _items(own)[order] = _items(v)
 
-        n = o.shape[0]
         if n:
             over_slices(n, work, slice_min=max(SLICE_RAYS, n // (THREAD_SLICES * torch.get_num_threads())))
 
-    def _order(self, o: Tensor, d: Tensor) -> tuple[np.ndarray | None, bool]:
-        """Permutation that brings like rays together, None where they are few or come in such an order already; and
-        whether a ray may be odd as :func:`embree_rays` means it.
+    def _order(self, o: Tensor, d: Tensor) -> np.ndarray | None:
+        """Permutation that brings like rays together, None where they are few or come in such an order already.
 
         Embree traces one ray after the other; neighbours that visit the same nodes find them in the cache.
         """
         n = o.shape[0]
-        if n < SLICE_RAYS:  # any NaN or infinity shows in the sums
-            plain = bool(torch.isfinite(o.sum() + d.sum())) and float(d.abs().amax(-1).min()) >= float(kernels.SHORT)
-            return None, not plain
-        key, odd = empty((n,), wp.int16, o.device), torch.zeros(1, dtype=torch.bool)
-        args = [(o, wp.vec3), (d, wp.vec3), *self._cells, (key, wp.int16), (odd, wp.bool)]
+        if n < SLICE_RAYS:
+            return None
+        key = empty((n,), wp.int16, o.device)
+        args = [(o, wp.vec3), (d, wp.vec3), *self._cells, (key, wp.int16)]
         launch(kernels.ray_key_kernel, n, args, o.device, slice_min=n)
         keys = key.numpy()
         if np.count_nonzero(keys[1:] != keys[:-1]) < 0.5 * n:
-            return None, bool(odd)
-        return np.argsort(keys, kind="stable"), bool(odd)  # a radix sort for 16 bits
+            return None
+        return np.argsort(keys, kind="stable")  # a radix sort for 16 bits
 
 
-def embree_rays(o: Tensor, d: Tensor, far: Tensor, odd: bool) -> tuple[Tensor, np.ndarray | None, Tensor | None]:
-    """Directions and far limits for Embree (None: all unlimited), and which directions were lengthened (None: none).
-
-    Embree's limit is inclusive; -1 turns an invalid ray off.  Directions shorter than ``SHORT`` go in ``LENGTHEN``
-    times as long.  odd: whether there may be any of the two.
-    """
-    if not odd and far.numel() == 1 and float(far) == float("inf"):
-        return d, None, None
-    limit = torch.from_numpy(np.nextafter(far.numpy(), np.float32(-np.inf))).expand(len(o))
-    reach = d.abs().amax(-1)
-    short = (reach > 0.0) & (reach < float(kernels.SHORT))
-    if bool(short.any()):
-        d = torch.where(short[:, None], d * LENGTHEN, d)
-        limit = torch.where(short, limit.clamp(max=torch.finfo(torch.float32).max) / LENGTHEN, limit)
-    else:
-        short = None
-    valid = torch.isfinite(o).all(-1) & torch.isfinite(reach) & (reach > 0.0) & (limit >= 0.0)
-    return d, torch.where(valid, limit, -1.0).numpy(), short
+def _items(values: Tensor) -> np.ndarray:
+    """``(N,)`` as it is, ``(N, 2)`` float32 as ``(N,)`` of eight bytes each, which numpy moves four times as fast."""
+    return values.numpy() if values.ndim == 1 else values.view(torch.float64)[:, 0].numpy()
 
 
 def offset_origin(position: Tensor, ng: Tensor, direction: Tensor, *, scale: float = 1.0) -> Tensor:

@@ -14,7 +14,6 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=n
 
 OFFSET = wp.constant(3.814697265625e-06)  # 2^-18: 64 ulp; interpolation errs by some 7 ulp of the largest coordinate
 T_FAR = wp.constant(3.0e38)
-SHORT = wp.constant(2.0**-50)  # Embree takes components of a direction below 1e-18 for 0
 
 
 @wp.func
@@ -60,7 +59,7 @@ def closest_kernel(
     face[i] = -1
     t[i] = wp.inf
     bary[i] = wp.vec2(0.0, 0.0)
-    far = t_max[i % t_max.shape[0]]
+    far = t_max[wp.min(i, t_max.shape[0] - 1)]
     if ray_is_valid(o, d) and far > 0.0:  # false for NaN
         hit = wp.mesh_query_ray(mesh, o, d, wp.min(far, T_FAR))
         if hit.result:
@@ -82,7 +81,7 @@ def occluded_kernel(
     o = origins[i]
     d = directions[i]
     occluded[i] = False
-    far = t_max[i % t_max.shape[0]]
+    far = t_max[wp.min(i, t_max.shape[0] - 1)]
     if ray_is_valid(o, d) and far > 0.0:  # false for NaN
         occluded[i] = hit_occluded(mesh, o, d, far)
 
@@ -115,11 +114,10 @@ def ray_key_kernel(
     # in
     origins: wp.array(dtype=wp.vec3), directions: wp.array(dtype=wp.vec3), low: wp.vec3, per_cell: wp.vec3,
     # out
-    key: wp.array(dtype=wp.int16), odd: wp.array(dtype=wp.bool),
+    key: wp.array(dtype=wp.int16),
 ):  # fmt: skip
     """16 bits alike for rays that visit the same part of the tree: the direction's cell of 32 x 32 on an octahedron in
-    Morton order, then the origin's of 4 x 4 x 4 above ``low``.  ``odd`` becomes True if any ray is not valid or has a
-    direction shorter than ``SHORT``; one whose components add up to infinity counts as such."""
+    Morton order, then the origin's of 4 x 4 x 4 above ``low``."""
     i = start + wp.tid()
     o = origins[i]
     d = directions[i]
@@ -135,31 +133,6 @@ def ray_key_kernel(
     for axis in range(3):
         k = k * 4 + int(wp.clamp(place[axis], 0.0, 3.0))
     key[i] = wp.int16(k - 32768)
-    if not (reach >= SHORT and reach + wp.abs(o[0]) + wp.abs(o[1]) + wp.abs(o[2]) < wp.inf):  # true for NaN
-        odd[0] = True
-
-
-@wp.kernel
-def place_hits_kernel(
-    start: int,
-    # in
-    order: wp.array(dtype=wp.int64), limit: wp.array(dtype=float), found: wp.array(dtype=wp.int32),
-    tfar: wp.array(dtype=float), u: wp.array(dtype=float), v: wp.array(dtype=float),
-    # out
-    face: wp.array(dtype=wp.int32), t: wp.array(dtype=float), bary: wp.array(dtype=wp.vec2),
-):  # fmt: skip
-    """Embree's hits in the rays' own order: entry j belongs to ray ``order[j]`` (j where ``order`` is empty) and is a
-    miss where ``limit[j]`` (if there are any) is below 0."""
-    j = start + wp.tid()
-    i = j
-    if order.shape[0] != 0:
-        i = int(order[j])
-    hit = found[j] >= 0
-    if limit.shape[0] != 0:
-        hit = hit and limit[j] >= 0.0
-    face[i] = wp.where(hit, found[j], -1)
-    t[i] = wp.where(hit, tfar[j], wp.inf)
-    bary[i] = wp.where(hit, wp.vec2(u[j], v[j]), wp.vec2(0.0, 0.0))
 
 
 @wp.kernel

@@ -1,7 +1,8 @@
-"""The estimator of ``reli3d.kernels.shade`` in two halves, between which another tracer tests the shadow rays."""
+"""The estimator of ``reli3d.kernels.shade`` in two halves: rays and values, then the sum of what Embree finds lit."""
 
 import warp as wp
 
+from reli3d.kernels.embree import block_rays
 from reli3d.kernels.envmap import lookup_envmap_uv
 from reli3d.kernels.intersect import offset_origin
 from reli3d.kernels.math import CONTRACT, INLINE
@@ -45,17 +46,21 @@ def shade_rays_kernel(
 def accumulate_kernel(
     start: int,
     # in
-    first: int, count: int, values: wp.array(dtype=wp.vec3), occluded: wp.array(dtype=wp.int32),
+    first: int, count: int, occluded16: wp.uint64, scene: wp.uint64, origins: wp.array(dtype=wp.vec3),
+    directions: wp.array(dtype=wp.vec3), values: wp.array(dtype=wp.vec3),
+    # in and out
+    t_max: wp.array(dtype=float),
     # out
     out: wp.array(dtype=wp.vec3), visible: wp.array2d(dtype=wp.int32),
 ):  # fmt: skip
-    """Second half: the sum of the values of a hit that are not ``occluded`` (Embree: 0 for a hit, -1 for none)."""
+    """Second half: the sum of a hit's values whose shadow rays nothing stops; ``t_max`` of the others becomes -1."""
     j = start + wp.tid()
+    block_rays(occluded16, scene, origins, directions, j * count, count, t_max)
     total = wp.vec3(0.0, 0.0, 0.0)
     word = wp.int32(0)
     for s in range(count):
         k = j * count + s
-        if occluded[k] != 0:
+        if t_max[k] >= 0.0:
             total = total + values[k]
             word = word | (1 << (s & 31))
         if (s & 31) == 31 or s == count - 1:

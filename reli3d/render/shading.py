@@ -11,6 +11,7 @@ import warp as wp
 from torch import Tensor
 
 from reli3d._bridge import SLICE_MIN, check, empty, launch, once_differentiable, over_slices, slices, views
+from reli3d.geometry import embree
 from reli3d.geometry.rays import RayScene
 from reli3d.kernels import shade as kernels
 from reli3d.kernels import shade_adjoint as adjoint
@@ -204,8 +205,8 @@ def _inputs(tensors: list[Tensor], job: _Job) -> list:
 
 
 def _shade_embree(n: int, ins: list, job: _Job, outs: list) -> None:
-    """Chunks of hits: one kernel makes the rays and values, Embree tests the rays, another sums what is lit."""
-    out, count, scene = outs[0][0], job.count, job.scene
+    """Chunks of hits: one kernel makes the rays and values, another has Embree test the rays and sums what is lit."""
+    out, count, tracer = outs[0][0], job.count, (embree.query("rtcOccluded16"), job.scene.embree_scene)
     if count == 0:
         out.zero_()
         return
@@ -215,13 +216,12 @@ def _shade_embree(n: int, ins: list, job: _Job, outs: list) -> None:
     def work(_, start, length):
         rays = [torch.empty(min(size, length) * count, 3) for _ in range(3)]
         far = torch.empty(min(size, length) * count)
-        buffers = views([(rays[0], wp.vec3), (rays[1], wp.vec3), (far, wp.float32), (rays[2], wp.vec3)])
+        origins, directions, values, t_max = views([*((v, wp.vec3) for v in rays), (far, wp.float32)])
         for first in range(start, start + length, size):
             hits = min(size, start + length - first)
-            launch(halves.shade_rays_kernel, hits, [first, *ins, job.plan, *buffers], out.device)
-            k = hits * count
-            blocked = scene.embree_blocked(rays[0][:k], rays[1][:k], far[:k])
-            args = [first, count, buffers[3], (blocked, wp.int32), *outs]
+            args = [first, *ins, job.plan, origins, directions, t_max, values]
+            launch(halves.shade_rays_kernel, hits, args, out.device)
+            args = [first, count, *tracer, origins, directions, values, t_max, *outs]
             launch(halves.accumulate_kernel, hits, args, out.device)
 
     if n:

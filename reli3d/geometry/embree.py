@@ -1,0 +1,89 @@
+"""Embree's triangle tree by its C interface, in the library that the embreex wheel brings.
+
+embreex's own calls copy every ray into and out of memory of their own (100 ns a ray) and know no packets.  Here a tree
+is built, and :mod:`reli3d.kernels.embree` traces rays in it, by the addresses of Embree's functions.  Names and
+constants: Embree 4 API reference, https://github.com/RenderKit/embree.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import weakref
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+VERSION, RAY_PACKETS = 0, 34  # device properties: 40400 is 4.4.0; 16 rays at once
+TRIANGLES, ROBUST = 0, 1 << 2
+INDEX, VERTEX = (0, 0x5003), (1, 0x9003)  # kind of buffer and format of its items: 3 unsigned, 3 float
+POINTER, SIZE = ctypes.c_void_p, ctypes.c_size_t
+SIGNATURES = {
+    "rtcNewDevice": (POINTER, ctypes.c_char_p),
+    "rtcGetDeviceError": (ctypes.c_int, POINTER),
+    "rtcGetDeviceProperty": (ctypes.c_ssize_t, POINTER, ctypes.c_int),
+    "rtcNewScene": (POINTER, POINTER),
+    "rtcSetSceneFlags": (None, POINTER, ctypes.c_int),
+    "rtcNewGeometry": (POINTER, POINTER, ctypes.c_int),
+    "rtcSetNewGeometryBuffer": (POINTER, POINTER, ctypes.c_int, ctypes.c_uint, ctypes.c_int, SIZE, SIZE),
+    "rtcCommitGeometry": (None, POINTER),
+    "rtcAttachGeometry": (ctypes.c_uint, POINTER, POINTER),
+    "rtcReleaseGeometry": (None, POINTER),
+    "rtcCommitScene": (None, POINTER),
+    "rtcReleaseScene": (None, POINTER),
+}
+QUERIES = "rtcIntersect1", "rtcOccluded1", "rtcOccluded16"
+
+
+@lru_cache(1)
+def _embree() -> tuple[ctypes.CDLL, int]:
+    """The library and its one device.  Raises ImportError where embreex comes without Embree 4."""
+    import embreex
+    from embreex import rtcore_scene
+
+    beside = sorted(Path(embreex.__file__).parents[1].glob("embreex.libs/*embree4*"))
+    for path in (Path(rtcore_scene.__file__), *beside):  # where the loader finds names of what a library needs: itself
+        library = ctypes.CDLL(str(path))
+        if hasattr(library, "rtcNewDevice"):
+            break
+    else:
+        raise ImportError(f"embreex: expected a wheel with Embree's library, found none beside {embreex.__file__}")
+    for name, (result, *arguments) in SIGNATURES.items():
+        function = getattr(library, name)
+        function.restype, function.argtypes = result, arguments
+    device = library.rtcNewDevice(None)
+    version = library.rtcGetDeviceProperty(device, VERSION) if device else 0
+    if version // 10000 != 4 or not library.rtcGetDeviceProperty(device, RAY_PACKETS):
+        raise ImportError(f"embreex: expected Embree 4 with packets of 16 rays, got version number {version}")
+    return library, device
+
+
+def query(name: str) -> int:
+    """Address of one of :data:`QUERIES`, for a kernel."""
+    return ctypes.cast(getattr(_embree()[0], name), POINTER).value
+
+
+class Tree:
+    """Triangles in robust mode; ``scene`` is what queries take, valid while the tree lives.
+
+    vertices: ``(V, 3)`` float32.  faces: ``(F, 3)`` int32 in [0, V).  Raises RuntimeError if Embree cannot build it.
+    """
+
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray):
+        library, device = _embree()
+        self.scene = library.rtcNewScene(device)
+        weakref.finalize(self, library.rtcReleaseScene, self.scene)
+        library.rtcSetSceneFlags(self.scene, ROBUST)
+        geometry = library.rtcNewGeometry(device, TRIANGLES)
+        for (kind, form), items in ((VERTEX, vertices), (INDEX, faces)):
+            items = np.ascontiguousarray(items)
+            place = library.rtcSetNewGeometryBuffer(geometry, kind, 0, form, items.itemsize * 3, len(items))
+            if place:
+                ctypes.memmove(place, items.ctypes.data, items.nbytes)
+        library.rtcCommitGeometry(geometry)
+        library.rtcAttachGeometry(self.scene, geometry)
+        library.rtcReleaseGeometry(geometry)
+        library.rtcCommitScene(self.scene)
+        error = library.rtcGetDeviceError(device)
+        if error:
+            raise RuntimeError(f"embree: expected a tree of {len(faces)} faces, got its error {error}")

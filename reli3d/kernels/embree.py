@@ -1,0 +1,175 @@
+"""Rays through Embree's tree, called by address from CPU kernels; on CUDA they would do nothing.
+
+``intersect1``, ``occluded1`` and ``occluded16`` are addresses of ``rtcIntersect1`` and so on, ``scene`` that of a
+committed RTCScene (:mod:`reli3d.geometry.embree`).  Layouts of rays and hits: Embree 4 API reference, rtcore_ray.h; the
+two words at the end of a hit are for instances, of which there are none.
+"""
+
+import warp as wp
+
+from reli3d.kernels.intersect import ray_is_valid
+from reli3d.kernels.math import INLINE
+
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native " + INLINE})
+
+SHORT = wp.constant(2.0**-50)  # Embree takes components of a direction below 1e-18 for 0
+GROUP = wp.constant(64)  # rays, of which some may not be valid, for four packets
+LENGTHEN = wp.constant(2.0**100)  # exact in float32, and brings a length of 2^-149 to 2^-50 near 1
+
+RAY = """
+#ifndef __CUDA_ARCH__
+struct alignas(16) Ray {
+    float org[3], tnear, dir[3], time, tfar;
+    unsigned mask, id, flags;
+};
+Ray ray = {{o[0], o[1], o[2]}, 0.0f, {d[0], d[1], d[2]}, 0.0f, limit, ~0u, 0, 0};
+"""
+
+
+@wp.func_native(
+    RAY
+    + """
+struct Hit {
+    Ray ray;
+    float normal[3], u, v;
+    unsigned face, geometry, instance[2];
+} hit = {ray, {}, 0.0f, 0.0f, ~0u, ~0u, {~0u, ~0u}};
+((void (*)(void*, Hit*, void*))intersect1)((void*)scene, &hit, nullptr);
+if (hit.geometry == ~0u) return -1;
+t.data[i] = hit.ray.tfar;
+bary.data[i] = wp::vec2(hit.u, hit.v);
+return (int)hit.face;
+#else
+return -1;
+#endif
+"""
+)
+def first_hit(
+    intersect1: wp.uint64, scene: wp.uint64, o: wp.vec3, d: wp.vec3, limit: float, i: int, t: wp.array(dtype=float),
+    bary: wp.array(dtype=wp.vec2),
+) -> int:  # fmt: skip
+    """Nearest face at t in [0, limit], -1 for none; a hit's t and the weights of vertices 1 and 2 go to place ``i``."""
+    ...
+
+
+@wp.func_native(
+    RAY
+    + """
+((void (*)(void*, Ray*, void*))occluded1)((void*)scene, &ray, nullptr);
+return ray.tfar < 0.0f;
+#else
+return false;
+#endif
+"""
+)
+def any_hit(occluded1: wp.uint64, scene: wp.uint64, o: wp.vec3, d: wp.vec3, limit: float) -> bool:
+    """Whether anything lies at t in [0, limit]."""
+    ...
+
+
+@wp.func_native("""
+#ifndef __CUDA_ARCH__
+struct alignas(64) Rays {
+    float org[3][16], tnear[16], dir[3][16], time[16], tfar[16];
+    unsigned mask[16], id[16], flags[16];
+} rays = {};
+alignas(64) int valid[16];
+int place[16];
+for (int s = 0; s < 16; s++) rays.mask[s] = ~0u;
+for (int k = first; k < first + count;) {
+    int filled = 0;
+    for (; k < first + count && filled < 16; k++)
+        if (t_max.data[k] >= 0.0f) {
+            for (int axis = 0; axis < 3; axis++) {
+                rays.org[axis][filled] = origins.data[k][axis];
+                rays.dir[axis][filled] = directions.data[k][axis];
+            }
+            rays.tfar[filled] = t_max.data[k];
+            place[filled++] = k;
+        }
+    for (int s = 0; s < 16; s++) valid[s] = s < filled ? -1 : 0;
+    ((void (*)(const int*, void*, Rays*, void*))occluded16)(valid, (void*)scene, &rays, nullptr);
+    for (int s = 0; s < filled; s++)
+        if (rays.tfar[s] < 0.0f) t_max.data[place[s]] = -1.0f;
+}
+#endif
+""")
+def block_rays(
+    occluded16: wp.uint64, scene: wp.uint64, origins: wp.array(dtype=wp.vec3), directions: wp.array(dtype=wp.vec3),
+    first: int, count: int, t_max: wp.array(dtype=float),
+):  # fmt: skip
+    """Set ``t_max`` to -1 for those of ``count`` valid rays that meet anything before it; those below 0 are left out.
+
+    In packets of 16, which pays for rays that leave from one place.
+    """
+    ...
+
+
+@wp.func
+def before(t_max: float) -> float:
+    """The largest float below a positive one: Embree's limits are inclusive."""
+    return wp.cast(wp.cast(t_max, int) - 1, float)
+
+
+@wp.func
+def stretch_of(direction: wp.vec3) -> float:
+    """What a direction is multiplied by for Embree."""
+    reach = wp.max(wp.abs(direction[0]), wp.max(wp.abs(direction[1]), wp.abs(direction[2])))
+    return wp.where(reach < SHORT, LENGTHEN, 1.0)
+
+
+@wp.kernel
+def embree_closest_kernel(
+    start: int,
+    # in
+    intersect1: wp.uint64, scene: wp.uint64, origins: wp.array(dtype=wp.vec3), directions: wp.array(dtype=wp.vec3),
+    t_max: wp.array(dtype=float),
+    # out
+    face: wp.array(dtype=wp.int32), t: wp.array(dtype=float), bary: wp.array(dtype=wp.vec2),
+):  # fmt: skip
+    i = start + wp.tid()
+    o = origins[i]
+    d = directions[i]
+    far = t_max[wp.min(i, t_max.shape[0] - 1)]
+    found = wp.int32(-1)
+    if ray_is_valid(o, d) and far > 0.0:  # false for NaN
+        stretch = stretch_of(d)
+        found = first_hit(intersect1, scene, o, d * stretch, before(far) / stretch, i, t, bary)
+        if found >= 0 and stretch != 1.0:
+            t[i] = t[i] * stretch
+    if found < 0:
+        t[i] = wp.inf
+        bary[i] = wp.vec2(0.0, 0.0)
+    face[i] = found
+
+
+@wp.kernel
+def embree_occluded_kernel(
+    start: int,
+    # in
+    occluded1: wp.uint64, scene: wp.uint64, origins: wp.array(dtype=wp.vec3), directions: wp.array(dtype=wp.vec3),
+    t_max: wp.array(dtype=float),
+    # out
+    occluded: wp.array(dtype=wp.bool),
+):  # fmt: skip
+    i = start + wp.tid()
+    o = origins[i]
+    d = directions[i]
+    far = t_max[wp.min(i, t_max.shape[0] - 1)]
+    occluded[i] = False
+    if ray_is_valid(o, d) and far > 0.0:  # false for NaN
+        stretch = stretch_of(d)
+        occluded[i] = any_hit(occluded1, scene, o, d * stretch, before(far) / stretch)
+
+
+@wp.kernel
+def embree_clear_kernel(
+    start: int,
+    # in
+    occluded16: wp.uint64, scene: wp.uint64, origins: wp.array(dtype=wp.vec3), directions: wp.array(dtype=wp.vec3),
+    # in and out
+    t_max: wp.array(dtype=float),
+):  # fmt: skip
+    """``t_max`` becomes -1 where anything is met up to it; :data:`GROUP` rays a thread."""
+    first = (start + wp.tid()) * GROUP
+    block_rays(occluded16, scene, origins, directions, first, wp.min(GROUP, t_max.shape[0] - first), t_max)
