@@ -209,7 +209,7 @@ class RayScene:
             return None
         key = empty((n,), wp.int16, o.device)
         args = [(o, wp.vec3), (d, wp.vec3), *self._cells, (key, wp.int16)]
-        launch(kernels.ray_key_kernel, n, args, o.device, slice_min=n)
+        launch(embree_kernels.ray_key_kernel, -(-n // embree_kernels.RUN), args, o.device, slice_min=n)
         keys = key.numpy()
         if np.count_nonzero(keys[1:] != keys[:-1]) < 0.5 * n:
             return None

@@ -14,6 +14,7 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=n
 
 SHORT = wp.constant(2.0**-50)  # Embree takes components of a direction below 1e-18 for 0
 GROUP = wp.constant(64)  # rays, of which some may not be valid, for four packets
+RUN = wp.constant(4096)  # rays of a thread that finds keys
 LENGTHEN = wp.constant(2.0**100)  # exact in float32, and brings a length of 2^-149 to 2^-50 near 1
 
 RAY = """
@@ -105,6 +106,52 @@ def block_rays(
     ...
 
 
+@wp.func_native("""
+#ifndef __CUDA_ARCH__
+const float* o = origins.data[first].c;
+const float* d = directions.data[first].c;
+short* out = key.data + first;
+const float low_x = low[0], low_y = low[1], low_z = low[2];
+const float per_x = per_cell[0], per_y = per_cell[1], per_z = per_cell[2];
+#pragma clang loop vectorize(enable)
+for (int i = 0; i < count; i++) {
+    float dx = d[3 * i], dy = d[3 * i + 1], dz = d[3 * i + 2];
+    float ax = __builtin_fabsf(dx), ay = __builtin_fabsf(dy), reach = ax + ay + __builtin_fabsf(dz);
+    float scale = 16.0f / (reach > 1e-37f ? reach : 1e-37f);
+    float x = dx * scale, y = dy * scale;
+    float folded_x = __builtin_copysignf(16.0f - ay * scale, x), folded_y = __builtin_copysignf(16.0f - ax * scale, y);
+    x = (dz < 0.0f ? folded_x : x) + 16.0f;
+    y = (dz < 0.0f ? folded_y : y) + 16.0f;
+    x = x < 31.0f ? x : 31.0f;
+    y = y < 31.0f ? y : 31.0f;
+    int k = (int)x | ((int)y << 16);
+    k = (k | (k << 4)) & 0x0F0F0F0F;
+    k = (k | (k << 2)) & 0x33333333;
+    k = (k | (k << 1)) & 0x55555555;
+    k = (k & 0xFFFF) + 2 * (k >> 16);
+    float cx = (o[3 * i] - low_x) * per_x, cy = (o[3 * i + 1] - low_y) * per_y, cz = (o[3 * i + 2] - low_z) * per_z;
+    cx = cx > 0.0f ? cx : 0.0f;
+    cy = cy > 0.0f ? cy : 0.0f;
+    cz = cz > 0.0f ? cz : 0.0f;
+    cx = cx < 3.0f ? cx : 3.0f;
+    cy = cy < 3.0f ? cy : 3.0f;
+    cz = cz < 3.0f ? cz : 3.0f;
+    out[i] = (short)((((k * 4 + (int)cx) * 4 + (int)cy) * 4 + (int)cz) - 32768);
+}
+#endif
+""")
+def ray_keys(
+    origins: wp.array(dtype=wp.vec3), directions: wp.array(dtype=wp.vec3), low: wp.vec3, per_cell: wp.vec3, first: int,
+    count: int, key: wp.array(dtype=wp.int16),
+):  # fmt: skip
+    """16 bits alike for rays that visit the same part of the tree: the direction's cell of 32 x 32 on an octahedron in
+    Morton order (Morton 1966), then the origin's of 4 x 4 x 4 above ``low``.
+
+    A loop that the compiler turns into vectors of 16: 3 instead of 23 ns a ray.
+    """
+    ...
+
+
 @wp.func
 def before(t_max: float) -> float:
     """The largest float below a positive one: Embree's limits are inclusive."""
@@ -173,3 +220,16 @@ def embree_clear_kernel(
     """``t_max`` becomes -1 where anything is met up to it; :data:`GROUP` rays a thread."""
     first = (start + wp.tid()) * GROUP
     block_rays(occluded16, scene, origins, directions, first, wp.min(GROUP, t_max.shape[0] - first), t_max)
+
+
+@wp.kernel
+def ray_key_kernel(
+    start: int,
+    # in
+    origins: wp.array(dtype=wp.vec3), directions: wp.array(dtype=wp.vec3), low: wp.vec3, per_cell: wp.vec3,
+    # out
+    key: wp.array(dtype=wp.int16),
+):  # fmt: skip
+    """:data:`RUN` rays a thread."""
+    first = (start + wp.tid()) * RUN
+    ray_keys(origins, directions, low, per_cell, first, wp.min(RUN, key.shape[0] - first), key)

@@ -98,43 +98,6 @@ def offset_origin_kernel(
     origin[i] = offset_origin(position[i], ng[i], direction[i], scale)
 
 
-@wp.func
-def interleave(x: int, y: int) -> int:
-    """The lowest 8 bits of ``x`` on the even places and those of ``y`` on the odd ones (Morton 1966)."""
-    a = x | (y << 16)
-    a = (a | (a << 4)) & 0x0F0F0F0F
-    a = (a | (a << 2)) & 0x33333333
-    a = (a | (a << 1)) & 0x55555555
-    return (a & 0xFFFF) + 2 * (a >> 16)
-
-
-@wp.kernel
-def ray_key_kernel(
-    start: int,
-    # in
-    origins: wp.array(dtype=wp.vec3), directions: wp.array(dtype=wp.vec3), low: wp.vec3, per_cell: wp.vec3,
-    # out
-    key: wp.array(dtype=wp.int16),
-):  # fmt: skip
-    """16 bits alike for rays that visit the same part of the tree: the direction's cell of 32 x 32 on an octahedron in
-    Morton order, then the origin's of 4 x 4 x 4 above ``low``."""
-    i = start + wp.tid()
-    o = origins[i]
-    d = directions[i]
-    reach = wp.abs(d[0]) + wp.abs(d[1]) + wp.abs(d[2])
-    scale = 16.0 / wp.max(reach, 1.0e-37)
-    x = d[0] * scale
-    y = d[1] * scale
-    lower = d[2] < 0.0  # that half is folded over the upper one's corners
-    across = wp.where(lower, (16.0 - wp.abs(y)) * wp.sign(x), x)
-    along = wp.where(lower, (16.0 - wp.abs(x)) * wp.sign(y), y)
-    k = interleave(int(wp.min(across + 16.0, 31.0)), int(wp.min(along + 16.0, 31.0)))
-    place = wp.cw_mul(o - low, per_cell)
-    for axis in range(3):
-        k = k * 4 + int(wp.clamp(place[axis], 0.0, 3.0))
-    key[i] = wp.int16(k - 32768)
-
-
 @wp.kernel
 def sight_kernel(
     start: int,
