@@ -1,5 +1,6 @@
 """Embree by its C interface: packets of shadow rays beside single rays, trees that come and go, a wheel without it."""
 
+import sys
 import threading
 import weakref
 
@@ -80,12 +81,16 @@ def test_scenes_in_many_threads_answer_as_alone_and_are_given_back(device):
     assert held() is None and len(given_back) == 1
 
 
-def test_a_wheel_without_embree_is_named(monkeypatch, tmp_path):
+def test_embree_is_found_beside_the_wheel_and_a_wheel_without_it_is_named(monkeypatch, tmp_path):
+    """Where the loader tells no names of what a library needs, as on Windows, the library itself is looked for."""
     import embreex
     from embreex import rtcore_scene
 
     other = np.linalg._umath_linalg.__file__  # a library of other names
     monkeypatch.setattr(rtcore_scene, "__file__", other)
+    if sys.platform != "darwin":
+        library, device = embree._embree.__wrapped__()
+        assert library.rtcGetDeviceProperty(device, embree.VERSION) >= 40000
     monkeypatch.setattr(embreex, "__file__", str(tmp_path / "embreex" / "__init__.py"))
     with pytest.raises(ImportError, match="embreex: expected a wheel with Embree's library, found none"):
         embree._embree.__wrapped__()
