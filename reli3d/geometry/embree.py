@@ -1,8 +1,8 @@
 """Embree's triangle tree by its C interface, in the library that the embreex wheel brings.
 
-embreex's own calls copy every ray into and out of memory of their own (100 ns a ray) and know no packets.  Here a tree
-is built, and :mod:`reli3d.kernels.embree` traces rays in it, by the addresses of Embree's functions.  Names and
-constants: Embree 4 API reference, https://github.com/RenderKit/embree.
+embreex's own calls copy every ray into and out of memory of their own and know no packets.  Here a tree is built, and
+:mod:`reli3d.kernels.embree` traces rays in it, by the addresses of Embree's functions.  Names and constants: Embree 4
+API reference, https://github.com/RenderKit/embree.
 """
 
 from __future__ import annotations
@@ -32,7 +32,6 @@ SIGNATURES = {
     "rtcCommitScene": (None, POINTER),
     "rtcReleaseScene": (None, POINTER),
 }
-QUERIES = "rtcIntersect1", "rtcOccluded1", "rtcOccluded16"
 
 
 @lru_cache(1)
@@ -59,7 +58,7 @@ def _embree() -> tuple[ctypes.CDLL, int]:
 
 
 def query(name: str) -> int:
-    """Address of one of :data:`QUERIES`, for a kernel."""
+    """Address of ``rtcIntersect1``, ``rtcOccluded1`` or ``rtcOccluded16``, for a kernel."""
     return ctypes.cast(getattr(_embree()[0], name), POINTER).value
 
 
