@@ -14,12 +14,12 @@ from torch import Tensor
 Density = Callable[[Tensor], Tensor]
 
 ALPHAS, DEGREES, AZIMUTHS = (0.02, 0.05, 0.1, 0.25, 0.5, 1.0), (0, 15, 45, 80, 89), (0.4, 3.9)
-DRAWS = ("half vector", "visible", "partner")
+DRAWS = ("half vector", "visible", "opposite", "mirrored")
 LOBES = [(alpha, deg, phi) for alpha in ALPHAS for deg in DEGREES for phi in (AZIMUTHS if deg else AZIMUTHS[:1])]
 MIXTURES = [(0.1, 45), (0.5, 80), (1.0, 0)]
 MAPS = ("one texel", "constant", "3 x 2", "sun", "beside the sun", "four black rows", "one black row", "odd")
 # of the suite: share, fine and coarse pass of each case and one for the cosine, on both devices
-TESTS = 2 * 3 * (len(LOBES) * len(DRAWS) + len(MIXTURES) + len(MAPS) + 1)
+TESTS = 2 * 3 * (len(LOBES) * len(DRAWS) + 2 * len(MIXTURES) + len(MAPS) + 1)
 LEVEL = 1.0 - 0.99 ** (1.0 / TESTS)  # Sidak: 1 % for the family
 SHARE = float(-ndtri(LEVEL / 2))  # standard deviations
 
@@ -87,15 +87,15 @@ class Window:
 
     wo: Tensor
     alpha: float
-    partner: bool = False
+    mirrored: bool = False
     shape: tuple[int, int] = (64, 64)
 
     def frame(self) -> tuple[Tensor, Tensor, float, float, float]:
         x, y, z = self.wo.double().tolist()
         flat = math.hypot(x, y)
         axes = torch.tensor([[-x, -y, 0.0], [y, -x, 0.0]], dtype=torch.float64, device=self.wo.device) / flat
-        high = 3.1 * z / flat  # a partner's normal faces wo, so wi is at most three times as high
-        if not self.partner:
+        high = 3.1 * z / flat  # a mirrored normal faces wo, so wi is at most three times as high
+        if not self.mirrored:
             high = math.tan(12.0 * self.alpha + math.atan(z / flat))  # a slope of 6 alpha of the half vector
         return *axes, z / flat, high, 6.0 * self.alpha
 

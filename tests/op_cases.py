@@ -257,7 +257,7 @@ CASES = {
         lambda wo, alpha, wm: (sampling.pdf_ggx_vndf(wo, alpha, wm),), ("wo", "alpha", "wm"), ("wo", "alpha", "wm")),
     "sample_bsdf": Case(
         lambda n: {"wo": above(n, 1), "alpha": uniform(n, seed=2, low=0.1), "u": numbers(n)},
-        lambda wo, alpha, u: (material.sample_bsdf(wo, alpha, u, "partner"),), ("wo", "alpha"), ("wo", "alpha", "u")),
+        lambda wo, alpha, u: (material.sample_bsdf(wo, alpha, u, "mirrored"),), ("wo", "alpha"), ("wo", "alpha", "u")),
     "Environment.lookup": Case(
         lambda n: {"radiance": uniform(8, 16, 3, seed=1), "directions": units(n, 2)},
         lambda radiance, directions: (Environment(radiance).lookup(directions),), ("radiance", "directions"),

@@ -89,19 +89,13 @@ def eval_bsdf(wo: Tensor, wi: Tensor, base_color: Tensor, alpha: Tensor, metalli
     return left * (1.0 - metallic[..., None]) * base_color / torch.pi + fresnel * specular[..., None]
 
 
-def reflected_visible_normal(wo: Tensor, alpha: Tensor, u: Tensor, partner: bool) -> Tensor:
-    """``wo`` mirrored at a visible normal or at that turned by pi; below the horizon where the latter looks away.
-
-    A partner in the tail, the last 32nd, is half of that on from its original, counted round.
-    """
-    if partner:
-        left = (1.0 - u[..., 1]) * 32.0
-        u = torch.stack([u[..., 0], torch.where(left <= 1.0, 1.0 - (left + 0.5) % 1.0 / 32.0, u[..., 1])], -1)
-    wm = sample_ggx_vndf(wo, alpha, u) * wo.new_tensor([-1.0, -1.0, 1.0] if partner else [1.0, 1.0, 1.0])
+def reflected_visible_normal(wo: Tensor, alpha: Tensor, u: Tensor, mirrored: bool) -> Tensor:
+    """``wo`` mirrored at a visible normal or at that turned by pi; below the horizon where the latter looks away."""
+    wm = sample_ggx_vndf(wo, alpha, u) * wo.new_tensor([-1.0, -1.0, 1.0] if mirrored else [1.0, 1.0, 1.0])
     cos = (wo * wm).sum(-1, keepdim=True)
     wi = 2.0 * cos * wm - wo
     under = wi * wi.new_tensor([1.0, 1.0, -1.0]) * torch.where(wi[..., 2:] < 0.0, wi.new_tensor([1.0, 1.0, -1.0]), 1.0)
-    return torch.where((cos <= 0.0) & torch.tensor(partner), under, wi)
+    return torch.where((cos <= 0.0) & torch.tensor(mirrored), under, wi)
 
 
 def sg_ends(sharpness: Tensor) -> tuple[Tensor, Tensor]:

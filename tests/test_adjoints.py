@@ -216,7 +216,7 @@ def reflections(g, small, lobe) -> Op:
     u = op_cases.numbers(n)
     return Op({"wo": op_cases.above(n, 1), "alpha": torch.rand(n, generator=g) * 0.95 + 0.05},
               lambda wo, alpha: sample_bsdf(wo, alpha, u.to(wo), lobe),
-              lambda wo, alpha: reference.reflected_visible_normal(wo, alpha, u.double(), lobe == "partner"),
+              lambda wo, alpha: reference.reflected_visible_normal(wo, alpha, u.double(), lobe == "mirrored"),
               ("wo",))  # fmt: skip
 
 
@@ -290,7 +290,7 @@ OPS = {
                                density, irradiance, gaussians)},
     **{f"attributes {n}": partial(attributes, channels=n) for n in (2, 3, 4)},
     **{f"points {name}": partial(points_of_a_mesh, tangents=name == "tangents") for name in ("tangents", "uv")},
-    **{f"reflections {lobe}": partial(reflections, lobe=lobe) for lobe in ("visible", "partner")},
+    **{f"reflections {lobe}": partial(reflections, lobe=lobe) for lobe in ("visible", "mirrored")},
 }  # fmt: skip
 
 

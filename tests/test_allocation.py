@@ -86,7 +86,7 @@ def test_the_promised_variance_is_what_shade_has(device, points):
     """With independent numbers it is equal, with even points less; the mean is that of the published counts."""
     arguments, env = surface(device, 0.3, 1.0), light("sun", device)
     plan = plan_samples(*arguments, env)
-    got = runs_of(arguments, env, plan.samples, points=points, antithetic=False)
+    got = runs_of(arguments, env, plan.samples, points=points, antithetic="none")
     ratio = float(got.var(0).sum(1).mean()) / plan.variance
     assert 0.8 < ratio < 1.25 if points == "random" else ratio < 1.0  # 256 runs: 5 % noise, the sun's tail some more
     assert deviation(got, runs_of(arguments, env, (20, 40, 4), points=points, seed=1)) < 4.5  # 72 numbers
@@ -102,7 +102,7 @@ def deviation(a, b):
 @pytest.mark.parametrize("case", GRID)
 def test_the_plan_changes_no_mean(device, case):
     arguments, env = surface(device, *case[1:]), light(case[0], device)
-    got = runs_of(arguments, env, plan_samples(*arguments, env).samples, antithetic=False, points="random")
+    got = runs_of(arguments, env, plan_samples(*arguments, env).samples, antithetic="none", points="random")
     assert deviation(got, runs_of(arguments, env, (20, 40, 4), points="random", seed=1)) < 5.0  # 1300 numbers
 
 
@@ -123,7 +123,7 @@ def compare(case, points, device, runs=256):
     name, roughness, metallic = case
     arguments, env = surface(device, roughness, metallic), light(name, device)
     plan = plan_samples(*arguments, env, points=points)
-    options = {"points": points, "antithetic": False, "runs": runs}
+    options = {"points": points, "antithetic": "none", "runs": runs}
     mixed, *alone = (runs_of(arguments, env, c, **options).flatten(1).cpu() for c in (plan.samples, *SINGLE))
     own, *variance = (3.0 * float(v.var(0).mean()) for v in (mixed, *alone))  # the three channels' sum
     hidden = sun_part(arguments, env).mean(0).tolist() if name == "sun" else [0.0] * 3
@@ -166,7 +166,7 @@ def test_the_pilot_sees_shadows(device):
     arguments = (torch.zeros_like(arguments[0]), *arguments[1:])
     free, shaded = plan_samples(*arguments, env), plan_samples(*arguments, env, scene=scene)
     assert free.samples[0] >= 40 > 8 >= shaded.samples[0]
-    got = runs_of(arguments, env, shaded.samples, scene=scene, points="random", antithetic=False)
+    got = runs_of(arguments, env, shaded.samples, scene=scene, points="random", antithetic="none")
     assert 0.8 < float(got.var(0).sum(1).mean()) / shaded.variance < 1.25  # 5 % noise of 256 runs, 3 % of the pilot
 
 
@@ -176,7 +176,7 @@ def test_few_bright_points_count_as_many_as_they_are(device):
     bright = torch.arange(1000, device=device) % 10 == 0
     arguments = (*arguments[:4], torch.where(bright, 0.9, 0.03)[:, None].expand(-1, 3), *arguments[5:])
     plan = plan_samples(*arguments, env, points="random")
-    got = runs_of(arguments, env, plan.samples, runs=64, points="random", antithetic=False)
+    got = runs_of(arguments, env, plan.samples, runs=64, points="random", antithetic="none")
     # 10 % noise of 128 bright points in the pilot; drawn evenly in the mean they would count 5 times
     assert 0.7 < plan.variance / float(got.var(0).sum(1).mean()) < 1.4
 
@@ -195,7 +195,7 @@ def test_the_relative_plan_is_for_what_is_seen(device):
     metallic = torch.arange(24, device=device) % 2 * 1.0
     arguments = (*arguments[:5], 1.0 - 0.7 * metallic, metallic)
     plans = [plan_samples(*arguments, env, points="random", relative=r) for r in (False, True)]
-    runs = [runs_of(arguments, env, p.samples, points="random", antithetic=False) for p in plans]
+    runs = [runs_of(arguments, env, p.samples, points="random", antithetic="none") for p in plans]
     mean = torch.cat(runs).mean((0, 2))
     scale = 1.0 / (mean.square() + (0.1 * mean.mean()) ** 2)
     plain, relative = ([float((r.var(0).sum(1) * w).mean()) for r in runs] for w in (torch.ones_like(scale), scale))
@@ -247,7 +247,7 @@ def test_an_image_has_less_noise_by_its_plan(device):
     images = {
         counts: torch.stack([render(asset, camera, env, samples=counts, antithetic=pairs, seed=k).radiance
                              for k in range(12)])
-        for counts, pairs in ((plan.samples, False), ((20, 40, 4), True))
+        for counts, pairs in ((plan.samples, "none"), ((20, 40, 4), "opposite"))
     }  # fmt: skip
     planned, published = (v.var(0).mean() for v in images.values())
     assert float(planned) < 0.7 * float(published)

@@ -192,7 +192,7 @@ def test_variance_is_that_of_the_closed_form(device, counts):
     env = light("constant", device)
     normal, wo, *_ = (v.double() for v in inputs(24, device))
     o = (normal * wo).sum(-1, keepdim=True)
-    got = spread(1.0, 1.0, env, base=torch.ones(24, 3, device=device), samples=counts, antithetic=False)[0][..., 0]
+    got = spread(1.0, 1.0, env, base=torch.ones(24, 3, device=device), samples=counts, antithetic="none")[0][..., 0]
     c = (torch.arange(20000, dtype=torch.float64, device=device) + 0.5) / 20000  # the ring of c has 2 pi dc
     f = c / (2.0 * torch.pi * (c + o))
     p = torch.stack([torch.full_like(f, 0.25), 0.5 / (1.0 + o).expand_as(f), c.expand_as(f)]) / torch.pi
@@ -212,35 +212,54 @@ def test_variance_is_that_of_the_closed_form(device, counts):
     assert error < 0.04 * truth.mean()  # measured 0.02 to 0.03
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", SKIES[:2])
-def test_pairs_still_the_slope_in_the_normal_and_double_that_in_roughness(device, name):
-    """Zhang et al. 2021: partners cancel what is odd about the normal.  The slope in roughness is even: a pair tells it
-    once.  docs/renderer.md has the whole table."""
-    env = light(name, device)
-    pair, alone = (
-        [variance(v) for v in spread(0.1, 1.0, env, samples=(0, 40, 0), antithetic=a)] for a in (True, False)
+def test_pairs_cancel_the_slopes_of_the_lobe(device, name):
+    """A lobe seen from above has d log D = (4 u - 2) / alpha d alpha for the second of its numbers, and 4 sqrt(u (1 -
+    u)) cos(2 pi phi) / alpha where the normal turns: half a turn and 1 - u change the sign of both.  Mirrored alone
+    (Zhang et al. 2021) keeps u and tells the slope in roughness twice: 20 draws instead of 40."""
+    env, spent = light(name, device), {"samples": (0, 40, 0), "seed": 3}
+    mirrored, pair, alone = (
+        [variance(v) for v in spread(0.1, 1.0, env, antithetic=a, **spent)] for a in ("mirrored", "opposite", "none")
     )
-    assert pair[2] < 0.05 * alone[2]  # measured 0.006
-    assert 1.6 < pair[1] / alone[1] < 2.4  # measured 1.9 to 2.0; 20 draws instead of 40
+    assert 1.6 < mirrored[1] / alone[1] < 2.4 and mirrored[2] < 0.05 * alone[2]  # measured 1.9 to 2.0 and 0.0001
+    assert pair[1] < 0.01 * alone[1] and pair[2] < 0.01 * alone[2]  # measured 0.0005 and 0.0002
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SKIES)
+@pytest.mark.parametrize("metallic", [0.0, 1.0])
+def test_pairs_are_never_noisier_than_as_many_independent_samples(device, name, metallic):
+    """The published counts with independent numbers on either side, 4096 runs: 1.05 at most, and less than 1 where the
+    light is smooth and the surface too.  Measured 0.42 to 1.00 without the sun, in it up to 1.04 with an interval of
+    1.00 to 1.09; slopes in single texels, of 1024 runs, 0.61 to 1.00."""
+    env = light(name, device)
+    for roughness in (0.05, 0.1, 0.3, 0.6, 1.0):
+        pairs, alone = (
+            [variance(v) for v in (*spread(roughness, metallic, env, runs=4096, **o),
+                                   texel_spread(roughness, metallic, env, runs=1024, **o))]
+            for o in ({"seed": 3}, {"antithetic": "none", "seed": 2})
+        )  # fmt: skip
+        ratio = dict(zip(COLUMNS, (a / b for a, b in zip(pairs, alone)), strict=True))
+        assert max(ratio.values()) < 1.05, (roughness, ratio)
+        ratio.pop("texels")
+        assert name == "sun" or roughness < 0.3 or max(ratio.values()) < 0.96, (roughness, ratio)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SKIES)
 @pytest.mark.parametrize("metallic", [0.0, 1.0])
 def test_pairs_as_shipped_are_less_noisy_than_as_many_independent_samples(device, name, metallic):
-    """The published counts with pairs from rotated Halton points, in value and in slopes of the surface: measured
-    0.0006 to 0.75, and 0.85 to 0.87 in value and base colour of metal of 0.05 (1.3 if pairs were mirrored in the tail
-    too); a pair from independent numbers would be 1.0 to 2.2 in value and slope in roughness.  Slopes in single
-    texels, where neither pairs nor even points help, 0.28 to 1.31."""
+    """The published counts with pairs from rotated Halton points: measured 0.0001 to 0.66, and 0.79 to 0.85 in value
+    and base colour of metal of 0.05; slopes in single texels, in whose few samples the points are not even, 0.31 to
+    1.00."""
     env = light(name, device)
     for roughness in (0.05, 0.1, 0.3, 1.0):
         pairs, alone = (
             [variance(v) for v in (*spread(roughness, metallic, env, **o), texel_spread(roughness, metallic, env, **o))]
-            for o in ({"points": "halton", "seed": 1}, {"antithetic": False, "seed": 2})
+            for o in ({"points": "halton", "seed": 1}, {"antithetic": "none", "seed": 2})
         )
         ratio = dict(zip(COLUMNS, (a / b for a, b in zip(pairs, alone)), strict=True))
-        assert ratio.pop("texels") < 1.4, (roughness, ratio)
+        assert ratio.pop("texels") < 1.05, (roughness, ratio)
         assert max(ratio.values()) < (0.95 if (roughness, metallic) == (0.05, 1.0) else 0.8), (roughness, ratio)
 
 
@@ -252,11 +271,11 @@ def test_the_balance_heuristic_keeps_its_bound(device, name):
     env, counts = light(name, device), (20, 40, 4)
     for roughness in (0.05, 0.3, 1.0):
         for metallic in (0.0, 1.0):
-            mixed = spread(roughness, metallic, env, antithetic=False)[0]
+            mixed = spread(roughness, metallic, env, antithetic="none")[0]
             single = []
             for k in range(3):
                 own = tuple(c if i == k else 0 for i, c in enumerate(counts))
-                single.append(spread(roughness, metallic, env, antithetic=False, samples=own)[0].var(0))
+                single.append(spread(roughness, metallic, env, antithetic="none", samples=own)[0].var(0))
             best = torch.stack(single).amin(0)
             bound = best + (1 / min(counts) - 1 / sum(counts)) * mixed.mean(0).square()
             # variances of 256 runs err by 9 % each where the tails are light

@@ -159,7 +159,7 @@ def test_gradients_of_the_estimator(device, strategy, paint):
 
     def grads(weight):
         out = shade(leaves[0].detach(), leaves[0], ng.to(device), wo.to(device), leaves[1], leaves[2], leaves[3],
-                    Environment(leaves[4]), samples=counts, seed=seed, antithetic=False, points="random",
+                    Environment(leaves[4]), samples=counts, seed=seed, antithetic="none", points="random",
                     alpha="linear", paint=paint)  # fmt: skip
         return out.detach(), torch.autograd.grad((out * weight.to(device)).sum(), leaves)
 
@@ -189,7 +189,7 @@ def test_gradients_of_the_estimator(device, strategy, paint):
 
 
 @pytest.mark.parametrize("options", [{}, {"paint": "published", "heuristic": "power", "points": "random"},
-                                     {"antithetic": False, "clamp": 0.5}])  # fmt: skip
+                                     {"antithetic": "mirrored"}, {"antithetic": "none", "clamp": 0.5}])  # fmt: skip
 @pytest.mark.parametrize("light", ["sun", "black"])
 def test_all_strategies_together_keep_their_gradients_finite(device, light, options):
     normal, ng, wo, _, base, alpha, metallic = drawn(N, 4)

@@ -108,7 +108,7 @@ def test_directions_in_and_below_the_horizon_and_extreme_parameters(device, pain
     u = torch.tensor([[0.0, 0.0], [0.0, end], [end, 0.0], [end, end]], device=device)
     wm = sample_ggx_vndf(wo, alpha, u)
     assert float(wm[..., 2].min()) > 0.0
-    for drawn in (wm, *(sample_bsdf(wo, alpha, u, lobe) for lobe in ("visible", "partner", "cosine"))):
+    for drawn in (wm, *(sample_bsdf(wo, alpha, u, lobe) for lobe in ("visible", "mirrored", "cosine"))):
         torch.testing.assert_close(drawn.norm(dim=-1), torch.ones_like(drawn[..., 0]), atol=1e-5, rtol=0)
         assert bool(torch.isfinite(pdf_lobes(wo, drawn, alpha)).all())
 

@@ -10,7 +10,7 @@ from reli3d.render.environment import Environment
 from reli3d.render.material import eval_bsdf, pdf_lobes, sample_bsdf
 from reli3d.render.sampling import (
     halton,
-    partner_point,
+    opposite,
     pdf_cosine,
     pdf_ggx_vndf,
     random_pairs,
@@ -36,7 +36,7 @@ def uniform(n, device, seed=7):
 def lobe_cases():
     """Every lobe; by default one azimuth of each but the narrowest and those of which few draws are valid."""
     for seed, (alpha, deg, phi, drawn) in enumerate((*lobe, drawn) for lobe in chi2.LOBES for drawn in chi2.DRAWS):
-        rare = drawn == "partner" and (deg == 89 and alpha >= 0.1 or deg == 80 and alpha == 1.0)
+        rare = drawn == "mirrored" and (deg == 89 and alpha >= 0.1 or deg == 80 and alpha == 1.0)
         even = (chi2.ALPHAS.index(alpha) + chi2.DEGREES.index(deg) + chi2.AZIMUTHS.index(phi)) % 2 == 0
         marks = () if (even or deg == 0) and alpha > 0.02 and not rare else pytest.mark.slow
         yield pytest.param(alpha, deg, phi, drawn, seed, marks=marks, id=f"{drawn}-{alpha}-{deg}-{phi}")
@@ -44,7 +44,7 @@ def lobe_cases():
 
 @pytest.mark.parametrize("alpha, deg, phi, drawn, seed", list(lobe_cases()))
 def test_lobes_follow_their_densities(device, alpha, deg, phi, drawn, seed):
-    """Visible normals, directions reflected at them and at their partners: a million draws, or 1e5 valid ones."""
+    """Visible normals, directions reflected at them and at either kind of partner: a million draws, or 1e5 valid."""
     wo, a, g = view(deg, device, phi), torch.tensor(alpha, device=device), torch.Generator().manual_seed(seed)
     grid = chi2.Sphere(45 if alpha > 0.2 else 81 if alpha > 0.05 else 141)
     if drawn == "half vector":
@@ -53,18 +53,19 @@ def test_lobes_follow_their_densities(device, alpha, deg, phi, drawn, seed):
         return chi2.check(grid, wm, lambda m: pdf_ggx_vndf(wo, a, m), wrong)
     valid, total = [], 0
     while sum(map(len, valid)) < 100_000:
-        wi = sample_bsdf(wo, a, torch.rand(N, 2, generator=g).to(device), drawn)
+        u = torch.rand(N, 2, generator=g).to(device)
+        wi = sample_bsdf(wo, a, opposite(u), "visible") if drawn == "opposite" else sample_bsdf(wo, a, u, drawn)
         valid.append(wi[wi[:, 2] > 1e-6])
         total += N
-    k = chi2.DRAWS.index(drawn) - 1
+    k = int(drawn == "mirrored")
     pdf = lambda d: pdf_lobes(wo, d, a)[:, k]  # noqa: E731
     wrong = {"width": lambda d: pdf_lobes(wo, d, 1.02 * a)[:, k]}
-    if deg >= 45:  # near the normal partners have almost the density of their originals
+    if deg >= 45:  # near the normal mirrored ones have almost the density of their originals
         wrong["the other's"] = lambda d: pdf_lobes(wo, d, a)[:, 1 - k]
-    if deg == 89 and (drawn == "partner" or alpha < 0.05):  # a degree or less beside the horizon
+    if deg == 89 and (drawn == "mirrored" or alpha < 0.05):  # a degree or less beside the horizon
         whole = chi2.masses(chi2.Sphere(141), pdf, device).sum()
         assert not chi2.lost(sum(map(len, valid)), whole, total)
-        grid = chi2.Window(wo, alpha, drawn == "partner")
+        grid = chi2.Window(wo, alpha, drawn == "mirrored")
         wrong["view"] = lambda d: pdf_lobes(view(89.1, device, phi), d, a)[:, k]
     return chi2.check(grid, torch.cat(valid), pdf, wrong, total)
 
@@ -78,20 +79,19 @@ def test_cosine_follows_its_density(device):
     torch.testing.assert_close(pdf_lobes(wo, wi, a)[:, 2], pdf_cosine(wi), rtol=1e-6, atol=0)  # 1 / pi is rounded
 
 
-def test_partners_in_the_tail_stay_uniform_and_do_not_come_in_twos(device):
-    """The last 32nd of the 2^24 numbers is turned onto itself, by half; the rest stands."""
-    tail = 1.0 - torch.arange(1, 2**19 + 1, dtype=torch.float64) / 2**24
-    rest = torch.rand(1000, generator=torch.Generator().manual_seed(1)) * (31 / 32)
-    u = torch.cat([tail.float(), rest])
-    u = torch.stack([u.flip(0), u], -1).to(device)
-    got = partner_point(u)
-    assert torch.equal(got[:, 0], u[:, 0]) and torch.equal(got[2**19 :], u[2**19 :])
-    moved = got[: 2**19, 1].cpu().double()
-    assert torch.equal(moved.sort().values, tail.flip(0)) and bool(((moved - tail).abs() == 2**-6).all())
+def test_opposite_numbers_are_each_of_them_once(device):
+    """Of the 2^24 there are, on either axis: what is uniform stays so.  Twice the same is where it began."""
+    every = torch.arange(2**24, dtype=torch.float64, device=device) / 2**24
+    u = torch.stack([every.float(), every.float().flip(0)], -1)
+    got = opposite(u)
+    assert torch.equal(opposite(got), u)
+    assert bool(((got[:, 0].double() - every).abs() == 0.5).all())
+    assert torch.equal(got[:, 1].double(), every)
 
 
+@pytest.mark.parametrize("antithetic", ["opposite", "mirrored"])
 @pytest.mark.parametrize("points", ["random", "halton"])
-def test_pairs_of_the_shader_are_those_of_the_samplers(device, points):
+def test_pairs_of_the_shader_are_those_of_the_samplers(device, points, antithetic):
     """One pair a point under even light: value over the sum of both densities, of which each is its own sample's."""
     n, seed = 20_000, 3
     g = torch.Generator().manual_seed(5)
@@ -103,39 +103,43 @@ def test_pairs_of_the_shader_are_those_of_the_samplers(device, points):
     u = random_pairs(n, seed=seed, sample=0, dimension=1, device=device)
     if points == "halton":
         u = (u + halton(1, device=device)) % 1.0
+    pair = ("visible", u), ("mirrored", u)
+    if antithetic == "opposite":
+        pair = ("visible", u), ("visible", opposite(u))
     want = torch.zeros(n, 3, device=device)
-    for lobe in ("visible", "partner"):
-        wi = sample_bsdf(wo, rough**2, u, lobe)
-        density = pdf_lobes(wo, wi, rough**2)[:, :2].sum(1, keepdim=True)
+    for lobe, numbers in pair:
+        wi = sample_bsdf(wo, rough**2, numbers, lobe)
+        lobes = pdf_lobes(wo, wi, rough**2)
+        density = sum(lobes[:, int(name == "mirrored"), None] for name, _ in pair)
         want += torch.where(wi[:, 2:] > 1e-6, eval_bsdf(wo, wi, base, rough**2, metal) * wi[:, 2:] / density, 0.0)
     env = Environment(torch.full((4, 8, 3), 0.7, device=device))
-    got = shade(up, up, up, wo, base, rough, metal, env, samples=(0, 2, 0), seed=seed, points=points)
-    assert int((u[:, 1] >= 31 / 32).sum()) > 500
+    got = shade(up, up, up, wo, base, rough, metal, env, samples=(0, 2, 0), seed=seed, points=points,
+                antithetic=antithetic)  # fmt: skip
     # sharp lobes have few digits of the half vector
     assert reference.share_within(got.cpu(), 0.7 * want.cpu()) > 0.999
 
 
-MIX = (20, 20, 20, 4)  # map, visible normals, their partners, cosine
-
-
+@pytest.mark.parametrize("antithetic", ["opposite", "mirrored"])
 @pytest.mark.parametrize("alpha, deg", chi2.MIXTURES)
-def test_the_mixture_of_all_strategies_follows_the_sum_of_their_densities(device, alpha, deg):
+def test_the_mixture_of_all_strategies_follows_the_sum_of_their_densities(device, alpha, deg, antithetic):
     """What the balance heuristic divides by: draws of every strategy in its share, invalid ones counted."""
     map_ = torch.rand(16, 32, 3, generator=torch.Generator().manual_seed(3)) ** 4
     wo, a, env = view(deg, device), torch.tensor(alpha, device=device), Environment(map_.to(device))
-    per, seed = N // sum(MIX), 10 * chi2.MIXTURES.index((alpha, deg))
-    draws = [env.sample(uniform(per * MIX[0], device, seed))[0]]
-    draws += [sample_bsdf(wo, a, uniform(per * k, device, seed + 1 + i), lobe)
-              for i, (k, lobe) in enumerate(zip(MIX[1:], ("visible", "partner", "cosine"), strict=True))]  # fmt: skip
+    per, seed = N // 64, 10 * chi2.MIXTURES.index((alpha, deg))
+    u = [uniform(per * k, device, seed + i) for i, k in enumerate((20, 20, 20, 4))]
+    partner = ("mirrored", u[2]) if antithetic == "mirrored" else ("visible", opposite(u[2]))
+    drawn = [sample_bsdf(wo, a, v, lobe) for lobe, v in (("visible", u[1]), partner, ("cosine", u[3]))]
+    draws = [env.sample(u[0])[0], *drawn]
     wi = torch.cat(draws)
     # below the horizon the map's own samples count too: the whole sphere is the domain, the lobes' share there is lost
     kept = torch.cat([torch.ones(len(draws[0]), dtype=torch.bool, device=device), torch.cat(draws[1:])[:, 2] > 1e-6])
 
-    def mixture(d, counts=MIX):
+    def mixture(d, table=20):
         lobes = pdf_lobes(wo, d, a)
-        return (counts[0] * env.pdf(d) + (lobes * lobes.new_tensor(counts[1:])).sum(-1)) / sum(MIX)
+        visible = lobes[:, 0] + lobes[:, int(antithetic == "mirrored")]
+        return (table * env.pdf(d) + (30 - table / 2) * visible + 4 * lobes[:, 2]) / 64
 
-    wrong = {"counts": lambda d: mixture(d, (21, 20, 19, 4))}
+    wrong = {"counts": lambda d: mixture(d, 21)}
     # the map's borders run through the cells: 16 midpoints a side leave some 1e-3 of a cell's mass
     chi2.check(chi2.Sphere(45 if alpha > 0.2 else 81), wi[kept], mixture, wrong, len(wi), finest=16)
 

@@ -50,7 +50,7 @@ def test_every_strategy_and_mix_converges_to_the_quadrature(device, counts, roug
         )
         args = [a.to(device) for a in args]
         light = Environment(env.radiance.to(device))
-        for extra in ({}, {"points": "random", "heuristic": "power"}, {"antithetic": False}):
+        for extra in ({}, {"points": "random", "heuristic": "power", "antithetic": "mirrored"}, {"antithetic": "none"}):
             got = shade(args[0], args[0], args[0], args[1], args[2], args[3], args[4], light, samples=counts, **extra)
             error = got.std(0) / n**0.5 + 2e-4 * truth.float().to(device)  # second term: quadrature error, 256 rows
             z = ((got.mean(0) - truth.to(device)) / error).abs().max()
@@ -235,7 +235,8 @@ def test_gradient_is_that_of_the_estimator_where_the_samples_stand_still(device,
 MEANS = [
     ((20, 40, 4), {}), ((0, 0, 64), {}), ((0, 64, 0), {}), ((20, 40, 4), {"paint": "published"}),
     ((20, 40, 4), {"heuristic": "power"}), ((20, 40, 4), {"points": "random"}),
-    ((20, 40, 4), {"antithetic": False}), ((20, 7, 0), {"heuristic": "power", "points": "random", "antithetic": False}),
+    ((20, 40, 4), {"antithetic": "none"}), ((20, 7, 0), {"antithetic": "mirrored"}),
+    ((20, 7, 0), {"heuristic": "power", "points": "random", "antithetic": "none"}),
 ]  # fmt: skip
 
 

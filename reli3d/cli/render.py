@@ -112,7 +112,7 @@ def render_files(args: argparse.Namespace) -> list[Path]:
         if args.plan is not None and frame == 0:
             plan = plan_render(parts, camera, environment, total=args.plan, seed=args.seed,
                                relative=args.format != "exr", **shown)  # fmt: skip
-            counts = {"samples": plan.samples, "antithetic": False}
+            counts = {"samples": plan.samples, "antithetic": "none"}
             print("reli3d-render: samples by strategy", *plan.samples, file=sys.stderr)
         image = render(
             parts, camera, environment if args.turn == "camera" else environment.rotated(turn), **counts, **shown,

@@ -6,7 +6,7 @@ from reli3d.kernels.bsdf import pdf_lobes
 from reli3d.kernels.envmap import lookup_envmap_uv, pdf_envmap_uv
 from reli3d.kernels.intersect import offset_origin
 from reli3d.kernels.math import CONTRACT, INLINE
-from reli3d.kernels.shade import Plan, draw_sample, make_surface, sample_value, visible_normal
+from reli3d.kernels.shade import Plan, draw_sample, make_surface, sample_value
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": f"-march=native {INLINE} {CONTRACT}"})
 
@@ -32,10 +32,8 @@ def pilot_kernel(
     i = start + wp.tid()
     surface = make_surface(plan, i, normal[i], ng[i], wo[i], base_color[i], alpha[i], metallic[i])
     count = plan.n_environment + plan.n_visible + plan.n_cosine
-    wm = wp.vec3(0.0, 0.0, 1.0)
     for s in range(count):
-        wm = visible_normal(surface, plan, points, s, wm)
-        d = draw_sample(surface, plan, points, rows, columns, row_guide, column_guide, density, s, wm)
+        d = draw_sample(surface, plan, points, rows, columns, row_guide, column_guide, density, s)
         directions[i, s] = surface.ng
         values[i, s] = wp.vec3(0.0, 0.0, 0.0)
         densities[i, s] = wp.vec3(0.0, 0.0, 0.0)

@@ -3,10 +3,9 @@
 import warp as wp
 
 from reli3d.kernels.math import INV_PI, safe_sqrt, turn_cos_sin
+from reli3d.kernels.random import TO_UNIT
 
 wp.set_module_options({"enable_backward": True, "cpu_compiler_flags": "-march=native"})
-
-TAIL = wp.constant(1.0 / 32.0)  # normals beyond 5.6 widths if seen from above; least variance of sharp metals measured
 
 
 @wp.func
@@ -33,23 +32,21 @@ def sample_cap(w: wp.vec3, u: wp.vec2) -> wp.vec3:
 
 
 @wp.func
-def partner_point(u: wp.vec2) -> wp.vec2:
-    """Numbers of an antithetic partner: its original's, but in the lobe's tail half of the tail away from them.
+def opposite(u: wp.vec2) -> wp.vec2:
+    """Numbers of the antithetic partner of the visible normal drawn with ``u``: its point of the cap is across the
+    normal, and as many points of the cap are lower as are higher than the original's.
 
-    So the rare samples far out, where the share of other strategies begins to count, do not come in twos.  Uniform
-    numbers stay uniform, and exact: the shift is a multiple of their grid.
+    Exact on the grid of the random numbers: what is uniform stays so.
     """
-    away = u[1]
-    if away >= 1.0 - TAIL:
-        away = away - 0.5 * TAIL
-        if away < 1.0 - TAIL:
-            away = away + TAIL
-    return wp.vec2(u[0], away)
+    turned = u[0] + 0.5
+    if u[0] >= 0.5:
+        turned = u[0] - 0.5
+    return wp.vec2(turned, (1.0 - TO_UNIT) - u[1])
 
 
 @wp.func
 def mirror(wm: wp.vec3) -> wp.vec3:
-    """The antithetic partner of a microfacet normal: turned by pi about the surface normal."""
+    """``wm`` turned by pi about the surface normal."""
     return wp.vec3(-wm[0], -wm[1], wm[2])
 
 
@@ -69,15 +66,3 @@ def sample_cosine_kernel(
 ):  # fmt: skip
     i = start + wp.tid()
     wi[i] = sample_cosine(u[i])
-
-
-@wp.kernel
-def partner_point_kernel(
-    start: int,
-    # in
-    u: wp.array(dtype=wp.vec2),
-    # out
-    out: wp.array(dtype=wp.vec2),
-):  # fmt: skip
-    i = start + wp.tid()
-    out[i] = partner_point(u[i])

@@ -1,8 +1,8 @@
 """Direct light of a hit by multiple importance sampling: all strategies in one loop, no per-sample arrays in memory.
 
-Strategies in the order of the sample index: environment table, visible normals (antithetic pairs: even index the
-original, odd its partner mirrored about the normal), cosine.  Every sample counts ``f L cos w / (n p)`` with the
-densities of all strategies in the weight.  A face seen from behind is shaded as its other side.
+Strategies in the order of the sample index: environment table, visible normals (in antithetic pairs: even index the
+original, odd its partner), cosine.  Every sample counts ``f L cos w / (n p)`` with the densities of all strategies in
+the weight.  A face seen from behind is shaded as its other side.
 
 ``visible`` keeps one bit a sample for the adjoint: lit, and above the horizon.  Without columns nothing is kept.
 """
@@ -24,10 +24,12 @@ from reli3d.kernels.microfacet import (
 )
 from reli3d.kernels.mis import mis_factor
 from reli3d.kernels.random import random_pair, rotate_point
-from reli3d.kernels.sampling import mirror, partner_point, reflect, sample_cosine
+from reli3d.kernels.sampling import mirror, opposite, reflect, sample_cosine
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native " + INLINE})
 
+OPPOSITE = wp.constant(1)  # how visible normals are paired; 0 is not at all
+MIRRORED = wp.constant(2)
 COS_VIEW_MIN = wp.constant(1.0e-3)  # an interpolated normal that turns away is bent until the view is this far above it
 
 
@@ -134,26 +136,20 @@ def draw_pair(
 
 
 @wp.func
-def visible_normal(
-    surface: Surface, plan: Plan, points: wp.array(dtype=wp.vec2), sample: int, last: wp.vec3
-) -> wp.vec3:
-    """Microfacet normal of a sample of the visible normals, ``last`` for those of other strategies.
-
-    The second of an antithetic pair mirrors the first's, which is the ``last``: so all samples are asked in order.  In
-    the tail of the lobe it mirrors another normal of the tail.
-    """
-    wm = last
-    k = sample - plan.n_environment
-    if k >= 0 and k < plan.n_visible:
-        second = plan.antithetic != 0 and (k & 1) == 1
-        u = draw_pair(plan, points, surface.shift_visible, surface.pixel, k >> plan.antithetic, 1)
-        own = u
-        if second:
-            own = partner_point(u)
-        if not second or own[1] != u[1]:
-            wm = sample_ggx_vndf(surface.stretched, surface.alpha, own)
-        if second:
-            wm = mirror(wm)
+def visible_normal(surface: Surface, plan: Plan, points: wp.array(dtype=wp.vec2), k: int) -> wp.vec3:
+    """Microfacet normal of the ``k``-th sample of the visible normals; both of a pair share their numbers."""
+    index = k
+    how = wp.int32(0)
+    if plan.antithetic != 0:
+        index = k >> 1
+        if (k & 1) == 1:
+            how = plan.antithetic
+    u = draw_pair(plan, points, surface.shift_visible, surface.pixel, index, 1)
+    if how == OPPOSITE:
+        u = opposite(u)
+    wm = sample_ggx_vndf(surface.stretched, surface.alpha, u)
+    if how == MIRRORED:
+        wm = mirror(wm)
     return wm
 
 
@@ -168,9 +164,8 @@ def draw_sample(
     column_guide: wp.array2d(dtype=wp.int32),
     density: wp.array2d(dtype=float),
     sample: int,
-    wm: wp.vec3,
 ) -> Draw:
-    """Sample ``sample`` of a hit; a direction below the horizon has factor 0.  wm: its :func:`visible_normal`."""
+    """Sample ``sample`` of a hit; a direction below the horizon has factor 0."""
     out = Draw()
     wi = wp.vec3(0.0, 0.0, 0.0)
     uv = wp.vec2(0.0, 0.0)
@@ -188,8 +183,9 @@ def draw_sample(
         if k < plan.n_visible:
             strategy = 1
             count = plan.n_visible
-            if plan.antithetic != 0 and (k & 1) == 1:
+            if plan.antithetic == MIRRORED and (k & 1) == 1:
                 strategy = 2
+            wm = visible_normal(surface, plan, points, k)
             if wp.dot(surface.wo, wm) > COS_MIN:
                 wi = reflect(surface.wo, wm)
         else:
@@ -203,11 +199,13 @@ def draw_sample(
     if wi[2] > COS_MIN:
         out.facet = facet_between(surface.wo, wi, surface.alpha, surface.root_o)
         lobes = pdf_lobes(out.facet, surface.wo, wi)
-        partners = float(plan.antithetic * (plan.n_visible // 2))
+        mirrored = wp.float32(0.0)  # only their density is another one
+        if plan.antithetic == MIRRORED:
+            mirrored = float(plan.n_visible // 2)
         all = wp.vec4(
             float(plan.n_environment) * pdf_envmap_uv(density, uv),
-            (float(plan.n_visible) - partners) * lobes[0],
-            partners * lobes[1],
+            (float(plan.n_visible) - mirrored) * lobes[0],
+            mirrored * lobes[1],
             float(plan.n_cosine) * lobes[2],
         )
         own = all[0]  # not all[strategy], which would send the vector through memory
@@ -255,10 +253,8 @@ def shade_kernel(
     total = wp.vec3(0.0, 0.0, 0.0)
     word = wp.int32(0)
     count = plan.n_environment + plan.n_visible + plan.n_cosine
-    wm = wp.vec3(0.0, 0.0, 1.0)
     for s in range(count):
-        wm = visible_normal(surface, plan, points, s, wm)
-        d = draw_sample(surface, plan, points, rows, columns, row_guide, column_guide, density, s, wm)
+        d = draw_sample(surface, plan, points, rows, columns, row_guide, column_guide, density, s)
         if d.factor > 0.0:
             lit = wp.bool(True)
             if shadows != 0:

@@ -12,7 +12,7 @@ from reli3d.kernels.bsdf import F0_DIELECTRIC, base_reflectance, coat_cosine, ev
 from reli3d.kernels.envmap import add_texels, lookup_envmap_uv
 from reli3d.kernels.math import CONTRACT, INLINE, INV_PI
 from reli3d.kernels.microfacet import ALPHA_MIN, Facet, smith_visibility
-from reli3d.kernels.shade import COS_VIEW_MIN, Plan, draw_sample, make_surface, visible_normal
+from reli3d.kernels.shade import COS_VIEW_MIN, Plan, draw_sample, make_surface
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": f"-march=native {INLINE} {CONTRACT}"})
 
@@ -123,11 +123,9 @@ def shade_adjoint_kernel(
     surface = make_surface(plan, pixels[i], normal[i], ng[i], wo[i], base_color[i], alpha[i], metallic[i])
     total = SurfaceGradient()
     g = g_out[i]
-    wm = wp.vec3(0.0, 0.0, 1.0)
     for s in range(plan.n_environment + plan.n_visible + plan.n_cosine):
-        wm = visible_normal(surface, plan, points, s, wm)
         if (visible[i, s // 32] >> (s & 31)) & 1 != 0:
-            d = draw_sample(surface, plan, points, rows, columns, row_guide, column_guide, density, s, wm)
+            d = draw_sample(surface, plan, points, rows, columns, row_guide, column_guide, density, s)
             if d.factor > 0.0:  # one in the horizon may have been above it as the forward kernel rounds
                 light = lookup_envmap_uv(radiance, d.uv)
                 value = eval_bsdf(d.facet, surface.wo, d.wi, surface.base_color, surface.alpha, surface.metallic,

@@ -6,7 +6,7 @@ from reli3d.kernels.embree import block_rays
 from reli3d.kernels.envmap import lookup_envmap_uv
 from reli3d.kernels.intersect import offset_origin
 from reli3d.kernels.math import CONTRACT, INLINE
-from reli3d.kernels.shade import Plan, draw_sample, make_surface, sample_value, visible_normal
+from reli3d.kernels.shade import Plan, draw_sample, make_surface, sample_value
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": f"-march=native {INLINE} {CONTRACT}"})
 
@@ -29,10 +29,8 @@ def shade_rays_kernel(
     i = first + j
     surface = make_surface(plan, pixels[i], normal[i], ng[i], wo[i], base_color[i], alpha[i], metallic[i])
     count = plan.n_environment + plan.n_visible + plan.n_cosine
-    wm = wp.vec3(0.0, 0.0, 1.0)
     for s in range(count):
-        wm = visible_normal(surface, plan, points, s, wm)
-        d = draw_sample(surface, plan, points, rows, columns, row_guide, column_guide, density, s, wm)
+        d = draw_sample(surface, plan, points, rows, columns, row_guide, column_guide, density, s)
         k = j * count + s
         t_max[k] = -1.0
         if d.factor > 0.0:

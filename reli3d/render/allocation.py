@@ -27,7 +27,7 @@ BLOCK = 1 << 17  # samples times candidates evaluated at once: arrays of 1 MB
 
 @dataclass(frozen=True)
 class SamplePlan:
-    """Counts ``samples`` for :func:`reli3d.render.shading.shade` with ``antithetic=False``, and what they should give.
+    """Counts ``samples`` for :func:`reli3d.render.shading.shade` with ``antithetic="none"``, and what they should give.
 
     variance: of a point's radiance with independent samples, summed over the channels, mean over the points; over its
     squared radiance where the plan is ``relative``.
@@ -148,7 +148,7 @@ def _draw(
     none.
     """
     n, count, device, samples = len(values[0]), 3 * each, values[0].device, (each, each, each)
-    plan, offsets = sampling_plan(samples, seed, False, "balance", "halton", paint, None, scene)
+    plan, offsets = sampling_plan(samples, seed, "none", "balance", "halton", paint, None, scene)
     table = environment.table
     light = [(environment.radiance.contiguous(), wp.vec3), *table.sampler, (table.density, wp.float32)]
     points = zip([v.contiguous() for v in values], [wp.vec3] * 5 + [wp.float32] * 2)
@@ -169,7 +169,7 @@ def _tried(values: list[Tensor], share: Tensor, environment: Environment, counts
     """Variance of a point, mean by ``share (P,)``, that :func:`reli3d.render.shading.shade` has with ``counts``."""
     runs = TRIED // len(share)
     many = [v.repeat(runs, *[1] * (v.ndim - 1)) for v in values]
-    drawn = shade(*many, environment, samples=_whole(counts), antithetic=False, alpha="linear", **options)
+    drawn = shade(*many, environment, samples=_whole(counts), antithetic="none", alpha="linear", **options)
     return float(share @ drawn.double().unflatten(0, (runs, -1)).var(0).sum(1))
 
 

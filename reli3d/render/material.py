@@ -11,7 +11,7 @@ from torch import Tensor
 
 from reli3d._bridge import call, check, empty, launch
 from reli3d.kernels import bsdf as kernels
-from reli3d.render.sampling import mirror, partner_point, reflect, sample_cosine, sample_ggx_vndf
+from reli3d.render.sampling import mirror, reflect, sample_cosine, sample_ggx_vndf
 
 PAINTS = ("conserving", "published")  # what the coat leaves to the paint: reli3d.kernels.bsdf
 
@@ -54,7 +54,7 @@ def eval_bsdf(
 
 
 def pdf_lobes(wo: Tensor, wi: Tensor, alpha: Tensor) -> Tensor:
-    """Densities ``(..., 3)`` [1/sr] at ``wi`` of visible-normal reflection, its antithetic partner and the cosine.
+    """Densities ``(..., 3)`` [1/sr] at ``wi`` of reflection at a visible normal, at a mirrored one, and the cosine.
 
     wo, wi: ``(..., 3)`` unit.  alpha: ``(...)``.  No gradient.
     """
@@ -68,18 +68,18 @@ def pdf_lobes(wo: Tensor, wi: Tensor, alpha: Tensor) -> Tensor:
 def sample_bsdf(wo: Tensor, alpha: Tensor, u: Tensor, lobe: str = "visible") -> Tensor:
     """Directions to the light ``(..., 3)`` for uniform ``u (..., 2)``; density: that column of :func:`pdf_lobes`.
 
-    lobe: ``visible`` (reflection at a visible normal), ``partner`` (at that normal mirrored about the surface normal,
-    or at another of the lobe's tail if it lies there: :func:`~reli3d.render.sampling.partner_point`) or ``cosine``.  A
-    direction below the horizon, or a partner that faces away from ``wo``, has value and density 0.
+    lobe: ``visible`` (reflection at a visible normal), ``mirrored`` (at that normal mirrored about the surface normal)
+    or ``cosine``.  A direction below the horizon, or a mirrored normal that faces away from ``wo``, has value and
+    density 0.  Antithetic partners are ``visible`` with :func:`~reli3d.render.sampling.opposite` of ``u``, or, as
+    published, ``mirrored`` with ``u``.
     Gradients reach ``wo`` and ``alpha``.
     """
     if lobe == "cosine":
         return sample_cosine(u).expand(*torch.broadcast_shapes(wo.shape[:-1], alpha.shape, u.shape[:-1]), 3)
-    if lobe not in ("visible", "partner"):
-        raise ValueError(f"lobe: expected visible, partner or cosine, got {lobe}")
-    if lobe == "visible":
-        return reflect(wo, sample_ggx_vndf(wo, alpha, u))
-    wm = mirror(sample_ggx_vndf(wo, alpha, partner_point(u)))
+    wm = sample_ggx_vndf(wo, alpha, u)
+    if choice("lobe", lobe, ("visible", "mirrored", "cosine")) == 0:
+        return reflect(wo, wm)
+    wm = mirror(wm)
     wi = reflect(wo, wm)
     away = (wo * wm).sum(-1, keepdim=True) <= 0.0
     return torch.where(away, torch.stack([wi[..., 0], wi[..., 1], -wi[..., 2].abs()], -1), wi)

@@ -48,7 +48,7 @@ def render(
     samples: tuple[int, int, int] = SAMPLES,
     supersampling: int = 1,
     seed: int = 0,
-    antithetic: bool = True,
+    antithetic: str = "opposite",
     shadows: bool = True,
     background: str = "transparent",
     scene: RayScene | None = None,
@@ -100,7 +100,7 @@ def plan_render(
     paint: str = "conserving",
     relative: bool = False,
 ) -> SamplePlan:
-    """Counts of ``total`` samples for :func:`render` of this view, to be given to it with ``antithetic=False``.
+    """Counts of ``total`` samples for :func:`render` of this view, to be given to it with ``antithetic="none"``.
 
     Arguments as for :func:`render`; relative: as for :func:`reli3d.render.allocation.plan_samples`, which plans for
     points among those that 32768 rays of the camera hit.  No gradient.  Raises ValueError without any environment and

@@ -62,21 +62,19 @@ def pdf_ggx_vndf(wo: Tensor, alpha: Tensor, wm: Tensor) -> Tensor:
     return pdf.reshape(batch)
 
 
-def partner_point(u: Tensor) -> Tensor:
-    """Numbers ``(..., 2)`` of the antithetic partners of samples drawn with ``u (..., 2)``.  No gradient.
+def opposite(u: Tensor) -> Tensor:
+    """Numbers ``(..., 2)`` of the antithetic partners of visible normals drawn with ``u (..., 2)``.
 
-    ``u`` itself, but where its second is in the last 32nd (the lobe's tail) that moves half of the 32nd on, round to
-    its begin: rare samples far out do not come in twos.  Uniform if ``u`` is.
+    The first is half a turn on, the second counts from the other end, exactly if ``u`` are multiples of 2^-24: uniform
+    if ``u`` is.  So the partner leans to the other side, and far where its original leans little.
     """
     check("u", u, last=2)
-    flat = u.detach().reshape(-1, 2).contiguous()
-    out = empty((flat.shape[0],), wp.vec2, u.device)
-    launch(kernels.partner_point_kernel, flat.shape[0], [(flat, wp.vec2), (out, wp.vec2)], u.device)
-    return out.reshape(u.shape)
+    turn, height = u.unbind(-1)
+    return torch.stack([torch.where(turn < 0.5, turn + 0.5, turn - 0.5), (1.0 - 2.0**-24) - height], -1)
 
 
 def mirror(wm: Tensor) -> Tensor:
-    """Microfacet normals ``(..., 3)`` turned by pi about the surface normal, as antithetic partners are."""
+    """Microfacet normals ``(..., 3)`` turned by pi about the surface normal."""
     check("wm", wm, last=3)
     return wm * wm.new_tensor([-1.0, -1.0, 1.0])
 

@@ -38,7 +38,7 @@ def shade(
     samples: tuple[int, int, int] = SAMPLES,
     scene: RayScene | None = None,
     seed: int = 0,
-    antithetic: bool = True,
+    antithetic: str = "opposite",
     heuristic: str = "balance",
     points: str = "halton",
     alpha: str = "squared",
@@ -52,12 +52,13 @@ def shade(
     ``(N, 3)`` LINEAR.  roughness, metallic: ``(N,)`` in [0, 1].  A face seen from behind is shaded as its other side.
 
     samples: counts from the environment table, from visible normals and from the cosine; zero is allowed.  scene: mesh
-    that casts shadows, None for none.  antithetic: visible normals in pairs, the partner mirrored about the normal (in
-    the lobe's tail another one, mirrored: :func:`reli3d.render.sampling.partner_point`), weighted with its own density.
-    heuristic: ``balance`` or ``power``.  points: ``halton`` (rotated per point and strategy) or ``random``.  alpha: GGX
-    width from roughness, ``squared`` or, as in the published model's shader, ``linear``.  paint: what the coat leaves
-    to the paint, ``conserving`` or ``published``, as in :func:`reli3d.render.material.eval_bsdf`.  clamp: largest value
-    of one sample times its strategy's count, per channel.
+    that casts shadows, None for none.  antithetic: how visible normals are paired, ``opposite`` (the partner across the
+    lobe, :func:`reli3d.render.sampling.opposite`), ``mirrored`` (about the normal, as published, but weighted with its
+    own density) or ``none``.  heuristic: ``balance`` or ``power``.  points: ``halton`` (rotated per point and strategy)
+    or ``random``.  alpha: GGX width from roughness, ``squared`` or, as in the published model's shader, ``linear``.
+    paint: what the coat leaves to the paint, ``conserving`` or ``published``, as in
+    :func:`reli3d.render.material.eval_bsdf`.  clamp: largest value of one sample times its strategy's count, per
+    channel.
 
     pixels: ``(N,)`` int32 counters of the random numbers, by default the row.
 
@@ -114,7 +115,7 @@ def shade_light(
     does not depend on it.  No gradient.
     """
     n = check_hits(position, normal, ng, wo, base_color, roughness, metallic, proposal)
-    plan, offsets = sampling_plan(samples, seed, True, "balance", points, paint, None, scene)
+    plan, offsets = sampling_plan(samples, seed, "opposite", "balance", points, paint, None, scene)
     device, count, table = position.device, sum(samples), proposal.table
     pixels = torch.arange(n, dtype=torch.int32, device=device)
     tables = [*table.sampler, (table.density, wp.float32), (offsets.to(device), wp.vec2)]
@@ -252,7 +253,7 @@ def sampling_plan(samples, seed, antithetic, heuristic, points, paint, clamp, sc
         raise ValueError(f"clamp: expected a positive number or None, got {clamp}")
     plan = kernels.Plan()
     plan.n_environment, plan.n_visible, plan.n_cosine = (int(k) for k in samples)
-    plan.antithetic = int(antithetic)
+    plan.antithetic = choice("antithetic", antithetic, ("none", "opposite", "mirrored"))
     plan.power = choice("heuristic", heuristic, ("balance", "power"))
     plan.rotate = 1 - choice("points", points, ("halton", "random"))
     plan.conserving = int(choice("paint", paint, PAINTS) == 0)
