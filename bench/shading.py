@@ -209,7 +209,7 @@ def equal_variance(say) -> None:
 # Floating-point operations of a sample above the horizon in ``reli3d.kernels.shade``, counted by hand from the source:
 # sums, products, quotients, roots, minima, roundings, one each; no integers (random numbers, table search), no choices.
 OPERATIONS = {
-    "direction and place on the map": 116,  # table 102, visible normal 123 (half of them mirrored), cosine 121; 20:40:4
+    "direction and place on the map": 132,  # table 102, visible normal 148, cosine 121; 20:40:4
     "facet and GGX": 38,
     "densities and weight": 21,
     "light": 37,
