@@ -17,7 +17,7 @@ from reli3d.kernels.microfacet import (
     Facet,
     facet_between,
     ggx_root,
-    pdf_vndf_partner,
+    pdf_vndf_mirrored,
     pdf_vndf_reflection,
     smith_visibility,
 )
@@ -70,8 +70,8 @@ def eval_bsdf(
 
 @wp.func
 def pdf_lobes(facet: Facet, wo: wp.vec3, wi: wp.vec3) -> wp.vec3:
-    """Densities [1/sr] of the material strategies at ``wi``: visible normals, their mirrored partners, cosine."""
-    return wp.vec3(pdf_vndf_reflection(facet, wo), pdf_vndf_partner(facet, wo), pdf_cosine(wi))
+    """Densities [1/sr] of the material strategies at ``wi``: visible normals, mirrored ones, cosine."""
+    return wp.vec3(pdf_vndf_reflection(facet, wo), pdf_vndf_mirrored(facet, wo), pdf_cosine(wi))
 
 
 @wp.kernel

@@ -105,7 +105,7 @@ def pdf_vndf_reflection(facet: Facet, wo: wp.vec3) -> float:
 
 
 @wp.func
-def pdf_vndf_partner(facet: Facet, wo: wp.vec3) -> float:
+def pdf_vndf_mirrored(facet: Facet, wo: wp.vec3) -> float:
     """Density [1/sr of ``wi``] of ``wo`` reflected at the mirrored visible normal: pdf_ggx_vndf(mirror(wm)) / (4
     wo.wm).
 

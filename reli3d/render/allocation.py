@@ -78,7 +78,7 @@ def plan_samples(
     best mixture, both are tried as they will be drawn, at 1024 points, and a gain below a tenth leaves the one.
     A plan is for images.  For fits the published counts are better: what a plan leaves out may hold the slopes (those
     in a normal get up to 10^4 times the variance, docs/renderer.md), and the environment table alone gives black texels
-    no gradient.  Visible normals are independent in a plan: pairs (``antithetic``) are for slopes, too.
+    no gradient.  Visible normals are not paired in a plan, whose points are even without.
 
     No gradient.  The result depends on the inputs and ``seed`` alone.  Raises TypeError for a wrong dtype, ValueError
     for a shape, device, count, choice or a value that is not finite.
