@@ -177,7 +177,7 @@ def test_bad_input_is_named(device):
         ({"normal": normal.double()}, TypeError, "normal"), ({"roughness": one[:3]}, ValueError, "roughness"),
         ({"samples": (1, 2)}, ValueError, "samples"), ({"samples": (-1, 2, 3)}, ValueError, "samples"),
         ({"heuristic": "x"}, ValueError, "heuristic"), ({"clamp": 0.0}, ValueError, "clamp"),
-        ({"paint": "white"}, ValueError, "paint"),
+        ({"paint": "white"}, ValueError, "paint"), ({"antithetic": True}, ValueError, "antithetic"),
         ({"pixels": torch.arange(3, dtype=torch.int32, device=device)}, ValueError, "pixels"),
     ]:  # fmt: skip
         with pytest.raises(kind, match=f"{name}: expected"):
