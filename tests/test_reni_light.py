@@ -100,7 +100,7 @@ def surfaces(n, device):
 def test_shading_that_asks_a_map_is_shading_by_the_map(device, backend):
     """The same samples; one adds them in its kernel, the other in torch.
 
-    On a border of texels, to rounding, a sample has the density of either side: 0.2 samples are due that lie so.
+    Not those of seed 5: one of them is 2e-6 of a texel beside a border, where the density is either side's.
     """
     generator = torch.Generator().manual_seed(4)
     light = Environment(torch.rand(16, 32, 3, generator=generator).to(device) * 3.0)
@@ -110,13 +110,11 @@ def test_shading_that_asks_a_map_is_shading_by_the_map(device, backend):
         scene = RayScene(triangle, torch.tensor([[0, 1, 2]], dtype=torch.int32, device=device), backend=backend)
     args = surfaces(500, device)
     for paint in PAINTS:
-        got, wanted = (shade_light(*args, light, light, scene=scene, seed=5, paint=paint),
-                       shade(*args, light, scene=scene, seed=5, paint=paint))  # fmt: skip
-        same = torch.isclose(got, wanted, rtol=1e-4, atol=1e-5).all(1)  # 64 numbers in another order
-        assert int((~same).sum()) <= 1
-        torch.testing.assert_close(got, wanted, rtol=1e-2, atol=0)
+        got, wanted = (shade_light(*args, light, light, scene=scene, seed=6, paint=paint),
+                       shade(*args, light, scene=scene, seed=6, paint=paint))  # fmt: skip
+        torch.testing.assert_close(got, wanted, rtol=1e-4, atol=1e-5)  # 64 numbers in another order
     if backend:
-        assert (wanted - shade(*args, light, seed=5, paint=paint)).abs().max() > 0.1  # the triangle is in the way
+        assert (wanted - shade(*args, light, seed=6, paint=paint)).abs().max() > 0.1  # the triangle is in the way
 
 
 def test_shading_by_a_latent_is_shading_by_its_fine_map(device):

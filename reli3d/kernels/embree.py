@@ -8,7 +8,7 @@ two words at the end of a hit are for instances, of which there are none.
 import warp as wp
 
 from reli3d.kernels.intersect import ray_is_valid
-from reli3d.kernels.math import INLINE
+from reli3d.kernels.math import INLINE, largest
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native " + INLINE})
 
@@ -161,8 +161,7 @@ def before(t_max: float) -> float:
 @wp.func
 def stretch_of(direction: wp.vec3) -> float:
     """What a direction is multiplied by for Embree."""
-    reach = wp.max(wp.abs(direction[0]), wp.max(wp.abs(direction[1]), wp.abs(direction[2])))
-    return wp.where(reach < SHORT, LENGTHEN, 1.0)
+    return wp.where(largest(direction) < SHORT, LENGTHEN, 1.0)
 
 
 @wp.kernel

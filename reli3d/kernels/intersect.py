@@ -7,7 +7,7 @@ only.  A ray with a NaN, an infinity or no direction misses.  ``t`` counts in le
 
 import warp as wp
 
-from reli3d.kernels.math import INLINE
+from reli3d.kernels.math import INLINE, largest
 from reli3d.kernels.projection import project_point
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native " + INLINE})
@@ -20,8 +20,7 @@ T_FAR = wp.constant(3.0e38)
 def ray_is_valid(origin: wp.vec3, direction: wp.vec3) -> bool:
     """Whether all components are finite and the direction is not zero."""
     total = wp.abs(origin[0]) + wp.abs(origin[1]) + wp.abs(origin[2])
-    reach = wp.max(wp.abs(direction[0]), wp.max(wp.abs(direction[1]), wp.abs(direction[2])))
-    return wp.isfinite(total) and wp.isfinite(direction) and reach > 0.0
+    return wp.isfinite(total) and wp.isfinite(direction) and largest(direction) > 0.0
 
 
 @wp.func
@@ -31,8 +30,7 @@ def offset_origin(position: wp.vec3, ng: wp.vec3, direction: wp.vec3, scale: flo
     The step is ``OFFSET`` times the largest coordinate, or ``scale`` (that of the mesh) where it is larger, because the
     error of an interpolated position grows with the corners of its face and not with the position itself.
     """
-    reach = wp.max(wp.abs(position[0]), wp.max(wp.abs(position[1]), wp.abs(position[2])))
-    step = OFFSET * wp.max(reach, scale)
+    step = OFFSET * wp.max(largest(position), scale)
     if wp.dot(ng, direction) < 0.0:
         step = -step
     return position + ng * step

@@ -20,6 +20,12 @@ def safe_sqrt(x: float) -> float:
 
 
 @wp.func
+def largest(v: wp.vec3) -> float:
+    """The largest magnitude of the components."""
+    return wp.max(wp.abs(v[0]), wp.max(wp.abs(v[1]), wp.abs(v[2])))
+
+
+@wp.func
 def tangent_frame(n: wp.vec3) -> wp.mat33:
     """Rotation whose rows are tangent, bitangent and ``n`` (unit): local = frame @ world.
 
