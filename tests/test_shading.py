@@ -311,7 +311,7 @@ def test_memory_does_not_grow_with_samples(device, shadows):
             torch.autograd.grad(out.sum(), inputs)
 
         step()  # what is made once
-        peaks = [peak_bytes(step, device) for _ in range(2)]
+        peaks = [peak_bytes(step, device) for _ in range(6)]  # what the allocator happens to hold only adds
         return pytest.skip("the system does not tell the peak of memory") if None in peaks else min(peaks)
 
     threads, words = torch.get_num_threads(), 2048 * (1024 - 64) // 32 * 4
