@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-VERSION, RAY_PACKETS = 0, 34  # device properties: 40400 is 4.4.0; 16 rays at once
+VERSION = 0  # device property: 40400 is 4.4.0
 TRIANGLES, ROBUST = 0, 1 << 2
 INDEX, VERTEX = (0, 0x5003), (1, 0x9003)  # kind of buffer and format of its items: 3 unsigned, 3 float
 POINTER, SIZE = ctypes.c_void_p, ctypes.c_size_t
@@ -52,13 +52,16 @@ def _embree() -> tuple[ctypes.CDLL, int]:
         function.restype, function.argtypes = result, arguments
     device = library.rtcNewDevice(None)
     version = library.rtcGetDeviceProperty(device, VERSION) if device else 0
-    if version // 10000 != 4 or not library.rtcGetDeviceProperty(device, RAY_PACKETS):
-        raise ImportError(f"embreex: expected Embree 4 with packets of 16 rays, got version number {version}")
+    if version // 10000 != 4:
+        raise ImportError(f"embreex: expected Embree 4, got version number {version}")
     return library, device
 
 
 def query(name: str) -> int:
-    """Address of ``rtcIntersect1``, ``rtcOccluded1`` or ``rtcOccluded16``, for a kernel."""
+    """Address of ``rtcIntersect1``, ``rtcOccluded1`` or ``rtcOccluded16``, for a kernel.
+
+    A processor without vectors of 16 floats takes the packet too: Embree then traces its rays one by one.
+    """
     return ctypes.cast(getattr(_embree()[0], name), POINTER).value
 
 
