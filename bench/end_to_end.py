@@ -7,10 +7,10 @@ import time
 from importlib import resources
 from pathlib import Path
 
-from reli3d.data.folder import load_views
 from reli3d.io.glb import write_glb
 from reli3d.nn.weights import load_model
 from reli3d.pipeline import reconstruct
+from reli3d.views.folder import load_views
 
 
 def example() -> Path:

@@ -6,7 +6,7 @@ every call; ``half`` and ``bfloat16`` are the storage of our planes, sums are fl
 
 import torch
 
-from reli3d.triplane import sample_triplane
+from reli3d.geometry.triplane import sample_triplane
 
 
 def grid_sample(planes, points):

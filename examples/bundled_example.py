@@ -12,14 +12,14 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from reli3d.data.procedural import example_object, sample_cameras
-from reli3d.data.synthesis import EXPOSED, PAINT, ObjectSurface
 from reli3d.io.images import write_png
 from reli3d.nn.reni import map_directions
 from reli3d.render.camera import Camera, camera_rays
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
 from reli3d.render.shading import shade
+from reli3d.synthetic.procedural import example_object, sample_cameras
+from reli3d.synthetic.samples import EXPOSED, PAINT, ObjectSurface
 
 SIZE, SUBPIXELS, VIEWS = 512, 2, 4
 SAMPLES = (24, 24, 4)

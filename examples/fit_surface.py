@@ -26,7 +26,8 @@ import torch
 import trimesh
 from torch import Tensor
 
-from reli3d.data.distance import signed_distance
+from reli3d.geometry.distance import signed_distance
+from reli3d.geometry.hits import evaluate_hits, interpolate
 from reli3d.geometry.hull import hull_distance, mask_distance
 from reli3d.geometry.mesh import Mesh, report, vertex_normals
 from reli3d.geometry.rays import RayScene
@@ -34,7 +35,7 @@ from reli3d.geometry.regularize import sign_entropy, vertex_deviation
 from reli3d.geometry.surface import extract_surface
 from reli3d.io.images import write_png
 from reli3d.render.camera import Camera, look_at
-from reli3d.render.gbuffer import evaluate_hits, interpolate, primary_hits
+from reli3d.render.gbuffer import primary_hits
 from reli3d.render.silhouette import antialias, mesh_edges
 
 RADIUS = 1.0  # of the grid's box

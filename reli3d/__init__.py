@@ -7,12 +7,12 @@ both a subpackage and a function.
 
 from importlib import import_module
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 _HOME = {
     "reconstruct": "reli3d.pipeline",
-    "load_views": "reli3d.data.folder",
-    "Views": "reli3d.data.views",
+    "load_views": "reli3d.views.folder",
+    "Views": "reli3d.views.views",
     "Camera": "reli3d.render.camera",
     "Environment": "reli3d.render.environment",
     "Asset": "reli3d.render.asset",
@@ -23,7 +23,7 @@ _HOME = {
     "extract_surface": "reli3d.geometry.surface",
     "unwrap": "reli3d.geometry.uv",
     "bake": "reli3d.geometry.bake",
-    "sample_triplane": "reli3d.triplane",
+    "sample_triplane": "reli3d.geometry.triplane",
     "write_glb": "reli3d.io.glb",
     "read_glb": "reli3d.io.glb",
 }

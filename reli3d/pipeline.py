@@ -11,9 +11,6 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from reli3d.data.normalize import Similarity, normalize
-from reli3d.data.published_views import background_shown, hero_first, published_views
-from reli3d.data.views import ViewBatch, Views
 from reli3d.geometry.bake import bake
 from reli3d.geometry.cover import cover_silhouettes
 from reli3d.geometry.hull import mask_distance
@@ -34,10 +31,10 @@ from reli3d.nn.field import (
     surface_material,
 )
 from reli3d.nn.heads import deformation
+from reli3d.nn.light_features import Shading
 from reli3d.nn.model import Code, Reconstructor
 from reli3d.nn.presets import Preset
 from reli3d.nn.reni import map_directions
-from reli3d.nn.shading import Shading
 from reli3d.nn.view_features import ViewMaps
 from reli3d.nn.weights import load_model
 from reli3d.render.asset import Asset, TextureSet
@@ -45,6 +42,10 @@ from reli3d.render.bump import radial_bump
 from reli3d.render.camera import Camera
 from reli3d.render.environment import Environment
 from reli3d.render.exposure import photograph_ratio
+from reli3d.views.normalize import normalize
+from reli3d.views.published_views import background_shown, hero_first, published_views
+from reli3d.views.similarity import Similarity
+from reli3d.views.views import ViewBatch, Views
 
 DETAIL = 512  # pixels of the views that colours and silhouettes are read from; the network's own input is smaller
 INSIDE = 2.0  # pixels of such a view that a silhouette's edge may spill over
@@ -298,13 +299,13 @@ def reconstruct(views: Views, *, weights: str | Reconstructor = "small", device:
                 timings: dict[str, float] | None = None, progress=None) -> Asset:  # fmt: skip
     """A relightable asset from posed photographs of one object.
 
-    views: 1 to 16, the first is the hero (see :func:`reli3d.data.folder.load_views`).  weights: ``small`` (in the
+    views: 1 to 16, the first is the hero (see :func:`reli3d.views.folder.load_views`).  weights: ``small`` (in the
     package), a safetensors file, or a loaded :class:`~reli3d.nn.model.Reconstructor`.  texture_size: 256 to 4096
     texels. resolution: cubes a side of the surface grid, default the preset's.  normalization: ``auto``, ``hull``,
     ``none``, or the map from the input frame to the model's; default :func:`default_normalization`.  frame: ``input``
     (that of the cameras) or ``model``.  up: the axis of that frame that shall become +Y.  hero: index of another view
     that comes first, or ``random``.  background: ``masked``, ``visible`` or ``auto``, see
-    :func:`~reli3d.data.published_views.background_shown`.  timings: filled with seconds of each stage.  progress:
+    :func:`~reli3d.views.published_views.background_shown`.  timings: filled with seconds of each stage.  progress:
     called with the name of each stage.  The same input and seed give the same asset.  Raises ValueError on options
     out of range and where the masks hold no object, NoSurface where the field holds none.
     """

@@ -16,12 +16,14 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from reli3d.geometry import projection
+from reli3d.geometry.hits import evaluate_hits, hit_normals, interpolate
 from reli3d.geometry.mesh import Mesh, vertex_normals
 from reli3d.geometry.rays import Hits, RayScene
 from reli3d.geometry.regularize import sign_entropy, vertex_deviation
 from reli3d.geometry.smooth import taubin_smooth
 from reli3d.geometry.surface import extract_surface
 from reli3d.geometry.tangents import decode_normals, encode_normals
+from reli3d.geometry.triplane import sample_triplane
 from reli3d.render import color, gbuffer, material, sampling
 from reli3d.render.asset import TextureSet
 from reli3d.render.bump import radial_bump, world_bump
@@ -31,7 +33,6 @@ from reli3d.render.gaussians import SphericalGaussians, shade_gaussians
 from reli3d.render.shading import shade
 from reli3d.render.silhouette import antialias
 from reli3d.render.volume import RaySamples, composite
-from reli3d.triplane import sample_triplane
 
 N = 5200  # rows: five slices of a CPU launch
 
@@ -112,7 +113,7 @@ def reevaluate(vertices, origins, directions):
     n = len(origins)
     faces, face = soup(vertices, n)
     hits = Hits(face, origins.new_ones(n), origins.new_zeros(n, 2))
-    hits = gbuffer.evaluate_hits(vertices, faces, hits, origins, directions)
+    hits = evaluate_hits(vertices, faces, hits, origins, directions)
     return hits.t, hits.bary
 
 
@@ -236,10 +237,10 @@ GRID = ("level", "deformation", "alpha", "beta")
 CASES = {
     "interpolate": Case(
         lambda n: {"values": uniform(180, 3, seed=1), "bary": weights(n)},
-        lambda values, bary: (gbuffer.interpolate(values, *soup(values, len(bary)), bary),), ("values", "bary"),
+        lambda values, bary: (interpolate(values, *soup(values, len(bary)), bary),), ("values", "bary"),
         ("bary",)),
     "hit_normals": Case(
-        lambda n: {"vertices": corners(60)}, lambda vertices: (gbuffer.hit_normals(vertices, *soup(vertices, N)),),
+        lambda n: {"vertices": corners(60)}, lambda vertices: (hit_normals(vertices, *soup(vertices, N)),),
         ("vertices",)),
     "evaluate_hits": Case(aimed, reevaluate, ("vertices", "origins", "directions"), ("origins", "directions")),
     "sample_texture": Case(

@@ -7,11 +7,12 @@ from torch.nn.functional import normalize
 
 from reli3d.geometry import bake, hull, projection
 from reli3d.geometry.cover import cover_silhouettes
+from reli3d.geometry.hits import interpolate
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene, offset_origin
 from reli3d.geometry.tangents import vertex_tangents
 from reli3d.geometry.visibility import visible_from
-from reli3d.render import gbuffer, material, sampling
+from reli3d.render import material, sampling
 from reli3d.render.environment import Environment
 from reli3d.render.reni_light import ReniLight
 from reli3d.render.shading import shade_light
@@ -121,7 +122,7 @@ def asked_of_reni(directions):
 
 
 def four(values, bary):
-    return (gbuffer.interpolate(values, *soup(values, len(bary)), bary),)
+    return (interpolate(values, *soup(values, len(bary)), bary),)
 
 
 CASES = {

@@ -11,17 +11,18 @@ import pytest
 import torch
 from torch import Tensor
 
+from reli3d.geometry.hits import interpolate
 from reli3d.geometry.mesh import Mesh, face_normals, vertex_normals
 from reli3d.geometry.regularize import vertex_deviation
 from reli3d.geometry.smooth import taubin_smooth
 from reli3d.geometry.surface import extract_surface
+from reli3d.geometry.triplane import sample_triplane
 from reli3d.render.asset import TextureSet
 from reli3d.render.color import srgb_to_linear
 from reli3d.render.gaussians import SphericalGaussians, shade_gaussians
-from reli3d.render.gbuffer import interpolate, sample_texture, surface_points
+from reli3d.render.gbuffer import sample_texture, surface_points
 from reli3d.render.material import sample_bsdf
 from reli3d.render.sampling import pdf_ggx_vndf
-from reli3d.triplane import sample_triplane
 from tests import op_cases, reference, reference_surface
 from tests.reference_surface import random_weights, torus
 from tests.test_smooth import sheet

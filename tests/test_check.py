@@ -4,8 +4,8 @@ import pytest
 import torch
 from PIL import Image
 
-from reli3d.data.check import explain_cameras, rig_picture
-from reli3d.data.folder import load_views
+from reli3d.views.check import explain_cameras, rig_picture
+from reli3d.views.folder import load_views
 from tests.rigs import sphere_views
 
 FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))

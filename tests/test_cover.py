@@ -9,13 +9,13 @@ from torch.nn.functional import grid_sample, max_pool2d
 
 import reli3d
 from reli3d import pipeline
-from reli3d.data.folder import load_views
 from reli3d.geometry.cover import DEPTH, REACH, STRIDE, cover_silhouettes
 from reli3d.geometry.hull import hull_distance, mask_distance
 from reli3d.geometry.rays import RayScene
 from reli3d.geometry.surface import extract_surface
 from reli3d.nn.weights import load_model
 from reli3d.render.camera import Camera, camera_rays, look_at, project
+from reli3d.views.folder import load_views
 
 RADIUS = 0.6
 FREE = -10.0  # bound of a grid without silhouettes

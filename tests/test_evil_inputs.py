@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from reli3d.data.folder import load_views
 from reli3d.io.files import InputError
 from reli3d.io.hdr import read_environment
+from reli3d.views.folder import load_views
 from tests import evil, evil_maps
 
 
@@ -63,7 +63,7 @@ import random, resource, sys
 from pathlib import Path
 import torch
 torch.set_num_threads(1)
-from reli3d.data.folder import load_views
+from reli3d.views.folder import load_views
 from reli3d.io.files import InputError
 from reli3d.io.hdr import read_environment
 from tests import evil, evil_maps

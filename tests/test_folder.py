@@ -6,10 +6,10 @@ import pytest
 import torch
 from PIL import Image
 
-from reli3d.data.folder import MAX_VIEWS, load_views
-from reli3d.data.shots import Lens, bend_of
 from reli3d.io.files import InputError
 from reli3d.render.camera import project
+from reli3d.views.folder import MAX_VIEWS, load_views
+from reli3d.views.shots import Lens, bend_of
 from tests import evil
 
 

@@ -14,8 +14,8 @@ from reli3d.geometry.regularize import vertex_deviation
 from reli3d.geometry.smooth import taubin_smooth
 from reli3d.geometry.surface import extract_surface
 from reli3d.geometry.tangents import decode_normals, encode_normals, vertex_tangents
+from reli3d.geometry.triplane import sample_triplane
 from reli3d.kernels.flexicubes import LEVEL_MIN
-from reli3d.triplane import sample_triplane
 from tests import reference_surface
 
 N = 100_000

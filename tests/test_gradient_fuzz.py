@@ -5,13 +5,14 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
+from reli3d.geometry.hits import evaluate_hits, hit_normals, interpolate
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import Hits
 from reli3d.kernels.microfacet import ALPHA_MIN, COS_MIN
 from reli3d.kernels.shade import COS_VIEW_MIN
 from reli3d.render.asset import TextureSet
 from reli3d.render.environment import Environment
-from reli3d.render.gbuffer import evaluate_hits, hit_normals, interpolate, surface_points
+from reli3d.render.gbuffer import surface_points
 from reli3d.render.material import PAINTS, eval_bsdf, sample_bsdf
 from reli3d.render.sampling import random_pairs
 from reli3d.render.shading import shade

@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from reli3d.data.procedural import make_object
-from reli3d.data.synthesis import ObjectSurface, synthesize
 from reli3d.eval import heldout
 from reli3d.eval.heldout import evaluate, light_error, mean_environment, scaled_square_error, square_error, summary
 from reli3d.eval.heldout import table as table_of
@@ -17,6 +15,8 @@ from reli3d.nn.weights import load_model
 from reli3d.pipeline import NoSurface
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.render.environment import Environment
+from reli3d.synthetic.procedural import make_object
+from reli3d.synthetic.samples import ObjectSurface, synthesize
 
 
 def test_a_factor_a_channel_is_forgiven_and_a_pattern_is_not():

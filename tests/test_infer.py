@@ -8,16 +8,16 @@ from pathlib import Path
 import pytest
 import torch
 
-from reli3d import results
 from reli3d.cli import infer
-from reli3d.data.folder import load_views
 from reli3d.io.glb import read_glb
 from reli3d.io.hdr import read_environment
 from reli3d.nn.weights import load_model
+from reli3d.output import results
 from reli3d.render.camera import Camera
 from reli3d.render.color import srgb_to_linear
 from reli3d.render.environment import Environment
 from reli3d.render.render import render
+from reli3d.views.folder import load_views
 from tests import evil
 
 QUICK = ["--texture-size", "256", "--resolution", "40", "--device", "cpu"]

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from reli3d.geometry.triplane import sample_triplane
 from reli3d.nn import transformer
 from reli3d.nn.camera import CameraEmbedder, camera_vector, ray_maps
 from reli3d.nn.heads import HEADS, Heads, WeightMerger
@@ -14,7 +15,6 @@ from reli3d.nn.reni import rotation_from_6d, rotation_to_6d
 from reli3d.nn.tokenizers import ImageTokenizer, patch_grid, resample_positions
 from reli3d.nn.transformer import TwoStreamTransformer
 from reli3d.nn.upsample import PixelShuffleUpsampler
-from reli3d.triplane import sample_triplane
 
 SHALLOW = dict(rtol=1e-5, atol=1e-5)  # one to four float32 layers with sums of at most a few hundred terms
 DEEP = dict(rtol=1e-4, atol=2e-5)  # blocks of attention and norms; the goldens say about 1e-5 of the largest value

@@ -3,9 +3,10 @@ import math
 import pytest
 import torch
 
-from reli3d.data.folder import load_views
-from reli3d.data.normalize import Similarity, meeting_point, normalize, visual_hull
-from reli3d.data.views import Views
+from reli3d.views.folder import load_views
+from reli3d.views.normalize import meeting_point, normalize, visual_hull
+from reli3d.views.similarity import Similarity
+from reli3d.views.views import Views
 from tests.rigs import eyes_around, sphere_views
 
 BALL = ((0.0, 0.0, 0.0, 0.5),)

@@ -5,12 +5,12 @@ import pytest
 import torch
 import trimesh
 
-from reli3d.data import primitives
-from reli3d.data.assembly import Assembly
-from reli3d.data.distance import signed_distance
-from reli3d.data.noise import cells, fbm
-from reli3d.data.organic import surface_nets
-from reli3d.data.procedural import (
+from reli3d.geometry.distance import signed_distance
+from reli3d.synthetic import primitives
+from reli3d.synthetic.assembly import Assembly
+from reli3d.synthetic.noise import cells, fbm
+from reli3d.synthetic.organic import surface_nets
+from reli3d.synthetic.procedural import (
     FAMILIES,
     FRAME_RADIUS,
     MAX_FACES,

@@ -8,11 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from reli3d import pipeline, results
+from reli3d import pipeline
 from reli3d.cli import infer
-from reli3d.data.folder import load_views
-from reli3d.data.normalize import Similarity
-from reli3d.data.published_views import published_views
 from reli3d.geometry.mesh import report
 from reli3d.geometry.surface import extract_surface, surface_cubes
 from reli3d.nn import field
@@ -20,7 +17,11 @@ from reli3d.nn.heads import deformation
 from reli3d.nn.model import Code, Reconstructor
 from reli3d.nn.published import our_key
 from reli3d.nn.weights import load_model, read_manifest, read_tensors, save
+from reli3d.output import results
 from reli3d.pipeline import NoSurface, default_normalization, prepare, reconstruct
+from reli3d.views.folder import load_views
+from reli3d.views.published_views import published_views
+from reli3d.views.similarity import Similarity
 from tests.test_nn_model import NANO, TINY, views
 
 EXAMPLE = load_views(infer.EXAMPLE, views=2)

@@ -8,17 +8,17 @@ import torch
 from safetensors.numpy import load_file
 from torch.nn.functional import interpolate
 
-from reli3d.data import published_views as module
-from reli3d.data.folder import load_views
-from reli3d.data.normalize import Similarity
-from reli3d.data.published_views import (
+from reli3d.views import published_views as module
+from reli3d.views.folder import load_views
+from reli3d.views.published_views import (
     background_shown,
     hero_first,
     jpeg_round_trip,
     placement_notes,
     published_views,
 )
-from reli3d.data.views import Views
+from reli3d.views.similarity import Similarity
+from reli3d.views.views import Views
 
 # bilinear weights and the division by 255 in float32, summed in another order: 2 units in the last place of 1
 ROUNDING = 2.5e-7

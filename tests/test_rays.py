@@ -9,8 +9,8 @@ import trimesh
 import warp as wp
 
 from reli3d import kernels
+from reli3d.geometry.hits import evaluate_hits, hit_normals, interpolate
 from reli3d.geometry.rays import Hits, RayScene, offset_origin
-from reli3d.render.gbuffer import evaluate_hits, hit_normals, interpolate
 from tests import reference
 
 BACKENDS = ["embree", "warp"]

@@ -13,9 +13,9 @@ import pytest
 import torch
 import trimesh
 
+from reli3d.geometry.hits import hit_normals, interpolate
 from reli3d.geometry.rays import offset_origin
 from reli3d.render.environment import Environment
-from reli3d.render.gbuffer import hit_normals, interpolate
 from reli3d.render.shading import shade
 from tests.test_rays import BACKENDS, PLACES, make, placed, rays, soup
 from tests.test_shading import sky

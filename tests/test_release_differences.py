@@ -18,12 +18,12 @@ from reli3d.geometry.bake import bake, rasterize_texels
 from reli3d.geometry.mesh import Mesh, volume
 from reli3d.geometry.surface import extract_surface
 from reli3d.geometry.tangents import decode_normals, encode_normals, with_tangents
+from reli3d.geometry.triplane import sample_triplane
 from reli3d.geometry.uv import unwrap
 from reli3d.io.glb import read_glb, write_glb
 from reli3d.nn.reni import map_directions
 from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.environment import Environment
-from reli3d.triplane import sample_triplane
 
 SIZE = 128
 

@@ -7,11 +7,12 @@ import pytest
 import torch
 import trimesh
 
+from reli3d.geometry.hits import interpolate
 from reli3d.geometry.mesh import Mesh
 from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.camera import Camera, camera_rays, look_at, project
 from reli3d.render.environment import Environment
-from reli3d.render.gbuffer import interpolate, sample_texture, surface_points
+from reli3d.render.gbuffer import sample_texture, surface_points
 from reli3d.render.material import PAINTS
 from reli3d.render.render import render
 from tests import reference

@@ -9,13 +9,13 @@ import torch
 import trimesh
 from scipy.special import erfc
 
+from reli3d.geometry.hits import hit_normals, interpolate
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene
 from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.camera import Camera, camera_rays, look_at
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.render.environment import Environment
-from reli3d.render.gbuffer import hit_normals, interpolate
 from reli3d.render.render import render
 from reli3d.render.shading import SAMPLES, shade
 from tests import mitsuba_scene

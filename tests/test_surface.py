@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from bench.flexicubes_torch import cube_list, flexicubes
 from reli3d.geometry.mesh import face_components, report, vertex_normals, volume
 from reli3d.geometry.surface import extract_surface, surface_cubes
-from reli3d.triplane import sample_triplane
+from reli3d.geometry.triplane import sample_triplane
 from tests.reference_surface import grid, random_weights, sphere, torus
 
 F = torch.nn.functional

@@ -8,21 +8,21 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from reli3d.data.distance import signed_distance
-from reli3d.data.procedural import make_object
-from reli3d.data.synthesis import ObjectSurface, synthesize
+from reli3d.geometry.distance import signed_distance
 from reli3d.geometry.hull import hull_distance
 from reli3d.nn.model import Reconstructor
 from reli3d.nn.presets import SMALL
 from reli3d.nn.reni import map_directions
 from reli3d.render.camera import project
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
+from reli3d.synthetic.procedural import make_object
+from reli3d.synthetic.samples import ObjectSurface, synthesize
+from reli3d.train.batches import batches, load_sample, mirrored, random_turn, recolored
 from reli3d.train.calibrate import ALIKE, LOST, calibrate, first_of_the_best, mismatch
 from reli3d.train.heads import train_heads
 from reli3d.train.light_prior import fit, scale_free
 from reli3d.train.loop import TrainConfig, averaged_model, progress, rate_at, train
 from reli3d.train.losses import ASTRAY, astray, losses, pattern_loss
-from reli3d.train.samples import batches, load_sample, mirrored, random_turn, recolored
 
 SEEDS = (3, 12)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from reli3d.triplane import CACHED, _is_walk, sample_triplane
+from reli3d.geometry.triplane import CACHED, _is_walk, sample_triplane
 from tests.reference import share_within
 
 

@@ -1,9 +1,9 @@
 import pytest
 import torch
 
-from reli3d.data.normalize import Similarity
-from reli3d.data.views import MASK_EDGE, Views, mask_box
 from reli3d.render.camera import project
+from reli3d.views.similarity import Similarity
+from reli3d.views.views import MASK_EDGE, Views, mask_box
 from tests.rigs import sphere_views
 
 

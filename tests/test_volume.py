@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
+from reli3d.geometry.triplane import sample_triplane
 from reli3d.render.volume import OccupancyGrid, RaySamples, composite, march_rays, sample_weights
-from reli3d.triplane import sample_triplane
 from tests.reference import share_within
 
 
@@ -128,7 +128,7 @@ def test_composite_and_gradients_match_the_float64_twin(device):
 
 
 def planes_read(planes, points):
-    """Float64 twin of :func:`reli3d.triplane.sample_triplane`, ``(S, 3 C)``."""
+    """Float64 twin of :func:`reli3d.geometry.triplane.sample_triplane`, ``(S, 3 C)``."""
     out = []
     for plane, axes in zip(planes[0], ((0, 1), (0, 2), (1, 2)), strict=True):
         grid = points[:, axes][None, None]

@@ -34,7 +34,7 @@ def _start(maps: Path, held: bool) -> None:
     global _LIGHTS
     import torch
 
-    from reli3d.train.light_prior import held_back, load_maps
+    from reli3d.synthetic.maps import held_back, load_maps
 
     torch.set_num_threads(1)
     lights, names = load_maps(maps)
@@ -46,9 +46,9 @@ def _make(seed: int, target: Path, size: int, views: int, mesh: Path | None) -> 
     import numpy as np
     from safetensors.torch import save_file
 
-    from reli3d.data.procedural import make_object
-    from reli3d.data.scanned import ScannedSurface
-    from reli3d.data.synthesis import ObjectSurface, synthesize
+    from reli3d.synthetic.procedural import make_object
+    from reli3d.synthetic.samples import ObjectSurface, synthesize
+    from reli3d.synthetic.scanned import ScannedSurface
 
     rng = np.random.default_rng((seed, 1))
     try:
@@ -66,7 +66,7 @@ def main(argv: list[str] | None = None) -> int:
     args = parser().parse_args(argv)
     from tqdm import tqdm
 
-    from reli3d.data.procedural import TEST_SEEDS, VALIDATION_SEEDS
+    from reli3d.synthetic.procedural import TEST_SEEDS, VALIDATION_SEEDS
 
     seeds = range(args.first, args.first + args.count)
     if args.held_back:

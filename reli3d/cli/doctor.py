@@ -83,7 +83,7 @@ def _cache() -> Iterator[tuple[str, str]]:
 def _kernels() -> Iterator[tuple[str, str]]:
     import torch
 
-    from reli3d.triplane import sample_triplane
+    from reli3d.geometry.triplane import sample_triplane
 
     for device in ["cpu"] + (["cuda"] if torch.cuda.is_available() else []):
         start = time.perf_counter()

@@ -24,7 +24,7 @@ def main(argv: list[str] | None = None) -> int:
     args = parser().parse_args(argv)
     from reli3d.eval.heldout import mean_environment, table
     from reli3d.nn.weights import load_model
-    from reli3d.train.light_prior import held_back, load_maps
+    from reli3d.synthetic.maps import held_back, load_maps
 
     try:
         maps, names = load_maps(args.maps)

@@ -132,8 +132,8 @@ def choose_device(wanted: str) -> str:
 
 def check(folder: Path, target: Path, args: argparse.Namespace) -> None:
     """Print what the cameras look like, one line a view, and write the picture of the rig."""
-    from reli3d.data.check import explain_cameras, rig_picture
-    from reli3d.data.folder import load_views
+    from reli3d.views.check import explain_cameras, rig_picture
+    from reli3d.views.folder import load_views
 
     views = load_views(folder, views=args.views, masks=args.masks, allow_outside=args.allow_outside)
     for line in (*views.notes, *explain_cameras(views)):
@@ -157,8 +157,8 @@ class Job:
     def __init__(self, args: argparse.Namespace, device: str):
         import torch
 
-        from reli3d import results
         from reli3d.nn import weights
+        from reli3d.output import results
         from reli3d.pipeline import check_options
 
         check_options(args.texture_size, args.resolution)
@@ -179,12 +179,12 @@ class Job:
         print(target / "mesh.glb")
 
     def _run(self, folder: Path, name: str, target: Path, steps: Progress) -> None:
-        from reli3d import results
-        from reli3d.data.folder import load_views
-        from reli3d.data.normalize import normalize
-        from reli3d.data.published_views import hero_first, placement_notes
-        from reli3d.eval.preview import preview
+        from reli3d.output import results
+        from reli3d.output.preview import preview
         from reli3d.pipeline import default_normalization, output_frame, reconstruct
+        from reli3d.views.folder import load_views
+        from reli3d.views.normalize import normalize
+        from reli3d.views.published_views import hero_first, placement_notes
 
         args = self.args
         began = time.perf_counter()

@@ -16,8 +16,6 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
-from reli3d.data.procedural import make_object
-from reli3d.data.synthesis import ObjectSurface
 from reli3d.geometry.rays import RayScene
 from reli3d.nn.model import Reconstructor
 from reli3d.pipeline import NoSurface, reconstruct
@@ -25,6 +23,8 @@ from reli3d.render.camera import Camera, camera_rays
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import surface_points
+from reli3d.synthetic.procedural import make_object
+from reli3d.synthetic.samples import ObjectSurface
 from reli3d.train.light_prior import scale_free
 from reli3d.train.pictures import sample_views
 

@@ -15,8 +15,8 @@ from torch.nn import functional
 
 from reli3d._bridge import over_rows
 from reli3d.geometry.hull import hull_distance
+from reli3d.nn.light_features import Shading, brightness_at, brightness_over_normal, palette_of, unshaded
 from reli3d.nn.model import Code, Reconstructor
-from reli3d.nn.shading import Shading, brightness_at, brightness_over_normal, palette_of, unshaded
 from reli3d.nn.view_features import ViewMaps
 from reli3d.render.color import srgb_to_linear
 from reli3d.render.environment import Environment

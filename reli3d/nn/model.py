@@ -9,6 +9,7 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor, nn
 
+from reli3d.geometry.triplane import sample_triplane
 from reli3d.nn.camera import CameraEmbedder, camera_vector, ray_maps
 from reli3d.nn.heads import HEADS, Heads, WeightMerger, truncated_exp
 from reli3d.nn.illumination import Illumination
@@ -19,7 +20,6 @@ from reli3d.nn.tokenizers import ImageTokenizer, TriplaneBank, patch_grid
 from reli3d.nn.transformer import TwoStreamTransformer
 from reli3d.nn.upsample import PixelShuffleUpsampler
 from reli3d.nn.view_features import ViewFeatures
-from reli3d.triplane import sample_triplane
 
 BACKGROUND = 0.5  # grey behind the object in the object encoder's images, sRGB
 

@@ -13,7 +13,7 @@ import json
 import typing
 from dataclasses import dataclass
 
-SHADING_FEATURES = 24  # see reli3d.nn.shading
+SHADING_FEATURES = 24  # see reli3d.nn.light_features
 
 
 @dataclass(frozen=True)

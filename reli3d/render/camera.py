@@ -7,7 +7,7 @@ intrinsics    ``fx, fy, cx, cy`` in pixels; x to the right, y DOWN, pixel centre
 depth         distance along the viewing axis (-Z of the camera), not along the ray
 ============  ==========================================================================================
 
-Other conventions are converted in ``reli3d.data`` and ``reli3d.io`` and nowhere else.
+Other conventions are converted in ``reli3d.views`` and ``reli3d.io`` and nowhere else.
 """
 
 from __future__ import annotations

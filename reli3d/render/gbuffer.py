@@ -1,7 +1,4 @@
-"""Primary visibility and what is seen there: hits of a camera, attributes and textures at hits, with gradients.
-
-Which face is hit has no gradient; everything evaluated at the hit has one.
-"""
+"""Primary visibility and what is seen there: hits of a camera, textures and materials at hits, with gradients."""
 
 from __future__ import annotations
 
@@ -13,15 +10,13 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from reli3d._bridge import call, check
+from reli3d.geometry.hits import hit_normals, interpolate
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import Hits, RayScene
 from reli3d.kernels import attributes as kernels
 from reli3d.render.asset import TextureSet
 from reli3d.render.camera import Camera, camera_rays
 from reli3d.render.color import srgb_to_linear
-
-_INTERPOLATE = {2: (kernels.interpolate2_kernel, wp.vec2), 3: (kernels.interpolate3_kernel, wp.vec3),
-                4: (kernels.interpolate4_kernel, wp.vec4)}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -40,60 +35,6 @@ def primary_hits(scene: RayScene, camera: Camera) -> tuple[Hits, Tensor, Tensor]
     """Closest hits ``(..., H, W)`` through the pixel centres, and the rays' origins and unit directions."""
     origins, directions = camera_rays(camera)
     return scene.closest(origins, directions), origins, directions
-
-
-def interpolate(values: Tensor, faces: Tensor, face: Tensor, bary: Tensor) -> Tensor:
-    """Vertex attribute ``(V, C)``, C = 2, 3 or 4, at hits: ``(..., C)``, 0 at a miss.
-
-    faces: ``(F, 3)`` int32.  face: ``(...)`` int32, -1 for a miss.  bary: ``(..., 2)``.  Gradients reach ``values`` and
-    ``bary``.  Raises ValueError for an index out of range.
-    """
-    check("values", values)
-    if values.ndim != 2 or values.shape[1] not in _INTERPOLATE:
-        raise ValueError(f"values: expected shape (V, C) with C = 2, 3 or 4, got {tuple(values.shape)}")
-    _check_faces(values.shape[0], faces, face, values)
-    check("bary", bary, last=2, like=values)
-    kernel, kind = _INTERPOLATE[values.shape[1]]
-    n = face.numel()
-    ins = [(values, kind), (faces, wp.int32), (face.reshape(-1), wp.int32), (bary.reshape(-1, 2), wp.vec2)]
-    (out,) = call(kernel, n, ins, [((n,), kind)], device=values.device, shared=(0,))
-    return out.reshape(*face.shape, values.shape[1])
-
-
-def hit_normals(vertices: Tensor, faces: Tensor, face: Tensor) -> Tensor:
-    """Unit geometric normals ``(..., 3)`` of hit faces ``(...)``, 0 at a miss or on a face without area.
-
-    Gradients reach ``vertices (V, 3)``.
-    """
-    check("vertices", vertices, last=3)
-    _check_faces(vertices.shape[0], faces, face, vertices)
-    n = face.numel()
-    ins = [(vertices, wp.vec3), (faces, wp.int32), (face.reshape(-1), wp.int32)]
-    (out,) = call(kernels.hit_normal_kernel, n, ins, [((n,), wp.vec3)], device=vertices.device, shared=(0,))
-    return out.reshape(*face.shape, 3)
-
-
-def evaluate_hits(vertices: Tensor, faces: Tensor, hits: Hits, origins: Tensor, directions: Tensor) -> Hits:
-    """The hits with ``t`` and ``bary`` re-evaluated from their faces, so that gradients flow.
-
-    vertices: ``(V, 3)``.  faces: ``(F, 3)`` int32.  origins, directions: ``(..., 3)`` of the rays that gave ``hits``.
-    Gradients reach vertices, origins and directions; which face is hit has none.  Computed in float64, the adjoint too;
-    a face thinner, or seen more edge on, than a ray query can tell keeps the hit as it was, with gradient 0.  The point
-    is ``origins + t directions``; its slope in the vertices has more digits than that of interpolated positions, whose
-    parts along the face cancel.  Moller and Trumbore 1997.
-    """
-    check("vertices", vertices, last=3)
-    _check_faces(vertices.shape[0], faces, hits.face, vertices)
-    check("origins", origins, last=3, like=vertices)
-    check("directions", directions, last=3, like=vertices)
-    shape = hits.face.shape
-    o, d = (v.expand(*shape, 3).reshape(-1, 3) for v in (origins, directions))
-    n = o.shape[0]
-    ins = [(vertices, wp.vec3), (faces, wp.int32), (hits.face.reshape(-1), wp.int32), (o, wp.vec3), (d, wp.vec3),
-           (hits.t.detach().reshape(-1), wp.float32), (hits.bary.detach().reshape(-1, 2), wp.vec2)]  # fmt: skip
-    outs = [((n,), wp.float32), ((n,), wp.vec2)]
-    t, bary = call(kernels.reevaluate_kernel, n, ins, outs, device=vertices.device, shared=(0,))
-    return Hits(hits.face, t.reshape(shape), bary.reshape(*shape, 2))
 
 
 def sample_texture(texture: Tensor, uv: Tensor) -> Tensor:
@@ -171,13 +112,3 @@ def _uv_tangent(mesh: Mesh, face: Tensor) -> tuple[Tensor, Tensor]:
     along_u = torch.where(area.abs() > 1e-20, along_u, fallback)
     # v is down, so the up bitangent is -dp/dv: a chart that is not mirrored has area < 0 in these coordinates
     return along_u, -side
-
-
-def _check_faces(count: int, faces: Tensor, face: Tensor, like: Tensor) -> None:
-    check("faces", faces, last=3, like=like, dtype=torch.int32)
-    check("face", face, like=like, dtype=torch.int32)
-    for name, value, high in (("faces", faces, count), ("face", face, faces.shape[0])):
-        if value.numel():
-            low, top = (int(v) for v in torch.aminmax(value))
-            if low < (-1 if name == "face" else 0) or top >= high:
-                raise ValueError(f"{name}: expected indices below {high}, got [{low}, {top}]")

@@ -17,13 +17,13 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
-from reli3d.data.normalize import Similarity
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene
 from reli3d.nn.model import Reconstructor
 from reli3d.pipeline import NoSurface, encode, extract, prepare
 from reli3d.render.camera import Camera, camera_rays
 from reli3d.train.pictures import sample_views
+from reli3d.views.similarity import Similarity
 
 OFFSETS = (0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 3.0, 5.0)  # of the logit; the last: the hull
 FEW, MANY = 1, 4  # numbers of views that are tried

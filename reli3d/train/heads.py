@@ -20,12 +20,12 @@ from torch import nn
 from tqdm import tqdm
 
 from reli3d.nn.field import LIGHT_ROWS
+from reli3d.nn.light_features import Shading
 from reli3d.nn.model import Code, Reconstructor
-from reli3d.nn.shading import Shading
 from reli3d.nn.view_features import ViewMaps
+from reli3d.train.batches import Batch, load_sample
 from reli3d.train.loop import WEIGHTS, TrainConfig, rate_at, update_average
 from reli3d.train.losses import field_losses, maps_of, sample_shading
-from reli3d.train.samples import Batch, load_sample
 from reli3d.train.workers import Workers
 
 KEPT = 4096  # volume points of an object that are kept; half as many surface points

@@ -14,15 +14,15 @@ import torch
 from torch import Tensor, nn
 
 from reli3d.nn.model import Reconstructor
+from reli3d.train.batches import batches
 from reli3d.train.losses import losses
 from reli3d.train.pictures import write_curves, write_validation
-from reli3d.train.samples import batches
 from reli3d.train.workers import Workers
 
 
 @dataclass(frozen=True)
 class TrainConfig:
-    samples: str  # folder of *.safetensors made by reli3d.data.synthesis
+    samples: str  # folder of *.safetensors made by reli3d.synthetic.samples
     output: str  # folder of checkpoints, log.jsonl and pictures
     steps: int = 20000
     minutes: float = math.inf  # the schedule follows whichever of steps and minutes runs out first

@@ -8,16 +8,16 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from reli3d.data.synthesis import PAINT
 from reli3d.nn.field import LIGHT_ROWS, bound_level, object_shading, surface_level, surface_material
+from reli3d.nn.light_features import Shading
 from reli3d.nn.model import Code, Reconstructor
-from reli3d.nn.shading import Shading
 from reli3d.nn.view_features import ViewMaps
 from reli3d.render.bump import radial_bump
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.render.environment import Environment
 from reli3d.render.shading import shade
-from reli3d.train.samples import Batch
+from reli3d.synthetic.samples import PAINT
+from reli3d.train.batches import Batch
 
 IMAGE_SAMPLES = (12, 8, 2)  # light, GGX and cosine samples a pixel of the image loss
 LIGHT_DIRECTIONS = 384  # of the 2048 of a sample's map: enough for one step's mean, a fifth of the decoder's time

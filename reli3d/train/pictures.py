@@ -10,11 +10,11 @@ import numpy as np
 from PIL import Image, ImageDraw
 from safetensors.torch import load_file
 
-from reli3d.data.views import Views
-from reli3d.eval.preview import preview
 from reli3d.io.images import write_png
 from reli3d.nn.model import Reconstructor
+from reli3d.output.preview import preview
 from reli3d.pipeline import NoSurface, reconstruct
+from reli3d.views.views import Views
 
 WIDTH, HEIGHT, MARGIN = 420, 180, 34
 

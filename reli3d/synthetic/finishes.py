@@ -10,8 +10,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from reli3d.data import patterns as pt
-from reli3d.data.materials import Coat, Material
+from reli3d.synthetic import patterns as pt
+from reli3d.synthetic.materials import Coat, Material
 
 METAL_SHARE = 0.36  # of the objects may have metal; some of these have no part that takes it
 # F0 of steel, aluminium, gold, brass, copper, bronze, iron, gunmetal, as published tables give them

@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from manifold3d import CrossSection, Manifold
 
-from reli3d.data import primitives as p
-from reli3d.data.assembly import Assembly
+from reli3d.synthetic import primitives as p
+from reli3d.synthetic.assembly import Assembly
 
 
 def csg(a: Assembly) -> None:

@@ -16,11 +16,11 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 from torch.nn.functional import max_pool2d, pad
 
-from reli3d.data.normalize import RADIUS, Hull, centre_rays, meeting_point, normalize, visual_hull
-from reli3d.data.views import Views
 from reli3d.io.files import printable
 from reli3d.io.images import write_png
 from reli3d.render.camera import project
+from reli3d.views.normalize import RADIUS, Hull, centre_rays, meeting_point, normalize, visual_hull
+from reli3d.views.views import Views
 
 GOOD = 0.8  # share of every mask that the hull of right cameras fills; masks a few pixels off still reach 0.9
 CLEAN = 0.97  # mean share from which no mistake is looked for

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from reli3d.data.shots import Lens, Shot, cleaned, inside, number
 from reli3d.io.files import InputError, file_size, shown
+from reli3d.views.shots import Lens, Shot, cleaned, inside, number
 
 MAX_BYTES = 1 << 28  # images.txt lists every matched point
 MAX_IMAGES = 100_000

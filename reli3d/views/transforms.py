@@ -12,8 +12,8 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
-from reli3d.data.shots import Lens, Shot, inside, number, rigid
 from reli3d.io.files import InputError, read_bytes, shown
+from reli3d.views.shots import Lens, Shot, inside, number, rigid
 
 MAX_BYTES = 1 << 24
 MAX_FRAMES = 4096  # a video at 30 frames a second for two minutes

@@ -15,8 +15,8 @@ from PIL import Image
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from reli3d.data.normalize import normalize
-from reli3d.data.views import ViewBatch, Views
+from reli3d.views.normalize import normalize
+from reli3d.views.views import ViewBatch, Views
 
 JPEG_QUALITY = 95  # with JPEG_CHROMA the defaults of OpenCV's encoder, which the release leaves as they are
 JPEG_CHROMA = "4:2:0"

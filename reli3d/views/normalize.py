@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d, pad
 
-from reli3d.data.views import Views, mask_box
+from reli3d.views.similarity import Similarity
+from reli3d.views.views import Views, mask_box
 
 RADIUS = 0.87  # half side of the network's cube
 SLACK = 1.1  # a hull of few views exceeds its object by about a tenth, so it may exceed the cube by as much
@@ -18,57 +19,6 @@ OFF_CENTRE = 0.3  # as far as the hull's centre of such an object may lie from t
 GRIDS = (24, 44)  # cells a side, coarse and refined: the last is 2 to 3 % of the object
 BALL = 1.3  # diameter of the ball that limits the hull, in mask widths: a generic view shows 0.8 of the longest side
 PARALLEL = 0.01  # mean squared sine between the axes (6 degrees) below which depth is guessed, not triangulated
-
-
-@dataclass(frozen=True)
-class Similarity:
-    """``x -> scale * rotation @ x + translation``; float64."""
-
-    scale: float
-    rotation: Tensor  # (3, 3)
-    translation: Tensor  # (3,)
-
-    @staticmethod
-    def identity() -> Similarity:
-        """The map that changes nothing."""
-        return Similarity(1.0, torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
-
-    @staticmethod
-    def from_matrix(matrix: Tensor) -> Similarity:
-        """The map of a 4x4 ``matrix``.  Raises ValueError unless it is a rotation with one positive scale."""
-        m = torch.as_tensor(matrix, dtype=torch.float64)
-        if m.shape != (4, 4) or not bool(torch.isfinite(m).all()):
-            raise ValueError(f"matrix: expected finite numbers of shape (4, 4), got {tuple(m.shape)}")
-        determinant = float(torch.linalg.det(m[:3, :3]))
-        scale = determinant ** (1 / 3) if determinant > 0 else 0.0
-        gram = m[:3, :3].T @ m[:3, :3]
-        last = m[3] - m.new_tensor([0.0, 0.0, 0.0, 1.0])
-        # 1e-5: a matrix that was stored in float32
-        if scale == 0 or float((gram - scale**2 * torch.eye(3)).abs().max()) > 1e-5 * scale**2 or bool(last.any()):
-            raise ValueError("matrix: expected a rotation times a positive scale, got a shear, a mirror or worse")
-        return Similarity(scale, m[:3, :3] / scale, m[:3, 3].clone())
-
-    def matrix(self) -> Tensor:
-        """``(4, 4)`` float64 matrix on column vectors."""
-        rows = torch.cat([self.scale * self.rotation, self.translation[:, None]], -1)
-        return torch.cat([rows, rows.new_tensor([[0.0, 0.0, 0.0, 1.0]])])
-
-    def apply(self, points: Tensor) -> Tensor:
-        """Mapped ``points (..., 3)``, in their dtype and on their device.  Gradients reach the points."""
-        return self.scale * points @ self.rotation.to(points).T + self.translation.to(points)
-
-    def inverse(self) -> Similarity:
-        """The map back."""
-        return Similarity(1 / self.scale, self.rotation.T, -(self.rotation.T @ self.translation) / self.scale)
-
-    def compose(self, first: Similarity) -> Similarity:
-        """``first``, then this map."""
-        return Similarity(self.scale * first.scale, self.rotation @ first.rotation, self.apply(first.translation))
-
-    def is_identity(self) -> bool:
-        """Whether the map changes nothing, to the last bit."""
-        same = torch.equal(self.rotation, torch.eye(3, dtype=torch.float64))
-        return self.scale == 1.0 and same and not bool(self.translation.any())
 
 
 @dataclass(frozen=True)

@@ -14,13 +14,13 @@ from pathlib import Path
 import numpy as np
 
 import reli3d
-from reli3d.data.normalize import Similarity
 from reli3d.geometry.mesh import Mesh, report
 from reli3d.io.glb import write_glb
 from reli3d.io.hdr import write_exr, write_hdr
 from reli3d.io.images import write_png
 from reli3d.nn.weights import Manifest
 from reli3d.render.asset import Asset
+from reli3d.views.similarity import Similarity
 
 FILES = ("mesh.glb", "environment.exr", "environment.hdr", "preview.png", "run_info.json")
 COPIES = {"illumination.hdr": "environment.hdr"}  # names of the published release, and what they hold

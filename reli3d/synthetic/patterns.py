@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from reli3d.data.noise import cells, fbm
+from reli3d.synthetic.noise import cells, fbm
 
 
 def smoothstep(low: float, high: float, x: Tensor) -> Tensor:

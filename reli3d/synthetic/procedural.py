@@ -15,11 +15,11 @@ import torch
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from reli3d.data import example, furniture, manmade, organic, vessels
-from reli3d.data.assembly import Assembly
-from reli3d.data.finishes import draw_materials
-from reli3d.data.materials import Material, evaluate
 from reli3d.render.camera import look_at
+from reli3d.synthetic import example, furniture, manmade, organic, vessels
+from reli3d.synthetic.assembly import Assembly
+from reli3d.synthetic.finishes import draw_materials
+from reli3d.synthetic.materials import Material, evaluate
 
 TRAINING_SEEDS = range(0, 1_000_000_000)
 VALIDATION_SEEDS = range(1_000_000_000, 1_000_000_032)

@@ -26,14 +26,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from reli3d.data.distance import signed_distance
-from reli3d.data.procedural import ProceduralObject, sample_cameras
+from reli3d.geometry.distance import signed_distance
 from reli3d.geometry.rays import RayScene
 from reli3d.geometry.visibility import visible_from
 from reli3d.render.camera import Camera, camera_rays, project
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
 from reli3d.render.shading import shade
+from reli3d.synthetic.procedural import ProceduralObject, sample_cameras
 
 SAMPLES = (16, 12, 4)  # light, GGX and cosine samples a pixel: the noise left is below that of a photograph
 PAINT = "published"  # what the shipped weights learned from, and what viewers show of an asset

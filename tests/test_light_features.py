@@ -5,8 +5,8 @@ import torch
 from torch.nn.functional import normalize
 
 from reli3d.nn.heads import COLOR_MARGIN
+from reli3d.nn.light_features import DARKEST, Shading, brightness_over_normal, harmonics, palette_of, unshaded
 from reli3d.nn.presets import SHADING_FEATURES
-from reli3d.nn.shading import DARKEST, Shading, brightness_over_normal, harmonics, palette_of, unshaded
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.render.environment import Environment
 

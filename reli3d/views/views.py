@@ -8,16 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 from torch.nn.functional import interpolate, pad
 
 from reli3d._bridge import check
-
-if TYPE_CHECKING:
-    from reli3d.data.normalize import Similarity
+from reli3d.views.similarity import Similarity
 
 MASK_EDGE = 0.1  # alpha from which a pixel counts into the bounding box: keeps hair and thin wires, drops codec noise
 

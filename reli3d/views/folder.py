@@ -16,12 +16,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from reli3d.data.colmap import find_colmap, read_colmap
-from reli3d.data.shots import Lens, Shot, inside, straight
-from reli3d.data.transforms import read_transforms
-from reli3d.data.views import Views
 from reli3d.io.files import InputError, shown
 from reli3d.io.images import read_image
+from reli3d.views.colmap import find_colmap, read_colmap
+from reli3d.views.shots import Lens, Shot, inside, straight
+from reli3d.views.transforms import read_transforms
+from reli3d.views.views import Views
 
 MAX_VIEWS = 16
 MIN_SIDE = 8  # pixels; below it there is nothing to see, and a mistake is likely

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from reli3d.data import primitives as p
-from reli3d.data.assembly import Assembly
+from reli3d.synthetic import primitives as p
+from reli3d.synthetic.assembly import Assembly
 
 CELLS = 52  # along the longest side: limbs of 4 % are still two cells thick
 

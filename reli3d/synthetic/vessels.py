@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from reli3d.data import primitives as p
-from reli3d.data.assembly import Assembly
+from reli3d.synthetic import primitives as p
+from reli3d.synthetic.assembly import Assembly
 
 
 def vessel(a: Assembly) -> None:

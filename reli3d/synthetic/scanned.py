@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from reli3d.data.distance import signed_distance
+from reli3d.geometry.distance import signed_distance
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene
 from reli3d.io.glb import read_glb
@@ -44,7 +44,7 @@ def outside_distance(vertices: Tensor, faces: Tensor, points: Tensor, scene: Ray
 
 
 class ScannedSurface:
-    """One GLB, centred, longest side 1, stretched and tinted at random; a :class:`~reli3d.data.synthesis.Surface`."""
+    """One GLB, centred, longest side 1, stretched and tinted at random: a ``Surface`` of :mod:`.samples`."""
 
     def __init__(self, path: Path, rng: np.random.Generator):
         self.assets = _read(path)

@@ -1,4 +1,4 @@
-"""Batches from the sample files of :mod:`reli3d.data.synthesis`: a choice of views and points, and one random turn
+"""Batches from the sample files of :mod:`reli3d.synthetic.samples`: a choice of views and points, and one random turn
 of the world.
 """
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from reli3d.data.noise import fbm
+from reli3d.synthetic.noise import fbm
 
 ALBEDO_RANGE = (0.02, 0.9)  # coal to fresh snow
 ROUGHNESS_RANGE = (0.08, 1.0)

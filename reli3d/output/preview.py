@@ -8,12 +8,12 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from reli3d.data.views import Views
 from reli3d.geometry.rays import RayScene
 from reli3d.render.asset import Asset
 from reli3d.render.camera import Camera
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.render import render
+from reli3d.views.views import Views
 
 TILE = 192  # pixels
 COLUMNS = 4

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from reli3d.data import patterns as pt
-from reli3d.data import primitives as p
-from reli3d.data.assembly import Assembly
-from reli3d.data.materials import Coat, Material
+from reli3d.synthetic import patterns as pt
+from reli3d.synthetic import primitives as p
+from reli3d.synthetic.assembly import Assembly
+from reli3d.synthetic.materials import Coat, Material
 
 TEAL, CREAM, CHARCOAL = (0.02, 0.19, 0.22), (0.78, 0.7, 0.52), (0.03, 0.028, 0.026)
 BRASS, STEEL = (0.86, 0.66, 0.3), (0.58, 0.58, 0.59)
