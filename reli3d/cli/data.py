@@ -23,11 +23,14 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--held-back", choices=("validation", "test"),
                    help="objects to choose by or to report on, under maps that no training sees")  # fmt: skip
     p.add_argument("--meshes", type=Path, nargs="+", help="GLB files to draw from instead of procedural objects")
+    p.add_argument("--shapes", type=Path, nargs="+",
+                   help="GLB files whose shapes are put together and dressed by finishes of their own")  # fmt: skip
     p.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     return p
 
 
 _LIGHTS = None  # maps of this worker process
+LAMPS = 0.45  # share of the training lights that get lamps of their own
 
 
 def _start(maps: Path, held: bool) -> None:
@@ -41,19 +44,29 @@ def _start(maps: Path, held: bool) -> None:
     _LIGHTS = [m for m, h in zip(lights, held_back(names), strict=True) if h == held]
 
 
-def _make(seed: int, target: Path, size: int, views: int, mesh: Path | None) -> str | None:
+def _make(seed: int, target: Path, args: argparse.Namespace) -> str | None:
     """Write one sample; the reason instead where the object could not be made."""
     import numpy as np
     from safetensors.torch import save_file
 
+    from reli3d.synthetic.maps import with_lamps
     from reli3d.synthetic.procedural import make_object
     from reli3d.synthetic.samples import ObjectSurface, synthesize
     from reli3d.synthetic.scanned import ScannedSurface
+    from reli3d.synthetic.shapes import ShapeSurface
 
     rng = np.random.default_rng((seed, 1))
     try:
-        surface = ScannedSurface(mesh, rng) if mesh else ObjectSurface(make_object(seed))
-        sample = synthesize(surface, _LIGHTS[int(rng.integers(len(_LIGHTS)))], rng, size=size, views=views)
+        if args.shapes:
+            surface = ShapeSurface(args.shapes, rng)
+        elif args.meshes:
+            surface = ScannedSurface(args.meshes[seed % len(args.meshes)], rng)
+        else:
+            surface = ObjectSurface(make_object(seed))
+        light = _LIGHTS[int(rng.integers(len(_LIGHTS)))]
+        if not args.held_back and rng.random() < LAMPS:
+            light = with_lamps(light, rng)
+        sample = synthesize(surface, light, rng, size=args.size, views=args.views)
     except ValueError as error:
         return f"seed {seed}: {error}"
     temporary = target.with_suffix(f".tmp{os.getpid()}")
@@ -72,13 +85,12 @@ def main(argv: list[str] | None = None) -> int:
     if args.held_back:
         seeds = {"validation": VALIDATION_SEEDS, "test": TEST_SEEDS}[args.held_back]
     args.output.mkdir(parents=True, exist_ok=True)
-    mesh_of = lambda seed: args.meshes[seed % len(args.meshes)] if args.meshes else None  # noqa: E731
     jobs = [(s, args.output / f"{s:010d}.safetensors") for s in seeds]
     jobs = [j for j in jobs if not j[1].exists()]
     context = get_context("spawn")
     failed = 0
     with ProcessPoolExecutor(args.workers, context, _start, (args.maps, bool(args.held_back))) as pool:
-        futures = [pool.submit(_make, seed, target, args.size, args.views, mesh_of(seed)) for seed, target in jobs]
+        futures = [pool.submit(_make, seed, target, args) for seed, target in jobs]
         for future in tqdm(as_completed(futures), total=len(futures), file=sys.stderr, unit="object"):
             reason = future.result()
             failed += reason is not None

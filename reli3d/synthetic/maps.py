@@ -1,4 +1,4 @@
-"""Environment maps: which ones training may see."""
+"""Environment maps: which ones training may see, and lamps that are added to them."""
 
 from __future__ import annotations
 
@@ -26,3 +26,27 @@ def held_back(names: list[str]) -> list[bool]:
     """Which maps no training may see: every sixth by alphabetical order."""
     rank = {n: i for i, n in enumerate(sorted(names))}
     return [rank[n] % HELD_BACK == HELD_BACK - 1 for n in names]
+
+
+def with_lamps(light: Tensor, rng: np.random.Generator) -> Tensor:
+    """The lat-long map ``(H, 2H, 3)`` with one to three lamps: soft discs that bring a good part of its light."""
+    rows = light.shape[0]
+    theta, phi = torch.meshgrid((torch.arange(rows) + 0.5) * np.pi / rows,
+                                (torch.arange(2 * rows) + 0.5) * np.pi / rows, indexing="ij")  # fmt: skip
+    directions = torch.stack([theta.sin() * phi.cos(), theta.cos(), theta.sin() * phi.sin()], -1)
+    area = theta.sin()[..., None]
+    total = float((light.mean(-1, keepdim=True) * area).sum())
+    out = light.clone()
+    for _ in range(int(rng.integers(1, 4))):
+        y = rng.uniform(-0.15, 0.98)
+        angle = rng.uniform(0, 2 * np.pi)
+        level = np.sqrt(1 - y * y)
+        to = torch.tensor([level * np.cos(angle), y, level * np.sin(angle)], dtype=torch.float32)
+        radius = np.radians(np.exp(rng.uniform(np.log(2.0), np.log(18.0))))
+        away = (directions @ to).clamp(-1, 1).acos()
+        disc = torch.sigmoid((radius - away) / (0.15 * radius + np.pi / rows / 2))[..., None]
+        warmth = rng.normal(0, 0.25)
+        tint = torch.tensor([np.exp(warmth), 1.0, np.exp(-warmth)], dtype=torch.float32)
+        share = np.exp(rng.uniform(np.log(0.15), np.log(1.5)))
+        out += disc * tint * (share * total / float((disc * area).sum()))
+    return out

@@ -124,10 +124,12 @@ def corner_normals(vertices: np.ndarray, faces: np.ndarray, crease_deg: float = 
     order = np.argsort(key)
     twin = order[np.minimum(np.searchsorted(key[order], mirrored), len(order) - 1)]  # half-edge on the other side
     half = np.arange(3 * count)
+    found = key[order[np.minimum(np.searchsorted(key[order], mirrored), len(order) - 1)]] == mirrored
     smooth = (normal[half // 3] * normal[twin // 3]).sum(-1) > np.cos(np.radians(crease_deg))
     # an edge joins the corner at its start with the corner at its end across the edge; a sliver has no normal of its
     # own
     smooth |= (area[half // 3] < 1e-12) | (area[twin // 3] < 1e-12)
+    smooth &= found  # an open border has no other side
     here, there = half[smooth], (twin - twin % 3 + (twin + 1) % 3)[smooth]
     graph = coo_matrix((np.ones(len(here), dtype=np.int8), (here, there)), shape=(3 * count, 3 * count))
     groups, label = connected_components(graph, directed=False)

@@ -13,6 +13,9 @@ points, distance   (P, 3), (P,) float16   volume points (first half near the sur
 outside surface            (N, 3, 3) float16      position, geometric normal, bumped normal of surface points
 material           (N, 5) uint8           base colour (sRGB-encoded), roughness, metallic
 visible            (N, V) uint8           1 where the surface point is seen by the view
+view_material      (V, S, S, 5) uint8     means over the pixel: base colour (sRGB-encoded), roughness, metallic
+view_normal        (V, S, S, 3) int8      bumped normal, world, times 127
+view_depth         (V, S, S) float16      along the camera's axis; 0, as above, where half the pixel or more is free
 pixels             (V, M, 3, 3) float16   position, bumped normal, direction to the camera of seen points, and ...
 pixel_radiance     (V, M, 3) float16      ... the linear radiance that left them
 =================  =====================  ==============================================================================
@@ -35,7 +38,8 @@ from reli3d.render.environment import Environment
 from reli3d.render.shading import shade
 from reli3d.synthetic.procedural import ProceduralObject, sample_cameras
 
-SAMPLES = (16, 12, 4)  # light, GGX and cosine samples a pixel: the noise left is below that of a photograph
+SAMPLES = (4, 3, 1)  # light, GGX and cosine samples a ray: with FINE**2 rays a pixel the noise left is a photograph's
+FINE = 2  # rays along each side of a pixel
 PAINT = "published"  # what the shipped weights learned from, and what viewers show of an asset
 EXPOSED = 0.6  # linear value of the 90th percentile of the object in the first view
 VOLUME_POINTS, SURFACE_POINTS, PIXELS = 16384, 8192, 1024
@@ -98,7 +102,7 @@ class ObjectSurface:
 
 
 def _render(surface: Surface, camera: Camera, light: Environment, seed: int):
-    """Linear image ``(S, S, 3)``, coverage, the pixels that hit and what is at the hits."""
+    """Linear radiance ``(H * W, 3)`` of every ray, the rays that hit, and what is at the hits."""
     origins, directions = (r.reshape(-1, 3) for r in camera_rays(camera))
     hits = surface.scene.closest(origins, directions)
     seen = (hits.face >= 0).nonzero()[:, 0]
@@ -121,27 +125,53 @@ def synthesize(
     c2w = torch.as_tensor(np.asarray(sample_cameras(rng, views)[0]), dtype=torch.float32)
     intrinsics = torch.stack([crop_camera(surface.vertices, m, size, rng.uniform(0.04, 0.12)) for m in c2w])
     sample, exposure, images, pixels, pixel_radiance = {}, None, [], [], []
+    maps: dict[str, list[Tensor]] = {"view_material": [], "view_normal": [], "view_depth": []}
     for k in range(views):
-        camera = Camera(c2w[k], intrinsics[k], size, size)
+        camera = Camera(c2w[k], intrinsics[k] * FINE, size * FINE, size * FINE)
         image, seen, at, wo, radiance = _render(surface, camera, environment, int(rng.integers(1 << 30)))
         if exposure is None:
             exposure = EXPOSED / max(float(radiance.mean(-1).quantile(0.9)), 1e-3) * float(np.exp(rng.normal(0, 0.25)))
         alpha = _coverage(surface.scene, c2w[k], intrinsics[k], size)
-        encoded = torch.cat(
-            [linear_to_srgb((image * exposure).clamp(0, 1)).reshape(size, size, 3), alpha[..., None]], -1
-        )
+        image = pooled_pixels((image * exposure).clamp(0, 4), size).clamp(0, 1)  # a sensor saturates, late
+        encoded = torch.cat([linear_to_srgb(image), alpha[..., None]], -1)
         images.append((encoded * 255 + 0.5).to(torch.uint8))
+        for name, value in _view_maps(at, seen, c2w[k], size).items():
+            maps[name].append(value)
         pick = torch.as_tensor(rng.integers(len(seen), size=PIXELS))
         pixels.append(torch.stack([at["position"], at["bump"], wo], 1)[pick])
         pixel_radiance.append((radiance[pick] * exposure).clamp(max=64.0))
     sample.update(images=torch.stack(images), c2w=c2w, intrinsics=intrinsics,
                   pixels=torch.stack(pixels).half(), pixel_radiance=torch.stack(pixel_radiance).half())  # fmt: skip
+    sample.update({name: torch.stack(values) for name, values in maps.items()})
     pooled = torch.nn.functional.interpolate(
         (environment.radiance * exposure).permute(2, 0, 1)[None], (32, 64), mode="area"
     )
     sample["environment"] = pooled[0].permute(1, 2, 0).clamp(max=6e4).half()
     sample.update(_volume(surface, rng), **_surface_points(surface, c2w, intrinsics, size, rng))
     return {k: v.contiguous() for k, v in sample.items()}
+
+
+def _view_maps(at: dict[str, Tensor], seen: Tensor, c2w: Tensor, size: int) -> dict[str, Tensor]:
+    """What is true at the pixels of one view, see the table above, from the rays ``seen (N,)`` that hit."""
+    rays = (size * FINE) ** 2
+    depth = -((at["position"] - c2w[:3, 3]) @ c2w[:3, 2])
+    values = [at["base_color"].clamp(0, 1), at["roughness"][:, None], at["metallic"][:, None], at["bump"],
+              depth[:, None], torch.ones_like(depth)[:, None]]  # fmt: skip
+    dense = torch.zeros(rays, 10).index_copy_(0, seen, torch.cat(values, -1))
+    base, rest, normal, depth, hit = pooled_pixels(dense, size).split([3, 2, 3, 1, 1], -1)
+    share = hit.clamp(min=0.5 / FINE**2)
+    material = torch.cat([linear_to_srgb((base / share).clamp(0, 1)), rest / share], -1)
+    normal = torch.nn.functional.normalize(normal, dim=-1)
+    whole = hit > 0.5
+    return {"view_material": (material * whole * 255 + 0.5).to(torch.uint8),
+            "view_normal": (normal * whole * 127).round().to(torch.int8),
+            "view_depth": (depth / share * whole)[..., 0].half()}  # fmt: skip
+
+
+def pooled_pixels(rays: Tensor, size: int) -> Tensor:
+    """Means ``(S, S, C)`` over the ``FINE**2`` rays of each pixel, of values ``(rays, C)``."""
+    image = rays.reshape(1, size * FINE, size * FINE, -1).permute(0, 3, 1, 2)
+    return torch.nn.functional.avg_pool2d(image, FINE)[0].permute(1, 2, 0)
 
 
 def _coverage(scene: RayScene, c2w: Tensor, intrinsics: Tensor, size: int, grid: int = 3) -> Tensor:

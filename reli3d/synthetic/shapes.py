@@ -1,0 +1,122 @@
+"""Shapes of untextured GLB files as training objects: rounded, stretched, put together, with finishes of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from scipy.sparse import coo_matrix
+from torch import Tensor
+
+from reli3d.io.glb import read_glb
+from reli3d.synthetic.finishes import draw_materials
+from reli3d.synthetic.procedural import CREASE_DEG, ProceduralObject, corner_normals
+from reli3d.synthetic.samples import ObjectSurface
+from reli3d.synthetic.scanned import outside_distance
+
+ROLES = ("any", "any", "any", "wood", "metal", "plastic", "paint", "fabric", "leather", "ceramic", "stone", "accent")
+STRETCH = 0.22  # standard deviation of the logarithm of the scale along each axis
+COMBINED = 0.3  # share of the objects that are put together from two or three shapes
+ROUNDED = 0.65  # share of the coarse shapes that are subdivided and smoothed
+COARSE_FACES = 3000  # above: scanned, and smooth already
+MAX_FACES = 60_000
+
+
+class ShapeSurface(ObjectSurface):
+    """One or more shapes, dressed; open undersides are closed by what no light reaches."""
+
+    def __init__(self, paths: Sequence[Path], rng: np.random.Generator):
+        super().__init__(combine([paths[int(rng.integers(len(paths)))] for _ in range(_count(rng))], rng))
+
+    def distance(self, points: Tensor) -> Tensor:
+        return outside_distance(self.vertices, self.faces, points, self.scene)
+
+
+def _count(rng: np.random.Generator) -> int:
+    return int(rng.integers(2, 4)) if rng.random() < COMBINED else 1
+
+
+@lru_cache(64)
+def _read(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Welded vertices, faces and the primitive of each face; longest side 1, centred."""
+    vertices, faces, part, start = [], [], [], 0
+    for k, asset in enumerate(read_glb(path)):
+        vertices.append(asset.mesh.vertices.numpy())
+        faces.append(asset.mesh.faces.numpy() + start)
+        part.append(np.full(len(faces[-1]), k))
+        start += len(vertices[-1])
+    v, f, part = np.concatenate(vertices).astype(np.float64), np.concatenate(faces), np.concatenate(part)
+    v = (v - (v.min(0) + v.max(0)) / 2) / np.ptp(v, axis=0).max()
+    _, first, index = np.unique(np.round(v * 1e5).astype(np.int64), axis=0, return_index=True, return_inverse=True)
+    f = index.reshape(-1)[f]
+    keep = (f[:, 0] != f[:, 1]) & (f[:, 1] != f[:, 2]) & (f[:, 2] != f[:, 0])
+    return v[first], f[keep], part[keep]
+
+
+def combine(paths: Sequence[Path], rng: np.random.Generator) -> ProceduralObject:
+    """The shapes of ``paths`` as one object: the first as it rests, the others beside, on or in it."""
+    vertices, faces, part, start, parts = [], [], [], 0, 0
+    for k, path in enumerate(paths):
+        v, f, p = _read(path)
+        if len(f) < COARSE_FACES and rng.random() < ROUNDED:
+            v, f, p = rounded(v, f, p, int(rng.integers(1, 3)), float(rng.uniform(0.2, 1.0)))
+        v = v * np.exp(rng.normal(0, STRETCH, 3))
+        yaw = rng.uniform(0, 2 * np.pi) if rng.random() < 0.5 else np.pi / 2 * rng.integers(4)
+        turn = _yaw(yaw)
+        if rng.random() < 0.12:
+            turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+            turn[:, 0] *= np.sign(np.linalg.det(turn))
+        v = v @ turn.T
+        if k:
+            v = v * rng.uniform(0.35, 0.9)
+            low, high = np.concatenate(vertices).min(0), np.concatenate(vertices).max(0)
+            at = rng.uniform(low, high)
+            side = int(rng.integers(3))
+            at[side] = (high if rng.random() < 0.7 else low)[side]
+            v = v - (v.min(0) + v.max(0)) / 2 + at
+            if rng.random() < 0.5:
+                v[:, 1] += low[1] - v[:, 1].min()  # both stand on the ground
+        vertices.append(v), faces.append(f + start), part.append(p + parts)
+        start, parts = start + len(v), parts + int(p.max()) + 1
+    v, f, part = np.concatenate(vertices), np.concatenate(faces), np.concatenate(part)
+    if len(f) > MAX_FACES:
+        raise ValueError(f"shape: expected at most {MAX_FACES} faces, got {len(f)}")
+    v = ((v - (v.min(0) + v.max(0)) / 2) / np.ptp(v, axis=0).max()).astype(np.float32)
+    used, part = np.unique(part, return_inverse=True)
+    part = part.reshape(-1).astype(np.int32)
+    bounds = [v[f[part == k]].reshape(-1, 3) for k in range(len(used))]
+    bounds = np.array([[b.min(0), b.max(0)] for b in bounds])
+    roles = [str(rng.choice(ROLES)) for _ in used]
+    materials = draw_materials(rng, roles, bounds)
+    crease = CREASE_DEG if rng.random() < 0.7 else float(rng.choice([10.0, 60.0]))
+    f = f.astype(np.int32)
+    return ProceduralObject(v, f, corner_normals(v, f, crease), part, materials, "shape")
+
+
+def rounded(v: np.ndarray, f: np.ndarray, part: np.ndarray, times: int, strength: float):
+    """Each face in four, ``times``; after each the vertices move towards their neighbours' mean."""
+    for _ in range(times):
+        if len(f) * 4 > COARSE_FACES * 8:
+            break
+        count = len(f)
+        v, f, index = trimesh.remesh.subdivide(v, f, return_index=True)
+        source = np.empty(len(f), dtype=np.int64)
+        for old, new in index.items():
+            source[new] = old
+        part = part[source]
+        assert len(f) == 4 * count
+        edge = np.concatenate([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]])
+        edge = np.concatenate([edge, edge[:, ::-1]])
+        graph = coo_matrix((np.ones(len(edge)), (edge[:, 0], edge[:, 1])), shape=(len(v),) * 2).tocsr()
+        degree = np.maximum(np.asarray(graph.sum(1)).reshape(-1, 1), 1)
+        for _ in range(2):
+            v = v + 0.5 * strength * (graph @ v / degree - v)
+    return v, f, part
+
+
+def _yaw(angle: float) -> np.ndarray:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
