@@ -21,11 +21,11 @@ from reli3d.geometry.surface import extract_surface, surface_cubes
 from reli3d.geometry.tangents import encode_normals, vertex_tangents
 from reli3d.geometry.uv import unwrap, unwrap_xatlas
 from reli3d.geometry.visibility import visible_from
+from reli3d.nn.blocks import in_rows
 from reli3d.nn.field import (
     LIGHT_ROWS,
     bound_level,
     grid_level,
-    in_rows,
     object_shading,
     surface_level,
     surface_material,

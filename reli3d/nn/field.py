@@ -7,21 +7,19 @@ all there is.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 from reli3d._bridge import over_rows
 from reli3d.geometry.hull import hull_distance
+from reli3d.nn.blocks import ROWS, in_rows
 from reli3d.nn.light_features import Shading, brightness_at, brightness_over_normal, palette_of, unshaded
 from reli3d.nn.model import Code, Reconstructor
 from reli3d.nn.view_features import ViewMaps
 from reli3d.render.color import srgb_to_linear
 from reli3d.render.environment import Environment
 
-ROWS = 8192  # points at a time without gradient: their features stay in the cache, which halves the time of the heads
 LIGHT_ROWS = 16  # of the decoded map from which the material is told its irradiance
 MATERIAL = ("base_color", "roughness", "metallic", "normal")
 
@@ -65,18 +63,6 @@ def _offset(model: Reconstructor, maps: ViewMaps) -> float:
     """Added to the raw density: moves the surface outward."""
     preset, views = model.preset, len(maps.c2w)
     return preset.offset_many_views + (preset.offset_one_view - preset.offset_many_views) / views
-
-
-def in_rows(evaluate: Callable[..., dict[str, Tensor]], *inputs: Tensor) -> dict[str, Tensor]:
-    """``evaluate(*inputs)``; on CPU, where no gradient is recorded, block by block of ROWS rows of the inputs.
-
-    The blocks run on the threads of the bridge's pool, so ``evaluate`` must work row by row and keep no state.
-    """
-    n = len(inputs[0])
-    if torch.is_grad_enabled() or inputs[0].is_cuda or n == 0:
-        return evaluate(*inputs)
-    parts = over_rows(n, ROWS, lambda start, stop: evaluate(*(x[start:stop] for x in inputs)))
-    return {name: torch.cat([p[name] for p in parts]) for name in parts[0]}
 
 
 def bound_level(model: Reconstructor, maps: ViewMaps, points: Tensor) -> Tensor:

@@ -1,0 +1,131 @@
+"""What a step of training asks of a :class:`~reli3d.nn.local.LocalReconstructor` about one object."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from reli3d.nn.local import LocalField, LocalReconstructor
+from reli3d.render.color import linear_to_srgb, srgb_to_linear
+from reli3d.train.objects import Sample
+
+WEIGHTS = {
+    "occupancy": 1.0, "surface": 0.02, "gradient": 0.3,
+    "base_color": 4.0, "pattern": 8.0, "roughness": 1.5, "metallic": 1.5, "normal": 1.0,
+    "pixel_color": 8.0, "pixel_roughness": 1.0, "pixel_metallic": 1.0, "pixel_normal": 0.7, "pixel_depth": 1.0,
+    "light": 0.4, "irradiance": 0.4,
+}  # fmt: skip
+ASTRAY = 0.02, 0.3  # greatest deviation of position [model's cube] and normal [radian] of an extracted surface
+GRADIENT_POINTS, GRADIENT_STEP = 256, 0.008  # surface points whose level's slope is asked, over about a grid cell
+DEPTH_UNIT = 0.1  # of the object's longest side
+NORMALS = 192  # directions at which the irradiance is compared
+
+
+def encode_sample(model: LocalReconstructor, sample: Sample) -> LocalField:
+    detail = torch.cat([sample.images, sample.silhouette[..., None]], -1).contiguous()
+    return model.encode(sample.images, sample.masks, sample.c2w, sample.intrinsics, detail, sample.intrinsics)
+
+
+def objectives(model: LocalReconstructor, sample: Sample) -> dict[str, Tensor]:
+    """Unweighted terms, each a scalar; gradients reach every parameter."""
+    field = encode_sample(model, sample)
+    position, normal, bumped = (t.contiguous() for t in sample.surface.unbind(1))
+    normal, bumped = functional.normalize(normal, dim=-1), functional.normalize(bumped, dim=-1)
+    field = field.with_shading(position, normal, sample.visible)
+    return {
+        **_shape(field, sample, position, normal),
+        **_paint(field, sample, position, normal, bumped),
+        **_pixels(field, sample),
+        **_light(field, sample),
+    }
+
+
+def _shape(field: LocalField, sample: Sample, position: Tensor, normal: Tensor) -> dict[str, Tensor]:
+    """Occupancy as a soft step; level zero and its slope along the normal at surface points.
+
+    The slope is asked by differences over a tetrahedron: no second derivative of the network is needed.
+    """
+    softness = field.model.preset.softness
+    level = field.level(sample.points)
+    target = (-sample.distance / softness).sigmoid()
+    corners = GRADIENT_STEP * position.new_tensor([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
+    few = position[:GRADIENT_POINTS]
+    around = field.free_level((few[:, None] + corners).reshape(-1, 3)).reshape(-1, 4)
+    slope = (around[..., None] * corners).sum(1)
+    on_surface = around.mean(1)
+    return {
+        "occupancy": functional.binary_cross_entropy_with_logits(-level, target),
+        "surface": functional.smooth_l1_loss(on_surface, torch.zeros_like(on_surface)),
+        "gradient": (1 - functional.cosine_similarity(slope, normal[:GRADIENT_POINTS], dim=-1, eps=1e-6)).mean(),
+    }
+
+
+def _paint(field: LocalField, sample: Sample, position: Tensor, normal: Tensor, bumped: Tensor) -> dict[str, Tensor]:
+    """Material at surface points, asked a little off the surface and with a tilted normal, as extraction errs."""
+    share = torch.rand((), device=position.device)
+    moved = position + ASTRAY[0] * share * torch.randn_like(position[:, :1]) * normal
+    tilted = functional.normalize(normal + ASTRAY[1] * share * torch.randn_like(normal) / 2**0.5, dim=-1)
+    got = field.material(moved, tilted, sample.visible)
+    base, rough, metal = sample.material[:, :3], sample.material[:, 3], sample.material[:, 4]
+    return {
+        "base_color": functional.mse_loss(got.base_color, base),
+        "pattern": pattern_loss(got.base_color, base),
+        "roughness": functional.mse_loss(got.roughness, rough),
+        "metallic": functional.mse_loss(got.metallic, metal),
+        "normal": (1 - functional.cosine_similarity(got.normal, bumped, dim=-1)).mean(),
+    }
+
+
+def pattern_loss(color: Tensor, target: Tensor) -> Tensor:
+    """Mean square difference of base colours ``(N, 3)``, sRGB, after each channel's best factor in linear light.
+
+    How bright an albedo is no image tells: a longer exposure looks the same.  How it varies over the surface, they do.
+    """
+    p, t = srgb_to_linear(color), srgb_to_linear(target)
+    factor = (p * t).sum(0) / p.square().sum(0).clamp(min=1e-4)
+    return functional.mse_loss(linear_to_srgb((p * factor.detach()).clamp(0.0, 1.0)), target)
+
+
+def _pixels(field: LocalField, sample: Sample) -> dict[str, Tensor]:
+    """The pyramid's predictions against the maps of the views, at pixels that show the surface alone."""
+    valid, pixels = sample.view_valid, field.pixels
+    want = sample.view_material[valid]
+    logit = pixels.base_logit(field.color)[valid]
+    return {
+        "pixel_color": functional.mse_loss(logit.sigmoid(), want[:, :3]),
+        "pixel_roughness": functional.mse_loss(pixels.roughness[valid][:, 0].sigmoid(), want[:, 3]),
+        "pixel_metallic": functional.mse_loss(pixels.metallic[valid][:, 0].sigmoid(), want[:, 4]),
+        "pixel_normal": (1 - (pixels.normal[valid] * sample.view_normal[valid]).sum(-1)).mean(),
+        "pixel_depth": functional.smooth_l1_loss(pixels.depth[valid][:, 0] / DEPTH_UNIT,
+                                                 sample.view_depth[valid] / DEPTH_UNIT, beta=0.2),
+    }  # fmt: skip
+
+
+def _light(field: LocalField, sample: Sample) -> dict[str, Tensor]:
+    """Log radiance over the sphere, and log irradiance at random normals, which lamps decide."""
+    log = field.log_light
+    count = len(sample.light)
+    rows = int((count // 2) ** 0.5)
+    angle = torch.sin((torch.arange(count) // (2 * rows) + 0.5) * torch.pi / rows).to(log)
+    got = _lookup(log, sample.light_directions)
+    error = (torch.logaddexp(got, got.new_tensor(-4.6)) - (sample.light + 0.01).log()).abs().mean(-1)
+    normals = functional.normalize(torch.randn(NORMALS, 3, device=log.device), dim=-1)
+    cosine = (normals @ sample.light_directions.T).clamp(min=0) * angle
+    cosine = cosine / cosine.sum(-1, keepdim=True)
+    irradiance, want = cosine @ got.exp(), cosine @ sample.light
+    return {
+        "light": (error * angle).sum() / angle.sum(),
+        "irradiance": ((irradiance + 0.01).log() - (want + 0.01).log()).abs().mean(),
+    }
+
+
+def _lookup(log: Tensor, directions: Tensor) -> Tensor:
+    """Bilinear values ``(N, 3)`` of the lat-long map ``log (3, H, 2H)``, periodic in azimuth."""
+    x, y, z = directions.unbind(-1)
+    wrapped = functional.pad(log[None], (1, 1, 0, 0), mode="circular")
+    width = log.shape[2]
+    u = (torch.atan2(x, -z) + torch.pi) / (2 * torch.pi) * width + 1.0  # in texels of the padded map
+    v = y.clamp(-1, 1).acos() / torch.pi * 2 - 1
+    at = torch.stack([2 * u / (width + 2) - 1, v], -1)[None, None]
+    return functional.grid_sample(wrapped, at, align_corners=False, padding_mode="border")[0, :, 0].T

@@ -1,0 +1,127 @@
+"""One object of a training step from a file of :mod:`reli3d.synthetic.samples`: views, points and maps, augmented."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from safetensors import safe_open
+from torch import Tensor
+from torch.nn import functional
+
+from reli3d.geometry.hull import mask_distance
+from reli3d.nn.reni import map_directions
+from reli3d.train.batches import random_turn
+
+NOISE = 0.012  # greatest standard deviation of a photograph's noise, sRGB
+KEPT = 0.75  # share of the augmented objects that stay the right way round in a mirror, and keep their channels
+
+
+@dataclass(frozen=True)
+class Sample:
+    """``V`` input views of ``S`` by ``S`` pixels, maps of ``P = S/2``; float32; the world turned at random."""
+
+    images: Tensor  # (V, S, S, 3) sRGB
+    masks: Tensor  # (V, S, S)
+    silhouette: Tensor  # (V, S, S) pixels
+    c2w: Tensor  # (V, 4, 4)
+    intrinsics: Tensor  # (V, 4)
+    view_material: Tensor  # (V, P, P, 5) base colour (sRGB), roughness, metallic
+    view_normal: Tensor  # (V, P, P, 3) world, unit
+    view_depth: Tensor  # (V, P, P) from the world's origin along the camera's axis
+    view_valid: Tensor  # (V, P, P) bool: the pixel shows the surface alone
+    points: Tensor  # (M, 3)
+    distance: Tensor  # (M,)
+    surface: Tensor  # (N, 3, 3) position, normal, bumped normal
+    material: Tensor  # (N, 5)
+    visible: Tensor  # (N, V)
+    light_directions: Tensor  # (2048, 3)
+    light: Tensor  # (2048, 3) linear radiance
+
+
+def load_object(path: Path, views: int, points: int, rng: np.random.Generator, *, augment: bool = True) -> Sample:
+    """``views`` random views of a file, at most what it has; ``points`` of the volume, half as many of the surface.
+
+    Without ``augment`` the first views, as they are.
+    """
+    with safe_open(path, "pt") as file:
+        total = file.get_slice("c2w").get_shape()[0]
+        order = rng.permutation(total)[:views] if augment else np.arange(min(views, total))
+        chosen = order.tolist()
+
+        def of_views(key: str) -> Tensor:
+            whole = file.get_slice(key)
+            return torch.stack([whole[k] for k in chosen])
+
+        def run(key: str, count: int, low: int, high: int, rng: np.random.Generator) -> slice:
+            first = low + int(rng.integers(max(1, high - low - count + 1)))
+            return slice(first, first + count)
+
+        n = file.get_slice("distance").get_shape()[0]
+        runs = [run("points", points // 2, 0, n // 2, rng), run("points", points // 2, n // 2, n, rng)]
+        volume = torch.cat([file.get_slice("points")[r] for r in runs]).float()
+        distance = torch.cat([file.get_slice("distance")[r] for r in runs]).float()
+        s = run("surface", points // 2, 0, file.get_slice("material").get_shape()[0], rng)
+        surface, material = file.get_slice("surface")[s].float(), file.get_slice("material")[s].float() / 255
+        visible = file.get_slice("visible")[s][:, chosen].float()
+        images, c2w, intrinsics = of_views("images").float() / 255, of_views("c2w"), of_views("intrinsics")
+        of_pixels = of_views("view_material").float() / 255
+        normal, depth = of_views("view_normal").float() / 127, of_views("view_depth").float()
+        light = file.get_tensor("environment").float()
+    turn = random_turn(rng) if augment else torch.eye(3)
+    flip = torch.tensor([-1.0 if augment and rng.random() > KEPT else 1.0, 1.0, 1.0])
+    turn = turn * flip  # a mirror at the plane x = 0, then the turn
+    mirrored = bool(flip[0] < 0)
+    if mirrored:
+        images, of_pixels, normal, depth = (t.flip(2) for t in (images, of_pixels, normal, depth))
+        intrinsics = intrinsics.clone()
+        intrinsics[:, 2] = images.shape[2] - intrinsics[:, 2]
+    c2w = c2w.clone()
+    c2w[:, :3] = turn @ c2w[:, :3]
+    if mirrored:
+        c2w[:, :, 0] *= -1  # the camera stays right-handed, its picture is flipped
+    if augment and rng.random() > KEPT:
+        channels = torch.as_tensor(rng.permutation(3))
+        images = torch.cat([images[..., channels], images[..., 3:]], -1)
+        light, material = light[..., channels], torch.cat([material[:, channels], material[:, 3:]], -1)
+        of_pixels = torch.cat([of_pixels[..., channels], of_pixels[..., 3:]], -1)
+    color, masks = images[..., :3], images[..., 3]
+    if augment:
+        color = (color + float(rng.random()) * NOISE * torch.randn_like(color)).clamp(0, 1)
+    valid = depth > 0
+    whole = functional.avg_pool2d(valid.float()[:, None], 2)[:, 0]
+    share = whole.clamp(min=0.25)[..., None]
+
+    def half(values: Tensor) -> Tensor:
+        pooled = functional.avg_pool2d((values * valid[..., None]).permute(0, 3, 1, 2), 2).permute(0, 2, 3, 1)
+        return pooled / share
+
+    origin = (c2w[:, :3, 3] * c2w[:, :3, 2]).sum(-1)[:, None, None]  # depth of the world's origin
+    return Sample(
+        images=color.contiguous(), masks=masks.contiguous(), silhouette=mask_distance(masks.contiguous()), c2w=c2w,
+        intrinsics=intrinsics, view_material=half(of_pixels),
+        view_normal=functional.normalize(half(normal) @ turn.T, dim=-1),
+        view_depth=half(depth[..., None])[..., 0] - origin, view_valid=whole > 0.99, points=volume @ turn.T,
+        distance=distance, surface=surface @ turn.T, material=material, visible=visible,
+        light_directions=map_directions(light.shape[0]).reshape(-1, 3) @ turn.T, light=light.reshape(-1, 3),
+    )  # fmt: skip
+
+
+def objects(folder: Path, *, size: int, points: int, max_views: int, seed: int, start: int = 0,
+            rank: int = 0) -> Iterator[list[Sample]]:  # fmt: skip
+    """Endless lists of ``size`` objects, each with 1 to ``max_views`` views; step ``k`` is a function of ``seed`` and
+    ``k`` alone for a fixed folder, so training resumes; ``rank`` tells processes apart that share a step.
+    """
+    files, step = sorted(folder.glob("*.safetensors")), start
+    if not files:
+        raise ValueError(f"samples: expected *.safetensors files, got none in {folder}")
+    while True:
+        if step % 50 == 0:  # samples may still be arriving
+            files = sorted(folder.glob("*.safetensors"))
+        rng = np.random.default_rng((seed, step, rank))
+        yield [load_object(files[int(rng.integers(len(files)))], int(rng.integers(1, max_views + 1)), points, rng)
+               for _ in range(size)]  # fmt: skip
+        step += 1
