@@ -57,7 +57,7 @@ def test_weights_asked_for_near_the_surface_give_the_published_mesh(goldens):
     code = Code(torch.from_numpy(data["triplane"]), none, none, none, none)
     flat = pipeline._grid(16, 0.87, torch.device("cpu")).reshape(-1, 3)
     level = model.level(model.query(code, flat[None], ("density",))["density"])[0, :, 0].view(17, 17, 17)
-    weights = pipeline._cube_weights(model, code, flat, level)
+    weights = field.Field(model, code, None).cube_weights(flat, level)
     got = extract_surface(level, radius=0.87, closed=False, **weights)
     assert np.array_equal(got.faces.numpy(), data["faces"])
     # density is exp of a sum of 64 products: 1e-5 relative, over slopes of about 1 a cell of 0.1
@@ -79,7 +79,7 @@ def test_weights_near_the_surface_are_those_of_the_whole_grid(tiny, half_space):
     dense = tiny.merger(torch.stack(eight, -2).view(n**3, 8, 16))
     want = extract_surface(level, radius=0.87, deformation=deformation(raw["deformation"][0], n).view(13, 13, 13, 3),
                            alpha=dense.alpha, beta=dense.beta, gamma=dense.gamma)  # fmt: skip
-    weights = pipeline._cube_weights(tiny, code, flat, level)
+    weights = field.Field(tiny, code, None).cube_weights(flat, level)
     assert len(weights["alpha"]) == len(surface_cubes(level))
     got = extract_surface(level, radius=0.87, **weights)
     assert torch.equal(got.faces, want.faces)
@@ -93,12 +93,13 @@ def test_the_grid_is_asked_by_planes_and_gives_the_level_of_its_points(tiny, mon
     monkeypatch.setattr(tiny, "preset", replace(tiny.preset, offset_many_views=0.03))
     code, maps = tiny.encode(*views(1, 2, 76)), SimpleNamespace(c2w=torch.zeros(2, 4, 4))
     axis = torch.linspace(-0.8, 0.6, 15)
-    want = field.surface_level(tiny, code, maps, torch.cartesian_prod(axis, axis, axis)).view(15, 15, 15)
+    own = field.Field(tiny, code, maps)
+    want = own.free_level(torch.cartesian_prod(axis, axis, axis)).view(15, 15, 15)
     assert float(want.min()) < 0 < float(want.max())
     for rows in (8192, 100, 1):
         monkeypatch.setattr(field, "ROWS", rows)
         # sums of 24 float32 products in another order, behind exp
-        torch.testing.assert_close(field.grid_level(tiny, code, maps, axis), want, rtol=1e-4, atol=1e-4)
+        torch.testing.assert_close(own.grid_level(axis), want, rtol=1e-4, atol=1e-4)
     with pytest.raises(ValueError, match="preset: expected one without point features"):
         Reconstructor(NANO).grid_density(code, axis)
 

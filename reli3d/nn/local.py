@@ -14,9 +14,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from reli3d.geometry.hull import hull_distance
 from reli3d.geometry.projection import gather_views, summarize_views
 from reli3d.nn.blocks import in_rows
+from reli3d.nn.field import LIGHT_ROWS, PointMaterial, bound_level
 from reli3d.nn.heads import ROUGHNESS_MIN, color_logit, mlp
 from reli3d.nn.light_features import Shading, brightness_at, brightness_over_normal, palette_of, unshaded
 from reli3d.nn.light_map import LightMap
@@ -27,20 +27,9 @@ from reli3d.nn.volume import HULL_SCALE, FeatureVolume
 from reli3d.render.color import srgb_to_linear
 from reli3d.render.environment import Environment
 
-LIGHT_ROWS = 16  # of the map from which the material is told its irradiance
 TOKEN_EXTRA = 4  # depth and world normal, beside the pyramid's features
 FUSED = 10  # numbers of Fused beside the colour
 SHARPNESS = 2.0  # power of a view's share: the view that looks straightest speaks, with smooth seams
-
-
-@dataclass(frozen=True)
-class PointMaterial:
-    """Material at N surface points."""
-
-    base_color: Tensor  # (N, 3) sRGB-encoded
-    roughness: Tensor  # (N,) perceptual
-    metallic: Tensor  # (N,)
-    normal: Tensor  # (N, 3) unit, world: of shading
 
 
 @dataclass(frozen=True)
@@ -154,32 +143,40 @@ class LocalField:
     log_light: Tensor  # (3, H, 2H)
     shading: Shading | None = None
 
-    def hull(self, points: Tensor) -> Tensor:
-        """Signed distance ``(N,)`` of ``points`` to the silhouettes' hull, positive inside; no gradient."""
-        maps = self.maps
-        return hull_distance(points, maps.images[..., 3].contiguous(), maps.c2w, maps.intrinsics)
+    bounded = True  # the silhouettes bound the surface
+    reads_views = True  # the material asks which view sees a point
 
     def bound(self, points: Tensor) -> Tensor:
         """Level ``(N,)`` of the silhouettes' hull: no point is further inside than this; no gradient."""
-        return -self.hull(points) / self.model.preset.softness
+        return bound_level(self.maps, points, self.model.preset.softness)
+
+    def grid_level(self, axis: Tensor) -> None:
+        """None: features of points belong to no plane, see :meth:`reli3d.nn.field.Field.grid_level`."""
+
+    def cube_weights(self, points: Tensor, level: Tensor) -> dict[str, Tensor]:
+        """None beside the level, see :meth:`reli3d.nn.field.Field.cube_weights`."""
+        return {}
 
     def free_level(self, points: Tensor) -> Tensor:
         """Level ``(N,)`` that the network gives ``points (N, 3)``, negative inside, without the hull's bound."""
-        preset, views = self.model.preset, len(self.maps.c2w)
-        many, one = preset.offset_many_views, preset.offset_one_view
-        offset = many + (one - many) / views
 
         def ask(points: Tensor) -> dict[str, Tensor]:
-            return {"level": self.model.level(self._features(points, self.hull(points)))[:, 0]}
+            return {"level": self.model.level(self._features(points))[:, 0]}
 
-        return in_rows(ask, points)["level"] - offset
+        return in_rows(ask, points)["level"] - self._offset()
+
+    def _offset(self) -> float:
+        """Moves the surface outward."""
+        many, one = self.model.preset.offset_many_views, self.model.preset.offset_one_view
+        return many + (one - many) / len(self.maps.c2w)
 
     def level(self, points: Tensor) -> Tensor:
         """Level ``(N,)``: negative inside, zero on the surface, in units of ``softness``."""
         return torch.maximum(self.free_level(points), self.bound(points))
 
-    def _features(self, points: Tensor, hull: Tensor, visible: Tensor | None = None, normal: Tensor | None = None):
+    def _features(self, points: Tensor, visible: Tensor | None = None, normal: Tensor | None = None) -> Tensor:
         model = self.model
+        hull = -self.bound(points) * model.preset.softness
         of_views, _ = model.view_features(self.maps, points, visible, normal)
         of_space = model.volume.sample(self.volume, points)
         rest = [(hull / HULL_SCALE).clamp(-2, 2), torch.full_like(hull, 1.0 / len(self.maps.c2w))]
@@ -222,7 +219,7 @@ class LocalField:
         def ask(position: Tensor, normal: Tensor, visible: Tensor) -> dict[str, Tensor]:
             fused = self.fused(position, normal, visible)
             features = torch.cat([
-                self._features(position, self.hull(position), visible, normal), fused.numbers, fused.logit,
+                self._features(position, visible, normal), fused.numbers, fused.logit,
                 self.shading.features(normal, fused.logit.detach().sigmoid()),
             ], -1)  # fmt: skip
             own, correction, share = self.model.color(features).split([3, 3, 1], -1)

@@ -155,16 +155,19 @@ class Preset:
         shading = SHADING_FEATURES if self.shading_features else 0
         return self.view_feature_width + shading if self.view_feature_width else 0
 
-    def to_json(self) -> str:
-        return json.dumps(dataclasses.asdict(self), sort_keys=True)
 
-    @classmethod
-    def from_json(cls, text: str) -> Preset:
-        """The preset that :meth:`to_json` wrote.  Raises ValueError for anything else."""
-        try:
-            return _build(cls, json.loads(text))
-        except (json.JSONDecodeError, AttributeError, KeyError, TypeError) as error:
-            raise ValueError(f"preset: expected the JSON of a Preset, got {error}") from None
+def to_json(preset: Preset | LocalPreset) -> str:
+    """A preset as text, which :func:`from_json` reads."""
+    return json.dumps(dataclasses.asdict(preset), sort_keys=True)
+
+
+def from_json(text: str) -> Preset | LocalPreset:
+    """The preset that :func:`to_json` wrote.  Raises ValueError for anything else."""
+    try:
+        values = json.loads(text)
+        return _build(LocalPreset if "pyramid" in values else Preset, values)
+    except (json.JSONDecodeError, AttributeError, KeyError, TypeError) as error:
+        raise ValueError(f"preset: expected the JSON of a preset, got {error}") from None
 
 
 def _build(kind, values: dict):
@@ -175,6 +178,10 @@ def _build(kind, values: dict):
         expected = fields[key]
         if dataclasses.is_dataclass(expected):
             built[key] = _build(expected, value)
+        elif typing.get_origin(expected) is tuple:  # JSON has lists
+            if not isinstance(value, list) or not all(type(v) is int for v in value):
+                raise TypeError(f"{key} = {value!r}")
+            built[key] = tuple(value)
         elif isinstance(value, bool) == (expected is bool) and isinstance(value, expected):
             built[key] = value
         else:
