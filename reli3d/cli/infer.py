@@ -229,7 +229,7 @@ class Job:
             "mesh": results.mesh_statistics(asset.mesh),
             "seconds": seconds,
             "seconds_since_start": round(time.monotonic() - STARTED, 3),
-            "peak_memory_mib": round(results.peak_memory_mib(), 1),
+            "peak_memory_mib": results.peak_memory_mib(),
             "versions": results.versions(),
         }
         steps("writing")

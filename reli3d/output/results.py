@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import resource
 import shutil
 import sys
 from dataclasses import asdict
@@ -36,10 +35,14 @@ def mesh_statistics(mesh: Mesh) -> dict:
     return asdict(report(mesh))
 
 
-def peak_memory_mib() -> float:
-    """Most memory that this process has held, MiB."""
+def peak_memory_mib() -> float | None:
+    """Most memory that this process has held, MiB, to a tenth; None on Windows, where Python has no such count."""
+    try:
+        import resource
+    except ImportError:
+        return None
     unit = 1 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20
+    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20, 1)
 
 
 def write_results(folder: Path, asset: Asset, picture: np.ndarray, info: dict, *, compatible: bool = False) -> None:
