@@ -10,6 +10,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from reli3d.nn.heads import HEADS, deformation, truncated_exp
 from reli3d.nn.model import Reconstructor
 from reli3d.nn.presets import (
+    LOCAL,
     OFFICIAL,
     SMALL,
     BackboneSizes,

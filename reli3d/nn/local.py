@@ -55,7 +55,7 @@ class PixelMaps:
         toward = -functional.normalize(torch.stack([x, y, -torch.ones_like(x)], -1), dim=-1)  # to the camera
         normal = functional.normalize(0.3 * toward + normal, dim=-1)
         world = torch.einsum("vij,vxyj->vxyi", c2w[:, :3, :3], normal)
-        return PixelMaps((gain + 2.0).sigmoid(), shift, confidence, rough, metal - 2.0, world, depth[..., :1])
+        return PixelMaps((gain + 2.0).sigmoid(), shift, confidence, rough, metal - 2.0, world, depth[..., :1] - 0.2)
 
     def stacked(self) -> Tensor:
         return torch.cat([self.gain, self.shift, self.confidence, self.roughness, self.metallic, self.normal], -1)

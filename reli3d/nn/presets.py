@@ -239,7 +239,7 @@ LOCAL = LocalPreset(
     name="local",
     image_size=256,
     pyramid=PyramidSizes(widths=(16, 40, 64, 96, 128), features=24),
-    volume=VolumeSizes(side=40, radius=0.56, widths=(16, 32, 64, 96), features=24),
+    volume=VolumeSizes(side=40, radius=0.56, widths=(16, 56, 96, 128), features=24),
     light=LightMapSizes(height=32, widths=(32, 64, 96, 128)),
     view_width=40,
     head_width=64,
