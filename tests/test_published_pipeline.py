@@ -12,6 +12,7 @@ from reli3d import pipeline
 from reli3d.cli import infer
 from reli3d.geometry.mesh import report
 from reli3d.geometry.surface import extract_surface, surface_cubes
+from reli3d.io.hdr import read_environment, read_hdr_image
 from reli3d.nn import field
 from reli3d.nn.heads import deformation
 from reli3d.nn.model import Code, Reconstructor
@@ -187,8 +188,10 @@ def test_the_command_takes_published_weights_and_writes_published_names(tiny, tm
     assert infer.main([*arguments, "--hero", "1", "--background", "visible", "--precision", "bfloat16"]) == 0
     folder = tmp_path / "out" / "example"
     assert sorted(p.name for p in folder.iterdir()) == sorted((*results.FILES, "illumination.hdr"))
-    assert (folder / "illumination.hdr").read_bytes() == (folder / "environment.hdr").read_bytes()
+    published, light = read_hdr_image(folder / "illumination.hdr"), read_environment(folder / "environment.hdr")
+    assert torch.equal(published, light)  # as the release lays it out: the centre column -Z
     info = json.loads((folder / "run_info.json").read_text())
+    assert info["environment_centre"] == "+X"
     assert info["views"] == list(EXAMPLE.names[::-1]) and info["background"] == "visible"
     assert info["precision"] == "bfloat16" and load_model(weights).dtype == torch.float32
     assert info["model_from_input"] == torch.eye(4).tolist()  # poses as stored

@@ -14,7 +14,7 @@ from PIL import Image
 from reli3d.cli.render import main
 from reli3d.geometry.mesh import Mesh
 from reli3d.io.glb import read_glb, write_glb
-from reli3d.io.hdr import read_environment, read_hdr_image, write_exr, write_hdr
+from reli3d.io.hdr import read_environment, read_hdr_image, write_environment
 from reli3d.render.asset import Asset
 from reli3d.render.camera import Camera, camera_rays, look_at
 from reli3d.render.color import agx, linear_to_srgb
@@ -37,8 +37,8 @@ def scene(tmp_path_factory):
                                          asset.textures))  # fmt: skip
     light = torch.full((8, 16, 3), 0.0625)
     light[:, :8] = torch.tensor([2.0, 1.0, 1.0])
-    write_hdr(folder / "half.hdr", light)
-    write_exr(folder / "half.exr", light)
+    write_environment(folder / "half.hdr", light)
+    write_environment(folder / "half.exr", light)
     return folder
 
 

@@ -17,7 +17,8 @@ def parser() -> argparse.ArgumentParser:
         epilog="Exit code: 0 done, 2 wrong input.  The files' names go to stdout, progress to stderr.",
     )
     p.add_argument("glb", type=Path)
-    p.add_argument("--light", type=Path, help="lat-long .hdr or .exr; default uniform white")
+    p.add_argument("--light", type=Path, help="lat-long .hdr or .exr, its centre column +X (as three.js, "
+                   "model-viewer and Blender have it); default uniform white")  # fmt: skip
     p.add_argument("--output", type=Path, default=Path("renders"), help="folder (default renders)")
     p.add_argument("--format", choices=FORMATS, default="png", help="png, exr (linear radiance), webp (animation)")
     p.add_argument("--frames", type=int, default=1, help="views on a full turn around +Y")
