@@ -17,6 +17,8 @@ _HOME = {
     "Environment": "reli3d.render.environment",
     "Asset": "reli3d.render.asset",
     "TextureSet": "reli3d.render.asset",
+    "SurfacePoints": "reli3d.render.points",
+    "ShadeOptions": "reli3d.render.shading",
     "shade": "reli3d.render.shading",
     "Mesh": "reli3d.geometry.mesh",
     "RayScene": "reli3d.geometry.rays",

@@ -30,9 +30,10 @@ from reli3d.render.bump import radial_bump, world_bump
 from reli3d.render.camera import Camera, camera_rays, look_at, project
 from reli3d.render.environment import Environment
 from reli3d.render.gaussians import SphericalGaussians, shade_gaussians
-from reli3d.render.shading import shade
+from reli3d.render.shading import ShadeOptions, shade
 from reli3d.render.silhouette import antialias
 from reli3d.render.volume import RaySamples, composite
+from tests.surfaces import at, on_ball
 
 N = 5200  # rows: five slices of a CPU launch
 
@@ -143,8 +144,8 @@ def lit(shadows: str | None = None, **options):
             vertices, faces = ball(normal.device)
             scene = RayScene(vertices + torch.tensor([0.0, 1.0, 0.0], device=normal.device), faces,
                              shadows if normal.device.type == "cpu" else "warp")  # fmt: skip
-        return (shade(0.2 * ng, normal, ng, wo, base_color, roughness, metallic, Environment(radiance), scene=scene,
-                      seed=3, **options),)  # fmt: skip
+        points, wo = at(0.2 * ng, normal, ng, wo, base_color, roughness, metallic)
+        return (shade(points, wo, Environment(radiance), scene=scene, options=ShadeOptions(seed=3, **options)),)
 
     return run
 
@@ -273,12 +274,12 @@ CASES = {
         lambda n: {**lobes(n, "normal"), **{k: v for k, v in shaded(n).items() if k != "radiance"},
                    "wo": normalize(units(n, 1) + 0.5 * units(n, 6), dim=-1)},
         lambda normal, wo, base_color, roughness, metallic, **g: (
-            shade_gaussians(normal, wo, base_color, roughness, metallic, SphericalGaussians(**g)),),
+            shade_gaussians(*on_ball(normal, wo, base_color, roughness, metallic), SphericalGaussians(**g)),),
         (*SG, "wo", *MAP), ("wo", *MAP)),
     "shade": Case(shaded, lit(), (*MAP, "radiance"), MAP),
     "shade, shadows by Embree": Case(shaded, lit("embree"), (*MAP, "radiance"), MAP),
     "shade, shadows, power, random": Case(
-        shaded, lit("warp", heuristic="power", points="random", clamp=5.0), (*MAP, "radiance"), MAP),
+        shaded, lit("warp", heuristic="power", sequence="random", clamp=5.0), (*MAP, "radiance"), MAP),
     "composite": Case(
         lambda n: {"density": uniform(n, seed=1, low=-3.0, high=27.0), "color": uniform(n, 3, seed=2)}, composited,
         ("density", "color"), ("density", "color")),

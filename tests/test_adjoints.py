@@ -25,6 +25,7 @@ from reli3d.render.material import sample_bsdf
 from reli3d.render.sampling import pdf_ggx_vndf
 from tests import op_cases, reference, reference_surface
 from tests.reference_surface import random_weights, torus
+from tests.surfaces import on_ball
 from tests.test_smooth import sheet
 from tests.test_triplane import twin as grid_samples
 
@@ -238,7 +239,7 @@ def gaussians(g, small) -> Op:
     leaves = {"normal": normal, "wo": F.normalize(normal + 0.7 * op_cases.units(n, 6), dim=-1),
               "base_color": torch.rand(n, 3, generator=g), "roughness": 0.2 + 0.8 * torch.rand(n, generator=g),
               "metallic": torch.rand(n, generator=g), **lobes(g, 2 if small else 24)}  # fmt: skip
-    return Op(leaves, lambda *v: shade_gaussians(*v[:5], SphericalGaussians(*v[5:])),
+    return Op(leaves, lambda *v: shade_gaussians(*on_ball(*v[:5]), SphericalGaussians(*v[5:])),
               lambda normal, wo, base, roughness, *rest: reference.shade_gaussians(
                   normal, wo, base, roughness**2, *rest), ("normal", "wo", "axis"), one_sign=True)  # fmt: skip
 

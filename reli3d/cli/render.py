@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 FORMATS = ("png", "exr", "webp")
@@ -85,6 +86,7 @@ def render_files(args: argparse.Namespace) -> list[Path]:
     from reli3d.render.camera import Camera, look_at
     from reli3d.render.environment import Environment
     from reli3d.render.render import joined_scene, plan_render, render
+    from reli3d.render.shading import ShadeOptions
 
     device = torch.device(args.device)
     parts = []
@@ -99,7 +101,7 @@ def render_files(args: argparse.Namespace) -> list[Path]:
     distance = args.distance or 1.02 * radius / math.sin(math.radians(args.fov) / 2)
     up = torch.tensor([0.0, 1.0, 0.0], device=device)
     args.output.mkdir(parents=True, exist_ok=True)
-    written, animation, counts = [], [], {"samples": tuple(args.samples)}
+    written, animation, options = [], [], ShadeOptions(tuple(args.samples), args.seed, paint=args.paint)
     bar = tqdm(total=args.frames, unit="frame", file=sys.stderr, disable=not sys.stderr.isatty())
     for frame in range(args.frames):
         turn = 2.0 * math.pi * frame / args.frames
@@ -108,15 +110,16 @@ def render_files(args: argparse.Namespace) -> list[Path]:
         offset = [math.cos(lift) * math.sin(azimuth), math.sin(lift), math.cos(lift) * math.cos(azimuth)]
         eye = centre + distance * torch.tensor(offset, device=device)
         camera = Camera.from_fov(look_at(eye, centre, up), math.radians(args.fov), args.size, args.size)
-        shown = {"scene": scene, "shadows": not args.no_shadows, "paint": args.paint}
+        shown = {"scene": scene, "shadows": not args.no_shadows}
         if args.plan is not None and frame == 0:
-            plan = plan_render(parts, camera, environment, total=args.plan, seed=args.seed,
+            plan = plan_render(parts, camera, environment, total=args.plan, options=options,
                                relative=args.format != "exr", **shown)  # fmt: skip
-            counts = {"samples": plan.samples, "antithetic": "none"}
+            options = replace(options, samples=plan.samples, antithetic="none")
             print("reli3d-render: samples by strategy", *plan.samples, file=sys.stderr)
         image = render(
-            parts, camera, environment if args.turn == "camera" else environment.rotated(turn), **counts, **shown,
-            supersampling=args.supersampling, seed=args.seed + frame, background=args.background,
+            parts, camera, environment if args.turn == "camera" else environment.rotated(turn), **shown,
+            options=replace(options, seed=args.seed + frame), supersampling=args.supersampling,
+            background=args.background,
         )  # fmt: skip
         stem = args.output / (args.glb.stem if args.frames == 1 else f"{args.glb.stem}_{frame:04d}")
         if args.format == "exr":

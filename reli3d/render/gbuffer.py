@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 import warp as wp
 from torch import Tensor
@@ -17,18 +15,7 @@ from reli3d.kernels import attributes as kernels
 from reli3d.render.asset import TextureSet
 from reli3d.render.camera import Camera, camera_rays
 from reli3d.render.color import srgb_to_linear
-
-
-@dataclass(frozen=True)
-class SurfacePoints:
-    """What the shader needs of N points; normals unit, ``base_color`` linear."""
-
-    position: Tensor  # (N, 3)
-    ng: Tensor  # (N, 3) geometric normal, outward
-    normal: Tensor  # (N, 3) shading normal
-    base_color: Tensor  # (N, 3)
-    roughness: Tensor  # (N,) perceptual
-    metallic: Tensor  # (N,)
+from reli3d.render.points import SurfacePoints
 
 
 def primary_hits(scene: RayScene, camera: Camera) -> tuple[Hits, Tensor, Tensor]:

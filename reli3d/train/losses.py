@@ -15,7 +15,8 @@ from reli3d.nn.view_features import ViewMaps
 from reli3d.render.bump import radial_bump
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.render.environment import Environment
-from reli3d.render.shading import shade
+from reli3d.render.points import SurfacePoints
+from reli3d.render.shading import ShadeOptions, shade
 from reli3d.synthetic.samples import PAINT
 from reli3d.train.batches import Batch
 
@@ -111,8 +112,9 @@ def _image_loss(model: Reconstructor, code: Code, maps: ViewMaps, batch: Batch, 
     )  # the nearest point may lie round a corner
     got = surface_material(model, code, maps, position, normal, batch.visible[b, near], known)
     shading = radial_bump(position, normal, got["normal"])
-    radiance = shade(position, shading, normal, wo, srgb_to_linear(got["base_color"]), got["roughness"][:, 0],
-                     got["metallic"][:, 0], Environment(light), samples=IMAGE_SAMPLES, seed=b, paint=PAINT)  # fmt: skip
+    points = SurfacePoints(position, normal, shading, srgb_to_linear(got["base_color"]), got["roughness"][:, 0],
+                           got["metallic"][:, 0])  # fmt: skip
+    radiance = shade(points, wo, Environment(light), options=ShadeOptions(IMAGE_SAMPLES, b, paint=PAINT))
     return (torch.log1p(radiance) - torch.log1p(batch.pixel_radiance[b])).abs().mean()
 
 
