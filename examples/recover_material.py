@@ -70,9 +70,7 @@ def load_object(folder: Path) -> Asset:
     column = (torch.arange(paint.shape[1]) + 0.5) / paint.shape[1]
     stripes = (0.5 + 0.2 * torch.sin(40.0 * column)).expand(paint.shape[:2])[..., None]
     base = torch.lerp(0.75 * paint, torch.tensor([0.9, 0.6, 0.25]), gold)
-    orm = torch.cat([torch.ones_like(gold), torch.lerp(stripes, torch.full_like(gold, 0.25), gold), gold], -1)
-    flat = torch.tensor([0.5, 0.5, 1.0]).expand_as(orm).contiguous()
-    return Asset(mesh, TextureSet(linear_to_srgb(base), orm, flat))
+    return Asset(mesh, TextureSet(linear_to_srgb(base), torch.lerp(stripes, torch.full_like(gold, 0.25), gold), gold))
 
 
 class Mitsuba:
@@ -91,8 +89,8 @@ class Mitsuba:
             return {"type": "bitmap", "bitmap": bitmap, "raw": raw}
 
         material = {"type": "principled", "base_color": texture(srgb_to_linear(maps.base_color), True), "specular": 0.5,
-                    "roughness": texture(maps.orm[..., 1:2], True),
-                    "metallic": texture(maps.orm[..., 2:], True)}  # fmt: skip
+                    "roughness": texture(maps.roughness[..., None], True),
+                    "metallic": texture(maps.metallic[..., None], True)}  # fmt: skip
         props = mi.Properties()
         props["bsdf"] = mi.load_dict({"type": "twosided", "bsdf": material})
         mesh = asset.mesh
@@ -142,9 +140,7 @@ class Unknowns(torch.nn.Module):
 
     def textures(self) -> TextureSet:
         rough, metal = torch.sigmoid(self.rough_metal).unbind(-1)
-        orm = torch.stack([torch.ones_like(rough), 0.05 + 0.95 * rough, metal], -1)
-        normal = torch.tensor([0.5, 0.5, 1.0]).expand_as(orm).contiguous()
-        return TextureSet(torch.sigmoid(self.base), orm, normal)
+        return TextureSet(torch.sigmoid(self.base), 0.05 + 0.95 * rough, metal)
 
     def environment(self) -> Environment:
         return Environment(self.light.exp())

@@ -205,9 +205,9 @@ def texture(
         if scene is not None:
             visible = visible_from(scene, position, normal, maps.c2w, maps.intrinsics, DETAIL).float()
         got = surface_material(model, code, maps, position, normal, visible, shading)
-        orm = torch.cat([torch.ones_like(got["roughness"]), got["roughness"], got["metallic"]], -1)
         bumped = radial_bump(position, normal, got["normal"])
-        return {"base_color": got["base_color"], "orm": orm, "normal": encode_normals(bumped, normal, tangent)}
+        found = {name: got[name] for name in ("base_color", "roughness", "metallic")}
+        return {**found, "normal": encode_normals(bumped, normal, tangent)}
 
     baked = bake(mesh, size, lambda *at: in_rows(surface, *at), chunk=CHUNK, tangents=True)
     return mesh, TextureSet(**{k: v.clamp(0, 1).contiguous() for k, v in baked.items()})

@@ -188,15 +188,16 @@ def deviation(level, deformation, alpha, beta):
     return (vertex_deviation(level, radius=0.8, deformation=deformation, alpha=alpha, beta=beta),)
 
 
-def points_of(vertices, normals, uv, base_color, orm, normal, bary):
+def points_of(vertices, normals, uv, base_color, roughness, metallic, normal, bary):
     faces, face = soup(vertices, len(bary))
     mesh = Mesh(vertices, faces, normals, uv)
-    return tuple(vars(gbuffer.surface_points(mesh, TextureSet(base_color, orm, normal), face, bary)).values())
+    maps = TextureSet(base_color, roughness, metallic, normal)
+    return tuple(vars(gbuffer.surface_points(mesh, maps, face, bary)).values())
 
 
 def textured(n: int) -> dict[str, Tensor]:
-    maps = {name: uniform(6, 6, 3, seed=k) for k, name in enumerate(("base_color", "orm", "normal"), 10)}
-    maps["normal"] = 0.5 + 0.5 * above(36, 13).reshape(6, 6, 3)
+    maps = {name: uniform(6, 6, seed=k) for k, name in ((11, "roughness"), (12, "metallic"))}
+    maps["base_color"], maps["normal"] = uniform(6, 6, 3, seed=10), 0.5 + 0.5 * above(36, 13).reshape(6, 6, 3)
     v = corners(60)
     return {"vertices": v, "normals": above(len(v), 8), "uv": uniform(len(v), 2, seed=9, high=2.0), **maps,
             "bary": weights(n)}  # fmt: skip
@@ -248,7 +249,8 @@ CASES = {
         lambda n: {"texture": uniform(9, 11, 3, seed=1), "uv": uniform(n, 2, seed=2, low=-1.0, high=2.0)},
         lambda texture, uv: (gbuffer.sample_texture(texture, uv),), ("texture", "uv"), ("uv",)),
     "surface_points": Case(
-        textured, points_of, ("vertices", "normals", "base_color", "orm", "normal", "bary"), ("bary",)),
+        textured, points_of, ("vertices", "normals", "base_color", "roughness", "metallic", "normal", "bary"),
+        ("bary",)),
     "eval_bsdf": Case(bsdf_inputs, bsdf("conserving"), MATERIAL, MATERIAL),
     "eval_bsdf published": Case(bsdf_inputs, bsdf("published"), MATERIAL, MATERIAL),
     "sample_ggx_vndf": Case(

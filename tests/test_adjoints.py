@@ -166,7 +166,8 @@ def points_of_a_mesh(g, small, tangents) -> Op:
 
     leaves = {"vertices": corners.reshape(-1, 3), "normals": about(flat), "uv": torch.rand(3 * count, 2, generator=g),
               "tangents": F.pad(about(corners[:, 1] - corners[:, 0]), (0, 1), value=-1.0),
-              "base_color": torch.rand(size, size, 3, generator=g), "orm": torch.rand(size, size, 3, generator=g),
+              "base_color": torch.rand(size, size, 3, generator=g),
+              **{k: torch.rand(size, size, generator=g) for k in ("roughness", "metallic")},
               "normal": 0.5 + 0.5 * op_cases.above(size * size, 13).reshape(size, size, 3),
               "bary": op_cases.weights(rows)}  # fmt: skip
     if not small:  # few digits, so that the texture coordinates of points, which are float32, come out exactly
@@ -179,7 +180,7 @@ def points_of_a_mesh(g, small, tangents) -> Op:
         v = dict(zip(leaves, values, strict=True))
         on = values[0].device
         mesh = Mesh(v["vertices"], faces.to(on), v["normals"], v["uv"], v.get("tangents"))
-        maps = TextureSet(v["base_color"], v["orm"], v["normal"])
+        maps = TextureSet(v["base_color"], v["roughness"], v["metallic"], v["normal"])
         found = vars(surface_points(mesh, maps, face.to(on), v["bary"])).values()
         return torch.cat([part.reshape(rows, -1) for part in found], 1)
 
@@ -202,7 +203,8 @@ def points_of_a_mesh(g, small, tangents) -> Op:
         bent = bent[:, :1] * along + bent[:, 1:2] * side * torch.linalg.cross(n, along) + bent[:, 2:] * n
         color = in_texture(srgb_to_linear(v["base_color"]), uv)
         return torch.cat([at("vertices"), F.normalize(torch.linalg.cross(b - a, c - a), dim=-1),
-                          F.normalize(bent, dim=-1), color, in_texture(v["orm"], uv)[:, 1:]], 1)  # fmt: skip
+                          F.normalize(bent, dim=-1), color,
+                          in_texture(torch.stack([v["roughness"], v["metallic"]], -1), uv)], 1)  # fmt: skip
 
     return Op(leaves, ours, twin)
 

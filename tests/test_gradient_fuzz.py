@@ -275,6 +275,7 @@ def test_shaded_points_of_slivers_have_finite_gradients(device):
     tangents[420:480] = normals[420:480]
     maps = [torch.rand(16, 16, 3, generator=g) for _ in range(3)]
     maps[1][:4], maps[1][4:8], maps[2][:4] = 0.0, 1.0, 0.5  # smooth, rough and metal; no normal
+    maps[1:2] = maps[1][..., 1].contiguous(), maps[1][..., 2].contiguous()
     texels = torch.rand(8, 16, 3, generator=g) ** 3 * 2.0
     face = torch.randint(count // 3, (N,), generator=g, dtype=torch.int32).to(device)
     bary = torch.rand(N, 3, generator=g)
@@ -286,8 +287,8 @@ def test_shaded_points_of_slivers_have_finite_gradients(device):
     for own in (signed, None):
         leaves = [v.to(device).requires_grad_() for v in (corners, normals, uv, *maps, texels)]
         own = None if own is None else own.to(device).requires_grad_()
-        points = surface_points(Mesh(leaves[0], faces, leaves[1], leaves[2], own), TextureSet(*leaves[3:6]), face, bary)
-        out = shade(points, wo, Environment(leaves[6]), options=ShadeOptions(samples=(2, 4, 1)))
+        points = surface_points(Mesh(leaves[0], faces, leaves[1], leaves[2], own), TextureSet(*leaves[3:7]), face, bary)
+        out = shade(points, wo, Environment(leaves[7]), options=ShadeOptions(samples=(2, 4, 1)))
         leaves += [] if own is None else [own]
         grads = torch.autograd.grad(weighed([*vars(points).values(), out]), leaves)
         for k, v in enumerate((*vars(points).values(), out, *grads)):

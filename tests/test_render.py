@@ -25,9 +25,8 @@ def eye(device, *position):
 
 
 def textures(size, device, color=(0.5, 0.5, 0.5), roughness=0.5, metallic=0.0, normal=(0.5, 0.5, 1.0)):
-    rows = [torch.tensor(v, device=device).expand(size, size, 3).contiguous()
-            for v in (color, (1.0, roughness, metallic), normal)]  # fmt: skip
-    return TextureSet(*rows)
+    color, normal = (torch.tensor(v, device=device).expand(size, size, 3).contiguous() for v in (color, normal))
+    return TextureSet(color, roughness, metallic, normal)
 
 
 def square(device, normals=True):
@@ -135,7 +134,7 @@ def test_image_gradient_reaches_textures_and_light(device):
                    Environment(light))  # fmt: skip
     grads = torch.autograd.grad(image.radiance.sum(), [*maps, light])
     assert all(bool(torch.isfinite(g).all()) and float(g.abs().max()) > 0 for g in grads)
-    assert float(grads[0].min()) >= 0.0 and float(grads[3].min()) >= 0.0  # more paint and more light are brighter
+    assert float(grads[0].min()) >= 0.0 and float(grads[4].min()) >= 0.0  # more paint and more light are brighter
 
 
 def test_no_light_is_gained_at_the_rim_but_with_the_published_paint(device):
@@ -167,7 +166,7 @@ def test_bad_input_is_named(device):
         interpolate(values, faces, torch.tensor([len(faces)], dtype=torch.int32, device=device),
                     torch.zeros(1, 2, device=device))  # fmt: skip
     with pytest.raises(ValueError, match="uv: expected"):
-        sample_texture(asset.textures.orm, torch.tensor([[np.nan, 0.0]], dtype=torch.float32, device=device))
+        sample_texture(asset.textures.normal, torch.tensor([[np.nan, 0.0]], dtype=torch.float32, device=device))
 
 
 def test_parts_shadow_each_other_and_keep_their_paint(device):

@@ -161,8 +161,7 @@ def mapped_ball_in_ring():
     g = torch.Generator().manual_seed(12)
     base, orm = 0.1 + 0.8 * torch.rand(8, 8, 3, generator=g), torch.rand(8, 8, 3, generator=g)
     orm[..., 1] = 0.3 + 0.7 * orm[..., 1]
-    flat = torch.tensor([0.5, 0.5, 1.0]).expand(8, 8, 3).contiguous()
-    return Asset(Mesh(vertices, faces, normals, uv), TextureSet(linear_to_srgb(base), orm, flat))
+    return Asset(Mesh(vertices, faces, normals, uv), TextureSet(linear_to_srgb(base), orm[..., 1], orm[..., 2]))
 
 
 def test_render_equals_mitsubas_sensor_textures_and_light(device):
@@ -198,7 +197,7 @@ def test_render_equals_mitsubas_sensor_textures_and_light(device):
     pose = look_at(*(torch.tensor(v, device=device) for v in (eye, target, (0.0, 1.0, 0.0))))
     camera = Camera.from_fov(pose, fov, width, height)
     asset = Asset(Mesh(*(getattr(m, k).to(device) for k in ("vertices", "faces", "normals", "uv"))),
-                  TextureSet(*(v.to(device) for v in vars(asset.textures).values())))  # fmt: skip
+                  asset.textures.to(device))  # fmt: skip
 
     def runs(asset, camera):
         images = (

@@ -82,17 +82,13 @@ def render_files(args: argparse.Namespace) -> list[Path]:
 
     from reli3d.io.glb import read_glb
     from reli3d.io.hdr import read_environment, write_exr
-    from reli3d.render.asset import Asset, TextureSet
     from reli3d.render.camera import Camera, look_at
     from reli3d.render.environment import Environment
     from reli3d.render.render import joined_scene, plan_render, render
     from reli3d.render.shading import ShadeOptions
 
     device = torch.device(args.device)
-    parts = []
-    for part in read_glb(args.glb):
-        maps = part.textures and TextureSet(*(m.to(device) for m in vars(part.textures).values()))
-        parts.append(Asset(part.mesh.to(device), maps))
+    parts = [part.to(device) for part in read_glb(args.glb)]
     light = torch.ones(8, 16, 3) if args.light is None else read_environment(args.light)
     environment = Environment(light.to(device))
     scene = joined_scene(parts)
@@ -147,13 +143,8 @@ def _picture(image, args):
 
     from reli3d.render.color import agx, linear_to_srgb
 
-    radiance = image.radiance * 2.0**args.exposure
-    if args.background == "transparent":  # the transform is not linear: it takes the colour, not the premultiplied one
-        radiance = radiance / image.alpha[..., None].clamp(min=1e-6)
     tone = {"srgb": linear_to_srgb, "agx": agx, "none": lambda v: v}[args.tone]
-    shown = tone(radiance).clamp(0.0, 1.0)
-    if args.background == "transparent":
-        shown = torch.cat([shown, image.alpha[..., None]], -1)
+    shown = image.picture(exposure=args.exposure, tone=tone, transparent=args.background == "transparent")
     return Image.fromarray((shown * 255.0 + 0.5).to(torch.uint8).cpu().numpy())
 
 

@@ -78,11 +78,12 @@ def surface_points(mesh: Mesh, textures: TextureSet | None, face: Tensor, bary: 
     if mesh.uv is None:
         raise ValueError("mesh.uv: expected texture coordinates for a textured asset, got None")
     uv = interpolate(mesh.uv, mesh.faces, face, bary)
-    orm = sample_texture(textures.orm, uv)
+    rough_metal = torch.stack([textures.roughness, textures.metallic, textures.metallic], -1)  # one look-up for both
+    rough_metal = sample_texture(rough_metal, uv)
     mapped = sample_texture(textures.normal, uv) * 2.0 - 1.0
     return SurfacePoints(
         position, ng, tangent_normals(mesh, face, bary, normal, mapped),
-        sample_texture(srgb_to_linear(textures.base_color), uv), orm[:, 1], orm[:, 2],
+        sample_texture(srgb_to_linear(textures.base_color), uv), rough_metal[:, 0], rough_metal[:, 1],
     )  # fmt: skip
 
 

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import io
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
+from PIL import Image
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -13,6 +17,7 @@ from reli3d.geometry.rays import RayScene
 from reli3d.render.allocation import SamplePlan, plan_samples, spread_rows
 from reli3d.render.asset import Asset
 from reli3d.render.camera import Camera, camera_rays
+from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import surface_points
 from reli3d.render.points import SurfacePoints
@@ -39,6 +44,36 @@ class Render:
     normal: Tensor
     position: Tensor
     depth: Tensor
+
+    def picture(
+        self,
+        *,
+        exposure: float = 0.0,
+        tone: Callable[[Tensor], Tensor] = linear_to_srgb,
+        transparent: bool = True,
+    ) -> Tensor:
+        """What is shown of ``radiance``, in [0, 1]: ``(H, W, 4)`` with straight alpha, else ``(H, W, 3)``.
+
+        exposure: in stops.  tone: from linear radiance to display values.  transparent: False where the background was
+        rendered.
+        """
+        radiance = self.radiance * 2.0**exposure
+        if transparent:  # the transform is not linear: it takes the colour, not the premultiplied one
+            radiance = radiance / self.alpha[..., None].clamp(min=1e-6)
+        shown = tone(radiance).clamp(0.0, 1.0)
+        return torch.cat([shown, self.alpha[..., None]], -1) if transparent else shown
+
+    def save_png(self, path: str | os.PathLike, **options) -> None:
+        """Write :meth:`picture`, which takes ``options``, as a PNG of 8 bits.
+
+        Raises ValueError, and writes nothing, where a value is not finite.
+        """
+        shown = self.picture(**options).detach()
+        if not bool(torch.isfinite(shown).all()):
+            raise ValueError("radiance: expected finite values, got NaN or infinity")
+        buffer = io.BytesIO()
+        Image.fromarray((shown * 255.0 + 0.5).to(torch.uint8).cpu().numpy()).save(buffer, "PNG")
+        Path(path).write_bytes(buffer.getvalue())
 
 
 def render(
