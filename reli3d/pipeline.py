@@ -176,8 +176,8 @@ def texture(field: AnyField, mesh: Mesh, size: int, scene: RayScene | None, *,
         if scene is not None:
             visible = visible_from(scene, position, normal, maps.c2w, maps.intrinsics, DETAIL).float()
         got = field.material(position, normal, visible)
-        orm = torch.stack([torch.ones_like(got.roughness), got.roughness, got.metallic], -1)
-        return {"base_color": got.base_color, "orm": orm, "normal": encode_normals(got.normal, normal, tangent)}
+        found = {"base_color": got.base_color, "roughness": got.roughness[:, None], "metallic": got.metallic[:, None]}
+        return {**found, "normal": encode_normals(got.normal, normal, tangent)}
 
     baked = bake(mesh, size, lambda *at: in_rows(surface, *at), chunk=CHUNK, tangents=True)
     return mesh, TextureSet(**{k: v.clamp(0, 1).contiguous() for k, v in baked.items()})

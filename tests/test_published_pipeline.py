@@ -155,7 +155,7 @@ def asset(tiny):
 def test_views_become_an_asset_without_looking_at_them_again(asset):
     found = report(asset.mesh)
     assert found.watertight and found.manifold
-    roughness = asset.textures.orm[..., 1]
+    roughness = asset.textures.roughness
     assert 0.1**0.5 - 1e-6 <= float(roughness.min()) <= float(roughness.max()) <= 1.0  # the head's range is [0.1, 1]
     assert bool(asset.environment.radiance.isfinite().all()) and asset.environment.radiance.shape == (64, 128, 3)
 
@@ -174,7 +174,7 @@ def test_exported_roughness_is_the_root_of_the_published_number(tiny, asset):
     same = Reconstructor(replace(TINY, roughness_is_alpha=False)).eval()
     same.load_state_dict(tiny.state_dict())
     release = reconstruct(EXAMPLE, weights=same, texture_size=256, resolution=16)
-    ours, theirs = asset.textures.orm[..., 1], release.textures.orm[..., 1]
+    ours, theirs = asset.textures.roughness, release.textures.roughness
     # the same width alpha in a viewer that squares, after baking means roots of texels beyond the charts as well
     torch.testing.assert_close(ours.square(), theirs, rtol=0, atol=1e-5)
     assert float((ours - theirs).max()) > 0.05  # shown as it is, the release's number is too glossy

@@ -20,6 +20,7 @@ from reli3d.render.camera import Camera, camera_rays, look_at
 from reli3d.render.color import agx, linear_to_srgb
 from reli3d.render.environment import Environment
 from reli3d.render.render import render
+from reli3d.render.shading import ShadeOptions
 from tests.test_render import ball
 
 SIZE, DISTANCE = 24, 2.6
@@ -62,7 +63,7 @@ def expected(folder, *, azimuth=30.0, yaw=0.0, seed=0, **options):
     pose = look_at((low + high) / 2 + DISTANCE * away, (low + high) / 2, torch.tensor([0.0, 1.0, 0.0]))
     camera = Camera.from_fov(pose, math.radians(32.0), SIZE, SIZE)
     light = Environment(read_environment(folder / "half.hdr")).rotated(yaw)
-    return render(parts, camera, light, seed=seed, **options), camera, light
+    return render(parts, camera, light, options=ShadeOptions(seed=seed), **options), camera, light
 
 
 def pixels(path):
