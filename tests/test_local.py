@@ -11,9 +11,10 @@ from reli3d.geometry.hull import mask_distance
 from reli3d.nn.light_map import LightMap, gathered, texel_of
 from reli3d.nn.local import LocalReconstructor, PixelMaps
 from reli3d.nn.presets import LOCAL, LightMapSizes, PyramidSizes, VolumeSizes
+from reli3d.nn.pyramid import place_of_pixels
 from reli3d.nn.reni import map_directions
 from reli3d.nn.volume import FeatureVolume
-from reli3d.render.camera import look_at
+from reli3d.render.camera import look_at, project
 
 TINY = dataclasses.replace(
     LOCAL, image_size=64, pyramid=PyramidSizes((8, 8, 16), 8), volume=VolumeSizes(12, 0.56, (8, 16), 8),
@@ -146,6 +147,18 @@ def test_pixels_start_as_what_they_show(model):
     centre = maps.normal[:, 15:17, 15:17].mean((1, 2))
     torch.testing.assert_close(normalize(centre, dim=-1), c2w[:, :3, 2], rtol=0, atol=1e-3)  # +Z of a camera looks back
     assert float(maps.shift.abs().max()) == 0.0 and float(maps.gain.min()) == pytest.approx(0.8808, abs=1e-4)
+
+
+def test_pixels_know_their_place():
+    """Points of the plane that faces the camera project to pixels that are told the points' coordinates."""
+    eye, target = torch.tensor([[0.7, 1.1, 2.0]]), torch.tensor([[0.1, -0.2, 0.3]])
+    c2w = look_at(eye, target, torch.tensor([0.0, 1.0, 0.0]))
+    intrinsics = torch.tensor([[SIZE * 1.7, SIZE * 1.9, SIZE / 2 + 3, SIZE / 2 - 5]])
+    place = place_of_pixels(c2w, intrinsics, SIZE)
+    want = place[0, 10, 40]
+    point = want[0] * c2w[0, :3, 0] + want[1] * c2w[0, :3, 1]
+    xy, _ = project(point[None], c2w[0], intrinsics[0])
+    torch.testing.assert_close(xy, torch.tensor([[40.5, 10.5]]), rtol=0, atol=1e-3)
 
 
 def test_the_view_that_sees_a_point_speaks(model):

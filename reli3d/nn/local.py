@@ -21,7 +21,7 @@ from reli3d.nn.heads import ROUGHNESS_MIN, color_logit, mlp
 from reli3d.nn.light_features import Shading, brightness_at, brightness_over_normal, palette_of, unshaded
 from reli3d.nn.light_map import LightMap
 from reli3d.nn.presets import SHADING_FEATURES, LocalPreset
-from reli3d.nn.pyramid import ImagePyramid
+from reli3d.nn.pyramid import ImagePyramid, place_of_pixels
 from reli3d.nn.view_features import ViewFeatures, ViewMaps
 from reli3d.nn.volume import HULL_SCALE, FeatureVolume
 from reli3d.render.color import srgb_to_linear
@@ -107,7 +107,7 @@ class LocalReconstructor(nn.Module):
         silhouette in pixels, from which colours are read; its intrinsics.  Gradients reach every parameter.
         """
         size = images.shape[1]
-        features, raw = self.pyramid(images, masks)
+        features, raw = self.pyramid(images, masks, place_of_pixels(c2w, intrinsics, size))
         pixels = PixelMaps.of(raw, c2w, intrinsics, size)
         shape = torch.cat([pixels.depth, pixels.normal], -1).permute(0, 3, 1, 2)
         shape = functional.avg_pool2d(shape, raw.shape[1] // features.shape[1]).permute(0, 2, 3, 1)

@@ -12,7 +12,7 @@ from torch.nn import functional
 
 from reli3d.nn.presets import PyramidSizes
 
-INPUTS = 4  # colour times mask, mask
+INPUTS = 6  # colour times mask, mask, place in the world
 PREDICTED = 12  # see PixelMaps
 
 
@@ -21,6 +21,20 @@ def block(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
     return nn.Sequential(
         nn.Conv2d(inputs, outputs, 3, stride=stride, padding=1), nn.GroupNorm(max(1, outputs // 8), outputs), nn.SiLU()
     )
+
+
+def place_of_pixels(c2w: Tensor, intrinsics: Tensor, size: int) -> Tensor:
+    """Right and up, ``(V, S, S, 2)`` in world units, of where the pixels' rays meet the plane through the world's
+    origin that faces the camera: a crop alone tells neither the scale of a picture nor where its middle is.
+
+    c2w: ``(V, 4, 4)``.  intrinsics: ``(V, 4)`` in pixels of views of ``size`` by ``size``.
+    """
+    depth = (c2w[:, :3, 3] * c2w[:, :3, 2]).sum(-1)[:, None, None]  # of the origin
+    pixel = torch.arange(size, device=c2w.device) + 0.5
+    fx, fy, cx, cy = (k[:, None, None] for k in intrinsics.unbind(-1))
+    x, y = ((pixel - cx) / fx).expand(-1, size, size), ((cy - pixel[:, None]) / fy).expand(-1, size, size)
+    origin = -(c2w[:, :3, :2] * c2w[:, :3, 3:]).sum(1)[:, None, None]  # in the camera's axes
+    return torch.stack([x * depth, y * depth], -1) - origin
 
 
 class ImagePyramid(nn.Module):
@@ -43,12 +57,13 @@ class ImagePyramid(nn.Module):
         nn.init.zeros_(self.pixels[1].weight)
         nn.init.zeros_(self.pixels[1].bias)
 
-    def forward(self, images: Tensor, masks: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, images: Tensor, masks: Tensor, place: Tensor) -> tuple[Tensor, Tensor]:
         """Features ``(V, S/4, S/4, F)`` and raw predictions ``(V, S/2, S/2, 12)`` of one object's views.
 
-        images: ``(V, S, S, 3)`` sRGB.  masks: ``(V, S, S)``.  S is a multiple of two to the number of levels.
+        images: ``(V, S, S, 3)`` sRGB.  masks: ``(V, S, S)``.  place: ``(V, S, S, 2)`` from :func:`place_of_pixels`.
+        S is a multiple of two to the number of levels.
         """
-        x = torch.cat([images * masks[..., None], masks[..., None]], -1).permute(0, 3, 1, 2)
+        x = torch.cat([images * masks[..., None], masks[..., None], place], -1).permute(0, 3, 1, 2)
         levels = []
         for down in self.down:
             x = down(x)
