@@ -211,7 +211,8 @@ class Job:
         self.cold = False
         steps("preview")
         output = output_frame(to_model, args.frame, args.up)
-        picture = preview(asset, views.transformed(output).to(self.device))
+        shown = views.transformed(output)
+        picture = preview(asset, shown.to(self.device))
         info = {
             "object": name,
             "views": list(views.names),
@@ -233,7 +234,7 @@ class Job:
             "versions": results.versions(),
         }
         steps("writing")
-        results.write_results(target, asset, picture, info, compatible=args.compatible_names)
+        results.write_results(target, asset, shown, picture, info, compatible=args.compatible_names)
 
 
 def ready_kernels(device: str) -> None:
