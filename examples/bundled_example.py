@@ -1,4 +1,5 @@
-"""Make the object folder that the package brings: a procedural kettle in a procedural room, seen by four cameras.
+"""Make the object folder that the package brings: a procedural kettle in a procedural room, seen by four cameras
+from all sides.
 
 usage: python examples/bundled_example.py reli3d/assets/example
 """
@@ -6,23 +7,26 @@ usage: python examples/bundled_example.py reli3d/assets/example
 from __future__ import annotations
 
 import json
+import math
 import sys
 from pathlib import Path
 
-import numpy as np
 import torch
 
 from reli3d.io.images import write_png
 from reli3d.nn.reni import map_directions
-from reli3d.render.camera import Camera, camera_rays
+from reli3d.render.camera import Camera, camera_rays, look_at
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
 from reli3d.render.points import SurfacePoints
 from reli3d.render.shading import ShadeOptions, shade
-from reli3d.synthetic.procedural import example_object, sample_cameras
+from reli3d.synthetic.procedural import FRAME_RADIUS, example_object
 from reli3d.synthetic.samples import EXPOSED, PAINT, ObjectSurface
 
-SIZE, SUBPIXELS, VIEWS = 512, 2, 4
+SIZE, SUBPIXELS = 512, 2
+FOV = math.radians(30.0)
+DISTANCE = 0.9 * FRAME_RADIUS / math.sin(FOV / 2)  # the object fills the frame
+RIG = ((30.0, 20.0), (120.0, 35.0), (210.0, 12.0), (300.0, 45.0))  # azimuth from +Z to +X and elevation, degrees
 SAMPLES = (24, 24, 4)
 
 
@@ -42,13 +46,14 @@ def room() -> Environment:
 
 
 def main(folder: Path) -> None:
-    surface, light, rng = ObjectSurface(example_object()), room(), np.random.default_rng(11)
-    poses, fovs = sample_cameras(rng, VIEWS)
+    surface, light = ObjectSurface(example_object()), room()
     (folder / "rgba").mkdir(parents=True, exist_ok=True)
     frames, exposure = [], None
-    for i, (pose, fov) in enumerate(zip(poses, fovs, strict=True)):
-        c2w = torch.as_tensor(np.asarray(pose), dtype=torch.float32)
-        camera = Camera.from_fov(c2w, float(fov), SIZE, SIZE)
+    for i, (azimuth, elevation) in enumerate(RIG):
+        a, lift = math.radians(azimuth), math.radians(elevation)
+        away = torch.tensor([math.cos(lift) * math.sin(a), math.sin(lift), math.cos(lift) * math.cos(a)])
+        c2w = look_at(DISTANCE * away, torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))
+        camera = Camera.from_fov(c2w, FOV, SIZE, SIZE)
         origins, directions = (r.reshape(-1, 3) for r in camera_rays(camera.scaled(SUBPIXELS)))
         hits = surface.scene.closest(origins, directions)
         seen = (hits.face >= 0).nonzero()[:, 0]
@@ -64,7 +69,7 @@ def main(folder: Path) -> None:
         rgba = torch.cat([linear_to_srgb(planes[..., :3]), planes[..., 3:]], -1)
         write_png(folder / f"rgba/{i:04d}.png", rgba)
         frames.append({"view_index": i, "file_path": f"rgba/{i:04d}.png", "width": SIZE, "height": SIZE,
-                       "transform_matrix": c2w.tolist(), "camera_fov": [float(fov), float(fov)],
+                       "transform_matrix": c2w.tolist(), "camera_fov": [FOV, FOV],
                        "camera_principal_point": [SIZE / 2, SIZE / 2]})  # fmt: skip
     record = {"object_uid": "kettle", "coordinate_system": "ogl", "frames": frames}
     (folder / "transforms.json").write_text(json.dumps(record, indent=1) + "\n")

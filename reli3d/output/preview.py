@@ -1,70 +1,110 @@
-"""One picture of a reconstruction: what went in beside what comes out."""
+"""One picture of a reconstruction: what went in, and what comes out where nobody looked."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 import torch
 from PIL import Image, ImageDraw
 from torch import Tensor
-from torch.nn.functional import interpolate
+from torch.nn.functional import interpolate, normalize
 
+from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene
 from reli3d.render.asset import Asset
-from reli3d.render.camera import Camera
+from reli3d.render.camera import Camera, look_at
 from reli3d.render.color import linear_to_srgb
+from reli3d.render.environment import Environment
+from reli3d.render.lights import studio
 from reli3d.render.render import render
 from reli3d.render.shading import ShadeOptions
+from reli3d.views.choose import choose_views
 from reli3d.views.views import Views
 
-TILE = 192  # pixels
+TILE = 256  # pixels
 COLUMNS = 4
-SAMPLES = (24, 16, 4)  # light, GGX and cosine samples a pixel: little noise for a quarter of a second a view
+TITLE = 14  # pixels of a line of text
+SAMPLES = (20, 12, 3)  # light, GGX and cosine samples a pixel: little noise for a quarter of a second a view
 PAPER = 0.93  # background of the tiles, sRGB
 MEAN = 0.25  # of the environment as it is drawn, linear
+FOV = math.radians(30.0)
+ELEVATIONS = (5.0, 30.0)  # degrees, of views that nobody took
+AZIMUTHS = 24  # places around the object to choose from
 
 
 def preview(asset: Asset, views: Views) -> np.ndarray:
-    """Picture ``(H, W, 3)`` uint8: up to four input views, the asset rendered from the same cameras under its own
-    light, the maps of the first view, and the environment (row 0 up, centre -Z), exposed so that its mean is ``MEAN``.
+    """Picture ``(H, W, 3)`` uint8: up to four input views; four views that nobody photographed under the asset's own
+    light, then under the studio of :mod:`reli3d.render.lights`; the maps of the first of them; the own light, row 0
+    up, centre -Z, exposed so that its mean is ``MEAN``.
 
     views: in the frame of ``asset``.
     """
-    batch = views.select(min(len(views), COLUMNS)).resampled(TILE, crop=True)
+    taken = views.select(choose_views(views.c2w, COLUMNS)).resampled(TILE, crop=True)
     scene = RayScene(asset.mesh.vertices, asset.mesh.faces)
-    shots = [
-        render(asset, Camera(batch.c2w[i], batch.intrinsics[i], TILE, TILE), options=ShadeOptions(SAMPLES), scene=scene)
-        for i in range(len(batch))
-    ]
-    hero = shots[0]
-    maps = [linear_to_srgb(hero.base_color), hero.roughness[..., None].expand(-1, -1, 3),
-            hero.metallic[..., None].expand(-1, -1, 3), hero.normal * 0.5 + 0.5]  # fmt: skip
+    relight = Environment(studio().radiance.to(asset.mesh.vertices.device))
+    cameras = unseen_cameras(asset.mesh, views.c2w)
+    own, relit = ([render(asset, camera, light, options=ShadeOptions(SAMPLES), scene=scene) for camera in cameras]
+                  for light in (asset.environment, relight))  # fmt: skip
+    first = own[0]
+    maps = [linear_to_srgb(first.base_color), first.roughness[..., None].expand(-1, -1, 3),
+            first.metallic[..., None].expand(-1, -1, 3), first.normal * 0.5 + 0.5]  # fmt: skip
     rows = [
-        ("input", [_on_paper(i, m) for i, m in zip(batch.images, batch.masks, strict=True)]),
-        ("reconstruction, own light", [_on_paper(_display(s.radiance, s.alpha), s.alpha) for s in shots]),
-        ("base colour, roughness, metallic, normal", [_on_paper(m, hero.alpha) for m in maps]),
+        ("input", [_on_paper(i, m) for i, m in zip(taken.images, taken.masks, strict=True)]),
+        ("views that nobody photographed, own light", [_lit(s.radiance, s.alpha) for s in own]),
+        ("the same views in a studio", [_lit(s.radiance, s.alpha) for s in relit]),
+        ("base colour, roughness, metallic, normal", [_on_paper(m, first.alpha) for m in maps]),
+        ("own light, its mean at a quarter", [_map(asset.environment)]),
     ]
-    height = 14 + TILE
-    sheet = Image.new("RGB", (COLUMNS * TILE, len(rows) * height + 14 + 2 * TILE), "white")
+    height = TITLE + TILE
+    sheet = Image.new("RGB", (COLUMNS * TILE, len(rows) * height - TILE // 2), "white")
     draw = ImageDraw.Draw(sheet)
     for r, (title, tiles) in enumerate(rows):
         draw.text((3, r * height + 1), title, fill="black")
         for c, tile in enumerate(tiles):
-            sheet.paste(_image(tile), (c * TILE, r * height + 14))
-    draw.text((3, len(rows) * height + 1), "environment, its mean at a quarter", fill="black")
-    light = asset.environment.radiance
-    light = linear_to_srgb((light * (MEAN / light.mean().clamp(min=1e-6))).clamp(0, 1)).permute(2, 0, 1)[None]
-    light = interpolate(light, (2 * TILE, 4 * TILE), mode="bilinear", align_corners=False)[0].permute(1, 2, 0)
-    sheet.paste(_image(light), (0, len(rows) * height + 14))
+            sheet.paste(_image(tile), (c * TILE, r * height + TITLE))
     return np.asarray(sheet)
 
 
-def _display(radiance: Tensor, alpha: Tensor) -> Tensor:
-    """sRGB of premultiplied linear radiance, straight."""
-    return linear_to_srgb((radiance / alpha.clamp(min=1e-3)[..., None]).clamp(0, 1))
+def unseen_cameras(mesh: Mesh, c2w: Tensor) -> list[Camera]:
+    """``COLUMNS`` cameras of ``TILE`` pixels around ``mesh``, each as far as can be from the cameras ``c2w`` and from
+    the others, in the order of their azimuth.
+
+    They stand at ``ELEVATIONS`` above the horizon (+Y is up), where a beholder would, and see all of the mesh.
+    """
+    low, high = mesh.vertices.aminmax(dim=0)
+    centre = (low + high) / 2
+    radius = float((mesh.vertices - centre).norm(dim=-1).max())
+    azimuth = torch.arange(AZIMUTHS) * (2.0 * math.pi / AZIMUTHS)
+    places = []
+    for lift in map(math.radians, ELEVATIONS):
+        level = torch.full_like(azimuth, math.sin(lift))
+        places.append(torch.stack([azimuth.sin() * math.cos(lift), level, azimuth.cos() * math.cos(lift)], -1))
+    offered = torch.cat(places).to(centre)
+    nearest = (offered @ normalize(c2w[:, :3, 3] - centre, dim=-1).T).amax(1)  # cosine of the angle to what is taken
+    chosen = []
+    for _ in range(COLUMNS):
+        chosen.append(int(nearest.argmin()))
+        nearest = torch.maximum(nearest, offered @ offered[chosen[-1]])
+    eyes = centre + offered[sorted(chosen, key=lambda k: k % AZIMUTHS)] * (radius / math.sin(FOV / 2))
+    up = torch.tensor([0.0, 1.0, 0.0]).to(centre)
+    return [Camera.from_fov(look_at(eye, centre, up), FOV, TILE, TILE) for eye in eyes]
+
+
+def _lit(radiance: Tensor, alpha: Tensor) -> Tensor:
+    """Tile of premultiplied linear radiance."""
+    return _on_paper(linear_to_srgb((radiance / alpha.clamp(min=1e-3)[..., None]).clamp(0, 1)), alpha)
 
 
 def _on_paper(color: Tensor, alpha: Tensor) -> Tensor:
     return torch.lerp(torch.full_like(color, PAPER), color, alpha[..., None])
+
+
+def _map(light: Environment) -> Tensor:
+    """The light as a tile of half the height."""
+    radiance = light.radiance
+    shown = linear_to_srgb((radiance * (MEAN / radiance.mean().clamp(min=1e-6))).clamp(0, 1)).permute(2, 0, 1)[None]
+    return interpolate(shown, (TILE // 2, TILE), mode="bilinear", align_corners=False)[0].permute(1, 2, 0)
 
 
 def _image(pixels: Tensor) -> Image.Image:
