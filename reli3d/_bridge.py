@@ -163,6 +163,21 @@ def views(args: Sequence) -> list:
     return [view(*a) if isinstance(a, tuple) else a for a in args]
 
 
+def struct_of(kind, **arrays: tuple[Tensor, type]):
+    """Warp struct ``kind`` with ``(tensor, warp type)`` in the fields named; it keeps the tensors.
+
+    For contiguous arrays that always go together, without gradient: what :func:`call` differentiates stays an argument
+    of its own.
+    """
+    initialise()
+    made = kind()
+    native = made.__ctype__()  # what a launch takes; Warp's own setters want arrays, which cost twice as much to make
+    for name, value in arrays.items():
+        setattr(native, name, view(*value))
+    vars(made)["arrays"] = arrays  # or their memory would go to others
+    return made
+
+
 def empty(shape: Sequence[int], dtype, device: torch.device) -> Tensor:
     """Uninitialised torch tensor that holds an array of ``shape`` of the Warp type ``dtype``."""
     torch_dtype, tail = _TORCH[dtype]

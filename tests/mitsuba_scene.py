@@ -103,7 +103,8 @@ def material(mi, base_color, alpha, metallic, paint="conserving", maps: TextureS
             f = schlick(dr.dot(i, h))
             left = 1 - f
             if paint == "conserving":
-                left = (1 - schlick((i.z + alpha) / (1 + alpha))) * (1 - schlick((o.z + alpha) / (1 + alpha)))
+                left_i, left_o = (0.96 * (1 - (1 - (z + alpha) / (1 + alpha)) ** 5) for z in (i.z, o.z))
+                left = left_i * left_o
             value = left * base * (1 - metallic) / dr.pi + f * d * g / (4 * i.z * o.z)
             return dr.select((i.z > 0) & (o.z > 0), value * o.z, 0)
 

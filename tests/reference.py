@@ -82,7 +82,8 @@ def eval_bsdf(wo: Tensor, wi: Tensor, base_color: Tensor, alpha: Tensor, metalli
     fresnel = schlick((wo * wm).sum(-1, keepdim=True))
     left = 1.0 - fresnel
     if paint == "conserving":
-        left_o, left_i = (1.0 - schlick((w[..., 2:] + alpha[..., None]) / (1.0 + alpha[..., None])) for w in (wo, wi))
+        cosines = ((w[..., 2:] + alpha[..., None]) / (1.0 + alpha[..., None]) for w in (wo, wi))
+        left_o, left_i = (0.96 * (1.0 - (1.0 - cos) ** 5) for cos in cosines)  # of the dielectric alone
         left = left_o * left_i
     g2 = 1.0 / (1.0 + smith_lambda(wo, alpha) + smith_lambda(wi, alpha))
     specular = ggx_ndf(wm, alpha) * g2 / (4.0 * wo[..., 2] * wi[..., 2])

@@ -180,7 +180,7 @@ def test_the_view_that_sees_a_point_speaks(model):
 def test_the_volume_is_read_where_it_was_written():
     volume = FeatureVolume(VolumeSizes(12, 0.56, (8, 16), 8), 8)
     axis = torch.linspace(-0.56, 0.56, 12)
-    grid = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"))  # the coordinates themselves as features
+    grid = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)  # the coordinates themselves as features
     points = torch.rand(500, 3) * 1.1 - 0.55
     torch.testing.assert_close(volume.sample(grid, points), points, rtol=0, atol=1e-6)
 

@@ -6,7 +6,7 @@ from reli3d.kernels.bsdf import pdf_lobes
 from reli3d.kernels.envmap import lookup_envmap_uv, pdf_envmap_uv
 from reli3d.kernels.intersect import offset_origin
 from reli3d.kernels.math import CONTRACT, INLINE
-from reli3d.kernels.shade import Plan, draw_sample, make_surface, sample_value
+from reli3d.kernels.shade import Light, Plan, Points, draw_sample, make_surface, sample_value
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": f"-march=native {INLINE} {CONTRACT}"})
 
@@ -15,11 +15,7 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": f"-march=
 def pilot_kernel(
     start: int,
     # in
-    position: wp.array(dtype=wp.vec3), normal: wp.array(dtype=wp.vec3), ng: wp.array(dtype=wp.vec3),
-    wo: wp.array(dtype=wp.vec3), base_color: wp.array(dtype=wp.vec3), alpha: wp.array(dtype=float),
-    metallic: wp.array(dtype=float), radiance: wp.array2d(dtype=wp.vec3), rows: wp.array2d(dtype=float),
-    columns: wp.array2d(dtype=float), row_guide: wp.array2d(dtype=wp.int32), column_guide: wp.array2d(dtype=wp.int32),
-    density: wp.array2d(dtype=float), points: wp.array(dtype=wp.vec2), plan: Plan,
+    points: Points, light: Light, plan: Plan,
     # out
     origins: wp.array2d(dtype=wp.vec3), directions: wp.array2d(dtype=wp.vec3), values: wp.array2d(dtype=wp.vec3),
     densities: wp.array2d(dtype=wp.vec3),
@@ -30,16 +26,16 @@ def pilot_kernel(
     are 0 for a sample below the horizon, whose ray is along the normal.
     """
     i = start + wp.tid()
-    surface = make_surface(plan, i, normal[i], ng[i], wo[i], base_color[i], alpha[i], metallic[i])
+    surface = make_surface(plan, points, i)
     count = plan.n_environment + plan.n_visible + plan.n_cosine
     for s in range(count):
-        d = draw_sample(surface, plan, points, rows, columns, row_guide, column_guide, density, s)
+        d = draw_sample(surface, plan, light, s)
         directions[i, s] = surface.ng
         values[i, s] = wp.vec3(0.0, 0.0, 0.0)
         densities[i, s] = wp.vec3(0.0, 0.0, 0.0)
         if d.factor > 0.0:
             lobes = pdf_lobes(d.facet, surface.wo, d.wi)
             directions[i, s] = d.direction
-            values[i, s] = sample_value(surface, plan, d, lookup_envmap_uv(radiance, d.uv))
-            densities[i, s] = wp.vec3(pdf_envmap_uv(density, d.uv), lobes[0], lobes[2]) * d.factor
-        origins[i, s] = offset_origin(position[i], surface.ng, directions[i, s], plan.scale)
+            values[i, s] = sample_value(surface, plan, d, lookup_envmap_uv(light.radiance, d.uv))
+            densities[i, s] = wp.vec3(pdf_envmap_uv(light.density, d.uv), lobes[0], lobes[2]) * d.factor
+        origins[i, s] = offset_origin(points.position[i], surface.ng, directions[i, s], plan.scale)

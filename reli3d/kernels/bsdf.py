@@ -3,7 +3,8 @@
 f = T (1 - metallic) base / pi + D G2 F / (4 cos_o cos_i), F = F0 + (1 - F0)(1 - wo.wm)^5 (Schlick 1994),
 F0 = 0.04 for dielectrics and the base colour for metals.  Linear Rec. 709; values are 1/sr and lack the cosine.
 T is what the coat leaves to the paint.  ``conserving`` takes it at the surface, once on the way in and once on the way
-out, after Shirley et al. 1997: T = (1 - F(c_o)) (1 - F(c_i)), 1 - c = (1 - cos) / (1 + alpha).  The published model
+out, after Shirley et al. 1997: T = (1 - F(c_o)) (1 - F(c_i)), 1 - c = (1 - cos) / (1 + alpha), of the dielectric's F0:
+the whole is then the dielectric and the metal blended by ``metallic``, and so is its energy.  The published model
 and glTF 2.0's appendix B take T = 1 - F of the microfacet, with which paint and coat of a white dielectric together
 exceed 1 at grazing views (docs/renderer.md).
 """
@@ -43,6 +44,14 @@ def base_reflectance(base_color: wp.vec3, metallic: float) -> wp.vec3:
 
 
 @wp.func
+def coat_schlick(cos: float) -> float:
+    """:func:`schlick` of the dielectric coat."""
+    m = wp.clamp(1.0 - cos, 0.0, 1.0)
+    m2 = m * m
+    return F0_DIELECTRIC + (1.0 - F0_DIELECTRIC) * (m2 * m2 * m)
+
+
+@wp.func
 def coat_cosine(cos: float, alpha: float) -> float:
     """Cosine at which Schlick's formula gives what the coat as a whole reflects, or more, from a direction of ``cos``.
 
@@ -64,7 +73,7 @@ def eval_bsdf(
     specular = facet.ndf * smith_visibility(facet, wo, wi)
     left = one - fresnel  # what the coat leaves to the paint
     if conserving != 0:
-        left = wp.cw_mul(one - schlick(f0, coat_cosine(wo[2], alpha)), one - schlick(f0, coat_cosine(wi[2], alpha)))
+        left = one * ((1.0 - coat_schlick(coat_cosine(wo[2], alpha))) * (1.0 - coat_schlick(coat_cosine(wi[2], alpha))))
     return wp.cw_mul(left, base_color) * ((1.0 - metallic) * INV_PI) + fresnel * specular
 
 

@@ -34,6 +34,33 @@ COS_VIEW_MIN = wp.constant(1.0e-3)  # an interpolated normal that turns away is 
 
 
 @wp.struct
+class Points:
+    """Arrays of the hits, a row each; ``pixel`` counts their random numbers."""
+
+    position: wp.array(dtype=wp.vec3)
+    normal: wp.array(dtype=wp.vec3)
+    ng: wp.array(dtype=wp.vec3)
+    wo: wp.array(dtype=wp.vec3)
+    base_color: wp.array(dtype=wp.vec3)
+    alpha: wp.array(dtype=float)
+    metallic: wp.array(dtype=float)
+    pixel: wp.array(dtype=wp.int32)
+
+
+@wp.struct
+class Light:
+    """Texels of the map, its sampling table, and the even points that all hits turn."""
+
+    radiance: wp.array2d(dtype=wp.vec3)
+    rows: wp.array2d(dtype=float)
+    columns: wp.array2d(dtype=float)
+    row_guide: wp.array2d(dtype=wp.int32)
+    column_guide: wp.array2d(dtype=wp.int32)
+    density: wp.array2d(dtype=float)
+    points: wp.array(dtype=wp.vec2)
+
+
+@wp.struct
 class Surface:
     """What the samples of one hit share; ``wo`` in the local frame, whose axes are the rows of ``frame``.
 
@@ -94,17 +121,12 @@ def bend_normal(n: wp.vec3, wo: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def make_surface(
-    plan: Plan,
-    pixel: int,
-    normal: wp.vec3,
-    ng: wp.vec3,
-    wo: wp.vec3,
-    base_color: wp.vec3,
-    alpha: float,
-    metallic: float,
-) -> Surface:
-    """Local frame of a hit, on the side of the viewer, and its random numbers."""
+def make_surface(plan: Plan, points: Points, i: int) -> Surface:
+    """Local frame of hit ``i``, on the side of the viewer, and its random numbers."""
+    normal = points.normal[i]
+    ng = points.ng[i]
+    wo = points.wo[i]
+    pixel = points.pixel[i]
     side = wp.float32(1.0)
     if wp.dot(ng, wo) < 0.0:
         side = -1.0
@@ -112,9 +134,9 @@ def make_surface(
     surface.frame = tangent_frame(bend_normal(normal * side, wo))
     surface.ng = ng * side
     surface.wo = surface.frame * wo
-    surface.base_color = base_color
-    surface.alpha = wp.max(alpha, ALPHA_MIN)
-    surface.metallic = metallic
+    surface.base_color = points.base_color[i]
+    surface.alpha = wp.max(points.alpha[i], ALPHA_MIN)
+    surface.metallic = points.metallic[i]
     surface.stretched = stretch_view(surface.wo, surface.alpha)
     surface.root_o = ggx_root(surface.wo, surface.alpha)
     surface.pixel = pixel
@@ -154,17 +176,7 @@ def visible_normal(surface: Surface, plan: Plan, points: wp.array(dtype=wp.vec2)
 
 
 @wp.func
-def draw_sample(
-    surface: Surface,
-    plan: Plan,
-    points: wp.array(dtype=wp.vec2),
-    rows: wp.array2d(dtype=float),
-    columns: wp.array2d(dtype=float),
-    row_guide: wp.array2d(dtype=wp.int32),
-    column_guide: wp.array2d(dtype=wp.int32),
-    density: wp.array2d(dtype=float),
-    sample: int,
-) -> Draw:
+def draw_sample(surface: Surface, plan: Plan, light: Light, sample: int) -> Draw:
     """Sample ``sample`` of a hit; a direction below the horizon has factor 0."""
     out = Draw()
     wi = wp.vec3(0.0, 0.0, 0.0)
@@ -173,8 +185,8 @@ def draw_sample(
     strategy = wp.int32(0)
     count = wp.int32(plan.n_environment)
     if sample < plan.n_environment:
-        u = draw_pair(plan, points, surface.shift_environment, surface.pixel, sample, 0)
-        drawn = sample_envmap(rows, columns, row_guide, column_guide, u)
+        u = draw_pair(plan, light.points, surface.shift_environment, surface.pixel, sample, 0)
+        drawn = sample_envmap(light.rows, light.columns, light.row_guide, light.column_guide, u)
         uv = drawn.uv
         out.direction = drawn.direction
         wi = surface.frame * out.direction
@@ -185,13 +197,13 @@ def draw_sample(
             count = plan.n_visible
             if plan.antithetic == MIRRORED and (k & 1) == 1:
                 strategy = 2
-            wm = visible_normal(surface, plan, points, k)
+            wm = visible_normal(surface, plan, light.points, k)
             if wp.dot(surface.wo, wm) > COS_MIN:
                 wi = reflect(surface.wo, wm)
         else:
             strategy = 3
             count = plan.n_cosine
-            u = draw_pair(plan, points, surface.shift_cosine, surface.pixel, k - plan.n_visible, 2)
+            u = draw_pair(plan, light.points, surface.shift_cosine, surface.pixel, k - plan.n_visible, 2)
             wi = sample_cosine(u)
         out.direction = wp.transpose(surface.frame) * wi
         if wi[2] > COS_MIN:
@@ -203,7 +215,7 @@ def draw_sample(
         if plan.antithetic == MIRRORED:
             mirrored = float(plan.n_visible // 2)
         all = wp.vec4(
-            float(plan.n_environment) * pdf_envmap_uv(density, uv),
+            float(plan.n_environment) * pdf_envmap_uv(light.density, uv),
             (float(plan.n_visible) - mirrored) * lobes[0],
             mirrored * lobes[1],
             float(plan.n_cosine) * lobes[2],
@@ -238,30 +250,25 @@ def sample_value(surface: Surface, plan: Plan, draw: Draw, light: wp.vec3) -> wp
 def shade_kernel(
     start: int,
     # in
-    position: wp.array(dtype=wp.vec3), normal: wp.array(dtype=wp.vec3), ng: wp.array(dtype=wp.vec3),
-    wo: wp.array(dtype=wp.vec3), base_color: wp.array(dtype=wp.vec3), alpha: wp.array(dtype=float),
-    metallic: wp.array(dtype=float), radiance: wp.array2d(dtype=wp.vec3), rows: wp.array2d(dtype=float),
-    columns: wp.array2d(dtype=float), row_guide: wp.array2d(dtype=wp.int32), column_guide: wp.array2d(dtype=wp.int32),
-    density: wp.array2d(dtype=float), points: wp.array(dtype=wp.vec2), pixels: wp.array(dtype=wp.int32), plan: Plan,
-    mesh: wp.uint64, shadows: int,
+    points: Points, light: Light, plan: Plan, mesh: wp.uint64, shadows: int,
     # out
     out: wp.array(dtype=wp.vec3), visible: wp.array2d(dtype=wp.int32),
 ):  # fmt: skip
     """The fused estimator; shadow rays through Warp's BVH."""
     i = start + wp.tid()
-    surface = make_surface(plan, pixels[i], normal[i], ng[i], wo[i], base_color[i], alpha[i], metallic[i])
+    surface = make_surface(plan, points, i)
     total = wp.vec3(0.0, 0.0, 0.0)
     word = wp.int32(0)
     count = plan.n_environment + plan.n_visible + plan.n_cosine
     for s in range(count):
-        d = draw_sample(surface, plan, points, rows, columns, row_guide, column_guide, density, s)
+        d = draw_sample(surface, plan, light, s)
         if d.factor > 0.0:
             lit = wp.bool(True)
             if shadows != 0:
-                origin = offset_origin(position[i], surface.ng, d.direction, plan.scale)
+                origin = offset_origin(points.position[i], surface.ng, d.direction, plan.scale)
                 lit = not hit_occluded(mesh, origin, d.direction, wp.inf)
             if lit:
-                total = total + sample_value(surface, plan, d, lookup_envmap_uv(radiance, d.uv))
+                total = total + sample_value(surface, plan, d, lookup_envmap_uv(light.radiance, d.uv))
                 word = word | (1 << (s & 31))
         if (s & 31) == 31 or s == count - 1:
             if s // 32 < visible.shape[1]:

@@ -8,11 +8,11 @@ from their counters, so nothing per sample is in memory but the visibility bits.
 
 import warp as wp
 
-from reli3d.kernels.bsdf import F0_DIELECTRIC, base_reflectance, coat_cosine, eval_bsdf, schlick
+from reli3d.kernels.bsdf import F0_DIELECTRIC, base_reflectance, coat_cosine, coat_schlick, eval_bsdf, schlick
 from reli3d.kernels.envmap import add_texels, lookup_envmap_uv
 from reli3d.kernels.math import CONTRACT, INLINE, INV_PI
 from reli3d.kernels.microfacet import ALPHA_MIN, Facet, smith_visibility
-from reli3d.kernels.shade import COS_VIEW_MIN, Plan, draw_sample, make_surface
+from reli3d.kernels.shade import COS_VIEW_MIN, Light, Plan, Points, draw_sample, make_surface
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": f"-march=native {INLINE} {CONTRACT}"})
 
@@ -72,13 +72,13 @@ def add_sample_gradient(
     if conserving != 0:
         c_o = coat_cosine(wo[2], alpha)
         c_i = coat_cosine(wi[2], alpha)
-        left_o = one - schlick(f0, c_o)
-        left_i = one - schlick(f0, c_i)
-        left = wp.cw_mul(left_o, left_i)
-        d_left = left_o * (-schlick_slope(c_i)) - left_i * schlick_slope(c_o)
-        g_c = wp.cw_mul(g_left, one - f0) * (1.0 / (1.0 + alpha))
-        g_o = wp.dot(g_c, left_i) * schlick_turn(c_o)  # to cos_o
-        g_i = wp.dot(g_c, left_o) * schlick_turn(c_i)
+        left_o = 1.0 - coat_schlick(c_o)
+        left_i = 1.0 - coat_schlick(c_i)
+        left = one * (left_o * left_i)
+        d_left = wp.vec3(0.0, 0.0, 0.0)  # the coat's F0 is a constant
+        g_c = wp.dot(g_left, one) * ((1.0 - F0_DIELECTRIC) / (1.0 + alpha))
+        g_o = g_c * left_i * schlick_turn(c_o)  # to cos_o
+        g_i = g_c * left_o * schlick_turn(c_i)
         out.n = out.n + wo * g_o + wi * g_i
         out.alpha = out.alpha + g_o * (1.0 - c_o) + g_i * (1.0 - c_i)
     g_f0 = g * (specular * slope) + wp.cw_mul(g_left, d_left)
@@ -107,11 +107,7 @@ def add_sample_gradient(
 def shade_adjoint_kernel(
     start: int,
     # in
-    first: int, normal: wp.array(dtype=wp.vec3), ng: wp.array(dtype=wp.vec3), wo: wp.array(dtype=wp.vec3),
-    base_color: wp.array(dtype=wp.vec3), alpha: wp.array(dtype=float), metallic: wp.array(dtype=float),
-    radiance: wp.array2d(dtype=wp.vec3), rows: wp.array2d(dtype=float), columns: wp.array2d(dtype=float),
-    row_guide: wp.array2d(dtype=wp.int32), column_guide: wp.array2d(dtype=wp.int32), density: wp.array2d(dtype=float),
-    points: wp.array(dtype=wp.vec2), pixels: wp.array(dtype=wp.int32), plan: Plan,
+    first: int, points: Points, light: Light, plan: Plan,
     visible: wp.array2d(dtype=wp.int32), g_out: wp.array(dtype=wp.vec3),
     # out
     g_normal: wp.array(dtype=wp.vec3), g_base_color: wp.array(dtype=wp.vec3), g_alpha: wp.array(dtype=float),
@@ -120,45 +116,46 @@ def shade_adjoint_kernel(
     """Adjoints of the hits from ``first``; ``g_radiance`` is added to.  An output without rows is left out."""
     i = first + start + wp.tid()
     material = g_normal.shape[0] + g_base_color.shape[0] + g_alpha.shape[0] + g_metallic.shape[0]
-    surface = make_surface(plan, pixels[i], normal[i], ng[i], wo[i], base_color[i], alpha[i], metallic[i])
+    surface = make_surface(plan, points, i)
     total = SurfaceGradient()
     g = g_out[i]
     for s in range(plan.n_environment + plan.n_visible + plan.n_cosine):
         if (visible[i, s // 32] >> (s & 31)) & 1 != 0:
-            d = draw_sample(surface, plan, points, rows, columns, row_guide, column_guide, density, s)
+            d = draw_sample(surface, plan, light, s)
             if d.factor > 0.0:  # one in the horizon may have been above it as the forward kernel rounds
-                light = lookup_envmap_uv(radiance, d.uv)
+                radiance = lookup_envmap_uv(light.radiance, d.uv)
                 value = eval_bsdf(d.facet, surface.wo, d.wi, surface.base_color, surface.alpha, surface.metallic,
                                   plan.conserving)  # fmt: skip
                 scale = d.factor * d.wi[2]
                 top = plan.clamp / float(d.count)
                 own = wp.vec3(0.0, 0.0, 0.0)  # the output's adjoint, 0 where the clamp held
                 for c in range(3):
-                    if value[c] * scale * light[c] < top:
+                    if value[c] * scale * radiance[c] < top:
                         own[c] = g[c]
                 if material != 0:
                     total = add_sample_gradient(total, d.facet, surface.wo, d.wi, surface.base_color, surface.alpha,
                                                 surface.metallic, plan.conserving, value,
-                                                wp.cw_mul(own, light) * d.factor)  # fmt: skip
+                                                wp.cw_mul(own, radiance) * d.factor)  # fmt: skip
                 if g_radiance.shape[0] != 0:
                     add_texels(g_radiance, d.uv, wp.cw_mul(own, value) * scale)
     if g_normal.shape[0] != 0:
+        wo = points.wo[i]
         side = wp.float32(1.0)
-        if wp.dot(ng[i], wo[i]) < 0.0:
+        if wp.dot(points.ng[i], wo) < 0.0:
             side = -1.0
         g_n = wp.transpose(surface.frame) * total.n
-        facing = normal[i] * side
-        cos_o = wp.dot(facing, wo[i])
+        facing = points.normal[i] * side
+        cos_o = wp.dot(facing, wo)
         if cos_o < COS_VIEW_MIN:  # through normalize(n + wo (c - n.wo))
-            m = facing + wo[i] * (COS_VIEW_MIN - cos_o)
+            m = facing + wo * (COS_VIEW_MIN - cos_o)
             length = wp.length(m)
             m = m / length
             g_n = (g_n - m * wp.dot(m, g_n)) / length
-            g_n = g_n - wo[i] * wp.dot(wo[i], g_n)
+            g_n = g_n - wo * wp.dot(wo, g_n)
         g_normal[i] = g_n * side
     if g_base_color.shape[0] != 0:
         g_base_color[i] = total.base_color
     if g_metallic.shape[0] != 0:
         g_metallic[i] = total.metallic
-    if g_alpha.shape[0] != 0 and alpha[i] >= ALPHA_MIN:
+    if g_alpha.shape[0] != 0 and points.alpha[i] >= ALPHA_MIN:
         g_alpha[i] = total.alpha

@@ -6,7 +6,7 @@ from reli3d.kernels.embree import block_rays
 from reli3d.kernels.envmap import lookup_envmap_uv
 from reli3d.kernels.intersect import offset_origin
 from reli3d.kernels.math import CONTRACT, INLINE
-from reli3d.kernels.shade import Plan, draw_sample, make_surface, sample_value
+from reli3d.kernels.shade import Light, Plan, Points, draw_sample, make_surface, sample_value
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": f"-march=native {INLINE} {CONTRACT}"})
 
@@ -15,11 +15,7 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": f"-march=
 def shade_rays_kernel(
     start: int,
     # in
-    first: int, position: wp.array(dtype=wp.vec3), normal: wp.array(dtype=wp.vec3), ng: wp.array(dtype=wp.vec3),
-    wo: wp.array(dtype=wp.vec3), base_color: wp.array(dtype=wp.vec3), alpha: wp.array(dtype=float),
-    metallic: wp.array(dtype=float), radiance: wp.array2d(dtype=wp.vec3), rows: wp.array2d(dtype=float),
-    columns: wp.array2d(dtype=float), row_guide: wp.array2d(dtype=wp.int32), column_guide: wp.array2d(dtype=wp.int32),
-    density: wp.array2d(dtype=float), points: wp.array(dtype=wp.vec2), pixels: wp.array(dtype=wp.int32), plan: Plan,
+    first: int, points: Points, light: Light, plan: Plan,
     # out
     origins: wp.array(dtype=wp.vec3), directions: wp.array(dtype=wp.vec3), t_max: wp.array(dtype=float),
     values: wp.array(dtype=wp.vec3),
@@ -27,17 +23,17 @@ def shade_rays_kernel(
     """First half of the estimator for a chunk of hits: shadow rays (``t_max`` < 0 where none is needed) and values."""
     j = start + wp.tid()
     i = first + j
-    surface = make_surface(plan, pixels[i], normal[i], ng[i], wo[i], base_color[i], alpha[i], metallic[i])
+    surface = make_surface(plan, points, i)
     count = plan.n_environment + plan.n_visible + plan.n_cosine
     for s in range(count):
-        d = draw_sample(surface, plan, points, rows, columns, row_guide, column_guide, density, s)
+        d = draw_sample(surface, plan, light, s)
         k = j * count + s
         t_max[k] = -1.0
         if d.factor > 0.0:
             t_max[k] = wp.inf
-            origins[k] = offset_origin(position[i], surface.ng, d.direction, plan.scale)
+            origins[k] = offset_origin(points.position[i], surface.ng, d.direction, plan.scale)
             directions[k] = d.direction
-            values[k] = sample_value(surface, plan, d, lookup_envmap_uv(radiance, d.uv))
+            values[k] = sample_value(surface, plan, d, lookup_envmap_uv(light.radiance, d.uv))
 
 
 @wp.kernel

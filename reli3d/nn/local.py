@@ -139,7 +139,7 @@ class LocalField:
     maps: ViewMaps
     pixels: PixelMaps
     color: Tensor  # (V, P, P, 3) sRGB, what the pixels of ``pixels`` show
-    volume: Tensor  # (F, N, N, N)
+    volume: Tensor  # (N, N, N, F)
     log_light: Tensor  # (3, H, 2H)
     shading: Shading | None = None
 

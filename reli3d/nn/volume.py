@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from reli3d.geometry.grid import sample_grid
 from reli3d.geometry.hull import hull_distance
 from reli3d.geometry.projection import OWN, gather_views, summarize_views
 from reli3d.nn.presets import VolumeSizes
@@ -41,7 +42,7 @@ class FeatureVolume(nn.Module):
         self.side, self.radius = sizes.side, sizes.radius
 
     def forward(self, maps: ViewMaps) -> Tensor:
-        """``(F, N, N, N)``, indexed x, y, z."""
+        """``(N, N, N, F)``, indexed x, y, z."""
         axis = torch.linspace(-self.radius, self.radius, self.side, device=maps.images.device)
         grid = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
         hull = hull_distance(grid, maps.images[..., 3].contiguous(), maps.c2w, maps.intrinsics)
@@ -56,7 +57,7 @@ class FeatureVolume(nn.Module):
         for across, up, finer in zip(reversed(self.across), reversed(self.up), reversed(levels[:-1]), strict=True):
             coarse = functional.interpolate(across(x), size=finer.shape[-3:], mode="trilinear", align_corners=False)
             x = up(finer + coarse)
-        return self.out(x)[0]
+        return self.out(x)[0].permute(1, 2, 3, 0).contiguous()
 
     def _pooled(self, maps: ViewMaps, points: Tensor, hull: Tensor) -> Tensor:
         scale = maps.tokens.shape[1] / maps.images.shape[1]
@@ -70,5 +71,4 @@ class FeatureVolume(nn.Module):
 
     def sample(self, volume: Tensor, points: Tensor) -> Tensor:
         """Trilinear values ``(N, F)`` of a ``volume`` at ``points (N, 3)``; outside, its border's."""
-        at = (points / self.radius)[None, None, None, :, [2, 1, 0]]  # the last index runs fastest
-        return functional.grid_sample(volume[None], at, align_corners=True, padding_mode="border")[0, :, 0, 0].T
+        return sample_grid(volume, points / self.radius)

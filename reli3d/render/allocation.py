@@ -13,7 +13,15 @@ from reli3d.geometry.rays import RayScene
 from reli3d.kernels import allocation as kernels
 from reli3d.render.environment import Environment
 from reli3d.render.points import SurfacePoints
-from reli3d.render.shading import DEFAULT, ShadeOptions, sampling_plan, shade, shaded_arrays
+from reli3d.render.shading import (
+    DEFAULT,
+    ShadeOptions,
+    sampling_plan,
+    shade,
+    shaded_arrays,
+    struct_of_light,
+    struct_of_points,
+)
 
 SCOUTED = 16384  # points looked at with one sample of each strategy, to find those that matter
 PILOT_SAMPLES = 24576  # then, in all; an image of 512 x 512, half of it covered, takes 8.4 million
@@ -138,10 +146,9 @@ def _draw(
     n, count, device = len(values[0]), 3 * each, values[0].device
     options = ShadeOptions((each, each, each), options.seed, antithetic="none", paint=options.paint)
     plan, offsets = sampling_plan(options, scene)
-    table = environment.table
-    light = [(environment.radiance.contiguous(), wp.vec3), *table.sampler, (table.density, wp.float32)]
-    points = zip([v.contiguous() for v in values], [wp.vec3] * 5 + [wp.float32] * 2)
-    ins = [*points, *light, (offsets.to(device), wp.vec2), plan]
+    light = struct_of_light(environment.radiance.contiguous(), environment.table, offsets.to(device))
+    pixels = torch.arange(n, dtype=torch.int32, device=device)
+    ins = [struct_of_points([v.contiguous() for v in values], pixels), light, plan]
     origins, directions, value, density = (torch.empty(n, count, 3, device=device) for _ in range(4))
     outs = [(v, wp.vec3) for v in (origins, directions, value, density)]
     launch(kernels.pilot_kernel, n, [*ins, *outs], device, slice_min=8)

@@ -17,7 +17,7 @@ from torch.nn.functional import normalize, softplus
 from reli3d._bridge import call, check
 from reli3d.kernels import sg as kernels
 from reli3d.render.environment import Environment, texel_solid_angles
-from reli3d.render.points import SurfacePoints, of_rows
+from reli3d.render.points import SurfacePoints, nan_where_not_finite, of_rows
 
 GOLDEN = 0.6180339887498949  # turns between neighbours of a spiral: the slowest to come round
 OVERLAP = 3.5  # sharpness of a lobe times the solid angle [sr] it stands for; real maps' residuals are least near here
@@ -74,7 +74,8 @@ class SphericalGaussians:
 def shade_gaussians(points: SurfacePoints, wo: Tensor, light: SphericalGaussians) -> Tensor:
     """Radiance ``(N, 3)`` towards ``wo`` of ``points`` lit by ``light`` without shadows; linear Rec. 709.
 
-    wo: ``(N, 3)`` unit, or one row for all.  The points' position and geometric normal play no part.  The
+    wo: ``(N, 3)`` unit, or one row for all.  A point that has a value that is not finite is NaN.  The position and
+    the geometric normal play no part.  The
     material is that of ``reli3d.kernels.bsdf``.  Diffuse: the closed cosine integral, the Fresnel factor taken at one
     direction.  Specular: Wang et al. 2009 with GGX as four Gaussians.  Against quadrature it errs by 6 % at roughness
     0.3 and 12 % at 0.5 for light about the mirror direction and views within 45 degrees; at roughness 1 or
@@ -89,7 +90,7 @@ def shade_gaussians(points: SurfacePoints, wo: Tensor, light: SphericalGaussians
     ins = [(normal, wp.vec3), (wo, wp.vec3), (points.base_color, wp.vec3), (width, wp.float32),
            (points.metallic, wp.float32), *light.arrays]  # fmt: skip
     (out,) = call(kernels.shade_sg_kernel, n, ins, [((n,), wp.vec3)], device=normal.device, shared=(5, 6, 7))
-    return out
+    return out + nan_where_not_finite([normal, wo, points.base_color, width, points.metallic])
 
 
 def fit_gaussians(environment: Environment, count: int, *, steps: int = 0, rate: float = 0.02) -> SphericalGaussians:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import torch
@@ -9,6 +10,7 @@ from torch import Tensor
 
 from reli3d._bridge import check
 
+UNIT = 1e-4  # of a length from 1: float32 interpolation and rotation err by 1e-6
 NUMBERS = ("base_color", "roughness", "metallic")  # may be a plain number: grey, or the same everywhere
 
 
@@ -50,6 +52,28 @@ class SurfacePoints:
     def to(self, device: torch.device | str) -> SurfacePoints:
         """The same points on ``device``."""
         return SurfacePoints(*(getattr(self, f.name).to(device) for f in fields(self)))
+
+
+@torch.no_grad()
+def nan_where_not_finite(values: Sequence[Tensor]) -> Tensor:
+    """``(N, 1)``: 0, or NaN where one of ``values (N, 3)`` or ``(N,)`` is not finite, which a minimum would hide."""
+    columns = torch.cat([v[:, None] if v.ndim == 1 else v for v in values], 1)
+    return (columns * 0.0).sum(1, keepdim=True)
+
+
+def check_values(points: SurfacePoints, wo: Tensor) -> None:
+    """Raise ValueError for directions that are not unit, materials beyond [0, 1] and what is not finite."""
+    given = {f.name: getattr(points, f.name).detach() for f in fields(points)} | {"wo": wo.detach()}
+    for name, value in given.items():
+        if name in NUMBERS:
+            bad, wanted = ~((value >= 0.0) & (value <= 1.0)), "values in [0, 1]"
+        elif name == "position":
+            bad, wanted = ~torch.isfinite(value), "finite values"
+        else:
+            bad, wanted = ~((value.norm(dim=1) - 1.0).abs() <= UNIT), "unit vectors"
+        rows = bad.reshape(len(value), -1).any(1).nonzero()
+        if len(rows):
+            raise ValueError(f"{name}: expected {wanted}, got {value[rows[0, 0]].tolist()} in row {int(rows[0, 0])}")
 
 
 def of_rows(name: str, value: Tensor | float, position: Tensor, last: int) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Protocol
@@ -10,15 +11,15 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from reli3d._bridge import SLICE_MIN, check, empty, launch, once_differentiable, over_slices, slices, views
+from reli3d._bridge import SLICE_MIN, check, empty, launch, once_differentiable, over_slices, slices, struct_of, views
 from reli3d.geometry import embree
 from reli3d.geometry.rays import RayScene
 from reli3d.kernels import shade as kernels
 from reli3d.kernels import shade_adjoint as adjoint
 from reli3d.kernels import shade_rays as halves
-from reli3d.render.environment import Environment
+from reli3d.render.environment import Environment, EnvironmentTable
 from reli3d.render.material import PAINTS, choice
-from reli3d.render.points import SurfacePoints, of_rows
+from reli3d.render.points import SurfacePoints, check_values, nan_where_not_finite, of_rows
 from reli3d.render.sampling import halton
 
 SAMPLES = (20, 40, 4)  # environment, visible normals, cosine: the published counts
@@ -39,7 +40,8 @@ class ShadeOptions:
     per point and strategy) or ``random``.  alpha: GGX width from roughness, ``squared`` or, as in the published model's
     shader, ``linear``.  paint: what the coat leaves to the paint, ``conserving`` or ``published``, as in
     :func:`reli3d.render.material.eval_bsdf`.  clamp: largest value of one sample times its strategy's count, per
-    channel.  Raises ValueError for a count or choice.
+    channel.  check_inputs: raise ValueError for directions that are not unit and materials beyond [0, 1], which
+    otherwise go into the formulas as they are.  Raises ValueError for a count or choice.
     """
 
     samples: tuple[int, int, int] = SAMPLES
@@ -50,6 +52,7 @@ class ShadeOptions:
     alpha: str = "squared"
     paint: str = "conserving"
     clamp: float | None = None
+    check_inputs: bool = False
 
     def __post_init__(self):
         if len(self.samples) != 3 or any(int(k) != k or k < 0 for k in self.samples):
@@ -80,26 +83,27 @@ def shade(
 
     wo: ``(N, 3)`` unit, to the viewer, or one row for all.  A face seen from behind is shaded as its other side.
     scene: mesh that casts shadows, None for none.  pixels: ``(N,)`` int32 counters of the random numbers, by default
-    the row.
+    the row.  Directions must be unit, materials in [0, 1]: ``options.check_inputs`` sees to it.  A point that has a
+    value that is not finite is NaN.
 
     Gradients reach normal, base_color, roughness, metallic and the texels of ``environment``, with detached sampling:
-    directions, densities and visibility are constants.  Once differentiable.  Random numbers are a function of the
-    seed and the counter, so the result has the same bits for any number of threads.  Raises TypeError for a wrong kind
-    or dtype, ValueError for a shape or device.  Estimator: Veach and Guibas 1995 over the material of
-    ``reli3d.kernels.bsdf``.
+    directions, densities and visibility are constants.  That of a normal has a part along it, which means nothing (the
+    formulas go on off the unit sphere) and which a ``normalize`` before takes away.  Once differentiable.  Random
+    numbers are a function of the seed and the counter, so the result has the same bits for any number of threads.
+    Raises TypeError for a wrong kind or dtype, ValueError for a shape or device.  Estimator: Veach and Guibas 1995 over
+    the material of ``reli3d.kernels.bsdf``.
     """
     values = shaded_arrays(points, wo, environment, scene, options)
     plan, offsets = sampling_plan(options, scene)
-    table, device = environment.table, points.position.device
-    tables = [*table.sampler, (table.density, wp.float32), (offsets.to(device), wp.vec2)]
-    n = len(points)
+    n, device = len(points), points.position.device
+    job = _Job(plan, sum(options.samples), scene, environment.table, offsets.to(device))
     if pixels is None:
         pixels = torch.arange(n, dtype=torch.int32, device=device)
     check("pixels", pixels, like=points.position, dtype=torch.int32)
     if pixels.shape != (n,):
         raise ValueError(f"pixels: expected shape ({n},), got {tuple(pixels.shape)}")
     values = (*values, environment.radiance, pixels)
-    return _Shade.apply(_Job(plan, sum(options.samples), scene, tables), *(v.contiguous() for v in values))
+    return _Shade.apply(job, *(v.contiguous() for v in values))
 
 
 class Light(Protocol):
@@ -126,12 +130,12 @@ def shade_light(
     """
     values = shaded_arrays(points, wo, proposal, scene, options)
     plan, offsets = sampling_plan(replace(options, clamp=None), scene)  # what is cut is the product with the light
-    n, device, count, table = len(points), points.position.device, sum(options.samples), proposal.table
+    n, device, count = len(points), points.position.device, sum(options.samples)
     pixels = torch.arange(n, dtype=torch.int32, device=device)
-    tables = [*table.sampler, (table.density, wp.float32), (offsets.to(device), wp.vec2)]
     white = torch.ones(1, 2, 3, device=device)  # what a sample adds under unit light; the light's radiance comes after
-    ins = _inputs([v.contiguous() for v in (*values, white, pixels)], _Job(plan, count, scene, tables))
-    out = torch.zeros(n, 3, device=device)
+    job = _Job(plan, count, scene, proposal.table, offsets.to(device))
+    ins = _inputs([v.contiguous() for v in (*values, white, pixels)], job)
+    out = nan_where_not_finite(values).expand(n, 3).clone()
     size = max(1, LIGHT_RAYS // max(1, count))
     for first in range(0, n if count else 0, size):
         hits = min(size, n - first)
@@ -148,7 +152,7 @@ def shade_light(
         if options.clamp is not None:
             counts = torch.tensor(options.samples, device=device)
             added = added.minimum((options.clamp / counts).repeat_interleave(counts)[:, None])
-        out[first : first + hits] = added.sum(1)
+        out[first : first + hits] += added.sum(1)
     return out
 
 
@@ -156,10 +160,11 @@ def shade_light(
 class _Job:
     """What a call has besides its differentiable inputs."""
 
-    plan: object
+    plan: kernels.Plan
     count: int
     scene: RayScene | None
-    tables: list
+    table: EnvironmentTable
+    offsets: Tensor
 
 
 class _Shade(torch.autograd.Function):
@@ -178,6 +183,7 @@ class _Shade(torch.autograd.Function):
         else:
             mesh = job.scene.mesh_id if job.scene is not None else 0
             launch(kernels.shade_kernel, n, [*ins, job.plan, mesh, int(mesh != 0), *outs], position.device)
+        out += nan_where_not_finite(tensors[:7])
         ctx.job = job
         ctx.save_for_backward(*tensors, visible)
         return out
@@ -192,7 +198,7 @@ class _Shade(torch.autograd.Function):
         g_normal, g_base, g_alpha, g_metallic, texels = (
             torch.zeros_like(tensors[k] if wanted[k] else tensors[k][:0]) for k in (1, 4, 5, 6, 7))  # fmt: skip
         g_radiance = texels.repeat(parts, 1, 1, 1)  # of each slice
-        ins = _inputs(tensors, ctx.job)[1:]  # all but the position
+        ins = _inputs(tensors, ctx.job)
         ins += [ctx.job.plan, (visible, wp.int32), (g_out.contiguous(), wp.vec3)]
         outs = [(g_normal, wp.vec3), (g_base, wp.vec3), (g_alpha, wp.float32), (g_metallic, wp.float32)]
 
@@ -212,10 +218,25 @@ class _Shade(torch.autograd.Function):
         return None, *(g if w else None for g, w in zip(grads, wanted, strict=True))
 
 
-def _inputs(tensors: list[Tensor], job: _Job) -> list:
-    *values, pixels = tensors
-    kinds = [wp.vec3] * 5 + [wp.float32] * 2 + [wp.vec3]
-    return [*zip(values, kinds, strict=True), *job.tables, (pixels, wp.int32)]
+def _inputs(tensors: Sequence[Tensor], job: _Job) -> list:
+    """Points and light as the kernels take them."""
+    *values, radiance, pixels = tensors
+    return [struct_of_points(values, pixels), struct_of_light(radiance, job.table, job.offsets)]
+
+
+def struct_of_points(values: Sequence[Tensor], pixels: Tensor) -> kernels.Points:
+    """Contiguous arrays in the order of :func:`shaded_arrays`, and the counters."""
+    names = ("position", "normal", "ng", "wo", "base_color", "alpha", "metallic")
+    kinds = [wp.vec3] * 5 + [wp.float32] * 2
+    return struct_of(kernels.Points, **dict(zip(names, zip(values, kinds), strict=True)), pixel=(pixels, wp.int32))
+
+
+def struct_of_light(radiance: Tensor, table: EnvironmentTable, offsets: Tensor) -> kernels.Light:
+    """Contiguous texels, their table, and the points that all hits turn."""
+    rows, columns, row_guide, column_guide = table.sampler
+    return struct_of(kernels.Light, radiance=(radiance, wp.vec3), rows=rows, columns=columns, row_guide=row_guide,
+                     column_guide=column_guide, density=(table.density, wp.float32),
+                     points=(offsets, wp.vec2))  # fmt: skip
 
 
 def _shade_embree(n: int, ins: list, job: _Job, outs: list) -> None:
@@ -225,7 +246,7 @@ def _shade_embree(n: int, ins: list, job: _Job, outs: list) -> None:
         out.zero_()
         return
     size = max(1, min(SLICE_MIN, CHUNK_RAYS // count))
-    ins, outs = views(ins), views(outs)  # once: a third of what a chunk costs besides its rays
+    outs = views(outs)  # once: a third of what a chunk costs besides its rays
 
     def work(_, start, length):
         rays = [torch.empty(min(size, length) * count, 3) for _ in range(3)]
@@ -255,6 +276,8 @@ def shaded_arrays(
     if scene is not None and scene.device != position.device:
         raise ValueError(f"scene: expected device {position.device}, got {scene.device}")
     wo, width = of_rows("wo", wo, position, 3), options.width(points.roughness)
+    if options.check_inputs:
+        check_values(points, wo)
     return position, points.normal, points.ng, wo, points.base_color, width, points.metallic
 
 

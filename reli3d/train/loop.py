@@ -32,7 +32,7 @@ class TrainConfig:
     rate: float = 1.5e-3  # peak learning rate; convolutions from scratch take thirty times the paper's 5e-5
     warmup: int = 100  # steps
     weight_decay: float = 0.02
-    clip: float = 1.0  # of the gradient norm
+    clip: float = 5.0  # of the gradient norm
     average: float = 0.999  # decay of the averaged weights that are saved for use
     checkpoint_seconds: float = 300.0
     seed: int = 0

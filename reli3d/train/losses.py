@@ -13,7 +13,7 @@ from reli3d.train.batches import Sample
 WEIGHTS = {
     "occupancy": 1.0, "surface": 0.02, "gradient": 0.3,
     "base_color": 4.0, "pattern": 8.0, "roughness": 1.5, "metallic": 1.5, "normal": 1.0,
-    "pixel_color": 8.0, "pixel_roughness": 1.0, "pixel_metallic": 1.0, "pixel_normal": 1.0, "pixel_depth": 0.3,
+    "pixel_color": 8.0, "pixel_roughness": 1.0, "pixel_metallic": 1.0, "pixel_normal": 1.0, "pixel_depth": 0.1,
     "light": 0.4, "irradiance": 0.4,
 }  # fmt: skip
 ASTRAY = 0.02, 0.3  # greatest deviation of position [model's cube] and normal [radian] of an extracted surface
