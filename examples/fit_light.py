@@ -2,7 +2,7 @@
 
 usage: python examples/fit_light.py OUTPUT_FOLDER [--steps 150] [--size 64]
 
-Writes ``found.png`` and ``true.png``, maps of the light with +X in the centre, and prints the error of the log radiance.
+Writes ``found.png`` and ``true.png``, maps with +X in the centre, and prints the error of the log radiance.
 """
 
 import argparse
@@ -11,7 +11,6 @@ from pathlib import Path
 import torch
 
 import reli3d
-from reli3d.geometry.hits import hit_normals
 from reli3d.io.images import write_png
 from reli3d.render.camera import camera_rays
 from reli3d.render.color import linear_to_srgb
@@ -34,10 +33,8 @@ camera = reli3d.Camera.from_fov(reli3d.look_at([0.0, 0.4, 3.0]), 0.6, args.size,
 origins, directions = (v.reshape(-1, 3) for v in camera_rays(camera))
 hits = reli3d.RayScene(ball.vertices, ball.faces).closest(origins, directions)
 seen = hits.face >= 0
-position = origins[seen] + hits.t[seen, None] * directions[seen]
-normal = torch.nn.functional.normalize(position, dim=-1)  # of the ball: its faces are flat
-ng = hit_normals(ball.vertices, ball.faces, hits.face[seen])
-points = reli3d.SurfacePoints(position, ng, normal, base_color=0.9, roughness=0.2, metallic=1.0)
+normal = torch.nn.functional.normalize(origins[seen] + hits.t[seen, None] * directions[seen], dim=-1)
+points = reli3d.SurfacePoints(0.8 * normal, normal, normal, base_color=0.9, roughness=0.2, metallic=1.0)
 
 
 def image(radiance: torch.Tensor, seed: int, samples: tuple = (8, 8, 2)) -> torch.Tensor:

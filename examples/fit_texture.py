@@ -31,10 +31,8 @@ mesh = reli3d.unwrap(torus, texture_size=TEXELS)
 checker = reli3d.bake(mesh, TEXELS, lambda position, _: 0.2 + 0.6 * ((6 * position).floor() % 2))["value"]
 truth = reli3d.Asset(mesh, reli3d.TextureSet(checker, roughness=0.4, metallic=0.0))
 
-light = torch.linspace(2.0, 0.2, 16)[:, None, None].expand(16, 32, 3).contiguous()  # bright above, dark below
-light = Environment(light)
-turns = torch.arange(8) * math.tau / 8
-poses = [reli3d.look_at([2.5 * a.cos(), 1.5 * (-1) ** k, 2.5 * a.sin()]) for k, a in enumerate(turns)]
+light = Environment(torch.linspace(2.0, 0.2, 16)[:, None, None].expand(16, 32, 3).contiguous())  # bright above
+poses = [reli3d.look_at([2.5 * math.cos(k), 1.5 * (-1) ** k, 2.5 * math.sin(k)]) for k in range(8)]
 cameras = [reli3d.Camera.from_fov(pose, 0.9, args.size, args.size) for pose in poses]
 
 

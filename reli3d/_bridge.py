@@ -1,10 +1,11 @@
-"""The one crossing between torch and Warp: zero-copy views, streams, CPU slices and hand-launched adjoints.
+"""The one crossing between torch and Warp: zero-copy views, streams, CPU slices and adjoints.
 
 A kernel launched from here takes ``start: int`` first and works on ``i = start + wp.tid()``.  Warp runs a CPU launch on
-one thread and releases the GIL, so a large CPU launch is cut into a fixed number of slices over a thread pool; the
-number depends on the size and the operation alone, which makes the results the same bits for any number of threads.
-Outputs must be disjoint per ``i``.  Warp's CPU atomics are not atomic: in a backward pass every input that several
-``i`` read (named in ``shared``) gets one accumulator a slice, added up in slice order.
+one thread and releases the GIL.  A large CPU launch is therefore cut into slices over a thread pool.  Their number
+depends on the size and the operation alone, so the bits do not depend on the number of threads.
+
+Outputs must be disjoint per ``i``.  Warp's CPU atomics are not atomic.  In a backward pass every input that several
+``i`` read (named in ``shared``) gets one accumulator for each slice; they are added up in the order of the slices.
 """
 
 from __future__ import annotations
@@ -117,8 +118,8 @@ def over_slices(n: int, work, *, slice_min: int = SLICE_MIN) -> list:
 def over_rows(n: int, rows: int, work) -> list:
     """``[work(start, stop), ...]`` for blocks of ``rows`` of ``n`` rows, on the thread pool; no gradient is recorded.
 
-    For chains of torch operations whose intermediate values of a block stay in a core's cache.  Torch computes a block
-    in one thread, so the bits do not depend on the number of threads.
+    For chains of torch operations: the intermediate values of a block stay in the cache of a core.  Torch computes a
+    block in one thread, so the bits do not depend on the number of threads.
     """
 
     def block(start: int):
@@ -133,9 +134,11 @@ def _mapped(work, items: Iterable) -> list:
 
 
 def _serial() -> bool:
-    """Whether the calling thread computes alone: torch has one thread, or this is a thread of the pool, which would
-    never end waiting for itself, or kernels run in Warp's debug mode, where two at a time crash over a static pointer
-    that only the optimiser takes away (``shared_tile_storage`` in Warp's tile.h).
+    """Whether the calling thread computes alone.
+
+    It does where torch has one thread, in a thread of the pool (it would wait for itself for ever), and in Warp's debug
+    mode: there two kernels at a time crash over a static pointer (``shared_tile_storage`` in Warp's tile.h), which only
+    optimised code does not have.
     """
     if wp.config.mode == "debug":
         return True
@@ -213,7 +216,7 @@ def launch(kernel, n: int, args: Sequence, device: torch.device, *, slice_min: i
     """Run ``kernel(start, *args)`` over ``n`` threads.  ``args``: ``(tensor, warp type)`` pairs or plain values.
 
     Tensors must be contiguous and on ``device``; nothing is copied and no gradient is recorded.  slice_min: fewest
-    threads of a CPU slice; small where each of few threads does much, so that their launch is cut too.
+    threads of a CPU slice; a small number cuts launches of few threads that do much each.
     """
     if n == 0:
         return
@@ -245,9 +248,9 @@ class _Once(torch.autograd.Function):
 def once_differentiable(backward):
     """Decorator of a ``backward`` without gradient: a second derivative raises RuntimeError.
 
-    Torch's own decorator refuses only where the incoming gradient has one; for a loss linear in the result the inputs'
-    share of the second derivative would silently be missing.  Tensors saved for backward must be the inputs themselves
-    (made contiguous before ``apply``, where that is recorded).
+    Torch's own decorator raises only where the incoming gradient has one.  For a loss that is linear in the result it
+    would leave out the inputs' part of the second derivative and say nothing.  Tensors saved for backward must be the
+    inputs themselves, made contiguous before ``apply``, where that is recorded.
     """
 
     def wrapper(ctx, *g_outs):

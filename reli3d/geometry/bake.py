@@ -1,7 +1,7 @@
-"""Baking: texels of an atlas to points of the surface, a function evaluated there, every texel filled.
+"""Baking: a function of surface points, evaluated at the texels of an atlas; every texel is filled.
 
-Maps are ``(T, T, C)``; row 0 is v = 0 (glTF: v down); texel (row, column) is sampled at its centre ((column + 0.5) / T,
-(row + 0.5) / T).  Nothing here passes a gradient on.
+Maps are ``(T, T, C)``; row 0 is v = 0 (glTF: v down).  Texel (row, column) is sampled at its centre ((column + 0.5) /
+T, (row + 0.5) / T).  Nothing here has a gradient.
 """
 
 from __future__ import annotations
@@ -87,10 +87,10 @@ def _border_segments(faces: Tensor) -> Tensor:
 def rasterize_texels(mesh: Mesh, size: int) -> Texels:
     """Face and barycentrics of every texel of a ``size`` x ``size`` map over the UV of ``mesh``.
 
-    A texel whose centre lies in a face takes it (the lowest face where several do); one whose centre is within 1.5
-    texels of a chart takes the nearest point of the chart's border, so that bilinear lookup on the surface reads texels
-    of the surface only.  The same bits for any number of threads.  Peak memory 24 bytes a texel.  Raises ValueError
-    without UV.
+    A texel whose centre lies in a face takes that face, the lowest where there are several.  A texel whose centre is
+    within 1.5 texels of a chart takes the nearest point of the chart's border.  So a bilinear look-up on the surface
+    reads texels of the surface only.  The same bits for any number of threads.  Peak memory: 24 bytes a texel.  Raises
+    ValueError without UV.
     """
     corners = _corners(mesh, size)
     device = corners.device
@@ -162,12 +162,11 @@ def bake(mesh: Mesh, size: int, fn: Callable[..., Tensor | Mapping[str, Tensor]]
          texels: Texels | None = None, tangents: bool = False, fill: bool = True) -> dict[str, Tensor]:  # fmt: skip
     """Maps ``{name: (size, size, C)}`` of ``fn(position (N, 3), normal (N, 3))`` over the surface.
 
-    fn: returns ``{name: (N, C)}`` or one tensor (named "value"), float32; with ``tangents`` it takes the tangents ``(N,
-    4)`` as third argument.  It is called at the valid texels only, at most ``chunk`` at a time, without gradient; the
-    result does not depend on ``chunk`` if ``fn`` works point by point.  texels: of :func:`rasterize_texels`, to reuse
-    them.
-    fill: copy to every other texel the value of the nearest valid one (:func:`dilate`); they stay 0 otherwise.
-    Raises ValueError if the surface covers no texel or ``fn`` changes its outputs from chunk to chunk.
+    fn: returns ``{name: (N, C)}``, or one tensor (named "value"), float32.  It is called at the valid texels, at most
+    ``chunk`` at a time, without gradient.  If it works point by point, the result does not depend on ``chunk``.
+    texels: of :func:`rasterize_texels`, to use them again.  tangents: ``fn`` takes the tangents ``(N, 4)`` as third
+    argument.  fill: every other texel takes the value of the nearest valid one (:func:`dilate`); otherwise it is 0.
+    Raises ValueError if the surface covers no texel, or ``fn`` changes its outputs from chunk to chunk.
     """
     if chunk < 1:
         raise ValueError(f"chunk: expected at least 1, got {chunk}")
@@ -224,9 +223,9 @@ def dilate(maps: Mapping[str, Tensor] | Tensor, valid: Tensor, *,
            iterations: int | None = None) -> dict[str, Tensor] | Tensor:  # fmt: skip
     """Maps in which every texel that is not ``valid`` takes the value of the nearest valid one.
 
-    maps: ``(H, W, C)`` float32, or a dictionary of them.  valid: ``(H, W)`` bool.  iterations: fill up to this distance
-    [texels] only; None fills everything, so that no mip level mixes in a texel that was never written.
-    The inputs are left alone.  Equal distances: the upper row, then the left column.
+    maps: ``(H, W, C)`` float32, or a dictionary of them; they are not changed.  valid: ``(H, W)`` bool.  iterations:
+    fill up to this distance [texels] only; None fills everything, so that every mip level holds written texels only.
+    Of equal distances the upper row comes first, then the left column.
     """
     if iterations is not None and iterations < 0:
         raise ValueError(f"iterations: expected None or at least 0, got {iterations}")

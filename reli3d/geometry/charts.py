@@ -1,9 +1,9 @@
 """Charts of a surface: regions that project onto a plane without overlap.
 
-A face takes the axis (of six) nearest to its smoothed normal; connected faces of one axis are a chart, projected along
-its own mean normal.  Topology is that of the welded mesh (equal positions are one vertex); an edge with one face or
-more than two is a border.  Every step costs a sort or less: the time is bounded by the number of faces and of overlaps.
-All on the CPU; per-face and sequential steps in Warp, per-chart ones in numpy.
+A face takes the axis (of six) nearest to its smoothed normal.  Connected faces of one axis are a chart, projected along
+its mean normal.  Topology is that of the welded mesh (equal positions are one vertex).  An edge with one face, or with
+more than two, is a border.  Every step takes a sort or less, so the time is bounded by the number of faces and of
+overlaps.  All runs on the CPU: steps for each face in Warp, steps for each chart in numpy.
 """
 
 from __future__ import annotations
@@ -183,10 +183,10 @@ def _upright(right: np.ndarray, up: np.ndarray, points: np.ndarray, chart: np.nd
 
 def _cut_bulky(points: np.ndarray, chart: np.ndarray, right: np.ndarray, up: np.ndarray, area: np.ndarray, waste: float,
                longest: float, neighbours: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:  # fmt: skip
-    """Charts with rings, bows and crosses cut in two where that saves room: ``(chart, parent of each chart)``, or None.
+    """Charts whose boxes are mostly empty, cut in two where that saves room: ``(chart, parent of each chart)`` or None.
 
     points: ``(F, 3)`` centres of the faces.  area: of each chart.  waste: empty area [texels] that is worth a cut.
-    longest: [texels] a chart above is halved across, whatever its fill: it would hold down the scale of all the others.
+    longest: [texels] a longer chart is halved in any case, since it would set the scale of all the others.
     """
     outer = outer_faces(chart, neighbours)
     order, start = group(chart[outer])
@@ -261,10 +261,10 @@ def _overlaps(charts: Charts, boxes: np.ndarray, query: np.ndarray):
 
 
 def split_overlaps(charts: Charts) -> bool:
-    """Give the faces of charts that overlap themselves to new charts that do not, in place; True if there were any.
+    """Move faces of charts that overlap themselves to new charts that do not, in place; True if there were any.
 
-    All faces of a chart look towards its plane, so that where two sheets overlap, a border of one of them ends over the
-    other: looking for faces over the faces at a border finds every chart that overlaps itself.
+    All faces of a chart look towards its plane.  So where two sheets overlap, the border of one of them ends over the
+    other: looking for faces that lie over the faces at a border finds every overlap.
     """
     outer = outer_faces(charts.chart, charts.neighbours)
     outer = outer[charts.chart[outer] >= 0]
@@ -311,10 +311,9 @@ def make_charts(points: np.ndarray, faces: np.ndarray, *, texels: float, least_t
                 sliver: float) -> Charts:  # fmt: skip
     """Charts of a welded mesh.
 
-    points: ``(V, 3)`` float32.  faces: ``(F, 3)`` int32.  texels: area to fill [texels]: it sets the unit of
-    ``corners``.
-    least_texels: charts below this area are merged where possible.
-    longest: charts beyond are cut [texels].  sliver: height [texels] of a face without a chart.
+    points: ``(V, 3)`` float32.  faces: ``(F, 3)`` int32.  texels: area to fill [texels]; it sets the unit of
+    ``corners``.  least_texels: smaller charts are merged where possible.  longest: longer charts are cut [texels].
+    sliver: height [texels] of a face without a chart.
     """
     centre = 0.5 * (points.min(0).astype(np.float64) + points.max(0))
     reach = np.abs(points - centre).max() or 1.0

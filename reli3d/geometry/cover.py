@@ -17,20 +17,15 @@ REACH = 3.0  # rays whose least level is this high meet nothing: masks disagree,
 
 def cover_silhouettes(level: Tensor, bound: Tensor, distance: Tensor, c2w: Tensor, intrinsics: Tensor, *,
                       radius: float) -> Tensor:  # fmt: skip
-    """``level (X, Y, Z)`` lowered so that the views' rays inside their silhouettes meet a surface; no gradient.
+    """``level (X, Y, Z)``, lowered so that every ray inside the views' silhouettes meets the surface; no gradient.
 
-    level: negative inside, on a grid over [-radius, radius]^3 as :func:`reli3d.geometry.surface.extract_surface` takes
-    it, in units of the field's doubt: logits of occupancy, or distances over the softness of the edge.  It is nowhere
-    below ``bound (X, Y, Z)``, nor is the result.  distance, c2w, intrinsics: silhouettes as
-    :func:`reli3d.geometry.hull.hull_distance` takes them, at least ``2 STRIDE`` pixels a side; without views ``level``
-    comes back.
+    level: negative inside, on a grid over [-radius, radius]^3, in logits of occupancy or in distances over the
+    softness.  bound: ``(X, Y, Z)``; neither ``level`` nor the result is below it.  distance, c2w, intrinsics: as in
+    :func:`reli3d.geometry.hull.hull_distance`, at least ``2 STRIDE`` pixels a side.  Without views nothing changes.
 
-    A field that is not sure of a thin part stays outside by little all along the lines of sight that show the part.
-    Every ``STRIDE``-th pixel's ray takes the least level it meets; what that lacks of ``-DEPTH`` is taken off
-    everywhere along the ray, so the surface appears where the field comes nearest to one and is as thick as the field
-    is unsure.  Rays that miss by ``REACH`` are left.  Source: own; the counterpart of the bound by a visual hull
-    (Laurentini 1994), which keeps a surface inside the silhouettes.  Raises TypeError unless float32, ValueError on
-    shapes, devices or a ``radius`` that is not positive.
+    A field that is not sure of a thin part stays a little above 0 along the rays that show it.  Every ``STRIDE``-th
+    pixel has a ray.  What its least level is above ``-DEPTH`` is subtracted along the ray, unless it is above
+    ``REACH``.  Source: own.  Raises TypeError or ValueError.
     """
     check("level", level)
     if level.ndim != 3 or min(level.shape) < 2:

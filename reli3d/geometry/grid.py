@@ -13,8 +13,7 @@ def sample_grid(grid: Tensor, points: Tensor) -> Tensor:
     """Trilinear values ``(N, C)`` of ``grid (X, Y, Z, C)`` at ``points (N, 3)``.
 
     -1 and 1 are the outermost grid points; beyond them the border's value is taken.  At least 2 points along each
-    axis.  Gradients reach both.  Raises
-    TypeError unless float32, ValueError on wrong shapes or mixed devices.
+    axis.  Gradients reach both.  Raises TypeError unless float32, ValueError on wrong shapes or mixed devices.
     """
     check("grid", grid)
     check("points", points, last=3, like=grid)

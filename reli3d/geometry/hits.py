@@ -49,13 +49,13 @@ def hit_normals(vertices: Tensor, faces: Tensor, face: Tensor) -> Tensor:
 
 
 def evaluate_hits(vertices: Tensor, faces: Tensor, hits: Hits, origins: Tensor, directions: Tensor) -> Hits:
-    """The hits with ``t`` and ``bary`` re-evaluated from their faces, so that gradients flow.
+    """The hits with ``t`` and ``bary`` computed again from their faces, so that gradients flow.
 
     vertices: ``(V, 3)``.  faces: ``(F, 3)`` int32.  origins, directions: ``(..., 3)`` of the rays that gave ``hits``.
-    Gradients reach vertices, origins and directions; which face is hit has none.  Computed in float64, the adjoint too;
-    a face thinner, or seen more edge on, than a ray query can tell keeps the hit as it was, with gradient 0.  The point
-    is ``origins + t directions``; its slope in the vertices has more digits than that of interpolated positions, whose
-    parts along the face cancel.  Moller and Trumbore 1997.
+    Gradients reach vertices, origins and directions; which face is hit has none.  Value and gradient are computed in
+    float64.  A face that is too thin, or seen too nearly from its edge, keeps the hit as it was, with gradient 0.  Use
+    ``origins + t directions`` for the point: its slope in the vertices has more digits than that of an interpolated
+    position.  Source: Moller and Trumbore 1997.
     """
     check("vertices", vertices, last=3)
     _check_faces(vertices.shape[0], faces, hits.face, vertices)

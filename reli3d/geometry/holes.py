@@ -25,12 +25,13 @@ class Hole:
 
 
 def open_loops(faces: np.ndarray) -> tuple[list[np.ndarray], np.ndarray]:
-    """Loops of open half-edges ``3 * face + corner`` of ``faces (F, 3)`` without degenerate ones, and which half-edges
-    ``(3 F,)`` lie on an edge with one face.
+    """Loops of open half-edges ``3 * face + corner``, and which half-edges ``(3 F,)`` lie on an edge with one face.
 
-    A half-edge is open unless exactly one other half-edge runs along its edge, the other way.  A loop turns at every
-    vertex within one fan of faces, so where fans touch in a vertex each has its own loop.  The walk from half-edge to
-    half-edge is one to one, so the loops are closed and hold every open half-edge once.
+    faces: ``(F, 3)``, none degenerate.
+
+    A half-edge is open unless exactly one other half-edge runs along its edge, the other way.  At a vertex a loop stays
+    within one fan of faces; where fans touch in a vertex, each has its own loop.  Each half-edge has one successor and
+    one predecessor, so the loops are closed and hold every open half-edge once.
     """
     tail, head = faces.reshape(-1), faces[:, [1, 2, 0]].reshape(-1)
     n = int(faces.max()) + 1 if len(faces) else 0

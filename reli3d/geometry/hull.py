@@ -15,11 +15,11 @@ from reli3d.kernels import hull as kernels
 def mask_distance(masks: Tensor) -> Tensor:
     """Signed distance of every pixel centre to the mask's contour, ``(V, H, W)`` in pixels, positive inside.
 
-    masks: ``(V, H, W)`` float32 coverage in [0, 1].  The contour is where the mask, bilinear between pixel centres,
-    is 0.5, as straight segments (marching squares): sub-pixel for a soft mask, half way between pixels for a hard
-    one. Exact to that contour near it; elsewhere at most a fraction of a pixel too long, since only the segments
-    around the nearest cell with a contour are measured.  The image border is no contour: a mask cut by it goes on
-    beyond.  A view without contour is the image diagonal deep inside or outside.  No gradient.
+    masks: ``(V, H, W)`` float32 coverage in [0, 1].  The contour is where the mask, bilinear between pixel centres, is
+    0.5, as straight segments (marching squares).  Near the contour the distance is exact.  Far from it, it can be a
+    fraction of a pixel too long, since only the segments around the nearest cell with a contour are measured.  The
+    image border is no contour: a mask that reaches it continues outside.  A view without contour has the image diagonal
+    everywhere, positive or negative.  No gradient.
     """
     check("masks", masks)
     if masks.ndim != 3 or min(masks.shape[1:]) < 2 or max(masks.shape[1:]) > 8192:
@@ -49,15 +49,13 @@ def _nearest_crossing(masks: Tensor) -> list:
 
 
 def hull_distance(points: Tensor, distance: Tensor, c2w: Tensor, intrinsics: Tensor) -> Tensor:
-    """Signed distance of points to the visual hull, ``(N,)`` world units, positive inside: the least over the views.
+    """Signed distance ``(N,)`` of points to the visual hull, world units, positive inside: the least over the views.
 
-    points: ``(N, 3)``.  distance: ``(V, H, W)`` from :func:`mask_distance`.  c2w: ``(V, 4, 4)`` rigid, OpenGL (looks
-    along -Z, +Y up).  intrinsics: ``(V, 4)`` fx, fy, cx, cy in pixels, pixel centres at +0.5.  A view's distance is
-    the pixel distance at the point's image (bilinear, clamped at the image border) times depth / focal length: exact
-    where the cone of sight through the contour is seen at a right angle, up to 1 / cos^2 of the angle to the optical
-    axis too long.  Outside the image the border's value holds, so an object cut by the border is unbounded there and
-    only there.  A point at or behind a camera's plane gets -1000.  Without views every point gets +1000.  No
-    gradient.
+    points: ``(N, 3)``.  distance: ``(V, H, W)`` from :func:`mask_distance`.  c2w: ``(V, 4, 4)`` rigid, OpenGL axes.
+    intrinsics: ``(V, 4)`` fx, fy, cx, cy in pixels.  A view's distance is the pixel distance where the point projects,
+    times depth / focal length.  It is up to 1 / cos^2 of the angle to the optical axis too long.  Outside an image the
+    value of its border is taken, so an object that the border cuts is unbounded there.  A point at or behind a camera's
+    plane gets -1000.  Without views every point gets +1000.  No gradient.
     """
     check("points", points, last=3)
     check("distance", distance, like=points)

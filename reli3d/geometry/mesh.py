@@ -1,7 +1,7 @@
-"""Triangle meshes: the type that the parts hand to each other, normals, components and the topology report.
+"""Triangle meshes: the mesh type, normals, components and the topology report.
 
-Faces are counter-clockwise seen from outside.  Topology (components, report) is judged on the *welded* mesh, in which
-vertices at bit-identical positions count as one, because charts and exporters split vertices that the surface does not.
+Faces are counter-clockwise seen from outside.  Topology (components, report) is that of the *welded* mesh, in which
+vertices at bit-identical positions are one: atlases and exporters split vertices where the surface is whole.
 """
 
 from __future__ import annotations

@@ -40,11 +40,12 @@ def gather_views(maps: Tensor, points: Tensor, c2w: Tensor, intrinsics: Tensor) 
 def summarize_views(
     images: Tensor, c2w: Tensor, intrinsics: Tensor, points: Tensor, visible: Tensor | None, normal: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """What the images show of ``points (N, 3)``: ``(N, V, 9)`` a view, its weight ``(N, V)``, ``(N, 9)`` in sum.
+    """What the images show of ``points (N, 3)``: numbers ``(N, V, 9)`` and weight ``(N, V)`` of each view, summary
+    ``(N, 9)``.
 
     images: ``(V, S, S, 4)``, sRGB and signed distance to the silhouette in pixels.  c2w: ``(V, 4, 4)`` OpenGL.
-    intrinsics: ``(V, 4)`` in pixels.  visible: ``(N, V)``, 1 where a view sees the point of a surface, 0 where it is
-    hidden, and normal: ``(N, 3)`` unit; both None for points in space.  :mod:`reli3d.kernels.view_features` has the
+    intrinsics: ``(V, 4)`` in pixels.  visible: ``(N, V)``, 1 where a view sees the surface point, 0 where it is
+    hidden.  normal: ``(N, 3)`` unit.  Both are None for points in space.  :mod:`reli3d.kernels.view_features` lists the
     numbers.  No gradient.  Raises TypeError unless float32, ValueError on wrong shapes or mixed devices.
     """
     n, out, inputs = _summary(images, c2w, intrinsics, points, visible, normal)
@@ -58,12 +59,13 @@ def pool_views(
     images: Tensor, tokens: Tensor, own: Tensor, c2w: Tensor, intrinsics: Tensor, points: Tensor,
     visible: Tensor | None, normal: Tensor | None
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """A hidden layer of every view at ``points (N, 3)``, ``(N, H)`` in the views' weighted mean, and the summary ``(N,
-    9)`` of :func:`summarize_views`.
+    """A hidden layer at ``points (N, 3)``: the weighted mean over the views, ``(N, H)``, and the summary ``(N, 9)`` of
+    :func:`summarize_views`.
 
-    The layer of a view is ``silu(token + numbers @ own)``: its ``tokens (V, P, P, H)`` looked up where the point
-    projects, and the 9 numbers of :func:`summarize_views` times ``own (9, H)``.  H is a multiple of 8.  The rest of the
-    arguments as there.  No gradient: :func:`gather_views` and torch do the same with one, in five times the time.
+    The layer of a view is ``silu(token + numbers @ own)``: its ``tokens (V, P, P, H)``, looked up where the point
+    projects, and the 9 numbers of :func:`summarize_views` times ``own (9, H)``.  H is a multiple of 8.  The other
+    arguments are those of :func:`summarize_views`.  No gradient: with :func:`gather_views` and torch the same has one
+    and takes five times as long.
     """
     n, out, inputs = _summary(images, c2w, intrinsics, points, visible, normal)
     check("tokens", tokens, like=images), check("own", own, like=images)

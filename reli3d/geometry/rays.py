@@ -1,8 +1,8 @@
-"""Rays against a triangle mesh: closest hit and occlusion, on Embree (CPU) or Warp's BVH (CPU and CUDA).
+"""Rays against a triangle mesh: closest hit and occlusion, on Embree (CPU) or Warp's tree (CPU and CUDA).
 
-Directions need not be unit; ``t`` counts in their lengths, from 0 inclusive to ``t_max`` exclusive.  A ray that
-misses, that holds a NaN, an infinity or a zero direction, or whose ``t`` leaves float32 has ``face = -1``, ``t = inf``,
-``bary = 0``.  Nothing here has a gradient: the hit is re-evaluated from its face by :func:`evaluate_hits`.
+Directions need not have unit length; ``t`` counts in their lengths, from 0 inclusive to ``t_max`` exclusive.  A ray
+misses where nothing is hit, where it holds a NaN, an infinity or a zero direction, and where ``t`` leaves float32.  A
+miss has ``face = -1``, ``t = inf``, ``bary = 0``.  Nothing here has a gradient: :func:`evaluate_hits` gives one.
 """
 
 from __future__ import annotations
@@ -26,8 +26,7 @@ THREAD_SLICES = 2  # of a large call for each thread: the more rays are ordered 
 
 @dataclass(frozen=True)
 class Hits:
-    """face ``(...)`` int32, -1 for a miss; t ``(...)``, inf for a miss; bary ``(..., 2)`` weights of vertices 1 and
-    2."""
+    """face ``(...)`` int32, -1 for a miss; t ``(...)``, inf for a miss; bary ``(..., 2)``: weights of vertices 1, 2."""
 
     face: Tensor
     t: Tensor
@@ -37,13 +36,12 @@ class Hits:
 class RayScene:
     """Acceleration structure over one mesh; keeps its own copy of the geometry.
 
-    vertices: ``(V, 3)`` float32.  faces: ``(F, 3)`` int32.  Arrays of numpy, and faces of other integers, are taken
-    where nothing is lost.  Zero-area faces are never hit; without faces every ray
-    misses. backend: ``embree`` (CPU only, robust mode), ``warp``, or ``auto``: Embree on CPU, where it is some three
-    times faster, Warp on CUDA.  Warp's tree is split by surface area on every device, since its other ways leak more
-    rays at vertices; on CUDA it is built by one thread of the host too (80 thousand triangles: 50 ms of a 2.8 GHz Xeon,
-    refit 3 ms).  Raises TypeError or ValueError for a wrong dtype or shape, an index out of range or a vertex that is
-    not finite.
+    vertices: ``(V, 3)`` float32.  faces: ``(F, 3)`` int32.  Numpy arrays and other integers are taken where no value
+    changes.  Faces without area are never hit; without faces every ray misses.  backend: ``embree`` (CPU only, robust
+    mode), ``warp``, or ``auto``: Embree on the CPU, where it is some three times faster, Warp on CUDA.  Warp's tree is
+    split by surface area, since its other trees lose more rays at vertices; on CUDA it is built on the host, and
+    :meth:`refit` is the fast way to move vertices.  Raises TypeError or ValueError for a wrong dtype or shape, an index
+    out of range or a vertex that is not finite.
     """
 
     def __init__(self, vertices: Tensor, faces: Tensor, backend: str = "auto"):
@@ -112,8 +110,8 @@ class RayScene:
     def clear(self, origins: Tensor, directions: Tensor, t_max: Tensor) -> Tensor:
         """Whether nothing lies on a ray before its ``t_max``, ``(N,)`` bool; False where ``t_max`` is below 0.
 
-        For rays that a kernel has made, ``(N, 3)``, ``(N, 3)`` and ``(N,)`` on the device, several in a row from about
-        one place: values are not checked.
+        For rays that a kernel has made, ``(N, 3)``, ``(N, 3)`` and ``(N,)`` on the device, whose neighbours start at
+        about one place.  Values are not checked.
         """
         if self._embree is None:
             return (t_max >= 0.0) & ~self.occluded(origins, directions, t_max=t_max)
@@ -224,11 +222,11 @@ def _items(values: Tensor) -> np.ndarray:
 
 
 def offset_origin(position: Tensor, ng: Tensor, direction: Tensor, *, scale: float = 1.0) -> Tensor:
-    """Origins ``(..., 3)`` for rays from a surface that cannot hit the face they start on.
+    """Origins ``(..., 3)`` for rays that start on a face and must not hit it.
 
-    position: ``(..., 3)`` on the face.  ng: ``(..., 3)`` unit geometric normal, either side; 0, of a face without area,
-    moves nothing.  direction: ``(..., 3)``, of the ray to come.  scale: largest coordinate of the mesh
-    (``RayScene.scale``).  No gradient.
+    position: ``(..., 3)`` on the face.  ng: ``(..., 3)`` unit geometric normal, of either side; 0 (a face without area)
+    moves nothing.  direction: ``(..., 3)`` of the ray.  scale: largest coordinate of the mesh (``RayScene.scale``).  No
+    gradient.
     """
     check("position", position, last=3)
     check("ng", ng, last=3, like=position)

@@ -25,13 +25,13 @@ def vertex_deviation(
     cubes: Tensor | None = None,
     closed: bool = True,
 ) -> Tensor:
-    """L_dev of every dual vertex, ``(D,)`` in units of the radius: how unequal its distances to its crossings are.
+    """L_dev of every dual vertex, ``(D,)`` in units of the radius; its mean is the loss.
 
-    The mean absolute deviation of the distances between a dual vertex and the zero crossings that it averages, which
-    keeps the mean well inside its polygon and the faces free of folds; its mean is the loss.  Arguments, their checks
-    and the order of the vertices (without centres) are those of :func:`reli3d.geometry.surface.extract_surface`.
-    Gradients reach level, deformation, alpha and beta; a distance of 0 gives none.  A field without surface has no
-    vertex, so the result is empty and its mean NaN.
+    It is the mean absolute deviation of the distances between a dual vertex and the zero crossings that it averages.  A
+    small one keeps the vertex inside its polygon and the faces without folds.  Arguments, checks and the order of the
+    vertices (without centres) are those of :func:`reli3d.geometry.surface.extract_surface`.  Gradients reach level,
+    deformation, alpha and beta; a distance of 0 gives none.  A field without surface gives an empty result, whose mean
+    is NaN.
     """
     extent = surface.check_fields(level, radius, deformation, alpha, beta, None, cubes)
     t, padded, _ = surface.topology_of(level.detach().contiguous(), cubes, closed)
@@ -87,14 +87,13 @@ def vertex_deviation(
 
 
 def sign_entropy(level: Tensor) -> Tensor:
-    """Cross-entropy of the levels across every sign change of the grid, a scalar: the loss that removes floaters.
+    """Cross-entropy of the levels across every sign change of the grid, a scalar: the loss that removes loose pieces.
 
-    ``H(sigmoid(a), [b > 0]) + H(sigmoid(b), [a > 0])``, averaged over the grid edges (a, b) with a sign change
-    (Munkberg et al. 2022, Extracting Triangular 3D Models; FlexiCubes' L_sign): each end is drawn
-    to the other's sign, so a change that nothing else holds up goes away.  0, without gradient, where there is none.
-
-    level: ``(X + 1, Y + 1, Z + 1)`` or with leading batch axes, float32, negative inside, in units in which 1 is
-    sure.  Raises TypeError or ValueError on a wrong dtype or shape and on values that are not finite.
+    ``H(sigmoid(a), [b > 0]) + H(sigmoid(b), [a > 0])``, mean over the grid edges (a, b) with a sign change: each end
+    moves towards the other's sign, so a change that no other loss needs disappears.  0, without gradient, where there
+    is none.  level: ``(X + 1, Y + 1, Z + 1)`` or with leading batch axes, float32, negative inside, 1 for a sure
+    value.  Raises TypeError or ValueError on a wrong dtype or shape and on values that are not finite.  Source:
+    Munkberg et al. 2022; L_sign of FlexiCubes.
     """
     check("level", level)
     if level.ndim < 3 or min(level.shape[-3:]) < 2:

@@ -1,13 +1,11 @@
-"""New triangles for an old surface: fewer of them, even ones, or a watertight solid.
+"""New triangles for a surface: fewer, even ones, or a watertight solid.
 
-Each works on the welded positions on the CPU and returns a mesh of positions and faces on the device it came from,
-without gradient: normals, UV and tangents belong to the old triangles.  Decimation (``fast-simplification``, MIT) and
-even remeshing (``pyacvd``, MIT, on VTK, BSD, and pykdtree, LGPL) are optional installs, never brought by default.
+Each function works on the welded positions on the CPU and returns a mesh of positions and faces on the device of the
+input, without gradient.  Normals, UV and tangents are left out, since they belong to the old triangles.
 
-Decimation compared on the two test meshes that both take, at a fifth of their faces: quadrics of
-``fast-simplification`` left 5 and 30 times less surface distance than ``manifold3d``'s ``simplify`` (which takes a
-tolerance, not a count, and solids only) in less than a hundredth of the time.  Left out for even remeshing: PyMeshLab
-is GPL, gpytoolbox's wheel carries GPL parts and the ``geogram`` wheel has no remeshing.
+Decimation (``fast-simplification``, MIT) and even remeshing (``pyacvd``, MIT, on VTK, BSD, and pykdtree, LGPL) are
+optional installs.  ``manifold3d`` can simplify too, but takes a tolerance instead of a count and solids only.
+PyMeshLab is GPL, gpytoolbox has GPL parts, and the wheel of ``geogram`` has no remeshing.
 """
 
 from __future__ import annotations
@@ -82,10 +80,10 @@ def decimate(mesh: Mesh, faces: int, *, keep_border: bool = False) -> Mesh:
 def remesh(mesh: Mesh, vertices: int, *, subdivide: int = 10) -> Mesh:
     """The surface with about ``vertices`` evenly spread vertices and nearly equilateral faces.
 
-    Clusters of equal area on the surface, their dual triangulated: Valette and Chassery 2004, Approximated centroidal
-    Voronoi diagrams for uniform polygonal mesh coarsening, through ``pyacvd`` (``pip install 'reli3d[remesh]'``).
-    Where the input has fewer than ``subdivide`` vertices a cluster, its faces are first split in four as often as
-    needed.  Sharp edges are rounded to the clusters' size, and parts thinner than a cluster may come out non-manifold.
+    Clusters of equal area, their dual triangulated: Valette and Chassery 2004, Approximated centroidal Voronoi diagrams
+    for uniform polygonal mesh coarsening, through ``pyacvd`` (``pip install 'reli3d[remesh]'``).  Faces are split in
+    four until there are at least ``subdivide`` vertices for each cluster.  Sharp edges are rounded to the clusters'
+    size; parts thinner than a cluster may come out non-manifold.
 
     Raises ValueError unless ``vertices`` is at least 8 and ``subdivide`` at least 1, ImportError without the library.
     """
@@ -108,13 +106,13 @@ def remesh(mesh: Mesh, vertices: int, *, subdivide: int = 10) -> Mesh:
 
 
 def repair(mesh: Mesh) -> Mesh:
-    """The watertight, manifold solid that the surface bounds, as ``manifold3d`` takes it; outward faces.
+    """The watertight, manifold solid that the surface bounds, as ``manifold3d`` takes it; faces look outward.
 
-    Vertices at one position are welded, repeated faces dropped; where that is no closed surface, it is cut at edges
-    with more than two faces or with two that disagree, and every border loop gets a cap (a fan around its mean).
-    Pieces that are inside out are turned, unless they lie within the bounds of another piece, whose cavity they then
-    are; overlapping pieces are united.  A single sheet has no inside: its cap makes a flat or empty solid.  Manifold
-    by index: where the solid touches itself in an edge or a vertex, positions repeat.
+    Vertices at one position are welded and repeated faces dropped.  If the surface is not closed then, it is cut at
+    edges with more than two faces, or with two that disagree, and every border loop gets a cap (a fan around its
+    mean).  Pieces that are inside out are turned; inside the bounds of another piece they are cavities and stay.
+    Overlapping pieces are united.  A single sheet has no inside: its cap makes a flat or empty solid.  Where the solid
+    touches itself in an edge or a vertex, positions repeat.
 
     Raises ValueError where no solid with a volume comes out.
     """

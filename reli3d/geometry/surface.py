@@ -1,9 +1,10 @@
 """Triangle mesh of the zero level of a grid: FlexiCubes (Shen et al. 2023, Flexible Isosurface Extraction, SIGGRAPH).
 
-A grid of X * Y * Z cubes fills the box [-radius, radius]^3; its vertices are ``(X + 1, Y + 1, Z + 1)`` with x first
-and z fastest, its cubes ``(X, Y, Z)`` in the same order.  The level is negative inside.  Corners of a cube are
-numbered x first, (0,0,0), (1,0,0), (0,1,0), (1,1,0), (0,0,1), ...; edges as ``kernels.flexicubes_tables.EDGES``.  The
-work after one pass over the grid is proportional to the surface.
+A grid of X * Y * Z cubes fills the box [-radius, radius]^3.  Its vertices are ``(X + 1, Y + 1, Z + 1)``, x first and z
+fastest, its cubes ``(X, Y, Z)`` in the same order.  Corners of a cube are numbered x first: (0,0,0), (1,0,0), (0,1,0),
+(1,1,0), (0,0,1), ...; edges as in ``kernels.flexicubes_tables.EDGES``.  Vertices and faces come in the order of the
+published release.  After one pass over the grid the work is proportional to the surface.  Left out: the tetrahedra of
+the paper's section 4.5, and dual vertices placed by the field's gradient.
 """
 
 from __future__ import annotations
@@ -68,33 +69,14 @@ def extract_surface(
 ) -> Mesh:
     """Mesh of ``level == 0`` inside the box, faces counter-clockwise from the positive side.
 
-    level: ``(X + 1, Y + 1, Z + 1)``, negative inside (0 is outside).  radius: half extent of the box, one or three
-    numbers. deformation: ``(X + 1, Y + 1, Z + 1, 3)`` offsets of the grid vertices in units of the box's extent; keep
-    it below half a cube.  Weights, already activated, positive: alpha ``(cubes, 8)`` of the corners, beta ``(cubes,
-    12)`` of the edges, gamma ``(cubes,)`` of the quads' split; None is 1.  cubes: where given, the weights have only
-    the rows of these cubes, which must be :func:`surface_cubes` of ``level``.
+    level: ``(X + 1, Y + 1, Z + 1)``, negative inside, 0 is outside.  radius: half extent of the box, one or three
+    numbers.  deformation: ``(*level.shape, 3)`` offsets of the grid vertices in box extents, below half a cube.
+    Positive weights, 1 if None: alpha ``(cubes, 8)`` of corners, beta ``(cubes, 12)`` of edges, gamma ``(cubes,)`` of
+    the quads' split.  cubes: :func:`surface_cubes` of ``level``, if the weights have rows for these alone.  closed: a
+    flat cap where the inside reaches the border.  centre: four triangles for each quad, as training wants it, else two.
 
-    closed: where the inside reaches the border of the box, a flat cap closes the surface; False leaves it open there,
-    as the published release does.  Away from the border both give the same.  centre: split every quad into four
-    triangles around the mean of its diagonals weighted by gamma, as training wants it (gradients reach gamma); else
-    into two.
-
-    Vertices and faces come in the order of the published release (for ``centre``, centres follow the dual vertices).
-    Gradients reach level, deformation, alpha, beta and with ``centre`` gamma, by an own adjoint; the same bits for
-    any number of CPU threads.  They are finite for levels of any size and weights in [1e-6, 1e6]; a slope goes with
-    1 / level, and an edge between levels below 1e-20 passes none on to them.
-
-    A level of one sign is no error.  All outside gives no vertices and no faces, with gradients of zero; all inside
-    gives the box with its edges cut off half a cube wide, like everything that reaches the border, or nothing where
-    ``closed`` is False.
-
-    Left out: the tetrahedral volume mesh of the paper's section 4.5; the output is the surface alone, which a
-    tetrahedraliser (TetGen, fTetWild) fills where a simulation needs it; and dual vertices placed by the field's
-    gradient (the quadric error that the authors' code offers without weights).
-    :mod:`reli3d.geometry.regularize` has the losses that keep a fitted surface sound.
-
-    Arrays of numpy are taken too.  Raises TypeError or ValueError on a wrong dtype, shape or device, on a level that is
-    not finite, on weights that are not positive.
+    A level of one sign gives no faces (outside) or the box (inside).  Gradients reach all but ``radius``, gamma only
+    with ``centre``; the same bits for any number of threads.  Raises TypeError or ValueError.
     """
     level, deformation, alpha, beta, gamma = (tensor_of(v) for v in (level, deformation, alpha, beta, gamma))
     cubes = tensor_of(cubes, torch.int64)
@@ -116,11 +98,10 @@ def extract_surface(
 
 def extract_surfaces(levels: Tensor | Sequence[Tensor], *, radius: float | Sequence[float], closed: bool = True,
                      centre: bool = False, **fields: Tensor | Sequence[Tensor] | None) -> list[Mesh]:  # fmt: skip
-    """:func:`extract_surface` of every field of a batch.
+    """:func:`extract_surface` of every field of a batch, one mesh for each; the same bits as alone.
 
-    levels: ``(B, X + 1, Y + 1, Z + 1)``, or a sequence of grids that may differ in shape.  fields: deformation,
-    alpha, beta, gamma, cubes, each with a leading axis B or as a sequence of B.  Meshes differ in size, so there is
-    one for every field and no padding; each is the same bits as alone.  Raises as the single function, and ValueError
+    levels: ``(B, X + 1, Y + 1, Z + 1)``, or a sequence of grids that may differ in shape.  fields: deformation, alpha,
+    beta, gamma, cubes, each with a leading axis B or as a sequence of B.  Raises as the single function, and ValueError
     where the batch sizes differ or the batch is empty.
     """
     unknown = sorted(set(fields) - {"deformation", "alpha", "beta", "gamma", "cubes"})

@@ -1,7 +1,7 @@
 """Tangent frames of a mesh with UV, and normals written in them.
 
-MikkTSpace convention as glTF uses it: the tangent follows +u, bitangent = w * cross(normal, tangent) points up on the
-image, which is -v; w is +1 where the texture is not mirrored.  A normal map holds n * 0.5 + 0.5 with red along
+The convention is MikkTSpace's, as in glTF.  The tangent follows +u.  The bitangent, w * cross(normal, tangent), points
+up on the image, which is -v; w is +1 where the texture is not mirrored.  A normal map holds n * 0.5 + 0.5, red along
 the tangent and green along the bitangent.
 """
 
@@ -32,11 +32,11 @@ def _flat(v: Tensor, n: Tensor) -> Tensor:
 def vertex_tangents(mesh: Mesh) -> Tensor:
     """Tangents ``(V, 4)`` float32: unit, orthogonal to the normal, w = +-1.
 
-    Mikkelsen 2008 (Simulation of wrinkled surfaces revisited), as in mikktspace.c: every corner adds the direction of
-    +u of its face, made flat to the vertex normal and unit, times the angle of the corner; corners count as one vertex
-    where position, normal and UV are equal.  A vertex that joins mirrored and plain faces, which MikkTSpace would
-    split, takes the side with the larger angle; :func:`unwrap` makes none.  Without any direction (no UV area) the
-    tangent is some vector orthogonal to the normal.  No gradient.  Raises ValueError without normals or UV.
+    Every corner adds the direction of +u of its face, projected onto the plane of the vertex normal and made unit,
+    times the angle of the corner.  Corners are one vertex where position, normal and UV are equal.  A vertex that joins
+    mirrored and plain faces, which MikkTSpace splits, takes the side with the larger angle; :func:`unwrap` makes none.
+    Without any direction (no UV area) the tangent is some vector orthogonal to the normal.  No gradient.  Raises
+    ValueError without normals or UV.  Source: Mikkelsen 2008, Simulation of wrinkled surfaces revisited; mikktspace.c.
     """
     if not isinstance(mesh, Mesh):
         raise TypeError(f"mesh: expected Mesh, got {type(mesh).__name__}")
@@ -97,11 +97,11 @@ def _frame(normal: Tensor, tangent: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def encode_normals(world: Tensor, normal: Tensor, tangent: Tensor) -> Tensor:
-    """Normal map values ``(..., 3)`` in [0, 1] of the unit world-space normals ``world`` ``(..., 3)``.
+    """Normal map values ``(..., 3)`` in [0, 1] of the unit world-space normals ``world (..., 3)``.
 
     normal: ``(..., 3)`` unit, tangent: ``(..., 4)`` with unit direction, both interpolated at the texel.  The frame is
     inverted, not transposed: interpolated tangents are not quite orthogonal, and :func:`decode_normals` must give
-    ``world`` back.  A normal below the surface is bent to it, because viewers have no use for it.  Gradients reach
+    ``world`` back.  A normal below the surface is bent up to it, since viewers expect none there.  Gradients reach
     ``world``.
     """
     t, b, n = _frame(normal, tangent)

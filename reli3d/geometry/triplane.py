@@ -17,12 +17,12 @@ PROBED, NEAR, WALK = 4096, 8.0, 0.8  # points looked at, texels from one to the 
 
 
 class _SampleTriplane(torch.autograd.Function):
-    """Own backward: a scatter per point would need atomics, which Warp's CPU launches lack and CUDA does in any order.
+    """Own backward: adding up point by point needs atomics, which Warp's CPU launches lack and CUDA runs in any order.
 
-    Points are sorted by their row of cells instead, and one thread owns the rows of texels it adds to.  On CPU the
-    forward pass walks the same order, as rows of a large plane stay in the cache, and makes channel-first rows
-    channel-last as it comes to them; points that come as a walk over neighbours (a grid, texels of an atlas) need no
-    order.
+    Points are sorted by their row of cells, and one thread owns the rows of texels to which it adds.  On the CPU the
+    forward pass takes the same order, since rows of a large plane then stay in the cache; it turns channel-first rows
+    into channel-last ones as it needs them.  Points in which neighbours follow each other (a grid, texels of an atlas)
+    are not sorted.
     """
 
     @staticmethod
@@ -135,20 +135,15 @@ def _planes_adjoint(points: Tensor, g: Tensor, order: Tensor, edges: Tensor, sha
 
 
 def sample_triplane(planes: Tensor, points: Tensor) -> Tensor:
-    """Features of ``points``, ``(B, N, 3 * C)`` float32: bilinear from the planes XY, XZ, YZ, concatenated in that
-    order.
+    """Features of ``points``, ``(B, N, 3 * C)`` float32: bilinear from the planes XY, XZ, YZ, in that order.
 
-    planes: ``(B, 3, C, H, W)`` float32, or bfloat16 / float16 (summed in float32).  The first coordinate of a plane
-    runs along W, the second along H; [-1, 1] spans the outer texel borders (align_corners False); outside the planes
-    the texels are zero, so a point on the border sees half.  points: ``(B, N, 3)`` float32; NaN gives zeros.
+    planes: ``(B, 3, C, H, W)`` float32, or bfloat16, float16 (float32 sums).  The first coordinate of a plane runs
+    along W, the second along H.  [-1, 1] spans the outer borders of the texels; outside, texels are zero, so a point on
+    the border gets half.  Channel-last strides, float32, C a multiple of 8, are read in place; other planes are
+    copied.  points: ``(B, N, 3)`` float32; NaN gives zeros.
 
-    Gradients reach ``planes`` (in their dtype) and ``points`` (one-sided at texel centres) and are the same bits for
-    any number of CPU threads.  Work in memory is channel-last: planes with those strides (``planes.movedim(2,
-    -1).contiguous() .movedim(-1, 2)``, C a multiple of 8, float32) are read in place, others are copied on every
-    call.
-
-    Raises TypeError on another dtype, ValueError on shapes that do not fit, mixed devices or sizes beyond 32-bit
-    indices.
+    Gradients reach ``planes`` (in their dtype) and ``points`` (one-sided at texel centres), with the same bits for any
+    number of threads.  Raises TypeError or ValueError, also for sizes beyond 32-bit indices.
     """
     if not isinstance(planes, Tensor):
         raise TypeError(f"planes: expected a tensor, got {type(planes).__name__}")

@@ -1,8 +1,8 @@
-"""UV atlas: charts by projection, packed with a guard band; xatlas in a process of its own as the other choice.
+"""UV atlas: charts by projection, packed with a guard band; xatlas in a process of its own is the other choice.
 
-UV follow glTF: u right, v down, [0, 1].  Seen from outside the charts are not mirrored: in (u, 1 - v) every face is
-counter-clockwise.  The atlas is a discrete choice made on the CPU; no gradient reaches ``uv``, while vertices and
-normals of the result are a gather of the input and pass theirs on.
+UV follow glTF: u right, v down, [0, 1].  Seen from outside, charts are not mirrored: in (u, 1 - v) every face is
+counter-clockwise.  The atlas is made on the CPU and ``uv`` has no gradient.  Vertices and normals of the result are a
+gather of the input's and pass gradients on.
 """
 
 from __future__ import annotations
@@ -74,12 +74,12 @@ def _check(mesh: Mesh, texture_size: int) -> None:
 
 
 def unwrap(mesh: Mesh, *, texture_size: int = 1024) -> Mesh:
-    """The mesh with ``uv``; vertices are split at chart borders, the faces keep their order.
+    """The mesh with ``uv``; vertices are split at the borders of charts, the faces keep their order.
 
-    Every face has positive UV area and faces of different charts are a guard band apart (:func:`guard_band`, less only
-    if the charts are too many for the texture).  Normals are taken over, or computed on the mesh before the split so
-    that shading is smooth across charts.  Any triangle mesh will do: open, non-manifold, in pieces, with faces without
-    area. The same input gives the same bits.  Raises TypeError or ValueError for a wrong mesh, no faces, or NaN.
+    Every face has positive UV area.  Faces of different charts are a guard band apart (:func:`guard_band`), less only
+    if there are too many charts for the texture.  Normals are kept, or computed before the split, so that shading is
+    smooth across charts.  Any triangle mesh is taken: open, non-manifold, in pieces, with faces without area.  The same
+    input gives the same bits.  Raises TypeError or ValueError for a wrong mesh, no faces, or NaN.
     """
     _check(mesh, texture_size)
     source_faces = mesh.faces.cpu().numpy()

@@ -1,8 +1,8 @@
 """The header of an OpenEXR file, checked before the library allocates anything for it.
 
-A file of 54 bytes can claim gigabytes.  Accepted is what an environment map needs: one flat part, scanlines or one
-level of tiles, a bounded number of samples, and a chunk table whose chunks lie inside the file.
-Source: the OpenEXR file layout, https://openexr.com/en/latest/OpenEXRFileLayout.html.
+A file of 54 bytes can claim gigabytes.  Taken is what an environment map needs: one flat part, scanlines or one level
+of tiles, a bounded number of samples, and a chunk table whose chunks lie inside the file.  Source: the OpenEXR file
+layout, https://openexr.com/en/latest/OpenEXRFileLayout.html.
 """
 
 from __future__ import annotations

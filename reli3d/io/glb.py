@@ -1,8 +1,7 @@
 """GLB out: one mesh, one metallic-roughness material, three PNG textures (glTF 2.0, Khronos).
 
-Axes and units are glTF's own (+Y up, right-handed), so that nothing is rotated.  Base colour is sRGB 8 bit; roughness
-is green and metallic is blue of one linear texture; all factors are written out as 1.  :func:`read_glb` is the way
-back.
+Axes and units are glTF's own (+Y up, right-handed), so nothing is rotated.  Base colour is sRGB 8 bit.  Roughness is
+green and metallic is blue of one linear texture.  All factors are written as 1.  :func:`read_glb` reads it back.
 """
 
 from __future__ import annotations
@@ -154,10 +153,9 @@ def write_glb(path: str | os.PathLike, asset: Asset, *, extras: Mapping | None =
 def read_glb(path: str | os.PathLike, **limits: int) -> list[Asset]:
     """The surfaces of a GLB file, one :class:`Asset` for each primitive, in the axes of its scene; no environment.
 
-    Node transforms are applied.  Textures come out square and of one size with all factors multiplied in; occlusion,
-    emission, alpha, animation, points and lines are left out.  Missing normals are flat ones, missing tangents
-    MikkTSpace's.
-    limits: see :func:`reli3d.io.gltf_parts.read_parts`.  Raises InputError, a ValueError that names field, value and
-    fix.
+    Node transforms are applied.  Textures come out square and of one size, with all factors multiplied in.  Occlusion,
+    emission, alpha, animation, points and lines are left out.  Missing normals are those of the faces, missing tangents
+    MikkTSpace's.  limits: see :func:`reli3d.io.gltf_parts.read_parts`.  Raises InputError, a ValueError that names
+    field, value and fix.
     """
     return read_parts(path, **limits)

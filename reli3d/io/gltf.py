@@ -1,6 +1,6 @@
-"""GLB in: the container, accessors and nodes of a glTF 2.0 file from anywhere, checked before use.
+"""GLB in: the container, accessors and nodes of any glTF 2.0 file, checked before use.
 
-Nothing outside the file is opened (data URIs only), sizes are limited before memory is taken, and every fault is an
+Nothing outside the file is opened (data URIs only).  Sizes are limited before memory is taken.  Every fault is an
 InputError that names the field.  Primitives and materials are read in ``gltf_parts.py``.
 """
 

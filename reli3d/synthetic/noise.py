@@ -13,11 +13,10 @@ from reli3d.kernels import noise as kernels
 def fbm(
     points: Tensor, *, octaves: int = 4, gain: float = 0.5, ridged: bool = False, seed: int = 0
 ) -> tuple[Tensor, Tensor]:
-    """Fractal sum of gradient noise at ``points`` ``(N, 3)``: value ``(N,)`` and gradient with respect to the points
-    ``(N, 3)``.
+    """Fractal sum of gradient noise at ``points (N, 3)``: value ``(N,)``, and its gradient in the points ``(N, 3)``.
 
-    One octave has mean 0 and standard deviation 0.5; ``ridged`` sums absolute values (turbulence, Perlin 1985).  No
-    autograd. Raises TypeError unless float32, ValueError on a wrong shape or ``octaves`` outside 1 to 16.
+    One octave has mean 0 and standard deviation 0.5.  ``ridged`` sums absolute values (turbulence, Perlin 1985).  No
+    autograd.  Raises TypeError unless float32, ValueError on a wrong shape or ``octaves`` outside 1 to 16.
     """
     points = _points(points)
     if not 1 <= octaves <= 16:
@@ -38,9 +37,10 @@ def fbm(
 
 
 def cells(points: Tensor, *, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
-    """Cellular noise (Worley 1996) at ``points`` ``(N, 3)``: distances to the nearest two of one jittered point a
-    lattice cell ``(N, 2)``, a number in [0, 1) of the nearest ``(N,)``, gradient of second minus first distance
-    ``(N, 3)``.  No autograd.
+    """Cellular noise (Worley 1996) at ``points (N, 3)``, with one jittered point in each lattice cell.
+
+    Gives the distances to the nearest two ``(N, 2)``, a number in [0, 1) of the nearest ``(N,)``, and the gradient of
+    the second minus the first distance ``(N, 3)``.  No autograd.
     """
     points = _points(points)
     distance = points.new_empty((len(points), 2))

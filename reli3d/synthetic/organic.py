@@ -1,8 +1,8 @@
-"""Grown and sculpted families: animals, figures, busts, fruits, shoes, stones, cushions; signed fields turned to
-surfaces.
+"""Families of grown and sculpted things: animals, figures, busts, fruits, shoes, stones, cushions.
 
-A field is sampled on a grid, negative inside, and its zero level is taken by surface nets (Gibson 1998): one vertex
-for each cell that the surface crosses, at the mean of its edge crossings, one quad for each crossed grid edge.
+Each is a signed field, negative inside, sampled on a grid.  Its zero level is taken by surface nets (Gibson 1998): one
+vertex for each cell that the surface crosses, at the mean of its edge crossings, and one quad for each crossed grid
+edge.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""Procedural objects without end, for training: a closed mesh, its parts and their materials from one seed.
+"""Procedural objects for training: a closed mesh, its parts and their materials from one seed.
 
-Seeds are disjoint by use: training draws from ``TRAINING_SEEDS``, choices are made on ``VALIDATION_SEEDS``, figures
-are reported on ``TEST_SEEDS``, and :func:`example_object` is a fixed thing that no family can make.  The same seed
-gives the same object.  Frame: right-handed, +Y up, as it rests, centred, longest side 1 (so inside the radius 0.87 of
-the network's frame).
+Seeds are disjoint by use: training takes ``TRAINING_SEEDS``, choices are made on ``VALIDATION_SEEDS``, figures are
+reported on ``TEST_SEEDS``.  :func:`example_object` is one fixed object that no family can make.  The same seed gives
+the same object.  Frame: right-handed, +Y up, resting, centred, longest side 1 (so inside the radius 0.87 of the
+network's frame).
 """
 
 from __future__ import annotations
@@ -104,12 +104,11 @@ def assemble(assembly: Assembly, name: str, materials: tuple[Material, ...] | No
 
 
 def corner_normals(vertices: np.ndarray, faces: np.ndarray, crease_deg: float = CREASE_DEG) -> np.ndarray:
-    """Shading normals ``(F, 3, 3)`` float32, one for each corner: smooth across edges that turn less than
-    ``crease_deg``.
+    """Shading normals ``(F, 3, 3)`` float32 of the corners: smooth across edges that turn by less than ``crease_deg``.
 
-    Corners of a vertex that smooth edges connect share the mean of their faces' normals, weighted by area and angle:
-    the area keeps flat sides flat beside narrow bevels, the angle makes the mean free of how a flat side is cut into
-    triangles.
+    Corners of a vertex that smooth edges connect share the mean of their faces' normals, weighted by area and angle.
+    The area keeps flat sides flat beside narrow bevels.  The angle makes the mean independent of how a flat side is cut
+    into triangles.
     """
     p = vertices[faces].astype(np.float64)
     edge = np.roll(p, -1, 1) - p
@@ -186,9 +185,9 @@ def _pose(a: Assembly) -> None:
 def sample_cameras(rng: np.random.Generator, n: int) -> tuple[np.ndarray, np.ndarray]:
     """Camera-to-world matrices ``(n, 4, 4)`` (OpenGL) and full fields of view ``(n,)`` in radians, float32.
 
-    The rendering protocol of the paper: field of view normal about 29.5 degrees (deviation 3.5), clipped to 22 to
-    37; distance 0.87 / sin(fov / 2) times 0.8 to 1.05, so that the object fills the frame.  Azimuths are spread
-    evenly with jitter and come in random order: the first k views are random but apart.  One set in six covers only
+    The rendering protocol of the paper.  Field of view: normal about 29.5 degrees (deviation 3.5), clipped to 22 to
+    37.  Distance: 0.87 / sin(fov / 2) times 0.8 to 1.05, so that the object fills the frame.  Azimuths are spread
+    evenly with jitter and come in random order, so the first k views are random but apart.  One set in six covers only
     an arc.
     """
     if n < 1:
