@@ -177,6 +177,22 @@ def test_the_view_that_sees_a_point_speaks(model):
     torch.testing.assert_close(logit, gain * torch.tensor([[white], [black]]).expand(2, 3), rtol=0, atol=0.01)
 
 
+def test_the_fused_pass_is_the_one_that_trains(model):
+    """The kernel of inference against torch's operations, which have the gradient."""
+    position, normal = surface_of_ball(3000)
+    field = encoded(model, *sphere(5))
+    visible = (torch.rand(3000, 5, generator=torch.Generator().manual_seed(2)) > 0.5).float()
+    want = field.fused(position, normal, visible)
+    with torch.no_grad():
+        got = field.fused(position, normal, visible)
+    # sums of five float32 terms in another order; logits of up to 4, and exp of the confidence
+    torch.testing.assert_close(got.logit, want.logit.detach(), rtol=0, atol=2e-5)
+    torch.testing.assert_close(got.normal, want.normal.detach(), rtol=0, atol=2e-5)
+    torch.testing.assert_close(got.numbers[:, :9], want.numbers[:, :9].detach(), rtol=0, atol=5e-5)
+    # the root of a difference of squares: 1e-3 where the views agree
+    torch.testing.assert_close(got.numbers[:, 9], want.numbers[:, 9].detach(), rtol=1e-3, atol=1e-3)
+
+
 def test_the_volume_is_read_where_it_was_written():
     volume = FeatureVolume(VolumeSizes(12, 0.56, (8, 16), 8), 8)
     axis = torch.linspace(-0.56, 0.56, 12)

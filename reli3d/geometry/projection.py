@@ -7,7 +7,7 @@ from torch import Tensor
 
 from reli3d._bridge import call, check, launch
 from reli3d.kernels.projection import gather_views_kernel
-from reli3d.kernels.view_features import pool_views_kernel, vec8, view_summary_kernel
+from reli3d.kernels.view_features import fuse_views_kernel, pool_views_kernel, vec8, view_summary_kernel
 
 BLOCK = 8  # floats of a kernels.vec8
 OWN = 9  # numbers that a view says of a point, and as many that sum up all views
@@ -80,6 +80,31 @@ def pool_views(
     outs = [(pooled.unflatten(-1, (-1, BLOCK)), vec8), (out, wp.float32)]
     launch(pool_views_kernel, n, [inputs[0], *layer, *inputs[1:], *outs], points.device)
     return pooled, out
+
+
+def fuse_views(
+    images: Tensor, pixels: Tensor, c2w: Tensor, intrinsics: Tensor, points: Tensor, visible: Tensor, normal: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """What the views predict of surface ``points (N, 3)``; the view that sees a point best speaks loudest.
+
+    Gives the colour's logit ``(N, 3)``, numbers ``(N, 10)`` and the unit normal ``(N, 3)``.
+
+    pixels: ``(3, V, P, P, 4)``: gain and three shifts of the colour's logit; confidence, roughness, metallic, 0;
+    normal, 0.  A view's colour is ``gain * logit(colour seen) + shift``, its weight the square of its share in
+    :func:`summarize_views` times exp(confidence).  The numbers: roughness, metallic, gain, normal less ``normal``,
+    their cosine, greatest share, confidence, spread of the logit.  The rest of the arguments as in
+    :func:`summarize_views`.  No gradient: :class:`reli3d.nn.local.LocalField` has the same in torch with one.
+    """
+    check("pixels", pixels, last=4, like=images)
+    if pixels.ndim != 5 or pixels.shape[:2] != (3, len(images)) or min(pixels.shape[2:4]) < 2:
+        raise ValueError(f"pixels: expected (3, {len(images)}, P, P, 4), P at least 2, got {tuple(pixels.shape)}")
+    n, _, inputs = _summary(images, c2w, intrinsics, points, visible, normal)
+    image, pose, camera, place, _, around, who = inputs
+    maps = [(part, wp.vec4) for part in pixels.detach().contiguous()]
+    logit, numbers, shading = points.new_empty(n, 3), points.new_empty(n, 10), points.new_empty(n, 3)
+    outs = [(logit, wp.vec3), (numbers, wp.float32), (shading, wp.vec3)]
+    launch(fuse_views_kernel, n, [image, *maps, pose, camera, place, around, who, *outs], points.device)
+    return logit, numbers, shading
 
 
 def _summary(images, c2w, intrinsics, points, visible, normal) -> tuple[int, Tensor, list]:

@@ -188,3 +188,79 @@ def pool_views_kernel(
     for b in range(blocks):
         pooled[n, b] = pooled[n, b] / total
     write_summary(summary, n, color, spread / total, least, greatest, p)
+
+
+LOGIT_MARGIN = wp.constant(0.02)  # as nn.heads.COLOR_MARGIN: the logit of black and of white stays within reach
+
+
+@wp.func
+def color_logit(color: wp.vec4) -> wp.vec3:
+    """Logit of the first three numbers, kept within reach."""
+    value = wp.vec3()
+    for k in range(3):
+        x = wp.clamp(color[k], LOGIT_MARGIN, 1.0 - LOGIT_MARGIN)
+        value[k] = wp.log(x / (1.0 - x))
+    return value
+
+
+@wp.kernel
+def fuse_views_kernel(
+    start: int,
+    # in
+    image: wp.array3d[wp.vec4],  # (V, S, S) sRGB and silhouette distance in pixels
+    paint: wp.array3d[wp.vec4],  # (V, P, P) gain and shift of the colour's logit
+    surface: wp.array3d[wp.vec4],  # (V, P, P) confidence, roughness, metallic; 0
+    bent: wp.array3d[wp.vec4],  # (V, P, P) normal; 0
+    c2w: wp.array[wp.mat44],  # (V,)
+    intrinsics: wp.array[wp.vec4],  # (V,)
+    points: wp.array[wp.vec3],  # (N,)
+    normal: wp.array[wp.vec3],  # (N,)
+    visible: wp.array2d[float],  # (N, V)
+    # out
+    logit: wp.array[wp.vec3],  # (N,)
+    numbers: wp.array2d[float],  # (N, 10): roughness, metallic, gain, bend, facing, greatest share, confidence, spread
+    shading: wp.array[wp.vec3],  # (N,) unit
+):
+    """Means over the views of what they predict, weighted by the square of their share times exp(confidence)."""
+    n = start + wp.tid()
+    p = points[n]
+    scale = float(paint.shape[1]) / float(image.shape[1])
+    total = wp.float32(0.0)
+    greatest = wp.float32(0.0)
+    mean = wp.vec3()
+    spread = wp.float32(0.0)
+    gain = wp.float32(0.0)
+    told = wp.vec4()
+    direction = wp.vec4()
+    for v in range(image.shape[0]):
+        pose = c2w[v]
+        q = project_point(p, pose, intrinsics[v])
+        seen, share = view_numbers(image, v, p, q, pose, 1, visible[n, v], normal[n])
+        greatest = wp.max(greatest, share)
+        x = q[0] * scale
+        y = q[1] * scale
+        change = look_up(paint, v, x, y)
+        own = look_up(surface, v, x, y)
+        weight = share * share * wp.exp(own[0])
+        color = color_logit(wp.vec4(seen[0], seen[1], seen[2], 0.0)) * change[0]
+        color += wp.vec3(change[1], change[2], change[3])
+        total += weight
+        away = color - mean
+        mean += away * (weight / total)  # Welford's update, as in pool_views_kernel
+        spread += weight * wp.dot(away, color - mean)
+        gain += weight * change[0]
+        told += own * weight
+        direction += look_up(bent, v, x, y) * weight
+    unit = wp.vec3(direction[0], direction[1], direction[2]) / total + 1.0e-3 * normal[n]
+    unit = unit / wp.max(wp.length(unit), 1.0e-12)
+    logit[n] = mean
+    shading[n] = unit
+    numbers[n, 0] = told[1] / total
+    numbers[n, 1] = told[2] / total
+    numbers[n, 2] = gain / total
+    for k in range(3):
+        numbers[n, 3 + k] = unit[k] - normal[n][k]
+    numbers[n, 6] = wp.dot(unit, normal[n])
+    numbers[n, 7] = greatest
+    numbers[n, 8] = told[0] / total
+    numbers[n, 9] = wp.sqrt(wp.max(spread / total, 1.0e-6))

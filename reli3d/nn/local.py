@@ -9,12 +9,13 @@ the views and to the object, so what is learned in one place holds everywhere.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from reli3d.geometry.projection import gather_views, summarize_views
+from reli3d.geometry.projection import fuse_views, gather_views, summarize_views
 from reli3d.nn.blocks import in_rows
 from reli3d.nn.field import LIGHT_ROWS, PointMaterial, bound_level
 from reli3d.nn.heads import ROUGHNESS_MIN, color_logit, mlp
@@ -58,7 +59,14 @@ class PixelMaps:
         return PixelMaps((gain + 2.0).sigmoid(), shift, confidence, rough, metal - 2.0, world, depth[..., :1] - 0.2)
 
     def stacked(self) -> Tensor:
+        """``(V, P, P, 10)``, all but the depth."""
         return torch.cat([self.gain, self.shift, self.confidence, self.roughness, self.metallic, self.normal], -1)
+
+    @cached_property
+    def packed(self) -> Tensor:
+        """The same as :func:`~reli3d.geometry.projection.fuse_views` reads it, without gradient."""
+        parts = self.stacked().detach().split([4, 3, 3], -1)
+        return torch.stack([functional.pad(part, (0, 4 - part.shape[-1])) for part in parts])
 
     def base_logit(self, color: Tensor) -> Tensor:
         """Logit of the base colour of pixels of ``color (V, P, P, 3)`` sRGB."""
@@ -97,6 +105,11 @@ class LocalReconstructor(nn.Module):
     @property
     def device(self) -> torch.device:
         return self.level[0].weight.device
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """In which it computes: float32."""
+        return self.level[0].weight.dtype
 
     def encode(self, images: Tensor, masks: Tensor, c2w: Tensor, intrinsics: Tensor, detail: Tensor,
                detail_intrinsics: Tensor) -> LocalField:  # fmt: skip
@@ -184,7 +197,11 @@ class LocalField:
 
     def fused(self, position: Tensor, normal: Tensor, visible: Tensor) -> Fused:
         """The views' predictions at surface points: ``position``, ``normal`` ``(N, 3)``, ``visible (N, V)``."""
-        maps, pixels = self.maps, self.pixels.stacked()
+        maps = self.maps
+        if not torch.is_grad_enabled():
+            return Fused(*fuse_views(maps.images, self.pixels.packed, maps.c2w, maps.intrinsics, position, visible,
+                                     normal))  # fmt: skip
+        pixels = self.pixels.stacked()
         scale = pixels.shape[1] / maps.images.shape[1]
         got, _ = gather_views(pixels, position, maps.c2w, maps.intrinsics * scale)
         own, share, summary = summarize_views(maps.images, maps.c2w, maps.intrinsics, position, visible, normal)

@@ -231,6 +231,8 @@ def load(
         found = sha256(path)
         if found != expected_sha256:
             raise WeightsError(path, f"expected SHA-256 {expected_sha256}, got {found}; fetch it again")
+    if isinstance(preset, LocalPreset) and trunk not in (None, torch.float32):
+        raise WeightsError(path, f"expected float32 for the network of convolutions, got {trunk}")
     with torch.device("meta"):
         model = network(preset)
         if isinstance(model, Reconstructor):
