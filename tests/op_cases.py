@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from reli3d.geometry import projection
+from reli3d.geometry.grid import sample_grid
 from reli3d.geometry.hits import evaluate_hits, hit_normals, interpolate
 from reli3d.geometry.mesh import Mesh, vertex_normals
 from reli3d.geometry.rays import Hits, RayScene
@@ -307,6 +308,9 @@ CASES = {
         lambda n: {"maps": uniform(3, 24, 20, 5, seed=1), "points": uniform(n, 3, low=-0.8, high=0.8)},
         lambda maps, points: projection.gather_views(maps, points, *rig(points.device)), ("maps", "points"),
         ("points",)),
+    "sample_grid": Case(
+        lambda n: {"grid": uniform(6, 5, 7, 4, seed=1), "points": uniform(n, 3, low=-1.2, high=1.2)},
+        lambda grid, points: (sample_grid(grid, points),), ("grid", "points"), ("points",)),
     "project": Case(
         lambda n: {"points": uniform(n, 3, low=-0.8, high=0.8)},
         lambda points: project(points, *(v[0] for v in rig(points.device))), ("points",), ("points",),

@@ -88,7 +88,9 @@ def seen_from(points, normal):
     own, share, total = projection.summarize_views(images, c2w, intrinsics, points, visible.float(), normal)
     tokens, mix = uniform(3, 4, 4, 8, seed=4).to(points), uniform(9, 8, seed=5).to(points)
     pooled, _ = projection.pool_views(images, tokens, mix, c2w, intrinsics, points, visible.float(), normal)
-    return visible, own, share, total, pooled
+    pixels = uniform(3, 3, 8, 8, 4, seed=6).to(points)
+    fused = projection.fuse_views(images, pixels, c2w, intrinsics, points, visible.float(), normal)
+    return visible, own, share, total, pooled, *fused
 
 
 def hulls(masks, points):
