@@ -60,7 +60,8 @@ def initialise() -> None:
 def _start() -> None:
     wp.config.log_level = wp.LOG_WARNING
     try:
-        wp.init()
+        with _no_driver_warning():
+            wp.init()
         writable = os.access(wp.config.kernel_cache_dir, os.W_OK)
     except OSError:
         writable = False
@@ -69,6 +70,31 @@ def _start() -> None:
         print(f"reli3d: kernel cache {wp.config.kernel_cache_dir} cannot be written; using {fallback}", file=sys.stderr)
         wp.config.kernel_cache_dir = fallback
         wp.init()
+
+
+@contextlib.contextmanager
+def _no_driver_warning():
+    """Keeps a line of Warp's native code from the terminal: that there is no NVIDIA driver.
+
+    Without one that is no news (``reli3d doctor`` says it), and it is written past Python to file descriptor 2.  What
+    else is written there meanwhile is passed on.
+    """
+    try:
+        terminal = os.dup(2)
+    except OSError:  # a process without that stream
+        yield
+        return
+    with tempfile.TemporaryFile() as caught:
+        os.dup2(caught.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(terminal, 2)
+            os.close(terminal)
+            caught.seek(0)
+            rest = b"".join(line for line in caught if b"Could not find or load the NVIDIA CUDA driver" not in line)
+            if rest:
+                os.write(2, rest)
 
 
 def _private_folder() -> str:

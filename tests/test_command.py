@@ -65,3 +65,11 @@ def test_view_refuses_in_one_line(tmp_path, monkeypatch, capsys, arguments):
     said = capsys.readouterr()
     assert said.out == "" and said.err.startswith("reli3d view: ") and said.err.count("\n") == 1
     assert "expected" in said.err
+
+
+def test_help_tells_defaults(capsys):
+    for name in ("infer", "render", "data", "eval"):
+        with pytest.raises(SystemExit):
+            main.main([name, "--help"])
+        text = " ".join(capsys.readouterr().out.split())
+        assert "default" in text and "(default None)" not in text and "(default False)" not in text

@@ -9,10 +9,14 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 from pathlib import Path
 
+from reli3d.cli.helping import Defaults
+
 
 def parser() -> argparse.ArgumentParser:
     p = argparse.ArgumentParser(
-        prog="reli3d-data", description="Make training samples of procedural objects, or of textured meshes."
+        formatter_class=Defaults,
+        prog="reli3d-data",
+        description="Make training samples of procedural objects, or of textured meshes.",
     )
     p.add_argument("output", type=Path, help="folder for NNNNNNNNNN.safetensors; those that exist are kept")
     p.add_argument("--maps", type=Path, required=True, help=".npz of environment maps: env (n, H, 2H, 3) linear, names")

@@ -53,8 +53,14 @@ def _versions() -> Iterator[tuple[str, str]]:
 
 def _devices() -> Iterator[tuple[str, str]]:
     import torch
+    import warp as wp
 
+    from reli3d import _bridge
+
+    _bridge.initialise()
     yield "cpu", f"{os.cpu_count()} cores, {torch.get_num_threads()} threads of torch"
+    if not wp.is_cuda_available():
+        yield "driver", "no NVIDIA driver with a device found: all runs on the CPU, which is no error"
     if torch.version.cuda is None:
         yield "cuda", "none: this torch is built without CUDA"
     elif not torch.cuda.is_available():

@@ -10,6 +10,8 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+from reli3d.cli.helping import Defaults
+
 STARTED = time.monotonic()
 EXAMPLE = Path(__file__).parents[1] / "assets" / "example"
 KERNELS = ("hull", "cover", "view_features", "triplane", "flexicubes", "uv", "raster", "intersect", "attributes",
@@ -19,6 +21,7 @@ SHADER = {"cpu": ("shade_rays", "embree"), "cuda": ("shade",)}  # and the shader
 
 def parser() -> argparse.ArgumentParser:
     p = argparse.ArgumentParser(
+        formatter_class=Defaults,
         prog="reli3d-infer",
         description="Turn a few posed photographs of an object into a relightable GLB and an HDR environment.",
         epilog="Exit code: 0 all done, 1 some objects failed, 2 wrong input.  Results go to stdout.",
@@ -58,7 +61,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--up", choices=("x", "y", "z", "-x", "-y", "-z"), default="y", help="axis of that frame to turn to +Y"
     )
-    p.add_argument("--seed", type=int, default=0)
+    p.add_argument("--seed", type=int, default=0, help="of what is drawn by chance")
     p.add_argument("--compatible-names", action="store_true", help="also write illumination.hdr: the published "
                    "release's name and layout, -Z in the centre column")  # fmt: skip
     p.add_argument("--skip-existing", action="store_true", help="leave objects alone whose files are all there")

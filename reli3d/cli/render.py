@@ -8,11 +8,14 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+from reli3d.cli.helping import Defaults
+
 FORMATS = ("png", "exr", "webp")
 
 
 def parser() -> argparse.ArgumentParser:
     p = argparse.ArgumentParser(
+        formatter_class=Defaults,
         prog="reli3d-render",
         description="Render a GLB with direct light and shadows under an HDR environment.",
         epilog="Exit code: 0 done, 2 wrong input.  The files' names go to stdout, progress to stderr.",
@@ -46,7 +49,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--aovs", action="store_true", help="also EXR files of base colour, material (0, roughness, "
                    "metallic), normal (n / 2 + 1 / 2) and depth (depth, depth, alpha)")  # fmt: skip
     p.add_argument("--no-shadows", action="store_true")
-    p.add_argument("--seed", type=int, default=0)
+    p.add_argument("--seed", type=int, default=0, help="of what is drawn by chance")
     p.add_argument("--device", default="cpu", help="cpu or cuda")
     return p
 

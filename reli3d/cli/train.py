@@ -6,11 +6,14 @@ import argparse
 import sys
 from pathlib import Path
 
+from reli3d.cli.helping import Defaults
+
 LICENCE = "Apache-2.0; trained by the reli3d authors, see docs/weights.md for the data"
 
 
 def parser() -> argparse.ArgumentParser:
     p = argparse.ArgumentParser(
+        formatter_class=Defaults,
         prog="reli3d-train",
         description="Train the small network; continues where it stopped.  Under torchrun the processes share "
         "each batch.",

@@ -10,11 +10,14 @@ import webbrowser
 from pathlib import Path
 from urllib.parse import quote
 
+from reli3d.cli.helping import Defaults
+
 PAGE = "viewer.html"
 
 
 def parser() -> argparse.ArgumentParser:
     p = argparse.ArgumentParser(
+        formatter_class=Defaults,
         prog="reli3d view",
         description="Show a reconstruction in the browser: orbit, relight, its maps, the photographs over it.",
         epilog="The page also opens by itself, as a file.  Its address goes to stdout; Ctrl-C ends.",
