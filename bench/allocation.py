@@ -5,7 +5,7 @@ with 64 samples a pixel by the plan's counts, by the published counts (visible n
 alone, and prints variance times time: CPU time of one thread, least of three images in turn; the plan's own is added to
 the plan's.  Variance is of 256 runs at 256 pixels, half of them drawn evenly and half where the image is bright, each
 counted for as many as it stands for; its 95 % interval is of a bootstrap over the runs.  Where a strategy's runs have
-missed the sun, a pixel has what the sun alone makes by quadrature, as in ``tests/test_allocation.py``.
+missed the sun, a pixel has what the sun alone makes by quadrature.
 
 ``python -m bench.allocation MESH.glb LIGHT.hdr``: variance of an image of 256 x 256 by both kinds of plan over that by
 the published counts, of the radiance and of the picture (sRGB, mean brightness at 0.18).
@@ -28,6 +28,7 @@ from reli3d.render.asset import Asset
 from reli3d.render.camera import Camera, camera_rays, look_at
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
+from reli3d.render.material import eval_bsdf, pdf_lobes
 from reli3d.render.points import SurfacePoints
 from reli3d.render.render import joined_scene, plan_render, render
 from reli3d.render.shading import ShadeOptions, shade
@@ -123,8 +124,6 @@ def measured(surface, environment, scene) -> str:
 
 def variances(surface, environment, scene, choices) -> dict[tuple[int, int, int], torch.Tensor]:
     """Variance of a pixel, mean over the image, and as 400 bootstraps over the runs see it: ``(401,)`` float64."""
-    from tests.test_allocation import runs_of, sun_part
-
     rows, share = _pilot_points(list(surface), environment, scene, ShadeOptions(seed=1))
     some, found = [v[rows] for v in surface], {}
     hidden = sun_part(some, environment) if bool(environment.radiance.max() > 10.0) else torch.zeros(len(rows), 3)
@@ -132,7 +131,7 @@ def variances(surface, environment, scene, choices) -> dict[tuple[int, int, int]
     weight = torch.zeros(400, RUNS, dtype=torch.float64).scatter_add_(1, picks, torch.ones(400, RUNS).double())
     weight = torch.cat([torch.ones(1, RUNS).double(), weight]) / RUNS
     for counts in choices:
-        runs = runs_of(some, environment, counts, runs=RUNS, scene=scene, antithetic=pairing(counts))
+        runs = independent(some, environment, scene, ShadeOptions(counts, antithetic=pairing(counts)))
         runs = (runs - runs.mean(0)).flatten(1)
         each = (weight @ runs.square() - (weight @ runs).square()).unflatten(1, (-1, 3)).sum(2) * (RUNS / (RUNS - 1))
         if counts in SINGLE:
@@ -140,6 +139,39 @@ def variances(surface, environment, scene, choices) -> dict[tuple[int, int, int]
             each = torch.where(each[0] < 0.01 * unseen, unseen, each)
         found[counts] = each @ share
     return found
+
+
+def independent(surface, environment, scene, options) -> torch.Tensor:
+    """Independent values ``(RUNS, N, 3)`` of ``shade``, float64."""
+    repeated = [v.repeat(RUNS, *[1] * (v.ndim - 1)) for v in surface]
+    return shade(*shaded(repeated), environment, scene=scene, options=options).double().reshape(RUNS, -1, 3)
+
+
+def sun_part(surface, environment, height=512) -> torch.Tensor:
+    """Variance ``(N, 3)`` that the sun adds to each point by each of :data:`SINGLE`, summed over the channels.
+
+    By midpoints in cos theta and phi over what is brighter than 10: (int f^2 / p - (int f)^2) / 64.
+    """
+    _, _, normal, wo, base, roughness, metallic = surface
+    y = (torch.arange(height, dtype=torch.float64) + 0.5) / height * 2 - 1
+    phi = (torch.arange(2 * height, dtype=torch.float64) + 0.5) / height * torch.pi
+    y, phi = torch.meshgrid(y, phi, indexing="ij")
+    s = (1 - y * y).sqrt()
+    d = torch.stack([s * phi.cos(), y, s * phi.sin()], -1).reshape(-1, 3).to(normal)
+    angle = 4 * torch.pi / len(d)
+    radiance = environment.lookup(d)
+    d, radiance = (v[radiance.amax(1) > 10.0] for v in (d, radiance))
+    table, rows = environment.pdf(d).double(), []
+    for k in range(len(normal)):
+        helper = torch.eye(3).to(normal)[normal[k].abs().argmin()]
+        t = torch.nn.functional.normalize(torch.linalg.cross(helper, normal[k]), dim=-1)
+        frame = torch.stack([t, torch.linalg.cross(normal[k], t), normal[k]])
+        wi, o, alpha = d @ frame.T, frame @ wo[k], roughness[k] ** 2
+        f = (eval_bsdf(o, wi, base[k], alpha, metallic[k]) * wi[:, 2:].clamp(min=0.0) * radiance).double()
+        visible, _, cosine = pdf_lobes(o, wi, alpha).double().unbind(-1)
+        p = torch.stack([table, visible, cosine], 1).clamp(min=1e-30)  # where a density is 0, so is f
+        rows.append((angle * (f.square().sum(1, keepdim=True) / p).sum(0) - (angle * f.sum(0)).square().sum()) / 64)
+    return torch.stack(rows)
 
 
 def pairing(counts: tuple[int, int, int]) -> str:

@@ -20,6 +20,7 @@ import numpy as np
 import torch
 import trimesh
 
+from bench.mitsuba_material import material
 from bench.timing import time_steps
 from reli3d.geometry.rays import RayScene
 from reli3d.render.camera import Camera, camera_rays, look_at
@@ -158,9 +159,7 @@ PEERS = {"direct": mitsuba_direct, "direct_grad": mitsuba_direct}
 
 def _own_formula(roughness, mi, base):
     """Our material as a Mitsuba one: variances are compared of one integrand."""
-    from tests import mitsuba_scene
-
-    return mitsuba_scene.material(mi, base, roughness**2, 0.0)
+    return material(mi, base, roughness**2, 0.0)
 
 
 def _noise(runs) -> float:

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from reli3d import _bridge
+from tests.support.checkout import SHARED
 
 DEVICES = ["cpu"] + (["cuda"] if torch.cuda.is_available() else [])
-SHARED = Path(__file__).parents[2] / "shared"
 
 
 @pytest.fixture(params=DEVICES)

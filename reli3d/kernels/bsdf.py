@@ -56,8 +56,8 @@ def coat_cosine(cos: float, alpha: float) -> float:
     """Cosine at which Schlick's formula gives what the coat as a whole reflects, or more, from a direction of ``cos``.
 
     The rougher, the less of its rise at grazing angles.  With this decay paint and coat together stay below 1 for every
-    width, colour and metallic (tests/test_energy.py) and above 0.75 for white; with none at all (alpha 0 here) rough
-    white paint would fall to 0.1 at the horizon.
+    width, colour and metallic (tests/render/test_energy.py) and above 0.75 for white; with none at all (alpha 0 here)
+    rough white paint would fall to 0.1 at the horizon.
     """
     return 1.0 - (1.0 - cos) / (1.0 + alpha)
 

@@ -1,0 +1,384 @@
+"""The crossing between torch and Warp: slices, gradients, ownership of buffers, checks."""
+
+import os
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+import torch
+import warp as wp
+
+from reli3d import _bridge
+from tests.support.checkout import ROOT
+
+wp.set_module_options({"enable_backward": True, "cpu_compiler_flags": ""})
+
+SIZES = [1, 7, _bridge.SLICE_MIN * _bridge.SLICES + 5]  # one thread, one slice, all slices with a remainder
+
+
+@wp.kernel
+def gather_scale_kernel(
+    start: int,
+    # in
+    table: wp.array[wp.vec3], index: wp.array[int], weight: wp.array[float], factor: float,
+    # out
+    value: wp.array[wp.vec3], parity: wp.array[int],
+):  # fmt: skip
+    i = start + wp.tid()
+    value[i] = factor * weight[i] * table[index[i]]
+    parity[i] = index[i] % 2
+
+
+@wp.kernel
+def square_kernel(
+    start: int,
+    # in
+    x: wp.array[float],
+    # out
+    y: wp.array[float],
+):
+    i = start + wp.tid()
+    y[i] = x[i] * x[i]
+
+
+@wp.kernel
+def count_kernel(
+    start: int,
+    # out
+    visits: wp.array[int],
+):
+    i = start + wp.tid()
+    visits[i] = visits[i] + i
+
+
+def gather_scale(table, index, weight, factor):
+    n = len(index)
+    outs = [((n,), wp.vec3), ((n,), wp.int32)]
+    ins = [(table, wp.vec3), (index, wp.int32), (weight, wp.float32), factor]
+    return _bridge.call(gather_scale_kernel, n, ins, outs, device=table.device, shared=(0,))
+
+
+def square(x):
+    return _bridge.call(square_kernel, len(x), [(x, wp.float32)], [((len(x),), wp.float32)], device=x.device)[0]
+
+
+def operands(n, device, rows=11):
+    rng = torch.Generator().manual_seed(n)
+    table = torch.randn(rows, 3, generator=rng).to(device).requires_grad_()
+    index = torch.randint(rows, (n,), generator=rng, dtype=torch.int32).to(device)
+    weight = torch.randn(n, generator=rng).to(device).requires_grad_()
+    g = torch.randn(n, 3, generator=rng).to(device)
+    return table, index, weight, g
+
+
+@pytest.mark.parametrize("n", [1, 2, 1023, 1024, 2047, 2048, 16384, 16385, 1_000_003])
+def test_slices_cover_the_range_once_in_order(n):
+    parts = _bridge.slices(n)
+    assert parts[0][0] == 0 and parts[-1][0] + parts[-1][1] == n and len(parts) <= _bridge.SLICES
+    assert all(a + c == b for (a, c), (b, _) in zip(parts[:-1], parts[1:], strict=True))
+    assert max(c for _, c in parts) - min(c for _, c in parts) <= 1
+
+
+def test_slices_depend_on_the_size_alone(threads):
+    counts = []
+    for n in (1, 2, 5):
+        threads(n)
+        counts.append(_bridge.slices(1 << 20))
+    assert counts[0] == counts[1] == counts[2]
+
+
+@pytest.mark.parametrize("n, slice_min, parts", [(5, 1, 5), (64, 1, 16), (64, 8, 8), (7, 8, 1), (1 << 20, 8, 16)])
+def test_few_heavy_threads_are_cut_by_their_own_minimum(device, threads, n, slice_min, parts):
+    assert len(_bridge.slices(n, slice_min)) == parts
+    threads(2)
+    seen = _bridge.over_slices(n, lambda k, start, count: (start, count), slice_min=slice_min)
+    assert seen == _bridge.slices(n, slice_min)
+    visits = torch.ones(n, dtype=torch.int32, device=device)
+    _bridge.launch(count_kernel, n, [(visits, wp.int32)], device, slice_min=slice_min)
+    assert torch.equal(visits, 1 + torch.arange(n, dtype=torch.int32, device=device))
+
+
+def test_gradients_follow_the_minimum_of_their_launch(device):
+    table, index, weight, g = operands(50, device)
+    ins = [(table, wp.vec3), (index, wp.int32), (weight, wp.float32), 1.7]
+    results = []
+    for slice_min in (_bridge.SLICE_MIN, 3):  # one slice, sixteen
+        value, _ = _bridge.call(gather_scale_kernel, 50, ins, [((50,), wp.vec3), ((50,), wp.int32)], device=device,
+                                shared=(0,), slice_min=slice_min)  # fmt: skip
+        results.append(torch.autograd.grad(value, (table, weight), g))
+    torch.testing.assert_close(*results, rtol=0, atol=1e-5)  # sums of five float32 terms in another order
+
+
+@pytest.mark.parametrize("n", SIZES)
+def test_launch_visits_every_index_once(device, n):
+    visits = torch.ones(n, dtype=torch.int32, device=device)
+    _bridge.launch(count_kernel, n, [(visits, wp.int32)], device)
+    assert torch.equal(visits, 1 + torch.arange(n, dtype=torch.int32, device=device))
+
+
+@pytest.mark.parametrize("n", SIZES)
+def test_values_and_gradients_match_torch_in_float64(device, n):
+    table, index, weight, g = operands(n, device)
+    value, parity = gather_scale(table, index, weight, 1.7)
+    got = torch.autograd.grad(value, (table, weight), g)
+    table64, weight64 = table.detach().double().requires_grad_(), weight.detach().double().requires_grad_()
+    value64 = 1.7 * weight64[:, None] * table64[index.long()]
+    ref = torch.autograd.grad(value64, (table64, weight64), g.double())
+    torch.testing.assert_close(value.double(), value64, rtol=3e-7, atol=0)  # two float32 roundings
+    assert torch.equal(parity, index % 2) and not parity.requires_grad
+    # A table row sums n / 11 float32 terms of size 1, slice by slice: rounding stays below 2e-6 of their norm.
+    torch.testing.assert_close(got[0].double(), ref[0], rtol=1e-5, atol=2e-6 * n**0.5)
+    torch.testing.assert_close(got[1].double(), ref[1], rtol=1e-5, atol=1e-5)  # three products of size 1 may cancel
+
+
+def test_gradients_are_the_same_bits_for_any_number_of_threads(threads):
+    n = SIZES[-1]
+    results = []
+    for count in (1, 2, 5):
+        threads(count)
+        table, index, weight, g = operands(n, torch.device("cpu"))
+        value, _ = gather_scale(table, index, weight, 1.7)
+        results.append((value.detach(), *torch.autograd.grad(value, (table, weight), g)))
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+
+def test_every_slice_adds_into_its_own_buffer(monkeypatch, threads):
+    """Two threads that add into one buffer lose additions, seldom enough that a comparison of sums would miss it."""
+    threads(2)
+    buffers, launch = [], wp.launch
+
+    def spy(*args, **options):
+        if options.get("adjoint"):
+            buffers.append(options["adj_inputs"][1].grad or options["adj_inputs"][1].data)
+        return launch(*args, **options)
+
+    table, index, weight, g = operands(SIZES[-1], torch.device("cpu"))
+    value, _ = gather_scale(table, index, weight, 1.0)
+    monkeypatch.setattr(wp, "launch", spy)
+    torch.autograd.grad(value, table, g)
+    assert len(set(buffers)) == len(buffers) == _bridge.SLICES
+
+
+def test_empty_launch_gives_empty_results_and_zero_gradients(device):
+    table, index, weight, g = operands(0, device)
+    value, parity = gather_scale(table, index, weight, 1.0)
+    assert value.shape == (0, 3) and parity.shape == (0,)
+    g_table, g_weight = torch.autograd.grad(value, (table, weight), g)
+    assert torch.equal(g_table, torch.zeros_like(table)) and g_weight.shape == (0,)
+
+
+def test_only_the_wanted_gradient_is_made(device):
+    table, index, weight, g = operands(64, device)
+    value, _ = gather_scale(table.detach(), index, weight, 1.0)
+    value.backward(g)
+    assert weight.grad is not None and table.grad is None
+
+
+def test_strided_inputs_and_gradients_are_understood(device):
+    x = torch.randn(40, 2, generator=torch.Generator().manual_seed(0)).to(device).requires_grad_()
+    y = square(x[:, 1])
+    (g,) = torch.autograd.grad(y, x, torch.tensor([2.0], device=device).expand(40))
+    assert torch.equal(y, x[:, 1] ** 2)
+    assert torch.equal(g[:, 1], 4 * x.detach()[:, 1]) and torch.equal(g[:, 0], torch.zeros_like(g[:, 0]))
+
+
+def test_incoming_gradient_is_left_as_it_was(device):
+    """Warp may clear the adjoint of an array it wrote to; torch hands the same buffer to other consumers."""
+    x = torch.full((8,), 3.0, device=device, requires_grad=True)
+    z = torch.zeros(8, device=device, requires_grad=True)
+    w = torch.arange(1.0, 9.0, device=device)
+    ((square(x) + z) * w).sum().backward()
+    assert torch.equal(z.grad, w) and torch.equal(x.grad, 6 * w)
+
+
+def test_in_place_edit_of_a_saved_input_is_caught(device):
+    x = torch.ones(4, device=device, requires_grad=True)
+    held = x * 1.0
+    y = square(held)
+    held.mul_(2.0)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        y.sum().backward()
+
+
+def test_second_derivative_is_refused_not_zero(device):
+    x = torch.ones(4, device=device, requires_grad=True)
+    (g,) = torch.autograd.grad(square(x).square().sum(), x, create_graph=True)
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        g.sum().backward()
+    for strided in (False, True):  # torch's own decorator lets a loss pass that is linear in the result
+        x = torch.ones(8, 2, device=device, requires_grad=True)
+        (g,) = torch.autograd.grad(square(x[:, 0] if strided else x.reshape(-1)).sum(), x, create_graph=True)
+        with pytest.raises(RuntimeError, match="once_differentiable"):
+            torch.autograd.grad(g.sum() + x.square().sum(), x)
+
+
+def test_backward_twice_gives_the_same(device):
+    x = torch.randn(2048, generator=torch.Generator().manual_seed(1)).to(device).requires_grad_()
+    y = square(x).sum()
+    first = torch.autograd.grad(y, x, retain_graph=True)[0]
+    assert torch.equal(first, torch.autograd.grad(y, x)[0])
+
+
+def test_an_unused_result_counts_as_zero_gradient(device):
+    table, index, weight, _ = operands(32, device)
+    value, parity = gather_scale(table, index, weight, 1.0)
+    (g,) = torch.autograd.grad(value[:, 0].sum(), weight)
+    assert torch.equal(g, table.detach()[index.long(), 0])
+
+
+def test_error_in_a_slice_reaches_the_caller():
+    def work(k, start, count):
+        raise RuntimeError(f"slice {k}")
+
+    with pytest.raises(RuntimeError, match="slice"):
+        _bridge.over_slices(1 << 16, work)
+
+
+def test_slices_within_slices_come_to_an_end(threads):
+    threads(2)
+    inner = _bridge.over_slices(1 << 16, lambda k, a, c: sum(_bridge.over_slices(1 << 15, lambda k, a, c: c)))
+    assert inner == [1 << 15] * _bridge.SLICES
+
+
+@pytest.mark.parametrize(
+    "value, options, error, message",
+    [
+        ([1.0], {}, TypeError, "x: expected a tensor, got list"),
+        (torch.ones(3, dtype=torch.float64), {}, TypeError, "x: expected torch.float32, got torch.float64"),
+        (torch.ones(3), {"dtype": torch.int32}, TypeError, "x: expected torch.int32, got torch.float32"),
+        (torch.ones(2, 4), {"last": 3}, ValueError, r"x: expected shape \(..., 3\), got \(2, 4\)"),
+        (torch.tensor(1.0), {"last": 3}, ValueError, r"x: expected shape \(..., 3\), got \(\)"),
+        (torch.ones(3), {"like": torch.ones(3, device="meta")}, ValueError, "x: expected device meta, got cpu"),
+    ],
+)
+def test_check_says_what_it_expected(value, options, error, message):
+    with pytest.raises(error, match=message):
+        _bridge.check("x", value, **options)
+
+
+LAUNCH = """
+import sys
+sys.path.insert(0, {root!r})
+import torch
+from tests.bridge import test_bridge
+y = test_bridge.square(torch.full((5000,), 3.0))
+assert y.sum().item() == 45000.0
+"""
+
+
+def run(code, **environment):
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120,
+                          env={**os.environ, **environment}, cwd=ROOT)  # fmt: skip
+
+
+def test_unwritable_kernel_cache_falls_back_and_says_so(tmp_path):
+    (tmp_path / "file").write_text("a file where the folder should be")
+    done = run(LAUNCH.format(root=str(ROOT)), WARP_CACHE_PATH=str(tmp_path / "file"),
+               TMPDIR=str(tmp_path))  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "" and "cannot be written" in done.stderr
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork, as the loaders of torch use it on Linux")
+def test_a_forked_child_can_launch_after_its_parent():
+    code = LAUNCH.format(root=str(ROOT)) + (
+        "import os\n"
+        "x = torch.full((1 << 16,), 2.0)\n"
+        "test_bridge.square(x)\n"  # starts the thread pool of the parent, which a fork does not copy
+        "child = os.fork()\n"
+        "if child == 0:\n"
+        "    import signal; signal.alarm(20)\n"  # a child that waits for threads it does not have is ended
+        "    ok = test_bridge.square(x)[-1].item() == 4\n"  # no reduction: the threads of OpenMP are not copied either
+        "    os._exit(0 if ok else 3)\n"
+        "assert os.waitpid(child, 0)[1] == 0, 'the child failed'\n"
+    )
+    done = run(code)
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_cpu_launch_compiles_its_module_once():
+    square(torch.ones(3))
+    cpu = wp.get_device("cpu").context
+    assert {block for context, block in square_kernel.module.execs if context == cpu} == {_bridge.CPU_BLOCK}
+
+
+def test_modules_load_together_and_are_known_as_compiled(tmp_path, monkeypatch, device):
+    from reli3d.kernels import distance, noise
+
+    _bridge.load_modules([distance, noise], device)
+    assert _bridge.compiled([distance, noise], device)
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+    assert not _bridge.compiled([distance, noise], device)
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_blocks_of_rows_come_in_order_without_gradient_and_with_one_torch_thread(threads, count):
+    threads(count)
+    weight = torch.ones(3, requires_grad=True)
+    seen = _bridge.over_rows(10, 4, lambda a, b: (a, b, torch.get_num_threads(), (weight * 2).requires_grad))
+    assert seen == [(0, 4, 1, False), (4, 8, 1, False), (8, 10, 1, False)]
+    assert torch.get_num_threads() == count and torch.is_grad_enabled()
+    assert _bridge.over_rows(0, 4, lambda a, b: (a, b)) == []
+
+
+def test_bits_of_a_block_of_torch_do_not_depend_on_the_threads(threads):
+    g = torch.Generator().manual_seed(0)
+    x, w = torch.randn(3000, 120, generator=g), torch.randn(120, 64, generator=g)
+    results = []
+    for count in (1, 2, 5):
+        threads(count)
+        parts = _bridge.over_rows(len(x), 700, lambda a, b: torch.nn.functional.silu(x[a:b] @ w))
+        results.append(torch.cat(parts))
+    assert all(torch.equal(results[0], other) for other in results[1:])
+
+
+def test_threads_load_a_kernel_one_after_the_other(threads, monkeypatch):
+    """Slices that launch kernels of their own, as the ray caster's do: Warp would compile a module in each thread."""
+    threads(4)
+    began, beside_the_first = [], []
+    load = wp.Module.load
+
+    def slow_at_first(module, *args, **kwargs):
+        began.append(1)
+        if len(began) == 1:
+            time.sleep(0.1)  # as if it compiled
+            beside_the_first.append(len(began) - 1)
+        return load(module, *args, **kwargs)
+
+    monkeypatch.setattr(wp.Module, "load", slow_at_first)
+    visits = torch.zeros(8 * _bridge.SLICE_MIN, dtype=torch.int32)
+
+    def work(k, start, count):
+        part = visits[start : start + count]
+        _bridge.launch(count_kernel, count, [(part, wp.int32)], part.device, slice_min=count)
+
+    _bridge.over_slices(len(visits), work)
+    assert beside_the_first == [0] and len(began) >= 8
+    assert torch.equal(visits, torch.arange(len(visits), dtype=torch.int32) % _bridge.SLICE_MIN)
+
+
+def test_threads_start_warp_once(monkeypatch):
+    """Warp forgets its modules' hashes while it starts; a thread that already loads one would stumble over that."""
+    started = []
+    monkeypatch.setattr(wp, "init", lambda: (time.sleep(0.05), started.append(1)))
+    _bridge._start.cache_clear()
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(lambda _: (_bridge.initialise(), started.append(0)), range(4)))
+    assert started == [1, 0, 0, 0, 0]
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
+def test_a_missing_driver_is_no_warning_and_other_words_are_passed_on():
+    code = """
+import os, warp as wp
+from reli3d import _bridge
+init = wp.init
+wp.init = lambda: (os.write(2, b"other words\\n"), init())
+_bridge.initialise()
+os.write(2, b"later\\n")
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0 and done.stderr == "other words\nlater\n"

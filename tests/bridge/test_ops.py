@@ -1,0 +1,310 @@
+"""What holds for every public operation, over the table of ``tests/support/op_cases.py``."""
+
+import importlib
+import itertools
+import pkgutil
+
+import pytest
+import torch
+import warp as wp
+
+import reli3d
+from reli3d import kernels
+from tests.support import op_cases, op_cases_plain, reference
+from tests.support.op_cases import Case, N, rng
+
+CASES = {**op_cases.CASES, **op_cases_plain.CASES}
+DIFFERENTIABLE = [name for name, case in CASES.items() if case.grads]
+FEW = 40  # rows where their number does not matter
+STEP = 3e-5  # of a difference of slopes: longer ones cross kinks of the mean absolute deviation
+
+
+def leaves_of(case: Case, device, n: int = FEW, asked=None) -> dict:
+    asked = case.grads if asked is None else asked
+    return {k: v.to(device).requires_grad_(k in asked) for k, v in case.inputs(n).items()}
+
+
+def strided(leaves: dict) -> dict:
+    """The same values, no two of a tensor side by side."""
+    return {k: torch.stack([v.detach(), -v.detach()], -1)[..., 0].requires_grad_(v.requires_grad)
+            for k, v in leaves.items()}  # fmt: skip
+
+
+def loss_of(outs) -> torch.Tensor:
+    """Every differentiable output weighed at random, the same numbers on any device."""
+    total = 0.0
+    for k, out in enumerate(outs):
+        if out.is_floating_point() and out.requires_grad:
+            weight = torch.rand(out.shape, generator=torch.Generator().manual_seed(k)) - 0.3
+            total = total + (out * weight.to(out.device)).sum()
+    return total
+
+
+def gradients(case: Case, leaves: dict, outs, **options) -> dict:
+    names = [k for k in leaves if leaves[k].requires_grad]
+    return dict(zip(names, torch.autograd.grad(loss_of(outs), [leaves[k] for k in names], **options), strict=True))
+
+
+def same(a: torch.Tensor, b: torch.Tensor) -> bool:
+    """Equal bits; on CUDA, whose sums take any order, 1e-4."""
+    return torch.equal(a, b) if a.device.type == "cpu" else reference.share_within(a, b) >= 0.999
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_strides_do_not_matter(device, name):
+    case = CASES[name]
+    plain = leaves_of(case, device)
+    spread = strided(plain)
+    assert all(v.numel() < 2 or not v.is_contiguous() for v in spread.values())
+    outs, others = case.run(**plain), case.run(**spread)
+    assert all(same(a, b) for a, b in zip(outs, others, strict=True))
+    if case.grads:
+        first, second = gradients(case, plain, outs), gradients(case, spread, others)
+        assert all(same(first[k], second[k]) for k in first)
+
+
+@pytest.mark.parametrize("name", [name for name, case in CASES.items() if case.rows])
+def test_an_expanded_row_is_as_good_as_its_copies(device, name):
+    case = CASES[name]
+    rows = {k: v.detach()[:1] if k in case.rows else v.detach() for k, v in leaves_of(case, device).items()}
+    one = {k: v.clone().requires_grad_(k in case.grads) for k, v in rows.items()}
+    wide = {k: v.expand(FEW, *v.shape[1:]) if k in case.rows else v for k, v in one.items()}
+    copies = {k: v.detach().repeat(FEW, *[1] * (v.ndim - 1)) if k in case.rows else v.detach().clone()
+              for k, v in one.items()}  # fmt: skip
+    copies = {k: v.requires_grad_(k in case.grads) for k, v in copies.items()}
+    outs, others = case.run(**wide), case.run(**copies)
+    assert all(same(a, b) for a, b in zip(outs, others, strict=True))
+    if case.grads:
+        first, second = gradients(case, one, outs), gradients(case, copies, others)
+        for k, g in first.items():
+            want = second[k].sum(0, keepdim=True) if k in case.rows else second[k]
+            torch.testing.assert_close(g, want, rtol=1e-4, atol=1e-5 * float(want.abs().max()))  # 40 float32 terms
+
+
+@pytest.mark.parametrize("name", DIFFERENTIABLE)
+def test_one_gradient_alone_is_that_of_all_and_backward_can_be_repeated(device, name):
+    case = CASES[name]
+    every = leaves_of(case, device)
+    outs = case.run(**every)
+    truth = gradients(case, every, outs, retain_graph=True)
+    again = gradients(case, every, outs)
+    assert all(same(truth[k], again[k]) for k in truth)
+    assert all(float(g.abs().max()) > 0.0 for g in truth.values())
+    for k in case.grads:
+        alone = leaves_of(case, device, asked=(k,))
+        loss_of(case.run(**alone)).backward()
+        assert same(alone[k].grad, truth[k]), k
+        assert all(v.grad is None for other, v in alone.items() if other != k)
+    none = case.run(**leaves_of(case, device, asked=()))
+    assert not any(out.requires_grad for out in none)
+
+
+@pytest.mark.parametrize("name", DIFFERENTIABLE)
+def test_an_edit_in_place_is_an_error_or_harmless(device, name):
+    """Never a gradient at values that are no longer those of the forward pass."""
+    case, refused = CASES[name], 0
+    plain = leaves_of(case, device)
+    truth = gradients(case, plain, case.run(**plain))
+    for k in case.grads:
+        leaves = leaves_of(case, device)
+        held = {other: v * 1.0 for other, v in leaves.items()}
+        outs = case.run(**held)
+        with torch.no_grad():
+            held[k].mul_(0.5)
+        try:
+            got = torch.autograd.grad(loss_of(outs), [leaves[other] for other in case.grads])
+        except RuntimeError as error:
+            assert "inplace" in str(error)
+            refused += 1
+            continue
+        for a, other in zip(got, case.grads, strict=True):
+            torch.testing.assert_close(a, truth[other], rtol=1e-5, atol=1e-6 * float(truth[other].abs().max()))
+    # plain torch may keep copies of what it needs
+    assert refused or case.second == case.grads or name == "taubin_smooth"
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_nothing_given_is_written_to_and_nothing_of_it_is_given_back(device, name):
+    """What ``torch.library.opcheck`` asks of a schema: no input and no incoming gradient has other bits or another
+    version afterwards, and no output lies in the memory of an input."""
+    case = CASES[name]
+    given = leaves_of(case, device)
+    before = {k: (v.detach().clone(), v._version) for k, v in given.items()}
+    outs = case.run(**given)
+    owned = {v.untyped_storage().data_ptr() for v in given.values()}
+    # a ray's origin is a view of its pose, which torch keeps count of
+    assert name == "camera_rays" or not any(out.untyped_storage().data_ptr() in owned for out in outs)
+    if case.grads:
+        out = [v for v in outs if v.requires_grad]
+        incoming = {f"gradient {k}": torch.randn(v.shape, generator=rng(k)).to(v) for k, v in enumerate(out)}
+        before |= {k: (v.clone(), v._version) for k, v in incoming.items()}
+        torch.autograd.grad(out, [given[k] for k in case.grads], list(incoming.values()))
+        given |= incoming
+    for k, (bits, version) in before.items():
+        assert torch.equal(given[k], bits) and given[k]._version == version, k
+
+
+def test_no_operator_of_torch_library_is_registered():
+    """The operations are autograd functions: no schema, no fake tensor, nothing that ``opcheck`` could take."""
+    for module in pkgutil.walk_packages(reli3d.__path__, "reli3d."):
+        if not module.name.endswith("__main__"):
+            importlib.import_module(module.name)
+    assert not [name for name in torch._C._dispatch_get_all_op_names() if name.startswith("reli3d")]
+
+
+@pytest.mark.slow  # 20 s of tracing
+@pytest.mark.parametrize("held_out", [True, False])
+def test_a_compiled_function_around_an_operation_gives_the_same_bits(device, held_out):
+    case = CASES["shade"]
+    run = torch.compiler.disable(case.run) if held_out else case.run
+
+    def image(**leaves):
+        return run(**{**leaves, "base_color": leaves["base_color"].square()})[0].square() + 1.0
+
+    results = []
+    for f in (image, torch.compile(image, backend="eager")):
+        leaves = leaves_of(case, device)
+        out = f(**leaves)
+        results.append([out, *torch.autograd.grad(out.sum(), [leaves[k] for k in case.grads])])
+    torch._dynamo.reset()
+    assert all(same(a, b) for a, b in zip(*results, strict=True))
+
+
+@pytest.mark.parametrize("kind", [torch.float64, torch.float16])
+@pytest.mark.parametrize("name", CASES)
+def test_other_floating_point_types_are_named_or_taken(device, name, kind):
+    case = CASES[name]
+    for k, value in leaves_of(case, device, asked=()).items():
+        changed = {**leaves_of(case, device, asked=()), k: value.to(kind)}
+        if k in case.dtypes and (kind == torch.float16 or name != "sample_triplane"):
+            assert all(bool(torch.isfinite(out).all()) for out in case.run(**changed))
+            continue
+        with pytest.raises(TypeError, match=r"^[\w.]+: expected .*got torch.float(64|16|32)"):
+            case.run(**changed)
+
+
+@pytest.mark.parametrize("name", [name for name, case in CASES.items() if case.rows])
+def test_no_rows_are_data(device, name):
+    case = CASES[name]
+    leaves = leaves_of(case, device, 0)
+    outs = case.run(**leaves)
+    assert all(out.isfinite().all() for out in outs if out.is_floating_point())
+    if case.grads:
+        for k, g in gradients(case, leaves, outs).items():
+            assert g.shape == leaves[k].shape and not bool(g.any()), k
+
+
+@pytest.mark.parametrize("of", [torch.clone, torch.square])
+@pytest.mark.parametrize("name", DIFFERENTIABLE)
+def test_second_derivatives_are_right_or_refused(device, name, of):
+    """Of every gradient in every input: those of kernels raise, those of plain torch equal differences of the first.
+    Of a loss that is linear in the results too: then the incoming gradient is a constant."""
+    case, noise = CASES[name], rng(4)
+    moves = {k: torch.randn(v.shape, generator=noise).to(device) for k, v in leaves_of(case, device).items()}
+
+    def slope(leaves, k, **options):
+        """Along a random direction of the input ``k``."""
+        loss = loss_of(tuple(of(out) for out in case.run(**leaves) if out.is_floating_point()))
+        return (torch.autograd.grad(loss, leaves[k], **options)[0] * moves[k]).double()
+
+    def bend(k, other):
+        leaves = strided(leaves_of(case, device))  # a copy of an input is not what the second derivative is asked of
+        along = slope(leaves, k, create_graph=True).sum()
+        return torch.autograd.grad(along, leaves[other], allow_unused=True)[0] if along.requires_grad else None
+
+    for k, other in itertools.product(case.grads, repeat=2):
+        try:
+            got = bend(k, other)
+        except RuntimeError as error:
+            refused = "once_differentiable" in str(error) or isinstance(error, NotImplementedError)  # ours; torch's
+            assert refused and k not in case.second, (k, other)
+            continue
+        ends = []
+        for sign in (1.0, -1.0):
+            moved = leaves_of(case, device)
+            moved[other] = (moved[other].detach() + sign * STEP * moves[other]).requires_grad_()
+            ends.append(slope(moved, k))
+        if got is None:  # linear, or no output depends on both
+            assert torch.equal(*ends), (k, other)
+            continue
+        got, want = (got * moves[other]).double(), float((ends[0] - ends[1]).sum()) / (2.0 * STEP)
+        assert k in case.second, (k, other)
+        # float32 slopes over the step
+        assert abs(float(got.sum()) - want) < 2e-2 * float(got.abs().sum()) + 1e-3, (k, other)
+
+
+def shares(case: Case, first, second, spoil=lambda tensor: tensor) -> dict[str, float]:
+    """How many entries of every output and gradient on the device ``second`` are within 1e-4 of those on ``first``."""
+    found, results = {}, []
+    for device in (first, second):
+        leaves = leaves_of(case, device, N)
+        outs = case.run(**leaves)
+        grads = gradients(case, leaves, outs) if case.grads else {}
+        results.append({**{f"output {k}": out.detach() for k, out in enumerate(outs)}, **grads})
+    for key, want in results[0].items():
+        got = spoil(results[1][key].cpu())
+        if got.shape != want.shape:
+            found[key] = 0.0
+        elif want.is_floating_point():
+            found[key] = reference.share_within(got, want)
+        else:
+            found[key] = float((got == want.cpu()).double().mean())
+    return found
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_one_two_and_five_threads_give_the_same_bits(threads, name):
+    case, results = CASES[name], []
+    for count in (1, 2, 5):
+        threads(count)
+        leaves = leaves_of(case, "cpu", N)
+        outs = case.run(**leaves)
+        results.append([*outs, *(gradients(case, leaves, outs).values() if case.grads else ())])
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_cpu_and_cuda_agree(name):
+    if not torch.cuda.is_available():
+        pytest.skip("needs CUDA")
+    for key, share in shares(CASES[name], "cpu", "cuda").items():
+        assert share >= 0.999, (key, share)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_what_compares_devices_is_still_on_one_and_sees_an_error(name):
+    """The judge of the test above: nothing differs between two runs on the CPU, and 3e-4 in one entry of 50 does."""
+    case = CASES[name]
+    assert all(share == 1.0 for share in shares(case, "cpu", "cpu").values())
+
+    def spoil(tensor):
+        flat = tensor.clone().reshape(-1)
+        if tensor.is_floating_point():
+            big = flat.abs().nan_to_num(posinf=0.0).argsort(descending=True)[: max(1, flat.numel() // 50)]
+            flat[big] *= 1.0 + 3e-4
+        else:
+            flat[:: max(1, min(50, flat.numel() - 1))] += 1 if tensor.dtype != torch.bool else True
+        return flat.reshape(tensor.shape)
+
+    assert all(share < 0.999 for share in shares(case, "cpu", "cpu", spoil).values() if share is not None)
+
+
+def test_no_kernel_is_left_out(monkeypatch):
+    """The table launches every kernel but those of other parts and of sizes and backends that it does not reach."""
+    launched, launch = set(), wp.launch
+    monkeypatch.setattr(wp, "launch", lambda kernel, *a, **k: (launched.add(kernel.key), launch(kernel, *a, **k))[1])
+    for case in CASES.values():
+        leaves = leaves_of(case, "cpu")
+        outs = case.run(**leaves)
+        if case.grads:
+            gradients(case, leaves, outs)
+    found = set()
+    for module in pkgutil.iter_modules(kernels.__path__):
+        if module.name not in ("noise", "distance", "uv", "allocation"):  # of data; on the CPU alone; of sample counts
+            values = vars(importlib.import_module(f"reli3d.kernels.{module.name}")).values()
+            found |= {v.key for v in values if isinstance(v, wp.Kernel)}
+    assert found - launched == {
+        "ray_key_kernel",  # many rays, before Embree
+        "sample_rows_kernel",  # triplanes beyond a cache
+    }  # fmt: skip

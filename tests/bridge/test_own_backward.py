@@ -1,0 +1,95 @@
+"""What backward passes written by hand owe torch beyond the table of operations: inputs without a gradient, and
+gradients that nobody asked for."""
+
+import pytest
+import torch
+
+from reli3d.render import shading, volume
+from reli3d.render.environment import Environment
+from reli3d.render.shading import shade
+from reli3d.render.volume import composite
+from tests.support.op_cases import shaded
+from tests.support.rays import packed
+from tests.support.surfaces import at
+
+NAMES = ("normal", "base_color", "roughness", "metallic", "radiance")
+
+
+def lit(leaves, pixels=None):
+    """Radiance of the table's hits; ``leaves`` by name, with all that ``shade`` takes."""
+    return shade(
+        *at(
+            leaves["normal"].detach(),
+            leaves["normal"],
+            leaves["ng"],
+            leaves["wo"],
+            leaves["base_color"],
+            leaves["roughness"],
+            leaves["metallic"],
+        ),
+        Environment(leaves["radiance"]),
+        pixels=pixels,
+    )
+
+
+def hits(device, asked=NAMES):
+    values = {k: v.to(device) for k, v in shaded(40).items()}
+    values = {"ng": values["normal"].clone(), **values}
+    values["wo"] = torch.nn.functional.normalize(values["normal"] + 0.3, dim=-1)
+    return {k: v.clone().requires_grad_(k in asked) for k, v in values.items()}
+
+
+@pytest.mark.parametrize("name", ["ng", "wo", "pixels"])
+def test_shade_refuses_inputs_that_were_edited_before_its_backward(device, name):
+    leaves, pixels = hits(device), torch.arange(40, dtype=torch.int32, device=device)
+    out = lit(leaves, pixels=pixels)
+    (pixels if name == "pixels" else leaves[name]).add_(1)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        out.sum().backward()
+
+
+@pytest.mark.parametrize("name", ["t", "first"])
+def test_composite_refuses_samples_that_were_edited_before_its_backward(device, name):
+    samples, density, color = packed([3, 0, 40], device)
+    out = composite(density.requires_grad_(), color, samples)
+    getattr(samples, name).mul_(1)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        out.color.sum().backward()
+
+
+def watched(monkeypatch, module, kernel):
+    """Rows of the arrays that each launch of the ``kernel`` of a ``module`` writes to, the last of its arguments."""
+    rows, launch = [], module.launch
+
+    def spy(launched, n, args, device, **options):
+        if launched.key.endswith(kernel):
+            rows.append([len(a[0]) for a in args if isinstance(a, tuple)])
+        return launch(launched, n, args, device, **options)
+
+    monkeypatch.setattr(module, "launch", spy)
+    return rows
+
+
+@pytest.mark.parametrize("asked", [*((name,) for name in NAMES), ("base_color", "radiance")])
+def test_shade_computes_no_gradient_that_nobody_asks_for(device, monkeypatch, asked):
+    every = hits(device)
+    truth = dict(zip(NAMES, torch.autograd.grad(lit(every).square().sum(), [every[k] for k in NAMES]), strict=True))
+    rows = watched(monkeypatch, shading, "shade_adjoint_kernel")
+    leaves = hits(device, asked)
+    lit(leaves).square().sum().backward()
+    assert rows and all([k for k, count in zip(NAMES, row[-5:], strict=True) if count] == list(asked) for row in rows)
+    for k in asked:
+        torch.testing.assert_close(leaves[k].grad, truth[k], rtol=1e-5, atol=1e-6 * float(truth[k].abs().max()))
+
+
+@pytest.mark.parametrize("asked", [(True, False), (False, True)])
+def test_composite_computes_no_gradient_that_nobody_asks_for(device, monkeypatch, asked):
+    samples, density, color = packed([3, 0, 40], device)
+    both = [v.clone().requires_grad_() for v in (density, color)]
+    truth = torch.autograd.grad(composite(*both, samples).color.square().sum(), both)
+    rows = watched(monkeypatch, volume, "composite_adjoint_kernel")
+    leaves = [v.requires_grad_(a) for v, a in zip((density, color), asked, strict=True)]
+    composite(*leaves, samples).color.square().sum().backward()
+    assert rows and all([bool(count) for count in row[-2:]] == list(asked) for row in rows)
+    for leaf, a, want in zip(leaves, asked, truth, strict=True):
+        assert torch.equal(leaf.grad, want) if a else leaf.grad is None

@@ -1,0 +1,86 @@
+"""``reli3d doctor``: says what is there, what is missing, and whether the package can work."""
+
+import hashlib
+import re
+
+import pytest
+import torch
+import warp
+
+import reli3d
+from reli3d.cli import doctor
+from tests.support.checkout import ROOT
+
+
+@pytest.fixture
+def assets(tmp_path, monkeypatch):
+    """A folder with weights and an example, in place of the shipped ones."""
+    (tmp_path / "weights").mkdir()
+    (tmp_path / "weights" / "small.safetensors").write_bytes(b"weights")
+    (tmp_path / "example").mkdir()
+    (tmp_path / "example" / "transforms.json").write_text("{}")
+    monkeypatch.setattr(doctor, "ASSETS", tmp_path)
+    return tmp_path
+
+
+def test_report_names_versions_devices_cache_and_weights(assets):
+    text = doctor.report()
+    rows = dict(re.match(r"(.{16}) (.*)", row).groups() for row in text.splitlines())
+    rows = {name.strip(): value for name, value in rows.items()}
+    assert rows["reli3d"].startswith(reli3d.__version__)
+    # the CUDA wheel of the package index does not name its build in its metadata
+    assert rows["torch"] in (torch.__version__, torch.__version__.split("+")[0])
+    assert rows["warp-lang"] == warp.__version__
+    assert str(warp.config.kernel_cache_dir) in rows["kernel cache"] and "writable" in rows["kernel cache"]
+    assert hashlib.sha256(b"weights").hexdigest() in rows["weights, small"]
+    assert rows["kernels, cpu"].startswith("run") and rows["verdict"] == "usable"
+    assert doctor.PROBLEM not in text
+
+
+def test_command_says_usable_on_stdout(assets, capsys):
+    assert doctor.main([]) == 0
+    assert capsys.readouterr().out.splitlines()[-1].endswith(" usable")
+
+
+def test_missing_weights_are_a_problem(assets, capsys):
+    (assets / "weights" / "small.safetensors").unlink()
+    assert doctor.main([]) == 1
+    out = capsys.readouterr().out
+    assert out.count(doctor.PROBLEM) == 1 and out.splitlines()[-1].endswith("not usable: 1 problem")
+
+
+def test_a_part_that_fails_is_reported_and_the_rest_goes_on(assets, monkeypatch):
+    def broken():
+        raise RuntimeError("the driver is gone")
+
+    monkeypatch.setattr(doctor, "_devices", broken)
+    text, usable = doctor.examine()
+    assert "the driver is gone" in text and "weights, small" in text and not usable
+
+
+def test_missing_package_is_a_problem(assets, monkeypatch):
+    monkeypatch.setattr(doctor, "REQUIRED", ("no-such-package-of-reli3d",))
+    text, usable = doctor.examine()
+    assert "pip install no-such-package-of-reli3d" in text and not usable
+
+
+@pytest.mark.parametrize("arguments", [["surgeon"], ["--now"]])
+def test_wrong_call_ends_with_two(arguments):
+    with pytest.raises(SystemExit) as stop:
+        doctor.main(arguments)
+    assert stop.value.code == 2
+
+
+def test_doctor_looks_for_every_dependency():
+    text = (ROOT / "pyproject.toml").read_text()
+    needed = re.search(r"^dependencies = \[(.*?)\]", text, re.DOTALL | re.MULTILINE).group(1)
+    assert re.findall(r'"([A-Za-z0-9-]+)', needed) == list(doctor.REQUIRED)
+
+
+def test_the_constraints_name_every_dependency_and_reference():
+    folder = ROOT
+    pins = re.findall(r"^([\w-]+)==", (folder / "constraints.txt").read_text(), re.MULTILINE)
+    text = (folder / "pyproject.toml").read_text()
+    extras = re.search(r"^test = \[(.*?)\]", text, re.MULTILINE).group(1)
+    wanted = (*doctor.REQUIRED, *re.findall(r'"([A-Za-z0-9-]+)', extras))
+    assert {name.lower() for name in wanted} <= {name.lower() for name in pins}

@@ -1,0 +1,177 @@
+"""The command from folders to files: what it writes, what it refuses, and how it ends."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from reli3d.cli import infer
+from reli3d.io.glb import read_glb
+from reli3d.io.hdr import read_environment
+from reli3d.nn.weights import load_model
+from reli3d.output import results
+from reli3d.render.camera import Camera
+from reli3d.render.color import srgb_to_linear
+from reli3d.render.environment import Environment
+from reli3d.render.render import render
+from reli3d.views.folder import load_views
+from tests.support import evil
+
+QUICK = ["--texture-size", "256", "--resolution", "40", "--device", "cpu"]
+
+
+def command(tmp_path: Path, *arguments) -> int:
+    return infer.main([*map(str, arguments), "--output", str(tmp_path / "out"), *QUICK])
+
+
+def moved_example(folder: Path, matrix: torch.Tensor) -> Path:
+    """The bundled example with the world carried by ``matrix`` (a similarity); images are links."""
+    folder.mkdir()
+    record = json.loads((infer.EXAMPLE / "transforms.json").read_text())
+    scale = torch.linalg.det(matrix[:3, :3]).abs() ** (1 / 3)
+    for frame in record["frames"]:
+        pose = matrix @ torch.tensor(frame["transform_matrix"], dtype=torch.float64)
+        pose[:3, :3] /= scale
+        frame["transform_matrix"] = pose.tolist()
+    (folder / "transforms.json").write_text(json.dumps(record))
+    (folder / "rgba").mkdir()
+    for image in (infer.EXAMPLE / "rgba").iterdir():
+        (folder / "rgba" / image.name).write_bytes(image.read_bytes())
+    return folder
+
+
+@pytest.fixture(scope="module")
+def example(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("example")
+    assert command(folder) == 0
+    return folder / "out" / "example"
+
+
+def test_the_example_gives_every_file_and_a_closed_mesh(example):
+    assert sorted(p.name for p in example.iterdir()) == sorted(results.FILES)
+    info = json.loads((example / "run_info.json").read_text())
+    assert info["mesh"]["watertight"] and info["mesh"]["manifold"]
+    assert info["mesh"]["faces"] > 1000
+    assert set(info["seconds"]["cold"]) >= {"read", "network", "surface", "textures", "light"}
+    assert len(info["weights"]["sha256"]) == 64 and "Apache-2.0" in info["weights"]["licence"]
+
+
+def test_peak_memory_is_none_where_python_has_no_count(monkeypatch):
+    """On Windows there is no module ``resource``."""
+    assert results.peak_memory_mib() > 10.0  # a Python with torch
+    monkeypatch.setitem(sys.modules, "resource", None)  # its import raises
+    assert results.peak_memory_mib() is None
+
+
+def test_both_environments_hold_the_same_light(example):
+    exr, hdr = (read_environment(example / f"environment.{kind}") for kind in ("exr", "hdr"))
+    assert exr.shape == (64, 128, 3) and bool((exr > 0).all())
+    peak = exr.amax(-1, keepdim=True)
+    assert bool(((exr - hdr).abs() <= peak / 100).all())  # RGBE keeps 8 bits of the largest channel
+
+
+def test_its_light_shows_it_as_bright_as_the_photographs(example):
+    views, light = load_views(infer.EXAMPLE, views=4), Environment(read_environment(example / "environment.exr"))
+    (asset,) = read_glb(example / "mesh.glb")
+    seen, shown = [], []
+    for image, mask, c2w, intrinsics in zip(views.images, views.masks, views.c2w, views.intrinsics, strict=True):
+        height, width = mask.shape
+        picture = render(asset, Camera(c2w, intrinsics / 8, width // 8, height // 8), light)
+        image = torch.nn.functional.avg_pool2d(srgb_to_linear(image).movedim(-1, 0), 8).movedim(0, -1)
+        inside = torch.nn.functional.avg_pool2d(mask[None], 8)[0] > 0.999
+        both = inside & (picture.alpha > 0) & (image.amax(-1) < 0.97)
+        seen.append(image[both]), shown.append(picture.radiance[both])
+    # without the correction it is half as bright; 10 %: other pixels, of which others are overexposed
+    assert float(torch.cat(shown).mean() / torch.cat(seen).mean()) == pytest.approx(1.0, abs=0.1)
+
+
+def test_the_mesh_follows_the_frame_of_the_cameras(tmp_path):
+    matrix = torch.eye(4, dtype=torch.float64)
+    matrix[:3, :3] *= 7.0
+    matrix[:3, 3] = torch.tensor([30.0, -4.0, 11.0])
+    folder = moved_example(tmp_path / "moved", matrix)
+    assert command(tmp_path, infer.EXAMPLE, folder, "--normalize", "hull") == 0
+    here, there = (read_glb(tmp_path / "out" / n / "mesh.glb")[0].mesh.vertices.double() for n in ("example", "moved"))
+    box = torch.stack([here.amin(0), here.amax(0)]) * 7 + matrix[:3, 3]
+    got = torch.stack([there.amin(0), there.amax(0)])
+    # the hull's grid starts at another place: its box moves by up to a cell of 3 %, and the network's input with it
+    assert float((box - got).abs().max()) < 0.06 * float((box[1] - box[0]).max())
+
+
+def test_the_same_input_gives_the_same_bits(example, tmp_path):
+    assert command(tmp_path, infer.EXAMPLE) == 0
+    for name in ("mesh.glb", "environment.exr", "preview.png"):
+        assert (tmp_path / "out/example" / name).read_bytes() == (example / name).read_bytes()
+
+
+def test_up_turns_mesh_and_light(example, tmp_path):
+    assert command(tmp_path, infer.EXAMPLE, "--up", "z") == 0
+    here, there = (read_glb(p)[0].mesh.vertices for p in (example / "mesh.glb", tmp_path / "out/example/mesh.glb"))
+    torch.testing.assert_close(there, torch.stack([here[:, 0], here[:, 2], -here[:, 1]], -1), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("name, make", evil.cases(), ids=[name for name, _ in evil.cases()])
+def test_an_evil_folder_ends_with_2_one_line_and_no_file(tmp_path, capsys, name, make):
+    make(tmp_path / "object")
+    assert command(tmp_path, tmp_path / "object") == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    lines = [line for line in err.replace("\r", "\n").split("\n") if line.startswith("reli3d-infer: ")]
+    assert len(lines) == 1 and "Traceback" not in err
+    assert not (tmp_path / "out").exists()
+
+
+def test_one_bad_object_does_not_stop_the_rest(tmp_path, capsys):
+    (tmp_path / "bad").mkdir()
+    assert command(tmp_path, tmp_path / "bad", infer.EXAMPLE) == 1
+    assert results.complete(tmp_path / "out" / "example")
+    assert capsys.readouterr().out.strip().endswith("mesh.glb")
+    before = (tmp_path / "out/example/mesh.glb").stat().st_mtime_ns
+    assert command(tmp_path, infer.EXAMPLE, "--skip-existing") == 0
+    assert (tmp_path / "out/example/mesh.glb").stat().st_mtime_ns == before
+
+
+@pytest.mark.parametrize("arguments", [["--texture-size", "100"], ["--resolution", "4"], ["--views", "0"],
+                                       ["--weights", "nowhere.safetensors"]])  # fmt: skip
+def test_options_out_of_range_end_with_2(tmp_path, capsys, arguments):
+    assert infer.main([str(infer.EXAMPLE), "--output", str(tmp_path / "out"), *arguments]) == 2
+    assert capsys.readouterr().err.count("reli3d-infer: ") == 1
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
+def test_cuda_is_not_replaced_by_the_cpu(tmp_path, capsys):
+    assert infer.main(["--device", "cuda", "--output", str(tmp_path / "out")]) == 2
+    assert "expected a CUDA device" in capsys.readouterr().err
+
+
+def test_check_explains_the_example_and_draws_the_rig(tmp_path, capsys):
+    assert infer.main(["--check", "--output", str(tmp_path)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(load_views(infer.EXAMPLE)) == 4 and any("agree" in line for line in lines)
+    assert (tmp_path / "example" / "rig.png").stat().st_size > 10_000
+
+
+def test_the_first_run_compiles_what_it_needs_side_by_side(tmp_path):
+    """A module missing from KERNELS would compile alone, at its first launch; one too many costs every first run."""
+    code = f"""
+import sys
+from pathlib import Path
+from reli3d.cli import infer
+infer.ready_kernels = lambda device: None
+assert infer.main(["--output", {str(tmp_path)!r}, *{QUICK!r}]) == 0
+import warp
+names = [p.stem for p in (Path(infer.__file__).parents[1] / "kernels").glob("*.py") if p.stem != "__init__"]
+loaded = [n for n in names if f"reli3d.kernels.{{n}}" in sys.modules and warp.get_module(f"reli3d.kernels.{{n}}").execs]
+sys.stdout.write("loaded " + " ".join(sorted(loaded)))
+compiler = [n for n in ("torch._dynamo", "trimesh", "matplotlib") if n in sys.modules]
+sys.stdout.write("; heavy " + " ".join(compiler))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    shading = load_model("small").preset.shading_features  # without them nobody looks the light up by normal
+    expected = sorted({*infer.KERNELS, *infer.SHADER["cpu"]} - (set() if shading else {"envmap"}))
+    assert done.stdout.splitlines()[-1] == f"loaded {' '.join(expected)}; heavy "

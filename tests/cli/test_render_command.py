@@ -1,0 +1,173 @@
+"""``reli3d-render``: its files against :func:`reli3d.render.render.render` of the same view, and how it ends."""
+
+import contextlib
+import io
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from reli3d.cli.render import main
+from reli3d.geometry.mesh import Mesh
+from reli3d.io.glb import read_glb, write_glb
+from reli3d.io.hdr import read_environment, read_hdr_image, write_environment
+from reli3d.render.asset import Asset
+from reli3d.render.camera import Camera, camera_rays, look_at
+from reli3d.render.color import agx, linear_to_srgb
+from reli3d.render.environment import Environment
+from reli3d.render.render import render
+from reli3d.render.shading import ShadeOptions
+from tests.support.scenes import ball
+
+SIZE, DISTANCE = 24, 2.6
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """Folder with a red ball and, as .hdr and .exr, a light whose one half is dark; exact in either format."""
+    folder = tmp_path_factory.mktemp("render")
+    asset = ball(torch.device("cpu"), (0.9, 0.1, 0.1))
+    n = asset.mesh.normals
+    tangent = torch.linalg.cross(n.new_tensor([0.3, 0.5, 0.81]).expand_as(n), n)
+    tangent = torch.cat([torch.nn.functional.normalize(tangent, dim=-1), torch.ones(len(n), 1)], -1)
+    write_glb(folder / "ball.glb", Asset(Mesh(asset.mesh.vertices, asset.mesh.faces, n, asset.mesh.uv, tangent),
+                                         asset.textures))  # fmt: skip
+    light = torch.full((8, 16, 3), 0.0625)
+    light[:, :8] = torch.tensor([2.0, 1.0, 1.0])
+    write_environment(folder / "half.hdr", light)
+    write_environment(folder / "half.exr", light)
+    return folder
+
+
+def run(folder, *options, light="half.hdr"):
+    """Files that the command names on stdout, by name."""
+    out = folder / "out"
+    common = ["--output", str(out), "--size", str(SIZE), "--distance", str(DISTANCE), "--supersampling", "1"]
+    lit = [] if light is None else ["--light", str(folder / light)]
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said):
+        assert main([str(folder / "ball.glb"), *common, *lit, *options]) == 0
+    return {Path(name).name: Path(name) for name in said.getvalue().splitlines()}
+
+
+def expected(folder, *, azimuth=30.0, yaw=0.0, seed=0, **options):
+    """What the view should be: the eye stands ``azimuth`` degrees from +Z towards +X and 20 above the horizon."""
+    parts = read_glb(folder / "ball.glb")
+    low, high = parts[0].mesh.vertices.amin(0), parts[0].mesh.vertices.amax(0)
+    a, lift = math.radians(azimuth), math.radians(20.0)
+    away = torch.tensor([math.cos(lift) * math.sin(a), math.sin(lift), math.cos(lift) * math.cos(a)])
+    pose = look_at((low + high) / 2 + DISTANCE * away, (low + high) / 2, torch.tensor([0.0, 1.0, 0.0]))
+    camera = Camera.from_fov(pose, math.radians(32.0), SIZE, SIZE)
+    light = Environment(read_environment(folder / "half.hdr")).rotated(yaw)
+    return render(parts, camera, light, options=ShadeOptions(seed=seed), **options), camera, light
+
+
+def pixels(path):
+    return torch.from_numpy(np.asarray(Image.open(path)).copy())
+
+
+def bytes_of(display):
+    return (display.clamp(0.0, 1.0) * 255.0 + 0.5).to(torch.uint8)
+
+
+def same_picture(got, want):
+    """8 bits; a value beside a rounding step may fall on its other side."""
+    off = (got.int() - want.int()).abs()
+    return got.shape == want.shape and int(off.max()) <= 1 and float((off > 0).float().mean()) < 0.01
+
+
+def straight(image):
+    """Colour before its premultiplication by alpha; the transforms to 8 bits take this."""
+    return image.radiance / image.alpha[..., None].clamp(min=1e-6)
+
+
+def test_linear_files_and_layers_are_those_of_render(scene):
+    image = expected(scene)[0]
+    for light in ("half.hdr", "half.exr"):  # the same radiance by either file
+        files = run(scene, "--format", "exr", "--aovs", light=light)
+        assert set(files) == {"ball.exr", *(f"ball_{k}.exr" for k in ("base_color", "material", "normal", "depth"))}
+        radiance = read_hdr_image(files["ball.exr"])
+        torch.testing.assert_close(radiance, image.radiance, rtol=2**-10, atol=1e-6)  # half floats
+    zero, seen = torch.zeros_like(image.alpha), image.alpha > 0.0
+    assert 0.2 < float(seen.float().mean()) < 0.8 and float(image.radiance.max()) > 0.1
+    depth = torch.where(seen, image.depth, 0.0)
+    layers = {"base_color": image.base_color, "material": torch.stack([zero, image.roughness, image.metallic], -1),
+              "normal": torch.where(seen[..., None], image.normal / 2 + 0.5, 0.0),
+              "depth": torch.stack([depth, depth, image.alpha], -1)}  # fmt: skip
+    for name, layer in layers.items():
+        torch.testing.assert_close(read_hdr_image(files[f"ball_{name}.exr"]), layer, rtol=0, atol=1e-6)
+    brighter = read_hdr_image(run(scene, "--format", "exr", "--exposure", "1")["ball.exr"])
+    torch.testing.assert_close(brighter, 2.0 * radiance, rtol=2**-10, atol=0)
+    clear = read_hdr_image(run(scene, "--format", "exr", "--no-shadows", "--seed", "5")["ball.exr"])
+    want = expected(scene, seed=5, shadows=False)[0].radiance
+    torch.testing.assert_close(clear, want, rtol=2**-10, atol=1e-6)
+
+
+@pytest.mark.parametrize("tone, transform", [("srgb", linear_to_srgb), ("agx", agx), ("none", lambda v: v)])
+def test_pictures_are_the_display_transform_of_the_exposed_radiance(scene, tone, transform):
+    image = expected(scene)[0]
+    for stops in (0, 1):
+        picture = pixels(run(scene, "--tone", tone, "--exposure", str(stops))["ball.png"])
+        shown = torch.cat([transform(2.0**stops * straight(image)), image.alpha[..., None]], -1)
+        assert same_picture(picture, bytes_of(shown))
+    assert int(picture[SIZE // 2, SIZE // 2, 0]) > int(picture[SIZE // 2, SIZE // 2, 1])  # the red ball
+
+
+def test_the_light_stands_behind_where_it_is_asked_for(scene):
+    image, camera, light = expected(scene, azimuth=5.0, background="environment")  # the centre of the map is in view
+    picture = pixels(run(scene, "--background", "environment", "--azimuth", "5")["ball.png"])
+    assert same_picture(picture, bytes_of(linear_to_srgb(image.radiance)))
+    behind = bytes_of(linear_to_srgb(light.lookup(camera_rays(camera)[1])))
+    free = image.alpha == 0.0
+    assert same_picture(picture[free], behind[free])
+    assert int(behind[free].int().amax()) - int(behind[free].int().amin()) > 100  # both halves of the light
+
+
+@pytest.mark.parametrize("turn", ["camera", "light"])
+def test_turntables_are_their_frames(scene, turn, monkeypatch):
+    """As numbered PNG and EXR files and as one animation; the progress goes to the error stream of a terminal."""
+    wanted = []
+    for k in range(3):
+        view = {"azimuth": 30.0 + 120.0 * k} if turn == "camera" else {"yaw": 2.0 * math.pi * k / 3}
+        wanted.append(expected(scene, seed=k, **view)[0])
+    terminal = io.StringIO()
+    terminal.isatty = lambda: True
+    monkeypatch.setattr(sys, "stderr", terminal)
+    options = ["--frames", "3", "--turn", turn]
+    files = run(scene, *options)
+    assert list(files) == [f"ball_{k:04d}.png" for k in range(3)]
+    assert "3/3" in terminal.getvalue() and "frame" in terminal.getvalue()
+    shown = [torch.cat([linear_to_srgb(straight(image)), image.alpha[..., None]], -1) for image in wanted]
+    assert all(same_picture(pixels(path), bytes_of(want)) for path, want in zip(files.values(), shown, strict=True))
+    for path, image in zip(run(scene, *options, "--format", "exr").values(), wanted, strict=True):
+        torch.testing.assert_close(read_hdr_image(path), image.radiance, rtol=2**-10, atol=1e-6)
+    (path,) = run(scene, *options, "--format", "webp").values()
+    with Image.open(path) as animation:
+        assert animation.n_frames == 3
+        for k, want in enumerate(shown):
+            animation.seek(k)
+            got = torch.from_numpy(np.asarray(animation.convert("RGBA")).astype(np.float32) / 255)
+            cover = want[..., 3:]
+            errors = [float(((got - other)[..., :3] * cover).abs().mean()) for other in shown]
+            assert errors[k] < 0.03 and errors[k] == min(errors), errors  # WebP loses detail
+
+
+def test_paint_and_wrong_options(scene, capsys):
+    picture = pixels(run(scene, light=None)["ball.png"])
+    changed = pixels(run(scene, "--paint", "published", light=None)["ball.png"])[..., :3].int() - picture[..., :3].int()
+    assert int(changed.max()) > 3 and int(changed.min()) >= -1  # more light at the rim, the same noise
+    common = [str(scene / "ball.glb"), "--output", str(scene / "none")]
+    with pytest.raises(SystemExit) as stopped:
+        main([*common, "--paint", "white"])
+    assert stopped.value.code == 2
+    capsys.readouterr()
+    for wrong in (["--size", "0"], ["--elevation", "90"], ["--azimuth", "nan"], ["--exposure", "nan"],
+                  ["--distance", "inf"], ["--light", str(scene / "none.hdr")]):  # fmt: skip
+        assert main([*common, *wrong]) == 2
+        said = capsys.readouterr()
+        assert said.err.startswith("reli3d-render: ") and said.err.count("\n") == 1 and said.out == ""
+    assert not (scene / "none").exists()

@@ -1,0 +1,300 @@
+"""Texels against brute force in float64, baking against closed forms, tangents against those of an exporter."""
+
+import json
+import math
+import struct
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from scipy import ndimage
+
+from reli3d.geometry.bake import bake, coverage, dilate, interpolate, nearest_valid, rasterize_texels
+from reli3d.geometry.mesh import Mesh
+from reli3d.geometry.tangents import decode_normals, encode_normals, vertex_tangents, with_tangents
+from reli3d.geometry.uv import unwrap
+from reli3d.io.glb import write_glb
+from reli3d.render.asset import Asset, TextureSet
+from tests.support.texels import bilinear, color
+
+SIZE = 256
+
+
+def icosphere(subdivisions: int, device="cpu") -> Mesh:
+    ball = trimesh.creation.icosphere(subdivisions)
+    return Mesh(torch.tensor(ball.vertices, dtype=torch.float32, device=device),
+                torch.tensor(ball.faces, dtype=torch.int32, device=device)).with_normals()  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def sphere() -> Mesh:
+    return with_tangents(unwrap(icosphere(4), texture_size=SIZE))
+
+
+def surface_samples(mesh: Mesh, n: int, seed: int = 0):
+    """Random faces and weights: positions and UV, float64."""
+    rng = np.random.default_rng(seed)
+    w = rng.dirichlet((1, 1, 1), n)[:, :, None]
+    face = mesh.faces.cpu().numpy()[rng.integers(0, len(mesh.faces), n)]
+    return (mesh.vertices.cpu().numpy().astype(np.float64)[face] * w).sum(1), (mesh.uv.cpu().numpy()[face] * w).sum(1)
+
+
+def test_texels_match_brute_force(device):
+    rng = torch.Generator().manual_seed(3)
+    uv = torch.rand(30, 2, generator=rng)
+    faces = torch.arange(30).reshape(-1, 3).int()
+    mesh = Mesh(torch.rand(30, 3, generator=rng), faces, uv=uv).to(device)  # ten triangles that overlap as they like
+    size = 40
+    got = rasterize_texels(mesh, size)
+    q = uv.double().numpy()[faces.numpy()] * size
+    y, x = np.mgrid[:size, :size] + 0.5
+    p = np.stack([x, y], -1).reshape(-1, 1, 2)
+    a, b, c = q[:, 0], q[:, 1], q[:, 2]
+
+    def cross(u, v):
+        return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
+
+    w = np.stack([cross(p - a, c - a), cross(b - a, p - a)], -1) / cross(b - a, c - a)[:, None]
+    inside = (w.min(-1) >= 0) & (w.sum(-1) <= 1)
+    # not within float32 of an edge
+    clear = np.abs(np.concatenate([w, 1 - w.sum(-1, keepdims=True)], -1)).min(-1) > 1e-5
+    first = np.where(inside.any(1), inside.argmax(1), -1)
+    same = clear.all(1)
+    got_first = torch.where(got.inside, got.face, -1).cpu().numpy().ravel()
+    assert np.array_equal(got_first[same], first[same]) and same.mean() > 0.95
+    covered = same & (first >= 0)
+    bary = got.bary.cpu().numpy().reshape(-1, 2)[covered]
+    # weights are cross products over an area; the smallest triangle here has 20 texels, float32 keeps 5 digits of it
+    np.testing.assert_allclose(bary, w[np.arange(len(w)), first][covered], atol=2e-4)
+    # border texels: nearest point of all edges
+    ends = np.stack([q, np.roll(q, -1, 1)], 2).reshape(-1, 2, 2)
+    e = ends[:, 1] - ends[:, 0]
+    t = np.clip(((p - ends[:, 0]) * e).sum(-1) / (e * e).sum(-1), 0, 1)
+    distance = np.linalg.norm(ends[:, 0] + t[..., None] * e - p, axis=-1).min(1)
+    outside = ~inside.any(1) & same
+    valid = got.valid.cpu().numpy().ravel()
+    settled = outside & (np.abs(distance - 1.5) > 1e-4)
+    assert np.array_equal(valid[settled], distance[settled] < 1.5)
+    ring = outside & valid
+    full = np.concatenate([1 - got.bary.cpu().numpy().reshape(-1, 2).sum(1, keepdims=True),
+                           got.bary.cpu().numpy().reshape(-1, 2)], 1)  # fmt: skip
+    point = (q[got.face.cpu().numpy().ravel()[ring]] * full[ring][:, :, None]).sum(1)
+    np.testing.assert_allclose(np.linalg.norm(point - p[ring][:, 0], axis=1), distance[ring], atol=1e-4)
+
+
+def test_coverage_counts_sheets_and_no_shared_edge(device):
+    corners = torch.tensor([[0.0, 0], [1, 0], [1, 1], [0, 1]])
+    faces = torch.tensor([[0, 1, 2], [0, 2, 3], [0, 1, 2]]).int()
+    mesh = Mesh(torch.zeros(4, 3), faces, uv=corners).to(device)
+    hits = coverage(mesh, 32).cpu()
+    y, x = torch.meshgrid(torch.arange(32), torch.arange(32), indexing="ij")
+    assert torch.equal(hits, torch.where(x > y, 2, torch.where(x < y, 1, 0)).to(torch.uint8))  # the diagonal is an edge
+
+
+def test_bilinear_lookup_reads_the_surface_only(sphere):
+    texels = rasterize_texels(sphere, SIZE)
+    _, uv = surface_samples(sphere, 100_000)
+    assert bilinear(texels.valid.numpy().astype(float)[..., None], uv).min() == pytest.approx(1.0, abs=1e-12)
+
+
+def test_same_texels_for_any_number_of_threads(sphere, threads):
+    found = []
+    for n in (1, 2, 5):
+        threads(n)
+        found.append(rasterize_texels(sphere, 512))
+    for other in found[1:]:
+        assert torch.equal(found[0].face, other.face) and torch.equal(found[0].bary, other.bary)
+
+
+def test_positions_and_normals_interpolate_linearly(sphere, device):
+    mesh = sphere.to(device)
+    texels = rasterize_texels(mesh, SIZE)
+    index = torch.nonzero(texels.valid.reshape(-1)).reshape(-1)
+    position, normal = interpolate(mesh, texels, index)
+    face = mesh.faces.long()[texels.face.reshape(-1)[index].long()]
+    b = texels.bary.reshape(-1, 2)[index].double()
+    w = torch.stack([1 - b.sum(1), b[:, 0], b[:, 1]], 1)[..., None]
+    want = (mesh.vertices.double()[face] * w).sum(1)
+    torch.testing.assert_close(position.double(), want, rtol=0, atol=3e-7)  # float32 sums of values up to 1
+    n = torch.nn.functional.normalize((mesh.normals.double()[face] * w).sum(1), dim=1)
+    torch.testing.assert_close(normal.double(), n, rtol=0, atol=1e-6)
+
+
+def test_known_colour_reads_back(sphere):
+    image = bake(sphere, SIZE, lambda p, n: color(p))["value"].numpy()
+    position, uv = surface_samples(sphere, 50_000)
+    want = color(torch.from_numpy(position)).numpy()
+    error = np.abs(bilinear(image, uv) - want)
+    # a texel is 0.022 long here: bilinear errs by 3.6 * h^2 / 8 = 2e-4 inside, border texels hold a point up to h away
+    assert error.mean() < 0.2 / 255
+    assert error.max() < 1.2 * 1.5 * 0.022 * 1.8
+
+
+def test_known_colour_reads_back_through_the_file_at_every_mip(sphere, tmp_path):
+    def material(p, n, t):
+        one = torch.ones_like(p[:, :1])
+        return {"base_color": color(p), "roughness": one, "metallic": one, "normal": encode_normals(n, n, t)}
+
+    write_glb(tmp_path / "ball.glb", Asset(sphere, TextureSet(**bake(sphere, SIZE, material, tangents=True))))
+    read = trimesh.load(tmp_path / "ball.glb", force="mesh", process=False)
+    image = np.asarray(read.visual.material.baseColorTexture.convert("RGB")) / 255.0
+    rng = np.random.default_rng(2)
+    w, face = rng.dirichlet((1, 1, 1), 50_000)[:, :, None], read.faces[rng.integers(0, len(read.faces), 50_000)]
+    uv = (read.visual.uv[face] * w).sum(1) * [1, -1] + [0, 1]  # trimesh turns v up
+    want = color(torch.from_numpy((np.asarray(read.vertices)[face] * w).sum(1))).numpy()
+    # 8 bit: a quarter of a step on average; the bake itself stays under a fifth (see above)
+    assert np.abs(bilinear(image, uv) - want).mean() < 0.5 / 255
+    while image.shape[0] >= 64:  # colours are at least 0.1: whatever is darker was never written
+        assert image.min() > 0.1 - 0.6 / 255
+        image = 0.25 * (image[::2, ::2] + image[1::2, ::2] + image[::2, 1::2] + image[1::2, 1::2])
+
+
+def test_constant_survives_every_mip_down_to_64(sphere):
+    image = bake(sphere, SIZE, lambda p, n: torch.full_like(p, 0.25))["value"].permute(2, 0, 1)[None]
+    while image.shape[-1] >= 64:
+        assert float(image.min()) == float(image.max()) == 0.25  # no texel was left black, so no mean mixes one in
+        image = torch.nn.functional.avg_pool2d(image, 2)
+
+
+def test_chunks_and_reused_texels_do_not_matter(sphere):
+    texels = rasterize_texels(sphere, SIZE)
+    one = bake(sphere, SIZE, lambda p, n: {"a": color(p), "b": n[:, :1]})
+    other = bake(sphere, SIZE, lambda p, n: {"a": color(p), "b": n[:, :1]}, chunk=777, texels=texels)
+    assert all(torch.equal(one[k], other[k]) for k in "ab") and one["b"].shape == (SIZE, SIZE, 1)
+    bare = bake(sphere, SIZE, lambda p, n: color(p), texels=texels, fill=False)["value"]
+    assert torch.equal(dilate(bare, texels.valid), one["a"]) and float(bare[~texels.valid].abs().max()) == 0.0
+
+
+@pytest.mark.parametrize("shape, share", [((64, 64), 0.02), ((33, 130), 0.3), ((1, 50), 0.1), ((50, 1), 0.1)])
+def test_nearest_valid_is_exact(device, shape, share):
+    valid = torch.rand(shape, generator=torch.Generator().manual_seed(5)) < share
+    valid[0, 0] = True
+    source, square = (t.cpu() for t in nearest_valid(valid.to(device)))
+    assert np.array_equal(np.rint(ndimage.distance_transform_edt(~valid.numpy()) ** 2), square.numpy())
+    y, x = torch.meshgrid(torch.arange(shape[0]), torch.arange(shape[1]), indexing="ij")
+    assert bool(valid.reshape(-1)[source.long()].all())
+    assert torch.equal(((source // shape[1] - y) ** 2 + (source % shape[1] - x) ** 2).float(), square)
+
+
+def test_dilation_limits_and_empty_masks(device):
+    valid = torch.zeros(9, 9, dtype=torch.bool, device=device)
+    image = torch.zeros(9, 9, 2, device=device)
+    assert torch.equal(dilate(image, valid), image)
+    valid[4, 4], image[4, 4] = True, torch.tensor([1.0, 2.0], device=device)
+    near = dilate(image, valid, iterations=2)[..., 0]
+    y, x = torch.meshgrid(torch.arange(9), torch.arange(9), indexing="ij")
+    assert torch.equal(near.cpu() > 0, (y - 4) ** 2 + (x - 4) ** 2 <= 4)
+    assert float(dilate({"m": image}, valid)["m"][..., 1].min()) == 2.0
+
+
+def test_faults_are_named(sphere):
+    with pytest.raises(ValueError, match="mesh.uv: expected UV"):
+        rasterize_texels(icosphere(0), 16)
+    with pytest.raises(ValueError, match="mesh.uv: expected finite"):
+        rasterize_texels(Mesh(sphere.vertices, sphere.faces, uv=sphere.uv * float("nan")), 16)
+    with pytest.raises(ValueError, match="covers no texel"):
+        bake(Mesh(sphere.vertices, sphere.faces, uv=sphere.uv + 3.0), 16, lambda p, n: p)
+    with pytest.raises(ValueError, match=r"fn\(\)\['value'\]: expected shape"):
+        bake(sphere, 16, lambda p, n: p[:1])
+    with pytest.raises(ValueError, match="chunk"):
+        bake(sphere, 16, lambda p, n: p, chunk=0)
+    with pytest.raises(ValueError, match=r"maps: expected shape \(4, 4, 'C'\)"):
+        dilate(torch.zeros(5, 4, 1), torch.zeros(4, 4, dtype=torch.bool))
+    with pytest.raises(ValueError, match="mesh.normals"):
+        vertex_tangents(Mesh(sphere.vertices, sphere.faces, uv=sphere.uv))
+
+
+def test_tangents_of_a_cylinder_follow_u(device):
+    k = 64
+    angle = torch.arange(k + 1) * (2 * math.pi / k)
+    ring = torch.stack([angle.cos(), torch.zeros(k + 1), -angle.sin()], 1)
+    normals = ring.repeat(2, 1)
+    vertices = torch.cat([ring, ring + torch.tensor([0.0, 2, 0])])
+    i = torch.arange(k)
+    faces = torch.cat([torch.stack([i, i + 1, k + 2 + i], 1), torch.stack([i, k + 2 + i, k + 1 + i], 1)]).int()
+    uv = torch.stack([angle.repeat(2) / (2 * math.pi), torch.cat([torch.ones(k + 1), torch.zeros(k + 1)])], 1)
+    mesh = Mesh(vertices, faces, normals, uv).to(device)
+    want = torch.stack([-angle.sin(), torch.zeros(k + 1), -angle.cos()], 1).repeat(2, 1)
+    for flip, w in ((1.0, 1.0), (-1.0, -1.0)):
+        turned = mesh.uv * mesh.uv.new_tensor([flip, 1.0])
+        t = vertex_tangents(Mesh(mesh.vertices, mesh.faces, mesh.normals, turned)).cpu()
+        assert torch.equal(t[:, 3], torch.full((2 * k + 2,), w))
+        cosine = (t[:, :3] * want).sum(1) * flip
+        inner = torch.arange(2 * k + 2) % (k + 1) % k > 0
+        # float32; the rim sees one side only: half a facet, projected flat
+        assert float(cosine[inner].min()) > 1 - 1e-6
+        assert float(cosine.min()) > math.cos(math.pi / k) - 1e-6
+
+
+def test_tangents_weigh_faces_by_their_angle(device):
+    """At the origin a face of 90 degrees has +u along (1, 0), one of 45 degrees along (1, 1), solved by hand."""
+    p = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [-1, 1, 0]], device=device)
+    uv = torch.tensor([[0.0, 0], [1, 0], [0, -1], [-1, -2]], device=device)
+    faces = torch.tensor([[0, 1, 2], [0, 2, 3]], device=device).int()
+    got = vertex_tangents(Mesh(p, faces, torch.tensor([0.0, 0, 1], device=device).repeat(4, 1), uv))[0].cpu()
+    want = math.pi / 2 * torch.tensor([1.0, 0, 0]) + math.pi / 4 * torch.tensor([0.5, 0.5, 0]) * 2**0.5
+    torch.testing.assert_close(got, torch.cat([want / want.norm(), torch.ones(1)]), rtol=0, atol=1e-6)
+
+
+def test_tangents_agree_with_an_exporter(shared_data):
+    """NormalTangentMirrorTest stores MikkTSpace tangents, with mirrored UV."""
+    data = (shared_data / "calibration" / "calib_normal_tangent_mirror.glb").read_bytes()
+    size = struct.unpack_from("<I", data, 12)[0]
+    document, start = json.loads(data[20 : 20 + size]), 20 + size + 8
+
+    def array(index):
+        accessor = document["accessors"][index]
+        view = document["bufferViews"][accessor["bufferView"]]
+        kind = {5126: "<f4", 5123: "<u2", 5125: "<u4"}[accessor["componentType"]]
+        width = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}[accessor["type"]]
+        at = start + view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
+        return np.frombuffer(data, kind, accessor["count"] * width, at).reshape(-1, width)
+
+    primitive = document["meshes"][0]["primitives"][0]
+    p, n, t, uv = (array(primitive["attributes"][k]) for k in ("POSITION", "NORMAL", "TANGENT", "TEXCOORD_0"))
+    faces = array(primitive["indices"]).reshape(-1, 3).astype(np.int32)
+    got = vertex_tangents(Mesh(*(torch.from_numpy(v.copy()) for v in (p, faces, n, uv)))).numpy()
+    assert (np.sign(got[:, 3]) == np.sign(t[:, 3])).mean() > 0.999 and (t[:, 3] < 0).any() and (t[:, 3] > 0).any()
+    cosine = (got[:, :3] * t[:, :3]).sum(1)
+    assert np.median(cosine) > 0.99999 and (cosine > 0.999).mean() > 0.98  # vertices were welded after its export
+
+
+def test_tangents_are_unit_orthogonal_and_plain(sphere):
+    t, n = sphere.tangents.double(), sphere.normals.double()
+    assert float((t[:, :3].norm(dim=1) - 1).abs().max()) < 1e-6  # float32 storage
+    assert float((t[:, :3] * n).sum(1).abs().max()) < 1e-6
+    assert bool((t[:, 3] == 1).all())
+
+
+def test_normal_map_decodes_to_the_world_normal_within_a_degree(sphere):
+    def world(p, n):
+        return torch.nn.functional.normalize(n + 0.3 * torch.sin(5.0 * p + 1.0), dim=1)
+
+    kept = {}
+
+    def fn(p, n, t):
+        kept.setdefault("parts", []).append((world(p, n), n, t))
+        return encode_normals(world(p, n), n, t)
+
+    texels = rasterize_texels(sphere, SIZE)
+    image = bake(sphere, SIZE, fn, texels=texels, tangents=True)["value"]
+    want, n, t = (torch.cat(v) for v in zip(*kept["parts"]))
+    stored = (image.reshape(-1, 3)[texels.valid.reshape(-1)] * 255).round() / 255
+    # the shader of glTF 2.0, section 3.9.3, in float64: bitangent from the exported w, green up
+    s = stored.double() * 2 - 1
+    b = torch.linalg.cross(n.double(), t[:, :3].double()) * t[:, 3:].double()
+    shaded = torch.nn.functional.normalize(s[:, :1] * t[:, :3] + s[:, 1:2] * b + s[:, 2:] * n, dim=1)
+    angle = torch.rad2deg(torch.acos((shaded * want.double()).sum(1).clamp(-1, 1)))
+    # 8 bit: half a step of 2 / 255 in each of three channels is at most 0.39 degrees
+    assert float(angle.max()) < 0.45
+    torch.testing.assert_close(decode_normals(stored, n, t).double(), shaded, rtol=0, atol=1e-5)
+
+
+def test_encoding_bends_normals_up_and_gives_exact_ones_back():
+    n = torch.tensor([[0.0, 0, 1]] * 3)
+    t = torch.tensor([[1.0, 0, 0, 1], [1, 0, 0, -1], [1, 0, 0, 1]])
+    world = torch.tensor([[0.6, 0, 0.8], [0, 0.6, 0.8], [0.6, 0.0, -0.8]])
+    # w = -1 turns green; below: on the horizon
+    want = torch.tensor([[0.8, 0.5, 0.9], [0.5, 0.2, 0.9], [1.0, 0.5, 0.5]])
+    torch.testing.assert_close(encode_normals(world, n, t), want)

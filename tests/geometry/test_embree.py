@@ -1,0 +1,95 @@
+"""Embree by its C interface: packets of shadow rays beside single rays, trees that come and go, a wheel without it."""
+
+import sys
+import threading
+import weakref
+
+import numpy as np
+import pytest
+import torch
+
+from reli3d.geometry import embree
+from reli3d.geometry.rays import RayScene
+from tests.support.rays import bumpy, make, rays
+
+
+@pytest.mark.parametrize("count", [1, 15, 16, 17, 63, 64, 65, 1000, 60_000])
+def test_packets_find_what_single_rays_find(device, count):
+    """Any number, any limit, some switched off by -1, from several places or from one."""
+    scene = make(*bumpy(3, subdivisions=4, height=0.5), "embree", device)
+    o, d = rays(count, 4, 1.0)
+    g = torch.Generator().manual_seed(count)
+    limit = torch.rand(count, generator=g) * 2.0
+    limit[torch.rand(count, generator=g) < 0.3] = -1.0
+    limit[torch.rand(count, generator=g) < 0.3] = torch.inf
+    for origins in (o, o[:1].expand(count, 3)):
+        clear = scene.clear(origins, d, limit)
+        single = (limit >= 0.0) & ~scene.occluded(origins, d, t_max=limit)
+        # a ray through an edge may count for either face, or miss by rounding in one of the two
+        assert int((clear != single).sum()) <= 1e-4 * count
+    assert count < 1000 or 0.1 < float(clear.float().mean()) < 0.6
+
+
+def test_packets_leave_no_closed_mesh(device):
+    """Embree's own bound for rays that leak: 2e-5."""
+    scene = make(*bumpy(2, subdivisions=4), "embree", device)
+    o, d = rays(300_000, 5, 0.3)
+    assert int(scene.clear(o, d, torch.full((len(o),), torch.inf)).sum()) <= 2e-5 * len(o)
+
+
+@pytest.mark.parametrize("odd", [None, float("nan"), float("inf"), 0.0])
+def test_the_order_brings_like_rays_together_and_loses_none(device, odd):
+    """Cells of 32 x 32 directions are some 5 degrees wide; among rays as they come neighbours are 90 degrees apart."""
+    scene = make(*bumpy(1), "embree", device)
+    o, d = rays(300_000, 7, 1.0)
+    if odd is not None:
+        o[::3, 1], d[1::3] = odd, odd
+    order = scene._order(o, d)
+    assert np.array_equal(np.sort(order), np.arange(len(o)))
+    if odd is None:
+        near = torch.nn.functional.normalize(d[order], dim=-1)
+        angle = torch.rad2deg(torch.acos((near[1:] * near[:-1]).sum(-1).clamp(-1, 1)))
+        assert float(angle.mean()) < 8.0  # 3.7 measured
+        assert scene._order(o[order], d[order]) is None
+
+
+def test_scenes_in_many_threads_answer_as_alone_and_are_given_back(device):
+    if device.type != "cpu":
+        pytest.skip("Embree runs on CPU only")
+    o, d = rays(3000, 6, 1.5)
+    meshes = [bumpy(seed) for seed in range(8)]
+    want = [make(*mesh, "embree", device).closest(o, d).face for mesh in meshes]
+    failed = []
+
+    def work(k):
+        for _ in range(10):
+            scene = RayScene(*(torch.from_numpy(a) for a in meshes[k]), "embree")
+            if not torch.equal(scene.closest(o, d).face, want[k]):
+                failed.append(k)
+
+    threads = [threading.Thread(target=work, args=(k,)) for k in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not failed
+    tree = embree.Tree(*meshes[0])
+    held, given_back = weakref.ref(tree), []
+    weakref.finalize(tree, given_back.append, tree.scene)
+    del tree
+    assert held() is None and len(given_back) == 1
+
+
+def test_embree_is_found_beside_the_wheel_and_a_wheel_without_it_is_named(monkeypatch, tmp_path):
+    """Where the loader tells no names of what a library needs, as on Windows, the library itself is looked for."""
+    import embreex
+    from embreex import rtcore_scene
+
+    other = np.linalg._umath_linalg.__file__  # a library of other names
+    monkeypatch.setattr(rtcore_scene, "__file__", other)
+    if sys.platform != "darwin":
+        library, device = embree._embree.__wrapped__()
+        assert library.rtcGetDeviceProperty(device, embree.VERSION) >= 40000
+    monkeypatch.setattr(embreex, "__file__", str(tmp_path / "embreex" / "__init__.py"))
+    with pytest.raises(ImportError, match="embreex: expected a wheel with Embree's library, found none"):
+        embree._embree.__wrapped__()

@@ -1,0 +1,129 @@
+"""Fields of one sign: no faces and gradients of zero, a closed box; and what every mesh operation makes of no faces."""
+
+import pytest
+import torch
+import trimesh
+
+from reli3d.cli import infer
+from reli3d.geometry import mesh as meshes
+from reli3d.geometry.bake import bake, coverage, rasterize_texels
+from reli3d.geometry.holes import fill_holes, holes
+from reli3d.geometry.mesh import Mesh, report, vertex_normals, volume
+from reli3d.geometry.regularize import sign_entropy, vertex_deviation
+from reli3d.geometry.remesh import decimate, remesh, repair
+from reli3d.geometry.smooth import laplacian_smooth, taubin_smooth
+from reli3d.geometry.surface import extract_surface, extract_surfaces, surface_cubes
+from reli3d.geometry.tangents import vertex_tangents
+from reli3d.geometry.uv import atlas_report, unwrap, unwrap_xatlas
+from reli3d.io.glb import glb_bytes
+from reli3d.nn.weights import load, locate, save
+from reli3d.render.asset import Asset, TextureSet
+from tests.support.reference_surface import random_weights, sphere
+
+SHAPE = (5, 6, 7)
+NOTHING = Mesh(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.int32))
+
+
+@pytest.mark.parametrize("centre", [False, True])
+@pytest.mark.parametrize("value, closed", [(1.0, True), (0.0, True), (-0.0, True), (1.0, False), (-1.0, False)])
+def test_a_field_without_a_change_of_sign_has_no_faces_and_gradients_of_zero(device, value, closed, centre):
+    level = torch.full(SHAPE, value, device=device).requires_grad_()
+    weights = {k: v.requires_grad_() for k, v in random_weights(SHAPE, 0, device).items()}
+    mesh = extract_surface(level, radius=1.0, closed=closed, centre=centre, **weights)
+    assert mesh.vertices.shape == (0, 3) and mesh.faces.shape == (0, 3) and mesh.vertices.device == level.device
+    assert len(surface_cubes(level)) == 0
+    leaves = [level, *(weights[k] for k in ("deformation", "alpha", "beta"))]
+    for g, leaf in zip(torch.autograd.grad(mesh.vertices.sum(), leaves), leaves, strict=True):
+        assert g.shape == leaf.shape and float(g.abs().max()) == 0.0
+    rows = {k: v.detach() if k == "deformation" else v.detach()[:0] for k, v in weights.items()}
+    cubes = torch.zeros(0, dtype=torch.int64, device=device)
+    assert len(extract_surface(level, radius=1.0, closed=closed, centre=centre, cubes=cubes, **rows).faces) == 0
+    weights.pop("gamma")
+    spread = vertex_deviation(level, radius=1.0, closed=closed, **weights)
+    assert spread.shape == (0,)
+    assert all(float(g.abs().max()) == 0.0 for g in torch.autograd.grad(spread.sum(), leaves))
+    assert float(sign_entropy(level.detach())) == 0.0
+
+
+def test_a_full_field_is_the_box_with_its_edges_cut_off(device):
+    """Dual vertices stand at the centres of the border's squares: the convex hull of those is the whole surface."""
+    level = -torch.ones(SHAPE, device=device)
+    mesh = extract_surface(level, radius=(1.0, 1.5, 2.0))
+    found = report(mesh)
+    assert found.watertight and found.manifold and found.euler == 2 and float(volume(mesh)) > 0
+    hull = trimesh.Trimesh(mesh.vertices.cpu().numpy()).convex_hull
+    assert float(volume(mesh)) == pytest.approx(hull.volume, rel=1e-5)
+    assert mesh.vertices.abs().amax(0).tolist() == [1.0, 1.5, 2.0]
+    leaf = level.requires_grad_()
+    for centre in (False, True):  # a crossing between a vertex and its copy in the padding does not move
+        moved = extract_surface(leaf, radius=1.0, centre=centre)
+        assert float(torch.autograd.grad(moved.vertices.square().sum(), leaf)[0].abs().max()) == 0.0
+
+
+def test_a_batch_may_hold_empty_full_and_other_fields(device):
+    levels = torch.stack([torch.ones(7, 7, 7), sphere(6), -torch.ones(7, 7, 7), torch.ones(7, 7, 7)]).to(device)
+    levels.requires_grad_()
+    found = extract_surfaces(levels, radius=1.0)
+    assert [len(m.faces) > 0 for m in found] == [False, True, True, False]
+    (g,) = torch.autograd.grad(sum(m.vertices.square().sum() for m in found), levels)
+    assert bool(torch.isfinite(g).all())
+    assert [bool(g[i].abs().max() > 0) for i in range(4)] == [False, True, False, False]
+    alone = extract_surface(levels[1].detach(), radius=1.0)
+    assert torch.equal(found[1].vertices.detach(), alone.vertices)
+
+
+def test_what_can_be_said_of_no_faces_is_said():
+    with_all = Mesh(NOTHING.vertices, NOTHING.faces, torch.zeros(0, 3), torch.zeros(0, 2), torch.zeros(0, 4))
+    loose = Mesh(torch.rand(4, 3), NOTHING.faces)  # vertices that no face uses
+    for mesh in (NOTHING, with_all, loose):
+        n = len(mesh.vertices)
+        found = report(mesh)
+        assert (found.vertices, found.faces, found.components, found.watertight) == (n, 0, 0, False)
+        assert not meshes.watertight(mesh) and float(volume(mesh)) == 0.0
+        assert vertex_normals(mesh.vertices, mesh.faces).tolist() == [[0.0, 0.0, 1.0]] * n
+        assert meshes.face_normals(mesh.vertices, mesh.faces).shape == (0, 3)
+        assert len(mesh.with_normals().normals) == n
+        assert meshes.face_components(mesh).shape == (0,)
+        assert meshes.largest_components(mesh) is mesh
+        assert len(meshes.select_faces(mesh, torch.zeros(0, dtype=torch.bool)).vertices) == 0
+        assert [len(part) for part in meshes.weld(mesh.vertices)] == [n, n]
+        assert holes(mesh) == [] and len(fill_holes(mesh).faces) == 0
+        for smooth in (laplacian_smooth, taubin_smooth):
+            assert torch.equal(smooth(mesh).vertices, mesh.vertices)
+        back = meshes.from_trimesh(meshes.to_trimesh(mesh))
+        assert torch.equal(back.vertices, mesh.vertices) and back.faces.shape == (0, 3)
+    assert vertex_tangents(with_all).shape == (0, 4)
+    assert not bool(rasterize_texels(with_all, 8).valid.any()) and int(coverage(with_all, 8).max()) == 0
+
+
+@pytest.mark.parametrize(
+    "call, module",
+    [
+        (lambda m: decimate(m, 10), "fast_simplification"),
+        (lambda m: remesh(m, 10), "pyacvd"),
+        (lambda m: repair(m), "manifold3d"),
+        (lambda m: unwrap(m), "numpy"),
+        (lambda m: unwrap_xatlas(m), "xatlas"),
+        (lambda m: atlas_report(m), "numpy"),
+        (lambda m: bake(m, 8, lambda p, n: p), "numpy"),
+        (lambda m: glb_bytes(Asset(m, TextureSet(torch.zeros(4, 4, 3), 0.0, 0.0))), "numpy"),
+    ],
+)
+def test_what_needs_a_face_says_so_in_one_line(call, module):
+    pytest.importorskip(module)
+    mesh = Mesh(NOTHING.vertices, NOTHING.faces, torch.zeros(0, 3), torch.zeros(0, 2), torch.zeros(0, 4))
+    with pytest.raises(ValueError, match=r"^[\w.]*mesh[\w.]*: expected .*, got .*$"):
+        call(mesh)
+
+
+def test_the_command_names_an_empty_field_in_one_line_and_writes_nothing(tmp_path, capsys):
+    model, manifest = load(locate("small"))
+    with torch.no_grad():
+        model.heads["density"][-1].bias.fill_(-1e4)
+    save(tmp_path / "blind.safetensors", model, licence=manifest.licence)
+    options = ["--weights", str(tmp_path / "blind.safetensors"), "--texture-size", "256", "--resolution", "24"]
+    assert infer.main(["--output", str(tmp_path / "out"), "--device", "cpu", *options]) == 2
+    out, err = capsys.readouterr()
+    lines = [line for line in err.replace("\r", "\n").split("\n") if line.startswith("reli3d-infer: ")]
+    assert out == "" and len(lines) == 1 and lines[0].endswith(": no surface") and "Traceback" not in err
+    assert not (tmp_path / "out").exists()

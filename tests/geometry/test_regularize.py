@@ -1,0 +1,136 @@
+"""FlexiCubes regularisers against float64 formulations and closed forms; fields in batches."""
+
+import math
+
+import pytest
+import torch
+from scipy.spatial import cKDTree
+
+from reli3d.geometry.mesh import report
+from reli3d.geometry.regularize import sign_entropy, vertex_deviation
+from reli3d.geometry.surface import extract_surface, extract_surfaces, surface_cubes
+from tests.support import reference_surface
+from tests.support.reference_surface import random_weights, sphere
+
+F = torch.nn.functional
+
+
+def test_deviation_and_gradients_match_the_plain_float64_formulation(device):
+    rng = torch.Generator().manual_seed(3)
+    level = F.pad(torch.randn(6, 5, 7, generator=rng), (1,) * 6, value=0.7)  # no cube of the padding is needed
+    weights = random_weights(level.shape, 5, spread=0.5)
+    weights.pop("gamma")
+    leaves = {"level": level, **weights}
+    ours = {k: v.to(device).requires_grad_() for k, v in leaves.items()}
+    double = {k: v.double().requires_grad_() for k, v in leaves.items()}
+    arguments = {k: v for k, v in ours.items() if k != "level"}
+    spread = vertex_deviation(ours["level"], radius=0.8, **arguments)
+    mesh = extract_surface(ours["level"], radius=0.8, **arguments)
+    plain, _ = reference_surface.flexicubes_vertices(**double, scale=1.6)
+    want = reference_surface.flexicubes_deviation(**double, scale=1.6)
+    _, match = cKDTree(mesh.vertices.detach().cpu().numpy()).query(plain.detach().numpy())
+    assert len(spread) == len(want) == len(set(match.tolist()))
+    got = spread[torch.from_numpy(match).to(device)]
+    torch.testing.assert_close(got.cpu().double(), want, rtol=0, atol=1e-6)  # float32 differences of positions below 1
+    share = torch.rand(len(want), generator=rng)
+    got = torch.autograd.grad((got * share.to(device)).sum(), list(ours.values()))
+    true = torch.autograd.grad((want * share.double()).sum(), list(double.values()))
+    for name, a, b in zip(ours, got, true, strict=True):
+        assert b.abs().max() > 0, name
+        # float64 inside, so what is left is float32 sums over eight cubes
+        torch.testing.assert_close(a.cpu().double(), b, rtol=1e-5, atol=1e-7 * float(b.abs().max()), msg=name)
+
+
+def test_deviation_of_a_flat_cut_vanishes_and_pulls_a_skewed_one_back():
+    x = torch.linspace(-1, 1, 5)
+    plane = (x[:, None, None] - 0.1).expand(5, 5, 5).contiguous()
+    spread = vertex_deviation(plane, radius=1.0, closed=False)
+    assert float(spread.max()) < 1e-6  # the vertex is as far from all four crossings
+    beta = torch.rand(64, 12, generator=torch.Generator().manual_seed(1)) + 0.5
+    losses = []
+    for _ in range(40):
+        beta = beta.detach().requires_grad_()
+        loss = vertex_deviation(plane, radius=1.0, closed=False, beta=beta).mean()
+        losses.append(float(loss.detach()))
+        beta = beta - 20.0 * torch.autograd.grad(loss, beta)[0]
+    assert losses[-1] < 0.3 * losses[0]
+
+
+def test_deviation_follows_the_vertices_of_a_closed_field_at_the_box(device):
+    level = sphere(6, radius=1.1, device=device).requires_grad_()
+    cubes = surface_cubes(level)
+    weights = {name: value[cubes.cpu()].to(device) for name, value in random_weights((7,) * 3, 2).items()
+               if name in ("alpha", "beta")}  # fmt: skip
+    spread = vertex_deviation(level, radius=1.0, cubes=cubes, **weights)
+    assert len(spread) == len(extract_surface(level, radius=1.0, cubes=cubes, **weights).vertices)
+    (g,) = torch.autograd.grad(spread.mean(), level)
+    assert bool(torch.isfinite(spread).all() & torch.isfinite(g).all()) and float(g.abs().max()) > 0
+
+
+def test_entropy_matches_cross_entropy_in_float64(device):
+    level = torch.randn(2, 4, 5, 6, generator=torch.Generator().manual_seed(0)) * 3
+    ours, double = level.to(device).requires_grad_(), level.double().requires_grad_()
+    terms = []
+    for axis in (1, 2, 3):
+        n = level.shape[axis]
+        a, b = double.narrow(axis, 0, n - 1), double.narrow(axis, 1, n - 1)
+        change = (a < 0) != (b < 0)
+        a, b = a[change], b[change]
+        terms.append(F.binary_cross_entropy_with_logits(a, (b > 0).double(), reduction="none")
+                     + F.binary_cross_entropy_with_logits(b, (a > 0).double(), reduction="none"))  # fmt: skip
+    want, got = torch.cat(terms).mean(), sign_entropy(ours)
+    torch.testing.assert_close(got.cpu().double(), want, rtol=1e-6, atol=0)  # a float32 sum of 300 like terms
+    torch.testing.assert_close(torch.autograd.grad(got, ours)[0].cpu().double(), torch.autograd.grad(want, double)[0],
+                               rtol=1e-5, atol=1e-9)  # fmt: skip
+
+
+def test_entropy_of_one_change_is_the_closed_form_and_a_uniform_field_has_none():
+    level = torch.ones(2, 2, 2)
+    level[0] = -1.0
+    assert float(sign_entropy(level)) == pytest.approx(2 * math.log1p(math.e), rel=1e-6)
+    one_sign = torch.ones(3, 3, 3, requires_grad=True)
+    sign_entropy(one_sign).backward()
+    assert float(sign_entropy(one_sign.detach())) == 0.0 and float(one_sign.grad.abs().max()) == 0.0
+
+
+def test_entropy_removes_a_floater_that_nothing_holds():
+    level = sphere(8, radius=0.5)
+    level[1, 1, 1] = -0.05
+    assert report(extract_surface(level, radius=1.0)).components == 2
+    for _ in range(5):
+        level = level.detach().requires_grad_()
+        level = level - 3.0 * torch.autograd.grad(sign_entropy(level), level)[0]
+    assert float(level[1, 1, 1].detach()) > 0.0
+
+
+def test_a_batch_is_the_fields_one_by_one(device):
+    levels = torch.stack([sphere(5, radius, device) for radius in (0.4, 0.7)])
+    weights = [random_weights((6,) * 3, seed, device) for seed in (0, 1)]
+    stacked = {name: torch.stack([w[name] for w in weights]) for name in weights[0]}
+    for fields in (stacked, {name: list(value) for name, value in stacked.items()}):
+        for level, own, got in zip(levels, weights, extract_surfaces(levels, radius=1.0, **fields), strict=True):
+            alone = extract_surface(level, radius=1.0, **own)
+            assert torch.equal(got.vertices, alone.vertices) and torch.equal(got.faces, alone.faces)
+    sizes = [len(m.vertices) for m in extract_surfaces([sphere(4), sphere(6)], radius=1.0)]
+    assert sizes[0] < sizes[1]
+
+
+@pytest.mark.parametrize(
+    "call, error, name",
+    [
+        (lambda: sign_entropy(torch.ones(3, 3)), ValueError, "level"),
+        (lambda: sign_entropy(torch.ones(3, 3, 1)), ValueError, "level"),
+        (lambda: sign_entropy(torch.ones(3, 3, 3, dtype=torch.float64)), TypeError, "level"),
+        (lambda: sign_entropy(torch.full((3, 3, 3), float("nan"))), ValueError, "level"),
+        (lambda: vertex_deviation(torch.ones(3, 3), radius=1.0), ValueError, "level"),
+        (lambda: vertex_deviation(sphere(4), radius=-1.0), ValueError, "radius"),
+        (lambda: vertex_deviation(sphere(4), radius=1.0, beta=torch.zeros(64, 12)), ValueError, "beta"),
+        (lambda: vertex_deviation(sphere(4), radius=1.0, alpha=torch.ones(9, 8)), ValueError, "alpha"),
+        (lambda: extract_surfaces([], radius=1.0), ValueError, "levels"),
+        (lambda: extract_surfaces([sphere(4)], radius=1.0, alpha=torch.ones(2, 64, 8)), ValueError, "alpha"),
+        (lambda: extract_surfaces([sphere(4)], radius=1.0, delta=torch.ones(1)), TypeError, "delta"),
+    ],
+)
+def test_wrong_input_is_named(call, error, name):
+    with pytest.raises(error, match=name):
+        call()

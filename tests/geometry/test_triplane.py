@@ -1,0 +1,187 @@
+"""sample_triplane against torch's grid_sample in float64, the published release's features, and itself."""
+
+import numpy as np
+import pytest
+import torch
+
+from reli3d.geometry.triplane import CACHED, _is_walk, sample_triplane
+from tests.support.reference import grid_samples, share_within
+
+
+def inputs(batch=2, channels=13, height=9, width=11, n=300, device="cpu", seed=0):
+    rng = torch.Generator().manual_seed(seed)
+    planes = torch.randn(batch, 3, channels, height, width, generator=rng)
+    points = torch.rand(batch, n, 3, generator=rng) * 2.6 - 1.3  # some beyond the last texel
+    weights = torch.randn(batch, n, 3 * channels, generator=rng)
+    return planes.to(device), points.to(device), weights.to(device)
+
+
+@pytest.mark.parametrize("channels, height, width", [(1, 1, 1), (3, 2, 5), (8, 16, 4), (40, 24, 24), (13, 300, 280)])
+def test_values_and_gradients_match_grid_sample_in_float64(device, channels, height, width):
+    planes, points, weights = inputs(2, channels, height, width, 300, device)
+    planes, points = planes.requires_grad_(), points.requires_grad_()
+    got = sample_triplane(planes, points)
+    reference = [planes.detach().double().requires_grad_(), points.detach().double().requires_grad_()]
+    want = grid_samples(*reference)
+    torch.testing.assert_close(got.double(), want, rtol=0, atol=5e-6)  # float32 sums of four values of up to 5
+    g_got = torch.autograd.grad((got * weights).sum(), (planes, points))
+    g_want = torch.autograd.grad((want * weights.double()).sum(), reference)
+    torch.testing.assert_close(g_got[0].double(), g_want[0], rtol=0, atol=4e-5)  # of 600 points where there is 1 texel
+    # the slope jumps at a texel centre, which rounding may move a point across: none of these 600 points lies there
+    for a, b in zip((got, *g_got), (want, *g_want), strict=True):
+        assert share_within(a, b) >= 0.999
+
+
+def test_the_twin_has_the_gradients_of_finite_differences():
+    planes, points, _ = inputs(1, 2, 4, 5, 6)
+    leaves = [v.double().requires_grad_() for v in (planes, points)]
+    assert torch.autograd.gradcheck(grid_samples, leaves, eps=1e-6, atol=1e-5, rtol=1e-3)
+
+
+def test_features_match_the_published_release(goldens, device):
+    data = np.load(goldens / "object_representation_heads.npz")
+    planes, points = (torch.from_numpy(data[k]).to(device) for k in ("triplane", "positions"))
+    got = sample_triplane(planes, points / 0.87).cpu()
+    torch.testing.assert_close(got, torch.from_numpy(data["features"]), rtol=0, atol=2e-5)  # float32 of values up to 4
+
+
+def test_a_texel_centre_gives_the_texel_and_a_face_of_the_cube_half(device):
+    planes = torch.zeros(1, 3, 2, 4, 8, device=device)
+    planes[0, :, :, 1, 6] = 1.0
+    planes[0, 0, 1] *= 3.0
+    x, y = (6 + 0.5) / 8 * 2 - 1, (1 + 0.5) / 4 * 2 - 1
+    got = sample_triplane(planes, torch.tensor([[[x, y, y], [x, -1.0, 5.0]]], device=device))[0].cpu()
+    assert got[0].tolist() == [1.0, 3.0, 1.0, 1.0, 0.0, 0.0]  # YZ takes y along W, where nothing is
+    assert got[1].tolist() == [0.0] * 6
+    ones = torch.ones(1, 3, 1, 4, 8, device=device)
+    border = sample_triplane(ones, torch.tensor([[[1.0, 0.0, 0.0], [1.0, 1.0, 1.0], [1.5, 0.0, 0.0]]], device=device))
+    assert border[0].tolist() == [[0.5, 0.5, 1.0], [0.25, 0.25, 0.25], [0.0, 0.0, 1.0]]
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_half_storage_is_summed_in_float32(device, dtype):
+    planes, points, weights = inputs(1, 8, 6, 7, 4000, device)
+    stored = planes.to(dtype).requires_grad_()
+    got = sample_triplane(stored, points)
+    assert got.dtype == torch.float32
+    torch.testing.assert_close(got, sample_triplane(stored.detach().float(), points), rtol=0, atol=0)
+    grad = torch.autograd.grad((got * weights).sum(), stored)[0]
+    full = stored.detach().float().requires_grad_()
+    want = torch.autograd.grad((sample_triplane(full, points) * weights).sum(), full)[0]
+    assert grad.dtype == dtype
+    assert torch.equal(grad, want.to(dtype))  # rounded once, after the sum over 4000 points
+
+
+def test_layouts_give_the_same_bits(device):
+    planes, points, _ = inputs(2, 16, 10, 12, 500, device)
+    want = sample_triplane(planes, points)
+    channel_last = planes.movedim(2, -1).contiguous().movedim(-1, 2)
+    assert torch.equal(sample_triplane(channel_last, points), want)
+    assert torch.equal(sample_triplane(planes.repeat(1, 2, 1, 1, 1)[:, :3], points.flip(1).flip(1)), want)
+    strided = torch.stack([points, points], -1)[..., 0]
+    assert not strided.is_contiguous()
+    assert torch.equal(sample_triplane(planes, strided), want)
+    assert torch.equal(sample_triplane(planes[:1].expand(2, -1, -1, -1, -1), points)[0], want[0])
+
+
+def test_a_walk_is_read_as_it_comes_and_shuffled_points_by_row_with_the_same_bits():
+    planes, _, _ = inputs(1, 8, 100, 100)
+    assert planes[0, 0].numel() > CACHED
+    t = torch.linspace(0, 300, 6000)
+    walk = torch.stack([0.9 * (0.11 * t).sin(), t / 160 - 0.9, 0.9 * (0.13 * t).cos()], -1)[None]
+    shuffled = torch.randperm(6000, generator=torch.Generator().manual_seed(0))
+    assert _is_walk(walk, 100) and not _is_walk(walk[:, shuffled], 100)
+    assert not _is_walk(torch.full((1, 100, 3), float("nan")), 100) and not _is_walk(walk[:, :0], 100)
+    assert torch.equal(sample_triplane(planes, walk[:, shuffled]), sample_triplane(planes, walk)[:, shuffled])
+
+
+@pytest.mark.parametrize("channels, height, width", [(40, 120, 90), (13, 64, 200)])
+def test_channel_first_planes_are_read_by_rows_with_the_same_bits(channels, height, width):
+    """Scattered points, some outside; rows of cells without any, whole bands of them, and a batch."""
+    planes, points, weights = inputs(2, channels, height, width, 3000)
+    points[1, :, 1] = points[1, :, 1].abs() * 0.3 + 0.4
+    points[0, 5] = float("nan")
+    assert planes[0, 0].numel() > CACHED and not _is_walk(points, max(height, width))
+    channel_last = planes.movedim(2, -1).contiguous().movedim(-1, 2)
+    p, q = planes.requires_grad_(), channel_last.requires_grad_()
+    got, want = sample_triplane(p, points), sample_triplane(q, points)
+    assert torch.equal(got, want)
+    assert torch.equal(*(torch.autograd.grad(f, x, weights)[0] for f, x in ((got, p), (want, q))))
+    assert torch.equal(sample_triplane(planes.detach(), points), want)
+
+
+def test_the_same_bits_for_any_number_of_threads(threads):
+    planes, points, weights = inputs(1, 40, 80, 80, 20000)
+    results = []
+    for count in (1, 2, 5):
+        threads(count)
+        p, q = planes.clone().requires_grad_(), points.clone().requires_grad_()
+        out = sample_triplane(p, q)
+        by_rows = sample_triplane(planes, points)
+        results.append((out.detach(), by_rows, *torch.autograd.grad(out, (p, q), weights)))
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+
+def test_gradient_only_where_asked_and_twice_is_refused(device):
+    planes, points, weights = inputs(device=device)
+    p = planes.clone().requires_grad_()
+    out = sample_triplane(p, points)
+    (g,) = torch.autograd.grad(out, p, weights, retain_graph=True)
+    assert torch.equal(g, torch.autograd.grad(out, p, weights, create_graph=True)[0])
+    q = points.clone().requires_grad_()
+    (g,) = torch.autograd.grad(sample_triplane(planes, q), q, weights)
+    assert g.shape == points.shape
+    (first,) = torch.autograd.grad(sample_triplane(p, points), p, weights.requires_grad_(), create_graph=True)
+    with pytest.raises(RuntimeError, match="twice|once_differentiable"):
+        first.sum().backward()
+
+
+def test_changing_an_input_in_place_before_backward_is_an_error():
+    planes, points, weights = inputs()
+    p, q = planes.requires_grad_(), points.clone()
+    out = sample_triplane(p, q)
+    q.add_(1.0)
+    with pytest.raises(RuntimeError, match="inplace|in-place"):
+        torch.autograd.grad(out, p, weights)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -1e30, 3e38])
+def test_points_at_no_place_have_no_features_and_no_gradient(device, value):
+    planes, points, weights = inputs(device=device)
+    points = points.clone()
+    points[:, ::2] = value
+    p, q = planes.requires_grad_(), points.requires_grad_()
+    out = sample_triplane(p, q)
+    assert bool((out[:, ::2] == 0).all())
+    for g in torch.autograd.grad(out, (p, q), weights):
+        assert bool(torch.isfinite(g).all())
+
+
+def test_empty_batches(device):
+    planes, points, _ = inputs(device=device)
+    p = planes.requires_grad_()
+    out = sample_triplane(p, points[:, :0])
+    assert out.shape == (2, 0, 39)
+    assert bool((torch.autograd.grad(out.sum(), p)[0] == 0).all())
+    assert sample_triplane(planes[:0], points[:0]).shape == (0, 300, 39)
+
+
+@pytest.mark.parametrize(
+    "change, error",
+    [
+        (dict(planes=torch.zeros(2, 3, 4, 5, 6, dtype=torch.float64)), TypeError),
+        (dict(planes=torch.zeros(2, 4, 4, 5, 6)), ValueError),
+        (dict(planes=torch.zeros(3, 4, 5, 6)), ValueError),
+        (dict(planes=torch.zeros(2, 3, 0, 5, 6)), ValueError),
+        (dict(points=torch.zeros(2, 7, 2)), ValueError),
+        (dict(points=torch.zeros(1, 7, 3)), ValueError),
+        (dict(points=torch.zeros(7, 3)), ValueError),
+        (dict(points=torch.zeros(2, 7, 3, dtype=torch.float16)), TypeError),
+        (dict(planes=None), TypeError),
+    ],
+)
+def test_wrong_input_is_named(change, error):
+    arguments = dict(planes=torch.zeros(2, 3, 4, 5, 6), points=torch.zeros(2, 7, 3)) | change
+    with pytest.raises(error, match=f"^{next(iter(change))}: expected"):
+        sample_triplane(**arguments)

@@ -1,0 +1,219 @@
+"""The atlas: every face has area, nothing overlaps, charts keep their distance, and any mesh will do."""
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from bench.surface import field
+from reli3d.geometry import charts, uv
+from reli3d.geometry.bake import coverage, nearest_valid
+from reli3d.geometry.mesh import Mesh
+from reli3d.geometry.surface import extract_surface
+from reli3d.geometry.uv import atlas_report, guard_band, unwrap, unwrap_xatlas
+from tests.support.meshes import QUICK, SLOW, loaded, mesh_of
+
+slow = pytest.mark.slow
+
+
+def icosphere(subdivisions: int) -> Mesh:
+    ball = trimesh.creation.icosphere(subdivisions)
+    return mesh_of(ball.vertices, ball.faces)
+
+
+def ramp(turns: int, steps: int = 12) -> Mesh:
+    """Helical ramp around a hole, every turn exactly above the last: in projection all sheets and edges coincide."""
+    angle = np.arange(turns * steps + 1) * (2 * np.pi / steps)
+    rim = [np.stack([r * np.cos(angle), 0.1 * angle, r * np.sin(angle)], 1) for r in (1.0, 2.0)]
+    k = np.arange(turns * steps)
+    n = len(angle)
+    faces = np.concatenate([np.stack([k, k + 1, n + k], 1), np.stack([k + 1, n + k + 1, n + k], 1)])
+    return mesh_of(np.concatenate(rim), faces)
+
+
+def areas(mesh: Mesh) -> np.ndarray:
+    """Signed area in (u, 1 - v), float64, of the faces as stored in float32."""
+    q = mesh.uv.numpy()[mesh.faces.numpy()].astype(np.float64)
+    d1, d2 = q[:, 1] - q[:, 0], q[:, 2] - q[:, 0]
+    return -0.5 * (d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0])
+
+
+def check_atlas(source: Mesh, result: Mesh, size: int = 2048, rel: float = 3e-3) -> None:
+    area = areas(result)
+    assert (area > 0).all()
+    assert float(result.uv.min()) >= 0.0 and float(result.uv.max()) <= 1.0
+    assert torch.equal(result.vertices[result.faces.long()], source.vertices[source.faces.long()])
+    hits = coverage(result, size)
+    covered = int((hits > 0).sum())
+    assert int((hits > 1).sum()) <= 1e-3 * covered
+    # overlap would make the areas add up to more than is covered; thousands of tiny charts are counted up to 1 % high
+    assert area.sum() <= (1 + rel) * covered / size**2
+    assert area.sum() >= (1 - 5 * rel) * covered / size**2
+
+
+@pytest.mark.parametrize("name", QUICK + [pytest.param(n, marks=slow) for n in SLOW])
+def test_real_meshes_have_area_everywhere_and_no_overlap(shared_data, name):
+    mesh = loaded(shared_data / "meshes" / f"{name}.glb")
+    check_atlas(mesh, unwrap(mesh, texture_size=1024))
+
+
+def test_sphere_fills_the_atlas_with_little_stretch():
+    mesh = icosphere(5)
+    result = unwrap(mesh, texture_size=1024)
+    check_atlas(mesh, result)
+    found = atlas_report(result, texture_size=512)
+    assert found.charts == 6
+    assert found.utilisation > 0.55
+    # a cap of 54.7 degrees seen along its axis: stretch at the tip 1 / cos = 1.73, less the common scale
+    assert found.stretch < 1.05 and found.stretch_max < 1.74
+
+
+@pytest.mark.parametrize("n", [32, pytest.param(80, marks=slow), pytest.param(160, marks=slow)])
+def test_extracted_surfaces_up_to_a_hundred_thousand_faces(n):
+    mesh = extract_surface(field(n, "cpu"), radius=0.87)
+    assert n < 160 or len(mesh.faces) > 100_000
+    check_atlas(mesh, unwrap(mesh, texture_size=1024))
+
+
+def test_a_long_part_does_not_hold_down_the_scale():
+    bar = trimesh.creation.box((30.0, 1.0, 1.0)).subdivide().subdivide().subdivide()
+    mesh = mesh_of(bar.vertices, bar.faces)
+    result = unwrap(mesh, texture_size=512)
+    check_atlas(mesh, result)
+    # 122 units of area; uncut, the longest chart's 30 units would span the side and use 122 / 900 of it
+    assert atlas_report(result, texture_size=512).utilisation > 0.5
+
+
+def test_charts_are_counted_by_their_uv_whether_vertices_are_split_or_not():
+    mesh = icosphere(3)
+    loose = Mesh(mesh.vertices[mesh.faces.reshape(-1).long()], torch.arange(3 * len(mesh.faces)).reshape(-1, 3).int())
+    assert atlas_report(unwrap(loose, texture_size=256), texture_size=256).charts == 6
+
+
+def test_stretch_of_a_plane_is_one_and_of_a_squeezed_one_is_known():
+    corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    square = Mesh(corners, torch.tensor([[0, 1, 2], [0, 2, 3]]).int(),
+                  uv=torch.tensor([[0.0, 1], [1, 1], [1, 0], [0, 0]]))  # fmt: skip
+    assert atlas_report(square, texture_size=64).stretch == pytest.approx(1.0, abs=1e-6)  # float32 coordinates
+    half = Mesh(square.vertices, square.faces, uv=square.uv * torch.tensor([1.0, 0.25]))
+    # singular values 1 and 4, mean scale 2: sqrt((1 + 16) / 2) / 2
+    assert atlas_report(half, texture_size=64).stretch == pytest.approx(np.sqrt(8.5) / 2, rel=1e-5)
+
+
+@pytest.mark.parametrize("size", [256, 512])
+def test_charts_keep_the_guard_band(size):
+    result = unwrap(icosphere(3), texture_size=size)
+    neighbours = charts.face_neighbours(result.faces.numpy())
+    chart, count = charts.components(neighbours, np.zeros(len(neighbours), np.int32))
+    fine = 2  # samples along a texel
+    for c in range(count):
+        own, others = (Mesh(result.vertices, result.faces[torch.from_numpy(m)].contiguous(), uv=result.uv)
+                       for m in (chart == c, chart != c))  # fmt: skip
+        _, square = nearest_valid(coverage(own, size * fine) > 0)
+        gap = float(square[coverage(others, size * fine) > 0].min()) ** 0.5 / fine
+        assert gap >= guard_band(size) - 2.0 / fine  # sample centres lie up to a sample inside on both sides
+        corner = result.uv[own.faces.long()]
+        assert float(torch.minimum(corner, 1 - corner).min()) * size >= 0.5 * guard_band(size) - 1e-3  # float32 uv
+
+
+def test_stacked_sheets_are_told_apart():
+    mesh = ramp(5)
+    result = unwrap(mesh, texture_size=512)
+    check_atlas(mesh, result)
+    assert atlas_report(result, texture_size=512).charts <= 10  # five turns: each one chart, or cut once
+
+
+def test_a_slab_folded_over_itself_is_told_apart():
+    # an S of gentle slope: every face looks up, the sheets lie over each other and cross in projection
+    t = np.linspace(0, 1, 60)
+    path = np.stack([np.cos(4 * np.pi * t) * (1 + t), 0.5 * t, np.sin(4 * np.pi * t) * (1 + t)], 1)
+    side = path * [1.5, 1.0, 1.5]
+    k, n = np.arange(59), 60
+    mesh = mesh_of(np.concatenate([path, side]), np.concatenate([np.stack([k, k + 1, n + k], 1),
+                                                                 np.stack([k + 1, n + k + 1, n + k], 1)]))  # fmt: skip
+    check_atlas(mesh, unwrap(mesh, texture_size=512))
+
+
+def test_degenerate_non_manifold_and_repeated_faces(device):
+    vertices = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0, -1, 0], [0.5, 0, 0], [5, 5, 5]]
+    faces = [[0, 1, 2], [0, 1, 3], [0, 1, 4], [0, 1, 2], [0, 2, 1],  # five faces at one edge, one twice, one turned
+             [0, 5, 1], [3, 3, 1], [2, 2, 2]]  # in line, two corners, one corner; vertex 6 unused  # fmt: skip
+    mesh = mesh_of(vertices, faces)
+    check_atlas(mesh, unwrap(mesh, texture_size=256), size=1024)
+
+
+@pytest.mark.parametrize("faces", [[[0, 1, 2]], [[0, 0, 0]], [[0, 0, 0]] * 300])
+def test_a_single_triangle_and_nothing_but_points(faces):
+    mesh = mesh_of([[0, 0, 0], [1e-3, 0, 0], [0, 1e-3, 0]], faces)
+    result = unwrap(mesh, texture_size=64)
+    assert (areas(result) > 0).all()
+    assert int((coverage(result, 512) > 1).sum()) == 0
+
+
+@pytest.mark.parametrize("scale, offset", [(1e-5, 0.0), (1e6, 0.0), (1.0, 100.0)])
+def test_size_and_place_of_the_mesh_do_not_matter(scale, offset):
+    mesh = icosphere(3)
+    moved = Mesh((mesh.vertices + offset) * scale, mesh.faces)
+    check_atlas(moved, unwrap(moved, texture_size=256), size=1024)
+
+
+def test_a_soup_of_triangles_fits():
+    rng = np.random.default_rng(0)
+    centre = rng.uniform(-1, 1, (3000, 1, 3))
+    corners = centre + rng.normal(0, 0.05, (3000, 3, 3))
+    mesh = mesh_of(corners.reshape(-1, 3), np.arange(9000).reshape(-1, 3))
+    check_atlas(mesh, unwrap(mesh, texture_size=512), rel=2e-2)  # all border: 3,000 triangles of about 150 samples
+
+
+def test_same_bits_again_and_for_any_number_of_threads(threads):
+    mesh, results = icosphere(5), []
+    for n in (1, 2, 5, 1):
+        threads(n)
+        results.append(unwrap(mesh, texture_size=512))
+    for other in results[1:]:
+        assert torch.equal(results[0].uv, other.uv) and torch.equal(results[0].faces, other.faces)
+
+
+def test_normals_are_taken_over_and_gradients_reach_the_vertices():
+    mesh = icosphere(2)
+    vertices = mesh.vertices.clone().requires_grad_()
+    result = unwrap(Mesh(vertices, mesh.faces), texture_size=128)
+    # a unit sphere's area-weighted normals point along its vertices: exact up to the subdivision's unevenness
+    assert float((result.normals * result.vertices).detach().sum(1).min()) > 0.998
+    result.vertices.sum().backward()
+    split = torch.bincount(torch.cdist(result.vertices.detach(), mesh.vertices).argmin(1), minlength=len(mesh.vertices))
+    torch.testing.assert_close(vertices.grad, split[:, None].float().expand(-1, 3))
+    assert not result.uv.requires_grad
+
+
+def test_neighbours_skip_borders_and_crowded_edges():
+    faces = np.array([[0, 1, 2], [2, 1, 3], [4, 5, 6], [5, 4, 7], [4, 5, 8]])
+    assert charts.face_neighbours(faces).tolist() == [[-1, 1, -1], [0, -1, -1], [-1] * 3, [-1] * 3, [-1] * 3]
+
+
+def test_faults_are_named():
+    mesh = icosphere(0)
+    with pytest.raises(ValueError, match="mesh.faces: expected at least one face"):
+        unwrap(Mesh(mesh.vertices, mesh.faces[:0]))
+    with pytest.raises(ValueError, match="finite coordinates"):
+        unwrap(Mesh(mesh.vertices * float("nan"), mesh.faces))
+    with pytest.raises(ValueError, match="texture_size: expected an integer"):
+        unwrap(mesh, texture_size=4)
+    with pytest.raises(TypeError, match="mesh: expected Mesh"):
+        unwrap(mesh.vertices)
+    with pytest.raises(ValueError, match="mesh.uv"):
+        atlas_report(mesh)
+
+
+def test_xatlas_gives_an_atlas_or_a_named_end():
+    mesh = icosphere(2)
+    result = unwrap_xatlas(mesh, texture_size=256)
+    hits = coverage(result, 1024)
+    assert (np.abs(areas(result)) > 0).all() and int((hits > 1).sum()) <= 1e-3 * int((hits > 0).sum())
+    assert torch.equal(result.vertices[result.faces.long()], mesh.vertices[mesh.faces.long()])
+    with pytest.raises(TimeoutError, match="no atlas of 320 faces in 0.01 s"):
+        unwrap_xatlas(mesh, timeout_s=0.01)
+
+
+def test_guard_band_grows_with_the_texture():
+    assert [uv.guard_band(s) for s in (128, 256, 512, 1024, 2048, 4096)] == [2, 2, 4, 4, 8, 16]

@@ -1,0 +1,173 @@
+"""Points looked up in the views: the fused kernel against plain torch, and what pooling promises."""
+
+import pytest
+import torch
+from torch.nn.functional import grid_sample, normalize
+
+from reli3d.geometry.projection import gather_views, pool_views, summarize_views
+from reli3d.kernels import view_features as kernels
+from reli3d.nn.view_features import ViewFeatures, ViewMaps
+from reli3d.render.camera import look_at, project
+from tests.support import reference
+
+SIZE, GRID, WIDTH = 24, 4, 6
+
+
+def rig(views: int, device: torch.device) -> ViewMaps:
+    g = torch.Generator().manual_seed(views)
+    eyes = normalize(torch.randn(views, 3, generator=g), dim=-1) * 2.5
+    c2w = torch.stack([look_at(e, torch.zeros(3), torch.tensor([0.0, 1.0, 0.0])) for e in eyes])
+    images = torch.rand(views, SIZE, SIZE, 4, generator=g)
+    images[..., 3] = images[..., 3] * 12 - 4
+    tokens = torch.randn(views, GRID, GRID, WIDTH, generator=g)
+    intrinsics = torch.tensor([30.0, 28.0, 11.0, 13.0]).expand(views, 4).contiguous()
+    return ViewMaps(*(t.to(device) for t in (tokens, images, c2w, intrinsics)))
+
+
+def surface(n: int, views: int, device: torch.device):
+    g = torch.Generator().manual_seed(n)
+    points = torch.rand(n, 3, generator=g) * 1.6 - 0.8
+    visible = (torch.rand(n, views, generator=g) < 0.5).float()
+    return (t.to(device) for t in (points, visible, normalize(torch.randn(n, 3, generator=g), dim=-1)))
+
+
+def plain(maps: ViewMaps, points, visible, normal):
+    """The same numbers in float64 torch, view by view."""
+    rows = []
+    for v in range(len(maps.images)):
+        c2w, points64 = maps.c2w[v].double(), points.double()
+        xy, depth = project(points64.float(), maps.c2w[v], maps.intrinsics[v])
+        grid = (xy / SIZE * 2 - 1).double()[None, None]
+        image = grid_sample(
+            maps.images[v].double().permute(2, 0, 1)[None], grid, align_corners=False, padding_mode="border"
+        )
+        rgb, silhouette = image[0, :3, 0].T, image[0, 3:, 0].T
+        inside = ((xy > 0) & (xy < SIZE)).all(-1, keepdim=True).double() * (depth[:, None] > 0)
+        seen, facing, share = torch.zeros_like(silhouette), torch.ones_like(silhouette), inside
+        if visible is not None:
+            seen = visible[:, v : v + 1].double() * 2 - 1
+            facing = (normalize(c2w[:3, 3] - points64, dim=-1) * normal.double()).sum(-1, keepdim=True).clamp(min=0)
+            share = inside * (float(kernels.HIDDEN_WEIGHT) + visible[:, v : v + 1].double() * facing**2)
+        edge = silhouette / (float(kernels.EDGE) * SIZE)
+        share = share * edge.clamp(float(kernels.EDGE_MIN), 1) + float(kernels.SHARE_MIN)
+        distance = (silhouette / SIZE).clamp(-0.15, 0.15) / 0.15
+        offset = depth[:, None].double() - (c2w[:3, 3] * c2w[:3, 2]).sum()
+        rows.append(torch.cat([rgb, distance, offset, inside, seen, facing, edge.clamp(-1, 1), share], -1))
+    rows = torch.stack(rows, 1)
+    own, share = rows[..., :9], rows[..., 9]
+    weight = share / share.sum(1, keepdim=True)
+    color = (own[..., :3] * weight[..., None]).sum(1)
+    spread = ((own[..., :3] - color[:, None]) ** 2 * weight[..., None]).sum(1).mean(-1, keepdim=True).sqrt()
+    return (
+        own,
+        weight,
+        torch.cat([color, spread, own[..., 3].amin(1)[:, None], share.amax(1)[:, None], points.double()], -1),
+    )
+
+
+@pytest.mark.parametrize("views", [1, 3, 16])
+@pytest.mark.parametrize("on_surface", [False, True])
+def test_the_kernel_matches_plain_torch(device, views, on_surface):
+    maps = rig(views, device)
+    points, visible, normal = surface(700, views, device)
+    if not on_surface:
+        visible = normal = None
+    got, want = (
+        summarize_views(maps.images, maps.c2w, maps.intrinsics, points, visible, normal),
+        plain(maps, points, visible, normal),
+    )
+    for g, w in zip(got, want, strict=True):
+        # projection in float32: 1e-5 pixel on values that change by up to 12 a pixel; 0.2 % of them divide by EDGE *
+        # size
+        torch.testing.assert_close(g.double(), w, rtol=1e-4, atol=5e-4)
+
+
+def test_gathered_values_and_gradients_equal_their_float64_twin(device):
+    """Border values outside, any channels; the slope of a point by its length, because image and pixels pull apart."""
+    g, n = torch.Generator().manual_seed(3), 20_000
+    maps, points = torch.rand(3, 24, 20, 5, generator=g), torch.rand(n, 3, generator=g) * 1.6 - 0.8
+    poses = rig(3, device)
+    ins = [v.to(device).requires_grad_() for v in (maps, points)]
+    values, pixels = gather_views(*ins, poses.c2w, poses.intrinsics)
+    twin, rows = [v.double().requires_grad_() for v in (maps, points)], []
+    for v in range(3):
+        c2w, intrinsics = poses.c2w[v].cpu().double(), poses.intrinsics[v].cpu().double()
+        local = (twin[1] - c2w[:3, 3]) @ c2w[:3, :3]
+        fx, fy, cx, cy = intrinsics
+        x, y = fx * local[:, 0] / -local[:, 2] + cx, fy * local[:, 1] / local[:, 2] + cy
+        grid = torch.stack([x / 20 * 2 - 1, y / 24 * 2 - 1], -1)[None, None]
+        image = grid_sample(twin[0][v].permute(2, 0, 1)[None], grid, align_corners=False, padding_mode="border")
+        rows.append(torch.cat([image[0, :, 0].T, torch.stack([x, y, -local[:, 2]], -1)], -1))
+    got, want = torch.cat([values, pixels], -1), torch.stack(rows, 1)
+    assert reference.share_within(got, want) >= 0.999
+    weight = torch.rand(want.shape, generator=g)  # of one sign: sums that cancel have no digits left
+    grads = torch.autograd.grad((got * weight.to(device)).sum(), ins)
+    truth = torch.autograd.grad((want * weight.double()).sum(), twin)
+    assert reference.share_within(grads[0], truth[0]) >= 0.999
+    assert reference.rows_within(grads[1], truth[1]) >= 0.999
+
+
+def test_the_order_of_the_views_does_not_matter(device):
+    torch.manual_seed(0)
+    maps, module = rig(4, device), ViewFeatures(WIDTH).to(device)
+    points, visible, normal = surface(200, 4, device)
+    order = torch.tensor([2, 0, 3, 1], device=device)
+    turned = ViewMaps(maps.tokens[order], maps.images[order], maps.c2w[order], maps.intrinsics[order])
+    first, color = module(maps, points, visible, normal)
+    second, again = module(turned, points, visible[:, order], normal)
+    torch.testing.assert_close(first, second, rtol=1e-5, atol=1e-5)  # sums of four in another order
+    torch.testing.assert_close(color, again, rtol=1e-5, atol=1e-5)
+
+
+def test_gradients_reach_the_tokens_and_match_finite_differences(device):
+    torch.manual_seed(0)
+    maps, module = rig(2, device), ViewFeatures(WIDTH).to(device)
+    points, visible, normal = surface(64, 2, device)
+    tokens = maps.tokens.clone().requires_grad_()
+    loss = lambda t: module(ViewMaps(t, maps.images, maps.c2w, maps.intrinsics), points, visible, normal)[0].sum()  # noqa: E731
+    (grad,) = torch.autograd.grad(loss(tokens), tokens)
+    step = torch.randn(tokens.shape, generator=torch.Generator().manual_seed(1)).to(device)
+    slope = (loss(tokens + 1e-2 * step) - loss(tokens - 1e-2 * step)) / 2e-2
+    assert float((grad * step).sum()) == pytest.approx(float(slope.detach()), rel=1e-2)  # float32 sums of 64 x 48 terms
+
+
+def test_half_of_the_arguments_of_a_surface_is_an_error(device):
+    maps = rig(2, device)
+    points, visible, _ = surface(8, 2, device)
+    with pytest.raises(ValueError, match="expected both or none"):
+        summarize_views(maps.images, maps.c2w, maps.intrinsics, points, visible, None)
+
+
+@pytest.mark.parametrize("views", [1, 3, 16])
+@pytest.mark.parametrize("on_surface", [False, True])
+def test_the_fused_pass_gives_what_the_differentiable_one_gives(device, views, on_surface):
+    torch.manual_seed(0)
+    maps, module = rig(views, device), ViewFeatures(WIDTH).to(device)
+    points, visible, normal = surface(700, views, device)
+    if not on_surface:
+        visible = normal = None
+    slow = module(maps, points, visible, normal)
+    with torch.no_grad():
+        fast = module(maps, points, visible, normal)
+    for a, b in zip(fast, slow, strict=True):
+        # float32 sums of 25 products in another order, and the kernel's SiLU, 4e-7 off
+        torch.testing.assert_close(a, b, rtol=1e-5, atol=3e-6)
+
+
+def test_the_layer_saturates_as_silu_does(device):
+    """Far beyond where the rational tanh is cut off, and around zero."""
+    maps = rig(2, device)
+    points, _, _ = surface(64, 2, device)
+    for value in (-80.0, -9.0, -1.0, 0.0, 1e-3, 2.0, 9.0, 80.0):
+        tokens = torch.full((2, GRID, GRID, 8), value, device=device)
+        pooled, _ = pool_views(maps.images, tokens, torch.zeros(9, 8, device=device), maps.c2w, maps.intrinsics,
+                               points, None, None)  # fmt: skip
+        want = torch.nn.functional.silu(torch.tensor(value, dtype=torch.float64)).item()
+        assert pooled.cpu().double().sub(want).abs().max() < 5e-7 * max(1.0, abs(value))  # bilinear weights: 2 ulp
+
+
+def test_a_layer_that_is_no_whole_number_of_registers_is_an_error(device):
+    maps = rig(2, device)
+    tokens, own = torch.zeros(2, GRID, GRID, 12, device=device), torch.zeros(9, 12, device=device)
+    with pytest.raises(ValueError, match="tokens: expected .* H a multiple of 8, got .2, 4, 4, 12."):
+        pool_views(maps.images, tokens, own, maps.c2w, maps.intrinsics, maps.c2w[:, :3, 3].contiguous(), None, None)

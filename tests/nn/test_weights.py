@@ -1,0 +1,303 @@
+"""Files of weights: every published tensor has its place, and a bad file is one line and leaves nothing behind."""
+
+import json
+import os
+import pickle
+from collections import Counter
+
+import pytest
+import torch
+from safetensors import safe_open
+
+from reli3d.nn import weights
+from reli3d.nn.model import Reconstructor
+from reli3d.nn.presets import OFFICIAL, SMALL
+from reli3d.nn.published import our_key
+from reli3d.nn.weights import (
+    WeightsError,
+    convert_checkpoint,
+    default_trunk,
+    known_sha256,
+    load,
+    load_environment,
+    load_model,
+    read_manifest,
+    save,
+    sha256,
+    shapes,
+    write,
+)
+from tests.support.evil import Bomb
+from tests.support.networks import NANO, TINY, views
+
+LICENCE = "Apache-2.0"
+
+
+@pytest.fixture
+def published(goldens):
+    """``{name: shape}`` of the published checkpoint."""
+    listed = json.loads((goldens.parent / "official_state_dict.json").read_text())
+    return {name: tuple(entry[0]) for name, entry in listed.items() if name != "_summary"}
+
+
+def test_every_published_tensor_has_one_place_and_none_is_left(published):
+    ours = shapes(OFFICIAL)
+    assert len(published) == 1774
+    places = {name: our_key(name) for name in published}
+    assert {name for name, place in places.items() if place not in ours} == set()
+    assert set(ours) - set(places.values()) == set()
+    assert {name for name, place in places.items() if ours[place] != published[name]} == set()
+    twice = Counter(places.values())
+    assert sum(count - 1 for count in twice.values()) == 144 and max(twice.values()) == 2
+    numbers = sum(torch.Size(shape).numel() for shape in ours.values())
+    assert numbers == 1_574_452_729 + 1024 + 384  # parameters of the listing, and the two unused mask tokens
+
+
+def aliased(published_names, model):
+    """A state in the published names, aliases included, from a model of other sizes."""
+    state = model.state_dict()
+    return {"system." + name: state[our_key(name)] for name in published_names if our_key(name) in state}
+
+
+@pytest.fixture
+def checkpoint(published, tmp_path):
+    """A tiny network as a checkpoint in the published form, and the network."""
+    torch.manual_seed(0)
+    model = Reconstructor(TINY).eval()
+    for p in model.parameters():  # modulations start at zero, which would hide a mix-up
+        torch.nn.init.normal_(p, std=0.05)
+    path = tmp_path / "published.ckpt"
+    torch.save({"epoch": 3, "state_dict": aliased(published, model) | {"loss.weight": torch.ones(2)}}, path)
+    return path, model
+
+
+@torch.no_grad()
+def test_a_published_checkpoint_converts_and_loads_strictly(checkpoint, tmp_path):
+    path, model = checkpoint
+    target = tmp_path / "converted.safetensors"
+    manifest = convert_checkpoint(path, target, licence="of the model's authors", preset=TINY)
+    assert manifest.licence == "of the model's authors" and manifest.metadata["converted_from"] == sha256(path)
+    loaded, _ = load(target, expected_sha256=sha256(target))
+    assert loaded.preset == TINY and not loaded.training
+    for name, value in model.state_dict().items():
+        torch.testing.assert_close(loaded.state_dict()[name], value, rtol=0, atol=0)
+    inputs = views(1, 2, 76)
+    torch.testing.assert_close(loaded.encode(*inputs).triplane, model.encode(*inputs).triplane, rtol=0, atol=0)
+
+
+def change(path, edit):
+    content = torch.load(path, weights_only=True)
+    edit(content["state_dict"])
+    torch.save(content, path)
+
+
+ALIAS = "system.tokenizer.0.modulations.0.linear2.weight"
+
+
+@pytest.mark.parametrize(
+    "edit, message",
+    [
+        (lambda s: s.pop("system.backbone.latent_init"), "lacks 1 of .* tensors, first backbone.latent_init"),
+        (lambda s: s.update({"system.extra": torch.ones(1)}), "extra: not a tensor of the published model"),
+        (lambda s: s.update({"system.backbone.latent_init": torch.ones(1, 9, 32)}),
+         r"backbone.latent_init: expected shape \(1, 10, 32\), got \(1, 9, 32\)"),
+        (lambda s: s.update({ALIAS: s[ALIAS] + 1}), "expected the values of the same parameter's other name"),
+        (lambda s: s.update({"system.backbone.latent_init": torch.ones(1, 10, 32).int()}), "expected floating-point"),
+        (lambda s: s.clear(), "lacks .* tensors"),
+    ],
+)  # fmt: skip
+def test_a_wrong_checkpoint_is_one_line_and_no_file(checkpoint, tmp_path, edit, message):
+    path, _ = checkpoint
+    change(path, edit)
+    refused(path, tmp_path, message)
+
+
+def refused(path, folder, message):
+    before = set(folder.iterdir())
+    with pytest.raises(WeightsError, match=message) as caught:
+        convert_checkpoint(path, folder / "out.safetensors", licence=LICENCE, preset=TINY)
+    assert "\n" not in str(caught.value) and str(path) in str(caught.value)
+    assert set(folder.iterdir()) == before
+
+
+def test_a_pickle_that_runs_code_is_refused_and_does_not_run(tmp_path):
+    (tmp_path / "files").mkdir()
+    crater = tmp_path / "crater"
+    zipped, plain = tmp_path / "files" / "bomb.ckpt", tmp_path / "files" / "plain.ckpt"
+    torch.save({"state_dict": {"system.x": torch.ones(1)}, "hook": Bomb(crater)}, zipped)
+    plain.write_bytes(pickle.dumps(Bomb(crater)))
+    refused(zipped, tmp_path / "files", "refused, nothing was run")
+    refused(plain, tmp_path / "files", "is not a torch checkpoint|refused, nothing was run")
+    assert not crater.exists()
+
+
+def test_a_checkpoint_that_is_cut_off_empty_or_absent(checkpoint, tmp_path):
+    path, _ = checkpoint
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+    refused(path, tmp_path, "is not a torch checkpoint, or it is cut off")
+    path.write_bytes(b"")
+    refused(path, tmp_path, "is not a torch checkpoint, or it is cut off")
+    path.unlink()
+    refused(path, tmp_path, "file not found")
+    torch.save(torch.ones(3), path)
+    refused(path, tmp_path, "expected tensors under state_dict")
+
+
+@pytest.fixture
+def saved(tmp_path):
+    torch.manual_seed(0)
+    model = Reconstructor(NANO).eval()
+    path = tmp_path / "nano.safetensors"
+    save(path, model, licence=LICENCE, metadata={"steps": "12"})
+    return path, model
+
+
+@torch.no_grad()
+def test_saved_weights_carry_their_preset_and_licence(saved):
+    path, model = saved
+    loaded, manifest = load(path)
+    assert loaded.preset == NANO and manifest.licence == LICENCE and manifest.metadata["steps"] == "12"
+    assert all(p.dtype == torch.float32 and p.requires_grad for p in loaded.parameters())
+    assert manifest.tensors["environment.sample_directions"].dtype == torch.float32  # float16 would bend the map
+    inputs = views(1, 2, 32)
+    expected = model.encode(*inputs).triplane
+    # float16 keeps 11 bits of each weight; the outputs' error is of that order
+    assert (loaded.encode(*inputs).triplane - expected).norm() < 2e-3 * expected.norm()
+    low, _ = load(path, trunk=torch.bfloat16)
+    assert low.backbone.latent_init.dtype == torch.bfloat16 and low.heads["density"][0].weight.dtype == torch.float32
+    with safe_open(path, "pt") as file:  # the reference reader agrees with our writer
+        assert set(file.keys()) == set(model.state_dict())
+        torch.testing.assert_close(file.get_tensor("backbone.latent_init"), model.backbone.latent_init.half())
+
+
+def test_mapped_tensors_are_not_copied(saved, tmp_path):
+    _, model = saved
+    path = tmp_path / "single.safetensors"
+    save(path, model, licence=LICENCE, dtype=torch.float32)
+    loaded, _ = load(path)
+    storages = {p.untyped_storage().data_ptr() for p in loaded.parameters()}
+    assert len(storages) == 1  # all are parts of the one mapping
+
+
+def test_a_failed_save_leaves_the_old_file(saved):
+    path, model = saved
+    before = path.read_bytes()
+    model.backbone.latent_init.data[0, 0, 0] = 1e6  # beyond float16
+    with pytest.raises(WeightsError, match="backbone.latent_init: expected finite values"):
+        save(path, model, licence=LICENCE)
+    assert path.read_bytes() == before and len(list(path.parent.iterdir())) == 1
+
+
+def header_of(path):
+    data = path.read_bytes()
+    length = int.from_bytes(data[:8], "little")
+    return json.loads(data[8 : 8 + length]), data[8 + length :]
+
+
+def rewritten(path, header, body):
+    text = json.dumps(header).encode()
+    path.write_bytes(len(text).to_bytes(8, "little") + text + body)
+
+
+def spoil_header(edit):
+    def spoil(path):
+        header, body = header_of(path)
+        edit(header)
+        rewritten(path, header, body)
+
+    return spoil
+
+
+@pytest.mark.parametrize(
+    "spoil, message",
+    [
+        (lambda p: p.write_bytes(p.read_bytes()[:-1]), "cut off or overlong"),
+        (lambda p: p.write_bytes(p.read_bytes() + b"0"), "cut off or overlong"),
+        (lambda p: p.write_bytes(p.read_bytes()[:100]), "cut off in its header"),
+        (lambda p: p.write_bytes(b"\xff" * 64), "is not a safetensors file"),
+        (lambda p: p.write_bytes(b""), "is not a safetensors file"),
+        (lambda p: torch.save({"state_dict": {}}, p), "is a torch checkpoint, expected safetensors; convert it first"),
+        (lambda p: p.write_bytes((2).to_bytes(8, "little") + b"[]"), "header that is not safetensors'"),
+        (spoil_header(lambda h: h["backbone.latent_init"].update(shape=[1, 8, 31])), "shape and place"),
+        (spoil_header(lambda h: h["backbone.latent_init"].update(dtype="I64")), "header that is not safetensors'"),
+        (spoil_header(lambda h: h["__metadata__"].pop("preset")), "has no preset in its header"),
+        (spoil_header(lambda h: h["__metadata__"].update(preset="{}")), "expected the JSON of a preset"),
+        (spoil_header(lambda h: h.update({"other": h.pop("backbone.latent_init")})), "lacks 1 of"),
+        (lambda p: p.unlink(), "file not found"),
+    ],
+)  # fmt: skip
+def test_a_spoilt_file_is_one_line(saved, spoil, message):
+    path, _ = saved
+    spoil(path)
+    with pytest.raises(WeightsError, match=message) as caught:
+        load(path)
+    assert "\n" not in str(caught.value) and "nano.safetensors" in str(caught.value)
+
+
+def test_names_and_paths_find_their_file(saved, monkeypatch):
+    path, _ = saved
+    assert load_model(path).preset == NANO and load_model(str(path)).preset == NANO
+    monkeypatch.setenv("RELI3D_WEIGHTS", str(path.parent))
+    with pytest.raises(WeightsError, match="official.safetensors: no such file of weights; fetch them with --download"):
+        load_model("official")
+    path.rename(path.with_name("official.safetensors"))
+    assert load_model("official").preset == NANO
+    with pytest.raises(WeightsError, match="gone: no such file of weights; check the path"):
+        load_model(path.parent / "gone")
+
+
+def test_another_preset_or_hash_is_refused(saved):
+    path, _ = saved
+    with pytest.raises(WeightsError, match="tensors"):
+        load(path, TINY)
+    with pytest.raises(WeightsError, match="expected SHA-256 0000, got [0-9a-f]{64}"):
+        load(path, expected_sha256="0000")
+
+
+def test_a_large_file_is_hashed_once_and_a_check_always(saved, monkeypatch):
+    path, _ = saved
+    note, digest, hashed = path.with_name(path.name + ".sha256"), sha256(path), []
+    monkeypatch.setattr(weights, "sha256", lambda p: hashed.append(p) or sha256(p))
+    assert known_sha256(path) == digest and not note.exists()  # a small one leaves nothing
+    monkeypatch.setattr(weights, "LARGE", 1)
+    assert known_sha256(path) == known_sha256(path) == digest and len(hashed) == 2
+    note.write_text(note.read_text().replace(digest, "0" * 64))
+    assert known_sha256(path) == "0" * 64  # it is the note that is read, and so no check:
+    with pytest.raises(WeightsError, match=f"expected SHA-256 0{{64}}, got {digest}"):
+        load(path, expected_sha256="0" * 64)
+    path.write_bytes(path.read_bytes())  # another time of change
+    os.utime(path, ns=(1, 1))
+    assert known_sha256(path) == digest
+    note.write_text("spoilt")
+    assert known_sha256(path) == digest and len(hashed) == 5
+    monkeypatch.setattr(weights, "replacing", lambda p: (_ for _ in ()).throw(PermissionError("read-only folder")))
+    note.unlink()
+    assert known_sha256(path) == digest and not note.exists()
+
+
+def test_bfloat16_is_the_default_for_the_published_sizes_on_cuda_alone(saved):
+    assert [default_trunk(p, d) for p in (OFFICIAL, SMALL) for d in ("cpu", "cuda")] == [
+        torch.float32, torch.bfloat16, torch.float32, torch.float32
+    ]  # fmt: skip
+    path, _ = saved
+    assert load_model(path).dtype == torch.float32 and load_model(path, trunk=torch.bfloat16).dtype == torch.bfloat16
+
+
+def test_published_environment_weights_load(goldens, saved):
+    _, model = saved
+    path = goldens.parent / "reni++L49.safetensors"
+    manifest = load_environment(path, model)
+    assert len(manifest.tensors) == 104
+    with safe_open(path, "pt") as file:
+        torch.testing.assert_close(model.environment.field.network.fc.weight, file.get_tensor("network.fc.weight"))
+
+
+def test_written_files_hold_bfloat16_and_scalars(tmp_path):
+    path = tmp_path / "x.safetensors"
+    state = {"b": torch.arange(6.0).reshape(2, 3).bfloat16(), "a": torch.tensor(2.5), "c": torch.zeros(0, 4)}
+    write(path, state, {})
+    assert read_manifest(path).tensors["b"].shape == (2, 3)
+    with safe_open(path, "pt") as file:
+        for name, value in state.items():
+            torch.testing.assert_close(file.get_tensor(name), value, rtol=0, atol=0)

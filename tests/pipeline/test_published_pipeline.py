@@ -1,0 +1,204 @@
+"""The way of the published model from views to files, at sizes that run in seconds."""
+
+import json
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from reli3d import pipeline
+from reli3d.cli import infer
+from reli3d.geometry.mesh import report
+from reli3d.geometry.surface import extract_surface, surface_cubes
+from reli3d.io.hdr import read_environment, read_hdr_image
+from reli3d.nn import field
+from reli3d.nn.heads import deformation
+from reli3d.nn.model import Code, Reconstructor
+from reli3d.nn.published import our_key
+from reli3d.nn.weights import load_model, read_manifest, read_tensors, save
+from reli3d.output import results
+from reli3d.pipeline import NoSurface, default_normalization, prepare, reconstruct
+from reli3d.views.folder import load_views
+from reli3d.views.published_views import published_views
+from reli3d.views.similarity import Similarity
+from tests.support.checkout import SHARED
+from tests.support.networks import NANO, TINY, views
+
+EXAMPLE = load_views(infer.EXAMPLE, views=2)
+
+
+@pytest.fixture(scope="module")
+def tiny():
+    """The network of the golden ``tiny_system``: its field crosses the threshold all over the cube."""
+    goldens = SHARED / "reference" / "goldens"
+    if not goldens.is_dir():
+        pytest.skip("needs the folder ../shared/reference/goldens beside the checkout")
+    model = Reconstructor(TINY).eval()
+    with np.load(goldens / "tiny_system.npz") as file:
+        state = {our_key(k[6:]): torch.from_numpy(file[k]) for k in file.files if k.startswith("param.")}
+    published = read_manifest(goldens.parent / "reni++L49.safetensors")
+    reni = read_tensors(published, {name: torch.float32 for name in published.tensors})
+    state |= {"environment.field." + k: v for k, v in reni.items()}
+    model.load_state_dict(state | {"environment.sample_directions": model.environment.sample_directions}, strict=True)
+    return model
+
+
+@torch.no_grad()
+def test_weights_asked_for_near_the_surface_give_the_published_mesh(goldens):
+    data = np.load(goldens / "object_representation_mesh16.npz")
+    heads = np.load(goldens / "object_representation_heads.npz")
+    state = {our_key("object_representation." + k[6:]): torch.from_numpy(heads[k]) for k in heads if k[:6] == "param."}
+    model = Reconstructor(TINY).eval()
+    missing, unknown = model.load_state_dict(state, strict=False)
+    assert not unknown and not [k for k in missing if k.startswith(("heads.", "merger."))]
+    none = torch.zeros(1)
+    code = Code(torch.from_numpy(data["triplane"]), none, none, none, none)
+    flat = pipeline._grid(16, 0.87, torch.device("cpu")).reshape(-1, 3)
+    level = model.level(model.query(code, flat[None], ("density",))["density"])[0, :, 0].view(17, 17, 17)
+    weights = field.Field(model, code, None).cube_weights(flat, level)
+    got = extract_surface(level, radius=0.87, closed=False, **weights)
+    assert np.array_equal(got.faces.numpy(), data["faces"])
+    # density is exp of a sum of 64 products: 1e-5 relative, over slopes of about 1 a cell of 0.1
+    np.testing.assert_allclose(got.vertices.numpy(), data["v_pos"], rtol=0, atol=1e-5)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("half_space", [False, True])
+def test_weights_near_the_surface_are_those_of_the_whole_grid(tiny, half_space):
+    """Also where the cap stands on the box, away from every cube that the surface crosses inside."""
+    code, n = tiny.encode(*views(1, 2, 76)), 12
+    flat = pipeline._grid(n, 0.87, torch.device("cpu")).reshape(-1, 3)
+    raw = tiny.query(code, flat[None], ("density", "deformation", "flexicubes"))
+    level = tiny.level(raw["density"])[0, :, 0].view(13, 13, 13)
+    if half_space:
+        level = (flat[:, 1] - 0.05).view(13, 13, 13)
+    corner = raw["flexicubes"][0].view(13, 13, 13, 16)
+    eight = [corner[i : i + n, j : j + n, k : k + n] for k in (0, 1) for j in (0, 1) for i in (0, 1)]
+    dense = tiny.merger(torch.stack(eight, -2).view(n**3, 8, 16))
+    want = extract_surface(level, radius=0.87, deformation=deformation(raw["deformation"][0], n).view(13, 13, 13, 3),
+                           alpha=dense.alpha, beta=dense.beta, gamma=dense.gamma)  # fmt: skip
+    weights = field.Field(tiny, code, None).cube_weights(flat, level)
+    assert len(weights["alpha"]) == len(surface_cubes(level))
+    got = extract_surface(level, radius=0.87, **weights)
+    assert torch.equal(got.faces, want.faces)
+    # products of other shapes sum in another order: a few units in the last place of 0.87
+    torch.testing.assert_close(got.vertices, want.vertices, rtol=0, atol=2e-6)
+
+
+@torch.no_grad()
+def test_the_grid_is_asked_by_planes_and_gives_the_level_of_its_points(tiny, monkeypatch):
+    """Also in pieces that do not divide it, with the box of one axis away from the middle."""
+    monkeypatch.setattr(tiny, "preset", replace(tiny.preset, offset_many_views=0.03))
+    code, maps = tiny.encode(*views(1, 2, 76)), SimpleNamespace(c2w=torch.zeros(2, 4, 4))
+    axis = torch.linspace(-0.8, 0.6, 15)
+    own = field.Field(tiny, code, maps)
+    want = own.free_level(torch.cartesian_prod(axis, axis, axis)).view(15, 15, 15)
+    assert float(want.min()) < 0 < float(want.max())
+    for rows in (8192, 100, 1):
+        monkeypatch.setattr(field, "ROWS", rows)
+        # sums of 24 float32 products in another order, behind exp
+        torch.testing.assert_close(own.grid_level(axis), want, rtol=1e-4, atol=1e-4)
+    with pytest.raises(ValueError, match="preset: expected one without point features"):
+        Reconstructor(NANO).grid_density(code, axis)
+
+
+@torch.no_grad()
+def test_the_release_s_preparation_is_a_switch_of_the_preset(tiny):
+    prepared = prepare(tiny, EXAMPLE, Similarity.identity())
+    want = published_views(EXAMPLE, 76)
+    assert torch.equal(prepared.batch.images, want.images) and torch.equal(prepared.batch.masks, want.masks)
+    assert torch.equal(prepared.batch.c2w, EXAMPLE.c2w)
+    torch.testing.assert_close(prepared.batch.intrinsics, want.intrinsics)
+    own = prepare(Reconstructor(NANO), EXAMPLE, Similarity.identity()).batch
+    cropped = EXAMPLE.resampled(NANO.image_size, crop=True)
+    assert torch.equal(own.images, cropped.images) and torch.equal(own.intrinsics, cropped.intrinsics)
+    assert default_normalization(TINY) == "none" and default_normalization(NANO) == "auto"
+
+
+def test_hero_background_and_frame_reach_the_network(tiny, monkeypatch):
+    seen = {}
+
+    def encode(images, masks, c2w, intrinsics, *, background_visible):
+        seen.update(c2w=c2w, background=background_visible)
+        raise InterruptedError
+
+    monkeypatch.setattr(tiny, "encode", encode)
+
+    def run(**options):
+        with pytest.raises(InterruptedError):
+            reconstruct(EXAMPLE, weights=tiny, texture_size=256, **options)
+        return seen["background"].tolist(), seen["c2w"][0]
+
+    background, c2w = run()
+    assert background == [False] and torch.equal(c2w, EXAMPLE.c2w)  # poses as stored
+    background, c2w = run(hero=1, background="visible")
+    assert background == [True] and torch.equal(c2w, EXAMPLE.c2w[[1, 0]])
+    moved = run(normalization="hull")[1]
+    assert (moved - EXAMPLE.c2w).abs().max() > 1e-3
+    with pytest.raises(ValueError, match="hero: expected"):
+        reconstruct(EXAMPLE, weights=tiny, hero=2)
+    with pytest.raises(ValueError, match="background: expected"):
+        reconstruct(EXAMPLE, weights=tiny, background="grey")
+
+
+@pytest.fixture(scope="module")
+def asset(tiny):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pipeline, "visible_from", None)  # nothing asks which view sees a point
+        patch.setattr(pipeline, "RayScene", None)
+        return reconstruct(EXAMPLE, weights=tiny, texture_size=256, resolution=16)
+
+
+def test_views_become_an_asset_without_looking_at_them_again(asset):
+    found = report(asset.mesh)
+    assert found.watertight and found.manifold
+    roughness = asset.textures.roughness
+    assert 0.1**0.5 - 1e-6 <= float(roughness.min()) <= float(roughness.max()) <= 1.0  # the head's range is [0.1, 1]
+    assert bool(asset.environment.radiance.isfinite().all()) and asset.environment.radiance.shape == (64, 128, 3)
+
+
+@pytest.mark.parametrize("bias", [-50.0, 50.0])
+def test_a_field_of_one_sign_is_an_error_and_not_a_box(tiny, bias):
+    empty = Reconstructor(TINY).eval()
+    empty.load_state_dict(tiny.state_dict())
+    with torch.no_grad():
+        empty.heads["density"][-1].bias.fill_(bias)
+    with pytest.raises(NoSurface, match=r"^level: expected values on both sides of 0, got \[.*\]: no surface$"):
+        reconstruct(EXAMPLE, weights=empty, texture_size=256, resolution=16)
+
+
+def test_exported_roughness_is_the_root_of_the_published_number(tiny, asset):
+    same = Reconstructor(replace(TINY, roughness_is_alpha=False)).eval()
+    same.load_state_dict(tiny.state_dict())
+    release = reconstruct(EXAMPLE, weights=same, texture_size=256, resolution=16)
+    ours, theirs = asset.textures.roughness, release.textures.roughness
+    # the same width alpha in a viewer that squares, after baking means roots of texels beyond the charts as well
+    torch.testing.assert_close(ours.square(), theirs, rtol=0, atol=1e-5)
+    assert float((ours - theirs).max()) > 0.05  # shown as it is, the release's number is too glossy
+
+
+def test_the_command_takes_published_weights_and_writes_published_names(tiny, tmp_path, capsys):
+    weights = tmp_path / "tiny.safetensors"
+    save(weights, tiny, licence="of the test", dtype=torch.float32)
+    arguments = [str(infer.EXAMPLE), "--weights", str(weights), "--output", str(tmp_path / "out"), "--device", "cpu",
+                 "--views", "2", "--texture-size", "256", "--resolution", "16", "--compatible-names"]  # fmt: skip
+    assert infer.main([*arguments, "--hero", "1", "--background", "visible", "--precision", "bfloat16"]) == 0
+    folder = tmp_path / "out" / "example"
+    assert sorted(p.name for p in folder.iterdir()) == sorted((*results.FILES, "illumination.hdr"))
+    published, light = read_hdr_image(folder / "illumination.hdr"), read_environment(folder / "environment.hdr")
+    assert torch.equal(published, light)  # as the release lays it out: the centre column -Z
+    info = json.loads((folder / "run_info.json").read_text())
+    assert info["environment_centre"] == "+X"
+    assert info["views"] == list(EXAMPLE.names[::-1]) and info["background"] == "visible"
+    assert info["precision"] == "bfloat16" and load_model(weights).dtype == torch.float32
+    assert info["model_from_input"] == torch.eye(4).tolist()  # poses as stored
+    capsys.readouterr()
+    assert infer.main([*arguments, "--skip-existing"]) == 0
+    assert "skipped" in capsys.readouterr().err
+    (folder / "illumination.hdr").unlink()
+    assert not results.complete(folder, compatible=True) and results.complete(folder)
+    for hero in ("2", "-1", "first"):
+        assert infer.main([*arguments, f"--hero={hero}"]) == 2
+        assert "hero: expected random or 0 to 1 with 2 views" in capsys.readouterr().err

@@ -1,0 +1,111 @@
+"""The documents: every Python block runs, every link and path leads somewhere, the design names the rooms there are."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+import reli3d
+from reli3d.io.hdr import write_environment
+from tests.support.checkout import ROOT, copied
+from tests.support.layers import LAYERS
+
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
+NOT_RUN = "<!-- not run:"  # stands on a line of its own before a block
+FILE = re.compile(r"# ([\w/]+\.py)\n")  # first line of a block that is a file of the repository
+
+
+def blocks(page: Path, language: str = "python") -> list[str]:
+    """Code of the fenced blocks of a page, each moved down to the line where it stands there."""
+    text, found = page.read_text(), []
+    for block in re.finditer(rf"^```{language}\n(.*?)^```", text, re.MULTILINE | re.DOTALL):
+        above = text[: block.start(1)]
+        if NOT_RUN not in above.rstrip().removesuffix(f"```{language}").rstrip().rpartition("\n")[2]:
+            found.append("\n" * above.count("\n") + block.group(1))
+    return found
+
+
+def name_of(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+WITH_CODE = [page for page in PAGES if any(not FILE.match(code.lstrip("\n")) for code in blocks(page))]
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch) -> Path:
+    """Working folder with what a reader has: an object folder ``photos/shoe`` and a light ``studio.hdr``."""
+    shutil.copytree(Path(reli3d.__file__).parent / "assets" / "example", tmp_path / "photos" / "shoe")
+    write_environment(tmp_path / "studio.hdr", torch.rand(16, 32, 3, generator=torch.Generator().manual_seed(0)))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize("page", WITH_CODE, ids=name_of)
+def test_code_of_a_page_runs_from_top_to_bottom(page, folder):
+    names = {"__name__": "page"}
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        for code in blocks(page):
+            exec(compile(code, str(page), "exec"), names)
+
+
+def test_pages_with_code_are_found():
+    assert {"README.md", "docs/renderer.md", "docs/geometry.md"} <= set(map(name_of, WITH_CODE))
+
+
+def test_a_block_that_is_not_to_run_is_left_out(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text("a\n```python\none\n```\n<!-- not run: no GPU -->\n```python\ntwo\n```\n\n```python\nthree\n```\n")
+    assert [code.strip() for code in blocks(page)] == ["one", "three"]
+    assert blocks(page)[1].index("three") == 10  # on the line where it stands
+
+
+def test_the_kernel_of_the_contributors_page_works_in_the_package(tmp_path):
+    """Its files are written into a copy: test, layout and bench case."""
+    copied(tmp_path)
+    for code in blocks(ROOT / "CONTRIBUTING.md"):
+        (tmp_path / FILE.match(code.lstrip("\n")).group(1)).write_text(code)
+    paths = {path for path in tmp_path.rglob("*solid_angle.py") if not path.is_symlink()}
+    assert len(paths) == 4 == len(blocks(ROOT / "CONTRIBUTING.md"))
+    env = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    bench = "from bench.solid_angle import CASES; build, options = CASES['angles']; build('cpu', n=1000)[0]()"
+    tests = ["-m", "pytest", "-q", "-p", "no:cacheprovider", "tests/geometry/test_solid_angle.py",
+             "tests/project/test_structure.py", "-k", "solid_angle"]  # fmt: skip
+    for command in (tests, ["-c", bench]):
+        done = subprocess.run([sys.executable, *command], cwd=tmp_path, env=env, capture_output=True, text=True)
+        assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_links_and_paths_of_a_page_lead_somewhere(page):
+    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
+    for target in re.findall(r"\]\(([^)#\s]+)", text):
+        assert target.startswith("https://") or (page.parent / target).exists(), target
+    if page.name == "CHANGELOG.md":  # names what is gone
+        return
+    for path in re.findall(r"`((?:reli3d|tests|bench|examples|docs)/[\w/.-]*\w)`", text):
+        assert (ROOT / path).exists(), path
+    rooms = "|".join(set().union(*LAYERS))
+    for path in re.findall(rf"`((?:{rooms})/\w+\.py)`", text):
+        assert (ROOT / "reli3d" / path).exists(), path
+    assert not re.search(r"HOUSE_STYLE|DESIGN\.md|\.\./shared", text)
+
+
+def test_the_design_names_the_rooms_of_the_import_test_in_their_order_and_is_short():
+    text = (ROOT / "docs" / "design.md").read_text()
+    table = text.partition("| room | what it holds |\n|---|---|\n")[2].partition("\n\n")[0]
+    rooms = [set(re.findall(r"`(\w+)`", row.split("|")[1])) for row in table.splitlines()]
+    assert rooms == LAYERS
+    assert len(text.split()) <= 1500
+
+
+def test_citation_and_changelog_have_the_version():
+    citation, changelog = ((ROOT / name).read_text() for name in ("CITATION.cff", "CHANGELOG.md"))
+    assert f"\nversion: {reli3d.__version__}\n" in citation
+    assert re.search(r"^## (\S+)", changelog, re.MULTILINE).group(1) == reli3d.__version__

@@ -1,0 +1,175 @@
+"""The layout of the package: who imports whom, how long a file may be, and that importing it is cheap and silent."""
+
+import ast
+import graphlib
+import importlib
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import reli3d
+from tests.support.checkout import ROOT
+from tests.support.layers import LAYERS
+
+PACKAGE = ROOT / "reli3d"
+SOURCES = sorted(PACKAGE.rglob("*.py"))
+MAX_LINES = 400
+
+
+LEVEL = {part: level for level, layer in enumerate(LAYERS) for part in layer}
+STARTERS = {"torch", "warp"}  # what ``import reli3d`` alone must not load
+
+
+def part_of(module: str) -> str:
+    """``reli3d.geometry.mesh`` -> ``geometry``; ``reli3d`` itself -> ``""``."""
+    return (module.split(".") + [""])[1]
+
+
+def name_of(path: Path, base: Path = ROOT) -> str:
+    parts = path.relative_to(base).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def imports(source: str, module: str, is_package: bool) -> list[str]:
+    """Every module that ``source`` imports, at the top or inside functions, with relative names made absolute."""
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            found += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            if node.level:
+                above = module.split(".")[: len(module.split(".")) - node.level + is_package]
+                base = ".".join([*above, base] if base else above)
+            # "from reli3d import x": x is a part, or one of the names that the package lends from its home
+            found += [reli3d._HOME.get(a.name, f"reli3d.{a.name}") if base == "reli3d" else base for a in node.names]
+    return found
+
+
+def violations(source: str, module: str, is_package: bool = False) -> list[str]:
+    """What in ``source`` breaks the direction of imports, as text."""
+    part, bad = part_of(module), []
+    for target in imports(source, module, is_package):
+        top = target.split(".")[0]
+        if part == "kernels" and top == "torch":
+            bad.append(f"{module} imports torch; kernels are Warp only")
+        if part in ("io", "views", "nn", "fit", "pipeline", "output", "train", "eval", "") and top == "warp":
+            bad.append(f"{module} imports warp; what launches kernels is a public operation of its own")
+        if top in ("tests", "bench"):
+            bad.append(f"{module} imports {target}, which is not shipped")
+        if top == "reli3d" and part and part_of(target) not in ("", part) and LEVEL[part_of(target)] >= LEVEL[part]:
+            bad.append(f"{module} imports {target}, which does not lie below it")
+    return bad
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda p: name_of(p))
+def test_imports_point_down(path):
+    module = name_of(path)
+    part = part_of(module)
+    assert not part or part in LEVEL, f"{part}: give the new part its place in LAYERS"
+    assert violations(path.read_text(), module, path.name == "__init__.py") == []
+
+
+@pytest.mark.parametrize(
+    "source, module, is_package",
+    [
+        ("import torch", "reli3d.kernels.math", False),
+        ("from .. import _bridge", "reli3d.kernels.math", False),
+        ("from .._bridge import call", "reli3d.kernels.math", False),
+        ("def f():\n    from reli3d.nn.model import Reconstructor", "reli3d.render.render", False),
+        ("from reli3d import reconstruct", "reli3d.nn.model", False),
+        ("from ..pipeline import reconstruct", "reli3d.nn", True),
+        ("import reli3d.cli.infer", "reli3d.pipeline", False),
+        ("import warp as wp", "reli3d.nn.model", False),
+        ("from tests.support import reference", "reli3d.geometry.uv", False),
+        ("from reli3d.synthetic.samples import synthesize", "reli3d.views.folder", False),
+        ("from reli3d.eval.heldout import evaluate", "reli3d.train.loop", False),
+        ("from reli3d.render.camera import Camera", "reli3d.geometry.rays", False),
+    ],
+)
+def test_the_import_check_sees_what_it_should(source, module, is_package):
+    assert len(violations(source, module, is_package)) == 1
+
+
+def test_the_import_check_allows_what_it_should():
+    source = "import warp as wp\nfrom reli3d.kernels import math\nfrom .._bridge import call\nfrom . import mesh"
+    assert violations(source, "reli3d.geometry.rays") == []
+    assert violations("from reli3d import Mesh, sample_triplane", "reli3d.nn.model") == []
+
+
+def test_modules_import_each_other_in_no_circle():
+    modules = {name_of(p): p for p in SOURCES if p.name != "__init__.py"}
+    graph = {}
+    for name, path in modules.items():
+        froms = [n for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.ImportFrom)]
+        used = {n.module for n in froms} | {f"{n.module}.{a.name}" for n in froms for a in n.names}
+        graph[name] = used & set(modules)
+    assert sum(map(len, graph.values())) > 200  # the graph was read
+    list(graphlib.TopologicalSorter(graph).static_order())  # raises CycleError
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda p: name_of(p))
+def test_nothing_below_the_commands_writes_to_stdout(path):
+    if part_of(name_of(path)) == "cli":
+        return
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print":
+            assert any(k.arg == "file" for k in node.keywords), f"{path}:{node.lineno}: print without file="
+        if isinstance(node, ast.Attribute) and node.attr == "stdout":
+            raise AssertionError(f"{path}:{node.lineno}: uses stdout")
+
+
+@pytest.mark.parametrize("folder", ["reli3d", "tests", "bench"])
+def test_files_stay_short(folder):
+    lengths = {str(p.relative_to(ROOT)): len(p.read_text().splitlines()) for p in (ROOT / folder).rglob("*.py")}
+    assert {name: n for name, n in lengths.items() if n >= MAX_LINES} == {}
+
+
+@pytest.mark.parametrize(
+    "path", [p for p in SOURCES if part_of(name_of(p)) in ("geometry", "render", "io")], ids=name_of
+)
+def test_public_functions_take_at_most_ten_arguments(path):
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.FunctionDef) and not node.name.startswith("_"):
+            found = node.args.posonlyargs + node.args.args + node.args.kwonlyargs
+            assert len(found) <= 10, f"{path}:{node.lineno}: {node.name} takes {len(found)} arguments"
+
+
+def run(code: str) -> subprocess.CompletedProcess:
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, timeout=120)
+
+
+def test_import_is_silent_and_starts_nothing():
+    done = run(f"import sys, reli3d; print(sorted({STARTERS} & set(sys.modules)), reli3d.__version__)")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.split() == ["[]", reli3d.__version__]
+
+
+def test_lent_names_load_without_network_device_or_output():
+    names = [name for name, home in reli3d._HOME.items() if part_of(home) != "pipeline"]
+    done = run(
+        "import sys, reli3d\n"
+        f"for name in {names}: getattr(reli3d, name)\n"
+        "import torch\n"
+        "assert not torch.cuda.is_initialized()\n"
+        "hubs = {'huggingface_hub', 'requests', 'urllib3'}\n"
+        "assert not any(m.startswith('reli3d.nn') or m.split('.')[0] in hubs for m in sys.modules)\n"
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def test_every_lent_name_lives_where_the_table_says():
+    for name, home in reli3d._HOME.items():
+        assert getattr(reli3d, name).__module__ == home
+    with pytest.raises(AttributeError, match="no_such_name"):
+        reli3d.no_such_name  # noqa: B018
+
+
+def test_every_command_of_the_package_exists():
+    commands = re.findall(r'^reli3d[\w-]* = "([\w.]+):(\w+)"', (ROOT / "pyproject.toml").read_text(), re.MULTILINE)
+    assert len(commands) >= 3
+    for module, function in commands:
+        assert callable(getattr(importlib.import_module(module), function)), module

@@ -1,0 +1,187 @@
+"""Environment maps: orientation, lookup with gradients, importance table."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from reli3d.render.environment import Environment
+from tests.support import chi2, mitsuba_scene, reference
+
+
+def directions(n, seed=0):
+    return torch.nn.functional.normalize(torch.randn(n, 3, generator=torch.Generator().manual_seed(seed)), dim=-1)
+
+
+def maps():
+    g = torch.Generator().manual_seed(3)
+    one = torch.zeros(10, 100, 3)
+    one[4, 37] = 1.0
+    sun = torch.rand(32, 64, 3, generator=g)
+    sun[5, 9] = 1e6
+    gap, line = torch.rand(32, 64, 3, generator=g), torch.rand(32, 64, 3, generator=g)
+    gap[10:14] = 0.0  # the filter of the table leaves two of them black
+    line[11] = 0.0
+    return {"one texel": one, "constant": torch.ones(100, 100, 3), "3 x 2": torch.ones(2, 3, 3), "sun": sun,
+            "four black rows": gap, "one black row": line, "odd": torch.rand(17, 33, 3, generator=g) ** 4}  # fmt: skip
+
+
+def test_axes_are_those_of_the_convention(device):
+    marks = torch.zeros(4, 8, 3, device=device)
+    marks[:, 3:5, 0] = 1.0  # centre: -Z
+    marks[:, 5:7, 1] = 1.0  # right of it: +X
+    marks[0, :, 2] = 1.0  # first row: +Y
+    env = Environment(marks)
+    axes = torch.tensor([[0.0, 0, -1], [1, 0, 0], [0, 0, 1], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], device=device)
+    want = torch.tensor([[1.0, 0, 0], [0, 1, 0], [0, 0, 0], [0, 0, 0], [1, 0, 1], [1, 0, 0]], device=device)
+    torch.testing.assert_close(env.lookup(axes), want, atol=1e-5, rtol=0)  # at a pole u is 0.5
+
+
+def test_directions_of_the_published_parametrisation(goldens):
+    data = np.load(goldens / "env_parametrisation.npz")
+    uv, want = data["uv"].reshape(-1, 2), torch.from_numpy(data["uv_direction"].reshape(-1, 3))
+    ramp = torch.zeros(64, 128, 3)
+    ramp[..., 0] = (torch.arange(128) + 0.5) / 128
+    ramp[..., 1] = ((torch.arange(64) + 0.5) / 64)[:, None]
+    got = Environment(ramp).lookup(want)[:, :2].numpy()
+    inside = (uv[:, 0] > 0.01) & (uv[:, 0] < 0.99) & (uv[:, 1] > 0.01) & (uv[:, 1] < 0.99)
+    assert np.abs(got - uv)[inside].max() < 1e-5
+
+
+def test_lookup_and_its_gradient_equal_the_float64_twin(device):
+    g = torch.Generator().manual_seed(1)
+    radiance, d = torch.rand(9, 18, 3, generator=g), directions(20_000)
+    weight = torch.rand(20_000, 3, generator=g)  # of one sign: sums that cancel have no digits left
+    ins = [radiance.to(device).requires_grad_(), d.to(device).requires_grad_()]
+    got = Environment(ins[0]).lookup(ins[1])
+    twin = [radiance.double().requires_grad_(), d.double().requires_grad_()]
+    want = reference.lookup_envmap(*twin)
+    torch.testing.assert_close(got.cpu().double(), want, rtol=0, atol=2e-5)  # 1e-7 of u times 18 texels, with margin
+    assert reference.share_within(got, want) >= 0.999
+    grads = torch.autograd.grad((got * weight.to(device)).sum(), ins)
+    truth = torch.autograd.grad((want * weight.double()).sum(), twin)
+    assert reference.share_within(grads[0], truth[0]) >= 0.999
+    # a direction may sit on a kink between texels
+    assert reference.rows_within(*(reference.across(v, d) for v in (grads[1], truth[1]))) >= 0.999
+
+
+@pytest.mark.parametrize("name", chi2.MAPS)
+def test_samples_fall_on_texels_as_their_density_says(device, name):
+    env = Environment(maps()["sun" if name == "beside the sun" else name].to(device))
+    height, width = env.radiance.shape[:2]
+    u = torch.rand(1_000_000, 2, generator=torch.Generator().manual_seed(chi2.MAPS.index(name))).to(device)
+    density = env.pdf
+    if name == "beside the sun":  # one sample in a thousand: numbers that leave out its row and both neighbours
+        rows, heights = env.table.rows.double()
+        gap = float(rows[7] - rows[4])
+        first = u[:, 0].double() * (1.0 - gap)
+        u[:, 0] = torch.where(first < rows[4], first, first + gap).float().clamp(max=1.0 - 2.0**-24)
+        near = lambda d: (d[:, 1] <= heights[4]) & (d[:, 1] >= heights[7])  # noqa: E731
+        density = lambda d: torch.where(near(d), 0.0, env.pdf(d) / (1.0 - gap))  # noqa: E731
+    d, pdf = env.sample(u)
+    grid = chi2.Map(height, width, 2 if height * width > 1000 else 5)
+    chi2.check(grid, d, density, finest=16)
+    down, across = grid.places(d)
+    off = [(v * n - (v * n).round()).abs() for v, n in ((down, height), (across, width))]
+    inner = (off[0] > 1e-4) & (off[1] > 1e-4)  # of a texel; float32 angles are 1e-5 of one, a border's side is a toss
+    assert ((env.pdf(d) / pdf - 1).abs() < 1e-5)[inner].all() and float(inner.float().mean()) > 0.99
+    y, x = torch.meshgrid((torch.arange(height, device=device) + 0.5) / height,
+                          (torch.arange(width, device=device) + 0.5) / width, indexing="ij")  # fmt: skip
+    centres = grid.at(y.reshape(-1).double(), x.reshape(-1).double())[0].float()
+    assert torch.equal(env.pdf(centres).reshape(height, width), env.table.density)  # exactly 0 where nothing is lit
+
+
+@pytest.mark.parametrize("name", maps())
+def test_density_is_the_light_of_a_texel_by_its_solid_angle(device, name):
+    """Per sr: the mean of the bilinear luminance over the texel, by the integral of it over the sphere.  Each quarter
+    of a texel is bilinear, so its mean is the value in its middle.  A constant map gives the uniform sphere."""
+    map_ = maps()[name]
+    height, width = map_.shape[:2]
+    light = (map_.double() @ torch.tensor([0.2126, 0.7152, 0.0722]).double())[..., None].expand(-1, -1, 3)
+    mean = torch.zeros(height, width, dtype=torch.float64)
+    for a, b in ((0.25, 0.25), (0.25, 0.75), (0.75, 0.25), (0.75, 0.75)):
+        phi = ((torch.arange(width).double() + a) / width - 0.5) * 2.0 * math.pi
+        theta = (torch.arange(height).double()[:, None] + b) / height * math.pi
+        axes = [theta.sin() * phi.sin(), theta.cos().expand(height, width), -theta.sin() * phi.cos()]
+        mean += reference.lookup_envmap(light, torch.stack(axes, -1))[..., 0] / 4.0
+    edge = torch.cos(torch.arange(height + 1).double() / height * math.pi)
+    angle = (edge[:-1] - edge[1:])[:, None] * 2.0 * math.pi / width
+    d = directions(20_000, 4).double()
+    across = (torch.atan2(d[:, 0], -d[:, 2]) / (2.0 * math.pi) + 0.5) * width
+    down = torch.acos(d[:, 1]) / math.pi * height
+    inside = ((across - across.round()).abs() > 1e-4) & ((down - down.round()).abs() > 1e-4)  # off a texel's border
+    d, column, row = d[inside], across[inside].long(), down[inside].long()
+    got = Environment(map_.to(device)).pdf(d.float().to(device)).cpu().double()
+    off = got - (mean / (mean * angle).sum())[row, column]
+    # mass of a texel: two differences of float32 sums of up to 1, a rounding of 3e-8 at either end
+    assert float((off * angle[row, 0]).abs().max()) < 1.2e-7
+    if name in ("constant", "3 x 2"):  # the first row of 100 holds 2.5e-4 of the mass
+        limit = {"constant": 2.5e-4, "3 x 2": 1e-6}[name]
+        assert float((got * 4.0 * math.pi - 1.0).abs().max()) < limit
+
+
+@pytest.mark.parametrize("name", maps())
+def test_weights_are_bounded_so_no_sample_is_a_firefly(device, name):
+    env = Environment(maps()[name].to(device))
+    d, pdf = env.sample(torch.rand(50_000, 2, generator=torch.Generator().manual_seed(6)).to(device))
+    weight = env.lookup(d) @ torch.tensor([0.2126, 0.7152, 0.0722], device=device) / pdf
+    # a bilinear value is at most its texel's four corners; the table holds at least (1/8)^2 of each
+    assert float(weight.max()) <= 16.5 * float(weight.mean())
+
+
+def test_table_of_a_black_map_is_the_uniform_sphere_and_bad_texels_are_named(device):
+    d, pdf = Environment(torch.zeros(4, 8, 3, device=device)).sample(torch.rand(1000, 2, device=device))
+    torch.testing.assert_close(pdf, torch.full_like(pdf, 1 / (4 * math.pi)), rtol=1e-5, atol=0)
+    bad = torch.zeros(4, 8, 3, device=device)
+    bad[1, 2, 0] = float("nan")
+    with pytest.raises(ValueError, match="radiance: expected finite"):
+        _ = Environment(bad).table
+    with pytest.raises(ValueError, match="radiance: expected"):
+        Environment(torch.zeros(0, 8, 3, device=device))
+    assert Environment(torch.ones(2, 4, 3, device=device)).lookup(torch.zeros(0, 3, device=device)).shape == (0, 3)
+
+
+def test_rotation_turns_the_light_about_y(device):
+    env = Environment(torch.rand(16, 32, 3, generator=torch.Generator().manual_seed(2)).to(device))
+    yaw = 2 * math.pi * 5 / 32
+    c, s = math.cos(yaw), math.sin(yaw)
+    turn = torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]], device=device)
+    d = directions(500).to(device)
+    torch.testing.assert_close(env.rotated(yaw).lookup(d @ turn.T), env.lookup(d), atol=1e-4, rtol=0)
+    there_and_back = env.rotated(0.3).rotated(-0.3).radiance.mean((0, 1))
+    torch.testing.assert_close(there_and_back, env.radiance.mean((0, 1)), rtol=1e-5, atol=0)
+
+
+@pytest.mark.slow  # Mitsuba starts its compiler
+def test_lookup_equals_mitsubas_map():
+    mi = mitsuba_scene.load()
+    env = Environment(torch.rand(8, 16, 3, generator=torch.Generator().manual_seed(2)))
+    d = directions(4000)
+    scene = mi.load_dict({"type": "scene", "light": mitsuba_scene.environment(mi, env.radiance)})
+    ray = mi.Ray3f(mi.Point3f(0, 0, 0), mi.Vector3f(d.numpy().T.copy()))
+    si = scene.ray_intersect(ray)
+    got = np.array(scene.environment().eval(si)).T
+    assert np.abs(got - env.lookup(d).numpy()).max() < 2e-3  # Mitsuba's map stores half floats
+
+
+def test_irradiance_of_a_constant_and_of_a_gradient(device):
+    """pi L of a constant; of radiance a + b y, integrated by hand: pi a + 2 pi b n_y / 3.
+
+    Texels of 16 rows integrate to 0.3 % of the largest value (their solid angles are exact, the cosine is taken in
+    the middle).
+    """
+    rows = 16
+    y = torch.cos((torch.arange(rows, device=device) + 0.5) * torch.pi / rows)
+    sky = (2.0 + y)[:, None, None].expand(rows, 2 * rows, 3).contiguous()
+    expected = torch.pi * 2.0 + 2.0 * torch.pi / 3.0 * y
+    got = Environment(sky).irradiance().radiance
+    torch.testing.assert_close(got, expected[:, None, None].expand_as(got), rtol=0, atol=3e-3 * float(expected.max()))
+
+
+def test_irradiance_faces_the_lamp(device):
+    radiance = torch.zeros(16, 32, 3, device=device)
+    radiance[5, 9, 1] = 40.0
+    got = Environment(radiance).irradiance()
+    assert int(got.radiance[..., 1].argmax()) == 5 * 32 + 9
+    assert got.radiance[..., 0].abs().max() == 0

@@ -1,0 +1,166 @@
+"""Cameras and whole images: geometry, textures and their frame, resolve, background, gradients."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from reli3d.geometry.hits import interpolate
+from reli3d.geometry.mesh import Mesh
+from reli3d.render.asset import Asset, TextureSet
+from reli3d.render.camera import Camera, camera_rays, look_at, project
+from reli3d.render.environment import Environment
+from reli3d.render.gbuffer import sample_texture, surface_points
+from reli3d.render.material import PAINTS
+from reli3d.render.render import render
+from reli3d.render.shading import ShadeOptions
+from tests.support import reference
+from tests.support.scenes import ball, eye, textures
+
+
+def square(device, normals=True):
+    """Unit square facing +Z, its picture upright: u along +X, v = 0 at the top."""
+    v = torch.tensor([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], device=device)
+    uv = torch.tensor([[0.0, 1], [1, 1], [1, 0], [0, 0]], device=device)
+    n = torch.tensor([[0.0, 0, 1]], device=device).expand(4, 3).contiguous() if normals else None
+    return Mesh(v, torch.tensor([[0, 1, 2], [0, 2, 3]], dtype=torch.int32, device=device), n, uv)
+
+
+def test_rays_and_projection_are_inverse(device):
+    camera = Camera(eye(device, 1.0, 0.7, 2.0), torch.tensor([50.0, 60.0, 17.0, 21.0], device=device), 40, 30)
+    origins, directions = camera_rays(camera)
+    assert origins.shape == directions.shape == (30, 40, 3)
+    pixels, depth = project(origins + 3.0 * directions, camera.c2w, camera.intrinsics)
+    ys, xs = torch.meshgrid(torch.arange(30) + 0.5, torch.arange(40) + 0.5, indexing="ij")
+    torch.testing.assert_close(pixels.cpu(), torch.stack([xs, ys], -1), rtol=0, atol=2e-4)
+    cos = (directions * -camera.c2w[:3, 2]).sum(-1)
+    torch.testing.assert_close(depth, 3.0 * cos, rtol=1e-5, atol=0)
+    centre, _ = project(torch.zeros(3, device=device), camera.c2w, camera.intrinsics)
+    torch.testing.assert_close(centre.cpu(), torch.tensor([17.0, 21.0]), rtol=0, atol=1e-4)  # looks at the origin
+    with pytest.raises(ValueError, match="up: expected"):
+        look_at(*(torch.tensor([0.0, k, 0.0], device=device) for k in (1.0, 0.0, 1.0)))
+
+
+def test_texture_lookup_is_bilinear_and_repeats(device):
+    t = torch.rand(8, 8, 3, generator=torch.Generator().manual_seed(0)).to(device).requires_grad_()
+    k = (torch.arange(8, device=device) + 0.5) / 8
+    grid = torch.stack(torch.meshgrid(k, k, indexing="ij")[::-1], -1)
+    torch.testing.assert_close(sample_texture(t, grid), t, rtol=0, atol=1e-6)
+    torch.testing.assert_close(sample_texture(t, grid + torch.tensor([3.0, -2.0], device=device)), t, rtol=0, atol=1e-5)
+    uv = torch.rand(5000, 2, generator=torch.Generator().manual_seed(1)).to(device).requires_grad_()
+    padded = torch.nn.functional.pad(t.double().permute(2, 0, 1)[None], (1, 1, 1, 1), mode="circular")
+    want = torch.nn.functional.grid_sample(
+        padded, ((uv.double() * 8 + 1) / 10 * 2 - 1)[None, None], align_corners=False
+    )
+    got = sample_texture(t, uv)
+    torch.testing.assert_close(got.double(), want[0, :, 0].T, rtol=0, atol=1e-5)
+    weight = torch.randn(5000, 3, generator=torch.Generator().manual_seed(2)).to(device)
+    for a, b in zip(torch.autograd.grad((got * weight).sum(), (t, uv)),
+                    torch.autograd.grad((want[0, :, 0].T * weight.double()).sum(), (t, uv)), strict=True):  # fmt: skip
+        assert reference.share_within(a, b) >= 0.999
+
+
+@pytest.mark.parametrize("explicit", [True, False])
+def test_normal_map_points_right_and_up_as_gltf_says(device, explicit):
+    """Red bends the normal towards u (right), green towards the top of the picture."""
+    mesh = square(device)
+    if explicit:
+        mesh = Mesh(mesh.vertices, mesh.faces, mesh.normals, mesh.uv,
+                    torch.tensor([[1.0, 0, 0, 1]], device=device).expand(4, 4).contiguous())  # fmt: skip
+    face, bary = torch.tensor([0, 1], dtype=torch.int32, device=device), torch.full((2, 2), 0.3, device=device)
+    s = math.sqrt(0.5)
+    for color, want in (((0.5 + s / 2, 0.5, 0.5 + s / 2), (s, 0.0, s)), ((0.5, 0.5 + s / 2, 0.5 + s / 2), (0.0, s, s))):
+        points = surface_points(mesh, textures(4, device, normal=color), face, bary)
+        torch.testing.assert_close(points.normal.cpu(), torch.tensor([want, want]), rtol=0, atol=1e-5)
+
+
+def test_picture_on_a_square_is_upright_and_resolved(device):
+    picture = torch.rand(8, 8, 3, generator=torch.Generator().manual_seed(0)).to(device)
+    asset = Asset(square(device), TextureSet(picture, *list(vars(textures(8, device)).values())[1:]))
+    camera = Camera(eye(device, 0.0, 0.0, 4.0), torch.tensor([16.0, 16.0, 4.0, 4.0], device=device), 8, 8)
+    env = Environment.constant(torch.ones(3, device=device))
+    image = render(asset, camera, env)
+    from reli3d.render.color import srgb_to_linear
+
+    torch.testing.assert_close(image.base_color, srgb_to_linear(picture), rtol=0, atol=1e-4)  # one texel a pixel
+    assert float(image.alpha.min()) == 1.0
+    torch.testing.assert_close(image.depth, torch.full_like(image.depth, 4.0), rtol=1e-5, atol=0)
+    wide = Camera(camera.c2w, torch.tensor([16.0, 16.0, 6.0, 4.0], device=device), 12, 8)
+    fine = render(asset, wide, env, supersampling=3, background="environment")
+    assert fine.alpha[:, :2].sum() == 0 and torch.isinf(fine.depth[:, 0]).all()
+    torch.testing.assert_close(fine.radiance[:, 0], torch.ones(8, 3, device=device), rtol=1e-5, atol=0)
+    assert float(render(asset, wide, env).radiance[:, 0].abs().max()) == 0.0
+
+
+def test_bands_progress_and_supersampling_do_not_change_the_mean(device, monkeypatch):
+    asset, env = ball(device), Environment(torch.rand(8, 16, 3, generator=torch.Generator().manual_seed(1)).to(device))
+    camera = Camera.from_fov(eye(device, 0.5, 1.0, 2.0), 0.8, 40, 40)
+    whole = render(asset, camera, env)
+    seen = []
+    monkeypatch.setattr("reli3d.render.render.BAND_RAYS", 200)
+    banded = render(asset, camera, env, progress=seen.append)
+    torch.testing.assert_close(banded.radiance, whole.radiance, rtol=1e-4, atol=1e-4)  # ray origins round differently
+    assert seen[-1] == 1.0 and len(seen) == 8
+    fine = render(asset, camera, env, supersampling=3)
+    inside = whole.alpha > 0
+    assert abs(fine.radiance.mean() / whole.radiance.mean() - 1) < 0.03  # 40 pixels of silhouette in 500
+    assert float((fine.normal.norm(dim=-1)[inside & (fine.alpha > 0)] - 1).abs().max()) < 1e-5
+
+
+def test_image_gradient_reaches_textures_and_light(device):
+    asset = ball(device)
+    maps = [v.clone().requires_grad_() for v in vars(asset.textures).values()]
+    light = torch.rand(8, 16, 3, generator=torch.Generator().manual_seed(1)).to(device).requires_grad_()
+    image = render(Asset(asset.mesh, TextureSet(*maps)), Camera.from_fov(eye(device, 0.0, 0.5, 2.0), 0.8, 24, 24),
+                   Environment(light))  # fmt: skip
+    grads = torch.autograd.grad(image.radiance.sum(), [*maps, light])
+    assert all(bool(torch.isfinite(g).all()) and float(g.abs().max()) > 0 for g in grads)
+    assert float(grads[0].min()) >= 0.0 and float(grads[4].min()) >= 0.0  # more paint and more light are brighter
+
+
+def test_no_light_is_gained_at_the_rim_but_with_the_published_paint(device):
+    """A smooth white ball in a furnace.  Rays from below the horizon never hit it, so it shadows nothing itself."""
+    asset = ball(device, (1.0, 1.0, 1.0))
+    camera, white = Camera.from_fov(eye(device, 0.0, 0.5, 2.0), 0.8, 40, 40), Environment.constant(
+        torch.ones(3, device=device))  # fmt: skip
+    asset = Asset(asset.mesh, textures(4, device, (1.0, 1.0, 1.0), roughness=0.2))
+    images = {paint: render(asset, camera, white, options=ShadeOptions((64, 64, 64), paint=paint)) for paint in PAINTS}
+    inside = images["published"].alpha > 0
+    bright = {paint: image.radiance[inside] for paint, image in images.items()}
+    assert float(bright["published"].max()) > 1.1
+    assert float(bright["conserving"].max()) < 1.05 and float(bright["conserving"].mean()) > 0.85  # 192 samples' noise
+    assert torch.equal(
+        images["conserving"].radiance, render(asset, camera, white, options=ShadeOptions((64, 64, 64))).radiance
+    )
+
+
+def test_bad_input_is_named(device):
+    asset, camera = ball(device), Camera.from_fov(eye(device, 0.0, 0.5, 2.0), 0.8, 4, 4)
+    with pytest.raises(ValueError, match="environment: expected"):
+        render(asset, camera)
+    with pytest.raises(ValueError, match="background: expected"):
+        render(asset, camera, Environment.constant(torch.ones(3, device=device)), background="pink")
+    with pytest.raises(ValueError, match="paint: expected"):
+        render(asset, camera, Environment.constant(torch.ones(3, device=device)), options=ShadeOptions(paint="white"))
+    faces, values = asset.mesh.faces, asset.mesh.vertices
+    with pytest.raises(ValueError, match="face: expected"):
+        interpolate(values, faces, torch.tensor([len(faces)], dtype=torch.int32, device=device),
+                    torch.zeros(1, 2, device=device))  # fmt: skip
+    with pytest.raises(ValueError, match="uv: expected"):
+        sample_texture(asset.textures.normal, torch.tensor([[np.nan, 0.0]], dtype=torch.float32, device=device))
+
+
+def test_parts_shadow_each_other_and_keep_their_paint(device):
+    floor = square(device)
+    flat = floor.vertices[:, [0, 2, 1]] * torch.tensor([2.0, 1.0, -2.0], device=device)
+    floor = Mesh(flat + torch.tensor([0, -0.6, 0], device=device), floor.faces, None, floor.uv)
+    parts = [ball(device, (0.9, 0.1, 0.1)), Asset(floor, textures(4, device, (0.1, 0.1, 0.9)))]
+    camera = Camera.from_fov(eye(device, 0.0, 2.0, 3.0), 0.9, 48, 48)
+    image = render(parts, camera, Environment.constant(torch.ones(3, device=device)))
+    assert image.base_color[24, 24, 0] > 10 * image.base_color[24, 24, 2]
+    below = image.position[..., 1] < -0.59
+    assert bool(below.any()) and bool((image.base_color[below][:, 2] > 10 * image.base_color[below][:, 0]).all())
+    alone = render(parts[1:], camera, Environment.constant(torch.ones(3, device=device)))
+    near = below & (image.position.norm(dim=-1) < 0.9)
+    assert float(image.radiance[near].mean()) < 0.9 * float(alone.radiance[near].mean())

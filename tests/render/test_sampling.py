@@ -1,0 +1,271 @@
+"""Samplers of directions against their densities, and the random numbers."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from reli3d.render.environment import Environment
+from reli3d.render.material import eval_bsdf, pdf_lobes, sample_bsdf
+from reli3d.render.sampling import (
+    halton,
+    opposite,
+    pdf_cosine,
+    pdf_ggx_vndf,
+    random_pairs,
+    sample_cosine,
+    sample_ggx_vndf,
+)
+from reli3d.render.shading import ShadeOptions, shade
+from tests.support import chi2, reference
+from tests.support.surfaces import at
+
+N = 1_000_000
+QUICK = [(alpha, deg) for alpha in (0.1, 0.5, 1.0) for deg in (0, 45, 80)]
+
+
+def view(deg, device, phi=0.4):
+    t = math.radians(deg)
+    return torch.tensor([math.sin(t) * math.cos(phi), math.sin(t) * math.sin(phi), math.cos(t)], device=device)
+
+
+def uniform(n, device, seed=7):
+    return torch.rand(n, 2, generator=torch.Generator().manual_seed(seed)).to(device)
+
+
+def lobe_cases():
+    """Every lobe; by default one azimuth of each but the narrowest and those of which few draws are valid."""
+    for seed, (alpha, deg, phi, drawn) in enumerate((*lobe, drawn) for lobe in chi2.LOBES for drawn in chi2.DRAWS):
+        rare = drawn == "mirrored" and (deg == 89 and alpha >= 0.1 or deg == 80 and alpha == 1.0)
+        even = (chi2.ALPHAS.index(alpha) + chi2.DEGREES.index(deg) + chi2.AZIMUTHS.index(phi)) % 2 == 0
+        marks = () if (even or deg == 0) and alpha > 0.02 and not rare else pytest.mark.slow
+        yield pytest.param(alpha, deg, phi, drawn, seed, marks=marks, id=f"{drawn}-{alpha}-{deg}-{phi}")
+
+
+@pytest.mark.parametrize("alpha, deg, phi, drawn, seed", list(lobe_cases()))
+def test_lobes_follow_their_densities(device, alpha, deg, phi, drawn, seed):
+    """Visible normals, directions reflected at them and at either kind of partner: a million draws, or 1e5 valid."""
+    wo, a, g = view(deg, device, phi), torch.tensor(alpha, device=device), torch.Generator().manual_seed(seed)
+    grid = chi2.Sphere(45 if alpha > 0.2 else 81 if alpha > 0.05 else 141)
+    if drawn == "half vector":
+        wm = sample_ggx_vndf(wo, a, torch.rand(N, 2, generator=g).to(device))
+        wrong = {"width": lambda m: pdf_ggx_vndf(wo, 1.02 * a, m)}
+        return chi2.check(grid, wm, lambda m: pdf_ggx_vndf(wo, a, m), wrong)
+    valid, total = [], 0
+    while sum(map(len, valid)) < 100_000:
+        u = torch.rand(N, 2, generator=g).to(device)
+        wi = sample_bsdf(wo, a, opposite(u), "visible") if drawn == "opposite" else sample_bsdf(wo, a, u, drawn)
+        valid.append(wi[wi[:, 2] > 1e-6])
+        total += N
+    k = int(drawn == "mirrored")
+    pdf = lambda d: pdf_lobes(wo, d, a)[:, k]  # noqa: E731
+    wrong = {"width": lambda d: pdf_lobes(wo, d, 1.02 * a)[:, k]}
+    if deg >= 45:  # near the normal mirrored ones have almost the density of their originals
+        wrong["the other's"] = lambda d: pdf_lobes(wo, d, a)[:, 1 - k]
+    if deg == 89 and (drawn == "mirrored" or alpha < 0.05):  # a degree or less beside the horizon
+        whole = chi2.masses(chi2.Sphere(141), pdf, device).sum()
+        assert not chi2.lost(sum(map(len, valid)), whole, total)
+        grid = chi2.Window(wo, alpha, drawn == "mirrored")
+        wrong["view"] = lambda d: pdf_lobes(view(89.1, device, phi), d, a)[:, k]
+    return chi2.check(grid, torch.cat(valid), pdf, wrong, total)
+
+
+def test_cosine_follows_its_density(device):
+    wrong = {"exponent": lambda d: 2.05 / (2 * math.pi) * d[:, 2].clamp(min=0.0) ** 1.05}
+    chi2.check(chi2.Sphere(45), sample_cosine(uniform(N, device)), pdf_cosine, wrong)
+    assert torch.equal(sample_bsdf(view(60, device), torch.tensor(0.3, device=device), uniform(9, device), "cosine"),
+                       sample_cosine(uniform(9, device)))  # fmt: skip
+    wo, wi, a = view(60, device), sample_cosine(uniform(1000, device)), torch.tensor(0.3, device=device)
+    torch.testing.assert_close(pdf_lobes(wo, wi, a)[:, 2], pdf_cosine(wi), rtol=1e-6, atol=0)  # 1 / pi is rounded
+
+
+def test_opposite_numbers_are_each_of_them_once(device):
+    """Of the 2^24 there are, on either axis: what is uniform stays so.  Twice the same is where it began."""
+    every = torch.arange(2**24, dtype=torch.float64, device=device) / 2**24
+    u = torch.stack([every.float(), every.float().flip(0)], -1)
+    got = opposite(u)
+    assert torch.equal(opposite(got), u)
+    assert bool(((got[:, 0].double() - every).abs() == 0.5).all())
+    assert torch.equal(got[:, 1].double(), every)
+
+
+@pytest.mark.parametrize("antithetic", ["opposite", "mirrored"])
+@pytest.mark.parametrize("points", ["random", "halton"])
+def test_pairs_of_the_shader_are_those_of_the_samplers(device, points, antithetic):
+    """One pair a point under even light: value over the sum of both densities, of which each is its own sample's."""
+    n, seed = 20_000, 3
+    g = torch.Generator().manual_seed(5)
+    up = torch.tensor([0.0, 0.0, 1.0], device=device).expand(n, 3)  # whose frame is the world
+    wo = torch.nn.functional.normalize(torch.rand(n, 3, generator=g) - torch.tensor([0.5, 0.5, -0.1]), dim=-1).to(
+        device
+    )
+    base, rough, metal = (torch.rand(n, *k, generator=g).to(device) for k in ((3,), (), ()))
+    u = random_pairs(n, seed=seed, sample=0, dimension=1, device=device)
+    if points == "halton":
+        u = (u + halton(1, device=device)) % 1.0
+    pair = ("visible", u), ("mirrored", u)
+    if antithetic == "opposite":
+        pair = ("visible", u), ("visible", opposite(u))
+    want = torch.zeros(n, 3, device=device)
+    for lobe, numbers in pair:
+        wi = sample_bsdf(wo, rough**2, numbers, lobe)
+        lobes = pdf_lobes(wo, wi, rough**2)
+        density = sum(lobes[:, int(name == "mirrored"), None] for name, _ in pair)
+        want += torch.where(wi[:, 2:] > 1e-6, eval_bsdf(wo, wi, base, rough**2, metal) * wi[:, 2:] / density, 0.0)
+    env = Environment(torch.full((4, 8, 3), 0.7, device=device))
+    got = shade(
+        *at(up, up, up, wo, base, rough, metal),
+        env,
+        options=ShadeOptions(samples=(0, 2, 0), seed=seed, sequence=points, antithetic=antithetic),
+    )
+    # sharp lobes have few digits of the half vector
+    assert reference.share_within(got.cpu(), 0.7 * want.cpu()) > 0.999
+
+
+@pytest.mark.parametrize("antithetic", ["opposite", "mirrored"])
+@pytest.mark.parametrize("alpha, deg", chi2.MIXTURES)
+def test_the_mixture_of_all_strategies_follows_the_sum_of_their_densities(device, alpha, deg, antithetic):
+    """What the balance heuristic divides by: draws of every strategy in its share, invalid ones counted."""
+    map_ = torch.rand(16, 32, 3, generator=torch.Generator().manual_seed(3)) ** 4
+    wo, a, env = view(deg, device), torch.tensor(alpha, device=device), Environment(map_.to(device))
+    per, seed = N // 64, 10 * chi2.MIXTURES.index((alpha, deg))
+    u = [uniform(per * k, device, seed + i) for i, k in enumerate((20, 20, 20, 4))]
+    partner = ("mirrored", u[2]) if antithetic == "mirrored" else ("visible", opposite(u[2]))
+    drawn = [sample_bsdf(wo, a, v, lobe) for lobe, v in (("visible", u[1]), partner, ("cosine", u[3]))]
+    draws = [env.sample(u[0])[0], *drawn]
+    wi = torch.cat(draws)
+    # below the horizon the map's own samples count too: the whole sphere is the domain, the lobes' share there is lost
+    kept = torch.cat([torch.ones(len(draws[0]), dtype=torch.bool, device=device), torch.cat(draws[1:])[:, 2] > 1e-6])
+
+    def mixture(d, table=20):
+        lobes = pdf_lobes(wo, d, a)
+        visible = lobes[:, 0] + lobes[:, int(antithetic == "mirrored")]
+        return (table * env.pdf(d) + (30 - table / 2) * visible + 4 * lobes[:, 2]) / 64
+
+    wrong = {"counts": lambda d: mixture(d, 21)}
+    # the map's borders run through the cells: 16 midpoints a side leave some 1e-3 of a cell's mass
+    chi2.check(chi2.Sphere(45 if alpha > 0.2 else 81), wi[kept], mixture, wrong, len(wi), finest=16)
+
+
+def test_cells_below_five_are_pooled_to_five_and_no_more():
+    """What moves between small cells is seen."""
+    g = np.random.default_rng(1)
+    expected = np.concatenate([g.uniform(0.0, 1.0, 2000), np.full(100, 50.0)])
+    observed = g.poisson(expected).astype(float)
+    expected *= observed.sum() / expected.sum()
+    p, cells = chi2.pooled(observed, expected)
+    assert p > 1e-3 and 200 <= cells <= 300  # the small ones hold 1000: pools of 5 to 10
+    observed[:2000] = np.where(np.arange(2000) == 7, observed[:2000].sum(), 0.0)
+    assert chi2.pooled(observed, expected)[0] < chi2.LEVEL
+    assert chi2.pooled(np.full(60, 3.0), np.full(60, 3.0))[1] == 18  # 10 are passed after every fourth or third
+    flat = np.full((8, 16), 1.0 / 128)
+    assert "cells" in chi2.refusal(flat * 400, flat, 400)  # too few to tell
+
+
+def test_map_samples_return_to_the_numbers_they_came_from(device):
+    """Inversion: the CDF of rows and columns at a sample's place gives ``u`` back."""
+    map_ = torch.rand(17, 33, 3, generator=torch.Generator().manual_seed(3)) ** 4
+    env, u = Environment(map_.to(device)), uniform(20_000, device)
+    d = env.sample(u)[0].double()
+    rows, columns = env.table.rows[0].double(), env.table.columns.double()
+    across = (torch.atan2(d[:, 0], -d[:, 2]) / (2 * math.pi) + 0.5) * 33
+    down = torch.acos(d[:, 1].clamp(-1, 1)) / math.pi * 17
+    r, c = down.long().clamp(0, 16), across.long().clamp(0, 32)
+    top, bottom = torch.cos(math.pi * r / 17), torch.cos(math.pi * (r + 1) / 17)
+    first = torch.lerp(rows[r], rows[r + 1], (top - d[:, 1]) / (top - bottom))
+    second = torch.lerp(columns[r, c], columns[r, c + 1], across - c)
+    off = torch.stack([first, second], -1) - u
+    # float32 angles are 1e-7 of a turn, 4e-6 of a texel, and a texel holds up to a tenth of the mass of its row
+    assert float(off.abs().max()) < 1e-4
+
+
+def test_directions_return_to_the_numbers_they_came_from(device):
+    """Inversion of the cosine's disk and of the cap: stretched by 1 / alpha, a visible normal is half way between the
+    stretched view and the cap's point."""
+    u = uniform(20_000, device)
+    wi = sample_cosine(u).double()
+    turn = (torch.atan2(wi[:, 1], wi[:, 0]) / (2 * math.pi)) % 1.0
+    off = torch.stack([1.0 - wi[:, 2] ** 2 - u[:, 0], (turn - u[:, 1] + 0.5) % 1.0 - 0.5], -1)
+    sure = u[:, 0] > 1e-3  # nearer to the pole the azimuth has fewer digits
+    assert float(off[:, 0].abs().max()) < 1e-6 and float(off[sure, 1].abs().max()) < 1e-5
+    for alpha, deg in QUICK:
+        wo, a = view(deg, device), torch.tensor(alpha, device=device)
+        wm = sample_ggx_vndf(wo, a, u).double()
+        stretch = torch.tensor([alpha, alpha, 1.0], dtype=torch.float64, device=device)
+        w = torch.nn.functional.normalize(wo.double() * stretch, dim=-1)
+        h = torch.nn.functional.normalize(wm / stretch, dim=-1)
+        cap = 2.0 * (h @ w)[:, None] * h - w
+        first = (torch.atan2(cap[:, 1], cap[:, 0]) / (2 * math.pi)) % 1.0
+        second = 1.0 - (cap[:, 2] + w[2]) / (1.0 + w[2])
+        sure = (cap[:, 2].abs() < 0.999) & (wm[:, 2] > 1e-3)  # off the poles and off the floor of the normal's height
+        off = torch.stack([(first - u[:, 0] + 0.5) % 1.0 - 0.5, second - u[:, 1]], -1)[sure]
+        # 1e-7 of a unit normal, some ten times that where it is far from the view and stretched
+        assert float(off.abs().max()) < 1e-4 and float(sure.double().mean()) > 0.95, (alpha, deg)
+
+
+def test_visible_normals_equal_their_float64_twin(device):
+    g = torch.Generator().manual_seed(1)
+    n = 4000
+    wo = torch.nn.functional.normalize(torch.rand(n, 3, generator=g) + torch.tensor([-0.5, -0.5, 0.02]), dim=-1)
+    wo[:, 2] = wo[:, 2].abs().clamp(min=0.01)
+    wo = torch.nn.functional.normalize(wo, dim=-1)
+    alpha, u = 0.02 + 0.98 * torch.rand(n, generator=g), torch.rand(n, 2, generator=g)
+    u[:, 1] = u[:, 1] * 0.98  # the rim of the cap, where a root has infinite slope, is left out of the gradient
+    ins = [wo.to(device).requires_grad_(), alpha.to(device).requires_grad_()]
+    got = sample_ggx_vndf(*ins, u.to(device))
+    twin = [wo.double().requires_grad_(), alpha.double().requires_grad_()]
+    want = reference.sample_ggx_vndf(*twin, u.double())
+    # float32: 1e-7 grows by 1 / alpha where the lobe is stretched
+    torch.testing.assert_close(got.cpu().double(), want, rtol=0, atol=2e-5)
+    weight = torch.randn(n, 3, generator=g)
+    grads = torch.autograd.grad((got * weight.to(device)).sum(), ins)
+    truth = torch.autograd.grad((want * weight.double()).sum(), twin)
+    assert all(reference.share_within(a, b) >= 0.999 for a, b in zip(grads, truth, strict=True))
+
+
+def test_density_equals_its_float64_twin(device):
+    g = torch.Generator().manual_seed(2)
+    n = 4000
+    wo, wm = (torch.nn.functional.normalize(torch.rand(n, 3, generator=g) + 0.02, dim=-1) for _ in range(2))
+    alpha = 0.02 + 0.98 * torch.rand(n, generator=g)
+    got = pdf_ggx_vndf(wo.to(device), alpha.to(device), wm.to(device)).cpu().double()
+    want = reference.pdf_ggx_vndf(wo.double(), alpha.double(), wm.double())
+    assert ((got / want - 1).abs() < 1e-4).all()  # relative, from 1e-7 in the cosine of wm against alpha^2 = 4e-4
+
+
+def test_random_pairs_are_uniform_independent_and_addressed(device):
+    u = random_pairs(200_000, seed=3, sample=5, dimension=1, device=device).cpu().numpy()
+    assert u.min() >= 0.0 and u.max() < 1.0
+    counts, _, _ = np.histogram2d(u[:, 0], u[:, 1], bins=32, range=[[0, 1], [0, 1]])
+    stat = ((counts - counts.mean()) ** 2 / counts.mean()).sum()
+    assert abs(stat - 1023) < 4.5 * (2 * 1023) ** 0.5  # chi-square of 1024 cells
+    for other in ({"seed": 4}, {"sample": 6}, {"dimension": 2}):
+        v = random_pairs(200_000, **{"seed": 3, "sample": 5, "dimension": 1, **other}, device=device).cpu().numpy()
+        assert abs(np.corrcoef(u.ravel(), v.ravel())[0, 1]) < 4.5 / 400_000**0.5
+    assert np.array_equal(u[:100], random_pairs(100, seed=3, sample=5, dimension=1, device=device).cpu().numpy())
+
+
+def test_no_two_streams_share_a_state(device):
+    """A million pairs of 48 bits from ten streams of neighbouring counters; by chance 0.002 would be equal."""
+    streams = [{}, {"seed": 1}, {"seed": 2}, {"seed": 1 << 16}, {"sample": 1}, {"sample": 2}, {"sample": 1 << 16},
+               {"dimension": 1}, {"dimension": 2}, {"seed": 1, "sample": 1, "dimension": 1}]  # fmt: skip
+    u = torch.cat([random_pairs(100_000, **stream, device=device) for stream in streams])
+    bits = (u.double() * 2**24).long()
+    assert len(torch.unique(bits[:, 0] * 2**24 + bits[:, 1])) == len(u)
+
+
+def test_halton_points_are_the_radical_inverses(device):
+    want = [[1 / 2, 1 / 3], [1 / 4, 2 / 3], [3 / 4, 1 / 9], [1 / 8, 4 / 9], [5 / 8, 7 / 9], [3 / 8, 2 / 9]]
+    torch.testing.assert_close(halton(6, device=device).cpu(), torch.tensor(want), rtol=0, atol=1e-7)
+
+
+def test_bad_input_is_named(device):
+    wo, alpha, u = torch.rand(4, 3, device=device), torch.rand(4, device=device), torch.rand(4, 2, device=device)
+    with pytest.raises(TypeError, match="wo: expected torch.float32"):
+        sample_ggx_vndf(wo.double(), alpha, u)
+    with pytest.raises(ValueError, match="u: expected shape"):
+        sample_ggx_vndf(wo, alpha, wo)
+    with pytest.raises(ValueError, match="lobe: expected"):
+        sample_bsdf(wo, alpha, u, "other")
+    assert sample_ggx_vndf(wo[:0], alpha[:0], u[:0]).shape == (0, 3)

@@ -1,0 +1,16 @@
+"""The rooms of the package, from the lowest to the highest."""
+
+# A room may import itself and every room of a line above; rooms of one line know nothing of each other.
+LAYERS = [
+    {"kernels"},
+    {"_bridge"},
+    {"geometry"},
+    {"render"},
+    {"io", "fit"},
+    {"views", "synthetic", "nn"},
+    {"pipeline"},
+    {"output"},
+    {"train"},
+    {"eval"},
+    {"cli"},
+]

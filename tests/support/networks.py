@@ -1,0 +1,57 @@
+"""Sizes of networks that run in seconds, and views to give them."""
+
+from dataclasses import replace
+
+import torch
+
+from reli3d.nn.presets import (
+    OFFICIAL,
+    SMALL,
+    BackboneSizes,
+    EncoderSizes,
+    IlluminationSizes,
+    UpsamplerSizes,
+)
+
+TINY = replace(  # the sizes of the golden tiny_system
+    OFFICIAL,
+    name="tiny",
+    image_size=76,
+    camera_width=32,
+    encoder=EncoderSizes(hidden=32, layers=2, heads=4, patch=14, grid=7, mask_channel=False, ray_maps=False),
+    plane_size=8,
+    backbone=BackboneSizes(heads=4, latents=10, blocks=3, basic_blocks=1, experts=2, experts_from=2, groups=8),
+    upsampler=UpsamplerSizes(convolutions=4, scale=4, channels=40),
+    illumination=IlluminationSizes(
+        encoder=EncoderSizes(hidden=24, layers=1, heads=2, patch=14, grid=7, mask_channel=True, ray_maps=False),
+        tokens=78, token_width=16, width=32, heads=4, layers=1, groups=4,
+    ),
+    resolution=16,
+)  # fmt: skip
+NANO = replace(  # small's switches at sizes that run in milliseconds
+    SMALL,
+    name="nano",
+    image_size=32,
+    camera_width=32,
+    encoder=replace(SMALL.encoder, hidden=32, layers=1, heads=2, patch=8, grid=4),
+    plane_size=4,
+    backbone=replace(SMALL.backbone, heads=2, latents=8, blocks=1, basic_blocks=1, groups=4),
+    illumination=replace(
+        SMALL.illumination, encoder=replace(SMALL.illumination.encoder, hidden=16, layers=1, heads=2, patch=8, grid=4),
+        token_width=16, width=32, heads=2, layers=1, groups=4,
+    ),
+    reni=replace(SMALL.reni, height=4),
+)  # fmt: skip
+
+
+def views(objects, count, size, seed=0):
+    """Random pictures from cameras at distance 2 on circles about the vertical, all looking at the origin."""
+    generator = torch.Generator().manual_seed(seed)
+    angle = torch.rand(objects, count, generator=generator) * 6.28
+    zero, one = torch.zeros_like(angle), torch.ones_like(angle)
+    c, s = angle.cos(), angle.sin()
+    c2w = torch.stack([c, zero, s, 2 * s, zero, one, zero, zero, -s, zero, c, 2 * c, zero, zero, zero, one], dim=-1)
+    intrinsics = torch.tensor([1.2 * size, 1.2 * size, size / 2, size / 2]).expand(objects, count, 4)
+    images = torch.rand(objects, count, size, size, 3, generator=generator)
+    masks = (torch.rand(objects, count, size, size, generator=generator) > 0.5).float()
+    return images, masks, c2w.unflatten(-1, (4, 4)), intrinsics

@@ -1,0 +1,337 @@
+"""Every public operation of geometry and renderer that has a gradient, once: inputs, which of them have it, the call.
+
+``tests/bridge/test_ops.py`` asks of all of them, and of those in ``tests/support/op_cases_plain.py``, what holds for
+any (layouts, one gradient alone, edits in place, dtypes, no rows, second derivatives, CPU against CUDA); what each
+computes is the matter of its own tests.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+import trimesh
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from reli3d.geometry import projection
+from reli3d.geometry.grid import sample_grid
+from reli3d.geometry.hits import evaluate_hits, hit_normals, interpolate
+from reli3d.geometry.mesh import Mesh, vertex_normals
+from reli3d.geometry.rays import Hits, RayScene
+from reli3d.geometry.regularize import sign_entropy, vertex_deviation
+from reli3d.geometry.smooth import taubin_smooth
+from reli3d.geometry.surface import extract_surface
+from reli3d.geometry.tangents import decode_normals, encode_normals
+from reli3d.geometry.triplane import sample_triplane
+from reli3d.render import color, gbuffer, material, sampling
+from reli3d.render.asset import TextureSet
+from reli3d.render.bump import radial_bump, world_bump
+from reli3d.render.camera import Camera, camera_rays, look_at, project
+from reli3d.render.environment import Environment
+from reli3d.render.gaussians import SphericalGaussians, shade_gaussians
+from reli3d.render.shading import ShadeOptions, shade
+from reli3d.render.silhouette import antialias
+from reli3d.render.volume import RaySamples, composite
+from tests.support.surfaces import at, on_ball
+
+N = 5200  # rows: five slices of a CPU launch
+
+
+@dataclass(frozen=True)
+class Case:
+    """inputs: ``(n)`` to float32 tensors by name, on the CPU, the same for the same n.  run: takes them on any device.
+
+    grads: those with a gradient.  rows: those whose first axis is n; empty where no n can be 0.  second: those whose
+    gradient is plain torch and has a derivative in every input; that of any other must raise.  dtypes: those that take
+    other floating-point types too.
+    """
+
+    inputs: Callable[[int], dict[str, Tensor]]
+    run: Callable[..., tuple[Tensor, ...]]
+    grads: tuple[str, ...] = ()
+    rows: tuple[str, ...] = ()
+    second: tuple[str, ...] = ()
+    dtypes: tuple[str, ...] = ()
+
+
+def rng(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def uniform(*shape: int, seed: int = 0, low: float = 0.0, high: float = 1.0) -> Tensor:
+    return low + (high - low) * torch.rand(*shape, generator=rng(seed))
+
+
+def units(n: int, seed: int = 0) -> Tensor:
+    return normalize(torch.randn(n, 3, generator=rng(seed)), dim=-1)
+
+
+def above(n: int, seed: int = 0) -> Tensor:
+    """Unit directions at least 0.1 above the horizon of +z."""
+    return normalize(units(n, seed) * torch.tensor([1.0, 1.0, 0.0]) + uniform(n, 1, seed=seed + 50, low=0.15, high=2.0)
+                     * torch.tensor([0.0, 0.0, 1.0]), dim=-1)  # fmt: skip
+
+
+def numbers(n: int) -> Tensor:
+    """For samplers: not at the rims, where slopes have no bound."""
+    return uniform(n, 2, seed=8, low=0.02, high=0.95)
+
+
+def ball(device, subdivisions: int = 2, radius: float = 0.5) -> tuple[Tensor, Tensor]:
+    mesh = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
+    turned = mesh.vertices @ trimesh.transformations.euler_matrix(0.4, 0.7, 0.2)[:3, :3].T  # no ties with any axis
+    return torch.tensor(turned, dtype=torch.float32, device=device), torch.tensor(
+        mesh.faces, dtype=torch.int32, device=device)  # fmt: skip
+
+
+def corners(count: int) -> Tensor:
+    centre = uniform(count, 1, 3, seed=1, low=-1.0)
+    return (centre + 0.3 * torch.randn(count, 3, 3, generator=rng(2))).reshape(-1, 3)
+
+
+def soup(vertices: Tensor, n: int) -> tuple[Tensor, Tensor]:
+    """Faces of separate triangles, and which of them each of n rows is about."""
+    faces = torch.arange(len(vertices), dtype=torch.int32, device=vertices.device).reshape(-1, 3)
+    return faces, (torch.arange(n, dtype=torch.int32, device=vertices.device) * 7) % len(faces)
+
+
+def weights(n: int) -> Tensor:
+    raw = uniform(n, 3, seed=3, low=0.05)
+    return (raw / raw.sum(1, keepdim=True))[:, 1:].contiguous()
+
+
+def aimed(n: int) -> dict[str, Tensor]:
+    v, bary = corners(60), weights(n)
+    faces, face = soup(v, n)
+    a, b, c = (v[faces[face.long(), k].long()] for k in range(3))
+    point = a + bary[:, :1] * (b - a) + bary[:, 1:] * (c - a)
+    o = uniform(n, 3, seed=4, low=-2.0, high=2.0)
+    return {"vertices": v, "origins": o, "directions": point - o}
+
+
+def reevaluate(vertices, origins, directions):
+    n = len(origins)
+    faces, face = soup(vertices, n)
+    hits = Hits(face, origins.new_ones(n), origins.new_zeros(n, 2))
+    hits = evaluate_hits(vertices, faces, hits, origins, directions)
+    return hits.t, hits.bary
+
+
+def camera(device, size: int = 32) -> Camera:
+    at = torch.tensor([0.7, 0.9, 2.0], device=device)
+    pose = look_at(at, torch.zeros(3, device=device), torch.tensor([0.0, 1.0, 0.0], device=device))
+    return Camera.from_fov(pose, 0.7, size, size)
+
+
+def rig(device) -> tuple[Tensor, Tensor]:
+    poses = [look_at(2.5 * e, torch.zeros(3), torch.tensor([0.0, 1.0, 0.0])) for e in units(3, 9)]
+    return torch.stack(poses).to(device), torch.tensor([30.0, 28.0, 11.0, 13.0]).expand(3, 4).contiguous().to(device)
+
+
+def shaded(n: int) -> dict[str, Tensor]:
+    normal = units(n, 1)
+    return {"normal": normal, "base_color": uniform(n, 3, seed=2, low=0.1), "metallic": uniform(n, seed=4),
+            "roughness": uniform(n, seed=3, low=0.2), "radiance": uniform(8, 16, 3, seed=5) ** 3 * 2.0}  # fmt: skip
+
+
+def lit(shadows: str | None = None, **options):
+    def run(normal, base_color, metallic, roughness, radiance):
+        ng = normal.detach()
+        wo = normalize(ng + 0.5 * units(len(ng), 6).to(ng), dim=-1)
+        scene = None
+        if shadows:
+            vertices, faces = ball(normal.device)
+            scene = RayScene(vertices + torch.tensor([0.0, 1.0, 0.0], device=normal.device), faces,
+                             shadows if normal.device.type == "cpu" else "warp")  # fmt: skip
+        points, wo = at(0.2 * ng, normal, ng, wo, base_color, roughness, metallic)
+        return (shade(points, wo, Environment(radiance), scene=scene, options=ShadeOptions(seed=3, **options)),)
+
+    return run
+
+
+def packed(density) -> RaySamples:
+    """Rays of 0, 1, 2 ... samples, as many as there are."""
+    n, device = len(density), density.device
+    ray = torch.repeat_interleave(torch.arange(n + 1), torch.arange(n + 1))[:n]
+    rays = int(ray[-1]) + 1 if n else 1
+    first = torch.searchsorted(ray, torch.arange(rays + 1))
+    t = 0.3 + 0.05 * (torch.arange(n) - first[ray])
+    return RaySamples(ray.int().to(device), t.float().to(device), first.int().to(device), 0.05)
+
+
+def composited(density, color):
+    out = composite(density, color, packed(density))
+    return out.color, out.opacity, out.depth
+
+
+def outlines(image, vertices):
+    _, faces = ball(vertices.device)
+    return (antialias(image, vertices, faces, camera(vertices.device), RayScene(vertices, faces, "warp")),)
+
+
+def grid_inputs(_, shape=(7, 6, 8), seed: int = 3) -> dict[str, Tensor]:
+    level = torch.nn.functional.pad(torch.randn(shape, generator=rng(seed)), (1,) * 6, value=0.7)
+    level = level + 0.2 * level.sign()  # no crossing beside a grid point, where slopes have no bound
+    cubes = (level.shape[0] - 1) * (level.shape[1] - 1) * (level.shape[2] - 1)
+    return {"level": level, "deformation": uniform(*level.shape, 3, seed=4, low=-0.02, high=0.02),
+            "alpha": uniform(cubes, 8, seed=5, low=0.5), "beta": uniform(cubes, 12, seed=6, low=0.5),
+            "gamma": uniform(cubes, seed=7, low=0.5)}  # fmt: skip
+
+
+def surface(level, deformation, alpha, beta, gamma):
+    mesh = extract_surface(level, radius=0.8, deformation=deformation, alpha=alpha, beta=beta, gamma=gamma, centre=True)
+    return mesh.vertices, mesh.faces
+
+
+def deviation(level, deformation, alpha, beta):
+    return (vertex_deviation(level, radius=0.8, deformation=deformation, alpha=alpha, beta=beta),)
+
+
+def points_of(vertices, normals, uv, base_color, roughness, metallic, normal, bary):
+    faces, face = soup(vertices, len(bary))
+    mesh = Mesh(vertices, faces, normals, uv)
+    maps = TextureSet(base_color, roughness, metallic, normal)
+    return tuple(vars(gbuffer.surface_points(mesh, maps, face, bary)).values())
+
+
+def textured(n: int) -> dict[str, Tensor]:
+    maps = {name: uniform(6, 6, seed=k) for k, name in ((11, "roughness"), (12, "metallic"))}
+    maps["base_color"], maps["normal"] = uniform(6, 6, 3, seed=10), 0.5 + 0.5 * above(36, 13).reshape(6, 6, 3)
+    v = corners(60)
+    return {"vertices": v, "normals": above(len(v), 8), "uv": uniform(len(v), 2, seed=9, high=2.0), **maps,
+            "bary": weights(n)}  # fmt: skip
+
+
+def lobes(n: int, name: str) -> dict[str, Tensor]:
+    return {"axis": units(12, 1), "sharpness": uniform(12, seed=2, low=0.5, high=30.0), "amplitude": uniform(12, 3),
+            name: units(n, 3)}  # fmt: skip
+
+
+def bsdf(paint):
+    return lambda wo, wi, base_color, alpha, metallic: (
+        material.eval_bsdf(wo, wi, base_color, alpha, metallic, paint=paint),)  # fmt: skip
+
+
+def bsdf_inputs(n):
+    return {"wo": above(n, 1), "wi": above(n, 2), "base_color": uniform(n, 3, seed=3),
+            "alpha": uniform(n, seed=4, low=0.1), "metallic": uniform(n, seed=5)}  # fmt: skip
+
+
+def moved(vertices):
+    _, faces = ball(vertices.device)
+    return (taubin_smooth(Mesh(vertices, faces), iterations=3).vertices,)
+
+
+def bumped(bump):
+    return (radial_bump(*(units(len(bump), k).to(bump) for k in (2, 3)), bump),)
+
+
+def posed(c2w, intrinsics):
+    return camera_rays(Camera(c2w, intrinsics, 12, 9))
+
+
+FRAME = dict(normal=units(N, 5), tangent=torch.nn.functional.pad(units(N, 6), (0, 1), value=1.0))
+SG, MAP = ("axis", "sharpness", "amplitude"), ("normal", "base_color", "metallic", "roughness")
+MATERIAL = ("wo", "wi", "base_color", "alpha", "metallic")
+GRID = ("level", "deformation", "alpha", "beta")
+
+CASES = {
+    "interpolate": Case(
+        lambda n: {"values": uniform(180, 3, seed=1), "bary": weights(n)},
+        lambda values, bary: (interpolate(values, *soup(values, len(bary)), bary),), ("values", "bary"),
+        ("bary",)),
+    "hit_normals": Case(
+        lambda n: {"vertices": corners(60)}, lambda vertices: (hit_normals(vertices, *soup(vertices, N)),),
+        ("vertices",)),
+    "evaluate_hits": Case(aimed, reevaluate, ("vertices", "origins", "directions"), ("origins", "directions")),
+    "sample_texture": Case(
+        lambda n: {"texture": uniform(9, 11, 3, seed=1), "uv": uniform(n, 2, seed=2, low=-1.0, high=2.0)},
+        lambda texture, uv: (gbuffer.sample_texture(texture, uv),), ("texture", "uv"), ("uv",)),
+    "surface_points": Case(
+        textured, points_of, ("vertices", "normals", "base_color", "roughness", "metallic", "normal", "bary"),
+        ("bary",)),
+    "eval_bsdf": Case(bsdf_inputs, bsdf("conserving"), MATERIAL, MATERIAL),
+    "eval_bsdf published": Case(bsdf_inputs, bsdf("published"), MATERIAL, MATERIAL),
+    "sample_ggx_vndf": Case(
+        lambda n: {"wo": above(n, 1), "alpha": uniform(n, seed=2, low=0.1), "u": numbers(n)},
+        lambda wo, alpha, u: (sampling.sample_ggx_vndf(wo, alpha, u),), ("wo", "alpha"), ("wo", "alpha", "u")),
+    "pdf_ggx_vndf": Case(
+        lambda n: {"wo": above(n, 1), "alpha": uniform(n, seed=2, low=0.1), "wm": above(n, 3)},
+        lambda wo, alpha, wm: (sampling.pdf_ggx_vndf(wo, alpha, wm),), ("wo", "alpha", "wm"), ("wo", "alpha", "wm")),
+    "sample_bsdf": Case(
+        lambda n: {"wo": above(n, 1), "alpha": uniform(n, seed=2, low=0.1), "u": numbers(n)},
+        lambda wo, alpha, u: (material.sample_bsdf(wo, alpha, u, "mirrored"),), ("wo", "alpha"), ("wo", "alpha", "u")),
+    "Environment.lookup": Case(
+        lambda n: {"radiance": uniform(8, 16, 3, seed=1), "directions": units(n, 2)},
+        lambda radiance, directions: (Environment(radiance).lookup(directions),), ("radiance", "directions"),
+        ("directions",)),
+    "SphericalGaussians.lookup": Case(
+        lambda n: lobes(n, "directions"), lambda directions, **g: (SphericalGaussians(**g).lookup(directions),),
+        (*SG, "directions"), ("directions",)),
+    "SphericalGaussians.irradiance": Case(
+        lambda n: lobes(n, "normals"), lambda normals, **g: (SphericalGaussians(**g).irradiance(normals),),
+        (*SG, "normals"), ("normals",)),
+    "shade_gaussians": Case(
+        lambda n: {**lobes(n, "normal"), **{k: v for k, v in shaded(n).items() if k != "radiance"},
+                   "wo": normalize(units(n, 1) + 0.5 * units(n, 6), dim=-1)},
+        lambda normal, wo, base_color, roughness, metallic, **g: (
+            shade_gaussians(*on_ball(normal, wo, base_color, roughness, metallic), SphericalGaussians(**g)),),
+        (*SG, "wo", *MAP), ("wo", *MAP)),
+    "shade": Case(shaded, lit(), (*MAP, "radiance"), MAP),
+    "shade, shadows by Embree": Case(shaded, lit("embree"), (*MAP, "radiance"), MAP),
+    "shade, shadows, power, random": Case(
+        shaded, lit("warp", heuristic="power", sequence="random", clamp=5.0), (*MAP, "radiance"), MAP),
+    "composite": Case(
+        lambda n: {"density": uniform(n, seed=1, low=-3.0, high=27.0), "color": uniform(n, 3, seed=2)}, composited,
+        ("density", "color"), ("density", "color")),
+    "sample_triplane": Case(
+        lambda n: {"planes": torch.randn(1, 3, 5, 9, 7, generator=rng(1)), "points": uniform(n, 3, low=-1.3, high=1.3)},
+        lambda planes, points: (sample_triplane(planes, points[None])[0],), ("planes", "points"), ("points",),
+        dtypes=("planes",)),
+    "antialias": Case(
+        lambda n: {"image": uniform(32, 32, 2, seed=1), "vertices": ball("cpu")[0]}, outlines, ("image", "vertices"),
+        second=("image", "vertices")),
+    "extract_surface": Case(grid_inputs, surface, (*GRID, "gamma"), second=("gamma",)),
+    "vertex_deviation": Case(
+        # few crossings, none within 3e-4 of a kink of the mean absolute deviation
+        lambda n: {k: v for k, v in grid_inputs(n, (3, 3, 4), 24).items() if k in GRID}, deviation, GRID, second=GRID),
+    "sign_entropy": Case(
+        lambda n: {"level": torch.randn(6, 7, 8, generator=rng(1))}, lambda level: (sign_entropy(level),), ("level",),
+        second=("level",)),
+    "vertex_normals": Case(
+        lambda n: {"vertices": ball("cpu")[0]}, lambda vertices: (vertex_normals(vertices, ball(vertices.device)[1]),),
+        ("vertices",), second=("vertices",)),
+    "taubin_smooth": Case(lambda n: {"vertices": ball("cpu")[0]}, moved, ("vertices",)),
+    "gather_views": Case(
+        lambda n: {"maps": uniform(3, 24, 20, 5, seed=1), "points": uniform(n, 3, low=-0.8, high=0.8)},
+        lambda maps, points: projection.gather_views(maps, points, *rig(points.device)), ("maps", "points"),
+        ("points",)),
+    "sample_grid": Case(
+        lambda n: {"grid": uniform(6, 5, 7, 4, seed=1), "points": uniform(n, 3, low=-1.2, high=1.2)},
+        lambda grid, points: (sample_grid(grid, points),), ("grid", "points"), ("points",)),
+    "project": Case(
+        lambda n: {"points": uniform(n, 3, low=-0.8, high=0.8)},
+        lambda points: project(points, *(v[0] for v in rig(points.device))), ("points",), ("points",),
+        second=("points",)),
+    "camera_rays": Case(
+        lambda n: dict(zip(("c2w", "intrinsics"), rig("cpu"))), posed, ("c2w", "intrinsics"),
+        second=("c2w", "intrinsics")),
+    "radial_bump": Case(
+        lambda n: {"bump": above(n, 1)}, bumped, ("bump",), ("bump",), second=("bump",), dtypes=("bump",)),
+    "world_bump": Case(
+        lambda n: {"normal": units(n, 3), "bump": above(n, 1)}, lambda normal, bump: (world_bump(normal, bump),),
+        ("normal", "bump"), ("normal", "bump"), second=("normal", "bump"), dtypes=("normal", "bump")),
+    "encode_normals": Case(
+        lambda n: {"world": units(n, 1)},
+        lambda world: (encode_normals(world, *(v[: len(world)].to(world.device) for v in FRAME.values())),), ("world",),
+        ("world",), second=("world",)),
+    "decode_normals": Case(
+        lambda n: {"encoded": 0.5 + 0.5 * above(n, 1)},
+        lambda encoded: (decode_normals(encoded, *(v[: len(encoded)].to(encoded.device) for v in FRAME.values())),),
+        ("encoded",), ("encoded",), second=("encoded",)),
+    **{f.__name__: Case(lambda n: {"value": uniform(n, 3, seed=1, low=0.01, high=1.5)}, lambda value, f=f: (f(value),),
+                        ("value",), ("value",), second=("value",), dtypes=("value",))
+       for f in (color.srgb_to_linear, color.linear_to_srgb, color.agx)},
+}  # fmt: skip

@@ -1,0 +1,155 @@
+"""The operations of geometry and renderer that have no gradient, as in ``tests/support/op_cases.py``."""
+
+from __future__ import annotations
+
+import torch
+from torch.nn.functional import normalize
+
+from reli3d.geometry import bake, hull, projection
+from reli3d.geometry.cover import cover_silhouettes
+from reli3d.geometry.hits import interpolate
+from reli3d.geometry.mesh import Mesh
+from reli3d.geometry.rays import RayScene, offset_origin
+from reli3d.geometry.tangents import vertex_tangents
+from reli3d.geometry.visibility import visible_from
+from reli3d.render import material, sampling
+from reli3d.render.environment import Environment
+from reli3d.render.reni_light import ReniLight
+from reli3d.render.shading import ShadeOptions, shade_light
+from reli3d.render.volume import OccupancyGrid, march_rays, sample_weights
+from tests.support.op_cases import (
+    MAP,
+    Case,
+    above,
+    ball,
+    corners,
+    numbers,
+    packed,
+    rig,
+    rng,
+    shaded,
+    soup,
+    uniform,
+    units,
+    weights,
+)  # fmt: skip
+from tests.support.surfaces import at
+
+
+def asked(normal, base_color, metallic, roughness, radiance):
+    light = Environment(radiance)
+    wo = normalize(normal + 0.5 * units(len(normal), 6).to(normal), dim=-1)
+    points, wo = at(0.2 * normal, normal, normal, wo, base_color, roughness, metallic)
+    return (shade_light(points, wo, light, light, options=ShadeOptions(seed=3)),)
+
+
+def traced(backend):
+    def run(origins, directions):
+        scene = RayScene(*ball(origins.device, 3), backend if origins.device.type == "cpu" else "warp")
+        hits = scene.closest(origins, directions)
+        clear = scene.clear(origins, directions, origins[:, 0])  # some limits are below 0
+        return hits.face, hits.t, hits.bary, scene.occluded(origins, directions, t_max=1.5), clear
+
+    return run
+
+
+def rays(n):
+    return {"origins": uniform(n, 3, seed=1, low=-1.0), "directions": torch.randn(n, 3, generator=rng(2))}
+
+
+def marched(origins, directions):
+    occupied = (torch.rand(12, 12, 12, generator=rng(5)) < 0.3).to(origins.device)
+    samples = march_rays(origins, directions, OccupancyGrid(occupied, 0.8), 0.013)
+    ray = samples.ray.long()
+    return samples.first.diff(), samples.t.new_zeros(len(origins)).index_add(0, ray, samples.t)
+
+
+def texels(vertices):
+    n = len(vertices)
+    faces, _ = soup(vertices, 0)
+    uv = torch.tensor([[0.05, 0.1], [0.9, 0.2], [0.15, 0.85]], device=vertices.device).repeat(n // 3, 1)
+    cell = torch.arange(n // 3, device=vertices.device).repeat_interleave(3)
+    uv = (uv + torch.stack([cell % 4, cell // 4], -1)) / 4.0
+    mesh = Mesh(vertices, faces, normalize(vertices.contiguous(), dim=-1), uv)
+    found = bake.rasterize_texels(mesh, 64)
+    maps = bake.bake(mesh, 64, lambda position, normal: torch.cat([position, normal], 1), texels=found)
+    near, square = bake.nearest_valid(found.valid)
+    tangents = vertex_tangents(mesh)
+    mesh = Mesh(vertices, faces, mesh.normals, uv, tangents)
+    along = bake.bake(mesh, 64, lambda position, normal, tangent: tangent, texels=found, tangents=True)
+    return found.face, found.bary, near, square, maps["value"], along["value"], bake.coverage(mesh, 64), tangents
+
+
+def seen_from(points, normal):
+    c2w, intrinsics = rig(points.device)
+    scene = RayScene(*ball(points.device, radius=0.3), "warp")
+    images = uniform(3, 24, 24, 4, seed=2).to(points)
+    visible = visible_from(scene, points, normal, c2w, intrinsics, 24)
+    own, share, total = projection.summarize_views(images, c2w, intrinsics, points, visible.float(), normal)
+    tokens, mix = uniform(3, 4, 4, 8, seed=4).to(points), uniform(9, 8, seed=5).to(points)
+    pooled, _ = projection.pool_views(images, tokens, mix, c2w, intrinsics, points, visible.float(), normal)
+    pixels = uniform(3, 3, 8, 8, 4, seed=6).to(points)
+    fused = projection.fuse_views(images, pixels, c2w, intrinsics, points, visible.float(), normal)
+    return visible, own, share, total, pooled, *fused
+
+
+def hulls(masks, points):
+    c2w, intrinsics = rig(points.device)
+    distance = hull.mask_distance(masks)
+    return distance, hull.hull_distance(points, distance, c2w, intrinsics)
+
+
+def hull_masks():
+    y, x = torch.meshgrid(torch.arange(24.0), torch.arange(20.0), indexing="ij")
+    return ((y - 12.5).square() + (x - 10.5).square() < 60.0).float().expand(3, 24, 20).contiguous()
+
+
+def covered(level, bound, masks):
+    return (cover_silhouettes(level, bound, hull.mask_distance(masks), *rig(level.device), radius=0.7),)
+
+
+def drawn(u, radiance, wo, alpha):
+    light = Environment(radiance)
+    directions, density = light.sample(u)
+    wi = sampling.sample_cosine(u)
+    return (directions, density, light.pdf(wi), wi, material.pdf_lobes(wo, wi, alpha),
+            sampling.random_pairs(len(u), seed=4, device=u.device), sampling.halton(len(u), device=u.device),
+            offset_origin(wo, wi, directions))  # fmt: skip
+
+
+def asked_of_reni(directions):
+    """Two layers of random numbers of the size that training leaves."""
+    rows = {"first": 5 * 11 + 1, "matrices": 512, "vectors": 14, "last": 3}
+    parts = {k: 0.1 * torch.randn(n, 128, generator=rng(n)).to(directions) for k, n in rows.items()}
+    light = ReniLight(uniform(9, 2, seed=1).to(directions), **parts, offset=uniform(1, 3, seed=2).to(directions))
+    return light.lookup(directions), light.environment(8).radiance
+
+
+def four(values, bary):
+    return (interpolate(values, *soup(values, len(bary)), bary),)
+
+
+CASES = {
+    "closest, Warp": Case(rays, traced("warp"), rows=("origins", "directions")),
+    "closest, Embree": Case(rays, traced("embree"), rows=("origins", "directions")),
+    "draws": Case(
+        lambda n: {"u": numbers(n), "radiance": uniform(8, 16, 3, seed=5), "wo": above(n, 1),
+                   "alpha": uniform(n, seed=2, low=0.1)}, drawn, rows=("u", "wo", "alpha")),
+    "shade_light": Case(shaded, asked, rows=MAP),
+    "sample_weights": Case(
+        lambda n: {"density": uniform(n, seed=1, low=-3.0, high=27.0)}, lambda density: (
+            sample_weights(density, packed(density)),), rows=("density",)),
+    "march_rays": Case(lambda n: {"origins": 2.0 * units(n, 1), "directions": units(n, 2)}, marched,
+                       rows=("origins", "directions")),
+    "bake": Case(lambda n: {"vertices": corners(12)}, texels),
+    "views": Case(lambda n: {"points": uniform(n, 3, seed=1, low=-0.6, high=0.6), "normal": units(n, 2)}, seen_from,
+                  rows=("points", "normal")),
+    "hull": Case(lambda n: {"masks": (uniform(3, 24, 20, seed=1) > 0.6).float(), "points": uniform(n, 3, low=-0.8)},
+                 hulls, rows=("points",)),
+    "cover_silhouettes": Case(
+        lambda n: {"level": uniform(12, 11, 10, seed=1, low=0.1, high=2.0), "bound": uniform(12, 11, 10, low=-3.0),
+                   "masks": hull_masks()}, covered),
+    "ReniLight": Case(lambda n: {"directions": units(n, 1)}, asked_of_reni, rows=("directions",)),
+    "interpolate tangents": Case(
+        lambda n: {"values": uniform(180, 4, seed=1), "bary": weights(n)}, four, ("values", "bary"), ("bary",)),
+}  # fmt: skip

@@ -1,0 +1,62 @@
+"""Small scenes: an eye, balls with their textures, a mesh that casts a shadow, maps of light."""
+
+import torch
+import trimesh
+
+from reli3d.geometry.mesh import Mesh
+from reli3d.geometry.rays import RayScene
+from reli3d.render.asset import Asset, TextureSet
+from reli3d.render.camera import look_at
+from reli3d.render.environment import Environment
+
+SKIES = ("constant", "sky", "sun")
+
+
+def eye(device, *position):
+    at = torch.tensor(position, dtype=torch.float32, device=device)
+    return look_at(at, torch.zeros(3, device=device), torch.tensor([0.0, 1.0, 0.0], device=device))
+
+
+def textures(size, device, color=(0.5, 0.5, 0.5), roughness=0.5, metallic=0.0, normal=(0.5, 0.5, 1.0)):
+    color, normal = (torch.tensor(v, device=device).expand(size, size, 3).contiguous() for v in (color, normal))
+    return TextureSet(color, roughness, metallic, normal)
+
+
+def ball(device, color=(0.7, 0.7, 0.7)):
+    m = trimesh.creation.icosphere(subdivisions=3, radius=0.6)
+    f = torch.tensor(m.faces, dtype=torch.int32, device=device)
+    v = torch.tensor(m.vertices, dtype=torch.float32, device=device)
+    uv = torch.rand(len(v), 2, generator=torch.Generator().manual_seed(0)).to(device)
+    return Asset(Mesh(v, f, torch.nn.functional.normalize(v, dim=-1), uv), textures(4, device, color))
+
+
+def ball_mesh(subdivisions: int, radius: float) -> Mesh:
+    """A ball with smooth normals, tangents, and its view from +Z as texture coordinates."""
+    m = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
+    v = torch.tensor(m.vertices, dtype=torch.float32)
+    n = torch.nn.functional.normalize(v, dim=-1)
+    tangent = torch.nn.functional.normalize(torch.linalg.cross(n.new_tensor([0.3, 0.5, 0.81]).expand_as(n), n), dim=-1)
+    return Mesh(v, torch.tensor(m.faces, dtype=torch.int32), n, (0.5 + 0.45 * n[:, :2]).contiguous(),
+                torch.cat([tangent, torch.ones(len(v), 1)], -1))  # fmt: skip
+
+
+def shadow_caster(device, backend="auto"):
+    mesh = trimesh.creation.icosphere(subdivisions=3, radius=0.4)
+    mesh.apply_translation([0, 1.2, 0])
+    vertices, faces = torch.tensor(mesh.vertices).float().to(device), torch.tensor(mesh.faces).int().to(device)
+    return RayScene(vertices, faces, backend)
+
+
+def sky(height=16, seed=0, power=3.0):
+    g = torch.Generator().manual_seed(seed)
+    return Environment(torch.rand(height, 2 * height, 3, generator=g) ** power * 2.0)
+
+
+def light(name, device):
+    up = torch.linspace(1, -1, 32)[:, None, None].clamp(min=0.0)
+    map_ = (0.4 + 0.6 * up).expand(32, 64, 3).clone()
+    if name == "constant":
+        map_ = torch.full((32, 64, 3), 0.7)
+    if name == "sun":
+        map_[7, 20] = 2000.0
+    return Environment(map_.to(device))

@@ -1,0 +1,33 @@
+"""Points to shade, at random, and from arrays in the order of the estimator's formulas."""
+
+import torch
+from torch import Tensor
+
+from reli3d.render.points import SurfacePoints
+
+
+def at(position, normal, ng, wo, base_color, roughness, metallic) -> tuple[SurfacePoints, Tensor]:
+    """The first two arguments of ``shade``."""
+    return SurfacePoints(position, ng, normal, base_color, roughness, metallic), wo
+
+
+def on_ball(normal, wo, base_color, roughness, metallic) -> tuple[SurfacePoints, Tensor]:
+    """The same for points of the unit ball, whose three vectors are one."""
+    return at(normal, normal, normal, wo, base_color, roughness, metallic)
+
+
+def points(n, seed=1):
+    g = torch.Generator().manual_seed(seed)
+    normal = torch.nn.functional.normalize(torch.randn(n, 3, generator=g), dim=-1)
+    wo = torch.nn.functional.normalize(normal + 0.6 * torch.randn(n, 3, generator=g), dim=-1)
+    wo = torch.where((wo * normal).sum(-1, keepdim=True) < 0.05, normal, wo)
+    return normal, wo
+
+
+def inputs(n, device):
+    """Leaves in the order of ``shade``: normal, wo, base, roughness, metallic."""
+    g = torch.Generator().manual_seed(4)
+    normal, wo = points(n, seed=6)
+    values = [normal, wo, 0.2 + 0.6 * torch.rand(n, 3, generator=g), 0.4 + 0.4 * torch.rand(n, generator=g),
+              torch.rand(n, generator=g)]  # fmt: skip
+    return [v.to(device) for v in values]

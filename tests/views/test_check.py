@@ -1,0 +1,109 @@
+from dataclasses import replace
+
+import pytest
+import torch
+from PIL import Image
+
+from reli3d.views.check import explain_cameras, rig_picture
+from reli3d.views.folder import load_views
+from tests.support.rigs import sphere_views
+
+FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
+ROLL = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0]))
+QUARTER = torch.tensor([[0.0, 1.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+
+
+def transposed(c2w):
+    result = c2w.clone()
+    result[:, :3, :3] = c2w[:, :3, :3].transpose(1, 2)
+    return result
+
+
+MISTAKES = {
+    "flipped": (lambda c: c @ FLIP, "camera axes look flipped"),
+    "world_to_camera": (torch.linalg.inv, "look like world-to-camera;"),
+    "colmap": (lambda c: torch.linalg.inv(c @ FLIP), "world-to-camera in OpenCV axes"),
+    "transposed": (transposed, "rotations look transposed (world"),
+    "transposed_flipped": (lambda c: transposed(c @ FLIP), "rotations look transposed and in OpenCV"),
+    "upside_down": (lambda c: c @ ROLL, "upside down"),
+    "quarter": (lambda c: c @ QUARTER, "turned by 90 degrees"),
+}
+
+
+def rig(count=4):
+    views = sphere_views(count=count, size=(120, 120))
+    return replace(views, intrinsics=views.intrinsics - torch.tensor([0.0, 0.0, 3.0, -2.0]))  # a turn keeps the centre
+
+
+@pytest.mark.parametrize("count", [2, 4, 16])
+def test_right_cameras_agree(count):
+    lines = explain_cameras(rig(count))
+    assert len(lines) == count + 1
+    assert lines[-1].startswith("cameras agree")
+    assert "left as it is" in lines[-1]
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_the_mistake_is_named(name):
+    change, words = MISTAKES[name]
+    views = rig(6)
+    line = explain_cameras(replace(views, c2w=change(views.c2w).contiguous()))[-1]
+    assert line.startswith("suspect: ")
+    assert words in line
+
+
+def test_inverted_masks_are_named():
+    views = rig()
+    line = explain_cameras(replace(views, masks=tuple(1 - m for m in views.masks)))[-1]
+    assert line.startswith("suspect: the masks look inverted")
+
+
+def test_the_view_that_disagrees_is_named():
+    views = rig(5)
+    c2w = views.c2w.clone()
+    c2w[3] = c2w[3] @ FLIP
+    assert "view 3 (3.png) does not agree" in explain_cameras(replace(views, c2w=c2w))[-1]
+
+
+def test_unrelated_cameras_are_suspect():
+    views = rig(4)
+    c2w = views.c2w.clone()
+    c2w[:, :3, 3] += torch.randn(4, 3, generator=torch.Generator().manual_seed(1)) * 2
+    assert explain_cameras(replace(views, c2w=c2w))[-1].startswith("suspect: ")
+
+
+def test_one_view_says_what_it_cannot_know():
+    views = rig(1)
+    assert explain_cameras(views)[-1].startswith("one view: nothing to compare")
+    assert "looks away from the origin" in explain_cameras(replace(views, c2w=views.c2w @ FLIP))[-1]
+
+
+def test_lines_are_single_and_printable():
+    views = replace(rig(2), names=("a\nb\x1b[31m.png", "c.png"))
+    assert all(line.isprintable() for line in explain_cameras(views))
+
+
+@pytest.mark.parametrize("change", [lambda c: c, lambda c: c @ FLIP, lambda c: torch.linalg.inv(c)])
+def test_the_picture_is_drawn_for_right_and_wrong_cameras(tmp_path, change):
+    views = sphere_views(count=9)
+    rig_picture(replace(views, c2w=change(views.c2w)), tmp_path / "rig.png")
+    picture = Image.open(tmp_path / "rig.png")
+    assert picture.width > 1000
+    colours = {c for _, c in picture.getcolors(1 << 20)}
+    assert {(214, 39, 40), (0, 200, 0)} <= colours  # the last frustum and the outline of a mask
+    assert [p.name for p in tmp_path.iterdir()] == ["rig.png"]
+
+
+def test_the_picture_takes_one_view_of_any_shape(tmp_path):
+    rig_picture(sphere_views(count=1, size=(300, 40), fov=1.5), tmp_path / "wide.png")
+    rig_picture(sphere_views(count=1, size=(24, 200), fov=0.2), tmp_path / "high.png")
+
+
+@pytest.mark.parametrize("name", ["Camera_01", "Lantern_01", "UCO3D_217-72983-41010", "UCO3D_639-13622-90739"])
+def test_real_captures(shared_data, name):
+    views = load_views(shared_data / "captures" / name)
+    for count in (2, 4):
+        assert explain_cameras(views.select(count))[-1].startswith("cameras agree")
+    for mistake in ("flipped", "world_to_camera", "colmap", "transposed"):
+        change, words = MISTAKES[mistake]
+        assert words in explain_cameras(replace(views, c2w=change(views.c2w)))[-1]

@@ -1,0 +1,229 @@
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from reli3d.io.files import InputError
+from reli3d.render.camera import project
+from reli3d.views.folder import MAX_VIEWS, load_views
+from reli3d.views.shots import Lens, bend_of
+from tests.support import evil
+
+
+def photo(path, width=40, height=30, alpha=True):
+    """A picture of this size with a rectangle as object."""
+    pixels = np.zeros((height, width, 4), np.uint8)
+    pixels[..., :3] = 90
+    pixels[5:-5, 8:-8] = (200, 50, 20, 255)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(pixels if alpha else pixels[..., :3].copy()).save(path)
+
+
+def transforms(folder, frames, **top):
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "transforms.json").write_text(json.dumps({**top, "frames": frames}))
+
+
+def test_object_folder_as_published(tmp_path):
+    data = evil.good(tmp_path)
+    frames = data["frames"]
+    frames[0].update(view_index=7, camera_fov=0.5)  # scalar: both sides
+    frames[1].update(view_index=3, camera_fov=[0.6, 0.4], camera_principal_point=[10.0, 20.5])
+    frames[1]["camera_transform"] = frames[1].pop("transform_matrix")
+    del frames[2]["camera_fov"], frames[2]["camera_principal_point"], frames[2]["view_index"]  # index 0, default lens
+    transforms(tmp_path, frames, coordinate_system="blender")
+    views = load_views(tmp_path)
+    assert views.names == ("rgba/2.png", "rgba/1.png", "rgba/0.png")
+    assert views.coordinate_system == "blender"
+    s = evil.SIDE / 2
+    expected = [[s / math.tan(0.35), s / math.tan(0.35), s, s], [s / math.tan(0.3), s / math.tan(0.2), 10.0, 20.5],
+                [s / math.tan(0.25), s / math.tan(0.25), s, s]]  # fmt: skip
+    torch.testing.assert_close(views.intrinsics, torch.tensor(expected), rtol=1e-6, atol=0)
+    torch.testing.assert_close(views.c2w, torch.tensor([evil.pose(2.1 * i) for i in (2, 1, 0)]), rtol=0, atol=1e-6)
+    assert len(views.notes) == 1
+    assert "0.7 radians" in views.notes[0]
+    assert load_views(tmp_path, first_views=2).names == views.names[:2]
+
+
+def test_blender_folder(tmp_path):
+    photo(tmp_path / "train/r_0.png")
+    transforms(tmp_path, [{"file_path": "./train/r_0", "rotation": 0.1, "transform_matrix": evil.pose(0.3)}],
+               camera_angle_x=0.6911112070083618)  # fmt: skip
+    views = load_views(tmp_path)
+    focal = 0.5 * 40 / math.tan(0.5 * 0.6911112070083618)  # the focal length of x serves y: square pixels
+    torch.testing.assert_close(views.intrinsics, torch.tensor([[focal, focal, 20.0, 15.0]]))
+    assert views.images[0].shape == (30, 40, 3)
+    assert float(views.images[0][0, 0, 0]) == pytest.approx(90 / 255)  # the colour under alpha 0
+
+
+def test_nerfstudio_folder(tmp_path):
+    photo(tmp_path / "images/a.jpg", alpha=False)
+    photo(tmp_path / "images/b.jpg", alpha=False)
+    for name in "ab":
+        mask = np.zeros((30, 40), np.uint8)
+        mask[4:20, 6:30] = 255
+        (tmp_path / "masks").mkdir(exist_ok=True)
+        Image.fromarray(mask).save(tmp_path / f"masks/{name}.png")
+    frames = [{"file_path": "images/a.jpg", "mask_path": "masks/a.png", "transform_matrix": evil.pose(0.0)},
+              {"file_path": "images/b.jpg", "transform_matrix": evil.pose(1.0), "fl_x": 70.0, "w": 40, "h": 30,
+               "cx": 19.0, "cy": 14.0}]  # fmt: skip
+    top = dict(camera_model="OPENCV", fl_x=120.0, fl_y=121.0, cx=41.0, cy=29.0, w=80, h=60, k1=1e-4, k2=0.0, p1=0, p2=0,
+               applied_transform=[[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]])  # fmt: skip
+    transforms(tmp_path, frames, **top)
+    views = load_views(tmp_path)
+    # the first is calibrated at twice the size; the second has its own focal length, which serves both sides
+    torch.testing.assert_close(views.intrinsics, torch.tensor([[60.0, 60.5, 20.5, 14.5], [70.0, 70.0, 19.0, 14.0]]))
+    notes = " ".join(views.notes)
+    assert "scaled from 80 x 60 to 40 x 30" in notes
+    assert "applied_transform" in notes
+    assert "distortion" in notes
+    assert [int(m.sum()) for m in views.masks] == [384, 384]
+
+
+def test_colmap_folder_agrees_with_colmaps_own_projection(tmp_path):
+    """x = K (R X + t) with the stored quaternion, in float64, against our camera-to-world and project()."""
+    rng = np.random.default_rng(4)
+    photo(tmp_path / "images/sub dir/ü 1.png")
+    photo(tmp_path / "images/a.png")
+    quaternions = rng.standard_normal((2, 4))
+    quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
+    t = np.array([[0.1, -0.2, 3.0], [0.3, 0.1, 2.5]])
+    (tmp_path / "sparse/0").mkdir(parents=True)
+    cameras = "# c\n3 PINHOLE 40 30 55.5 56.5 21.0 13.0\n9 SIMPLE_PINHOLE 40 30 44 20 15\n"
+    (tmp_path / "sparse/0/cameras.txt").write_text(cameras)
+    lines = [f"{i} {' '.join(map(repr, map(float, q)))} {' '.join(map(repr, map(float, p)))} {c} {n}\n"
+             for i, q, p, c, n in zip((5, 2), quaternions, t, (3, 9), ("sub dir/ü 1.png", "a.png"))]  # fmt: skip
+    (tmp_path / "sparse/0/images.txt").write_text(f"# i\n{lines[0]}1 2 -1 3 4 7\n{lines[1]}\n")  # no points: empty line
+    views = load_views(tmp_path)
+    assert views.names == ("a.png", "sub dir/ü 1.png")
+    points = rng.uniform(-0.5, 0.5, (20, 3))
+    for ours, i, k in ((0, 1, (44, 44, 20, 15)), (1, 0, (55.5, 56.5, 21.0, 13.0))):
+        w, v = quaternions[i][0], quaternions[i][1:]
+        turned = points + 2 * np.cross(v, np.cross(v, points) + w * points)  # q X q*
+        camera = turned + t[i]
+        expected = camera[:, :2] / camera[:, 2:] * k[:2] + k[2:]
+        pixels, depth = project(torch.from_numpy(points).float(), views.c2w[ours], views.intrinsics[ours])
+        np.testing.assert_allclose(pixels, expected, atol=2e-4)  # float32 poses, some 50 pixels from the centre
+        np.testing.assert_allclose(depth, camera[:, 2], rtol=1e-5)
+    with pytest.raises(InputError, match="masks: expected a folder"):
+        load_views(tmp_path, masks=tmp_path / "none")
+
+
+def test_small_distortion_is_ignored_with_a_note_and_large_refused(tmp_path):
+    evil.colmap(tmp_path)
+    cameras = tmp_path / "sparse/0/cameras.txt"
+    cameras.write_text("1 RADIAL 32 32 51.7 16 16 0.001 0\n")
+    assert any("distortion" in n for n in load_views(tmp_path).notes)
+    cameras.write_text("1 RADIAL 32 32 51.7 16 16 -0.5 0\n")
+    with pytest.raises(InputError, match="undistort"):
+        load_views(tmp_path)
+    # k1 moves the corner at radius r (over the focal length) by f k1 r^3
+    assert bend_of(100, 120, 160, (0.1, 0.0), ()) == pytest.approx(100 * 0.1 * 1.0**3)
+
+
+def test_which_mask_counts(tmp_path):
+    """A masks argument, then mask_path, then alpha, then a masks folder."""
+    photo(tmp_path / "a.png")
+    shapes = {}
+    for k, name in enumerate(("given", "named", "masks")):
+        mask = np.zeros((30, 40), np.uint8)
+        mask[: 10 + k] = 255
+        shapes[name] = int(mask.sum() / 255)
+        (tmp_path / name).mkdir()
+        Image.fromarray(mask).save(tmp_path / name / "a.png")
+    frame = {"file_path": "a.png", "transform_matrix": evil.pose(0), "camera_fov": 0.6}
+    transforms(tmp_path, [frame])
+    alpha = 20 * 24
+    assert int(load_views(tmp_path).masks[0].sum()) == alpha
+    assert int(load_views(tmp_path, masks=tmp_path / "given").masks[0].sum()) == shapes["given"]
+    transforms(tmp_path, [frame | {"mask_path": "named/a.png"}])
+    assert int(load_views(tmp_path).masks[0].sum()) == shapes["named"]
+    transforms(tmp_path, [frame])
+    photo(tmp_path / "a.png", alpha=False)
+    assert int(load_views(tmp_path).masks[0].sum()) == shapes["masks"]
+    (tmp_path / "masks/a.png").rename(tmp_path / "masks/a.png.png")  # as COLMAP names them
+    assert int(load_views(tmp_path).masks[0].sum()) == shapes["masks"]
+
+
+def test_files_outside_need_permission(tmp_path):
+    photo(tmp_path / "elsewhere/a.png")
+    frame = {"file_path": "../elsewhere/a.png", "transform_matrix": evil.pose(0), "camera_fov": 0.6}
+    transforms(tmp_path / "object", [frame])
+    with pytest.raises(InputError, match="leads out of it"):
+        load_views(tmp_path / "object")
+    assert len(load_views(tmp_path / "object", allow_outside=True)) == 1
+    transforms(tmp_path / "object", [frame | {"file_path": str(tmp_path / "elsewhere/a.png")}])
+    assert len(load_views(tmp_path / "object", allow_outside=True)) == 1
+    transforms(tmp_path / "object", [frame | {"file_path": "../object/../object/b"}])  # comes back in: fine
+    photo(tmp_path / "object/b.png")
+    assert len(load_views(tmp_path / "object")) == 1
+
+
+def test_number_of_views(tmp_path):
+    frames = evil.good(tmp_path)["frames"] * 7
+    transforms(tmp_path, frames)
+    assert len(load_views(tmp_path)) == 3  # what is there seven times is taken once
+    for options in ({"views": MAX_VIEWS}, {"first_views": MAX_VIEWS}):
+        assert len(load_views(tmp_path, **options)) == MAX_VIEWS
+    for name in ("views", "first_views"):
+        for wrong in (0, 17, -1, True, 2.0):
+            with pytest.raises(InputError, match=f"^{name}: expected 1 to 16"):
+                load_views(tmp_path, **{name: wrong})
+
+
+def test_rounding_in_the_matrix_is_cleaned_up(tmp_path):
+    data = evil.good(tmp_path, views=1)
+    matrix = [[round(v, 4) for v in row] for row in evil.pose(0.7)]
+    transforms(tmp_path, [data["frames"][0] | {"transform_matrix": matrix}])
+    rotation = load_views(tmp_path).c2w[0, :3, :3].double()
+    assert float((rotation.T @ rotation - torch.eye(3)).abs().max()) < 3e-7  # float32
+    exact = torch.tensor(evil.pose(0.7), dtype=torch.float64)[:3, :3]
+    assert float((rotation - exact).abs().max()) < 1e-4  # four digits
+
+
+def test_paths_with_spaces_and_other_letters(tmp_path):
+    folder = tmp_path / "mein Objekt ñ"
+    photo(folder / "im ages/é 1.png")
+    transforms(folder, [{"file_path": "im ages/é 1.png", "transform_matrix": evil.pose(0), "camera_fov": 0.6}])
+    assert load_views(str(folder)).names == ("im ages/é 1.png",)
+
+
+@pytest.mark.parametrize("name, system, count", [
+    ("Camera_01", "ogl", 4), ("Lantern_01", "ogl", 4), ("UCO3D_217-72983-41010", "blender", 4),
+    ("UCO3D_639-13622-90739", "blender", 4),
+])  # fmt: skip
+def test_real_captures(shared_data, name, system, count):
+    folder = shared_data / "captures" / name
+    views = load_views(folder)
+    stored = json.loads((folder / "transforms.json").read_text())["frames"]
+    stored.sort(key=lambda f: f["view_index"])
+    assert (len(views), views.coordinate_system, views.notes) == (count, system, ())
+    for i, frame in enumerate(stored):
+        pixels = np.asarray(Image.open(folder / frame["file_path"]))
+        assert torch.equal((views.images[i] * 255).round().byte(), torch.from_numpy(pixels[..., :3].copy()))
+        assert torch.equal((views.masks[i] * 255).round().byte(), torch.from_numpy(pixels[..., 3].copy()))
+        # float32 of the file against a rotation made exact: its own rounding
+        np.testing.assert_allclose(views.c2w[i], frame["transform_matrix"], atol=1e-6)
+        fx, fy = (288 / math.tan(0.5 * a) for a in frame["camera_fov"])
+        np.testing.assert_allclose(views.intrinsics[i], [fx, fy, *frame["camera_principal_point"]], rtol=1e-6)
+
+
+def test_premultiplied_alpha_is_noted(tmp_path):
+    """A bright disk with a soft edge on black, its colour multiplied by alpha or not."""
+    y, x = np.mgrid[:64, :64] - 31.5
+    alpha = np.clip((24 - np.hypot(x, y)) / 6, 0, 1)
+    frame = {"file_path": "a.png", "transform_matrix": evil.pose(0), "camera_fov": 0.6}
+    transforms(tmp_path, [frame])
+    flat = np.full_like(alpha, 0.8)
+    for colour, noted in ((np.where(alpha > 0, flat, 0.0), False), (flat * alpha, True), (flat, False)):
+        pixels = np.stack([colour, colour * 0.7, colour * 0.5, alpha], -1)
+        Image.fromarray(np.rint(pixels * 255).astype(np.uint8)).save(tmp_path / "a.png")
+        assert bool(load_views(tmp_path).notes) == noted
+
+
+def test_lens_defaults():
+    assert Lens().size is None
+    assert Lens(fov=(0.5, math.nan)).centre is None

@@ -1,0 +1,147 @@
+import math
+
+import pytest
+import torch
+
+from reli3d.views.folder import load_views
+from reli3d.views.normalize import meeting_point, normalize, visual_hull
+from reli3d.views.similarity import Similarity
+from reli3d.views.views import Views
+from tests.support.rigs import eyes_around, sphere_views
+
+BALL = ((0.0, 0.0, 0.0, 0.5),)
+
+
+def turn(seed: int) -> torch.Tensor:
+    q = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64))[0]
+    return q * torch.sign(torch.linalg.det(q))
+
+
+def some_similarity(seed: int) -> Similarity:
+    shift = torch.randn(3, generator=torch.Generator().manual_seed(seed + 9), dtype=torch.float64)
+    return Similarity(0.3 + seed, turn(seed), shift)
+
+
+def test_similarities_are_a_group():
+    a, b = some_similarity(1), some_similarity(2)
+    points = torch.randn(20, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
+    homogeneous = torch.cat([points, torch.ones(20, 1)], -1)
+    exact = dict(rtol=0, atol=1e-12)  # float64, a few operations on values below 10
+    torch.testing.assert_close(a.apply(points), (homogeneous @ a.matrix().T)[:, :3], **exact)
+    torch.testing.assert_close(a.compose(b).matrix(), a.matrix() @ b.matrix(), **exact)
+    torch.testing.assert_close(a.compose(b).apply(points), a.apply(b.apply(points)), **exact)
+    torch.testing.assert_close(a.inverse().matrix() @ a.matrix(), torch.eye(4, dtype=torch.float64), **exact)
+    torch.testing.assert_close(Similarity.from_matrix(a.matrix()).matrix(), a.matrix(), **exact)
+    assert Similarity.identity().is_identity()
+    assert not a.is_identity()
+    assert a.apply(points.float()).dtype == torch.float32
+
+
+@pytest.mark.parametrize("matrix", [
+    torch.zeros(4, 4), torch.diag(torch.tensor([1.0, 1.0, -1.0, 1.0])), torch.diag(torch.tensor([1.0, 2.0, 1.0, 1.0])),
+    torch.eye(3), torch.full((4, 4), math.nan), torch.eye(4) * 2,
+])  # fmt: skip
+def test_other_matrices_are_refused(matrix):
+    with pytest.raises(ValueError, match="matrix: expected"):
+        Similarity.from_matrix(matrix)
+
+
+@pytest.mark.parametrize("spheres, low, high", [
+    (BALL, (-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)),
+    (((0.3, 0.0, 0.0, 0.1), (-0.3, 0.1, 0.2, 0.2)), (-0.5, -0.1, -0.1), (0.4, 0.3, 0.4)),
+])  # fmt: skip
+def test_the_hull_of_many_views_is_the_object(spheres, low, high):
+    axes = 4.0 * torch.cat([torch.eye(3), -torch.eye(3)])
+    hull = visual_hull(sphere_views(spheres, eyes=torch.cat([axes, eyes_around(8, 4.0)]), fov=0.4, size=(200, 200)))
+    got = torch.stack(hull.box())
+    # a cell and two pixels (4 * 0.4 / 200 each); the hull of a ball of radius 1/2 from distance 4 exceeds it by 0.004
+    limit = 1.0 * hull.cell + 2 * 4 * 0.4 / 200 + 0.004
+    torch.testing.assert_close(got, torch.tensor([low, high], dtype=torch.float64), rtol=0, atol=limit)
+    assert limit < 0.1
+
+
+@pytest.mark.parametrize("count, scale, centre", [
+    (1, 1.0, (0, 0, 0)), (1, 40.0, (0, 0, 0)), (2, 1.0, (0, 0, 0)), (2, 40.0, (300, -20, 5)), (3, 0.01, (0.02, 0.1, 0)),
+    (8, 40.0, (300, -20, 5)), (8, 0.01, (0.02, 0.1, 0)),
+])  # fmt: skip
+def test_an_object_anywhere_is_centred_and_scaled(count, scale, centre):
+    """A ball of diameter 1.  One view finds its middle if it is the point of the ray nearest to the origin."""
+    centre = torch.tensor(centre, dtype=torch.float64)
+    views = sphere_views(BALL, count).transformed(Similarity(scale, torch.eye(3, dtype=torch.float64), centre))
+    similarity = normalize(views, "hull")
+    middle = similarity.apply(centre)
+    radius = similarity.scale * 0.5 * scale
+    # the hull of a few views of a ball exceeds it by up to 30 % (the limiting ball), mostly by its grid
+    assert 0.5 / 1.35 < radius < 0.53
+    assert float(middle.norm()) < 0.12
+    assert torch.equal(similarity.rotation, torch.eye(3, dtype=torch.float64))
+
+
+def test_normalisation_does_not_depend_on_the_frame():
+    """Scaling and shifting the rig changes the answer by that much and nothing else."""
+    views = sphere_views(count=5)
+    move = Similarity(7.0, torch.eye(3, dtype=torch.float64), torch.tensor([3.0, 1.0, -2.0], dtype=torch.float64))
+    there = normalize(views.transformed(move), "hull").compose(move)
+    # c2w is float32: the grid shifts by 1e-6 and a cell at the edge may change sides
+    torch.testing.assert_close(there.matrix(), normalize(views, "hull").matrix(), rtol=0, atol=0.04)
+
+
+def test_auto_leaves_a_good_frame_alone_and_changes_a_bad_one():
+    assert normalize(sphere_views(BALL, 4)).is_identity()
+    assert normalize(sphere_views(BALL, 1)).is_identity()
+    for scale, shift in ((0.3, 0.0), (2.5, 0.0), (1.0, 0.5)):
+        move = Similarity(scale, torch.eye(3, dtype=torch.float64), torch.tensor([shift, 0, 0], dtype=torch.float64))
+        moved = sphere_views(BALL, 4).transformed(move)
+        similarity = normalize(moved)
+        assert not similarity.is_identity()
+        assert normalize(moved.transformed(similarity)).is_identity()  # once is enough
+    assert normalize(sphere_views(BALL, 4).transformed(move), "none").is_identity()
+
+
+def test_thin_parts_count():
+    """A rod of spheres 1 pixel wide is far below a grid cell."""
+    rod = tuple((0.0, 0.02 * k, 0.0, 0.012) for k in range(-25, 26))
+    low, high = visual_hull(sphere_views(rod, 4, size=(150, 150))).box()
+    assert float((high - low)[1]) == pytest.approx(1.02, abs=0.12)
+
+
+def test_an_object_cut_by_the_border_is_not_lost():
+    views = sphere_views(((0.0, 0.0, 0.0, 0.9),), 4, distance=2.2, fov=0.5)  # larger than the image
+    hull = visual_hull(views)
+    assert len(hull.points) > 1000
+    assert float(hull.points.norm(dim=-1).max()) < 2.2
+
+
+def test_rays_meet():
+    eyes = torch.tensor([[2.0, 0.0, 1.0], [0.0, 2.0, 1.0]], dtype=torch.float64)
+    point, spread = meeting_point(eyes, torch.tensor([[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], dtype=torch.float64))
+    torch.testing.assert_close(point, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+    assert spread == pytest.approx(0.5)  # sin^2 of the z axis is 1, of x and y 1/2
+    ray = torch.tensor([[-1.0, 0.0, 0.0]], dtype=torch.float64)
+    point, spread = meeting_point(eyes[:1], ray)
+    torch.testing.assert_close(point, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))  # nearest to the origin
+    assert spread == pytest.approx(0.0, abs=1e-12)
+    away, _ = meeting_point(eyes[:1], -ray)
+    torch.testing.assert_close(away, torch.tensor([3.0, 0.0, 1.0], dtype=torch.float64))
+
+
+def test_cameras_that_agree_on_nothing_are_an_error():
+    views = sphere_views(count=3)
+    flipped = views.c2w @ torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
+    wrong = Views(views.images, views.masks, flipped, views.intrinsics, views.names)
+    with pytest.raises(ValueError, match="--check"):
+        normalize(wrong)
+    assert normalize(wrong, "none").is_identity()
+    with pytest.raises(ValueError, match="mode"):
+        normalize(views, "centre")
+
+
+@pytest.mark.parametrize("name", ["Camera_01", "Lantern_01", "UCO3D_217-72983-41010", "UCO3D_639-13622-90739"])
+def test_real_captures_are_left_alone_until_they_are_moved(shared_data, name):
+    views = load_views(shared_data / "captures" / name)
+    assert normalize(views).is_identity()
+    move = Similarity(12.0, turn(3), torch.tensor([5.0, -9.0, 2.0], dtype=torch.float64))
+    similarity = normalize(views.transformed(move))
+    size = 12.0 * similarity.scale  # of the capture in the network's frame; its longest side was 0.87 to 1.07
+    assert 0.7 < size < 1.5  # the box of a turned object is another box, up to sqrt(2) smaller for a rod
+    assert float((similarity.apply(move.translation)).norm()) < 0.3

@@ -1,0 +1,116 @@
+import pytest
+import torch
+
+from reli3d.render.camera import project
+from reli3d.views.similarity import Similarity
+from reli3d.views.views import MASK_EDGE, Views, mask_box
+from tests.support.rigs import sphere_views
+
+
+def ramp_views(width: int = 90, height: int = 70, box=(20, 12, 50, 60)) -> Views:
+    """One view whose red and green are its pixel coordinates over 100, mask a rectangle."""
+    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    image = torch.stack([x / 100, y / 100, torch.full_like(x, 0.5)], -1)
+    mask = torch.zeros(height, width)
+    mask[box[1] : box[3], box[0] : box[2]] = 1.0
+    k = torch.tensor([[100.0, 110.0, 41.3, 37.7]])
+    return Views((image,), (mask,), torch.eye(4)[None], k, ("ramp",))
+
+
+@pytest.mark.parametrize("crop, size", [(True, 32), (True, 100), (False, 32), (False, 40)])
+def test_intrinsics_follow_the_pixels(crop, size):
+    """The colour under a projected point tells its pixel in the original: there the original camera must see it."""
+    views = ramp_views()
+    batch = views.resampled(size, crop=crop)
+    across = (torch.rand(200, 2, generator=torch.Generator().manual_seed(2)) - 0.5) * 0.3
+    points = torch.cat([across, -torch.ones(200, 1)], 1)
+    before, _ = project(points, views.c2w[0], views.intrinsics[0])
+    after, _ = project(points, batch.c2w[0], batch.intrinsics[0])
+    inside = ((after > 2) & (after < size - 2)).all(-1) & ((before > 4) & (before < torch.tensor([86.0, 66.0]))).all(-1)
+    assert int(inside.sum()) > 50
+    grid = (after[inside] / size * 2 - 1)[None, None]
+    pixels = batch.images[0].permute(2, 0, 1)[None]
+    found = torch.nn.functional.grid_sample(pixels, grid, align_corners=False)[0, :2, 0].T * 100
+    # a triangle sampled at whole pixels is off centre by up to 0.045 pixels; half a pixel would be a wrong convention
+    torch.testing.assert_close(found, before[inside], rtol=0, atol=0.05)
+
+
+def test_a_crop_is_square_centred_on_the_mask_and_padded():
+    batch = ramp_views().resampled(64, crop=True, padding=0.08)
+    x0, y0, x1, y1 = mask_box(batch.masks[0])
+    assert abs((x0 + x1) / 2 - 32) <= 1
+    assert abs((y0 + y1) / 2 - 32) <= 1
+    assert abs((y1 - y0) - 64 / 1.16) <= 2  # the longer side plus 8 % on each side; a pixel of blur at each end
+    assert float(batch.intrinsics[0, 0] / batch.intrinsics[0, 1]) == pytest.approx(100 / 110, rel=1e-6)
+
+
+def test_a_crop_over_the_border_has_no_mask_and_the_edge_colour():
+    batch = ramp_views(box=(0, 5, 20, 65)).resampled(70, crop=True)  # 60 high: reaches 20 pixels over the left border
+    left = batch.masks[0][:, :20]
+    assert float(left.max()) == 0.0
+    row = batch.images[0][35, :, 0]
+    torch.testing.assert_close(row[:20], torch.full((20,), 0.005), rtol=0, atol=1e-4)  # the first column's colour
+    assert float(row[30]) > 0.02
+
+
+def test_small_pixels_do_not_alias():
+    checker = (torch.arange(128)[:, None] + torch.arange(128)) % 2
+    views = Views((checker[..., None].expand(-1, -1, 3).float(),), (torch.ones(128, 128),), torch.eye(4)[None],
+                  torch.ones(1, 4), ("c",))  # fmt: skip
+    image = views.resampled(16, crop=False).images[0]
+    # a triangle filter over 16 pixels leaves 1/64 of a checkerboard; the border, where it is cut, a little more
+    assert float((image - 0.5).abs().max()) < 0.02
+
+
+def test_the_mask_keeps_its_area():
+    views = sphere_views()
+    batch = views.resampled(48, crop=False)
+    for mask, small in zip(views.masks, batch.masks):
+        assert float(small.mean()) == pytest.approx(float(mask.mean()), rel=5e-3)  # weights are cut at borders only
+
+
+def test_a_similarity_moves_cameras_and_points_together():
+    views = sphere_views(count=3)
+    turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64))[0]
+    turn = turn * torch.sign(torch.linalg.det(turn))
+    similarity = Similarity(2.5, turn, torch.tensor([1.0, -2.0, 3.0], dtype=torch.float64))
+    moved = views.transformed(similarity)
+    points = torch.rand(50, 3, generator=torch.Generator().manual_seed(0)) - 0.5
+    before, depth = project(points, views.c2w[:, None], views.intrinsics[:, None])
+    after, moved_depth = project(similarity.apply(points), moved.c2w[:, None], moved.intrinsics[:, None])
+    torch.testing.assert_close(after, before, rtol=0, atol=1e-3)  # float32 coordinates of some units, focal 160
+    torch.testing.assert_close(moved_depth, 2.5 * depth, rtol=1e-5, atol=0)
+    back = moved.transformed(similarity.inverse())
+    torch.testing.assert_close(back.c2w, views.c2w, rtol=0, atol=2e-6)  # float32 rounding, twice, of values up to 10
+    rotation = moved.c2w[:, :3, :3]
+    torch.testing.assert_close(rotation.transpose(1, 2) @ rotation, torch.eye(3).expand(3, 3, 3))
+
+
+def test_selection():
+    views = sphere_views(count=4)
+    assert views.select(2).names == ("0.png", "1.png")
+    swapped = views.select([3, 0])
+    assert swapped.names == ("3.png", "0.png")
+    assert torch.equal(swapped.c2w, views.c2w[[3, 0]])
+    for wrong in (0, 5, [], [4], [-1]):
+        with pytest.raises(ValueError, match="which: expected"):
+            views.select(wrong)
+
+
+def test_views_are_checked():
+    v = sphere_views(count=2)
+    with pytest.raises(ValueError, match="c2w: expected shape"):
+        Views(v.images, v.masks, v.c2w[:1], v.intrinsics, v.names)
+    with pytest.raises(ValueError, match="masks, names"):
+        Views(v.images, v.masks[:1], v.c2w, v.intrinsics, v.names)
+    with pytest.raises(ValueError, match=r"masks\[1\]"):
+        Views(v.images, (v.masks[0], v.masks[1][:-1]), v.c2w, v.intrinsics, v.names)
+    with pytest.raises(TypeError, match=r"images\[0\]"):
+        Views((v.images[0].double(), v.images[1]), v.masks, v.c2w, v.intrinsics, v.names)
+    with pytest.raises(ValueError, match="at least one view"):
+        Views((), (), v.c2w[:0], v.intrinsics[:0], ())
+    with pytest.raises(ValueError, match="size"):
+        v.resampled(0)
+    empty = Views(v.images, (v.masks[0] * MASK_EDGE, v.masks[1]), v.c2w, v.intrinsics, v.names)
+    with pytest.raises(ValueError, match="empty mask"):
+        empty.resampled(32)
