@@ -1,6 +1,6 @@
 """Turn an object in front of the camera, then turn another light around it.
 
-usage: python examples/turntable.py OUTPUT_FOLDER [--glb FILE] [--frames 24] [--size 256]
+usage: python examples/turntable.py OUTPUT_FOLDER [--glb FILE] [--frames 12] [--size 256]
 
 Without ``--glb`` the object is reconstructed from the photographs that come with the package.  Writes the frames
 ``turn_00.png``, ... and ``light_00.png``, ..., and the animation ``turntable.webp``.
@@ -20,7 +20,7 @@ from reli3d.render.render import joined_scene, render
 parser = argparse.ArgumentParser()
 parser.add_argument("output", type=Path)
 parser.add_argument("--glb", type=Path)
-parser.add_argument("--frames", type=int, default=24)
+parser.add_argument("--frames", type=int, default=12)
 parser.add_argument("--size", type=int, default=256, help="pixels along a side of a frame")
 args = parser.parse_args()
 args.output.mkdir(parents=True, exist_ok=True)
@@ -48,6 +48,7 @@ for name in ("turn", "light"):
         camera = reli3d.Camera.from_fov(reli3d.look_at(eye, centre), 0.75, args.size, args.size)
         light = own if name == "turn" else studio.rotated(angle)
         path = args.output / f"{name}_{i:02d}.png"
-        render(parts, camera, light, scene=scene, supersampling=2).save_png(path)
+        options = reli3d.ShadeOptions(samples=(8, 12, 2))  # for each of four subpixels
+        render(parts, camera, light, scene=scene, supersampling=2, options=options).save_png(path)
         frames.append(Image.open(path).convert("RGBA"))
 frames[0].save(args.output / "turntable.webp", save_all=True, append_images=frames[1:], duration=80, loop=0)
