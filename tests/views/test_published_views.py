@@ -53,7 +53,7 @@ def test_a_render_is_prepared_as_published(goldens, shared_data):
 
 def test_a_capture_is_prepared_as_published(goldens, shared_data):
     golden = load_file(goldens / "mapper_UCO3D_217-72983-41010.safetensors")
-    views = load_views(shared_data / "captures" / "UCO3D_217-72983-41010", views=2)
+    views = load_views(shared_data / "captures" / "UCO3D_217-72983-41010", first_views=2)
     assert np.abs(views.c2w.numpy() - golden["in.c2w"]).max() < 1e-6
     batch = published_views(views, 512)
 
@@ -80,7 +80,7 @@ def test_a_capture_is_prepared_as_published(goldens, shared_data):
 def test_no_step_can_be_left_out_or_changed(goldens, shared_data, monkeypatch, name, instead):
     golden = np.load(goldens / "mapper_Camera_01.npz")["image_stride16"][0]
     monkeypatch.setattr(module, name, instead)
-    images = published_views(load_views(shared_data / "captures" / "Camera_01", views=1), 512).images
+    images = published_views(load_views(shared_data / "captures" / "Camera_01", first_views=1), 512).images
     assert np.abs(images[0, ::16, ::16].numpy() - golden[0]).max() > 1000 * ROUNDING
 
 
