@@ -28,8 +28,9 @@ from reli3d.render.asset import Asset
 from reli3d.render.camera import Camera, camera_rays, look_at
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
+from reli3d.render.points import SurfacePoints
 from reli3d.render.render import joined_scene, plan_render, render
-from reli3d.render.shading import shade
+from reli3d.render.shading import ShadeOptions, shade
 
 RUNS = 256  # of a variance
 IMAGES = 3  # timed; and of a variance over all pixels of a picture
@@ -64,6 +65,12 @@ def arguments(points, roughness, metallic):
     return position, normal, normal, wo, base, flat * roughness, flat * metallic
 
 
+def shaded(surface):
+    """Points and views of :func:`arguments`, as ``shade`` takes them."""
+    position, normal, ng, wo, *material = surface
+    return SurfacePoints(position, ng, normal, *material), wo
+
+
 def plan(device, size):
     """One plan of 64 samples for a glossy ball in the sun."""
     points, environment = seen(device, size), lights(device)["sun"]
@@ -71,7 +78,7 @@ def plan(device, size):
     _ = environment.table
 
     def step():
-        return plan_samples(*surface, environment, scene=points[3])
+        return plan_samples(*shaded(surface), environment, scene=points[3])
 
     return step, {"plans": 1}
 
@@ -94,13 +101,14 @@ def study(names: list[str]) -> None:
 
 def measured(surface, environment, scene) -> str:
     """Variance times time of one scene, as text."""
-    plans = [timed(lambda: plan_samples(*surface, environment, scene=scene)) for _ in range(IMAGES)]
+    plans = [timed(lambda: plan_samples(*shaded(surface), environment, scene=scene)) for _ in range(IMAGES)]
     pilot, chosen = min(t for t, _ in plans), plans[0][1].samples
     spent = {counts: float("inf") for counts in (chosen, SAMPLES, *SINGLE)}
     for seed in range(IMAGES):
         for counts in spent:
-            options = {"samples": counts, "scene": scene, "seed": seed, "antithetic": pairing(counts)}
-            spent[counts] = min(spent[counts], timed(partial(shade, *surface, environment, **options))[0])
+            options = ShadeOptions(counts, seed, pairing(counts))
+            step = partial(shade, *shaded(surface), environment, scene=scene, options=options)
+            spent[counts] = min(spent[counts], timed(step)[0])
     drawn = variances(surface, environment, scene, list(spent))
     variance = {counts: float(v[0]) for counts, v in drawn.items()}
     best = min(SINGLE, key=lambda c: variance[c] * spent[c])
@@ -117,7 +125,7 @@ def variances(surface, environment, scene, choices) -> dict[tuple[int, int, int]
     """Variance of a pixel, mean over the image, and as 400 bootstraps over the runs see it: ``(401,)`` float64."""
     from tests.test_allocation import runs_of, sun_part
 
-    rows, share = _pilot_points(list(surface), environment, scene, 1, "conserving")
+    rows, share = _pilot_points(list(surface), environment, scene, ShadeOptions(seed=1))
     some, found = [v[rows] for v in surface], {}
     hidden = sun_part(some, environment) if bool(environment.radiance.max() > 10.0) else torch.zeros(len(rows), 3)
     picks = torch.randint(RUNS, (400, RUNS), generator=torch.Generator().manual_seed(0))
@@ -156,8 +164,8 @@ def images(glb: Path, light: Path) -> None:
     camera = Camera.from_fov(pose, math.radians(34.0), 256, 256)
 
     def variances(counts):
-        runs = [render(parts, camera, environment, scene=scene, samples=counts, antithetic=pairing(counts), seed=seed)
-                for seed in range(IMAGES)]  # fmt: skip
+        options = [ShadeOptions(counts, seed, pairing(counts)) for seed in range(IMAGES)]
+        runs = [render(parts, camera, environment, scene=scene, options=o) for o in options]
         radiance = torch.stack([r.radiance for r in runs])
         shown = linear_to_srgb(radiance * (0.18 / radiance[:, runs[0].alpha > 0.0].mean())).clamp(0.0, 1.0)
         return [float(v.double().var(0).mean()) for v in (radiance, shown)]

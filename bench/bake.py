@@ -19,8 +19,13 @@ def sphere(device, subdivisions, size) -> Mesh:
 
 
 def colors(p, n, t):
-    orm = torch.stack([torch.ones_like(p[:, 0]), 0.5 + 0.2 * p[:, 1], 0.5 + 0.2 * p[:, 2]], 1)
-    return {"base_color": 0.5 + 0.4 * torch.sin(5 * p), "orm": orm, "normal": encode_normals(n, n, t)}
+    rough, metal = 0.5 + 0.2 * p[:, 1:2], 0.5 + 0.2 * p[:, 2:]
+    return {
+        "base_color": 0.5 + 0.4 * torch.sin(5 * p),
+        "roughness": rough,
+        "metallic": metal,
+        "normal": encode_normals(n, n, t),
+    }
 
 
 def texels(device, subdivisions, size):

@@ -19,6 +19,7 @@ import torch
 
 from bench.surface import field
 from reli3d.io.glb import glb_bytes
+from reli3d.nn.field import Field
 from reli3d.nn.model import Code, Reconstructor
 from reli3d.nn.presets import OFFICIAL, SMALL
 from reli3d.nn.view_features import ViewMaps
@@ -41,7 +42,7 @@ def _field(n, device):
     return field(n, device)
 
 
-def model_and_code(device):
+def random_field(device):
     """The heads of the published preset and a random channel-last triplane of its size."""
     torch.manual_seed(0)
     small = {part: getattr(SMALL, part) for part in ("encoder", "backbone", "illumination", "camera_width")}
@@ -50,22 +51,22 @@ def model_and_code(device):
     planes = torch.randn(1, 3, PLANE, PLANE, preset.upsampler.channels, device=device).movedim(-1, 2)
     nothing = torch.zeros(1, 4, device=device)
     maps = ViewMaps(nothing[None, None], nothing[None, None], torch.eye(4, device=device)[None], nothing)
-    return model, Code(planes, nothing[None, None], nothing[None], nothing, nothing[:, :1]), maps
+    return Field(model, Code(planes, nothing[None, None], nothing[None], nothing, nothing[:, :1]), maps)
 
 
 @torch.no_grad()
-def stages(model, code, maps, resolution, size) -> dict[str, float]:
+def stages(field, resolution, size) -> dict[str, float]:
     """Seconds of each part."""
     clock = [time.perf_counter()]
 
     def tick():
-        if code.triplane.is_cuda:
+        if field.code.triplane.is_cuda:
             torch.cuda.synchronize()
         clock.append(time.perf_counter())
 
-    mesh = extract(model, code, maps, resolution)
+    mesh = extract(field, resolution)
     tick()
-    mesh, textures = texture(model, code, maps, mesh, size, None)
+    mesh, textures = texture(field, mesh, size, None)
     tick()
     glb_bytes(Asset(mesh, textures))
     tick()
@@ -73,8 +74,8 @@ def stages(model, code, maps, resolution, size) -> dict[str, float]:
 
 
 def mesh_stage(device, resolution, size):
-    model, code, maps = model_and_code(device)
-    return lambda: stages(model, code, maps, resolution, size), {"texels": size * size}
+    known = random_field(device)
+    return lambda: stages(known, resolution, size), {"texels": size * size}
 
 
 CASES = {"published_sizes": (mesh_stage, dict(resolution=80, size=1024))}
@@ -82,15 +83,15 @@ CASES = {"published_sizes": (mesh_stage, dict(resolution=80, size=1024))}
 
 def main() -> int:
     device = torch.device("cpu")
-    model, code, maps = model_and_code(device)
-    stages(model, code, maps, 32, 512)
+    known = random_field(device)
+    stages(known, 32, 512)
     sys.stdout.write(
         f"{'resolution':>10s} {'texture':>8s} {'surface':>9s} {'textures':>9s} {'glb':>9s} {'all, ms':>9s}\n"
     )
     for resolution, size in ((32, 1024), (80, 1024), (128, 1024), (256, 1024), (80, 512), (80, 2048), (80, 4096)):
         best = None
         for _ in range(3 if resolution < 256 and size < 4096 else 1):
-            found = stages(model, code, maps, resolution, size)
+            found = stages(known, resolution, size)
             best = found if best is None or sum(found.values()) < sum(best.values()) else best
         row = " ".join(f"{1e3 * s:9.1f}" for s in (*best.values(), sum(best.values())))
         sys.stdout.write(f"{resolution:10d} {size:8d} {row}\n")

@@ -21,7 +21,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from bench.timing import _status, synchronise
 from reli3d.nn import weights
-from reli3d.nn.field import surface_level
+from reli3d.nn.field import Field
 from reli3d.nn.model import Reconstructor
 from reli3d.nn.presets import PRESETS, EncoderSizes, Preset
 from reli3d.nn.reni import EnvironmentDecoder
@@ -199,7 +199,7 @@ def forward(path: Path, count: int, trunk: torch.dtype, device: torch.device, ru
         images, masks, c2w, intrinsics = (t[0] for t in inputs)
         maps = ViewMaps(code.view_tokens[0].float(), torch.cat([images, masks[..., None]], -1), c2w, intrinsics)
         began, side = time.perf_counter(), torch.linspace(-0.87, 0.87, model.preset.resolution + 1, device=device)
-        surface_level(model, code, maps, torch.cartesian_prod(side, side, side))
+        Field(model, code, maps).free_level(torch.cartesian_prod(side, side, side))
         synchronise(device)
         print(f"  {'level, grid':16s} {time.perf_counter() - began:8.3f} s")
         if device.type == "cuda":

@@ -6,7 +6,7 @@ hold ``PEERS = {"name": peer_builder}`` with the same arguments, for a named oth
 is timed in turn with ours.  A builder returns None on a device that its case does not run on.
 
 Each result is one line of JSON in ``bench/results/<machine>.jsonl``.  ``--record`` writes the ratios, our time by the
-peer's, to ``bench/baseline.json``, which ``pytest bench/`` compares with.
+peer's, to ``bench/baseline.json`` under this kind of machine (:func:`kind`), which ``pytest bench/`` compares with.
 """
 
 from __future__ import annotations
@@ -107,6 +107,11 @@ def machine(device: torch.device) -> str:
     return re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")
 
 
+def kind(device: torch.device) -> str:
+    """The machine and the vectors that its processor has and the system lets it use: what a ratio may depend on."""
+    return f"{machine(device)} {torch.backends.cpu.get_cpu_capability().lower()}"
+
+
 def context(device: torch.device) -> dict:
     """What a number depends on besides the code: versions, commit, machine, threads."""
     versions = {"python": platform.python_version()}
@@ -162,7 +167,7 @@ def main(argv: list[str] | None = None) -> int:
             with open(results / f"{about['machine']}.jsonl", "a") as file:
                 file.write(json.dumps(row, default=lambda o: o.__name__) + "\n")
         if options.record and result.ratio is not None:
-            baseline.setdefault(device.type, {})[name] = round(result.ratio, 4)
+            baseline.setdefault(device.type, {}).setdefault(kind(device), {})[name] = round(result.ratio, 4)
     if options.record:
         BASELINE.write_text(json.dumps(baseline, indent=2, sort_keys=True) + "\n")
     return 1 if failed else 0

@@ -24,7 +24,8 @@ from bench.timing import time_steps
 from reli3d.geometry.rays import RayScene
 from reli3d.render.camera import Camera, camera_rays, look_at
 from reli3d.render.environment import Environment
-from reli3d.render.shading import shade
+from reli3d.render.points import SurfacePoints
+from reli3d.render.shading import ShadeOptions, shade
 from reli3d.render.silhouette import antialias, mesh_edges
 
 SAMPLES = (20, 40, 4)  # the published counts: 64
@@ -62,9 +63,8 @@ def direct(device, size, roughness, backward, samples=SAMPLES, subdivisions=6):
         wo, n = -directions[index], len(index)
         position = origins[index] + directions[index] * found.t[index, None]
         normal = torch.nn.functional.normalize(position, dim=-1)
-        rough = torch.full((n,), roughness, device=device)
-        out = shade(position, normal, normal, wo, base.expand(n, 3), rough, torch.zeros_like(rough), environment,
-                    samples=samples, scene=scene, seed=seed)  # fmt: skip
+        points = SurfacePoints(position, normal, normal, base.expand(n, 3), roughness, 0.0)
+        out = shade(points, wo, environment, scene=scene, options=ShadeOptions(samples, seed))
         return torch.autograd.grad(out.sum(), (base, light)) if backward else out
 
     return step, {"samples": hit * sum(samples)}
@@ -226,10 +226,11 @@ def floor(device, say) -> None:
     """
     n, g = 1 << (14 if device.type == "cpu" else 19), torch.Generator().manual_seed(0)
     normal = torch.nn.functional.normalize(torch.randn(n, 3, generator=g), dim=-1).to(device)
-    flat, environment = torch.full((n,), 0.4, device=device), Environment(sky(device))
+    environment = Environment(sky(device))
     square, block = torch.rand(2048, 2048, generator=g).to(device), torch.zeros(1 << 26, device=device)
     into = torch.empty_like(block)
-    steps = [lambda: shade(normal, normal, normal, normal, normal.abs(), flat, flat, environment),
+    points = SurfacePoints(normal, normal, normal, normal.abs(), 0.4, 0.4)
+    steps = [lambda: shade(points, normal, environment),
              lambda: square @ square, lambda: into.copy_(block)]  # fmt: skip
     kernel, product, copy = (t.median for t in time_steps(steps, device, seconds=2.0))
     rate, width = 2 * 2048**3 / product, 2 * 4 * block.numel() / copy

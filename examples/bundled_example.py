@@ -17,7 +17,8 @@ from reli3d.nn.reni import map_directions
 from reli3d.render.camera import Camera, camera_rays
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
-from reli3d.render.shading import shade
+from reli3d.render.points import SurfacePoints
+from reli3d.render.shading import ShadeOptions, shade
 from reli3d.synthetic.procedural import example_object, sample_cameras
 from reli3d.synthetic.samples import EXPOSED, PAINT, ObjectSurface
 
@@ -53,9 +54,9 @@ def main(folder: Path) -> None:
         seen = (hits.face >= 0).nonzero()[:, 0]
         at = surface.at(hits.face[seen].long(), hits.bary[seen])
         image = light.lookup(directions)
-        image[seen] = shade(at["position"], at["bump"], at["ng"], -directions[seen], at["base_color"], at["roughness"],
-                            at["metallic"], light, samples=SAMPLES, scene=surface.scene, seed=i,
-                            paint=PAINT)  # fmt: skip
+        points = SurfacePoints(at["position"], at["ng"], at["bump"], at["base_color"], at["roughness"], at["metallic"])
+        options = ShadeOptions(SAMPLES, seed=i, paint=PAINT)
+        image[seen] = shade(points, -directions[seen], light, scene=surface.scene, options=options)
         if exposure is None:
             exposure = EXPOSED / float(image[seen].mean(-1).quantile(0.9))
         planes = torch.cat([(image * exposure).clamp(0, 1), (hits.face >= 0).float()[:, None]], -1)

@@ -34,12 +34,13 @@ from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import surface_points
 from reli3d.render.render import render
-from reli3d.render.shading import shade
+from reli3d.render.shading import ShadeOptions, shade
 
 VIEWS, TEXELS, LIGHT_ROWS = 16, 192, 32
 BATCH = 12288  # pixels a step
 SAMPLES = (16, 16, 4)  # a pixel and step; the noise of a step is that of its pixels' subpixel places anyway
 PAINT = "published"  # nearer to Mitsuba's ``principled`` than the default: true maps relit at 32.6 instead of 28.5 dB
+MANY = ShadeOptions((64, 64, 8), paint=PAINT)  # for pictures and scores
 CAPTURE, UNSEEN = "aerodynamics_workshop", "leadenhall_market"
 
 
@@ -69,9 +70,7 @@ def load_object(folder: Path) -> Asset:
     column = (torch.arange(paint.shape[1]) + 0.5) / paint.shape[1]
     stripes = (0.5 + 0.2 * torch.sin(40.0 * column)).expand(paint.shape[:2])[..., None]
     base = torch.lerp(0.75 * paint, torch.tensor([0.9, 0.6, 0.25]), gold)
-    orm = torch.cat([torch.ones_like(gold), torch.lerp(stripes, torch.full_like(gold, 0.25), gold), gold], -1)
-    flat = torch.tensor([0.5, 0.5, 1.0]).expand_as(orm).contiguous()
-    return Asset(mesh, TextureSet(linear_to_srgb(base), orm, flat))
+    return Asset(mesh, TextureSet(linear_to_srgb(base), torch.lerp(stripes, torch.full_like(gold, 0.25), gold), gold))
 
 
 class Mitsuba:
@@ -90,8 +89,8 @@ class Mitsuba:
             return {"type": "bitmap", "bitmap": bitmap, "raw": raw}
 
         material = {"type": "principled", "base_color": texture(srgb_to_linear(maps.base_color), True), "specular": 0.5,
-                    "roughness": texture(maps.orm[..., 1:2], True),
-                    "metallic": texture(maps.orm[..., 2:], True)}  # fmt: skip
+                    "roughness": texture(maps.roughness[..., None], True),
+                    "metallic": texture(maps.metallic[..., None], True)}  # fmt: skip
         props = mi.Properties()
         props["bsdf"] = mi.load_dict({"type": "twosided", "bsdf": material})
         mesh = asset.mesh
@@ -141,9 +140,7 @@ class Unknowns(torch.nn.Module):
 
     def textures(self) -> TextureSet:
         rough, metal = torch.sigmoid(self.rough_metal).unbind(-1)
-        orm = torch.stack([torch.ones_like(rough), 0.05 + 0.95 * rough, metal], -1)
-        normal = torch.tensor([0.5, 0.5, 1.0]).expand_as(orm).contiguous()
-        return TextureSet(torch.sigmoid(self.base), orm, normal)
+        return TextureSet(torch.sigmoid(self.base), 0.05 + 0.95 * rough, metal)
 
     def environment(self) -> Environment:
         return Environment(self.light.exp())
@@ -183,8 +180,7 @@ def fit(asset: Asset, views: list[Camera], images: torch.Tensor, steps: int, rep
         light = unknowns.environment()
 
         def image(seed, points=points, wo=wo, light=light):
-            return shade(points.position, points.normal, points.ng, wo, points.base_color, points.roughness,
-                         points.metallic, light, samples=SAMPLES, scene=scene, seed=seed, paint=PAINT)  # fmt: skip
+            return shade(points, wo, light, scene=scene, options=ShadeOptions(SAMPLES, seed, paint=PAINT))
 
         slope = image(2 * step)
         with torch.no_grad():
@@ -217,8 +213,8 @@ def scale_to(got: torch.Tensor, want: torch.Tensor) -> torch.Tensor:
 
 def row_of_picture(asset: Asset, camera: Camera, unseen: Environment, own: Environment, exposures, size: int):
     """Tiles of one row: base colour, roughness, metallic, under its own light, under the unseen one, its light."""
-    image = render(asset, camera, own, samples=(64, 64, 8), supersampling=2, paint=PAINT)
-    relit = render(asset, camera, unseen, samples=(64, 64, 8), supersampling=2, paint=PAINT)
+    image = render(asset, camera, own, options=MANY, supersampling=2)
+    relit = render(asset, camera, unseen, options=MANY, supersampling=2)
     grey = lambda v: v[..., None].expand(-1, -1, 3) * (image.alpha > 0)[..., None]  # noqa: E731
     sky = torch.nn.functional.interpolate(own.radiance.permute(2, 0, 1)[None], (size // 2, size), mode="area")[0]
     sky = torch.nn.functional.pad(sky.permute(1, 2, 0), (0, 0, 0, 0, size // 4, size - size // 2 - size // 4))
@@ -277,7 +273,7 @@ def judge_results(args, asset, judge, images, unknowns, capture, unseen) -> int:
     tests = cameras(args.size, 2 * VIEWS + 1)[3::8]  # four views beside those of the capture
     exposure = [float(0.8 / judge.image(tests[0], light, 64)[..., :3].flatten().quantile(0.97))
                 for light in (capture, unseen)]  # fmt: skip
-    layers = [[render(a, v, unseen, samples=(1, 0, 0)) for v in tests] for a in (asset, found, start)]
+    layers = [[render(a, v, unseen, options=ShadeOptions((1, 0, 0))) for v in tests] for a in (asset, found, start)]
     mask = [x.alpha > 0 for x in layers[0]]
     joined = lambda k, name: torch.cat([getattr(x, name)[m] for x, m in zip(layers[k], mask)])  # noqa: E731
     scale = scale_to(joined(1, "base_color"), joined(0, "base_color"))
@@ -288,7 +284,7 @@ def judge_results(args, asset, judge, images, unknowns, capture, unseen) -> int:
         values = []
         for v in tests:
             want = judge.image(v, unseen, args.truth_samples)
-            got = render(subject, v, unseen, samples=(64, 64, 8), supersampling=3, paint=PAINT)
+            got = render(subject, v, unseen, options=MANY, supersampling=3)
             values.append(
                 psnr(shown(got.radiance, exposure[1]), shown(want[..., :3], exposure[1]), want[..., 3] > 0.999)
             )

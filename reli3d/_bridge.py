@@ -19,6 +19,7 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from types import ModuleType
 
+import numpy as np
 import torch
 import warp as wp
 from torch import Tensor
@@ -320,6 +321,24 @@ def call(kernel, n: int, ins: Sequence, outs: Sequence, *, device: torch.device,
     types = [a[1] for a in ins if isinstance(a, tuple)]
     plain = [_SLOT if isinstance(a, tuple) else a for a in ins]
     return _KernelOp.apply(kernel, n, slice_min, plain, types, frozenset(shared), list(outs), device, *tensors)
+
+
+def tensor_of(value, dtype: torch.dtype = torch.float32):
+    """``value`` as a tensor of ``dtype`` where nothing is lost: numpy arrays, and for int32, int64 any integers.
+
+    What would lose digits, and anything else, comes back as it is, for :func:`check` to refuse.
+    """
+    if isinstance(value, np.ndarray):
+        if value.dtype.name not in ("float32", "float64", "int64", "int32", "int16", "uint8", "uint16", "uint32"):
+            return value
+        value = value.astype(np.int64) if value.dtype.name in ("uint16", "uint32") else value
+        value = torch.from_numpy(np.ascontiguousarray(value) if value.flags.writeable else value.copy())
+    whole = (torch.int64, torch.int32, torch.int16, torch.uint8)
+    if isinstance(value, Tensor) and dtype in whole[:2] and value.dtype in whole and value.dtype != dtype:
+        limits = torch.iinfo(dtype)
+        low, high = (int(v) for v in torch.aminmax(value)) if value.numel() else (0, 0)
+        return value.to(dtype) if limits.min <= low and high <= limits.max else value
+    return value
 
 
 def check(name: str, value: Tensor, *, last: int | None = None, like: Tensor | None = None,

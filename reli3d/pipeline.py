@@ -17,28 +17,18 @@ from reli3d.geometry.hull import mask_distance
 from reli3d.geometry.mesh import Mesh, largest_components, vertex_normals
 from reli3d.geometry.rays import RayScene
 from reli3d.geometry.smooth import taubin_smooth
-from reli3d.geometry.surface import extract_surface, surface_cubes
+from reli3d.geometry.surface import extract_surface
 from reli3d.geometry.tangents import encode_normals, vertex_tangents
 from reli3d.geometry.uv import unwrap, unwrap_xatlas
 from reli3d.geometry.visibility import visible_from
-from reli3d.nn.field import (
-    LIGHT_ROWS,
-    bound_level,
-    grid_level,
-    in_rows,
-    object_shading,
-    surface_level,
-    surface_material,
-)
-from reli3d.nn.heads import deformation
-from reli3d.nn.light_features import Shading
-from reli3d.nn.model import Code, Reconstructor
-from reli3d.nn.presets import Preset
+from reli3d.nn.blocks import in_rows
+from reli3d.nn.field import CHUNK, Field
+from reli3d.nn.local import LocalField, LocalReconstructor
+from reli3d.nn.presets import LocalPreset, Preset
 from reli3d.nn.reni import map_directions
 from reli3d.nn.view_features import ViewMaps
-from reli3d.nn.weights import load_model
+from reli3d.nn.weights import Network, load_model
 from reli3d.render.asset import Asset, TextureSet
-from reli3d.render.bump import radial_bump
 from reli3d.render.camera import Camera
 from reli3d.render.environment import Environment
 from reli3d.render.exposure import photograph_ratio
@@ -50,7 +40,6 @@ from reli3d.views.views import ViewBatch, Views
 DETAIL = 512  # pixels of the views that colours and silhouettes are read from; the network's own input is smaller
 INSIDE = 2.0  # pixels of such a view that a silhouette's edge may spill over
 SMALLEST_PART = 0.01  # share of the faces below which a separate piece is dropped
-CHUNK = 1 << 17  # points a query: 200 MB of features
 SHADING_POINTS = 4096  # vertices by which the light on the object is judged
 OUTSIDE = 1.0  # level given to grid points that the silhouettes exclude
 COARSE = 4  # cells of the surface grid along a cell of the one that looks for the silhouettes' hull first
@@ -63,6 +52,9 @@ UP = {  # rotations that carry an axis to +Y
     "z": torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
     "-z": torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
 }
+
+
+AnyField = Field | LocalField
 
 
 class NoSurface(ValueError):
@@ -80,75 +72,78 @@ class Prepared:
     intrinsics: Tensor  # (V, 4) of ``images``
 
 
-def prepare(model: Reconstructor, views: Views, model_from_input: Similarity) -> Prepared:
+def prepare(model: Network, views: Views, model_from_input: Similarity) -> Prepared:
     """Resample ``views`` for ``model``: cropped to the object, or as the release does where the preset says so."""
     moved = views.transformed(model_from_input).to(model.device)
-    if model.preset.published_input:
+    published = published_input(model.preset)
+    if published:
         batch = published_views(moved.to("cpu"), model.preset.image_size).to(model.device)  # the codec runs there
     else:
         batch = moved.resampled(model.preset.image_size)
-    detail = moved.resampled(DETAIL, crop=not model.preset.published_input)
+    detail = moved.resampled(DETAIL, crop=not published)
     silhouette = mask_distance(detail.masks)
     return Prepared(batch, torch.cat([detail.images, silhouette[..., None]], -1).contiguous(), detail.intrinsics)
 
 
-def encode(model: Reconstructor, prepared: Prepared, *, background: bool = False) -> tuple[Code, ViewMaps]:
-    """Run the network; the maps carry the encoder's tokens beside the images.
+def encode(model: Network, prepared: Prepared, *, background: bool = False) -> AnyField:
+    """Run the network on the views of one object.
 
-    background: whether the illumination path may look past the masks.
+    background: whether the illumination path of a :class:`Reconstructor` may look past the masks.
     """
     batch = prepared.batch
+    if isinstance(model, LocalReconstructor):
+        return model.encode(batch.images, batch.masks, batch.c2w, batch.intrinsics, prepared.images,
+                            prepared.intrinsics)  # fmt: skip
     shown = torch.tensor([background], device=batch.images.device)
     code = model.encode(batch.images[None], batch.masks[None], batch.c2w[None], batch.intrinsics[None],
                         background_visible=shown)  # fmt: skip
-    return code, ViewMaps(code.view_tokens[0].float(), prepared.images, batch.c2w, prepared.intrinsics)
+    return Field(model, code, ViewMaps(code.view_tokens[0].float(), prepared.images, batch.c2w, prepared.intrinsics))
 
 
-def extract(model: Reconstructor, code: Code, maps: ViewMaps, resolution: int) -> Mesh:
+def extract(field: AnyField, resolution: int) -> Mesh:
     """Closed surface of the field on ``resolution`` cubes a side, without small loose pieces; model frame.
 
     Raises NoSurface, a ValueError, where the field has none.
     """
-    radius, masked = model.preset.radius, model.preset.silhouette_bound
-    if masked:  # as many cubes on the space that matters
-        radius = min(radius, _hull_reach(model, maps, resolution) + 2 * MARGIN_CELLS * radius / resolution)
+    preset, maps = field.model.preset, field.maps
+    radius = preset.radius
+    if field.bounded:  # as many cubes on the space that matters
+        radius = min(radius, _hull_reach(field, resolution) + 2 * MARGIN_CELLS * radius / resolution)
     flat = _grid(resolution, radius, maps.c2w.device).reshape(-1, 3)
-    bound = bound_level(model, maps, flat) if masked else torch.full_like(flat[:, 0], -torch.inf)
-    if model.preset.point_features:
-        level, margin = bound.clamp(min=OUTSIDE), MARGIN_CELLS * 2 * radius / resolution / model.preset.softness
+    bound = field.bound(flat) if field.bounded else torch.full_like(flat[:, 0], -torch.inf)
+    level = field.grid_level(flat[: resolution + 1, 2])
+    if level is None:
+        level, margin = bound.clamp(min=OUTSIDE), MARGIN_CELLS * 2 * radius / resolution / preset.softness
         for part in (bound < margin).nonzero()[:, 0].split(CHUNK):
-            level[part] = surface_level(model, code, maps, flat[part])
-    else:
-        level = grid_level(model, code, maps, flat[: resolution + 1, 2])
+            level[part] = field.free_level(flat[part])
     level = torch.maximum(level.view(-1), bound).view((resolution + 1,) * 3)
-    if masked:
+    if field.bounded:
         silhouette = maps.images[..., 3].contiguous()
         level = cover_silhouettes(level, bound.view_as(level), silhouette, maps.c2w, maps.intrinsics, radius=radius)
     low, high = (float(v) for v in torch.aminmax(level))
     if low >= 0.0 or high < 0.0:
         raise NoSurface(f"level: expected values on both sides of 0, got [{low:.4g}, {high:.4g}]: no surface")
-    weights = {} if model.preset.log_level else _cube_weights(model, code, flat, level)
-    mesh = extract_surface(level, radius=radius, **weights)
+    mesh = extract_surface(level, radius=radius, **field.cube_weights(flat, level))
     mesh = largest_components(mesh, SMALLEST_PART)
-    if model.preset.smoothing:
-        mesh = taubin_smooth(mesh, iterations=model.preset.smoothing)
+    if preset.smoothing:
+        mesh = taubin_smooth(mesh, iterations=preset.smoothing)
     return replace(mesh, normals=vertex_normals(mesh.vertices, mesh.faces))
 
 
-def _hull_reach(model: Reconstructor, maps: ViewMaps, resolution: int) -> float:
+def _hull_reach(field: AnyField, resolution: int) -> float:
     """Largest coordinate of the points of the model's grid that lie inside all silhouettes.
 
     Asked coarsely first: a point inside has a coarse neighbour that is outside by no more than their distance.
     """
-    radius, device = model.preset.radius, maps.c2w.device
+    radius, device = field.model.preset.radius, field.maps.c2w.device
     coarse = -(-resolution // COARSE)
     apart = 2 * radius / coarse
-    level = bound_level(model, maps, _grid(coarse, radius, device).reshape(-1, 3))
-    slack = 2 * 0.5 * 3**0.5 * apart / model.preset.softness  # twice: the distance is stretched away from the axis
+    level = field.bound(_grid(coarse, radius, device).reshape(-1, 3))
+    slack = 3**0.5 * apart / field.model.preset.softness  # twice half a diagonal: distances stretch off the axis
     near = (level < slack).reshape((coarse + 1,) * 3)
     k = ((torch.linspace(-radius, radius, resolution + 1, device=device) + radius) / apart).round().long()
     flat = _grid(resolution, radius, device)[near[k][:, k][:, :, k]]
-    inside = flat[bound_level(model, maps, flat) < 0]
+    inside = flat[field.bound(flat) < 0]
     if len(inside) == 0:
         raise ValueError("masks: expected masks that overlap in space, got none inside all of them; run --check")
     return float(inside.abs().max())
@@ -159,44 +154,20 @@ def _grid(resolution: int, radius: float, device: torch.device) -> Tensor:
     return torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
 
 
-def _cube_weights(model: Reconstructor, code: Code, flat: Tensor, level: Tensor) -> dict[str, Tensor]:
-    """Deformation and weights for ``extract_surface``, asked for only where the surface passes.
-
-    flat: ``(N, 3)`` the grid's points, in the order of ``level``.
-    """
-    cubes, (y, z) = surface_cubes(level), level.shape[1:]
-    i, rest = cubes // ((y - 1) * (z - 1)), cubes % ((y - 1) * (z - 1))
-    lowest = (i * y + rest // (z - 1)) * z + rest % (z - 1)
-    k = torch.arange(8, device=flat.device)
-    corners = lowest[:, None] + ((k & 1) * y + (k >> 1 & 1)) * z + (k >> 2)
-    needed = torch.zeros_like(level, dtype=torch.bool)
-    for side in range(3):  # where the inside reaches the box, the cap stands on the border's vertices
-        for end in (0, -1):
-            needed.select(side, end)[level.select(side, end) < 0] = True
-    needed.view(-1)[corners] = True
-    at = needed.view(-1).nonzero()[:, 0]
-    raw = [model.query(code, flat[part][None], ("deformation", "flexicubes")) for part in at.split(CHUNK)]
-    offset = flat.new_zeros(len(flat), 3)
-    offset[at] = deformation(torch.cat([r["deformation"][0] for r in raw]), level.shape[0] - 1)
-    corner = torch.cat([r["flexicubes"][0] for r in raw])
-    row = torch.cumsum(needed.view(-1), 0) - 1
-    merged = [model.merger(corner[row[part]]) for part in corners.split(CHUNK)]
-    alpha, beta, gamma = (torch.cat([getattr(m, name) for m in merged]) for name in ("alpha", "beta", "gamma"))
-    return {"deformation": offset.reshape(*level.shape, 3), "alpha": alpha, "beta": beta, "gamma": gamma,
-            "cubes": cubes}  # fmt: skip
-
-
-def texture(
-    model: Reconstructor, code: Code, maps: ViewMaps, mesh: Mesh, size: int, scene: RayScene | None, *,
-    uv: str = "project",
-) -> tuple[Mesh, TextureSet]:  # fmt: skip
+def texture(field: AnyField, mesh: Mesh, size: int, scene: RayScene | None, *,
+            uv: str = "project") -> tuple[Mesh, TextureSet]:  # fmt: skip
     """The mesh with an atlas, normals and tangents, and its maps of ``size`` texels; the faces keep their order.
 
     scene: rays against ``mesh``, for a network that asks which view sees a point, else None.
     """
     if uv not in ("project", "xatlas"):
         raise ValueError(f"uv: expected project or xatlas, got {uv}")
-    shading = _shading(model, code, maps, mesh, scene)
+    maps = field.maps
+    if scene is not None:
+        every = slice(None, None, max(1, len(mesh.vertices) // SHADING_POINTS))
+        position, normal = mesh.vertices[every].contiguous(), mesh.normals[every].contiguous()
+        visible = visible_from(scene, position, normal, maps.c2w, maps.intrinsics, DETAIL).float()
+        field = field.with_shading(position, normal, visible)
     mesh = unwrap(mesh, texture_size=size) if uv == "project" else unwrap_xatlas(mesh, texture_size=size)
     mesh = replace(mesh, tangents=vertex_tangents(mesh))
 
@@ -204,29 +175,17 @@ def texture(
         visible = position.new_zeros(len(position), len(maps.c2w))
         if scene is not None:
             visible = visible_from(scene, position, normal, maps.c2w, maps.intrinsics, DETAIL).float()
-        got = surface_material(model, code, maps, position, normal, visible, shading)
-        orm = torch.cat([torch.ones_like(got["roughness"]), got["roughness"], got["metallic"]], -1)
-        bumped = radial_bump(position, normal, got["normal"])
-        return {"base_color": got["base_color"], "orm": orm, "normal": encode_normals(bumped, normal, tangent)}
+        got = field.material(position, normal, visible)
+        found = {"base_color": got.base_color, "roughness": got.roughness[:, None], "metallic": got.metallic[:, None]}
+        return {**found, "normal": encode_normals(got.normal, normal, tangent)}
 
     baked = bake(mesh, size, lambda *at: in_rows(surface, *at), chunk=CHUNK, tangents=True)
     return mesh, TextureSet(**{k: v.clamp(0, 1).contiguous() for k, v in baked.items()})
 
 
-def _shading(model: Reconstructor, code: Code, maps: ViewMaps, mesh: Mesh, scene: RayScene | None) -> Shading | None:
-    """What the network is told of the light, from the views and some vertices of the mesh."""
-    if scene is None or not model.preset.shading_features:
-        return None
-    some = slice(None, None, max(1, len(mesh.vertices) // SHADING_POINTS))
-    position, normal = mesh.vertices[some].contiguous(), mesh.normals[some].contiguous()
-    visible = visible_from(scene, position, normal, maps.c2w, maps.intrinsics, DETAIL).float()
-    light = model.decode_environment(code, LIGHT_ROWS)[0]
-    return object_shading(model, light, maps, position, normal, visible)
-
-
-def light(model: Reconstructor, code: Code) -> Environment:
-    """The decoded environment, in the world's axes."""
-    return Environment(model.decode_environment(code)[0].contiguous())
+def light(field: AnyField) -> Environment:
+    """The environment of the field, in the world's axes."""
+    return Environment(field.radiance_map().contiguous())
 
 
 def as_bright_as_seen(asset: Asset, maps: ViewMaps, scene: RayScene) -> Asset:
@@ -279,9 +238,14 @@ class Stopwatch:
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - began
 
 
-def default_normalization(preset: Preset) -> str:
+def published_input(preset: Preset | LocalPreset) -> bool:
+    """Whether views go in as the release prepares them."""
+    return isinstance(preset, Preset) and preset.published_input
+
+
+def default_normalization(preset: Preset | LocalPreset) -> str:
     """``none`` where views go in as the release prepares them, poses as stored; else ``auto``."""
-    return "none" if preset.published_input else "auto"
+    return "none" if published_input(preset) else "auto"
 
 
 def check_options(texture_size: int, resolution: int | None) -> None:
@@ -293,7 +257,7 @@ def check_options(texture_size: int, resolution: int | None) -> None:
 
 
 @torch.no_grad()
-def reconstruct(views: Views, *, weights: str | Reconstructor = "small", device: str = "cpu", texture_size: int = 1024,
+def reconstruct(views: Views, *, weights: str | Network = "small", device: str = "cpu", texture_size: int = 1024,
                 resolution: int | None = None, normalization: str | Similarity | None = None, frame: str = "input",
                 up: str = "y", uv: str = "project", hero: int | str = 0, background: str = "masked", seed: int = 0,
                 timings: dict[str, float] | None = None, progress=None) -> Asset:  # fmt: skip
@@ -310,12 +274,12 @@ def reconstruct(views: Views, *, weights: str | Reconstructor = "small", device:
     out of range and where the masks hold no object, NoSurface where the field holds none.
     """
     check_options(texture_size, resolution)
-    model = weights if isinstance(weights, Reconstructor) else load_model(weights, device)
+    model = weights if isinstance(weights, Network) else load_model(weights, device)
     resolution = resolution or model.preset.resolution
     if normalization is None:
         normalization = default_normalization(model.preset)
     views = hero_first(views, hero, seed)
-    shown = background_shown(views, background, readable=model.preset.reads_background)
+    shown = background_shown(views, background, readable=getattr(model.preset, "reads_background", False))
     torch.manual_seed(seed)
     watch = Stopwatch(model.device, progress)
     with watch.stage("normalize"):
@@ -324,16 +288,16 @@ def reconstruct(views: Views, *, weights: str | Reconstructor = "small", device:
     with watch.stage("prepare"):
         prepared = prepare(model, views, to_model)
     with watch.stage("network"):
-        code, maps = encode(model, prepared, background=shown)
+        field = encode(model, prepared, background=shown)
     with watch.stage("surface"):
-        mesh = extract(model, code, maps, resolution)
+        mesh = extract(field, resolution)
     with watch.stage("textures"):
-        scene = RayScene(mesh.vertices, mesh.faces) if model.preset.view_feature_width else None
-        mesh, textures = texture(model, code, maps, mesh, texture_size, scene, uv=uv)
+        scene = RayScene(mesh.vertices, mesh.faces) if field.reads_views else None
+        mesh, textures = texture(field, mesh, texture_size, scene, uv=uv)
     with watch.stage("light"):
-        asset = Asset(mesh, textures, light(model, code))
+        asset = Asset(mesh, textures, light(field))
         if scene is not None:
-            asset = as_bright_as_seen(asset, maps, scene)
+            asset = as_bright_as_seen(asset, field.maps, scene)
     with watch.stage("frame"):
         asset = turned(asset, output.compose(to_model.inverse()))
     if timings is not None:

@@ -56,7 +56,7 @@ def material(mi, base_color, alpha, metallic, paint="conserving", maps: TextureS
     numbers = mi.Color3f(*base_color), mi.Float(alpha), mi.Float(metallic)
     dr.make_opaque(*numbers)  # not literals: materials share a compiled kernel
     if maps is not None:
-        planes = srgb_to_linear(maps.base_color), maps.orm[..., 1:2], maps.orm[..., 2:]
+        planes = srgb_to_linear(maps.base_color), maps.roughness[..., None], maps.metallic[..., None]
         bitmaps = [mi.Bitmap(np.ascontiguousarray(v.cpu().numpy(), np.float32)) for v in planes]
         textures = [mi.load_dict({"type": "bitmap", "bitmap": b, "raw": True}) for b in bitmaps]
 

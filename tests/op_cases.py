@@ -30,9 +30,10 @@ from reli3d.render.bump import radial_bump, world_bump
 from reli3d.render.camera import Camera, camera_rays, look_at, project
 from reli3d.render.environment import Environment
 from reli3d.render.gaussians import SphericalGaussians, shade_gaussians
-from reli3d.render.shading import shade
+from reli3d.render.shading import ShadeOptions, shade
 from reli3d.render.silhouette import antialias
 from reli3d.render.volume import RaySamples, composite
+from tests.surfaces import at, on_ball
 
 N = 5200  # rows: five slices of a CPU launch
 
@@ -143,8 +144,8 @@ def lit(shadows: str | None = None, **options):
             vertices, faces = ball(normal.device)
             scene = RayScene(vertices + torch.tensor([0.0, 1.0, 0.0], device=normal.device), faces,
                              shadows if normal.device.type == "cpu" else "warp")  # fmt: skip
-        return (shade(0.2 * ng, normal, ng, wo, base_color, roughness, metallic, Environment(radiance), scene=scene,
-                      seed=3, **options),)  # fmt: skip
+        points, wo = at(0.2 * ng, normal, ng, wo, base_color, roughness, metallic)
+        return (shade(points, wo, Environment(radiance), scene=scene, options=ShadeOptions(seed=3, **options)),)
 
     return run
 
@@ -187,15 +188,16 @@ def deviation(level, deformation, alpha, beta):
     return (vertex_deviation(level, radius=0.8, deformation=deformation, alpha=alpha, beta=beta),)
 
 
-def points_of(vertices, normals, uv, base_color, orm, normal, bary):
+def points_of(vertices, normals, uv, base_color, roughness, metallic, normal, bary):
     faces, face = soup(vertices, len(bary))
     mesh = Mesh(vertices, faces, normals, uv)
-    return tuple(vars(gbuffer.surface_points(mesh, TextureSet(base_color, orm, normal), face, bary)).values())
+    maps = TextureSet(base_color, roughness, metallic, normal)
+    return tuple(vars(gbuffer.surface_points(mesh, maps, face, bary)).values())
 
 
 def textured(n: int) -> dict[str, Tensor]:
-    maps = {name: uniform(6, 6, 3, seed=k) for k, name in enumerate(("base_color", "orm", "normal"), 10)}
-    maps["normal"] = 0.5 + 0.5 * above(36, 13).reshape(6, 6, 3)
+    maps = {name: uniform(6, 6, seed=k) for k, name in ((11, "roughness"), (12, "metallic"))}
+    maps["base_color"], maps["normal"] = uniform(6, 6, 3, seed=10), 0.5 + 0.5 * above(36, 13).reshape(6, 6, 3)
     v = corners(60)
     return {"vertices": v, "normals": above(len(v), 8), "uv": uniform(len(v), 2, seed=9, high=2.0), **maps,
             "bary": weights(n)}  # fmt: skip
@@ -247,7 +249,8 @@ CASES = {
         lambda n: {"texture": uniform(9, 11, 3, seed=1), "uv": uniform(n, 2, seed=2, low=-1.0, high=2.0)},
         lambda texture, uv: (gbuffer.sample_texture(texture, uv),), ("texture", "uv"), ("uv",)),
     "surface_points": Case(
-        textured, points_of, ("vertices", "normals", "base_color", "orm", "normal", "bary"), ("bary",)),
+        textured, points_of, ("vertices", "normals", "base_color", "roughness", "metallic", "normal", "bary"),
+        ("bary",)),
     "eval_bsdf": Case(bsdf_inputs, bsdf("conserving"), MATERIAL, MATERIAL),
     "eval_bsdf published": Case(bsdf_inputs, bsdf("published"), MATERIAL, MATERIAL),
     "sample_ggx_vndf": Case(
@@ -273,12 +276,12 @@ CASES = {
         lambda n: {**lobes(n, "normal"), **{k: v for k, v in shaded(n).items() if k != "radiance"},
                    "wo": normalize(units(n, 1) + 0.5 * units(n, 6), dim=-1)},
         lambda normal, wo, base_color, roughness, metallic, **g: (
-            shade_gaussians(normal, wo, base_color, roughness, metallic, SphericalGaussians(**g)),),
+            shade_gaussians(*on_ball(normal, wo, base_color, roughness, metallic), SphericalGaussians(**g)),),
         (*SG, "wo", *MAP), ("wo", *MAP)),
     "shade": Case(shaded, lit(), (*MAP, "radiance"), MAP),
     "shade, shadows by Embree": Case(shaded, lit("embree"), (*MAP, "radiance"), MAP),
     "shade, shadows, power, random": Case(
-        shaded, lit("warp", heuristic="power", points="random", clamp=5.0), (*MAP, "radiance"), MAP),
+        shaded, lit("warp", heuristic="power", sequence="random", clamp=5.0), (*MAP, "radiance"), MAP),
     "composite": Case(
         lambda n: {"density": uniform(n, seed=1, low=-3.0, high=27.0), "color": uniform(n, 3, seed=2)}, composited,
         ("density", "color"), ("density", "color")),

@@ -15,7 +15,7 @@ from reli3d.geometry.visibility import visible_from
 from reli3d.render import material, sampling
 from reli3d.render.environment import Environment
 from reli3d.render.reni_light import ReniLight
-from reli3d.render.shading import shade_light
+from reli3d.render.shading import ShadeOptions, shade_light
 from reli3d.render.volume import OccupancyGrid, march_rays, sample_weights
 from tests.op_cases import (
     MAP,
@@ -33,12 +33,14 @@ from tests.op_cases import (
     units,
     weights,
 )  # fmt: skip
+from tests.surfaces import at
 
 
 def asked(normal, base_color, metallic, roughness, radiance):
     light = Environment(radiance)
     wo = normalize(normal + 0.5 * units(len(normal), 6).to(normal), dim=-1)
-    return (shade_light(0.2 * normal, normal, normal, wo, base_color, roughness, metallic, light, light, seed=3),)
+    points, wo = at(0.2 * normal, normal, normal, wo, base_color, roughness, metallic)
+    return (shade_light(points, wo, light, light, options=ShadeOptions(seed=3)),)
 
 
 def traced(backend):

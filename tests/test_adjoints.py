@@ -25,6 +25,7 @@ from reli3d.render.material import sample_bsdf
 from reli3d.render.sampling import pdf_ggx_vndf
 from tests import op_cases, reference, reference_surface
 from tests.reference_surface import random_weights, torus
+from tests.surfaces import on_ball
 from tests.test_smooth import sheet
 from tests.test_triplane import twin as grid_samples
 
@@ -165,7 +166,8 @@ def points_of_a_mesh(g, small, tangents) -> Op:
 
     leaves = {"vertices": corners.reshape(-1, 3), "normals": about(flat), "uv": torch.rand(3 * count, 2, generator=g),
               "tangents": F.pad(about(corners[:, 1] - corners[:, 0]), (0, 1), value=-1.0),
-              "base_color": torch.rand(size, size, 3, generator=g), "orm": torch.rand(size, size, 3, generator=g),
+              "base_color": torch.rand(size, size, 3, generator=g),
+              **{k: torch.rand(size, size, generator=g) for k in ("roughness", "metallic")},
               "normal": 0.5 + 0.5 * op_cases.above(size * size, 13).reshape(size, size, 3),
               "bary": op_cases.weights(rows)}  # fmt: skip
     if not small:  # few digits, so that the texture coordinates of points, which are float32, come out exactly
@@ -178,7 +180,7 @@ def points_of_a_mesh(g, small, tangents) -> Op:
         v = dict(zip(leaves, values, strict=True))
         on = values[0].device
         mesh = Mesh(v["vertices"], faces.to(on), v["normals"], v["uv"], v.get("tangents"))
-        maps = TextureSet(v["base_color"], v["orm"], v["normal"])
+        maps = TextureSet(v["base_color"], v["roughness"], v["metallic"], v["normal"])
         found = vars(surface_points(mesh, maps, face.to(on), v["bary"])).values()
         return torch.cat([part.reshape(rows, -1) for part in found], 1)
 
@@ -201,7 +203,8 @@ def points_of_a_mesh(g, small, tangents) -> Op:
         bent = bent[:, :1] * along + bent[:, 1:2] * side * torch.linalg.cross(n, along) + bent[:, 2:] * n
         color = in_texture(srgb_to_linear(v["base_color"]), uv)
         return torch.cat([at("vertices"), F.normalize(torch.linalg.cross(b - a, c - a), dim=-1),
-                          F.normalize(bent, dim=-1), color, in_texture(v["orm"], uv)[:, 1:]], 1)  # fmt: skip
+                          F.normalize(bent, dim=-1), color,
+                          in_texture(torch.stack([v["roughness"], v["metallic"]], -1), uv)], 1)  # fmt: skip
 
     return Op(leaves, ours, twin)
 
@@ -238,7 +241,7 @@ def gaussians(g, small) -> Op:
     leaves = {"normal": normal, "wo": F.normalize(normal + 0.7 * op_cases.units(n, 6), dim=-1),
               "base_color": torch.rand(n, 3, generator=g), "roughness": 0.2 + 0.8 * torch.rand(n, generator=g),
               "metallic": torch.rand(n, generator=g), **lobes(g, 2 if small else 24)}  # fmt: skip
-    return Op(leaves, lambda *v: shade_gaussians(*v[:5], SphericalGaussians(*v[5:])),
+    return Op(leaves, lambda *v: shade_gaussians(*on_ball(*v[:5]), SphericalGaussians(*v[5:])),
               lambda normal, wo, base, roughness, *rest: reference.shade_gaussians(
                   normal, wo, base, roughness**2, *rest), ("normal", "wo", "axis"), one_sign=True)  # fmt: skip
 

@@ -13,8 +13,9 @@ from reli3d.render.asset import Asset
 from reli3d.render.camera import Camera
 from reli3d.render.environment import Environment
 from reli3d.render.render import plan_render, render
-from reli3d.render.shading import shade
+from reli3d.render.shading import ShadeOptions, shade
 from tests import reference
+from tests.surfaces import at
 from tests.test_estimator import SKIES, inputs, interval, light
 from tests.test_render import ball, eye
 
@@ -58,11 +59,15 @@ def quadrature(arguments, environment, counts, inside=None, height=256):
     return torch.stack(rows)
 
 
-def runs_of(arguments, environment, counts, runs=256, **options):
+def runs_of(arguments, environment, counts, runs=256, scene=None, **options):
     """``(runs, points, 3)`` float64: independent values of ``shade``."""
     n = len(arguments[0])
     repeated = [v.repeat(runs, *[1] * (v.ndim - 1)) for v in arguments]
-    return shade(*repeated, environment, samples=counts, **options).double().reshape(runs, n, 3)
+    return (
+        shade(*at(*repeated), environment, scene=scene, options=ShadeOptions(samples=counts, **options))
+        .double()
+        .reshape(runs, n, 3)
+    )
 
 
 @pytest.mark.parametrize(
@@ -72,7 +77,7 @@ def runs_of(arguments, environment, counts, runs=256, **options):
 def test_the_plan_is_the_best_split_and_its_variance_that_of_quadrature(device, name, roughness, metallic, error):
     arguments, env = surface(device, roughness, metallic, points=6), light(name, device)
     splits = [(8 * a, 8 * b, 64 - 8 * a - 8 * b) for a in range(9) for b in range(9 - a)]
-    plans = [plan_samples(*arguments, env, seed=seed) for seed in range(3)]
+    plans = [plan_samples(*at(*arguments), env, options=ShadeOptions(seed=seed)) for seed in range(3)]
     counts = torch.tensor([p.samples for p in plans] + splits, dtype=torch.float64)
     truth = quadrature(arguments, env, counts).mean(0).tolist()
     for plan, true in zip(plans, truth):
@@ -85,11 +90,11 @@ def test_the_plan_is_the_best_split_and_its_variance_that_of_quadrature(device, 
 def test_the_promised_variance_is_what_shade_has(device, points):
     """With independent numbers it is equal, with even points less; the mean is that of the published counts."""
     arguments, env = surface(device, 0.3, 1.0), light("sun", device)
-    plan = plan_samples(*arguments, env)
-    got = runs_of(arguments, env, plan.samples, points=points, antithetic="none")
+    plan = plan_samples(*at(*arguments), env)
+    got = runs_of(arguments, env, plan.samples, sequence=points, antithetic="none")
     ratio = float(got.var(0).sum(1).mean()) / plan.variance
     assert 0.8 < ratio < 1.25 if points == "random" else ratio < 1.0  # 256 runs: 5 % noise, the sun's tail some more
-    assert deviation(got, runs_of(arguments, env, (20, 40, 4), points=points, seed=1)) < 4.5  # 72 numbers
+    assert deviation(got, runs_of(arguments, env, (20, 40, 4), sequence=points, seed=1)) < 4.5  # 72 numbers
 
 
 def deviation(a, b):
@@ -102,8 +107,8 @@ def deviation(a, b):
 @pytest.mark.parametrize("case", GRID)
 def test_the_plan_changes_no_mean(device, case):
     arguments, env = surface(device, *case[1:]), light(case[0], device)
-    got = runs_of(arguments, env, plan_samples(*arguments, env).samples, antithetic="none", points="random")
-    assert deviation(got, runs_of(arguments, env, (20, 40, 4), points="random", seed=1)) < 5.0  # 1300 numbers
+    got = runs_of(arguments, env, plan_samples(*at(*arguments), env).samples, antithetic="none", sequence="random")
+    assert deviation(got, runs_of(arguments, env, (20, 40, 4), sequence="random", seed=1)) < 5.0  # 1300 numbers
 
 
 def sun_part(arguments, environment):
@@ -122,8 +127,8 @@ def compare(case, points, device, runs=256):
     """
     name, roughness, metallic = case
     arguments, env = surface(device, roughness, metallic), light(name, device)
-    plan = plan_samples(*arguments, env, points=points)
-    options = {"points": points, "antithetic": "none", "runs": runs}
+    plan = plan_samples(*at(*arguments), env, options=ShadeOptions(sequence=points))
+    options = {"sequence": points, "antithetic": "none", "runs": runs}
     mixed, *alone = (runs_of(arguments, env, c, **options).flatten(1).cpu() for c in (plan.samples, *SINGLE))
     own, *variance = (3.0 * float(v.var(0).mean()) for v in (mixed, *alone))  # the three channels' sum
     hidden = sun_part(arguments, env).mean(0).tolist() if name == "sun" else [0.0] * 3
@@ -164,9 +169,9 @@ def test_the_pilot_sees_shadows(device):
     vertices = torch.tensor(mesh.vertices) + 3.0 * where
     scene = RayScene(vertices.float().to(device), torch.tensor(mesh.faces, dtype=torch.int32, device=device))
     arguments = (torch.zeros_like(arguments[0]), *arguments[1:])
-    free, shaded = plan_samples(*arguments, env), plan_samples(*arguments, env, scene=scene)
+    free, shaded = plan_samples(*at(*arguments), env), plan_samples(*at(*arguments), env, scene=scene)
     assert free.samples[0] >= 40 > 8 >= shaded.samples[0]
-    got = runs_of(arguments, env, shaded.samples, scene=scene, points="random", antithetic="none")
+    got = runs_of(arguments, env, shaded.samples, scene=scene, sequence="random", antithetic="none")
     assert 0.8 < float(got.var(0).sum(1).mean()) / shaded.variance < 1.25  # 5 % noise of 256 runs, 3 % of the pilot
 
 
@@ -175,8 +180,8 @@ def test_few_bright_points_count_as_many_as_they_are(device):
     arguments, env = surface(device, 0.4, 1.0, points=1000), light("sky", device)
     bright = torch.arange(1000, device=device) % 10 == 0
     arguments = (*arguments[:4], torch.where(bright, 0.9, 0.03)[:, None].expand(-1, 3), *arguments[5:])
-    plan = plan_samples(*arguments, env, points="random")
-    got = runs_of(arguments, env, plan.samples, runs=64, points="random", antithetic="none")
+    plan = plan_samples(*at(*arguments), env, options=ShadeOptions(sequence="random"))
+    got = runs_of(arguments, env, plan.samples, runs=64, sequence="random", antithetic="none")
     # 10 % noise of 128 bright points in the pilot; drawn evenly in the mean they would count 5 times
     assert 0.7 < plan.variance / float(got.var(0).sum(1).mean()) < 1.4
 
@@ -185,7 +190,7 @@ def test_a_mirror_under_even_light_has_no_variance(device):
     """Nor a negative one: the pilot's weights have mass 1 for each strategy, whatever their noise."""
     arguments, env = surface(device, 0.05, 1.0), light("constant", device)
     for seed in range(5):
-        plan = plan_samples(*arguments, env, seed=seed)
+        plan = plan_samples(*at(*arguments), env, options=ShadeOptions(seed=seed))
         assert plan.samples == (0, 64, 0) and 0.0 < plan.variance < 3e-6  # of values about 1; 2e-8 but for rare facets
 
 
@@ -194,8 +199,10 @@ def test_the_relative_plan_is_for_what_is_seen(device):
     arguments, env = surface(device, 0.3, 1.0), light("sun", device)
     metallic = torch.arange(24, device=device) % 2 * 1.0
     arguments = (*arguments[:5], 1.0 - 0.7 * metallic, metallic)
-    plans = [plan_samples(*arguments, env, points="random", relative=r) for r in (False, True)]
-    runs = [runs_of(arguments, env, p.samples, points="random", antithetic="none") for p in plans]
+    plans = [
+        plan_samples(*at(*arguments), env, relative=r, options=ShadeOptions(sequence="random")) for r in (False, True)
+    ]
+    runs = [runs_of(arguments, env, p.samples, sequence="random", antithetic="none") for p in plans]
     mean = torch.cat(runs).mean((0, 2))
     scale = 1.0 / (mean.square() + (0.1 * mean.mean()) ** 2)
     plain, relative = ([float((r.var(0).sum(1) * w).mean()) for r in runs] for w in (torch.ones_like(scale), scale))
@@ -206,13 +213,18 @@ def test_the_relative_plan_is_for_what_is_seen(device):
 def test_the_plan_depends_on_inputs_and_seed_alone_and_takes_any_size(device):
     env = light("sky", device)
     many = surface(device, 0.4, 0.5, points=3000)
-    assert plan_samples(*many, env, seed=3) == plan_samples(*many, env, seed=3)
-    assert plan_samples(*many, env, seed=3).variance != plan_samples(*many, env, seed=4).variance
+    assert plan_samples(*at(*many), env, options=ShadeOptions(seed=3)) == plan_samples(
+        *at(*many), env, options=ShadeOptions(seed=3)
+    )
+    assert (
+        plan_samples(*at(*many), env, options=ShadeOptions(seed=3)).variance
+        != plan_samples(*at(*many), env, options=ShadeOptions(seed=4)).variance
+    )
     for total in (1, 3, 7, 64, 1001):
-        one = plan_samples(*(v[:1] for v in many), env, total=total)
+        one = plan_samples(*at(*(v[:1] for v in many)), env, total=total)
         assert sum(one.samples) == total and min(one.samples) >= 0 and one.variance > 0.0
     for relative in (False, True):
-        black = plan_samples(*many, Environment(torch.zeros(4, 8, 3, device=device)), relative=relative)
+        black = plan_samples(*at(*many), Environment(torch.zeros(4, 8, 3, device=device)), relative=relative)
         assert sum(black.samples) == 64 and black.variance == 0.0
 
 
@@ -220,17 +232,17 @@ def test_bad_input_is_named(device):
     arguments, env = surface(device, 0.4, 0.5), light("sky", device)
     for total in (0, 2.5):
         with pytest.raises(ValueError, match="total: expected"):
-            plan_samples(*arguments, env, total=total)
+            plan_samples(*at(*arguments), env, total=total)
     with pytest.raises(ValueError, match="position: expected at least one"):
-        plan_samples(*(v[:0] for v in arguments), env)
+        plan_samples(*at(*(v[:0] for v in arguments)), env)
     with pytest.raises(ValueError, match="alpha: expected one of"):
-        plan_samples(*arguments, env, alpha="cubed")
-    with pytest.raises(ValueError, match="points: expected one of"):
-        plan_samples(*arguments, env, points="sobol")
+        plan_samples(*at(*arguments), env, options=ShadeOptions(alpha="cubed"))
+    with pytest.raises(ValueError, match="sequence: expected one of"):
+        plan_samples(*at(*arguments), env, options=ShadeOptions(sequence="sobol"))
     with pytest.raises(TypeError, match="metallic: expected"):
-        plan_samples(*arguments[:6], arguments[6].double(), env)
+        plan_samples(*at(*arguments[:6], arguments[6].double()), env)
     with pytest.raises(ValueError, match="got NaN"):
-        plan_samples(*arguments[:4], arguments[4] * torch.nan, *arguments[5:], env)
+        plan_samples(*at(*arguments[:4], arguments[4] * torch.nan, *arguments[5:]), env)
     camera = Camera.from_fov(eye(device, 0.0, 0.0, 2.0), 0.8, 8, 8)
     away = Camera(eye(device, 0.0, 0.0, 2.0), camera.intrinsics.new_tensor([9.0, 9.0, 900.0, 4.0]), 8, 8)
     with pytest.raises(ValueError, match="camera: expected one that sees"):
@@ -245,7 +257,7 @@ def test_an_image_has_less_noise_by_its_plan(device):
     camera = Camera.from_fov(eye(device, 0.0, 0.5, 2.0), 0.8, 48, 48)
     plan = plan_render(asset, camera, env)
     images = {
-        counts: torch.stack([render(asset, camera, env, samples=counts, antithetic=pairs, seed=k).radiance
+        counts: torch.stack([render(asset, camera, env, options=ShadeOptions(counts, k, pairs)).radiance
                              for k in range(12)])
         for counts, pairs in ((plan.samples, "none"), ((20, 40, 4), "opposite"))
     }  # fmt: skip

@@ -152,7 +152,8 @@ def test_known_colour_reads_back(sphere):
 
 def test_known_colour_reads_back_through_the_file_at_every_mip(sphere, tmp_path):
     def material(p, n, t):
-        return {"base_color": color(p), "orm": torch.ones_like(p), "normal": encode_normals(n, n, t)}
+        one = torch.ones_like(p[:, :1])
+        return {"base_color": color(p), "roughness": one, "metallic": one, "normal": encode_normals(n, n, t)}
 
     write_glb(tmp_path / "ball.glb", Asset(sphere, TextureSet(**bake(sphere, SIZE, material, tangents=True))))
     read = trimesh.load(tmp_path / "ball.glb", force="mesh", process=False)

@@ -35,8 +35,8 @@ def baked(mesh: Mesh, size: int) -> Asset:
     mesh = with_tangents(unwrap(mesh, texture_size=size))
 
     def material(p, n, t):
-        orm = torch.stack([torch.ones_like(p[:, 0]), 0.5 + 0.4 * p[:, 1], 0.5 + 0.4 * p[:, 2]], 1)
-        return {"base_color": color(p), "orm": orm.clamp(0, 1), "normal": encode_normals(n, n, t)}
+        rough, metal = ((0.5 + 0.4 * p[:, k : k + 1]).clamp(0, 1) for k in (1, 2))
+        return {"base_color": color(p), "roughness": rough, "metallic": metal, "normal": encode_normals(n, n, t)}
 
     return Asset(mesh, TextureSet(**bake(mesh, size, material, tangents=True)))
 

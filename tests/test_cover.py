@@ -128,8 +128,8 @@ def test_equals_its_twin_on_a_rough_field(device):
 
 def seen_share(model, views):
     """Share of the pixels inside the silhouettes whose rays meet the mesh; and of the mesh's that lie inside."""
-    code, maps = pipeline.encode(model, pipeline.prepare(model, views, pipeline.normalize(views, "auto")))
-    mesh = pipeline.extract(model, code, maps, model.preset.resolution)
+    field = pipeline.encode(model, pipeline.prepare(model, views, pipeline.normalize(views, "auto")))
+    mesh, maps = pipeline.extract(field, model.preset.resolution), field.maps
     scene, size = RayScene(mesh.vertices, mesh.faces), maps.images.shape[1]
     hit = torch.stack([scene.closest(*camera_rays(Camera(c, k, size, size))).face >= 0
                        for c, k in zip(maps.c2w, maps.intrinsics, strict=True)])  # fmt: skip

@@ -106,7 +106,7 @@ def test_what_can_be_said_of_no_faces_is_said():
         (lambda m: unwrap_xatlas(m), "xatlas"),
         (lambda m: atlas_report(m), "numpy"),
         (lambda m: bake(m, 8, lambda p, n: p), "numpy"),
-        (lambda m: glb_bytes(Asset(m, TextureSet(*torch.zeros(3, 4, 4, 3)))), "numpy"),
+        (lambda m: glb_bytes(Asset(m, TextureSet(torch.zeros(4, 4, 3), 0.0, 0.0))), "numpy"),
     ],
 )
 def test_what_needs_a_face_says_so_in_one_line(call, module):

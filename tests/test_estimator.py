@@ -6,7 +6,8 @@ import trimesh
 
 from reli3d.geometry.rays import RayScene
 from reli3d.render.environment import Environment
-from reli3d.render.shading import shade
+from reli3d.render.shading import ShadeOptions, shade
+from tests.surfaces import at
 from tests.test_shading import points, sky
 
 
@@ -41,7 +42,12 @@ def test_mean_gradient_with_shadows_is_the_difference_of_means(device):
 
     def image(normal, base, rough, metal, texels, seed, samples=(320, 640, 64), scene=scene):
         env = Environment(texels)
-        return shade(place, normal, values[0], wo, base, rough, metal, env, scene=scene, seed=seed, samples=samples)
+        return shade(
+            *at(place, normal, values[0], wo, base, rough, metal),
+            env,
+            scene=scene,
+            options=ShadeOptions(seed=seed, samples=samples),
+        )
 
     leaves = [v.clone().requires_grad_() for v in (normal, *values[2:], map_)]
     shadow = (image(*leaves, 0) < 0.9 * image(*leaves, 0, scene=None)).any(1)
@@ -83,8 +89,11 @@ def test_black_texels_get_a_gradient_only_where_a_strategy_reaches_them(device):
     grads = {}
     for counts in ((64, 0, 0), (0, 0, 64), (20, 40, 4)):
         leaf = map_.clone().requires_grad_()
-        out = shade(up, up, up, up, flat[:, None].expand(n, 3), flat, torch.zeros_like(flat), Environment(leaf),
-                    samples=counts)  # fmt: skip
+        out = shade(
+            *at(up, up, up, up, flat[:, None].expand(n, 3), flat, torch.zeros_like(flat)),
+            Environment(leaf),
+            options=ShadeOptions(samples=counts),
+        )
         grads[counts] = torch.autograd.grad(out.mean(0).sum(), leaf)[0][0].sum()  # the black row about the zenith
     truth = grads[(0, 0, 64)]
     # 4 of 64 samples by the cosine and 40 by visible normals reach it: their noise over 40000 points is below 1 %
@@ -104,7 +113,9 @@ def test_gradients_stay_finite_at_the_edges_of_every_input(device):
         leaves = [normal, pick(0.0, 1.0, 0.5)[:, None].expand(n, 3).contiguous(), pick(0.0, 1e-3, 0.02, 1.0),
                   pick(0.0, 1.0, 0.3), light]  # fmt: skip
         leaves = [v.to(device).requires_grad_() for v in leaves]
-        out = shade(leaves[0].detach(), leaves[0], ng.to(device), wo.to(device), *leaves[1:4], Environment(leaves[4]))
+        out = shade(
+            *at(leaves[0].detach(), leaves[0], ng.to(device), wo.to(device), *leaves[1:4]), Environment(leaves[4])
+        )
         assert all(bool(torch.isfinite(v).all()) for v in (out, *torch.autograd.grad(out.sum(), leaves)))
 
 
@@ -113,21 +124,21 @@ def test_torch_sees_an_ordinary_function(device):
     n = 300
     normal, wo, base, rough, metal = inputs(n, device)
     env = Environment(sky(8).radiance.to(device))
-    plain = shade(normal, normal, normal, wo, base, rough, metal, env)
+    plain = shade(*at(normal, normal, normal, wo, base, rough, metal), env)
     wide = torch.stack([normal, wo, base], 0).permute(1, 0, 2)
-    same = shade(wide[:, 0], wide[:, 0], wide[:, 0], wide[:, 1], wide[:, 2], rough, metal, env)
+    same = shade(*at(wide[:, 0], wide[:, 0], wide[:, 0], wide[:, 1], wide[:, 2], rough, metal), env)
     assert torch.equal(plain, same)
     one = base[:1].clone().requires_grad_()
-    out = shade(normal, normal, normal, wo, one.expand(n, 3), rough, metal, env)
+    out = shade(*at(normal, normal, normal, wo, one.expand(n, 3), rough, metal), env)
     (g,) = torch.autograd.grad(out.sum(), one, retain_graph=True)
     assert g.shape == (1, 3) and torch.equal(g, torch.autograd.grad(out.sum(), one, retain_graph=True)[0])
     leaf = rough.clone().requires_grad_()
-    out = shade(normal, normal, normal, wo, base, leaf, metal, env)
+    out = shade(*at(normal, normal, normal, wo, base, leaf, metal), env)
     (g,) = torch.autograd.grad(out.sum(), leaf, create_graph=True)
     with pytest.raises(RuntimeError, match="once_differentiable"):
         torch.autograd.grad(g.sum(), leaf)
     moved = base.clone()
-    out = shade(normal, normal, normal, wo, moved, leaf, metal, env)
+    out = shade(*at(normal, normal, normal, wo, moved, leaf, metal), env)
     moved.add_(0.1)
     with pytest.raises(RuntimeError, match="modified by an inplace operation"):
         out.sum().backward()
@@ -157,8 +168,11 @@ def spread(roughness, metallic, environment, runs=256, base=None, **options):
     rough = torch.full((n,), roughness, device=normal.device).requires_grad_()
     facing, view = normal.repeat(runs, 1).requires_grad_(), wo.repeat(runs, 1)
     paint, fixed = base.repeat(runs, 1).requires_grad_(), facing.detach()
-    out = shade(fixed, facing, fixed, view, paint, rough, torch.full_like(rough, metallic).detach(), environment,
-                **{"points": "random", **options}).mean(1)  # fmt: skip
+    out = shade(
+        *at(fixed, facing, fixed, view, paint, rough, torch.full_like(rough, metallic).detach()),
+        environment,
+        options=ShadeOptions(**{"sequence": "random", **options}),
+    ).mean(1)
     slope, turn, tint = torch.autograd.grad(out.sum(), (rough, facing, paint))
     turn = turn - (turn * fixed).sum(-1, keepdim=True) * fixed
     return [v.detach().double().reshape(runs, 24, -1) for v in (out, slope, turn, tint)]
@@ -171,8 +185,12 @@ def texel_spread(roughness, metallic, environment, runs=256, **options):
     env, flat, rows = Environment(texels), torch.ones(24, device=normal.device), []
     for k in range(runs):
         pixels = torch.arange(24 * k, 24 * (k + 1), dtype=torch.int32, device=normal.device)
-        out = shade(normal, normal, normal, wo, base, flat * roughness, flat * metallic, env, pixels=pixels,
-                    **{"points": "random", **options})  # fmt: skip
+        out = shade(
+            *at(normal, normal, normal, wo, base, flat * roughness, flat * metallic),
+            env,
+            pixels=pixels,
+            options=ShadeOptions(**{"sequence": "random", **options}),
+        )
         rows.append(torch.autograd.grad(out.mean(), texels)[0].double().reshape(1, -1))
     return torch.stack(rows)
 
@@ -256,7 +274,7 @@ def test_pairs_as_shipped_are_less_noisy_than_as_many_independent_samples(device
     for roughness in (0.05, 0.1, 0.3, 1.0):
         pairs, alone = (
             [variance(v) for v in (*spread(roughness, metallic, env, **o), texel_spread(roughness, metallic, env, **o))]
-            for o in ({"points": "halton", "seed": 1}, {"antithetic": "none", "seed": 2})
+            for o in ({"sequence": "halton", "seed": 1}, {"antithetic": "none", "seed": 2})
         )
         ratio = dict(zip(COLUMNS, (a / b for a, b in zip(pairs, alone)), strict=True))
         assert ratio.pop("texels") < 1.05, (roughness, ratio)

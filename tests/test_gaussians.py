@@ -10,6 +10,7 @@ from torch.nn.functional import normalize
 from reli3d.render.environment import Environment, texel_solid_angles
 from reli3d.render.gaussians import SphericalGaussians, fit_gaussians, shade_gaussians
 from tests import reference
+from tests.surfaces import on_ball
 
 ROWS = 96  # midpoint rule; a lobe of sharpness 200 is 4 degrees wide, two rows
 
@@ -122,7 +123,7 @@ def test_shading_matches_quadrature(device):
         rows = [t.float().to(device)[None] for t in (torch.tensor([0.0, 0, 1]), wo, base)]
         light = SphericalGaussians(axis.float().to(device)[None], torch.tensor([sharpness], device=device),
                                    torch.ones(1, 3, device=device))  # fmt: skip
-        got = shade_gaussians(*rows, *(torch.tensor([v], device=device) for v in (roughness, metallic)), light)[0]
+        got = shade_gaussians(*on_ball(*rows, roughness, metallic), light)[0]
         # round lobes and one Fresnel factor: the method's own error as the docstring states it
         limit = 0.065 if roughness < 0.4 else 0.12 if roughness < 0.6 else 0.18
         error = (got.cpu().double() / want - 1.0).abs().max()
@@ -153,7 +154,7 @@ def test_gradients_stay_finite_at_the_edges(device):
     sharpness[3:5], amplitude[5] = torch.tensor([0.01, 0.5]), 0.0
     asked = ask(t.to(device) for t in (normal, wo, base, rough, metal, axis, sharpness, amplitude))
     light = SphericalGaussians(*asked[5:])
-    for out in (shade_gaussians(*asked[:5], light), light.irradiance(asked[0]), light.lookup(asked[1])):
+    for out in (shade_gaussians(*on_ball(*asked[:5]), light), light.irradiance(asked[0]), light.lookup(asked[1])):
         grads = torch.autograd.grad(out.sum(), asked, allow_unused=True)
         assert bool(torch.isfinite(out).all()) and float(out.detach().min()) >= 0.0
         assert all(g is None or bool(torch.isfinite(g).all()) for g in grads)
@@ -202,7 +203,7 @@ def test_same_bits_for_any_number_of_threads(device, threads):
     for count in (1, 2, 5):
         threads(count)
         asked = ask([*shading_inputs(device, 6000), *lobes(device, 6)])
-        out = shade_gaussians(*asked[:5], SphericalGaussians(*asked[5:]))
+        out = shade_gaussians(*on_ball(*asked[:5]), SphericalGaussians(*asked[5:]))
         results.append([out.detach(), *torch.autograd.grad(out.square().sum(), asked)])
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
@@ -215,9 +216,9 @@ def test_bad_input_and_empty_batches(device):
     light = SphericalGaussians(axis, sharpness, amplitude)
     assert light.lookup(axis[:0]).shape == (0, 3)
     rows = shading_inputs(device)
-    assert shade_gaussians(*(r[:0] for r in rows), light).shape == (0, 3)
+    assert shade_gaussians(*on_ball(*(r[:0] for r in rows)), light).shape == (0, 3)
     with pytest.raises(ValueError, match="wo: expected"):
-        shade_gaussians(rows[0], rows[1][:2], *rows[2:], light)
+        shade_gaussians(*on_ball(rows[0], rows[1][:2], *rows[2:]), light)
     with pytest.raises(ValueError, match="count: expected"):
         fit_gaussians(light.environment(4), 0)
     dark = fit_gaussians(Environment(torch.zeros(8, 16, 3, device=device)), 16)

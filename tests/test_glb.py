@@ -10,6 +10,7 @@ import os
 import shutil
 import struct
 import subprocess
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -46,8 +47,8 @@ def asset() -> Asset:
 
     def fn(p, n, t):
         bumped = torch.nn.functional.normalize(n + 0.2 * torch.sin(6 * p), dim=1)
-        orm = torch.tensor([1.0, 0.25, 0.75]).expand(len(p), 3)
-        return {"base_color": color(p), "orm": orm, "normal": encode_normals(bumped, n, t)}
+        rough, metal = (torch.full((len(p), 1), v) for v in (0.25, 0.75))
+        return {"base_color": color(p), "roughness": rough, "metallic": metal, "normal": encode_normals(bumped, n, t)}
 
     return Asset(mesh, TextureSet(**bake(mesh, SIZE, fn, tangents=True)))
 
@@ -83,7 +84,7 @@ def test_khronos_validator_on_a_real_mesh(shared_data, tmp_path):
     mesh = Mesh(torch.tensor(shape.vertices, dtype=torch.float32), torch.tensor(shape.faces, dtype=torch.int32))
     mesh = with_tangents(unwrap(mesh, texture_size=64))
     plain = torch.full((64, 64, 3), 0.5)
-    write_glb(tmp_path / "a.glb", Asset(mesh, TextureSet(plain, plain, plain)))
+    write_glb(tmp_path / "a.glb", Asset(mesh, TextureSet(plain, 0.5, 0.5, plain)))
     issues = judged(tmp_path / "a.glb")
     assert issues["numErrors"] == issues["numWarnings"] == 0, issues["messages"]
 
@@ -137,8 +138,7 @@ def test_trimesh_reads_the_same_surface_and_colours(asset, tmp_path):
 def test_pygltflib_reads_constants_back_exactly(asset, tmp_path, level):
     pygltflib = pytest.importorskip("pygltflib")
     flat = torch.full((8, 8, 3), level * STEP)
-    orm = torch.tensor([1.0, 0.2, 0.6]).expand(8, 8, 3)
-    write_glb(tmp_path / "a.glb", Asset(asset.mesh, TextureSet(flat, orm, flat)))
+    write_glb(tmp_path / "a.glb", Asset(asset.mesh, TextureSet(flat, 0.2, 0.6, flat)))
     document = pygltflib.GLTF2().load(str(tmp_path / "a.glb"))
 
     def pixels(texture):
@@ -159,7 +159,7 @@ def test_own_reader_gives_the_asset_back(asset, tmp_path):
         assert torch.equal(getattr(back.mesh, name), getattr(asset.mesh, name))
     for name in ("normals", "tangents"):
         torch.testing.assert_close(getattr(back.mesh, name), getattr(asset.mesh, name), rtol=0, atol=1e-6)
-    for name in ("base_color", "orm", "normal"):
+    for name in ("base_color", "roughness", "metallic", "normal"):
         difference = getattr(back.textures, name) - getattr(asset.textures, name)
         assert float(difference.abs().max()) <= 0.5 * STEP + 1e-4  # 8 bit; the colour passes through linear and back
 
@@ -203,7 +203,7 @@ def test_factors_and_missing_parts(asset, tmp_path):
     # sRGB encoding of 0.5 and 0.25 (IEC 61966-2-1)
     want = torch.tensor([0.735357, 0.537099, 1.0])
     torch.testing.assert_close(part.textures.base_color[0, 0], want, rtol=0, atol=1e-5)
-    torch.testing.assert_close(part.textures.orm[0, 0], torch.tensor([1.0, 0.5, 1.0]))
+    assert float(part.textures.roughness[0, 0]) == 0.5 and float(part.textures.metallic[0, 0]) == 1.0
     a, b, c = (part.mesh.vertices[part.mesh.faces[:, k].long()] for k in range(3))
     flat = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=1)
     torch.testing.assert_close(part.mesh.normals[part.mesh.faces[:, 0].long()], flat, rtol=0, atol=1e-5)
@@ -308,7 +308,7 @@ def test_what_an_asset_lacks_is_named(asset, tmp_path):
         write_glb(tmp_path / "a.glb", Asset(Mesh(m.vertices, m.faces, m.normals, m.uv), asset.textures))
     with pytest.raises(ValueError, match="asset.mesh.normals: expected unit length"):
         write_glb(tmp_path / "a.glb", Asset(Mesh(m.vertices, m.faces, m.normals * 2, m.uv, m.tangents), asset.textures))
-    bad = TextureSet(asset.textures.base_color + 1, asset.textures.orm, asset.textures.normal)
+    bad = replace(asset.textures, base_color=asset.textures.base_color + 1)
     with pytest.raises(ValueError, match="asset.textures.base_color: expected values in"):
         write_glb(tmp_path / "a.glb", Asset(m, bad))
     assert os.listdir(tmp_path) == []  # nothing half-written stays behind

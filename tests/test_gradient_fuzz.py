@@ -15,8 +15,9 @@ from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import surface_points
 from reli3d.render.material import PAINTS, eval_bsdf, sample_bsdf
 from reli3d.render.sampling import random_pairs
-from reli3d.render.shading import shade
+from reli3d.render.shading import ShadeOptions, shade
 from tests import reference
+from tests.surfaces import at
 
 N = 100_000
 EDGES = {"alpha": (0.0, 1e-3, 0.01, 0.1, 1.0), "metallic": (0.0, 1.0, 1e-7, 0.5), "base": (0.0, 1.0, 0.5)}
@@ -159,9 +160,13 @@ def test_gradients_of_the_estimator(device, strategy, paint):
     counts = (count, 0, 0) if strategy == "map" else (0, count, 0)
 
     def grads(weight):
-        out = shade(leaves[0].detach(), leaves[0], ng.to(device), wo.to(device), leaves[1], leaves[2], leaves[3],
-                    Environment(leaves[4]), samples=counts, seed=seed, antithetic="none", points="random",
-                    alpha="linear", paint=paint)  # fmt: skip
+        out = shade(
+            *at(leaves[0].detach(), leaves[0], ng.to(device), wo.to(device), leaves[1], leaves[2], leaves[3]),
+            Environment(leaves[4]),
+            options=ShadeOptions(
+                samples=counts, seed=seed, antithetic="none", sequence="random", alpha="linear", paint=paint
+            ),
+        )
         return out.detach(), torch.autograd.grad((out * weight.to(device)).sum(), leaves)
 
     weight = torch.rand(N, 3, generator=generator)
@@ -189,7 +194,7 @@ def test_gradients_of_the_estimator(device, strategy, paint):
     assert reference.share_within(got[4], g_texels) >= 0.999
 
 
-@pytest.mark.parametrize("options", [{}, {"paint": "published", "heuristic": "power", "points": "random"},
+@pytest.mark.parametrize("options", [{}, {"paint": "published", "heuristic": "power", "sequence": "random"},
                                      {"antithetic": "mirrored"}, {"antithetic": "none", "clamp": 0.5}])  # fmt: skip
 @pytest.mark.parametrize("light", ["sun", "black"])
 def test_all_strategies_together_keep_their_gradients_finite(device, light, options):
@@ -198,8 +203,11 @@ def test_all_strategies_together_keep_their_gradients_finite(device, light, opti
     if light == "sun":
         texels = torch.rand(8, 16, 3, generator=torch.Generator().manual_seed(5)) ** 30 * 1e5
     leaves = [v.to(device).requires_grad_() for v in (normal, base, alpha, metallic, texels)]
-    out = shade(leaves[0].detach(), leaves[0], ng.to(device), wo.to(device), *leaves[1:4], Environment(leaves[4]),
-                samples=(2, 4, 1), alpha="linear", **options)  # fmt: skip
+    out = shade(
+        *at(leaves[0].detach(), leaves[0], ng.to(device), wo.to(device), *leaves[1:4]),
+        Environment(leaves[4]),
+        options=ShadeOptions(samples=(2, 4, 1), alpha="linear", **options),
+    )
     grads = torch.autograd.grad(out.sum(), leaves)
     assert all(bool(torch.isfinite(v).all()) for v in (out, *grads))
     assert light == "sun" or all(float(g.abs().max()) == 0.0 for g in grads[:4])  # no light, no slope but the light's
@@ -267,6 +275,7 @@ def test_shaded_points_of_slivers_have_finite_gradients(device):
     tangents[420:480] = normals[420:480]
     maps = [torch.rand(16, 16, 3, generator=g) for _ in range(3)]
     maps[1][:4], maps[1][4:8], maps[2][:4] = 0.0, 1.0, 0.5  # smooth, rough and metal; no normal
+    maps[1:2] = maps[1][..., 1].contiguous(), maps[1][..., 2].contiguous()
     texels = torch.rand(8, 16, 3, generator=g) ** 3 * 2.0
     face = torch.randint(count // 3, (N,), generator=g, dtype=torch.int32).to(device)
     bary = torch.rand(N, 3, generator=g)
@@ -278,10 +287,9 @@ def test_shaded_points_of_slivers_have_finite_gradients(device):
     for own in (signed, None):
         leaves = [v.to(device).requires_grad_() for v in (corners, normals, uv, *maps, texels)]
         own = None if own is None else own.to(device).requires_grad_()
-        at = surface_points(Mesh(leaves[0], faces, leaves[1], leaves[2], own), TextureSet(*leaves[3:6]), face, bary)
-        out = shade(at.position, at.normal, at.ng, wo, at.base_color, at.roughness, at.metallic,
-                    Environment(leaves[6]), samples=(2, 4, 1))  # fmt: skip
+        points = surface_points(Mesh(leaves[0], faces, leaves[1], leaves[2], own), TextureSet(*leaves[3:7]), face, bary)
+        out = shade(points, wo, Environment(leaves[7]), options=ShadeOptions(samples=(2, 4, 1)))
         leaves += [] if own is None else [own]
-        grads = torch.autograd.grad(weighed([*vars(at).values(), out]), leaves)
-        for k, v in enumerate((*vars(at).values(), out, *grads)):
+        grads = torch.autograd.grad(weighed([*vars(points).values(), out]), leaves)
+        for k, v in enumerate((*vars(points).values(), out, *grads)):
             assert bool(torch.isfinite(v).all()) and float(v.detach().abs().max()) > 0.0, k

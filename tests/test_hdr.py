@@ -6,7 +6,15 @@ import pytest
 import torch
 
 from reli3d.io.files import InputError
-from reli3d.io.hdr import HALF_MAX, read_environment, read_hdr_image, rgbe_bytes, write_exr, write_hdr
+from reli3d.io.hdr import (
+    HALF_MAX,
+    read_environment,
+    read_hdr_image,
+    rgbe_bytes,
+    write_environment,
+    write_exr,
+    write_hdr,
+)
 
 
 def sky(height: int = 16, seed: int = 0, spread: float = 3.0) -> torch.Tensor:
@@ -21,24 +29,24 @@ def sky(height: int = 16, seed: int = 0, spread: float = 3.0) -> torch.Tensor:
 
 def test_float_exr_is_exact(tmp_path):
     assert write_exr(tmp_path / "a.exr", sky(), half=False) == 0
-    assert torch.equal(read_environment(tmp_path / "a.exr"), sky())
+    assert torch.equal(read_hdr_image(tmp_path / "a.exr"), sky())
 
 
 def test_half_exr_keeps_eleven_bits(tmp_path):
     image = sky().clamp_min(6.2e-5)  # the smallest normal half; below it precision falls
     assert write_exr(tmp_path / "a.exr", image) == 0
-    torch.testing.assert_close(read_environment(tmp_path / "a.exr"), image, rtol=2**-11, atol=0)  # half of 2^-10
+    torch.testing.assert_close(read_hdr_image(tmp_path / "a.exr"), image, rtol=2**-11, atol=0)  # half of 2^-10
 
 
 def test_values_a_file_cannot_hold_are_clamped_and_counted(tmp_path):
     image = sky()
     image[0, 0] = torch.tensor([1e6, math.inf, 1.0])
     assert write_exr(tmp_path / "a.exr", image) == 2
-    assert read_environment(tmp_path / "a.exr")[0, 0].tolist() == [HALF_MAX, HALF_MAX, 1.0]
+    assert read_hdr_image(tmp_path / "a.exr")[0, 0].tolist() == [HALF_MAX, HALF_MAX, 1.0]
     assert write_exr(tmp_path / "b.exr", image, half=False) == 1  # float holds a million
     assert write_hdr(tmp_path / "c.hdr", image) == 1
     for name in ("b.exr", "c.hdr"):
-        assert torch.isfinite(read_environment(tmp_path / name)).all()
+        assert torch.isfinite(read_hdr_image(tmp_path / name)).all()
 
 
 @pytest.mark.parametrize("write", [write_exr, write_hdr])
@@ -59,7 +67,7 @@ def test_nan_and_negative_are_never_written(tmp_path, write, bad):
 def test_rgbe_keeps_each_pixel_to_a_256th_of_its_largest_channel(tmp_path, height):
     image = sky(height, seed=height) if height > 3 else torch.rand(height, 2 * height, 3)
     write_hdr(tmp_path / "a.hdr", image)
-    error = (read_environment(tmp_path / "a.hdr") - image).abs()
+    error = (read_hdr_image(tmp_path / "a.hdr") - image).abs()
     # half a step of the largest channel's mantissa, which is 128 to 255.5 before rounding (above it the step doubles)
     assert bool((error <= image.amax(-1, keepdim=True) / 255).all())
 
@@ -68,7 +76,7 @@ def test_rgbe_edges_of_the_format(tmp_path):
     values = torch.tensor([0.0, 1e-39, 1.0, 255.6 / 256, 0.9999, 1.5e38, 2.0**-100, 65504.0])
     image = values[:, None].expand(8, 16)[..., None].expand(8, 16, 3).contiguous()
     write_hdr(tmp_path / "a.hdr", image)
-    back = read_environment(tmp_path / "a.hdr")[:, 0, 0]
+    back = read_hdr_image(tmp_path / "a.hdr")[:, 0, 0]
     torch.testing.assert_close(back, values, rtol=1 / 256, atol=1e-38)  # 1e-39 lies below the smallest exponent
     assert float(back[0]) == 0.0
 
@@ -97,31 +105,51 @@ def test_real_maps_read_as_mitsuba_reads_them(shared_data):
     mi = pytest.importorskip("mitsuba")
     mi.set_variant("scalar_rgb")
     for path in sorted((shared_data / "hdri").glob("*.hdr"))[:3]:
-        image = read_environment(path)
+        image = read_hdr_image(path)
         theirs = np.array(mi.Bitmap(str(path)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False))
         np.testing.assert_allclose(image.numpy(), theirs, rtol=1e-6)  # the same integers times powers of two
 
 
-@pytest.mark.parametrize("suffix", ["exr", "hdr"])
-def test_mitsuba_sees_the_sun_where_we_put_it(tmp_path, suffix):
-    """Row 0 is +Y, the centre column -Z, right of it +X; Mitsuba's centre column is +Z: half a turn about +Y."""
+@pytest.mark.parametrize("suffix, centre, turn", [("exr", "+X", 90), ("hdr", "+X", 90), ("hdr", "-Z", 180)])
+def test_mitsuba_sees_the_sun_where_we_put_it(tmp_path, suffix, centre, turn):
+    """Here the centre column is -Z, right of it +X; Mitsuba's centre column is +Z: turned as the file's centre asks."""
     mi = pytest.importorskip("mitsuba")
     mi.set_variant("scalar_rgb")
     height = 32
     for row, column in ((16, 32), (16, 48), (4, 10), (27, 60)):
         image = torch.full((height, 2 * height, 3), 0.01)
         image[row - 1 : row + 2, column - 1 : column + 2] = 100.0
-        (write_exr if suffix == "exr" else write_hdr)(tmp_path / f"sun.{suffix}", image)
+        write_environment(tmp_path / f"sun.{suffix}", image, centre=centre)
         theta = 2 * math.pi * (column + 0.5) / (2 * height) - math.pi
         phi = math.pi * (row + 0.5) / height
         d = [math.sin(theta) * math.sin(phi), math.cos(phi), -math.cos(theta) * math.sin(phi)]
         light = mi.load_dict({"type": "envmap", "filename": str(tmp_path / f"sun.{suffix}"),
-                              "to_world": mi.ScalarTransform4f().rotate([0, 1, 0], 180)})  # fmt: skip
+                              "to_world": mi.ScalarTransform4f().rotate([0, 1, 0], turn)})  # fmt: skip
         it = mi.SurfaceInteraction3f()
         it.wi = mi.Vector3f([-v for v in d])
         assert abs(float(light.eval(it)[0]) - 100.0) < 0.1  # Mitsuba's texels lie up to half a texel off: hence 3 x 3
         it.wi = mi.Vector3f(d)
         assert float(light.eval(it)[0]) < 0.1
+
+
+def test_an_environment_comes_back_and_its_file_has_x_in_the_centre(tmp_path):
+    image = sky(8)
+    assert write_environment(tmp_path / "a.exr", image) == 0
+    torch.testing.assert_close(read_environment(tmp_path / "a.exr"), image, rtol=2**-11, atol=2**-25)  # half floats
+    write_exr(tmp_path / "b.exr", image, half=False)
+    stored = read_hdr_image(tmp_path / "b.exr")
+    assert torch.equal(read_environment(tmp_path / "b.exr")[:, 12:], stored[:, 8:12])  # +X: three quarters across
+    columns = torch.arange(6.0)[None, :, None].expand(3, 6, 3).contiguous()
+    write_exr(tmp_path / "odd.exr", columns, half=False)  # a quarter of 6 columns is 1.5 of them
+    assert read_environment(tmp_path / "odd.exr")[0, :, 0].tolist() == [4.5, 2.5, 0.5, 1.5, 2.5, 3.5]
+
+
+def test_an_environment_is_refused_by_name_shape_and_centre(tmp_path):
+    for path, image, centre, said in (("a.png", sky(), "+X", "path: expected"), ("a.exr", sky(), "X", "centre: exp"),
+                                      ("a.exr", sky()[:8], "+X", "radiance: expected shape")):  # fmt: skip
+        with pytest.raises(ValueError, match=said):
+            write_environment(tmp_path / path, image, centre=centre)
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("options, dtype", [
@@ -134,7 +162,7 @@ def test_exr_of_other_writers_reads(tmp_path, options, dtype):
     header = {"type": OpenEXR.scanlineimage, "dataWindow": window, **options}
     with OpenEXR.File(header, dict(planes)) as file:
         file.write(str(tmp_path / "a.exr"))
-    got = read_environment(tmp_path / "a.exr")
+    got = read_hdr_image(tmp_path / "a.exr")
     assert np.array_equal(got.numpy(), np.stack([planes[c] for c in "RGB"], -1).astype(np.float32))
 
 
@@ -144,14 +172,14 @@ def test_grey_and_cleaned_pixels(tmp_path):
     with OpenEXR.File({"type": OpenEXR.scanlineimage}, {"Y": grey}) as file:
         file.write(str(tmp_path / "a.exr"))
     notes: list[str] = []
-    image = read_environment(tmp_path / "a.exr", notes=notes)
+    image = read_hdr_image(tmp_path / "a.exr", notes=notes)
     assert image[0, :3, 2].tolist() == [HALF_MAX, 0.0, 5e5]
     assert notes == ["a.exr: 3 infinite values set to 65504, 3 negative to 0"]
     grey[0, 0] = np.nan
     with OpenEXR.File({"type": OpenEXR.scanlineimage}, {"Y": grey}) as file:
         file.write(str(tmp_path / "a.exr"))
     with pytest.raises(InputError, match="NaN at 1 pixels"):
-        read_environment(tmp_path / "a.exr")
+        read_hdr_image(tmp_path / "a.exr")
 
 
 def test_exposure_of_the_header_is_divided_out(tmp_path):

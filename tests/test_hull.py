@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from reli3d import pipeline
 from reli3d.geometry.hull import hull_distance, mask_distance
-from reli3d.nn.field import bound_level
+from reli3d.nn.field import Field, bound_level
 from reli3d.nn.presets import SMALL
 from reli3d.nn.view_features import ViewMaps
 
@@ -184,11 +184,11 @@ def test_the_coarse_look_finds_the_reach_of_the_dense_one(device, radius, views)
     maps = ViewMaps(images.new_empty(views, 1, 1, 1), images, c2w, intrinsics)
     model = SimpleNamespace(preset=SMALL)
     grid = pipeline._grid(80, SMALL.radius, device).reshape(-1, 3)
-    dense = float(grid[bound_level(model, maps, grid) < 0].abs().max())
-    assert pipeline._hull_reach(model, maps, 80) == dense
+    dense = float(grid[bound_level(maps, grid, SMALL.softness) < 0].abs().max())
+    assert pipeline._hull_reach(Field(model, None, maps), 80) == dense
     empty = replace(maps, images=images - 1000.0)
     with pytest.raises(ValueError, match="masks: expected masks that overlap"):
-        pipeline._hull_reach(model, empty, 80)
+        pipeline._hull_reach(Field(model, None, empty), 80)
 
 
 def test_far_from_the_contour_the_ends_of_segments_will_do(device):

@@ -59,6 +59,13 @@ def test_the_example_gives_every_file_and_a_closed_mesh(example):
     assert len(info["weights"]["sha256"]) == 64 and "Apache-2.0" in info["weights"]["licence"]
 
 
+def test_peak_memory_is_none_where_python_has_no_count(monkeypatch):
+    """On Windows there is no module ``resource``."""
+    assert results.peak_memory_mib() > 10.0  # a Python with torch
+    monkeypatch.setitem(sys.modules, "resource", None)  # its import raises
+    assert results.peak_memory_mib() is None
+
+
 def test_both_environments_hold_the_same_light(example):
     exr, hdr = (read_environment(example / f"environment.{kind}") for kind in ("exr", "hdr"))
     assert exr.shape == (64, 128, 3) and bool((exr > 0).all())

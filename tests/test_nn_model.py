@@ -10,13 +10,15 @@ from torch.utils.flop_counter import FlopCounterMode
 from reli3d.nn.heads import HEADS, deformation, truncated_exp
 from reli3d.nn.model import Reconstructor
 from reli3d.nn.presets import (
+    LOCAL,
     OFFICIAL,
     SMALL,
     BackboneSizes,
     EncoderSizes,
     IlluminationSizes,
-    Preset,
     UpsamplerSizes,
+    from_json,
+    to_json,
 )
 from reli3d.nn.published import our_key
 from reli3d.nn.weights import read_manifest, read_tensors
@@ -235,11 +237,11 @@ def test_small_keeps_its_promises():
 
 
 def test_presets_return_from_their_text():
-    for preset in (SMALL, OFFICIAL, NANO):
-        assert Preset.from_json(preset.to_json()) == preset
-    for text in ("", "[]", "{}", '{"name": "x"}', SMALL.to_json().replace('"name": "small"', '"name": 5')):
-        with pytest.raises(ValueError, match="preset: expected the JSON of a Preset"):
-            Preset.from_json(text)
+    for preset in (SMALL, OFFICIAL, NANO, LOCAL):
+        assert from_json(to_json(preset)) == preset
+    for text in ("", "[]", "{}", '{"name": "x"}', to_json(SMALL).replace('"name": "small"', '"name": 5')):
+        with pytest.raises(ValueError, match="preset: expected the JSON of a preset"):
+            from_json(text)
 
 
 @torch.no_grad()

@@ -9,15 +9,27 @@ from reli3d.render.environment import Environment
 from reli3d.render.shading import shade
 from reli3d.render.volume import composite
 from tests.op_cases import shaded
+from tests.surfaces import at
 from tests.test_volume import packed
 
 NAMES = ("normal", "base_color", "roughness", "metallic", "radiance")
 
 
-def lit(leaves, **options):
+def lit(leaves, pixels=None):
     """Radiance of the table's hits; ``leaves`` by name, with all that ``shade`` takes."""
-    return shade(leaves["normal"].detach(), leaves["normal"], leaves["ng"], leaves["wo"], leaves["base_color"],
-                 leaves["roughness"], leaves["metallic"], Environment(leaves["radiance"]), **options)  # fmt: skip
+    return shade(
+        *at(
+            leaves["normal"].detach(),
+            leaves["normal"],
+            leaves["ng"],
+            leaves["wo"],
+            leaves["base_color"],
+            leaves["roughness"],
+            leaves["metallic"],
+        ),
+        Environment(leaves["radiance"]),
+        pixels=pixels,
+    )
 
 
 def hits(device, asked=NAMES):

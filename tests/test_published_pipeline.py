@@ -12,6 +12,7 @@ from reli3d import pipeline
 from reli3d.cli import infer
 from reli3d.geometry.mesh import report
 from reli3d.geometry.surface import extract_surface, surface_cubes
+from reli3d.io.hdr import read_environment, read_hdr_image
 from reli3d.nn import field
 from reli3d.nn.heads import deformation
 from reli3d.nn.model import Code, Reconstructor
@@ -57,7 +58,7 @@ def test_weights_asked_for_near_the_surface_give_the_published_mesh(goldens):
     code = Code(torch.from_numpy(data["triplane"]), none, none, none, none)
     flat = pipeline._grid(16, 0.87, torch.device("cpu")).reshape(-1, 3)
     level = model.level(model.query(code, flat[None], ("density",))["density"])[0, :, 0].view(17, 17, 17)
-    weights = pipeline._cube_weights(model, code, flat, level)
+    weights = field.Field(model, code, None).cube_weights(flat, level)
     got = extract_surface(level, radius=0.87, closed=False, **weights)
     assert np.array_equal(got.faces.numpy(), data["faces"])
     # density is exp of a sum of 64 products: 1e-5 relative, over slopes of about 1 a cell of 0.1
@@ -79,7 +80,7 @@ def test_weights_near_the_surface_are_those_of_the_whole_grid(tiny, half_space):
     dense = tiny.merger(torch.stack(eight, -2).view(n**3, 8, 16))
     want = extract_surface(level, radius=0.87, deformation=deformation(raw["deformation"][0], n).view(13, 13, 13, 3),
                            alpha=dense.alpha, beta=dense.beta, gamma=dense.gamma)  # fmt: skip
-    weights = pipeline._cube_weights(tiny, code, flat, level)
+    weights = field.Field(tiny, code, None).cube_weights(flat, level)
     assert len(weights["alpha"]) == len(surface_cubes(level))
     got = extract_surface(level, radius=0.87, **weights)
     assert torch.equal(got.faces, want.faces)
@@ -93,12 +94,13 @@ def test_the_grid_is_asked_by_planes_and_gives_the_level_of_its_points(tiny, mon
     monkeypatch.setattr(tiny, "preset", replace(tiny.preset, offset_many_views=0.03))
     code, maps = tiny.encode(*views(1, 2, 76)), SimpleNamespace(c2w=torch.zeros(2, 4, 4))
     axis = torch.linspace(-0.8, 0.6, 15)
-    want = field.surface_level(tiny, code, maps, torch.cartesian_prod(axis, axis, axis)).view(15, 15, 15)
+    own = field.Field(tiny, code, maps)
+    want = own.free_level(torch.cartesian_prod(axis, axis, axis)).view(15, 15, 15)
     assert float(want.min()) < 0 < float(want.max())
     for rows in (8192, 100, 1):
         monkeypatch.setattr(field, "ROWS", rows)
         # sums of 24 float32 products in another order, behind exp
-        torch.testing.assert_close(field.grid_level(tiny, code, maps, axis), want, rtol=1e-4, atol=1e-4)
+        torch.testing.assert_close(own.grid_level(axis), want, rtol=1e-4, atol=1e-4)
     with pytest.raises(ValueError, match="preset: expected one without point features"):
         Reconstructor(NANO).grid_density(code, axis)
 
@@ -153,7 +155,7 @@ def asset(tiny):
 def test_views_become_an_asset_without_looking_at_them_again(asset):
     found = report(asset.mesh)
     assert found.watertight and found.manifold
-    roughness = asset.textures.orm[..., 1]
+    roughness = asset.textures.roughness
     assert 0.1**0.5 - 1e-6 <= float(roughness.min()) <= float(roughness.max()) <= 1.0  # the head's range is [0.1, 1]
     assert bool(asset.environment.radiance.isfinite().all()) and asset.environment.radiance.shape == (64, 128, 3)
 
@@ -172,7 +174,7 @@ def test_exported_roughness_is_the_root_of_the_published_number(tiny, asset):
     same = Reconstructor(replace(TINY, roughness_is_alpha=False)).eval()
     same.load_state_dict(tiny.state_dict())
     release = reconstruct(EXAMPLE, weights=same, texture_size=256, resolution=16)
-    ours, theirs = asset.textures.orm[..., 1], release.textures.orm[..., 1]
+    ours, theirs = asset.textures.roughness, release.textures.roughness
     # the same width alpha in a viewer that squares, after baking means roots of texels beyond the charts as well
     torch.testing.assert_close(ours.square(), theirs, rtol=0, atol=1e-5)
     assert float((ours - theirs).max()) > 0.05  # shown as it is, the release's number is too glossy
@@ -186,8 +188,10 @@ def test_the_command_takes_published_weights_and_writes_published_names(tiny, tm
     assert infer.main([*arguments, "--hero", "1", "--background", "visible", "--precision", "bfloat16"]) == 0
     folder = tmp_path / "out" / "example"
     assert sorted(p.name for p in folder.iterdir()) == sorted((*results.FILES, "illumination.hdr"))
-    assert (folder / "illumination.hdr").read_bytes() == (folder / "environment.hdr").read_bytes()
+    published, light = read_hdr_image(folder / "illumination.hdr"), read_environment(folder / "environment.hdr")
+    assert torch.equal(published, light)  # as the release lays it out: the centre column -Z
     info = json.loads((folder / "run_info.json").read_text())
+    assert info["environment_centre"] == "+X"
     assert info["views"] == list(EXAMPLE.names[::-1]) and info["background"] == "visible"
     assert info["precision"] == "bfloat16" and load_model(weights).dtype == torch.float32
     assert info["model_from_input"] == torch.eye(4).tolist()  # poses as stored

@@ -17,6 +17,7 @@ from reli3d.geometry.hits import hit_normals, interpolate
 from reli3d.geometry.rays import offset_origin
 from reli3d.render.environment import Environment
 from reli3d.render.shading import shade
+from tests.surfaces import at
 from tests.test_rays import BACKENDS, PLACES, make, placed, rays, soup
 from tests.test_shading import sky
 
@@ -146,7 +147,7 @@ def shaded(scene, face, bary):
     n, device = len(face), face.device
     position, ng = interpolate(scene.vertices, scene.faces, face, bary), hit_normals(scene.vertices, scene.faces, face)
     white, half = torch.full((n, 3), 0.8, device=device), torch.full((n,), 0.5, device=device)
-    return shade(position, ng, ng, ng, white, half, half, Environment(sky().radiance.to(device)), scene=scene)
+    return shade(*at(position, ng, ng, ng, white, half, half), Environment(sky().radiance.to(device)), scene=scene)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

@@ -15,6 +15,7 @@ from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import sample_texture, surface_points
 from reli3d.render.material import PAINTS
 from reli3d.render.render import render
+from reli3d.render.shading import ShadeOptions
 from tests import reference
 
 
@@ -24,9 +25,8 @@ def eye(device, *position):
 
 
 def textures(size, device, color=(0.5, 0.5, 0.5), roughness=0.5, metallic=0.0, normal=(0.5, 0.5, 1.0)):
-    rows = [torch.tensor(v, device=device).expand(size, size, 3).contiguous()
-            for v in (color, (1.0, roughness, metallic), normal)]  # fmt: skip
-    return TextureSet(*rows)
+    color, normal = (torch.tensor(v, device=device).expand(size, size, 3).contiguous() for v in (color, normal))
+    return TextureSet(color, roughness, metallic, normal)
 
 
 def square(device, normals=True):
@@ -134,7 +134,7 @@ def test_image_gradient_reaches_textures_and_light(device):
                    Environment(light))  # fmt: skip
     grads = torch.autograd.grad(image.radiance.sum(), [*maps, light])
     assert all(bool(torch.isfinite(g).all()) and float(g.abs().max()) > 0 for g in grads)
-    assert float(grads[0].min()) >= 0.0 and float(grads[3].min()) >= 0.0  # more paint and more light are brighter
+    assert float(grads[0].min()) >= 0.0 and float(grads[4].min()) >= 0.0  # more paint and more light are brighter
 
 
 def test_no_light_is_gained_at_the_rim_but_with_the_published_paint(device):
@@ -143,12 +143,14 @@ def test_no_light_is_gained_at_the_rim_but_with_the_published_paint(device):
     camera, white = Camera.from_fov(eye(device, 0.0, 0.5, 2.0), 0.8, 40, 40), Environment.constant(
         torch.ones(3, device=device))  # fmt: skip
     asset = Asset(asset.mesh, textures(4, device, (1.0, 1.0, 1.0), roughness=0.2))
-    images = {paint: render(asset, camera, white, paint=paint, samples=(64, 64, 64)) for paint in PAINTS}
+    images = {paint: render(asset, camera, white, options=ShadeOptions((64, 64, 64), paint=paint)) for paint in PAINTS}
     inside = images["published"].alpha > 0
     bright = {paint: image.radiance[inside] for paint, image in images.items()}
     assert float(bright["published"].max()) > 1.1
     assert float(bright["conserving"].max()) < 1.05 and float(bright["conserving"].mean()) > 0.85  # 192 samples' noise
-    assert torch.equal(images["conserving"].radiance, render(asset, camera, white, samples=(64, 64, 64)).radiance)
+    assert torch.equal(
+        images["conserving"].radiance, render(asset, camera, white, options=ShadeOptions((64, 64, 64))).radiance
+    )
 
 
 def test_bad_input_is_named(device):
@@ -158,13 +160,13 @@ def test_bad_input_is_named(device):
     with pytest.raises(ValueError, match="background: expected"):
         render(asset, camera, Environment.constant(torch.ones(3, device=device)), background="pink")
     with pytest.raises(ValueError, match="paint: expected"):
-        render(asset, camera, Environment.constant(torch.ones(3, device=device)), paint="white")
+        render(asset, camera, Environment.constant(torch.ones(3, device=device)), options=ShadeOptions(paint="white"))
     faces, values = asset.mesh.faces, asset.mesh.vertices
     with pytest.raises(ValueError, match="face: expected"):
         interpolate(values, faces, torch.tensor([len(faces)], dtype=torch.int32, device=device),
                     torch.zeros(1, 2, device=device))  # fmt: skip
     with pytest.raises(ValueError, match="uv: expected"):
-        sample_texture(asset.textures.orm, torch.tensor([[np.nan, 0.0]], dtype=torch.float32, device=device))
+        sample_texture(asset.textures.normal, torch.tensor([[np.nan, 0.0]], dtype=torch.float32, device=device))
 
 
 def test_parts_shadow_each_other_and_keep_their_paint(device):

@@ -14,12 +14,13 @@ from PIL import Image
 from reli3d.cli.render import main
 from reli3d.geometry.mesh import Mesh
 from reli3d.io.glb import read_glb, write_glb
-from reli3d.io.hdr import read_environment, read_hdr_image, write_exr, write_hdr
+from reli3d.io.hdr import read_environment, read_hdr_image, write_environment
 from reli3d.render.asset import Asset
 from reli3d.render.camera import Camera, camera_rays, look_at
 from reli3d.render.color import agx, linear_to_srgb
 from reli3d.render.environment import Environment
 from reli3d.render.render import render
+from reli3d.render.shading import ShadeOptions
 from tests.test_render import ball
 
 SIZE, DISTANCE = 24, 2.6
@@ -37,8 +38,8 @@ def scene(tmp_path_factory):
                                          asset.textures))  # fmt: skip
     light = torch.full((8, 16, 3), 0.0625)
     light[:, :8] = torch.tensor([2.0, 1.0, 1.0])
-    write_hdr(folder / "half.hdr", light)
-    write_exr(folder / "half.exr", light)
+    write_environment(folder / "half.hdr", light)
+    write_environment(folder / "half.exr", light)
     return folder
 
 
@@ -62,7 +63,7 @@ def expected(folder, *, azimuth=30.0, yaw=0.0, seed=0, **options):
     pose = look_at((low + high) / 2 + DISTANCE * away, (low + high) / 2, torch.tensor([0.0, 1.0, 0.0]))
     camera = Camera.from_fov(pose, math.radians(32.0), SIZE, SIZE)
     light = Environment(read_environment(folder / "half.hdr")).rotated(yaw)
-    return render(parts, camera, light, seed=seed, **options), camera, light
+    return render(parts, camera, light, options=ShadeOptions(seed=seed), **options), camera, light
 
 
 def pixels(path):

@@ -13,7 +13,8 @@ from reli3d.nn.reni_fit import fit_latent
 from reli3d.nn.weights import load_model, read_manifest, read_tensors
 from reli3d.render.environment import Environment
 from reli3d.render.material import PAINTS
-from reli3d.render.shading import shade, shade_light
+from reli3d.render.shading import ShadeOptions, shade, shade_light
+from tests.surfaces import at
 from tests.test_shading import points
 
 # Six norms and an exponential in float32.  The torch module itself is 4e-6 from float64; measured here 5e-6.
@@ -110,21 +111,25 @@ def test_shading_that_asks_a_map_is_shading_by_the_map(device, backend):
         scene = RayScene(triangle, torch.tensor([[0, 1, 2]], dtype=torch.int32, device=device), backend=backend)
     args = surfaces(500, device)
     for paint in PAINTS:
-        got, wanted = (shade_light(*args, light, light, scene=scene, seed=6, paint=paint),
-                       shade(*args, light, scene=scene, seed=6, paint=paint))  # fmt: skip
+        got, wanted = (
+            shade_light(*at(*args), light, light, scene=scene, options=ShadeOptions(seed=6, paint=paint)),
+            shade(*at(*args), light, scene=scene, options=ShadeOptions(seed=6, paint=paint)),
+        )
         torch.testing.assert_close(got, wanted, rtol=1e-4, atol=1e-5)  # 64 numbers in another order
     if backend:
-        assert (wanted - shade(*args, light, seed=6, paint=paint)).abs().max() > 0.1  # the triangle is in the way
+        assert (
+            wanted - shade(*at(*args), light, options=ShadeOptions(seed=6, paint=paint))
+        ).abs().max() > 0.1  # the triangle is in the way
 
 
 def test_shading_by_a_latent_is_shading_by_its_fine_map(device):
     decoder = load_model("small").environment.to(device)
     light = decoder.light(*code(6, device, 0.3))
     args, coarse = surfaces(300, device), light.environment(16)
-    got = shade_light(*args, light, coarse, seed=1)
-    fine = shade_light(*args, light.environment(256), coarse, seed=1)  # the same directions
+    got = shade_light(*at(*args), light, coarse, options=ShadeOptions(seed=1))
+    fine = shade_light(*at(*args), light.environment(256), coarse, options=ShadeOptions(seed=1))  # the same directions
     torch.testing.assert_close(got, fine, rtol=5e-3, atol=1e-3 * float(fine.mean()))  # bilinear over 0.7 degrees
-    rough = shade_light(*args, coarse, coarse, seed=1)
+    rough = shade_light(*at(*args), coarse, coarse, options=ShadeOptions(seed=1))
     assert (rough - fine).abs().mean() > 4 * (got - fine).abs().mean()  # a stored map of 16 rows shows
 
 

@@ -17,8 +17,9 @@ from reli3d.render.sampling import (
     sample_cosine,
     sample_ggx_vndf,
 )
-from reli3d.render.shading import shade
+from reli3d.render.shading import ShadeOptions, shade
 from tests import chi2, reference
+from tests.surfaces import at
 
 N = 1_000_000
 QUICK = [(alpha, deg) for alpha in (0.1, 0.5, 1.0) for deg in (0, 45, 80)]
@@ -113,8 +114,11 @@ def test_pairs_of_the_shader_are_those_of_the_samplers(device, points, antitheti
         density = sum(lobes[:, int(name == "mirrored"), None] for name, _ in pair)
         want += torch.where(wi[:, 2:] > 1e-6, eval_bsdf(wo, wi, base, rough**2, metal) * wi[:, 2:] / density, 0.0)
     env = Environment(torch.full((4, 8, 3), 0.7, device=device))
-    got = shade(up, up, up, wo, base, rough, metal, env, samples=(0, 2, 0), seed=seed, points=points,
-                antithetic=antithetic)  # fmt: skip
+    got = shade(
+        *at(up, up, up, wo, base, rough, metal),
+        env,
+        options=ShadeOptions(samples=(0, 2, 0), seed=seed, sequence=points, antithetic=antithetic),
+    )
     # sharp lobes have few digits of the half vector
     assert reference.share_within(got.cpu(), 0.7 * want.cpu()) > 0.999
 

@@ -17,8 +17,9 @@ from reli3d.render.camera import Camera, camera_rays, look_at
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.render.environment import Environment
 from reli3d.render.render import render
-from reli3d.render.shading import SAMPLES, shade
+from reli3d.render.shading import SAMPLES, ShadeOptions, shade
 from tests import mitsuba_scene
+from tests.surfaces import at
 
 pytestmark = pytest.mark.slow  # Mitsuba compiles its kernels for half a minute a case
 
@@ -73,7 +74,9 @@ class Stage:
         values = (self.position, self.normal, self.ng, -self.directions, base.expand(n, 3), roughness.expand(n),
                   torch.full((n,), metallic))  # fmt: skip
         light = Environment(environment.radiance.to(self.device))
-        return shade(*(v.to(self.device) for v in values), light, scene=self.scene, seed=seed).cpu()
+        return shade(
+            *at(*(v.to(self.device) for v in values)), light, scene=self.scene, options=ShadeOptions(seed=seed)
+        ).cpu()
 
 
 @pytest.mark.parametrize("material", MATERIALS)
@@ -158,8 +161,7 @@ def mapped_ball_in_ring():
     g = torch.Generator().manual_seed(12)
     base, orm = 0.1 + 0.8 * torch.rand(8, 8, 3, generator=g), torch.rand(8, 8, 3, generator=g)
     orm[..., 1] = 0.3 + 0.7 * orm[..., 1]
-    flat = torch.tensor([0.5, 0.5, 1.0]).expand(8, 8, 3).contiguous()
-    return Asset(Mesh(vertices, faces, normals, uv), TextureSet(linear_to_srgb(base), orm, flat))
+    return Asset(Mesh(vertices, faces, normals, uv), TextureSet(linear_to_srgb(base), orm[..., 1], orm[..., 2]))
 
 
 def test_render_equals_mitsubas_sensor_textures_and_light(device):
@@ -195,10 +197,12 @@ def test_render_equals_mitsubas_sensor_textures_and_light(device):
     pose = look_at(*(torch.tensor(v, device=device) for v in (eye, target, (0.0, 1.0, 0.0))))
     camera = Camera.from_fov(pose, fov, width, height)
     asset = Asset(Mesh(*(getattr(m, k).to(device) for k in ("vertices", "faces", "normals", "uv"))),
-                  TextureSet(*(v.to(device) for v in vars(asset.textures).values())))  # fmt: skip
+                  asset.textures.to(device))  # fmt: skip
 
     def runs(asset, camera):
-        images = (render(asset, camera, sky, supersampling=fine, seed=k).radiance for k in range(count))
+        images = (
+            render(asset, camera, sky, supersampling=fine, options=ShadeOptions(seed=k)).radiance for k in range(count)
+        )
         return np.stack([v.cpu().double().numpy()[kept] for v in images])
 
     compare(runs(asset, camera), want, variance, 2 * draws * passes)
@@ -209,7 +213,7 @@ def test_render_equals_mitsubas_sensor_textures_and_light(device):
     for wrong in ((asset, aside), (raw, camera), (turned, camera)):  # what the z-test is there to see
         assert rejected(runs(*wrong).mean(0), want, variance, samples).mean() > 4 * (1.0 - ACCEPT)  # measured 3 to 98 %
 
-    full = partial(render, asset, camera, sky, samples=(1, 0, 0), shadows=False)
+    full = partial(render, asset, camera, sky, options=ShadeOptions((1, 0, 0)), shadows=False)
     off = full(supersampling=fine).alpha.cpu().numpy() - pixels(hit).mean((2, 3))
     assert (off != 0.0).mean() < 2e-3  # rays that graze the outline; measured 0
     film = mitsuba_scene.sensor(mi, eye, target, fov, width, height)

@@ -56,8 +56,8 @@ def parser() -> argparse.ArgumentParser:
         "--up", choices=("x", "y", "z", "-x", "-y", "-z"), default="y", help="axis of that frame to turn to +Y"
     )
     p.add_argument("--seed", type=int, default=0)
-    p.add_argument("--compatible-names", action="store_true", help="write illumination.hdr, the published release's "
-                   "name, beside environment.hdr")  # fmt: skip
+    p.add_argument("--compatible-names", action="store_true", help="also write illumination.hdr: the published "
+                   "release's name and layout, -Z in the centre column")  # fmt: skip
     p.add_argument("--skip-existing", action="store_true", help="leave objects alone whose files are all there")
     p.add_argument(
         "--warm", action="store_true", help="reconstruct every object twice and record the second time as well"
@@ -229,7 +229,7 @@ class Job:
             "mesh": results.mesh_statistics(asset.mesh),
             "seconds": seconds,
             "seconds_since_start": round(time.monotonic() - STARTED, 3),
-            "peak_memory_mib": round(results.peak_memory_mib(), 1),
+            "peak_memory_mib": results.peak_memory_mib(),
             "versions": results.versions(),
         }
         steps("writing")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 FORMATS = ("png", "exr", "webp")
@@ -17,7 +18,8 @@ def parser() -> argparse.ArgumentParser:
         epilog="Exit code: 0 done, 2 wrong input.  The files' names go to stdout, progress to stderr.",
     )
     p.add_argument("glb", type=Path)
-    p.add_argument("--light", type=Path, help="lat-long .hdr or .exr; default uniform white")
+    p.add_argument("--light", type=Path, help="lat-long .hdr or .exr, its centre column +X (as three.js, "
+                   "model-viewer and Blender have it); default uniform white")  # fmt: skip
     p.add_argument("--output", type=Path, default=Path("renders"), help="folder (default renders)")
     p.add_argument("--format", choices=FORMATS, default="png", help="png, exr (linear radiance), webp (animation)")
     p.add_argument("--frames", type=int, default=1, help="views on a full turn around +Y")
@@ -81,16 +83,13 @@ def render_files(args: argparse.Namespace) -> list[Path]:
 
     from reli3d.io.glb import read_glb
     from reli3d.io.hdr import read_environment, write_exr
-    from reli3d.render.asset import Asset, TextureSet
     from reli3d.render.camera import Camera, look_at
     from reli3d.render.environment import Environment
     from reli3d.render.render import joined_scene, plan_render, render
+    from reli3d.render.shading import ShadeOptions
 
     device = torch.device(args.device)
-    parts = []
-    for part in read_glb(args.glb):
-        maps = part.textures and TextureSet(*(m.to(device) for m in vars(part.textures).values()))
-        parts.append(Asset(part.mesh.to(device), maps))
+    parts = [part.to(device) for part in read_glb(args.glb)]
     light = torch.ones(8, 16, 3) if args.light is None else read_environment(args.light)
     environment = Environment(light.to(device))
     scene = joined_scene(parts)
@@ -99,7 +98,7 @@ def render_files(args: argparse.Namespace) -> list[Path]:
     distance = args.distance or 1.02 * radius / math.sin(math.radians(args.fov) / 2)
     up = torch.tensor([0.0, 1.0, 0.0], device=device)
     args.output.mkdir(parents=True, exist_ok=True)
-    written, animation, counts = [], [], {"samples": tuple(args.samples)}
+    written, animation, options = [], [], ShadeOptions(tuple(args.samples), args.seed, paint=args.paint)
     bar = tqdm(total=args.frames, unit="frame", file=sys.stderr, disable=not sys.stderr.isatty())
     for frame in range(args.frames):
         turn = 2.0 * math.pi * frame / args.frames
@@ -108,15 +107,16 @@ def render_files(args: argparse.Namespace) -> list[Path]:
         offset = [math.cos(lift) * math.sin(azimuth), math.sin(lift), math.cos(lift) * math.cos(azimuth)]
         eye = centre + distance * torch.tensor(offset, device=device)
         camera = Camera.from_fov(look_at(eye, centre, up), math.radians(args.fov), args.size, args.size)
-        shown = {"scene": scene, "shadows": not args.no_shadows, "paint": args.paint}
+        shown = {"scene": scene, "shadows": not args.no_shadows}
         if args.plan is not None and frame == 0:
-            plan = plan_render(parts, camera, environment, total=args.plan, seed=args.seed,
+            plan = plan_render(parts, camera, environment, total=args.plan, options=options,
                                relative=args.format != "exr", **shown)  # fmt: skip
-            counts = {"samples": plan.samples, "antithetic": "none"}
+            options = replace(options, samples=plan.samples, antithetic="none")
             print("reli3d-render: samples by strategy", *plan.samples, file=sys.stderr)
         image = render(
-            parts, camera, environment if args.turn == "camera" else environment.rotated(turn), **counts, **shown,
-            supersampling=args.supersampling, seed=args.seed + frame, background=args.background,
+            parts, camera, environment if args.turn == "camera" else environment.rotated(turn), **shown,
+            options=replace(options, seed=args.seed + frame), supersampling=args.supersampling,
+            background=args.background,
         )  # fmt: skip
         stem = args.output / (args.glb.stem if args.frames == 1 else f"{args.glb.stem}_{frame:04d}")
         if args.format == "exr":
@@ -144,13 +144,8 @@ def _picture(image, args):
 
     from reli3d.render.color import agx, linear_to_srgb
 
-    radiance = image.radiance * 2.0**args.exposure
-    if args.background == "transparent":  # the transform is not linear: it takes the colour, not the premultiplied one
-        radiance = radiance / image.alpha[..., None].clamp(min=1e-6)
     tone = {"srgb": linear_to_srgb, "agx": agx, "none": lambda v: v}[args.tone]
-    shown = tone(radiance).clamp(0.0, 1.0)
-    if args.background == "transparent":
-        shown = torch.cat([shown, image.alpha[..., None]], -1)
+    shown = image.picture(exposure=args.exposure, tone=tone, transparent=args.background == "transparent")
     return Image.fromarray((shown * 255.0 + 0.5).to(torch.uint8).cpu().numpy())
 
 

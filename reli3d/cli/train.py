@@ -17,15 +17,12 @@ def parser() -> argparse.ArgumentParser:
     )
     p.add_argument("samples", type=Path, help="folder of samples made by reli3d-data")
     p.add_argument("output", type=Path, help="folder of the checkpoint, the log, the curves and validation pictures")
-    p.add_argument("--light-prior", type=Path, help="environment decoder made by python -m reli3d.train.light_prior; "
-                   "kept as it is")  # fmt: skip
-    p.add_argument("--heads", action="store_true", help="train the heads alone, --minutes on, with the trunk of OUTPUT")
     p.add_argument("--steps", type=int, default=20000)
     p.add_argument("--minutes", type=float, default=float("inf"), help="end of the schedule in minutes of training")
     p.add_argument("--batch", type=int, default=4, help="objects a step")
     p.add_argument("--points", type=int, default=2048, help="volume points an object")
-    p.add_argument("--max-views", type=int, default=4)
-    p.add_argument("--rate", type=float, default=6e-4, help="peak learning rate")
+    p.add_argument("--max-views", type=int, default=6)
+    p.add_argument("--rate", type=float, default=1.5e-3, help="peak learning rate")
     p.add_argument("--seed", type=int, default=0)
     p.add_argument(
         "--validation",
@@ -48,18 +45,16 @@ def report(line: str) -> None:
 def main(argv: list[str] | None = None) -> int:
     args = parser().parse_args(argv)
     import torch
-    from safetensors.torch import load_file
 
     from reli3d.nn import weights
-    from reli3d.nn.model import Reconstructor
-    from reli3d.nn.presets import SMALL
+    from reli3d.nn.local import LocalReconstructor
+    from reli3d.nn.presets import LOCAL
     from reli3d.train.calibrate import calibrate
-    from reli3d.train.heads import train_heads
     from reli3d.train.loop import TrainConfig, averaged_model, train
     from reli3d.train.workers import Workers
 
     torch.manual_seed(args.seed)
-    model = Reconstructor(SMALL)
+    model = LocalReconstructor(LOCAL)
     try:
         if args.export:
             averaged_model(args.output / "state.pt", model)
@@ -69,13 +64,8 @@ def main(argv: list[str] | None = None) -> int:
             report(f"chosen: {model.preset.offset_one_view:g}, of many views {model.preset.offset_many_views:g}")
             print(weights.save(args.export, model, licence=LICENCE).path)
             return 0
-        if args.light_prior:
-            prior = load_file(args.light_prior)
-            model.environment.load_state_dict({k: v for k, v in prior.items() if k != "latents"})
-            model.environment.requires_grad_(False)
         workers = Workers.join()
-        run = train_heads if args.heads else train
-        run(model, TrainConfig(samples=str(args.samples), output=str(args.output), steps=args.steps,
+        train(model, TrainConfig(samples=str(args.samples), output=str(args.output), steps=args.steps,
                                  minutes=args.minutes, batch=args.batch, points=args.points, max_views=args.max_views,
                                  rate=args.rate, seed=args.seed,
                                  validation=str(args.validation or "")), workers)  # fmt: skip

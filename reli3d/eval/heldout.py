@@ -17,8 +17,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from reli3d.geometry.rays import RayScene
-from reli3d.nn.model import Reconstructor
-from reli3d.pipeline import NoSurface, reconstruct
+from reli3d.pipeline import Network, NoSurface, reconstruct
 from reli3d.render.camera import Camera, camera_rays
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.render.environment import Environment
@@ -84,9 +83,7 @@ def light_error(predicted: Tensor, target: Tensor) -> float:
     return float((difference.abs() * weight).sum() / weight.sum())
 
 
-def evaluate(
-    model: Reconstructor, sample: dict[str, Tensor], seed: int, count: int, mean_light: Tensor
-) -> dict[str, float]:
+def evaluate(model: Network, sample: dict[str, Tensor], seed: int, count: int, mean_light: Tensor) -> dict[str, float]:
     """Figures of one object reconstructed from ``count`` views; colours are compared where truth and result are seen.
 
     ``*_mse`` are square errors of the base colour, ``single_*`` those of the best single colour of this very object.
@@ -152,7 +149,7 @@ def mean_environment(maps: Tensor) -> Tensor:
     return Environment(wide.contiguous()).resized(32).radiance
 
 
-def table(model: Reconstructor, folder: Path, mean_light: Tensor, counts: Sequence[int],
+def table(model: Network, folder: Path, mean_light: Tensor, counts: Sequence[int],
           progress: Callable[[str], None]) -> dict[int, dict]:  # fmt: skip
     """:func:`summary` of the samples in ``folder`` for each number of views (at most ``INPUTS``); ``progress`` gets a
     line an object.  Raises ValueError where the folder holds no samples.

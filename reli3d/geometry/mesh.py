@@ -14,7 +14,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components as graph_components
 from torch import Tensor
 
-from reli3d._bridge import check
+from reli3d._bridge import check, tensor_of
 
 NORMAL_MIN = 1.0e-20  # squared length of an area-weighted normal sum below which it counts as zero (published release)
 
@@ -23,7 +23,8 @@ NORMAL_MIN = 1.0e-20  # squared length of an area-weighted normal sum below whic
 class Mesh:
     """Triangle mesh on one device; knows no network and no texture.
 
-    Raises TypeError or ValueError for a wrong dtype, shape, device or a face index out of range.
+    Arrays of numpy, and faces of other integers, are taken where nothing is lost.  Raises TypeError or ValueError for a
+    wrong dtype, shape, device or a face index out of range.
     """
 
     vertices: Tensor  # (V, 3) float32
@@ -33,6 +34,9 @@ class Mesh:
     tangents: Tensor | None = None  # (V, 4) unit, w = +-1: bitangent = w * cross(normal, tangent)
 
     def __post_init__(self) -> None:
+        for f in fields(self):
+            kind = torch.int32 if f.name == "faces" else torch.float32
+            object.__setattr__(self, f.name, tensor_of(getattr(self, f.name), kind))
         _check_topology(self.vertices, self.faces)
         for name, last in (("normals", 3), ("uv", 2), ("tangents", 4)):
             value = getattr(self, name)

@@ -14,7 +14,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from reli3d._bridge import check, empty, launch, over_slices, stream
+from reli3d._bridge import check, empty, launch, over_slices, stream, tensor_of
 from reli3d.geometry import embree
 from reli3d.kernels import embree as embree_kernels
 from reli3d.kernels import intersect as kernels
@@ -37,7 +37,8 @@ class Hits:
 class RayScene:
     """Acceleration structure over one mesh; keeps its own copy of the geometry.
 
-    vertices: ``(V, 3)`` float32.  faces: ``(F, 3)`` int32.  Zero-area faces are never hit; without faces every ray
+    vertices: ``(V, 3)`` float32.  faces: ``(F, 3)`` int32.  Arrays of numpy, and faces of other integers, are taken
+    where nothing is lost.  Zero-area faces are never hit; without faces every ray
     misses. backend: ``embree`` (CPU only, robust mode), ``warp``, or ``auto``: Embree on CPU, where it is some three
     times faster, Warp on CUDA.  Warp's tree is split by surface area on every device, since its other ways leak more
     rays at vertices; on CUDA it is built by one thread of the host too (80 thousand triangles: 50 ms of a 2.8 GHz Xeon,
@@ -48,6 +49,7 @@ class RayScene:
     def __init__(self, vertices: Tensor, faces: Tensor, backend: str = "auto"):
         if backend not in BACKENDS:
             raise ValueError(f"backend: expected one of {', '.join(BACKENDS)}, got {backend}")
+        vertices, faces = tensor_of(vertices), tensor_of(faces, torch.int32)
         check("faces", faces, last=3, dtype=torch.int32)
         if faces.ndim != 2:
             raise ValueError(f"faces: expected shape (F, 3), got {tuple(faces.shape)}")

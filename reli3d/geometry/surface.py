@@ -16,7 +16,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from reli3d._bridge import check, launch, once_differentiable
+from reli3d._bridge import check, launch, once_differentiable, tensor_of
 from reli3d.geometry.mesh import Mesh
 from reli3d.kernels import flexicubes as kernels
 from reli3d.kernels.flexicubes_tables import tables
@@ -93,9 +93,11 @@ def extract_surface(
     gradient (the quadric error that the authors' code offers without weights).
     :mod:`reli3d.geometry.regularize` has the losses that keep a fitted surface sound.
 
-    Raises TypeError or ValueError on a wrong dtype, shape or device, on a level that is not finite, on weights that
-    are not positive.
+    Arrays of numpy are taken too.  Raises TypeError or ValueError on a wrong dtype, shape or device, on a level that is
+    not finite, on weights that are not positive.
     """
+    level, deformation, alpha, beta, gamma = (tensor_of(v) for v in (level, deformation, alpha, beta, gamma))
+    cubes = tensor_of(cubes, torch.int64)
     extent = check_fields(level, radius, deformation, alpha, beta, gamma, cubes)
     topology, padded, crossed = topology_of(level.detach().contiguous(), cubes, closed)
     scale = tuple(2.0 * float(r) for r in extent)

@@ -58,7 +58,7 @@ def _checked(asset: Asset) -> None:
             raise ValueError(f"asset.mesh.{name}: expected unit length, got a length off by {worst:.3g}")
     if not bool((mesh.tangents[:, 3].abs() == 1.0).all()):
         raise ValueError("asset.mesh.tangents: expected w = +1 or -1, got another value")
-    for name in ("base_color", "orm", "normal"):
+    for name in ("base_color", "roughness", "metallic", "normal"):
         value = getattr(asset.textures, name)
         low, high = (float(v) for v in torch.aminmax(value)) if value.numel() else (-1.0, -1.0)
         if not 0.0 <= low <= high <= 1.0:  # NaN fails too
@@ -71,8 +71,10 @@ def glb_bytes(asset: Asset, *, extras: Mapping | None = None, double_sided: bool
     mesh, textures = asset.mesh, asset.textures
     if double_sided is None:
         double_sided = not watertight(mesh)
+    rough = textures.roughness
+    orm = torch.stack([torch.ones_like(rough), rough, textures.metallic], -1)  # no occlusion is baked
     with ThreadPoolExecutor(3) as pool:  # the encoder runs without the interpreter lock
-        images = [pool.submit(encode_png, t) for t in (textures.base_color, textures.orm, textures.normal)]
+        images = [pool.submit(encode_png, t) for t in (textures.base_color, orm, textures.normal)]
         document, chunks = _geometry(mesh)
         chunks += [image.result() for image in images]
     names = ("base_color", "metallic_roughness", "normal")

@@ -156,14 +156,11 @@ class _Materials:
         factor = torch.tensor(color).clamp(0.0, 1.0)
         base = linear_to_srgb((srgb_to_linear(base) if base is not None else torch.ones(size, size, 3)) * factor)
         orm = orm if orm is not None else torch.ones(size, size, 3)
-        orm = torch.stack([torch.ones(size, size), orm[..., 1] * min(max(roughness, 0.0), 1.0),
-                           orm[..., 2] * min(max(metallic, 0.0), 1.0)], -1)  # fmt: skip
-        if normal is None:
-            normal = torch.tensor([0.5, 0.5, 1.0]).expand(size, size, 3).contiguous()
-        elif scale != 1.0:
+        rough, metal = (orm[..., k] * min(max(v, 0.0), 1.0) for k, v in ((1, roughness), (2, metallic)))
+        if normal is not None and scale != 1.0:
             local = (normal * 2.0 - 1.0) * torch.tensor([scale, scale, 1.0])
             normal = torch.nn.functional.normalize(local, dim=-1, eps=1e-6) * 0.5 + 0.5
-        return TextureSet(base.clamp(0.0, 1.0), orm, normal), channels.pop() if channels else 0
+        return TextureSet(base.clamp(0.0, 1.0), rough, metal, normal), channels.pop() if channels else 0
 
     def _image(self, index: object, field: str) -> Tensor:
         entry = self.document.item("images", index, field)

@@ -1,6 +1,9 @@
 """Environment maps and other linear images: OpenEXR through the OpenEXR package, Radiance RGBE by our own code.
 
-Pixels are linear Rec. 709 radiance, row 0 at the top (+Y of an environment, whose centre column looks to -Z).
+Pixels are linear Rec. 709 radiance, row 0 at the top, +Y of an environment.  The centre column of an environment's
+file looks to +X and right of it lies +Z: so three.js, model-viewer and Blender place a lat-long map about a glTF.  In
+the program the centre column looks to -Z and right of it lies +X, as in the published release; the quarter turn between
+the two is done here and nowhere else.
 What a file may not hold is never written: NaN and negative values are refused, infinity and (in half precision) values
 above 65504 are clamped to 65504 and counted.  On reading, NaN is refused, negative values become 0 and infinity 65504.
 """
@@ -23,16 +26,41 @@ MAX_BYTES = 1 << 28  # MAX_PIXELS of RGBE, run lengths that do not pay, and a he
 
 
 def read_environment(path: str | os.PathLike, *, notes: list[str] | None = None) -> Tensor:
-    """Lat-long map ``(H, 2H, 3)``, float32 linear radiance, from a ``.hdr`` or ``.exr`` file.
+    """Lat-long map ``(H, 2H, 3)``, float32 linear radiance, centre column -Z, from a ``.hdr`` or ``.exr`` file.
 
-    The kind is told by the content.  What was clamped is appended to ``notes``.
+    The file's centre column is +X; a map of an odd height is blended by half a texel.  The kind of file is told by its
+    content.  What was clamped is appended to ``notes``.
     Raises InputError on a broken file, NaN, a shape other than 2:1, or a map above 8192 x 4096.
     """
     image = read_hdr_image(path, notes=notes)
     height, width = image.shape[:2]
     if width != 2 * height:
         raise InputError(path, f"size: expected a map twice as wide as high, got {width} x {height}; convert it")
-    return image
+    return _quarter_turn(image, 1)
+
+
+def write_environment(path: str | os.PathLike, radiance: Tensor, *, centre: str = "+X") -> int:
+    """Write the map ``radiance`` ``(H, 2H, 3)``, centre column -Z, as ``.exr`` or ``.hdr``, by the ending of ``path``.
+
+    centre: where the centre column of the file looks, ``+X`` (which :func:`read_environment` expects) or ``-Z`` (the
+    published release's).  Returns the number of values clamped.  Raises ValueError on NaN, negative values or another
+    shape, OSError where it cannot be written.
+    """
+    write = {".exr": write_exr, ".hdr": write_hdr}.get(os.path.splitext(path)[1].lower())
+    if write is None:
+        raise ValueError(f"path: expected a name that ends in .exr or .hdr, got {shown(os.path.basename(path))}")
+    if centre not in ("+X", "-Z"):
+        raise ValueError(f"centre: expected +X or -Z, got {centre}")
+    if radiance.ndim != 3 or radiance.shape[1] != 2 * radiance.shape[0]:
+        raise ValueError(f"radiance: expected shape (H, 2H, 3), got {tuple(radiance.shape)}")
+    return write(path, _quarter_turn(radiance, -1) if centre == "+X" else radiance)
+
+
+def _quarter_turn(radiance: Tensor, sign: int) -> Tensor:
+    """Columns moved right by ``sign`` times a quarter of the width; an odd height needs a mean of two texels."""
+    height = radiance.shape[0]
+    moved = radiance.roll(sign * (height // 2), 1)
+    return moved if height % 2 == 0 else 0.5 * (moved + moved.roll(sign, 1))
 
 
 def read_hdr_image(path: str | os.PathLike, *, notes: list[str] | None = None) -> Tensor:

@@ -76,6 +76,51 @@ class ReniSizes:
 
 
 @dataclass(frozen=True)
+class PyramidSizes:
+    """The 2D U-Net of a view, :mod:`reli3d.nn.pyramid`."""
+
+    widths: tuple[int, ...]  # channels at 1/2, 1/4, ... of the image
+    features: int  # that leave it
+
+
+@dataclass(frozen=True)
+class VolumeSizes:
+    """The 3D U-Net over pooled views, :mod:`reli3d.nn.volume`."""
+
+    side: int  # grid points
+    radius: float  # half side of the grid's cube, model units
+    widths: tuple[int, ...]  # channels at 1, 1/2, ... of the grid
+    features: int  # that leave it
+
+
+@dataclass(frozen=True)
+class LightMapSizes:
+    """The U-Net on the sphere of directions, :mod:`reli3d.nn.light_map`."""
+
+    height: int  # rows of the map
+    widths: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class LocalPreset:
+    """A network of convolutions over images and space, :mod:`reli3d.nn.local`."""
+
+    name: str
+    image_size: int
+    pyramid: PyramidSizes
+    volume: VolumeSizes
+    light: LightMapSizes
+    view_width: int  # pooled features of the views at a point
+    head_width: int
+    resolution: int  # cubes along each side of the surface grid
+    radius: float = 0.87  # half side of the model's cube
+    softness: float = 0.02  # model units from occupancy 1/2 to 0.73: unit of the level
+    offset_one_view: float = 0.0  # of the surface, in units of the level, outward; see reli3d.train.calibrate
+    offset_many_views: float = 0.0  # the same in the limit of many views; in between by the inverse of their number
+    smoothing: int = 8  # iterations of Taubin smoothing of the extracted surface
+
+
+@dataclass(frozen=True)
 class Preset:
     name: str
     image_size: int  # square network input, pixels
@@ -110,16 +155,19 @@ class Preset:
         shading = SHADING_FEATURES if self.shading_features else 0
         return self.view_feature_width + shading if self.view_feature_width else 0
 
-    def to_json(self) -> str:
-        return json.dumps(dataclasses.asdict(self), sort_keys=True)
 
-    @classmethod
-    def from_json(cls, text: str) -> Preset:
-        """The preset that :meth:`to_json` wrote.  Raises ValueError for anything else."""
-        try:
-            return _build(cls, json.loads(text))
-        except (json.JSONDecodeError, AttributeError, KeyError, TypeError) as error:
-            raise ValueError(f"preset: expected the JSON of a Preset, got {error}") from None
+def to_json(preset: Preset | LocalPreset) -> str:
+    """A preset as text, which :func:`from_json` reads."""
+    return json.dumps(dataclasses.asdict(preset), sort_keys=True)
+
+
+def from_json(text: str) -> Preset | LocalPreset:
+    """The preset that :func:`to_json` wrote.  Raises ValueError for anything else."""
+    try:
+        values = json.loads(text)
+        return _build(LocalPreset if "pyramid" in values else Preset, values)
+    except (json.JSONDecodeError, AttributeError, KeyError, TypeError) as error:
+        raise ValueError(f"preset: expected the JSON of a preset, got {error}") from None
 
 
 def _build(kind, values: dict):
@@ -130,6 +178,10 @@ def _build(kind, values: dict):
         expected = fields[key]
         if dataclasses.is_dataclass(expected):
             built[key] = _build(expected, value)
+        elif typing.get_origin(expected) is tuple:  # JSON has lists
+            if not isinstance(value, list) or not all(type(v) is int for v in value):
+                raise TypeError(f"{key} = {value!r}")
+            built[key] = tuple(value)
         elif isinstance(value, bool) == (expected is bool) and isinstance(value, expected):
             built[key] = value
         else:
@@ -182,5 +234,16 @@ SMALL = Preset(
     silhouette_bound=True,
     shading_features=True,
 )  # fmt: skip
+
+LOCAL = LocalPreset(
+    name="local",
+    image_size=256,
+    pyramid=PyramidSizes(widths=(16, 40, 64, 96, 128), features=24),
+    volume=VolumeSizes(side=40, radius=0.56, widths=(16, 56, 96, 128), features=24),
+    light=LightMapSizes(height=32, widths=(32, 64, 96, 128)),
+    view_width=40,
+    head_width=64,
+    resolution=96,
+)
 
 PRESETS = {preset.name: preset for preset in (SMALL, OFFICIAL)}

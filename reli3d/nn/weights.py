@@ -21,8 +21,9 @@ import torch
 from torch import Tensor
 
 from reli3d.io.files import InputError, file_size, replacing
+from reli3d.nn.local import LocalReconstructor
 from reli3d.nn.model import Reconstructor
-from reli3d.nn.presets import OFFICIAL, Preset
+from reli3d.nn.presets import OFFICIAL, LocalPreset, Preset, from_json, to_json
 from reli3d.nn.published import CHECKPOINT_PREFIX, our_key
 
 FORMAT = "reli3d 1"
@@ -31,6 +32,15 @@ LARGE = 1 << 30  # bytes; hashing less takes about a second
 HEADER_LIMIT = 100 << 20  # bytes, the safetensors library's own bound
 _DTYPES = {"F64": torch.float64, "F32": torch.float32, "F16": torch.float16, "BF16": torch.bfloat16}
 _NAMES = {dtype: name for name, dtype in _DTYPES.items()}
+
+
+AnyPreset = Preset | LocalPreset
+Network = Reconstructor | LocalReconstructor
+
+
+def network(preset: AnyPreset) -> Network:
+    """The network of a preset, its parameters ready for training from scratch."""
+    return LocalReconstructor(preset) if isinstance(preset, LocalPreset) else Reconstructor(preset)
 
 
 class WeightsError(InputError):
@@ -58,10 +68,10 @@ class Manifest:
     def licence(self) -> str:
         return self.metadata.get("licence", "not stated")
 
-    def preset(self) -> Preset:
+    def preset(self) -> AnyPreset:
         """The preset in the file's header.  Raises WeightsError where there is none."""
         try:
-            return Preset.from_json(self.metadata["preset"])
+            return from_json(self.metadata["preset"])
         except KeyError:
             raise WeightsError(self.path, "has no preset in its header; it is not a file of this package") from None
         except ValueError as error:
@@ -144,10 +154,10 @@ def _size(path: str | os.PathLike) -> int:
         raise WeightsError(path, str(error).split(": ", 1)[1]) from None
 
 
-def shapes(preset: Preset) -> dict[str, tuple[int, ...]]:
+def shapes(preset: AnyPreset) -> dict[str, tuple[int, ...]]:
     """Name and shape of every stored tensor of the network; allocates nothing."""
     with torch.device("meta"):
-        return {name: tuple(value.shape) for name, value in Reconstructor(preset).state_dict().items()}
+        return {name: tuple(value.shape) for name, value in network(preset).state_dict().items()}
 
 
 def check_keys(where: object, got: Mapping[str, tuple[int, ...]], expected: Mapping[str, tuple[int, ...]]) -> None:
@@ -188,24 +198,24 @@ def locate(weights: str | os.PathLike) -> Path:
 
 def load_model(
     weights: str | os.PathLike, device: torch.device | str = "cpu", *, trunk: torch.dtype | None = None
-) -> Reconstructor:
+) -> Network:
     """The network of :func:`locate`'s file, see :func:`load`.  Raises WeightsError."""
     return load(locate(weights), trunk=trunk, device=device)[0]
 
 
-def default_trunk(preset: Preset, device: torch.device | str) -> torch.dtype:
+def default_trunk(preset: AnyPreset, device: torch.device | str) -> torch.dtype:
     """bfloat16 for the published sizes on CUDA, whose matrix units are made for it; float32 everywhere else."""
     return torch.bfloat16 if preset.name == "official" and torch.device(device).type == "cuda" else torch.float32
 
 
 def load(
     path: str | os.PathLike,
-    preset: Preset | None = None,
+    preset: AnyPreset | None = None,
     *,
     trunk: torch.dtype | None = None,
     device: torch.device | str = "cpu",
     expected_sha256: str | None = None,
-) -> tuple[Reconstructor, Manifest]:
+) -> tuple[Network, Manifest]:
     """The network in a safetensors file, in evaluation mode, and the file's manifest.
 
     preset: what the file must hold; default the one in its header.  trunk: dtype of the trunk's parameters, default
@@ -222,7 +232,9 @@ def load(
         if found != expected_sha256:
             raise WeightsError(path, f"expected SHA-256 {expected_sha256}, got {found}; fetch it again")
     with torch.device("meta"):
-        model = Reconstructor(preset).to_compute(trunk or default_trunk(preset, device))
+        model = network(preset)
+        if isinstance(model, Reconstructor):
+            model.to_compute(trunk or default_trunk(preset, device))
     wanted = {name: value.dtype for name, value in model.state_dict().items()}
     model.load_state_dict(read_tensors(manifest, wanted, device), strict=True, assign=True)
     return model.eval(), manifest
@@ -247,7 +259,7 @@ def read_tensors(
     return result
 
 
-def save(path: str | os.PathLike, model: Reconstructor, *, licence: str, dtype: torch.dtype = torch.float16,
+def save(path: str | os.PathLike, model: Network, *, licence: str, dtype: torch.dtype = torch.float16,
          metadata: Mapping[str, str] | None = None) -> Manifest:  # fmt: skip
     """Write the network's parameters as ``dtype`` (buffers as they are), its preset and licence; whole or not at all.
 
@@ -258,7 +270,7 @@ def save(path: str | os.PathLike, model: Reconstructor, *, licence: str, dtype: 
     for name, value in state.items():
         if not torch.isfinite(value).all():
             raise WeightsError(path, f"{name}: expected finite values in {dtype}; nothing was written")
-    header = {"format": FORMAT, "preset": model.preset.to_json(), "licence": licence, **(metadata or {})}
+    header = {"format": FORMAT, "preset": to_json(model.preset), "licence": licence, **(metadata or {})}
     write(path, state, header)
     return read_manifest(path)
 
@@ -290,7 +302,7 @@ def convert_checkpoint(source: str | os.PathLike, target: str | os.PathLike, *, 
     """
     state = published_state(read_checkpoint(source), source)
     check_keys(source, {name: tuple(value.shape) for name, value in state.items()}, shapes(preset))
-    header = {"format": FORMAT, "preset": preset.to_json(), "licence": licence, "converted_from": sha256(source)}
+    header = {"format": FORMAT, "preset": to_json(preset), "licence": licence, "converted_from": sha256(source)}
     write(target, state, header)
     return read_manifest(target)
 

@@ -13,6 +13,7 @@ from reli3d.render.asset import Asset
 from reli3d.render.camera import Camera
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.render import render
+from reli3d.render.shading import ShadeOptions
 from reli3d.views.views import Views
 
 TILE = 192  # pixels
@@ -31,7 +32,7 @@ def preview(asset: Asset, views: Views) -> np.ndarray:
     batch = views.select(min(len(views), COLUMNS)).resampled(TILE, crop=True)
     scene = RayScene(asset.mesh.vertices, asset.mesh.faces)
     shots = [
-        render(asset, Camera(batch.c2w[i], batch.intrinsics[i], TILE, TILE), samples=SAMPLES, scene=scene)
+        render(asset, Camera(batch.c2w[i], batch.intrinsics[i], TILE, TILE), options=ShadeOptions(SAMPLES), scene=scene)
         for i in range(len(batch))
     ]
     hero = shots[0]

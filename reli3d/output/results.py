@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import resource
 import shutil
 import sys
 from dataclasses import asdict
@@ -16,19 +15,23 @@ import numpy as np
 import reli3d
 from reli3d.geometry.mesh import Mesh, report
 from reli3d.io.glb import write_glb
-from reli3d.io.hdr import write_exr, write_hdr
+from reli3d.io.hdr import write_environment
 from reli3d.io.images import write_png
 from reli3d.nn.weights import Manifest
 from reli3d.render.asset import Asset
 from reli3d.views.similarity import Similarity
 
 FILES = ("mesh.glb", "environment.exr", "environment.hdr", "preview.png", "run_info.json")
-COPIES = {"illumination.hdr": "environment.hdr"}  # names of the published release, and what they hold
+PUBLISHED_LIGHT = "illumination.hdr"  # name of the light in the published release, whose centre column is -Z
 
 
 def complete(folder: Path, *, compatible: bool = False) -> bool:
-    """Whether ``folder`` holds every file of a reconstruction, with ``compatible`` the copies too."""
-    return all((folder / name).is_file() for name in (*FILES, *(COPIES if compatible else ())))
+    """Whether ``folder`` holds every file of a reconstruction, with ``compatible`` the published name too."""
+    return all((folder / name).is_file() for name in _names(compatible))
+
+
+def _names(compatible: bool) -> tuple[str, ...]:
+    return (*FILES, PUBLISHED_LIGHT) if compatible else FILES
 
 
 def mesh_statistics(mesh: Mesh) -> dict:
@@ -36,32 +39,37 @@ def mesh_statistics(mesh: Mesh) -> dict:
     return asdict(report(mesh))
 
 
-def peak_memory_mib() -> float:
-    """Most memory that this process has held, MiB."""
+def peak_memory_mib() -> float | None:
+    """Most memory that this process has held, MiB, to a tenth; None on Windows, where Python has no such count."""
+    try:
+        import resource
+    except ImportError:
+        return None
     unit = 1 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20
+    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20, 1)
 
 
 def write_results(folder: Path, asset: Asset, picture: np.ndarray, info: dict, *, compatible: bool = False) -> None:
     """Write :data:`FILES` into ``folder``; an error leaves what was there before.  Raises OSError, ValueError.
 
-    compatible: write :data:`COPIES` as well.
+    compatible: write the light as :data:`PUBLISHED_LIGHT` as well.
     """
-    copies = COPIES if compatible else {}
+    radiance = asset.environment.radiance
+    info = {**info, "environment_centre": "+X"}
     folder.parent.mkdir(parents=True, exist_ok=True)
     temporary = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
     temporary.mkdir()
     try:
         extras = {k: info[k] for k in ("output_from_input", "model_from_input", "weights")}
         write_glb(temporary / "mesh.glb", asset, extras=extras)
-        write_exr(temporary / "environment.exr", asset.environment.radiance)
-        write_hdr(temporary / "environment.hdr", asset.environment.radiance)
+        for name in ("environment.exr", "environment.hdr"):
+            write_environment(temporary / name, radiance)
+        if compatible:
+            write_environment(temporary / PUBLISHED_LIGHT, radiance, centre="-Z")
         write_png(temporary / "preview.png", picture)
         (temporary / "run_info.json").write_text(json.dumps(info, indent=1) + "\n")
-        for name, source in copies.items():
-            shutil.copyfile(temporary / source, temporary / name)
         folder.mkdir(exist_ok=True)
-        for name in (*FILES, *copies):
+        for name in _names(compatible):
             os.replace(temporary / name, folder / name)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)

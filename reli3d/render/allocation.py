@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 import warp as wp
@@ -12,8 +12,8 @@ from reli3d._bridge import launch
 from reli3d.geometry.rays import RayScene
 from reli3d.kernels import allocation as kernels
 from reli3d.render.environment import Environment
-from reli3d.render.material import choice
-from reli3d.render.shading import check_hits, sampling_plan, shade
+from reli3d.render.points import SurfacePoints
+from reli3d.render.shading import DEFAULT, ShadeOptions, sampling_plan, shade, shaded_arrays
 
 SCOUTED = 16384  # points looked at with one sample of each strategy, to find those that matter
 PILOT_SAMPLES = 24576  # then, in all; an image of 512 x 512, half of it covered, takes 8.4 million
@@ -39,26 +39,19 @@ class SamplePlan:
 
 @torch.no_grad()
 def plan_samples(
-    position: Tensor,
-    normal: Tensor,
-    ng: Tensor,
+    points: SurfacePoints,
     wo: Tensor,
-    base_color: Tensor,
-    roughness: Tensor,
-    metallic: Tensor,
     environment: Environment,
     *,
     total: int = 64,
     scene: RayScene | None = None,
-    seed: int = 0,
-    points: str = "halton",
-    alpha: str = "squared",
-    paint: str = "conserving",
+    options: ShadeOptions = DEFAULT,
     relative: bool = False,
 ) -> SamplePlan:
     """Counts of the three strategies, ``total`` together, with the least variance for these points under this light.
 
-    Arguments are those of :func:`reli3d.render.shading.shade`, but ``total`` and ``relative``; N is at least 1.  One
+    Arguments are those of :func:`reli3d.render.shading.shade`, but ``total`` and ``relative``; N is at least 1.  Of
+    ``options`` the seed, ``sequence``, ``alpha`` and ``paint`` count.  One
     plan is made for all points: the one with the least sum of their variances, and of the channels', in which the
     brightest points weigh most; with ``relative`` of the variances over the squared radiance (or over that of a tenth
     of the mean, where it is less), which is nearer to the noise that is seen.  Other materials or another light want
@@ -80,27 +73,22 @@ def plan_samples(
     in a normal get up to 10^4 times the variance, docs/renderer.md), and the environment table alone gives black texels
     no gradient.  Visible normals are not paired in a plan, whose points are even without.
 
-    No gradient.  The result depends on the inputs and ``seed`` alone.  Raises TypeError for a wrong dtype, ValueError
+    No gradient.  The result depends on the inputs and the seed alone.  Raises TypeError for a wrong dtype, ValueError
     for a shape, device, count, choice or a value that is not finite.
     """
-    n = check_hits(position, normal, ng, wo, base_color, roughness, metallic, environment)
-    if n == 0:
+    values = [v.detach() for v in shaded_arrays(points, wo, environment, scene, options)]
+    if len(points) == 0:
         raise ValueError("position: expected at least one point, got none")
     if int(total) != total or total < 1:
         raise ValueError(f"total: expected a count of at least 1, got {total}")
-    if scene is not None and scene.device != position.device:
-        raise ValueError(f"scene: expected device {position.device}, got {scene.device}")
-    choice("points", points, ("halton", "random"))
-    width = roughness * roughness if choice("alpha", alpha, ("squared", "linear")) == 0 else roughness
-    values = [v.detach() for v in (position, normal, ng, wo, base_color, width, metallic)]
-    rows, share = _pilot_points(values, environment, scene, seed, paint)
+    rows, share = _pilot_points(values, environment, scene, options)
     values = [v[rows] for v in values]
-    drawn = _draw(values, environment, PILOT_SAMPLES // (3 * len(rows)), scene, seed, paint)
+    drawn = _draw(values, environment, PILOT_SAMPLES // (3 * len(rows)), scene, options)
     if relative:
         radiance = drawn[0].sum(1).mean(1)
         share = share / (radiance.square() + (DARK * (share @ radiance)) ** 2).clamp(min=1e-30)
     pilot = *drawn, share
-    counts = _splits(int(total)).to(position.device)
+    counts = _splits(int(total)).to(share.device)
     variance = _variances(*pilot, counts)
     finer = counts[variance.argmin()] + _MOVES.to(counts) * max(1, int(total) // 16)
     finer = finer[(finer >= 0.0).all(1)]
@@ -108,8 +96,7 @@ def plan_samples(
     alone = (counts > 0.0).sum(1) == 1
     best, single = int(variance.argmin()), int(torch.where(alone, variance, torch.inf).argmin())
     if best != single and float(variance[single]) < RIVAL * float(variance[best]):
-        options = {"scene": scene, "seed": seed, "points": points, "paint": paint}
-        mixture, one = (_tried(values, share, environment, counts[k], **options) for k in (best, single))
+        mixture, one = (_tried(values, share, environment, counts[k], scene, options) for k in (best, single))
         best = best if mixture < PREFER_ONE * one else single
     return SamplePlan(_whole(counts[best]), float(variance[best]))
 
@@ -125,13 +112,14 @@ def _spread(count: int, seed: int) -> Tensor:
     return (torch.arange(count) + jitter) / count
 
 
-def _pilot_points(values: list[Tensor], environment, scene, seed: int, paint: str) -> tuple[Tensor, Tensor]:
+def _pilot_points(values: list[Tensor], environment, scene, options: ShadeOptions) -> tuple[Tensor, Tensor]:
     """Rows of the pilot's points and what each counts in the mean over all points, both ``(P,)``."""
-    n, device = len(values[0]), values[0].device
+    n, device, seed = len(values[0]), values[0].device, options.seed
     if n <= PILOT_POINTS:
         return torch.arange(n, device=device), torch.full((n,), 1.0 / n, dtype=torch.float64, device=device)
     rows = spread_rows(n, min(n, SCOUTED), seed).to(device)
-    square = _draw([v[rows] for v in values], environment, 1, scene, seed + 1, paint)[0].square().sum((1, 2))
+    first = _draw([v[rows] for v in values], environment, 1, scene, replace(options, seed=seed + 1))
+    square = first[0].square().sum((1, 2))
     chance = 0.5 / len(rows) + 0.5 * square / square.sum().clamp(min=1e-30)
     edges = chance.cumsum(0)
     chosen = torch.searchsorted(edges, _spread(PILOT_POINTS, seed + 2).to(device) * edges[-1]).clamp(max=len(rows) - 1)
@@ -139,7 +127,7 @@ def _pilot_points(values: list[Tensor], environment, scene, seed: int, paint: st
 
 
 def _draw(
-    values: list[Tensor], environment: Environment, each: int, scene, seed: int, paint: str
+    values: list[Tensor], environment: Environment, each: int, scene: RayScene | None, options: ShadeOptions
 ) -> tuple[Tensor, ...]:
     """``each`` samples of every strategy for P points, S for each point, float64.
 
@@ -147,8 +135,9 @@ def _draw(
     samples, and those of its own that are lost below the horizon, have mass 1: so an integrand without variance shows
     none.
     """
-    n, count, device, samples = len(values[0]), 3 * each, values[0].device, (each, each, each)
-    plan, offsets = sampling_plan(samples, seed, "none", "balance", "halton", paint, None, scene)
+    n, count, device = len(values[0]), 3 * each, values[0].device
+    options = ShadeOptions((each, each, each), options.seed, antithetic="none", paint=options.paint)
+    plan, offsets = sampling_plan(options, scene)
     table = environment.table
     light = [(environment.radiance.contiguous(), wp.vec3), *table.sampler, (table.density, wp.float32)]
     points = zip([v.contiguous() for v in values], [wp.vec3] * 5 + [wp.float32] * 2)
@@ -165,11 +154,13 @@ def _draw(
     return value.double(), density, density / (density.sum(1) + lost)[:, None]
 
 
-def _tried(values: list[Tensor], share: Tensor, environment: Environment, counts: Tensor, **options) -> float:
+def _tried(values: list[Tensor], share: Tensor, environment, counts: Tensor, scene, options: ShadeOptions) -> float:
     """Variance of a point, mean by ``share (P,)``, that :func:`reli3d.render.shading.shade` has with ``counts``."""
     runs = TRIED // len(share)
-    many = [v.repeat(runs, *[1] * (v.ndim - 1)) for v in values]
-    drawn = shade(*many, environment, samples=_whole(counts), antithetic="none", alpha="linear", **options)
+    position, normal, ng, wo, *material = (v.repeat(runs, *[1] * (v.ndim - 1)) for v in values)
+    options = ShadeOptions(_whole(counts), options.seed, antithetic="none", sequence=options.sequence, alpha="linear",
+                           paint=options.paint)  # fmt: skip
+    drawn = shade(SurfacePoints(position, ng, normal, *material), wo, environment, scene=scene, options=options)
     return float(share @ drawn.double().unflatten(0, (runs, -1)).var(0).sum(1))
 
 

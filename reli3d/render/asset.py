@@ -2,49 +2,100 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
+import torch
 from torch import Tensor
 
-from reli3d._bridge import check
+from reli3d._bridge import check, tensor_of
 
 if TYPE_CHECKING:
     from reli3d.geometry.mesh import Mesh
     from reli3d.render.environment import Environment
 
+FLAT = (0.5, 0.5, 1.0)  # a normal map's texel where nothing is bent
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, repr=False)
 class TextureSet:
     """Square maps of one size, values in [0, 1]; row 0 is v = 0 (glTF: v down), texel centres at +0.5.
 
-    base_color: ``(T, T, 3)``, sRGB-encoded.  orm: ``(T, T, 3)``, linear: 1 (no occlusion is baked), perceptual
-    roughness, metallic.  normal: ``(T, T, 3)``, linear, tangent-space unit normal as
-    ``n * 0.5 + 0.5``, green along the bitangent.
+    base_color: ``(T, T, 3)``, sRGB-encoded.  roughness: ``(T, T)`` or ``(T, T, 1)``, perceptual.  metallic: the same.
+    Either may be a number.  normal: ``(T, T, 3)``, tangent-space unit normal as ``n * 0.5 + 0.5``, green along the
+    bitangent; None is flat.  Fields are ``(T, T, 3)`` and ``(T, T)`` tensors after construction.  Raises TypeError for
+    a wrong kind or dtype, ValueError for a shape or device.
     """
 
     base_color: Tensor
-    orm: Tensor
-    normal: Tensor
+    roughness: Tensor | float
+    metallic: Tensor | float
+    normal: Tensor | None = None
 
     def __post_init__(self):
-        for name in ("base_color", "orm", "normal"):
+        self._set("base_color", self.base_color, 3)
+        for name in ("roughness", "metallic"):
             value = getattr(self, name)
-            check(name, value, last=3, like=self.base_color)
-            if value.ndim != 3 or value.shape[0] != value.shape[1] or value.shape != self.base_color.shape:
-                raise ValueError(f"{name}: expected (T, T, 3) like base_color {tuple(self.base_color.shape)}, "
-                                 f"got {tuple(value.shape)}")  # fmt: skip
+            if isinstance(value, (int, float)):
+                value = self.base_color.new_full(self.base_color.shape[:2], float(value))
+            self._set(name, value, 1)
+        flat = self.normal if self.normal is not None else self.base_color.new_tensor(FLAT).repeat(*[self.size] * 2, 1)
+        self._set("normal", flat, 3)
+
+    def _set(self, name: str, value: Tensor, channels: int) -> None:
+        value = tensor_of(value)
+        check(name, value)
+        if channels == 1 and value.ndim == 3 and value.shape[2] == 1:
+            value = value[..., 0]
+        first = value if name == "base_color" else self.base_color
+        check(name, value, like=first)
+        size = (first.shape[0] if first.ndim else 0,) * 2
+        if value.shape != (size if channels == 1 else (*size, channels)) or size[0] == 0:
+            wanted = "(T, T, 3)" if name == "base_color" else f"{size if channels == 1 else (*size, channels)}"
+            raise ValueError(f"{name}: expected shape {wanted}, got {tuple(value.shape)}")
+        object.__setattr__(self, name, value)
 
     @property
     def size(self) -> int:
         """Texels along a side."""
         return self.base_color.shape[0]
 
+    def to(self, device: torch.device | str) -> TextureSet:
+        """The same maps on ``device``."""
+        return TextureSet(*(getattr(self, f.name).to(device) for f in fields(self)))
 
-@dataclass(frozen=True)
+    def detach(self) -> TextureSet:
+        """The same maps without gradient."""
+        return TextureSet(*(getattr(self, f.name).detach() for f in fields(self)))
+
+    def __repr__(self) -> str:
+        return f"TextureSet({self.size} x {self.size} texels, {self.base_color.device})"
+
+
+@dataclass(frozen=True, repr=False)
 class Asset:
     """A relightable object.  ``environment`` is the light it was captured under, where that is known."""
 
     mesh: Mesh
     textures: TextureSet
     environment: Environment | None = None
+
+    def to(self, device: torch.device | str) -> Asset:
+        """The same asset on ``device``."""
+        return Asset(*(None if part is None else part.to(device) for part in self._parts))
+
+    def detach(self) -> Asset:
+        """The same asset without gradient."""
+        return Asset(*(None if part is None else part.detach() for part in self._parts))
+
+    @property
+    def _parts(self) -> tuple:
+        return self.mesh, self.textures, self.environment  # a renderer takes an asset without textures too
+
+    def __repr__(self) -> str:
+        maps = "no textures" if self.textures is None else f"{self.textures.size} x {self.textures.size} texels"
+        light = "no environment"
+        if self.environment is not None:
+            light = "environment {} x {}".format(*self.environment.radiance.shape[:2])
+        vertices, faces = self.mesh.vertices, self.mesh.faces
+        return f"Asset({len(vertices)} vertices, {len(faces)} faces, {maps}, {light}, {vertices.device})"

@@ -12,13 +12,14 @@ Other conventions are converted in ``reli3d.views`` and ``reli3d.io`` and nowher
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from reli3d._bridge import check
+from reli3d._bridge import check, tensor_of
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,8 @@ class Camera:
     height: int
 
     def __post_init__(self):
+        for name in ("c2w", "intrinsics"):
+            object.__setattr__(self, name, tensor_of(getattr(self, name)))
         check("c2w", self.c2w, last=4)
         check("intrinsics", self.intrinsics, last=4, like=self.c2w)
         if self.c2w.ndim < 2 or self.c2w.shape[-2] != 4 or self.c2w.shape[:-2] != self.intrinsics.shape[:-1]:
@@ -52,6 +55,14 @@ class Camera:
         f = 0.5 * width / torch.tan(torch.tensor(0.5 * fov_x, dtype=torch.float64)).item()
         row = torch.tensor([f, f, 0.5 * width, 0.5 * height], dtype=torch.float32, device=c2w.device)
         return cls(c2w, row.expand(*c2w.shape[:-2], 4).contiguous(), width, height)
+
+    def to(self, device: torch.device | str) -> Camera:
+        """The same camera on ``device``."""
+        return Camera(self.c2w.to(device), self.intrinsics.to(device), self.width, self.height)
+
+    def detach(self) -> Camera:
+        """The same camera without gradient."""
+        return Camera(self.c2w.detach(), self.intrinsics.detach(), self.width, self.height)
 
     @property
     def position(self) -> Tensor:
@@ -97,11 +108,19 @@ def project(points: Tensor, c2w: Tensor, intrinsics: Tensor) -> tuple[Tensor, Te
     return pixels, depth
 
 
-def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:
+def look_at(
+    eye: Tensor | Sequence[float],
+    target: Tensor | Sequence[float] = (0.0, 0.0, 0.0),
+    up: Tensor | Sequence[float] = (0.0, 1.0, 0.0),
+) -> Tensor:
     """Camera-to-world ``(..., 4, 4)`` at ``eye`` looking to ``target``, image up towards ``up``; all ``(..., 3)``.
 
-    Batch axes broadcast.  ``up`` parallel to the view raises ValueError.
+    Lists of numbers are taken too, on the device of the first tensor among the three.  Batch axes broadcast.  ``up``
+    parallel to the view raises ValueError.
     """
+    device = next((v.device for v in (eye, target, up) if isinstance(v, Tensor)), None)
+    eye, target, up = (v if isinstance(v, Tensor) else torch.as_tensor(v, dtype=torch.float32, device=device)
+                       for v in (eye, target, up))  # fmt: skip
     check("eye", eye, last=3)
     check("target", target, last=3, like=eye)
     check("up", up, last=3, like=eye)

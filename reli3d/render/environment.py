@@ -12,7 +12,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from reli3d._bridge import SLICE_MIN, check, empty, launch, once_differentiable, over_slices, slices
+from reli3d._bridge import SLICE_MIN, check, empty, launch, once_differentiable, over_slices, slices, tensor_of
 from reli3d.kernels import envmap as kernels
 
 _LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709
@@ -56,6 +56,7 @@ class Environment:
     radiance: Tensor
 
     def __post_init__(self):
+        object.__setattr__(self, "radiance", tensor_of(self.radiance))
         check("radiance", self.radiance, last=3)
         if self.radiance.ndim != 3 or self.radiance.numel() == 0:
             raise ValueError(f"radiance: expected (H, W, 3), got {tuple(self.radiance.shape)}")
@@ -65,6 +66,14 @@ class Environment:
         """The same radiance ``rgb (3,)`` from everywhere."""
         check("rgb", rgb, last=3)
         return cls(rgb.expand(height, 2 * height, 3).contiguous())
+
+    def to(self, device: torch.device | str) -> Environment:
+        """The same light on ``device``; this very one where it is there, with its table."""
+        return self if torch.device(device) == self.radiance.device else Environment(self.radiance.to(device))
+
+    def detach(self) -> Environment:
+        """The same light without gradient."""
+        return Environment(self.radiance.detach())
 
     def lookup(self, directions: Tensor) -> Tensor:
         """Radiance ``(..., 3)`` from unit ``directions (..., 3)``: bilinear between texel centres, periodic in azimuth.

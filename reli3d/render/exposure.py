@@ -10,7 +10,7 @@ from reli3d.render.asset import Asset
 from reli3d.render.camera import Camera
 from reli3d.render.color import srgb_to_linear
 from reli3d.render.gbuffer import primary_hits, surface_points
-from reli3d.render.shading import shade
+from reli3d.render.shading import ShadeOptions, shade
 
 STEP = 16  # of the photographs' pixels one in STEP^2 is asked: some thousand in four photographs of 512 pixels
 SAMPLES = (8, 8, 2)  # a pixel; the noise of the mean over some hundred pixels is below a percent
@@ -33,7 +33,6 @@ def photograph_ratio(asset: Asset, images: Tensor, inside: Tensor, camera: Camer
     hits, _, directions = primary_hits(scene, coarse)
     both = inside & (hits.face >= 0) & (seen.amax(-1) < WHITE)
     at = surface_points(asset.mesh, asset.textures, hits.face[both], hits.bary[both])
-    shown = shade(at.position, at.normal, at.ng, -directions[both], at.base_color, at.roughness, at.metallic,
-                  asset.environment, samples=SAMPLES, scene=scene)  # fmt: skip
+    shown = shade(at, -directions[both], asset.environment, scene=scene, options=ShadeOptions(SAMPLES))
     count = max(1, len(shown))
     return (seen[both].sum() / count + BLACK) / (shown.sum() / count + BLACK)

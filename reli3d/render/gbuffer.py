@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 import warp as wp
 from torch import Tensor
@@ -17,18 +15,7 @@ from reli3d.kernels import attributes as kernels
 from reli3d.render.asset import TextureSet
 from reli3d.render.camera import Camera, camera_rays
 from reli3d.render.color import srgb_to_linear
-
-
-@dataclass(frozen=True)
-class SurfacePoints:
-    """What the shader needs of N points; normals unit, ``base_color`` linear."""
-
-    position: Tensor  # (N, 3)
-    ng: Tensor  # (N, 3) geometric normal, outward
-    normal: Tensor  # (N, 3) shading normal
-    base_color: Tensor  # (N, 3)
-    roughness: Tensor  # (N,) perceptual
-    metallic: Tensor  # (N,)
+from reli3d.render.points import SurfacePoints
 
 
 def primary_hits(scene: RayScene, camera: Camera) -> tuple[Hits, Tensor, Tensor]:
@@ -91,11 +78,12 @@ def surface_points(mesh: Mesh, textures: TextureSet | None, face: Tensor, bary: 
     if mesh.uv is None:
         raise ValueError("mesh.uv: expected texture coordinates for a textured asset, got None")
     uv = interpolate(mesh.uv, mesh.faces, face, bary)
-    orm = sample_texture(textures.orm, uv)
+    rough_metal = torch.stack([textures.roughness, textures.metallic, textures.metallic], -1)  # one look-up for both
+    rough_metal = sample_texture(rough_metal, uv)
     mapped = sample_texture(textures.normal, uv) * 2.0 - 1.0
     return SurfacePoints(
         position, ng, tangent_normals(mesh, face, bary, normal, mapped),
-        sample_texture(srgb_to_linear(textures.base_color), uv), orm[:, 1], orm[:, 2],
+        sample_texture(srgb_to_linear(textures.base_color), uv), rough_metal[:, 0], rough_metal[:, 1],
     )  # fmt: skip
 
 

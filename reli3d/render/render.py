@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import io
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
+from PIL import Image
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -13,9 +17,11 @@ from reli3d.geometry.rays import RayScene
 from reli3d.render.allocation import SamplePlan, plan_samples, spread_rows
 from reli3d.render.asset import Asset
 from reli3d.render.camera import Camera, camera_rays
+from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
-from reli3d.render.gbuffer import SurfacePoints, surface_points
-from reli3d.render.shading import SAMPLES, shade
+from reli3d.render.gbuffer import surface_points
+from reli3d.render.points import SurfacePoints
+from reli3d.render.shading import DEFAULT, ShadeOptions, shade
 
 PLAN_RAYS = 32768  # of a view, to find the points of a plan's pilot among
 BAND_RAYS = 1 << 18  # rays of one band of rows: bounds memory at about 40 MB whatever the image size
@@ -39,29 +45,55 @@ class Render:
     position: Tensor
     depth: Tensor
 
+    def picture(
+        self,
+        *,
+        exposure: float = 0.0,
+        tone: Callable[[Tensor], Tensor] = linear_to_srgb,
+        transparent: bool = True,
+    ) -> Tensor:
+        """What is shown of ``radiance``, in [0, 1]: ``(H, W, 4)`` with straight alpha, else ``(H, W, 3)``.
+
+        exposure: in stops.  tone: from linear radiance to display values.  transparent: False where the background was
+        rendered.
+        """
+        radiance = self.radiance * 2.0**exposure
+        if transparent:  # the transform is not linear: it takes the colour, not the premultiplied one
+            radiance = radiance / self.alpha[..., None].clamp(min=1e-6)
+        shown = tone(radiance).clamp(0.0, 1.0)
+        return torch.cat([shown, self.alpha[..., None]], -1) if transparent else shown
+
+    def save_png(self, path: str | os.PathLike, **options) -> None:
+        """Write :meth:`picture`, which takes ``options``, as a PNG of 8 bits.
+
+        Raises ValueError, and writes nothing, where a value is not finite.
+        """
+        shown = self.picture(**options).detach()
+        if not bool(torch.isfinite(shown).all()):
+            raise ValueError("radiance: expected finite values, got NaN or infinity")
+        buffer = io.BytesIO()
+        Image.fromarray((shown * 255.0 + 0.5).to(torch.uint8).cpu().numpy()).save(buffer, "PNG")
+        Path(path).write_bytes(buffer.getvalue())
+
 
 def render(
     asset: Asset | Sequence[Asset],
     camera: Camera,
     environment: Environment | None = None,
     *,
-    samples: tuple[int, int, int] = SAMPLES,
+    options: ShadeOptions = DEFAULT,
     supersampling: int = 1,
-    seed: int = 0,
-    antithetic: str = "opposite",
     shadows: bool = True,
     background: str = "transparent",
     scene: RayScene | None = None,
-    clamp: float | None = None,
-    paint: str = "conserving",
     progress: Callable[[float], None] | None = None,
 ) -> Render:
     """Image of ``asset`` under ``environment`` (default: the asset's own) with direct light and shadows.
 
-    asset: one, or the parts of one that cast shadows on each other.  camera: one camera, no batch.  supersampling:
-    side of the subpixel grid; ``samples`` are per subpixel.  background: ``transparent`` or ``environment``.  scene:
-    rays against :func:`joined_scene`, made here if None.  samples, seed, antithetic, clamp, paint (``conserving`` or
-    ``published``): as for :func:`reli3d.render.shading.shade`.  progress: called with the fraction done.  Gradients
+    asset: one, or the parts of one that cast shadows on each other.  camera: one camera, no batch.  options: of
+    :func:`reli3d.render.shading.shade`.  supersampling: side of the subpixel grid; samples are per subpixel.
+    background: ``transparent`` or ``environment``.  scene: rays against :func:`joined_scene`, made here if None.
+    progress: called with the fraction done.  Gradients
     reach textures, mesh attributes and environment where ``shade`` has them; silhouettes have none.  Raises ValueError
     without any environment.
     """
@@ -71,11 +103,11 @@ def render(
     scene = scene if scene is not None else joined_scene(parts)
     fine = camera.scaled(supersampling)
     band = max(1, BAND_RAYS // (fine.width * supersampling)) * supersampling
-    bands, options = [], {"samples": samples, "seed": seed, "antithetic": antithetic, "clamp": clamp, "paint": paint}
+    bands = []
     for row in range(0, fine.height, band):
         rows = min(band, fine.height - row)
         part = Camera(fine.c2w, fine.intrinsics - fine.intrinsics.new_tensor([0.0, 0.0, 0.0, row]), fine.width, rows)
-        layers = _band(parts, part, environment, scene, row * fine.width, shadows, background, **options)
+        layers = _band(parts, part, environment, scene, row * fine.width, shadows, background, options)
         bands.append([_resolve(layer, supersampling) for layer in layers])
         if progress is not None:
             progress((row + rows) / fine.height)
@@ -94,32 +126,29 @@ def plan_render(
     environment: Environment | None = None,
     *,
     total: int = 64,
-    seed: int = 0,
+    options: ShadeOptions = DEFAULT,
     shadows: bool = True,
     scene: RayScene | None = None,
-    paint: str = "conserving",
     relative: bool = False,
 ) -> SamplePlan:
     """Counts of ``total`` samples for :func:`render` of this view, to be given to it with ``antithetic="none"``.
 
-    Arguments as for :func:`render`; relative: as for :func:`reli3d.render.allocation.plan_samples`, which plans for
-    points among those that 32768 rays of the camera hit.  No gradient.  Raises ValueError without any environment and
-    where the camera sees nothing.
+    Arguments as for :func:`render`; total, relative: as for :func:`reli3d.render.allocation.plan_samples`, which plans
+    for points among those that 32768 rays of the camera hit.  No gradient.  Raises ValueError without any environment
+    and where the camera sees nothing.
     """
     parts, environment = _checked(asset, camera, environment)
     scene = scene if scene is not None else joined_scene(parts)
     origins, directions = (v.reshape(-1, 3) for v in camera_rays(camera))
-    rays = spread_rows(len(directions), min(len(directions), PLAN_RAYS), seed).to(directions.device)
+    rays = spread_rows(len(directions), min(len(directions), PLAN_RAYS), options.seed).to(directions.device)
     directions = directions[rays]
     hits = scene.closest(origins[rays], directions)
     seen = hits.face >= 0
     if not bool(seen.any()):
         raise ValueError(f"camera: expected one that sees the asset, got none of {len(rays)} rays that hits it")
-    p = _points(parts, hits.face[seen], hits.bary[seen])
-    return plan_samples(
-        p.position, p.normal, p.ng, -directions[seen], p.base_color, p.roughness, p.metallic, environment,
-        total=total, scene=scene if shadows else None, seed=seed, paint=paint, relative=relative,
-    )  # fmt: skip
+    points = _points(parts, hits.face[seen], hits.bary[seen])
+    return plan_samples(points, -directions[seen], environment, total=total, scene=scene if shadows else None,
+                        options=options, relative=relative)  # fmt: skip
 
 
 def _checked(asset, camera: Camera, environment: Environment | None) -> tuple[list[Asset], Environment]:
@@ -160,19 +189,14 @@ def _points(parts: Sequence[Asset], face: Tensor, bary: Tensor) -> SurfacePoints
     return SurfacePoints(*(torch.cat(columns)[back] for columns in zip(*(vars(p).values() for p in pieces))))
 
 
-def _band(parts, camera, environment, scene, first, shadows, background, **options) -> list[Tensor]:
-    """Premultiplied layers ``(rows, W, C)`` of one band of subpixels, in the order that :func:`render` takes apart.
-
-    options: of :func:`reli3d.render.shading.shade`.
-    """
+def _band(parts, camera, environment, scene, first, shadows, background, options) -> list[Tensor]:
+    """Premultiplied layers ``(rows, W, C)`` of one band of subpixels, in the order that :func:`render` takes apart."""
     origins, directions = (v.reshape(-1, 3) for v in camera_rays(camera))
     hits = scene.closest(origins, directions)
     index = torch.nonzero(hits.face >= 0)[:, 0]
     points = _points(parts, hits.face[index], hits.bary[index])
-    lit = shade(
-        points.position, points.normal, points.ng, -directions[index], points.base_color, points.roughness,
-        points.metallic, environment, scene=scene if shadows else None, pixels=(index + first).int(), **options,
-    )  # fmt: skip
+    lit = shade(points, -directions[index], environment, scene=scene if shadows else None, options=options,
+                pixels=(index + first).int())  # fmt: skip
     axis = -camera.c2w[:3, 2]
     depth = ((points.position - camera.position) * axis).sum(-1, keepdim=True)
     layers = [lit, torch.ones_like(depth), points.base_color, torch.stack([points.roughness, points.metallic], -1),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Protocol
 
@@ -18,70 +18,88 @@ from reli3d.kernels import shade_adjoint as adjoint
 from reli3d.kernels import shade_rays as halves
 from reli3d.render.environment import Environment
 from reli3d.render.material import PAINTS, choice
+from reli3d.render.points import SurfacePoints, of_rows
 from reli3d.render.sampling import halton
 
 SAMPLES = (20, 40, 4)  # environment, visible normals, cosine: the published counts
 LIGHT_RAYS = 1 << 20  # directions asked of a light at once: 45 MB of rays
+CHOICES = {"antithetic": ("none", "opposite", "mirrored"), "heuristic": ("balance", "power"),
+           "sequence": ("halton", "random"), "alpha": ("squared", "linear"), "paint": PAINTS}  # fmt: skip
 CHUNK_RAYS = 65536  # shadow rays of a chunk and their values take 2.6 MB a thread: near the cache, far above call costs
 
 
+@dataclass(frozen=True)
+class ShadeOptions:
+    """How :func:`shade` draws and weighs its samples, and which formulas the material has.
+
+    samples: counts from the environment table, from visible normals and from the cosine; zero is allowed.  antithetic:
+    how visible normals are paired, ``opposite`` (the partner across the lobe,
+    :func:`reli3d.render.sampling.opposite`), ``mirrored`` (about the normal, as published, but weighted with its own
+    density) or ``none``.  heuristic: ``balance`` or ``power``.  sequence: of the random numbers, ``halton`` (rotated
+    per point and strategy) or ``random``.  alpha: GGX width from roughness, ``squared`` or, as in the published model's
+    shader, ``linear``.  paint: what the coat leaves to the paint, ``conserving`` or ``published``, as in
+    :func:`reli3d.render.material.eval_bsdf`.  clamp: largest value of one sample times its strategy's count, per
+    channel.  Raises ValueError for a count or choice.
+    """
+
+    samples: tuple[int, int, int] = SAMPLES
+    seed: int = 0
+    antithetic: str = "opposite"
+    heuristic: str = "balance"
+    sequence: str = "halton"
+    alpha: str = "squared"
+    paint: str = "conserving"
+    clamp: float | None = None
+
+    def __post_init__(self):
+        if len(self.samples) != 3 or any(int(k) != k or k < 0 for k in self.samples):
+            raise ValueError(f"samples: expected three counts of at least 0, got {self.samples}")
+        for name, allowed in CHOICES.items():
+            choice(name, getattr(self, name), allowed)
+        if self.clamp is not None and not self.clamp > 0.0:
+            raise ValueError(f"clamp: expected a positive number or None, got {self.clamp}")
+
+    def width(self, roughness: Tensor) -> Tensor:
+        """GGX width of a perceptual roughness."""
+        return roughness * roughness if self.alpha == "squared" else roughness
+
+
+DEFAULT = ShadeOptions()
+
+
 def shade(
-    position: Tensor,
-    normal: Tensor,
-    ng: Tensor,
+    points: SurfacePoints,
     wo: Tensor,
-    base_color: Tensor,
-    roughness: Tensor,
-    metallic: Tensor,
     environment: Environment,
     *,
-    samples: tuple[int, int, int] = SAMPLES,
     scene: RayScene | None = None,
-    seed: int = 0,
-    antithetic: str = "opposite",
-    heuristic: str = "balance",
-    points: str = "halton",
-    alpha: str = "squared",
-    paint: str = "conserving",
-    clamp: float | None = None,
+    options: ShadeOptions = DEFAULT,
     pixels: Tensor | None = None,
 ) -> Tensor:
-    """Radiance ``(N, 3)`` that leaves surface points towards ``wo``, lit by ``environment``; linear Rec. 709.
+    """Radiance ``(N, 3)`` that leaves surface ``points`` towards ``wo``, lit by ``environment``; linear Rec. 709.
 
-    position, normal (shading), ng (geometric), wo (to the viewer): ``(N, 3)``, the last three unit.  base_color:
-    ``(N, 3)`` LINEAR.  roughness, metallic: ``(N,)`` in [0, 1].  A face seen from behind is shaded as its other side.
-
-    samples: counts from the environment table, from visible normals and from the cosine; zero is allowed.  scene: mesh
-    that casts shadows, None for none.  antithetic: how visible normals are paired, ``opposite`` (the partner across the
-    lobe, :func:`reli3d.render.sampling.opposite`), ``mirrored`` (about the normal, as published, but weighted with its
-    own density) or ``none``.  heuristic: ``balance`` or ``power``.  points: ``halton`` (rotated per point and strategy)
-    or ``random``.  alpha: GGX width from roughness, ``squared`` or, as in the published model's shader, ``linear``.
-    paint: what the coat leaves to the paint, ``conserving`` or ``published``, as in
-    :func:`reli3d.render.material.eval_bsdf`.  clamp: largest value of one sample times its strategy's count, per
-    channel.
-
-    pixels: ``(N,)`` int32 counters of the random numbers, by default the row.
+    wo: ``(N, 3)`` unit, to the viewer, or one row for all.  A face seen from behind is shaded as its other side.
+    scene: mesh that casts shadows, None for none.  pixels: ``(N,)`` int32 counters of the random numbers, by default
+    the row.
 
     Gradients reach normal, base_color, roughness, metallic and the texels of ``environment``, with detached sampling:
-    directions, densities and visibility are constants.  Once differentiable.  Random numbers are a function of
-    ``seed`` and the counter, so the result has the same bits for any number of threads.  Raises TypeError for a wrong
-    dtype, ValueError for a shape, device, count or choice.  Estimator: Veach and Guibas 1995 over the material of
+    directions, densities and visibility are constants.  Once differentiable.  Random numbers are a function of the
+    seed and the counter, so the result has the same bits for any number of threads.  Raises TypeError for a wrong kind
+    or dtype, ValueError for a shape or device.  Estimator: Veach and Guibas 1995 over the material of
     ``reli3d.kernels.bsdf``.
     """
-    n = check_hits(position, normal, ng, wo, base_color, roughness, metallic, environment)
-    if scene is not None and scene.device != position.device:
-        raise ValueError(f"scene: expected device {position.device}, got {scene.device}")
-    plan, offsets = sampling_plan(samples, seed, antithetic, heuristic, points, paint, clamp, scene)
-    width = roughness * roughness if choice("alpha", alpha, ("squared", "linear")) == 0 else roughness
-    table, device = environment.table, position.device
+    values = shaded_arrays(points, wo, environment, scene, options)
+    plan, offsets = sampling_plan(options, scene)
+    table, device = environment.table, points.position.device
     tables = [*table.sampler, (table.density, wp.float32), (offsets.to(device), wp.vec2)]
+    n = len(points)
     if pixels is None:
         pixels = torch.arange(n, dtype=torch.int32, device=device)
-    check("pixels", pixels, like=position, dtype=torch.int32)
+    check("pixels", pixels, like=points.position, dtype=torch.int32)
     if pixels.shape != (n,):
         raise ValueError(f"pixels: expected shape ({n},), got {tuple(pixels.shape)}")
-    values = (position, normal, ng, wo, base_color, width, metallic, environment.radiance, pixels)
-    return _Shade.apply(_Job(plan, sum(samples), scene, tables), *(v.contiguous() for v in values))
+    values = (*values, environment.radiance, pixels)
+    return _Shade.apply(_Job(plan, sum(options.samples), scene, tables), *(v.contiguous() for v in values))
 
 
 class Light(Protocol):
@@ -92,21 +110,13 @@ class Light(Protocol):
 
 @torch.no_grad()
 def shade_light(
-    position: Tensor,
-    normal: Tensor,
-    ng: Tensor,
+    points: SurfacePoints,
     wo: Tensor,
-    base_color: Tensor,
-    roughness: Tensor,
-    metallic: Tensor,
     light: Light,
     proposal: Environment,
     *,
-    samples: tuple[int, int, int] = SAMPLES,
     scene: RayScene | None = None,
-    seed: int = 0,
-    points: str = "halton",
-    paint: str = "conserving",
+    options: ShadeOptions = DEFAULT,
 ) -> Tensor:
     """:func:`shade` with radiance asked of ``light`` in each sample's direction instead of read from a map, ``(N, 3)``.
 
@@ -114,12 +124,11 @@ def shade_light(
     environment strategy draws from; where it is dark and the light is not, the other strategies stand in, so the mean
     does not depend on it.  No gradient.
     """
-    n = check_hits(position, normal, ng, wo, base_color, roughness, metallic, proposal)
-    plan, offsets = sampling_plan(samples, seed, "opposite", "balance", points, paint, None, scene)
-    device, count, table = position.device, sum(samples), proposal.table
+    values = shaded_arrays(points, wo, proposal, scene, options)
+    plan, offsets = sampling_plan(replace(options, clamp=None), scene)  # what is cut is the product with the light
+    n, device, count, table = len(points), points.position.device, sum(options.samples), proposal.table
     pixels = torch.arange(n, dtype=torch.int32, device=device)
     tables = [*table.sampler, (table.density, wp.float32), (offsets.to(device), wp.vec2)]
-    values = (position, normal, ng, wo, base_color, roughness * roughness, metallic)
     white = torch.ones(1, 2, 3, device=device)  # what a sample adds under unit light; the light's radiance comes after
     ins = _inputs([v.contiguous() for v in (*values, white, pixels)], _Job(plan, count, scene, tables))
     out = torch.zeros(n, 3, device=device)
@@ -135,7 +144,11 @@ def shade_light(
             lit = lit[~scene.occluded(origins[lit], directions[lit])]
         added = torch.zeros_like(value)
         added[lit] = value[lit] * light.lookup(directions[lit])
-        out[first : first + hits] = added.view(hits, count, 3).sum(1)
+        added = added.view(hits, count, 3)
+        if options.clamp is not None:
+            counts = torch.tensor(options.samples, device=device)
+            added = added.minimum((options.clamp / counts).repeat_interleave(counts)[:, None])
+        out[first : first + hits] = added.sum(1)
     return out
 
 
@@ -229,38 +242,34 @@ def _shade_embree(n: int, ins: list, job: _Job, outs: list) -> None:
         over_slices(n, work)
 
 
-def check_hits(position, normal, ng, wo, base_color, roughness, metallic, environment) -> int:
-    check("position", position, last=3)
-    if position.ndim != 2:
-        raise ValueError(f"position: expected shape (N, 3), got {tuple(position.shape)}")
-    n = position.shape[0]
-    for name, value in (("normal", normal), ("ng", ng), ("wo", wo), ("base_color", base_color)):
-        check(name, value, last=3, like=position)
-        if value.shape != (n, 3):
-            raise ValueError(f"{name}: expected shape ({n}, 3), got {tuple(value.shape)}")
-    for name, value in (("roughness", roughness), ("metallic", metallic)):
-        check(name, value, like=position)
-        if value.shape != (n,):
-            raise ValueError(f"{name}: expected shape ({n},), got {tuple(value.shape)}")
+def shaded_arrays(
+    points: SurfacePoints, wo: Tensor, environment: Environment, scene: RayScene | None, options: ShadeOptions
+) -> tuple[Tensor, ...]:
+    """The seven arrays of points in the order of the kernels, with the GGX width for the roughness; all checked."""
+    for name, value, kind in (("points", points, SurfacePoints), ("environment", environment, Environment),
+                              ("options", options, ShadeOptions)):  # fmt: skip
+        if not isinstance(value, kind):
+            raise TypeError(f"{name}: expected {kind.__name__}, got {type(value).__name__}")
+    position = points.position
     check("environment.radiance", environment.radiance, like=position)
-    return n
+    if scene is not None and scene.device != position.device:
+        raise ValueError(f"scene: expected device {position.device}, got {scene.device}")
+    wo, width = of_rows("wo", wo, position, 3), options.width(points.roughness)
+    return position, points.normal, points.ng, wo, points.base_color, width, points.metallic
 
 
-def sampling_plan(samples, seed, antithetic, heuristic, points, paint, clamp, scene):
-    if len(samples) != 3 or any(int(k) != k or k < 0 for k in samples):
-        raise ValueError(f"samples: expected three counts of at least 0, got {samples}")
-    if clamp is not None and not clamp > 0.0:
-        raise ValueError(f"clamp: expected a positive number or None, got {clamp}")
+def sampling_plan(options: ShadeOptions, scene: RayScene | None) -> tuple[kernels.Plan, Tensor]:
+    """What the kernels are told of ``options``, and the points that they rotate."""
     plan = kernels.Plan()
-    plan.n_environment, plan.n_visible, plan.n_cosine = (int(k) for k in samples)
-    plan.antithetic = choice("antithetic", antithetic, ("none", "opposite", "mirrored"))
-    plan.power = choice("heuristic", heuristic, ("balance", "power"))
-    plan.rotate = 1 - choice("points", points, ("halton", "random"))
-    plan.conserving = int(choice("paint", paint, PAINTS) == 0)
-    plan.seed = int(seed) & 0x7FFFFFFF
-    plan.clamp = float("inf") if clamp is None else float(clamp)
+    plan.n_environment, plan.n_visible, plan.n_cosine = (int(k) for k in options.samples)
+    plan.antithetic = CHOICES["antithetic"].index(options.antithetic)
+    plan.power = CHOICES["heuristic"].index(options.heuristic)
+    plan.rotate = 1 - CHOICES["sequence"].index(options.sequence)
+    plan.conserving = 1 - PAINTS.index(options.paint)
+    plan.seed = int(options.seed) & 0x7FFFFFFF
+    plan.clamp = float("inf") if options.clamp is None else float(options.clamp)
     plan.scale = 0.0 if scene is None else scene.scale
-    return plan, _halton(max(1, *samples))
+    return plan, _halton(max(1, *options.samples))
 
 
 @lru_cache(16)

@@ -35,7 +35,8 @@ from reli3d.geometry.visibility import visible_from
 from reli3d.render.camera import Camera, camera_rays, project
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
-from reli3d.render.shading import shade
+from reli3d.render.points import SurfacePoints
+from reli3d.render.shading import ShadeOptions, shade
 from reli3d.synthetic.procedural import ProceduralObject, sample_cameras
 
 SAMPLES = (4, 3, 1)  # light, GGX and cosine samples a ray: with FINE**2 rays a pixel the noise left is a photograph's
@@ -108,8 +109,8 @@ def _render(surface: Surface, camera: Camera, light: Environment, seed: int):
     seen = (hits.face >= 0).nonzero()[:, 0]
     at = surface.at(hits.face[seen].long(), hits.bary[seen])
     wo = -directions[seen]
-    radiance = shade(at["position"], at["bump"], at["ng"], wo, at["base_color"], at["roughness"], at["metallic"], light,
-                     samples=SAMPLES, scene=surface.scene, seed=seed, paint=PAINT)  # fmt: skip
+    points = SurfacePoints(at["position"], at["ng"], at["bump"], at["base_color"], at["roughness"], at["metallic"])
+    radiance = shade(points, wo, light, scene=surface.scene, options=ShadeOptions(SAMPLES, seed, paint=PAINT))
     image = light.lookup(directions)
     image[seen] = radiance
     return image, seen, at, wo, radiance

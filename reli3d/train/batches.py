@@ -1,6 +1,4 @@
-"""Batches from the sample files of :mod:`reli3d.synthetic.samples`: a choice of views and points, and one random turn
-of the world.
-"""
+"""One object of a training step from a file of :mod:`reli3d.synthetic.samples`: views, points and maps, augmented."""
 
 from __future__ import annotations
 
@@ -12,34 +10,14 @@ import numpy as np
 import torch
 from safetensors import safe_open
 from torch import Tensor
+from torch.nn import functional
 
 from reli3d.geometry.hull import mask_distance
 from reli3d.nn.reni import map_directions
 
-
-@dataclass(frozen=True)
-class Batch:
-    """``B`` objects, ``V`` input views; float32; ``visible`` speaks of the input views; ``pixels`` come from all
-    views.
-    """
-
-    images: Tensor  # (B, V, S, S, 3) sRGB
-    masks: Tensor  # (B, V, S, S)
-    silhouette: Tensor  # (B, V, S, S) pixels
-    c2w: Tensor  # (B, V, 4, 4)
-    intrinsics: Tensor  # (B, V, 4)
-    points: Tensor  # (B, P, 3)
-    distance: Tensor  # (B, P)
-    surface: Tensor  # (B, N, 3, 3) position, normal, bumped normal
-    material: Tensor  # (B, N, 5)
-    visible: Tensor  # (B, N, V)
-    light_directions: Tensor  # (B, 2048, 3) world, after the turn
-    light: Tensor  # (B, 2048, 3) linear radiance
-    pixels: Tensor  # (B, M, 3, 3)
-    pixel_radiance: Tensor  # (B, M, 3)
-
-
 TURNED_UP = 0.12  # share of objects whose world is not +Y up: captures come in any frame
+NOISE = 0.012  # greatest standard deviation of a photograph's noise, sRGB
+KEPT = 0.75  # share of the augmented objects that stay the right way round in a mirror, and keep their channels
 
 
 def random_turn(rng: np.random.Generator) -> Tensor:
@@ -53,94 +31,109 @@ def random_turn(rng: np.random.Generator) -> Tensor:
     return torch.as_tensor(yaw, dtype=torch.float32)
 
 
-def mirrored(sample: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The sample seen in a mirror at the plane x = 0: another object under another light, as true as the first."""
-    flip = torch.tensor([-1.0, 1.0, 1.0])
-    out = dict(sample)
-    for key in ("points", "surface", "light_directions", "pixels"):
-        out[key] = sample[key] * flip
-    out["c2w"] = sample["c2w"].clone()
-    out["c2w"][:, :3] *= flip[:, None]
-    out["c2w"][:, :, 0] *= -1  # the camera stays right-handed, its picture is flipped
-    out["intrinsics"] = sample["intrinsics"].clone()
-    out["intrinsics"][:, 2] = sample["images"].shape[2] - sample["intrinsics"][:, 2]
-    out["images"] = sample["images"].flip(2)
-    out["masks"], out["silhouette"] = sample["masks"].flip(2), sample["silhouette"].flip(2)
-    return out
+@dataclass(frozen=True)
+class Sample:
+    """``V`` input views of ``S`` by ``S`` pixels, maps of ``P = S/2``; float32; the world turned at random."""
+
+    images: Tensor  # (V, S, S, 3) sRGB
+    masks: Tensor  # (V, S, S)
+    silhouette: Tensor  # (V, S, S) pixels
+    c2w: Tensor  # (V, 4, 4)
+    intrinsics: Tensor  # (V, 4)
+    view_material: Tensor  # (V, P, P, 5) base colour (sRGB), roughness, metallic
+    view_normal: Tensor  # (V, P, P, 3) world, unit
+    view_depth: Tensor  # (V, P, P) from the world's origin along the camera's axis
+    view_valid: Tensor  # (V, P, P) bool: the pixel shows the surface alone
+    points: Tensor  # (M, 3)
+    distance: Tensor  # (M,)
+    surface: Tensor  # (N, 3, 3) position, normal, bumped normal
+    material: Tensor  # (N, 5)
+    visible: Tensor  # (N, V)
+    light_directions: Tensor  # (2048, 3)
+    light: Tensor  # (2048, 3) linear radiance
 
 
-def recolored(sample: dict[str, Tensor], order: Tensor) -> dict[str, Tensor]:
-    """The sample with its colour channels exchanged, ``order (3,)``, in material, light and images alike."""
-    out = {k: sample[k][..., order] if k in ("images", "light", "pixel_radiance") else v for k, v in sample.items()}
-    out["material"] = torch.cat([sample["material"][:, order], sample["material"][:, 3:]], -1)
-    return out
-
-
-def load_sample(
-    path: Path, views: int, points: int, rng: np.random.Generator, *, augment: bool = True
-) -> dict[str, Tensor]:
-    """One object: ``views`` random views, ``points`` of each kind; turned, mirrored and recoloured at random.
+def load_sample(path: Path, views: int, points: int, rng: np.random.Generator, *, augment: bool = True) -> Sample:
+    """``views`` random views of a file, at most what it has; ``points`` of the volume, half as many of the surface.
 
     Without ``augment`` the first views, as they are.
     """
     with safe_open(path, "pt") as file:
         total = file.get_slice("c2w").get_shape()[0]
-        order = rng.permutation(total) if augment else np.arange(total)
-        chosen = torch.as_tensor(order[:views].copy())
-        every = {k: file.get_tensor(k) for k in ("images", "c2w", "intrinsics", "visible", "environment")}
+        order = rng.permutation(total)[:views] if augment else np.arange(min(views, total))
+        chosen = order.tolist()
 
-        def part(key: str, count: int) -> Tensor:
-            n = file.get_slice(key).get_shape()[0]
-            first = int(rng.integers(max(1, n - count + 1)))
-            return file.get_slice(key)[first : first + count]
+        def of_views(key: str) -> Tensor:
+            whole = file.get_slice(key)
+            return torch.stack([whole[k] for k in chosen])
 
-        # near and uniform points lie in two halves; a run of each is as random as a draw, and cheap to read
-        half = file.get_slice("distance").get_shape()[0] // 2
-        a, b = int(rng.integers(half - points // 2 + 1)), half + int(rng.integers(half - points // 2 + 1))
-        runs = [slice(a, a + points // 2), slice(b, b + points // 2)]
+        def run(key: str, count: int, low: int, high: int, rng: np.random.Generator) -> slice:
+            first = low + int(rng.integers(max(1, high - low - count + 1)))
+            return slice(first, first + count)
+
+        n = file.get_slice("distance").get_shape()[0]
+        runs = [run("points", points // 2, 0, n // 2, rng), run("points", points // 2, n // 2, n, rng)]
         volume = torch.cat([file.get_slice("points")[r] for r in runs]).float()
         distance = torch.cat([file.get_slice("distance")[r] for r in runs]).float()
-        n = file.get_slice("material").get_shape()[0]
-        s = int(rng.integers(n - points // 2 + 1))
-        s = slice(s, s + points // 2)
+        s = run("surface", points // 2, 0, file.get_slice("material").get_shape()[0], rng)
         surface, material = file.get_slice("surface")[s].float(), file.get_slice("material")[s].float() / 255
-        view = int(order[-1])  # a view that is not among the inputs as long as there is one
-        m = int(rng.integers(file.get_slice("pixels").get_shape()[1] - points // 4 + 1))
-        pixels = file.get_slice("pixels")[view, m : m + points // 4].float()
-        pixel_radiance = file.get_slice("pixel_radiance")[view, m : m + points // 4].float()
+        visible = file.get_slice("visible")[s][:, chosen].float()
+        images, c2w, intrinsics = of_views("images").float() / 255, of_views("c2w"), of_views("intrinsics")
+        of_pixels = of_views("view_material").float() / 255
+        normal, depth = of_views("view_normal").float() / 127, of_views("view_depth").float()
+        light = file.get_tensor("environment").float()
     turn = random_turn(rng) if augment else torch.eye(3)
-    c2w = every["c2w"][chosen].clone()
+    flip = torch.tensor([-1.0 if augment and rng.random() > KEPT else 1.0, 1.0, 1.0])
+    turn = turn * flip  # a mirror at the plane x = 0, then the turn
+    mirrored = bool(flip[0] < 0)
+    if mirrored:
+        images, of_pixels, normal, depth = (t.flip(2) for t in (images, of_pixels, normal, depth))
+        intrinsics = intrinsics.clone()
+        intrinsics[:, 2] = images.shape[2] - intrinsics[:, 2]
+    c2w = c2w.clone()
     c2w[:, :3] = turn @ c2w[:, :3]
-    images = every["images"][chosen].float() / 255
-    light = every["environment"].float()
-    sample = {
-        "images": images[..., :3], "masks": images[..., 3], "silhouette": mask_distance(images[..., 3].contiguous()),
-        "c2w": c2w, "intrinsics": every["intrinsics"][chosen], "points": volume @ turn.T, "distance": distance,
-        "surface": surface @ turn.T, "material": material, "visible": every["visible"][s][:, chosen].float(),
-        "light_directions": map_directions(light.shape[0]).reshape(-1, 3) @ turn.T, "light": light.reshape(-1, 3),
-        "pixels": pixels @ turn.T, "pixel_radiance": pixel_radiance,
-    }  # fmt: skip
-    if augment and rng.random() < 0.5:
-        sample = mirrored(sample)
+    if mirrored:
+        c2w[:, :, 0] *= -1  # the camera stays right-handed, its picture is flipped
+    if augment and rng.random() > KEPT:
+        channels = torch.as_tensor(rng.permutation(3))
+        images = torch.cat([images[..., channels], images[..., 3:]], -1)
+        light, material = light[..., channels], torch.cat([material[:, channels], material[:, 3:]], -1)
+        of_pixels = torch.cat([of_pixels[..., channels], of_pixels[..., 3:]], -1)
+    color, masks = images[..., :3], images[..., 3]
     if augment:
-        sample = recolored(sample, torch.as_tensor(rng.permutation(3)))
-    return sample
+        noise = torch.from_numpy(rng.standard_normal(color.shape, dtype=np.float32))
+        color = (color + float(rng.random()) * NOISE * noise).clamp(0, 1)
+    valid = depth > 0
+    whole = functional.avg_pool2d(valid.float()[:, None], 2)[:, 0]
+    share = whole.clamp(min=0.25)[..., None]
+
+    def half(values: Tensor) -> Tensor:
+        pooled = functional.avg_pool2d((values * valid[..., None]).permute(0, 3, 1, 2), 2).permute(0, 2, 3, 1)
+        return pooled / share
+
+    origin = (c2w[:, :3, 3] * c2w[:, :3, 2]).sum(-1)[:, None, None]  # depth of the world's origin
+    return Sample(
+        images=color.contiguous(), masks=masks.contiguous(), silhouette=mask_distance(masks.contiguous()), c2w=c2w,
+        intrinsics=intrinsics, view_material=half(of_pixels),
+        view_normal=functional.normalize(half(normal) @ turn.T, dim=-1),
+        view_depth=half(depth[..., None])[..., 0] - origin, view_valid=whole > 0.99, points=volume @ turn.T,
+        distance=distance, surface=surface @ turn.T, material=material, visible=visible,
+        light_directions=map_directions(light.shape[0]).reshape(-1, 3) @ turn.T, light=light.reshape(-1, 3),
+    )  # fmt: skip
 
 
-def batches(
-    folder: Path, *, size: int, points: int, max_views: int, seed: int, start: int = 0, rank: int = 0
-) -> Iterator[Batch]:
-    """Endless batches of ``size`` objects; step ``k`` is a function of ``seed`` and ``k`` alone for a fixed folder,
-    so training resumes; ``rank`` tells processes apart that share a step.
+def batches(folder: Path, *, size: int, points: int, max_views: int, seed: int, start: int = 0,
+            rank: int = 0) -> Iterator[list[Sample]]:  # fmt: skip
+    """Endless lists of ``size`` objects, each with 1 to ``max_views`` views; step ``k`` is a function of ``seed`` and
+    ``k`` alone for a fixed folder, so training resumes; ``rank`` tells processes apart that share a step.
     """
     files, step = sorted(folder.glob("*.safetensors")), start
     if not files:
         raise ValueError(f"samples: expected *.safetensors files, got none in {folder}")
     while True:
-        if step % 100 == 0:  # samples may still be arriving
+        if step % 50 == 0:  # samples may still be arriving
             files = sorted(folder.glob("*.safetensors"))
-        views = int(np.random.default_rng((seed, step)).choice(np.arange(1, max_views + 1)))  # the same in all ranks
         rng = np.random.default_rng((seed, step, rank))
-        loaded = [load_sample(files[int(rng.integers(len(files)))], views, points, rng) for _ in range(size)]
-        yield Batch(**{k: torch.stack([s[k] for s in loaded]) for k in loaded[0]})
+        yield [load_sample(files[int(rng.integers(len(files)))], int(rng.integers(1, max_views + 1)), points, rng)
+               for _ in range(size)]  # fmt: skip
         step += 1

@@ -19,8 +19,7 @@ from torch import Tensor
 
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene
-from reli3d.nn.model import Reconstructor
-from reli3d.pipeline import NoSurface, encode, extract, prepare
+from reli3d.pipeline import Network, NoSurface, encode, extract, prepare
 from reli3d.render.camera import Camera, camera_rays
 from reli3d.train.pictures import sample_views
 from reli3d.views.similarity import Similarity
@@ -33,7 +32,7 @@ LOST = math.log(20.0)  # a twentieth of the object is all that is found
 
 
 @torch.no_grad()
-def calibrate(model: Reconstructor, samples: Path, *, objects: int = 32, seed: int = 1,
+def calibrate(model: Network, samples: Path, *, objects: int = 32, seed: int = 1,
               progress: Callable[[str], None] = lambda line: None) -> dict[int, dict[float, float]]:  # fmt: skip
     """Set the preset's surface offsets to the least that do as well as any by :func:`mismatch` over random ``samples``.
 
@@ -49,12 +48,12 @@ def calibrate(model: Reconstructor, samples: Path, *, objects: int = 32, seed: i
     for k in chosen:
         sample = load_file(files[k])
         for count, rows in scores.items():
-            code, maps = encode(model, prepare(model, sample_views(sample, count), Similarity.identity()))
+            field = encode(model, prepare(model, sample_views(sample, count), Similarity.identity()))
             rows.append([])
             for offset in OFFSETS:
                 model.preset = replace(plain, offset_one_view=offset, offset_many_views=offset)
                 try:
-                    mesh = extract(model, code, maps, plain.resolution)
+                    mesh = extract(field, plain.resolution)
                     rows[-1].append(agreement(mesh, sample, range(count, len(sample["images"]))))
                 except NoSurface:  # nothing is left of the object
                     rows[-1].append((0.0, LOST))

@@ -13,9 +13,9 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from reli3d.nn.model import Reconstructor
+from reli3d.nn.local import LocalReconstructor
 from reli3d.train.batches import batches
-from reli3d.train.losses import losses
+from reli3d.train.losses import WEIGHTS, losses
 from reli3d.train.pictures import write_curves, write_validation
 from reli3d.train.workers import Workers
 
@@ -27,12 +27,12 @@ class TrainConfig:
     steps: int = 20000
     minutes: float = math.inf  # the schedule follows whichever of steps and minutes runs out first
     batch: int = 4  # objects a step
-    points: int = 2048  # volume points an object; half as many surface points, a quarter of pixels
-    max_views: int = 4  # a step draws 1 to this many views
-    rate: float = 6.0e-4  # peak learning rate; a small network from scratch takes ten times the paper's 5e-5
+    points: int = 2048  # volume points an object; half as many surface points
+    max_views: int = 6  # an object is read from 1 to this many views
+    rate: float = 1.5e-3  # peak learning rate; convolutions from scratch take thirty times the paper's 5e-5
     warmup: int = 100  # steps
     weight_decay: float = 0.02
-    clip: float = 1.0  # of the gradient norm
+    clip: float = 5.0  # of the gradient norm
     average: float = 0.999  # decay of the averaged weights that are saved for use
     checkpoint_seconds: float = 300.0
     seed: int = 0
@@ -40,18 +40,6 @@ class TrainConfig:
 
 
 PICTURED = 3  # validation objects in the picture, from one and from four views
-
-
-WEIGHTS = {
-    "occupancy": 1.0,
-    "base_color": 4.0,
-    "pattern": 10.0,
-    "roughness": 2.0,
-    "metallic": 2.0,
-    "normal": 1.0,
-    "light": 0.5,
-    "image": 0.3,
-}
 
 
 def progress(config: TrainConfig, step: int, seconds: float) -> float:
@@ -64,7 +52,7 @@ def rate_at(config: TrainConfig, step: int, done: float) -> float:
     return config.rate * min(1.0, (step + 1) / config.warmup) * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * done)))
 
 
-def train(model: Reconstructor, config: TrainConfig, workers: Workers | None = None) -> None:
+def train(model: LocalReconstructor, config: TrainConfig, workers: Workers | None = None) -> None:
     """Train ``model`` in place until the schedule ends; continue from ``output/state.pt`` where there is one.
 
     Writes ``state.pt`` (all that resuming needs), ``log.jsonl`` and the pictures.  workers: processes that share the
@@ -99,12 +87,15 @@ def train(model: Reconstructor, config: TrainConfig, workers: Workers | None = N
         done = progress(config, step, seconds)
         for group in optimizer.param_groups:
             group["lr"] = rate_at(config, step, done)
-        terms = losses(model, next(source))
-        loss = sum(WEIGHTS[k] * v for k, v in terms.items())
         optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        names = list(terms)
-        values = torch.stack([*(terms[k].detach() for k in names), torch.tensor(time.monotonic() - began)])
+        share = config.batch // workers.count
+        values = torch.zeros(len(WEIGHTS) + 1)
+        for sample in next(source):  # one after the other: they have different numbers of views
+            terms = losses(model, sample)
+            (sum(WEIGHTS[k] * v for k, v in terms.items()) / share).backward()
+            values[:-1] += torch.stack([terms[k].detach() for k in WEIGHTS]) / share
+        values[-1] = time.monotonic() - began
+        names = list(WEIGHTS)
         values = workers.average(trained, values)  # one clock for all: they must agree when to stop
         norm = torch.nn.utils.clip_grad_norm_(trained, config.clip)
         if torch.isfinite(norm):
@@ -148,12 +139,12 @@ def save(folder: Path, model, optimizer, average, step: int, seconds: float, con
     os.replace(folder / "state.tmp", folder / "state.pt")
     write_curves(folder / "log.jsonl", folder / "curves.png")
     if config.validation:
-        averaged = Reconstructor(model.preset)
+        averaged = LocalReconstructor(model.preset)
         averaged.load_state_dict(average)
         write_validation(averaged.eval(), sorted(Path(config.validation).glob("*.safetensors"))[:PICTURED], folder)
 
 
-def averaged_model(state: Path, model: Reconstructor) -> Reconstructor:
+def averaged_model(state: Path, model: LocalReconstructor) -> LocalReconstructor:
     """``model`` with the averaged weights of a checkpoint, for use."""
     model.load_state_dict(torch.load(state, weights_only=True)["average"])
     return model.eval()

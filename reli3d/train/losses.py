@@ -1,6 +1,4 @@
-"""What a step of training asks of the network: the field at points, the material at the surface, the light, and
-images.
-"""
+"""What a step of training asks of a :class:`~reli3d.nn.local.LocalReconstructor` about one object."""
 
 from __future__ import annotations
 
@@ -8,75 +6,78 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from reli3d.nn.field import LIGHT_ROWS, bound_level, object_shading, surface_level, surface_material
-from reli3d.nn.light_features import Shading
-from reli3d.nn.model import Code, Reconstructor
-from reli3d.nn.view_features import ViewMaps
-from reli3d.render.bump import radial_bump
+from reli3d.nn.local import LocalField, LocalReconstructor
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
-from reli3d.render.environment import Environment
-from reli3d.render.shading import shade
-from reli3d.synthetic.samples import PAINT
-from reli3d.train.batches import Batch
+from reli3d.train.batches import Sample
 
-IMAGE_SAMPLES = (12, 8, 2)  # light, GGX and cosine samples a pixel of the image loss
-LIGHT_DIRECTIONS = 384  # of the 2048 of a sample's map: enough for one step's mean, a fifth of the decoder's time
-ASTRAY = 0.04, 0.4  # greatest deviation of position [model's cube] and normal [radian] of an extracted surface
-
-
-def losses(model: Reconstructor, batch: Batch) -> dict[str, Tensor]:
-    """Unweighted terms, each a scalar mean over the batch; gradients reach every parameter that took part."""
-    code = model.encode(batch.images, batch.masks, batch.c2w, batch.intrinsics)
-    lights = model.decode_environment(code, LIGHT_ROWS)
-    fields = []
-    for b in range(len(batch.images)):
-        own = code.of(b)
-        maps = maps_of(own, batch.images[b], batch.silhouette[b], batch.c2w[b], batch.intrinsics[b])
-        shading = sample_shading(model, lights[b], maps, batch, b)
-        fields.append(field_losses(model, own, maps, batch, b, shading))
-        fields[-1]["image"] = _image_loss(model, own, maps, batch, b, lights[b], shading)
-    terms = {k: torch.stack([f[k] for f in fields]).mean() for k in fields[0]}
-    terms["light"] = light_loss(model, code, batch)
-    return terms
+WEIGHTS = {
+    "occupancy": 1.0, "surface": 0.02, "gradient": 0.3,
+    "base_color": 4.0, "pattern": 8.0, "roughness": 1.5, "metallic": 1.5, "normal": 1.0,
+    "pixel_color": 8.0, "pixel_roughness": 1.0, "pixel_metallic": 1.0, "pixel_normal": 1.0, "pixel_depth": 0.1,
+    "light": 0.4, "irradiance": 0.4,
+}  # fmt: skip
+ASTRAY = 0.02, 0.3  # greatest deviation of position [model's cube] and normal [radian] of an extracted surface
+GRADIENT_POINTS, GRADIENT_STEP = 256, 0.008  # surface points whose level's slope is asked, over about a grid cell
+DEPTH_UNIT = 0.1  # of the object's longest side
+NORMALS = 192  # directions at which the irradiance is compared
 
 
-def maps_of(code: Code, images: Tensor, silhouette: Tensor, c2w: Tensor, intrinsics: Tensor) -> ViewMaps:
-    return ViewMaps(code.view_tokens[0], torch.cat([images, silhouette[..., None]], -1).contiguous(), c2w, intrinsics)
+def encode_sample(model: LocalReconstructor, sample: Sample) -> LocalField:
+    detail = torch.cat([sample.images, sample.silhouette[..., None]], -1).contiguous()
+    return model.encode(sample.images, sample.masks, sample.c2w, sample.intrinsics, detail, sample.intrinsics)
 
 
-def sample_shading(model: Reconstructor, light: Tensor, maps: ViewMaps, batch: Batch, b: int) -> Shading | None:
-    """What is known of the light on object ``b`` of the batch, from its surface points."""
-    position, normal, _ = batch.surface[b].unbind(1)
-    return object_shading(model, light, maps, position.contiguous(), functional.normalize(normal, dim=-1),
-                          batch.visible[b])  # fmt: skip
+def losses(model: LocalReconstructor, sample: Sample) -> dict[str, Tensor]:
+    """Unweighted terms, each a scalar; gradients reach every parameter."""
+    field = encode_sample(model, sample)
+    position, normal, bumped = (t.contiguous() for t in sample.surface.unbind(1))
+    normal, bumped = functional.normalize(normal, dim=-1), functional.normalize(bumped, dim=-1)
+    field = field.with_shading(position, normal, sample.visible)
+    return {
+        **_shape(field, sample, position, normal),
+        **_paint(field, sample, position, normal, bumped),
+        **_pixels(field, sample),
+        **_light(field, sample),
+    }
 
 
-def field_losses(model: Reconstructor, code: Code, maps: ViewMaps, batch: Batch, b: int,
-                 shading: Shading | None) -> dict[str, Tensor]:  # fmt: skip
-    """The terms of object ``b`` that ask for no image: occupancy at its points, material at its surface."""
-    level = surface_level(model, code, maps, batch.points[b])
-    if model.preset.silhouette_bound:
-        level = torch.maximum(level, bound_level(model, maps, batch.points[b]))
-    target = (-batch.distance[b] / model.preset.softness).sigmoid()
-    out = {"occupancy": functional.binary_cross_entropy_with_logits(-level, target)}
+def _shape(field: LocalField, sample: Sample, position: Tensor, normal: Tensor) -> dict[str, Tensor]:
+    """Occupancy as a soft step; level zero and its slope along the normal at surface points.
 
-    position, normal, bumped = batch.surface[b].unbind(1)
-    normal = functional.normalize(normal, dim=-1)
-    got = surface_material(model, code, maps, *astray(position, normal), batch.visible[b], shading)
-    out["base_color"] = functional.mse_loss(got["base_color"], batch.material[b, :, :3])
-    out["pattern"] = pattern_loss(got["base_color"], batch.material[b, :, :3])
-    out["roughness"] = functional.mse_loss(got["roughness"][:, 0], batch.material[b, :, 3])
-    out["metallic"] = functional.mse_loss(got["metallic"][:, 0], batch.material[b, :, 4])
-    world = radial_bump(position, normal, got["normal"])
-    out["normal"] = (1 - functional.cosine_similarity(world, bumped, dim=-1)).mean()
-    return out
+    The slope is asked by differences over a tetrahedron: no second derivative of the network is needed.
+    """
+    softness = field.model.preset.softness
+    level = field.level(sample.points)
+    target = (-sample.distance / softness).sigmoid()
+    corners = GRADIENT_STEP * position.new_tensor([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
+    few = position[:GRADIENT_POINTS]
+    around = field.free_level((few[:, None] + corners).reshape(-1, 3)).reshape(-1, 4)
+    slope = (around[..., None] * corners).sum(1)
+    on_surface = around.mean(1)
+    return {
+        "occupancy": functional.binary_cross_entropy_with_logits(-level, target),
+        "surface": functional.smooth_l1_loss(on_surface, torch.zeros_like(on_surface)),
+        "gradient": (1 - functional.cosine_similarity(slope, normal[:GRADIENT_POINTS], dim=-1, eps=1e-6)).mean(),
+    }
+
+
+def _paint(field: LocalField, sample: Sample, position: Tensor, normal: Tensor, bumped: Tensor) -> dict[str, Tensor]:
+    """Material at surface points, asked a little off the surface and with a tilted normal, as extraction errs."""
+    got = field.material(*astray(position, normal), sample.visible)
+    base, rough, metal = sample.material[:, :3], sample.material[:, 3], sample.material[:, 4]
+    return {
+        "base_color": functional.mse_loss(got.base_color, base),
+        "pattern": pattern_loss(got.base_color, base),
+        "roughness": functional.mse_loss(got.roughness, rough),
+        "metallic": functional.mse_loss(got.metallic, metal),
+        "normal": (1 - functional.cosine_similarity(got.normal, bumped, dim=-1)).mean(),
+    }
 
 
 def astray(position: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
     """Points ``(N, 3)`` moved along their normals, and the normals tilted, as far as an extracted surface errs.
 
-    The material is asked for where the extracted surface lies, not where the object's does; how far they are apart is
-    drawn for all points together, for it differs from object to object.
+    How far they are apart is drawn for all points together, for it differs from object to object.
     """
     share = torch.rand((), device=position.device)
     distance = ASTRAY[0] * share * torch.randn_like(position[:, :1])
@@ -94,35 +95,45 @@ def pattern_loss(color: Tensor, target: Tensor) -> Tensor:
     return functional.mse_loss(linear_to_srgb((p * factor.detach()).clamp(0.0, 1.0)), target)
 
 
-def _image_loss(model: Reconstructor, code: Code, maps: ViewMaps, batch: Batch, b: int, light: Tensor,
-                known: Shading | None) -> Tensor:  # fmt: skip
-    """Difference of log(1 + radiance) of pixels of a view, mostly one that was not input, shaded with what is
-    predicted.
-
-    Shadows and what other surfaces reflect are missing from the prediction: the term teaches which material and light
-    explain a colour together, and weighs little.  Gradients reach material, bump normal and light.
-    """
-    position, _, wo = batch.pixels[b].unbind(1)
-    wo = functional.normalize(wo, dim=-1)
-    near = torch.cdist(position, batch.surface[b, :, 0]).argmin(1)  # the sample knows who sees its surface points
-    normal = functional.normalize(batch.surface[b, near, 1], dim=-1)
-    normal = torch.where(
-        (normal * wo).sum(-1, keepdim=True) > 0, normal, wo
-    )  # the nearest point may lie round a corner
-    got = surface_material(model, code, maps, position, normal, batch.visible[b, near], known)
-    shading = radial_bump(position, normal, got["normal"])
-    radiance = shade(position, shading, normal, wo, srgb_to_linear(got["base_color"]), got["roughness"][:, 0],
-                     got["metallic"][:, 0], Environment(light), samples=IMAGE_SAMPLES, seed=b, paint=PAINT)  # fmt: skip
-    return (torch.log1p(radiance) - torch.log1p(batch.pixel_radiance[b])).abs().mean()
+def _pixels(field: LocalField, sample: Sample) -> dict[str, Tensor]:
+    """The pyramid's predictions against the maps of the views, at pixels that show the surface alone."""
+    valid, pixels = sample.view_valid, field.pixels
+    want = sample.view_material[valid]
+    logit = pixels.base_logit(field.color)[valid]
+    return {
+        "pixel_color": functional.mse_loss(logit.sigmoid(), want[:, :3]),
+        "pixel_roughness": functional.mse_loss(pixels.roughness[valid][:, 0].sigmoid(), want[:, 3]),
+        "pixel_metallic": functional.mse_loss(pixels.metallic[valid][:, 0].sigmoid(), want[:, 4]),
+        "pixel_normal": (1 - (pixels.normal[valid] * sample.view_normal[valid]).sum(-1)).mean(),
+        "pixel_depth": functional.smooth_l1_loss(pixels.depth[valid][:, 0] / DEPTH_UNIT,
+                                                 sample.view_depth[valid] / DEPTH_UNIT, beta=0.2),
+    }  # fmt: skip
 
 
-def light_loss(model: Reconstructor, code: Code, batch: Batch) -> Tensor:
-    """Absolute difference of log radiance over directions, weighted by solid angle; 0.01 keeps black from mattering."""
-    count = batch.light.shape[1]
-    pick = torch.randperm(count)[:LIGHT_DIRECTIONS]
-    directions, target = batch.light_directions[:, pick], batch.light[:, pick]
+def _light(field: LocalField, sample: Sample) -> dict[str, Tensor]:
+    """Log radiance over the sphere, and log irradiance at random normals, which lamps decide."""
+    log = field.log_light
+    count = len(sample.light)
     rows = int((count // 2) ** 0.5)
-    weight = torch.sin((pick // (2 * rows) + 0.5) * torch.pi / rows)
-    radiance = model.radiance(code, directions)
-    error = (torch.log(radiance + 0.01) - torch.log(target + 0.01)).abs().mean(-1)
-    return (error * weight).sum() / (weight.sum() * len(error))
+    angle = torch.sin((torch.arange(count) // (2 * rows) + 0.5) * torch.pi / rows).to(log)
+    got = _lookup(log, sample.light_directions)
+    error = (torch.logaddexp(got, got.new_tensor(-4.6)) - (sample.light + 0.01).log()).abs().mean(-1)
+    normals = functional.normalize(torch.randn(NORMALS, 3, device=log.device), dim=-1)
+    cosine = (normals @ sample.light_directions.T).clamp(min=0) * angle
+    cosine = cosine / cosine.sum(-1, keepdim=True)
+    irradiance, want = cosine @ got.exp(), cosine @ sample.light
+    return {
+        "light": (error * angle).sum() / angle.sum(),
+        "irradiance": ((irradiance + 0.01).log() - (want + 0.01).log()).abs().mean(),
+    }
+
+
+def _lookup(log: Tensor, directions: Tensor) -> Tensor:
+    """Bilinear values ``(N, 3)`` of the lat-long map ``log (3, H, 2H)``, periodic in azimuth."""
+    x, y, z = directions.unbind(-1)
+    wrapped = functional.pad(log[None], (1, 1, 0, 0), mode="circular")
+    width = log.shape[2]
+    u = (torch.atan2(x, -z) + torch.pi) / (2 * torch.pi) * width + 1.0  # in texels of the padded map
+    v = y.clamp(-1, 1).acos() / torch.pi * 2 - 1
+    at = torch.stack([2 * u / (width + 2) - 1, v], -1)[None, None]
+    return functional.grid_sample(wrapped, at, align_corners=False, padding_mode="border")[0, :, 0].T

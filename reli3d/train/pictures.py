@@ -11,9 +11,8 @@ from PIL import Image, ImageDraw
 from safetensors.torch import load_file
 
 from reli3d.io.images import write_png
-from reli3d.nn.model import Reconstructor
 from reli3d.output.preview import preview
-from reli3d.pipeline import NoSurface, reconstruct
+from reli3d.pipeline import Network, NoSurface, reconstruct
 from reli3d.views.views import Views
 
 WIDTH, HEIGHT, MARGIN = 420, 180, 34
@@ -61,7 +60,7 @@ def sample_views(sample: dict, count: int) -> Views:
     )
 
 
-def write_validation(model: Reconstructor, samples: list[Path], folder: Path) -> None:
+def write_validation(model: Network, samples: list[Path], folder: Path) -> None:
     """``validation.png``: previews of the samples reconstructed from one and from four views; an empty field leaves
     a gap.
     """

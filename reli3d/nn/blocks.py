@@ -1,0 +1,24 @@
+"""Large sets of points in blocks that stay in the processor's cache."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from reli3d._bridge import over_rows
+
+ROWS = 8192  # points at a time without gradient: their features stay in the cache, which halves the time of the heads
+
+
+def in_rows(evaluate: Callable[..., dict[str, Tensor]], *inputs: Tensor) -> dict[str, Tensor]:
+    """``evaluate(*inputs)``; on CPU, where no gradient is recorded, block by block of ROWS rows of the inputs.
+
+    The blocks run on the threads of the bridge's pool, so ``evaluate`` must work row by row and keep no state.
+    """
+    n = len(inputs[0])
+    if torch.is_grad_enabled() or inputs[0].is_cuda or n == 0:
+        return evaluate(*inputs)
+    parts = over_rows(n, ROWS, lambda start, stop: evaluate(*(x[start:stop] for x in inputs)))
+    return {name: torch.cat([p[name] for p in parts]) for name in parts[0]}

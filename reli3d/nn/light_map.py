@@ -1,0 +1,95 @@
+"""The light from what the surface shows of it: pixels sorted by where they mirror, and a U-Net on the sphere.
+
+A glossy pixel shows the light in its mirror direction, a matt one the light around its normal.  Both are laid into
+lat-long maps; what no pixel shows is completed by convolutions that wrap around the azimuth, so a turn of the world
+about +Y turns the answer.  Layout of the maps: row 0 is +Y, the centre column -Z, right of it +X.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from reli3d.nn.presets import LightMapSizes
+from reli3d.nn.reni import map_directions
+
+BLACK = 0.01  # added to a radiance before its logarithm
+PAINT_FLOOR = 0.04  # of the albedo that a pixel is divided by: a dielectric reflects as much at least
+CHANNELS = 14
+LIMIT = 12.0  # of the logarithm of a radiance: a sun of exp(12)
+
+
+def texel_of(directions: Tensor, height: int) -> Tensor:
+    """Index ``(N,)`` of the texel of a flattened ``(height, 2 height)`` map that holds unit ``directions (N, 3)``."""
+    x, y, z = directions.unbind(-1)
+    row = (y.clamp(-1, 1).acos() * (height / math.pi)).long().clamp(0, height - 1)
+    column = ((torch.atan2(x, -z) + math.pi) * (height / math.pi)).long() % (2 * height)
+    return row * 2 * height + column
+
+
+def gathered(values: Tensor, weight: Tensor, texel: Tensor, height: int) -> tuple[Tensor, Tensor]:
+    """Weighted means ``(C, H, 2H)`` of ``values (N, C)`` over the texels they fall in, and log(1 + weight) there."""
+    count = 2 * height * height
+    total = weight.new_zeros(count).index_add(0, texel, weight)
+    summed = values.new_zeros(count, values.shape[1]).index_add(0, texel, values * weight[:, None])
+    mean = summed / total.clamp(min=1e-4)[:, None]
+    shape = (height, 2 * height)
+    return mean.T.reshape(-1, *shape), torch.log1p(total).reshape(1, *shape)
+
+
+class _Block(nn.Module):
+    """3x3 convolution around the sphere: wraps in azimuth, repeats the border row at the poles."""
+
+    def __init__(self, inputs: int, outputs: int, stride: int = 1):
+        super().__init__()
+        self.conv = nn.Conv2d(inputs, outputs, 3, stride=stride)
+        self.norm = nn.GroupNorm(max(1, outputs // 8), outputs)
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = functional.pad(functional.pad(x, (1, 1, 0, 0), mode="circular"), (0, 0, 1, 1), mode="replicate")
+        return functional.silu(self.norm(self.conv(x)))
+
+
+class LightMap(nn.Module):
+    """Logarithm of the radiance, ``(3, H, 2H)``, from pixels of all views."""
+
+    def __init__(self, sizes: LightMapSizes):
+        super().__init__()
+        widths = sizes.widths
+        self.height = sizes.height
+        self.first = _Block(CHANNELS, widths[0])
+        self.down = nn.ModuleList(
+            nn.Sequential(_Block(a, b, 2), _Block(b, b)) for a, b in zip(widths[:-1], widths[1:], strict=True)
+        )
+        self.across = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in zip(widths[:-1], widths[1:], strict=True))
+        self.up = nn.ModuleList(_Block(a, a) for a in widths[:-1])
+        self.out = nn.Conv2d(widths[0], 3, 1)
+        nn.init.zeros_(self.out.weight)
+        nn.init.zeros_(self.out.bias)
+
+    def forward(self, radiance: Tensor, albedo: Tensor, gloss: Tensor, normal: Tensor, wo: Tensor) -> Tensor:
+        """radiance, albedo: ``(N, 3)`` linear.  gloss: ``(N,)`` in [0, 1].  normal, wo: ``(N, 3)`` unit, world."""
+        facing = (normal * wo).sum(-1).clamp(min=0.0)
+        mirror = functional.normalize(2.0 * facing[:, None] * normal - wo, dim=-1)
+        log = (radiance + BLACK).log()
+        demodulated = log - (albedo + PAINT_FLOOR).log()
+        level = (demodulated * facing[:, None]).sum(0) / facing.sum().clamp(min=1e-4)
+        scale = 256.0 / max(1, len(radiance))  # weights do not depend on the resolution of the views
+        at_mirror = texel_of(mirror, self.height)
+        shown, shown_weight = gathered(torch.cat([log - level, demodulated - level], -1),
+                                       facing * (0.05 + gloss) * scale, at_mirror, self.height)  # fmt: skip
+        under, under_weight = gathered(demodulated - level, facing * scale, texel_of(normal, self.height), self.height)
+        y = map_directions(self.height, radiance.device)[..., 1][None]
+        rest = torch.cat([y, y.square(), torch.ones_like(y) * level.mean()])
+        x = self.first(torch.cat([shown, shown_weight, under, under_weight, rest])[None])
+        levels = [x]
+        for down in self.down:
+            levels.append(down(levels[-1]))
+        x = levels[-1]
+        for across, up, finer in zip(reversed(self.across), reversed(self.up), reversed(levels[:-1]), strict=True):
+            coarse = functional.interpolate(across(x), size=finer.shape[-2:], mode="bilinear", align_corners=False)
+            x = up(finer + coarse)
+        return (self.out(x)[0] + level[:, None, None]).clamp(max=LIMIT)

@@ -1,0 +1,74 @@
+"""What all views say about the space of the object: pooled on a grid, then a 3D U-Net, then looked up at points."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from reli3d.geometry.grid import sample_grid
+from reli3d.geometry.hull import hull_distance
+from reli3d.geometry.projection import OWN, gather_views, summarize_views
+from reli3d.nn.presets import VolumeSizes
+from reli3d.nn.view_features import ViewMaps
+
+NEAR_HULL = 0.08  # farther outside the silhouettes' hull there is nothing: views are not asked
+HULL_SCALE = 0.1  # unit of the hull's distance as a feature
+MIXED = 24  # channels of a view at a point, and as many of their spread
+
+
+def _block(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv3d(inputs, outputs, 3, stride=stride, padding=1), nn.GroupNorm(max(1, outputs // 8), outputs), nn.SiLU()
+    )
+
+
+class FeatureVolume(nn.Module):
+    """Features of the space ``[-R, R]^3``: ``N`` grid points a side, any number of views in any order."""
+
+    def __init__(self, sizes: VolumeSizes, features: int):
+        super().__init__()
+        widths = sizes.widths
+        self.mix = nn.Sequential(nn.Linear(features + OWN, 32), nn.SiLU(), nn.Linear(32, MIXED))
+        self.reduce = nn.Sequential(nn.Linear(2 * MIXED + OWN + 2, widths[0]), nn.SiLU())
+        self.first = _block(widths[0], widths[0])
+        self.down = nn.ModuleList(
+            nn.Sequential(_block(a, b, 2), _block(b, b)) for a, b in zip(widths[:-1], widths[1:], strict=True)
+        )
+        self.deepest = _block(widths[-1], widths[-1])
+        self.across = nn.ModuleList(nn.Conv3d(b, a, 1) for a, b in zip(widths[:-1], widths[1:], strict=True))
+        self.up = nn.ModuleList(_block(a, a) for a in widths[:-1])
+        self.out = nn.Conv3d(widths[0], sizes.features, 1)
+        self.side, self.radius = sizes.side, sizes.radius
+
+    def forward(self, maps: ViewMaps) -> Tensor:
+        """``(N, N, N, F)``, indexed x, y, z."""
+        axis = torch.linspace(-self.radius, self.radius, self.side, device=maps.images.device)
+        grid = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+        hull = hull_distance(grid, maps.images[..., 3].contiguous(), maps.c2w, maps.intrinsics)
+        near = (hull > -NEAR_HULL).nonzero()[:, 0]
+        pooled = self._pooled(maps, grid[near], hull[near])
+        x = pooled.new_zeros(len(grid), pooled.shape[1]).index_copy(0, near, pooled)
+        x = self.first(x.T.reshape(1, -1, self.side, self.side, self.side))
+        levels = [x]
+        for down in self.down:
+            levels.append(down(levels[-1]))
+        x = self.deepest(levels[-1])
+        for across, up, finer in zip(reversed(self.across), reversed(self.up), reversed(levels[:-1]), strict=True):
+            coarse = functional.interpolate(across(x), size=finer.shape[-3:], mode="trilinear", align_corners=False)
+            x = up(finer + coarse)
+        return self.out(x)[0].permute(1, 2, 3, 0).contiguous()
+
+    def _pooled(self, maps: ViewMaps, points: Tensor, hull: Tensor) -> Tensor:
+        scale = maps.tokens.shape[1] / maps.images.shape[1]
+        gathered, _ = gather_views(maps.tokens, points, maps.c2w, maps.intrinsics * scale)
+        own, weight, summary = summarize_views(maps.images, maps.c2w, maps.intrinsics, points, None, None)
+        mixed = self.mix(torch.cat([gathered, own], -1))
+        mean = (mixed * weight[..., None]).sum(1)
+        spread = ((mixed - mean[:, None]).square() * weight[..., None]).sum(1)
+        rest = torch.stack([(hull / HULL_SCALE).clamp(-2, 2), torch.full_like(hull, 1.0 / len(maps.c2w))], -1)
+        return self.reduce(torch.cat([mean, spread, summary, rest], -1))
+
+    def sample(self, volume: Tensor, points: Tensor) -> Tensor:
+        """Trilinear values ``(N, F)`` of a ``volume`` at ``points (N, 3)``; outside, its border's."""
+        return sample_grid(volume, points / self.radius)

@@ -1,0 +1,65 @@
+"""Points of surfaces with their material: what is shaded."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+from reli3d._bridge import check
+
+NUMBERS = ("base_color", "roughness", "metallic")  # may be a plain number: grey, or the same everywhere
+
+
+@dataclass(frozen=True)
+class SurfacePoints:
+    """What the shader needs of N points; directions unit, world frame.
+
+    position: ``(N, 3)``.  ng: ``(N, 3)`` geometric normal, outward.  normal: ``(N, 3)`` shading normal.  base_color:
+    ``(N, 3)`` LINEAR.  roughness: ``(N,)`` perceptual.  metallic: ``(N,)``.  All but ``position`` may be one row, which
+    then holds for all points, and the material may be plain numbers.  Fields have N rows after construction.  Raises
+    TypeError for a wrong kind or dtype, ValueError for a shape or device.
+    """
+
+    position: Tensor
+    ng: Tensor
+    normal: Tensor
+    base_color: Tensor | float
+    roughness: Tensor | float
+    metallic: Tensor | float
+
+    def __post_init__(self):
+        check("position", self.position, last=3)
+        if self.position.ndim != 2:
+            raise ValueError(f"position: expected shape (N, 3), got {tuple(self.position.shape)}")
+        for name, last in (("ng", 3), ("normal", 3), ("base_color", 3), ("roughness", 0), ("metallic", 0)):
+            object.__setattr__(self, name, of_rows(name, getattr(self, name), self.position, last))
+
+    def __len__(self) -> int:
+        return len(self.position)
+
+    def __getitem__(self, rows: Tensor | slice) -> SurfacePoints:
+        """The points of ``rows``: a slice, indices or a mask."""
+        return SurfacePoints(*(getattr(self, f.name)[rows] for f in fields(self)))
+
+    def detach(self) -> SurfacePoints:
+        """The same numbers without gradient."""
+        return SurfacePoints(*(getattr(self, f.name).detach() for f in fields(self)))
+
+    def to(self, device: torch.device | str) -> SurfacePoints:
+        """The same points on ``device``."""
+        return SurfacePoints(*(getattr(self, f.name).to(device) for f in fields(self)))
+
+
+def of_rows(name: str, value: Tensor | float, position: Tensor, last: int) -> Tensor:
+    """``value`` as ``(N, last)``, or ``(N,)`` for ``last`` 0, for the N rows of ``position``; one row is repeated."""
+    shape = (len(position), last) if last else (len(position),)
+    if name in NUMBERS and isinstance(value, (int, float)):
+        return position.new_tensor(float(value)).expand(shape)
+    check(name, value, last=last or None, like=position)
+    if value.shape == shape:
+        return value
+    if value.numel() != max(last, 1):
+        raise ValueError(f"{name}: expected shape {shape} or one row, got {tuple(value.shape)}")
+    return value.reshape(shape[1:]).expand(shape)

@@ -1,0 +1,200 @@
+"""The network of convolutions: its parts know where things are, and what must not matter does not."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+from torch.nn.functional import normalize
+
+from reli3d.geometry.hull import mask_distance
+from reli3d.nn.light_map import LightMap, gathered, texel_of
+from reli3d.nn.local import LocalReconstructor, PixelMaps
+from reli3d.nn.presets import LOCAL, LightMapSizes, PyramidSizes, VolumeSizes
+from reli3d.nn.pyramid import place_of_pixels
+from reli3d.nn.reni import map_directions
+from reli3d.nn.volume import FeatureVolume
+from reli3d.render.camera import look_at, project
+
+TINY = dataclasses.replace(
+    LOCAL, image_size=64, pyramid=PyramidSizes((8, 8, 16), 8), volume=VolumeSizes(12, 0.56, (8, 16), 8),
+    light=LightMapSizes(16, (8, 16, 16)), view_width=24, head_width=16,
+)  # fmt: skip
+SIZE = TINY.image_size
+
+
+@pytest.fixture(scope="module")
+def model():
+    torch.manual_seed(0)
+    model = LocalReconstructor(TINY)
+    with torch.no_grad():  # away from the zeros of the start, so that every path speaks
+        for parameter in model.parameters():
+            parameter += 0.1 * torch.randn_like(parameter)
+    return model.eval()
+
+
+def sphere(count: int, seed: int = 0, turn: torch.Tensor | None = None):
+    """Views of a ball of radius 0.4 whose colour is a function of the normal: images, masks, c2w, intrinsics."""
+    generator = torch.Generator().manual_seed(seed)
+    eye = normalize(torch.randn(count, 3, generator=generator), dim=-1) * 2.2
+    c2w = look_at(eye, torch.zeros(count, 3), torch.tensor([0.0, 1.0, 0.0]))
+    intrinsics = torch.tensor([SIZE * 1.9, SIZE * 1.9, SIZE / 2, SIZE / 2]).expand(count, 4).contiguous()
+    pixel = (torch.arange(SIZE) + 0.5 - SIZE / 2) / (SIZE * 1.9)
+    y, x = torch.meshgrid(-pixel, pixel, indexing="ij")
+    local = normalize(torch.stack([x, y, -torch.ones_like(x)], -1), dim=-1)
+    d = torch.einsum("vij,xyj->vxyi", c2w[:, :3, :3], local)
+    o = eye[:, None, None]
+    b = (o * d).sum(-1)
+    root = b * b - (2.2**2 - 0.4**2)
+    point = o + d * (-b - root.clamp(min=0).sqrt())[..., None]
+    normal = normalize(point, dim=-1)
+    images = torch.where(root[..., None] > 0, 0.5 + 0.3 * normal, torch.full_like(normal, 0.2))
+    return images, (root > 0).float(), c2w, intrinsics
+
+
+def turned(c2w: torch.Tensor, yaw: float) -> torch.Tensor:
+    c, s = math.cos(yaw), math.sin(yaw)
+    moved = c2w.clone()
+    moved[:, :3] = torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]]) @ c2w[:, :3]
+    return moved
+
+
+def encoded(model, images, masks, c2w, intrinsics):
+    detail = torch.cat([images, mask_distance(masks)[..., None]], -1).contiguous()
+    return model.encode(images, masks, c2w, intrinsics, detail, intrinsics)
+
+
+def surface_of_ball(n: int = 200):
+    normal = normalize(torch.randn(n, 3, generator=torch.Generator().manual_seed(5)), dim=-1)
+    return 0.4 * normal, normal
+
+
+@torch.no_grad()
+def asked(field):
+    position, normal = surface_of_ball()
+    eyes = field.maps.c2w[:, :3, 3]
+    visible = ((eyes[None] - position[:, None]) * normal[:, None]).sum(-1).gt(0).float()
+    field = field.with_shading(position, normal, visible)
+    material = field.material(position, normal, visible)
+    return field.free_level(1.2 * position), material, field.radiance_map()
+
+
+@pytest.mark.parametrize("views", [1, 2, 5, 16])
+def test_any_number_of_views_in_any_order(model, views):
+    inputs = sphere(views)
+    level, material, light = asked(encoded(model, *inputs))
+    assert level.shape == (200,) and material.base_color.shape == (200, 3) and light.shape == (16, 32, 3)
+    assert all(bool(torch.isfinite(v).all()) for v in (level, light, *vars(material).values()))
+    order = torch.randperm(views, generator=torch.Generator().manual_seed(1))
+    other, other_material, other_light = asked(encoded(model, *(t[order] for t in inputs)))
+    # sums over the views in another order, behind a dozen layers: float32 rounding, amplified
+    torch.testing.assert_close(other, level, rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(other_light, light, rtol=2e-3, atol=1e-3)
+    for a, b in zip(vars(other_material).values(), vars(material).values(), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-3)
+
+
+def test_every_view_is_read(model):
+    images, masks, c2w, intrinsics = sphere(3)
+    level, material, light = asked(encoded(model, images, masks, c2w, intrinsics))
+    changed = images.clone()
+    changed[2] = 1 - changed[2]
+    other, other_material, other_light = asked(encoded(model, changed, masks, c2w, intrinsics))
+    assert float((other - level).abs().max()) > 1e-3 and float((other_light - light).abs().max()) > 1e-3
+    assert float((other_material.base_color - material.base_color).abs().max()) > 1e-3
+
+
+def test_a_turn_of_the_world_turns_the_light(model):
+    """By a multiple of the coarsest texel's width (four columns of 32), so that no texel is cut."""
+    images, masks, c2w, intrinsics = sphere(3)
+    field = encoded(model, images, masks, c2w, intrinsics)
+    yaw = 2 * math.pi * 4 / 32
+    with torch.no_grad():
+        other = encoded(model, images, masks, turned(c2w, yaw), intrinsics).log_light
+        expected = torch.roll(field.log_light, -4, 2)  # from -Z, the centre, towards -X, which lies to the left
+        wrong = torch.roll(field.log_light, 4, 2)
+        # pixels beside the border of a texel may fall to its other side
+        assert float((other - expected).abs().mean()) < 0.02 * float((wrong - expected).abs().mean())
+
+
+def test_directions_fall_into_their_own_texels():
+    flat = map_directions(16).reshape(-1, 3)
+    assert torch.equal(texel_of(flat, 16), torch.arange(512))
+    values, weight = torch.randn(512, 2), torch.rand(512) + 0.5
+    mean, total = gathered(values, weight, texel_of(flat, 16), 16)
+    torch.testing.assert_close(mean.reshape(2, -1).T, values, rtol=1e-6, atol=1e-6)
+    torch.testing.assert_close(total.reshape(-1), torch.log1p(weight))
+
+
+def test_a_mirror_shows_the_light_where_it_reflects_it():
+    """What enters the U-Net of a glossy pixel lies in the mirror direction."""
+    torch.manual_seed(0)
+    light, seen = LightMap(LightMapSizes(16, (8, 16))), []
+    light.first.register_forward_pre_hook(lambda module, inputs: seen.append(inputs[0][0]))
+    normal, mirror = (torch.tensor([[0.0, math.cos(a), math.sin(a)]]) for a in (0.7, 1.4))  # twice the angle
+    wo = torch.tensor([[0.0, 1.0, 0.0]])
+    with torch.no_grad():
+        light(torch.ones(1, 3), torch.full((1, 3), 0.5), torch.ones(1), normal, wo)
+    weight = seen[0][6]  # after six means
+    assert int((weight > 0).sum()) == 1
+    assert int(weight.argmax()) == int(texel_of(mirror, 16))  # the view from +Y goes towards +Z
+
+
+def test_pixels_start_as_what_they_show(model):
+    """Of zeros: the normal looks at the camera, nothing is added to the colour."""
+    _, _, c2w, intrinsics = sphere(4)
+    maps = PixelMaps.of(torch.zeros(4, 32, 32, 12), c2w, intrinsics, SIZE)
+    centre = maps.normal[:, 15:17, 15:17].mean((1, 2))
+    torch.testing.assert_close(normalize(centre, dim=-1), c2w[:, :3, 2], rtol=0, atol=1e-3)  # +Z of a camera looks back
+    assert float(maps.shift.abs().max()) == 0.0 and float(maps.gain.min()) == pytest.approx(0.8808, abs=1e-4)
+
+
+def test_pixels_know_their_place():
+    """Points of the plane that faces the camera project to pixels that are told the points' coordinates."""
+    eye, target = torch.tensor([[0.7, 1.1, 2.0]]), torch.tensor([[0.1, -0.2, 0.3]])
+    c2w = look_at(eye, target, torch.tensor([0.0, 1.0, 0.0]))
+    intrinsics = torch.tensor([[SIZE * 1.7, SIZE * 1.9, SIZE / 2 + 3, SIZE / 2 - 5]])
+    place = place_of_pixels(c2w, intrinsics, SIZE)
+    want = place[0, 10, 40]
+    point = want[0] * c2w[0, :3, 0] + want[1] * c2w[0, :3, 1]
+    xy, _ = project(point[None], c2w[0], intrinsics[0])
+    torch.testing.assert_close(xy, torch.tensor([[40.5, 10.5]]), rtol=0, atol=1e-3)
+
+
+def test_the_view_that_sees_a_point_speaks(model):
+    """A point that one view sees and another does not has the first one's colour, not the mean of both."""
+    images, masks, c2w, intrinsics = sphere(2, seed=3)
+    images[0], images[1] = 0.8, 0.2
+    field = encoded(model, images, masks, c2w, intrinsics)
+    plain = torch.zeros(2, 32, 32, 12)
+    field = dataclasses.replace(field, pixels=PixelMaps.of(plain, c2w, intrinsics, SIZE))
+    position = 0.4 * normalize(c2w[:, :3, 3], dim=-1)  # the nearest point to each camera
+    visible = torch.eye(2)
+    with torch.no_grad():
+        logit = field.fused(position, normalize(position, dim=-1), visible).logit
+    gain, white, black = 0.8808, math.log(0.8 / 0.2), math.log(0.2 / 0.8)
+    # the hidden view keeps a share of 0.02 squared
+    torch.testing.assert_close(logit, gain * torch.tensor([[white], [black]]).expand(2, 3), rtol=0, atol=0.01)
+
+
+def test_the_volume_is_read_where_it_was_written():
+    volume = FeatureVolume(VolumeSizes(12, 0.56, (8, 16), 8), 8)
+    axis = torch.linspace(-0.56, 0.56, 12)
+    grid = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)  # the coordinates themselves as features
+    points = torch.rand(500, 3) * 1.1 - 0.55
+    torch.testing.assert_close(volume.sample(grid, points), points, rtol=0, atol=1e-6)
+
+
+def test_blocks_of_points_give_what_all_at_once_give(model):
+    position, normal = surface_of_ball(9000)
+    field = encoded(model, *sphere(2))
+    visible = torch.ones(9000, 2)
+    with torch.no_grad():
+        field = field.with_shading(position, normal, visible)
+        blocks = field.material(position, normal, visible)  # in blocks of 8192
+        level = field.level(position)
+    whole = field.material(position, normal, visible)  # with gradient: at once
+    # the fused pass without gradient sums in another order
+    torch.testing.assert_close(blocks.base_color, whole.base_color.detach(), rtol=0, atol=1e-4)
+    torch.testing.assert_close(blocks.normal, whole.normal.detach(), rtol=0, atol=1e-3)
+    torch.testing.assert_close(level, field.level(position).detach(), rtol=0, atol=2e-3)

@@ -1,0 +1,119 @@
+"""What a user may hand over: numpy arrays and other integers where nothing is lost, lists, numbers; assets moved,
+shown and saved."""
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import reli3d
+from reli3d.geometry.mesh import Mesh
+from reli3d.geometry.rays import RayScene
+from reli3d.geometry.surface import extract_surface
+from reli3d.render.asset import Asset, TextureSet
+from reli3d.render.camera import Camera, look_at
+from reli3d.render.color import linear_to_srgb
+from reli3d.render.environment import Environment
+from reli3d.render.render import render
+from reli3d.render.shading import ShadeOptions
+from tests.test_render import ball, textures
+
+VERTICES = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype=np.float32)
+
+
+@pytest.mark.parametrize("kind", ["int64", "int32", "int16", "uint8", "uint32"])
+def test_faces_of_any_integers_and_numpy_arrays_are_taken(kind):
+    faces = np.array([[0, 1, 2]], dtype=kind)
+    mesh = Mesh(VERTICES, faces)
+    assert mesh.faces.dtype == torch.int32 and mesh.vertices.dtype == torch.float32
+    scene = RayScene(VERTICES, faces)
+    assert int(scene.closest(torch.tensor([0.2, 0.2, 1.0]), torch.tensor([0.0, 0.0, -1.0])).face) == 0
+    if kind in ("int64", "int32", "int16", "uint8"):
+        assert torch.equal(Mesh(torch.from_numpy(VERTICES), torch.from_numpy(faces)).faces, mesh.faces)
+    frozen = VERTICES.copy()
+    frozen.flags.writeable = False  # as trimesh gives them
+    assert torch.equal(Mesh(frozen, faces[:, ::-1]).faces, torch.tensor([[2, 1, 0]], dtype=torch.int32))
+
+
+def test_what_would_lose_digits_is_refused():
+    one = np.array([[0, 1, 2]])
+    for vertices, faces, error in (
+        (VERTICES.astype(np.float64), one, TypeError), (VERTICES, one.astype(np.float32), TypeError),
+        (VERTICES, one + 2**32, TypeError), (VERTICES, one + 1, ValueError), (VERTICES.tolist(), one, TypeError),
+        (VERTICES.astype(np.complex64), one, TypeError), (VERTICES, one > 0, TypeError),
+    ):  # fmt: skip
+        for taker in (Mesh, RayScene):
+            with pytest.raises(error, match="(vertices|faces): expected"):
+                taker(vertices, faces)
+
+
+def test_a_grid_from_numpy_gives_the_same_surface():
+    level = np.random.default_rng(0).normal(size=(5, 6, 7)).astype(np.float32)
+    alpha = np.ones((4 * 5 * 6, 8), np.float32)
+    a, b = extract_surface(level, radius=1.0, alpha=alpha), extract_surface(torch.from_numpy(level), radius=1.0)
+    assert torch.equal(a.vertices, b.vertices) and torch.equal(a.faces, b.faces)
+
+
+def test_look_at_takes_lists_and_has_defaults(device):
+    want = look_at(*(torch.tensor(v, device=device) for v in ([1.0, 2.0, 3.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0])))
+    assert torch.equal(want.cpu(), look_at([1, 2, 3]))
+    assert torch.equal(want, look_at(torch.tensor([1.0, 2.0, 3.0], device=device), (0, 0, 0), [0, 1, 0]))
+    with pytest.raises(ValueError, match="up: expected"):
+        look_at([0, 1, 0])
+
+
+def test_a_texture_set_has_named_maps(device):
+    base = torch.rand(4, 4, 3, device=device)
+    maps = TextureSet(base, 0.25, torch.full((4, 4, 1), 0.75, device=device))
+    assert maps.roughness.shape == maps.metallic.shape == (4, 4)
+    assert float(maps.roughness[1, 2]) == 0.25 and float(maps.metallic[3, 0]) == 0.75
+    assert torch.equal(maps.normal, torch.tensor([0.5, 0.5, 1.0], device=device).expand(4, 4, 3))
+    for change, error in ((dict(roughness=base), ValueError), (dict(metallic="metal"), TypeError),
+                          (dict(normal=base[:2]), ValueError), (dict(base_color=base[:, :2]), ValueError),
+                          (dict(base_color=base[0]), ValueError), (dict(base_color=0.5), TypeError)):  # fmt: skip
+        with pytest.raises(error, match=f"{next(iter(change))}: expected"):
+            TextureSet(**{"base_color": base, "roughness": 0.5, "metallic": 0.5, **change})
+
+
+def test_an_asset_moves_detaches_and_says_what_it_is(device):
+    asset = ball(torch.device("cpu"))
+    maps = asset.textures
+    leaf = maps.base_color.clone().requires_grad_()
+    asset = Asset(asset.mesh, TextureSet(leaf, maps.roughness, maps.metallic), Environment(torch.ones(4, 8, 3)))
+    moved = asset.to(device)
+    on = {v.device.type for part in (moved.mesh, moved.textures, moved.environment)
+          for v in vars(part).values() if isinstance(v, torch.Tensor)}  # fmt: skip
+    assert on == {torch.device(device).type}
+    assert moved.textures.base_color.requires_grad and not moved.detach().textures.base_color.requires_grad
+    assert repr(asset) == "Asset(642 vertices, 1280 faces, 4 x 4 texels, environment 4 x 8, cpu)"
+    assert repr(Asset(asset.mesh, None)) == "Asset(642 vertices, 1280 faces, no textures, no environment, cpu)"
+    assert repr(asset.textures) == "TextureSet(4 x 4 texels, cpu)"
+    pose = look_at([0.0, 0.0, 3.0]).requires_grad_()
+    camera = Camera.from_fov(pose, 0.7, 8, 8).to(device)
+    assert camera.c2w.device.type == camera.intrinsics.device.type == torch.device(device).type
+    assert camera.c2w.requires_grad and not camera.detach().c2w.requires_grad
+    light = asset.environment
+    assert light.to("cpu") is light and not Environment(light.radiance.requires_grad_()).detach().radiance.requires_grad
+
+
+def test_an_image_is_saved_as_it_is_shown(tmp_path, device):
+    asset = Asset(ball(device).mesh, textures(4, device))
+    camera = Camera.from_fov(look_at([0.0, 0.0, 2.0]), 0.8, 16, 16).to(device)
+    image = render(asset, camera, Environment.constant(torch.ones(3, device=device)), options=ShadeOptions((4, 4, 4)))
+    image.save_png(tmp_path / "a.png", exposure=-1.0)
+    got = torch.from_numpy(np.asarray(Image.open(tmp_path / "a.png")).copy()).float() / 255.0
+    want = torch.cat([linear_to_srgb(image.radiance * 0.5), image.alpha[..., None]], -1).cpu()
+    inside = want[..., 3] == 1.0  # without subpixels alpha is 0 or 1
+    assert 0 < int(inside.sum()) < inside.numel() and bool((got[~inside] == 0.0).all())
+    torch.testing.assert_close(got[inside], want[inside].clamp(0, 1), rtol=0, atol=0.5 / 255 + 1e-5)  # 8 bits
+    image.save_png(tmp_path / "b.png", transparent=False)
+    assert Image.open(tmp_path / "b.png").mode == "RGB"
+    image.radiance[3, 3] = torch.nan
+    with pytest.raises(ValueError, match="radiance: expected finite"):
+        image.save_png(tmp_path / "c.png")
+    assert not (tmp_path / "c.png").exists()
+
+
+def test_the_names_of_the_readme_example_are_lent():
+    for name in ("look_at", "read_environment", "SurfacePoints", "ShadeOptions", "Camera", "Environment"):
+        assert callable(getattr(reli3d, name))
