@@ -6,24 +6,17 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor
-from torch.nn.functional import grid_sample, interpolate, pad
+from torch.nn.functional import interpolate, pad
 
-
-def sample_grid(grid: Tensor, points: Tensor) -> Tensor:
-    """Trilinear values ``(N, C)`` of ``grid (C, X, Y, Z)`` over the box [-1, 1]^3 at ``points (N, 3)``.
-
-    Vertices of the grid at the borders of the box lie on it; beyond, the border's value holds.  Gradients reach both.
-    """
-    where = points.flip(-1)[None, :, None, None]  # grid_sample counts the last axis first
-    return grid_sample(grid[None], where, mode="bilinear", padding_mode="border", align_corners=True)[0, :, :, 0, 0].T
+from reli3d.geometry.grid import sample_grid
 
 
 def space_field(grids: Sequence[Tensor], points: Tensor) -> Tensor:
-    """Sum ``(N, C)`` of :func:`sample_grid` over grids of rising resolution.
+    """Sum ``(N, C)`` at ``points (N, 3)`` of grids ``(n, n, n, C)`` over [-1, 1]^3 of rising resolution.
 
     Coarse grids carry what is smooth, so that a step moves whole regions; fine ones only what those cannot.
     """
-    return torch.stack([sample_grid(grid, points) for grid in grids]).sum(0)
+    return torch.stack([sample_grid(grid.contiguous(), points) for grid in grids]).sum(0)
 
 
 def light_field(maps: Sequence[Tensor], height: int) -> Tensor:

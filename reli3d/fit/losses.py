@@ -19,10 +19,10 @@ TINT = 0.25  # of the logarithm of colour without brightness: what the light's o
 class Weights:
     """Weights of all terms; lengths in cells of the grid, colours in the display's range."""
 
-    outline: float = 4.0  # of :func:`outline`
-    agreement: float = 1.0  # of :func:`agreement`
-    shading: float = 0.5  # of :func:`display_error` while the surface moves
-    curvature: float = 0.02  # of :func:`curvature`
+    outline: float = 10.0  # of :func:`outline`
+    agreement: float = 0.3  # of :func:`agreement`
+    shading: float = 2.0  # of :func:`display_error` while the surface moves
+    curvature: float = 0.01  # of :func:`curvature`
     stay: float = 2e-3  # of the level's distance from the start, over the number of views
     picture: float = 1.0  # of :func:`display_error` in the fit of the maps and the light
     palette: float = 0.03  # of :func:`palette`
@@ -52,8 +52,9 @@ def display_error(image: Tensor, other: Tensor, target: Tensor, bright: Tensor) 
     slope = display_slope(target)
     miss = ((other - target) * slope).detach()
     miss = torch.where(bright, miss.clamp(max=0.0), miss)
-    miss = miss * (ROBUST / miss.abs().clamp(min=ROBUST))
-    value = miss * (image.detach() - target) * slope  # the mean of the product is the squared error
+    whole, miss = miss, miss * (ROBUST / miss.abs().clamp(min=ROBUST))
+    apart = (image.detach() - target) * slope
+    value = miss * torch.where(bright, apart.clamp(max=0.0), apart) + miss * (whole - miss)  # squared, then linear
     pull = 2.0 * miss * slope * image
     return (value + pull - pull.detach()).mean()
 
@@ -80,17 +81,15 @@ def outline(cover: Tensor, mask: Tensor) -> Tensor:
     return (cover - mask).abs().mean()
 
 
-def curvature(level: Tensor, cell: float, reach: float) -> Tensor:
-    """Mean squared Laplacian of the level in the band ``|level| < reach``, in cells: bumps that no photograph asks for.
+def curvature(level: Tensor, cell: float, near: Tensor) -> Tensor:
+    """Mean squared Laplacian of the level in the band that ``near`` marks, in cells: bumps that no photograph asks for.
 
     Silhouettes and colours leave the surface free between what they see; a plain grid answers with noise.
     """
-    x = level / cell
-    inner = x[1:-1, 1:-1, 1:-1]
+    x, near = level / cell, near[1:-1, 1:-1, 1:-1].to(level)
     around = (x[2:, 1:-1, 1:-1] + x[:-2, 1:-1, 1:-1] + x[1:-1, 2:, 1:-1] + x[1:-1, :-2, 1:-1]
               + x[1:-1, 1:-1, 2:] + x[1:-1, 1:-1, :-2])  # fmt: skip
-    near = (inner.detach().abs() < reach / cell).to(x)
-    return ((around - 6.0 * inner).square() * near).sum() / near.sum().clamp(min=1.0)
+    return ((around - 6.0 * x[1:-1, 1:-1, 1:-1]).square() * near).sum() / near.sum().clamp(min=1.0)
 
 
 def slopes(values: Tensor) -> Tensor:

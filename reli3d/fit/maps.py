@@ -24,7 +24,8 @@ from reli3d.fit.unknowns import (
 from reli3d.geometry.hits import interpolate
 from reli3d.geometry.rays import RayScene
 from reli3d.render.asset import Asset
-from reli3d.render.gbuffer import SurfacePoints, primary_hits, sample_texture, surface_points
+from reli3d.render.gbuffer import primary_hits, sample_texture, surface_points
+from reli3d.render.points import SurfacePoints
 
 BATCH = 6144  # pixels a step
 SAMPLES = ((6, 6, 2), (12, 12, 4))  # of a pixel at the start and the end: coarse steps need no clean images
@@ -90,9 +91,9 @@ def maps_loss(unknowns: Unknowns, start: Start, pixels: Pixels, rows: Tensor, sc
     loss = weights.picture * losses.display_error(image, other, target, target > WHITE)
     loss = loss + weights.palette * losses.palette(points.base_color.clamp(min=losses.DARK).log(), target)
     # priors: the more views, the less the start's answer counts
-    base = [grid[:3] for grid in unknowns.material]
+    base = [grid[..., :3] for grid in unknowns.material]
     loss = loss + weights.base_coarse / views * losses.near_start(base)
-    loss = loss + weights.finish / views * losses.near_start([grid[3:] for grid in unknowns.material])
+    loss = loss + weights.finish / views * losses.near_start([grid[..., 3:] for grid in unknowns.material])
     loss = loss + weights.base_detail / views * fine.square().mean()
     loss = loss + weights.light * losses.near_start(unknowns.light)
     loss = loss + weights.light_slope * losses.slopes(light_field(unknowns.light, LIGHT_ROWS))

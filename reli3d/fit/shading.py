@@ -6,8 +6,8 @@ from torch import Tensor
 
 from reli3d.geometry.rays import RayScene
 from reli3d.render.environment import Environment
-from reli3d.render.gbuffer import SurfacePoints
-from reli3d.render.shading import shade
+from reli3d.render.points import SurfacePoints
+from reli3d.render.shading import ShadeOptions, shade
 
 PAINT = "published"  # glTF's own formula: what viewers show, and what the shipped weights learned from
 
@@ -15,5 +15,5 @@ PAINT = "published"  # glTF's own formula: what viewers show, and what the shipp
 def radiance(points: SurfacePoints, wo: Tensor, light: Environment, *, samples: tuple[int, int, int],
              scene: RayScene | None, seed: int) -> Tensor:  # fmt: skip
     """Radiance ``(N, 3)`` that leaves ``points`` towards ``wo``: direct light with shadows, linear."""
-    return shade(points.position, points.normal, points.ng, wo, points.base_color, points.roughness, points.metallic,
-                 light, samples=samples, scene=scene, seed=seed, paint=PAINT)  # fmt: skip
+    options = ShadeOptions(samples=samples, seed=seed, paint=PAINT)
+    return shade(points, wo, light, scene=scene, options=options)

@@ -11,11 +11,12 @@ from torch.nn.functional import grid_sample, interpolate
 
 from reli3d.fit import losses
 from reli3d.fit.budget import Budget
-from reli3d.fit.fields import EvenAdam, blurred_grid, sample_grid
+from reli3d.fit.fields import EvenAdam, blurred_grid
 from reli3d.fit.photographs import WHITE, Photographs
 from reli3d.fit.shading import radiance
 from reli3d.fit.unknowns import Start, Unknowns, corrected, environment, material_change, material_of, unit
 from reli3d.geometry.distance import signed_distance
+from reli3d.geometry.grid import sample_grid
 from reli3d.geometry.hull import hull_distance, mask_distance
 from reli3d.geometry.mesh import Mesh, largest_components, vertex_normals
 from reli3d.geometry.rays import RayScene
@@ -24,7 +25,8 @@ from reli3d.geometry.surface import extract_surface
 from reli3d.geometry.visibility import visible_from
 from reli3d.render.camera import Camera, project
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
-from reli3d.render.gbuffer import SurfacePoints, primary_hits
+from reli3d.render.gbuffer import primary_hits
+from reli3d.render.points import SurfacePoints
 from reli3d.render.silhouette import antialias, mesh_edges
 
 MARGIN = 3  # cells around the object
@@ -33,7 +35,7 @@ COARSE = 4  # cells of the grid along a cell of the one that is asked first
 POINTS, SHADED = 8192, 3072  # on the surface, a step, whose colours are compared, and that are shaded
 OUTLINES, OUTLINE_PIXELS = 2, 160  # views a step whose outlines are compared, and their size
 SAMPLES = (8, 8, 2)
-RATE = (0.30, 0.04)  # largest move of the surface in a step, in cells, at the start and the end
+RATE = (1.0, 0.15)  # largest move of the surface in a step, in cells, at the start and the end
 BLUR = (8, 2)  # cells over which a move is spread, at the start and the end
 DETAIL = (0.25, 1.0)  # of the photographs' size, in which colours are compared at the start and the end
 SMALLEST_PART = 0.01  # share of the faces below which a separate piece is dropped
@@ -153,9 +155,9 @@ def shape_loss(unknowns: Unknowns, data: ShapeData, weights: losses.Weights, *, 
     mesh = extracted(unknowns.level, data.bound, data.grid)
     scene = RayScene(mesh.vertices, mesh.faces)
     views, grid = len(data.photographs), data.grid
-    loss = weights.curvature * losses.curvature(unknowns.level, grid.cell, BAND * grid.cell)
     moved = (unknowns.level - data.first) / grid.cell
-    near = (data.first.abs() < BAND * grid.cell).to(moved)
+    near = data.first.abs() < BAND * grid.cell
+    loss = weights.curvature * losses.curvature(unknowns.level, grid.cell, near)
     loss = loss + weights.stay / views * (moved.square() * near).sum() / near.sum()
     loss = loss + weights.outline * _outlines(unknowns, data, mesh, scene, rng)
     loss = loss + _colors(unknowns, data, mesh, scene, weights, progress, rng, seed, independent)
@@ -181,12 +183,8 @@ def _colors(unknowns, data, mesh, scene, weights, progress, rng, seed, independe
     camera = corrected(camera, unknowns.pose[data.colored])
     pick = torch.randint(len(mesh.vertices), (POINTS,), generator=rng).to(mesh.vertices.device)
     position, normal = (v.index_select(0, pick) for v in (mesh.vertices, mesh.normals))
-    with torch.no_grad():
-        seen = visible_from(scene, position, normal, camera.c2w, camera.intrinsics, size)
-        to_eye = unit(camera.c2w[None, :, :3, 3] - position[:, None])
-        facing = ((to_eye * normal[:, None]).sum(-1) / LEAST).clamp(0.0, 1.0)
     color, cover = seen_colors(planes, position, camera)
-    weight = seen * facing * (cover.detach() > 0.9)
+    weight = sight(scene, position, normal, camera) * (cover.detach() > 0.9)
     exposure = unknowns.exposure[data.colored].exp()
     loss = weights.agreement * losses.agreement(color, weight) if len(data.colored) > 1 else 0.0
     if weights.shading == 0.0:
@@ -207,6 +205,17 @@ def _colors(unknowns, data, mesh, scene, weights, progress, rng, seed, independe
         with torch.no_grad():
             other = radiance(points, wo, light, samples=SAMPLES, scene=scene, seed=2 * seed + 1) * exposure[view, None]
     return loss + weights.shading * losses.display_error(image, other, target, target > WHITE)
+
+
+@torch.no_grad()
+def sight(scene: RayScene, position: Tensor, normal: Tensor, camera: Camera) -> Tensor:
+    """How well each camera sees the points, ``(N, V)`` in [0, 1]: 0 where they are hidden, less where they are grazed.
+
+    No gradient: no surface shall turn away to be seen less.
+    """
+    seen = visible_from(scene, position, normal, camera.c2w, camera.intrinsics, camera.width)
+    to_eye = unit(camera.c2w[None, :, :3, 3] - position[:, None])
+    return seen * ((to_eye * normal[:, None]).sum(-1) / LEAST).clamp(0.0, 1.0)
 
 
 def fit_shape(unknowns: Unknowns, data: ShapeData, weights: losses.Weights, budget: Budget, until: float, *,

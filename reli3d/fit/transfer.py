@@ -17,7 +17,8 @@ from reli3d.geometry.tangents import encode_normals, vertex_tangents
 from reli3d.geometry.uv import unwrap
 from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.color import linear_to_srgb
-from reli3d.render.gbuffer import SurfacePoints, sample_texture, surface_points
+from reli3d.render.gbuffer import sample_texture, surface_points
+from reli3d.render.points import SurfacePoints
 
 REACH = 0.08  # of the box's half side: how far apart the surfaces may lie along the new one's normal
 
@@ -75,10 +76,14 @@ def _textures(mesh: Mesh, texels: Texels, index: Tensor, at: SurfacePoints, worl
               normal: Tensor) -> TextureSet:  # fmt: skip
     size = texels.face.shape[0]
     encoded = encode_normals(world, normal, interpolate_tangents(mesh, texels, index))
-    orm = torch.stack([torch.ones_like(at.roughness), at.roughness, at.metallic], -1)
     maps = {}
-    for name, value in (("base_color", linear_to_srgb(at.base_color)), ("orm", orm), ("normal", encoded)):
-        full = value.new_zeros(size * size, 3)
+    for name, value in (
+        ("base_color", linear_to_srgb(at.base_color)),
+        ("roughness", at.roughness[:, None]),
+        ("metallic", at.metallic[:, None]),
+        ("normal", encoded),
+    ):
+        full = value.new_zeros(size * size, value.shape[1])
         full[index] = value.clamp(0.0, 1.0)
-        maps[name] = full.reshape(size, size, 3)
+        maps[name] = full.reshape(size, size, -1)
     return TextureSet(**dilate(maps, texels.valid))

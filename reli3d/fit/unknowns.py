@@ -17,7 +17,8 @@ from reli3d.geometry.bake import rasterize_texels
 from reli3d.render.asset import Asset
 from reli3d.render.camera import Camera
 from reli3d.render.environment import Environment
-from reli3d.render.gbuffer import SurfacePoints, surface_points
+from reli3d.render.gbuffer import surface_points
+from reli3d.render.points import SurfacePoints
 
 ROOM = 0.005  # base colours and metallic end this far from 0 and 1, where their logits are still near
 ROUGHEST, SMOOTHEST = 1.0, 0.05  # roughness: below, a lobe is narrower than the light's texels
@@ -33,7 +34,7 @@ DARKEST = 1e-4  # of the start's mean radiance: its logarithm must exist
 class Unknowns:
     """Everything that gradients may reach.  Lengths are those of the fit's own box, [-1, 1]^3 and what lies around.
 
-    level: ``(X, Y, Z)`` negative inside.  material: grids ``(5, n, n, n)`` over the box.  detail: ``(T, T, 3)`` base
+    level: ``(X, Y, Z)`` negative inside.  material: grids ``(n, n, n, 5)`` over the box.  detail: ``(T, T, 3)`` base
     colour over the atlas.  light: maps ``(h, 2h, 3)``.  exposure: ``(V,)`` logarithms.  pose: ``(V, 6)``, a rotation
     vector [rad] and a shift in the camera's own axes.
     """
@@ -51,7 +52,7 @@ class Unknowns:
         device = level.device
         return cls(
             level.clone(),
-            [torch.zeros(5, n, n, n, device=device) for n in MATERIAL_GRIDS],
+            [torch.zeros(n, n, n, 5, device=device) for n in MATERIAL_GRIDS],
             torch.zeros(texels, texels, 3, device=device),
             [torch.zeros(n, 2 * n, 3, device=device) for n in LIGHT_MAPS],
             torch.zeros(views, device=device),
@@ -71,7 +72,7 @@ class Unknowns:
 
 @dataclass(frozen=True)
 class Start:
-    """What the changes count from: logits of the material on a grid ``(5, n, n, n)``, log radiance ``(h, 2h, 3)``."""
+    """What the changes count from: logits of the material on a grid ``(n, n, n, 5)``, log radiance ``(h, 2h, 3)``."""
 
     material: Tensor
     light: Tensor
@@ -104,7 +105,7 @@ def material_of(logits: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 def material_change(unknowns: Unknowns, position: Tensor) -> Tensor:
     """Change of the logits ``(N, 5)`` at ``position (N, 3)``; roughness and metallic from the coarse grids only."""
     both = space_field(unknowns.material[:FINISH_GRIDS], position)
-    fine = space_field([grid[:3] for grid in unknowns.material[FINISH_GRIDS:]], position)
+    fine = space_field([grid[..., :3] for grid in unknowns.material[FINISH_GRIDS:]], position)
     return both + torch.cat([fine, torch.zeros_like(both[:, 3:])], 1)
 
 
@@ -130,7 +131,7 @@ def corrected(camera: Camera, pose: Tensor) -> Camera:
 
 
 def filled_grid(position: Tensor, values: Tensor, n: int) -> Tensor:
-    """Grid ``(C, n, n, n)`` over [-1, 1]^3 of the means of ``values (N, C)`` near its points; empty ones take what lies
+    """Grid ``(n, n, n, C)`` over [-1, 1]^3 of the means of ``values (N, C)`` near its points; empty ones take what lies
     around.
 
     Means over ever larger blocks fill what is empty (pull and push; Grossman and Dally 1998, Point Sample Rendering).
@@ -140,7 +141,7 @@ def filled_grid(position: Tensor, values: Tensor, n: int) -> Tensor:
     channels = values.shape[1]
     total = values.new_zeros(n**3, channels + 1)
     total.index_add_(0, index, torch.cat([values.detach(), torch.ones_like(values[:, :1])], 1))
-    return _pushed(total.T.reshape(1, channels + 1, n, n, n))[0]
+    return _pushed(total.T.reshape(1, channels + 1, n, n, n))[0].permute(1, 2, 3, 0).contiguous()
 
 
 def _pushed(total: Tensor) -> Tensor:
