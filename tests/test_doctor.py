@@ -37,15 +37,14 @@ def test_report_names_versions_devices_cache_and_weights(assets):
     assert doctor.PROBLEM not in text
 
 
-@pytest.mark.parametrize("arguments", [["doctor"], []])
-def test_command_says_usable_on_stdout(assets, capsys, arguments):
-    assert doctor.main(arguments) == 0
+def test_command_says_usable_on_stdout(assets, capsys):
+    assert doctor.main([]) == 0
     assert capsys.readouterr().out.splitlines()[-1].endswith(" usable")
 
 
 def test_missing_weights_are_a_problem(assets, capsys):
     (assets / "weights" / "small.safetensors").unlink()
-    assert doctor.main(["doctor"]) == 1
+    assert doctor.main([]) == 1
     out = capsys.readouterr().out
     assert out.count(doctor.PROBLEM) == 1 and out.splitlines()[-1].endswith("not usable: 1 problem")
 
@@ -65,7 +64,7 @@ def test_missing_package_is_a_problem(assets, monkeypatch):
     assert "pip install no-such-package-of-reli3d" in text and not usable
 
 
-@pytest.mark.parametrize("arguments", [["surgeon"], ["doctor", "--now"]])
+@pytest.mark.parametrize("arguments", [["surgeon"], ["--now"]])
 def test_wrong_call_ends_with_two(arguments):
     with pytest.raises(SystemExit) as stop:
         doctor.main(arguments)

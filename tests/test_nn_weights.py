@@ -231,7 +231,7 @@ def spoil_header(edit):
         (spoil_header(lambda h: h["backbone.latent_init"].update(shape=[1, 8, 31])), "shape and place"),
         (spoil_header(lambda h: h["backbone.latent_init"].update(dtype="I64")), "header that is not safetensors'"),
         (spoil_header(lambda h: h["__metadata__"].pop("preset")), "has no preset in its header"),
-        (spoil_header(lambda h: h["__metadata__"].update(preset="{}")), "expected the JSON of a Preset"),
+        (spoil_header(lambda h: h["__metadata__"].update(preset="{}")), "expected the JSON of a preset"),
         (spoil_header(lambda h: h.update({"other": h.pop("backbone.latent_init")})), "lacks 1 of"),
         (lambda p: p.unlink(), "file not found"),
     ],

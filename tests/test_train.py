@@ -21,7 +21,7 @@ from reli3d.train.batches import batches, random_turn
 from reli3d.train.calibrate import ALIKE, LOST, calibrate, first_of_the_best, mismatch
 from reli3d.train.light_prior import fit, scale_free
 from reli3d.train.loop import TrainConfig, averaged_model, progress, rate_at, train
-from reli3d.train.losses import ASTRAY, astray, losses, pattern_loss
+from reli3d.train.losses import ASTRAY, WEIGHTS, astray, losses, pattern_loss
 
 SEEDS = (3, 12)
 
@@ -136,12 +136,15 @@ def test_every_parameter_gets_a_gradient(samples):
 def test_training_learns_logs_and_resumes(folder, tmp_path):
     torch.manual_seed(0)
     config = TrainConfig(str(folder), str(tmp_path), steps=50, batch=1, points=256, max_views=1, warmup=5, seed=3)
-    train(LocalReconstructor(LOCAL), config)
-    rows = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    model = LocalReconstructor(LOCAL)
     (sample,) = next(batches(folder, size=1, points=256, max_views=1, seed=3))
-    first = losses(LocalReconstructor(LOCAL), sample)
-    assert rows[-1]["step"] == 50
-    assert rows[-1]["occupancy"] < float(first["occupancy"]) and rows[-1]["light"] < float(first["light"])
+    before = losses(model, sample)
+    train(model, config)
+    rows = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert rows[-1]["step"] == 50 and set(WEIGHTS) < set(rows[-1])
+    after = losses(model, sample)
+    whole = [float(sum(WEIGHTS[k] * v for k, v in terms.items())) for terms in (before, after)]
+    assert whole[1] < 0.9 * whole[0]  # 50 steps on two objects
     train(LocalReconstructor(LOCAL), dataclasses.replace(config, steps=52))
     state = torch.load(tmp_path / "state.pt", weights_only=True)
     assert state["step"] == 52

@@ -52,19 +52,23 @@ class Seen:
         return np.array([(x * weight).sum(), (y * weight).sum()]) / weight.sum()
 
 
+def ball_mesh(subdivisions: int, radius: float) -> Mesh:
+    """A ball with smooth normals, tangents, and its view from +Z as texture coordinates."""
+    m = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
+    v = torch.tensor(m.vertices, dtype=torch.float32)
+    n = torch.nn.functional.normalize(v, dim=-1)
+    tangent = torch.nn.functional.normalize(torch.linalg.cross(n.new_tensor([0.3, 0.5, 0.81]).expand_as(n), n), dim=-1)
+    return Mesh(v, torch.tensor(m.faces, dtype=torch.int32), n, (0.5 + 0.45 * n[:, :2]).contiguous(),
+                torch.cat([tangent, torch.ones(len(v), 1)], -1))  # fmt: skip
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """``mesh.glb``, ``environment.hdr`` and ``.exr`` as the command writes them."""
     folder = tmp_path_factory.mktemp("viewers")
-    m = trimesh.creation.icosphere(subdivisions=5, radius=0.6)
-    v = torch.tensor(m.vertices, dtype=torch.float32)
-    n = torch.nn.functional.normalize(v, dim=-1)
-    tangent = torch.nn.functional.normalize(torch.linalg.cross(n.new_tensor([0.3, 0.5, 0.81]).expand_as(n), n), dim=-1)
-    mesh = Mesh(v, torch.tensor(m.faces, dtype=torch.int32), n, torch.full((len(v), 2), 0.5),
-                torch.cat([tangent, torch.ones(len(v), 1)], -1))  # fmt: skip
     flat = lambda *rgb: torch.tensor(rgb).expand(4, 4, 3).contiguous()  # noqa: E731
-    write_glb(folder / "mesh.glb", Asset(mesh, TextureSet(flat(1.0, 1.0, 1.0), flat(1.0, 0.0, 1.0),
-                                                          flat(0.5, 0.5, 1.0))))  # fmt: skip
+    write_glb(folder / "mesh.glb", Asset(ball_mesh(5, 0.6), TextureSet(
+        flat(1.0, 1.0, 1.0), flat(1.0, 0.0, 1.0), flat(0.5, 0.5, 1.0))))  # fmt: skip
     light = torch.full((256, 512, 3), 0.02)  # three.js makes cubes of a quarter of the width
     column, row = (torch.arange(512) + 0.5) / 512, (torch.arange(256) + 0.5) / 256
     theta, phi = 2 * math.pi * column - math.pi, math.pi * row[:, None]

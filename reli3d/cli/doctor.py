@@ -115,13 +115,10 @@ def _tools() -> Iterator[tuple[str, str]]:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """The command ``reli3d``; returns 0 when usable, 1 when something must be mended, 2 for a wrong call."""
+    """The command ``reli3d doctor``; 0 when usable, 1 when something must be mended, 2 for a wrong call."""
     parser = argparse.ArgumentParser(
-        prog="reli3d", description="Looks after the installation. The work is done by reli3d-infer and reli3d-train."
+        prog="reli3d doctor", description="Print versions, devices, kernel cache and weights, and the verdict."
     )
-    parser.add_argument("--version", action="version", version=f"reli3d {reli3d.__version__}")
-    parser.add_argument("command", nargs="?", choices=["doctor"], default="doctor",
-                        help="print versions, devices, kernel cache and weights, and the verdict")  # fmt: skip
     parser.parse_args(argv)
     text, usable = examine()
     sys.stdout.write(text + "\n")

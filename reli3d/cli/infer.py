@@ -26,7 +26,10 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("folder", nargs="*", type=Path, help="object folders: transforms.json or a COLMAP text model; "
                    "default the bundled example")  # fmt: skip
     p.add_argument("--output", type=Path, default=Path("outputs"), help="files land in OUTPUT/<object>/")
-    p.add_argument("--views", type=int, help="use the first N views (1 to 16)")
+    taken = p.add_mutually_exclusive_group()
+    taken.add_argument("--views", type=int, metavar="N", help="use the N views, 1 to 16, that lie farthest apart; "
+                       "default all, of more than 16 those that lie farthest apart")  # fmt: skip
+    taken.add_argument("--first-views", type=int, metavar="N", help="use the first N views, 1 to 16")
     p.add_argument("--masks", type=Path, help="folder of masks with the names of the images, instead of their alpha")
     p.add_argument("--weights", default="small", help="small (in the package), official, or a safetensors file")
     p.add_argument("--download", action="store_true", help="with --weights official: fetch and convert the published "
@@ -130,12 +133,19 @@ def choose_device(wanted: str) -> str:
     return "cuda" if wanted != "cpu" and torch.cuda.is_available() else "cpu"
 
 
+def _read(folder: Path, args: argparse.Namespace):
+    """The views of ``folder`` as the command asks for them."""
+    from reli3d.views.folder import load_views
+
+    return load_views(folder, views=args.views, first_views=args.first_views, masks=args.masks,
+                      allow_outside=args.allow_outside)  # fmt: skip
+
+
 def check(folder: Path, target: Path, args: argparse.Namespace) -> None:
     """Print what the cameras look like, one line a view, and write the picture of the rig."""
     from reli3d.views.check import explain_cameras, rig_picture
-    from reli3d.views.folder import load_views
 
-    views = load_views(folder, views=args.views, masks=args.masks, allow_outside=args.allow_outside)
+    views = _read(folder, args)
     for line in (*views.notes, *explain_cameras(views)):
         print(line)
     target.mkdir(parents=True, exist_ok=True)
@@ -182,14 +192,13 @@ class Job:
         from reli3d.output import results
         from reli3d.output.preview import preview
         from reli3d.pipeline import default_normalization, output_frame, reconstruct
-        from reli3d.views.folder import load_views
         from reli3d.views.normalize import normalize
         from reli3d.views.published_views import hero_first, placement_notes
 
         args = self.args
         began = time.perf_counter()
         steps("reading")
-        views = load_views(folder, views=args.views, masks=args.masks, allow_outside=args.allow_outside)
+        views = _read(folder, args)
         normalization = args.normalize or default_normalization(self.model.preset)
         if normalization == "none" and args.normalize is None:
             views = replace(views, notes=(*views.notes, *placement_notes(views)))
@@ -211,10 +220,12 @@ class Job:
         self.cold = False
         steps("preview")
         output = output_frame(to_model, args.frame, args.up)
-        picture = preview(asset, views.transformed(output).to(self.device))
+        shown = views.transformed(output)
+        picture = preview(asset, shown.to(self.device))
         info = {
             "object": name,
             "views": list(views.names),
+            "views_in_folder": views.in_folder,
             "coordinate_system": views.coordinate_system,
             "notes": list(views.notes),
             **results.frame_record(to_model, output, args.frame, args.up),
@@ -233,7 +244,7 @@ class Job:
             "versions": results.versions(),
         }
         steps("writing")
-        results.write_results(target, asset, picture, info, compatible=args.compatible_names)
+        results.write_results(target, asset, shown, picture, info, compatible=args.compatible_names)
 
 
 def ready_kernels(device: str) -> None:

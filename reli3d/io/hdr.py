@@ -56,6 +56,12 @@ def write_environment(path: str | os.PathLike, radiance: Tensor, *, centre: str 
     return write(path, _quarter_turn(radiance, -1) if centre == "+X" else radiance)
 
 
+def environment_bytes(radiance: Tensor) -> bytes:
+    """What :func:`write_environment` writes into a ``.hdr`` file.  Raises as it does."""
+    pixels, _ = _writable(radiance, float(np.finfo(np.float32).max) / 2)
+    return rgbe_bytes(np.ascontiguousarray(_quarter_turn(torch.from_numpy(pixels), -1).numpy()))
+
+
 def _quarter_turn(radiance: Tensor, sign: int) -> Tensor:
     """Columns moved right by ``sign`` times a quarter of the width; an odd height needs a mean of two texels."""
     height = radiance.shape[0]

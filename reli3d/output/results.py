@@ -18,10 +18,12 @@ from reli3d.io.glb import write_glb
 from reli3d.io.hdr import write_environment
 from reli3d.io.images import write_png
 from reli3d.nn.weights import Manifest
+from reli3d.output.viewer import viewer_page
 from reli3d.render.asset import Asset
 from reli3d.views.similarity import Similarity
+from reli3d.views.views import Views
 
-FILES = ("mesh.glb", "environment.exr", "environment.hdr", "preview.png", "run_info.json")
+FILES = ("mesh.glb", "environment.exr", "environment.hdr", "preview.png", "viewer.html", "run_info.json")
 PUBLISHED_LIGHT = "illumination.hdr"  # name of the light in the published release, whose centre column is -Z
 
 
@@ -49,9 +51,13 @@ def peak_memory_mib() -> float | None:
     return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20, 1)
 
 
-def write_results(folder: Path, asset: Asset, picture: np.ndarray, info: dict, *, compatible: bool = False) -> None:
+def write_results(
+    folder: Path, asset: Asset, views: Views, picture: np.ndarray, info: dict, *, compatible: bool = False
+) -> None:
     """Write :data:`FILES` into ``folder``; an error leaves what was there before.  Raises OSError, ValueError.
 
+    views: the photographs, in the frame of ``asset``.  picture: :func:`~reli3d.output.preview.preview` of both.
+    info: what ``run_info.json`` holds, the convention of the light apart.
     compatible: write the light as :data:`PUBLISHED_LIGHT` as well.
     """
     radiance = asset.environment.radiance
@@ -67,6 +73,10 @@ def write_results(folder: Path, asset: Asset, picture: np.ndarray, info: dict, *
         if compatible:
             write_environment(temporary / PUBLISHED_LIGHT, radiance, centre="-Z")
         write_png(temporary / "preview.png", picture)
+        low, high = asset.mesh.vertices.aminmax(dim=0)
+        page = viewer_page(info["object"], {"mesh": (temporary / "mesh.glb").read_bytes()}, radiance,
+                           (low + high) / 2, float((high - low).norm()) / 2, views)  # fmt: skip
+        (temporary / "viewer.html").write_text(page)
         (temporary / "run_info.json").write_text(json.dumps(info, indent=1) + "\n")
         folder.mkdir(exist_ok=True)
         for name in _names(compatible):

@@ -37,8 +37,8 @@ def find_colmap(folder: Path) -> Path | None:
     return None
 
 
-def read_colmap(folder: Path, model: Path, count: int, *, outside: bool = False) -> tuple[list[Shot], list[str]]:
-    """The first ``count`` shots by image name of the model in ``model``, image files below ``folder``, and notes.
+def read_colmap(folder: Path, model: Path, *, outside: bool = False) -> tuple[list[Shot], list[str]]:
+    """All shots by image name of the model in ``model``, image files below ``folder``, and notes.
 
     Raises InputError naming the line and the field.
     """
@@ -59,7 +59,7 @@ def read_colmap(folder: Path, model: Path, count: int, *, outside: bool = False)
         raise InputError(path, "expected at least one image, got none; export the model again")
     images = folder / "images" if (folder / "images").is_dir() else folder
     shots = []
-    for name, n, words in sorted(entries)[:count]:
+    for name, n, words in sorted(entries):
         where = f"{path}: line {n}"
         if words[8] not in lenses:
             raise InputError(where, f"CAMERA_ID: expected one of cameras.txt, got {shown(words[8])}; export it again")

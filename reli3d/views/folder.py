@@ -18,6 +18,7 @@ from torch import Tensor
 
 from reli3d.io.files import InputError, shown
 from reli3d.io.images import read_image
+from reli3d.views.choose import NEAR, choose_views, spread_notes
 from reli3d.views.colmap import find_colmap, read_colmap
 from reli3d.views.shots import Lens, Shot, inside, straight
 from reli3d.views.transforms import read_transforms
@@ -34,18 +35,25 @@ def load_views(
     folder: str | os.PathLike,
     *,
     views: int | None = None,
+    first_views: int | None = None,
     masks: str | os.PathLike | None = None,
     allow_outside: bool = False,
 ) -> Views:
-    """The first ``views`` photographs (all up to 16 if None) of an object folder, with their cameras and masks.
+    """Photographs of an object folder, with their cameras and masks, in the order of the folder.
 
+    views: so many that lie farthest apart, the first among them (see :mod:`reli3d.views.choose`).  first_views: the
+    first so many.  Neither: all, or where there are more than 16, up to 16 that lie farthest apart and show each
+    something else.  What was chosen, near-duplicates and a narrow baseline are told in ``notes``.
     masks: folder of mask images with the stems of the images; it goes before the images' own alpha.  Otherwise
     ``mask_path`` of a frame counts, then alpha, then a folder ``masks`` or ``mask`` beside the cameras.
     allow_outside: let the camera file name images outside ``folder``.
     Raises InputError, one line that names the file, the field, the value and the fix.
     """
-    if views is not None and (isinstance(views, bool) or not isinstance(views, int) or not 1 <= views <= MAX_VIEWS):
-        raise InputError("views", f"expected 1 to {MAX_VIEWS}, got {views!r}; give a number in that range")
+    for name, value in (("views", views), ("first_views", first_views)):
+        if value is not None and (isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= MAX_VIEWS):
+            raise InputError(name, f"expected 1 to {MAX_VIEWS}, got {value!r}; give a number in that range")
+    if views is not None and first_views is not None:
+        raise InputError("views", "expected views or first_views, got both; give one of them")
     root = Path(folder)
     try:
         is_folder = root.is_dir()
@@ -55,17 +63,20 @@ def load_views(
         raise InputError(folder, "expected a folder with transforms.json or a COLMAP text model; check the path")
     if masks is not None and not Path(masks).is_dir():
         raise InputError(masks, "masks: expected a folder of mask images, got none; check the path")
-    count, system = views or MAX_VIEWS, None
+    system = None
     if (root / "transforms.json").exists() or (root / "transforms.json").is_symlink():
         cameras = inside(root, str(root), "transforms.json", "transforms.json", outside=allow_outside)
-        shots, notes, system = read_transforms(cameras, count, outside=allow_outside)
+        shots, notes, system = read_transforms(cameras, outside=allow_outside)
     else:
         model = find_colmap(root)
         if model is None:
             raise InputError(folder, "expected transforms.json or a COLMAP text model (sparse/0/cameras.txt, "
                              "images.txt), "
                                      "got neither; see docs/inputs.md")  # fmt: skip
-        shots, notes = read_colmap(root, model, count, outside=allow_outside)
+        shots, notes = read_colmap(root, model, outside=allow_outside)
+    offered = len(shots)
+    shots, told = _chosen(shots, views, first_views)
+    notes += told + [note for shot in shots for note in shot.notes]
     # decoding releases the GIL; torch is not used there, as each of these threads would start threads of its own
     with ThreadPoolExecutor(max_workers=min(4, os.cpu_count() or 1)) as pool:
         loaded = list(pool.map(lambda shot: _load(root, shot, masks, allow_outside), shots))
@@ -78,7 +89,24 @@ def load_views(
         names=tuple(s.name for s in shots),
         notes=tuple(dict.fromkeys(notes)),
         coordinate_system=system,
+        in_folder=offered,
     )
+
+
+def _chosen(shots: list[Shot], views: int | None, first_views: int | None) -> tuple[list[Shot], list[str]]:
+    """The shots to load, and notes on the choice and on how they lie."""
+    poses, count, notes = torch.from_numpy(np.stack([s.c2w for s in shots])), len(shots), []
+    if first_views is not None:
+        taken = list(range(min(first_views, count)))
+    elif views is not None or count > MAX_VIEWS:
+        taken = choose_views(poses, views or MAX_VIEWS, apart=0.0 if views else NEAR)
+        if len(taken) < count:
+            names = ", ".join(str(i) for i in taken)
+            notes.append(f"{len(taken)} of {count} views taken, farthest apart in direction and distance: {names}; "
+                         "--first-views N takes the first N")  # fmt: skip
+    else:
+        taken = list(range(count))
+    return [shots[i] for i in taken], notes + spread_notes(poses[taken])
 
 
 def _load(root: Path, shot: Shot, masks, outside: bool) -> tuple[Tensor, Tensor, list[float], list[str]]:

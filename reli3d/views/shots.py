@@ -39,6 +39,7 @@ class Shot:
     mask: Path | None
     c2w: np.ndarray  # (4, 4) float64, OpenGL axes
     lens: Lens
+    notes: tuple[str, ...] = ()  # what was assumed of it
 
 
 def number(where: str, field: str, value: object, low: float = -math.inf, high: float = math.inf) -> float:

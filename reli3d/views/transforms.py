@@ -60,8 +60,8 @@ def _unique(pairs: list) -> dict:
     return result
 
 
-def read_transforms(path: Path, count: int, *, outside: bool = False) -> tuple[list[Shot], list[str], str | None]:
-    """The first ``count`` shots by ``view_index`` (missing: 0; else file order), notes, and ``coordinate_system``.
+def read_transforms(path: Path, *, outside: bool = False) -> tuple[list[Shot], list[str], str | None]:
+    """All shots by ``view_index`` (missing: 0; else file order), notes, and ``coordinate_system``.
 
     Raises InputError naming the frame and the field.
     """
@@ -76,7 +76,7 @@ def read_transforms(path: Path, count: int, *, outside: bool = False) -> tuple[l
             raise InputError(path, f"frames[{i}]: expected an object, got {shown(frame)}; export the cameras again")
     order = [number(f"{path}: frames[{i}]", "view_index", f.get("view_index", 0)) for i, f in enumerate(frames)]
     ranked = sorted(range(len(frames)), key=order.__getitem__)
-    shots = [_shot(path, i, frames[i], data, notes, outside) for i in ranked[:count]]
+    shots = [_shot(path, i, frames[i], data, outside) for i in ranked]
     system = data.get("coordinate_system")
     if data.get("applied_transform") is not None:
         notes.append(f"{path.name}: applied_transform recorded by nerfstudio is not undone; the mesh comes out in the "
@@ -84,7 +84,7 @@ def read_transforms(path: Path, count: int, *, outside: bool = False) -> tuple[l
     return shots, notes, system[:80] if isinstance(system, str) else None
 
 
-def _shot(path: Path, index: int, frame: dict, data: dict, notes: list[str], outside: bool) -> Shot:
+def _shot(path: Path, index: int, frame: dict, data: dict, outside: bool) -> Shot:
     where = f"{path}: frames[{index}]"
     key = next((k for k in ("transform_matrix", "camera_transform") if frame.get(k) is not None), None)
     if key is None:
@@ -93,8 +93,9 @@ def _shot(path: Path, index: int, frame: dict, data: dict, notes: list[str], out
     image = inside(path.parent, where, "file_path", frame.get("file_path"), outside=outside)
     mask = frame.get("mask_path")
     mask = None if mask is None else inside(path.parent, where, "mask_path", mask, outside=outside)
+    notes: list[str] = []
     lens = _lens(where, frame, data, notes)
-    return Shot(where, str(frame["file_path"]), image, mask, rigid(where, key, frame[key]), lens)
+    return Shot(where, str(frame["file_path"]), image, mask, rigid(where, key, frame[key]), lens, tuple(notes))
 
 
 def _lens(where: str, frame: dict, data: dict, notes: list[str]) -> Lens:

@@ -54,6 +54,7 @@ class Views:
     names: tuple[str, ...]
     notes: tuple[str, ...] = ()  # what reading changed or guessed, one line each
     coordinate_system: str | None = None  # as the folder states it; recorded only, it turns nothing
+    in_folder: int | None = None  # views that the folder offered
 
     def __post_init__(self):
         count = len(self.images)

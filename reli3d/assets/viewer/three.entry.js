@@ -1,9 +1,8 @@
 // What three.min.js holds, as the global THREE: three 0.183.2 (three.LICENSE.txt), what nothing here asks for left out.
 //   npm install three@0.183.2 esbuild
 //   npx esbuild three.entry.js --bundle --minify --format=iife --global-name=THREE --outfile=three.min.js
-export { BufferAttribute, Color, DataTexture, DataUtils, EquirectangularReflectionMapping, FloatType, HalfFloatType, LinearFilter,
-  LinearSRGBColorSpace, Matrix3, Matrix4, Mesh, MeshBasicMaterial, NoToneMapping, PerspectiveCamera, Quaternion, Scene,
-  ShaderMaterial, SRGBColorSpace, Vector3, WebGLRenderer } from "three";
+export { DataTexture, DataUtils, EquirectangularReflectionMapping, HalfFloatType, LinearFilter, LinearSRGBColorSpace,
+  Matrix4, MeshBasicMaterial, PerspectiveCamera, RGBAFormat, Scene, ShaderMaterial, Vector3, WebGLRenderer } from "three";
 export { OrbitControls } from "three/addons/controls/OrbitControls.js";
 export { GLTFLoader } from "three/addons/loaders/GLTFLoader.js";
 export { HDRLoader } from "three/addons/loaders/HDRLoader.js";

@@ -1,0 +1,53 @@
+"""Turn an object in front of the camera, then turn another light around it.
+
+usage: python examples/turntable.py OUTPUT_FOLDER [--glb FILE] [--frames 24] [--size 256]
+
+Without ``--glb`` the object is reconstructed from the photographs that come with the package.  Writes the frames
+``turn_00.png``, ... and ``light_00.png``, ..., and the animation ``turntable.webp``.
+"""
+
+import argparse
+import math
+from pathlib import Path
+
+import torch
+from PIL import Image
+
+import reli3d
+from reli3d.render.environment import Environment
+from reli3d.render.render import joined_scene, render
+
+parser = argparse.ArgumentParser()
+parser.add_argument("output", type=Path)
+parser.add_argument("--glb", type=Path)
+parser.add_argument("--frames", type=int, default=24)
+parser.add_argument("--size", type=int, default=256, help="pixels along a side of a frame")
+args = parser.parse_args()
+args.output.mkdir(parents=True, exist_ok=True)
+
+if args.glb:
+    parts = reli3d.read_glb(args.glb)
+else:
+    photographs = Path(reli3d.__file__).parent / "assets" / "example"
+    parts = [reli3d.reconstruct(reli3d.load_views(photographs), texture_size=512)]
+
+studio = torch.full((32, 64, 3), 0.2)
+studio[6:12, 8:20] = 6.0  # a large lamp at one side
+studio[8:10, 44:48] = torch.tensor([4.0, 8.0, 16.0])  # a small blue one at the other
+studio = Environment(studio)
+own = next((part.environment for part in parts if part.environment is not None), studio)
+
+vertices = torch.cat([part.mesh.vertices for part in parts])
+centre, reach = (vertices.amax(0) + vertices.amin(0)) / 2, (vertices.amax(0) - vertices.amin(0)).norm() / 2
+scene, frames = joined_scene(parts), []
+for name in ("turn", "light"):
+    for i in range(args.frames):
+        angle = math.tau * i / args.frames
+        turn = angle if name == "turn" else 0.0
+        eye = centre + 3 * reach * torch.tensor([math.sin(turn), 0.35, math.cos(turn)])
+        camera = reli3d.Camera.from_fov(reli3d.look_at(eye, centre), 0.75, args.size, args.size)
+        light = own if name == "turn" else studio.rotated(angle)
+        path = args.output / f"{name}_{i:02d}.png"
+        render(parts, camera, light, scene=scene, supersampling=2).save_png(path)
+        frames.append(Image.open(path).convert("RGBA"))
+frames[0].save(args.output / "turntable.webp", save_all=True, append_images=frames[1:], duration=80, loop=0)

@@ -1,0 +1,45 @@
+"""``reli3d``: one name for all commands."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+
+import reli3d
+
+COMMANDS = {  # module of reli3d.cli, arguments put before the given ones, what it does
+    "infer": ("infer", (), "photographs with cameras to a relightable asset (also reli3d-infer)"),
+    "view": ("view", (), "show a reconstruction in the browser"),
+    "check": ("infer", ("--check",), "explain the cameras of a folder, reconstruct nothing"),
+    "render": ("render", (), "views and turntables of a GLB under any light (also reli3d-render)"),
+    "data": ("data", (), "make training samples (also reli3d-data)"),
+    "train": ("train", (), "train the network (also reli3d-train)"),
+    "eval": ("eval", (), "measure the network on held-back objects (also reli3d-eval)"),
+    "doctor": ("doctor", (), "say what is installed, where it runs and whether it can"),
+}
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the named command; its exit code.  2 for a name that is none."""
+    rows = "\n".join(f"  {name:8s} {what}" for name, (_, _, what) in COMMANDS.items())
+    parser = argparse.ArgumentParser(
+        prog="reli3d",
+        description="Relightable 3D assets from a few posed photographs.",
+        usage="reli3d COMMAND [OPTION ...]",
+        epilog=f"commands:\n{rows}\n\n'reli3d COMMAND --help' has the options of each.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=f"reli3d {reli3d.__version__}")
+    parser.add_argument("command", choices=COMMANDS, metavar="COMMAND", help="one of those below")
+    parser.add_argument("options", nargs=argparse.REMAINDER, help=argparse.SUPPRESS)
+    if not (sys.argv[1:] if argv is None else argv):
+        parser.print_help()
+        return 0
+    args = parser.parse_args(argv)
+    module, before, _ = COMMANDS[args.command]
+    return importlib.import_module(f"reli3d.cli.{module}").main([*before, *args.options])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

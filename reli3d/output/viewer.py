@@ -1,0 +1,77 @@
+"""One page that shows a reconstruction in any browser, from a file and without a network: it holds all it needs."""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+from torch import Tensor
+
+import reli3d
+from reli3d.io.hdr import environment_bytes
+from reli3d.render.lights import LIGHTS
+from reli3d.views.views import Views
+
+PARTS = Path(reli3d.__file__).parent / "assets" / "viewer"
+PHOTOGRAPH = 640  # pixels of the longer side: 16 of them take less than a megabyte
+QUALITY = 80  # of their WebP
+
+
+def viewer_page(name: str, meshes: Mapping[str, bytes], light: Tensor, middle: Tensor, radius: float,
+                views: Views) -> str:  # fmt: skip
+    """HTML page of the GLB files ``meshes`` by name, under ``light`` ``(H, 2H, 3)`` and two lights of the package.
+
+    middle ``(3,)``, radius: of the object, for the camera.  views: the photographs, in the frame of the meshes; they
+    become stops of the camera, scaled down to ``PHOTOGRAPH`` pixels and cut out by their masks.
+    """
+    lights = {"own light": light, **{k: make().radiance for k, make in LIGHTS.items()}}
+    data = {
+        "name": name,
+        "meshes": [{"name": k, "glb": _base64(glb)} for k, glb in meshes.items()],
+        "lights": [{"name": k, "hdr": _base64(environment_bytes(v))} for k, v in lights.items()],
+        "views": [_stop(views, i) for i in range(len(views))],
+        "middle": middle.tolist(),
+        "radius": radius,
+    }
+    page = (PARTS / "viewer.html").read_text()
+    fillings = {
+        "title": html.escape(name),
+        "data": json.dumps(data).replace("<", "\\u003c"),
+        "three": (PARTS / "three.min.js").read_text(),
+        "viewer": (PARTS / "viewer.js").read_text(),
+    }
+    head, *rest = page.split("{{")  # one pass: what is filled in is not looked through again
+    return head + "".join(fillings[part.split("}}", 1)[0]] + part.split("}}", 1)[1] for part in rest)
+
+
+def _base64(data: bytes) -> str:
+    return base64.b64encode(data).decode()
+
+
+def _stop(views: Views, i: int) -> dict:
+    """One photograph with its camera; the intrinsics are those of the scaled picture."""
+    height, width = views.masks[i].shape
+    rgba = np.concatenate([views.images[i].cpu().numpy(), views.masks[i].cpu().numpy()[..., None]], -1)
+    picture = Image.fromarray((rgba * 255 + 0.5).astype(np.uint8))
+    scale = min(1.0, PHOTOGRAPH / max(width, height))
+    size = (max(1, round(width * scale)), max(1, round(height * scale)))
+    if size != picture.size:
+        picture = picture.resize(size, Image.Resampling.BOX)
+    data = io.BytesIO()
+    picture.save(data, "WEBP", quality=QUALITY)
+    fx, fy, cx, cy = views.intrinsics[i].tolist()
+    sx, sy = size[0] / width, size[1] / height
+    return {
+        "name": views.names[i],
+        "image": f"data:image/webp;base64,{_base64(data.getvalue())}",
+        "width": size[0],
+        "height": size[1],
+        "c2w": views.c2w[i].tolist(),
+        "intrinsics": [fx * sx, fy * sy, cx * sx, cy * sy],
+    }

@@ -1,0 +1,74 @@
+"""Two lights of the package's own: a studio and an open sky, by formulas.
+
+Both have a mean radiance of 1 over the sphere, so that paint shows about as bright as it is.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from reli3d.render.environment import Environment, texel_solid_angles
+
+SUN_RADIUS = 0.055  # rad, twelve times the real one: a texel of a small map is 0.05 wide
+SUN_SHARE = 0.45  # of all the light
+SOFTBOXES = (  # direction of the middle, half width and half height [tangents of angles], radiance
+    ((-0.75, 0.5, 0.6), 0.45, 0.6, (9.0, 8.8, 8.4)),  # key
+    ((0.9, 0.25, 0.35), 0.16, 0.8, (3.6, 3.8, 4.2)),  # strip
+    ((0.25, 0.45, -0.9), 0.8, 0.12, (5.0, 5.0, 5.0)),  # rim, behind
+    ((0.05, 1.0, 0.0), 0.5, 0.5, (2.5, 2.5, 2.5)),  # above
+)
+
+
+def studio(height: int = 64) -> Environment:
+    """A grey room with four softboxes: a key at the left, a strip at the right, one behind and one above."""
+    d = _directions(height)
+    y = d[..., 1:2]
+    light = (0.22 + 0.12 * y).expand(-1, -1, 3)
+    edge = 2.0 * math.pi / height  # a softbox fades over two texels
+    for middle, width, rise, radiance in SOFTBOXES:
+        axis = normalize(torch.tensor(middle), dim=0)
+        right = normalize(torch.linalg.cross(torch.tensor([0.0, 1.0, 1e-3]), axis), dim=0)
+        depth = d @ axis
+        across = (d @ right).abs() / depth.clamp(min=1e-3)
+        along = (d @ torch.linalg.cross(axis, right)).abs() / depth.clamp(min=1e-3)
+        inside = torch.sigmoid(4.0 * (width - across) / edge) * torch.sigmoid(4.0 * (rise - along) / edge)
+        light = light + (inside * (depth > 0))[..., None] * torch.tensor(radiance)
+    return _of_mean_one(light)
+
+
+def sky(height: int = 64) -> Environment:
+    """A clear sky over brown ground, the sun 40 degrees high in front at the right."""
+    d = _directions(height)
+    y = d[..., 1:2]
+    up = torch.lerp(torch.tensor([0.75, 0.85, 1.0]), torch.tensor([0.16, 0.36, 0.85]), y.clamp(min=0.0).sqrt())
+    ground = torch.tensor([0.2, 0.17, 0.13])
+    light = torch.lerp(ground.expand_as(up), up, torch.sigmoid(y * height))  # the horizon fades over a texel
+    sun = normalize(torch.tensor([0.5, math.sin(math.radians(40.0)), 0.58]), dim=0)
+    away = torch.linalg.cross(d, sun.expand_as(d)).norm(dim=-1).atan2(d @ sun)
+    disc = torch.sigmoid((SUN_RADIUS - away) * (2.0 * height / math.pi))[..., None] * torch.tensor([1.0, 0.9, 0.75])
+    return _of_mean_one(light / _mean(light) + disc / _mean(disc) * (SUN_SHARE / (1.0 - SUN_SHARE)))
+
+
+LIGHTS = {"studio": studio, "sky": sky}
+
+
+def _directions(height: int) -> Tensor:
+    """``(H, 2H, 3)`` unit directions of the texels' centres, laid out as :mod:`reli3d.kernels.envmap` has them."""
+    theta = (torch.arange(2 * height) + 0.5) * (math.pi / height) - math.pi
+    phi = ((torch.arange(height) + 0.5) * (math.pi / height))[:, None]
+    up = phi.cos().expand(-1, 2 * height)
+    return torch.stack([theta.sin() * phi.sin(), up, -theta.cos() * phi.sin()], -1)
+
+
+def _mean(light: Tensor) -> float:
+    """Mean radiance over the sphere and the channels."""
+    angle = texel_solid_angles(*light.shape[:2]) / (4.0 * math.pi)
+    return float((light.mean(-1).sum(1).double() * angle).sum())
+
+
+def _of_mean_one(light: Tensor) -> Environment:
+    return Environment((light / _mean(light)).contiguous())

@@ -1,0 +1,107 @@
+"""The choice among many views: distinct ones first, and what is said of near-duplicates and narrow baselines."""
+
+import itertools
+import json
+import math
+
+import pytest
+import torch
+
+from reli3d.io.files import InputError
+from reli3d.render.camera import look_at
+from reli3d.views.choose import NEAR, choose_views, spread_notes, view_distances
+from reli3d.views.folder import MAX_VIEWS, load_views
+from tests import evil
+
+
+def rig(*at: tuple[float, float, float], target=(0.3, -0.2, 5.0)) -> torch.Tensor:
+    """Cameras at azimuth and elevation [degrees] and distance that look at ``target``."""
+    rows = []
+    for azimuth, elevation, distance in at:
+        a, e = math.radians(azimuth), math.radians(elevation)
+        away = torch.tensor([math.cos(e) * math.sin(a), math.sin(e), math.cos(e) * math.cos(a)])
+        middle = torch.tensor(target)
+        rows.append(look_at(middle + distance * away, middle, torch.tensor([0.0, 1.0, 0.0])))
+    return torch.stack(rows)
+
+
+def crowd() -> torch.Tensor:
+    """60 views: 57 within half a degree of view 0, and three others at 17, 33 and 51."""
+    rng = torch.Generator().manual_seed(2)
+    at = [(20.0 + 0.3 * x, 15.0 + 0.3 * y, 2.0 + 0.002 * z) for x, y, z in torch.rand(60, 3, generator=rng).tolist()]
+    at[17], at[33], at[51] = (110.0, 20.0, 2.0), (200.0, 10.0, 2.2), (290.0, 40.0, 1.9)
+    return rig(*at)
+
+
+def test_of_sixty_views_of_which_57_are_near_identical_the_four_distinct_are_taken():
+    assert choose_views(crowd(), 4) == [0, 17, 33, 51]
+    assert choose_views(crowd(), 16, apart=NEAR) == [0, 17, 33, 51]
+    assert len(choose_views(crowd(), 16)) == 16  # as many as asked for
+
+
+def test_the_choice_covers_within_twice_the_best():
+    """Gonzalez's bound, against all choices of 3 of 9 with view 0 among them."""
+    rng = torch.Generator().manual_seed(4)
+    cameras = rig(*[(360 * x, 80 * y - 30, 2 + z) for x, y, z in torch.rand(9, 3, generator=rng).tolist()])
+    distance = view_distances(cameras)[1]
+    radius = lambda taken: float(distance[list(taken)].amin(0).max())  # noqa: E731
+    best = min(radius((0, *rest)) for rest in itertools.combinations(range(1, 9), 2))
+    assert radius(choose_views(cameras, 3)) <= 2 * best
+
+
+def test_distance_counts_beside_direction():
+    cameras = rig((0, 0, 2), (4, 0, 2), (0, 0, 0.5), (0, 5, 2))
+    assert choose_views(cameras, 2) == [0, 2]  # a close-up tells more than four degrees
+    angle, distance = view_distances(cameras)
+    # axes within 5 degrees: the prior on the point where they meet still weighs a little
+    assert float(angle[0, 1]) == pytest.approx(math.radians(4), rel=0.05) and float(angle[0, 2]) < 0.01
+    assert float(distance[0, 2]) == pytest.approx(0.5 * math.log(4), rel=0.05)
+
+
+def test_a_move_of_the_world_changes_nothing():
+    cameras = crowd().double()
+    turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64))[0]
+    turn = turn * torch.linalg.det(turn)
+    moved = cameras.clone()
+    moved[:, :3, :3] = turn @ cameras[:, :3, :3]
+    moved[:, :3, 3] = 7.0 * cameras[:, :3, 3] @ turn.T + torch.tensor([3.0, -90.0, 1.0], dtype=torch.float64)
+    assert choose_views(moved, 4) == choose_views(cameras, 4)
+
+
+def test_all_views_the_same_or_one_view():
+    same = crowd()[:1].expand(5, 4, 4)
+    assert choose_views(same, 3) == [0, 1, 2] and choose_views(same, 3, apart=NEAR) == [0]
+    assert choose_views(same[:1], 16) == [0] and spread_notes(same[:1]) == []
+    with pytest.raises(ValueError, match="count: expected"):
+        choose_views(same, 0)
+
+
+def test_near_duplicates_and_a_narrow_baseline_are_told():
+    assert spread_notes(rig((0, 0, 2), (90, 0, 2), (180, 0, 2))) == []
+    (near,) = spread_notes(rig((0, 0, 2), (90, 0, 2), (91, 0, 2), (180, 0, 2)))
+    assert near.startswith("1 of 4 views lie within 3 degrees") and near.endswith(": 2")
+    (narrow,) = spread_notes(rig((0, 0, 2), (10, 0, 2), (20, 0, 2)))
+    assert narrow.startswith("narrow baseline: all views lie within 20.0 degrees")
+
+
+def folder(path, cameras) -> None:
+    data = evil.good(path)
+    frames = [
+        data["frames"][0] | {"transform_matrix": pose.tolist(), "view_index": i} for i, pose in enumerate(cameras)
+    ]
+    (path / "transforms.json").write_text(json.dumps({**data, "frames": frames}))
+
+
+def test_a_folder_of_sixty_is_read_as_its_four_distinct_views(tmp_path):
+    cameras = crowd()
+    folder(tmp_path, cameras)
+    for asked in ({}, {"views": 4}):
+        views = load_views(tmp_path, **asked)
+        assert views.in_folder == 60 and torch.allclose(views.c2w, cameras[[0, 17, 33, 51]], atol=1e-5)
+        (note,) = views.notes
+        assert note.startswith("4 of 60 views taken, farthest apart in direction and distance: 0, 17, 33, 51")
+    first = load_views(tmp_path, first_views=4)
+    assert torch.allclose(first.c2w, cameras[:4], atol=1e-5) and len(first.notes) == 2  # near-duplicates, narrow
+    assert len(load_views(tmp_path, views=MAX_VIEWS)) == MAX_VIEWS
+    with pytest.raises(InputError, match="got both"):
+        load_views(tmp_path, views=4, first_views=4)

@@ -1,0 +1,67 @@
+"""``reli3d``: every command by its name; ``reli3d view`` serves the page of a folder and nothing else."""
+
+import re
+import subprocess
+import sys
+import urllib.error
+import urllib.request
+
+import pytest
+
+from reli3d.cli import doctor, main, view
+
+
+def test_help_names_every_command_and_the_old_names(capsys):
+    assert main.main([]) == 0
+    text = capsys.readouterr().out
+    for name in ("infer", "view", "check", "render", "data", "train", "eval", "doctor"):
+        assert re.search(rf"^  {name} ", text, re.MULTILINE)
+    for name in ("reli3d-infer", "reli3d-render", "reli3d-data", "reli3d-train", "reli3d-eval"):
+        assert name in text
+
+
+@pytest.mark.parametrize("name", main.COMMANDS)
+def test_every_command_has_its_help(name, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main.main([name, "--help"])
+    assert stop.value.code == 0 and "usage: reli3d" in capsys.readouterr().out
+
+
+def test_options_reach_the_command_and_so_does_its_exit_code(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(doctor, "examine", lambda: ("ill", False))
+    assert main.main(["doctor"]) == 1 and capsys.readouterr().out == "ill\n"
+    assert main.main(["view", str(tmp_path)]) == 2
+    assert capsys.readouterr().err.startswith("reli3d view: ")
+    assert main.main(["check", str(tmp_path), "--output", str(tmp_path)]) == 2  # not an object folder
+    with pytest.raises(SystemExit) as stop:
+        main.main(["infr"])
+    assert stop.value.code == 2
+
+
+def test_view_serves_the_folder_on_this_machine_until_it_is_told_to_stop(tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / view.PAGE).write_text("the page")
+    (tmp_path / "secret").write_text("not served")
+    command = [sys.executable, "-m", "reli3d.cli.main", "view", str(tmp_path / "out"), "--no-browser"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            url = process.stdout.readline().strip()
+            assert re.fullmatch(r"http://127\.0\.0\.1:\d+/viewer\.html", url)
+            with urllib.request.urlopen(url, timeout=30) as answer:
+                assert answer.read() == b"the page"
+            with pytest.raises(urllib.error.HTTPError):
+                urllib.request.urlopen(url.replace("viewer.html", "../secret"), timeout=30)
+        finally:
+            process.send_signal(2)  # Ctrl-C
+            assert process.wait(30) == 0
+        assert process.stderr.read() == ""
+
+
+@pytest.mark.parametrize("arguments", [["none"], [".", "--port", "70000"]])
+def test_view_refuses_in_one_line(tmp_path, monkeypatch, capsys, arguments):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / view.PAGE).touch()
+    assert view.main(arguments) == 2
+    said = capsys.readouterr()
+    assert said.out == "" and said.err.startswith("reli3d view: ") and said.err.count("\n") == 1
+    assert "expected" in said.err

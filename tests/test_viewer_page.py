@@ -1,0 +1,144 @@
+"""``viewer.html`` in headless Chromium, opened as a file: what it shows beside what our renderer shows."""
+
+import json
+import math
+import re
+
+import numpy as np
+import pytest
+import torch
+
+from reli3d.io.glb import glb_bytes, read_glb, write_glb
+from reli3d.output.viewer import viewer_page
+from reli3d.render.asset import Asset, TextureSet
+from reli3d.render.camera import Camera, look_at
+from reli3d.render.color import linear_to_srgb
+from reli3d.render.environment import Environment
+from reli3d.render.lights import sky, studio
+from reli3d.render.render import Render, render
+from reli3d.views.views import Views
+from tests.browser import chromium, pixels
+from tests.test_viewers import ball_mesh
+
+SIZE, WIDE = 256, 320  # the page's window is wider than the photographs
+EYES = ((0.9, 0.6, 2.0), (-2.0, 0.5, -0.6))
+# What the own light must reach.  The ball casts no shadow on itself, and three.js casts none.  What limits it is its
+# light prefiltered by roughness, whose lobes are narrower than GGX: a ball half of rough metal reaches 24.9.
+DECIBELS = 26.0
+
+
+@pytest.fixture(scope="module")
+def asset(tmp_path_factory) -> Asset:
+    """A ball: convex, painted, with a metal edge, rough enough for prefiltered light."""
+    mesh = ball_mesh(4, 0.7)
+    rows, columns = torch.meshgrid(torch.arange(64), torch.arange(64), indexing="ij")
+    color = torch.stack([0.3 + rows / 128, 0.9 - columns / 96, (0.4 + (rows + columns) / 256)], -1)
+    metal = (columns >= 52).float()
+    orm = torch.stack([torch.ones(64, 64), 0.35 + 0.2 * metal, metal], -1)
+    textures = TextureSet(color, orm, torch.tensor([0.5, 0.5, 1.0]).expand(64, 64, 3).contiguous())
+    path = tmp_path_factory.mktemp("page") / "mesh.glb"
+    write_glb(path, Asset(mesh, textures))
+    (stored,) = read_glb(path)  # rounded to 8 bits, as the page has it
+    return Asset(stored.mesh, stored.textures, studio())
+
+
+@pytest.fixture(scope="module")
+def views() -> Views:
+    """Two blue photographs of the ball's cameras, whose principal point is off the middle."""
+    up, zero = torch.tensor([0.0, 1.0, 0.0]), torch.zeros(3)
+    c2w = torch.stack([look_at(torch.tensor(eye), zero, up) for eye in EYES])
+    image, mask = torch.tensor([0.0, 0.0, 1.0]).expand(SIZE, SIZE, 3).contiguous(), torch.ones(SIZE, SIZE)
+    intrinsics = torch.tensor([[300.0, 290.0, 140.0, 120.0]] * 2)
+    return Views((image,) * 2, (mask,) * 2, c2w, intrinsics, ("front </script>.png", "back.png"))
+
+
+def ours(asset: Asset, views: Views, i: int, light: Environment) -> Render:
+    """The view of the page's window: the photograph's, with more at its sides."""
+    camera = views.intrinsics[i] + torch.tensor([0.0, 0.0, (WIDE - SIZE) / 2, 0.0])
+    return render(asset, Camera(views.c2w[i], camera, WIDE, SIZE), light, supersampling=2)
+
+
+def psnr(picture: np.ndarray, color: torch.Tensor, alpha: torch.Tensor) -> float:
+    """Decibels on the pixels that both have; also checks that they have the same pixels."""
+    mask = picture[..., 3] > 127
+    assert (mask & (alpha.numpy() > 0.5)).sum() / (mask | (alpha.numpy() > 0.5)).sum() > 0.99
+    both = (picture[..., 3] == 255) & (alpha.numpy() > 0.999)
+    error = (picture[..., :3][both] / 255.0 - color.numpy()[both]).astype(np.float64)
+    return float(-10 * np.log10(np.mean(error**2)))
+
+
+def shown(image: Render, brightness: float = 1.0) -> torch.Tensor:
+    straight = brightness * image.radiance / image.alpha[..., None].clamp(min=1e-6)
+    return linear_to_srgb(straight.clamp(0, 1))
+
+
+def choose(**values) -> str:
+    """JavaScript that sets the page's controls and tells it."""
+    code = ""
+    for name, value in values.items():
+        field = "checked" if isinstance(value, bool) else "value"
+        code += f"get('{name}').{field} = {json.dumps(value)}; get('{name}').dispatchEvent(new Event('input')); "
+    return code
+
+
+def test_the_page_shows_the_asset_as_the_renderer_does(tmp_path, asset, views):
+    glb = glb_bytes(asset)
+    page = viewer_page(
+        "a <ball>", {"before": glb, "after": glb}, asset.environment.radiance, torch.zeros(3), 0.7, views
+    )
+    (tmp_path / "viewer.html").write_text(page)
+    with chromium() as tab:
+        tab.open((tmp_path / "viewer.html").as_uri(), size=(WIDE, SIZE)).wait("document.body.dataset.ready")
+
+        def picture(**values) -> np.ndarray:
+            return pixels(tab.ask(choose(**values) + "picture()"))
+
+        tab.ask("take(0)")
+        first = ours(asset, views, 0, asset.environment)
+        own = psnr(picture(), shown(first), first.alpha)
+        layers = {
+            "base colour": linear_to_srgb(first.base_color / first.alpha[..., None].clamp(min=1e-6)),
+            "roughness": (first.roughness / first.alpha.clamp(min=1e-6))[..., None].expand(-1, -1, 3),
+            "metallic": (first.metallic / first.alpha.clamp(min=1e-6))[..., None].expand(-1, -1, 3),
+            "normal": torch.nn.functional.normalize(first.normal, dim=-1) / 2 + 0.5,
+        }
+        found = {name: psnr(picture(layer=name), color, first.alpha) for name, color in layers.items()}
+        wires = picture(layer="wireframe")
+        tab.ask("take(1)")
+        turned = ours(asset, views, 1, Environment(sky().radiance).rotated(math.pi / 2))
+        relit = psnr(picture(layer="lit", light="sky", turn=90, stopsof=-1), shown(turned, 0.5), turned.alpha)
+        still = psnr(picture(turn=0), shown(turned, 0.5), turned.alpha)
+        behind = picture(behind=True)
+        tab.ask(choose(blend=1.0))
+        covered = tab.picture()
+        tab.ask("leave()")
+        free = tab.ask("photograph.hidden")
+        title, choices = tab.ask("document.title"), tab.ask("get('mesh').parentElement.hidden")
+        assert tab.problems == []
+    assert own > DECIBELS, own
+    assert relit > DECIBELS, relit
+    assert still < relit - 6, (still, relit)  # turning does turn
+    assert min(found.values()) > 40, found  # 8 bits: 58; the metal's border, filtered otherwise: 52
+    assert 0.02 < (wires[..., 3] > 127).mean() < 0.9
+    assert (behind[..., 3] == 255).all()
+    right = covered[:, -(WIDE - SIZE) // 2 - 30 : -(WIDE - SIZE) // 2 - 2]  # the panel is at the left
+    assert np.abs(right.astype(int) - (0, 0, 255)).max() < 12  # the photograph, by lossy WebP
+    assert free and not choices and title == "a <ball>"
+
+
+def test_the_page_of_a_reconstruction_holds_all_it_needs(asset, views):
+    page = viewer_page("x", {"mesh": glb_bytes(asset)}, asset.environment.radiance, torch.zeros(3), 0.7, views)
+    assert not re.search(r"""(src|href)=["']?(https?:)?//""", page)
+    assert page.count("</script>") == 3  # a name cannot end the data
+    data = json.loads(re.search(r'id="data">(.*?)</script>', page, re.DOTALL)[1])
+    assert [light["name"] for light in data["lights"]] == ["own light", "studio", "sky"]
+    assert [view["name"] for view in data["views"]] == list(views.names)
+
+
+def test_large_photographs_are_scaled_with_their_cameras(asset):
+    image, mask = torch.rand(1000, 2000, 3), torch.ones(1000, 2000)
+    views = Views((image,), (mask,), torch.eye(4)[None], torch.tensor([[3000.0, 2900.0, 990.0, 510.0]]), ("a",))
+    page = viewer_page("x", {"mesh": b""}, asset.environment.radiance, torch.zeros(3), 0.7, views)
+    (view,) = json.loads(re.search(r'id="data">(.*?)</script>', page, re.DOTALL)[1])["views"]
+    assert (view["width"], view["height"]) == (640, 320)
+    np.testing.assert_allclose(view["intrinsics"], [960.0, 928.0, 316.8, 163.2])
