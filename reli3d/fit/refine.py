@@ -49,6 +49,13 @@ class Refinement:
     curve: list[dict] = field(default_factory=list)
     steps: dict[str, int] = field(default_factory=dict)
 
+    def record(self) -> dict:
+        """What a file may hold of it: plain values, without the asset."""
+        pairs = {name: dict(zip(("input", "held_out"), (None if math.isnan(v) else round(v, 3) for v in values)))
+                 for name, values in (("psnr_before", self.before), ("psnr_after", self.after))}  # fmt: skip
+        return {"kept": self.kept, **pairs, "views_held_out": list(self.held), "steps": self.steps,
+                "notes": list(self.notes), "curve": self.curve}  # fmt: skip
+
 
 def held_out(count: int) -> tuple[int, ...]:
     """Views whose colours no fit may use: none of fewer than three, one of fewer than twelve, else two."""

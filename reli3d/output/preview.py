@@ -58,6 +58,26 @@ def preview(asset: Asset, views: Views) -> np.ndarray:
     return np.asarray(sheet)
 
 
+def comparison(before: Asset, after: Asset, views: Views) -> np.ndarray:
+    """Picture ``(H, W, 3)`` uint8 of three views: photographs, ``before`` and ``after`` in their own light."""
+    count = min(len(views), 3)
+    batch = views.select([k * len(views) // count for k in range(count)]).resampled(TILE, crop=True)
+    rows = [("input", [_on_paper(i, m) for i, m in zip(batch.images, batch.masks, strict=True)])]
+    for title, asset in (("before", before), ("after refinement", after)):
+        scene = RayScene(asset.mesh.vertices, asset.mesh.faces)
+        cameras = [Camera(batch.c2w[i], batch.intrinsics[i], TILE, TILE) for i in range(count)]
+        shots = [render(asset, c, options=ShadeOptions(samples=SAMPLES), scene=scene) for c in cameras]
+        rows.append((title, [_on_paper(_display(s.radiance, s.alpha), s.alpha) for s in shots]))
+    height = 14 + TILE
+    sheet = Image.new("RGB", (count * TILE, len(rows) * height), "white")
+    draw = ImageDraw.Draw(sheet)
+    for r, (title, tiles) in enumerate(rows):
+        draw.text((3, r * height + 1), title, fill="black")
+        for c, tile in enumerate(tiles):
+            sheet.paste(_image(tile), (c * TILE, r * height + 14))
+    return np.asarray(sheet)
+
+
 def _display(radiance: Tensor, alpha: Tensor) -> Tensor:
     """sRGB of premultiplied linear radiance, straight."""
     return linear_to_srgb((radiance / alpha.clamp(min=1e-3)[..., None]).clamp(0, 1))
