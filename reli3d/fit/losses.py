@@ -8,6 +8,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from reli3d.fit.fields import light_field
+from reli3d.fit.unknowns import LIGHT_ROWS, Unknowns
+
 DARK = 0.02  # linear; below it errors count as at it: there photographs hold noise and eyes see little
 ROBUST = 0.25  # of the display range; an error beyond it counts linearly: mirrored surroundings, glare, wrong masks
 SAME = 0.1  # of the display range; colours of one point that differ by more are another surface or a highlight
@@ -117,6 +120,15 @@ def palette(color: Tensor, tint: Tensor) -> Tensor:
     alike = torch.exp(-(logs - logs.roll(1, 0)).square().sum(1) / (2.0 * TINT * TINT))
     square = (color - color.roll(1, 0)).square().mean(1)
     return (alike * square / (square + PALETTE * PALETTE)).mean()
+
+
+def priors(unknowns: Unknowns, weights: Weights, views: int) -> Tensor:
+    """What holds material, light and exposures to the start: less, the more photographs there are."""
+    base, finish = ([grid[..., part] for grid in unknowns.material] for part in (slice(0, 3), slice(3, 5)))
+    loss = weights.base_coarse / views * near_start(base) + weights.finish / views * near_start(finish)
+    loss = loss + weights.light * near_start(unknowns.light)
+    loss = loss + weights.light_slope * slopes(light_field(unknowns.light, LIGHT_ROWS))
+    return loss + weights.exposure * unknowns.exposure.square().mean()
 
 
 def shared_pattern(change: Tensor, shading: Tensor) -> Tensor:

@@ -9,11 +9,9 @@ from torch import Tensor
 
 from reli3d.fit import losses
 from reli3d.fit.budget import Budget
-from reli3d.fit.fields import light_field
 from reli3d.fit.photographs import WHITE, Photographs
 from reli3d.fit.shading import radiance
 from reli3d.fit.unknowns import (
-    LIGHT_ROWS,
     Start,
     Unknowns,
     environment,
@@ -90,14 +88,7 @@ def maps_loss(unknowns: Unknowns, start: Start, pixels: Pixels, rows: Tensor, sc
             other = radiance(points, pixels.wo[rows], light, samples=samples, scene=scene, seed=2 * seed + 1) * exposure
     loss = weights.picture * losses.display_error(image, other, target, target > WHITE)
     loss = loss + weights.palette * losses.palette(points.base_color.clamp(min=losses.DARK).log(), target)
-    # priors: the more views, the less the start's answer counts
-    base = [grid[..., :3] for grid in unknowns.material]
-    loss = loss + weights.base_coarse / views * losses.near_start(base)
-    loss = loss + weights.finish / views * losses.near_start([grid[..., 3:] for grid in unknowns.material])
-    loss = loss + weights.base_detail / views * fine.square().mean()
-    loss = loss + weights.light * losses.near_start(unknowns.light)
-    loss = loss + weights.light_slope * losses.slopes(light_field(unknowns.light, LIGHT_ROWS))
-    loss = loss + weights.exposure * unknowns.exposure.square().mean()
+    loss = loss + losses.priors(unknowns, weights, views) + weights.base_detail / views * fine.square().mean()
     if weights.demodulation:
         bright = other.detach().mean(1) / points.base_color.detach().mean(1).clamp(min=0.02)
         shading = bright.clamp(min=1e-3).log()

@@ -204,7 +204,12 @@ def _colors(unknowns, data, mesh, scene, weights, progress, rng, seed, independe
     if independent:
         with torch.no_grad():
             other = radiance(points, wo, light, samples=SAMPLES, scene=scene, seed=2 * seed + 1) * exposure[view, None]
-    return loss + weights.shading * losses.display_error(image, other, target, target > WHITE)
+    loss = loss + weights.shading * losses.display_error(image, other, target, target > WHITE)
+    # as strong beside the shading as in the fit of the maps
+    loss = loss + weights.shading * weights.palette * losses.palette(
+        points.base_color.clamp(min=losses.DARK).log(), target
+    )
+    return loss + weights.shading * losses.priors(unknowns, weights, len(data.photographs))
 
 
 @torch.no_grad()
