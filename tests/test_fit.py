@@ -57,8 +57,8 @@ def test_a_small_scene_is_recovered(refined, start):
 
 
 def test_the_surface_moves_towards_the_silhouettes(refined, start):
-    high = [float(a.mesh.vertices[:, 1].abs().amax()) for a in (start, refined.asset)]
-    assert abs(high[1] - 0.8) < 0.6 * abs(high[0] - 0.8)  # the squeezed ball grows back to its height
+    off = [float((a.mesh.vertices.norm(dim=1) - 0.8).abs().mean()) for a in (start, refined.asset)]
+    assert off[1] < 0.6 * off[0]  # the squeezed ball grows back; between the silhouettes of six views some is free
 
 
 def test_the_same_steps_and_seed_give_the_same_bits(refined, start, views):
@@ -69,8 +69,8 @@ def test_the_same_steps_and_seed_give_the_same_bits(refined, start, views):
 
 
 def test_a_worse_result_gives_the_start_and_says_so(start, views, monkeypatch):
-    def spoiled(first, *args, **options):
-        return replace(first, environment=Environment(0.2 * first.environment.radiance))
+    def spoiled(first, photographs, *args, **options):
+        return replace(first, environment=Environment(0.2 * first.environment.radiance)), photographs
 
     monkeypatch.setattr(fit, "_fitted", spoiled)
     result = fit.refine(start, views, steps=1)
@@ -92,6 +92,17 @@ def test_an_interrupt_gives_the_best_so_far(start, views, monkeypatch):
     assert sum(result.steps.values()) < STEPS / 2 and any("interrupted" in note for note in result.notes)
     assert signal.getsignal(signal.SIGINT) is before
     assert result.after[0] >= result.before[0] - fit.SLACK
+
+
+def test_cameras_that_are_off_move_back(start, views):
+    c2w = views.c2w.clone()
+    c2w[:, :3, 3] += 0.03 * torch.randn(VIEWS, 3, generator=torch.Generator().manual_seed(4))
+    result = fit.refine(small_scene.ball(), replace(views, c2w=c2w), steps=90, resolution=24, cameras=True)
+    off = [(c[:, :3, 3] - views.c2w[:, :3, 3]) for c in (c2w, result.c2w)]
+    # silhouettes of a ball tell shifts across the view, little along it; the common shift is free
+    across = [(o - o.mean(0)) - ((o - o.mean(0)) * views.c2w[:, :3, 2]).sum(-1, keepdim=True) * views.c2w[:, :3, 2]
+              for o in off]  # fmt: skip
+    assert float(across[1].norm()) < float(across[0].norm())
 
 
 def test_an_open_surface_keeps_its_shape(start, views):

@@ -81,6 +81,10 @@ class Photographs:
         color = planes[:, :3].permute(0, 2, 3, 1) / cover.clamp(min=1e-4)[..., None]
         return Photographs(color.contiguous(), cover.clamp(0.0, 1.0), self.c2w, self.intrinsics * (size / self.size))
 
+    def seen_from(self, c2w: Tensor) -> Photographs:
+        """The same photographs with other cameras ``(V, 4, 4)``."""
+        return replace(self, c2w=c2w)
+
     def moved(self, shift: Tensor, scale: float) -> Photographs:
         """The same photographs in the frame ``scale * (x - shift)``."""
         c2w = self.c2w.clone()

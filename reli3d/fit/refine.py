@@ -16,10 +16,11 @@ from reli3d.fit.photographs import Photographs, PosedImages
 from reli3d.fit.shading import radiance
 from reli3d.fit.shape import Grid, ShapeData, bound_level, finished, fit_shape, start_level
 from reli3d.fit.transfer import changed, dressed
-from reli3d.fit.unknowns import Start, Unknowns, environment
+from reli3d.fit.unknowns import Start, Unknowns, corrected, environment
 from reli3d.geometry.mesh import watertight
 from reli3d.geometry.rays import RayScene
 from reli3d.render.asset import Asset
+from reli3d.render.camera import Camera
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.gbuffer import primary_hits, surface_points
 
@@ -36,7 +37,8 @@ class Refinement:
     """What :func:`refine` gives.
 
     asset: the refined one, or the start where that is better.  kept: which of them.  before, after: mean PSNR [dB] on
-    white of the photographs that were used and of those held out (NaN without any).  notes: one line each.  curve,
+    white of the photographs that were used and of those held out (NaN without any).  held: their indices.  c2w:
+    ``(V, 4, 4)``, the cameras as corrected.  notes: one line each.  curve,
     steps: what the run did.
     """
 
@@ -45,6 +47,7 @@ class Refinement:
     before: tuple[float, float]
     after: tuple[float, float]
     held: tuple[int, ...]
+    c2w: Tensor
     notes: tuple[str, ...]
     curve: list[dict] = field(default_factory=list)
     steps: dict[str, int] = field(default_factory=dict)
@@ -113,7 +116,7 @@ def refine(asset: Asset, views: PosedImages, *, seconds: float | None = None, st
     before = picture_error(first, near)
     notes: list[str] = []
     with torch.random.fork_rng(devices=[]), _interruptible(budget, notes):
-        result = _fitted(first, near, used, resolution, weights, budget, notes, seed=seed, cameras=cameras)
+        result, near = _fitted(first, near, used, resolution, weights, budget, notes, seed=seed, cameras=cameras)
     after = picture_error(result, near)
     if budget.bar is not None:
         budget.bar.close()
@@ -122,18 +125,22 @@ def refine(asset: Asset, views: PosedImages, *, seconds: float | None = None, st
     if worse:
         notes.append(f"refinement: kept the start, as the result is worse on {' and '.join(worse)} views")
     kept = asset if worse else _moved(result, -scale * shift, 1.0 / scale)
-    return Refinement(kept, "start" if worse else "result", was, now, held, tuple(notes), budget.curve, budget.counts)
+    c2w = views.c2w if worse else near.moved(-scale * shift, 1.0 / scale).c2w
+    name = "start" if worse else "result"
+    return Refinement(kept, name, was, now, held, c2w, tuple(notes), budget.curve, budget.counts)
 
 
 def _fitted(first: Asset, photographs: Photographs, used: list[int], resolution: int, weights: losses.Weights,
-            budget: Budget, notes: list[str], *, seed: int, cameras: bool) -> Asset:  # fmt: skip
+            budget: Budget, notes: list[str], *, seed: int,
+            cameras: bool) -> tuple[Asset, Photographs]:  # fmt: skip
+    """The fitted asset, and the photographs with their cameras corrected."""
     start, texels = Start.of(first), min(TEXELS, first.textures.size)
     closed = watertight(first.mesh)
     grid = Grid.around(first.mesh.vertices, resolution)
-    level = start_level(first.mesh, grid) if closed else torch.ones(grid.shape)
+    level = start_level(first.mesh, grid) if closed else first.mesh.vertices.new_ones(grid.shape)
     unknowns = Unknowns.zero(level, len(photographs), texels)
-    options = {"photographs": photographs, "views": used, "weights": weights, "budget": budget, "seed": seed}
-    fit_maps(unknowns, start, first, until=LIGHT_UNTIL, name="light", detail=False, **options)
+    options = {"views": used, "weights": weights, "budget": budget, "seed": seed}
+    fit_maps(unknowns, start, first, photographs, until=LIGHT_UNTIL, name="light", detail=False, **options)
     surface = first
     if closed:
         bound = bound_level(photographs, grid)
@@ -141,11 +148,13 @@ def _fitted(first: Asset, photographs: Photographs, used: list[int], resolution:
         fit_shape(unknowns, data, weights, budget, SHAPE_UNTIL, seed=seed, cameras=cameras)
         mesh = finished(unknowns.level, bound, grid)
         surface = dressed(mesh, first, first.textures.size)
+        turned = corrected(Camera(photographs.c2w, photographs.intrinsics, 1, 1), unknowns.pose)
+        photographs = photographs.seen_from(turned.c2w)
     else:
         notes.append("refinement: the surface is not closed, so only its maps and light are fitted")
-    fit_maps(unknowns, start, surface, until=1.0, name="maps", **options)
+    fit_maps(unknowns, start, surface, photographs, until=1.0, name="maps", **options)
     with torch.no_grad():
-        return replace(changed(surface, unknowns), environment=environment(unknowns, start))
+        return replace(changed(surface, unknowns), environment=environment(unknowns, start)), photographs
 
 
 def _check_asset(asset: Asset, photographs: Photographs) -> None:
