@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from reli3d.fit import refine as fit
 from reli3d.geometry.bake import bake
 from reli3d.geometry.cover import cover_silhouettes
 from reli3d.geometry.hull import mask_distance
@@ -38,6 +39,7 @@ from reli3d.views.similarity import Similarity
 from reli3d.views.views import ViewBatch, Views
 
 DETAIL = 512  # pixels of the views that colours and silhouettes are read from; the network's own input is smaller
+REFINED = 384  # pixels of the views that a refinement compares with
 INSIDE = 2.0  # pixels of such a view that a silhouette's edge may spill over
 SMALLEST_PART = 0.01  # share of the faces below which a separate piece is dropped
 SHADING_POINTS = 4096  # vertices by which the light on the object is judged
@@ -303,3 +305,18 @@ def reconstruct(views: Views, *, weights: str | Network = "small", device: str =
     if timings is not None:
         timings.update(watch.seconds)
     return asset
+
+
+def refine(asset: Asset, views: Views, *, seconds: float | None = None, steps: int | None = None, **options) -> Asset:
+    """``asset`` fitted to its photographs, or as it was where that is better; see :func:`reli3d.fit.refine.refine`.
+
+    views: any number, in the frame of ``asset`` (that of :func:`reconstruct` with ``frame="input"``).  seconds or
+    steps: one of the two.
+    """
+    return refined(asset, views, seconds=seconds, steps=steps, **options).asset
+
+
+def refined(asset: Asset, views: Views, **options) -> fit.Refinement:
+    """:func:`refine` with its record."""
+    device = asset.mesh.vertices.device
+    return fit.refine(asset, views.to(device).resampled(REFINED), **options)

@@ -16,6 +16,8 @@ STARTED = time.monotonic()
 EXAMPLE = Path(__file__).parents[1] / "assets" / "example"
 KERNELS = ("hull", "cover", "view_features", "triplane", "flexicubes", "uv", "raster", "intersect", "attributes",
            "random", "envmap")  # modules of reli3d.kernels that one object needs  # fmt: skip
+FITTING = ("distance", "grid", "silhouette", "shade_adjoint", "flexicubes_adjoint")  # what a refinement asks for too
+REFINE_SECONDS = {"cpu": 60.0, "cuda": 20.0}  # without a number
 SHADER = {"cpu": ("shade_rays", "embree"), "cuda": ("shade",)}  # and the shader's: Embree traces its rays, or Warp
 
 
@@ -61,6 +63,12 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--up", choices=("x", "y", "z", "-x", "-y", "-z"), default="y", help="axis of that frame to turn to +Y"
     )
+    p.add_argument("--refine", nargs="?", type=float, const=0.0, metavar="SECONDS", help="fit the result to all "
+                   "photographs of the folder; without a number 60 seconds, 20 on CUDA; stands after the "
+                   "folders")  # fmt: skip
+    p.add_argument("--refine-steps", type=int, metavar="N", help="the same with a number of steps instead of seconds: "
+                   "every run of one machine gives the same")  # fmt: skip
+    p.add_argument("--refine-cameras", action="store_true", help="with either: correct the cameras as well")
     p.add_argument("--seed", type=int, default=0, help="of what is drawn by chance")
     p.add_argument("--compatible-names", action="store_true", help="also write illumination.hdr: the published "
                    "release's name and layout, -Z in the centre column")  # fmt: skip
@@ -93,7 +101,7 @@ def main(argv: list[str] | None = None) -> int:
         try:
             if args.check:
                 check(folder, target, args)
-            elif args.skip_existing and job.complete(target, compatible=args.compatible_names):
+            elif args.skip_existing and job.complete(target):
                 print(f"{name}: all files are there, skipped", file=sys.stderr)
             else:
                 job.run(folder, name, target)
@@ -136,12 +144,13 @@ def choose_device(wanted: str) -> str:
     return "cuda" if wanted != "cpu" and torch.cuda.is_available() else "cpu"
 
 
-def _read(folder: Path, args: argparse.Namespace):
-    """The views of ``folder`` as the command asks for them."""
+def _read(folder: Path, args: argparse.Namespace, *, every: bool = False):
+    """The views of ``folder`` as the command asks for them; every: all of them where it names no number."""
     from reli3d.views.folder import load_views
 
+    every = every and args.views is None and args.first_views is None
     return load_views(folder, views=args.views, first_views=args.first_views, masks=args.masks,
-                      allow_outside=args.allow_outside)  # fmt: skip
+                      allow_outside=args.allow_outside, every=every)  # fmt: skip
 
 
 def check(folder: Path, target: Path, args: argparse.Namespace) -> None:
@@ -171,19 +180,26 @@ class Job:
         import torch
 
         from reli3d.nn import weights
-        from reli3d.output import results
         from reli3d.pipeline import check_options
 
         check_options(args.texture_size, args.resolution)
         if args.download:
             _fetch(args.weights)
         path = weights.locate(args.weights)
-        self.args, self.device, self.complete = args, device, results.complete
+        self.args, self.device, self.budget = args, device, refinement_budget(args, device)
         trunk = args.precision and {"float32": torch.float32, "bfloat16": torch.bfloat16}[args.precision]
         self.model, self.manifest = weights.load(path, trunk=trunk, device=device)
         self.digest = weights.known_sha256(path)
         ready_kernels(device)  # takes half a minute the first time: not before the weights are known to be good
+        if self.budget:
+            ready_kernels(device, FITTING)
         self.cold = True
+
+    def complete(self, target: Path) -> bool:
+        """Whether ``target`` holds every file that this command writes."""
+        from reli3d.output import results
+
+        return results.complete(target, compatible=self.args.compatible_names, refined=bool(self.budget))
 
     def run(self, folder: Path, name: str, target: Path) -> None:
         """Reconstruct one object and write its files; the bar goes before an error is told."""
@@ -193,8 +209,8 @@ class Job:
 
     def _run(self, folder: Path, name: str, target: Path, steps: Progress) -> None:
         from reli3d.output import results
-        from reli3d.output.preview import preview
-        from reli3d.pipeline import default_normalization, output_frame, reconstruct
+        from reli3d.output.preview import comparison, preview
+        from reli3d.pipeline import default_normalization, output_frame, reconstruct, refined
         from reli3d.views.normalize import normalize
         from reli3d.views.published_views import hero_first, placement_notes
 
@@ -221,9 +237,17 @@ class Job:
                                 background=args.background, timings=stages, progress=steps)  # fmt: skip
             seconds[label] = {k: round(v, 4) for k, v in {**stages, **before}.items()}
         self.cold = False
-        steps("preview")
         output = output_frame(to_model, args.frame, args.up)
-        shown = views.transformed(output)
+        shown, compared, record = views.transformed(output), None, {}
+        if self.budget:
+            steps("refine")
+            photographs = _read(folder, args, every=True).transformed(output)
+            result = refined(asset, photographs, seed=args.seed, cameras=args.refine_cameras, bar=True, **self.budget)
+            for note in result.notes:
+                steps.bar.write(f"{name}: {note}", file=sys.stderr)
+            compared, asset = comparison(asset, result.asset, shown.to(self.device)), result.asset
+            record = {"refinement": {"views": len(photographs), **self.budget, **result.record()}}
+        steps("preview")
         picture = preview(asset, shown.to(self.device))
         info = {
             "object": name,
@@ -241,22 +265,39 @@ class Job:
             "seed": args.seed,
             "device": self.device,
             "mesh": results.mesh_statistics(asset.mesh),
+            **record,
             "seconds": seconds,
             "seconds_since_start": round(time.monotonic() - STARTED, 3),
             "peak_memory_mib": results.peak_memory_mib(),
             "versions": results.versions(),
         }
         steps("writing")
-        results.write_results(target, asset, shown, picture, info, compatible=args.compatible_names)
+        results.write_results(target, asset, shown, picture, info, compatible=args.compatible_names,
+                              comparison=compared)  # fmt: skip
 
 
-def ready_kernels(device: str) -> None:
+def refinement_budget(args: argparse.Namespace, device: str) -> dict[str, float | int]:
+    """``seconds`` or ``steps`` of a refinement, empty for none.  Raises ValueError for what makes no sense."""
+    if args.refine is None and args.refine_steps is None:
+        if args.refine_cameras:
+            raise ValueError("refine-cameras: expected --refine or --refine-steps with it, got neither")
+        return {}
+    if args.refine_steps is not None:
+        if args.refine_steps < 1:
+            raise ValueError(f"refine-steps: expected at least 1, got {args.refine_steps}")
+        return {"steps": args.refine_steps}
+    if not 0.0 <= args.refine < 1e6:
+        raise ValueError(f"refine: expected a positive number of seconds, got {args.refine}")
+    return {"seconds": args.refine or REFINE_SECONDS[device]}
+
+
+def ready_kernels(device: str, names: tuple[str, ...] = KERNELS) -> None:
     """Compile side by side what the first run would compile piece by piece; says so on stderr if there is something."""
     import torch
 
     from reli3d._bridge import compiled, load_modules
 
-    names = (*KERNELS, *SHADER[torch.device(device).type])
+    names = (*names, *SHADER[torch.device(device).type])
     modules = [importlib.import_module(f"reli3d.kernels.{name}") for name in names]
     if not compiled(modules, torch.device(device)):
         print("compiling kernels (first run only)", file=sys.stderr)
@@ -275,6 +316,7 @@ class Progress:
         "textures",
         "light",
         "frame",
+        "refine",
         "preview",
         "writing",
     )

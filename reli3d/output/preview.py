@@ -66,6 +66,26 @@ def preview(asset: Asset, views: Views) -> np.ndarray:
     return np.asarray(sheet)
 
 
+def comparison(before: Asset, after: Asset, views: Views) -> np.ndarray:
+    """Picture ``(H, W, 3)`` uint8 of three views: photographs, ``before`` and ``after`` in their own light."""
+    count = min(len(views), 3)
+    batch = views.select([k * len(views) // count for k in range(count)]).resampled(TILE, crop=True)
+    rows = [("input", [_on_paper(i, m) for i, m in zip(batch.images, batch.masks, strict=True)])]
+    for title, asset in (("before", before), ("after refinement", after)):
+        scene = RayScene(asset.mesh.vertices, asset.mesh.faces)
+        cameras = [Camera(batch.c2w[i], batch.intrinsics[i], TILE, TILE) for i in range(count)]
+        shots = [render(asset, c, options=ShadeOptions(samples=SAMPLES), scene=scene) for c in cameras]
+        rows.append((title, [_lit(s.radiance, s.alpha) for s in shots]))
+    height = TITLE + TILE
+    sheet = Image.new("RGB", (count * TILE, len(rows) * height), "white")
+    draw = ImageDraw.Draw(sheet)
+    for r, (title, tiles) in enumerate(rows):
+        draw.text((3, r * height + 1), title, fill="black")
+        for c, tile in enumerate(tiles):
+            sheet.paste(_image(tile), (c * TILE, r * height + TITLE))
+    return np.asarray(sheet)
+
+
 def unseen_cameras(mesh: Mesh, c2w: Tensor) -> list[Camera]:
     """``COLUMNS`` cameras of ``TILE`` pixels around ``mesh``, each as far as can be from the cameras ``c2w`` and from
     the others, in the order of their azimuth.

@@ -24,16 +24,17 @@ from reli3d.views.similarity import Similarity
 from reli3d.views.views import Views
 
 FILES = ("mesh.glb", "environment.exr", "environment.hdr", "preview.png", "viewer.html", "run_info.json")
+COMPARISON = "refine.png"  # of a refinement
 PUBLISHED_LIGHT = "illumination.hdr"  # name of the light in the published release, whose centre column is -Z
 
 
-def complete(folder: Path, *, compatible: bool = False) -> bool:
+def complete(folder: Path, *, compatible: bool = False, refined: bool = False) -> bool:
     """Whether ``folder`` holds every file of a reconstruction, with ``compatible`` the published name too."""
-    return all((folder / name).is_file() for name in _names(compatible))
+    return all((folder / name).is_file() for name in _names(compatible, refined))
 
 
-def _names(compatible: bool) -> tuple[str, ...]:
-    return (*FILES, PUBLISHED_LIGHT) if compatible else FILES
+def _names(compatible: bool, refined: bool) -> tuple[str, ...]:
+    return (*FILES, *([PUBLISHED_LIGHT] if compatible else []), *([COMPARISON] if refined else []))
 
 
 def mesh_statistics(mesh: Mesh) -> dict:
@@ -52,13 +53,20 @@ def peak_memory_mib() -> float | None:
 
 
 def write_results(
-    folder: Path, asset: Asset, views: Views, picture: np.ndarray, info: dict, *, compatible: bool = False
+    folder: Path,
+    asset: Asset,
+    views: Views,
+    picture: np.ndarray,
+    info: dict,
+    *,
+    compatible: bool = False,
+    comparison: np.ndarray | None = None,
 ) -> None:
     """Write :data:`FILES` into ``folder``; an error leaves what was there before.  Raises OSError, ValueError.
 
     views: the photographs, in the frame of ``asset``.  picture: :func:`~reli3d.output.preview.preview` of both.
     info: what ``run_info.json`` holds, the convention of the light apart.
-    compatible: write the light as :data:`PUBLISHED_LIGHT` as well.
+    compatible: write the light as :data:`PUBLISHED_LIGHT` as well.  comparison: the picture of a refinement.
     """
     radiance = asset.environment.radiance
     info = {**info, "environment_centre": "+X"}
@@ -73,13 +81,15 @@ def write_results(
         if compatible:
             write_environment(temporary / PUBLISHED_LIGHT, radiance, centre="-Z")
         write_png(temporary / "preview.png", picture)
+        if comparison is not None:
+            write_png(temporary / COMPARISON, comparison)
         low, high = asset.mesh.vertices.aminmax(dim=0)
         page = viewer_page(info["object"], {"mesh": (temporary / "mesh.glb").read_bytes()}, radiance,
                            (low + high) / 2, float((high - low).norm()) / 2, views)  # fmt: skip
         (temporary / "viewer.html").write_text(page)
         (temporary / "run_info.json").write_text(json.dumps(info, indent=1) + "\n")
         folder.mkdir(exist_ok=True)
-        for name in _names(compatible):
+        for name in _names(compatible, comparison is not None):
             os.replace(temporary / name, folder / name)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)

@@ -38,6 +38,7 @@ def load_views(
     first_views: int | None = None,
     masks: str | os.PathLike | None = None,
     allow_outside: bool = False,
+    every: bool = False,
 ) -> Views:
     """Photographs of an object folder, with their cameras and masks, in the order of the folder.
 
@@ -46,7 +47,8 @@ def load_views(
     something else.  What was chosen, near-duplicates and a narrow baseline are told in ``notes``.
     masks: folder of mask images with the stems of the images; it goes before the images' own alpha.  Otherwise
     ``mask_path`` of a frame counts, then alpha, then a folder ``masks`` or ``mask`` beside the cameras.
-    allow_outside: let the camera file name images outside ``folder``.
+    allow_outside: let the camera file name images outside ``folder``.  every: all, however many: what a refinement
+    reads, while a network reads 16 at most.
     Raises InputError, one line that names the file, the field, the value and the fix.
     """
     for name, value in (("views", views), ("first_views", first_views)):
@@ -75,7 +77,7 @@ def load_views(
                                      "got neither; see docs/inputs.md")  # fmt: skip
         shots, notes = read_colmap(root, model, outside=allow_outside)
     offered = len(shots)
-    shots, told = _chosen(shots, views, first_views)
+    shots, told = (shots, []) if every else _chosen(shots, views, first_views)
     notes += told + [note for shot in shots for note in shot.notes]
     # decoding releases the GIL; torch is not used there, as each of these threads would start threads of its own
     with ThreadPoolExecutor(max_workers=min(4, os.cpu_count() or 1)) as pool:

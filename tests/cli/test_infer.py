@@ -175,3 +175,18 @@ sys.stdout.write("; heavy " + " ".join(compiler))
     shading = load_model("small").preset.shading_features  # without them nobody looks the light up by normal
     expected = sorted({*infer.KERNELS, *infer.SHADER["cpu"]} - (set() if shading else {"envmap"}))
     assert done.stdout.splitlines()[-1] == f"loaded {' '.join(expected)}; heavy "
+
+
+def test_a_refinement_writes_its_picture_and_its_curve(tmp_path):
+    assert command(tmp_path, "--refine-steps", "6", "--views", "3") == 0
+    folder = tmp_path / "out" / "example"
+    assert sorted(p.name for p in folder.iterdir()) == sorted((*results.FILES, results.COMPARISON))
+    record = json.loads((folder / "run_info.json").read_text())["refinement"]
+    assert sum(record["steps"].values()) == 6 and record["kept"] in ("start", "result") and record["curve"]
+    assert record["psnr_after"]["input"] is not None and record["views_held_out"] == [1]
+
+
+def test_a_refinement_of_no_time_is_refused(tmp_path, capsys):
+    for options in (["--refine", "-1"], ["--refine-steps", "0"], ["--refine-cameras"]):
+        assert command(tmp_path, *options) == 2
+        assert "refine" in capsys.readouterr().err and not (tmp_path / "out").exists()

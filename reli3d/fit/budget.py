@@ -1,0 +1,79 @@
+"""How long a fit may take, how far it is, and what it tells while it runs."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+from tqdm import tqdm
+
+
+@dataclass
+class Budget:
+    """Seconds or steps for the parts of a fit; ``steps`` alone gives the same result on every run.
+
+    curve: one entry every ``EVERY`` steps, ``{part, step, seconds, loss}``.  interrupted: Ctrl-C was pressed; parts
+    that are running end at once and later ones do not begin.
+    """
+
+    seconds: float | None = None
+    steps: int | None = None
+    bar: tqdm | None = None
+    curve: list[dict] = field(default_factory=list)
+    counts: dict[str, int] = field(default_factory=dict)
+    interrupted: bool = False
+    began: float = field(default_factory=time.perf_counter)
+
+    EVERY = 10
+
+    def __post_init__(self):
+        if (self.seconds is None) == (self.steps is None):
+            raise ValueError(f"seconds, steps: expected one of the two, got {self.seconds} and {self.steps}")
+        if self.seconds is not None and not 0.0 < self.seconds < 1e6:
+            raise ValueError(f"seconds: expected a positive number, got {self.seconds}")
+        if self.steps is not None and self.steps < 1:
+            raise ValueError(f"steps: expected at least 1, got {self.steps}")
+
+    def part(self, name: str, until: float) -> Iterator[tuple[int, float]]:
+        """``(step, progress)`` with progress in [0, 1), until ``until`` of the whole budget is used.
+
+        With seconds the progress is that of the clock.  A part that would begin after its end takes no step.
+        """
+        started = time.perf_counter() - self.began
+        done = sum(self.counts.values())
+        count = self.counts[name] = 0
+        while not self.interrupted:
+            if self.steps is not None:
+                total = round(self.steps * until) - done
+                progress = count / max(total, 1)
+                if count >= total:
+                    return
+            else:
+                now = time.perf_counter() - self.began
+                if now >= self.seconds * until:
+                    return
+                progress = (now - started) / (self.seconds * until - started)
+            try:
+                yield count, progress
+            except GeneratorExit:
+                return
+            count += 1
+            self.counts[name] = count
+
+    def tell(self, name: str, step: int, loss: float) -> None:
+        """Record the loss of a step and show it."""
+        if step % self.EVERY == 0:
+            seconds = round(time.perf_counter() - self.began, 3)
+            self.curve.append({"part": name, "step": step, "seconds": seconds, "loss": round(loss, 6)})
+        if self.bar is not None:
+            used = sum(self.counts.values()) if self.steps is not None else time.perf_counter() - self.began
+            self.bar.n = min(used, self.bar.total)
+            self.bar.set_postfix_str(f"{name} {loss:.4f}")
+
+
+def progress_bar(budget_total: float, unit: str) -> tqdm:
+    """A bar on stderr over seconds or steps."""
+    layout = "refine: {bar:20} {n:.0f}/{total:.0f} {unit} {postfix} {remaining}"
+    return tqdm(total=budget_total, unit=unit, file=sys.stderr, bar_format=layout, leave=False)

@@ -1,0 +1,67 @@
+"""Values on grids, coarse to fine: what a fit changes, and how coarse parts go before fine ones."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+from torch.nn.functional import interpolate, pad
+
+from reli3d.geometry.grid import sample_grid
+
+
+def space_field(grids: Sequence[Tensor], points: Tensor) -> Tensor:
+    """Sum ``(N, C)`` at ``points (N, 3)`` of grids ``(n, n, n, C)`` over [-1, 1]^3 of rising resolution.
+
+    Coarse grids carry what is smooth, so that a step moves whole regions; fine ones only what those cannot.
+    """
+    return torch.stack([sample_grid(grid.contiguous(), points) for grid in grids]).sum(0)
+
+
+def light_field(maps: Sequence[Tensor], height: int) -> Tensor:
+    """Sum ``(height, 2 height, 3)`` of lat-long maps of rising resolution, bilinear and periodic in azimuth."""
+    total = 0.0
+    for values in maps:
+        planes = values.permute(2, 0, 1)[None]
+        rows = planes.shape[2]
+        if rows != height:
+            factor = height // rows
+            planes = pad(planes, (1, 1, 0, 0), mode="circular")
+            planes = interpolate(planes, scale_factor=factor, mode="bilinear", align_corners=False)
+            planes = planes[..., factor:-factor]
+        total = total + planes[0].permute(1, 2, 0)
+    return total
+
+
+def blurred_grid(grid: Tensor, cells: int) -> Tensor:
+    """``grid (X, Y, Z)`` averaged over blocks of ``cells`` a side and blended between their centres."""
+    if cells <= 1:
+        return grid
+    shape = grid.shape
+    small = tuple(max(1, -(-n // cells)) for n in shape)
+    coarse = interpolate(grid[None, None], small, mode="area")
+    return interpolate(coarse, tuple(shape), mode="trilinear", align_corners=False)[0, 0]
+
+
+class EvenAdam:
+    """Adam with one second moment for the whole tensor: the step keeps the shape of the gradient.
+
+    Adam's own division by the size of each entry undoes a smoothed gradient, because it makes tiny entries as large as
+    the others (Nicolet, Jacobson and Jakob 2021, Large Steps in Inverse Rendering of Geometry, section 3.5).
+    """
+
+    def __init__(self, value: Tensor, betas: tuple[float, float] = (0.9, 0.99)):
+        self.value, self.betas = value, betas
+        self.mean, self.square, self.count = torch.zeros_like(value), 0.0, 0
+
+    @torch.no_grad()
+    def step(self, gradient: Tensor, rate: float) -> None:
+        """Move the value by at most about ``rate`` against ``gradient``."""
+        one, two = self.betas
+        self.count += 1
+        self.mean.mul_(one).add_(gradient, alpha=1.0 - one)
+        self.square = two * self.square + (1.0 - two) * float(gradient.abs().max()) ** 2
+        size = (self.square / (1.0 - two**self.count)) ** 0.5
+        if size > 0.0:
+            self.value.sub_(self.mean, alpha=rate / ((1.0 - one**self.count) * size))

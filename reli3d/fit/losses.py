@@ -1,0 +1,142 @@
+"""What a fit makes small: one function a term with its reason, and all weights in :class:`Weights`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from reli3d.fit.fields import light_field
+from reli3d.fit.unknowns import LIGHT_ROWS, Unknowns
+
+DARK = 0.02  # linear; below it errors count as at it: there photographs hold noise and eyes see little
+ROBUST = 0.25  # of the display range; an error beyond it counts linearly: mirrored surroundings, glare, wrong masks
+SAME = 0.1  # of the display range; colours of one point that differ by more are another surface or a highlight
+PALETTE = 0.5  # of the logarithm of base colour: beyond it two points are of two paints rather than of two shades
+TINT = 0.25  # of the logarithm of colour without brightness: what the light's own colours do to one paint
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Weights of all terms; lengths in cells of the grid, colours in the display's range."""
+
+    outline: float = 10.0  # of :func:`outline`
+    agreement: float = 0.3  # of :func:`agreement`
+    shading: float = 2.0  # of :func:`display_error` while the surface moves
+    curvature: float = 0.01  # of :func:`curvature`
+    stay: float = 2e-3  # of the level's distance from the start, over the number of views
+    picture: float = 1.0  # of :func:`display_error` in the fit of the maps and the light
+    palette: float = 0.03  # of :func:`palette`
+    base_coarse: float = 0.02  # prior of the base colour's coarse field towards the start, over the number of views
+    base_detail: float = 2e-3  # the same of its texture
+    finish: float = 0.05  # prior of roughness and metallic towards the start, over the number of views
+    light: float = 2e-3  # prior of the light's maps towards the start
+    light_slope: float = 2e-3  # of :func:`slopes` of the light
+    exposure: float = 0.1  # of exposures, whose mean the light already has
+    demodulation: float = 0.02  # of :func:`shared_pattern`
+
+
+def display_slope(target: Tensor) -> Tensor:
+    """Slope of the display's curve at linear ``target``, about x^(1/2.2), level below ``DARK``."""
+    return (1.0 / 2.2) * target.clamp(min=DARK) ** (1.0 / 2.2 - 1.0)
+
+
+def display_error(image: Tensor, other: Tensor, target: Tensor, bright: Tensor) -> Tensor:
+    """Mean squared error of ``image (N, 3)`` in the display's range, as a value whose gradient has no bias.
+
+    image, other: two independent estimates of the same linear radiance.  d (I - T)^2 = 2 (I - T) dI: one estimate
+    tells the difference, the other the slope, so the noise does not multiply with itself as in a square.  The display's
+    curve is replaced by its tangent at the photograph, because a curve of a noisy value has another mean than the
+    curve of the mean.  Beyond ``ROBUST`` the error grows linearly.  bright: ``(N, 3)`` bool, photographs at the upper
+    end of their range, where only what is too dark is an error.
+    """
+    slope = display_slope(target)
+    miss = ((other - target) * slope).detach()
+    miss = torch.where(bright, miss.clamp(max=0.0), miss)
+    whole, miss = miss, miss * (ROBUST / miss.abs().clamp(min=ROBUST))
+    apart = (image.detach() - target) * slope
+    value = miss * torch.where(bright, apart.clamp(max=0.0), apart) + miss * (whole - miss)  # squared, then linear
+    pull = 2.0 * miss * slope * image
+    return (value + pull - pull.detach()).mean()
+
+
+def agreement(color: Tensor, weight: Tensor) -> Tensor:
+    """How much the views disagree on the colour of a point, mean over points.
+
+    color: ``(N, V, 3)`` display values where the point projects.  weight: ``(N, V)``, 0 where it is not seen.  A point
+    on the true surface has one colour in all views that see it, but for highlights; a point beside it has another in
+    each.  Neither light nor material is asked, so this holds the shape before they are known.  Points that fewer than
+    two views see say nothing.
+    """
+    total = weight.sum(1)
+    seen = (weight > 0.0).sum(1) >= 2
+    share = weight / total.clamp(min=1e-6)[:, None]
+    mean = (share[..., None] * color).sum(1, keepdim=True)
+    square = (color - mean).square().sum(-1)
+    apart = SAME * SAME * (1.0 - torch.exp(-square / (2.0 * SAME * SAME)))  # bounded: an outlier pulls no surface
+    return ((share * apart).sum(1) * seen).sum() / seen.sum().clamp(min=1) / (SAME * SAME)
+
+
+def outline(cover: Tensor, mask: Tensor) -> Tensor:
+    """Mean absolute difference of antialiased coverage and mask: what the silhouettes miss and what is too much."""
+    return (cover - mask).abs().mean()
+
+
+def curvature(level: Tensor, cell: float, near: Tensor) -> Tensor:
+    """Mean squared Laplacian of the level in the band that ``near`` marks, in cells: bumps that no photograph asks for.
+
+    Silhouettes and colours leave the surface free between what they see; a plain grid answers with noise.
+    """
+    x, near = level / cell, near[1:-1, 1:-1, 1:-1].to(level)
+    around = (x[2:, 1:-1, 1:-1] + x[:-2, 1:-1, 1:-1] + x[1:-1, 2:, 1:-1] + x[1:-1, :-2, 1:-1]
+              + x[1:-1, 1:-1, 2:] + x[1:-1, 1:-1, :-2])  # fmt: skip
+    return ((around - 6.0 * x[1:-1, 1:-1, 1:-1]).square() * near).sum() / near.sum().clamp(min=1.0)
+
+
+def slopes(values: Tensor) -> Tensor:
+    """Mean absolute difference of neighbours of a map ``(H, W, C)`` that is periodic along W: edges may stay, noise
+    goes."""
+    return values.diff(dim=0).abs().mean() + (values - values.roll(1, 1)).abs().mean()
+
+
+def near_start(grids: Sequence[Tensor]) -> Tensor:
+    """Sum over grids of the mean square of what was changed: nobody who is not asked leaves the start's answer."""
+    return torch.stack([grid.square().mean() for grid in grids]).sum()
+
+
+def palette(color: Tensor, tint: Tensor) -> Tensor:
+    """How many base colours an object has: mean over random pairs of points of a bounded distance of their colours.
+
+    color: ``(N, 3)`` logarithms of base colour at points in random order, each paired with the next.  tint: ``(N, 3)``
+    photographed colour, any brightness; pairs of another tint count less.  Shading makes shades of one colour, which
+    this draws together so that the light has to explain them; paints that differ by much more than ``PALETTE`` feel
+    nothing of each other (the global sparsity of reflectances of Barron and Malik 2015, Shape, Illumination, and
+    Reflectance from Shading, section 4.1.2, on pairs).
+    """
+    logs = tint.clamp(min=DARK).log()
+    logs = logs - logs.mean(1, keepdim=True)
+    alike = torch.exp(-(logs - logs.roll(1, 0)).square().sum(1) / (2.0 * TINT * TINT))
+    square = (color - color.roll(1, 0)).square().mean(1)
+    return (alike * square / (square + PALETTE * PALETTE)).mean()
+
+
+def priors(unknowns: Unknowns, weights: Weights, views: int) -> Tensor:
+    """What holds material, light and exposures to the start: less, the more photographs there are."""
+    base, finish = ([grid[..., part] for grid in unknowns.material] for part in (slice(0, 3), slice(3, 5)))
+    loss = weights.base_coarse / views * near_start(base) + weights.finish / views * near_start(finish)
+    loss = loss + weights.light * near_start(unknowns.light)
+    loss = loss + weights.light_slope * slopes(light_field(unknowns.light, LIGHT_ROWS))
+    return loss + weights.exposure * unknowns.exposure.square().mean()
+
+
+def shared_pattern(change: Tensor, shading: Tensor) -> Tensor:
+    """Squared correlation, over points, of the change of log base colour ``(N,)`` and log shading ``(N,)``.
+
+    Paint has no reason to follow the light.  Where a change of the paint repeats the pattern of the shading, or its
+    negative, the light's error is being written into the paint (after Hasselgren, Hofmann and Munkberg 2022, Shape,
+    Light, and Material Decomposition, section 3: demodulation).
+    """
+    a, b = change - change.mean(), (shading - shading.mean()).detach()
+    return (a * b).mean().square() / (b.square().mean() + 1e-4)

@@ -1,0 +1,131 @@
+"""Light and maps of a fixed surface: primary rays are traced once, random pixels are shaded at every step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from reli3d.fit import losses
+from reli3d.fit.budget import Budget
+from reli3d.fit.photographs import WHITE, Photographs
+from reli3d.fit.shading import radiance
+from reli3d.fit.unknowns import (
+    Start,
+    Unknowns,
+    environment,
+    material_change,
+    material_logits,
+    material_of,
+)
+from reli3d.geometry.hits import interpolate
+from reli3d.geometry.rays import RayScene
+from reli3d.render.asset import Asset
+from reli3d.render.gbuffer import primary_hits, sample_texture, surface_points
+from reli3d.render.points import SurfacePoints
+
+BATCH = 6144  # pixels a step
+SAMPLES = ((6, 6, 2), (12, 12, 4))  # of a pixel at the start and the end: coarse steps need no clean images
+PIXELS = 400_000  # of all photographs that are kept: 40 MB; of more, a random part
+RATES = {"material": 0.04, "detail": 0.03, "light": 0.04, "exposure": 0.01}
+OPENING = 0.15  # share of the part after which the next finer map or grid joins in
+DETAIL_FROM = 0.5
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """Pixels that show the object, and what their rays hit; N rows."""
+
+    view: Tensor
+    position: Tensor
+    normal: Tensor
+    ng: Tensor
+    wo: Tensor
+    uv: Tensor
+    logits: Tensor  # of the start's material
+    target: Tensor  # (N, 3) linear
+    order: Tensor  # random, so that a run of it is a fair sample
+
+
+@torch.no_grad()
+def traced(asset: Asset, scene: RayScene, photographs: Photographs, views: list[int], seed: int) -> Pixels:
+    """The pixels of ``views`` well inside the masks at which ``asset`` is hit."""
+    inside, mesh, parts = photographs.inside(), asset.mesh, []
+    for view in views:
+        hits, _, directions = primary_hits(scene, photographs.camera(view))
+        both = inside[view] & (hits.face >= 0)
+        face, bary = hits.face[both], hits.bary[both]
+        at = surface_points(mesh, asset.textures, face, bary)
+        uv = interpolate(mesh.uv, mesh.faces, face, bary)
+        which = torch.full_like(face, view, dtype=torch.long)
+        parts.append((which, at.position, at.normal, at.ng, -directions[both], uv, material_logits(at),
+                      photographs.color[view][both]))  # fmt: skip
+    columns = [torch.cat(column) for column in zip(*parts)]
+    rng = torch.Generator().manual_seed(seed)
+    order = torch.randperm(len(columns[0]), generator=rng).to(columns[0].device)
+    if len(order) > PIXELS:
+        order = order[:PIXELS]
+        columns, order = [column[order] for column in columns], torch.arange(PIXELS, device=order.device)
+    return Pixels(*columns, order)
+
+
+def maps_loss(unknowns: Unknowns, start: Start, pixels: Pixels, rows: Tensor, scene: RayScene | None,
+              weights: losses.Weights, *, samples: tuple[int, int, int], views: int, seed: int,
+              independent: bool = True) -> Tensor:  # fmt: skip
+    """Loss of one step over ``rows`` of the pixels, with gradients to material, detail, light and exposure."""
+    position, view, target = pixels.position[rows], pixels.view[rows], pixels.target[rows]
+    change = material_change(unknowns, position)
+    fine = sample_texture(unknowns.detail, pixels.uv[rows])
+    change = torch.cat([change[:, :3] + fine, change[:, 3:]], 1)
+    points = SurfacePoints(position, pixels.ng[rows], pixels.normal[rows],
+                           *material_of(pixels.logits[rows] + change))  # fmt: skip
+    light, exposure = environment(unknowns, start), unknowns.exposure.exp()[view, None]
+    image = radiance(points, pixels.wo[rows], light, samples=samples, scene=scene, seed=2 * seed) * exposure
+    other = image
+    if independent:
+        with torch.no_grad():
+            other = radiance(points, pixels.wo[rows], light, samples=samples, scene=scene, seed=2 * seed + 1) * exposure
+    loss = weights.picture * losses.display_error(image, other, target, target > WHITE)
+    loss = loss + weights.palette * losses.palette(points.base_color.clamp(min=losses.DARK).log(), target)
+    loss = loss + losses.priors(unknowns, weights, views) + weights.base_detail / views * fine.square().mean()
+    if weights.demodulation:
+        bright = other.detach().mean(1) / points.base_color.detach().mean(1).clamp(min=0.02)
+        shading = bright.clamp(min=1e-3).log()
+        loss = loss + weights.demodulation * losses.shared_pattern(change[:, :3].mean(1), shading)
+    return loss
+
+
+def fit_maps(unknowns: Unknowns, start: Start, asset: Asset, photographs: Photographs, views: list[int],
+             weights: losses.Weights, budget: Budget, until: float, *, name: str, seed: int,
+             detail: bool = True) -> None:  # fmt: skip
+    """Fit light, exposures and materials on the surface of ``asset``, coarse parts first, textures with ``detail``."""
+    scene = RayScene(asset.mesh.vertices, asset.mesh.faces)
+    pixels = traced(asset, scene, photographs, views, seed)
+    count = len(pixels.order)
+    if count == 0:
+        return
+    names = ("light", "exposure", "material", *(("detail",) if detail else ()))
+    groups, opens = [], []
+    for which in names:
+        for k, value in enumerate(unknowns.groups()[which]):
+            groups.append({"params": [value], "lr": 0.0, "full": RATES[which]})
+            opens.append(DETAIL_FROM if which == "detail" else OPENING * k)
+            value.requires_grad_(True)
+    optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99))
+    first = 0
+    for step, progress in budget.part(name, until):
+        for group, opening in zip(optimizer.param_groups, opens, strict=True):
+            fade = 1.0 if progress < 0.6 else 1.0 - 0.9 * (progress - 0.6) / 0.4
+            group["lr"] = group["full"] * fade if progress >= opening else 0.0
+        rows = pixels.order[torch.arange(first, first + min(BATCH, count), device=pixels.order.device) % count]
+        first = (first + BATCH) % count
+        samples = SAMPLES[0] if progress < 0.5 else SAMPLES[1]
+        loss = maps_loss(unknowns, start, pixels, rows, scene, weights, samples=samples, views=len(views),
+                         seed=seed * 1_000_003 + step)  # fmt: skip
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        budget.tell(name, step, float(loss.detach()))
+    for group in optimizer.param_groups:
+        group["params"][0].requires_grad_(False)

@@ -1,0 +1,96 @@
+"""Posed photographs as a fit takes them: linear light, what can be trusted in them, and their cameras."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import torch
+from torch import Tensor
+from torch.nn.functional import interpolate, max_pool2d
+
+from reli3d._bridge import check
+from reli3d.render.camera import Camera
+from reli3d.render.color import srgb_to_linear
+
+WHITE = 0.97  # linear; a brighter pixel may be cut off, so it only says that the surface is at least as bright
+INSIDE = 0.99  # coverage from which a pixel, and its neighbours, show nothing but the object
+
+
+class PosedImages(Protocol):
+    """What :meth:`reli3d.views.views.Views.resampled` gives, or anything like it."""
+
+    images: Tensor  # (V, S, S, 3) sRGB in [0, 1]
+    masks: Tensor  # (V, S, S) in [0, 1]
+    c2w: Tensor  # (V, 4, 4)
+    intrinsics: Tensor  # (V, 4)
+
+
+@dataclass(frozen=True)
+class Photographs:
+    """``V`` photographs of one size and device.
+
+    color: ``(V, S, S, 3)`` linear.  mask: ``(V, S, S)`` coverage in [0, 1].  c2w: ``(V, 4, 4)``.  intrinsics:
+    ``(V, 4)`` in pixels.
+    """
+
+    color: Tensor
+    mask: Tensor
+    c2w: Tensor
+    intrinsics: Tensor
+
+    @classmethod
+    def of(cls, views: PosedImages) -> Photographs:
+        """Photographs from sRGB images.  Raises TypeError or ValueError where the parts do not fit together."""
+        images, masks = views.images, views.masks
+        check("images", images, last=3), check("masks", masks, like=images)
+        check("c2w", views.c2w, last=4, like=images), check("intrinsics", views.intrinsics, last=4, like=images)
+        count = len(images)
+        if images.ndim != 4 or not count or images.shape[1] != images.shape[2]:
+            raise ValueError(f"images: expected (V, S, S, 3) with at least one view, got {tuple(images.shape)}")
+        if masks.shape != images.shape[:3]:
+            raise ValueError(f"masks: expected {tuple(images.shape[:3])}, got {tuple(masks.shape)}")
+        if views.c2w.shape != (count, 4, 4) or views.intrinsics.shape != (count, 4):
+            got = f"{tuple(views.c2w.shape)} and {tuple(views.intrinsics.shape)}"
+            raise ValueError(f"c2w, intrinsics: expected {count} cameras, got {got}")
+        return cls(srgb_to_linear(images.detach()), masks.detach(), views.c2w.detach(), views.intrinsics.detach())
+
+    def __len__(self) -> int:
+        return len(self.color)
+
+    @property
+    def size(self) -> int:
+        """Pixels along a side."""
+        return self.color.shape[1]
+
+    def camera(self, view: int) -> Camera:
+        """The camera of one view."""
+        return Camera(self.c2w[view], self.intrinsics[view], self.size, self.size)
+
+    def select(self, views: list[int]) -> Photographs:
+        """The photographs of these indices, in this order."""
+        return Photographs(self.color[views], self.mask[views], self.c2w[views], self.intrinsics[views])
+
+    def resized(self, size: int) -> Photographs:
+        """The same photographs with ``size`` pixels a side; colours are averaged over what the object covers."""
+        if size == self.size:
+            return self
+        planes = torch.cat([self.color * self.mask[..., None], self.mask[..., None]], -1).permute(0, 3, 1, 2)
+        planes = interpolate(planes, (size, size), mode="bilinear", align_corners=False, antialias=True)
+        cover = planes[:, 3]
+        color = planes[:, :3].permute(0, 2, 3, 1) / cover.clamp(min=1e-4)[..., None]
+        return Photographs(color.contiguous(), cover.clamp(0.0, 1.0), self.c2w, self.intrinsics * (size / self.size))
+
+    def seen_from(self, c2w: Tensor) -> Photographs:
+        """The same photographs with other cameras ``(V, 4, 4)``."""
+        return replace(self, c2w=c2w)
+
+    def moved(self, shift: Tensor, scale: float) -> Photographs:
+        """The same photographs in the frame ``scale * (x - shift)``."""
+        c2w = self.c2w.clone()
+        c2w[:, :3, 3] = scale * (c2w[:, :3, 3] - shift)
+        return replace(self, c2w=c2w)
+
+    def inside(self) -> Tensor:
+        """``(V, S, S)`` bool: pixels that show nothing but the object, and neither do their neighbours."""
+        return max_pool2d(1.0 - self.mask[:, None], 3, 1, 1)[:, 0] < 1.0 - INSIDE

@@ -1,0 +1,250 @@
+"""The surface: levels on a grid, extracted at every step, held by silhouettes, agreement of the views and shading."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import grid_sample, interpolate
+
+from reli3d.fit import losses
+from reli3d.fit.budget import Budget
+from reli3d.fit.fields import EvenAdam, blurred_grid
+from reli3d.fit.photographs import WHITE, Photographs
+from reli3d.fit.shading import radiance
+from reli3d.fit.unknowns import Start, Unknowns, corrected, environment, material_change, material_of, unit
+from reli3d.geometry.distance import signed_distance
+from reli3d.geometry.grid import sample_grid
+from reli3d.geometry.hull import hull_distance, mask_distance
+from reli3d.geometry.mesh import Mesh, largest_components, vertex_normals
+from reli3d.geometry.rays import RayScene
+from reli3d.geometry.smooth import taubin_smooth
+from reli3d.geometry.surface import extract_surface
+from reli3d.geometry.visibility import visible_from
+from reli3d.render.camera import Camera, project
+from reli3d.render.color import linear_to_srgb, srgb_to_linear
+from reli3d.render.gbuffer import primary_hits
+from reli3d.render.points import SurfacePoints
+from reli3d.render.silhouette import antialias, mesh_edges
+
+MARGIN = 3  # cells around the object
+BAND = 4.0  # cells from the surface within which the level's distance is exact at the start
+COARSE = 4  # cells of the grid along a cell of the one that is asked first
+POINTS, SHADED = 8192, 3072  # on the surface, a step, whose colours are compared, and that are shaded
+OUTLINES, OUTLINE_PIXELS = 2, 160  # views a step whose outlines are compared, and their size
+SAMPLES = (8, 8, 2)
+RATE = (0.6, 0.08)  # largest move of the surface in a step, in cells, at the start and the end
+BLUR = (8, 2)  # cells over which a move is spread, at the start and the end
+DETAIL = (0.25, 1.0)  # of the photographs' size, in which colours are compared at the start and the end
+SMALLEST_PART = 0.01  # share of the faces below which a separate piece is dropped
+LEAST = 0.2  # cosine of the view from which a colour counts in full
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A grid of ``shape`` points, ``cell`` apart, whose centre is 0."""
+
+    shape: tuple[int, int, int]
+    cell: float
+
+    @classmethod
+    def around(cls, vertices: Tensor, resolution: int) -> Grid:
+        """About ``resolution`` cells along the longest side of what ``vertices`` span around 0."""
+        reach = vertices.abs().amax(0)
+        cell = 2.0 * float(reach.max()) / resolution
+        return cls(tuple(2 * (math.ceil(r / cell) + MARGIN) + 1 for r in reach.tolist()), cell)
+
+    @property
+    def radius(self) -> tuple[float, ...]:
+        """Half extents."""
+        return tuple(0.5 * self.cell * (n - 1) for n in self.shape)
+
+    def points(self, device) -> Tensor:
+        """``(X, Y, Z, 3)``."""
+        axes = [torch.linspace(-r, r, n, device=device) for r, n in zip(self.radius, self.shape)]
+        return torch.stack(torch.meshgrid(*axes, indexing="ij"), -1)
+
+
+@torch.no_grad()
+def start_level(mesh: Mesh, grid: Grid) -> Tensor:
+    """Signed distance of a closed mesh at the points of ``grid``: exact within ``BAND`` cells, blended beyond."""
+    at = grid.points(mesh.vertices.device)
+    few = tuple(max(2, (n - 1) // COARSE + 1) for n in grid.shape)
+    axes = [torch.linspace(-r, r, n, device=at.device) for r, n in zip(grid.radius, few)]
+    coarse = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1)
+    coarse = signed_distance(mesh.vertices, mesh.faces, coarse.reshape(-1, 3)).reshape(few)
+    level = interpolate(coarse[None, None], grid.shape, mode="trilinear", align_corners=True)[0, 0].contiguous()
+    apart = max(2.0 * r / (n - 1) for r, n in zip(grid.radius, few))
+    near = level.abs() < BAND * grid.cell + apart  # the blend errs by less than half the coarse cell's diagonal
+    level[near] = signed_distance(mesh.vertices, mesh.faces, at[near])
+    return level
+
+
+@torch.no_grad()
+def bound_level(photographs: Photographs, grid: Grid) -> Tensor:
+    """Level of the visual hull of all masks: no surface lies outside any silhouette."""
+    at = grid.points(photographs.mask.device).reshape(-1, 3)
+    inside = hull_distance(at, mask_distance(photographs.mask), photographs.c2w, photographs.intrinsics)
+    return -inside.reshape(grid.shape)
+
+
+def extracted(level: Tensor, bound: Tensor, grid: Grid) -> Mesh:
+    """The surface of the level within the bound, with normals."""
+    mesh = extract_surface(torch.maximum(level, bound), radius=grid.radius)
+    return Mesh(mesh.vertices, mesh.faces, vertex_normals(mesh.vertices, mesh.faces))
+
+
+def finished(level: Tensor, bound: Tensor, grid: Grid, smoothing: int = 2) -> Mesh:
+    """The surface without small loose pieces and without the grid's own ripple."""
+    mesh = largest_components(extracted(level, bound, grid).detach(), SMALLEST_PART)
+    return taubin_smooth(Mesh(mesh.vertices, mesh.faces), iterations=smoothing).with_normals()
+
+
+def seen_colors(display: Tensor, position: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+    """Colours ``(N, V, 3)`` and coverage ``(N, V)`` of the photographs where ``position (N, 3)`` projects.
+
+    display: ``(V, 4, S, S)``, display values times coverage, and coverage.  camera: of all V.  Gradients reach the
+    points and the cameras.
+    """
+    pixels, _ = project(position[None], camera.c2w[:, None], camera.intrinsics[:, None])
+    where = 2.0 * pixels[:, :, None] / camera.width - 1.0
+    values = grid_sample(display, where, mode="bilinear", padding_mode="zeros", align_corners=False)[..., 0]
+    cover = values[:, 3]
+    return (values[:, :3] / cover.clamp(min=1e-2)[:, None]).permute(2, 0, 1), cover.T
+
+
+def display_planes(photographs: Photographs) -> Tensor:
+    """What :func:`seen_colors` reads."""
+    shown = linear_to_srgb(photographs.color.clamp(0.0, 1.0)) * photographs.mask[..., None]
+    return torch.cat([shown, photographs.mask[..., None]], -1).permute(0, 3, 1, 2).contiguous()
+
+
+@dataclass(frozen=True)
+class ShapeData:
+    """What does not change while the surface does."""
+
+    grid: Grid
+    bound: Tensor
+    first: Tensor  # the level at the start
+    start: Start
+    photographs: Photographs  # for outlines
+    planes: list[Tensor]  # of :func:`display_planes`, small to large
+    colored: list[int]  # views whose colours may be used
+
+    @classmethod
+    def of(cls, start: Start, level: Tensor, bound: Tensor, grid: Grid, photographs: Photographs,
+           colored: list[int]) -> ShapeData:  # fmt: skip
+        """Photographs in the sizes that a fit asks for."""
+        sizes = sorted({max(16, round(photographs.size * s)) for s in (DETAIL[0], sum(DETAIL) / 2, DETAIL[1])})
+        used = photographs.select(colored)
+        planes = [display_planes(used.resized(size)) for size in sizes]
+        small = photographs.resized(min(OUTLINE_PIXELS, photographs.size))
+        return cls(grid, bound, level.clone(), start, small, planes, colored)
+
+
+def shape_loss(unknowns: Unknowns, data: ShapeData, weights: losses.Weights, *, progress: float, seed: int,
+               independent: bool = True) -> Tensor:  # fmt: skip
+    """Loss of one step over the surface, with gradients to every part of ``unknowns`` but the detail.
+
+    progress: in [0, 1], how far the fit is; seed: of the step's points, views and light samples.  independent: two
+    estimates of the shading; False gives the value whose slope the gradient is, for tests.
+    """
+    rng = torch.Generator().manual_seed(seed)
+    mesh = extracted(unknowns.level, data.bound, data.grid)
+    scene = RayScene(mesh.vertices, mesh.faces)
+    views, grid = len(data.photographs), data.grid
+    moved = (unknowns.level - data.first) / grid.cell
+    near = data.first.abs() < BAND * grid.cell
+    loss = weights.curvature * losses.curvature(unknowns.level, grid.cell, near)
+    loss = loss + weights.stay / views * (moved.square() * near).sum() / near.sum()
+    loss = loss + weights.outline * _outlines(unknowns, data, mesh, scene, rng)
+    loss = loss + _colors(unknowns, data, mesh, scene, weights, progress, rng, seed, independent)
+    return loss
+
+
+def _outlines(unknowns: Unknowns, data: ShapeData, mesh: Mesh, scene: RayScene, rng) -> Tensor:
+    edges, total, small = mesh_edges(mesh.vertices, mesh.faces), 0.0, data.photographs
+    chosen = torch.randperm(len(small), generator=rng)[:OUTLINES].tolist()
+    for view in chosen:
+        camera = corrected(small.camera(view), unknowns.pose[view])
+        cover = (primary_hits(scene, Camera(camera.c2w.detach(), camera.intrinsics, small.size, small.size))[0].face
+                 >= 0).float()[..., None]  # fmt: skip
+        cover = antialias(cover, mesh.vertices, mesh.faces, camera, scene, edges=edges)[..., 0]
+        total = total + losses.outline(cover, small.mask[view])
+    return total / len(chosen)
+
+
+def _colors(unknowns, data, mesh, scene, weights, progress, rng, seed, independent) -> Tensor:
+    planes = data.planes[min(int(progress * len(data.planes)), len(data.planes) - 1)]
+    size, some = planes.shape[-1], data.photographs.select(data.colored)
+    camera = Camera(some.c2w, some.intrinsics * (size / some.size), size, size)
+    camera = corrected(camera, unknowns.pose[data.colored])
+    pick = torch.randint(len(mesh.vertices), (POINTS,), generator=rng).to(mesh.vertices.device)
+    position, normal = (v.index_select(0, pick) for v in (mesh.vertices, mesh.normals))
+    color, cover = seen_colors(planes, position, camera)
+    weight = sight(scene, position, normal, camera) * (cover.detach() > 0.9)
+    exposure = unknowns.exposure[data.colored].exp()
+    loss = weights.agreement * losses.agreement(color, weight) if len(data.colored) > 1 else 0.0
+    if weights.shading == 0.0:
+        return loss
+    row = torch.nonzero(weight.sum(1) > 0.0)[:SHADED, 0]
+    if len(row) == 0:
+        return loss
+    view = torch.multinomial(weight[row].cpu(), 1, generator=rng)[:, 0].to(row.device)
+    target = srgb_to_linear(color[row, view].detach())
+    position, normal = position[row], normal[row]
+    logits = sample_grid(data.start.material, position) + material_change(unknowns, position)
+    points = SurfacePoints(position, normal.detach(), normal, *material_of(logits))
+    light = environment(unknowns, data.start)
+    wo = unit(camera.c2w[view, :3, 3] - position).detach()
+    image = radiance(points, wo, light, samples=SAMPLES, scene=scene, seed=2 * seed) * exposure[view, None]
+    other = image
+    if independent:
+        with torch.no_grad():
+            other = radiance(points, wo, light, samples=SAMPLES, scene=scene, seed=2 * seed + 1) * exposure[view, None]
+    loss = loss + weights.shading * losses.display_error(image, other, target, target > WHITE)
+    # as strong beside the shading as in the fit of the maps
+    loss = loss + weights.shading * weights.palette * losses.palette(
+        points.base_color.clamp(min=losses.DARK).log(), target
+    )
+    return loss + weights.shading * losses.priors(unknowns, weights, len(data.photographs))
+
+
+@torch.no_grad()
+def sight(scene: RayScene, position: Tensor, normal: Tensor, camera: Camera) -> Tensor:
+    """How well each camera sees the points, ``(N, V)`` in [0, 1]: 0 where they are hidden, less where they are grazed.
+
+    No gradient: no surface shall turn away to be seen less.
+    """
+    seen = visible_from(scene, position, normal, camera.c2w, camera.intrinsics, camera.width)
+    to_eye = unit(camera.c2w[None, :, :3, 3] - position[:, None])
+    return seen * ((to_eye * normal[:, None]).sum(-1) / LEAST).clamp(0.0, 1.0)
+
+
+def fit_shape(unknowns: Unknowns, data: ShapeData, weights: losses.Weights, budget: Budget, until: float, *,
+              seed: int, cameras: bool) -> None:  # fmt: skip
+    """Move ``unknowns.level``, and with it what else :func:`shape_loss` reaches, until ``until`` of the budget."""
+    level = EvenAdam(unknowns.level)
+    rates = {"material": 0.03, "light": 0.02, "exposure": 0.01, **({"pose": 2e-4} if cameras else {})}
+    groups = [{"params": unknowns.groups()[name], "lr": rate} for name, rate in rates.items()]
+    others = torch.optim.Adam(groups, betas=(0.9, 0.99))
+    wanted = [unknowns.level, *(p for g in groups for p in g["params"])]
+    for step, progress in budget.part("shape", until):
+        for value in wanted:
+            value.requires_grad_(True)
+        loss = shape_loss(unknowns, data, weights, progress=progress, seed=seed * 1_000_003 + step)
+        others.zero_grad()
+        gradient, *rest = torch.autograd.grad(loss, wanted, allow_unused=True)
+        for value, slope in zip(wanted[1:], rest, strict=True):
+            value.requires_grad_(False)
+            value.grad = slope
+        unknowns.level.requires_grad_(False)
+        cells = round(BLUR[0] * (BLUR[1] / BLUR[0]) ** progress)
+        rate = data.grid.cell * RATE[0] * (RATE[1] / RATE[0]) ** progress
+        level.step(blurred_grid(gradient, cells), rate)
+        others.step()
+        budget.tell("shape", step, float(loss.detach()))
+    for value in wanted:
+        value.requires_grad_(False)

@@ -1,0 +1,89 @@
+"""Maps from one surface to another that lies close to it, and changes of maps written into textures."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from reli3d.fit.unknowns import Unknowns, material_change, material_logits, material_of, unit
+from reli3d.geometry.bake import Texels, dilate, interpolate, interpolate_tangents, rasterize_texels
+from reli3d.geometry.hits import interpolate as at_hits
+from reli3d.geometry.mesh import Mesh
+from reli3d.geometry.rays import RayScene
+from reli3d.geometry.tangents import encode_normals, vertex_tangents
+from reli3d.geometry.uv import unwrap
+from reli3d.render.asset import Asset, TextureSet
+from reli3d.render.color import linear_to_srgb
+from reli3d.render.gbuffer import sample_texture, surface_points
+from reli3d.render.points import SurfacePoints
+
+REACH = 0.08  # of the box's half side: how far apart the surfaces may lie along the new one's normal
+
+
+def nearest_hits(mesh: Mesh, position: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
+    """Face ``(N,)`` and barycentrics ``(N, 2)`` of ``mesh`` beside points of another surface: where a line along the
+    normal meets it from outside, else its nearest vertex."""
+    scene = RayScene(mesh.vertices, mesh.faces)
+    hits = scene.closest(position + REACH * normal, -normal, t_max=2.0 * REACH)
+    face, bary = hits.face.clone(), hits.bary.clone()
+    missed = torch.nonzero(face < 0)[:, 0]
+    if len(missed):
+        corner = torch.zeros(len(mesh.vertices), dtype=torch.long, device=face.device)
+        corner[mesh.faces.reshape(-1).long()] = torch.arange(mesh.faces.numel(), device=face.device)
+        used = torch.unique(mesh.faces).long()
+        _, found = cKDTree(mesh.vertices[used].cpu().numpy()).query(position[missed].cpu().numpy())
+        at = corner[used[torch.as_tensor(found, device=face.device)]]
+        face[missed] = (at // 3).int()
+        bary[missed] = torch.stack([at % 3 == 1, at % 3 == 2], -1).float()
+    return face, bary
+
+
+def dressed(mesh: Mesh, source: Asset, size: int) -> Asset:
+    """``mesh`` with an atlas, and the maps that ``source`` has beside it; the light of ``source``."""
+    mesh = unwrap(mesh, texture_size=size)
+    mesh = replace(mesh, tangents=vertex_tangents(mesh))
+    texels = rasterize_texels(mesh, size)
+    index = torch.nonzero(texels.valid.reshape(-1))[:, 0]
+    position, normal = interpolate(mesh, texels, index)
+    face, bary = nearest_hits(source.mesh, position, normal)
+    old = surface_points(source.mesh, source.textures, face, bary)
+    bump = old.normal - unit(at_hits(source.mesh.normals, source.mesh.faces, face, bary))
+    world = unit(normal + bump)
+    return Asset(mesh, _textures(mesh, texels, index, old, world, normal), source.environment)
+
+
+def changed(asset: Asset, unknowns: Unknowns) -> Asset:
+    """``asset`` with the changes of its materials written into its textures."""
+    size = asset.textures.size
+    texels = rasterize_texels(asset.mesh, size)
+    index = torch.nonzero(texels.valid.reshape(-1))[:, 0]
+    position, normal = interpolate(asset.mesh, texels, index)
+    found = texels.face.reshape(-1)[index], texels.bary.reshape(-1, 2)[index]
+    old = surface_points(asset.mesh, asset.textures, *found)
+    row, column = torch.div(index, size, rounding_mode="floor"), index % size
+    uv = (torch.stack([column, row], -1) + 0.5) / size
+    logits = material_logits(old) + material_change(unknowns, position)
+    logits[:, :3] += sample_texture(unknowns.detail, uv)
+    color, roughness, metallic = material_of(logits)
+    new = SurfacePoints(position, old.ng, old.normal, color, roughness, metallic)
+    return replace(asset, textures=_textures(asset.mesh, texels, index, new, old.normal, normal))
+
+
+def _textures(mesh: Mesh, texels: Texels, index: Tensor, at: SurfacePoints, world: Tensor,
+              normal: Tensor) -> TextureSet:  # fmt: skip
+    size = texels.face.shape[0]
+    encoded = encode_normals(world, normal, interpolate_tangents(mesh, texels, index))
+    maps = {}
+    for name, value in (
+        ("base_color", linear_to_srgb(at.base_color)),
+        ("roughness", at.roughness[:, None]),
+        ("metallic", at.metallic[:, None]),
+        ("normal", encoded),
+    ):
+        full = value.new_zeros(size * size, value.shape[1])
+        full[index] = value.clamp(0.0, 1.0)
+        maps[name] = full.reshape(size, size, -1)
+    return TextureSet(**dilate(maps, texels.valid))

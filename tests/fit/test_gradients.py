@@ -1,0 +1,100 @@
+"""The gradient of a whole step of a fit against central differences with the same random numbers on both sides.
+
+Directions and densities of light samples are constants of the backward pass.  So levels, materials, exposures and
+cameras are tried with samples of the light alone, which do not move with them, and the light with samples of the
+cosine alone.  What is seen from where, and in which direction, is a constant too: it is taken once and kept.
+"""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from reli3d.fit import shape
+from reli3d.fit.losses import Weights
+from reli3d.fit.photographs import Photographs
+from reli3d.fit.unknowns import Start, Unknowns
+from tests.support import small_scene
+
+SIZE = 40
+
+
+def scene(plain: bool):
+    """Data and unknowns of a ball that is not quite the photographed one; plain: photographs of one even colour."""
+    views = small_scene.photographs(small_scene.painted(small_scene.ball()), 3, SIZE)
+    if plain:  # the slope of a photograph's colour along the surface is no part of the shading's gradient
+        views = replace(views, images=torch.full_like(views.images, 0.5))
+    photographs, asset = Photographs.of(views), replace(small_scene.ball(0.76), environment=small_scene.sky())
+    grid = shape.Grid.around(asset.mesh.vertices, 16)
+    level = shape.start_level(asset.mesh, grid)
+    data = shape.ShapeData.of(Start.of(asset), level, torch.full_like(level, -9.0), grid, photographs, [0, 1, 2])
+    unknowns = Unknowns.zero(level + 0.02 * grid.cell, 3, 8)
+    rng = torch.Generator().manual_seed(2)
+    for values in (*unknowns.material, *unknowns.light, unknowns.exposure):
+        values += 0.1 * torch.randn(values.shape, generator=rng)
+    unknowns.pose += 1e-3 * torch.randn(unknowns.pose.shape, generator=rng)
+    return unknowns, data
+
+
+def towards(kind: str, values: list[Tensor]) -> list[Tensor]:
+    """A direction of change: all entries, all a little alike; smooth bumps; or the camera's own axis."""
+    rng = torch.Generator().manual_seed(5)
+    if kind == "bumps":
+        coarse = torch.randn(1, 1, 6, 6, 6, generator=rng)
+        return [torch.nn.functional.interpolate(coarse, v.shape, mode="trilinear")[0, 0] for v in values]
+    if kind == "axis":
+        return [torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, 1.0]).expand_as(v) for v in values]
+    return [1.0 + 0.3 * torch.randn(v.shape, generator=rng) for v in values]
+
+
+NONE = dict.fromkeys(vars(Weights()), 0.0)
+LIGHT, COSINE = (64, 0, 0), (0, 0, 64)
+# an outline goes from pixel to pixel by small jumps, which only a wide step averages; the rest is smooth, and float32
+CASES = {
+    "level, outlines": ("level", {"outline": 1.0}, "all", LIGHT, False, 5e-3, 0.1),
+    "level, agreement": ("level", {"agreement": 1.0}, "all", LIGHT, False, 1e-4, 0.02),
+    "level, shading": ("level", {"shading": 1.0}, "bumps", LIGHT, True, 3e-4, 0.05),
+    "level, priors": ("level", {"curvature": 1.0, "stay": 1.0}, "all", LIGHT, False, 1e-3, 0.02),
+    "material": ("material", {"shading": 1.0}, "all", LIGHT, True, 1e-2, 0.02),
+    "light": ("light", {"shading": 1.0}, "all", COSINE, True, 1e-3, 0.02),
+    "exposure": ("exposure", {"shading": 1.0}, "all", LIGHT, True, 1e-2, 0.02),
+    "camera, outlines": ("pose", {"outline": 1.0}, "axis", LIGHT, False, 1e-2, 0.1),
+    "camera, agreement": ("pose", {"agreement": 1.0}, "all", LIGHT, False, 1e-4, 0.02),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_step_has_the_slope_of_central_differences(case, monkeypatch):
+    name, terms, kind, samples, plain, step, tolerance = CASES[case]
+    weights = Weights(**{**NONE, **terms})
+    monkeypatch.setattr(shape, "SAMPLES", samples)
+    unknowns, data = scene(plain)
+    sight, kept = shape.sight, []
+    monkeypatch.setattr(shape, "sight", lambda *a: (kept or kept.append(sight(*a)) or kept)[0])
+    radiance, eyes = shape.radiance, []
+
+    def shown(points, wo, light, **options):
+        """Without shadows and with the directions to the eye kept: both move with the surface, and have no slope."""
+        return radiance(points, (eyes or eyes.append(wo) or eyes)[0], light, **{**options, "scene": None})
+
+    monkeypatch.setattr(shape, "radiance", shown)
+    values = unknowns.groups()[name]
+    directions = towards(kind, values)
+
+    def loss() -> Tensor:
+        return shape.shape_loss(unknowns, data, weights, progress=0.9, seed=1, independent=False)
+
+    for value in values:
+        value.requires_grad_(True)
+    slopes = torch.autograd.grad(loss(), values, allow_unused=True)
+    got = sum(float((g * d).sum()) for g, d in zip(slopes, directions, strict=True) if g is not None)
+    for value in values:
+        value.requires_grad_(False)
+    ends = []
+    for sign in (1.0, -2.0):
+        for value, direction in zip(values, directions, strict=True):
+            value += sign * step * direction
+        ends.append(float(loss().double()))
+    want = (ends[0] - ends[1]) / (2.0 * step)
+    assert got == pytest.approx(want, rel=tolerance)

@@ -1,0 +1,62 @@
+"""A small known scene for fits: a ball of two paints under a sky, photographed by the renderer from all around."""
+
+import math
+from dataclasses import replace
+
+import torch
+
+from reli3d.geometry.surface import extract_surface
+from reli3d.geometry.tangents import vertex_tangents
+from reli3d.geometry.uv import unwrap
+from reli3d.render.asset import Asset, TextureSet
+from reli3d.render.camera import Camera, look_at
+from reli3d.render.color import linear_to_srgb
+from reli3d.render.environment import Environment
+from reli3d.render.render import render
+from reli3d.render.shading import ShadeOptions
+from reli3d.views.views import ViewBatch
+from tests.rigs import eyes_around
+
+TEXELS = 64
+
+
+def ball(radius: float = 0.8, cells: int = 24, squeeze: float = 1.0) -> Asset:
+    """A closed ball with an atlas, grey maps and an even light; ``squeeze`` scales its height."""
+    axis = torch.linspace(-1.0, 1.0, cells + 1)
+    points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
+    level = (points / torch.tensor([1.0, squeeze, 1.0])).norm(dim=-1) - radius
+    mesh = unwrap(extract_surface(level, radius=1.0).with_normals(), texture_size=TEXELS)
+    mesh = replace(mesh, tangents=vertex_tangents(mesh))
+    grey = torch.full((TEXELS, TEXELS, 3), 0.6)
+    return Asset(mesh, TextureSet(grey, 0.6, 0.1), Environment(torch.full((16, 32, 3), 0.5)))
+
+
+def sky() -> Environment:
+    """Bright from above and one side, dark from below; three colours."""
+    row = torch.linspace(1.6, 0.1, 16)[:, None, None]
+    column = 0.6 + 0.4 * torch.cos(torch.linspace(0.0, 2.0 * math.pi, 33)[:-1])[None, :, None]
+    return Environment((row * column * torch.tensor([0.9, 1.0, 1.1])).contiguous())
+
+
+def painted(asset: Asset) -> Asset:
+    """The ball with a red and a green half and the sky around it."""
+    from reli3d.geometry.bake import bake
+
+    def paint(position, normal):
+        side = torch.sigmoid(40.0 * position[:, :1])
+        return side * torch.tensor([0.8, 0.25, 0.2]) + (1.0 - side) * torch.tensor([0.25, 0.6, 0.3])
+
+    color = bake(asset.mesh, TEXELS, paint)["value"]
+    return Asset(asset.mesh, replace(asset.textures, base_color=color), sky())
+
+
+def photographs(asset: Asset, count: int, size: int) -> ViewBatch:
+    """``count`` pictures of ``asset`` in its own light, little noise, antialiased masks."""
+    eyes = eyes_around(count, 3.2).float()
+    c2w = look_at(eyes, torch.zeros(3), torch.tensor([0.05, 1.0, 0.02]))
+    camera = Camera.from_fov(c2w, math.radians(38.0), size, size)
+    options = ShadeOptions(samples=(32, 16, 8), paint="published")
+    cameras = [Camera(c2w[i], camera.intrinsics[i], size, size) for i in range(count)]
+    shots = [render(asset, c, options=options, supersampling=2) for c in cameras]
+    colors = torch.stack([linear_to_srgb((s.radiance / s.alpha.clamp(min=1e-3)[..., None]).clamp(0, 1)) for s in shots])
+    return ViewBatch(colors, torch.stack([s.alpha for s in shots]), camera.c2w, camera.intrinsics)
