@@ -15,7 +15,7 @@ from reli3d.render.environment import Environment
 from reli3d.render.render import render
 from reli3d.render.shading import ShadeOptions
 from reli3d.views.views import ViewBatch
-from tests.rigs import eyes_around
+from tests.support.rigs import eyes_around
 
 TEXELS = 64
 
