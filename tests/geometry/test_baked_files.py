@@ -21,7 +21,7 @@ from tests.support.meshes import QUICK, SLOW, loaded
 from tests.support.texels import bilinear, color
 
 STEP = 1 / 255
-DARKEST = 0.1  # of test_bake.color: a darker texel was never written
+DARKEST = 0.1  # of the colour's values: a darker texel was never written
 FIELDS = {5126: ("<f4", 4), 5125: ("<u4", 4)}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 

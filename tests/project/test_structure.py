@@ -100,6 +100,48 @@ def test_the_import_check_allows_what_it_should():
     assert violations("from reli3d import Mesh, sample_triplane", "reli3d.nn.model") == []
 
 
+def of_other_tests(source: str, folder: str) -> list[str]:
+    """What a file of ``tests`` imports from test modules, or one of ``bench`` from ``tests``."""
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, (ast.Import, ast.ImportFrom)):
+            base = (node.module or "").split(".") if isinstance(node, ast.ImportFrom) else []
+            found += [[*base, *alias.name.split(".")] for alias in node.names]
+    if folder == "bench":
+        return [".".join(parts) for parts in found if parts[0] == "tests"]
+    return [".".join(parts) for parts in found if any(p == "conftest" or p.startswith("test_") for p in parts)]
+
+
+@pytest.mark.parametrize("folder", ["tests", "bench"])
+def test_no_test_imports_another_and_bench_imports_no_test(folder):
+    files = sorted((ROOT / folder).rglob("*.py"))
+    found = {name_of(path): of_other_tests(path.read_text(), folder) for path in files}
+    assert len(found) > 20 and {name: bad for name, bad in found.items() if bad} == {}
+
+
+@pytest.mark.parametrize(
+    "source, folder, count",
+    [
+        ("from tests.geometry.test_rays import soup", "tests", 1),
+        ("from tests.geometry import test_rays", "tests", 1),
+        ("def f():\n    import tests.geometry.test_rays as other", "tests", 1),
+        ("from . import test_rays", "tests", 1),
+        ("from tests.conftest import DEVICES", "tests", 1),
+        ("from tests.support.rays import soup", "bench", 1),
+        ("from tests.support.rays import soup", "tests", 0),
+        ("from bench.surface import field", "tests", 0),
+    ],
+)
+def test_the_check_of_tests_sees_what_it_should(source, folder, count):
+    assert len(of_other_tests(source, folder)) == count
+
+
+def test_folders_of_tests_have_the_names_of_rooms():
+    folders = {path.parent for path in (ROOT / "tests").glob("*/*.py")}
+    assert {folder.name for folder in folders} <= {*LEVEL, "bridge", "project", "support"}
+    assert all((folder / "__init__.py").exists() for folder in folders)  # equal names of files do not meet
+
+
 def test_modules_import_each_other_in_no_circle():
     modules = {name_of(p): p for p in SOURCES if p.name != "__init__.py"}
     graph = {}

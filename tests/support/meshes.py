@@ -18,11 +18,13 @@ def mesh_of(vertices, faces) -> Mesh:
 
 
 def loaded(path) -> Mesh:
+    """The whole file as one mesh, without texture coordinates."""
     shape = trimesh.load(path, force="mesh", process=False)
     return mesh_of(shape.vertices, shape.faces)
 
 
 def sheet(n=9):
+    """A bumpy sheet of ``n x n`` vertices, and which of them lie on its border."""
     x, y = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
     vertices = np.stack([x, y, np.random.default_rng(0).normal(size=x.shape)], -1).reshape(-1, 3)
     corner = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).reshape(-1)

@@ -15,6 +15,7 @@ PLACES = [((1.0, 1.0, 1.0), 0.0), ((1e-4, 1e-4, 1e-4), 0.0), ((1.0, 1.0, 1e3), 0
 
 
 def make(vertices, faces, backend, device):
+    """The scene, or a visible skip where the backend has no such device."""
     if backend == "embree" and device.type != "cpu":
         pytest.skip("Embree runs on CPU only")
     v = torch.as_tensor(np.asarray(vertices), dtype=torch.float32, device=device)
@@ -22,6 +23,7 @@ def make(vertices, faces, backend, device):
 
 
 def soup(seed, count=60):
+    """Vertices and faces of triangles at random places, none joined."""
     rng = np.random.default_rng(seed)
     centre = rng.uniform(-1, 1, (count, 1, 3))
     vertices = (centre + rng.normal(0, 0.3, (count, 3, 3))).reshape(-1, 3).astype(np.float32)
@@ -36,6 +38,7 @@ def bumpy(seed, subdivisions=2, height=0.25):
 
 
 def rays(n, seed=0, reach=2.0):
+    """Random origins within ``reach`` and directions of random length."""
     rng = np.random.default_rng(seed)
     o, d = rng.uniform(-reach, reach, (n, 3)), rng.normal(size=(n, 3))
     return torch.tensor(o, dtype=torch.float32), torch.tensor(d, dtype=torch.float32)
@@ -48,6 +51,7 @@ def placed(vertices, o, d, stretch, shift):
 
 
 def packed(counts, device, step=0.05, seed=2):
+    """Samples of rays with these counts, random densities (some negative) and colours."""
     rng = torch.Generator().manual_seed(seed)
     first = torch.nn.functional.pad(torch.tensor(counts).cumsum(0), (1, 0)).int()
     ray = torch.repeat_interleave(torch.arange(len(counts)), torch.tensor(counts)).int()

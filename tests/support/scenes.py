@@ -13,16 +13,19 @@ SKIES = ("constant", "sky", "sun")
 
 
 def eye(device, *position):
+    """Pose of a camera that looks at the origin."""
     at = torch.tensor(position, dtype=torch.float32, device=device)
     return look_at(at, torch.zeros(3, device=device), torch.tensor([0.0, 1.0, 0.0], device=device))
 
 
 def textures(size, device, color=(0.5, 0.5, 0.5), roughness=0.5, metallic=0.0, normal=(0.5, 0.5, 1.0)):
+    """Maps of one value each."""
     color, normal = (torch.tensor(v, device=device).expand(size, size, 3).contiguous() for v in (color, normal))
     return TextureSet(color, roughness, metallic, normal)
 
 
 def ball(device, color=(0.7, 0.7, 0.7)):
+    """An asset of one finish; its texture coordinates are random."""
     m = trimesh.creation.icosphere(subdivisions=3, radius=0.6)
     f = torch.tensor(m.faces, dtype=torch.int32, device=device)
     v = torch.tensor(m.vertices, dtype=torch.float32, device=device)
@@ -41,6 +44,7 @@ def ball_mesh(subdivisions: int, radius: float) -> Mesh:
 
 
 def shadow_caster(device, backend="auto"):
+    """A ball above the unit ball's points: it hides part of the sky."""
     mesh = trimesh.creation.icosphere(subdivisions=3, radius=0.4)
     mesh.apply_translation([0, 1.2, 0])
     vertices, faces = torch.tensor(mesh.vertices).float().to(device), torch.tensor(mesh.faces).int().to(device)
@@ -48,11 +52,13 @@ def shadow_caster(device, backend="auto"):
 
 
 def sky(height=16, seed=0, power=3.0):
+    """A map of random texels up to 2; the greater ``power``, the fewer are bright."""
     g = torch.Generator().manual_seed(seed)
     return Environment(torch.rand(height, 2 * height, 3, generator=g) ** power * 2.0)
 
 
 def light(name, device):
+    """One of :data:`SKIES`: even light, a sky brighter above, and the sky with a sun of one texel."""
     up = torch.linspace(1, -1, 32)[:, None, None].clamp(min=0.0)
     map_ = (0.4 + 0.6 * up).expand(32, 64, 3).clone()
     if name == "constant":

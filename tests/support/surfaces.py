@@ -17,6 +17,7 @@ def on_ball(normal, wo, base_color, roughness, metallic) -> tuple[SurfacePoints,
 
 
 def points(n, seed=1):
+    """Random normals, and views at most 87 degrees from them."""
     g = torch.Generator().manual_seed(seed)
     normal = torch.nn.functional.normalize(torch.randn(n, 3, generator=g), dim=-1)
     wo = torch.nn.functional.normalize(normal + 0.6 * torch.randn(n, 3, generator=g), dim=-1)
