@@ -7,8 +7,11 @@ import importlib
 import os
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+
+from reli3d.cli.ending import command, reason
 
 STARTED = time.monotonic()
 EXAMPLE = Path(__file__).parents[1] / "assets" / "example"
@@ -21,7 +24,7 @@ def parser() -> argparse.ArgumentParser:
     p = argparse.ArgumentParser(
         prog="reli3d-infer",
         description="Turn a few posed photographs of an object into a relightable GLB and an HDR environment.",
-        epilog="Exit code: 0 all done, 1 some objects failed, 2 wrong input.  Results go to stdout.",
+        epilog="Exit code: 0 all done, 1 some objects failed, 2 wrong input, 130 interrupted.  Results go to stdout.",
     )
     p.add_argument("folder", nargs="*", type=Path, help="object folders: transforms.json or a COLMAP text model; "
                    "default the bundled example")  # fmt: skip
@@ -71,7 +74,10 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
+@command("reli3d-infer")
 def main(argv: list[str] | None = None) -> int:
+    from reli3d.output.folder import check_place
+
     args = parser().parse_args(argv)
     if args.doctor:
         from reli3d.cli import doctor
@@ -80,6 +86,8 @@ def main(argv: list[str] | None = None) -> int:
     folders = args.folder or [EXAMPLE]
     names = object_names(folders)
     try:
+        for name in names:
+            check_place(args.output / name)  # before minutes of work
         device = choose_device(args.device)
         job = None if args.check else Job(args, device)
     except (ValueError, OSError) as error:
@@ -90,8 +98,6 @@ def main(argv: list[str] | None = None) -> int:
         try:
             if args.check:
                 check(folder, target, args)
-            elif args.skip_existing and job.complete(target, compatible=args.compatible_names):
-                print(f"{name}: all files are there, skipped", file=sys.stderr)
             else:
                 job.run(folder, name, target)
             done += 1
@@ -107,8 +113,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _fail(error: BaseException, name: str | None = None) -> int:
-    text = " ".join(str(error).split()) or type(error).__name__
-    print(f"reli3d-infer: {name + ': ' if name else ''}{text}", file=sys.stderr)
+    print(f"reli3d-infer: {name + ': ' if name else ''}{reason(error)}", file=sys.stderr)
     return 2
 
 
@@ -168,14 +173,13 @@ class Job:
         import torch
 
         from reli3d.nn import weights
-        from reli3d.output import results
         from reli3d.pipeline import check_options
 
         check_options(args.texture_size, args.resolution)
         if args.download:
             _fetch(args.weights)
         path = weights.locate(args.weights)
-        self.args, self.device, self.complete = args, device, results.complete
+        self.args, self.device = args, device
         trunk = args.precision and {"float32": torch.float32, "bfloat16": torch.bfloat16}[args.precision]
         self.model, self.manifest = weights.load(path, trunk=trunk, device=device)
         self.digest = weights.known_sha256(path)
@@ -184,11 +188,17 @@ class Job:
 
     def run(self, folder: Path, name: str, target: Path) -> None:
         """Reconstruct one object and write its files; the bar goes before an error is told."""
-        with Progress(name) as steps:
-            self._run(folder, name, target, steps)
-        print(target / "mesh.glb")
+        from reli3d.output import results
 
-    def _run(self, folder: Path, name: str, target: Path, steps: Progress) -> None:
+        with results.claim(target) as replacing:
+            if self.args.skip_existing and results.complete(target, compatible=self.args.compatible_names):
+                print(f"{name}: all files are there, skipped", file=sys.stderr)
+                return
+            with Progress(name) as steps:
+                self._run(folder, name, replacing, steps)
+        print(target / "mesh.glb", flush=True)
+
+    def _run(self, folder: Path, name: str, replacing: Callable, steps: Progress) -> None:
         from reli3d.output import results
         from reli3d.output.preview import preview
         from reli3d.pipeline import default_normalization, output_frame, reconstruct
@@ -244,7 +254,7 @@ class Job:
             "versions": results.versions(),
         }
         steps("writing")
-        results.write_results(target, asset, shown, picture, info, compatible=args.compatible_names)
+        results.write_results(replacing, asset, shown, picture, info, compatible=args.compatible_names)
 
 
 def ready_kernels(device: str) -> None:

@@ -1,11 +1,11 @@
-"""The files of one reconstruction: written beside their place first, then moved, so that none is ever half there."""
+"""The files of one reconstruction, which change together: :mod:`reli3d.output.folder`."""
 
 from __future__ import annotations
 
 import json
-import os
-import shutil
 import sys
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
@@ -18,6 +18,7 @@ from reli3d.io.glb import write_glb
 from reli3d.io.hdr import write_environment
 from reli3d.io.images import write_png
 from reli3d.nn.weights import Manifest
+from reli3d.output.folder import claimed
 from reli3d.output.viewer import viewer_page
 from reli3d.render.asset import Asset
 from reli3d.views.similarity import Similarity
@@ -25,6 +26,7 @@ from reli3d.views.views import Views
 
 FILES = ("mesh.glb", "environment.exr", "environment.hdr", "preview.png", "viewer.html", "run_info.json")
 PUBLISHED_LIGHT = "illumination.hdr"  # name of the light in the published release, whose centre column is -Z
+OURS = (*FILES, PUBLISHED_LIGHT)  # what a new result never leaves of an old one
 
 
 def complete(folder: Path, *, compatible: bool = False) -> bool:
@@ -34,6 +36,11 @@ def complete(folder: Path, *, compatible: bool = False) -> bool:
 
 def _names(compatible: bool) -> tuple[str, ...]:
     return (*FILES, PUBLISHED_LIGHT) if compatible else FILES
+
+
+def claim(folder: Path) -> AbstractContextManager[Callable]:
+    """Hold ``folder`` for one result: :func:`~reli3d.output.folder.claimed`.  Raises OSError, InputError."""
+    return claimed(folder, OURS)
 
 
 def mesh_statistics(mesh: Mesh) -> dict:
@@ -52,37 +59,30 @@ def peak_memory_mib() -> float | None:
 
 
 def write_results(
-    folder: Path, asset: Asset, views: Views, picture: np.ndarray, info: dict, *, compatible: bool = False
+    replacing: Callable, asset: Asset, views: Views, picture: np.ndarray, info: dict, *, compatible: bool = False
 ) -> None:
-    """Write :data:`FILES` into ``folder``; an error leaves what was there before.  Raises OSError, ValueError.
+    """Write :data:`FILES`; an error leaves what was there before.  Raises OSError, ValueError.
 
+    replacing: what :func:`claim` of the folder gives.
     views: the photographs, in the frame of ``asset``.  picture: :func:`~reli3d.output.preview.preview` of both.
     info: what ``run_info.json`` holds, the convention of the light apart.
     compatible: write the light as :data:`PUBLISHED_LIGHT` as well.
     """
     radiance = asset.environment.radiance
     info = {**info, "environment_centre": "+X"}
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    temporary = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
-    temporary.mkdir()
-    try:
+    with replacing() as new:
         extras = {k: info[k] for k in ("output_from_input", "model_from_input", "weights")}
-        write_glb(temporary / "mesh.glb", asset, extras=extras)
+        write_glb(new / "mesh.glb", asset, extras=extras)
         for name in ("environment.exr", "environment.hdr"):
-            write_environment(temporary / name, radiance)
+            write_environment(new / name, radiance)
         if compatible:
-            write_environment(temporary / PUBLISHED_LIGHT, radiance, centre="-Z")
-        write_png(temporary / "preview.png", picture)
+            write_environment(new / PUBLISHED_LIGHT, radiance, centre="-Z")
+        write_png(new / "preview.png", picture)
         low, high = asset.mesh.vertices.aminmax(dim=0)
-        page = viewer_page(info["object"], {"mesh": (temporary / "mesh.glb").read_bytes()}, radiance,
+        page = viewer_page(info["object"], {"mesh": (new / "mesh.glb").read_bytes()}, radiance,
                            (low + high) / 2, float((high - low).norm()) / 2, views)  # fmt: skip
-        (temporary / "viewer.html").write_text(page)
-        (temporary / "run_info.json").write_text(json.dumps(info, indent=1) + "\n")
-        folder.mkdir(exist_ok=True)
-        for name in _names(compatible):
-            os.replace(temporary / name, folder / name)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+        (new / "viewer.html").write_text(page, encoding="utf-8")
+        (new / "run_info.json").write_text(json.dumps(info, indent=1) + "\n")
 
 
 def frame_record(model_from_input: Similarity, output_from_input: Similarity, frame: str, up: str) -> dict:
