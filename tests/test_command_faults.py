@@ -2,7 +2,6 @@
 
 import os
 import re
-import resource
 import signal
 import subprocess
 import sys
@@ -12,11 +11,14 @@ import pytest
 
 from reli3d.cli import infer
 
-# reli3d-infer with a network that takes no time: its one object is {body}
+# reli3d-infer without torch, which takes seconds to load, and without a network: its one object is {body}
 QUICK = """
-import sys, time
+import sys, time, types
 from pathlib import Path
 from reli3d.cli import infer
+from reli3d.output.folder import claimed
+sys.modules["reli3d.output.results"] = types.SimpleNamespace(claim=lambda folder: claimed(folder, ["mesh.glb"]))
+infer.choose_device = lambda wanted: wanted
 class Job(infer.Job):
     def __init__(self, args, device):
         self.args = args
@@ -81,7 +83,6 @@ def test_ascii_streams_change_nothing(tmp_path):
 
 @pytest.mark.parametrize("streams", [(1,), (2,), (0, 1, 2)])
 def test_closed_streams_change_nothing(tmp_path, streams):
-    options = {k: None for k in ("stdout", "stderr")}
     with open(tmp_path / "log", "w") as log:
         options = {"stdout": log, "stderr": log, "preexec_fn": lambda: [os.close(n) for n in streams]}
         process = start(["--output", tmp_path / "out"], **options)
@@ -112,10 +113,11 @@ def test_a_full_disk_is_one_line_and_leaves_the_old_result(tmp_path):
     """A limit on the size of a file stands for the disk: both raise OSError in the middle of a write."""
     (tmp_path / "out/example").mkdir(parents=True)
     (tmp_path / "out/example/mesh.glb").write_text("old")
-    body = """with replacing() as new:
+    body = """import resource
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
+        with replacing() as new:
             (new / "mesh.glb").write_bytes(bytes(1 << 20))"""
-    limit = lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))  # noqa: E731
-    process = start(["--output", tmp_path / "out"], body=body, preexec_fn=limit)
+    process = start(["--output", tmp_path / "out"], body=body)
     out, err = process.communicate(timeout=60)
     assert process.returncode == 1 and out == ""
     assert len(told(err)) == 1 and "File too large" in told(err)[0] and "Traceback" not in err
