@@ -79,6 +79,12 @@ def reason(error: BaseException) -> str:
     return " ".join(str(error).split()) or type(error).__name__
 
 
+def check_range(name: str, value: float | None, low: float, high: float) -> None:
+    """Raise ValueError where the option ``--name`` is given and not within ``low`` and ``high``."""
+    if value is not None and not low <= value <= high:
+        raise ValueError(f"--{name}: expected {low:g} to {high:g}, got {value}")
+
+
 def _said(name: str, text: str, code: int) -> int:
     print(f"{name}: {text}", file=sys.stderr)
     return code

@@ -26,14 +26,17 @@ LONGEST = 255  # bytes of a name, on every usual file system
 NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.ENOLCK)  # file systems that have none: the same
 
 
-def check_place(folder: Path) -> Path:
-    """``folder`` with links resolved; nothing is written.  Raises InputError where no result can be put there."""
+def check_folder(folder: Path, *, longest: int = LONGEST) -> Path:
+    """``folder``, there or not, with links resolved; nothing is written.  Raises InputError where it takes no file.
+
+    longest: bytes of its own name.
+    """
     folder = Path(os.path.realpath(folder))
     try:
         str(folder).encode()
     except UnicodeEncodeError:
         raise InputError(folder, "expected an output folder with a name in UTF-8; give another --output") from None
-    for part, limit in (*((p, LONGEST) for p in folder.parts[:-1]), (folder.name, LONGEST - len(".") - len(PARTIAL))):
+    for part, limit in (*((p, LONGEST) for p in folder.parts[:-1]), (folder.name, longest)):
         if len(part.encode()) > limit:
             raise InputError(shown(part), f"expected a name of at most {limit} bytes for the output, got "
                              f"{len(part.encode())}; rename the folder or give another --output")  # fmt: skip
@@ -42,9 +45,15 @@ def check_place(folder: Path) -> Path:
         above = above.parent
     if not above.is_dir():
         raise InputError(above, "expected a folder for the output, got a file; give another --output")
-    for place in {above, folder.parent if folder.exists() else above}:
-        if not os.access(place, os.W_OK | os.X_OK):
-            raise InputError(place, "expected a folder that can be written, got one that cannot; give another --output")
+    if not os.access(above, os.W_OK | os.X_OK):
+        raise InputError(above, "expected a folder that can be written, got one that cannot; give another --output")
+    return folder
+
+
+def check_place(folder: Path) -> Path:
+    """:func:`check_folder` of a result folder, which others of its name must fit beside."""
+    folder = check_folder(folder, longest=LONGEST - len(".") - len(PARTIAL))
+    check_folder(folder.parent)
     if os.path.ismount(folder):
         raise InputError(folder, "expected a folder that can be renamed, got a mount point; mount its parent")
     return folder
