@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import argparse
 import os
+import signal
 import sys
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context
 from pathlib import Path
 
+from reli3d.cli.ending import check_range, command
 from reli3d.cli.helping import Defaults
 
 
@@ -43,6 +46,7 @@ def _start(maps: Path, held: bool) -> None:
 
     from reli3d.synthetic.maps import held_back, load_maps
 
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the first one ends the others
     torch.set_num_threads(1)
     lights, names = load_maps(maps)
     _LIGHTS = [m for m, h in zip(lights, held_back(names), strict=True) if h == held]
@@ -51,8 +55,10 @@ def _start(maps: Path, held: bool) -> None:
 def _make(seed: int, target: Path, args: argparse.Namespace) -> str | None:
     """Write one sample; the reason instead where the object could not be made."""
     import numpy as np
+    from safetensors import SafetensorError
     from safetensors.torch import save_file
 
+    from reli3d.io.files import replacing
     from reli3d.synthetic.maps import with_lamps
     from reli3d.synthetic.procedural import make_object
     from reli3d.synthetic.samples import ObjectSurface, synthesize
@@ -73,14 +79,33 @@ def _make(seed: int, target: Path, args: argparse.Namespace) -> str | None:
         sample = synthesize(surface, light, rng, size=args.size, views=args.views)
     except ValueError as error:
         return f"seed {seed}: {error}"
-    temporary = target.with_suffix(f".tmp{os.getpid()}")
-    save_file(sample, temporary)
-    os.replace(temporary, target)
+    try:
+        with replacing(target) as temporary:
+            save_file(sample, temporary)
+    except SafetensorError as error:  # a full disk, for one
+        raise OSError(f"{target}: cannot be written ({error})") from None
     return None
 
 
+def _check(args: argparse.Namespace) -> None:
+    from reli3d.io.files import file_size
+    from reli3d.output.folder import check_folder
+    from reli3d.synthetic.maps import held_back, load_maps
+
+    for name, low, high in (("first", 0, 10**9), ("count", 1, 10**9), ("views", 1, 64), ("size", 16, 2048),
+                            ("workers", 1, 1024)):  # fmt: skip
+        check_range(name, getattr(args, name), low, high)
+    check_folder(args.output)
+    for path in (*(args.meshes or ()), *(args.shapes or ())):
+        file_size(path)
+    if bool(args.held_back) not in held_back(load_maps(args.maps)[1]):
+        raise ValueError("--maps: expected at least six maps for --held-back, got fewer")
+
+
+@command("reli3d-data")
 def main(argv: list[str] | None = None) -> int:
     args = parser().parse_args(argv)
+    _check(args)
     from tqdm import tqdm
 
     from reli3d.synthetic.procedural import TEST_SEEDS, VALIDATION_SEEDS
@@ -93,13 +118,20 @@ def main(argv: list[str] | None = None) -> int:
     jobs = [j for j in jobs if not j[1].exists()]
     context = get_context("spawn")
     failed = 0
-    with ProcessPoolExecutor(args.workers, context, _start, (args.maps, bool(args.held_back))) as pool:
+    pool = ProcessPoolExecutor(args.workers, context, _start, (args.maps, bool(args.held_back)))
+    try:
         futures = [pool.submit(_make, seed, target, args) for seed, target in jobs]
         for future in tqdm(as_completed(futures), total=len(futures), file=sys.stderr, unit="object"):
             reason = future.result()
             failed += reason is not None
             if reason:
                 tqdm.write(reason, file=sys.stderr)
+    except BrokenProcessPool:
+        raise OSError(
+            "workers: expected all to live, got one killed (too little memory?); give fewer --workers"
+        ) from None
+    finally:
+        pool.shutdown(cancel_futures=True)  # else an error would wait for all that is left
     return 1 if failed else 0
 
 

@@ -7,6 +7,7 @@ import json
 import sys
 from pathlib import Path
 
+from reli3d.cli.ending import command
 from reli3d.cli.helping import Defaults
 
 
@@ -24,24 +25,37 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
+def _seeded(path: Path) -> None:
+    from reli3d.io.files import InputError
+
+    if not (path.stem.isascii() and path.stem.isdecimal()):
+        raise InputError(path, "expected the seed of the object as its name; give samples of procedural objects")
+
+
+@command("reli3d-eval")
 def main(argv: list[str] | None = None) -> int:
     args = parser().parse_args(argv)
-    from reli3d.eval.heldout import mean_environment, table
+    from reli3d.eval.heldout import INPUTS, UNSEEN, mean_environment, table
+    from reli3d.io.files import InputError, write_bytes
     from reli3d.nn.weights import load_model
+    from reli3d.output.folder import check_folder
     from reli3d.synthetic.maps import held_back, load_maps
+    from reli3d.synthetic.stored import check_samples
 
-    try:
-        maps, names = load_maps(args.maps)
-        mean = mean_environment(maps[[not h for h in held_back(names)]])
-        model = load_model(args.weights)
-        figures = table(model, args.samples, mean, args.views, lambda line: print(line, file=sys.stderr))
-    except (ValueError, OSError) as error:
-        print(f"reli3d-eval: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
+    check_samples(args.samples, "samples", views=INPUTS + UNSEEN, also=_seeded)
+    if args.json:
+        if args.json.is_dir():
+            raise InputError(args.json, "expected a file for --json, got a folder")
+        check_folder(args.json.parent)
+    maps, names = load_maps(args.maps)
+    mean = mean_environment(maps[[not h for h in held_back(names)]])
+    model = load_model(args.weights)
+    figures = table(model, args.samples, mean, args.views, lambda line: print(line, file=sys.stderr))
     text = json.dumps(figures, indent=1)
     print(text)
     if args.json:
-        args.json.write_text(text + "\n")
+        args.json.parent.mkdir(parents=True, exist_ok=True)
+        write_bytes(args.json, f"{text}\n".encode())
     return 0
 
 

@@ -7,9 +7,11 @@ import importlib
 import os
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+from reli3d.cli.ending import command, reason
 from reli3d.cli.helping import Defaults
 
 STARTED = time.monotonic()
@@ -26,7 +28,7 @@ def parser() -> argparse.ArgumentParser:
         formatter_class=Defaults,
         prog="reli3d-infer",
         description="Turn a few posed photographs of an object into a relightable GLB and an HDR environment.",
-        epilog="Exit code: 0 all done, 1 some objects failed, 2 wrong input.  Results go to stdout.",
+        epilog="Exit code: 0 all done, 1 some objects failed, 2 wrong input, 130 interrupted.  Results go to stdout.",
     )
     p.add_argument("folder", nargs="*", type=Path, help="object folders: transforms.json or a COLMAP text model; "
                    "default the bundled example")  # fmt: skip
@@ -82,7 +84,10 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
+@command("reli3d-infer")
 def main(argv: list[str] | None = None) -> int:
+    from reli3d.output.folder import check_place
+
     args = parser().parse_args(argv)
     if args.doctor:
         from reli3d.cli import doctor
@@ -91,6 +96,8 @@ def main(argv: list[str] | None = None) -> int:
     folders = args.folder or [EXAMPLE]
     names = object_names(folders)
     try:
+        for name in names:
+            check_place(args.output / name)  # before minutes of work
         device = choose_device(args.device)
         job = None if args.check else Job(args, device)
     except (ValueError, OSError) as error:
@@ -101,8 +108,6 @@ def main(argv: list[str] | None = None) -> int:
         try:
             if args.check:
                 check(folder, target, args)
-            elif args.skip_existing and job.complete(target):
-                print(f"{name}: all files are there, skipped", file=sys.stderr)
             else:
                 job.run(folder, name, target)
             done += 1
@@ -118,8 +123,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _fail(error: BaseException, name: str | None = None) -> int:
-    text = " ".join(str(error).split()) or type(error).__name__
-    print(f"reli3d-infer: {name + ': ' if name else ''}{text}", file=sys.stderr)
+    print(f"reli3d-infer: {name + ': ' if name else ''}{reason(error)}", file=sys.stderr)
     return 2
 
 
@@ -203,11 +207,17 @@ class Job:
 
     def run(self, folder: Path, name: str, target: Path) -> None:
         """Reconstruct one object and write its files; the bar goes before an error is told."""
-        with Progress(name) as steps:
-            self._run(folder, name, target, steps)
-        print(target / "mesh.glb")
+        from reli3d.output import results
 
-    def _run(self, folder: Path, name: str, target: Path, steps: Progress) -> None:
+        with results.claim(target) as replacing:
+            if self.args.skip_existing and self.complete(target):
+                print(f"{name}: all files are there, skipped", file=sys.stderr)
+                return
+            with Progress(name) as steps:
+                self._run(folder, name, replacing, steps)
+        print(target / "mesh.glb", flush=True)
+
+    def _run(self, folder: Path, name: str, replacing: Callable, steps: Progress) -> None:
         from reli3d.output import results
         from reli3d.output.preview import comparison, preview
         from reli3d.pipeline import default_normalization, output_frame, reconstruct, refined
@@ -272,7 +282,7 @@ class Job:
             "versions": results.versions(),
         }
         steps("writing")
-        results.write_results(target, asset, shown, picture, info, compatible=args.compatible_names,
+        results.write_results(replacing, asset, shown, picture, info, compatible=args.compatible_names,
                               comparison=compared)  # fmt: skip
 
 

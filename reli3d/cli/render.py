@@ -8,6 +8,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+from reli3d.cli.ending import check_range, command
 from reli3d.cli.helping import Defaults
 
 FORMATS = ("png", "exr", "webp")
@@ -50,26 +51,28 @@ def parser() -> argparse.ArgumentParser:
                    "metallic), normal (n / 2 + 1 / 2) and depth (depth, depth, alpha)")  # fmt: skip
     p.add_argument("--no-shadows", action="store_true")
     p.add_argument("--seed", type=int, default=0, help="of what is drawn by chance")
-    p.add_argument("--device", default="cpu", help="cpu or cuda")
+    p.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     return p
 
 
+@command("reli3d-render")
 def main(argv: list[str] | None = None) -> int:
     args = parser().parse_args(argv)
-    try:
-        _check(args)
-        for path in render_files(args):
-            print(path)
-    except (OSError, ValueError, TypeError) as error:
-        print(f"reli3d-render: {error}", file=sys.stderr)
-        return 2
+    _check(args)
+    for path in render_files(args):
+        print(path)
     return 0
 
 
 def _check(args: argparse.Namespace) -> None:
-    for name, low, high in (("frames", 1, 3600), ("size", 1, 8192), ("supersampling", 1, 16), ("plan", 1, 65536)):
-        if getattr(args, name) is not None and not low <= getattr(args, name) <= high:
-            raise ValueError(f"--{name}: expected {low} to {high}, got {getattr(args, name)}")
+    from reli3d.cli.infer import choose_device
+    from reli3d.output.folder import check_folder
+
+    for name, low, high in (("frames", 1, 3600), ("size", 1, 8192), ("supersampling", 1, 16), ("plan", 1, 65536),
+                            ("seed", 0, 10**9)):  # fmt: skip
+        check_range(name, getattr(args, name), low, high)
+    if not all(0 <= k <= 65536 for k in args.samples) or sum(args.samples) == 0:
+        raise ValueError(f"--samples: expected three counts of 0 to 65536, one above 0, got {tuple(args.samples)}")
     if not 1.0 <= args.fov <= 150.0:
         raise ValueError(f"--fov: expected 1 to 150 degrees, got {args.fov}")
     for name, limit in (("elevation", 89.0), ("azimuth", 3600.0), ("exposure", 32.0)):
@@ -77,6 +80,8 @@ def _check(args: argparse.Namespace) -> None:
             raise ValueError(f"--{name}: expected {-limit:g} to {limit:g}, got {getattr(args, name)}")
     if args.distance is not None and not 0.0 < args.distance < math.inf:
         raise ValueError(f"--distance: expected a positive length, got {args.distance}")
+    choose_device(args.device)
+    check_folder(args.output)
 
 
 def render_files(args: argparse.Namespace) -> list[Path]:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from pathlib import Path
 
+from reli3d.cli.ending import check_range, command
 from reli3d.cli.helping import Defaults
 
 LICENCE = "Apache-2.0; trained by the reli3d authors, see docs/weights.md for the data"
+CALIBRATED = 5  # views of a sample: four are input, one is looked at
 
 
 def parser() -> argparse.ArgumentParser:
@@ -45,8 +48,51 @@ def report(line: str) -> None:
     print(line, file=sys.stderr, flush=True)
 
 
+def _check(args: argparse.Namespace) -> None:
+    """Raise InputError or ValueError for what would end the work later."""
+    from reli3d.output.folder import check_folder
+    from reli3d.synthetic.stored import check_samples
+
+    for name, low, high in (("steps", 1, 10**9), ("minutes", 1e-3, math.inf), ("batch", 1, 4096),
+                            ("points", 2, 16384), ("max-views", 1, 16), ("rate", 1e-9, 10.0),
+                            ("seed", 0, 10**9)):  # fmt: skip
+        check_range(name, getattr(args, name.replace("-", "_")), low, high)
+    check_folder(args.output)
+    if args.export:
+        check_folder(args.export.parent)
+    if not args.export or not args.validation:
+        check_samples(args.samples, "samples", views=CALIBRATED if args.export else 1)
+    if args.validation:
+        check_samples(args.validation, "validation", views=CALIBRATED)
+
+
+def _check_state(path: Path, model) -> None:
+    """Raise InputError where ``path`` is not a whole checkpoint of ``model``."""
+    import torch
+
+    from reli3d.io.files import InputError, file_size, shown
+    from reli3d.nn.weights import check_keys
+
+    file_size(path)
+    try:
+        state = torch.load(path, weights_only=True, mmap=True)
+        shapes = [{k: tuple(v.shape) for k, v in state[name].items()} for name in ("model", "average")]
+        groups, step, seconds = state["optimizer"]["param_groups"], state["step"], state["seconds"]
+        whole = len(groups) == 2 and isinstance(step, int) and step >= 0 and seconds >= 0
+    except Exception as error:  # of a broken file torch, pickle and zipfile raise almost anything
+        reason = shown(" ".join(str(error).split()))
+        raise InputError(path, f"expected a checkpoint of this training, got a broken file ({reason}); remove "
+                         "it to start again") from None  # fmt: skip
+    for found in shapes:
+        check_keys(path, found, {k: tuple(v.shape) for k, v in model.state_dict().items()})
+    if not whole:
+        raise InputError(path, "expected a checkpoint of this training, got another one; remove it to start again")
+
+
+@command("reli3d-train")
 def main(argv: list[str] | None = None) -> int:
     args = parser().parse_args(argv)
+    _check(args)
     import torch
 
     from reli3d.nn import weights
@@ -58,24 +104,23 @@ def main(argv: list[str] | None = None) -> int:
 
     torch.manual_seed(args.seed)
     model = LocalReconstructor(LOCAL)
-    try:
-        if args.export:
-            averaged_model(args.output / "state.pt", model)
-            for views, tried in calibrate(model, args.validation or args.samples, progress=report).items():
-                row = ", ".join(f"{offset:g}: {iou:.4f}" for offset, iou in tried.items())
-                report(f"silhouette IoU by surface offset, {views} views: {row}")
-            report(f"chosen: {model.preset.offset_one_view:g}, of many views {model.preset.offset_many_views:g}")
-            print(weights.save(args.export, model, licence=LICENCE).path)
-            return 0
-        workers = Workers.join()
-        train(model, TrainConfig(samples=str(args.samples), output=str(args.output), steps=args.steps,
-                                 minutes=args.minutes, batch=args.batch, points=args.points, max_views=args.max_views,
-                                 rate=args.rate, seed=args.seed,
-                                 validation=str(args.validation or "")), workers)  # fmt: skip
-        workers.leave()
-    except (ValueError, OSError) as error:
-        print(f"reli3d-train: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
+    state = args.output / "state.pt"
+    if args.export or state.exists():
+        _check_state(state, model)
+    if args.export:
+        averaged_model(state, model)
+        for views, tried in calibrate(model, args.validation or args.samples, progress=report).items():
+            row = ", ".join(f"{offset:g}: {iou:.4f}" for offset, iou in tried.items())
+            report(f"silhouette IoU by surface offset, {views} views: {row}")
+        report(f"chosen: {model.preset.offset_one_view:g}, of many views {model.preset.offset_many_views:g}")
+        print(weights.save(args.export, model, licence=LICENCE).path)
+        return 0
+    workers = Workers.join()
+    train(model, TrainConfig(samples=str(args.samples), output=str(args.output), steps=args.steps,
+                             minutes=args.minutes, batch=args.batch, points=args.points, max_views=args.max_views,
+                             rate=args.rate, seed=args.seed,
+                             validation=str(args.validation or "")), workers)  # fmt: skip
+    workers.leave()
     return 0
 
 

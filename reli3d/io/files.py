@@ -66,7 +66,9 @@ def write_bytes(path: str | os.PathLike, data: bytes) -> None:
 def replacing(path: str | os.PathLike):
     """Yield a temporary path beside ``path``; it takes the place of ``path`` when the block ends without an error."""
     path = Path(path)
-    temporary = path.with_name(f".{path.stem[:80]}.{os.getpid()}.{os.urandom(4).hex()}{path.suffix}")
+    temporary = path.with_name(
+        f".{os.getpid()}.{os.urandom(4).hex()}{path.suffix[-8:]}"
+    )  # short: no file system cuts it
     try:
         yield temporary
         os.replace(temporary, path)

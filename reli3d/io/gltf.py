@@ -20,6 +20,7 @@ from reli3d.io.files import InputError, read_bytes, shown
 DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 SHAPES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 EXTENSIONS = {"KHR_materials_unlit", "KHR_mesh_quantization", "KHR_lights_punctual"}  # readable without doing anything
+EMPTY = 1 << 20  # values of an accessor without a buffer view: all zero, and not limited by the file's size
 DEPTH = 256  # of the node tree
 TRIANGLES, STRIP, FAN = 4, 5, 6
 _KINDS = {list: "a list", dict: "an object", str: "a string"}
@@ -38,9 +39,12 @@ class Document:
         version = self.get(self.get(self.json, "asset", dict, "asset"), "version", str, "asset.version")
         if not version.startswith("2."):
             self.fail("asset.version", "expected 2.x", version, "export as glTF 2.0")
-        needed = set(self.get(self.json, "extensionsRequired", list, "extensionsRequired", []))
+        needed = self.get(self.json, "extensionsRequired", list, "extensionsRequired", [])
+        if not all(isinstance(name, str) for name in needed):
+            self.fail("extensionsRequired", "expected names", needed)
+        needed = set(needed)
         if not needed <= EXTENSIONS:
-            self.fail("extensionsRequired", "expected none that must be decoded", sorted(map(str, needed - EXTENSIONS)),
+            self.fail("extensionsRequired", "expected none that must be decoded", sorted(needed - EXTENSIONS),
                       "export without compression or extensions")  # fmt: skip
         self._buffers: dict[int, bytes] = {}
 
@@ -162,6 +166,8 @@ class Document:
             self.fail(f"{where}.sparse", "expected a dense accessor", "sparse", "export without sparse accessors")
         dtype, width = np.dtype(DTYPES[code]), SHAPES[kind]
         if "bufferView" not in entry:
+            if count > EMPTY:
+                self.fail(f"{where}.count", f"expected at most {EMPTY} values without data", count)
             return np.zeros((count, width), np.float32 if code == 5126 else dtype)
         data, stride = self.view(entry["bufferView"], f"{where}.bufferView")
         offset = self.get(entry, "byteOffset", int, f"{where}.byteOffset", 0)
@@ -212,7 +218,9 @@ class Document:
             number = self.get(self.json, "scene", int, "scene", 0)
             roots = self.get(self.item("scenes", number, "scene"), "nodes", list, f"scenes[{number}].nodes", [])
         else:
-            children = {c for n in nodes if isinstance(n, dict) for c in n.get("children", []) if isinstance(c, int)}
+            lists = [self.get(self.item("nodes", k, "nodes"), "children", list, f"nodes[{k}].children", [])
+                     for k in range(len(nodes))]  # fmt: skip
+            children = {c for items in lists for c in items if isinstance(c, int)}
             roots = [k for k in range(len(nodes)) if k not in children]
         stack = [(r, np.eye(4), 0) for r in reversed(roots)]
         seen: set[int] = set()

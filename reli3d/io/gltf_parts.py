@@ -20,6 +20,8 @@ from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
 
 FORMATS = ("PNG", "JPEG", "WEBP")
+MAX_PARTS = 4096  # primitives as placed: each is a mesh with textures of its own
+MAX_SCALE = 1e6  # of a normal texture's slopes: beyond it float32 has only the plane
 PLAIN = 4  # texels along a side of a texture without an image
 
 
@@ -32,8 +34,12 @@ def read_parts(path: str | os.PathLike, *, max_bytes: int = 1 << 29, max_vertice
     document = Document(path, max_bytes=max_bytes, max_vertices=max_vertices)
     materials = _Materials(document, max_pixels)
     parts, vertices = [], 0
-    for mesh, world, name in document.placed_meshes():
-        for k, primitive in enumerate(document.get(mesh, "primitives", list, f"{name}.primitives")):
+    placed = document.placed_meshes()
+    count = sum(len(document.get(mesh, "primitives", list, f"{name}.primitives")) for mesh, _, name in placed)
+    if count > MAX_PARTS:
+        document.fail("meshes", f"expected at most {MAX_PARTS} primitives as placed", count, "join the meshes")
+    for mesh, world, name in placed:
+        for k, primitive in enumerate(mesh["primitives"]):
             field = f"{name}.primitives[{k}]"
             if not isinstance(primitive, dict):
                 document.fail(field, "expected an object", primitive)
@@ -114,7 +120,7 @@ class _Materials:
     """Texture sets of the materials of one document, each made once."""
 
     def __init__(self, document: Document, max_pixels: int):
-        self.document, self.left = document, max_pixels
+        self.document, self.left, self.squares = document, max_pixels, max_pixels
         self.made: dict[int | None, tuple[TextureSet, int]] = {}
         self.images: dict[int, Tensor] = {}
 
@@ -146,12 +152,19 @@ class _Materials:
             channels.add(get(info, "texCoord", int, f"{place}.{key}.texCoord", 0))
             if key == "normalTexture":
                 scale = get(info, "scale", float, f"{place}.{key}.scale", 1.0)
+                if abs(scale) > MAX_SCALE:
+                    self.document.fail(f"{place}.{key}.scale", f"expected at most {MAX_SCALE:g}", scale)
             texture = self.document.item("textures", info.get("index"), f"{place}.{key}.index")
             images.append(self._image(texture.get("source"), f"textures[{info['index']}].source"))
         if len(channels) > 1:
             self.document.fail(field, "expected one UV channel for all textures", sorted(channels),
                                "bake to one UV channel")  # fmt: skip
         size = max((max(i.shape[:2]) for i in images if i is not None), default=PLAIN)
+        if size > PLAIN:
+            self.squares -= size * size
+            if self.squares < 0:
+                self.document.fail(field, "expected smaller textures: images are made square, for each material", size,
+                                   "use smaller textures or fewer materials")  # fmt: skip
         base, orm, normal = (_square(i, size) for i in images)
         factor = torch.tensor(color).clamp(0.0, 1.0)
         base = linear_to_srgb((srgb_to_linear(base) if base is not None else torch.ones(size, size, 3)) * factor)

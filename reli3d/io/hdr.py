@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from reli3d.io.exr_header import read_exr_header
-from reli3d.io.files import InputError, read_bytes, replacing, shown, write_bytes
+from reli3d.io.files import InputError, file_size, read_bytes, replacing, shown, write_bytes
 
 HALF_MAX = 65504.0  # largest finite half
 MAX_PIXELS = 1 << 25  # 8192 x 4096
@@ -71,11 +71,12 @@ def _quarter_turn(radiance: Tensor, sign: int) -> Tensor:
 
 def read_hdr_image(path: str | os.PathLike, *, notes: list[str] | None = None) -> Tensor:
     """Linear image ``(H, W, 3)``, float32, finite and not negative, of a ``.hdr`` or ``.exr`` file (see the module)."""
+    file_size(path)  # raises for a pipe, which would block
     try:
         with open(path, "rb") as file:
-            start = file.read(4) if os.path.isfile(path) else b""
-    except (OSError, ValueError):
-        start = b""
+            start = file.read(4)
+    except OSError as error:
+        raise InputError(path, f"cannot be read ({error.strerror or error}); check its permissions") from None
     pixels = _read_exr(path) if start == b"\x76\x2f\x31\x01" else _read_rgbe(path)
     if np.isnan(pixels).any():
         count = int(np.isnan(pixels).any(-1).sum())

@@ -21,6 +21,7 @@ from reli3d.io.files import InputError, file_size, shown, write_bytes
 MAX_PIXELS = 1 << 26  # 64 MP: 256 MiB of RGBA, above any camera this is meant for
 MAX_BYTES = 1 << 29  # an uncompressed 16-bit RGBA image of MAX_PIXELS
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF")  # nothing that runs a program or unpacks streams of its own
+MAX_SCANS = 100  # progressive files have about ten; a thousand in a small file take minutes
 _OPENING = Lock()  # Python's warning filters are global; decoding runs outside
 _GREY = ("1", "L", "LA", "I;16", "I;16B", "I;16L", "I")
 _COLOUR = ("RGB", "RGBA", "P", "PA", "CMYK", "YCbCr")
@@ -49,6 +50,8 @@ def read_image(path: str | os.PathLike, *, notes: list[str] | None = None) -> tu
         raise InputError(path, f"expected at most {MAX_PIXELS} pixels; scale the image down") from None
     except Image.UnidentifiedImageError:
         raise InputError(path, "expected a PNG, JPEG, WebP or TIFF image, got something else; convert it") from None
+    except PermissionError:
+        raise InputError(path, "cannot be read; check its permissions") from None
     except MemoryError:
         raise InputError(path, "does not fit into memory; scale the image down") from None
     except Exception as error:  # on a broken file decoders raise almost anything: struct.error, IndexError ...
@@ -61,8 +64,10 @@ def _decoded(path, image: Image.Image, notes: list[str]) -> tuple[Tensor, Tensor
         raise InputError(path, f"expected at most {MAX_PIXELS} pixels, got {width} x {height}; scale the image down")
     if width < 1 or height < 1:
         raise InputError(path, f"expected at least one pixel, got {width} x {height}; save the image again")
-    if image.format != "MPO" and getattr(image, "n_frames", 1) > 1:  # MPO: JPEG of many phones, the photo comes first
-        raise InputError(path, f"expected one picture, got {image.n_frames} frames; save a single frame")
+    if image.format != "MPO" and _several(image):  # MPO: JPEG of many phones, the photo comes first
+        raise InputError(path, "expected one picture, got several frames; save a single frame")
+    if image.format in ("JPEG", "MPO") and (scans := _scans(path)) > MAX_SCANS:
+        raise InputError(path, f"expected at most {MAX_SCANS} scans, got {scans}; save the image again")
     if image.mode not in _GREY + _COLOUR:
         raise InputError(path, f"expected 8 or 16 bit grey or colour, got mode {image.mode}; save as 8 bit PNG")
     orientation = image.getexif().get(0x0112, 1)
@@ -80,6 +85,22 @@ def _decoded(path, image: Image.Image, notes: list[str]) -> tuple[Tensor, Tensor
     # by numpy: this runs on several threads at once, each of which would start torch's own threads
     rgb, alpha = (np.divide(part, np.float32(255), dtype=np.float32) for part in (pixels[..., :3], pixels[..., 3:]))
     return torch.from_numpy(rgb), torch.from_numpy(alpha[..., 0]).contiguous() if transparent else None
+
+
+def _several(image: Image.Image) -> bool:
+    """Whether there is a second frame.  A TIFF of many would be read to its end to count them."""
+    try:
+        image.seek(1)
+    except EOFError:
+        image.seek(0)
+        return False
+    return True
+
+
+def _scans(path) -> int:
+    """Scans of a JPEG file; each passes over the whole image.  A few more where a picture is embedded."""
+    with open(path, "rb") as file:
+        return file.read().count(b"\xff\xda")
 
 
 def png_bytes(pixels: Tensor | np.ndarray) -> bytes:

@@ -14,6 +14,8 @@ import typing
 from dataclasses import dataclass
 
 SHADING_FEATURES = 24  # see reli3d.nn.light_features
+MOST = 8192  # of any number of a preset in a file: several times what a network of this kind has
+DEEP, MOST_LAYERS = ("layers", "blocks", "basic_blocks", "experts", "convolutions", "smoothing"), 64
 
 
 @dataclass(frozen=True)
@@ -166,7 +168,7 @@ def from_json(text: str) -> Preset | LocalPreset:
     try:
         values = json.loads(text)
         return _build(LocalPreset if "pyramid" in values else Preset, values)
-    except (json.JSONDecodeError, AttributeError, KeyError, TypeError) as error:
+    except (ValueError, AttributeError, KeyError, TypeError, RecursionError) as error:
         raise ValueError(f"preset: expected the JSON of a preset, got {error}") from None
 
 
@@ -179,11 +181,15 @@ def _build(kind, values: dict):
         if dataclasses.is_dataclass(expected):
             built[key] = _build(expected, value)
         elif typing.get_origin(expected) is tuple:  # JSON has lists
-            if not isinstance(value, list) or not all(type(v) is int for v in value):
+            if not isinstance(value, list) or not all(type(v) is int and 0 < v <= MOST for v in value):
                 raise TypeError(f"{key} = {value!r}")
             built[key] = tuple(value)
         elif isinstance(value, bool) == (expected is bool) and isinstance(value, expected):
             built[key] = value
+            if isinstance(value, float) and not abs(value) <= MOST:
+                raise ValueError(f"{key} = {value!r}")
+            if isinstance(value, int) and not 0 <= value <= (MOST_LAYERS if key in DEEP else MOST):
+                raise ValueError(f"{key} = {value!r}")
         else:
             raise TypeError(f"{key} = {value!r}")
     return kind(**built)

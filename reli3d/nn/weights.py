@@ -140,8 +140,9 @@ def read_manifest(path: str | os.PathLike) -> Manifest:
 
 
 def _stored(entry: dict) -> Stored:
-    start, end = (int(value) for value in entry["data_offsets"])
-    shape = tuple(int(value) for value in entry["shape"])
+    (start, end), shape = entry["data_offsets"], tuple(entry["shape"])
+    if not all(type(value) is int for value in (start, end, *shape)):
+        raise TypeError("no integers")
     if min((start, *shape)) < 0:
         raise ValueError("negative")
     return Stored(_DTYPES[entry["dtype"]], shape, start, end)

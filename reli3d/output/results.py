@@ -1,11 +1,11 @@
-"""The files of one reconstruction: written beside their place first, then moved, so that none is ever half there."""
+"""The files of one reconstruction, which change together: :mod:`reli3d.output.folder`."""
 
 from __future__ import annotations
 
 import json
-import os
-import shutil
 import sys
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
@@ -18,6 +18,7 @@ from reli3d.io.glb import write_glb
 from reli3d.io.hdr import write_environment
 from reli3d.io.images import write_png
 from reli3d.nn.weights import Manifest
+from reli3d.output.folder import claimed
 from reli3d.output.viewer import viewer_page
 from reli3d.render.asset import Asset
 from reli3d.views.similarity import Similarity
@@ -26,6 +27,7 @@ from reli3d.views.views import Views
 FILES = ("mesh.glb", "environment.exr", "environment.hdr", "preview.png", "viewer.html", "run_info.json")
 COMPARISON = "refine.png"  # of a refinement
 PUBLISHED_LIGHT = "illumination.hdr"  # name of the light in the published release, whose centre column is -Z
+OURS = (*FILES, COMPARISON, PUBLISHED_LIGHT)  # what a new result never leaves of an old one
 
 
 def complete(folder: Path, *, compatible: bool = False, refined: bool = False) -> bool:
@@ -35,6 +37,11 @@ def complete(folder: Path, *, compatible: bool = False, refined: bool = False) -
 
 def _names(compatible: bool, refined: bool) -> tuple[str, ...]:
     return (*FILES, *([PUBLISHED_LIGHT] if compatible else []), *([COMPARISON] if refined else []))
+
+
+def claim(folder: Path) -> AbstractContextManager[Callable]:
+    """Hold ``folder`` for one result: :func:`~reli3d.output.folder.claimed`.  Raises OSError, InputError."""
+    return claimed(folder, OURS)
 
 
 def mesh_statistics(mesh: Mesh) -> dict:
@@ -53,7 +60,7 @@ def peak_memory_mib() -> float | None:
 
 
 def write_results(
-    folder: Path,
+    replacing: Callable,
     asset: Asset,
     views: Views,
     picture: np.ndarray,
@@ -62,37 +69,30 @@ def write_results(
     compatible: bool = False,
     comparison: np.ndarray | None = None,
 ) -> None:
-    """Write :data:`FILES` into ``folder``; an error leaves what was there before.  Raises OSError, ValueError.
+    """Write :data:`FILES`; an error leaves what was there before.  Raises OSError, ValueError.
 
+    replacing: what :func:`claim` of the folder gives.
     views: the photographs, in the frame of ``asset``.  picture: :func:`~reli3d.output.preview.preview` of both.
     info: what ``run_info.json`` holds, the convention of the light apart.
     compatible: write the light as :data:`PUBLISHED_LIGHT` as well.  comparison: the picture of a refinement.
     """
     radiance = asset.environment.radiance
     info = {**info, "environment_centre": "+X"}
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    temporary = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
-    temporary.mkdir()
-    try:
+    with replacing() as new:
         extras = {k: info[k] for k in ("output_from_input", "model_from_input", "weights")}
-        write_glb(temporary / "mesh.glb", asset, extras=extras)
+        write_glb(new / "mesh.glb", asset, extras=extras)
         for name in ("environment.exr", "environment.hdr"):
-            write_environment(temporary / name, radiance)
+            write_environment(new / name, radiance)
         if compatible:
-            write_environment(temporary / PUBLISHED_LIGHT, radiance, centre="-Z")
-        write_png(temporary / "preview.png", picture)
+            write_environment(new / PUBLISHED_LIGHT, radiance, centre="-Z")
+        write_png(new / "preview.png", picture)
         if comparison is not None:
-            write_png(temporary / COMPARISON, comparison)
+            write_png(new / COMPARISON, comparison)
         low, high = asset.mesh.vertices.aminmax(dim=0)
-        page = viewer_page(info["object"], {"mesh": (temporary / "mesh.glb").read_bytes()}, radiance,
+        page = viewer_page(info["object"], {"mesh": (new / "mesh.glb").read_bytes()}, radiance,
                            (low + high) / 2, float((high - low).norm()) / 2, views)  # fmt: skip
-        (temporary / "viewer.html").write_text(page)
-        (temporary / "run_info.json").write_text(json.dumps(info, indent=1) + "\n")
-        folder.mkdir(exist_ok=True)
-        for name in _names(compatible, comparison is not None):
-            os.replace(temporary / name, folder / name)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+        (new / "viewer.html").write_text(page, encoding="utf-8")
+        (new / "run_info.json").write_text(json.dumps(info, indent=1) + "\n")
 
 
 def frame_record(model_from_input: Similarity, output_from_input: Similarity, frame: str, up: str) -> dict:

@@ -39,12 +39,12 @@ def viewer_page(name: str, meshes: Mapping[str, bytes], light: Tensor, middle: T
         "middle": middle.tolist(),
         "radius": radius,
     }
-    page = (PARTS / "viewer.html").read_text()
+    page = (PARTS / "viewer.html").read_text(encoding="utf-8")
     fillings = {
         "title": html.escape(name),
         "data": json.dumps(data).replace("<", "\\u003c"),
-        "three": (PARTS / "three.min.js").read_text(),
-        "viewer": (PARTS / "viewer.js").read_text(),
+        "three": (PARTS / "three.min.js").read_text(encoding="utf-8"),
+        "viewer": (PARTS / "viewer.js").read_text(encoding="utf-8"),
     }
     head, *rest = page.split("{{")  # one pass: what is filled in is not looked through again
     return head + "".join(fillings[part.split("}}", 1)[0]] + part.split("}}", 1)[1] for part in rest)

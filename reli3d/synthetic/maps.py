@@ -8,18 +8,31 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from reli3d.io.files import InputError, file_size, shown
+
 ROWS = 64
 HELD_BACK = 6  # every sixth map is left out of the fit and of all training
 
 
 def load_maps(path: Path) -> tuple[Tensor, list[str]]:
     """Maps ``(n, 64, 128, 3)`` linear, row 0 up, area-averaged, and their names, from an .npz of ``env`` and
-    ``names``.
+    ``names``.  Raises InputError for anything else.
     """
-    data = np.load(path)
-    maps = torch.as_tensor(data["env"].astype(np.float32)).permute(0, 3, 1, 2)
+    file_size(path)
+    try:
+        with np.load(path) as data:
+            env, names = data["env"], [str(n) for n in data["names"]]
+    except KeyError as error:
+        raise InputError(path, f"expected an .npz of env and names, got none of {error}") from None
+    except Exception as error:  # on a broken file numpy and zipfile raise almost anything
+        raise InputError(path, f"expected an .npz of env and names, got a broken file ({shown(str(error))})") from None
+    if env.dtype.kind != "f" or env.ndim != 4 or env.shape[3] != 3 or env.shape[2] != 2 * env.shape[1] or not env.size:
+        raise InputError(path, f"env: expected floats of shape (n, H, 2H, 3), got {env.dtype} {env.shape}")
+    if len(names) != len(env):
+        raise InputError(path, f"names: expected {len(env)}, one a map, got {len(names)}")
+    maps = torch.as_tensor(env.astype(np.float32)).permute(0, 3, 1, 2)
     maps = torch.nn.functional.interpolate(maps, (ROWS, 2 * ROWS), mode="area").permute(0, 2, 3, 1)
-    return maps.contiguous(), [str(n) for n in data["names"]]
+    return maps.contiguous(), names
 
 
 def held_back(names: list[str]) -> list[bool]:

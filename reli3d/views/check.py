@@ -19,7 +19,7 @@ from torch.nn.functional import max_pool2d, pad
 from reli3d.io.files import printable
 from reli3d.io.images import write_png
 from reli3d.render.camera import project
-from reli3d.views.normalize import RADIUS, Hull, centre_rays, meeting_point, normalize, visual_hull
+from reli3d.views.normalize import AT_EYE, RADIUS, Hull, centre_rays, meeting_point, normalize, visual_hull
 from reli3d.views.views import Views
 
 GOOD = 0.8  # share of every mask that the hull of right cameras fills; masks a few pixels off still reach 0.9
@@ -141,6 +141,12 @@ def _verdict(views: Views, hull: Hull, shares: list[float]) -> str:
                 f"suspect: view {i} ({printable(views.names[i])}) does not agree with the others, which agree without "
                 "it; check its camera and mask, or leave it out"
             )
+    eyes = views.c2w[:, :3, 3].double()
+    if float((eyes - eyes[0]).norm(dim=-1).max()) <= AT_EYE * float(eyes.norm(dim=-1).max()):
+        return (
+            "suspect: all cameras stand in one point: the views show one side of the object, and no depth; give the "
+            "positions of the cameras, or one view"
+        )
     if len(hull.points) == 0:
         return (
             "suspect: no point lies inside all masks (the visual hull is empty): the cameras do not look at a common "
@@ -185,7 +191,7 @@ def rig_picture(views: Views, path: str | os.PathLike) -> None:
     c2w, intrinsics = views.c2w.double().cpu(), views.intrinsics.double().cpu()
     target = hull.points.mean(0) if len(hull.points) else hull.aim
     eyes = c2w[:, :3, 3]
-    reach = max(float((eyes - target).norm(dim=-1).max()), float(eyes.norm(dim=-1).max()))
+    reach = max(float((eyes - target).norm(dim=-1).max()), float(eyes.norm(dim=-1).max())) or 1.0
     frustums = [_frustum(c, k, m.shape, 0.16 * reach) for c, k, m in zip(c2w, intrinsics, views.masks)]
     cube = _cube(views) if len(hull.points) else target[None].numpy()
     spread = np.concatenate([*frustums, cube, np.zeros((1, 3))])

@@ -16,6 +16,7 @@ from reli3d.io.files import InputError, file_size, shown
 from reli3d.views.shots import Lens, Shot, cleaned, inside, number
 
 MAX_BYTES = 1 << 28  # images.txt lists every matched point
+MAX_LINE = 1 << 24  # an image's points: 30 characters each
 MAX_IMAGES = 100_000
 PLACES = ("sparse/0", "sparse", "colmap/sparse/0", "")
 # model: numbers of focal lengths, radial and tangential parameters; the centre stands after the focal lengths
@@ -136,7 +137,9 @@ def _lines(path: Path):
         raise InputError(path, f"expected at most {MAX_BYTES} bytes, got {size}; export the model without points")
     try:
         with open(path, encoding="utf-8", errors="strict") as file:
-            for n, line in enumerate(file, 1):
+            for n, line in enumerate(iter(lambda: file.readline(MAX_LINE + 1), ""), 1):
+                if len(line) > MAX_LINE:
+                    raise InputError(path, f"line {n}: expected at most {MAX_LINE} characters; export it again")
                 if not line.startswith("#"):
                     yield n, line.strip()
     except UnicodeDecodeError:

@@ -202,7 +202,9 @@ def _existing(path: Path) -> Path | None:
 def _beside(folder: Path, image: Path) -> Path | None:
     """The mask of ``image`` in ``folder``: the same stem or the full name (COLMAP), with the ending of an image."""
     names = (image.name, *(stem + ending for stem in (image.stem, image.name) for ending in ENDINGS))
-    return next((folder / name for name in names if (folder / name).is_file()), None)
+    return next(
+        (folder / name for name in names if os.path.isfile(folder / name)), None
+    )  # False, too, for a name too long
 
 
 def _still_inside(root: Path, path: Path, shot: Shot, outside: bool) -> None:

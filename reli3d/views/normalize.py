@@ -19,6 +19,7 @@ OFF_CENTRE = 0.3  # as far as the hull's centre of such an object may lie from t
 GRIDS = (24, 44)  # cells a side, coarse and refined: the last is 2 to 3 % of the object
 BALL = 1.3  # diameter of the ball that limits the hull, in mask widths: a generic view shows 0.8 of the longest side
 PARALLEL = 0.01  # mean squared sine between the axes (6 degrees) below which depth is guessed, not triangulated
+AT_EYE = 1e-6  # of an eye's distance from the origin: what is nearer to the eye than float32 tells places apart
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ def visual_hull(views: Views) -> Hull:
     origins, rays = c2w[:, :3, 3], centre_rays(masks, c2w, intrinsics)
     aim, spread = meeting_point(origins, rays)
     depth = ((aim - origins)[:, None] @ -c2w[:, :3, 2:3])[:, 0, 0]  # along the viewing axes
-    if bool((depth <= 0).any()):
+    if not bool((depth > AT_EYE * origins.norm(dim=-1).max()).all()):
         return Hull(origins.new_zeros(0, 3), 0.0, aim, 0.0)
     boxes = torch.tensor([mask_box(m) for m in masks], dtype=torch.float64)
     sides = (boxes[:, 2:] - boxes[:, :2]) / intrinsics[:, :2] * depth[:, None]

@@ -81,7 +81,8 @@ def cleaned(where: str, field: str, matrix: np.ndarray) -> np.ndarray:
                                 "a mirrored or flat camera cannot be used, export it again")  # fmt: skip
     if np.abs(gram - np.eye(3)).max() > ORTHONORMAL:
         scale = determinant ** (1 / 3)
-        if np.abs(gram / scale**2 - np.eye(3)).max() <= ORTHONORMAL:
+        skew = np.abs(gram / scale**2 - np.eye(3)).max()
+        if skew <= ORTHONORMAL and abs(scale**2 - 1) > skew:
             raise InputError(where, f"{field}: expected a rotation without scale, got scale {scale:.4g}; "
                                     "divide the 3x3 block by it")  # fmt: skip
         raise InputError(where, f"{field}: expected a rotation, got axes that are not at right angles or not of length "
@@ -136,7 +137,10 @@ def straight(where: str, lens: Lens, focal: float, width: int, height: int) -> s
     """Check that ``lens`` moves the corner of its image by at most BEND pixels; a note where it moves it at all."""
     if not any(lens.radial + lens.tangential):
         return None
-    bend = bend_of(focal, width, height, lens.radial, lens.tangential)
+    try:
+        bend = bend_of(focal, width, height, lens.radial, lens.tangential)
+    except OverflowError:  # a focal length next to nothing
+        bend = math.inf
     if not bend <= BEND:
         raise InputError(where, f"distortion: expected an undistorted lens, got {bend:.3g} pixels at the corner of the "
                                 "image; undistort the images (colmap image_undistorter)")  # fmt: skip

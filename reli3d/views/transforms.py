@@ -18,6 +18,7 @@ from reli3d.views.shots import Lens, Shot, inside, number, rigid
 MAX_BYTES = 1 << 24
 MAX_FRAMES = 4096  # a video at 30 frames a second for two minutes
 DEFAULT_FOV = 0.7  # radians, of the published release
+MIN_FOV = 1e-6  # radians: the tangent of a much smaller angle is 0
 _PINHOLE = (None, "PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "RADIAL", "SIMPLE_RADIAL", "FULL_OPENCV", "PERSPECTIVE")
 
 
@@ -55,8 +56,9 @@ def _refuse(word: str):
 def _unique(pairs: list) -> dict:
     result = dict(pairs)
     if len(result) != len(pairs):
-        keys = [k for k, _ in pairs]
-        raise _Refused(f"expected every key once, got {shown(next(k for k in keys if keys.count(k) > 1))} twice")
+        seen: set[str] = set()
+        twice = next(k for k, _ in pairs if k in seen or seen.add(k))
+        raise _Refused(f"expected every key once, got {shown(twice)} twice")
     return result
 
 
@@ -108,6 +110,8 @@ def _lens(where: str, frame: dict, data: dict, notes: list[str]) -> Lens:
         raise InputError(where, f"camera_model: expected a pinhole camera, got {shown(model)}; undistort the "
                          "images first")  # fmt: skip
     size = (found("w", 0, 1e6), found("h", 0, 1e6))
+    if any(side is not None and side < 1 for side in size):
+        raise InputError(where, f"w, h: expected at least 1 pixel, got {size[0]} x {size[1]}; correct the camera file")
     size = None if None in size else (int(size[0]), int(size[1]))
     centre = (found("cx", -1e6, 1e6), found("cy", -1e6, 1e6))
     centre = None if None in centre else centre
@@ -118,9 +122,9 @@ def _lens(where: str, frame: dict, data: dict, notes: list[str]) -> Lens:
             fy = fx if source.get("fl_y") is None else number(where, "fl_y", source["fl_y"], 0, 1e9)
             lens = Lens(focal=(fx, fy), centre=centre, size=size)
         if lens is None and source.get("camera_angle_x") is not None:
-            x = number(where, "camera_angle_x", source["camera_angle_x"], 0, math.pi)
+            x = number(where, "camera_angle_x", source["camera_angle_x"], MIN_FOV, math.pi)
             y = source.get("camera_angle_y")
-            y = math.nan if y is None else number(where, "camera_angle_y", y, 0, math.pi)
+            y = math.nan if y is None else number(where, "camera_angle_y", y, MIN_FOV, math.pi)
             lens = Lens(fov=(x, y), centre=centre, size=size)
         for key in ("camera_fov", "fov_rad"):
             if lens is None and source.get(key) is not None:
@@ -141,8 +145,8 @@ def _fov(where: str, key: str, value: object) -> tuple[float, float]:
     if isinstance(value, list) and len(value) == 1:
         value = value[0]
     if isinstance(value, list):
-        return _pair(where, key, value, 0.0, math.pi)
-    angle = number(where, key, value, 0.0, math.pi)
+        return _pair(where, key, value, MIN_FOV, math.pi)
+    angle = number(where, key, value, MIN_FOV, math.pi)
     return angle, angle
 
 

@@ -1,0 +1,124 @@
+"""How the commands end where the machine, the streams or the user are the problem: one line and the right exit code."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from reli3d.cli import infer
+
+# reli3d-infer without torch, which takes seconds to load, and without a network: its one object is {body}
+QUICK = """
+import sys, time, types
+from pathlib import Path
+from reli3d.cli import infer
+from reli3d.output.folder import claimed
+sys.modules["reli3d.output.results"] = types.SimpleNamespace(claim=lambda folder: claimed(folder, ["mesh.glb"]))
+infer.choose_device = lambda wanted: wanted
+class Job(infer.Job):
+    def __init__(self, args, device):
+        self.args = args
+    def _run(self, folder, name, replacing, steps):
+        {body}
+infer.Job = Job
+sys.exit(infer.main(sys.argv[1:]))
+"""
+WRITES = """with replacing() as new:
+            (new / "mesh.glb").write_text("mesh")"""
+WAITS = """with replacing() as new:
+            (new / "mesh.glb").write_text("mesh")
+            print("working", flush=True)
+            time.sleep(60)"""
+
+
+def start(arguments, *, body=WRITES, **options) -> subprocess.Popen:
+    options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, **options}
+    return subprocess.Popen([sys.executable, "-c", QUICK.format(body=body), *map(str, arguments)], **options)
+
+
+def told(text: str) -> list[str]:
+    """The command's own lines; the bar is redrawn with carriage returns."""
+    return [line for line in re.split("[\r\n]", text) if line.startswith("reli3d-infer: ")]
+
+
+@pytest.mark.parametrize("number, code, text", [(signal.SIGINT, 130, "interrupted"), (signal.SIGTERM, 143, "SIGTERM"),
+                                                (signal.SIGHUP, 129, "SIGHUP")])  # fmt: skip
+def test_a_signal_ends_with_one_line_and_leaves_nothing_behind(tmp_path, number, code, text):
+    process = start(["--output", tmp_path / "out"], body=WAITS)
+    assert process.stdout.readline() == "working\n"
+    process.send_signal(number)
+    out, err = process.communicate(timeout=30)
+    assert process.returncode == code and out == "" and "Traceback" not in err
+    assert len(told(err)) == 1 and text in told(err)[0]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_place_that_cannot_be_written_is_told_before_the_weights_are_read(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(infer, "Job", None)  # a call raises TypeError
+    (tmp_path / "file").touch()
+    for output in (tmp_path / "file", tmp_path / "file" / "out", tmp_path / ("n" * 300)):
+        began = time.monotonic()
+        assert infer.main(["--output", str(output)]) == 2
+        assert time.monotonic() - began < 5  # no weights, no kernels; torch may be imported here
+        out, err = capsys.readouterr()
+        assert out == "" and err.count("\n") == 1 and "expected" in err
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
+def test_ascii_streams_change_nothing(tmp_path):
+    process = start(["--output", tmp_path / "größe"], env={**os.environ, "PYTHONIOENCODING": "ascii:strict",
+                                                           "PYTHONOPTIMIZE": "1"})  # fmt: skip
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 0, err
+    assert out.endswith("\\xf6\\xdfe/example/mesh.glb\n") and "Traceback" not in err
+    process = start([tmp_path / "größer"], body="raise ValueError('größer')", cwd=tmp_path,
+                    env={**os.environ, "PYTHONIOENCODING": "ascii:strict"})  # fmt: skip
+    err = process.communicate(timeout=60)[1]
+    assert process.returncode == 2 and told(err) == ["reli3d-infer: gr\\xf6\\xdfer"]
+
+
+@pytest.mark.parametrize("streams", [(1,), (2,), (0, 1, 2)])
+def test_closed_streams_change_nothing(tmp_path, streams):
+    with open(tmp_path / "log", "w") as log:
+        options = {"stdout": log, "stderr": log, "preexec_fn": lambda: [os.close(n) for n in streams]}
+        process = start(["--output", tmp_path / "out"], **options)
+        assert process.wait(60) == 0
+    assert (tmp_path / "out/example/mesh.glb").read_text() == "mesh"
+    assert "Traceback" not in (tmp_path / "log").read_text()
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
+@pytest.mark.parametrize("name", ["stdout", "stderr"])
+def test_full_streams_change_nothing(tmp_path, name):
+    with open("/dev/full", "w") as full:
+        process = start(["--output", tmp_path / "out"], **{name: full})
+        said = process.communicate(timeout=60)
+    assert process.returncode == 0, said
+    assert "Exception" not in "".join(s or "" for s in said)
+
+
+def test_a_reader_that_goes_away_changes_nothing(tmp_path):
+    process = start(["--output", tmp_path / "out"])
+    process.stdout.close()
+    err = process.stderr.read()
+    assert process.wait(60) == 0 and "Broken" not in err
+    process.stderr.close()
+
+
+def test_a_full_disk_is_one_line_and_leaves_the_old_result(tmp_path):
+    """A limit on the size of a file stands for the disk: both raise OSError in the middle of a write."""
+    (tmp_path / "out/example").mkdir(parents=True)
+    (tmp_path / "out/example/mesh.glb").write_text("old")
+    body = """import resource
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
+        with replacing() as new:
+            (new / "mesh.glb").write_bytes(bytes(1 << 20))"""
+    process = start(["--output", tmp_path / "out"], body=body)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 1 and out == ""
+    assert len(told(err)) == 1 and "File too large" in told(err)[0] and "Traceback" not in err
+    assert (tmp_path / "out/example/mesh.glb").read_text() == "old" and len(list((tmp_path / "out").iterdir())) == 1

@@ -1,0 +1,127 @@
+"""``reli3d-render``, ``-data``, ``-train`` and ``-eval`` on wrong input: one line, exit code 2, before any work."""
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from reli3d.cli import data, render, train
+from reli3d.cli import eval as evaluation
+from reli3d.io.files import InputError
+from reli3d.synthetic.stored import TENSORS, check_sample
+
+TYPES = {"U8": torch.uint8, "I8": torch.int8, "F16": torch.float16, "F32": torch.float32}
+
+
+def sample(path, **changed):
+    """A sample of twelve small views, all zero; ``changed`` tensors take the place of some, None of none."""
+    sizes = {"V": 12, "S": 8, "P": 16, "N": 8}
+    tensors = {}
+    for name, (axes, dtype) in TENSORS.items():
+        tensors[name] = torch.zeros([sizes.get(a) or int(a) for a in axes.split()], dtype=TYPES[dtype])
+    path.parent.mkdir(exist_ok=True)
+    save_file({k: v for k, v in {**tensors, **changed}.items() if v is not None}, path)
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    """A folder with good samples, broken ones, maps, broken maps, a file, and checkpoints that are none."""
+    monkeypatch.chdir(tmp_path)
+    sample(tmp_path / "good/0000000003.safetensors")
+    sample(tmp_path / "named/chair.safetensors")
+    sample(tmp_path / "lacks/0000000003.safetensors", points=None)
+    sample(tmp_path / "few/0000000003.safetensors", c2w=torch.zeros(3, 4, 4))
+    whole = (tmp_path / "good/0000000003.safetensors").read_bytes()
+    for name, part in (("cut", whole[: len(whole) // 2]), ("nothing", b""), ("noise", b"\x07" * 4000)):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "0000000003.safetensors").write_bytes(part)
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "file").write_text("no maps")
+    names = [str(k) for k in range(8)]
+    np.savez(tmp_path / "maps.npz", env=np.ones((8, 4, 8, 3), np.float32), names=names)
+    np.savez(tmp_path / "few.npz", env=np.ones((2, 4, 8, 3), np.float32), names=names[:2])
+    np.savez(tmp_path / "long.npz", env=np.ones((2, 4, 8, 3), np.float32), names=names)
+    np.savez(tmp_path / "shape.npz", env=np.ones((8, 4, 4, 3), np.float32), names=names)
+    np.savez(tmp_path / "key.npz", maps=np.ones((8, 4, 8, 3), np.float32))
+    np.savez(tmp_path / "pickle.npz", env=np.array([{}], dtype=object), names=names)
+    (tmp_path / "cut.npz").write_bytes((tmp_path / "maps.npz").read_bytes()[:300])
+    for name, state in (("list", [1]), ("other", {"model": {"x": torch.zeros(2)}, "average": {}, "step": 0,
+                                                  "seconds": 0.0, "optimizer": {"param_groups": [1, 2]}})):  # fmt: skip
+        (tmp_path / f"run_{name}").mkdir()
+        torch.save(state, tmp_path / f"run_{name}" / "state.pt")
+    (tmp_path / "run_noise").mkdir()
+    (tmp_path / "run_noise" / "state.pt").write_bytes(b"\x80\x02" * 100)
+    return tmp_path
+
+
+CASES = [
+    *((render, ["x.glb", *options], word) for options, word in [
+        (["--samples", "-1", "0", "4"], "--samples"), (["--samples", "0", "0", "0"], "--samples"),
+        (["--samples", "99999999999", "1", "1"], "--samples"), (["--seed", "-1"], "--seed"),
+        (["--seed", "99999999999999999999"], "--seed"), (["--output", "file"], "a file"), ([], "not found")]),
+    *((data, ["out", "--maps", *options], word) for options, word in [
+        (["none.npz"], "not found"), (["file"], "broken file"), (["cut.npz"], "broken file"), (["key.npz"], "env"),
+        (["pickle.npz"], "broken file"), (["shape.npz"], "env"), (["long.npz"], "names"), (["/dev/zero"], "regular"),
+        (["few.npz", "--held-back", "test"], "--maps"), (["maps.npz", "--workers", "0"], "--workers"),
+        (["maps.npz", "--first", "-5"], "--first"), (["maps.npz", "--count", "0"], "--count"),
+        (["maps.npz", "--views", "0"], "--views"), (["maps.npz", "--size", "0"], "--size"),
+        (["maps.npz", "--meshes", "none.glb"], "not found")]),
+    (data, ["file", "--maps", "maps.npz"], "a file"),
+    *((train, [folder, "out"], word) for folder, word in [
+        ("none", "folder of samples"), ("file", "folder of samples"), ("empty", "got none"), ("lacks", "points"),
+        ("few", "c2w"), ("cut", "broken file"), ("nothing", "broken file"), ("noise", "broken file")]),
+    *((train, ["good", "out", *options], word) for options, word in [
+        (["--batch", "0"], "--batch"), (["--steps", "0"], "--steps"), (["--minutes", "nan"], "--minutes"),
+        (["--points", "0"], "--points"), (["--max-views", "0"], "--max-views"), (["--rate", "nan"], "--rate"),
+        (["--seed", "-1"], "--seed"), (["--validation", "cut"], "broken file"), (["--export", "a/b"], "not found")]),
+    (train, ["good", "file"], "a file"),
+    (train, ["good", "run_list"], "broken file"),
+    (train, ["good", "run_noise"], "broken file"),
+    (train, ["good", "run_other"], "run_other/state.pt"),
+    (train, ["good", "run_noise", "--export", "x.safetensors"], "broken file"),
+    *((evaluation, [folder, "--maps", maps, *options], word) for folder, maps, options, word in [
+        ("none", "maps.npz", [], "folder of samples"), ("named", "maps.npz", [], "seed"),
+        ("cut", "maps.npz", [], "broken file"), ("good", "cut.npz", [], "broken file"),
+        ("good", "maps.npz", ["--json", "file/x"], "a file"), ("good", "maps.npz", ["--json", "good"], "a folder"),
+        ("good", "maps.npz", ["--weights", "none"], "none")]),
+]  # fmt: skip
+
+
+def before(place):
+    return {p: p.stat().st_mtime_ns for p in place.rglob("*")}
+
+
+def test_wrong_input_ends_with_one_line_that_names_it(place, capsys):
+    there = before(place)
+    for command, arguments, word in CASES:
+        assert command.main(arguments) == 2, arguments
+        out, err = capsys.readouterr()
+        assert out == "" and err.count("\n") == 1 and word in err, (arguments, err)
+        assert err.startswith(f"{command.parser().prog}: ")
+        assert before(place) == there, arguments
+
+
+@pytest.mark.parametrize("device", ["nonsense", "cuda:99", "meta"])
+def test_a_device_is_cpu_or_cuda(device, capsys):
+    with pytest.raises(SystemExit) as stop:
+        render.main(["x.glb", "--device", device])
+    assert stop.value.code == 2 and "--device" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
+def test_cuda_that_is_missing_is_told(capsys):
+    assert render.main(["x.glb", "--device", "cuda"]) == 2
+    assert "expected a CUDA device" in capsys.readouterr().err
+
+
+def test_a_good_sample_passes_and_each_other_dtype_or_shape_does_not(tmp_path):
+    path = tmp_path / "samples" / "1.safetensors"
+    sample(path)
+    check_sample(path, views=12)
+    with pytest.raises(InputError, match="at least 13"):
+        check_sample(path, views=13)
+    for name, (_, dtype) in TENSORS.items():
+        for tensor in (torch.zeros(2, 5, 7, 11, 13, dtype=TYPES[dtype]), torch.zeros(1, dtype=torch.int64), None):
+            sample(path, **{name: tensor})
+            with pytest.raises(InputError, match=name):
+                check_sample(path)

@@ -1,0 +1,211 @@
+"""Reading what a file must not hold: an error that names the field, at once, and nothing but ValueError and OSError."""
+
+import dataclasses
+import json
+import os
+import struct
+import time
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from reli3d.io.files import InputError, write_bytes
+from reli3d.io.glb import read_glb
+from reli3d.io.hdr import read_environment, read_hdr_image
+from reli3d.io.images import _several, read_image
+from reli3d.nn.presets import LOCAL, SMALL, from_json, to_json
+from reli3d.nn.weights import WeightsError, read_manifest
+from reli3d.views.colmap import _cameras
+from reli3d.views.folder import _beside, intrinsics_of
+from reli3d.views.shots import Lens, cleaned
+from reli3d.views.transforms import read_json, read_transforms
+
+AT_ONCE = 5.0  # seconds of the processor: what is meant is less than one, against minutes
+
+
+@pytest.fixture(autouse=True)
+def at_once():
+    began = time.process_time()
+    yield
+    assert time.process_time() - began < AT_ONCE
+
+
+def transforms(folder, **fields):
+    frame = {"file_path": "0.png", "transform_matrix": np.eye(4).tolist(), **fields}
+    (folder / "transforms.json").write_text(json.dumps({"frames": [frame]}))
+    return folder / "transforms.json"
+
+
+@pytest.mark.parametrize(
+    "name, value, word",
+    [
+        ("w", 0.5, "w, h"),
+        ("h", 1e-300, "w, h"),
+        ("fov_rad", 5e-324, "fov_rad"),
+        ("camera_fov", [0.7, 5e-324], "camera_fov"),
+        ("camera_angle_x", 1e-320, "camera_angle_x"),
+    ],
+)
+def test_lenses_that_divide_by_zero(tmp_path, name, value, word):
+    with pytest.raises(InputError, match=word):
+        read_transforms(transforms(tmp_path, **{"w": 8, "h": 8, "fl_x": 9, name: value} if name in "wh" else
+                                   {name: value}))  # fmt: skip
+
+
+def test_a_focal_length_next_to_nothing_with_distortion():
+    with pytest.raises(InputError, match="distortion"):
+        intrinsics_of(Lens(focal=(1e-100, 1e-100), radial=(0.1, 0.1, 0.1)), 64, 64, "here", [])
+
+
+def test_a_skew_is_not_called_a_scale():
+    matrix = np.eye(4)
+    matrix[0, 1] = 0.0009  # with the scale below R^T R leaves 1 by more than is allowed, and without it by less
+    matrix[0, 0] = 1.0006
+    with pytest.raises(InputError, match="right angles"):
+        cleaned("here", "transform_matrix", matrix)
+    with pytest.raises(InputError, match="got scale 1.01"):
+        cleaned("here", "transform_matrix", np.diag([1.01, 1.01, 1.01, 1.0]))
+
+
+def test_many_keys_of_which_one_stands_twice(tmp_path):
+    path = tmp_path / "many.json"
+    path.write_text("{" + ",".join(f'"{k}":0' for k in range(200_000)) + ',"199999":0}')
+    with pytest.raises(InputError, match="'199999' twice"):
+        read_json(path)
+
+
+def test_a_line_without_end(tmp_path):
+    path = tmp_path / "cameras.txt"
+    path.write_text("1 PINHOLE 8 8 " + "9 " * 30_000_000)
+    with pytest.raises(InputError, match="line 1"):
+        _cameras(path)
+
+
+def test_names_of_255_letters(tmp_path):
+    write_bytes(tmp_path / ("n" * 251 + ".png"), b"data")
+    write_bytes(tmp_path / ("n." + "s" * 253), b"data")
+    assert len(list(tmp_path.iterdir())) == 2
+    assert _beside(tmp_path, tmp_path / ("m" * 251 + ".png")) is None
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs pipes")
+@pytest.mark.parametrize("read", [read_environment, read_hdr_image, read_image, read_glb, read_manifest, read_json])
+def test_pipes_and_devices_are_not_opened(tmp_path, read):
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path / "pipe", "/dev/zero", "/dev/stdin", tmp_path):
+        with pytest.raises(ValueError, match="regular file"):
+            read(path)
+
+
+def test_a_file_without_permission_is_told_so(tmp_path, monkeypatch):
+    Image.new("RGB", (9, 9)).save(tmp_path / "a.png")
+
+    def refuse(*_, **__):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Image, "open", refuse)  # also for root, who may read everything
+    with pytest.raises(InputError, match="permissions"):
+        read_image(tmp_path / "a.png")
+
+
+def test_many_frames_are_not_counted(tmp_path):
+    """A TIFF whose 20,000 directories follow each other; each has an entry of its own."""
+    entries = [(256, 3, 1), (257, 3, 1), (258, 3, 8), (259, 3, 1), (262, 3, 1), (273, 4, 8), (277, 3, 1), (278, 3, 1),
+               (279, 4, 1)]  # fmt: skip
+    size = 2 + 12 * len(entries) + 4
+    data = bytearray(b"II*\0" + struct.pack("<I", 16) + bytes(8))
+    for k in range(20_000):
+        data += struct.pack("<H", len(entries)) + b"".join(struct.pack("<HHII", t, f, 1, v) for t, f, v in entries)
+        data += struct.pack("<I", 16 + (k + 1) * size if k < 19_999 else 0)
+    (tmp_path / "many.tif").write_bytes(data)
+    with pytest.raises(InputError, match="several frames"):
+        read_image(tmp_path / "many.tif")
+    Image.new("L", (16, 9), 77).save(tmp_path / "one.tif")
+    assert read_image(tmp_path / "one.tif")[0].shape == (9, 16, 3)
+    with Image.open(tmp_path / "one.tif") as image:
+        assert not _several(image) and image.getpixel((3, 3)) == 77
+
+
+def test_a_thousand_scans_are_refused_and_ten_are_not(tmp_path):
+    picture = Image.fromarray(np.random.default_rng(0).integers(0, 255, (64, 64, 3), dtype=np.uint8))
+    picture.save(tmp_path / "a.jpg", progressive=True)
+    assert read_image(tmp_path / "a.jpg")[0].shape == (64, 64, 3)
+    data = (tmp_path / "a.jpg").read_bytes()
+    last = data.rindex(b"\xff\xda")
+    (tmp_path / "b.jpg").write_bytes(data[:last] + data[last:-2] * 1000 + data[-2:])
+    with pytest.raises(InputError, match="scans"):
+        read_image(tmp_path / "b.jpg")
+
+
+def glb(path, **document):
+    """A GLB of one triangle at the origin; ``document`` takes the place of top-level fields."""
+    binary = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32).tobytes()
+    document = {"asset": {"version": "2.0"}, "buffers": [{"byteLength": 36}],
+                "bufferViews": [{"buffer": 0, "byteLength": 36}],
+                "accessors": [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}],
+                "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}], "nodes": [{"mesh": 0}],
+                **document}  # fmt: skip
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
+    path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+    return path
+
+
+def textured(size, **info):
+    """The fields of a GLB whose material has one image of ``size``."""
+    import base64
+    import io
+
+    data = io.BytesIO()
+    Image.new("RGB", size).save(data, "PNG")
+    uri = "data:image/png;base64," + base64.b64encode(data.getvalue()).decode()
+    material = {"normalTexture": {"index": 0, **info}}
+    return {"images": [{"uri": uri}], "textures": [{"source": 0}], "materials": [material],
+            "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "material": 0}]}]}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "fields, word",
+    [
+        ({"extensionsRequired": [{}]}, "extensionsRequired"),
+        ({"extensionsRequired": [["KHR"], 3]}, "extensionsRequired"),
+        ({"nodes": [{"mesh": 0, "children": None}]}, "children"),
+        ({"nodes": [7]}, "nodes"),
+        ({"accessors": [{"componentType": 5126, "count": 60_000_000, "type": "VEC3"}]}, "count"),
+        ({"nodes": [{"mesh": 0}] * 5000}, "primitives as placed"),
+        ({"meshes": [{"primitives": [{"attributes": {"POSITION": 0}}] * 5000}]}, "primitives as placed"),
+        (textured((30000, 1)), "made square"),
+        (textured((8, 8), scale=1e308), "scale"),
+    ],
+)
+def test_glb_fields(tmp_path, fields, word):
+    assert len(read_glb(glb(tmp_path / "good.glb"))) == 1
+    with pytest.raises(InputError, match=word):
+        read_glb(glb(tmp_path / "bad.glb", **fields))
+
+
+@pytest.mark.parametrize("change", [{"shape": [1.0]}, {"shape": ["1"]}, {"shape": [True]}, {"data_offsets": [0.0, 4]},
+                                    {"data_offsets": ["0", "4"]}, {"data_offsets": [0, 1e400]},
+                                    {"data_offsets": [0]}])  # fmt: skip
+def test_headers_of_weights_hold_integers(tmp_path, change):
+    header = json.dumps({"x": {"dtype": "F32", "shape": [1], "data_offsets": [0, 4], **change}}).encode()
+    (tmp_path / "w").write_bytes(len(header).to_bytes(8, "little") + header + bytes(4))
+    with pytest.raises(WeightsError):
+        read_manifest(tmp_path / "w")
+
+
+def test_presets_of_absurd_size_or_depth_are_refused():
+    assert from_json(to_json(SMALL)) == SMALL and from_json(to_json(LOCAL)) == LOCAL
+    for text in ("[" * 100_000, "{" * 100_000, '{"pyramid":' * 50_000, "1" * 10_000, "[]", "null"):
+        with pytest.raises(ValueError, match="preset"):
+            from_json(text)
+    small = dataclasses.asdict(SMALL)
+    for change in ({"radius": float("nan")}, {"radius": float("inf")}, {"head_width": 10**9}, {"head_width": -1},
+                   {"encoder": {**small["encoder"], "layers": 10**9}}):  # fmt: skip
+        with pytest.raises(ValueError, match="preset"):
+            from_json(json.dumps({**small, **change}))
+    widths = {**dataclasses.asdict(LOCAL)["pyramid"], "widths": [10**9] * 5}
+    with pytest.raises(ValueError, match="preset"):
+        from_json(json.dumps({**dataclasses.asdict(LOCAL), "pyramid": widths}))
