@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 import sys
 import tempfile
 import threading
@@ -227,15 +228,31 @@ def load_modules(modules: Sequence[ModuleType], device: torch.device) -> None:
     Without it every module compiles at its first launch, one after the other.  The compiler releases the GIL.
     """
     with stream(device) as name:
-        wp.force_load(name, [wp.get_module(m.__name__) for m in modules],
-                      block_dim=CPU_BLOCK if name == "cpu" else None,
-                      max_workers=min(os.cpu_count() or 1, COMPILERS))  # fmt: skip
+        loaded = [wp.get_module(m.__name__) for m in modules]
+        block = CPU_BLOCK if name == "cpu" else None
+        try:
+            wp.force_load(name, loaded, block_dim=block, max_workers=min(os.cpu_count() or 1, COMPILERS))
+        except Exception:  # Warp raises no narrower class
+            for module in loaded:
+                _repaired(module, block, lambda m=module: wp.force_load(name, [m], block_dim=block))
 
 
 def _load(kernel) -> None:
     """Have a kernel's module ready on the CPU."""
     with _LOADING:
-        kernel.module.load(wp.get_device("cpu"), block_dim=CPU_BLOCK)
+        _repaired(kernel.module, CPU_BLOCK, lambda: kernel.module.load(wp.get_device("cpu"), block_dim=CPU_BLOCK))
+
+
+def _repaired(module, block: int | None, load) -> None:
+    """``load()``; where it fails, once more without the module's folder in the kernel cache, which may be broken."""
+    try:
+        load()
+    except Exception as error:  # Warp raises no narrower class
+        folder = os.path.join(wp.config.kernel_cache_dir, module.get_module_identifier(block_dim=block))
+        print(f"reli3d: {folder} cannot be loaded ({error}); compiling it again", file=sys.stderr)
+        shutil.rmtree(folder, ignore_errors=True)
+        module.mark_modified()
+        load()
 
 
 def launch(kernel, n: int, args: Sequence, device: torch.device, *, slice_min: int = SLICE_MIN) -> None:
