@@ -12,9 +12,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-import shutil
 import sys
-import tempfile
 import threading
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -25,6 +23,8 @@ import numpy as np
 import torch
 import warp as wp
 from torch import Tensor
+
+from reli3d.kernels.cache import no_driver_warning, private_folder, repaired
 
 WORKER = "reli3d-slice"  # how the threads of the pool are called
 SLICES = 16  # several a thread balance uneven rays on 2 to 8 cores; more only add 20 us of launch each
@@ -61,49 +61,16 @@ def initialise() -> None:
 def _start() -> None:
     wp.config.log_level = wp.LOG_WARNING
     try:
-        with _no_driver_warning():
+        with no_driver_warning():
             wp.init()
         writable = os.access(wp.config.kernel_cache_dir, os.W_OK)
     except OSError:
         writable = False
     if not writable:
-        fallback = _private_folder()
+        fallback = private_folder()
         print(f"reli3d: kernel cache {wp.config.kernel_cache_dir} cannot be written; using {fallback}", file=sys.stderr)
         wp.config.kernel_cache_dir = fallback
         wp.init()
-
-
-@contextlib.contextmanager
-def _no_driver_warning():
-    """Keeps a line of Warp's native code from the terminal: that there is no NVIDIA driver.
-
-    Without one that is no news (``reli3d doctor`` says it), and it is written past Python to file descriptor 2.  What
-    else is written there meanwhile is passed on.
-    """
-    try:
-        terminal = os.dup(2)
-    except OSError:  # a process without that stream
-        yield
-        return
-    with tempfile.TemporaryFile() as caught:
-        os.dup2(caught.fileno(), 2)
-        try:
-            yield
-        finally:
-            os.dup2(terminal, 2)
-            os.close(terminal)
-            caught.seek(0)
-            rest = b"".join(line for line in caught if b"Could not find or load the NVIDIA CUDA driver" not in line)
-            if rest:
-                os.write(2, rest)
-
-
-def _private_folder() -> str:
-    """Folder for compiled kernels that no other user can have filled: the same one in the next process."""
-    user = os.getuid() if hasattr(os, "getuid") else 0
-    folder = os.path.join(tempfile.gettempdir(), f"reli3d-warp-{user}")
-    os.makedirs(folder, mode=0o700, exist_ok=True)
-    return folder if os.name == "nt" or os.lstat(folder).st_uid == user else tempfile.mkdtemp(prefix="reli3d-warp-")
 
 
 @lru_cache(1)
@@ -234,25 +201,13 @@ def load_modules(modules: Sequence[ModuleType], device: torch.device) -> None:
             wp.force_load(name, loaded, block_dim=block, max_workers=min(os.cpu_count() or 1, COMPILERS))
         except Exception:  # Warp raises no narrower class
             for module in loaded:
-                _repaired(module, block, lambda m=module: wp.force_load(name, [m], block_dim=block))
+                repaired(module, block, lambda m=module: wp.force_load(name, [m], block_dim=block))
 
 
 def _load(kernel) -> None:
     """Have a kernel's module ready on the CPU."""
     with _LOADING:
-        _repaired(kernel.module, CPU_BLOCK, lambda: kernel.module.load(wp.get_device("cpu"), block_dim=CPU_BLOCK))
-
-
-def _repaired(module, block: int | None, load) -> None:
-    """``load()``; where it fails, once more without the module's folder in the kernel cache, which may be broken."""
-    try:
-        load()
-    except Exception as error:  # Warp raises no narrower class
-        folder = os.path.join(wp.config.kernel_cache_dir, module.get_module_identifier(block_dim=block))
-        print(f"reli3d: {folder} cannot be loaded ({error}); compiling it again", file=sys.stderr)
-        shutil.rmtree(folder, ignore_errors=True)
-        module.mark_modified()
-        load()
+        repaired(kernel.module, CPU_BLOCK, lambda: kernel.module.load(wp.get_device("cpu"), block_dim=CPU_BLOCK))
 
 
 def launch(kernel, n: int, args: Sequence, device: torch.device, *, slice_min: int = SLICE_MIN) -> None:

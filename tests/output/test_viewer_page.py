@@ -34,8 +34,7 @@ def asset(tmp_path_factory) -> Asset:
     rows, columns = torch.meshgrid(torch.arange(64), torch.arange(64), indexing="ij")
     color = torch.stack([0.3 + rows / 128, 0.9 - columns / 96, (0.4 + (rows + columns) / 256)], -1)
     metal = (columns >= 52).float()
-    orm = torch.stack([torch.ones(64, 64), 0.35 + 0.2 * metal, metal], -1)
-    textures = TextureSet(color, orm, torch.tensor([0.5, 0.5, 1.0]).expand(64, 64, 3).contiguous())
+    textures = TextureSet(color, 0.35 + 0.2 * metal, metal)
     path = tmp_path_factory.mktemp("page") / "mesh.glb"
     write_glb(path, Asset(mesh, textures))
     (stored,) = read_glb(path)  # rounded to 8 bits, as the page has it

@@ -26,6 +26,7 @@ from reli3d.render.camera import Camera, look_at
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
 from reli3d.render.render import render
+from reli3d.render.shading import ShadeOptions
 from tests.support.browser import chromium, pixels, served
 from tests.support.scenes import ball_mesh
 
@@ -55,9 +56,7 @@ class Seen:
 def folder(tmp_path_factory):
     """``mesh.glb``, ``environment.hdr`` and ``.exr`` as the command writes them."""
     folder = tmp_path_factory.mktemp("viewers")
-    flat = lambda *rgb: torch.tensor(rgb).expand(4, 4, 3).contiguous()  # noqa: E731
-    write_glb(folder / "mesh.glb", Asset(ball_mesh(5, 0.6), TextureSet(
-        flat(1.0, 1.0, 1.0), flat(1.0, 0.0, 1.0), flat(0.5, 0.5, 1.0))))  # fmt: skip
+    write_glb(folder / "mesh.glb", Asset(ball_mesh(5, 0.6), TextureSet(torch.ones(4, 4, 3), 0.0, 1.0)))
     light = torch.full((256, 512, 3), 0.02)  # three.js makes cubes of a quarter of the width
     column, row = (torch.arange(512) + 0.5) / 512, (torch.arange(256) + 0.5) / 256
     theta, phi = 2 * math.pi * column - math.pi, math.pi * row[:, None]
@@ -78,7 +77,7 @@ def ours(folder) -> Seen:
 def rendered(glb: Path, light: Environment) -> Seen:
     pose = look_at(torch.tensor(EYE, dtype=torch.float32), torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))
     camera = Camera.from_fov(pose, math.radians(FOV), SIZE, SIZE)
-    image = render(read_glb(glb), camera, light, samples=(0, 12, 0), supersampling=2)  # a mirror: GGX alone
+    image = render(read_glb(glb), camera, light, options=ShadeOptions((0, 12, 0)), supersampling=2)  # a mirror: GGX
     color = linear_to_srgb((image.radiance / image.alpha[..., None].clamp(min=1e-6)).clamp(0, 1))
     return Seen(image.alpha.numpy() > 0.5, 255.0 * color.numpy())
 

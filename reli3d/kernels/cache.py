@@ -1,0 +1,54 @@
+"""Warp at its start, and the folder that holds compiled kernels."""
+
+import contextlib
+import os
+import shutil
+import sys
+import tempfile
+
+import warp as wp
+
+
+@contextlib.contextmanager
+def no_driver_warning():
+    """Keeps a line of Warp's native code from the terminal: that there is no NVIDIA driver.
+
+    Without one that is no news (``reli3d doctor`` says it), and it is written past Python to file descriptor 2.  What
+    else is written there meanwhile is passed on.
+    """
+    try:
+        terminal = os.dup(2)
+    except OSError:  # a process without that stream
+        yield
+        return
+    with tempfile.TemporaryFile() as caught:
+        os.dup2(caught.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(terminal, 2)
+            os.close(terminal)
+            caught.seek(0)
+            rest = b"".join(line for line in caught if b"Could not find or load the NVIDIA CUDA driver" not in line)
+            if rest:
+                os.write(2, rest)
+
+
+def private_folder() -> str:
+    """Folder for compiled kernels that no other user can have filled: the same one in the next process."""
+    user = os.getuid() if hasattr(os, "getuid") else 0
+    folder = os.path.join(tempfile.gettempdir(), f"reli3d-warp-{user}")
+    os.makedirs(folder, mode=0o700, exist_ok=True)
+    return folder if os.name == "nt" or os.lstat(folder).st_uid == user else tempfile.mkdtemp(prefix="reli3d-warp-")
+
+
+def repaired(module, block: int | None, load) -> None:
+    """``load()``; where it fails, once more without the module's folder in the kernel cache, which may be broken."""
+    try:
+        load()
+    except Exception as error:  # Warp raises no narrower class
+        folder = os.path.join(wp.config.kernel_cache_dir, module.get_module_identifier(block_dim=block))
+        print(f"reli3d: {folder} cannot be loaded ({error}); compiling it again", file=sys.stderr)
+        shutil.rmtree(folder, ignore_errors=True)
+        module.mark_modified()
+        load()
