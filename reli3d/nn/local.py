@@ -98,9 +98,10 @@ class LocalReconstructor(nn.Module):
         surface = inside + FUSED + 3 + SHADING_FEATURES
         self.color = mlp(surface, preset.head_width, 7, 2)  # own guess, correction, share of the own guess
         self.surface = mlp(surface, preset.head_width, 6, 2)  # roughness, metallic, bend of the normal, its share
-        for head in (self.color, self.surface):
-            nn.init.normal_(head[-1].weight, std=0.01)
-            nn.init.zeros_(head[-1].bias)
+        if self.device.type != "meta":  # there are no values there, and torch would import its compiler to say so
+            for head in (self.color, self.surface):
+                nn.init.normal_(head[-1].weight, std=0.01)
+                nn.init.zeros_(head[-1].bias)
 
     @property
     def device(self) -> torch.device:
@@ -167,7 +168,7 @@ class LocalField:
         """None: features of points belong to no plane, see :meth:`reli3d.nn.field.Field.grid_level`."""
 
     def cube_weights(self, points: Tensor, level: Tensor) -> dict[str, Tensor]:
-        """None beside the level, see :meth:`reli3d.nn.field.Field.cube_weights`."""
+        """Empty: this network gives cubes no weights, see :meth:`reli3d.nn.field.Field.cube_weights`."""
         return {}
 
     def free_level(self, points: Tensor) -> Tensor:

@@ -1,9 +1,9 @@
-"""Sizes and switches of the network: two presets of one code path, as plain numbers.
+"""Sizes and switches of the networks, as plain numbers.
 
 ``official`` has the sizes of the published checkpoint (1.574 billion parameters).  ``small`` is the embedded default:
 the same modules, fewer numbers, and aids that let a small network learn geometry from little data (ray maps, image
 features sampled at the query points).  Where the paper and its release differ the release is followed, so that its
-weights load.
+weights load.  ``local`` is another network, made of convolutions, which ``reli3d-train`` trains.
 """
 
 from __future__ import annotations

@@ -56,14 +56,7 @@ def preview(asset: Asset, views: Views) -> np.ndarray:
         ("base colour, roughness, metallic, normal", [_on_paper(m, first.alpha) for m in maps]),
         ("own light, its mean at a quarter", [_map(asset.environment)]),
     ]
-    height = TITLE + TILE
-    sheet = Image.new("RGB", (COLUMNS * TILE, len(rows) * height - TILE // 2), "white")
-    draw = ImageDraw.Draw(sheet)
-    for r, (title, tiles) in enumerate(rows):
-        draw.text((3, r * height + 1), title, fill="black")
-        for c, tile in enumerate(tiles):
-            sheet.paste(_image(tile), (c * TILE, r * height + TITLE))
-    return np.asarray(sheet)
+    return _sheet(rows, COLUMNS, last=TILE // 2)
 
 
 def comparison(before: Asset, after: Asset, views: Views) -> np.ndarray:
@@ -76,8 +69,13 @@ def comparison(before: Asset, after: Asset, views: Views) -> np.ndarray:
         cameras = [Camera(batch.c2w[i], batch.intrinsics[i], TILE, TILE) for i in range(count)]
         shots = [render(asset, c, options=ShadeOptions(samples=SAMPLES), scene=scene) for c in cameras]
         rows.append((title, [_lit(s.radiance, s.alpha) for s in shots]))
+    return _sheet(rows, count)
+
+
+def _sheet(rows: list[tuple[str, list[Tensor]]], columns: int, *, last: int = TILE) -> np.ndarray:
+    """Rows of tiles under their titles, ``(H, W, 3)`` uint8; last: height of the last row's tiles."""
     height = TITLE + TILE
-    sheet = Image.new("RGB", (count * TILE, len(rows) * height), "white")
+    sheet = Image.new("RGB", (columns * TILE, len(rows) * height - TILE + last), "white")
     draw = ImageDraw.Draw(sheet)
     for r, (title, tiles) in enumerate(rows):
         draw.text((3, r * height + 1), title, fill="black")
