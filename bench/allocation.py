@@ -209,8 +209,10 @@ def images(glb: Path, light: Path) -> None:
         spent = time.process_time() - start
         radiance, shown = (a / b for a, b in zip(variances(counts), published, strict=True))
         kind = "relative" if relative else "absolute"
-        sys.stdout.write(f"{glb.stem} {light.stem} {kind} {counts}: variance over the published counts' "
-                         f"{radiance:.2f}, of the picture {shown:.2f}; plan {1e3 * spent:.0f} ms\n")  # fmt: skip
+        sys.stdout.write(
+            f"{glb.stem} {light.stem} {kind} {counts}: variance over the published counts' "
+            f"{radiance:.2f}, of the picture {shown:.2f}; plan {1e3 * spent:.0f} ms\n"
+        )
 
 
 if __name__ == "__main__":

@@ -36,8 +36,9 @@ def meshes(folder: Path) -> dict[str, Mesh]:
     found = {}
     for path in sorted(folder.glob("*.glb")):
         shape = trimesh.load(path, force="mesh", process=False)
-        found[path.stem] = Mesh(torch.from_numpy(np.array(shape.vertices, np.float32)),
-                                torch.from_numpy(np.array(shape.faces, np.int32)))  # fmt: skip
+        found[path.stem] = Mesh(
+            torch.from_numpy(np.array(shape.vertices, np.float32)), torch.from_numpy(np.array(shape.faces, np.int32))
+        )
     return found | {f"extracted_{n}": extract_surface(field(n, "cpu"), radius=0.87) for n in EXTRACTED}
 
 
@@ -85,8 +86,14 @@ def main(argv: list[str] | None = None) -> int:
         if options.limit > 0:
             makers["xatlas"] = theirs(mesh, options.size, options.limit)
         for maker, (result, seconds) in makers.items():
-            row = {"case": f"atlas_table.{name}", "maker": maker, "faces": len(mesh.faces), "cpu_seconds": seconds,
-                   "size": options.size, "timeout": result is None}  # fmt: skip
+            row = {
+                "case": f"atlas_table.{name}",
+                "maker": maker,
+                "faces": len(mesh.faces),
+                "cpu_seconds": seconds,
+                "size": options.size,
+                "timeout": result is None,
+            }
             text = f"{name:28s} {len(mesh.faces):7d}  {maker:7s} {1e3 * seconds:9.1f}"
             if result is None:
                 text += " timeout"

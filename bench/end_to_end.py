@@ -9,7 +9,7 @@ from pathlib import Path
 
 from reli3d.io.glb import write_glb
 from reli3d.nn.weights import load_model
-from reli3d.pipeline import reconstruct
+from reli3d.pipeline import ReconstructOptions, Stopwatch, reconstruct
 from reli3d.views.folder import load_views
 
 
@@ -21,14 +21,15 @@ def views_to_glb(device, texture_size, resolution):
     """Views and ``small`` weights in memory to ``mesh.glb`` on disk; the parts of the time are the pipeline's own."""
     views = load_views(example(), views=4)
     model = load_model("small", str(device))
+    options = ReconstructOptions(texture_size=texture_size, resolution=resolution)
     folder = tempfile.TemporaryDirectory()
 
     def step():
-        stages = {}
-        asset = reconstruct(views, weights=model, texture_size=texture_size, resolution=resolution, timings=stages)
+        watch = Stopwatch(device)
+        asset = reconstruct(views, weights=model, options=options, watch=watch)
         start = time.perf_counter()
         write_glb(Path(folder.name) / "mesh.glb", asset)
-        return {**stages, "write_glb": time.perf_counter() - start}
+        return {**watch.seconds, "write_glb": time.perf_counter() - start}
 
     return step, {"objects": 1}
 

@@ -37,8 +37,9 @@ def torch_lookup(device, n, height, backward):
         x = torch.atan2(directions[:, 0], -directions[:, 2]) / torch.pi * (height / (height + 1))
         y = torch.acos(directions[:, 1].clamp(-1, 1)) / torch.pi * 2 - 1
         planes = torch.cat([r[:, -1:], r, r[:, :1]], 1).permute(2, 0, 1)[None]
-        got = torch.nn.functional.grid_sample(planes, torch.stack([x, y], -1)[None, None], padding_mode="border",
-                                              align_corners=False)  # fmt: skip
+        got = torch.nn.functional.grid_sample(
+            planes, torch.stack([x, y], -1)[None, None], padding_mode="border", align_corners=False
+        )
         return got[0, :, 0].T
 
     return with_grad(function, radiance, weight, backward)

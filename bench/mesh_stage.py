@@ -19,9 +19,9 @@ import torch
 
 from bench.surface import field
 from reli3d.io.glb import glb_bytes
-from reli3d.nn.field import Field
+from reli3d.nn.field import TriplaneField
 from reli3d.nn.model import Code, Reconstructor
-from reli3d.nn.presets import OFFICIAL, SMALL
+from reli3d.nn.presets import OFFICIAL, BackboneSizes, EncoderSizes
 from reli3d.nn.view_features import ViewMaps
 from reli3d.pipeline import extract, texture
 from reli3d.render.asset import Asset
@@ -45,13 +45,20 @@ def _field(n, device):
 def random_field(device):
     """The heads of the published preset and a random channel-last triplane of its size."""
     torch.manual_seed(0)
-    small = {part: getattr(SMALL, part) for part in ("encoder", "backbone", "illumination", "camera_width")}
-    preset = replace(OFFICIAL, plane_size=12, **small)
+    tiny = EncoderSizes(hidden=32, layers=1, heads=2, patch=14, grid=4, mask_channel=True)  # the trunk is not run
+    preset = replace(
+        OFFICIAL,
+        plane_size=12,
+        camera_width=32,
+        encoder=tiny,
+        backbone=BackboneSizes(heads=2, latents=8, blocks=1, basic_blocks=1, experts=0, experts_from=0, groups=4),
+        illumination=replace(OFFICIAL.illumination, encoder=tiny, width=32, heads=2, layers=1),
+    )
     model = KnownSurface(preset).to(device).eval()
     planes = torch.randn(1, 3, PLANE, PLANE, preset.upsampler.channels, device=device).movedim(-1, 2)
     nothing = torch.zeros(1, 4, device=device)
     maps = ViewMaps(nothing[None, None], nothing[None, None], torch.eye(4, device=device)[None], nothing)
-    return Field(model, Code(planes, nothing[None, None], nothing[None], nothing, nothing[:, :1]), maps)
+    return TriplaneField(maps, model, Code(planes, nothing[None, None], nothing[None], nothing, nothing[:, :1]))
 
 
 @torch.no_grad()

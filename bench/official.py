@@ -21,20 +21,27 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from bench.timing import _status, synchronise
 from reli3d.nn import weights
-from reli3d.nn.field import Field
+from reli3d.nn.field import TriplaneField
 from reli3d.nn.model import Reconstructor
-from reli3d.nn.presets import PRESETS, EncoderSizes, Preset
+from reli3d.nn.presets import OFFICIAL, EncoderSizes, Preset
 from reli3d.nn.reni import EnvironmentDecoder
 from reli3d.nn.view_features import ViewMaps
 
 CASES: dict = {}
-PARTS = ("camera", "encoder", "bank", "backbone", "upsampler", "illumination", "environment", "heads", "merger",
-         "view_features")  # fmt: skip
+PARTS = ("camera", "encoder", "bank", "backbone", "upsampler", "illumination", "environment", "heads", "merger")
 # Parameters as the specification counts them, by part of ours.  It gives no number for the illumination: that is its
 # whole, 1,574,452,729, less the others, 24,576 numbers of map directions and 10 of tone mapping, buffers here.
-SPECIFIED = {"camera": 26_624, "encoder": 304_367_616 + 100_761_600, "bank": 28_311_552, "backbone": 996_710_448,
-             "upsampler": 34_213_504, "illumination": 109_273_856, "environment": 659_854, "heads": 89_308,
-             "merger": 13_781}  # fmt: skip
+SPECIFIED = {
+    "camera": 26_624,
+    "encoder": 304_367_616 + 100_761_600,
+    "bank": 28_311_552,
+    "backbone": 996_710_448,
+    "upsampler": 34_213_504,
+    "illumination": 109_273_856,
+    "environment": 659_854,
+    "heads": 89_308,
+    "merger": 13_781,
+}
 
 
 def views(preset: Preset, count: int, device: torch.device) -> tuple[torch.Tensor, ...]:
@@ -108,9 +115,17 @@ def specified_flops(preset: Preset, count: int) -> dict[str, float]:
     reni += r.layers * (
         2 * linear(rays, r.width, r.width) + linear(1, 3 * r.latents, r.width) + linear(1, r.width, r.width)
     )
-    return {"camera": linear(count, 25, preset.camera_width), "encoder": own, "bank": 0.0, "backbone": two_stream,
-            "upsampler": upsampler, "illumination": light, "environment": reni + 2 * 9.0 * r.latents,
-            "heads": 0.0, "merger": 0.0, "view_features": 0.0}  # fmt: skip
+    return {
+        "camera": linear(count, 25, preset.camera_width),
+        "encoder": own,
+        "bank": 0.0,
+        "backbone": two_stream,
+        "upsampler": upsampler,
+        "illumination": light,
+        "environment": reni + 2 * 9.0 * r.latents,
+        "heads": 0.0,
+        "merger": 0.0,
+    }
 
 
 def parameters(preset: Preset) -> dict[str, int]:
@@ -126,11 +141,15 @@ def table(preset: Preset, count: int) -> str:
     own, stated = parameters(preset), SPECIFIED if preset.name == "official" else {}
     rows = [f"| part | parameters | specification | GFLOP, {count} views | closed form |", "|---|---|---|---|---|"]
     for part, number in own.items():
-        rows.append(f"| {part} | {number:,} | {f'{stated[part]:,}' if part in stated else '-'} | "
-                    f"{flops[part] / 1e9:.3f} | {formula[part] / 1e9:.3f} |")  # fmt: skip
+        rows.append(
+            f"| {part} | {number:,} | {f'{stated[part]:,}' if part in stated else '-'} | "
+            f"{flops[part] / 1e9:.3f} | {formula[part] / 1e9:.3f} |"
+        )
     whole = f"{sum(stated.values()):,}" if stated else "-"
-    rows.append(f"| sum | {sum(own.values()):,} | {whole} | {sum(flops.values()) / 1e9:.1f} | "
-                f"{sum(formula.values()) / 1e9:.1f} |")  # fmt: skip
+    rows.append(
+        f"| sum | {sum(own.values()):,} | {whole} | {sum(flops.values()) / 1e9:.1f} | "
+        f"{sum(formula.values()) / 1e9:.1f} |"
+    )
     return "\n".join(rows)
 
 
@@ -157,7 +176,7 @@ class Clock:
 
     def __init__(self, model: Reconstructor, device: torch.device):
         self.seconds: dict[str, float] = defaultdict(float)
-        named = {name: getattr(model, name) for name in PARTS[:-3]}
+        named = {name: getattr(model, name) for name in PARTS[:-2]}
         named |= {f"  block {k}": block for k, block in enumerate(model.backbone.main_blocks)}
         for name, module in named.items():
             module.register_forward_pre_hook(lambda *_, name=name: self._add(name, device, -1.0))
@@ -186,12 +205,16 @@ def forward(path: Path, count: int, trunk: torch.dtype, device: torch.device, ru
         synchronise(device)
         whole, busy = time.perf_counter() - began, time.process_time() - processor
         finite = all(bool(t.isfinite().all()) for t in (code.triplane, code.latent, code.strength, environment))
-        print(f"run {run + 1}: {whole:.2f} s with {count} views (processor {busy:.1f} s), "
-              f"{sum(flops.values()) / whole / 1e9:.0f} GFLOP/s, {'finite' if finite else 'NOT FINITE'}")  # fmt: skip
+        print(
+            f"run {run + 1}: {whole:.2f} s with {count} views (processor {busy:.1f} s), "
+            f"{sum(flops.values()) / whole / 1e9:.0f} GFLOP/s, {'finite' if finite else 'NOT FINITE'}"
+        )
         after = matrix_rate(device, trunk)
         floor = 2.0 * sum(flops.values()) / (before + after)
-        print(f"  matrix products alone run at {before / 1e9:.0f} GFLOP/s before and {after / 1e9:.0f} after: floor "
-              f"{floor:.2f} s, of which the forward reaches {floor / whole:.0%}")  # fmt: skip
+        print(
+            f"  matrix products alone run at {before / 1e9:.0f} GFLOP/s before and {after / 1e9:.0f} after: floor "
+            f"{floor:.2f} s, of which the forward reaches {floor / whole:.0%}"
+        )
         before = after
         for name, seconds in clock.seconds.items():
             rate = f"{flops[name] / seconds / 1e9:8.0f} GFLOP/s" if flops.get(name) else ""
@@ -199,7 +222,7 @@ def forward(path: Path, count: int, trunk: torch.dtype, device: torch.device, ru
         images, masks, c2w, intrinsics = (t[0] for t in inputs)
         maps = ViewMaps(code.view_tokens[0].float(), torch.cat([images, masks[..., None]], -1), c2w, intrinsics)
         began, side = time.perf_counter(), torch.linspace(-0.87, 0.87, model.preset.resolution + 1, device=device)
-        Field(model, code, maps).free_level(torch.cartesian_prod(side, side, side))
+        TriplaneField(maps, model, code).free_level(torch.cartesian_prod(side, side, side))
         synchronise(device)
         print(f"  {'level, grid':16s} {time.perf_counter() - began:8.3f} s")
         if device.type == "cuda":
@@ -212,16 +235,19 @@ def forward(path: Path, count: int, trunk: torch.dtype, device: torch.device, ru
 
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m bench.official", description=__doc__.splitlines()[0])
-    parser.add_argument("--preset", choices=sorted(PRESETS), default="official")
     parser.add_argument("--views", type=int, nargs="+", default=[1, 4])
     parser.add_argument("--precision", choices=("float32", "bfloat16"), default="float32", help="of the trunk")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
-    parser.add_argument("--weights", type=Path, help="file to use; where it is missing random weights are written "
-                        "there (6.3 GB) and kept; default a temporary one")  # fmt: skip
+    parser.add_argument(
+        "--weights",
+        type=Path,
+        help="file to use; where it is missing random weights are written "
+        "there (6.3 GB) and kept; default a temporary one",
+    )
     parser.add_argument("--runs", type=int, default=1)
     parser.add_argument("--table", action="store_true", help="only count parameters and operations")
     options = parser.parse_args(argv)
-    preset = PRESETS[options.preset]
+    preset = OFFICIAL
     if options.table:
         print(table(preset, max(options.views)))
         return 0

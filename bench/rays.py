@@ -102,8 +102,10 @@ def study() -> None:
         for n, subdivisions in [(1 << k, 6) for k in (10, 14, 17, 20, 22)] + [(1 << 18, k) for k in (2, 4, 6, 8)]:
             steps = [f(device, n, query, subdivisions)[0] for f in (cast, embree_cast)]
             ours, theirs = time_steps(steps, device, seconds=0.7)
-            say(f"{query}, {n} rays, {20 * 4**subdivisions} triangles: {1e9 * ours.median / n:.0f} ns a ray, embreex "
-                f"{1e9 * theirs.median / n:.0f}, {theirs.median / ours.median:.2f} times\n")  # fmt: skip
+            say(
+                f"{query}, {n} rays, {20 * 4**subdivisions} triangles: {1e9 * ours.median / n:.0f} ns a ray, embreex "
+                f"{1e9 * theirs.median / n:.0f}, {theirs.median / ours.median:.2f} times\n"
+            )
     n, torch_threads = 1 << 18, torch.get_num_threads()
     torch.set_num_threads(1)
     vertices, faces, origins, directions = inputs(n)

@@ -122,11 +122,17 @@ def context(device: torch.device) -> dict:
             continue
     git = ["git", "-C", str(HERE)]
     commit = subprocess.run([*git, "rev-parse", "--short=12", "HEAD"], capture_output=True, text=True).stdout.strip()
-    changed = subprocess.run([*git, "status", "--porcelain", "-uno", "--", "../reli3d", "*.py"],
-                             capture_output=True, text=True).stdout.strip()  # fmt: skip
-    return {"time": datetime.now(timezone.utc).isoformat(timespec="seconds"), "device": device.type,
-            "machine": machine(device), "threads": torch.get_num_threads(), "versions": versions,
-            "commit": (commit or "none") + ("+changes" if changed else "")}  # fmt: skip
+    changed = subprocess.run(
+        [*git, "status", "--porcelain", "-uno", "--", "../reli3d", "*.py"], capture_output=True, text=True
+    ).stdout.strip()
+    return {
+        "time": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "device": device.type,
+        "machine": machine(device),
+        "threads": torch.get_num_threads(),
+        "versions": versions,
+        "commit": (commit or "none") + ("+changes" if changed else ""),
+    }
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -161,9 +167,15 @@ def main(argv: list[str] | None = None) -> int:
         sys.stdout.flush()
         if not options.no_results:
             results.mkdir(exist_ok=True)
-            row = {"case": name, "work": result.work, **asdict(result.ours), "ratio": result.ratio,
-                   "peer": None if result.peer is None else asdict(result.peer),
-                   "arguments": case.arguments, **about}  # fmt: skip
+            row = {
+                "case": name,
+                "work": result.work,
+                **asdict(result.ours),
+                "ratio": result.ratio,
+                "peer": None if result.peer is None else asdict(result.peer),
+                "arguments": case.arguments,
+                **about,
+            }
             with open(results / f"{about['machine']}.jsonl", "a") as file:
                 file.write(json.dumps(row, default=lambda o: o.__name__) + "\n")
         if options.record and result.ratio is not None:

@@ -90,16 +90,26 @@ def mitsuba_direct(device, size, roughness, backward, formula=None):
     params = mi.traverse(mesh)
     params["vertex_positions"], params["faces"] = vertices.ravel(), faces.ravel().astype(np.uint32)
     params.update()
-    principled = {"type": "principled", "base_color": {"type": "rgb", "value": [0.7, 0.4, 0.2]},
-                  "roughness": roughness, "metallic": 0.0, "specular": 0.5}  # fmt: skip
+    principled = {
+        "type": "principled",
+        "base_color": {"type": "rgb", "value": [0.7, 0.4, 0.2]},
+        "roughness": roughness,
+        "metallic": 0.0,
+        "specular": 0.5,
+    }
     color = mi.Color3f(0.7, 0.4, 0.2)
     if formula and backward:
         dr.enable_grad(color)
     mesh.set_bsdf(mi.load_dict(formula(mi, color) if formula else principled))
     bitmap = mi.Bitmap(sky(device).numpy())
-    scene = mi.load_dict({"type": "scene", "mesh": mesh, "light": {"type": "envmap", "bitmap": bitmap},
-                          "integrator": {"type": "direct", "emitter_samples": 32, "bsdf_samples": 32,
-                                         "hide_emitters": True}})  # fmt: skip
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "mesh": mesh,
+            "light": {"type": "envmap", "bitmap": bitmap},
+            "integrator": {"type": "direct", "emitter_samples": 32, "bsdf_samples": 32, "hide_emitters": True},
+        }
+    )
     origins, directions = (v.reshape(-1, 3).contiguous().numpy().T for v in camera_rays(view(device, size)))
     ray = mi.RayDifferential3f(mi.Point3f(origins), mi.Vector3f(directions))
 
@@ -200,9 +210,11 @@ def equal_variance(say) -> None:
         pairs["texels"] = _noise([g[1].numpy() for g in a]), _noise([_folded(np.array(g[1])) for g in b])
         for what, (ours, theirs) in pairs.items():
             faster = time[roughness, what != "image"]
-            say(f"roughness {roughness}, {what}: variance over squared mean, 64 samples: ours {ours:.3e}, Mitsuba "
+            say(
+                f"roughness {roughness}, {what}: variance over squared mean, 64 samples: ours {ours:.3e}, Mitsuba "
                 f"{theirs:.3e}, {theirs / ours:.2f} times; time {faster:.2f} times less at equal samples, "
-                f"{faster * theirs / ours:.2f} at equal variance\n")  # fmt: skip
+                f"{faster * theirs / ours:.2f} at equal variance\n"
+            )
 
 
 # Floating-point operations of a sample above the horizon in ``reli3d.kernels.shade``, counted by hand from the source:
@@ -229,16 +241,17 @@ def floor(device, say) -> None:
     square, block = torch.rand(2048, 2048, generator=g).to(device), torch.zeros(1 << 26, device=device)
     into = torch.empty_like(block)
     points = SurfacePoints(normal, normal, normal, normal.abs(), 0.4, 0.4)
-    steps = [lambda: shade(points, normal, environment),
-             lambda: square @ square, lambda: into.copy_(block)]  # fmt: skip
+    steps = [lambda: shade(points, normal, environment), lambda: square @ square, lambda: into.copy_(block)]
     kernel, product, copy = (t.median for t in time_steps(steps, device, seconds=2.0))
     rate, width = 2 * 2048**3 / product, 2 * 4 * block.numel() / copy
     count = sum(OPERATIONS.values())
     took, least, read = (1e9 * v for v in (kernel / (n * 64), count / rate, HIT_BYTES / 64 / width))
-    say(f"fused kernel on {device.type}, 64 samples, no shadows: {took:.3g} ns a sample, {count / took:.3g} GFLOP/s; "
+    say(
+        f"fused kernel on {device.type}, 64 samples, no shadows: {took:.3g} ns a sample, {count / took:.3g} GFLOP/s; "
         f"floor {least:.3g} ns by {count} operations at {rate / 1e9:.0f} GFLOP/s (float32 matrix product), "
         f"{read:.3g} ns by {HIT_BYTES / 64:.1f} bytes at {width / 1e9:.0f} GB/s (copy): "
-        f"{max(least, read) / took:.1%} of it\n")  # fmt: skip
+        f"{max(least, read) / took:.1%} of it\n"
+    )
 
 
 def study() -> None:
@@ -254,8 +267,10 @@ def study() -> None:
         step, work = direct(device, **{**base, **change})
         timing = time_steps([step], device, seconds=1.0)[0]
         rate, pixels = work["samples"] / timing.median / 1e6, change.get("size", base["size"]) ** 2
-        say(f"{change or 'the case'}: {1e3 * timing.median:.1f} ms, {rate:.2f} M samples/s, "
-            f"{timing.peak_bytes / pixels:.0f} bytes a pixel\n")  # fmt: skip
+        say(
+            f"{change or 'the case'}: {1e3 * timing.median:.1f} ms, {rate:.2f} M samples/s, "
+            f"{timing.peak_bytes / pixels:.0f} bytes a pixel\n"
+        )
 
 
 if __name__ == "__main__":

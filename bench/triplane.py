@@ -54,11 +54,17 @@ def torch_triplane(device, n, size, backward, threads, **_):
 
 CASES = {
     f"sample{'_grad' * backward}{variant}_{threads}": (
-        triplane, dict(n=200_000, size=384, backward=backward, threads=threads, **options))
+        triplane,
+        dict(n=200_000, size=384, backward=backward, threads=threads, **options),
+    )
     for backward in (False, True)
     for threads in (1, 2)
-    for variant, options in {"": {}, "_channel_last": {"channel_last": True}, "_half": {"dtype": "float16"},
-                             "_bfloat16": {"dtype": "bfloat16"}}.items()
+    for variant, options in {
+        "": {},
+        "_channel_last": {"channel_last": True},
+        "_half": {"dtype": "float16"},
+        "_bfloat16": {"dtype": "bfloat16"},
+    }.items()
     if threads == 2 or not variant or variant == "_channel_last"
-}  # fmt: skip
+}
 PEERS = dict.fromkeys(CASES, torch_triplane)

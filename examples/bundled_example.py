@@ -68,9 +68,17 @@ def main(folder: Path) -> None:
         planes = planes.reshape(SIZE, SUBPIXELS, SIZE, SUBPIXELS, 4).mean((1, 3))
         rgba = torch.cat([linear_to_srgb(planes[..., :3]), planes[..., 3:]], -1)
         write_png(folder / f"rgba/{i:04d}.png", rgba)
-        frames.append({"view_index": i, "file_path": f"rgba/{i:04d}.png", "width": SIZE, "height": SIZE,
-                       "transform_matrix": c2w.tolist(), "camera_fov": [FOV, FOV],
-                       "camera_principal_point": [SIZE / 2, SIZE / 2]})  # fmt: skip
+        frames.append(
+            {
+                "view_index": i,
+                "file_path": f"rgba/{i:04d}.png",
+                "width": SIZE,
+                "height": SIZE,
+                "transform_matrix": c2w.tolist(),
+                "camera_fov": [FOV, FOV],
+                "camera_principal_point": [SIZE / 2, SIZE / 2],
+            }
+        )
     record = {"object_uid": "kettle", "coordinate_system": "ogl", "frames": frames}
     (folder / "transforms.json").write_text(json.dumps(record, indent=1) + "\n")
 

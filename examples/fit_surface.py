@@ -124,8 +124,9 @@ def fit_distance(truth: Mesh, resolution: int, steps: int) -> Grid:
 
     grid = Grid(distance(vertices_of(resolution)))
     cell = 2 * RADIUS / resolution
-    optimizer = torch.optim.Adam([{"params": [grid.level], "lr": 0.02 * cell},
-                                  {"params": [grid.offset, grid.weights], "lr": 0.02}])  # fmt: skip
+    optimizer = torch.optim.Adam(
+        [{"params": [grid.level], "lr": 0.02 * cell}, {"params": [grid.offset, grid.weights], "lr": 0.02}]
+    )
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
     rng, step = torch.Generator().manual_seed(0), 1e-3
     for _ in range(steps):
@@ -168,8 +169,9 @@ def fit_images(truth: Mesh, resolution: int, steps: int) -> Grid:
     grid = Grid(-hull.reshape((resolution + 1,) * 3))
     cell = 2 * RADIUS / resolution
     sys.stdout.write(f"visual hull of the masks: Chamfer {chamfer(grid.mesh(), truth):.5f}\n")
-    optimizer = torch.optim.Adam([{"params": [grid.level], "lr": 0.2 * cell},
-                                  {"params": [grid.offset, grid.weights], "lr": 0.02}])  # fmt: skip
+    optimizer = torch.optim.Adam(
+        [{"params": [grid.level], "lr": 0.2 * cell}, {"params": [grid.offset, grid.weights], "lr": 0.02}]
+    )
     schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda i: 0.02 ** (i / steps))
     order = torch.Generator().manual_seed(0)
     for i in range(steps):
@@ -231,13 +233,17 @@ def main(argv: list[str] | None = None) -> int:
         f"plain extraction of the distance at {n} cubes a side: Chamfer {chamfer(grid.mesh(), truth):.5f}\n"
     )
     meshes = [truth]
-    for name, fit, steps in (("(a) distance", fit_distance, options.steps // 4),
-                             ("(b) masks and depth", fit_images, options.steps)):  # fmt: skip
+    for name, fit, steps in (
+        ("(a) distance", fit_distance, options.steps // 4),
+        ("(b) masks and depth", fit_images, options.steps),
+    ):
         began = time.perf_counter()
         mesh = fit(truth, n, steps).mesh()
         seconds, found = time.perf_counter() - began, report(mesh)
-        sys.stdout.write(f"{name}: Chamfer {chamfer(mesh, truth):.5f}, {len(mesh.faces)} faces, {found.components} "
-                         f"components, watertight {found.watertight}, {steps} steps in {seconds:.0f} s\n")  # fmt: skip
+        sys.stdout.write(
+            f"{name}: Chamfer {chamfer(mesh, truth):.5f}, {len(mesh.faces)} faces, {found.components} "
+            f"components, watertight {found.watertight}, {steps} steps in {seconds:.0f} s\n"
+        )
         sys.stdout.flush()
         meshes.append(mesh)
     write_png(options.output / "fitted.png", picture(meshes))

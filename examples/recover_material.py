@@ -88,14 +88,24 @@ class Mitsuba:
             bitmap = mi.Bitmap(np.ascontiguousarray(values.numpy(), np.float32))
             return {"type": "bitmap", "bitmap": bitmap, "raw": raw}
 
-        material = {"type": "principled", "base_color": texture(srgb_to_linear(maps.base_color), True), "specular": 0.5,
-                    "roughness": texture(maps.roughness[..., None], True),
-                    "metallic": texture(maps.metallic[..., None], True)}  # fmt: skip
+        material = {
+            "type": "principled",
+            "base_color": texture(srgb_to_linear(maps.base_color), True),
+            "specular": 0.5,
+            "roughness": texture(maps.roughness[..., None], True),
+            "metallic": texture(maps.metallic[..., None], True),
+        }
         props = mi.Properties()
         props["bsdf"] = mi.load_dict({"type": "twosided", "bsdf": material})
         mesh = asset.mesh
-        self.mesh = mi.Mesh("object", len(mesh.vertices), len(mesh.faces), has_vertex_normals=True,
-                            has_vertex_texcoords=True, props=props)  # fmt: skip
+        self.mesh = mi.Mesh(
+            "object",
+            len(mesh.vertices),
+            len(mesh.faces),
+            has_vertex_normals=True,
+            has_vertex_texcoords=True,
+            props=props,
+        )
         values = mi.traverse(self.mesh)
         values["vertex_positions"], values["vertex_normals"] = (
             mesh.vertices.numpy().ravel(),
@@ -117,15 +127,25 @@ class Mitsuba:
         high = (low + 1).clamp(max=planes.shape[2] - 1)
         part = (rows.clamp(min=0.0) - rows.clamp(min=0.0).floor())[:, None]
         data = (planes[:, :, low] * (1 - part) + planes[:, :, high] * part)[0].permute(1, 2, 0)
-        emitter = {"type": "envmap", "bitmap": mi.Bitmap(np.ascontiguousarray(data.numpy(), np.float32)),
-                   "to_world": mi.ScalarTransform4f().rotate([0, 1, 0], 180)}  # fmt: skip
+        emitter = {
+            "type": "envmap",
+            "bitmap": mi.Bitmap(np.ascontiguousarray(data.numpy(), np.float32)),
+            "to_world": mi.ScalarTransform4f().rotate([0, 1, 0], 180),
+        }
         pose = camera.c2w.double().numpy() @ np.diag([-1.0, 1.0, -1.0, 1.0])  # it looks along +Z with +X to the left
         fov = 2.0 * math.degrees(math.atan(0.5 * camera.width / float(camera.intrinsics[0])))
         sensor = {"type": "perspective", "fov": fov, "to_world": mi.ScalarTransform4f(pose),
                   "film": {"type": "hdrfilm", "width": camera.width, "height": camera.height, "pixel_format": "rgba",
                            "rfilter": {"type": "box"}}}  # fmt: skip
-        scene = mi.load_dict({"type": "scene", "object": self.mesh, "light": emitter, "sensor": sensor,
-                              "integrator": {"type": "direct", "hide_emitters": True}})  # fmt: skip
+        scene = mi.load_dict(
+            {
+                "type": "scene",
+                "object": self.mesh,
+                "light": emitter,
+                "sensor": sensor,
+                "integrator": {"type": "direct", "hide_emitters": True},
+            }
+        )
         return torch.from_numpy(np.array(mi.render(scene, spp=samples), dtype=np.float32))
 
 
@@ -162,8 +182,11 @@ def fit(asset: Asset, views: list[Camera], images: torch.Tensor, steps: int, rep
     weight = 1.0 / (target + 0.1 * target.mean()).square()  # about relative errors: dark parts count too
     c2w, focal = torch.stack([v.c2w for v in views]), views[0].intrinsics
     unknowns = Unknowns(float(target.mean()) * 2.0)
-    rates = [{"params": [unknowns.base], "lr": 0.06}, {"params": [unknowns.rough_metal], "lr": 0.06},
-             {"params": [unknowns.light], "lr": 0.05}]  # fmt: skip
+    rates = [
+        {"params": [unknowns.base], "lr": 0.06},
+        {"params": [unknowns.rough_metal], "lr": 0.06},
+        {"params": [unknowns.light], "lr": 0.05},
+    ]
     optimizer = torch.optim.Adam(rates, betas=(0.9, 0.99))
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps, 1e-3)
     rng, began = torch.Generator().manual_seed(0), time.perf_counter()
@@ -218,9 +241,14 @@ def row_of_picture(asset: Asset, camera: Camera, unseen: Environment, own: Envir
     grey = lambda v: v[..., None].expand(-1, -1, 3) * (image.alpha > 0)[..., None]  # noqa: E731
     sky = torch.nn.functional.interpolate(own.radiance.permute(2, 0, 1)[None], (size // 2, size), mode="area")[0]
     sky = torch.nn.functional.pad(sky.permute(1, 2, 0), (0, 0, 0, 0, size // 4, size - size // 2 - size // 4))
-    return [linear_to_srgb(image.base_color.clamp(0, 1)), grey(image.roughness), grey(image.metallic),
-            shown(image.radiance, exposures[0]), shown(relit.radiance, exposures[1]),
-            shown(sky, exposures[0])]  # fmt: skip
+    return [
+        linear_to_srgb(image.base_color.clamp(0, 1)),
+        grey(image.roughness),
+        grey(image.metallic),
+        shown(image.radiance, exposures[0]),
+        shown(relit.radiance, exposures[1]),
+        shown(sky, exposures[0]),
+    ]
 
 
 def write_picture(path: Path, rows: list[list[torch.Tensor]], size: int) -> None:
@@ -271,8 +299,9 @@ def judge_results(args, asset, judge, images, unknowns, capture, unseen) -> int:
     found = Asset(asset.mesh, unknowns.textures(), unknowns.environment())
     start = Asset(asset.mesh, first.textures(), first.environment())
     tests = cameras(args.size, 2 * VIEWS + 1)[3::8]  # four views beside those of the capture
-    exposure = [float(0.8 / judge.image(tests[0], light, 64)[..., :3].flatten().quantile(0.97))
-                for light in (capture, unseen)]  # fmt: skip
+    exposure = [
+        float(0.8 / judge.image(tests[0], light, 64)[..., :3].flatten().quantile(0.97)) for light in (capture, unseen)
+    ]
     layers = [[render(a, v, unseen, options=ShadeOptions((1, 0, 0))) for v in tests] for a in (asset, found, start)]
     mask = [x.alpha > 0 for x in layers[0]]
     joined = lambda k, name: torch.cat([getattr(x, name)[m] for x, m in zip(layers[k], mask)])  # noqa: E731

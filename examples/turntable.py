@@ -29,7 +29,8 @@ if args.glb:
     parts = reli3d.read_glb(args.glb)
 else:
     photographs = Path(reli3d.__file__).parent / "assets" / "example"
-    parts = [reli3d.reconstruct(reli3d.load_views(photographs), texture_size=512)]
+    options = reli3d.ReconstructOptions(texture_size=512)
+    parts = [reli3d.reconstruct(reli3d.load_views(photographs), options=options)]
 
 studio = torch.full((32, 64, 3), 0.2)
 studio[6:12, 8:20] = 6.0  # a large lamp at one side

@@ -11,6 +11,7 @@ __version__ = "0.2.0"
 
 _HOME = {
     "reconstruct": "reli3d.pipeline",
+    "ReconstructOptions": "reli3d.pipeline",
     "refine": "reli3d.pipeline",
     "load_views": "reli3d.views.folder",
     "Views": "reli3d.views.views",

@@ -18,6 +18,7 @@ from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from types import ModuleType
+from typing import TypeVar, cast
 
 import numpy as np
 import torch
@@ -31,6 +32,8 @@ SLICES = 16  # several a thread balance uneven rays on 2 to 8 cores; more only a
 CPU_BLOCK = 1  # block size of Warp's CPU launches; loading a module for its default one would compile it once more
 COMPILERS = 4  # modules compiled at once; each thread builds its own precompiled header, 1.5 CPU seconds
 SLICE_MIN = 1024  # below this many threads a slice costs about as much to launch as to run
+
+T = TypeVar("T")
 
 _LOADING = threading.Lock()  # Warp has none: it would be started, and a module compiled, by two threads at once
 
@@ -63,7 +66,7 @@ def _start() -> None:
     try:
         with no_driver_warning():
             wp.init()
-        writable = os.access(wp.config.kernel_cache_dir, os.W_OK)
+        writable = os.access(str(wp.config.kernel_cache_dir), os.W_OK)
     except OSError:
         writable = False
     if not writable:
@@ -155,6 +158,11 @@ def view(tensor: Tensor, dtype):
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
 
 
+def array_of(tensor: Tensor, dtype) -> wp.array:
+    """Warp array over the memory of a contiguous tensor, without gradient, for what Warp itself keeps."""
+    return cast(wp.array, wp.from_torch(tensor, dtype=dtype, requires_grad=False))
+
+
 def views(args: Sequence) -> list:
     """What :func:`launch` makes of its ``args``, for those that go to many launches; the caller keeps the tensors."""
     return [view(*a) if isinstance(a, tuple) else a for a in args]
@@ -186,7 +194,7 @@ def compiled(modules: Sequence[ModuleType], device: torch.device) -> bool:
     initialise()
     block = CPU_BLOCK if device.type == "cpu" else None
     names = [wp.get_module(m.__name__).get_module_identifier(block_dim=block) for m in modules]
-    return all(os.path.isdir(os.path.join(wp.config.kernel_cache_dir, name)) for name in names)
+    return all(os.path.isdir(os.path.join(str(wp.config.kernel_cache_dir), name)) for name in names)
 
 
 def load_modules(modules: Sequence[ModuleType], device: torch.device) -> None:
@@ -227,8 +235,9 @@ def launch(kernel, n: int, args: Sequence, device: torch.device, *, slice_min: i
         if _serial():
             wp.launch(kernel, n, [0, *values], device="cpu")  # no thread would take a slice
             return
-        over_slices(n, lambda k, start, count: wp.launch(kernel, count, [start, *values], device="cpu"),
-                    slice_min=slice_min)  # fmt: skip
+        over_slices(
+            n, lambda k, start, count: wp.launch(kernel, count, [start, *values], device="cpu"), slice_min=slice_min
+        )
 
 
 class _Once(torch.autograd.Function):
@@ -270,8 +279,13 @@ class _KernelOp(torch.autograd.Function):
     @staticmethod
     def forward(ctx, kernel, n, slice_min, plain, types, shared, outs, device, *tensors):
         results = [empty(shape, dtype, device) for shape, dtype in outs]
-        launch(kernel, n, _fill(plain, zip(tensors, types, strict=True)) + _typed(results, outs), device,
-               slice_min=slice_min)  # fmt: skip
+        launch(
+            kernel,
+            n,
+            _fill(plain, zip(tensors, types, strict=True)) + _typed(results, outs),
+            device,
+            slice_min=slice_min,
+        )
         ctx.save_for_backward(*tensors, *results)
         ctx.op = kernel, n, slice_min, plain, types, shared, outs, device
         ctx.mark_non_differentiable(*(r for r in results if not r.is_floating_point()))
@@ -289,8 +303,10 @@ class _KernelOp(torch.autograd.Function):
             for i, (t, w) in enumerate(zip(tensors, wanted, strict=True))
         ]
         g_results = [None if g is None else g.contiguous() for g in g_outs]
-        g_results = [torch.zeros_like(r) if g is None and r.is_floating_point() else g
-                     for g, r in zip(g_results, results, strict=True)]  # fmt: skip
+        g_results = [
+            torch.zeros_like(r) if g is None and r.is_floating_point() else g
+            for g, r in zip(g_results, results, strict=True)
+        ]
         ins = _fill(plain, zip(tensors, types, strict=True))
         if n > 0:
             with stream(device) as name:
@@ -298,10 +314,11 @@ class _KernelOp(torch.autograd.Function):
                 adj_out = [None if g is None else view(g, d) for g, (_, d) in zip(g_results, outs, strict=True)]
 
                 def adjoint(k, start, count):
-                    own = [None if g is None else (g[min(k, g.shape[0] - 1)], d)
-                           for g, d in zip(grads, types, strict=True)]  # fmt: skip
-                    own = _fill([None] * len(plain), own, plain)
-                    adj_in = [view(*a) if isinstance(a, tuple) else None for a in own]
+                    in_grads = [
+                        None if g is None else (g[min(k, g.shape[0] - 1)], d) for g, d in zip(grads, types, strict=True)
+                    ]
+                    in_grads = _fill([None] * len(plain), in_grads, plain)
+                    adj_in = [view(*a) if isinstance(a, tuple) else None for a in in_grads]
                     wp.launch(kernel, count, [start, *values], out_values, adj_inputs=[None, *adj_in],
                               adj_outputs=adj_out, adjoint=True, device=name)  # fmt: skip
 
@@ -357,8 +374,16 @@ def tensor_of(value, dtype: torch.dtype = torch.float32):
     return value
 
 
-def check(name: str, value: Tensor, *, last: int | None = None, like: Tensor | None = None,
-          dtype: torch.dtype = torch.float32) -> None:  # fmt: skip
+def present(name: str, value: T | None) -> T:
+    """``value``; raises ValueError where it is None."""
+    if value is None:
+        raise ValueError(f"{name}: expected a value, got None")
+    return value
+
+
+def check(
+    name: str, value: object, *, last: int | None = None, like: Tensor | None = None, dtype: torch.dtype = torch.float32
+) -> None:
     """Raise TypeError or ValueError as ``name: expected X, got Y`` for a wrong kind, dtype, last axis or device."""
     if not isinstance(value, Tensor):
         raise TypeError(f"{name}: expected a tensor, got {type(value).__name__}")

@@ -11,11 +11,12 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from reli3d._bridge import present
 from reli3d.fit import refine as fit
 from reli3d.geometry.bake import bake
 from reli3d.geometry.cover import cover_silhouettes
 from reli3d.geometry.hull import mask_distance
-from reli3d.geometry.mesh import Mesh, largest_components, vertex_normals
+from reli3d.geometry.mesh import Mesh, largest_components, vertex_normals, weld
 from reli3d.geometry.rays import RayScene
 from reli3d.geometry.smooth import taubin_smooth
 from reli3d.geometry.surface import extract_surface
@@ -23,7 +24,7 @@ from reli3d.geometry.tangents import encode_normals, vertex_tangents
 from reli3d.geometry.uv import unwrap, unwrap_xatlas
 from reli3d.geometry.visibility import visible_from
 from reli3d.nn.blocks import in_rows
-from reli3d.nn.field import CHUNK, Field
+from reli3d.nn.field import CHUNK, Field, TriplaneField
 from reli3d.nn.local import LocalField, LocalReconstructor
 from reli3d.nn.presets import LocalPreset, Preset
 from reli3d.nn.reni import map_directions
@@ -32,10 +33,10 @@ from reli3d.nn.weights import Network, load_model
 from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.camera import Camera
 from reli3d.render.environment import Environment
-from reli3d.render.exposure import photograph_ratio
-from reli3d.views.normalize import normalize
-from reli3d.views.published_views import background_shown, hero_first, published_views
-from reli3d.views.similarity import Similarity
+from reli3d.render.exposure import weighed
+from reli3d.views.normalize import FAR, normalize
+from reli3d.views.published_views import background_shown, hero_first, placement_notes, published_views
+from reli3d.views.similarity import Similarity, output_frame
 from reli3d.views.views import ViewBatch, Views
 
 DETAIL = 512  # pixels of the views that colours and silhouettes are read from; the network's own input is smaller
@@ -46,17 +47,6 @@ SHADING_POINTS = 4096  # vertices by which the light on the object is judged
 OUTSIDE = 1.0  # level given to grid points that the silhouettes exclude
 COARSE = 4  # cells of the surface grid along a cell of the one that looks for the silhouettes' hull first
 MARGIN_CELLS = 2.5  # cells around the silhouettes' hull in which the field is still asked
-UP = {  # rotations that carry an axis to +Y
-    "y": torch.eye(3),
-    "-y": torch.diag(torch.tensor([1.0, -1.0, -1.0])),
-    "x": torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
-    "-x": torch.tensor([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
-    "z": torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
-    "-z": torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
-}
-
-
-AnyField = Field | LocalField
 
 
 class NoSurface(ValueError):
@@ -87,52 +77,80 @@ def prepare(model: Network, views: Views, model_from_input: Similarity) -> Prepa
     return Prepared(batch, torch.cat([detail.images, silhouette[..., None]], -1).contiguous(), detail.intrinsics)
 
 
-def encode(model: Network, prepared: Prepared, *, background: bool = False) -> AnyField:
+def encode(model: Network, prepared: Prepared, *, background: bool = False) -> Field:
     """Run the network on the views of one object.
 
     background: whether the illumination path of a :class:`Reconstructor` may look past the masks.
     """
     batch = prepared.batch
     if isinstance(model, LocalReconstructor):
-        return model.encode(batch.images, batch.masks, batch.c2w, batch.intrinsics, prepared.images,
-                            prepared.intrinsics)  # fmt: skip
+        return model.encode(
+            batch.images, batch.masks, batch.c2w, batch.intrinsics, prepared.images, prepared.intrinsics
+        )
     shown = torch.tensor([background], device=batch.images.device)
-    code = model.encode(batch.images[None], batch.masks[None], batch.c2w[None], batch.intrinsics[None],
-                        background_visible=shown)  # fmt: skip
-    return Field(model, code, ViewMaps(code.view_tokens[0].float(), prepared.images, batch.c2w, prepared.intrinsics))
+    code = model.encode(
+        batch.images[None], batch.masks[None], batch.c2w[None], batch.intrinsics[None], background_visible=shown
+    )
+    maps = ViewMaps(code.view_tokens[0].float(), prepared.images, batch.c2w, prepared.intrinsics)
+    return TriplaneField(maps, model, code)
 
 
-def extract(field: AnyField, resolution: int) -> Mesh:
+def extract(field: Field, resolution: int) -> Mesh:
     """Closed surface of the field on ``resolution`` cubes a side, without small loose pieces; model frame.
 
     Raises NoSurface, a ValueError, where the field has none.
     """
-    preset, maps = field.model.preset, field.maps
-    radius = preset.radius
-    if field.bounded:  # as many cubes on the space that matters
-        radius = min(radius, _hull_reach(field, resolution) + 2 * MARGIN_CELLS * radius / resolution)
-    flat = _grid(resolution, radius, maps.c2w.device).reshape(-1, 3)
-    bound = field.bound(flat) if field.bounded else torch.full_like(flat[:, 0], -torch.inf)
-    level = field.grid_level(flat[: resolution + 1, 2])
-    if level is None:
-        level, margin = bound.clamp(min=OUTSIDE), MARGIN_CELLS * 2 * radius / resolution / preset.softness
-        for part in (bound < margin).nonzero()[:, 0].split(CHUNK):
-            level[part] = field.free_level(flat[part])
-    level = torch.maximum(level.view(-1), bound).view((resolution + 1,) * 3)
-    if field.bounded:
-        silhouette = maps.images[..., 3].contiguous()
-        level = cover_silhouettes(level, bound.view_as(level), silhouette, maps.c2w, maps.intrinsics, radius=radius)
-    low, high = (float(v) for v in torch.aminmax(level))
-    if low >= 0.0 or high < 0.0:
-        raise NoSurface(f"level: expected values on both sides of 0, got [{low:.4g}, {high:.4g}]: no surface")
-    mesh = extract_surface(level, radius=radius, **field.cube_weights(flat, level))
-    mesh = largest_components(mesh, SMALLEST_PART)
-    if preset.smoothing:
-        mesh = taubin_smooth(mesh, iterations=preset.smoothing)
+    if isinstance(field, LocalField):
+        mesh = largest_components(_bounded_surface(field, resolution), SMALLEST_PART)
+        mesh = taubin_smooth(mesh, iterations=field.model.preset.smoothing)  # ripples of a cell: each level is a guess
+    elif isinstance(field, TriplaneField):
+        mesh = largest_components(_free_surface(field, resolution), SMALLEST_PART)
+    else:
+        raise TypeError(f"field: expected LocalField or TriplaneField, got {type(field).__name__}")
     return replace(mesh, normals=vertex_normals(mesh.vertices, mesh.faces))
 
 
-def _hull_reach(field: AnyField, resolution: int) -> float:
+def _free_surface(field: TriplaneField, resolution: int) -> Mesh:
+    radius = field.model.preset.radius
+    flat = _grid(resolution, radius, field.maps.c2w.device).reshape(-1, 3)
+    level = field.grid_level(flat[: resolution + 1, 2])
+    _check_signs(level)
+    found = field.cube_weights(flat, level)
+    return extract_surface(
+        level,
+        radius=radius,
+        deformation=found["deformation"],
+        alpha=found["alpha"],
+        beta=found["beta"],
+        gamma=found["gamma"],
+        cubes=found["cubes"],
+    )
+
+
+def _bounded_surface(field: LocalField, resolution: int) -> Mesh:
+    """The silhouettes bound it: as many cubes on the space that matters."""
+    preset, maps = field.model.preset, field.maps
+    radius = preset.radius
+    radius = min(radius, _hull_reach(field, resolution) + 2 * MARGIN_CELLS * radius / resolution)
+    flat = _grid(resolution, radius, maps.c2w.device).reshape(-1, 3)
+    bound = field.bound(flat)
+    level, margin = bound.clamp(min=OUTSIDE), MARGIN_CELLS * 2 * radius / resolution / preset.softness
+    for part in (bound < margin).nonzero()[:, 0].split(CHUNK):
+        level[part] = field.free_level(flat[part])
+    level = torch.maximum(level, bound).view((resolution + 1,) * 3)
+    silhouette = maps.images[..., 3].contiguous()
+    level = cover_silhouettes(level, bound.view_as(level), silhouette, maps.c2w, maps.intrinsics, radius=radius)
+    _check_signs(level)
+    return extract_surface(level, radius=radius)
+
+
+def _check_signs(level: Tensor) -> None:
+    low, high = (float(v) for v in torch.aminmax(level))
+    if low >= 0.0 or high < 0.0:
+        raise NoSurface(f"level: expected values on both sides of 0, got [{low:.4g}, {high:.4g}]: no surface")
+
+
+def _hull_reach(field: LocalField, resolution: int) -> float:
     """Largest coordinate of the points of the model's grid that lie inside all silhouettes.
 
     Asked coarsely first: a point inside has a coarse neighbour that is outside by no more than their distance.
@@ -156,8 +174,9 @@ def _grid(resolution: int, radius: float, device: torch.device) -> Tensor:
     return torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
 
 
-def texture(field: AnyField, mesh: Mesh, size: int, scene: RayScene | None, *,
-            uv: str = "project") -> tuple[Mesh, TextureSet]:  # fmt: skip
+def texture(
+    field: Field, mesh: Mesh, size: int, scene: RayScene | None, *, uv: str = "project"
+) -> tuple[Mesh, TextureSet]:
     """The mesh with an atlas, normals and tangents, and its maps of ``size`` texels; the faces keep their order.
 
     scene: rays against ``mesh``, for a network that asks which view sees a point, else None.
@@ -165,61 +184,73 @@ def texture(field: AnyField, mesh: Mesh, size: int, scene: RayScene | None, *,
     if uv not in ("project", "xatlas"):
         raise ValueError(f"uv: expected project or xatlas, got {uv}")
     maps = field.maps
-    if scene is not None:
+
+    def seen(position: Tensor, normal: Tensor) -> Tensor:
+        return visible_from(present("scene", scene), position, normal, maps.c2w, maps.intrinsics, DETAIL).float()
+
+    local = None
+    if isinstance(field, LocalField):
         every = slice(None, None, max(1, len(mesh.vertices) // SHADING_POINTS))
-        position, normal = mesh.vertices[every].contiguous(), mesh.normals[every].contiguous()
-        visible = visible_from(scene, position, normal, maps.c2w, maps.intrinsics, DETAIL).float()
-        field = field.with_shading(position, normal, visible)
+        position, normal = mesh.vertices[every].contiguous(), present("mesh.normals", mesh.normals)[every].contiguous()
+        local = field.with_shading(position, normal, seen(position, normal))
     mesh = unwrap(mesh, texture_size=size) if uv == "project" else unwrap_xatlas(mesh, texture_size=size)
     mesh = replace(mesh, tangents=vertex_tangents(mesh))
 
-    def surface(position: Tensor, normal: Tensor, tangent: Tensor) -> dict[str, Tensor]:
-        visible = position.new_zeros(len(position), len(maps.c2w))
-        if scene is not None:
-            visible = visible_from(scene, position, normal, maps.c2w, maps.intrinsics, DETAIL).float()
-        got = field.material(position, normal, visible)
+    heads = None
+    if local is not None:  # asked at the vertices, which lie as close as the cells that the network knows
+        normals = present("mesh.normals", mesh.normals)
+        heads = local.heads(mesh.vertices, normals, seen(mesh.vertices, normals))
+
+    def surface(position: Tensor, normal: Tensor, tangent: Tensor, *values: Tensor) -> dict[str, Tensor]:
+        if local is not None:
+            got = local.painted(values[0], position, normal, seen(position, normal))
+        else:
+            got = field.material(position, normal, position.new_zeros(len(position), len(maps.c2w)))
         found = {"base_color": got.base_color, "roughness": got.roughness[:, None], "metallic": got.metallic[:, None]}
         return {**found, "normal": encode_normals(got.normal, normal, tangent)}
 
-    baked = bake(mesh, size, lambda *at: in_rows(surface, *at), chunk=CHUNK, tangents=True)
+    baked = bake(mesh, size, lambda *at: in_rows(surface, *at), chunk=CHUNK, tangents=True, values=heads)
     return mesh, TextureSet(**{k: v.clamp(0, 1).contiguous() for k, v in baked.items()})
 
 
-def light(field: AnyField) -> Environment:
+def light(field: Field) -> Environment:
     """The environment of the field, in the world's axes."""
     return Environment(field.radiance_map().contiguous())
 
 
-def as_bright_as_seen(asset: Asset, maps: ViewMaps, scene: RayScene) -> Asset:
-    """``asset`` with a light that shows it as bright as the views that ``maps`` hold.
+def as_seen(asset: Asset, maps: ViewMaps, scene: RayScene) -> Asset:
+    """``asset`` with the likeliest paint, and with a light that shows it as the views that ``maps`` hold.
 
-    Paint times light is all that photographs tell: where the network guesses one of them too dark, this makes it up.
+    Paint times light is all that photographs tell; see :mod:`reli3d.render.exposure`.
     """
     camera = Camera(maps.c2w, maps.intrinsics, maps.images.shape[2], maps.images.shape[1])
-    ratio = photograph_ratio(asset, maps.images[..., :3], maps.images[..., 3] > INSIDE, camera, scene)
-    return replace(asset, environment=Environment(asset.environment.radiance * ratio))
-
-
-def output_frame(model_from_input: Similarity, frame: str, up: str) -> Similarity:
-    """The frame of the asset from the frame of the input cameras.  Raises ValueError on a name that is none."""
-    if frame not in ("input", "model"):
-        raise ValueError(f"frame: expected input or model, got {frame}")
-    if up not in UP:
-        raise ValueError(f"up: expected one of {', '.join(UP)}, got {up}")
-    turn = Similarity(1.0, UP[up].double(), torch.zeros(3, dtype=torch.float64))
-    return turn.compose(model_from_input) if frame == "model" else turn
+    return weighed(asset, maps.images[..., :3], maps.images[..., 3] > INSIDE, camera, scene)
 
 
 def turned(asset: Asset, similarity: Similarity) -> Asset:
     """``asset`` moved by ``similarity``; normals, tangents and the light turn with it."""
     mesh, rotation = asset.mesh, similarity.rotation.to(asset.mesh.vertices)
-    moved = replace(mesh, vertices=similarity.apply(mesh.vertices), normals=mesh.normals @ rotation.T,
-                    tangents=torch.cat([mesh.tangents[:, :3] @ rotation.T, mesh.tangents[:, 3:]], -1))  # fmt: skip
+    normals, tangents = present("mesh.normals", mesh.normals), present("mesh.tangents", mesh.tangents)
+    tangents = torch.cat([tangents[:, :3] @ rotation.T, tangents[:, 3:]], -1)
+    moved = replace(mesh, vertices=similarity.apply(mesh.vertices), normals=normals @ rotation.T, tangents=tangents)
     environment = asset.environment
     if environment is not None and not torch.equal(rotation, torch.eye(3).to(rotation)):
         rows = environment.radiance.shape[0]
         environment = Environment(environment.lookup((map_directions(rows).to(rotation) @ rotation).contiguous()))
     return replace(asset, mesh=moved, environment=environment)
+
+
+def _check_place(near: Mesh, mesh: Mesh) -> None:
+    """Raise ValueError where vertices that differ in ``near`` meet in ``mesh``, the same elsewhere: float32 is coarse
+    far from the origin.
+    """
+    low, high = mesh.vertices.aminmax(dim=0)
+    far, size = float(torch.maximum(-low, high).max()), float((high - low).max())
+    if far > FAR * size and len(weld(mesh.vertices)[0]) < len(weld(near.vertices)[0]):
+        raise ValueError(
+            f"views: expected an object near the origin, got one of size {size:.3g} at {far:.3g}; "
+            "subtract its place from the positions of the cameras"
+        )
 
 
 class Stopwatch:
@@ -250,68 +281,109 @@ def default_normalization(preset: Preset | LocalPreset) -> str:
     return "none" if published_input(preset) else "auto"
 
 
-def check_options(texture_size: int, resolution: int | None) -> None:
-    """Raise ValueError where a size is out of range; None is the preset's own."""
-    if not 256 <= texture_size <= 4096:
-        raise ValueError(f"texture_size: expected 256 to 4096 texels, got {texture_size}")
-    if resolution is not None and not 16 <= resolution <= 256:
-        raise ValueError(f"resolution: expected 16 to 256 cubes, got {resolution}")
+@dataclass(frozen=True)
+class ReconstructOptions:
+    """How :func:`reconstruct` works.  Raises ValueError on a size out of range.
+
+    texture_size: 256 to 4096 texels.  resolution: cubes a side of the surface grid, 16 to 256; None is the preset's.
+    normalization: ``auto``, ``hull``, ``none``, or the map from the input frame to the model's; None is
+    :func:`default_normalization`.  frame: ``input`` (that of the cameras) or ``model``.  up: the axis of that frame
+    that shall become +Y.  uv: ``project`` or ``xatlas``.  hero: index of the network's main view, or ``random``.
+    background: ``masked``, ``visible`` or ``auto``, see :func:`~reli3d.views.published_views.background_shown`.
+    """
+
+    texture_size: int = 1024
+    resolution: int | None = None
+    normalization: str | Similarity | None = None
+    frame: str = "input"
+    up: str = "y"
+    uv: str = "project"
+    hero: int | str = 0
+    background: str = "masked"
+    seed: int = 0
+
+    def __post_init__(self):
+        if not 256 <= self.texture_size <= 4096:
+            raise ValueError(f"texture_size: expected 256 to 4096 texels, got {self.texture_size}")
+        if self.resolution is not None and not 16 <= self.resolution <= 256:
+            raise ValueError(f"resolution: expected 16 to 256 cubes, got {self.resolution}")
+
+
+DEFAULT = ReconstructOptions()
+
+
+@dataclass(frozen=True)
+class Placed:
+    """Views in the order in which a network takes them, and the frames that it and the asset have."""
+
+    views: Views
+    model_from_input: Similarity
+    output_from_input: Similarity
+
+
+def place(views: Views, preset: Preset | LocalPreset, options: ReconstructOptions = DEFAULT) -> Placed:
+    """The views with the hero first, and the frames.
+
+    Where poses are left as stored though nobody asked for it, ``notes`` of the views say so if the object does not fit.
+    """
+    normalization = options.normalization
+    if normalization is None:
+        normalization = default_normalization(preset)
+        if normalization == "none":
+            views = replace(views, notes=(*views.notes, *placement_notes(views)))
+    views = hero_first(views, options.hero, options.seed)
+    to_model = normalization if isinstance(normalization, Similarity) else normalize(views, normalization)
+    return Placed(views, to_model, output_frame(to_model, options.frame, options.up))
 
 
 @torch.no_grad()
-def reconstruct(views: Views, *, weights: str | Network = "small", device: str = "cpu", texture_size: int = 1024,
-                resolution: int | None = None, normalization: str | Similarity | None = None, frame: str = "input",
-                up: str = "y", uv: str = "project", hero: int | str = 0, background: str = "masked", seed: int = 0,
-                timings: dict[str, float] | None = None, progress=None) -> Asset:  # fmt: skip
+def reconstruct(views: Views, *, weights: str | Network = "small", device: str = "cpu",
+                options: ReconstructOptions = DEFAULT, watch: Stopwatch | None = None) -> Asset:  # fmt: skip
     """A relightable asset from posed photographs of one object.
 
-    views: 1 to 16, the first is the hero (see :func:`reli3d.views.folder.load_views`).  weights: ``small`` (in the
-    package), a safetensors file, or a loaded :class:`~reli3d.nn.model.Reconstructor`.  texture_size: 256 to 4096
-    texels. resolution: cubes a side of the surface grid, default the preset's.  normalization: ``auto``, ``hull``,
-    ``none``, or the map from the input frame to the model's; default :func:`default_normalization`.  frame: ``input``
-    (that of the cameras) or ``model``.  up: the axis of that frame that shall become +Y.  hero: index of another view
-    that comes first, or ``random``.  background: ``masked``, ``visible`` or ``auto``, see
-    :func:`~reli3d.views.published_views.background_shown`.  timings: filled with seconds of each stage.  progress:
-    called with the name of each stage.  The same input and seed give the same asset.  Raises ValueError on options
-    out of range and where the masks hold no object, NoSurface where the field holds none.
+    views: 1 to 16, see :func:`reli3d.views.folder.load_views`.  weights: ``small`` (in the package), a safetensors
+    file, or a loaded network.  watch: filled with the seconds of each stage.  The same input and options give the same
+    asset.  Raises ValueError on options out of range and where the masks hold no object, NoSurface where the field
+    holds none.
     """
-    check_options(texture_size, resolution)
     model = weights if isinstance(weights, Network) else load_model(weights, device)
-    resolution = resolution or model.preset.resolution
-    if normalization is None:
-        normalization = default_normalization(model.preset)
-    views = hero_first(views, hero, seed)
-    shown = background_shown(views, background, readable=getattr(model.preset, "reads_background", False))
-    torch.manual_seed(seed)
-    watch = Stopwatch(model.device, progress)
+    watch = watch or Stopwatch(model.device)
     with watch.stage("normalize"):
-        to_model = normalization if isinstance(normalization, Similarity) else normalize(views, normalization)
-        output = output_frame(to_model, frame, up)
+        placed = place(views, model.preset, options)
+    return reconstruct_placed(placed, model, options, watch)
+
+
+@torch.no_grad()
+def reconstruct_placed(placed: Placed, model: Network, options: ReconstructOptions, watch: Stopwatch) -> Asset:
+    """:func:`reconstruct` after its first stage, :func:`place`."""
+    shown = background_shown(
+        placed.views, options.background, readable=getattr(model.preset, "reads_background", False)
+    )
+    torch.manual_seed(options.seed)
     with watch.stage("prepare"):
-        prepared = prepare(model, views, to_model)
+        prepared = prepare(model, placed.views, placed.model_from_input)
     with watch.stage("network"):
         field = encode(model, prepared, background=shown)
     with watch.stage("surface"):
-        mesh = extract(field, resolution)
+        mesh = extract(field, options.resolution or model.preset.resolution)
     with watch.stage("textures"):
         scene = RayScene(mesh.vertices, mesh.faces) if field.reads_views else None
-        mesh, textures = texture(field, mesh, texture_size, scene, uv=uv)
+        mesh, textures = texture(field, mesh, options.texture_size, scene, uv=options.uv)
     with watch.stage("light"):
         asset = Asset(mesh, textures, light(field))
         if scene is not None:
-            asset = as_bright_as_seen(asset, field.maps, scene)
+            asset = as_seen(asset, field.maps, scene)
     with watch.stage("frame"):
-        asset = turned(asset, output.compose(to_model.inverse()))
-    if timings is not None:
-        timings.update(watch.seconds)
+        near, asset = asset.mesh, turned(asset, placed.output_from_input.compose(placed.model_from_input.inverse()))
+        _check_place(near, asset.mesh)
     return asset
 
 
 def refine(asset: Asset, views: Views, *, seconds: float | None = None, steps: int | None = None, **options) -> Asset:
     """``asset`` fitted to its photographs, or as it was where that is better; see :func:`reli3d.fit.refine.refine`.
 
-    views: any number, in the frame of ``asset`` (that of :func:`reconstruct` with ``frame="input"``).  seconds or
-    steps: one of the two.
+    views: any number, in the frame of ``asset`` (that of :func:`reconstruct`, unless its options name another).
+    seconds or steps: one of the two.
     """
     return refined(asset, views, seconds=seconds, steps=steps, **options).asset
 

@@ -77,7 +77,7 @@ def _cache() -> Iterator[tuple[str, str]]:
     from reli3d import _bridge
 
     _bridge.initialise()
-    folder = Path(wp.config.kernel_cache_dir)
+    folder = Path(str(wp.config.kernel_cache_dir))
     try:
         with tempfile.TemporaryFile(dir=folder):
             compiled = sum(entry.is_dir() for entry in folder.iterdir())

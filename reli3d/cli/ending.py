@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator
 
 from reli3d.io.files import printable
 
-FAULTS = (ValueError, TypeError, OSError, MemoryError)
+FAULTS = (ValueError, TypeError, OSError, MemoryError, ImportError)  # the last: an extra is not installed
 
 
 class Stopped(BaseException):
@@ -56,7 +56,7 @@ def command(name: str) -> Callable:
     def decorate(main: Callable) -> Callable:
         @functools.wraps(main)
         def run(argv: list[str] | None = None) -> int:
-            with _streams(), _signals():
+            with _streams(), signals():
                 try:
                     return main(argv)
                 except KeyboardInterrupt:
@@ -91,7 +91,7 @@ def _said(name: str, text: str, code: int) -> int:
 
 
 @contextlib.contextmanager
-def _signals() -> Iterator[None]:
+def signals() -> Iterator[None]:
     """Signals that would end the process at once raise :class:`Stopped` instead; the next ones are not heeded."""
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -15,7 +15,7 @@ def parser() -> argparse.ArgumentParser:
     p = argparse.ArgumentParser(
         formatter_class=Defaults, prog="reli3d-eval", description="Measure the network on held-back procedural objects."
     )
-    p.add_argument("samples", type=Path, help="folder made by reli3d-data --held-back test --views 12")
+    p.add_argument("samples", type=Path, help="folder made by reli3d-data render --held-back test --views 12")
     p.add_argument("--maps", type=Path, required=True, help=".npz of environment maps that the training drew from")
     p.add_argument("--weights", default="small", help="small, or a safetensors file")
     p.add_argument(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import sys
+from collections.abc import Sequence
 
 
 class Defaults(argparse.HelpFormatter):
@@ -13,3 +15,14 @@ class Defaults(argparse.HelpFormatter):
         if silent or action.default == argparse.SUPPRESS or "default" in (action.help or "default"):
             return action.help
         return f"{action.help} (default %(default)s)"
+
+
+def joined(argv: Sequence[str] | None, option: str, values: Sequence[str]) -> list[str]:
+    """The arguments with ``option value`` as one word where ``value`` begins with a dash: argparse would take it for
+    an option.
+    """
+    words = list(sys.argv[1:] if argv is None else argv)
+    for k in range(len(words) - 2, -1, -1):
+        if words[k] == option and words[k + 1] in values:
+            words[k : k + 2] = [f"{option}={words[k + 1]}"]
+    return words

@@ -3,24 +3,28 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import functools
 import importlib
-import os
+import json
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
-from reli3d.cli.ending import command, reason
-from reli3d.cli.helping import Defaults
+from reli3d.cli import objects
+from reli3d.cli.checking import SUSPECT, Check, diagnosed
+from reli3d.cli.ending import check_range, command, reason
+from reli3d.cli.helping import Defaults, joined
+from reli3d.cli.progress import Progress
 
 STARTED = time.monotonic()
 EXAMPLE = Path(__file__).parents[1] / "assets" / "example"
-KERNELS = ("hull", "cover", "view_features", "triplane", "flexicubes", "uv", "raster", "intersect", "attributes",
-           "random", "envmap")  # modules of reli3d.kernels that one object needs  # fmt: skip
-FITTING = ("distance", "grid", "silhouette", "shade_adjoint", "flexicubes_adjoint")  # what a refinement asks for too
+KERNELS = EXAMPLE.parent / "kernels.json"  # modules that a run launches, written by tests/support/kernel_list.py
+AXES = ("x", "y", "z", "-x", "-y", "-z")
 REFINE_SECONDS = {"cpu": 60.0, "cuda": 20.0}  # without a number
-SHADER = {"cpu": ("shade_rays", "embree"), "cuda": ("shade",)}  # and the shader's: Embree traces its rays, or Warp
+SHADER = {"cpu": ["shade_rays", "embree"], "cuda": ["shade"]}  # Embree traces the shader's rays, or Warp
 
 
 def parser() -> argparse.ArgumentParser:
@@ -28,22 +32,40 @@ def parser() -> argparse.ArgumentParser:
         formatter_class=Defaults,
         prog="reli3d-infer",
         description="Turn a few posed photographs of an object into a relightable GLB and an HDR environment.",
-        epilog="Exit code: 0 all done, 1 some objects failed, 2 wrong input, 130 interrupted.  Results go to stdout.",
+        epilog="Exit code: 0 all done, 1 some objects failed, 2 wrong input, 3 --check suspects cameras or masks, 130 "
+        "interrupted.  Results go to stdout.",
     )
-    p.add_argument("folder", nargs="*", type=Path, help="object folders: transforms.json or a COLMAP text model; "
-                   "default the bundled example")  # fmt: skip
+    p.add_argument(
+        "folder",
+        nargs="*",
+        type=Path,
+        help="object folders: transforms.json or a COLMAP model; default the bundled example",
+    )
     p.add_argument("--output", type=Path, default=Path("outputs"), help="files land in OUTPUT/<object>/")
     taken = p.add_mutually_exclusive_group()
     taken.add_argument("--views", type=int, metavar="N", help="use the N views, 1 to 16, that lie farthest apart; "
                        "default all, of more than 16 those that lie farthest apart")  # fmt: skip
     taken.add_argument("--first-views", type=int, metavar="N", help="use the first N views, 1 to 16")
     p.add_argument("--masks", type=Path, help="folder of masks with the names of the images, instead of their alpha")
+    p.add_argument(
+        "--remove-background",
+        action="store_true",
+        help="make masks for photographs without, by rembg "
+        "(pip install 'reli3d[masks]'), which fetches its network once",
+    )
     p.add_argument("--weights", default="small", help="small (in the package), official, or a safetensors file")
-    p.add_argument("--download", action="store_true", help="with --weights official: fetch and convert the published "
-                   "checkpoint where it is not there yet; nothing else ever uses the network")  # fmt: skip
+    p.add_argument(
+        "--download",
+        action="store_true",
+        help="with --weights official: fetch and convert the published "
+        "checkpoint where it is not there yet; nothing else ever uses the network",
+    )
     p.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="auto: cuda where there is one")
-    p.add_argument("--precision", choices=("float32", "bfloat16"), help="of the network's large parts; default "
-                   "float32, for official weights on CUDA bfloat16")  # fmt: skip
+    p.add_argument(
+        "--precision",
+        choices=("float32", "bfloat16"),
+        help="of the network's large parts; default float32, for official weights on CUDA bfloat16",
+    )
     p.add_argument("--texture-size", type=int, default=1024, help="texels, 256 to 4096 (default 1024)")
     p.add_argument(
         "--resolution", type=int, help="cubes along a side of the surface grid, 16 to 256 (default the preset's)"
@@ -51,35 +73,58 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--uv", choices=("project", "xatlas"), default="project", help="atlas: own projection or xatlas (slow)"
     )
-    p.add_argument("--normalize", choices=("auto", "hull", "none"),
-                   help="auto: centre and scale by the visual hull unless it sits in the model's cube; default auto, "
-                   "with official weights none: poses as stored")  # fmt: skip
-    p.add_argument("--hero", default="0", metavar="N", help="view that the network takes as its main one, counted "
-                   "from 0 (the default), or random")  # fmt: skip
-    p.add_argument("--background", choices=("auto", "masked", "visible"), default="masked",
-                   help="what the light is read from: masked (default): the object alone; visible: the background "
-                   "too; auto: visible where all views have one and the weights know how")  # fmt: skip
+    p.add_argument(
+        "--normalize",
+        choices=("auto", "hull", "none"),
+        help="auto: centre and scale by the visual hull unless it sits in the model's cube; default auto, "
+        "with official weights none: poses as stored",
+    )
+    p.add_argument(
+        "--hero",
+        default="0",
+        metavar="N",
+        help="view that the network takes as its main one, counted from 0 (the default), or random",
+    )
+    p.add_argument(
+        "--background",
+        choices=("auto", "masked", "visible"),
+        default="masked",
+        help="what the light is read from: masked (default): the object alone; visible: the background "
+        "too; auto: visible where all views have one and the weights know how",
+    )
     p.add_argument(
         "--frame", choices=("input", "model"), default="input", help="frame of the mesh (default the cameras')"
     )
-    p.add_argument(
-        "--up", choices=("x", "y", "z", "-x", "-y", "-z"), default="y", help="axis of that frame to turn to +Y"
-    )
+    p.add_argument("--up", choices=AXES, default="y", help="axis of that frame to turn to +Y")
     p.add_argument("--refine", nargs="?", type=float, const=0.0, metavar="SECONDS", help="fit the result to all "
                    "photographs of the folder; without a number 60 seconds, 20 on CUDA; stands after the "
                    "folders")  # fmt: skip
-    p.add_argument("--refine-steps", type=int, metavar="N", help="the same with a number of steps instead of seconds: "
-                   "every run of one machine gives the same")  # fmt: skip
+    p.add_argument(
+        "--refine-steps",
+        type=int,
+        metavar="N",
+        help="the same with a number of steps instead of seconds: every run of one machine gives the same",
+    )
     p.add_argument("--refine-cameras", action="store_true", help="with either: correct the cameras as well")
     p.add_argument("--seed", type=int, default=0, help="of what is drawn by chance")
-    p.add_argument("--compatible-names", action="store_true", help="also write illumination.hdr: the published "
-                   "release's name and layout, -Z in the centre column")  # fmt: skip
+    p.add_argument(
+        "--compatible-names",
+        action="store_true",
+        help="also write illumination.hdr: the published release's name and layout, -Z in the centre column",
+    )
+    p.add_argument("--list", type=Path, metavar="FILE", help="text file that names more object folders, one a line")
+    p.add_argument("--workers", type=int, metavar="N", help="make N objects at a time, each in a process of its own "
+                   "with one thread and the network, 0.7 GiB with the shipped weights")  # fmt: skip
+    p.add_argument("--ray", metavar="ADDRESS", help="make the objects on a Ray cluster: its address, auto for that of "
+                   "this machine, local to start one; needs pip install reli3d[ray]")  # fmt: skip
     p.add_argument("--skip-existing", action="store_true", help="leave objects alone whose files are all there")
     p.add_argument(
         "--warm", action="store_true", help="reconstruct every object twice and record the second time as well"
     )
     p.add_argument("--allow-outside", action="store_true", help="let a camera file name images outside its folder")
     p.add_argument("--check", action="store_true", help="explain the cameras and draw the rig; reconstruct nothing")
+    p.add_argument("--json", action="store_true", help="print one JSON object, with an entry for each object, instead "
+                   "of lines")  # fmt: skip
     p.add_argument("--doctor", action="store_true", help="say what is installed and where it runs")
     return p
 
@@ -88,55 +133,93 @@ def parser() -> argparse.ArgumentParser:
 def main(argv: list[str] | None = None) -> int:
     from reli3d.output.folder import check_place
 
-    args = parser().parse_args(argv)
+    args = parser().parse_args(joined(argv, "--up", AXES))
     if args.doctor:
         from reli3d.cli import doctor
 
         return doctor.main([])
-    folders = args.folder or [EXAMPLE]
-    names = object_names(folders)
     try:
-        for name in names:
-            check_place(args.output / name)  # before minutes of work
+        items = objects.items_of(_folders(args), args.output)
+        for item in items:
+            check_place(item.target)  # before minutes of work
+        summary = args.output / objects.SUMMARY
+        if summary.is_dir():
+            raise ValueError(f"{summary}: expected a file or none, got a folder; give another --output")
+        check_range("workers", args.workers, 1, 1024)
+        if args.workers is not None and args.ray is not None:
+            raise ValueError("--workers: expected --workers or --ray, got both; Ray knows its workers")
+        if args.check and (args.workers is not None or args.ray is not None):
+            raise ValueError("--check: expected neither --workers nor --ray with it; it takes a moment")
         device = choose_device(args.device)
-        job = None if args.check else Job(args, device)
+        job = Check(functools.partial(_read, args=args, whole=True), args.json) if args.check else Job(args, device)
+        rows = _rows(args, items, device, job)
     except (ValueError, OSError) as error:
         return _fail(error)
-    wrong = failed = done = 0
-    for folder, name in zip(folders, names, strict=True):
-        target = args.output / name
-        try:
-            if args.check:
-                check(folder, target, args)
-            else:
-                job.run(folder, name, target)
-            done += 1
-        except ValueError as error:
-            wrong += 1
-            _fail(error)
-        except (OSError, RuntimeError, MemoryError) as error:
-            failed += 1
-            _fail(error, name)
-    if wrong + failed == 0:
-        return 0
-    return 2 if wrong and done == 0 and failed == 0 else 1
+    ended: list[objects.Row] = []
+    try:
+        with contextlib.closing(rows):
+            for row in rows:
+                ended.append(row)
+                _tell(row, args, len(items))
+    finally:
+        if len(items) > 1 and not args.check:
+            order = {item.name: k for k, item in enumerate(items)}
+            objects.write_summary(summary, sorted(ended, key=lambda row: order[row.object]))
+    results = {row.result for row in ended}
+    if {"refused", "failed"} & results:
+        code = 2 if results == {"refused"} else 1
+    else:
+        code = SUSPECT if isinstance(job, Check) and job.suspects() else 0
+    if args.json:
+        found = job.found if isinstance(job, Check) else {}
+        told = [asdict(row) | found.get(row.object, {"folder": str(args.output / row.object)}) for row in ended]
+        print(json.dumps({"objects": told, "exit_code": code}))
+    return code
 
 
-def _fail(error: BaseException, name: str | None = None) -> int:
-    print(f"reli3d-infer: {name + ': ' if name else ''}{reason(error)}", file=sys.stderr)
+def _folders(args: argparse.Namespace) -> list[Path]:
+    if args.list is not None:
+        return [*args.folder, *objects.listed(args.list)]
+    return args.folder or [EXAMPLE]
+
+
+def _rows(args: argparse.Namespace, items: list[objects.Item], device: str, job: objects.Job) -> objects.Rows:
+    """What becomes of each object, made where the options say.  Raises ValueError where there is no Ray."""
+    if args.workers is None and args.ray is None:
+        return (objects.make(job, item) for item in items)
+    # the weights are good and the kernels compiled: other processes make jobs of their own
+    start = functools.partial(objects.called, "reli3d.cli.infer", "worker_job", args, device)
+    if args.workers is not None:
+        return objects.in_processes(start, items, min(args.workers, len(items)))
+    return objects.on_ray(start, items, args.ray, gpu=device == "cuda")
+
+
+def worker_job(args: argparse.Namespace, device: str) -> Job:
+    """The job of a process that has others beside it."""
+    import torch
+
+    torch.set_num_threads(1)
+    return Job(args, device)
+
+
+def _tell(row: objects.Row, args: argparse.Namespace, count: int) -> None:
+    """The path of a result on stdout; errors, and what processes cannot show by a bar, on stderr."""
+    if row.result == "refused" and count == 1:
+        _fail(*row.notes)
+    elif row.result in ("refused", "failed"):
+        _fail(f"{row.object}: {row.notes[0]}")
+    elif row.result == "skipped":
+        print(f"{row.object}: all files are there, skipped", file=sys.stderr)
+    elif not args.check:
+        if args.workers is not None or args.ray is not None:
+            print(f"{row.object}: {row.seconds:.1f} s", file=sys.stderr)
+        if not args.json:
+            print(args.output / row.object / "mesh.glb", flush=True)
+
+
+def _fail(error: BaseException | str) -> int:
+    print(f"reli3d-infer: {error if isinstance(error, str) else reason(error)}", file=sys.stderr)
     return 2
-
-
-def object_names(folders: list[Path]) -> list[str]:
-    """A name for each folder: its own, with a number where two are alike."""
-    names: list[str] = []
-    for folder in folders:
-        base = name = Path(os.path.abspath(folder)).name or "object"
-        k = 2
-        while name in names:
-            name, k = f"{base}-{k}", k + 1
-        names.append(name)
-    return names
 
 
 def choose_device(wanted: str) -> str:
@@ -148,25 +231,17 @@ def choose_device(wanted: str) -> str:
     return "cuda" if wanted != "cpu" and torch.cuda.is_available() else "cpu"
 
 
-def _read(folder: Path, args: argparse.Namespace, *, every: bool = False):
-    """The views of ``folder`` as the command asks for them; every: all of them where it names no number."""
+def _read(folder: Path, args: argparse.Namespace, *, every: bool = False, whole: bool = False):
+    """The views of ``folder`` as the command asks for them; every: all of them where it names no number.
+
+    whole: see :func:`~reli3d.views.folder.load_views`.
+    """
     from reli3d.views.folder import load_views
 
     every = every and args.views is None and args.first_views is None
     return load_views(folder, views=args.views, first_views=args.first_views, masks=args.masks,
-                      allow_outside=args.allow_outside, every=every)  # fmt: skip
-
-
-def check(folder: Path, target: Path, args: argparse.Namespace) -> None:
-    """Print what the cameras look like, one line a view, and write the picture of the rig."""
-    from reli3d.views.check import explain_cameras, rig_picture
-
-    views = _read(folder, args)
-    for line in (*views.notes, *explain_cameras(views)):
-        print(line)
-    target.mkdir(parents=True, exist_ok=True)
-    rig_picture(views, target / "rig.png")
-    print(target / "rig.png")
+                      allow_outside=args.allow_outside, every=every, whole=whole,
+                      remove_background=args.remove_background)  # fmt: skip
 
 
 def _fetch(weights: str) -> None:
@@ -184,9 +259,11 @@ class Job:
         import torch
 
         from reli3d.nn import weights
-        from reli3d.pipeline import check_options
+        from reli3d.pipeline import ReconstructOptions
 
-        check_options(args.texture_size, args.resolution)
+        hero = int(args.hero) if args.hero.isdecimal() and args.hero.isascii() else args.hero
+        self.options = ReconstructOptions(args.texture_size, args.resolution, args.normalize, args.frame, args.up,
+                                          args.uv, hero, args.background, args.seed)  # fmt: skip
         if args.download:
             _fetch(args.weights)
         path = weights.locate(args.weights)
@@ -194,9 +271,8 @@ class Job:
         trunk = args.precision and {"float32": torch.float32, "bfloat16": torch.bfloat16}[args.precision]
         self.model, self.manifest = weights.load(path, trunk=trunk, device=device)
         self.digest = weights.known_sha256(path)
-        ready_kernels(device)  # takes half a minute the first time: not before the weights are known to be good
-        if self.budget:
-            ready_kernels(device, FITTING)
+        # takes half a minute the first time: not before the weights are known to be good
+        ready_kernels(device, needed_kernels(device, type(self.model).__name__, refined=bool(self.budget)))
         self.cold = True
 
     def complete(self, target: Path) -> bool:
@@ -205,67 +281,64 @@ class Job:
 
         return results.complete(target, compatible=self.args.compatible_names, refined=bool(self.budget))
 
-    def run(self, folder: Path, name: str, target: Path) -> None:
-        """Reconstruct one object and write its files; the bar goes before an error is told."""
+    def run(self, folder: Path, name: str, target: Path) -> str:
+        """Reconstruct one object and write its files, unless they are there; the bar goes before an error is told."""
         from reli3d.output import results
 
         with results.claim(target) as replacing:
             if self.args.skip_existing and self.complete(target):
-                print(f"{name}: all files are there, skipped", file=sys.stderr)
-                return
+                return "skipped"
             with Progress(name) as steps:
                 self._run(folder, name, replacing, steps)
-        print(target / "mesh.glb", flush=True)
+        return "done"
 
     def _run(self, folder: Path, name: str, replacing: Callable, steps: Progress) -> None:
         from reli3d.output import results
         from reli3d.output.preview import comparison, preview
-        from reli3d.pipeline import default_normalization, output_frame, reconstruct, refined
-        from reli3d.views.normalize import normalize
-        from reli3d.views.published_views import hero_first, placement_notes
+        from reli3d.pipeline import Stopwatch, place, published_input, reconstruct_placed, refined
+        from reli3d.views.check import up_axis
 
         args = self.args
         began = time.perf_counter()
         steps("reading")
-        views = _read(folder, args)
-        normalization = args.normalize or default_normalization(self.model.preset)
-        if normalization == "none" and args.normalize is None:
-            views = replace(views, notes=(*views.notes, *placement_notes(views)))
-        for note in views.notes:
-            steps.bar.write(f"{name}: {note}", file=sys.stderr)
-        hero = int(args.hero) if args.hero.isdecimal() and args.hero.isascii() else args.hero
-        views = hero_first(views, hero, args.seed)
+        whole = published_input(self.model.preset) or args.background != "masked"
+        photographs = _read(folder, args, every=bool(self.budget), whole=whole)
         read = time.perf_counter()
+        views = photographs.taken()
+        if args.up == "y" and args.frame == "input" and (axis := up_axis(views.c2w)) not in (None, "y"):
+            views = replace(views, notes=(*views.notes, f"the cameras stand upright about {axis}: try --up {axis}"))
+        steps.tell(views.notes)
         steps("normalize")
-        to_model = normalize(views, normalization)
+        with diagnosed(views):
+            placed = place(views, self.model.preset, self.options)
         before = {"read": read - began, "normalize": time.perf_counter() - read}
+        steps.tell(placed.views.notes[len(views.notes) :])
+        views, output = placed.views, placed.output_from_input
         seconds: dict[str, dict[str, float]] = {}
         for label in ["cold" if self.cold else "warm", *(["warm"] if args.warm else [])]:
-            stages: dict[str, float] = {}
-            asset = reconstruct(views, weights=self.model, texture_size=args.texture_size, resolution=args.resolution,
-                                normalization=to_model, frame=args.frame, up=args.up, uv=args.uv, seed=args.seed,
-                                background=args.background, timings=stages, progress=steps)  # fmt: skip
-            seconds[label] = {k: round(v, 4) for k, v in {**stages, **before}.items()}
+            watch = Stopwatch(self.model.device, steps)
+            with diagnosed(views):
+                asset = reconstruct_placed(placed, self.model, self.options, watch)
+            seconds[label] = {k: round(v, 4) for k, v in {**before, **watch.seconds}.items()}
         self.cold = False
-        output = output_frame(to_model, args.frame, args.up)
         shown, compared, record = views.transformed(output), None, {}
         if self.budget:
             steps("refine")
-            photographs = _read(folder, args, every=True).transformed(output)
+            photographs = photographs.transformed(output)
             result = refined(asset, photographs, seed=args.seed, cameras=args.refine_cameras, bar=True, **self.budget)
-            for note in result.notes:
-                steps.bar.write(f"{name}: {note}", file=sys.stderr)
+            steps.tell(result.notes)
             compared, asset = comparison(asset, result.asset, shown.to(self.device)), result.asset
             record = {"refinement": {"views": len(photographs), **self.budget, **result.record()}}
         steps("preview")
         picture = preview(asset, shown.to(self.device))
+        frames, translation = results.frame_record(placed.model_from_input, output, views.origin, args.frame, args.up)
         info = {
             "object": name,
             "views": list(views.names),
             "views_in_folder": views.in_folder,
             "coordinate_system": views.coordinate_system,
             "notes": list(views.notes),
-            **results.frame_record(to_model, output, args.frame, args.up),
+            **frames,
             "weights": results.weights_record(self.manifest, self.digest),
             "preset": self.model.preset.name,
             "precision": str(self.model.dtype).removeprefix("torch."),
@@ -275,6 +348,7 @@ class Job:
             "seed": args.seed,
             "device": self.device,
             "mesh": results.mesh_statistics(asset.mesh),
+            "mask_iou": results.mask_iou(asset.mesh, shown.to(self.device)),
             **record,
             "seconds": seconds,
             "seconds_since_start": round(time.monotonic() - STARTED, 3),
@@ -283,7 +357,7 @@ class Job:
         }
         steps("writing")
         results.write_results(replacing, asset, shown, picture, info, compatible=args.compatible_names,
-                              comparison=compared)  # fmt: skip
+                              comparison=compared, translation=translation)  # fmt: skip
 
 
 def refinement_budget(args: argparse.Namespace, device: str) -> dict[str, float | int]:
@@ -301,57 +375,23 @@ def refinement_budget(args: argparse.Namespace, device: str) -> dict[str, float 
     return {"seconds": args.refine or REFINE_SECONDS[device]}
 
 
-def ready_kernels(device: str, names: tuple[str, ...] = KERNELS) -> None:
+def needed_kernels(device: str, network: str, *, refined: bool) -> list[str]:
+    """Names of the kernel modules that objects need on ``device`` with a network of the class ``network``."""
+    found = json.loads(KERNELS.read_text())  # of runs on a CPU
+    names = {*found[network], *(found["refine"] if refined else ())}
+    return sorted(names if device == "cpu" else names - {*SHADER["cpu"]} | {*SHADER[device]})
+
+
+def ready_kernels(device: str, names: list[str]) -> None:
     """Compile side by side what the first run would compile piece by piece; says so on stderr if there is something."""
     import torch
 
     from reli3d._bridge import compiled, load_modules
 
-    names = (*names, *SHADER[torch.device(device).type])
     modules = [importlib.import_module(f"reli3d.kernels.{name}") for name in names]
     if not compiled(modules, torch.device(device)):
         print("compiling kernels (first run only)", file=sys.stderr)
         load_modules(modules, torch.device(device))
-
-
-class Progress:
-    """A bar over the stages of one object, on stderr."""
-
-    STAGES = (
-        "reading",
-        "normalize",
-        "prepare",
-        "network",
-        "surface",
-        "textures",
-        "light",
-        "frame",
-        "refine",
-        "preview",
-        "writing",
-    )
-
-    def __init__(self, name: str):
-        from tqdm import tqdm
-
-        self.bar = tqdm(
-            total=len(self.STAGES), desc=name, file=sys.stderr, bar_format="{desc}: {bar:20} {postfix} {elapsed}"
-        )
-
-    def __call__(self, stage: str) -> None:
-        self.bar.set_postfix_str(stage, refresh=False)
-        self.bar.n = self.STAGES.index(stage)
-        self.bar.refresh()
-
-    def __enter__(self) -> Progress:
-        return self
-
-    def __exit__(self, kind, error, trace) -> None:
-        self.bar.leave = error is None
-        if error is None:
-            self.bar.n = len(self.STAGES)
-            self.bar.set_postfix_str("done", refresh=True)
-        self.bar.close()
 
 
 if __name__ == "__main__":

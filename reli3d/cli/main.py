@@ -13,9 +13,12 @@ COMMANDS = {  # module of reli3d.cli, arguments put before the given ones, what 
     "view": ("view", (), "show a reconstruction in the browser"),
     "check": ("infer", ("--check",), "explain the cameras of a folder, reconstruct nothing"),
     "render": ("render", (), "views and turntables of a GLB under any light (also reli3d-render)"),
+    "export": ("export", (), "write a GLB as OBJ, USDZ or GLB, with fewer triangles or smaller textures"),
     "data": ("data", (), "make training samples (also reli3d-data)"),
     "train": ("train", (), "train the network (also reli3d-train)"),
+    "stages": ("stages", (), "train the paper's network stage by stage (also reli3d-stages)"),
     "eval": ("eval", (), "measure the network on held-back objects (also reli3d-eval)"),
+    "tables": ("tables", (), "the paper's tables on a folder of GLB files (also reli3d-tables)"),
     "doctor": ("doctor", (), "say what is installed, where it runs and whether it can"),
 }
 

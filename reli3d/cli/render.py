@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import importlib
+import json
 import math
 import sys
 from dataclasses import replace
@@ -11,7 +13,10 @@ from pathlib import Path
 from reli3d.cli.ending import check_range, command
 from reli3d.cli.helping import Defaults
 
-FORMATS = ("png", "exr", "webp")
+FORMATS = ("png", "exr", "webp", "gif", "mp4")
+MOVING = ("webp", "gif", "mp4")  # one file of all frames
+RATE = 24  # frames a second
+QUALITIES = {"draft": ((6, 12, 2), 1), "good": ((20, 40, 4), 2), "best": ((64, 128, 16), 4)}  # samples, supersampling
 
 
 def parser() -> argparse.ArgumentParser:
@@ -22,57 +27,136 @@ def parser() -> argparse.ArgumentParser:
         epilog="Exit code: 0 done, 2 wrong input.  The files' names go to stdout, progress to stderr.",
     )
     p.add_argument("glb", type=Path)
-    p.add_argument("--light", type=Path, help="lat-long .hdr or .exr, its centre column +X (as three.js, "
-                   "model-viewer and Blender have it); default uniform white")  # fmt: skip
-    p.add_argument("--output", type=Path, default=Path("renders"), help="folder (default renders)")
-    p.add_argument("--format", choices=FORMATS, default="png", help="png, exr (linear radiance), webp (animation)")
-    p.add_argument("--frames", type=int, default=1, help="views on a full turn around +Y")
+    p.add_argument(
+        "--light",
+        type=Path,
+        help="lat-long .hdr or .exr, its centre column +X (as three.js, "
+        "model-viewer and Blender have it); default uniform white",
+    )
+    p.add_argument(
+        "--output",
+        type=Path,
+        default=Path("renders"),
+        help="folder, or the name of an animation that ends in .webp, .gif or .mp4 (default renders)",
+    )
+    p.add_argument(
+        "--format",
+        choices=FORMATS,
+        help="png (default), exr (linear radiance), or an animation: webp, gif "
+        "(256 colours), mp4 (on white; pip install 'reli3d[video]')",
+    )
+    p.add_argument(
+        "--frames", type=int, help="views on a full turn around +Y (default 1, of an animation named by --output 72)"
+    )
     p.add_argument("--turn", choices=("camera", "light"), default="camera", help="what turns between frames")
+    p.add_argument("--rotate-light", dest="turn", action="store_const", const="light", help="the same as --turn light")
     p.add_argument("--azimuth", type=float, default=30.0, help="of the first view, degrees from +Z towards +X")
     p.add_argument("--elevation", type=float, default=20.0, help="degrees above the horizon, within 89")
     p.add_argument("--fov", type=float, default=32.0, help="horizontal field of view in degrees")
     p.add_argument("--distance", type=float, help="from the centre of the object (default: it fills the view)")
     p.add_argument("--size", type=int, default=512, help="pixels along a side (default 512)")
+    p.add_argument(
+        "--quality",
+        choices=tuple(QUALITIES),
+        default="good",
+        help="samples, supersampling: draft 6 12 2 "
+        "and 1, good 20 40 4 and 2, best 64 128 16 and 4; what is given beside it counts",
+    )
     counts = p.add_mutually_exclusive_group()
-    counts.add_argument("--samples", type=int, nargs=3, default=(20, 40, 4), metavar=("ENV", "GGX", "COS"),
-                        help="per subpixel, by strategy (default 20 40 4)")  # fmt: skip
-    counts.add_argument("--plan", type=int, metavar="TOTAL", help="so many per subpixel, shared among the strategies "
-                        "for the least noise of the first view (relative noise; with exr absolute); the counts go to "
-                        "stderr")  # fmt: skip
-    p.add_argument("--supersampling", type=int, default=2, help="subpixels along a side of a pixel (default 2)")
-    p.add_argument("--paint", choices=("conserving", "published"), default="conserving",
-                   help="what the coat leaves to the paint: conserving (default; no surface sends out more than it "
-                   "gets) or published (glTF viewers' formula; white paint gains light at grazing angles)")  # fmt: skip
+    counts.add_argument(
+        "--samples",
+        type=int,
+        nargs=3,
+        metavar=("ENV", "GGX", "COS"),
+        help="per subpixel, by strategy (default that of --quality)",
+    )
+    counts.add_argument(
+        "--plan",
+        type=int,
+        metavar="TOTAL",
+        help="so many per subpixel, shared among the strategies "
+        "for the least noise of the first view (relative noise; with exr absolute); the counts go to "
+        "stderr",
+    )
+    p.add_argument("--supersampling", type=int, help="subpixels along a side of a pixel (default that of --quality)")
+    p.add_argument(
+        "--paint",
+        choices=("conserving", "published"),
+        default="conserving",
+        help="what the coat leaves to the paint: conserving (default; no surface sends out more than it "
+        "gets) or published (glTF viewers' formula; white paint gains light at grazing angles)",
+    )
     p.add_argument("--background", choices=("transparent", "environment"), default="transparent")
-    p.add_argument("--tone", choices=("srgb", "agx", "none"), default="srgb",
-                   help="display transform of png and webp; none writes linear values")  # fmt: skip
+    p.add_argument(
+        "--tone",
+        choices=("srgb", "agx", "none"),
+        default="srgb",
+        help="display transform of png and webp; none writes linear values",
+    )
     p.add_argument("--exposure", type=float, default=0.0, help="stops, of every format (not of AOVs), within 32")
-    p.add_argument("--aovs", action="store_true", help="also EXR files of base colour, material (0, roughness, "
-                   "metallic), normal (n / 2 + 1 / 2) and depth (depth, depth, alpha)")  # fmt: skip
+    p.add_argument(
+        "--aovs",
+        action="store_true",
+        help="also EXR files of base colour, material (0, roughness, "
+        "metallic), normal (n / 2 + 1 / 2) and depth (depth, depth, alpha)",
+    )
     p.add_argument("--no-shadows", action="store_true")
     p.add_argument("--seed", type=int, default=0, help="of what is drawn by chance")
     p.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
+    p.add_argument("--json", action="store_true", help="print one JSON object instead of the files' names")
     return p
 
 
 @command("reli3d-render")
 def main(argv: list[str] | None = None) -> int:
-    args = parser().parse_args(argv)
+    args = _completed(parser().parse_args(argv))
     _check(args)
-    for path in render_files(args):
-        print(path)
+    files = [str(path) for path in render_files(args)]
+    record = {
+        "files": files,
+        "frames": args.frames,
+        "size": args.size,
+        "samples": list(args.samples),
+        "supersampling": args.supersampling,
+    }
+    print(json.dumps(record) if args.json else "\n".join(files))
     return 0
+
+
+def _completed(args: argparse.Namespace) -> argparse.Namespace:
+    """The arguments with what others of them say; ``args.file`` is the animation that ``--output`` names, or None."""
+    ending = args.output.suffix.lower().removeprefix(".")
+    args.file = args.output if ending in MOVING and not args.output.is_dir() else None
+    if args.file is not None:
+        if args.format not in (None, ending):
+            raise ValueError(f"--format: expected {ending} as in the name of the output, got {args.format}")
+        args.format, args.output = ending, args.file.parent
+    args.format = args.format or "png"
+    args.frames = args.frames if args.frames is not None else 1 if args.file is None else 72
+    samples, supersampling = QUALITIES[args.quality]
+    args.samples = tuple(args.samples or samples)
+    args.supersampling = args.supersampling if args.supersampling is not None else supersampling
+    return args
 
 
 def _check(args: argparse.Namespace) -> None:
     from reli3d.cli.infer import choose_device
     from reli3d.output.folder import check_folder
 
-    for name, low, high in (("frames", 1, 3600), ("size", 1, 8192), ("supersampling", 1, 16), ("plan", 1, 65536),
-                            ("seed", 0, 10**9)):  # fmt: skip
+    for name, low, high in (
+        ("frames", 1, 3600),
+        ("size", 1, 8192),
+        ("supersampling", 1, 16),
+        ("plan", 1, 65536),
+        ("seed", 0, 10**9),
+    ):
         check_range(name, getattr(args, name), low, high)
     if not all(0 <= k <= 65536 for k in args.samples) or sum(args.samples) == 0:
         raise ValueError(f"--samples: expected three counts of 0 to 65536, one above 0, got {tuple(args.samples)}")
+    if args.format == "mp4":
+        if args.size % 2:
+            raise ValueError(f"--size: expected an even number of pixels for mp4, got {args.size}")
+        importlib.import_module("reli3d.output.video").library()  # before minutes of work
     if not 1.0 <= args.fov <= 150.0:
         raise ValueError(f"--fov: expected 1 to 150 degrees, got {args.fov}")
     for name, limit in (("elevation", 89.0), ("azimuth", 3600.0), ("exposure", 32.0)):
@@ -107,7 +191,7 @@ def render_files(args: argparse.Namespace) -> list[Path]:
     up = torch.tensor([0.0, 1.0, 0.0], device=device)
     args.output.mkdir(parents=True, exist_ok=True)
     written, animation, options = [], [], ShadeOptions(tuple(args.samples), args.seed, paint=args.paint)
-    bar = tqdm(total=args.frames, unit="frame", file=sys.stderr, disable=not sys.stderr.isatty())
+    bar = tqdm(total=args.frames, unit="frame", file=sys.stderr, disable=None)
     for frame in range(args.frames):
         turn = 2.0 * math.pi * frame / args.frames
         azimuth = math.radians(args.azimuth) + (turn if args.turn == "camera" else 0.0)
@@ -115,17 +199,29 @@ def render_files(args: argparse.Namespace) -> list[Path]:
         offset = [math.cos(lift) * math.sin(azimuth), math.sin(lift), math.cos(lift) * math.cos(azimuth)]
         eye = centre + distance * torch.tensor(offset, device=device)
         camera = Camera.from_fov(look_at(eye, centre, up), math.radians(args.fov), args.size, args.size)
-        shown = {"scene": scene, "shadows": not args.no_shadows}
         if args.plan is not None and frame == 0:
-            plan = plan_render(parts, camera, environment, total=args.plan, options=options,
-                               relative=args.format != "exr", **shown)  # fmt: skip
+            plan = plan_render(
+                parts,
+                camera,
+                environment,
+                total=args.plan,
+                options=options,
+                relative=args.format != "exr",
+                scene=scene,
+                shadows=not args.no_shadows,
+            )
             options = replace(options, samples=plan.samples, antithetic="none")
             print("reli3d-render: samples by strategy", *plan.samples, file=sys.stderr)
         image = render(
-            parts, camera, environment if args.turn == "camera" else environment.rotated(turn), **shown,
-            options=replace(options, seed=args.seed + frame), supersampling=args.supersampling,
+            parts,
+            camera,
+            environment if args.turn == "camera" else environment.rotated(turn),
+            scene=scene,
+            shadows=not args.no_shadows,
+            options=replace(options, seed=args.seed + frame),
+            supersampling=args.supersampling,
             background=args.background,
-        )  # fmt: skip
+        )
         stem = args.output / (args.glb.stem if args.frames == 1 else f"{args.glb.stem}_{frame:04d}")
         if args.format == "exr":
             written.append(stem.with_name(stem.name + ".exr"))
@@ -140,8 +236,8 @@ def render_files(args: argparse.Namespace) -> list[Path]:
         bar.update(1)
     bar.close()
     if animation:
-        written.append(args.output / f"{args.glb.stem}.webp")
-        _save(written[-1], animation[0], format="WEBP", save_all=True, append_images=animation[1:], duration=42, loop=0)
+        written.append(args.file or args.output / f"{args.glb.stem}.{args.format}")
+        _animate(written[-1], animation, args.format)
     return written
 
 
@@ -155,6 +251,26 @@ def _picture(image, args):
     tone = {"srgb": linear_to_srgb, "agx": agx, "none": lambda v: v}[args.tone]
     shown = image.picture(exposure=args.exposure, tone=tone, transparent=args.background == "transparent")
     return Image.fromarray((shown * 255.0 + 0.5).to(torch.uint8).cpu().numpy())
+
+
+def _animate(path: Path, pictures: list, kind: str) -> None:
+    """One file of all ``pictures``, RATE a second, that begins again."""
+    if kind == "mp4":
+        from reli3d.io.files import write_bytes
+        from reli3d.output.video import mp4_bytes
+
+        return write_bytes(path, mp4_bytes(pictures, RATE))
+    options = {"lossless": False} if kind == "webp" else {"disposal": 2}  # gif: what is transparent shows no old frame
+    return _save(
+        path,
+        pictures[0],
+        format=kind.upper(),
+        save_all=True,
+        append_images=pictures[1:],
+        duration=round(1000 / RATE),
+        loop=0,
+        **options,
+    )
 
 
 def _save(path: Path, picture, **options) -> None:

@@ -30,6 +30,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--max-views", type=int, default=6)
     p.add_argument("--rate", type=float, default=1.5e-3, help="peak learning rate")
     p.add_argument("--seed", type=int, default=0)
+    p.add_argument("--maps", type=Path, help="environment maps, .npz, under which about half of the draws are relit")
     p.add_argument(
         "--validation",
         type=Path,
@@ -53,9 +54,15 @@ def _check(args: argparse.Namespace) -> None:
     from reli3d.output.folder import check_folder
     from reli3d.synthetic.stored import check_samples
 
-    for name, low, high in (("steps", 1, 10**9), ("minutes", 1e-3, math.inf), ("batch", 1, 4096),
-                            ("points", 2, 16384), ("max-views", 1, 16), ("rate", 1e-9, 10.0),
-                            ("seed", 0, 10**9)):  # fmt: skip
+    for name, low, high in (
+        ("steps", 1, 10**9),
+        ("minutes", 1e-3, math.inf),
+        ("batch", 1, 4096),
+        ("points", 2, 16384),
+        ("max-views", 1, 16),
+        ("rate", 1e-9, 10.0),
+        ("seed", 0, 10**9),
+    ):
         check_range(name, getattr(args, name.replace("-", "_")), low, high)
     check_folder(args.output)
     if args.export:
@@ -81,8 +88,9 @@ def _check_state(path: Path, model) -> None:
         whole = len(groups) == 2 and isinstance(step, int) and step >= 0 and seconds >= 0
     except Exception as error:  # of a broken file torch, pickle and zipfile raise almost anything
         reason = shown(" ".join(str(error).split()))
-        raise InputError(path, f"expected a checkpoint of this training, got a broken file ({reason}); remove "
-                         "it to start again") from None  # fmt: skip
+        raise InputError(
+            path, f"expected a checkpoint of this training, got a broken file ({reason}); remove it to start again"
+        ) from None
     for found in shapes:
         check_keys(path, found, {k: tuple(v.shape) for k, v in model.state_dict().items()})
     if not whole:
@@ -97,13 +105,13 @@ def main(argv: list[str] | None = None) -> int:
 
     from reli3d.nn import weights
     from reli3d.nn.local import LocalReconstructor
-    from reli3d.nn.presets import LOCAL
+    from reli3d.nn.presets import SMALL
     from reli3d.train.calibrate import calibrate
     from reli3d.train.loop import TrainConfig, averaged_model, train
     from reli3d.train.workers import Workers
 
     torch.manual_seed(args.seed)
-    model = LocalReconstructor(LOCAL)
+    model = LocalReconstructor(SMALL)
     state = args.output / "state.pt"
     if args.export or state.exists():
         _check_state(state, model)
@@ -119,7 +127,7 @@ def main(argv: list[str] | None = None) -> int:
     train(model, TrainConfig(samples=str(args.samples), output=str(args.output), steps=args.steps,
                              minutes=args.minutes, batch=args.batch, points=args.points, max_views=args.max_views,
                              rate=args.rate, seed=args.seed,
-                             validation=str(args.validation or "")), workers)  # fmt: skip
+                             maps=str(args.maps or ""), validation=str(args.validation or "")), workers)  # fmt: skip
     workers.leave()
     return 0
 

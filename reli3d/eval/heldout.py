@@ -17,7 +17,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from reli3d.geometry.rays import RayScene
-from reli3d.pipeline import Network, NoSurface, reconstruct
+from reli3d.pipeline import Network, NoSurface, ReconstructOptions, reconstruct
 from reli3d.render.camera import Camera, camera_rays
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.render.environment import Environment
@@ -91,7 +91,8 @@ def evaluate(model: Network, sample: dict[str, Tensor], seed: int, count: int, m
     there are no colours.
     """
     try:
-        asset = reconstruct(sample_views(sample, count), weights=model, texture_size=512)
+        options = ReconstructOptions(texture_size=512)
+        asset = reconstruct(sample_views(sample, count), weights=model, options=options)
     except NoSurface:
         return {"empty": 1.0, "iou": 0.0}
     scene, size = RayScene(asset.mesh.vertices, asset.mesh.faces), sample["images"].shape[1]
@@ -102,10 +103,11 @@ def evaluate(model: Network, sample: dict[str, Tensor], seed: int, count: int, m
         got_mask, got = asset_colors(asset, scene, camera)
         ious.append(float((mask & got_mask).sum() / (mask | got_mask).sum().clamp(min=1)))
         both = mask & got_mask
-        got_all.append(got[both]), want_all.append(want[both])
+        got_all.append(got[both])
+        want_all.append(want[both])
     got, want = torch.cat(got_all), torch.cat(want_all)
     target = sample["environment"].float()
-    predicted = asset.environment.resized(len(target)).radiance
+    predicted = asset.light.resized(len(target)).radiance
     exposure = target.mean() / mean_light.mean()
     found = {
         "empty": 0.0,
@@ -128,7 +130,7 @@ def summary(rows: list[dict[str, float]]) -> dict[str, float]:
     (``_psnr``), which objects of nearly one colour rule, and that of the mean error (``_psnr_pooled``), which the
     colourful ones rule.
     """
-    out = {"objects": len(rows)}
+    out: dict[str, float] = {"objects": len(rows)}
     for key in dict.fromkeys(key for row in rows for key in row):
         values = np.array([row[key] for row in rows if key in row])
         if key.endswith("_mse"):
@@ -149,8 +151,9 @@ def mean_environment(maps: Tensor) -> Tensor:
     return Environment(wide.contiguous()).resized(32).radiance
 
 
-def table(model: Network, folder: Path, mean_light: Tensor, counts: Sequence[int],
-          progress: Callable[[str], None]) -> dict[int, dict]:  # fmt: skip
+def table(
+    model: Network, folder: Path, mean_light: Tensor, counts: Sequence[int], progress: Callable[[str], None]
+) -> dict[int, dict]:
     """:func:`summary` of the samples in ``folder`` for each number of views (at most ``INPUTS``); ``progress`` gets a
     line an object.  Raises ValueError where the folder holds no samples.
     """

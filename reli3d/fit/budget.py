@@ -50,7 +50,7 @@ class Budget:
                 progress = count / max(total, 1)
                 if count >= total:
                     return
-            else:
+            elif self.seconds is not None:
                 now = time.perf_counter() - self.began
                 if now >= self.seconds * until:
                     return
@@ -76,4 +76,4 @@ class Budget:
 def progress_bar(budget_total: float, unit: str) -> tqdm:
     """A bar on stderr over seconds or steps."""
     layout = "refine: {bar:20} {n:.0f}/{total:.0f} {unit} {postfix} {remaining}"
-    return tqdm(total=budget_total, unit=unit, file=sys.stderr, bar_format=layout, leave=False)
+    return tqdm(total=budget_total, unit=unit, file=sys.stderr, bar_format=layout, leave=False, disable=None)

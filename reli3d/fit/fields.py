@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import reduce
 
 import torch
 from torch import Tensor
@@ -21,7 +22,7 @@ def space_field(grids: Sequence[Tensor], points: Tensor) -> Tensor:
 
 def light_field(maps: Sequence[Tensor], height: int) -> Tensor:
     """Sum ``(height, 2 height, 3)`` of lat-long maps of rising resolution, bilinear and periodic in azimuth."""
-    total = 0.0
+    parts = []
     for values in maps:
         planes = values.permute(2, 0, 1)[None]
         rows = planes.shape[2]
@@ -30,8 +31,8 @@ def light_field(maps: Sequence[Tensor], height: int) -> Tensor:
             planes = pad(planes, (1, 1, 0, 0), mode="circular")
             planes = interpolate(planes, scale_factor=factor, mode="bilinear", align_corners=False)
             planes = planes[..., factor:-factor]
-        total = total + planes[0].permute(1, 2, 0)
-    return total
+        parts.append(planes[0].permute(1, 2, 0))
+    return reduce(torch.add, parts)
 
 
 def blurred_grid(grid: Tensor, cells: int) -> Tensor:

@@ -90,8 +90,14 @@ def curvature(level: Tensor, cell: float, near: Tensor) -> Tensor:
     Silhouettes and colours leave the surface free between what they see; a plain grid answers with noise.
     """
     x, near = level / cell, near[1:-1, 1:-1, 1:-1].to(level)
-    around = (x[2:, 1:-1, 1:-1] + x[:-2, 1:-1, 1:-1] + x[1:-1, 2:, 1:-1] + x[1:-1, :-2, 1:-1]
-              + x[1:-1, 1:-1, 2:] + x[1:-1, 1:-1, :-2])  # fmt: skip
+    around = (
+        x[2:, 1:-1, 1:-1]
+        + x[:-2, 1:-1, 1:-1]
+        + x[1:-1, 2:, 1:-1]
+        + x[1:-1, :-2, 1:-1]
+        + x[1:-1, 1:-1, 2:]
+        + x[1:-1, 1:-1, :-2]
+    )
     return ((around - 6.0 * x[1:-1, 1:-1, 1:-1]).square() * near).sum() / near.sum().clamp(min=1.0)
 
 

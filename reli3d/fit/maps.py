@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from reli3d._bridge import present
 from reli3d.fit import losses
 from reli3d.fit.budget import Budget
 from reli3d.fit.photographs import WHITE, Photographs
@@ -57,9 +58,9 @@ def traced(asset: Asset, scene: RayScene, photographs: Photographs, views: list[
         both = inside[view] & (hits.face >= 0)
         face, bary = hits.face[both], hits.bary[both]
         at = surface_points(mesh, asset.textures, face, bary)
-        uv = interpolate(mesh.uv, mesh.faces, face, bary)
-        which = torch.full_like(face, view, dtype=torch.long)
-        parts.append((which, at.position, at.normal, at.ng, -directions[both], uv, material_logits(at),
+        uv = interpolate(present("mesh.uv", mesh.uv), mesh.faces, face, bary)
+        of_view = torch.full_like(face, view, dtype=torch.long)
+        parts.append((of_view, at.position, at.normal, at.ng, -directions[both], uv, material_logits(at),
                       photographs.color[view][both]))  # fmt: skip
     columns = [torch.cat(column) for column in zip(*parts)]
     rng = torch.Generator().manual_seed(seed)
@@ -67,7 +68,8 @@ def traced(asset: Asset, scene: RayScene, photographs: Photographs, views: list[
     if len(order) > PIXELS:
         order = order[:PIXELS]
         columns, order = [column[order] for column in columns], torch.arange(PIXELS, device=order.device)
-    return Pixels(*columns, order)
+    which, position, normal, ng, wo, uv, logits, target = columns
+    return Pixels(which, position, normal, ng, wo, uv, logits, target, order)
 
 
 def maps_loss(unknowns: Unknowns, start: Start, pixels: Pixels, rows: Tensor, scene: RayScene | None,
@@ -78,8 +80,7 @@ def maps_loss(unknowns: Unknowns, start: Start, pixels: Pixels, rows: Tensor, sc
     change = material_change(unknowns, position)
     fine = sample_texture(unknowns.detail, pixels.uv[rows])
     change = torch.cat([change[:, :3] + fine, change[:, 3:]], 1)
-    points = SurfacePoints(position, pixels.ng[rows], pixels.normal[rows],
-                           *material_of(pixels.logits[rows] + change))  # fmt: skip
+    points = SurfacePoints(position, pixels.ng[rows], pixels.normal[rows], *material_of(pixels.logits[rows] + change))
     light, exposure = environment(unknowns, start), unknowns.exposure.exp()[view, None]
     image = radiance(points, pixels.wo[rows], light, samples=samples, scene=scene, seed=2 * seed) * exposure
     other = image

@@ -20,10 +20,25 @@ INSIDE = 0.99  # coverage from which a pixel, and its neighbours, show nothing b
 class PosedImages(Protocol):
     """What :meth:`reli3d.views.views.Views.resampled` gives, or anything like it."""
 
-    images: Tensor  # (V, S, S, 3) sRGB in [0, 1]
-    masks: Tensor  # (V, S, S) in [0, 1]
-    c2w: Tensor  # (V, 4, 4)
-    intrinsics: Tensor  # (V, 4)
+    @property
+    def images(self) -> Tensor:
+        """``(V, S, S, 3)`` sRGB in [0, 1]."""
+        ...
+
+    @property
+    def masks(self) -> Tensor:
+        """``(V, S, S)`` in [0, 1]."""
+        ...
+
+    @property
+    def c2w(self) -> Tensor:
+        """``(V, 4, 4)``."""
+        ...
+
+    @property
+    def intrinsics(self) -> Tensor:
+        """``(V, 4)``."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -43,8 +58,10 @@ class Photographs:
     def of(cls, views: PosedImages) -> Photographs:
         """Photographs from sRGB images.  Raises TypeError or ValueError where the parts do not fit together."""
         images, masks = views.images, views.masks
-        check("images", images, last=3), check("masks", masks, like=images)
-        check("c2w", views.c2w, last=4, like=images), check("intrinsics", views.intrinsics, last=4, like=images)
+        check("images", images, last=3)
+        check("masks", masks, like=images)
+        check("c2w", views.c2w, last=4, like=images)
+        check("intrinsics", views.intrinsics, last=4, like=images)
         count = len(images)
         if images.ndim != 4 or not count or images.shape[1] != images.shape[2]:
             raise ValueError(f"images: expected (V, S, S, 3) with at least one view, got {tuple(images.shape)}")

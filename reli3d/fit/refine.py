@@ -54,10 +54,18 @@ class Refinement:
 
     def record(self) -> dict:
         """What a file may hold of it: plain values, without the asset."""
-        pairs = {name: dict(zip(("input", "held_out"), (None if math.isnan(v) else round(v, 3) for v in values)))
-                 for name, values in (("psnr_before", self.before), ("psnr_after", self.after))}  # fmt: skip
-        return {"kept": self.kept, **pairs, "views_held_out": list(self.held), "steps": self.steps,
-                "notes": list(self.notes), "curve": self.curve}  # fmt: skip
+        pairs = {
+            name: dict(zip(("input", "held_out"), (None if math.isnan(v) else round(v, 3) for v in values)))
+            for name, values in (("psnr_before", self.before), ("psnr_after", self.after))
+        }
+        return {
+            "kept": self.kept,
+            **pairs,
+            "views_held_out": list(self.held),
+            "steps": self.steps,
+            "notes": list(self.notes),
+            "curve": self.curve,
+        }
 
 
 def held_out(count: int) -> tuple[int, ...]:
@@ -76,10 +84,11 @@ def picture_error(asset: Asset, photographs: Photographs) -> Tensor:
         seen = hits.face >= 0
         at = surface_points(asset.mesh, asset.textures, hits.face[seen], hits.bary[seen])
         image = torch.ones_like(small.color[view])
-        lit = radiance(at, -directions[seen], asset.environment, samples=CHECK_SAMPLES, scene=scene, seed=view)
+        lit = radiance(at, -directions[seen], asset.light, samples=CHECK_SAMPLES, scene=scene, seed=view)
         image[seen] = linear_to_srgb(lit.clamp(0.0, 1.0))
-        wanted = torch.lerp(torch.ones_like(image), linear_to_srgb(small.color[view].clamp(0, 1)),
-                            small.mask[view][..., None])  # fmt: skip
+        wanted = torch.lerp(
+            torch.ones_like(image), linear_to_srgb(small.color[view].clamp(0, 1)), small.mask[view][..., None]
+        )
         errors.append((image - wanted).square().mean())
     return torch.stack(errors)
 
@@ -97,17 +106,17 @@ def refine(asset: Asset, views: PosedImages, *, seconds: float | None = None, st
 
     seconds or steps: one of the two; with ``steps`` the result is the same on every run of one machine.  resolution:
     cells of the surface's grid along the longest side.  weights: of the losses.  cameras: correct the cameras as well.
-    bar: show progress on stderr.  Ctrl-C ends the fit and the best so far is taken.
+    bar: progress on stderr.  Ctrl-C ends the fit and the best so far is taken.
 
     With three views or more some are held out: their masks bound the surface, their colours are not used.  Where the
-    result shows them, or the others, worse than the start does, the start is returned.  Raises TypeError or ValueError
-    where the parts do not fit together, and on an asset without light, atlas or faces.
+    result shows any views worse than the start does, the start is returned.  Raises TypeError or ValueError where the
+    parts do not fit together, and on an asset without light, atlas or faces.
     """
     photographs, weights = Photographs.of(views), weights or losses.Weights()
     _check_asset(asset, photographs)
     budget = Budget(seconds, steps)
     if bar:
-        budget.bar = progress_bar(seconds or steps, "s" if seconds else "steps")
+        budget.bar = progress_bar(seconds or steps or 0, "s" if seconds else "steps")
     held = held_out(len(photographs))
     used = [v for v in range(len(photographs)) if v not in held]
     low, high = asset.mesh.vertices.amin(0), asset.mesh.vertices.amax(0)
@@ -120,7 +129,7 @@ def refine(asset: Asset, views: PosedImages, *, seconds: float | None = None, st
     after = picture_error(result, near)
     if budget.bar is not None:
         budget.bar.close()
-    was, now = (tuple(decibels(e[list(some)]) for some in (used, held)) for e in (before, after))
+    was, now = ((decibels(e[used]), decibels(e[list(held)])) for e in (before, after))
     worse = [name for name, a, b in zip(("input", "held-out"), was, now) if b < a - SLACK]
     if worse:
         notes.append(f"refinement: kept the start, as the result is worse on {' and '.join(worse)} views")
@@ -139,8 +148,9 @@ def _fitted(first: Asset, photographs: Photographs, used: list[int], resolution:
     grid = Grid.around(first.mesh.vertices, resolution)
     level = start_level(first.mesh, grid) if closed else first.mesh.vertices.new_ones(grid.shape)
     unknowns = Unknowns.zero(level, len(photographs), texels)
-    options = {"views": used, "weights": weights, "budget": budget, "seed": seed}
-    fit_maps(unknowns, start, first, photographs, until=LIGHT_UNTIL, name="light", detail=False, **options)
+    fit_maps(
+        unknowns, start, first, photographs, used, weights, budget, LIGHT_UNTIL, name="light", seed=seed, detail=False
+    )
     surface = first
     if closed:
         bound = bound_level(photographs, grid)
@@ -152,7 +162,7 @@ def _fitted(first: Asset, photographs: Photographs, used: list[int], resolution:
         photographs = photographs.seen_from(turned.c2w)
     else:
         notes.append("refinement: the surface is not closed, so only its maps and light are fitted")
-    fit_maps(unknowns, start, surface, photographs, until=1.0, name="maps", **options)
+    fit_maps(unknowns, start, surface, photographs, used, weights, budget, 1.0, name="maps", seed=seed)
     with torch.no_grad():
         return replace(changed(surface, unknowns), environment=environment(unknowns, start)), photographs
 

@@ -12,8 +12,15 @@ from reli3d.render.shading import ShadeOptions, shade
 PAINT = "published"  # glTF's own formula: what viewers show, and what the shipped weights learned from
 
 
-def radiance(points: SurfacePoints, wo: Tensor, light: Environment, *, samples: tuple[int, int, int],
-             scene: RayScene | None, seed: int) -> Tensor:  # fmt: skip
+def radiance(
+    points: SurfacePoints,
+    wo: Tensor,
+    light: Environment,
+    *,
+    samples: tuple[int, int, int],
+    scene: RayScene | None,
+    seed: int,
+) -> Tensor:
     """Radiance ``(N, 3)`` that leaves ``points`` towards ``wo``: direct light with shadows, linear."""
     options = ShadeOptions(samples=samples, seed=seed, paint=PAINT)
     return shade(points, wo, light, scene=scene, options=options)

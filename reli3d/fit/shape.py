@@ -134,8 +134,9 @@ class ShapeData:
     colored: list[int]  # views whose colours may be used
 
     @classmethod
-    def of(cls, start: Start, level: Tensor, bound: Tensor, grid: Grid, photographs: Photographs,
-           colored: list[int]) -> ShapeData:  # fmt: skip
+    def of(
+        cls, start: Start, level: Tensor, bound: Tensor, grid: Grid, photographs: Photographs, colored: list[int]
+    ) -> ShapeData:
         """Photographs in the sizes that a fit asks for."""
         sizes = sorted({max(16, round(photographs.size * s)) for s in (DETAIL[0], sum(DETAIL) / 2, DETAIL[1])})
         used = photographs.select(colored)
@@ -144,8 +145,15 @@ class ShapeData:
         return cls(grid, bound, level.clone(), start, small, planes, colored)
 
 
-def shape_loss(unknowns: Unknowns, data: ShapeData, weights: losses.Weights, *, progress: float, seed: int,
-               independent: bool = True) -> Tensor:  # fmt: skip
+def shape_loss(
+    unknowns: Unknowns,
+    data: ShapeData,
+    weights: losses.Weights,
+    *,
+    progress: float,
+    seed: int,
+    independent: bool = True,
+) -> Tensor:
     """Loss of one step over the surface, with gradients to every part of ``unknowns`` but the detail.
 
     progress: in [0, 1], how far the fit is; seed: of the step's points, views and light samples.  independent: two
@@ -165,12 +173,14 @@ def shape_loss(unknowns: Unknowns, data: ShapeData, weights: losses.Weights, *, 
 
 
 def _outlines(unknowns: Unknowns, data: ShapeData, mesh: Mesh, scene: RayScene, rng) -> Tensor:
-    edges, total, small = mesh_edges(mesh.vertices, mesh.faces), 0.0, data.photographs
+    edges, small = mesh_edges(mesh.vertices, mesh.faces), data.photographs
+    total = small.color.new_zeros(())
     chosen = torch.randperm(len(small), generator=rng)[:OUTLINES].tolist()
     for view in chosen:
         camera = corrected(small.camera(view), unknowns.pose[view])
-        cover = (primary_hits(scene, Camera(camera.c2w.detach(), camera.intrinsics, small.size, small.size))[0].face
-                 >= 0).float()[..., None]  # fmt: skip
+        cover = (
+            primary_hits(scene, Camera(camera.c2w.detach(), camera.intrinsics, small.size, small.size))[0].face >= 0
+        ).float()[..., None]
         cover = antialias(cover, mesh.vertices, mesh.faces, camera, scene, edges=edges)[..., 0]
         total = total + losses.outline(cover, small.mask[view])
     return total / len(chosen)
@@ -178,15 +188,15 @@ def _outlines(unknowns: Unknowns, data: ShapeData, mesh: Mesh, scene: RayScene, 
 
 def _colors(unknowns, data, mesh, scene, weights, progress, rng, seed, independent) -> Tensor:
     planes = data.planes[min(int(progress * len(data.planes)), len(data.planes) - 1)]
-    size, some = planes.shape[-1], data.photographs.select(data.colored)
-    camera = Camera(some.c2w, some.intrinsics * (size / some.size), size, size)
+    size, photographs = planes.shape[-1], data.photographs.select(data.colored)
+    camera = Camera(photographs.c2w, photographs.intrinsics * (size / photographs.size), size, size)
     camera = corrected(camera, unknowns.pose[data.colored])
     pick = torch.randint(len(mesh.vertices), (POINTS,), generator=rng).to(mesh.vertices.device)
     position, normal = (v.index_select(0, pick) for v in (mesh.vertices, mesh.normals))
     color, cover = seen_colors(planes, position, camera)
     weight = sight(scene, position, normal, camera) * (cover.detach() > 0.9)
     exposure = unknowns.exposure[data.colored].exp()
-    loss = weights.agreement * losses.agreement(color, weight) if len(data.colored) > 1 else 0.0
+    loss = weights.agreement * losses.agreement(color, weight) if len(data.colored) > 1 else color.new_zeros(())
     if weights.shading == 0.0:
         return loss
     row = torch.nonzero(weight.sum(1) > 0.0)[:SHADED, 0]
@@ -223,14 +233,23 @@ def sight(scene: RayScene, position: Tensor, normal: Tensor, camera: Camera) -> 
     return seen * ((to_eye * normal[:, None]).sum(-1) / LEAST).clamp(0.0, 1.0)
 
 
-def fit_shape(unknowns: Unknowns, data: ShapeData, weights: losses.Weights, budget: Budget, until: float, *,
-              seed: int, cameras: bool) -> None:  # fmt: skip
+def fit_shape(
+    unknowns: Unknowns,
+    data: ShapeData,
+    weights: losses.Weights,
+    budget: Budget,
+    until: float,
+    *,
+    seed: int,
+    cameras: bool,
+) -> None:
     """Move ``unknowns.level``, and with it what else :func:`shape_loss` reaches, until ``until`` of the budget."""
     level = EvenAdam(unknowns.level)
     rates = {"material": 0.03, "light": 0.02, "exposure": 0.01, **({"pose": 2e-4} if cameras else {})}
-    groups = [{"params": unknowns.groups()[name], "lr": rate} for name, rate in rates.items()]
+    changed = {name: unknowns.groups()[name] for name in rates}
+    groups = [{"params": changed[name], "lr": rate} for name, rate in rates.items()]
     others = torch.optim.Adam(groups, betas=(0.9, 0.99))
-    wanted = [unknowns.level, *(p for g in groups for p in g["params"])]
+    wanted = [unknowns.level, *(value for values in changed.values() for value in values)]
     for step, progress in budget.part("shape", until):
         for value in wanted:
             value.requires_grad_(True)

@@ -8,6 +8,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from reli3d._bridge import present
 from reli3d.fit.unknowns import Unknowns, material_change, material_logits, material_of, unit
 from reli3d.geometry.bake import Texels, dilate, interpolate, interpolate_tangents, rasterize_texels
 from reli3d.geometry.hits import interpolate as at_hits
@@ -50,7 +51,7 @@ def dressed(mesh: Mesh, source: Asset, size: int) -> Asset:
     position, normal = interpolate(mesh, texels, index)
     face, bary = nearest_hits(source.mesh, position, normal)
     old = surface_points(source.mesh, source.textures, face, bary)
-    bump = old.normal - unit(at_hits(source.mesh.normals, source.mesh.faces, face, bary))
+    bump = old.normal - unit(at_hits(present("mesh.normals", source.mesh.normals), source.mesh.faces, face, bary))
     world = unit(normal + bump)
     return Asset(mesh, _textures(mesh, texels, index, old, world, normal), source.environment)
 
@@ -72,8 +73,9 @@ def changed(asset: Asset, unknowns: Unknowns) -> Asset:
     return replace(asset, textures=_textures(asset.mesh, texels, index, new, old.normal, normal))
 
 
-def _textures(mesh: Mesh, texels: Texels, index: Tensor, at: SurfacePoints, world: Tensor,
-              normal: Tensor) -> TextureSet:  # fmt: skip
+def _textures(
+    mesh: Mesh, texels: Texels, index: Tensor, at: SurfacePoints, world: Tensor, normal: Tensor
+) -> TextureSet:
     size = texels.face.shape[0]
     encoded = encode_normals(world, normal, interpolate_tangents(mesh, texels, index))
     maps = {}

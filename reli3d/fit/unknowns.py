@@ -7,6 +7,7 @@ metallic; logarithms of radiance), so zero is the start and every value is allow
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -65,8 +66,10 @@ class Unknowns:
 
     def clone(self) -> Unknowns:
         """A copy that shares nothing."""
-        copy = {n: [t.detach().clone() for t in v] if isinstance(v, list) else v.detach().clone()
-                for n, v in vars(self).items()}  # fmt: skip
+        copy: dict[str, Any] = {
+            name: [t.detach().clone() for t in value] if isinstance(value, list) else value.detach().clone()
+            for name, value in vars(self).items()
+        }
         return Unknowns(**copy)
 
 
@@ -82,10 +85,11 @@ class Start:
         """The start that an asset in the fit's box gives; its surface's material fills space around it."""
         found = rasterize_texels(asset.mesh, texels)
         valid = found.face.reshape(-1) >= 0
-        points = surface_points(asset.mesh, asset.textures, found.face.reshape(-1)[valid],
-                                found.bary.reshape(-1, 2)[valid])  # fmt: skip
+        points = surface_points(
+            asset.mesh, asset.textures, found.face.reshape(-1)[valid], found.bary.reshape(-1, 2)[valid]
+        )
         material = filled_grid(points.position, material_logits(points), START_GRID)
-        radiance = asset.environment.resized(LIGHT_ROWS).radiance
+        radiance = asset.light.resized(LIGHT_ROWS).radiance
         return cls(material, radiance.clamp(min=DARKEST * float(radiance.mean())).log())
 
 

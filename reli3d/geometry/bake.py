@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import overload
 
 import torch
 import warp as wp
@@ -107,8 +108,13 @@ def rasterize_texels(mesh: Mesh, size: int) -> Texels:
     lower, upper = torch.aminmax(ends, dim=1)
     segment_start, segment_list = _bins(lower - REACH, upper + REACH, size, tile)
     ints = [(t, wp.int32) for t in (face_start, face_list, segment_start, segment_list, segments)]
-    _bridge.launch(kernels.texels_kernel, (-(-size // tile)) ** 2, [(corners, wp.vec2), *ints, size, tile, REACH,
-                   (distance, wp.float32), (face, wp.int32), (bary, wp.vec2)], device, slice_min=TILES_MIN)  # fmt: skip
+    _bridge.launch(
+        kernels.texels_kernel,
+        (-(-size // tile)) ** 2,
+        [(corners, wp.vec2), *ints, size, tile, REACH, (distance, wp.float32), (face, wp.int32), (bary, wp.vec2)],
+        device,
+        slice_min=TILES_MIN,
+    )
     return Texels(face, bary, distance == 0.0)
 
 
@@ -120,9 +126,13 @@ def coverage(mesh: Mesh, size: int) -> Tensor:
         tile = TILE[corners.device.type]
         lower, upper = torch.aminmax(corners, dim=1)
         face_start, face_list = _bins(lower, upper, size, tile)
-        _bridge.launch(kernels.coverage_kernel, (-(-size // tile)) ** 2, [(corners, wp.vec2), (face_start, wp.int32),
-                       (face_list, wp.int32), size, tile, (hits, wp.uint8)], corners.device,
-                       slice_min=TILES_MIN)  # fmt: skip
+        _bridge.launch(
+            kernels.coverage_kernel,
+            (-(-size // tile)) ** 2,
+            [(corners, wp.vec2), (face_start, wp.int32), (face_list, wp.int32), size, tile, (hits, wp.uint8)],
+            corners.device,
+            slice_min=TILES_MIN,
+        )
     return hits
 
 
@@ -152,21 +162,48 @@ def interpolate_tangents(mesh: Mesh, texels: Texels, index: Tensor) -> Tensor:
     return tangent
 
 
+def interpolate_values(mesh: Mesh, values: Tensor, texels: Texels, index: Tensor) -> Tensor:
+    """Numbers of the vertices, ``values (V, C)``, at the texels with the flat indices ``index`` (N,) int64: ``(N, C)``.
+
+    No gradient.
+    """
+    _check_index(texels, index)
+    check("values", values, like=texels.bary)
+    if values.ndim != 2 or len(values) != len(mesh.vertices):
+        raise ValueError(f"values: expected ({len(mesh.vertices)}, C), got {tuple(values.shape)}")
+    out = torch.empty(len(index), values.shape[1], device=index.device)
+    _bridge.launch(kernels.values_kernel, len(index), [
+        (index, wp.int64), (texels.face.reshape(-1), wp.int32), (texels.bary.reshape(-1, 2), wp.vec2),
+        (mesh.faces.contiguous(), wp.int32), (values.detach().contiguous(), wp.float32),
+        (out, wp.float32)], index.device)  # fmt: skip
+    return out
+
+
 def _check_index(texels: Texels, index: Tensor) -> None:
     check("index", index, dtype=torch.int64, like=texels.bary)
     if index.ndim != 1 or (len(index) and not bool((texels.face.reshape(-1)[index] >= 0).all())):
         raise ValueError("index: expected a list of valid texels, got others")
 
 
-def bake(mesh: Mesh, size: int, fn: Callable[..., Tensor | Mapping[str, Tensor]], *, chunk: int = 1 << 18,
-         texels: Texels | None = None, tangents: bool = False, fill: bool = True) -> dict[str, Tensor]:  # fmt: skip
+def bake(
+    mesh: Mesh,
+    size: int,
+    fn: Callable[..., Tensor | Mapping[str, Tensor]],
+    *,
+    chunk: int = 1 << 18,
+    texels: Texels | None = None,
+    tangents: bool = False,
+    values: Tensor | None = None,
+    fill: bool = True,
+) -> dict[str, Tensor]:
     """Maps ``{name: (size, size, C)}`` of ``fn(position (N, 3), normal (N, 3))`` over the surface.
 
     fn: returns ``{name: (N, C)}``, or one tensor (named "value"), float32.  It is called at the valid texels, at most
     ``chunk`` at a time, without gradient.  If it works point by point, the result does not depend on ``chunk``.
     texels: of :func:`rasterize_texels`, to use them again.  tangents: ``fn`` takes the tangents ``(N, 4)`` as third
-    argument.  fill: every other texel takes the value of the nearest valid one (:func:`dilate`); otherwise it is 0.
-    Raises ValueError if the surface covers no texel, or ``fn`` changes its outputs from chunk to chunk.
+    argument.  values: numbers of the vertices, ``(V, C)``, which ``fn`` takes, interpolated, as last argument.  fill:
+    every other texel takes the value of the nearest valid one (:func:`dilate`); otherwise it is 0.  Raises ValueError
+    if the surface covers no texel, or ``fn`` changes its outputs from chunk to chunk.
     """
     if chunk < 1:
         raise ValueError(f"chunk: expected at least 1, got {chunk}")
@@ -180,11 +217,13 @@ def bake(mesh: Mesh, size: int, fn: Callable[..., Tensor | Mapping[str, Tensor]]
     maps: dict[str, Tensor] = {}
     with torch.no_grad():
         for part in index.split(chunk):
-            arguments = interpolate(mesh, texels, part)
+            arguments: tuple[Tensor, ...] = interpolate(mesh, texels, part)
             if tangents:
                 arguments = (*arguments, interpolate_tangents(mesh, texels, part))
-            values = fn(*arguments)
-            for name, value in ({"value": values} if isinstance(values, Tensor) else values).items():
+            if values is not None:
+                arguments = (*arguments, interpolate_values(mesh, values, texels, part))
+            found = fn(*arguments)
+            for name, value in ({"value": found} if isinstance(found, Tensor) else found).items():
                 check(f"fn()[{name!r}]", value, like=texels.bary)
                 if value.ndim != 2 or len(value) != len(part):
                     raise ValueError(f"fn()[{name!r}]: expected shape ({len(part)}, C), got {tuple(value.shape)}")
@@ -211,16 +250,30 @@ def nearest_valid(valid: Tensor) -> tuple[Tensor, Tensor]:
     if valid.numel() == 0:
         return source, square
     strips = -(-w // STRIP)
-    _bridge.launch(kernels.nearest_row_kernel, strips, [
-        (valid.contiguous().view(torch.uint8), wp.uint8), STRIP, (row, wp.int32)], device, slice_min=1)  # fmt: skip
-    _bridge.launch(kernels.nearest_texel_kernel, h, [
-        (row, wp.int32), (site, wp.int32), (border, wp.float32), (source, wp.int32), (square, wp.float32)],
-        device, slice_min=ROWS_MIN)  # fmt: skip
+    _bridge.launch(
+        kernels.nearest_row_kernel,
+        strips,
+        [(valid.contiguous().view(torch.uint8), wp.uint8), STRIP, (row, wp.int32)],
+        device,
+        slice_min=1,
+    )
+    _bridge.launch(
+        kernels.nearest_texel_kernel,
+        h,
+        [(row, wp.int32), (site, wp.int32), (border, wp.float32), (source, wp.int32), (square, wp.float32)],
+        device,
+        slice_min=ROWS_MIN,
+    )
     return source, square
 
 
-def dilate(maps: Mapping[str, Tensor] | Tensor, valid: Tensor, *,
-           iterations: int | None = None) -> dict[str, Tensor] | Tensor:  # fmt: skip
+@overload
+def dilate(maps: Tensor, valid: Tensor, *, iterations: int | None = None) -> Tensor: ...
+@overload
+def dilate(maps: Mapping[str, Tensor], valid: Tensor, *, iterations: int | None = None) -> dict[str, Tensor]: ...
+def dilate(
+    maps: Mapping[str, Tensor] | Tensor, valid: Tensor, *, iterations: int | None = None
+) -> dict[str, Tensor] | Tensor:
     """Maps in which every texel that is not ``valid`` takes the value of the nearest valid one.
 
     maps: ``(H, W, C)`` float32, or a dictionary of them; they are not changed.  valid: ``(H, W)`` bool.  iterations:
@@ -239,8 +292,12 @@ def dilate(maps: Mapping[str, Tensor] | Tensor, valid: Tensor, *,
         result = value.detach().clone(memory_format=torch.contiguous_format)
         nearest = (source.reshape(-1), wp.int32), (square.reshape(-1), wp.float32)
         channels = value.shape[2]
-        _bridge.launch(kernels.fill_kernel, valid.numel(), [
-            *nearest, limit, channels, (result.view(-1, channels), wp.float32)], value.device)  # fmt: skip
+        _bridge.launch(
+            kernels.fill_kernel,
+            valid.numel(),
+            [*nearest, limit, channels, (result.view(-1, channels), wp.float32)],
+            value.device,
+        )
         return result
 
     if isinstance(maps, Tensor):

@@ -65,8 +65,9 @@ def face_neighbours(faces: np.ndarray) -> np.ndarray:
 def components(neighbours: np.ndarray, labels: np.ndarray) -> tuple[np.ndarray, int]:
     """Connected faces of equal label, ``(F,)`` int32 numbered by their first face, and their number."""
     parent = torch.empty(len(labels), dtype=torch.int32)
-    _bridge.launch(kernels.components_serial_kernel, 1, [
-        _ints(neighbours), _ints(labels), len(labels), (parent, wp.int32)], CPU)  # fmt: skip
+    _bridge.launch(
+        kernels.components_serial_kernel, 1, [_ints(neighbours), _ints(labels), len(labels), (parent, wp.int32)], CPU
+    )
     root = parent.numpy()
     number = np.cumsum(root == np.arange(len(root)), dtype=np.int32) - 1
     return number[root], int(number[-1]) + 1
@@ -98,13 +99,22 @@ def axis_labels(normal: torch.Tensor, neighbours: np.ndarray) -> np.ndarray:
         rough, smoothed = smoothed, torch.empty_like(normal)
         _bridge.launch(kernels.smooth_kernel, n, [links, (rough, wp.vec3), (smoothed, wp.vec3)], CPU, slice_min=LIGHT)
     label = torch.empty(n, dtype=torch.int32)
-    _bridge.launch(kernels.labels_kernel, n, [
-        (normal, wp.vec3), (smoothed, wp.vec3), COS_LABEL, (label, wp.int32)], CPU, slice_min=LIGHT)  # fmt: skip
+    _bridge.launch(
+        kernels.labels_kernel,
+        n,
+        [(normal, wp.vec3), (smoothed, wp.vec3), COS_LABEL, (label, wp.int32)],
+        CPU,
+        slice_min=LIGHT,
+    )
     for _ in range(MAJORITY):
         voted = torch.empty_like(label)
-        _bridge.launch(kernels.majority_kernel, n, [
-            links, (normal, wp.vec3), (label, wp.int32), COS_LABEL, (voted, wp.int32)], CPU,
-            slice_min=LIGHT)  # fmt: skip
+        _bridge.launch(
+            kernels.majority_kernel,
+            n,
+            [links, (normal, wp.vec3), (label, wp.int32), COS_LABEL, (voted, wp.int32)],
+            CPU,
+            slice_min=LIGHT,
+        )
         label = voted
     return label.numpy()
 
@@ -142,9 +152,13 @@ def _frames(normal: torch.Tensor, label: np.ndarray, chart: np.ndarray, count: i
     length = np.linalg.norm(total, axis=1, keepdims=True)
     toward = total / np.maximum(length, 1e-300)
     oblique = torch.zeros(count, dtype=torch.uint8)
-    _bridge.launch(kernels.oblique_kernel, len(chart), [
-        (normal, wp.vec3), _ints(chart), _floats(toward, wp.vec3), COS_TILT, (oblique, wp.uint8)], CPU,
-        slice_min=LIGHT)  # fmt: skip
+    _bridge.launch(
+        kernels.oblique_kernel,
+        len(chart),
+        [(normal, wp.vec3), _ints(chart), _floats(toward, wp.vec3), COS_TILT, (oblique, wp.uint8)],
+        CPU,
+        slice_min=LIGHT,
+    )
     axis = np.zeros((count, 3))
     axis[chart] = AXES[label]  # one label in a chart
     toward = np.where((oblique.numpy()[:, None] > 0) | (length < 1e-20), axis, toward)
@@ -181,8 +195,16 @@ def _upright(right: np.ndarray, up: np.ndarray, points: np.ndarray, chart: np.nd
     return right * cos - up * sin, right * sin + up * cos, low
 
 
-def _cut_bulky(points: np.ndarray, chart: np.ndarray, right: np.ndarray, up: np.ndarray, area: np.ndarray, waste: float,
-               longest: float, neighbours: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:  # fmt: skip
+def _cut_bulky(
+    points: np.ndarray,
+    chart: np.ndarray,
+    right: np.ndarray,
+    up: np.ndarray,
+    area: np.ndarray,
+    waste: float,
+    longest: float,
+    neighbours: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray] | None:
     """Charts whose boxes are mostly empty, cut in two where that saves room: ``(chart, parent of each chart)`` or None.
 
     points: ``(F, 3)`` centres of the faces.  area: of each chart.  waste: empty area [texels] that is worth a cut.
@@ -223,8 +245,9 @@ def _cut_bulky(points: np.ndarray, chart: np.ndarray, right: np.ndarray, up: np.
             total = np.bincount(side[rows[begin]] // 2, boxes(extents(begin, [w[rows] for w in along])), count)
             total = np.where(axis < 0, total, np.where(axis == k, 0.0, np.inf))
             better = total < best * (1 - 1e-6)
-            best, best_angle, best_at = (np.where(better, new, old) for new, old in
-                                         ((total, best), (k, best_angle), (at, best_at)))  # fmt: skip
+            best, best_angle, best_at = (
+                np.where(better, new, old) for new, old in ((total, best), (k, best_angle), (at, best_at))
+            )
     cut = np.flatnonzero(bulky)[best_angle >= 0]
     if not len(cut):
         return None
@@ -247,7 +270,7 @@ def _overlaps(charts: Charts, boxes: np.ndarray, query: np.ndarray):
     lower = torch.from_numpy(np.column_stack([np.minimum(np.minimum(a, b), c), z]))
     upper = torch.from_numpy(np.column_stack([np.maximum(np.maximum(a, b), c), z]))
     _bridge.initialise()
-    bvh = wp.Bvh(wp.from_torch(lower, wp.vec3), wp.from_torch(upper, wp.vec3))
+    bvh = wp.Bvh(_bridge.array_of(lower, wp.vec3), _bridge.array_of(upper, wp.vec3))
     count = torch.zeros(len(query), dtype=torch.int32)
     none = torch.zeros(1, dtype=torch.int64), torch.zeros(1, dtype=torch.int32)
     ins = _ints(boxes), _ints(query), (corners, wp.vec2)
@@ -307,8 +330,9 @@ def split_overlaps(charts: Charts) -> bool:
     return True
 
 
-def make_charts(points: np.ndarray, faces: np.ndarray, *, texels: float, least_texels: float, longest: float,
-                sliver: float) -> Charts:  # fmt: skip
+def make_charts(
+    points: np.ndarray, faces: np.ndarray, *, texels: float, least_texels: float, longest: float, sliver: float
+) -> Charts:
     """Charts of a welded mesh.
 
     points: ``(V, 3)`` float32.  faces: ``(F, 3)`` int32.  texels: area to fill [texels]; it sets the unit of
@@ -319,8 +343,13 @@ def make_charts(points: np.ndarray, faces: np.ndarray, *, texels: float, least_t
     reach = np.abs(points - centre).max() or 1.0
     local = ((points - centre) / reach).astype(np.float32)  # at most 1: products cannot overflow
     normal = torch.empty(len(faces), 3)
-    _bridge.launch(kernels.normals_kernel, len(faces), [_floats(local, wp.vec3), _ints(faces), (normal, wp.vec3)], CPU,
-                   slice_min=LIGHT)  # fmt: skip
+    _bridge.launch(
+        kernels.normals_kernel,
+        len(faces),
+        [_floats(local, wp.vec3), _ints(faces), (normal, wp.vec3)],
+        CPU,
+        slice_min=LIGHT,
+    )
     size = 0.5 * np.sqrt(np.einsum("fk,fk->f", normal.numpy(), normal.numpy(), dtype=np.float64))
     area = float(size.sum())
     unit = np.sqrt(texels / area) if area > 1e-30 else 0.0
@@ -332,8 +361,9 @@ def make_charts(points: np.ndarray, faces: np.ndarray, *, texels: float, least_t
     right, up = _frames(normal, label, chart, count)
     centres = local[faces].mean(1).astype(np.float64)
     for _ in range(CUTTING):
-        cut = _cut_bulky(centres, chart, right, up, np.bincount(chart, size, count), CUT_WASTE * texels, longest,
-                         neighbours)  # fmt: skip
+        cut = _cut_bulky(
+            centres, chart, right, up, np.bincount(chart, size, count), CUT_WASTE * texels, longest, neighbours
+        )
         if cut is None:
             break
         chart, parent = cut

@@ -15,8 +15,9 @@ DEPTH = 0.05  # level below the surface that a ray reaches: enough to make one; 
 REACH = 3.0  # rays whose least level is this high meet nothing: masks disagree, or a rod is thinner than a cell
 
 
-def cover_silhouettes(level: Tensor, bound: Tensor, distance: Tensor, c2w: Tensor, intrinsics: Tensor, *,
-                      radius: float) -> Tensor:  # fmt: skip
+def cover_silhouettes(
+    level: Tensor, bound: Tensor, distance: Tensor, c2w: Tensor, intrinsics: Tensor, *, radius: float
+) -> Tensor:
     """``level (X, Y, Z)``, lowered so that every ray inside the views' silhouettes meets the surface; no gradient.
 
     level: negative inside, on a grid over [-radius, radius]^3, in logits of occupancy or in distances over the
@@ -30,8 +31,12 @@ def cover_silhouettes(level: Tensor, bound: Tensor, distance: Tensor, c2w: Tenso
     check("level", level)
     if level.ndim != 3 or min(level.shape) < 2:
         raise ValueError(f"level: expected shape (X, Y, Z) of at least 2 points a side, got {tuple(level.shape)}")
-    for name, value, last in (("bound", bound, None), ("distance", distance, None), ("c2w", c2w, 4),
-                              ("intrinsics", intrinsics, 4)):  # fmt: skip
+    for name, value, last in (
+        ("bound", bound, None),
+        ("distance", distance, None),
+        ("c2w", c2w, 4),
+        ("intrinsics", intrinsics, 4),
+    ):
         check(name, value, last=last, like=level)
     if bound.shape != level.shape:
         raise ValueError(f"bound: expected shape {tuple(level.shape)}, got {tuple(bound.shape)}")
@@ -51,9 +56,12 @@ def cover_silhouettes(level: Tensor, bound: Tensor, distance: Tensor, c2w: Tenso
     )
     lacking = level.new_empty(views, height // STRIDE, width // STRIDE)
     cameras = [(c2w, wp.mat44), (intrinsics, wp.vec4)]
-    launch(kernels.lacking_kernel, lacking.numel(), [
-        (level, wp.float32), (distance, wp.float32), *cameras, radius, DEPTH, REACH, STRIDE, (lacking, wp.float32)],
-        level.device)  # fmt: skip
+    launch(
+        kernels.lacking_kernel,
+        lacking.numel(),
+        [(level, wp.float32), (distance, wp.float32), *cameras, radius, DEPTH, REACH, STRIDE, (lacking, wp.float32)],
+        level.device,
+    )
     lacking = max_pool2d(lacking, 3, 1, 1)  # as far as the silhouette's edge, between two rays
     lowered = torch.empty_like(level)
     launch(kernels.lower_kernel, level.numel(), [

@@ -62,7 +62,7 @@ def query(name: str) -> int:
 
     A processor without vectors of 16 floats takes the packet too: Embree then traces its rays one by one.
     """
-    return ctypes.cast(getattr(_embree()[0], name), POINTER).value
+    return ctypes.cast(getattr(_embree()[0], name), POINTER).value or 0
 
 
 class Tree:

@@ -13,8 +13,11 @@ from reli3d._bridge import call, check
 from reli3d.geometry.rays import Hits
 from reli3d.kernels import attributes as kernels
 
-_INTERPOLATE = {2: (kernels.interpolate2_kernel, wp.vec2), 3: (kernels.interpolate3_kernel, wp.vec3),
-                4: (kernels.interpolate4_kernel, wp.vec4)}  # fmt: skip
+_INTERPOLATE = {
+    2: (kernels.interpolate2_kernel, wp.vec2),
+    3: (kernels.interpolate3_kernel, wp.vec3),
+    4: (kernels.interpolate4_kernel, wp.vec4),
+}
 
 
 def interpolate(values: Tensor, faces: Tensor, face: Tensor, bary: Tensor) -> Tensor:
@@ -64,8 +67,15 @@ def evaluate_hits(vertices: Tensor, faces: Tensor, hits: Hits, origins: Tensor, 
     shape = hits.face.shape
     o, d = (v.expand(*shape, 3).reshape(-1, 3) for v in (origins, directions))
     n = o.shape[0]
-    ins = [(vertices, wp.vec3), (faces, wp.int32), (hits.face.reshape(-1), wp.int32), (o, wp.vec3), (d, wp.vec3),
-           (hits.t.detach().reshape(-1), wp.float32), (hits.bary.detach().reshape(-1, 2), wp.vec2)]  # fmt: skip
+    ins = [
+        (vertices, wp.vec3),
+        (faces, wp.int32),
+        (hits.face.reshape(-1), wp.int32),
+        (o, wp.vec3),
+        (d, wp.vec3),
+        (hits.t.detach().reshape(-1), wp.float32),
+        (hits.bary.detach().reshape(-1, 2), wp.vec2),
+    ]
     outs = [((n,), wp.float32), ((n,), wp.vec2)]
     t, bary = call(kernels.reevaluate_kernel, n, ins, outs, device=vertices.device, shared=(0,))
     return Hits(hits.face, t.reshape(shape), bary.reshape(*shape, 2))

@@ -87,8 +87,9 @@ def holes(mesh: Mesh) -> list[Hole]:
         following = np.roll(at, -1, axis=0)
         area = 0.5 * np.linalg.norm(np.cross(at - at.mean(0), following - at.mean(0)).sum(0))
         vertices = torch.from_numpy(first[tail[loop]]).to(mesh.faces.device)
-        found.append(Hole(vertices, float(np.linalg.norm(following - at, axis=1).sum()), float(area),
-                          bool(single[loop].all())))  # fmt: skip
+        found.append(
+            Hole(vertices, float(np.linalg.norm(following - at, axis=1).sum()), float(area), bool(single[loop].all()))
+        )
     return sorted(found, key=lambda hole: -hole.length)
 
 
@@ -106,7 +107,8 @@ def fill_holes(mesh: Mesh, *, max_edges: int | None = None) -> Mesh:
     faces = faces[sound]
     vertices = mesh.vertices[first]
     loops, single = open_loops(faces)
-    tail, new_faces, centres = faces.reshape(-1), [faces], []
+    tail, new_faces = faces.reshape(-1), [faces]
+    centres: list[Tensor] = []
     for loop in loops:
         if not single[loop].all() or not 3 <= len(loop) <= (max_edges or len(loop)):
             continue

@@ -43,8 +43,12 @@ def _nearest_crossing(masks: Tensor) -> list:
     rows, begin = torch.empty_like(masks), torch.empty_like(masks)
     apex, nearest = (torch.empty_like(masks, dtype=torch.int32) for _ in range(2))
     launch(kernels.column_kernel, views * width, [(masks, wp.float32), (rows, wp.float32)], masks.device)
-    launch(kernels.row_kernel, views * height, [
-        (rows, wp.float32), (apex, wp.int32), (begin, wp.float32), (nearest, wp.int32)], masks.device)  # fmt: skip
+    launch(
+        kernels.row_kernel,
+        views * height,
+        [(rows, wp.float32), (apex, wp.int32), (begin, wp.float32), (nearest, wp.int32)],
+        masks.device,
+    )
     return [(rows, wp.float32), (nearest, wp.int32)]
 
 
@@ -58,11 +62,46 @@ def hull_distance(points: Tensor, distance: Tensor, c2w: Tensor, intrinsics: Ten
     plane gets -1000.  Without views every point gets +1000.  No gradient.
     """
     check("points", points, last=3)
+    if points.ndim != 2:
+        raise ValueError(f"points: expected shape (N, 3), got {tuple(points.shape)}")
+    _check_views(points, distance, c2w, intrinsics)
+    hull = torch.empty(len(points), device=points.device)
+    inputs = [v.detach().contiguous() for v in (points, distance, c2w, intrinsics)]
+    types = (wp.vec3, wp.float32, wp.mat44, wp.vec4)
+    launch(kernels.hull_distance_kernel, len(points), [*zip(inputs, types), (hull, wp.float32)], points.device)
+    return hull
+
+
+def hull_span(
+    origins: Tensor, directions: Tensor, radius: float, distance: Tensor, c2w: Tensor, intrinsics: Tensor
+) -> Tensor:
+    """Where rays enter the visual hull first and leave it last, ``(N, 2)``, in lengths of their ``directions``.
+
+    origins, directions: ``(N, 3)``, no direction zero.  radius: of the sphere around the world's origin in which the
+    hull is looked for.  The other arguments are those of :func:`hull_distance`.  A ray that misses the hull gets,
+    twice, the place where it comes closest to it.  Parts thinner than 0.004 along the ray may be missed.  Sphere
+    tracing, Hart 1996.  No gradient.
+    """
+    check("origins", origins, last=3)
+    check("directions", directions, last=3, like=origins)
+    if origins.ndim != 2 or origins.shape != directions.shape:
+        shapes = f"{tuple(origins.shape)} and {tuple(directions.shape)}"
+        raise ValueError(f"origins, directions: expected (N, 3) both, got {shapes}")
+    if not 0.0 < radius < 100.0:
+        raise ValueError(f"radius: expected between 0 and 100, got {radius}")
+    _check_views(origins, distance, c2w, intrinsics)
+    span = torch.empty(len(origins), 2, device=origins.device)
+    views = [v.detach().contiguous() for v in (distance, c2w, intrinsics)]
+    rays = [(v.detach().contiguous(), wp.vec3) for v in (origins, directions)]
+    inputs = [*rays, float(radius), *zip(views, (wp.float32, wp.mat44, wp.vec4)), (span, wp.vec2)]
+    launch(kernels.hull_span_kernel, len(origins), inputs, origins.device)
+    return span
+
+
+def _check_views(points: Tensor, distance: Tensor, c2w: Tensor, intrinsics: Tensor) -> None:
     check("distance", distance, like=points)
     check("c2w", c2w, last=4, like=points)
     check("intrinsics", intrinsics, last=4, like=points)
-    if points.ndim != 2:
-        raise ValueError(f"points: expected shape (N, 3), got {tuple(points.shape)}")
     if distance.ndim != 3 or min(distance.shape[1:]) < 2:
         raise ValueError(f"distance: expected shape (V, H, W) with H and W above 1, got {tuple(distance.shape)}")
     views = distance.shape[0]
@@ -70,8 +109,3 @@ def hull_distance(points: Tensor, distance: Tensor, c2w: Tensor, intrinsics: Ten
         raise ValueError(f"c2w: expected shape {(views, 4, 4)}, got {tuple(c2w.shape)}")
     if intrinsics.shape != (views, 4):
         raise ValueError(f"intrinsics: expected shape {(views, 4)}, got {tuple(intrinsics.shape)}")
-    hull = torch.empty(len(points), device=points.device)
-    inputs = [v.detach().contiguous() for v in (points, distance, c2w, intrinsics)]
-    types = (wp.vec3, wp.float32, wp.mat44, wp.vec4)
-    launch(kernels.hull_distance_kernel, len(points), [*zip(inputs, types), (hull, wp.float32)], points.device)
-    return hull

@@ -6,6 +6,7 @@ vertices at bit-identical positions are one: atlases and exporters split vertice
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -47,13 +48,15 @@ class Mesh:
 
     def to(self, device: torch.device | str) -> Mesh:
         """The same mesh on another device."""
-        moved = {f.name: getattr(self, f.name) for f in fields(self)}
-        return Mesh(**{name: None if value is None else value.to(device) for name, value in moved.items()})
+        return self._changed(lambda value: value.to(device))
 
     def detach(self) -> Mesh:
         """The same mesh without gradients."""
-        moved = {f.name: getattr(self, f.name) for f in fields(self)}
-        return Mesh(**{name: None if value is None else value.detach() for name, value in moved.items()})
+        return self._changed(lambda value: value.detach())
+
+    def _changed(self, change: Callable[[Tensor], Tensor]) -> Mesh:
+        rest = (None if value is None else change(value) for value in (self.normals, self.uv, self.tangents))
+        return Mesh(change(self.vertices), change(self.faces), *rest)
 
     def with_normals(self) -> Mesh:
         """The same mesh with :func:`vertex_normals`."""
@@ -197,9 +200,8 @@ def select_faces(mesh: Mesh, keep: Tensor) -> Mesh:
     used = torch.zeros(len(mesh.vertices), dtype=torch.bool, device=faces.device)
     used[faces.reshape(-1).long()] = True
     new_index = torch.cumsum(used, 0, dtype=torch.int32) - 1
-    values = {f.name: getattr(mesh, f.name) for f in fields(mesh) if f.name != "faces"}
-    kept = {name: None if value is None else value[used] for name, value in values.items()}
-    return Mesh(faces=new_index[faces.long()].reshape(-1, 3), **kept)
+    rest = (None if value is None else value[used] for value in (mesh.normals, mesh.uv, mesh.tangents))
+    return Mesh(mesh.vertices[used], new_index[faces.long()].reshape(-1, 3), *rest)
 
 
 def largest_components(mesh: Mesh, min_fraction: float = 0.02) -> Mesh:
@@ -293,8 +295,14 @@ def to_trimesh(mesh: Mesh):
         visual = trimesh.visual.TextureVisuals(uv=np.stack([uv[:, 0], 1.0 - uv[:, 1]], -1))
     attributes = {} if mesh.tangents is None else {"tangents": array(mesh.tangents)}
     normals = array(mesh.normals) if len(mesh.vertices) else None  # trimesh takes no normals of no vertices
-    return trimesh.Trimesh(array(mesh.vertices), array(mesh.faces).astype(np.int64), vertex_normals=normals,
-                           visual=visual, vertex_attributes=attributes, process=False)  # fmt: skip
+    return trimesh.Trimesh(
+        array(mesh.vertices),
+        array(mesh.faces).astype(np.int64),
+        vertex_normals=normals,
+        visual=visual,
+        vertex_attributes=attributes,
+        process=False,
+    )
 
 
 def from_trimesh(source, *, device: torch.device | str = "cpu") -> Mesh:
@@ -312,5 +320,10 @@ def from_trimesh(source, *, device: torch.device | str = "cpu") -> Mesh:
         uv = tensor(np.stack([uv[:, 0], 1.0 - uv[:, 1]], -1))
     normals = tensor(source.vertex_normals) if "vertex_normals" in source._cache.cache else None
     tangents = source.vertex_attributes.get("tangents")
-    return Mesh(tensor(source.vertices), tensor(source.faces, torch.int32), normals, uv,
-                None if tangents is None else tensor(tangents))  # fmt: skip
+    return Mesh(
+        tensor(source.vertices),
+        tensor(source.faces, torch.int32),
+        normals,
+        uv,
+        None if tangents is None else tensor(tangents),
+    )

@@ -5,9 +5,9 @@ from __future__ import annotations
 import warp as wp
 from torch import Tensor
 
-from reli3d._bridge import call, check, launch
+from reli3d._bridge import call, check, launch, struct_of
 from reli3d.kernels.projection import gather_views_kernel
-from reli3d.kernels.view_features import fuse_views_kernel, pool_views_kernel, vec8, view_summary_kernel
+from reli3d.kernels.view_features import Viewed, fuse_views_kernel, pool_views_kernel, vec8, view_summary_kernel
 
 BLOCK = 8  # floats of a kernels.vec8
 OWN = 9  # numbers that a view says of a point, and as many that sum up all views
@@ -21,8 +21,10 @@ def gather_views(maps: Tensor, points: Tensor, c2w: Tensor, intrinsics: Tensor) 
     reach ``maps`` and ``points``; the pixels carry the gradient of the points too.  Raises TypeError unless float32,
     ValueError on wrong shapes or mixed devices.
     """
-    check("maps", maps), check("points", points, last=3, like=maps)
-    check("c2w", c2w, last=4, like=maps), check("intrinsics", intrinsics, last=4, like=maps)
+    check("maps", maps)
+    check("points", points, last=3, like=maps)
+    check("c2w", c2w, last=4, like=maps)
+    check("intrinsics", intrinsics, last=4, like=maps)
     if maps.ndim != 4 or maps.shape[1] < 2 or maps.shape[2] < 2:
         raise ValueError(f"maps: expected (V, H, W, C) of at least 2 by 2 pixels, got {tuple(maps.shape)}")
     views, n = maps.shape[0], len(points)
@@ -48,17 +50,23 @@ def summarize_views(
     hidden.  normal: ``(N, 3)`` unit.  Both are None for points in space.  :mod:`reli3d.kernels.view_features` lists the
     numbers.  No gradient.  Raises TypeError unless float32, ValueError on wrong shapes or mixed devices.
     """
-    n, out, inputs = _summary(images, c2w, intrinsics, points, visible, normal)
+    n, out, viewed = _summary(images, c2w, intrinsics, points, visible, normal)
     own, weight = points.new_empty(n, len(images), OWN), points.new_empty(n, len(images))
     outs = [(own, wp.float32), (weight, wp.float32), (out, wp.float32)]
-    launch(view_summary_kernel, n, [*inputs, *outs], points.device)
+    launch(view_summary_kernel, n, [viewed, *outs], points.device)
     return own, weight, out
 
 
 def pool_views(
-    images: Tensor, tokens: Tensor, own: Tensor, c2w: Tensor, intrinsics: Tensor, points: Tensor,
-    visible: Tensor | None, normal: Tensor | None
-) -> tuple[Tensor, Tensor]:  # fmt: skip
+    images: Tensor,
+    tokens: Tensor,
+    own: Tensor,
+    c2w: Tensor,
+    intrinsics: Tensor,
+    points: Tensor,
+    visible: Tensor | None,
+    normal: Tensor | None,
+) -> tuple[Tensor, Tensor]:
     """A hidden layer at ``points (N, 3)``: the weighted mean over the views, ``(N, H)``, and the summary ``(N, 9)`` of
     :func:`summarize_views`.
 
@@ -67,18 +75,21 @@ def pool_views(
     arguments are those of :func:`summarize_views`.  No gradient: with :func:`gather_views` and torch the same has one
     and takes five times as long.
     """
-    n, out, inputs = _summary(images, c2w, intrinsics, points, visible, normal)
-    check("tokens", tokens, like=images), check("own", own, like=images)
+    n, out, viewed = _summary(images, c2w, intrinsics, points, visible, normal)
+    check("tokens", tokens, like=images)
+    check("own", own, like=images)
     hidden = tokens.shape[-1]
     if tokens.ndim != 4 or tokens.shape[0] != len(images) or min(tokens.shape[1:3]) < 2 or hidden % BLOCK:
-        raise ValueError(f"tokens: expected ({len(images)}, P, P, H), P at least 2 and H a multiple of {BLOCK}, "
-                         f"got {tuple(tokens.shape)}")  # fmt: skip
+        raise ValueError(
+            f"tokens: expected ({len(images)}, P, P, H), P at least 2 and H a multiple of {BLOCK}, "
+            f"got {tuple(tokens.shape)}"
+        )
     if tuple(own.shape) != (OWN, hidden):
         raise ValueError(f"own: expected shape {(OWN, hidden)}, got {tuple(own.shape)}")
     pooled = points.new_empty(n, hidden)
     layer = [(t.detach().contiguous().unflatten(-1, (-1, BLOCK)), vec8) for t in (tokens, own)]
     outs = [(pooled.unflatten(-1, (-1, BLOCK)), vec8), (out, wp.float32)]
-    launch(pool_views_kernel, n, [inputs[0], *layer, *inputs[1:], *outs], points.device)
+    launch(pool_views_kernel, n, [viewed, *layer, *outs], points.device)
     return pooled, out
 
 
@@ -98,32 +109,39 @@ def fuse_views(
     check("pixels", pixels, last=4, like=images)
     if pixels.ndim != 5 or pixels.shape[:2] != (3, len(images)) or min(pixels.shape[2:4]) < 2:
         raise ValueError(f"pixels: expected (3, {len(images)}, P, P, 4), P at least 2, got {tuple(pixels.shape)}")
-    n, _, inputs = _summary(images, c2w, intrinsics, points, visible, normal)
-    image, pose, camera, place, _, around, who = inputs
+    n, _, viewed = _summary(images, c2w, intrinsics, points, visible, normal)
     maps = [(part, wp.vec4) for part in pixels.detach().contiguous()]
     logit, numbers, shading = points.new_empty(n, 3), points.new_empty(n, 10), points.new_empty(n, 3)
     outs = [(logit, wp.vec3), (numbers, wp.float32), (shading, wp.vec3)]
-    launch(fuse_views_kernel, n, [image, *maps, pose, camera, place, around, who, *outs], points.device)
+    launch(fuse_views_kernel, n, [viewed, *maps, *outs], points.device)
     return logit, numbers, shading
 
 
-def _summary(images, c2w, intrinsics, points, visible, normal) -> tuple[int, Tensor, list]:
-    """Number of points, the empty summary and the kernels' common arguments, checked."""
+def _summary(images, c2w, intrinsics, points, visible, normal) -> tuple[int, Tensor, Viewed]:
+    """Number of points, the empty summary and what the kernels have in common, checked."""
     views, n = len(images), len(points)
-    check("images", images, last=4), check("points", points, last=3, like=images)
+    check("images", images, last=4)
+    check("points", points, last=3, like=images)
     if images.ndim != 4 or images.shape[1] != images.shape[2] or images.shape[1] < 2:
         raise ValueError(f"images: expected (V, S, S, 4) with S of at least 2, got {tuple(images.shape)}")
     if (visible is None) != (normal is None):
         raise ValueError("visible, normal: expected both or none, got one")
     if visible is None:
-        visible, normal, surface = points.new_empty(0, views), points.new_empty(0, 3), 0
+        visible, normal = points.new_empty(0, views), points.new_empty(0, 3)
     else:
-        check("visible", visible, last=views, like=points), check("normal", normal, last=3, like=points)
-        surface = 1
+        check("visible", visible, last=views, like=points)
+        check("normal", normal, last=3, like=points)
         if len(visible) != n or len(normal) != n:
             raise ValueError(f"visible, normal: expected {n} rows, got {len(visible)} and {len(normal)}")
     inputs = (images, c2w, intrinsics, points, normal, visible)
     images, c2w, intrinsics, points, normal, visible = (t.detach().contiguous() for t in inputs)
-    return n, points.new_empty(n, OWN), [
-        (images, wp.vec4), (c2w, wp.mat44), (intrinsics, wp.vec4), (points, wp.vec3), surface, (normal, wp.vec3),
-        (visible, wp.float32)]  # fmt: skip
+    viewed = struct_of(
+        Viewed,
+        image=(images, wp.vec4),
+        c2w=(c2w, wp.mat44),
+        intrinsics=(intrinsics, wp.vec4),
+        points=(points, wp.vec3),
+        normal=(normal, wp.vec3),
+        visible=(visible, wp.float32),
+    )
+    return n, points.new_empty(n, OWN), viewed

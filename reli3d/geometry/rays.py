@@ -14,7 +14,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from reli3d._bridge import check, empty, launch, over_slices, stream, tensor_of
+from reli3d._bridge import array_of, check, empty, launch, over_slices, stream, tensor_of
 from reli3d.geometry import embree
 from reli3d.kernels import embree as embree_kernels
 from reli3d.kernels import intersect as kernels
@@ -44,6 +44,8 @@ class RayScene:
     out of range or a vertex that is not finite.
     """
 
+    vertices: Tensor  # (V, 3), a copy
+
     def __init__(self, vertices: Tensor, faces: Tensor, backend: str = "auto"):
         if backend not in BACKENDS:
             raise ValueError(f"backend: expected one of {', '.join(BACKENDS)}, got {backend}")
@@ -58,7 +60,8 @@ class RayScene:
         if backend == "embree" and self.device.type != "cpu":
             raise ValueError(f"backend: expected warp on {self.device}, got embree, which runs on CPU only")
         self.backend = backend
-        self._embree = self._warp = None
+        self._embree: embree.Tree | None = None
+        self._warp: wp.Mesh | None = None
         self._set_vertices(vertices)
         self._build()
 
@@ -116,10 +119,11 @@ class RayScene:
         if self._embree is None:
             return (t_max >= 0.0) & ~self.occluded(origins, directions, t_max=t_max)
         left, group = t_max.clone(memory_format=torch.contiguous_format), embree_kernels.GROUP
-        args = [(origins.contiguous(), wp.vec3), (directions.contiguous(), wp.vec3), (left, wp.float32)]
-        args = [embree.query("rtcOccluded16"), self._embree.scene, *args]
-        launch(embree_kernels.embree_clear_kernel, -(-len(left) // group), args, self.device,
-               slice_min=SLICE_RAYS // group)  # fmt: skip
+        rays = [(origins.contiguous(), wp.vec3), (directions.contiguous(), wp.vec3), (left, wp.float32)]
+        args = [embree.query("rtcOccluded16"), self._embree.scene, *rays]
+        launch(
+            embree_kernels.embree_clear_kernel, -(-len(left) // group), args, self.device, slice_min=SLICE_RAYS // group
+        )
         return left >= 0.0
 
     @property
@@ -158,8 +162,8 @@ class RayScene:
         if self.backend == "warp":
             with stream(self.device):
                 self._warp = wp.Mesh(
-                    points=wp.from_torch(self.vertices, dtype=wp.vec3, requires_grad=False),
-                    indices=wp.from_torch(self.faces.reshape(-1), dtype=wp.int32, requires_grad=False),
+                    points=array_of(self.vertices, wp.vec3),
+                    indices=array_of(self.faces.reshape(-1), wp.int32),
                     bvh_constructor="sah",  # Warp's own choice on CUDA is "lbvh"
                 )
             return
@@ -191,10 +195,10 @@ class RayScene:
                 rays = [v if len(v) == 1 else torch.from_numpy(np.take(v.numpy(), order, 0, mode="clip")) for v in rays]
                 found = [torch.empty_like(v) for v in answers]
             args = [*zip(rays, (wp.vec3, wp.vec3, wp.float32)), *zip(found, (kind for _, kind in outs))]
-            launch(kernel, count, [address, self._embree.scene, *args], o.device, slice_min=count)
+            launch(kernel, count, [address, self.embree_scene, *args], o.device, slice_min=count)
             if order is not None:
-                for own, v in zip(answers, found, strict=True):
-                    _items(own)[order] = _items(v)
+                for answer, v in zip(answers, found, strict=True):
+                    _items(answer)[order] = _items(v)
 
         if n:
             over_slices(n, work, slice_min=max(SLICE_RAYS, n // (THREAD_SLICES * torch.get_num_threads())))

@@ -72,7 +72,7 @@ def vertex_deviation(
     # float64 from here on: levels and weights have any size, and distances are differences of positions
     values = [torch.where(tiny, v.detach(), v).double() * a for v, a in zip(levels, weights, strict=True)]
     share = values[0] / (values[0] - values[1])
-    crossing = torch.lerp(*positions, share[:, None]) * (2.0 * size.new_tensor(extent))
+    crossing = torch.lerp(positions[0], positions[1], share[:, None]) * (2.0 * size.new_tensor(extent))
 
     total = int(t.counts.sum())
     share, none = weight(beta, edge).double(), size.new_zeros(total)

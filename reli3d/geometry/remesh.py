@@ -50,8 +50,10 @@ def _used(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 def _mesh(positions: np.ndarray, faces: np.ndarray, like: Mesh) -> Mesh:
     device = like.vertices.device
-    return Mesh(torch.from_numpy(np.array(positions, np.float32, order="C")).to(device),
-                torch.from_numpy(np.array(faces, np.int32, order="C")).to(device))  # fmt: skip
+    return Mesh(
+        torch.from_numpy(np.array(positions, np.float32, order="C")).to(device),
+        torch.from_numpy(np.array(faces, np.int32, order="C")).to(device),
+    )
 
 
 def decimate(mesh: Mesh, faces: int, *, keep_border: bool = False) -> Mesh:
@@ -131,7 +133,8 @@ def repair(mesh: Mesh) -> Mesh:
         whole = solid(positions, triangles)
     if whole.status() != Error.NoError:
         raise ValueError(f"mesh: expected a surface that manifold3d can close, got {whole.status().name}")
-    outer, inner = [], []
+    outer: list[Manifold] = []
+    inner: list[Manifold] = []
     for piece in whole.decompose():
         (outer if piece.volume() > 0.0 else inner).append(piece)
     turned = []
@@ -180,7 +183,8 @@ def _cut(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 def _capped(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Every border loop closed by a fan around the mean of its vertices."""
-    tail, caps, centres = faces.reshape(-1), [faces], []
+    tail, caps = faces.reshape(-1), [faces]
+    centres: list[np.ndarray] = []
     for loop in open_loops(faces)[0]:
         ring = tail[loop][::-1]
         hub = np.full(len(ring), len(positions) + len(centres))

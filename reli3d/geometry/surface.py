@@ -29,8 +29,8 @@ I32 = wp.int32
 class _Topology:
     """Integers that say what is connected; constants of the extraction."""
 
-    shape: tuple[int, int, int]  # vertices of the grid, padded
-    cubes: tuple[int, int, int]  # before padding
+    shape: tuple[int, ...]  # (3,) vertices of the grid, padded
+    cubes: tuple[int, ...]  # (3,) before padding
     pad: int
     cells: Tensor  # (S,) surface cubes, by index of their lowest vertex
     rows: Tensor  # (S,) their row in the weights, -1 for a cube of the padding
@@ -69,14 +69,14 @@ def extract_surface(
 ) -> Mesh:
     """Mesh of ``level == 0`` inside the box, faces counter-clockwise from the positive side.
 
-    level: ``(X + 1, Y + 1, Z + 1)``, negative inside, 0 is outside.  radius: half extent of the box, one or three
-    numbers.  deformation: ``(*level.shape, 3)`` offsets of the grid vertices in box extents, below half a cube.
-    Positive weights, 1 if None: alpha ``(cubes, 8)`` of corners, beta ``(cubes, 12)`` of edges, gamma ``(cubes,)`` of
-    the quads' split.  cubes: :func:`surface_cubes` of ``level``, if the weights have rows for these alone.  closed: a
-    flat cap where the inside reaches the border.  centre: four triangles for each quad, as training wants it, else two.
+    level: ``(X + 1, Y + 1, Z + 1)``, negative inside.  radius: half extent of the box, one or three numbers.
+    deformation: ``(*level.shape, 3)`` offsets of the grid vertices in box extents.  Positive weights, 1 if None: alpha
+    ``(cubes, 8)``, beta ``(cubes, 12)`` of edges, gamma ``(cubes,)`` of the quads' split.  cubes:
+    :func:`surface_cubes`, where weights have rows for these alone.  closed: a flat cap at the border.  centre: four
+    triangles for each quad, else two.
 
-    A level of one sign gives no faces (outside) or the box (inside).  Gradients reach all but ``radius``, gamma only
-    with ``centre``; the same bits for any number of threads.  Raises TypeError or ValueError.
+    A level of one sign gives no faces or the whole box.  Gradients reach all but ``radius``, gamma only with
+    ``centre``; the same bits for any number of threads.  Raises TypeError or ValueError.
     """
     level, deformation, alpha, beta, gamma = (tensor_of(v) for v in (level, deformation, alpha, beta, gamma))
     cubes = tensor_of(cubes, torch.int64)
@@ -96,8 +96,14 @@ def extract_surface(
     return Mesh(vertices, faces.reshape(-1, 3))
 
 
-def extract_surfaces(levels: Tensor | Sequence[Tensor], *, radius: float | Sequence[float], closed: bool = True,
-                     centre: bool = False, **fields: Tensor | Sequence[Tensor] | None) -> list[Mesh]:  # fmt: skip
+def extract_surfaces(
+    levels: Tensor | Sequence[Tensor],
+    *,
+    radius: float | Sequence[float],
+    closed: bool = True,
+    centre: bool = False,
+    **fields: Tensor | Sequence[Tensor] | None,
+) -> list[Mesh]:
     """:func:`extract_surface` of every field of a batch, one mesh for each; the same bits as alone.
 
     levels: ``(B, X + 1, Y + 1, Z + 1)``, or a sequence of grids that may differ in shape.  fields: deformation, alpha,
@@ -113,13 +119,23 @@ def extract_surfaces(levels: Tensor | Sequence[Tensor], *, radius: float | Seque
     for name, value in given.items():
         if len(value) != len(levels):
             raise ValueError(f"{name}: expected {len(levels)} fields, got {len(value)}")
-    return [extract_surface(level, radius=radius, closed=closed, centre=centre,
-                            **{name: value[i] for name, value in given.items()})
-            for i, level in enumerate(levels)]  # fmt: skip
+    return [
+        extract_surface(
+            level, radius=radius, closed=closed, centre=centre, **{name: value[i] for name, value in given.items()}
+        )
+        for i, level in enumerate(levels)
+    ]
 
 
-def check_fields(level: Tensor, radius: float | Sequence[float], deformation: Tensor | None, alpha: Tensor | None,
-                 beta: Tensor | None, gamma: Tensor | None, cubes: Tensor | None) -> list[float]:  # fmt: skip
+def check_fields(
+    level: Tensor,
+    radius: float | Sequence[float],
+    deformation: Tensor | None,
+    alpha: Tensor | None,
+    beta: Tensor | None,
+    gamma: Tensor | None,
+    cubes: Tensor | None,
+) -> list[float]:
     """Raise for what :func:`extract_surface` cannot take; returns the three radii."""
     _check_level(level)
     size = tuple(n - 1 for n in level.shape)
@@ -154,9 +170,12 @@ def _check_level(level: Tensor) -> None:
 
 def _classify(level: Tensor) -> tuple[Tensor, Tensor]:
     case, crossed = torch.empty_like(level, dtype=torch.uint8), torch.empty_like(level, dtype=torch.uint8)
-    launch(kernels.classify_kernel, level.shape[0] * level.shape[1], [
-        (level.view(-1), wp.float32), *level.shape, (case.view(-1), wp.uint8), (crossed.view(-1), wp.uint8)],
-        level.device)  # fmt: skip
+    launch(
+        kernels.classify_kernel,
+        level.shape[0] * level.shape[1],
+        [(level.view(-1), wp.float32), *level.shape, (case.view(-1), wp.uint8), (crossed.view(-1), wp.uint8)],
+        level.device,
+    )
     return case, crossed
 
 
@@ -169,16 +188,20 @@ def topology_of(level: Tensor, cubes: Tensor | None, closed: bool) -> tuple[_Top
         level = torch.nn.functional.pad(level, (1,) * 6, value=1.0)
     case, crossed = _classify(level)
     cells = case.view(-1).nonzero().squeeze(1)
-    i, j, k = cells // (level.shape[1] * level.shape[2]) - pad, cells // level.shape[2] % level.shape[1] - pad, \
-        cells % level.shape[2] - pad  # fmt: skip
+    i, j, k = (
+        cells // (level.shape[1] * level.shape[2]) - pad,
+        cells // level.shape[2] % level.shape[1] - pad,
+        cells % level.shape[2] - pad,
+    )
     rows = (i * size[1] + j) * size[2] + k
     if pad:
         real = (i >= 0) & (j >= 0) & (k >= 0) & (i < size[0]) & (j < size[1]) & (k < size[2])
         rows = torch.where(real, rows, -1)
     if cubes is not None:
-        own = rows if not pad else rows[real]
-        if not torch.equal(own, cubes):
-            raise ValueError(f"cubes: expected surface_cubes(level), {len(own)} of them, got {len(cubes)} others")
+        weight_rows = rows if not pad else rows[real]
+        if not torch.equal(weight_rows, cubes):
+            count = len(weight_rows)
+            raise ValueError(f"cubes: expected surface_cubes(level), {count} of them, got {len(cubes)} others")
         index = torch.cumsum(real, 0) - 1 if pad else torch.arange(len(cells), device=device)
         rows = torch.where(real, index, -1) if pad else index
     cells, rows = cells.to(torch.int32), rows.to(torch.int32)
@@ -215,9 +238,12 @@ class _DualVertices(torch.autograd.Function):
         group = torch.arange(len(owner), dtype=torch.int32, device=device) - t.base[owner.long()]
         vertices = torch.empty(len(owner), 3, device=device)
         inputs = [None if v is None else v.detach().contiguous() for v in (deformation, alpha, beta)]
-        launch(kernels.dual_vertex_kernel, len(owner), [
-            (owner, I32), (group, I32), *_DualVertices.arguments(t, padded, inputs, scale), (vertices, wp.vec3)],
-            device)  # fmt: skip
+        launch(
+            kernels.dual_vertex_kernel,
+            len(owner),
+            [(owner, I32), (group, I32), *_DualVertices.arguments(t, padded, inputs, scale), (vertices, wp.vec3)],
+            device,
+        )
         ctx.topology, ctx.scale, ctx.given = topology, scale, [v is not None for v in (deformation, alpha, beta)]
         ctx.save_for_backward(padded, level, *(v for v in (deformation, alpha, beta) if v is not None))
         return vertices
@@ -242,22 +268,31 @@ class _DualVertices(torch.autograd.Function):
         n = len(t.cells)
         g_level, g_alpha, g_beta = (torch.zeros(n, width, device=device) for width in (8, 8, 12))
         g_shift = torch.zeros(n, 8, 3, device=device)
-        launch(flexicubes_adjoint.dual_vertex_adjoint_kernel, n, [
-            *_DualVertices.arguments(t, padded, inputs, ctx.scale, (t.counts, I32), (t.base, I32)),
-            (g_vertices.contiguous(), wp.vec3), (g_level.view(-1), wp.float32),
-            (g_shift.view(-1, 3), wp.vec3), (g_alpha.view(-1), wp.float32), (g_beta.view(-1), wp.float32)],
-            device)  # fmt: skip
+        launch(
+            flexicubes_adjoint.dual_vertex_adjoint_kernel,
+            n,
+            [
+                *_DualVertices.arguments(t, padded, inputs, ctx.scale, (t.counts, I32), (t.base, I32)),
+                (g_vertices.contiguous(), wp.vec3),
+                (g_level.view(-1), wp.float32),
+                (g_shift.view(-1, 3), wp.vec3),
+                (g_alpha.view(-1), wp.float32),
+                (g_beta.view(-1), wp.float32),
+            ],
+            device,
+        )
         corner = corner_vertices(t).view(-1)
-        grads = [None, None, None, None]
+        grads: list[Tensor | None] = [None, None, None, None]
         if ctx.needs_input_grad[3]:
             grads[0] = _scatter(corner, g_level.view(-1, 1), level.numel()).view(level.shape)
         if ctx.needs_input_grad[4]:
             grads[1] = _scatter(corner, g_shift.view(-1, 3), level.numel()).view(*level.shape, 3)
         real = t.rows >= 0
         for i, value, g in ((2, inputs[1], g_alpha), (3, inputs[2], g_beta)):
-            if ctx.needs_input_grad[3 + i]:
-                grads[i] = torch.zeros_like(value)
-                grads[i][t.rows[real].long()] = g[real]
+            if ctx.needs_input_grad[3 + i] and value is not None:
+                every = torch.zeros_like(value)
+                every[t.rows[real].long()] = g[real]
+                grads[i] = every
         return None, None, None, *grads
 
 
@@ -275,10 +310,10 @@ def corner_vertices(t: _Topology) -> Tensor:
 def _quads(t: _Topology, padded: Tensor, crossed: Tensor, gamma: Tensor | None) -> tuple[Tensor, Tensor]:
     """Dual vertices of every quad ``(Q, 4)`` and the gammas of their cubes ``(Q, 4)``, in the published order."""
     device = padded.device
-    own = crossed.view(-1).nonzero().squeeze(1)
+    starts = crossed.view(-1).nonzero().squeeze(1)
     bits = torch.tensor([1, 2, 4], dtype=torch.uint8, device=device)
-    which, direction = (crossed.view(-1)[own][:, None] & bits).nonzero(as_tuple=True)
-    origin, direction = own[which].to(torch.int32), direction.to(torch.int32)
+    which, direction = (crossed.view(-1)[starts][:, None] & bits).nonzero(as_tuple=True)
+    origin, direction = starts[which].to(torch.int32), direction.to(torch.int32)
     quads = torch.empty(len(origin), 4, dtype=torch.int32, device=device)
     split = torch.empty(len(origin), 4, device=device)
     table = tables_on(device)

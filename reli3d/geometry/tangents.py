@@ -12,7 +12,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from reli3d._bridge import check
+from reli3d._bridge import check, present
 from reli3d.geometry.mesh import Mesh, weld_rows
 
 PARALLEL = 1.0e-12  # length of a projected direction, relative, below which it has no direction in float64
@@ -40,9 +40,10 @@ def vertex_tangents(mesh: Mesh) -> Tensor:
     """
     if not isinstance(mesh, Mesh):
         raise TypeError(f"mesh: expected Mesh, got {type(mesh).__name__}")
-    for name, fix in (("normals", "Mesh.with_normals"), ("uv", "unwrap")):
-        if getattr(mesh, name) is None:
-            raise ValueError(f"mesh.{name}: expected a tensor, got None (see {fix})")
+    if mesh.normals is None:
+        raise ValueError("mesh.normals: expected a tensor, got None (see Mesh.with_normals)")
+    if mesh.uv is None:
+        raise ValueError("mesh.uv: expected a tensor, got None (see unwrap)")
     corners = mesh.faces.long().T.contiguous()  # vectors are columns: torch sums a short last axis slowly
     vertices, uv, normals = (x.detach().double().T.contiguous() for x in (mesh.vertices, mesh.uv, mesh.normals))
     p, n = [vertices[:, c] for c in corners], _unit(normals)[0]
@@ -69,7 +70,12 @@ def vertex_tangents(mesh: Mesh) -> Tensor:
 
 def _merged(mesh: Mesh) -> Tensor:
     """First vertex with the same position, normal and UV, for every vertex, ``(V,)``."""
-    first, label = weld_rows(torch.cat([mesh.vertices, mesh.normals, mesh.uv], 1).detach().cpu().numpy())
+    first, label = weld_rows(
+        torch.cat([mesh.vertices, present("mesh.normals", mesh.normals), present("mesh.uv", mesh.uv)], 1)
+        .detach()
+        .cpu()
+        .numpy()
+    )
     return torch.from_numpy(first[label]).to(mesh.vertices.device)
 
 
@@ -90,7 +96,8 @@ def _dot(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _frame(normal: Tensor, tangent: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    check("normal", normal, last=3), check("tangent", tangent, last=4, like=normal)
+    check("normal", normal, last=3)
+    check("tangent", tangent, last=4, like=normal)
     t, n = tangent[..., :3], normal
     b = torch.linalg.cross(n, t) * tangent[..., 3:]
     return t, b, n

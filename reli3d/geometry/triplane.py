@@ -29,28 +29,37 @@ class _SampleTriplane(torch.autograd.Function):
     def forward(ctx, planes: Tensor, points: Tensor) -> Tensor:
         batch, _, channels, height, width = planes.shape
         n, blocks = points.shape[1], -(-channels // BLOCK)
-        order, edges = points.new_empty(0, dtype=torch.int32), None
-        scattered = not planes.is_cuda and height * width * blocks * BLOCK > CACHED \
-            and not _is_walk(points, max(height, width))  # fmt: skip
-        by_rows = scattered and planes.dtype == torch.float32 and planes.is_contiguous() \
-            and not ctx.needs_input_grad[1] and planes.numel() < 2**31  # fmt: skip
+        order = edges = points.new_empty(0, dtype=torch.int32)
+        scattered = (
+            not planes.is_cuda and height * width * blocks * BLOCK > CACHED and not _is_walk(points, max(height, width))
+        )
+        by_rows = (
+            scattered
+            and planes.dtype == torch.float32
+            and planes.is_contiguous()
+            and not ctx.needs_input_grad[1]
+            and planes.numel() < 2**31
+        )
         if ctx.needs_input_grad[0] or scattered:
             order, edges = _by_cell_row(points, height, width)
         features = points.new_empty(batch, n, 3, blocks * BLOCK)
-        packed = None if by_rows else _packed(planes)
+        packed = planes.detach() if by_rows else _packed(planes)
         inputs = (points.view(-1, 3), kernels.wp.vec3), (order.view(-1), kernels.wp.int32)
         out = features.view(-1, BLOCK), kernels.vec8
         if by_rows:
             scratch = points.new_empty(batch * 3 * BANDS * 2 * (width + 2) * blocks, BLOCK)
             launch(kernels.sample_rows_kernel, batch * 3 * BANDS, [
-                (planes.detach().view(-1), kernels.wp.float32), *inputs, (edges.view(-1), kernels.wp.int32), n,
+                (packed.view(-1), kernels.wp.float32), *inputs, (edges.view(-1), kernels.wp.int32), n,
                 channels, height, width, blocks, BANDS, (scratch, kernels.vec8), out],
                 planes.device, slice_min=1)  # fmt: skip
         else:
             split = blocks if planes.is_cuda else 1  # neighbouring GPU threads read neighbouring blocks
-            launch(kernels.sample_kernel, batch * n * 3 * split, [
-                (packed.view(-1, BLOCK), kernels.vec8), *inputs, n, height, width, blocks, split, out],
-                planes.device)  # fmt: skip
+            launch(
+                kernels.sample_kernel,
+                batch * n * 3 * split,
+                [(packed.view(-1, BLOCK), kernels.vec8), *inputs, n, height, width, blocks, split, out],
+                planes.device,
+            )
         sorted_points = (order, edges) if ctx.needs_input_grad[0] else (None, None)
         source = planes if all(ctx.needs_input_grad) else None  # refuses a second derivative: packed is a copy
         ctx.save_for_backward(points, packed if ctx.needs_input_grad[1] else None, *sorted_points, source)
@@ -78,8 +87,8 @@ def _packed(planes: Tensor) -> Tensor:
 
 def _is_walk(points: Tensor, size: int) -> bool:
     """Whether the first points mostly lie within a few texels, ``size`` along a plane, of those before them."""
-    some = points[:, :PROBED]
-    near = (some[:, 1:] - some[:, :-1]).abs().amax(-1) < NEAR * 2.0 / size
+    probed = points[:, :PROBED]
+    near = (probed[:, 1:] - probed[:, :-1]).abs().amax(-1) < NEAR * 2.0 / size
     return bool(near.sum() > WALK * near.numel())
 
 
@@ -89,8 +98,12 @@ def _by_cell_row(points: Tensor, height: int, width: int) -> tuple[Tensor, Tenso
     slabs, n = points.shape[0] * 3, points.shape[1]
     bins = 2**16 // (height + 2)
     keys = torch.empty(slabs, n, dtype=torch.int32, device=points.device)
-    launch(kernels.cell_key_kernel, slabs * n, [(points.view(-1, 3), kernels.wp.vec3), n, height, width, bins,
-                                                (keys.view(-1), kernels.wp.int32)], points.device)  # fmt: skip
+    launch(
+        kernels.cell_key_kernel,
+        slabs * n,
+        [(points.view(-1, 3), kernels.wp.vec3), n, height, width, bins, (keys.view(-1), kernels.wp.int32)],
+        points.device,
+    )
     edges = keys.new_zeros(slabs, height + 2)
     if points.is_cuda:
         order = torch.argsort(keys, dim=1, stable=True).to(torch.int32)

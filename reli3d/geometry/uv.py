@@ -7,6 +7,7 @@ gather of the input's and pass gradients on.
 
 from __future__ import annotations
 
+import math
 import os
 import subprocess
 import sys
@@ -86,9 +87,14 @@ def unwrap(mesh: Mesh, *, texture_size: int = 1024) -> Mesh:
     first, label = (t.cpu().numpy() for t in weld(mesh.vertices.detach()))
     points = mesh.vertices.detach().cpu().numpy()[first]
     guard = guard_band(texture_size)
-    charts = parts.make_charts(points, label[source_faces].astype(np.int32), texels=FILL * texture_size**2,
-                               least_texels=9.0 * guard * guard, longest=LONGEST * texture_size,
-                               sliver=4.0e-6 * texture_size)  # fmt: skip
+    charts = parts.make_charts(
+        points,
+        label[source_faces].astype(np.int32),
+        texels=FILL * texture_size**2,
+        least_texels=9.0 * guard * guard,
+        longest=LONGEST * texture_size,
+        sliver=4.0e-6 * texture_size,
+    )
     uv = _pack(charts, texture_size, guard)
     flat = _area(uv) <= 0.0
     while flat.any():  # rounding to float32 took a face's area: it moves to the slivers
@@ -108,8 +114,8 @@ def _joined(mesh: Mesh, faces: np.ndarray, charts: parts.Charts, uv: np.ndarray)
     """Corners of one source vertex in one chart become one vertex; a sliver keeps its three for itself."""
     count = len(mesh.vertices)
     alone = charts.chart < 0
-    own = charts.count + 3 * (np.cumsum(alone) - 1)[:, None] + np.arange(3)
-    corner = (np.where(alone[:, None], own, charts.chart[:, None]).astype(np.int64) * count + faces).ravel()
+    corner_ids = charts.count + 3 * (np.cumsum(alone) - 1)[:, None] + np.arange(3)
+    corner = (np.where(alone[:, None], corner_ids, charts.chart[:, None]).astype(np.int64) * count + faces).ravel()
     order, first = group(corner)
     rank = np.zeros(len(order), np.int64)
     rank[first[1:]] = 1
@@ -155,11 +161,11 @@ def _place(charts: parts.Charts, faces: np.ndarray, size: int, guard: float, res
     order, start = group(chart[face])
     face, corner = face[order], corner[order]
     edges = np.stack([charts.corners[faces[face], corner], charts.corners[faces[face], (corner + 1) % 3]], 1)
-    low = np.minimum.reduceat(edges.min(1), start, axis=0)
-    edges -= low[chart[face]][:, None]
+    lowest = np.minimum.reduceat(edges.min(1), start, axis=0)
+    edges -= lowest[chart[face]][:, None]
     edge_start = np.append(start, len(edges)).astype(np.int32)
     extent = np.maximum.reduceat(edges.max(1), start, axis=0).astype(np.float64)
-    corners = charts.corners[faces].astype(np.float64) - low[chart][:, None]
+    corners = charts.corners[faces].astype(np.float64) - lowest[chart][:, None]
     cell = max(1.0, size / CELLS)
     cells = int(size / cell)
     sequence = torch.from_numpy(np.lexsort((np.arange(count), -extent[:, 0], -extent[:, 1])).astype(np.int32))
@@ -177,16 +183,17 @@ def _place(charts: parts.Charts, faces: np.ndarray, size: int, guard: float, res
         start = torch.from_numpy(column_start), wp.int32
         bottom, top = torch.empty(2, int(column_start[-1]), dtype=torch.int32)
         outline = (bottom, wp.int32), (top, wp.int32)
-        _bridge.launch(kernels.outline_kernel, count,
-                       [*inputs, start, scale / cell, margin / cell, *outline], parts.CPU)  # fmt: skip
+        _bridge.launch(
+            kernels.outline_kernel, count, [*inputs, start, scale / cell, margin / cell, *outline], parts.CPU
+        )
         _bridge.launch(kernels.pack_serial_kernel, 1, [(sequence, wp.int32), start, *outline, strip,
                        (horizon, wp.int32), (place, wp.int32), (top_cell, wp.int32)], parts.CPU)  # fmt: skip
         return int(top_cell)
 
     while True:
-        best, best_place = 0.0, None
-        low, high, scale = 0.0, float(cells / max(extent.max() / cell, 1e-9)), 1.0
-        scale = min(scale, 0.98 * high)
+        best, best_place = 0.0, np.empty((0, 4), np.int32)
+        low, high = 0.0, float(cells / max(extent.max() / cell, 1e-9))
+        scale = min(1.0, 0.98 * high)
         for _ in range(ROUNDS):
             reached = drop(scale, guard)
             if reached <= cells:
@@ -195,7 +202,7 @@ def _place(charts: parts.Charts, faces: np.ndarray, size: int, guard: float, res
                 high = scale
             if best and high < 1.01 * low:
                 break
-            ratio = np.sqrt(cells / reached) if reached < 1 << 30 else 0.5
+            ratio = math.sqrt(cells / reached) if reached < 1 << 30 else 0.5
             scale = scale * ratio
             if not low * 1.002 < scale < high * 0.998:
                 scale = 0.5 * (low + high) if low else 0.7 * high
@@ -252,13 +259,19 @@ def unwrap_xatlas(mesh: Mesh, *, texture_size: int = 1024, timeout_s: float = 12
     _check(mesh, texture_size)
     with tempfile.TemporaryDirectory() as folder:
         job, result = os.path.join(folder, "job.npz"), os.path.join(folder, "result.npz")
-        np.savez(job, vertices=mesh.vertices.detach().cpu().numpy(), faces=mesh.faces.cpu().numpy().astype(np.uint32),
-                 size=texture_size, guard=guard_band(texture_size))  # fmt: skip
+        np.savez(
+            job,
+            vertices=mesh.vertices.detach().cpu().numpy(),
+            faces=mesh.faces.cpu().numpy().astype(np.uint32),
+            size=texture_size,
+            guard=guard_band(texture_size),
+        )
         try:
             done = subprocess.run([sys.executable, "-c", XATLAS, job, result], capture_output=True, timeout=timeout_s)
         except subprocess.TimeoutExpired:
-            raise TimeoutError(f"unwrap_xatlas: no atlas of {len(mesh.faces)} faces in {timeout_s:g} s; "
-                               "use unwrap, or raise timeout_s") from None  # fmt: skip
+            raise TimeoutError(
+                f"unwrap_xatlas: no atlas of {len(mesh.faces)} faces in {timeout_s:g} s; use unwrap, or raise timeout_s"
+            ) from None
         if done.returncode != 0:
             tail = done.stderr.decode(errors="replace").strip().splitlines()[-1:] or ["no message"]
             raise RuntimeError(f"unwrap_xatlas: xatlas ended with code {done.returncode} ({tail[0]}); use unwrap")
@@ -277,4 +290,4 @@ def unwrap_xatlas(mesh: Mesh, *, texture_size: int = 1024, timeout_s: float = 12
 
 def uv_faces(mesh: Mesh) -> Tensor:
     """UV of the corners of every face, ``(F, 3, 2)``."""
-    return mesh.uv[mesh.faces.long()]
+    return _bridge.present("mesh.uv", mesh.uv)[mesh.faces.long()]

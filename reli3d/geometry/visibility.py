@@ -21,8 +21,10 @@ def visible_from(
     position, normal: ``(N, 3)`` world, the normal unit.  c2w: ``(V, 4, 4)``.  intrinsics: ``(V, 4)`` pixels.  No
     gradient.
     """
-    check("position", position, last=3), check("normal", normal, last=3, like=position)
-    check("c2w", c2w, last=4, like=position), check("intrinsics", intrinsics, last=4, like=position)
+    check("position", position, last=3)
+    check("normal", normal, last=3, like=position)
+    check("c2w", c2w, last=4, like=position)
+    check("intrinsics", intrinsics, last=4, like=position)
     n, views = len(position), len(c2w)
     origin, direction = (position.new_empty(n * views, 3) for _ in range(2))
     distance = position.new_empty(n * views)

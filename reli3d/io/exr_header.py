@@ -44,7 +44,8 @@ def _header(path, data: bytes) -> ExrHeader:
         raise InputError(path, f"EXR version: expected 2, got {version & 0xFF}; save as a plain scanline EXR")
     if version & 0x1800:
         raise InputError(path, "EXR kind: expected one flat image, got a deep or multi-part file; save as a plain EXR")
-    attributes, at = {}, 8
+    attributes: dict[str, tuple[str, bytes]] = {}
+    at = 8
     while data[at] != 0:
         name, at = _text(data, at)
         kind, at = _text(data, at)
@@ -61,8 +62,11 @@ def _header(path, data: bytes) -> ExrHeader:
     width, height = x1 - x0 + 1, y1 - y0 + 1
     channels = _channels(path, attributes["channels"][1])
     if width < 1 or height < 1 or width * height * len(channels) > MAX_SAMPLES:
-        raise InputError(path, f"EXR dataWindow: expected at most {MAX_SAMPLES} samples, got {width} x {height} x "
-                               f"{len(channels)}; scale the map down")  # fmt: skip
+        raise InputError(
+            path,
+            f"EXR dataWindow: expected at most {MAX_SAMPLES} samples, got {width} x {height} x "
+            f"{len(channels)}; scale the map down",
+        )
     compression = attributes["compression"][1][0]
     if compression not in _BLOCK:
         raise InputError(path, f"EXR compression: expected a known kind, got {compression}; save with ZIP compression")
@@ -85,7 +89,8 @@ def _header(path, data: bytes) -> ExrHeader:
 
 
 def _channels(path, data: bytes) -> dict[str, str]:
-    channels, at = {}, 0
+    channels: dict[str, str] = {}
+    at = 0
     while data[at] != 0:
         name, at = _text(data, at)
         kind, _, step_x, step_y = struct.unpack_from("<iIii", data, at)

@@ -23,8 +23,10 @@ def printable(text: str) -> str:
 def shown(value: object, limit: int = 60) -> str:
     """``value`` as it stands in a message: its repr on one line, cut after ``limit`` characters."""
     try:
-        long = isinstance(value, list | dict) and len(value) > 16
-        text = f"{type(value).__name__} of {len(value)}" if long else repr(value)
+        if isinstance(value, list | dict) and len(value) > 16:
+            text = f"{type(value).__name__} of {len(value)}"
+        else:
+            text = repr(value)
     except (ValueError, RecursionError):  # an int of more digits than Python prints, a list nested without end
         text = type(value).__name__
     return text if len(text) <= limit else text[: limit - 3] + "..."

@@ -1,4 +1,4 @@
-"""GLB out: one mesh, one metallic-roughness material, three PNG textures (glTF 2.0, Khronos).
+"""GLB out: one mesh, one metallic-roughness material, three PNG or WebP textures (glTF 2.0, Khronos).
 
 Axes and units are glTF's own (+Y up, right-handed), so nothing is rotated.  Base colour is sRGB 8 bit.  Roughness is
 green and metallic is blue of one linear texture.  All factors are written as 1.  :func:`read_glb` reads it back.
@@ -10,8 +10,9 @@ import io
 import json
 import os
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,26 +20,42 @@ from PIL import Image
 from torch import Tensor
 
 import reli3d
+from reli3d._bridge import present
 from reli3d.geometry.mesh import watertight
 from reli3d.io.files import write_bytes
 from reli3d.io.gltf_parts import read_parts
 from reli3d.render.asset import Asset
 
 UNIT = 1.0e-3  # deviation from length 1 that readers accept
-PNG_LEVEL = 1  # zlib level: 2 is 1.3 times slower for 2 % less; baked maps are smooth
+ENCODERS: dict[str, dict[str, Any]] = {
+    "png": {"compress_level": 1},  # zlib level: 2 is 1.3 times slower for 2 % less; baked maps are smooth
+    "webp": {"lossless": True, "exact": True},
+}
+WEBP = "EXT_texture_webp"
 FLOAT, UINT = 5126, 5125
 LINEAR, LINEAR_MIPMAP_LINEAR, CLAMP_TO_EDGE = 9729, 9987, 33071
 
 
-def encode_png(values: Tensor) -> bytes:
-    """PNG file, 8 bit RGB, of ``(H, W, 3)`` values in [0, 1], rounded to the nearest step."""
+def encode_image(values: Tensor, kind: str = "png") -> bytes:
+    """PNG or lossless WebP file, 8 bit RGB, of ``(H, W, 3)`` values in [0, 1], rounded to the nearest step."""
     pixels = (values.detach() * 255.0).round_().to(torch.uint8).cpu().numpy()
     buffer = io.BytesIO()
-    Image.fromarray(np.ascontiguousarray(pixels)).save(buffer, "PNG", compress_level=PNG_LEVEL)
+    Image.fromarray(np.ascontiguousarray(pixels)).save(buffer, kind.upper(), **ENCODERS[kind])
     return buffer.getvalue()
 
 
-def _checked(asset: Asset) -> None:
+def texture_images(asset: Asset, kind: str = "png") -> dict[str, bytes]:
+    """The files of ``base_color``, ``metallic_roughness`` (green roughness, blue metallic, red 1) and ``normal``."""
+    rough = asset.textures.roughness
+    orm = torch.stack([torch.ones_like(rough), rough, asset.textures.metallic], -1)  # no occlusion is baked
+    maps = {"base_color": asset.textures.base_color, "metallic_roughness": orm, "normal": asset.textures.normal}
+    with ThreadPoolExecutor(3) as pool:  # the encoder runs without the interpreter lock
+        images = {name: pool.submit(encode_image, values, kind) for name, values in maps.items()}
+        return {name: image.result() for name, image in images.items()}
+
+
+def check_asset(asset: Asset) -> None:
+    """Raise TypeError or ValueError for an asset that lacks what a file needs, or is not finite."""
     if not isinstance(asset, Asset):
         raise TypeError(f"asset: expected Asset, got {type(asset).__name__}")
     mesh = asset.mesh
@@ -50,12 +67,13 @@ def _checked(asset: Asset) -> None:
     for name in ("vertices", "normals", "uv", "tangents"):
         if not bool(torch.isfinite(getattr(mesh, name)).all()):
             raise ValueError(f"asset.mesh.{name}: expected finite values, got NaN or infinity")
-    for name, value in (("normals", mesh.normals), ("tangents", mesh.tangents[:, :3])):
+    normals, tangents = present("normals", mesh.normals), present("tangents", mesh.tangents)
+    for name, value in (("normals", normals), ("tangents", tangents[:, :3])):
         length = value.detach().norm(dim=1)
         worst = float((length - 1.0).abs().max())
         if worst > UNIT:
             raise ValueError(f"asset.mesh.{name}: expected unit length, got a length off by {worst:.3g}")
-    if not bool((mesh.tangents[:, 3].abs() == 1.0).all()):
+    if not bool((tangents[:, 3].abs() == 1.0).all()):
         raise ValueError("asset.mesh.tangents: expected w = +1 or -1, got another value")
     for name in ("base_color", "roughness", "metallic", "normal"):
         value = getattr(asset.textures, name)
@@ -64,60 +82,84 @@ def _checked(asset: Asset) -> None:
             raise ValueError(f"asset.textures.{name}: expected values in [0, 1], got others or none")
 
 
-def glb_bytes(asset: Asset, *, extras: Mapping | None = None, double_sided: bool | None = None) -> bytes:
+def glb_bytes(
+    asset: Asset,
+    *,
+    extras: Mapping | None = None,
+    double_sided: bool | None = None,
+    translation: Sequence[float] = (0.0, 0.0, 0.0),
+    textures: str = "png",
+) -> bytes:
     """The GLB file of :func:`write_glb` as bytes."""
-    _checked(asset)
-    mesh, textures = asset.mesh, asset.textures
+    check_asset(asset)
+    if textures not in ENCODERS:
+        raise ValueError(f"textures: expected {' or '.join(ENCODERS)}, got {textures}")
+    mesh = asset.mesh
     if double_sided is None:
         double_sided = not watertight(mesh)
-    rough = textures.roughness
-    orm = torch.stack([torch.ones_like(rough), rough, textures.metallic], -1)  # no occlusion is baked
-    with ThreadPoolExecutor(3) as pool:  # the encoder runs without the interpreter lock
-        images = [pool.submit(encode_png, t) for t in (textures.base_color, orm, textures.normal)]
-        document, chunks = _geometry(mesh)
-        chunks += [image.result() for image in images]
-    names = ("base_color", "metallic_roughness", "normal")
+    images = texture_images(asset, textures)
+    document, chunks = _geometry(mesh)
+    names, chunks = tuple(images), chunks + list(images.values())
     views, offset = [], 0
     targets = [34962] * 4 + [34963]  # vertex attributes, indices; images have none
     for k, chunk in enumerate(chunks):
         view = {"buffer": 0, "byteOffset": offset, "byteLength": len(chunk)}
         views.append({**view, "target": targets[k]} if k < len(targets) else view)
         offset += len(chunk) + -len(chunk) % 4
-    info = {"version": "2.0", "generator": f"reli3d {reli3d.__version__}"}
+    info: dict[str, object] = {"version": "2.0", "generator": f"reli3d {reli3d.__version__}"}
     if extras:
         info["extras"] = dict(extras)
     document |= {
         "asset": info,
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "name": "object"}],
-        "materials": [{
-            "name": "baked",
-            "pbrMetallicRoughness": {
-                "baseColorTexture": {"index": 0}, "baseColorFactor": [1.0, 1.0, 1.0, 1.0],
-                "metallicRoughnessTexture": {"index": 1}, "metallicFactor": 1.0, "roughnessFactor": 1.0,
-            },
-            "normalTexture": {"index": 2, "scale": 1.0},
-            "doubleSided": bool(double_sided),
-        }],
-        "textures": [{"sampler": 0, "source": k, "name": name} for k, name in enumerate(names)],
-        "images": [{"bufferView": len(targets) + k, "mimeType": "image/png", "name": name}
-                   for k, name in enumerate(names)],
-        "samplers": [{"magFilter": LINEAR, "minFilter": LINEAR_MIPMAP_LINEAR,
-                      "wrapS": CLAMP_TO_EDGE, "wrapT": CLAMP_TO_EDGE}],
+        "nodes": [{"mesh": 0, "name": "object"} | ({"translation": list(translation)} if any(translation) else {})],
+        "materials": [
+            {
+                "name": "baked",
+                "pbrMetallicRoughness": {
+                    "baseColorTexture": {"index": 0},
+                    "baseColorFactor": [1.0, 1.0, 1.0, 1.0],
+                    "metallicRoughnessTexture": {"index": 1},
+                    "metallicFactor": 1.0,
+                    "roughnessFactor": 1.0,
+                },
+                "normalTexture": {"index": 2, "scale": 1.0},
+                "doubleSided": bool(double_sided),
+            }
+        ],
+        "textures": [{"sampler": 0, "name": name, **_source(k, textures)} for k, name in enumerate(names)],
+        "images": [
+            {"bufferView": len(targets) + k, "mimeType": f"image/{textures}", "name": name}
+            for k, name in enumerate(names)
+        ],
+        "samplers": [
+            {"magFilter": LINEAR, "minFilter": LINEAR_MIPMAP_LINEAR, "wrapS": CLAMP_TO_EDGE, "wrapT": CLAMP_TO_EDGE}
+        ],
         "bufferViews": views,
         "buffers": [{"byteLength": offset}],
-    }  # fmt: skip
+    }
+    if textures == "webp":
+        document |= {"extensionsUsed": [WEBP], "extensionsRequired": [WEBP]}
     text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
     total = 12 + 8 + len(text) + 8 + offset
     if total >= 1 << 32:
         raise ValueError(f"asset: expected less than 4 GiB, got {total} bytes; use smaller textures")
-    parts = [struct.pack("<4sII", b"glTF", 2, total), struct.pack("<I4s", len(text), b"JSON"), text,
-             struct.pack("<I4s", offset, b"BIN\0")]  # fmt: skip
+    parts = [
+        struct.pack("<4sII", b"glTF", 2, total),
+        struct.pack("<I4s", len(text), b"JSON"),
+        text,
+        struct.pack("<I4s", offset, b"BIN\0"),
+    ]
     for chunk in chunks:
         parts += [chunk, b"\0" * (-len(chunk) % 4)]
     return b"".join(parts)
+
+
+def _source(image: int, kind: str) -> dict:
+    """Where a texture finds its image; a viewer that does not know the extension finds none."""
+    return {"source": image} if kind == "png" else {"extensions": {WEBP: {"source": image}}}
 
 
 def _geometry(mesh) -> tuple[dict, list[bytes]]:
@@ -134,20 +176,34 @@ def _geometry(mesh) -> tuple[dict, list[bytes]]:
     faces = np.ascontiguousarray(mesh.faces.cpu().numpy(), dtype="<u4")
     accessors.append({"bufferView": len(arrays), "componentType": UINT, "count": faces.size, "type": "SCALAR"})
     chunks.append(faces.tobytes())
-    primitive = {"attributes": {name: k for k, name in enumerate(arrays)}, "indices": len(arrays),
-                 "material": 0, "mode": 4}  # fmt: skip
+    primitive = {
+        "attributes": {name: k for k, name in enumerate(arrays)},
+        "indices": len(arrays),
+        "material": 0,
+        "mode": 4,
+    }
     return {"accessors": accessors, "meshes": [{"name": "object", "primitives": [primitive]}]}, chunks
 
 
-def write_glb(path: str | os.PathLike, asset: Asset, *, extras: Mapping | None = None,
-              double_sided: bool | None = None) -> None:  # fmt: skip
+def write_glb(
+    path: str | os.PathLike,
+    asset: Asset,
+    *,
+    extras: Mapping | None = None,
+    double_sided: bool | None = None,
+    translation: Sequence[float] = (0.0, 0.0, 0.0),
+    textures: str = "png",
+) -> None:
     """Write ``asset`` (its mesh with normals, UV and tangents, and its textures) as a GLB: the whole file or nothing.
 
     extras: JSON values kept in ``asset.extras``, such as the recorded transform and the licence.  double_sided: None
-    writes false for a watertight mesh, true otherwise.  Raises TypeError, ValueError for an asset that lacks something
-    or is not finite, OSError where the file cannot be written.
+    writes false for a watertight mesh, true otherwise.  translation: of the node that holds the mesh, for places where
+    float32 vertices would lose their shape.  textures: ``png``, or ``webp``, lossless too, smaller, and required from a
+    viewer by ``EXT_texture_webp``.  Raises TypeError, ValueError for an asset that lacks something or is not finite,
+    OSError where the file cannot be written.
     """
-    write_bytes(path, glb_bytes(asset, extras=extras, double_sided=double_sided))
+    data = glb_bytes(asset, extras=extras, double_sided=double_sided, translation=translation, textures=textures)
+    write_bytes(path, data)
 
 
 def read_glb(path: str | os.PathLike, **limits: int) -> list[Asset]:

@@ -12,6 +12,7 @@ import json
 import math
 import os
 import struct
+from typing import NoReturn
 
 import numpy as np
 
@@ -19,11 +20,11 @@ from reli3d.io.files import InputError, read_bytes, shown
 
 DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 SHAPES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
-EXTENSIONS = {"KHR_materials_unlit", "KHR_mesh_quantization", "KHR_lights_punctual"}  # readable without doing anything
+EXTENSIONS = {"EXT_texture_webp", "KHR_materials_unlit", "KHR_mesh_quantization", "KHR_lights_punctual"}  # readable
 EMPTY = 1 << 20  # values of an accessor without a buffer view: all zero, and not limited by the file's size
 DEPTH = 256  # of the node tree
 TRIANGLES, STRIP, FAN = 4, 5, 6
-_KINDS = {list: "a list", dict: "an object", str: "a string"}
+_KINDS: dict[type, str] = {list: "a list", dict: "an object", str: "a string"}
 
 
 class Document:
@@ -44,11 +45,15 @@ class Document:
             self.fail("extensionsRequired", "expected names", needed)
         needed = set(needed)
         if not needed <= EXTENSIONS:
-            self.fail("extensionsRequired", "expected none that must be decoded", sorted(needed - EXTENSIONS),
-                      "export without compression or extensions")  # fmt: skip
+            self.fail(
+                "extensionsRequired",
+                "expected none that must be decoded",
+                sorted(needed - EXTENSIONS),
+                "export without compression or extensions",
+            )
         self._buffers: dict[int, bytes] = {}
 
-    def fail(self, field: str, expected: str, got: object, fix: str = "export the file again"):
+    def fail(self, field: str, expected: str, got: object, fix: str = "export the file again") -> NoReturn:
         """Raise the InputError of ``field``."""
         raise InputError(self.path, f"{field}: {expected}, got {shown(got)}; {fix}")
 
@@ -64,7 +69,7 @@ class Document:
             if value is None:
                 self.fail(field, "expected a value", None)
             self.fail(field, f"expected {_KINDS.get(kind, kind.__name__)}", value)
-        if kind is float and not math.isfinite(value):
+        if isinstance(value, float) and not math.isfinite(value):
             self.fail(field, "expected a finite number", value)
         return value
 
@@ -218,8 +223,10 @@ class Document:
             number = self.get(self.json, "scene", int, "scene", 0)
             roots = self.get(self.item("scenes", number, "scene"), "nodes", list, f"scenes[{number}].nodes", [])
         else:
-            lists = [self.get(self.item("nodes", k, "nodes"), "children", list, f"nodes[{k}].children", [])
-                     for k in range(len(nodes))]  # fmt: skip
+            lists = [
+                self.get(self.item("nodes", k, "nodes"), "children", list, f"nodes[{k}].children", [])
+                for k in range(len(nodes))
+            ]
             children = {c for items in lists for c in items if isinstance(c, int)}
             roots = [k for k in range(len(nodes)) if k not in children]
         stack = [(r, np.eye(4), 0) for r in reversed(roots)]
@@ -250,9 +257,11 @@ class Document:
             self.fail(f"{field}.rotation", "expected a unit quaternion", [x, y, z, w])
         x, y, z, w = x / norm, y / norm, z / norm, w / norm
         local = np.eye(4)
-        local[:3, :3] = [[1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-                         [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-                         [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)]]  # fmt: skip
+        local[:3, :3] = [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
         local[:3, :3] *= self.numbers(node, "scale", 3, f"{field}.scale", [1, 1, 1])
         local[:3, 3] = self.numbers(node, "translation", 3, f"{field}.translation", [0, 0, 0])
         return local

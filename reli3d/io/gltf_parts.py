@@ -25,8 +25,9 @@ MAX_SCALE = 1e6  # of a normal texture's slopes: beyond it float32 has only the 
 PLAIN = 4  # texels along a side of a texture without an image
 
 
-def read_parts(path: str | os.PathLike, *, max_bytes: int = 1 << 29, max_vertices: int = 20_000_000,
-               max_pixels: int = 1 << 26) -> list[Asset]:  # fmt: skip
+def read_parts(
+    path: str | os.PathLike, *, max_bytes: int = 1 << 29, max_vertices: int = 20_000_000, max_pixels: int = 1 << 26
+) -> list[Asset]:
     """See :func:`reli3d.io.glb.read_glb`.
 
     max_bytes: of the file.  max_vertices: in all meshes as placed.  max_pixels: of all images together.
@@ -48,8 +49,9 @@ def read_parts(path: str | os.PathLike, *, max_bytes: int = 1 << 29, max_vertice
                 parts.append(part)
                 vertices += len(part.mesh.vertices)
                 if vertices > max_vertices:
-                    document.fail(field, f"expected at most {max_vertices} vertices in all", vertices,
-                                  "simplify the mesh")  # fmt: skip
+                    document.fail(
+                        field, f"expected at most {max_vertices} vertices in all", vertices, "simplify the mesh"
+                    )
     if not parts:
         raise InputError(path, "expected triangles in its scene, got none; export a mesh")
     return parts
@@ -90,16 +92,17 @@ def _part(document: Document, materials: _Materials, primitive: dict, world: np.
     else:
         u, s, vt = np.linalg.svd(linear)
         normal = normal @ (u @ np.diag(1.0 / np.maximum(s, 1e-12 * s.max() + 1e-300)) @ vt).T  # inverse transpose
-    mesh = Mesh(_tensor(position), torch.from_numpy(np.ascontiguousarray(faces)), _tensor(_unit(normal)), _tensor(uv))
-    if not all(bool(torch.isfinite(t).all()) for t in (mesh.vertices, mesh.uv)):
+    vertices, normals, coordinates = _tensor(position), _tensor(_unit(normal)), _tensor(uv)
+    mesh = Mesh(vertices, torch.from_numpy(np.ascontiguousarray(faces)), normals, coordinates)
+    if not all(bool(torch.isfinite(t).all()) for t in (vertices, coordinates)):
         document.fail(f"{field}.attributes", "expected values within the range of float32", "an overflow")
     sign = 1.0 if np.linalg.det(linear) >= 0 else -1.0
     if tangent is None or not (np.linalg.norm(tangent[:, :3], axis=1) > 1e-6).all():
         return Asset(with_tangents(mesh), textures)
     direction = tangent[:, :3] @ linear.T
-    n = mesh.normals.double().numpy()
+    n = normals.double().numpy()
     direction -= n * (n * direction).sum(1, keepdims=True)
-    if not (np.linalg.norm(direction, axis=1) > 1e-9 * max(np.linalg.norm(linear), 1e-300)).all():
+    if not (np.linalg.norm(direction, axis=1) > 1e-9 * max(float(np.linalg.norm(linear)), 1e-300)).all():
         return Asset(with_tangents(mesh), textures)
     frame = np.concatenate([_unit(direction), np.where(tangent[:, 3:] < 0, -sign, sign)], 1)
     return Asset(Mesh(mesh.vertices, mesh.faces, mesh.normals, mesh.uv, _tensor(frame)), textures)
@@ -121,8 +124,8 @@ class _Materials:
 
     def __init__(self, document: Document, max_pixels: int):
         self.document, self.left, self.squares = document, max_pixels, max_pixels
-        self.made: dict[int | None, tuple[TextureSet, int]] = {}
-        self.images: dict[int, Tensor] = {}
+        self.made: dict[object, tuple[TextureSet, int]] = {}
+        self.images: dict[object, Tensor] = {}
 
     def textures(self, index: object, field: str) -> tuple[TextureSet, int]:
         """Texture set of a material and the UV channel it uses."""
@@ -138,33 +141,50 @@ class _Materials:
         color = numbers(pbr, "baseColorFactor", 4, f"{where}.baseColorFactor", [1, 1, 1, 1])[:3]
         roughness = get(pbr, "roughnessFactor", float, f"{where}.roughnessFactor", 1.0)
         metallic = get(pbr, "metallicFactor", float, f"{where}.metallicFactor", 1.0)
-        slots = [(pbr, "baseColorTexture", where), (pbr, "metallicRoughnessTexture", where),
-                 (material, "normalTexture", field)]  # fmt: skip
-        images, channels, scale = [], set(), 1.0
+        slots = [
+            (pbr, "baseColorTexture", where),
+            (pbr, "metallicRoughnessTexture", where),
+            (material, "normalTexture", field),
+        ]
+        images: list[Tensor | None] = []
+        channels: set[int] = set()
+        scale = 1.0
         for node, key, place in slots:
             info = get(node, key, dict, f"{place}.{key}", {}) if key in node else None
             if info is None:
                 images.append(None)
                 continue
             if "KHR_texture_transform" in get(info, "extensions", dict, f"{place}.{key}.extensions", {}):
-                self.document.fail(f"{place}.{key}", "expected UV without KHR_texture_transform", "one",
-                                   "apply the transform to the UV")  # fmt: skip
+                self.document.fail(
+                    f"{place}.{key}",
+                    "expected UV without KHR_texture_transform",
+                    "one",
+                    "apply the transform to the UV",
+                )
             channels.add(get(info, "texCoord", int, f"{place}.{key}.texCoord", 0))
             if key == "normalTexture":
                 scale = get(info, "scale", float, f"{place}.{key}.scale", 1.0)
                 if abs(scale) > MAX_SCALE:
                     self.document.fail(f"{place}.{key}.scale", f"expected at most {MAX_SCALE:g}", scale)
             texture = self.document.item("textures", info.get("index"), f"{place}.{key}.index")
-            images.append(self._image(texture.get("source"), f"textures[{info['index']}].source"))
+            where_from = f"textures[{info['index']}].extensions"
+            webp = get(get(texture, "extensions", dict, where_from, {}), "EXT_texture_webp", dict, where_from, {})
+            source = webp.get("source", texture.get("source"))
+            images.append(self._image(source, f"textures[{info['index']}].source"))
         if len(channels) > 1:
-            self.document.fail(field, "expected one UV channel for all textures", sorted(channels),
-                               "bake to one UV channel")  # fmt: skip
+            self.document.fail(
+                field, "expected one UV channel for all textures", sorted(channels), "bake to one UV channel"
+            )
         size = max((max(i.shape[:2]) for i in images if i is not None), default=PLAIN)
         if size > PLAIN:
             self.squares -= size * size
             if self.squares < 0:
-                self.document.fail(field, "expected smaller textures: images are made square, for each material", size,
-                                   "use smaller textures or fewer materials")  # fmt: skip
+                self.document.fail(
+                    field,
+                    "expected smaller textures: images are made square, for each material",
+                    size,
+                    "use smaller textures or fewer materials",
+                )
         base, orm, normal = (_square(i, size) for i in images)
         factor = torch.tensor(color).clamp(0.0, 1.0)
         base = linear_to_srgb((srgb_to_linear(base) if base is not None else torch.ones(size, size, 3)) * factor)
@@ -189,15 +209,21 @@ class _Materials:
                 warnings.simplefilter("ignore")
                 with Image.open(io.BytesIO(data), formats=FORMATS) as image:
                     if not 0 < math.prod(image.size) <= self.left:
-                        self.document.fail(where, f"expected at most {self.left} more pixels in all", image.size,
-                                           "use smaller textures")  # fmt: skip
+                        self.document.fail(
+                            where,
+                            f"expected at most {self.left} more pixels in all",
+                            image.size,
+                            "use smaller textures",
+                        )
                     self.left -= math.prod(image.size)
                     pixels = np.asarray(image.convert("RGB"))
         except InputError:
             raise
         except Exception as error:  # on a broken file decoders raise almost anything: struct.error, IndexError ...
-            raise InputError(self.document.path, f"{where}: expected a PNG, JPEG or WebP image, "
-                             f"got {shown(str(error))}; save the image again") from None  # fmt: skip
+            raise InputError(
+                self.document.path,
+                f"{where}: expected a PNG, JPEG or WebP image, got {shown(str(error))}; save the image again",
+            ) from None
         self.images[index] = torch.from_numpy(pixels.astype(np.float32)) / 255.0
         return self.images[index]
 
@@ -206,6 +232,7 @@ def _square(image: Tensor | None, size: int) -> Tensor | None:
     """``(size, size, 3)`` by bilinear interpolation, texel centres at +0.5."""
     if image is None or image.shape[:2] == (size, size):
         return image
-    resized = torch.nn.functional.interpolate(image.permute(2, 0, 1)[None], (size, size), mode="bilinear",
-                                              align_corners=False)  # fmt: skip
+    resized = torch.nn.functional.interpolate(
+        image.permute(2, 0, 1)[None], (size, size), mode="bilinear", align_corners=False
+    )
     return resized[0].permute(1, 2, 0).contiguous()

@@ -1,11 +1,11 @@
 """Environment maps and other linear images: OpenEXR through the OpenEXR package, Radiance RGBE by our own code.
 
-Pixels are linear Rec. 709 radiance, row 0 at the top, +Y of an environment.  The centre column of an environment's
-file looks to +X and right of it lies +Z: so three.js, model-viewer and Blender place a lat-long map about a glTF.  In
-the program the centre column looks to -Z and right of it lies +X, as in the published release; the quarter turn between
-the two is done here and nowhere else.
-What a file may not hold is never written: NaN and negative values are refused, infinity and (in half precision) values
-above 65504 are clamped to 65504 and counted.  On reading, NaN is refused, negative values become 0 and infinity 65504.
+Pixels are linear Rec. 709 radiance, row 0 at the top, +Y of an environment.  The centre column of an environment's file
+looks to +X and right of it lies +Z, as three.js, model-viewer and Blender read it.  In the program the centre column
+looks to -Z and right of it lies +X, as in the published release.  The quarter turn is done here alone.
+
+NaN and negative values are never written: they are refused.  Infinity and, in half precision, values above 65504 are
+clamped to 65504 and counted.  On reading, NaN is refused, negative values become 0 and infinity 65504.
 """
 
 from __future__ import annotations
@@ -132,7 +132,7 @@ def _read_exr(path) -> np.ndarray:
     if header.width * header.height > MAX_PIXELS:
         size = f"{header.width} x {header.height}"
         raise InputError(path, f"size: expected at most {MAX_PIXELS} pixels, got {size}; scale the map down")
-    names = [n for n in ("R", "G", "B") if n in header.channels] or [n for n in ("Y",) if n in header.channels]
+    names = [n for n in "RGB" if n in header.channels] or [n for n in "Y" if n in header.channels]
     if len(names) not in (1, 3) or names == ["R"]:
         got = shown(sorted(header.channels))
         raise InputError(path, f"channels: expected R, G, B or Y, got {got}; save as plain RGB")
@@ -217,8 +217,8 @@ def _read_rgbe(path) -> np.ndarray:
             exposure *= _positive(path, "EXPOSURE", value)
     words = data[end + 2 : line_end].split()
     if len(words) != 4 or words[0] != b"-Y" or words[2] != b"+X" or not (words[1] + words[3]).isdigit():
-        line = data[end + 2 : line_end].decode("latin-1")
-        raise InputError(path, f"resolution: expected '-Y height +X width', got {shown(line)}; save the file again")
+        size = data[end + 2 : line_end].decode("latin-1")
+        raise InputError(path, f"resolution: expected '-Y height +X width', got {shown(size)}; save the file again")
     if len(words[1]) > 8 or len(words[3]) > 8 or not 0 < int(words[1]) * int(words[3]) <= MAX_PIXELS:
         size = f"{shown(words[3].decode())} x {shown(words[1].decode())}"
         raise InputError(path, f"resolution: expected 1 to {MAX_PIXELS} pixels, got {size}; scale the map down")

@@ -1,7 +1,8 @@
 """Photographs and masks in, PNG out.
 
 Colour is sRGB in [0, 1] as stored; alpha is straight (not premultiplied), and the colour under alpha 0 is kept.  Pixels
-are used as stored: an EXIF orientation is noted and not applied, because calibrated cameras refer to the stored pixels.
+are used as stored: an EXIF orientation is noted and not applied, because calibrated cameras refer to the stored pixels,
+unless the size they were calibrated for says that they refer to the turned ones.
 """
 
 from __future__ import annotations
@@ -9,11 +10,11 @@ from __future__ import annotations
 import io
 import os
 import warnings
-from threading import Lock
+from threading import BoundedSemaphore, Lock
 
 import numpy as np
 import torch
-from PIL import Image
+from PIL import Image, ImageOps
 from torch import Tensor
 
 from reli3d.io.files import InputError, file_size, shown, write_bytes
@@ -22,6 +23,10 @@ MAX_PIXELS = 1 << 26  # 64 MP: 256 MiB of RGBA, above any camera this is meant f
 MAX_BYTES = 1 << 29  # an uncompressed 16-bit RGBA image of MAX_PIXELS
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF")  # nothing that runs a program or unpacks streams of its own
 MAX_SCANS = 100  # progressive files have about ten; a thousand in a small file take minutes
+ORIENTATION = 0x0112  # of EXIF; 5 to 8 swap the sides
+ASPECT = 0.01  # relative difference up to which two sizes have the same aspect
+_TOP = {"L": 255, "RGB": 255, "RGBA": 255, "F": 65535}  # mode: the value that is 1
+_DECODING = BoundedSemaphore(2)  # pictures at a time: one of 24 MP takes 96 MB
 _OPENING = Lock()  # Python's warning filters are global; decoding runs outside
 _GREY = ("1", "L", "LA", "I;16", "I;16B", "I;16L", "I")
 _COLOUR = ("RGB", "RGBA", "P", "PA", "CMYK", "YCbCr")
@@ -30,9 +35,39 @@ _COLOUR = ("RGB", "RGBA", "P", "PA", "CMYK", "YCbCr")
 def read_image(path: str | os.PathLike, *, notes: list[str] | None = None) -> tuple[Tensor, Tensor | None]:
     """Colour ``(H, W, 3)`` in [0, 1], sRGB-encoded as stored, and straight alpha ``(H, W)`` in [0, 1] or None.
 
-    PNG, JPEG, WebP or TIFF; 8 bit, palette, grey, 16-bit grey; 16-bit colour comes down to 8 bit.  The size is checked
-    before a pixel is decoded.  What was done to the pixels is appended to ``notes``.
-    Raises InputError on anything else: another format, more than 64 MP, several frames, a truncated file.
+    As :func:`read_picture` reads it.
+    """
+    picture = read_picture(path, notes=notes)
+    alpha = torch.from_numpy(unit(picture.getchannel("A"))) if picture.mode == "RGBA" else None
+    return colour(picture), alpha
+
+
+def colour(picture: Image.Image) -> Tensor:
+    """Colour ``(H, W, 3)`` in [0, 1] of what :func:`read_picture` gives."""
+    values = unit(picture)
+    return torch.from_numpy(np.repeat(values[..., None], 3, -1) if values.ndim == 2 else values[..., :3].copy())
+
+
+def unit(picture: Image.Image) -> np.ndarray:
+    """Values of a picture, or of a channel of it, over their highest: float32 in [0, 1]."""
+    return np.divide(np.asarray(picture), np.float32(_TOP[picture.mode]), dtype=np.float32)
+
+
+def above(channel: Image.Image, limit: float) -> np.ndarray:
+    """``(H, W)`` bool: where a channel exceeds ``limit`` of its highest value."""
+    level = limit * _TOP[channel.mode]
+    return np.asarray(channel) > (level if channel.mode == "F" else np.uint8(level))  # no array of floats beside it
+
+
+def read_picture(
+    path: str | os.PathLike, *, notes: list[str] | None = None, calibrated: tuple[int, int] | None = None
+) -> Image.Image:
+    """A decoded picture of mode RGB, RGBA, L, or F for grey of 16 bits in [0, 65535].
+
+    PNG, JPEG, WebP or TIFF; 8 bit, palette, grey, CMYK, 16-bit grey; 16-bit colour comes down to 8 bit.  The size is
+    checked before a pixel is decoded.  What was done to the pixels is appended to ``notes``.  calibrated: width and
+    height that the camera file states; where only the picture turned by its EXIF orientation has that aspect, it is
+    turned.  Raises InputError on anything else: another format, more than 64 MP, several frames, a truncated file.
     """
     size = file_size(path)
     if size > MAX_BYTES:
@@ -42,8 +77,8 @@ def read_image(path: str | os.PathLike, *, notes: list[str] | None = None) -> tu
             warnings.simplefilter("error", Image.DecompressionBombWarning)
             warnings.simplefilter("ignore", UserWarning)  # broken EXIF or TIFF tags that the pixels do not need
             image = Image.open(path, formats=FORMATS)  # reads the header only
-        with image:
-            return _decoded(path, image, notes if notes is not None else [])
+        with image, _DECODING:
+            return _decoded(path, image, notes if notes is not None else [], calibrated)
     except InputError:
         raise
     except (Image.DecompressionBombError, Image.DecompressionBombWarning):
@@ -58,7 +93,7 @@ def read_image(path: str | os.PathLike, *, notes: list[str] | None = None) -> tu
         raise InputError(path, f"cannot be decoded ({shown(str(error))}); save the image again") from None
 
 
-def _decoded(path, image: Image.Image, notes: list[str]) -> tuple[Tensor, Tensor | None]:
+def _decoded(path, image: Image.Image, notes: list[str], calibrated: tuple[int, int] | None) -> Image.Image:
     width, height = image.size
     if width * height > MAX_PIXELS:
         raise InputError(path, f"expected at most {MAX_PIXELS} pixels, got {width} x {height}; scale the image down")
@@ -70,21 +105,27 @@ def _decoded(path, image: Image.Image, notes: list[str]) -> tuple[Tensor, Tensor
         raise InputError(path, f"expected at most {MAX_SCANS} scans, got {scans}; save the image again")
     if image.mode not in _GREY + _COLOUR:
         raise InputError(path, f"expected 8 or 16 bit grey or colour, got mode {image.mode}; save as 8 bit PNG")
-    orientation = image.getexif().get(0x0112, 1)
+    orientation = image.getexif().get(ORIENTATION, 1)
     if orientation not in (0, 1):
-        name = os.path.basename(path)
-        notes.append(f"{name}: EXIF orientation {shown(orientation)} not applied, cameras refer to stored pixels")
+        name = f"{os.path.basename(path)}: EXIF orientation {shown(orientation)}"
+        if calibrated and _aspect(calibrated, (height, width)) and not _aspect(calibrated, image.size):
+            notes.append(f"{name} applied: the camera file says {calibrated[0]} x {calibrated[1]} pixels")
+            image = ImageOps.exif_transpose(image)
+        else:
+            notes.append(f"{name} not applied, cameras refer to stored pixels")
     if image.mode.startswith("I"):
         grey = np.asarray(image).astype(np.float32)
         if image.mode == "I" and (grey.min() < 0 or grey.max() > 65535):
             raise InputError(path, "expected 8 or 16 bit grey, got 32 bit; save as 8 bit PNG")
-        return torch.from_numpy(np.repeat(grey[..., None] / np.float32(65535), 3, -1)), None
+        return Image.fromarray(grey)
     transparent = image.mode in ("LA", "PA", "RGBA") or "transparency" in image.info
-    wanted = "RGBA" if transparent else "RGB"
-    pixels = np.asarray(image if image.mode == wanted else image.convert(wanted))
-    # by numpy: this runs on several threads at once, each of which would start torch's own threads
-    rgb, alpha = (np.divide(part, np.float32(255), dtype=np.float32) for part in (pixels[..., :3], pixels[..., 3:]))
-    return torch.from_numpy(rgb), torch.from_numpy(alpha[..., 0]).contiguous() if transparent else None
+    wanted = "RGBA" if transparent else "L" if image.mode in ("1", "L") else "RGB"
+    image.load()
+    return image if image.mode == wanted else image.convert(wanted)
+
+
+def _aspect(a: tuple[int, int], b: tuple[int, int]) -> bool:
+    return abs(a[0] * b[1] / (a[1] * b[0]) - 1.0) <= ASPECT
 
 
 def _several(image: Image.Image) -> bool:

@@ -15,11 +15,15 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": f"-march=
 def pilot_kernel(
     start: int,
     # in
-    points: Points, light: Light, plan: Plan,
+    points: Points,
+    light: Light,
+    plan: Plan,
     # out
-    origins: wp.array2d(dtype=wp.vec3), directions: wp.array2d(dtype=wp.vec3), values: wp.array2d(dtype=wp.vec3),
+    origins: wp.array2d(dtype=wp.vec3),
+    directions: wp.array2d(dtype=wp.vec3),
+    values: wp.array2d(dtype=wp.vec3),
     densities: wp.array2d(dtype=wp.vec3),
-):  # fmt: skip
+):
     """Each sample's shadow ray, its value over q, and the densities of table, visible normals and cosine over q.
 
     q is the sum of counts times densities of the plan, whose visible normals are not in pairs.  Values and densities

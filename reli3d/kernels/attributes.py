@@ -30,11 +30,13 @@ def wrap(k: int, size: int) -> int:
 def interpolate2_kernel(
     start: int,
     # in
-    values: wp.array(dtype=wp.vec2), faces: wp.array2d(dtype=wp.int32), face: wp.array(dtype=wp.int32),
+    values: wp.array(dtype=wp.vec2),
+    faces: wp.array2d(dtype=wp.int32),
+    face: wp.array(dtype=wp.int32),
     bary: wp.array(dtype=wp.vec2),
     # out
     out: wp.array(dtype=wp.vec2),
-):  # fmt: skip
+):
     i = start + wp.tid()
     f = face[i]
     if f >= 0:
@@ -48,11 +50,13 @@ def interpolate2_kernel(
 def interpolate3_kernel(
     start: int,
     # in
-    values: wp.array(dtype=wp.vec3), faces: wp.array2d(dtype=wp.int32), face: wp.array(dtype=wp.int32),
+    values: wp.array(dtype=wp.vec3),
+    faces: wp.array2d(dtype=wp.int32),
+    face: wp.array(dtype=wp.int32),
     bary: wp.array(dtype=wp.vec2),
     # out
     out: wp.array(dtype=wp.vec3),
-):  # fmt: skip
+):
     i = start + wp.tid()
     f = face[i]
     if f >= 0:
@@ -66,11 +70,13 @@ def interpolate3_kernel(
 def interpolate4_kernel(
     start: int,
     # in
-    values: wp.array(dtype=wp.vec4), faces: wp.array2d(dtype=wp.int32), face: wp.array(dtype=wp.int32),
+    values: wp.array(dtype=wp.vec4),
+    faces: wp.array2d(dtype=wp.int32),
+    face: wp.array(dtype=wp.int32),
     bary: wp.array(dtype=wp.vec2),
     # out
     out: wp.array(dtype=wp.vec4),
-):  # fmt: skip
+):
     i = start + wp.tid()
     f = face[i]
     if f >= 0:
@@ -84,10 +90,12 @@ def interpolate4_kernel(
 def hit_normal_kernel(
     start: int,
     # in
-    vertices: wp.array(dtype=wp.vec3), faces: wp.array2d(dtype=wp.int32), face: wp.array(dtype=wp.int32),
+    vertices: wp.array(dtype=wp.vec3),
+    faces: wp.array2d(dtype=wp.int32),
+    face: wp.array(dtype=wp.int32),
     # out
     out: wp.array(dtype=wp.vec3),
-):  # fmt: skip
+):
     """Outward normal of a counter-clockwise face."""
     i = start + wp.tid()
     f = face[i]
@@ -104,12 +112,17 @@ def hit_normal_kernel(
 def reevaluate_kernel(
     start: int,
     # in
-    vertices: wp.array(dtype=wp.vec3), faces: wp.array2d(dtype=wp.int32), face: wp.array(dtype=wp.int32),
-    origins: wp.array(dtype=wp.vec3), directions: wp.array(dtype=wp.vec3), hit_t: wp.array(dtype=float),
+    vertices: wp.array(dtype=wp.vec3),
+    faces: wp.array2d(dtype=wp.int32),
+    face: wp.array(dtype=wp.int32),
+    origins: wp.array(dtype=wp.vec3),
+    directions: wp.array(dtype=wp.vec3),
+    hit_t: wp.array(dtype=float),
     hit_bary: wp.array(dtype=wp.vec2),
     # out
-    t: wp.array(dtype=float), bary: wp.array(dtype=wp.vec2),
-):  # fmt: skip
+    t: wp.array(dtype=float),
+    bary: wp.array(dtype=wp.vec2),
+):
     """Ray against the plane of a known face.  Moller and Trumbore 1997, without their early exits.
 
     A miss, and a face that the ray query cannot tell from one seen edge on, keep what the hit has, without gradient."""
@@ -136,10 +149,11 @@ def reevaluate_kernel(
 def sample_texture_kernel(
     start: int,
     # in
-    texture: wp.array2d(dtype=wp.vec3), uv: wp.array(dtype=wp.vec2),
+    texture: wp.array2d(dtype=wp.vec3),
+    uv: wp.array(dtype=wp.vec2),
     # out
     out: wp.array(dtype=wp.vec3),
-):  # fmt: skip
+):
     i = start + wp.tid()
     height = texture.shape[0]
     width = texture.shape[1]

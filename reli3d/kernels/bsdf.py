@@ -2,11 +2,9 @@
 
 f = T (1 - metallic) base / pi + D G2 F / (4 cos_o cos_i), F = F0 + (1 - F0)(1 - wo.wm)^5 (Schlick 1994),
 F0 = 0.04 for dielectrics and the base colour for metals.  Linear Rec. 709; values are 1/sr and lack the cosine.
-T is what the coat leaves to the paint.  ``conserving`` takes it at the surface, once on the way in and once on the way
-out, after Shirley et al. 1997: T = (1 - F(c_o)) (1 - F(c_i)), 1 - c = (1 - cos) / (1 + alpha), of the dielectric's F0:
-the whole is then the dielectric and the metal blended by ``metallic``, and so is its energy.  The published model
-and glTF 2.0's appendix B take T = 1 - F of the microfacet, with which paint and coat of a white dielectric together
-exceed 1 at grazing views (docs/renderer.md).
+T is what the coat leaves to the paint.  ``conserving``, after Shirley et al. 1997, with the dielectric's F0:
+T = (1 - F(c_o)) (1 - F(c_i)), 1 - c = (1 - cos) / (1 + alpha).
+``published``, as glTF 2.0's appendix B: T = 1 - F of the microfacet, which creates energy at grazing views.
 """
 
 import warp as wp
@@ -87,11 +85,15 @@ def pdf_lobes(facet: Facet, wo: wp.vec3, wi: wp.vec3) -> wp.vec3:
 def eval_bsdf_kernel(
     start: int,
     # in
-    wo: wp.array(dtype=wp.vec3), wi: wp.array(dtype=wp.vec3), base_color: wp.array(dtype=wp.vec3),
-    alpha: wp.array(dtype=float), metallic: wp.array(dtype=float), conserving: int,
+    wo: wp.array(dtype=wp.vec3),
+    wi: wp.array(dtype=wp.vec3),
+    base_color: wp.array(dtype=wp.vec3),
+    alpha: wp.array(dtype=float),
+    metallic: wp.array(dtype=float),
+    conserving: int,
     # out
     value: wp.array(dtype=wp.vec3),
-):  # fmt: skip
+):
     i = start + wp.tid()
     value[i] = wp.vec3(0.0, 0.0, 0.0)
     if wo[i][2] > COS_MIN and wi[i][2] > COS_MIN:
@@ -104,10 +106,12 @@ def eval_bsdf_kernel(
 def pdf_lobes_kernel(
     start: int,
     # in
-    wo: wp.array(dtype=wp.vec3), wi: wp.array(dtype=wp.vec3), alpha: wp.array(dtype=float),
+    wo: wp.array(dtype=wp.vec3),
+    wi: wp.array(dtype=wp.vec3),
+    alpha: wp.array(dtype=float),
     # out
     pdf: wp.array(dtype=wp.vec3),
-):  # fmt: skip
+):
     i = start + wp.tid()
     pdf[i] = wp.vec3(0.0, 0.0, 0.0)
     if wo[i][2] > COS_MIN and wi[i][2] > COS_MIN:

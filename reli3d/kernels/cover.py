@@ -38,11 +38,17 @@ def level_at(level: wp.array3d[float], cell: wp.vec3) -> float:
 def lacking_kernel(
     start: int,
     # in
-    level: wp.array3d[float], distance: wp.array3d[float], c2w: wp.array[wp.mat44], intrinsics: wp.array[wp.vec4],
-    radius: float, depth: float, reach: float, stride: int,
+    level: wp.array3d[float],
+    distance: wp.array3d[float],
+    c2w: wp.array[wp.mat44],
+    intrinsics: wp.array[wp.vec4],
+    radius: float,
+    depth: float,
+    reach: float,
+    stride: int,
     # out
     lacking: wp.array3d[float],  # (V, H // stride, W // stride)
-):  # fmt: skip
+):
     """By how much the least level along a pixel's ray exceeds ``-depth``; 0 outside the silhouette, and where it
     exceeds 0 by ``reach``.
     """
@@ -79,11 +85,17 @@ def lacking_kernel(
 def lower_kernel(
     start: int,
     # in
-    level: wp.array3d[float], bound: wp.array3d[float], lacking: wp.array3d[float], c2w: wp.array[wp.mat44],
-    intrinsics: wp.array[wp.vec4], radius: float, reach: float, stride: int,
+    level: wp.array3d[float],
+    bound: wp.array3d[float],
+    lacking: wp.array3d[float],
+    c2w: wp.array[wp.mat44],
+    intrinsics: wp.array[wp.vec4],
+    radius: float,
+    reach: float,
+    stride: int,
     # out
     lowered: wp.array3d[float],
-):  # fmt: skip
+):
     """Level less the most that the views' rays through a point lack, but not below the bound."""
     n = start + wp.tid()
     z = n % level.shape[2]

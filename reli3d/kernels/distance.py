@@ -41,9 +41,11 @@ def signed_distance(mesh: wp.uint64, point: wp.vec3, reach: float) -> float:
 def signed_distance_kernel(
     start: int,
     # in
-    mesh: wp.uint64, points: wp.array[wp.vec3], reach: float,
+    mesh: wp.uint64,
+    points: wp.array[wp.vec3],
+    reach: float,
     # out
     distance: wp.array[float],
-):  # fmt: skip
+):
     i = start + wp.tid()
     distance[i] = signed_distance(mesh, points[i], reach)

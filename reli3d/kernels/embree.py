@@ -46,9 +46,15 @@ return -1;
 """
 )
 def first_hit(
-    intersect1: wp.uint64, scene: wp.uint64, o: wp.vec3, d: wp.vec3, limit: float, i: int, t: wp.array(dtype=float),
+    intersect1: wp.uint64,
+    scene: wp.uint64,
+    o: wp.vec3,
+    d: wp.vec3,
+    limit: float,
+    i: int,
+    t: wp.array(dtype=float),
     bary: wp.array(dtype=wp.vec2),
-) -> int:  # fmt: skip
+) -> int:
     """Nearest face at t in [0, limit], -1 for none; a hit's t and the weights of vertices 1 and 2 go to place ``i``."""
     ...
 
@@ -96,9 +102,14 @@ for (int k = first; k < first + count;) {
 #endif
 """)
 def block_rays(
-    occluded16: wp.uint64, scene: wp.uint64, origins: wp.array(dtype=wp.vec3), directions: wp.array(dtype=wp.vec3),
-    first: int, count: int, t_max: wp.array(dtype=float),
-):  # fmt: skip
+    occluded16: wp.uint64,
+    scene: wp.uint64,
+    origins: wp.array(dtype=wp.vec3),
+    directions: wp.array(dtype=wp.vec3),
+    first: int,
+    count: int,
+    t_max: wp.array(dtype=float),
+):
     """Set ``t_max`` to -1 for those of ``count`` valid rays that meet anything before it; those below 0 are left out.
 
     In packets of 16, which pays for rays that leave from one place.
@@ -141,9 +152,14 @@ for (int i = 0; i < count; i++) {
 #endif
 """)
 def ray_keys(
-    origins: wp.array(dtype=wp.vec3), directions: wp.array(dtype=wp.vec3), low: wp.vec3, per_cell: wp.vec3, first: int,
-    count: int, key: wp.array(dtype=wp.int16),
-):  # fmt: skip
+    origins: wp.array(dtype=wp.vec3),
+    directions: wp.array(dtype=wp.vec3),
+    low: wp.vec3,
+    per_cell: wp.vec3,
+    first: int,
+    count: int,
+    key: wp.array(dtype=wp.int16),
+):
     """16 bits alike for rays that visit the same part of the tree: the direction's cell of 32 x 32 on an octahedron in
     Morton order (Morton 1966), then the origin's of 4 x 4 x 4 above ``low``.
 
@@ -168,11 +184,16 @@ def stretch_of(direction: wp.vec3) -> float:
 def embree_closest_kernel(
     start: int,
     # in
-    intersect1: wp.uint64, scene: wp.uint64, origins: wp.array(dtype=wp.vec3), directions: wp.array(dtype=wp.vec3),
+    intersect1: wp.uint64,
+    scene: wp.uint64,
+    origins: wp.array(dtype=wp.vec3),
+    directions: wp.array(dtype=wp.vec3),
     t_max: wp.array(dtype=float),
     # out
-    face: wp.array(dtype=wp.int32), t: wp.array(dtype=float), bary: wp.array(dtype=wp.vec2),
-):  # fmt: skip
+    face: wp.array(dtype=wp.int32),
+    t: wp.array(dtype=float),
+    bary: wp.array(dtype=wp.vec2),
+):
     i = start + wp.tid()
     o = origins[i]
     d = directions[i]
@@ -193,11 +214,14 @@ def embree_closest_kernel(
 def embree_occluded_kernel(
     start: int,
     # in
-    occluded1: wp.uint64, scene: wp.uint64, origins: wp.array(dtype=wp.vec3), directions: wp.array(dtype=wp.vec3),
+    occluded1: wp.uint64,
+    scene: wp.uint64,
+    origins: wp.array(dtype=wp.vec3),
+    directions: wp.array(dtype=wp.vec3),
     t_max: wp.array(dtype=float),
     # out
     occluded: wp.array(dtype=wp.bool),
-):  # fmt: skip
+):
     i = start + wp.tid()
     o = origins[i]
     d = directions[i]
@@ -212,10 +236,13 @@ def embree_occluded_kernel(
 def embree_clear_kernel(
     start: int,
     # in
-    occluded16: wp.uint64, scene: wp.uint64, origins: wp.array(dtype=wp.vec3), directions: wp.array(dtype=wp.vec3),
+    occluded16: wp.uint64,
+    scene: wp.uint64,
+    origins: wp.array(dtype=wp.vec3),
+    directions: wp.array(dtype=wp.vec3),
     # in and out
     t_max: wp.array(dtype=float),
-):  # fmt: skip
+):
     """``t_max`` becomes -1 where anything is met up to it; :data:`GROUP` rays a thread."""
     first = (start + wp.tid()) * GROUP
     block_rays(occluded16, scene, origins, directions, first, wp.min(GROUP, t_max.shape[0] - first), t_max)
@@ -225,10 +252,13 @@ def embree_clear_kernel(
 def ray_key_kernel(
     start: int,
     # in
-    origins: wp.array(dtype=wp.vec3), directions: wp.array(dtype=wp.vec3), low: wp.vec3, per_cell: wp.vec3,
+    origins: wp.array(dtype=wp.vec3),
+    directions: wp.array(dtype=wp.vec3),
+    low: wp.vec3,
+    per_cell: wp.vec3,
     # out
     key: wp.array(dtype=wp.int16),
-):  # fmt: skip
+):
     """:data:`RUN` rays a thread."""
     first = (start + wp.tid()) * RUN
     ray_keys(origins, directions, low, per_cell, first, wp.min(RUN, key.shape[0] - first), key)

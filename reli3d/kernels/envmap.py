@@ -156,10 +156,11 @@ def pdf_envmap_uv(density: wp.array2d(dtype=float), uv: wp.vec2) -> float:
 def lookup_envmap_kernel(
     start: int,
     # in
-    radiance: wp.array2d(dtype=wp.vec3), directions: wp.array(dtype=wp.vec3),
+    radiance: wp.array2d(dtype=wp.vec3),
+    directions: wp.array(dtype=wp.vec3),
     # out
     out: wp.array(dtype=wp.vec3),
-):  # fmt: skip
+):
     i = start + wp.tid()
     out[i] = lookup_envmap(radiance, directions[i])
 
@@ -168,11 +169,14 @@ def lookup_envmap_kernel(
 def lookup_adjoint_kernel(
     start: int,
     # in
-    first: int, radiance: wp.array2d(dtype=wp.vec3), directions: wp.array(dtype=wp.vec3),
+    first: int,
+    radiance: wp.array2d(dtype=wp.vec3),
+    directions: wp.array(dtype=wp.vec3),
     g_out: wp.array(dtype=wp.vec3),
     # out
-    g_radiance: wp.array2d(dtype=wp.vec3), g_directions: wp.array(dtype=wp.vec3),
-):  # fmt: skip
+    g_radiance: wp.array2d(dtype=wp.vec3),
+    g_directions: wp.array(dtype=wp.vec3),
+):
     """Adjoints of the lookups from ``first``; an output without rows is left out.  ``g_radiance`` is added to.
 
     u and v are angles: their slopes are those of atan2(x, -z) / 2 pi and atan2(sqrt(x^2 + z^2), y) / pi.
@@ -206,11 +210,16 @@ def lookup_adjoint_kernel(
 def sample_envmap_kernel(
     start: int,
     # in
-    rows: wp.array2d(dtype=float), columns: wp.array2d(dtype=float), row_guide: wp.array2d(dtype=wp.int32),
-    column_guide: wp.array2d(dtype=wp.int32), density: wp.array2d(dtype=float), u: wp.array(dtype=wp.vec2),
+    rows: wp.array2d(dtype=float),
+    columns: wp.array2d(dtype=float),
+    row_guide: wp.array2d(dtype=wp.int32),
+    column_guide: wp.array2d(dtype=wp.int32),
+    density: wp.array2d(dtype=float),
+    u: wp.array(dtype=wp.vec2),
     # out
-    directions: wp.array(dtype=wp.vec3), pdf: wp.array(dtype=float),
-):  # fmt: skip
+    directions: wp.array(dtype=wp.vec3),
+    pdf: wp.array(dtype=float),
+):
     i = start + wp.tid()
     drawn = sample_envmap(rows, columns, row_guide, column_guide, u[i])
     directions[i] = drawn.direction
@@ -221,9 +230,10 @@ def sample_envmap_kernel(
 def pdf_envmap_kernel(
     start: int,
     # in
-    density: wp.array2d(dtype=float), directions: wp.array(dtype=wp.vec3),
+    density: wp.array2d(dtype=float),
+    directions: wp.array(dtype=wp.vec3),
     # out
     pdf: wp.array(dtype=float),
-):  # fmt: skip
+):
     i = start + wp.tid()
     pdf[i] = pdf_envmap_uv(density, direction_to_uv(directions[i]))

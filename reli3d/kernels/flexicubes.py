@@ -48,8 +48,9 @@ def exact_position(at: wp.vec3i, shift: wp.array[wp.vec3], cubes: wp.vec3i, pad:
     i = wp.clamp(at[0] - pad, 0, cubes[0])
     j = wp.clamp(at[1] - pad, 0, cubes[1])
     k = wp.clamp(at[2] - pad, 0, cubes[2])
-    p = wp.vec3d(wp.float64(i) / wp.float64(cubes[0]), wp.float64(j) / wp.float64(cubes[1]),
-                 wp.float64(k) / wp.float64(cubes[2]))  # fmt: skip
+    p = wp.vec3d(
+        wp.float64(i) / wp.float64(cubes[0]), wp.float64(j) / wp.float64(cubes[1]), wp.float64(k) / wp.float64(cubes[2])
+    )
     if shift.shape[0] > 0:
         p += wp.vec3d(shift[(i * (cubes[1] + 1) + j) * (cubes[2] + 1) + k])
     return p
@@ -91,10 +92,14 @@ def column_bits(level: wp.array[float], index: int, step_x: int, step_y: int, ha
 def classify_kernel(
     start: int,
     # in
-    level: wp.array[float], nx: int, ny: int, nz: int,
+    level: wp.array[float],
+    nx: int,
+    ny: int,
+    nz: int,
     # out
-    codes: wp.array[wp.uint8], crossed: wp.array[wp.uint8],
-):  # fmt: skip
+    codes: wp.array[wp.uint8],
+    crossed: wp.array[wp.uint8],
+):
     """Case of every cube (0 where it is all inside), and which edges of a vertex have a quad: bit 0 y, 1 z, 2 x.
 
     An edge belongs to the end that comes first in EDGES: the low end along x and z, the high end along y.  A thread is
@@ -136,11 +141,17 @@ def classify_kernel(
 def resolve_kernel(
     start: int,
     # in
-    cells: wp.array[wp.int32], codes: wp.array[wp.uint8], neighbour: wp.array[wp.int32], count: wp.array[wp.int32],
-    ny: int, nz: int,
+    cells: wp.array[wp.int32],
+    codes: wp.array[wp.uint8],
+    neighbour: wp.array[wp.int32],
+    count: wp.array[wp.int32],
+    ny: int,
+    nz: int,
     # out
-    resolved: wp.array[wp.int32], counts: wp.array[wp.int32], slot: wp.array[wp.int32],
-):  # fmt: skip
+    resolved: wp.array[wp.int32],
+    counts: wp.array[wp.int32],
+    slot: wp.array[wp.int32],
+):
     """Case whose groups a surface cube uses: the complement's if both cubes at its ambiguous face would join there."""
     s = start + wp.tid()
     cell = cells[s]

@@ -34,8 +34,12 @@ def dual_vertex_adjoint_kernel(
             if group[resolved[s] * 12 + e] == own:
                 a = ends[2 * e]
                 b = ends[2 * e + 1]
-                ways = end_shares(weight(alpha, row, 8, a), level[corner_index(cell, a, ny, nz)],
-                                  weight(alpha, row, 8, b), level[corner_index(cell, b, ny, nz)])  # fmt: skip
+                ways = end_shares(
+                    weight(alpha, row, 8, a),
+                    level[corner_index(cell, a, ny, nz)],
+                    weight(alpha, row, 8, b),
+                    level[corner_index(cell, b, ny, nz)],
+                )
                 x_a = exact_position(at + wp.vec3i(a & 1, a >> 1 & 1, a >> 2), shift, cubes, pad)
                 x_b = exact_position(at + wp.vec3i(b & 1, b >> 1 & 1, b >> 2), shift, cubes, pad)
                 beta_e = wp.float64(weight(beta, row, 12, e))

@@ -1,11 +1,11 @@
 """Tables of dual marching cubes, generated from the topology of the cube.
 
 Corner k stands at (k & 1, k >> 1 & 1, k >> 2 & 1) in (x, y, z).  A case is the sum of ``1 << k`` over the inside
-corners. Every face of the cube with a sign change joins its crossed edges in pairs; the joined edges form closed
-loops, and each loop is one dual vertex (Nielson 2004, Dual Marching Cubes).  A face with four crossed edges is
-*ambiguous*: here its inside corners are kept apart from each other.  If both its pairs belong to one loop in the two
-cubes at the face, four quads would meet in one dual edge; both cubes then keep the outside corners apart instead,
-which parts the loops (cases C16 and C19 of Wenger 2013, Isosurfaces, as FlexiCubes, Shen et al. 2023, resolves them).
+corners.  A face joins its crossed edges in pairs; they form closed loops, and each loop is one dual vertex (Nielson
+2004, Dual Marching Cubes).
+
+A face with four crossed edges is ambiguous: its inside corners are kept apart.  Where four quads would meet in one dual
+edge, both cubes keep the outside corners apart (cases C16 and C19 of Wenger 2013, Isosurfaces; Shen et al. 2023).
 """
 
 from functools import lru_cache

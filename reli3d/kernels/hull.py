@@ -15,6 +15,12 @@ NEVER = wp.constant(65536.0)  # rows to a crossing where a column has none: beyo
 NEAR = wp.constant(4.0)  # pixels; beyond, other segments are at most sqrt(16.5) - 4 = 0.06 pixels nearer
 FAR = wp.constant(16.0)  # pixels; beyond, the end of a segment is at most 0.25 / 16 pixels farther than the segment
 BEHIND = wp.constant(-1.0e3)  # distance of a point that a camera cannot see, in world units: below that of any other
+REACHED = wp.constant(1.0e-3)  # a ray this close to the hull is on it, in world units
+CAREFUL = wp.constant(
+    0.7
+)  # share of the distance that a ray may go: distances are up to 1 / cos^2 of an angle too long
+STEP_MIN = wp.constant(4.0e-3)  # thinner parts of the hull may be missed
+STEP_MAX = wp.constant(0.25)
 DEPTH_MIN = wp.constant(1.0e-4)  # a point this close to a camera's plane counts as behind it
 
 
@@ -128,10 +134,11 @@ def row_kernel(
     # in
     row: wp.array3d[float],
     # scratch
-    apex: wp.array3d[wp.int32], begin: wp.array3d[float],
+    apex: wp.array3d[wp.int32],
+    begin: wp.array3d[float],
     # out
     nearest: wp.array3d[wp.int32],
-):  # fmt: skip
+):
     """Column whose crossing, at its ``row``, is the nearest one of all columns; -1 without any.  A thread is a row.
 
     Lower envelope of parabolas, Felzenszwalb and Huttenlocher 2012, Distance Transforms of Sampled Functions.
@@ -176,11 +183,15 @@ def row_kernel(
 def mask_distance_kernel(
     start: int,
     # in
-    mask: wp.array3d[float], row: wp.array3d[float], nearest_x: wp.array3d[wp.int32],
-    column: wp.array3d[float], nearest_y: wp.array3d[wp.int32], far: float,
+    mask: wp.array3d[float],
+    row: wp.array3d[float],
+    nearest_x: wp.array3d[wp.int32],
+    column: wp.array3d[float],
+    nearest_y: wp.array3d[wp.int32],
+    far: float,
     # out
     distance: wp.array3d[float],
-):  # fmt: skip
+):
     """Signed distance to the contour, ``far`` without one.
 
     The nearest crossing with any column (``row``, ``nearest_x``) or row (``column``, ``nearest_y``, both transposed)
@@ -226,20 +237,15 @@ def mask_distance_kernel(
         distance[view, y, x] = -wp.sqrt(best)
 
 
-@wp.kernel
-def hull_distance_kernel(
-    start: int,
-    # in
-    points: wp.array[wp.vec3], distance: wp.array3d[float], c2w: wp.array[wp.mat44], intrinsics: wp.array[wp.vec4],
-    # out
-    hull: wp.array[float],
-):  # fmt: skip
+@wp.func
+def distance_to_hull(
+    point: wp.vec3, distance: wp.array3d[float], c2w: wp.array[wp.mat44], intrinsics: wp.array[wp.vec4]
+) -> float:
     """Least over the views of the pixel distance at a point's image times the size of a pixel at its depth."""
-    i = start + wp.tid()
     best = wp.float32(-BEHIND)
     for view in range(c2w.shape[0]):
         m = c2w[view]
-        away = points[i] - wp.vec3(m[0, 3], m[1, 3], m[2, 3])
+        away = point - wp.vec3(m[0, 3], m[1, 3], m[2, 3])
         right = m[0, 0] * away[0] + m[1, 0] * away[1] + m[2, 0] * away[2]
         up = m[0, 1] * away[0] + m[1, 1] * away[1] + m[2, 1] * away[2]
         depth = -(m[0, 2] * away[0] + m[1, 2] * away[1] + m[2, 2] * away[2])
@@ -249,4 +255,69 @@ def hull_distance_kernel(
             best = wp.min(best, value * depth * 2.0 / (k[0] + k[1]))
         else:
             best = BEHIND
-    hull[i] = best
+    return best
+
+
+@wp.kernel
+def hull_distance_kernel(
+    start: int,
+    # in
+    points: wp.array[wp.vec3],
+    distance: wp.array3d[float],
+    c2w: wp.array[wp.mat44],
+    intrinsics: wp.array[wp.vec4],
+    # out
+    hull: wp.array[float],
+):
+    i = start + wp.tid()
+    hull[i] = distance_to_hull(points[i], distance, c2w, intrinsics)
+
+
+@wp.kernel
+def hull_span_kernel(
+    start: int,
+    # in
+    origins: wp.array[wp.vec3],
+    directions: wp.array[wp.vec3],
+    radius: float,
+    distance: wp.array3d[float],
+    c2w: wp.array[wp.mat44],
+    intrinsics: wp.array[wp.vec4],
+    # out
+    span: wp.array[wp.vec2],
+):
+    """Sphere tracing from both ends of the chord that a ray has in the sphere of ``radius`` around the origin."""
+    i = start + wp.tid()
+    o = origins[i]
+    d = directions[i]
+    a = wp.dot(d, d)
+    b = wp.dot(o, d)
+    half = wp.sqrt(wp.max(b * b - a * (wp.dot(o, o) - radius * radius), 0.0)) / a
+    low = -b / a - half
+    high = -b / a + half
+    unit = 1.0 / wp.sqrt(a)
+    nearest = wp.float32(low)  # where the ray comes closest to the hull: what a ray that misses it gets
+    best = wp.float32(BEHIND)
+    first = wp.float32(low)
+    inside = wp.bool(False)
+    while first <= high and not inside:
+        h = distance_to_hull(o + d * first, distance, c2w, intrinsics)
+        if h > best:
+            best = h
+            nearest = first
+        if h >= -REACHED:
+            inside = True
+        else:
+            first += wp.clamp(-h * CAREFUL, STEP_MIN, STEP_MAX) * unit
+    if not inside:
+        span[i] = wp.vec2(nearest, nearest)
+        return
+    last = wp.float32(high)
+    inside = wp.bool(False)
+    while last > first and not inside:
+        h = distance_to_hull(o + d * last, distance, c2w, intrinsics)
+        if h >= -REACHED:
+            inside = True
+        else:
+            last -= wp.clamp(-h * CAREFUL, STEP_MIN, STEP_MAX) * unit
+    span[i] = wp.vec2(first, wp.max(first, last))

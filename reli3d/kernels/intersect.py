@@ -46,11 +46,15 @@ def hit_occluded(mesh: wp.uint64, origin: wp.vec3, direction: wp.vec3, t_max: fl
 def closest_kernel(
     start: int,
     # in
-    mesh: wp.uint64, origins: wp.array(dtype=wp.vec3), directions: wp.array(dtype=wp.vec3),
+    mesh: wp.uint64,
+    origins: wp.array(dtype=wp.vec3),
+    directions: wp.array(dtype=wp.vec3),
     t_max: wp.array(dtype=float),
     # out
-    face: wp.array(dtype=wp.int32), t: wp.array(dtype=float), bary: wp.array(dtype=wp.vec2),
-):  # fmt: skip
+    face: wp.array(dtype=wp.int32),
+    t: wp.array(dtype=float),
+    bary: wp.array(dtype=wp.vec2),
+):
     i = start + wp.tid()
     o = origins[i]
     d = directions[i]
@@ -70,11 +74,13 @@ def closest_kernel(
 def occluded_kernel(
     start: int,
     # in
-    mesh: wp.uint64, origins: wp.array(dtype=wp.vec3), directions: wp.array(dtype=wp.vec3),
+    mesh: wp.uint64,
+    origins: wp.array(dtype=wp.vec3),
+    directions: wp.array(dtype=wp.vec3),
     t_max: wp.array(dtype=float),
     # out
     occluded: wp.array(dtype=wp.bool),
-):  # fmt: skip
+):
     i = start + wp.tid()
     o = origins[i]
     d = directions[i]
@@ -88,10 +94,13 @@ def occluded_kernel(
 def offset_origin_kernel(
     start: int,
     # in
-    position: wp.array(dtype=wp.vec3), ng: wp.array(dtype=wp.vec3), direction: wp.array(dtype=wp.vec3), scale: float,
+    position: wp.array(dtype=wp.vec3),
+    ng: wp.array(dtype=wp.vec3),
+    direction: wp.array(dtype=wp.vec3),
+    scale: float,
     # out
     origin: wp.array(dtype=wp.vec3),
-):  # fmt: skip
+):
     i = start + wp.tid()
     origin[i] = offset_origin(position[i], ng[i], direction[i], scale)
 
@@ -100,11 +109,17 @@ def offset_origin_kernel(
 def sight_kernel(
     start: int,
     # in
-    position: wp.array(dtype=wp.vec3), normal: wp.array(dtype=wp.vec3), c2w: wp.array(dtype=wp.mat44),
-    intrinsics: wp.array(dtype=wp.vec4), size: float, grazing: float,
+    position: wp.array(dtype=wp.vec3),
+    normal: wp.array(dtype=wp.vec3),
+    c2w: wp.array(dtype=wp.mat44),
+    intrinsics: wp.array(dtype=wp.vec4),
+    size: float,
+    grazing: float,
     # out
-    origin: wp.array(dtype=wp.vec3), direction: wp.array(dtype=wp.vec3), t_max: wp.array(dtype=float),
-):  # fmt: skip
+    origin: wp.array(dtype=wp.vec3),
+    direction: wp.array(dtype=wp.vec3),
+    t_max: wp.array(dtype=float),
+):
     """Ray from a point of a surface to a camera; ``t_max`` is -1 where the point looks away or lies off the image.
 
     A thread is a point and a camera, the camera running faster.

@@ -36,9 +36,7 @@ def tangent_frame(n: wp.vec3) -> wp.mat33:
         s = -1.0
     a = -1.0 / (s + n[2])
     b = n[0] * n[1] * a
-    return wp.mat33(1.0 + s * n[0] * n[0] * a, s * b, -s * n[0],
-                    b, s + n[1] * n[1] * a, -n[1],
-                    n[0], n[1], n[2])  # fmt: skip
+    return wp.mat33(1.0 + s * n[0] * n[0] * a, s * b, -s * n[0], b, s + n[1] * n[1] * a, -n[1], n[0], n[1], n[2])
 
 
 @wp.func

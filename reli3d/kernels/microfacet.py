@@ -120,10 +120,12 @@ def pdf_vndf_mirrored(facet: Facet, wo: wp.vec3) -> float:
 def sample_ggx_vndf_kernel(
     start: int,
     # in
-    wo: wp.array(dtype=wp.vec3), alpha: wp.array(dtype=float), u: wp.array(dtype=wp.vec2),
+    wo: wp.array(dtype=wp.vec3),
+    alpha: wp.array(dtype=float),
+    u: wp.array(dtype=wp.vec2),
     # out
     wm: wp.array(dtype=wp.vec3),
-):  # fmt: skip
+):
     i = start + wp.tid()
     width = wp.max(alpha[i], ALPHA_MIN)
     wm[i] = sample_ggx_vndf(stretch_view(wo[i], width), width, u[i])
@@ -133,9 +135,11 @@ def sample_ggx_vndf_kernel(
 def pdf_ggx_vndf_kernel(
     start: int,
     # in
-    wo: wp.array(dtype=wp.vec3), alpha: wp.array(dtype=float), wm: wp.array(dtype=wp.vec3),
+    wo: wp.array(dtype=wp.vec3),
+    alpha: wp.array(dtype=float),
+    wm: wp.array(dtype=wp.vec3),
     # out
     pdf: wp.array(dtype=float),
-):  # fmt: skip
+):
     i = start + wp.tid()
     pdf[i] = pdf_ggx_vndf(wo[i], wp.max(alpha[i], ALPHA_MIN), wm[i])

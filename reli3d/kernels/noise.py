@@ -71,10 +71,15 @@ def gradient_noise(q: wp.vec3, seed: wp.uint32) -> wp.vec4:
 def fbm_kernel(
     start: int,
     # in
-    points: wp.array[wp.vec3], octaves: int, gain: float, ridged: int, seed: int,
+    points: wp.array[wp.vec3],
+    octaves: int,
+    gain: float,
+    ridged: int,
+    seed: int,
     # out
-    value: wp.array[float], gradient: wp.array[wp.vec3],
-):  # fmt: skip
+    value: wp.array[float],
+    gradient: wp.array[wp.vec3],
+):
     i = start + wp.tid()
     q = points[i]
     total = wp.float32(0.0)
@@ -98,10 +103,13 @@ def fbm_kernel(
 def cells_kernel(
     start: int,
     # in
-    points: wp.array[wp.vec3], seed: int,
+    points: wp.array[wp.vec3],
+    seed: int,
     # out
-    distance: wp.array[wp.vec2], cell: wp.array[float], gradient: wp.array[wp.vec3],
-):  # fmt: skip
+    distance: wp.array[wp.vec2],
+    cell: wp.array[float],
+    gradient: wp.array[wp.vec3],
+):
     i = start + wp.tid()
     q = points[i]
     base = wp.vec3(wp.floor(q[0]), wp.floor(q[1]), wp.floor(q[2]))

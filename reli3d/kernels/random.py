@@ -72,10 +72,12 @@ def radical_inverse(index: int, base: int) -> float:
 def random_pair_kernel(
     start: int,
     # in
-    seed: int, sample: int, dimension: int,
+    seed: int,
+    sample: int,
+    dimension: int,
     # out
     u: wp.array(dtype=wp.vec2),
-):  # fmt: skip
+):
     i = start + wp.tid()
     u[i] = random_pair(seed, i, sample, dimension)
 
@@ -87,6 +89,6 @@ def halton_kernel(
     first: int,
     # out
     u: wp.array(dtype=wp.vec2),
-):  # fmt: skip
+):
     i = start + wp.tid()
     u[i] = wp.vec2(radical_inverse(first + i, 2), radical_inverse(first + i, 3))

@@ -34,14 +34,21 @@ def weight_on_segment(a: wp.vec2, b: wp.vec2, p: wp.vec2) -> float:
 def texels_kernel(
     start: int,
     # in
-    corners: wp.array2d(dtype=wp.vec2), face_start: wp.array(dtype=wp.int32), face_list: wp.array(dtype=wp.int32),
-    segment_start: wp.array(dtype=wp.int32), segment_list: wp.array(dtype=wp.int32), segments: wp.array(dtype=wp.int32),
-    size: int, tile: int, reach: float,
+    corners: wp.array2d(dtype=wp.vec2),
+    face_start: wp.array(dtype=wp.int32),
+    face_list: wp.array(dtype=wp.int32),
+    segment_start: wp.array(dtype=wp.int32),
+    segment_list: wp.array(dtype=wp.int32),
+    segments: wp.array(dtype=wp.int32),
+    size: int,
+    tile: int,
+    reach: float,
     # scratch
     distance: wp.array2d(dtype=wp.float32),
     # out
-    face: wp.array2d(dtype=wp.int32), bary: wp.array2d(dtype=wp.vec2),
-):  # fmt: skip
+    face: wp.array2d(dtype=wp.int32),
+    bary: wp.array2d(dtype=wp.vec2),
+):
     """Fill tile ``i``: the first face over a texel's centre; else the nearest border segment within ``reach`` texels.
 
     ``segments`` holds 3 * face + corner of each edge on a border.  ``bary`` weighs vertices 1 and 2.
@@ -119,11 +126,14 @@ def texels_kernel(
 def coverage_kernel(
     start: int,
     # in
-    corners: wp.array2d(dtype=wp.vec2), face_start: wp.array(dtype=wp.int32), face_list: wp.array(dtype=wp.int32),
-    size: int, tile: int,
+    corners: wp.array2d(dtype=wp.vec2),
+    face_start: wp.array(dtype=wp.int32),
+    face_list: wp.array(dtype=wp.int32),
+    size: int,
+    tile: int,
     # out
     hits: wp.array2d(dtype=wp.uint8),
-):  # fmt: skip
+):
     """Number of faces, 255 at most, whose interior holds each centre of tile ``i``."""
     i = start + wp.tid()
     tiles = (size + tile - 1) / tile
@@ -160,11 +170,16 @@ def coverage_kernel(
 def attributes_kernel(
     start: int,
     # in
-    texel: wp.array(dtype=wp.int64), face: wp.array(dtype=wp.int32), bary: wp.array(dtype=wp.vec2),
-    faces: wp.array2d(dtype=wp.int32), vertices: wp.array(dtype=wp.vec3), normals: wp.array(dtype=wp.vec3),
+    texel: wp.array(dtype=wp.int64),
+    face: wp.array(dtype=wp.int32),
+    bary: wp.array(dtype=wp.vec2),
+    faces: wp.array2d(dtype=wp.int32),
+    vertices: wp.array(dtype=wp.vec3),
+    normals: wp.array(dtype=wp.vec3),
     # out
-    position: wp.array(dtype=wp.vec3), normal: wp.array(dtype=wp.vec3),
-):  # fmt: skip
+    position: wp.array(dtype=wp.vec3),
+    normal: wp.array(dtype=wp.vec3),
+):
     """Interpolated position and unit normal at the listed texels; the normal of vertex 0 where they cancel."""
     i = start + wp.tid()
     t = texel[i]
@@ -185,11 +200,14 @@ def attributes_kernel(
 def tangents_kernel(
     start: int,
     # in
-    texel: wp.array(dtype=wp.int64), face: wp.array(dtype=wp.int32), bary: wp.array(dtype=wp.vec2),
-    faces: wp.array2d(dtype=wp.int32), tangents: wp.array(dtype=wp.vec4),
+    texel: wp.array(dtype=wp.int64),
+    face: wp.array(dtype=wp.int32),
+    bary: wp.array(dtype=wp.vec2),
+    faces: wp.array2d(dtype=wp.int32),
+    tangents: wp.array(dtype=wp.vec4),
     # out
     tangent: wp.array(dtype=wp.vec4),
-):  # fmt: skip
+):
     """Interpolated unit tangent at the listed texels with the sign w of vertex 0."""
     i = start + wp.tid()
     t = texel[i]
@@ -205,13 +223,36 @@ def tangents_kernel(
 
 
 @wp.kernel
+def values_kernel(
+    start: int,
+    # in
+    texel: wp.array(dtype=wp.int64),
+    face: wp.array(dtype=wp.int32),
+    bary: wp.array(dtype=wp.vec2),
+    faces: wp.array2d(dtype=wp.int32),
+    values: wp.array2d(dtype=wp.float32),
+    # out
+    value: wp.array2d(dtype=wp.float32),
+):
+    """Interpolated numbers of the vertices at the listed texels."""
+    i = start + wp.tid()
+    t = texel[i]
+    f = face[t]
+    w = bary[t]
+    for k in range(values.shape[1]):
+        first = (1.0 - w[0] - w[1]) * values[faces[f, 0], k]
+        value[i, k] = first + w[0] * values[faces[f, 1], k] + w[1] * values[faces[f, 2], k]
+
+
+@wp.kernel
 def nearest_row_kernel(
     start: int,
     # in
-    valid: wp.array2d(dtype=wp.uint8), strip: int,
+    valid: wp.array2d(dtype=wp.uint8),
+    strip: int,
     # out
     row: wp.array2d(dtype=wp.int32),
-):  # fmt: skip
+):
     """Row of the nearest valid texel of the same column, the upper of two; -1 without one.
 
     A thread works on ``strip`` columns: contiguous reads.
@@ -245,10 +286,12 @@ def nearest_texel_kernel(
     # in
     row: wp.array2d(dtype=wp.int32),
     # scratch
-    site: wp.array2d(dtype=wp.int32), border: wp.array2d(dtype=wp.float32),
+    site: wp.array2d(dtype=wp.int32),
+    border: wp.array2d(dtype=wp.float32),
     # out
-    source: wp.array2d(dtype=wp.int32), square: wp.array2d(dtype=wp.float32),
-):  # fmt: skip
+    source: wp.array2d(dtype=wp.int32),
+    square: wp.array2d(dtype=wp.float32),
+):
     """Flat index and squared distance of the nearest valid texel for every texel of row ``i``; -1 and inf without one.
 
     Lower envelope of parabolas, Felzenszwalb and Huttenlocher 2012 (Distance transforms of sampled functions).
@@ -294,10 +337,13 @@ def nearest_texel_kernel(
 def fill_kernel(
     start: int,
     # in
-    source: wp.array(dtype=wp.int32), square: wp.array(dtype=wp.float32), limit: float, channels: int,
+    source: wp.array(dtype=wp.int32),
+    square: wp.array(dtype=wp.float32),
+    limit: float,
+    channels: int,
     # in and out
     values: wp.array2d(dtype=wp.float32),
-):  # fmt: skip
+):
     """Copy the channels of ``source[i]`` to texel ``i``, which differ where it is not valid, up to a distance."""
     i = start + wp.tid()
     j = source[i]

@@ -174,12 +174,16 @@ def eval_reni(
 def eval_reni_kernel(
     start: int,
     # in
-    latent: wp.array(dtype=wp.vec2), first: wp.array(dtype=Part), matrices: wp.array(dtype=Part),
-    vectors: wp.array(dtype=Row), last: wp.array(dtype=Row), offset: wp.array(dtype=wp.vec3),
+    latent: wp.array(dtype=wp.vec2),
+    first: wp.array(dtype=Part),
+    matrices: wp.array(dtype=Part),
+    vectors: wp.array(dtype=Row),
+    last: wp.array(dtype=Row),
+    offset: wp.array(dtype=wp.vec3),
     direction: wp.array(dtype=wp.vec3),
     # out
     radiance: wp.array(dtype=wp.vec3),
-):  # fmt: skip
+):
     i = start + wp.tid()
     radiance[i] = eval_reni(latent, first, matrices, vectors, last, offset[0], direction[i])
 
@@ -188,11 +192,16 @@ def eval_reni_kernel(
 def decode_reni_kernel(
     start: int,
     # in
-    latent: wp.array(dtype=wp.vec2), first: wp.array(dtype=Part), matrices: wp.array(dtype=Part),
-    vectors: wp.array(dtype=Row), last: wp.array(dtype=Row), offset: wp.array(dtype=wp.vec3), height: int,
+    latent: wp.array(dtype=wp.vec2),
+    first: wp.array(dtype=Part),
+    matrices: wp.array(dtype=Part),
+    vectors: wp.array(dtype=Row),
+    last: wp.array(dtype=Row),
+    offset: wp.array(dtype=wp.vec3),
+    height: int,
     # out
     radiance: wp.array(dtype=wp.vec3),
-):  # fmt: skip
+):
     i = start + wp.tid()
     u = (float(i % (2 * height)) + 0.5) / float(2 * height)
     v = (float(i // (2 * height)) + 0.5) / float(height)

@@ -63,6 +63,6 @@ def sample_cosine_kernel(
     u: wp.array(dtype=wp.vec2),
     # out
     wi: wp.array(dtype=wp.vec3),
-):  # fmt: skip
+):
     i = start + wp.tid()
     wi[i] = sample_cosine(u[i])

@@ -129,11 +129,13 @@ def shade_lobe(
 def eval_sg_kernel(
     start: int,
     # in
-    axis: wp.array(dtype=wp.vec3), sharpness: wp.array(dtype=float), amplitude: wp.array(dtype=wp.vec3),
+    axis: wp.array(dtype=wp.vec3),
+    sharpness: wp.array(dtype=float),
+    amplitude: wp.array(dtype=wp.vec3),
     directions: wp.array(dtype=wp.vec3),
     # out
     out: wp.array(dtype=wp.vec3),
-):  # fmt: skip
+):
     i = start + wp.tid()
     total = wp.vec3(0.0, 0.0, 0.0)
     for k in range(axis.shape[0]):
@@ -145,11 +147,13 @@ def eval_sg_kernel(
 def irradiance_sg_kernel(
     start: int,
     # in
-    axis: wp.array(dtype=wp.vec3), sharpness: wp.array(dtype=float), amplitude: wp.array(dtype=wp.vec3),
+    axis: wp.array(dtype=wp.vec3),
+    sharpness: wp.array(dtype=float),
+    amplitude: wp.array(dtype=wp.vec3),
     normals: wp.array(dtype=wp.vec3),
     # out
     out: wp.array(dtype=wp.vec3),
-):  # fmt: skip
+):
     i = start + wp.tid()
     total = wp.vec3(0.0, 0.0, 0.0)
     for k in range(axis.shape[0]):
@@ -161,12 +165,17 @@ def irradiance_sg_kernel(
 def shade_sg_kernel(
     start: int,
     # in
-    normal: wp.array(dtype=wp.vec3), wo: wp.array(dtype=wp.vec3), base_color: wp.array(dtype=wp.vec3),
-    alpha: wp.array(dtype=float), metallic: wp.array(dtype=float), axis: wp.array(dtype=wp.vec3),
-    sharpness: wp.array(dtype=float), amplitude: wp.array(dtype=wp.vec3),
+    normal: wp.array(dtype=wp.vec3),
+    wo: wp.array(dtype=wp.vec3),
+    base_color: wp.array(dtype=wp.vec3),
+    alpha: wp.array(dtype=float),
+    metallic: wp.array(dtype=float),
+    axis: wp.array(dtype=wp.vec3),
+    sharpness: wp.array(dtype=float),
+    amplitude: wp.array(dtype=wp.vec3),
     # out
     out: wp.array(dtype=wp.vec3),
-):  # fmt: skip
+):
     i = start + wp.tid()
     a = wp.max(alpha[i], ALPHA_MIN)
     total = wp.vec3(0.0, 0.0, 0.0)

@@ -250,10 +250,15 @@ def sample_value(surface: Surface, plan: Plan, draw: Draw, light: wp.vec3) -> wp
 def shade_kernel(
     start: int,
     # in
-    points: Points, light: Light, plan: Plan, mesh: wp.uint64, shadows: int,
+    points: Points,
+    light: Light,
+    plan: Plan,
+    mesh: wp.uint64,
+    shadows: int,
     # out
-    out: wp.array(dtype=wp.vec3), visible: wp.array2d(dtype=wp.int32),
-):  # fmt: skip
+    out: wp.array(dtype=wp.vec3),
+    visible: wp.array2d(dtype=wp.int32),
+):
     """The fused estimator; shadow rays through Warp's BVH."""
     i = start + wp.tid()
     surface = make_surface(plan, points, i)

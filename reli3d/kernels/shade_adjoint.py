@@ -107,12 +107,19 @@ def add_sample_gradient(
 def shade_adjoint_kernel(
     start: int,
     # in
-    first: int, points: Points, light: Light, plan: Plan,
-    visible: wp.array2d(dtype=wp.int32), g_out: wp.array(dtype=wp.vec3),
+    first: int,
+    points: Points,
+    light: Light,
+    plan: Plan,
+    visible: wp.array2d(dtype=wp.int32),
+    g_out: wp.array(dtype=wp.vec3),
     # out
-    g_normal: wp.array(dtype=wp.vec3), g_base_color: wp.array(dtype=wp.vec3), g_alpha: wp.array(dtype=float),
-    g_metallic: wp.array(dtype=float), g_radiance: wp.array2d(dtype=wp.vec3),
-):  # fmt: skip
+    g_normal: wp.array(dtype=wp.vec3),
+    g_base_color: wp.array(dtype=wp.vec3),
+    g_alpha: wp.array(dtype=float),
+    g_metallic: wp.array(dtype=float),
+    g_radiance: wp.array2d(dtype=wp.vec3),
+):
     """Adjoints of the hits from ``first``; ``g_radiance`` is added to.  An output without rows is left out."""
     i = first + start + wp.tid()
     material = g_normal.shape[0] + g_base_color.shape[0] + g_alpha.shape[0] + g_metallic.shape[0]
@@ -124,8 +131,9 @@ def shade_adjoint_kernel(
             d = draw_sample(surface, plan, light, s)
             if d.factor > 0.0:  # one in the horizon may have been above it as the forward kernel rounds
                 radiance = lookup_envmap_uv(light.radiance, d.uv)
-                value = eval_bsdf(d.facet, surface.wo, d.wi, surface.base_color, surface.alpha, surface.metallic,
-                                  plan.conserving)  # fmt: skip
+                value = eval_bsdf(
+                    d.facet, surface.wo, d.wi, surface.base_color, surface.alpha, surface.metallic, plan.conserving
+                )
                 scale = d.factor * d.wi[2]
                 top = plan.clamp / float(d.count)
                 own = wp.vec3(0.0, 0.0, 0.0)  # the output's adjoint, 0 where the clamp held

@@ -15,11 +15,16 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": f"-march=
 def shade_rays_kernel(
     start: int,
     # in
-    first: int, points: Points, light: Light, plan: Plan,
+    first: int,
+    points: Points,
+    light: Light,
+    plan: Plan,
     # out
-    origins: wp.array(dtype=wp.vec3), directions: wp.array(dtype=wp.vec3), t_max: wp.array(dtype=float),
+    origins: wp.array(dtype=wp.vec3),
+    directions: wp.array(dtype=wp.vec3),
+    t_max: wp.array(dtype=float),
     values: wp.array(dtype=wp.vec3),
-):  # fmt: skip
+):
     """First half of the estimator for a chunk of hits: shadow rays (``t_max`` < 0 where none is needed) and values."""
     j = start + wp.tid()
     i = first + j
@@ -40,13 +45,19 @@ def shade_rays_kernel(
 def accumulate_kernel(
     start: int,
     # in
-    first: int, count: int, occluded16: wp.uint64, scene: wp.uint64, origins: wp.array(dtype=wp.vec3),
-    directions: wp.array(dtype=wp.vec3), values: wp.array(dtype=wp.vec3),
+    first: int,
+    count: int,
+    occluded16: wp.uint64,
+    scene: wp.uint64,
+    origins: wp.array(dtype=wp.vec3),
+    directions: wp.array(dtype=wp.vec3),
+    values: wp.array(dtype=wp.vec3),
     # in and out
     t_max: wp.array(dtype=float),
     # out
-    out: wp.array(dtype=wp.vec3), visible: wp.array2d(dtype=wp.int32),
-):  # fmt: skip
+    out: wp.array(dtype=wp.vec3),
+    visible: wp.array2d(dtype=wp.int32),
+):
     """Second half: the sum of a hit's values whose shadow rays nothing stops; ``t_max`` of the others becomes -1."""
     j = start + wp.tid()
     block_rays(occluded16, scene, origins, directions, j * count, count, t_max)

@@ -40,12 +40,18 @@ def line_range(from_: float, to: float, size: int) -> wp.vec2i:
 def outline_kernel(
     start: int,
     # in
-    vertices: wp.array(dtype=wp.vec3), edges: wp.array2d(dtype=wp.int32), c2w: wp.mat44, intrinsics: wp.vec4,
-    width: int, height: int,
+    vertices: wp.array(dtype=wp.vec3),
+    edges: wp.array2d(dtype=wp.int32),
+    c2w: wp.mat44,
+    intrinsics: wp.vec4,
+    width: int,
+    height: int,
     # out
-    outward: wp.array(dtype=float), steep: wp.array(dtype=wp.bool), first: wp.array(dtype=wp.int32),
+    outward: wp.array(dtype=float),
+    steep: wp.array(dtype=wp.bool),
+    first: wp.array(dtype=wp.int32),
     count: wp.array(dtype=wp.int32),
-):  # fmt: skip
+):
     """``outward``: 1 where the surface ends towards larger x (steep) or y, else -1.  ``count``: 0 for no outline."""
     i = start + wp.tid()
     eye = wp.vec3(c2w[0, 3], c2w[1, 3], c2w[2, 3])

@@ -56,11 +56,17 @@ def texel(planes: wp.array[vec8], base: int, x: int, y: int, height: int, width:
 def sample_kernel(
     start: int,
     # in
-    planes: wp.array[vec8], points: wp.array[wp.vec3], order: wp.array[wp.int32],
-    per_batch: int, height: int, width: int, blocks: int, split: int,
+    planes: wp.array[vec8],
+    points: wp.array[wp.vec3],
+    order: wp.array[wp.int32],
+    per_batch: int,
+    height: int,
+    width: int,
+    blocks: int,
+    split: int,
     # out
     features: wp.array[vec8],
-):  # fmt: skip
+):
     """A thread is a plane, a point and every ``split``-th block; points come by ``order`` if that has entries."""
     i = start + wp.tid()
     first = i % split
@@ -87,14 +93,20 @@ def sample_kernel(
             top = base + (y * width + x) * blocks
             bottom = top + width * blocks
             for q in range(first, blocks, split):
-                features[out + q] = (planes[top + q] * w00 + planes[top + blocks + q] * w01
-                                     + planes[bottom + q] * w10 + planes[bottom + blocks + q] * w11)  # fmt: skip
+                features[out + q] = (
+                    planes[top + q] * w00
+                    + planes[top + blocks + q] * w01
+                    + planes[bottom + q] * w10
+                    + planes[bottom + blocks + q] * w11
+                )
         else:
             for q in range(first, blocks, split):
-                features[out + q] = (texel(planes, base + q, x, y, height, width, blocks) * w00
-                                     + texel(planes, base + q, x + 1, y, height, width, blocks) * w01
-                                     + texel(planes, base + q, x, y + 1, height, width, blocks) * w10
-                                     + texel(planes, base + q, x + 1, y + 1, height, width, blocks) * w11)  # fmt: skip
+                features[out + q] = (
+                    texel(planes, base + q, x, y, height, width, blocks) * w00
+                    + texel(planes, base + q, x + 1, y, height, width, blocks) * w01
+                    + texel(planes, base + q, x, y + 1, height, width, blocks) * w10
+                    + texel(planes, base + q, x + 1, y + 1, height, width, blocks) * w11
+                )
     else:
         for q in range(first, blocks, split):
             features[out + q] = vec8()
@@ -119,13 +131,21 @@ def copy_row(planes: wp.array[float], slab: int, y: int, channels: int, height: 
 def sample_rows_kernel(
     start: int,
     # in
-    planes: wp.array[float], points: wp.array[wp.vec3], order: wp.array[wp.int32], edges: wp.array[wp.int32],
-    per_batch: int, channels: int, height: int, width: int, blocks: int, bands: int,
+    planes: wp.array[float],
+    points: wp.array[wp.vec3],
+    order: wp.array[wp.int32],
+    edges: wp.array[wp.int32],
+    per_batch: int,
+    channels: int,
+    height: int,
+    width: int,
+    blocks: int,
+    bands: int,
     # scratch
     scratch: wp.array[vec8],
     # out
     features: wp.array[vec8],
-):  # fmt: skip
+):
     """As :func:`sample_kernel` from channel-first planes: a thread is a band of rows of cells of a plane.
 
     It keeps the two rows of texels that a row of cells needs, channel-last, in its own ``scratch``, which stays in the
@@ -162,8 +182,12 @@ def sample_rows_kernel(
                 other = bottom + (x + 1) * blocks
                 out = (point * 3 + plane) * blocks
                 for q in range(blocks):
-                    features[out + q] = (scratch[one + q] * w00 + scratch[one + blocks + q] * w01
-                                         + scratch[other + q] * w10 + scratch[other + blocks + q] * w11)  # fmt: skip
+                    features[out + q] = (
+                        scratch[one + q] * w00
+                        + scratch[one + blocks + q] * w01
+                        + scratch[other + q] * w10
+                        + scratch[other + blocks + q] * w11
+                    )
     if band == bands - 1:
         for k in range(edges[slab * (height + 2) + height + 1], per_batch):
             out = ((order[slab * per_batch + k] + offset) * 3 + plane) * blocks
@@ -175,11 +199,16 @@ def sample_rows_kernel(
 def points_adjoint_kernel(
     start: int,
     # in
-    planes: wp.array[vec8], points: wp.array[wp.vec3], g_features: wp.array[vec8],
-    per_batch: int, height: int, width: int, blocks: int,
+    planes: wp.array[vec8],
+    points: wp.array[wp.vec3],
+    g_features: wp.array[vec8],
+    per_batch: int,
+    height: int,
+    width: int,
+    blocks: int,
     # out
     g_points: wp.array[wp.vec3],
-):  # fmt: skip
+):
     """Gradient of the features with respect to a point; one-sided, towards +, at a texel centre."""
     point = start + wp.tid()
     g = wp.vec3()
@@ -217,10 +246,14 @@ def points_adjoint_kernel(
 def cell_key_kernel(
     start: int,
     # in
-    points: wp.array[wp.vec3], per_batch: int, height: int, width: int, bins: int,
+    points: wp.array[wp.vec3],
+    per_batch: int,
+    height: int,
+    width: int,
+    bins: int,
     # out
     keys: wp.array[wp.int32],
-):  # fmt: skip
+):
     """``row * bins + bin``: the row of cells ``floor(y) + 1`` of a point in a plane, and which part of it.
 
     A row has ``bins`` parts; a point that misses the plane has the row ``height + 1``.
@@ -249,11 +282,19 @@ def add_texel(g_planes: wp.array[vec8], base: int, x: int, y: int, height: int, 
 def planes_adjoint_kernel(
     start: int,
     # in
-    points: wp.array[wp.vec3], g_features: wp.array[vec8], order: wp.array[wp.int32], edges: wp.array[wp.int32],
-    parity: int, split: int, per_batch: int, height: int, width: int, blocks: int,
+    points: wp.array[wp.vec3],
+    g_features: wp.array[vec8],
+    order: wp.array[wp.int32],
+    edges: wp.array[wp.int32],
+    parity: int,
+    split: int,
+    per_batch: int,
+    height: int,
+    width: int,
+    blocks: int,
     # out
     g_planes: wp.array[vec8],
-):  # fmt: skip
+):
     """A thread is a row of cells of a plane and every ``split``-th block; it adds that row's points to two texel rows.
 
     Only rows of one ``parity`` run in a launch, so no two threads share a row of texels.  ``order`` lists the points

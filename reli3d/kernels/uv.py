@@ -14,10 +14,11 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=n
 def normals_kernel(
     start: int,
     # in
-    points: wp.array(dtype=wp.vec3), faces: wp.array2d(dtype=wp.int32),
+    points: wp.array(dtype=wp.vec3),
+    faces: wp.array2d(dtype=wp.int32),
     # out
     normal: wp.array(dtype=wp.vec3),
-):  # fmt: skip
+):
     """Normals of the faces, length twice the area."""
     i = start + wp.tid()
     a = points[faces[i, 0]]

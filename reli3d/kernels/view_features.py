@@ -18,11 +18,29 @@ OUTSIDE = wp.constant(0.15)  # silhouette distances beyond this share of the ima
 TANH_FLAT = wp.constant(8.3)  # where tanh is 1 but for 1.2e-7, a float32 rounding
 
 
+@wp.struct
+class Viewed:
+    """Posed images, and N points that are looked up in them; points in space have no normals and no visibility."""
+
+    image: wp.array3d(dtype=wp.vec4)  # (V, S, S) sRGB and silhouette distance in pixels
+    c2w: wp.array(dtype=wp.mat44)  # (V,)
+    intrinsics: wp.array(dtype=wp.vec4)  # (V,)
+    points: wp.array(dtype=wp.vec3)  # (N,)
+    normal: wp.array(dtype=wp.vec3)  # (N,) or none
+    visible: wp.array2d(dtype=float)  # (N, V) or none
+
+
 @wp.func
 def view_numbers(
-    image: wp.array3d[wp.vec4], view: int, p: wp.vec3, q: wp.vec3, pose: wp.mat44, surface: int, visible: float,
+    image: wp.array3d[wp.vec4],
+    view: int,
+    p: wp.vec3,
+    q: wp.vec3,
+    pose: wp.mat44,
+    surface: int,
+    visible: float,
     normal: wp.vec3,
-):  # fmt: skip
+):
     """What a view says of ``p``, which it has at pixel and depth ``q``: colour, silhouette, depth, in the image, seen,
     facing, edge; and its share before the views' shares are made to sum to 1.
     """
@@ -49,11 +67,11 @@ def view_numbers(
 
 
 @wp.func
-def surface_point(surface: int, visible: wp.array2d[float], normal: wp.array[wp.vec3], n: int, view: int):
+def surface_point(viewed: Viewed, n: int, view: int):
     """Visibility and normal of point ``n``; of no meaning for a point in space."""
-    if surface == 0:
+    if viewed.normal.shape[0] == 0:
         return 0.0, wp.vec3()
-    return visible[n, view], normal[n]
+    return viewed.visible[n, view], viewed.normal[n]
 
 
 @wp.func
@@ -72,29 +90,23 @@ def write_summary(
 def view_summary_kernel(
     start: int,
     # in
-    image: wp.array3d[wp.vec4],  # (V, S, S) sRGB and silhouette distance in pixels
-    c2w: wp.array[wp.mat44],  # (V,)
-    intrinsics: wp.array[wp.vec4],  # (V,)
-    points: wp.array[wp.vec3],  # (N,)
-    surface: int,  # whether the points lie on a surface, so that the next two hold something
-    normal: wp.array[wp.vec3],  # (N,)
-    visible: wp.array2d[float],  # (N, V)
+    viewed: Viewed,
     # out
     own: wp.array3d[float],  # (N, V, 9) as view_numbers has them
     weight: wp.array2d[float],  # (N, V), sums to 1
     summary: wp.array2d[float],  # (N, 9) mean colour, its spread, least silhouette, greatest share, position
 ):
     n = start + wp.tid()
-    p = points[n]
+    p = viewed.points[n]
     total = wp.float32(0.0)
     greatest = wp.float32(0.0)
     least = wp.float32(1.0)
     color = wp.vec3(0.0, 0.0, 0.0)
-    for v in range(image.shape[0]):
-        pose = c2w[v]
-        q = project_point(p, pose, intrinsics[v])
-        seen, normal_n = surface_point(surface, visible, normal, n, v)
-        numbers, share = view_numbers(image, v, p, q, pose, surface, seen, normal_n)
+    for v in range(viewed.image.shape[0]):
+        pose = viewed.c2w[v]
+        q = project_point(p, pose, viewed.intrinsics[v])
+        seen, normal = surface_point(viewed, n, v)
+        numbers, share = view_numbers(viewed.image, v, p, q, pose, viewed.normal.shape[0], seen, normal)
         for k in range(9):
             own[n, v, k] = numbers[k]
         weight[n, v] = share
@@ -104,7 +116,7 @@ def view_summary_kernel(
         color += wp.vec3(numbers[0], numbers[1], numbers[2]) * share
     color /= total
     spread = wp.float32(0.0)
-    for v in range(image.shape[0]):
+    for v in range(viewed.image.shape[0]):
         share = weight[n, v] / total
         weight[n, v] = share
         away = wp.vec3(own[n, v, 0], own[n, v, 1], own[n, v, 2]) - color
@@ -133,24 +145,18 @@ def silu(x: vec8) -> vec8:
 def pool_views_kernel(
     start: int,
     # in
-    image: wp.array3d[wp.vec4],  # (V, S, S) sRGB and silhouette distance in pixels
+    viewed: Viewed,
     tokens: wp.array4d[vec8],  # (V, P, P, B) what the hidden layer makes of a token, with its bias
     own: wp.array2d[vec8],  # (9, B) what it makes of the numbers of view_numbers
-    c2w: wp.array[wp.mat44],  # (V,)
-    intrinsics: wp.array[wp.vec4],  # (V,)
-    points: wp.array[wp.vec3],  # (N,)
-    surface: int,  # whether the points lie on a surface, so that the next two hold something
-    normal: wp.array[wp.vec3],  # (N,)
-    visible: wp.array2d[float],  # (N, V)
     # out
     pooled: wp.array2d[vec8],  # (N, B) mean over the views of the hidden layer
     summary: wp.array2d[float],  # (N, 9) as of view_summary_kernel
 ):
     """The hidden layer of every view and its mean in one pass: nothing a view is written to memory."""
     n = start + wp.tid()
-    p = points[n]
+    p = viewed.points[n]
     blocks = own.shape[1]
-    scale = float(tokens.shape[1]) / float(image.shape[1])
+    scale = float(tokens.shape[1]) / float(viewed.image.shape[1])
     total = wp.float32(0.0)
     greatest = wp.float32(0.0)
     least = wp.float32(1.0)
@@ -158,11 +164,11 @@ def pool_views_kernel(
     spread = wp.float32(0.0)
     for b in range(blocks):
         pooled[n, b] = vec8()
-    for v in range(image.shape[0]):
-        pose = c2w[v]
-        q = project_point(p, pose, intrinsics[v])
-        seen, normal_n = surface_point(surface, visible, normal, n, v)
-        numbers, share = view_numbers(image, v, p, q, pose, surface, seen, normal_n)
+    for v in range(viewed.image.shape[0]):
+        pose = viewed.c2w[v]
+        q = project_point(p, pose, viewed.intrinsics[v])
+        seen, normal = surface_point(viewed, n, v)
+        numbers, share = view_numbers(viewed.image, v, p, q, pose, viewed.normal.shape[0], seen, normal)
         total += share
         greatest = wp.max(greatest, share)
         least = wp.min(least, numbers[3])
@@ -207,15 +213,10 @@ def color_logit(color: wp.vec4) -> wp.vec3:
 def fuse_views_kernel(
     start: int,
     # in
-    image: wp.array3d[wp.vec4],  # (V, S, S) sRGB and silhouette distance in pixels
+    viewed: Viewed,  # points of surfaces
     paint: wp.array3d[wp.vec4],  # (V, P, P) gain and shift of the colour's logit
-    surface: wp.array3d[wp.vec4],  # (V, P, P) confidence, roughness, metallic; 0
+    rough_metal: wp.array3d[wp.vec4],  # (V, P, P) confidence, roughness, metallic; 0
     bent: wp.array3d[wp.vec4],  # (V, P, P) normal; 0
-    c2w: wp.array[wp.mat44],  # (V,)
-    intrinsics: wp.array[wp.vec4],  # (V,)
-    points: wp.array[wp.vec3],  # (N,)
-    normal: wp.array[wp.vec3],  # (N,)
-    visible: wp.array2d[float],  # (N, V)
     # out
     logit: wp.array[wp.vec3],  # (N,)
     numbers: wp.array2d[float],  # (N, 10): roughness, metallic, gain, bend, facing, greatest share, confidence, spread
@@ -223,25 +224,26 @@ def fuse_views_kernel(
 ):
     """Means over the views of what they predict, weighted by the square of their share times exp(confidence)."""
     n = start + wp.tid()
-    p = points[n]
-    scale = float(paint.shape[1]) / float(image.shape[1])
+    p = viewed.points[n]
+    scale = float(paint.shape[1]) / float(viewed.image.shape[1])
+    normal = viewed.normal[n]
     total = wp.float32(0.0)
     greatest = wp.float32(0.0)
     mean = wp.vec3()
     spread = wp.float32(0.0)
     gain = wp.float32(0.0)
-    told = wp.vec4()
+    surface = wp.vec4()
     direction = wp.vec4()
-    for v in range(image.shape[0]):
-        pose = c2w[v]
-        q = project_point(p, pose, intrinsics[v])
-        seen, share = view_numbers(image, v, p, q, pose, 1, visible[n, v], normal[n])
+    for v in range(viewed.image.shape[0]):
+        pose = viewed.c2w[v]
+        q = project_point(p, pose, viewed.intrinsics[v])
+        seen, share = view_numbers(viewed.image, v, p, q, pose, 1, viewed.visible[n, v], normal)
         greatest = wp.max(greatest, share)
         x = q[0] * scale
         y = q[1] * scale
         change = look_up(paint, v, x, y)
-        own = look_up(surface, v, x, y)
-        weight = share * share * wp.exp(own[0])
+        of_view = look_up(rough_metal, v, x, y)
+        weight = share * share * wp.exp(of_view[0])
         color = color_logit(wp.vec4(seen[0], seen[1], seen[2], 0.0)) * change[0]
         color += wp.vec3(change[1], change[2], change[3])
         total += weight
@@ -249,18 +251,18 @@ def fuse_views_kernel(
         mean += away * (weight / total)  # Welford's update, as in pool_views_kernel
         spread += weight * wp.dot(away, color - mean)
         gain += weight * change[0]
-        told += own * weight
+        surface += of_view * weight
         direction += look_up(bent, v, x, y) * weight
-    unit = wp.vec3(direction[0], direction[1], direction[2]) / total + 1.0e-3 * normal[n]
+    unit = wp.vec3(direction[0], direction[1], direction[2]) / total + 1.0e-3 * normal
     unit = unit / wp.max(wp.length(unit), 1.0e-12)
     logit[n] = mean
     shading[n] = unit
-    numbers[n, 0] = told[1] / total
-    numbers[n, 1] = told[2] / total
+    numbers[n, 0] = surface[1] / total
+    numbers[n, 1] = surface[2] / total
     numbers[n, 2] = gain / total
     for k in range(3):
-        numbers[n, 3 + k] = unit[k] - normal[n][k]
-    numbers[n, 6] = wp.dot(unit, normal[n])
+        numbers[n, 3 + k] = unit[k] - normal[k]
+    numbers[n, 6] = wp.dot(unit, normal)
     numbers[n, 7] = greatest
-    numbers[n, 8] = told[0] / total
+    numbers[n, 8] = surface[0] / total
     numbers[n, 9] = wp.sqrt(wp.max(spread / total, 1.0e-6))

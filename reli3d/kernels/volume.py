@@ -108,11 +108,17 @@ def own_thickness(density: float, step: float) -> float:
 def count_samples_kernel(
     start: int,
     # in
-    occupied: wp.array3d(dtype=wp.uint8), origins: wp.array(dtype=wp.vec3), directions: wp.array(dtype=wp.vec3),
-    shift: wp.array(dtype=float), radius: float, step: float, near: float, far: float,
+    occupied: wp.array3d(dtype=wp.uint8),
+    origins: wp.array(dtype=wp.vec3),
+    directions: wp.array(dtype=wp.vec3),
+    shift: wp.array(dtype=float),
+    radius: float,
+    step: float,
+    near: float,
+    far: float,
     # out
     count: wp.array(dtype=wp.int32),
-):  # fmt: skip
+):
     i = start + wp.tid()
     o = origins[i]
     d = directions[i]
@@ -130,12 +136,19 @@ def count_samples_kernel(
 def emit_samples_kernel(
     start: int,
     # in
-    occupied: wp.array3d(dtype=wp.uint8), origins: wp.array(dtype=wp.vec3), directions: wp.array(dtype=wp.vec3),
-    shift: wp.array(dtype=float), radius: float, step: float, near: float, far: float,
+    occupied: wp.array3d(dtype=wp.uint8),
+    origins: wp.array(dtype=wp.vec3),
+    directions: wp.array(dtype=wp.vec3),
+    shift: wp.array(dtype=float),
+    radius: float,
+    step: float,
+    near: float,
+    far: float,
     first: wp.array(dtype=wp.int32),
     # out
-    ray: wp.array(dtype=wp.int32), t: wp.array(dtype=float),
-):  # fmt: skip
+    ray: wp.array(dtype=wp.int32),
+    t: wp.array(dtype=float),
+):
     i = start + wp.tid()
     row = first[i]
     end = first[i + 1]
@@ -156,11 +169,16 @@ def emit_samples_kernel(
 def composite_kernel(
     start: int,
     # in
-    density: wp.array(dtype=float), color: wp.array(dtype=wp.vec3), t: wp.array(dtype=float),
-    first: wp.array(dtype=wp.int32), step: float,
+    density: wp.array(dtype=float),
+    color: wp.array(dtype=wp.vec3),
+    t: wp.array(dtype=float),
+    first: wp.array(dtype=wp.int32),
+    step: float,
     # out
-    out: wp.array(dtype=wp.vec3), opacity: wp.array(dtype=float), depth: wp.array(dtype=float),
-):  # fmt: skip
+    out: wp.array(dtype=wp.vec3),
+    opacity: wp.array(dtype=float),
+    depth: wp.array(dtype=float),
+):
     """Emission and absorption, Max 1995: a sample counts ``T (1 - exp(-density step))`` of its colour and distance."""
     i = start + wp.tid()
     thickness = wp.float32(0.0)
@@ -183,10 +201,12 @@ def composite_kernel(
 def weights_kernel(
     start: int,
     # in
-    density: wp.array(dtype=float), first: wp.array(dtype=wp.int32), step: float,
+    density: wp.array(dtype=float),
+    first: wp.array(dtype=wp.int32),
+    step: float,
     # out
     weight: wp.array(dtype=float),
-):  # fmt: skip
+):
     """Only as far as light comes through: ``weight`` holds zeros before."""
     i = start + wp.tid()
     thickness = wp.float32(0.0)
@@ -202,12 +222,18 @@ def weights_kernel(
 def composite_adjoint_kernel(
     start: int,
     # in
-    density: wp.array(dtype=float), color: wp.array(dtype=wp.vec3), t: wp.array(dtype=float),
-    first: wp.array(dtype=wp.int32), step: float, g_out: wp.array(dtype=wp.vec3), g_opacity: wp.array(dtype=float),
+    density: wp.array(dtype=float),
+    color: wp.array(dtype=wp.vec3),
+    t: wp.array(dtype=float),
+    first: wp.array(dtype=wp.int32),
+    step: float,
+    g_out: wp.array(dtype=wp.vec3),
+    g_opacity: wp.array(dtype=float),
     g_depth: wp.array(dtype=float),
     # out
-    g_density: wp.array(dtype=float), g_color: wp.array(dtype=wp.vec3),
-):  # fmt: skip
+    g_density: wp.array(dtype=float),
+    g_color: wp.array(dtype=wp.vec3),
+):
     """Back to front: with e the adjoint of a sample's weight, d loss / d own thickness = T_after e - sum behind of w e.
 
     The thickness before a sample comes from the whole one by taking samples away; that one is below 2 OPAQUE, so the

@@ -5,11 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from reli3d._bridge import over_rows
 
 ROWS = 8192  # points at a time without gradient: their features stay in the cache, which halves the time of the heads
+
+
+def linear_of(layers: nn.Module, index: int) -> nn.Linear:
+    """Layer ``index`` of a stack, which is a linear one."""
+    layer = layers[index] if isinstance(layers, nn.Sequential) else None
+    if not isinstance(layer, nn.Linear):
+        raise TypeError(f"layers[{index}]: expected nn.Linear, got {type(layer).__name__}")
+    return layer
 
 
 def in_rows(evaluate: Callable[..., dict[str, Tensor]], *inputs: Tensor) -> dict[str, Tensor]:

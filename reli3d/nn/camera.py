@@ -1,4 +1,4 @@
-"""What the network is told about cameras: an embedding of each view's matrices, and Pluecker maps of its pixels.
+"""What the network is told about cameras: an embedding of each view's matrices.
 
 Camera-to-world matrices are 4x4 in OpenGL axes (+X right, +Y up, looking along -Z); intrinsics are fx, fy, cx, cy in
 pixels of the square input, pixel centres at +0.5.
@@ -19,22 +19,6 @@ def camera_vector(c2w: Tensor, intrinsics: Tensor, size: int) -> Tensor:
     zero, one = torch.zeros_like(fx), torch.ones_like(fx)
     normalised = torch.stack([fx, zero, cx, zero, fy, cy, zero, zero, one], dim=-1)
     return torch.cat([c2w.flatten(-2), normalised], dim=-1)
-
-
-def ray_maps(c2w: Tensor, intrinsics: Tensor, size: int) -> Tensor:
-    """Pluecker coordinates of the rays through the pixel centres, ``(..., 6, size, size)``: direction, moment.
-
-    The direction is unit and points away from the camera; the moment is origin x direction, whose length is the
-    distance of the ray from the world's origin.  Arguments as in :func:`camera_vector`.
-    """
-    pixel = torch.arange(size, device=c2w.device, dtype=c2w.dtype) + 0.5
-    fx, fy, cx, cy = (value[..., None, None] for value in intrinsics.unbind(-1))
-    x = ((pixel - cx) / fx).expand(*intrinsics.shape[:-1], size, size)
-    y = ((cy - pixel[:, None]) / fy).expand_as(x)
-    local = nn.functional.normalize(torch.stack([x, y, -torch.ones_like(x)], dim=-3), dim=-3)
-    direction = torch.einsum("...ij,...jhw->...ihw", c2w[..., :3, :3], local)
-    origin = c2w[..., :3, 3, None, None].expand_as(direction)
-    return torch.cat([direction, torch.linalg.cross(origin, direction, dim=-3)], dim=-3)
 
 
 class CameraEmbedder(nn.Module):

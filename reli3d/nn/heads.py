@@ -12,6 +12,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from reli3d.nn.blocks import linear_of
+
 ROUGHNESS_MIN = 0.1  # range [0.1, 1] of the published head
 NORMALIZE_EPS = 1.0e-7
 COLOR_MARGIN = 0.02  # keeps the logit of black and of clipped highlights within reach of a correction
@@ -48,11 +50,13 @@ def mlp(inputs: int, width: int, outputs: int, hidden: int) -> nn.Sequential:
     return nn.Sequential(*layers[:-1])
 
 
-def _rest(layers: nn.Sequential, x: Tensor) -> Tensor:
+def _rest(layers: nn.Module, x: Tensor) -> Tensor:
     """What :func:`mlp` makes of its first activation ``x (width, N)``, ``(outputs, N)``; without gradient."""
-    for layer in layers[2:]:
-        silu = isinstance(layer, nn.SiLU)
-        x = functional.silu(x, inplace=True) if silu else torch.addmm(layer.bias[:, None], layer.weight, x)
+    for layer in list(layers.children())[2:]:
+        if isinstance(layer, nn.Linear):
+            x = torch.addmm(layer.bias[:, None], layer.weight, x)
+        else:
+            x = functional.silu(x, inplace=True)
     return x
 
 
@@ -83,11 +87,8 @@ class Heads(nn.ModuleDict):
     def __init__(self, features: int, width: int):
         super().__init__({name: mlp(features, width, head.outputs, head.hidden) for name, head in HEADS.items()})
 
-    def forward(self, features: Tensor, names: Sequence[str], color: Tensor | None = None) -> dict[str, Tensor]:
-        """``{name: (..., outputs)}`` of features ``(..., features)``; values as :func:`activate` describes them.
-
-        color: ``(..., 3)`` a guess of the base colour, sRGB in [0, 1]; its head then corrects the guess's logit.
-        """
+    def forward(self, features: Tensor, names: Sequence[str]) -> dict[str, Tensor]:
+        """``{name: (..., outputs)}`` of features ``(..., features)``; values as :func:`activate` describes them."""
         for name in names:
             if name not in self:
                 raise ValueError(f"heads: expected some of {', '.join(self)}, got {name}")
@@ -95,8 +96,6 @@ class Heads(nn.ModuleDict):
             raw = {name: self[name](features) for name in names}
         else:
             raw = self._inferred(features, names)
-        if color is not None and "base_color" in raw:
-            raw["base_color"] = raw["base_color"] + color_logit(color)
         return {name: activate(name, value) for name, value in raw.items()}
 
     def _inferred(self, features: Tensor, names: Sequence[str]) -> dict[str, Tensor]:
@@ -108,7 +107,7 @@ class Heads(nn.ModuleDict):
 
     def first_layer(self, names: Sequence[str]) -> tuple[Tensor, Tensor]:
         """Weight ``(K, features)`` and bias ``(K,)`` of the first layers of the named heads, one below the other."""
-        first = [self[name][0] for name in names]
+        first = [linear_of(self[name], 0) for name in names]
         return torch.cat([layer.weight for layer in first]), torch.cat([layer.bias for layer in first])
 
     def after_first(self, hidden: Tensor, names: Sequence[str]) -> dict[str, Tensor]:
@@ -118,7 +117,7 @@ class Heads(nn.ModuleDict):
         A point is a column: products with 64 by 64 weights take half the time of points as rows.
         """
         functional.silu(hidden, inplace=True)
-        parts = hidden.split([self[name][0].out_features for name in names])
+        parts = hidden.split([linear_of(self[name], 0).out_features for name in names])
         return {name: _rest(self[name], part).T for name, part in zip(names, parts, strict=True)}
 
 

@@ -30,8 +30,10 @@ REPOSITORY = "StabilityLabs/ReLi3D"
 CHECKPOINT = "reli3d_final.ckpt"
 ENDPOINT = "https://huggingface.co"
 LICENCE = "Stability AI Community License, https://stability.ai/license"
-NOTICE = (f"The weights of {REPOSITORY} are not part of this package: they come under the {LICENCE}; "
-          "using them is accepting it.")  # fmt: skip
+NOTICE = (
+    f"The weights of {REPOSITORY} are not part of this package: they come under the {LICENCE}; "
+    "using them is accepting it."
+)
 TIMEOUT = 30.0  # seconds without a byte
 TRIES = 4  # in a row that bring nothing new
 WAIT = 2.0  # seconds before the second try; grows with each
@@ -109,8 +111,11 @@ def _fetched(link: _Link, remote: Remote, file, part: Path) -> str:
         file.seek(0)
         needed = 2 * remote.size - have  # the converted file is as long
         if free < needed:
-            raise WeightsError(part.parent, f"expected {needed / 1e9:.1f} GB of free space, got {free / 1e9:.1f}; set "
-                                            "RELI3D_WEIGHTS to another folder")  # fmt: skip
+            raise WeightsError(
+                part.parent,
+                f"expected {needed / 1e9:.1f} GB of free space, got {free / 1e9:.1f}; set "
+                "RELI3D_WEIGHTS to another folder",
+            )
         return _fill(link, remote, file)
     except BaseException:
         if remote.sha256 is None or file.seek(0, os.SEEK_END) == 0:
@@ -126,7 +131,9 @@ def _fill(link: _Link, remote: Remote, file) -> str:
         have += len(block)
     best, tries, problem = have, 0, ""
     name = remote.url.rsplit("/", 1)[1]
-    with tqdm(total=remote.size, initial=have, desc=name, unit="B", unit_scale=True, file=sys.stderr) as bar:
+    with tqdm(
+        total=remote.size, initial=have, desc=name, unit="B", unit_scale=True, file=sys.stderr, disable=None
+    ) as bar:
         while have < remote.size:
             if tries == TRIES:
                 raise WeightsError(remote.url, f"ended after {best} of {remote.size} bytes{problem}; run it again")

@@ -52,9 +52,11 @@ def initialise(model: nn.Module) -> None:
         elif isinstance(module, EnvironmentDecoder):
             _initialise_reni(module)
     for stream in (model.backbone, model.illumination.transformer):
-        _shrink([m.proj for m in stream.modules() if hasattr(m, "wq")]
-                + [m.to_out[0] for m in stream.modules() if hasattr(m, "to_q")]
-                + [m.net[2] for m in stream.modules() if hasattr(m, "net")])  # fmt: skip
+        _shrink(
+            [m.proj for m in stream.modules() if hasattr(m, "wq")]
+            + [m.to_out[0] for m in stream.modules() if hasattr(m, "to_q")]
+            + [m.net[2] for m in stream.modules() if hasattr(m, "net")]
+        )
     tokens = model.illumination.bank.embeddings
     nn.init.normal_(tokens, std=1.0 / math.sqrt(tokens.shape[1]))
 

@@ -8,6 +8,7 @@ varies with the normal.  The second needs no network: over many points the paint
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -26,6 +27,8 @@ class Shading:
     irradiance: Environment  # of the predicted light, over the normal
     observed: Tensor  # (9, 3) harmonics of the photographs' linear brightness over the normal, its mean 1
     palette: Tensor  # (12,) see :func:`palette_of`
+
+    WIDTH: ClassVar[int] = 24  # of :meth:`features`
 
     def features(self, normal: Tensor, color: Tensor) -> Tensor:
         """Normal, logarithms of the irradiance over pi and of the observed brightness, logit of the colour without

@@ -67,8 +67,8 @@ class LightMap(nn.Module):
         self.across = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in zip(widths[:-1], widths[1:], strict=True))
         self.up = nn.ModuleList(_Block(a, a) for a in widths[:-1])
         self.out = nn.Conv2d(widths[0], 3, 1)
-        nn.init.zeros_(self.out.weight)
-        nn.init.zeros_(self.out.bias)
+        for value in self.out.parameters():
+            nn.init.zeros_(value)
 
     def forward(self, radiance: Tensor, albedo: Tensor, gloss: Tensor, normal: Tensor, wo: Tensor) -> Tensor:
         """radiance, albedo: ``(N, 3)`` linear.  gloss: ``(N,)`` in [0, 1].  normal, wo: ``(N, 3)`` unit, world."""
@@ -79,8 +79,9 @@ class LightMap(nn.Module):
         level = (demodulated * facing[:, None]).sum(0) / facing.sum().clamp(min=1e-4)
         scale = 256.0 / max(1, len(radiance))  # weights do not depend on the resolution of the views
         at_mirror = texel_of(mirror, self.height)
-        shown, shown_weight = gathered(torch.cat([log - level, demodulated - level], -1),
-                                       facing * (0.05 + gloss) * scale, at_mirror, self.height)  # fmt: skip
+        shown, shown_weight = gathered(
+            torch.cat([log - level, demodulated - level], -1), facing * (0.05 + gloss) * scale, at_mirror, self.height
+        )
         under, under_weight = gathered(demodulated - level, facing * scale, texel_of(normal, self.height), self.height)
         y = map_directions(self.height, radiance.device)[..., 1][None]
         rest = torch.cat([y, y.square(), torch.ones_like(y) * level.mean()])

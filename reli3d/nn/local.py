@@ -10,26 +10,31 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from reli3d.geometry.projection import fuse_views, gather_views, summarize_views
-from reli3d.nn.blocks import in_rows
-from reli3d.nn.field import LIGHT_ROWS, PointMaterial, bound_level
+from reli3d.nn.blocks import in_rows, linear_of
+from reli3d.nn.field import Field, PointMaterial, bound_level
 from reli3d.nn.heads import ROUGHNESS_MIN, color_logit, mlp
 from reli3d.nn.light_features import Shading, brightness_at, brightness_over_normal, palette_of, unshaded
 from reli3d.nn.light_map import LightMap
-from reli3d.nn.presets import SHADING_FEATURES, LocalPreset
-from reli3d.nn.pyramid import ImagePyramid, place_of_pixels
-from reli3d.nn.view_features import ViewFeatures, ViewMaps
+from reli3d.nn.presets import LocalPreset
+from reli3d.nn.pyramid import ImagePyramid, place_of_pixels, span_of_pixels
+from reli3d.nn.view_features import AHEAD, ViewFeatures, ViewMaps, ahead_of_surface
 from reli3d.nn.volume import HULL_SCALE, FeatureVolume
+from reli3d.render.camera import Camera, image_plane
 from reli3d.render.color import srgb_to_linear
 from reli3d.render.environment import Environment
 
+LIGHT_ROWS = 16  # of the map from which the material is told its irradiance
 TOKEN_EXTRA = 4  # depth and world normal, beside the pyramid's features
+QUARTER = 4  # pixels of a view along a pixel that is asked for the hull
 FUSED = 10  # numbers of Fused beside the colour
+HEADS = 13  # numbers of LocalField.heads
 SHARPNESS = 2.0  # power of a view's share: the view that looks straightest speaks, with smooth seams
 
 
@@ -46,17 +51,19 @@ class PixelMaps:
     depth: Tensor  # (V, P, P, 1) along the camera's axis, from the world's origin
 
     @staticmethod
-    def of(raw: Tensor, c2w: Tensor, intrinsics: Tensor, size: int) -> PixelMaps:
-        """From the pyramid's 12 numbers ``(V, P, P, 12)``; ``intrinsics`` in pixels of the views, ``size`` wide."""
-        gain, shift, confidence, rough, metal, normal, depth = raw.split([1, 3, 1, 1, 1, 3, 2], -1)
-        side = raw.shape[1]
-        pixel = (torch.arange(side, device=raw.device) + 0.5) * (size / side)
-        fx, fy, cx, cy = (k[:, None, None] for k in intrinsics.unbind(-1))
-        x, y = ((pixel - cx) / fx).expand(-1, side, side), ((cy - pixel[:, None]) / fy).expand(-1, side, side)
+    def of(raw: Tensor, span: Tensor, camera: Camera) -> PixelMaps:
+        """From the pyramid's 12 numbers ``(V, P, P, 12)``, whose pixels are those of ``camera``, and the hull's ``span
+        (V, Q, Q, 2)``.
+        """
+        gain, shift, confidence, rough, metal, normal, depth, _ = raw.split([1, 3, 1, 1, 1, 3, 1, 1], -1)
+        x, y = image_plane(camera)
         toward = -functional.normalize(torch.stack([x, y, -torch.ones_like(x)], -1), dim=-1)  # to the camera
         normal = functional.normalize(0.3 * toward + normal, dim=-1)
-        world = torch.einsum("vij,vxyj->vxyi", c2w[:, :3, :3], normal)
-        return PixelMaps((gain + 2.0).sigmoid(), shift, confidence, rough, metal - 2.0, world, depth[..., :1] - 0.2)
+        world = torch.einsum("vij,vxyj->vxyi", camera.c2w[:, :3, :3], normal)
+        size = camera.height, camera.width
+        span = functional.interpolate(span.permute(0, 3, 1, 2), size=size, mode="nearest").permute(0, 2, 3, 1)
+        depth = torch.lerp(span[..., :1], span[..., 1:], (depth - 1.0).sigmoid())  # the surface lies within
+        return PixelMaps((gain + 2.0).sigmoid(), shift, confidence, rough, metal - 2.0, world, depth)
 
     def stacked(self) -> Tensor:
         """``(V, P, P, 10)``, all but the depth."""
@@ -93,27 +100,28 @@ class LocalReconstructor(nn.Module):
         self.volume = FeatureVolume(preset.volume, tokens)
         self.light = LightMap(preset.light)
         self.view_features = ViewFeatures(tokens, width=preset.view_width)
-        inside = preset.volume.features + preset.view_width + 2
+        inside = preset.volume.features + preset.view_width + 2 + AHEAD
         self.level = mlp(inside, preset.head_width, 1, 2)
-        surface = inside + FUSED + 3 + SHADING_FEATURES
+        surface = inside + FUSED + 3 + Shading.WIDTH
         self.color = mlp(surface, preset.head_width, 7, 2)  # own guess, correction, share of the own guess
         self.surface = mlp(surface, preset.head_width, 6, 2)  # roughness, metallic, bend of the normal, its share
         if self.device.type != "meta":  # there are no values there, and torch would import its compiler to say so
             for head in (self.color, self.surface):
-                nn.init.normal_(head[-1].weight, std=0.01)
-                nn.init.zeros_(head[-1].bias)
+                nn.init.normal_(linear_of(head, -1).weight, std=0.01)
+                nn.init.zeros_(linear_of(head, -1).bias)
 
     @property
     def device(self) -> torch.device:
-        return self.level[0].weight.device
+        return linear_of(self.level, 0).weight.device
 
     @property
     def dtype(self) -> torch.dtype:
         """In which it computes: float32."""
-        return self.level[0].weight.dtype
+        return linear_of(self.level, 0).weight.dtype
 
-    def encode(self, images: Tensor, masks: Tensor, c2w: Tensor, intrinsics: Tensor, detail: Tensor,
-               detail_intrinsics: Tensor) -> LocalField:  # fmt: skip
+    def encode(
+        self, images: Tensor, masks: Tensor, c2w: Tensor, intrinsics: Tensor, detail: Tensor, detail_intrinsics: Tensor
+    ) -> LocalField:
         """Read the posed views of one object, in the model's frame.
 
         images: ``(V, S, S, 3)`` sRGB in [0, 1], straight.  masks: ``(V, S, S)``.  c2w: ``(V, 4, 4)`` OpenGL.
@@ -121,24 +129,29 @@ class LocalReconstructor(nn.Module):
         silhouette in pixels, from which colours are read; its intrinsics.  Gradients reach every parameter.
         """
         size = images.shape[1]
-        features, raw = self.pyramid(images, masks, place_of_pixels(c2w, intrinsics, size))
-        pixels = PixelMaps.of(raw, c2w, intrinsics, size)
+        camera = Camera(c2w, intrinsics, size, size)
+        quarter = functional.avg_pool2d(masks[:, None], QUARTER)[:, 0]
+        span = span_of_pixels(detail[..., 3], detail_intrinsics, quarter, camera.resized(*quarter.shape[:0:-1]))
+        features, raw = self.pyramid(images, masks, place_of_pixels(camera), span)
+        coarse = camera.resized(raw.shape[2], raw.shape[1])
+        pixels = PixelMaps.of(raw, span, coarse)
         shape = torch.cat([pixels.depth, pixels.normal], -1).permute(0, 3, 1, 2)
         shape = functional.avg_pool2d(shape, raw.shape[1] // features.shape[1]).permute(0, 2, 3, 1)
         tokens = torch.cat([features, shape], -1).contiguous()
         maps = ViewMaps(tokens, detail, c2w, detail_intrinsics)
-        volume = self.volume(maps)
         shown = torch.cat([images, masks[..., None]], -1).permute(0, 3, 1, 2)
         shown = functional.avg_pool2d(shown, size // raw.shape[1])
         color, mask = shown.permute(0, 2, 3, 1).split([3, 1], -1)
-        log_light = self._light(pixels, color, mask[..., 0], c2w, intrinsics / (size / raw.shape[1]))
-        return LocalField(self, maps, pixels, color, volume, log_light)
+        surface = torch.cat([pixels.depth * mask, mask], -1)
+        volume = self.volume(maps, surface)
+        log_light = self._light(pixels, color, mask[..., 0], coarse)
+        return LocalField(maps, self, pixels, color, surface, volume, log_light)
 
-    def _light(self, pixels: PixelMaps, color: Tensor, mask: Tensor, c2w: Tensor, intrinsics: Tensor) -> Tensor:
+    def _light(self, pixels: PixelMaps, color: Tensor, mask: Tensor, camera: Camera) -> Tensor:
         v, y, x = (mask > 0.9).nonzero(as_tuple=True)
-        fx, fy, cx, cy = intrinsics[v].unbind(-1)
-        local = torch.stack([(x + 0.5 - cx) / fx, (cy - y - 0.5) / fy, -torch.ones_like(fx)], -1)
-        wo = -functional.normalize((c2w[v, :3, :3] @ local[..., None])[..., 0], dim=-1)
+        right, up = (t[v, y, x] for t in image_plane(camera))
+        local = torch.stack([right, up, -torch.ones_like(right)], -1)
+        wo = -functional.normalize((camera.c2w[v, :3, :3] @ local[..., None])[..., 0], dim=-1)
         seen = color[v, y, x]
         albedo = srgb_to_linear((pixels.gain[v, y, x] * color_logit(seen) + pixels.shift[v, y, x]).sigmoid())
         gloss = 1.0 - pixels.roughness[v, y, x, 0].sigmoid()
@@ -146,38 +159,25 @@ class LocalReconstructor(nn.Module):
 
 
 @dataclass(frozen=True)
-class LocalField:
-    """One object: level at points of its volume, material at points of its surface, light around it."""
+class LocalField(Field):
+    """What a :class:`LocalReconstructor` knows of one object."""
 
     model: LocalReconstructor
-    maps: ViewMaps
     pixels: PixelMaps
     color: Tensor  # (V, P, P, 3) sRGB, what the pixels of ``pixels`` show
+    surface: Tensor  # (V, P, P, 2) depth of ``pixels`` times coverage, and coverage
     volume: Tensor  # (N, N, N, F)
     log_light: Tensor  # (3, H, 2H)
     shading: Shading | None = None
 
-    bounded = True  # the silhouettes bound the surface
-    reads_views = True  # the material asks which view sees a point
+    reads_views: ClassVar[bool] = True
 
     def bound(self, points: Tensor) -> Tensor:
         """Level ``(N,)`` of the silhouettes' hull: no point is further inside than this; no gradient."""
         return bound_level(self.maps, points, self.model.preset.softness)
 
-    def grid_level(self, axis: Tensor) -> None:
-        """None: features of points belong to no plane, see :meth:`reli3d.nn.field.Field.grid_level`."""
-
-    def cube_weights(self, points: Tensor, level: Tensor) -> dict[str, Tensor]:
-        """Empty: this network gives cubes no weights, see :meth:`reli3d.nn.field.Field.cube_weights`."""
-        return {}
-
-    def free_level(self, points: Tensor) -> Tensor:
-        """Level ``(N,)`` that the network gives ``points (N, 3)``, negative inside, without the hull's bound."""
-
-        def ask(points: Tensor) -> dict[str, Tensor]:
-            return {"level": self.model.level(self._features(points))[:, 0]}
-
-        return in_rows(ask, points)["level"] - self._offset()
+    def _level(self, points: Tensor) -> Tensor:
+        return self.model.level(self._features(points))[:, 0] - self._offset()
 
     def _offset(self) -> float:
         """Moves the surface outward."""
@@ -194,21 +194,23 @@ class LocalField:
         of_views, _ = model.view_features(self.maps, points, visible, normal)
         of_space = model.volume.sample(self.volume, points)
         rest = [(hull / HULL_SCALE).clamp(-2, 2), torch.full_like(hull, 1.0 / len(self.maps.c2w))]
-        return torch.cat([of_space, of_views, torch.stack(rest, -1)], -1)
+        ahead = ahead_of_surface(self.surface, self.maps, points)
+        return torch.cat([of_space, of_views, torch.stack(rest, -1), ahead], -1)
 
     def fused(self, position: Tensor, normal: Tensor, visible: Tensor) -> Fused:
         """The views' predictions at surface points: ``position``, ``normal`` ``(N, 3)``, ``visible (N, V)``."""
         maps = self.maps
         if not torch.is_grad_enabled():
-            return Fused(*fuse_views(maps.images, self.pixels.packed, maps.c2w, maps.intrinsics, position, visible,
-                                     normal))  # fmt: skip
+            return Fused(
+                *fuse_views(maps.images, self.pixels.packed, maps.c2w, maps.intrinsics, position, visible, normal)
+            )
         pixels = self.pixels.stacked()
         scale = pixels.shape[1] / maps.images.shape[1]
         got, _ = gather_views(pixels, position, maps.c2w, maps.intrinsics * scale)
-        own, share, summary = summarize_views(maps.images, maps.c2w, maps.intrinsics, position, visible, normal)
+        shown, share, summary = summarize_views(maps.images, maps.c2w, maps.intrinsics, position, visible, normal)
         gain, shift, confidence, rough, metal, bent = got.split([1, 3, 1, 1, 1, 3], -1)
         weight = (SHARPNESS * share.log() + confidence[..., 0]).softmax(-1)[..., None]
-        each = gain * color_logit(own[..., :3]) + shift
+        each = gain * color_logit(shown[..., :3]) + shift
         logit = (each * weight).sum(1)
         spread = ((each - logit[:, None]).square() * weight).sum((1, 2), keepdim=True)[..., 0].clamp(min=1e-6).sqrt()
         bent = functional.normalize((bent * weight).sum(1) + 1e-3 * normal, dim=-1)
@@ -221,39 +223,66 @@ class LocalField:
         """The field that knows the light on its surface, from some thousand points all over it; no gradient."""
         with torch.no_grad():
             color = self.fused(position, normal, visible).logit.sigmoid()
-            _, _, summary = summarize_views(self.maps.images, self.maps.c2w, self.maps.intrinsics, position, visible,
-                                            normal)  # fmt: skip
+            _, _, summary = summarize_views(
+                self.maps.images, self.maps.c2w, self.maps.intrinsics, position, visible, normal
+            )
             shown, seen = summary[:, :3], visible.amax(1)
             observed = brightness_over_normal(srgb_to_linear(shown), seen, normal)
             plain = unshaded(shown, brightness_at(normal, observed))
             irradiance = Environment(self.radiance_map(LIGHT_ROWS).detach().contiguous()).irradiance()
             return replace(self, shading=Shading(irradiance, observed, palette_of(color, plain, seen)))
 
-    def material(self, position: Tensor, normal: Tensor, visible: Tensor) -> PointMaterial:
-        """Material at surface points: ``position``, ``normal`` ``(N, 3)`` unit, ``visible (N, V)``; after
-        :meth:`with_shading`.
+    def _material(self, position: Tensor, normal: Tensor, visible: Tensor) -> dict[str, Tensor]:
+        fused = self.fused(position, normal, visible)
+        return _painted(fused, self._heads(fused, position, normal, visible), normal)
+
+    def heads(self, position: Tensor, normal: Tensor, visible: Tensor) -> Tensor:
+        """What the heads say of surface points, ``(N, HEADS)``, for :meth:`painted`; arguments of :meth:`material`.
+
+        It changes from cell to cell of the volume, not from texel to texel: values between points may be interpolated.
         """
 
         def ask(position: Tensor, normal: Tensor, visible: Tensor) -> dict[str, Tensor]:
-            fused = self.fused(position, normal, visible)
-            features = torch.cat([
-                self._features(position, visible, normal), fused.numbers, fused.logit,
-                self.shading.features(normal, fused.logit.detach().sigmoid()),
-            ], -1)  # fmt: skip
-            own, correction, share = self.model.color(features).split([3, 3, 1], -1)
-            share = (share - 3.0).sigmoid()
-            base = (1.0 - share) * fused.logit + share * own + correction
-            rough, metal, bend, turn = self.model.surface(features).split([1, 1, 3, 1], -1)
-            shaded = functional.normalize(normal + turn.sigmoid() * (fused.normal - normal) + bend, dim=-1)
-            rough, metal = (v[:, 0] for v in (rough + fused.numbers[:, :1], metal + fused.numbers[:, 1:2]))
-            return {"base_color": base.sigmoid(), "metallic": metal.sigmoid(), "normal": shaded,
-                    "roughness": ROUGHNESS_MIN + (1 - ROUGHNESS_MIN) * rough.sigmoid()}  # fmt: skip
+            return {"heads": self._heads(self.fused(position, normal, visible), position, normal, visible)}
 
-        return PointMaterial(**in_rows(ask, position, normal, visible))
+        return in_rows(ask, position, normal, visible)["heads"]
+
+    def painted(self, heads: Tensor, position: Tensor, normal: Tensor, visible: Tensor) -> PointMaterial:
+        """Material at surface points where ``heads (N, HEADS)`` are known: what the views show is looked up again."""
+
+        def ask(heads: Tensor, position: Tensor, normal: Tensor, visible: Tensor) -> dict[str, Tensor]:
+            return _painted(self.fused(position, normal, visible), heads, normal)
+
+        return PointMaterial(**in_rows(ask, heads, position, normal, visible))
+
+    def _heads(self, fused: Fused, position: Tensor, normal: Tensor, visible: Tensor) -> Tensor:
+        if self.shading is None:
+            raise ValueError("field: expected one with_shading, got one that does not know the light on its surface")
+        parts = [
+            self._features(position, visible, normal),
+            fused.numbers,
+            fused.logit,
+            self.shading.features(normal, fused.logit.detach().sigmoid()),
+        ]
+        features = torch.cat(parts, -1)
+        return torch.cat([self.model.color(features), self.model.surface(features)], -1)
 
     def radiance_map(self, height: int | None = None) -> Tensor:
-        """Linear radiance ``(H, 2H, 3)``, row 0 is +Y, the centre column -Z; default height the network's."""
         log = self.log_light
         if height is not None and height < log.shape[1]:
             return functional.adaptive_avg_pool2d(log.exp()[None], (height, 2 * height))[0].permute(1, 2, 0)
         return log.exp().permute(1, 2, 0)
+
+
+def _painted(fused: Fused, heads: Tensor, normal: Tensor) -> dict[str, Tensor]:
+    guess, correction, share, rough, metal, bend, turn = heads.split([3, 3, 1, 1, 1, 3, 1], -1)
+    share = (share - 3.0).sigmoid()
+    base = (1.0 - share) * fused.logit + share * guess + correction
+    shaded = functional.normalize(normal + turn.sigmoid() * (fused.normal - normal) + bend, dim=-1)
+    rough, metal = (v[:, 0] for v in (rough + fused.numbers[:, :1], metal + fused.numbers[:, 1:2]))
+    return {
+        "base_color": base.sigmoid(),
+        "metallic": metal.sigmoid(),
+        "normal": shaded,
+        "roughness": ROUGHNESS_MIN + (1 - ROUGHNESS_MIN) * rough.sigmoid(),
+    }

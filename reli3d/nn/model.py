@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from reli3d.geometry.triplane import sample_triplane
-from reli3d.nn.camera import CameraEmbedder, camera_vector, ray_maps
+from reli3d.nn.camera import CameraEmbedder, camera_vector
 from reli3d.nn.heads import HEADS, Heads, WeightMerger, truncated_exp
 from reli3d.nn.illumination import Illumination
 from reli3d.nn.initialise import initialise
@@ -19,7 +19,6 @@ from reli3d.nn.reni import EnvironmentDecoder, reni_frame
 from reli3d.nn.tokenizers import ImageTokenizer, TriplaneBank, patch_grid
 from reli3d.nn.transformer import TwoStreamTransformer
 from reli3d.nn.upsample import PixelShuffleUpsampler
-from reli3d.nn.view_features import ViewFeatures
 
 BACKGROUND = 0.5  # grey behind the object in the object encoder's images, sRGB
 
@@ -68,10 +67,8 @@ class Reconstructor(nn.Module):
         self.upsampler = PixelShuffleUpsampler(preset.upsampler, width)
         self.illumination = Illumination(preset.illumination, preset.reni.latents, preset.camera_width, width)
         self.environment = EnvironmentDecoder(preset.reni)
-        self.heads = Heads(3 * preset.upsampler.channels + preset.point_features, preset.head_width)
+        self.heads = Heads(3 * preset.upsampler.channels, preset.head_width)
         self.merger = WeightMerger(preset.head_width)
-        if preset.view_feature_width:
-            self.view_features = ViewFeatures(width, width=preset.view_feature_width)
         if preset.tone_mapping:
             self.tone_mapping = ToneMappingConstants()
         if self.device.type != "meta":  # there are no values there, and torch would import its compiler to say so
@@ -95,8 +92,15 @@ class Reconstructor(nn.Module):
     def trunk(self) -> Iterator[nn.Module]:
         yield from (self.encoder, self.bank, self.backbone, self.upsampler, self.illumination)
 
-    def encode(self, images: Tensor, masks: Tensor, c2w: Tensor, intrinsics: Tensor, *,
-               background_visible: Tensor | None = None) -> Code:  # fmt: skip
+    def encode(
+        self,
+        images: Tensor,
+        masks: Tensor,
+        c2w: Tensor,
+        intrinsics: Tensor,
+        *,
+        background_visible: Tensor | None = None,
+    ) -> Code:
         """Read posed views of B objects, each in the model's frame; the first view is the hero.
 
         images: ``(B, V, S, S, 3)`` sRGB in [0, 1], straight (not multiplied by the mask), S the preset's image size.
@@ -111,14 +115,9 @@ class Reconstructor(nn.Module):
         camera = self.camera(camera_vector(c2w, intrinsics, images.shape[2]))
         dtype = self.dtype
         sizes, light = self.preset.encoder, self.preset.illumination.encoder
-        rays = None
-        if sizes.ray_maps or light.ray_maps:
-            rays = ray_maps(c2w, intrinsics, images.shape[2]).to(dtype)
 
         def extra(encoder, mask):
-            parts = [mask.unsqueeze(2).to(dtype)] if encoder.mask_channel else []
-            parts += [rays] if encoder.ray_maps else []
-            return torch.cat(parts, dim=2) if parts else None
+            return mask.unsqueeze(2).to(dtype) if encoder.mask_channel else None
 
         composite = torch.lerp(torch.full_like(images, BACKGROUND), images, masks.unsqueeze(-1))
         tokens = self.encoder(composite, camera, extra(sizes, masks))
@@ -142,25 +141,16 @@ class Reconstructor(nn.Module):
         """
         return self.environment.radiance(code.latent, code.rotation, code.strength, reni_frame(directions))
 
-    def query(self, code: Code, points: Tensor, heads: Sequence[str] = tuple(HEADS),
-              point_features: Tensor | None = None, color: Tensor | None = None) -> dict[str, Tensor]:  # fmt: skip
+    def query(self, code: Code, points: Tensor, heads: Sequence[str] = tuple(HEADS)) -> dict[str, Tensor]:
         """Values of the named heads at points of the model's cube, ``{name: (B, N, outputs)}``, float32.
 
-        points: ``(B, N, 3)``, inside plus or minus the preset's radius; features fade to zero outside.
-        point_features: ``(B, N, K)`` where the preset has ``point_features`` K, else None.  color: ``(B, N, 3)``
-        sRGB, what the views show at the points; the base colour is then a correction of it.
-        ``density`` is the raw value, see :meth:`level`; ``base_color`` is sRGB-encoded; ``roughness`` is perceptual;
-        ``normal`` is unit in the frame of :mod:`reli3d.geometry.bake`; ``deformation`` and ``flexicubes`` are raw, see
-        :mod:`reli3d.nn.heads`.  Gradients reach the triplane, the points, their features and the heads.
+        points: ``(B, N, 3)``, inside plus or minus the preset's radius; features fade to zero outside.  ``density`` is
+        the raw value, see :meth:`level`; ``base_color`` is sRGB-encoded; ``roughness`` is perceptual; ``normal`` is
+        unit in the frame of :mod:`reli3d.render.bump`; ``deformation`` and ``flexicubes`` are raw, see
+        :mod:`reli3d.nn.heads`.  Gradients reach the triplane, the points and the heads.
         """
-        width = 0 if point_features is None else point_features.shape[-1]
-        if width != self.preset.point_features:
-            raise ValueError(f"point_features: expected (B, N, {self.preset.point_features}), got width {width}")
         with torch.autocast(points.device.type, enabled=False):
-            features = sample_triplane(code.triplane, points / self.preset.radius)
-            if point_features is not None:
-                features = torch.cat([features, point_features.float()], dim=-1)
-            values = self.heads(features, heads, color)
+            values = self.heads(sample_triplane(code.triplane, points / self.preset.radius), heads)
             if self.preset.roughness_is_alpha and "roughness" in values:
                 values["roughness"] = values["roughness"].sqrt()
         return values
@@ -171,17 +161,15 @@ class Reconstructor(nn.Module):
 
         axis: ``(n,)``, model units.  A plane of features has ``n * n`` different points, and the head's first layer is
         linear: it is done on the three planes' points and added up.  Values differ from :meth:`query`'s by rounding.
-        Raises ValueError for a preset with point features, which belong to no plane.
         """
-        if self.preset.point_features:
-            raise ValueError(f"preset: expected one without point features, got {self.preset.point_features} of them")
         n, channels, at = len(axis), code.triplane.shape[2], axis / self.preset.radius
         a, b = (c.reshape(-1) for c in torch.meshgrid(at, at, indexing="ij"))
         xy, xz, _ = sample_triplane(code.triplane, torch.stack([a, b, b], -1)[None])[0].split(channels, -1)
         yz = sample_triplane(code.triplane, torch.stack([b, a, b], -1)[None])[0][:, 2 * channels :]
         weight, bias = self.heads.first_layer(("density",))
-        of_xy, of_xz, of_yz = (torch.mm(w, f.T).view(-1, n, n)
-                               for w, f in zip(weight.split(channels, 1), (xy, xz, yz), strict=True))  # fmt: skip
+        of_xy, of_xz, of_yz = (
+            torch.mm(w, f.T).view(-1, n, n) for w, f in zip(weight.split(channels, 1), (xy, xz, yz), strict=True)
+        )
         of_xy += bias[:, None, None]
 
         def ask(i: int, j: slice) -> Tensor:
@@ -192,8 +180,6 @@ class Reconstructor(nn.Module):
 
     def level(self, density: Tensor) -> Tensor:
         """Surface level of the ``density`` head's raw values: negative inside, zero on the surface."""
-        if self.preset.log_level:
-            return self.surface_density - density
         return self.preset.density_threshold - truncated_exp(density + self.preset.density_bias)
 
     @property
@@ -202,8 +188,9 @@ class Reconstructor(nn.Module):
         return math.log(self.preset.density_threshold) - self.preset.density_bias
 
 
-def check_views(images: Tensor, masks: Tensor, c2w: Tensor, intrinsics: Tensor, size: int,
-                device: torch.device) -> None:  # fmt: skip
+def check_views(
+    images: Tensor, masks: Tensor, c2w: Tensor, intrinsics: Tensor, size: int, device: torch.device
+) -> None:
     """Raise TypeError or ValueError, ``name: expected X, got Y``, where the inputs are not what ``encode`` asks for."""
     tails = {"images": (size, size, 3), "masks": (size, size), "c2w": (4, 4), "intrinsics": (4,)}
     lead = images.shape[:2]
@@ -211,8 +198,8 @@ def check_views(images: Tensor, masks: Tensor, c2w: Tensor, intrinsics: Tensor, 
         if value.dtype != torch.float32:
             raise TypeError(f"{name}: expected torch.float32, got {value.dtype}")
         if value.shape[2:] != tail or value.shape[:2] != lead or 0 in value.shape:
-            lead = tuple(lead) if name != "images" and len(lead) == 2 else ("B", "V")
-            expected = ", ".join(map(str, (*lead, *tail)))
+            front = tuple(lead) if name != "images" and len(lead) == 2 else ("B", "V")
+            expected = ", ".join(map(str, (*front, *tail)))
             raise ValueError(f"{name}: expected shape ({expected}), got {tuple(value.shape)}")
         if value.device != device:
             raise ValueError(f"{name}: expected device {device}, got {value.device}")

@@ -1,9 +1,9 @@
 """Sizes and switches of the networks, as plain numbers.
 
-``official`` has the sizes of the published checkpoint (1.574 billion parameters).  ``small`` is the embedded default:
-the same modules, fewer numbers, and aids that let a small network learn geometry from little data (ray maps, image
-features sampled at the query points).  Where the paper and its release differ the release is followed, so that its
-weights load.  ``local`` is another network, made of convolutions, which ``reli3d-train`` trains.
+``official`` has the sizes of the published checkpoint (1.574 billion parameters); where the paper and its release
+differ the release is followed, so that its weights load.  ``tiny`` is the same network with 0.6 million parameters:
+its training runs on two cores and shows that the stages work.  ``small`` is the default, a network of convolutions
+whose weights are in the package.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import json
 import typing
 from dataclasses import dataclass
 
-SHADING_FEATURES = 24  # see reli3d.nn.light_features
 MOST = 8192  # of any number of a preset in a file: several times what a network of this kind has
 DEEP, MOST_LAYERS = ("layers", "blocks", "basic_blocks", "experts", "convolutions", "smoothing"), 64
 
@@ -28,11 +27,10 @@ class EncoderSizes:
     patch: int  # pixels; a remainder of image size / patch is cut off at the right and below
     grid: int  # side of the stored position grid; resampled for another number of patches
     mask_channel: bool  # the mask as input channel after RGB
-    ray_maps: bool  # Pluecker coordinates of every pixel's ray as 6 more input channels
 
     @property
     def channels(self) -> int:
-        return 3 + int(self.mask_channel) + 6 * int(self.ray_maps)
+        return 3 + int(self.mask_channel)
 
 
 @dataclass(frozen=True)
@@ -132,7 +130,6 @@ class Preset:
     backbone: BackboneSizes
     upsampler: UpsamplerSizes
     head_width: int
-    view_feature_width: int  # features of the views that join the triplane's at each query point; 0: none
     illumination: IlluminationSizes
     reni: ReniSizes
     resolution: int  # cubes along each side of the surface grid
@@ -140,22 +137,9 @@ class Preset:
     density_threshold: float = 10.0  # the surface is where exp(raw + density_bias) has this value
     density_bias: float = -1.0
     roughness_is_alpha: bool = False  # the roughness head predicts the GGX width; query() returns its square root
-    log_level: bool = False  # the surface level is linear in the raw density (a distance) instead of in the density
-    offset_one_view: float = 0.0  # of the surface, in raw density, outward; see reli3d.train.calibrate
-    offset_many_views: float = 0.0  # the same in the limit of many views; in between by the inverse of their number
-    softness: float = 0.02  # model units from occupancy 1/2 to 0.73: unit of log_level and of the silhouettes' bound
-    smoothing: int = 0  # iterations of Taubin smoothing of the extracted surface
-    silhouette_bound: bool = False  # the density is bounded by the views' masks
     published_input: bool = False  # views prepared as by the release: JPEG, not cropped, poses as stored unless asked
     reads_background: bool = False  # the illumination path was trained with visible backgrounds too
-    shading_features: bool = False  # beside view features: the normal and the light on it
     tone_mapping: bool = False  # carry the published tone-mapping constants, which nothing here reads
-
-    @property
-    def point_features(self) -> int:
-        """Features that a caller adds to the triplane's at each query point."""
-        shading = SHADING_FEATURES if self.shading_features else 0
-        return self.view_feature_width + shading if self.view_feature_width else 0
 
 
 def to_json(preset: Preset | LocalPreset) -> str:
@@ -177,6 +161,8 @@ def _build(kind, values: dict):
     fields = typing.get_type_hints(kind)
     built = {}
     for key, value in values.items():
+        if key not in fields:
+            raise TypeError(f"no field {key}; it is of another version")
         expected = fields[key]
         if dataclasses.is_dataclass(expected):
             built[key] = _build(expected, value)
@@ -199,17 +185,19 @@ OFFICIAL = Preset(
     name="official",
     image_size=512,
     camera_width=1024,
-    encoder=EncoderSizes(hidden=1024, layers=24, heads=16, patch=14, grid=37, mask_channel=False, ray_maps=False),
+    encoder=EncoderSizes(hidden=1024, layers=24, heads=16, patch=14, grid=37, mask_channel=False),
     plane_size=96,
-    backbone=BackboneSizes(
-        heads=16, latents=1792, blocks=4, basic_blocks=3, experts=8, experts_from=2, groups=32
-    ),
+    backbone=BackboneSizes(heads=16, latents=1792, blocks=4, basic_blocks=3, experts=8, experts_from=2, groups=32),
     upsampler=UpsamplerSizes(convolutions=4, scale=4, channels=40),
     head_width=64,
-    view_feature_width=0,
     illumination=IlluminationSizes(
-        encoder=EncoderSizes(hidden=384, layers=12, heads=6, patch=14, grid=37, mask_channel=True, ray_maps=False),
-        tokens=78, token_width=256, width=1024, heads=16, layers=4, groups=16,
+        encoder=EncoderSizes(hidden=384, layers=12, heads=6, patch=14, grid=37, mask_channel=True),
+        tokens=78,
+        token_width=256,
+        width=1024,
+        heads=16,
+        layers=4,
+        groups=16,
     ),
     reni=ReniSizes(latents=49, width=128, layers=6, heads=8, height=64),
     resolution=80,
@@ -217,32 +205,33 @@ OFFICIAL = Preset(
     published_input=True,
     reads_background=True,
     tone_mapping=True,
-)  # fmt: skip
+)
 
-SMALL = Preset(
-    name="small",
-    image_size=192,
-    camera_width=192,
-    encoder=EncoderSizes(hidden=192, layers=3, heads=6, patch=24, grid=8, mask_channel=True, ray_maps=True),
+TINY = Preset(
+    name="tiny",
+    image_size=64,
+    camera_width=64,
+    encoder=EncoderSizes(hidden=64, layers=2, heads=2, patch=8, grid=8, mask_channel=True),
     plane_size=12,
-    backbone=BackboneSizes(heads=6, latents=64, blocks=2, basic_blocks=1, experts=0, experts_from=0, groups=16),
-    upsampler=UpsamplerSizes(convolutions=2, scale=4, channels=24),
-    head_width=64,
-    view_feature_width=48,
+    backbone=BackboneSizes(heads=2, latents=32, blocks=1, basic_blocks=1, experts=0, experts_from=0, groups=8),
+    upsampler=UpsamplerSizes(convolutions=2, scale=4, channels=16),
+    head_width=32,
     illumination=IlluminationSizes(
-        encoder=EncoderSizes(hidden=128, layers=2, heads=4, patch=24, grid=8, mask_channel=True, ray_maps=True),
-        tokens=78, token_width=64, width=256, heads=8, layers=2, groups=16,
+        encoder=EncoderSizes(hidden=32, layers=1, heads=2, patch=8, grid=8, mask_channel=True),
+        tokens=16,
+        token_width=16,
+        width=32,
+        heads=2,
+        layers=1,
+        groups=4,
     ),
-    reni=ReniSizes(latents=49, width=128, layers=6, heads=8, height=64),
-    resolution=80,
-    smoothing=8,
-    log_level=True,
-    silhouette_bound=True,
-    shading_features=True,
-)  # fmt: skip
+    reni=ReniSizes(latents=9, width=32, layers=2, heads=4, height=16),
+    resolution=24,
+    reads_background=True,
+)
 
-LOCAL = LocalPreset(
-    name="local",
+SMALL = LocalPreset(
+    name="small",
     image_size=256,
     pyramid=PyramidSizes(widths=(16, 40, 64, 96, 128), features=24),
     volume=VolumeSizes(side=40, radius=0.56, widths=(16, 56, 96, 128), features=24),
@@ -251,5 +240,3 @@ LOCAL = LocalPreset(
     head_width=64,
     resolution=96,
 )
-
-PRESETS = {preset.name: preset for preset in (SMALL, OFFICIAL)}

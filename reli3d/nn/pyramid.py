@@ -10,10 +10,14 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from reli3d.geometry.hull import hull_span
 from reli3d.nn.presets import PyramidSizes
+from reli3d.render.camera import Camera, image_plane
 
-INPUTS = 6  # colour times mask, mask, place in the world
-PREDICTED = 12  # see PixelMaps
+INPUTS = 9  # colour times mask, mask, place in the world, where the ray enters and leaves the hull, 1 / views
+PREDICTED = 12  # see PixelMaps, which reads 11: the last is a weight of trained networks, without a meaning
+SEEN = 0.1  # coverage of a pixel that is asked for the hull
+REACH = 0.87  # radius of the sphere around the origin that the hull is cut off at: of a cube of side 1
 
 
 def block(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
@@ -23,18 +27,33 @@ def block(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
     )
 
 
-def place_of_pixels(c2w: Tensor, intrinsics: Tensor, size: int) -> Tensor:
+def place_of_pixels(camera: Camera) -> Tensor:
     """Right and up, ``(V, S, S, 2)`` in world units, of where the pixels' rays meet the plane through the world's
     origin that faces the camera: a crop alone tells neither the scale of a picture nor where its middle is.
 
-    c2w: ``(V, 4, 4)``.  intrinsics: ``(V, 4)`` in pixels of views of ``size`` by ``size``.
+    camera: ``V`` views of ``S`` by ``S`` pixels.
     """
+    c2w = camera.c2w
     depth = (c2w[:, :3, 3] * c2w[:, :3, 2]).sum(-1)[:, None, None]  # of the origin
-    pixel = torch.arange(size, device=c2w.device) + 0.5
-    fx, fy, cx, cy = (k[:, None, None] for k in intrinsics.unbind(-1))
-    x, y = ((pixel - cx) / fx).expand(-1, size, size), ((cy - pixel[:, None]) / fy).expand(-1, size, size)
+    x, y = image_plane(camera)
     origin = -(c2w[:, :3, :2] * c2w[:, :3, 3:]).sum(1)[:, None, None]  # in the camera's axes
     return torch.stack([x * depth, y * depth], -1) - origin
+
+
+def span_of_pixels(silhouette: Tensor, intrinsics: Tensor, seen: Tensor, camera: Camera) -> Tensor:
+    """Depths, from the world's origin, ``(V, Q, Q, 2)`` at which pixels' rays enter and leave the silhouettes' hull.
+
+    silhouette: ``(V, D, D)`` signed distance in pixels, with its ``intrinsics (V, 4)``.  seen: ``(V, Q, Q)`` coverage
+    of the pixels of ``camera``: those above SEEN are asked, the others get 0.
+    """
+    c2w = camera.c2w
+    v, y, x = (seen > SEEN).nonzero(as_tuple=True)
+    right, up = (t[v, y, x] for t in image_plane(camera))
+    local = torch.stack([right, up, -torch.ones_like(right)], -1)
+    directions = (c2w[v, :3, :3] @ local[..., None])[..., 0]  # of depth 1
+    depth = (c2w[:, :3, 3] * c2w[:, :3, 2]).sum(-1)  # of the origin
+    span = hull_span(c2w[v, :3, 3].contiguous(), directions, REACH, silhouette, c2w, intrinsics) - depth[v, None]
+    return span.new_zeros(*seen.shape, 2).index_put((v, y, x), span)
 
 
 class ImagePyramid(nn.Module):
@@ -54,16 +73,19 @@ class ImagePyramid(nn.Module):
         self.up = nn.ModuleList(block(a, a) for a in widths[:-1])
         self.features = nn.Conv2d(widths[1], sizes.features, 1)
         self.pixels = nn.Sequential(block(widths[0], widths[0]), nn.Conv2d(widths[0], PREDICTED, 1))
-        nn.init.zeros_(self.pixels[1].weight)
-        nn.init.zeros_(self.pixels[1].bias)
+        for value in self.pixels[1].parameters():
+            nn.init.zeros_(value)
 
-    def forward(self, images: Tensor, masks: Tensor, place: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, images: Tensor, masks: Tensor, place: Tensor, span: Tensor) -> tuple[Tensor, Tensor]:
         """Features ``(V, S/4, S/4, F)`` and raw predictions ``(V, S/2, S/2, 12)`` of one object's views.
 
         images: ``(V, S, S, 3)`` sRGB.  masks: ``(V, S, S)``.  place: ``(V, S, S, 2)`` from :func:`place_of_pixels`.
-        S is a multiple of two to the number of levels.
+        span: ``(V, S / k, S / k, 2)`` from :func:`span_of_pixels`.  S is a multiple of two to the number of levels.
         """
-        x = torch.cat([images * masks[..., None], masks[..., None], place], -1).permute(0, 3, 1, 2)
+        few = torch.full_like(masks, 1.0 / len(masks))
+        x = torch.cat([images * masks[..., None], masks[..., None], place, few[..., None]], -1).permute(0, 3, 1, 2)
+        span = functional.interpolate(span.permute(0, 3, 1, 2), size=x.shape[-2:], mode="nearest")
+        x = torch.cat([x, span], 1)
         levels = []
         for down in self.down:
             x = down(x)

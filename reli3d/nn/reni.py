@@ -161,6 +161,8 @@ class ReniField(nn.Module):
 class EnvironmentDecoder(nn.Module):
     """Latents, their rotation and a strength to an environment map."""
 
+    sample_directions: Tensor  # (H * 2H, 3)
+
     def __init__(self, sizes: ReniSizes):
         super().__init__()
         self.height, self.latents = sizes.height, sizes.latents
@@ -168,8 +170,15 @@ class EnvironmentDecoder(nn.Module):
         directions = reni_frame(map_directions(sizes.height, torch.device("cpu"))).flatten(0, 1)  # arange: as torch.eye
         self.register_buffer("sample_directions", directions.to(torch.empty(0).device))
 
-    def forward(self, latent: Tensor, rotation: Tensor, strength: Tensor, height: int | None = None, *,
-                z_rotation: Tensor | None = None) -> Tensor:  # fmt: skip
+    def forward(
+        self,
+        latent: Tensor,
+        rotation: Tensor,
+        strength: Tensor,
+        height: int | None = None,
+        *,
+        z_rotation: Tensor | None = None,
+    ) -> Tensor:
         """Linear radiance ``(B, H, 2H, 3)``, row 0 up, laid out as :func:`map_directions`.
 
         latent: ``(B, L, 3)``.  rotation: ``(B, 3, 3)`` applied to every latent.  strength: ``(B,)``, natural logarithm

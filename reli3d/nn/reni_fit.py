@@ -26,17 +26,17 @@ class LightFit:
     error: float
 
 
-def fit_latent(decoder: EnvironmentDecoder, radiance: Tensor, *, steps: int = 500, rays: int = 512,
-               seed: int = 0) -> LightFit:  # fmt: skip
+def fit_latent(
+    decoder: EnvironmentDecoder, radiance: Tensor, *, steps: int = 500, rays: int = 512, seed: int = 0
+) -> LightFit:
     """Latents and strength whose decoded map is nearest to ``radiance``.
 
     radiance: ``(H, 2H, 3)`` linear, at least 0, row 0 up, laid out as :func:`~reli3d.nn.reni.map_directions`, on the
     decoder's device; H at least 8.  steps: of Adam, each on ``rays`` texels of the map, drawn evenly over the sphere.
-    The strength starts at the logarithm of the geometric mean; colour and contrast are the latents'.  The loss is that
-    of the training of the decoder: the difference of logarithms, floored at a hundredth of the mean, and one minus
-    the cosine of the colours, which sees the lamps.  The decoder is left as it is, gradients included.  Raises
-    TypeError unless float32, ValueError for another shape, a map that is not finite, negative or black.
-    Source: Gardner and others 2023, RENI++, section 4, with Adam's steps falling as a cosine.
+    The strength starts at the logarithm of the geometric mean.  The loss is the difference of logarithms, floored at a
+    hundredth of the mean, and one minus the cosine of the colours, which sees the lamps.  The decoder stays as it is.
+    Raises TypeError unless float32, ValueError for another shape, a map that is not finite, negative or black. Source:
+    Gardner and others 2023, RENI++, section 4.
     """
     directions, target, weight = _rays(decoder, radiance)
     shade = target.mean(-1)

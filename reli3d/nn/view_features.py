@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from torch.nn.functional import linear
 
 from reli3d.geometry.projection import OWN, gather_views, pool_views, summarize_views
+from reli3d.nn.blocks import linear_of
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,31 @@ class ViewMaps:
     images: Tensor
     c2w: Tensor
     intrinsics: Tensor  # in pixels of ``images``
+
+
+AHEAD = 4  # numbers of ahead_of_surface
+NEAR, FAR = 0.05, 0.2  # units in which they measure a distance, in those of the world
+
+
+def ahead_of_surface(surface: Tensor, maps: ViewMaps, points: Tensor) -> Tensor:
+    """How far ``points (N, 3)`` lie before the surfaces that the views show, as seen from each, ``(N, AHEAD)``.
+
+    surface: ``(V, P, P, 2)`` depth of a pixel from the world's origin along the camera's axis, times coverage, and
+    coverage.  The numbers are the greatest and the mean over the views that show the object there, of a distance that
+    saturates at NEAR, its mean at FAR, and the share of these views.  Before a surface that a view shows there is
+    nothing; far behind it a view tells nothing.  Gradients reach the surface.
+    """
+    scale = surface.shape[1] / maps.images.shape[1]
+    got, pixel = gather_views(surface, points, maps.c2w, maps.intrinsics * scale)
+    covered = got[..., 1].clamp(min=0.1)
+    origin = (maps.c2w[:, :3, 3] * maps.c2w[:, :3, 2]).sum(-1)
+    ahead = got[..., 0] / covered - (pixel[..., 2] - origin)
+    shown = (got[..., 1] > 0.5).to(ahead)
+    near, far = (ahead / NEAR).tanh() * shown, (ahead / FAR).tanh() * shown
+    share = shown.mean(1)
+    few = share.clamp(min=0.5 / len(maps.c2w))
+    greatest = (near - 2.0 * (1.0 - shown)).amax(1).clamp(min=-1.0)
+    return torch.stack([greatest, near.mean(1) / few, far.mean(1) / few, share], -1)
 
 
 class ViewFeatures(nn.Module):
@@ -44,16 +70,24 @@ class ViewFeatures(nn.Module):
         visible: ``(N, V)``, 1 where the view sees the surface point, 0 where it is hidden; without it the points are
         in free space. normal: ``(N, 3)`` unit, outward, beside ``visible``.  Gradients reach the tokens.
         """
-        first, activation, last = self.per_view
+        first, activation, last = linear_of(self.per_view, 0), self.per_view[1], self.per_view[2]
         tokens, channels = self.tokens(maps.tokens), self.tokens.out_features
         of_tokens, of_own = first.weight[:, :channels], first.weight[:, channels:]
         if torch.is_grad_enabled():
             scale = maps.tokens.shape[1] / maps.images.shape[1]
             gathered, _ = gather_views(tokens, points, maps.c2w, maps.intrinsics * scale)
-            own, weight, summary = summarize_views(maps.images, maps.c2w, maps.intrinsics, points, visible, normal)
-            hidden = linear(gathered, of_tokens) + linear(own, of_own, first.bias)
+            numbers, weight, summary = summarize_views(maps.images, maps.c2w, maps.intrinsics, points, visible, normal)
+            hidden = linear(gathered, of_tokens) + linear(numbers, of_own, first.bias)
             pooled = (weight[:, None] @ activation(hidden))[:, 0]
         else:  # bilinear weights sum to 1: the layer and its bias may come before the look-up
-            pooled, summary = pool_views(maps.images, linear(tokens, of_tokens, first.bias), of_own.T, maps.c2w,
-                                         maps.intrinsics, points, visible, normal)  # fmt: skip
+            pooled, summary = pool_views(
+                maps.images,
+                linear(tokens, of_tokens, first.bias),
+                of_own.T,
+                maps.c2w,
+                maps.intrinsics,
+                points,
+                visible,
+                normal,
+            )
         return torch.cat([last(pooled), summary], -1), summary[:, :3]  # pooled before the last layer: it is linear

@@ -10,7 +10,7 @@ from reli3d.geometry.grid import sample_grid
 from reli3d.geometry.hull import hull_distance
 from reli3d.geometry.projection import OWN, gather_views, summarize_views
 from reli3d.nn.presets import VolumeSizes
-from reli3d.nn.view_features import ViewMaps
+from reli3d.nn.view_features import AHEAD, ViewMaps, ahead_of_surface
 
 NEAR_HULL = 0.08  # farther outside the silhouettes' hull there is nothing: views are not asked
 HULL_SCALE = 0.1  # unit of the hull's distance as a feature
@@ -30,7 +30,7 @@ class FeatureVolume(nn.Module):
         super().__init__()
         widths = sizes.widths
         self.mix = nn.Sequential(nn.Linear(features + OWN, 32), nn.SiLU(), nn.Linear(32, MIXED))
-        self.reduce = nn.Sequential(nn.Linear(2 * MIXED + OWN + 2, widths[0]), nn.SiLU())
+        self.reduce = nn.Sequential(nn.Linear(2 * MIXED + OWN + 2 + AHEAD, widths[0]), nn.SiLU())
         self.first = _block(widths[0], widths[0])
         self.down = nn.ModuleList(
             nn.Sequential(_block(a, b, 2), _block(b, b)) for a, b in zip(widths[:-1], widths[1:], strict=True)
@@ -41,15 +41,16 @@ class FeatureVolume(nn.Module):
         self.out = nn.Conv3d(widths[0], sizes.features, 1)
         self.side, self.radius = sizes.side, sizes.radius
 
-    def forward(self, maps: ViewMaps) -> Tensor:
-        """``(N, N, N, F)``, indexed x, y, z."""
+    def forward(self, maps: ViewMaps, surface: Tensor) -> Tensor:
+        """``(N, N, N, F)``, indexed x, y, z.  surface: as in :func:`~reli3d.nn.view_features.ahead_of_surface`."""
         axis = torch.linspace(-self.radius, self.radius, self.side, device=maps.images.device)
         grid = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
         hull = hull_distance(grid, maps.images[..., 3].contiguous(), maps.c2w, maps.intrinsics)
         near = (hull > -NEAR_HULL).nonzero()[:, 0]
-        pooled = self._pooled(maps, grid[near], hull[near])
+        pooled = self._pooled(maps, surface, grid[near], hull[near])
         x = pooled.new_zeros(len(grid), pooled.shape[1]).index_copy(0, near, pooled)
-        x = self.first(x.T.reshape(1, -1, self.side, self.side, self.side))
+        x = x.reshape(1, self.side, self.side, self.side, -1).permute(0, 4, 1, 2, 3)  # channels last: half the time
+        x = self.first(x)
         levels = [x]
         for down in self.down:
             levels.append(down(levels[-1]))
@@ -59,15 +60,15 @@ class FeatureVolume(nn.Module):
             x = up(finer + coarse)
         return self.out(x)[0].permute(1, 2, 3, 0).contiguous()
 
-    def _pooled(self, maps: ViewMaps, points: Tensor, hull: Tensor) -> Tensor:
+    def _pooled(self, maps: ViewMaps, surface: Tensor, points: Tensor, hull: Tensor) -> Tensor:
         scale = maps.tokens.shape[1] / maps.images.shape[1]
         gathered, _ = gather_views(maps.tokens, points, maps.c2w, maps.intrinsics * scale)
-        own, weight, summary = summarize_views(maps.images, maps.c2w, maps.intrinsics, points, None, None)
-        mixed = self.mix(torch.cat([gathered, own], -1))
+        numbers, weight, summary = summarize_views(maps.images, maps.c2w, maps.intrinsics, points, None, None)
+        mixed = self.mix(torch.cat([gathered, numbers], -1))
         mean = (mixed * weight[..., None]).sum(1)
         spread = ((mixed - mean[:, None]).square() * weight[..., None]).sum(1)
         rest = torch.stack([(hull / HULL_SCALE).clamp(-2, 2), torch.full_like(hull, 1.0 / len(maps.c2w))], -1)
-        return self.reduce(torch.cat([mean, spread, summary, rest], -1))
+        return self.reduce(torch.cat([mean, spread, summary, rest, ahead_of_surface(surface, maps, points)], -1))
 
     def sample(self, volume: Tensor, points: Tensor) -> Tensor:
         """Trilinear values ``(N, F)`` of a ``volume`` at ``points (N, 3)``; outside, its border's."""

@@ -117,8 +117,9 @@ def read_manifest(path: str | os.PathLike) -> Manifest:
     with open(path, "rb") as file:
         start = file.read(8)
         if start.startswith(b"PK\x03\x04"):
-            raise WeightsError(path, "is a torch checkpoint, expected safetensors; convert it first, docs/network.md "
-                                     "tells how")  # fmt: skip
+            raise WeightsError(
+                path, "is a torch checkpoint, expected safetensors; convert it first, docs/network.md tells how"
+            )
         length = int.from_bytes(start, "little")
         if size < 8 or length > min(HEADER_LIMIT, size - 8):
             raise WeightsError(path, "is not a safetensors file, or it is cut off in its header; fetch it again")
@@ -262,8 +263,14 @@ def read_tensors(
     return result
 
 
-def save(path: str | os.PathLike, model: Network, *, licence: str, dtype: torch.dtype = torch.float16,
-         metadata: Mapping[str, str] | None = None) -> Manifest:  # fmt: skip
+def save(
+    path: str | os.PathLike,
+    model: Network,
+    *,
+    licence: str,
+    dtype: torch.dtype = torch.float16,
+    metadata: Mapping[str, str] | None = None,
+) -> Manifest:
     """Write the network's parameters as ``dtype`` (buffers as they are), its preset and licence; whole or not at all.
 
     Raises WeightsError where a value is not finite in ``dtype``: such a file would only fail later.
@@ -284,8 +291,11 @@ def write(path: str | os.PathLike, state: Mapping[str, Tensor], metadata: Mappin
     end = 0
     for name in sorted(state):
         size = state[name].numel() * state[name].dtype.itemsize
-        header[name] = {"dtype": _NAMES[state[name].dtype], "shape": list(state[name].shape),
-                        "data_offsets": [end, end + size]}  # fmt: skip
+        header[name] = {
+            "dtype": _NAMES[state[name].dtype],
+            "shape": list(state[name].shape),
+            "data_offsets": [end, end + size],
+        }
         end += size
     text = json.dumps(header).encode()
     text += b" " * (-len(text) % 8)  # the format asks for tensors that start at a multiple of 8
@@ -295,8 +305,9 @@ def write(path: str | os.PathLike, state: Mapping[str, Tensor], metadata: Mappin
             file.write(state[name].contiguous().reshape(-1).view(torch.uint8).numpy().data)
 
 
-def convert_checkpoint(source: str | os.PathLike, target: str | os.PathLike, *, licence: str,
-                       preset: Preset = OFFICIAL) -> Manifest:  # fmt: skip
+def convert_checkpoint(
+    source: str | os.PathLike, target: str | os.PathLike, *, licence: str, preset: Preset = OFFICIAL
+) -> Manifest:
     """Turn a published training checkpoint into a safetensors file of ours, float32 as it is.
 
     The checkpoint's tensors stay mapped; names go through :mod:`reli3d.nn.published`; a parameter that is stored under

@@ -19,7 +19,7 @@ from reli3d.io.files import InputError, shown
 try:
     import fcntl
 except ImportError:  # Windows: another process at the same folder is not noticed
-    fcntl = None
+    fcntl = None  # type: ignore[assignment] # of a module
 
 PARTIAL = ".partial"
 LONGEST = 255  # bytes of a name, on every usual file system
@@ -38,8 +38,11 @@ def check_folder(folder: Path, *, longest: int = LONGEST) -> Path:
         raise InputError(folder, "expected an output folder with a name in UTF-8; give another --output") from None
     for part, limit in (*((p, LONGEST) for p in folder.parts[:-1]), (folder.name, longest)):
         if len(part.encode()) > limit:
-            raise InputError(shown(part), f"expected a name of at most {limit} bytes for the output, got "
-                             f"{len(part.encode())}; rename the folder or give another --output")  # fmt: skip
+            raise InputError(
+                shown(part),
+                f"expected a name of at most {limit} bytes for the output, got "
+                f"{len(part.encode())}; rename the folder or give another --output",
+            )
     above = folder
     while not os.path.lexists(above):
         above = above.parent
@@ -135,8 +138,10 @@ def _locked(work: Path, folder: Path) -> int:
                 return lock
         except BlockingIOError:
             os.close(lock)
-            raise OSError(f"{folder}: expected no other process at this result, got one at work; wait for it or give "
-                          "another --output") from None  # fmt: skip
+            raise OSError(
+                f"{folder}: expected no other process at this result, got one at work; wait for it or give "
+                "another --output"
+            ) from None
         except FileNotFoundError:
             pass
         except OSError as error:

@@ -4,29 +4,34 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
+import torch
 
 import reli3d
 from reli3d.geometry.mesh import Mesh, report
-from reli3d.io.glb import write_glb
+from reli3d.geometry.rays import RayScene
+from reli3d.io.glb import glb_bytes
 from reli3d.io.hdr import write_environment
 from reli3d.io.images import write_png
 from reli3d.nn.weights import Manifest
 from reli3d.output.folder import claimed
 from reli3d.output.viewer import viewer_page
 from reli3d.render.asset import Asset
+from reli3d.render.camera import Camera
+from reli3d.render.gbuffer import primary_hits
 from reli3d.views.similarity import Similarity
 from reli3d.views.views import Views
 
 FILES = ("mesh.glb", "environment.exr", "environment.hdr", "preview.png", "viewer.html", "run_info.json")
 COMPARISON = "refine.png"  # of a refinement
 PUBLISHED_LIGHT = "illumination.hdr"  # name of the light in the published release, whose centre column is -Z
+SILHOUETTE = 256  # pixels a side by which mesh and masks are compared
 OURS = (*FILES, COMPARISON, PUBLISHED_LIGHT)  # what a new result never leaves of an old one
 
 
@@ -49,6 +54,16 @@ def mesh_statistics(mesh: Mesh) -> dict:
     return asdict(report(mesh))
 
 
+def mask_iou(mesh: Mesh, views: Views) -> float:
+    """Mean intersection over union of the silhouettes of ``mesh`` and the masks of ``views``, in one frame, to 1e-4."""
+    batch = views.resampled(SILHOUETTE, crop=True)
+    camera = Camera(batch.c2w, batch.intrinsics, SILHOUETTE, SILHOUETTE)
+    seen = primary_hits(RayScene(mesh.vertices, mesh.faces), camera)[0].face >= 0
+    masks = batch.masks > 0.5
+    both, either = ((a.sum((1, 2)).double()) for a in (masks & seen, masks | seen))
+    return round(float((both / either.clamp(min=1)).mean()), 4)
+
+
 def peak_memory_mib() -> float | None:
     """Most memory that this process has held, MiB, to a tenth; None on Windows, where Python has no such count."""
     try:
@@ -68,6 +83,7 @@ def write_results(
     *,
     compatible: bool = False,
     comparison: np.ndarray | None = None,
+    translation: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> None:
     """Write :data:`FILES`; an error leaves what was there before.  Raises OSError, ValueError.
 
@@ -75,12 +91,15 @@ def write_results(
     views: the photographs, in the frame of ``asset``.  picture: :func:`~reli3d.output.preview.preview` of both.
     info: what ``run_info.json`` holds, the convention of the light apart.
     compatible: write the light as :data:`PUBLISHED_LIGHT` as well.  comparison: the picture of a refinement.
+    translation: of ``mesh.glb``, see :func:`~reli3d.io.glb.write_glb`; the page shows it where it is.
     """
-    radiance = asset.environment.radiance
+    radiance = asset.light.radiance
     info = {**info, "environment_centre": "+X"}
     with replacing() as new:
         extras = {k: info[k] for k in ("output_from_input", "model_from_input", "weights")}
-        write_glb(new / "mesh.glb", asset, extras=extras)
+        glb = glb_bytes(asset, extras=extras)
+        placed = glb_bytes(asset, extras=extras, translation=translation) if any(translation) else glb
+        (new / "mesh.glb").write_bytes(placed)
         for name in ("environment.exr", "environment.hdr"):
             write_environment(new / name, radiance)
         if compatible:
@@ -89,16 +108,30 @@ def write_results(
         if comparison is not None:
             write_png(new / COMPARISON, comparison)
         low, high = asset.mesh.vertices.aminmax(dim=0)
-        page = viewer_page(info["object"], {"mesh": (new / "mesh.glb").read_bytes()}, radiance,
-                           (low + high) / 2, float((high - low).norm()) / 2, views)  # fmt: skip
+        page = viewer_page(
+            info["object"], {"mesh": glb}, radiance, (low + high) / 2, float((high - low).norm()) / 2, views
+        )
         (new / "viewer.html").write_text(page, encoding="utf-8")
         (new / "run_info.json").write_text(json.dumps(info, indent=1) + "\n")
 
 
-def frame_record(model_from_input: Similarity, output_from_input: Similarity, frame: str, up: str) -> dict:
-    """The frames of the output, as matrices on column vectors."""
-    return {"frame": frame, "up": up, "model_from_input": model_from_input.matrix().tolist(),
-            "output_from_input": output_from_input.matrix().tolist()}  # fmt: skip
+def frame_record(
+    model_from_views: Similarity, output_from_views: Similarity, origin: Sequence[float], frame: str, up: str
+) -> tuple[dict, list[float]]:
+    """The frames of the output, as matrices on column vectors, and the translation that its mesh needs.
+
+    origin: of the frame of the views, in that of the folder, which the matrices begin with.
+    """
+    began = torch.tensor(origin, dtype=torch.float64)
+    read = Similarity(1.0, torch.eye(3, dtype=torch.float64), -began)
+    back = output_from_views.rotation @ began if frame == "input" else torch.zeros_like(began)
+    output = Similarity(output_from_views.scale, output_from_views.rotation, output_from_views.translation + back)
+    return {
+        "frame": frame,
+        "up": up,
+        "model_from_input": model_from_views.compose(read).matrix().tolist(),
+        "output_from_input": output.compose(read).matrix().tolist(),
+    }, back.tolist()
 
 
 def weights_record(manifest: Manifest, digest: str) -> dict:

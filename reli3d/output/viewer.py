@@ -23,8 +23,9 @@ PHOTOGRAPH = 640  # pixels of the longer side: 16 of them take less than a megab
 QUALITY = 80  # of their WebP
 
 
-def viewer_page(name: str, meshes: Mapping[str, bytes], light: Tensor, middle: Tensor, radius: float,
-                views: Views) -> str:  # fmt: skip
+def viewer_page(
+    name: str, meshes: Mapping[str, bytes], light: Tensor, middle: Tensor, radius: float, views: Views
+) -> str:
     """HTML page of the GLB files ``meshes`` by name, under ``light`` ``(H, 2H, 3)`` and two lights of the package.
 
     middle ``(3,)``, radius: of the object, for the camera.  views: the photographs, in the frame of the meshes; they

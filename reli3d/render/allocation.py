@@ -58,28 +58,11 @@ def plan_samples(
 ) -> SamplePlan:
     """Counts of the three strategies, ``total`` together, with the least variance for these points under this light.
 
-    Arguments are those of :func:`reli3d.render.shading.shade`, but ``total`` and ``relative``; N is at least 1.  Of
-    ``options`` the seed, ``sequence``, ``alpha`` and ``paint`` count.  One
-    plan is made for all points: the one with the least sum of their variances, and of the channels', in which the
-    brightest points weigh most; with ``relative`` of the variances over the squared radiance (or over that of a tenth
-    of the mean, where it is less), which is nearer to the noise that is seen.  Other materials or another light want
-    another plan.
+    Arguments are those of :func:`reli3d.render.shading.shade`; N is at least 1.  Of ``options`` the seed, ``sequence``,
+    ``alpha`` and ``paint`` count.  One plan holds for all points: the sum of their variances is least, with
+    ``relative`` of the variances over the squared radiance.
 
-    At most 16384 of the points get one sample of each strategy, which tells where the light is.  A pilot takes 24576
-    more, a third from each strategy, at 256 points, half of them drawn evenly and half in proportion to squared values:
-    small highlights may hold most of an image's variance.  With counts n_k, densities p_k and q = sum n_k p_k the
-    balance heuristic has the variance ``int f^2 / q - sum n_k (int f p_k / q)^2`` (Veach and Guibas 1995; Sbert,
-    Havran and Szirmay-Kalos 2016, Variance Analysis of Multi-sample and One-sample Multiple Importance Sampling).  The
-    pilot's samples over the pilot's own q estimate both integrals for any n_k, as He and Owen 2014 (Optimal mixture
-    weights in multiple importance sampling) do for mixtures.  So what one strategy would meet once in a thousand runs,
-    a small sun in a broad lobe, another has drawn, and no candidate looks better than it is.
-
-    Compared are splits by eighths, and by sixteenths about the best.  This is for independent numbers; even ones serve
-    one strategy better than few points of each.  So where one strategy alone comes within twice the variance of the
-    best mixture, both are tried as they will be drawn, at 1024 points, and a gain below a tenth leaves the one.
-    A plan is for images.  For fits the published counts are better: what a plan leaves out may hold the slopes (those
-    in a normal get up to 10^4 times the variance, docs/renderer.md), and the environment table alone gives black texels
-    no gradient.  Visible normals are not paired in a plan, whose points are even without.
+    A pilot's samples estimate the variance of any split, see docs/renderer.md.  A plan is for images, not for fits.
 
     No gradient.  The result depends on the inputs and the seed alone.  Raises TypeError for a wrong dtype, ValueError
     for a shape, device, count, choice or a value that is not finite.
@@ -95,12 +78,11 @@ def plan_samples(
     if relative:
         radiance = drawn[0].sum(1).mean(1)
         share = share / (radiance.square() + (DARK * (share @ radiance)) ** 2).clamp(min=1e-30)
-    pilot = *drawn, share
     counts = _splits(int(total)).to(share.device)
-    variance = _variances(*pilot, counts)
+    variance = _variances(*drawn, share, counts)
     finer = counts[variance.argmin()] + _MOVES.to(counts) * max(1, int(total) // 16)
     finer = finer[(finer >= 0.0).all(1)]
-    counts, variance = torch.cat([counts, finer]), torch.cat([variance, _variances(*pilot, finer)])
+    counts, variance = torch.cat([counts, finer]), torch.cat([variance, _variances(*drawn, share, finer)])
     alone = (counts > 0.0).sum(1) == 1
     best, single = int(variance.argmin()), int(torch.where(alone, variance, torch.inf).argmin())
     if best != single and float(variance[single]) < RIVAL * float(variance[best]):
@@ -136,7 +118,7 @@ def _pilot_points(values: list[Tensor], environment, scene, options: ShadeOption
 
 def _draw(
     values: list[Tensor], environment: Environment, each: int, scene: RayScene | None, options: ShadeOptions
-) -> tuple[Tensor, ...]:
+) -> tuple[Tensor, Tensor, Tensor]:
     """``each`` samples of every strategy for P points, S for each point, float64.
 
     Values over q ``(P, S, 3)``; densities over q ``(P, S, 3)``; these scaled to weights with which each strategy's
@@ -165,14 +147,16 @@ def _tried(values: list[Tensor], share: Tensor, environment, counts: Tensor, sce
     """Variance of a point, mean by ``share (P,)``, that :func:`reli3d.render.shading.shade` has with ``counts``."""
     runs = TRIED // len(share)
     position, normal, ng, wo, *material = (v.repeat(runs, *[1] * (v.ndim - 1)) for v in values)
-    options = ShadeOptions(_whole(counts), options.seed, antithetic="none", sequence=options.sequence, alpha="linear",
-                           paint=options.paint)  # fmt: skip
+    options = ShadeOptions(
+        _whole(counts), options.seed, antithetic="none", sequence=options.sequence, alpha="linear", paint=options.paint
+    )
     drawn = shade(SurfacePoints(position, ng, normal, *material), wo, environment, scene=scene, options=options)
     return float(share @ drawn.double().unflatten(0, (runs, -1)).var(0).sum(1))
 
 
 def _whole(counts: Tensor) -> tuple[int, int, int]:
-    return tuple(int(k) for k in counts)
+    light, normals, cosine = (int(k) for k in counts)
+    return light, normals, cosine
 
 
 def _splits(total: int) -> Tensor:

@@ -8,9 +8,12 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from reli3d._bridge import check, tensor_of
+from reli3d._bridge import check, present, tensor_of
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+    from typing import Any
+
     from reli3d.geometry.mesh import Mesh
     from reli3d.render.environment import Environment
 
@@ -28,9 +31,19 @@ class TextureSet:
     """
 
     base_color: Tensor
-    roughness: Tensor | float
-    metallic: Tensor | float
-    normal: Tensor | None = None
+    roughness: Tensor
+    metallic: Tensor
+    normal: Tensor = None  # type: ignore[assignment] # flat after construction
+
+    if TYPE_CHECKING:  # what a caller may give, beside what the fields hold
+
+        def __init__(
+            self,
+            base_color: Tensor,
+            roughness: Tensor | float,
+            metallic: Tensor | float,
+            normal: Tensor | None = None,
+        ) -> None: ...
 
     def __post_init__(self):
         self._set("base_color", self.base_color, 3)
@@ -82,15 +95,20 @@ class Asset:
 
     def to(self, device: torch.device | str) -> Asset:
         """The same asset on ``device``."""
-        return Asset(*(None if part is None else part.to(device) for part in self._parts))
+        return self._changed(lambda part: part.to(device))
 
     def detach(self) -> Asset:
         """The same asset without gradient."""
-        return Asset(*(None if part is None else part.detach() for part in self._parts))
+        return self._changed(lambda part: part.detach())
+
+    def _changed(self, change: Callable[[Any], Any]) -> Asset:
+        textures = self.textures and change(self.textures)  # a renderer takes an asset without textures too
+        return Asset(change(self.mesh), textures, self.environment and change(self.environment))
 
     @property
-    def _parts(self) -> tuple:
-        return self.mesh, self.textures, self.environment  # a renderer takes an asset without textures too
+    def light(self) -> Environment:
+        """``environment``; raises ValueError where there is none."""
+        return present("asset.environment", self.environment)
 
     def __repr__(self) -> str:
         maps = "no textures" if self.textures is None else f"{self.textures.size} x {self.textures.size} texels"

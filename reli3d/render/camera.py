@@ -69,6 +69,11 @@ class Camera:
         """Eye position, ``(..., 3)``."""
         return self.c2w[..., :3, 3]
 
+    def resized(self, width: int, height: int) -> Camera:
+        """The same view in ``width`` x ``height`` pixels; gradients reach the intrinsics."""
+        x, y = width / self.width, height / self.height
+        return Camera(self.c2w, self.intrinsics * self.intrinsics.new_tensor([x, y, x, y]), width, height)
+
     def scaled(self, factor: int) -> Camera:
         """The same view with ``factor`` times as many pixels along each side."""
         if factor < 1:
@@ -76,15 +81,21 @@ class Camera:
         return Camera(self.c2w, self.intrinsics * factor, self.width * factor, self.height * factor)
 
 
+def image_plane(camera: Camera) -> tuple[Tensor, Tensor]:
+    """Right and up, both ``(..., H, W)``, of all pixel centres in the plane at distance 1 before the camera."""
+    fx, fy, cx, cy = (v[..., None, None] for v in camera.intrinsics.unbind(-1))
+    ys = torch.arange(camera.height, dtype=torch.float32, device=camera.c2w.device)[:, None] + 0.5
+    xs = torch.arange(camera.width, dtype=torch.float32, device=camera.c2w.device)[None, :] + 0.5
+    x, y = torch.broadcast_tensors((xs - cx) / fx, -(ys - cy) / fy)
+    return x, y
+
+
 def camera_rays(camera: Camera) -> tuple[Tensor, Tensor]:
     """Origins and unit directions through all pixel centres, both ``(..., H, W, 3)``, world frame.
 
     The origins are an expanded view of the eye.  Gradients reach ``c2w`` and ``intrinsics``.
     """
-    fx, fy, cx, cy = (v[..., None, None] for v in camera.intrinsics.unbind(-1))
-    ys = torch.arange(camera.height, dtype=torch.float32, device=camera.c2w.device)[:, None] + 0.5
-    xs = torch.arange(camera.width, dtype=torch.float32, device=camera.c2w.device)[None, :] + 0.5
-    x, y = torch.broadcast_tensors((xs - cx) / fx, -(ys - cy) / fy)
+    x, y = image_plane(camera)
     local = normalize(torch.stack([x, y, -torch.ones_like(x)], -1), dim=-1)
     rotation = camera.c2w[..., None, None, :3, :3]
     directions = normalize((rotation @ local[..., None])[..., 0], dim=-1)
@@ -119,17 +130,20 @@ def look_at(
     parallel to the view raises ValueError.
     """
     device = next((v.device for v in (eye, target, up) if isinstance(v, Tensor)), None)
-    eye, target, up = (v if isinstance(v, Tensor) else torch.as_tensor(v, dtype=torch.float32, device=device)
-                       for v in (eye, target, up))  # fmt: skip
-    check("eye", eye, last=3)
-    check("target", target, last=3, like=eye)
-    check("up", up, last=3, like=eye)
-    eye, target, up = torch.broadcast_tensors(eye, target, up)
-    z = normalize(eye - target, dim=-1)
-    x = torch.linalg.cross(normalize(up, dim=-1), z)
-    if eye.numel() and float(x.norm(dim=-1).min()) < 1e-6:  # sine of the angle; float32 noise of unit vectors is 1e-7
+    given = [
+        v if isinstance(v, Tensor) else torch.as_tensor(v, dtype=torch.float32, device=device)
+        for v in (eye, target, up)
+    ]
+    for name, value in zip(("eye", "target", "up"), given, strict=True):
+        check(name, value, last=3, like=given[0])
+    origin, aim, above = torch.broadcast_tensors(*given)
+    z = normalize(origin - aim, dim=-1)
+    x = torch.linalg.cross(normalize(above, dim=-1), z)
+    if (
+        origin.numel() and float(x.norm(dim=-1).min()) < 1e-6
+    ):  # sine of the angle; float32 noise of unit vectors is 1e-7
         raise ValueError("up: expected a direction not parallel to the view, got a parallel one")
     x = normalize(x, dim=-1)
-    rows = torch.stack([x, torch.linalg.cross(z, x), z, eye], -1)
+    rows = torch.stack([x, torch.linalg.cross(z, x), z, origin], -1)
     last = rows.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*rows.shape[:-2], 1, 4)
     return torch.cat([rows, last], -2)

@@ -36,8 +36,12 @@ class EnvironmentTable:
     @property
     def sampler(self) -> list[tuple[Tensor, type]]:
         """The four arrays that ``sample_envmap`` takes, with their Warp types."""
-        return [(self.rows, wp.float32), (self.columns, wp.float32), (self.row_guide, wp.int32),
-                (self.column_guide, wp.int32)]  # fmt: skip
+        return [
+            (self.rows, wp.float32),
+            (self.columns, wp.float32),
+            (self.row_guide, wp.int32),
+            (self.column_guide, wp.int32),
+        ]
 
 
 def texel_solid_angles(height: int, width: int, device: torch.device | None = None) -> Tensor:
@@ -145,8 +149,9 @@ class Environment:
         heights = torch.cos(torch.linspace(0.0, torch.pi, height + 1, dtype=torch.float64, device=value.device))
         # from the rounded tables, so that density and samples agree to the last bit
         density = rows.double().diff()[0][:, None] * columns.double().diff() / angle[:, None]
-        return EnvironmentTable(torch.cat([rows, heights[None].float()]), columns, _guide(rows), _guide(columns),
-                                density.float())  # fmt: skip
+        return EnvironmentTable(
+            torch.cat([rows, heights[None].float()]), columns, _guide(rows), _guide(columns), density.float()
+        )
 
     def sample(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """Directions ``(..., 3)`` and density ``(...)`` [1/sr] for uniform ``u (..., 2)`` in [0, 1).  No gradient."""

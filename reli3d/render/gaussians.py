@@ -74,21 +74,27 @@ class SphericalGaussians:
 def shade_gaussians(points: SurfacePoints, wo: Tensor, light: SphericalGaussians) -> Tensor:
     """Radiance ``(N, 3)`` towards ``wo`` of ``points`` lit by ``light`` without shadows; linear Rec. 709.
 
-    wo: ``(N, 3)`` unit, or one row for all.  A point that has a value that is not finite is NaN.  The position and
-    the geometric normal play no part.  The
-    material is that of ``reli3d.kernels.bsdf``.  Diffuse: the closed cosine integral, the Fresnel factor taken at one
-    direction.  Specular: Wang et al. 2009 with GGX as four Gaussians.  Against quadrature it errs by 6 % at roughness
-    0.3 and 12 % at 0.5 for light about the mirror direction and views within 45 degrees; at roughness 1 or
-    at 70 degrees, where the true lobe is stretched and this one round, by 20 to 35 % for light at the peak, and by 80 %
-    to a factor of two for sharp light beside it.  Gradients reach every other argument.
+    wo: ``(N, 3)`` unit, or one row for all.  A value that is not finite gives NaN.  Position and geometric
+    normal play no part.  The material is that of ``reli3d.kernels.bsdf``.  Diffuse: the closed cosine integral.
+    Specular: Wang et al. 2009 with GGX as four Gaussians.
+
+    Against quadrature it errs by 6 % at roughness 0.3 and 12 % at 0.5 for light about the mirror direction and views
+    within 45 degrees; at roughness 1 or at 70 degrees by 20 to 35 % for light at the peak, and up to a factor of two
+    beside it.  Gradients reach every argument that is used.
     """
     if not isinstance(points, SurfacePoints):
         raise TypeError(f"points: expected SurfacePoints, got {type(points).__name__}")
     normal, n = points.normal, len(points)
     check("points.normal", normal, like=light.axis)
     wo, width = of_rows("wo", wo, points.position, 3), points.roughness * points.roughness
-    ins = [(normal, wp.vec3), (wo, wp.vec3), (points.base_color, wp.vec3), (width, wp.float32),
-           (points.metallic, wp.float32), *light.arrays]  # fmt: skip
+    ins = [
+        (normal, wp.vec3),
+        (wo, wp.vec3),
+        (points.base_color, wp.vec3),
+        (width, wp.float32),
+        (points.metallic, wp.float32),
+        *light.arrays,
+    ]
     (out,) = call(kernels.shade_sg_kernel, n, ins, [((n,), wp.vec3)], device=normal.device, shared=(5, 6, 7))
     return out + nan_where_not_finite([normal, wo, points.base_color, width, points.metallic])
 
@@ -173,23 +179,23 @@ def _solve_amplitudes(directions: Tensor, weight: Tensor, target: Tensor, axis: 
 def _refine(directions, weight, target, axis, sharpness, amplitude, texel, steps, rate) -> SphericalGaussians:
     limit = OVERLAP / texel
     floor = 1e-4 * float(amplitude.max().clamp(min=1e-20))
+    if steps == 0:
+        return SphericalGaussians(axis, sharpness, amplitude)
     values = [axis.clone(), sharpness.log(), _inverse_softplus(amplitude.clamp(min=floor) / (100.0 * floor))]
     for v in values:
-        v.requires_grad_(steps > 0)
+        v.requires_grad_(True)
 
     def mixture():
         sharp = values[1].exp().clamp(max=limit)
         return SphericalGaussians(normalize(values[0], dim=-1), sharp, softplus(values[2]) * (100.0 * floor))
 
-    optimizer = torch.optim.Adam(values, lr=rate) if steps else None
+    optimizer = torch.optim.Adam(values, lr=rate)
     for _ in range(steps):
         with torch.enable_grad():
             loss = (weight[:, None] * (mixture().lookup(directions) - target).square()).sum()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-    if steps == 0:
-        return SphericalGaussians(axis, sharpness, amplitude)
     with torch.no_grad():
         return mixture()
 

@@ -7,7 +7,7 @@ import warp as wp
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from reli3d._bridge import call, check
+from reli3d._bridge import call, check, present
 from reli3d.geometry.hits import hit_normals, interpolate
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import Hits, RayScene
@@ -82,15 +82,19 @@ def surface_points(mesh: Mesh, textures: TextureSet | None, face: Tensor, bary: 
     rough_metal = sample_texture(rough_metal, uv)
     mapped = sample_texture(textures.normal, uv) * 2.0 - 1.0
     return SurfacePoints(
-        position, ng, tangent_normals(mesh, face, bary, normal, mapped),
-        sample_texture(srgb_to_linear(textures.base_color), uv), rough_metal[:, 0], rough_metal[:, 1],
-    )  # fmt: skip
+        position,
+        ng,
+        tangent_normals(mesh, face, bary, normal, mapped),
+        sample_texture(srgb_to_linear(textures.base_color), uv),
+        rough_metal[:, 0],
+        rough_metal[:, 1],
+    )
 
 
 def _uv_tangent(mesh: Mesh, face: Tensor) -> tuple[Tensor, Tensor]:
     """Tangent ``(N, 3)`` along u and handedness ``(N, 1)`` of faces, from the gradients of uv; no gradient."""
     corners = mesh.faces[face.long()].long()
-    p, uv = mesh.vertices.detach()[corners], mesh.uv.detach()[corners]
+    p, uv = mesh.vertices.detach()[corners], present("mesh.uv", mesh.uv).detach()[corners]
     e1, e2 = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
     d1, d2 = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
     area = d1[:, :1] * d2[:, 1:] - d1[:, 1:] * d2[:, :1]

@@ -45,8 +45,9 @@ def eval_bsdf(
     ``ALPHA_MIN`` = 1e-3.  Raises ValueError for another ``paint``.
     """
     conserving = int(choice("paint", paint, PAINTS) == 0)
-    batch, flat = _flat([("wo", wo, 3), ("wi", wi, 3), ("base_color", base_color, 3), ("alpha", alpha, 0),
-                         ("metallic", metallic, 0)])  # fmt: skip
+    batch, flat = _flat(
+        [("wo", wo, 3), ("wi", wi, 3), ("base_color", base_color, 3), ("alpha", alpha, 0), ("metallic", metallic, 0)]
+    )
     kinds = (wp.vec3, wp.vec3, wp.vec3, wp.float32, wp.float32)
     n = flat[0].shape[0]
     (out,) = call(kernels.eval_bsdf_kernel, n, [*zip(flat, kinds), conserving], [((n,), wp.vec3)], device=wo.device)

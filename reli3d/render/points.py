@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -27,9 +28,21 @@ class SurfacePoints:
     position: Tensor
     ng: Tensor
     normal: Tensor
-    base_color: Tensor | float
-    roughness: Tensor | float
-    metallic: Tensor | float
+    base_color: Tensor
+    roughness: Tensor
+    metallic: Tensor
+
+    if TYPE_CHECKING:  # what a caller may give, beside what the fields hold
+
+        def __init__(
+            self,
+            position: Tensor,
+            ng: Tensor,
+            normal: Tensor,
+            base_color: Tensor | float,
+            roughness: Tensor | float,
+            metallic: Tensor | float,
+        ) -> None: ...
 
     def __post_init__(self):
         check("position", self.position, last=3)
@@ -79,7 +92,9 @@ def check_values(points: SurfacePoints, wo: Tensor) -> None:
 def of_rows(name: str, value: Tensor | float, position: Tensor, last: int) -> Tensor:
     """``value`` as ``(N, last)``, or ``(N,)`` for ``last`` 0, for the N rows of ``position``; one row is repeated."""
     shape = (len(position), last) if last else (len(position),)
-    if name in NUMBERS and isinstance(value, (int, float)):
+    if isinstance(value, (int, float)):
+        if name not in NUMBERS:
+            check(name, value)
         return position.new_tensor(float(value)).expand(shape)
     check(name, value, last=last or None, like=position)
     if value.shape == shape:

@@ -116,8 +116,16 @@ def render(
     roughness, metallic = (orm / cover).unbind(-1)
     inside = alpha[..., 0] > 0.0
     depth = torch.where(inside, (depth / cover)[..., 0], torch.inf)
-    return Render(radiance, alpha[..., 0], base_color / cover, roughness, metallic, normalize(normal, dim=-1),
-                  position / cover, depth)  # fmt: skip
+    return Render(
+        radiance,
+        alpha[..., 0],
+        base_color / cover,
+        roughness,
+        metallic,
+        normalize(normal, dim=-1),
+        position / cover,
+        depth,
+    )
 
 
 def plan_render(
@@ -147,8 +155,15 @@ def plan_render(
     if not bool(seen.any()):
         raise ValueError(f"camera: expected one that sees the asset, got none of {len(rays)} rays that hits it")
     points = _points(parts, hits.face[seen], hits.bary[seen])
-    return plan_samples(points, -directions[seen], environment, total=total, scene=scene if shadows else None,
-                        options=options, relative=relative)  # fmt: skip
+    return plan_samples(
+        points,
+        -directions[seen],
+        environment,
+        total=total,
+        scene=scene if shadows else None,
+        options=options,
+        relative=relative,
+    )
 
 
 def _checked(asset, camera: Camera, environment: Environment | None) -> tuple[list[Asset], Environment]:
@@ -195,12 +210,25 @@ def _band(parts, camera, environment, scene, first, shadows, background, options
     hits = scene.closest(origins, directions)
     index = torch.nonzero(hits.face >= 0)[:, 0]
     points = _points(parts, hits.face[index], hits.bary[index])
-    lit = shade(points, -directions[index], environment, scene=scene if shadows else None, options=options,
-                pixels=(index + first).int())  # fmt: skip
+    lit = shade(
+        points,
+        -directions[index],
+        environment,
+        scene=scene if shadows else None,
+        options=options,
+        pixels=(index + first).int(),
+    )
     axis = -camera.c2w[:3, 2]
     depth = ((points.position - camera.position) * axis).sum(-1, keepdim=True)
-    layers = [lit, torch.ones_like(depth), points.base_color, torch.stack([points.roughness, points.metallic], -1),
-              points.normal, points.position, depth]  # fmt: skip
+    layers = [
+        lit,
+        torch.ones_like(depth),
+        points.base_color,
+        torch.stack([points.roughness, points.metallic], -1),
+        points.normal,
+        points.position,
+        depth,
+    ]
     full = []
     for layer in layers:
         image = layer.new_zeros(directions.shape[0], layer.shape[1])

@@ -37,8 +37,13 @@ class ReniLight:
             check(name, getattr(self, name), last=kernels.WIDTH, like=self.latent)
         check("offset", self.offset, last=3, like=self.latent)
         layers = self.matrices.shape[0] // (2 * kernels.WIDTH)
-        wanted = {"first": kernels.CODES * (len(self.latent) + 2) + 1, "matrices": 2 * kernels.WIDTH * layers,
-                  "vectors": kernels.VECTORS * layers, "last": 3, "offset": 1}  # fmt: skip
+        wanted = {
+            "first": kernels.CODES * (len(self.latent) + 2) + 1,
+            "matrices": 2 * kernels.WIDTH * layers,
+            "vectors": kernels.VECTORS * layers,
+            "last": 3,
+            "offset": 1,
+        }
         for name, rows in wanted.items():
             if getattr(self, name).shape[:-1] != (rows,):
                 raise ValueError(f"{name}: expected {rows} rows, got {tuple(getattr(self, name).shape)}")
@@ -61,7 +66,13 @@ class ReniLight:
     def _run(self, kernel, n: int, at) -> Tensor:
         device, part, row = self.latent.device, kernels.Part, kernels.Row
         radiance = empty((n,), wp.vec3, device)
-        numbers = [(self.latent, wp.vec2), (self.first.view(-1, 16), part), (self.matrices.view(-1, 16), part),
-                   (self.vectors, row), (self.last, row), (self.offset, wp.vec3)]  # fmt: skip
+        numbers = [
+            (self.latent, wp.vec2),
+            (self.first.view(-1, 16), part),
+            (self.matrices.view(-1, 16), part),
+            (self.vectors, row),
+            (self.last, row),
+            (self.offset, wp.vec3),
+        ]
         launch(kernel, n, [*numbers, at, (radiance, wp.vec3)], device, slice_min=SLICE_MIN)
         return radiance

@@ -39,8 +39,11 @@ def sample_ggx_vndf(wo: Tensor, alpha: Tensor, u: Tensor) -> Tensor:
     check("alpha", alpha, like=wo)
     check("u", u, last=2, like=wo)
     batch = torch.broadcast_shapes(wo.shape[:-1], alpha.shape, u.shape[:-1])
-    ins = [(wo.expand(*batch, 3).reshape(-1, 3), wp.vec3), (alpha.expand(batch).reshape(-1), wp.float32),
-           (u.detach().expand(*batch, 2).reshape(-1, 2), wp.vec2)]  # fmt: skip
+    ins = [
+        (wo.expand(*batch, 3).reshape(-1, 3), wp.vec3),
+        (alpha.expand(batch).reshape(-1), wp.float32),
+        (u.detach().expand(*batch, 2).reshape(-1, 2), wp.vec2),
+    ]
     n = batch.numel()
     (wm,) = call(microfacet.sample_ggx_vndf_kernel, n, ins, [((n,), wp.vec3)], device=wo.device)
     return wm.reshape(*batch, 3)
@@ -55,8 +58,11 @@ def pdf_ggx_vndf(wo: Tensor, alpha: Tensor, wm: Tensor) -> Tensor:
     check("alpha", alpha, like=wo)
     check("wm", wm, last=3, like=wo)
     batch = torch.broadcast_shapes(wo.shape[:-1], alpha.shape, wm.shape[:-1])
-    ins = [(wo.expand(*batch, 3).reshape(-1, 3), wp.vec3), (alpha.expand(batch).reshape(-1), wp.float32),
-           (wm.expand(*batch, 3).reshape(-1, 3), wp.vec3)]  # fmt: skip
+    ins = [
+        (wo.expand(*batch, 3).reshape(-1, 3), wp.vec3),
+        (alpha.expand(batch).reshape(-1), wp.float32),
+        (wm.expand(*batch, 3).reshape(-1, 3), wp.vec3),
+    ]
     n = batch.numel()
     (pdf,) = call(microfacet.pdf_ggx_vndf_kernel, n, ins, [((n,), wp.float32)], device=wo.device)
     return pdf.reshape(batch)
@@ -86,8 +92,9 @@ def reflect(wo: Tensor, wm: Tensor) -> Tensor:
     return 2.0 * (wo * wm).sum(-1, keepdim=True) * wm - wo
 
 
-def random_pairs(count: int, *, seed: int = 0, sample: int = 0, dimension: int = 0,
-                 device: torch.device | str = "cpu") -> Tensor:  # fmt: skip
+def random_pairs(
+    count: int, *, seed: int = 0, sample: int = 0, dimension: int = 0, device: torch.device | str = "cpu"
+) -> Tensor:
     """Uniform ``u (count, 2)`` in [0, 1): row i is a hash of (i, sample, dimension, seed) alone.
 
     pcg4d, Jarzynski and Olano 2020.  The first two of its four words, 24 bits each.

@@ -11,7 +11,18 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from reli3d._bridge import SLICE_MIN, check, empty, launch, once_differentiable, over_slices, slices, struct_of, views
+from reli3d._bridge import (
+    SLICE_MIN,
+    check,
+    empty,
+    launch,
+    once_differentiable,
+    over_slices,
+    present,
+    slices,
+    struct_of,
+    views,
+)
 from reli3d.geometry import embree
 from reli3d.geometry.rays import RayScene
 from reli3d.kernels import shade as kernels
@@ -24,8 +35,13 @@ from reli3d.render.sampling import halton
 
 SAMPLES = (20, 40, 4)  # environment, visible normals, cosine: the published counts
 LIGHT_RAYS = 1 << 20  # directions asked of a light at once: 45 MB of rays
-CHOICES = {"antithetic": ("none", "opposite", "mirrored"), "heuristic": ("balance", "power"),
-           "sequence": ("halton", "random"), "alpha": ("squared", "linear"), "paint": PAINTS}  # fmt: skip
+CHOICES = {
+    "antithetic": ("none", "opposite", "mirrored"),
+    "heuristic": ("balance", "power"),
+    "sequence": ("halton", "random"),
+    "alpha": ("squared", "linear"),
+    "paint": PAINTS,
+}
 CHUNK_RAYS = 65536  # shadow rays of a chunk and their values take 2.6 MB a thread: near the cache, far above call costs
 
 
@@ -33,15 +49,13 @@ CHUNK_RAYS = 65536  # shadow rays of a chunk and their values take 2.6 MB a thre
 class ShadeOptions:
     """How :func:`shade` draws and weighs its samples, and which formulas the material has.
 
-    samples: counts from the environment table, from visible normals and from the cosine; zero is allowed.  antithetic:
-    how visible normals are paired, ``opposite`` (the partner across the lobe,
-    :func:`reli3d.render.sampling.opposite`), ``mirrored`` (about the normal, as published, but weighted with its own
-    density) or ``none``.  heuristic: ``balance`` or ``power``.  sequence: of the random numbers, ``halton`` (rotated
-    per point and strategy) or ``random``.  alpha: GGX width from roughness, ``squared`` or, as in the published model's
-    shader, ``linear``.  paint: what the coat leaves to the paint, ``conserving`` or ``published``, as in
-    :func:`reli3d.render.material.eval_bsdf`.  clamp: largest value of one sample times its strategy's count, per
-    channel.  check_inputs: raise ValueError for directions that are not unit and materials beyond [0, 1], which
-    otherwise go into the formulas as they are.  Raises ValueError for a count or choice.
+    samples: counts from the environment table, from visible normals and from the cosine.  antithetic: partners of
+    visible normals, ``opposite`` (across the lobe, :func:`reli3d.render.sampling.opposite`), ``mirrored`` (about the
+    normal, as published) or ``none``.  heuristic: ``balance`` or ``power``.  sequence: ``halton`` (rotated per point
+    and strategy) or ``random``.  alpha: GGX width, ``squared`` roughness or, as published, ``linear``.  paint: what the
+    coat leaves to it, ``conserving`` or ``published``, see :func:`reli3d.render.material.eval_bsdf`.  clamp: largest
+    value of one sample times its strategy's count, per channel.  check_inputs: raise ValueError for directions that are
+    not unit and materials beyond [0, 1].  Raises ValueError for a count or choice.
     """
 
     samples: tuple[int, int, int] = SAMPLES
@@ -81,17 +95,14 @@ def shade(
 ) -> Tensor:
     """Radiance ``(N, 3)`` that leaves surface ``points`` towards ``wo``, lit by ``environment``; linear Rec. 709.
 
-    wo: ``(N, 3)`` unit, to the viewer, or one row for all.  A face seen from behind is shaded as its other side.
-    scene: mesh that casts shadows, None for none.  pixels: ``(N,)`` int32 counters of the random numbers, by default
-    the row.  Directions must be unit, materials in [0, 1]: ``options.check_inputs`` sees to it.  A point that has a
-    value that is not finite is NaN.
+    wo: ``(N, 3)`` unit, to the viewer, or one row for all.  A face seen from behind is shaded as its other side. scene:
+    mesh that casts shadows, None for none.  pixels: ``(N,)`` int32 counters of the random numbers, by default the row.
+    A point with a value that is not finite is NaN.
 
-    Gradients reach normal, base_color, roughness, metallic and the texels of ``environment``, with detached sampling:
-    directions, densities and visibility are constants.  That of a normal has a part along it, which means nothing (the
-    formulas go on off the unit sphere) and which a ``normalize`` before takes away.  Once differentiable.  Random
-    numbers are a function of the seed and the counter, so the result has the same bits for any number of threads.
-    Raises TypeError for a wrong kind or dtype, ValueError for a shape or device.  Estimator: Veach and Guibas 1995 over
-    the material of ``reli3d.kernels.bsdf``.
+    Gradients reach normal, base_color, roughness, metallic and the texels of ``environment``; sampling is detached. The
+    part of the normal's gradient along the normal has no meaning.  Once differentiable.  The same bits for any number
+    of threads.  Raises TypeError, ValueError.  Estimator: Veach and Guibas 1995 over the material of
+    ``reli3d.kernels.bsdf``.
     """
     values = shaded_arrays(points, wo, environment, scene, options)
     plan, offsets = sampling_plan(options, scene)
@@ -196,7 +207,8 @@ class _Shade(torch.autograd.Function):
         parts = len(slices(n)) if device.type == "cpu" else 1
         # what nobody asks for has no rows: the kernel leaves it out
         g_normal, g_base, g_alpha, g_metallic, texels = (
-            torch.zeros_like(tensors[k] if wanted[k] else tensors[k][:0]) for k in (1, 4, 5, 6, 7))  # fmt: skip
+            torch.zeros_like(tensors[k] if wanted[k] else tensors[k][:0]) for k in (1, 4, 5, 6, 7)
+        )
         g_radiance = texels.repeat(parts, 1, 1, 1)  # of each slice
         ins = _inputs(tensors, ctx.job)
         ins += [ctx.job.plan, (visible, wp.int32), (g_out.contiguous(), wp.vec3)]
@@ -234,14 +246,25 @@ def struct_of_points(values: Sequence[Tensor], pixels: Tensor) -> kernels.Points
 def struct_of_light(radiance: Tensor, table: EnvironmentTable, offsets: Tensor) -> kernels.Light:
     """Contiguous texels, their table, and the points that all hits turn."""
     rows, columns, row_guide, column_guide = table.sampler
-    return struct_of(kernels.Light, radiance=(radiance, wp.vec3), rows=rows, columns=columns, row_guide=row_guide,
-                     column_guide=column_guide, density=(table.density, wp.float32),
-                     points=(offsets, wp.vec2))  # fmt: skip
+    return struct_of(
+        kernels.Light,
+        radiance=(radiance, wp.vec3),
+        rows=rows,
+        columns=columns,
+        row_guide=row_guide,
+        column_guide=column_guide,
+        density=(table.density, wp.float32),
+        points=(offsets, wp.vec2),
+    )
 
 
 def _shade_embree(n: int, ins: list, job: _Job, outs: list) -> None:
     """Chunks of hits: one kernel makes the rays and values, another has Embree test the rays and sums what is lit."""
-    out, count, tracer = outs[0][0], job.count, (embree.query("rtcOccluded16"), job.scene.embree_scene)
+    out, count, tracer = (
+        outs[0][0],
+        job.count,
+        (embree.query("rtcOccluded16"), present("scene", job.scene).embree_scene),
+    )
     if count == 0:
         out.zero_()
         return
@@ -267,8 +290,11 @@ def shaded_arrays(
     points: SurfacePoints, wo: Tensor, environment: Environment, scene: RayScene | None, options: ShadeOptions
 ) -> tuple[Tensor, ...]:
     """The seven arrays of points in the order of the kernels, with the GGX width for the roughness; all checked."""
-    for name, value, kind in (("points", points, SurfacePoints), ("environment", environment, Environment),
-                              ("options", options, ShadeOptions)):  # fmt: skip
+    for name, value, kind in (
+        ("points", points, SurfacePoints),
+        ("environment", environment, Environment),
+        ("options", options, ShadeOptions),
+    ):
         if not isinstance(value, kind):
             raise TypeError(f"{name}: expected {kind.__name__}, got {type(value).__name__}")
     position = points.position

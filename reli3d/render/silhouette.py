@@ -1,13 +1,12 @@
 """Antialiased outlines whose gradient reaches the vertices, for any image that was made through the pixel centres.
 
-After Laine et al. 2020, Modular Primitives for High-Performance Differentiable Rendering, section 3.4: where an outline
-passes between two neighbouring pixel centres, the two are blended by the place where it crosses the line between them.
-There the edge is looked for in the triangle that a pixel shows, which misses it when triangles are smaller than pixels.
-Here every edge of the mesh is judged, its crossings with the rows or columns of pixel centres are listed, and a ray
-tells whether a crossing is seen; triangles of any size take part.  The sum over an image whose contrast is constant
-along the outline then has the derivative of the area by the midpoint rule, one crossing a row.  A single pixel is not
-the exact share of its area, because an oblique edge changes one pixel of a row where its true coverage changes two:
-values err by 0.02 on average there, gradients of squared differences by some 10 %.
+After Laine et al. 2020, Modular Primitives for High-Performance Differentiable Rendering, section 3.4: two neighbouring
+pixels are blended where an outline crosses the line between their centres.  There the edge belongs to the triangle that
+a pixel shows, which fails for small triangles.  Here every edge's crossings with the rows or columns of pixel centres
+are listed, and a ray tells whether one is seen.
+
+Sums over an image have the derivative of the area.  Single pixels err by 0.02 on average, gradients of squared
+differences by some 10 %.
 """
 
 from __future__ import annotations
@@ -132,8 +131,15 @@ def blend_outlines(image: Tensor, crossings: Crossings) -> Tensor:
     return flat.index_add(0, into, (weight / total.index_select(0, into))[:, None] * contrast).reshape(image.shape)
 
 
-def antialias(image: Tensor, vertices: Tensor, faces: Tensor, camera: Camera, scene: RayScene | None = None, *,
-              edges: Tensor | None = None) -> Tensor:  # fmt: skip
+def antialias(
+    image: Tensor,
+    vertices: Tensor,
+    faces: Tensor,
+    camera: Camera,
+    scene: RayScene | None = None,
+    *,
+    edges: Tensor | None = None,
+) -> Tensor:
     """``image (H, W, C)`` with antialiased outlines of the mesh; float32, any number of layers (mask, colour, normal).
 
     image: values at the first hits of the camera's rays through the pixel centres.  vertices: ``(V, 3)``.  faces:

@@ -40,8 +40,15 @@ class OccupancyGrid:
         return cls(torch.ones(resolution, resolution, resolution, dtype=torch.bool, device=device), radius)
 
     @classmethod
-    def of_density(cls, field: Callable[[Tensor], Tensor], resolution: int, radius: float, *, threshold: float,
-                   device: torch.device | None = None) -> OccupancyGrid:  # fmt: skip
+    def of_density(
+        cls,
+        field: Callable[[Tensor], Tensor],
+        resolution: int,
+        radius: float,
+        *,
+        threshold: float,
+        device: torch.device | None = None,
+    ) -> OccupancyGrid:
         """Cells where ``field`` exceeds ``threshold`` at the centre or a corner, grown by one cell on every side.
 
         field: densities ``(N,)`` of points ``(N, 3)``; asked without gradient, in chunks.  Detail of less than half a
@@ -86,8 +93,16 @@ class Composite:
     depth: Tensor
 
 
-def march_rays(origins: Tensor, directions: Tensor, grid: OccupancyGrid, step: float, *, near: float = 0.0,
-               far: float = float("inf"), shift: Tensor | None = None) -> RaySamples:  # fmt: skip
+def march_rays(
+    origins: Tensor,
+    directions: Tensor,
+    grid: OccupancyGrid,
+    step: float,
+    *,
+    near: float = 0.0,
+    far: float = float("inf"),
+    shift: Tensor | None = None,
+) -> RaySamples:
     """Samples in the occupied cells along N rays, ``step`` lengths of the direction apart.
 
     origins, directions: ``(N, 3)``, directions normally unit.  near, far: limits of t.  shift: ``(N,)`` in [0, 1),
@@ -109,8 +124,12 @@ def march_rays(origins: Tensor, directions: Tensor, grid: OccupancyGrid, step: f
     if shift.shape not in ((1,), (n,)) or (shift.numel() and not 0.0 <= float(shift.min()) <= float(shift.max()) < 1.0):
         raise ValueError(f"shift: expected ({n},) numbers in [0, 1), got {tuple(shift.shape)} or others")
     device = origins.device
-    rays = [(grid.occupied.contiguous().view(torch.uint8), wp.uint8), (origins.detach().contiguous(), wp.vec3),
-            (directions.detach().contiguous(), wp.vec3), (shift.detach().contiguous(), wp.float32)]  # fmt: skip
+    rays = [
+        (grid.occupied.contiguous().view(torch.uint8), wp.uint8),
+        (origins.detach().contiguous(), wp.vec3),
+        (directions.detach().contiguous(), wp.vec3),
+        (shift.detach().contiguous(), wp.float32),
+    ]
     numbers = [float(grid.radius), float(step), float(near), float(min(far, 3.0e38))]
     count = torch.zeros(n, dtype=torch.int32, device=device)
     launch(kernels.count_samples_kernel, n, [*rays, *numbers, (count, wp.int32)], device)
@@ -172,8 +191,10 @@ class _Composite(torch.autograd.Function):
     def backward(ctx, g_color: Tensor, g_opacity: Tensor, g_depth: Tensor):
         tensors, (_, *wanted) = ctx.saved_tensors, ctx.needs_input_grad
         # what nobody asks for has no rows: the kernel leaves it out
-        outs = [(torch.zeros_like(v if w else v[:0]), kind)
-                for v, w, kind in zip(tensors, wanted, (wp.float32, wp.vec3), strict=False)]  # fmt: skip
+        outs = [
+            (torch.zeros_like(v if w else v[:0]), kind)
+            for v, w, kind in zip(tensors, wanted, (wp.float32, wp.vec3), strict=False)
+        ]
         gs = [(g_color.contiguous(), wp.vec3), (g_opacity.contiguous(), wp.float32), (g_depth.contiguous(), wp.float32)]
         args = [*_inputs(tensors, ctx.step), *gs, *outs]
         launch(kernels.composite_adjoint_kernel, len(tensors[3]) - 1, args, g_color.device)

@@ -28,7 +28,7 @@ class Assembly:
         self.roles.append(role)
         return len(self.roles) - 1
 
-    def add(self, solid: Manifold, part: int, at: Sequence[float] | None = None) -> None:
+    def add(self, solid: Manifold, part: int, at: Sequence[float] | np.ndarray | None = None) -> None:
         """Join ``solid``, moved by ``at``."""
         self._solids.append(self._tagged(solid, part, at))
 
@@ -38,12 +38,15 @@ class Assembly:
         numbers, starts = np.unique(part[order], return_index=True)
         first = Manifold.reserve_ids(len(numbers))
         self._part_of.update({first + k: int(n) for k, n in enumerate(numbers)})
-        mesh = Mesh(np.array(vertices, dtype=np.float32, order="C"), np.array(faces[order], dtype=np.uint32, order="C"),
-                    run_index=np.append(starts, len(faces)).astype(np.uint32) * 3,
-                    run_original_id=np.arange(first, first + len(numbers), dtype=np.uint32))  # fmt: skip
+        mesh = Mesh(
+            np.array(vertices, dtype=np.float32, order="C"),
+            np.array(faces[order], dtype=np.uint32, order="C"),
+            run_index=np.append(starts, len(faces)).astype(np.uint32) * 3,
+            run_original_id=np.arange(first, first + len(numbers), dtype=np.uint32),
+        )
         self._solids.append(Manifold(mesh))
 
-    def cut(self, solid: Manifold, part: int, at: Sequence[float] | None = None) -> None:
+    def cut(self, solid: Manifold, part: int, at: Sequence[float] | np.ndarray | None = None) -> None:
         """Take ``solid`` away from all that has been added so far; the cut faces belong to ``part``."""
         self._solids = [self.joined() - self._tagged(solid, part, at)]
 
@@ -109,7 +112,7 @@ class Assembly:
         vertices = np.asarray(mesh.vert_properties)[:, :3]
         return vertices, np.asarray(mesh.tri_verts).astype(np.int32), part
 
-    def _tagged(self, solid: Manifold, part: int, at: Sequence[float] | None) -> Manifold:
+    def _tagged(self, solid: Manifold, part: int, at: Sequence[float] | np.ndarray | None) -> Manifold:
         solid = (solid if at is None else solid.translate(tuple(map(float, at)))).as_original()
         self._part_of[solid.original_id()] = part
         return solid

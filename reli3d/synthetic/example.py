@@ -30,8 +30,8 @@ def kettle(a: Assembly) -> None:
     a.add(p.tube(line, width, segments=28), spout)
     a.add(p.tube(line[-4:], width[-4:] + 0.012, segments=28), trim)
     a.cut(p.tube(line[14:] + 0.02 * (line[-1] - line[-2]), width[14:] - 0.014, segments=24), spout)
-    along = (line[-1] - line[-2]) / np.linalg.norm(line[-1] - line[-2])
-    a.cut(p.capsule(line[-1] - 0.05 * along, line[-1] + 0.1 * along, 0.036), spout)
+    axis = (line[-1] - line[-2]) / np.linalg.norm(line[-1] - line[-2])
+    a.cut(p.capsule(line[-1] - 0.05 * axis, line[-1] + 0.1 * axis, 0.036), spout)
     a.add(p.torus(0.245, 0.017, segments=72), trim, (0, 0.62, 0))
     a.add(p.torus(0.452, 0.014, segments=72), trim, (0, 0.02, 0))
     dome = np.linspace(0, np.pi / 2, 14)
@@ -68,20 +68,26 @@ def finish() -> tuple[Material, ...]:
             (enamel, pt.Ramp((0.0, -1.0, 0.0), 0.03, 0.034, 0.0, 0)),
             (Coat(CHARCOAL, 0.75), chips),
         ),
-        drift=0.03, drift_roughness=0.03, drift_scale=4.0, seed=5,
-    )  # fmt: skip
+        drift=0.03,
+        drift_roughness=0.03,
+        drift_scale=4.0,
+        seed=5,
+    )
     plain = Material(enamel, ((Coat(CHARCOAL, 0.75), chips),), drift=0.03, drift_roughness=0.03, seed=6)
     fibre = np.diag([0.8, 60.0, 60.0])
     steel = Material(
         Coat(STEEL, 0.32, 1.0),
         ((Coat((0.2, 0.08, 0.035), 0.9, 0.0), pt.Blotches(9.0 * np.eye(3), 3, 0.75, 0.15, octaves=5, gain=0.6)),),
-        (pt.Emboss(fibre, 2, 0.0006, octaves=1),), drift_roughness=0.05, seed=7,
-    )  # fmt: skip
+        (pt.Emboss(fibre, 2, 0.0006, octaves=1),),
+        drift_roughness=0.05,
+        seed=7,
+    )
     brass = Material(
         Coat(BRASS, 0.22, 1.0),
         ((Coat((0.3, 0.2, 0.09), 0.5, 1.0), pt.Blotches(4.0 * np.eye(3), 9, 0.1, 0.6, octaves=4)),),
-        drift_roughness=0.06, seed=8,
-    )  # fmt: skip
+        drift_roughness=0.06,
+        seed=8,
+    )
 
     def wood(light, dark, rough: float, seed: int) -> Material:
         axes = np.eye(3)[[1, 2, 0]]  # the fibres run along x

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from reli3d.synthetic import patterns as pt
-from reli3d.synthetic.materials import Coat, Material
+from reli3d.synthetic.materials import Bump, Coat, Layer, Material
 
 METAL_SHARE = 0.36  # of the objects may have metal; some of these have no part that takes it
 # F0 of steel, aluminium, gold, brass, copper, bronze, iron, gunmetal, as published tables give them
@@ -76,7 +76,12 @@ def color(rng: np.random.Generator, kind: str) -> tuple[float, float, float]:
             rgb = _linear_of_hsv(u(), u(0.08, 0.42), u(0.25, 0.88))
         case _:
             rgb = _linear_of_hsv(u(), u(0.6, 0.97), u(0.35, 0.95))
-    return tuple(float(x) for x in np.clip(rgb, 0.02, 0.88))
+    return _rgb(rgb)
+
+
+def _rgb(values: np.ndarray) -> tuple[float, float, float]:
+    red, green, blue = (float(x) for x in np.clip(values, 0.02, 0.88))
+    return red, green, blue
 
 
 def _linear_of_hsv(hue: float, saturation: float, value: float) -> np.ndarray:
@@ -102,12 +107,7 @@ def _seed(rng: np.random.Generator) -> int:
 
 
 def _near(rng: np.random.Generator, rgb: tuple, spread: float) -> tuple[float, float, float]:
-    return tuple(
-        float(x)
-        for x in np.clip(
-            np.array(rgb) * np.exp(rng.normal(0, spread)) * np.exp(rng.normal(0, 0.2 * spread, 3)), 0.02, 0.88
-        )
-    )
+    return _rgb(np.array(rgb) * np.exp(rng.normal(0, spread)) * np.exp(rng.normal(0, 0.2 * spread, 3)))
 
 
 def _roughness(rng: np.random.Generator, low: float, high: float) -> float:
@@ -115,7 +115,9 @@ def _roughness(rng: np.random.Generator, low: float, high: float) -> float:
 
 
 def _draw(rng: np.random.Generator, role: str, box: np.ndarray) -> Material:
-    u, layers, bumps = rng.uniform, [], []
+    u = rng.uniform
+    layers: list[Layer] = []
+    bumps: list[Bump] = []
     match role:
         case "wood":
             return _wood(rng, box)
@@ -126,7 +128,7 @@ def _draw(rng: np.random.Generator, role: str, box: np.ndarray) -> Material:
             if rng.random() < 0.6:
                 thread = _frame(rng, 20, 70, turned=0.1)
                 layers.append((Coat(_near(rng, base.color, 0.35), base.roughness), pt.Weave(thread)))
-                bumps.append(pt.Weave(thread, u(0.1, 0.35) / np.linalg.norm(thread[0])))
+                bumps.append(pt.Weave(thread, float(u(0.1, 0.35) / np.linalg.norm(thread[0]))))
             else:
                 bumps.append(_noise_bump(rng, 15, 50, u(0.04, 0.15)))
         case "leather":
@@ -135,13 +137,10 @@ def _draw(rng: np.random.Generator, role: str, box: np.ndarray) -> Material:
                 u(0.3, 0.7),
             )
             skin = _frame(rng, 18, 50)
-            layers.append(
-                (
-                    Coat(_near(rng, base.color, 0.3), min(base.roughness + 0.15, 1.0)),
-                    pt.Mosaic(skin, _seed(rng), border=0.12),
-                )
-            )
-            bumps.append(pt.Emboss(skin, int(layers[0][1].seed), u(0.15, 0.4) / np.linalg.norm(skin[0]), cellular=True))
+            creases = Coat(_near(rng, base.color, 0.3), min(base.roughness + 0.15, 1.0))
+            seed = _seed(rng)
+            layers.append((creases, pt.Mosaic(skin, seed, border=0.12)))
+            bumps.append(pt.Emboss(skin, seed, float(u(0.15, 0.4) / np.linalg.norm(skin[0])), cellular=True))
         case "ceramic":
             base = Coat(color(rng, "white" if rng.random() < 0.4 else "any"), _roughness(rng, 0.12, 0.5))
         case "stone":
@@ -185,7 +184,8 @@ def _draw(rng: np.random.Generator, role: str, box: np.ndarray) -> Material:
 
 def _decor(rng: np.random.Generator, base: Coat, box: np.ndarray, chance: float) -> list:
     """Painted decoration: bands, checks, dots, blotches, a second colour from some height on, labels."""
-    u, layers = rng.uniform, []
+    u = rng.uniform
+    layers: list[Layer] = []
     second = Coat(color(rng, "any"), float(np.clip(base.roughness + rng.normal(0, 0.1), 0.1, 1)))
     size = float(np.max(box[1] - box[0]))
     if rng.random() < chance:
@@ -233,23 +233,29 @@ def label(rng: np.random.Generator, box: np.ndarray) -> list:
         + right * u(-0.3, 0.3) * (np.abs(extent @ right) / 2 - half[0])
         + up * u(-0.6, 0.6) * (np.abs(extent @ up) / 2 - half[1])
     )
-    place = tuple(tuple(float(v) for v in x) for x in (centre, right, up))
+    place = [(float(x), float(y), float(z)) for x, y, z in (centre, right, up)]
     paper = Coat(color(rng, str(rng.choice(["white", "vivid", "any"]))), u(0.3, 0.8))
     ink = Coat(
         color(rng, "dark" if sum(paper.color) > 1.0 else "white") if rng.random() < 0.6 else color(rng, "vivid"),
         paper.roughness,
     )
-    layers, oval = [], rng.random() < 0.2
+    layers: list[Layer] = []
+    oval = rng.random() < 0.2
     if rng.random() < 0.75:
-        layers.append((paper, pt.Decal(*place, tuple(half.tolist()), np.ones((1, 1), dtype=np.float32), oval)))
+        layers.append((paper, _decal(place, half, np.ones((1, 1)), oval)))
     if rng.random() < 0.3:
         side = rng.random((9, 5)) < 0.55
         picture = np.concatenate([side, side[:, -2::-1]], 1)
         inner = np.full(2, 0.7 * half.min())
     else:
         picture, inner = _text(rng, int(rng.integers(1, 6)), int(rng.integers(3, 10))), half * 0.85
-    layers.append((ink, pt.Decal(*place, tuple(inner.tolist()), picture.astype(np.float32))))
+    layers.append((ink, _decal(place, inner, picture)))
     return layers
+
+
+def _decal(place: list[tuple[float, float, float]], half: np.ndarray, picture: np.ndarray, oval=False) -> pt.Decal:
+    centre, right, up = place
+    return pt.Decal(centre, right, up, (float(half[0]), float(half[1])), picture.astype(np.float32), oval)
 
 
 def _text(rng: np.random.Generator, rows: int, columns: int) -> np.ndarray:
@@ -301,8 +307,8 @@ def _wood(rng: np.random.Generator, box: np.ndarray) -> Material:
     frame = u(1.5, 4.0) * axes
     grain = pt.Grain(frame, _seed(rng), u(3, 9), tuple(u(0.5, 4.0, 2).tolist()))
     varnish = _roughness(rng, 0.25, 0.85)
-    late = tuple(float(x) for x in np.clip(np.array(rgb) * u(0.3, 0.75) ** np.array([0.85, 1.0, 1.15]), 0.02, 0.88))
-    layers = [(Coat(late, min(varnish + 0.08, 1.0)), grain)]
+    late = _rgb(np.array(rgb) * u(0.3, 0.75) ** np.array([0.85, 1.0, 1.15]))
+    layers: list[Layer] = [(Coat(late, min(varnish + 0.08, 1.0)), grain)]
     base = Coat(rgb, varnish)
     if rng.random() < 0.2:
         layers += _decor(rng, base, box, 0.4)
@@ -321,7 +327,9 @@ def _metal(rng: np.random.Generator, box: np.ndarray) -> Material:
     u = rng.uniform
     rgb = _near(rng, METALS[int(rng.choice(len(METALS), p=METAL_WEIGHTS))], 0.08)
     base = Coat(rgb, _roughness(rng, 0.15, 0.6), 1.0)
-    layers, bumps, kind = [], [], rng.random()
+    layers: list[Layer] = []
+    bumps: list[Bump] = []
+    kind = rng.random()
     if kind < 0.25:  # rust or verdigris
         rust = Coat(
             _near(rng, (0.22, 0.075, 0.03) if rng.random() < 0.75 else (0.16, 0.3, 0.24), 0.3), u(0.75, 1.0), 0.0
@@ -356,7 +364,8 @@ def _metal(rng: np.random.Generator, box: np.ndarray) -> Material:
 def _stone(rng: np.random.Generator) -> Material:
     u = rng.uniform
     base = Coat(color(rng, str(rng.choice(["grey", "white", "earth", "dark", "muted"]))), _roughness(rng, 0.3, 0.95))
-    layers, bumps = [], []
+    layers: list[Layer] = []
+    bumps: list[Bump] = []
     other = Coat(_near(rng, base.color, 0.7) if rng.random() < 0.7 else color(rng, "any"), base.roughness)
     kind = rng.random()
     if kind < 0.45:

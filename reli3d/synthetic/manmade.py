@@ -16,8 +16,10 @@ from reli3d.synthetic.assembly import Assembly
 def csg(a: Assembly) -> None:
     """Two to eight primitives, mostly aligned with the axes and touching, joined, cut and mirrored."""
     rng, u = a.rng, a.rng.uniform
-    roles = [a.part(str(rng.choice(["plastic", "metal", "wood", "paint", "stone", "accent", "ceramic"])))
-             for _ in range(int(rng.integers(1, 4)))]  # fmt: skip
+    roles = [
+        a.part(str(rng.choice(["plastic", "metal", "wood", "paint", "stone", "accent", "ceramic"])))
+        for _ in range(int(rng.integers(1, 4)))
+    ]
     size = u(0.35, 1.0, 3)
     a.add(primitive(rng, size), roles[0])
     for _ in range(int(rng.integers(1, 8))):
@@ -268,19 +270,19 @@ def profile(a: Assembly) -> None:
         for _ in range(int(rng.integers(0, 4))):
             a.cut(p.cylinder(u(0.05, 0.14), 2).rotate((90, 0, 0)), part, (*u(-0.35, 0.35, 2), 0))
     elif kind == 3:  # knot or closed loop
-        t = np.linspace(0, 2 * np.pi, 121)[:-1]
+        turn = np.linspace(0, 2 * np.pi, 121)[:-1]
         q, r = (2, 3) if rng.random() < 0.5 else (1, int(rng.integers(2, 5)))
-        wide = 1 + u(0.15, 0.4) * np.cos(r * t)
-        path = np.stack([wide * np.cos(q * t), u(0.2, 0.4) * np.sin(r * t), wide * np.sin(q * t)], -1)
+        wide = 1 + u(0.15, 0.4) * np.cos(r * turn)
+        path = np.stack([wide * np.cos(q * turn), u(0.2, 0.4) * np.sin(r * turn), wide * np.sin(q * turn)], -1)
         a.add(p.tube(path, u(0.07, 0.14), closed=True, segments=14), part)
         if rng.random() < 0.5:
             a.transform(np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0.0]]))
     else:  # horn: a coiled tube that opens
         turns, count = u(0.6, 2.2), 90
-        t = np.linspace(0, 1, count)
-        angle, radius = 2 * np.pi * turns * t, 0.25 + 0.35 * t
-        path = np.stack([radius * np.cos(angle), radius * np.sin(angle), u(0.1, 0.5) * t], -1)
-        width = u(0.02, 0.05) + 0.06 * t + u(0.05, 0.25) * np.maximum(t - 0.8, 0) ** 2 / 0.04
+        done = np.linspace(0, 1, count)
+        angle, radius = 2 * np.pi * turns * done, 0.25 + 0.35 * done
+        path = np.stack([radius * np.cos(angle), radius * np.sin(angle), u(0.1, 0.5) * done], -1)
+        width = u(0.02, 0.05) + 0.06 * done + u(0.05, 0.25) * np.maximum(done - 0.8, 0) ** 2 / 0.04
         a.add(p.tube(path, width, segments=18), part)
         tangent = path[-1] - path[-2]
         inside = p.capsule(path[-1] - 2 * tangent, path[-1] + 4 * tangent, width[-1] * 0.5, tip=width[-1] * 0.9)

@@ -41,11 +41,18 @@ def held_back(names: list[str]) -> list[bool]:
     return [rank[n] % HELD_BACK == HELD_BACK - 1 for n in names]
 
 
+def training_maps(path: Path) -> Tensor:
+    """The maps of :func:`load_maps` that training may see, ``(n, 64, 128, 3)``."""
+    maps, names = load_maps(path)
+    return maps[torch.tensor([not held for held in held_back(names)])].contiguous()
+
+
 def with_lamps(light: Tensor, rng: np.random.Generator) -> Tensor:
     """The lat-long map ``(H, 2H, 3)`` with one to three lamps: soft discs that bring a good part of its light."""
     rows = light.shape[0]
-    theta, phi = torch.meshgrid((torch.arange(rows) + 0.5) * np.pi / rows,
-                                (torch.arange(2 * rows) + 0.5) * np.pi / rows, indexing="ij")  # fmt: skip
+    theta, phi = torch.meshgrid(
+        (torch.arange(rows) + 0.5) * np.pi / rows, (torch.arange(2 * rows) + 0.5) * np.pi / rows, indexing="ij"
+    )
     directions = torch.stack([theta.sin() * phi.cos(), theta.cos(), theta.sin() * phi.sin()], -1)
     area = theta.sin()[..., None]
     total = float((light.mean(-1, keepdim=True) * area).sum())

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -28,13 +29,32 @@ class Coat:
     metallic: float = 0.0
 
 
+class Pattern(Protocol):
+    """Where a coat lies."""
+
+    def weight(self, points: Tensor, normals: Tensor) -> Tensor:
+        """``(N,)`` in [0, 1] at surface points and normals ``(N, 3)``."""
+        ...
+
+
+class Bump(Protocol):
+    """How the surface is embossed."""
+
+    def slope(self, points: Tensor, normals: Tensor) -> Tensor:
+        """Gradient ``(N, 3)`` of the height at surface points and normals ``(N, 3)``."""
+        ...
+
+
+Layer = tuple[Coat, Pattern]
+
+
 @dataclass(frozen=True)
 class Material:
     """A coat, further coats where their patterns say, a slow drift of colour and roughness, and bumps."""
 
     base: Coat
-    layers: tuple[tuple[Coat, object], ...] = ()
-    bumps: tuple[object, ...] = ()
+    layers: tuple[Layer, ...] = ()
+    bumps: tuple[Bump, ...] = ()
     drift: float = 0.0  # relative standard deviation of the colour, by noise
     drift_roughness: float = 0.0
     drift_scale: float = 3.0  # cycles a unit
@@ -82,7 +102,7 @@ def evaluate(materials: Sequence[Material], points, normals, part):
     color, bumped = torch.empty_like(points), torch.empty_like(points)
     roughness, metallic = points.new_empty(len(points)), points.new_empty(len(points))
     for k in torch.bincount(part, minlength=1).nonzero()[:, 0].tolist():
-        own = (part == k).nonzero()[:, 0]
-        color[own], roughness[own], metallic[own], bumped[own] = materials[k].at(points[own], normals[own])
+        rows = (part == k).nonzero()[:, 0]
+        color[rows], roughness[rows], metallic[rows], bumped[rows] = materials[k].at(points[rows], normals[rows])
     results = color, roughness, metallic, bumped
     return tuple(r.numpy() for r in results) if as_array else results

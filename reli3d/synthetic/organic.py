@@ -7,6 +7,8 @@ edge.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from reli3d.synthetic import primitives as p
@@ -18,12 +20,14 @@ CELLS = 52  # along the longest side: limbs of 4 % are still two cells thick
 class Field:
     """Signed distance-like values on a grid about a box, joined smoothly piece by piece."""
 
-    def __init__(self, low: np.ndarray, high: np.ndarray):
-        low, high = np.asarray(low, dtype=np.float32), np.asarray(high, dtype=np.float32)
+    def __init__(self, lowest: Sequence[float], highest: Sequence[float]):
+        low, high = np.asarray(lowest, dtype=np.float32), np.asarray(highest, dtype=np.float32)
         self.step = float((high - low).max()) / CELLS
         self.low = low - 3 * self.step
         count = np.ceil((high - self.low) / self.step).astype(int) + 4
-        self.axes = [np.float32(self.low[k] + self.step * np.arange(count[k], dtype=np.float32)) for k in range(3)]
+        self.axes = [
+            (self.low[k] + self.step * np.arange(count[k], dtype=np.float32)).astype(np.float32) for k in range(3)
+        ]
         self.value = np.full(tuple(count), 10.0, dtype=np.float32)
         self.label = np.zeros(tuple(count), dtype=np.int8)
 

@@ -16,7 +16,7 @@ Y_UP = (-90.0, 0.0, 0.0)  # manifold3d extrudes and revolves along +Z: (x, y, z)
 BEVEL_STEPS = 2  # facets of a rounded edge: with smoothed normals two look round at 512 pixels
 
 
-def box(size: Sequence[float], bevel: float = 0.0) -> Manifold:
+def box(size: Sequence[float] | np.ndarray, bevel: float = 0.0) -> Manifold:
     """Box of full ``size`` about the origin; edges rounded with radius ``bevel``, at most half the shortest side."""
     half = np.asarray(size, dtype=float) / 2
     bevel = min(bevel, 0.98 * float(half.min()))
@@ -61,7 +61,7 @@ def cylinder(
     return solid_of_profile(ring[:, 0], ring[:, 1], segments)
 
 
-def ellipsoid(radii: Sequence[float], segments: int = 32) -> Manifold:
+def ellipsoid(radii: Sequence[float] | np.ndarray, segments: int = 32) -> Manifold:
     """Ellipsoid of the given half axes about the origin."""
     return Manifold.sphere(1.0, segments).scale(tuple(float(r) for r in radii))
 
@@ -70,8 +70,10 @@ def capsule(
     start: Sequence[float], end: Sequence[float], radius: float, *, tip: float | None = None, segments: int = 20
 ) -> Manifold:
     """Convex hull of two balls, of ``radius`` at ``start`` and ``tip`` (default the same) at ``end``."""
-    ends = [Manifold.sphere(r, segments).translate(tuple(map(float, p)))
-            for p, r in ((start, radius), (end, radius if tip is None else tip))]  # fmt: skip
+    ends = [
+        Manifold.sphere(r, segments).translate(tuple(map(float, p)))
+        for p, r in ((start, radius), (end, radius if tip is None else tip))
+    ]
     return Manifold.batch_hull(ends)
 
 
@@ -82,7 +84,12 @@ def torus(ring: float, tube: float, *, segments: int = 40, degrees: float = 360.
 
 
 def prism(
-    outline: np.ndarray, height: float, *, bevel: float = 0.0, taper: float = 1.0, twist: float = 0.0
+    outline: np.ndarray | Sequence[np.ndarray],
+    height: float,
+    *,
+    bevel: float = 0.0,
+    taper: float = 1.0,
+    twist: float = 0.0,
 ) -> Manifold:
     """Polygon ``(K, 2)`` (or a list of contours) in x, z raised by ``height`` about the origin.
 
@@ -109,8 +116,14 @@ def wedge(size: Sequence[float], ridge: float, shift: float = 0.0) -> Manifold:
     return Manifold.hull_points(np.concatenate([low, top]))
 
 
-def tube(path: np.ndarray, radius: np.ndarray | float, *, closed: bool = False, outline: np.ndarray | None = None,
-         segments: int = 12) -> Manifold:  # fmt: skip
+def tube(
+    path: np.ndarray,
+    radius: np.ndarray | float,
+    *,
+    closed: bool = False,
+    outline: np.ndarray | None = None,
+    segments: int = 12,
+) -> Manifold:
     """Solid swept along ``path`` ``(K, 3)`` with ``radius`` at each point; ``outline`` ``(M, 2)`` replaces the unit
     circle.
 
@@ -138,9 +151,9 @@ def tube(path: np.ndarray, radius: np.ndarray | float, *, closed: bool = False, 
     size = np.broadcast_to(np.asarray(radius, dtype=float), (count,))[:, None, None]
     rings = path[:, None] + size * (outline[None, :, :1] * side[:, None] + outline[None, :, 1:] * other[:, None])
     m = len(outline)
-    k, j = np.meshgrid(np.arange(count if closed else count - 1), np.arange(m), indexing="ij")
-    a, b = (k * m + j).ravel(), (k * m + (j + 1) % m).ravel()
-    c, d = ((k + 1) % count * m + j).ravel(), ((k + 1) % count * m + (j + 1) % m).ravel()
+    i, j = np.meshgrid(np.arange(count if closed else count - 1), np.arange(m), indexing="ij")
+    a, b = (i * m + j).ravel(), (i * m + (j + 1) % m).ravel()
+    c, d = ((i + 1) % count * m + j).ravel(), ((i + 1) % count * m + (j + 1) % m).ravel()
     faces = [np.stack([a, b, d], -1), np.stack([a, d, c], -1)]
     vertices = rings.reshape(-1, 3)
     if not closed:

@@ -95,8 +95,8 @@ def assemble(assembly: Assembly, name: str, materials: tuple[Material, ...] | No
     used, part = np.unique(part, return_inverse=True)
     part = part.reshape(-1).astype(np.int32)
     if materials is None:
-        own = [vertices[faces[part == k]].reshape(-1, 3) for k in range(len(used))]
-        bounds = np.array([[points.min(0), points.max(0)] for points in own])
+        corners = [vertices[faces[part == k]].reshape(-1, 3) for k in range(len(used))]
+        bounds = np.array([[points.min(0), points.max(0)] for points in corners])
         materials = draw_materials(assembly.rng, [assembly.roles[k] for k in used], bounds)
     else:
         materials = tuple(materials[k] for k in used)
@@ -135,8 +135,8 @@ def corner_normals(vertices: np.ndarray, faces: np.ndarray, crease_deg: float = 
     weight = np.repeat(normal * area[:, None], 3, axis=0) * angle.reshape(-1, 1)
     total = np.stack([np.bincount(label, weights=weight[:, k], minlength=groups) for k in range(3)], -1)
     size = np.linalg.norm(total, axis=1, keepdims=True)
-    own = np.repeat(normal, 3, axis=0)
-    result = np.where(size[label] > 1e-20, total[label] / np.maximum(size[label], 1e-20), own)
+    flat = np.repeat(normal, 3, axis=0)
+    result = np.where(size[label] > 1e-20, total[label] / np.maximum(size[label], 1e-20), flat)
     result[np.linalg.norm(result, axis=1) < 0.5] = (0.0, 1.0, 0.0)  # a sliver by itself: any unit vector
     return result.reshape(count, 3, 3).astype(np.float32)
 

@@ -97,8 +97,15 @@ class ObjectSurface:
         position = (corners * weights).sum(1)
         base, rough, metal, bump = self.shape.material(position.numpy(), normal.numpy(), self.part[face].numpy())
         as_float = lambda x: torch.as_tensor(np.ascontiguousarray(x), dtype=torch.float32)  # noqa: E731
-        return {"position": position, "normal": normal, "ng": ng, "bump": as_float(bump), "base_color": as_float(base),
-                "roughness": as_float(rough), "metallic": as_float(metal)}  # fmt: skip
+        return {
+            "position": position,
+            "normal": normal,
+            "ng": ng,
+            "bump": as_float(bump),
+            "base_color": as_float(base),
+            "roughness": as_float(rough),
+            "metallic": as_float(metal),
+        }
 
 
 def _render(surface: Surface, camera: Camera, light: Environment, seed: int):
@@ -124,12 +131,13 @@ def synthesize(
     environment = Environment(torch.roll(light, int(rng.integers(light.shape[1])), 1).contiguous())
     c2w = torch.as_tensor(np.asarray(sample_cameras(rng, views)[0]), dtype=torch.float32)
     intrinsics = torch.stack([crop_camera(surface.vertices, m, size, rng.uniform(0.04, 0.12)) for m in c2w])
-    sample, exposure, images, pixels, pixel_radiance = {}, None, [], [], []
+    sample: dict[str, Tensor] = {}
+    exposure, images, pixels, pixel_radiance = 0.0, [], [], []
     maps: dict[str, list[Tensor]] = {"view_material": [], "view_normal": [], "view_depth": []}
     for k in range(views):
         camera = Camera(c2w[k], intrinsics[k] * FINE, size * FINE, size * FINE)
         image, seen, at, wo, radiance = _render(surface, camera, environment, int(rng.integers(1 << 30)))
-        if exposure is None:
+        if k == 0:
             exposure = EXPOSED / max(float(radiance.mean(-1).quantile(0.9)), 1e-3) * float(np.exp(rng.normal(0, 0.25)))
         alpha = _coverage(surface.scene, c2w[k], intrinsics[k], size)
         image = pooled_pixels((image * exposure).clamp(0, 4), size).clamp(0, 1)  # a sensor saturates, late
@@ -140,8 +148,13 @@ def synthesize(
         pick = torch.as_tensor(rng.integers(len(seen), size=PIXELS))
         pixels.append(torch.stack([at["position"], at["bump"], wo], 1)[pick])
         pixel_radiance.append((radiance[pick] * exposure).clamp(max=64.0))
-    sample.update(images=torch.stack(images), c2w=c2w, intrinsics=intrinsics,
-                  pixels=torch.stack(pixels).half(), pixel_radiance=torch.stack(pixel_radiance).half())  # fmt: skip
+    sample.update(
+        images=torch.stack(images),
+        c2w=c2w,
+        intrinsics=intrinsics,
+        pixels=torch.stack(pixels).half(),
+        pixel_radiance=torch.stack(pixel_radiance).half(),
+    )
     sample.update({name: torch.stack(values) for name, values in maps.items()})
     pooled = torch.nn.functional.interpolate(
         (environment.radiance * exposure).permute(2, 0, 1)[None], (32, 64), mode="area"
@@ -155,17 +168,25 @@ def _view_maps(at: dict[str, Tensor], seen: Tensor, c2w: Tensor, size: int) -> d
     """What is true at the pixels of one view, see the table above, from the rays ``seen (N,)`` that hit."""
     rays = (size * FINE) ** 2
     depth = -((at["position"] - c2w[:3, 3]) @ c2w[:3, 2])
-    values = [at["base_color"].clamp(0, 1), at["roughness"][:, None], at["metallic"][:, None], at["bump"],
-              depth[:, None], torch.ones_like(depth)[:, None]]  # fmt: skip
+    values = [
+        at["base_color"].clamp(0, 1),
+        at["roughness"][:, None],
+        at["metallic"][:, None],
+        at["bump"],
+        depth[:, None],
+        torch.ones_like(depth)[:, None],
+    ]
     dense = torch.zeros(rays, 10).index_copy_(0, seen, torch.cat(values, -1))
     base, rest, normal, depth, hit = pooled_pixels(dense, size).split([3, 2, 3, 1, 1], -1)
     share = hit.clamp(min=0.5 / FINE**2)
     material = torch.cat([linear_to_srgb((base / share).clamp(0, 1)), rest / share], -1)
     normal = torch.nn.functional.normalize(normal, dim=-1)
     whole = hit > 0.5
-    return {"view_material": (material * whole * 255 + 0.5).to(torch.uint8),
-            "view_normal": (normal * whole * 127).round().to(torch.int8),
-            "view_depth": (depth / share * whole)[..., 0].half()}  # fmt: skip
+    return {
+        "view_material": (material * whole * 255 + 0.5).to(torch.uint8),
+        "view_normal": (normal * whole * 127).round().to(torch.int8),
+        "view_depth": (depth / share * whole)[..., 0].half(),
+    }
 
 
 def pooled_pixels(rays: Tensor, size: int) -> Tensor:

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from reli3d._bridge import present
 from reli3d.geometry.distance import signed_distance
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene
@@ -82,11 +83,11 @@ class ScannedSurface:
 
 
 def _moved(mesh: Mesh, centre: Tensor, stretch: Tensor, size: float) -> Mesh:
-    normals = torch.nn.functional.normalize(mesh.normals / stretch, dim=-1)
+    normals = torch.nn.functional.normalize(present("mesh.normals", mesh.normals) / stretch, dim=-1)
     tangents = mesh.tangents
     if tangents is not None:
-        along = tangents[:, :3] * stretch
-        along = torch.nn.functional.normalize(along - (along * normals).sum(-1, keepdim=True) * normals, dim=-1)
-        tangents = torch.cat([along, tangents[:, 3:]], -1)
+        turned = tangents[:, :3] * stretch
+        turned = torch.nn.functional.normalize(turned - (turned * normals).sum(-1, keepdim=True) * normals, dim=-1)
+        tangents = torch.cat([turned, tangents[:, 3:]], -1)
     vertices = (mesh.vertices * stretch - centre) / size
     return replace(mesh, vertices=vertices.contiguous(), normals=normals.contiguous(), tangents=tangents)

@@ -42,13 +42,13 @@ def _count(rng: np.random.Generator) -> int:
 @lru_cache(64)
 def _read(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Welded vertices, faces and the primitive of each face; longest side 1, centred."""
-    vertices, faces, part, start = [], [], [], 0
+    vertices, faces, owners, start = [], [], [], 0
     for k, asset in enumerate(read_glb(path)):
         vertices.append(asset.mesh.vertices.numpy())
         faces.append(asset.mesh.faces.numpy() + start)
-        part.append(np.full(len(faces[-1]), k))
+        owners.append(np.full(len(faces[-1]), k))
         start += len(vertices[-1])
-    v, f, part = np.concatenate(vertices).astype(np.float64), np.concatenate(faces), np.concatenate(part)
+    v, f, part = np.concatenate(vertices).astype(np.float64), np.concatenate(faces), np.concatenate(owners)
     v = (v - (v.min(0) + v.max(0)) / 2) / np.ptp(v, axis=0).max()
     _, first, index = np.unique(np.round(v * 1e5).astype(np.int64), axis=0, return_index=True, return_inverse=True)
     f = index.reshape(-1)[f]
@@ -58,7 +58,8 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def combine(paths: Sequence[Path], rng: np.random.Generator) -> ProceduralObject:
     """The shapes of ``paths`` as one object: the first as it rests, the others beside, on or in it."""
-    vertices, faces, part, start, parts = [], [], [], 0, 0
+    vertices: list[np.ndarray] = []
+    faces, owners, start, parts = [], [], 0, 0
     for k, path in enumerate(paths):
         v, f, p = _read(path)
         if len(f) < COARSE_FACES and rng.random() < ROUNDED:
@@ -79,16 +80,18 @@ def combine(paths: Sequence[Path], rng: np.random.Generator) -> ProceduralObject
             v = v - (v.min(0) + v.max(0)) / 2 + at
             if rng.random() < 0.5:
                 v[:, 1] += low[1] - v[:, 1].min()  # both stand on the ground
-        vertices.append(v), faces.append(f + start), part.append(p + parts)
+        vertices.append(v)
+        faces.append(f + start)
+        owners.append(p + parts)
         start, parts = start + len(v), parts + int(p.max()) + 1
-    v, f, part = np.concatenate(vertices), np.concatenate(faces), np.concatenate(part)
+    v, f, part = np.concatenate(vertices), np.concatenate(faces), np.concatenate(owners)
     if len(f) > MAX_FACES:
         raise ValueError(f"shape: expected at most {MAX_FACES} faces, got {len(f)}")
     v = ((v - (v.min(0) + v.max(0)) / 2) / np.ptp(v, axis=0).max()).astype(np.float32)
     used, part = np.unique(part, return_inverse=True)
     part = part.reshape(-1).astype(np.int32)
-    bounds = [v[f[part == k]].reshape(-1, 3) for k in range(len(used))]
-    bounds = np.array([[b.min(0), b.max(0)] for b in bounds])
+    corners = [v[f[part == k]].reshape(-1, 3) for k in range(len(used))]
+    bounds = np.array([[c.min(0), c.max(0)] for c in corners])
     roles = [str(rng.choice(ROLES)) for _ in used]
     materials = draw_materials(rng, roles, bounds)
     crease = CREASE_DEG if rng.random() < 0.7 else float(rng.choice([10.0, 60.0]))

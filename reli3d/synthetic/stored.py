@@ -35,25 +35,29 @@ def check_sample(path: str | os.PathLike, *, views: int = 1) -> None:
             slices = {name: file.get_slice(name) for name in file.keys()}  # noqa: SIM118 - no iterable
             found = {name: (tuple(s.get_shape()), s.get_dtype()) for name, s in slices.items()}
     except SafetensorError as error:
-        raise InputError(path, f"expected a sample of reli3d-data, got a broken file ({shown(str(error))}); make it "
-                         "again") from None  # fmt: skip
+        raise InputError(
+            path, f"expected a sample of reli3d-data, got a broken file ({shown(str(error))}); make it again"
+        ) from None
     sizes: dict[str, int] = {}
     for name, (axes, dtype) in TENSORS.items():
         shape, got = found.get(name, ((), None))
         wanted = axes.split()
         if got != dtype or len(shape) != len(wanted):
-            told = "none" if got is None else f"{got} {shape}"
-            raise InputError(path, f"{name}: expected {dtype} ({', '.join(wanted)}), got {told}; make it again")
+            found_text = "none" if got is None else f"{got} {shape}"
+            raise InputError(path, f"{name}: expected {dtype} ({', '.join(wanted)}), got {found_text}; make it again")
         for letter, size in zip(wanted, shape, strict=True):
             if size < 1 or size != (int(letter) if letter.isdigit() else sizes.setdefault(letter, size)):
-                raise InputError(path, f"{name}: expected ({', '.join(wanted)}) as its other tensors have it, got "
-                                 f"{shape}; make it again")  # fmt: skip
+                raise InputError(
+                    path,
+                    f"{name}: expected ({', '.join(wanted)}) as its other tensors have it, got {shape}; make it again",
+                )
     if sizes["V"] < views:
         raise InputError(path, f"views: expected at least {views}, got {sizes['V']}; make samples of more views")
 
 
-def check_samples(folder: Path, name: str, *, views: int = 1,
-                  also: Callable[[Path], None] = lambda path: None) -> list[Path]:  # fmt: skip
+def check_samples(
+    folder: Path, name: str, *, views: int = 1, also: Callable[[Path], None] = lambda path: None
+) -> list[Path]:
     """Files of all samples in ``folder``, checked.  Raises InputError where one is broken or there is none.
 
     name: of the option or argument that gave the folder.  also: what else must hold of each file.

@@ -14,9 +14,11 @@ from torch.nn import functional
 
 from reli3d.geometry.hull import mask_distance
 from reli3d.nn.reni import map_directions
+from reli3d.train.relight import Finish, draw_light, relit
 
 TURNED_UP = 0.12  # share of objects whose world is not +Y up: captures come in any frame
 NOISE = 0.012  # greatest standard deviation of a photograph's noise, sRGB
+RELIT = 0.5  # share of the objects whose photographs are made anew under another light
 KEPT = 0.75  # share of the augmented objects that stay the right way round in a mirror, and keep their channels
 
 
@@ -25,8 +27,11 @@ def random_turn(rng: np.random.Generator) -> Tensor:
     a = rng.uniform(0, 2 * np.pi)
     yaw = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
     if rng.random() < TURNED_UP:
-        up = [np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]), np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]]),
-              np.array([[1, 0, 0], [0, -1, 0], [0, 0, -1]])][rng.integers(3)]  # fmt: skip
+        up = [
+            np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]),
+            np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]]),
+            np.array([[1, 0, 0], [0, -1, 0], [0, 0, -1]]),
+        ][rng.integers(3)]
         yaw = up @ yaw
     return torch.as_tensor(yaw, dtype=torch.float32)
 
@@ -53,10 +58,12 @@ class Sample:
     light: Tensor  # (2048, 3) linear radiance
 
 
-def load_sample(path: Path, views: int, points: int, rng: np.random.Generator, *, augment: bool = True) -> Sample:
+def load_sample(
+    path: Path, views: int, points: int, rng: np.random.Generator, *, augment: bool = True, lights: Tensor | None = None
+) -> Sample:
     """``views`` random views of a file, at most what it has; ``points`` of the volume, half as many of the surface.
 
-    Without ``augment`` the first views, as they are.
+    lights: ``(n, H, 2H, 3)`` under which some samples are relit.  Without ``augment`` the first views, as they are.
     """
     with safe_open(path, "pt") as file:
         total = file.get_slice("c2w").get_shape()[0]
@@ -82,12 +89,17 @@ def load_sample(path: Path, views: int, points: int, rng: np.random.Generator, *
         of_pixels = of_views("view_material").float() / 255
         normal, depth = of_views("view_normal").float() / 127, of_views("view_depth").float()
         light = file.get_tensor("environment").float()
+    valid = depth > 0
+    if augment and lights is not None and rng.random() < RELIT:
+        finish = Finish.draw(rng)
+        material, of_pixels = finish.apply(material), finish.apply(of_pixels)
+        images, light = relit(images, of_pixels, normal, valid, c2w, intrinsics, draw_light(lights, rng), rng)
     turn = random_turn(rng) if augment else torch.eye(3)
     flip = torch.tensor([-1.0 if augment and rng.random() > KEPT else 1.0, 1.0, 1.0])
     turn = turn * flip  # a mirror at the plane x = 0, then the turn
     mirrored = bool(flip[0] < 0)
     if mirrored:
-        images, of_pixels, normal, depth = (t.flip(2) for t in (images, of_pixels, normal, depth))
+        images, of_pixels, normal, depth, valid = (t.flip(2) for t in (images, of_pixels, normal, depth, valid))
         intrinsics = intrinsics.clone()
         intrinsics[:, 2] = images.shape[2] - intrinsics[:, 2]
     c2w = c2w.clone()
@@ -103,7 +115,6 @@ def load_sample(path: Path, views: int, points: int, rng: np.random.Generator, *
     if augment:
         noise = torch.from_numpy(rng.standard_normal(color.shape, dtype=np.float32))
         color = (color + float(rng.random()) * NOISE * noise).clamp(0, 1)
-    valid = depth > 0
     whole = functional.avg_pool2d(valid.float()[:, None], 2)[:, 0]
     share = whole.clamp(min=0.25)[..., None]
 
@@ -123,9 +134,10 @@ def load_sample(path: Path, views: int, points: int, rng: np.random.Generator, *
 
 
 def batches(folder: Path, *, size: int, points: int, max_views: int, seed: int, start: int = 0,
-            rank: int = 0) -> Iterator[list[Sample]]:  # fmt: skip
+            rank: int = 0, lights: Tensor | None = None) -> Iterator[list[Sample]]:  # fmt: skip
     """Endless lists of ``size`` objects, each with 1 to ``max_views`` views; step ``k`` is a function of ``seed`` and
-    ``k`` alone for a fixed folder, so training resumes; ``rank`` tells processes apart that share a step.
+    ``k`` alone for a fixed folder, so training resumes; ``rank`` tells processes apart that share a step; ``lights``
+    as in :func:`load_sample`.
     """
     files, step = sorted(folder.glob("*.safetensors")), start
     if not files:
@@ -134,6 +146,10 @@ def batches(folder: Path, *, size: int, points: int, max_views: int, seed: int, 
         if step % 50 == 0:  # samples may still be arriving
             files = sorted(folder.glob("*.safetensors"))
         rng = np.random.default_rng((seed, step, rank))
-        yield [load_sample(files[int(rng.integers(len(files)))], int(rng.integers(1, max_views + 1)), points, rng)
-               for _ in range(size)]  # fmt: skip
+        yield [
+            load_sample(
+                files[int(rng.integers(len(files)))], int(rng.integers(1, max_views + 1)), points, rng, lights=lights
+            )
+            for _ in range(size)
+        ]
         step += 1

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene
+from reli3d.nn.presets import LocalPreset
 from reli3d.pipeline import Network, NoSurface, encode, extract, prepare
 from reli3d.render.camera import Camera, camera_rays
 from reli3d.train.pictures import sample_views
@@ -32,8 +33,14 @@ LOST = math.log(20.0)  # a twentieth of the object is all that is found
 
 
 @torch.no_grad()
-def calibrate(model: Network, samples: Path, *, objects: int = 32, seed: int = 1,
-              progress: Callable[[str], None] = lambda line: None) -> dict[int, dict[float, float]]:  # fmt: skip
+def calibrate(
+    model: Network,
+    samples: Path,
+    *,
+    objects: int = 32,
+    seed: int = 1,
+    progress: Callable[[str], None] = lambda line: None,
+) -> dict[int, dict[float, float]]:
     """Set the preset's surface offsets to the least that do as well as any by :func:`mismatch` over random ``samples``.
 
     samples: a folder of samples with more than ``MANY`` views, best of objects that no training saw: of those it knows
@@ -44,7 +51,10 @@ def calibrate(model: Network, samples: Path, *, objects: int = 32, seed: int = 1
     if not files:
         raise ValueError(f"samples: expected *.safetensors files, got none in {samples}")
     chosen = np.random.default_rng(seed).permutation(len(files))[:objects]
-    plain, scores = model.preset, {FEW: [], MANY: []}
+    plain = model.preset
+    if not isinstance(plain, LocalPreset):
+        raise ValueError(f"model: expected a network of convolutions, got the preset {plain.name}")
+    scores: dict[int, list[list[tuple[float, float]]]] = {FEW: [], MANY: []}
     for k in chosen:
         sample = load_file(files[k])
         for count, rows in scores.items():

@@ -18,7 +18,7 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
-from reli3d.nn.presets import SMALL
+from reli3d.nn.presets import OFFICIAL, TINY
 from reli3d.nn.reni import EnvironmentDecoder, map_directions, reni_frame
 from reli3d.nn.reni_fit import fit_latent
 from reli3d.synthetic.maps import ROWS, held_back, load_maps
@@ -54,9 +54,9 @@ def fit(decoder: EnvironmentDecoder, maps: Tensor, *, steps: int, minutes: float
     latents = torch.nn.Parameter(
         0.1 * torch.randn(len(maps), decoder.field.network.layers[0].mha.key.in_features // 3, 3, generator=generator)
     )
-    groups = [{"params": [latents], "lr": 1e-2}, {"params": [p for p in decoder.field.parameters()], "lr": 1e-3}]
-    optimizer = torch.optim.Adam(groups)
-    base = [g["lr"] for g in groups]
+    base = [1e-2, 1e-3]
+    groups = zip(([latents], list(decoder.field.parameters())), base, strict=True)
+    optimizer = torch.optim.Adam([{"params": values, "lr": rate} for values, rate in groups])
     directions, flat = reni_frame(map_directions(ROWS)).reshape(-1, 3), maps.reshape(len(maps), -1, 3)
     height = torch.sin((torch.arange(ROWS) + 0.5) * torch.pi / ROWS).repeat_interleave(2 * ROWS)
     began, mean = time.monotonic(), 0.0
@@ -98,11 +98,12 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=8000)
     parser.add_argument("--minutes", type=float, default=12.0)
     parser.add_argument("--blends", type=int, default=400)
+    parser.add_argument("--preset", choices=("tiny", "official"), default="official", help="whose decoder it is")
     args = parser.parse_args()
     torch.manual_seed(0)
     maps, names = load_maps(args.maps)
     kept = scale_free(maps[[not h for h in held_back(names)]])
-    decoder = EnvironmentDecoder(SMALL.reni)
+    decoder = EnvironmentDecoder((TINY if args.preset == "tiny" else OFFICIAL).reni)
     every = torch.cat([kept, scale_free(blends(kept, args.blends, np.random.default_rng(0)))])
     latents = fit(decoder, every, steps=args.steps, minutes=args.minutes)
     state = {k: v.contiguous() for k, v in decoder.state_dict().items()}

@@ -8,12 +8,14 @@ import os
 import sys
 import time
 from dataclasses import asdict, dataclass
+from functools import reduce
 from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 
 from reli3d.nn.local import LocalReconstructor
+from reli3d.synthetic.maps import training_maps
 from reli3d.train.batches import batches
 from reli3d.train.losses import WEIGHTS, losses
 from reli3d.train.pictures import write_curves, write_validation
@@ -36,6 +38,7 @@ class TrainConfig:
     average: float = 0.999  # decay of the averaged weights that are saved for use
     checkpoint_seconds: float = 300.0
     seed: int = 0
+    maps: str = ""  # file of environment maps, .npz, under which some samples are relit
     validation: str = ""  # folder of held-back samples; the first ones are drawn at every checkpoint
 
 
@@ -79,8 +82,16 @@ def train(model: LocalReconstructor, config: TrainConfig, workers: Workers | Non
     if workers.rank == 0:
         log = open(folder / "log.jsonl", "a", buffering=1)  # noqa: SIM115 - open for the whole run
         log.write(json.dumps({"step": step, "config": asdict(config), "processes": workers.count}) + "\n")
-    source = batches(Path(config.samples), size=config.batch // workers.count, points=config.points,
-                     max_views=config.max_views, seed=config.seed, start=step, rank=workers.rank)  # fmt: skip
+    source = batches(
+        Path(config.samples),
+        size=config.batch // workers.count,
+        points=config.points,
+        max_views=config.max_views,
+        seed=config.seed,
+        start=step,
+        rank=workers.rank,
+        lights=training_maps(Path(config.maps)) if config.maps else None,
+    )
     began, saved = time.monotonic() - seconds, time.monotonic()
     sums: dict[str, float] = {}
     while progress(config, step, seconds) < 1.0:
@@ -92,7 +103,7 @@ def train(model: LocalReconstructor, config: TrainConfig, workers: Workers | Non
         values = torch.zeros(len(WEIGHTS) + 1)
         for sample in next(source):  # one after the other: they have different numbers of views
             terms = losses(model, sample)
-            (sum(WEIGHTS[k] * v for k, v in terms.items()) / share).backward()
+            (reduce(torch.add, [WEIGHTS[k] * v for k, v in terms.items()]) / share).backward()
             values[:-1] += torch.stack([terms[k].detach() for k in WEIGHTS]) / share
         values[-1] = time.monotonic() - began
         names = list(WEIGHTS)

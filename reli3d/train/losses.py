@@ -12,12 +12,12 @@ from reli3d.train.batches import Sample
 
 WEIGHTS = {
     "occupancy": 1.0, "surface": 0.02, "gradient": 0.3,
-    "base_color": 4.0, "pattern": 8.0, "roughness": 1.5, "metallic": 1.5, "normal": 1.0,
-    "pixel_color": 8.0, "pixel_roughness": 1.0, "pixel_metallic": 1.0, "pixel_normal": 1.0, "pixel_depth": 0.1,
-    "light": 0.4, "irradiance": 0.4,
+    "base_color": 4.0, "pattern": 12.0, "roughness": 1.5, "metallic": 1.5, "normal": 1.0,
+    "pixel_color": 3.0, "pixel_pattern": 12.0, "pixel_roughness": 1.0, "pixel_metallic": 1.0, "pixel_normal": 1.0,
+    "pixel_depth": 0.3, "light": 0.4, "light_level": 0.1, "irradiance": 0.4,
 }  # fmt: skip
 ASTRAY = 0.02, 0.3  # greatest deviation of position [model's cube] and normal [radian] of an extracted surface
-GRADIENT_POINTS, GRADIENT_STEP = 256, 0.008  # surface points whose level's slope is asked, over about a grid cell
+GRADIENT_POINTS, GRADIENT_STEP = 384, 0.012  # surface points whose level's slope is asked, over about a grid cell
 DEPTH_UNIT = 0.1  # of the object's longest side
 NORMALS = 192  # directions at which the irradiance is compared
 
@@ -89,42 +89,53 @@ def pattern_loss(color: Tensor, target: Tensor) -> Tensor:
     """Mean square difference of base colours ``(N, 3)``, sRGB, after each channel's best factor in linear light.
 
     How bright an albedo is no image tells: a longer exposure looks the same.  How it varies over the surface, they do.
+    The factor has its gradient, else the colours would drift: the mean square is that of encoded colours.
     """
     p, t = srgb_to_linear(color), srgb_to_linear(target)
     factor = (p * t).sum(0) / p.square().sum(0).clamp(min=1e-4)
-    return functional.mse_loss(linear_to_srgb((p * factor.detach()).clamp(0.0, 1.0)), target)
+    return functional.mse_loss(linear_to_srgb((p * factor).clamp(0.0, 1.0)), target)
 
 
 def _pixels(field: LocalField, sample: Sample) -> dict[str, Tensor]:
     """The pyramid's predictions against the maps of the views, at pixels that show the surface alone."""
     valid, pixels = sample.view_valid, field.pixels
     want = sample.view_material[valid]
-    logit = pixels.base_logit(field.color)[valid]
+    color = pixels.base_logit(field.color)[valid].sigmoid()
     return {
-        "pixel_color": functional.mse_loss(logit.sigmoid(), want[:, :3]),
+        "pixel_color": functional.mse_loss(color, want[:, :3]),
+        "pixel_pattern": pattern_loss(color, want[:, :3]),
         "pixel_roughness": functional.mse_loss(pixels.roughness[valid][:, 0].sigmoid(), want[:, 3]),
         "pixel_metallic": functional.mse_loss(pixels.metallic[valid][:, 0].sigmoid(), want[:, 4]),
         "pixel_normal": (1 - (pixels.normal[valid] * sample.view_normal[valid]).sum(-1)).mean(),
-        "pixel_depth": functional.smooth_l1_loss(pixels.depth[valid][:, 0] / DEPTH_UNIT,
-                                                 sample.view_depth[valid] / DEPTH_UNIT, beta=0.2),
-    }  # fmt: skip
+        "pixel_depth": functional.smooth_l1_loss(
+            pixels.depth[valid][:, 0] / DEPTH_UNIT, sample.view_depth[valid] / DEPTH_UNIT, beta=0.2
+        ),
+    }
 
 
 def _light(field: LocalField, sample: Sample) -> dict[str, Tensor]:
-    """Log radiance over the sphere, and log irradiance at random normals, which lamps decide."""
+    """Log radiance over the sphere, and log irradiance at random normals, which lamps decide.
+
+    Both after each channel's best factor, for a darker paint under a brighter light gives the same photographs; the
+    logarithm of that factor is a term of its own.
+    """
     log = field.log_light
     count = len(sample.light)
     rows = int((count // 2) ** 0.5)
     angle = torch.sin((torch.arange(count) // (2 * rows) + 0.5) * torch.pi / rows).to(log)
     got = _lookup(log, sample.light_directions)
-    error = (torch.logaddexp(got, got.new_tensor(-4.6)) - (sample.light + 0.01).log()).abs().mean(-1)
+    error = torch.logaddexp(got, got.new_tensor(-4.6)) - (sample.light + 0.01).log()
+    angle = angle / angle.sum()
+    level = (error * angle[:, None]).sum(0)
     normals = functional.normalize(torch.randn(NORMALS, 3, device=log.device), dim=-1)
     cosine = (normals @ sample.light_directions.T).clamp(min=0) * angle
     cosine = cosine / cosine.sum(-1, keepdim=True)
     irradiance, want = cosine @ got.exp(), cosine @ sample.light
+    under = (irradiance + 0.01).log() - (want + 0.01).log()
     return {
-        "light": (error * angle).sum() / angle.sum(),
-        "irradiance": ((irradiance + 0.01).log() - (want + 0.01).log()).abs().mean(),
+        "light": ((error - level).abs().mean(-1) * angle).sum(),
+        "light_level": level.abs().mean(),
+        "irradiance": (under - under.mean(0)).abs().mean(),
     }
 
 

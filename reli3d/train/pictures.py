@@ -12,7 +12,7 @@ from safetensors.torch import load_file
 
 from reli3d.io.images import write_png
 from reli3d.output.preview import preview
-from reli3d.pipeline import Network, NoSurface, reconstruct
+from reli3d.pipeline import Network, NoSurface, ReconstructOptions, reconstruct
 from reli3d.views.views import Views
 
 WIDTH, HEIGHT, MARGIN = 420, 180, 34
@@ -71,7 +71,8 @@ def write_validation(model: Network, samples: list[Path], folder: Path) -> None:
         for count in (1, 4):
             views = sample_views(sample, count)
             try:
-                row.append(preview(reconstruct(views, weights=model, texture_size=256), sample_views(sample, 4)))
+                asset = reconstruct(views, weights=model, options=ReconstructOptions(texture_size=256))
+                row.append(preview(asset, sample_views(sample, 4)))
             except NoSurface:  # early in training
                 continue
         if row:

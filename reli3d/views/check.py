@@ -25,6 +25,8 @@ from reli3d.views.views import Views
 GOOD = 0.8  # share of every mask that the hull of right cameras fills; masks a few pixels off still reach 0.9
 CLEAN = 0.97  # mean share from which no mistake is looked for
 BETTER = 3.0  # an alternative is named where it leaves that many times less of the masks unfilled
+TOLD = 0.1  # mean squared sine by which the up axis must be nearer to the horizon's than another: 18 degrees about it
+NEAR_AXIS = 0.94  # cosine, 20 degrees: what is farther from every axis no --up puts right
 BORDER = 0.6  # share of the image border inside the mask from which the mask looks inverted
 
 _FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
@@ -32,7 +34,7 @@ _HALF_TURN = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0]))
 
 
 def explain_cameras(views: Views) -> list[str]:
-    """One line per view, then one line that says ``cameras agree`` or names the suspected cause of what is wrong."""
+    """One line per view, one on the up axis where it is not +Y, and last the :func:`verdict` on the cameras."""
     hull, shares = agreement(views)
     c2w, intrinsics = views.c2w.double().cpu(), views.intrinsics.double().cpu()
     rays = centre_rays([m.cpu() for m in views.masks], c2w, intrinsics)
@@ -50,7 +52,30 @@ def explain_cameras(views: Views) -> list[str]:
             f"eye {_triple(c2w[i, :3, 3])}, {float(away.norm()):.3g} from the meeting point ({side}), "
             f"mask {100 * cover:.0f} % of the image, hull fills {100 * shares[i]:.0f} % of it"
         )
+    axis = up_axis(views.c2w)
+    if axis not in (None, "y"):
+        lines.append(f"up: the cameras stand upright about {axis}, not y; give --up {axis}")
     return [*lines, _verdict(views, hull, shares)]
+
+
+def verdict(views: Views) -> str:
+    """One line that begins with ``cameras agree``, or with ``suspect`` and names the likely cause, or ``one view``."""
+    return _verdict(views, *agreement(views))
+
+
+def up_axis(c2w: Tensor) -> str | None:
+    """The axis (``y``, ``-z``, ...) that is up for cameras held upright; None where they do not tell.
+
+    c2w: ``(V, 4, 4)``.  A camera held upright has its right axis on the horizon: up is the direction most nearly at
+    right angles to all of them, on the side of the cameras' own up axes.
+    """
+    right, above = c2w[:, :3, 0].double().cpu(), c2w[:, :3, 1].double().cpu().mean(0)
+    spread, directions = torch.linalg.eigh(right.T @ right / len(right))
+    up = directions[:, 0] * torch.sign(directions[:, 0] @ above)
+    if float(spread[1] - spread[0]) < TOLD or float(up @ above) < TOLD:
+        return None
+    k = int(up.abs().argmax())
+    return ("" if up[k] > 0 else "-") + "xyz"[k] if float(up.abs()[k]) > NEAR_AXIS else None
 
 
 def _triple(values: Tensor) -> str:
@@ -192,7 +217,7 @@ def rig_picture(views: Views, path: str | os.PathLike) -> None:
     target = hull.points.mean(0) if len(hull.points) else hull.aim
     eyes = c2w[:, :3, 3]
     reach = max(float((eyes - target).norm(dim=-1).max()), float(eyes.norm(dim=-1).max())) or 1.0
-    frustums = [_frustum(c, k, m.shape, 0.16 * reach) for c, k, m in zip(c2w, intrinsics, views.masks)]
+    frustums = [_frustum(c, k, tuple(m.shape), 0.16 * reach) for c, k, m in zip(c2w, intrinsics, views.masks)]
     cube = _cube(views) if len(hull.points) else target[None].numpy()
     spread = np.concatenate([*frustums, cube, np.zeros((1, 3))])
     middle, reach = (spread.min(0) + spread.max(0)) / 2, 0.55 * float((spread.max(0) - spread.min(0)).max())
@@ -216,7 +241,7 @@ def _latin(text: str) -> str:
     return text.encode("latin-1", "replace").decode("latin-1")  # Pillow's built-in font has no more
 
 
-def _frustum(pose: Tensor, camera: Tensor, shape: tuple[int, int], length: float) -> np.ndarray:
+def _frustum(pose: Tensor, camera: Tensor, shape: tuple[int, ...], length: float) -> np.ndarray:
     """``(5, 3)`` world points: the eye and the four image corners at depth ``length``."""
     corners = torch.tensor([[0, 0], [shape[1], 0], [shape[1], shape[0]], [0, shape[0]]], dtype=torch.float64)
     x, y = ((corners - camera[2:]) / camera[:2]).unbind(-1)

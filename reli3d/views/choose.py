@@ -69,10 +69,14 @@ def spread_notes(c2w: Tensor) -> list[str]:
     again = (distance + torch.full_like(distance, torch.inf).triu()).amin(1) < NEAR  # near to an earlier view
     if bool(again.any()):
         which = ", ".join(str(i) for i in again.nonzero()[:, 0].tolist()[:8]) + (", ..." if again.sum() > 8 else "")
-        notes.append(f"{int(again.sum())} of {len(c2w)} views lie within {math.degrees(NEAR):.0f} degrees of an "
-                     f"earlier one and tell little more: {which}")  # fmt: skip
+        notes.append(
+            f"{int(again.sum())} of {len(c2w)} views lie within {math.degrees(NEAR):.0f} degrees of an "
+            f"earlier one and tell little more: {which}"
+        )
     widest = float(angle.max())
     if len(c2w) > 1 and widest < NARROW:
-        notes.append(f"narrow baseline: all views lie within {math.degrees(widest):.1f} degrees; depth and the other "
-                     "sides are guessed, add views from all around")  # fmt: skip
+        notes.append(
+            f"narrow baseline: all views lie within {math.degrees(widest):.1f} degrees; depth and the other "
+            "sides are guessed, add views from all around"
+        )
     return notes

@@ -1,7 +1,7 @@
 """A folder of posed photographs -> Views.
 
 Read are: an object folder as published (``transforms.json`` with per-frame ``camera_fov``), a Blender or nerfstudio
-``transforms.json``, and a COLMAP text model (``sparse/0`` beside ``images``).  The object is told from the background
+``transforms.json``, and a COLMAP model (``sparse/0`` beside ``images``).  The object is told from the background
 by the images' alpha, by ``mask_path``, or by a ``masks`` folder with a file of the same stem for each image.
 """
 
@@ -14,15 +14,21 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from PIL import Image, ImageChops
 from torch import Tensor
 
+from reli3d._bridge import present
 from reli3d.io.files import InputError, shown
-from reli3d.io.images import read_image
+from reli3d.io.images import above, colour, read_picture, unit
+from reli3d.views.advice import no_cameras
+from reli3d.views.background import Remover
 from reli3d.views.choose import NEAR, choose_views, spread_notes
 from reli3d.views.colmap import find_colmap, read_colmap
+from reli3d.views.normalize import near_origin
+from reli3d.views.reduce import LARGE, OBJECT, cut
 from reli3d.views.shots import Lens, Shot, inside, straight
 from reli3d.views.transforms import read_transforms
-from reli3d.views.views import Views
+from reli3d.views.views import MASK_EDGE, Views
 
 MAX_VIEWS = 16
 MIN_SIDE = 8  # pixels; below it there is nothing to see, and a mistake is likely
@@ -39,6 +45,8 @@ def load_views(
     masks: str | os.PathLike | None = None,
     allow_outside: bool = False,
     every: bool = False,
+    whole: bool = False,
+    remove_background: bool = False,
 ) -> Views:
     """Photographs of an object folder, with their cameras and masks, in the order of the folder.
 
@@ -47,8 +55,12 @@ def load_views(
     something else.  What was chosen, near-duplicates and a narrow baseline are told in ``notes``.
     masks: folder of mask images with the stems of the images; it goes before the images' own alpha.  Otherwise
     ``mask_path`` of a frame counts, then alpha, then a folder ``masks`` or ``mask`` beside the cameras.
-    allow_outside: let the camera file name images outside ``folder``.  every: all, however many: what a refinement
-    reads, while a network reads 16 at most.
+    allow_outside: let the camera file name images outside ``folder``.  every: all, however many, for a refinement;
+    :meth:`Views.taken` of them are the views that come without it.
+    Where the cameras stand far from their origin, it is moved to where they look, in float64: ``origin`` says whereto.
+    Of photographs of more than two megapixels only the object and a margin are kept, at 768 pixels along it.  whole:
+    all of the photograph instead, scaled down to two megapixels.  remove_background: make a mask by ``rembg`` (extra
+    ``masks``), which may fetch its network, for each photograph that has none.
     Raises InputError, one line that names the file, the field, the value and the fix.
     """
     for name, value in (("views", views), ("first_views", first_views)):
@@ -62,7 +74,7 @@ def load_views(
     except (OSError, ValueError):
         is_folder = False
     if not is_folder:
-        raise InputError(folder, "expected a folder with transforms.json or a COLMAP text model; check the path")
+        raise InputError(folder, "expected a folder with transforms.json or a COLMAP model; check the path")
     if masks is not None and not Path(masks).is_dir():
         raise InputError(masks, "masks: expected a folder of mask images, got none; check the path")
     system = None
@@ -72,31 +84,56 @@ def load_views(
     else:
         model = find_colmap(root)
         if model is None:
-            raise InputError(folder, "expected transforms.json or a COLMAP text model (sparse/0/cameras.txt, "
-                             "images.txt), "
-                                     "got neither; see docs/inputs.md")  # fmt: skip
+            raise no_cameras(root)
         shots, notes = read_colmap(root, model, outside=allow_outside)
     offered = len(shots)
-    shots, told = (shots, []) if every else _chosen(shots, views, first_views)
+    origin, moved = _origin(shots, folder)
+    notes += moved
+    taken, told = _chosen(shots, views, first_views)
+    shots = shots if every else [shots[i] for i in taken]
     notes += told + [note for shot in shots for note in shot.notes]
+    remover = Remover() if remove_background else None
     # decoding releases the GIL; torch is not used there, as each of these threads would start threads of its own
     with ThreadPoolExecutor(max_workers=min(4, os.cpu_count() or 1)) as pool:
-        loaded = list(pool.map(lambda shot: _load(root, shot, masks, allow_outside), shots))
-    notes += [note for *_, found in loaded for note in found]
+        loaded = list(pool.map(lambda shot: _load(root, shot, masks, allow_outside, whole, remover), shots))
+    notes += [note for *_, found, _ in loaded for note in found]
+    if reduced := sum(smaller for *_, smaller in loaded):
+        kept = f"scaled down to {LARGE} pixels" if whole else f"cut to the object, at most {OBJECT} pixels of it"
+        notes.append(f"{reduced} of {len(loaded)} photographs have more than {LARGE} pixels: {kept}")
+    if remover and remover.masks:
+        notes.append(f"{remover.masks} of {len(loaded)} masks made by rembg ({remover.network})")
     return Views(
         images=tuple(image for image, *_ in loaded),
         masks=tuple(mask for _, mask, *_ in loaded),
-        c2w=torch.from_numpy(np.stack([s.c2w for s in shots]).astype(np.float32)),
-        intrinsics=torch.tensor([k for _, _, k, _ in loaded], dtype=torch.float32),
+        c2w=_poses(shots, origin),
+        intrinsics=torch.tensor([k for _, _, k, *_ in loaded], dtype=torch.float32),
         names=tuple(s.name for s in shots),
         notes=tuple(dict.fromkeys(notes)),
         coordinate_system=system,
         in_folder=offered,
+        chosen=tuple(taken) if every else None,
+        origin=origin,
     )
 
 
-def _chosen(shots: list[Shot], views: int | None, first_views: int | None) -> tuple[list[Shot], list[str]]:
-    """The shots to load, and notes on the choice and on how they lie."""
+def _origin(shots: list[Shot], folder) -> tuple[tuple[float, float, float], list[str]]:
+    """Where the frame of the views begins, in the folder's, and a note where that is elsewhere."""
+    try:
+        at = tuple(near_origin(torch.from_numpy(np.stack([s.c2w for s in shots]))).tolist())
+    except ValueError as error:
+        raise InputError(folder, str(error)) from None
+    place = ", ".join(f"{v:.6g}" for v in at)
+    return at, [f"the cameras are far from their origin: work is done about ({place})"] if any(at) else []
+
+
+def _poses(shots: list[Shot], origin: tuple[float, float, float]) -> Tensor:
+    poses = np.stack([s.c2w for s in shots])
+    poses[:, :3, 3] -= origin
+    return torch.from_numpy(poses.astype(np.float32))
+
+
+def _chosen(shots: list[Shot], views: int | None, first_views: int | None) -> tuple[list[int], list[str]]:
+    """Indices of the shots for a network, and notes on the choice and on how they lie."""
     poses, count, notes = torch.from_numpy(np.stack([s.c2w for s in shots])), len(shots), []
     if first_views is not None:
         taken = list(range(min(first_views, count)))
@@ -104,37 +141,54 @@ def _chosen(shots: list[Shot], views: int | None, first_views: int | None) -> tu
         taken = choose_views(poses, views or MAX_VIEWS, apart=0.0 if views else NEAR)
         if len(taken) < count:
             names = ", ".join(str(i) for i in taken)
-            notes.append(f"{len(taken)} of {count} views taken, farthest apart in direction and distance: {names}; "
-                         "--first-views N takes the first N")  # fmt: skip
+            notes.append(
+                f"{len(taken)} of {count} views taken, farthest apart in direction and distance: {names}; "
+                "--first-views N takes the first N"
+            )
     else:
         taken = list(range(count))
-    return [shots[i] for i in taken], notes + spread_notes(poses[taken])
+    return taken, notes + spread_notes(poses[taken])
 
 
-def _load(root: Path, shot: Shot, masks, outside: bool) -> tuple[Tensor, Tensor, list[float], list[str]]:
-    """Image, mask, intrinsics and notes of one shot."""
+def _load(
+    root: Path, shot: Shot, masks, outside: bool, whole: bool, remover: Remover | None
+) -> tuple[Tensor, Tensor, list[float], list[str], bool]:
+    """Image, mask, intrinsics and notes of one shot, and whether less than the whole picture is kept."""
     notes: list[str] = []
     path = _existing(shot.image)
     if path is None:
-        raise InputError(shot.where, f"file_path: expected an image, got {shown(shot.name)} which does not exist; "
-                                     "paths are relative to the camera file and use /")  # fmt: skip
+        raise InputError(
+            shot.where,
+            f"file_path: expected an image, got {shown(shot.name)} which does not exist; "
+            "paths are relative to the camera file and use /",
+        )
     _still_inside(root, path, shot, outside)
-    image, alpha = read_image(path, notes=notes)
-    height, width = image.shape[:2]
+    picture = read_picture(path, notes=notes, calibrated=shot.lens.size)
+    width, height = picture.size
     if min(height, width) < MIN_SIDE:
-        raise InputError(path, f"expected at least {MIN_SIDE} pixels a side, got {width} x {height}; give a larger "
-                         "image")  # fmt: skip
-    mask = _mask(root, shot, path, alpha, masks, notes, outside)
-    if mask.shape != (height, width):
-        got = f"{mask.shape[1]} x {mask.shape[0]}"
-        raise InputError(path, f"mask: expected {width} x {height} pixels as the image, got {got}; save it at that "
-                         "size")  # fmt: skip
-    if int((mask.numpy() > 0.5).sum()) < MIN_OBJECT:
-        raise InputError(path, "mask: expected the object to be opaque (white), got a mask that is empty; "
-                               "check that it is neither blank nor inverted")  # fmt: skip
-    if looks_premultiplied(image.numpy(), mask.numpy()):
+        raise InputError(
+            path, f"expected at least {MIN_SIDE} pixels a side, got {width} x {height}; give a larger image"
+        )
+    mask = _mask(root, shot, path, picture, masks, notes, outside, remover)
+    if mask.size != (width, height):
+        got = f"{mask.size[0]} x {mask.size[1]}"
+        raise InputError(
+            path, f"mask: expected {width} x {height} pixels as the image, got {got}; save it at that size"
+        )
+    if int(above(mask, 0.5).sum()) < MIN_OBJECT:
+        raise InputError(
+            path,
+            "mask: expected the object to be opaque (white), got a mask that is empty; "
+            "check that it is neither blank nor inverted",
+        )
+    camera = intrinsics_of(shot.lens, width, height, shot.where, notes)
+    part = cut(picture.size, above(mask, MASK_EDGE), whole=whole)
+    if part is not None:
+        picture, mask, camera = part.pixels(picture), part.pixels(mask), part.intrinsics(camera)
+    image, share = colour(picture), unit(mask)
+    if looks_premultiplied(image.numpy(), share):
         notes.append(f"{path.name}: the colour looks multiplied by alpha, edges will be dark; save straight alpha")
-    return image, mask, intrinsics_of(shot.lens, width, height, shot.where, notes), notes
+    return image, torch.from_numpy(share), camera, notes, part is not None
 
 
 def looks_premultiplied(image: np.ndarray, mask: np.ndarray) -> bool:
@@ -155,37 +209,65 @@ def looks_premultiplied(image: np.ndarray, mask: np.ndarray) -> bool:
     return bool((value[faint] <= mask[faint] + 1 / 255).all())  # both are rounded to 8 bits
 
 
-def _mask(root: Path, shot: Shot, path: Path, alpha: Tensor | None, masks, notes: list[str], outside: bool) -> Tensor:
+def _mask(
+    root: Path,
+    shot: Shot,
+    path: Path,
+    picture: Image.Image,
+    masks,
+    notes: list[str],
+    outside: bool,
+    remover: Remover | None,
+) -> Image.Image:
+    """The mask of a shot in full size, of mode L or F."""
     if masks is not None:
         found = _beside(Path(masks), path)
         if found is None:
             raise InputError(masks, f"masks: expected a file with the stem of {shown(path.name)}, got none; add it")
-        return _grey(found, notes)
+        return _grey(found, notes, shot.lens.size)
     if shot.mask is not None:
         found = _existing(shot.mask)
         if found is None:
-            raise InputError(shot.where, f"mask_path: expected an image, got {shown(shot.mask.name)} which does not "
-                                         "exist; correct the path")  # fmt: skip
+            raise InputError(
+                shot.where,
+                f"mask_path: expected an image, got {shown(shot.mask.name)} which does not exist; correct the path",
+            )
         _still_inside(root, found, shot, outside)
-        return _grey(found, notes)
-    if alpha is not None and float(alpha.numpy().min()) < 0.5:
+        return _grey(found, notes, shot.lens.size)
+    alpha = _alpha(picture)
+    if alpha is not None:
         return alpha
     for name in ("masks", "mask"):
         found = _beside(root / name, path)
         if found is not None:
             _still_inside(root, found, shot, outside)
-            return _grey(found, notes)
-    got = "no alpha" if alpha is None else "alpha that is opaque everywhere"
-    raise InputError(path, f"expected alpha or a mask that tells the object from the background, got {got}; save RGBA "
-                           "images, or put white-on-black masks of the same names into a folder 'masks'")  # fmt: skip
+            return _grey(found, notes, shot.lens.size)
+    if remover is not None:
+        return remover.mask(picture)
+    got = "alpha that is opaque everywhere" if picture.mode == "RGBA" else "no alpha"
+    raise InputError(
+        path,
+        f"expected alpha or a mask that tells the object from the background, got {got}; save RGBA "
+        "images, put white-on-black masks of the same names into a folder 'masks', or give "
+        "--remove-background",
+    )
 
 
-def _grey(path: Path, notes: list[str]) -> Tensor:
-    """Mask ``(H, W)``: the alpha of a mask file that has one which is used, else its grey value."""
-    colour, alpha = read_image(path, notes=notes)
-    if alpha is not None and float(alpha.numpy().min()) < 0.5:
-        return alpha
-    return torch.from_numpy(colour.numpy().max(-1))
+def _alpha(picture: Image.Image) -> Image.Image | None:
+    """The alpha of a picture that has one which is used."""
+    alpha = picture.getchannel("A") if picture.mode == "RGBA" else None
+    if alpha is None:
+        return None
+    return alpha if np.asarray(alpha).min() < 128 else None
+
+
+def _grey(path: Path, notes: list[str], calibrated: tuple[int, int] | None) -> Image.Image:
+    """A mask file as grey: its alpha where that is used, else its brightest channel."""
+    picture = read_picture(path, notes=notes, calibrated=calibrated)
+    if picture.mode in ("L", "F"):
+        return picture
+    red, green, blue, *_ = picture.split()
+    return _alpha(picture) or ImageChops.lighter(ImageChops.lighter(red, green), blue)
 
 
 def _existing(path: Path) -> Path | None:
@@ -209,8 +291,11 @@ def _beside(folder: Path, image: Path) -> Path | None:
 
 def _still_inside(root: Path, path: Path, shot: Shot, outside: bool) -> None:
     if not outside and not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(root)):
-        raise InputError(shot.where, f"file_path: expected a file within the folder, got {shown(path.name)} which "
-                                     "links out of it; copy the file in")  # fmt: skip
+        raise InputError(
+            shot.where,
+            f"file_path: expected a file within the folder, got {shown(path.name)} which "
+            "links out of it; copy the file in",
+        )
 
 
 def intrinsics_of(lens: Lens, width: int, height: int, where: str, notes: list[str]) -> list[float]:
@@ -222,23 +307,33 @@ def intrinsics_of(lens: Lens, width: int, height: int, where: str, notes: list[s
     if lens.size is not None and lens.size != (width, height):
         sx, sy = width / lens.size[0], height / lens.size[1]
         if abs(sx / sy - 1.0) > ASPECT:
-            raise InputError(where, f"w, h: expected the image's size {width} x {height}, got {lens.size[0]} x "
-                                    f"{lens.size[1]}; calibrate on these images")  # fmt: skip
+            raise InputError(
+                where,
+                f"w, h: expected the image's size {width} x {height}, got {lens.size[0]} x "
+                f"{lens.size[1]}; calibrate on these images",
+            )
         notes.append(f"{where}: intrinsics scaled from {lens.size[0]} x {lens.size[1]} to {width} x {height}")
     if lens.focal is not None:
         fx, fy = lens.focal[0] * sx, lens.focal[1] * sy
     else:
-        fx = 0.5 * width / math.tan(0.5 * lens.fov[0])
-        fy = fx if math.isnan(lens.fov[1]) else 0.5 * height / math.tan(0.5 * lens.fov[1])
+        across, upright = present("lens.fov", lens.fov)
+        fx = 0.5 * width / math.tan(0.5 * across)
+        fy = fx if math.isnan(upright) else 0.5 * height / math.tan(0.5 * upright)
     note = straight(where, lens, fx, width, height)
     notes.extend([note] if note else [])
     cx, cy = (0.5 * width, 0.5 * height) if lens.centre is None else (lens.centre[0] * sx, lens.centre[1] * sy)
     for name, value, side in (("cx", cx, width), ("cy", cy, height)):
         if not -side < value < 2 * side:
-            raise InputError(where, f"{name}: expected a principal point near the image of {side} pixels, got "
-                             f"{value:.6g}; "
-                                    "give pixels of the stored image")  # fmt: skip
+            raise InputError(
+                where,
+                f"{name}: expected a principal point near the image of {side} pixels, got "
+                f"{value:.6g}; "
+                "give pixels of the stored image",
+            )
     if min(fx / width, fy / height) < 0.05 or max(fx / width, fy / height) > 1000:
-        raise InputError(where, f"focal length: expected 0.05 to 1000 image sides, got {fx:.6g} pixels for {width}; "
-                                "give pixels (or radians for an angle)")  # fmt: skip
+        raise InputError(
+            where,
+            f"focal length: expected 0.05 to 1000 image sides, got {fx:.6g} pixels for {width}; "
+            "give pixels (or radians for an angle)",
+        )
     return [fx, fy, cx, cy]

@@ -19,6 +19,9 @@ OFF_CENTRE = 0.3  # as far as the hull's centre of such an object may lie from t
 GRIDS = (24, 44)  # cells a side, coarse and refined: the last is 2 to 3 % of the object
 BALL = 1.3  # diameter of the ball that limits the hull, in mask widths: a generic view shows 0.8 of the longest side
 PARALLEL = 0.01  # mean squared sine between the axes (6 degrees) below which depth is guessed, not triangulated
+FAR = 10.0  # distances to the object from which the origin is moved to it: float32 then loses a digit of each position
+SMALLEST = 1e-6  # distance to the object below which squares of areas of a mesh's faces leave float32
+ONE_POINT = 1e-12  # of the eyes' distance from the origin: nearer together, only float64's rounding tells them apart
 AT_EYE = 1e-6  # of an eye's distance from the origin: what is nearer to the eye than float32 tells places apart
 
 
@@ -113,6 +116,25 @@ def meeting_point(origins: Tensor, rays: Tensor) -> tuple[Tensor, float]:
     eye, ray = origins.mean(0), torch.nn.functional.normalize(rays.mean(0), dim=-1)
     distance = float(-(eye @ ray))
     return eye + ray * (distance if distance > 0 else 1.0), spread
+
+
+def near_origin(c2w: Tensor) -> Tensor:
+    """The point ``(3,)`` float64 that shall be the origin of cameras ``c2w (V, 4, 4)`` float64: where they look, if
+    the origin of their frame is more than FAR times as far from there as they are; else zero.
+
+    Raises ValueError where they are nearer to it than SMALLEST, unless all stand in one point.
+    """
+    eyes = c2w[:, :3, 3]
+    if len(eyes) > 1 and float((eyes - eyes[0]).abs().max()) <= ONE_POINT * float(eyes.abs().max()):
+        return torch.zeros_like(eyes[0])
+    aim = meeting_point(eyes, -c2w[:, :3, 2])[0]
+    reach = float((eyes - aim).norm(dim=-1).median())
+    if reach < SMALLEST:
+        raise ValueError(
+            f"cameras: expected a distance of {SMALLEST:g} or more to the object, got {reach:.3g}; "
+            "scale the positions up"
+        )
+    return aim if float(aim.norm()) > FAR * reach else torch.zeros_like(aim)
 
 
 def _covered(points: Tensor, mask: Tensor, pose: Tensor, camera: Tensor, cell: float) -> Tensor:

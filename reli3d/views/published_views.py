@@ -103,5 +103,11 @@ def placement_notes(views: Views) -> tuple[str, ...]:
         placed = normalize(views, "auto").is_identity()
     except ValueError:  # masks that do not meet
         placed = False
-    return () if placed else ("poses go in as stored, but the object does not sit in the network's cube of half side "
-                              "0.87 about the origin; try --normalize auto",)  # fmt: skip
+    return (
+        ()
+        if placed
+        else (
+            "poses go in as stored, but the object does not sit in the network's cube of half side "
+            "0.87 about the origin; try --normalize auto",
+        )
+    )

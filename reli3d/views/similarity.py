@@ -7,6 +7,15 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+UP = {  # rotations that carry an axis to +Y
+    "y": torch.eye(3),
+    "-y": torch.diag(torch.tensor([1.0, -1.0, -1.0])),
+    "x": torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
+    "-x": torch.tensor([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
+    "z": torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
+    "-z": torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
+}
+
 
 @dataclass(frozen=True)
 class Similarity:
@@ -57,3 +66,13 @@ class Similarity:
         """Whether the map changes nothing, to the last bit."""
         same = torch.equal(self.rotation, torch.eye(3, dtype=torch.float64))
         return self.scale == 1.0 and same and not bool(self.translation.any())
+
+
+def output_frame(model_from_input: Similarity, frame: str, up: str) -> Similarity:
+    """The frame of the asset from the frame of the input cameras.  Raises ValueError on a name that is none."""
+    if frame not in ("input", "model"):
+        raise ValueError(f"frame: expected input or model, got {frame}")
+    if up not in UP:
+        raise ValueError(f"up: expected one of {', '.join(UP)}, got {up}")
+    turn = Similarity(1.0, UP[up].double(), torch.zeros(3, dtype=torch.float64))
+    return turn.compose(model_from_input) if frame == "model" else turn

@@ -40,8 +40,9 @@ def read_json(path: Path) -> dict:
     except ValueError:
         raise InputError(path, "expected numbers, got an integer of thousands of digits; correct the file") from None
     if not isinstance(value, dict):
-        raise InputError(path, f"expected a JSON object with frames, got {type(value).__name__}; export the "
-                         "cameras again")  # fmt: skip
+        raise InputError(
+            path, f"expected a JSON object with frames, got {type(value).__name__}; export the cameras again"
+        )
     return value
 
 
@@ -57,8 +58,10 @@ def _unique(pairs: list) -> dict:
     result = dict(pairs)
     if len(result) != len(pairs):
         seen: set[str] = set()
-        twice = next(k for k, _ in pairs if k in seen or seen.add(k))
-        raise _Refused(f"expected every key once, got {shown(twice)} twice")
+        for key, _ in pairs:
+            if key in seen:
+                raise _Refused(f"expected every key once, got {shown(key)} twice")
+            seen.add(key)
     return result
 
 
@@ -81,8 +84,10 @@ def read_transforms(path: Path, *, outside: bool = False) -> tuple[list[Shot], l
     shots = [_shot(path, i, frames[i], data, outside) for i in ranked]
     system = data.get("coordinate_system")
     if data.get("applied_transform") is not None:
-        notes.append(f"{path.name}: applied_transform recorded by nerfstudio is not undone; the mesh comes out in the "
-                     "frame of transform_matrix")  # fmt: skip
+        notes.append(
+            f"{path.name}: applied_transform recorded by nerfstudio is not undone; the mesh comes out in the "
+            "frame of transform_matrix"
+        )
     return shots, notes, system[:80] if isinstance(system, str) else None
 
 
@@ -90,8 +95,9 @@ def _shot(path: Path, index: int, frame: dict, data: dict, outside: bool) -> Sho
     where = f"{path}: frames[{index}]"
     key = next((k for k in ("transform_matrix", "camera_transform") if frame.get(k) is not None), None)
     if key is None:
-        raise InputError(where, "transform_matrix: expected the camera-to-world matrix, got none; export the "
-                         "cameras again")  # fmt: skip
+        raise InputError(
+            where, "transform_matrix: expected the camera-to-world matrix, got none; export the cameras again"
+        )
     image = inside(path.parent, where, "file_path", frame.get("file_path"), outside=outside)
     mask = frame.get("mask_path")
     mask = None if mask is None else inside(path.parent, where, "mask_path", mask, outside=outside)
@@ -107,14 +113,15 @@ def _lens(where: str, frame: dict, data: dict, notes: list[str]) -> Lens:
 
     model = frame.get("camera_model", data.get("camera_model"))
     if model not in _PINHOLE:
-        raise InputError(where, f"camera_model: expected a pinhole camera, got {shown(model)}; undistort the "
-                         "images first")  # fmt: skip
-    size = (found("w", 0, 1e6), found("h", 0, 1e6))
-    if any(side is not None and side < 1 for side in size):
-        raise InputError(where, f"w, h: expected at least 1 pixel, got {size[0]} x {size[1]}; correct the camera file")
-    size = None if None in size else (int(size[0]), int(size[1]))
-    centre = (found("cx", -1e6, 1e6), found("cy", -1e6, 1e6))
-    centre = None if None in centre else centre
+        raise InputError(
+            where, f"camera_model: expected a pinhole camera, got {shown(model)}; undistort the images first"
+        )
+    w, h = found("w", 0, 1e6), found("h", 0, 1e6)
+    if any(side is not None and side < 1 for side in (w, h)):
+        raise InputError(where, f"w, h: expected at least 1 pixel, got {w} x {h}; correct the camera file")
+    size = None if w is None or h is None else (int(w), int(h))
+    cx, cy = found("cx", -1e6, 1e6), found("cy", -1e6, 1e6)
+    centre = None if cx is None or cy is None else (cx, cy)
     lens = None
     for source in (frame, data):
         if lens is None and source.get("fl_x") is not None:
@@ -133,8 +140,8 @@ def _lens(where: str, frame: dict, data: dict, notes: list[str]) -> Lens:
                 lens = Lens(fov=_fov(where, key, source[key]), centre=point, size=None if point is None else size)
     if lens is None:
         notes.append(f"{where}: no field of view given, {DEFAULT_FOV} radians assumed as in the published release")
-        point = frame.get("camera_principal_point")
-        point = centre if point is None else _pair(where, "camera_principal_point", point, -1e6, 1e6)
+        centre_key = frame.get("camera_principal_point")
+        point = centre if centre_key is None else _pair(where, "camera_principal_point", centre_key, -1e6, 1e6)
         lens = Lens(fov=(DEFAULT_FOV, DEFAULT_FOV), centre=point)
     radial = tuple(found(k, -1e6, 1e6) or 0.0 for k in ("k1", "k2", "k3", "k4"))
     tangential = tuple(found(k, -1e6, 1e6) or 0.0 for k in ("p1", "p2"))

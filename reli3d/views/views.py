@@ -34,8 +34,8 @@ class ViewBatch:
 
     def to(self, device: torch.device | str) -> ViewBatch:
         """The same batch with its tensors on ``device``."""
-        moved = (t.to(device) for t in (self.images, self.masks, self.c2w, self.intrinsics))
-        return ViewBatch(*moved, self.names)
+        images, masks, c2w, intrinsics = (t.to(device) for t in (self.images, self.masks, self.c2w, self.intrinsics))
+        return ViewBatch(images, masks, c2w, intrinsics, self.names)
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,8 @@ class Views:
     notes: tuple[str, ...] = ()  # what reading changed or guessed, one line each
     coordinate_system: str | None = None  # as the folder states it; recorded only, it turns nothing
     in_folder: int | None = None  # views that the folder offered
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the frame as read, in that of the folder
+    chosen: tuple[int, ...] | None = None  # of all of a folder: those for a network, which reads 16 at most
 
     def __post_init__(self):
         count = len(self.images)
@@ -84,10 +86,21 @@ class Views:
         indices = list(range(which)) if isinstance(which, int) else list(which)
         if not indices or min(indices) < 0 or max(indices) >= len(self):
             raise ValueError(f"which: expected 1 to {len(self)} views of {len(self)}, got {which}")
-        images, masks, names = (tuple(t[i] for i in indices) for t in (self.images, self.masks, self.names))
+        images, masks = (tuple(t[i] for i in indices) for t in (self.images, self.masks))
+        names = tuple(self.names[i] for i in indices)
         return replace(
-            self, images=images, masks=masks, names=names, c2w=self.c2w[indices], intrinsics=self.intrinsics[indices]
+            self,
+            images=images,
+            masks=masks,
+            names=names,
+            c2w=self.c2w[indices],
+            intrinsics=self.intrinsics[indices],
+            chosen=None,
         )
+
+    def taken(self) -> Views:
+        """The views for a network: those ``chosen``, all where nothing was."""
+        return self if self.chosen is None else self.select(self.chosen)
 
     def transformed(self, similarity: Similarity) -> Views:
         """The same photographs with the cameras in another frame: eyes mapped, axes turned, intrinsics as they are."""

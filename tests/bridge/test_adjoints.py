@@ -56,8 +56,11 @@ class Op:
 def triplane(g, small) -> Op:
     batch, channels, height, width, count = (1, 2, 5, 6, 9) if small else (2, 40, 96, 128, 20_000)
     planes = torch.randn(batch, 3, channels, height, width, generator=g)
-    return Op({"planes": planes, "points": torch.rand(batch, count, 3, generator=g) * 2.1 - 1.05}, sample_triplane,
-              grid_samples)  # fmt: skip
+    return Op(
+        {"planes": planes, "points": torch.rand(batch, count, 3, generator=g) * 2.1 - 1.05},
+        sample_triplane,
+        grid_samples,
+    )
 
 
 def surface_leaves(g, small):
@@ -73,8 +76,9 @@ def flexicubes(g, small) -> Op:
     gamma = leaves.pop("gamma")
 
     def ours(level, alpha, beta, deformation):
-        return extract_surface(level, radius=0.8, alpha=alpha, beta=beta, deformation=deformation,
-                               gamma=gamma.to(level)).vertices  # fmt: skip
+        return extract_surface(
+            level, radius=0.8, alpha=alpha, beta=beta, deformation=deformation, gamma=gamma.to(level)
+        ).vertices
 
     def twin(level, alpha, beta, deformation):
         return reference_surface.flexicubes_vertices(level, deformation, alpha, beta, 1.6)[0]
@@ -134,8 +138,11 @@ def attributes(g, small, channels) -> Op:
     def ours(values, bary):
         return interpolate(values, faces.to(bary.device), face.to(bary.device), bary)
 
-    return Op({"values": torch.randn(vertices, channels, generator=g), "bary": op_cases.weights(rows)}, ours,
-              lambda values, bary: on_faces(values, faces, face, bary))  # fmt: skip
+    return Op(
+        {"values": torch.randn(vertices, channels, generator=g), "bary": op_cases.weights(rows)},
+        ours,
+        lambda values, bary: on_faces(values, faces, face, bary),
+    )
 
 
 def in_texture(texture, uv):
@@ -149,8 +156,11 @@ def in_texture(texture, uv):
 
 def texture(g, small) -> Op:
     height, width, rows = (4, 5, 9) if small else (96, 64, 30_000)
-    return Op({"texture": torch.rand(height, width, 3, generator=g), "uv": torch.rand(rows, 2, generator=g) * 3 - 1},
-              sample_texture, in_texture)  # fmt: skip
+    return Op(
+        {"texture": torch.rand(height, width, 3, generator=g), "uv": torch.rand(rows, 2, generator=g) * 3 - 1},
+        sample_texture,
+        in_texture,
+    )
 
 
 def points_of_a_mesh(g, small, tangents) -> Op:
@@ -164,12 +174,16 @@ def points_of_a_mesh(g, small, tangents) -> Op:
         noise = 0.15 * torch.randn(count, 3, 3, generator=g)
         return F.normalize(F.normalize(direction, dim=-1)[:, None] + noise, dim=-1).reshape(-1, 3)
 
-    leaves = {"vertices": corners.reshape(-1, 3), "normals": about(flat), "uv": torch.rand(3 * count, 2, generator=g),
-              "tangents": F.pad(about(corners[:, 1] - corners[:, 0]), (0, 1), value=-1.0),
-              "base_color": torch.rand(size, size, 3, generator=g),
-              **{k: torch.rand(size, size, generator=g) for k in ("roughness", "metallic")},
-              "normal": 0.5 + 0.5 * op_cases.above(size * size, 13).reshape(size, size, 3),
-              "bary": op_cases.weights(rows)}  # fmt: skip
+    leaves = {
+        "vertices": corners.reshape(-1, 3),
+        "normals": about(flat),
+        "uv": torch.rand(3 * count, 2, generator=g),
+        "tangents": F.pad(about(corners[:, 1] - corners[:, 0]), (0, 1), value=-1.0),
+        "base_color": torch.rand(size, size, 3, generator=g),
+        **{k: torch.rand(size, size, generator=g) for k in ("roughness", "metallic")},
+        "normal": 0.5 + 0.5 * op_cases.above(size * size, 13).reshape(size, size, 3),
+        "bary": op_cases.weights(rows),
+    }
     if not small:  # few digits, so that the texture coordinates of points, which are float32, come out exactly
         leaves |= {k: (leaves[k] * digits).round() / digits for k, digits in (("uv", 4096.0), ("bary", 64.0))}
     if not tangents:
@@ -202,9 +216,16 @@ def points_of_a_mesh(g, small, tangents) -> Op:
         bent = in_texture(v["normal"], uv) * 2.0 - 1.0
         bent = bent[:, :1] * along + bent[:, 1:2] * side * torch.linalg.cross(n, along) + bent[:, 2:] * n
         color = in_texture(srgb_to_linear(v["base_color"]), uv)
-        return torch.cat([at("vertices"), F.normalize(torch.linalg.cross(b - a, c - a), dim=-1),
-                          F.normalize(bent, dim=-1), color,
-                          in_texture(torch.stack([v["roughness"], v["metallic"]], -1), uv)], 1)  # fmt: skip
+        return torch.cat(
+            [
+                at("vertices"),
+                F.normalize(torch.linalg.cross(b - a, c - a), dim=-1),
+                F.normalize(bent, dim=-1),
+                color,
+                in_texture(torch.stack([v["roughness"], v["metallic"]], -1), uv),
+            ],
+            1,
+        )
 
     return Op(leaves, ours, twin)
 
@@ -218,32 +239,51 @@ def density(g, small) -> Op:
 def reflections(g, small, lobe) -> Op:
     n = 5 if small else 30_000
     u = op_cases.numbers(n)
-    return Op({"wo": op_cases.above(n, 1), "alpha": torch.rand(n, generator=g) * 0.95 + 0.05},
-              lambda wo, alpha: sample_bsdf(wo, alpha, u.to(wo), lobe),
-              lambda wo, alpha: reference.reflected_visible_normal(wo, alpha, u.double(), lobe == "mirrored"),
-              ("wo",))  # fmt: skip
+    return Op(
+        {"wo": op_cases.above(n, 1), "alpha": torch.rand(n, generator=g) * 0.95 + 0.05},
+        lambda wo, alpha: sample_bsdf(wo, alpha, u.to(wo), lobe),
+        lambda wo, alpha: reference.reflected_visible_normal(wo, alpha, u.double(), lobe == "mirrored"),
+        ("wo",),
+    )
 
 
 def lobes(g, count):
-    return {"axis": op_cases.units(count, 4), "sharpness": torch.exp(torch.rand(count, generator=g) * 6.0 - 1.0),
-            "amplitude": torch.rand(count, 3, generator=g)}  # fmt: skip
+    return {
+        "axis": op_cases.units(count, 4),
+        "sharpness": torch.exp(torch.rand(count, generator=g) * 6.0 - 1.0),
+        "amplitude": torch.rand(count, 3, generator=g),
+    }
 
 
 def irradiance(g, small) -> Op:
     leaves = {"normals": op_cases.units(4 if small else 6000, 2), **lobes(g, 3 if small else 24)}
-    return Op(leaves, lambda normals, *light: SphericalGaussians(*light).irradiance(normals), reference.sg_irradiance,
-              ("normals", "axis"), one_sign=True)  # fmt: skip
+    return Op(
+        leaves,
+        lambda normals, *light: SphericalGaussians(*light).irradiance(normals),
+        reference.sg_irradiance,
+        ("normals", "axis"),
+        one_sign=True,
+    )
 
 
 def gaussians(g, small) -> Op:
     n = 2 if small else 6000
     normal = op_cases.units(n, 1)
-    leaves = {"normal": normal, "wo": F.normalize(normal + 0.7 * op_cases.units(n, 6), dim=-1),
-              "base_color": torch.rand(n, 3, generator=g), "roughness": 0.2 + 0.8 * torch.rand(n, generator=g),
-              "metallic": torch.rand(n, generator=g), **lobes(g, 2 if small else 24)}  # fmt: skip
-    return Op(leaves, lambda *v: shade_gaussians(*on_ball(*v[:5]), SphericalGaussians(*v[5:])),
-              lambda normal, wo, base, roughness, *rest: reference.shade_gaussians(
-                  normal, wo, base, roughness**2, *rest), ("normal", "wo", "axis"), one_sign=True)  # fmt: skip
+    leaves = {
+        "normal": normal,
+        "wo": F.normalize(normal + 0.7 * op_cases.units(n, 6), dim=-1),
+        "base_color": torch.rand(n, 3, generator=g),
+        "roughness": 0.2 + 0.8 * torch.rand(n, generator=g),
+        "metallic": torch.rand(n, generator=g),
+        **lobes(g, 2 if small else 24),
+    }
+    return Op(
+        leaves,
+        lambda *v: shade_gaussians(*on_ball(*v[:5]), SphericalGaussians(*v[5:])),
+        lambda normal, wo, base, roughness, *rest: reference.shade_gaussians(normal, wo, base, roughness**2, *rest),
+        ("normal", "wo", "axis"),
+        one_sign=True,
+    )
 
 
 def normals(g, small) -> Op:

@@ -22,10 +22,14 @@ SIZES = [1, 7, _bridge.SLICE_MIN * _bridge.SLICES + 5]  # one thread, one slice,
 def gather_scale_kernel(
     start: int,
     # in
-    table: wp.array[wp.vec3], index: wp.array[int], weight: wp.array[float], factor: float,
+    table: wp.array[wp.vec3],
+    index: wp.array[int],
+    weight: wp.array[float],
+    factor: float,
     # out
-    value: wp.array[wp.vec3], parity: wp.array[int],
-):  # fmt: skip
+    value: wp.array[wp.vec3],
+    parity: wp.array[int],
+):
     i = start + wp.tid()
     value[i] = factor * weight[i] * table[index[i]]
     parity[i] = index[i] % 2
@@ -105,8 +109,15 @@ def test_gradients_follow_the_minimum_of_their_launch(device):
     ins = [(table, wp.vec3), (index, wp.int32), (weight, wp.float32), 1.7]
     results = []
     for slice_min in (_bridge.SLICE_MIN, 3):  # one slice, sixteen
-        value, _ = _bridge.call(gather_scale_kernel, 50, ins, [((50,), wp.vec3), ((50,), wp.int32)], device=device,
-                                shared=(0,), slice_min=slice_min)  # fmt: skip
+        value, _ = _bridge.call(
+            gather_scale_kernel,
+            50,
+            ins,
+            [((50,), wp.vec3), ((50,), wp.int32)],
+            device=device,
+            shared=(0,),
+            slice_min=slice_min,
+        )
         results.append(torch.autograd.grad(value, (table, weight), g))
     torch.testing.assert_close(*results, rtol=0, atol=1e-5)  # sums of five float32 terms in another order
 
@@ -276,8 +287,7 @@ def run(code, **environment):
 
 def test_unwritable_kernel_cache_falls_back_and_says_so(tmp_path):
     (tmp_path / "file").write_text("a file where the folder should be")
-    done = run(LAUNCH.format(root=str(ROOT)), WARP_CACHE_PATH=str(tmp_path / "file"),
-               TMPDIR=str(tmp_path))  # fmt: skip
+    done = run(LAUNCH.format(root=str(ROOT)), WARP_CACHE_PATH=str(tmp_path / "file"), TMPDIR=str(tmp_path))
     assert done.returncode == 0, done.stderr
     assert done.stdout == "" and "cannot be written" in done.stderr
 

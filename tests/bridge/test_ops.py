@@ -26,8 +26,9 @@ def leaves_of(case: Case, device, n: int = FEW, asked=None) -> dict:
 
 def strided(leaves: dict) -> dict:
     """The same values, no two of a tensor side by side."""
-    return {k: torch.stack([v.detach(), -v.detach()], -1)[..., 0].requires_grad_(v.requires_grad)
-            for k, v in leaves.items()}  # fmt: skip
+    return {
+        k: torch.stack([v.detach(), -v.detach()], -1)[..., 0].requires_grad_(v.requires_grad) for k, v in leaves.items()
+    }
 
 
 def loss_of(outs) -> torch.Tensor:
@@ -69,8 +70,9 @@ def test_an_expanded_row_is_as_good_as_its_copies(device, name):
     rows = {k: v.detach()[:1] if k in case.rows else v.detach() for k, v in leaves_of(case, device).items()}
     one = {k: v.clone().requires_grad_(k in case.grads) for k, v in rows.items()}
     wide = {k: v.expand(FEW, *v.shape[1:]) if k in case.rows else v for k, v in one.items()}
-    copies = {k: v.detach().repeat(FEW, *[1] * (v.ndim - 1)) if k in case.rows else v.detach().clone()
-              for k, v in one.items()}  # fmt: skip
+    copies = {
+        k: v.detach().repeat(FEW, *[1] * (v.ndim - 1)) if k in case.rows else v.detach().clone() for k, v in one.items()
+    }
     copies = {k: v.requires_grad_(k in case.grads) for k, v in copies.items()}
     outs, others = case.run(**wide), case.run(**copies)
     assert all(same(a, b) for a, b in zip(outs, others, strict=True))
@@ -307,4 +309,4 @@ def test_no_kernel_is_left_out(monkeypatch):
     assert found - launched == {
         "ray_key_kernel",  # many rays, before Embree
         "sample_rows_kernel",  # triplanes beyond a cache
-    }  # fmt: skip
+    }

@@ -14,10 +14,10 @@ from reli3d.cli import doctor, main, view
 def test_help_names_every_command_and_the_old_names(capsys):
     assert main.main([]) == 0
     text = capsys.readouterr().out
-    for name in ("infer", "view", "check", "render", "data", "train", "eval", "doctor"):
+    for name in ("infer", "view", "check", "render", "data", "train", "stages", "eval", "tables", "doctor"):
         assert re.search(rf"^  {name} ", text, re.MULTILINE)
-    for name in ("reli3d-infer", "reli3d-render", "reli3d-data", "reli3d-train", "reli3d-eval"):
-        assert name in text
+    for name in ("infer", "render", "data", "train", "stages", "eval", "tables"):
+        assert f"reli3d-{name}" in text
 
 
 @pytest.mark.parametrize("name", main.COMMANDS)
@@ -68,8 +68,8 @@ def test_view_refuses_in_one_line(tmp_path, monkeypatch, capsys, arguments):
 
 
 def test_help_tells_defaults(capsys):
-    for name in ("infer", "render", "data", "eval"):
+    for name in ("infer", "render", "data render", "data pack", "stages", "eval"):
         with pytest.raises(SystemExit):
-            main.main([name, "--help"])
+            main.main([*name.split(), "--help"])
         text = " ".join(capsys.readouterr().out.split())
         assert "default" in text and "(default None)" not in text and "(default False)" not in text

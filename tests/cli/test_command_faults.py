@@ -45,8 +45,10 @@ def told(text: str) -> list[str]:
     return [line for line in re.split("[\r\n]", text) if line.startswith("reli3d-infer: ")]
 
 
-@pytest.mark.parametrize("number, code, text", [(signal.SIGINT, 130, "interrupted"), (signal.SIGTERM, 143, "SIGTERM"),
-                                                (signal.SIGHUP, 129, "SIGHUP")])  # fmt: skip
+@pytest.mark.parametrize(
+    "number, code, text",
+    [(signal.SIGINT, 130, "interrupted"), (signal.SIGTERM, 143, "SIGTERM"), (signal.SIGHUP, 129, "SIGHUP")],
+)
 def test_a_signal_ends_with_one_line_and_leaves_nothing_behind(tmp_path, number, code, text):
     process = start(["--output", tmp_path / "out"], body=WAITS)
     assert process.stdout.readline() == "working\n"
@@ -70,13 +72,18 @@ def test_a_place_that_cannot_be_written_is_told_before_the_weights_are_read(tmp_
 
 
 def test_ascii_streams_change_nothing(tmp_path):
-    process = start(["--output", tmp_path / "größe"], env={**os.environ, "PYTHONIOENCODING": "ascii:strict",
-                                                           "PYTHONOPTIMIZE": "1"})  # fmt: skip
+    process = start(
+        ["--output", tmp_path / "größe"], env={**os.environ, "PYTHONIOENCODING": "ascii:strict", "PYTHONOPTIMIZE": "1"}
+    )
     out, err = process.communicate(timeout=60)
     assert process.returncode == 0, err
     assert out.endswith("\\xf6\\xdfe/example/mesh.glb\n") and "Traceback" not in err
-    process = start([tmp_path / "größer"], body="raise ValueError('größer')", cwd=tmp_path,
-                    env={**os.environ, "PYTHONIOENCODING": "ascii:strict"})  # fmt: skip
+    process = start(
+        [tmp_path / "größer"],
+        body="raise ValueError('größer')",
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONIOENCODING": "ascii:strict"},
+    )
     err = process.communicate(timeout=60)[1]
     assert process.returncode == 2 and told(err) == ["reli3d-infer: gr\\xf6\\xdfer"]
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from reli3d.cli import data, render, train
+from reli3d.cli import data, render, stages, train
 from reli3d.cli import eval as evaluation
 from reli3d.io.files import InputError
 from reli3d.synthetic.stored import TENSORS, check_sample
@@ -59,14 +59,23 @@ CASES = [
         (["--samples", "-1", "0", "4"], "--samples"), (["--samples", "0", "0", "0"], "--samples"),
         (["--samples", "99999999999", "1", "1"], "--samples"), (["--seed", "-1"], "--seed"),
         (["--seed", "99999999999999999999"], "--seed"), (["--output", "file"], "a file"), ([], "not found")]),
-    *((data, ["out", "--maps", *options], word) for options, word in [
+    *((data, ["render", "out", "--maps", *options], word) for options, word in [
         (["none.npz"], "not found"), (["file"], "broken file"), (["cut.npz"], "broken file"), (["key.npz"], "env"),
         (["pickle.npz"], "broken file"), (["shape.npz"], "env"), (["long.npz"], "names"), (["/dev/zero"], "regular"),
         (["few.npz", "--held-back", "test"], "--maps"), (["maps.npz", "--workers", "0"], "--workers"),
         (["maps.npz", "--first", "-5"], "--first"), (["maps.npz", "--count", "0"], "--count"),
         (["maps.npz", "--views", "0"], "--views"), (["maps.npz", "--size", "0"], "--size"),
         (["maps.npz", "--meshes", "none.glb"], "not found")]),
-    (data, ["file", "--maps", "maps.npz"], "a file"),
+    (data, ["render", "file", "--maps", "maps.npz"], "a file"),
+    (data, ["pack", "none", "out"], "none"),
+    (data, ["pack", "empty", "out"], "captures"),
+    (data, ["pack", "good", "out", "--each", "0"], "--each"),
+    (data, ["check", "empty"], "not found"),
+    (data, ["show", "empty"], "not found"),
+    *((stages, [stage, "out", "good", *options], word) for stage, options, word in [
+        ("nothing", [], "stage"), ("volume", ["--steps", "-1"], "--steps"), ("volume", ["--rate", "nan"], "--rate"),
+        ("volume", ["--inputs", "17"], "inputs"), ("volume", ["--start", "none"], "none"),
+        ("volume", ["--prior", "file"], "light prior"), ("volume", ["--patch", "999"], "patch")]),
     *((train, [folder, "out"], word) for folder, word in [
         ("none", "folder of samples"), ("file", "folder of samples"), ("empty", "got none"), ("lacks", "points"),
         ("few", "c2w"), ("cut", "broken file"), ("nothing", "broken file"), ("noise", "broken file")]),

@@ -1,7 +1,6 @@
 """The command from folders to files: what it writes, what it refuses, and how it ends."""
 
 import json
-import subprocess
 import sys
 from pathlib import Path
 
@@ -9,9 +8,9 @@ import pytest
 import torch
 
 from reli3d.cli import infer
+from reli3d.cli.helping import joined
 from reli3d.io.glb import read_glb
 from reli3d.io.hdr import read_environment
-from reli3d.nn.weights import load_model
 from reli3d.output import results
 from reli3d.render.camera import Camera
 from reli3d.render.color import srgb_to_linear
@@ -19,28 +18,12 @@ from reli3d.render.environment import Environment
 from reli3d.render.render import render
 from reli3d.views.folder import load_views
 from tests.support import evil
-
-QUICK = ["--texture-size", "256", "--resolution", "40", "--device", "cpu"]
+from tests.support.example import QUICK, moved_example
+from tests.support.kernel_list import CASES, launched
 
 
 def command(tmp_path: Path, *arguments) -> int:
     return infer.main([*map(str, arguments), "--output", str(tmp_path / "out"), *QUICK])
-
-
-def moved_example(folder: Path, matrix: torch.Tensor) -> Path:
-    """The bundled example with the world carried by ``matrix`` (a similarity); images are links."""
-    folder.mkdir()
-    record = json.loads((infer.EXAMPLE / "transforms.json").read_text())
-    scale = torch.linalg.det(matrix[:3, :3]).abs() ** (1 / 3)
-    for frame in record["frames"]:
-        pose = matrix @ torch.tensor(frame["transform_matrix"], dtype=torch.float64)
-        pose[:3, :3] /= scale
-        frame["transform_matrix"] = pose.tolist()
-    (folder / "transforms.json").write_text(json.dumps(record))
-    (folder / "rgba").mkdir()
-    for image in (infer.EXAMPLE / "rgba").iterdir():
-        (folder / "rgba" / image.name).write_bytes(image.read_bytes())
-    return folder
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +51,7 @@ def test_peak_memory_is_none_where_python_has_no_count(monkeypatch):
 
 def test_both_environments_hold_the_same_light(example):
     exr, hdr = (read_environment(example / f"environment.{kind}") for kind in ("exr", "hdr"))
-    assert exr.shape == (64, 128, 3) and bool((exr > 0).all())
+    assert exr.shape == (32, 64, 3) and bool((exr > 0).all())
     peak = exr.amax(-1, keepdim=True)
     assert bool(((exr - hdr).abs() <= peak / 100).all())  # RGBE keeps 8 bits of the largest channel
 
@@ -134,8 +117,10 @@ def test_one_bad_object_does_not_stop_the_rest(tmp_path, capsys):
     assert (tmp_path / "out/example/mesh.glb").stat().st_mtime_ns == before
 
 
-@pytest.mark.parametrize("arguments", [["--texture-size", "100"], ["--resolution", "4"], ["--views", "0"],
-                                       ["--weights", "nowhere.safetensors"]])  # fmt: skip
+@pytest.mark.parametrize(
+    "arguments",
+    [["--texture-size", "100"], ["--resolution", "4"], ["--views", "0"], ["--weights", "nowhere.safetensors"]],
+)
 def test_options_out_of_range_end_with_2(tmp_path, capsys, arguments):
     assert infer.main([str(infer.EXAMPLE), "--output", str(tmp_path / "out"), *arguments]) == 2
     assert capsys.readouterr().err.count("reli3d-infer: ") == 1
@@ -155,26 +140,55 @@ def test_check_explains_the_example_and_draws_the_rig(tmp_path, capsys):
     assert (tmp_path / "example" / "rig.png").stat().st_size > 10_000
 
 
-def test_the_first_run_compiles_what_it_needs_side_by_side(tmp_path):
-    """A module missing from KERNELS would compile alone, at its first launch; one too many costs every first run."""
-    code = f"""
-import sys
-from pathlib import Path
-from reli3d.cli import infer
-infer.ready_kernels = lambda device: None
-assert infer.main(["--output", {str(tmp_path)!r}, *{QUICK!r}]) == 0
-import warp
-names = [p.stem for p in (Path(infer.__file__).parents[1] / "kernels").glob("*.py") if p.stem != "__init__"]
-loaded = [n for n in names if f"reli3d.kernels.{{n}}" in sys.modules and warp.get_module(f"reli3d.kernels.{{n}}").execs]
-sys.stdout.write("loaded " + " ".join(sorted(loaded)))
-compiler = [n for n in ("torch._dynamo", "trimesh", "matplotlib") if n in sys.modules]
-sys.stdout.write("; heavy " + " ".join(compiler))
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    shading = load_model("small").preset.shading_features  # without them nobody looks the light up by normal
-    expected = sorted({*infer.KERNELS, *infer.SHADER["cpu"]} - (set() if shading else {"envmap"}))
-    assert done.stdout.splitlines()[-1] == f"loaded {' '.join(expected)}; heavy "
+def test_wrong_cameras_end_the_check_with_3_and_are_named_where_the_reconstruction_fails(tmp_path, capsys):
+    folder = moved_example(tmp_path / "object", torch.eye(4, dtype=torch.float64))
+    data = json.loads((folder / "transforms.json").read_text())
+    for frame in data["frames"]:  # OpenCV's axes where OpenGL's are expected
+        frame["transform_matrix"] = [[v * s for v, s in zip(row, (1, -1, -1, 1))] for row in frame["transform_matrix"]]
+    (folder / "transforms.json").write_text(json.dumps(data))
+    assert infer.main([str(folder), "--check", "--output", str(tmp_path / "out")]) == 3
+    named = "suspect: the camera axes look flipped"
+    assert any(line.startswith(named) for line in capsys.readouterr().out.splitlines())
+    assert infer.main([str(folder), str(infer.EXAMPLE), "--check", "--output", str(tmp_path / "out")]) == 3
+    capsys.readouterr()
+    assert command(tmp_path, folder) == 2
+    err = capsys.readouterr().err
+    assert "\r" not in err  # no bar where there is no terminal
+    err = [line for line in err.splitlines() if line.startswith("reli3d-infer: ")]
+    assert len(err) == 1 and named in err[0] and "expected" in err[0]
+
+
+def test_json_is_one_object_on_stdout(tmp_path, capsys):
+    (tmp_path / "empty").mkdir()
+    folders = [str(infer.EXAMPLE), str(tmp_path / "empty")]
+    assert infer.main([*folders, "--check", "--json", "--output", str(tmp_path / "out")]) == 1
+    seen = json.loads(capsys.readouterr().out)
+    assert seen["exit_code"] == 1 and [o["object"] for o in seen["objects"]] == ["example", "empty"]
+    example, empty = seen["objects"]
+    assert example["result"] == "done" and not example["suspect"] and example["verdict"].startswith("cameras agree")
+    assert len(example["lines"]) == 4 and Path(example["picture"]).is_file()
+    assert empty["result"] == "refused" and "expected transforms.json" in empty["notes"][0]
+    assert command(tmp_path, *folders, "--json") == 1
+    made = json.loads(capsys.readouterr().out)["objects"]
+    assert [o["result"] for o in made] == ["done", "refused"] and made[0]["faces"] > 1000
+    assert (Path(made[0]["folder"]) / "mesh.glb").is_file()
+
+
+def test_a_negative_axis_may_be_a_word_of_its_own(tmp_path):
+    for words in (["--up", "-z"], ["--up=-z"]):
+        assert infer.parser().parse_args(joined(["a", *words], "--up", infer.AXES)).up == "-z"
+    assert joined(["--up", "z", "-z", "--up"], "--up", infer.AXES) == ["--up=z", "-z", "--up"]
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_first_run_compiles_what_it_needs_side_by_side(case):
+    """A missing module would compile alone, at its first launch; one too many costs every first run.
+
+    After a change run ``python -m tests.support.kernel_list``.
+    """
+    kernels, heavy = launched(case)
+    assert kernels == json.loads(infer.KERNELS.read_text())[case]
+    assert heavy == [] or case == "refine"
 
 
 def test_a_refinement_writes_its_picture_and_its_curve(tmp_path):

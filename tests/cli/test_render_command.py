@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import json
 import math
 import sys
 from pathlib import Path
@@ -34,8 +35,10 @@ def scene(tmp_path_factory):
     n = asset.mesh.normals
     tangent = torch.linalg.cross(n.new_tensor([0.3, 0.5, 0.81]).expand_as(n), n)
     tangent = torch.cat([torch.nn.functional.normalize(tangent, dim=-1), torch.ones(len(n), 1)], -1)
-    write_glb(folder / "ball.glb", Asset(Mesh(asset.mesh.vertices, asset.mesh.faces, n, asset.mesh.uv, tangent),
-                                         asset.textures))  # fmt: skip
+    write_glb(
+        folder / "ball.glb",
+        Asset(Mesh(asset.mesh.vertices, asset.mesh.faces, n, asset.mesh.uv, tangent), asset.textures),
+    )
     light = torch.full((8, 16, 3), 0.0625)
     light[:, :8] = torch.tensor([2.0, 1.0, 1.0])
     write_environment(folder / "half.hdr", light)
@@ -95,9 +98,12 @@ def test_linear_files_and_layers_are_those_of_render(scene):
     zero, seen = torch.zeros_like(image.alpha), image.alpha > 0.0
     assert 0.2 < float(seen.float().mean()) < 0.8 and float(image.radiance.max()) > 0.1
     depth = torch.where(seen, image.depth, 0.0)
-    layers = {"base_color": image.base_color, "material": torch.stack([zero, image.roughness, image.metallic], -1),
-              "normal": torch.where(seen[..., None], image.normal / 2 + 0.5, 0.0),
-              "depth": torch.stack([depth, depth, image.alpha], -1)}  # fmt: skip
+    layers = {
+        "base_color": image.base_color,
+        "material": torch.stack([zero, image.roughness, image.metallic], -1),
+        "normal": torch.where(seen[..., None], image.normal / 2 + 0.5, 0.0),
+        "depth": torch.stack([depth, depth, image.alpha], -1),
+    }
     for name, layer in layers.items():
         torch.testing.assert_close(read_hdr_image(files[f"ball_{name}.exr"]), layer, rtol=0, atol=1e-6)
     brighter = read_hdr_image(run(scene, "--format", "exr", "--exposure", "1")["ball.exr"])
@@ -165,9 +171,62 @@ def test_paint_and_wrong_options(scene, capsys):
         main([*common, "--paint", "white"])
     assert stopped.value.code == 2
     capsys.readouterr()
-    for wrong in (["--size", "0"], ["--elevation", "90"], ["--azimuth", "nan"], ["--exposure", "nan"],
-                  ["--distance", "inf"], ["--light", str(scene / "none.hdr")]):  # fmt: skip
+    for wrong in (
+        ["--size", "0"],
+        ["--elevation", "90"],
+        ["--azimuth", "nan"],
+        ["--exposure", "nan"],
+        ["--distance", "inf"],
+        ["--light", str(scene / "none.hdr")],
+    ):
         assert main([*common, *wrong]) == 2
         said = capsys.readouterr()
         assert said.err.startswith("reli3d-render: ") and said.err.count("\n") == 1 and said.out == ""
     assert not (scene / "none").exists()
+
+
+@pytest.mark.parametrize("ending", ["webp", "gif", "mp4"])
+def test_the_name_of_the_output_makes_an_animation(scene, tmp_path, ending):
+    """Four frames of a turning light; the first shows what a single picture does."""
+    if ending == "mp4":
+        av = pytest.importorskip("av")
+    path = tmp_path / f"turn.{ending}"
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said):
+        assert main([str(scene / "ball.glb"), "--light", str(scene / "half.hdr"), "--output", str(path), "--size", "48",
+                     "--frames", "4", "--rotate-light", "--quality", "draft", "--json"]) == 0  # fmt: skip
+    assert json.loads(said.getvalue()) == {
+        "files": [str(path)],
+        "frames": 4,
+        "size": 48,
+        "samples": [6, 12, 2],
+        "supersampling": 1,
+    }
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+    if ending == "mp4":
+        with av.open(str(path)) as file:
+            assert file.streams.video[0].average_rate == 24
+            frames = [frame.to_image() for frame in file.decode(video=0)]
+    else:
+        image = Image.open(path)
+        frames = [(image.seek(k), image.convert("RGBA"))[1] for k in range(image.n_frames)]
+    assert len(frames) == 4 and frames[0].size == (48, 48)
+    shown = [np.asarray(f.convert("RGB")).astype(float) for f in frames]
+    middle = [v[20:28, 20:28].mean() for v in shown]
+    assert max(middle) > 1.3 * min(middle)  # the light turns
+    red = shown[0][24, 24]
+    assert red[0] > 2 * red[1]  # in its colours: 4:2:0, 256 colours and lossy WebP keep a red ball red
+    corner = np.asarray(frames[0])[1, 1]
+    assert (corner[:3] > 250).all() if ending == "mp4" else corner[3] == 0
+
+
+@pytest.mark.parametrize(
+    "words, text",
+    [
+        (["--output", "a.gif", "--format", "png"], "--format: expected gif"),
+        (["--output", "a.mp4", "--size", "47"], "--size: expected an even number"),
+    ],
+)
+def test_an_animation_that_cannot_be_is_refused(scene, capsys, words, text):
+    assert main([str(scene / "ball.glb"), *words]) == 2
+    assert text in capsys.readouterr().err

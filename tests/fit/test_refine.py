@@ -100,8 +100,10 @@ def test_cameras_that_are_off_move_back(start, views):
     result = fit.refine(small_scene.ball(), replace(views, c2w=c2w), steps=90, resolution=24, cameras=True)
     off = [(c[:, :3, 3] - views.c2w[:, :3, 3]) for c in (c2w, result.c2w)]
     # silhouettes of a ball tell shifts across the view, little along it; the common shift is free
-    across = [(o - o.mean(0)) - ((o - o.mean(0)) * views.c2w[:, :3, 2]).sum(-1, keepdim=True) * views.c2w[:, :3, 2]
-              for o in off]  # fmt: skip
+    across = [
+        (o - o.mean(0)) - ((o - o.mean(0)) * views.c2w[:, :3, 2]).sum(-1, keepdim=True) * views.c2w[:, :3, 2]
+        for o in off
+    ]
     assert float(across[1].norm()) < float(across[0].norm())
 
 

@@ -23,8 +23,10 @@ SIZE = 256
 
 def icosphere(subdivisions: int, device="cpu") -> Mesh:
     ball = trimesh.creation.icosphere(subdivisions)
-    return Mesh(torch.tensor(ball.vertices, dtype=torch.float32, device=device),
-                torch.tensor(ball.faces, dtype=torch.int32, device=device)).with_normals()  # fmt: skip
+    return Mesh(
+        torch.tensor(ball.vertices, dtype=torch.float32, device=device),
+        torch.tensor(ball.faces, dtype=torch.int32, device=device),
+    ).with_normals()
 
 
 @pytest.fixture(scope="module")
@@ -77,8 +79,9 @@ def test_texels_match_brute_force(device):
     settled = outside & (np.abs(distance - 1.5) > 1e-4)
     assert np.array_equal(valid[settled], distance[settled] < 1.5)
     ring = outside & valid
-    full = np.concatenate([1 - got.bary.cpu().numpy().reshape(-1, 2).sum(1, keepdims=True),
-                           got.bary.cpu().numpy().reshape(-1, 2)], 1)  # fmt: skip
+    full = np.concatenate(
+        [1 - got.bary.cpu().numpy().reshape(-1, 2).sum(1, keepdims=True), got.bary.cpu().numpy().reshape(-1, 2)], 1
+    )
     point = (q[got.face.cpu().numpy().ravel()[ring]] * full[ring][:, :, None]).sum(1)
     np.testing.assert_allclose(np.linalg.norm(point - p[ring][:, 0], axis=1), distance[ring], atol=1e-4)
 
@@ -164,6 +167,17 @@ def test_chunks_and_reused_texels_do_not_matter(sphere):
     assert all(torch.equal(one[k], other[k]) for k in "ab") and one["b"].shape == (SIZE, SIZE, 1)
     bare = bake(sphere, SIZE, lambda p, n: color(p), texels=texels, fill=False)["value"]
     assert torch.equal(dilate(bare, texels.valid), one["a"]) and float(bare[~texels.valid].abs().max()) == 0.0
+
+
+def test_numbers_of_the_vertices_reach_the_texels(sphere):
+    """The vertices' own coordinates, interpolated, are the texels' positions; in any chunks."""
+    numbers = torch.cat([sphere.vertices, 2.0 * sphere.vertices[:, :1]], -1)
+    for chunk in (1 << 18, 777):
+        both = bake(sphere, SIZE, lambda p, n, v: torch.cat([p, v], -1), values=numbers, chunk=chunk)["value"]
+        torch.testing.assert_close(both[..., 3:6], both[..., :3], rtol=0, atol=1e-6)  # float32 of numbers below 1
+        torch.testing.assert_close(both[..., 6], 2.0 * both[..., 0], rtol=0, atol=2e-6)
+    with pytest.raises(ValueError, match="values: expected"):
+        bake(sphere, SIZE, lambda p, n, v: v, values=numbers[1:])
 
 
 @pytest.mark.parametrize("shape, share", [((64, 64), 0.02), ((33, 130), 0.3), ((1, 50), 0.1), ((50, 1), 0.1)])

@@ -15,7 +15,7 @@ from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.surface import extract_surface
 from reli3d.geometry.tangents import encode_normals, with_tangents
 from reli3d.geometry.uv import unwrap
-from reli3d.io.glb import encode_png, write_glb
+from reli3d.io.glb import encode_image, write_glb
 from reli3d.render.asset import Asset, TextureSet
 from tests.support.meshes import QUICK, SLOW, loaded
 from tests.support.texels import bilinear, color
@@ -115,5 +115,5 @@ def test_known_colour_reads_back_from_the_file_of_an_extracted_surface(tmp_path,
 @pytest.mark.parametrize("shape", [(1, 1), (1, 7), (5, 1), (33, 64)])
 def test_png_is_exact(shape):
     pixels = torch.randint(0, 256, (*shape, 3), generator=torch.Generator().manual_seed(1))
-    stored = np.asarray(Image.open(io.BytesIO(encode_png(pixels / 255.0))))
+    stored = np.asarray(Image.open(io.BytesIO(encode_image(pixels / 255.0))))
     assert np.array_equal(stored, pixels.numpy())

@@ -90,8 +90,9 @@ def twin(level, bound, distance, c2w, intrinsics):
         near, far = ends.amin(0).amax(1).clamp(min=0.0), ends.amax(0).amin(1)
         t = near[:, None] + step * torch.arange(int(4 * RADIUS / step))
         at = (o[:, None] + t[..., None] * d[:, None]) / RADIUS
-        value = grid_sample(level[None, None], at.flip(-1)[None, :, :, None], align_corners=True,
-                            padding_mode="border")[0, 0, :, :, 0]  # fmt: skip
+        value = grid_sample(
+            level[None, None], at.flip(-1)[None, :, :, None], align_corners=True, padding_mode="border"
+        )[0, 0, :, :, 0]
         least = torch.where(t < far[:, None], value, torch.inf).amin(1)
         x, y = torch.meshgrid(torch.arange(columns), torch.arange(rows), indexing="xy")
         centre = (torch.stack([x, y], -1) + 0.5) * STRIDE * 2 / torch.tensor([distance.shape[2], distance.shape[1]]) - 1
@@ -101,8 +102,9 @@ def twin(level, bound, distance, c2w, intrinsics):
         )
         pixel, _ = project(points.float(), c2w[v], intrinsics[v])
         place = pixel.double() / STRIDE * 2 / torch.tensor([columns, rows]) - 1
-        value = grid_sample(max_pool2d(lacks, 3, 1, 1), place[None, :, None], align_corners=False,
-                            padding_mode="border")[0, 0, :, 0]  # fmt: skip
+        value = grid_sample(
+            max_pool2d(lacks, 3, 1, 1), place[None, :, None], align_corners=False, padding_mode="border"
+        )[0, 0, :, 0]
         most = torch.maximum(most, torch.where((place.abs() < 1.0).all(1), value, 0.0))
     flat = level.reshape(-1)
     return torch.where(flat.abs() < REACH, torch.maximum(flat - most, bound.reshape(-1)), flat).view_as(level)
@@ -131,8 +133,12 @@ def seen_share(model, views):
     field = pipeline.encode(model, pipeline.prepare(model, views, pipeline.normalize(views, "auto")))
     mesh, maps = pipeline.extract(field, model.preset.resolution), field.maps
     scene, size = RayScene(mesh.vertices, mesh.faces), maps.images.shape[1]
-    hit = torch.stack([scene.closest(*camera_rays(Camera(c, k, size, size))).face >= 0
-                       for c, k in zip(maps.c2w, maps.intrinsics, strict=True)])  # fmt: skip
+    hit = torch.stack(
+        [
+            scene.closest(*camera_rays(Camera(c, k, size, size))).face >= 0
+            for c, k in zip(maps.c2w, maps.intrinsics, strict=True)
+        ]
+    )
     inside = maps.images[..., 3] > 0
     return float((hit & inside).sum() / inside.sum()), float((hit & inside).sum() / hit.sum())
 
@@ -158,10 +164,12 @@ def test_without_views_the_level_comes_back(device):
 def test_bad_input_is_named():
     level, (c2w, intrinsics) = torch.zeros(4, 4, 4), far_camera()
     good = {"level": level, "bound": level, "distance": disc(32, 9.0), "c2w": c2w, "intrinsics": intrinsics}
-    for change, message in (({"level": torch.zeros(4, 4)}, r"level: expected shape \(X, Y, Z\)"),
-                            ({"bound": torch.zeros(4, 4, 5)}, r"bound: expected shape \(4, 4, 4\)"),
-                            ({"distance": torch.zeros(1, 4, 40)}, r"distance: expected shape \(V, H, W\)"),
-                            ({"c2w": c2w[0]}, "c2w, intrinsics: expected 1 cameras")):  # fmt: skip
+    for change, message in (
+        ({"level": torch.zeros(4, 4)}, r"level: expected shape \(X, Y, Z\)"),
+        ({"bound": torch.zeros(4, 4, 5)}, r"bound: expected shape \(4, 4, 4\)"),
+        ({"distance": torch.zeros(1, 4, 40)}, r"distance: expected shape \(V, H, W\)"),
+        ({"c2w": c2w[0]}, "c2w, intrinsics: expected 1 cameras"),
+    ):
         with pytest.raises(ValueError, match=message):
             cover_silhouettes(**{**good, **change}, radius=1.0)
     for radius in (0.0, math.nan):

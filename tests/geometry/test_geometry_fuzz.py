@@ -74,7 +74,8 @@ def test_gradients_of_flexicubes(device, reach):
     assert finite(mesh.vertices, *got)
     double = {k: v.double().requires_grad_() for k, v in leaves.items()}
     dual, cube_of = reference_surface.flexicubes_vertices(
-        *(double[k] for k in ("level", "deformation", "alpha", "beta")), 1.0, LEVEL_MIN)  # fmt: skip
+        *(double[k] for k in ("level", "deformation", "alpha", "beta")), 1.0, LEVEL_MIN
+    )
     quads = mesh.faces.cpu().long().view(-1, 4, 3)[:, :, 0]
     corner, weight = dual[quads], double["gamma"][cube_of[quads]]
     one, other = weight[:, 0] * weight[:, 2], weight[:, 1] * weight[:, 3]
@@ -95,8 +96,12 @@ def test_gradients_of_the_deviation(device, reach):
     level = wild((CUBES + 1,) * 3, g)
     for axis in range(3):
         level.select(axis, 0).abs_(), level.select(axis, -1).abs_()
-    leaves = [level, (torch.randint(3, (*level.shape, 3), generator=g) - 1) * (0.49 / CUBES),
-              wild_weights((n, 8), g, reach), wild_weights((n, 12), g, reach)]  # fmt: skip
+    leaves = [
+        level,
+        (torch.randint(3, (*level.shape, 3), generator=g) - 1) * (0.49 / CUBES),
+        wild_weights((n, 8), g, reach),
+        wild_weights((n, 12), g, reach),
+    ]
     ours = [v.to(device).requires_grad_() for v in leaves]
     spread = vertex_deviation(ours[0], radius=0.5, **dict(zip(("deformation", "alpha", "beta"), ours[1:], strict=True)))
     assert len(spread) > N and finite(spread, *torch.autograd.grad(spread.sum(), ours))
@@ -279,8 +284,13 @@ def test_distance_to_the_hull_of_points_anywhere(device):
     assert bool((got[~torch.isfinite(points).all(1)] == -1000).all())
     pixel = torch.stack([k[0, 2] + k[0, 0] * away[..., 0] / depth, k[0, 3] - k[0, 1] * away[..., 1] / depth], -1)
     ndc = (pixel / torch.tensor([24.0, 16.0]) * 2 - 1).clamp(-9, 9)  # (N, V, 2); clamped at the border either way
-    seen = torch.nn.functional.grid_sample(distance.double()[:, None], ndc.transpose(0, 1)[:, None], mode="bilinear",
-                                           padding_mode="border", align_corners=False)[:, 0, 0].T  # fmt: skip
+    seen = torch.nn.functional.grid_sample(
+        distance.double()[:, None],
+        ndc.transpose(0, 1)[:, None],
+        mode="bilinear",
+        padding_mode="border",
+        align_corners=False,
+    )[:, 0, 0].T
     want = (seen * depth * 2 / (k[0, 0] + k[0, 1])).amin(1)
     plain = (depth > 1e-3).all(1) & (points.abs() < 1e6).all(1)
     assert plain.sum() > N // 3

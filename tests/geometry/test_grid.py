@@ -44,8 +44,11 @@ def test_grid_points_give_their_own_values(device):
 
 def test_bad_input_is_named():
     grid, points = random_case("cpu", 4)
-    for change, message in (({"grid": grid[0]}, r"grid: expected \(X, Y, Z, C\)"), ({"grid": grid[:1]}, "at least 2"),
-                            ({"points": points[None]}, r"points: expected \(N, 3\)")):  # fmt: skip
+    for change, message in (
+        ({"grid": grid[0]}, r"grid: expected \(X, Y, Z, C\)"),
+        ({"grid": grid[:1]}, "at least 2"),
+        ({"points": points[None]}, r"points: expected \(N, 3\)"),
+    ):
         with pytest.raises(ValueError, match=message):
             sample_grid(**{"grid": grid, "points": points, **change})
     with pytest.raises(TypeError, match="points: expected torch.float32"):

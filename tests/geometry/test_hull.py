@@ -9,8 +9,9 @@ import torch
 from scipy.spatial import cKDTree
 
 from reli3d import pipeline
-from reli3d.geometry.hull import hull_distance, mask_distance
-from reli3d.nn.field import Field, bound_level
+from reli3d.geometry.hull import hull_distance, hull_span, mask_distance
+from reli3d.nn.field import bound_level
+from reli3d.nn.local import LocalField
 from reli3d.nn.presets import SMALL
 from reli3d.nn.view_features import ViewMaps
 
@@ -122,6 +123,32 @@ def test_sphere_seen_by_eight_cameras(device):
     assert bool((got[true < -0.002] < 0).all())
 
 
+def test_rays_enter_and_leave_the_cones_of_sight(device):
+    """Against the cones in float64, looked at every 0.001 along the ray."""
+    masks, c2w, intrinsics = sphere_views(device)
+    draw = torch.Generator().manual_seed(3)
+    origins = torch.nn.functional.normalize(torch.randn(300, 3, generator=draw), dim=-1) * 2.5
+    target = (torch.rand(300, 3, generator=draw) - 0.5) * 1.2
+    directions = (target - origins) * (0.3 + torch.rand(300, 1, generator=draw))  # of any length
+    got = hull_span(origins.to(device), directions.to(device), 0.87, mask_distance(masks), c2w, intrinsics).cpu()
+    length = directions.norm(dim=-1)
+    t = torch.linspace(1.5, 3.5, 2001, dtype=torch.float64) / length[:, None]
+    along = origins[:, None] + directions[:, None] * t[..., None]
+    true = cone_distance(along.reshape(-1, 3), c2w.cpu()).reshape(300, -1)
+    true[along.norm(dim=-1) > 0.87] = -1.0
+    hit = true.max(1).values > 0.02  # a ray that grazes the hull may miss it
+    missed = true.max(1).values < -0.01
+    assert hit.sum() > 150 and missed.sum() > 20
+    first = torch.stack([t[k, true[k] > 0][0] for k in hit.nonzero()[:, 0]])
+    last = torch.stack([t[k, true[k] > 0][-1] for k in hit.nonzero()[:, 0]])
+    # a step of the truth, one of the tracing, and the cones' error, longer where the ray meets them at a slant
+    error = torch.stack([got[hit, 0] - first, got[hit, 1] - last]).abs() * length[hit]
+    assert error.quantile(0.9) < 0.006 and error.max() < 0.05
+    assert torch.equal(got[missed, 0], got[missed, 1])
+    closest = t[missed, true[missed].argmax(1)]
+    assert ((got[missed, 0] - closest).abs() * length[missed]).median() < 0.03
+
+
 def test_behind_a_camera_is_far_outside_and_no_view_bounds_nothing(device):
     masks, c2w, intrinsics = sphere_views(device, n=1)
     behind = c2w[:, :3, 3] + c2w[:, :3, 2]
@@ -185,10 +212,10 @@ def test_the_coarse_look_finds_the_reach_of_the_dense_one(device, radius, views)
     model = SimpleNamespace(preset=SMALL)
     grid = pipeline._grid(80, SMALL.radius, device).reshape(-1, 3)
     dense = float(grid[bound_level(maps, grid, SMALL.softness) < 0].abs().max())
-    assert pipeline._hull_reach(Field(model, None, maps), 80) == dense
+    assert pipeline._hull_reach(LocalField(maps, model, None, None, None, None, None), 80) == dense
     empty = replace(maps, images=images - 1000.0)
     with pytest.raises(ValueError, match="masks: expected masks that overlap"):
-        pipeline._hull_reach(Field(model, None, empty), 80)
+        pipeline._hull_reach(LocalField(empty, model, None, None, None, None, None), 80)
 
 
 def test_far_from_the_contour_the_ends_of_segments_will_do(device):

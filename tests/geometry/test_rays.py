@@ -199,17 +199,28 @@ def test_reevaluated_hits_and_their_gradients_equal_float64(device):
     hits = Hits(hits.face[seen], hits.t[seen], hits.bary[seen])
     ins = [t.to(device).requires_grad_() for t in (v, o[seen.cpu()], d[seen.cpu()])]
     got = evaluate_hits(ins[0], f, hits, ins[1], ins[2])
-    own = {"t": got.t[:, None], "bary": got.bary, "position": ins[1] + got.t[:, None] * ins[2],
-           "interpolated": interpolate(ins[0], f, hits.face, got.bary),
-           "normal": hit_normals(ins[0], f, hits.face)}  # fmt: skip
+    own = {
+        "t": got.t[:, None],
+        "bary": got.bary,
+        "position": ins[1] + got.t[:, None] * ins[2],
+        "interpolated": interpolate(ins[0], f, hits.face, got.bary),
+        "normal": hit_normals(ins[0], f, hits.face),
+    }
     twin = [t.detach().cpu().double().requires_grad_() for t in ins]
     a, b, c = (twin[0][f.cpu().long()[hits.face.cpu().long(), k]] for k in range(3))
     uvt = solved(a, b, c, twin[1], twin[2])
     spot = twin[1] + uvt[:, 2:] * twin[2]
-    want = {"t": uvt[:, 2:], "bary": uvt[:, :2], "position": spot, "interpolated": spot,
-            "normal": torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1)}  # fmt: skip
-    sine = (torch.linalg.det(torch.stack([b - a, c - a, twin[2]], -1)).abs() / ((b - a).norm(dim=-1)
-            * (c - a).norm(dim=-1) * twin[2].norm(dim=-1))).detach()  # fmt: skip
+    want = {
+        "t": uvt[:, 2:],
+        "bary": uvt[:, :2],
+        "position": spot,
+        "interpolated": spot,
+        "normal": torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1),
+    }
+    sine = (
+        torch.linalg.det(torch.stack([b - a, c - a, twin[2]], -1)).abs()
+        / ((b - a).norm(dim=-1) * (c - a).norm(dim=-1) * twin[2].norm(dim=-1))
+    ).detach()
     steep = sine > 0.01  # what the ray query itself says of t and bary errs by 1e-7 over that
     torch.testing.assert_close(got.t.cpu()[steep], hits.t.cpu()[steep], rtol=1e-4, atol=1e-5)
     torch.testing.assert_close(got.bary.cpu()[steep], hits.bary.cpu()[steep], rtol=0, atol=2e-4)

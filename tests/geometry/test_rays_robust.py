@@ -218,8 +218,7 @@ print("all refused or answered")
 
 def test_wrong_indices_and_odd_meshes_end_in_an_error_and_never_in_a_crash():
     """In a process of its own: a wrong index that came through would end it with a signal."""
-    done = subprocess.run([sys.executable, "-c", HOSTILE], capture_output=True, text=True, timeout=300,
-                          cwd=ROOT)  # fmt: skip
+    done = subprocess.run([sys.executable, "-c", HOSTILE], capture_output=True, text=True, timeout=300, cwd=ROOT)
     assert done.returncode == 0 and done.stdout == "all refused or answered\n", done.stderr
 
 

@@ -59,8 +59,11 @@ def test_deviation_of_a_flat_cut_vanishes_and_pulls_a_skewed_one_back():
 def test_deviation_follows_the_vertices_of_a_closed_field_at_the_box(device):
     level = sphere(6, radius=1.1, device=device).requires_grad_()
     cubes = surface_cubes(level)
-    weights = {name: value[cubes.cpu()].to(device) for name, value in random_weights((7,) * 3, 2).items()
-               if name in ("alpha", "beta")}  # fmt: skip
+    weights = {
+        name: value[cubes.cpu()].to(device)
+        for name, value in random_weights((7,) * 3, 2).items()
+        if name in ("alpha", "beta")
+    }
     spread = vertex_deviation(level, radius=1.0, cubes=cubes, **weights)
     assert len(spread) == len(extract_surface(level, radius=1.0, cubes=cubes, **weights).vertices)
     (g,) = torch.autograd.grad(spread.mean(), level)
@@ -76,12 +79,15 @@ def test_entropy_matches_cross_entropy_in_float64(device):
         a, b = double.narrow(axis, 0, n - 1), double.narrow(axis, 1, n - 1)
         change = (a < 0) != (b < 0)
         a, b = a[change], b[change]
-        terms.append(F.binary_cross_entropy_with_logits(a, (b > 0).double(), reduction="none")
-                     + F.binary_cross_entropy_with_logits(b, (a > 0).double(), reduction="none"))  # fmt: skip
+        terms.append(
+            F.binary_cross_entropy_with_logits(a, (b > 0).double(), reduction="none")
+            + F.binary_cross_entropy_with_logits(b, (a > 0).double(), reduction="none")
+        )
     want, got = torch.cat(terms).mean(), sign_entropy(ours)
     torch.testing.assert_close(got.cpu().double(), want, rtol=1e-6, atol=0)  # a float32 sum of 300 like terms
-    torch.testing.assert_close(torch.autograd.grad(got, ours)[0].cpu().double(), torch.autograd.grad(want, double)[0],
-                               rtol=1e-5, atol=1e-9)  # fmt: skip
+    torch.testing.assert_close(
+        torch.autograd.grad(got, ours)[0].cpu().double(), torch.autograd.grad(want, double)[0], rtol=1e-5, atol=1e-9
+    )
 
 
 def test_entropy_of_one_change_is_the_closed_form_and_a_uniform_field_has_none():

@@ -77,9 +77,15 @@ def test_loops_follow_the_faces_and_fans_that_touch_keep_apart():
 
 
 def test_a_cut_along_a_triple_edge_is_not_clean():
-    fin = Mesh(torch.cat([BOX.vertices, torch.tensor([[0.0, 3.0, 0.0]])]),
-               torch.cat([BOX.faces, torch.tensor([[int(BOX.faces[0, 0]), int(BOX.faces[0, 1]), len(BOX.vertices)]],
-                                                  dtype=torch.int32)]))  # fmt: skip
+    fin = Mesh(
+        torch.cat([BOX.vertices, torch.tensor([[0.0, 3.0, 0.0]])]),
+        torch.cat(
+            [
+                BOX.faces,
+                torch.tensor([[int(BOX.faces[0, 0]), int(BOX.faces[0, 1]), len(BOX.vertices)]], dtype=torch.int32),
+            ]
+        ),
+    )
     assert report(fin).nonmanifold_edges == 1 and any(not h.clean for h in holes(fin))
 
 
@@ -111,9 +117,11 @@ def test_decimation_of_flat_faces_is_exact_and_borders_can_stay():
     got = decimate(mesh_of(box), 60)
     assert float(volume(got)) == pytest.approx(2.0, rel=1e-5)
     x, y = np.meshgrid(np.linspace(0, 1, 17), np.linspace(0, 1, 17), indexing="ij")
-    sheet = trimesh.Trimesh(np.stack([x, y, 0.1 * np.sin(5 * x)], -1).reshape(-1, 3),
-                            [[a, a + 17, a + 18] for i in range(16) for a in range(i * 17, i * 17 + 16)]
-                            + [[a, a + 18, a + 1] for i in range(16) for a in range(i * 17, i * 17 + 16)])  # fmt: skip
+    sheet = trimesh.Trimesh(
+        np.stack([x, y, 0.1 * np.sin(5 * x)], -1).reshape(-1, 3),
+        [[a, a + 17, a + 18] for i in range(16) for a in range(i * 17, i * 17 + 16)]
+        + [[a, a + 18, a + 1] for i in range(16) for a in range(i * 17, i * 17 + 16)],
+    )
     kept = holes(decimate(mesh_of(sheet), 200, keep_border=True))
     assert len(kept) == 1 and len(kept[0].vertices) == 64
 
@@ -132,8 +140,9 @@ def test_even_remeshing_gives_round_triangles():
     edge = got.vertices[got.faces.long()]
     length = (edge - edge.roll(1, 1)).norm(dim=-1)
     assert float(length.std() / length.mean()) < 0.3  # 0.16 measured on a torus; creases are rounded here
-    distance, _ = cKDTree(trimesh.sample.sample_surface(trimesh.Trimesh(TUBE.vertices, TUBE.faces), 20000, seed=0)[0]) \
-        .query(got.vertices.numpy())  # fmt: skip
+    distance, _ = cKDTree(
+        trimesh.sample.sample_surface(trimesh.Trimesh(TUBE.vertices, TUBE.faces), 20000, seed=0)[0]
+    ).query(got.vertices.numpy())
     assert distance.max() < 0.1  # under the size of a cluster
 
 
@@ -159,9 +168,15 @@ def test_repair_gives_the_solid(broken, want):
 
 
 def test_repair_cuts_a_fin_off():
-    fin = Mesh(torch.cat([BOX.vertices, torch.tensor([[0.0, 3.0, 0.0]])]),
-               torch.cat([BOX.faces, torch.tensor([[int(BOX.faces[0, 0]), int(BOX.faces[0, 1]), len(BOX.vertices)]],
-                                                  dtype=torch.int32)]))  # fmt: skip
+    fin = Mesh(
+        torch.cat([BOX.vertices, torch.tensor([[0.0, 3.0, 0.0]])]),
+        torch.cat(
+            [
+                BOX.faces,
+                torch.tensor([[int(BOX.faces[0, 0]), int(BOX.faces[0, 1]), len(BOX.vertices)]], dtype=torch.int32),
+            ]
+        ),
+    )
     assert report(repair(fin)).watertight
 
 
@@ -182,12 +197,14 @@ def test_repair_of_real_meshes(shared_data):
         (lambda: remesh(BALL, 7), "vertices"),
         (lambda: remesh(BALL, 70, subdivide=0), "subdivide"),
         (lambda: fill_holes(BALL, max_edges=2), "max_edges"),
-        (lambda: repair(Mesh(torch.full((3, 3), float("nan")), torch.tensor([[0, 1, 2]], dtype=torch.int32))),
-         "mesh.vertices"),
+        (
+            lambda: repair(Mesh(torch.full((3, 3), float("nan")), torch.tensor([[0, 1, 2]], dtype=torch.int32))),
+            "mesh.vertices",
+        ),
         (lambda: repair(Mesh(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.int32))), "mesh"),
         (lambda: repair(Mesh(torch.rand(3, 3), torch.tensor([[0, 1, 2]], dtype=torch.int32))), "mesh"),
     ],
-)  # fmt: skip
+)
 def test_wrong_input_is_named(call, name):
     with pytest.raises(ValueError, match=f"^{name}: expected"):
         call()

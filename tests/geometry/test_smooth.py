@@ -93,9 +93,11 @@ def test_borders_stay_or_move_along_themselves():
 
 def test_copies_of_a_vertex_move_together_and_uv_stay():
     whole = ball(noise=0.02)
-    split = Mesh(whole.vertices[whole.faces.long().view(-1)],
-                 torch.arange(whole.faces.numel(), dtype=torch.int32).view(-1, 3),
-                 uv=torch.rand(whole.faces.numel(), 2))  # fmt: skip
+    split = Mesh(
+        whole.vertices[whole.faces.long().view(-1)],
+        torch.arange(whole.faces.numel(), dtype=torch.int32).view(-1, 3),
+        uv=torch.rand(whole.faces.numel(), 2),
+    )
     got, want = taubin_smooth(split), taubin_smooth(whole)
     assert got.uv is split.uv and got.normals is None
     # a mean over copies rounds once more than the vertex alone
@@ -104,10 +106,15 @@ def test_copies_of_a_vertex_move_together_and_uv_stay():
 
 @pytest.mark.parametrize(
     "smooth, change",
-    [(laplacian_smooth, dict(iterations=-1)), (laplacian_smooth, dict(step=0.0)), (laplacian_smooth, dict(step=1.5)),
-     (laplacian_smooth, dict(border="open")), (taubin_smooth, dict(pass_band=0.0)),
-     (taubin_smooth, dict(pass_band=2.0))],
-)  # fmt: skip
+    [
+        (laplacian_smooth, dict(iterations=-1)),
+        (laplacian_smooth, dict(step=0.0)),
+        (laplacian_smooth, dict(step=1.5)),
+        (laplacian_smooth, dict(border="open")),
+        (taubin_smooth, dict(pass_band=0.0)),
+        (taubin_smooth, dict(pass_band=2.0)),
+    ],
+)
 def test_wrong_input_is_named(smooth, change):
     with pytest.raises(ValueError, match=f"^{next(iter(change))}: expected"):
         smooth(ball(subdivisions=1), **change)

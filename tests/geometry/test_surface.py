@@ -23,8 +23,12 @@ def test_vertices_and_faces_are_the_published_ones_in_their_order(goldens, devic
     weights = {}
     if name != "sphere":
         shift = torch.from_numpy(data["deformation"]).view(17, 17, 17, 3).to(device)
-        weights = dict(beta=1 + 0.5 * raw[:, :12].tanh(), alpha=1 + 0.5 * raw[:, 12:20].tanh(),
-                       gamma=0.25 + 0.5 * raw[:, 20].sigmoid(), deformation=shift.tanh() * (1 - 1e-8) / 32)  # fmt: skip
+        weights = dict(
+            beta=1 + 0.5 * raw[:, :12].tanh(),
+            alpha=1 + 0.5 * raw[:, 12:20].tanh(),
+            gamma=0.25 + 0.5 * raw[:, 20].sigmoid(),
+            deformation=shift.tanh() * (1 - 1e-8) / 32,
+        )
     got = extract_surface(level, radius=0.5, closed=False, **weights)
     assert np.array_equal(got.faces.cpu().numpy(), data[f"{name}.f"])
     # coordinates up to 0.53 as quotients of a few float32 terms
@@ -50,9 +54,14 @@ def test_mesh_of_the_published_heads(goldens):
     merged = 0.1 * mlp(p, "indices_merging_mlp.heads.flexicubes-weight", torch.cat(eight, -1).view(-1, 128), 3)
     np.testing.assert_allclose(merged[:64].numpy(), data["weight21_first64"], rtol=0, atol=2e-6)
     got = extract_surface(
-        level, radius=0.87, closed=False, deformation=offset.tanh() * (1 - 1e-8) / 32,
-        beta=1 + 0.5 * merged[:, :12].tanh(), alpha=1 + 0.5 * merged[:, 12:20].tanh(),
-        gamma=0.25 + 0.5 * merged[:, 20].sigmoid())  # fmt: skip
+        level,
+        radius=0.87,
+        closed=False,
+        deformation=offset.tanh() * (1 - 1e-8) / 32,
+        beta=1 + 0.5 * merged[:, :12].tanh(),
+        alpha=1 + 0.5 * merged[:, 12:20].tanh(),
+        gamma=0.25 + 0.5 * merged[:, 20].sigmoid(),
+    )
     assert np.array_equal(got.faces.numpy(), data["faces"])
     # density is exp of a sum of 64 products: 1e-5 relative, over slopes of about 1 a cell of 0.1
     np.testing.assert_allclose(got.vertices.numpy(), data["v_pos"], rtol=0, atol=1e-5)
@@ -149,8 +158,9 @@ def test_the_peer_that_is_timed_gives_the_same_surface():
     level = F.pad(torch.randn(9, 8, 10, generator=torch.Generator().manual_seed(8)), (1,) * 6, value=0.7)
     weights = random_weights(level.shape, 2, spread=0.5)
     mesh = extract_surface(level, radius=0.8, **weights)
-    vertices, faces = flexicubes(level, *(weights[k] for k in ("deformation", "alpha", "beta", "gamma")),
-                                 cube_list(level.shape), 1.6)  # fmt: skip
+    vertices, faces = flexicubes(
+        level, *(weights[k] for k in ("deformation", "alpha", "beta", "gamma")), cube_list(level.shape), 1.6
+    )
     distance, match = cKDTree(mesh.vertices.numpy()).query(vertices.numpy())
     assert len(vertices) == len(mesh.vertices) and distance.max() < 1e-6  # float32 quotients of coordinates below 1
 

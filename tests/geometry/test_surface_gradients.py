@@ -26,7 +26,8 @@ def test_gradients_match_the_plain_float64_formulation(device):
     mesh = extract_surface(ours["level"], radius=0.8, gamma=gamma.to(device), **{k: ours[k] for k in weights})
     double = {k: v.double().requires_grad_() for k, v in leaves.items()}
     want, _ = reference_surface.flexicubes_vertices(
-        double["level"], double["deformation"], double["alpha"], double["beta"], 1.6)  # fmt: skip
+        double["level"], double["deformation"], double["alpha"], double["beta"], 1.6
+    )
     tree = cKDTree(mesh.vertices.detach().cpu().numpy())
     distance, match = tree.query(want.detach().numpy())
     assert len(want) == len(mesh.vertices) == len(set(match.tolist()))

@@ -92,8 +92,9 @@ def test_charts_are_counted_by_their_uv_whether_vertices_are_split_or_not():
 
 def test_stretch_of_a_plane_is_one_and_of_a_squeezed_one_is_known():
     corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
-    square = Mesh(corners, torch.tensor([[0, 1, 2], [0, 2, 3]]).int(),
-                  uv=torch.tensor([[0.0, 1], [1, 1], [1, 0], [0, 0]]))  # fmt: skip
+    square = Mesh(
+        corners, torch.tensor([[0, 1, 2], [0, 2, 3]]).int(), uv=torch.tensor([[0.0, 1], [1, 1], [1, 0], [0, 0]])
+    )
     assert atlas_report(square, texture_size=64).stretch == pytest.approx(1.0, abs=1e-6)  # float32 coordinates
     half = Mesh(square.vertices, square.faces, uv=square.uv * torch.tensor([1.0, 0.25]))
     # singular values 1 and 4, mean scale 2: sqrt((1 + 16) / 2) / 2
@@ -107,8 +108,10 @@ def test_charts_keep_the_guard_band(size):
     chart, count = charts.components(neighbours, np.zeros(len(neighbours), np.int32))
     fine = 2  # samples along a texel
     for c in range(count):
-        own, others = (Mesh(result.vertices, result.faces[torch.from_numpy(m)].contiguous(), uv=result.uv)
-                       for m in (chart == c, chart != c))  # fmt: skip
+        own, others = (
+            Mesh(result.vertices, result.faces[torch.from_numpy(m)].contiguous(), uv=result.uv)
+            for m in (chart == c, chart != c)
+        )
         _, square = nearest_valid(coverage(own, size * fine) > 0)
         gap = float(square[coverage(others, size * fine) > 0].min()) ** 0.5 / fine
         assert gap >= guard_band(size) - 2.0 / fine  # sample centres lie up to a sample inside on both sides
@@ -129,15 +132,25 @@ def test_a_slab_folded_over_itself_is_told_apart():
     path = np.stack([np.cos(4 * np.pi * t) * (1 + t), 0.5 * t, np.sin(4 * np.pi * t) * (1 + t)], 1)
     side = path * [1.5, 1.0, 1.5]
     k, n = np.arange(59), 60
-    mesh = mesh_of(np.concatenate([path, side]), np.concatenate([np.stack([k, k + 1, n + k], 1),
-                                                                 np.stack([k + 1, n + k + 1, n + k], 1)]))  # fmt: skip
+    mesh = mesh_of(
+        np.concatenate([path, side]),
+        np.concatenate([np.stack([k, k + 1, n + k], 1), np.stack([k + 1, n + k + 1, n + k], 1)]),
+    )
     check_atlas(mesh, unwrap(mesh, texture_size=512))
 
 
 def test_degenerate_non_manifold_and_repeated_faces(device):
     vertices = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0, -1, 0], [0.5, 0, 0], [5, 5, 5]]
-    faces = [[0, 1, 2], [0, 1, 3], [0, 1, 4], [0, 1, 2], [0, 2, 1],  # five faces at one edge, one twice, one turned
-             [0, 5, 1], [3, 3, 1], [2, 2, 2]]  # in line, two corners, one corner; vertex 6 unused  # fmt: skip
+    faces = [
+        [0, 1, 2],
+        [0, 1, 3],
+        [0, 1, 4],
+        [0, 1, 2],
+        [0, 2, 1],  # five faces at one edge, one twice, one turned
+        [0, 5, 1],
+        [3, 3, 1],
+        [2, 2, 2],
+    ]  # in line, two corners, one corner; vertex 6 unused
     mesh = mesh_of(vertices, faces)
     check_atlas(mesh, unwrap(mesh, texture_size=256), size=1024)
 

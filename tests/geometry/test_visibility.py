@@ -41,8 +41,11 @@ def test_a_ball_is_seen_where_it_faces_the_camera_and_lies_in_the_image(device, 
         pytest.skip("Embree runs on the CPU")
     ball = trimesh.creation.icosphere(5)
     # 1.001: the facets of the ball, 4e-4 deep, stay below the points; a ray that grazes less than 0.05 + 0.03 leaves it
-    scene = RayScene(torch.tensor(ball.vertices, dtype=torch.float32, device=device),
-                     torch.tensor(ball.faces, dtype=torch.int32, device=device), backend)  # fmt: skip
+    scene = RayScene(
+        torch.tensor(ball.vertices, dtype=torch.float32, device=device),
+        torch.tensor(ball.faces, dtype=torch.int32, device=device),
+        backend,
+    )
     c2w, intrinsics = rig(device)
     p = points(device)
     got = visible_from(scene, p * 1.001, p, c2w, intrinsics, size)

@@ -62,7 +62,7 @@ def packed(document: dict, binary: bytes) -> bytes:
     text = json.dumps(document).encode()
     text += b" " * (-len(text) % 4)
     head = struct.pack("<4sIII4s", b"glTF", 2, 28 + len(text) + len(binary), len(text), b"JSON")
-    return b"".join([head, text, struct.pack("<I4s", len(binary), b"BIN\0"), binary])  # fmt: skip
+    return b"".join([head, text, struct.pack("<I4s", len(binary), b"BIN\0"), binary])
 
 
 def judged(path) -> dict:
@@ -76,6 +76,23 @@ def judged(path) -> dict:
 def test_khronos_validator_finds_nothing(asset, tmp_path):
     write_glb(tmp_path / "a.glb", asset, extras={"licence": "CC0-1.0", "world_from_model": np.eye(4).tolist()})
     issues = judged(tmp_path / "a.glb")
+    assert issues["numErrors"] == issues["numWarnings"] == 0, issues["messages"]
+
+
+def test_webp_textures_are_smaller_exact_and_valid(asset, tmp_path):
+    sizes = {}
+    for kind in ("png", "webp"):
+        write_glb(tmp_path / f"{kind}.glb", asset, textures=kind)
+        sizes[kind] = (tmp_path / f"{kind}.glb").stat().st_size
+    assert sizes["webp"] < sizes["png"]
+    png, webp = (read_glb(tmp_path / f"{kind}.glb")[0].textures for kind in ("png", "webp"))
+    for name in ("base_color", "roughness", "metallic", "normal"):
+        assert torch.equal(getattr(png, name), getattr(webp, name))
+    document = parsed((tmp_path / "webp.glb").read_bytes())[0]
+    assert document["extensionsRequired"] == ["EXT_texture_webp"]
+    with pytest.raises(ValueError, match="textures: expected png or webp, got jpeg"):
+        glb_bytes(asset, textures="jpeg")
+    issues = judged(tmp_path / "webp.glb")
     assert issues["numErrors"] == issues["numWarnings"] == 0, issues["messages"]
 
 
@@ -165,8 +182,10 @@ def test_own_reader_gives_the_asset_back(asset, tmp_path):
 
 
 def test_an_unsymmetric_arrow_keeps_its_axes(tmp_path, asset):
-    arrow = Mesh(torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]]),
-                 torch.tensor([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]).int())  # fmt: skip
+    arrow = Mesh(
+        torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]]),
+        torch.tensor([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]).int(),
+    )
     write_glb(tmp_path / "a.glb", Asset(with_tangents(unwrap(arrow, texture_size=64)), asset.textures))
     shape = trimesh.load(tmp_path / "a.glb", force="mesh")
     assert np.allclose(shape.bounds, [[0, 0, 0], [1, 2, 3]]) and shape.volume == pytest.approx(1.0, rel=1e-6)
@@ -174,8 +193,10 @@ def test_an_unsymmetric_arrow_keeps_its_axes(tmp_path, asset):
 
 def test_node_transforms_reach_positions_normals_and_mirrors(asset, tmp_path):
     document, binary = parsed(glb_bytes(asset))
-    document["nodes"] = [{"children": [1], "translation": [1, 2, 3]},
-                         {"mesh": 0, "scale": [-2, 1, 1], "rotation": [0, 0, 0.5**0.5, 0.5**0.5]}]  # fmt: skip
+    document["nodes"] = [
+        {"children": [1], "translation": [1, 2, 3]},
+        {"mesh": 0, "scale": [-2, 1, 1], "rotation": [0, 0, 0.5**0.5, 0.5**0.5]},
+    ]
     (tmp_path / "a.glb").write_bytes(packed(document, binary))
     (part,) = read_glb(tmp_path / "a.glb")
     p = asset.mesh.vertices
@@ -189,7 +210,8 @@ def test_node_transforms_reach_positions_normals_and_mirrors(asset, tmp_path):
     face_normal = outward / outward.norm(dim=1, keepdim=True)
     assert float((part.mesh.normals[part.mesh.faces[:, 0].long()] * face_normal).sum(1).min()) > 0.9
     assert trimesh.load(tmp_path / "a.glb", force="mesh").bounds == pytest.approx(
-        np.stack([part.mesh.vertices.min(0).values, part.mesh.vertices.max(0).values]), abs=1e-5)  # fmt: skip
+        np.stack([part.mesh.vertices.min(0).values, part.mesh.vertices.max(0).values]), abs=1e-5
+    )
 
 
 def test_factors_and_missing_parts(asset, tmp_path):

@@ -123,8 +123,13 @@ def test_mitsuba_sees_the_sun_where_we_put_it(tmp_path, suffix, centre, turn):
         theta = 2 * math.pi * (column + 0.5) / (2 * height) - math.pi
         phi = math.pi * (row + 0.5) / height
         d = [math.sin(theta) * math.sin(phi), math.cos(phi), -math.cos(theta) * math.sin(phi)]
-        light = mi.load_dict({"type": "envmap", "filename": str(tmp_path / f"sun.{suffix}"),
-                              "to_world": mi.ScalarTransform4f().rotate([0, 1, 0], turn)})  # fmt: skip
+        light = mi.load_dict(
+            {
+                "type": "envmap",
+                "filename": str(tmp_path / f"sun.{suffix}"),
+                "to_world": mi.ScalarTransform4f().rotate([0, 1, 0], turn),
+            }
+        )
         it = mi.SurfaceInteraction3f()
         it.wi = mi.Vector3f([-v for v in d])
         assert abs(float(light.eval(it)[0]) - 100.0) < 0.1  # Mitsuba's texels lie up to half a texel off: hence 3 x 3
@@ -145,17 +150,25 @@ def test_an_environment_comes_back_and_its_file_has_x_in_the_centre(tmp_path):
 
 
 def test_an_environment_is_refused_by_name_shape_and_centre(tmp_path):
-    for path, image, centre, said in (("a.png", sky(), "+X", "path: expected"), ("a.exr", sky(), "X", "centre: exp"),
-                                      ("a.exr", sky()[:8], "+X", "radiance: expected shape")):  # fmt: skip
+    for path, image, centre, said in (
+        ("a.png", sky(), "+X", "path: expected"),
+        ("a.exr", sky(), "X", "centre: exp"),
+        ("a.exr", sky()[:8], "+X", "radiance: expected shape"),
+    ):
         with pytest.raises(ValueError, match=said):
             write_environment(tmp_path / path, image, centre=centre)
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("options, dtype", [
-    ({"compression": OpenEXR.PIZ_COMPRESSION}, np.float32), ({"compression": OpenEXR.NO_COMPRESSION}, np.float16),
-    ({"compression": OpenEXR.RLE_COMPRESSION}, np.float32), ({"compression": OpenEXR.ZIPS_COMPRESSION}, np.float16),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "options, dtype",
+    [
+        ({"compression": OpenEXR.PIZ_COMPRESSION}, np.float32),
+        ({"compression": OpenEXR.NO_COMPRESSION}, np.float16),
+        ({"compression": OpenEXR.RLE_COMPRESSION}, np.float32),
+        ({"compression": OpenEXR.ZIPS_COMPRESSION}, np.float16),
+    ],
+)
 def test_exr_of_other_writers_reads(tmp_path, options, dtype):
     planes = {c: np.random.default_rng(0).random((40, 80)).astype(dtype) for c in ("A", "B", "G", "R", "Z")}
     window = (np.array([3, 7], np.int32), np.array([82, 46], np.int32))

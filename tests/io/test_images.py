@@ -71,10 +71,16 @@ def test_png_round_trip(tmp_path):
     assert np.asarray(Image.open(tmp_path / "b.png")).tolist() == [[[0, 0, 127], [128, 255, 255]]]
 
 
-@pytest.mark.parametrize("pixels, error", [
-    (torch.zeros(4, 4, 2), ValueError), (torch.zeros(0, 4, 3), ValueError), (torch.zeros(4, 4, 3).long(), TypeError),
-    (torch.full((4, 4, 3), float("nan")), ValueError), (torch.zeros(4), ValueError),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "pixels, error",
+    [
+        (torch.zeros(4, 4, 2), ValueError),
+        (torch.zeros(0, 4, 3), ValueError),
+        (torch.zeros(4, 4, 3).long(), TypeError),
+        (torch.full((4, 4, 3), float("nan")), ValueError),
+        (torch.zeros(4), ValueError),
+    ],
+)
 def test_png_refuses(pixels, error):
     with pytest.raises(error, match="pixels: expected"):
         png_bytes(pixels)

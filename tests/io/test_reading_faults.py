@@ -14,9 +14,9 @@ from reli3d.io.files import InputError, write_bytes
 from reli3d.io.glb import read_glb
 from reli3d.io.hdr import read_environment, read_hdr_image
 from reli3d.io.images import _several, read_image
-from reli3d.nn.presets import LOCAL, SMALL, from_json, to_json
+from reli3d.nn.presets import OFFICIAL, SMALL, from_json, to_json
 from reli3d.nn.weights import WeightsError, read_manifest
-from reli3d.views.colmap import _cameras
+from reli3d.views.colmap import _text_cameras
 from reli3d.views.folder import _beside, intrinsics_of
 from reli3d.views.shots import Lens, cleaned
 from reli3d.views.transforms import read_json, read_transforms
@@ -49,8 +49,9 @@ def transforms(folder, **fields):
 )
 def test_lenses_that_divide_by_zero(tmp_path, name, value, word):
     with pytest.raises(InputError, match=word):
-        read_transforms(transforms(tmp_path, **{"w": 8, "h": 8, "fl_x": 9, name: value} if name in "wh" else
-                                   {name: value}))  # fmt: skip
+        read_transforms(
+            transforms(tmp_path, **{"w": 8, "h": 8, "fl_x": 9, name: value} if name in "wh" else {name: value})
+        )
 
 
 def test_a_focal_length_next_to_nothing_with_distortion():
@@ -79,7 +80,7 @@ def test_a_line_without_end(tmp_path):
     path = tmp_path / "cameras.txt"
     path.write_text("1 PINHOLE 8 8 " + "9 " * 30_000_000)
     with pytest.raises(InputError, match="line 1"):
-        _cameras(path)
+        list(_text_cameras(path))
 
 
 def test_names_of_255_letters(tmp_path):
@@ -141,11 +142,15 @@ def test_a_thousand_scans_are_refused_and_ten_are_not(tmp_path):
 def glb(path, **document):
     """A GLB of one triangle at the origin; ``document`` takes the place of top-level fields."""
     binary = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32).tobytes()
-    document = {"asset": {"version": "2.0"}, "buffers": [{"byteLength": 36}],
-                "bufferViews": [{"buffer": 0, "byteLength": 36}],
-                "accessors": [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}],
-                "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}], "nodes": [{"mesh": 0}],
-                **document}  # fmt: skip
+    document = {
+        "asset": {"version": "2.0"},
+        "buffers": [{"byteLength": 36}],
+        "bufferViews": [{"buffer": 0, "byteLength": 36}],
+        "accessors": [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
+        "nodes": [{"mesh": 0}],
+        **document,
+    }
     text = json.dumps(document).encode()
     text += b" " * (-len(text) % 4)
     chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
@@ -162,8 +167,25 @@ def textured(size, **info):
     Image.new("RGB", size).save(data, "PNG")
     uri = "data:image/png;base64," + base64.b64encode(data.getvalue()).decode()
     material = {"normalTexture": {"index": 0, **info}}
-    return {"images": [{"uri": uri}], "textures": [{"source": 0}], "materials": [material],
-            "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "material": 0}]}]}  # fmt: skip
+    return {
+        "images": [{"uri": uri}],
+        "textures": [{"source": 0}],
+        "materials": [material],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "material": 0}]}],
+    }
+
+
+def test_an_image_of_twenty_materials_is_decoded_once(tmp_path, monkeypatch):
+    fields = textured((32, 32))
+    fields["textures"] *= 20
+    fields["materials"] = [{"normalTexture": {"index": k}, "name": str(k)} for k in range(20)]
+    part = {"attributes": {"POSITION": 0, "TEXCOORD_0": 1}}
+    fields["meshes"] = [{"primitives": [{**part, "material": k} for k in range(20)]}]
+    place = {"bufferView": 0, "componentType": 5126}
+    fields["accessors"] = [{**place, "count": 3, "type": "VEC3"}, {**place, "count": 3, "type": "VEC2"}]
+    opened, real = [], Image.open
+    monkeypatch.setattr(Image, "open", lambda *args, **options: opened.append(1) or real(*args, **options))
+    assert len(read_glb(glb(tmp_path / "a.glb", **fields))) == 20 and len(opened) == 1
 
 
 @pytest.mark.parametrize(
@@ -197,15 +219,20 @@ def test_headers_of_weights_hold_integers(tmp_path, change):
 
 
 def test_presets_of_absurd_size_or_depth_are_refused():
-    assert from_json(to_json(SMALL)) == SMALL and from_json(to_json(LOCAL)) == LOCAL
+    assert from_json(to_json(OFFICIAL)) == OFFICIAL and from_json(to_json(SMALL)) == SMALL
     for text in ("[" * 100_000, "{" * 100_000, '{"pyramid":' * 50_000, "1" * 10_000, "[]", "null"):
         with pytest.raises(ValueError, match="preset"):
             from_json(text)
-    small = dataclasses.asdict(SMALL)
-    for change in ({"radius": float("nan")}, {"radius": float("inf")}, {"head_width": 10**9}, {"head_width": -1},
-                   {"encoder": {**small["encoder"], "layers": 10**9}}):  # fmt: skip
+    large = dataclasses.asdict(OFFICIAL)
+    for change in (
+        {"radius": float("nan")},
+        {"radius": float("inf")},
+        {"head_width": 10**9},
+        {"head_width": -1},
+        {"encoder": {**large["encoder"], "layers": 10**9}},
+    ):
         with pytest.raises(ValueError, match="preset"):
-            from_json(json.dumps({**small, **change}))
-    widths = {**dataclasses.asdict(LOCAL)["pyramid"], "widths": [10**9] * 5}
+            from_json(json.dumps({**large, **change}))
+    widths = {**dataclasses.asdict(SMALL)["pyramid"], "widths": [10**9] * 5}
     with pytest.raises(ValueError, match="preset"):
-        from_json(json.dumps({**dataclasses.asdict(LOCAL), "pyramid": widths}))
+        from_json(json.dumps({**dataclasses.asdict(SMALL), "pyramid": widths}))

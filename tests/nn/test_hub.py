@@ -55,8 +55,15 @@ class Answer(http.server.BaseHTTPRequestHandler):
             digest = this.sha256 or hashlib.sha256(content).hexdigest()
             # another name of this machine: another origin, to which no token may go
             store = f"http://localhost:{this.server_port}/store"
-            self.reply(302, {"Location": store, "X-Linked-Size": str(len(content)), "X-Linked-ETag": f'"{digest}"',
-                             "Content-Length": "0"})  # fmt: skip
+            self.reply(
+                302,
+                {
+                    "Location": store,
+                    "X-Linked-Size": str(len(content)),
+                    "X-Linked-ETag": f'"{digest}"',
+                    "Content-Length": "0",
+                },
+            )
             return
         start, status, headers = 0, 200, {}
         asked = self.headers.get("Range")
@@ -167,10 +174,16 @@ def test_wrong_bytes_are_thrown_away(server, checkpoint):
 
 @pytest.mark.parametrize(
     "status, message",
-    [(401, "asks for a token .401.; accept the licence at http.*/StabilityLabs/ReLi3D and set HF_TOKEN"),
-     (403, "asks for a token .403."), (404, "no such file .404."), (407, "proxy"), (429, "wait"), (503, "answered 503"),
-     (301, "redirects more than 5 times|redirects to")],
-)  # fmt: skip
+    [
+        (401, "asks for a token .401.; accept the licence at http.*/StabilityLabs/ReLi3D and set HF_TOKEN"),
+        (403, "asks for a token .403."),
+        (404, "no such file .404."),
+        (407, "proxy"),
+        (429, "wait"),
+        (503, "answered 503"),
+        (301, "redirects more than 5 times|redirects to"),
+    ],
+)
 def test_refusals_are_one_line_and_no_file(server, status, message):
     server.status = status
     fails(message)
@@ -257,7 +270,8 @@ def run(tmp_path, *arguments) -> int:
 
 
 def test_the_command_asks_no_network_without_download(server, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(infer, "ready_kernels", lambda device: pytest.fail("compiled before weights were looked for"))
+    fail = lambda device, names: pytest.fail("compiled before weights were looked for")  # noqa: E731
+    monkeypatch.setattr(infer, "ready_kernels", fail)
     assert run(tmp_path, "--weights", "official") == 2
     out, err = capsys.readouterr()
     assert out == "" and err.count("\n") == 1 and "fetch them with --download" in err

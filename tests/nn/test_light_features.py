@@ -6,7 +6,6 @@ from torch.nn.functional import normalize
 
 from reli3d.nn.heads import COLOR_MARGIN
 from reli3d.nn.light_features import DARKEST, Shading, brightness_over_normal, harmonics, palette_of, unshaded
-from reli3d.nn.presets import SHADING_FEATURES
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.render.environment import Environment
 
@@ -87,7 +86,7 @@ def test_features_in_their_order():
     observed[0], observed[2] = 1.0, 2.0  # 1 + 2 y, negative below
     light = Environment.constant(torch.tensor([1.0, 2.0, 3.0])).irradiance()
     got = Shading(light, observed, torch.arange(12.0)).features(n, color)
-    assert got.shape == (50, SHADING_FEATURES)
+    assert got.shape == (50, Shading.WIDTH)
     torch.testing.assert_close(got[:, :3], n)
     expected = torch.log(torch.tensor([1.0, 2.0, 3.0]) + 0.01)
     torch.testing.assert_close(got[:, 3:6], expected.expand(50, 3), rtol=0, atol=5e-3)  # the map's 16 rows

@@ -5,21 +5,28 @@ import math
 
 import pytest
 import torch
-from torch.nn.functional import normalize
+from torch.nn.functional import avg_pool2d, normalize
+from torch.utils.flop_counter import FlopCounterMode
 
 from reli3d.geometry.hull import mask_distance
 from reli3d.nn.light_map import LightMap, gathered, texel_of
 from reli3d.nn.local import LocalReconstructor, PixelMaps
-from reli3d.nn.presets import LOCAL, LightMapSizes, PyramidSizes, VolumeSizes
-from reli3d.nn.pyramid import place_of_pixels
+from reli3d.nn.presets import SMALL, LightMapSizes, PyramidSizes, VolumeSizes
+from reli3d.nn.pyramid import place_of_pixels, span_of_pixels
 from reli3d.nn.reni import map_directions
+from reli3d.nn.view_features import ViewMaps, ahead_of_surface
 from reli3d.nn.volume import FeatureVolume
-from reli3d.render.camera import look_at, project
+from reli3d.render.camera import Camera, look_at, project
 
 TINY = dataclasses.replace(
-    LOCAL, image_size=64, pyramid=PyramidSizes((8, 8, 16), 8), volume=VolumeSizes(12, 0.56, (8, 16), 8),
-    light=LightMapSizes(16, (8, 16, 16)), view_width=24, head_width=16,
-)  # fmt: skip
+    SMALL,
+    image_size=64,
+    pyramid=PyramidSizes((8, 8, 16), 8),
+    volume=VolumeSizes(12, 0.56, (8, 16), 8),
+    light=LightMapSizes(16, (8, 16, 16)),
+    view_width=24,
+    head_width=16,
+)
 SIZE = TINY.image_size
 
 
@@ -143,7 +150,7 @@ def test_a_mirror_shows_the_light_where_it_reflects_it():
 def test_pixels_start_as_what_they_show(model):
     """Of zeros: the normal looks at the camera, nothing is added to the colour."""
     _, _, c2w, intrinsics = sphere(4)
-    maps = PixelMaps.of(torch.zeros(4, 32, 32, 12), c2w, intrinsics, SIZE)
+    maps = PixelMaps.of(torch.zeros(4, 32, 32, 12), torch.zeros(4, 16, 16, 2), Camera(c2w, intrinsics / 2, 32, 32))
     centre = maps.normal[:, 15:17, 15:17].mean((1, 2))
     torch.testing.assert_close(normalize(centre, dim=-1), c2w[:, :3, 2], rtol=0, atol=1e-3)  # +Z of a camera looks back
     assert float(maps.shift.abs().max()) == 0.0 and float(maps.gain.min()) == pytest.approx(0.8808, abs=1e-4)
@@ -154,11 +161,23 @@ def test_pixels_know_their_place():
     eye, target = torch.tensor([[0.7, 1.1, 2.0]]), torch.tensor([[0.1, -0.2, 0.3]])
     c2w = look_at(eye, target, torch.tensor([0.0, 1.0, 0.0]))
     intrinsics = torch.tensor([[SIZE * 1.7, SIZE * 1.9, SIZE / 2 + 3, SIZE / 2 - 5]])
-    place = place_of_pixels(c2w, intrinsics, SIZE)
+    place = place_of_pixels(Camera(c2w, intrinsics, SIZE, SIZE))
     want = place[0, 10, 40]
     point = want[0] * c2w[0, :3, 0] + want[1] * c2w[0, :3, 1]
     xy, _ = project(point[None], c2w[0], intrinsics[0])
     torch.testing.assert_close(xy, torch.tensor([[40.5, 10.5]]), rtol=0, atol=1e-3)
+
+
+def test_pixels_know_where_their_rays_meet_the_hull():
+    """Many views of a ball of radius 0.4: the hull is the ball, but for the angles between the views."""
+    _, masks, c2w, intrinsics = sphere(16)
+    seen = avg_pool2d(masks[:, None], 4)[:, 0]
+    span = span_of_pixels(mask_distance(masks), intrinsics, seen, Camera(c2w, intrinsics / 4, *seen.shape[:0:-1]))
+    middle = slice(seen.shape[1] // 2 - 1, seen.shape[1] // 2 + 1)
+    enter, leave = span[:, middle, middle].mean((1, 2)).unbind(-1)
+    assert float(enter.max()) < -0.38 and float(enter.median()) > -0.5  # before the ball, not far
+    assert float(leave.min()) > 0.38 and float(leave.median()) < 0.5
+    assert float(span[seen <= 0.1].abs().max()) == 0.0
 
 
 def test_the_view_that_sees_a_point_speaks(model):
@@ -167,7 +186,8 @@ def test_the_view_that_sees_a_point_speaks(model):
     images[0], images[1] = 0.8, 0.2
     field = encoded(model, images, masks, c2w, intrinsics)
     plain = torch.zeros(2, 32, 32, 12)
-    field = dataclasses.replace(field, pixels=PixelMaps.of(plain, c2w, intrinsics, SIZE))
+    camera = Camera(c2w, intrinsics / 2, 32, 32)
+    field = dataclasses.replace(field, pixels=PixelMaps.of(plain, torch.zeros(2, 16, 16, 2), camera))
     position = 0.4 * normalize(c2w[:, :3, 3], dim=-1)  # the nearest point to each camera
     visible = torch.eye(2)
     with torch.no_grad():
@@ -214,3 +234,49 @@ def test_blocks_of_points_give_what_all_at_once_give(model):
     torch.testing.assert_close(blocks.base_color, whole.base_color.detach(), rtol=0, atol=1e-4)
     torch.testing.assert_close(blocks.normal, whole.normal.detach(), rtol=0, atol=1e-3)
     torch.testing.assert_close(level, field.level(position).detach(), rtol=0, atol=2e-3)
+
+
+def test_points_know_whether_they_lie_before_a_surface():
+    """A plane at depth 0 that two cameras on the axis Z see: before it +, behind it -, beside it nothing."""
+    c2w = look_at(torch.tensor([[0.0, 0.0, 2.0], [0.0, 0.0, 3.0]]), torch.zeros(2, 3), torch.tensor([0.0, 1.0, 0.0]))
+    intrinsics = torch.tensor([[SIZE * 1.2, SIZE * 1.2, SIZE / 2, SIZE / 2]]).expand(2, 4).contiguous()
+    maps = ViewMaps(torch.zeros(2, 16, 16, 8), torch.zeros(2, SIZE, SIZE, 4), c2w, intrinsics)
+    surface = torch.zeros(2, 32, 32, 2)
+    surface[0, ..., 1] = 1.0  # the second camera shows nothing
+    surface.requires_grad_()
+    points = torch.tensor([[0.0, 0.0, 0.03], [0.1, 0.0, -0.03], [0.1, 0.1, 0.5]])
+    got = ahead_of_surface(surface, maps, points)
+    want = torch.tensor([math.tanh(0.6), math.tanh(-0.6), math.tanh(10.0)])
+    torch.testing.assert_close(got[:, 0], want, rtol=0, atol=1e-4)
+    torch.testing.assert_close(got[:, 1], want, rtol=0, atol=1e-4)
+    assert torch.equal(got[:, 3], torch.full((3,), 0.5))
+    got[0, 0].backward()
+    assert float(surface.grad[0, ..., 0].sum()) > 0 and float(surface.grad[1].abs().max()) == 0.0
+    assert torch.equal(ahead_of_surface(torch.zeros(2, 32, 32, 2), maps, points)[:, 1:], torch.zeros(3, 3))
+
+
+@torch.no_grad()
+def test_heads_known_before_give_the_same_material(model):
+    position, normal = surface_of_ball(300)
+    visible = (torch.rand(300, 3, generator=torch.Generator().manual_seed(2)) > 0.3).float()
+    field = encoded(model, *sphere(3)).with_shading(position, normal, visible)
+    at_once = field.material(position, normal, visible)
+    later = field.painted(field.heads(position, normal, visible), position, normal, visible)
+    for a, b in zip(vars(at_once).values(), vars(later).values(), strict=True):
+        assert torch.equal(a, b)
+
+
+@torch.no_grad()
+def test_small_keeps_its_promises():
+    """At most 30 GFLOP for 4 views, at most 60 MB in float16."""
+    torch.manual_seed(0)
+    model = LocalReconstructor(SMALL).eval()
+    assert 2 * sum(p.numel() for p in model.parameters()) < 60e6
+    size = SMALL.image_size
+    images = torch.rand(4, size, size, 3)
+    _, _, c2w, intrinsics = sphere(4)
+    masks = torch.ones(4, size, size)  # the hull is the whole volume: the most work there can be
+    with FlopCounterMode(display=False) as counter:
+        field = encoded(model, images, masks, c2w, intrinsics * (size / SIZE))
+    assert counter.get_total_flops() < 30e9
+    assert bool(field.volume.isfinite().all()) and bool(field.log_light.isfinite().all())

@@ -6,7 +6,7 @@ import torch
 
 from reli3d.geometry.triplane import sample_triplane
 from reli3d.nn import transformer
-from reli3d.nn.camera import CameraEmbedder, camera_vector, ray_maps
+from reli3d.nn.camera import CameraEmbedder, camera_vector
 from reli3d.nn.heads import HEADS, Heads, WeightMerger
 from reli3d.nn.illumination import Illumination, Transformer1D
 from reli3d.nn.presets import BackboneSizes, EncoderSizes, IlluminationSizes, UpsamplerSizes
@@ -64,26 +64,7 @@ def test_camera_vector_holds_both_matrices_row_by_row():
     torch.testing.assert_close(vector, torch.cat([torch.arange(16.0), torch.tensor(expected)]))
 
 
-def test_ray_maps_are_pluecker_coordinates_of_the_pixels():
-    generator = torch.Generator().manual_seed(0)
-    c2w = torch.eye(4).repeat(2, 3, 1, 1)
-    c2w[..., :3, :3] = torch.linalg.qr(torch.randn(2, 3, 3, 3, generator=generator))[0]
-    c2w[..., :3, 3] = torch.randn(2, 3, 3, generator=generator)
-    intrinsics = torch.tensor([30.0, 25.0, 7.0, 9.0]).expand(2, 3, 4)
-    maps = ray_maps(c2w, intrinsics, 16)
-    direction, moment = maps[:, :, :3], maps[:, :, 3:]
-    torch.testing.assert_close(direction.norm(dim=2), torch.ones(2, 3, 16, 16))
-    # a point on the ray of pixel (row 4, column 11), 2.5 along: its projection is that pixel's centre
-    point = c2w[..., :3, 3] + 2.5 * direction[..., 4, 11]
-    local = torch.einsum("bvij,bvi->bvj", c2w[..., :3, :3], point - c2w[..., :3, 3])
-    column = 30.0 * local[..., 0] / -local[..., 2] + 7.0
-    row = -25.0 * local[..., 1] / -local[..., 2] + 9.0
-    torch.testing.assert_close(column, torch.full((2, 3), 11.5))
-    torch.testing.assert_close(row, torch.full((2, 3), 4.5))
-    torch.testing.assert_close(torch.linalg.cross(point, direction[..., 4, 11]), moment[..., 4, 11], **SHALLOW)
-
-
-DINO = EncoderSizes(hidden=48, layers=2, heads=3, patch=14, grid=7, mask_channel=False, ray_maps=False)
+DINO = EncoderSizes(hidden=48, layers=2, heads=3, patch=14, grid=7, mask_channel=False)
 
 
 @torch.no_grad()
@@ -138,7 +119,7 @@ def test_feed_forward_in_chunks_is_the_same(golden, monkeypatch):
 
 
 def illumination_sizes(**changes):
-    encoder = EncoderSizes(hidden=24, layers=2, heads=2, patch=14, grid=7, mask_channel=True, ray_maps=False)
+    encoder = EncoderSizes(hidden=24, layers=2, heads=2, patch=14, grid=7, mask_channel=True)
     values = dict(encoder=encoder, tokens=78, token_width=32, width=32, heads=4, layers=2, groups=4)
     return IlluminationSizes(**{**values, **changes})
 
@@ -252,11 +233,11 @@ def test_gradients_of_a_shared_bank_are_those_of_its_copies_added_up(golden):
 
 def test_heads_without_gradient_share_their_first_layer_and_change_nothing():
     torch.manual_seed(0)
-    heads, features, color = Heads(21, 16), torch.randn(50, 21), torch.rand(50, 3)
-    slow = heads(features, tuple(HEADS), color)
+    heads, features = Heads(21, 16), torch.randn(50, 21)
+    slow = heads(features, tuple(HEADS))
     kept = features.clone()
     with torch.no_grad():
-        fast = heads(features, tuple(HEADS), color)
+        fast = heads(features, tuple(HEADS))
     assert torch.equal(features, kept)
     for name in HEADS:
         # sums of 21 float32 products in another order

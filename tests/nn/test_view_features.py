@@ -160,8 +160,9 @@ def test_the_layer_saturates_as_silu_does(device):
     points, _, _ = surface(64, 2, device)
     for value in (-80.0, -9.0, -1.0, 0.0, 1e-3, 2.0, 9.0, 80.0):
         tokens = torch.full((2, GRID, GRID, 8), value, device=device)
-        pooled, _ = pool_views(maps.images, tokens, torch.zeros(9, 8, device=device), maps.c2w, maps.intrinsics,
-                               points, None, None)  # fmt: skip
+        pooled, _ = pool_views(
+            maps.images, tokens, torch.zeros(9, 8, device=device), maps.c2w, maps.intrinsics, points, None, None
+        )
         want = torch.nn.functional.silu(torch.tensor(value, dtype=torch.float64)).item()
         assert pooled.cpu().double().sub(want).abs().max() < 5e-7 * max(1.0, abs(value))  # bilinear weights: 2 ulp
 

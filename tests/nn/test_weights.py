@@ -99,13 +99,15 @@ ALIAS = "system.tokenizer.0.modulations.0.linear2.weight"
     [
         (lambda s: s.pop("system.backbone.latent_init"), "lacks 1 of .* tensors, first backbone.latent_init"),
         (lambda s: s.update({"system.extra": torch.ones(1)}), "extra: not a tensor of the published model"),
-        (lambda s: s.update({"system.backbone.latent_init": torch.ones(1, 9, 32)}),
-         r"backbone.latent_init: expected shape \(1, 10, 32\), got \(1, 9, 32\)"),
+        (
+            lambda s: s.update({"system.backbone.latent_init": torch.ones(1, 9, 32)}),
+            r"backbone.latent_init: expected shape \(1, 10, 32\), got \(1, 9, 32\)",
+        ),
         (lambda s: s.update({ALIAS: s[ALIAS] + 1}), "expected the values of the same parameter's other name"),
         (lambda s: s.update({"system.backbone.latent_init": torch.ones(1, 10, 32).int()}), "expected floating-point"),
         (lambda s: s.clear(), "lacks .* tensors"),
     ],
-)  # fmt: skip
+)
 def test_a_wrong_checkpoint_is_one_line_and_no_file(checkpoint, tmp_path, edit, message):
     path, _ = checkpoint
     change(path, edit)
@@ -226,7 +228,7 @@ def spoil_header(edit):
         (spoil_header(lambda h: h.update({"other": h.pop("backbone.latent_init")})), "lacks 1 of"),
         (lambda p: p.unlink(), "file not found"),
     ],
-)  # fmt: skip
+)
 def test_a_spoilt_file_is_one_line(saved, spoil, message):
     path, _ = saved
     spoil(path)
@@ -278,8 +280,11 @@ def test_a_large_file_is_hashed_once_and_a_check_always(saved, monkeypatch):
 
 def test_bfloat16_is_the_default_for_the_published_sizes_on_cuda_alone(saved):
     assert [default_trunk(p, d) for p in (OFFICIAL, SMALL) for d in ("cpu", "cuda")] == [
-        torch.float32, torch.bfloat16, torch.float32, torch.float32
-    ]  # fmt: skip
+        torch.float32,
+        torch.bfloat16,
+        torch.float32,
+        torch.float32,
+    ]
     path, _ = saved
     assert load_model(path).dtype == torch.float32 and load_model(path, trunk=torch.bfloat16).dtype == torch.bfloat16
 

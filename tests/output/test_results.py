@@ -126,8 +126,15 @@ def test_of_two_processes_one_says_so_at_its_start(tmp_path):
 @pytest.mark.skipif(os.name == "nt", reason="needs locks of files")
 def test_many_processes_at_one_result_leave_one_of_theirs(tmp_path):
     folder = tmp_path / "name"
-    running = [subprocess.Popen([sys.executable, "-c", WRITER, folder, str(k), "0"], stdout=subprocess.DEVNULL,
-                                stderr=subprocess.PIPE, text=True) for k in range(6)]  # fmt: skip
+    running = [
+        subprocess.Popen(
+            [sys.executable, "-c", WRITER, folder, str(k), "0"],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for k in range(6)
+    ]
     said = [process.communicate()[1] for process in running]
     assert any(process.returncode == 0 for process in running)
     for process, text in zip(running, said, strict=True):
@@ -146,9 +153,15 @@ def test_what_a_dead_process_left_does_not_block(tmp_path):
 
 @pytest.mark.parametrize(
     "place, text",
-    [("file", "got a file"), ("file/name", "got a file"), ("x" * 250, "at most 246 bytes"),
-     (f"no/{'y' * 300}/name", "at most 255 bytes"), ("a\udcff", "UTF-8"), ("b\udcff/name", "UTF-8")],
-)  # fmt: skip
+    [
+        ("file", "got a file"),
+        ("file/name", "got a file"),
+        ("x" * 250, "at most 246 bytes"),
+        (f"no/{'y' * 300}/name", "at most 255 bytes"),
+        ("a\udcff", "UTF-8"),
+        ("b\udcff/name", "UTF-8"),
+    ],
+)
 def test_a_place_that_cannot_take_a_result_is_refused_in_one_line(tmp_path, place, text):
     (tmp_path / "file").touch()
     with pytest.raises(InputError) as refused:

@@ -33,9 +33,13 @@ from tests.support.scenes import ball_mesh
 SIZE, FOV, AZIMUTH, ELEVATION, DISTANCE = 256, 32.0, 40.0, 15.0, 2.6  # degrees; the view of every client
 THREE = Path(reli3d.__file__).parent / "assets" / "viewer" / "three.min.js"
 LAMPS = {0: (0.55, 0.45, 0.7), 1: (0.9, 0.1, -0.25)}  # red and green: channel and direction
-EYE = DISTANCE * np.array([math.sin(math.radians(AZIMUTH)) * math.cos(math.radians(ELEVATION)),
-                           math.sin(math.radians(ELEVATION)),
-                           math.cos(math.radians(AZIMUTH)) * math.cos(math.radians(ELEVATION))])  # fmt: skip
+EYE = DISTANCE * np.array(
+    [
+        math.sin(math.radians(AZIMUTH)) * math.cos(math.radians(ELEVATION)),
+        math.sin(math.radians(ELEVATION)),
+        math.cos(math.radians(AZIMUTH)) * math.cos(math.radians(ELEVATION)),
+    ]
+)
 
 
 @dataclass(frozen=True)
@@ -93,8 +97,11 @@ def agree(got: Seen, want: Seen) -> None:
 def test_a_light_turned_by_ten_degrees_would_be_seen(folder, ours):
     """The comparison's own power; also that the usual mistakes, a quarter turn or a mirrored map, are far off."""
     light = Environment(read_environment(folder / "environment.exr"))
-    for wrong in (light.rotated(math.radians(10.0)), light.rotated(math.pi / 2),
-                  Environment(light.radiance.flip(1).contiguous())):  # fmt: skip
+    for wrong in (
+        light.rotated(math.radians(10.0)),
+        light.rotated(math.pi / 2),
+        Environment(light.radiance.flip(1).contiguous()),
+    ):
         with pytest.raises(AssertionError, match="highlight"):
             agree(rendered(folder / "mesh.glb", wrong), ours)
 
@@ -131,8 +138,14 @@ MODEL_VIEWER_PAGE = """<!doctype html><link rel="icon" href="data:,">
 const viewer = document.querySelector('model-viewer')
 viewer.addEventListener('load', () => setTimeout(() => { window.picture = viewer.toDataURL('image/png') }, 1000))
 </script>"""
-VALUES = {"size": SIZE, "fov": FOV, "azimuth": AZIMUTH, "polar": 90.0 - ELEVATION, "distance": DISTANCE,
-          "eye": ", ".join(f"{v:.6f}" for v in EYE)}  # fmt: skip
+VALUES = {
+    "size": SIZE,
+    "fov": FOV,
+    "azimuth": AZIMUTH,
+    "polar": 90.0 - ELEVATION,
+    "distance": DISTANCE,
+    "eye": ", ".join(f"{v:.6f}" for v in EYE),
+}
 
 
 def shown(folder: Path, page: str) -> Seen:

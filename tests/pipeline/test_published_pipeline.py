@@ -19,7 +19,7 @@ from reli3d.nn.model import Code, Reconstructor
 from reli3d.nn.published import our_key
 from reli3d.nn.weights import load_model, read_manifest, read_tensors, save
 from reli3d.output import results
-from reli3d.pipeline import NoSurface, default_normalization, prepare, reconstruct
+from reli3d.pipeline import NoSurface, ReconstructOptions, default_normalization, prepare, reconstruct
 from reli3d.views.folder import load_views
 from reli3d.views.published_views import published_views
 from reli3d.views.similarity import Similarity
@@ -57,7 +57,7 @@ def test_weights_asked_for_near_the_surface_give_the_published_mesh(goldens):
     code = Code(torch.from_numpy(data["triplane"]), none, none, none, none)
     flat = pipeline._grid(16, 0.87, torch.device("cpu")).reshape(-1, 3)
     level = model.level(model.query(code, flat[None], ("density",))["density"])[0, :, 0].view(17, 17, 17)
-    weights = field.Field(model, code, None).cube_weights(flat, level)
+    weights = field.TriplaneField(None, model, code).cube_weights(flat, level)
     got = extract_surface(level, radius=0.87, closed=False, **weights)
     assert np.array_equal(got.faces.numpy(), data["faces"])
     # density is exp of a sum of 64 products: 1e-5 relative, over slopes of about 1 a cell of 0.1
@@ -77,9 +77,15 @@ def test_weights_near_the_surface_are_those_of_the_whole_grid(tiny, half_space):
     corner = raw["flexicubes"][0].view(13, 13, 13, 16)
     eight = [corner[i : i + n, j : j + n, k : k + n] for k in (0, 1) for j in (0, 1) for i in (0, 1)]
     dense = tiny.merger(torch.stack(eight, -2).view(n**3, 8, 16))
-    want = extract_surface(level, radius=0.87, deformation=deformation(raw["deformation"][0], n).view(13, 13, 13, 3),
-                           alpha=dense.alpha, beta=dense.beta, gamma=dense.gamma)  # fmt: skip
-    weights = field.Field(tiny, code, None).cube_weights(flat, level)
+    want = extract_surface(
+        level,
+        radius=0.87,
+        deformation=deformation(raw["deformation"][0], n).view(13, 13, 13, 3),
+        alpha=dense.alpha,
+        beta=dense.beta,
+        gamma=dense.gamma,
+    )
+    weights = field.TriplaneField(None, tiny, code).cube_weights(flat, level)
     assert len(weights["alpha"]) == len(surface_cubes(level))
     got = extract_surface(level, radius=0.87, **weights)
     assert torch.equal(got.faces, want.faces)
@@ -90,18 +96,15 @@ def test_weights_near_the_surface_are_those_of_the_whole_grid(tiny, half_space):
 @torch.no_grad()
 def test_the_grid_is_asked_by_planes_and_gives_the_level_of_its_points(tiny, monkeypatch):
     """Also in pieces that do not divide it, with the box of one axis away from the middle."""
-    monkeypatch.setattr(tiny, "preset", replace(tiny.preset, offset_many_views=0.03))
     code, maps = tiny.encode(*views(1, 2, 76)), SimpleNamespace(c2w=torch.zeros(2, 4, 4))
     axis = torch.linspace(-0.8, 0.6, 15)
-    own = field.Field(tiny, code, maps)
+    own = field.TriplaneField(maps, tiny, code)
     want = own.free_level(torch.cartesian_prod(axis, axis, axis)).view(15, 15, 15)
     assert float(want.min()) < 0 < float(want.max())
     for rows in (8192, 100, 1):
         monkeypatch.setattr(field, "ROWS", rows)
         # sums of 24 float32 products in another order, behind exp
         torch.testing.assert_close(own.grid_level(axis), want, rtol=1e-4, atol=1e-4)
-    with pytest.raises(ValueError, match="preset: expected one without point features"):
-        Reconstructor(NANO).grid_density(code, axis)
 
 
 @torch.no_grad()
@@ -128,7 +131,7 @@ def test_hero_background_and_frame_reach_the_network(tiny, monkeypatch):
 
     def run(**options):
         with pytest.raises(InterruptedError):
-            reconstruct(EXAMPLE, weights=tiny, texture_size=256, **options)
+            reconstruct(EXAMPLE, weights=tiny, options=ReconstructOptions(256, **options))
         return seen["background"].tolist(), seen["c2w"][0]
 
     background, c2w = run()
@@ -138,9 +141,9 @@ def test_hero_background_and_frame_reach_the_network(tiny, monkeypatch):
     moved = run(normalization="hull")[1]
     assert (moved - EXAMPLE.c2w).abs().max() > 1e-3
     with pytest.raises(ValueError, match="hero: expected"):
-        reconstruct(EXAMPLE, weights=tiny, hero=2)
+        reconstruct(EXAMPLE, weights=tiny, options=ReconstructOptions(hero=2))
     with pytest.raises(ValueError, match="background: expected"):
-        reconstruct(EXAMPLE, weights=tiny, background="grey")
+        reconstruct(EXAMPLE, weights=tiny, options=ReconstructOptions(background="grey"))
 
 
 @pytest.fixture(scope="module")
@@ -148,7 +151,7 @@ def asset(tiny):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pipeline, "visible_from", None)  # nothing asks which view sees a point
         patch.setattr(pipeline, "RayScene", None)
-        return reconstruct(EXAMPLE, weights=tiny, texture_size=256, resolution=16)
+        return reconstruct(EXAMPLE, weights=tiny, options=ReconstructOptions(256, 16))
 
 
 def test_views_become_an_asset_without_looking_at_them_again(asset):
@@ -166,13 +169,13 @@ def test_a_field_of_one_sign_is_an_error_and_not_a_box(tiny, bias):
     with torch.no_grad():
         empty.heads["density"][-1].bias.fill_(bias)
     with pytest.raises(NoSurface, match=r"^level: expected values on both sides of 0, got \[.*\]: no surface$"):
-        reconstruct(EXAMPLE, weights=empty, texture_size=256, resolution=16)
+        reconstruct(EXAMPLE, weights=empty, options=ReconstructOptions(256, 16))
 
 
 def test_exported_roughness_is_the_root_of_the_published_number(tiny, asset):
     same = Reconstructor(replace(TINY, roughness_is_alpha=False)).eval()
     same.load_state_dict(tiny.state_dict())
-    release = reconstruct(EXAMPLE, weights=same, texture_size=256, resolution=16)
+    release = reconstruct(EXAMPLE, weights=same, options=ReconstructOptions(256, 16))
     ours, theirs = asset.textures.roughness, release.textures.roughness
     # the same width alpha in a viewer that squares, after baking means roots of texels beyond the charts as well
     torch.testing.assert_close(ours.square(), theirs, rtol=0, atol=1e-5)

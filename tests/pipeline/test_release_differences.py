@@ -112,8 +112,9 @@ def test_an_empty_field_has_no_faces_and_a_full_one_is_an_outward_box(goldens, n
 def release_lookup(radiance: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
     theta = torch.atan2(directions[:, 0], directions[:, 2]) % (2 * math.pi)
     at = torch.stack([1 - theta / (2 * math.pi), directions[:, 1].clamp(-1, 1).acos() / math.pi], -1) * 2 - 1
-    return grid_sample(radiance.permute(2, 0, 1)[None], at[None, None], mode="bilinear", padding_mode="border",
-                       align_corners=True)[0, :, 0].T  # fmt: skip
+    return grid_sample(
+        radiance.permute(2, 0, 1)[None], at[None, None], mode="bilinear", padding_mode="border", align_corners=True
+    )[0, :, 0].T
 
 
 def test_environment_lookups_meet_texel_centres_and_wrap(goldens):

@@ -49,8 +49,9 @@ BROKEN = {
 def run(folder: Path, tests: str) -> subprocess.CompletedProcess:
     file, *options = tests.split(maxsplit=2)
     command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", f"tests/{file}", *options]
-    return subprocess.run(command, cwd=folder, env={**os.environ, "PYTHONPATH": str(folder)}, capture_output=True,
-                          text=True, timeout=600)  # fmt: skip
+    return subprocess.run(
+        command, cwd=folder, env={**os.environ, "PYTHONPATH": str(folder)}, capture_output=True, text=True, timeout=600
+    )
 
 
 def test_an_unbroken_copy_passes(tmp_path):

@@ -38,10 +38,14 @@ def test_faces_of_any_integers_and_numpy_arrays_are_taken(kind):
 def test_what_would_lose_digits_is_refused():
     one = np.array([[0, 1, 2]])
     for vertices, faces, error in (
-        (VERTICES.astype(np.float64), one, TypeError), (VERTICES, one.astype(np.float32), TypeError),
-        (VERTICES, one + 2**32, TypeError), (VERTICES, one + 1, ValueError), (VERTICES.tolist(), one, TypeError),
-        (VERTICES.astype(np.complex64), one, TypeError), (VERTICES, one > 0, TypeError),
-    ):  # fmt: skip
+        (VERTICES.astype(np.float64), one, TypeError),
+        (VERTICES, one.astype(np.float32), TypeError),
+        (VERTICES, one + 2**32, TypeError),
+        (VERTICES, one + 1, ValueError),
+        (VERTICES.tolist(), one, TypeError),
+        (VERTICES.astype(np.complex64), one, TypeError),
+        (VERTICES, one > 0, TypeError),
+    ):
         for taker in (Mesh, RayScene):
             with pytest.raises(error, match="(vertices|faces): expected"):
                 taker(vertices, faces)
@@ -68,9 +72,14 @@ def test_a_texture_set_has_named_maps(device):
     assert maps.roughness.shape == maps.metallic.shape == (4, 4)
     assert float(maps.roughness[1, 2]) == 0.25 and float(maps.metallic[3, 0]) == 0.75
     assert torch.equal(maps.normal, torch.tensor([0.5, 0.5, 1.0], device=device).expand(4, 4, 3))
-    for change, error in ((dict(roughness=base), ValueError), (dict(metallic="metal"), TypeError),
-                          (dict(normal=base[:2]), ValueError), (dict(base_color=base[:, :2]), ValueError),
-                          (dict(base_color=base[0]), ValueError), (dict(base_color=0.5), TypeError)):  # fmt: skip
+    for change, error in (
+        (dict(roughness=base), ValueError),
+        (dict(metallic="metal"), TypeError),
+        (dict(normal=base[:2]), ValueError),
+        (dict(base_color=base[:, :2]), ValueError),
+        (dict(base_color=base[0]), ValueError),
+        (dict(base_color=0.5), TypeError),
+    ):
         with pytest.raises(error, match=f"{next(iter(change))}: expected"):
             TextureSet(**{"base_color": base, "roughness": 0.5, "metallic": 0.5, **change})
 
@@ -81,8 +90,12 @@ def test_an_asset_moves_detaches_and_says_what_it_is(device):
     leaf = maps.base_color.clone().requires_grad_()
     asset = Asset(asset.mesh, TextureSet(leaf, maps.roughness, maps.metallic), Environment(torch.ones(4, 8, 3)))
     moved = asset.to(device)
-    on = {v.device.type for part in (moved.mesh, moved.textures, moved.environment)
-          for v in vars(part).values() if isinstance(v, torch.Tensor)}  # fmt: skip
+    on = {
+        v.device.type
+        for part in (moved.mesh, moved.textures, moved.environment)
+        for v in vars(part).values()
+        if isinstance(v, torch.Tensor)
+    }
     assert on == {torch.device(device).type}
     assert moved.textures.base_color.requires_grad and not moved.detach().textures.base_color.requires_grad
     assert repr(asset) == "Asset(642 vertices, 1280 faces, 4 x 4 texels, environment 4 x 8, cpu)"

@@ -21,8 +21,16 @@ from tests.support.surfaces import at, inputs
 
 SINGLE = (64, 0, 0), (0, 64, 0), (0, 0, 64)
 GRID = [(name, r, m) for name in SKIES for r in (0.05, 0.3, 1.0) for m in (0.0, 1.0)]
-MIXED = {("constant", 0.05, 0.0), ("constant", 0.3, 0.0), ("sky", 0.05, 0.0), ("sky", 0.3, 0.0), ("sun", 0.05, 0.0),
-         ("sun", 0.3, 0.0), ("sun", 0.05, 1.0), ("sun", 0.3, 1.0)}  # fmt: skip
+MIXED = {
+    ("constant", 0.05, 0.0),
+    ("constant", 0.3, 0.0),
+    ("sky", 0.05, 0.0),
+    ("sky", 0.3, 0.0),
+    ("sun", 0.05, 0.0),
+    ("sun", 0.3, 0.0),
+    ("sun", 0.05, 1.0),
+    ("sun", 0.3, 1.0),
+}
 
 
 def surface(device, roughness, metallic, points=24):
@@ -257,10 +265,11 @@ def test_an_image_has_less_noise_by_its_plan(device):
     camera = Camera.from_fov(eye(device, 0.0, 0.5, 2.0), 0.8, 48, 48)
     plan = plan_render(asset, camera, env)
     images = {
-        counts: torch.stack([render(asset, camera, env, options=ShadeOptions(counts, k, pairs)).radiance
-                             for k in range(12)])
+        counts: torch.stack(
+            [render(asset, camera, env, options=ShadeOptions(counts, k, pairs)).radiance for k in range(12)]
+        )
         for counts, pairs in ((plan.samples, "none"), ((20, 40, 4), "opposite"))
-    }  # fmt: skip
+    }
     planned, published = (v.var(0).mean() for v in images.values())
     assert float(planned) < 0.7 * float(published)
 

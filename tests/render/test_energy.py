@@ -90,8 +90,10 @@ def test_neither_coat_nor_paint_nor_metal_gains_energy(device, alpha):
     u = halton(1 << 16, device=device)
     width, one = torch.tensor(alpha, device=device), torch.ones((), device=device)
     for cos_o in (0.02, *COSINES):
-        metal, white, coat = (albedo(view(cos_o, device), width, c * one.expand(3), m * one, u, paint="published")[0]
-                              for c, m in ((1, 1.0), (1, 0.0), (0, 0.0)))  # fmt: skip
+        metal, white, coat = (
+            albedo(view(cos_o, device), width, c * one.expand(3), m * one, u, paint="published")[0]
+            for c, m in ((1, 1.0), (1, 0.0), (0, 0.0))
+        )
         assert max(metal, white - coat, coat) <= 1.0 + 1e-3, cos_o  # measured 3e-5, of the Halton points
 
 
@@ -142,8 +144,13 @@ def test_partly_metallic_white_loses_no_more_than_its_parts(device):
     assert abs(float(share.sum()) - 1.0) < 1e-6
 
     def sent(metallic):
-        value = eval_bsdf(wo.float().to(device), wi.float().to(device), torch.ones(3, device=device),
-                          torch.tensor(0.09, device=device), torch.tensor(metallic, device=device))  # fmt: skip
+        value = eval_bsdf(
+            wo.float().to(device),
+            wi.float().to(device),
+            torch.ones(3, device=device),
+            torch.tensor(0.09, device=device),
+            torch.tensor(metallic, device=device),
+        )
         return float((value[:, 0].double().cpu() * share).sum() * torch.pi)
 
     got = [sent(m) for m in METALLIC]

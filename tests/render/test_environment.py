@@ -23,8 +23,15 @@ def maps():
     gap, line = torch.rand(32, 64, 3, generator=g), torch.rand(32, 64, 3, generator=g)
     gap[10:14] = 0.0  # the filter of the table leaves two of them black
     line[11] = 0.0
-    return {"one texel": one, "constant": torch.ones(100, 100, 3), "3 x 2": torch.ones(2, 3, 3), "sun": sun,
-            "four black rows": gap, "one black row": line, "odd": torch.rand(17, 33, 3, generator=g) ** 4}  # fmt: skip
+    return {
+        "one texel": one,
+        "constant": torch.ones(100, 100, 3),
+        "3 x 2": torch.ones(2, 3, 3),
+        "sun": sun,
+        "four black rows": gap,
+        "one black row": line,
+        "odd": torch.rand(17, 33, 3, generator=g) ** 4,
+    }
 
 
 def test_axes_are_those_of_the_convention(device):
@@ -86,8 +93,11 @@ def test_samples_fall_on_texels_as_their_density_says(device, name):
     off = [(v * n - (v * n).round()).abs() for v, n in ((down, height), (across, width))]
     inner = (off[0] > 1e-4) & (off[1] > 1e-4)  # of a texel; float32 angles are 1e-5 of one, a border's side is a toss
     assert ((env.pdf(d) / pdf - 1).abs() < 1e-5)[inner].all() and float(inner.float().mean()) > 0.99
-    y, x = torch.meshgrid((torch.arange(height, device=device) + 0.5) / height,
-                          (torch.arange(width, device=device) + 0.5) / width, indexing="ij")  # fmt: skip
+    y, x = torch.meshgrid(
+        (torch.arange(height, device=device) + 0.5) / height,
+        (torch.arange(width, device=device) + 0.5) / width,
+        indexing="ij",
+    )
     centres = grid.at(y.reshape(-1).double(), x.reshape(-1).double())[0].float()
     assert torch.equal(env.pdf(centres).reshape(height, width), env.table.density)  # exactly 0 where nothing is lit
 

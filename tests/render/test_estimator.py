@@ -103,8 +103,13 @@ def test_gradients_stay_finite_at_the_edges_of_every_input(device):
     wo[n // 4 : n // 2] = normal[n // 4 : n // 2]
     pick = lambda *v: torch.tensor(v)[torch.randint(len(v), (n,), generator=g)]  # noqa: E731
     for texels in (sky(power=30.0).radiance * 1e4, torch.zeros(4, 8, 3)):
-        leaves = [normal, pick(0.0, 1.0, 0.5)[:, None].expand(n, 3).contiguous(), pick(0.0, 1e-3, 0.02, 1.0),
-                  pick(0.0, 1.0, 0.3), texels]  # fmt: skip
+        leaves = [
+            normal,
+            pick(0.0, 1.0, 0.5)[:, None].expand(n, 3).contiguous(),
+            pick(0.0, 1e-3, 0.02, 1.0),
+            pick(0.0, 1.0, 0.3),
+            texels,
+        ]
         leaves = [v.to(device).requires_grad_() for v in leaves]
         out = shade(
             *at(leaves[0].detach(), leaves[0], ng.to(device), wo.to(device), *leaves[1:4]), Environment(leaves[4])
@@ -233,10 +238,15 @@ def test_pairs_are_never_noisier_than_as_many_independent_samples(device, name, 
     env = light(name, device)
     for roughness in (0.05, 0.1, 0.3, 0.6, 1.0):
         pairs, alone = (
-            [variance(v) for v in (*spread(roughness, metallic, env, runs=4096, **o),
-                                   texel_spread(roughness, metallic, env, runs=1024, **o))]
+            [
+                variance(v)
+                for v in (
+                    *spread(roughness, metallic, env, runs=4096, **o),
+                    texel_spread(roughness, metallic, env, runs=1024, **o),
+                )
+            ]
             for o in ({"seed": 3}, {"antithetic": "none", "seed": 2})
-        )  # fmt: skip
+        )
         ratio = dict(zip(COLUMNS, (a / b for a, b in zip(pairs, alone)), strict=True))
         assert max(ratio.values()) < 1.05, (roughness, ratio)
         ratio.pop("texels")

@@ -4,11 +4,12 @@ import pytest
 import torch
 
 from reli3d.geometry.rays import RayScene
+from reli3d.render import exposure
 from reli3d.render.asset import Asset
 from reli3d.render.camera import Camera, look_at
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
-from reli3d.render.exposure import photograph_ratio
+from reli3d.render.exposure import TINT, paint_factor, photograph_ratio, weighed
 from tests.support.scenes import ball, textures
 
 SIZE = (160, 224)
@@ -32,7 +33,9 @@ def photographs(device, *radiance):
 
 
 def ratio(asset, images, inside, camera):
-    return float(photograph_ratio(asset, images, inside, camera, RayScene(asset.mesh.vertices, asset.mesh.faces)))
+    found = photograph_ratio(asset, images, inside, camera, RayScene(asset.mesh.vertices, asset.mesh.faces))
+    assert found.shape == (3,)
+    return float(found.mean())
 
 
 @pytest.mark.parametrize("factor", [0.25, 1.0, 2.0])
@@ -67,3 +70,66 @@ def test_where_nothing_is_seen_nothing_changes(device, scene):
     asset, camera, inside = scene
     images = photographs(device, 0.1, 0.1, 0.1)
     assert ratio(asset, images, torch.zeros_like(inside), camera) == 1.0
+
+
+def painted(device, scene, *color):
+    """The ball of ``scene`` in a paint of linear ``color``."""
+    asset, camera, inside = scene
+    maps = textures(4, device, tuple(linear_to_srgb(torch.tensor(color)).tolist()), roughness=0.6, metallic=0.0)
+    return Asset(asset.mesh, maps, asset.environment), camera, inside
+
+
+def factor(asset, images, inside, camera):
+    rays = RayScene(asset.mesh.vertices, asset.mesh.faces)
+    return paint_factor(asset, images, inside, camera, rays).cpu()
+
+
+def test_the_tint_of_photographs_goes_to_the_light(device, scene):
+    asset, camera, inside = scene
+    rays = RayScene(asset.mesh.vertices, asset.mesh.faces)
+    found = photograph_ratio(asset, photographs(device, 0.36, 0.4, 0.44), inside, camera, rays).cpu()
+    # one percent from single scattering and the rim, as above
+    torch.testing.assert_close(found, torch.tensor([0.9, 1.0, 1.1]), rtol=0.03, atol=0)
+    strong = photograph_ratio(asset, photographs(device, 0.1, 0.4, 0.4), inside, camera, rays).cpu()
+    # the red of 0.25 over the mean of 0.75 is cut off at 1 / TINT, the others have 1 / 0.75; the brightness stays
+    assert float(strong[1] / strong[0]) == pytest.approx(TINT / 0.75, rel=0.03)
+    assert float(strong.mean()) == pytest.approx(0.75, rel=0.03)
+
+
+def test_the_likeliest_paint_is_the_mean_of_three_normal_distributions(device, scene):
+    """Where paint, light and guess are the usual ones, nothing changes; what is off is brought back by its share."""
+    usual = float(torch.tensor(exposure.PAINT).exp())
+    lit = usual * float(torch.tensor(exposure.LIGHT).exp())
+    asset, camera, inside = painted(device, scene, usual, usual, usual)
+    # two conversions to sRGB and back in float32
+    plain = factor(asset, photographs(device, lit, lit, lit), inside, camera)
+    torch.testing.assert_close(plain, torch.ones(3), rtol=1e-4, atol=0)
+    shares = torch.tensor([s**-2.0 for s in (exposure.PAINT_SPREAD, exposure.LIGHT_SPREAD, exposure.GUESS_SPREAD)])
+    shares = shares / shares.sum()
+    dark = factor(asset, photographs(device, *3 * [lit / 3]), inside, camera)
+    torch.testing.assert_close(dark, torch.full((3,), float((1 / 3) ** shares[1])), rtol=1e-4, atol=0)
+    bright, *_ = painted(device, scene, *3 * [usual * 2])
+    again = factor(bright, photographs(device, lit, lit, lit), inside, camera)
+    torch.testing.assert_close(again, torch.full((3,), float(2.0 ** (shares[2] - 1))), rtol=1e-4, atol=0)
+
+
+def test_a_paint_more_colourful_than_the_photographs_is_calmed(device, scene):
+    """A dark grey thing, guessed blue: the photographs are nearly grey."""
+    asset, camera, inside = painted(device, scene, 0.03, 0.1, 0.15)
+    images = photographs(device, 0.010, 0.013, 0.018)
+    paint = torch.tensor([0.03, 0.1, 0.15]) * factor(asset, images, inside, camera)
+    assert 1.5 < float(paint[2] / paint[0]) < 3.5 and float(paint.mean()) < 0.08
+    assert torch.equal(factor(asset, images, torch.zeros_like(inside), camera), torch.ones(3))
+
+
+def test_the_weighed_asset_shows_the_photographs_colour(device, scene):
+    asset, camera, inside = painted(device, scene, 0.03, 0.1, 0.15)
+    images = photographs(device, 0.010, 0.013, 0.018)
+    rays = RayScene(asset.mesh.vertices, asset.mesh.faces)
+    after = weighed(asset, images, inside, camera, rays)
+    found = photograph_ratio(after, images, inside, camera, rays).cpu()
+    # same seed and samples, so only the tint that the light may not take, and BLACK, are left
+    torch.testing.assert_close(found, torch.ones(3), rtol=0.1, atol=0)
+    want = factor(asset, images, inside, camera) * torch.tensor([0.03, 0.1, 0.15])
+    got = exposure.srgb_to_linear(after.textures.base_color)[0, 0].cpu()
+    torch.testing.assert_close(got, want, rtol=1e-3, atol=0)

@@ -81,8 +81,10 @@ def test_irradiance_and_gradients_match_quadrature(device):
 @pytest.mark.parametrize("sharpness", [0.02, 0.29, 0.49, 0.51, 1.0, 10.0, 300.0])
 def test_irradiance_is_exact_along_the_axis(device, sharpness):
     s = torch.tensor([sharpness], dtype=torch.float64, requires_grad=True)
-    want = 2 * torch.pi * (s - 1 + torch.exp(-s)) / s**2, 2 * torch.pi * torch.exp(-s) * (
-        1 - torch.exp(-s) * (1 + s)) / s**2  # fmt: skip
+    want = (
+        2 * torch.pi * (s - 1 + torch.exp(-s)) / s**2,
+        2 * torch.pi * torch.exp(-s) * (1 - torch.exp(-s) * (1 + s)) / s**2,
+    )
     axis = torch.tensor([[0.0, 0, 1]], device=device)
     own = s.detach().float().to(device).requires_grad_()
     light = SphericalGaussians(axis, own, torch.ones(1, 3, device=device))
@@ -109,8 +111,12 @@ def reflected(wo, base, alpha, metallic, axis, sharpness):
     return (value * light[:, None]).sum(0)
 
 
-CASES = [(r, deg, s, m) for r, deg in ((0.3, 0), (0.3, 45), (0.5, 0), (0.5, 45), (0.7, 20)) for s in (2.0, 30.0, 150.0)
-         for m in (0.0, 1.0)]  # fmt: skip
+CASES = [
+    (r, deg, s, m)
+    for r, deg in ((0.3, 0), (0.3, 45), (0.5, 0), (0.5, 45), (0.7, 20))
+    for s in (2.0, 30.0, 150.0)
+    for m in (0.0, 1.0)
+]
 
 
 def test_shading_matches_quadrature(device):
@@ -121,8 +127,9 @@ def test_shading_matches_quadrature(device):
         axis = normalize(wo * torch.tensor([-1.0, 1.0, 1.0]) + torch.tensor([0.05, 0.1, 0.0]), dim=-1)  # by the mirror
         want = reflected(wo, base, torch.tensor(roughness**2, dtype=torch.float64), metallic, axis, sharpness)
         rows = [t.float().to(device)[None] for t in (torch.tensor([0.0, 0, 1]), wo, base)]
-        light = SphericalGaussians(axis.float().to(device)[None], torch.tensor([sharpness], device=device),
-                                   torch.ones(1, 3, device=device))  # fmt: skip
+        light = SphericalGaussians(
+            axis.float().to(device)[None], torch.tensor([sharpness], device=device), torch.ones(1, 3, device=device)
+        )
         got = shade_gaussians(*on_ball(*rows, roughness, metallic), light)[0]
         # round lobes and one Fresnel factor: the method's own error as the docstring states it
         limit = 0.065 if roughness < 0.4 else 0.12 if roughness < 0.6 else 0.18

@@ -54,8 +54,9 @@ def frame(n):
     s = torch.where(z < 0.0, -1.0, 1.0).to(n)
     a = -1.0 / (s + z)
     b = x * y * a
-    return torch.stack([torch.stack([1 + s * x * x * a, s * b, -s * x], -1), torch.stack([b, s + y * y * a, -y], -1),
-                        n], 1)  # fmt: skip
+    return torch.stack(
+        [torch.stack([1 + s * x * x * a, s * b, -s * x], -1), torch.stack([b, s + y * y * a, -y], -1), n], 1
+    )
 
 
 def close(got, want, share, within=2e-3):
@@ -194,8 +195,15 @@ def test_gradients_of_the_estimator(device, strategy, paint):
     assert reference.share_within(got[4], g_texels) >= 0.999
 
 
-@pytest.mark.parametrize("options", [{}, {"paint": "published", "heuristic": "power", "sequence": "random"},
-                                     {"antithetic": "mirrored"}, {"antithetic": "none", "clamp": 0.5}])  # fmt: skip
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"paint": "published", "heuristic": "power", "sequence": "random"},
+        {"antithetic": "mirrored"},
+        {"antithetic": "none", "clamp": 0.5},
+    ],
+)
 @pytest.mark.parametrize("light", ["sun", "black"])
 def test_all_strategies_together_keep_their_gradients_finite(device, light, options):
     normal, ng, wo, _, base, alpha, metallic = drawn(N, 4)

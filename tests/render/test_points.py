@@ -30,9 +30,10 @@ def test_one_row_and_plain_numbers_hold_for_all_points(device):
     rows = [v.expand(300, 3) for v in (normal[:1], normal[:1], color.new_full((1, 3), 0.5))]
     assert torch.equal(flat, shade(SurfacePoints(normal, *rows, one, 0 * one), wo[:1].expand(300, 3), light))
     part = SurfacePoints(normal, normal, normal, color, 0.3, 0.0)[100:200]
-    assert len(part) == 100 and torch.equal(shade(part, wo[100:200], light, pixels=torch.arange(
-        100, 200, dtype=torch.int32, device=device)), shade(SurfacePoints(normal, normal, normal, color, 0.3, 0.0), wo,
-                                                            light)[100:200])  # fmt: skip
+    assert len(part) == 100 and torch.equal(
+        shade(part, wo[100:200], light, pixels=torch.arange(100, 200, dtype=torch.int32, device=device)),
+        shade(SurfacePoints(normal, normal, normal, color, 0.3, 0.0), wo, light)[100:200],
+    )
 
 
 @pytest.mark.parametrize("name", ["normal", "ng", "base_color", "roughness", "metallic", "position", "wo"])
@@ -42,18 +43,28 @@ def test_what_is_not_finite_gives_nan_and_its_neighbours_stay(device, name, valu
     normal, wo = (v.to(device) for v in points(40))
     light = Environment(sky().radiance.to(device))
     lobe = SphericalGaussians(normal[:1], normal.new_tensor([3.0]), normal.new_ones(1, 3))
-    values = dict(position=0.3 * normal, ng=normal, normal=normal, base_color=normal.abs(),
-                  roughness=normal[:, 0].abs(), metallic=normal[:, 1].abs(), wo=wo)  # fmt: skip
+    values = dict(
+        position=0.3 * normal,
+        ng=normal,
+        normal=normal,
+        base_color=normal.abs(),
+        roughness=normal[:, 0].abs(),
+        metallic=normal[:, 1].abs(),
+        wo=wo,
+    )
     broken = {k: v.clone() for k, v in values.items()}
     broken[name][7].fill_(value) if broken[name].ndim == 1 else broken[name][7, 1:2].fill_(value)
-    calls = [lambda p, wo, s=s: shade(p, wo, light, scene=s) for s in (None, shadow_caster(device),
-                                                                       shadow_caster(device, "warp"))]  # fmt: skip
+    calls = [
+        lambda p, wo, s=s: shade(p, wo, light, scene=s)
+        for s in (None, shadow_caster(device), shadow_caster(device, "warp"))
+    ]
     calls += [lambda p, wo: shade_light(p, wo, light, light)]
     if name not in ("position", "ng"):  # which play no part in it
         calls += [lambda p, wo: shade_gaussians(p, wo, lobe)]
     for call in calls:
-        want, got = (call(SurfacePoints(**{k: v for k, v in rows.items() if k != "wo"}), rows["wo"])
-                     for rows in (values, broken))  # fmt: skip
+        want, got = (
+            call(SurfacePoints(**{k: v for k, v in rows.items() if k != "wo"}), rows["wo"]) for rows in (values, broken)
+        )
         assert bool(want.isfinite().all()) and bool(got[7].isnan().all())
         rest = torch.arange(40, device=device) != 7
         assert torch.equal(got[rest], want[rest])
@@ -64,15 +75,25 @@ def test_directions_and_ranges_are_checked_on_request(device):
     light, asked = Environment(sky().radiance.to(device)), ShadeOptions(check_inputs=True)
     good = dict(position=normal, ng=normal, normal=normal, base_color=normal.abs(), roughness=0.5, metallic=1.0)
     assert torch.equal(shade(SurfacePoints(**good), wo, light, options=asked), shade(SurfacePoints(**good), wo, light))
-    for name, value in (("normal", 1.01 * normal), ("ng", 0.0 * normal), ("base_color", 1.5), ("roughness", -0.1),
-                        ("metallic", torch.nan), ("position", normal / 0.0)):  # fmt: skip
+    for name, value in (
+        ("normal", 1.01 * normal),
+        ("ng", 0.0 * normal),
+        ("base_color", 1.5),
+        ("roughness", -0.1),
+        ("metallic", torch.nan),
+        ("position", normal / 0.0),
+    ):
         wrong = SurfacePoints(**{**good, name: value})
         with pytest.raises(ValueError, match=f"^{name}: expected .* in row 0$"):
             shade(wrong, wo, light, options=asked)
         shade(wrong, wo, light)  # else it goes into the formulas as it is
     with pytest.raises(ValueError, match="^wo: expected unit vectors, got .* in row 3$"):
-        shade(SurfacePoints(**good), torch.where(torch.arange(30, device=device)[:, None] == 3, 2.0, 1.0) * wo, light,
-              options=asked)  # fmt: skip
+        shade(
+            SurfacePoints(**good),
+            torch.where(torch.arange(30, device=device)[:, None] == 3, 2.0, 1.0) * wo,
+            light,
+            options=asked,
+        )
 
 
 def test_a_clamp_holds_for_a_light_that_is_asked_too(device):

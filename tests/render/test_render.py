@@ -56,8 +56,11 @@ def test_texture_lookup_is_bilinear_and_repeats(device):
     got = sample_texture(t, uv)
     torch.testing.assert_close(got.double(), want[0, :, 0].T, rtol=0, atol=1e-5)
     weight = torch.randn(5000, 3, generator=torch.Generator().manual_seed(2)).to(device)
-    for a, b in zip(torch.autograd.grad((got * weight).sum(), (t, uv)),
-                    torch.autograd.grad((want[0, :, 0].T * weight.double()).sum(), (t, uv)), strict=True):  # fmt: skip
+    for a, b in zip(
+        torch.autograd.grad((got * weight).sum(), (t, uv)),
+        torch.autograd.grad((want[0, :, 0].T * weight.double()).sum(), (t, uv)),
+        strict=True,
+    ):
         assert reference.share_within(a, b) >= 0.999
 
 
@@ -66,8 +69,13 @@ def test_normal_map_points_right_and_up_as_gltf_says(device, explicit):
     """Red bends the normal towards u (right), green towards the top of the picture."""
     mesh = square(device)
     if explicit:
-        mesh = Mesh(mesh.vertices, mesh.faces, mesh.normals, mesh.uv,
-                    torch.tensor([[1.0, 0, 0, 1]], device=device).expand(4, 4).contiguous())  # fmt: skip
+        mesh = Mesh(
+            mesh.vertices,
+            mesh.faces,
+            mesh.normals,
+            mesh.uv,
+            torch.tensor([[1.0, 0, 0, 1]], device=device).expand(4, 4).contiguous(),
+        )
     face, bary = torch.tensor([0, 1], dtype=torch.int32, device=device), torch.full((2, 2), 0.3, device=device)
     s = math.sqrt(0.5)
     for color, want in (((0.5 + s / 2, 0.5, 0.5 + s / 2), (s, 0.0, s)), ((0.5, 0.5 + s / 2, 0.5 + s / 2), (0.0, s, s))):
@@ -112,8 +120,11 @@ def test_image_gradient_reaches_textures_and_light(device):
     asset = ball(device)
     maps = [v.clone().requires_grad_() for v in vars(asset.textures).values()]
     light = torch.rand(8, 16, 3, generator=torch.Generator().manual_seed(1)).to(device).requires_grad_()
-    image = render(Asset(asset.mesh, TextureSet(*maps)), Camera.from_fov(eye(device, 0.0, 0.5, 2.0), 0.8, 24, 24),
-                   Environment(light))  # fmt: skip
+    image = render(
+        Asset(asset.mesh, TextureSet(*maps)),
+        Camera.from_fov(eye(device, 0.0, 0.5, 2.0), 0.8, 24, 24),
+        Environment(light),
+    )
     grads = torch.autograd.grad(image.radiance.sum(), [*maps, light])
     assert all(bool(torch.isfinite(g).all()) and float(g.abs().max()) > 0 for g in grads)
     assert float(grads[0].min()) >= 0.0 and float(grads[4].min()) >= 0.0  # more paint and more light are brighter
@@ -122,8 +133,10 @@ def test_image_gradient_reaches_textures_and_light(device):
 def test_no_light_is_gained_at_the_rim_but_with_the_published_paint(device):
     """A smooth white ball in a furnace.  Rays from below the horizon never hit it, so it shadows nothing itself."""
     asset = ball(device, (1.0, 1.0, 1.0))
-    camera, white = Camera.from_fov(eye(device, 0.0, 0.5, 2.0), 0.8, 40, 40), Environment.constant(
-        torch.ones(3, device=device))  # fmt: skip
+    camera, white = (
+        Camera.from_fov(eye(device, 0.0, 0.5, 2.0), 0.8, 40, 40),
+        Environment.constant(torch.ones(3, device=device)),
+    )
     asset = Asset(asset.mesh, textures(4, device, (1.0, 1.0, 1.0), roughness=0.2))
     images = {paint: render(asset, camera, white, options=ShadeOptions((64, 64, 64), paint=paint)) for paint in PAINTS}
     inside = images["published"].alpha > 0
@@ -145,8 +158,12 @@ def test_bad_input_is_named(device):
         render(asset, camera, Environment.constant(torch.ones(3, device=device)), options=ShadeOptions(paint="white"))
     faces, values = asset.mesh.faces, asset.mesh.vertices
     with pytest.raises(ValueError, match="face: expected"):
-        interpolate(values, faces, torch.tensor([len(faces)], dtype=torch.int32, device=device),
-                    torch.zeros(1, 2, device=device))  # fmt: skip
+        interpolate(
+            values,
+            faces,
+            torch.tensor([len(faces)], dtype=torch.int32, device=device),
+            torch.zeros(1, 2, device=device),
+        )
     with pytest.raises(ValueError, match="uv: expected"):
         sample_texture(asset.textures.normal, torch.tensor([[np.nan, 0.0]], dtype=torch.float32, device=device))
 

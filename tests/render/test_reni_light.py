@@ -10,7 +10,7 @@ from reli3d.geometry.rays import RayScene
 from reli3d.nn.presets import OFFICIAL
 from reli3d.nn.reni import EnvironmentDecoder, map_directions, reni_frame
 from reli3d.nn.reni_fit import fit_latent
-from reli3d.nn.weights import load_model, read_manifest, read_tensors
+from reli3d.nn.weights import read_manifest, read_tensors
 from reli3d.render.environment import Environment
 from reli3d.render.material import PAINTS
 from reli3d.render.shading import ShadeOptions, shade, shade_light
@@ -20,10 +20,11 @@ from tests.support.surfaces import at, points
 CLOSE = dict(rtol=1e-5, atol=0.0)
 
 
-@pytest.fixture(params=["shipped", "published"])
+@pytest.fixture(params=["random", "published"])
 def decoder(request, device):
-    if request.param == "shipped":
-        return load_model("small").environment.to(device)
+    if request.param == "random":
+        torch.manual_seed(0)
+        return EnvironmentDecoder(OFFICIAL.reni).to(device).eval()
     path = request.getfixturevalue("goldens").parent / "reni++L49.safetensors"
     decoder, manifest = EnvironmentDecoder(OFFICIAL.reni), read_manifest(path)
     decoder.field.load_state_dict(read_tensors(manifest, {name: torch.float32 for name in manifest.tensors}))
@@ -122,7 +123,8 @@ def test_shading_that_asks_a_map_is_shading_by_the_map(device, backend):
 
 
 def test_shading_by_a_latent_is_shading_by_its_fine_map(device):
-    decoder = load_model("small").environment.to(device)
+    torch.manual_seed(0)
+    decoder = EnvironmentDecoder(OFFICIAL.reni).to(device).eval()
     light = decoder.light(*code(6, device, 0.3))
     args, coarse = surfaces(300, device), light.environment(16)
     got = shade_light(*at(*args), light, coarse, options=ShadeOptions(seed=1))
@@ -157,7 +159,8 @@ def test_a_decoded_map_is_found_again(decoder, height):
 
 
 def test_maps_that_cannot_be_fitted_are_named():
-    decoder = load_model("small").environment
+    torch.manual_seed(0)
+    decoder = EnvironmentDecoder(OFFICIAL.reni).eval()
     for radiance, message in [
         (torch.ones(8, 15, 3), r"expected \(H, 2H, 3\) with H at least 8, got \(8, 15, 3\)"),
         (torch.ones(4, 8, 3), "H at least 8"),

@@ -74,8 +74,10 @@ def test_lobes_follow_their_densities(device, alpha, deg, phi, drawn, seed):
 def test_cosine_follows_its_density(device):
     wrong = {"exponent": lambda d: 2.05 / (2 * math.pi) * d[:, 2].clamp(min=0.0) ** 1.05}
     chi2.check(chi2.Sphere(45), sample_cosine(uniform(N, device)), pdf_cosine, wrong)
-    assert torch.equal(sample_bsdf(view(60, device), torch.tensor(0.3, device=device), uniform(9, device), "cosine"),
-                       sample_cosine(uniform(9, device)))  # fmt: skip
+    assert torch.equal(
+        sample_bsdf(view(60, device), torch.tensor(0.3, device=device), uniform(9, device), "cosine"),
+        sample_cosine(uniform(9, device)),
+    )
     wo, wi, a = view(60, device), sample_cosine(uniform(1000, device)), torch.tensor(0.3, device=device)
     torch.testing.assert_close(pdf_lobes(wo, wi, a)[:, 2], pdf_cosine(wi), rtol=1e-6, atol=0)  # 1 / pi is rounded
 

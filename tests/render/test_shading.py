@@ -33,9 +33,13 @@ def test_every_strategy_and_mix_converges_to_the_quadrature(device, counts, roug
     for k in range(2):
         base = torch.tensor([0.8, 0.5, 0.2])
         truth = reference.direct_light(
-            normal[k].double(), wo[k].double(), base.double(), torch.tensor(roughness**2).double(),
-            torch.tensor(metallic).double(), env.radiance.double(),
-        )  # fmt: skip
+            normal[k].double(),
+            wo[k].double(),
+            base.double(),
+            torch.tensor(roughness**2).double(),
+            torch.tensor(metallic).double(),
+            env.radiance.double(),
+        )
         n = 3000
         args = repeat(
             n, normal[k : k + 1], wo[k : k + 1], base[None], torch.tensor([roughness]), torch.tensor([metallic])
@@ -190,15 +194,22 @@ def test_bad_input_is_named(device):
     surface = dict(position=normal, normal=normal, ng=normal, base_color=normal.abs(), roughness=one, metallic=one)
     call = dict(wo=wo, environment=env)
     for change, kind, name in [
-        ({"normal": normal.double()}, TypeError, "normal"), ({"roughness": one[:3]}, ValueError, "roughness"),
-        ({"samples": (1, 2)}, ValueError, "samples"), ({"samples": (-1, 2, 3)}, ValueError, "samples"),
-        ({"heuristic": "x"}, ValueError, "heuristic"), ({"clamp": 0.0}, ValueError, "clamp"),
-        ({"paint": "white"}, ValueError, "paint"), ({"antithetic": True}, ValueError, "antithetic"),
+        ({"normal": normal.double()}, TypeError, "normal"),
+        ({"roughness": one[:3]}, ValueError, "roughness"),
+        ({"samples": (1, 2)}, ValueError, "samples"),
+        ({"samples": (-1, 2, 3)}, ValueError, "samples"),
+        ({"heuristic": "x"}, ValueError, "heuristic"),
+        ({"clamp": 0.0}, ValueError, "clamp"),
+        ({"paint": "white"}, ValueError, "paint"),
+        ({"antithetic": True}, ValueError, "antithetic"),
         ({"pixels": torch.arange(3, dtype=torch.int32, device=device)}, ValueError, "pixels"),
-        ({"environment": env.radiance}, TypeError, "environment"), ({"options": {"seed": 1}}, TypeError, "options"),
-        ({"points": (normal, wo)}, TypeError, "points"), ({"sequence": "sobol"}, ValueError, "sequence"),
-        ({"wo": wo[:2]}, ValueError, "wo"), ({"normal": 0.5}, TypeError, "normal"),
-    ]:  # fmt: skip
+        ({"environment": env.radiance}, TypeError, "environment"),
+        ({"options": {"seed": 1}}, TypeError, "options"),
+        ({"points": (normal, wo)}, TypeError, "points"),
+        ({"sequence": "sobol"}, ValueError, "sequence"),
+        ({"wo": wo[:2]}, ValueError, "wo"),
+        ({"normal": 0.5}, TypeError, "normal"),
+    ]:
         with pytest.raises(kind, match=f"{name}: expected"):
             own = {k: change.get(k, v) for k, v in surface.items()}
             given = {k: v for k, v in change.items() if k in ("points", "pixels", "wo", "environment", "options")}
@@ -209,8 +220,13 @@ def test_bad_input_is_named(device):
 def gradient_inputs(device, n=400):
     normal, wo = points(n, seed=4)
     g = torch.Generator().manual_seed(9)
-    values = [normal, 0.1 + 0.8 * torch.rand(n, 3, generator=g), 0.3 + 0.6 * torch.rand(n, generator=g),
-              torch.rand(n, generator=g), sky(8).radiance]  # fmt: skip
+    values = [
+        normal,
+        0.1 + 0.8 * torch.rand(n, 3, generator=g),
+        0.3 + 0.6 * torch.rand(n, generator=g),
+        torch.rand(n, generator=g),
+        sky(8).radiance,
+    ]
     return wo.to(device), [v.to(device).requires_grad_() for v in values]
 
 
@@ -262,11 +278,16 @@ def test_gradient_is_that_of_the_estimator_where_the_samples_stand_still(device,
 
 
 MEANS = [
-    ((20, 40, 4), {}), ((0, 0, 64), {}), ((0, 64, 0), {}), ((20, 40, 4), {"paint": "published"}),
-    ((20, 40, 4), {"heuristic": "power"}), ((20, 40, 4), {"sequence": "random"}),
-    ((20, 40, 4), {"antithetic": "none"}), ((20, 7, 0), {"antithetic": "mirrored"}),
+    ((20, 40, 4), {}),
+    ((0, 0, 64), {}),
+    ((0, 64, 0), {}),
+    ((20, 40, 4), {"paint": "published"}),
+    ((20, 40, 4), {"heuristic": "power"}),
+    ((20, 40, 4), {"sequence": "random"}),
+    ((20, 40, 4), {"antithetic": "none"}),
+    ((20, 7, 0), {"antithetic": "mirrored"}),
     ((20, 7, 0), {"heuristic": "power", "sequence": "random", "antithetic": "none"}),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize("counts, options", MEANS)

@@ -72,8 +72,15 @@ class Stage:
 
     def shade(self, base, roughness, metallic, environment, seed):
         n = len(self.position)
-        values = (self.position, self.normal, self.ng, -self.directions, base.expand(n, 3), roughness.expand(n),
-                  torch.full((n,), metallic))  # fmt: skip
+        values = (
+            self.position,
+            self.normal,
+            self.ng,
+            -self.directions,
+            base.expand(n, 3),
+            roughness.expand(n),
+            torch.full((n,), metallic),
+        )
         light = Environment(environment.radiance.to(self.device))
         return shade(
             *at(*(v.to(self.device) for v in values)), light, scene=self.scene, options=ShadeOptions(seed=seed)
@@ -197,8 +204,9 @@ def test_render_equals_mitsubas_sensor_textures_and_light(device):
     sky = Environment(environment.radiance.to(device))
     pose = look_at(*(torch.tensor(v, device=device) for v in (eye, target, (0.0, 1.0, 0.0))))
     camera = Camera.from_fov(pose, fov, width, height)
-    asset = Asset(Mesh(*(getattr(m, k).to(device) for k in ("vertices", "faces", "normals", "uv"))),
-                  asset.textures.to(device))  # fmt: skip
+    asset = Asset(
+        Mesh(*(getattr(m, k).to(device) for k in ("vertices", "faces", "normals", "uv"))), asset.textures.to(device)
+    )
 
     def runs(asset, camera):
         images = (

@@ -29,8 +29,10 @@ def shape(name, device):
         mesh.vertices = mesh.vertices @ TURN.T
     else:  # 20 thousand faces on 28 pixels across: at the outline they are far smaller than a pixel
         mesh = trimesh.creation.icosphere(subdivisions=5 if name == "fine sphere" else 2, radius=0.6)
-    return (torch.tensor(mesh.vertices, dtype=torch.float32, device=device),
-            torch.tensor(mesh.faces, dtype=torch.int32, device=device))  # fmt: skip
+    return (
+        torch.tensor(mesh.vertices, dtype=torch.float32, device=device),
+        torch.tensor(mesh.faces, dtype=torch.int32, device=device),
+    )
 
 
 def layer_of_hits(scene, camera, value=None):
@@ -69,8 +71,12 @@ def coverage(points, camera, factor=12):
     return inside.reshape(camera.height, factor, camera.width, factor).mean((1, 3))
 
 
-MOVES = {"x": lambda v: torch.tensor([1.0, 0, 0]).expand_as(v), "y": lambda v: torch.tensor([0.0, 1, 0]).expand_as(v),
-         "z": lambda v: torch.tensor([0.0, 0, 1]).expand_as(v), "scale": lambda v: v.cpu()}  # fmt: skip
+MOVES = {
+    "x": lambda v: torch.tensor([1.0, 0, 0]).expand_as(v),
+    "y": lambda v: torch.tensor([0.0, 1, 0]).expand_as(v),
+    "z": lambda v: torch.tensor([0.0, 0, 1]).expand_as(v),
+    "scale": lambda v: v.cpu(),
+}
 
 
 @pytest.mark.parametrize("name", ["sphere", "fine sphere", "cube"])
@@ -150,8 +156,10 @@ def test_descent_moves_a_sphere_onto_its_target(device, layer):
         optimizer.step()
         losses.append(float(loss.detach()))
     assert losses[-1] < 0.01 * losses[0]
-    wanted, got = (outline((vertices * s + o).detach().cpu().double().numpy(), camera)[0]
-                   for s, o in ((0.8, aim), (log_scale.exp(), offset)))  # fmt: skip
+    wanted, got = (
+        outline((vertices * s + o).detach().cpu().double().numpy(), camera)[0]
+        for s, o in ((0.8, aim), (log_scale.exp(), offset))
+    )
     assert np.abs(wanted.mean(0) - got.mean(0)).max() < 0.3  # pixels, of 5 at the start
 
 

@@ -237,8 +237,11 @@ def test_same_bits_for_any_number_of_threads(device, threads):
 
 def test_bad_input_is_named(device):
     grid, (origins, directions) = OccupancyGrid.full(4, 1.0, device), rays(device, 4)
-    for keywords, name in (({"step": 0.0}, "step"), ({"step": 0.1, "near": 2.0, "far": 1.0}, "near"),
-                           ({"step": 0.1, "shift": torch.ones(4, device=device)}, "shift")):  # fmt: skip
+    for keywords, name in (
+        ({"step": 0.0}, "step"),
+        ({"step": 0.1, "near": 2.0, "far": 1.0}, "near"),
+        ({"step": 0.1, "shift": torch.ones(4, device=device)}, "shift"),
+    ):
         with pytest.raises(ValueError, match=name):
             march_rays(origins, directions, grid, **keywords)
     with pytest.raises(ValueError, match="origins, directions: expected"):

@@ -55,8 +55,9 @@ class Page:
 
     def open(self, url: str, *, size: tuple[int, int] = (512, 512)) -> Page:
         """Go to ``url`` with a window of ``size`` pixels; returns once the document is there."""
-        self._call("Emulation.setDeviceMetricsOverride", width=size[0], height=size[1], deviceScaleFactor=1,
-                   mobile=False)  # fmt: skip
+        self._call(
+            "Emulation.setDeviceMetricsOverride", width=size[0], height=size[1], deviceScaleFactor=1, mobile=False
+        )
         self._call("Page.navigate", url=url)
         self.wait("document.readyState === 'complete' && location.href !== 'about:blank'")
         return self
@@ -135,8 +136,13 @@ def chromium() -> Iterator[Page]:
             os.dup2(high[0], 3)
             os.dup2(high[1], 4)
 
-        process = subprocess.Popen([program, *FLAGS, f"--user-data-dir={profile}"], preexec_fn=wire, pass_fds=(3, 4),
-                                   stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)  # fmt: skip
+        process = subprocess.Popen(
+            [program, *FLAGS, f"--user-data-dir={profile}"],
+            preexec_fn=wire,
+            pass_fds=(3, 4),
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
         for fd in (to_browser[0], to_us[1], *high):
             os.close(fd)
         try:

@@ -215,8 +215,14 @@ def refusal(observed: np.ndarray, mass: np.ndarray, total: int) -> str:
     return f"{cells} coarse cells, p = {p:.2g}" if p < LEVEL else ""
 
 
-def check(grid: Grid, drawn: Tensor, pdf: Density, wrong: dict[str, Density] | None = None, total: int | None = None,
-          finest: int = 64) -> None:  # fmt: skip
+def check(
+    grid: Grid,
+    drawn: Tensor,
+    pdf: Density,
+    wrong: dict[str, Density] | None = None,
+    total: int | None = None,
+    finest: int = 64,
+) -> None:
     """Assert that unit ``drawn (N, 3)``, the valid ones of ``total`` draws, follow ``pdf``, and that on this grid and
     with these samples densities that are wrong by 2 to 3 % and those named in ``wrong`` are refused."""
     total = len(drawn) if total is None else total

@@ -37,8 +37,15 @@ def good(folder: Path, views: int = 3) -> dict:
     frames = []
     for i in range(views):
         Image.fromarray(picture()).save(folder / f"rgba/{i}.png")
-        frames.append({"view_index": i, "file_path": f"rgba/{i}.png", "transform_matrix": pose(2.1 * i),
-                       "camera_fov": [0.6, 0.6], "camera_principal_point": [SIDE / 2, SIDE / 2]})  # fmt: skip
+        frames.append(
+            {
+                "view_index": i,
+                "file_path": f"rgba/{i}.png",
+                "transform_matrix": pose(2.1 * i),
+                "camera_fov": [0.6, 0.6],
+                "camera_principal_point": [SIDE / 2, SIDE / 2],
+            }
+        )
     data = {"object_uid": "disk", "coordinate_system": "ogl", "frames": frames}
     (folder / "transforms.json").write_text(json.dumps(data))
     return data
@@ -208,10 +215,14 @@ def cases() -> list[tuple[str, Callable[[Path], None]]]:
         ("missing_folder", lambda f: None),
         ("transforms_is_folder", lambda f: (f / "transforms.json").mkdir(parents=True)),
         ("transforms_is_pipe", lambda f: (f.mkdir(), os.mkfifo(f / "transforms.json"))),
-        ("transforms_links_outside", _with(lambda f: ((f / "transforms.json").unlink(),
-                                                      (f / "transforms.json").symlink_to("/etc/passwd")))),
-        ("transforms_dangling_link", _with(lambda f: ((f / "transforms.json").unlink(),
-                                                      (f / "transforms.json").symlink_to("nowhere.json")))),
+        (
+            "transforms_links_outside",
+            _with(lambda f: ((f / "transforms.json").unlink(), (f / "transforms.json").symlink_to("/etc/passwd"))),
+        ),
+        (
+            "transforms_dangling_link",
+            _with(lambda f: ((f / "transforms.json").unlink(), (f / "transforms.json").symlink_to("nowhere.json"))),
+        ),
         # the text of the camera file
         ("json_empty", _text(lambda t: "")),
         ("json_truncated", _text(lambda t: t[: len(t) // 2])),
@@ -342,7 +353,7 @@ def cases() -> list[tuple[str, Callable[[Path], None]]]:
         ("colmap_traversal", _colmap(images=lambda t: t.replace("0.png", "../../../etc/passwd"))),
         ("colmap_binary_text", _colmap(images=lambda t: bytes(range(128, 256)))),
         ("colmap_one_line", _colmap(images=lambda t: "1 " * 500_000)),
-    ]  # fmt: skip
+    ]
 
 
 class Bomb:

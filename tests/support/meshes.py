@@ -13,8 +13,10 @@ SLOW = ["boombox", "coffee_grinder", "dutch_ship_medium", "exploding_barrel", "f
 
 
 def mesh_of(vertices, faces) -> Mesh:
-    return Mesh(torch.as_tensor(np.asarray(vertices), dtype=torch.float32).contiguous(),
-                torch.as_tensor(np.asarray(faces), dtype=torch.int32).contiguous())  # fmt: skip
+    return Mesh(
+        torch.as_tensor(np.asarray(vertices), dtype=torch.float32).contiguous(),
+        torch.as_tensor(np.asarray(faces), dtype=torch.int32).contiguous(),
+    )
 
 
 def loaded(path) -> Mesh:
@@ -28,7 +30,8 @@ def sheet(n=9):
     x, y = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
     vertices = np.stack([x, y, np.random.default_rng(0).normal(size=x.shape)], -1).reshape(-1, 3)
     corner = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).reshape(-1)
-    faces = np.concatenate([np.stack([corner, corner + n, corner + n + 1], -1),
-                            np.stack([corner, corner + n + 1, corner + 1], -1)])  # fmt: skip
+    faces = np.concatenate(
+        [np.stack([corner, corner + n, corner + n + 1], -1), np.stack([corner, corner + n + 1, corner + 1], -1)]
+    )
     border = ((x == 0) | (y == 0) | (x == n - 1) | (y == n - 1)).reshape(-1)
     return Mesh(torch.tensor(vertices, dtype=torch.float32), torch.tensor(faces, dtype=torch.int32)), border

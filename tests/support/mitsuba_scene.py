@@ -47,8 +47,9 @@ def smooth_mesh(mi, vertices: torch.Tensor, faces: torch.Tensor, normals: torch.
     """A mesh with vertex normals and the material; uv: ``(V, 2)``, v down, or None."""
     props = mi.Properties()
     props["bsdf"] = mi.load_dict(bsdf)
-    mesh = mi.Mesh("mesh", len(vertices), len(faces), props=props, has_vertex_normals=True,
-                   has_vertex_texcoords=uv is not None)  # fmt: skip
+    mesh = mi.Mesh(
+        "mesh", len(vertices), len(faces), props=props, has_vertex_normals=True, has_vertex_texcoords=uv is not None
+    )
     params = mi.traverse(mesh)
     params["vertex_positions"], params["faces"] = vertices.numpy().ravel(), faces.numpy().ravel().astype(np.uint32)
     params["vertex_normals"] = normals.numpy().ravel()

@@ -6,7 +6,6 @@ import torch
 
 from reli3d.nn.presets import (
     OFFICIAL,
-    SMALL,
     BackboneSizes,
     EncoderSizes,
     IlluminationSizes,
@@ -18,30 +17,44 @@ TINY = replace(  # the sizes of the golden tiny_system
     name="tiny",
     image_size=76,
     camera_width=32,
-    encoder=EncoderSizes(hidden=32, layers=2, heads=4, patch=14, grid=7, mask_channel=False, ray_maps=False),
+    encoder=EncoderSizes(hidden=32, layers=2, heads=4, patch=14, grid=7, mask_channel=False),
     plane_size=8,
     backbone=BackboneSizes(heads=4, latents=10, blocks=3, basic_blocks=1, experts=2, experts_from=2, groups=8),
     upsampler=UpsamplerSizes(convolutions=4, scale=4, channels=40),
     illumination=IlluminationSizes(
-        encoder=EncoderSizes(hidden=24, layers=1, heads=2, patch=14, grid=7, mask_channel=True, ray_maps=False),
-        tokens=78, token_width=16, width=32, heads=4, layers=1, groups=4,
+        encoder=EncoderSizes(hidden=24, layers=1, heads=2, patch=14, grid=7, mask_channel=True),
+        tokens=78,
+        token_width=16,
+        width=32,
+        heads=4,
+        layers=1,
+        groups=4,
     ),
     resolution=16,
-)  # fmt: skip
-NANO = replace(  # small's switches at sizes that run in milliseconds
-    SMALL,
+)
+NANO = replace(  # the paper's network at sizes that run in milliseconds, without what only the release does
+    TINY,
     name="nano",
     image_size=32,
-    camera_width=32,
-    encoder=replace(SMALL.encoder, hidden=32, layers=1, heads=2, patch=8, grid=4),
+    encoder=EncoderSizes(hidden=32, layers=1, heads=2, patch=8, grid=4, mask_channel=True),
     plane_size=4,
-    backbone=replace(SMALL.backbone, heads=2, latents=8, blocks=1, basic_blocks=1, groups=4),
-    illumination=replace(
-        SMALL.illumination, encoder=replace(SMALL.illumination.encoder, hidden=16, layers=1, heads=2, patch=8, grid=4),
-        token_width=16, width=32, heads=2, layers=1, groups=4,
+    backbone=BackboneSizes(heads=2, latents=8, blocks=1, basic_blocks=1, experts=0, experts_from=0, groups=4),
+    upsampler=UpsamplerSizes(convolutions=2, scale=4, channels=24),
+    illumination=IlluminationSizes(
+        encoder=EncoderSizes(hidden=16, layers=1, heads=2, patch=8, grid=4, mask_channel=True),
+        tokens=78,
+        token_width=16,
+        width=32,
+        heads=2,
+        layers=1,
+        groups=4,
     ),
-    reni=replace(SMALL.reni, height=4),
-)  # fmt: skip
+    reni=replace(OFFICIAL.reni, height=4),
+    roughness_is_alpha=False,
+    published_input=False,
+    reads_background=False,
+    tone_mapping=False,
+)
 
 
 def views(objects, count, size, seed=0):

@@ -70,8 +70,11 @@ def units(n: int, seed: int = 0) -> Tensor:
 
 def above(n: int, seed: int = 0) -> Tensor:
     """Unit directions at least 0.1 above the horizon of +z."""
-    return normalize(units(n, seed) * torch.tensor([1.0, 1.0, 0.0]) + uniform(n, 1, seed=seed + 50, low=0.15, high=2.0)
-                     * torch.tensor([0.0, 0.0, 1.0]), dim=-1)  # fmt: skip
+    return normalize(
+        units(n, seed) * torch.tensor([1.0, 1.0, 0.0])
+        + uniform(n, 1, seed=seed + 50, low=0.15, high=2.0) * torch.tensor([0.0, 0.0, 1.0]),
+        dim=-1,
+    )
 
 
 def numbers(n: int) -> Tensor:
@@ -83,7 +86,8 @@ def ball(device, subdivisions: int = 2, radius: float = 0.5) -> tuple[Tensor, Te
     mesh = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
     turned = mesh.vertices @ trimesh.transformations.euler_matrix(0.4, 0.7, 0.2)[:3, :3].T  # no ties with any axis
     return torch.tensor(turned, dtype=torch.float32, device=device), torch.tensor(
-        mesh.faces, dtype=torch.int32, device=device)  # fmt: skip
+        mesh.faces, dtype=torch.int32, device=device
+    )
 
 
 def corners(count: int) -> Tensor:
@@ -132,8 +136,13 @@ def rig(device) -> tuple[Tensor, Tensor]:
 
 def shaded(n: int) -> dict[str, Tensor]:
     normal = units(n, 1)
-    return {"normal": normal, "base_color": uniform(n, 3, seed=2, low=0.1), "metallic": uniform(n, seed=4),
-            "roughness": uniform(n, seed=3, low=0.2), "radiance": uniform(8, 16, 3, seed=5) ** 3 * 2.0}  # fmt: skip
+    return {
+        "normal": normal,
+        "base_color": uniform(n, 3, seed=2, low=0.1),
+        "metallic": uniform(n, seed=4),
+        "roughness": uniform(n, seed=3, low=0.2),
+        "radiance": uniform(8, 16, 3, seed=5) ** 3 * 2.0,
+    }
 
 
 def lit(shadows: str | None = None, **options):
@@ -143,8 +152,11 @@ def lit(shadows: str | None = None, **options):
         scene = None
         if shadows:
             vertices, faces = ball(normal.device)
-            scene = RayScene(vertices + torch.tensor([0.0, 1.0, 0.0], device=normal.device), faces,
-                             shadows if normal.device.type == "cpu" else "warp")  # fmt: skip
+            scene = RayScene(
+                vertices + torch.tensor([0.0, 1.0, 0.0], device=normal.device),
+                faces,
+                shadows if normal.device.type == "cpu" else "warp",
+            )
         points, wo = at(0.2 * ng, normal, ng, wo, base_color, roughness, metallic)
         return (shade(points, wo, Environment(radiance), scene=scene, options=ShadeOptions(seed=3, **options)),)
 
@@ -175,9 +187,13 @@ def grid_inputs(_, shape=(7, 6, 8), seed: int = 3) -> dict[str, Tensor]:
     level = torch.nn.functional.pad(torch.randn(shape, generator=rng(seed)), (1,) * 6, value=0.7)
     level = level + 0.2 * level.sign()  # no crossing beside a grid point, where slopes have no bound
     cubes = (level.shape[0] - 1) * (level.shape[1] - 1) * (level.shape[2] - 1)
-    return {"level": level, "deformation": uniform(*level.shape, 3, seed=4, low=-0.02, high=0.02),
-            "alpha": uniform(cubes, 8, seed=5, low=0.5), "beta": uniform(cubes, 12, seed=6, low=0.5),
-            "gamma": uniform(cubes, seed=7, low=0.5)}  # fmt: skip
+    return {
+        "level": level,
+        "deformation": uniform(*level.shape, 3, seed=4, low=-0.02, high=0.02),
+        "alpha": uniform(cubes, 8, seed=5, low=0.5),
+        "beta": uniform(cubes, 12, seed=6, low=0.5),
+        "gamma": uniform(cubes, seed=7, low=0.5),
+    }
 
 
 def surface(level, deformation, alpha, beta, gamma):
@@ -200,23 +216,38 @@ def textured(n: int) -> dict[str, Tensor]:
     maps = {name: uniform(6, 6, seed=k) for k, name in ((11, "roughness"), (12, "metallic"))}
     maps["base_color"], maps["normal"] = uniform(6, 6, 3, seed=10), 0.5 + 0.5 * above(36, 13).reshape(6, 6, 3)
     v = corners(60)
-    return {"vertices": v, "normals": above(len(v), 8), "uv": uniform(len(v), 2, seed=9, high=2.0), **maps,
-            "bary": weights(n)}  # fmt: skip
+    return {
+        "vertices": v,
+        "normals": above(len(v), 8),
+        "uv": uniform(len(v), 2, seed=9, high=2.0),
+        **maps,
+        "bary": weights(n),
+    }
 
 
 def lobes(n: int, name: str) -> dict[str, Tensor]:
-    return {"axis": units(12, 1), "sharpness": uniform(12, seed=2, low=0.5, high=30.0), "amplitude": uniform(12, 3),
-            name: units(n, 3)}  # fmt: skip
+    return {
+        "axis": units(12, 1),
+        "sharpness": uniform(12, seed=2, low=0.5, high=30.0),
+        "amplitude": uniform(12, 3),
+        name: units(n, 3),
+    }
 
 
 def bsdf(paint):
     return lambda wo, wi, base_color, alpha, metallic: (
-        material.eval_bsdf(wo, wi, base_color, alpha, metallic, paint=paint),)  # fmt: skip
+        material.eval_bsdf(wo, wi, base_color, alpha, metallic, paint=paint),
+    )
 
 
 def bsdf_inputs(n):
-    return {"wo": above(n, 1), "wi": above(n, 2), "base_color": uniform(n, 3, seed=3),
-            "alpha": uniform(n, seed=4, low=0.1), "metallic": uniform(n, seed=5)}  # fmt: skip
+    return {
+        "wo": above(n, 1),
+        "wi": above(n, 2),
+        "base_color": uniform(n, 3, seed=3),
+        "alpha": uniform(n, seed=4, low=0.1),
+        "metallic": uniform(n, seed=5),
+    }
 
 
 def moved(vertices):

@@ -32,7 +32,7 @@ from tests.support.op_cases import (
     uniform,
     units,
     weights,
-)  # fmt: skip
+)
 from tests.support.surfaces import at
 
 
@@ -112,9 +112,16 @@ def drawn(u, radiance, wo, alpha):
     light = Environment(radiance)
     directions, density = light.sample(u)
     wi = sampling.sample_cosine(u)
-    return (directions, density, light.pdf(wi), wi, material.pdf_lobes(wo, wi, alpha),
-            sampling.random_pairs(len(u), seed=4, device=u.device), sampling.halton(len(u), device=u.device),
-            offset_origin(wo, wi, directions))  # fmt: skip
+    return (
+        directions,
+        density,
+        light.pdf(wi),
+        wi,
+        material.pdf_lobes(wo, wi, alpha),
+        sampling.random_pairs(len(u), seed=4, device=u.device),
+        sampling.halton(len(u), device=u.device),
+        offset_origin(wo, wi, directions),
+    )
 
 
 def asked_of_reni(directions):

@@ -10,8 +10,14 @@ from reli3d.render.volume import RaySamples
 
 BACKENDS = ["embree", "warp"]
 # stretch and shift of meshes and rays: plain, tiny, long, flat, far
-PLACES = [((1.0, 1.0, 1.0), 0.0), ((1e-4, 1e-4, 1e-4), 0.0), ((1.0, 1.0, 1e3), 0.0), ((1.0, 1e-3, 1.0), 0.0),
-          ((1.0, 1.0, 1.0), 1e3), ((1.0, 1.0, 1.0), 1e5)]  # fmt: skip
+PLACES = [
+    ((1.0, 1.0, 1.0), 0.0),
+    ((1e-4, 1e-4, 1e-4), 0.0),
+    ((1.0, 1.0, 1e3), 0.0),
+    ((1.0, 1e-3, 1.0), 0.0),
+    ((1.0, 1.0, 1.0), 1e3),
+    ((1.0, 1.0, 1.0), 1e5),
+]
 
 
 def make(vertices, faces, backend, device):

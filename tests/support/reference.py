@@ -69,8 +69,9 @@ def sample_ggx_vndf(wo: Tensor, alpha: Tensor, u: Tensor) -> Tensor:
     return torch.nn.functional.normalize(h * stretch, dim=-1)
 
 
-def eval_bsdf(wo: Tensor, wi: Tensor, base_color: Tensor, alpha: Tensor, metallic: Tensor,
-              paint: str = "conserving") -> Tensor:  # fmt: skip
+def eval_bsdf(
+    wo: Tensor, wi: Tensor, base_color: Tensor, alpha: Tensor, metallic: Tensor, paint: str = "conserving"
+) -> Tensor:
     """Lambert below Schlick, GGX with height-correlated Smith; directions above the horizon.
 
     The paint loses what the surface reflects on the way in and out, with 1 - cos divided by 1 + alpha, or,
@@ -124,8 +125,16 @@ def sg_irradiance(normal: Tensor, axis: Tensor, sharpness: Tensor, amplitude: Te
 GGX_NORMALS = ((0.01271983, 0.08227587), (0.15480422, 0.41751521), (0.51788954, 1.38313102), (0.31433217, 3.80806021))
 
 
-def shade_gaussians(normal: Tensor, wo: Tensor, base_color: Tensor, alpha: Tensor, metallic: Tensor, axis: Tensor,
-                    sharpness: Tensor, amplitude: Tensor) -> Tensor:  # fmt: skip
+def shade_gaussians(
+    normal: Tensor,
+    wo: Tensor,
+    base_color: Tensor,
+    alpha: Tensor,
+    metallic: Tensor,
+    axis: Tensor,
+    sharpness: Tensor,
+    amplitude: Tensor,
+) -> Tensor:
     """``(N, 3)``: Wang et al. 2009, section 4, for each of four lobes of normals and K of light, and the diffuse part
     with one Fresnel factor, at the axis of the light's product with the cosine (a lobe of sharpness 2.133)."""
     dot = lambda a, b: (a * b).sum(-1, keepdim=True)  # noqa: E731
@@ -174,8 +183,16 @@ def lookup_envmap(radiance: Tensor, d: Tensor) -> Tensor:
     return out[0, :, 0].T.reshape(*d.shape)
 
 
-def direct_light(normal: Tensor, wo: Tensor, base_color: Tensor, alpha: Tensor, metallic: Tensor, radiance: Tensor,
-                 height: int = 256, paint: str = "conserving") -> Tensor:  # fmt: skip
+def direct_light(
+    normal: Tensor,
+    wo: Tensor,
+    base_color: Tensor,
+    alpha: Tensor,
+    metallic: Tensor,
+    radiance: Tensor,
+    height: int = 256,
+    paint: str = "conserving",
+) -> Tensor:
     """Radiance ``(3,)`` of one unshadowed point by midpoint quadrature over the sphere."""
     d, angle = sphere_grid(height)
     d = d[(d @ normal) > 1e-6]

@@ -39,8 +39,13 @@ def ball_mesh(subdivisions: int, radius: float) -> Mesh:
     v = torch.tensor(m.vertices, dtype=torch.float32)
     n = torch.nn.functional.normalize(v, dim=-1)
     tangent = torch.nn.functional.normalize(torch.linalg.cross(n.new_tensor([0.3, 0.5, 0.81]).expand_as(n), n), dim=-1)
-    return Mesh(v, torch.tensor(m.faces, dtype=torch.int32), n, (0.5 + 0.45 * n[:, :2]).contiguous(),
-                torch.cat([tangent, torch.ones(len(v), 1)], -1))  # fmt: skip
+    return Mesh(
+        v,
+        torch.tensor(m.faces, dtype=torch.int32),
+        n,
+        (0.5 + 0.45 * n[:, :2]).contiguous(),
+        torch.cat([tangent, torch.ones(len(v), 1)], -1),
+    )
 
 
 def shadow_caster(device, backend="auto"):

@@ -29,6 +29,11 @@ def inputs(n, device):
     """Leaves in the order of ``shade``: normal, wo, base, roughness, metallic."""
     g = torch.Generator().manual_seed(4)
     normal, wo = points(n, seed=6)
-    values = [normal, wo, 0.2 + 0.6 * torch.rand(n, 3, generator=g), 0.4 + 0.4 * torch.rand(n, generator=g),
-              torch.rand(n, generator=g)]  # fmt: skip
+    values = [
+        normal,
+        wo,
+        0.2 + 0.6 * torch.rand(n, 3, generator=g),
+        0.4 + 0.4 * torch.rand(n, generator=g),
+        torch.rand(n, generator=g),
+    ]
     return [v.to(device) for v in values]

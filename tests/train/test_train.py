@@ -11,7 +11,7 @@ from safetensors.torch import save_file
 from reli3d.geometry.distance import signed_distance
 from reli3d.geometry.hull import hull_distance
 from reli3d.nn.local import LocalField, LocalReconstructor
-from reli3d.nn.presets import LOCAL, SMALL
+from reli3d.nn.presets import OFFICIAL, SMALL
 from reli3d.nn.reni import map_directions
 from reli3d.render.camera import project
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
@@ -120,7 +120,7 @@ def test_batches_are_a_function_of_seed_and_step(folder):
 
 def test_every_parameter_gets_a_gradient(samples):
     torch.manual_seed(0)
-    model = LocalReconstructor(LOCAL)
+    model = LocalReconstructor(SMALL)
     for _ in range(2):  # the last layers start at zero, so what lies before them learns from the second step on
         terms = losses(model, samples[0])
         assert all(bool(torch.isfinite(v)) for v in terms.values())
@@ -136,7 +136,7 @@ def test_every_parameter_gets_a_gradient(samples):
 def test_training_learns_logs_and_resumes(folder, tmp_path):
     torch.manual_seed(0)
     config = TrainConfig(str(folder), str(tmp_path), steps=50, batch=1, points=256, max_views=1, warmup=5, seed=3)
-    model = LocalReconstructor(LOCAL)
+    model = LocalReconstructor(SMALL)
     (sample,) = next(batches(folder, size=1, points=256, max_views=1, seed=3))
     before = losses(model, sample)
     train(model, config)
@@ -145,10 +145,10 @@ def test_training_learns_logs_and_resumes(folder, tmp_path):
     after = losses(model, sample)
     whole = [float(sum(WEIGHTS[k] * v for k, v in terms.items())) for terms in (before, after)]
     assert whole[1] < 0.9 * whole[0]  # 50 steps on two objects
-    train(LocalReconstructor(LOCAL), dataclasses.replace(config, steps=52))
+    train(LocalReconstructor(SMALL), dataclasses.replace(config, steps=52))
     state = torch.load(tmp_path / "state.pt", weights_only=True)
     assert state["step"] == 52
-    model = averaged_model(tmp_path / "state.pt", LocalReconstructor(LOCAL))
+    model = averaged_model(tmp_path / "state.pt", LocalReconstructor(SMALL))
     assert torch.equal(model.state_dict()["level.0.weight"], state["average"]["level.0.weight"])
 
 
@@ -164,7 +164,7 @@ def test_the_light_prior_fits_a_map():
     from reli3d.nn.reni import EnvironmentDecoder
 
     maps = scale_free(0.3 + map_directions(64)[None, ..., 1:2].clamp(min=0).expand(-1, -1, -1, 3) * 2.0)
-    decoder = EnvironmentDecoder(SMALL.reni)
+    decoder = EnvironmentDecoder(OFFICIAL.reni)
     latents = fit(decoder, maps, steps=60, minutes=5.0, rays=256, batch=1)
     with torch.no_grad():
         got = decoder.radiance(latents, torch.eye(3)[None], torch.zeros(1), decoder.sample_directions[None])
@@ -194,7 +194,7 @@ def test_calibration_gives_back_what_is_missing(folder, tmp_path):
     shape = make_object(seed)
     torch.manual_seed(0)
     # the cells of a coarser grid shift the best offset by a step
-    model = _Thin(dataclasses.replace(LOCAL, resolution=64)).eval()
+    model = _Thin(dataclasses.replace(SMALL, resolution=64)).eval()
     model.shape = torch.from_numpy(shape.vertices), torch.from_numpy(shape.faces)
     tried = calibrate(model, tmp_path, objects=1)
     preset = model.preset

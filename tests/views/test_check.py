@@ -4,8 +4,9 @@ import pytest
 import torch
 from PIL import Image
 
-from reli3d.views.check import explain_cameras, rig_picture
+from reli3d.views.check import explain_cameras, rig_picture, up_axis, verdict
 from reli3d.views.folder import load_views
+from tests.support.rigs import rig as cameras
 from tests.support.rigs import sphere_views
 
 FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
@@ -107,3 +108,44 @@ def test_real_captures(shared_data, name):
     for mistake in ("flipped", "world_to_camera", "colmap", "transposed"):
         change, words = MISTAKES[mistake]
         assert words in explain_cameras(replace(views, c2w=change(views.c2w)))[-1]
+
+
+TURNS = {  # rotations of the world that carry +Y to the named axis
+    "y": torch.eye(3),
+    "-y": torch.diag(torch.tensor([1.0, -1.0, -1.0])),
+    "x": torch.tensor([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
+    "-x": torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
+    "z": torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
+    "-z": torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
+}
+
+
+def turned(c2w, rotation):
+    result = c2w.clone()
+    result[:, :3] = rotation @ c2w[:, :3]
+    return result
+
+
+@pytest.mark.parametrize("axis", TURNS)
+def test_the_up_axis_is_told_from_upright_cameras(axis):
+    """Around at many heights, one of them nearly from above, all held upright but for a few degrees."""
+    c2w = cameras((0, 20, 2), (80, 70, 2), (170, -10, 2.5), (260, 35, 2), (310, 50, 3))
+    lean = torch.tensor(0.06)
+    c2w[2, :3, :2] = c2w[2, :3, :2] @ torch.stack([lean.cos(), -lean.sin(), lean.sin(), lean.cos()]).view(2, 2)
+    assert up_axis(turned(c2w, TURNS[axis])) == axis
+    halfway = torch.matrix_exp(torch.linalg.cross(torch.eye(3), torch.tensor([0.5, 0.3, 0.4]).expand(3, 3)))
+    assert up_axis(turned(c2w, halfway @ TURNS[axis])) is None  # 40 degrees from every axis
+
+
+def test_cameras_that_do_not_tell_up_suggest_nothing():
+    assert up_axis(cameras((0, 20, 2))) is None  # one
+    assert up_axis(cameras((0, 20, 2), (4, 20, 2), (8, 25, 2))) is None  # from one side: up or towards us
+    rolls = torch.randn(24, 3, 3, generator=torch.Generator().manual_seed(1))
+    c2w = torch.eye(4).repeat(24, 1, 1)
+    c2w[:, :3, :3] = torch.linalg.qr(rolls)[0]
+    assert up_axis(c2w) is None
+
+
+def test_the_verdict_alone_is_the_last_line():
+    views = rig()
+    assert verdict(views) == explain_cameras(views)[-1]

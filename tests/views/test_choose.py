@@ -89,6 +89,9 @@ def test_a_folder_of_sixty_is_read_as_its_four_distinct_views(tmp_path):
         assert views.in_folder == 60 and torch.allclose(views.c2w, cameras[[0, 17, 33, 51]], atol=1e-5)
         (note,) = views.notes
         assert note.startswith("4 of 60 views taken, farthest apart in direction and distance: 0, 17, 33, 51")
+    whole = load_views(tmp_path, every=True)
+    assert len(whole) == 60 and whole.notes == views.notes and torch.equal(whole.taken().c2w, views.c2w)
+    assert whole.taken().taken() is not whole and len(whole.taken().taken()) == 4
     first = load_views(tmp_path, first_views=4)
     assert torch.allclose(first.c2w, cameras[:4], atol=1e-5) and len(first.notes) == 2  # near-duplicates, narrow
     assert len(load_views(tmp_path, views=MAX_VIEWS)) == MAX_VIEWS

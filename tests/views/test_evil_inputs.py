@@ -106,7 +106,12 @@ def test_random_damage_is_read_or_refused(tmp_path, rounds):
     from reli3d.io.hdr import write_hdr
 
     write_hdr(tmp_path / "seed.hdr", torch.rand(16, 32, 3, generator=torch.Generator().manual_seed(0)))
-    done = subprocess.run([sys.executable, "-c", FUZZ, tmp_path, tmp_path / "seed.hdr", str(rounds)], timeout=300,
-                          cwd=ROOT, capture_output=True, text=True)  # fmt: skip
+    done = subprocess.run(
+        [sys.executable, "-c", FUZZ, tmp_path, tmp_path / "seed.hdr", str(rounds)],
+        timeout=300,
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+    )
     assert done.returncode == 0, done.stderr[-2000:]
     assert "accepted" in done.stdout

@@ -39,8 +39,11 @@ def test_object_folder_as_published(tmp_path):
     assert views.names == ("rgba/2.png", "rgba/1.png", "rgba/0.png")
     assert views.coordinate_system == "blender"
     s = evil.SIDE / 2
-    expected = [[s / math.tan(0.35), s / math.tan(0.35), s, s], [s / math.tan(0.3), s / math.tan(0.2), 10.0, 20.5],
-                [s / math.tan(0.25), s / math.tan(0.25), s, s]]  # fmt: skip
+    expected = [
+        [s / math.tan(0.35), s / math.tan(0.35), s, s],
+        [s / math.tan(0.3), s / math.tan(0.2), 10.0, 20.5],
+        [s / math.tan(0.25), s / math.tan(0.25), s, s],
+    ]
     torch.testing.assert_close(views.intrinsics, torch.tensor(expected), rtol=1e-6, atol=0)
     torch.testing.assert_close(views.c2w, torch.tensor([evil.pose(2.1 * i) for i in (2, 1, 0)]), rtol=0, atol=1e-6)
     assert len(views.notes) == 1
@@ -50,8 +53,11 @@ def test_object_folder_as_published(tmp_path):
 
 def test_blender_folder(tmp_path):
     photo(tmp_path / "train/r_0.png")
-    transforms(tmp_path, [{"file_path": "./train/r_0", "rotation": 0.1, "transform_matrix": evil.pose(0.3)}],
-               camera_angle_x=0.6911112070083618)  # fmt: skip
+    transforms(
+        tmp_path,
+        [{"file_path": "./train/r_0", "rotation": 0.1, "transform_matrix": evil.pose(0.3)}],
+        camera_angle_x=0.6911112070083618,
+    )
     views = load_views(tmp_path)
     focal = 0.5 * 40 / math.tan(0.5 * 0.6911112070083618)  # the focal length of x serves y: square pixels
     torch.testing.assert_close(views.intrinsics, torch.tensor([[focal, focal, 20.0, 15.0]]))
@@ -94,8 +100,10 @@ def test_colmap_folder_agrees_with_colmaps_own_projection(tmp_path):
     (tmp_path / "sparse/0").mkdir(parents=True)
     cameras = "# c\n3 PINHOLE 40 30 55.5 56.5 21.0 13.0\n9 SIMPLE_PINHOLE 40 30 44 20 15\n"
     (tmp_path / "sparse/0/cameras.txt").write_text(cameras)
-    lines = [f"{i} {' '.join(map(repr, map(float, q)))} {' '.join(map(repr, map(float, p)))} {c} {n}\n"
-             for i, q, p, c, n in zip((5, 2), quaternions, t, (3, 9), ("sub dir/ü 1.png", "a.png"))]  # fmt: skip
+    lines = [
+        f"{i} {' '.join(map(repr, map(float, q)))} {' '.join(map(repr, map(float, p)))} {c} {n}\n"
+        for i, q, p, c, n in zip((5, 2), quaternions, t, (3, 9), ("sub dir/ü 1.png", "a.png"))
+    ]
     (tmp_path / "sparse/0/images.txt").write_text(f"# i\n{lines[0]}1 2 -1 3 4 7\n{lines[1]}\n")  # no points: empty line
     views = load_views(tmp_path)
     assert views.names == ("a.png", "sub dir/ü 1.png")
@@ -191,10 +199,15 @@ def test_paths_with_spaces_and_other_letters(tmp_path):
     assert load_views(str(folder)).names == ("im ages/é 1.png",)
 
 
-@pytest.mark.parametrize("name, system, count", [
-    ("Camera_01", "ogl", 4), ("Lantern_01", "ogl", 4), ("UCO3D_217-72983-41010", "blender", 4),
-    ("UCO3D_639-13622-90739", "blender", 4),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "name, system, count",
+    [
+        ("Camera_01", "ogl", 4),
+        ("Lantern_01", "ogl", 4),
+        ("UCO3D_217-72983-41010", "blender", 4),
+        ("UCO3D_639-13622-90739", "blender", 4),
+    ],
+)
 def test_real_captures(shared_data, name, system, count):
     folder = shared_data / "captures" / name
     views = load_views(folder)

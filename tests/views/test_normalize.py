@@ -37,19 +37,29 @@ def test_similarities_are_a_group():
     assert a.apply(points.float()).dtype == torch.float32
 
 
-@pytest.mark.parametrize("matrix", [
-    torch.zeros(4, 4), torch.diag(torch.tensor([1.0, 1.0, -1.0, 1.0])), torch.diag(torch.tensor([1.0, 2.0, 1.0, 1.0])),
-    torch.eye(3), torch.full((4, 4), math.nan), torch.eye(4) * 2,
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "matrix",
+    [
+        torch.zeros(4, 4),
+        torch.diag(torch.tensor([1.0, 1.0, -1.0, 1.0])),
+        torch.diag(torch.tensor([1.0, 2.0, 1.0, 1.0])),
+        torch.eye(3),
+        torch.full((4, 4), math.nan),
+        torch.eye(4) * 2,
+    ],
+)
 def test_other_matrices_are_refused(matrix):
     with pytest.raises(ValueError, match="matrix: expected"):
         Similarity.from_matrix(matrix)
 
 
-@pytest.mark.parametrize("spheres, low, high", [
-    (BALL, (-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)),
-    (((0.3, 0.0, 0.0, 0.1), (-0.3, 0.1, 0.2, 0.2)), (-0.5, -0.1, -0.1), (0.4, 0.3, 0.4)),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "spheres, low, high",
+    [
+        (BALL, (-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)),
+        (((0.3, 0.0, 0.0, 0.1), (-0.3, 0.1, 0.2, 0.2)), (-0.5, -0.1, -0.1), (0.4, 0.3, 0.4)),
+    ],
+)
 def test_the_hull_of_many_views_is_the_object(spheres, low, high):
     axes = 4.0 * torch.cat([torch.eye(3), -torch.eye(3)])
     hull = visual_hull(sphere_views(spheres, eyes=torch.cat([axes, eyes_around(8, 4.0)]), fov=0.4, size=(200, 200)))
@@ -60,10 +70,18 @@ def test_the_hull_of_many_views_is_the_object(spheres, low, high):
     assert limit < 0.1
 
 
-@pytest.mark.parametrize("count, scale, centre", [
-    (1, 1.0, (0, 0, 0)), (1, 40.0, (0, 0, 0)), (2, 1.0, (0, 0, 0)), (2, 40.0, (300, -20, 5)), (3, 0.01, (0.02, 0.1, 0)),
-    (8, 40.0, (300, -20, 5)), (8, 0.01, (0.02, 0.1, 0)),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "count, scale, centre",
+    [
+        (1, 1.0, (0, 0, 0)),
+        (1, 40.0, (0, 0, 0)),
+        (2, 1.0, (0, 0, 0)),
+        (2, 40.0, (300, -20, 5)),
+        (3, 0.01, (0.02, 0.1, 0)),
+        (8, 40.0, (300, -20, 5)),
+        (8, 0.01, (0.02, 0.1, 0)),
+    ],
+)
 def test_an_object_anywhere_is_centred_and_scaled(count, scale, centre):
     """A ball of diameter 1.  One view finds its middle if it is the point of the ray nearest to the origin."""
     centre = torch.tensor(centre, dtype=torch.float64)

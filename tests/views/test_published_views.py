@@ -73,10 +73,14 @@ def test_a_capture_is_prepared_as_published(goldens, shared_data):
         ("jpeg_round_trip", lambda pixels: pixels),
         ("JPEG_CHROMA", "4:4:4"),
         ("JPEG_QUALITY", 94),
-        ("_resized", lambda pixels, size: interpolate(pixels.permute(2, 0, 1)[None], (size, size), mode="bilinear",
-                                                      antialias=True)[0].permute(1, 2, 0)),
+        (
+            "_resized",
+            lambda pixels, size: interpolate(
+                pixels.permute(2, 0, 1)[None], (size, size), mode="bilinear", antialias=True
+            )[0].permute(1, 2, 0),
+        ),
     ],
-)  # fmt: skip
+)
 def test_no_step_can_be_left_out_or_changed(goldens, shared_data, monkeypatch, name, instead):
     golden = np.load(goldens / "mapper_Camera_01.npz")["image_stride16"][0]
     monkeypatch.setattr(module, name, instead)

@@ -55,8 +55,13 @@ def test_a_crop_over_the_border_has_no_mask_and_the_edge_colour():
 
 def test_small_pixels_do_not_alias():
     checker = (torch.arange(128)[:, None] + torch.arange(128)) % 2
-    views = Views((checker[..., None].expand(-1, -1, 3).float(),), (torch.ones(128, 128),), torch.eye(4)[None],
-                  torch.ones(1, 4), ("c",))  # fmt: skip
+    views = Views(
+        (checker[..., None].expand(-1, -1, 3).float(),),
+        (torch.ones(128, 128),),
+        torch.eye(4)[None],
+        torch.ones(1, 4),
+        ("c",),
+    )
     image = views.resampled(16, crop=False).images[0]
     # a triangle filter over 16 pixels leaves 1/64 of a checkerboard; the border, where it is cut, a little more
     assert float((image - 0.5).abs().max()) < 0.02

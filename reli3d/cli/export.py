@@ -1,0 +1,104 @@
+"""``reli3d export``: a reconstruction in another format, with fewer triangles or smaller textures."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+from reli3d.cli.ending import check_range, command
+from reli3d.cli.helping import Defaults
+
+FORMATS = ("glb", "obj", "usdz")
+
+
+def parser() -> argparse.ArgumentParser:
+    p = argparse.ArgumentParser(
+        formatter_class=Defaults,
+        prog="reli3d export",
+        description="Write a GLB of one surface in another format.  The files' names go to stdout.",
+        epilog="Exit code: 0 done, 2 wrong input.",
+    )
+    p.add_argument("glb", type=Path, help="a GLB with one surface, such as mesh.glb of a result")
+    p.add_argument(
+        "--format",
+        choices=FORMATS,
+        default="glb",
+        help="obj has a material file and four PNG textures beside it; usdz needs pip install 'reli3d[usd]'",
+    )
+    p.add_argument(
+        "--output", type=Path, default=Path("exports"), help="folder; a file in it with the same name is replaced"
+    )
+    p.add_argument(
+        "--decimate",
+        type=int,
+        metavar="N",
+        help="at most N triangles, 16 to 10^7, with a new atlas (pip install 'reli3d[mesh]')",
+    )
+    p.add_argument("--texture-size", type=int, help="texels along a side, 64 to 4096 (default those of the GLB)")
+    p.add_argument(
+        "--textures",
+        choices=("png", "webp"),
+        default="png",
+        help="of glb: webp, without loss as png, is smaller, and needs a viewer that knows EXT_texture_webp",
+    )
+    p.add_argument("--json", action="store_true", help="print one JSON object instead of the names")
+    return p
+
+
+@command("reli3d export")
+def main(argv: list[str] | None = None) -> int:
+    args = parser().parse_args(argv)
+    _check(args)
+    files, record = export(args)
+    print(json.dumps({"files": [str(f) for f in files], **record}) if args.json else "\n".join(map(str, files)))
+    return 0
+
+
+def _check(args: argparse.Namespace) -> None:
+    from reli3d.output.folder import check_folder
+
+    check_range("decimate", args.decimate, 16, 10**7)
+    check_range("texture-size", args.texture_size, 64, 4096)
+    if args.textures != "png" and args.format != "glb":
+        raise ValueError(f"--textures: expected png with --format {args.format}, got {args.textures}")
+    check_folder(args.output)
+
+
+def export(args: argparse.Namespace) -> tuple[list[Path], dict]:
+    """Write the files; their paths, and what was written in numbers."""
+    from reli3d.fit.transfer import dressed
+    from reli3d.geometry.mesh import vertex_normals
+    from reli3d.geometry.remesh import decimate
+    from reli3d.io.files import write_bytes
+    from reli3d.io.glb import glb_bytes, read_glb
+    from reli3d.io.obj import obj_files
+    from reli3d.io.usd import usdz_bytes
+
+    parts = read_glb(args.glb)
+    if len(parts) != 1:
+        raise ValueError(f"{args.glb}: expected a GLB with one surface, got {len(parts)}")
+    asset, size = parts[0], args.texture_size or parts[0].textures.size
+    if args.decimate is not None and len(asset.mesh.faces) > args.decimate:
+        mesh = decimate(asset.mesh, args.decimate)
+        asset = dressed(replace(mesh, normals=vertex_normals(mesh.vertices, mesh.faces)), asset, size)
+    elif size != asset.textures.size:
+        asset = dressed(asset.mesh, asset, size)
+    name = args.glb.stem
+    if args.format == "glb":
+        files = {f"{name}.glb": glb_bytes(asset, textures=args.textures)}
+    elif args.format == "obj":
+        files = obj_files(asset, name)
+    else:
+        files = {f"{name}.usdz": usdz_bytes(asset)}
+    args.output.mkdir(parents=True, exist_ok=True)
+    for file, data in files.items():
+        write_bytes(args.output / file, data)
+    record = {"triangles": len(asset.mesh.faces), "texture_size": asset.textures.size}
+    return [args.output / file for file in files], record
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,141 @@
+"""``reli3d-stages``: train the paper's network, one stage a call."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import sys
+from pathlib import Path
+
+from reli3d.cli.ending import check_range, command
+from reli3d.cli.helping import Defaults
+
+HELD = 3  # objects in the pictures
+OVERRIDES = ("steps", "batch", "rate", "image_size", "patch", "targets", "lobes", "resolution")  # of a stage
+
+
+def parser() -> argparse.ArgumentParser:
+    p = argparse.ArgumentParser(
+        formatter_class=Defaults,
+        prog="reli3d-stages",
+        description="Train the paper's network, one stage a call; continues where it stopped.  Under torchrun the "
+        "processes share each batch.",
+    )
+    p.add_argument(
+        "stage",
+        help="volume, gaussians, surface, monte_carlo; of official: volume, gaussians128, "
+        "gaussians256, gaussians512, monte_carlo",
+    )
+    p.add_argument("output", type=Path, help="folder of the checkpoint, the log, curves and pictures")
+    p.add_argument("data", type=Path, nargs="*", help="folders of samples, of captures, or of shards")
+    p.add_argument("--preset", choices=("tiny", "official"), default="tiny")
+    p.add_argument("--start", type=Path, help="state.pt of the stage before")
+    p.add_argument(
+        "--prior",
+        type=Path,
+        help="light prior of reli3d.train.light_prior: it stays as it is, and its "
+        "latents of the samples' lights are part of the loss",
+    )
+    p.add_argument("--validation", type=Path, help="folder of held-back samples for the pictures")
+    p.add_argument("--seed", type=int, default=0)
+    p.add_argument("--inputs", type=int, default=4, help="an object is read from 1 to this many views")
+    p.add_argument("--perceptual", choices=("gradients", "lpips"), default="gradients")
+    p.add_argument("--bfloat16", action="store_true", help="autocast of the trunk")
+    p.add_argument("--checkpointing", action="store_true", help="compute the trunk's layers again in the backward pass")
+    p.add_argument("--save-every", type=int, default=200, help="steps")
+    p.add_argument("--export", type=Path, help="write the averaged weights of the checkpoint to this file and stop")
+    p.add_argument("--licence", default="not stated", help="of the exported weights")
+    p.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
+    for name in OVERRIDES:
+        kind = float if name == "rate" else int
+        p.add_argument(f"--{name.replace('_', '-')}", type=kind, default=argparse.SUPPRESS, help="of the stage's own")
+    return p
+
+
+def report(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)
+
+
+def run_of(args: argparse.Namespace):
+    """The configuration that the arguments ask for.  Raises ValueError for what would end the work later."""
+    from reli3d.output.folder import check_folder
+    from reli3d.train.stages.config import PAPER, TINY, Run
+
+    if not args.data and not args.export:
+        raise ValueError("data: expected folders of samples, captures or shards, got none")
+    stages = PAPER if args.preset == "official" else TINY
+    if args.stage not in stages:
+        raise ValueError(f"stage: expected {', '.join(stages)} for {args.preset}, got {args.stage}")
+    own = {name: getattr(args, name) for name in OVERRIDES if hasattr(args, name)}
+    for name, low, high in (
+        ("steps", 0, 10**9),
+        ("batch", 1, 4096),
+        ("rate", 1e-9, 10.0),
+        ("image_size", 8, 2048),
+        ("patch", 0, 2048),
+        ("targets", 1, 16),
+        ("lobes", 1, 4096),
+        ("resolution", 4, 256),
+    ):
+        check_range(name.replace("_", "-"), own.get(name), low, high)
+    check_range("save-every", args.save_every, 1, 10**9)
+    check_range("seed", args.seed, 0, 10**9)
+    check_folder(args.export.parent if args.export else args.output)
+    return Run(tuple(map(str, args.data)), str(args.output), dataclasses.replace(stages[args.stage], **own),
+               start=str(args.start or ""), seed=args.seed, inputs=args.inputs, perceptual=args.perceptual,
+               save_every=args.save_every, bfloat16=args.bfloat16, checkpointing=args.checkpointing)  # fmt: skip
+
+
+@command("reli3d-stages")
+def main(argv: list[str] | None = None) -> int:
+    args = parser().parse_args(argv)
+    run = run_of(args)
+    import torch
+
+    from reli3d.nn import weights
+    from reli3d.nn.model import Reconstructor
+    from reli3d.nn.presets import OFFICIAL, TINY
+    from reli3d.train.stages.latents import fitted, load_prior
+    from reli3d.train.stages.loop import averaged, drawn, load_state, train
+    from reli3d.train.stages.sources import source
+    from reli3d.train.stages.views import Samples
+    from reli3d.train.workers import Workers
+
+    if args.device == "cuda" and not torch.cuda.is_available():
+        raise ValueError("--device: expected a CUDA device, got none; leave it out to train on the CPU")
+    if args.export:
+        model = Reconstructor(TINY if args.preset == "tiny" else OFFICIAL)
+        model = averaged(model, load_state(args.output / "state.pt", model)["average"])
+        print(weights.save(args.export, model, licence=args.licence).path)
+        return 0
+    sources = [source(folder) for folder in args.data]
+    held = source(args.validation) if args.validation else None
+    torch.manual_seed(args.seed)
+    model = Reconstructor(TINY if args.preset == "tiny" else OFFICIAL)
+    if args.start:
+        load_state(args.start, model)
+    if args.prior:
+        load_prior(model, args.prior)
+    workers = Workers.join()
+    if args.prior:
+        for one, folder in zip(sources, args.data, strict=True):
+            if isinstance(one, Samples):
+                cache = args.output / f"{folder.name}.{workers.rank}.latents"
+                one.latents = fitted(model.environment, one.files, cache, progress=report)
+    if workers.rank == 0:
+        report(run.text())
+    pictured = (
+        [
+            drawn(dataclasses.replace(run, stage=dataclasses.replace(run.stage, patch=0)), [held], model, 0, k)
+            for k in range(HELD)
+        ]
+        if held
+        else []
+    )
+    train(model.to(args.device), run, sources, workers, held_back=pictured)
+    workers.leave()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

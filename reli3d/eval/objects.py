@@ -1,0 +1,190 @@
+"""The paper's tables on any folder of textured GLB files: each is rendered, reconstructed and compared with itself.
+
+An object is centred and its longest side made 1.  Input views lie about it under one map of light; held-out views show
+the same light, another light and the materials.  The reconstruction sees the input views alone, masks and cameras.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from reli3d._bridge import present
+from reli3d.eval.metrics import geometry, psnr, ssim, surface_samples
+from reli3d.geometry.mesh import Mesh
+from reli3d.io.glb import read_glb
+from reli3d.pipeline import Network, NoSurface, ReconstructOptions, reconstruct
+from reli3d.render.asset import Asset
+from reli3d.render.camera import Camera
+from reli3d.render.color import linear_to_srgb
+from reli3d.render.environment import Environment
+from reli3d.render.render import render
+from reli3d.render.shading import ShadeOptions
+from reli3d.synthetic.procedural import sample_cameras
+from reli3d.views.views import Views
+
+UNSEEN = 4  # views that are compared
+SAMPLES = (16, 16, 4)
+EXPOSED = 0.6  # linear value of the 90th percentile of the object in the first view
+MAPS = ("base_color", "roughness", "metallic")
+COLUMNS = {  # the paper's groups
+    "3D": ("cd", "fs@0.1", "fs@0.2", "fs@0.5"),
+    "image": ("image_psnr", "image_ssim"),
+    "relit": ("relit_psnr", "relit_ssim"),
+    **{name: (f"{name}_psnr", f"{name}_ssim") for name in MAPS},
+}
+
+
+@dataclass(frozen=True)
+class Truth:
+    """An object as it is, and how it is looked at."""
+
+    name: str
+    parts: list[Asset]
+    light: Environment
+    other: Environment
+    cameras: list[Camera]  # the inputs, then ``UNSEEN`` others
+
+
+def load_truth(path: Path, light: Environment, other: Environment, *, inputs: int, size: int, seed: int) -> Truth:
+    """The object of a file among cameras of the paper's protocol."""
+    parts = read_glb(path)
+    points = torch.cat([p.mesh.vertices for p in parts])
+    low, high = points.amin(0), points.amax(0)
+    scale = 1.0 / float((high - low).max())
+    moved = [replace(p, mesh=replace(p.mesh, vertices=((p.mesh.vertices - (low + high) / 2) * scale).contiguous()))
+             for p in parts]  # fmt: skip
+    c2w, fov = sample_cameras(np.random.default_rng((seed, 5)), inputs + UNSEEN)
+    cameras = [Camera.from_fov(torch.as_tensor(m), float(f), size, size) for m, f in zip(c2w, fov, strict=True)]
+    return Truth(path.stem, moved, light, other, cameras)
+
+
+def layers(asset: Asset | Sequence[Asset], camera: Camera, light: Environment, other: Environment,
+           exposures: tuple[float, float]) -> dict[str, Tensor]:  # fmt: skip
+    """Pictures ``(H, W, 3)`` in [0, 1] over black: in both lights, and the maps; and ``alpha (H, W)``."""
+    own = render(asset, camera, light, options=ShadeOptions(SAMPLES, 1))
+    lit = render(asset, camera, other, options=ShadeOptions(SAMPLES, 2))
+    shown = {"alpha": own.alpha}
+    for name, picture, exposure in (("image", own, exposures[0]), ("relit", lit, exposures[1])):
+        shown[name] = linear_to_srgb((picture.radiance * exposure).clamp(0.0, 1.0))
+    cover = own.alpha[..., None]
+    shown["base_color"] = linear_to_srgb(own.base_color.clamp(0.0, 1.0)) * cover
+    for name in ("roughness", "metallic"):
+        shown[name] = getattr(own, name)[..., None].expand(*own.alpha.shape, 3) * cover
+    return shown
+
+
+def exposure_of(truth: Truth, light: Environment) -> float:
+    """What brings the first view's 90th percentile to :data:`EXPOSED`."""
+    picture = render(truth.parts, truth.cameras[0], light, options=ShadeOptions(SAMPLES, 0))
+    shown = picture.radiance[picture.alpha > 0.99].mean(-1)
+    return EXPOSED / max(float(shown.quantile(0.9)) if len(shown) else 1.0, 1e-3)
+
+
+def input_views(truth: Truth, count: int, hero: int, exposure: float) -> Views:
+    """The first ``count`` views as photographs, the one of index ``hero`` in front."""
+    order = [hero, *(k for k in range(count) if k != hero)]
+    images, masks = [], []
+    for k in order:
+        picture = render(truth.parts, truth.cameras[k], truth.light, options=ShadeOptions(SAMPLES, 3),
+                         background="environment", supersampling=2)  # fmt: skip
+        images.append(linear_to_srgb((picture.radiance * exposure).clamp(0.0, 1.0)))
+        masks.append(picture.alpha)
+    cameras = [truth.cameras[k] for k in order]
+    return Views(tuple(images), tuple(masks), torch.stack([c.c2w for c in cameras]),
+                 torch.stack([c.intrinsics for c in cameras]), tuple(f"{k:04d}" for k in order))  # fmt: skip
+
+
+@torch.no_grad()
+def evaluate(model: Network, truth: Truth, count: int, *, hero: str = "random", icp: bool = False,
+             seed: int = 0) -> tuple[dict[str, float], list[Tensor]]:  # fmt: skip
+    """Figures of one object from ``count`` views, and a row of pictures; ``empty`` 1 where nothing was found.
+
+    hero: ``random``, or ``first``.  Without a surface the pictures are black and there is no geometry to compare.
+    """
+    exposures = exposure_of(truth, truth.light), exposure_of(truth, truth.other)
+    front = int(np.random.default_rng((seed, count)).integers(count)) if hero == "random" else 0
+    views = input_views(truth, count, front, exposures[0])
+    unseen = truth.cameras[-UNSEEN:]
+    want = [layers(truth.parts, c, truth.light, truth.other, exposures) for c in unseen]
+    found = {"empty": 0.0}
+    try:
+        options = ReconstructOptions(texture_size=512, normalization="none")
+        asset = reconstruct(views, weights=model, options=options)
+    except NoSurface:
+        found, got = {"empty": 1.0}, [{k: torch.zeros_like(v) for k, v in w.items()} for w in want]
+    else:
+        own = present("environment", asset.environment)
+        got = [layers(asset, c, own, truth.other, (1.0, exposures[1])) for c in unseen]
+        mesh = joined([p.mesh for p in truth.parts])
+        found |= geometry(surface_samples(asset.mesh), surface_samples(mesh, seed=1), icp=icp)
+    for name in ("image", "relit", *MAPS):
+        found[f"{name}_psnr"] = float(np.mean([psnr(g[name], w[name]) for g, w in zip(got, want, strict=True)]))
+        found[f"{name}_ssim"] = float(np.mean([ssim(g[name], w[name]) for g, w in zip(got, want, strict=True)]))
+    names = ("image", "relit", "base_color")
+    return found, [views.images[0], *(x[n] for n in names for x in (want[0], got[0]))]
+
+
+def joined(meshes: Sequence[Mesh]) -> Mesh:
+    """One mesh of several, positions and faces."""
+    starts = np.cumsum([0] + [len(m.vertices) for m in meshes])
+    faces = [m.faces + int(s) for m, s in zip(meshes, starts)]
+    return Mesh(torch.cat([m.vertices for m in meshes]), torch.cat(faces))
+
+
+def summary(rows: Sequence[dict[str, float]]) -> dict[str, float]:
+    """Means over the objects that have the figure, and how many objects there were."""
+    names = dict.fromkeys(name for row in rows for name in row)
+    means = {name: float(np.mean([row[name] for row in rows if name in row])) for name in names}
+    return {"objects": float(len(rows)), **means}
+
+
+def markdown(tables: dict[str, dict[str, float]]) -> str:
+    """The paper's layout: a row for each number of views, groups of columns; a dash where there is no figure."""
+    names = [c for columns in COLUMNS.values() for c in columns]
+    lines = ["| views | objects | " + " | ".join(names) + " |", "|---" * (len(names) + 2) + "|"]
+    for label, row in tables.items():
+        cells = [f"{row[n]:.3f}" if n in row else "-" for n in names]
+        lines.append(f"| {label} | {row['objects']:.0f} | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def as_csv(rows: Sequence[dict]) -> str:
+    """All objects, one a line."""
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    out = io.StringIO()
+    writer = csv.DictWriter(out, names, restval="", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return out.getvalue()
+
+
+def sheet(rows: Sequence[Sequence[Tensor]]) -> Tensor:
+    """Pictures side by side: hero, then truth and result of image, relit and base colour; uint8."""
+    return (torch.cat([torch.cat([t.clamp(0, 1).cpu() for t in row], 1) for row in rows]) * 255 + 0.5).to(torch.uint8)
+
+
+def table(model: Network, files: Sequence[Path], lights: Sequence[Environment], counts: Sequence[int], *,
+          size: int = 128, hero: str = "random", icp: bool = False, seed: int = 0,
+          progress: Callable[[str], None] = lambda line: None) -> tuple[dict, list[dict], Tensor]:  # fmt: skip
+    """Means for each number of views, all rows, and the sheet of the largest number; lights go round the objects."""
+    rows: list[dict] = []
+    pictures = []
+    for k, path in enumerate(files):
+        light, other = lights[k % len(lights)], lights[(k + 1) % len(lights)]
+        truth = load_truth(path, light, other, inputs=max(counts), size=size, seed=seed + k)
+        for count in counts:
+            found, shown = evaluate(model, truth, count, hero=hero, icp=icp, seed=seed + k)
+            rows.append({"object": truth.name, "views": count, **found})
+            progress(f"{truth.name}, {count} views: " + ", ".join(f"{n} {v:.3f}" for n, v in found.items()))
+        pictures.append(shown)
+    of = {str(c): [{n: v for n, v in r.items() if n not in ("object", "views")} for r in rows if r["views"] == c]
+          for c in counts}  # fmt: skip
+    return {label: summary(some) for label, some in of.items()}, rows, sheet(pictures)

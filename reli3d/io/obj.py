@@ -1,0 +1,47 @@
+"""Wavefront OBJ out, with the metallic-roughness words that Blender and others read from a material file.
+
+The words ``map_Pr``, ``map_Pm`` and ``norm`` are those of the PBR extension (http://exocortex.com/blog/extending_wavefront_mtl_to_support_pbr).
+"""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+
+from reli3d._bridge import present
+from reli3d.io.glb import check_asset, encode_image
+from reli3d.render.asset import Asset
+
+MATERIAL = """newmtl baked
+Kd 1 1 1
+map_Kd {name}_base_color.png
+map_Pr {name}_roughness.png
+map_Pm {name}_metallic.png
+norm {name}_normal.png
+"""
+
+
+def obj_files(asset: Asset, name: str) -> dict[str, bytes]:
+    """Files by name: ``NAME.obj``, ``NAME.mtl`` and four PNG textures.  Raises TypeError, ValueError as glTF does.
+
+    Corners share positions, normals and texture coordinates by the same index.  v goes up in OBJ, so it is turned.
+    """
+    check_asset(asset)
+    mesh, textures = asset.mesh, asset.textures
+    text = io.StringIO()
+    text.write(f"mtllib {name}.mtl\no object\n")
+    uv = present("uv", mesh.uv).detach().cpu().double().numpy() * (1, -1) + (0, 1)
+    vertices, normals = (t.detach().cpu().numpy() for t in (mesh.vertices, present("normals", mesh.normals)))
+    for word, values in (("v", vertices), ("vn", normals), ("vt", uv)):
+        np.savetxt(text, values, fmt=" ".join([word, *["%.9g"] * values.shape[1]]))
+    text.write("usemtl baked\n")
+    corners = np.repeat(mesh.faces.cpu().numpy() + 1, 3, axis=1)
+    np.savetxt(text, corners, fmt="f %d/%d/%d %d/%d/%d %d/%d/%d")
+    grey = {k: getattr(textures, k)[..., None].expand(-1, -1, 3) for k in ("roughness", "metallic")}
+    maps = {"base_color": textures.base_color, **grey, "normal": textures.normal}
+    return {
+        f"{name}.obj": text.getvalue().encode(),
+        f"{name}.mtl": MATERIAL.format(name=name).encode(),
+        **{f"{name}_{k}.png": encode_image(v) for k, v in maps.items()},
+    }

@@ -1,0 +1,88 @@
+"""Real captures as training objects: photographs with masks and cameras, and no truth of material or light."""
+
+from __future__ import annotations
+
+import json
+from functools import lru_cache
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from reli3d.io.files import InputError, read_bytes, shown
+from reli3d.train.stages.views import Chooser, ObjectViews
+from reli3d.views.folder import load_views
+from reli3d.views.normalize import normalize
+from reli3d.views.published_views import has_background
+from reli3d.views.views import Views
+
+SIZE = 256  # pixels of the square crops; the stages scale them further
+SCORES = ("camera_quality_score", "gaussian_splats_quality_score")  # of UCO3D's metadata.json
+LEAST = 1.0  # of both, as the paper filters
+METADATA_LIMIT = 1 << 20  # bytes
+KEPT = 64  # prepared captures in memory: 50 MB at 4 views
+
+
+class Captures:
+    """Object folders below one folder; those of UCO3D must have both scores of at least 1.
+
+    ``refused`` has the name of each folder that is left out, and the reason.  Raises InputError where none is left.
+    """
+
+    def __init__(self, folder: Path, size: int = SIZE):
+        self.size, self.refused, self.folders = size, {}, []
+        candidates = sorted(p.parent for p in folder.glob("*/transforms.json"))
+        for one in candidates:
+            reason = unfit(one)
+            if reason:
+                self.refused[one.name] = reason
+            else:
+                self.folders.append(one)
+        if not self.folders:
+            told = "; ".join(f"{k}: {v}" for k, v in list(self.refused.items())[:3]) or "no */transforms.json"
+            raise InputError(folder, f"expected captures of good quality, got none ({told})")
+        self._prepared = lru_cache(KEPT)(self._prepare)
+
+    def __len__(self) -> int:
+        return len(self.folders)
+
+    def load(self, index: int, choose: Chooser) -> ObjectViews:
+        views = self._prepared(index)
+        return views.select(choose(len(views)))
+
+    def _prepare(self, index: int) -> ObjectViews:
+        return capture_views(load_views(self.folders[index], every=True), self.size)
+
+
+def unfit(folder: Path) -> str | None:
+    """Why a capture is left out by UCO3D's own scores; None where it is not, or where it has none."""
+    path = folder / "metadata.json"
+    if not path.exists():
+        return None
+    try:
+        scores = json.loads(read_bytes(path, METADATA_LIMIT))
+        values = [float(scores[name]) for name in SCORES]
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        return f"metadata.json: expected {' and '.join(SCORES)}, got a broken file ({shown(str(error))})"
+    low = [f"{n} {v:.2f}" for n, v in zip(SCORES, values, strict=True) if not v >= LEAST]
+    return f"expected scores of at least {LEAST:g}, got {', '.join(low)}" if low else None
+
+
+def capture_views(views: Views, size: int) -> ObjectViews:
+    """Square crops around the object, scaled so that the longest side of its hull is 1, as the samples' objects are."""
+    moved = views.transformed(normalize(views, "hull"))
+    cut = moved.resampled(size)
+    valid = torch.stack(
+        [_inside(cut.intrinsics[k], moved.intrinsics[k], moved.masks[k].shape, size) for k in range(len(views))]
+    )
+    background = all(has_background(i, m) for i, m in zip(views.images, views.masks, strict=True))
+    return ObjectViews(cut.images, cut.masks, cut.c2w, cut.intrinsics, background=background, valid=valid)
+
+
+def _inside(new: Tensor, old: Tensor, shape: torch.Size, size: int) -> Tensor:
+    """``(S, S)`` 1 where the crop's pixel lies in the photograph of ``shape`` (rows, columns)."""
+    at = torch.arange(size, dtype=torch.float32) + 0.5
+    x = (at - new[2]) * (old[0] / new[0]) + old[2]
+    y = (at - new[3]) * (old[1] / new[1]) + old[3]
+    inside = ((x >= 0) & (x <= shape[1]))[None] & ((y >= 0) & (y <= shape[0]))[:, None]
+    return inside.float()

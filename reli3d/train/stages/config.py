@@ -1,0 +1,113 @@
+"""What a stage of the paper's training is, in numbers: sizes, counts and weights.  All of it is stored with a run.
+
+The paper's section B and C in short: images of views that were not input are compared with renders of the predicted
+object, first of its volume, then of its surface under spherical Gaussians at rising resolution, last of its surface by
+Monte Carlo integration with shadows.  Where the paper leaves a number open the comment says so.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from dataclasses import dataclass, field
+
+RENDERERS = ("volume", "gaussians", "monte_carlo")
+PERCEPTUAL = ("gradients", "lpips")
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Of the terms of :mod:`reli3d.train.stages.losses`; the paper's unless said otherwise."""
+
+    image: float = 10.0  # mean square difference of display values
+    perceptual: float = 2.0  # LPIPS, or what stands in for it
+    mask: float = 10.0  # cross-entropy of the volume's opacity; of a surface: mean square difference, not in the paper
+    material: float = 10.0  # mean square difference of base colour, roughness, metallic
+    normal: float = 4.0  # one minus the cosine
+    flat: float = 0.05  # bump normals off the surface's own
+    latent: float = 0.1  # mean square difference of RENI++ latents
+    neutral: float = 0.02  # colour of the light, where its latents are not known
+    deviation: float = 0.5  # FlexiCubes' own example: distances of a dual vertex from its crossings
+    sign: float = 0.2  # the same: sign changes that nothing asks for
+    spread: float = 0.1  # the same: weights away from 1
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage.  Sizes are those of a whole object; the paper's are in :data:`PAPER`."""
+
+    name: str
+    renderer: str  # volume, gaussians or monte_carlo
+    image_size: int  # of the target views, pixels
+    patch: int = 0  # side of the square of a target view that is rendered; 0: all of it
+    targets: int = 1  # views that are compared, an object and step; open in the paper
+    lobes: int = 128  # spherical Gaussians of the light
+    resolution: int = 0  # cubes along each side of the surface grid; 0: the preset's
+    grid: int = 16  # cells along each side of the volume's occupancy grid
+    samples_along: int = 64  # samples of a ray across the model's cube
+    samples: tuple[int, int, int] = (20, 40, 4)  # by the light, by visible normals, by the cosine
+    shadows: bool = True  # of monte_carlo
+    batch: int = 4  # objects a step
+    steps: int = 60_000
+    rate: float = 5e-5
+    weights: Weights = field(default_factory=Weights)
+
+    def __post_init__(self):
+        if self.renderer not in RENDERERS:
+            raise ValueError(f"renderer: expected {', '.join(RENDERERS)}, got {self.renderer!r}")
+        if not 0 <= self.patch <= self.image_size:
+            raise ValueError(f"patch: expected 0 to image_size {self.image_size}, got {self.patch}")
+
+
+@dataclass(frozen=True)
+class Run:
+    """One training of one stage."""
+
+    data: tuple[str, ...]  # folders of samples, of captures, or of shards
+    output: str  # folder of the checkpoint, the log, curves and pictures
+    stage: Stage
+    start: str = ""  # checkpoint of the stage before; "": from scratch
+    seed: int = 0
+    inputs: int = 4  # an object is read from 1 to this many views; the first is the hero
+    background: float = 0.5  # share of the objects whose light may be read from the background
+    perceptual: str = "gradients"  # or lpips: needs the package of that name and its weights
+    warmup: int = 100  # steps
+    weight_decay: float = 0.01
+    clip: float = 1.0  # of the gradient norm
+    average: float = 0.999  # decay of the averaged weights
+    save_every: int = 200  # steps
+    log_every: int = 10  # steps
+    bfloat16: bool = False  # autocast of the trunk
+    checkpointing: bool = False  # of the trunk's layers: computed again in the backward pass
+    bad_steps: int = 20  # steps in a row without finite gradients after which a run gives up
+
+    def __post_init__(self):
+        if self.perceptual not in PERCEPTUAL:
+            raise ValueError(f"perceptual: expected {', '.join(PERCEPTUAL)}, got {self.perceptual!r}")
+        if not 1 <= self.inputs <= 16:
+            raise ValueError(f"inputs: expected 1 to 16, got {self.inputs}")
+
+    def text(self) -> str:
+        """JSON, stored with every checkpoint."""
+        return json.dumps(dataclasses.asdict(self), sort_keys=True)
+
+
+PAPER = {  # for `official`: batch sizes, resolutions and rate of the paper; lobes follow the resolution
+    s.name: s
+    for s in (
+        Stage("volume", "volume", 512, patch=128, grid=64, samples_along=256, batch=64),  # patch: open
+        Stage("gaussians128", "gaussians", 128, lobes=128, batch=192),
+        Stage("gaussians256", "gaussians", 256, lobes=256, batch=192),
+        Stage("gaussians512", "gaussians", 512, lobes=512, batch=192),
+        Stage("monte_carlo", "monte_carlo", 512, batch=32),
+    )
+}
+TINY = {  # for `tiny`: a network from scratch takes forty times the rate of one with a pretrained encoder
+    s.name: s
+    for s in (
+        Stage("volume", "volume", 32, patch=24, lobes=32, grid=10, samples_along=32, steps=1500, rate=2e-3),
+        Stage("gaussians", "gaussians", 48, lobes=48, steps=1000, rate=1e-3),
+        Stage("surface", "gaussians", 64, lobes=64, steps=500, rate=5e-4),
+        Stage("monte_carlo", "monte_carlo", 48, samples=(6, 8, 2), steps=500, rate=5e-4),
+    )
+}

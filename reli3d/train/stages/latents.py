@@ -1,0 +1,69 @@
+"""RENI++ latents of the lights of training samples: what the light of a prediction is compared with."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from reli3d.io.files import InputError, replacing
+from reli3d.nn.model import Reconstructor
+from reli3d.nn.reni import EnvironmentDecoder
+from reli3d.nn.reni_fit import fit_latent
+
+Latents = dict[str, tuple[Tensor, Tensor]]  # of a file's stem: (L, 3) and ()
+
+
+def load_prior(model: Reconstructor, path: Path) -> None:
+    """Give ``model`` the decoder that :mod:`reli3d.train.light_prior` fitted, and keep it as it is from now on.
+
+    Raises InputError where the file holds no decoder of the preset's sizes.
+    """
+    try:
+        stored = {k: v for k, v in load_file(path).items() if k != "latents"}
+        model.environment.load_state_dict(stored)
+    except Exception as error:  # a broken file, other names, other shapes
+        reason = " ".join(str(error).split())[:100]
+        raise InputError(
+            path, f"expected a light prior of preset {model.preset.name}, got another file ({reason})"
+        ) from None
+    model.environment.requires_grad_(False)
+
+
+def fitted(
+    decoder: EnvironmentDecoder,
+    files: Sequence[Path],
+    cache: Path,
+    *,
+    steps: int = 200,
+    progress: Callable[[str], None] = lambda line: None,
+) -> Latents:
+    """Latents and strength of each sample's light, by the stem of its file; kept in ``cache`` for the next time.
+
+    What the cache holds counts while decoder and number of steps are the same.
+    """
+    digest = hashlib.sha256(str(steps).encode())
+    for name, value in decoder.state_dict().items():
+        digest.update(name.encode() + value.cpu().numpy().tobytes())
+    known: dict[str, Tensor] = {}
+    if cache.exists():
+        with safe_open(cache, "pt") as file:
+            if (file.metadata() or {}).get("decoder") == digest.hexdigest():
+                known = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no iterable
+    missing = [p for p in files if f"{p.stem}.latent" not in known]
+    for done, path in enumerate(missing):
+        with safe_open(path, "pt") as file:
+            light = file.get_tensor("environment").float()
+        found = fit_latent(decoder, light.to(decoder.sample_directions.device), steps=steps)
+        known[f"{path.stem}.latent"], known[f"{path.stem}.strength"] = found.latent.cpu(), found.strength.cpu()
+        if done % 16 == 15:
+            progress(f"latents: {done + 1} of {len(missing)} lights, the last with error {found.error:.3f}")
+    if missing:
+        cache.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(cache) as temporary:
+            save_file({k: v.contiguous() for k, v in known.items()}, temporary, {"decoder": digest.hexdigest()})
+    return {p.stem: (known[f"{p.stem}.latent"], known[f"{p.stem}.strength"]) for p in files}

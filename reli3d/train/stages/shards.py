@@ -1,0 +1,190 @@
+"""Objects in tar files of the WebDataset form: written in parallel and resumable, read in any order, checked by hash.
+
+A shard ``NNNNNN.tar`` holds ``<object>.safetensors`` entries.  ``index.json`` beside the shards names each with its
+size, its SHA-256 and its objects; a shard that is not in it does not count.  Any reader of WebDataset can stream them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import sys
+import tarfile
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from safetensors.torch import load, save
+from torch import Tensor
+
+from reli3d.io.files import InputError, read_bytes, replacing, shown, write_bytes
+from reli3d.train.stages.captures import Captures
+from reli3d.train.stages.views import Chooser, ObjectViews, Samples, sample_views
+
+INDEX = "index.json"
+INDEX_LIMIT = 1 << 30  # bytes
+OF_SAMPLE = ("images", "c2w", "intrinsics", "view_material", "view_normal", "view_depth", "environment")
+
+
+def to_tensors(views: ObjectViews) -> dict[str, Tensor]:
+    """What is stored of captures; the layout of :mod:`reli3d.synthetic.samples`, and what it lacks is not there."""
+    images = torch.cat([views.images, views.masks[..., None]], -1)
+    stored = {
+        "images": (images * 255 + 0.5).to(torch.uint8),
+        "c2w": views.c2w,
+        "intrinsics": views.intrinsics,
+        "background": torch.tensor(views.background),
+    }
+    if views.valid is not None:
+        stored["view_valid"] = views.valid.to(torch.uint8)
+    return {k: v.contiguous() for k, v in stored.items()}
+
+
+def objects(source: Samples | Captures, numbers: Iterable[int]) -> Iterator[tuple[str, bytes]]:
+    """Name and stored bytes of these objects of a folder of samples or captures."""
+    for k in numbers:
+        if isinstance(source, Samples):
+            tensors = load(source.files[k].read_bytes())
+            yield source.files[k].stem, save({n: tensors[n] for n in OF_SAMPLE if n in tensors})
+        else:
+            yield source.folders[k].name, save(to_tensors(source.load(k, range)))
+
+
+def pack(
+    source: Samples | Captures,
+    folder: Path,
+    *,
+    each: int = 64,
+    progress: Callable[[str], None] = lambda line: None,
+    part: tuple[int, int] = (0, 1),
+) -> None:
+    """Write the objects of ``source`` as shards of ``each``; shards that the index has are left as they are.
+
+    part: ``(k, n)``, this call writes every n-th shard from k; calls of all parts can run at once.
+    """
+    from webdataset import TarWriter
+
+    folder.mkdir(parents=True, exist_ok=True)
+    count = -(-len(source) // each)
+    names = [p.stem for p in source.files] if isinstance(source, Samples) else [p.name for p in source.folders]
+    for number in range(part[0], count, part[1]):
+        wanted = names[number * each : (number + 1) * each]
+        entry_path = folder / f"{number:06d}.json"
+        if entry_path.exists() and json.loads(entry_path.read_text())["objects"] == wanted:
+            continue
+        numbers = range(number * each, min((number + 1) * each, len(source)))
+        with replacing(folder / f"{number:06d}.tar") as temporary:
+            with TarWriter(str(temporary)) as writer:
+                for name, data in objects(source, numbers):
+                    writer.write({"__key__": name, "safetensors": data})
+            data = temporary.read_bytes()
+        entry = {
+            "shard": f"{number:06d}.tar",
+            "bytes": len(data),
+            "sha256": hashlib.sha256(data).hexdigest(),
+            "objects": wanted,
+        }
+        write_bytes(entry_path, json.dumps(entry).encode())
+        progress(f"{entry['shard']}: {len(wanted)} objects, {len(data) / 1e6:.1f} MB")
+    entries = [folder / f"{k:06d}.json" for k in range(count)]
+    if all(p.exists() for p in entries):
+        rows = [json.loads(p.read_text()) for p in entries]
+        write_bytes(folder / INDEX, json.dumps({"shards": rows}, indent=1).encode())
+
+
+def read_index(folder: Path) -> list[dict]:
+    """Rows of the index.  Raises InputError for a broken one."""
+    path = folder / INDEX
+    try:
+        rows = json.loads(read_bytes(path, INDEX_LIMIT))["shards"]
+        for row in rows:
+            sized = isinstance(row["bytes"], int) and len(row["sha256"]) == 64 and isinstance(row["objects"], list)
+            if not sized or Path(row["shard"]).name != row["shard"]:
+                raise ValueError(shown(row))
+    except InputError:
+        raise
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise InputError(
+            path, f"expected an index of shards, got a broken file ({shown(str(error))}); pack again"
+        ) from None
+    return rows
+
+
+def fault(folder: Path, row: dict, *, hashed: bool) -> str | None:
+    """What is wrong with a shard; None where nothing is.  hashed: read it whole and compare its hash."""
+    path = folder / row["shard"]
+    if not path.is_file():
+        return f"{path.name}: expected a shard, got none"
+    size = path.stat().st_size
+    if size != row["bytes"]:
+        return f"{path.name}: expected {row['bytes']} bytes, got {size}"
+    if hashed:
+        digest = hashlib.sha256()
+        with open(path, "rb") as file:
+            while block := file.read(1 << 20):
+                digest.update(block)
+        if digest.hexdigest() != row["sha256"]:
+            return f"{path.name}: expected SHA-256 {row['sha256'][:12]}..., got {digest.hexdigest()[:12]}..."
+    return None
+
+
+class Shards:
+    """Objects of a folder of shards, by number; a shard that is not whole is told on stderr and left out.
+
+    Sizes are checked here, hashes by ``reli3d-data check``.
+    """
+
+    def __init__(self, folder: Path):
+        self.places: list[tuple[Path, str, int, int]] = []  # shard, object, offset and length of its bytes
+        for row in read_index(folder):
+            wrong = fault(folder, row, hashed=False)
+            found = [] if wrong else _members(folder / row["shard"])
+            if found is None:
+                wrong = f"{row['shard']}: expected a tar file, got a broken one"
+            if wrong:
+                print(f"{folder}: left out {wrong}", file=sys.stderr, flush=True)
+            self.places += found or []
+        if not self.places:
+            raise InputError(folder, "expected a whole shard, got none; pack again")
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+    def tensors(self, index: int) -> dict[str, Tensor]:
+        """What is stored of an object."""
+        path, _, offset, length = self.places[index]
+        with open(path, "rb") as file:
+            file.seek(offset)
+            return load(file.read(length))
+
+    def load(self, index: int, choose: Chooser) -> ObjectViews:
+        stored = self.tensors(index)
+        views = sample_views(stored.get, choose)
+        return replace(views, background=bool(stored.get("background", True)))
+
+
+def _members(path: Path) -> list[tuple[Path, str, int, int]] | None:
+    try:
+        with tarfile.open(path, "r:") as tar:
+            return [
+                (path, m.name.removesuffix(".safetensors"), m.offset_data, m.size)
+                for m in tar
+                if m.name.endswith(".safetensors")
+            ]
+    except (tarfile.TarError, OSError):
+        return None
+
+
+def picture(tensors: dict[str, Tensor]) -> bytes:
+    """PNG of all views of an object, with its base colours below where it has them."""
+    from reli3d.io.images import png_bytes
+
+    images = tensors["images"].float() / 255
+    rows = [torch.cat(list(images[..., :3] * images[..., 3:]), 1)]
+    if "view_material" in tensors:
+        rows.append(torch.cat(list(tensors["view_material"][..., :3].float() / 255), 1))
+    out = io.BytesIO()
+    out.write(png_bytes((torch.cat(rows) * 255 + 0.5).to(torch.uint8)))
+    return out.getvalue()

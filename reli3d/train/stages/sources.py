@@ -1,0 +1,21 @@
+"""Where objects come from: which reader a folder has."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from reli3d.io.files import InputError
+from reli3d.train.stages.captures import Captures
+from reli3d.train.stages.shards import INDEX, Shards
+from reli3d.train.stages.views import Samples, Source
+
+
+def source(folder: Path) -> Source:
+    """The objects of a folder: of shards, of samples, or of captures.  Raises InputError where it holds none."""
+    if not folder.is_dir():
+        raise InputError(folder, "expected a folder of samples, captures or shards, got none")
+    if (folder / INDEX).exists():
+        return Shards(folder)
+    if any(folder.glob("*.safetensors")):
+        return Samples(folder)
+    return Captures(folder)

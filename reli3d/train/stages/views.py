@@ -1,0 +1,185 @@
+"""One object of a training step, whatever its source: posed views, and the truth that its source has.
+
+What a source does not have is None and takes part in no loss; nothing stands for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from safetensors import safe_open
+from torch import Tensor
+from torch.nn.functional import interpolate, normalize
+
+from reli3d._bridge import present
+
+Chooser = Callable[[int], Sequence[int]]  # from the number of views that there are to the indices wanted
+
+
+@dataclass(frozen=True)
+class ObjectViews:
+    """``V`` views of ``S`` by ``S`` pixels in the model's frame, float32."""
+
+    images: Tensor  # (V, S, S, 3) sRGB, straight
+    masks: Tensor  # (V, S, S) coverage
+    c2w: Tensor  # (V, 4, 4)
+    intrinsics: Tensor  # (V, 4) pixels
+    background: bool  # whether there is a photograph outside the masks
+    valid: Tensor | None = None  # (V, S, S) 1 where the pixel lies in the photograph; None: everywhere
+    material: Tensor | None = None  # (V, S, S, 5) base colour (sRGB), roughness, metallic
+    normal: Tensor | None = None  # (V, S, S, 3) world, unit
+    shown: Tensor | None = None  # (V, S, S) 1 where material and normal are known
+    latent: Tensor | None = None  # (L, 3) RENI++ latents of the light
+    strength: Tensor | None = None  # () logarithm of the light's factor
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def select(self, views: Sequence[int]) -> ObjectViews:
+        """The views of these indices, in this order."""
+        chosen = torch.as_tensor(list(views))
+        values = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("latent", "strength")}
+        taken: dict[str, Any] = {k: v[chosen] for k, v in values.items() if isinstance(v, Tensor)}
+        return replace(self, **taken)
+
+    def to(self, device: torch.device | str) -> ObjectViews:
+        """The same views on ``device``."""
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        moved: dict[str, Any] = {k: v.to(device) for k, v in values.items() if isinstance(v, Tensor)}
+        return replace(self, **moved)
+
+    def resized(self, size: int) -> ObjectViews:
+        """``size`` pixels a side, filtered over the area that they cover; maps are means over where they are known."""
+        if size == self.images.shape[1]:
+            return self
+        planes = lambda x: interpolate(x.movedim(-1, 1), (size, size), mode="bilinear", align_corners=False,  # noqa: E731
+                                       antialias=True).movedim(1, -1)  # fmt: skip
+        changed: dict[str, Any] = {
+            "images": planes(self.images).clamp(0, 1).contiguous(),
+            "masks": planes(self.masks[..., None])[..., 0].clamp(0, 1).contiguous(),
+            "intrinsics": self.intrinsics * (size / self.images.shape[1]),
+        }
+        if self.valid is not None:
+            changed["valid"] = (planes(self.valid[..., None])[..., 0] > 0.99).float()
+        if self.shown is not None:
+            known = self.shown[..., None]
+            share = planes(known)
+            for name in ("material", "normal"):
+                value = getattr(self, name)
+                if value is not None:
+                    changed[name] = planes(value * known) / share.clamp(min=1e-3)
+            if "normal" in changed:
+                changed["normal"] = normalize(changed["normal"], dim=-1)
+            changed["shown"] = (share[..., 0] > 0.99).float()
+        return replace(self, **changed)
+
+    def window(self, x: int, y: int, side: int) -> ObjectViews:
+        """The square of ``side`` pixels whose corner is ``(x, y)``, of every view."""
+        cut: dict[str, Any] = {}
+        for f in fields(self):
+            value = getattr(self, f.name)
+            if isinstance(value, Tensor) and f.name in ("images", "masks", "valid", "material", "normal", "shown"):
+                cut[f.name] = value[:, y : y + side, x : x + side].contiguous()
+        shift = self.intrinsics.new_tensor([0.0, 0.0, float(x), float(y)])
+        return replace(self, intrinsics=self.intrinsics - shift, **cut)
+
+
+class Source(Protocol):
+    """Objects by number."""
+
+    def __len__(self) -> int: ...
+
+    def load(self, index: int, choose: Chooser) -> ObjectViews: ...
+
+
+def sample_views(read: Callable[[str], Any], choose: Chooser) -> ObjectViews:
+    """Views of a sample of :mod:`reli3d.synthetic.samples`, or of what a shard holds of a capture.
+
+    read: gives for the name of a tensor what is indexed by the view, a slice of a file or the tensor itself; None
+    where there is none.
+    """
+    poses = read("c2w")
+    total = len(poses) if isinstance(poses, Tensor) else poses.get_shape()[0]
+    chosen = list(choose(total))
+
+    def of_views(name: str) -> Tensor | None:
+        values = read(name)
+        return None if values is None else torch.stack([values[k] for k in chosen]).float()
+
+    images = present("images", of_views("images")) / 255
+    c2w, intrinsics = present("c2w", of_views("c2w")), present("intrinsics", of_views("intrinsics"))
+    valid, depth = of_views("view_valid"), of_views("view_depth")
+    material, normal = of_views("view_material"), of_views("view_normal")
+    return ObjectViews(
+        images[..., :3].contiguous(), images[..., 3].contiguous(), c2w, intrinsics,
+        background=True, valid=valid, material=None if material is None else material / 255,
+        normal=None if normal is None else normalize(normal, dim=-1),
+        shown=None if depth is None else (depth > 0).float(),
+    )  # fmt: skip
+
+
+class Samples:
+    """A folder of ``*.safetensors`` that ``reli3d-data`` made.
+
+    latents: of :func:`reli3d.train.stages.latents.fitted`, by the stem of a file; None: not known.
+    """
+
+    def __init__(self, folder: Path, latents: dict[str, tuple[Tensor, Tensor]] | None = None):
+        self.files, self.latents = sorted(folder.glob("*.safetensors")), latents or {}
+        if not self.files:
+            raise ValueError(f"data: expected *.safetensors files, got none in {folder}")
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+    def load(self, index: int, choose: Chooser) -> ObjectViews:
+        with safe_open(self.files[index], "pt") as file:
+            names = set(file.keys())
+            views = sample_views(lambda name: file.get_slice(name) if name in names else None, choose)
+        latent, strength = self.latents.get(self.files[index].stem, (None, None))
+        return replace(views, latent=latent, strength=strength)
+
+
+@dataclass(frozen=True)
+class Draw:
+    """What one object of a step is: the views that are read, hero first, and those that are compared."""
+
+    inputs: ObjectViews
+    targets: ObjectViews
+    background_visible: bool
+    seed: int  # of everything random in the rendering
+
+
+def draw(sources: Sequence[Source], seed: tuple[int, ...], *, inputs: int, targets: int, background: float,
+         input_size: int, target_size: int, patch: int) -> Draw:  # fmt: skip
+    """A random object: 1 to ``inputs`` random views are read, ``targets`` others are compared.
+
+    A function of ``seed`` and the sources alone.  Of an object with fewer views fewer are read; the only view of an
+    object is read and compared.  patch: side of a random square of the targets, 0 for all of them.
+    """
+    rng = np.random.default_rng(seed)
+    sizes = [len(s) for s in sources]
+    index = int(rng.integers(sum(sizes)))
+    read = int(rng.integers(1, inputs + 1))
+    split = [0]
+
+    def choose(total: int) -> list[int]:
+        split[0] = max(1, min(read, total - 1))
+        return rng.permutation(total)[: split[0] + targets].tolist()
+
+    which = 0
+    while index >= sizes[which]:
+        index, which = index - sizes[which], which + 1
+    views = sources[which].load(index, choose)
+    k = split[0]
+    compared = views.select(range(k, len(views)) if len(views) > k else [0]).resized(target_size)
+    if patch:
+        x, y = rng.integers(target_size - patch + 1, size=2)
+        compared = compared.window(int(x), int(y), patch)
+    shown = bool(rng.random() < background) and views.background
+    return Draw(views.select(range(k)).resized(input_size), compared, shown, int(rng.integers(1 << 30)))

@@ -1,0 +1,51 @@
+"""Masks made by a network that tells objects from backgrounds: ``rembg`` (MIT), an optional install.
+
+rembg fetches its network from its own release page where it is not on the disk yet; nothing here asks for that unless
+a user did.
+"""
+
+from __future__ import annotations
+
+import importlib
+import threading
+from collections.abc import Callable
+
+from PIL import Image
+
+from reli3d.io.files import InputError
+
+NETWORK = "isnet-general-use"  # Qin and others 2022, Highly accurate dichotomous image segmentation; Apache-2.0
+
+
+class Remover:
+    """Makes masks, one at a time; the network is loaded with the first.  Raises InputError where it cannot be."""
+
+    def __init__(self, network: str = NETWORK):
+        self.network, self.masks = network, 0
+        self._lock = threading.Lock()
+        self._cut_out: Callable[[Image.Image], Image.Image] | None = None
+
+    def mask(self, picture: Image.Image) -> Image.Image:
+        """Mask of mode L in the size of ``picture``, soft at the edge of what stands before the background."""
+        with self._lock:
+            if self._cut_out is None:
+                self._cut_out = _loaded(self.network)
+            self.masks += 1
+            return self._cut_out(picture if picture.mode != "F" else picture.point(lambda v: v / 257.0).convert("L"))
+
+
+def _loaded(network: str) -> Callable[[Image.Image], Image.Image]:
+    try:
+        rembg = importlib.import_module("rembg")
+    except (ImportError, SystemExit) as error:  # without onnxruntime rembg ends the process
+        raise InputError(
+            "remove-background", f"expected rembg installed, got none ({error}); pip install 'reli3d[masks]'"
+        ) from None
+    try:
+        session = rembg.new_session(network)
+    except Exception as error:  # downloads raise almost anything
+        raise InputError(
+            "remove-background",
+            f"expected the network {network} of rembg, got {error}; it is fetched once, or give masks",
+        ) from None
+    return lambda picture: rembg.remove(picture.convert("RGB"), session=session, only_mask=True).convert("L")

@@ -1,0 +1,57 @@
+"""How much of a large photograph is kept: what is read from it later, not what the camera's sensor has."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from PIL import Image
+
+LARGE = 1 << 21  # pixels up to which a photograph is kept as it is: 1920 x 1080
+OBJECT = 768  # pixels along the object that are kept: nothing reads more than 512
+MARGIN = 1.25  # side of the square that is kept, in sides of the object
+
+
+@dataclass(frozen=True)
+class Cut:
+    """A part ``(x0, y0, x1, y1)`` of a picture and the size ``(width, height)`` it is scaled to."""
+
+    part: tuple[int, int, int, int]
+    size: tuple[int, int]
+
+    def pixels(self, picture: Image.Image) -> Image.Image:
+        """The part of ``picture`` at the new size, filtered over their area; straight alpha stays straight."""
+        if picture.mode == "RGBA":  # Pillow would multiply the colour by alpha, and lose that under alpha 0
+            return Image.merge("RGBA", [self.pixels(band) for band in picture.split()])
+        return picture.resize(self.size, Image.Resampling.BILINEAR, box=self.part)
+
+    def intrinsics(self, camera: list[float]) -> list[float]:
+        """``[fx, fy, cx, cy]`` of the new pixels."""
+        x0, y0, x1, y1 = self.part
+        sx, sy = self.size[0] / (x1 - x0), self.size[1] / (y1 - y0)
+        fx, fy, cx, cy = camera
+        return [fx * sx, fy * sy, (cx - x0) * sx, (cy - y0) * sy]
+
+
+def cut(size: tuple[int, int], inside: np.ndarray, *, whole: bool) -> Cut | None:
+    """What to keep of a picture of ``size`` (width, height); None where all of it is kept as it is.
+
+    inside: ``(H, W)`` bool, the pixels of the object, one at least.  whole: keep the background as well, with fewer
+    pixels on the object.
+    """
+    width, height = size
+    if width * height <= LARGE:
+        return None
+    if whole:
+        scale, part = math.sqrt(LARGE / (width * height)), (0, 0, width, height)
+    else:
+        columns, rows = (np.flatnonzero(inside.any(axis)) for axis in (0, 1))
+        x0, y0, x1, y1 = int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
+        side = max(x1 - x0, y1 - y0)
+        reach = math.ceil(0.5 * MARGIN * side)
+        x, y = (x0 + x1) // 2, (y0 + y1) // 2
+        scale = min(1.0, OBJECT / side)
+        part = max(0, x - reach), max(0, y - reach), min(width, x + reach), min(height, y + reach)
+    columns_kept, rows_kept = part[2] - part[0], part[3] - part[1]
+    return Cut(part, (max(1, round(scale * columns_kept)), max(1, round(scale * rows_kept))))

@@ -1,0 +1,86 @@
+"""``reli3d export``: its files, and how it ends."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from reli3d.cli.export import main
+from reli3d.geometry.mesh import Mesh
+from reli3d.geometry.tangents import with_tangents
+from reli3d.geometry.uv import unwrap
+from reli3d.io.glb import read_glb, write_glb
+from reli3d.render.asset import Asset, TextureSet
+
+
+@pytest.fixture(scope="module")
+def glb(tmp_path_factory):
+    """A ball of 1280 triangles whose paint is a function of the place, at 128 texels."""
+    from reli3d.geometry.bake import bake
+
+    ball = trimesh.creation.icosphere(3)
+    mesh = Mesh(torch.tensor(ball.vertices, dtype=torch.float32), torch.tensor(ball.faces, dtype=torch.int32))
+    mesh = with_tangents(unwrap(mesh, texture_size=128))
+
+    def at(position, normal, tangent):
+        flat = torch.tensor([0.5, 0.5, 1.0]).expand_as(position)
+        half = torch.full_like(position[:, :1], 0.5)
+        return {"base_color": 0.5 + 0.4 * position, "roughness": half, "metallic": half, "normal": flat}
+
+    path = tmp_path_factory.mktemp("export") / "mesh.glb"
+    write_glb(path, Asset(mesh, TextureSet(**bake(mesh, 128, at, tangents=True))))
+    return path
+
+
+def test_every_format_is_written_and_named(glb, tmp_path, capsys):
+    names = {
+        "glb": {"mesh.glb"},
+        "usdz": {"mesh.usdz"},
+        "obj": {"mesh.obj", "mesh.mtl", *(f"mesh_{k}.png" for k in ("base_color", "roughness", "metallic", "normal"))},
+    }
+    for kind, expected in names.items():
+        if kind == "usdz":
+            pytest.importorskip("pxr", reason="needs usd-core")
+        assert main([str(glb), "--format", kind, "--output", str(tmp_path / kind), "--json"]) == 0
+        record = json.loads(capsys.readouterr().out)
+        assert record["triangles"] == 1280 and record["texture_size"] == 128
+        assert {p.name for p in (tmp_path / kind).iterdir()} == expected == {f.split("/")[-1] for f in record["files"]}
+
+
+def test_fewer_triangles_keep_the_shape_and_the_paint(glb, tmp_path, capsys):
+    pytest.importorskip("fast_simplification")
+    assert main([str(glb), "--decimate", "400", "--textures", "webp", "--output", str(tmp_path)]) == 0
+    assert capsys.readouterr().out.strip() == str(tmp_path / "mesh.glb")
+    (asset,) = read_glb(tmp_path / "mesh.glb")
+    assert 300 < len(asset.mesh.faces) <= 400
+    # 400 triangles on a unit ball: sagitta of an edge of 0.27 is 0.009
+    assert float((asset.mesh.vertices.norm(dim=1) - 1).abs().max()) < 0.03
+    uv = (asset.mesh.uv * 128).long().clamp(0, 127)
+    paint = asset.textures.base_color[uv[:, 1], uv[:, 0]]
+    # a texel is 0.03 of the ball, where the paint changes by 0.012; borders of charts are a texel off
+    assert float((paint - (0.5 + 0.4 * asset.mesh.vertices)).abs().mean()) < 0.03
+
+
+@pytest.mark.parametrize(
+    "words, text",
+    [
+        (["--decimate", "3"], "--decimate: expected 16"),
+        (["--texture-size", "9"], "--texture-size: expected 64"),
+        (["--format", "obj", "--textures", "webp"], "--textures: expected png"),
+    ],
+)
+def test_what_makes_no_sense_ends_with_2(glb, tmp_path, capsys, words, text):
+    assert main([str(glb), *words, "--output", str(tmp_path / "out")]) == 2
+    assert capsys.readouterr().err.startswith(f"reli3d export: {text}")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_missing_extra_is_one_line(glb, tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pxr", None)
+    assert main([str(glb), "--format", "usdz", "--output", str(tmp_path / "out")]) == 2
+    assert capsys.readouterr().err == "reli3d export: usd-core is not installed: pip install 'reli3d[usd]'\n"
+    assert not (tmp_path / "out").exists()
+    assert np.isfinite(read_glb(glb)[0].mesh.vertices.numpy()).all()

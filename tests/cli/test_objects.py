@@ -1,0 +1,253 @@
+"""Many objects: in one process, in several, on Ray; nothing is lost and nothing done twice where processes die."""
+
+import csv
+import functools
+import json
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from reli3d.cli import infer, objects
+from reli3d.io.files import InputError
+from tests.support.checkout import ROOT
+from tests.support.jobs import Start, WordJob
+
+WORDS = ["one", "die once", "three", "refuse", "die", "six", "fail", "eight", "nine", "die once"]
+WITH_RAY = pytest.param("ray", marks=pytest.mark.slow)  # its cluster takes half a minute to start
+
+
+def folders(root: Path, words: list[str]) -> list[objects.Item]:
+    for k, word in enumerate(words):
+        (root / f"object{k}").mkdir(parents=True)
+        (root / f"object{k}" / "word").write_text(word)
+    return objects.items_of([root / f"object{k}" for k in range(len(words))], root / "out")
+
+
+def read_table(path: Path) -> list[dict[str, str]]:
+    with open(path, encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def rows(where: str, start: Start, items: list[objects.Item], count: int = 2):
+    if where == "here":
+        job = start()
+        return [objects.make(job, item) for item in items]
+    if where == "processes":
+        return list(objects.in_processes(start, items, count))
+    pytest.importorskip("ray")
+    return list(objects.on_ray(start, items, "local"))
+
+
+@pytest.mark.parametrize("where", ["here", "processes", WITH_RAY])
+def test_every_object_has_one_row_and_one_result(tmp_path, where):
+    words = [w for w in WORDS if "die" not in w]
+    items = folders(tmp_path, words)
+    found = {row.object: row for row in rows(where, Start(tmp_path / "log"), items)}
+    assert list(sorted(found)) == [item.name for item in items]
+    for item, word in zip(items, words, strict=True):
+        row = found[item.name]
+        if word in ("refuse", "fail"):
+            assert row.result == {"refuse": "refused", "fail": "failed"}[word] and not item.target.exists()
+            assert row.notes == ({"refuse": "word: expected another, got refuse", "fail": "it failed"}[word],)
+        else:
+            assert (item.target / "mesh.glb").read_text() == word
+            assert (row.result, row.mask_iou, row.faces) == ("done", 0.5, len(word)) and row.seconds >= 0
+    assert sorted((tmp_path / "log").read_text().split()) == sorted(i.name for i in items if i.target.exists())
+    again = rows("here", Start(tmp_path / "log"), items)
+    assert [r.result for r in again].count("skipped") == len(words) - 2
+    assert all(r.faces and r.seconds is None for r in again if r.result == "skipped")
+
+
+@pytest.mark.skipif(os.name == "nt", reason="needs SIGKILL")
+@pytest.mark.parametrize("where", ["processes", WITH_RAY])
+def test_a_process_that_dies_loses_nothing_and_does_nothing_twice(tmp_path, where):
+    items = folders(tmp_path, WORDS)
+    found = rows(where, Start(tmp_path / "log"), items)
+    assert sorted(row.object for row in found) == [item.name for item in items]  # one row each
+    result = {row.object: row.result for row in found}
+    finished = sorted((tmp_path / "log").read_text().split())
+    assert len(set(finished)) == len(finished)
+    for item, word in zip(items, WORDS, strict=True):
+        wanted = {"refuse": "refused", "fail": "failed", "die": "failed"}.get(word, "done")
+        assert result[item.name] == wanted, (word, found)
+        assert (item.name in finished) == (wanted == "done") == item.target.exists()
+    assert "died twice" in " ".join(next(r.notes for r in found if r.object == "object4"))
+    # the dead left their half-written folders, which the next claim of the same object removes; nothing else is there
+    left = {p.name for p in (tmp_path / "out").iterdir()} - {i.name for i in items}
+    assert left == {".object4.partial"}
+
+
+def test_processes_start_once_and_no_more_than_asked(tmp_path):
+    items = folders(tmp_path, ["word"] * 7)
+    assert len(rows("processes", Start(tmp_path / "log"), items, count=2)) == 7
+    assert len((tmp_path / "starts").read_text().split()) == 2
+
+
+COMMAND = """
+import sys
+from pathlib import Path
+from reli3d.cli import infer
+from tests.support.jobs import Start
+root = Path(sys.argv[1])
+infer.choose_device = lambda wanted: "cpu"
+infer.Job = lambda args, device: None
+infer.worker_job = lambda *_: None
+import functools
+functools.partial = lambda *_: Start(root / "log")
+sys.exit(infer.main(sys.argv[2:]))
+"""
+
+
+def command(tmp_path, *arguments) -> subprocess.Popen:
+    return subprocess.Popen(
+        [sys.executable, "-c", COMMAND, tmp_path, *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+    )
+
+
+@pytest.mark.skipif(os.name == "nt", reason="needs signals")
+@pytest.mark.parametrize("number, code", [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_ends_all_processes_and_leaves_whole_results(tmp_path, number, code):
+    items = folders(tmp_path, ["one", "two", "wait", "wait", "five"])
+    process = command(tmp_path, *(i.folder for i in items), "--output", tmp_path / "out", "--workers", 2)
+    until = time.monotonic() + 60
+    while not all((i.folder / "waits").exists() for i in items[2:4]):
+        assert time.monotonic() < until and process.poll() is None
+        time.sleep(0.05)
+    process.send_signal(number)
+    out, err = process.communicate(timeout=30)
+    assert process.returncode == code and err.count("reli3d-infer: ") == 1 and "Traceback" not in err
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["object0", "object1", "summary.csv"]
+    assert out.count("mesh.glb") == 2
+    table = read_table(tmp_path / "out" / "summary.csv")
+    assert [(r["object"], r["result"]) for r in table] == [("object0", "done"), ("object1", "done")]
+
+
+@pytest.mark.skipif(os.name == "nt", reason="needs SIGKILL")
+def test_processes_end_when_the_command_is_killed(tmp_path):
+    items = folders(tmp_path, ["wait", "wait", "three"])
+    process = command(tmp_path, *(i.folder for i in items), "--output", tmp_path / "out", "--workers", 2)
+    until = time.monotonic() + 60
+    while not all((i.folder / "waits").exists() for i in items[:2]):
+        assert time.monotonic() < until and process.poll() is None
+        time.sleep(0.05)
+    process.kill()
+    assert process.wait() == -signal.SIGKILL
+    for item in items:
+        (item.folder / "go").touch()
+    process.communicate(timeout=30)  # the streams are open in all: they end their objects, and nobody asks for a next
+    assert sorted((tmp_path / "log").read_text().split()) == ["object0", "object1"]
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["object0", "object1"]
+
+
+def test_the_summary_is_in_the_order_of_the_call_and_survives_every_name(tmp_path):
+    table = [
+        objects.Row('a"b,c', "done", 1.5, 0.93, 12, ("one", "two; three")),
+        objects.Row("line\nbreak", "refused", notes=("expected\tthis",)),
+        objects.Row("größe", "skipped"),
+    ]
+    objects.write_summary(tmp_path / "summary.csv", table)
+    got = read_table(tmp_path / "summary.csv")
+    assert list(got[0]) == ["object", "result", "seconds", "mask_iou", "faces", "notes"]
+    assert list(got[0].values()) == ['a"b,c', "done", "1.5", "0.93", "12", "one; two; three"]
+    assert got[1]["object"] == "line\\nbreak" and got[1]["notes"] == "expected\\tthis" and got[1]["faces"] == ""
+    assert got[2]["object"] == "größe"
+
+
+def test_names_are_different_and_quick_for_many(tmp_path):
+    items = objects.items_of([Path("a"), Path("b/a"), Path("a-2"), Path("c/a"), Path("summary.csv")], tmp_path)
+    assert [i.name for i in items] == ["a", "a-2", "a-2-2", "a-3", "summary.csv-2"]
+    began = time.monotonic()
+    assert len({i.name for i in objects.items_of([Path("same")] * 50_000, tmp_path)}) == 50_000
+    assert time.monotonic() - began < 20  # a search through all names would take minutes
+
+
+def test_a_list_names_folders(tmp_path):
+    (tmp_path / "list.txt").write_text("one\n\n  two/three  \nmit größe\n")
+    assert objects.listed(tmp_path / "list.txt") == [Path("one"), Path("two/three"), Path("mit größe")]
+    (tmp_path / "empty").write_text("\n \n")
+    (tmp_path / "bytes").write_bytes(b"\xff\xfe")
+    for name, word in (("empty", "got none"), ("bytes", "UTF-8"), ("missing", "not found"), (".", "regular file")):
+        with pytest.raises(InputError, match=word):
+            objects.listed(tmp_path / name)
+
+
+def test_objects_that_are_all_refused_have_a_summary(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(infer, "Job", lambda args, device: WordJob(tmp_path / "log"))
+    items = folders(tmp_path, ["refuse", "refuse"])
+    assert infer.main([*(str(i.folder) for i in items), "--output", str(tmp_path / "out")]) == 2
+    assert [r["result"] for r in read_table(tmp_path / "out" / "summary.csv")] == ["refused", "refused"]
+    assert capsys.readouterr().err.count("word: expected another") == 2
+
+
+def test_a_job_is_found_by_the_name_of_its_module():
+    """The command may run as ``__main__``, which is another module in another process."""
+    start = functools.partial(objects.called, "tests.support.jobs", "WordJob", Path("log"))
+    assert pickle.loads(pickle.dumps(start))() == WordJob(Path("log"))
+
+
+@pytest.mark.parametrize(
+    "options, word",
+    [
+        (["--workers", "0"], "--workers"),
+        (["--workers", "2", "--ray", "auto"], "--ray"),
+        (["--check", "--workers", "2"], "--check"),
+        (["--list", "nowhere"], "not found"),
+    ],
+)
+def test_wrong_options_end_with_2_before_the_work(tmp_path, capsys, monkeypatch, options, word):
+    monkeypatch.setattr(infer, "Job", None)  # a call raises TypeError
+    assert infer.main([*options, "--output", str(tmp_path / "out")]) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and err.count("\n") == 1 and word in err and not (tmp_path / "out").exists()
+
+
+def test_a_folder_in_the_place_of_the_summary_is_told_at_once(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(infer, "Job", None)
+    (tmp_path / "summary.csv").mkdir()
+    assert infer.main(["a", "b", "--output", str(tmp_path)]) == 2
+    assert "expected a file or none" in capsys.readouterr().err
+
+
+def test_ray_that_is_missing_is_told(monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)  # its import raises
+    with pytest.raises(ValueError, match=r"pip install reli3d\[ray\]"):
+        objects.on_ray(WordJob, [], "auto")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("options", [["--workers", "1"], ["--workers", "2"], ["--ray", "local"]])
+def test_the_same_bits_wherever_an_object_is_made(tmp_path, options):
+    if "--ray" in options:
+        pytest.importorskip("ray")
+    for name in ("first", "second", "third"):
+        (tmp_path / name).symlink_to(infer.EXAMPLE)
+    names = [str(tmp_path / name) for name in ("first", "second", "third")]
+    quick = ["--texture-size", "256", "--resolution", "40", "--device", "cpu"]
+    alone = [sys.executable, "-m", "reli3d.cli.infer", names[0], "--output", str(tmp_path / "alone"), *quick]
+    subprocess.run(alone, check=True, env={**os.environ, "OMP_NUM_THREADS": "1"}, cwd=ROOT)
+    done = subprocess.run(
+        [sys.executable, "-m", "reli3d.cli.infer", *names, "--output", str(tmp_path / "out"), *quick, *options],
+        check=True,
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert done.stdout.count("mesh.glb") == 3
+    for name in ("mesh.glb", "environment.exr", "environment.hdr", "preview.png"):
+        for folder in ("first", "second", "third"):
+            wanted = (tmp_path / "alone" / "first" / name).read_bytes()
+            assert (tmp_path / "out" / folder / name).read_bytes() == wanted
+    table = read_table(tmp_path / "out" / "summary.csv")
+    info = json.loads((tmp_path / "out/third/run_info.json").read_text())
+    assert [r["object"] for r in table] == ["first", "second", "third"]
+    assert float(table[2]["mask_iou"]) == info["mask_iou"] > 0.8 and int(table[2]["faces"]) == info["mesh"]["faces"]

@@ -1,0 +1,111 @@
+"""The paper's figures against closed forms, and its tables on a ball."""
+
+import inspect
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from reli3d.cli import tables
+from reli3d.eval import objects
+from reli3d.eval.metrics import geometry, psnr, ssim, surface_samples
+from reli3d.io.glb import write_glb
+from reli3d.nn.reni import map_directions
+from reli3d.render.environment import Environment
+from tests.support import small_scene
+
+
+def sphere(radius, count=20_000, seed=0):
+    points = np.random.default_rng(seed).normal(size=(count, 3))
+    return radius * points / np.linalg.norm(points, axis=1, keepdims=True)
+
+
+def test_chamfer_and_f_score_of_two_spheres():
+    """Spheres of radius 1 and 1.15: every point is 0.15 from the other, in a frame whose half side is 1."""
+    found = geometry(sphere(1.15), sphere(1.0, seed=1))
+    # the nearest of 20,000 points lies beside the foot: sqrt(4 pi / 20000) / 2, far less than 0.15 in quadrature
+    assert found["cd"] == pytest.approx(0.15, rel=0.01)
+    assert found["fs@0.1"] == 0.0 and found["fs@0.2"] == 1.0 and found["fs@0.5"] == 1.0
+    scaled = geometry(7.0 * sphere(1.15), 7.0 * sphere(1.0, seed=1))
+    assert scaled["cd"] == pytest.approx(found["cd"], rel=1e-9)
+
+
+def test_icp_takes_a_small_turn_and_shift_back():
+    want = sphere(1.0, 4000) * np.array([1.0, 0.5, 0.3])
+    c, s = math.cos(0.1), math.sin(0.1)
+    got = want @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T + 0.05
+    assert geometry(got, want)["cd"] > 0.02 and geometry(got, want, icp=True)["cd"] < 2e-3
+
+
+def test_surface_samples_lie_on_the_surface_evenly():
+    points = surface_samples(small_scene.ball().mesh, 4000)
+    radius = np.linalg.norm(points, axis=1)
+    assert np.ptp(radius) < 0.03 and float(np.abs(points.mean(0)).max()) < 0.03 * radius.mean() * 2
+
+
+def test_psnr_and_ssim_of_known_pictures():
+    picture = torch.rand(40, 40, 3, generator=torch.Generator().manual_seed(0)) * 0.5
+    assert psnr(picture + 0.1, picture) == pytest.approx(20.0, abs=1e-4) and psnr(picture, picture) == 100.0
+    assert ssim(picture, picture) == pytest.approx(1.0, abs=1e-12)
+    even = torch.full((20, 20, 3), 0.4)  # no variance: the luminance term alone
+    luminance = (2 * 0.4 * 0.6 + 1e-4) / (0.4**2 + 0.6**2 + 1e-4)
+    assert ssim(even, even + 0.2) == pytest.approx(luminance, rel=1e-5)
+    assert ssim(picture, picture.flip(0)) < 0.2
+    with pytest.raises(ValueError, match="11 pixels"):
+        ssim(even[:5], even[:5])
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("tables")
+    write_glb(folder / "ball.glb", replace(small_scene.ball(), environment=None))
+    sky = (0.3 + map_directions(64).clamp(min=0)).numpy()[None].repeat(12, 0)
+    names = [f"{k:02d}" for k in range(12)]
+    np.savez(folder / "maps.npz", env=sky * (1 + np.arange(12)[:, None, None, None] / 12), names=names)
+    return folder
+
+
+def test_the_pipeline_takes_what_it_is_given():
+    asked = {"weights", "options"}
+    assert asked <= set(inspect.signature(objects.reconstruct).parameters)
+
+
+def test_the_truth_reconstructed_perfectly_has_perfect_figures(place, monkeypatch):
+    """The pipeline replaced by one that gives the object itself, in its own light at the photographs' exposure."""
+    light = Environment(torch.rand(16, 32, 3, generator=torch.Generator().manual_seed(0)) + 0.2)
+    truth = objects.load_truth(place / "ball.glb", light, light, inputs=2, size=32, seed=0)
+    exposure = objects.exposure_of(truth, light)
+    given = []
+
+    def perfect(views, *, weights, options):
+        given.append(views)
+        return replace(truth.parts[0], environment=Environment(light.radiance * exposure))
+
+    monkeypatch.setattr(objects, "reconstruct", perfect)
+    found, pictures = objects.evaluate(None, truth, 2)
+    assert len(given[0]) == 2 and len(pictures) == 7
+    for name in objects.MAPS:
+        assert found[f"{name}_psnr"] == 100.0
+    assert found["image_psnr"] > 60 and found["relit_psnr"] == 100.0  # the light's product rounds
+    assert found["cd"] < 0.02 and found["fs@0.1"] == 1.0  # two draws of 30,000 points
+    assert found["empty"] == 0.0
+
+
+def test_the_command_writes_table_rows_and_pictures(place, monkeypatch, capsys):
+    monkeypatch.setattr("reli3d.nn.weights.load_model", lambda name: None)
+
+    def nothing(views, *, weights, options):
+        raise objects.NoSurface("none")
+
+    monkeypatch.setattr(objects, "reconstruct", nothing)
+    out = place / "out"
+    args = [str(place / "ball.glb"), "--maps", str(place / "maps.npz"), "--views", "1", "2", "--size", "24"]
+    assert tables.main([*args, "--output", str(out)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("| views | objects | cd | fs@0.1") and len(lines) == 4
+    assert lines[2].split("|")[3].strip() == "-"  # no geometry where there is no surface
+    assert len((out / "objects.csv").read_text().splitlines()) == 3
+    assert Image.open(out / "sheet.png").size == (24 * 7, 24)

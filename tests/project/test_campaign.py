@@ -1,0 +1,142 @@
+"""The campaign finds what it looks for, and finds nothing in the readers."""
+
+import os
+import signal
+import sys
+import time
+from random import Random
+
+import pytest
+import torch
+
+from reli3d.output.folder import claimed
+from tests import campaign
+from tests.support.mutators import LONGEST, edited
+from tests.support.readers import Target, targets
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="needs fork and /proc")
+NAMES = ("a", "b", "c")
+
+
+@pytest.fixture
+def small_threads(threads):
+    threads(1)  # a fork does not inherit torch's threads
+
+
+def outcomes(read, count: int = 3):
+    target = Target("planted", {"a.txt": b"one"}, read)
+    return list(campaign.in_fork([(k, target, []) for k in range(count)]))
+
+
+def test_every_kind_of_fault_is_told_apart(small_threads, monkeypatch):
+    monkeypatch.setattr(campaign, "SECONDS", 0.2)
+    monkeypatch.setattr(campaign, "MEMORY", 1 << 26)
+    monkeypatch.setattr(campaign, "WALL", 3.0)
+
+    def raises(error):
+        def read(folder):
+            raise error
+
+        return read
+
+    def busy(seconds):
+        def read(folder):
+            began = time.process_time()
+            while time.process_time() < began + seconds:
+                pass
+
+        return read
+
+    def kept(folder):
+        return bytearray(b"x") * (1 << 27)
+
+    assert [o.kind for o in outcomes(lambda folder: (folder / "a.txt").read_bytes())] == ["accepted"] * 3
+    assert [o.kind for o in outcomes(raises(ValueError("a: expected b")))] == ["refused"] * 3
+    assert [o.kind for o in outcomes(raises(OSError(2, "none")))] == ["refused"] * 3
+    for error in (KeyError("x"), RuntimeError(), MemoryError(), SystemExit(3), ValueError("two\nlines"), ValueError()):
+        assert [o.kind for o in outcomes(raises(error))] == ["wrong"] * 3, error
+    assert [o.kind for o in outcomes(busy(0.5), 1)] == ["slow"]
+    assert [o.kind for o in outcomes(busy(60.0), 1)] == ["slow"]  # ended by the limit on the processor's time
+    assert [o.kind for o in outcomes(lambda folder: time.sleep(60), 1)] == ["slow"]
+    assert [o.kind for o in outcomes(kept, 1)] == ["memory"]
+    (crash,) = outcomes(lambda folder: os.kill(os.getpid(), signal.SIGSEGV))  # the rest goes to another process
+    assert (crash.kind, crash.text) == ("crash", "SIGSEGV")
+
+
+def test_a_finding_is_saved_with_few_changes_and_the_rest_is_tried(tmp_path, small_threads):
+    def read(folder):
+        if b"\0" in (folder / "a.txt").read_bytes():
+            raise KeyError("planted")
+
+    target = Target("planted", {"a.txt": b"one two three\n" * 3}, read)
+    found = campaign.Campaign(1, [target], tmp_path / "findings")
+    assert found.run(120, time.monotonic() + 300) == 120
+    line = found.table["planted"]
+    assert line.failed == len(found.failed) > 0 and line.accepted + line.failed == 120
+    folders = sorted((tmp_path / "findings").iterdir())
+    assert len(folders) == line.failed
+    for folder in folders:
+        assert b"\0" in (folder / "a.txt").read_bytes() and "planted" in (folder / "finding.json").read_text()
+    again = campaign.Campaign(1, [target], tmp_path / "again")
+    again.run(120, time.monotonic() + 300)
+    assert [o.number for _, o in again.failed] == [o.number for _, o in found.failed]  # the same seed, the same inputs
+
+
+def test_changes_are_drawn_by_their_seed_and_stay_small(tmp_path):
+    for target in targets(tmp_path):
+        different = 0
+        for seed in range(30):
+            files = edited(edited(target.files, seed), seed + 100)
+            assert files == edited(edited(target.files, seed), seed + 100)
+            assert set(files) == set(target.files) and max(map(len, files.values())) <= 4 * LONGEST
+            different += files != target.files
+        assert different > 20, target.name
+
+
+def test_good_files_are_accepted(tmp_path, small_threads):
+    found = targets(tmp_path)
+    assert [o.kind for o in campaign.in_fork([(k, t, []) for k, t in enumerate(found)])] == ["accepted"] * len(found)
+
+
+@pytest.mark.parametrize("count", [140, pytest.param(10_000, marks=pytest.mark.slow)])
+def test_hostile_inputs_are_read_or_refused_in_one_line(tmp_path, small_threads, count):
+    found = campaign.Campaign(20, targets(tmp_path / "good"), tmp_path / "findings")
+    assert found.run(count, time.monotonic() + 3600) == count
+    assert found.failed == [], found.report()
+
+
+@pytest.mark.parametrize("kills", [10, pytest.param(200, marks=pytest.mark.slow)])
+def test_kills_at_random_moments_leave_one_whole_result(tmp_path, kills):
+    """A process that exchanges results as fast as it can; what it is killed in, nobody chooses."""
+    folder, rng, seen = tmp_path / "out" / "name", Random(7), set()
+    for _ in range(kills):
+        pid = os.fork()
+        if pid == 0:
+            try:
+                for word in range(10**9):
+                    with claimed(folder, NAMES) as replacing, replacing() as new:
+                        for name in NAMES:
+                            (new / name).write_text(f"{os.getpid()} {word}")
+            finally:
+                os._exit(1)
+        time.sleep(rng.uniform(0.0, 0.05))
+        os.kill(pid, signal.SIGKILL)
+        os.waitpid(pid, 0)
+        if folder.exists():  # what anybody else sees now
+            assert len({(folder / name).read_text() for name in NAMES}) == 1
+        with claimed(folder, NAMES):  # the next start
+            words = {(folder / name).read_text() for name in NAMES} if folder.exists() else {"none"}
+        assert len(words) == 1
+        seen |= words
+        assert {p.name for p in (tmp_path / "out").iterdir()} <= {"name"} if folder.parent.exists() else True
+    assert len(seen) > kills / 4  # most lived long enough to write
+
+
+def test_the_command_says_what_it_did(tmp_path, capsys):
+    before = torch.get_num_threads()
+    try:
+        assert campaign.main(["--count", "14", "--seed", "3", "--findings", str(tmp_path / "none")]) == 0
+    finally:
+        torch.set_num_threads(before)
+    out = capsys.readouterr().out
+    assert out.count("\n") == 2 + 14 and "highest memory" in out and not (tmp_path / "none").exists()

@@ -1,0 +1,98 @@
+"""What reads a user's files, each with files that it accepts: the targets of the campaign."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+from safetensors.torch import save
+
+from reli3d.cli.objects import listed
+from reli3d.io.glb import glb_bytes, read_glb
+from reli3d.io.hdr import environment_bytes, read_environment
+from reli3d.io.images import read_image
+from reli3d.nn.presets import SMALL, to_json
+from reli3d.nn.weights import read_manifest
+from reli3d.render.asset import Asset
+from reli3d.synthetic.maps import load_maps
+from reli3d.views.check import explain_cameras
+from reli3d.views.folder import load_views
+from tests.support import evil, evil_maps
+from tests.support.scenes import ball_mesh, textures
+
+
+@dataclass(frozen=True)
+class Target:
+    """files: by their names in the folder that ``read`` is called with."""
+
+    name: str
+    files: dict[str, bytes]
+    read: Callable[[Path], object]
+
+
+def _folder(make: Callable[[Path], object], root: Path) -> dict[str, bytes]:
+    make(root)
+    return {str(p.relative_to(root)): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
+
+
+def _picture(form: str, **options) -> bytes:
+    data = io.BytesIO()
+    Image.fromarray(evil.picture(alpha=form != "JPEG")).save(data, form, **options)
+    return data.getvalue()
+
+
+def _weights() -> bytes:
+    return save({"x": torch.zeros(4)}, {"preset": to_json(SMALL), "licence": "none"})
+
+
+def targets(root: Path) -> list[Target]:
+    """root: an empty folder to make the accepted ones in."""
+    found = [
+        Target("transforms", _folder(evil.good, root / "json"), load_views),
+        Target("colmap", _folder(evil.colmap, root / "colmap"), load_views),
+    ]
+    cameras = {"transforms.json": found[0].files["transforms.json"]}
+    found.append(Target("rigs", cameras, _with_pictures))
+    pictures = [
+        ("png", {}),
+        ("jpeg", {"progressive": True}),
+        ("webp", {}),
+        ("tiff", {}),
+        ("tiff", {"compression": "tiff_lzw"}),
+    ]
+    for k, (form, options) in enumerate(pictures):
+        name = f"a.{form}"
+        found.append(
+            Target(
+                f"{form} {k}" if form == "tiff" else form,
+                {name: _picture(form.upper(), **options)},
+                lambda folder, name=name: read_image(folder / name),
+            )
+        )
+    radiance = torch.rand(8, 16, 3, generator=torch.Generator().manual_seed(0))
+    asset = Asset(ball_mesh(1, 0.6), textures(4, torch.device("cpu")))
+    maps = io.BytesIO()
+    np.savez(maps, env=np.ones((2, 4, 8, 3), np.float32), names=["a", "b"])
+    found += [
+        Target("hdr", {"a.hdr": environment_bytes(radiance)}, lambda f: read_environment(f / "a.hdr")),
+        Target("exr", {"a.exr": evil_maps.exr_bytes()}, lambda f: read_environment(f / "a.exr")),
+        Target("glb", {"a.glb": glb_bytes(asset)}, lambda f: read_glb(f / "a.glb")),
+        Target("weights", {"a.safetensors": _weights()}, lambda f: read_manifest(f / "a.safetensors").preset()),
+        Target("maps", {"a.npz": maps.getvalue()}, lambda f: load_maps(f / "a.npz")),
+        Target("list", {"a.txt": b"one\ntwo/three\n"}, lambda f: listed(f / "a.txt")),
+    ]
+    return found
+
+
+def _with_pictures(folder: Path) -> None:
+    """Cameras alone are changed: the pictures are good."""
+    (folder / "rgba").mkdir(exist_ok=True)
+    data = _picture("PNG")
+    for k in range(3):
+        (folder / "rgba" / f"{k}.png").write_bytes(data)
+    explain_cameras(load_views(folder))

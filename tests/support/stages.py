@@ -1,0 +1,51 @@
+"""A network that shows a ball from the first step on, and small samples to train it with."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from safetensors.torch import save_file
+
+from reli3d.nn.model import Reconstructor
+from reli3d.nn.presets import TINY
+from reli3d.nn.reni import map_directions
+from reli3d.render.camera import Camera, look_at
+from reli3d.synthetic.procedural import make_object
+from reli3d.synthetic.samples import ObjectSurface, synthesize
+
+RADIUS = 0.5
+SMALL = replace(TINY, name="smaller", image_size=32, plane_size=4, resolution=16)
+
+
+class BallModel(Reconstructor):
+    """``SMALL`` whose raw density is that of a ball plus what the head says."""
+
+    steep = 12.0  # of the raw density, per model unit
+
+    def query(self, code, points, heads=("density",)):
+        values = super().query(code, points, heads)
+        if "density" in values:
+            ball = self.steep * (RADIUS - points.norm(dim=-1, keepdim=True))
+            values["density"] = values["density"] + 2.0 + ball  # 2: the head starts that far outside
+        return values
+
+
+def ball_model(seed: int = 0) -> BallModel:
+    """The same parameters for the same seed."""
+    torch.manual_seed(seed)
+    return BallModel(SMALL)
+
+
+def camera(size: int) -> Camera:
+    """From the side, far enough for the ball to stay in the picture."""
+    return Camera.from_fov(look_at([0.4, 0.5, 2.0], [0.0, 0.0, 0.0]), 0.75, size, size)
+
+
+def write_samples(folder: Path, seeds=(3, 12), views: int = 4) -> Path:
+    """Samples of 48 pixels under a sky that is bright towards +X."""
+    light = 0.2 + 3.0 * map_directions(32)[..., :1].clamp(min=0).expand(-1, -1, 3).contiguous()
+    for seed in seeds:
+        sample = synthesize(ObjectSurface(make_object(seed)), light, np.random.default_rng(seed), size=48, views=views)
+        save_file(sample, folder / f"{seed:010d}.safetensors")
+    return folder

@@ -1,0 +1,204 @@
+"""Sources of objects: real captures, shards and latents of lights."""
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from reli3d.cli import data
+from reli3d.io.files import InputError
+from reli3d.nn.model import Reconstructor
+from reli3d.nn.presets import TINY
+from reli3d.nn.reni import map_directions
+from reli3d.render.camera import look_at, project
+from reli3d.train.stages.captures import Captures
+from reli3d.train.stages.config import Stage
+from reli3d.train.stages.latents import fitted, load_prior
+from reli3d.train.stages.losses import gradients
+from reli3d.train.stages.shards import INDEX, Shards, pack, read_index
+from reli3d.train.stages.sources import source
+from reli3d.train.stages.step import object_losses
+from reli3d.train.stages.views import Samples, draw
+from tests.support.stages import ball_model, write_samples
+
+GAUSSIANS = Stage("gaussians", "gaussians", 16, lobes=16)
+REAL = Path(os.environ.get("RELI3D_CAPTURES", "../shared/data/captures"))
+
+
+@pytest.fixture(scope="module")
+def samples(tmp_path_factory):
+    return write_samples(tmp_path_factory.mktemp("packed"), seeds=(1, 2, 3), views=3)
+
+
+def write_capture(folder: Path, scores: dict | None, radius: float = 3.0) -> None:
+    """Three photographs of a disc of radius 0.6 about the origin, off the centre of frames of 60 by 40 pixels."""
+    (folder / "images").mkdir(parents=True)
+    frames = []
+    for k, eye in enumerate(([0.3, 0.2, 3.0], [2.5, 0.5, 1.5], [-2.0, 1.0, 2.0])):
+        eye = radius * np.array(eye) / np.linalg.norm(eye)
+        c2w = look_at(torch.tensor(eye, dtype=torch.float32), [0.45, 0.0, 0.0])  # the object is not in the middle
+        camera = torch.tensor([50.0, 50.0, 30.0, 20.0])
+        middle, depth = project(torch.zeros(1, 3), c2w, camera)
+        y, x = np.mgrid[:40, :60] + 0.5
+        inside = np.hypot(x - float(middle[0, 0]), y - float(middle[0, 1])) < 50.0 * 0.6 / float(depth)
+        rng = np.random.default_rng(k)
+        rgba = np.concatenate([rng.integers(0, 255, (40, 60, 3)), 255 * inside[..., None]], -1).astype(np.uint8)
+        Image.fromarray(rgba).save(folder / "images" / f"{k}.png")
+        frames.append({"file_path": f"images/{k}.png", "transform_matrix": c2w.tolist()})
+    text = {"fl_x": 50.0, "fl_y": 50.0, "cx": 30.0, "cy": 20.0, "w": 60, "h": 40, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(text))
+    if scores is not None:
+        (folder / "metadata.json").write_text(json.dumps(scores))
+
+
+@pytest.fixture(scope="module")
+def captures(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("captures")
+    names = ("camera_quality_score", "gaussian_splats_quality_score")
+    write_capture(folder / "good", dict(zip(names, (1.0, 1.7), strict=True)))
+    write_capture(folder / "blurred", dict(zip(names, (2.0, 0.99), strict=True)))
+    write_capture(folder / "broken", {"camera_quality_score": 2.0})
+    write_capture(folder / "own", None, radius=6.0)
+    return folder
+
+
+def test_captures_are_filtered_by_both_scores(captures):
+    found = Captures(captures, 32)
+    assert [f.name for f in found.folders] == ["good", "own"]
+    assert "gaussian_splats_quality_score 0.99" in found.refused["blurred"] and "broken" in found.refused["broken"]
+
+
+def test_a_capture_is_cropped_centred_and_scaled_and_knows_where_its_photograph_ends(captures):
+    found = Captures(captures, 32)
+    for index in range(2):  # the second is as the first, seen from twice as far: the same size after scaling
+        views = found.load(index, range)
+        assert views.material is None and views.normal is None and views.latent is None and views.background
+        for v in range(3):
+            rows, columns = (views.masks[v] > 0.5).nonzero().unbind(1)
+            assert abs(float(rows.float().mean()) + 0.5 - 16) < 1.5 and abs(float(columns.float().mean()) - 15.5) < 1.5
+            centre, depth = project(torch.zeros(1, 3), views.c2w[v], views.intrinsics[v])
+            assert float((centre - 16).abs().max()) < 2.5  # the hull of three views lies about the object
+            width = float((views.masks[v] > 0.5).any(0).sum()) / float(views.intrinsics[v, 0]) * float(depth)
+            assert 0.7 < width < 1.1  # longest side of the hull 1, the ball in it a little less
+    valid = views.valid
+    assert 0.0 < float(valid.min(0).values.mean()) < 1.0 or float(valid.mean()) == 1.0
+    whole = torch.where(valid > 0, 0.0, 1.0) * views.masks
+    assert float(whole.max()) == 0.0  # the object is never shown where there is no photograph
+
+
+def test_a_capture_takes_part_without_truth(captures):
+    one = draw(
+        [Captures(captures, 32)], (0, 2), inputs=2, targets=1, background=1.0, input_size=32, target_size=16, patch=0
+    )
+    terms = object_losses(ball_model(), one, GAUSSIANS, gradients)
+    assert {"image", "mask", "neutral"} <= set(terms) and not {"material", "normal", "latent"} & set(terms)
+
+
+@pytest.mark.skipif(not REAL.exists(), reason="needs the captures beside the checkout; set RELI3D_CAPTURES")
+def test_uco3d_objects_are_read():
+    found = Captures(REAL, 64)
+    names = [f.name for f in found.folders]
+    index = next(k for k, n in enumerate(names) if n.startswith("UCO3D"))
+    views = found.load(index, range)
+    assert views.images.shape[1:] == (64, 64, 3) and float(views.masks.mean()) > 0.1
+
+
+def test_shards_hold_what_the_samples_held_and_any_reader_reads_them(samples, tmp_path):
+    import webdataset
+
+    pack(Samples(samples), tmp_path, each=2)
+    rows = read_index(tmp_path)
+    assert [len(r["objects"]) for r in rows] == [2, 1]
+    packed, plain = Shards(tmp_path), Samples(samples)
+    for k in range(3):
+        a, b = packed.load(k, lambda total: [2, 0]), plain.load(k, lambda total: [2, 0])
+        for name in ("images", "masks", "c2w", "intrinsics", "material", "normal", "shown"):
+            assert torch.equal(getattr(a, name), getattr(b, name)), name
+    urls = [str(tmp_path / r["shard"]) for r in rows]
+    streamed = [entry["__key__"] for entry in webdataset.WebDataset(urls, shardshuffle=False)]
+    assert streamed == [p.stem for p in plain.files]
+
+
+def test_packing_goes_on_and_its_parts_can_be_split(samples, tmp_path):
+    for k in (1, 0):
+        pack(Samples(samples), tmp_path / "parts", each=1, part=(k, 2))
+        assert (tmp_path / "parts" / INDEX).exists() == (k == 0)  # not before the last shard
+    times = {p: p.stat().st_mtime_ns for p in (tmp_path / "parts").glob("*.tar")}
+    pack(Samples(samples), tmp_path / "parts", each=1)
+    assert {p: p.stat().st_mtime_ns for p in (tmp_path / "parts").glob("*.tar")} == times and len(times) == 3
+
+
+def test_a_shard_cut_in_half_is_told_and_left_out(samples, tmp_path, capsys):
+    pack(Samples(samples), tmp_path, each=2)
+    first = tmp_path / "000000.tar"
+    content = first.read_bytes()
+    first.write_bytes(content[: len(content) // 2])
+    found = Shards(tmp_path)
+    told = capsys.readouterr().err
+    assert len(found) == 1 and told.count("\n") == 1 and "000000.tar: expected" in told
+    assert data.main(["check", str(tmp_path)]) == 1
+    assert "000000.tar" in capsys.readouterr().out
+    first.write_bytes(content[:5000] + bytes([content[5000] ^ 1]) + content[5001:])  # one bit, the same length
+    assert data.main(["check", str(tmp_path)]) == 1
+    assert "SHA-256" in capsys.readouterr().out
+    (tmp_path / "000001.tar").unlink(), first.unlink()
+    with pytest.raises(InputError, match="expected a whole shard"):
+        Shards(tmp_path)
+
+
+@pytest.mark.parametrize("text", ["", "{}", '{"shards": [{"shard": "../x.tar"}]}', '{"shards": 3}'])
+def test_a_broken_index_is_refused_in_one_line(text, tmp_path):
+    (tmp_path / INDEX).write_text(text)
+    with pytest.raises(InputError, match="index"):
+        read_index(tmp_path)
+
+
+def test_the_commands_pack_check_and_show(captures, tmp_path, capsys):
+    out = tmp_path / "shards"
+    assert data.main(["pack", str(captures), str(out)]) == 0
+    assert "blurred: left out" in capsys.readouterr().err
+    assert data.main(["check", str(out)]) == 0
+    assert data.main(["show", str(out)]) == 0
+    shown = capsys.readouterr().out.splitlines()
+    assert len(shown) == 2 and "good" in shown[0] and "3 views of 256 pixels" in shown[0]
+    assert data.main(["show", str(out), "--picture", str(tmp_path / "x.png")]) == 0
+    assert Image.open(tmp_path / "x.png").size == (768, 256)
+    views = Shards(out).load(0, range)
+    assert views.material is None and views.valid is not None and views.background
+    assert isinstance(source(out), Shards) and isinstance(source(captures), Captures)
+
+
+def test_latents_decode_to_the_light_and_are_kept(samples, tmp_path):
+    torch.manual_seed(0)
+    model = Reconstructor(TINY)
+    files = Samples(samples).files
+    found = fitted(model.environment, files[:1], tmp_path / "cache", steps=60)
+    again = fitted(model.environment, files, tmp_path / "cache", steps=60)
+    assert torch.equal(found[files[0].stem][0], again[files[0].stem][0]) and len(again) == 3
+    latent, strength = found[files[0].stem]
+    with torch.no_grad():
+        radiance = model.environment(latent[None], torch.eye(3)[None], strength[None], 16)[0]
+    bright = radiance.mean(-1)[map_directions(16)[..., 0].abs() > 0.8]
+    assert float(bright.max()) > 1.3 * float(bright.min())  # by a decoder that nothing was taught
+    other = fitted(model.environment, files[:1], tmp_path / "cache", steps=40)
+    assert not torch.equal(other[files[0].stem][0], latent)  # another number of steps is another fit
+
+
+def test_a_prior_is_loaded_and_left_alone(tmp_path):
+    from safetensors.torch import save_file
+
+    torch.manual_seed(1)
+    model, other = Reconstructor(TINY), Reconstructor(TINY)
+    save_file({k: v.contiguous() for k, v in other.environment.state_dict().items()}, tmp_path / "prior.safetensors")
+    load_prior(model, tmp_path / "prior.safetensors")
+    assert torch.equal(model.environment.field.network.fc.weight, other.environment.field.network.fc.weight)
+    assert not any(p.requires_grad for p in model.environment.parameters())
+    shutil.copy(tmp_path / "prior.safetensors", tmp_path / "cut.safetensors")
+    (tmp_path / "cut.safetensors").write_bytes((tmp_path / "cut.safetensors").read_bytes()[:500])
+    with pytest.raises(InputError, match="light prior"):
+        load_prior(model, tmp_path / "cut.safetensors")

@@ -1,0 +1,136 @@
+"""Cameras far from their origin, or next to nothing apart: float64 where the poses are read, float32 about the object.
+
+Float32 is 0.06 apart at 900,000: poses and vertices that went there lost their shape.
+"""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from reli3d.cli import infer
+from reli3d.geometry.mesh import report
+from reli3d.io.files import InputError
+from reli3d.io.glb import glb_bytes, read_glb
+from reli3d.nn.weights import load_model
+from reli3d.pipeline import ReconstructOptions, reconstruct
+from reli3d.views.folder import load_views
+from reli3d.views.normalize import FAR, near_origin
+from reli3d.views.similarity import Similarity
+from tests.support import evil
+from tests.support.example import QUICK, moved_example
+from tests.support.rigs import sphere_views
+
+FARTHEST = (6e5, -4e5, 5e5)
+
+
+def moved(folder, shift, scale=1.0):
+    matrix = torch.eye(4, dtype=torch.float64)
+    matrix[:3, :3] *= scale
+    matrix[:3, 3] = torch.tensor(shift, dtype=torch.float64)
+    return moved_example(folder, matrix)
+
+
+def poses(shift, scale=1.0, count=5):
+    c2w = sphere_views(count=count).c2w.double()
+    c2w[:, :3, 3] = scale * c2w[:, :3, 3] + torch.tensor(shift, dtype=torch.float64)
+    return c2w
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+@pytest.mark.parametrize("shift", [(9e5, 0, 0), FARTHEST])
+def test_the_origin_of_a_far_rig_is_where_it_looks(shift, scale):
+    at = near_origin(poses(shift, scale))
+    # float32 rotations put the meeting point 1e-7 of the distance off
+    torch.testing.assert_close(at, torch.tensor(shift, dtype=torch.float64), rtol=0, atol=1e-6 * scale)
+
+
+def test_a_rig_that_is_not_far_stays():
+    for shift, scale in (((0, 0, 0), 1.0), ((0.9 * FAR * 2.2, 0, 0), 1.0), ((300, -20, 5), 40.0), ((0, 0, 0), 4e5)):
+        assert not bool(near_origin(poses(shift, scale)).any())
+
+
+def test_one_view_is_far_only_where_it_looks_elsewhere():
+    """The object of one view is where its ray is nearest to the origin: to move that would change the object."""
+    towards, away = torch.eye(4, dtype=torch.float64)[None], torch.eye(4, dtype=torch.float64)[None].clone()
+    towards[0, 2, 3], away[0, 2, 3] = 9e5, -9e5  # OpenGL cameras look along -z
+    assert not bool(near_origin(towards).any())
+    assert float(near_origin(away)[2]) == pytest.approx(-9e5 - 1)
+
+
+def test_cameras_in_one_point_are_left_to_the_check():
+    for shift in ((0, 0, 0), (0.3, 0.7, 0.9), FARTHEST):
+        c2w = poses(shift)
+        c2w[:, :3, 3] = torch.tensor(shift, dtype=torch.float64)
+        assert not bool(near_origin(c2w).any())
+
+
+@pytest.mark.parametrize("scale", [1e-7, 1e-20, 1e-44, 1e-300])
+def test_a_rig_of_no_size_is_refused(tmp_path, scale):
+    data = evil.good(tmp_path)
+    for frame in data["frames"]:
+        for row in frame["transform_matrix"][:3]:
+            row[3] *= scale
+    (tmp_path / "transforms.json").write_text(json.dumps(data))
+    with pytest.raises(InputError, match=r"expected a distance of 1e-06 or more to the object, got (2e-|0)"):
+        load_views(tmp_path)
+
+
+def test_a_far_folder_reads_as_a_near_one(tmp_path):
+    near, far = load_views(infer.EXAMPLE), load_views(moved(tmp_path / "far", FARTHEST))
+    assert near.origin == (0, 0, 0) and any("far from their origin" in note for note in far.notes)
+    assert not any("far" in note for note in near.notes)
+    eyes = near.c2w[:, :3, 3].double() + torch.tensor(FARTHEST, dtype=torch.float64)
+    got = far.c2w[:, :3, 3].double() + torch.tensor(far.origin, dtype=torch.float64)
+    # float32 about the object, and float64's own 1e-10 at 1e6; without the move 0.03
+    torch.testing.assert_close(got, eyes, rtol=0, atol=5e-7)
+    assert far.select(1).transformed(Similarity.identity()).origin == far.origin
+    every = load_views(tmp_path / "far", every=True)
+    assert load_views(tmp_path / "far", first_views=2).origin == every.origin == far.origin
+
+
+@pytest.mark.parametrize("options", [[], ["--up", "z"], ["--frame", "model"]])
+def test_the_mesh_of_far_cameras_is_closed_and_in_its_place(tmp_path, options):
+    folder = moved(tmp_path / "far", FARTHEST)
+    arguments = [str(infer.EXAMPLE), str(folder), "--output", str(tmp_path / "out"), "--normalize", "hull"]
+    assert infer.main([*arguments, *QUICK, *options]) == 0
+    boxes, records = [], []
+    for name in ("example", "far"):
+        data = (tmp_path / "out" / name / "mesh.glb").read_bytes()
+        document = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+        shift = np.array(document["nodes"][0].pop("translation", [0.0, 0.0, 0.0]))
+        low, high = (np.array(document["accessors"][0][k]) for k in ("min", "max"))
+        boxes.append((low + shift, high + shift))
+        records.append(json.loads((tmp_path / "out" / name / "run_info.json").read_text()))
+    record = records[1]["mesh"]
+    assert record["watertight"] and record["manifold"] and record["degenerate_faces"] == 0
+    x, y, z = FARTHEST if "model" not in options else (0, 0, 0)
+    there = (x, z, -y) if "z" in options else (x, y, z)
+    # the meeting point of the axes is some 1e-7 beside the cameras' own origin, and the hull's grid begins elsewhere
+    for near, far in zip(*boxes):
+        np.testing.assert_allclose(far - there, near, rtol=0, atol=0.02)
+    # both matrices lead from the folder's frame: the same point of the object goes to the same place
+    for key, rest in (("model_from_input", (0, 0, 0)), ("output_from_input", there)):
+        near, far = (np.array(r[key]) for r in records)
+        np.testing.assert_allclose(far @ (*FARTHEST, 1) - (*rest, 0), near @ (0, 0, 0, 1), rtol=0, atol=0.02)
+
+
+def test_views_that_are_far_in_float32_are_refused_where_the_mesh_would_break():
+    views = load_views(infer.EXAMPLE)
+    shift = Similarity(1.0, torch.eye(3, dtype=torch.float64), torch.tensor(FARTHEST, dtype=torch.float64))
+    weights, options = load_model("small"), ReconstructOptions(texture_size=256, resolution=40)
+    with pytest.raises(ValueError, match="views: expected an object near the origin, got one of size"):
+        reconstruct(views.transformed(shift), weights=weights, options=options)
+    own = replace(options, frame="model")
+    assert report(reconstruct(views.transformed(shift), weights=weights, options=own).mesh).watertight
+
+
+def test_a_translation_goes_to_the_node_and_back(tmp_path):
+    asset = reconstruct(load_views(infer.EXAMPLE, views=1), options=ReconstructOptions(texture_size=256, resolution=16))
+    assert b"translation" not in glb_bytes(asset)
+    (tmp_path / "far.glb").write_bytes(glb_bytes(asset, translation=(8.0, -4.0, 2.0)))
+    got = read_glb(tmp_path / "far.glb")[0].mesh.vertices
+    # exact sums but for float32's step at 8
+    torch.testing.assert_close(got, asset.mesh.vertices + torch.tensor([8.0, -4.0, 2.0]), rtol=0, atol=1e-6)

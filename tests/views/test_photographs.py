@@ -1,0 +1,264 @@
+"""Photographs as people have them: many kinds of files, large ones, turned ones, without cameras, without masks."""
+
+import json
+import re
+import subprocess
+import sys
+import types
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from reli3d.io.files import InputError
+from reli3d.io.images import read_image
+from reli3d.render.camera import project
+from reli3d.views.folder import load_views
+from reli3d.views.reduce import LARGE, OBJECT, cut
+from tests.support import evil
+from tests.support.checkout import ROOT
+from tests.support.evil import pose
+
+SIZE = (40, 24)  # width, height
+SHADES = np.random.default_rng(1).integers(0, 256, (SIZE[1], SIZE[0], 4), np.uint8)
+DEEP = SHADES.astype(np.uint16) * 256 + 3
+PALETTE = Image.fromarray(SHADES[..., :3]).quantize(16)
+
+
+def deep_png(path, values):
+    """16-bit PNG of ``(H, W, C)`` values; Pillow writes none but grey."""
+    import struct
+    import zlib
+
+    def chunk(name, data):
+        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+    height, width, channels = values.shape
+    kind = {1: 0, 2: 4, 3: 2, 4: 6}[channels]
+    rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in values)
+    head = struct.pack(">IIBBBBB", width, height, 16, kind, 0, 0, 0)
+    path.write_bytes(
+        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
+    )
+
+
+def saver(mode, ending, **options):
+    return lambda path: Image.fromarray(SHADES).convert(mode).save(path.with_suffix(ending), **options)
+
+
+def grey(k):
+    return lambda v: np.repeat(v[..., k : k + 1], 3, -1)
+
+
+# name in docs/inputs.md: how a file of it is written, colour that is expected, tolerance [levels of 255]
+ACCEPTED = {
+    "8-bit colour": (saver("RGB", ".png"), lambda v: v[..., :3], 0),
+    "8-bit colour, TIFF": (saver("RGB", ".tif"), lambda v: v[..., :3], 0),
+    "8-bit colour with alpha": (saver("RGBA", ".png"), lambda v: v[..., :3], 0),
+    "8-bit colour with alpha, WebP": (saver("RGBA", ".webp", lossless=True, exact=True), lambda v: v[..., :3], 0),
+    "8-bit grey": (lambda p: Image.fromarray(SHADES[..., 0]).save(p), grey(0), 0),
+    "1-bit": (lambda p: Image.fromarray(SHADES[..., 0] > 99).save(p), lambda v: (grey(0)(v) > 99) * 255, 0),
+    "16-bit grey": (lambda p: Image.fromarray(DEEP[..., 0]).save(p), lambda v: DEEP[..., :1] / 257.0, 0),
+    "16-bit colour": (lambda p: deep_png(p, DEEP[..., :3]), lambda v: v[..., :3], 1),  # the low byte is dropped
+    "16-bit colour with alpha": (lambda p: deep_png(p, DEEP), lambda v: v[..., :3], 1),
+    "palette": (lambda p: PALETTE.save(p), lambda v: np.array(PALETTE.convert("RGB")), 0),
+    # Pillow's plain conversion to ink and back: each of the two rounds to a level
+    "CMYK": (
+        lambda p: Image.fromarray(SHADES[..., :3]).convert("CMYK").save(p.with_suffix(".tif")),
+        lambda v: v[..., :3],
+        2,
+    ),
+}
+REFUSED = {
+    "32-bit": lambda p: Image.fromarray(SHADES[..., 0].astype(np.float32)).save(p.with_suffix(".tif")),
+    "LAB": lambda p: Image.fromarray(SHADES[..., :3]).convert("RGB").save(p.with_suffix(".gif")),
+    "AVIF": lambda p: Image.fromarray(SHADES[..., :3]).save(p.with_suffix(".avif")),
+    "several frames": lambda p: Image.fromarray(SHADES).save(
+        p.with_suffix(".tif"), save_all=True, append_images=[Image.fromarray(SHADES)]
+    ),
+}
+
+
+@pytest.mark.parametrize("name", ACCEPTED)
+def test_what_is_accepted_comes_out_as_stored(tmp_path, name):
+    write, expected, levels = ACCEPTED[name]
+    write(tmp_path / "a.png")
+    (path,) = tmp_path.iterdir()
+    colour, alpha = read_image(path)
+    want = torch.from_numpy(np.ascontiguousarray(expected(SHADES))).float().expand(SIZE[1], SIZE[0], 3)
+    assert float((colour * 255 - want).abs().max()) <= levels + 1e-4  # a few ulp of float32 at 255
+    assert (alpha is not None) == ("alpha" in name)
+    if alpha is not None:
+        assert torch.equal((alpha * 255).round().byte(), torch.from_numpy(SHADES[..., 3].copy()))
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_is_refused_ends_in_one_line(tmp_path, name):
+    REFUSED[name](tmp_path / "a.png")
+    (path,) = tmp_path.iterdir()
+    with pytest.raises(InputError, match=r"a\.\w+: expected .*; "):
+        read_image(path)
+
+
+def test_the_table_of_the_documents_names_what_is_tested():
+    text = (ROOT / "docs/inputs.md").read_text()
+    table = text[text.index("## Images") : text.index("## Masks")]
+    for name in ACCEPTED:
+        assert name.split(",")[0].replace(" with alpha", "").lower() in table.lower()
+    for word in ("EXIF", "32-bit", "LAB", "HEIC", "AVIF", "raw"):
+        assert word in table
+
+
+def capture(folder, width, height, box, *, exif=None, mask_at=None, **lens):
+    """One photograph with a gradient, an object in ``box`` (x0, y0, x1, y1), its mask beside it."""
+    pixels = np.full((height, width, 3), 60, np.uint8)
+    pixels[..., 0] = np.arange(width) * 255 // width
+    pixels[..., 1] = (np.arange(height) * 255 // height)[:, None]
+    mask = np.zeros((height, width), np.uint8)
+    mask[box[1] : box[3], box[0] : box[2]] = 255
+    (folder / "masks").mkdir(parents=True)
+    Image.fromarray(pixels).save(folder / "a.jpg", quality=95, **({} if exif is None else {"exif": exif}))
+    Image.fromarray(mask if mask_at is None else mask_at(mask)).save(folder / "masks/a.png")
+    frame = {"file_path": "a.jpg", "transform_matrix": pose(0.4)}
+    data = {"fl_x": 1.2 * width, "frames": [frame], **lens}
+    (folder / "transforms.json").write_text(json.dumps(data))
+    return folder
+
+
+@pytest.mark.parametrize("whole", [False, True])
+def test_a_large_photograph_keeps_its_object_and_its_camera(tmp_path, whole):
+    """A point of the world falls on the same colour, whatever is kept of the picture."""
+    width, height, box = 3001, 2000, (1200, 300, 2703, 1500)
+    capture(tmp_path / "large", width, height, box, cx=1400.0, cy=1100.0)
+    views = load_views(tmp_path / "large", whole=whole)
+    image, mask = views.images[0], views.masks[0]
+    assert any("more than" in note for note in views.notes)
+    if whole:
+        assert 0.99 * LARGE < mask.numel() < 1.01 * LARGE
+    else:
+        columns, rows = (mask > 0.5).any(0).nonzero(), (mask > 0.5).any(1).nonzero()
+        side = max(int(columns[-1] - columns[0]), int(rows[-1] - rows[0])) + 1
+        assert OBJECT - 2 <= side <= OBJECT
+        assert max(mask.shape) <= 1.3 * OBJECT
+    points = torch.tensor([[0.15, 0.1, 0.0], [0.5, 0.2, 0.1], [0.3, -0.1, -0.2]])
+    full = torch.tensor([1.2 * width, 1.2 * width, 1400.0, 1100.0])
+    at, _ = project(points, views.c2w[0], full)
+    now, _ = project(points, views.c2w[0], views.intrinsics[0])
+    for (x, y), (u, v) in zip(at.tolist(), now.tolist()):
+        assert box[0] < x < box[2] and box[1] < y < box[3]
+        colour = image[int(v), int(u)] * 255
+        # the gradient moves by a level in 8 rows; JPEG and rounding cost two
+        assert abs(float(colour[0]) - x * 255 / width) < 3 and abs(float(colour[1]) - y * 255 / height) < 3
+        assert float(mask[int(v), int(u)]) == 1.0
+    assert views.masks[0].dtype == torch.float32
+
+
+def test_photographs_up_to_two_megapixels_stay_as_they_are():
+    inside = np.ones((1080, 1920), bool)
+    assert cut((1920, 1080), inside, whole=False) is None and cut((1920, 1080), inside, whole=True) is None
+    small = cut((6000, 4000), np.pad(np.ones((9, 7), bool), ((10, 3981), (20, 5973))), whole=False)
+    assert small.size == (small.part[2] - small.part[0], small.part[3] - small.part[1])  # nothing is made larger
+
+
+def test_colour_under_alpha_survives_the_reduction(tmp_path):
+    pixels = np.full((1600, 1600, 4), (200, 100, 50, 0), np.uint8)
+    pixels[200:1400, 200:1400, 3] = 255
+    (tmp_path / "rgba").mkdir()
+    Image.fromarray(pixels).save(tmp_path / "rgba/0.png", compress_level=1)
+    frame = {"file_path": "rgba/0.png", "transform_matrix": pose(0.0), "camera_fov": 0.6}
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": [frame]}))
+    views = load_views(tmp_path)
+    assert views.images[0].shape == (960, 960, 3)
+    assert float((views.images[0] * 255 - torch.tensor([200.0, 100.0, 50.0])).abs().max()) < 1e-3
+
+
+@pytest.mark.parametrize("w, h, turned", [(300, 400, True), (600, 800, True), (400, 300, False), (None, None, False)])
+def test_exif_orientation_counts_where_the_cameras_were_calibrated_on_turned_pictures(tmp_path, w, h, turned):
+    exif = Image.Exif()
+    exif[0x0112] = 6  # the camera was turned: the first row of the file is the right side of what is shown
+    lens = {} if w is None else {"w": w, "h": h, "cx": 140.0 * w / 300, "cy": 0.5 * h}
+    upright = lambda mask: np.rot90(mask, -1) if turned else mask  # noqa: E731
+    capture(tmp_path / "phone", 400, 300, (100, 50, 300, 250), exif=exif, mask_at=upright, **lens)
+    views = load_views(tmp_path / "phone")
+    note = next(n for n in views.notes if "EXIF orientation 6" in n)
+    assert (" applied: " in note) == turned
+    assert tuple(views.images[0].shape[:2]) == ((400, 300) if turned else (300, 400))
+    top_right = views.images[0][2, -3] if turned else views.images[0][2, 2]
+    assert float(top_right[:2].max()) < 0.05  # the first stored pixel
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the peak of a process is read from Linux' /proc")
+def test_16_large_photographs_take_less_than_a_gibibyte(tmp_path):
+    """Peak of a process that reads 16 photographs of 24 megapixels, their masks beside them."""
+    folder = capture(tmp_path / "large", 6000, 4000, (1500, 800, 4500, 3200))
+    data = json.loads((folder / "transforms.json").read_text())
+    data["frames"] = [data["frames"][0] | {"transform_matrix": pose(0.39 * i)} for i in range(16)]
+    (folder / "transforms.json").write_text(json.dumps(data))
+    peak = r"re.search(r'VmHWM:\s+(\d+)', open('/proc/self/status').read())[1]"
+    code = (
+        "import re, sys; from reli3d.views.folder import load_views; v = load_views(sys.argv[1]); "
+        f"print(len(v), int({peak}) / 2**20)"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(folder)], capture_output=True, text=True, timeout=300)
+    count, gibibytes = done.stdout.split()
+    assert int(count) == 16
+    assert float(gibibytes) < 1.0
+
+
+def plain(folder, masks=True, inner="images"):
+    (folder / inner).mkdir(parents=True, exist_ok=True)
+    for i in range(3):
+        Image.fromarray(evil.picture(alpha=False)).save(folder / inner / f"p {i}.jpg")
+    if masks:
+        (folder / "masks").mkdir()
+        for i in range(3):
+            Image.fromarray(evil.picture()[..., 3]).save(folder / f"masks/p {i}.png")
+    return folder
+
+
+def test_photographs_without_cameras_are_answered_with_commands(tmp_path):
+    with pytest.raises(InputError, match="got 3 photographs without") as caught:
+        load_views(plain(tmp_path / "my shoe"))
+    text = str(caught.value)
+    for command in ("feature_extractor", "exhaustive_matcher", "mapper"):
+        assert f"colmap {command} --database_path '{tmp_path / 'my shoe' / 'database.db'}'" in text
+    assert "remove-background" not in text and "mv " not in text
+    with pytest.raises(InputError, match=r"mv .*\*\.jpg .*--remove-background"):
+        load_views(plain(tmp_path / "flat", masks=False, inner="."))
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="expected transforms.json or a COLMAP model"):
+        load_views(tmp_path / "empty")
+
+
+def without_masks(folder):
+    capture(folder, 400, 300, (100, 50, 300, 250))
+    for path in (folder / "masks").iterdir():
+        path.unlink()
+    return folder
+
+
+def test_backgrounds_are_removed_on_request_alone(tmp_path, monkeypatch):
+    folder = without_masks(tmp_path / "object")
+    with pytest.raises(InputError, match="expected alpha or a mask.*--remove-background"):
+        load_views(folder)
+    asked = []
+    box = Image.new("L", (400, 300))
+    box.paste(255, (110, 60, 290, 240))
+    fake = types.SimpleNamespace(
+        new_session=lambda name: asked.append(name) or "session", remove=lambda image, *, session, only_mask: box
+    )
+    monkeypatch.setitem(sys.modules, "rembg", fake)
+    views = load_views(folder, remove_background=True)
+    assert int(views.masks[0].sum()) == 180 * 180 and asked == ["isnet-general-use"]
+    assert any(re.match("1 of 1 masks made by rembg", n) for n in views.notes)
+    Image.fromarray(np.asarray(box)).save(folder / "masks/a.png")
+    load_views(folder, remove_background=True)
+    assert len(asked) == 1  # a mask that is there goes first, and no network is loaded
+    (folder / "masks/a.png").unlink()
+    fake.new_session = lambda name: (_ for _ in ()).throw(OSError("no route to\nhost"))
+    with pytest.raises(InputError, match="expected the network isnet-general-use of rembg, got no route to"):
+        load_views(folder, remove_background=True)
+    monkeypatch.setitem(sys.modules, "rembg", None)  # as if it were not installed
+    with pytest.raises(InputError, match=r"^remove-background: expected rembg installed.*reli3d\[masks\]"):
+        load_views(folder, remove_background=True)
