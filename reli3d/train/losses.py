@@ -11,9 +11,9 @@ from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.train.batches import Sample
 
 WEIGHTS = {
-    "occupancy": 1.0, "surface": 0.02, "gradient": 0.3,
-    "base_color": 4.0, "pattern": 12.0, "roughness": 1.5, "metallic": 1.5, "normal": 1.0,
-    "pixel_color": 3.0, "pixel_pattern": 12.0, "pixel_roughness": 1.0, "pixel_metallic": 1.0, "pixel_normal": 1.0,
+    "occupancy": 1.0, "surface": 0.02, "gradient": 0.6,
+    "base_color": 8.0, "pattern": 12.0, "roughness": 1.5, "metallic": 1.5, "normal": 1.0,
+    "pixel_color": 4.0, "pixel_pattern": 12.0, "pixel_roughness": 1.0, "pixel_metallic": 1.0, "pixel_normal": 1.0,
     "pixel_depth": 0.3, "light": 0.4, "light_level": 0.1, "irradiance": 0.4,
 }  # fmt: skip
 ASTRAY = 0.02, 0.3  # greatest deviation of position [model's cube] and normal [radian] of an extracted surface
@@ -44,16 +44,18 @@ def losses(model: LocalReconstructor, sample: Sample) -> dict[str, Tensor]:
 def _shape(field: LocalField, sample: Sample, position: Tensor, normal: Tensor) -> dict[str, Tensor]:
     """Occupancy as a soft step; level zero and its slope along the normal at surface points.
 
-    The slope is asked by differences over a tetrahedron: no second derivative of the network is needed.
+    The slope is asked by differences over a tetrahedron: no second derivative of the network is needed.  It is asked
+    around points a little off the surface, as the surface that is drawn errs.
     """
     softness = field.model.preset.softness
     level = field.level(sample.points)
     target = (-sample.distance / softness).sigmoid()
     corners = GRADIENT_STEP * position.new_tensor([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
     few = position[:GRADIENT_POINTS]
-    around = field.free_level((few[:, None] + corners).reshape(-1, 3)).reshape(-1, 4)
+    near, _ = astray(few, normal[:GRADIENT_POINTS])
+    around = field.free_level((near[:, None] + corners).reshape(-1, 3)).reshape(-1, 4)
     slope = (around[..., None] * corners).sum(1)
-    on_surface = around.mean(1)
+    on_surface = field.free_level(few)
     return {
         "occupancy": functional.binary_cross_entropy_with_logits(-level, target),
         "surface": functional.smooth_l1_loss(on_surface, torch.zeros_like(on_surface)),

@@ -92,14 +92,14 @@ def test_processes_start_once_and_no_more_than_asked(tmp_path):
 COMMAND = """
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from reli3d.cli import infer
 from tests.support.jobs import Start
 root = Path(sys.argv[1])
 infer.choose_device = lambda wanted: "cpu"
 infer.Job = lambda args, device: None
 infer.worker_job = lambda *_: None
-import functools
-functools.partial = lambda *_: Start(root / "log")
+infer.functools = SimpleNamespace(partial=lambda *_: Start(root / "log"))
 sys.exit(infer.main(sys.argv[2:]))
 """
 
@@ -114,15 +114,20 @@ def command(tmp_path, *arguments) -> subprocess.Popen:
     )
 
 
+def until_all_wait(process: subprocess.Popen, items: list[objects.Item]) -> None:
+    until = time.monotonic() + 60
+    while not all((i.folder / "waits").exists() for i in items):
+        assert time.monotonic() < until
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.05)
+
+
 @pytest.mark.skipif(os.name == "nt", reason="needs signals")
 @pytest.mark.parametrize("number, code", [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_ends_all_processes_and_leaves_whole_results(tmp_path, number, code):
     items = folders(tmp_path, ["one", "two", "wait", "wait", "five"])
     process = command(tmp_path, *(i.folder for i in items), "--output", tmp_path / "out", "--workers", 2)
-    until = time.monotonic() + 60
-    while not all((i.folder / "waits").exists() for i in items[2:4]):
-        assert time.monotonic() < until and process.poll() is None
-        time.sleep(0.05)
+    until_all_wait(process, items[2:4])
     process.send_signal(number)
     out, err = process.communicate(timeout=30)
     assert process.returncode == code and err.count("reli3d-infer: ") == 1 and "Traceback" not in err
@@ -136,10 +141,7 @@ def test_a_signal_ends_all_processes_and_leaves_whole_results(tmp_path, number, 
 def test_processes_end_when_the_command_is_killed(tmp_path):
     items = folders(tmp_path, ["wait", "wait", "three"])
     process = command(tmp_path, *(i.folder for i in items), "--output", tmp_path / "out", "--workers", 2)
-    until = time.monotonic() + 60
-    while not all((i.folder / "waits").exists() for i in items[:2]):
-        assert time.monotonic() < until and process.poll() is None
-        time.sleep(0.05)
+    until_all_wait(process, items[:2])
     process.kill()
     assert process.wait() == -signal.SIGKILL
     for item in items:

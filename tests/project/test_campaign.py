@@ -59,6 +59,9 @@ def test_every_kind_of_fault_is_told_apart(small_threads, monkeypatch):
     assert [o.kind for o in outcomes(busy(60.0), 1)] == ["slow"]  # ended by the limit on the processor's time
     assert [o.kind for o in outcomes(lambda folder: time.sleep(60), 1)] == ["slow"]
     assert [o.kind for o in outcomes(kept, 1)] == ["memory"]
+    free = [bytearray(b"x") * (1 << 16) for _ in range(1 << 12)]  # 256 MiB in pieces, which the heap keeps when freed
+    del free[:-1]
+    assert [o.kind for o in outcomes(kept, 1)] == ["memory"]
     (crash,) = outcomes(lambda folder: os.kill(os.getpid(), signal.SIGSEGV))  # the rest goes to another process
     assert (crash.kind, crash.text) == ("crash", "SIGSEGV")
 

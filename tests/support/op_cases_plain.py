@@ -77,7 +77,10 @@ def texels(vertices):
     tangents = vertex_tangents(mesh)
     mesh = Mesh(vertices, faces, mesh.normals, uv, tangents)
     along = bake.bake(mesh, 64, lambda position, normal, tangent: tangent, texels=found, tangents=True)
-    return found.face, found.bary, near, square, maps["value"], along["value"], bake.coverage(mesh, 64), tangents
+    colors = uniform(n, 5, seed=7).to(vertices)
+    of_vertices = bake.interpolate_values(mesh, colors, found, found.valid.reshape(-1).nonzero().squeeze(1))
+    covered = bake.coverage(mesh, 64)
+    return found.face, found.bary, near, square, maps["value"], along["value"], covered, tangents, of_vertices
 
 
 def seen_from(points, normal):
@@ -96,7 +99,8 @@ def seen_from(points, normal):
 def hulls(masks, points):
     c2w, intrinsics = rig(points.device)
     distance = hull.mask_distance(masks)
-    return distance, hull.hull_distance(points, distance, c2w, intrinsics)
+    span = hull.hull_span(3.0 * points, -points, 1.0, distance, c2w, intrinsics)
+    return distance, hull.hull_distance(points, distance, c2w, intrinsics), span
 
 
 def hull_masks():
