@@ -128,24 +128,29 @@ class LocalReconstructor(nn.Module):
         intrinsics: ``(V, 4)`` pixels of ``images``.  detail: ``(V, D, D, 4)`` sRGB and signed distance to the
         silhouette in pixels, from which colours are read; its intrinsics.  Gradients reach every parameter.
         """
-        size = images.shape[1]
-        camera = Camera(c2w, intrinsics, size, size)
+        features, pixels, camera = self.read_pixels(images, masks, c2w, intrinsics, detail, detail_intrinsics)
+        color, mask = shown_pixels(images, masks, camera)
+        shape = torch.cat([pixels.depth, pixels.normal], -1).permute(0, 3, 1, 2)
+        shape = functional.avg_pool2d(shape, camera.height // features.shape[1]).permute(0, 2, 3, 1)
+        tokens = torch.cat([features, shape], -1).contiguous()
+        maps = ViewMaps(tokens, detail, c2w, detail_intrinsics)
+        surface = torch.cat([pixels.depth * mask, mask], -1)
+        volume = self.volume(maps, surface)
+        log_light = self._light(pixels, color, mask[..., 0], camera)
+        return LocalField(maps, self, pixels, color, surface, volume, log_light)
+
+    def read_pixels(
+        self, images: Tensor, masks: Tensor, c2w: Tensor, intrinsics: Tensor, detail: Tensor, detail_intrinsics: Tensor
+    ) -> tuple[Tensor, PixelMaps, Camera]:
+        """The first part of :meth:`encode`, each view by itself: features of a quarter of the resolution, predictions
+        of half of it, and the cameras of these.
+        """
+        camera = Camera(c2w, intrinsics, *images.shape[2:0:-1])
         quarter = functional.avg_pool2d(masks[:, None], QUARTER)[:, 0]
         span = span_of_pixels(detail[..., 3], detail_intrinsics, quarter, camera.resized(*quarter.shape[:0:-1]))
         features, raw = self.pyramid(images, masks, place_of_pixels(camera), span)
-        coarse = camera.resized(raw.shape[2], raw.shape[1])
-        pixels = PixelMaps.of(raw, span, coarse)
-        shape = torch.cat([pixels.depth, pixels.normal], -1).permute(0, 3, 1, 2)
-        shape = functional.avg_pool2d(shape, raw.shape[1] // features.shape[1]).permute(0, 2, 3, 1)
-        tokens = torch.cat([features, shape], -1).contiguous()
-        maps = ViewMaps(tokens, detail, c2w, detail_intrinsics)
-        shown = torch.cat([images, masks[..., None]], -1).permute(0, 3, 1, 2)
-        shown = functional.avg_pool2d(shown, size // raw.shape[1])
-        color, mask = shown.permute(0, 2, 3, 1).split([3, 1], -1)
-        surface = torch.cat([pixels.depth * mask, mask], -1)
-        volume = self.volume(maps, surface)
-        log_light = self._light(pixels, color, mask[..., 0], coarse)
-        return LocalField(maps, self, pixels, color, surface, volume, log_light)
+        coarse = camera.resized(*raw.shape[2:0:-1])
+        return features, PixelMaps.of(raw, span, coarse), coarse
 
     def _light(self, pixels: PixelMaps, color: Tensor, mask: Tensor, camera: Camera) -> Tensor:
         v, y, x = (mask > 0.9).nonzero(as_tuple=True)
@@ -156,6 +161,14 @@ class LocalReconstructor(nn.Module):
         albedo = srgb_to_linear((pixels.gain[v, y, x] * color_logit(seen) + pixels.shift[v, y, x]).sigmoid())
         gloss = 1.0 - pixels.roughness[v, y, x, 0].sigmoid()
         return self.light(srgb_to_linear(seen), albedo, gloss, pixels.normal[v, y, x], wo)
+
+
+def shown_pixels(images: Tensor, masks: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+    """Colours ``(V, P, P, 3)`` and coverage ``(V, P, P, 1)`` of views at the resolution of ``camera``."""
+    shown = torch.cat([images, masks[..., None]], -1).permute(0, 3, 1, 2)
+    shown = functional.avg_pool2d(shown, images.shape[1] // camera.height)
+    color, mask = shown.permute(0, 2, 3, 1).split([3, 1], -1)
+    return color, mask
 
 
 @dataclass(frozen=True)

@@ -233,7 +233,7 @@ TINY = Preset(
 SMALL = LocalPreset(
     name="small",
     image_size=256,
-    pyramid=PyramidSizes(widths=(16, 40, 64, 96, 128), features=24),
+    pyramid=PyramidSizes(widths=(16, 48, 96, 160, 256), features=24),
     volume=VolumeSizes(side=40, radius=0.56, widths=(16, 56, 96, 128), features=24),
     light=LightMapSizes(height=32, widths=(32, 64, 96, 128)),
     view_width=40,

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from reli3d.nn.local import LocalReconstructor
 from reli3d.synthetic.maps import training_maps
 from reli3d.train.batches import batches
-from reli3d.train.losses import WEIGHTS, losses
+from reli3d.train.losses import PIXEL_TERMS, WEIGHTS, losses, pixel_losses
 from reli3d.train.pictures import write_curves, write_validation
 from reli3d.train.workers import Workers
 
@@ -38,6 +38,7 @@ class TrainConfig:
     average: float = 0.999  # decay of the averaged weights that are saved for use
     checkpoint_seconds: float = 300.0
     seed: int = 0
+    pixels: bool = False  # the 2D U-Net alone, on what the pixels of all views of an object show
     maps: str = ""  # file of environment maps, .npz, under which some samples are relit
     validation: str = ""  # folder of held-back samples; the first ones are drawn at every checkpoint
 
@@ -48,6 +49,11 @@ PICTURED = 3  # validation objects in the picture, from one and from four views
 def progress(config: TrainConfig, step: int, seconds: float) -> float:
     """Share of the training that is done, by steps or by time, whichever is further."""
     return min(1.0, max(step / config.steps, seconds / (60 * config.minutes)))
+
+
+def predicts(name: str) -> bool:
+    """Whether the predictions of pixels need the parameter ``name``."""
+    return name.startswith("pyramid.") and not name.startswith("pyramid.features.")
 
 
 def rate_at(config: TrainConfig, step: int, done: float) -> float:
@@ -66,7 +72,8 @@ def train(model: LocalReconstructor, config: TrainConfig, workers: Workers | Non
         raise ValueError(f"batch: expected a multiple of the {workers.count} processes, got {config.batch}")
     folder = Path(config.output)
     folder.mkdir(parents=True, exist_ok=True)
-    trained = [p for p in model.parameters() if p.requires_grad]
+    ask, names = (pixel_losses, PIXEL_TERMS) if config.pixels else (losses, tuple(WEIGHTS))
+    trained = [p for name, p in model.named_parameters() if p.requires_grad and (not config.pixels or predicts(name))]
     groups = [
         {"params": [p for p in trained if p.ndim > 1], "weight_decay": config.weight_decay},
         {"params": [p for p in trained if p.ndim <= 1], "weight_decay": 0.0},
@@ -91,6 +98,7 @@ def train(model: LocalReconstructor, config: TrainConfig, workers: Workers | Non
         start=step,
         rank=workers.rank,
         lights=training_maps(Path(config.maps)) if config.maps else None,
+        every_view=config.pixels,
     )
     began, saved = time.monotonic() - seconds, time.monotonic()
     sums: dict[str, float] = {}
@@ -99,14 +107,13 @@ def train(model: LocalReconstructor, config: TrainConfig, workers: Workers | Non
         for group in optimizer.param_groups:
             group["lr"] = rate_at(config, step, done)
         optimizer.zero_grad(set_to_none=True)
-        share = config.batch // workers.count
-        values = torch.zeros(len(WEIGHTS) + 1)
-        for sample in next(source):  # one after the other: they have different numbers of views
-            terms = losses(model, sample)
-            (reduce(torch.add, [WEIGHTS[k] * v for k, v in terms.items()]) / share).backward()
-            values[:-1] += torch.stack([terms[k].detach() for k in WEIGHTS]) / share
+        values = torch.zeros(len(names) + 1)
+        samples = next(source)
+        for sample in samples:  # one after the other: they have different numbers of views
+            terms = ask(model, sample)
+            (reduce(torch.add, [WEIGHTS[k] * v for k, v in terms.items()]) / len(samples)).backward()
+            values[:-1] += torch.stack([terms[k].detach() for k in names]) / len(samples)
         values[-1] = time.monotonic() - began
-        names = list(WEIGHTS)
         values = workers.average(trained, values)  # one clock for all: they must agree when to stop
         norm = torch.nn.utils.clip_grad_norm_(trained, config.clip)
         if torch.isfinite(norm):

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from reli3d.nn.local import LocalField, LocalReconstructor
+from reli3d.nn.local import LocalField, LocalReconstructor, PixelMaps, shown_pixels
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.train.batches import Sample
 
@@ -22,9 +22,23 @@ DEPTH_UNIT = 0.1  # of the object's longest side
 NORMALS = 192  # directions at which the irradiance is compared
 
 
+PIXEL_TERMS = tuple(name for name in WEIGHTS if name.startswith("pixel"))
+
+
 def encode_sample(model: LocalReconstructor, sample: Sample) -> LocalField:
+    return model.encode(*_views_of(sample))
+
+
+def _views_of(sample: Sample) -> tuple[Tensor, ...]:
+    """Arguments of :meth:`~reli3d.nn.local.LocalReconstructor.encode`."""
     detail = torch.cat([sample.images, sample.silhouette[..., None]], -1).contiguous()
-    return model.encode(sample.images, sample.masks, sample.c2w, sample.intrinsics, detail, sample.intrinsics)
+    return sample.images, sample.masks, sample.c2w, sample.intrinsics, detail, sample.intrinsics
+
+
+def pixel_losses(model: LocalReconstructor, sample: Sample) -> dict[str, Tensor]:
+    """The terms PIXEL_TERMS alone; gradients reach the predictions of the 2D U-Net."""
+    _, pixels, camera = model.read_pixels(*_views_of(sample))
+    return _pixels(pixels, shown_pixels(sample.images, sample.masks, camera)[0], sample)
 
 
 def losses(model: LocalReconstructor, sample: Sample) -> dict[str, Tensor]:
@@ -36,7 +50,7 @@ def losses(model: LocalReconstructor, sample: Sample) -> dict[str, Tensor]:
     return {
         **_shape(field, sample, position, normal),
         **_paint(field, sample, position, normal, bumped),
-        **_pixels(field, sample),
+        **_pixels(field.pixels, field.color, sample),
         **_light(field, sample),
     }
 
@@ -98,11 +112,14 @@ def pattern_loss(color: Tensor, target: Tensor) -> Tensor:
     return functional.mse_loss(linear_to_srgb((p * factor).clamp(0.0, 1.0)), target)
 
 
-def _pixels(field: LocalField, sample: Sample) -> dict[str, Tensor]:
-    """The pyramid's predictions against the maps of the views, at pixels that show the surface alone."""
-    valid, pixels = sample.view_valid, field.pixels
+def _pixels(pixels: PixelMaps, shown: Tensor, sample: Sample) -> dict[str, Tensor]:
+    """The pyramid's predictions against the maps of the views, at pixels that show the surface alone.
+
+    shown: ``(V, P, P, 3)`` sRGB, the colours of these pixels.
+    """
+    valid = sample.view_valid
     want = sample.view_material[valid]
-    color = pixels.base_logit(field.color)[valid].sigmoid()
+    color = pixels.base_logit(shown)[valid].sigmoid()
     return {
         "pixel_color": functional.mse_loss(color, want[:, :3]),
         "pixel_pattern": pattern_loss(color, want[:, :3]),
