@@ -32,7 +32,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--seed", type=int, default=0)
     p.add_argument("--pixels", action="store_true", help="train the 2D U-Net alone, on what the pixels of all views "
                    "show: three times as many photographs an hour; then go on without")  # fmt: skip
-    p.add_argument("--start", type=Path, help="begin with these weights, not with random ones: small, "
+    p.add_argument("--weights", type=Path, help="begin with these weights, not with random ones: small, "
                    "a safetensors file, or the averaged ones of another run's state.pt")  # fmt: skip
     p.add_argument("--maps", type=Path, help="environment maps, .npz, under which about half of the draws are relit")
     p.add_argument(
@@ -131,8 +131,8 @@ def main(argv: list[str] | None = None) -> int:
 
     torch.manual_seed(args.seed)
     model = LocalReconstructor(SMALL)
-    if args.start:
-        _start(model, args.start)
+    if args.weights:
+        _start(model, args.weights)
     state = args.output / "state.pt"
     if args.export or state.exists():
         _check_state(state, model)
