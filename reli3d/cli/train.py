@@ -6,9 +6,13 @@ import argparse
 import math
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from reli3d.cli.ending import check_range, command
 from reli3d.cli.helping import Defaults
+
+if TYPE_CHECKING:
+    from reli3d.nn.local import LocalReconstructor
 
 LICENCE = "Apache-2.0; trained by the reli3d authors, see docs/weights.md for the data"
 CALIBRATED = 5  # views of a sample: four are input, one is looked at
@@ -101,19 +105,23 @@ def _check_state(path: Path, model) -> None:
         raise InputError(path, "expected a checkpoint of this training, got another one; remove it to start again")
 
 
-def _start(model, start: Path) -> None:
-    """Give ``model`` the weights of ``start``."""
+def _begun(start: Path | None) -> LocalReconstructor:
+    """The network with the weights of ``start``, or with random ones.  Raises ValueError for another network's."""
     from reli3d.nn import weights
+    from reli3d.nn.local import LocalReconstructor
+    from reli3d.nn.presets import SMALL
     from reli3d.train.loop import averaged_model
 
-    if start.suffix == ".pt":
-        _check_state(start, model)
-        averaged_model(start, model).train()
-        return
-    values = weights.load_model(str(start), "cpu").state_dict()
-    shapes = ({k: tuple(v.shape) for k, v in got.items()} for got in (values, model.state_dict()))
-    weights.check_keys(start, *shapes)
-    model.load_state_dict(values)
+    if start is None or start.suffix == ".pt":
+        model = LocalReconstructor(SMALL)
+        if start:
+            _check_state(start, model)
+            averaged_model(start, model)
+        return model.train()
+    found = weights.load_model(str(start), "cpu")
+    if not isinstance(found, LocalReconstructor):
+        raise ValueError(f"--weights: expected a network of convolutions, got the preset {found.preset.name}")
+    return found.train().requires_grad_(True)
 
 
 @command("reli3d-train")
@@ -123,16 +131,12 @@ def main(argv: list[str] | None = None) -> int:
     import torch
 
     from reli3d.nn import weights
-    from reli3d.nn.local import LocalReconstructor
-    from reli3d.nn.presets import SMALL
     from reli3d.train.calibrate import calibrate
     from reli3d.train.loop import TrainConfig, averaged_model, train
     from reli3d.train.workers import Workers
 
     torch.manual_seed(args.seed)
-    model = LocalReconstructor(SMALL)
-    if args.weights:
-        _start(model, args.weights)
+    model = _begun(args.weights)
     state = args.output / "state.pt"
     if args.export or state.exists():
         _check_state(state, model)

@@ -6,35 +6,19 @@ import json
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import save_file
 
-from reli3d.geometry.distance import signed_distance
+from reli3d.cli.train import main
 from reli3d.geometry.hull import hull_distance
-from reli3d.nn.local import LocalField, LocalReconstructor
+from reli3d.nn.local import LocalReconstructor
 from reli3d.nn.presets import OFFICIAL, SMALL
 from reli3d.nn.reni import map_directions
+from reli3d.nn.weights import load_model
 from reli3d.render.camera import project
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
-from reli3d.synthetic.procedural import make_object
-from reli3d.synthetic.samples import ObjectSurface, synthesize
-from reli3d.train.batches import batches, random_turn
-from reli3d.train.calibrate import ALIKE, LOST, calibrate, first_of_the_best, mismatch
+from reli3d.train.batches import OF_VIEWS, batches, groups, load_sample, random_turn
 from reli3d.train.light_prior import fit, scale_free
-from reli3d.train.loop import TrainConfig, averaged_model, progress, rate_at, train
-from reli3d.train.losses import ASTRAY, WEIGHTS, astray, losses, pattern_loss
-
-SEEDS = (3, 12)
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    """Two samples of six views under a sky that is bright towards +X."""
-    out = tmp_path_factory.mktemp("samples")
-    light = 0.2 + 3.0 * map_directions(32)[..., :1].clamp(min=0).expand(-1, -1, 3).contiguous()
-    for seed in SEEDS:
-        sample = synthesize(ObjectSurface(make_object(seed)), light, np.random.default_rng(seed), views=6)
-        save_file(sample, out / f"{seed:010d}.safetensors")
-    return out
+from reli3d.train.loop import TrainConfig, averaged_model, predicts, progress, rate_at, train
+from reli3d.train.losses import ASTRAY, PIXEL_TERMS, WEIGHTS, astray, losses, pattern_loss, pixel_losses
 
 
 @pytest.fixture(scope="module")
@@ -152,6 +136,54 @@ def test_training_learns_logs_and_resumes(folder, tmp_path):
     assert torch.equal(model.state_dict()["level.0.weight"], state["average"]["level.0.weight"])
 
 
+def test_views_are_parted_into_groups_and_stay_what_they_are(folder):
+    sample = load_sample(sorted(folder.glob("*"))[0], 6, 64, np.random.default_rng(0))
+    sizes = set()
+    for seed in range(5):
+        parts = groups(sample, 3, np.random.default_rng(seed))
+        sizes |= {len(part.images) for part in parts}
+        for name in OF_VIEWS:
+            assert torch.equal(torch.cat([getattr(part, name) for part in parts]), getattr(sample, name)), name
+        assert torch.equal(torch.cat([part.visible for part in parts], 1), sample.visible)
+    assert sizes == {1, 2, 3}
+
+
+def test_the_pixels_alone_are_asked_as_with_all_else(samples):
+    torch.manual_seed(0)
+    model = LocalReconstructor(SMALL)
+    alone, whole = pixel_losses(model, samples[0]), losses(model, samples[0])
+    assert set(alone) == set(PIXEL_TERMS) < set(whole)
+    for name, value in alone.items():
+        assert torch.equal(value, whole[name]), name
+
+
+def test_training_of_pixels_teaches_the_2d_u_net_alone(folder, tmp_path):
+    torch.manual_seed(0)
+    model = LocalReconstructor(SMALL)
+    before = {k: v.clone() for k, v in model.state_dict().items()}
+    train(model, TrainConfig(str(folder), str(tmp_path), steps=3, batch=1, points=64, warmup=1, seed=3, pixels=True))
+    changed = {k for k, v in model.state_dict().items() if not torch.equal(v, before[k])}
+    assert changed == {k for k in before if predicts(k)} and len(changed) > 20
+    first = torch.load(tmp_path / "state.pt", weights_only=True)["average"]
+    then = step_from(folder, tmp_path / "next", str(tmp_path / "state.pt"))
+    assert all(float((then[k] - v).abs().max()) < 1e-6 for k, v in first.items())
+
+
+def step_from(folder, out, weights):
+    """Values after one step that is too short to be seen, from ``weights``."""
+    assert main([str(folder), str(out), "--weights", weights, "--steps", "1", "--batch", "1", "--rate", "1e-9"]) == 0
+    return torch.load(out / "state.pt", weights_only=True)["model"]
+
+
+def test_training_may_begin_with_the_weights_of_the_package_alone(folder, tmp_path, capsys):
+    shipped, then = load_model("small", "cpu").state_dict(), step_from(folder, tmp_path / "run", "small")
+    assert all(float((then[k] - v).abs().max()) < 1e-6 for k, v in shipped.items())
+    other = tmp_path / "other.pt"
+    other.write_bytes(b"none")
+    assert main([str(folder), str(tmp_path / "none"), "--weights", str(other)]) == 2
+    assert str(other) in capsys.readouterr().err and not (tmp_path / "none").exists()
+
+
 def test_the_rate_warms_up_and_ends_low():
     config = TrainConfig("", "", steps=1000, warmup=100)
     assert rate_at(config, 0, 0.0) == pytest.approx(config.rate / 100)
@@ -173,39 +205,6 @@ def test_the_light_prior_fits_a_map():
     assert float(error) < 0.5 * float(spread)  # 60 steps are enough to know up from down
 
 
-class _Thin(LocalReconstructor):
-    """Knows the shape of one object exactly, and draws it 1.5 units too thin."""
-
-    def encode(self, *inputs):
-        known = super().encode(*inputs)
-        return _ThinField(*(getattr(known, f.name) for f in dataclasses.fields(known)))
-
-
-class _ThinField(LocalField):
-    def free_level(self, points):
-        distance = signed_distance(*self.model.shape, points.contiguous())
-        return distance / self.model.preset.softness + 1.5 - self._offset()
-
-
-def test_calibration_gives_back_what_is_missing(folder, tmp_path):
-    """The best offset is the one that was taken away, from one view and from many, to a step of the offsets."""
-    seed = SEEDS[0]
-    (tmp_path / f"{seed}.safetensors").write_bytes((folder / f"{seed:010d}.safetensors").read_bytes())
-    shape = make_object(seed)
-    torch.manual_seed(0)
-    # the cells of a coarser grid shift the best offset by a step
-    model = _Thin(dataclasses.replace(SMALL, resolution=64)).eval()
-    model.shape = torch.from_numpy(shape.vertices), torch.from_numpy(shape.faces)
-    tried = calibrate(model, tmp_path, objects=1)
-    preset = model.preset
-    assert set(tried) == {1, 4} and max(tried[1].values()) > 0.9
-    assert tried[1][1.5] > tried[1][0.0] + 0.02
-    assert abs(preset.offset_one_view - 1.5) <= 0.25
-    assert abs(preset.offset_many_views - 1.5) <= 0.25
-    with pytest.raises(ValueError, match="samples: expected"):
-        calibrate(model, tmp_path / "none")
-
-
 def test_points_go_astray_along_their_normals_as_far_as_stated():
     """Over many draws the mean squares are a third of the greatest deviation's: its share is uniform in [0, 1]."""
     torch.manual_seed(0)
@@ -222,26 +221,3 @@ def test_points_go_astray_along_their_normals_as_far_as_stated():
     # the mean of 400 squares of uniform numbers is known to 4.5 % (standard error 0.30 / sqrt(400) of 1/3): four of it
     assert abs(float(torch.stack(moved).mean()) / (ASTRAY[0] ** 2 / 3) - 1) < 0.18
     assert abs(float(torch.stack(angle).mean()) / (ASTRAY[1] ** 2 / 3) - 1) < 0.18  # chords of small angles
-
-
-def test_mismatch_is_the_error_of_a_picture_in_one_colour_at_its_best_brightness():
-    rng = np.random.default_rng(0)
-    for share in (0.1, 0.5, 0.9):
-        want = rng.random(5000) < 0.4
-        got = np.where(rng.random(5000) < share, want, rng.random(5000) < 0.5)
-        both = (want & got).sum()
-        _, residual, _, _ = np.linalg.lstsq(got[:, None].astype(float), want.astype(float), rcond=None)
-        value = mismatch(int(both), int(got.sum()), int(want.sum()))
-        assert abs(value - np.log(residual[0] / both)) < 1e-9
-    assert mismatch(0, 10, 10) == mismatch(1, 1000, 1000) == LOST
-    assert mismatch(10, 10, 10) == np.log(ALIKE)
-
-
-def test_the_first_choice_within_a_standard_error_of_the_best_is_taken():
-    rng = np.random.default_rng(0)
-    level = rng.normal(0, 5, (32, 1))  # objects differ far more than choices do: differences count, not means
-    noise = rng.normal(0, 1, (32, 4))
-    errors = level + np.array([1.0, 0.02, 0.0, 0.4]) + 0.3 * (noise - noise.mean(0))
-    assert first_of_the_best(errors) == 1  # 0.02 is within 0.3 sqrt(2 / 32) = 0.075, 1.0 is not
-    assert first_of_the_best(level + np.array([0.2, 0.1, 0.0, 0.4])) == 2  # no noise, no tie
-    assert first_of_the_best(np.array([[3.0, 1.0, 2.0]])) == 1
