@@ -16,8 +16,9 @@ from reli3d.train.stages import step as stage_step
 from reli3d.train.stages.config import Stage, Weights
 from reli3d.train.stages.losses import gradients
 from reli3d.train.stages.step import object_losses, total
+from reli3d.train.stages.surface import render_surface, surface
 from reli3d.train.stages.views import Samples, draw
-from tests.support.stages import ball_model, write_samples
+from tests.support.stages import ball_model, camera, write_samples
 
 VOLUME = Stage("volume", "volume", 24, lobes=16, grid=8, samples_along=32)
 GAUSSIANS = Stage("gaussians", "gaussians", 24, lobes=16)
@@ -94,3 +95,55 @@ def test_all_terms_are_in_the_slope(one):
         for drawn in (one, replace(one, inputs=replace(one.inputs, latent=None, strength=None))):
             asked |= set(object_losses(model, drawn, stage, gradients))
     assert asked == set(vars(Weights()))
+
+
+def difference(f, value: torch.Tensor, direction: torch.Tensor, size: float) -> float:
+    with torch.no_grad():
+        ends = [float(f(value + sign * size * direction).double()) for sign in (1.0, -1.0)]
+    return (ends[0] - ends[1]) / (2.0 * size)
+
+
+def test_the_weight_of_quads_moves_their_centres(one, monkeypatch):
+    """gamma decides where a quad's centre lies.  Its last layer alone moves, by which no other weight changes."""
+    model = ball_model()
+    code = stage_step.encode(model, one)
+    last = model.merger.mlp[-1]
+    weight = last.weight.detach().clone()
+
+    def centres(row: torch.Tensor) -> torch.Tensor:
+        values = torch.cat([weight[:20], row[None]])
+        monkeypatch.setattr(last, "forward", lambda x: torch.nn.functional.linear(x, values, last.bias))
+        vertices = surface(model, code, 16).mesh.vertices
+        return (vertices * torch.randn(vertices.shape, generator=torch.Generator().manual_seed(1))).sum()
+
+    row, direction = weight[20].clone().requires_grad_(), torch.ones(weight.shape[1])
+    (slope,) = torch.autograd.grad(centres(row), row)
+    # float32 positions summed: 1e-6, of a difference of 2e-3; gamma is far from where its sigmoid bends
+    assert float(slope @ direction) == pytest.approx(difference(centres, row.detach(), direction, 100.0), rel=0.02)
+    assert float(slope @ direction) != 0.0
+
+
+def test_the_normals_of_the_mesh_have_a_slope_in_the_picture(one):
+    """The shading normal of a flat bump is that of the mesh; what a light shows of it follows."""
+    model = ball_model()
+    model.heads["normal"][-1].weight.data.zero_()
+    model.heads["normal"][-1].bias.data.zero_()
+    code = stage_step.encode(model, one)
+    with torch.no_grad():
+        found = surface(model, code, 16)
+    generator = torch.Generator().manual_seed(2)
+    normals, direction = found.mesh.normals, torch.randn(found.mesh.normals.shape, generator=generator)
+
+    def lit(points, wo, scene):
+        return 0.5 + 0.25 * points.normal
+
+    def shown(normals: torch.Tensor) -> torch.Tensor:
+        bent = replace(found, mesh=replace(found.mesh, normals=normals))
+        picture = render_surface(model, code, bent, camera(24), lit)
+        return (picture.color * noise).sum() + (picture.normal * noise.flip(0)).sum()
+
+    noise = torch.randn(24, 24, 3, generator=generator)
+    leaf = normals.clone().requires_grad_()
+    (slope,) = torch.autograd.grad(shown(leaf), leaf)
+    # float32 sums of 576 pixels; the curvature of a normalisation over a step of 1e-2 is 1e-4
+    assert float((slope * direction).sum()) == pytest.approx(difference(shown, normals, direction, 1e-2), rel=0.01)
