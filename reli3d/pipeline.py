@@ -7,12 +7,12 @@ from __future__ import annotations
 import time
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from reli3d._bridge import present
-from reli3d.fit import refine as fit
 from reli3d.geometry.bake import bake
 from reli3d.geometry.cover import cover_silhouettes
 from reli3d.geometry.hull import mask_distance
@@ -38,6 +38,9 @@ from reli3d.views.normalize import FAR, normalize
 from reli3d.views.published_views import background_shown, hero_first, placement_notes, published_views
 from reli3d.views.similarity import Similarity, output_frame
 from reli3d.views.views import ViewBatch, Views
+
+if TYPE_CHECKING:
+    from reli3d.fit.refine import Refinement
 
 DETAIL = 512  # pixels of the views that colours and silhouettes are read from; the network's own input is smaller
 REFINED = 384  # pixels of the views that a refinement compares with
@@ -388,7 +391,9 @@ def refine(asset: Asset, views: Views, *, seconds: float | None = None, steps: i
     return refined(asset, views, seconds=seconds, steps=steps, **options).asset
 
 
-def refined(asset: Asset, views: Views, **options) -> fit.Refinement:
+def refined(asset: Asset, views: Views, **options) -> Refinement:
     """:func:`refine` with its record."""
+    from reli3d.fit import refine as fit  # not before it is asked for: the command without it starts earlier
+
     device = asset.mesh.vertices.device
     return fit.refine(asset, views.to(device).resampled(REFINED), **options)
