@@ -1,0 +1,54 @@
+"""One picture of a reconstruction in our renderer and in three clients: ``python -m tests.side_by_side FOLDER OUT``.
+
+FOLDER is what reli3d-infer wrote for an object.  What the clients are and where they lie: ``tests/support/clients.py``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+from reli3d.io.hdr import read_environment
+from reli3d.render.environment import Environment
+from tests.support import clients
+
+BACKGROUND = 255.0
+SAMPLES = (32, 64, 8)  # by light, by visible normals, by the cosine
+
+
+def main(argv: list[str] | None = None) -> int:
+    p = argparse.ArgumentParser(prog="python -m tests.side_by_side", description=__doc__.splitlines()[0])
+    p.add_argument("folder", type=Path)
+    p.add_argument("output", type=Path)
+    for name, value in vars(clients.Shot()).items():
+        p.add_argument(f"--{name}", type=type(value), default=value)
+    args = p.parse_args(argv)
+    shot = clients.Shot(args.size, args.fov, args.azimuth, args.elevation, args.distance)
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        for name in ("mesh.glb", "environment.hdr", "environment.exr"):
+            shutil.copy(args.folder / name, folder)
+        light = Environment(read_environment(folder / "environment.exr"))
+        pictures = {
+            "reli3d-render": clients.ours(folder / "mesh.glb", light, shot, SAMPLES),
+            "three.js": clients.three_js(folder, shot),
+            "model-viewer": clients.model_viewer(folder, shot),
+            "Blender Cycles": clients.blender(folder, shot),
+        }
+    tiles = []
+    for name, rgba in pictures.items():
+        cover = rgba[..., 3:] / 255.0
+        tile = Image.fromarray((rgba[..., :3] * cover + BACKGROUND * (1.0 - cover)).round().astype(np.uint8))
+        ImageDraw.Draw(tile).text((6, 4), name, fill="black")
+        tiles.append(np.asarray(tile))
+    Image.fromarray(np.concatenate(tiles, 1)).save(args.output, quality=92)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
