@@ -18,7 +18,6 @@ def test_the_site_builds_strictly(tmp_path):
     assert (tmp_path / "site/measurements/quality/index.html").is_file()
 
 
-@pytest.mark.slow
 def test_the_notebook_runs(tmp_path):
     nbclient = pytest.importorskip("nbclient", reason="needs nbclient and ipykernel (extra docs)")
     nbformat = pytest.importorskip("nbformat")
