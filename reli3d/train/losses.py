@@ -12,8 +12,8 @@ from reli3d.train.batches import Sample
 
 WEIGHTS = {
     "occupancy": 1.0, "surface": 0.02, "gradient": 0.6,
-    "base_color": 8.0, "pattern": 12.0, "roughness": 1.5, "metallic": 1.5, "normal": 1.0,
-    "pixel_color": 4.0, "pixel_pattern": 12.0, "pixel_roughness": 1.0, "pixel_metallic": 1.0, "pixel_normal": 1.0,
+    "base_color": 2.0, "pattern": 12.0, "roughness": 1.5, "metallic": 1.5, "normal": 1.0,
+    "pixel_color": 1.5, "pixel_pattern": 12.0, "pixel_roughness": 1.0, "pixel_metallic": 1.0, "pixel_normal": 1.0,
     "pixel_depth": 0.3, "light": 0.4, "light_level": 0.1, "irradiance": 0.4,
 }  # fmt: skip
 ASTRAY = 0.02, 0.3  # greatest deviation of position [model's cube] and normal [radian] of an extracted surface
@@ -82,7 +82,7 @@ def _paint(field: LocalField, sample: Sample, position: Tensor, normal: Tensor, 
     got = field.material(*astray(position, normal), sample.visible)
     base, rough, metal = sample.material[:, :3], sample.material[:, 3], sample.material[:, 4]
     return {
-        "base_color": functional.mse_loss(got.base_color, base),
+        "base_color": color_loss(got.base_color, base),
         "pattern": pattern_loss(got.base_color, base),
         "roughness": functional.mse_loss(got.roughness, rough),
         "metallic": functional.mse_loss(got.metallic, metal),
@@ -99,6 +99,15 @@ def astray(position: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
     distance = ASTRAY[0] * share * torch.randn_like(position[:, :1])
     tilt = ASTRAY[1] * share * torch.randn_like(normal) / 2**0.5  # two of its three components turn the normal
     return position + distance * normal, functional.normalize(normal + tilt, dim=-1)
+
+
+def color_loss(color: Tensor, target: Tensor) -> Tensor:
+    """Cross-entropy of colours ``(N, 3)`` in [0, 1] over its least value, which is 0 where they are equal.
+
+    The mean square has no slope where a sigmoid has gone to black or white: colours that are there would stay.
+    """
+    least = functional.binary_cross_entropy(target, target)
+    return functional.binary_cross_entropy(color, target) - least
 
 
 def pattern_loss(color: Tensor, target: Tensor) -> Tensor:
@@ -121,7 +130,7 @@ def _pixels(pixels: PixelMaps, shown: Tensor, sample: Sample) -> dict[str, Tenso
     want = sample.view_material[valid]
     color = pixels.base_logit(shown)[valid].sigmoid()
     return {
-        "pixel_color": functional.mse_loss(color, want[:, :3]),
+        "pixel_color": color_loss(color, want[:, :3]),
         "pixel_pattern": pattern_loss(color, want[:, :3]),
         "pixel_roughness": functional.mse_loss(pixels.roughness[valid][:, 0].sigmoid(), want[:, 3]),
         "pixel_metallic": functional.mse_loss(pixels.metallic[valid][:, 0].sigmoid(), want[:, 4]),

@@ -18,7 +18,7 @@ from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.train.batches import OF_VIEWS, batches, groups, load_sample, random_turn
 from reli3d.train.light_prior import fit, scale_free
 from reli3d.train.loop import TrainConfig, averaged_model, predicts, progress, rate_at, train
-from reli3d.train.losses import ASTRAY, PIXEL_TERMS, WEIGHTS, astray, losses, pattern_loss, pixel_losses
+from reli3d.train.losses import ASTRAY, PIXEL_TERMS, WEIGHTS, astray, color_loss, losses, pattern_loss, pixel_losses
 
 
 @pytest.fixture(scope="module")
@@ -83,6 +83,16 @@ def test_the_pattern_loss_forgives_exposure_and_nothing_else():
     darker = linear_to_srgb(srgb_to_linear(target) * torch.tensor([0.3, 0.7, 0.5]))
     assert float(pattern_loss(darker, target)) < 1e-9
     assert float(pattern_loss(target.flip(0), target)) > 0.02  # unrelated values: about twice the variance, 0.06
+
+
+def test_the_color_loss_is_least_at_the_target_and_pulls_from_black_and_white():
+    target = torch.rand(500, 3)
+    assert float(color_loss(target, target)) == 0.0
+    assert float(color_loss((target + 0.01).clamp(max=1.0), target)) > 0.0
+    logit = torch.tensor([-9.0, 9.0]).repeat(3, 1).T.requires_grad_()
+    color_loss(logit.sigmoid(), torch.full((2, 3), 0.5)).backward()
+    # the slope of the cross-entropy in the logit is the difference of the colours, by the mean over 6 numbers
+    torch.testing.assert_close(logit.grad, torch.tensor([-0.5, 0.5]).repeat(3, 1).T / 6, rtol=1e-3, atol=0)
 
 
 def test_turns_are_rotations():
