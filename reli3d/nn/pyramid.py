@@ -59,8 +59,11 @@ def span_of_pixels(silhouette: Tensor, intrinsics: Tensor, seen: Tensor, camera:
 class ImagePyramid(nn.Module):
     """Features of every view at a quarter of its resolution, predictions at half.
 
-    The coarsest level exchanges one mean vector between the views: they stand under one light.
+    The coarsest level exchanges one mean vector between the views: they stand under one light.  ``in_bfloat16``:
+    whether convolutions compute in it; parameters and results are float32.
     """
+
+    in_bfloat16 = False
 
     def __init__(self, sizes: PyramidSizes):
         super().__init__()
@@ -85,7 +88,11 @@ class ImagePyramid(nn.Module):
         few = torch.full_like(masks, 1.0 / len(masks))
         x = torch.cat([images * masks[..., None], masks[..., None], place, few[..., None]], -1).permute(0, 3, 1, 2)
         span = functional.interpolate(span.permute(0, 3, 1, 2), size=x.shape[-2:], mode="nearest")
-        x = torch.cat([x, span], 1)
+        with torch.autocast(x.device.type, torch.bfloat16, enabled=self.in_bfloat16):
+            found = self._convolved(torch.cat([x, span], 1))
+        return tuple(t.float().permute(0, 2, 3, 1).contiguous() for t in found)
+
+    def _convolved(self, x: Tensor) -> tuple[Tensor, Tensor]:
         levels = []
         for down in self.down:
             x = down(x)
@@ -94,4 +101,4 @@ class ImagePyramid(nn.Module):
         for across, up, finer in zip(reversed(self.across), reversed(self.up), reversed(levels[:-1]), strict=True):
             coarse = functional.interpolate(across(x), size=finer.shape[-2:], mode="bilinear", align_corners=False)
             quarter, x = x, up(finer + coarse)
-        return tuple(t.permute(0, 2, 3, 1).contiguous() for t in (self.features(quarter), self.pixels(x)))
+        return self.features(quarter), self.pixels(x)

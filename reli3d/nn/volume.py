@@ -24,7 +24,12 @@ def _block(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
 
 
 class FeatureVolume(nn.Module):
-    """Features of the space ``[-R, R]^3``: ``N`` grid points a side, any number of views in any order."""
+    """Features of the space ``[-R, R]^3``: ``N`` grid points a side, any number of views in any order.
+
+    ``in_bfloat16``: whether convolutions compute in it; parameters and results are float32.
+    """
+
+    in_bfloat16 = False
 
     def __init__(self, sizes: VolumeSizes, features: int):
         super().__init__()
@@ -50,6 +55,11 @@ class FeatureVolume(nn.Module):
         pooled = self._pooled(maps, surface, grid[near], hull[near])
         x = pooled.new_zeros(len(grid), pooled.shape[1]).index_copy(0, near, pooled)
         x = x.reshape(1, self.side, self.side, self.side, -1).permute(0, 4, 1, 2, 3)  # channels last: half the time
+        with torch.autocast(x.device.type, torch.bfloat16, enabled=self.in_bfloat16):
+            x = self._convolved(x)
+        return x[0].float().permute(1, 2, 3, 0).contiguous()
+
+    def _convolved(self, x: Tensor) -> Tensor:
         x = self.first(x)
         levels = [x]
         for down in self.down:
@@ -58,7 +68,7 @@ class FeatureVolume(nn.Module):
         for across, up, finer in zip(reversed(self.across), reversed(self.up), reversed(levels[:-1]), strict=True):
             coarse = functional.interpolate(across(x), size=finer.shape[-3:], mode="trilinear", align_corners=False)
             x = up(finer + coarse)
-        return self.out(x)[0].permute(1, 2, 3, 0).contiguous()
+        return self.out(x)
 
     def _pooled(self, maps: ViewMaps, surface: Tensor, points: Tensor, hull: Tensor) -> Tensor:
         scale = maps.tokens.shape[1] / maps.images.shape[1]

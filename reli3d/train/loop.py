@@ -39,6 +39,7 @@ class TrainConfig:
     checkpoint_seconds: float = 300.0
     seed: int = 0
     pixels: bool = False  # the 2D U-Net alone, on what the pixels of all views of an object show
+    bfloat16: bool = False  # of the convolutions; parameters and their updates are float32
     maps: str = ""  # file of environment maps, .npz, under which some samples are relit
     validation: str = ""  # folder of held-back samples; the first ones are drawn at every checkpoint
 
@@ -72,6 +73,7 @@ def train(model: LocalReconstructor, config: TrainConfig, workers: Workers | Non
         raise ValueError(f"batch: expected a multiple of the {workers.count} processes, got {config.batch}")
     folder = Path(config.output)
     folder.mkdir(parents=True, exist_ok=True)
+    model.pyramid.in_bfloat16 = model.volume.in_bfloat16 = config.bfloat16
     ask, names = (pixel_losses, PIXEL_TERMS) if config.pixels else (losses, tuple(WEIGHTS))
     trained = [p for name, p in model.named_parameters() if p.requires_grad and (not config.pixels or predicts(name))]
     groups = [
