@@ -90,7 +90,7 @@ def pack(args: argparse.Namespace) -> int:
 
 
 def check(args: argparse.Namespace) -> int:
-    from reli3d.train.stages.shards import fault, read_index
+    from reli3d.io.shards import fault, read_index
 
     rows = read_index(args.input)
     wrong = [w for w in (fault(args.input, row, hashed=True) for row in rows) if w]
