@@ -10,7 +10,7 @@ import hashlib
 import json
 import os
 import tarfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 from reli3d.io.files import InputError, read_bytes, replacing, shown, write_bytes
@@ -41,6 +41,44 @@ def write_shard(folder: Path, number: int, objects: Iterable[tuple[str, Sequence
                         tar.addfile(info, file)
         synced(temporary)  # the files may be deleted when the shard is there
     return write_entry(folder, number, names)
+
+
+def pack_in_parts(
+    folder: Path,
+    names: Sequence[str],
+    write: Callable[[int, range], dict],
+    *,
+    each: int,
+    part: tuple[int, int] = (0, 1),
+    progress: Callable[[str], None] = lambda line: None,
+) -> None:
+    """Write the objects ``names`` as shards of ``each``, and the index with the last; those that are there stay.
+
+    write: of the number of a shard and the numbers of its objects; gives its entry.  part: ``(k, n)``, this call
+    writes every n-th shard from k; calls of all parts can run at once.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    count = -(-len(names) // each)
+    entries = [folder / Path(shard_name(k)).with_suffix(".json") for k in range(count)]
+    for number in range(part[0], count, part[1]):
+        numbers = range(number * each, min((number + 1) * each, len(names)))
+        path, wanted = entries[number], [names[k] for k in numbers]
+        if path.exists() and json.loads(path.read_text())["objects"] == wanted:
+            continue
+        entry = write(number, numbers)
+        progress(f"{entry['shard']}: {len(wanted)} objects, {entry['bytes'] / 1e6:.1f} MB")
+    if all(p.exists() for p in entries):
+        write_index(folder, [json.loads(p.read_text()) for p in entries])
+
+
+def folder_files(folder: Path) -> list[tuple[str, Path]]:
+    """The files below a folder, with the names that they get in a tar file; those of hidden names are left out."""
+    below = ((path, path.relative_to(folder)) for path in sorted(folder.rglob("*")))
+    return [
+        (f"{folder.name}/{name.as_posix()}", path)
+        for path, name in below
+        if path.is_file() and not any(part.startswith(".") for part in name.parts)
+    ]
 
 
 def synced(path: Path) -> None:

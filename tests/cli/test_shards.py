@@ -314,6 +314,30 @@ def test_a_disk_that_is_full_ends_in_one_line_and_keeps_the_folders(tmp_path, ca
     assert len(log(tmp_path)) == 2
 
 
+def test_folders_are_packed_as_they_are_and_found_again(tmp_path, capsys):
+    for name in ("lamp", "shoe 1.2", "cup"):
+        evil.good(tmp_path / "in" / name)
+    (tmp_path / "in" / "cup" / ".DS_Store").touch()
+    (tmp_path / "in" / "notes.txt").touch()
+    call = ["pack", str(tmp_path / "in"), str(tmp_path / "shards"), "--folders", "--each", "2"]
+    assert data.main(call) == 0 and "000001.tar: 1 objects" in capsys.readouterr().err
+    assert data.main(call) == 0 and capsys.readouterr().err == ""  # they are there
+    assert data.main(["check", str(tmp_path / "shards")]) == 0
+    found = [one for k in range(2) for one in packed_objects(tmp_path / "shards" / f"00000{k}.tar")]
+    assert [one.name for one in found] == ["cup", "lamp", "shoe 1.2"]
+    for one in found:
+        assert set(one.files()) == {"transforms.json", *(f"rgba/{k}.png" for k in range(3))}
+        with one.unpacked() as folder:
+            assert len(load_views(folder)) == 3
+    first = (tmp_path / "shards" / "000000.tar").read_bytes()
+    assert data.main([*call[:2], str(tmp_path / "two"), *call[3:], "--workers", "2"]) == 0
+    assert (tmp_path / "two" / "000000.tar").read_bytes() == first
+    capsys.readouterr()
+    for wrong in ("none", "in/notes.txt", "in/cup/rgba"):
+        assert data.main(["pack", str(tmp_path / wrong), str(tmp_path / "out"), "--folders"]) == 2
+        assert capsys.readouterr().err.count("\n") == 1
+
+
 def test_an_entry_with_another_name_is_refused(tmp_path):
     (tmp_path / "000000.tar").write_bytes(tars.written(*tars.GOOD))
     shards.write_entry(tmp_path, 0, ["a", "b"])

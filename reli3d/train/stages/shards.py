@@ -7,7 +7,6 @@ WebDataset can stream them.
 from __future__ import annotations
 
 import io
-import json
 import sys
 import tarfile
 from collections.abc import Callable, Iterable, Iterator
@@ -19,7 +18,7 @@ from safetensors.torch import load, save
 from torch import Tensor
 
 from reli3d.io.files import InputError, replacing
-from reli3d.io.shards import fault, read_index, shard_name, write_entry, write_index
+from reli3d.io.shards import fault, pack_in_parts, read_index, shard_name, write_entry
 from reli3d.train.stages.captures import Captures
 from reli3d.train.stages.views import Chooser, ObjectViews, Samples, sample_views
 
@@ -58,29 +57,18 @@ def pack(
     progress: Callable[[str], None] = lambda line: None,
     part: tuple[int, int] = (0, 1),
 ) -> None:
-    """Write the objects of ``source`` as shards of ``each``; shards that the index has are left as they are.
-
-    part: ``(k, n)``, this call writes every n-th shard from k; calls of all parts can run at once.
-    """
+    """Write the objects of ``source`` as :func:`~reli3d.io.shards.pack_in_parts` does."""
     from webdataset import TarWriter
 
-    folder.mkdir(parents=True, exist_ok=True)
-    count = -(-len(source) // each)
     names = [p.stem for p in source.files] if isinstance(source, Samples) else [p.name for p in source.folders]
-    for number in range(part[0], count, part[1]):
-        wanted = names[number * each : (number + 1) * each]
-        entry_path = folder / f"{number:06d}.json"
-        if entry_path.exists() and json.loads(entry_path.read_text())["objects"] == wanted:
-            continue
-        numbers = range(number * each, min((number + 1) * each, len(source)))
+
+    def write(number: int, numbers: range) -> dict:
         with replacing(folder / shard_name(number)) as temporary, TarWriter(str(temporary)) as writer:
             for name, data in objects(source, numbers):
                 writer.write({"__key__": name, "safetensors": data})
-        entry = write_entry(folder, number, wanted)
-        progress(f"{entry['shard']}: {len(wanted)} objects, {entry['bytes'] / 1e6:.1f} MB")
-    entries = [folder / f"{k:06d}.json" for k in range(count)]
-    if all(p.exists() for p in entries):
-        write_index(folder, [json.loads(p.read_text()) for p in entries])
+        return write_entry(folder, number, [names[k] for k in numbers])
+
+    pack_in_parts(folder, names, write, each=each, part=part, progress=progress)
 
 
 class Shards:
