@@ -56,12 +56,13 @@ def read_image(path: str | os.PathLike, *, notes: list[str] | None = None) -> tu
 def colour(picture: Image.Image) -> Tensor:
     """Colour ``(H, W, 3)`` in [0, 1] of what :func:`read_picture` gives."""
     values = unit(picture)
-    return torch.from_numpy(np.repeat(values[..., None], 3, -1) if values.ndim == 2 else values[..., :3].copy())
+    return torch.from_numpy(np.repeat(values[..., None], 3, -1) if values.ndim == 2 else values)
 
 
 def unit(picture: Image.Image) -> np.ndarray:
-    """Values of a picture, or of a channel of it, over their highest: float32 in [0, 1]."""
-    return np.divide(np.asarray(picture), np.float32(_TOP[picture.mode]), dtype=np.float32)
+    """Values of a picture, or of a channel of it, over their highest, without alpha: float32 in [0, 1]."""
+    values = np.asarray(picture)
+    return np.divide(values[..., :3] if values.ndim == 3 else values, np.float32(_TOP[picture.mode]), dtype=np.float32)
 
 
 def above(channel: Image.Image, limit: float) -> np.ndarray:
