@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from reli3d.cli.ending import reason
 
 if TYPE_CHECKING:
+    from reli3d.io.tar import Packed
     from reli3d.views.views import Views
 
 SUSPECT = 3  # exit code of --check where it does not trust the cameras
@@ -21,11 +22,11 @@ class Check:
     read: the views of a folder.  silent: print nothing; ``found`` has it all, by the names of the objects.
     """
 
-    def __init__(self, read: Callable[[Path], Views], silent: bool):
+    def __init__(self, read: Callable[[Path | Packed], Views], silent: bool):
         self._read, self._silent = read, silent
         self.found: dict[str, dict] = {}
 
-    def run(self, folder: Path, name: str, target: Path) -> str:
+    def run(self, folder: Path | Packed, name: str, target: Path) -> str:
         """Print what the cameras look like, one line a view, and write the picture of the rig."""
         from reli3d.views.check import explain_cameras, rig_picture
 

@@ -6,165 +6,108 @@ import argparse
 import contextlib
 import functools
 import importlib
+import itertools
 import json
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from reli3d.cli import objects
 from reli3d.cli.checking import SUSPECT, Check, diagnosed
 from reli3d.cli.ending import check_range, command, reason
-from reli3d.cli.helping import Defaults, joined
+from reli3d.cli.helping import joined
+from reli3d.cli.options import AXES, parser
 from reli3d.cli.progress import Progress
+from reli3d.cli.shelf import Shelf, opened_shelf
+from reli3d.io.tar import Packed
 
 STARTED = time.monotonic()
 EXAMPLE = Path(__file__).parents[1] / "assets" / "example"
 KERNELS = EXAMPLE.parent / "kernels.json"  # modules that a run launches, written by tests/support/kernel_list.py
-AXES = ("x", "y", "z", "-x", "-y", "-z")
 REFINE_SECONDS = {"cpu": 60.0, "cuda": 20.0}  # without a number
 SHADER = {"cpu": ["shade_rays", "embree"], "cuda": ["shade"]}  # Embree traces the shader's rays, or Warp
 
 
-def parser() -> argparse.ArgumentParser:
-    p = argparse.ArgumentParser(
-        formatter_class=Defaults,
-        prog="reli3d-infer",
-        description="Turn a few posed photographs of an object into a relightable GLB and an HDR environment.",
-        epilog="Exit code: 0 all done, 1 some objects failed, 2 wrong input, 3 --check suspects cameras or masks, 130 "
-        "interrupted.  Results go to stdout.",
-    )
-    p.add_argument(
-        "folder",
-        nargs="*",
-        type=Path,
-        help="object folders: transforms.json or a COLMAP model; default the bundled example",
-    )
-    p.add_argument("--output", type=Path, default=Path("outputs"), help="files land in OUTPUT/<object>/")
-    taken = p.add_mutually_exclusive_group()
-    taken.add_argument("--views", type=int, metavar="N", help="use the N views, 1 to 16, that lie farthest apart; "
-                       "default all, of more than 16 those that lie farthest apart")  # fmt: skip
-    taken.add_argument("--first-views", type=int, metavar="N", help="use the first N views, 1 to 16")
-    p.add_argument("--masks", type=Path, help="folder of masks with the names of the images, instead of their alpha")
-    p.add_argument(
-        "--remove-background",
-        action="store_true",
-        help="make masks for photographs without, by rembg "
-        "(pip install 'reli3d[masks]'), which fetches its network once",
-    )
-    p.add_argument("--weights", default="small", help="small (in the package), official, or a safetensors file")
-    p.add_argument(
-        "--download",
-        action="store_true",
-        help="with --weights official: fetch and convert the published "
-        "checkpoint where it is not there yet; nothing else ever uses the network",
-    )
-    p.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="auto: cuda where there is one")
-    p.add_argument(
-        "--precision",
-        choices=("float32", "bfloat16"),
-        help="of the network's large parts; default float32, for official weights on CUDA bfloat16",
-    )
-    p.add_argument("--texture-size", type=int, default=1024, help="texels, 256 to 4096 (default 1024)")
-    p.add_argument(
-        "--resolution", type=int, help="cubes along a side of the surface grid, 16 to 256 (default the preset's)"
-    )
-    p.add_argument(
-        "--uv", choices=("project", "xatlas"), default="project", help="atlas: own projection or xatlas (slow)"
-    )
-    p.add_argument(
-        "--normalize",
-        choices=("auto", "hull", "none"),
-        help="auto: centre and scale by the visual hull unless it sits in the model's cube; default auto, "
-        "with official weights none: poses as stored",
-    )
-    p.add_argument(
-        "--hero",
-        default="0",
-        metavar="N",
-        help="view that the network takes as its main one, counted from 0 (the default), or random",
-    )
-    p.add_argument(
-        "--background",
-        choices=("auto", "masked", "visible"),
-        default="masked",
-        help="what the light is read from: masked (default): the object alone; visible: the background "
-        "too; auto: visible where all views have one and the weights know how",
-    )
-    p.add_argument(
-        "--frame", choices=("input", "model"), default="input", help="frame of the mesh (default the cameras')"
-    )
-    p.add_argument("--up", choices=AXES, default="y", help="axis of that frame to turn to +Y")
-    p.add_argument("--refine", nargs="?", type=float, const=0.0, metavar="SECONDS", help="fit the result to all "
-                   "photographs of the folder; without a number 60 seconds, 20 on CUDA; stands after the "
-                   "folders")  # fmt: skip
-    p.add_argument(
-        "--refine-steps",
-        type=int,
-        metavar="N",
-        help="the same with a number of steps instead of seconds: every run of one machine gives the same",
-    )
-    p.add_argument("--refine-cameras", action="store_true", help="with either: correct the cameras as well")
-    p.add_argument("--seed", type=int, default=0, help="of what is drawn by chance")
-    p.add_argument(
-        "--compatible-names",
-        action="store_true",
-        help="also write illumination.hdr: the published release's name and layout, -Z in the centre column",
-    )
-    p.add_argument("--list", type=Path, metavar="FILE", help="text file that names more object folders, one a line")
-    p.add_argument("--workers", type=int, metavar="N", help="make N objects at a time, each in a process of its own "
-                   "with one thread and the network, 0.7 GiB with the shipped weights")  # fmt: skip
-    p.add_argument("--ray", metavar="ADDRESS", help="make the objects on a Ray cluster: its address, auto for that of "
-                   "this machine, local to start one; needs pip install reli3d[ray]")  # fmt: skip
-    p.add_argument("--skip-existing", action="store_true", help="leave objects alone whose files are all there")
-    p.add_argument(
-        "--warm", action="store_true", help="reconstruct every object twice and record the second time as well"
-    )
-    p.add_argument("--allow-outside", action="store_true", help="let a camera file name images outside its folder")
-    p.add_argument("--check", action="store_true", help="explain the cameras and draw the rig; reconstruct nothing")
-    p.add_argument("--json", action="store_true", help="print one JSON object, with an entry for each object, instead "
-                   "of lines")  # fmt: skip
-    p.add_argument("--doctor", action="store_true", help="say what is installed and where it runs")
-    return p
-
-
 @command("reli3d-infer")
 def main(argv: list[str] | None = None) -> int:
-    from reli3d.output.folder import check_place
-
     args = parser().parse_args(joined(argv, "--up", AXES))
     if args.doctor:
         from reli3d.cli import doctor
 
         return doctor.main([])
-    try:
-        items = objects.items_of(_folders(args), args.output)
-        for item in items:
-            check_place(item.target)  # before minutes of work
-        summary = args.output / objects.SUMMARY
-        if summary.is_dir():
-            raise ValueError(f"{summary}: expected a file or none, got a folder; give another --output")
-        check_range("workers", args.workers, 1, 1024)
-        if args.workers is not None and args.ray is not None:
-            raise ValueError("--workers: expected --workers or --ray, got both; Ray knows its workers")
-        if args.check and (args.workers is not None or args.ray is not None):
-            raise ValueError("--check: expected neither --workers nor --ray with it; it takes a moment")
-        device = choose_device(args.device)
-        job = Check(functools.partial(_read, args=args, whole=True), args.json) if args.check else Job(args, device)
-        rows = _rows(args, items, device, job)
-    except (ValueError, OSError) as error:
-        return _fail(error)
+    with contextlib.ExitStack() as held:
+        try:
+            plan = _planned(args, held)
+        except (ValueError, OSError) as error:
+            return _fail(error)
+        return _carried_out(args, plan)
+
+
+@dataclass
+class Plan:
+    """ready: rows of the objects that earlier calls put into shards.  rows: those of the others, as they are made."""
+
+    items: list[objects.Item]
+    ready: list[objects.Row]
+    rows: objects.Rows
+    job: objects.Job
+    shelf: Shelf | None
+
+
+def _planned(args: argparse.Namespace, held: contextlib.ExitStack) -> Plan:
+    """What the command will do; what is wrong with it is told here.  Raises ValueError, OSError."""
+    from reli3d.output import results
+    from reli3d.output.folder import check_place
+
+    for name, high in (("workers", 1024), ("shards_out", 10**6)):
+        check_range(name.replace("_", "-"), getattr(args, name), 1, high)
+    for name in ("workers", "ray", "shards_out"):
+        if args.check and getattr(args, name) is not None:
+            raise ValueError(f"--check: expected no --{name.replace('_', '-')} with it, got one; it takes a moment")
+    if args.workers is not None and args.ray is not None:
+        raise ValueError("--workers: expected --workers or --ray, got both; Ray knows its workers")
+    listed = [] if args.list is None else objects.listed(args.list)
+    named = [*args.folder, *listed] or [EXAMPLE]
+    items = objects.items_of(objects.sources(named), args.output, dots=args.shards_out is None)
+    if args.allow_outside and any(isinstance(item.folder, Packed) for item in items):
+        raise ValueError("--allow-outside: expected folders with it, got a tar file, which has all its images")
+    for item in items:
+        check_place(item.target)  # before minutes of work
+    if (args.output / objects.SUMMARY).is_dir():
+        raise ValueError(f"{args.output / objects.SUMMARY}: expected a file or none, got a folder; give another "
+                         "--output")  # fmt: skip
+    device = choose_device(args.device)
+    budget = refinement_budget(args, device)
+    ready, left, shelf = [], items, None
+    if args.shards_out is not None:
+        shelf = held.enter_context(opened_shelf(args.output, args.shards_out, results.OURS, more=args.skip_existing))
+        files = results.names(compatible=args.compatible_names, refined=bool(budget))
+        left = [item for item in items if item.name not in shelf.objects]
+        packed = [item.name for item in items if item.name in shelf.objects]
+        ready = [objects.Row(n, "skipped", **objects.recorded(shelf.record(n, files))) for n in packed]
+    job = Check(functools.partial(_read, args=args, whole=True), args.json) if args.check else Job(args, device)
+    return Plan(items, ready, _rows(args, left, device, job), job, shelf)
+
+
+def _carried_out(args: argparse.Namespace, plan: Plan) -> int:
+    """Make the objects of ``plan``; the exit code."""
+    items, job, shelf = plan.items, plan.job, plan.shelf
     ended: list[objects.Row] = []
     try:
-        with contextlib.closing(rows):
-            for row in rows:
+        with contextlib.closing(plan.rows):
+            for row in itertools.chain(plan.ready, plan.rows):
                 ended.append(row)
                 _tell(row, args, len(items))
+                if shelf and row.result in ("done", "skipped") and row.object not in shelf.place:
+                    _tell_shard(shelf.add(row.object), args)
+        if shelf:
+            _tell_shard(shelf.write(), args)
     finally:
         if len(items) > 1 and not args.check:
             order = {item.name: k for k, item in enumerate(items)}
-            objects.write_summary(summary, sorted(ended, key=lambda row: order[row.object]))
+            objects.write_summary(args.output / objects.SUMMARY, sorted(ended, key=lambda row: order[row.object]))
     results = {row.result for row in ended}
     if {"refused", "failed"} & results:
         code = 2 if results == {"refused"} else 1
@@ -172,20 +115,20 @@ def main(argv: list[str] | None = None) -> int:
         code = SUSPECT if isinstance(job, Check) and job.suspects() else 0
     if args.json:
         found = job.found if isinstance(job, Check) else {}
-        told = [asdict(row) | found.get(row.object, {"folder": str(args.output / row.object)}) for row in ended]
+        told = [asdict(row) | (found.get(row.object) or _place(row, args, shelf)) for row in ended]
         print(json.dumps({"objects": told, "exit_code": code}))
     return code
 
 
-def _folders(args: argparse.Namespace) -> list[Path]:
-    if args.list is not None:
-        return [*args.folder, *objects.listed(args.list)]
-    return args.folder or [EXAMPLE]
+def _place(row: objects.Row, args: argparse.Namespace, shelf: Shelf | None) -> dict[str, str]:
+    if shelf is None:
+        return {"folder": str(args.output / row.object)}
+    return {"shard": str(shelf.place[row.object])} if row.object in shelf.place else {}
 
 
 def _rows(args: argparse.Namespace, items: list[objects.Item], device: str, job: objects.Job) -> objects.Rows:
     """What becomes of each object, made where the options say.  Raises ValueError where there is no Ray."""
-    if args.workers is None and args.ray is None:
+    if not items or (args.workers is None and args.ray is None):
         return (objects.make(job, item) for item in items)
     # the weights are good and the kernels compiled: other processes make jobs of their own
     start = functools.partial(objects.called, "reli3d.cli.infer", "worker_job", args, device)
@@ -213,8 +156,13 @@ def _tell(row: objects.Row, args: argparse.Namespace, count: int) -> None:
     elif not args.check:
         if args.workers is not None or args.ray is not None:
             print(f"{row.object}: {row.seconds:.1f} s", file=sys.stderr)
-        if not args.json:
+        if not args.json and args.shards_out is None:
             print(args.output / row.object / "mesh.glb", flush=True)
+
+
+def _tell_shard(path: Path | None, args: argparse.Namespace) -> None:
+    if path and not args.json:
+        print(path, flush=True)
 
 
 def _fail(error: BaseException | str) -> int:
@@ -231,7 +179,7 @@ def choose_device(wanted: str) -> str:
     return "cuda" if wanted != "cpu" and torch.cuda.is_available() else "cpu"
 
 
-def _read(folder: Path, args: argparse.Namespace, *, every: bool = False, whole: bool = False):
+def _read(folder: Path | Packed, args: argparse.Namespace, *, every: bool = False, whole: bool = False):
     """The views of ``folder`` as the command asks for them; every: all of them where it names no number.
 
     whole: see :func:`~reli3d.views.folder.load_views`.
@@ -239,9 +187,10 @@ def _read(folder: Path, args: argparse.Namespace, *, every: bool = False, whole:
     from reli3d.views.folder import load_views
 
     every = every and args.views is None and args.first_views is None
-    return load_views(folder, views=args.views, first_views=args.first_views, masks=args.masks,
-                      allow_outside=args.allow_outside, every=every, whole=whole,
-                      remove_background=args.remove_background)  # fmt: skip
+    with objects.opened(folder) as found:
+        return load_views(found, views=args.views, first_views=args.first_views, masks=args.masks,
+                          allow_outside=args.allow_outside, every=every, whole=whole,
+                          remove_background=args.remove_background)  # fmt: skip
 
 
 def _fetch(weights: str) -> None:
@@ -281,7 +230,7 @@ class Job:
 
         return results.complete(target, compatible=self.args.compatible_names, refined=bool(self.budget))
 
-    def run(self, folder: Path, name: str, target: Path) -> str:
+    def run(self, folder: Path | Packed, name: str, target: Path) -> str:
         """Reconstruct one object and write its files, unless they are there; the bar goes before an error is told."""
         from reli3d.output import results
 
@@ -292,7 +241,7 @@ class Job:
                 self._run(folder, name, replacing, steps)
         return "done"
 
-    def _run(self, folder: Path, name: str, replacing: Callable, steps: Progress) -> None:
+    def _run(self, folder: Path | Packed, name: str, replacing: Callable, steps: Progress) -> None:
         from reli3d.output import results
         from reli3d.output.preview import comparison, preview
         from reli3d.pipeline import Stopwatch, place, published_input, reconstruct_placed, refined

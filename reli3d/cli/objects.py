@@ -18,6 +18,7 @@ import signal
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from multiprocessing.connection import Connection, wait
@@ -26,6 +27,7 @@ from typing import Any, Protocol, cast
 
 from reli3d.cli.ending import Stopped, reason, signals
 from reli3d.io.files import InputError, printable, read_bytes, write_bytes
+from reli3d.io.tar import Packed, packed_objects
 
 MAX_LIST = 1 << 28  # bytes of a list of folders: a million names of 250 letters
 SUMMARY = "summary.csv"
@@ -34,13 +36,13 @@ PATIENCE = 10.0  # seconds for a process to end before it is killed
 
 
 class Job(Protocol):
-    def run(self, folder: Path, name: str, target: Path) -> str:
+    def run(self, folder: Path | Packed, name: str, target: Path) -> str:
         """Make ``target`` from ``folder``; the result of its row."""
 
 
 @dataclass(frozen=True)
 class Item:
-    folder: Path
+    folder: Path | Packed
     name: str
     target: Path
 
@@ -74,21 +76,48 @@ def make(job: Job, item: Item) -> Row:
 
 
 def _recorded(target: Path) -> dict:
-    """What ``run_info.json`` says that a summary holds; nothing where there is none."""
     try:
-        info = json.loads((target / "run_info.json").read_bytes())
-        return {"mask_iou": info["mask_iou"], "faces": info["mesh"]["faces"], "notes": tuple(info["notes"])}
-    except (OSError, ValueError, LookupError, TypeError):
+        return recorded((target / "run_info.json").read_bytes())
+    except OSError:
         return {}
 
 
-def items_of(folders: Sequence[Path], output: Path) -> list[Item]:
-    """Each folder with a name of its own in ``output``: that of the folder, with a number where two are alike."""
+def recorded(data: bytes) -> dict:
+    """What ``run_info.json`` says that a summary holds; nothing where it is broken."""
+    try:
+        info = json.loads(data)
+        return {"mask_iou": info["mask_iou"], "faces": info["mesh"]["faces"], "notes": tuple(info["notes"])}
+    except (ValueError, LookupError, TypeError):
+        return {}
+
+
+def opened(folder: Path | Packed) -> AbstractContextManager[Path]:
+    """The folder of an object, a temporary one where it stands in a tar file."""
+    return folder.unpacked() if isinstance(folder, Packed) else nullcontext(folder)
+
+
+def sources(paths: Sequence[Path]) -> list[Path | Packed]:
+    """The folders among ``paths``, and the objects of the tar files.  Raises InputError for a file that is none."""
+    found: list[Path | Packed] = []
+    for path in paths:
+        if path.suffix == ".tar" and not path.is_dir() or path.is_file():
+            found += packed_objects(path)
+        else:
+            found.append(path)
+    return found
+
+
+def items_of(folders: Sequence[Path | Packed], output: Path, *, dots: bool = True) -> list[Item]:
+    """Each folder with a name of its own in ``output``: that of the folder, with a number where two are alike.
+
+    dots: leave them in names; in a name of WebDataset what follows the first is no longer the object's.
+    """
     taken = {SUMMARY}
     last: dict[str, int] = {}
     items = []
     for folder in folders:
-        base = name = Path(os.path.abspath(folder)).name or "object"
+        base = folder.name if isinstance(folder, Packed) else Path(os.path.abspath(folder)).name or "object"
+        base = name = base if dots else base.replace(".", "_")
         while name in taken:
             last[base] = last.get(base, 1) + 1
             name = f"{base}-{last[base]}"
@@ -98,7 +127,7 @@ def items_of(folders: Sequence[Path], output: Path) -> list[Item]:
 
 
 def listed(path: Path) -> list[Path]:
-    """The folders that a text file names, one a line, relative to where the command runs.  Raises InputError."""
+    """What a text file names, one folder or tar file a line, relative to where the command runs.  Raises InputError."""
     try:
         lines = read_bytes(path, MAX_LIST).decode().splitlines()
     except UnicodeDecodeError as error:

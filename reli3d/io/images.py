@@ -32,6 +32,17 @@ _GREY = ("1", "L", "LA", "I;16", "I;16B", "I;16L", "I")
 _COLOUR = ("RGB", "RGBA", "P", "PA", "CMYK", "YCbCr")
 
 
+class _Reader(io.BufferedReader):
+    """A file of which no more is asked than it holds: Python takes memory at once for what a broken chunk claims."""
+
+    def __init__(self, path: str | os.PathLike, size: int):
+        super().__init__(io.FileIO(path))
+        self._size = size
+
+    def read(self, size: int | None = -1) -> bytes:
+        return super().read(self._size if size is None or size < 0 else min(size, self._size))
+
+
 def read_image(path: str | os.PathLike, *, notes: list[str] | None = None) -> tuple[Tensor, Tensor | None]:
     """Colour ``(H, W, 3)`` in [0, 1], sRGB-encoded as stored, and straight alpha ``(H, W)`` in [0, 1] or None.
 
@@ -45,12 +56,13 @@ def read_image(path: str | os.PathLike, *, notes: list[str] | None = None) -> tu
 def colour(picture: Image.Image) -> Tensor:
     """Colour ``(H, W, 3)`` in [0, 1] of what :func:`read_picture` gives."""
     values = unit(picture)
-    return torch.from_numpy(np.repeat(values[..., None], 3, -1) if values.ndim == 2 else values[..., :3].copy())
+    return torch.from_numpy(np.repeat(values[..., None], 3, -1) if values.ndim == 2 else values)
 
 
 def unit(picture: Image.Image) -> np.ndarray:
-    """Values of a picture, or of a channel of it, over their highest: float32 in [0, 1]."""
-    return np.divide(np.asarray(picture), np.float32(_TOP[picture.mode]), dtype=np.float32)
+    """Values of a picture, or of a channel of it, over their highest, without alpha: float32 in [0, 1]."""
+    values = np.asarray(picture)
+    return np.divide(values[..., :3] if values.ndim == 3 else values, np.float32(_TOP[picture.mode]), dtype=np.float32)
 
 
 def above(channel: Image.Image, limit: float) -> np.ndarray:
@@ -73,12 +85,13 @@ def read_picture(
     if size > MAX_BYTES:
         raise InputError(path, f"expected at most {MAX_BYTES} bytes, got {size}; give a smaller image")
     try:
-        with _OPENING, warnings.catch_warnings():
-            warnings.simplefilter("error", Image.DecompressionBombWarning)
-            warnings.simplefilter("ignore", UserWarning)  # broken EXIF or TIFF tags that the pixels do not need
-            image = Image.open(path, formats=FORMATS)  # reads the header only
-        with image, _DECODING:
-            return _decoded(path, image, notes if notes is not None else [], calibrated)
+        with _Reader(path, size) as file:
+            with _OPENING, warnings.catch_warnings():
+                warnings.simplefilter("error", Image.DecompressionBombWarning)
+                warnings.simplefilter("ignore", UserWarning)  # broken EXIF or TIFF tags that the pixels do not need
+                image = Image.open(file, formats=FORMATS)  # reads the header only
+            with image, _DECODING:
+                return _decoded(path, image, notes if notes is not None else [], calibrated)
     except InputError:
         raise
     except (Image.DecompressionBombError, Image.DecompressionBombWarning):

@@ -37,10 +37,11 @@ OURS = (*FILES, COMPARISON, PUBLISHED_LIGHT)  # what a new result never leaves o
 
 def complete(folder: Path, *, compatible: bool = False, refined: bool = False) -> bool:
     """Whether ``folder`` holds every file of a reconstruction, with ``compatible`` the published name too."""
-    return all((folder / name).is_file() for name in _names(compatible, refined))
+    return all((folder / name).is_file() for name in names(compatible=compatible, refined=refined))
 
 
-def _names(compatible: bool, refined: bool) -> tuple[str, ...]:
+def names(*, compatible: bool = False, refined: bool = False) -> tuple[str, ...]:
+    """The files of a reconstruction."""
     return (*FILES, *([PUBLISHED_LIGHT] if compatible else []), *([COMPARISON] if refined else []))
 
 

@@ -142,7 +142,8 @@ def _covered(points: Tensor, mask: Tensor, pose: Tensor, camera: Tensor, cell: f
     local = (points - pose[:3, 3]) @ pose[:3, :3]
     depth = (-local[:, 2]).clamp_min(1e-12)
     footprint = float((camera[:2] * cell / depth.median()).max()) if len(points) else 0.0
-    step, (height, width) = max(1, int(footprint // 3)), mask.shape
+    height, width = mask.shape
+    step = max(1, min(int(footprint // 3), max(height, width)))  # without end where most points are behind the camera
     if footprint > 1:  # maximum over 3 x 3 blocks of a third of a footprint: the thin part that one sample would miss
         mask = max_pool2d(pad(mask, (0, -width % step, 0, -height % step))[None], step)
         mask = max_pool2d(mask, 3, 1, 1)[0]

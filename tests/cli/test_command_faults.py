@@ -73,7 +73,8 @@ def test_a_place_that_cannot_be_written_is_told_before_the_weights_are_read(tmp_
 
 def test_ascii_streams_change_nothing(tmp_path):
     process = start(
-        ["--output", tmp_path / "größe"], env={**os.environ, "PYTHONIOENCODING": "ascii:strict", "PYTHONOPTIMIZE": "1"}
+        ["--output", tmp_path / "größe"],
+        env={**os.environ, "LC_ALL": "C", "PYTHONIOENCODING": "ascii:strict", "PYTHONOPTIMIZE": "1"},
     )
     out, err = process.communicate(timeout=60)
     assert process.returncode == 0, err

@@ -1,4 +1,5 @@
 import os
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -6,7 +7,7 @@ import torch
 from PIL import Image
 
 from reli3d.io.files import InputError, printable, read_bytes, shown, write_bytes
-from reli3d.io.images import png_bytes, read_image, write_png
+from reli3d.io.images import colour, png_bytes, read_image, write_png
 
 NOISE = np.random.default_rng(3).integers(0, 256, (9, 14, 4), np.uint8)
 
@@ -61,6 +62,17 @@ def test_the_size_limit_holds_before_decoding(tmp_path):
     path = saved(tmp_path, Image.new("1", (9000, 9000)), "large.png")  # 81 MP in 10 kB: below Pillow's own limit
     with pytest.raises(InputError, match="67108864 pixels, got 9000 x 9000"):
         read_image(path)
+
+
+def test_colour_takes_no_memory_for_alpha():
+    """Found by the campaign: 33 MP with alpha took more than 1 GiB."""
+    picture = Image.fromarray(np.full((1000, 1000, 4), 255, np.uint8))
+    tracemalloc.start()
+    try:
+        assert bool((colour(picture) == 1).all())
+        assert tracemalloc.get_traced_memory()[1] < 24e6  # 12 of the result, 4 or 8 of the pixels as stored
+    finally:
+        tracemalloc.stop()
 
 
 def test_png_round_trip(tmp_path):

@@ -5,6 +5,7 @@ import json
 import os
 import struct
 import time
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -236,3 +237,18 @@ def test_presets_of_absurd_size_or_depth_are_refused():
     widths = {**dataclasses.asdict(SMALL)["pyramid"], "widths": [10**9] * 5}
     with pytest.raises(ValueError, match="preset"):
         from_json(json.dumps({**dataclasses.asdict(SMALL), "pyramid": widths}))
+
+
+def test_a_chunk_that_claims_more_than_the_file_takes_no_memory(tmp_path):
+    """Found by the campaign: Pillow asks for the rest of the chunk after the last row, 4 GiB."""
+    path = tmp_path / "a.png"
+    Image.fromarray(np.full((32, 32, 4), 255, np.uint8)).save(path)
+    data = path.read_bytes()
+    at = data.index(b"IDAT") - 4
+    path.write_bytes(data[:at] + struct.pack(">I", 2**32 - 1) + data[at + 4 :])
+    tracemalloc.start()
+    try:
+        assert read_image(path)[0].shape == (32, 32, 3)
+        assert tracemalloc.get_traced_memory()[1] < 1 << 24  # 16 MiB; the picture has 4 KiB
+    finally:
+        tracemalloc.stop()

@@ -7,7 +7,10 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from reli3d.cli.objects import opened
 from reli3d.output.folder import claimed
+
+FILES = ("mesh.glb", "environment.exr", "environment.hdr", "preview.png", "viewer.html", "run_info.json")
 
 
 @dataclass
@@ -15,21 +18,26 @@ class WordJob:
     """Writes the word of ``folder/word`` in ``target``, and a line in ``log`` for every result that it finishes.
 
     The words ``die`` and ``die once`` kill the process in the middle of the work, ``wait`` waits there for a file
-      ``go``; ``refuse`` and ``fail`` are errors.
+      ``go``; ``refuse`` and ``fail`` are errors.  What they leave stands in ``folder``, or beside the tar file that the
+      object is in.
     """
 
     log: Path
 
-    def run(self, folder: Path, name: str, target: Path) -> str:
-        word = (folder / "word").read_text()
+    def run(self, folder, name: str, target: Path) -> str:
+        with opened(folder) as found:
+            word = (found / "word").read_text()
+        folder = folder if isinstance(folder, Path) else folder.shard.with_name(f"{folder.name}-marks")
+        folder.mkdir(exist_ok=True)
         if (target / "mesh.glb").exists():
             return "skipped"
         if word == "refuse":
             raise ValueError("word: expected another, got refuse")
         if word == "fail":
             raise RuntimeError("it failed")
-        with claimed(target, ["mesh.glb", "run_info.json"]) as replacing, replacing() as new:
-            (new / "mesh.glb").write_text(word)
+        with claimed(target, FILES) as replacing, replacing() as new:
+            for file in FILES:
+                (new / file).write_text(word)
             if word == "die" or (word == "die once" and not (folder / "died").exists()):
                 (folder / "died").touch()
                 os.kill(os.getpid(), signal.SIGKILL)

@@ -35,7 +35,8 @@ def damaged(data: bytes, rng: Random) -> bytes:
     if kind == 3:
         return data[:at]
     if kind == 4:
-        return (data[:at] + data[some] * rng.choice((2, 3, 1000)) + data[some.stop :])[:LONGEST]
+        times = min(rng.choice((2, 3, 1000)), LONGEST // len(data[some]) + 1)  # no more than is kept
+        return (data[:at] + data[some] * times + data[some.stop :])[:LONGEST]
     form = rng.choice("<>") + rng.choice("HI")
     value = struct.pack(form, rng.choice(INTEGERS) % (1 << 8 * struct.calcsize(form)))
     return data[:at] + value + data[at + len(value) :]

@@ -12,6 +12,7 @@ from PIL import Image
 
 from reli3d.cli import data
 from reli3d.io.files import InputError
+from reli3d.io.shards import INDEX, read_index
 from reli3d.nn.model import Reconstructor
 from reli3d.nn.presets import TINY
 from reli3d.nn.reni import map_directions
@@ -20,7 +21,7 @@ from reli3d.train.stages.captures import Captures
 from reli3d.train.stages.config import Stage
 from reli3d.train.stages.latents import fitted, load_prior
 from reli3d.train.stages.losses import gradients
-from reli3d.train.stages.shards import INDEX, Shards, pack, read_index
+from reli3d.train.stages.shards import Shards, pack
 from reli3d.train.stages.sources import source
 from reli3d.train.stages.step import object_losses
 from reli3d.train.stages.views import Samples, draw

@@ -1,5 +1,6 @@
 """The check of cameras says what is wrong and never ends in a traceback, wherever the eyes are."""
 
+import json
 from dataclasses import replace
 
 import pytest
@@ -7,6 +8,8 @@ import torch
 from PIL import Image
 
 from reli3d.views.check import explain_cameras, rig_picture
+from reli3d.views.folder import load_views
+from tests.support import evil
 from tests.support.rigs import sphere_views
 
 
@@ -48,3 +51,12 @@ def test_rigs_of_any_size(tmp_path, scale):
     c2w[:, :3, 3] *= scale
     explain_cameras(replace(views, c2w=c2w))
     rig_picture(replace(views, c2w=c2w), tmp_path / "rig.png")
+
+
+def test_lenses_of_all_widths_have_a_verdict(tmp_path):
+    """Found by the campaign: most of the hull lies behind the camera of the second view, so that no footprint ends."""
+    data = evil.good(tmp_path)
+    for frame, fov in zip(data["frames"], (0.011823446300047972, 2.780726955605057, 0.7154630259161558), strict=True):
+        frame["camera_fov"] = [fov, fov]
+    (tmp_path / "transforms.json").write_text(json.dumps(data))
+    assert explain_cameras(load_views(tmp_path))[-1].startswith("suspect")

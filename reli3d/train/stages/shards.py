@@ -1,14 +1,12 @@
 """Objects in tar files of the WebDataset form: written in parallel and resumable, read in any order, checked by hash.
 
-A shard ``NNNNNN.tar`` holds ``<object>.safetensors`` entries.  ``index.json`` beside the shards names each with its
-size, its SHA-256 and its objects; a shard that is not in it does not count.  Any reader of WebDataset can stream them.
+A shard holds ``<object>.safetensors`` entries.  :mod:`reli3d.io.shards` has the index beside them.  Any reader of
+WebDataset can stream them.
 """
 
 from __future__ import annotations
 
-import hashlib
 import io
-import json
 import sys
 import tarfile
 from collections.abc import Callable, Iterable, Iterator
@@ -19,12 +17,11 @@ import torch
 from safetensors.torch import load, save
 from torch import Tensor
 
-from reli3d.io.files import InputError, read_bytes, replacing, shown, write_bytes
+from reli3d.io.files import InputError, replacing
+from reli3d.io.shards import fault, pack_in_parts, read_index, shard_name, write_entry
 from reli3d.train.stages.captures import Captures
 from reli3d.train.stages.views import Chooser, ObjectViews, Samples, sample_views
 
-INDEX = "index.json"
-INDEX_LIMIT = 1 << 30  # bytes
 OF_SAMPLE = ("images", "c2w", "intrinsics", "view_material", "view_normal", "view_depth", "environment")
 
 
@@ -60,74 +57,18 @@ def pack(
     progress: Callable[[str], None] = lambda line: None,
     part: tuple[int, int] = (0, 1),
 ) -> None:
-    """Write the objects of ``source`` as shards of ``each``; shards that the index has are left as they are.
-
-    part: ``(k, n)``, this call writes every n-th shard from k; calls of all parts can run at once.
-    """
+    """Write the objects of ``source`` as :func:`~reli3d.io.shards.pack_in_parts` does."""
     from webdataset import TarWriter
 
-    folder.mkdir(parents=True, exist_ok=True)
-    count = -(-len(source) // each)
     names = [p.stem for p in source.files] if isinstance(source, Samples) else [p.name for p in source.folders]
-    for number in range(part[0], count, part[1]):
-        wanted = names[number * each : (number + 1) * each]
-        entry_path = folder / f"{number:06d}.json"
-        if entry_path.exists() and json.loads(entry_path.read_text())["objects"] == wanted:
-            continue
-        numbers = range(number * each, min((number + 1) * each, len(source)))
-        with replacing(folder / f"{number:06d}.tar") as temporary:
-            with TarWriter(str(temporary)) as writer:
-                for name, data in objects(source, numbers):
-                    writer.write({"__key__": name, "safetensors": data})
-            data = temporary.read_bytes()
-        entry = {
-            "shard": f"{number:06d}.tar",
-            "bytes": len(data),
-            "sha256": hashlib.sha256(data).hexdigest(),
-            "objects": wanted,
-        }
-        write_bytes(entry_path, json.dumps(entry).encode())
-        progress(f"{entry['shard']}: {len(wanted)} objects, {len(data) / 1e6:.1f} MB")
-    entries = [folder / f"{k:06d}.json" for k in range(count)]
-    if all(p.exists() for p in entries):
-        rows = [json.loads(p.read_text()) for p in entries]
-        write_bytes(folder / INDEX, json.dumps({"shards": rows}, indent=1).encode())
 
+    def write(number: int, numbers: range) -> dict:
+        with replacing(folder / shard_name(number)) as temporary, TarWriter(str(temporary)) as writer:
+            for name, data in objects(source, numbers):
+                writer.write({"__key__": name, "safetensors": data})
+        return write_entry(folder, number, [names[k] for k in numbers])
 
-def read_index(folder: Path) -> list[dict]:
-    """Rows of the index.  Raises InputError for a broken one."""
-    path = folder / INDEX
-    try:
-        rows = json.loads(read_bytes(path, INDEX_LIMIT))["shards"]
-        for row in rows:
-            sized = isinstance(row["bytes"], int) and len(row["sha256"]) == 64 and isinstance(row["objects"], list)
-            if not sized or Path(row["shard"]).name != row["shard"]:
-                raise ValueError(shown(row))
-    except InputError:
-        raise
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise InputError(
-            path, f"expected an index of shards, got a broken file ({shown(str(error))}); pack again"
-        ) from None
-    return rows
-
-
-def fault(folder: Path, row: dict, *, hashed: bool) -> str | None:
-    """What is wrong with a shard; None where nothing is.  hashed: read it whole and compare its hash."""
-    path = folder / row["shard"]
-    if not path.is_file():
-        return f"{path.name}: expected a shard, got none"
-    size = path.stat().st_size
-    if size != row["bytes"]:
-        return f"{path.name}: expected {row['bytes']} bytes, got {size}"
-    if hashed:
-        digest = hashlib.sha256()
-        with open(path, "rb") as file:
-            while block := file.read(1 << 20):
-                digest.update(block)
-        if digest.hexdigest() != row["sha256"]:
-            return f"{path.name}: expected SHA-256 {row['sha256'][:12]}..., got {digest.hexdigest()[:12]}..."
-    return None
+    pack_in_parts(folder, names, write, each=each, part=part, progress=progress)
 
 
 class Shards:

@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from reli3d.io.files import InputError
+from reli3d.io.shards import INDEX
 from reli3d.train.stages.captures import Captures
-from reli3d.train.stages.shards import INDEX, Shards
+from reli3d.train.stages.shards import Shards
 from reli3d.train.stages.views import Samples, Source
 
 
