@@ -27,6 +27,10 @@ def block(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
     )
 
 
+def _channels_last(x: Tensor) -> Tensor:
+    return x.float().permute(0, 2, 3, 1).contiguous()
+
+
 def place_of_pixels(camera: Camera) -> Tensor:
     """Right and up, ``(V, S, S, 2)`` in world units, of where the pixels' rays meet the plane through the world's
     origin that faces the camera: a crop alone tells neither the scale of a picture nor where its middle is.
@@ -89,8 +93,8 @@ class ImagePyramid(nn.Module):
         x = torch.cat([images * masks[..., None], masks[..., None], place, few[..., None]], -1).permute(0, 3, 1, 2)
         span = functional.interpolate(span.permute(0, 3, 1, 2), size=x.shape[-2:], mode="nearest")
         with torch.autocast(x.device.type, torch.bfloat16, enabled=self.in_bfloat16):
-            found = self._convolved(torch.cat([x, span], 1))
-        return tuple(t.float().permute(0, 2, 3, 1).contiguous() for t in found)
+            features, pixels = self._convolved(torch.cat([x, span], 1))
+        return _channels_last(features), _channels_last(pixels)
 
     def _convolved(self, x: Tensor) -> tuple[Tensor, Tensor]:
         levels = []
