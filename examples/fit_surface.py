@@ -26,6 +26,7 @@ import torch
 import trimesh
 from torch import Tensor
 
+from reli3d.geometry.camera import Camera, look_at
 from reli3d.geometry.distance import signed_distance
 from reli3d.geometry.hits import evaluate_hits, interpolate
 from reli3d.geometry.hull import hull_distance, mask_distance
@@ -34,7 +35,6 @@ from reli3d.geometry.rays import RayScene
 from reli3d.geometry.regularize import sign_entropy, vertex_deviation
 from reli3d.geometry.surface import extract_surface
 from reli3d.io.images import write_png
-from reli3d.render.camera import Camera, look_at
 from reli3d.render.gbuffer import primary_hits
 from reli3d.render.silhouette import antialias, mesh_edges
 

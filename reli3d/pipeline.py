@@ -14,6 +14,7 @@ from torch import Tensor
 from reli3d._bridge import present
 from reli3d.fit import refine as fit
 from reli3d.geometry.bake import bake
+from reli3d.geometry.camera import Camera
 from reli3d.geometry.cover import cover_silhouettes
 from reli3d.geometry.hull import mask_distance
 from reli3d.geometry.mesh import Mesh, largest_components, vertex_normals, weld
@@ -31,7 +32,6 @@ from reli3d.nn.reni import map_directions
 from reli3d.nn.view_features import ViewMaps
 from reli3d.nn.weights import Network, load_model
 from reli3d.render.asset import Asset, TextureSet
-from reli3d.render.camera import Camera
 from reli3d.render.environment import Environment
 from reli3d.render.exposure import weighed
 from reli3d.views.normalize import FAR, normalize

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate, max_pool2d
 
 from reli3d._bridge import check
-from reli3d.render.camera import Camera
+from reli3d.geometry.camera import Camera
 from reli3d.render.color import srgb_to_linear
 
 WHITE = 0.97  # linear; a brighter pixel may be cut off, so it only says that the surface is at least as bright

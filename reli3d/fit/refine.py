@@ -17,10 +17,10 @@ from reli3d.fit.shading import radiance
 from reli3d.fit.shape import Grid, ShapeData, bound_level, finished, fit_shape, start_level
 from reli3d.fit.transfer import changed, dressed
 from reli3d.fit.unknowns import Start, Unknowns, corrected, environment
+from reli3d.geometry.camera import Camera
 from reli3d.geometry.mesh import watertight
 from reli3d.geometry.rays import RayScene
 from reli3d.render.asset import Asset
-from reli3d.render.camera import Camera
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.gbuffer import primary_hits, surface_points
 

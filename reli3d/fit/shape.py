@@ -15,6 +15,7 @@ from reli3d.fit.fields import EvenAdam, blurred_grid
 from reli3d.fit.photographs import WHITE, Photographs
 from reli3d.fit.shading import radiance
 from reli3d.fit.unknowns import Start, Unknowns, corrected, environment, material_change, material_of, unit
+from reli3d.geometry.camera import Camera, project
 from reli3d.geometry.distance import signed_distance
 from reli3d.geometry.grid import sample_grid
 from reli3d.geometry.hull import hull_distance, mask_distance
@@ -23,7 +24,6 @@ from reli3d.geometry.rays import RayScene
 from reli3d.geometry.smooth import taubin_smooth
 from reli3d.geometry.surface import extract_surface
 from reli3d.geometry.visibility import visible_from
-from reli3d.render.camera import Camera, project
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.render.gbuffer import primary_hits
 from reli3d.render.points import SurfacePoints

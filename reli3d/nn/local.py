@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from reli3d.geometry.camera import Camera, image_plane
 from reli3d.geometry.projection import fuse_views, gather_views, summarize_views
 from reli3d.nn.blocks import in_rows, linear_of
 from reli3d.nn.field import Field, PointMaterial, bound_level
@@ -26,7 +27,6 @@ from reli3d.nn.presets import LocalPreset
 from reli3d.nn.pyramid import ImagePyramid, place_of_pixels, span_of_pixels
 from reli3d.nn.view_features import AHEAD, ViewFeatures, ViewMaps, ahead_of_surface
 from reli3d.nn.volume import HULL_SCALE, FeatureVolume
-from reli3d.render.camera import Camera, image_plane
 from reli3d.render.color import srgb_to_linear
 from reli3d.render.environment import Environment
 

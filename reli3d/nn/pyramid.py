@@ -10,9 +10,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from reli3d.geometry.camera import Camera, image_plane
 from reli3d.geometry.hull import hull_span
 from reli3d.nn.presets import PyramidSizes
-from reli3d.render.camera import Camera, image_plane
 
 INPUTS = 9  # colour times mask, mask, place in the world, where the ray enters and leaves the hull, 1 / views
 PREDICTED = 12  # see PixelMaps, which reads 11: the last is a weight of trained networks, without a meaning

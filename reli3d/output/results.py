@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 import reli3d
+from reli3d.geometry.camera import Camera
 from reli3d.geometry.mesh import Mesh, report
 from reli3d.geometry.rays import RayScene
 from reli3d.io.glb import glb_bytes
@@ -23,7 +24,6 @@ from reli3d.nn.weights import Manifest
 from reli3d.output.folder import claimed
 from reli3d.output.viewer import viewer_page
 from reli3d.render.asset import Asset
-from reli3d.render.camera import Camera
 from reli3d.render.gbuffer import primary_hits
 from reli3d.views.similarity import Similarity
 from reli3d.views.views import Views

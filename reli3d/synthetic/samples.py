@@ -28,10 +28,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from reli3d.geometry.camera import Camera, camera_rays, project
 from reli3d.geometry.distance import signed_distance
 from reli3d.geometry.rays import RayScene
 from reli3d.geometry.visibility import visible_from
-from reli3d.render.camera import Camera, camera_rays, project
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
 from reli3d.render.points import SurfacePoints

@@ -9,12 +9,12 @@ from torch.nn.functional import grid_sample, max_pool2d
 
 import reli3d
 from reli3d import pipeline
+from reli3d.geometry.camera import Camera, camera_rays, look_at, project
 from reli3d.geometry.cover import DEPTH, REACH, STRIDE, cover_silhouettes
 from reli3d.geometry.hull import hull_distance, mask_distance
 from reli3d.geometry.rays import RayScene
 from reli3d.geometry.surface import extract_surface
 from reli3d.nn.weights import load_model
-from reli3d.render.camera import Camera, camera_rays, look_at, project
 from reli3d.views.folder import load_views
 
 RADIUS = 0.6

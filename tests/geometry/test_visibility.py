@@ -5,9 +5,9 @@ import torch
 import trimesh
 from torch.nn.functional import normalize
 
+from reli3d.geometry.camera import look_at
 from reli3d.geometry.rays import RayScene
 from reli3d.geometry.visibility import GRAZING, visible_from
-from reli3d.render.camera import look_at
 
 SIZE, FOCAL = 64, 90.0
 

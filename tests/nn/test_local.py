@@ -8,6 +8,7 @@ import torch
 from torch.nn.functional import avg_pool2d, normalize
 from torch.utils.flop_counter import FlopCounterMode
 
+from reli3d.geometry.camera import Camera, look_at, project
 from reli3d.geometry.hull import mask_distance
 from reli3d.nn.light_map import LightMap, gathered, texel_of
 from reli3d.nn.local import LocalReconstructor, PixelMaps
@@ -16,7 +17,6 @@ from reli3d.nn.pyramid import place_of_pixels, span_of_pixels
 from reli3d.nn.reni import map_directions
 from reli3d.nn.view_features import ViewMaps, ahead_of_surface
 from reli3d.nn.volume import FeatureVolume
-from reli3d.render.camera import Camera, look_at, project
 
 TINY = dataclasses.replace(
     SMALL,

@@ -4,10 +4,10 @@ import pytest
 import torch
 from torch.nn.functional import grid_sample, normalize
 
+from reli3d.geometry.camera import look_at, project
 from reli3d.geometry.projection import gather_views, pool_views, summarize_views
 from reli3d.kernels import view_features as kernels
 from reli3d.nn.view_features import ViewFeatures, ViewMaps
-from reli3d.render.camera import look_at, project
 from tests.support import reference
 
 SIZE, GRID, WIDTH = 24, 4, 6

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
+from reli3d.geometry.camera import Camera, camera_rays, look_at, project
 from reli3d.geometry.hits import interpolate
 from reli3d.geometry.mesh import Mesh
 from reli3d.render.asset import Asset, TextureSet
-from reli3d.render.camera import Camera, camera_rays, look_at, project
 from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import sample_texture, surface_points
 from reli3d.render.material import PAINTS

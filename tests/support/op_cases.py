@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from reli3d.geometry import projection
+from reli3d.geometry.camera import Camera, camera_rays, look_at, project
 from reli3d.geometry.grid import sample_grid
 from reli3d.geometry.hits import evaluate_hits, hit_normals, interpolate
 from reli3d.geometry.mesh import Mesh, vertex_normals
@@ -28,7 +29,6 @@ from reli3d.geometry.triplane import sample_triplane
 from reli3d.render import color, gbuffer, material, sampling
 from reli3d.render.asset import TextureSet
 from reli3d.render.bump import radial_bump, world_bump
-from reli3d.render.camera import Camera, camera_rays, look_at, project
 from reli3d.render.environment import Environment
 from reli3d.render.gaussians import SphericalGaussians, shade_gaussians
 from reli3d.render.shading import ShadeOptions, shade

@@ -8,12 +8,12 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
+from reli3d.geometry.camera import project
 from reli3d.geometry.distance import signed_distance
 from reli3d.geometry.hull import hull_distance
 from reli3d.nn.local import LocalField, LocalReconstructor
 from reli3d.nn.presets import OFFICIAL, SMALL
 from reli3d.nn.reni import map_directions
-from reli3d.render.camera import project
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.synthetic.procedural import make_object
 from reli3d.synthetic.samples import ObjectSurface, synthesize
