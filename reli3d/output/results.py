@@ -14,7 +14,6 @@ import numpy as np
 import torch
 
 import reli3d
-from reli3d.geometry.camera import Camera
 from reli3d.geometry.mesh import Mesh, report
 from reli3d.geometry.rays import RayScene
 from reli3d.io.glb import glb_bytes
@@ -57,8 +56,7 @@ def mesh_statistics(mesh: Mesh) -> dict:
 def mask_iou(mesh: Mesh, views: Views) -> float:
     """Mean intersection over union of the silhouettes of ``mesh`` and the masks of ``views``, in one frame, to 1e-4."""
     batch = views.resampled(SILHOUETTE, crop=True)
-    camera = Camera(batch.c2w, batch.intrinsics, SILHOUETTE, SILHOUETTE)
-    seen = primary_hits(RayScene(mesh.vertices, mesh.faces), camera)[0].face >= 0
+    seen = primary_hits(RayScene(mesh.vertices, mesh.faces), batch.camera)[0].face >= 0
     masks = batch.masks > 0.5
     both, either = ((a.sum((1, 2)).double()) for a in (masks & seen, masks | seen))
     return round(float((both / either.clamp(min=1)).mean()), 4)
