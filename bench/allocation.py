@@ -20,12 +20,12 @@ from pathlib import Path
 import torch
 
 from bench.shading import SAMPLES, geometry, view
+from reli3d.geometry.camera import Camera, camera_rays, look_at
 from reli3d.geometry.rays import RayScene
 from reli3d.io.glb import read_glb
 from reli3d.io.hdr import read_environment
 from reli3d.render.allocation import _pilot_points, plan_samples
 from reli3d.render.asset import Asset
-from reli3d.render.camera import Camera, camera_rays, look_at
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
 from reli3d.render.material import eval_bsdf, pdf_lobes

@@ -70,10 +70,10 @@ def system(device: torch.device, dry: bool) -> dict:
 
 def kernels(device: torch.device, dry: bool) -> dict:
     """Seconds to the first result of a triplane lookup, a surface and a shaded picture, imports apart."""
+    from reli3d.geometry.camera import Camera, look_at
     from reli3d.geometry.surface import extract_surface
     from reli3d.geometry.triplane import sample_triplane
     from reli3d.render.asset import Asset
-    from reli3d.render.camera import Camera, look_at
     from reli3d.render.environment import Environment
     from reli3d.render.render import render
     from reli3d.render.shading import ShadeOptions

@@ -18,6 +18,7 @@ from functools import lru_cache
 import torch
 
 from bench.surface import field
+from reli3d.geometry.camera import Camera
 from reli3d.io.glb import glb_bytes
 from reli3d.nn.field import TriplaneField
 from reli3d.nn.model import Code, Reconstructor
@@ -57,7 +58,7 @@ def random_field(device):
     model = KnownSurface(preset).to(device).eval()
     planes = torch.randn(1, 3, PLANE, PLANE, preset.upsampler.channels, device=device).movedim(-1, 2)
     nothing = torch.zeros(1, 4, device=device)
-    maps = ViewMaps(nothing[None, None], nothing[None, None], torch.eye(4, device=device)[None], nothing)
+    maps = ViewMaps(nothing[None, None], nothing[None, None], Camera(torch.eye(4, device=device)[None], nothing, 1, 1))
     return TriplaneField(maps, model, Code(planes, nothing[None, None], nothing[None], nothing, nothing[:, :1]))
 
 

@@ -20,6 +20,7 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from bench.timing import _status, synchronise
+from reli3d.geometry.camera import Camera
 from reli3d.nn import weights
 from reli3d.nn.field import TriplaneField
 from reli3d.nn.model import Reconstructor
@@ -220,7 +221,8 @@ def forward(path: Path, count: int, trunk: torch.dtype, device: torch.device, ru
             rate = f"{flops[name] / seconds / 1e9:8.0f} GFLOP/s" if flops.get(name) else ""
             print(f"  {name:16s} {seconds:8.3f} s {rate}")
         images, masks, c2w, intrinsics = (t[0] for t in inputs)
-        maps = ViewMaps(code.view_tokens[0].float(), torch.cat([images, masks[..., None]], -1), c2w, intrinsics)
+        camera = Camera(c2w, intrinsics, *masks.shape[:0:-1])
+        maps = ViewMaps(code.view_tokens[0].float(), torch.cat([images, masks[..., None]], -1), camera)
         began, side = time.perf_counter(), torch.linspace(-0.87, 0.87, model.preset.resolution + 1, device=device)
         TriplaneField(maps, model, code).free_level(torch.cartesian_prod(side, side, side))
         synchronise(device)

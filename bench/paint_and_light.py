@@ -15,13 +15,13 @@ from pathlib import Path
 import torch
 from torch.nn.functional import interpolate
 
+from reli3d.geometry.camera import Camera, look_at
 from reli3d.geometry.rays import RayScene
 from reli3d.io.glb import read_glb
 from reli3d.io.hdr import read_environment
 from reli3d.nn.weights import load_model
 from reli3d.pipeline import ReconstructOptions, reconstruct
 from reli3d.render.asset import Asset
-from reli3d.render.camera import Camera, look_at
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import primary_hits, surface_points

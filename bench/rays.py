@@ -13,8 +13,8 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 from bench.timing import time_steps
+from reli3d.geometry.camera import Camera, camera_rays, look_at
 from reli3d.geometry.rays import RayScene
-from reli3d.render.camera import Camera, camera_rays, look_at
 
 
 def inputs(n, subdivisions=6):

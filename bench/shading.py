@@ -22,8 +22,8 @@ import trimesh
 
 from bench.mitsuba_material import material
 from bench.timing import time_steps
+from reli3d.geometry.camera import Camera, camera_rays, look_at
 from reli3d.geometry.rays import RayScene
-from reli3d.render.camera import Camera, camera_rays, look_at
 from reli3d.render.environment import Environment
 from reli3d.render.points import SurfacePoints
 from reli3d.render.shading import ShadeOptions, shade

@@ -5,6 +5,7 @@ import math
 import torch
 
 from bench.flexicubes_torch import cube_list, flexicubes
+from reli3d.geometry.camera import Camera
 from reli3d.geometry.hull import hull_distance, mask_distance
 from reli3d.geometry.mesh import largest_components
 from reli3d.geometry.surface import extract_surface
@@ -76,9 +77,10 @@ def hull(device, size, n):
         c, s = math.cos(k * math.pi / 2), math.sin(k * math.pi / 2)
         c2w[k, :3] = torch.tensor([[c, 0, s, 3 * s], [0, 1, 0, 0], [-s, 0, c, 3 * c]])
     intrinsics = torch.tensor([1.2 * size, 1.2 * size, size / 2, size / 2], device=device).expand(4, 4)
+    camera = Camera(c2w, intrinsics, size, size)
     axis = torch.linspace(-0.87, 0.87, n + 1, device=device)
     points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).view(-1, 3)
-    return (lambda: hull_distance(points, mask_distance(masks), c2w, intrinsics)), {"points": len(points)}
+    return (lambda: hull_distance(points, mask_distance(masks), camera)), {"points": len(points)}
 
 
 CASES = {f"extract_{n}": (extraction, dict(n=n, backward=False)) for n in (32, 80, 128, 256)}

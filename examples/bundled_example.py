@@ -13,9 +13,9 @@ from pathlib import Path
 
 import torch
 
+from reli3d.geometry.camera import Camera, camera_rays, look_at
 from reli3d.io.images import write_png
 from reli3d.nn.reni import map_directions
-from reli3d.render.camera import Camera, camera_rays, look_at
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
 from reli3d.render.points import SurfacePoints

@@ -11,8 +11,8 @@ from pathlib import Path
 import torch
 
 import reli3d
+from reli3d.geometry.camera import camera_rays
 from reli3d.io.images import write_png
-from reli3d.render.camera import camera_rays
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
 

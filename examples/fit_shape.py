@@ -38,11 +38,10 @@ def layers(mesh: reli3d.Mesh, camera: reli3d.Camera) -> torch.Tensor:  # silhoue
 
 grid = torch.stack(torch.meshgrid(*[torch.linspace(-1, 1, 33)] * 3, indexing="ij"), -1)
 eyes = [[0, 0.5, 3], [3, 0.5, 0], [0, 0.5, -3], [-3, 0.5, 0], [0.1, 3, 0], [0.1, -3, 0]]
-cameras = [reli3d.Camera.from_fov(reli3d.look_at(eye, [0, 0, 0]), 0.6, args.size, args.size) for eye in eyes]
+cameras = reli3d.Camera.from_fov(reli3d.look_at(eyes, [0, 0, 0]), 0.6, args.size, args.size)
 targets = [layers(reli3d.extract_surface(distance(grid), radius=1.0), camera) for camera in cameras]
 masks = mask_distance(torch.stack([t[..., 0] for t in targets]))
-rig = torch.stack([c.c2w for c in cameras]), torch.stack([c.intrinsics for c in cameras])
-level = -hull_distance(grid.reshape(-1, 3), masks, *rig).reshape(33, 33, 33)
+level = -hull_distance(grid.reshape(-1, 3), masks, cameras).reshape(33, 33, 33)
 print(f"hull:  {distance(reli3d.extract_surface(level, radius=1.0).vertices).abs().mean():.4f}")
 optimizer = torch.optim.Adam([level.requires_grad_()], lr=0.01)
 for step in range(args.steps):

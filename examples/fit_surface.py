@@ -26,6 +26,7 @@ import torch
 import trimesh
 from torch import Tensor
 
+from reli3d.geometry.camera import Camera, look_at
 from reli3d.geometry.distance import signed_distance
 from reli3d.geometry.hits import evaluate_hits, interpolate
 from reli3d.geometry.hull import hull_distance, mask_distance
@@ -34,7 +35,6 @@ from reli3d.geometry.rays import RayScene
 from reli3d.geometry.regularize import sign_entropy, vertex_deviation
 from reli3d.geometry.surface import extract_surface
 from reli3d.io.images import write_png
-from reli3d.render.camera import Camera, look_at
 from reli3d.render.gbuffer import primary_hits
 from reli3d.render.silhouette import antialias, mesh_edges
 
@@ -62,12 +62,12 @@ def view(direction: Tensor, pixels: int) -> Camera:
     return Camera.from_fov(pose, math.radians(36.0), pixels, pixels)
 
 
-def cameras() -> list[Camera]:
+def cameras() -> Camera:
     """Eyes spread evenly over the sphere, on a spiral."""
     height = 1 - 2 * (torch.arange(VIEWS) + 0.5) / VIEWS
     turn = 2.399963 * torch.arange(VIEWS)
     ring = (1 - height**2).sqrt()
-    return [view(d, PIXELS) for d in torch.stack([ring * turn.sin(), height, ring * turn.cos()], -1)]
+    return view(torch.stack([ring * turn.sin(), height, ring * turn.cos()], -1), PIXELS)
 
 
 def surface_points(mesh: Mesh, n: int, rng: torch.Generator) -> Tensor:
@@ -145,7 +145,7 @@ def fit_distance(truth: Mesh, resolution: int, steps: int) -> Grid:
     return grid
 
 
-def layers(mesh: Mesh, rig: list[Camera]) -> list[Tensor]:
+def layers(mesh: Mesh, rig: Camera) -> list[Tensor]:
     """Mask and depth along the rays, 0 outside, ``(H, W, 2)`` with antialiased outlines, for every camera."""
     vertices, faces = mesh.vertices, mesh.faces
     scene, edges = RayScene(vertices.detach(), faces), mesh_edges(vertices, faces)
@@ -163,9 +163,8 @@ def fit_images(truth: Mesh, resolution: int, steps: int) -> Grid:
     rig = cameras()
     with torch.no_grad():
         targets = layers(truth, rig)
-    c2w, intrinsics = torch.stack([c.c2w for c in rig]), torch.stack([c.intrinsics for c in rig])
     masks = mask_distance(torch.stack([t[..., 0] for t in targets]))
-    hull = hull_distance(vertices_of(resolution).reshape(-1, 3), masks, c2w, intrinsics)
+    hull = hull_distance(vertices_of(resolution).reshape(-1, 3), masks, rig)
     grid = Grid(-hull.reshape((resolution + 1,) * 3))
     cell = 2 * RADIUS / resolution
     sys.stdout.write(f"visual hull of the masks: Chamfer {chamfer(grid.mesh(), truth):.5f}\n")
@@ -179,7 +178,7 @@ def fit_images(truth: Mesh, resolution: int, steps: int) -> Grid:
         mesh = grid.surface(fields, centre=True)
         loss = 0.0
         chosen = torch.randperm(VIEWS, generator=order)[:BATCH].tolist()
-        for k, image in zip(chosen, layers(mesh, [rig[k] for k in chosen])):
+        for k, image in zip(chosen, layers(mesh, rig[chosen])):
             both = (image[..., 0] == 1) & (targets[k][..., 0] == 1)
             depth = (image[..., 1] - targets[k][..., 1]).abs()[both].sum() / PIXELS**2
             loss = loss + (image[..., 0] - targets[k][..., 0]).abs().mean() + 10 * depth

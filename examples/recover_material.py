@@ -24,12 +24,12 @@ import torch
 import trimesh
 from PIL import Image, ImageDraw
 
+from reli3d.geometry.camera import Camera, look_at
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene
 from reli3d.io.hdr import read_environment
 from reli3d.io.images import read_image
 from reli3d.render.asset import Asset, TextureSet
-from reli3d.render.camera import Camera, look_at
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import surface_points

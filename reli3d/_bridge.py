@@ -168,8 +168,8 @@ def views(args: Sequence) -> list:
     return [view(*a) if isinstance(a, tuple) else a for a in args]
 
 
-def struct_of(kind, **arrays: tuple[Tensor, type]):
-    """Warp struct ``kind`` with ``(tensor, warp type)`` in the fields named; it keeps the tensors.
+def struct_of(kind, **fields):
+    """Warp struct ``kind`` with ``(tensor, warp type)`` or plain values in the fields named; it keeps the tensors.
 
     For contiguous arrays that always go together, without gradient: what :func:`call` differentiates stays an argument
     of its own.
@@ -177,9 +177,9 @@ def struct_of(kind, **arrays: tuple[Tensor, type]):
     initialise()
     made = kind()
     native = made.__ctype__()  # what a launch takes; Warp's own setters want arrays, which cost twice as much to make
-    for name, value in arrays.items():
-        setattr(native, name, view(*value))
-    vars(made)["arrays"] = arrays  # or their memory would go to others
+    for name, value in fields.items():
+        setattr(native, name, view(*value) if isinstance(value, tuple) else value)
+    vars(made)["fields"] = fields  # or the tensors' memory would go to others
     return made
 
 

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from reli3d._bridge import present
 from reli3d.geometry.bake import bake
+from reli3d.geometry.camera import Camera
 from reli3d.geometry.cover import cover_silhouettes
 from reli3d.geometry.hull import mask_distance
 from reli3d.geometry.mesh import Mesh, largest_components, vertex_normals, weld
@@ -31,7 +32,6 @@ from reli3d.nn.reni import map_directions
 from reli3d.nn.view_features import ViewMaps
 from reli3d.nn.weights import Network, load_model
 from reli3d.render.asset import Asset, TextureSet
-from reli3d.render.camera import Camera
 from reli3d.render.environment import Environment
 from reli3d.render.exposure import weighed
 from reli3d.views.normalize import FAR, normalize
@@ -64,7 +64,7 @@ class Prepared:
 
     batch: ViewBatch
     images: Tensor  # (V, D, D, 4) sRGB and signed silhouette distance
-    intrinsics: Tensor  # (V, 4) of ``images``
+    camera: Camera  # of ``images``
 
 
 def prepare(model: Network, views: Views, model_from_input: Similarity) -> Prepared:
@@ -77,7 +77,7 @@ def prepare(model: Network, views: Views, model_from_input: Similarity) -> Prepa
         batch = moved.resampled(model.preset.image_size)
     detail = moved.resampled(DETAIL, crop=not published)
     silhouette = mask_distance(detail.masks)
-    return Prepared(batch, torch.cat([detail.images, silhouette[..., None]], -1).contiguous(), detail.intrinsics)
+    return Prepared(batch, torch.cat([detail.images, silhouette[..., None]], -1).contiguous(), detail.camera)
 
 
 def encode(model: Network, prepared: Prepared, *, background: bool = False) -> Field:
@@ -88,13 +88,13 @@ def encode(model: Network, prepared: Prepared, *, background: bool = False) -> F
     batch = prepared.batch
     if isinstance(model, LocalReconstructor):
         return model.encode(
-            batch.images, batch.masks, batch.c2w, batch.intrinsics, prepared.images, prepared.intrinsics
+            batch.images, batch.masks, batch.c2w, batch.intrinsics, prepared.images, prepared.camera.intrinsics
         )
     shown = torch.tensor([background], device=batch.images.device)
     code = model.encode(
         batch.images[None], batch.masks[None], batch.c2w[None], batch.intrinsics[None], background_visible=shown
     )
-    maps = ViewMaps(code.view_tokens[0].float(), prepared.images, batch.c2w, prepared.intrinsics)
+    maps = ViewMaps(code.view_tokens[0].float(), prepared.images, prepared.camera)
     return TriplaneField(maps, model, code)
 
 
@@ -115,7 +115,7 @@ def extract(field: Field, resolution: int) -> Mesh:
 
 def _free_surface(field: TriplaneField, resolution: int) -> Mesh:
     radius = field.model.preset.radius
-    flat = _grid(resolution, radius, field.maps.c2w.device).reshape(-1, 3)
+    flat = _grid(resolution, radius, field.maps.images.device).reshape(-1, 3)
     level = field.grid_level(flat[: resolution + 1, 2])
     _check_signs(level)
     found = field.cube_weights(flat, level)
@@ -135,14 +135,14 @@ def _bounded_surface(field: LocalField, resolution: int) -> Mesh:
     preset, maps = field.model.preset, field.maps
     radius = preset.radius
     radius = min(radius, _hull_reach(field, resolution) + 2 * MARGIN_CELLS * radius / resolution)
-    flat = _grid(resolution, radius, maps.c2w.device).reshape(-1, 3)
+    flat = _grid(resolution, radius, maps.images.device).reshape(-1, 3)
     bound = field.bound(flat)
     level, margin = bound.clamp(min=OUTSIDE), MARGIN_CELLS * 2 * radius / resolution / preset.softness
     for part in (bound < margin).nonzero()[:, 0].split(CHUNK):
         level[part] = field.free_level(flat[part])
     level = torch.maximum(level, bound).view((resolution + 1,) * 3)
     silhouette = maps.images[..., 3].contiguous()
-    level = cover_silhouettes(level, bound.view_as(level), silhouette, maps.c2w, maps.intrinsics, radius=radius)
+    level = cover_silhouettes(level, bound.view_as(level), silhouette, maps.camera, radius=radius)
     _check_signs(level)
     return extract_surface(level, radius=radius)
 
@@ -158,7 +158,7 @@ def _hull_reach(field: LocalField, resolution: int) -> float:
 
     Asked coarsely first: a point inside has a coarse neighbour that is outside by no more than their distance.
     """
-    radius, device = field.model.preset.radius, field.maps.c2w.device
+    radius, device = field.model.preset.radius, field.maps.images.device
     coarse = -(-resolution // COARSE)
     apart = 2 * radius / coarse
     level = field.bound(_grid(coarse, radius, device).reshape(-1, 3))
@@ -189,7 +189,7 @@ def texture(
     maps = field.maps
 
     def seen(position: Tensor, normal: Tensor) -> Tensor:
-        return visible_from(present("scene", scene), position, normal, maps.c2w, maps.intrinsics, DETAIL).float()
+        return visible_from(present("scene", scene), position, normal, maps.camera).float()
 
     local = None
     if isinstance(field, LocalField):
@@ -208,7 +208,7 @@ def texture(
         if local is not None:
             got = local.painted(values[0], position, normal, seen(position, normal))
         else:
-            got = field.material(position, normal, position.new_zeros(len(position), len(maps.c2w)))
+            got = field.material(position, normal, position.new_zeros(len(position), len(maps.images)))
         found = {"base_color": got.base_color, "roughness": got.roughness[:, None], "metallic": got.metallic[:, None]}
         return {**found, "normal": encode_normals(got.normal, normal, tangent)}
 
@@ -226,8 +226,7 @@ def as_seen(asset: Asset, maps: ViewMaps, scene: RayScene) -> Asset:
 
     Paint times light is all that photographs tell; see :mod:`reli3d.render.exposure`.
     """
-    camera = Camera(maps.c2w, maps.intrinsics, maps.images.shape[2], maps.images.shape[1])
-    return weighed(asset, maps.images[..., :3], maps.images[..., 3] > INSIDE, camera, scene)
+    return weighed(asset, maps.images[..., :3], maps.images[..., 3] > INSIDE, maps.camera, scene)
 
 
 def turned(asset: Asset, similarity: Similarity) -> Asset:

@@ -173,9 +173,9 @@ def render_files(args: argparse.Namespace) -> list[Path]:
     import torch
     from tqdm import tqdm
 
+    from reli3d.geometry.camera import Camera, look_at
     from reli3d.io.glb import read_glb
     from reli3d.io.hdr import read_environment, write_exr
-    from reli3d.render.camera import Camera, look_at
     from reli3d.render.environment import Environment
     from reli3d.render.render import joined_scene, plan_render, render
     from reli3d.render.shading import ShadeOptions

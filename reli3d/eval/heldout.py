@@ -16,9 +16,9 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
+from reli3d.geometry.camera import Camera, camera_rays
 from reli3d.geometry.rays import RayScene
 from reli3d.pipeline import Network, NoSurface, ReconstructOptions, reconstruct
-from reli3d.render.camera import Camera, camera_rays
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import surface_points

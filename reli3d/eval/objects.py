@@ -18,11 +18,11 @@ from torch import Tensor
 
 from reli3d._bridge import present
 from reli3d.eval.metrics import geometry, psnr, ssim, surface_samples
+from reli3d.geometry.camera import Camera
 from reli3d.geometry.mesh import Mesh
 from reli3d.io.glb import read_glb
 from reli3d.pipeline import Network, NoSurface, ReconstructOptions, reconstruct
 from reli3d.render.asset import Asset
-from reli3d.render.camera import Camera
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
 from reli3d.render.render import render

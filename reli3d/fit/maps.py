@@ -54,7 +54,7 @@ def traced(asset: Asset, scene: RayScene, photographs: Photographs, views: list[
     """The pixels of ``views`` well inside the masks at which ``asset`` is hit."""
     inside, mesh, parts = photographs.inside(), asset.mesh, []
     for view in views:
-        hits, _, directions = primary_hits(scene, photographs.camera(view))
+        hits, _, directions = primary_hits(scene, photographs.camera[view])
         both = inside[view] & (hits.face >= 0)
         face, bary = hits.face[both], hits.bary[both]
         at = surface_points(mesh, asset.textures, face, bary)

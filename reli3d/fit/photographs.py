@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate, max_pool2d
 
 from reli3d._bridge import check
-from reli3d.render.camera import Camera
+from reli3d.geometry.camera import Camera
 from reli3d.render.color import srgb_to_linear
 
 WHITE = 0.97  # linear; a brighter pixel may be cut off, so it only says that the surface is at least as bright
@@ -45,14 +45,12 @@ class PosedImages(Protocol):
 class Photographs:
     """``V`` photographs of one size and device.
 
-    color: ``(V, S, S, 3)`` linear.  mask: ``(V, S, S)`` coverage in [0, 1].  c2w: ``(V, 4, 4)``.  intrinsics:
-    ``(V, 4)`` in pixels.
+    color: ``(V, S, S, 3)`` linear.  mask: ``(V, S, S)`` coverage in [0, 1].  camera: of all of them.
     """
 
     color: Tensor
     mask: Tensor
-    c2w: Tensor
-    intrinsics: Tensor
+    camera: Camera
 
     @classmethod
     def of(cls, views: PosedImages) -> Photographs:
@@ -70,7 +68,8 @@ class Photographs:
         if views.c2w.shape != (count, 4, 4) or views.intrinsics.shape != (count, 4):
             got = f"{tuple(views.c2w.shape)} and {tuple(views.intrinsics.shape)}"
             raise ValueError(f"c2w, intrinsics: expected {count} cameras, got {got}")
-        return cls(srgb_to_linear(images.detach()), masks.detach(), views.c2w.detach(), views.intrinsics.detach())
+        camera = Camera(views.c2w, views.intrinsics, *images.shape[2:0:-1]).detach()
+        return cls(srgb_to_linear(images.detach()), masks.detach(), camera)
 
     def __len__(self) -> int:
         return len(self.color)
@@ -80,13 +79,9 @@ class Photographs:
         """Pixels along a side."""
         return self.color.shape[1]
 
-    def camera(self, view: int) -> Camera:
-        """The camera of one view."""
-        return Camera(self.c2w[view], self.intrinsics[view], self.size, self.size)
-
     def select(self, views: list[int]) -> Photographs:
         """The photographs of these indices, in this order."""
-        return Photographs(self.color[views], self.mask[views], self.c2w[views], self.intrinsics[views])
+        return Photographs(self.color[views], self.mask[views], self.camera[views])
 
     def resized(self, size: int) -> Photographs:
         """The same photographs with ``size`` pixels a side; colours are averaged over what the object covers."""
@@ -96,17 +91,13 @@ class Photographs:
         planes = interpolate(planes, (size, size), mode="bilinear", align_corners=False, antialias=True)
         cover = planes[:, 3]
         color = planes[:, :3].permute(0, 2, 3, 1) / cover.clamp(min=1e-4)[..., None]
-        return Photographs(color.contiguous(), cover.clamp(0.0, 1.0), self.c2w, self.intrinsics * (size / self.size))
-
-    def seen_from(self, c2w: Tensor) -> Photographs:
-        """The same photographs with other cameras ``(V, 4, 4)``."""
-        return replace(self, c2w=c2w)
+        return Photographs(color.contiguous(), cover.clamp(0.0, 1.0), self.camera.resized(size, size))
 
     def moved(self, shift: Tensor, scale: float) -> Photographs:
         """The same photographs in the frame ``scale * (x - shift)``."""
-        c2w = self.c2w.clone()
+        c2w = self.camera.c2w.clone()
         c2w[:, :3, 3] = scale * (c2w[:, :3, 3] - shift)
-        return replace(self, c2w=c2w)
+        return replace(self, camera=replace(self.camera, c2w=c2w))
 
     def inside(self) -> Tensor:
         """``(V, S, S)`` bool: pixels that show nothing but the object, and neither do their neighbours."""

@@ -20,7 +20,6 @@ from reli3d.fit.unknowns import Start, Unknowns, corrected, environment
 from reli3d.geometry.mesh import watertight
 from reli3d.geometry.rays import RayScene
 from reli3d.render.asset import Asset
-from reli3d.render.camera import Camera
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.gbuffer import primary_hits, surface_points
 
@@ -80,7 +79,7 @@ def picture_error(asset: Asset, photographs: Photographs) -> Tensor:
     scene = RayScene(asset.mesh.vertices, asset.mesh.faces)
     errors = []
     for view in range(len(small)):
-        hits, _, directions = primary_hits(scene, small.camera(view))
+        hits, _, directions = primary_hits(scene, small.camera[view])
         seen = hits.face >= 0
         at = surface_points(asset.mesh, asset.textures, hits.face[seen], hits.bary[seen])
         image = torch.ones_like(small.color[view])
@@ -134,7 +133,7 @@ def refine(asset: Asset, views: PosedImages, *, seconds: float | None = None, st
     if worse:
         notes.append(f"refinement: kept the start, as the result is worse on {' and '.join(worse)} views")
     kept = asset if worse else _moved(result, -scale * shift, 1.0 / scale)
-    c2w = views.c2w if worse else near.moved(-scale * shift, 1.0 / scale).c2w
+    c2w = views.c2w if worse else near.moved(-scale * shift, 1.0 / scale).camera.c2w
     name = "start" if worse else "result"
     return Refinement(kept, name, was, now, held, c2w, tuple(notes), budget.curve, budget.counts)
 
@@ -158,8 +157,7 @@ def _fitted(first: Asset, photographs: Photographs, used: list[int], resolution:
         fit_shape(unknowns, data, weights, budget, SHAPE_UNTIL, seed=seed, cameras=cameras)
         mesh = finished(unknowns.level, bound, grid)
         surface = dressed(mesh, first, first.textures.size)
-        turned = corrected(Camera(photographs.c2w, photographs.intrinsics, 1, 1), unknowns.pose)
-        photographs = photographs.seen_from(turned.c2w)
+        photographs = replace(photographs, camera=corrected(photographs.camera, unknowns.pose))
     else:
         notes.append("refinement: the surface is not closed, so only its maps and light are fitted")
     fit_maps(unknowns, start, surface, photographs, used, weights, budget, 1.0, name="maps", seed=seed)

@@ -15,6 +15,7 @@ from reli3d.fit.fields import EvenAdam, blurred_grid
 from reli3d.fit.photographs import WHITE, Photographs
 from reli3d.fit.shading import radiance
 from reli3d.fit.unknowns import Start, Unknowns, corrected, environment, material_change, material_of, unit
+from reli3d.geometry.camera import Camera, project
 from reli3d.geometry.distance import signed_distance
 from reli3d.geometry.grid import sample_grid
 from reli3d.geometry.hull import hull_distance, mask_distance
@@ -23,7 +24,6 @@ from reli3d.geometry.rays import RayScene
 from reli3d.geometry.smooth import taubin_smooth
 from reli3d.geometry.surface import extract_surface
 from reli3d.geometry.visibility import visible_from
-from reli3d.render.camera import Camera, project
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.render.gbuffer import primary_hits
 from reli3d.render.points import SurfacePoints
@@ -86,7 +86,7 @@ def start_level(mesh: Mesh, grid: Grid) -> Tensor:
 def bound_level(photographs: Photographs, grid: Grid) -> Tensor:
     """Level of the visual hull of all masks: no surface lies outside any silhouette."""
     at = grid.points(photographs.mask.device).reshape(-1, 3)
-    inside = hull_distance(at, mask_distance(photographs.mask), photographs.c2w, photographs.intrinsics)
+    inside = hull_distance(at, mask_distance(photographs.mask), photographs.camera)
     return -inside.reshape(grid.shape)
 
 
@@ -177,10 +177,8 @@ def _outlines(unknowns: Unknowns, data: ShapeData, mesh: Mesh, scene: RayScene, 
     total = small.color.new_zeros(())
     chosen = torch.randperm(len(small), generator=rng)[:OUTLINES].tolist()
     for view in chosen:
-        camera = corrected(small.camera(view), unknowns.pose[view])
-        cover = (
-            primary_hits(scene, Camera(camera.c2w.detach(), camera.intrinsics, small.size, small.size))[0].face >= 0
-        ).float()[..., None]
+        camera = corrected(small.camera[view], unknowns.pose[view])
+        cover = (primary_hits(scene, camera.detach())[0].face >= 0).float()[..., None]
         cover = antialias(cover, mesh.vertices, mesh.faces, camera, scene, edges=edges)[..., 0]
         total = total + losses.outline(cover, small.mask[view])
     return total / len(chosen)
@@ -189,8 +187,7 @@ def _outlines(unknowns: Unknowns, data: ShapeData, mesh: Mesh, scene: RayScene, 
 def _colors(unknowns, data, mesh, scene, weights, progress, rng, seed, independent) -> Tensor:
     planes = data.planes[min(int(progress * len(data.planes)), len(data.planes) - 1)]
     size, photographs = planes.shape[-1], data.photographs.select(data.colored)
-    camera = Camera(photographs.c2w, photographs.intrinsics * (size / photographs.size), size, size)
-    camera = corrected(camera, unknowns.pose[data.colored])
+    camera = corrected(photographs.camera.resized(size, size), unknowns.pose[data.colored])
     pick = torch.randint(len(mesh.vertices), (POINTS,), generator=rng).to(mesh.vertices.device)
     position, normal = (v.index_select(0, pick) for v in (mesh.vertices, mesh.normals))
     color, cover = seen_colors(planes, position, camera)
@@ -228,7 +225,7 @@ def sight(scene: RayScene, position: Tensor, normal: Tensor, camera: Camera) -> 
 
     No gradient: no surface shall turn away to be seen less.
     """
-    seen = visible_from(scene, position, normal, camera.c2w, camera.intrinsics, camera.width)
+    seen = visible_from(scene, position, normal, camera)
     to_eye = unit(camera.c2w[None, :, :3, 3] - position[:, None])
     return seen * ((to_eye * normal[:, None]).sum(-1) / LEAST).clamp(0.0, 1.0)
 

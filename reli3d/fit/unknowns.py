@@ -15,8 +15,8 @@ from torch.nn.functional import normalize
 
 from reli3d.fit.fields import light_field, space_field
 from reli3d.geometry.bake import rasterize_texels
+from reli3d.geometry.camera import Camera
 from reli3d.render.asset import Asset
-from reli3d.render.camera import Camera
 from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import surface_points
 from reli3d.render.points import SurfacePoints

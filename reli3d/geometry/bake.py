@@ -15,7 +15,7 @@ import warp as wp
 from torch import Tensor
 
 from reli3d import _bridge
-from reli3d._bridge import check
+from reli3d._bridge import check, struct_of
 from reli3d.geometry.mesh import Mesh, sorted_keys, vertex_normals
 from reli3d.kernels import raster as kernels
 
@@ -70,6 +70,13 @@ def _bins(lower: Tensor, upper: Tensor, size: int, tile: int) -> tuple[Tensor, T
     return start.to(torch.int32), (order % max(len(lower), 1)).to(torch.int32)
 
 
+def _tiles(corners: Tensor, lower: Tensor, upper: Tensor, size: int, tile: int) -> kernels.Tiles:
+    """What the kernels read of faces ``corners (F, 3, 2)``, whose boxes are ``lower`` to ``upper``."""
+    start, faces = ((t, wp.int32) for t in _bins(lower, upper, size, tile))
+    corner = corners, wp.vec2
+    return struct_of(kernels.Tiles, corners=corner, face_start=start, face_list=faces, size=size, tile=tile)
+
+
 def _border_segments(faces: Tensor) -> Tensor:
     """``3 * face + corner``, ascending, of the edges that only one face has."""
     head, tail = faces.long().reshape(-1), faces[:, [1, 2, 0]].long().reshape(-1)
@@ -102,16 +109,16 @@ def rasterize_texels(mesh: Mesh, size: int) -> Texels:
         return Texels(face.fill_(-1), bary.zero_(), torch.zeros_like(face, dtype=torch.bool))
     tile = TILE[device.type]
     lower, upper = torch.aminmax(corners, dim=1)
-    face_start, face_list = _bins(lower, upper, size, tile)
+    tiles = _tiles(corners, lower, upper, size, tile)
     segments = _border_segments(mesh.faces)
     ends = torch.stack([corners.reshape(-1, 2), corners.roll(-1, 1).reshape(-1, 2)], 1)[segments.long()]
     lower, upper = torch.aminmax(ends, dim=1)
     segment_start, segment_list = _bins(lower - REACH, upper + REACH, size, tile)
-    ints = [(t, wp.int32) for t in (face_start, face_list, segment_start, segment_list, segments)]
+    borders = [(t, wp.int32) for t in (segment_start, segment_list, segments)]
     _bridge.launch(
         kernels.texels_kernel,
         (-(-size // tile)) ** 2,
-        [(corners, wp.vec2), *ints, size, tile, REACH, (distance, wp.float32), (face, wp.int32), (bary, wp.vec2)],
+        [tiles, *borders, REACH, (distance, wp.float32), (face, wp.int32), (bary, wp.vec2)],
         device,
         slice_min=TILES_MIN,
     )
@@ -125,11 +132,11 @@ def coverage(mesh: Mesh, size: int) -> Tensor:
     if len(mesh.faces):
         tile = TILE[corners.device.type]
         lower, upper = torch.aminmax(corners, dim=1)
-        face_start, face_list = _bins(lower, upper, size, tile)
+        tiles = _tiles(corners, lower, upper, size, tile)
         _bridge.launch(
             kernels.coverage_kernel,
             (-(-size // tile)) ** 2,
-            [(corners, wp.vec2), (face_start, wp.int32), (face_list, wp.int32), size, tile, (hits, wp.uint8)],
+            [tiles, (hits, wp.uint8)],
             corners.device,
             slice_min=TILES_MIN,
         )
@@ -138,27 +145,24 @@ def coverage(mesh: Mesh, size: int) -> Tensor:
 
 def interpolate(mesh: Mesh, texels: Texels, index: Tensor) -> tuple[Tensor, Tensor]:
     """Positions and unit normals ``(N, 3)`` of the texels with the flat indices ``index`` (N,) int64, all valid."""
-    _check_index(texels, index)
+    places = _places(mesh, texels, index)
     normals = mesh.normals if mesh.normals is not None else vertex_normals(mesh.vertices, mesh.faces)
     device = index.device
     position, normal = (torch.empty(len(index), 3, device=device) for _ in range(2))
     _bridge.launch(kernels.attributes_kernel, len(index), [
-        (index, wp.int64), (texels.face.reshape(-1), wp.int32), (texels.bary.reshape(-1, 2), wp.vec2),
-        (mesh.faces.contiguous(), wp.int32), (mesh.vertices.detach().contiguous(), wp.vec3),
-        (normals.detach().contiguous(), wp.vec3), (position, wp.vec3), (normal, wp.vec3)], device)  # fmt: skip
+        places, (mesh.vertices.detach().contiguous(), wp.vec3), (normals.detach().contiguous(), wp.vec3),
+        (position, wp.vec3), (normal, wp.vec3)], device)  # fmt: skip
     return position, normal
 
 
 def interpolate_tangents(mesh: Mesh, texels: Texels, index: Tensor) -> Tensor:
     """Unit tangents with sign, ``(N, 4)``, of the texels with the flat indices ``index`` (N,) int64, all valid."""
-    _check_index(texels, index)
+    places = _places(mesh, texels, index)
     if mesh.tangents is None:
         raise ValueError("mesh.tangents: expected tangents, got None (see vertex_tangents)")
     tangent = torch.empty(len(index), 4, device=index.device)
-    _bridge.launch(kernels.tangents_kernel, len(index), [
-        (index, wp.int64), (texels.face.reshape(-1), wp.int32), (texels.bary.reshape(-1, 2), wp.vec2),
-        (mesh.faces.contiguous(), wp.int32), (mesh.tangents.detach().contiguous(), wp.vec4),
-        (tangent, wp.vec4)], index.device)  # fmt: skip
+    inputs = [places, (mesh.tangents.detach().contiguous(), wp.vec4), (tangent, wp.vec4)]
+    _bridge.launch(kernels.tangents_kernel, len(index), inputs, index.device)
     return tangent
 
 
@@ -167,22 +171,24 @@ def interpolate_values(mesh: Mesh, values: Tensor, texels: Texels, index: Tensor
 
     No gradient.
     """
-    _check_index(texels, index)
+    places = _places(mesh, texels, index)
     check("values", values, like=texels.bary)
     if values.ndim != 2 or len(values) != len(mesh.vertices):
         raise ValueError(f"values: expected ({len(mesh.vertices)}, C), got {tuple(values.shape)}")
     out = torch.empty(len(index), values.shape[1], device=index.device)
-    _bridge.launch(kernels.values_kernel, len(index), [
-        (index, wp.int64), (texels.face.reshape(-1), wp.int32), (texels.bary.reshape(-1, 2), wp.vec2),
-        (mesh.faces.contiguous(), wp.int32), (values.detach().contiguous(), wp.float32),
-        (out, wp.float32)], index.device)  # fmt: skip
+    inputs = [places, (values.detach().contiguous(), wp.float32), (out, wp.float32)]
+    _bridge.launch(kernels.values_kernel, len(index), inputs, index.device)
     return out
 
 
-def _check_index(texels: Texels, index: Tensor) -> None:
+def _places(mesh: Mesh, texels: Texels, index: Tensor) -> kernels.Places:
+    """What the kernels read of the texels of ``index``, checked."""
     check("index", index, dtype=torch.int64, like=texels.bary)
     if index.ndim != 1 or (len(index) and not bool((texels.face.reshape(-1)[index] >= 0).all())):
         raise ValueError("index: expected a list of valid texels, got others")
+    face, bary = (texels.face.reshape(-1), wp.int32), (texels.bary.reshape(-1, 2), wp.vec2)
+    faces = mesh.faces.contiguous(), wp.int32
+    return struct_of(kernels.Places, texel=(index, wp.int64), face=face, bary=bary, faces=faces)
 
 
 def bake(

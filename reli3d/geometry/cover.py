@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from reli3d._bridge import check, launch
+from reli3d.geometry.camera import Camera, check_camera
 from reli3d.kernels import cover as kernels
 
 STRIDE = 4  # pixels between rays
@@ -15,13 +16,11 @@ DEPTH = 0.05  # level below the surface that a ray reaches: enough to make one; 
 REACH = 3.0  # rays whose least level is this high meet nothing: masks disagree, or a rod is thinner than a cell
 
 
-def cover_silhouettes(
-    level: Tensor, bound: Tensor, distance: Tensor, c2w: Tensor, intrinsics: Tensor, *, radius: float
-) -> Tensor:
+def cover_silhouettes(level: Tensor, bound: Tensor, distance: Tensor, camera: Camera, *, radius: float) -> Tensor:
     """``level (X, Y, Z)``, lowered so that every ray inside the views' silhouettes meets the surface; no gradient.
 
     level: negative inside, on a grid over [-radius, radius]^3, in logits of occupancy or in distances over the
-    softness.  bound: ``(X, Y, Z)``; neither ``level`` nor the result is below it.  distance, c2w, intrinsics: as in
+    softness.  bound: ``(X, Y, Z)``; neither ``level`` nor the result is below it.  distance, camera: as in
     :func:`reli3d.geometry.hull.hull_distance`, at least ``2 STRIDE`` pixels a side.  Without views nothing changes.
 
     A field that is not sure of a thin part stays a little above 0 along the rays that show it.  Every ``STRIDE``-th
@@ -31,31 +30,23 @@ def cover_silhouettes(
     check("level", level)
     if level.ndim != 3 or min(level.shape) < 2:
         raise ValueError(f"level: expected shape (X, Y, Z) of at least 2 points a side, got {tuple(level.shape)}")
-    for name, value, last in (
-        ("bound", bound, None),
-        ("distance", distance, None),
-        ("c2w", c2w, 4),
-        ("intrinsics", intrinsics, 4),
-    ):
-        check(name, value, last=last, like=level)
+    check("bound", bound, like=level)
+    check("distance", distance, like=level)
     if bound.shape != level.shape:
         raise ValueError(f"bound: expected shape {tuple(level.shape)}, got {tuple(bound.shape)}")
     if distance.ndim != 3 or min(distance.shape[1:]) < 2 * STRIDE:
         expected = f"(V, H, W) with H and W of at least {2 * STRIDE}"
         raise ValueError(f"distance: expected shape {expected}, got {tuple(distance.shape)}")
     views, height, width = distance.shape
-    if c2w.shape != (views, 4, 4) or intrinsics.shape != (views, 4):
-        got = f"{tuple(c2w.shape)} and {tuple(intrinsics.shape)}"
-        raise ValueError(f"c2w, intrinsics: expected {views} cameras, got {got}")
+    check_camera(camera, like=level, views=views, size=(height, width))
     if not 0.0 < radius < float("inf"):
         raise ValueError(f"radius: expected a positive number, got {radius}")
     if views == 0:
         return level.detach().clone()
-    level, bound, distance, c2w, intrinsics = (
-        v.detach().contiguous() for v in (level, bound, distance, c2w, intrinsics)
-    )
+    level, bound, distance = (v.detach().contiguous() for v in (level, bound, distance))
     lacking = level.new_empty(views, height // STRIDE, width // STRIDE)
-    cameras = [(c2w, wp.mat44), (intrinsics, wp.vec4)]
+    posed = (camera.c2w, wp.mat44), (camera.intrinsics, wp.vec4)
+    cameras = [(v.detach().contiguous(), kind) for v, kind in posed]
     launch(
         kernels.lacking_kernel,
         lacking.numel(),

@@ -9,6 +9,7 @@ import warp as wp
 from torch import Tensor
 
 from reli3d._bridge import check, launch
+from reli3d.geometry.camera import Camera, check_camera
 from reli3d.kernels import hull as kernels
 
 
@@ -52,29 +53,26 @@ def _nearest_crossing(masks: Tensor) -> list:
     return [(rows, wp.float32), (nearest, wp.int32)]
 
 
-def hull_distance(points: Tensor, distance: Tensor, c2w: Tensor, intrinsics: Tensor) -> Tensor:
+def hull_distance(points: Tensor, distance: Tensor, camera: Camera) -> Tensor:
     """Signed distance ``(N,)`` of points to the visual hull, world units, positive inside: the least over the views.
 
-    points: ``(N, 3)``.  distance: ``(V, H, W)`` from :func:`mask_distance`.  c2w: ``(V, 4, 4)`` rigid, OpenGL axes.
-    intrinsics: ``(V, 4)`` fx, fy, cx, cy in pixels.  A view's distance is the pixel distance where the point projects,
-    times depth / focal length.  It is up to 1 / cos^2 of the angle to the optical axis too long.  Outside an image the
-    value of its border is taken, so an object that the border cuts is unbounded there.  A point at or behind a camera's
-    plane gets -1000.  Without views every point gets +1000.  No gradient.
+    points: ``(N, 3)``.  distance: ``(V, H, W)`` from :func:`mask_distance`.  camera: of these V views and pixels.
+    A view's distance is the pixel distance where the point projects, times depth / focal length.  It is up to 1 / cos^2
+    of the angle to the optical axis too long.  Outside an image the value of its border is taken, so an object that the
+    border cuts is unbounded there.  A point at or behind a camera's plane gets -1000.  Without views every point gets
+    +1000.  No gradient.
     """
     check("points", points, last=3)
     if points.ndim != 2:
         raise ValueError(f"points: expected shape (N, 3), got {tuple(points.shape)}")
-    _check_views(points, distance, c2w, intrinsics)
+    _check_views(points, distance, camera)
     hull = torch.empty(len(points), device=points.device)
-    inputs = [v.detach().contiguous() for v in (points, distance, c2w, intrinsics)]
-    types = (wp.vec3, wp.float32, wp.mat44, wp.vec4)
-    launch(kernels.hull_distance_kernel, len(points), [*zip(inputs, types), (hull, wp.float32)], points.device)
+    inputs = [(points.detach().contiguous(), wp.vec3), *_views(distance, camera), (hull, wp.float32)]
+    launch(kernels.hull_distance_kernel, len(points), inputs, points.device)
     return hull
 
 
-def hull_span(
-    origins: Tensor, directions: Tensor, radius: float, distance: Tensor, c2w: Tensor, intrinsics: Tensor
-) -> Tensor:
+def hull_span(origins: Tensor, directions: Tensor, radius: float, distance: Tensor, camera: Camera) -> Tensor:
     """Where rays enter the visual hull first and leave it last, ``(N, 2)``, in lengths of their ``directions``.
 
     origins, directions: ``(N, 3)``, no direction zero.  radius: of the sphere around the world's origin in which the
@@ -89,23 +87,22 @@ def hull_span(
         raise ValueError(f"origins, directions: expected (N, 3) both, got {shapes}")
     if not 0.0 < radius < 100.0:
         raise ValueError(f"radius: expected between 0 and 100, got {radius}")
-    _check_views(origins, distance, c2w, intrinsics)
+    _check_views(origins, distance, camera)
     span = torch.empty(len(origins), 2, device=origins.device)
-    views = [v.detach().contiguous() for v in (distance, c2w, intrinsics)]
     rays = [(v.detach().contiguous(), wp.vec3) for v in (origins, directions)]
-    inputs = [*rays, float(radius), *zip(views, (wp.float32, wp.mat44, wp.vec4)), (span, wp.vec2)]
+    inputs = [*rays, float(radius), *_views(distance, camera), (span, wp.vec2)]
     launch(kernels.hull_span_kernel, len(origins), inputs, origins.device)
     return span
 
 
-def _check_views(points: Tensor, distance: Tensor, c2w: Tensor, intrinsics: Tensor) -> None:
+def _check_views(points: Tensor, distance: Tensor, camera: Camera) -> None:
     check("distance", distance, like=points)
-    check("c2w", c2w, last=4, like=points)
-    check("intrinsics", intrinsics, last=4, like=points)
     if distance.ndim != 3 or min(distance.shape[1:]) < 2:
         raise ValueError(f"distance: expected shape (V, H, W) with H and W above 1, got {tuple(distance.shape)}")
-    views = distance.shape[0]
-    if c2w.shape != (views, 4, 4):
-        raise ValueError(f"c2w: expected shape {(views, 4, 4)}, got {tuple(c2w.shape)}")
-    if intrinsics.shape != (views, 4):
-        raise ValueError(f"intrinsics: expected shape {(views, 4)}, got {tuple(intrinsics.shape)}")
+    check_camera(camera, like=points, views=len(distance), size=distance.shape[1:])
+
+
+def _views(distance: Tensor, camera: Camera) -> list:
+    """Kernel arguments: the views' distances and cameras."""
+    views = (distance, wp.float32), (camera.c2w, wp.mat44), (camera.intrinsics, wp.vec4)
+    return [(value.detach().contiguous(), kind) for value, kind in views]

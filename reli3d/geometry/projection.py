@@ -6,6 +6,7 @@ import warp as wp
 from torch import Tensor
 
 from reli3d._bridge import call, check, launch, struct_of
+from reli3d.geometry.camera import Camera, check_camera
 from reli3d.kernels.projection import gather_views_kernel
 from reli3d.kernels.view_features import Viewed, fuse_views_kernel, pool_views_kernel, vec8, view_summary_kernel
 
@@ -13,44 +14,40 @@ BLOCK = 8  # floats of a kernels.vec8
 OWN = 9  # numbers that a view says of a point, and as many that sum up all views
 
 
-def gather_views(maps: Tensor, points: Tensor, c2w: Tensor, intrinsics: Tensor) -> tuple[Tensor, Tensor]:
+def gather_views(maps: Tensor, points: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
     """Bilinear values ``(N, V, C)`` of ``maps`` where ``points`` project, and pixel x, y and depth ``(N, V, 3)``.
 
-    maps: ``(V, H, W, C)``, at least 2 by 2 pixels.  points: ``(N, 3)`` world.  c2w: ``(V, 4, 4)`` OpenGL.
-    intrinsics: ``(V, 4)`` fx, fy, cx, cy in pixels of ``maps``.  Outside a map its border value is taken.  Gradients
-    reach ``maps`` and ``points``; the pixels carry the gradient of the points too.  Raises TypeError unless float32,
-    ValueError on wrong shapes or mixed devices.
+    maps: ``(V, H, W, C)``, at least 2 by 2 pixels.  points: ``(N, 3)`` world.  camera: of V views; the maps show its
+    whole image in any resolution, and the pixels are those of the maps.  Outside a map its border value is taken.
+    Gradients reach ``maps`` and ``points``; the pixels carry the gradient of the points too.  Raises TypeError unless
+    float32, ValueError on wrong shapes or mixed devices.
     """
     check("maps", maps)
     check("points", points, last=3, like=maps)
-    check("c2w", c2w, last=4, like=maps)
-    check("intrinsics", intrinsics, last=4, like=maps)
     if maps.ndim != 4 or maps.shape[1] < 2 or maps.shape[2] < 2:
         raise ValueError(f"maps: expected (V, H, W, C) of at least 2 by 2 pixels, got {tuple(maps.shape)}")
     views, n = maps.shape[0], len(points)
     if points.ndim != 2:
         raise ValueError(f"points: expected (N, 3), got {tuple(points.shape)}")
-    if c2w.shape != (views, 4, 4) or intrinsics.shape != (views, 4):
-        raise ValueError(
-            f"c2w, intrinsics: expected {views} cameras, got {tuple(c2w.shape)} and {tuple(intrinsics.shape)}"
-        )
-    ins = [(maps, wp.float32), (points, wp.vec3), (c2w.detach(), wp.mat44), (intrinsics.detach(), wp.vec4)]
+    check_camera(camera, like=maps, views=views)
+    camera = camera.detach().resized(maps.shape[2], maps.shape[1])
+    ins = [(maps, wp.float32), (points, wp.vec3), (camera.c2w, wp.mat44), (camera.intrinsics, wp.vec4)]
     outs = [((n, views, maps.shape[3]), wp.float32), ((n, views), wp.vec3)]
     return call(gather_views_kernel, n * views, ins, outs, device=maps.device, shared=(0, 1))
 
 
 def summarize_views(
-    images: Tensor, c2w: Tensor, intrinsics: Tensor, points: Tensor, visible: Tensor | None, normal: Tensor | None
+    images: Tensor, camera: Camera, points: Tensor, visible: Tensor | None, normal: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor]:
     """What the images show of ``points (N, 3)``: numbers ``(N, V, 9)`` and weight ``(N, V)`` of each view, summary
     ``(N, 9)``.
 
-    images: ``(V, S, S, 4)``, sRGB and signed distance to the silhouette in pixels.  c2w: ``(V, 4, 4)`` OpenGL.
-    intrinsics: ``(V, 4)`` in pixels.  visible: ``(N, V)``, 1 where a view sees the surface point, 0 where it is
-    hidden.  normal: ``(N, 3)`` unit.  Both are None for points in space.  :mod:`reli3d.kernels.view_features` lists the
-    numbers.  No gradient.  Raises TypeError unless float32, ValueError on wrong shapes or mixed devices.
+    images: ``(V, S, S, 4)``, sRGB and signed distance to the silhouette in pixels.  camera: of these images.
+    visible: ``(N, V)``, 1 where a view sees the surface point, 0 where it is hidden.  normal: ``(N, 3)`` unit.  Both
+    are None for points in space.  :mod:`reli3d.kernels.view_features` lists the numbers.  No gradient.  Raises
+    TypeError unless float32, ValueError on wrong shapes or mixed devices.
     """
-    n, out, viewed = _summary(images, c2w, intrinsics, points, visible, normal)
+    n, out, viewed = _summary(images, camera, points, visible, normal)
     own, weight = points.new_empty(n, len(images), OWN), points.new_empty(n, len(images))
     outs = [(own, wp.float32), (weight, wp.float32), (out, wp.float32)]
     launch(view_summary_kernel, n, [viewed, *outs], points.device)
@@ -61,8 +58,7 @@ def pool_views(
     images: Tensor,
     tokens: Tensor,
     own: Tensor,
-    c2w: Tensor,
-    intrinsics: Tensor,
+    camera: Camera,
     points: Tensor,
     visible: Tensor | None,
     normal: Tensor | None,
@@ -75,7 +71,7 @@ def pool_views(
     arguments are those of :func:`summarize_views`.  No gradient: with :func:`gather_views` and torch the same has one
     and takes five times as long.
     """
-    n, out, viewed = _summary(images, c2w, intrinsics, points, visible, normal)
+    n, out, viewed = _summary(images, camera, points, visible, normal)
     check("tokens", tokens, like=images)
     check("own", own, like=images)
     hidden = tokens.shape[-1]
@@ -94,7 +90,7 @@ def pool_views(
 
 
 def fuse_views(
-    images: Tensor, pixels: Tensor, c2w: Tensor, intrinsics: Tensor, points: Tensor, visible: Tensor, normal: Tensor
+    images: Tensor, pixels: Tensor, camera: Camera, points: Tensor, visible: Tensor, normal: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """What the views predict of surface ``points (N, 3)``; the view that sees a point best speaks loudest.
 
@@ -109,7 +105,7 @@ def fuse_views(
     check("pixels", pixels, last=4, like=images)
     if pixels.ndim != 5 or pixels.shape[:2] != (3, len(images)) or min(pixels.shape[2:4]) < 2:
         raise ValueError(f"pixels: expected (3, {len(images)}, P, P, 4), P at least 2, got {tuple(pixels.shape)}")
-    n, _, viewed = _summary(images, c2w, intrinsics, points, visible, normal)
+    n, _, viewed = _summary(images, camera, points, visible, normal)
     maps = [(part, wp.vec4) for part in pixels.detach().contiguous()]
     logit, numbers, shading = points.new_empty(n, 3), points.new_empty(n, 10), points.new_empty(n, 3)
     outs = [(logit, wp.vec3), (numbers, wp.float32), (shading, wp.vec3)]
@@ -117,13 +113,14 @@ def fuse_views(
     return logit, numbers, shading
 
 
-def _summary(images, c2w, intrinsics, points, visible, normal) -> tuple[int, Tensor, Viewed]:
+def _summary(images, camera, points, visible, normal) -> tuple[int, Tensor, Viewed]:
     """Number of points, the empty summary and what the kernels have in common, checked."""
     views, n = len(images), len(points)
     check("images", images, last=4)
     check("points", points, last=3, like=images)
     if images.ndim != 4 or images.shape[1] != images.shape[2] or images.shape[1] < 2:
         raise ValueError(f"images: expected (V, S, S, 4) with S of at least 2, got {tuple(images.shape)}")
+    check_camera(camera, like=images, views=views, size=images.shape[1:3])
     if (visible is None) != (normal is None):
         raise ValueError("visible, normal: expected both or none, got one")
     if visible is None:
@@ -133,15 +130,13 @@ def _summary(images, c2w, intrinsics, points, visible, normal) -> tuple[int, Ten
         check("normal", normal, last=3, like=points)
         if len(visible) != n or len(normal) != n:
             raise ValueError(f"visible, normal: expected {n} rows, got {len(visible)} and {len(normal)}")
-    inputs = (images, c2w, intrinsics, points, normal, visible)
-    images, c2w, intrinsics, points, normal, visible = (t.detach().contiguous() for t in inputs)
-    viewed = struct_of(
-        Viewed,
-        image=(images, wp.vec4),
-        c2w=(c2w, wp.mat44),
-        intrinsics=(intrinsics, wp.vec4),
-        points=(points, wp.vec3),
-        normal=(normal, wp.vec3),
-        visible=(visible, wp.float32),
-    )
+    arrays = {
+        "image": (images, wp.vec4),
+        "c2w": (camera.c2w, wp.mat44),
+        "intrinsics": (camera.intrinsics, wp.vec4),
+        "points": (points, wp.vec3),
+        "normal": (normal, wp.vec3),
+        "visible": (visible, wp.float32),
+    }
+    viewed = struct_of(Viewed, **{name: (v.detach().contiguous(), kind) for name, (v, kind) in arrays.items()})
     return n, points.new_empty(n, OWN), viewed

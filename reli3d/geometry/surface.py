@@ -11,13 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import torch
 import warp as wp
 from torch import Tensor
 
-from reli3d._bridge import check, launch, once_differentiable, tensor_of
+from reli3d._bridge import check, launch, once_differentiable, struct_of, tensor_of
 from reli3d.geometry.mesh import Mesh
 from reli3d.kernels import flexicubes as kernels
 from reli3d.kernels.flexicubes_tables import tables
@@ -39,10 +39,28 @@ class _Topology:
     base: Tensor  # (S,) the first one
     slot: Tensor  # (vertices of the grid,) surface cube of a cell; undefined elsewhere
 
+    @cached_property
+    def surface(self) -> kernels.SurfaceCubes:
+        """What the kernels read of it."""
+        names = ("cells", "rows", "resolved", "counts", "base", "slot")
+        return struct_of(kernels.SurfaceCubes, **{name: (getattr(self, name), I32) for name in names})
+
+    def grid(self, level: Tensor, shift: Tensor | None) -> kernels.Grid:
+        """The kernels' grid of the padded ``level`` and the offsets before padding."""
+        shift = level.new_empty(0, 3) if shift is None else shift.view(-1, 3)
+        return struct_of(kernels.Grid, level=(level.view(-1), wp.float32), shift=(shift, wp.vec3), ny=self.shape[1],
+                         nz=self.shape[2], cubes=wp.vec3i(*self.cubes), pad=self.pad)  # fmt: skip
+
 
 @lru_cache(8)
 def tables_on(device: torch.device) -> dict[str, Tensor]:
     return {name: torch.from_numpy(value.reshape(-1)).to(device) for name, value in tables()._asdict().items()}
+
+
+@lru_cache(8)
+def _struct_of_tables(device: torch.device) -> kernels.Tables:
+    table = tables_on(device)
+    return struct_of(kernels.Tables, **{name: (table[name], I32) for name in ("group", "ends", "around")})
 
 
 def surface_cubes(level: Tensor) -> Tensor:
@@ -234,14 +252,14 @@ class _DualVertices(torch.autograd.Function):
         t, device = topology, level.device
         counts = t.counts.long()
         order = torch.argsort(t.base)
-        owner = torch.repeat_interleave(order, counts[order]).to(torch.int32)
-        group = torch.arange(len(owner), dtype=torch.int32, device=device) - t.base[owner.long()]
-        vertices = torch.empty(len(owner), 3, device=device)
+        cube = torch.repeat_interleave(order, counts[order]).to(torch.int32)
+        group = torch.arange(len(cube), dtype=torch.int32, device=device) - t.base[cube.long()]
+        vertices = torch.empty(len(cube), 3, device=device)
         inputs = [None if v is None else v.detach().contiguous() for v in (deformation, alpha, beta)]
         launch(
             kernels.dual_vertex_kernel,
-            len(owner),
-            [(owner, I32), (group, I32), *_DualVertices.arguments(t, padded, inputs, scale), (vertices, wp.vec3)],
+            len(cube),
+            [(cube, I32), (group, I32), *_DualVertices.arguments(t, padded, inputs, scale), (vertices, wp.vec3)],
             device,
         )
         ctx.topology, ctx.scale, ctx.given = topology, scale, [v is not None for v in (deformation, alpha, beta)]
@@ -249,12 +267,11 @@ class _DualVertices(torch.autograd.Function):
         return vertices
 
     @staticmethod
-    def arguments(t: _Topology, padded: Tensor, inputs: list, scale: tuple, *more) -> list:
-        table, none = tables_on(padded.device), padded.new_empty(0)
-        shift, alpha, beta = (none if v is None else v.view(-1) for v in inputs)
-        return [(t.cells, I32), (t.resolved, I32), (t.rows, I32), *more, (table["group"], I32), (table["ends"], I32),
-                (padded.view(-1), wp.float32), (shift.view(-1, 3), wp.vec3), (alpha, wp.float32), (beta, wp.float32),
-                t.shape[1], t.shape[2], wp.vec3i(*t.cubes), t.pad, wp.vec3(*scale)]  # fmt: skip
+    def arguments(t: _Topology, padded: Tensor, inputs: list, scale: tuple) -> list:
+        none = padded.new_empty(0)
+        alpha, beta = ((none if v is None else v.view(-1), wp.float32) for v in inputs[1:])
+        weights = struct_of(kernels.Weights, alpha=alpha, beta=beta)
+        return [t.surface, _struct_of_tables(padded.device), t.grid(padded, inputs[0]), weights, wp.vec3(*scale)]
 
     @staticmethod
     @once_differentiable
@@ -272,7 +289,7 @@ class _DualVertices(torch.autograd.Function):
             flexicubes_adjoint.dual_vertex_adjoint_kernel,
             n,
             [
-                *_DualVertices.arguments(t, padded, inputs, ctx.scale, (t.counts, I32), (t.base, I32)),
+                *_DualVertices.arguments(t, padded, inputs, ctx.scale),
                 (g_vertices.contiguous(), wp.vec3),
                 (g_level.view(-1), wp.float32),
                 (g_shift.view(-1, 3), wp.vec3),
@@ -316,11 +333,9 @@ def _quads(t: _Topology, padded: Tensor, crossed: Tensor, gamma: Tensor | None) 
     origin, direction = starts[which].to(torch.int32), direction.to(torch.int32)
     quads = torch.empty(len(origin), 4, dtype=torch.int32, device=device)
     split = torch.empty(len(origin), 4, device=device)
-    table = tables_on(device)
     launch(kernels.quad_kernel, len(origin), [
-        (origin, I32), (direction, I32), (t.slot, I32), (t.resolved, I32), (t.base, I32), (t.rows, I32),
-        (table["group"], I32), (table["around"], I32), (padded.view(-1), wp.float32),
-        (padded.new_empty(0) if gamma is None else gamma.detach().contiguous(), wp.float32), t.shape[1], t.shape[2],
+        (origin, I32), (direction, I32), t.surface, _struct_of_tables(device), t.grid(padded, None),
+        (padded.new_empty(0) if gamma is None else gamma.detach().contiguous(), wp.float32),
         (quads.view(-1), I32), (split.view(-1), wp.float32)], device)  # fmt: skip
     return quads, split
 

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from reli3d._bridge import check, launch, once_differentiable, over_rows
+from reli3d._bridge import check, launch, once_differentiable, over_rows, struct_of
 from reli3d.kernels import triplane as kernels
 
 BLOCK = 8  # channels of a kernels.vec8
@@ -45,19 +45,19 @@ class _SampleTriplane(torch.autograd.Function):
         features = points.new_empty(batch, n, 3, blocks * BLOCK)
         packed = planes.detach() if by_rows else _packed(planes)
         inputs = (points.view(-1, 3), kernels.wp.vec3), (order.view(-1), kernels.wp.int32)
-        out = features.view(-1, BLOCK), kernels.vec8
+        out, sizes = (features.view(-1, BLOCK), kernels.vec8), _sizes(n, height, width, blocks)
         if by_rows:
             scratch = points.new_empty(batch * 3 * BANDS * 2 * (width + 2) * blocks, BLOCK)
             launch(kernels.sample_rows_kernel, batch * 3 * BANDS, [
-                (packed.view(-1), kernels.wp.float32), *inputs, (edges.view(-1), kernels.wp.int32), n,
-                channels, height, width, blocks, BANDS, (scratch, kernels.vec8), out],
+                (packed.view(-1), kernels.wp.float32), *inputs, (edges.view(-1), kernels.wp.int32), sizes,
+                channels, BANDS, (scratch, kernels.vec8), out],
                 planes.device, slice_min=1)  # fmt: skip
         else:
             split = blocks if planes.is_cuda else 1  # neighbouring GPU threads read neighbouring blocks
             launch(
                 kernels.sample_kernel,
                 batch * n * 3 * split,
-                [(packed.view(-1, BLOCK), kernels.vec8), *inputs, n, height, width, blocks, split, out],
+                [(packed.view(-1, BLOCK), kernels.vec8), *inputs, sizes, split, out],
                 planes.device,
             )
         sorted_points = (order, edges) if ctx.needs_input_grad[0] else (None, None)
@@ -76,6 +76,10 @@ class _SampleTriplane(torch.autograd.Function):
         g_planes = _planes_adjoint(points, g, order, edges, ctx.shape).to(ctx.dtype) if order is not None else None
         g_points = _points_adjoint(packed, points, g) if packed is not None else None
         return g_planes, g_points
+
+
+def _sizes(points: int, height: int, width: int, blocks: int) -> kernels.Sizes:
+    return struct_of(kernels.Sizes, points=points, height=height, width=width, blocks=blocks)
 
 
 def _packed(planes: Tensor) -> Tensor:
@@ -101,7 +105,7 @@ def _by_cell_row(points: Tensor, height: int, width: int) -> tuple[Tensor, Tenso
     launch(
         kernels.cell_key_kernel,
         slabs * n,
-        [(points.view(-1, 3), kernels.wp.vec3), n, height, width, bins, (keys.view(-1), kernels.wp.int32)],
+        [(points.view(-1, 3), kernels.wp.vec3), _sizes(n, height, width, 0), bins, (keys.view(-1), kernels.wp.int32)],
         points.device,
     )
     edges = keys.new_zeros(slabs, height + 2)
@@ -128,7 +132,7 @@ def _points_adjoint(packed: Tensor, points: Tensor, g: Tensor) -> Tensor:
     g_points = torch.empty_like(points)
     launch(kernels.points_adjoint_kernel, batch * n, [
         (packed.view(-1, BLOCK), kernels.vec8), (points.view(-1, 3), kernels.wp.vec3),
-        (g.view(-1, BLOCK), kernels.vec8), n, height, width, channels // BLOCK,
+        (g.view(-1, BLOCK), kernels.vec8), _sizes(n, height, width, channels // BLOCK),
         (g_points.view(-1, 3), kernels.wp.vec3)], points.device)  # fmt: skip
     return g_points
 
@@ -138,12 +142,12 @@ def _planes_adjoint(points: Tensor, g: Tensor, order: Tensor, edges: Tensor, sha
     channels, height, width = shape[2:]
     blocks = g.shape[-1] // BLOCK
     g_planes = torch.zeros(batch, 3, height, width, blocks * BLOCK, device=points.device)
-    split = 1 if points.device.type == "cpu" else blocks
+    split, sizes = 1 if points.device.type == "cpu" else blocks, _sizes(n, height, width, blocks)
     for parity in (0, 1):
         launch(kernels.planes_adjoint_kernel, batch * 3 * ((height + 2 - parity) // 2) * split, [
             (points.view(-1, 3), kernels.wp.vec3), (g.view(-1, BLOCK), kernels.vec8),
-            (order.view(-1), kernels.wp.int32), (edges.view(-1), kernels.wp.int32), parity, split, n, height,
-            width, blocks, (g_planes.view(-1, BLOCK), kernels.vec8)], points.device, slice_min=ROWS_MIN)  # fmt: skip
+            (order.view(-1), kernels.wp.int32), (edges.view(-1), kernels.wp.int32), sizes, parity, split,
+            (g_planes.view(-1, BLOCK), kernels.vec8)], points.device, slice_min=ROWS_MIN)  # fmt: skip
     return g_planes[..., :channels].permute(0, 1, 4, 2, 3)
 
 

@@ -13,6 +13,52 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=n
 LEVEL_MIN = wp.constant(1.0e-20)  # slopes are 1 / level: an edge whose levels are both smaller passes none to them
 
 
+@wp.struct
+class Grid:
+    """Levels of the padded grid's vertices, offsets of those before padding (empty for none), and the shape.
+
+    ``cubes`` counts those before padding.
+    """
+
+    level: wp.array[float]
+    shift: wp.array[wp.vec3]
+    ny: int
+    nz: int
+    cubes: wp.vec3i
+    pad: int
+
+
+@wp.struct
+class SurfaceCubes:
+    """A row for each cube with a sign change: its lowest vertex, the case whose groups it uses, its row in the weights
+    (-1 in the padding), the number of its dual vertices and the first of them; ``slot`` has the row of a vertex.
+    """
+
+    cells: wp.array[wp.int32]
+    resolved: wp.array[wp.int32]
+    rows: wp.array[wp.int32]
+    counts: wp.array[wp.int32]
+    base: wp.array[wp.int32]
+    slot: wp.array[wp.int32]
+
+
+@wp.struct
+class Tables:
+    """Of :mod:`reli3d.kernels.flexicubes_tables`, flat."""
+
+    group: wp.array[wp.int32]
+    ends: wp.array[wp.int32]
+    around: wp.array[wp.int32]
+
+
+@wp.struct
+class Weights:
+    """Of the surface cubes; empty arrays stand for 1."""
+
+    alpha: wp.array[float]
+    beta: wp.array[float]
+
+
 @wp.func
 def split_index(index: int, ny: int, nz: int) -> wp.vec3i:
     return wp.vec3i(index // (ny * nz), (index // nz) % ny, index % nz)
@@ -31,28 +77,32 @@ def inside_bit(level: wp.array[float], index: int) -> int:
 
 
 @wp.func
-def grid_position(at: wp.vec3i, shift: wp.array[wp.vec3], cubes: wp.vec3i, pad: int) -> wp.vec3:
-    """Position of a grid vertex in [-0.5, 0.5]^3 plus deformation; ``cubes`` counts those before padding."""
+def grid_position(at: wp.vec3i, grid: Grid) -> wp.vec3:
+    """Position of a grid vertex in [-0.5, 0.5]^3 plus deformation."""
+    cubes = grid.cubes
+    pad = grid.pad
     i = wp.clamp(at[0] - pad, 0, cubes[0])
     j = wp.clamp(at[1] - pad, 0, cubes[1])
     k = wp.clamp(at[2] - pad, 0, cubes[2])
     p = wp.vec3(float(i) / float(cubes[0]) - 0.5, float(j) / float(cubes[1]) - 0.5, float(k) / float(cubes[2]) - 0.5)
-    if shift.shape[0] > 0:
-        p += shift[(i * (cubes[1] + 1) + j) * (cubes[2] + 1) + k]
+    if grid.shift.shape[0] > 0:
+        p += grid.shift[(i * (cubes[1] + 1) + j) * (cubes[2] + 1) + k]
     return p
 
 
 @wp.func
-def exact_position(at: wp.vec3i, shift: wp.array[wp.vec3], cubes: wp.vec3i, pad: int) -> wp.vec3d:
+def exact_position(at: wp.vec3i, grid: Grid) -> wp.vec3d:
     """:func:`grid_position` in float64, for differences."""
+    cubes = grid.cubes
+    pad = grid.pad
     i = wp.clamp(at[0] - pad, 0, cubes[0])
     j = wp.clamp(at[1] - pad, 0, cubes[1])
     k = wp.clamp(at[2] - pad, 0, cubes[2])
     p = wp.vec3d(
         wp.float64(i) / wp.float64(cubes[0]), wp.float64(j) / wp.float64(cubes[1]), wp.float64(k) / wp.float64(cubes[2])
     )
-    if shift.shape[0] > 0:
-        p += wp.vec3d(shift[(i * (cubes[1] + 1) + j) * (cubes[2] + 1) + k])
+    if grid.shift.shape[0] > 0:
+        p += wp.vec3d(grid.shift[(i * (cubes[1] + 1) + j) * (cubes[2] + 1) + k])
     return p
 
 
@@ -179,35 +229,39 @@ def resolve_kernel(
 def dual_vertex_kernel(
     start: int,
     # in
-    owner: wp.array[wp.int32], own_group: wp.array[wp.int32],
-    cells: wp.array[wp.int32], resolved: wp.array[wp.int32], rows: wp.array[wp.int32],
-    group: wp.array[wp.int32], ends: wp.array[wp.int32],
-    level: wp.array[float], shift: wp.array[wp.vec3], alpha: wp.array[float], beta: wp.array[float],
-    ny: int, nz: int, cubes: wp.vec3i, pad: int, scale: wp.vec3,
+    cube: wp.array[wp.int32],
+    group: wp.array[wp.int32],
+    surface: SurfaceCubes,
+    tables: Tables,
+    grid: Grid,
+    weights: Weights,
+    scale: wp.vec3,
     # out
     vertices: wp.array[wp.vec3],
-):  # fmt: skip
-    """Mean of the crossings of a group of edges, weighted by beta; NaN if a weight it uses is not positive."""
+):
+    """Mean of the crossings of a ``group`` of the edges of surface cube ``cube``, weighted by beta; NaN if a weight it
+    uses is not positive.
+    """
     v = start + wp.tid()
-    s = owner[v]
-    cell = cells[s]
-    code = resolved[s]
-    row = rows[s]
-    at = split_index(cell, ny, nz)
+    s = cube[v]
+    cell = surface.cells[s]
+    code = surface.resolved[s]
+    row = surface.rows[s]
+    at = split_index(cell, grid.ny, grid.nz)
     total = wp.float32(0.0)
     point = wp.vec3()
     for e in range(12):
-        if group[code * 12 + e] == own_group[v]:
-            a = ends[2 * e]
-            b = ends[2 * e + 1]
-            alpha_a = weight(alpha, row, 8, a)
-            alpha_b = weight(alpha, row, 8, b)
-            beta_e = weight(beta, row, 12, e)
-            level_a = level[corner_index(cell, a, ny, nz)]
-            level_b = level[corner_index(cell, b, ny, nz)]
+        if tables.group[code * 12 + e] == group[v]:
+            a = tables.ends[2 * e]
+            b = tables.ends[2 * e + 1]
+            alpha_a = weight(weights.alpha, row, 8, a)
+            alpha_b = weight(weights.alpha, row, 8, b)
+            beta_e = weight(weights.beta, row, 12, e)
+            level_a = grid.level[corner_index(cell, a, grid.ny, grid.nz)]
+            level_b = grid.level[corner_index(cell, b, grid.ny, grid.nz)]
             t = float(end_shares(alpha_a, level_a, alpha_b, level_b)[0])
-            x_a = grid_position(at + wp.vec3i(a & 1, a >> 1 & 1, a >> 2), shift, cubes, pad)
-            x_b = grid_position(at + wp.vec3i(b & 1, b >> 1 & 1, b >> 2), shift, cubes, pad)
+            x_a = grid_position(at + wp.vec3i(a & 1, a >> 1 & 1, a >> 2), grid)
+            x_b = grid_position(at + wp.vec3i(b & 1, b >> 1 & 1, b >> 2), grid)
             if not (alpha_a > 0.0 and alpha_b > 0.0 and beta_e > 0.0):
                 beta_e = wp.nan
             point += (x_a + t * (x_b - x_a)) * beta_e
@@ -219,31 +273,35 @@ def dual_vertex_kernel(
 def quad_kernel(
     start: int,
     # in
-    origin: wp.array[wp.int32], direction: wp.array[wp.int32], slot: wp.array[wp.int32], resolved: wp.array[wp.int32],
-    base: wp.array[wp.int32], rows: wp.array[wp.int32], group: wp.array[wp.int32], around: wp.array[wp.int32],
-    level: wp.array[float], gamma: wp.array[float], ny: int, nz: int,
+    origin: wp.array[wp.int32],
+    direction: wp.array[wp.int32],
+    surface: SurfaceCubes,
+    tables: Tables,
+    grid: Grid,
+    gamma: wp.array[float],
     # out
-    quads: wp.array[wp.int32], split: wp.array[float],
-):  # fmt: skip
+    quads: wp.array[wp.int32],
+    split: wp.array[float],
+):
     """Dual vertices around a crossed edge, counter-clockwise seen from outside, and the gammas of their cubes.
 
     ``direction``: 0 y (downwards), 1 z, 2 x, as the bits of :func:`classify_kernel`.
     """
     q = start + wp.tid()
     v = origin[q]
-    first = ny * nz  # steps across the edge; the larger first
-    second = nz
+    first = grid.ny * grid.nz  # steps across the edge; the larger first
+    second = grid.nz
     lowest = v
     axis = 2
     if direction[q] == 0:
         second = 1
-        lowest = v - nz
+        lowest = v - grid.nz
         axis = 1
     if direction[q] == 2:
-        first = nz
+        first = grid.nz
         second = 1
         axis = 0
-    outward = level[v] < 0.0
+    outward = grid.level[v] < 0.0
     for corner in range(4):
         # positions 0, 1, 3, 2 run around the edge; seen from the other end 2, 3, 1, 0
         turn = corner
@@ -255,6 +313,7 @@ def quad_kernel(
         if turn == 3:
             n = 2
         cell = lowest - first * (1 - (n >> 1)) - second * (1 - (n & 1))
-        s = slot[cell]
-        quads[q * 4 + corner] = base[s] + group[resolved[s] * 12 + around[axis * 4 + n]]
-        split[q * 4 + corner] = weight(gamma, rows[s], 1, 0)
+        s = surface.slot[cell]
+        edge = surface.resolved[s] * 12 + tables.around[axis * 4 + n]
+        quads[q * 4 + corner] = surface.base[s] + tables.group[edge]
+        split[q * 4 + corner] = weight(gamma, surface.rows[s], 1, 0)

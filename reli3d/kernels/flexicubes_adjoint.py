@@ -2,7 +2,18 @@
 
 import warp as wp
 
-from reli3d.kernels.flexicubes import LEVEL_MIN, corner_index, end_shares, exact_position, split_index, weight
+from reli3d.kernels.flexicubes import (
+    LEVEL_MIN,
+    Grid,
+    SurfaceCubes,
+    Tables,
+    Weights,
+    corner_index,
+    end_shares,
+    exact_position,
+    split_index,
+    weight,
+)
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
 
@@ -11,55 +22,60 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=n
 def dual_vertex_adjoint_kernel(
     start: int,
     # in
-    cells: wp.array[wp.int32], resolved: wp.array[wp.int32], rows: wp.array[wp.int32], counts: wp.array[wp.int32],
-    base: wp.array[wp.int32], group: wp.array[wp.int32], ends: wp.array[wp.int32],
-    level: wp.array[float], shift: wp.array[wp.vec3], alpha: wp.array[float], beta: wp.array[float],
-    ny: int, nz: int, cubes: wp.vec3i, pad: int, scale: wp.vec3,
+    surface: SurfaceCubes,
+    tables: Tables,
+    grid: Grid,
+    weights: Weights,
+    scale: wp.vec3,
     g_vertices: wp.array[wp.vec3],
     # out, zeroed
-    g_level: wp.array[float], g_shift: wp.array[wp.vec3], g_alpha: wp.array[float], g_beta: wp.array[float],
-):  # fmt: skip
+    g_level: wp.array[float],
+    g_shift: wp.array[wp.vec3],
+    g_alpha: wp.array[float],
+    g_beta: wp.array[float],
+):
     """A thread is a surface cube and owns its 8 entries of g_level, g_shift, g_alpha and its 12 of g_beta.
 
     In float64: a point less the mean, and ends of an edge, are differences of a small part of their size.
     """
     s = start + wp.tid()
-    cell = cells[s]
-    row = rows[s]
-    at = split_index(cell, ny, nz)
-    for own in range(counts[s]):
+    cell = surface.cells[s]
+    code = surface.resolved[s]
+    row = surface.rows[s]
+    at = split_index(cell, grid.ny, grid.nz)
+    for group in range(surface.counts[s]):
         total = wp.float64(0.0)
         mean = wp.vec3d()
         for e in range(12):
-            if group[resolved[s] * 12 + e] == own:
-                a = ends[2 * e]
-                b = ends[2 * e + 1]
+            if tables.group[code * 12 + e] == group:
+                a = tables.ends[2 * e]
+                b = tables.ends[2 * e + 1]
                 ways = end_shares(
-                    weight(alpha, row, 8, a),
-                    level[corner_index(cell, a, ny, nz)],
-                    weight(alpha, row, 8, b),
-                    level[corner_index(cell, b, ny, nz)],
+                    weight(weights.alpha, row, 8, a),
+                    grid.level[corner_index(cell, a, grid.ny, grid.nz)],
+                    weight(weights.alpha, row, 8, b),
+                    grid.level[corner_index(cell, b, grid.ny, grid.nz)],
                 )
-                x_a = exact_position(at + wp.vec3i(a & 1, a >> 1 & 1, a >> 2), shift, cubes, pad)
-                x_b = exact_position(at + wp.vec3i(b & 1, b >> 1 & 1, b >> 2), shift, cubes, pad)
-                beta_e = wp.float64(weight(beta, row, 12, e))
+                x_a = exact_position(at + wp.vec3i(a & 1, a >> 1 & 1, a >> 2), grid)
+                x_b = exact_position(at + wp.vec3i(b & 1, b >> 1 & 1, b >> 2), grid)
+                beta_e = wp.float64(weight(weights.beta, row, 12, e))
                 mean += (x_a * ways[1] + x_b * ways[0]) * beta_e
                 total += beta_e
         mean = mean / total
-        g = wp.vec3d(wp.cw_mul(g_vertices[base[s] + own], scale)) / total
+        g = wp.vec3d(wp.cw_mul(g_vertices[surface.base[s] + group], scale)) / total
         for e in range(12):
-            if group[resolved[s] * 12 + e] == own:
-                a = ends[2 * e]
-                b = ends[2 * e + 1]
-                alpha_a = wp.float64(weight(alpha, row, 8, a))
-                alpha_b = wp.float64(weight(alpha, row, 8, b))
-                level_a = level[corner_index(cell, a, ny, nz)]
-                level_b = level[corner_index(cell, b, ny, nz)]
+            if tables.group[code * 12 + e] == group:
+                a = tables.ends[2 * e]
+                b = tables.ends[2 * e + 1]
+                alpha_a = wp.float64(weight(weights.alpha, row, 8, a))
+                alpha_b = wp.float64(weight(weights.alpha, row, 8, b))
+                level_a = grid.level[corner_index(cell, a, grid.ny, grid.nz)]
+                level_b = grid.level[corner_index(cell, b, grid.ny, grid.nz)]
                 ways = end_shares(float(alpha_a), level_a, float(alpha_b), level_b)
-                x_a = exact_position(at + wp.vec3i(a & 1, a >> 1 & 1, a >> 2), shift, cubes, pad)
-                x_b = exact_position(at + wp.vec3i(b & 1, b >> 1 & 1, b >> 2), shift, cubes, pad)
+                x_a = exact_position(at + wp.vec3i(a & 1, a >> 1 & 1, a >> 2), grid)
+                x_b = exact_position(at + wp.vec3i(b & 1, b >> 1 & 1, b >> 2), grid)
                 g_beta[s * 12 + e] = float(wp.dot(x_a * ways[1] + x_b * ways[0] - mean, g))
-                g_point = g * wp.float64(weight(beta, row, 12, e))
+                g_point = g * wp.float64(weight(weights.beta, row, 12, e))
                 g_t = wp.dot(x_b - x_a, g_point)
                 g_size = g_t * ways[0] * ways[1]  # of the logarithms of the two sizes, with opposite signs
                 g_alpha[s * 8 + a] = g_alpha[s * 8 + a] + float(g_size / alpha_a)

@@ -113,7 +113,7 @@ def sight_kernel(
     normal: wp.array(dtype=wp.vec3),
     c2w: wp.array(dtype=wp.mat44),
     intrinsics: wp.array(dtype=wp.vec4),
-    size: float,
+    size: wp.vec2,
     grazing: float,
     # out
     origin: wp.array(dtype=wp.vec3),
@@ -135,7 +135,7 @@ def sight_kernel(
     toward = away / distance
     q = project_point(p, pose, intrinsics[camera])
     t_max[i] = -1.0
-    if wp.dot(toward, n) > grazing and q[2] > 0.0 and q[0] > 0.0 and q[0] < size and q[1] > 0.0 and q[1] < size:
+    if wp.dot(toward, n) > grazing and q[2] > 0.0 and q[0] > 0.0 and q[0] < size[0] and q[1] > 0.0 and q[1] < size[1]:
         t_max[i] = distance
     direction[i] = toward
     origin[i] = offset_origin(p, n, toward, 1.0)

@@ -12,6 +12,29 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=n
 ROUNDING = wp.constant(4.0e-7)  # relative error of a float32 cross product, twice over: neighbours leave no crack
 
 
+@wp.struct
+class Tiles:
+    """Corners of the faces in texels, and the faces whose boxes touch each tile of the map: ``face_list`` from
+    ``face_start[i]`` to ``face_start[i + 1]``.
+    """
+
+    corners: wp.array2d(dtype=wp.vec2)
+    face_start: wp.array(dtype=wp.int32)
+    face_list: wp.array(dtype=wp.int32)
+    size: int  # texels along the map
+    tile: int  # and along a tile
+
+
+@wp.struct
+class Places:
+    """Flat indices of the texels asked for; face and weights of every texel of the map; vertices of the faces."""
+
+    texel: wp.array(dtype=wp.int64)
+    face: wp.array(dtype=wp.int32)
+    bary: wp.array(dtype=wp.vec2)
+    faces: wp.array2d(dtype=wp.int32)
+
+
 @wp.func
 def cross2(a: wp.vec2, b: wp.vec2) -> float:
     return a[0] * b[1] - a[1] * b[0]
@@ -34,14 +57,10 @@ def weight_on_segment(a: wp.vec2, b: wp.vec2, p: wp.vec2) -> float:
 def texels_kernel(
     start: int,
     # in
-    corners: wp.array2d(dtype=wp.vec2),
-    face_start: wp.array(dtype=wp.int32),
-    face_list: wp.array(dtype=wp.int32),
+    tiles: Tiles,
     segment_start: wp.array(dtype=wp.int32),
     segment_list: wp.array(dtype=wp.int32),
     segments: wp.array(dtype=wp.int32),
-    size: int,
-    tile: int,
     reach: float,
     # scratch
     distance: wp.array2d(dtype=wp.float32),
@@ -54,22 +73,23 @@ def texels_kernel(
     ``segments`` holds 3 * face + corner of each edge on a border.  ``bary`` weighs vertices 1 and 2.
     """
     i = start + wp.tid()
-    tiles = (size + tile - 1) / tile
-    x0 = (i % tiles) * tile
-    y0 = (i / tiles) * tile
-    x1 = wp.min(x0 + tile, size) - 1
-    y1 = wp.min(y0 + tile, size) - 1
+    tile = tiles.tile
+    across = (tiles.size + tile - 1) / tile
+    x0 = (i % across) * tile
+    y0 = (i / across) * tile
+    x1 = wp.min(x0 + tile, tiles.size) - 1
+    y1 = wp.min(y0 + tile, tiles.size) - 1
     far = reach * reach * 1.0001 + 1.0
     for y in range(y0, y1 + 1):
         for x in range(x0, x1 + 1):
             face[y, x] = -1
             bary[y, x] = wp.vec2(0.0, 0.0)
             distance[y, x] = far
-    for s in range(face_start[i], face_start[i + 1]):
-        f = face_list[s]
-        a = corners[f, 0]
-        b = corners[f, 1] - a
-        c = corners[f, 2] - a
+    for s in range(tiles.face_start[i], tiles.face_start[i + 1]):
+        f = tiles.face_list[s]
+        a = tiles.corners[f, 0]
+        b = tiles.corners[f, 1] - a
+        c = tiles.corners[f, 2] - a
         area = cross2(b, c)
         if area != 0.0:
             inverse = 1.0 / area
@@ -94,8 +114,8 @@ def texels_kernel(
         code = segments[segment_list[s]]
         f = code / 3
         k = code % 3
-        a = corners[f, k]
-        b = corners[f, (k + 1) % 3]
+        a = tiles.corners[f, k]
+        b = tiles.corners[f, (k + 1) % 3]
         left = wp.max(int(wp.floor(wp.min(a[0], b[0]) - 0.5 - reach)), x0)
         right = wp.min(int(wp.ceil(wp.max(a[0], b[0]) - 0.5 + reach)), x1)
         high = wp.max(int(wp.floor(wp.min(a[1], b[1]) - 0.5 - reach)), y0)
@@ -126,29 +146,26 @@ def texels_kernel(
 def coverage_kernel(
     start: int,
     # in
-    corners: wp.array2d(dtype=wp.vec2),
-    face_start: wp.array(dtype=wp.int32),
-    face_list: wp.array(dtype=wp.int32),
-    size: int,
-    tile: int,
+    tiles: Tiles,
     # out
     hits: wp.array2d(dtype=wp.uint8),
 ):
     """Number of faces, 255 at most, whose interior holds each centre of tile ``i``."""
     i = start + wp.tid()
-    tiles = (size + tile - 1) / tile
-    x0 = (i % tiles) * tile
-    y0 = (i / tiles) * tile
-    x1 = wp.min(x0 + tile, size) - 1
-    y1 = wp.min(y0 + tile, size) - 1
+    tile = tiles.tile
+    across = (tiles.size + tile - 1) / tile
+    x0 = (i % across) * tile
+    y0 = (i / across) * tile
+    x1 = wp.min(x0 + tile, tiles.size) - 1
+    y1 = wp.min(y0 + tile, tiles.size) - 1
     for y in range(y0, y1 + 1):
         for x in range(x0, x1 + 1):
             hits[y, x] = wp.uint8(0)
-    for s in range(face_start[i], face_start[i + 1]):
-        f = face_list[s]
-        a = corners[f, 0]
-        b = corners[f, 1] - a
-        c = corners[f, 2] - a
+    for s in range(tiles.face_start[i], tiles.face_start[i + 1]):
+        f = tiles.face_list[s]
+        a = tiles.corners[f, 0]
+        b = tiles.corners[f, 1] - a
+        c = tiles.corners[f, 2] - a
         turn = float(1.0)
         if cross2(b, c) < 0.0:
             turn = -1.0
@@ -170,10 +187,7 @@ def coverage_kernel(
 def attributes_kernel(
     start: int,
     # in
-    texel: wp.array(dtype=wp.int64),
-    face: wp.array(dtype=wp.int32),
-    bary: wp.array(dtype=wp.vec2),
-    faces: wp.array2d(dtype=wp.int32),
+    places: Places,
     vertices: wp.array(dtype=wp.vec3),
     normals: wp.array(dtype=wp.vec3),
     # out
@@ -182,13 +196,13 @@ def attributes_kernel(
 ):
     """Interpolated position and unit normal at the listed texels; the normal of vertex 0 where they cancel."""
     i = start + wp.tid()
-    t = texel[i]
-    f = face[t]
-    w = bary[t]
+    t = places.texel[i]
+    f = places.face[t]
+    w = places.bary[t]
     w0 = 1.0 - w[0] - w[1]
-    a = faces[f, 0]
-    b = faces[f, 1]
-    c = faces[f, 2]
+    a = places.faces[f, 0]
+    b = places.faces[f, 1]
+    c = places.faces[f, 2]
     position[i] = w0 * vertices[a] + w[0] * vertices[b] + w[1] * vertices[c]
     n = w0 * normals[a] + w[0] * normals[b] + w[1] * normals[c]
     if wp.length_sq(n) < 1.0e-12:
@@ -200,21 +214,18 @@ def attributes_kernel(
 def tangents_kernel(
     start: int,
     # in
-    texel: wp.array(dtype=wp.int64),
-    face: wp.array(dtype=wp.int32),
-    bary: wp.array(dtype=wp.vec2),
-    faces: wp.array2d(dtype=wp.int32),
+    places: Places,
     tangents: wp.array(dtype=wp.vec4),
     # out
     tangent: wp.array(dtype=wp.vec4),
 ):
     """Interpolated unit tangent at the listed texels with the sign w of vertex 0."""
     i = start + wp.tid()
-    t = texel[i]
-    f = face[t]
-    w = bary[t]
-    a = tangents[faces[f, 0]]
-    m = (1.0 - w[0] - w[1]) * a + w[0] * tangents[faces[f, 1]] + w[1] * tangents[faces[f, 2]]
+    t = places.texel[i]
+    f = places.face[t]
+    w = places.bary[t]
+    a = tangents[places.faces[f, 0]]
+    m = (1.0 - w[0] - w[1]) * a + w[0] * tangents[places.faces[f, 1]] + w[1] * tangents[places.faces[f, 2]]
     d = wp.vec3(m[0], m[1], m[2])
     if wp.length_sq(d) < 1.0e-12:
         d = wp.vec3(a[0], a[1], a[2])
@@ -226,22 +237,19 @@ def tangents_kernel(
 def values_kernel(
     start: int,
     # in
-    texel: wp.array(dtype=wp.int64),
-    face: wp.array(dtype=wp.int32),
-    bary: wp.array(dtype=wp.vec2),
-    faces: wp.array2d(dtype=wp.int32),
+    places: Places,
     values: wp.array2d(dtype=wp.float32),
     # out
     value: wp.array2d(dtype=wp.float32),
 ):
     """Interpolated numbers of the vertices at the listed texels."""
     i = start + wp.tid()
-    t = texel[i]
-    f = face[t]
-    w = bary[t]
+    t = places.texel[i]
+    f = places.face[t]
+    w = places.bary[t]
     for k in range(values.shape[1]):
-        first = (1.0 - w[0] - w[1]) * values[faces[f, 0], k]
-        value[i, k] = first + w[0] * values[faces[f, 1], k] + w[1] * values[faces[f, 2], k]
+        first = (1.0 - w[0] - w[1]) * values[places.faces[f, 0], k]
+        value[i, k] = first + w[0] * values[places.faces[f, 1], k] + w[1] * values[places.faces[f, 2], k]
 
 
 @wp.kernel

@@ -13,11 +13,21 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=n
 vec8 = wp.types.vector(length=8, dtype=wp.float32)  # one AVX register; a plane's channels are padded to blocks of it
 
 
+@wp.struct
+class Sizes:
+    """Points of each triplane; texels and blocks of channels of a plane."""
+
+    points: int
+    height: int
+    width: int
+    blocks: int
+
+
 ONE, HALF, MINUS = (wp.constant(wp.float64(v)) for v in (1.0, 0.5, -1.0))
 
 
 @wp.func
-def texel_position(point: wp.vec3, plane: int, height: int, width: int) -> wp.vec2d:
+def texel_position(point: wp.vec3, plane: int, sizes: Sizes) -> wp.vec2d:
     """Column and row of ``point`` in texel centres, as far outside as needed: -1 and below has no texel.
 
     In float64: float32 would leave 1.5e-5 of a texel of 300, and a value of that part of what neighbours differ by.
@@ -29,7 +39,9 @@ def texel_position(point: wp.vec3, plane: int, height: int, width: int) -> wp.ve
     if plane == 2:
         a = wp.float64(point[1])
         b = wp.float64(point[2])
-    return wp.vec2d(((a + ONE) * wp.float64(width) - ONE) * HALF, ((b + ONE) * wp.float64(height) - ONE) * HALF)
+    width = wp.float64(sizes.width)
+    height = wp.float64(sizes.height)
+    return wp.vec2d(((a + ONE) * width - ONE) * HALF, ((b + ONE) * height - ONE) * HALF)
 
 
 @wp.func
@@ -39,17 +51,18 @@ def beyond(at: wp.float64, k: int) -> float:
 
 
 @wp.func
-def touches(at: wp.vec2d, height: int, width: int) -> bool:
+def touches(at: wp.vec2d, sizes: Sizes) -> bool:
     """Whether any texel has a weight; False for NaN, so that the conversion to int below is defined."""
-    return at[0] > MINUS and at[0] < wp.float64(width) and at[1] > MINUS and at[1] < wp.float64(height)
+    inside_x = at[0] > MINUS and at[0] < wp.float64(sizes.width)
+    return inside_x and at[1] > MINUS and at[1] < wp.float64(sizes.height)
 
 
 @wp.func
-def texel(planes: wp.array[vec8], base: int, x: int, y: int, height: int, width: int, blocks: int) -> vec8:
+def texel(planes: wp.array[vec8], base: int, x: int, y: int, sizes: Sizes) -> vec8:
     """Block of texel (y, x), zero outside; ``base`` is that of texel (0, 0)."""
-    if x < 0 or x >= width or y < 0 or y >= height:
+    if x < 0 or x >= sizes.width or y < 0 or y >= sizes.height:
         return vec8()
-    return planes[base + (y * width + x) * blocks]
+    return planes[base + (y * sizes.width + x) * sizes.blocks]
 
 
 @wp.kernel
@@ -59,27 +72,27 @@ def sample_kernel(
     planes: wp.array[vec8],
     points: wp.array[wp.vec3],
     order: wp.array[wp.int32],
-    per_batch: int,
-    height: int,
-    width: int,
-    blocks: int,
+    sizes: Sizes,
     split: int,
     # out
     features: wp.array[vec8],
 ):
     """A thread is a plane, a point and every ``split``-th block; points come by ``order`` if that has entries."""
     i = start + wp.tid()
+    height = sizes.height
+    width = sizes.width
+    blocks = sizes.blocks
     first = i % split
     i = i // split
-    slab = i // per_batch  # batch * 3 + plane
+    slab = i // sizes.points  # batch * 3 + plane
     plane = slab % 3
-    point = i % per_batch
+    point = i % sizes.points
     if order.shape[0] > 0:
         point = order[i]
-    point += (slab // 3) * per_batch
-    at = texel_position(points[point], plane, height, width)
+    point += (slab // 3) * sizes.points
+    at = texel_position(points[point], plane, sizes)
     out = (point * 3 + plane) * blocks
-    if touches(at, height, width):
+    if touches(at, sizes):
         x = int(wp.floor(at[0]))
         y = int(wp.floor(at[1]))
         u = beyond(at[0], x)
@@ -102,10 +115,10 @@ def sample_kernel(
         else:
             for q in range(first, blocks, split):
                 features[out + q] = (
-                    texel(planes, base + q, x, y, height, width, blocks) * w00
-                    + texel(planes, base + q, x + 1, y, height, width, blocks) * w01
-                    + texel(planes, base + q, x, y + 1, height, width, blocks) * w10
-                    + texel(planes, base + q, x + 1, y + 1, height, width, blocks) * w11
+                    texel(planes, base + q, x, y, sizes) * w00
+                    + texel(planes, base + q, x + 1, y, sizes) * w01
+                    + texel(planes, base + q, x, y + 1, sizes) * w10
+                    + texel(planes, base + q, x + 1, y + 1, sizes) * w11
                 )
     else:
         for q in range(first, blocks, split):
@@ -113,9 +126,11 @@ def sample_kernel(
 
 
 @wp.func
-def copy_row(planes: wp.array[float], slab: int, y: int, channels: int, height: int, width: int, blocks: int,
-             scratch: wp.array[vec8], to: int):  # fmt: skip
+def copy_row(planes: wp.array[float], slab: int, y: int, channels: int, sizes: Sizes, scratch: wp.array[vec8], to: int):
     """Texel row ``y`` of channel-first planes to ``to``, channel-last with a zero texel at both ends, or all zero."""
+    height = sizes.height
+    width = sizes.width
+    blocks = sizes.blocks
     for q in range(blocks):
         for x in range(width + 2):
             value = vec8()
@@ -135,11 +150,8 @@ def sample_rows_kernel(
     points: wp.array[wp.vec3],
     order: wp.array[wp.int32],
     edges: wp.array[wp.int32],
-    per_batch: int,
+    sizes: Sizes,
     channels: int,
-    height: int,
-    width: int,
-    blocks: int,
     bands: int,
     # scratch
     scratch: wp.array[vec8],
@@ -152,10 +164,13 @@ def sample_rows_kernel(
     cache.  ``order`` and ``edges`` as for :func:`planes_adjoint_kernel`.
     """
     i = start + wp.tid()
+    height = sizes.height
+    width = sizes.width
+    blocks = sizes.blocks
     slab = i // bands
     band = i % bands
     plane = slab % 3
-    offset = (slab // 3) * per_batch
+    offset = (slab // 3) * sizes.points
     stride = (width + 2) * blocks
     held = wp.int32(-2)
     for row in range(band * (height + 1) // bands, (band + 1) * (height + 1) // bands):
@@ -165,12 +180,12 @@ def sample_rows_kernel(
             top = (2 * i + row % 2) * stride
             bottom = (2 * i + (row + 1) % 2) * stride
             if held != row - 1:
-                copy_row(planes, slab, row - 1, channels, height, width, blocks, scratch, top)
-            copy_row(planes, slab, row, channels, height, width, blocks, scratch, bottom)
+                copy_row(planes, slab, row - 1, channels, sizes, scratch, top)
+            copy_row(planes, slab, row, channels, sizes, scratch, bottom)
             held = row
             for k in range(begin, end):
-                point = order[slab * per_batch + k] + offset
-                at = texel_position(points[point], plane, height, width)
+                point = order[slab * sizes.points + k] + offset
+                at = texel_position(points[point], plane, sizes)
                 x = int(wp.floor(at[0]))
                 u = beyond(at[0], x)
                 v = beyond(at[1], row - 1)
@@ -189,8 +204,8 @@ def sample_rows_kernel(
                         + scratch[other + blocks + q] * w11
                     )
     if band == bands - 1:
-        for k in range(edges[slab * (height + 2) + height + 1], per_batch):
-            out = ((order[slab * per_batch + k] + offset) * 3 + plane) * blocks
+        for k in range(edges[slab * (height + 2) + height + 1], sizes.points):
+            out = ((order[slab * sizes.points + k] + offset) * 3 + plane) * blocks
             for q in range(blocks):
                 features[out + q] = vec8()
 
@@ -202,32 +217,32 @@ def points_adjoint_kernel(
     planes: wp.array[vec8],
     points: wp.array[wp.vec3],
     g_features: wp.array[vec8],
-    per_batch: int,
-    height: int,
-    width: int,
-    blocks: int,
+    sizes: Sizes,
     # out
     g_points: wp.array[wp.vec3],
 ):
     """Gradient of the features with respect to a point; one-sided, towards +, at a texel centre."""
     point = start + wp.tid()
+    height = sizes.height
+    width = sizes.width
+    blocks = sizes.blocks
     g = wp.vec3()
     for plane in range(3):
-        at = texel_position(points[point], plane, height, width)
-        if touches(at, height, width):
+        at = texel_position(points[point], plane, sizes)
+        if touches(at, sizes):
             x = int(wp.floor(at[0]))
             y = int(wp.floor(at[1]))
             u = beyond(at[0], x)
             v = beyond(at[1], y)
-            base = ((point // per_batch) * 3 + plane) * height * width * blocks
+            base = ((point // sizes.points) * 3 + plane) * height * width * blocks
             across = vec8()
             down = vec8()
             for q in range(blocks):
                 g_out = g_features[(point * 3 + plane) * blocks + q]
-                c00 = texel(planes, base + q, x, y, height, width, blocks)
-                c01 = texel(planes, base + q, x + 1, y, height, width, blocks)
-                c10 = texel(planes, base + q, x, y + 1, height, width, blocks)
-                c11 = texel(planes, base + q, x + 1, y + 1, height, width, blocks)
+                c00 = texel(planes, base + q, x, y, sizes)
+                c01 = texel(planes, base + q, x + 1, y, sizes)
+                c10 = texel(planes, base + q, x, y + 1, sizes)
+                c11 = texel(planes, base + q, x + 1, y + 1, sizes)
                 across += wp.cw_mul(g_out, (c01 - c00) * (1.0 - v) + (c11 - c10) * v)
                 down += wp.cw_mul(g_out, (c10 - c00) * (1.0 - u) + (c11 - c01) * u)
             one = vec8(1.0)
@@ -247,9 +262,7 @@ def cell_key_kernel(
     start: int,
     # in
     points: wp.array[wp.vec3],
-    per_batch: int,
-    height: int,
-    width: int,
+    sizes: Sizes,
     bins: int,
     # out
     keys: wp.array[wp.int32],
@@ -259,22 +272,24 @@ def cell_key_kernel(
     A row has ``bins`` parts; a point that misses the plane has the row ``height + 1``.
     """
     i = start + wp.tid()
+    height = sizes.height
+    width = sizes.width
     point = i // 3
     plane = i % 3
-    at = texel_position(points[point], plane, height, width)
+    at = texel_position(points[point], plane, sizes)
     key = (height + 1) * bins
-    if touches(at, height, width):
+    if touches(at, sizes):
         key = (int(wp.floor(at[1])) + 1) * bins
         key += wp.min(int(wp.float32(at[0] + ONE) * float(bins) / float(width + 1)), bins - 1)
-    batch = point // per_batch
-    keys[(batch * 3 + plane) * per_batch + point % per_batch] = key
+    batch = point // sizes.points
+    keys[(batch * 3 + plane) * sizes.points + point % sizes.points] = key
 
 
 @wp.func
-def add_texel(g_planes: wp.array[vec8], base: int, x: int, y: int, height: int, width: int, blocks: int, value: vec8):
+def add_texel(g_planes: wp.array[vec8], base: int, x: int, y: int, sizes: Sizes, value: vec8):
     """Plain addition: the caller owns the rows of the texel."""
-    if x >= 0 and x < width and y >= 0 and y < height:
-        at = base + (y * width + x) * blocks
+    if x >= 0 and x < sizes.width and y >= 0 and y < sizes.height:
+        at = base + (y * sizes.width + x) * sizes.blocks
         g_planes[at] = g_planes[at] + value
 
 
@@ -286,12 +301,9 @@ def planes_adjoint_kernel(
     g_features: wp.array[vec8],
     order: wp.array[wp.int32],
     edges: wp.array[wp.int32],
+    sizes: Sizes,
     parity: int,
     split: int,
-    per_batch: int,
-    height: int,
-    width: int,
-    blocks: int,
     # out
     g_planes: wp.array[vec8],
 ):
@@ -301,6 +313,9 @@ def planes_adjoint_kernel(
     of every plane by row of cells, ``edges (P, height + 2)`` where each begins.
     """
     i = start + wp.tid()
+    height = sizes.height
+    width = sizes.width
+    blocks = sizes.blocks
     first = i % split
     i = i // split
     rows = (height + 2 - parity) // 2
@@ -310,8 +325,8 @@ def planes_adjoint_kernel(
     y = row - 1
     base = slab * height * width * blocks
     for k in range(edges[slab * (height + 2) + row], edges[slab * (height + 2) + row + 1]):
-        point = (slab // 3) * per_batch + order[slab * per_batch + k]
-        at = texel_position(points[point], plane, height, width)
+        point = (slab // 3) * sizes.points + order[slab * sizes.points + k]
+        at = texel_position(points[point], plane, sizes)
         x = int(wp.floor(at[0]))
         u = beyond(at[0], x)
         v = beyond(at[1], y)
@@ -330,7 +345,7 @@ def planes_adjoint_kernel(
         else:
             for q in range(first, blocks, split):
                 g = g_features[source + q]
-                add_texel(g_planes, base + q, x, y, height, width, blocks, g * ((1.0 - u) * (1.0 - v)))
-                add_texel(g_planes, base + q, x + 1, y, height, width, blocks, g * (u * (1.0 - v)))
-                add_texel(g_planes, base + q, x, y + 1, height, width, blocks, g * ((1.0 - u) * v))
-                add_texel(g_planes, base + q, x + 1, y + 1, height, width, blocks, g * (u * v))
+                add_texel(g_planes, base + q, x, y, sizes, g * ((1.0 - u) * (1.0 - v)))
+                add_texel(g_planes, base + q, x + 1, y, sizes, g * (u * (1.0 - v)))
+                add_texel(g_planes, base + q, x, y + 1, sizes, g * ((1.0 - u) * v))
+                add_texel(g_planes, base + q, x + 1, y + 1, sizes, g * (u * v))

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from reli3d.geometry.camera import Camera, image_plane
 from reli3d.geometry.projection import fuse_views, gather_views, summarize_views
 from reli3d.nn.blocks import in_rows, linear_of
 from reli3d.nn.field import Field, PointMaterial, bound_level
@@ -26,7 +27,6 @@ from reli3d.nn.presets import LocalPreset
 from reli3d.nn.pyramid import ImagePyramid, place_of_pixels, span_of_pixels
 from reli3d.nn.view_features import AHEAD, ViewFeatures, ViewMaps, ahead_of_surface
 from reli3d.nn.volume import HULL_SCALE, FeatureVolume
-from reli3d.render.camera import Camera, image_plane
 from reli3d.render.color import srgb_to_linear
 from reli3d.render.environment import Environment
 
@@ -133,7 +133,7 @@ class LocalReconstructor(nn.Module):
         shape = torch.cat([pixels.depth, pixels.normal], -1).permute(0, 3, 1, 2)
         shape = functional.avg_pool2d(shape, camera.height // features.shape[1]).permute(0, 2, 3, 1)
         tokens = torch.cat([features, shape], -1).contiguous()
-        maps = ViewMaps(tokens, detail, c2w, detail_intrinsics)
+        maps = ViewMaps(tokens, detail, Camera(c2w, detail_intrinsics, *detail.shape[2:0:-1]))
         surface = torch.cat([pixels.depth * mask, mask], -1)
         volume = self.volume(maps, surface)
         log_light = self._light(pixels, color, mask[..., 0], camera)
@@ -147,7 +147,8 @@ class LocalReconstructor(nn.Module):
         """
         camera = Camera(c2w, intrinsics, *images.shape[2:0:-1])
         quarter = functional.avg_pool2d(masks[:, None], QUARTER)[:, 0]
-        span = span_of_pixels(detail[..., 3], detail_intrinsics, quarter, camera.resized(*quarter.shape[:0:-1]))
+        outlined = Camera(c2w, detail_intrinsics, *detail.shape[2:0:-1])
+        span = span_of_pixels(detail[..., 3], outlined, quarter, camera.resized(*quarter.shape[:0:-1]))
         features, raw = self.pyramid(images, masks, place_of_pixels(camera), span)
         coarse = camera.resized(*raw.shape[2:0:-1])
         return features, PixelMaps.of(raw, span, coarse), coarse
@@ -195,7 +196,7 @@ class LocalField(Field):
     def _offset(self) -> float:
         """Moves the surface outward."""
         many, one = self.model.preset.offset_many_views, self.model.preset.offset_one_view
-        return many + (one - many) / len(self.maps.c2w)
+        return many + (one - many) / len(self.maps.images)
 
     def level(self, points: Tensor) -> Tensor:
         """Level ``(N,)``: negative inside, zero on the surface, in units of ``softness``."""
@@ -206,7 +207,7 @@ class LocalField(Field):
         hull = -self.bound(points) * model.preset.softness
         of_views, _ = model.view_features(self.maps, points, visible, normal)
         of_space = model.volume.sample(self.volume, points)
-        rest = [(hull / HULL_SCALE).clamp(-2, 2), torch.full_like(hull, 1.0 / len(self.maps.c2w))]
+        rest = [(hull / HULL_SCALE).clamp(-2, 2), torch.full_like(hull, 1.0 / len(self.maps.images))]
         ahead = ahead_of_surface(self.surface, self.maps, points)
         return torch.cat([of_space, of_views, torch.stack(rest, -1), ahead], -1)
 
@@ -214,13 +215,10 @@ class LocalField(Field):
         """The views' predictions at surface points: ``position``, ``normal`` ``(N, 3)``, ``visible (N, V)``."""
         maps = self.maps
         if not torch.is_grad_enabled():
-            return Fused(
-                *fuse_views(maps.images, self.pixels.packed, maps.c2w, maps.intrinsics, position, visible, normal)
-            )
+            return Fused(*fuse_views(maps.images, self.pixels.packed, maps.camera, position, visible, normal))
         pixels = self.pixels.stacked()
-        scale = pixels.shape[1] / maps.images.shape[1]
-        got, _ = gather_views(pixels, position, maps.c2w, maps.intrinsics * scale)
-        shown, share, summary = summarize_views(maps.images, maps.c2w, maps.intrinsics, position, visible, normal)
+        got, _ = gather_views(pixels, position, maps.camera)
+        shown, share, summary = summarize_views(maps.images, maps.camera, position, visible, normal)
         gain, shift, confidence, rough, metal, bent = got.split([1, 3, 1, 1, 1, 3], -1)
         weight = (SHARPNESS * share.log() + confidence[..., 0]).softmax(-1)[..., None]
         each = gain * color_logit(shown[..., :3]) + shift
@@ -236,9 +234,7 @@ class LocalField(Field):
         """The field that knows the light on its surface, from some thousand points all over it; no gradient."""
         with torch.no_grad():
             color = self.fused(position, normal, visible).logit.sigmoid()
-            _, _, summary = summarize_views(
-                self.maps.images, self.maps.c2w, self.maps.intrinsics, position, visible, normal
-            )
+            _, _, summary = summarize_views(self.maps.images, self.maps.camera, position, visible, normal)
             shown, seen = summary[:, :3], visible.amax(1)
             observed = brightness_over_normal(srgb_to_linear(shown), seen, normal)
             plain = unshaded(shown, brightness_at(normal, observed))

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from reli3d.geometry.camera import Camera, image_plane
 from reli3d.geometry.hull import hull_span
 from reli3d.nn.presets import PyramidSizes
-from reli3d.render.camera import Camera, image_plane
 
 INPUTS = 9  # colour times mask, mask, place in the world, where the ray enters and leaves the hull, 1 / views
 PREDICTED = 12  # see PixelMaps, which reads 11: the last is a weight of trained networks, without a meaning
@@ -44,10 +44,10 @@ def place_of_pixels(camera: Camera) -> Tensor:
     return torch.stack([x * depth, y * depth], -1) - origin
 
 
-def span_of_pixels(silhouette: Tensor, intrinsics: Tensor, seen: Tensor, camera: Camera) -> Tensor:
+def span_of_pixels(silhouette: Tensor, outlined: Camera, seen: Tensor, camera: Camera) -> Tensor:
     """Depths, from the world's origin, ``(V, Q, Q, 2)`` at which pixels' rays enter and leave the silhouettes' hull.
 
-    silhouette: ``(V, D, D)`` signed distance in pixels, with its ``intrinsics (V, 4)``.  seen: ``(V, Q, Q)`` coverage
+    silhouette: ``(V, D, D)`` signed distance in pixels of the cameras ``outlined``.  seen: ``(V, Q, Q)`` coverage
     of the pixels of ``camera``: those above SEEN are asked, the others get 0.
     """
     c2w = camera.c2w
@@ -56,7 +56,7 @@ def span_of_pixels(silhouette: Tensor, intrinsics: Tensor, seen: Tensor, camera:
     local = torch.stack([right, up, -torch.ones_like(right)], -1)
     directions = (c2w[v, :3, :3] @ local[..., None])[..., 0]  # of depth 1
     depth = (c2w[:, :3, 3] * c2w[:, :3, 2]).sum(-1)  # of the origin
-    span = hull_span(c2w[v, :3, 3].contiguous(), directions, REACH, silhouette, c2w, intrinsics) - depth[v, None]
+    span = hull_span(c2w[v, :3, 3].contiguous(), directions, REACH, silhouette, outlined) - depth[v, None]
     return span.new_zeros(*seen.shape, 2).index_put((v, y, x), span)
 
 

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import linear
 
+from reli3d.geometry.camera import Camera
 from reli3d.geometry.projection import OWN, gather_views, pool_views, summarize_views
 from reli3d.nn.blocks import linear_of
 
@@ -26,8 +27,7 @@ class ViewMaps:
 
     tokens: Tensor
     images: Tensor
-    c2w: Tensor
-    intrinsics: Tensor  # in pixels of ``images``
+    camera: Camera  # of ``images``
 
 
 AHEAD = 4  # numbers of ahead_of_surface
@@ -42,15 +42,15 @@ def ahead_of_surface(surface: Tensor, maps: ViewMaps, points: Tensor) -> Tensor:
     saturates at NEAR, its mean at FAR, and the share of these views.  Before a surface that a view shows there is
     nothing; far behind it a view tells nothing.  Gradients reach the surface.
     """
-    scale = surface.shape[1] / maps.images.shape[1]
-    got, pixel = gather_views(surface, points, maps.c2w, maps.intrinsics * scale)
+    got, pixel = gather_views(surface, points, maps.camera)
     covered = got[..., 1].clamp(min=0.1)
-    origin = (maps.c2w[:, :3, 3] * maps.c2w[:, :3, 2]).sum(-1)
+    c2w = maps.camera.c2w
+    origin = (c2w[:, :3, 3] * c2w[:, :3, 2]).sum(-1)
     ahead = got[..., 0] / covered - (pixel[..., 2] - origin)
     shown = (got[..., 1] > 0.5).to(ahead)
     near, far = (ahead / NEAR).tanh() * shown, (ahead / FAR).tanh() * shown
     share = shown.mean(1)
-    few = share.clamp(min=0.5 / len(maps.c2w))
+    few = share.clamp(min=0.5 / len(c2w))
     greatest = (near - 2.0 * (1.0 - shown)).amax(1).clamp(min=-1.0)
     return torch.stack([greatest, near.mean(1) / few, far.mean(1) / few, share], -1)
 
@@ -74,20 +74,11 @@ class ViewFeatures(nn.Module):
         tokens, channels = self.tokens(maps.tokens), self.tokens.out_features
         of_tokens, of_own = first.weight[:, :channels], first.weight[:, channels:]
         if torch.is_grad_enabled():
-            scale = maps.tokens.shape[1] / maps.images.shape[1]
-            gathered, _ = gather_views(tokens, points, maps.c2w, maps.intrinsics * scale)
-            numbers, weight, summary = summarize_views(maps.images, maps.c2w, maps.intrinsics, points, visible, normal)
+            gathered, _ = gather_views(tokens, points, maps.camera)
+            numbers, weight, summary = summarize_views(maps.images, maps.camera, points, visible, normal)
             hidden = linear(gathered, of_tokens) + linear(numbers, of_own, first.bias)
             pooled = (weight[:, None] @ activation(hidden))[:, 0]
         else:  # bilinear weights sum to 1: the layer and its bias may come before the look-up
-            pooled, summary = pool_views(
-                maps.images,
-                linear(tokens, of_tokens, first.bias),
-                of_own.T,
-                maps.c2w,
-                maps.intrinsics,
-                points,
-                visible,
-                normal,
-            )
+            tokens = linear(tokens, of_tokens, first.bias)
+            pooled, summary = pool_views(maps.images, tokens, of_own.T, maps.camera, points, visible, normal)
         return torch.cat([last(pooled), summary], -1), summary[:, :3]  # pooled before the last layer: it is linear

@@ -50,7 +50,7 @@ class FeatureVolume(nn.Module):
         """``(N, N, N, F)``, indexed x, y, z.  surface: as in :func:`~reli3d.nn.view_features.ahead_of_surface`."""
         axis = torch.linspace(-self.radius, self.radius, self.side, device=maps.images.device)
         grid = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
-        hull = hull_distance(grid, maps.images[..., 3].contiguous(), maps.c2w, maps.intrinsics)
+        hull = hull_distance(grid, maps.images[..., 3].contiguous(), maps.camera)
         near = (hull > -NEAR_HULL).nonzero()[:, 0]
         pooled = self._pooled(maps, surface, grid[near], hull[near])
         x = pooled.new_zeros(len(grid), pooled.shape[1]).index_copy(0, near, pooled)
@@ -71,13 +71,12 @@ class FeatureVolume(nn.Module):
         return self.out(x)
 
     def _pooled(self, maps: ViewMaps, surface: Tensor, points: Tensor, hull: Tensor) -> Tensor:
-        scale = maps.tokens.shape[1] / maps.images.shape[1]
-        gathered, _ = gather_views(maps.tokens, points, maps.c2w, maps.intrinsics * scale)
-        numbers, weight, summary = summarize_views(maps.images, maps.c2w, maps.intrinsics, points, None, None)
+        gathered, _ = gather_views(maps.tokens, points, maps.camera)
+        numbers, weight, summary = summarize_views(maps.images, maps.camera, points, None, None)
         mixed = self.mix(torch.cat([gathered, numbers], -1))
         mean = (mixed * weight[..., None]).sum(1)
         spread = ((mixed - mean[:, None]).square() * weight[..., None]).sum(1)
-        rest = torch.stack([(hull / HULL_SCALE).clamp(-2, 2), torch.full_like(hull, 1.0 / len(maps.c2w))], -1)
+        rest = torch.stack([(hull / HULL_SCALE).clamp(-2, 2), torch.full_like(hull, 1.0 / len(maps.images))], -1)
         return self.reduce(torch.cat([mean, spread, summary, rest, ahead_of_surface(surface, maps, points)], -1))
 
     def sample(self, volume: Tensor, points: Tensor) -> Tensor:

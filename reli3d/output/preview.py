@@ -10,10 +10,10 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 from torch.nn.functional import interpolate, normalize
 
+from reli3d.geometry.camera import Camera, look_at
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene
 from reli3d.render.asset import Asset
-from reli3d.render.camera import Camera, look_at
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
 from reli3d.render.lights import studio
@@ -72,8 +72,8 @@ def comparison(before: Asset, after: Asset, views: Views) -> np.ndarray:
     rows = [("input", [_on_paper(i, m) for i, m in zip(batch.images, batch.masks, strict=True)])]
     for title, asset in (("before", before), ("after refinement", after)):
         scene = RayScene(asset.mesh.vertices, asset.mesh.faces)
-        cameras = [Camera(batch.c2w[i], batch.intrinsics[i], TILE, TILE) for i in range(count)]
-        shots = [render(asset, c, options=ShadeOptions(samples=SAMPLES), scene=scene) for c in cameras]
+        options = ShadeOptions(samples=SAMPLES)
+        shots = [render(asset, batch.camera[i], options=options, scene=scene) for i in range(count)]
         rows.append((title, [_lit(s.radiance, s.alpha) for s in shots]))
     return _sheet(rows, count)
 

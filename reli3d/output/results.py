@@ -23,7 +23,6 @@ from reli3d.nn.weights import Manifest
 from reli3d.output.folder import claimed
 from reli3d.output.viewer import viewer_page
 from reli3d.render.asset import Asset
-from reli3d.render.camera import Camera
 from reli3d.render.gbuffer import primary_hits
 from reli3d.views.similarity import Similarity
 from reli3d.views.views import Views
@@ -58,8 +57,7 @@ def mesh_statistics(mesh: Mesh) -> dict:
 def mask_iou(mesh: Mesh, views: Views) -> float:
     """Mean intersection over union of the silhouettes of ``mesh`` and the masks of ``views``, in one frame, to 1e-4."""
     batch = views.resampled(SILHOUETTE, crop=True)
-    camera = Camera(batch.c2w, batch.intrinsics, SILHOUETTE, SILHOUETTE)
-    seen = primary_hits(RayScene(mesh.vertices, mesh.faces), camera)[0].face >= 0
+    seen = primary_hits(RayScene(mesh.vertices, mesh.faces), batch.camera)[0].face >= 0
     masks = batch.masks > 0.5
     both, either = ((a.sum((1, 2)).double()) for a in (masks & seen, masks | seen))
     return round(float((both / either.clamp(min=1)).mean()), 4)

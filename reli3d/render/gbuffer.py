@@ -8,12 +8,12 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from reli3d._bridge import call, check, present
+from reli3d.geometry.camera import Camera, camera_rays
 from reli3d.geometry.hits import hit_normals, interpolate
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import Hits, RayScene
 from reli3d.kernels import attributes as kernels
 from reli3d.render.asset import TextureSet
-from reli3d.render.camera import Camera, camera_rays
 from reli3d.render.color import srgb_to_linear
 from reli3d.render.points import SurfacePoints
 

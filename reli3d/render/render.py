@@ -13,10 +13,10 @@ from PIL import Image
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from reli3d.geometry.camera import Camera, camera_rays
 from reli3d.geometry.rays import RayScene
 from reli3d.render.allocation import SamplePlan, plan_samples, spread_rows
 from reli3d.render.asset import Asset
-from reli3d.render.camera import Camera, camera_rays
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import surface_points

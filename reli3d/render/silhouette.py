@@ -18,10 +18,10 @@ import warp as wp
 from torch import Tensor
 
 from reli3d._bridge import check, launch
+from reli3d.geometry.camera import Camera, project
 from reli3d.geometry.mesh import weld
 from reli3d.geometry.rays import RayScene
 from reli3d.kernels import silhouette as kernels
-from reli3d.render.camera import Camera, project
 
 OUTSIDE = 0.01  # pixels that the visibility ray passes beside the edge, so as not to graze its own faces
 IN_FRONT = 1e-3  # share of the distance by which something must be nearer to hide an edge; spares folds of float32

@@ -15,7 +15,7 @@ import torch
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from reli3d.render.camera import look_at
+from reli3d.geometry.camera import look_at
 from reli3d.synthetic import example, furniture, manmade, organic, vessels
 from reli3d.synthetic.assembly import Assembly
 from reli3d.synthetic.finishes import draw_materials

@@ -28,10 +28,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from reli3d.geometry.camera import Camera, camera_rays, project
 from reli3d.geometry.distance import signed_distance
 from reli3d.geometry.rays import RayScene
 from reli3d.geometry.visibility import visible_from
-from reli3d.render.camera import Camera, camera_rays, project
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
 from reli3d.render.points import SurfacePoints
@@ -131,15 +131,17 @@ def synthesize(
     environment = Environment(torch.roll(light, int(rng.integers(light.shape[1])), 1).contiguous())
     c2w = torch.as_tensor(np.asarray(sample_cameras(rng, views)[0]), dtype=torch.float32)
     intrinsics = torch.stack([crop_camera(surface.vertices, m, size, rng.uniform(0.04, 0.12)) for m in c2w])
+    cameras = Camera(c2w, intrinsics, size, size)
     sample: dict[str, Tensor] = {}
     exposure, images, pixels, pixel_radiance = 0.0, [], [], []
     maps: dict[str, list[Tensor]] = {"view_material": [], "view_normal": [], "view_depth": []}
     for k in range(views):
-        camera = Camera(c2w[k], intrinsics[k] * FINE, size * FINE, size * FINE)
-        image, seen, at, wo, radiance = _render(surface, camera, environment, int(rng.integers(1 << 30)))
+        image, seen, at, wo, radiance = _render(
+            surface, cameras[k].scaled(FINE), environment, int(rng.integers(1 << 30))
+        )
         if k == 0:
             exposure = EXPOSED / max(float(radiance.mean(-1).quantile(0.9)), 1e-3) * float(np.exp(rng.normal(0, 0.25)))
-        alpha = _coverage(surface.scene, c2w[k], intrinsics[k], size)
+        alpha = _coverage(surface.scene, cameras[k])
         image = pooled_pixels((image * exposure).clamp(0, 4), size).clamp(0, 1)  # a sensor saturates, late
         encoded = torch.cat([linear_to_srgb(image), alpha[..., None]], -1)
         images.append((encoded * 255 + 0.5).to(torch.uint8))
@@ -160,7 +162,7 @@ def synthesize(
         (environment.radiance * exposure).permute(2, 0, 1)[None], (32, 64), mode="area"
     )
     sample["environment"] = pooled[0].permute(1, 2, 0).clamp(max=6e4).half()
-    sample.update(_volume(surface, rng), **_surface_points(surface, c2w, intrinsics, size, rng))
+    sample.update(_volume(surface, rng), **_surface_points(surface, cameras, rng))
     return {k: v.contiguous() for k, v in sample.items()}
 
 
@@ -195,10 +197,9 @@ def pooled_pixels(rays: Tensor, size: int) -> Tensor:
     return torch.nn.functional.avg_pool2d(image, FINE)[0].permute(1, 2, 0)
 
 
-def _coverage(scene: RayScene, c2w: Tensor, intrinsics: Tensor, size: int, grid: int = 3) -> Tensor:
+def _coverage(scene: RayScene, camera: Camera, grid: int = 3) -> Tensor:
     """Antialiased alpha ``(S, S)``: share of ``grid**2`` sub-pixel rays that hit."""
-    fine = Camera(c2w, intrinsics * grid, size * grid, size * grid)
-    origins, directions = camera_rays(fine)
+    origins, directions = camera_rays(camera.scaled(grid))
     hit = scene.occluded(origins, directions).float()
     return torch.nn.functional.avg_pool2d(hit[None, None], grid)[0, 0]
 
@@ -226,11 +227,9 @@ def _volume(surface: Surface, rng: np.random.Generator) -> dict[str, Tensor]:
     return {"points": points.half(), "distance": surface.distance(points).half()}
 
 
-def _surface_points(
-    surface: Surface, c2w: Tensor, intrinsics: Tensor, size: int, rng: np.random.Generator
-) -> dict[str, Tensor]:
+def _surface_points(surface: Surface, cameras: Camera, rng: np.random.Generator) -> dict[str, Tensor]:
     at = surface.at(*_random_faces(surface, SURFACE_POINTS, rng))
-    visible = visible_from(surface.scene, at["position"], at["ng"], c2w, intrinsics, size)
+    visible = visible_from(surface.scene, at["position"], at["ng"], cameras)
     encoded = torch.cat(
         [linear_to_srgb(at["base_color"].clamp(0, 1)), at["roughness"][:, None], at["metallic"][:, None]], -1
     )

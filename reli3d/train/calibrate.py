@@ -17,11 +17,11 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
+from reli3d.geometry.camera import Camera, camera_rays
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene
 from reli3d.nn.presets import LocalPreset
 from reli3d.pipeline import Network, NoSurface, encode, extract, prepare
-from reli3d.render.camera import Camera, camera_rays
 from reli3d.train.pictures import sample_views
 from reli3d.views.similarity import Similarity
 

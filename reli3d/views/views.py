@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate, pad
 
 from reli3d._bridge import check
+from reli3d.geometry.camera import Camera
 from reli3d.views.similarity import Similarity
 
 MASK_EDGE = 0.1  # alpha from which a pixel counts into the bounding box: keeps hair and thin wires, drops codec noise
@@ -31,6 +32,11 @@ class ViewBatch:
 
     def __len__(self) -> int:
         return self.images.shape[0]
+
+    @property
+    def camera(self) -> Camera:
+        """The cameras of all views."""
+        return Camera(self.c2w, self.intrinsics, *self.images.shape[2:0:-1])
 
     def to(self, device: torch.device | str) -> ViewBatch:
         """The same batch with its tensors on ``device``."""

@@ -9,10 +9,10 @@ import torch
 
 from reli3d.cli import infer
 from reli3d.cli.helping import joined
+from reli3d.geometry.camera import Camera
 from reli3d.io.glb import read_glb
 from reli3d.io.hdr import read_environment
 from reli3d.output import results
-from reli3d.render.camera import Camera
 from reli3d.render.color import srgb_to_linear
 from reli3d.render.environment import Environment
 from reli3d.render.render import render

@@ -13,11 +13,11 @@ import torch
 from PIL import Image
 
 from reli3d.cli.render import main
+from reli3d.geometry.camera import Camera, camera_rays, look_at
 from reli3d.geometry.mesh import Mesh
 from reli3d.io.glb import read_glb, write_glb
 from reli3d.io.hdr import read_environment, read_hdr_image, write_environment
 from reli3d.render.asset import Asset
-from reli3d.render.camera import Camera, camera_rays, look_at
 from reli3d.render.color import agx, linear_to_srgb
 from reli3d.render.environment import Environment
 from reli3d.render.render import render

@@ -9,12 +9,12 @@ from torch.nn.functional import grid_sample, max_pool2d
 
 import reli3d
 from reli3d import pipeline
+from reli3d.geometry.camera import Camera, camera_rays, look_at, project
 from reli3d.geometry.cover import DEPTH, REACH, STRIDE, cover_silhouettes
 from reli3d.geometry.hull import hull_distance, mask_distance
 from reli3d.geometry.rays import RayScene
 from reli3d.geometry.surface import extract_surface
 from reli3d.nn.weights import load_model
-from reli3d.render.camera import Camera, camera_rays, look_at, project
 from reli3d.views.folder import load_views
 
 RADIUS = 0.6
@@ -30,7 +30,7 @@ def far_camera(size=128, height=0.9):
     """On +z, 200 units away: its rays are parallel to z but for 0.3 % and ``height`` units high at the origin."""
     c2w = look_at(torch.tensor([0.0, 0.0, 200.0]), torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))
     focal = size * 200.0 / height
-    return c2w[None], torch.tensor([[focal, focal, size / 2, size / 2]])
+    return Camera(c2w[None], torch.tensor([[focal, focal, size / 2, size / 2]]), size, size)
 
 
 def disc(size, radius):
@@ -43,7 +43,7 @@ def test_an_unsure_sheet_becomes_a_surface_as_thick_as_it_is_unsure(device):
     """Level 0.5 + (z / s)^2 has no inside; lowered to (z / s)^2 - DEPTH it has one for |z| < s sqrt(DEPTH)."""
     points, s = grid((41, 41, 41)), 0.4
     level = 0.5 + (points[..., 2] / s).square()
-    args = [v.to(device) for v in (level, torch.full_like(level, FREE), disc(128, 40.0), *far_camera())]
+    args = [v.to(device) for v in (level, torch.full_like(level, FREE), disc(128, 40.0), far_camera())]
     got = cover_silhouettes(*args, radius=RADIUS).cpu()
     radius = points[..., :2].norm(dim=-1)
     inner, outer = radius < (40 - STRIDE) * 0.9 / 128, radius > (40 + 2 * STRIDE) * 0.9 / 128
@@ -60,31 +60,31 @@ def test_an_unsure_sheet_becomes_a_surface_as_thick_as_it_is_unsure(device):
 def test_a_surface_that_covers_its_silhouettes_stays_as_it_is(device):
     points = grid((31, 33, 35))
     level = (points.norm(dim=-1) - 0.4) / 0.02
-    args = [v.to(device) for v in (level, torch.full_like(level, FREE), disc(128, 0.385 * 128 / 0.9), *far_camera())]
+    args = [v.to(device) for v in (level, torch.full_like(level, FREE), disc(128, 0.385 * 128 / 0.9), far_camera())]
     assert torch.equal(cover_silhouettes(*args, radius=RADIUS).cpu(), level)
 
 
 def test_the_bound_holds_and_hopeless_rays_are_left(device):
     points = grid((31, 31, 31))
-    camera = [v.to(device) for v in far_camera()]
+    camera = far_camera().to(device)
     mask = disc(128, 40.0).to(device)
     level = torch.full(points.shape[:3], 0.4).to(device)
-    bound = -hull_distance(points.reshape(-1, 3).to(device), mask, *camera).view_as(level) / 0.02
+    bound = -hull_distance(points.reshape(-1, 3).to(device), mask, camera).view_as(level) / 0.02
     start = torch.maximum(level, bound)
-    got = cover_silhouettes(start, bound, mask, *camera, radius=RADIUS)
+    got = cover_silhouettes(start, bound, mask, camera, radius=RADIUS)
     assert bool((got >= bound).all()) and bool((got <= start).all()) and float(got.min()) <= -DEPTH
     high = torch.full_like(level, REACH + 0.1)
-    assert torch.equal(cover_silhouettes(high, high - 5.0, mask, *camera, radius=RADIUS), high)
+    assert torch.equal(cover_silhouettes(high, high - 5.0, mask, camera, radius=RADIUS), high)
 
 
-def twin(level, bound, distance, c2w, intrinsics):
+def twin(level, bound, distance, cameras):
     """Rays by ``camera_rays``, trilinear and bilinear values by ``grid_sample``, all steps of a ray at once."""
     rows, columns = (k // STRIDE for k in distance.shape[1:])
     step = RADIUS / (max(level.shape) - 1)  # half a cell
     points = grid(level.shape, torch.float64).reshape(-1, 3)
     most = torch.zeros(len(points), dtype=torch.float64)
-    for v in range(len(c2w)):
-        camera = Camera(c2w[v], intrinsics[v] / STRIDE, columns, rows)
+    for v, c2w in enumerate(cameras.c2w):
+        camera = Camera(c2w, cameras.intrinsics[v] / STRIDE, columns, rows)
         o, d = (r.reshape(-1, 3).double() for r in camera_rays(camera))
         ends = torch.stack([(-RADIUS - o) / d, (RADIUS - o) / d])
         near, far = ends.amin(0).amax(1).clamp(min=0.0), ends.amax(0).amin(1)
@@ -100,7 +100,7 @@ def twin(level, bound, distance, c2w, intrinsics):
         lacks = torch.where((inside > 1.0) & (least < REACH), (least + DEPTH).clamp(min=0.0), 0.0).view(
             1, 1, rows, columns
         )
-        pixel, _ = project(points.float(), c2w[v], intrinsics[v])
+        pixel, _ = project(points.float(), c2w, cameras.intrinsics[v])
         place = pixel.double() / STRIDE * 2 / torch.tensor([columns, rows]) - 1
         value = grid_sample(
             max_pool2d(lacks, 3, 1, 1), place[None, :, None], align_corners=False, padding_mode="border"
@@ -117,12 +117,12 @@ def test_equals_its_twin_on_a_rough_field(device):
     bound = level - 2.0 * torch.rand(level.shape, generator=g)
     eyes = torch.tensor([[1.5, 0.4, 1.0], [-1.2, 0.3, 1.4], [0.3, -1.5, 0.8]])
     c2w = torch.stack([look_at(e, torch.zeros(3), torch.tensor([0.0, 1.0, 0.0])) for e in eyes])
-    intrinsics = torch.tensor([[70.0, 75.0, 31.0, 33.0]]).expand(3, 4).contiguous()
+    camera = Camera(c2w, torch.tensor([[70.0, 75.0, 31.0, 33.0]]).expand(3, 4).contiguous(), 64, 64)
     masks = (torch.rand(3, 8, 8, generator=g) > 0.3).float().repeat_interleave(8, 1).repeat_interleave(8, 2)
     distance = mask_distance(masks)
-    args = [v.to(device) for v in (level, bound, distance, c2w, intrinsics)]
+    args = [v.to(device) for v in (level, bound, distance, camera)]
     got = cover_silhouettes(*args, radius=RADIUS).cpu()
-    want = twin(level.double(), bound.double(), distance.double(), c2w, intrinsics)
+    want = twin(level.double(), bound.double(), distance.double(), camera)
     assert float((want != level).double().mean()) > 0.2
     # float32 has rays enter the cube 1e-5 of a step aside; one whose least level is REACH falls to either side
     assert float(((got - want).abs() < 2e-4).double().mean()) > 0.999
@@ -132,13 +132,8 @@ def seen_share(model, views):
     """Share of the pixels inside the silhouettes whose rays meet the mesh; and of the mesh's that lie inside."""
     field = pipeline.encode(model, pipeline.prepare(model, views, pipeline.normalize(views, "auto")))
     mesh, maps = pipeline.extract(field, model.preset.resolution), field.maps
-    scene, size = RayScene(mesh.vertices, mesh.faces), maps.images.shape[1]
-    hit = torch.stack(
-        [
-            scene.closest(*camera_rays(Camera(c, k, size, size))).face >= 0
-            for c, k in zip(maps.c2w, maps.intrinsics, strict=True)
-        ]
-    )
+    scene = RayScene(mesh.vertices, mesh.faces)
+    hit = torch.stack([scene.closest(*camera_rays(camera)).face >= 0 for camera in maps.camera])
     inside = maps.images[..., 3] > 0
     return float((hit & inside).sum() / inside.sum()), float((hit & inside).sum() / hit.sum())
 
@@ -157,18 +152,19 @@ def test_the_mesh_shows_what_the_photographs_show(count, least, monkeypatch):
 
 def test_without_views_the_level_comes_back(device):
     level = grid((5, 6, 7)).sum(-1).to(device)
-    none = torch.zeros(0, 16, 16, device=device), torch.zeros(0, 4, 4, device=device), torch.zeros(0, 4, device=device)
+    none = torch.zeros(0, 16, 16, device=device), Camera(torch.zeros(0, 4, 4), torch.zeros(0, 4), 16, 16).to(device)
     assert torch.equal(cover_silhouettes(level, level - 1.0, *none, radius=RADIUS), level)
 
 
 def test_bad_input_is_named():
-    level, (c2w, intrinsics) = torch.zeros(4, 4, 4), far_camera()
-    good = {"level": level, "bound": level, "distance": disc(32, 9.0), "c2w": c2w, "intrinsics": intrinsics}
+    level, camera = torch.zeros(4, 4, 4), far_camera(32)
+    good = {"level": level, "bound": level, "distance": disc(32, 9.0), "camera": camera}
     for change, message in (
         ({"level": torch.zeros(4, 4)}, r"level: expected shape \(X, Y, Z\)"),
         ({"bound": torch.zeros(4, 4, 5)}, r"bound: expected shape \(4, 4, 4\)"),
         ({"distance": torch.zeros(1, 4, 40)}, r"distance: expected shape \(V, H, W\)"),
-        ({"c2w": c2w[0]}, "c2w, intrinsics: expected 1 cameras"),
+        ({"camera": camera[0]}, "camera: expected 1 views"),
+        ({"camera": far_camera(30)}, "camera: expected 32 by 32 pixels, got 30 by 30"),
     ):
         with pytest.raises(ValueError, match=message):
             cover_silhouettes(**{**good, **change}, radius=1.0)

@@ -8,6 +8,7 @@ import torch
 from torch.nn.functional import normalize
 
 from reli3d.geometry.bake import Texels, interpolate, interpolate_tangents
+from reli3d.geometry.camera import Camera
 from reli3d.geometry.hull import hull_distance
 from reli3d.geometry.mesh import Mesh, vertex_normals
 from reli3d.geometry.regularize import vertex_deviation
@@ -276,7 +277,7 @@ def test_distance_to_the_hull_of_points_anywhere(device):
     points[kind == 1, 2] = c2w[1, 2, 3]  # in the plane of one
     points[kind == 2] = wild((int((kind == 2).sum()), 3), g).clamp(-1e30, 1e30)  # the distance itself must fit
     points[kind == 3, 1], points[kind == 4, 0] = math.nan, math.inf
-    got = hull_distance(points.to(device), *(v.to(device) for v in (distance, c2w, k))).cpu()
+    got = hull_distance(points.to(device), distance.to(device), Camera(c2w, k, 24, 16).to(device)).cpu()
     assert finite(got)
     away = points[:, None].double() - c2w[:, :3, 3].double()
     depth = -away[..., 2]

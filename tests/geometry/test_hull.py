@@ -9,6 +9,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from reli3d import pipeline
+from reli3d.geometry.camera import Camera
 from reli3d.geometry.hull import hull_distance, hull_span, mask_distance
 from reli3d.nn.field import bound_level
 from reli3d.nn.local import LocalField
@@ -96,7 +97,7 @@ def sphere_views(device, n=8, distance=3.0, radius=0.5, size=256, focal=300.0):
     outline = focal * math.tan(math.asin(radius / distance))
     mask, _ = disc(size, (size / 2, size / 2), outline)
     intrinsics = torch.tensor([focal, focal, size / 2, size / 2]).expand(n, 4)
-    return mask.expand(n, size, size).to(device), torch.stack(c2w).float().to(device), intrinsics.to(device)
+    return mask.expand(n, size, size).to(device), Camera(torch.stack(c2w).float(), intrinsics, size, size).to(device)
 
 
 def cone_distance(points, c2w, distance=3.0, radius=0.5):
@@ -111,10 +112,10 @@ def cone_distance(points, c2w, distance=3.0, radius=0.5):
 
 
 def test_sphere_seen_by_eight_cameras(device):
-    masks, c2w, intrinsics = sphere_views(device)
+    masks, camera = sphere_views(device)
     points = (torch.rand(4000, 3, generator=torch.Generator().manual_seed(1)) * 1.4 - 0.7).to(device)
-    got = hull_distance(points, mask_distance(masks), c2w, intrinsics).cpu()
-    true = cone_distance(points.cpu(), c2w.cpu())
+    got = hull_distance(points, mask_distance(masks), camera).cpu()
+    true = cone_distance(points.cpu(), camera.c2w.cpu())
     # a pixel at depth 3 is 0.01 wide, its contour 0.1 px off; the slant of the rays stretches by up to 6 % off the axis
     near = true.abs() < 0.05
     assert near.sum() > 200
@@ -125,16 +126,16 @@ def test_sphere_seen_by_eight_cameras(device):
 
 def test_rays_enter_and_leave_the_cones_of_sight(device):
     """Against the cones in float64, looked at every 0.001 along the ray."""
-    masks, c2w, intrinsics = sphere_views(device)
+    masks, camera = sphere_views(device)
     draw = torch.Generator().manual_seed(3)
     origins = torch.nn.functional.normalize(torch.randn(300, 3, generator=draw), dim=-1) * 2.5
     target = (torch.rand(300, 3, generator=draw) - 0.5) * 1.2
     directions = (target - origins) * (0.3 + torch.rand(300, 1, generator=draw))  # of any length
-    got = hull_span(origins.to(device), directions.to(device), 0.87, mask_distance(masks), c2w, intrinsics).cpu()
+    got = hull_span(origins.to(device), directions.to(device), 0.87, mask_distance(masks), camera).cpu()
     length = directions.norm(dim=-1)
     t = torch.linspace(1.5, 3.5, 2001, dtype=torch.float64) / length[:, None]
     along = origins[:, None] + directions[:, None] * t[..., None]
-    true = cone_distance(along.reshape(-1, 3), c2w.cpu()).reshape(300, -1)
+    true = cone_distance(along.reshape(-1, 3), camera.c2w.cpu()).reshape(300, -1)
     true[along.norm(dim=-1) > 0.87] = -1.0
     hit = true.max(1).values > 0.02  # a ray that grazes the hull may miss it
     missed = true.max(1).values < -0.01
@@ -150,12 +151,12 @@ def test_rays_enter_and_leave_the_cones_of_sight(device):
 
 
 def test_behind_a_camera_is_far_outside_and_no_view_bounds_nothing(device):
-    masks, c2w, intrinsics = sphere_views(device, n=1)
-    behind = c2w[:, :3, 3] + c2w[:, :3, 2]
-    assert hull_distance(behind, mask_distance(masks), c2w, intrinsics).item() == -1000.0
+    masks, camera = sphere_views(device, n=1)
+    behind = camera.position + camera.c2w[:, :3, 2]
+    assert hull_distance(behind, mask_distance(masks), camera).item() == -1000.0
     nan = torch.full((1, 3), math.nan, device=device)
-    assert hull_distance(nan, mask_distance(masks), c2w, intrinsics).item() == -1000.0
-    empty = hull_distance(behind, masks[:0], c2w[:0], intrinsics[:0])
+    assert hull_distance(nan, mask_distance(masks), camera).item() == -1000.0
+    empty = hull_distance(behind, masks[:0], camera[:0])
     assert empty.item() == 1000.0
 
 
@@ -166,7 +167,7 @@ def test_object_cut_by_the_border_is_unbounded_only_there(device):
     c2w = torch.eye(4)[None].to(device)
     intrinsics = torch.tensor([[64.0, 64.0, 32.0, 32.0]], device=device)
     points = torch.tensor([[5.0, 0.0, -2.0], [-5.0, 0.0, -2.0], [0.0, 5.0, -2.0]], device=device)
-    got = hull_distance(points, mask_distance(mask[None].to(device)), c2w, intrinsics)
+    got = hull_distance(points, mask_distance(mask[None].to(device)), Camera(c2w, intrinsics, 64, 64))
     assert [bool(v > 0) for v in got] == [True, False, False]
 
 
@@ -176,13 +177,15 @@ def test_object_cut_by_the_border_is_unbounded_only_there(device):
         (dict(points=torch.zeros(3)), ValueError),
         (dict(points=torch.zeros(4, 3, dtype=torch.float64)), TypeError),
         (dict(distance=torch.zeros(8, 1, 5)), ValueError),
-        (dict(c2w=torch.zeros(7, 4, 4)), ValueError),
-        (dict(intrinsics=torch.zeros(8, 3)), ValueError),
+        (dict(camera=Camera(torch.zeros(7, 4, 4), torch.zeros(7, 4), 16, 16)), ValueError),
+        (dict(camera=Camera(torch.zeros(4, 4), torch.zeros(4), 16, 16)), ValueError),
+        (dict(camera=Camera(torch.zeros(8, 4, 4), torch.zeros(8, 4), 16, 15)), ValueError),
+        (dict(camera=torch.zeros(8, 4, 4)), TypeError),
     ],
 )
 def test_wrong_input_is_named(change, error):
-    masks, c2w, intrinsics = sphere_views("cpu", size=16)
-    inputs = dict(points=torch.zeros(4, 3), distance=mask_distance(masks), c2w=c2w, intrinsics=intrinsics) | change
+    masks, camera = sphere_views("cpu", size=16)
+    inputs = dict(points=torch.zeros(4, 3), distance=mask_distance(masks), camera=camera) | change
     with pytest.raises(error, match=next(iter(change))):
         hull_distance(**inputs)
 
@@ -194,21 +197,21 @@ def test_wrong_mask_is_named(mask):
 
 
 def test_result_does_not_depend_on_the_number_of_threads(threads):
-    masks, c2w, intrinsics = sphere_views("cpu", size=64)
+    masks, camera = sphere_views("cpu", size=64)
     points = torch.rand(6000, 3, generator=torch.Generator().manual_seed(2)) - 0.5
     results = []
     for count in (1, 2, 5):
         threads(count)
-        results.append(hull_distance(points, mask_distance(masks), c2w, intrinsics))
+        results.append(hull_distance(points, mask_distance(masks), camera))
     assert all(torch.equal(results[0], other) for other in results[1:])
 
 
 @pytest.mark.parametrize("radius, views", [(0.5, 8), (0.06, 3), (0.3, 1)])
 def test_the_coarse_look_finds_the_reach_of_the_dense_one(device, radius, views):
     """Also of a ball thinner than a coarse cell (0.087), and of one view's cone that runs to the end of the grid."""
-    masks, c2w, intrinsics = sphere_views(device, n=views, radius=radius)
+    masks, camera = sphere_views(device, n=views, radius=radius)
     images = torch.cat([torch.zeros(*masks.shape, 3, device=device), mask_distance(masks)[..., None]], -1)
-    maps = ViewMaps(images.new_empty(views, 1, 1, 1), images, c2w, intrinsics)
+    maps = ViewMaps(images.new_empty(views, 1, 1, 1), images, camera)
     model = SimpleNamespace(preset=SMALL)
     grid = pipeline._grid(80, SMALL.radius, device).reshape(-1, 3)
     dense = float(grid[bound_level(maps, grid, SMALL.softness) < 0].abs().max())

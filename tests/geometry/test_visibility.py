@@ -5,37 +5,39 @@ import torch
 import trimesh
 from torch.nn.functional import normalize
 
+from reli3d.geometry.camera import Camera, look_at
 from reli3d.geometry.rays import RayScene
 from reli3d.geometry.visibility import GRAZING, visible_from
-from reli3d.render.camera import look_at
 
 SIZE, FOCAL = 64, 90.0
 
 
-def rig(device):
+def rig(device, width=SIZE, height=SIZE):
     eyes = torch.tensor([[0.0, 0.0, 3.0], [2.5, 1.0, 0.0], [0.0, 3.0, 0.5]])
     c2w = torch.stack([look_at(e, torch.zeros(3), torch.tensor([0.1, 1.0, 0.0])) for e in eyes])
-    return c2w.to(device), torch.tensor([FOCAL, FOCAL, SIZE / 2, SIZE / 2]).expand(3, 4).contiguous().to(device)
+    intrinsics = torch.tensor([FOCAL, FOCAL, SIZE / 2, SIZE / 2]).expand(3, 4).contiguous()
+    return Camera(c2w, intrinsics, width, height).to(device)
 
 
 def points(device, n=3000):
     return normalize(torch.randn(n, 3, generator=torch.Generator().manual_seed(0)), dim=-1).to(device)
 
 
-def closed_form(p, n, c2w, intrinsics, size):
+def closed_form(p, n, camera):
     """Facing and in the image; on a convex body nothing else stands between.  Also how near a point is to changing."""
+    c2w = camera.c2w
     away = c2w[None, :, :3, 3].double() - p[:, None].double()
     cosine = (normalize(away, dim=-1) * n[:, None].double()).sum(-1)
     local = torch.einsum("nvk,vkj->nvj", -away, c2w[:, :3, :3].double())
-    k = intrinsics.double()
+    k = camera.intrinsics.double()
     x, y = k[:, 2] - k[:, 0] * local[..., 0] / local[..., 2], k[:, 3] + k[:, 1] * local[..., 1] / local[..., 2]
-    inside = (x > 0) & (x < size) & (y > 0) & (y < size) & (local[..., 2] < 0)
-    near = torch.stack([x, y, size - x, size - y]).abs().amin(0)
+    inside = (x > 0) & (x < camera.width) & (y > 0) & (y < camera.height) & (local[..., 2] < 0)
+    near = torch.stack([x, y, camera.width - x, camera.height - y]).abs().amin(0)
     return (cosine > GRAZING) & inside, ((cosine - GRAZING).abs() < 0.03) | (near < 1e-3)
 
 
 @pytest.mark.parametrize("backend", ["embree", "warp"])
-@pytest.mark.parametrize("size", [SIZE, SIZE // 2])
+@pytest.mark.parametrize("size", [(SIZE, SIZE), (SIZE // 2, SIZE // 2), (SIZE, SIZE // 2)])
 def test_a_ball_is_seen_where_it_faces_the_camera_and_lies_in_the_image(device, backend, size):
     if backend == "embree" and device.type != "cpu":
         pytest.skip("Embree runs on the CPU")
@@ -46,10 +48,9 @@ def test_a_ball_is_seen_where_it_faces_the_camera_and_lies_in_the_image(device, 
         torch.tensor(ball.faces, dtype=torch.int32, device=device),
         backend,
     )
-    c2w, intrinsics = rig(device)
-    p = points(device)
-    got = visible_from(scene, p * 1.001, p, c2w, intrinsics, size)
-    want, unsure = closed_form(p * 1.001, p, c2w, intrinsics, size)
+    camera, p = rig(device, *size), points(device)
+    got = visible_from(scene, p * 1.001, p, camera)
+    want, unsure = closed_form(p * 1.001, p, camera)
     assert got.dtype == torch.bool and got.shape == want.shape
     assert torch.equal(got[~unsure], want[~unsure])
     assert unsure.float().mean() < 0.05 and 0.05 < want.float().mean() < 0.6
@@ -57,22 +58,22 @@ def test_a_ball_is_seen_where_it_faces_the_camera_and_lies_in_the_image(device, 
 
 def test_what_stands_between_hides(device):
     """A plate between ball and first camera hides from it alone what lies behind."""
-    c2w, intrinsics = rig(device)
+    camera = rig(device)
     plate = torch.tensor([[-4.0, -4.0, 2.0], [4.0, -4.0, 2.0], [4.0, 4.0, 2.0], [-4.0, 4.0, 2.0]], device=device)
     scene = RayScene(plate, torch.tensor([[0, 1, 2], [0, 2, 3]], dtype=torch.int32, device=device))
     p = points(device, 500)
-    got, want = visible_from(scene, p, p, c2w, intrinsics, SIZE), closed_form(p, p, c2w, intrinsics, SIZE)[0]
+    got, want = visible_from(scene, p, p, camera), closed_form(p, p, camera)[0]
     assert not got[:, 0].any() and want[:, 0].any()
     behind = p[:, 2] < 0.4  # rays to the other cameras stay below the plate
     assert torch.equal(got[behind, 1:], want[behind, 1:])
 
 
 def test_wrong_inputs_are_told(device):
-    c2w, intrinsics = rig(device)
+    camera = rig(device)
     scene = RayScene(torch.zeros(0, 3, device=device), torch.zeros(0, 3, dtype=torch.int32, device=device))
     p = points(device, 4)
-    assert visible_from(scene, p[:0], p[:0], c2w, intrinsics, SIZE).shape == (0, 3)
+    assert visible_from(scene, p[:0], p[:0], camera).shape == (0, 3)
     with pytest.raises(ValueError, match="normal: expected shape"):
-        visible_from(scene, p, p[:, :2], c2w, intrinsics, SIZE)
+        visible_from(scene, p, p[:, :2], camera)
     with pytest.raises(TypeError, match="position: expected torch.float32"):
-        visible_from(scene, p.double(), p, c2w, intrinsics, SIZE)
+        visible_from(scene, p.double(), p, camera)

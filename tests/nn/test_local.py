@@ -8,6 +8,7 @@ import torch
 from torch.nn.functional import avg_pool2d, normalize
 from torch.utils.flop_counter import FlopCounterMode
 
+from reli3d.geometry.camera import Camera, look_at, project
 from reli3d.geometry.hull import mask_distance
 from reli3d.nn.light_map import LightMap, gathered, texel_of
 from reli3d.nn.local import LocalReconstructor, PixelMaps
@@ -16,7 +17,6 @@ from reli3d.nn.pyramid import place_of_pixels, span_of_pixels
 from reli3d.nn.reni import map_directions
 from reli3d.nn.view_features import ViewMaps, ahead_of_surface
 from reli3d.nn.volume import FeatureVolume
-from reli3d.render.camera import Camera, look_at, project
 
 TINY = dataclasses.replace(
     SMALL,
@@ -79,7 +79,7 @@ def surface_of_ball(n: int = 200):
 @torch.no_grad()
 def asked(field):
     position, normal = surface_of_ball()
-    eyes = field.maps.c2w[:, :3, 3]
+    eyes = field.maps.camera.position
     visible = ((eyes[None] - position[:, None]) * normal[:, None]).sum(-1).gt(0).float()
     field = field.with_shading(position, normal, visible)
     material = field.material(position, normal, visible)
@@ -171,8 +171,9 @@ def test_pixels_know_their_place():
 def test_pixels_know_where_their_rays_meet_the_hull():
     """Many views of a ball of radius 0.4: the hull is the ball, but for the angles between the views."""
     _, masks, c2w, intrinsics = sphere(16)
+    camera = Camera(c2w, intrinsics, *masks.shape[:0:-1])
     seen = avg_pool2d(masks[:, None], 4)[:, 0]
-    span = span_of_pixels(mask_distance(masks), intrinsics, seen, Camera(c2w, intrinsics / 4, *seen.shape[:0:-1]))
+    span = span_of_pixels(mask_distance(masks), camera, seen, camera.resized(*seen.shape[:0:-1]))
     middle = slice(seen.shape[1] // 2 - 1, seen.shape[1] // 2 + 1)
     enter, leave = span[:, middle, middle].mean((1, 2)).unbind(-1)
     assert float(enter.max()) < -0.38 and float(enter.median()) > -0.5  # before the ball, not far
@@ -240,7 +241,7 @@ def test_points_know_whether_they_lie_before_a_surface():
     """A plane at depth 0 that two cameras on the axis Z see: before it +, behind it -, beside it nothing."""
     c2w = look_at(torch.tensor([[0.0, 0.0, 2.0], [0.0, 0.0, 3.0]]), torch.zeros(2, 3), torch.tensor([0.0, 1.0, 0.0]))
     intrinsics = torch.tensor([[SIZE * 1.2, SIZE * 1.2, SIZE / 2, SIZE / 2]]).expand(2, 4).contiguous()
-    maps = ViewMaps(torch.zeros(2, 16, 16, 8), torch.zeros(2, SIZE, SIZE, 4), c2w, intrinsics)
+    maps = ViewMaps(torch.zeros(2, 16, 16, 8), torch.zeros(2, SIZE, SIZE, 4), Camera(c2w, intrinsics, SIZE, SIZE))
     surface = torch.zeros(2, 32, 32, 2)
     surface[0, ..., 1] = 1.0  # the second camera shows nothing
     surface.requires_grad_()

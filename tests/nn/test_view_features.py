@@ -4,10 +4,10 @@ import pytest
 import torch
 from torch.nn.functional import grid_sample, normalize
 
+from reli3d.geometry.camera import Camera, look_at, project
 from reli3d.geometry.projection import gather_views, pool_views, summarize_views
 from reli3d.kernels import view_features as kernels
 from reli3d.nn.view_features import ViewFeatures, ViewMaps
-from reli3d.render.camera import look_at, project
 from tests.support import reference
 
 SIZE, GRID, WIDTH = 24, 4, 6
@@ -21,7 +21,7 @@ def rig(views: int, device: torch.device) -> ViewMaps:
     images[..., 3] = images[..., 3] * 12 - 4
     tokens = torch.randn(views, GRID, GRID, WIDTH, generator=g)
     intrinsics = torch.tensor([30.0, 28.0, 11.0, 13.0]).expand(views, 4).contiguous()
-    return ViewMaps(*(t.to(device) for t in (tokens, images, c2w, intrinsics)))
+    return ViewMaps(tokens.to(device), images.to(device), Camera(c2w, intrinsics, SIZE, SIZE).to(device))
 
 
 def surface(n: int, views: int, device: torch.device):
@@ -35,8 +35,9 @@ def plain(maps: ViewMaps, points, visible, normal):
     """The same numbers in float64 torch, view by view."""
     rows = []
     for v in range(len(maps.images)):
-        c2w, points64 = maps.c2w[v].double(), points.double()
-        xy, depth = project(points64.float(), maps.c2w[v], maps.intrinsics[v])
+        camera, points64 = maps.camera[v], points.double()
+        c2w = camera.c2w.double()
+        xy, depth = project(points64.float(), camera.c2w, camera.intrinsics)
         grid = (xy / SIZE * 2 - 1).double()[None, None]
         image = grid_sample(
             maps.images[v].double().permute(2, 0, 1)[None], grid, align_corners=False, padding_mode="border"
@@ -73,7 +74,7 @@ def test_the_kernel_matches_plain_torch(device, views, on_surface):
     if not on_surface:
         visible = normal = None
     got, want = (
-        summarize_views(maps.images, maps.c2w, maps.intrinsics, points, visible, normal),
+        summarize_views(maps.images, maps.camera, points, visible, normal),
         plain(maps, points, visible, normal),
     )
     for g, w in zip(got, want, strict=True):
@@ -86,9 +87,12 @@ def test_gathered_values_and_gradients_equal_their_float64_twin(device):
     """Border values outside, any channels; the slope of a point by its length, because image and pixels pull apart."""
     g, n = torch.Generator().manual_seed(3), 20_000
     maps, points = torch.rand(3, 24, 20, 5, generator=g), torch.rand(n, 3, generator=g) * 1.6 - 0.8
-    poses = rig(3, device)
+    poses = rig(3, device).camera
+    camera = Camera(poses.c2w, poses.intrinsics, 20, 24)
     ins = [v.to(device).requires_grad_() for v in (maps, points)]
-    values, pixels = gather_views(*ins, poses.c2w, poses.intrinsics)
+    values, pixels = gather_views(*ins, camera)
+    finer, shown = gather_views(*ins, camera.scaled(2))  # the maps show the same image in half of its resolution
+    assert torch.equal(finer, values) and torch.equal(shown, pixels)
     twin, rows = [v.double().requires_grad_() for v in (maps, points)], []
     for v in range(3):
         c2w, intrinsics = poses.c2w[v].cpu().double(), poses.intrinsics[v].cpu().double()
@@ -112,7 +116,7 @@ def test_the_order_of_the_views_does_not_matter(device):
     maps, module = rig(4, device), ViewFeatures(WIDTH).to(device)
     points, visible, normal = surface(200, 4, device)
     order = torch.tensor([2, 0, 3, 1], device=device)
-    turned = ViewMaps(maps.tokens[order], maps.images[order], maps.c2w[order], maps.intrinsics[order])
+    turned = ViewMaps(maps.tokens[order], maps.images[order], maps.camera[order])
     first, color = module(maps, points, visible, normal)
     second, again = module(turned, points, visible[:, order], normal)
     torch.testing.assert_close(first, second, rtol=1e-5, atol=1e-5)  # sums of four in another order
@@ -124,7 +128,7 @@ def test_gradients_reach_the_tokens_and_match_finite_differences(device):
     maps, module = rig(2, device), ViewFeatures(WIDTH).to(device)
     points, visible, normal = surface(64, 2, device)
     tokens = maps.tokens.clone().requires_grad_()
-    loss = lambda t: module(ViewMaps(t, maps.images, maps.c2w, maps.intrinsics), points, visible, normal)[0].sum()  # noqa: E731
+    loss = lambda t: module(ViewMaps(t, maps.images, maps.camera), points, visible, normal)[0].sum()  # noqa: E731
     (grad,) = torch.autograd.grad(loss(tokens), tokens)
     step = torch.randn(tokens.shape, generator=torch.Generator().manual_seed(1)).to(device)
     slope = (loss(tokens + 1e-2 * step) - loss(tokens - 1e-2 * step)) / 2e-2
@@ -135,7 +139,7 @@ def test_half_of_the_arguments_of_a_surface_is_an_error(device):
     maps = rig(2, device)
     points, visible, _ = surface(8, 2, device)
     with pytest.raises(ValueError, match="expected both or none"):
-        summarize_views(maps.images, maps.c2w, maps.intrinsics, points, visible, None)
+        summarize_views(maps.images, maps.camera, points, visible, None)
 
 
 @pytest.mark.parametrize("views", [1, 3, 16])
@@ -160,9 +164,8 @@ def test_the_layer_saturates_as_silu_does(device):
     points, _, _ = surface(64, 2, device)
     for value in (-80.0, -9.0, -1.0, 0.0, 1e-3, 2.0, 9.0, 80.0):
         tokens = torch.full((2, GRID, GRID, 8), value, device=device)
-        pooled, _ = pool_views(
-            maps.images, tokens, torch.zeros(9, 8, device=device), maps.c2w, maps.intrinsics, points, None, None
-        )
+        layer = torch.zeros(9, 8, device=device)
+        pooled, _ = pool_views(maps.images, tokens, layer, maps.camera, points, None, None)
         want = torch.nn.functional.silu(torch.tensor(value, dtype=torch.float64)).item()
         assert pooled.cpu().double().sub(want).abs().max() < 5e-7 * max(1.0, abs(value))  # bilinear weights: 2 ulp
 
@@ -171,4 +174,4 @@ def test_a_layer_that_is_no_whole_number_of_registers_is_an_error(device):
     maps = rig(2, device)
     tokens, own = torch.zeros(2, GRID, GRID, 12, device=device), torch.zeros(9, 12, device=device)
     with pytest.raises(ValueError, match="tokens: expected .* H a multiple of 8, got .2, 4, 4, 12."):
-        pool_views(maps.images, tokens, own, maps.c2w, maps.intrinsics, maps.c2w[:, :3, 3].contiguous(), None, None)
+        pool_views(maps.images, tokens, own, maps.camera, maps.camera.position.contiguous(), None, None)

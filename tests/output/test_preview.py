@@ -5,10 +5,10 @@ import math
 import pytest
 import torch
 
+from reli3d.geometry.camera import project
 from reli3d.geometry.mesh import Mesh
 from reli3d.output import preview
 from reli3d.render.asset import Asset
-from reli3d.render.camera import project
 from reli3d.render.lights import sky
 from reli3d.views.views import Views
 from tests.support.rigs import rig

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
+from reli3d.geometry.camera import Camera, look_at
 from reli3d.io.glb import glb_bytes, read_glb, write_glb
 from reli3d.output.viewer import viewer_page
 from reli3d.render.asset import Asset, TextureSet
-from reli3d.render.camera import Camera, look_at
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
 from reli3d.render.lights import sky, studio

@@ -87,7 +87,7 @@ def test_imports_point_down(path):
         ("from tests.support import reference", "reli3d.geometry.uv", False),
         ("from reli3d.synthetic.samples import synthesize", "reli3d.views.folder", False),
         ("from reli3d.eval.heldout import evaluate", "reli3d.train.loop", False),
-        ("from reli3d.render.camera import Camera", "reli3d.geometry.rays", False),
+        ("from reli3d.render.environment import Environment", "reli3d.geometry.rays", False),
     ],
 )
 def test_the_import_check_sees_what_it_should(source, module, is_package):

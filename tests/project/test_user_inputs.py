@@ -7,11 +7,11 @@ import torch
 from PIL import Image
 
 import reli3d
+from reli3d.geometry.camera import Camera, look_at
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene
 from reli3d.geometry.surface import extract_surface
 from reli3d.render.asset import Asset, TextureSet
-from reli3d.render.camera import Camera, look_at
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
 from reli3d.render.render import render

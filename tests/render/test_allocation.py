@@ -5,12 +5,12 @@ import torch
 import trimesh
 
 from reli3d.cli.render import main
+from reli3d.geometry.camera import Camera
 from reli3d.geometry.rays import RayScene
 from reli3d.geometry.tangents import with_tangents
 from reli3d.io.glb import write_glb
 from reli3d.render.allocation import plan_samples
 from reli3d.render.asset import Asset
-from reli3d.render.camera import Camera
 from reli3d.render.environment import Environment
 from reli3d.render.render import plan_render, render
 from reli3d.render.shading import ShadeOptions, shade

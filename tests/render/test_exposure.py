@@ -3,10 +3,10 @@
 import pytest
 import torch
 
+from reli3d.geometry.camera import Camera, look_at
 from reli3d.geometry.rays import RayScene
 from reli3d.render import exposure
 from reli3d.render.asset import Asset
-from reli3d.render.camera import Camera, look_at
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
 from reli3d.render.exposure import TINT, paint_factor, photograph_ratio, weighed

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
+from reli3d.geometry.camera import Camera, camera_rays, look_at, project
 from reli3d.geometry.hits import interpolate
 from reli3d.geometry.mesh import Mesh
 from reli3d.render.asset import Asset, TextureSet
-from reli3d.render.camera import Camera, camera_rays, look_at, project
 from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import sample_texture, surface_points
 from reli3d.render.material import PAINTS
@@ -38,6 +38,10 @@ def test_rays_and_projection_are_inverse(device):
     torch.testing.assert_close(depth, 3.0 * cos, rtol=1e-5, atol=0)
     centre, _ = project(torch.zeros(3, device=device), camera.c2w, camera.intrinsics)
     torch.testing.assert_close(centre.cpu(), torch.tensor([17.0, 21.0]), rtol=0, atol=1e-4)  # looks at the origin
+    with pytest.raises(ValueError, match=r"intrinsics: expected shape \(..., 4\)"):
+        Camera(torch.zeros(8, 4, 4), torch.zeros(8, 3), 4, 4)
+    with pytest.raises(ValueError, match="c2w: expected"):
+        Camera(torch.zeros(7, 4, 4), torch.zeros(8, 4), 4, 4)
     with pytest.raises(ValueError, match="up: expected"):
         look_at(*(torch.tensor([0.0, k, 0.0], device=device) for k in (1.0, 0.0, 1.0)))
 

@@ -10,11 +10,11 @@ import trimesh
 from scipy.special import erfc
 
 from bench.mitsuba_material import material
+from reli3d.geometry.camera import Camera, camera_rays, look_at
 from reli3d.geometry.hits import hit_normals, interpolate
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene
 from reli3d.render.asset import Asset, TextureSet
-from reli3d.render.camera import Camera, camera_rays, look_at
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.render.environment import Environment
 from reli3d.render.render import render

@@ -8,8 +8,8 @@ import torch
 import trimesh
 from scipy.spatial import ConvexHull
 
+from reli3d.geometry.camera import Camera, camera_rays, look_at
 from reli3d.geometry.rays import RayScene
-from reli3d.render.camera import Camera, camera_rays, look_at
 from reli3d.render.silhouette import antialias, blend_outlines, mesh_edges, outline_crossings
 
 SIZE = 48

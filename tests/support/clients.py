@@ -21,8 +21,8 @@ import torch
 from PIL import Image
 
 import reli3d
+from reli3d.geometry.camera import Camera, look_at
 from reli3d.io.glb import read_glb
-from reli3d.render.camera import Camera, look_at
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
 from reli3d.render.render import render

@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from reli3d.geometry import projection
+from reli3d.geometry.camera import Camera, camera_rays, look_at, project
 from reli3d.geometry.grid import sample_grid
 from reli3d.geometry.hits import evaluate_hits, hit_normals, interpolate
 from reli3d.geometry.mesh import Mesh, vertex_normals
@@ -28,7 +29,6 @@ from reli3d.geometry.triplane import sample_triplane
 from reli3d.render import color, gbuffer, material, sampling
 from reli3d.render.asset import TextureSet
 from reli3d.render.bump import radial_bump, world_bump
-from reli3d.render.camera import Camera, camera_rays, look_at, project
 from reli3d.render.environment import Environment
 from reli3d.render.gaussians import SphericalGaussians, shade_gaussians
 from reli3d.render.shading import ShadeOptions, shade
@@ -129,9 +129,10 @@ def camera(device, size: int = 32) -> Camera:
     return Camera.from_fov(pose, 0.7, size, size)
 
 
-def rig(device) -> tuple[Tensor, Tensor]:
+def rig(device, width: int = 20, height: int = 24) -> Camera:
     poses = [look_at(2.5 * e, torch.zeros(3), torch.tensor([0.0, 1.0, 0.0])) for e in units(3, 9)]
-    return torch.stack(poses).to(device), torch.tensor([30.0, 28.0, 11.0, 13.0]).expand(3, 4).contiguous().to(device)
+    intrinsics = torch.tensor([30.0, 28.0, 11.0, 13.0]).expand(3, 4).contiguous()
+    return Camera(torch.stack(poses), intrinsics, width, height).to(device)
 
 
 def shaded(n: int) -> dict[str, Tensor]:
@@ -337,17 +338,18 @@ CASES = {
     "taubin_smooth": Case(lambda n: {"vertices": ball("cpu")[0]}, moved, ("vertices",)),
     "gather_views": Case(
         lambda n: {"maps": uniform(3, 24, 20, 5, seed=1), "points": uniform(n, 3, low=-0.8, high=0.8)},
-        lambda maps, points: projection.gather_views(maps, points, *rig(points.device)), ("maps", "points"),
+        lambda maps, points: projection.gather_views(maps, points, rig(points.device)), ("maps", "points"),
         ("points",)),
     "sample_grid": Case(
         lambda n: {"grid": uniform(6, 5, 7, 4, seed=1), "points": uniform(n, 3, low=-1.2, high=1.2)},
         lambda grid, points: (sample_grid(grid, points),), ("grid", "points"), ("points",)),
     "project": Case(
         lambda n: {"points": uniform(n, 3, low=-0.8, high=0.8)},
-        lambda points: project(points, *(v[0] for v in rig(points.device))), ("points",), ("points",),
+        lambda points: project(points, rig(points.device).c2w[0], rig(points.device).intrinsics[0]), ("points",),
+        ("points",),
         second=("points",)),
     "camera_rays": Case(
-        lambda n: dict(zip(("c2w", "intrinsics"), rig("cpu"))), posed, ("c2w", "intrinsics"),
+        lambda n: {"c2w": rig("cpu").c2w, "intrinsics": rig("cpu").intrinsics}, posed, ("c2w", "intrinsics"),
         second=("c2w", "intrinsics")),
     "radial_bump": Case(
         lambda n: {"bump": above(n, 1)}, bumped, ("bump",), ("bump",), second=("bump",), dtypes=("bump",)),

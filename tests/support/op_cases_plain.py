@@ -84,23 +84,23 @@ def texels(vertices):
 
 
 def seen_from(points, normal):
-    c2w, intrinsics = rig(points.device)
+    camera = rig(points.device, 24, 24)
     scene = RayScene(*ball(points.device, radius=0.3), "warp")
     images = uniform(3, 24, 24, 4, seed=2).to(points)
-    visible = visible_from(scene, points, normal, c2w, intrinsics, 24)
-    own, share, total = projection.summarize_views(images, c2w, intrinsics, points, visible.float(), normal)
+    visible = visible_from(scene, points, normal, camera)
+    own, share, total = projection.summarize_views(images, camera, points, visible.float(), normal)
     tokens, mix = uniform(3, 4, 4, 8, seed=4).to(points), uniform(9, 8, seed=5).to(points)
-    pooled, _ = projection.pool_views(images, tokens, mix, c2w, intrinsics, points, visible.float(), normal)
+    pooled, _ = projection.pool_views(images, tokens, mix, camera, points, visible.float(), normal)
     pixels = uniform(3, 3, 8, 8, 4, seed=6).to(points)
-    fused = projection.fuse_views(images, pixels, c2w, intrinsics, points, visible.float(), normal)
+    fused = projection.fuse_views(images, pixels, camera, points, visible.float(), normal)
     return visible, own, share, total, pooled, *fused
 
 
 def hulls(masks, points):
-    c2w, intrinsics = rig(points.device)
+    camera = rig(points.device)
     distance = hull.mask_distance(masks)
-    span = hull.hull_span(3.0 * points, -points, 1.0, distance, c2w, intrinsics)
-    return distance, hull.hull_distance(points, distance, c2w, intrinsics), span
+    span = hull.hull_span(3.0 * points, -points, 1.0, distance, camera)
+    return distance, hull.hull_distance(points, distance, camera), span
 
 
 def hull_masks():
@@ -109,7 +109,7 @@ def hull_masks():
 
 
 def covered(level, bound, masks):
-    return (cover_silhouettes(level, bound, hull.mask_distance(masks), *rig(level.device), radius=0.7),)
+    return (cover_silhouettes(level, bound, hull.mask_distance(masks), rig(level.device), radius=0.7),)
 
 
 def drawn(u, radiance, wo, alpha):

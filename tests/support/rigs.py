@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from reli3d.render.camera import Camera, camera_rays, look_at
+from reli3d.geometry.camera import Camera, camera_rays, look_at
 from reli3d.views.views import Views
 
 SPHERES = ((0.0, 0.0, 0.0, 0.3), (0.35, 0.1, 0.0, 0.15), (0.0, 0.38, 0.1, 0.12), (-0.1, -0.1, 0.4, 0.1))  # no symmetry

@@ -3,10 +3,10 @@
 import torch
 import trimesh
 
+from reli3d.geometry.camera import look_at
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene
 from reli3d.render.asset import Asset, TextureSet
-from reli3d.render.camera import look_at
 from reli3d.render.environment import Environment
 
 SKIES = ("constant", "sky", "sun")

@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import torch
 
+from reli3d.geometry.camera import Camera, look_at
 from reli3d.geometry.surface import extract_surface
 from reli3d.geometry.tangents import vertex_tangents
 from reli3d.geometry.uv import unwrap
 from reli3d.render.asset import Asset, TextureSet
-from reli3d.render.camera import Camera, look_at
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
 from reli3d.render.render import render

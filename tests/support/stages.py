@@ -7,10 +7,10 @@ import numpy as np
 import torch
 from safetensors.torch import save_file
 
+from reli3d.geometry.camera import Camera, look_at
 from reli3d.nn.model import Reconstructor
 from reli3d.nn.presets import TINY
 from reli3d.nn.reni import map_directions
-from reli3d.render.camera import Camera, look_at
 from reli3d.synthetic.procedural import make_object
 from reli3d.synthetic.samples import ObjectSurface, synthesize
 

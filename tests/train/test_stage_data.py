@@ -11,12 +11,12 @@ import torch
 from PIL import Image
 
 from reli3d.cli import data
+from reli3d.geometry.camera import look_at, project
 from reli3d.io.files import InputError
 from reli3d.io.shards import INDEX, read_index
 from reli3d.nn.model import Reconstructor
 from reli3d.nn.presets import TINY
 from reli3d.nn.reni import map_directions
-from reli3d.render.camera import look_at, project
 from reli3d.train.stages.captures import Captures
 from reli3d.train.stages.config import Stage
 from reli3d.train.stages.latents import fitted, load_prior

@@ -6,9 +6,9 @@ from dataclasses import replace
 import pytest
 import torch
 
+from reli3d.geometry.camera import camera_rays
 from reli3d.nn.model import Reconstructor
 from reli3d.nn.presets import TINY
-from reli3d.render.camera import camera_rays
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.gaussians import shade_gaussians
 from reli3d.train.stages.config import PAPER, Run, Stage, Weights
@@ -84,7 +84,7 @@ def test_a_window_looks_through_the_same_pixels(one):
 
 
 def camera_rays_of(views: ObjectViews):
-    from reli3d.render.camera import Camera
+    from reli3d.geometry.camera import Camera
 
     size = views.images.shape[1]
     return camera_rays(Camera(views.c2w[0], views.intrinsics[0], size, size))[1]

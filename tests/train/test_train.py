@@ -8,12 +8,12 @@ import pytest
 import torch
 
 from reli3d.cli.train import main
+from reli3d.geometry.camera import project
 from reli3d.geometry.hull import hull_distance
 from reli3d.nn.local import LocalReconstructor
 from reli3d.nn.presets import OFFICIAL, SMALL
 from reli3d.nn.reni import map_directions
 from reli3d.nn.weights import load_model
-from reli3d.render.camera import project
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.train.batches import OF_VIEWS, batches, groups, load_sample, random_turn
 from reli3d.train.light_prior import fit, scale_free
@@ -28,14 +28,16 @@ def samples(folder):
 
 def test_surface_points_lie_in_every_silhouette(samples):
     for s in samples:
-        distance = hull_distance(s.surface[:, 0].contiguous(), s.silhouette, s.c2w, s.intrinsics)
+        camera = Camera(s.c2w, s.intrinsics, *s.silhouette.shape[:0:-1])
+        distance = hull_distance(s.surface[:, 0].contiguous(), s.silhouette, camera)
         pixel = 3.0 / float(s.intrinsics[:, 0].min())  # world size of a pixel at the farthest camera, about 3 away
         assert float(distance.min()) > -pixel  # the contour is known to a pixel
 
 
 def test_signed_distance_is_zero_on_the_surface_and_positive_outside_the_hull(samples):
     for s in samples:
-        outside = hull_distance(s.points.contiguous(), s.silhouette, s.c2w, s.intrinsics) < -0.05
+        camera = Camera(s.c2w, s.intrinsics, *s.silhouette.shape[:0:-1])
+        outside = hull_distance(s.points.contiguous(), s.silhouette, camera) < -0.05
         assert bool(outside.any()) and bool((s.distance[outside] > 0).all())
 
 

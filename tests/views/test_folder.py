@@ -6,8 +6,8 @@ import pytest
 import torch
 from PIL import Image
 
+from reli3d.geometry.camera import project
 from reli3d.io.files import InputError
-from reli3d.render.camera import project
 from reli3d.views.folder import MAX_VIEWS, load_views
 from reli3d.views.shots import Lens, bend_of
 from tests.support import evil

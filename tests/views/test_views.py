@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from reli3d.render.camera import project
+from reli3d.geometry.camera import project
 from reli3d.views.similarity import Similarity
 from reli3d.views.views import MASK_EDGE, Views, mask_box
 from tests.support.rigs import sphere_views

@@ -8,9 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from reli3d.geometry.camera import Camera
 from reli3d.geometry.rays import RayScene
 from reli3d.nn.model import Code, Reconstructor
-from reli3d.render.camera import Camera
 from reli3d.render.environment import Environment
 from reli3d.render.gaussians import shade_gaussians
 from reli3d.render.points import SurfacePoints

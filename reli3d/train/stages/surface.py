@@ -11,6 +11,7 @@ from torch.nn.functional import normalize, relu
 from torch.utils.checkpoint import checkpoint
 
 from reli3d._bridge import present
+from reli3d.geometry.camera import Camera
 from reli3d.geometry.hits import interpolate
 from reli3d.geometry.mesh import Mesh, vertex_normals
 from reli3d.geometry.rays import RayScene
@@ -20,7 +21,6 @@ from reli3d.nn.field import MATERIAL
 from reli3d.nn.heads import deformation
 from reli3d.nn.model import Code, Reconstructor
 from reli3d.render.bump import radial_bump
-from reli3d.render.camera import Camera
 from reli3d.render.color import srgb_to_linear
 from reli3d.render.gbuffer import primary_hits
 from reli3d.render.points import SurfacePoints

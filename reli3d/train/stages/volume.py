@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from reli3d.geometry.camera import Camera, camera_rays
 from reli3d.nn.heads import truncated_exp
 from reli3d.nn.model import Code, Reconstructor
 from reli3d.render.bump import radial_bump
-from reli3d.render.camera import Camera, camera_rays
 from reli3d.render.color import srgb_to_linear
 from reli3d.render.gaussians import SphericalGaussians, shade_gaussians
 from reli3d.render.points import SurfacePoints

@@ -64,6 +64,10 @@ class Camera:
         """The same camera without gradient."""
         return Camera(self.c2w.detach(), self.intrinsics.detach(), self.width, self.height)
 
+    def __getitem__(self, index) -> Camera:
+        """The cameras that ``index`` picks from the batch axes, as torch indexes."""
+        return Camera(self.c2w[index], self.intrinsics[index], self.width, self.height)
+
     @property
     def position(self) -> Tensor:
         """Eye position, ``(..., 3)``."""
@@ -72,13 +76,29 @@ class Camera:
     def resized(self, width: int, height: int) -> Camera:
         """The same view in ``width`` x ``height`` pixels; gradients reach the intrinsics."""
         x, y = width / self.width, height / self.height
-        return Camera(self.c2w, self.intrinsics * self.intrinsics.new_tensor([x, y, x, y]), width, height)
+        scale = x if x == y else self.intrinsics.new_tensor([x, y, x, y])  # a number waits for no device
+        return Camera(self.c2w, self.intrinsics * scale, width, height)
 
     def scaled(self, factor: int) -> Camera:
         """The same view with ``factor`` times as many pixels along each side."""
         if factor < 1:
             raise ValueError(f"factor: expected at least 1, got {factor}")
         return Camera(self.c2w, self.intrinsics * factor, self.width * factor, self.height * factor)
+
+
+def check_camera(camera: Camera, *, like: Tensor, views: int | None = None, size: Sequence[int] | None = None) -> None:
+    """Raise TypeError or ValueError unless ``camera`` has one batch axis, of ``views``, on the device of ``like``.
+
+    size: height and width of its images, where they matter.
+    """
+    if not isinstance(camera, Camera):
+        raise TypeError(f"camera: expected a Camera, got {type(camera).__name__}")
+    check("camera", camera.c2w, like=like)
+    batch = tuple(camera.c2w.shape[:-2])
+    if len(batch) != 1 or views not in (None, batch[0]):
+        raise ValueError(f"camera: expected {'one axis of' if views is None else views} views, got {batch}")
+    if size is not None and (camera.height, camera.width) != tuple(size):
+        raise ValueError(f"camera: expected {size[0]} by {size[1]} pixels, got {camera.height} by {camera.width}")
 
 
 def image_plane(camera: Camera) -> tuple[Tensor, Tensor]:
