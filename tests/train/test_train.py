@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from reli3d.cli.train import main
-from reli3d.geometry.camera import project
+from reli3d.geometry.camera import Camera, project
 from reli3d.geometry.hull import hull_distance
 from reli3d.nn.local import LocalReconstructor
 from reli3d.nn.presets import OFFICIAL, SMALL
