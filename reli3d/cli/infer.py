@@ -156,8 +156,22 @@ def _tell(row: objects.Row, args: argparse.Namespace, count: int) -> None:
     elif not args.check:
         if args.workers is not None or args.ray is not None:
             print(f"{row.object}: {row.seconds:.1f} s", file=sys.stderr)
+        if args.verbose:
+            print(_stages(args.output / row.object), file=sys.stderr)
         if not args.json and args.shards_out is None:
             print(args.output / row.object / "mesh.glb", flush=True)
+
+
+def _stages(folder: Path) -> str:
+    """Seconds of the stages of a result, one line a run, and what its process took."""
+    info = json.loads((folder / "run_info.json").read_text())
+    lines = []
+    for label, seconds in info["seconds"].items():
+        parts = ", ".join(f"{name} {value:.2f}" for name, value in seconds.items())
+        lines.append(f"{info['object']}, {label}: {parts}; in all {sum(seconds.values()):.2f} s")
+    peak = info["peak_memory_mib"]
+    memory = "" if peak is None else f"; peak memory {peak:.0f} MiB"
+    return "\n".join([*lines, f"{info['object']}: {info['seconds_since_start']:.2f} s since the start{memory}"])
 
 
 def _tell_shard(path: Path | None, args: argparse.Namespace) -> None:

@@ -109,6 +109,7 @@ def parser() -> argparse.ArgumentParser:
     )
     p.add_argument("--allow-outside", action="store_true", help="let a camera file name images outside its folder")
     p.add_argument("--check", action="store_true", help="explain the cameras and draw the rig; reconstruct nothing")
+    p.add_argument("-v", "--verbose", action="store_true", help="print the seconds of every stage, and the memory")
     p.add_argument("--json", action="store_true", help="print one JSON object, with an entry for each object, instead "
                    "of lines")  # fmt: skip
     p.add_argument("--doctor", action="store_true", help="say what is installed and where it runs")

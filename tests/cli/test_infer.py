@@ -158,6 +158,16 @@ def test_wrong_cameras_end_the_check_with_3_and_are_named_where_the_reconstructi
     assert len(err) == 1 and named in err[0] and "expected" in err[0]
 
 
+def test_verbose_prints_the_stages_of_the_record(tmp_path, capsys):
+    assert command(tmp_path, "--verbose") == 0
+    out, err = capsys.readouterr()
+    folder = tmp_path / "out" / "example"
+    seconds = json.loads((folder / "run_info.json").read_text())["seconds"]["cold"]
+    (line,) = (line for line in err.splitlines() if ", cold: " in line)
+    assert all(f"{name} {value:.2f}" in line for name, value in seconds.items())
+    assert "since the start" in err and out.splitlines() == [str(folder / "mesh.glb")]
+
+
 def test_json_is_one_object_on_stdout(tmp_path, capsys):
     (tmp_path / "empty").mkdir()
     folders = [str(infer.EXAMPLE), str(tmp_path / "empty")]
