@@ -172,8 +172,8 @@ def main(argv: list[str] | None = None) -> int:
         code = SUSPECT if isinstance(job, Check) and job.suspects() else 0
     if args.json:
         found = job.found if isinstance(job, Check) else {}
-        told = [asdict(row) | found.get(row.object, {"folder": str(args.output / row.object)}) for row in ended]
-        print(json.dumps({"objects": told, "exit_code": code}))
+        entries = [asdict(row) | found.get(row.object, {"folder": str(args.output / row.object)}) for row in ended]
+        print(json.dumps({"objects": entries, "exit_code": code}))
     return code
 
 
