@@ -50,12 +50,12 @@ def load_views(
 ) -> Views:
     """Photographs of an object folder, with their cameras and masks, in the order of the folder.
 
-    views: how many, farthest apart, the first among them.  first_views: how many from the beginning.  Neither: all, at
-    most 16.  every: all; :meth:`Views.taken` are those without it.  masks: folder of masks
-    with the images' stems; else ``mask_path`` of a frame, alpha, or a folder ``masks`` or ``mask``, in this order.
-    allow_outside: the camera file may name images outside ``folder``.  whole: keep all of photographs of more than two
-    megapixels, scaled to two, not the object alone at 768 pixels.  remove_background: masks by ``rembg``
-    (extra ``masks``) where there are none; may download.
+    views: how many, farthest apart, the first among them.  first_views: how many from the beginning.  Neither: all,
+    at most 16.  every: all; :meth:`Views.taken` are those without it.  masks: folder of masks with the images' stems;
+    else ``mask_path`` of a frame, alpha, or a folder ``masks`` or ``mask``, in this order.  allow_outside: the camera
+    file may name images outside ``folder``.  whole: keep all of photographs of more than two megapixels, scaled to
+    two, not the object alone at 768 pixels.  remove_background: masks by ``rembg`` (extra ``masks``) where there are
+    none; may download.
 
     Cameras far from their origin are moved by ``-origin``.  Raises InputError, one line.
     """
