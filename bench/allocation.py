@@ -1,11 +1,9 @@
 """Planning the counts of direct light's strategies, and what it gains at equal time.
 
-``python -m bench.allocation [LIGHT ...]`` renders the ball of ``bench.shading`` with shadows, 128 x 128, in 18 scenes,
-with 64 samples a pixel by the plan's counts, by the published counts (visible normals in pairs) and by each strategy
-alone, and prints variance times time: CPU time of one thread, least of three images in turn; the plan's own is added to
-the plan's.  Variance is of 256 runs at 256 pixels, half of them drawn evenly and half where the image is bright, each
-counted for as many as it stands for; its 95 % interval is of a bootstrap over the runs.  Where a strategy's runs have
-missed the sun, a pixel has what the sun alone makes by quadrature.
+``python -m bench.allocation [LIGHT ...]``: variance times time of the ball of ``bench.shading``, 128 x 128, 64 samples,
+in 18 scenes, by the plan, by the published counts and by each strategy alone.  Time: CPU seconds of one thread, least
+of three, planning included.  Variance: 256 runs at 256 weighted pixels, half of them bright; 95 % interval by
+bootstrap.  Where all runs missed the sun, quadrature gives its part.
 
 ``python -m bench.allocation MESH.glb LIGHT.hdr``: variance of an image of 256 x 256 by both kinds of plan over that by
 the published counts, of the radiance and of the picture (sRGB, mean brightness at 0.18).

@@ -1,13 +1,12 @@
 """Direct light of a sphere of 82 thousand triangles with shadows, and its outline, beside Mitsuba's llvm variant.
 
-Mitsuba renders its own ``principled`` material with as many samples a pixel in two strategies (``direct``: emitter and
-BSDF), primary rays included on both sides: the same amount of work, not the same estimator.  Its film pays for nothing
-here: rays are given and radiance is returned.  With gradients both sides differentiate the sum of the image with
-respect to one base colour and all texels of the map.
+Mitsuba renders its ``principled`` material with as many samples a pixel in two strategies (``direct``: emitter and
+BSDF): the same amount of work, not the same estimator.  Both sides trace primary rays, without a film.  Gradients: of
+the sum of the image with respect to one base colour and all texels of the map.
 
-``python -m bench.shading`` prints what the cases do not: variance of the image and of its gradients at equal samples
-and of one formula on both sides, with the ratio of times at equal variance; memory a pixel; how time grows with pixels,
-samples and triangles; and how near the fused kernel comes to what the device can do.
+``python -m bench.shading`` prints what the cases do not: variance of the image and its gradients at equal samples, of
+one formula on both sides, and the ratio of times at equal variance; memory a pixel; time over pixels, samples and
+triangles; how near the device's peak is.
 """
 
 import glob

@@ -1,16 +1,14 @@
-"""Fit FlexiCubes surfaces to a real mesh without any network: to its signed distance, and to rendered masks and depth.
+"""Fit FlexiCubes surfaces to a mesh: to its signed distance, and to rendered masks and depth.
 
 usage: python examples/fit_surface.py OUTPUT_FOLDER [--mesh FILE] [--resolution 48] [--steps 300]
 
-(a) The grid starts with the signed distance at its vertices.  Random points of the extracted surface are pulled onto
-the zero set, whose place and direction come from more values of the distance; the weights and offsets of FlexiCubes
-learn the features that lie between the grid's vertices.
-(b) The grid knows 32 views of mask and depth only and starts with the visual hull of the masks.  Gradients reach it
-through the depth of the hits and, where outlines move, through their antialiasing.
+(a) From the signed distance at the grid's vertices.  Random points of the extracted surface are pulled onto the zero
+set; FlexiCubes' weights and offsets learn what lies between the vertices.
+(b) From the visual hull of 32 masks, with their depth images.  Gradients: depth of the hits, antialiased outlines.
 
-Without ``--mesh`` it looks for Keenan Crane's spot in ``../shared/data`` and says so where it is not there.  Writes
-``fitted.png``: truth, (a) and (b) from two sides.  Chamfer distance: exact distances between 30,000 random points of
-one surface and the other surface, mean of both directions, in units of the mesh's half extent.
+Without ``--mesh`` it takes Keenan Crane's spot from ``../shared/data``.  Writes ``fitted.png``: truth, (a) and (b) from
+two sides.  Prints the Chamfer distance: from 30,000 random points of each surface to the other, mean of both
+directions, in half extents of the mesh.
 """
 
 from __future__ import annotations

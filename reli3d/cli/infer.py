@@ -115,8 +115,8 @@ def _carried_out(args: argparse.Namespace, plan: Plan) -> int:
         code = SUSPECT if isinstance(job, Check) and job.suspects() else 0
     if args.json:
         found = job.found if isinstance(job, Check) else {}
-        told = [asdict(row) | (found.get(row.object) or _place(row, args, shelf)) for row in ended]
-        print(json.dumps({"objects": told, "exit_code": code}))
+        entries = [asdict(row) | (found.get(row.object) or _place(row, args, shelf)) for row in ended]
+        print(json.dumps({"objects": entries, "exit_code": code}))
     return code
 
 

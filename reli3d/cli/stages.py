@@ -66,7 +66,7 @@ def run_of(args: argparse.Namespace):
     stages = PAPER if args.preset == "official" else TINY
     if args.stage not in stages:
         raise ValueError(f"stage: expected {', '.join(stages)} for {args.preset}, got {args.stage}")
-    own = {name: getattr(args, name) for name in OVERRIDES if hasattr(args, name)}
+    given = {name: getattr(args, name) for name in OVERRIDES if hasattr(args, name)}
     for name, low, high in (
         ("steps", 0, 10**9),
         ("batch", 1, 4096),
@@ -77,11 +77,11 @@ def run_of(args: argparse.Namespace):
         ("lobes", 1, 4096),
         ("resolution", 4, 256),
     ):
-        check_range(name.replace("_", "-"), own.get(name), low, high)
+        check_range(name.replace("_", "-"), given.get(name), low, high)
     check_range("save-every", args.save_every, 1, 10**9)
     check_range("seed", args.seed, 0, 10**9)
     check_folder(args.export.parent if args.export else args.output)
-    return Run(tuple(map(str, args.data)), str(args.output), dataclasses.replace(stages[args.stage], **own),
+    return Run(tuple(map(str, args.data)), str(args.output), dataclasses.replace(stages[args.stage], **given),
                start=str(args.start or ""), seed=args.seed, inputs=args.inputs, perceptual=args.perceptual,
                save_every=args.save_every, bfloat16=args.bfloat16, checkpointing=args.checkpointing)  # fmt: skip
 

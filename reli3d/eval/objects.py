@@ -69,15 +69,15 @@ def load_truth(path: Path, light: Environment, other: Environment, *, inputs: in
 def layers(asset: Asset | Sequence[Asset], camera: Camera, light: Environment, other: Environment,
            exposures: tuple[float, float]) -> dict[str, Tensor]:  # fmt: skip
     """Pictures ``(H, W, 3)`` in [0, 1] over black: in both lights, and the maps; and ``alpha (H, W)``."""
-    own = render(asset, camera, light, options=ShadeOptions(SAMPLES, 1))
+    first = render(asset, camera, light, options=ShadeOptions(SAMPLES, 1))
     lit = render(asset, camera, other, options=ShadeOptions(SAMPLES, 2))
-    shown = {"alpha": own.alpha}
-    for name, picture, exposure in (("image", own, exposures[0]), ("relit", lit, exposures[1])):
+    shown = {"alpha": first.alpha}
+    for name, picture, exposure in (("image", first, exposures[0]), ("relit", lit, exposures[1])):
         shown[name] = linear_to_srgb((picture.radiance * exposure).clamp(0.0, 1.0))
-    cover = own.alpha[..., None]
-    shown["base_color"] = linear_to_srgb(own.base_color.clamp(0.0, 1.0)) * cover
+    cover = first.alpha[..., None]
+    shown["base_color"] = linear_to_srgb(first.base_color.clamp(0.0, 1.0)) * cover
     for name in ("roughness", "metallic"):
-        shown[name] = getattr(own, name)[..., None].expand(*own.alpha.shape, 3) * cover
+        shown[name] = getattr(first, name)[..., None].expand(*first.alpha.shape, 3) * cover
     return shown
 
 
@@ -121,8 +121,8 @@ def evaluate(model: Network, truth: Truth, count: int, *, hero: str = "random", 
     except NoSurface:
         found, got = {"empty": 1.0}, [{k: torch.zeros_like(v) for k, v in w.items()} for w in want]
     else:
-        own = present("environment", asset.environment)
-        got = [layers(asset, c, own, truth.other, (1.0, exposures[1])) for c in unseen]
+        light = present("environment", asset.environment)
+        got = [layers(asset, c, light, truth.other, (1.0, exposures[1])) for c in unseen]
         mesh = joined([p.mesh for p in truth.parts])
         found |= geometry(surface_samples(asset.mesh), surface_samples(mesh, seed=1), icp=icp)
     for name in ("image", "relit", *MAPS):
@@ -187,4 +187,4 @@ def table(model: Network, files: Sequence[Path], lights: Sequence[Environment], 
         pictures.append(shown)
     of = {str(c): [{n: v for n, v in r.items() if n not in ("object", "views")} for r in rows if r["views"] == c]
           for c in counts}  # fmt: skip
-    return {label: summary(some) for label, some in of.items()}, rows, sheet(pictures)
+    return {label: summary(scores) for label, scores in of.items()}, rows, sheet(pictures)

@@ -215,7 +215,7 @@ def _cut_bulky(
     outer = outer[order]
     x, y = (np.einsum("pk,pk->p", points[outer], v[chart[outer]]) for v in (right, up))
     angles = np.arange(CUT_ANGLES) * (np.pi / CUT_ANGLES)
-    along = [x * np.cos(a) + y * np.sin(a) for a in angles]
+    turned = [x * np.cos(a) + y * np.sin(a) for a in angles]
 
     def extents(begin: np.ndarray, values: list[np.ndarray]) -> np.ndarray:
         return np.stack([np.maximum.reduceat(v, begin) - np.minimum.reduceat(v, begin) for v in values])
@@ -223,26 +223,26 @@ def _cut_bulky(
     def boxes(extent: np.ndarray) -> np.ndarray:
         return (extent * np.roll(extent, CUT_ANGLES // 2, 0)).min(0)
 
-    extent = extents(start, along)
+    extent = extents(start, turned)
     box, axis, long = boxes(extent), extent.argmax(0), extent.max(0) > longest
     bulky = (box - area > waste) & (area < CUT_FILL * box) | long
     if not bulky.any():
         return None
     keep = bulky[chart[outer]]
-    outer, along = outer[keep], [v[keep] for v in along]
+    outer, turned = outer[keep], [v[keep] for v in turned]
     owner = (np.cumsum(bulky) - 1)[chart[outer]]
     count = int(bulky.sum())
     least = np.where(area < CUT_HOLLOW * box, CUT_HOLLOW_GAIN, CUT_GAIN) * box
     best, best_angle, best_at = least[bulky], np.full(count, -1), np.zeros(count)
     axis = np.where(long, axis, -1)[bulky]
     start = np.searchsorted(owner, np.arange(count))
-    for k, v in enumerate(along):
+    for k, v in enumerate(turned):
         middle = 0.5 * (np.maximum.reduceat(v, start) + np.minimum.reduceat(v, start))
         mean = np.bincount(owner, v, count) / np.bincount(owner, minlength=count)
         for at in (middle, mean):
             side = 2 * owner + (v > at[owner])
             rows, begin = group(side)
-            total = np.bincount(side[rows[begin]] // 2, boxes(extents(begin, [w[rows] for w in along])), count)
+            total = np.bincount(side[rows[begin]] // 2, boxes(extents(begin, [w[rows] for w in turned])), count)
             total = np.where(axis < 0, total, np.where(axis == k, 0.0, np.inf))
             better = total < best * (1 - 1e-6)
             best, best_angle, best_at = (

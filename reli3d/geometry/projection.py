@@ -11,7 +11,7 @@ from reli3d.kernels.projection import gather_views_kernel
 from reli3d.kernels.view_features import Viewed, fuse_views_kernel, pool_views_kernel, vec8, view_summary_kernel
 
 BLOCK = 8  # floats of a kernels.vec8
-OWN = 9  # numbers that a view says of a point, and as many that sum up all views
+NUMBERS = 9  # numbers that a view says of a point, and as many that sum up all views
 
 
 def gather_views(maps: Tensor, points: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
@@ -48,16 +48,16 @@ def summarize_views(
     TypeError unless float32, ValueError on wrong shapes or mixed devices.
     """
     n, out, viewed = _summary(images, camera, points, visible, normal)
-    own, weight = points.new_empty(n, len(images), OWN), points.new_empty(n, len(images))
-    outs = [(own, wp.float32), (weight, wp.float32), (out, wp.float32)]
+    numbers, weight = points.new_empty(n, len(images), NUMBERS), points.new_empty(n, len(images))
+    outs = [(numbers, wp.float32), (weight, wp.float32), (out, wp.float32)]
     launch(view_summary_kernel, n, [viewed, *outs], points.device)
-    return own, weight, out
+    return numbers, weight, out
 
 
 def pool_views(
     images: Tensor,
     tokens: Tensor,
-    own: Tensor,
+    mix: Tensor,
     camera: Camera,
     points: Tensor,
     visible: Tensor | None,
@@ -66,24 +66,24 @@ def pool_views(
     """A hidden layer at ``points (N, 3)``: the weighted mean over the views, ``(N, H)``, and the summary ``(N, 9)`` of
     :func:`summarize_views`.
 
-    The layer of a view is ``silu(token + numbers @ own)``: its ``tokens (V, P, P, H)``, looked up where the point
-    projects, and the 9 numbers of :func:`summarize_views` times ``own (9, H)``.  H is a multiple of 8.  The other
+    The layer of a view is ``silu(token + numbers @ mix)``: its ``tokens (V, P, P, H)``, looked up where the point
+    projects, and the 9 numbers of :func:`summarize_views` times ``mix (9, H)``.  H is a multiple of 8.  The other
     arguments are those of :func:`summarize_views`.  No gradient: with :func:`gather_views` and torch the same has one
     and takes five times as long.
     """
     n, out, viewed = _summary(images, camera, points, visible, normal)
     check("tokens", tokens, like=images)
-    check("own", own, like=images)
+    check("mix", mix, like=images)
     hidden = tokens.shape[-1]
     if tokens.ndim != 4 or tokens.shape[0] != len(images) or min(tokens.shape[1:3]) < 2 or hidden % BLOCK:
         raise ValueError(
             f"tokens: expected ({len(images)}, P, P, H), P at least 2 and H a multiple of {BLOCK}, "
             f"got {tuple(tokens.shape)}"
         )
-    if tuple(own.shape) != (OWN, hidden):
-        raise ValueError(f"own: expected shape {(OWN, hidden)}, got {tuple(own.shape)}")
+    if tuple(mix.shape) != (NUMBERS, hidden):
+        raise ValueError(f"mix: expected shape {(NUMBERS, hidden)}, got {tuple(mix.shape)}")
     pooled = points.new_empty(n, hidden)
-    layer = [(t.detach().contiguous().unflatten(-1, (-1, BLOCK)), vec8) for t in (tokens, own)]
+    layer = [(t.detach().contiguous().unflatten(-1, (-1, BLOCK)), vec8) for t in (tokens, mix)]
     outs = [(pooled.unflatten(-1, (-1, BLOCK)), vec8), (out, wp.float32)]
     launch(pool_views_kernel, n, [viewed, *layer, *outs], points.device)
     return pooled, out
@@ -139,4 +139,4 @@ def _summary(images, camera, points, visible, normal) -> tuple[int, Tensor, View
         "visible": (visible, wp.float32),
     }
     viewed = struct_of(Viewed, **{name: (v.detach().contiguous(), kind) for name, (v, kind) in arrays.items()})
-    return n, points.new_empty(n, OWN), viewed
+    return n, points.new_empty(n, NUMBERS), viewed

@@ -110,7 +110,7 @@ class RayScene:
             launch(kernels.occluded_kernel, o.shape[0], args, self.device)
         return out.reshape(shape)
 
-    def clear(self, origins: Tensor, directions: Tensor, t_max: Tensor) -> Tensor:
+    def unoccluded(self, origins: Tensor, directions: Tensor, t_max: Tensor) -> Tensor:
         """Whether nothing lies on a ray before its ``t_max``, ``(N,)`` bool; False where ``t_max`` is below 0.
 
         For rays that a kernel has made, ``(N, 3)``, ``(N, 3)`` and ``(N,)`` on the device, whose neighbours start at
@@ -122,7 +122,11 @@ class RayScene:
         rays = [(origins.contiguous(), wp.vec3), (directions.contiguous(), wp.vec3), (left, wp.float32)]
         args = [embree.query("rtcOccluded16"), self._embree.scene, *rays]
         launch(
-            embree_kernels.embree_clear_kernel, -(-len(left) // group), args, self.device, slice_min=SLICE_RAYS // group
+            embree_kernels.embree_unoccluded_kernel,
+            -(-len(left) // group),
+            args,
+            self.device,
+            slice_min=SLICE_RAYS // group,
         )
         return left >= 0.0
 

@@ -93,8 +93,8 @@ def extract_surface(
     :func:`surface_cubes`, where weights have rows for these alone.  closed: a flat cap at the border.  centre: four
     triangles for each quad, else two.
 
-    A level of one sign gives no faces or the whole box.  Gradients reach all but ``radius``, gamma only with
-    ``centre``; the same bits for any number of threads.  Raises TypeError or ValueError.
+    A level of one sign gives no faces or the whole box.  Gradients: all but ``radius``; gamma with ``centre``.
+    Same bits for any number of threads.  Raises TypeError or ValueError.
     """
     level, deformation, alpha, beta, gamma = (tensor_of(v) for v in (level, deformation, alpha, beta, gamma))
     cubes = tensor_of(cubes, torch.int64)

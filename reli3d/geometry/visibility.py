@@ -29,4 +29,4 @@ def visible_from(scene: RayScene, position: Tensor, normal: Tensor, camera: Came
     arrays = [(v.detach().contiguous(), kind) for v, kind in ins]
     size = wp.vec2(float(camera.width), float(camera.height))
     launch(sight_kernel, n * views, [*arrays, size, GRAZING, *outs], position.device)
-    return scene.clear(origin, direction, distance).view(n, views)
+    return scene.unoccluded(origin, direction, distance).view(n, views)

@@ -1,10 +1,9 @@
 """Metallic-roughness material in the local frame: normal +z, ``wo`` to the viewer, ``wi`` to the light, both unit.
 
-f = T (1 - metallic) base / pi + D G2 F / (4 cos_o cos_i), F = F0 + (1 - F0)(1 - wo.wm)^5 (Schlick 1994),
-F0 = 0.04 for dielectrics and the base colour for metals.  Linear Rec. 709; values are 1/sr and lack the cosine.
-T is what the coat leaves to the paint.  ``conserving``, after Shirley et al. 1997, with the dielectric's F0:
-T = (1 - F(c_o)) (1 - F(c_i)), 1 - c = (1 - cos) / (1 + alpha).
-``published``, as glTF 2.0's appendix B: T = 1 - F of the microfacet, which creates energy at grazing views.
+f = T (1 - metallic) base / pi + D G2 F / (4 cos_o cos_i) [1/sr], without the cosine; linear Rec. 709.
+F = F0 + (1 - F0)(1 - wo.wm)^5 (Schlick 1994), F0 = 0.04 for dielectrics, the base colour for metals.
+``conserving`` (Shirley et al. 1997): T = (1 - F(c_o)) (1 - F(c_i)), 1 - c = (1 - cos) / (1 + alpha), dielectric F0.
+``published`` (glTF 2.0, appendix B): T = 1 - F of the microfacet, which creates energy at grazing views.
 """
 
 import warp as wp

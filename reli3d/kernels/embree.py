@@ -233,7 +233,7 @@ def embree_occluded_kernel(
 
 
 @wp.kernel
-def embree_clear_kernel(
+def embree_unoccluded_kernel(
     start: int,
     # in
     occluded16: wp.uint64,

@@ -199,10 +199,10 @@ def lookup_adjoint_kernel(
         g_v = ((c - a) * (1.0 - at.fx) + (e - b) * at.fx) * float(height) * INV_PI
         square = d[0] * d[0] + d[2] * d[2]
         s = safe_sqrt(square)
-        around = g_u / wp.max(square, TINY)
-        along = g_v / (s * s + d[1] * d[1])
+        g_azimuth = g_u / wp.max(square, TINY)
+        g_polar = g_v / (s * s + d[1] * d[1])
         g_directions[i] = wp.vec3(
-            d[0] * d[1] / s * along - d[2] * around, -s * along, d[2] * d[1] / s * along + d[0] * around
+            d[0] * d[1] / s * g_polar - d[2] * g_azimuth, -s * g_polar, d[2] * d[1] / s * g_polar + d[0] * g_azimuth
         )
 
 

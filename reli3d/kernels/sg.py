@@ -35,18 +35,18 @@ def cosine_integral_ends(sharpness: float) -> wp.vec2:
     e = wp.exp(-s)
     # sums over k from 2 to 8 of (-x)^(k - 2) / k! and of (k - 1) (-x)^(k - 2) / k!
     x = wp.min(s, SERIES)  # the adjoint passes here for any s, and its powers must not overflow
-    along = 1.0 / 2.0 - x * (
+    toward = 1.0 / 2.0 - x * (
         1.0 / 6.0 - x * (1.0 / 24.0 - x * (1.0 / 120.0 - x * (1.0 / 720.0 - x * (1.0 / 5040.0 - x / 40320.0))))
     )
     against = 1.0 / 2.0 - x * (
         1.0 / 3.0 - x * (1.0 / 8.0 - x * (1.0 / 30.0 - x * (1.0 / 144.0 - x * (1.0 / 840.0 - x / 5760.0))))
     )
-    along = along * x
+    toward = toward * x
     against = against * x
     if s > SERIES:
-        along = 1.0 - (1.0 - e) / s
+        toward = 1.0 - (1.0 - e) / s
         against = (1.0 - e) / s - e
-    return wp.vec2(along, e * against)
+    return wp.vec2(toward, e * against)
 
 
 @wp.func

@@ -220,14 +220,14 @@ def draw_sample(surface: Surface, plan: Plan, light: Light, sample: int) -> Draw
             mirrored * lobes[1],
             float(plan.n_cosine) * lobes[2],
         )
-        own = all[0]  # not all[strategy], which would send the vector through memory
+        chosen = all[0]  # not all[strategy], which would send the vector through memory
         if strategy == 1:
-            own = all[1]
+            chosen = all[1]
         elif strategy == 2:
-            own = all[2]
+            chosen = all[2]
         elif strategy == 3:
-            own = all[3]
-        factor = mis_factor(own, all, plan.power)
+            chosen = all[3]
+        factor = mis_factor(chosen, all, plan.power)
     out.wi = wi
     out.uv = uv
     out.factor = factor

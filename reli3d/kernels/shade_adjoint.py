@@ -136,16 +136,16 @@ def shade_adjoint_kernel(
                 )
                 scale = d.factor * d.wi[2]
                 top = plan.clamp / float(d.count)
-                own = wp.vec3(0.0, 0.0, 0.0)  # the output's adjoint, 0 where the clamp held
+                g_output = wp.vec3(0.0, 0.0, 0.0)  # the output's adjoint, 0 where the clamp held
                 for c in range(3):
                     if value[c] * scale * radiance[c] < top:
-                        own[c] = g[c]
+                        g_output[c] = g[c]
                 if material != 0:
                     total = add_sample_gradient(total, d.facet, surface.wo, d.wi, surface.base_color, surface.alpha,
                                                 surface.metallic, plan.conserving, value,
-                                                wp.cw_mul(own, radiance) * d.factor)  # fmt: skip
+                                                wp.cw_mul(g_output, radiance) * d.factor)  # fmt: skip
                 if g_radiance.shape[0] != 0:
-                    add_texels(g_radiance, d.uv, wp.cw_mul(own, value) * scale)
+                    add_texels(g_radiance, d.uv, wp.cw_mul(g_output, value) * scale)
     if g_normal.shape[0] != 0:
         wo = points.wo[i]
         side = wp.float32(1.0)

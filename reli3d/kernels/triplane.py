@@ -45,7 +45,7 @@ def texel_position(point: wp.vec3, plane: int, sizes: Sizes) -> wp.vec2d:
 
 
 @wp.func
-def beyond(at: wp.float64, k: int) -> float:
+def fraction(at: wp.float64, k: int) -> float:
     """Place between texel centres ``k`` and ``k + 1``, in [0, 1]."""
     return wp.float32(at - wp.float64(k))
 
@@ -95,8 +95,8 @@ def sample_kernel(
     if touches(at, sizes):
         x = int(wp.floor(at[0]))
         y = int(wp.floor(at[1]))
-        u = beyond(at[0], x)
-        v = beyond(at[1], y)
+        u = fraction(at[0], x)
+        v = fraction(at[1], y)
         w00 = (1.0 - u) * (1.0 - v)
         w01 = u * (1.0 - v)
         w10 = (1.0 - u) * v
@@ -187,8 +187,8 @@ def sample_rows_kernel(
                 point = order[slab * sizes.points + k] + offset
                 at = texel_position(points[point], plane, sizes)
                 x = int(wp.floor(at[0]))
-                u = beyond(at[0], x)
-                v = beyond(at[1], row - 1)
+                u = fraction(at[0], x)
+                v = fraction(at[1], row - 1)
                 w00 = (1.0 - u) * (1.0 - v)
                 w01 = u * (1.0 - v)
                 w10 = (1.0 - u) * v
@@ -232,8 +232,8 @@ def points_adjoint_kernel(
         if touches(at, sizes):
             x = int(wp.floor(at[0]))
             y = int(wp.floor(at[1]))
-            u = beyond(at[0], x)
-            v = beyond(at[1], y)
+            u = fraction(at[0], x)
+            v = fraction(at[1], y)
             base = ((point // sizes.points) * 3 + plane) * height * width * blocks
             across = vec8()
             down = vec8()
@@ -328,8 +328,8 @@ def planes_adjoint_kernel(
         point = (slab // 3) * sizes.points + order[slab * sizes.points + k]
         at = texel_position(points[point], plane, sizes)
         x = int(wp.floor(at[0]))
-        u = beyond(at[0], x)
-        v = beyond(at[1], y)
+        u = fraction(at[0], x)
+        v = fraction(at[1], y)
         source = (point * 3 + plane) * blocks
         if x >= 0 and y >= 0 and x + 1 < width and y + 1 < height:
             top = base + (y * width + x) * blocks

@@ -44,7 +44,7 @@ def smooth_kernel(
 
 
 @wp.func
-def along(n: wp.vec3, axis: int) -> float:
+def component(n: wp.vec3, axis: int) -> float:
     """Component of ``n`` on axis 0..5: +x, +y, +z, -x, -y, -z."""
     if axis < 3:
         return n[axis]
@@ -56,7 +56,7 @@ def nearest_axis(n: wp.vec3) -> int:
     """Axis of the largest component, the first of equals."""
     best = int(0)
     for k in range(1, 6):
-        if along(n, k) > along(n, best):
+        if component(n, k) > component(n, best):
             best = k
     return best
 
@@ -72,7 +72,7 @@ def labels_kernel(
     """Axis nearest to the smoothed normal, or to the face's own where the first is off by more than ``cosine``."""
     i = start + wp.tid()
     axis = nearest_axis(smoothed[i])
-    if along(normal[i], axis) < cosine * wp.length(normal[i]):
+    if component(normal[i], axis) < cosine * wp.length(normal[i]):
         axis = nearest_axis(normal[i])
     label[i] = axis
 
@@ -99,7 +99,7 @@ def majority_kernel(
         if vote[1] == vote[2]:
             winner = vote[1]
     voted[i] = label[i]
-    if winner >= 0 and along(normal[i], winner) >= cosine * wp.length(normal[i]):
+    if winner >= 0 and component(normal[i], winner) >= cosine * wp.length(normal[i]):
         voted[i] = winner
 
 

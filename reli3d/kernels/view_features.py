@@ -92,7 +92,7 @@ def view_summary_kernel(
     # in
     viewed: Viewed,
     # out
-    own: wp.array3d[float],  # (N, V, 9) as view_numbers has them
+    numbers: wp.array3d[float],  # (N, V, 9) as view_numbers has them
     weight: wp.array2d[float],  # (N, V), sums to 1
     summary: wp.array2d[float],  # (N, 9) mean colour, its spread, least silhouette, greatest share, position
 ):
@@ -106,20 +106,20 @@ def view_summary_kernel(
         pose = viewed.c2w[v]
         q = project_point(p, pose, viewed.intrinsics[v])
         seen, normal = surface_point(viewed, n, v)
-        numbers, share = view_numbers(viewed.image, v, p, q, pose, viewed.normal.shape[0], seen, normal)
+        shown, share = view_numbers(viewed.image, v, p, q, pose, viewed.normal.shape[0], seen, normal)
         for k in range(9):
-            own[n, v, k] = numbers[k]
+            numbers[n, v, k] = shown[k]
         weight[n, v] = share
         total += share
         greatest = wp.max(greatest, share)
-        least = wp.min(least, numbers[3])
-        color += wp.vec3(numbers[0], numbers[1], numbers[2]) * share
+        least = wp.min(least, shown[3])
+        color += wp.vec3(shown[0], shown[1], shown[2]) * share
     color /= total
     spread = wp.float32(0.0)
     for v in range(viewed.image.shape[0]):
         share = weight[n, v] / total
         weight[n, v] = share
-        away = wp.vec3(own[n, v, 0], own[n, v, 1], own[n, v, 2]) - color
+        away = wp.vec3(numbers[n, v, 0], numbers[n, v, 1], numbers[n, v, 2]) - color
         spread += share * wp.dot(away, away)
     write_summary(summary, n, color, spread, least, greatest, p)
 
@@ -147,7 +147,7 @@ def pool_views_kernel(
     # in
     viewed: Viewed,
     tokens: wp.array4d[vec8],  # (V, P, P, B) what the hidden layer makes of a token, with its bias
-    own: wp.array2d[vec8],  # (9, B) what it makes of the numbers of view_numbers
+    mix: wp.array2d[vec8],  # (9, B) what it makes of the numbers of view_numbers
     # out
     pooled: wp.array2d[vec8],  # (N, B) mean over the views of the hidden layer
     summary: wp.array2d[float],  # (N, 9) as of view_summary_kernel
@@ -155,7 +155,7 @@ def pool_views_kernel(
     """The hidden layer of every view and its mean in one pass: nothing a view is written to memory."""
     n = start + wp.tid()
     p = viewed.points[n]
-    blocks = own.shape[1]
+    blocks = mix.shape[1]
     scale = float(tokens.shape[1]) / float(viewed.image.shape[1])
     total = wp.float32(0.0)
     greatest = wp.float32(0.0)
@@ -185,11 +185,11 @@ def pool_views_kernel(
         for b in range(blocks):
             h = tokens[v, j, i, b] * w00 + tokens[v, j, i + 1, b] * w01
             h += tokens[v, j + 1, i, b] * w10 + tokens[v, j + 1, i + 1, b] * w11
-            g = own[0, b] * numbers[0] + own[1, b] * numbers[1]
-            h += own[2, b] * numbers[2] + own[3, b] * numbers[3]
-            g += own[4, b] * numbers[4] + own[5, b] * numbers[5]
-            h += own[6, b] * numbers[6] + own[7, b] * numbers[7]
-            h += g + own[8, b] * numbers[8]
+            g = mix[0, b] * numbers[0] + mix[1, b] * numbers[1]
+            h += mix[2, b] * numbers[2] + mix[3, b] * numbers[3]
+            g += mix[4, b] * numbers[4] + mix[5, b] * numbers[5]
+            h += mix[6, b] * numbers[6] + mix[7, b] * numbers[7]
+            h += g + mix[8, b] * numbers[8]
             pooled[n, b] = pooled[n, b] + silu(h) * share
     for b in range(blocks):
         pooled[n, b] = pooled[n, b] / total

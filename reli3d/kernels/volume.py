@@ -99,7 +99,7 @@ def absorbed(thickness: float) -> float:
 
 
 @wp.func
-def own_thickness(density: float, step: float) -> float:
+def step_thickness(density: float, step: float) -> float:
     """Optical depth of one step, in [0, OPAQUE]."""
     return wp.clamp(density * step, 0.0, OPAQUE)
 
@@ -186,11 +186,11 @@ def composite_kernel(
     distance = wp.float32(0.0)
     k = first[i]
     while k < first[i + 1] and thickness < OPAQUE:
-        own = own_thickness(density[k], step)
-        weight = wp.exp(-thickness) * absorbed(own)
+        layer = step_thickness(density[k], step)
+        weight = wp.exp(-thickness) * absorbed(layer)
         total = total + color[k] * weight
         distance = distance + t[k] * weight
-        thickness = thickness + own
+        thickness = thickness + layer
         k = k + 1
     out[i] = total
     opacity[i] = absorbed(thickness)
@@ -212,9 +212,9 @@ def weights_kernel(
     thickness = wp.float32(0.0)
     k = first[i]
     while k < first[i + 1] and thickness < OPAQUE:
-        own = own_thickness(density[k], step)
-        weight[k] = wp.exp(-thickness) * absorbed(own)
-        thickness = thickness + own
+        layer = step_thickness(density[k], step)
+        weight[k] = wp.exp(-thickness) * absorbed(layer)
+        thickness = thickness + layer
         k = k + 1
 
 
@@ -245,16 +245,16 @@ def composite_adjoint_kernel(
     end = begin
     thickness = wp.float32(0.0)
     while end < first[i + 1] and thickness < OPAQUE:
-        thickness = thickness + own_thickness(density[end], step)
+        thickness = thickness + step_thickness(density[end], step)
         end = end + 1
     last = wp.exp(-thickness)
     behind = wp.float32(0.0)
     for j in range(begin, end):
         k = begin + end - 1 - j
-        own = own_thickness(density[k], step)
+        layer = step_thickness(density[k], step)
         after = wp.exp(-thickness)
-        thickness = wp.max(thickness - own, 0.0)
-        weight = wp.exp(-thickness) * absorbed(own)
+        thickness = wp.max(thickness - layer, 0.0)
+        weight = wp.exp(-thickness) * absorbed(layer)
         e = wp.dot(g_out[i], color[k]) + g_depth[i] * t[k]
         if g_color.shape[0] != 0:
             g_color[k] = g_out[i] * weight

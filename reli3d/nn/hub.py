@@ -63,9 +63,9 @@ def fetch_official(*, preset: Preset = OFFICIAL) -> Path:
     if target.is_file():
         return target
     print(NOTICE, file=sys.stderr)
-    own = target.with_name(CHECKPOINT)
-    if own.is_file():
-        convert_checkpoint(own, target, licence=LICENCE, preset=preset)
+    fetched = target.with_name(CHECKPOINT)
+    if fetched.is_file():
+        convert_checkpoint(fetched, target, licence=LICENCE, preset=preset)
         return target
     checkpoint = download(REPOSITORY, CHECKPOINT, target.parent)
     try:
@@ -223,8 +223,10 @@ class _Link:
                 response = error
             except (OSError, ValueError, http.client.HTTPException) as error:
                 raise WeightsError(self.url, f"cannot be fetched ({_reason(error)}); {_advice(error)}") from None
-            told = method == "HEAD" and (response.headers.get("X-Linked-Size") or response.headers.get("X-Linked-ETag"))
-            if response.status not in _REDIRECT or told:
+            answered = method == "HEAD" and (
+                response.headers.get("X-Linked-Size") or response.headers.get("X-Linked-ETag")
+            )
+            if response.status not in _REDIRECT or answered:
                 if response.status >= 400:
                     response.close()
                     raise WeightsError(self.url, self._refusal(response.status))

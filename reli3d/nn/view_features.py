@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn.functional import linear
 
 from reli3d.geometry.camera import Camera
-from reli3d.geometry.projection import OWN, gather_views, pool_views, summarize_views
+from reli3d.geometry.projection import NUMBERS, gather_views, pool_views, summarize_views
 from reli3d.nn.blocks import linear_of
 
 
@@ -61,7 +61,9 @@ class ViewFeatures(nn.Module):
     def __init__(self, token_width: int, channels: int = 16, hidden: int = 48, width: int = 48):
         super().__init__()
         self.tokens = nn.Linear(token_width, channels)
-        self.per_view = nn.Sequential(nn.Linear(channels + OWN, hidden), nn.SiLU(), nn.Linear(hidden, width - OWN))
+        self.per_view = nn.Sequential(
+            nn.Linear(channels + NUMBERS, hidden), nn.SiLU(), nn.Linear(hidden, width - NUMBERS)
+        )
         self.width = width
 
     def forward(self, maps: ViewMaps, points: Tensor, visible: Tensor | None = None, normal: Tensor | None = None):
@@ -72,13 +74,13 @@ class ViewFeatures(nn.Module):
         """
         first, activation, last = linear_of(self.per_view, 0), self.per_view[1], self.per_view[2]
         tokens, channels = self.tokens(maps.tokens), self.tokens.out_features
-        of_tokens, of_own = first.weight[:, :channels], first.weight[:, channels:]
+        of_tokens, of_numbers = first.weight[:, :channels], first.weight[:, channels:]
         if torch.is_grad_enabled():
             gathered, _ = gather_views(tokens, points, maps.camera)
             numbers, weight, summary = summarize_views(maps.images, maps.camera, points, visible, normal)
-            hidden = linear(gathered, of_tokens) + linear(numbers, of_own, first.bias)
+            hidden = linear(gathered, of_tokens) + linear(numbers, of_numbers, first.bias)
             pooled = (weight[:, None] @ activation(hidden))[:, 0]
         else:  # bilinear weights sum to 1: the layer and its bias may come before the look-up
             tokens = linear(tokens, of_tokens, first.bias)
-            pooled, summary = pool_views(maps.images, tokens, of_own.T, maps.camera, points, visible, normal)
+            pooled, summary = pool_views(maps.images, tokens, of_numbers.T, maps.camera, points, visible, normal)
         return torch.cat([last(pooled), summary], -1), summary[:, :3]  # pooled before the last layer: it is linear

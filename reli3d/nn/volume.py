@@ -8,7 +8,7 @@ from torch.nn import functional
 
 from reli3d.geometry.grid import sample_grid
 from reli3d.geometry.hull import hull_distance
-from reli3d.geometry.projection import OWN, gather_views, summarize_views
+from reli3d.geometry.projection import NUMBERS, gather_views, summarize_views
 from reli3d.nn.presets import VolumeSizes
 from reli3d.nn.view_features import AHEAD, ViewMaps, ahead_of_surface
 
@@ -34,8 +34,8 @@ class FeatureVolume(nn.Module):
     def __init__(self, sizes: VolumeSizes, features: int):
         super().__init__()
         widths = sizes.widths
-        self.mix = nn.Sequential(nn.Linear(features + OWN, 32), nn.SiLU(), nn.Linear(32, MIXED))
-        self.reduce = nn.Sequential(nn.Linear(2 * MIXED + OWN + 2 + AHEAD, widths[0]), nn.SiLU())
+        self.mix = nn.Sequential(nn.Linear(features + NUMBERS, 32), nn.SiLU(), nn.Linear(32, MIXED))
+        self.reduce = nn.Sequential(nn.Linear(2 * MIXED + NUMBERS + 2 + AHEAD, widths[0]), nn.SiLU())
         self.first = _block(widths[0], widths[0])
         self.down = nn.ModuleList(
             nn.Sequential(_block(a, b, 2), _block(b, b)) for a, b in zip(widths[:-1], widths[1:], strict=True)

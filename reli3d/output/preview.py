@@ -44,11 +44,11 @@ def preview(asset: Asset, views: Views) -> np.ndarray:
     scene = RayScene(asset.mesh.vertices, asset.mesh.faces)
     relight = Environment(studio().radiance.to(asset.mesh.vertices.device))
     cameras = unseen_cameras(asset.mesh, views.c2w)
-    own, relit = (
+    in_own_light, relit = (
         [render(asset, camera, light, options=ShadeOptions(SAMPLES), scene=scene) for camera in cameras]
         for light in (asset.environment, relight)
     )
-    first = own[0]
+    first = in_own_light[0]
     maps = [
         linear_to_srgb(first.base_color),
         first.roughness[..., None].expand(-1, -1, 3),
@@ -57,7 +57,7 @@ def preview(asset: Asset, views: Views) -> np.ndarray:
     ]
     rows = [
         ("input", [_on_paper(i, m) for i, m in zip(taken.images, taken.masks, strict=True)]),
-        ("views that nobody photographed, own light", [_lit(s.radiance, s.alpha) for s in own]),
+        ("views that nobody photographed, own light", [_lit(s.radiance, s.alpha) for s in in_own_light]),
         ("the same views in a studio", [_lit(s.radiance, s.alpha) for s in relit]),
         ("base colour, roughness, metallic, normal", [_on_paper(m, first.alpha) for m in maps]),
         ("own light, its mean at a quarter", [_map(asset.light)]),

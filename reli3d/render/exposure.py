@@ -58,9 +58,9 @@ def photograph_ratio(asset: Asset, images: Tensor, inside: Tensor, camera: Camer
     seen, at, directions = _seen(asset, images, inside, camera, scene)
     shown = shade(at, -directions, asset.light, scene=scene, options=ShadeOptions(SAMPLES))
     count = max(1, len(shown))
-    photograph, own = seen.sum(0) / count + BLACK, shown.sum(0) / count + BLACK
-    tint = (photograph / own * (own.sum() / photograph.sum())).clamp(1.0 / TINT, TINT)
-    return tint * (photograph.sum() / (own * tint).sum())
+    photograph, rendered = seen.sum(0) / count + BLACK, shown.sum(0) / count + BLACK
+    tint = (photograph / rendered * (rendered.sum() / photograph.sum())).clamp(1.0 / TINT, TINT)
+    return tint * (photograph.sum() / (rendered * tint).sum())
 
 
 @torch.no_grad()

@@ -34,8 +34,8 @@ def studio(height: int = 64) -> Environment:
         right = normalize(torch.linalg.cross(torch.tensor([0.0, 1.0, 1e-3]), axis), dim=0)
         depth = d @ axis
         across = (d @ right).abs() / depth.clamp(min=1e-3)
-        along = (d @ torch.linalg.cross(axis, right)).abs() / depth.clamp(min=1e-3)
-        inside = torch.sigmoid(4.0 * (width - across) / edge) * torch.sigmoid(4.0 * (rise - along) / edge)
+        above = (d @ torch.linalg.cross(axis, right)).abs() / depth.clamp(min=1e-3)
+        inside = torch.sigmoid(4.0 * (width - across) / edge) * torch.sigmoid(4.0 * (rise - above) / edge)
         light = light + (inside * (depth > 0))[..., None] * torch.tensor(radiance)
     return _of_mean_one(light)
 

@@ -61,8 +61,8 @@ class OccupancyGrid:
             for part in points.split(CHUNK):
                 values.append(field(part) > threshold)
         fine = torch.cat(values).reshape(1, 1, *(2 * resolution + 1,) * 3).float()
-        own = torch.nn.functional.max_pool3d(fine, 3, 2)
-        return cls(torch.nn.functional.max_pool3d(own, 3, 1, 1)[0, 0] > 0.0, radius)
+        cells = torch.nn.functional.max_pool3d(fine, 3, 2)
+        return cls(torch.nn.functional.max_pool3d(cells, 3, 1, 1)[0, 0] > 0.0, radius)
 
 
 @dataclass(frozen=True)

@@ -50,18 +50,14 @@ def load_views(
 ) -> Views:
     """Photographs of an object folder, with their cameras and masks, in the order of the folder.
 
-    views: so many that lie farthest apart, the first among them (see :mod:`reli3d.views.choose`).  first_views: the
-    first so many.  Neither: all, or where there are more than 16, up to 16 that lie farthest apart and show each
-    something else.  What was chosen, near-duplicates and a narrow baseline are told in ``notes``.
-    masks: folder of mask images with the stems of the images; it goes before the images' own alpha.  Otherwise
-    ``mask_path`` of a frame counts, then alpha, then a folder ``masks`` or ``mask`` beside the cameras.
-    allow_outside: let the camera file name images outside ``folder``.  every: all, however many, for a refinement;
-    :meth:`Views.taken` of them are the views that come without it.
-    Where the cameras stand far from their origin, it is moved to where they look, in float64: ``origin`` says whereto.
-    Of photographs of more than two megapixels only the object and a margin are kept, at 768 pixels along it.  whole:
-    all of the photograph instead, scaled down to two megapixels.  remove_background: make a mask by ``rembg`` (extra
-    ``masks``), which may fetch its network, for each photograph that has none.
-    Raises InputError, one line that names the file, the field, the value and the fix.
+    views: how many, farthest apart, the first among them.  first_views: how many from the beginning.  Neither: all,
+    at most 16.  every: all; :meth:`Views.taken` are those without it.  masks: folder of masks with the images' stems;
+    else ``mask_path`` of a frame, alpha, or a folder ``masks`` or ``mask``, in this order.  allow_outside: the camera
+    file may name images outside ``folder``.  whole: keep all of photographs of more than two megapixels, scaled to
+    two, not the object alone at 768 pixels.  remove_background: masks by ``rembg`` (extra ``masks``) where there are
+    none; may download.
+
+    Cameras far from their origin are moved by ``-origin``.  Raises InputError, one line.
     """
     for name, value in (("views", views), ("first_views", first_views)):
         if value is not None and (isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= MAX_VIEWS):
@@ -89,9 +85,9 @@ def load_views(
     offered = len(shots)
     origin, moved = _origin(shots, folder)
     notes += moved
-    taken, told = _chosen(shots, views, first_views)
+    taken, choice = _chosen(shots, views, first_views)
     shots = shots if every else [shots[i] for i in taken]
-    notes += told + [note for shot in shots for note in shot.notes]
+    notes += choice + [note for shot in shots for note in shot.notes]
     remover = Remover() if remove_background else None
     # decoding releases the GIL; torch is not used there, as each of these threads would start threads of its own
     with ThreadPoolExecutor(max_workers=min(4, os.cpu_count() or 1)) as pool:

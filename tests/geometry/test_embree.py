@@ -23,18 +23,18 @@ def test_packets_find_what_single_rays_find(device, count):
     limit[torch.rand(count, generator=g) < 0.3] = -1.0
     limit[torch.rand(count, generator=g) < 0.3] = torch.inf
     for origins in (o, o[:1].expand(count, 3)):
-        clear = scene.clear(origins, d, limit)
+        free = scene.unoccluded(origins, d, limit)
         single = (limit >= 0.0) & ~scene.occluded(origins, d, t_max=limit)
         # a ray through an edge may count for either face, or miss by rounding in one of the two
-        assert int((clear != single).sum()) <= 1e-4 * count
-    assert count < 1000 or 0.1 < float(clear.float().mean()) < 0.6
+        assert int((free != single).sum()) <= 1e-4 * count
+    assert count < 1000 or 0.1 < float(free.float().mean()) < 0.6
 
 
 def test_packets_leave_no_closed_mesh(device):
     """Embree's own bound for rays that leak: 2e-5."""
     scene = make(*bumpy(2, subdivisions=4), "embree", device)
     o, d = rays(300_000, 5, 0.3)
-    assert int(scene.clear(o, d, torch.full((len(o),), torch.inf)).sum()) <= 2e-5 * len(o)
+    assert int(scene.unoccluded(o, d, torch.full((len(o),), torch.inf)).sum()) <= 2e-5 * len(o)
 
 
 @pytest.mark.parametrize("odd", [None, float("nan"), float("inf"), 0.0])

@@ -181,7 +181,7 @@ def ask(scene):
     many = o.expand(20_000, 3), d.expand(20_000, 3)
     t = round(float(scene.closest(o, d).t), 5)  # Embree's reciprocal is approximate: two units in the last place
     return (t, bool(scene.occluded(o, d)), int((scene.closest(*many).face >= 0).sum()),
-            bool(scene.clear(o, d, torch.ones(1) * 9.0)))
+            bool(scene.unoccluded(o, d, torch.ones(1) * 9.0)))
 
 def refused(name, act):
     try:

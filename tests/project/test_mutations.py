@@ -25,7 +25,7 @@ BROKEN = {
                           "geometry/test_surface_gradients.py -k plain_float64"),
     "manifold fix": ("kernels/flexicubes.py", "neighbour[int(codes[cell + step])] == face - 1:",
                      "neighbour[int(codes[cell + step])] == face + 7:", "geometry/test_surface.py -k noise"),
-    "orientation": ("kernels/flexicubes.py", "outward = level[v] < 0.0", "outward = level[v] >= 0.0",
+    "orientation": ("kernels/flexicubes.py", "outward = grid.level[v] < 0.0", "outward = grid.level[v] >= 0.0",
                     "geometry/test_surface.py -k sign_pattern"),
     "tangent of a corner": ("geometry/tangents.py", "_unit(_flat(along_u, normal))[0] * angle",
                             "_unit(_flat(along_u, normal))[0] * (angle > 0)", "geometry/test_bake.py -k tangents"),

@@ -47,8 +47,8 @@ def traced(backend):
     def run(origins, directions):
         scene = RayScene(*ball(origins.device, 3), backend if origins.device.type == "cpu" else "warp")
         hits = scene.closest(origins, directions)
-        clear = scene.clear(origins, directions, origins[:, 0])  # some limits are below 0
-        return hits.face, hits.t, hits.bary, scene.occluded(origins, directions, t_max=1.5), clear
+        free = scene.unoccluded(origins, directions, origins[:, 0])  # some limits are below 0
+        return hits.face, hits.t, hits.bary, scene.occluded(origins, directions, t_max=1.5), free
 
     return run
 
