@@ -19,7 +19,7 @@ import numpy as np
 import torch
 import trimesh
 
-from bench.mitsuba_material import material
+from bench.peers.mitsuba_material import material
 from bench.timing import time_steps
 from reli3d.geometry.camera import Camera, camera_rays, look_at
 from reli3d.geometry.rays import RayScene

@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from bench.flexicubes_torch import cube_list, flexicubes
+from bench.peers.flexicubes_torch import cube_list, flexicubes
 from reli3d.geometry.camera import Camera
 from reli3d.geometry.hull import hull_distance, mask_distance
 from reli3d.geometry.mesh import largest_components

@@ -109,9 +109,9 @@ def main() -> None:
     state = {k: v.contiguous() for k, v in decoder.state_dict().items()}
     save_file({**state, "latents": latents}, args.output)
     test = scale_free(maps[held_back(names)])
-    own = [fit_latent(decoder, radiance) for radiance in test]
+    fitted = [fit_latent(decoder, radiance) for radiance in test]
     with torch.no_grad():
-        radiance = torch.cat([decoder(f.latent[None], f.rotation[None], f.strength[None], ROWS) for f in own])
+        radiance = torch.cat([decoder(f.latent[None], f.rotation[None], f.strength[None], ROWS) for f in fitted])
     error = ((radiance + FLOOR).log() - (test + FLOOR).log()).abs().mean((1, 2, 3))
     mean_map = every[: len(kept)].log1p().mean(0).expm1()
     base = ((mean_map + FLOOR).log() - (test + FLOOR).log()).abs().mean((1, 2, 3))

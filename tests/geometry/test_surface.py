@@ -6,7 +6,7 @@ import torch
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from bench.flexicubes_torch import cube_list, flexicubes
+from bench.peers.flexicubes_torch import cube_list, flexicubes
 from reli3d.geometry.mesh import face_components, report, vertex_normals, volume
 from reli3d.geometry.surface import extract_surface, surface_cubes
 from reli3d.geometry.triplane import sample_triplane

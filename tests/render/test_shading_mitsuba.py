@@ -9,7 +9,7 @@ import torch
 import trimesh
 from scipy.special import erfc
 
-from bench.mitsuba_material import material
+from bench.peers.mitsuba_material import material
 from reli3d.geometry.camera import Camera, camera_rays, look_at
 from reli3d.geometry.hits import hit_normals, interpolate
 from reli3d.geometry.mesh import Mesh

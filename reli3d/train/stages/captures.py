@@ -39,8 +39,8 @@ class Captures:
             else:
                 self.folders.append(one)
         if not self.folders:
-            told = "; ".join(f"{k}: {v}" for k, v in list(self.refused.items())[:3]) or "no */transforms.json"
-            raise InputError(folder, f"expected captures of good quality, got none ({told})")
+            reasons = "; ".join(f"{k}: {v}" for k, v in list(self.refused.items())[:3]) or "no */transforms.json"
+            raise InputError(folder, f"expected captures of good quality, got none ({reasons})")
         self._prepared = lru_cache(KEPT)(self._prepare)
 
     def __len__(self) -> int:

@@ -1,6 +1,6 @@
 """Mean paint of reconstructions beside the true one: meshes as they are and with their colours darkened to a third.
 
-usage: python -m bench.paint_and_light MESHES LIGHTS [--weights PATH]
+usage: python -m bench.studies.paint_and_light MESHES LIGHTS [--weights PATH]
 
 Each GLB of MESHES is photographed by four cameras under an .hdr of LIGHTS.  Two ways of exposing: `scene`, the mean of
 the light (the sun cut off) at 0.35, as a camera meters a room; `object`, the object's 90th percentile at 0.6.
@@ -77,7 +77,7 @@ def compared(asset: Asset, views: Views, true: torch.Tensor) -> tuple[torch.Tens
 
 
 def main() -> None:
-    p = argparse.ArgumentParser(prog="bench.paint_and_light", description=__doc__)
+    p = argparse.ArgumentParser(prog="bench.studies.paint_and_light", description=__doc__)
     p.add_argument("meshes", type=Path)
     p.add_argument("lights", type=Path)
     p.add_argument("--weights", default="small")

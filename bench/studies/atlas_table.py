@@ -1,6 +1,6 @@
 """The atlas of every mesh of a folder and of extracted surfaces, beside xatlas.
 
-``python -m bench.atlas_table FOLDER``
+``python -m bench.studies.atlas_table FOLDER``
 
 A row a mesh and a maker: processor time of all threads (which other work on the machine moves little), charts,
 utilisation, overlap and stretch of ``atlas_report``.  xatlas runs in a process of its own with a limit in real time
@@ -67,7 +67,9 @@ def theirs(mesh: Mesh, size: int, limit: float) -> tuple[Mesh | None, float]:
 
 
 def main(argv: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m bench.atlas_table", description="Atlas quality beside xatlas.")
+    parser = argparse.ArgumentParser(
+        prog="python -m bench.studies.atlas_table", description="Atlas quality beside xatlas."
+    )
     parser.add_argument("folder", type=Path, help="folder of GLB files")
     parser.add_argument("--size", type=int, default=1024, help="texels along the texture")
     parser.add_argument("--limit", type=float, default=120.0, help="seconds for xatlas, a mesh; 0 leaves it out")

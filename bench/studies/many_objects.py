@@ -1,6 +1,6 @@
 """Many different objects with one worker, two workers, and two workers of Ray: speed, memory, and whether bits agree.
 
-``python -m bench.many_objects`` (64 objects), ``--count 4 --texture-size 256 --resolution 40`` to try it.
+``python -m bench.studies.many_objects`` (64 objects), ``--count 4 --texture-size 256 --resolution 40`` to try it.
 
 Each place runs ``reli3d-infer`` once, from the start of the command to its end.  The objects are procedural ones
 (``reli3d.synthetic``) under a sky with a lamp, four views each, and differ by their seeds.  The bits of ``mesh.glb``
@@ -161,7 +161,7 @@ def cluster(workers: int) -> Iterator[str | None]:
 
 
 def main(argv: list[str] | None = None) -> int:
-    p = argparse.ArgumentParser(prog="python -m bench.many_objects", description=__doc__.splitlines()[0])
+    p = argparse.ArgumentParser(prog="python -m bench.studies.many_objects", description=__doc__.splitlines()[0])
     p.add_argument("--count", type=int, default=64, help="objects")
     p.add_argument("--size", type=int, default=256, help="pixels of the photographs")
     p.add_argument("--texture-size", default="512", help="texels of the maps")
