@@ -1,9 +1,9 @@
 """Planning the counts of direct light's strategies, and what it gains at equal time.
 
-``python -m bench.studies.allocation [LIGHT ...]``: variance times time of the ball of ``bench.shading``, 128 x 128, 64
-samples, in 18 scenes, by the plan, by the published counts and by each strategy alone.  Time: CPU seconds of one thread, least
-of three, planning included.  Variance: 256 runs at 256 weighted pixels, half of them bright; 95 % interval by
-bootstrap.  Where all runs missed the sun, quadrature gives its part.
+``python -m bench.studies.allocation [LIGHT ...]``: variance times time of the ball of ``bench.shading``, 128 x 128,
+64 samples, in 18 scenes, by the plan, by the published counts and by each strategy alone.  Time: CPU seconds of one
+thread, least of three, planning included.  Variance: 256 runs at 256 weighted pixels, half of them bright; 95 %
+interval by bootstrap.  Where all runs missed the sun, quadrature gives its part.
 
 ``python -m bench.studies.allocation MESH.glb LIGHT.hdr``: variance of an image of 256 x 256 by both kinds of plan
 over that by the published counts, of the radiance and of the picture (sRGB, mean brightness at 0.18).
