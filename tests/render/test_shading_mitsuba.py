@@ -9,7 +9,7 @@ import torch
 import trimesh
 from scipy.special import erfc
 
-from bench.peers.mitsuba_material import material
+from bench.peers import mitsuba_material
 from reli3d.geometry.camera import Camera, camera_rays, look_at
 from reli3d.geometry.hits import hit_normals, interpolate
 from reli3d.geometry.mesh import Mesh
@@ -125,7 +125,7 @@ def compare_image(material, sky, stage):
     """The z-test of Mitsuba's ``test_renders.py``, against at least eight times as many samples of Mitsuba's."""
     mi = mitsuba_scene.load()
     (alpha, metallic), environment = MATERIALS[material], light(sky)
-    world = stage.world(mi, environment, material(mi, BASE, alpha, metallic))
+    world = stage.world(mi, environment, mitsuba_material.material(mi, BASE, alpha, metallic))
     count = runs_for(len(stage.position))
     draws, passes = 64, count * (16 if sky == "sun" else 4)  # its own noise counts where few samples find the sun
     want, variance = mitsuba_scene.radiance(mi, world, stage.origins, stage.directions, draws, passes)
@@ -178,7 +178,7 @@ def test_render_equals_mitsubas_sensor_textures_and_light(device):
     mi = mitsuba_scene.load()
     asset, environment, (width, height, fine, fov) = mapped_ball_in_ring(), light("sky"), (40, 32, 2, 0.75)
     eye, target = (1.2, 1.6, 1.9), (0.1, -0.1, 0.05)
-    bsdf, m = material(mi, BASE, 0.0, 0.0, maps=asset.textures), asset.mesh
+    bsdf, m = mitsuba_material.material(mi, BASE, 0.0, 0.0, maps=asset.textures), asset.mesh
     mesh = mitsuba_scene.smooth_mesh(mi, m.vertices, m.faces, m.normals, bsdf, m.uv)
     world = mi.load_dict({"type": "scene", "light": mitsuba_scene.environment(mi, environment.radiance), "mesh": mesh})
     sensor = mitsuba_scene.sensor(mi, eye, target, fov, fine * width, fine * height)
@@ -249,7 +249,7 @@ def test_gradients_with_shadows_equal_mitsubas(device, material):
     probes[0] = 1.0
     base, width = mi.Color3f(*BASE), mi.Float(alpha)
     dr.enable_grad(base, width)
-    world = stage.world(mi, environment, material(mi, base, width, metallic))
+    world = stage.world(mi, environment, mitsuba_material.material(mi, base, width, metallic))
     params = mi.traverse(world)
     nodes = mi.TensorXf(params["light.data"])
     integrator = mi.load_dict({"type": "direct", "emitter_samples": 32, "bsdf_samples": 32, "hide_emitters": True})
