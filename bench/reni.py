@@ -2,14 +2,15 @@
 
 import torch
 
-from reli3d.nn.reni import reni_frame
-from reli3d.nn.weights import load_model
+from reli3d.nn.presets import OFFICIAL
+from reli3d.nn.reni import EnvironmentDecoder, reni_frame
 
 
 def parts(device):
     rng = torch.Generator().manual_seed(0)
     latent = torch.randn(1, 49, 3, generator=rng).to(device)
-    decoder = load_model("small").environment.to(device)
+    torch.manual_seed(0)
+    decoder = EnvironmentDecoder(OFFICIAL.reni).to(device).eval()
     return decoder, (latent, torch.eye(3, device=device)[None], torch.zeros(1, device=device))
 
 
