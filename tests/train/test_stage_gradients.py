@@ -1,7 +1,7 @@
 """The gradient of each stage's whole loss on one object against central differences.
 
 The random numbers are the same on both sides.  What is a constant backwards by design is left alone: materials are
-asked at detached points, the frames of bumps have no slope, densities of samples are detached.  So light samples alone
+asked at detached points, the frames of bumps have no slope, densities of samples are detached.  So light samples
 are taken where the material moves, cosine samples alone where the light does, and where the geometry moves the
 materials are even and the bumps are flat.  Colours at outlines go from pixel to pixel by jumps, which only a wide step
 averages, and a normal is not asked where a moved surface would have it: the slope of a surface is one to 15 per cent.
