@@ -134,9 +134,18 @@ class Mitsuba:
         }
         pose = camera.c2w.double().numpy() @ np.diag([-1.0, 1.0, -1.0, 1.0])  # it looks along +Z with +X to the left
         fov = 2.0 * math.degrees(math.atan(0.5 * camera.width / float(camera.intrinsics[0])))
-        sensor = {"type": "perspective", "fov": fov, "to_world": mi.ScalarTransform4f(pose),
-                  "film": {"type": "hdrfilm", "width": camera.width, "height": camera.height, "pixel_format": "rgba",
-                           "rfilter": {"type": "box"}}}  # fmt: skip
+        sensor = {
+            "type": "perspective",
+            "fov": fov,
+            "to_world": mi.ScalarTransform4f(pose),
+            "film": {
+                "type": "hdrfilm",
+                "width": camera.width,
+                "height": camera.height,
+                "pixel_format": "rgba",
+                "rfilter": {"type": "box"},
+            },
+        }
         scene = mi.load_dict(
             {
                 "type": "scene",

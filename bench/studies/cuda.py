@@ -63,8 +63,12 @@ def system(device: torch.device, dry: bool) -> dict:
     found = context(device)
     if device.type == "cuda":
         free, total = torch.cuda.mem_get_info()
-        found |= {"gpu": torch.cuda.get_device_name(), "cuda": torch.version.cuda, "free_GiB": round(free / 2**30, 1),
-                  "total_GiB": round(total / 2**30, 1)}  # fmt: skip
+        found |= {
+            "gpu": torch.cuda.get_device_name(),
+            "cuda": torch.version.cuda,
+            "free_GiB": round(free / 2**30, 1),
+            "total_GiB": round(total / 2**30, 1),
+        }
     return found
 
 
@@ -126,8 +130,16 @@ def drawn(preset, stage, device):
 
     images, masks, c2w, intrinsics = (t[0] for t in views(preset, 5, device))
     normal = torch.nn.functional.normalize(torch.rand_like(images), dim=-1)
-    whole = ObjectViews(images, masks, c2w, intrinsics, background=True, normal=normal, shown=torch.ones_like(masks),
-                        material=torch.rand(*masks.shape, 5, device=device))  # fmt: skip
+    whole = ObjectViews(
+        images,
+        masks,
+        c2w,
+        intrinsics,
+        background=True,
+        normal=normal,
+        shown=torch.ones_like(masks),
+        material=torch.rand(*masks.shape, 5, device=device),
+    )
     target = whole.select([4]).resized(stage.image_size)
     if stage.patch:
         target = target.window(0, 0, stage.patch)
@@ -200,8 +212,15 @@ def run_piece(piece: Piece, cache: Path, left: float) -> dict:
     if limit < 5.0:
         return {"name": piece.name, "end": "left out: no time left", "seconds": 0.0, "output": ""}
     try:
-        done = subprocess.run([sys.executable, *piece.command], cwd=ROOT, env=env, capture_output=True, text=True,
-                              timeout=limit, check=False)  # fmt: skip
+        done = subprocess.run(
+            [sys.executable, *piece.command],
+            cwd=ROOT,
+            env=env,
+            capture_output=True,
+            text=True,
+            timeout=limit,
+            check=False,
+        )
         end, output = ("ok" if done.returncode == 0 else f"failed ({done.returncode})"), done.stdout + done.stderr
     except subprocess.TimeoutExpired as error:
         parts = [p.decode(errors="replace") if isinstance(p, bytes) else p or "" for p in (error.stdout, error.stderr)]

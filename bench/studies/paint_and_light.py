@@ -54,8 +54,16 @@ def photographed(parts: list[Asset], light: torch.Tensor, kind: str) -> tuple[Vi
     c2w = look_at(torch.tensor(EYES), torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))
     camera = Camera.from_fov(c2w, FOV, SIZE, SIZE)
     lens = camera.intrinsics.expand(len(EYES), 4).contiguous()
-    shots = [render(parts, Camera(pose, lens[0], SIZE, SIZE), Environment(light), supersampling=1,
-                    options=ShadeOptions((12, 12, 4), seed=k)) for k, pose in enumerate(c2w)]  # fmt: skip
+    shots = [
+        render(
+            parts,
+            Camera(pose, lens[0], SIZE, SIZE),
+            Environment(light),
+            supersampling=1,
+            options=ShadeOptions((12, 12, 4), seed=k),
+        )
+        for k, pose in enumerate(c2w)
+    ]
     radiance, alpha = (torch.stack([getattr(s, name) for s in shots]) for name in ("radiance", "alpha"))
     if kind == "scene":
         exposure = 0.35 / float(light.clamp(max=float(light.mean() * 20)).mean())
@@ -100,8 +108,10 @@ def main() -> None:
         color = (f.log() - f.log().mean(-1, True)) - (t.log() - t.log().mean(-1, True))
         psnr = sum(row[2] for row in found) / len(found)
         rms, tint = (float(v.square().mean().sqrt()) for v in (off, color))
-        print(f"{kind} {factor:.2f}: brightness off by {float(off.mean()):+.2f}, rms {rms:.2f}; colour rms {tint:.2f}; "
-              f"{psnr:.1f} dB")  # fmt: skip
+        print(
+            f"{kind} {factor:.2f}: brightness off by {float(off.mean()):+.2f}, rms {rms:.2f}; colour rms {tint:.2f}; "
+            f"{psnr:.1f} dB"
+        )
 
 
 if __name__ == "__main__":

@@ -36,8 +36,13 @@ class Check:
         rig_picture(views, target / "rig.png")
         if not self._silent:
             print(*views.notes, *lines, target / "rig.png", sep="\n")
-        self.found[name] = {"suspect": lines[-1].startswith("suspect"), "verdict": lines[-1], "lines": lines[:-1],
-                            "notes": list(views.notes), "picture": str(target / "rig.png")}  # fmt: skip
+        self.found[name] = {
+            "suspect": lines[-1].startswith("suspect"),
+            "verdict": lines[-1],
+            "lines": lines[:-1],
+            "notes": list(views.notes),
+            "picture": str(target / "rig.png"),
+        }
         return "done"
 
     def suspects(self) -> bool:

@@ -17,8 +17,20 @@ from pathlib import Path
 
 import reli3d
 
-REQUIRED = ("torch", "warp-lang", "numpy", "scipy", "pillow", "safetensors", "trimesh", "embreex", "OpenEXR",
-            "manifold3d", "xatlas", "tqdm")  # fmt: skip
+REQUIRED = (
+    "torch",
+    "warp-lang",
+    "numpy",
+    "scipy",
+    "pillow",
+    "safetensors",
+    "trimesh",
+    "embreex",
+    "OpenEXR",
+    "manifold3d",
+    "xatlas",
+    "tqdm",
+)
 ASSETS = Path(reli3d.__file__).parent / "assets"
 PROBLEM = "PROBLEM: "  # starts the value of a line that keeps the package from working
 

@@ -76,8 +76,9 @@ def _planned(args: argparse.Namespace, held: contextlib.ExitStack) -> Plan:
     for item in items:
         check_place(item.target)  # before minutes of work
     if (args.output / objects.SUMMARY).is_dir():
-        raise ValueError(f"{args.output / objects.SUMMARY}: expected a file or none, got a folder; give another "
-                         "--output")  # fmt: skip
+        raise ValueError(
+            f"{args.output / objects.SUMMARY}: expected a file or none, got a folder; give another --output"
+        )
     device = choose_device(args.device)
     budget = refinement_budget(args, device)
     ready, left, shelf = [], items, None
@@ -202,9 +203,16 @@ def _read(folder: Path | Packed, args: argparse.Namespace, *, every: bool = Fals
 
     every = every and args.views is None and args.first_views is None
     with objects.opened(folder) as found:
-        return load_views(found, views=args.views, first_views=args.first_views, masks=args.masks,
-                          allow_outside=args.allow_outside, every=every, whole=whole,
-                          remove_background=args.remove_background)  # fmt: skip
+        return load_views(
+            found,
+            views=args.views,
+            first_views=args.first_views,
+            masks=args.masks,
+            allow_outside=args.allow_outside,
+            every=every,
+            whole=whole,
+            remove_background=args.remove_background,
+        )
 
 
 def _fetch(weights: str) -> None:
@@ -225,8 +233,17 @@ class Job:
         from reli3d.pipeline import ReconstructOptions
 
         hero = int(args.hero) if args.hero.isdecimal() and args.hero.isascii() else args.hero
-        self.options = ReconstructOptions(args.texture_size, args.resolution, args.normalize, args.frame, args.up,
-                                          args.uv, hero, args.background, args.seed)  # fmt: skip
+        self.options = ReconstructOptions(
+            args.texture_size,
+            args.resolution,
+            args.normalize,
+            args.frame,
+            args.up,
+            args.uv,
+            hero,
+            args.background,
+            args.seed,
+        )
         if args.download:
             _fetch(args.weights)
         path = weights.locate(args.weights)
@@ -319,8 +336,16 @@ class Job:
             "versions": results.versions(),
         }
         steps("writing")
-        results.write_results(replacing, asset, shown, picture, info, compatible=args.compatible_names,
-                              comparison=compared, translation=translation)  # fmt: skip
+        results.write_results(
+            replacing,
+            asset,
+            shown,
+            picture,
+            info,
+            compatible=args.compatible_names,
+            comparison=compared,
+            translation=translation,
+        )
 
 
 def refinement_budget(args: argparse.Namespace, device: str) -> dict[str, float | int]:

@@ -27,8 +27,13 @@ def parser() -> argparse.ArgumentParser:
     )
     p.add_argument("--output", type=Path, default=Path("outputs"), help="files land in OUTPUT/<object>/")
     taken = p.add_mutually_exclusive_group()
-    taken.add_argument("--views", type=int, metavar="N", help="use the N views, 1 to 16, that lie farthest apart; "
-                       "default all, of more than 16 those that lie farthest apart")  # fmt: skip
+    taken.add_argument(
+        "--views",
+        type=int,
+        metavar="N",
+        help="use the N views, 1 to 16, that lie farthest apart; "
+        "default all, of more than 16 those that lie farthest apart",
+    )
     taken.add_argument("--first-views", type=int, metavar="N", help="use the first N views, 1 to 16")
     p.add_argument("--masks", type=Path, help="folder of masks with the names of the images, instead of their alpha")
     p.add_argument(
@@ -80,9 +85,16 @@ def parser() -> argparse.ArgumentParser:
         "--frame", choices=("input", "model"), default="input", help="frame of the mesh (default the cameras')"
     )
     p.add_argument("--up", choices=AXES, default="y", help="axis of that frame to turn to +Y")
-    p.add_argument("--refine", nargs="?", type=float, const=0.0, metavar="SECONDS", help="fit the result to all "
-                   "photographs of the folder; without a number 60 seconds, 20 on CUDA; stands after the "
-                   "folders")  # fmt: skip
+    p.add_argument(
+        "--refine",
+        nargs="?",
+        type=float,
+        const=0.0,
+        metavar="SECONDS",
+        help="fit the result to all "
+        "photographs of the folder; without a number 60 seconds, 20 on CUDA; stands after the "
+        "folders",
+    )
     p.add_argument(
         "--refine-steps",
         type=int,
@@ -97,12 +109,25 @@ def parser() -> argparse.ArgumentParser:
         help="also write illumination.hdr: the published release's name and layout, -Z in the centre column",
     )
     p.add_argument("--list", type=Path, metavar="FILE", help="text file that names more of them, one a line")
-    p.add_argument("--workers", type=int, metavar="N", help="make N objects at a time, each in a process of its own "
-                   "with one thread and the network, 0.7 GiB with the shipped weights")  # fmt: skip
-    p.add_argument("--ray", metavar="ADDRESS", help="make the objects on a Ray cluster: its address, auto for that of "
-                   "this machine, local to start one; needs pip install reli3d[ray]")  # fmt: skip
-    p.add_argument("--shards-out", type=int, metavar="N", help="write tar files of N objects, NNNNNN.tar with "
-                   "index.json, instead of a folder for each object")  # fmt: skip
+    p.add_argument(
+        "--workers",
+        type=int,
+        metavar="N",
+        help="make N objects at a time, each in a process of its own "
+        "with one thread and the network, 0.7 GiB with the shipped weights",
+    )
+    p.add_argument(
+        "--ray",
+        metavar="ADDRESS",
+        help="make the objects on a Ray cluster: its address, auto for that of "
+        "this machine, local to start one; needs pip install reli3d[ray]",
+    )
+    p.add_argument(
+        "--shards-out",
+        type=int,
+        metavar="N",
+        help="write tar files of N objects, NNNNNN.tar with index.json, instead of a folder for each object",
+    )
     p.add_argument("--skip-existing", action="store_true", help="leave objects alone whose files are all there")
     p.add_argument(
         "--warm", action="store_true", help="reconstruct every object twice and record the second time as well"
@@ -110,7 +135,8 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--allow-outside", action="store_true", help="let a camera file name images outside its folder")
     p.add_argument("--check", action="store_true", help="explain the cameras and draw the rig; reconstruct nothing")
     p.add_argument("-v", "--verbose", action="store_true", help="print the seconds of every stage, and the memory")
-    p.add_argument("--json", action="store_true", help="print one JSON object, with an entry for each object, instead "
-                   "of lines")  # fmt: skip
+    p.add_argument(
+        "--json", action="store_true", help="print one JSON object, with an entry for each object, instead of lines"
+    )
     p.add_argument("--doctor", action="store_true", help="say what is installed and where it runs")
     return p

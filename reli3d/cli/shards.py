@@ -23,13 +23,17 @@ def add(actions) -> None:
         description="Write a folder of samples or captures as tar files of the WebDataset form; "
         "those that are there are kept.",
     )
-    p.add_argument("input", type=Path, help="folder of samples, of captures with transforms.json each, or of "
-                   "object folders")  # fmt: skip
+    p.add_argument(
+        "input", type=Path, help="folder of samples, of captures with transforms.json each, or of object folders"
+    )
     p.add_argument("output", type=Path, help="folder for NNNNNN.tar and index.json")
     p.add_argument("--each", type=int, default=64, help="objects of a shard")
     p.add_argument("--workers", type=int, default=1)
-    p.add_argument("--folders", action="store_true", help="the files of object folders as they are, for reli3d-infer, "
-                   "instead of what a training reads")  # fmt: skip
+    p.add_argument(
+        "--folders",
+        action="store_true",
+        help="the files of object folders as they are, for reli3d-infer, instead of what a training reads",
+    )
     p.set_defaults(run=pack)
     p = actions.add_parser(
         "check",

@@ -81,9 +81,18 @@ def run_of(args: argparse.Namespace):
     check_range("save-every", args.save_every, 1, 10**9)
     check_range("seed", args.seed, 0, 10**9)
     check_folder(args.export.parent if args.export else args.output)
-    return Run(tuple(map(str, args.data)), str(args.output), dataclasses.replace(stages[args.stage], **given),
-               start=str(args.start or ""), seed=args.seed, inputs=args.inputs, perceptual=args.perceptual,
-               save_every=args.save_every, bfloat16=args.bfloat16, checkpointing=args.checkpointing)  # fmt: skip
+    return Run(
+        tuple(map(str, args.data)),
+        str(args.output),
+        dataclasses.replace(stages[args.stage], **given),
+        start=str(args.start or ""),
+        seed=args.seed,
+        inputs=args.inputs,
+        perceptual=args.perceptual,
+        save_every=args.save_every,
+        bfloat16=args.bfloat16,
+        checkpointing=args.checkpointing,
+    )
 
 
 @command("reli3d-stages")

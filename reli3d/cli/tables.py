@@ -53,8 +53,17 @@ def main(argv: list[str] | None = None) -> int:
     if len(lights) < 2:
         raise ValueError("--maps: expected two held-back maps, so twelve maps, got fewer")
     model = load_model(args.weights)
-    tables, rows, sheet = table(model, args.objects, lights, args.views, size=args.size, hero=args.hero, icp=args.icp,
-                                seed=args.seed, progress=lambda line: print(line, file=sys.stderr))  # fmt: skip
+    tables, rows, sheet = table(
+        model,
+        args.objects,
+        lights,
+        args.views,
+        size=args.size,
+        hero=args.hero,
+        icp=args.icp,
+        seed=args.seed,
+        progress=lambda line: print(line, file=sys.stderr),
+    )
     args.output.mkdir(parents=True, exist_ok=True)
     text = markdown(tables)
     write_bytes(args.output / "table.md", text.encode())

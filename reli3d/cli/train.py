@@ -34,11 +34,19 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--max-views", type=int, default=6)
     p.add_argument("--rate", type=float, default=1.5e-3, help="peak learning rate")
     p.add_argument("--seed", type=int, default=0)
-    p.add_argument("--pixels", action="store_true", help="train the 2D U-Net alone, on what the pixels of all views "
-                   "show: three times as many photographs an hour; then go on without")  # fmt: skip
+    p.add_argument(
+        "--pixels",
+        action="store_true",
+        help="train the 2D U-Net alone, on what the pixels of all views "
+        "show: three times as many photographs an hour; then go on without",
+    )
     p.add_argument("--bfloat16", action="store_true", help="of the convolutions: faster where the processor has it")
-    p.add_argument("--weights", type=Path, help="begin with these weights, not with random ones: small, "
-                   "a safetensors file, or the averaged ones of another run's state.pt")  # fmt: skip
+    p.add_argument(
+        "--weights",
+        type=Path,
+        help="begin with these weights, not with random ones: small, "
+        "a safetensors file, or the averaged ones of another run's state.pt",
+    )
     p.add_argument("--maps", type=Path, help="environment maps, .npz, under which about half of the draws are relit")
     p.add_argument(
         "--validation",
@@ -150,10 +158,25 @@ def main(argv: list[str] | None = None) -> int:
         print(weights.save(args.export, model, licence=LICENCE).path)
         return 0
     workers = Workers.join()
-    train(model, TrainConfig(samples=str(args.samples), output=str(args.output), steps=args.steps,
-                             minutes=args.minutes, batch=args.batch, points=args.points, max_views=args.max_views,
-                             rate=args.rate, seed=args.seed, pixels=args.pixels, bfloat16=args.bfloat16,
-                             maps=str(args.maps or ""), validation=str(args.validation or "")), workers)  # fmt: skip
+    train(
+        model,
+        TrainConfig(
+            samples=str(args.samples),
+            output=str(args.output),
+            steps=args.steps,
+            minutes=args.minutes,
+            batch=args.batch,
+            points=args.points,
+            max_views=args.max_views,
+            rate=args.rate,
+            seed=args.seed,
+            pixels=args.pixels,
+            bfloat16=args.bfloat16,
+            maps=str(args.maps or ""),
+            validation=str(args.validation or ""),
+        ),
+        workers,
+    )
     workers.leave()
     return 0
 

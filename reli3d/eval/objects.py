@@ -59,15 +59,22 @@ def load_truth(path: Path, light: Environment, other: Environment, *, inputs: in
     points = torch.cat([p.mesh.vertices for p in parts])
     low, high = points.amin(0), points.amax(0)
     scale = 1.0 / float((high - low).max())
-    moved = [replace(p, mesh=replace(p.mesh, vertices=((p.mesh.vertices - (low + high) / 2) * scale).contiguous()))
-             for p in parts]  # fmt: skip
+    moved = [
+        replace(p, mesh=replace(p.mesh, vertices=((p.mesh.vertices - (low + high) / 2) * scale).contiguous()))
+        for p in parts
+    ]
     c2w, fov = sample_cameras(np.random.default_rng((seed, 5)), inputs + UNSEEN)
     cameras = [Camera.from_fov(torch.as_tensor(m), float(f), size, size) for m, f in zip(c2w, fov, strict=True)]
     return Truth(path.stem, moved, light, other, cameras)
 
 
-def layers(asset: Asset | Sequence[Asset], camera: Camera, light: Environment, other: Environment,
-           exposures: tuple[float, float]) -> dict[str, Tensor]:  # fmt: skip
+def layers(
+    asset: Asset | Sequence[Asset],
+    camera: Camera,
+    light: Environment,
+    other: Environment,
+    exposures: tuple[float, float],
+) -> dict[str, Tensor]:
     """Pictures ``(H, W, 3)`` in [0, 1] over black: in both lights, and the maps; and ``alpha (H, W)``."""
     first = render(asset, camera, light, options=ShadeOptions(SAMPLES, 1))
     lit = render(asset, camera, other, options=ShadeOptions(SAMPLES, 2))
@@ -93,18 +100,30 @@ def input_views(truth: Truth, count: int, hero: int, exposure: float) -> Views:
     order = [hero, *(k for k in range(count) if k != hero)]
     images, masks = [], []
     for k in order:
-        picture = render(truth.parts, truth.cameras[k], truth.light, options=ShadeOptions(SAMPLES, 3),
-                         background="environment", supersampling=2)  # fmt: skip
+        picture = render(
+            truth.parts,
+            truth.cameras[k],
+            truth.light,
+            options=ShadeOptions(SAMPLES, 3),
+            background="environment",
+            supersampling=2,
+        )
         images.append(linear_to_srgb((picture.radiance * exposure).clamp(0.0, 1.0)))
         masks.append(picture.alpha)
     cameras = [truth.cameras[k] for k in order]
-    return Views(tuple(images), tuple(masks), torch.stack([c.c2w for c in cameras]),
-                 torch.stack([c.intrinsics for c in cameras]), tuple(f"{k:04d}" for k in order))  # fmt: skip
+    return Views(
+        tuple(images),
+        tuple(masks),
+        torch.stack([c.c2w for c in cameras]),
+        torch.stack([c.intrinsics for c in cameras]),
+        tuple(f"{k:04d}" for k in order),
+    )
 
 
 @torch.no_grad()
-def evaluate(model: Network, truth: Truth, count: int, *, hero: str = "random", icp: bool = False,
-             seed: int = 0) -> tuple[dict[str, float], list[Tensor]]:  # fmt: skip
+def evaluate(
+    model: Network, truth: Truth, count: int, *, hero: str = "random", icp: bool = False, seed: int = 0
+) -> tuple[dict[str, float], list[Tensor]]:
     """Figures of one object from ``count`` views, and a row of pictures; ``empty`` 1 where nothing was found.
 
     hero: ``random``, or ``first``.  Without a surface the pictures are black and there is no geometry to compare.
@@ -171,9 +190,18 @@ def sheet(rows: Sequence[Sequence[Tensor]]) -> Tensor:
     return (torch.cat([torch.cat([t.clamp(0, 1).cpu() for t in row], 1) for row in rows]) * 255 + 0.5).to(torch.uint8)
 
 
-def table(model: Network, files: Sequence[Path], lights: Sequence[Environment], counts: Sequence[int], *,
-          size: int = 128, hero: str = "random", icp: bool = False, seed: int = 0,
-          progress: Callable[[str], None] = lambda line: None) -> tuple[dict, list[dict], Tensor]:  # fmt: skip
+def table(
+    model: Network,
+    files: Sequence[Path],
+    lights: Sequence[Environment],
+    counts: Sequence[int],
+    *,
+    size: int = 128,
+    hero: str = "random",
+    icp: bool = False,
+    seed: int = 0,
+    progress: Callable[[str], None] = lambda line: None,
+) -> tuple[dict, list[dict], Tensor]:
     """Means for each number of views, all rows, and the sheet of the largest number; lights go round the objects."""
     rows: list[dict] = []
     pictures = []
@@ -185,6 +213,8 @@ def table(model: Network, files: Sequence[Path], lights: Sequence[Environment], 
             rows.append({"object": truth.name, "views": count, **found})
             progress(f"{truth.name}, {count} views: " + ", ".join(f"{n} {v:.3f}" for n, v in found.items()))
         pictures.append(shown)
-    of = {str(c): [{n: v for n, v in r.items() if n not in ("object", "views")} for r in rows if r["views"] == c]
-          for c in counts}  # fmt: skip
+    of = {
+        str(c): [{n: v for n, v in r.items() if n not in ("object", "views")} for r in rows if r["views"] == c]
+        for c in counts
+    }
     return {label: summary(scores) for label, scores in of.items()}, rows, sheet(pictures)

@@ -60,8 +60,18 @@ def traced(asset: Asset, scene: RayScene, photographs: Photographs, views: list[
         at = surface_points(mesh, asset.textures, face, bary)
         uv = interpolate(present("mesh.uv", mesh.uv), mesh.faces, face, bary)
         of_view = torch.full_like(face, view, dtype=torch.long)
-        parts.append((of_view, at.position, at.normal, at.ng, -directions[both], uv, material_logits(at),
-                      photographs.color[view][both]))  # fmt: skip
+        parts.append(
+            (
+                of_view,
+                at.position,
+                at.normal,
+                at.ng,
+                -directions[both],
+                uv,
+                material_logits(at),
+                photographs.color[view][both],
+            )
+        )
     columns = [torch.cat(column) for column in zip(*parts)]
     rng = torch.Generator().manual_seed(seed)
     order = torch.randperm(len(columns[0]), generator=rng).to(columns[0].device)
@@ -72,9 +82,19 @@ def traced(asset: Asset, scene: RayScene, photographs: Photographs, views: list[
     return Pixels(which, position, normal, ng, wo, uv, logits, target, order)
 
 
-def maps_loss(unknowns: Unknowns, start: Start, pixels: Pixels, rows: Tensor, scene: RayScene | None,
-              weights: losses.Weights, *, samples: tuple[int, int, int], views: int, seed: int,
-              independent: bool = True) -> Tensor:  # fmt: skip
+def maps_loss(
+    unknowns: Unknowns,
+    start: Start,
+    pixels: Pixels,
+    rows: Tensor,
+    scene: RayScene | None,
+    weights: losses.Weights,
+    *,
+    samples: tuple[int, int, int],
+    views: int,
+    seed: int,
+    independent: bool = True,
+) -> Tensor:
     """Loss of one step over ``rows`` of the pixels, with gradients to material, detail, light and exposure."""
     position, view, target = pixels.position[rows], pixels.view[rows], pixels.target[rows]
     change = material_change(unknowns, position)
@@ -97,9 +117,20 @@ def maps_loss(unknowns: Unknowns, start: Start, pixels: Pixels, rows: Tensor, sc
     return loss
 
 
-def fit_maps(unknowns: Unknowns, start: Start, asset: Asset, photographs: Photographs, views: list[int],
-             weights: losses.Weights, budget: Budget, until: float, *, name: str, seed: int,
-             detail: bool = True) -> None:  # fmt: skip
+def fit_maps(
+    unknowns: Unknowns,
+    start: Start,
+    asset: Asset,
+    photographs: Photographs,
+    views: list[int],
+    weights: losses.Weights,
+    budget: Budget,
+    until: float,
+    *,
+    name: str,
+    seed: int,
+    detail: bool = True,
+) -> None:
     """Fit light, exposures and materials on the surface of ``asset``, coarse parts first, textures with ``detail``."""
     scene = RayScene(asset.mesh.vertices, asset.mesh.faces)
     pixels = traced(asset, scene, photographs, views, seed)
@@ -122,8 +153,17 @@ def fit_maps(unknowns: Unknowns, start: Start, asset: Asset, photographs: Photog
         rows = pixels.order[torch.arange(first, first + min(BATCH, count), device=pixels.order.device) % count]
         first = (first + BATCH) % count
         samples = SAMPLES[0] if progress < 0.5 else SAMPLES[1]
-        loss = maps_loss(unknowns, start, pixels, rows, scene, weights, samples=samples, views=len(views),
-                         seed=seed * 1_000_003 + step)  # fmt: skip
+        loss = maps_loss(
+            unknowns,
+            start,
+            pixels,
+            rows,
+            scene,
+            weights,
+            samples=samples,
+            views=len(views),
+            seed=seed * 1_000_003 + step,
+        )
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()

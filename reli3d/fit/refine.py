@@ -98,9 +98,18 @@ def decibels(errors: Tensor) -> float:
 
 
 @torch.enable_grad()
-def refine(asset: Asset, views: PosedImages, *, seconds: float | None = None, steps: int | None = None,
-           resolution: int = RESOLUTION, weights: losses.Weights | None = None, cameras: bool = False, seed: int = 0,
-           bar: bool = False) -> Refinement:  # fmt: skip
+def refine(
+    asset: Asset,
+    views: PosedImages,
+    *,
+    seconds: float | None = None,
+    steps: int | None = None,
+    resolution: int = RESOLUTION,
+    weights: losses.Weights | None = None,
+    cameras: bool = False,
+    seed: int = 0,
+    bar: bool = False,
+) -> Refinement:
     """``asset`` fitted to the photographs ``views``, in whose frame it lies.
 
     seconds or steps: one of the two; with ``steps`` the result is the same on every run of one machine.  resolution:
@@ -138,9 +147,18 @@ def refine(asset: Asset, views: PosedImages, *, seconds: float | None = None, st
     return Refinement(kept, name, was, now, held, c2w, tuple(notes), budget.curve, budget.counts)
 
 
-def _fitted(first: Asset, photographs: Photographs, used: list[int], resolution: int, weights: losses.Weights,
-            budget: Budget, notes: list[str], *, seed: int,
-            cameras: bool) -> tuple[Asset, Photographs]:  # fmt: skip
+def _fitted(
+    first: Asset,
+    photographs: Photographs,
+    used: list[int],
+    resolution: int,
+    weights: losses.Weights,
+    budget: Budget,
+    notes: list[str],
+    *,
+    seed: int,
+    cameras: bool,
+) -> tuple[Asset, Photographs]:
     """The fitted asset, and the photographs with their cameras corrected."""
     start, texels = Start.of(first), min(TEXELS, first.textures.size)
     closed = watertight(first.mesh)

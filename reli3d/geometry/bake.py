@@ -149,9 +149,18 @@ def interpolate(mesh: Mesh, texels: Texels, index: Tensor) -> tuple[Tensor, Tens
     normals = mesh.normals if mesh.normals is not None else vertex_normals(mesh.vertices, mesh.faces)
     device = index.device
     position, normal = (torch.empty(len(index), 3, device=device) for _ in range(2))
-    _bridge.launch(kernels.attributes_kernel, len(index), [
-        places, (mesh.vertices.detach().contiguous(), wp.vec3), (normals.detach().contiguous(), wp.vec3),
-        (position, wp.vec3), (normal, wp.vec3)], device)  # fmt: skip
+    _bridge.launch(
+        kernels.attributes_kernel,
+        len(index),
+        [
+            places,
+            (mesh.vertices.detach().contiguous(), wp.vec3),
+            (normals.detach().contiguous(), wp.vec3),
+            (position, wp.vec3),
+            (normal, wp.vec3),
+        ],
+        device,
+    )
     return position, normal
 
 

@@ -55,7 +55,19 @@ def cover_silhouettes(level: Tensor, bound: Tensor, distance: Tensor, camera: Ca
     )
     lacking = max_pool2d(lacking, 3, 1, 1)  # as far as the silhouette's edge, between two rays
     lowered = torch.empty_like(level)
-    launch(kernels.lower_kernel, level.numel(), [
-        (level, wp.float32), (bound, wp.float32), (lacking, wp.float32), *cameras, radius, REACH, STRIDE,
-        (lowered, wp.float32)], level.device)  # fmt: skip
+    launch(
+        kernels.lower_kernel,
+        level.numel(),
+        [
+            (level, wp.float32),
+            (bound, wp.float32),
+            (lacking, wp.float32),
+            *cameras,
+            radius,
+            REACH,
+            STRIDE,
+            (lowered, wp.float32),
+        ],
+        level.device,
+    )
     return lowered

@@ -30,9 +30,18 @@ def mask_distance(masks: Tensor) -> Tensor:
     if views and not (bool((masks >= 0).all()) and bool((masks <= 1).all())):
         raise ValueError("masks: expected values in [0, 1], got others")
     distance = torch.empty_like(masks)
-    launch(kernels.mask_distance_kernel, masks.numel(), [
-        (masks, wp.float32), *_nearest_crossing(masks), *_nearest_crossing(masks.transpose(1, 2).contiguous()),
-        math.hypot(height, width), (distance, wp.float32)], masks.device)  # fmt: skip
+    launch(
+        kernels.mask_distance_kernel,
+        masks.numel(),
+        [
+            (masks, wp.float32),
+            *_nearest_crossing(masks),
+            *_nearest_crossing(masks.transpose(1, 2).contiguous()),
+            math.hypot(height, width),
+            (distance, wp.float32),
+        ],
+        masks.device,
+    )
     return distance
 
 

@@ -227,8 +227,18 @@ def report(mesh: Mesh) -> MeshReport:
     faces = faces[sound]
     size = {"vertices": len(mesh.vertices), "faces": len(mesh.faces), "degenerate_faces": degenerate}
     if not len(faces):
-        return MeshReport(**size, welded_vertices=0, components=0, euler=0, boundary_edges=0, nonmanifold_edges=0,
-                          flipped_edges=0, nonmanifold_vertices=0, watertight=False, manifold=True)  # fmt: skip
+        return MeshReport(
+            **size,
+            welded_vertices=0,
+            components=0,
+            euler=0,
+            boundary_edges=0,
+            nonmanifold_edges=0,
+            flipped_edges=0,
+            nonmanifold_vertices=0,
+            watertight=False,
+            manifold=True,
+        )
     n = int(faces.max()) + 1
     tail, head, order, start, valence = _edges(faces)
     forward = np.add.reduceat((tail < head)[order].astype(np.int64), start)

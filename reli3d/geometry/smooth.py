@@ -89,8 +89,9 @@ def laplacian_smooth(mesh: Mesh, *, iterations: int = 10, step: float = 0.5, bor
     return _smoothed(mesh, [step] * iterations, border)
 
 
-def taubin_smooth(mesh: Mesh, *, iterations: int = 10, step: float = 0.5, pass_band: float = 0.1,
-                  border: str = "fixed") -> Mesh:  # fmt: skip
+def taubin_smooth(
+    mesh: Mesh, *, iterations: int = 10, step: float = 0.5, pass_band: float = 0.1, border: str = "fixed"
+) -> Mesh:
     """The mesh after ``iterations`` pairs of a shrinking and an inflating step: noise goes, the volume stays.
 
     Taubin 1995, A signal processing approach to fair surface design: steps ``step`` and ``mu`` with ``1 / step + 1 /

@@ -48,8 +48,15 @@ class _Topology:
     def grid(self, level: Tensor, shift: Tensor | None) -> kernels.Grid:
         """The kernels' grid of the padded ``level`` and the offsets before padding."""
         shift = level.new_empty(0, 3) if shift is None else shift.view(-1, 3)
-        return struct_of(kernels.Grid, level=(level.view(-1), wp.float32), shift=(shift, wp.vec3), ny=self.shape[1],
-                         nz=self.shape[2], cubes=wp.vec3i(*self.cubes), pad=self.pad)  # fmt: skip
+        return struct_of(
+            kernels.Grid,
+            level=(level.view(-1), wp.float32),
+            shift=(shift, wp.vec3),
+            ny=self.shape[1],
+            nz=self.shape[2],
+            cubes=wp.vec3i(*self.cubes),
+            pad=self.pad,
+        )
 
 
 @lru_cache(8)
@@ -226,9 +233,21 @@ def topology_of(level: Tensor, cubes: Tensor | None, closed: bool) -> tuple[_Top
     resolved, counts = torch.empty_like(cells), torch.empty_like(cells)
     slot = torch.empty(level.numel(), dtype=torch.int32, device=device)
     table = tables_on(device)
-    launch(kernels.resolve_kernel, len(cells), [
-        (cells, I32), (case.view(-1), wp.uint8), (table["neighbour"], I32), (table["count"], I32), *level.shape[1:],
-        (resolved, I32), (counts, I32), (slot, I32)], device)  # fmt: skip
+    launch(
+        kernels.resolve_kernel,
+        len(cells),
+        [
+            (cells, I32),
+            (case.view(-1), wp.uint8),
+            (table["neighbour"], I32),
+            (table["count"], I32),
+            *level.shape[1:],
+            (resolved, I32),
+            (counts, I32),
+            (slot, I32),
+        ],
+        device,
+    )
     base = torch.zeros_like(counts)
     start = 0
     for n in range(1, 5):  # the published order: cubes with one dual vertex first, then those with two, ...
@@ -333,10 +352,21 @@ def _quads(t: _Topology, padded: Tensor, crossed: Tensor, gamma: Tensor | None) 
     origin, direction = starts[which].to(torch.int32), direction.to(torch.int32)
     quads = torch.empty(len(origin), 4, dtype=torch.int32, device=device)
     split = torch.empty(len(origin), 4, device=device)
-    launch(kernels.quad_kernel, len(origin), [
-        (origin, I32), (direction, I32), t.surface, _struct_of_tables(device), t.grid(padded, None),
-        (padded.new_empty(0) if gamma is None else gamma.detach().contiguous(), wp.float32),
-        (quads.view(-1), I32), (split.view(-1), wp.float32)], device)  # fmt: skip
+    launch(
+        kernels.quad_kernel,
+        len(origin),
+        [
+            (origin, I32),
+            (direction, I32),
+            t.surface,
+            _struct_of_tables(device),
+            t.grid(padded, None),
+            (padded.new_empty(0) if gamma is None else gamma.detach().contiguous(), wp.float32),
+            (quads.view(-1), I32),
+            (split.view(-1), wp.float32),
+        ],
+        device,
+    )
     return quads, split
 
 

@@ -48,10 +48,22 @@ class _SampleTriplane(torch.autograd.Function):
         out, sizes = (features.view(-1, BLOCK), kernels.vec8), _sizes(n, height, width, blocks)
         if by_rows:
             scratch = points.new_empty(batch * 3 * BANDS * 2 * (width + 2) * blocks, BLOCK)
-            launch(kernels.sample_rows_kernel, batch * 3 * BANDS, [
-                (packed.view(-1), kernels.wp.float32), *inputs, (edges.view(-1), kernels.wp.int32), sizes,
-                channels, BANDS, (scratch, kernels.vec8), out],
-                planes.device, slice_min=1)  # fmt: skip
+            launch(
+                kernels.sample_rows_kernel,
+                batch * 3 * BANDS,
+                [
+                    (packed.view(-1), kernels.wp.float32),
+                    *inputs,
+                    (edges.view(-1), kernels.wp.int32),
+                    sizes,
+                    channels,
+                    BANDS,
+                    (scratch, kernels.vec8),
+                    out,
+                ],
+                planes.device,
+                slice_min=1,
+            )
         else:
             split = blocks if planes.is_cuda else 1  # neighbouring GPU threads read neighbouring blocks
             launch(
@@ -130,10 +142,18 @@ def _points_adjoint(packed: Tensor, points: Tensor, g: Tensor) -> Tensor:
     batch, n, _ = points.shape
     _, _, height, width, channels = packed.shape
     g_points = torch.empty_like(points)
-    launch(kernels.points_adjoint_kernel, batch * n, [
-        (packed.view(-1, BLOCK), kernels.vec8), (points.view(-1, 3), kernels.wp.vec3),
-        (g.view(-1, BLOCK), kernels.vec8), _sizes(n, height, width, channels // BLOCK),
-        (g_points.view(-1, 3), kernels.wp.vec3)], points.device)  # fmt: skip
+    launch(
+        kernels.points_adjoint_kernel,
+        batch * n,
+        [
+            (packed.view(-1, BLOCK), kernels.vec8),
+            (points.view(-1, 3), kernels.wp.vec3),
+            (g.view(-1, BLOCK), kernels.vec8),
+            _sizes(n, height, width, channels // BLOCK),
+            (g_points.view(-1, 3), kernels.wp.vec3),
+        ],
+        points.device,
+    )
     return g_points
 
 
@@ -144,10 +164,22 @@ def _planes_adjoint(points: Tensor, g: Tensor, order: Tensor, edges: Tensor, sha
     g_planes = torch.zeros(batch, 3, height, width, blocks * BLOCK, device=points.device)
     split, sizes = 1 if points.device.type == "cpu" else blocks, _sizes(n, height, width, blocks)
     for parity in (0, 1):
-        launch(kernels.planes_adjoint_kernel, batch * 3 * ((height + 2 - parity) // 2) * split, [
-            (points.view(-1, 3), kernels.wp.vec3), (g.view(-1, BLOCK), kernels.vec8),
-            (order.view(-1), kernels.wp.int32), (edges.view(-1), kernels.wp.int32), sizes, parity, split,
-            (g_planes.view(-1, BLOCK), kernels.vec8)], points.device, slice_min=ROWS_MIN)  # fmt: skip
+        launch(
+            kernels.planes_adjoint_kernel,
+            batch * 3 * ((height + 2 - parity) // 2) * split,
+            [
+                (points.view(-1, 3), kernels.wp.vec3),
+                (g.view(-1, BLOCK), kernels.vec8),
+                (order.view(-1), kernels.wp.int32),
+                (edges.view(-1), kernels.wp.int32),
+                sizes,
+                parity,
+                split,
+                (g_planes.view(-1, BLOCK), kernels.vec8),
+            ],
+            points.device,
+            slice_min=ROWS_MIN,
+        )
     return g_planes[..., :channels].permute(0, 1, 4, 2, 3)
 
 

@@ -186,8 +186,20 @@ def _place(charts: parts.Charts, faces: np.ndarray, size: int, guard: float, res
         _bridge.launch(
             kernels.outline_kernel, count, [*inputs, start, scale / cell, margin / cell, *outline], parts.CPU
         )
-        _bridge.launch(kernels.pack_serial_kernel, 1, [(sequence, wp.int32), start, *outline, strip,
-                       (horizon, wp.int32), (place, wp.int32), (top_cell, wp.int32)], parts.CPU)  # fmt: skip
+        _bridge.launch(
+            kernels.pack_serial_kernel,
+            1,
+            [
+                (sequence, wp.int32),
+                start,
+                *outline,
+                strip,
+                (horizon, wp.int32),
+                (place, wp.int32),
+                (top_cell, wp.int32),
+            ],
+            parts.CPU,
+        )
         return int(top_cell)
 
     while True:

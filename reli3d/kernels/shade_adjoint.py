@@ -141,9 +141,18 @@ def shade_adjoint_kernel(
                     if value[c] * scale * radiance[c] < top:
                         g_output[c] = g[c]
                 if material != 0:
-                    total = add_sample_gradient(total, d.facet, surface.wo, d.wi, surface.base_color, surface.alpha,
-                                                surface.metallic, plan.conserving, value,
-                                                wp.cw_mul(g_output, radiance) * d.factor)  # fmt: skip
+                    total = add_sample_gradient(
+                        total,
+                        d.facet,
+                        surface.wo,
+                        d.wi,
+                        surface.base_color,
+                        surface.alpha,
+                        surface.metallic,
+                        plan.conserving,
+                        value,
+                        wp.cw_mul(g_output, radiance) * d.factor,
+                    )
                 if g_radiance.shape[0] != 0:
                     add_texels(g_radiance, d.uv, wp.cw_mul(g_output, value) * scale)
     if g_normal.shape[0] != 0:

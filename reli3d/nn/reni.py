@@ -225,9 +225,21 @@ class EnvironmentDecoder(nn.Module):
         codes = codes.reshape(2, features, 2, width).transpose(0, 1).reshape(features, 4, width)
         first = torch.cat([torch.cat([codes, raw[:, None]], 1).flatten(0, 1), net.residual_projection.bias[None]])
         matrices = torch.cat([w.T for layer in net.layers for w in (layer.fc[0].weight, layer.fc[2].weight)])
-        vectors = torch.stack([v for layer in net.layers for v in (
-            layer.mha(condition), layer.norm1.weight, layer.norm1.bias, layer.fc[0].bias, layer.fc[2].bias,
-            layer.norm2.weight, layer.norm2.bias)])  # fmt: skip
+        vectors = torch.stack(
+            [
+                v
+                for layer in net.layers
+                for v in (
+                    layer.mha(condition),
+                    layer.norm1.weight,
+                    layer.norm1.bias,
+                    layer.fc[0].bias,
+                    layer.fc[2].bias,
+                    layer.norm2.weight,
+                    layer.norm2.bias,
+                )
+            ]
+        )
         offset = (net.fc.bias + strength.float())[None]
         parts = turned[:, :2], first, matrices, vectors, net.fc.weight, offset
         return ReniLight(*(part.detach().contiguous() for part in parts))

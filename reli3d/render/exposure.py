@@ -86,8 +86,9 @@ def _color(value: Tensor) -> Tensor:
     return value.log() - value.log().mean()
 
 
-def _seen(asset: Asset, images: Tensor, inside: Tensor, camera: Camera,
-          scene: RayScene) -> tuple[Tensor, SurfacePoints, Tensor]:  # fmt: skip
+def _seen(
+    asset: Asset, images: Tensor, inside: Tensor, camera: Camera, scene: RayScene
+) -> tuple[Tensor, SurfacePoints, Tensor]:
     """Linear colours of the photographs ``(N, 3)`` on the grid, what ``asset`` has there, and the rays' directions."""
     first = STEP // 2
     seen, inside = srgb_to_linear(images[:, first::STEP, first::STEP]), inside[:, first::STEP, first::STEP]

@@ -165,10 +165,23 @@ def _lines(vertices: Tensor, edges: Tensor, camera: Camera) -> tuple[Tensor, Ten
     outward = torch.empty(n, device=device)
     steep = torch.empty(n, dtype=torch.bool, device=device)
     c2w, intrinsics = camera.c2w.detach().tolist(), camera.intrinsics.detach().tolist()
-    launch(kernels.outline_kernel, n, [
-        (vertices.contiguous(), wp.vec3), (edges.contiguous(), wp.int32), wp.mat44(*sum(c2w, [])), wp.vec4(*intrinsics),
-        camera.width, camera.height, (outward, wp.float32), (steep, wp.bool), (first, wp.int32), (count, wp.int32),
-    ], device)  # fmt: skip
+    launch(
+        kernels.outline_kernel,
+        n,
+        [
+            (vertices.contiguous(), wp.vec3),
+            (edges.contiguous(), wp.int32),
+            wp.mat44(*sum(c2w, [])),
+            wp.vec4(*intrinsics),
+            camera.width,
+            camera.height,
+            (outward, wp.float32),
+            (steep, wp.bool),
+            (first, wp.int32),
+            (count, wp.int32),
+        ],
+        device,
+    )
     count = count.long()
     edge = torch.repeat_interleave(torch.arange(n, device=device), count)
     begin = count.cumsum(0) - count

@@ -41,8 +41,20 @@ def kettle(a: Assembly) -> None:
     )
     fine = p.curve(neck, 24)
     a.add(p.solid_of_profile(fine[:, 0].clip(0.003), fine[:, 1], 40), knob)
-    arch = p.curve(np.array([[-0.3, 0.52, 0], [-0.345, 0.72, 0], [-0.2, 0.98, 0], [0, 1.04, 0], [0.2, 0.98, 0],
-                             [0.345, 0.72, 0], [0.3, 0.52, 0]]), 60)  # fmt: skip
+    arch = p.curve(
+        np.array(
+            [
+                [-0.3, 0.52, 0],
+                [-0.345, 0.72, 0],
+                [-0.2, 0.98, 0],
+                [0, 1.04, 0],
+                [0.2, 0.98, 0],
+                [0.345, 0.72, 0],
+                [0.3, 0.52, 0],
+            ]
+        ),
+        60,
+    )
     a.add(p.tube(arch, 0.021, segments=16), arms)
     swell = 0.04 + 0.016 * np.sin(np.linspace(0, np.pi, 24))
     a.add(p.tube(arch[18:42], swell, segments=24), grip)

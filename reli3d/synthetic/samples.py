@@ -1,23 +1,8 @@
 """Training samples: one object under one light, seen by a few cameras, with the truth at points in and on it.
 
-A sample is a dictionary of tensors (one safetensors file on disk).  There are ``V`` views of ``S`` by ``S`` pixels,
-cropped to the object as the network's input is.  World +Y up, object centred, longest side 1.  Radiance is scaled so
-that the first view is well exposed.
-
-=================  =====================  ==============================================================================
-images             (V, S, S, 4) uint8     sRGB with straight alpha; the light's background is kept under it
-c2w, intrinsics    (V, 4, 4), (V, 4)      OpenGL camera to world; fx, fy, cx, cy in pixels
-environment        (32, 64, 3) float16    linear radiance of the light, scaled as the images are
-points, distance   (P, 3), (P,) float16   volume points (first half near the surface); signed distance, positive outside
-surface            (N, 3, 3) float16      position, geometric normal, bumped normal of surface points
-material           (N, 5) uint8           base colour (sRGB-encoded), roughness, metallic
-visible            (N, V) uint8           1 where the surface point is seen by the view
-view_material      (V, S, S, 5) uint8     means over the pixel: base colour (sRGB-encoded), roughness, metallic
-view_normal        (V, S, S, 3) int8      bumped normal, world, times 127
-view_depth         (V, S, S) float16      along the camera's axis; 0, as above, where half the pixel or more is free
-pixels             (V, M, 3, 3) float16   position, bumped normal, direction to the camera of seen points
-pixel_radiance     (V, M, 3) float16      the linear radiance that left them
-=================  =====================  ==============================================================================
+A sample is a dictionary of tensors, one safetensors file on disk.  ``docs/training.md``, "A sample", lists its entries
+with shapes and units.  There are ``V`` views of ``S`` by ``S`` pixels, cropped to the object as the network's input
+is.  World +Y up, object centred, longest side 1.  Radiance is scaled so that the first view is well exposed.
 """
 
 from __future__ import annotations

@@ -50,8 +50,18 @@ def vessel(a: Assembly) -> None:
         high = max(high, low + 0.25 * height)
         at = lambda y: float(np.interp(y, fine[:, 1], fine[:, 0]))  # noqa: E731
         out = wide + u(0.12, 0.5)
-        path = p.curve(np.array([[at(low) * 0.96, low], [(out + at(low)) / 2, low - 0.02], [out, (low + high) / 2],
-                                 [(out + at(high)) / 2, high + 0.03], [at(high) * 0.96, high]]), 20)  # fmt: skip
+        path = p.curve(
+            np.array(
+                [
+                    [at(low) * 0.96, low],
+                    [(out + at(low)) / 2, low - 0.02],
+                    [out, (low + high) / 2],
+                    [(out + at(high)) / 2, high + 0.03],
+                    [at(high) * 0.96, high],
+                ]
+            ),
+            20,
+        )
         thick = u(0.03, 0.075) * max(wide, 0.5)
         grip = p.tube(np.concatenate([path, np.zeros((20, 1))], 1), thick, segments=10).scale((1, 1, u(0.8, 1.8)))
         handle = body if rng.random() < 0.6 else a.part(str(rng.choice(["wood", "metal", "plastic"])))

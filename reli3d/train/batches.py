@@ -20,8 +20,17 @@ TURNED_UP = 0.12  # share of objects whose world is not +Y up: captures come in 
 NOISE = 0.012  # greatest standard deviation of a photograph's noise, sRGB
 RELIT = 0.5  # share of the objects whose photographs are made anew under another light
 MOST = 64  # views of a file
-OF_VIEWS = ("images", "masks", "silhouette", "c2w", "intrinsics", "view_material", "view_normal", "view_depth",
-            "view_valid")  # fmt: skip
+OF_VIEWS = (
+    "images",
+    "masks",
+    "silhouette",
+    "c2w",
+    "intrinsics",
+    "view_material",
+    "view_normal",
+    "view_depth",
+    "view_valid",
+)
 KEPT = 0.75  # share of the augmented objects that stay the right way round in a mirror, and keep their channels
 
 
@@ -132,13 +141,23 @@ def load_sample(
 
     origin = (c2w[:, :3, 3] * c2w[:, :3, 2]).sum(-1)[:, None, None]  # depth of the world's origin
     return Sample(
-        images=color.contiguous(), masks=masks.contiguous(), silhouette=mask_distance(masks.contiguous()), c2w=c2w,
-        intrinsics=intrinsics, view_material=half(of_pixels),
+        images=color.contiguous(),
+        masks=masks.contiguous(),
+        silhouette=mask_distance(masks.contiguous()),
+        c2w=c2w,
+        intrinsics=intrinsics,
+        view_material=half(of_pixels),
         view_normal=functional.normalize(half(normal) @ turn.T, dim=-1),
-        view_depth=half(depth[..., None])[..., 0] - origin, view_valid=whole > 0.99, points=volume @ turn.T,
-        distance=distance, surface=surface @ turn.T, material=material, visible=visible,
-        light_directions=map_directions(light.shape[0]).reshape(-1, 3) @ turn.T, light=light.reshape(-1, 3),
-    )  # fmt: skip
+        view_depth=half(depth[..., None])[..., 0] - origin,
+        view_valid=whole > 0.99,
+        points=volume @ turn.T,
+        distance=distance,
+        surface=surface @ turn.T,
+        material=material,
+        visible=visible,
+        light_directions=map_directions(light.shape[0]).reshape(-1, 3) @ turn.T,
+        light=light.reshape(-1, 3),
+    )
 
 
 def groups(sample: Sample, most: int, rng: np.random.Generator) -> list[Sample]:
@@ -151,8 +170,18 @@ def groups(sample: Sample, most: int, rng: np.random.Generator) -> list[Sample]:
     return out
 
 
-def batches(folder: Path, *, size: int, points: int, max_views: int, seed: int, start: int = 0, rank: int = 0,
-            lights: Tensor | None = None, every_view: bool = False) -> Iterator[list[Sample]]:  # fmt: skip
+def batches(
+    folder: Path,
+    *,
+    size: int,
+    points: int,
+    max_views: int,
+    seed: int,
+    start: int = 0,
+    rank: int = 0,
+    lights: Tensor | None = None,
+    every_view: bool = False,
+) -> Iterator[list[Sample]]:
     """Endless lists of ``size`` objects, each with 1 to ``max_views`` views; step ``k`` is a function of ``seed`` and
     ``k`` alone for a fixed folder, so training resumes; ``rank`` tells processes apart that share a step; ``lights``
     as in :func:`load_sample`.  every_view: all views of each object, in :func:`groups`.

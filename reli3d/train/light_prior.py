@@ -47,8 +47,17 @@ def blends(maps: Tensor, count: int, rng: np.random.Generator) -> Tensor:
     return torch.stack(out)
 
 
-def fit(decoder: EnvironmentDecoder, maps: Tensor, *, steps: int, minutes: float, rays: int = 512, batch: int = 16,
-        seed: int = 0, log=sys.stderr) -> Tensor:  # fmt: skip
+def fit(
+    decoder: EnvironmentDecoder,
+    maps: Tensor,
+    *,
+    steps: int,
+    minutes: float,
+    rays: int = 512,
+    batch: int = 16,
+    seed: int = 0,
+    log=sys.stderr,
+) -> Tensor:
     """Latents ``(n, L, 3)`` that decode to ``maps``; the decoder is fitted with them in place."""
     generator = torch.Generator().manual_seed(seed)
     latents = torch.nn.Parameter(

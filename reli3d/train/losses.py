@@ -11,11 +11,24 @@ from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.train.batches import Sample
 
 WEIGHTS = {
-    "occupancy": 1.0, "surface": 0.02, "gradient": 0.6,
-    "base_color": 2.0, "pattern": 12.0, "roughness": 1.5, "metallic": 1.5, "normal": 1.0,
-    "pixel_color": 1.5, "pixel_pattern": 12.0, "pixel_roughness": 1.0, "pixel_metallic": 1.0, "pixel_normal": 1.0,
-    "pixel_depth": 0.3, "light": 0.4, "light_level": 0.1, "irradiance": 0.4,
-}  # fmt: skip
+    "occupancy": 1.0,
+    "surface": 0.02,
+    "gradient": 0.6,
+    "base_color": 2.0,
+    "pattern": 12.0,
+    "roughness": 1.5,
+    "metallic": 1.5,
+    "normal": 1.0,
+    "pixel_color": 1.5,
+    "pixel_pattern": 12.0,
+    "pixel_roughness": 1.0,
+    "pixel_metallic": 1.0,
+    "pixel_normal": 1.0,
+    "pixel_depth": 0.3,
+    "light": 0.4,
+    "light_level": 0.1,
+    "irradiance": 0.4,
+}
 ASTRAY = 0.02, 0.3  # greatest deviation of position [model's cube] and normal [radian] of an extracted surface
 GRADIENT_POINTS, GRADIENT_STEP = 384, 0.012  # surface points whose level's slope is asked, over about a grid cell
 DEPTH_UNIT = 0.1  # of the object's longest side

@@ -116,16 +116,25 @@ def _alternatives(views: Views):
     turned = c2w.clone()
     turned[:, :3, :3] = c2w[:, :3, :3].transpose(1, 2)
     cases = [
-        ("the camera axes look flipped: OpenCV (+Y down, looking along +Z) given, OpenGL expected",
-         "negate the second and third column of each matrix", c2w @ flip),
+        (
+            "the camera axes look flipped: OpenCV (+Y down, looking along +Z) given, OpenGL expected",
+            "negate the second and third column of each matrix",
+            c2w @ flip,
+        ),
         ("the matrices look like world-to-camera", "store their inverses", inverse),
-        ("the matrices look like world-to-camera in OpenCV axes (as COLMAP has them)",
-         "store their inverses with the second and third column negated", inverse @ flip),
+        (
+            "the matrices look like world-to-camera in OpenCV axes (as COLMAP has them)",
+            "store their inverses with the second and third column negated",
+            inverse @ flip,
+        ),
         ("the rotations look transposed (world-to-camera) beside camera positions", "transpose the 3x3 blocks", turned),
-        ("the rotations look transposed and in OpenCV axes beside camera positions",
-         "transpose the 3x3 blocks, then negate their second and third column", turned @ flip),
+        (
+            "the rotations look transposed and in OpenCV axes beside camera positions",
+            "transpose the 3x3 blocks, then negate their second and third column",
+            turned @ flip,
+        ),
         ("the images look upside down", "turn them by 180 degrees", c2w @ half),
-    ]  # fmt: skip
+    ]
     for what, fix, poses in cases:
         yield what, fix, replace(views, c2w=poses)
     what = "the images look turned by 90 degrees (an EXIF orientation that was applied or lost?)"

@@ -330,12 +330,26 @@ def smoothing(g, small) -> Op:
 
 
 OPS = {
-    **{f.__name__: f for f in (triplane, flexicubes, centres, deviation, texture, normals, flat_normals, smoothing,
-                               density, irradiance, gaussians)},
+    **{
+        f.__name__: f
+        for f in (
+            triplane,
+            flexicubes,
+            centres,
+            deviation,
+            texture,
+            normals,
+            flat_normals,
+            smoothing,
+            density,
+            irradiance,
+            gaussians,
+        )
+    },
     **{f"attributes {n}": partial(attributes, channels=n) for n in (2, 3, 4)},
     **{f"points {name}": partial(points_of_a_mesh, tangents=name == "tangents") for name in ("tangents", "uv")},
     **{f"reflections {lobe}": partial(reflections, lobe=lobe) for lobe in ("visible", "mirrored")},
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", OPS)

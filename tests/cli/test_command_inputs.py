@@ -45,8 +45,19 @@ def place(tmp_path, monkeypatch):
     np.savez(tmp_path / "key.npz", maps=np.ones((8, 4, 8, 3), np.float32))
     np.savez(tmp_path / "pickle.npz", env=np.array([{}], dtype=object), names=names)
     (tmp_path / "cut.npz").write_bytes((tmp_path / "maps.npz").read_bytes()[:300])
-    for name, state in (("list", [1]), ("other", {"model": {"x": torch.zeros(2)}, "average": {}, "step": 0,
-                                                  "seconds": 0.0, "optimizer": {"param_groups": [1, 2]}})):  # fmt: skip
+    for name, state in (
+        ("list", [1]),
+        (
+            "other",
+            {
+                "model": {"x": torch.zeros(2)},
+                "average": {},
+                "step": 0,
+                "seconds": 0.0,
+                "optimizer": {"param_groups": [1, 2]},
+            },
+        ),
+    ):
         (tmp_path / f"run_{name}").mkdir()
         torch.save(state, tmp_path / f"run_{name}" / "state.pt")
     (tmp_path / "run_noise").mkdir()
@@ -55,45 +66,101 @@ def place(tmp_path, monkeypatch):
 
 
 CASES = [
-    *((render, ["x.glb", *options], word) for options, word in [
-        (["--samples", "-1", "0", "4"], "--samples"), (["--samples", "0", "0", "0"], "--samples"),
-        (["--samples", "99999999999", "1", "1"], "--samples"), (["--seed", "-1"], "--seed"),
-        (["--seed", "99999999999999999999"], "--seed"), (["--output", "file"], "a file"), ([], "not found")]),
-    *((data, ["render", "out", "--maps", *options], word) for options, word in [
-        (["none.npz"], "not found"), (["file"], "broken file"), (["cut.npz"], "broken file"), (["key.npz"], "env"),
-        (["pickle.npz"], "broken file"), (["shape.npz"], "env"), (["long.npz"], "names"), (["/dev/zero"], "regular"),
-        (["few.npz", "--held-back", "test"], "--maps"), (["maps.npz", "--workers", "0"], "--workers"),
-        (["maps.npz", "--first", "-5"], "--first"), (["maps.npz", "--count", "0"], "--count"),
-        (["maps.npz", "--views", "0"], "--views"), (["maps.npz", "--size", "0"], "--size"),
-        (["maps.npz", "--meshes", "none.glb"], "not found")]),
+    *(
+        (render, ["x.glb", *options], word)
+        for options, word in [
+            (["--samples", "-1", "0", "4"], "--samples"),
+            (["--samples", "0", "0", "0"], "--samples"),
+            (["--samples", "99999999999", "1", "1"], "--samples"),
+            (["--seed", "-1"], "--seed"),
+            (["--seed", "99999999999999999999"], "--seed"),
+            (["--output", "file"], "a file"),
+            ([], "not found"),
+        ]
+    ),
+    *(
+        (data, ["render", "out", "--maps", *options], word)
+        for options, word in [
+            (["none.npz"], "not found"),
+            (["file"], "broken file"),
+            (["cut.npz"], "broken file"),
+            (["key.npz"], "env"),
+            (["pickle.npz"], "broken file"),
+            (["shape.npz"], "env"),
+            (["long.npz"], "names"),
+            (["/dev/zero"], "regular"),
+            (["few.npz", "--held-back", "test"], "--maps"),
+            (["maps.npz", "--workers", "0"], "--workers"),
+            (["maps.npz", "--first", "-5"], "--first"),
+            (["maps.npz", "--count", "0"], "--count"),
+            (["maps.npz", "--views", "0"], "--views"),
+            (["maps.npz", "--size", "0"], "--size"),
+            (["maps.npz", "--meshes", "none.glb"], "not found"),
+        ]
+    ),
     (data, ["render", "file", "--maps", "maps.npz"], "a file"),
     (data, ["pack", "none", "out"], "none"),
     (data, ["pack", "empty", "out"], "captures"),
     (data, ["pack", "good", "out", "--each", "0"], "--each"),
     (data, ["check", "empty"], "not found"),
     (data, ["show", "empty"], "not found"),
-    *((stages, [stage, "out", "good", *options], word) for stage, options, word in [
-        ("nothing", [], "stage"), ("volume", ["--steps", "-1"], "--steps"), ("volume", ["--rate", "nan"], "--rate"),
-        ("volume", ["--inputs", "17"], "inputs"), ("volume", ["--start", "none"], "none"),
-        ("volume", ["--prior", "file"], "light prior"), ("volume", ["--patch", "999"], "patch")]),
-    *((train, [folder, "out"], word) for folder, word in [
-        ("none", "folder of samples"), ("file", "folder of samples"), ("empty", "got none"), ("lacks", "points"),
-        ("few", "c2w"), ("cut", "broken file"), ("nothing", "broken file"), ("noise", "broken file")]),
-    *((train, ["good", "out", *options], word) for options, word in [
-        (["--batch", "0"], "--batch"), (["--steps", "0"], "--steps"), (["--minutes", "nan"], "--minutes"),
-        (["--points", "0"], "--points"), (["--max-views", "0"], "--max-views"), (["--rate", "nan"], "--rate"),
-        (["--seed", "-1"], "--seed"), (["--validation", "cut"], "broken file"), (["--export", "a/b"], "not found")]),
+    *(
+        (stages, [stage, "out", "good", *options], word)
+        for stage, options, word in [
+            ("nothing", [], "stage"),
+            ("volume", ["--steps", "-1"], "--steps"),
+            ("volume", ["--rate", "nan"], "--rate"),
+            ("volume", ["--inputs", "17"], "inputs"),
+            ("volume", ["--start", "none"], "none"),
+            ("volume", ["--prior", "file"], "light prior"),
+            ("volume", ["--patch", "999"], "patch"),
+        ]
+    ),
+    *(
+        (train, [folder, "out"], word)
+        for folder, word in [
+            ("none", "folder of samples"),
+            ("file", "folder of samples"),
+            ("empty", "got none"),
+            ("lacks", "points"),
+            ("few", "c2w"),
+            ("cut", "broken file"),
+            ("nothing", "broken file"),
+            ("noise", "broken file"),
+        ]
+    ),
+    *(
+        (train, ["good", "out", *options], word)
+        for options, word in [
+            (["--batch", "0"], "--batch"),
+            (["--steps", "0"], "--steps"),
+            (["--minutes", "nan"], "--minutes"),
+            (["--points", "0"], "--points"),
+            (["--max-views", "0"], "--max-views"),
+            (["--rate", "nan"], "--rate"),
+            (["--seed", "-1"], "--seed"),
+            (["--validation", "cut"], "broken file"),
+            (["--export", "a/b"], "not found"),
+        ]
+    ),
     (train, ["good", "file"], "a file"),
     (train, ["good", "run_list"], "broken file"),
     (train, ["good", "run_noise"], "broken file"),
     (train, ["good", "run_other"], "run_other/state.pt"),
     (train, ["good", "run_noise", "--export", "x.safetensors"], "broken file"),
-    *((evaluation, [folder, "--maps", maps, *options], word) for folder, maps, options, word in [
-        ("none", "maps.npz", [], "folder of samples"), ("named", "maps.npz", [], "seed"),
-        ("cut", "maps.npz", [], "broken file"), ("good", "cut.npz", [], "broken file"),
-        ("good", "maps.npz", ["--json", "file/x"], "a file"), ("good", "maps.npz", ["--json", "good"], "a folder"),
-        ("good", "maps.npz", ["--weights", "none"], "none")]),
-]  # fmt: skip
+    *(
+        (evaluation, [folder, "--maps", maps, *options], word)
+        for folder, maps, options, word in [
+            ("none", "maps.npz", [], "folder of samples"),
+            ("named", "maps.npz", [], "seed"),
+            ("cut", "maps.npz", [], "broken file"),
+            ("good", "cut.npz", [], "broken file"),
+            ("good", "maps.npz", ["--json", "file/x"], "a file"),
+            ("good", "maps.npz", ["--json", "good"], "a folder"),
+            ("good", "maps.npz", ["--weights", "none"], "none"),
+        ]
+    ),
+]
 
 
 def before(place):

@@ -193,8 +193,26 @@ def test_the_name_of_the_output_makes_an_animation(scene, tmp_path, ending):
     path = tmp_path / f"turn.{ending}"
     said = io.StringIO()
     with contextlib.redirect_stdout(said):
-        assert main([str(scene / "ball.glb"), "--light", str(scene / "half.hdr"), "--output", str(path), "--size", "48",
-                     "--frames", "4", "--rotate-light", "--quality", "draft", "--json"]) == 0  # fmt: skip
+        assert (
+            main(
+                [
+                    str(scene / "ball.glb"),
+                    "--light",
+                    str(scene / "half.hdr"),
+                    "--output",
+                    str(path),
+                    "--size",
+                    "48",
+                    "--frames",
+                    "4",
+                    "--rotate-light",
+                    "--quality",
+                    "draft",
+                    "--json",
+                ]
+            )
+            == 0
+        )
     assert json.loads(said.getvalue()) == {
         "files": [str(path)],
         "frames": 4,

@@ -167,8 +167,12 @@ def test_skip_existing_adds_what_is_missing_and_changes_no_shard(tmp_path, capsy
     assert command(shard, "--shards-out", 2, "--skip-existing", "--json") == 0
     told = json.loads(capsys.readouterr().out)["objects"]
     assert {t["object"]: Path(t["shard"]).name for t in told} == {
-        "object_0": "000000.tar", "object_3": "000000.tar", "object_4": "000001.tar", "object_1": "000002.tar",
-        "object_2": "000002.tar"}  # fmt: skip
+        "object_0": "000000.tar",
+        "object_3": "000000.tar",
+        "object_4": "000001.tar",
+        "object_1": "000002.tar",
+        "object_2": "000002.tar",
+    }
     assert all(t["faces"] for t in told)
     assert (tmp_path / "out" / "000000.tar").read_bytes() == first
     assert sorted(packed(tmp_path / "out")) == [f"object_{k}" for k in range(5)]

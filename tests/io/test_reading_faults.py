@@ -113,8 +113,17 @@ def test_a_file_without_permission_is_told_so(tmp_path, monkeypatch):
 
 def test_many_frames_are_not_counted(tmp_path):
     """A TIFF whose 20,000 directories follow each other; each has an entry of its own."""
-    entries = [(256, 3, 1), (257, 3, 1), (258, 3, 8), (259, 3, 1), (262, 3, 1), (273, 4, 8), (277, 3, 1), (278, 3, 1),
-               (279, 4, 1)]  # fmt: skip
+    entries = [
+        (256, 3, 1),
+        (257, 3, 1),
+        (258, 3, 8),
+        (259, 3, 1),
+        (262, 3, 1),
+        (273, 4, 8),
+        (277, 3, 1),
+        (278, 3, 1),
+        (279, 4, 1),
+    ]
     size = 2 + 12 * len(entries) + 4
     data = bytearray(b"II*\0" + struct.pack("<I", 16) + bytes(8))
     for k in range(20_000):
@@ -209,9 +218,18 @@ def test_glb_fields(tmp_path, fields, word):
         read_glb(glb(tmp_path / "bad.glb", **fields))
 
 
-@pytest.mark.parametrize("change", [{"shape": [1.0]}, {"shape": ["1"]}, {"shape": [True]}, {"data_offsets": [0.0, 4]},
-                                    {"data_offsets": ["0", "4"]}, {"data_offsets": [0, 1e400]},
-                                    {"data_offsets": [0]}])  # fmt: skip
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"shape": [1.0]},
+        {"shape": ["1"]},
+        {"shape": [True]},
+        {"data_offsets": [0.0, 4]},
+        {"data_offsets": ["0", "4"]},
+        {"data_offsets": [0, 1e400]},
+        {"data_offsets": [0]},
+    ],
+)
 def test_headers_of_weights_hold_integers(tmp_path, change):
     header = json.dumps({"x": {"dtype": "F32", "shape": [1], "data_offsets": [0, 4], **change}}).encode()
     (tmp_path / "w").write_bytes(len(header).to_bytes(8, "little") + header + bytes(4))

@@ -185,8 +185,22 @@ def test_exported_roughness_is_the_root_of_the_published_number(tiny, asset):
 def test_the_command_takes_published_weights_and_writes_published_names(tiny, tmp_path, capsys):
     weights = tmp_path / "tiny.safetensors"
     save(weights, tiny, licence="of the test", dtype=torch.float32)
-    arguments = [str(infer.EXAMPLE), "--weights", str(weights), "--output", str(tmp_path / "out"), "--device", "cpu",
-                 "--views", "2", "--texture-size", "256", "--resolution", "16", "--compatible-names"]  # fmt: skip
+    arguments = [
+        str(infer.EXAMPLE),
+        "--weights",
+        str(weights),
+        "--output",
+        str(tmp_path / "out"),
+        "--device",
+        "cpu",
+        "--views",
+        "2",
+        "--texture-size",
+        "256",
+        "--resolution",
+        "16",
+        "--compatible-names",
+    ]
     assert infer.main([*arguments, "--hero", "1", "--background", "visible", "--precision", "bfloat16"]) == 0
     folder = tmp_path / "out" / "example"
     assert sorted(p.name for p in folder.iterdir()) == sorted((*results.FILES, "illumination.hdr"))

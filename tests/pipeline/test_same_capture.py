@@ -36,12 +36,33 @@ def write_form(folder: Path, form: str) -> Path:
         fov = [2 * math.atan(0.5 * width / fx), 2 * math.atan(0.5 * height / fy)]
         data = {"frames": [f | {"camera_fov": fov, "camera_principal_point": [cx, cy]} for f in frames]}
     elif form == "nerfstudio":
-        data = {"camera_model": "OPENCV", "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": width, "h": height,
-                "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0, "frames": frames}  # fmt: skip
+        data = {
+            "camera_model": "OPENCV",
+            "fl_x": fx,
+            "fl_y": fy,
+            "cx": cx,
+            "cy": cy,
+            "w": width,
+            "h": height,
+            "k1": 0.0,
+            "k2": 0.0,
+            "p1": 0.0,
+            "p2": 0.0,
+            "frames": frames,
+        }
     elif form == "instant-ngp":
-        data = {"camera_angle_x": 2 * math.atan(0.5 * width / fx), "camera_angle_y": 2 * math.atan(0.5 * height / fy),
-                "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": float(width), "h": float(height), "aabb_scale": 4,
-                "frames": [f | {"sharpness": 30.0} for f in frames]}  # fmt: skip
+        data = {
+            "camera_angle_x": 2 * math.atan(0.5 * width / fx),
+            "camera_angle_y": 2 * math.atan(0.5 * height / fy),
+            "fl_x": fx,
+            "fl_y": fy,
+            "cx": cx,
+            "cy": cy,
+            "w": float(width),
+            "h": float(height),
+            "aabb_scale": 4,
+            "frames": [f | {"sharpness": 30.0} for f in frames],
+        }
     else:
         write_colmap(folder / "sparse/0", form, names, poses, (width, height), (fx, fy, cx, cy))
         return folder
@@ -118,8 +139,18 @@ def test_many_photographs_from_one_place_do_not_hide_the_others(tmp_path):
             pixels = torch.cat([image, mask[..., None]], -1).mul(255).round().byte().numpy()
             Image.fromarray(pixels).save(tmp_path / name / f"{k}.png")
             fx, fy, cx, cy = views.intrinsics[k].double().tolist()
-            frames.append({"file_path": f"{k}.png", "transform_matrix": views.c2w[k].double().tolist(), "fl_x": fx,
-                           "fl_y": fy, "cx": cx, "cy": cy, "w": 128, "h": 128})  # fmt: skip
+            frames.append(
+                {
+                    "file_path": f"{k}.png",
+                    "transform_matrix": views.c2w[k].double().tolist(),
+                    "fl_x": fx,
+                    "fl_y": fy,
+                    "cx": cx,
+                    "cy": cy,
+                    "w": 128,
+                    "h": 128,
+                }
+            )
         (tmp_path / name / "transforms.json").write_text(json.dumps({"frames": frames}))
         loaded = load_views(tmp_path / name)
         assert len(loaded) <= 16 and loaded.in_folder == len(eyes)

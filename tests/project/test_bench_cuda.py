@@ -23,9 +23,12 @@ def test_all_pieces_fit_into_eight_minutes():
 
 @pytest.mark.parametrize(
     "code, seconds, end",
-    [("print('fine')", 60.0, "ok"), ("raise SystemExit(3)", 60.0, "failed (3)"),
-     ("print('half', flush=True); import time; time.sleep(60)", 8.0, "out of time (8 s)")],
-)  # fmt: skip
+    [
+        ("print('fine')", 60.0, "ok"),
+        ("raise SystemExit(3)", 60.0, "failed (3)"),
+        ("print('half', flush=True); import time; time.sleep(60)", 8.0, "out of time (8 s)"),
+    ],
+)
 def test_a_piece_that_fails_or_hangs_is_told(code, seconds, end, tmp_path):
     row = run_piece(Piece("piece", ("-c", code), seconds), tmp_path, 100.0)
     assert row["end"] == end

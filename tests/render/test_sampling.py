@@ -250,8 +250,18 @@ def test_random_pairs_are_uniform_independent_and_addressed(device):
 
 def test_no_two_streams_share_a_state(device):
     """A million pairs of 48 bits from ten streams of neighbouring counters; by chance 0.002 would be equal."""
-    streams = [{}, {"seed": 1}, {"seed": 2}, {"seed": 1 << 16}, {"sample": 1}, {"sample": 2}, {"sample": 1 << 16},
-               {"dimension": 1}, {"dimension": 2}, {"seed": 1, "sample": 1, "dimension": 1}]  # fmt: skip
+    streams = [
+        {},
+        {"seed": 1},
+        {"seed": 2},
+        {"seed": 1 << 16},
+        {"sample": 1},
+        {"sample": 2},
+        {"sample": 1 << 16},
+        {"dimension": 1},
+        {"dimension": 2},
+        {"seed": 1, "sample": 1, "dimension": 1},
+    ]
     u = torch.cat([random_pairs(100_000, **stream, device=device) for stream in streams])
     bits = (u.double() * 2**24).long()
     assert len(torch.unique(bits[:, 0] * 2**24 + bits[:, 1])) == len(u)

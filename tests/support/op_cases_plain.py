@@ -144,23 +144,45 @@ CASES = {
     "closest, Warp": Case(rays, traced("warp"), rows=("origins", "directions")),
     "closest, Embree": Case(rays, traced("embree"), rows=("origins", "directions")),
     "draws": Case(
-        lambda n: {"u": numbers(n), "radiance": uniform(8, 16, 3, seed=5), "wo": above(n, 1),
-                   "alpha": uniform(n, seed=2, low=0.1)}, drawn, rows=("u", "wo", "alpha")),
+        lambda n: {
+            "u": numbers(n),
+            "radiance": uniform(8, 16, 3, seed=5),
+            "wo": above(n, 1),
+            "alpha": uniform(n, seed=2, low=0.1),
+        },
+        drawn,
+        rows=("u", "wo", "alpha"),
+    ),
     "shade_light": Case(shaded, asked, rows=MAP),
     "sample_weights": Case(
-        lambda n: {"density": uniform(n, seed=1, low=-3.0, high=27.0)}, lambda density: (
-            sample_weights(density, packed(density)),), rows=("density",)),
-    "march_rays": Case(lambda n: {"origins": 2.0 * units(n, 1), "directions": units(n, 2)}, marched,
-                       rows=("origins", "directions")),
+        lambda n: {"density": uniform(n, seed=1, low=-3.0, high=27.0)},
+        lambda density: (sample_weights(density, packed(density)),),
+        rows=("density",),
+    ),
+    "march_rays": Case(
+        lambda n: {"origins": 2.0 * units(n, 1), "directions": units(n, 2)}, marched, rows=("origins", "directions")
+    ),
     "bake": Case(lambda n: {"vertices": corners(12)}, texels),
-    "views": Case(lambda n: {"points": uniform(n, 3, seed=1, low=-0.6, high=0.6), "normal": units(n, 2)}, seen_from,
-                  rows=("points", "normal")),
-    "hull": Case(lambda n: {"masks": (uniform(3, 24, 20, seed=1) > 0.6).float(), "points": uniform(n, 3, low=-0.8)},
-                 hulls, rows=("points",)),
+    "views": Case(
+        lambda n: {"points": uniform(n, 3, seed=1, low=-0.6, high=0.6), "normal": units(n, 2)},
+        seen_from,
+        rows=("points", "normal"),
+    ),
+    "hull": Case(
+        lambda n: {"masks": (uniform(3, 24, 20, seed=1) > 0.6).float(), "points": uniform(n, 3, low=-0.8)},
+        hulls,
+        rows=("points",),
+    ),
     "cover_silhouettes": Case(
-        lambda n: {"level": uniform(12, 11, 10, seed=1, low=0.1, high=2.0), "bound": uniform(12, 11, 10, low=-3.0),
-                   "masks": hull_masks()}, covered),
+        lambda n: {
+            "level": uniform(12, 11, 10, seed=1, low=0.1, high=2.0),
+            "bound": uniform(12, 11, 10, low=-3.0),
+            "masks": hull_masks(),
+        },
+        covered,
+    ),
     "ReniLight": Case(lambda n: {"directions": units(n, 1)}, asked_of_reni, rows=("directions",)),
     "interpolate tangents": Case(
-        lambda n: {"values": uniform(180, 4, seed=1), "bary": weights(n)}, four, ("values", "bary"), ("bary",)),
-}  # fmt: skip
+        lambda n: {"values": uniform(180, 4, seed=1), "bary": weights(n)}, four, ("values", "bary"), ("bary",)
+    ),
+}

@@ -176,8 +176,9 @@ def test_steps_without_finite_gradients_are_left_out_and_end_a_run(folder, tmp_p
     model = ball_model()
     before = {k: v.clone() for k, v in model.state_dict().items()}
     broken = loop.object_losses
-    monkeypatch.setattr(loop, "object_losses",
-                        lambda *a, **k: {n: v * float("nan") for n, v in broken(*a, **k).items()})  # fmt: skip
+    monkeypatch.setattr(
+        loop, "object_losses", lambda *a, **k: {n: v * float("nan") for n, v in broken(*a, **k).items()}
+    )
     with pytest.raises(RuntimeError, match="gradients: expected finite ones, got none in 3 steps"):
         train(model, run, [Samples(folder)])
     assert all(torch.equal(v, before[k]) for k, v in model.state_dict().items())

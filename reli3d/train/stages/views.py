@@ -57,8 +57,11 @@ class ObjectViews:
         """``size`` pixels a side, filtered over the area that they cover; maps are means over where they are known."""
         if size == self.images.shape[1]:
             return self
-        planes = lambda x: interpolate(x.movedim(-1, 1), (size, size), mode="bilinear", align_corners=False,  # noqa: E731
-                                       antialias=True).movedim(1, -1)  # fmt: skip
+
+        def planes(x: Tensor) -> Tensor:
+            x = interpolate(x.movedim(-1, 1), (size, size), mode="bilinear", align_corners=False, antialias=True)
+            return x.movedim(1, -1)
+
         changed: dict[str, Any] = {
             "images": planes(self.images).clamp(0, 1).contiguous(),
             "masks": planes(self.masks[..., None])[..., 0].clamp(0, 1).contiguous(),
@@ -116,11 +119,16 @@ def sample_views(read: Callable[[str], Any], choose: Chooser) -> ObjectViews:
     valid, depth = of_views("view_valid"), of_views("view_depth")
     material, normal = of_views("view_material"), of_views("view_normal")
     return ObjectViews(
-        images[..., :3].contiguous(), images[..., 3].contiguous(), c2w, intrinsics,
-        background=True, valid=valid, material=None if material is None else material / 255,
+        images[..., :3].contiguous(),
+        images[..., 3].contiguous(),
+        c2w,
+        intrinsics,
+        background=True,
+        valid=valid,
+        material=None if material is None else material / 255,
         normal=None if normal is None else normalize(normal, dim=-1),
         shown=None if depth is None else (depth > 0).float(),
-    )  # fmt: skip
+    )
 
 
 class Samples:
@@ -155,8 +163,17 @@ class Draw:
     seed: int  # of everything random in the rendering
 
 
-def draw(sources: Sequence[Source], seed: tuple[int, ...], *, inputs: int, targets: int, background: float,
-         input_size: int, target_size: int, patch: int) -> Draw:  # fmt: skip
+def draw(
+    sources: Sequence[Source],
+    seed: tuple[int, ...],
+    *,
+    inputs: int,
+    targets: int,
+    background: float,
+    input_size: int,
+    target_size: int,
+    patch: int,
+) -> Draw:
     """A random object: 1 to ``inputs`` random views are read, ``targets`` others are compared.
 
     A function of ``seed`` and the sources alone.  Of an object with fewer views fewer are read; the only view of an
