@@ -146,11 +146,12 @@ def write(folder: Path, files: dict[str, bytes]) -> None:
 def in_fork(inputs: Sequence[tuple[int, Target, list[int]]]) -> Iterator[Outcome]:
     """Outcomes of ``inputs``, up to the first that ends the process or its limits."""
     ours, theirs = os.pipe()
+    root = Path(tempfile.mkdtemp(prefix="campaign"))
     pid = os.fork()
     if pid == 0:
         try:
             os.close(ours)
-            _read_all(inputs, theirs)
+            _read_all(inputs, theirs, root)
             os._exit(0)
         finally:
             os._exit(OWN_FAULT)
@@ -180,25 +181,22 @@ def in_fork(inputs: Sequence[tuple[int, Target, list[int]]]) -> Iterator[Outcome
         if pid:
             os.kill(pid, signal.SIGKILL)
             os.waitpid(pid, 0)
+        shutil.rmtree(root, ignore_errors=True)
 
 
-def _read_all(inputs: Sequence[tuple[int, Target, list[int]]], pipe: int) -> None:
-    """In the fork: each input in a folder of its own."""
+def _read_all(inputs: Sequence[tuple[int, Target, list[int]]], pipe: int, root: Path) -> None:
+    """In the fork: each input in a folder of its own under ``root``."""
     faulthandler.disable()  # pytest's; a crash is told by the parent
     for stream in (1, 2):
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
     limit = _kilobytes("VmSize") * 1024 + 3 * MEMORY  # threads and their heaps take addresses, not memory
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
-    root = Path(tempfile.mkdtemp(prefix="campaign"))
-    try:
-        for number, target, edits in inputs:
-            folder = root / str(number)
-            folder.mkdir()
-            write(folder, applied(target, edits))
-            os.write(pipe, json.dumps(asdict(_tried(number, target, folder))).encode() + b"\n")
-            shutil.rmtree(folder)
-    finally:
-        shutil.rmtree(root, ignore_errors=True)
+    for number, target, edits in inputs:
+        folder = root / str(number)
+        folder.mkdir()
+        write(folder, applied(target, edits))
+        os.write(pipe, json.dumps(asdict(_tried(number, target, folder))).encode() + b"\n")
+        shutil.rmtree(folder)
 
 
 def _tried(number: int, target: Target, folder: Path) -> Outcome:

@@ -3,6 +3,7 @@
 import os
 import signal
 import sys
+import tempfile
 import time
 from random import Random
 
@@ -28,7 +29,8 @@ def outcomes(read, count: int = 3):
     return list(campaign.in_fork([(k, target, []) for k in range(count)]))
 
 
-def test_every_kind_of_fault_is_told_apart(small_threads, monkeypatch):
+def test_every_kind_of_fault_is_told_apart_and_none_leaves_files(small_threads, monkeypatch, tmp_path):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.setattr(campaign, "SECONDS", 0.2)
     monkeypatch.setattr(campaign, "MEMORY", 1 << 26)
     monkeypatch.setattr(campaign, "WALL", 3.0)
@@ -66,6 +68,7 @@ def test_every_kind_of_fault_is_told_apart(small_threads, monkeypatch):
     assert [o.kind for o in outcomes(kept, 1)] == ["memory"]
     (crash,) = outcomes(lambda folder: os.kill(os.getpid(), signal.SIGSEGV))  # the rest goes to another process
     assert (crash.kind, crash.text) == ("crash", "SIGSEGV")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_finding_is_saved_with_few_changes_and_the_rest_is_tried(tmp_path, small_threads):
