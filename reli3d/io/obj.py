@@ -1,6 +1,7 @@
 """Wavefront OBJ out, with the metallic-roughness words that Blender and others read from a material file.
 
 The words ``map_Pr``, ``map_Pm`` and ``norm`` are those of the PBR extension (http://exocortex.com/blog/extending_wavefront_mtl_to_support_pbr).
+``Ks 0.5`` is what Blender writes and reads for a dielectric of refractive index 1.5; without it nothing shines there.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from reli3d.render.asset import Asset
 
 MATERIAL = """newmtl baked
 Kd 1 1 1
+Ks 0.5 0.5 0.5
 map_Kd {name}_base_color.png
 map_Pr {name}_roughness.png
 map_Pm {name}_metallic.png

@@ -10,6 +10,8 @@ import torch
 
 from reli3d.io.glb import write_glb
 from reli3d.io.hdr import read_environment, write_environment
+from reli3d.io.obj import obj_files
+from reli3d.io.usd import usdz_bytes
 from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.environment import Environment
 from tests.support import clients
@@ -88,3 +90,31 @@ def of_rgba(rgba: np.ndarray) -> Seen:
 @pytest.mark.parametrize("client", [clients.three_js, clients.model_viewer, clients.blender])
 def test_a_client_shows_the_light_where_we_do(client, folder, ours):
     agree(of_rgba(client(folder, SHOT)), ours)
+
+
+def test_blender_shows_the_exports_as_the_glb(folder, tmp_path):
+    """A ball of four colours, of which a half is rough and another half is metal: a map that is lost, flipped or taken
+    for another gives another picture, as the halves exchanged show.
+    """
+    light = read_environment(folder / "environment.exr")
+    write_environment(tmp_path / "environment.exr", light + torch.linspace(1.0, 0.0, len(light))[:, None, None])
+    row, column = torch.meshgrid(torch.arange(64) < 32, torch.arange(64) < 24, indexing="ij")
+    color = torch.stack([row, column, ~row], -1).float() * 0.6 + 0.2
+    maps = [torch.where(half, 0.9, 0.15).float() for half in (row, column)]
+    ball = ball_mesh(4, 0.6)
+    for name, (roughness, metallic) in (("mesh", maps), ("exchanged", maps[::-1])):
+        asset = Asset(ball, TextureSet(color, roughness, metallic))
+        write_glb(tmp_path / f"{name}.glb", asset)
+    asset = Asset(ball, TextureSet(color, *maps))
+    (tmp_path / "mesh.usdz").write_bytes(usdz_bytes(asset))
+    for file, data in obj_files(asset, "mesh").items():
+        (tmp_path / file).write_bytes(data)
+    glb, usdz, obj, exchanged = (
+        clients.blender(tmp_path, SHOT, file) for file in ("mesh.glb", "mesh.usdz", "mesh.obj", "exchanged.glb")
+    )
+
+    def off(image):
+        return float(np.abs(image - glb).mean())
+
+    assert off(usdz) < 0.2 and off(obj) < 0.2, (off(usdz), off(obj))  # of 255: triangles in another order
+    assert off(exchanged) > 2.0

@@ -116,7 +116,12 @@ import bpy
 from mathutils import Matrix, Vector
 folder, eye, fov, size = sys.argv[1], eval(sys.argv[2]), float(sys.argv[3]), int(sys.argv[4])
 bpy.ops.wm.read_factory_settings(use_empty=True)
-bpy.ops.import_scene.gltf(filepath=folder + "/mesh.glb")
+path = folder + "/" + sys.argv[5]
+load = {"glb": bpy.ops.import_scene.gltf, "usdz": bpy.ops.wm.usd_import, "obj": bpy.ops.wm.obj_import}
+load[path.rsplit(".", 1)[1]](filepath=path)
+for image in bpy.data.images:
+    if path.endswith("obj") and ("roughness" in image.name or "metallic" in image.name):
+        image.colorspace_settings.name = "Non-Color"  # as docs/viewers.md says
 scene = bpy.context.scene
 scene.world = bpy.data.worlds.new("light")
 scene.world.use_nodes = True
@@ -142,11 +147,13 @@ bpy.ops.render.render(write_still=True)
 """
 
 
-def blender(folder: Path, shot: Shot) -> np.ndarray:
+def blender(folder: Path, shot: Shot, mesh: str = "mesh.glb") -> np.ndarray:
+    """``mesh``: the file of ``folder`` that is loaded, ``.glb``, ``.usdz`` or ``.obj``."""
     place = os.environ.get("RELI3D_BPY")
     if place is None:
         pytest.skip("needs PyPI's bpy in the folder RELI3D_BPY")
-    command = [sys.executable, "-c", BLENDER, str(folder), str(shot.eye.tolist()), str(shot.fov), str(shot.size)]
+    options = [str(folder), str(shot.eye.tolist()), str(shot.fov), str(shot.size), mesh]
+    command = [sys.executable, "-c", BLENDER, *options]
     environment = {**os.environ, "PYTHONPATH": place}
     done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=600)
     assert (folder / "blender.png").exists(), done.stderr
