@@ -1,6 +1,7 @@
 """``reli3d``: every command by its name; ``reli3d view`` serves the page of a folder and nothing else."""
 
 import re
+import signal
 import subprocess
 import sys
 import urllib.error
@@ -43,7 +44,12 @@ def test_view_serves_the_folder_on_this_machine_until_it_is_told_to_stop(tmp_pat
     (tmp_path / "out" / view.PAGE).write_text("the page")
     (tmp_path / "secret").write_text("not served")
     command = [sys.executable, "-m", "reli3d.cli.main", "view", str(tmp_path / "out"), "--no-browser"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+
+    def heard():  # a shell's background job ignores Ctrl-C, and so would its children
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, preexec_fn=heard) as process:
         try:
             url = process.stdout.readline().strip()
             assert re.fullmatch(r"http://127\.0\.0\.1:\d+/viewer\.html", url)
@@ -52,7 +58,7 @@ def test_view_serves_the_folder_on_this_machine_until_it_is_told_to_stop(tmp_pat
             with pytest.raises(urllib.error.HTTPError):
                 urllib.request.urlopen(url.replace("viewer.html", "../secret"), timeout=30)
         finally:
-            process.send_signal(2)  # Ctrl-C
+            process.send_signal(signal.SIGINT)
             assert process.wait(30) == 0
         assert process.stderr.read() == ""
 
