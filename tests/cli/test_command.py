@@ -10,6 +10,7 @@ import urllib.request
 import pytest
 
 from reli3d.cli import doctor, main, view
+from tests.support.signals import heed_signals
 
 
 def test_help_names_every_command_and_the_old_names(capsys):
@@ -45,11 +46,8 @@ def test_view_serves_the_folder_on_this_machine_until_it_is_told_to_stop(tmp_pat
     (tmp_path / "secret").write_text("not served")
     command = [sys.executable, "-m", "reli3d.cli.main", "view", str(tmp_path / "out"), "--no-browser"]
 
-    def heard():  # a shell's background job ignores Ctrl-C, and so would its children
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
-
     pipe = subprocess.PIPE
-    with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, preexec_fn=heard) as process:
+    with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, preexec_fn=heed_signals) as process:
         try:
             url = process.stdout.readline().strip()
             assert re.fullmatch(r"http://127\.0\.0\.1:\d+/viewer\.html", url)

@@ -10,6 +10,7 @@ import time
 import pytest
 
 from reli3d.cli import infer
+from tests.support.signals import heed_signals
 
 # reli3d-infer without torch, which takes seconds to load, and without a network: its one object is {body}
 QUICK = """
@@ -36,7 +37,8 @@ WAITS = """with replacing() as new:
 
 
 def start(arguments, *, body=WRITES, **options) -> subprocess.Popen:
-    options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, **options}
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    options = {**pipes, "preexec_fn": heed_signals, **options}
     return subprocess.Popen([sys.executable, "-c", QUICK.format(body=body), *map(str, arguments)], **options)
 
 
