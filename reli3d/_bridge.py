@@ -358,9 +358,7 @@ def call(kernel, n: int, ins: Sequence, outs: Sequence, *, device: torch.device,
 
 def tensor_of(value, dtype: torch.dtype = torch.float32):
     """``value`` as a tensor of ``dtype`` where nothing is lost: numpy arrays, and for int32, int64 any integers.
-
-    What would lose digits, and anything else, comes back as it is, for :func:`check` to refuse.
-    """
+    Anything else comes back as it is, for :func:`check` to refuse."""
     if isinstance(value, np.ndarray):
         if value.dtype.name not in ("float32", "float64", "int64", "int32", "int16", "uint8", "uint16", "uint32"):
             return value
@@ -379,6 +377,12 @@ def present(name: str, value: T | None) -> T:
     if value is None:
         raise ValueError(f"{name}: expected a value, got None")
     return value
+
+
+def expect(name: str, value: object, kind: type) -> None:
+    """Raise TypeError as ``name: expected X, got Y`` for a value that is no ``kind``."""
+    if not isinstance(value, kind):
+        raise TypeError(f"{name}: expected {kind.__name__}, got {type(value).__name__}")
 
 
 def check(

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from reli3d._bridge import present
+from reli3d._bridge import expect, present
 from reli3d.geometry.bake import bake
 from reli3d.geometry.camera import Camera
 from reli3d.geometry.cover import cover_silhouettes
@@ -348,6 +348,7 @@ def reconstruct(views: Views, *, weights: str | Network = "small", device: str =
     asset.  Raises ValueError on options out of range and where the masks hold no object, NoSurface where the field
     holds none.
     """
+    expect("views", views, Views)
     model = weights if isinstance(weights, Network) else load_model(weights, device)
     watch = watch or Stopwatch(model.device)
     with watch.stage("normalize"):

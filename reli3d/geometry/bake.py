@@ -15,7 +15,7 @@ import warp as wp
 from torch import Tensor
 
 from reli3d import _bridge
-from reli3d._bridge import check, struct_of
+from reli3d._bridge import check, expect, struct_of
 from reli3d.geometry.mesh import Mesh, sorted_keys, vertex_normals
 from reli3d.kernels import raster as kernels
 
@@ -42,8 +42,7 @@ class Texels:
 
 def _corners(mesh: Mesh, size: int) -> Tensor:
     """Corners of the faces in texels, ``(F, 3, 2)``, checked."""
-    if not isinstance(mesh, Mesh):
-        raise TypeError(f"mesh: expected Mesh, got {type(mesh).__name__}")
+    expect("mesh", mesh, Mesh)
     if mesh.uv is None:
         raise ValueError("mesh.uv: expected UV coordinates, got None (see unwrap)")
     if not isinstance(size, int) or not 1 <= size <= 16384:

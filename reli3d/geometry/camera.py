@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from reli3d._bridge import check, tensor_of
+from reli3d._bridge import check, expect, tensor_of
 
 
 @dataclass(frozen=True)
@@ -50,6 +50,8 @@ class Camera:
     @classmethod
     def from_fov(cls, c2w: Tensor, fov_x: float, width: int, height: int) -> Camera:
         """Camera with the horizontal field of view ``fov_x`` [rad], square pixels and the axis at the image centre."""
+        c2w = tensor_of(c2w)
+        check("c2w", c2w, last=4)
         if not 0.0 < fov_x < torch.pi:
             raise ValueError(f"fov_x: expected radians in (0, pi), got {fov_x}")
         f = 0.5 * width / torch.tan(torch.tensor(0.5 * fov_x, dtype=torch.float64)).item()
@@ -91,8 +93,7 @@ def check_camera(camera: Camera, *, like: Tensor, views: int | None = None, size
 
     size: height and width of its images, where they matter.
     """
-    if not isinstance(camera, Camera):
-        raise TypeError(f"camera: expected a Camera, got {type(camera).__name__}")
+    expect("camera", camera, Camera)
     check("camera", camera.c2w, like=like)
     batch = tuple(camera.c2w.shape[:-2])
     if len(batch) != 1 or views not in (None, batch[0]):

@@ -174,6 +174,7 @@ class RayScene:
         self._embree = embree.Tree(self.vertices.numpy(), self.faces.numpy())
 
     def _rays(self, origins, directions, t_max):
+        origins, directions = tensor_of(origins), tensor_of(directions)
         check("origins", origins, last=3, like=self.faces)
         check("directions", directions, last=3, like=self.faces)
         if isinstance(t_max, Tensor):

@@ -12,7 +12,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from reli3d._bridge import check, present
+from reli3d._bridge import check, expect, present
 from reli3d.geometry.mesh import Mesh, weld_rows
 
 PARALLEL = 1.0e-12  # length of a projected direction, relative, below which it has no direction in float64
@@ -38,8 +38,7 @@ def vertex_tangents(mesh: Mesh) -> Tensor:
     Without any direction (no UV area) the tangent is some vector orthogonal to the normal.  No gradient.  Raises
     ValueError without normals or UV.  Source: Mikkelsen 2008, Simulation of wrinkled surfaces revisited; mikktspace.c.
     """
-    if not isinstance(mesh, Mesh):
-        raise TypeError(f"mesh: expected Mesh, got {type(mesh).__name__}")
+    expect("mesh", mesh, Mesh)
     if mesh.normals is None:
         raise ValueError("mesh.normals: expected a tensor, got None (see Mesh.with_normals)")
     if mesh.uv is None:

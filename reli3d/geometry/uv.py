@@ -64,8 +64,7 @@ def guard_band(texture_size: int) -> int:
 
 
 def _check(mesh: Mesh, texture_size: int) -> None:
-    if not isinstance(mesh, Mesh):
-        raise TypeError(f"mesh: expected Mesh, got {type(mesh).__name__}")
+    _bridge.expect("mesh", mesh, Mesh)
     if not isinstance(texture_size, int) or not 16 <= texture_size <= 16384:
         raise ValueError(f"texture_size: expected an integer in [16, 16384], got {texture_size!r}")
     if len(mesh.faces) == 0:

@@ -45,9 +45,9 @@ def read_bytes(path: str | os.PathLike, limit: int) -> bytes:
 
 
 def file_size(path: str | os.PathLike) -> int:
-    """Bytes of a regular file.  Raises InputError where there is none."""
+    """Bytes of a regular file.  Raises InputError where there is none, TypeError for what is no path."""
     try:
-        info = os.stat(path)
+        info = os.stat(os.fspath(path))
     except FileNotFoundError:
         raise InputError(path, "file not found; check the path") from None
     except (OSError, ValueError) as error:

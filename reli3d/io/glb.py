@@ -20,7 +20,7 @@ from PIL import Image
 from torch import Tensor
 
 import reli3d
-from reli3d._bridge import present
+from reli3d._bridge import expect, present
 from reli3d.geometry.mesh import watertight
 from reli3d.io.files import write_bytes
 from reli3d.io.gltf_parts import read_parts
@@ -56,8 +56,7 @@ def texture_images(asset: Asset, kind: str = "png") -> dict[str, bytes]:
 
 def check_asset(asset: Asset) -> None:
     """Raise TypeError or ValueError for an asset that lacks what a file needs, or is not finite."""
-    if not isinstance(asset, Asset):
-        raise TypeError(f"asset: expected Asset, got {type(asset).__name__}")
+    expect("asset", asset, Asset)
     mesh = asset.mesh
     if len(mesh.faces) == 0:
         raise ValueError("asset.mesh.faces: expected at least one face, got 0")

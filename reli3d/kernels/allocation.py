@@ -19,10 +19,10 @@ def pilot_kernel(
     light: Light,
     plan: Plan,
     # out
-    origins: wp.array2d(dtype=wp.vec3),
-    directions: wp.array2d(dtype=wp.vec3),
-    values: wp.array2d(dtype=wp.vec3),
-    densities: wp.array2d(dtype=wp.vec3),
+    origins: wp.array2d[wp.vec3],
+    directions: wp.array2d[wp.vec3],
+    values: wp.array2d[wp.vec3],
+    densities: wp.array2d[wp.vec3],
 ):
     """Each sample's shadow ray, its value over q, and the densities of table, visible normals and cosine over q.
 

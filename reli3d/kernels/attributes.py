@@ -30,12 +30,12 @@ def wrap(k: int, size: int) -> int:
 def interpolate2_kernel(
     start: int,
     # in
-    values: wp.array(dtype=wp.vec2),
-    faces: wp.array2d(dtype=wp.int32),
-    face: wp.array(dtype=wp.int32),
-    bary: wp.array(dtype=wp.vec2),
+    values: wp.array[wp.vec2],
+    faces: wp.array2d[wp.int32],
+    face: wp.array[wp.int32],
+    bary: wp.array[wp.vec2],
     # out
-    out: wp.array(dtype=wp.vec2),
+    out: wp.array[wp.vec2],
 ):
     i = start + wp.tid()
     f = face[i]
@@ -50,12 +50,12 @@ def interpolate2_kernel(
 def interpolate3_kernel(
     start: int,
     # in
-    values: wp.array(dtype=wp.vec3),
-    faces: wp.array2d(dtype=wp.int32),
-    face: wp.array(dtype=wp.int32),
-    bary: wp.array(dtype=wp.vec2),
+    values: wp.array[wp.vec3],
+    faces: wp.array2d[wp.int32],
+    face: wp.array[wp.int32],
+    bary: wp.array[wp.vec2],
     # out
-    out: wp.array(dtype=wp.vec3),
+    out: wp.array[wp.vec3],
 ):
     i = start + wp.tid()
     f = face[i]
@@ -70,12 +70,12 @@ def interpolate3_kernel(
 def interpolate4_kernel(
     start: int,
     # in
-    values: wp.array(dtype=wp.vec4),
-    faces: wp.array2d(dtype=wp.int32),
-    face: wp.array(dtype=wp.int32),
-    bary: wp.array(dtype=wp.vec2),
+    values: wp.array[wp.vec4],
+    faces: wp.array2d[wp.int32],
+    face: wp.array[wp.int32],
+    bary: wp.array[wp.vec2],
     # out
-    out: wp.array(dtype=wp.vec4),
+    out: wp.array[wp.vec4],
 ):
     i = start + wp.tid()
     f = face[i]
@@ -90,11 +90,11 @@ def interpolate4_kernel(
 def hit_normal_kernel(
     start: int,
     # in
-    vertices: wp.array(dtype=wp.vec3),
-    faces: wp.array2d(dtype=wp.int32),
-    face: wp.array(dtype=wp.int32),
+    vertices: wp.array[wp.vec3],
+    faces: wp.array2d[wp.int32],
+    face: wp.array[wp.int32],
     # out
-    out: wp.array(dtype=wp.vec3),
+    out: wp.array[wp.vec3],
 ):
     """Outward normal of a counter-clockwise face."""
     i = start + wp.tid()
@@ -112,16 +112,16 @@ def hit_normal_kernel(
 def reevaluate_kernel(
     start: int,
     # in
-    vertices: wp.array(dtype=wp.vec3),
-    faces: wp.array2d(dtype=wp.int32),
-    face: wp.array(dtype=wp.int32),
-    origins: wp.array(dtype=wp.vec3),
-    directions: wp.array(dtype=wp.vec3),
-    hit_t: wp.array(dtype=float),
-    hit_bary: wp.array(dtype=wp.vec2),
+    vertices: wp.array[wp.vec3],
+    faces: wp.array2d[wp.int32],
+    face: wp.array[wp.int32],
+    origins: wp.array[wp.vec3],
+    directions: wp.array[wp.vec3],
+    hit_t: wp.array[float],
+    hit_bary: wp.array[wp.vec2],
     # out
-    t: wp.array(dtype=float),
-    bary: wp.array(dtype=wp.vec2),
+    t: wp.array[float],
+    bary: wp.array[wp.vec2],
 ):
     """Ray against the plane of a known face.  Moller and Trumbore 1997, without their early exits.
 
@@ -149,10 +149,10 @@ def reevaluate_kernel(
 def sample_texture_kernel(
     start: int,
     # in
-    texture: wp.array2d(dtype=wp.vec3),
-    uv: wp.array(dtype=wp.vec2),
+    texture: wp.array2d[wp.vec3],
+    uv: wp.array[wp.vec2],
     # out
-    out: wp.array(dtype=wp.vec3),
+    out: wp.array[wp.vec3],
 ):
     i = start + wp.tid()
     height = texture.shape[0]

@@ -29,7 +29,7 @@ def blend(upper_left: Any, upper_right: Any, lower_left: Any, lower_right: Any, 
 
 
 @wp.func
-def look_up(images: wp.array3d(dtype=Any), view: int, x: float, y: float) -> Any:
+def look_up(images: wp.array3d[Any], view: int, x: float, y: float) -> Any:
     """Value of image ``view`` of ``images (V, H, W)`` at pixel coordinates, the border's value outside."""
     at = between_pixels(x, y, images.shape[1], images.shape[2])
     i = int(at[0])

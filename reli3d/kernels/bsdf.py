@@ -84,14 +84,14 @@ def pdf_lobes(facet: Facet, wo: wp.vec3, wi: wp.vec3) -> wp.vec3:
 def eval_bsdf_kernel(
     start: int,
     # in
-    wo: wp.array(dtype=wp.vec3),
-    wi: wp.array(dtype=wp.vec3),
-    base_color: wp.array(dtype=wp.vec3),
-    alpha: wp.array(dtype=float),
-    metallic: wp.array(dtype=float),
+    wo: wp.array[wp.vec3],
+    wi: wp.array[wp.vec3],
+    base_color: wp.array[wp.vec3],
+    alpha: wp.array[float],
+    metallic: wp.array[float],
     conserving: int,
     # out
-    value: wp.array(dtype=wp.vec3),
+    value: wp.array[wp.vec3],
 ):
     i = start + wp.tid()
     value[i] = wp.vec3(0.0, 0.0, 0.0)
@@ -105,11 +105,11 @@ def eval_bsdf_kernel(
 def pdf_lobes_kernel(
     start: int,
     # in
-    wo: wp.array(dtype=wp.vec3),
-    wi: wp.array(dtype=wp.vec3),
-    alpha: wp.array(dtype=float),
+    wo: wp.array[wp.vec3],
+    wi: wp.array[wp.vec3],
+    alpha: wp.array[float],
     # out
-    pdf: wp.array(dtype=wp.vec3),
+    pdf: wp.array[wp.vec3],
 ):
     i = start + wp.tid()
     pdf[i] = wp.vec3(0.0, 0.0, 0.0)

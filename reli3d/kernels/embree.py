@@ -52,8 +52,8 @@ def first_hit(
     d: wp.vec3,
     limit: float,
     i: int,
-    t: wp.array(dtype=float),
-    bary: wp.array(dtype=wp.vec2),
+    t: wp.array[float],
+    bary: wp.array[wp.vec2],
 ) -> int:
     """Nearest face at t in [0, limit], -1 for none; a hit's t and the weights of vertices 1 and 2 go to place ``i``."""
     ...
@@ -104,11 +104,11 @@ for (int k = first; k < first + count;) {
 def block_rays(
     occluded16: wp.uint64,
     scene: wp.uint64,
-    origins: wp.array(dtype=wp.vec3),
-    directions: wp.array(dtype=wp.vec3),
+    origins: wp.array[wp.vec3],
+    directions: wp.array[wp.vec3],
     first: int,
     count: int,
-    t_max: wp.array(dtype=float),
+    t_max: wp.array[float],
 ):
     """Set ``t_max`` to -1 for those of ``count`` valid rays that meet anything before it; those below 0 are left out.
 
@@ -152,13 +152,13 @@ for (int i = 0; i < count; i++) {
 #endif
 """)
 def ray_keys(
-    origins: wp.array(dtype=wp.vec3),
-    directions: wp.array(dtype=wp.vec3),
+    origins: wp.array[wp.vec3],
+    directions: wp.array[wp.vec3],
     low: wp.vec3,
     per_cell: wp.vec3,
     first: int,
     count: int,
-    key: wp.array(dtype=wp.int16),
+    key: wp.array[wp.int16],
 ):
     """16 bits alike for rays that visit the same part of the tree: the direction's cell of 32 x 32 on an octahedron in
     Morton order (Morton 1966), then the origin's of 4 x 4 x 4 above ``low``.
@@ -186,13 +186,13 @@ def embree_closest_kernel(
     # in
     intersect1: wp.uint64,
     scene: wp.uint64,
-    origins: wp.array(dtype=wp.vec3),
-    directions: wp.array(dtype=wp.vec3),
-    t_max: wp.array(dtype=float),
+    origins: wp.array[wp.vec3],
+    directions: wp.array[wp.vec3],
+    t_max: wp.array[float],
     # out
-    face: wp.array(dtype=wp.int32),
-    t: wp.array(dtype=float),
-    bary: wp.array(dtype=wp.vec2),
+    face: wp.array[wp.int32],
+    t: wp.array[float],
+    bary: wp.array[wp.vec2],
 ):
     i = start + wp.tid()
     o = origins[i]
@@ -216,11 +216,11 @@ def embree_occluded_kernel(
     # in
     occluded1: wp.uint64,
     scene: wp.uint64,
-    origins: wp.array(dtype=wp.vec3),
-    directions: wp.array(dtype=wp.vec3),
-    t_max: wp.array(dtype=float),
+    origins: wp.array[wp.vec3],
+    directions: wp.array[wp.vec3],
+    t_max: wp.array[float],
     # out
-    occluded: wp.array(dtype=wp.bool),
+    occluded: wp.array[wp.bool],
 ):
     i = start + wp.tid()
     o = origins[i]
@@ -238,10 +238,10 @@ def embree_unoccluded_kernel(
     # in
     occluded16: wp.uint64,
     scene: wp.uint64,
-    origins: wp.array(dtype=wp.vec3),
-    directions: wp.array(dtype=wp.vec3),
+    origins: wp.array[wp.vec3],
+    directions: wp.array[wp.vec3],
     # in and out
-    t_max: wp.array(dtype=float),
+    t_max: wp.array[float],
 ):
     """``t_max`` becomes -1 where anything is met up to it; :data:`GROUP` rays a thread."""
     first = (start + wp.tid()) * GROUP
@@ -252,12 +252,12 @@ def embree_unoccluded_kernel(
 def ray_key_kernel(
     start: int,
     # in
-    origins: wp.array(dtype=wp.vec3),
-    directions: wp.array(dtype=wp.vec3),
+    origins: wp.array[wp.vec3],
+    directions: wp.array[wp.vec3],
     low: wp.vec3,
     per_cell: wp.vec3,
     # out
-    key: wp.array(dtype=wp.int16),
+    key: wp.array[wp.int16],
 ):
     """:data:`RUN` rays a thread."""
     first = (start + wp.tid()) * RUN

@@ -58,7 +58,7 @@ def four_texels(height: int, width: int, uv: wp.vec2) -> Texels:
 
 
 @wp.func
-def lookup_envmap_uv(radiance: wp.array2d(dtype=wp.vec3), uv: wp.vec2) -> wp.vec3:
+def lookup_envmap_uv(radiance: wp.array2d[wp.vec3], uv: wp.vec2) -> wp.vec3:
     """Bilinear radiance at map coordinates in [0, 1]^2."""
     at = four_texels(radiance.shape[0], radiance.shape[1], uv)
     top = radiance[at.r0, at.c0] * (1.0 - at.fx) + radiance[at.r0, at.c1] * at.fx
@@ -67,7 +67,7 @@ def lookup_envmap_uv(radiance: wp.array2d(dtype=wp.vec3), uv: wp.vec2) -> wp.vec
 
 
 @wp.func
-def add_texels(g_radiance: wp.array2d(dtype=wp.vec3), uv: wp.vec2, g: wp.vec3):
+def add_texels(g_radiance: wp.array2d[wp.vec3], uv: wp.vec2, g: wp.vec3):
     """Adjoint of :func:`lookup_envmap_uv` in the texels: ``g`` is spread over the four."""
     at = four_texels(g_radiance.shape[0], g_radiance.shape[1], uv)
     top = g * (1.0 - at.fy)
@@ -79,13 +79,13 @@ def add_texels(g_radiance: wp.array2d(dtype=wp.vec3), uv: wp.vec2, g: wp.vec3):
 
 
 @wp.func
-def lookup_envmap(radiance: wp.array2d(dtype=wp.vec3), d: wp.vec3) -> wp.vec3:
+def lookup_envmap(radiance: wp.array2d[wp.vec3], d: wp.vec3) -> wp.vec3:
     """Bilinear radiance from the unit direction ``d``."""
     return lookup_envmap_uv(radiance, direction_to_uv(d))
 
 
 @wp.func
-def upper_cell(cdf: wp.array2d(dtype=float), guide: wp.array2d(dtype=wp.int32), row: int, u: float) -> int:
+def upper_cell(cdf: wp.array2d[float], guide: wp.array2d[wp.int32], row: int, u: float) -> int:
     """Index k with ``cdf[row, k] <= u < cdf[row, k + 1]``; such a cell has positive probability.
 
     Chen and Asau 1974: ``guide[row, j]`` is the cell of u = j / n, from which one step is expected for any CDF.  The
@@ -110,10 +110,10 @@ class MapSample:
 
 @wp.func
 def sample_envmap(
-    rows: wp.array2d(dtype=float),
-    columns: wp.array2d(dtype=float),
-    row_guide: wp.array2d(dtype=wp.int32),
-    column_guide: wp.array2d(dtype=wp.int32),
+    rows: wp.array2d[float],
+    columns: wp.array2d[float],
+    row_guide: wp.array2d[wp.int32],
+    column_guide: wp.array2d[wp.int32],
     u: wp.vec2,
 ) -> MapSample:
     """Point of the map for uniform ``u`` in [0, 1)^2; density :func:`pdf_envmap_uv`.
@@ -143,7 +143,7 @@ def sample_envmap(
 
 
 @wp.func
-def pdf_envmap_uv(density: wp.array2d(dtype=float), uv: wp.vec2) -> float:
+def pdf_envmap_uv(density: wp.array2d[float], uv: wp.vec2) -> float:
     """Density [1/sr] of the table at map coordinates."""
     height = density.shape[0]
     width = density.shape[1]
@@ -156,10 +156,10 @@ def pdf_envmap_uv(density: wp.array2d(dtype=float), uv: wp.vec2) -> float:
 def lookup_envmap_kernel(
     start: int,
     # in
-    radiance: wp.array2d(dtype=wp.vec3),
-    directions: wp.array(dtype=wp.vec3),
+    radiance: wp.array2d[wp.vec3],
+    directions: wp.array[wp.vec3],
     # out
-    out: wp.array(dtype=wp.vec3),
+    out: wp.array[wp.vec3],
 ):
     i = start + wp.tid()
     out[i] = lookup_envmap(radiance, directions[i])
@@ -170,12 +170,12 @@ def lookup_adjoint_kernel(
     start: int,
     # in
     first: int,
-    radiance: wp.array2d(dtype=wp.vec3),
-    directions: wp.array(dtype=wp.vec3),
-    g_out: wp.array(dtype=wp.vec3),
+    radiance: wp.array2d[wp.vec3],
+    directions: wp.array[wp.vec3],
+    g_out: wp.array[wp.vec3],
     # out
-    g_radiance: wp.array2d(dtype=wp.vec3),
-    g_directions: wp.array(dtype=wp.vec3),
+    g_radiance: wp.array2d[wp.vec3],
+    g_directions: wp.array[wp.vec3],
 ):
     """Adjoints of the lookups from ``first``; an output without rows is left out.  ``g_radiance`` is added to.
 
@@ -210,15 +210,15 @@ def lookup_adjoint_kernel(
 def sample_envmap_kernel(
     start: int,
     # in
-    rows: wp.array2d(dtype=float),
-    columns: wp.array2d(dtype=float),
-    row_guide: wp.array2d(dtype=wp.int32),
-    column_guide: wp.array2d(dtype=wp.int32),
-    density: wp.array2d(dtype=float),
-    u: wp.array(dtype=wp.vec2),
+    rows: wp.array2d[float],
+    columns: wp.array2d[float],
+    row_guide: wp.array2d[wp.int32],
+    column_guide: wp.array2d[wp.int32],
+    density: wp.array2d[float],
+    u: wp.array[wp.vec2],
     # out
-    directions: wp.array(dtype=wp.vec3),
-    pdf: wp.array(dtype=float),
+    directions: wp.array[wp.vec3],
+    pdf: wp.array[float],
 ):
     i = start + wp.tid()
     drawn = sample_envmap(rows, columns, row_guide, column_guide, u[i])
@@ -230,10 +230,10 @@ def sample_envmap_kernel(
 def pdf_envmap_kernel(
     start: int,
     # in
-    density: wp.array2d(dtype=float),
-    directions: wp.array(dtype=wp.vec3),
+    density: wp.array2d[float],
+    directions: wp.array[wp.vec3],
     # out
-    pdf: wp.array(dtype=float),
+    pdf: wp.array[float],
 ):
     i = start + wp.tid()
     pdf[i] = pdf_envmap_uv(density, direction_to_uv(directions[i]))

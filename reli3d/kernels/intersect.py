@@ -47,13 +47,13 @@ def closest_kernel(
     start: int,
     # in
     mesh: wp.uint64,
-    origins: wp.array(dtype=wp.vec3),
-    directions: wp.array(dtype=wp.vec3),
-    t_max: wp.array(dtype=float),
+    origins: wp.array[wp.vec3],
+    directions: wp.array[wp.vec3],
+    t_max: wp.array[float],
     # out
-    face: wp.array(dtype=wp.int32),
-    t: wp.array(dtype=float),
-    bary: wp.array(dtype=wp.vec2),
+    face: wp.array[wp.int32],
+    t: wp.array[float],
+    bary: wp.array[wp.vec2],
 ):
     i = start + wp.tid()
     o = origins[i]
@@ -75,11 +75,11 @@ def occluded_kernel(
     start: int,
     # in
     mesh: wp.uint64,
-    origins: wp.array(dtype=wp.vec3),
-    directions: wp.array(dtype=wp.vec3),
-    t_max: wp.array(dtype=float),
+    origins: wp.array[wp.vec3],
+    directions: wp.array[wp.vec3],
+    t_max: wp.array[float],
     # out
-    occluded: wp.array(dtype=wp.bool),
+    occluded: wp.array[wp.bool],
 ):
     i = start + wp.tid()
     o = origins[i]
@@ -94,12 +94,12 @@ def occluded_kernel(
 def offset_origin_kernel(
     start: int,
     # in
-    position: wp.array(dtype=wp.vec3),
-    ng: wp.array(dtype=wp.vec3),
-    direction: wp.array(dtype=wp.vec3),
+    position: wp.array[wp.vec3],
+    ng: wp.array[wp.vec3],
+    direction: wp.array[wp.vec3],
     scale: float,
     # out
-    origin: wp.array(dtype=wp.vec3),
+    origin: wp.array[wp.vec3],
 ):
     i = start + wp.tid()
     origin[i] = offset_origin(position[i], ng[i], direction[i], scale)
@@ -109,16 +109,16 @@ def offset_origin_kernel(
 def sight_kernel(
     start: int,
     # in
-    position: wp.array(dtype=wp.vec3),
-    normal: wp.array(dtype=wp.vec3),
-    c2w: wp.array(dtype=wp.mat44),
-    intrinsics: wp.array(dtype=wp.vec4),
+    position: wp.array[wp.vec3],
+    normal: wp.array[wp.vec3],
+    c2w: wp.array[wp.mat44],
+    intrinsics: wp.array[wp.vec4],
     size: wp.vec2,
     grazing: float,
     # out
-    origin: wp.array(dtype=wp.vec3),
-    direction: wp.array(dtype=wp.vec3),
-    t_max: wp.array(dtype=float),
+    origin: wp.array[wp.vec3],
+    direction: wp.array[wp.vec3],
+    t_max: wp.array[float],
 ):
     """Ray from a point of a surface to a camera; ``t_max`` is -1 where the point looks away or lies off the image.
 

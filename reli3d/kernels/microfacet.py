@@ -120,11 +120,11 @@ def pdf_vndf_mirrored(facet: Facet, wo: wp.vec3) -> float:
 def sample_ggx_vndf_kernel(
     start: int,
     # in
-    wo: wp.array(dtype=wp.vec3),
-    alpha: wp.array(dtype=float),
-    u: wp.array(dtype=wp.vec2),
+    wo: wp.array[wp.vec3],
+    alpha: wp.array[float],
+    u: wp.array[wp.vec2],
     # out
-    wm: wp.array(dtype=wp.vec3),
+    wm: wp.array[wp.vec3],
 ):
     i = start + wp.tid()
     width = wp.max(alpha[i], ALPHA_MIN)
@@ -135,11 +135,11 @@ def sample_ggx_vndf_kernel(
 def pdf_ggx_vndf_kernel(
     start: int,
     # in
-    wo: wp.array(dtype=wp.vec3),
-    alpha: wp.array(dtype=float),
-    wm: wp.array(dtype=wp.vec3),
+    wo: wp.array[wp.vec3],
+    alpha: wp.array[float],
+    wm: wp.array[wp.vec3],
     # out
-    pdf: wp.array(dtype=float),
+    pdf: wp.array[float],
 ):
     i = start + wp.tid()
     pdf[i] = pdf_ggx_vndf(wo[i], wp.max(alpha[i], ALPHA_MIN), wm[i])

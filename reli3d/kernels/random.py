@@ -76,7 +76,7 @@ def random_pair_kernel(
     sample: int,
     dimension: int,
     # out
-    u: wp.array(dtype=wp.vec2),
+    u: wp.array[wp.vec2],
 ):
     i = start + wp.tid()
     u[i] = random_pair(seed, i, sample, dimension)
@@ -88,7 +88,7 @@ def halton_kernel(
     # in
     first: int,
     # out
-    u: wp.array(dtype=wp.vec2),
+    u: wp.array[wp.vec2],
 ):
     i = start + wp.tid()
     u[i] = wp.vec2(radical_inverse(first + i, 2), radical_inverse(first + i, 3))

@@ -6,7 +6,6 @@ row of the output and gathers, so that the result does not depend on the number 
 
 import warp as wp
 
-# ruff: noqa: UP018  (int(0) is a variable to Warp, 0 a constant)
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
 
 ROUNDING = wp.constant(4.0e-7)  # relative error of a float32 cross product, twice over: neighbours leave no crack
@@ -18,9 +17,9 @@ class Tiles:
     ``face_start[i]`` to ``face_start[i + 1]``.
     """
 
-    corners: wp.array2d(dtype=wp.vec2)
-    face_start: wp.array(dtype=wp.int32)
-    face_list: wp.array(dtype=wp.int32)
+    corners: wp.array2d[wp.vec2]
+    face_start: wp.array[wp.int32]
+    face_list: wp.array[wp.int32]
     size: int  # texels along the map
     tile: int  # and along a tile
 
@@ -29,10 +28,10 @@ class Tiles:
 class Places:
     """Flat indices of the texels asked for; face and weights of every texel of the map; vertices of the faces."""
 
-    texel: wp.array(dtype=wp.int64)
-    face: wp.array(dtype=wp.int32)
-    bary: wp.array(dtype=wp.vec2)
-    faces: wp.array2d(dtype=wp.int32)
+    texel: wp.array[wp.int64]
+    face: wp.array[wp.int32]
+    bary: wp.array[wp.vec2]
+    faces: wp.array2d[wp.int32]
 
 
 @wp.func
@@ -58,15 +57,15 @@ def texels_kernel(
     start: int,
     # in
     tiles: Tiles,
-    segment_start: wp.array(dtype=wp.int32),
-    segment_list: wp.array(dtype=wp.int32),
-    segments: wp.array(dtype=wp.int32),
+    segment_start: wp.array[wp.int32],
+    segment_list: wp.array[wp.int32],
+    segments: wp.array[wp.int32],
     reach: float,
     # scratch
-    distance: wp.array2d(dtype=wp.float32),
+    distance: wp.array2d[float],
     # out
-    face: wp.array2d(dtype=wp.int32),
-    bary: wp.array2d(dtype=wp.vec2),
+    face: wp.array2d[wp.int32],
+    bary: wp.array2d[wp.vec2],
 ):
     """Fill tile ``i``: the first face over a texel's centre; else the nearest border segment within ``reach`` texels.
 
@@ -74,9 +73,9 @@ def texels_kernel(
     """
     i = start + wp.tid()
     tile = tiles.tile
-    across = (tiles.size + tile - 1) / tile
+    across = (tiles.size + tile - 1) // tile
     x0 = (i % across) * tile
-    y0 = (i / across) * tile
+    y0 = (i // across) * tile
     x1 = wp.min(x0 + tile, tiles.size) - 1
     y1 = wp.min(y0 + tile, tiles.size) - 1
     far = reach * reach * 1.0001 + 1.0
@@ -112,7 +111,7 @@ def texels_kernel(
                             distance[y, x] = 0.0
     for s in range(segment_start[i], segment_start[i + 1]):
         code = segments[segment_list[s]]
-        f = code / 3
+        f = code // 3
         k = code % 3
         a = tiles.corners[f, k]
         b = tiles.corners[f, (k + 1) % 3]
@@ -130,8 +129,8 @@ def texels_kernel(
                         # an exact 0 would lock the texel; it is on the border, any face of it will do
                         distance[y, x] = wp.max(d, 1.0e-12)
                         face[y, x] = f
-                        w1 = float(0.0)
-                        w2 = float(0.0)
+                        w1 = wp.float32(0.0)
+                        w2 = wp.float32(0.0)
                         if k == 0:
                             w1 = t
                         elif k == 1:
@@ -148,14 +147,14 @@ def coverage_kernel(
     # in
     tiles: Tiles,
     # out
-    hits: wp.array2d(dtype=wp.uint8),
+    hits: wp.array2d[wp.uint8],
 ):
     """Number of faces, 255 at most, whose interior holds each centre of tile ``i``."""
     i = start + wp.tid()
     tile = tiles.tile
-    across = (tiles.size + tile - 1) / tile
+    across = (tiles.size + tile - 1) // tile
     x0 = (i % across) * tile
-    y0 = (i / across) * tile
+    y0 = (i // across) * tile
     x1 = wp.min(x0 + tile, tiles.size) - 1
     y1 = wp.min(y0 + tile, tiles.size) - 1
     for y in range(y0, y1 + 1):
@@ -166,7 +165,7 @@ def coverage_kernel(
         a = tiles.corners[f, 0]
         b = tiles.corners[f, 1] - a
         c = tiles.corners[f, 2] - a
-        turn = float(1.0)
+        turn = wp.float32(1.0)
         if cross2(b, c) < 0.0:
             turn = -1.0
         left = wp.max(int(wp.ceil(a[0] + wp.min(0.0, wp.min(b[0], c[0])) - 0.5)), x0)
@@ -188,11 +187,11 @@ def attributes_kernel(
     start: int,
     # in
     places: Places,
-    vertices: wp.array(dtype=wp.vec3),
-    normals: wp.array(dtype=wp.vec3),
+    vertices: wp.array[wp.vec3],
+    normals: wp.array[wp.vec3],
     # out
-    position: wp.array(dtype=wp.vec3),
-    normal: wp.array(dtype=wp.vec3),
+    position: wp.array[wp.vec3],
+    normal: wp.array[wp.vec3],
 ):
     """Interpolated position and unit normal at the listed texels; the normal of vertex 0 where they cancel."""
     i = start + wp.tid()
@@ -215,9 +214,9 @@ def tangents_kernel(
     start: int,
     # in
     places: Places,
-    tangents: wp.array(dtype=wp.vec4),
+    tangents: wp.array[wp.vec4],
     # out
-    tangent: wp.array(dtype=wp.vec4),
+    tangent: wp.array[wp.vec4],
 ):
     """Interpolated unit tangent at the listed texels with the sign w of vertex 0."""
     i = start + wp.tid()
@@ -238,9 +237,9 @@ def values_kernel(
     start: int,
     # in
     places: Places,
-    values: wp.array2d(dtype=wp.float32),
+    values: wp.array2d[float],
     # out
-    value: wp.array2d(dtype=wp.float32),
+    value: wp.array2d[float],
 ):
     """Interpolated numbers of the vertices at the listed texels."""
     i = start + wp.tid()
@@ -256,10 +255,10 @@ def values_kernel(
 def nearest_row_kernel(
     start: int,
     # in
-    valid: wp.array2d(dtype=wp.uint8),
+    valid: wp.array2d[wp.uint8],
     strip: int,
     # out
-    row: wp.array2d(dtype=wp.int32),
+    row: wp.array2d[wp.int32],
 ):
     """Row of the nearest valid texel of the same column, the upper of two; -1 without one.
 
@@ -292,13 +291,13 @@ def nearest_row_kernel(
 def nearest_texel_kernel(
     start: int,
     # in
-    row: wp.array2d(dtype=wp.int32),
+    row: wp.array2d[wp.int32],
     # scratch
-    site: wp.array2d(dtype=wp.int32),
-    border: wp.array2d(dtype=wp.float32),
+    site: wp.array2d[wp.int32],
+    border: wp.array2d[float],
     # out
-    source: wp.array2d(dtype=wp.int32),
-    square: wp.array2d(dtype=wp.float32),
+    source: wp.array2d[wp.int32],
+    square: wp.array2d[float],
 ):
     """Flat index and squared distance of the nearest valid texel for every texel of row ``i``; -1 and inf without one.
 
@@ -307,13 +306,13 @@ def nearest_texel_kernel(
     """
     i = start + wp.tid()
     width = row.shape[1]
-    top = int(-1)
+    top = wp.int32(-1)
     for q in range(width):
         r = row[i, q]
         if r >= 0:
             h = float(r - i) * float(r - i)
-            s = float(0.0)
-            keep = int(1)
+            s = wp.float32(0.0)
+            keep = wp.int32(1)
             while top >= 0 and keep == 1:
                 v = site[i, top]
                 g = float(row[i, v] - i)
@@ -327,7 +326,7 @@ def nearest_texel_kernel(
             border[i, top] = s
             if top == 0:
                 border[i, 0] = -1.0e30
-    k = int(0)
+    k = wp.int32(0)
     for x in range(width):
         if top < 0:
             source[i, x] = -1
@@ -345,12 +344,12 @@ def nearest_texel_kernel(
 def fill_kernel(
     start: int,
     # in
-    source: wp.array(dtype=wp.int32),
-    square: wp.array(dtype=wp.float32),
+    source: wp.array[wp.int32],
+    square: wp.array[float],
     limit: float,
     channels: int,
     # in and out
-    values: wp.array2d(dtype=wp.float32),
+    values: wp.array2d[float],
 ):
     """Copy the channels of ``source[i]`` to texel ``i``, which differ where it is not valid, up to a distance."""
     i = start + wp.tid()

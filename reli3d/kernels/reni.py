@@ -38,7 +38,7 @@ def joined(a: Part, b: Part, c: Part, d: Part, e: Part, f: Part, g: Part, h: Par
 
 
 @wp.func
-def product(rows: wp.array(dtype=Part), first: int, x: Row) -> Row:
+def product(rows: wp.array[Part], first: int, x: Row) -> Row:
     """``sum_k rows[first + k] x[k]``, rows in eight parts."""
     a = Part()
     b = Part()
@@ -96,13 +96,13 @@ def normalised(x: Row, gain: Row, offset: Row) -> Row:
 
 
 @wp.func
-def code(rows: wp.array(dtype=Part), r: int, s: float, s4: float, c: float, c4: float, value: float) -> Part:
+def code(rows: wp.array[Part], r: int, s: float, s4: float, c: float, c4: float, value: float) -> Part:
     """One part of what a feature adds."""
     return ((rows[r] * s + rows[r + 8] * s4) + (rows[r + 16] * c + rows[r + 24] * c4)) + rows[r + 32] * value
 
 
 @wp.func
-def encoded(latent: wp.array(dtype=wp.vec2), rows: wp.array(dtype=Part), direction: wp.vec3) -> Row:
+def encoded(latent: wp.array[wp.vec2], rows: wp.array[Part], direction: wp.vec3) -> Row:
     """The first matrix times the codes of all features, and its offset."""
     xy = wp.vec2(direction[2], direction[0])
     count = latent.shape[0]
@@ -142,11 +142,11 @@ def encoded(latent: wp.array(dtype=wp.vec2), rows: wp.array(dtype=Part), directi
 
 @wp.func
 def eval_reni(
-    latent: wp.array(dtype=wp.vec2),
-    first: wp.array(dtype=Part),
-    matrices: wp.array(dtype=Part),
-    vectors: wp.array(dtype=Row),
-    last: wp.array(dtype=Row),
+    latent: wp.array[wp.vec2],
+    first: wp.array[Part],
+    matrices: wp.array[Part],
+    vectors: wp.array[Row],
+    last: wp.array[Row],
     offset: wp.vec3,
     direction: wp.vec3,
 ) -> wp.vec3:
@@ -174,15 +174,15 @@ def eval_reni(
 def eval_reni_kernel(
     start: int,
     # in
-    latent: wp.array(dtype=wp.vec2),
-    first: wp.array(dtype=Part),
-    matrices: wp.array(dtype=Part),
-    vectors: wp.array(dtype=Row),
-    last: wp.array(dtype=Row),
-    offset: wp.array(dtype=wp.vec3),
-    direction: wp.array(dtype=wp.vec3),
+    latent: wp.array[wp.vec2],
+    first: wp.array[Part],
+    matrices: wp.array[Part],
+    vectors: wp.array[Row],
+    last: wp.array[Row],
+    offset: wp.array[wp.vec3],
+    direction: wp.array[wp.vec3],
     # out
-    radiance: wp.array(dtype=wp.vec3),
+    radiance: wp.array[wp.vec3],
 ):
     i = start + wp.tid()
     radiance[i] = eval_reni(latent, first, matrices, vectors, last, offset[0], direction[i])
@@ -192,15 +192,15 @@ def eval_reni_kernel(
 def decode_reni_kernel(
     start: int,
     # in
-    latent: wp.array(dtype=wp.vec2),
-    first: wp.array(dtype=Part),
-    matrices: wp.array(dtype=Part),
-    vectors: wp.array(dtype=Row),
-    last: wp.array(dtype=Row),
-    offset: wp.array(dtype=wp.vec3),
+    latent: wp.array[wp.vec2],
+    first: wp.array[Part],
+    matrices: wp.array[Part],
+    vectors: wp.array[Row],
+    last: wp.array[Row],
+    offset: wp.array[wp.vec3],
     height: int,
     # out
-    radiance: wp.array(dtype=wp.vec3),
+    radiance: wp.array[wp.vec3],
 ):
     i = start + wp.tid()
     u = (float(i % (2 * height)) + 0.5) / float(2 * height)

@@ -60,9 +60,9 @@ def reflect(wo: wp.vec3, wm: wp.vec3) -> wp.vec3:
 def sample_cosine_kernel(
     start: int,
     # in
-    u: wp.array(dtype=wp.vec2),
+    u: wp.array[wp.vec2],
     # out
-    wi: wp.array(dtype=wp.vec3),
+    wi: wp.array[wp.vec3],
 ):
     i = start + wp.tid()
     wi[i] = sample_cosine(u[i])

@@ -129,12 +129,12 @@ def shade_lobe(
 def eval_sg_kernel(
     start: int,
     # in
-    axis: wp.array(dtype=wp.vec3),
-    sharpness: wp.array(dtype=float),
-    amplitude: wp.array(dtype=wp.vec3),
-    directions: wp.array(dtype=wp.vec3),
+    axis: wp.array[wp.vec3],
+    sharpness: wp.array[float],
+    amplitude: wp.array[wp.vec3],
+    directions: wp.array[wp.vec3],
     # out
-    out: wp.array(dtype=wp.vec3),
+    out: wp.array[wp.vec3],
 ):
     i = start + wp.tid()
     total = wp.vec3(0.0, 0.0, 0.0)
@@ -147,12 +147,12 @@ def eval_sg_kernel(
 def irradiance_sg_kernel(
     start: int,
     # in
-    axis: wp.array(dtype=wp.vec3),
-    sharpness: wp.array(dtype=float),
-    amplitude: wp.array(dtype=wp.vec3),
-    normals: wp.array(dtype=wp.vec3),
+    axis: wp.array[wp.vec3],
+    sharpness: wp.array[float],
+    amplitude: wp.array[wp.vec3],
+    normals: wp.array[wp.vec3],
     # out
-    out: wp.array(dtype=wp.vec3),
+    out: wp.array[wp.vec3],
 ):
     i = start + wp.tid()
     total = wp.vec3(0.0, 0.0, 0.0)
@@ -165,16 +165,16 @@ def irradiance_sg_kernel(
 def shade_sg_kernel(
     start: int,
     # in
-    normal: wp.array(dtype=wp.vec3),
-    wo: wp.array(dtype=wp.vec3),
-    base_color: wp.array(dtype=wp.vec3),
-    alpha: wp.array(dtype=float),
-    metallic: wp.array(dtype=float),
-    axis: wp.array(dtype=wp.vec3),
-    sharpness: wp.array(dtype=float),
-    amplitude: wp.array(dtype=wp.vec3),
+    normal: wp.array[wp.vec3],
+    wo: wp.array[wp.vec3],
+    base_color: wp.array[wp.vec3],
+    alpha: wp.array[float],
+    metallic: wp.array[float],
+    axis: wp.array[wp.vec3],
+    sharpness: wp.array[float],
+    amplitude: wp.array[wp.vec3],
     # out
-    out: wp.array(dtype=wp.vec3),
+    out: wp.array[wp.vec3],
 ):
     i = start + wp.tid()
     a = wp.max(alpha[i], ALPHA_MIN)

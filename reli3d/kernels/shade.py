@@ -37,27 +37,27 @@ COS_VIEW_MIN = wp.constant(1.0e-3)  # an interpolated normal that turns away is 
 class Points:
     """Arrays of the hits, a row each; ``pixel`` counts their random numbers."""
 
-    position: wp.array(dtype=wp.vec3)
-    normal: wp.array(dtype=wp.vec3)
-    ng: wp.array(dtype=wp.vec3)
-    wo: wp.array(dtype=wp.vec3)
-    base_color: wp.array(dtype=wp.vec3)
-    alpha: wp.array(dtype=float)
-    metallic: wp.array(dtype=float)
-    pixel: wp.array(dtype=wp.int32)
+    position: wp.array[wp.vec3]
+    normal: wp.array[wp.vec3]
+    ng: wp.array[wp.vec3]
+    wo: wp.array[wp.vec3]
+    base_color: wp.array[wp.vec3]
+    alpha: wp.array[float]
+    metallic: wp.array[float]
+    pixel: wp.array[wp.int32]
 
 
 @wp.struct
 class Light:
     """Texels of the map, its sampling table, and the even points that all hits turn."""
 
-    radiance: wp.array2d(dtype=wp.vec3)
-    rows: wp.array2d(dtype=float)
-    columns: wp.array2d(dtype=float)
-    row_guide: wp.array2d(dtype=wp.int32)
-    column_guide: wp.array2d(dtype=wp.int32)
-    density: wp.array2d(dtype=float)
-    points: wp.array(dtype=wp.vec2)
+    radiance: wp.array2d[wp.vec3]
+    rows: wp.array2d[float]
+    columns: wp.array2d[float]
+    row_guide: wp.array2d[wp.int32]
+    column_guide: wp.array2d[wp.int32]
+    density: wp.array2d[float]
+    points: wp.array[wp.vec2]
 
 
 @wp.struct
@@ -147,9 +147,7 @@ def make_surface(plan: Plan, points: Points, i: int) -> Surface:
 
 
 @wp.func
-def draw_pair(
-    plan: Plan, points: wp.array(dtype=wp.vec2), shift: wp.vec2, pixel: int, index: int, strategy: int
-) -> wp.vec2:
+def draw_pair(plan: Plan, points: wp.array[wp.vec2], shift: wp.vec2, pixel: int, index: int, strategy: int) -> wp.vec2:
     """Uniform pair of a sample: independent, or the shifted point of an even set."""
     u = rotate_point(points[index], shift)
     if plan.rotate == 0:
@@ -158,7 +156,7 @@ def draw_pair(
 
 
 @wp.func
-def visible_normal(surface: Surface, plan: Plan, points: wp.array(dtype=wp.vec2), k: int) -> wp.vec3:
+def visible_normal(surface: Surface, plan: Plan, points: wp.array[wp.vec2], k: int) -> wp.vec3:
     """Microfacet normal of the ``k``-th sample of the visible normals; both of a pair share their numbers."""
     index = k
     how = wp.int32(0)
@@ -256,8 +254,8 @@ def shade_kernel(
     mesh: wp.uint64,
     shadows: int,
     # out
-    out: wp.array(dtype=wp.vec3),
-    visible: wp.array2d(dtype=wp.int32),
+    out: wp.array[wp.vec3],
+    visible: wp.array2d[wp.int32],
 ):
     """The fused estimator; shadow rays through Warp's BVH."""
     i = start + wp.tid()

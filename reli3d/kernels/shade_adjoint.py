@@ -111,14 +111,14 @@ def shade_adjoint_kernel(
     points: Points,
     light: Light,
     plan: Plan,
-    visible: wp.array2d(dtype=wp.int32),
-    g_out: wp.array(dtype=wp.vec3),
+    visible: wp.array2d[wp.int32],
+    g_out: wp.array[wp.vec3],
     # out
-    g_normal: wp.array(dtype=wp.vec3),
-    g_base_color: wp.array(dtype=wp.vec3),
-    g_alpha: wp.array(dtype=float),
-    g_metallic: wp.array(dtype=float),
-    g_radiance: wp.array2d(dtype=wp.vec3),
+    g_normal: wp.array[wp.vec3],
+    g_base_color: wp.array[wp.vec3],
+    g_alpha: wp.array[float],
+    g_metallic: wp.array[float],
+    g_radiance: wp.array2d[wp.vec3],
 ):
     """Adjoints of the hits from ``first``; ``g_radiance`` is added to.  An output without rows is left out."""
     i = first + start + wp.tid()

@@ -20,10 +20,10 @@ def shade_rays_kernel(
     light: Light,
     plan: Plan,
     # out
-    origins: wp.array(dtype=wp.vec3),
-    directions: wp.array(dtype=wp.vec3),
-    t_max: wp.array(dtype=float),
-    values: wp.array(dtype=wp.vec3),
+    origins: wp.array[wp.vec3],
+    directions: wp.array[wp.vec3],
+    t_max: wp.array[float],
+    values: wp.array[wp.vec3],
 ):
     """First half of the estimator for a chunk of hits: shadow rays (``t_max`` < 0 where none is needed) and values."""
     j = start + wp.tid()
@@ -49,14 +49,14 @@ def accumulate_kernel(
     count: int,
     occluded16: wp.uint64,
     scene: wp.uint64,
-    origins: wp.array(dtype=wp.vec3),
-    directions: wp.array(dtype=wp.vec3),
-    values: wp.array(dtype=wp.vec3),
+    origins: wp.array[wp.vec3],
+    directions: wp.array[wp.vec3],
+    values: wp.array[wp.vec3],
     # in and out
-    t_max: wp.array(dtype=float),
+    t_max: wp.array[float],
     # out
-    out: wp.array(dtype=wp.vec3),
-    visible: wp.array2d(dtype=wp.int32),
+    out: wp.array[wp.vec3],
+    visible: wp.array2d[wp.int32],
 ):
     """Second half: the sum of a hit's values whose shadow rays nothing stops; ``t_max`` of the others becomes -1."""
     j = start + wp.tid()

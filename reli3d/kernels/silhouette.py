@@ -40,17 +40,17 @@ def line_range(from_: float, to: float, size: int) -> wp.vec2i:
 def outline_kernel(
     start: int,
     # in
-    vertices: wp.array(dtype=wp.vec3),
-    edges: wp.array2d(dtype=wp.int32),
+    vertices: wp.array[wp.vec3],
+    edges: wp.array2d[wp.int32],
     c2w: wp.mat44,
     intrinsics: wp.vec4,
     width: int,
     height: int,
     # out
-    outward: wp.array(dtype=float),
-    steep: wp.array(dtype=wp.bool),
-    first: wp.array(dtype=wp.int32),
-    count: wp.array(dtype=wp.int32),
+    outward: wp.array[float],
+    steep: wp.array[wp.bool],
+    first: wp.array[wp.int32],
+    count: wp.array[wp.int32],
 ):
     """``outward``: 1 where the surface ends towards larger x (steep) or y, else -1.  ``count``: 0 for no outline."""
     i = start + wp.tid()

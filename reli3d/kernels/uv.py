@@ -6,7 +6,6 @@ Coordinates of a chart are plane units with x right and y up; packing works in c
 
 import warp as wp
 
-# ruff: noqa: UP018  (int(0) is a variable to Warp, 0 a constant)
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
 
 
@@ -14,10 +13,10 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=n
 def normals_kernel(
     start: int,
     # in
-    points: wp.array(dtype=wp.vec3),
-    faces: wp.array2d(dtype=wp.int32),
+    points: wp.array[wp.vec3],
+    faces: wp.array2d[wp.int32],
     # out
-    normal: wp.array(dtype=wp.vec3),
+    normal: wp.array[wp.vec3],
 ):
     """Normals of the faces, length twice the area."""
     i = start + wp.tid()
@@ -29,9 +28,9 @@ def normals_kernel(
 def smooth_kernel(
     start: int,
     # in
-    neighbours: wp.array2d(dtype=wp.int32), normal: wp.array(dtype=wp.vec3),
+    neighbours: wp.array2d[wp.int32], normal: wp.array[wp.vec3],
     # out
-    smoothed: wp.array(dtype=wp.vec3),
+    smoothed: wp.array[wp.vec3],
 ):  # fmt: skip
     """Sum of the normals of a face and its neighbours."""
     i = start + wp.tid()
@@ -54,7 +53,7 @@ def component(n: wp.vec3, axis: int) -> float:
 @wp.func
 def nearest_axis(n: wp.vec3) -> int:
     """Axis of the largest component, the first of equals."""
-    best = int(0)
+    best = wp.int32(0)
     for k in range(1, 6):
         if component(n, k) > component(n, best):
             best = k
@@ -65,9 +64,9 @@ def nearest_axis(n: wp.vec3) -> int:
 def labels_kernel(
     start: int,
     # in
-    normal: wp.array(dtype=wp.vec3), smoothed: wp.array(dtype=wp.vec3), cosine: float,
+    normal: wp.array[wp.vec3], smoothed: wp.array[wp.vec3], cosine: float,
     # out
-    label: wp.array(dtype=wp.int32),
+    label: wp.array[wp.int32],
 ):  # fmt: skip
     """Axis nearest to the smoothed normal, or to the face's own where the first is off by more than ``cosine``."""
     i = start + wp.tid()
@@ -81,10 +80,10 @@ def labels_kernel(
 def majority_kernel(
     start: int,
     # in
-    neighbours: wp.array2d(dtype=wp.int32), normal: wp.array(dtype=wp.vec3), label: wp.array(dtype=wp.int32),
+    neighbours: wp.array2d[wp.int32], normal: wp.array[wp.vec3], label: wp.array[wp.int32],
     cosine: float,
     # out
-    voted: wp.array(dtype=wp.int32),
+    voted: wp.array[wp.int32],
 ):  # fmt: skip
     """The label of two or three neighbours of a face, if the face is within ``cosine`` of that axis."""
     i = start + wp.tid()
@@ -107,9 +106,9 @@ def majority_kernel(
 def oblique_kernel(
     start: int,
     # in
-    normal: wp.array(dtype=wp.vec3), chart: wp.array(dtype=wp.int32), toward: wp.array(dtype=wp.vec3), cosine: float,
+    normal: wp.array[wp.vec3], chart: wp.array[wp.int32], toward: wp.array[wp.vec3], cosine: float,
     # out
-    oblique: wp.array(dtype=wp.uint8),
+    oblique: wp.array[wp.uint8],
 ):  # fmt: skip
     """Mark charts with a face more oblique than ``cosine`` to their direction.  Every writer writes the same 1."""
     i = start + wp.tid()
@@ -121,10 +120,10 @@ def oblique_kernel(
 def project_kernel(
     start: int,
     # in
-    points: wp.array(dtype=wp.vec3), faces: wp.array2d(dtype=wp.int32), chart: wp.array(dtype=wp.int32),
-    right: wp.array(dtype=wp.vec3), up: wp.array(dtype=wp.vec3), low: wp.array(dtype=wp.vec2), least: float,
+    points: wp.array[wp.vec3], faces: wp.array2d[wp.int32], chart: wp.array[wp.int32],
+    right: wp.array[wp.vec3], up: wp.array[wp.vec3], low: wp.array[wp.vec2], least: float,
     # out
-    corners: wp.array2d(dtype=wp.vec2), flat: wp.array(dtype=wp.uint8),
+    corners: wp.array2d[wp.vec2], flat: wp.array[wp.uint8],
 ):  # fmt: skip
     """Corners of a face in the plane of its chart; ``flat`` marks a face lower than ``least`` or turned over."""
     i = start + wp.tid()
@@ -142,7 +141,7 @@ def project_kernel(
 
 
 @wp.func
-def root_of(parent: wp.array(dtype=wp.int32), i: int) -> int:
+def root_of(parent: wp.array[wp.int32], i: int) -> int:
     """Smallest member of the set of ``i``; halves the path on its way."""
     r = int(i)
     while parent[r] != r:
@@ -155,9 +154,9 @@ def root_of(parent: wp.array(dtype=wp.int32), i: int) -> int:
 def components_serial_kernel(
     start: int,
     # in
-    neighbours: wp.array2d(dtype=wp.int32), group: wp.array(dtype=wp.int32), count: int,
+    neighbours: wp.array2d[wp.int32], group: wp.array[wp.int32], count: int,
     # out
-    parent: wp.array(dtype=wp.int32),
+    parent: wp.array[wp.int32],
 ):  # fmt: skip
     """Join faces of one ``group`` across their edges; ``parent`` becomes the smallest face of each set."""
     for i in range(count):
@@ -190,7 +189,7 @@ def separates(a: wp.vec2, b: wp.vec2, p: wp.vec2, q: wp.vec2, r: wp.vec2, slack:
 
 
 @wp.func
-def overlap(corners: wp.array2d(dtype=wp.vec2), i: int, j: int, slack: float) -> bool:
+def overlap(corners: wp.array2d[wp.vec2], i: int, j: int, slack: float) -> bool:
     """True if two counter-clockwise triangles share more than a strip of width ``slack`` (separating axes)."""
     a0 = corners[i, 0]
     a1 = corners[i, 1]
@@ -215,11 +214,11 @@ def overlap(corners: wp.array2d(dtype=wp.vec2), i: int, j: int, slack: float) ->
 def overlaps_kernel(
     start: int,
     # in
-    bvh: wp.uint64, boxes: wp.array(dtype=wp.int32), query: wp.array(dtype=wp.int32),
-    corners: wp.array2d(dtype=wp.vec2), chart: wp.array(dtype=wp.int32), slack: float,
-    offset: wp.array(dtype=wp.int64), emit: int,
+    bvh: wp.uint64, boxes: wp.array[wp.int32], query: wp.array[wp.int32],
+    corners: wp.array2d[wp.vec2], chart: wp.array[wp.int32], slack: float,
+    offset: wp.array[wp.int64], emit: int,
     # out
-    count: wp.array(dtype=wp.int32), partner: wp.array(dtype=wp.int32),
+    count: wp.array[wp.int32], partner: wp.array[wp.int32],
 ):  # fmt: skip
     """Count (``emit`` 0) or list (1, from ``offset[i]``) the faces of the same chart that overlap face ``query[i]``.
 
@@ -229,13 +228,13 @@ def overlaps_kernel(
     if emit == 1 and count[i] == 0:
         return
     f = query[i]
-    found = int(0)
+    found = wp.int32(0)
     if chart[f] >= 0:
         low = wp.min(corners[f, 0], wp.min(corners[f, 1], corners[f, 2]))
         high = wp.max(corners[f, 0], wp.max(corners[f, 1], corners[f, 2]))
         z = float(chart[f])
         search = wp.bvh_query_aabb(bvh, wp.vec3(low[0], low[1], z), wp.vec3(high[0], high[1], z))
-        b = int(0)
+        b = wp.int32(0)
         while wp.bvh_query_next(search, b):
             g = boxes[b]
             if g != f and chart[g] == chart[f] and overlap(corners, f, g, slack):
@@ -250,12 +249,12 @@ def overlaps_kernel(
 def split_serial_kernel(
     start: int,
     # in
-    neighbours: wp.array2d(dtype=wp.int32), chart: wp.array(dtype=wp.int32), seeds: wp.array(dtype=wp.int32),
-    offset: wp.array(dtype=wp.int64), count: wp.array(dtype=wp.int32), partner: wp.array(dtype=wp.int32), first: int,
+    neighbours: wp.array2d[wp.int32], chart: wp.array[wp.int32], seeds: wp.array[wp.int32],
+    offset: wp.array[wp.int64], count: wp.array[wp.int32], partner: wp.array[wp.int32], first: int,
     # scratch
-    queue: wp.array(dtype=wp.int32),
+    queue: wp.array[wp.int32],
     # out
-    owner: wp.array(dtype=wp.int32),
+    owner: wp.array[wp.int32],
 ):  # fmt: skip
     """Grow connected charts without overlap, breadth first, from ``seeds`` in order; they are numbered from ``first``.
 
@@ -266,13 +265,13 @@ def split_serial_kernel(
     for s in range(seeds.shape[0]):
         if owner[seeds[s]] < 0:
             queue[0] = seeds[s]
-            head = int(0)
-            tail = int(1)
+            head = wp.int32(0)
+            tail = wp.int32(1)
             while head < tail:
                 f = queue[head]
                 head += 1
                 if owner[f] < 0:
-                    free = int(1)
+                    free = wp.int32(1)
                     for k in range(count[f]):
                         if owner[partner[int(offset[f]) + k]] == current:
                             free = 0
@@ -290,10 +289,10 @@ def split_serial_kernel(
 def outline_kernel(
     start: int,
     # in
-    edge_start: wp.array(dtype=wp.int32), edges: wp.array2d(dtype=wp.vec2), column_start: wp.array(dtype=wp.int32),
+    edge_start: wp.array[wp.int32], edges: wp.array2d[wp.vec2], column_start: wp.array[wp.int32],
     scale: float, margin: float,
     # out
-    bottom: wp.array(dtype=wp.int32), top: wp.array(dtype=wp.int32),
+    bottom: wp.array[wp.int32], top: wp.array[wp.int32],
 ):  # fmt: skip
     """Lowest and highest cell that chart ``i`` or its margin touches in each of its columns.
 
@@ -333,12 +332,12 @@ def outline_kernel(
 def pack_serial_kernel(
     start: int,
     # in
-    order: wp.array(dtype=wp.int32), column_start: wp.array(dtype=wp.int32), bottom: wp.array(dtype=wp.int32),
-    top: wp.array(dtype=wp.int32), floor_height: int,
+    order: wp.array[wp.int32], column_start: wp.array[wp.int32], bottom: wp.array[wp.int32],
+    top: wp.array[wp.int32], floor_height: int,
     # scratch
-    horizon: wp.array(dtype=wp.int32),
+    horizon: wp.array[wp.int32],
     # out
-    place: wp.array2d(dtype=wp.int32), height: wp.array(dtype=wp.int32),
+    place: wp.array2d[wp.int32], height: wp.array[wp.int32],
 ):  # fmt: skip
     """Drop charts one after the other onto the horizon, each where it comes to rest lowest; leftmost among equals.
 
@@ -357,15 +356,15 @@ def pack_serial_kernel(
         if width > size:
             height[0] = 1 << 30
             return
-        tall = int(0)
+        tall = wp.int32(0)
         for c in range(width):
             tall = wp.max(tall, top[base + c])
         best = int(1 << 30)
-        best_x = int(0)
-        turned = int(0)
+        best_x = wp.int32(0)
+        turned = wp.int32(0)
         for x in range(size - width + 1):
-            y = int(0)
-            c = int(0)
+            y = wp.int32(0)
+            c = wp.int32(0)
             while c < width:
                 y = wp.max(y, horizon[x + c] - bottom[base + c])
                 c += 1
@@ -375,8 +374,8 @@ def pack_serial_kernel(
                 best = y
                 best_x = x
                 turned = 0
-            y = int(0)
-            c = int(0)
+            y = wp.int32(0)
+            c = wp.int32(0)
             while c < width:
                 y = wp.max(y, horizon[x + c] - (tall - top[base + width - 1 - c]))
                 c += 1

@@ -22,12 +22,12 @@ TANH_FLAT = wp.constant(8.3)  # where tanh is 1 but for 1.2e-7, a float32 roundi
 class Viewed:
     """Posed images, and N points that are looked up in them; points in space have no normals and no visibility."""
 
-    image: wp.array3d(dtype=wp.vec4)  # (V, S, S) sRGB and silhouette distance in pixels
-    c2w: wp.array(dtype=wp.mat44)  # (V,)
-    intrinsics: wp.array(dtype=wp.vec4)  # (V,)
-    points: wp.array(dtype=wp.vec3)  # (N,)
-    normal: wp.array(dtype=wp.vec3)  # (N,) or none
-    visible: wp.array2d(dtype=float)  # (N, V) or none
+    image: wp.array3d[wp.vec4]  # (V, S, S) sRGB and silhouette distance in pixels
+    c2w: wp.array[wp.mat44]  # (V,)
+    intrinsics: wp.array[wp.vec4]  # (V,)
+    points: wp.array[wp.vec3]  # (N,)
+    normal: wp.array[wp.vec3]  # (N,) or none
+    visible: wp.array2d[float]  # (N, V) or none
 
 
 @wp.func

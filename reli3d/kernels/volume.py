@@ -58,7 +58,7 @@ def cell_exit(origin: wp.vec3, direction: wp.vec3, radius: float, size: int, x: 
 
 @wp.func
 def next_sample(
-    occupied: wp.array3d(dtype=wp.uint8),
+    occupied: wp.array3d[wp.uint8],
     origin: wp.vec3,
     direction: wp.vec3,
     range_: wp.vec2,
@@ -108,16 +108,16 @@ def step_thickness(density: float, step: float) -> float:
 def count_samples_kernel(
     start: int,
     # in
-    occupied: wp.array3d(dtype=wp.uint8),
-    origins: wp.array(dtype=wp.vec3),
-    directions: wp.array(dtype=wp.vec3),
-    shift: wp.array(dtype=float),
+    occupied: wp.array3d[wp.uint8],
+    origins: wp.array[wp.vec3],
+    directions: wp.array[wp.vec3],
+    shift: wp.array[float],
     radius: float,
     step: float,
     near: float,
     far: float,
     # out
-    count: wp.array(dtype=wp.int32),
+    count: wp.array[wp.int32],
 ):
     i = start + wp.tid()
     o = origins[i]
@@ -136,18 +136,18 @@ def count_samples_kernel(
 def emit_samples_kernel(
     start: int,
     # in
-    occupied: wp.array3d(dtype=wp.uint8),
-    origins: wp.array(dtype=wp.vec3),
-    directions: wp.array(dtype=wp.vec3),
-    shift: wp.array(dtype=float),
+    occupied: wp.array3d[wp.uint8],
+    origins: wp.array[wp.vec3],
+    directions: wp.array[wp.vec3],
+    shift: wp.array[float],
     radius: float,
     step: float,
     near: float,
     far: float,
-    first: wp.array(dtype=wp.int32),
+    first: wp.array[wp.int32],
     # out
-    ray: wp.array(dtype=wp.int32),
-    t: wp.array(dtype=float),
+    ray: wp.array[wp.int32],
+    t: wp.array[float],
 ):
     i = start + wp.tid()
     row = first[i]
@@ -169,15 +169,15 @@ def emit_samples_kernel(
 def composite_kernel(
     start: int,
     # in
-    density: wp.array(dtype=float),
-    color: wp.array(dtype=wp.vec3),
-    t: wp.array(dtype=float),
-    first: wp.array(dtype=wp.int32),
+    density: wp.array[float],
+    color: wp.array[wp.vec3],
+    t: wp.array[float],
+    first: wp.array[wp.int32],
     step: float,
     # out
-    out: wp.array(dtype=wp.vec3),
-    opacity: wp.array(dtype=float),
-    depth: wp.array(dtype=float),
+    out: wp.array[wp.vec3],
+    opacity: wp.array[float],
+    depth: wp.array[float],
 ):
     """Emission and absorption, Max 1995: a sample counts ``T (1 - exp(-density step))`` of its colour and distance."""
     i = start + wp.tid()
@@ -201,11 +201,11 @@ def composite_kernel(
 def weights_kernel(
     start: int,
     # in
-    density: wp.array(dtype=float),
-    first: wp.array(dtype=wp.int32),
+    density: wp.array[float],
+    first: wp.array[wp.int32],
     step: float,
     # out
-    weight: wp.array(dtype=float),
+    weight: wp.array[float],
 ):
     """Only as far as light comes through: ``weight`` holds zeros before."""
     i = start + wp.tid()
@@ -222,17 +222,17 @@ def weights_kernel(
 def composite_adjoint_kernel(
     start: int,
     # in
-    density: wp.array(dtype=float),
-    color: wp.array(dtype=wp.vec3),
-    t: wp.array(dtype=float),
-    first: wp.array(dtype=wp.int32),
+    density: wp.array[float],
+    color: wp.array[wp.vec3],
+    t: wp.array[float],
+    first: wp.array[wp.int32],
     step: float,
-    g_out: wp.array(dtype=wp.vec3),
-    g_opacity: wp.array(dtype=float),
-    g_depth: wp.array(dtype=float),
+    g_out: wp.array[wp.vec3],
+    g_opacity: wp.array[float],
+    g_depth: wp.array[float],
     # out
-    g_density: wp.array(dtype=float),
-    g_color: wp.array(dtype=wp.vec3),
+    g_density: wp.array[float],
+    g_color: wp.array[wp.vec3],
 ):
     """Back to front: with e the adjoint of a sample's weight, d loss / d own thickness = T_after e - sum behind of w e.
 

@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from reli3d._bridge import check, present, tensor_of
+from reli3d._bridge import check, expect, present, tensor_of
+from reli3d.geometry.mesh import Mesh
+from reli3d.render.environment import Environment
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from typing import Any
-
-    from reli3d.geometry.mesh import Mesh
-    from reli3d.render.environment import Environment
 
 FLAT = (0.5, 0.5, 1.0)  # a normal map's texel where nothing is bent
 
@@ -92,6 +91,11 @@ class Asset:
     mesh: Mesh
     textures: TextureSet
     environment: Environment | None = None
+
+    def __post_init__(self):
+        for name, kind in (("mesh", Mesh), ("textures", TextureSet), ("environment", Environment)):
+            if name == "mesh" or getattr(self, name) is not None:
+                expect(name, getattr(self, name), kind)
 
     def to(self, device: torch.device | str) -> Asset:
         """The same asset on ``device``."""

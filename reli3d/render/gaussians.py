@@ -14,7 +14,7 @@ import warp as wp
 from torch import Tensor
 from torch.nn.functional import normalize, softplus
 
-from reli3d._bridge import call, check
+from reli3d._bridge import call, check, expect
 from reli3d.kernels import sg as kernels
 from reli3d.render.environment import Environment, texel_solid_angles
 from reli3d.render.points import SurfacePoints, nan_where_not_finite, of_rows
@@ -82,8 +82,7 @@ def shade_gaussians(points: SurfacePoints, wo: Tensor, light: SphericalGaussians
     within 45 degrees; at roughness 1 or at 70 degrees by 20 to 35 % for light at the peak, and up to a factor of two
     beside it.  Gradients reach every argument that is used.
     """
-    if not isinstance(points, SurfacePoints):
-        raise TypeError(f"points: expected SurfacePoints, got {type(points).__name__}")
+    expect("points", points, SurfacePoints)
     normal, n = points.normal, len(points)
     check("points.normal", normal, like=light.axis)
     wo, width = of_rows("wo", wo, points.position, 3), points.roughness * points.roughness

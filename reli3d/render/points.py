@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from numbers import Real
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from reli3d._bridge import check
+from reli3d._bridge import check, tensor_of
 
 UNIT = 1e-4  # of a length from 1: float32 interpolation and rotation err by 1e-6
 NUMBERS = ("base_color", "roughness", "metallic")  # may be a plain number: grey, or the same everywhere
@@ -21,8 +22,9 @@ class SurfacePoints:
 
     position: ``(N, 3)``.  ng: ``(N, 3)`` geometric normal, outward.  normal: ``(N, 3)`` shading normal.  base_color:
     ``(N, 3)`` LINEAR.  roughness: ``(N,)`` perceptual.  metallic: ``(N,)``.  All but ``position`` may be one row, which
-    then holds for all points, and the material may be plain numbers.  Fields have N rows after construction.  Raises
-    TypeError for a wrong kind or dtype, ValueError for a shape or device.
+    then holds for all points, and the material may be single numbers.  Arrays of numpy are taken where nothing is lost.
+    Fields have N rows after construction.  Raises TypeError for a wrong kind or dtype, ValueError for a shape or
+    device.
     """
 
     position: Tensor
@@ -45,6 +47,7 @@ class SurfacePoints:
         ) -> None: ...
 
     def __post_init__(self):
+        object.__setattr__(self, "position", tensor_of(self.position))
         check("position", self.position, last=3)
         if self.position.ndim != 2:
             raise ValueError(f"position: expected shape (N, 3), got {tuple(self.position.shape)}")
@@ -92,13 +95,15 @@ def check_values(points: SurfacePoints, wo: Tensor) -> None:
 def of_rows(name: str, value: Tensor | float, position: Tensor, last: int) -> Tensor:
     """``value`` as ``(N, last)``, or ``(N,)`` for ``last`` 0, for the N rows of ``position``; one row is repeated."""
     shape = (len(position), last) if last else (len(position),)
-    if isinstance(value, (int, float)):
-        if name not in NUMBERS:
-            check(name, value)
+    if isinstance(value, Real) and name in NUMBERS:
         return position.new_tensor(float(value)).expand(shape)
-    check(name, value, last=last or None, like=position)
-    if value.shape == shape:
-        return value
-    if value.numel() != max(last, 1):
-        raise ValueError(f"{name}: expected shape {shape} or one row, got {tuple(value.shape)}")
-    return value.reshape(shape[1:]).expand(shape)
+    rows: Tensor = tensor_of(value)
+    check(name, rows, like=position)
+    if name in NUMBERS and rows.numel() == 1:
+        return rows.reshape(()).expand(shape)
+    check(name, rows, last=last or None)
+    if rows.shape == shape:
+        return rows
+    if rows.numel() != max(last, 1):
+        raise ValueError(f"{name}: expected shape {shape} or one row, got {tuple(rows.shape)}")
+    return rows.reshape(shape[1:]).expand(shape)

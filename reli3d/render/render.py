@@ -13,6 +13,7 @@ from PIL import Image
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from reli3d._bridge import expect
 from reli3d.geometry.camera import Camera, camera_rays
 from reli3d.geometry.rays import RayScene
 from reli3d.render.allocation import SamplePlan, plan_samples, spread_rows
@@ -168,7 +169,10 @@ def plan_render(
 
 def _checked(asset, camera: Camera, environment: Environment | None) -> tuple[list[Asset], Environment]:
     """The parts, and the light: the argument or the first part's own."""
-    parts = [asset] if isinstance(asset, Asset) else list(asset)
+    parts = list(asset) if isinstance(asset, (list, tuple)) else [asset]
+    for part in parts:
+        expect("asset", part, Asset)
+    expect("camera", camera, Camera)
     if environment is None:
         environment = next((p.environment for p in parts if p.environment is not None), None)
     if environment is None:

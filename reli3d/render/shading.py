@@ -15,6 +15,7 @@ from reli3d._bridge import (
     SLICE_MIN,
     check,
     empty,
+    expect,
     launch,
     once_differentiable,
     over_slices,
@@ -69,6 +70,7 @@ class ShadeOptions:
     check_inputs: bool = False
 
     def __post_init__(self):
+        expect("samples", self.samples, Sequence)
         if len(self.samples) != 3 or any(int(k) != k or k < 0 for k in self.samples):
             raise ValueError(f"samples: expected three counts of at least 0, got {self.samples}")
         for name, allowed in CHOICES.items():
@@ -295,8 +297,7 @@ def shaded_arrays(
         ("environment", environment, Environment),
         ("options", options, ShadeOptions),
     ):
-        if not isinstance(value, kind):
-            raise TypeError(f"{name}: expected {kind.__name__}, got {type(value).__name__}")
+        expect(name, value, kind)
     position = points.position
     check("environment.radiance", environment.radiance, like=position)
     if scene is not None and scene.device != position.device:

@@ -215,3 +215,9 @@ def test_every_command_of_the_package_exists():
     assert len(commands) >= 3
     for module, function in commands:
         assert callable(getattr(importlib.import_module(module), function)), module
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "reli3d" / "kernels").glob("*.py")), ids=lambda p: p.name)
+def test_kernels_have_one_dialect(path):
+    """``wp.array[...]``; a local variable that changes begins as ``wp.float32(0.0)`` or ``wp.int32(0)``."""
+    assert re.findall(r"array\dd?\(dtype=|array\(dtype=|= (?:float|int)\(-?[0-9.]+\)", path.read_text()) == []

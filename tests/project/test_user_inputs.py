@@ -7,6 +7,7 @@ import torch
 from PIL import Image
 
 import reli3d
+from reli3d.geometry.bake import bake
 from reli3d.geometry.camera import Camera, look_at
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene
@@ -14,8 +15,9 @@ from reli3d.geometry.surface import extract_surface
 from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
+from reli3d.render.points import SurfacePoints
 from reli3d.render.render import render
-from reli3d.render.shading import ShadeOptions
+from reli3d.render.shading import ShadeOptions, shade
 from tests.support.scenes import ball, textures
 
 VERTICES = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype=np.float32)
@@ -130,3 +132,40 @@ def test_an_image_is_saved_as_it_is_shown(tmp_path, device):
 def test_the_names_of_the_readme_example_are_lent():
     for name in ("look_at", "read_environment", "SurfacePoints", "ShadeOptions", "Camera", "Environment"):
         assert callable(getattr(reli3d, name))
+
+
+def test_points_take_numbers_of_any_kind_and_numpy_arrays():
+    position = np.random.default_rng(0).random((5, 3), dtype=np.float32)
+    normal = np.array([0.0, 0.0, 1.0], np.float32)
+    want = SurfacePoints(*map(torch.from_numpy, (position, normal, normal)), torch.full((5, 3), 0.5), 0.25, 0.0)
+    for grey in (0.5, np.float32(0.5), torch.tensor(0.5), torch.tensor([0.5]), np.array([[0.5]], np.float32)):
+        got = SurfacePoints(position, normal, normal, grey, np.float32(0.25), torch.tensor([0.0]))
+        assert all(torch.equal(getattr(got, f), getattr(want, f)) for f in vars(want))
+    light = Environment(torch.ones(4, 8, 3))
+    assert torch.equal(shade(want, normal, light), shade(want, torch.from_numpy(normal), light))
+    mesh = ball(torch.device("cpu")).mesh
+    hits = RayScene(mesh.vertices, mesh.faces).closest(position + np.float32(3.0), -position - np.float32(3.0))
+    assert bool((hits.face >= 0).all())
+    with pytest.raises(TypeError, match="position: expected torch.float32, got torch.float64"):
+        SurfacePoints(position.astype(np.float64), normal, normal, 0.5, 0.5, 0.5)
+
+
+def test_a_wrong_kind_is_a_type_error_that_names_the_argument():
+    asset = ball(torch.device("cpu"))
+    camera = Camera.from_fov(look_at([0.0, 0.0, 3.0]), 0.7, 8, 8)
+    light = Environment(torch.ones(4, 8, 3))
+    for name, call in (
+        ("views", lambda: reli3d.reconstruct("photos")),
+        ("c2w", lambda: Camera.from_fov(None, 0.7, 8, 8)),
+        ("asset", lambda: render(asset.mesh, camera, light)),
+        ("camera", lambda: render(asset, look_at([0.0, 0.0, 3.0]), light)),
+        ("environment", lambda: render(asset, camera, torch.ones(4, 8, 3))),
+        ("mesh", lambda: Asset(1, 2)),
+        ("textures", lambda: Asset(asset.mesh, 2)),
+        ("mesh", lambda: bake(asset, 64, None)),
+        ("samples", lambda: ShadeOptions(samples=3)),
+    ):
+        with pytest.raises(TypeError, match=f"^{name}: expected"):
+            call()
+    with pytest.raises(TypeError, match="int"):
+        reli3d.read_glb(0)  # no file descriptor is read

@@ -27,7 +27,7 @@ import warp as wp
 {setting}
 
 @wp.kernel
-def beyond(a: wp.array(dtype=float), k: int):
+def beyond(a: wp.array[float], k: int):
     a[wp.tid()] = a[wp.tid() + k]
 
 a = wp.zeros(4, dtype=float, device="cpu")
