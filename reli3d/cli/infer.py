@@ -301,13 +301,14 @@ class Job:
                 asset = reconstruct_placed(placed, self.model, self.options, watch)
             seconds[label] = {k: round(v, 4) for k, v in {**before, **watch.seconds}.items()}
         self.cold = False
-        shown, compared, record = views.transformed(output), None, {}
+        shown, compared, first, record = views.transformed(output), None, None, {}
         if self.budget:
             steps("refine")
             photographs = photographs.transformed(output)
             result = refined(asset, photographs, seed=args.seed, cameras=args.refine_cameras, bar=True, **self.budget)
             steps.tell(result.notes)
-            compared, asset = comparison(asset, result.asset, shown.to(self.device)), result.asset
+            compared = comparison(asset, result.asset, shown.to(self.device))
+            first, asset = asset if result.kept == "result" else None, result.asset
             record = {"refinement": {"views": len(photographs), **self.budget, **result.record()}}
         steps("preview")
         picture = preview(asset, shown.to(self.device))
@@ -344,6 +345,7 @@ class Job:
             info,
             compatible=args.compatible_names,
             comparison=compared,
+            before=first,
             translation=translation,
         )
 

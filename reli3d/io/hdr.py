@@ -36,7 +36,7 @@ def read_environment(path: str | os.PathLike, *, notes: list[str] | None = None)
     height, width = image.shape[:2]
     if width != 2 * height:
         raise InputError(path, f"size: expected a map twice as wide as high, got {width} x {height}; convert it")
-    return _quarter_turn(image, 1)
+    return quarter_turn(image, 1)
 
 
 def write_environment(path: str | os.PathLike, radiance: Tensor, *, centre: str = "+X") -> int:
@@ -53,16 +53,16 @@ def write_environment(path: str | os.PathLike, radiance: Tensor, *, centre: str 
         raise ValueError(f"centre: expected +X or -Z, got {centre}")
     if radiance.ndim != 3 or radiance.shape[1] != 2 * radiance.shape[0]:
         raise ValueError(f"radiance: expected shape (H, 2H, 3), got {tuple(radiance.shape)}")
-    return write(path, _quarter_turn(radiance, -1) if centre == "+X" else radiance)
+    return write(path, quarter_turn(radiance, -1) if centre == "+X" else radiance)
 
 
 def environment_bytes(radiance: Tensor) -> bytes:
     """What :func:`write_environment` writes into a ``.hdr`` file.  Raises as it does."""
     pixels, _ = _writable(radiance, float(np.finfo(np.float32).max) / 2)
-    return rgbe_bytes(np.ascontiguousarray(_quarter_turn(torch.from_numpy(pixels), -1).numpy()))
+    return rgbe_bytes(np.ascontiguousarray(quarter_turn(torch.from_numpy(pixels), -1).numpy()))
 
 
-def _quarter_turn(radiance: Tensor, sign: int) -> Tensor:
+def quarter_turn(radiance: Tensor, sign: int) -> Tensor:
     """Columns moved right by ``sign`` times a quarter of the width; an odd height needs a mean of two texels."""
     height = radiance.shape[0]
     moved = radiance.roll(sign * (height // 2), 1)

@@ -13,6 +13,7 @@ from torch.nn.functional import interpolate, normalize
 from reli3d.geometry.camera import Camera, look_at
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene
+from reli3d.io.hdr import quarter_turn
 from reli3d.render.asset import Asset
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
@@ -36,7 +37,7 @@ AZIMUTHS = 24  # places around the object to choose from
 def preview(asset: Asset, views: Views) -> np.ndarray:
     """Picture ``(H, W, 3)`` uint8: up to four input views; four views that nobody photographed under the asset's own
     light, then under the studio of :mod:`reli3d.render.lights`; the maps of the first of them; the own light, row 0
-    up, centre -Z, exposed so that its mean is ``MEAN``.
+    up, centre +X as in its files, exposed so that its mean is ``MEAN``.
 
     views: in the frame of ``asset``.
     """
@@ -126,7 +127,7 @@ def _on_paper(color: Tensor, alpha: Tensor) -> Tensor:
 
 def _map(light: Environment) -> Tensor:
     """The light as a tile of half the height."""
-    radiance = light.radiance
+    radiance = quarter_turn(light.radiance, -1)
     shown = linear_to_srgb((radiance * (MEAN / radiance.mean().clamp(min=1e-6))).clamp(0, 1)).permute(2, 0, 1)[None]
     return interpolate(shown, (TILE // 2, TILE), mode="bilinear", align_corners=False)[0].permute(1, 2, 0)
 

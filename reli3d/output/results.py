@@ -82,6 +82,7 @@ def write_results(
     *,
     compatible: bool = False,
     comparison: np.ndarray | None = None,
+    before: Asset | None = None,
     translation: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> None:
     """Write :data:`FILES`; an error leaves what was there before.  Raises OSError, ValueError.
@@ -89,7 +90,8 @@ def write_results(
     replacing: what :func:`claim` of the folder gives.
     views: the photographs, in the frame of ``asset``.  picture: :func:`~reli3d.output.preview.preview` of both.
     info: what ``run_info.json`` holds, the convention of the light apart.
-    compatible: write the light as :data:`PUBLISHED_LIGHT` as well.  comparison: the picture of a refinement.
+    compatible: write the light as :data:`PUBLISHED_LIGHT` as well.  comparison: the picture of a refinement.  before:
+    the asset without it, which the page shows too.
     translation: of ``mesh.glb``, see :func:`~reli3d.io.glb.write_glb`; the page shows it where it is.
     """
     radiance = asset.light.radiance
@@ -107,9 +109,8 @@ def write_results(
         if comparison is not None:
             write_png(new / COMPARISON, comparison)
         low, high = asset.mesh.vertices.aminmax(dim=0)
-        page = viewer_page(
-            info["object"], {"mesh": glb}, radiance, (low + high) / 2, float((high - low).norm()) / 2, views
-        )
+        meshes = {"mesh": glb} if before is None else {"after": glb, "before": glb_bytes(before)}
+        page = viewer_page(info["object"], meshes, radiance, (low + high) / 2, float((high - low).norm()) / 2, views)
         (new / "viewer.html").write_text(page, encoding="utf-8")
         (new / "run_info.json").write_text(json.dumps(info, indent=1) + "\n")
 

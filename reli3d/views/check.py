@@ -112,7 +112,9 @@ def _quarter_turn(views: Views, sign: float) -> Views:
 def _alternatives(views: Views):
     """``(what is wrong, what to do, views with it undone)`` for the usual mistakes."""
     c2w, flip, half = views.c2w, _FLIP.to(views.c2w), _HALF_TURN.to(views.c2w)
-    inverse = torch.linalg.inv(c2w.double()).to(c2w)
+    given = c2w.double()
+    given[:, :3, 3] += given.new_tensor(views.origin)  # as in the folder
+    inverse = torch.linalg.inv(given).to(c2w)
     turned = c2w.clone()
     turned[:, :3, :3] = c2w[:, :3, :3].transpose(1, 2)
     cases = [

@@ -21,6 +21,7 @@ BALL = 1.3  # diameter of the ball that limits the hull, in mask widths: a gener
 PARALLEL = 0.01  # mean squared sine between the axes (6 degrees) below which depth is guessed, not triangulated
 FAR = 10.0  # distances to the object from which the origin is moved to it: float32 then loses a digit of each position
 SMALLEST = 1e-6  # distance to the object below which squares of areas of a mesh's faces leave float32
+WRITTEN = 1e-6  # of a position: matrices are often written with seven digits
 ONE_POINT = 1e-12  # of the eyes' distance from the origin: nearer together, only float64's rounding tells them apart
 AT_EYE = 1e-6  # of an eye's distance from the origin: what is nearer to the eye than float32 tells places apart
 
@@ -122,19 +123,20 @@ def near_origin(c2w: Tensor) -> Tensor:
     """The point ``(3,)`` float64 that shall be the origin of cameras ``c2w (V, 4, 4)`` float64: where they look, if
     the origin of their frame is more than FAR times as far from there as they are; else zero.
 
-    Raises ValueError where they are nearer to it than SMALLEST, unless all stand in one point.
+    Raises ValueError where they are nearer to it than SMALLEST, unless all stand in one point, as the eyes of a rig
+    about the origin do where its matrices are world-to-camera.
     """
     eyes = c2w[:, :3, 3]
     if len(eyes) > 1 and float((eyes - eyes[0]).abs().max()) <= ONE_POINT * float(eyes.abs().max()):
         return torch.zeros_like(eyes[0])
     aim = meeting_point(eyes, -c2w[:, :3, 2])[0]
     reach = float((eyes - aim).norm(dim=-1).median())
-    if reach < SMALLEST:
+    if reach < SMALLEST and float((eyes - aim).abs().max()) > WRITTEN * float(eyes.abs().max()):
         raise ValueError(
             f"cameras: expected a distance of {SMALLEST:g} or more to the object, got {reach:.3g}; "
             "scale the positions up"
         )
-    return aim if float(aim.norm()) > FAR * reach else torch.zeros_like(aim)
+    return aim if float(aim.norm()) > FAR * reach and reach >= SMALLEST else torch.zeros_like(aim)
 
 
 def _covered(points: Tensor, mask: Tensor, pose: Tensor, camera: Tensor, cell: float) -> Tensor:

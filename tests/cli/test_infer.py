@@ -1,6 +1,7 @@
 """The command from folders to files: what it writes, what it refuses, and how it ends."""
 
 import json
+import re
 import sys
 from pathlib import Path
 
@@ -208,6 +209,9 @@ def test_a_refinement_writes_its_picture_and_its_curve(tmp_path):
     record = json.loads((folder / "run_info.json").read_text())["refinement"]
     assert sum(record["steps"].values()) == 6 and record["kept"] in ("start", "result") and record["curve"]
     assert record["psnr_after"]["input"] is not None and record["views_held_out"] == [1]
+    page = (folder / "viewer.html").read_text()
+    names = re.findall(r'"name": "(mesh|before|after)"', page)
+    assert names == (["after", "before"] if record["kept"] == "result" else ["mesh"])
 
 
 def test_a_refinement_of_no_time_is_refused(tmp_path, capsys):

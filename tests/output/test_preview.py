@@ -7,8 +7,10 @@ import torch
 
 from reli3d.geometry.camera import project
 from reli3d.geometry.mesh import Mesh
+from reli3d.io.hdr import read_hdr_image, write_environment
 from reli3d.output import preview
 from reli3d.render.asset import Asset
+from reli3d.render.environment import Environment
 from reli3d.render.lights import sky
 from reli3d.views.views import Views
 from tests.support.rigs import rig
@@ -54,3 +56,13 @@ def test_the_sheet_holds_the_inputs_unseen_views_maps_and_a_small_light(asset):
     light = sheet[4 * row + preview.TITLE :, :tile]
     blue, red = (light[: tile // 8, :, k].float().mean() for k in (2, 0))
     assert float(blue) > 1.3 * float(red)  # a sky above
+
+
+def test_the_light_is_drawn_as_its_file_holds_it(asset, tmp_path):
+    radiance = torch.full((32, 64, 3), 0.1)
+    radiance[8:12, 5:9] = 5.0
+    write_environment(tmp_path / "light.hdr", radiance)
+    stored = read_hdr_image(tmp_path / "light.hdr")
+    drawn = preview._map(Environment(radiance))
+    peak = [int(m.mean(-1).amax(0).argmax()) / m.shape[1] for m in (stored, drawn)]
+    assert abs(peak[0] - peak[1]) < 4 / 64 and peak[0] > 0.25  # in memory it is at 0.1

@@ -1,14 +1,19 @@
+import json
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 from PIL import Image
 
+import reli3d
 from reli3d.views.check import explain_cameras, rig_picture, up_axis, verdict
 from reli3d.views.folder import load_views
 from tests.support.rigs import rig as cameras
 from tests.support.rigs import sphere_views
 
+EXAMPLE = Path(reli3d.__file__).parent / "assets" / "example"
 FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
 ROLL = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0]))
 QUARTER = torch.tensor([[0.0, 1.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
@@ -149,3 +154,19 @@ def test_cameras_that_do_not_tell_up_suggest_nothing():
 def test_the_verdict_alone_is_the_last_line():
     views = rig()
     assert verdict(views) == explain_cameras(views)[-1]
+
+
+@pytest.mark.parametrize("apart", [0.0, 0.25, 3.0])
+@pytest.mark.parametrize("axes, words", [(torch.eye(4), "world-to-camera; store"), (FLIP, "in OpenCV axes")])
+def test_world_to_camera_matrices_of_a_folder_are_named(tmp_path, apart, axes, words):
+    """Read as poses, those of a rig about the origin put all eyes in one point, and others move the origin."""
+    folder = tmp_path / "object"
+    shutil.copytree(EXAMPLE, folder)
+    data = json.loads((folder / "transforms.json").read_text())
+    for frame in data["frames"]:
+        pose = torch.tensor(frame["transform_matrix"], dtype=torch.float64)
+        pose[0, 3] += apart
+        frame["transform_matrix"] = torch.linalg.inv(pose @ axes.double()).tolist()
+    (folder / "transforms.json").write_text(json.dumps(data))
+    line = verdict(load_views(folder))
+    assert line.startswith("suspect: the matrices look like world-to-camera") and words in line
