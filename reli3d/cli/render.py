@@ -14,6 +14,7 @@ from reli3d.cli.ending import check_range, command
 from reli3d.cli.helping import Defaults
 
 FORMATS = ("png", "exr", "webp", "gif", "mp4")
+OTHER_FILMS = (".mov", ".avi", ".mkv", ".webm", ".m4v", ".apng")  # not written
 MOVING = ("webp", "gif", "mp4")  # one file of all frames
 RATE = 24  # frames a second
 QUALITIES = {"draft": ((6, 12, 2), 1), "good": ((20, 40, 4), 2), "best": ((64, 128, 16), 4)}  # samples, supersampling
@@ -153,6 +154,8 @@ def _check(args: argparse.Namespace) -> None:
         check_range(name, getattr(args, name), low, high)
     if not all(0 <= k <= 65536 for k in args.samples) or sum(args.samples) == 0:
         raise ValueError(f"--samples: expected three counts of 0 to 65536, one above 0, got {tuple(args.samples)}")
+    if args.output.suffix.lower() in OTHER_FILMS:
+        raise ValueError(f"--output: expected a folder, or a name that ends in .webp, .gif or .mp4, got {args.output}")
     if args.format == "mp4":
         if args.size % 2:
             raise ValueError(f"--size: expected an even number of pixels for mp4, got {args.size}")

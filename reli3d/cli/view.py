@@ -37,7 +37,9 @@ def main(argv: list[str] | None = None) -> int:
     args = parser().parse_args(argv)
     try:
         if not (args.folder / PAGE).is_file():
-            raise ValueError(f"{args.folder}: expected a folder with {PAGE}, got none; make it with reli3d infer")
+            below = [str(p.parent) for p in sorted(args.folder.glob(f"*/{PAGE}"))[:3]]
+            fix = f"give {' or '.join(below)}" if below else "make it with reli3d infer"
+            raise ValueError(f"{args.folder}: expected a folder with {PAGE}, got none; {fix}")
         if not 0 <= args.port <= 65535:
             raise ValueError(f"--port: expected 0 to 65535, got {args.port}")
         handler = functools.partial(_Handler, directory=str(args.folder))

@@ -8,6 +8,7 @@ from pathlib import Path
 from reli3d.io.files import InputError
 
 ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff")
+UNREAD = (".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw")  # of telephones and cameras
 
 
 def no_cameras(folder: Path) -> InputError:
@@ -21,6 +22,11 @@ def no_cameras(folder: Path) -> InputError:
         names = " ".join(sorted({f"{shlex.quote(str(folder))}/*{p.suffix}" for p in photographs}))
         images = shlex.quote(str(folder / "images"))
         move = f"mkdir {images} && mv {names} {images} && "  # COLMAP would take the masks for photographs
+    unread = [p for place in (folder, folder / "images") for p in _images(place, UNREAD)]
+    if not photographs and unread:
+        return InputError(
+            unread[0], "expected PNG, JPEG, WebP or TIFF photographs; convert them to JPEG, at full size and uncropped"
+        )
     if len(photographs) < 2:
         return InputError(
             folder, "expected transforms.json or a COLMAP model (sparse/0), got neither; see docs/inputs.md"
@@ -38,8 +44,8 @@ def no_cameras(folder: Path) -> InputError:
     )
 
 
-def _images(folder: Path) -> list[Path]:
+def _images(folder: Path, endings: tuple[str, ...] = ENDINGS) -> list[Path]:
     try:
-        return sorted(p for p in folder.iterdir() if p.suffix.lower() in ENDINGS and p.is_file())
+        return sorted(p for p in folder.iterdir() if p.suffix.lower() in endings and p.is_file())
     except OSError:
         return []

@@ -71,6 +71,13 @@ def test_view_refuses_in_one_line(tmp_path, monkeypatch, capsys, arguments):
     assert "expected" in said.err
 
 
+def test_view_of_the_folder_above_names_the_one_below(tmp_path, capsys):
+    (tmp_path / "shoe").mkdir()
+    (tmp_path / "shoe" / view.PAGE).touch()
+    assert view.main([str(tmp_path)]) == 2
+    assert capsys.readouterr().err.rstrip().endswith(f"give {tmp_path / 'shoe'}")
+
+
 def test_help_tells_defaults(capsys):
     for name in ("infer", "render", "data render", "data pack", "stages", "eval"):
         with pytest.raises(SystemExit):

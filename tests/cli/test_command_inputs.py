@@ -75,6 +75,7 @@ CASES = [
             (["--seed", "-1"], "--seed"),
             (["--seed", "99999999999999999999"], "--seed"),
             (["--output", "file"], "a file"),
+            (["--output", "turn.mov"], "ends in .webp, .gif or .mp4"),
             ([], "not found"),
         ]
     ),

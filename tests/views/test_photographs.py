@@ -262,3 +262,9 @@ def test_backgrounds_are_removed_on_request_alone(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rembg", None)  # as if it were not installed
     with pytest.raises(InputError, match=r"^remove-background: expected rembg installed.*reli3d\[masks\]"):
         load_views(folder, remove_background=True)
+
+
+def test_photographs_of_a_kind_that_is_not_read_are_named(tmp_path):
+    (tmp_path / "IMG_1.HEIC").write_bytes(b"photograph")
+    with pytest.raises(InputError, match="IMG_1.HEIC: expected PNG, JPEG, WebP or TIFF photographs; convert"):
+        load_views(tmp_path)
