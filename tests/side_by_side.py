@@ -15,8 +15,9 @@ import numpy as np
 import pytest
 from PIL import Image, ImageDraw
 
-from reli3d.io.hdr import read_environment
+from reli3d.io.hdr import read_environment, write_environment
 from reli3d.render.environment import Environment
+from reli3d.render.lights import studio
 from tests.support import clients
 
 BACKGROUND = 255.0
@@ -29,12 +30,16 @@ def main(argv: list[str] | None = None) -> int:
     p.add_argument("output", type=Path)
     for name, value in vars(clients.Shot()).items():
         p.add_argument(f"--{name}", type=type(value), default=value)
+    p.add_argument("--studio", action="store_true", help="under the package's studio instead of its own light")
     args = p.parse_args(argv)
     shot = clients.Shot(args.size, args.fov, args.azimuth, args.elevation, args.distance)
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         for name in ("mesh.glb", "environment.hdr", "environment.exr"):
             shutil.copy(args.folder / name, folder)
+        if args.studio:
+            for name in ("environment.hdr", "environment.exr"):
+                write_environment(folder / name, studio(256).radiance)
         light = Environment(read_environment(folder / "environment.exr"))
         try:
             pictures = {
