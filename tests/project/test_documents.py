@@ -98,7 +98,7 @@ def test_links_and_paths_of_a_page_lead_somewhere(page):
         assert target.startswith("https://") or (page.parent / target).exists(), target
     if page.name == "CHANGELOG.md":  # names what is gone
         return
-    for path in re.findall(r"`((?:reli3d|tests|bench|examples|docs)/[\w/.-]*\w)`", text):
+    for path in re.findall(r"`((?:reli3d|tests|bench|examples|tools|docs)/[\w/.-]*\w)`", text):
         assert (ROOT / path).exists(), path
     rooms = "|".join(set().union(*LAYERS))
     for path in re.findall(rf"`((?:{rooms})/\w+\.py)`", text):

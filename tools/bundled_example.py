@@ -1,7 +1,7 @@
 """Make the object folder that the package brings: a procedural kettle in a procedural room, seen by four cameras
 from all sides.
 
-usage: python examples/bundled_example.py reli3d/assets/example
+usage: python tools/bundled_example.py reli3d/assets/example
 """
 
 from __future__ import annotations
