@@ -56,7 +56,7 @@ def test_code_of_a_page_runs_from_top_to_bottom(page, folder):
 
 
 def test_pages_with_code_are_found():
-    assert {"README.md", "docs/renderer.md", "docs/geometry.md"} <= set(map(name_of, WITH_CODE))
+    assert {"README.md", "docs/renderer.md", "docs/geometry.md", "docs/refinement.md"} <= set(map(name_of, WITH_CODE))
 
 
 def test_a_block_that_is_not_to_run_is_left_out(tmp_path):
