@@ -2,8 +2,8 @@
 
 usage: python examples/fit_shape.py OUTPUT_FOLDER [--steps 60] [--size 96]
 
-Starts from the visual hull of the silhouettes.  Gradients reach the grid through depth and antialiased outlines.
-Writes ``shape.glb`` and prints the mean distance from the true surface.
+Starts from the visual hull.  Gradients reach the grid through depth and antialiased outlines.  Writes ``shape.glb`` and
+prints the mean distance from the true surface.
 """
 
 import argparse
@@ -54,7 +54,6 @@ for step in range(args.steps):
     optimizer.zero_grad()
     loss.backward()
     optimizer.step()
-
 found = reli3d.extract_surface(level.detach(), radius=1.0)
 print(f"found: {distance(found.vertices).abs().mean():.4f}")
 found, clay = with_tangents(reli3d.unwrap(found)), reli3d.TextureSet(torch.full((8, 8, 3), 0.7), 0.8, 0.0)

@@ -33,7 +33,7 @@ from reli3d.nn.view_features import ViewMaps
 from reli3d.nn.weights import Network, load_model
 from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.environment import Environment
-from reli3d.render.exposure import weighed
+from reli3d.render.exposure import estimate_paint_and_light
 from reli3d.views.normalize import FAR, normalize
 from reli3d.views.published_views import background_shown, hero_first, placement_notes, published_views
 from reli3d.views.similarity import Similarity, output_frame
@@ -221,15 +221,15 @@ def light(field: Field) -> Environment:
     return Environment(field.radiance_map().contiguous())
 
 
-def as_seen(asset: Asset, maps: ViewMaps, scene: RayScene) -> Asset:
-    """``asset`` with the likeliest paint, and with a light that shows it as the views that ``maps`` hold.
+def match_brightness(asset: Asset, maps: ViewMaps, scene: RayScene) -> Asset:
+    """``asset`` with the likeliest paint, and its light scaled to the colour of the views that ``maps`` hold.
 
-    Paint times light is all that photographs tell; see :mod:`reli3d.render.exposure`.
+    Photographs determine only the product of paint and light; see :mod:`reli3d.render.exposure`.
     """
-    return weighed(asset, maps.images[..., :3], maps.images[..., 3] > INSIDE, maps.camera, scene)
+    return estimate_paint_and_light(asset, maps.images[..., :3], maps.images[..., 3] > INSIDE, maps.camera, scene)
 
 
-def turned(asset: Asset, similarity: Similarity) -> Asset:
+def transform_asset(asset: Asset, similarity: Similarity) -> Asset:
     """``asset`` moved by ``similarity``; normals, tangents and the light turn with it."""
     mesh, rotation = asset.mesh, similarity.rotation.to(asset.mesh.vertices)
     normals, tangents = present("mesh.normals", mesh.normals), present("mesh.tangents", mesh.tangents)
@@ -375,9 +375,10 @@ def reconstruct_placed(placed: Placed, model: Network, options: ReconstructOptio
     with watch.stage("light"):
         asset = Asset(mesh, textures, light(field))
         if scene is not None:
-            asset = as_seen(asset, field.maps, scene)
+            asset = match_brightness(asset, field.maps, scene)
     with watch.stage("frame"):
-        near, asset = asset.mesh, turned(asset, placed.output_from_input.compose(placed.model_from_input.inverse()))
+        near, output_from_model = asset.mesh, placed.output_from_input.compose(placed.model_from_input.inverse())
+        asset = transform_asset(asset, output_from_model)
         _check_place(near, asset.mesh)
     return asset
 

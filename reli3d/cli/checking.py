@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from reli3d.cli.ending import reason
+from reli3d.cli.exit_codes import reason
 
 if TYPE_CHECKING:
     from reli3d.io.tar import Packed

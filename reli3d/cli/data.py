@@ -13,8 +13,8 @@ from pathlib import Path
 
 from reli3d._bridge import present
 from reli3d.cli import shards
-from reli3d.cli.ending import check_range, command
-from reli3d.cli.helping import Defaults
+from reli3d.cli.exit_codes import check_range, command
+from reli3d.cli.help_format import Defaults
 
 
 def parser() -> argparse.ArgumentParser:

@@ -7,8 +7,8 @@ import json
 import sys
 from pathlib import Path
 
-from reli3d.cli.ending import command
-from reli3d.cli.helping import Defaults
+from reli3d.cli.exit_codes import command
+from reli3d.cli.help_format import Defaults
 
 
 def parser() -> argparse.ArgumentParser:

@@ -8,8 +8,8 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from reli3d.cli.ending import check_range, command
-from reli3d.cli.helping import Defaults
+from reli3d.cli.exit_codes import check_range, command
+from reli3d.cli.help_format import Defaults
 
 FORMATS = ("glb", "obj", "usdz")
 

@@ -16,11 +16,11 @@ from pathlib import Path
 
 from reli3d.cli import objects
 from reli3d.cli.checking import SUSPECT, Check, diagnosed
-from reli3d.cli.ending import check_range, command, reason
-from reli3d.cli.helping import joined
+from reli3d.cli.exit_codes import check_range, command, reason
+from reli3d.cli.help_format import joined
 from reli3d.cli.options import AXES, parser
 from reli3d.cli.progress import Progress
-from reli3d.cli.shelf import Shelf, opened_shelf
+from reli3d.cli.shard_writer import ShardWriter, open_shards
 from reli3d.io.tar import Packed
 
 STARTED = time.monotonic()
@@ -39,10 +39,10 @@ def main(argv: list[str] | None = None) -> int:
         return doctor.main([])
     with contextlib.ExitStack() as held:
         try:
-            plan = _planned(args, held)
+            plan = _plan(args, held)
         except (ValueError, OSError) as error:
             return _fail(error)
-        return _carried_out(args, plan)
+        return _execute(args, plan)
 
 
 @dataclass
@@ -53,10 +53,10 @@ class Plan:
     ready: list[objects.Row]
     rows: objects.Rows
     job: objects.Job
-    shelf: Shelf | None
+    writer: ShardWriter | None
 
 
-def _planned(args: argparse.Namespace, held: contextlib.ExitStack) -> Plan:
+def _plan(args: argparse.Namespace, held: contextlib.ExitStack) -> Plan:
     """What the command will do; what is wrong with it is told here.  Raises ValueError, OSError."""
     from reli3d.output import results
     from reli3d.output.folder import check_place
@@ -81,30 +81,30 @@ def _planned(args: argparse.Namespace, held: contextlib.ExitStack) -> Plan:
         )
     device = choose_device(args.device)
     budget = refinement_budget(args, device)
-    ready, left, shelf = [], items, None
+    ready, left, writer = [], items, None
     if args.shards_out is not None:
-        shelf = held.enter_context(opened_shelf(args.output, args.shards_out, results.OURS, more=args.skip_existing))
+        writer = held.enter_context(open_shards(args.output, args.shards_out, results.OURS, more=args.skip_existing))
         files = results.names(compatible=args.compatible_names, refined=bool(budget))
-        left = [item for item in items if item.name not in shelf.objects]
-        packed = [item.name for item in items if item.name in shelf.objects]
-        ready = [objects.Row(n, "skipped", **objects.recorded(shelf.record(n, files))) for n in packed]
+        left = [item for item in items if item.name not in writer.objects]
+        packed = [item.name for item in items if item.name in writer.objects]
+        ready = [objects.Row(n, "skipped", **objects.recorded(writer.record(n, files))) for n in packed]
     job = Check(functools.partial(_read, args=args, whole=True), args.json) if args.check else Job(args, device)
-    return Plan(items, ready, _rows(args, left, device, job), job, shelf)
+    return Plan(items, ready, _rows(args, left, device, job), job, writer)
 
 
-def _carried_out(args: argparse.Namespace, plan: Plan) -> int:
+def _execute(args: argparse.Namespace, plan: Plan) -> int:
     """Make the objects of ``plan``; the exit code."""
-    items, job, shelf = plan.items, plan.job, plan.shelf
+    items, job, writer = plan.items, plan.job, plan.writer
     ended: list[objects.Row] = []
     try:
         with contextlib.closing(plan.rows):
             for row in itertools.chain(plan.ready, plan.rows):
                 ended.append(row)
-                _tell(row, args, len(items))
-                if shelf and row.result in ("done", "skipped") and row.object not in shelf.place:
-                    _tell_shard(shelf.add(row.object), args)
-        if shelf:
-            _tell_shard(shelf.write(), args)
+                _report(row, args, len(items))
+                if writer and row.result in ("done", "skipped") and row.object not in writer.place:
+                    _report_shard(writer.add(row.object), args)
+        if writer:
+            _report_shard(writer.write(), args)
     finally:
         if len(items) > 1 and not args.check:
             order = {item.name: k for k, item in enumerate(items)}
@@ -116,15 +116,15 @@ def _carried_out(args: argparse.Namespace, plan: Plan) -> int:
         code = SUSPECT if isinstance(job, Check) and job.suspects() else 0
     if args.json:
         found = job.found if isinstance(job, Check) else {}
-        entries = [asdict(row) | (found.get(row.object) or _place(row, args, shelf)) for row in ended]
+        entries = [asdict(row) | (found.get(row.object) or _place(row, args, writer)) for row in ended]
         print(json.dumps({"objects": entries, "exit_code": code}))
     return code
 
 
-def _place(row: objects.Row, args: argparse.Namespace, shelf: Shelf | None) -> dict[str, str]:
-    if shelf is None:
+def _place(row: objects.Row, args: argparse.Namespace, writer: ShardWriter | None) -> dict[str, str]:
+    if writer is None:
         return {"folder": str(args.output / row.object)}
-    return {"shard": str(shelf.place[row.object])} if row.object in shelf.place else {}
+    return {"shard": str(writer.place[row.object])} if row.object in writer.place else {}
 
 
 def _rows(args: argparse.Namespace, items: list[objects.Item], device: str, job: objects.Job) -> objects.Rows:
@@ -146,7 +146,7 @@ def worker_job(args: argparse.Namespace, device: str) -> Job:
     return Job(args, device)
 
 
-def _tell(row: objects.Row, args: argparse.Namespace, count: int) -> None:
+def _report(row: objects.Row, args: argparse.Namespace, count: int) -> None:
     """The path of a result on stdout; errors, and what processes cannot show by a bar, on stderr."""
     if row.result == "refused" and count == 1:
         _fail(*row.notes)
@@ -175,7 +175,7 @@ def _stages(folder: Path) -> str:
     return "\n".join([*lines, f"{info['object']}: {info['seconds_since_start']:.2f} s since the start{memory}"])
 
 
-def _tell_shard(path: Path | None, args: argparse.Namespace) -> None:
+def _report_shard(path: Path | None, args: argparse.Namespace) -> None:
     if path and not args.json:
         print(path, flush=True)
 

@@ -25,7 +25,7 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any, Protocol, cast
 
-from reli3d.cli.ending import Stopped, reason, signals
+from reli3d.cli.exit_codes import Stopped, reason, signals
 from reli3d.io.files import InputError, printable, read_bytes, write_bytes
 from reli3d.io.tar import Packed, packed_objects
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from reli3d.cli.helping import Defaults
+from reli3d.cli.help_format import Defaults
 
 AXES = ("x", "y", "z", "-x", "-y", "-z")
 

@@ -8,8 +8,8 @@ from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
 
-from reli3d.cli.ending import check_range
-from reli3d.cli.helping import Defaults
+from reli3d.cli.exit_codes import check_range
+from reli3d.cli.help_format import Defaults
 from reli3d.io.files import InputError
 from reli3d.io.shards import fault, folder_files, pack_in_parts, read_index, write_shard
 

@@ -7,8 +7,8 @@ import dataclasses
 import sys
 from pathlib import Path
 
-from reli3d.cli.ending import check_range, command
-from reli3d.cli.helping import Defaults
+from reli3d.cli.exit_codes import check_range, command
+from reli3d.cli.help_format import Defaults
 
 HELD = 3  # objects in the pictures
 OVERRIDES = ("steps", "batch", "rate", "image_size", "patch", "targets", "lobes", "resolution")  # of a stage

@@ -6,8 +6,8 @@ import argparse
 import sys
 from pathlib import Path
 
-from reli3d.cli.ending import check_range, command
-from reli3d.cli.helping import Defaults
+from reli3d.cli.exit_codes import check_range, command
+from reli3d.cli.help_format import Defaults
 
 MOST = 16  # input views
 

@@ -8,8 +8,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from reli3d.cli.ending import check_range, command
-from reli3d.cli.helping import Defaults
+from reli3d.cli.exit_codes import check_range, command
+from reli3d.cli.help_format import Defaults
 
 if TYPE_CHECKING:
     from reli3d.nn.local import LocalReconstructor

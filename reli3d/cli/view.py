@@ -10,7 +10,7 @@ import webbrowser
 from pathlib import Path
 from urllib.parse import quote
 
-from reli3d.cli.helping import Defaults
+from reli3d.cli.help_format import Defaults
 
 PAGE = "viewer.html"
 

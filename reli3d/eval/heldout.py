@@ -42,7 +42,7 @@ def truth_colors(seed: int, cameras: list[Camera]) -> list[tuple[Tensor, Tensor]
         hits = surface.scene.closest(origins, directions)
         seen = (hits.face >= 0).nonzero()[:, 0]
         color = torch.zeros(len(origins), 3)
-        color[seen] = linear_to_srgb(surface.at(hits.face[seen].long(), hits.bary[seen])["base_color"].clamp(0, 1))
+        color[seen] = linear_to_srgb(surface.points_at(hits.face[seen].long(), hits.bary[seen]).base_color.clamp(0, 1))
         shape = (camera.height, camera.width)
         out.append(((hits.face >= 0).reshape(shape), color.reshape(*shape, 3)))
     return out

@@ -35,6 +35,15 @@ DETAIL_FROM = 0.5
 
 
 @dataclass(frozen=True)
+class MapsStage:
+    """A part of a fit on a fixed surface."""
+
+    name: str
+    until: float  # share of the budget used at its end
+    detail: bool = True  # fit the textures, too
+
+
+@dataclass(frozen=True)
 class Pixels:
     """Pixels that show the object, and what their rays hit; N rows."""
 
@@ -125,19 +134,17 @@ def fit_maps(
     views: list[int],
     weights: losses.Weights,
     budget: Budget,
-    until: float,
+    stage: MapsStage,
     *,
-    name: str,
     seed: int,
-    detail: bool = True,
 ) -> None:
-    """Fit light, exposures and materials on the surface of ``asset``, coarse parts first, textures with ``detail``."""
+    """Fit light, exposures and materials on the surface of ``asset``, coarse parts first."""
     scene = RayScene(asset.mesh.vertices, asset.mesh.faces)
     pixels = traced(asset, scene, photographs, views, seed)
     count = len(pixels.order)
     if count == 0:
         return
-    names = ("light", "exposure", "material", *(("detail",) if detail else ()))
+    names = ("light", "exposure", "material", *(("detail",) if stage.detail else ()))
     groups, opens = [], []
     for which in names:
         for k, value in enumerate(unknowns.groups()[which]):
@@ -146,7 +153,7 @@ def fit_maps(
             value.requires_grad_(True)
     optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99))
     first = 0
-    for step, progress in budget.part(name, until):
+    for step, progress in budget.part(stage.name, stage.until):
         for group, opening in zip(optimizer.param_groups, opens, strict=True):
             fade = 1.0 if progress < 0.6 else 1.0 - 0.9 * (progress - 0.6) / 0.4
             group["lr"] = group["full"] * fade if progress >= opening else 0.0
@@ -167,6 +174,6 @@ def fit_maps(
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-        budget.tell(name, step, float(loss.detach()))
+        budget.tell(stage.name, step, float(loss.detach()))
     for group in optimizer.param_groups:
         group["params"][0].requires_grad_(False)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from reli3d.fit import losses
 from reli3d.fit.budget import Budget, progress_bar
-from reli3d.fit.maps import fit_maps
+from reli3d.fit.maps import MapsStage, fit_maps
 from reli3d.fit.photographs import Photographs, PosedImages
 from reli3d.fit.shading import radiance
 from reli3d.fit.shape import Grid, ShapeData, bound_level, finished, fit_shape, start_level
@@ -24,7 +24,9 @@ from reli3d.render.color import linear_to_srgb
 from reli3d.render.gbuffer import primary_hits, surface_points
 
 RESOLUTION = 96  # cells along the longest side
-LIGHT_UNTIL, SHAPE_UNTIL = 0.12, 0.5  # of the budget: first the light, then the surface, then all maps
+LIGHT = MapsStage("light", until=0.12, detail=False)  # first the light, then the surface, then all maps
+SHAPE_UNTIL = 0.5  # of the budget
+MAPS = MapsStage("maps", until=1.0)
 CHECK_PIXELS = 96  # of a photograph, a side, by which start and result are compared
 CHECK_SAMPLES = (16, 16, 4)
 TEXELS = 512  # of the base colour's detail, at most
@@ -165,9 +167,7 @@ def _fitted(
     grid = Grid.around(first.mesh.vertices, resolution)
     level = start_level(first.mesh, grid) if closed else first.mesh.vertices.new_ones(grid.shape)
     unknowns = Unknowns.zero(level, len(photographs), texels)
-    fit_maps(
-        unknowns, start, first, photographs, used, weights, budget, LIGHT_UNTIL, name="light", seed=seed, detail=False
-    )
+    fit_maps(unknowns, start, first, photographs, used, weights, budget, LIGHT, seed=seed)
     surface = first
     if closed:
         bound = bound_level(photographs, grid)
@@ -178,7 +178,7 @@ def _fitted(
         photographs = replace(photographs, camera=corrected(photographs.camera, unknowns.pose))
     else:
         notes.append("refinement: the surface is not closed, so only its maps and light are fitted")
-    fit_maps(unknowns, start, surface, photographs, used, weights, budget, 1.0, name="maps", seed=seed)
+    fit_maps(unknowns, start, surface, photographs, used, weights, budget, MAPS, seed=seed)
     with torch.no_grad():
         return replace(changed(surface, unknowns), environment=environment(unknowns, start)), photographs
 

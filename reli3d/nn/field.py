@@ -45,7 +45,7 @@ def bound_level(maps: ViewMaps, points: Tensor, softness: float) -> Tensor:
 
 @dataclass(frozen=True)
 class Field(ABC):
-    """What a network knows of one object, with the views it was told.  Frame: the model's."""
+    """Network output for one object, and its input views.  Frame: the model's."""
 
     reads_views: ClassVar[bool]  # whether the material asks which view sees a point
 
@@ -76,7 +76,7 @@ class Field(ABC):
 
 @dataclass(frozen=True)
 class TriplaneField(Field):
-    """What a :class:`~reli3d.nn.model.Reconstructor` knows of one object."""
+    """Output of a :class:`~reli3d.nn.model.Reconstructor` for one object."""
 
     model: Reconstructor
     code: Code  # of one object

@@ -174,7 +174,7 @@ def shown_pixels(images: Tensor, masks: Tensor, camera: Camera) -> tuple[Tensor,
 
 @dataclass(frozen=True)
 class LocalField(Field):
-    """What a :class:`LocalReconstructor` knows of one object."""
+    """Output of a :class:`LocalReconstructor` for one object."""
 
     model: LocalReconstructor
     pixels: PixelMaps

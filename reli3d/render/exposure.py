@@ -1,7 +1,8 @@
-"""Paint and light of an asset beside its photographs, which tell their product alone.
+"""Paint and light of an asset estimated from its photographs, which determine only their product.
 
-A darker paint under a brighter light looks the same, in each channel.  What a network guesses is put where guess,
-photographs and what is usual agree best; the light then makes up what is left.
+A darker paint under a brighter light looks the same, in each channel.  The brightness of the paint is the mean of
+three normal distributions: a prior of paint, the photographs under a prior of light, and the guess of a network.  The
+light is then scaled until the asset has the photographs' colour.
 """
 
 from __future__ import annotations
@@ -26,12 +27,13 @@ WHITE = 0.97  # linear; brighter pixels may be cut off
 BLACK = 1e-3  # added to both means: where nothing is seen the ratio is 1
 TINT = 1.5  # by which the light's colour may change beside its brightness
 
-# Logarithms of mean linear paint and of the light on it (photograph over paint): what is usual, and how far it strays;
-# last how far a guess strays.  Chosen on 20 meshes, as they are and dark: docs/measurements/paint_and_light.md.
+# Prior mean and standard deviation of the logarithms of mean linear paint and of the light on it (photograph over
+# paint); last the standard deviation of a guess.  Chosen on 20 meshes, as they are and dark:
+# docs/measurements/paint_and_light.md.
 PAINT, PAINT_SPREAD = -2.1, 1.2
 LIGHT, LIGHT_SPREAD = -0.3, 0.9
 GUESS_SPREAD = 0.7
-# Colour, as the logarithm of a channel over the mean of the channels: so much of the photographs' and of the guess.
+# Colour, as the logarithm of a channel over the mean of the channels: weights of the photographs' and of the guess.
 # Lights are less coloured than paints.
 SEEN_COLOR, GUESSED_COLOR = 0.8, 0.2
 DARKEST = 1e-3  # linear; below it a logarithm is noise
@@ -39,7 +41,7 @@ FARTHEST = 4.0  # factor by which a guess is changed at most
 
 
 @torch.no_grad()
-def weighed(asset: Asset, images: Tensor, inside: Tensor, camera: Camera, scene: RayScene) -> Asset:
+def estimate_paint_and_light(asset: Asset, images: Tensor, inside: Tensor, camera: Camera, scene: RayScene) -> Asset:
     """``asset`` with its paint times :func:`paint_factor`, and then its light times :func:`photograph_ratio`."""
     views = images, inside, camera, scene
     paint = srgb_to_linear(asset.textures.base_color) * paint_factor(asset, *views)
@@ -65,19 +67,19 @@ def photograph_ratio(asset: Asset, images: Tensor, inside: Tensor, camera: Camer
 
 @torch.no_grad()
 def paint_factor(asset: Asset, images: Tensor, inside: Tensor, camera: Camera, scene: RayScene) -> Tensor:
-    """What the linear base colour of ``asset`` is to be multiplied with, ``(3,)``, so that it is the likeliest.
+    """Factor ``(3,)`` of the linear base colour of ``asset`` that makes it the likeliest.
 
-    The mean of three normal distributions in the logarithm of its brightness: usual paint, the photographs under usual
-    light, and the guess that ``asset`` has.  The colour is weighed between photographs and guess.  Arguments as of
-    :func:`photograph_ratio`; the light of ``asset`` is not asked.  1 where nothing is seen.
+    The mean of three normal distributions in the logarithm of its brightness: the prior of paint, the photographs under
+    the prior of light, and the guess that ``asset`` has.  The colour is a weighted mean of photographs' and guess'.
+    Arguments as of :func:`photograph_ratio`; the light of ``asset`` is not used.  1 where nothing is seen.
     """
     seen, at, _ = _seen(asset, images, inside, camera, scene)
     if len(seen) == 0:
         return seen.new_ones(3)
     photograph, guess = seen.mean(0).clamp(min=DARKEST), at.base_color.mean(0).clamp(min=DARKEST)
-    share = [1.0 / spread**2 for spread in (PAINT_SPREAD, LIGHT_SPREAD, GUESS_SPREAD)]
-    said = torch.stack([seen.new_tensor(PAINT), photograph.mean().log() - LIGHT, guess.mean().log()])
-    brightness = (seen.new_tensor(share) * said).sum() / sum(share)
+    weights = [1.0 / spread**2 for spread in (PAINT_SPREAD, LIGHT_SPREAD, GUESS_SPREAD)]
+    estimates = torch.stack([seen.new_tensor(PAINT), photograph.mean().log() - LIGHT, guess.mean().log()])
+    brightness = (seen.new_tensor(weights) * estimates).sum() / sum(weights)
     color = (SEEN_COLOR * _color(photograph) + GUESSED_COLOR * _color(guess)).exp()
     return (brightness.exp() * color / color.mean() / guess).clamp(1.0 / FARTHEST, FARTHEST)
 

@@ -52,10 +52,8 @@ class Surface(Protocol):
     def distance(self, points: Tensor) -> Tensor:
         """Signed distance ``(N,)`` of points ``(N, 3)``, positive outside."""
 
-    def at(self, face: Tensor, bary: Tensor) -> dict[str, Tensor]:
-        """Position, shading, geometric and bumped normal, LINEAR base colour, roughness and metallic of hits
-        ``(N,)``.
-        """
+    def points_at(self, face: Tensor, bary: Tensor) -> SurfacePoints:
+        """Geometry and material of hits: ``face (N,)``, ``bary (N, 2)``; the shading normal is the bumped one."""
 
 
 class ObjectSurface:
@@ -72,7 +70,7 @@ class ObjectSurface:
     def distance(self, points: Tensor) -> Tensor:
         return signed_distance(self.vertices, self.faces, points)
 
-    def at(self, face: Tensor, bary: Tensor) -> dict[str, Tensor]:
+    def points_at(self, face: Tensor, bary: Tensor) -> SurfacePoints:
         weights = torch.stack([1 - bary.sum(-1), bary[:, 0], bary[:, 1]], -1)[..., None]
         corners = self.vertices[self.faces[face].long()]
         ng = torch.nn.functional.normalize(
@@ -82,29 +80,20 @@ class ObjectSurface:
         position = (corners * weights).sum(1)
         base, rough, metal, bump = self.shape.material(position.numpy(), normal.numpy(), self.part[face].numpy())
         as_float = lambda x: torch.as_tensor(np.ascontiguousarray(x), dtype=torch.float32)  # noqa: E731
-        return {
-            "position": position,
-            "normal": normal,
-            "ng": ng,
-            "bump": as_float(bump),
-            "base_color": as_float(base),
-            "roughness": as_float(rough),
-            "metallic": as_float(metal),
-        }
+        return SurfacePoints(position, ng, *map(as_float, (bump, base, rough, metal)))
 
 
 def _render(surface: Surface, camera: Camera, light: Environment, seed: int):
-    """Linear radiance ``(H * W, 3)`` of every ray, the rays that hit, and what is at the hits."""
+    """Linear radiance ``(H * W, 3)`` of every ray, the rays that hit, and the points at the hits."""
     origins, directions = (r.reshape(-1, 3) for r in camera_rays(camera))
     hits = surface.scene.closest(origins, directions)
     seen = (hits.face >= 0).nonzero()[:, 0]
-    at = surface.at(hits.face[seen].long(), hits.bary[seen])
+    points = surface.points_at(hits.face[seen].long(), hits.bary[seen])
     wo = -directions[seen]
-    points = SurfacePoints(at["position"], at["ng"], at["bump"], at["base_color"], at["roughness"], at["metallic"])
     radiance = shade(points, wo, light, scene=surface.scene, options=ShadeOptions(SAMPLES, seed, paint=PAINT))
     image = light.lookup(directions)
     image[seen] = radiance
-    return image, seen, at, wo, radiance
+    return image, seen, points, wo, radiance
 
 
 def synthesize(
@@ -121,7 +110,7 @@ def synthesize(
     exposure, images, pixels, pixel_radiance = 0.0, [], [], []
     maps: dict[str, list[Tensor]] = {"view_material": [], "view_normal": [], "view_depth": []}
     for k in range(views):
-        image, seen, at, wo, radiance = _render(
+        image, seen, points, wo, radiance = _render(
             surface, cameras[k].scaled(FINE), environment, int(rng.integers(1 << 30))
         )
         if k == 0:
@@ -130,10 +119,10 @@ def synthesize(
         image = pooled_pixels((image * exposure).clamp(0, 4), size).clamp(0, 1)  # a sensor saturates, late
         encoded = torch.cat([linear_to_srgb(image), alpha[..., None]], -1)
         images.append((encoded * 255 + 0.5).to(torch.uint8))
-        for name, value in _view_maps(at, seen, c2w[k], size).items():
+        for name, value in _view_maps(points, seen, c2w[k], size).items():
             maps[name].append(value)
         pick = torch.as_tensor(rng.integers(len(seen), size=PIXELS))
-        pixels.append(torch.stack([at["position"], at["bump"], wo], 1)[pick])
+        pixels.append(torch.stack([points.position, points.normal, wo], 1)[pick])
         pixel_radiance.append((radiance[pick] * exposure).clamp(max=64.0))
     sample.update(
         images=torch.stack(images),
@@ -151,15 +140,15 @@ def synthesize(
     return {k: v.contiguous() for k, v in sample.items()}
 
 
-def _view_maps(at: dict[str, Tensor], seen: Tensor, c2w: Tensor, size: int) -> dict[str, Tensor]:
-    """What is true at the pixels of one view, see the table above, from the rays ``seen (N,)`` that hit."""
+def _view_maps(points: SurfacePoints, seen: Tensor, c2w: Tensor, size: int) -> dict[str, Tensor]:
+    """True maps of one view, see the table above, from the ``points`` that the rays ``seen (N,)`` hit."""
     rays = (size * FINE) ** 2
-    depth = -((at["position"] - c2w[:3, 3]) @ c2w[:3, 2])
+    depth = -((points.position - c2w[:3, 3]) @ c2w[:3, 2])
     values = [
-        at["base_color"].clamp(0, 1),
-        at["roughness"][:, None],
-        at["metallic"][:, None],
-        at["bump"],
+        points.base_color.clamp(0, 1),
+        points.roughness[:, None],
+        points.metallic[:, None],
+        points.normal,
         depth[:, None],
         torch.ones_like(depth)[:, None],
     ]
@@ -202,7 +191,7 @@ def _volume(surface: Surface, rng: np.random.Generator) -> dict[str, Tensor]:
     """Half the points beside the surface (normal offsets of 0.01 and 0.05), half uniform in a box slightly larger
     than the object.
     """
-    near = surface.at(*_random_faces(surface, VOLUME_POINTS // 2, rng))["position"].numpy()
+    near = surface.points_at(*_random_faces(surface, VOLUME_POINTS // 2, rng)).position.numpy()
     near = near + rng.normal(size=near.shape) * rng.choice([0.01, 0.05], (len(near), 1))
     box = surface.vertices.abs().amax(0).numpy() + 0.12
     points = torch.as_tensor(
@@ -213,13 +202,13 @@ def _volume(surface: Surface, rng: np.random.Generator) -> dict[str, Tensor]:
 
 
 def _surface_points(surface: Surface, cameras: Camera, rng: np.random.Generator) -> dict[str, Tensor]:
-    at = surface.at(*_random_faces(surface, SURFACE_POINTS, rng))
-    visible = visible_from(surface.scene, at["position"], at["ng"], cameras)
+    points = surface.points_at(*_random_faces(surface, SURFACE_POINTS, rng))
+    visible = visible_from(surface.scene, points.position, points.ng, cameras)
     encoded = torch.cat(
-        [linear_to_srgb(at["base_color"].clamp(0, 1)), at["roughness"][:, None], at["metallic"][:, None]], -1
+        [linear_to_srgb(points.base_color.clamp(0, 1)), points.roughness[:, None], points.metallic[:, None]], -1
     )
     return {
-        "surface": torch.stack([at["position"], at["ng"], at["bump"]], 1).half(),
+        "surface": torch.stack([points.position, points.ng, points.normal], 1).half(),
         "material": (encoded * 255 + 0.5).to(torch.uint8),
         "visible": visible.to(torch.uint8),
     }

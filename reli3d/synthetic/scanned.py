@@ -16,6 +16,7 @@ from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene
 from reli3d.io.glb import read_glb
 from reli3d.render.gbuffer import surface_points
+from reli3d.render.points import SurfacePoints
 
 ESCAPES = 48  # directions in which a point may see the sky: enough for an opening of a tenth of the sphere
 STRETCH = 0.18  # standard deviation of the logarithm of the scale along each axis
@@ -64,22 +65,19 @@ class ScannedSurface:
     def distance(self, points: Tensor) -> Tensor:
         return outside_distance(self.vertices, self.faces, points, self.scene)
 
-    def at(self, face: Tensor, bary: Tensor) -> dict[str, Tensor]:
-        names = ("position", "normal", "ng", "bump", "base_color", "roughness", "metallic")
-        out = {n: torch.empty(len(face), *((3,) if k < 5 else ())) for k, n in enumerate(names)}
+    def points_at(self, face: Tensor, bary: Tensor) -> SurfacePoints:
+        vectors, numbers = torch.empty(4, len(face), 3), torch.empty(2, len(face))
         part = torch.searchsorted(self.starts, face, right=True) - 1
         for k, asset in enumerate(self.assets):
             index = (part == k).nonzero()[:, 0]
             if len(index) == 0:
                 continue
             local = (face[index] - self.starts[k]).to(torch.int32)
-            got = surface_points(replace(asset.mesh), asset.textures, local, bary[index])
-            smooth = surface_points(asset.mesh, None, local, bary[index]).normal
-            color = (got.base_color * self.gain).clamp(0.0, 1.0)
-            values = (got.position, smooth, got.ng, got.normal, color, got.roughness, got.metallic)
-            for name, value in zip(names, values, strict=True):
-                out[name][index] = value
-        return out
+            points = surface_points(asset.mesh, asset.textures, local, bary[index])
+            color = (points.base_color * self.gain).clamp(0.0, 1.0)
+            vectors[:, index] = torch.stack([points.position, points.ng, points.normal, color])
+            numbers[:, index] = torch.stack([points.roughness, points.metallic])
+        return SurfacePoints(*vectors, *numbers)
 
 
 def _moved(mesh: Mesh, centre: Tensor, stretch: Tensor, size: float) -> Mesh:

@@ -1,8 +1,7 @@
-"""The two numbers that training leaves open: at which density the surface is drawn, from one view and from many.
+"""An uncertain network predicts occupancy below 0.5 at the surface.  A constant added to the logit corrects it.
 
-Trained on a soft occupancy, a network that is not sure says a little less than one half where it means a surface, and
-the shape comes out thin.  A constant on the density, chosen by the silhouettes of whole objects in views that were not
-input, takes that back.  How sure it is depends on the number of views, so one view and four have their own.
+Without it shapes come out thin.  The constant is chosen by the silhouettes of whole objects in views that were not
+input.  The uncertainty depends on the number of views, so one view and four have their own constant.
 """
 
 from __future__ import annotations

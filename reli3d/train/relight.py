@@ -86,12 +86,12 @@ def relit(
     n = functional.normalize(normal[valid], dim=-1)
     behind = (n * wo).sum(-1, keepdim=True)
     n = functional.normalize(n + (0.02 - behind).clamp(min=0.0) * wo, dim=-1)  # a mean of normals may face away
-    at = material[valid]
-    points = SurfacePoints(torch.zeros_like(n), n, n, srgb_to_linear(at[:, :3]), at[:, 3], at[:, 4])
+    paint = material[valid]
+    points = SurfacePoints(torch.zeros_like(n), n, n, srgb_to_linear(paint[:, :3]), paint[:, 3], paint[:, 4])
     options = ShadeOptions(SAMPLES, int(rng.integers(1 << 30)), paint=PAINT)
     radiance = shade(points, wo, environment, options=options)
-    shown = int(valid[0].sum()) or len(radiance)
-    bright = float(radiance[:shown].mean(-1).quantile(0.9))
+    first_view = int(valid[0].sum()) or len(radiance)
+    bright = float(radiance[:first_view].mean(-1).quantile(0.9))
     exposure = EXPOSED / max(bright, 1e-3) * float(np.exp(rng.normal(0, EXPOSURE)))
     surface = torch.zeros(views, size, size, 4)
     surface[valid] = functional.pad(radiance, (0, 1), value=1.0)

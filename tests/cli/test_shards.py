@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from reli3d.cli import data, infer, objects
-from reli3d.cli.shelf import opened_shelf
+from reli3d.cli.shard_writer import open_shards
 from reli3d.io import shards
 from reli3d.io.files import InputError
 from reli3d.io.tar import packed_objects
@@ -197,7 +197,7 @@ def test_what_is_wrong_with_shards_that_are_there_is_told(tmp_path, capsys, comm
     again = [shard, "--shards-out", 2, "--skip-existing"]
     assert command(shard, "--shards-out", 2) == 0
     assert command(*again, "--compatible-names") == 2 and "illumination.hdr" in capsys.readouterr().err
-    with opened_shelf(tmp_path / "out", 2, FILES, more=True):
+    with open_shards(tmp_path / "out", 2, FILES, more=True):
         assert command(*again) == 2 and "no other process" in capsys.readouterr().err
     path = tmp_path / "out" / "000000.tar"
     path.write_bytes(path.read_bytes()[:-512])
@@ -213,7 +213,7 @@ def test_what_is_wrong_with_shards_that_are_there_is_told(tmp_path, capsys, comm
 PACKER = """
 import os, signal, sys
 from pathlib import Path
-from reli3d.cli.shelf import opened_shelf
+from reli3d.cli.shard_writer import open_shards
 from tests.support.jobs import FILES
 last, count = int(sys.argv[2]), 0
 def hook(event, args):
@@ -223,11 +223,11 @@ def hook(event, args):
         if count == last:
             os.kill(os.getpid(), signal.SIGKILL)
 sys.addaudithook(hook)
-with opened_shelf(Path(sys.argv[1]), 2, FILES, more=True) as shelf:
+with open_shards(Path(sys.argv[1]), 2, FILES, more=True) as writer:
     for name in ("a", "b"):
-        if name not in shelf.place:
-            shelf.add(name)
-    shelf.write()
+        if name not in writer.place:
+            writer.add(name)
+    writer.write()
 print(count)
 """
 
@@ -251,12 +251,12 @@ def test_a_kill_at_any_operation_of_packing_loses_nothing(tmp_path):
     for last in range(1, count + 1, 1 if count < 100 else 3):
         out = folders(tmp_path / f"{last}")
         assert pack(out, last).returncode == -signal.SIGKILL
-        with opened_shelf(out, 2, FILES, more=True) as shelf:  # the next call
+        with open_shards(out, 2, FILES, more=True) as writer:  # the next call
             for name in ("a", "b"):
-                assert name in shelf.place or all((out / name / file).read_text() == name for file in FILES), last
-                if name not in shelf.place:
-                    shelf.add(name)
-            shelf.write()
+                assert name in writer.place or all((out / name / file).read_text() == name for file in FILES), last
+                if name not in writer.place:
+                    writer.add(name)
+            writer.write()
         assert {p.name: p.read_bytes() for p in out.iterdir()} == wanted, last
 
 
@@ -346,5 +346,5 @@ def test_an_entry_with_another_name_is_refused(tmp_path):
     (tmp_path / "000000.tar").write_bytes(tars.written(*tars.GOOD))
     shards.write_entry(tmp_path, 0, ["a", "b"])
     (tmp_path / "000000.json").rename(tmp_path / "000007.json")
-    with pytest.raises(InputError), opened_shelf(tmp_path, 2, FILES, more=True):
+    with pytest.raises(InputError), open_shards(tmp_path, 2, FILES, more=True):
         pass

@@ -56,7 +56,7 @@ def test_code_of_a_page_runs_from_top_to_bottom(page, folder):
 
 
 def test_pages_with_code_are_found():
-    assert {"README.md", "docs/renderer.md", "docs/geometry.md"} <= set(map(name_of, WITH_CODE))
+    assert {"README.md", "docs/renderer.md", "docs/geometry.md", "docs/refinement.md"} <= set(map(name_of, WITH_CODE))
 
 
 def test_a_block_that_is_not_to_run_is_left_out(tmp_path):
@@ -98,7 +98,7 @@ def test_links_and_paths_of_a_page_lead_somewhere(page):
         assert target.startswith("https://") or (page.parent / target).exists(), target
     if page.name == "CHANGELOG.md":  # names what is gone
         return
-    for path in re.findall(r"`((?:reli3d|tests|bench|examples|docs)/[\w/.-]*\w)`", text):
+    for path in re.findall(r"`((?:reli3d|tests|bench|examples|tools|docs)/[\w/.-]*\w)`", text):
         assert (ROOT / path).exists(), path
     rooms = "|".join(set().union(*LAYERS))
     for path in re.findall(rf"`((?:{rooms})/\w+\.py)`", text):

@@ -9,7 +9,7 @@ from reli3d.render import exposure
 from reli3d.render.asset import Asset
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
-from reli3d.render.exposure import TINT, paint_factor, photograph_ratio, weighed
+from reli3d.render.exposure import TINT, estimate_paint_and_light, paint_factor, photograph_ratio
 from tests.support.scenes import ball, textures
 
 SIZE = (160, 224)
@@ -97,10 +97,10 @@ def test_the_tint_of_photographs_goes_to_the_light(device, scene):
 
 
 def test_the_likeliest_paint_is_the_mean_of_three_normal_distributions(device, scene):
-    """Where paint, light and guess are the usual ones, nothing changes; what is off is brought back by its share."""
-    usual = float(torch.tensor(exposure.PAINT).exp())
-    lit = usual * float(torch.tensor(exposure.LIGHT).exp())
-    asset, camera, inside = painted(device, scene, usual, usual, usual)
+    """Where paint, light and guess are at the prior means nothing changes; else each pulls by its weight."""
+    prior = float(torch.tensor(exposure.PAINT).exp())
+    lit = prior * float(torch.tensor(exposure.LIGHT).exp())
+    asset, camera, inside = painted(device, scene, prior, prior, prior)
     # two conversions to sRGB and back in float32
     plain = factor(asset, photographs(device, lit, lit, lit), inside, camera)
     torch.testing.assert_close(plain, torch.ones(3), rtol=1e-4, atol=0)
@@ -108,7 +108,7 @@ def test_the_likeliest_paint_is_the_mean_of_three_normal_distributions(device, s
     shares = shares / shares.sum()
     dark = factor(asset, photographs(device, *3 * [lit / 3]), inside, camera)
     torch.testing.assert_close(dark, torch.full((3,), float((1 / 3) ** shares[1])), rtol=1e-4, atol=0)
-    bright, *_ = painted(device, scene, *3 * [usual * 2])
+    bright, *_ = painted(device, scene, *3 * [prior * 2])
     again = factor(bright, photographs(device, lit, lit, lit), inside, camera)
     torch.testing.assert_close(again, torch.full((3,), float(2.0 ** (shares[2] - 1))), rtol=1e-4, atol=0)
 
@@ -122,11 +122,11 @@ def test_a_paint_more_colourful_than_the_photographs_is_calmed(device, scene):
     assert torch.equal(factor(asset, images, torch.zeros_like(inside), camera), torch.ones(3))
 
 
-def test_the_weighed_asset_shows_the_photographs_colour(device, scene):
+def test_the_estimated_asset_shows_the_photographs_colour(device, scene):
     asset, camera, inside = painted(device, scene, 0.03, 0.1, 0.15)
     images = photographs(device, 0.010, 0.013, 0.018)
     rays = RayScene(asset.mesh.vertices, asset.mesh.faces)
-    after = weighed(asset, images, inside, camera, rays)
+    after = estimate_paint_and_light(asset, images, inside, camera, rays)
     found = photograph_ratio(after, images, inside, camera, rays).cpu()
     # same seed and samples, so only the tint that the light may not take, and BLACK, are left
     torch.testing.assert_close(found, torch.ones(3), rtol=0.1, atol=0)

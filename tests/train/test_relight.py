@@ -9,6 +9,7 @@ from safetensors.torch import save_file
 from reli3d.geometry.distance import signed_distance
 from reli3d.geometry.rays import RayScene
 from reli3d.nn.reni import map_directions
+from reli3d.render.points import SurfacePoints
 from reli3d.synthetic.maps import training_maps
 from reli3d.synthetic.samples import synthesize
 from reli3d.train import batches
@@ -27,21 +28,13 @@ class Ball:
     def distance(self, points):
         return signed_distance(self.vertices, self.faces, points)
 
-    def at(self, face, bary):
+    def points_at(self, face, bary):
         weights = torch.stack([1 - bary.sum(-1), bary[:, 0], bary[:, 1]], -1)[..., None]
         position = (self.vertices[self.faces[face].long()] * weights).sum(1)
         normal = torch.nn.functional.normalize(position, dim=-1)
         right = (position[:, 0] > 0).float()
         color = torch.stack([0.7 - 0.4 * right, 0.3 + 0.2 * right, 0.2 + 0.5 * right], -1)
-        return {
-            "position": position,
-            "normal": normal,
-            "ng": normal,
-            "bump": normal,
-            "base_color": color,
-            "roughness": 0.8 - 0.4 * right,
-            "metallic": right,
-        }
+        return SurfacePoints(position, normal, normal, color, 0.8 - 0.4 * right, right)
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,7 @@
 """Make the object folder that the package brings: a procedural kettle in a procedural room, seen by four cameras
 from all sides.
 
-usage: python examples/bundled_example.py reli3d/assets/example
+usage: python tools/bundled_example.py reli3d/assets/example
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ from reli3d.io.images import write_png
 from reli3d.nn.reni import map_directions
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
-from reli3d.render.points import SurfacePoints
 from reli3d.render.shading import ShadeOptions, shade
 from reli3d.synthetic.procedural import FRAME_RADIUS, example_object
 from reli3d.synthetic.samples import EXPOSED, PAINT, ObjectSurface
@@ -57,9 +56,8 @@ def main(folder: Path) -> None:
         origins, directions = (r.reshape(-1, 3) for r in camera_rays(camera.scaled(SUBPIXELS)))
         hits = surface.scene.closest(origins, directions)
         seen = (hits.face >= 0).nonzero()[:, 0]
-        at = surface.at(hits.face[seen].long(), hits.bary[seen])
         image = light.lookup(directions)
-        points = SurfacePoints(at["position"], at["ng"], at["bump"], at["base_color"], at["roughness"], at["metallic"])
+        points = surface.points_at(hits.face[seen].long(), hits.bary[seen])
         options = ShadeOptions(SAMPLES, seed=i, paint=PAINT)
         image[seen] = shade(points, -directions[seen], light, scene=surface.scene, options=options)
         if exposure is None:

@@ -21,7 +21,7 @@ LOCK = "shards.lock"  # nothing has this name: see claimed
 HALF_WRITTEN = re.compile(r"\.[0-9]+\.[0-9a-f]{8}\.(tar|json)")  # of a process that was killed
 
 
-class Shelf:
+class ShardWriter:
     """Shards of ``each`` objects in ``output``.  ours: names of the files that belong to a result."""
 
     def __init__(self, output: Path, each: int, ours: Collection[str]):
@@ -89,22 +89,22 @@ class Shelf:
 
 
 @contextlib.contextmanager
-def opened_shelf(output: Path, each: int, ours: Collection[str], *, more: bool) -> Iterator[Shelf]:
-    """A shelf in ``output``, which this process holds alone; at the end the index is written.
+def open_shards(output: Path, each: int, ours: Collection[str], *, more: bool) -> Iterator[ShardWriter]:
+    """Shards in ``output``, which this process holds alone; at the end the index is written.
 
     more: shards may be there, to which others are added.  Raises InputError, OSError.
     """
     with claimed(output / LOCK, ()):
-        found = Shelf(output, each, ours)
-        if found.entries and not more:
+        writer = ShardWriter(output, each, ours)
+        if writer.entries and not more:
             raise InputError(output, "expected no shards yet, got some; give --skip-existing or another --output")
         for path in output.glob(".*"):
             if HALF_WRITTEN.fullmatch(path.name):
                 path.unlink()
-        for name in found.objects:
+        for name in writer.objects:
             if (output / name).is_dir():  # killed before the folder went
-                found.remove(name)
+                writer.remove(name)
         try:
-            yield found
+            yield writer
         finally:
-            found.index()
+            writer.index()

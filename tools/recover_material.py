@@ -1,6 +1,6 @@
 """Recover base colour, roughness, metallic and the light of a known mesh from 16 images that Mitsuba 3 rendered.
 
-usage: python examples/recover_material.py OUTPUT_FOLDER [--data ../shared/data] [--steps 600] [--size 160]
+usage: python tools/recover_material.py OUTPUT_FOLDER [--data ../shared/data] [--steps 600] [--size 160]
 
 The images are Mitsuba's own: its ``principled`` material, its light, its shadows, its film.  Everything on our side is
 a public function of ``reli3d``.  The loss is the squared difference of pixel and target, whose gradient is unbiased

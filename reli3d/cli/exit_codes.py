@@ -60,11 +60,11 @@ def command(name: str) -> Callable:
                 try:
                     return main(argv)
                 except KeyboardInterrupt:
-                    return _said(name, "interrupted", 128 + signal.SIGINT)
+                    return _report(name, "interrupted", 128 + signal.SIGINT)
                 except Stopped as stop:
-                    return _said(name, f"ended by {signal.Signals(stop.number).name}", 128 + stop.number)
+                    return _report(name, f"ended by {signal.Signals(stop.number).name}", 128 + stop.number)
                 except FAULTS as error:
-                    return _said(name, reason(error), 2)
+                    return _report(name, reason(error), 2)
 
         return run
 
@@ -85,7 +85,7 @@ def check_range(name: str, value: float | None, low: float, high: float) -> None
         raise ValueError(f"--{name}: expected {low:g} to {high:g}, got {value}")
 
 
-def _said(name: str, text: str, code: int) -> int:
+def _report(name: str, text: str, code: int) -> int:
     print(f"{name}: {text}", file=sys.stderr)
     return code
 

@@ -1,6 +1,6 @@
 """Fit FlexiCubes surfaces to a mesh: to its signed distance, and to rendered masks and depth.
 
-usage: python examples/fit_surface.py OUTPUT_FOLDER [--mesh FILE] [--resolution 48] [--steps 300]
+usage: python tools/fit_surface.py OUTPUT_FOLDER [--mesh FILE] [--resolution 48] [--steps 300]
 
 (a) From the signed distance at the grid's vertices.  Random points of the extracted surface are pulled onto the zero
 set; FlexiCubes' weights and offsets learn what lies between the vertices.
