@@ -23,7 +23,7 @@ from reli3d.render.asset import Asset
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.gbuffer import primary_hits, surface_points
 
-RESOLUTION = 96  # cells along the longest side
+RESOLUTION = 128  # cells along the longest side
 LIGHT_UNTIL, SHAPE_UNTIL = 0.12, 0.5  # of the budget: first the light, then the surface, then all maps
 CHECK_PIXELS = 96  # of a photograph, a side, by which start and result are compared
 CHECK_SAMPLES = (16, 16, 4)
