@@ -58,9 +58,7 @@ class NoSurface(ValueError):
 
 @dataclass(frozen=True)
 class Prepared:
-    """Views in the model's frame: the network's input, and maps of ``DETAIL`` pixels for what is read from the
-    views.
-    """
+    """Views in the model's frame: the network's input, and maps of ``DETAIL`` pixels that are looked up at points."""
 
     batch: ViewBatch
     images: Tensor  # (V, D, D, 4) sRGB and signed silhouette distance

@@ -23,7 +23,7 @@ from reli3d.render.asset import Asset
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.gbuffer import primary_hits, surface_points
 
-RESOLUTION = 96  # cells along the longest side
+RESOLUTION = 128  # cells along the longest side
 LIGHT = MapsStage("light", until=0.12, detail=False)  # first the light, then the surface, then all maps
 SHAPE_UNTIL = 0.5  # of the budget
 MAPS = MapsStage("maps", until=1.0)

@@ -11,6 +11,7 @@ from torch.nn.functional import grid_sample, interpolate
 
 from reli3d.fit import losses
 from reli3d.fit.budget import Budget
+from reli3d.fit.facets import flattened
 from reli3d.fit.fields import EvenAdam, blurred_grid
 from reli3d.fit.photographs import WHITE, Photographs
 from reli3d.fit.shading import radiance
@@ -21,7 +22,6 @@ from reli3d.geometry.grid import sample_grid
 from reli3d.geometry.hull import hull_distance, mask_distance
 from reli3d.geometry.mesh import Mesh, largest_components, vertex_normals
 from reli3d.geometry.rays import RayScene
-from reli3d.geometry.smooth import taubin_smooth
 from reli3d.geometry.surface import extract_surface
 from reli3d.geometry.visibility import visible_from
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
@@ -96,10 +96,10 @@ def extracted(level: Tensor, bound: Tensor, grid: Grid) -> Mesh:
     return Mesh(mesh.vertices, mesh.faces, vertex_normals(mesh.vertices, mesh.faces))
 
 
-def finished(level: Tensor, bound: Tensor, grid: Grid, smoothing: int = 2) -> Mesh:
+def finished(level: Tensor, bound: Tensor, grid: Grid) -> Mesh:
     """The surface without small loose pieces and without the grid's own ripple."""
     mesh = largest_components(extracted(level, bound, grid).detach(), SMALLEST_PART)
-    return taubin_smooth(Mesh(mesh.vertices, mesh.faces), iterations=smoothing).with_normals()
+    return flattened(mesh).with_normals()
 
 
 def seen_colors(display: Tensor, position: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
