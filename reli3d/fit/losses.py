@@ -67,8 +67,8 @@ def agreement(color: Tensor, weight: Tensor) -> Tensor:
 
     color: ``(N, V, 3)`` display values where the point projects.  weight: ``(N, V)``, 0 where it is not seen.  A point
     on the true surface has one colour in all views that see it, but for highlights; a point beside it has another in
-    each.  Neither light nor material is asked, so this holds the shape before they are known.  Points that fewer than
-    two views see say nothing.
+    each.  Neither light nor material is needed, so this term works before they are fitted.  Points that fewer than two
+    views see do not count.
     """
     total = weight.sum(1)
     seen = (weight > 0.0).sum(1) >= 2
@@ -108,7 +108,7 @@ def slopes(values: Tensor) -> Tensor:
 
 
 def near_start(grids: Sequence[Tensor]) -> Tensor:
-    """Sum over grids of the mean square of what was changed: nobody who is not asked leaves the start's answer."""
+    """Sum over grids of the mean squared change: parameters without data stay at the start."""
     return torch.stack([grid.square().mean() for grid in grids]).sum()
 
 
@@ -117,8 +117,8 @@ def palette(color: Tensor, tint: Tensor) -> Tensor:
 
     color: ``(N, 3)`` logarithms of base colour at points in random order, each paired with the next.  tint: ``(N, 3)``
     photographed colour, any brightness; pairs of another tint count less.  Shading makes shades of one colour, which
-    this draws together so that the light has to explain them; paints that differ by much more than ``PALETTE`` feel
-    nothing of each other (the global sparsity of reflectances of Barron and Malik 2015, Shape, Illumination, and
+    this draws together so that the light has to explain them; pairs that differ by much more than ``PALETTE`` have
+    almost no gradient (the global sparsity of reflectances of Barron and Malik 2015, Shape, Illumination, and
     Reflectance from Shading, section 4.1.2, on pairs).
     """
     logs = tint.clamp(min=DARK).log()

@@ -1,4 +1,4 @@
-"""A surface for every line of sight: levels lowered where a pixel inside a silhouette would see nothing."""
+"""Levels lowered along the rays of pixels inside a silhouette that meet no surface."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ NORMAL_MIN = 1.0e-20  # squared length of an area-weighted normal sum below whic
 
 @dataclass(frozen=True)
 class Mesh:
-    """Triangle mesh on one device; knows no network and no texture.
+    """Triangle mesh on one device, without textures.
 
     Arrays of numpy, and faces of other integers, are taken where nothing is lost.  Raises TypeError or ValueError for a
     wrong dtype, shape, device or a face index out of range.

@@ -1,4 +1,4 @@
-"""What the network is told about cameras: an embedding of each view's matrices.
+"""Embedding of each view's camera matrices, an input of the network.
 
 Camera-to-world matrices are 4x4 in OpenGL axes (+X right, +Y up, looking along -Z); intrinsics are fx, fy, cx, cy in
 pixels of the square input, pixel centres at +0.5.

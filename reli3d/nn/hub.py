@@ -105,7 +105,7 @@ def download(repository: str, name: str, folder: Path) -> Path:
 def _fetched(link: _Link, remote: Remote, file, part: Path) -> str:
     """:func:`_fill`; an error leaves ``part`` only where the next call can go on with it."""
     if remote.sha256 is None:
-        file.truncate(0)  # of which version these bytes are, nobody knows
+        file.truncate(0)  # the version of these bytes is unknown
     try:
         have, free = file.seek(0, os.SEEK_END), shutil.disk_usage(part.parent).free
         file.seek(0)

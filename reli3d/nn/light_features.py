@@ -1,4 +1,4 @@
-"""What a surface point is told of the light on it, so that shade can be told from paint.
+"""Features of the light at surface points, by which shading is separated from paint.
 
 Two estimates: the irradiance of the environment that the network predicts, and how the brightness of the photographs
 varies with the normal.  The second needs no network: over many points the paint averages out and the light remains

@@ -30,7 +30,7 @@ from reli3d.nn.volume import HULL_SCALE, FeatureVolume
 from reli3d.render.color import srgb_to_linear
 from reli3d.render.environment import Environment
 
-LIGHT_ROWS = 16  # of the map from which the material is told its irradiance
+LIGHT_ROWS = 16  # of the map whose irradiance the material heads read
 TOKEN_EXTRA = 4  # depth and world normal, beside the pyramid's features
 QUARTER = 4  # pixels of a view along a pixel that is asked for the hull
 FUSED = 10  # numbers of Fused beside the colour
@@ -231,7 +231,7 @@ class LocalField(Field):
         return Fused(logit, numbers, bent)
 
     def with_shading(self, position: Tensor, normal: Tensor, visible: Tensor) -> LocalField:
-        """The field that knows the light on its surface, from some thousand points all over it; no gradient."""
+        """The field with the light on its surface, from some thousand points all over it; no gradient."""
         with torch.no_grad():
             color = self.fused(position, normal, visible).logit.sigmoid()
             _, _, summary = summarize_views(self.maps.images, self.maps.camera, position, visible, normal)

@@ -25,7 +25,7 @@ BACKGROUND = 0.5  # grey behind the object in the object encoder's images, sRGB
 
 @dataclass(frozen=True)
 class Code:
-    """What the network knows about B objects."""
+    """Encoding of B objects."""
 
     triplane: Tensor  # (B, 3, C, H, W) float32; planes XY, XZ, YZ, the first coordinate along W
     view_tokens: Tensor  # (B, V, P, P, D) the encoder's patch tokens, in the trunk's dtype

@@ -92,7 +92,7 @@ def known_sha256(path: str | os.PathLike) -> str:
     """:func:`sha256` of a large file, for the record, read once: a note ``<file>.sha256`` beside it keeps the hash with
     the file's size and time of change, and counts as long as both are the same.
 
-    It never stands in for a check: :func:`load` and the download hash what they are told to compare.
+    It never stands in for a check: :func:`load` and the download hash what they compare.
     """
     path = Path(path)
     if _size(path) < LARGE:

@@ -309,7 +309,7 @@ def shaded_arrays(
 
 
 def sampling_plan(options: ShadeOptions, scene: RayScene | None) -> tuple[kernels.Plan, Tensor]:
-    """What the kernels are told of ``options``, and the points that they rotate."""
+    """``options`` as the kernels read them, and the points that they rotate."""
     plan = kernels.Plan()
     plan.n_environment, plan.n_visible, plan.n_cosine = (int(k) for k in options.samples)
     plan.antithetic = CHOICES["antithetic"].index(options.antithetic)
