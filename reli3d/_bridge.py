@@ -85,7 +85,7 @@ def _pool() -> ThreadPoolExecutor:
 
     def start(_) -> None:
         started.wait()  # so that every task has a thread of its own
-        torch.get_num_threads()  # a thread takes over torch's number when it first asks, which must come before
+        torch.get_num_threads()  # a thread takes over torch's number at its first call, which must come before
         torch.set_num_threads(1)
 
     list(pool.map(start, range(threads)))

@@ -49,7 +49,7 @@ SMALLEST_PART = 0.01  # share of the faces below which a separate piece is dropp
 SHADING_POINTS = 4096  # vertices by which the light on the object is judged
 OUTSIDE = 1.0  # level given to grid points that the silhouettes exclude
 COARSE = 4  # cells of the surface grid along a cell of the one that looks for the silhouettes' hull first
-MARGIN_CELLS = 2.5  # cells around the silhouettes' hull in which the field is still asked
+MARGIN_CELLS = 2.5  # cells around the silhouettes' hull in which the field is still evaluated
 
 
 class NoSurface(ValueError):
@@ -154,7 +154,7 @@ def _check_signs(level: Tensor) -> None:
 def _hull_reach(field: LocalField, resolution: int) -> float:
     """Largest coordinate of the points of the model's grid that lie inside all silhouettes.
 
-    Asked coarsely first: a point inside has a coarse neighbour that is outside by no more than their distance.
+    Evaluated coarsely first: a point inside has a coarse neighbour that is outside by no more than their distance.
     """
     radius, device = field.model.preset.radius, field.maps.images.device
     coarse = -(-resolution // COARSE)
@@ -180,7 +180,7 @@ def texture(
 ) -> tuple[Mesh, TextureSet]:
     """The mesh with an atlas, normals and tangents, and its maps of ``size`` texels; the faces keep their order.
 
-    scene: rays against ``mesh``, for a network that asks which view sees a point, else None.
+    scene: rays against ``mesh``, for a network that uses which view sees a point, else None.
     """
     if uv not in ("project", "xatlas"):
         raise ValueError(f"uv: expected project or xatlas, got {uv}")
@@ -198,7 +198,7 @@ def texture(
     mesh = replace(mesh, tangents=vertex_tangents(mesh))
 
     heads = None
-    if local is not None:  # asked at the vertices, which lie as close as the cells that the network knows
+    if local is not None:  # evaluated at the vertices, which lie as close as the network's cells
         normals = present("mesh.normals", mesh.normals)
         heads = local.heads(mesh.vertices, normals, seen(mesh.vertices, normals))
 

@@ -20,7 +20,7 @@ FAULTS = (ValueError, TypeError, OSError, MemoryError, ImportError)  # the last:
 
 
 class Stopped(BaseException):
-    """A signal asks the process to end."""
+    """A signal that ends the process."""
 
     def __init__(self, number: int):
         super().__init__(number)

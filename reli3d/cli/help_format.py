@@ -1,4 +1,4 @@
-"""How the commands tell their options."""
+"""How the commands print their options."""
 
 from __future__ import annotations
 

@@ -57,7 +57,7 @@ class Plan:
 
 
 def _plan(args: argparse.Namespace, held: contextlib.ExitStack) -> Plan:
-    """What the command will do; what is wrong with it is told here.  Raises ValueError, OSError."""
+    """What the command will do; what is wrong with it is raised here.  Raises ValueError, OSError."""
     from reli3d.output import results
     from reli3d.output.folder import check_place
 
@@ -262,7 +262,7 @@ class Job:
         return results.complete(target, compatible=self.args.compatible_names, refined=bool(self.budget))
 
     def run(self, folder: Path | Packed, name: str, target: Path) -> str:
-        """Reconstruct one object and write its files, unless they are there; the bar goes before an error is told."""
+        """Reconstruct one object and write its files, unless they are there; the bar ends before an error is raised."""
         from reli3d.output import results
 
         with results.claim(target) as replacing:

@@ -30,7 +30,7 @@ def parser() -> argparse.ArgumentParser:
 
 class _Handler(http.server.SimpleHTTPRequestHandler):
     def log_message(self, *_) -> None:
-        """Requests are not told."""
+        """Requests are not logged."""
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -67,7 +67,7 @@ def square_error(color: Tensor, truth: Tensor) -> float:
 
 
 def scaled_square_error(color: Tensor, truth: Tensor) -> float:
-    """The same after the best factor for each channel in linear light: how bright an albedo is no image can tell,
+    """The same after the best factor for each channel in linear light: no image determines how bright an albedo is,
     since a longer exposure looks the same.
     """
     p, t = srgb_to_linear(color), srgb_to_linear(truth)

@@ -61,7 +61,7 @@ def decimate(mesh: Mesh, faces: int, *, keep_border: bool = False) -> Mesh:
 
     Garland and Heckbert 1997, Surface simplification using quadric error metrics, through ``fast-simplification``
     (``pip install 'reli3d[mesh]'``).  The result has at most ``faces`` faces unless no collapse is left that turns no
-    face over, and it may have a few non-manifold edges (:func:`reli3d.geometry.mesh.report` tells).  keep_border:
+    face over, and it may have a few non-manifold edges (:func:`reli3d.geometry.mesh.report` counts them).  keep_border:
     collapse nothing at open borders.  Deterministic.  A surface that has no more than ``faces`` comes back welded.
 
     Raises ValueError unless ``faces`` is at least 4 and positions are finite, ImportError without the library.

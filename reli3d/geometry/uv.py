@@ -265,7 +265,7 @@ def unwrap_xatlas(mesh: Mesh, *, texture_size: int = 1024, timeout_s: float = 12
     """As :func:`unwrap` with the charts of xatlas (Young 2018), in a process of its own that ends after ``timeout_s``.
 
     Its time grows with the square of the number of charts and it can crash; here that is a TimeoutError or RuntimeError
-    instead of a hang.  Faces xatlas could not chart may share UV; :func:`atlas_report` tells.
+    instead of a hang.  Faces xatlas could not chart may share UV; :func:`atlas_report` counts them.
     """
     _check(mesh, texture_size)
     with tempfile.TemporaryDirectory() as folder:

@@ -28,8 +28,8 @@ MAX_BYTES = 1 << 28  # MAX_PIXELS of RGBE, run lengths that do not pay, and a he
 def read_environment(path: str | os.PathLike, *, notes: list[str] | None = None) -> Tensor:
     """Lat-long map ``(H, 2H, 3)``, float32 linear radiance, centre column -Z, from a ``.hdr`` or ``.exr`` file.
 
-    The file's centre column is +X; a map of an odd height is blended by half a texel.  The kind of file is told by its
-    content.  What was clamped is appended to ``notes``.
+    The file's centre column is +X; a map of an odd height is blended by half a texel.  The kind of file is
+    found by its content.  What was clamped is appended to ``notes``.
     Raises InputError on a broken file, NaN, a shape other than 2:1, or a map above 8192 x 4096.
     """
     image = read_hdr_image(path, notes=notes)

@@ -33,7 +33,7 @@ _COLOUR = ("RGB", "RGBA", "P", "PA", "CMYK", "YCbCr")
 
 
 class _Reader(io.BufferedReader):
-    """A file of which no more is asked than it holds: Python takes memory at once for what a broken chunk claims."""
+    """A file of which no more is read than it holds: Python takes memory at once for what a broken chunk claims."""
 
     def __init__(self, path: str | os.PathLike, size: int):
         super().__init__(io.FileIO(path))

@@ -14,7 +14,7 @@ NEAR = wp.constant(1.0e-6)  # depth below which an end counts as behind the eye;
 
 @wp.func
 def side_of_edge(eye: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3) -> float:
-    """Signed volume that tells on which side of the plane through the eye and the edge ``c`` lies."""
+    """Signed volume whose sign says on which side of the plane through the eye and the edge ``c`` lies."""
     return wp.dot(wp.cross(a - eye, b - eye), c - a)
 
 

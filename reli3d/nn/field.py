@@ -47,7 +47,7 @@ def bound_level(maps: ViewMaps, points: Tensor, softness: float) -> Tensor:
 class Field(ABC):
     """Network output for one object, and its input views.  Frame: the model's."""
 
-    reads_views: ClassVar[bool]  # whether the material asks which view sees a point
+    reads_views: ClassVar[bool]  # whether the material depends on which view sees a point
 
     maps: ViewMaps
 
@@ -104,7 +104,7 @@ class TriplaneField(Field):
 
     @torch.no_grad()
     def cube_weights(self, points: Tensor, level: Tensor) -> dict[str, Tensor]:
-        """Deformation and weights for ``extract_surface``, asked for only where the surface passes.
+        """Deformation and weights for ``extract_surface``, evaluated only where the surface passes.
 
         points: ``(N, 3)`` the grid's, in the order of ``level``.
         """

@@ -1,4 +1,4 @@
-"""The published checkpoint from its hub: fetched only where asked for, resumed, checked, converted.
+"""The published checkpoint from its hub: fetched only on request, resumed, checked, converted.
 
 Plain HTTP of the standard library.  ``HF_ENDPOINT`` names another hub, ``HF_TOKEN`` is sent to that hub and never to
 where it redirects, ``HF_HUB_OFFLINE=1`` forbids the network, and proxies are those of the environment.
@@ -40,7 +40,7 @@ WAIT = 2.0  # seconds before the second try; grows with each
 REDIRECTS = 5
 BLOCK = 1 << 20
 _REDIRECT = (301, 302, 303, 307, 308)
-_BROKEN = (ConnectionError, TimeoutError, http.client.HTTPException)  # a transfer that may go on when asked again
+_BROKEN = (ConnectionError, TimeoutError, http.client.HTTPException)  # a transfer that may go on at the next request
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Remote:
 
     url: str
     size: int  # bytes
-    sha256: str | None  # None where the server does not tell
+    sha256: str | None  # None where the server does not say
 
 
 def fetch_official(*, preset: Preset = OFFICIAL) -> Path:
@@ -81,7 +81,7 @@ def download(repository: str, name: str, folder: Path) -> Path:
     """A file of a hub repository, whole, in ``folder``, under a name that ends in ``.part``: the caller puts it in its
     place.
 
-    Its size and, where the hub tells it, its SHA-256 are checked.  Raises WeightsError.
+    Its size and, where the hub gives it, its SHA-256 are checked.  Raises WeightsError.
     """
     if os.environ.get("HF_HUB_OFFLINE", "").strip().lower() in ("1", "on", "yes", "true"):
         raise WeightsError(name, f"HF_HUB_OFFLINE forbids to fetch it from {repository}; unset it, or give a file")
@@ -194,7 +194,7 @@ class _Link:
             headers = response.headers
         size = headers.get("X-Linked-Size") or headers.get("Content-Length") or ""
         if not size.isdigit() or int(size) == 0:
-            raise WeightsError(self.url, f"expected the server to tell the file's size, got {size or 'none'}")
+            raise WeightsError(self.url, f"expected the file's size from the server, got {size or 'none'}")
         tag = (headers.get("X-Linked-ETag") or headers.get("ETag") or "").removeprefix("W/").strip('"').lower()
         return Remote(self.url, int(size), tag if re.fullmatch("[0-9a-f]{64}", tag) else None)
 
@@ -211,7 +211,7 @@ class _Link:
         return response
 
     def _ask(self, method: str, headers: dict[str, str]):
-        """The answer after redirects; for HEAD the first one that tells size or hash.  Raises WeightsError."""
+        """The answer after redirects; for HEAD the first one that has a size or hash.  Raises WeightsError."""
         url = self.url
         for _ in range(REDIRECTS + 1):
             request = urllib.request.Request(url, method=method, headers={"User-Agent": "reli3d", **headers})

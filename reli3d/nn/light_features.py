@@ -49,7 +49,7 @@ def unshaded(color: Tensor, brightness: Tensor) -> Tensor:
 
 def palette_of(color: Tensor, plain: Tensor, seen: Tensor) -> Tensor:
     """``(12,)`` means and deviations, over the points that are ``seen (N,)``, of the logits of the colours that the
-    views show and of those without shade: what an object looks like as a whole tells its paint from a stain.
+    views show and of those without shade: the look of the whole object separates its paint from a stain.
     """
     weight = ((seen + 1e-6) / (seen + 1e-6).sum())[:, None]
     values = torch.cat([color_logit(color), color_logit(plain)], -1)

@@ -2,7 +2,7 @@
 
 Every view goes through a 2D U-Net that predicts paint, normal and depth where it looks (``pyramid``); a volume pools
 what all views say of the object's space (``volume``); a map of directions gathers what the surface shows of the light
-(``light_map``).  A point is then asked of all of them by small MLPs.  All parts know where a point is only relative to
+(``light_map``).  Small MLPs then evaluate a point from all of them.  All parts see where a point is only relative to
 the views and to the object, so what is learned in one place holds everywhere.
 """
 
@@ -32,7 +32,7 @@ from reli3d.render.environment import Environment
 
 LIGHT_ROWS = 16  # of the map whose irradiance the material heads read
 TOKEN_EXTRA = 4  # depth and world normal, beside the pyramid's features
-QUARTER = 4  # pixels of a view along a pixel that is asked for the hull
+QUARTER = 4  # pixels of a view along a pixel whose ray is intersected with the hull
 FUSED = 10  # numbers of Fused beside the colour
 HEADS = 13  # numbers of LocalField.heads
 SHARPNESS = 2.0  # power of a view's share: the view that looks straightest speaks, with smooth seams

@@ -191,7 +191,7 @@ class Reconstructor(nn.Module):
 def check_views(
     images: Tensor, masks: Tensor, c2w: Tensor, intrinsics: Tensor, size: int, device: torch.device
 ) -> None:
-    """Raise TypeError or ValueError, ``name: expected X, got Y``, where the inputs are not what ``encode`` asks for."""
+    """Raise TypeError or ValueError, ``name: expected X, got Y``, where the inputs are not what ``encode`` needs."""
     tails = {"images": (size, size, 3), "masks": (size, size), "c2w": (4, 4), "intrinsics": (4,)}
     lead = images.shape[:2]
     for (name, tail), value in zip(tails.items(), (images, masks, c2w, intrinsics), strict=True):

@@ -1,4 +1,4 @@
-"""Each view by itself: a 2D U-Net that tells, pixel by pixel, the paint under the light and the shape that is seen.
+"""Each view by itself: a 2D U-Net that predicts, pixel by pixel, the paint under the light and the shape that is seen.
 
 Convolutions are local and the same everywhere, so they learn from few objects what a transformer over large patches
 learns from millions.  Source of the form: Ronneberger et al. 2015, U-Net, arXiv 1505.04597.
@@ -16,7 +16,7 @@ from reli3d.nn.presets import PyramidSizes
 
 INPUTS = 9  # colour times mask, mask, place in the world, where the ray enters and leaves the hull, 1 / views
 PREDICTED = 12  # see PixelMaps, which reads 11: the last is a weight of trained networks, without a meaning
-SEEN = 0.1  # coverage of a pixel that is asked for the hull
+SEEN = 0.1  # least coverage of a pixel whose ray is intersected with the hull
 REACH = 0.87  # radius of the sphere around the origin that the hull is cut off at: of a cube of side 1
 
 
@@ -33,7 +33,7 @@ def _channels_last(x: Tensor) -> Tensor:
 
 def place_of_pixels(camera: Camera) -> Tensor:
     """Right and up, ``(V, S, S, 2)`` in world units, of where the pixels' rays meet the plane through the world's
-    origin that faces the camera: a crop alone tells neither the scale of a picture nor where its middle is.
+    origin that faces the camera: a crop alone shows neither the scale of a picture nor where its middle is.
 
     camera: ``V`` views of ``S`` by ``S`` pixels.
     """
@@ -48,7 +48,7 @@ def span_of_pixels(silhouette: Tensor, outlined: Camera, seen: Tensor, camera: C
     """Depths, from the world's origin, ``(V, Q, Q, 2)`` at which pixels' rays enter and leave the silhouettes' hull.
 
     silhouette: ``(V, D, D)`` signed distance in pixels of the cameras ``outlined``.  seen: ``(V, Q, Q)`` coverage
-    of the pixels of ``camera``: those above SEEN are asked, the others get 0.
+    of the pixels of ``camera``: those above SEEN are evaluated, the others get 0.
     """
     c2w = camera.c2w
     v, y, x = (seen > SEEN).nonzero(as_tuple=True)

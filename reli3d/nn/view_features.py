@@ -40,7 +40,7 @@ def ahead_of_surface(surface: Tensor, maps: ViewMaps, points: Tensor) -> Tensor:
     surface: ``(V, P, P, 2)`` depth of a pixel from the world's origin along the camera's axis, times coverage, and
     coverage.  The numbers are the greatest and the mean over the views that show the object there, of a distance that
     saturates at NEAR, its mean at FAR, and the share of these views.  Before a surface that a view shows there is
-    nothing; far behind it a view tells nothing.  Gradients reach the surface.
+    nothing; far behind it a view has no information.  Gradients reach the surface.
     """
     got, pixel = gather_views(surface, points, maps.camera)
     covered = got[..., 1].clamp(min=0.1)

@@ -12,7 +12,7 @@ from reli3d.geometry.projection import NUMBERS, gather_views, summarize_views
 from reli3d.nn.presets import VolumeSizes
 from reli3d.nn.view_features import AHEAD, ViewMaps, ahead_of_surface
 
-NEAR_HULL = 0.08  # farther outside the silhouettes' hull there is nothing: views are not asked
+NEAR_HULL = 0.08  # farther outside the silhouettes' hull there is nothing: views are not read
 HULL_SCALE = 0.1  # unit of the hull's distance as a feature
 MIXED = 24  # channels of a view at a point, and as many of their spread
 

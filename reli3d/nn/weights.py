@@ -118,7 +118,7 @@ def read_manifest(path: str | os.PathLike) -> Manifest:
         start = file.read(8)
         if start.startswith(b"PK\x03\x04"):
             raise WeightsError(
-                path, "is a torch checkpoint, expected safetensors; convert it first, docs/network.md tells how"
+                path, "is a torch checkpoint, expected safetensors; convert it first, see docs/network.md"
             )
         length = int.from_bytes(start, "little")
         if size < 8 or length > min(HEADER_LIMIT, size - 8):
@@ -184,7 +184,7 @@ def official_path() -> Path:
 def locate(weights: str | os.PathLike) -> Path:
     """File of the weights called ``small``, which the package brings, or ``official``, or of a path.
 
-    Nothing is fetched: :mod:`reli3d.nn.hub` does, where asked.  Raises WeightsError where there is no such file.
+    Nothing is fetched: :mod:`reli3d.nn.hub` does, on request.  Raises WeightsError where there is no such file.
     """
     if os.fspath(weights) == "small":
         path, fix = SMALL, "install the package again"

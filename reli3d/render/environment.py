@@ -174,7 +174,7 @@ class Environment:
 
 
 class _Lookup(torch.autograd.Function):
-    """Own backward: Warp's adjoint would go through the direction's angles where only texels are asked for."""
+    """Own backward: Warp's adjoint would go through the direction's angles where only texels are wanted."""
 
     @staticmethod
     def forward(ctx, radiance: Tensor, directions: Tensor) -> Tensor:

@@ -21,7 +21,7 @@ from reli3d.render.gbuffer import primary_hits, surface_points
 from reli3d.render.points import SurfacePoints
 from reli3d.render.shading import ShadeOptions, shade
 
-STEP = 16  # of the photographs' pixels one in STEP^2 is asked: some thousand in four photographs of 512 pixels
+STEP = 16  # of the photographs' pixels one in STEP^2 is read: some thousand in four photographs of 512 pixels
 SAMPLES = (8, 8, 2)  # a pixel; the noise of the mean over some hundred pixels is below a percent
 WHITE = 0.97  # linear; brighter pixels may be cut off
 BLACK = 1e-3  # added to both means: where nothing is seen the ratio is 1
@@ -94,7 +94,7 @@ def _seen(
     """Linear colours of the photographs ``(N, 3)`` on the grid, what ``asset`` has there, and the rays' directions."""
     first = STEP // 2
     seen, inside = srgb_to_linear(images[:, first::STEP, first::STEP]), inside[:, first::STEP, first::STEP]
-    corner = camera.intrinsics.new_tensor([0.0, 0.0, 0.5, 0.5])  # puts the centres of the coarse pixels on those asked
+    corner = camera.intrinsics.new_tensor([0.0, 0.0, 0.5, 0.5])  # centres of coarse pixels on those read
     coarse = Camera(camera.c2w, (camera.intrinsics - corner) / STEP, seen.shape[2], seen.shape[1])
     hits, _, directions = primary_hits(scene, coarse)
     both = inside & (hits.face >= 0) & (seen.amax(-1) < WHITE)

@@ -35,7 +35,7 @@ from reli3d.render.points import SurfacePoints, check_values, nan_where_not_fini
 from reli3d.render.sampling import halton
 
 SAMPLES = (20, 40, 4)  # environment, visible normals, cosine: the published counts
-LIGHT_RAYS = 1 << 20  # directions asked of a light at once: 45 MB of rays
+LIGHT_RAYS = 1 << 20  # directions in which a light is evaluated at once: 45 MB of rays
 CHOICES = {
     "antithetic": ("none", "opposite", "mirrored"),
     "heuristic": ("balance", "power"),
@@ -120,7 +120,7 @@ def shade(
 
 
 class Light(Protocol):
-    """Distant light that can be asked: ``Environment``, ``SphericalGaussians``, ``ReniLight``."""
+    """Distant light that can be evaluated: ``Environment``, ``SphericalGaussians``, ``ReniLight``."""
 
     def lookup(self, directions: Tensor) -> Tensor: ...
 
@@ -135,7 +135,7 @@ def shade_light(
     scene: RayScene | None = None,
     options: ShadeOptions = DEFAULT,
 ) -> Tensor:
-    """:func:`shade` with radiance asked of ``light`` in each sample's direction instead of read from a map, ``(N, 3)``.
+    """:func:`shade` with the radiance of ``light`` in each sample's direction instead of a map's, ``(N, 3)``.
 
     The other arguments are those of :func:`shade`.  proposal: a coarse map of the light, whose table the
     environment strategy draws from; where it is dark and the light is not, the other strategies stand in, so the mean
@@ -207,7 +207,7 @@ class _Shade(torch.autograd.Function):
         *tensors, visible = ctx.saved_tensors
         n, device, wanted = g_out.shape[0], g_out.device, ctx.needs_input_grad[1:]
         parts = len(slices(n)) if device.type == "cpu" else 1
-        # what nobody asks for has no rows: the kernel leaves it out
+        # what is not requested has no rows: the kernel leaves it out
         g_normal, g_base, g_alpha, g_metallic, texels = (
             torch.zeros_like(tensors[k] if wanted[k] else tensors[k][:0]) for k in (1, 4, 5, 6, 7)
         )

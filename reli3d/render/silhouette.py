@@ -3,7 +3,7 @@
 After Laine et al. 2020, Modular Primitives for High-Performance Differentiable Rendering, section 3.4: two neighbouring
 pixels are blended where an outline crosses the line between their centres.  There the edge belongs to the triangle that
 a pixel shows, which fails for small triangles.  Here every edge's crossings with the rows or columns of pixel centres
-are listed, and a ray tells whether one is seen.
+are listed, and a ray decides whether one is seen.
 
 Sums over an image have the derivative of the area.  Single pixels err by 0.02 on average, gradients of squared
 differences by some 10 %.

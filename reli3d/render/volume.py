@@ -17,7 +17,7 @@ from torch import Tensor
 from reli3d._bridge import check, empty, launch, once_differentiable
 from reli3d.kernels import volume as kernels
 
-CHUNK = 1 << 18  # points a call when a field is asked over a whole grid: 3 MB of positions
+CHUNK = 1 << 18  # points a call when a field is evaluated over a whole grid: 3 MB of positions
 
 
 @dataclass(frozen=True)
@@ -51,8 +51,8 @@ class OccupancyGrid:
     ) -> OccupancyGrid:
         """Cells where ``field`` exceeds ``threshold`` at the centre or a corner, grown by one cell on every side.
 
-        field: densities ``(N,)`` of points ``(N, 3)``; asked without gradient, in chunks.  Detail of less than half a
-        cell between those points may be missed.
+        field: densities ``(N,)`` of points ``(N, 3)``; evaluated without gradient, in chunks.  Detail of less than half
+        a cell between those points may be missed.
         """
         k = (torch.arange(2 * resolution + 1, device=device) / resolution - 1.0) * radius
         values = []
@@ -190,7 +190,7 @@ class _Composite(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, g_color: Tensor, g_opacity: Tensor, g_depth: Tensor):
         tensors, (_, *wanted) = ctx.saved_tensors, ctx.needs_input_grad
-        # what nobody asks for has no rows: the kernel leaves it out
+        # what is not requested has no rows: the kernel leaves it out
         outs = [
             (torch.zeros_like(v if w else v[:0]), kind)
             for v, w, kind in zip(tensors, wanted, (wp.float32, wp.vec3), strict=False)

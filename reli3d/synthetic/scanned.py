@@ -31,7 +31,7 @@ def _read(path: Path):
 def outside_distance(vertices: Tensor, faces: Tensor, points: Tensor, scene: RayScene) -> Tensor:
     """Distance ``(N,)`` to a mesh with holes and inner walls: positive where a point sees the sky in some direction.
 
-    The inside of a scan is what no light reaches.  Parity and winding of its faces do not tell it.
+    The inside of a scan is what no light reaches.  Parity and winding of its faces do not show it.
     """
     z = 1 - (2 * torch.arange(ESCAPES) + 1) / ESCAPES
     phi = torch.arange(ESCAPES) * (np.pi * (3 - 5**0.5))

@@ -1,4 +1,4 @@
-"""What a file of a training sample must hold, told by its header before any work."""
+"""What a file of a training sample must hold, checked by its header before any work."""
 
 from __future__ import annotations
 

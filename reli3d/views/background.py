@@ -1,6 +1,6 @@
-"""Masks made by a network that tells objects from backgrounds: ``rembg`` (MIT), an optional install.
+"""Masks made by a network that separates objects from backgrounds: ``rembg`` (MIT), an optional install.
 
-rembg fetches its network from its own release page where it is not on the disk yet; nothing here asks for that unless
+rembg fetches its network from its own release page where it is not on the disk yet; nothing here starts that unless
 a user did.
 """
 

@@ -1,4 +1,4 @@
-"""Which of many views to take: those that lie farthest apart, told by their cameras alone."""
+"""Which of many views to take: those that lie farthest apart, by their cameras alone."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """A folder of posed photographs -> Views.
 
 Read are: an object folder as published (``transforms.json`` with per-frame ``camera_fov``), a Blender or nerfstudio
-``transforms.json``, and a COLMAP model (``sparse/0`` beside ``images``).  The object is told from the background
+``transforms.json``, and a COLMAP model (``sparse/0`` beside ``images``).  The object is separated from the background
 by the images' alpha, by ``mask_path``, or by a ``masks`` folder with a file of the same stem for each image.
 """
 
@@ -192,7 +192,7 @@ def looks_premultiplied(image: np.ndarray, mask: np.ndarray) -> bool:
 
     Of a straight image with a bright object the faint edge pixels are brighter than their alpha.
     """
-    if (image[::8, ::8].max(-1)[mask[::8, ::8] < 0.02] > 0.02).any():  # a background: the usual case, told by a few
+    if (image[::8, ::8].max(-1)[mask[::8, ::8] < 0.02] > 0.02).any():  # a background: the usual case, seen by a few
         return False
     edge = mask > 0.02
     if not (edge & (mask < 0.5)).any():  # a binary mask

@@ -22,8 +22,8 @@ PARALLEL = 0.01  # mean squared sine between the axes (6 degrees) below which de
 FAR = 10.0  # distances to the object from which the origin is moved to it: float32 then loses a digit of each position
 SMALLEST = 1e-6  # distance to the object below which squares of areas of a mesh's faces leave float32
 WRITTEN = 1e-6  # of a position: matrices are often written with seven digits
-ONE_POINT = 1e-12  # of the eyes' distance from the origin: nearer together, only float64's rounding tells them apart
-AT_EYE = 1e-6  # of an eye's distance from the origin: what is nearer to the eye than float32 tells places apart
+ONE_POINT = 1e-12  # of the eyes' distance from the origin: nearer together, they differ by float64's rounding alone
+AT_EYE = 1e-6  # of an eye's distance from the origin: what is nearer to the eye than float32 resolves
 
 
 @dataclass(frozen=True)

@@ -98,7 +98,7 @@ def has_background(image: Tensor, mask: Tensor) -> bool:
 
 
 def placement_notes(views: Views) -> tuple[str, ...]:
-    """What to tell who leaves poses as stored: nothing where the object fills the network's cube, else one line."""
+    """The notes for poses that are left as stored: nothing where the object fills the network's cube, else one line."""
     try:
         placed = normalize(views, "auto").is_identity()
     except ValueError:  # masks that do not meet
