@@ -14,6 +14,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 
+from reli3d.cli import collector
 from reli3d.io.files import printable
 
 FAULTS = (ValueError, TypeError, OSError, MemoryError, ImportError)  # the last: an extra is not installed
@@ -51,11 +52,16 @@ class _Stream:
 
 
 def command(name: str) -> Callable:
-    """Decorator of a command's ``main``: its exit code for everything that may happen.  name: of the command."""
+    """Decorator of a command's ``main``: its exit code for everything that may happen.  name: of the command.
+
+    Without arguments of its own ``main`` is the program: the garbage collector is relaxed.
+    """
 
     def decorate(main: Callable) -> Callable:
         @functools.wraps(main)
         def run(argv: list[str] | None = None) -> int:
+            if argv is None:
+                collector.relax()
             with _streams(), signals():
                 try:
                     return main(argv)

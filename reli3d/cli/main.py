@@ -7,6 +7,7 @@ import importlib
 import sys
 
 import reli3d
+from reli3d.cli import collector
 
 COMMANDS = {  # module of reli3d.cli, arguments put before the given ones, what it does
     "infer": ("infer", (), "photographs with cameras to a relightable asset (also reli3d-infer)"),
@@ -36,6 +37,8 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--version", action="version", version=f"reli3d {reli3d.__version__}")
     parser.add_argument("command", choices=COMMANDS, metavar="COMMAND", help="one of those below")
     parser.add_argument("options", nargs=argparse.REMAINDER, help=argparse.SUPPRESS)
+    if argv is None:
+        collector.relax()
     if not (sys.argv[1:] if argv is None else argv):
         parser.print_help()
         return 0

@@ -1,0 +1,18 @@
+"""Python's garbage collector in a process that runs one command."""
+
+from __future__ import annotations
+
+import atexit
+import gc
+
+OBJECTS = 100_000  # allocations between two collections; Python's own 700 to 2,000 make thousands of them
+
+
+def relax() -> None:
+    """Collect seldom, and not at the end of the process.
+
+    Importing torch and Warp makes about a million objects that all stay.  Looking through them again and again takes
+    as long as the imports, and at the end of the process, whose memory goes back anyway, another half second.
+    """
+    gc.set_threshold(OBJECTS, *gc.get_threshold()[1:])
+    atexit.register(gc.freeze)
