@@ -19,7 +19,7 @@ def example() -> Path:
 
 def views_to_glb(device, texture_size, resolution):
     """Views and ``small`` weights in memory to ``mesh.glb`` on disk; the parts of the time are the pipeline's own."""
-    views = load_views(example(), views=4)
+    views = load_views(example(), first_views=4)
     model = load_model("small", str(device))
     options = ReconstructOptions(texture_size=texture_size, resolution=resolution)
     folder = tempfile.TemporaryDirectory()
@@ -48,5 +48,5 @@ def process(device, arguments):
 
 CASES = {
     "views_to_glb": (views_to_glb, dict(texture_size=512, resolution=None)),  # the preset's own resolution
-    "process": (process, dict(arguments=["--texture-size", "512"])),
+    "process": (process, dict(arguments=["--texture-size", "512", "--first-views", "4"])),
 }

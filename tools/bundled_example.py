@@ -1,5 +1,5 @@
-"""Make the object folder that the package brings: a procedural kettle in a procedural room, seen by four cameras
-from all sides.
+"""Make the object folder that the package brings: a procedural kettle in a procedural room, seen by twelve cameras
+from all sides; the first four see it from four sides.
 
 usage: python tools/bundled_example.py reli3d/assets/example
 """
@@ -25,7 +25,11 @@ from reli3d.synthetic.samples import EXPOSED, PAINT, ObjectSurface
 SIZE, SUBPIXELS = 512, 2
 FOV = math.radians(30.0)
 DISTANCE = 0.9 * FRAME_RADIUS / math.sin(FOV / 2)  # the object fills the frame
-RIG = ((30.0, 20.0), (120.0, 35.0), (210.0, 12.0), (300.0, 45.0))  # azimuth from +Z to +X and elevation, degrees
+RIG = (  # azimuth from +Z to +X and elevation, degrees
+    *((30.0, 20.0), (120.0, 35.0), (210.0, 12.0), (300.0, 45.0)),
+    *((75.0, 12.0), (165.0, 45.0), (255.0, 20.0), (345.0, 35.0)),
+    *((7.5, 5.0), (52.5, 50.0), (97.5, 5.0), (142.5, 20.0)),
+)
 SAMPLES = (24, 24, 4)
 
 

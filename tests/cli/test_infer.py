@@ -137,7 +137,7 @@ def test_cuda_is_not_replaced_by_the_cpu(tmp_path, capsys):
 def test_check_explains_the_example_and_draws_the_rig(tmp_path, capsys):
     assert infer.main(["--check", "--output", str(tmp_path)]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert len(load_views(infer.EXAMPLE)) == 4 and any("agree" in line for line in lines)
+    assert len(load_views(infer.EXAMPLE)) == 12 and any("agree" in line for line in lines)
     assert (tmp_path / "example" / "rig.png").stat().st_size > 10_000
 
 
@@ -177,7 +177,7 @@ def test_json_is_one_object_on_stdout(tmp_path, capsys):
     assert seen["exit_code"] == 1 and [o["object"] for o in seen["objects"]] == ["example", "empty"]
     example, empty = seen["objects"]
     assert example["result"] == "done" and not example["suspect"] and example["verdict"].startswith("cameras agree")
-    assert len(example["lines"]) == 4 and Path(example["picture"]).is_file()
+    assert len(example["lines"]) == 12 and Path(example["picture"]).is_file()
     assert empty["result"] == "refused" and "expected transforms.json" in empty["notes"][0]
     assert command(tmp_path, *folders, "--json") == 1
     made = json.loads(capsys.readouterr().out)["objects"]
