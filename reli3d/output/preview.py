@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from PIL import Image, ImageDraw
 from torch import Tensor
-from torch.nn.functional import interpolate, normalize
+from torch.nn.functional import interpolate, normalize, pad
 
 from reli3d.geometry.camera import Camera, look_at
 from reli3d.geometry.mesh import Mesh
@@ -18,7 +18,7 @@ from reli3d.render.asset import Asset
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
 from reli3d.render.lights import studio
-from reli3d.render.render import render
+from reli3d.render.render import Render, render
 from reli3d.render.shading import ShadeOptions
 from reli3d.views.choose import choose_views
 from reli3d.views.views import Views
@@ -26,7 +26,11 @@ from reli3d.views.views import Views
 TILE = 256  # pixels
 COLUMNS = 4
 TITLE = 14  # pixels of a line of text
-SAMPLES = (20, 12, 3)  # light, GGX and cosine samples a pixel: little noise for a quarter of a second a view
+SUBPIXELS = 2  # a side of a pixel
+SAMPLES = (2, 1, 1)  # light, GGX and cosine samples a subpixel
+WINDOW = 2  # pixels that noise is averaged over, to each side
+SAME_NORMAL = 0.2  # length of a difference of normals above which pixels are averaged little
+GLOSS = 0.1  # added to the base colour: highlights do not have it
 PAPER = 0.93  # background of the tiles, sRGB
 MEAN = 0.25  # of the environment as it is drawn, linear
 FOV = math.radians(30.0)
@@ -46,8 +50,7 @@ def preview(asset: Asset, views: Views) -> np.ndarray:
     relight = Environment(studio().radiance.to(asset.mesh.vertices.device))
     cameras = unseen_cameras(asset.mesh, views.c2w)
     in_own_light, relit = (
-        [render(asset, camera, light, options=ShadeOptions(SAMPLES), scene=scene) for camera in cameras]
-        for light in (asset.environment, relight)
+        [_rendered(asset, camera, scene, light) for camera in cameras] for light in (asset.environment, relight)
     )
     first = in_own_light[0]
     maps = [
@@ -58,8 +61,8 @@ def preview(asset: Asset, views: Views) -> np.ndarray:
     ]
     rows = [
         ("input", [_on_paper(i, m) for i, m in zip(taken.images, taken.masks, strict=True)]),
-        ("views that nobody photographed, own light", [_lit(s.radiance, s.alpha) for s in in_own_light]),
-        ("the same views in a studio", [_lit(s.radiance, s.alpha) for s in relit]),
+        ("views that nobody photographed, own light", [_lit(_smoothed(s), s.alpha) for s in in_own_light]),
+        ("the same views in a studio", [_lit(_smoothed(s), s.alpha) for s in relit]),
         ("base colour, roughness, metallic, normal", [_on_paper(m, first.alpha) for m in maps]),
         ("own light, its mean at a quarter", [_map(asset.light)]),
     ]
@@ -73,10 +76,33 @@ def comparison(before: Asset, after: Asset, views: Views) -> np.ndarray:
     rows = [("input", [_on_paper(i, m) for i, m in zip(batch.images, batch.masks, strict=True)])]
     for title, asset in (("before", before), ("after refinement", after)):
         scene = RayScene(asset.mesh.vertices, asset.mesh.faces)
-        options = ShadeOptions(samples=SAMPLES)
-        shots = [render(asset, batch.camera[i], options=options, scene=scene) for i in range(count)]
-        rows.append((title, [_lit(s.radiance, s.alpha) for s in shots]))
+        shots = [_rendered(asset, batch.camera[i], scene) for i in range(count)]
+        rows.append((title, [_lit(_smoothed(s), s.alpha) for s in shots]))
     return _sheet(rows, count)
+
+
+def _rendered(asset: Asset, camera: Camera, scene: RayScene, light: Environment | None = None) -> Render:
+    return render(asset, camera, light, options=ShadeOptions(SAMPLES), supersampling=SUBPIXELS, scene=scene)
+
+
+def _smoothed(shot: Render) -> Tensor:
+    """The radiance with less noise: its ratio to the base colour, averaged over pixels of about the same normal.
+
+    A joint bilateral filter (Petschnigg and others 2004): Monte Carlo noise is in the light, edges are in the maps.
+    """
+    paint = (shot.base_color + GLOSS) * shot.alpha[..., None]
+    guides = torch.cat([shot.radiance / paint.clamp(min=1e-6), shot.normal, shot.alpha[..., None]], -1)
+    padded = pad(guides.permute(2, 0, 1)[None], (WINDOW,) * 4)[0].permute(1, 2, 0)
+    height, width = shot.alpha.shape
+    total, weights = torch.zeros_like(shot.radiance), torch.zeros_like(shot.alpha)[..., None]
+    for row in range(2 * WINDOW + 1):
+        for column in range(2 * WINDOW + 1):
+            near = padded[row : row + height, column : column + width]
+            apart = ((row - WINDOW) ** 2 + (column - WINDOW) ** 2) / (2 * WINDOW)
+            bent = (near[..., 3:6] - shot.normal).square().sum(-1, keepdim=True) / SAME_NORMAL**2
+            weight = torch.exp(-apart - bent) * near[..., 6:]
+            total, weights = total + weight * near[..., :3], weights + weight
+    return total / weights.clamp(min=1e-6) * paint
 
 
 def _sheet(rows: list[tuple[str, list[Tensor]]], columns: int, *, last: int = TILE) -> np.ndarray:
