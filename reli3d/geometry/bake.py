@@ -144,28 +144,46 @@ def coverage(mesh: Mesh, size: int) -> Tensor:
 
 def interpolate(mesh: Mesh, texels: Texels, index: Tensor) -> tuple[Tensor, Tensor]:
     """Positions and unit normals ``(N, 3)`` of the texels with the flat indices ``index`` (N,) int64, all valid."""
-    places = _places(mesh, texels, index)
-    normals = mesh.normals if mesh.normals is not None else vertex_normals(mesh.vertices, mesh.faces)
-    device = index.device
-    position, normal = (torch.empty(len(index), 3, device=device) for _ in range(2))
-    _bridge.launch(
-        kernels.attributes_kernel,
-        len(index),
-        [
-            places,
-            (mesh.vertices.detach().contiguous(), wp.vec3),
-            (normals.detach().contiguous(), wp.vec3),
-            (position, wp.vec3),
-            (normal, wp.vec3),
-        ],
-        device,
-    )
-    return position, normal
+    return _positions_normals(mesh, _checked_places(mesh, texels, index), index)
 
 
 def interpolate_tangents(mesh: Mesh, texels: Texels, index: Tensor) -> Tensor:
     """Unit tangents with sign, ``(N, 4)``, of the texels with the flat indices ``index`` (N,) int64, all valid."""
-    places = _places(mesh, texels, index)
+    return _tangents(mesh, _checked_places(mesh, texels, index), index)
+
+
+def interpolate_values(mesh: Mesh, values: Tensor, texels: Texels, index: Tensor) -> Tensor:
+    """Numbers of the vertices, ``values (V, C)``, at the texels with the flat indices ``index`` (N,) int64: ``(N, C)``.
+
+    No gradient.
+    """
+    return _values(mesh, values, _checked_places(mesh, texels, index), index)
+
+
+def _checked_places(mesh: Mesh, texels: Texels, index: Tensor) -> kernels.Places:
+    check("index", index, dtype=torch.int64, like=texels.bary)
+    if index.ndim != 1 or (len(index) and not bool((texels.face.reshape(-1)[index] >= 0).all())):
+        raise ValueError("index: expected a list of valid texels, got others")
+    return _places(mesh, texels, index)
+
+
+def _places(mesh: Mesh, texels: Texels, index: Tensor) -> kernels.Places:
+    """What the kernels read of the texels of ``index``."""
+    face, bary = (texels.face.reshape(-1), wp.int32), (texels.bary.reshape(-1, 2), wp.vec2)
+    faces = mesh.faces.contiguous(), wp.int32
+    return struct_of(kernels.Places, texel=(index, wp.int64), face=face, bary=bary, faces=faces)
+
+
+def _positions_normals(mesh: Mesh, places: kernels.Places, index: Tensor) -> tuple[Tensor, Tensor]:
+    normals = mesh.normals if mesh.normals is not None else vertex_normals(mesh.vertices, mesh.faces)
+    position, normal = (torch.empty(len(index), 3, device=index.device) for _ in range(2))
+    sources = [(v.detach().contiguous(), wp.vec3) for v in (mesh.vertices, normals)]
+    inputs = [places, *sources, (position, wp.vec3), (normal, wp.vec3)]
+    _bridge.launch(kernels.attributes_kernel, len(index), inputs, index.device)
+    return position, normal
+
+
+def _tangents(mesh: Mesh, places: kernels.Places, index: Tensor) -> Tensor:
     if mesh.tangents is None:
         raise ValueError("mesh.tangents: expected tangents, got None (see vertex_tangents)")
     tangent = torch.empty(len(index), 4, device=index.device)
@@ -174,29 +192,14 @@ def interpolate_tangents(mesh: Mesh, texels: Texels, index: Tensor) -> Tensor:
     return tangent
 
 
-def interpolate_values(mesh: Mesh, values: Tensor, texels: Texels, index: Tensor) -> Tensor:
-    """Numbers of the vertices, ``values (V, C)``, at the texels with the flat indices ``index`` (N,) int64: ``(N, C)``.
-
-    No gradient.
-    """
-    places = _places(mesh, texels, index)
-    check("values", values, like=texels.bary)
+def _values(mesh: Mesh, values: Tensor, places: kernels.Places, index: Tensor) -> Tensor:
+    check("values", values, like=mesh.vertices)
     if values.ndim != 2 or len(values) != len(mesh.vertices):
         raise ValueError(f"values: expected ({len(mesh.vertices)}, C), got {tuple(values.shape)}")
     out = torch.empty(len(index), values.shape[1], device=index.device)
     inputs = [places, (values.detach().contiguous(), wp.float32), (out, wp.float32)]
     _bridge.launch(kernels.values_kernel, len(index), inputs, index.device)
     return out
-
-
-def _places(mesh: Mesh, texels: Texels, index: Tensor) -> kernels.Places:
-    """What the kernels read of the texels of ``index``, checked."""
-    check("index", index, dtype=torch.int64, like=texels.bary)
-    if index.ndim != 1 or (len(index) and not bool((texels.face.reshape(-1)[index] >= 0).all())):
-        raise ValueError("index: expected a list of valid texels, got others")
-    face, bary = (texels.face.reshape(-1), wp.int32), (texels.bary.reshape(-1, 2), wp.vec2)
-    faces = mesh.faces.contiguous(), wp.int32
-    return struct_of(kernels.Places, texel=(index, wp.int64), face=face, bary=bary, faces=faces)
 
 
 def bake(
@@ -231,11 +234,12 @@ def bake(
     maps: dict[str, Tensor] = {}
     with torch.no_grad():
         for part in index.split(chunk):
-            arguments: tuple[Tensor, ...] = interpolate(mesh, texels, part)
+            places = _places(mesh, texels, part)
+            arguments: tuple[Tensor, ...] = _positions_normals(mesh, places, part)
             if tangents:
-                arguments = (*arguments, interpolate_tangents(mesh, texels, part))
+                arguments = (*arguments, _tangents(mesh, places, part))
             if values is not None:
-                arguments = (*arguments, interpolate_values(mesh, values, texels, part))
+                arguments = (*arguments, _values(mesh, values, places, part))
             found = fn(*arguments)
             for name, value in ({"value": found} if isinstance(found, Tensor) else found).items():
                 check(f"fn()[{name!r}]", value, like=texels.bary)
