@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING
 
 import torch
@@ -10,6 +10,7 @@ from torch import Tensor
 
 from reli3d._bridge import check, expect, present, tensor_of
 from reli3d.geometry.mesh import Mesh
+from reli3d.render.color import srgb_to_linear
 from reli3d.render.environment import Environment
 
 if TYPE_CHECKING:
@@ -33,6 +34,7 @@ class TextureSet:
     roughness: Tensor
     metallic: Tensor
     normal: Tensor = None  # type: ignore[assignment] # flat after construction
+    _kept: dict = field(default_factory=dict, init=False, compare=False)  # of :meth:`lookups`
 
     if TYPE_CHECKING:  # what a caller may give, beside what the fields hold
 
@@ -72,13 +74,31 @@ class TextureSet:
         """Texels along a side."""
         return self.base_color.shape[0]
 
+    def lookups(self) -> tuple[Tensor, Tensor]:
+        """What a renderer looks up: linear base colour, and roughness with metallic twice, both ``(T, T, 3)``.
+
+        Computed once for maps without gradient that nothing has written to since.
+        """
+        sources = self.base_color, self.roughness, self.metallic
+        lasting = not any(s.is_inference() or (s.requires_grad and torch.is_grad_enabled()) for s in sources)
+        written = tuple(s._version for s in sources) if lasting else None
+        if not lasting or self._kept.get("written") != written:
+            values = srgb_to_linear(self.base_color), torch.stack([self.roughness, self.metallic, self.metallic], -1)
+            if not lasting:
+                return values
+            self._kept.update(written=written, values=values)
+        return self._kept["values"]
+
     def to(self, device: torch.device | str) -> TextureSet:
         """The same maps on ``device``."""
-        return TextureSet(*(getattr(self, f.name).to(device) for f in fields(self)))
+        return self._changed(lambda value: value.to(device))
 
     def detach(self) -> TextureSet:
         """The same maps without gradient."""
-        return TextureSet(*(getattr(self, f.name).detach() for f in fields(self)))
+        return self._changed(lambda value: value.detach())
+
+    def _changed(self, change: Callable[[Tensor], Tensor]) -> TextureSet:
+        return TextureSet(*(change(getattr(self, f.name)) for f in fields(self) if f.init))
 
     def __repr__(self) -> str:
         return f"TextureSet({self.size} x {self.size} texels, {self.base_color.device})"

@@ -14,7 +14,6 @@ from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import Hits, RayScene
 from reli3d.kernels import attributes as kernels
 from reli3d.render.asset import TextureSet
-from reli3d.render.color import srgb_to_linear
 from reli3d.render.points import SurfacePoints
 
 
@@ -78,14 +77,14 @@ def surface_points(mesh: Mesh, textures: TextureSet | None, face: Tensor, bary: 
     if mesh.uv is None:
         raise ValueError("mesh.uv: expected texture coordinates for a textured asset, got None")
     uv = interpolate(mesh.uv, mesh.faces, face, bary)
-    rough_metal = torch.stack([textures.roughness, textures.metallic, textures.metallic], -1)  # one look-up for both
-    rough_metal = sample_texture(rough_metal, uv)
+    linear, rough_metal = textures.lookups()
+    rough_metal = sample_texture(rough_metal, uv)  # one look-up for both
     mapped = sample_texture(textures.normal, uv) * 2.0 - 1.0
     return SurfacePoints(
         position,
         ng,
         tangent_normals(mesh, face, bary, normal, mapped),
-        sample_texture(srgb_to_linear(textures.base_color), uv),
+        sample_texture(linear, uv),
         rough_metal[:, 0],
         rough_metal[:, 1],
     )

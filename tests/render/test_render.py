@@ -1,6 +1,7 @@
 """Cameras and whole images: geometry, textures and their frame, resolve, background, gradients."""
 
 import math
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from reli3d.geometry.camera import Camera, camera_rays, look_at, project
 from reli3d.geometry.hits import interpolate
 from reli3d.geometry.mesh import Mesh
 from reli3d.render.asset import Asset, TextureSet
+from reli3d.render.color import srgb_to_linear
 from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import sample_texture, surface_points
 from reli3d.render.material import PAINTS
@@ -89,11 +91,10 @@ def test_normal_map_points_right_and_up_as_gltf_says(device, explicit):
 
 def test_picture_on_a_square_is_upright_and_resolved(device):
     picture = torch.rand(8, 8, 3, generator=torch.Generator().manual_seed(0)).to(device)
-    asset = Asset(square(device), TextureSet(picture, *list(vars(textures(8, device)).values())[1:]))
+    asset = Asset(square(device), replace(textures(8, device), base_color=picture))
     camera = Camera(eye(device, 0.0, 0.0, 4.0), torch.tensor([16.0, 16.0, 4.0, 4.0], device=device), 8, 8)
     env = Environment.constant(torch.ones(3, device=device))
     image = render(asset, camera, env)
-    from reli3d.render.color import srgb_to_linear
 
     torch.testing.assert_close(image.base_color, srgb_to_linear(picture), rtol=0, atol=1e-4)  # one texel a pixel
     assert float(image.alpha.min()) == 1.0
@@ -122,7 +123,7 @@ def test_bands_progress_and_supersampling_do_not_change_the_mean(device, monkeyp
 
 def test_image_gradient_reaches_textures_and_light(device):
     asset = ball(device)
-    maps = [v.clone().requires_grad_() for v in vars(asset.textures).values()]
+    maps = [getattr(asset.textures, f.name).clone().requires_grad_() for f in fields(asset.textures) if f.init]
     light = torch.rand(8, 16, 3, generator=torch.Generator().manual_seed(1)).to(device).requires_grad_()
     image = render(
         Asset(asset.mesh, TextureSet(*maps)),
@@ -185,3 +186,20 @@ def test_parts_shadow_each_other_and_keep_their_paint(device):
     alone = render(parts[1:], camera, Environment.constant(torch.ones(3, device=device)))
     near = below & (image.position.norm(dim=-1) < 0.9)
     assert float(image.radiance[near].mean()) < 0.9 * float(alone.radiance[near].mean())
+
+
+def test_what_is_looked_up_follows_the_maps(device):
+    maps = textures(8, device, (0.5, 0.2, 0.1), roughness=0.3)
+    linear, rough_metal = maps.lookups()
+    assert maps.lookups()[0] is linear  # kept
+    maps.base_color.mul_(0.5)
+    maps.roughness.fill_(0.9)
+    again, rough = maps.lookups()
+    torch.testing.assert_close(again, srgb_to_linear(maps.base_color), rtol=0, atol=0)
+    assert float(rough[..., 0].min()) == pytest.approx(0.9) and float(rough_metal[..., 0].max()) == pytest.approx(0.3)
+    leaf = TextureSet(maps.base_color.clone().requires_grad_(), 0.5, 0.0)
+    for _ in range(2):  # a graph for each
+        leaf.lookups()[0].sum().backward()
+    assert float(leaf.base_color.grad.min()) > 0
+    with torch.inference_mode():
+        torch.testing.assert_close(textures(8, device).lookups()[1][..., 0], torch.full((8, 8), 0.5, device=device))
