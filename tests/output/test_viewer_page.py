@@ -174,7 +174,7 @@ def test_the_page_shows_what_a_surface_hides_from_itself(tmp_path, waisted, view
 
 
 def test_a_half_hidden_everywhere_is_a_stop_less(tmp_path, asset, views, monkeypatch):
-    """Half of an open surface's transfer as what is hidden: the page's harmonics are ours, or something else is left."""
+    """Half of an open surface's transfer as what is hidden; harmonics other than ours would leave something else."""
     cosine = torch.tensor([math.pi] + [2 * math.pi / 3] * 3 + [math.pi / 4] * 5 + [0.0] * 7)  # of the harmonics
     pictures = []
     with chromium() as tab:
