@@ -173,6 +173,18 @@ def test_the_page_shows_what_a_surface_hides_from_itself(tmp_path, waisted, view
             assert decibels > DECIBELS and decibels > found[i, name, False] + 2, found
 
 
+def test_the_harmonics_of_the_page_are_ours():
+    """Its shader's lines are arithmetic that Python reads as well."""
+    source = (viewer.PARTS / "viewer.js").read_text()
+    d = torch.nn.functional.normalize(torch.randn(50, 3, generator=torch.Generator().manual_seed(0)).double(), dim=-1)
+    x, y, z = d[:, 2], d[:, 0], d[:, 1]
+    assert "float x = d.z, y = d.x, z = d.y, xx = x * x, yy = y * y, zz = z * z;" in source
+    (text,) = re.findall(r"return mat4[(](0[.]28.*?)[)];", source, re.DOTALL)
+    values = eval(f"[{text}]", {}, {"x": x, "y": y, "z": z, "xx": x * x, "yy": y * y, "zz": z * z})
+    got = torch.stack([value * torch.ones_like(x) for value in values], -1)
+    torch.testing.assert_close(got, spherical_harmonics(d), rtol=0, atol=2e-7)  # seven digits
+
+
 def test_a_half_hidden_everywhere_is_a_stop_less(tmp_path, asset, views, monkeypatch):
     """Half of an open surface's transfer as what is hidden; harmonics other than ours would leave something else."""
     cosine = torch.tensor([math.pi] + [2 * math.pi / 3] * 3 + [math.pi / 4] * 5 + [0.0] * 7)  # of the harmonics
