@@ -6,6 +6,7 @@ import base64
 import html
 import io
 import json
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -25,6 +26,7 @@ from reli3d.views.views import Views
 PARTS = Path(reli3d.__file__).parent / "assets" / "viewer"
 PHOTOGRAPH = 640  # pixels of the longer side: 16 of them take less than a megabyte
 QUALITY = 80  # of their WebP
+LEVEL = 1  # of deflate: 2.3 times smaller; more effort gains a tenth
 TINY = 1e-20  # instead of a division by zero where nothing is blocked
 
 
@@ -62,11 +64,11 @@ def _base64(data: bytes) -> str:
 
 
 def _shadow(mesh: Mesh) -> dict:
-    """The light that every vertex misses, 16 bytes each: harmonics in steps of ``largest`` / 127."""
+    """The light that every vertex misses, 16 bytes each, deflated: harmonics in steps of ``largest`` / 127."""
     blocked = blocked_transfer(mesh).cpu()
     largest = float(blocked.abs().amax()) if blocked.numel() else 0.0
     steps = (blocked * (127.0 / max(largest, TINY))).round().to(torch.int8)
-    return {"blocked": _base64(steps.numpy().tobytes()), "largest": largest}
+    return {"blocked": _base64(zlib.compress(steps.numpy().tobytes(), LEVEL)), "largest": largest}
 
 
 def _light(name: str, radiance: Tensor) -> dict:

@@ -4,6 +4,7 @@ import base64
 import json
 import math
 import re
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -224,7 +225,7 @@ def test_the_page_of_a_reconstruction_holds_all_it_needs(asset, views):
     assert not re.search(r"""(src|href)=["']?(https?:)?//""", page)
     assert page.count("</script>") == 3  # a name cannot end the data
     data = json.loads(re.search(r'id="data">(.*?)</script>', page, re.DOTALL)[1])
-    assert len(base64.b64decode(data["meshes"][0]["blocked"])) == 16 * len(asset.mesh.vertices)
+    assert len(zlib.decompress(base64.b64decode(data["meshes"][0]["blocked"]))) == 16 * len(asset.mesh.vertices)
     assert [light["name"] for light in data["lights"]] == ["own light", "studio", "sky"]
     assert [view["name"] for view in data["views"]] == list(views.names)
 

@@ -6,6 +6,7 @@ const get = id => document.getElementById(id)
 const data = JSON.parse(get('data').textContent)
 const stage = get('stage'), photograph = get('photograph')
 const bytes = text => Uint8Array.from(atob(text), c => c.charCodeAt(0)).buffer
+const inflate = data => new Response(new Blob([data]).stream().pipeThrough(new DecompressionStream('deflate'))).arrayBuffer()
 const FINE = 512 // columns of the maps that three.js filters: it makes cubes of a quarter of them
 
 const renderer = new T.WebGLRenderer({ alpha: true, antialias: true })
@@ -146,10 +147,11 @@ async function load() {
   const lightHarmonics = { value: [0, 1, 2].map(() => new T.Matrix4()) }
   for (const { name, glb, blocked, largest } of data.meshes) {
     const { scene: root } = await loader.parseAsync(bytes(glb), '')
+    const hidden = new Int8Array(await inflate(bytes(blocked)))
     root.traverse(mesh => {
       if (!mesh.isMesh) return
       const lit = mesh.material, shown = { lit }
-      mesh.geometry.setAttribute('blocked', new T.BufferAttribute(new Int8Array(bytes(blocked)), 16, true))
+      mesh.geometry.setAttribute('blocked', new T.BufferAttribute(hidden, 16, true))
       shadowed(lit, { lightHarmonics, largest: { value: largest } })
       const maps = { color: { value: lit.map }, orm: { value: lit.roughnessMap }, bump: { value: lit.normalMap } }
       for (const [layer, value] of Object.entries(layers)) shown[layer] = new T.ShaderMaterial(
