@@ -16,6 +16,7 @@ from reli3d.cli.help_format import Defaults
 FORMATS = ("png", "exr", "webp", "gif", "mp4")
 OTHER_FILMS = (".mov", ".avi", ".mkv", ".webm", ".m4v", ".apng")  # not written
 MOVING = ("webp", "gif", "mp4")  # one file of all frames
+STILL = ("png", "exr")  # one file a frame
 RATE = 24  # frames a second
 QUALITIES = {"draft": ((6, 12, 2), 1), "good": ((20, 40, 4), 2), "best": ((64, 128, 16), 4)}  # samples, supersampling
 
@@ -38,7 +39,8 @@ def parser() -> argparse.ArgumentParser:
         "--output",
         type=Path,
         default=Path("renders"),
-        help="folder, or the name of an animation that ends in .webp, .gif or .mp4 (default renders)",
+        help="folder, or the name of one view that ends in .png or .exr, or of an animation that ends in .webp, .gif "
+        "or .mp4 (default renders)",
     )
     p.add_argument(
         "--format",
@@ -125,15 +127,18 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _completed(args: argparse.Namespace) -> argparse.Namespace:
-    """The arguments with what others of them say; ``args.file`` is the animation that ``--output`` names, or None."""
+    """The arguments with what others of them say; ``args.file`` is the file that ``--output`` names, or None."""
     ending = args.output.suffix.lower().removeprefix(".")
-    args.file = args.output if ending in MOVING and not args.output.is_dir() else None
+    args.file = args.output if ending in FORMATS and not args.output.is_dir() else None
     if args.file is not None:
         if args.format not in (None, ending):
             raise ValueError(f"--format: expected {ending} as in the name of the output, got {args.format}")
         args.format, args.output = ending, args.file.parent
     args.format = args.format or "png"
-    args.frames = args.frames if args.frames is not None else 1 if args.file is None else 72
+    moves = args.file is not None and args.format in MOVING
+    args.frames = args.frames if args.frames is not None else 72 if moves else 1
+    if args.file is not None and not moves and args.frames > 1:
+        raise ValueError(f"--frames: expected 1 where --output names one {ending}, got {args.frames}; name a folder")
     samples, supersampling = QUALITIES[args.quality]
     args.samples = tuple(args.samples or samples)
     args.supersampling = args.supersampling if args.supersampling is not None else supersampling
@@ -155,7 +160,9 @@ def _check(args: argparse.Namespace) -> None:
     if not all(0 <= k <= 65536 for k in args.samples) or sum(args.samples) == 0:
         raise ValueError(f"--samples: expected three counts of 0 to 65536, one above 0, got {tuple(args.samples)}")
     if args.output.suffix.lower() in OTHER_FILMS:
-        raise ValueError(f"--output: expected a folder, or a name that ends in .webp, .gif or .mp4, got {args.output}")
+        raise ValueError(
+            f"--output: expected a folder, or a name that ends in .png, .exr, .webp, .gif or .mp4, got {args.output}"
+        )
     if args.format == "mp4":
         if args.size % 2:
             raise ValueError(f"--size: expected an even number of pixels for mp4, got {args.size}")
@@ -225,14 +232,16 @@ def render_files(args: argparse.Namespace) -> list[Path]:
             supersampling=args.supersampling,
             background=args.background,
         )
-        stem = args.output / (args.glb.stem if args.frames == 1 else f"{args.glb.stem}_{frame:04d}")
+        still = args.file if args.format in STILL else None
+        name = args.glb.stem if still is None else still.stem
+        stem = args.output / (name if args.frames == 1 else f"{name}_{frame:04d}")
         if args.format == "exr":
-            written.append(stem.with_name(stem.name + ".exr"))
+            written.append(still or stem.with_name(stem.name + ".exr"))
             write_exr(written[-1], (image.radiance * 2.0**args.exposure).cpu())
         else:
             animation.append(_picture(image, args))
             if args.format == "png":
-                written.append(stem.with_name(stem.name + ".png"))
+                written.append(still or stem.with_name(stem.name + ".png"))
                 _save(written[-1], animation.pop(), format="PNG")
         if args.aovs:
             written += _write_aovs(stem, image)

@@ -109,8 +109,10 @@ def write_results(
         if comparison is not None:
             write_png(new / COMPARISON, comparison)
         low, high = asset.mesh.vertices.aminmax(dim=0)
-        meshes = {"mesh": glb} if before is None else {"after": glb, "before": glb_bytes(before)}
-        page = viewer_page(info["object"], meshes, radiance, (low + high) / 2, float((high - low).norm()) / 2, views)
+        shown = {"mesh" if before is None else "after": (glb, asset.mesh)}
+        if before is not None:
+            shown["before"] = (glb_bytes(before), before.mesh)
+        page = viewer_page(info["object"], shown, radiance, (low + high) / 2, float((high - low).norm()) / 2, views)
         (new / "viewer.html").write_text(page, encoding="utf-8")
         (new / "run_info.json").write_text(json.dumps(info, indent=1) + "\n")
 

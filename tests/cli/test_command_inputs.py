@@ -75,7 +75,8 @@ CASES = [
             (["--seed", "-1"], "--seed"),
             (["--seed", "99999999999999999999"], "--seed"),
             (["--output", "file"], "a file"),
-            (["--output", "turn.mov"], "ends in .webp, .gif or .mp4"),
+            (["--output", "turn.mov"], "ends in .png, .exr, .webp, .gif or .mp4"),
+            (["--output", "turn.png", "--frames", "4"], "--frames: expected 1 where --output names one png, got 4"),
             ([], "not found"),
         ]
     ),

@@ -238,6 +238,16 @@ def test_the_name_of_the_output_makes_an_animation(scene, tmp_path, ending):
     assert (corner[:3] > 250).all() if ending == "mp4" else corner[3] == 0
 
 
+@pytest.mark.parametrize("name", ["seen.png", "seen.PNG", "linear.light.exr"])
+def test_the_name_of_the_output_makes_one_picture(scene, tmp_path, name):
+    in_folder = run(scene, "--format", name[-3:].lower())
+    (found,) = run(scene, "--output", str(tmp_path / name)).values()
+    assert found == tmp_path / name
+    assert found.read_bytes() == next(iter(in_folder.values())).read_bytes()
+    layers = run(scene, "--output", str(tmp_path / name), "--aovs")
+    assert f"{found.stem}_normal.exr" in layers and len(layers) == 5
+
+
 @pytest.mark.parametrize(
     "words, text",
     [

@@ -1,29 +1,38 @@
 """``viewer.html`` in headless Chromium, opened as a file: what it shows beside what our renderer shows."""
 
+import base64
 import json
 import math
 import re
+import zlib
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from reli3d.cli import infer
 from reli3d.geometry.camera import Camera, look_at
+from reli3d.geometry.mesh import Mesh, vertex_normals
+from reli3d.geometry.tangents import with_tangents
 from reli3d.io.glb import glb_bytes, read_glb, write_glb
+from reli3d.io.hdr import read_environment
+from reli3d.output import viewer
 from reli3d.output.viewer import viewer_page
 from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
 from reli3d.render.lights import sky, studio
 from reli3d.render.render import Render, render
+from reli3d.render.transfer import spherical_harmonics
 from reli3d.views.views import Views
 from tests.support.browser import chromium, pixels
-from tests.support.scenes import ball_mesh
+from tests.support.scenes import ball_mesh, textures
 
 SIZE, WIDE = 256, 320  # the page's window is wider than the photographs
 EYES = ((0.9, 0.6, 2.0), (-2.0, 0.5, -0.6))
-# What the own light must reach.  The ball casts no shadow on itself, and three.js casts none.  What limits it is its
-# light prefiltered by roughness, whose lobes are narrower than GGX: a ball half of rough metal reaches 24.9.
+# What a light must reach.  What limits it on a ball, which hides nothing from itself, is three.js' light prefiltered by
+# roughness, whose lobes are narrower than GGX: a ball half of rough metal reaches 24.9.
 DECIBELS = 26.0
 
 
@@ -34,11 +43,25 @@ def asset(tmp_path_factory) -> Asset:
     rows, columns = torch.meshgrid(torch.arange(64), torch.arange(64), indexing="ij")
     color = torch.stack([0.3 + rows / 128, 0.9 - columns / 96, (0.4 + (rows + columns) / 256)], -1)
     metal = (columns >= 52).float()
-    textures = TextureSet(color, 0.35 + 0.2 * metal, metal)
-    path = tmp_path_factory.mktemp("page") / "mesh.glb"
-    write_glb(path, Asset(mesh, textures))
-    (stored,) = read_glb(path)  # rounded to 8 bits, as the page has it
-    return Asset(stored.mesh, stored.textures, studio())
+    maps = TextureSet(color, 0.35 + 0.2 * metal, metal)
+    return stored(tmp_path_factory.mktemp("page"), Asset(mesh, maps))
+
+
+def stored(folder: Path, asset: Asset) -> Asset:
+    """``asset`` as the page has it, rounded to 8 bits, in the light of the studio."""
+    write_glb(folder / "mesh.glb", asset)
+    (part,) = read_glb(folder / "mesh.glb")
+    return Asset(part.mesh, part.textures, studio())
+
+
+@pytest.fixture(scope="module")
+def waisted(tmp_path_factory) -> Asset:
+    """A grey body with a deep groove about it, in which little of the light arrives."""
+    ball = ball_mesh(5, 1.0)
+    away = torch.linalg.cross(ball.vertices, torch.tensor([0.36, 0.8, 0.48]).expand_as(ball.vertices)).square().sum(-1)
+    vertices = ball.vertices * (0.7 - 0.45 * torch.exp(-12.0 * (1.0 - away)))[:, None]
+    mesh = with_tangents(Mesh(vertices, ball.faces, vertex_normals(vertices, ball.faces), ball.uv))
+    return stored(tmp_path_factory.mktemp("waisted"), Asset(mesh, textures(4, "cpu", (0.6, 0.6, 0.6), 0.5)))
 
 
 @pytest.fixture(scope="module")
@@ -51,16 +74,16 @@ def views() -> Views:
     return Views((image,) * 2, (mask,) * 2, c2w, intrinsics, ("front </script>.png", "back.png"))
 
 
-def ours(asset: Asset, views: Views, i: int, light: Environment) -> Render:
+def ours(asset: Asset, views: Views, i: int, light: Environment, **options) -> Render:
     """The view of the page's window: the photograph's, with more at its sides."""
     camera = views.intrinsics[i] + torch.tensor([0.0, 0.0, (WIDE - SIZE) / 2, 0.0])
-    return render(asset, Camera(views.c2w[i], camera, WIDE, SIZE), light, supersampling=2)
+    return render(asset, Camera(views.c2w[i], camera, WIDE, SIZE), light, supersampling=2, **options)
 
 
-def psnr(picture: np.ndarray, color: torch.Tensor, alpha: torch.Tensor) -> float:
-    """Decibels on the pixels that both have; also checks that they have the same pixels."""
+def psnr(picture: np.ndarray, color: torch.Tensor, alpha: torch.Tensor, *, shared: float = 0.99) -> float:
+    """Decibels on the pixels that both have; also checks that they share more than ``shared`` of their pixels."""
     mask = picture[..., 3] > 127
-    assert (mask & (alpha.numpy() > 0.5)).sum() / (mask | (alpha.numpy() > 0.5)).sum() > 0.99
+    assert (mask & (alpha.numpy() > 0.5)).sum() / (mask | (alpha.numpy() > 0.5)).sum() > shared
     both = (picture[..., 3] == 255) & (alpha.numpy() > 0.999)
     error = (picture[..., :3][both] / 255.0 - color.numpy()[both]).astype(np.float64)
     return float(-10 * np.log10(np.mean(error**2)))
@@ -83,7 +106,12 @@ def choose(**values) -> str:
 def test_the_page_shows_the_asset_as_the_renderer_does(tmp_path, asset, views):
     glb = glb_bytes(asset)
     page = viewer_page(
-        "a <ball>", {"before": glb, "after": glb}, asset.environment.radiance, torch.zeros(3), 0.7, views
+        "a <ball>",
+        {"before": (glb, asset.mesh), "after": (glb, asset.mesh)},
+        asset.environment.radiance,
+        torch.zeros(3),
+        0.7,
+        views,
     )
     (tmp_path / "viewer.html").write_text(page)
     with chromium() as tab:
@@ -125,11 +153,79 @@ def test_the_page_shows_the_asset_as_the_renderer_does(tmp_path, asset, views):
     assert free and not choices and title == "a <ball>"
 
 
+def test_the_page_shows_what_a_surface_hides_from_itself(tmp_path, waisted, views):
+    """In each light, turned and brightened: nearer to our renderer than without, and near."""
+    page = viewer_page("x", {"mesh": (glb_bytes(waisted), waisted.mesh)}, studio().radiance, torch.zeros(3), 0.7, views)
+    (tmp_path / "viewer.html").write_text(page)
+    found = {}
+    with chromium() as tab:
+        tab.open((tmp_path / "viewer.html").as_uri(), size=(WIDE, SIZE)).wait("document.body.dataset.ready")
+        for i in range(len(views)):
+            tab.ask(f"take({i})")
+            for name, turn, stops, light in (("own light", 30, 0, studio()), ("sky", -60, -1, sky())):
+                picture = pixels(tab.ask(choose(light=name, turn=turn, stopsof=stops) + "picture()"))
+                turned = light.rotated(math.radians(turn))
+                for shadows in (True, False):
+                    image = ours(waisted, views, i, turned, shadows=shadows)
+                    found[i, name, shadows] = psnr(picture, shown(image, 2.0**stops), image.alpha)
+        assert tab.problems == []
+    for (i, name, shadows), decibels in found.items():
+        if shadows:
+            assert decibels > DECIBELS and decibels > found[i, name, False] + 2, found
+
+
+def test_the_harmonics_of_the_page_are_ours():
+    """Its shader's lines are arithmetic that Python reads as well."""
+    source = (viewer.PARTS / "viewer.js").read_text()
+    d = torch.nn.functional.normalize(torch.randn(50, 3, generator=torch.Generator().manual_seed(0)).double(), dim=-1)
+    x, y, z = d[:, 2], d[:, 0], d[:, 1]
+    assert "float x = d.z, y = d.x, z = d.y, xx = x * x, yy = y * y, zz = z * z;" in source
+    (text,) = re.findall(r"return mat4[(](0[.]28.*?)[)];", source, re.DOTALL)
+    values = eval(f"[{text}]", {}, {"x": x, "y": y, "z": z, "xx": x * x, "yy": y * y, "zz": z * z})
+    got = torch.stack([value * torch.ones_like(x) for value in values], -1)
+    torch.testing.assert_close(got, spherical_harmonics(d), rtol=0, atol=2e-7)  # seven digits
+
+
+def test_a_half_hidden_everywhere_is_a_stop_less(tmp_path, asset, views, monkeypatch):
+    """Half of an open surface's transfer as what is hidden; harmonics other than ours would leave something else."""
+    cosine = torch.tensor([math.pi] + [2 * math.pi / 3] * 3 + [math.pi / 4] * 5 + [0.0] * 7)  # of the harmonics
+    pictures = []
+    with chromium() as tab:
+        for hidden, stops in ((0.5, 0), (0.0, -1)):
+            monkeypatch.setattr(
+                viewer, "blocked_transfer", lambda m, h=hidden: h * cosine * spherical_harmonics(m.normals)
+            )
+            page = viewer_page("x", {"m": (glb_bytes(asset), asset.mesh)}, sky().radiance, torch.zeros(3), 0.7, views)
+            (tmp_path / f"{stops}.html").write_text(page)
+            tab.open((tmp_path / f"{stops}.html").as_uri(), size=(WIDE, SIZE)).wait("document.body.dataset.ready")
+            pictures.append(pixels(tab.ask("take(0); " + choose(turn=40, stopsof=stops) + "picture()")).astype(int))
+        assert tab.problems == []
+    assert np.abs(pictures[0] - pictures[1]).max() <= 4  # of 255: coefficients have 8 bits
+
+
+def test_the_page_of_the_example_looks_as_its_picture_by_the_renderer(tmp_path):
+    """The own light from the first photograph, at the command's own sizes."""
+    assert infer.main(["--output", str(tmp_path), "--device", "cpu"]) == 0
+    (part,) = read_glb(tmp_path / "example" / "mesh.glb")
+    light = Environment(read_environment(tmp_path / "example" / "environment.exr"))
+    with chromium() as tab:
+        tab.open((tmp_path / "example" / "viewer.html").as_uri(), size=(SIZE, SIZE)).wait("document.body.dataset.ready")
+        (view, *_) = tab.ask("data.views")
+        picture = pixels(tab.ask("take(0); picture()"))
+        assert tab.problems == []
+    camera = torch.tensor(view["intrinsics"]) * (SIZE / view["width"])
+    image = render(part, Camera(torch.tensor(view["c2w"]), camera, SIZE, SIZE), light, supersampling=2)
+    assert psnr(picture, shown(image), image.alpha, shared=0.98) > 30.0  # its handle is thin
+
+
 def test_the_page_of_a_reconstruction_holds_all_it_needs(asset, views):
-    page = viewer_page("x", {"mesh": glb_bytes(asset)}, asset.environment.radiance, torch.zeros(3), 0.7, views)
+    page = viewer_page(
+        "x", {"mesh": (glb_bytes(asset), asset.mesh)}, asset.environment.radiance, torch.zeros(3), 0.7, views
+    )
     assert not re.search(r"""(src|href)=["']?(https?:)?//""", page)
     assert page.count("</script>") == 3  # a name cannot end the data
     data = json.loads(re.search(r'id="data">(.*?)</script>', page, re.DOTALL)[1])
+    assert len(zlib.decompress(base64.b64decode(data["meshes"][0]["blocked"]))) == 16 * len(asset.mesh.vertices)
     assert [light["name"] for light in data["lights"]] == ["own light", "studio", "sky"]
     assert [view["name"] for view in data["views"]] == list(views.names)
 
@@ -137,7 +233,7 @@ def test_the_page_of_a_reconstruction_holds_all_it_needs(asset, views):
 def test_large_photographs_are_scaled_with_their_cameras(asset):
     image, mask = torch.rand(1000, 2000, 3), torch.ones(1000, 2000)
     views = Views((image,), (mask,), torch.eye(4)[None], torch.tensor([[3000.0, 2900.0, 990.0, 510.0]]), ("a",))
-    page = viewer_page("x", {"mesh": b""}, asset.environment.radiance, torch.zeros(3), 0.7, views)
+    page = viewer_page("x", {"mesh": (b"", asset.mesh)}, asset.environment.radiance, torch.zeros(3), 0.7, views)
     (view,) = json.loads(re.search(r'id="data">(.*?)</script>', page, re.DOTALL)[1])["views"]
     assert (view["width"], view["height"]) == (640, 320)
     np.testing.assert_allclose(view["intrinsics"], [960.0, 928.0, 316.8, 163.2])

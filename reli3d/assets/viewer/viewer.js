@@ -6,6 +6,7 @@ const get = id => document.getElementById(id)
 const data = JSON.parse(get('data').textContent)
 const stage = get('stage'), photograph = get('photograph')
 const bytes = text => Uint8Array.from(atob(text), c => c.charCodeAt(0)).buffer
+const inflate = data => new Response(new Blob([data]).stream().pipeThrough(new DecompressionStream('deflate'))).arrayBuffer()
 const FINE = 512 // columns of the maps that three.js filters: it makes cubes of a quarter of them
 
 const renderer = new T.WebGLRenderer({ alpha: true, antialias: true })
@@ -43,6 +44,71 @@ void main() {
   } else gl_FragColor = vec4(vec3(layer == 1 ? texture2D(orm, at).g : texture2D(orm, at).b), 1.0);
 }`
 
+// Shadows: reli3d/render/transfer.py.  A vertex has the harmonics of what the mesh hides from it, weighed by the cosine.
+// Their product with those of the light is the irradiance that it misses.
+const HARMONICS = `
+mat4 harmonics(vec3 d) { // degree 0 is the first value, 1 the next three, 2 the next five, 3 the last seven
+  float x = d.z, y = d.x, z = d.y, xx = x * x, yy = y * y, zz = z * z;
+  return mat4(0.2820948, 0.4886025 * y, 0.4886025 * z, 0.4886025 * x,
+    1.0925484 * x * y, 1.0925484 * y * z, 0.3153916 * (3.0 * zz - 1.0), 1.0925484 * x * z,
+    0.5462742 * (xx - yy), 0.5900436 * y * (3.0 * xx - yy), 2.8906114 * x * y * z, 0.4570458 * y * (5.0 * zz - 1.0),
+    0.3731763 * z * (5.0 * zz - 3.0), 0.4570458 * x * (5.0 * zz - 1.0), 1.4453057 * z * (xx - yy),
+    0.5900436 * x * (xx - 3.0 * yy));
+}
+mat4 bands(mat4 v, float k0, float k1, float k2, float k3) {
+  return matrixCompMult(v, mat4(k0, k1, k1, k1, k2, k2, k2, k2, k2, k3, k3, k3, k3, k3, k3, k3));
+}
+mat4 cosine(mat4 v) { return bands(v, 3.1415927, 2.0943951, 0.7853982, 0.0); }
+float product(mat4 a, mat4 b) { return dot(a[0], b[0]) + dot(a[1], b[1]) + dot(a[2], b[2]) + dot(a[3], b[3]); }
+`
+const SHADOW_VERTEX = `
+attribute mat4 blocked;
+uniform mat4 lightHarmonics[3];
+uniform float largest;
+varying mat4 hidden;
+varying vec3 open, up;
+` + HARMONICS
+const SHADOW_AT_VERTEX = `
+hidden = largest * blocked;
+up = normal;
+mat4 whole = cosine(harmonics(normal));
+for (int i = 0; i < 3; i++)
+  open[i] = clamp(1.0 - product(hidden, lightHarmonics[i]) / max(product(whole, lightHarmonics[i]), 1e-6), 0.0, 1.0);
+`
+// What is mirrored is hidden as far as a lobe about its direction is, a Gaussian on the sphere as wide as GGX's (Wang et
+// al. 2009).  The lobe is reflected at the tangent plane, so that nothing is lost below it where nothing is hidden.
+const SHADOW_AT_FRAGMENT = `
+iblIrradiance *= open;
+vec3 facing = normalize(up), mirrored = reflect(-geometryViewDir, geometryNormal);
+mirrored = inverseTransformDirection(normalize(mix(mirrored, geometryNormal, pow4(material.roughness))), viewMatrix);
+float wide = pow4(material.roughness);
+mat4 lobe = harmonics(mirrored) + harmonics(reflect(mirrored, facing));
+lobe = bands(lobe, 1.0, exp(-2.0 * wide), exp(-6.0 * wide), exp(-12.0 * wide));
+radiance *= clamp(1.0 - product(hidden, lobe) / product(cosine(lobe), harmonics(facing)), 0.0, 1.0);
+`
+
+// MeshStandardMaterial whose image-based light is hidden by the mesh; uniforms are shared by all that have them.
+function shadowed(material, uniforms) {
+  material.onBeforeCompile = shader => {
+    Object.assign(shader.uniforms, uniforms)
+    const after = (text, chunk, code) => text.replace(`#include <${chunk}>`, `#include <${chunk}>\n${code}`)
+    shader.vertexShader = after(after(shader.vertexShader, 'common', SHADOW_VERTEX), 'begin_vertex', SHADOW_AT_VERTEX)
+    shader.fragmentShader = after(after(shader.fragmentShader, 'common',
+      'varying mat4 hidden;\nvarying vec3 open, up;\n' + HARMONICS), 'lights_fragment_maps', SHADOW_AT_FRAGMENT)
+  }
+}
+
+// The harmonics of a light turned by an angle about +Y, their polar axis: those of order m and -m are a pair.
+function turned(harmonics, angle) {
+  const out = [...harmonics]
+  for (let l = 1; l < 4; l++) for (let m = 1; m <= l; m++) {
+    const i = l * l + l + m, j = l * l + l - m, c = Math.cos(m * angle), s = Math.sin(m * angle)
+    out[i] = c * harmonics[i] - s * harmonics[j]
+    out[j] = s * harmonics[i] + c * harmonics[j]
+  }
+  return out
+}
+
 function draw() {
   renderer.render(scene, camera)
 }
@@ -78,11 +144,15 @@ function finer({ width, height, data: half }) {
 
 async function load() {
   const loader = new T.GLTFLoader(), parts = []
-  for (const { name, glb } of data.meshes) {
+  const lightHarmonics = { value: [0, 1, 2].map(() => new T.Matrix4()) }
+  for (const { name, glb, blocked, largest } of data.meshes) {
     const { scene: root } = await loader.parseAsync(bytes(glb), '')
+    const hidden = new Int8Array(await inflate(bytes(blocked)))
     root.traverse(mesh => {
       if (!mesh.isMesh) return
       const lit = mesh.material, shown = { lit }
+      mesh.geometry.setAttribute('blocked', new T.BufferAttribute(hidden, 16, true))
+      shadowed(lit, { lightHarmonics, largest: { value: largest } })
       const maps = { color: { value: lit.map }, orm: { value: lit.roughnessMap }, bump: { value: lit.normalMap } }
       for (const [layer, value] of Object.entries(layers)) shown[layer] = new T.ShaderMaterial(
         { vertexShader: VERTEX, fragmentShader: FRAGMENT, uniforms: { ...maps, layer: { value } } })
@@ -93,7 +163,8 @@ async function load() {
     get('mesh').add(new Option(name))
   }
   get('mesh').parentElement.hidden = data.meshes.length < 2
-  const lights = new Map(data.lights.map(({ name, hdr }) => [name, finer(new T.HDRLoader().parse(bytes(hdr)))]))
+  const lights = new Map(data.lights.map(({ name, hdr, harmonics }) =>
+    [name, { map: finer(new T.HDRLoader().parse(bytes(hdr))), harmonics }]))
   for (const name of lights.keys()) get('light').add(new Option(name))
   renderer.setClearColor(0, 0)
 
@@ -102,7 +173,8 @@ async function load() {
       mesh.visible = name === get('mesh').value
       mesh.material = shown[get('layer').value]
     }
-    const map = lights.get(get('light').value), angle = get('turn').value * Math.PI / 180
+    const { map, harmonics } = lights.get(get('light').value), angle = get('turn').value * Math.PI / 180
+    for (const [channel, matrix] of lightHarmonics.value.entries()) matrix.fromArray(turned(harmonics[channel], angle))
     scene.environment = map
     scene.background = get('behind').checked ? map : null
     scene.environmentRotation.set(0, angle, 0)

@@ -1,0 +1,98 @@
+"""Light that a surface keeps from itself, as spherical harmonics of its directions: precomputed radiance transfer.
+
+Sloan, Kautz and Snyder 2002, "Precomputed Radiance Transfer for Real-Time Rendering in Dynamic, Low-Frequency Lighting
+Environments".  The harmonics are real, orthonormal, up to degree 3, with +Y as the polar axis, so that a light turned
+about +Y turns pairs of its coefficients.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from reli3d._bridge import check, present
+from reli3d.geometry.mesh import Mesh, weld_rows
+from reli3d.geometry.rays import RayScene
+from reli3d.render.environment import Environment, texel_solid_angles
+
+HEIGHT = 0.05  # of a mean edge, from where rays start: above the facets of a smooth surface that is convex
+
+
+def spherical_harmonics(directions: Tensor) -> Tensor:
+    """Values ``(..., 16)`` of the harmonics at unit ``directions (..., 3)``: degree l from column l^2 on, m ascending.
+
+    Any dtype.  Differentiable.  Source: Sloan 2008, "Stupid Spherical Harmonics Tricks", appendix A2.
+    """
+    y, z, x = directions.unbind(-1)  # his z is +Y here
+    xx, yy, zz = x * x, y * y, z * z
+    one = torch.ones_like(x)
+    values = [
+        (1.0 / 4.0, one),
+        *((3.0 / 4.0, v) for v in (y, z, x)),
+        (15.0 / 4.0, x * y),
+        (15.0 / 4.0, y * z),
+        (5.0 / 16.0, 3.0 * zz - 1.0),
+        (15.0 / 4.0, x * z),
+        (15.0 / 16.0, xx - yy),
+        (35.0 / 32.0, y * (3.0 * xx - yy)),
+        (105.0 / 4.0, x * y * z),
+        (21.0 / 32.0, y * (5.0 * zz - 1.0)),
+        (7.0 / 16.0, z * (5.0 * zz - 3.0)),
+        (21.0 / 32.0, x * (5.0 * zz - 1.0)),
+        (105.0 / 16.0, z * (xx - yy)),
+        (35.0 / 32.0, x * (xx - 3.0 * yy)),
+    ]
+    return torch.stack([math.sqrt(square / math.pi) * value for square, value in values], -1)
+
+
+def light_harmonics(light: Environment) -> Tensor:
+    """Coefficients ``(16, 3)`` of a light: its texels' solid angles times their values, summed in float64."""
+    height, width = light.radiance.shape[:2]
+    phi = (torch.arange(width, dtype=torch.float64) + 0.5) * (2.0 * math.pi / width) - math.pi
+    theta = (torch.arange(height, dtype=torch.float64)[:, None] + 0.5) * (math.pi / height)
+    d = torch.stack([phi.sin() * theta.sin(), theta.cos().expand(-1, width), -phi.cos() * theta.sin()], -1)
+    weight = spherical_harmonics(d) * texel_solid_angles(height, width)[:, None, None]
+    return torch.einsum("hwk,hwc->kc", weight, light.radiance.detach().cpu().double()).float()
+
+
+def blocked_transfer(mesh: Mesh, *, directions: int = 64) -> Tensor:
+    """What the mesh keeps from its vertices: ``(V, 16)``, integrals of hidden cosine times harmonics, no gradient.
+
+    Row i times the coefficients of a light (:func:`light_harmonics`) is the irradiance that vertex i misses.  mesh:
+    with normals.  directions: over the whole sphere, on a spiral of equal areas and the same for all vertices, so that
+    neighbours differ by their geometry alone.  Exactly 0 where no ray is hidden.  Raises TypeError, ValueError.
+    """
+    normals = present("normals", mesh.normals).detach()
+    check("vertices", mesh.vertices, last=3, like=normals)
+    if directions < 1:
+        raise ValueError(f"directions: expected at least 1, got {directions}")
+    device = normals.device
+    first, label = weld_rows(torch.cat([mesh.vertices.detach(), normals], 1).cpu().numpy())  # seams have copies
+    rows = torch.from_numpy(first).to(device)
+    position, normal = mesh.vertices.detach()[rows], normals[rows]
+    start = position + HEIGHT * _mean_edge(mesh) * normal
+    toward = sphere_spiral(directions).to(device)
+    cosine = (normal @ toward.T).clamp(min=0.0)
+    above = cosine > 0.0
+    vertex, which = above.nonzero(as_tuple=True)  # rays of one vertex are neighbours
+    far = torch.full((len(vertex),), torch.inf, device=device)
+    free = RayScene(mesh.vertices, mesh.faces).unoccluded(start[vertex], toward[which], far)
+    cosine.masked_fill_(torch.zeros_like(above).masked_scatter_(above, free), 0.0)
+    blocked = cosine @ (spherical_harmonics(toward) * (4.0 * math.pi / directions))
+    return blocked[torch.from_numpy(label).to(device)]
+
+
+def sphere_spiral(count: int) -> Tensor:
+    """``(count, 3)`` unit directions, each in the middle of an equal share of the sphere (a Fibonacci spiral)."""
+    k = torch.arange(count, dtype=torch.float64) + 0.5
+    height, turn = 1.0 - 2.0 * k / count, k * (math.pi * (3.0 - math.sqrt(5.0)))
+    across = (1.0 - height * height).sqrt()
+    return torch.stack([across * turn.cos(), height, across * turn.sin()], -1).float()
+
+
+def _mean_edge(mesh: Mesh) -> Tensor:
+    """Mean length of a side of the faces; 0 without faces."""
+    corner = mesh.vertices.detach()[mesh.faces[:, :2].long()]
+    return (corner[:, 1] - corner[:, 0]).norm(dim=-1).sum() / max(len(mesh.faces), 1)
