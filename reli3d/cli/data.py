@@ -59,7 +59,7 @@ def parser() -> argparse.ArgumentParser:
         help="GLB files whose shapes are put together and dressed by finishes of their own",
     )
     where = p.add_mutually_exclusive_group()
-    where.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes of this machine")
+    where.add_argument("--workers", type=int, help="processes of this machine; default one a core")
     where.add_argument("--ray", metavar="ADDRESS", help="render on a Ray cluster: auto, local, or its address")
     p.set_defaults(run=render)
     shards.add(actions)
@@ -226,7 +226,8 @@ def render(args: argparse.Namespace) -> int:
     items = [objects.Item(Path(), n, args.output.absolute() / f"{n}.safetensors") for n in names]
     items = [item for item in items if not item.target.exists()]
     start = functools.partial(objects.called, "reli3d.cli.data", "Samples", wanted)
-    rows = objects.on_ray(start, items, args.ray) if args.ray else objects.in_processes(start, items, args.workers)
+    workers = args.workers or os.cpu_count() or 1
+    rows = objects.on_ray(start, items, args.ray) if args.ray else objects.in_processes(start, items, workers)
     lost = 0
     with contextlib.closing(rows), tqdm(total=len(items), file=sys.stderr, unit="sample", disable=None) as bar:
         for row in rows:

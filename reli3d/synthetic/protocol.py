@@ -53,7 +53,8 @@ def framed_cameras(vertices: Tensor, rng: np.random.Generator, count: int, size:
     """
     fov = np.radians(fields_of_view(rng.random(count)))
     azimuth = rng.uniform(0.0, 2.0 * math.pi, count)
-    height = rng.uniform(*np.sin(np.radians(ELEVATION_DEG)), count)
+    low, high = (math.sin(math.radians(e)) for e in ELEVATION_DEG)
+    height = rng.uniform(low, high, count)
     padding = rng.uniform(*PADDING, count)
     shift = torch.as_tensor(rng.uniform(-JITTER, JITTER, (count, 3)), dtype=torch.float32)
     level = np.sqrt(1.0 - height**2)
