@@ -1,6 +1,6 @@
 """One training step of the published sizes on a CPU: forward and backward of each kind of stage, random weights.
 
-usage: python -m bench.studies.official_step [--gib LIMIT]
+usage: python -m bench.studies.official_step [--stages NAME ...] [--bfloat16] [--gib LIMIT]
 
 One object, one view read, the trunk's layers computed again in the backward pass.  Adam's moments and the averaged
 parameters are left out: with them it takes 30 GiB.  The surface has 32 cubes a side and the pictures 64 pixels.  A
@@ -61,6 +61,8 @@ def drawn(size: int) -> Draw:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--stages", nargs="+", choices=[s.name for s in STAGES], default=[s.name for s in STAGES])
+    parser.add_argument("--bfloat16", action="store_true", help="autocast of the trunk")
     parser.add_argument("--gib", type=float, help="of address space; beyond it the step ends with an error")
     args = parser.parse_args()
     if args.gib:
@@ -72,12 +74,12 @@ def main() -> None:
     checkpointed(model)
     count = sum(p.numel() for p in model.parameters())
     print(f"{count:,} parameters in {time.monotonic() - began:.0f} s, {peak():.1f} GiB", flush=True)
-    for stage in STAGES:
+    for stage in (s for s in STAGES if s.name in args.stages):
         model.zero_grad(set_to_none=True)
         began, used = time.monotonic(), time.process_time()
-        terms = object_losses(model, one, stage, gradients)
+        terms = object_losses(model, one, stage, gradients, bfloat16=args.bfloat16)
         loss = total(terms, stage)
-        forward = time.monotonic() - began
+        forward, forward_used = time.monotonic() - began, time.process_time() - used
         loss.backward()
         seconds, used = time.monotonic() - began, time.process_time() - used
         grads = [p.grad for p in model.parameters() if p.grad is not None]
@@ -85,9 +87,9 @@ def main() -> None:
         finite = all(bool(torch.isfinite(g).all()) for g in grads)
         share = sum(int((g != 0).sum()) for g in grads) / count
         print(
-            f"{stage.name}: loss {float(loss):.3f}, forward {forward:.0f} s, with backward {seconds:.0f} s, processor "
-            f"{used:.0f} s, gradients finite: {finite}, norm {norm:.3g}, of {share:.1%} of the parameters not 0, "
-            f"{peak():.1f} GiB; {', '.join(terms)}",
+            f"{stage.name}: loss {float(loss):.3f}, forward {forward:.0f} s (processor {forward_used:.0f} s), with "
+            f"backward {seconds:.0f} s ({used:.0f} s), gradients finite: {finite}, norm {norm:.3g}, "
+            f"of {share:.1%} of the parameters not 0, {peak():.1f} GiB; {', '.join(terms)}",
             flush=True,
         )
 

@@ -7,14 +7,13 @@ import contextlib
 import functools
 import os
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 
 from reli3d.cli import objects, shards
 from reli3d.cli.exit_codes import check_range, command
 from reli3d.cli.help_format import Defaults
+from reli3d.cli.samples import Samples, Wanted
 
-LAMPS = 0.45  # share of the training lights that get lamps of their own
 COUNT, VIEWS = 1000, 6  # seeds and views where nothing else is asked for
 
 
@@ -64,97 +63,6 @@ def parser() -> argparse.ArgumentParser:
     p.set_defaults(run=render)
     shards.add(actions)
     return whole
-
-
-@dataclass(frozen=True)
-class Wanted:
-    """What a process needs to make samples.  Paths are those of all machines."""
-
-    maps: Path
-    held: bool  # under the maps, and without the lamps, of held-back objects
-    paper: bool
-    views: int
-    size: int
-    meshes: tuple[Path, ...]
-    shapes: tuple[Path, ...]
-
-
-class Samples:
-    """Makes samples, in one process."""
-
-    def __init__(self, wanted: Wanted):
-        import torch
-
-        from reli3d.synthetic.maps import held_back, load_maps
-
-        torch.set_num_threads(1)
-        maps, names = load_maps(wanted.maps)
-        self.wanted = wanted
-        self.lights = [m for m, h in zip(maps, held_back(names), strict=True) if h == wanted.held]
-
-    def run(self, folder: object, name: str, target: Path) -> str:
-        """Write the sample ``name``: a seed, by the paper's protocol with the number of a light behind it.
-
-        Raises ValueError where the object cannot be made.
-        """
-        from safetensors import SafetensorError
-        from safetensors.torch import save_file
-
-        from reli3d.io.files import replacing
-
-        if target.exists():  # by a process that died after it
-            return "skipped"
-        seed, _, light = name.partition("_")
-        sample = self._paper(int(seed), int(light)) if self.wanted.paper else self._own(int(seed))
-        try:
-            with replacing(target) as temporary:
-                save_file(sample, temporary)
-        except SafetensorError as error:  # a full disk, for one
-            raise OSError(f"{target}: cannot be written ({error})") from None
-        return "done"
-
-    def _own(self, seed: int):
-        import numpy as np
-
-        from reli3d.synthetic.maps import with_lamps
-        from reli3d.synthetic.procedural import make_object
-        from reli3d.synthetic.samples import ObjectSurface, Surface, synthesize
-        from reli3d.synthetic.scanned import ScannedSurface
-        from reli3d.synthetic.shapes import ShapeSurface
-
-        wanted, rng = self.wanted, np.random.default_rng((seed, 1))
-        surface: Surface
-        if wanted.shapes:
-            surface = ShapeSurface(wanted.shapes, rng)
-        elif wanted.meshes:
-            surface = ScannedSurface(wanted.meshes[seed % len(wanted.meshes)], rng)
-        else:
-            surface = ObjectSurface(make_object(seed))
-        light = self.lights[int(rng.integers(len(self.lights)))]
-        if not wanted.held and rng.random() < LAMPS:
-            light = with_lamps(light, rng)
-        return synthesize(surface, light, rng, size=wanted.size, views=wanted.views)
-
-    def _paper(self, seed: int, light: int):
-        import numpy as np
-
-        from reli3d.io.gltf_parts import has_material_maps
-        from reli3d.synthetic.procedural import make_object
-        from reli3d.synthetic.protocol import protocol_sample
-        from reli3d.synthetic.samples import ObjectSurface, Surface
-        from reli3d.synthetic.scanned import ScannedSurface
-        from reli3d.synthetic.shapes import ShapeSurface
-
-        wanted, known = self.wanted, True
-        surface: Surface
-        if wanted.shapes:
-            surface = ShapeSurface(wanted.shapes, np.random.default_rng((seed, 1)))
-        elif wanted.meshes:
-            path = wanted.meshes[seed % len(wanted.meshes)]
-            surface, known = ScannedSurface(path, None), has_material_maps(path)
-        else:
-            surface = ObjectSurface(make_object(seed))
-        return protocol_sample(surface, self.lights, seed, light, pbr=known, size=wanted.size)
 
 
 def glb_files(paths: list[Path] | None) -> tuple[Path, ...]:
@@ -225,7 +133,7 @@ def render(args: argparse.Namespace) -> int:
     names = [f"{seed:010d}{end}" for seed in seeds for end in ends]
     items = [objects.Item(Path(), n, args.output.absolute() / f"{n}.safetensors") for n in names]
     items = [item for item in items if not item.target.exists()]
-    start = functools.partial(objects.called, "reli3d.cli.data", "Samples", wanted)
+    start = functools.partial(Samples, wanted)
     workers = args.workers or os.cpu_count() or 1
     rows = objects.on_ray(start, items, args.ray) if args.ray else objects.in_processes(start, items, workers)
     lost = 0

@@ -69,9 +69,7 @@ def at_work(of: int) -> list[int]:
 
 
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="finds the processes in /proc")
-@pytest.mark.parametrize(
-    "where", [pytest.param(["--workers", "2"], id="processes"), pytest.param(["--ray", "local"], id="ray", marks=SLOW)]
-)
+@pytest.mark.parametrize("where", PLACES)
 def test_the_work_of_a_killed_process_is_done_again(where, maps, alone, tmp_path):
     if "--ray" in where:
         pytest.importorskip("ray")
