@@ -12,7 +12,7 @@ from pathlib import Path
 from reli3d.cli import objects, shards
 from reli3d.cli.exit_codes import check_range, command
 from reli3d.cli.help_format import Defaults
-from reli3d.cli.samples import Samples, Wanted
+from reli3d.cli.samples import SampleJob, Wanted
 
 COUNT, VIEWS = 1000, 6  # seeds and views where nothing else is asked for
 
@@ -133,7 +133,7 @@ def render(args: argparse.Namespace) -> int:
     names = [f"{seed:010d}{end}" for seed in seeds for end in ends]
     items = [objects.Item(Path(), n, args.output.absolute() / f"{n}.safetensors") for n in names]
     items = [item for item in items if not item.target.exists()]
-    start = functools.partial(Samples, wanted)
+    start = functools.partial(SampleJob, wanted)
     workers = args.workers or os.cpu_count() or 1
     rows = objects.on_ray(start, items, args.ray) if args.ray else objects.in_processes(start, items, workers)
     lost = 0

@@ -4,6 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import numpy as np
+    from torch import Tensor
+
+    from reli3d.synthetic.samples import Surface
 
 LAMPS = 0.45  # share of the training lights that get lamps of their own
 
@@ -21,7 +28,7 @@ class Wanted:
     shapes: tuple[Path, ...]
 
 
-class Samples:
+class SampleJob:
     """Makes samples, in one process."""
 
     def __init__(self, wanted: Wanted):
@@ -55,45 +62,41 @@ class Samples:
             raise OSError(f"{target}: cannot be written ({error})") from None
         return "done"
 
-    def _own(self, seed: int):
+    def _surface(self, seed: int, rng: np.random.Generator) -> Surface:
+        """The object of a seed.  ``rng`` stretches and tints a mesh, which the paper's protocol leaves as it is."""
+        from reli3d.synthetic.procedural import make_object
+        from reli3d.synthetic.samples import ObjectSurface
+        from reli3d.synthetic.scanned import ScannedSurface
+        from reli3d.synthetic.shapes import ShapeSurface
+
+        if self.wanted.shapes:
+            return ShapeSurface(self.wanted.shapes, rng)
+        if self.wanted.meshes:
+            return ScannedSurface(self._mesh(seed), None if self.wanted.paper else rng)
+        return ObjectSurface(make_object(seed))
+
+    def _mesh(self, seed: int) -> Path:
+        return self.wanted.meshes[seed % len(self.wanted.meshes)]
+
+    def _own(self, seed: int) -> dict[str, Tensor]:
         import numpy as np
 
         from reli3d.synthetic.maps import with_lamps
-        from reli3d.synthetic.procedural import make_object
-        from reli3d.synthetic.samples import ObjectSurface, Surface, synthesize
-        from reli3d.synthetic.scanned import ScannedSurface
-        from reli3d.synthetic.shapes import ShapeSurface
+        from reli3d.synthetic.samples import synthesize
 
-        wanted, rng = self.wanted, np.random.default_rng((seed, 1))
-        surface: Surface
-        if wanted.shapes:
-            surface = ShapeSurface(wanted.shapes, rng)
-        elif wanted.meshes:
-            surface = ScannedSurface(wanted.meshes[seed % len(wanted.meshes)], rng)
-        else:
-            surface = ObjectSurface(make_object(seed))
+        rng = np.random.default_rng((seed, 1))
+        surface = self._surface(seed, rng)
         light = self.lights[int(rng.integers(len(self.lights)))]
-        if not wanted.held and rng.random() < LAMPS:
+        if not self.wanted.held and rng.random() < LAMPS:
             light = with_lamps(light, rng)
-        return synthesize(surface, light, rng, size=wanted.size, views=wanted.views)
+        return synthesize(surface, light, rng, size=self.wanted.size, views=self.wanted.views)
 
-    def _paper(self, seed: int, light: int):
+    def _paper(self, seed: int, light: int) -> dict[str, Tensor]:
         import numpy as np
 
         from reli3d.io.gltf_parts import has_material_maps
-        from reli3d.synthetic.procedural import make_object
         from reli3d.synthetic.protocol import protocol_sample
-        from reli3d.synthetic.samples import ObjectSurface, Surface
-        from reli3d.synthetic.scanned import ScannedSurface
-        from reli3d.synthetic.shapes import ShapeSurface
 
-        wanted, known = self.wanted, True
-        surface: Surface
-        if wanted.shapes:
-            surface = ShapeSurface(wanted.shapes, np.random.default_rng((seed, 1)))
-        elif wanted.meshes:
-            path = wanted.meshes[seed % len(wanted.meshes)]
-            surface, known = ScannedSurface(path, None), has_material_maps(path)
-        else:
-            surface = ObjectSurface(make_object(seed))
-        return protocol_sample(surface, self.lights, seed, light, pbr=known, size=wanted.size)
+        surface = self._surface(seed, np.random.default_rng((seed, 1)))
+        known = not self.wanted.meshes or bool(self.wanted.shapes) or has_material_maps(self._mesh(seed))
+        return protocol_sample(surface, self.lights, seed, light, pbr=known, size=self.wanted.size)
