@@ -29,7 +29,8 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("output", type=Path, help="folder of the checkpoint, the log, curves and pictures")
     p.add_argument("data", type=Path, nargs="*", help="folders of samples, of captures, or of shards")
     p.add_argument("--preset", choices=("tiny", "official"), default="tiny")
-    p.add_argument("--start", type=Path, help="state.pt of the stage before")
+    # torchrun reads the whole line first: an option that is the beginning of one of its own would be ambiguous
+    p.add_argument("--start-from", dest="start", type=Path, help="state.pt of the stage before")
     p.add_argument(
         "--prior",
         type=Path,

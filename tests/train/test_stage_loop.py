@@ -11,6 +11,7 @@ from dataclasses import replace
 import pytest
 import torch
 from PIL import Image
+from torch.distributed.run import get_args_parser
 
 from reli3d.cli import stages
 from reli3d.io.files import InputError
@@ -262,3 +263,11 @@ def test_tensorboard_that_is_missing_is_told_in_one_line(folder, tmp_path, monke
     assert stages.main(call) == 2
     told = capsys.readouterr().err
     assert "pip install reli3d[train]" in told and told.count("\n") == 1 and not (tmp_path / "run").exists()
+
+
+def test_no_option_is_the_beginning_of_one_of_torchruns():
+    """torchrun looks at the whole line, and takes such an option for its own or calls it ambiguous."""
+    theirs = [o for action in get_args_parser()._actions for o in action.option_strings]
+    ours = [o for action in stages.parser()._actions for o in action.option_strings if o not in ("-h", "--help")]
+    assert "--start-method" in theirs and "--start-from" in ours
+    assert [o for o in ours if any(t.startswith(o) for t in theirs)] == []
