@@ -3,8 +3,9 @@
 usage: python -m bench.studies.stages RUNS --train SAMPLES --held-back SAMPLES --prior FILE --out FOLDER
 
 RUNS holds ``seed0/volume``, ``seed0/gaussians`` and so on, as ``reli3d-stages`` wrote them.  The loss of a stage is
-asked twice on the same views: with the averaged parameters that it starts from and with those at its end.  Intervals
-(95 %) are of the mean over objects, by bootstrap.  Writes ``stages.md``, ``stages.png`` and ``stages.jpg``.
+asked twice on the same views: with the averaged parameters that it starts from and with those at its end.  ``shown`` is
+its part that compares pictures, with the weights of the stage; where there is no surface the picture is black.
+Intervals (95 %) are of the mean over objects, by bootstrap.  Writes ``stages.md``, ``stages.png`` and ``stages.jpg``.
 """
 
 from __future__ import annotations
@@ -16,17 +17,20 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image, ImageDraw
+from torch import Tensor
 
 from reli3d.nn.model import Reconstructor
 from reli3d.nn.presets import TINY
 from reli3d.train.stages import config
 from reli3d.train.stages.latents import fitted, load_prior
 from reli3d.train.stages.loop import averaged, load_state
-from reli3d.train.stages.losses import gradients
+from reli3d.train.stages.losses import cover_error, gradients, shown_colors
+from reli3d.train.stages.picture import Picture
 from reli3d.train.stages.step import object_losses, total
 from reli3d.train.stages.views import Draw, Samples, draw
 
 STAGES = tuple(config.TINY)
+PICTURES = ("image", "perceptual", "mask")
 PARTS = ("image", "mask", "material", "normal")
 COLORS = ("#1f5fa8", "#b3541e", "#3a8f4d")
 PANEL, MARGIN = (270, 120), 36
@@ -41,12 +45,25 @@ def drawn(source: Samples, stage: config.Stage, count: int) -> list[Draw]:
 
 @torch.no_grad()
 def losses(model: Reconstructor, stage: config.Stage, draws: list[Draw]) -> dict[str, np.ndarray]:
-    """The loss and some of its terms of each draw; NaN where a draw does not have a term."""
+    """``shown``, the whole loss and some of its terms of each draw; NaN where a draw does not have a term."""
     rows = []
     for one in draws:
         terms = object_losses(model, one, stage, gradients)
-        rows.append({"loss": float(total(terms, stage)), **{n: float(v) for n, v in terms.items() if n in PARTS}})
-    return {name: np.array([r.get(name, np.nan) for r in rows]) for name in ("loss", *PARTS)}
+        row = {"loss": float(total(terms, stage))} if "image" in terms else {}
+        terms = {**black(one), **terms}
+        row["shown"] = sum(getattr(stage.weights, name) * float(terms[name]) for name in PICTURES)
+        rows.append({**row, **{n: float(v) for n, v in terms.items() if n in PARTS}})
+    return {name: np.array([r.get(name, np.nan) for r in rows]) for name in ("shown", "loss", *PARTS)}
+
+
+def black(one: Draw) -> dict[str, Tensor]:
+    """The terms of :data:`PICTURES` of a picture that shows nothing."""
+    view = one.targets.images[0]
+    none, flat = torch.zeros_like(view), torch.zeros_like(view[..., 0])
+    empty = Picture(none, flat, flat, torch.zeros(*flat.shape, 5), none, none[:0, 0])
+    got, want = shown_colors(empty, one.targets, 0)
+    pictured = {"image": (got - want).square().mean(), "perceptual": gradients(got, want)}
+    return {**pictured, "mask": cover_error(empty, one.targets, 0)}
 
 
 def start_of(runs: Path, seed: int, stage: str, prior: Path) -> Reconstructor:
@@ -68,6 +85,11 @@ def interval(values: np.ndarray) -> str:
     return f"{values.mean():.3f} ({np.quantile(means, 0.025):.3f} to {np.quantile(means, 0.975):.3f})"
 
 
+def mean(values: np.ndarray) -> str:
+    """Mean of all draws, or - where one has none."""
+    return f"{values.mean():.3f}" if np.isfinite(values).all() else "-"
+
+
 def table(args: argparse.Namespace, seeds: list[int]) -> str:
     """Loss at start and end of each stage, in Markdown."""
     model = Reconstructor(TINY)
@@ -76,10 +98,10 @@ def table(args: argparse.Namespace, seeds: list[int]) -> str:
     for name, folder in (("training", args.train), ("held-back", args.held_back)):
         latents = fitted(model.environment, sorted(folder.glob("*.safetensors")), args.out / f"{name}.latents")
         sources[name] = Samples(folder, latents)
-    head = ["objects", "seed", "stage", "loss at its start", "at its end", "end less start", *PARTS]
+    head = ["objects", "seed", "stage", "shown at its start", "at its end", "end less start", "whole loss", *PARTS]
     lines = [f"| {' | '.join(head)} |", f"|{'---|' * len(head)}"]
     for name, source in sources.items():
-        for stage in STAGES:
+        for stage in args.stages:
             for seed in seeds:
                 end = runs_state(args.runs, seed, stage)
                 if not end.exists():
@@ -89,8 +111,8 @@ def table(args: argparse.Namespace, seeds: list[int]) -> str:
                 start = start_of(args.runs, seed, stage, args.prior)
                 first = losses(start, settings, draws)
                 last = losses(averaged(start, load_state(end, start)["average"]), settings, draws)
-                change = [f"{np.nanmean(first[p]):.4f} to {np.nanmean(last[p]):.4f}" for p in PARTS]
-                cells = [interval(first["loss"]), interval(last["loss"]), interval(last["loss"] - first["loss"])]
+                change = [f"{mean(first[p])} to {mean(last[p])}" for p in ("loss", *PARTS)]
+                cells = [interval(v) for v in (first["shown"], last["shown"], last["shown"] - first["shown"])]
                 lines.append(f"| {' | '.join([name, str(seed), stage, *cells, *change])} |")
                 print(lines[-1], flush=True)
     return "\n".join(lines) + "\n"
@@ -154,6 +176,7 @@ def main() -> None:
     parser.add_argument("--held-back", type=Path, required=True)
     parser.add_argument("--prior", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--stages", nargs="+", choices=STAGES, default=STAGES, help="that the table has")
     parser.add_argument("--count", type=int, default=64, help="views of a mean")
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
