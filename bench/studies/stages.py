@@ -85,9 +85,10 @@ def interval(values: np.ndarray) -> str:
     return f"{values.mean():.3f} ({np.quantile(means, 0.025):.3f} to {np.quantile(means, 0.975):.3f})"
 
 
-def mean(values: np.ndarray) -> str:
-    """Mean of all draws, or - where one has none."""
-    return f"{values.mean():.3f}" if np.isfinite(values).all() else "-"
+def mean(values: np.ndarray, all_of_them: bool) -> str:
+    """Mean over the draws that have a value, or - where none has, or where all must."""
+    known = values[np.isfinite(values)]
+    return f"{known.mean():.3f}" if len(known) and len(known) >= all_of_them * len(values) else "-"
 
 
 def table(args: argparse.Namespace, seeds: list[int]) -> str:
@@ -111,7 +112,7 @@ def table(args: argparse.Namespace, seeds: list[int]) -> str:
                 start = start_of(args.runs, seed, stage, args.prior)
                 first = losses(start, settings, draws)
                 last = losses(averaged(start, load_state(end, start)["average"]), settings, draws)
-                change = [f"{mean(first[p])} to {mean(last[p])}" for p in ("loss", *PARTS)]
+                change = [f"{mean(first[p], p == 'loss')} to {mean(last[p], p == 'loss')}" for p in ("loss", *PARTS)]
                 cells = [interval(v) for v in (first["shown"], last["shown"], last["shown"] - first["shown"])]
                 lines.append(f"| {' | '.join([name, str(seed), stage, *cells, *change])} |")
                 print(lines[-1], flush=True)
