@@ -78,8 +78,9 @@ def start_of(runs: Path, seed: int, stage: str, prior: Path) -> Reconstructor:
 
 
 def interval(values: np.ndarray) -> str:
-    """Mean and 95 % interval of the mean, by bootstrap."""
-    values = values[np.isfinite(values)]
+    """Mean and 95 % interval of the mean, by bootstrap; - where a draw has no value."""
+    if not np.isfinite(values).all():
+        return "-"
     rng = np.random.default_rng(0)
     means = rng.choice(values, (4000, len(values))).mean(1)
     return f"{values.mean():.3f} ({np.quantile(means, 0.025):.3f} to {np.quantile(means, 0.975):.3f})"
@@ -99,7 +100,7 @@ def table(args: argparse.Namespace, seeds: list[int]) -> str:
     for name, folder in (("training", args.train), ("held-back", args.held_back)):
         latents = fitted(model.environment, sorted(folder.glob("*.safetensors")), args.out / f"{name}.latents")
         sources[name] = Samples(folder, latents)
-    head = ["objects", "seed", "stage", "shown at its start", "at its end", "end less start", "whole loss", *PARTS]
+    head = ["objects", "seed", "stage", "shown", "end less start", "whole loss", "end less start", *PARTS]
     lines = [f"| {' | '.join(head)} |", f"|{'---|' * len(head)}"]
     for name, source in sources.items():
         for stage in args.stages:
@@ -112,9 +113,11 @@ def table(args: argparse.Namespace, seeds: list[int]) -> str:
                 start = start_of(args.runs, seed, stage, args.prior)
                 first = losses(start, settings, draws)
                 last = losses(averaged(start, load_state(end, start)["average"]), settings, draws)
-                change = [f"{mean(first[p], p == 'loss')} to {mean(last[p], p == 'loss')}" for p in ("loss", *PARTS)]
-                cells = [interval(v) for v in (first["shown"], last["shown"], last["shown"] - first["shown"])]
-                lines.append(f"| {' | '.join([name, str(seed), stage, *cells, *change])} |")
+                change = [f"{mean(first[p], False)} to {mean(last[p], False)}" for p in PARTS]
+                cells = [f"{mean(first[p], True)} to {mean(last[p], True)}" for p in ("shown", "loss")]
+                less = [interval(last[p] - first[p]) for p in ("shown", "loss")]
+                change = [cells[0], less[0], cells[1], less[1], *change]
+                lines.append(f"| {' | '.join([name, str(seed), stage, *change])} |")
                 print(lines[-1], flush=True)
     return "\n".join(lines) + "\n"
 
