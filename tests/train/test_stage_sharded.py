@@ -49,6 +49,30 @@ run = Run((folder,), out, stage, warmup=2, save_every=2, log_every=1, shard=True
 loop.train(ball_model(), run, [Samples(Path(folder))], workers)
 """
 
+CLIP = """
+import copy
+import torch
+from torch import nn
+from reli3d.train.sharded import clip_gradients, gathered, scattered, shard
+from reli3d.train.workers import Workers
+workers = Workers.join()
+torch.manual_seed(0)
+whole = nn.Sequential(nn.Linear(5, 7), nn.Linear(7, 3))
+cut = copy.deepcopy(whole)
+shard([cut[0]], torch.device("cpu"))
+x = torch.randn(4, 5)
+for model in (whole, cut):
+    model(x).square().sum().backward()
+for limit in (1e3, 0.1):  # not reached, reached
+    want = nn.utils.clip_grad_norm_(whole.parameters(), limit)
+    torch.testing.assert_close(clip_gradients(list(cut.parameters()), limit), want)
+    for a, b in zip(whole.parameters(), cut.parameters()):
+        torch.testing.assert_close(gathered(b.grad, True), a.grad)
+for a, b in zip(whole.parameters(), cut.parameters()):
+    assert torch.equal(gathered(scattered(a.detach() + 1, b), True), a.detach() + 1)
+workers.leave()
+"""
+
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
@@ -74,13 +98,18 @@ def alone(folder, out, stop=None):
             assert stop
 
 
-def together(folder, out, stop, script):
-    """The same on two processes, in parts."""
-    script.write_text(WORKER)
+def on_two(script, text, *arguments):
+    """Run ``text`` on two processes."""
+    script.write_text(text)
     env = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
     group = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", script]
-    done = subprocess.run([*group, folder, out, str(stop)], env=env, capture_output=True, text=True, timeout=300)
+    done = subprocess.run([*group, *arguments], env=env, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr[-2000:]
+
+
+def together(folder, out, stop, script):
+    """The run of two processes, in parts, ended after the checkpoint of step ``stop``."""
+    on_two(script, WORKER, folder, out, str(stop))
 
 
 def rows(out):
@@ -144,3 +173,8 @@ def test_one_process_alone_is_refused(folder, tmp_path, capsys):
     assert "shard: expected several processes" in capsys.readouterr().err
     with pytest.raises(ValueError, match="start with torchrun"):
         train(ball_model(), replace(Run((str(folder),), str(tmp_path), STAGE), shard=True), [Samples(folder)])
+
+
+def test_norms_and_parts_are_those_of_whole_gradients(tmp_path):
+    """Beside torch's own clipping of a module that is whole, on the same input on both processes."""
+    on_two(tmp_path / "clip.py", CLIP)
