@@ -29,7 +29,8 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("output", type=Path, help="folder of the checkpoint, the log, curves and pictures")
     p.add_argument("data", type=Path, nargs="*", help="folders of samples, of captures, or of shards")
     p.add_argument("--preset", choices=("tiny", "official"), default="tiny")
-    p.add_argument("--start", type=Path, help="state.pt of the stage before")
+    # torchrun reads the whole line first: an option that is the beginning of one of its own would be ambiguous
+    p.add_argument("--start-from", dest="start", type=Path, help="state.pt of the stage before")
     p.add_argument(
         "--prior",
         type=Path,
@@ -42,6 +43,12 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--perceptual", choices=("gradients", "lpips"), default="gradients")
     p.add_argument("--bfloat16", action="store_true", help="autocast of the trunk")
     p.add_argument("--checkpointing", action="store_true", help="compute the trunk's layers again in the backward pass")
+    p.add_argument(
+        "--shard",
+        action="store_true",
+        help="cut parameters, gradients and moments of the trunk among the processes of torchrun (FSDP)",
+    )
+    p.add_argument("--tensorboard", type=Path, metavar="DIR", help="write curves and pictures as event files there too")
     p.add_argument("--save-every", type=int, default=200, help="steps")
     p.add_argument("--export", type=Path, help="write the averaged weights of the checkpoint to this file and stop")
     p.add_argument("--licence", default="not stated", help="of the exported weights")
@@ -59,6 +66,7 @@ def report(line: str) -> None:
 def run_of(args: argparse.Namespace):
     """The configuration that the arguments ask for.  Raises ValueError for what would end the work later."""
     from reli3d.output.folder import check_folder
+    from reli3d.train.stages.board import writer_class
     from reli3d.train.stages.config import PAPER, TINY, Run
 
     if not args.data and not args.export:
@@ -81,6 +89,9 @@ def run_of(args: argparse.Namespace):
     check_range("save-every", args.save_every, 1, 10**9)
     check_range("seed", args.seed, 0, 10**9)
     check_folder(args.export.parent if args.export else args.output)
+    if args.tensorboard:
+        check_folder(args.tensorboard)
+        writer_class()
     return Run(
         tuple(map(str, args.data)),
         str(args.output),
@@ -92,6 +103,8 @@ def run_of(args: argparse.Namespace):
         save_every=args.save_every,
         bfloat16=args.bfloat16,
         checkpointing=args.checkpointing,
+        shard=args.shard,
+        tensorboard=str(args.tensorboard or ""),
     )
 
 

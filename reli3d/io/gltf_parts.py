@@ -57,6 +57,21 @@ def read_parts(
     return parts
 
 
+def has_material_maps(path: str | os.PathLike, *, max_bytes: int = 1 << 29, max_vertices: int = 20_000_000) -> bool:
+    """Whether a material of the file has a metallic-roughness texture.
+
+    Without one its roughness and metallic are two numbers, which exporters fill in where nobody chose them.  Raises
+    InputError as :func:`read_parts` does.
+    """
+    document = Document(path, max_bytes=max_bytes, max_vertices=max_vertices)
+    for k in range(len(document.get(document.json, "materials", list, "materials", []))):
+        material = document.item("materials", k, f"materials[{k}]")
+        pbr = document.get(material, "pbrMetallicRoughness", dict, f"materials[{k}].pbrMetallicRoughness", {})
+        if "metallicRoughnessTexture" in pbr:
+            return True
+    return False
+
+
 def _part(document: Document, materials: _Materials, primitive: dict, world: np.ndarray, field: str) -> Asset | None:
     attributes = document.get(primitive, "attributes", dict, f"{field}.attributes")
     if "POSITION" not in attributes:

@@ -105,7 +105,14 @@ def synthesize(
     environment = Environment(torch.roll(light, int(rng.integers(light.shape[1])), 1).contiguous())
     c2w = torch.as_tensor(np.asarray(sample_cameras(rng, views)[0]), dtype=torch.float32)
     intrinsics = torch.stack([crop_camera(surface.vertices, m, size, rng.uniform(0.04, 0.12)) for m in c2w])
-    cameras = Camera(c2w, intrinsics, size, size)
+    return render_sample(surface, environment, Camera(c2w, intrinsics, size, size), rng)
+
+
+def render_sample(
+    surface: Surface, environment: Environment, cameras: Camera, rng: np.random.Generator
+) -> dict[str, Tensor]:
+    """The sample of an object under ``environment``, seen by ``V`` square ``cameras``."""
+    c2w, views, size = cameras.c2w, len(cameras.c2w), cameras.width
     sample: dict[str, Tensor] = {}
     exposure, images, pixels, pixel_radiance = 0.0, [], [], []
     maps: dict[str, list[Tensor]] = {"view_material": [], "view_normal": [], "view_depth": []}
@@ -127,7 +134,7 @@ def synthesize(
     sample.update(
         images=torch.stack(images),
         c2w=c2w,
-        intrinsics=intrinsics,
+        intrinsics=cameras.intrinsics,
         pixels=torch.stack(pixels).half(),
         pixel_radiance=torch.stack(pixel_radiance).half(),
     )

@@ -46,15 +46,18 @@ def outside_distance(vertices: Tensor, faces: Tensor, points: Tensor, scene: Ray
 
 
 class ScannedSurface:
-    """One GLB, centred, longest side 1, stretched and tinted at random: a ``Surface`` of :mod:`.samples`."""
+    """One GLB, centred, longest side 1, stretched and tinted at random: a ``Surface`` of :mod:`.samples`.
 
-    def __init__(self, path: Path, rng: np.random.Generator):
+    rng: None leaves its proportions and its paint as they are.
+    """
+
+    def __init__(self, path: Path, rng: np.random.Generator | None):
         self.assets = _read(path)
         points = torch.cat([a.mesh.vertices for a in self.assets])
-        stretch = torch.as_tensor(np.exp(rng.normal(0, STRETCH, 3)), dtype=torch.float32)
+        stretch = torch.ones(3) if rng is None else _factors(rng.normal(0, STRETCH, 3))
         low, high = (points * stretch).amin(0), (points * stretch).amax(0)
         size = float((high - low).max())
-        self.gain = torch.as_tensor(np.exp(rng.normal(0, GAIN, 3) + rng.normal(0, GAIN)), dtype=torch.float32)
+        self.gain = torch.ones(3) if rng is None else _factors(rng.normal(0, GAIN, 3) + rng.normal(0, GAIN))
         self.assets = [replace(a, mesh=_moved(a.mesh, (low + high) / 2, stretch, size)) for a in self.assets]
         counts = np.cumsum([0] + [len(a.mesh.vertices) for a in self.assets])
         self.vertices = torch.cat([a.mesh.vertices for a in self.assets])
@@ -78,6 +81,10 @@ class ScannedSurface:
             vectors[:, index] = torch.stack([points.position, points.ng, points.normal, color])
             numbers[:, index] = torch.stack([points.roughness, points.metallic])
         return SurfacePoints(*vectors, *numbers)
+
+
+def _factors(logarithms: np.ndarray) -> Tensor:
+    return torch.as_tensor(np.exp(logarithms), dtype=torch.float32)
 
 
 def _moved(mesh: Mesh, centre: Tensor, stretch: Tensor, size: float) -> Mesh:

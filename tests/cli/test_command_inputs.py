@@ -113,7 +113,7 @@ CASES = [
             ("volume", ["--steps", "-1"], "--steps"),
             ("volume", ["--rate", "nan"], "--rate"),
             ("volume", ["--inputs", "17"], "inputs"),
-            ("volume", ["--start", "none"], "none"),
+            ("volume", ["--start-from", "none"], "none"),
             ("volume", ["--prior", "file"], "light prior"),
             ("volume", ["--patch", "999"], "patch"),
         ]

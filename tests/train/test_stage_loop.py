@@ -10,6 +10,8 @@ from dataclasses import replace
 
 import pytest
 import torch
+from PIL import Image
+from torch.distributed.run import get_args_parser
 
 from reli3d.cli import stages
 from reli3d.io.files import InputError
@@ -112,6 +114,7 @@ def test_two_shares_of_a_batch_add_up_to_the_whole(folder, tmp_path):
 WORKER = """
 import sys
 import torch
+from PIL import Image
 from pathlib import Path
 from reli3d.train.stages.config import Run, Stage
 from reli3d.train.stages.loop import train
@@ -229,3 +232,42 @@ def test_the_command_trains_and_exports_what_the_pipeline_loads(folder, tmp_path
     assert model.preset.name == "tiny"  # stored in half precision
     want = state["average"]["bank.embeddings"]
     torch.testing.assert_close(model.bank.embeddings.detach(), want, rtol=1e-3, atol=1e-4)
+
+
+def test_tensorboard_has_the_numbers_of_the_log_and_the_pictures(folder, tmp_path):
+    pytest.importorskip("tensorboard")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    run = replace(run_of(folder, tmp_path / "run"), tensorboard=str(tmp_path / "board"))
+    run = replace(run, stage=replace(run.stage, steps=2))
+    source = Samples(folder)
+    train(ball_model(), run, [source], held_back=[drawn(run, [source], ball_model(), 0, 0)])
+    run = replace(run, stage=replace(run.stage, steps=4))
+    train(ball_model(), run, [source], held_back=[drawn(run, [source], ball_model(), 0, 0)])  # goes on at step 2
+    found = EventAccumulator(str(tmp_path / "board"), {"images": 0, "scalars": 0})
+    found.Reload()
+    logged = [r for r in rows(tmp_path / "run") if "config" not in r]
+    assert [r["step"] for r in logged] == [1, 2, 3, 4]
+    for name in ("loss", "image", "rate"):
+        events = found.Scalars(name)
+        assert [e.step for e in events] == [1, 2, 3, 4]
+        assert [e.value for e in events] == pytest.approx([r[name] for r in logged], rel=1e-6)  # float32
+    pictures = found.Images("pictures")
+    with Image.open(tmp_path / "run" / "pictures.png") as grid:
+        assert [e.step for e in pictures] == [2, 4] and (pictures[-1].width, pictures[-1].height) == grid.size
+
+
+def test_tensorboard_that_is_missing_is_told_in_one_line(folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)  # its import raises
+    call = ["volume", str(tmp_path / "run"), str(folder), "--tensorboard", str(tmp_path / "board")]
+    assert stages.main(call) == 2
+    told = capsys.readouterr().err
+    assert "pip install reli3d[train]" in told and told.count("\n") == 1 and not (tmp_path / "run").exists()
+
+
+def test_no_option_is_the_beginning_of_one_of_torchruns():
+    """torchrun looks at the whole line, and takes such an option for its own or calls it ambiguous."""
+    theirs = [o for action in get_args_parser()._actions for o in action.option_strings]
+    ours = [o for action in stages.parser()._actions for o in action.option_strings if o not in ("-h", "--help")]
+    assert "--start-method" in theirs and "--start-from" in ours
+    assert [o for o in ours if any(t.startswith(o) for t in theirs)] == []

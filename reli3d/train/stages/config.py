@@ -79,6 +79,8 @@ class Run:
     log_every: int = 10  # steps
     bfloat16: bool = False  # autocast of the trunk
     checkpointing: bool = False  # of the trunk's layers: computed again in the backward pass
+    shard: bool = False  # cut parameters, gradients and moments of the trunk's layers among the processes
+    tensorboard: str = ""  # folder of event files; "": none
     bad_steps: int = 20  # steps in a row without finite gradients after which a run gives up
 
     def __post_init__(self):

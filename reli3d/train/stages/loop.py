@@ -18,10 +18,12 @@ from reli3d.nn.model import Reconstructor
 from reli3d.nn.presets import to_json
 from reli3d.train.loop import update_average
 from reli3d.train.pictures import write_curves
+from reli3d.train.sharded import clip_gradients, gathered, plain, scattered, shard
+from reli3d.train.stages.board import Board
 from reli3d.train.stages.config import Run, Weights
 from reli3d.train.stages.losses import Perceptual, perceptual
 from reli3d.train.stages.sheet import write_sheet
-from reli3d.train.stages.step import checkpointed, object_losses, total
+from reli3d.train.stages.step import checkpointed, object_losses, total, trunk_layers
 from reli3d.train.stages.views import Draw, Source, draw
 from reli3d.train.workers import Workers
 
@@ -84,32 +86,41 @@ def train(
     """
     workers = workers or Workers()
     stage, folder = run.stage, Path(run.output)
+    if run.shard and workers.count == 1:
+        raise ValueError("shard: expected several processes to share the parameters, got one; start with torchrun")
     if stage.batch % workers.count:
         raise ValueError(f"batch: expected a multiple of the {workers.count} processes, got {stage.batch}")
     folder.mkdir(parents=True, exist_ok=True)
     if run.checkpointing:
         checkpointed(model)
     distance = perceptual(run.perceptual)
+    state: dict = {}
+    if (folder / "state.pt").exists():
+        state = load_state(folder / "state.pt", model)
+        model.load_state_dict(state["model"])
+    elif run.start:
+        model.load_state_dict(load_state(Path(run.start), model)["average"])
+    if run.shard:
+        shard(trunk_layers(model), model.device)
     trained = [p for p in model.parameters() if p.requires_grad]
     groups = [
         {"params": [p for p in trained if p.ndim > 1], "weight_decay": run.weight_decay},
         {"params": [p for p in trained if p.ndim <= 1], "weight_decay": 0.0},
     ]
-    optimizer = torch.optim.AdamW(groups, lr=stage.rate, betas=(0.9, 0.98))
-    step, average = 0, None
-    if (folder / "state.pt").exists():
-        state = load_state(folder / "state.pt", model)
-        model.load_state_dict(state["model"])
-        optimizer.load_state_dict(state["optimizer"])
-        average, step = state["average"], state["step"]
-    elif run.start:
-        model.load_state_dict(load_state(Path(run.start), model)["average"])
-    average = average or {k: v.detach().clone() for k, v in model.state_dict().items()}
+    # one call for many tensors takes no mixture of sharded and whole ones
+    optimizer = torch.optim.AdamW(groups, lr=stage.rate, betas=(0.9, 0.98), foreach=False if run.shard else None)
+    step, average = 0, {k: v.detach().clone() for k, v in model.state_dict().items()}
+    if state:
+        step = state["step"]
+        average = {k: scattered(v, average[k]) for k, v in state["average"].items()}
+        resume(optimizer, state["optimizer"])
+        state.clear()
     log = open_log(folder / "log.jsonl", step, run) if workers.rank == 0 else None
+    board = Board(run.tensorboard, step) if run.tensorboard and log else None
     bad, began, device = 0, time.monotonic(), model.device
     sums = torch.zeros(2 * len(TERMS) + 1, dtype=torch.float64)
-    if step == 0 and log:
-        save(folder, model, optimizer, average, step, run)
+    if step == 0:
+        save(folder, model, optimizer, average, step, run, workers)
     while step < stage.steps:
         for group in optimizer.param_groups:
             group["lr"] = rate_at(run, step)
@@ -117,8 +128,8 @@ def train(
         mine = range(workers.rank, stage.batch, workers.count)
         draws = (drawn(run, sources, model, step, k) for k in mine)
         values = accumulate(model, run, (_on(d, device) for d in draws), distance, stage.batch // workers.count)
-        values = workers.average(trained, values.float()).double() * workers.count
-        norm = torch.nn.utils.clip_grad_norm_(trained, run.clip)
+        values = workers.average(plain(trained), values.float()).double() * workers.count
+        norm = clip_gradients(trained, run.clip)
         finite = bool(torch.isfinite(norm))
         bad = 0 if finite else bad + 1
         if finite:
@@ -131,25 +142,32 @@ def train(
         update_average(average, model, min(run.average, (1 + step) / (10 + step)))
         step, sums = step + 1, sums + values
         if log and step % run.log_every == 0:
-            write_row(log, step, sums, stage.batch * run.log_every, rate_at(run, step - 1), float(norm), bad)
+            row = write_row(log, step, sums, stage.batch * run.log_every, rate_at(run, step - 1), float(norm), bad)
+            if board:
+                board.numbers(row)
         if step % run.log_every == 0:
             sums = torch.zeros_like(sums)
-        if log and (step % run.save_every == 0 or step == stage.steps):
-            save(folder, model, optimizer, average, step, run)
-            write_curves(folder / "log.jsonl", folder / "curves.png")
-            if held_back:
-                write_sheet(folder / "pictures.png", averaged(model, average), held_back, stage)
-            print(f"{stage.name}: step {step}, {time.monotonic() - began:.0f} s", file=sys.stderr, flush=True)
+        if step % run.save_every == 0 or step == stage.steps:
+            whole = save(folder, model, optimizer, average, step, run, workers)
+            if log:
+                write_curves(folder / "log.jsonl", folder / "curves.png")
+                if held_back:
+                    grid = write_sheet(folder / "pictures.png", averaged(model, whole), held_back, stage)
+                    if board:
+                        board.pictures(grid, step)
+                print(f"{stage.name}: step {step}, {time.monotonic() - began:.0f} s", file=sys.stderr, flush=True)
     if log:
         log.close()
+    if board:
+        board.close()
 
 
 def _on(one: Draw, device: torch.device) -> Draw:
     return Draw(one.inputs.to(device), one.targets.to(device), one.background_visible, one.seed)
 
 
-def write_row(log, step: int, sums: Tensor, objects: int, rate: float, norm: float, bad: int) -> None:
-    """One line of the log: each term's mean over the objects that have it."""
+def write_row(log, step: int, sums: Tensor, objects: int, rate: float, norm: float, bad: int) -> dict:
+    """One line of the log, which comes back: each term's mean over the objects that have it."""
     count = sums[len(TERMS) : -1]
     means = {n: round(float(s / c), 6) for n, s, c in zip(TERMS, sums, count, strict=False) if c > 0}
     row = {
@@ -161,6 +179,7 @@ def write_row(log, step: int, sums: Tensor, objects: int, rate: float, norm: flo
         "bad": bad,
     }
     log.write(json.dumps(row) + "\n")
+    return row
 
 
 def open_log(path: Path, step: int, run: Run):
@@ -188,21 +207,38 @@ def save(
     average: dict[str, Tensor],
     step: int,
     run: Run,
-) -> None:
-    """Replace the checkpoint whole: a stop in the middle leaves the old one."""
+    workers: Workers,
+) -> dict[str, Tensor]:
+    """Replace the checkpoint whole: a stop in the middle leaves the old one.  All processes must call it.
+
+    The first one writes, and has the whole averaged parameters.
+    """
+    first = workers.rank == 0
     state = {
-        "model": model.state_dict(),
-        "optimizer": optimizer.state_dict(),
-        "average": average,
+        "model": gathered(model.state_dict(), first),
+        "optimizer": gathered(optimizer.state_dict(), first),
+        "average": gathered(average, first),
         "step": step,
         "run": run.text(),
         "preset": to_json(model.preset),
     }
-    with open(folder / "state.tmp", "wb") as file:
-        torch.save(state, file)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(folder / "state.tmp", folder / "state.pt")
+    if first:
+        with open(folder / "state.tmp", "wb") as file:
+            torch.save(state, file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(folder / "state.tmp", folder / "state.pt")
+    return state["average"]
+
+
+def resume(optimizer: torch.optim.Optimizer, state: dict) -> None:
+    """Give ``optimizer`` the whole moments of a checkpoint, in parts where its parameters are."""
+    parameters = [p for group in optimizer.param_groups for p in group["params"]]
+    for k, values in state["state"].items():
+        state["state"][k] = {name: scattered(value, parameters[k]) for name, value in values.items()}
+    for saved, group in zip(state["param_groups"], optimizer.param_groups, strict=True):
+        saved["foreach"] = group["foreach"]
+    optimizer.load_state_dict(state)
 
 
 def load_state(path: Path, model: Reconstructor) -> dict:

@@ -110,7 +110,7 @@ def map_terms(picture: Picture, target: ObjectViews, view: int) -> dict[str, Ten
         return terms
     weight = target.shown[view] * picture.known * picture.cover.detach()
     total = weight.sum()
-    if float(total) < 1.0:  # nothing in common yet
+    if float(total.detach()) < 1.0:  # nothing in common yet
         return terms
     if target.material is not None:
         error = (picture.material - target.material[view]).square().mean(-1)

@@ -18,8 +18,11 @@ SIDE = 96  # pixels of a tile, at least
 
 
 @torch.no_grad()
-def write_sheet(path: Path, model: Reconstructor, draws: Sequence[Draw], stage: Stage) -> None:
-    """A row for each object: hero, photograph, render, base colour, roughness and metallic, normal, light."""
+def write_sheet(path: Path, model: Reconstructor, draws: Sequence[Draw], stage: Stage) -> np.ndarray:
+    """A row for each object: hero, photograph, render, base colour, roughness and metallic, normal, light.
+
+    What is written comes back, ``(H, W, 3)`` uint8.
+    """
     rows = []
     for one in draws:
         code = encode(model, one)
@@ -36,7 +39,9 @@ def write_sheet(path: Path, model: Reconstructor, draws: Sequence[Draw], stage: 
         light = model.decode_environment(code)[0]
         tiles.append((light / light.mean().clamp(min=1e-6) * 0.3).clamp(0, 1) ** (1 / 2.2))
         rows.append(np.concatenate([_tile(t.clamp(0, 1).cpu().numpy()) for t in tiles], 1))
-    write_png(path, np.concatenate(rows))
+    grid = np.concatenate(rows)
+    write_png(path, grid)
+    return grid
 
 
 def _tile(values: np.ndarray) -> np.ndarray:

@@ -101,10 +101,8 @@ def total(terms: dict[str, Tensor], stage: Stage) -> Tensor:
     return sum((weights[name] * value for name, value in terms.items()), start=torch.zeros(()))
 
 
-def checkpointed(model: Reconstructor) -> None:
-    """Let the trunk's layers be computed again in the backward pass instead of kept, in place."""
-    from torch.utils.checkpoint import checkpoint
-
+def trunk_layers(model: Reconstructor) -> list[Any]:
+    """The layers of encoders and transformers: a few large modules of which one is needed at a time."""
     layers: list[Any] = [
         *model.encoder.model.encoder.layer,
         *model.illumination.encoder.model.encoder.layer,
@@ -113,7 +111,14 @@ def checkpointed(model: Reconstructor) -> None:
     blocks: Any = model.backbone.main_blocks
     for block in blocks:
         layers += [block.fuse_block_in, *list(block.transformer_block), block.fuse_block_out]
-    for layer in layers:
+    return layers
+
+
+def checkpointed(model: Reconstructor) -> None:
+    """Let the trunk's layers be computed again in the backward pass instead of kept, in place."""
+    from torch.utils.checkpoint import checkpoint
+
+    for layer in trunk_layers(model):
         layer.forward = _again(checkpoint, layer.forward)
 
 

@@ -1,0 +1,102 @@
+"""What a process of ``reli3d-data render`` does: one sample a call."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import numpy as np
+    from torch import Tensor
+
+    from reli3d.synthetic.samples import Surface
+
+LAMPS = 0.45  # share of the training lights that get lamps of their own
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What a process needs to make samples.  Paths are those of all machines."""
+
+    maps: Path
+    held: bool  # under the maps, and without the lamps, of held-back objects
+    paper: bool
+    views: int
+    size: int
+    meshes: tuple[Path, ...]
+    shapes: tuple[Path, ...]
+
+
+class SampleJob:
+    """Makes samples, in one process."""
+
+    def __init__(self, wanted: Wanted):
+        import torch
+
+        from reli3d.synthetic.maps import held_back, load_maps
+
+        torch.set_num_threads(1)
+        maps, names = load_maps(wanted.maps)
+        self.wanted = wanted
+        self.lights = [m for m, h in zip(maps, held_back(names), strict=True) if h == wanted.held]
+
+    def run(self, folder: object, name: str, target: Path) -> str:
+        """Write the sample ``name``: a seed, by the paper's protocol with the number of a light behind it.
+
+        Raises ValueError where the object cannot be made.
+        """
+        from safetensors import SafetensorError
+        from safetensors.torch import save_file
+
+        from reli3d.io.files import replacing
+
+        if target.exists():  # by a process that died after it
+            return "skipped"
+        seed, _, light = name.partition("_")
+        sample = self._paper(int(seed), int(light)) if self.wanted.paper else self._own(int(seed))
+        try:
+            with replacing(target) as temporary:
+                save_file(sample, temporary)
+        except SafetensorError as error:  # a full disk, for one
+            raise OSError(f"{target}: cannot be written ({error})") from None
+        return "done"
+
+    def _surface(self, seed: int, rng: np.random.Generator) -> Surface:
+        """The object of a seed.  ``rng`` stretches and tints a mesh, which the paper's protocol leaves as it is."""
+        from reli3d.synthetic.procedural import make_object
+        from reli3d.synthetic.samples import ObjectSurface
+        from reli3d.synthetic.scanned import ScannedSurface
+        from reli3d.synthetic.shapes import ShapeSurface
+
+        if self.wanted.shapes:
+            return ShapeSurface(self.wanted.shapes, rng)
+        if self.wanted.meshes:
+            return ScannedSurface(self._mesh(seed), None if self.wanted.paper else rng)
+        return ObjectSurface(make_object(seed))
+
+    def _mesh(self, seed: int) -> Path:
+        return self.wanted.meshes[seed % len(self.wanted.meshes)]
+
+    def _own(self, seed: int) -> dict[str, Tensor]:
+        import numpy as np
+
+        from reli3d.synthetic.maps import with_lamps
+        from reli3d.synthetic.samples import synthesize
+
+        rng = np.random.default_rng((seed, 1))
+        surface = self._surface(seed, rng)
+        light = self.lights[int(rng.integers(len(self.lights)))]
+        if not self.wanted.held and rng.random() < LAMPS:
+            light = with_lamps(light, rng)
+        return synthesize(surface, light, rng, size=self.wanted.size, views=self.wanted.views)
+
+    def _paper(self, seed: int, light: int) -> dict[str, Tensor]:
+        import numpy as np
+
+        from reli3d.io.gltf_parts import has_material_maps
+        from reli3d.synthetic.protocol import protocol_sample
+
+        surface = self._surface(seed, np.random.default_rng((seed, 1)))
+        known = not self.wanted.meshes or bool(self.wanted.shapes) or has_material_maps(self._mesh(seed))
+        return protocol_sample(surface, self.lights, seed, light, pbr=known, size=self.wanted.size)

@@ -1,0 +1,109 @@
+"""``reli3d-data render`` in several processes and on Ray: who is killed loses nothing, and the bits are the same."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from reli3d.cli import data, objects
+from reli3d.nn.reni import map_directions
+from tests.support.checkout import ROOT
+
+COUNT = 6
+SLOW = pytest.mark.slow  # a cluster of Ray takes half a minute to start
+PLACES = [pytest.param(["--workers", "2"], id="processes"), pytest.param(["--ray", "local"], id="ray", marks=SLOW)]
+
+
+@pytest.fixture(scope="module")
+def maps(tmp_path_factory):
+    path = tmp_path_factory.mktemp("maps") / "maps.npz"
+    sky = 0.2 + 3.0 * map_directions(16)[..., :1].clamp(min=0).expand(-1, -1, 3).numpy()
+    np.savez(path, env=np.stack([sky * (1 + 0.2 * k) for k in range(6)]), names=[f"m{k}" for k in range(6)])
+    return path
+
+
+def call(maps: Path, out: Path, *options: str) -> list[str]:
+    return ["render", str(out), "--maps", str(maps), "--count", str(COUNT), "--size", "64", "--views", "4", *options]
+
+
+@pytest.fixture(scope="module")
+def alone(maps, tmp_path_factory):
+    """The bytes of the samples of one process, by name."""
+    out = tmp_path_factory.mktemp("alone")
+    assert data.main(call(maps, out, "--workers", "1")) == 0
+    return {p.name: p.read_bytes() for p in out.iterdir()}
+
+
+def children(of: int) -> list[int]:
+    """Processes below ``of``."""
+    parents = {}
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = path.read_text().rpartition(")")[2].split()
+        except OSError:  # it has ended
+            continue
+        parents[int(path.parent.name)] = int(fields[1])
+    found, last = [], {of}
+    while last:
+        last = {p for p, parent in parents.items() if parent in last}
+        found += last
+    return found
+
+
+def at_work(of: int) -> list[int]:
+    """Processes below ``of`` that make samples."""
+    found = []
+    for pid in children(of):
+        try:
+            line = Path(f"/proc/{pid}/cmdline").read_bytes()
+        except OSError:
+            continue
+        if b"ray::_made" in line or b"spawn_main" in line:  # Ray writes there what a worker does
+            found.append(pid)
+    return found
+
+
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="finds the processes in /proc")
+@pytest.mark.parametrize("where", PLACES)
+def test_the_work_of_a_killed_process_is_done_again(where, maps, alone, tmp_path):
+    if "--ray" in where:
+        pytest.importorskip("ray")
+    out = tmp_path / "out"
+    command = [sys.executable, "-m", "reli3d.cli.data", *call(maps, out, *where)]
+    with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True) as process:
+        until, killed = time.monotonic() + 200, None
+        while process.poll() is None and killed is None and time.monotonic() < until:
+            if out.is_dir() and any(out.glob("*.safetensors")) and (found := at_work(process.pid)):
+                killed = found[0]
+                os.kill(killed, signal.SIGKILL)
+            time.sleep(0.02)
+        _, told = process.communicate(timeout=300)
+    assert killed and process.returncode == 0, told
+    assert {p.name: p.read_bytes() for p in out.glob("*.safetensors")} == alone
+
+
+def test_what_cannot_be_made_is_told_and_the_rest_is_made(maps, tmp_path, monkeypatch, capsys):
+    """A refused object and a process that died twice cost their own sample; a full disk ends the command."""
+    ends = [
+        objects.Row("0000000000", "refused", notes=("mesh: expected a surface, got none",)),
+        objects.Row("0000000001", "failed", notes=(objects.KILLED,)),
+        objects.Row("0000000002", "done"),
+    ]
+    monkeypatch.setattr(objects, "in_processes", lambda *_: (row for row in ends))
+    assert data.main(call(maps, tmp_path)) == 1
+    told = capsys.readouterr().err
+    assert "0000000000: mesh: expected a surface" in told and "0000000001: expected its process to live" in told
+    ends.append(objects.Row("0000000003", "failed", notes=("no space left",)))
+    assert data.main(call(maps, tmp_path)) == 2
+    assert "0000000003: no space left" in capsys.readouterr().err
+
+
+def test_ray_that_is_missing_is_told_in_one_line(maps, tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "ray", None)  # its import raises
+    assert data.main(call(maps, tmp_path / "out", "--ray", "local")) == 2
+    assert "pip install reli3d[ray]" in capsys.readouterr().err

@@ -1,0 +1,180 @@
+"""Parameters of the trunk in parts on two processes: the losses of one process, and checkpoints that either reads."""
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+
+import pytest
+import torch
+
+from reli3d.cli import stages
+from reli3d.train.stages import loop
+from reli3d.train.stages.config import Run, Stage
+from reli3d.train.stages.loop import train
+from reli3d.train.stages.step import trunk_layers
+from reli3d.train.stages.views import Samples
+from tests.support.stages import ball_model, write_samples
+
+STAGE = Stage("gaussians", "gaussians", 16, lobes=16, batch=2, steps=4, rate=1e-3)
+WORKER = """
+import json
+import sys
+from pathlib import Path
+import torch
+from torch.distributed.tensor import DTensor
+from reli3d.train.stages import loop
+from reli3d.train.stages.config import Run, Stage
+from reli3d.train.stages.views import Samples
+from reli3d.train.workers import Workers
+from tests.support.stages import ball_model
+torch.set_num_threads(1)
+folder, out, stop = sys.argv[1:]
+saved = loop.save
+def save(folder, model, optimizer, average, step, *rest):
+    whole = saved(folder, model, optimizer, average, step, *rest)
+    if step == int(stop):
+        cut = [p for p in model.parameters() if isinstance(p, DTensor)]
+        moments = [v for s in optimizer.state.values() for v in s.values() if isinstance(v, DTensor)]
+        here = [sum(t.to_local().numel() for t in ts) / sum(t.numel() for t in ts) for ts in (cut, moments)]
+        (folder / f"share.{workers.rank}").write_text(json.dumps([len(cut), *here]))
+        workers.leave()
+        sys.exit(0)
+    return whole
+loop.save = save
+stage = Stage("gaussians", "gaussians", 16, lobes=16, batch=2, steps=4, rate=1e-3)
+workers = Workers.join()
+run = Run((folder,), out, stage, warmup=2, save_every=2, log_every=1, shard=True, checkpointing=True)
+loop.train(ball_model(), run, [Samples(Path(folder))], workers)
+"""
+
+CLIP = """
+import copy
+import torch
+from torch import nn
+from reli3d.train.sharded import clip_gradients, gathered, scattered, shard
+from reli3d.train.workers import Workers
+workers = Workers.join()
+torch.manual_seed(0)
+whole = nn.Sequential(nn.Linear(5, 7), nn.Linear(7, 3))
+cut = copy.deepcopy(whole)
+shard([cut[0]], torch.device("cpu"))
+x = torch.randn(4, 5)
+for model in (whole, cut):
+    model(x).square().sum().backward()
+for limit in (1e3, 0.1):  # not reached, reached
+    want = nn.utils.clip_grad_norm_(whole.parameters(), limit)
+    torch.testing.assert_close(clip_gradients(list(cut.parameters()), limit), want)
+    for a, b in zip(whole.parameters(), cut.parameters()):
+        torch.testing.assert_close(gathered(b.grad, True), a.grad)
+for a, b in zip(whole.parameters(), cut.parameters()):
+    assert torch.equal(gathered(scattered(a.detach() + 1, b), True), a.detach() + 1)
+workers.leave()
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return write_samples(tmp_path_factory.mktemp("sharded"))
+
+
+def alone(folder, out, stop=None):
+    """The run of one process, ended after the checkpoint of step ``stop``."""
+    saved = loop.save
+
+    def save(*args):
+        whole = saved(*args)
+        if args[4] == stop:
+            raise KeyboardInterrupt
+        return whole
+
+    run = Run((str(folder),), str(out), STAGE, warmup=2, save_every=2, log_every=1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(loop, "save", save)
+        try:
+            train(ball_model(), run, [Samples(folder)])
+        except KeyboardInterrupt:
+            assert stop
+
+
+def on_two(script, text, *arguments):
+    """Run ``text`` on two processes."""
+    script.write_text(text)
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
+    group = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", script]
+    done = subprocess.run([*group, *arguments], env=env, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr[-2000:]
+
+
+def together(folder, out, stop, script):
+    """The run of two processes, in parts, ended after the checkpoint of step ``stop``."""
+    on_two(script, WORKER, folder, out, str(stop))
+
+
+def rows(out):
+    return [r for r in map(json.loads, (out / "log.jsonl").read_text().splitlines()) if "config" not in r]
+
+
+@pytest.fixture(scope="module")
+def runs(folder, tmp_path_factory):
+    """``one`` by one process; ``first`` begun in parts and ended by one process; ``last`` the other way."""
+    root = tmp_path_factory.mktemp("runs")
+    alone(folder, root / "one")
+    together(folder, root / "first", 2, root / "worker.py")
+    state = torch.load(root / "first" / "state.pt", weights_only=True)
+    alone(folder, root / "first")
+    alone(folder, root / "last", 2)
+    together(folder, root / "last", 4, root / "worker.py")
+    return root, state
+
+
+def test_losses_and_parameters_are_those_of_one_process_and_either_goes_on(runs):
+    root, _ = runs
+    one = rows(root / "one")
+    end = torch.load(root / "one" / "state.pt", weights_only=True)
+    for name in ("first", "last"):
+        found = rows(root / name)
+        assert [r["step"] for r in found] == [1, 2, 3, 4]
+        for a, b in zip(one, found, strict=True):
+            for key in a:  # float32 sums in another order, enlarged by Adam: its first steps have the rate's size
+                assert b[key] == pytest.approx(a[key], rel=2e-3, abs=5e-6), (name, a["step"], key)
+        state = torch.load(root / name / "state.pt", weights_only=True)
+        for part in ("model", "average"):
+            for key, value in end[part].items():
+                # Adam moves what has nearly no gradient by up to the rate, either way: two steps of 1e-3
+                torch.testing.assert_close(state[part][key], value, rtol=0, atol=2e-3)
+                assert float((state[part][key] - value).abs().mean()) < 5e-5, key
+
+
+def test_a_checkpoint_is_whole(runs):
+    _, state = runs
+    model = ball_model()
+    for part in ("model", "average"):
+        assert {k: v.shape for k, v in state[part].items()} == {k: v.shape for k, v in model.state_dict().items()}
+    assert all(type(v) is torch.Tensor for v in state["model"].values())
+    sizes = [p.shape for g in (True, False) for p in model.parameters() if (p.ndim > 1) == g and p.requires_grad]
+    found = state["optimizer"]["state"]
+    assert [found[k]["exp_avg"].shape for k in range(len(sizes))] == sizes
+    assert float(found[0]["step"]) == 2.0
+
+
+def test_each_process_has_half_of_the_layers_and_of_their_moments(runs):
+    root, _ = runs
+    count = sum(len(list(layer.parameters())) for layer in trunk_layers(ball_model()))
+    for name in ("first", "last"):
+        for rank in range(2):
+            found, parameters, moments = json.loads((root / name / f"share.{rank}").read_text())
+            assert found == count and 0.49 < parameters < 0.51 and 0.49 < moments < 0.51  # odd rows are rounded up
+
+
+def test_one_process_alone_is_refused(folder, tmp_path, capsys):
+    assert stages.main(["gaussians", str(tmp_path / "out"), str(folder), "--shard", "--steps", "1"]) == 2
+    assert "shard: expected several processes" in capsys.readouterr().err
+    with pytest.raises(ValueError, match="start with torchrun"):
+        train(ball_model(), replace(Run((str(folder),), str(tmp_path), STAGE), shard=True), [Samples(folder)])
+
+
+def test_norms_and_parts_are_those_of_whole_gradients(tmp_path):
+    """Beside torch's own clipping of a module that is whole, on the same input on both processes."""
+    on_two(tmp_path / "clip.py", CLIP)
