@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
 import torch
@@ -34,7 +34,6 @@ class TextureSet:
     roughness: Tensor
     metallic: Tensor
     normal: Tensor = None  # type: ignore[assignment] # flat after construction
-    _kept: dict = field(default_factory=dict, init=False, compare=False)  # of :meth:`lookups`
 
     if TYPE_CHECKING:  # what a caller may give, beside what the fields hold
 
@@ -82,12 +81,12 @@ class TextureSet:
         sources = self.base_color, self.roughness, self.metallic
         lasting = not any(s.is_inference() or (s.requires_grad and torch.is_grad_enabled()) for s in sources)
         written = tuple(s._version for s in sources) if lasting else None
-        if not lasting or self._kept.get("written") != written:
+        kept, values = vars(self).get("_lookups", (None, None))
+        if not lasting or kept != written:
             values = srgb_to_linear(self.base_color), torch.stack([self.roughness, self.metallic, self.metallic], -1)
-            if not lasting:
-                return values
-            self._kept.update(written=written, values=values)
-        return self._kept["values"]
+        if lasting:
+            object.__setattr__(self, "_lookups", (written, values))
+        return values
 
     def to(self, device: torch.device | str) -> TextureSet:
         """The same maps on ``device``."""
@@ -98,7 +97,7 @@ class TextureSet:
         return self._changed(lambda value: value.detach())
 
     def _changed(self, change: Callable[[Tensor], Tensor]) -> TextureSet:
-        return TextureSet(*(change(getattr(self, f.name)) for f in fields(self) if f.init))
+        return TextureSet(*(change(getattr(self, f.name)) for f in fields(self)))
 
     def __repr__(self) -> str:
         return f"TextureSet({self.size} x {self.size} texels, {self.base_color.device})"
