@@ -33,7 +33,7 @@ class Weights:
     base_coarse: float = 0.02  # prior of the base colour's coarse field towards the start, over the number of views
     paint: float = 20.0  # of :func:`near_paint`, over the fourth power of the number of views whose colours are used
     finish: float = 0.05  # prior of roughness and metallic towards the start, over the number of views
-    light: float = 0.45  # prior of the light's maps towards the start, over the square of the number of views
+    light: float = 2e-3  # prior of the light's maps towards the start
     light_slope: float = 2e-3  # of :func:`slopes` of the light
     exposure: float = 0.1  # of exposures, whose mean the light already has
     demodulation: float = 0.02  # of :func:`shared_pattern`
@@ -142,13 +142,10 @@ def palette(color: Tensor, tint: Tensor) -> Tensor:
 
 
 def priors(unknowns: Unknowns, weights: Weights, views: int) -> Tensor:
-    """What holds material, light and exposures to the start: less, the more photographs there are.
-
-    Few views see the light from few sides.  Bound loosely, it explains those and spoils pictures from elsewhere.
-    """
+    """What holds material, light and exposures to the start: less, the more photographs there are."""
     base, finish = ([grid[..., part] for grid in unknowns.material] for part in (slice(0, 3), slice(3, 5)))
     loss = weights.base_coarse / views * near_start(base) + weights.finish / views * near_start(finish)
-    loss = loss + weights.light / views**2 * near_start(unknowns.light)
+    loss = loss + weights.light * near_start(unknowns.light)
     loss = loss + weights.light_slope * slopes(light_field(unknowns.light, LIGHT_ROWS))
     return loss + weights.exposure * unknowns.exposure.square().mean()
 
