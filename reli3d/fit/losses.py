@@ -119,7 +119,7 @@ def near_paint(change: Tensor, weights: Weights, views: int) -> Tensor:
     With few views the normals are far off and the light is hardly told.  What these two leave unexplained is shading,
     and it would be painted on: a small change of most points.  Where the start has the wrong paint the change is large;
     beyond ``REPAINT`` the gradient fades.  The fourth power of the number of views makes the weight 0.25 with 3 of
-    them, where five meshes lose no base colour, and 5e-4 with 14.
+    them, where five meshes lose at most 0.2 dB of base colour, and 5e-4 with 14.
     """
     square = change.square().mean(1)
     return weights.paint / views**4 * (square / (1.0 + square / (REPAINT * REPAINT))).mean()
