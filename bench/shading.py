@@ -9,8 +9,6 @@ one formula on both sides, and the ratio of times at equal variance; memory a pi
 triangles; how near the device's peak is.
 """
 
-import glob
-import os
 import sys
 from functools import partial
 from itertools import product
@@ -19,6 +17,7 @@ import numpy as np
 import torch
 import trimesh
 
+from bench.peers.mitsuba_llvm import mitsuba
 from bench.peers.mitsuba_material import material
 from bench.timing import time_steps
 from reli3d.geometry.camera import Camera, camera_rays, look_at
@@ -73,17 +72,11 @@ def direct(device, size, roughness, backward, samples=SAMPLES, subdivisions=6):
 def mitsuba_direct(device, size, roughness, backward, formula=None):
     """The same image from Mitsuba; CPU only, None without LLVM 19 or newer.  formula: ``(mi, base colour)`` to a
     material's dictionary instead of ``principled``."""
-    found = sorted(glob.glob("/usr/lib/*/libLLVM-19.so*") + glob.glob("/usr/lib/*/libLLVM-2?.so*"))
-    if device.type != "cpu" or not ("DRJIT_LIBLLVM_PATH" in os.environ or found):
-        return None
-    os.environ.setdefault("DRJIT_LIBLLVM_PATH", found[0] if found else "")
-    try:
-        import mitsuba as mi
-    except ImportError:
+    mi = mitsuba(device)
+    if mi is None:
         return None
     import drjit as dr
 
-    mi.set_variant("llvm_ad_rgb")
     vertices, faces = geometry()
     mesh = mi.Mesh("ball", len(vertices), len(faces))
     params = mi.traverse(mesh)

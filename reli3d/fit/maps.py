@@ -118,7 +118,7 @@ def maps_loss(
             other = radiance(points, pixels.wo[rows], light, samples=samples, scene=scene, seed=2 * seed + 1) * exposure
     loss = weights.picture * losses.display_error(image, other, target, target > WHITE)
     loss = loss + weights.palette * losses.palette(points.base_color.clamp(min=losses.DARK).log(), target)
-    loss = loss + losses.priors(unknowns, weights, views) + weights.base_detail / views * fine.square().mean()
+    loss = loss + losses.priors(unknowns, weights, views) + losses.near_paint(change[:, :3], weights, views)
     if weights.demodulation:
         bright = other.detach().mean(1) / points.base_color.detach().mean(1).clamp(min=0.02)
         shading = bright.clamp(min=1e-3).log()

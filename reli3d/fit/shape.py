@@ -202,7 +202,8 @@ def _colors(unknowns, data, mesh, scene, weights, progress, rng, seed, independe
     view = torch.multinomial(weight[row].cpu(), 1, generator=rng)[:, 0].to(row.device)
     target = srgb_to_linear(color[row, view].detach())
     position, normal = position[row], normal[row]
-    logits = sample_grid(data.start.material, position) + material_change(unknowns, position)
+    change = material_change(unknowns, position)
+    logits = sample_grid(data.start.material, position) + change
     points = SurfacePoints(position, normal.detach(), normal, *material_of(logits))
     light = environment(unknowns, data.start)
     wo = unit(camera.c2w[view, :3, 3] - position).detach()
@@ -216,6 +217,7 @@ def _colors(unknowns, data, mesh, scene, weights, progress, rng, seed, independe
     loss = loss + weights.shading * weights.palette * losses.palette(
         points.base_color.clamp(min=losses.DARK).log(), target
     )
+    loss = loss + weights.shading * losses.near_paint(change[:, :3], weights, len(data.colored))
     return loss + weights.shading * losses.priors(unknowns, weights, len(data.photographs))
 
 

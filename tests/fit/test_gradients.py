@@ -56,7 +56,7 @@ CASES = {
     "level, agreement": ("level", {"agreement": 1.0}, "all", LIGHT, False, 1e-4, 0.02),
     "level, shading": ("level", {"shading": 1.0}, "bumps", LIGHT, True, 3e-4, 0.05),
     "level, priors": ("level", {"curvature": 1.0, "stay": 1.0}, "all", LIGHT, False, 1e-3, 0.02),
-    "material": ("material", {"shading": 1.0}, "all", LIGHT, True, 1e-2, 0.02),
+    "material": ("material", {"shading": 1.0, "paint": 1.0}, "all", LIGHT, True, 1e-2, 0.02),
     "light": ("light", {"shading": 1.0}, "all", COSINE, True, 1e-3, 0.02),
     "exposure": ("exposure", {"shading": 1.0}, "all", LIGHT, True, 1e-2, 0.02),
     "camera, outlines": ("pose", {"outline": 1.0}, "axis", LIGHT, False, 1e-2, 0.1),

@@ -56,6 +56,20 @@ def test_a_small_scene_is_recovered(refined, start):
     assert float(error.max()) < 0.65 * float((want[0] / want[1]).log().abs().max())
 
 
+def test_few_views_fit_the_light_and_leave_the_paint(views):
+    true = small_scene.painted(small_scene.ball())
+    first = replace(true, environment=Environment(torch.full((16, 32, 3), 0.5)))
+    few = replace(
+        views, **{name: getattr(views, name)[:3] for name in ("images", "masks", "c2w", "intrinsics")}, names=()
+    )
+    off = []
+    for weights in (Weights(), Weights(paint=0.0)):
+        result = fit.refine(first, few, steps=30, resolution=24, weights=weights)
+        assert result.kept == "result" and result.after[0] > result.before[0] + 2.0
+        off.append(float((half_colors(result.asset) / half_colors(true)).log().abs().mean()))
+    assert off[0] < 0.5 * off[1]  # the paint was right at the start, the light was not
+
+
 def test_the_surface_moves_towards_the_silhouettes(refined, start):
     off = [float((a.mesh.vertices.norm(dim=1) - 0.8).abs().mean()) for a in (start, refined.asset)]
     assert off[1] < 0.6 * off[0]  # the squeezed ball grows back; between the silhouettes of six views some is free

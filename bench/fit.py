@@ -1,0 +1,153 @@
+"""One step of a fit of surface, material and light to four photographs, stage by stage, beside Mitsuba's llvm variant.
+
+Ours extracts the surface of 128 cells from its levels, traces and shades the pixels with shadows, compares colours and
+antialiased silhouettes, and moves levels, material grids, light maps and exposures by their gradients.  Mitsuba's
+surface stands still, so it neither extracts nor antialiases: it traces the same rays, takes as many samples in two
+strategies (``direct``: emitter and BSDF, material ``principled``), compares the same colours by the same loss, and
+moves the material at the same mesh's vertices and the texels of the light.
+"""
+
+from __future__ import annotations
+
+import time
+
+import torch
+import trimesh
+
+from bench.peers.mitsuba_llvm import fit_step, mitsuba
+from reli3d._bridge import present
+from reli3d.fit import losses
+from reli3d.fit.fields import EvenAdam, blurred_grid
+from reli3d.fit.shading import radiance
+from reli3d.fit.shape import Grid, extracted
+from reli3d.fit.unknowns import LIGHT_ROWS, START_GRID, Start, Unknowns, environment, material_change, material_of, unit
+from reli3d.geometry.camera import Camera, look_at
+from reli3d.geometry.grid import sample_grid
+from reli3d.geometry.hits import evaluate_hits, interpolate
+from reli3d.geometry.rays import Hits, RayScene
+from reli3d.render.environment import Environment
+from reli3d.render.gbuffer import primary_hits
+from reli3d.render.points import SurfacePoints
+from reli3d.render.silhouette import antialias, mesh_edges
+
+SAMPLES = (7, 7, 2)  # of 16; Mitsuba's are 8 and 8
+RATE = 1e-6  # of all unknowns: each run does the same work
+COLOR, ROUGHNESS, METALLIC = 0.5, 0.5, 0.1  # where both begin
+VIEWS, TARGET = 4, 0.3
+
+
+def body(resolution: int) -> tuple[torch.Tensor, Grid]:
+    """Level of a ball with dents on a grid."""
+    grid = Grid.around(torch.as_tensor(trimesh.creation.icosphere(radius=0.9).vertices).float(), resolution)
+    at = grid.points(torch.device("cpu"))
+    return at.norm(dim=-1) - 0.8 + 0.06 * (6.0 * at).sin().prod(-1), grid
+
+
+def cameras(device, size: int) -> Camera:
+    """Four views from around and a little above; the object fills two thirds of a picture's side."""
+    angle = torch.arange(VIEWS) * (2.0 * torch.pi / VIEWS)
+    eyes = torch.stack([2.6 * angle.sin(), 0.4 + 0.2 * angle, 2.6 * angle.cos()], -1).to(device)
+    poses = look_at(eyes, torch.zeros(3, device=device), torch.tensor([0.0, 1.0, 0.0], device=device))
+    return Camera.from_fov(poses, 0.9, size, size)
+
+
+def sky() -> torch.Tensor:
+    """Log radiance ``(LIGHT_ROWS, 2 LIGHT_ROWS, 3)``."""
+    return torch.rand(LIGHT_ROWS, 2 * LIGHT_ROWS, 3, generator=torch.Generator().manual_seed(0)) - 0.5
+
+
+def apart(tensors) -> list[torch.Tensor]:
+    """The values as new leaves: the backward pass of each stage is timed alone."""
+    return [t.detach().requires_grad_() for t in tensors]
+
+
+class Clock:
+    """Seconds of named stages; a stage may come twice."""
+
+    def __init__(self, device: torch.device):
+        self.device, self.seconds, self.last = device, {}, time.perf_counter()
+
+    def __call__(self, stage: str) -> None:
+        if self.device.type == "cuda":
+            torch.cuda.synchronize()
+        now = time.perf_counter()
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self.last
+        self.last = now
+
+
+def step_of_a_fit(device, size, resolution):
+    level, grid = body(resolution)
+    level = level.to(device)
+    unknowns, bound = Unknowns.zero(level, VIEWS, 1), torch.full_like(level, -9.0)
+    middle = (COLOR, COLOR, COLOR, (ROUGHNESS - 0.05) / 0.95, METALLIC)
+    logits = torch.logit(torch.tensor(middle, device=device)).expand(START_GRID, START_GRID, START_GRID, 5)
+    start, camera = Start(logits.contiguous(), sky().to(device)), cameras(device, size)
+    mask = torch.zeros(VIEWS, size, size, device=device)
+    maps = [*unknowns.material, *unknowns.light, unknowns.exposure]
+    moving, mover = torch.optim.Adam(maps, lr=RATE), EvenAdam(unknowns.level)
+    for value in (unknowns.level, *maps):
+        value.requires_grad_(True)
+
+    def run():
+        tick = Clock(device)
+        mesh = extracted(unknowns.level, bound, grid)
+        ends = [mesh.vertices, present("mesh.normals", mesh.normals)]
+        vertices, normals = apart(ends)
+        tick("extract")
+        scene = RayScene(vertices.detach(), mesh.faces)
+        hits, origins, directions = primary_hits(scene, camera)
+        seen = hits.face >= 0
+        tick("rays")
+        wo, view = -directions[seen], torch.nonzero(seen)[:, 0]
+        eye, found = origins.expand_as(directions)[seen], Hits(hits.face[seen], hits.t[seen], hits.bary[seen])
+        found = evaluate_hits(vertices, mesh.faces, found, eye, -wo)
+        position = eye - found.t[:, None] * wo
+        normal = unit(interpolate(normals, mesh.faces, found.face, found.bary))
+        paint = material_of(sample_grid(start.material, position) + material_change(unknowns, position))
+        light = environment(unknowns, start).radiance
+        given = [normal, *paint, light, unknowns.exposure.exp()[view, None]]
+        tick("points")
+        leaves = apart(given)
+        points = SurfacePoints(position.detach(), normal.detach(), *leaves[:4])
+        image = radiance(points, wo, Environment(leaves[4]), samples=SAMPLES, scene=scene, seed=0) * leaves[5]
+        target = torch.full_like(image, TARGET)
+        loss = losses.display_error(image, image, target, target > 1.0)
+        tick("shade, forward")
+        slopes = torch.autograd.grad(loss, leaves)
+        tick("shade, backward")
+        edges = mesh_edges(vertices, mesh.faces)
+        covers = [
+            antialias(seen[k].float()[..., None], vertices, mesh.faces, camera[k], scene, edges=edges)[..., 0]
+            for k in range(VIEWS)
+        ]
+        (outline,) = torch.autograd.grad(losses.outline(torch.stack(covers), mask), vertices)
+        tick("antialias")
+        of_vertices, of_normals, *of_maps = torch.autograd.grad(given, [vertices, normals, *maps], slopes)
+        tick("points")
+        (of_level,) = torch.autograd.grad(ends, unknowns.level, [of_vertices + outline, of_normals])
+        tick("extract")
+        for value, slope in zip(maps, of_maps, strict=True):
+            value.grad = slope
+        moving.step()
+        mover.step(blurred_grid(of_level, 4), RATE)
+        tick("optimiser")
+        return tick.seconds
+
+    return run, {"steps": 1}
+
+
+def mitsuba_step(device, size, resolution):
+    """None where Mitsuba does not run."""
+    mi = mitsuba(device)
+    if mi is None:
+        return None
+    level, grid = body(resolution)
+    mesh = extracted(level, torch.full_like(level, -9.0), grid)
+    material = COLOR, ROUGHNESS, METALLIC
+    return fit_step(mi, mesh, sky().exp(), cameras(device, size), material, TARGET, sum(SAMPLES) // 2, RATE), {
+        "steps": 1
+    }
+
+
+CASES = {"step": (step_of_a_fit, dict(size=256, resolution=128))}
+PEERS = {"step": mitsuba_step}
