@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from typing import Any
 
 FLAT = (0.5, 0.5, 1.0)  # a normal map's texel where nothing is bent
+KEPT = 2048  # texels a side up to which look-ups are kept: 100 MB
 
 
 @dataclass(frozen=True, repr=False)
@@ -76,10 +77,11 @@ class TextureSet:
     def lookups(self) -> tuple[Tensor, Tensor]:
         """What a renderer looks up: linear base colour, and roughness with metallic twice, both ``(T, T, 3)``.
 
-        Computed once for maps without gradient that nothing has written to since.
+        Computed once for maps of at most ``KEPT`` texels a side, without gradient, that nothing has written to since.
         """
         sources = self.base_color, self.roughness, self.metallic
-        lasting = not any(s.is_inference() or (s.requires_grad and torch.is_grad_enabled()) for s in sources)
+        changing = any(s.is_inference() or (s.requires_grad and torch.is_grad_enabled()) for s in sources)
+        lasting = self.size <= KEPT and not changing
         written = tuple(s._version for s in sources) if lasting else None
         kept, values = vars(self).get("_lookups", (None, None))
         if not lasting or kept != written:
