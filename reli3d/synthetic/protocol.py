@@ -1,11 +1,11 @@
 """Samples by the paper's rendering protocol: three lights an object, turned about the vertical, and framed cameras.
 
-Section B.1 of the paper: "Each object is rendered under three distinct illumination environments, randomly rotated
-around the vertical axis [...] Camera focal lengths are sampled from a scaled normal distribution between 22 and 37
-degrees [...] Objects are normalized to unit scale and centered, with cameras positioned to fill the frame with
-appropriate padding, followed by slight positional augmentation. [...] objects with PBR ground truth (100 images)
-compared to RGB-only objects (30 images)".  What it leaves open is read so: the views of an object are shared among
-its lights; the normal distribution ends three deviations from its mean; eyes lie evenly over a zone of the sphere.
+Section B.1 of the paper gives: three environments an object, each turned at random about the vertical axis; a field of
+view from a scaled normal distribution between 22 and 37 degrees; objects of unit scale in the centre; cameras that fill
+the frame with padding and a small shift; 100 images of objects with PBR truth, 30 of others.
+
+The paper leaves three things open.  Here the views of an object are shared among its lights, the normal distribution
+ends three deviations from its mean, and eyes lie evenly over a zone of the sphere.
 """
 
 from __future__ import annotations
