@@ -29,14 +29,14 @@ class Weights:
     curvature: float = 0.01  # of :func:`curvature`
     stay: float = 2e-3  # of the level's distance from the start, over the number of views
     picture: float = 1.0  # of :func:`display_error` in the fit of the maps and the light
-    palette: float = 0.03  # of :func:`palette`
+    palette: float = 0.02  # of :func:`palette`
     base_coarse: float = 0.02  # prior of the base colour's coarse field towards the start, over the number of views
     paint: float = 20.0  # of :func:`near_paint`, over the fourth power of the number of views whose colours are used
     finish: float = 0.05  # prior of roughness and metallic towards the start, over the number of views
     light: float = 2e-3  # prior of the light's maps towards the start
     light_slope: float = 2e-3  # of :func:`slopes` of the light
     exposure: float = 0.1  # of exposures, whose mean the light already has
-    demodulation: float = 0.02  # of :func:`shared_pattern`
+    demodulation: float = 0.3  # of :func:`shared_pattern`
 
 
 def display_slope(target: Tensor) -> Tensor:
