@@ -21,6 +21,7 @@ from reli3d.geometry.mesh import Mesh, largest_components, vertex_normals, weld
 from reli3d.geometry.rays import RayScene
 from reli3d.geometry.smooth import taubin_smooth
 from reli3d.geometry.surface import extract_surface
+from reli3d.geometry.symmetry import MirrorPlane, mirror_plane
 from reli3d.geometry.tangents import encode_normals, vertex_tangents
 from reli3d.geometry.uv import unwrap, unwrap_xatlas
 from reli3d.geometry.visibility import visible_from
@@ -49,6 +50,7 @@ SMALLEST_PART = 0.01  # share of the faces below which a separate piece is dropp
 SHADING_POINTS = 4096  # vertices by which the light on the object is judged
 OUTSIDE = 1.0  # level given to grid points that the silhouettes exclude
 COARSE = 4  # cells of the surface grid along a cell of the one that looks for the silhouettes' hull first
+MOST_MIRRORED = 8  # views: a network reads 16, mirror images too
 MARGIN_CELLS = 2.5  # cells around the silhouettes' hull in which the field is still evaluated
 
 
@@ -63,6 +65,16 @@ class Prepared:
     batch: ViewBatch
     images: Tensor  # (V, D, D, 4) sRGB and signed silhouette distance
     camera: Camera  # of ``images``
+    mirrored: int = 0  # how many of the last views are mirror images
+
+    def with_mirror(self, plane: MirrorPlane) -> Prepared:
+        """Twice as many views: each is also a view of the other half of an object that ``plane`` mirrors."""
+        batch, flipped = self.batch, plane.mirrored(self.batch.camera)
+        parts = [torch.cat([t, t.flip(2)]) for t in (batch.images, batch.masks, self.images)]
+        c2w, intrinsics = (torch.cat([getattr(batch, name), getattr(flipped, name)]) for name in ("c2w", "intrinsics"))
+        camera, other = self.camera, plane.mirrored(self.camera)
+        camera = Camera(c2w, torch.cat([camera.intrinsics, other.intrinsics]), camera.width, camera.height)
+        return Prepared(ViewBatch(parts[0], parts[1], c2w, intrinsics, 2 * batch.names), parts[2], camera, len(batch))
 
 
 def prepare(model: Network, views: Views, model_from_input: Similarity) -> Prepared:
@@ -86,7 +98,13 @@ def encode(model: Network, prepared: Prepared, *, background: bool = False) -> F
     batch = prepared.batch
     if isinstance(model, LocalReconstructor):
         return model.encode(
-            batch.images, batch.masks, batch.c2w, batch.intrinsics, prepared.images, prepared.camera.intrinsics
+            batch.images,
+            batch.masks,
+            batch.c2w,
+            batch.intrinsics,
+            prepared.images,
+            prepared.camera.intrinsics,
+            mirrored=prepared.mirrored,
         )
     shown = torch.tensor([background], device=batch.images.device)
     code = model.encode(
@@ -187,7 +205,7 @@ def texture(
     maps = field.maps
 
     def seen(position: Tensor, normal: Tensor) -> Tensor:
-        return visible_from(present("scene", scene), position, normal, maps.camera).float()
+        return maps.photographs_first(visible_from(present("scene", scene), position, normal, maps.camera).float())
 
     local = None
     if isinstance(field, LocalField):
@@ -224,6 +242,7 @@ def match_brightness(asset: Asset, maps: ViewMaps, scene: RayScene) -> Asset:
 
     Photographs determine only the product of paint and light; see :mod:`reli3d.render.exposure`.
     """
+    maps = maps.photographs
     return estimate_paint_and_light(asset, maps.images[..., :3], maps.images[..., 3] > INSIDE, maps.camera, scene)
 
 
@@ -254,10 +273,11 @@ def _check_place(near: Mesh, mesh: Mesh) -> None:
 
 
 class Stopwatch:
-    """Seconds of each stage, in the order they ran; waits for the device before it reads the clock."""
+    """Seconds of each stage, in the order they ran, and notes; waits for the device before it reads the clock."""
 
     def __init__(self, device: torch.device, report=None):
         self.seconds: dict[str, float] = {}
+        self.notes: list[str] = []
         self._device, self._report = device, report
 
     @contextmanager
@@ -290,6 +310,8 @@ class ReconstructOptions:
     :func:`default_normalization`.  frame: ``input`` (that of the cameras) or ``model``.  up: the axis of that frame
     that shall become +Y.  uv: ``project`` or ``xatlas``.  hero: index of the network's main view, or ``random``.
     background: ``masked``, ``visible`` or ``auto``, see :func:`~reli3d.views.published_views.background_shown`.
+    symmetry: ``auto`` lets a network of convolutions see 3 to 8 views of an object that is its own mirror image as
+    views of both halves, see :func:`~reli3d.geometry.symmetry.mirror_plane`; or ``off``.
     """
 
     texture_size: int = 1024
@@ -301,8 +323,11 @@ class ReconstructOptions:
     hero: int | str = 0
     background: str = "masked"
     seed: int = 0
+    symmetry: str = "auto"
 
     def __post_init__(self):
+        if self.symmetry not in ("auto", "off"):
+            raise ValueError(f"symmetry: expected auto or off, got {self.symmetry}")
         if not 256 <= self.texture_size <= 4096:
             raise ValueError(f"texture_size: expected 256 to 4096 texels, got {self.texture_size}")
         if self.resolution is not None and not 16 <= self.resolution <= 256:
@@ -363,6 +388,14 @@ def reconstruct_placed(placed: Placed, model: Network, options: ReconstructOptio
     torch.manual_seed(options.seed)
     with watch.stage("prepare"):
         prepared = prepare(model, placed.views, placed.model_from_input)
+    if options.symmetry == "auto" and isinstance(model, LocalReconstructor) and len(placed.views) <= MOST_MIRRORED:
+        with watch.stage("symmetry"):
+            plane = mirror_plane(prepared.images[..., 3].contiguous(), prepared.camera)
+            if plane is not None:
+                prepared = prepared.with_mirror(plane)
+                watch.notes.append(
+                    "symmetry: the object is its own mirror image, so each view is also one of the other half"
+                )
     with watch.stage("network"):
         field = encode(model, prepared, background=shown)
     with watch.stage("surface"):

@@ -120,23 +120,34 @@ class LocalReconstructor(nn.Module):
         return linear_of(self.level, 0).weight.dtype
 
     def encode(
-        self, images: Tensor, masks: Tensor, c2w: Tensor, intrinsics: Tensor, detail: Tensor, detail_intrinsics: Tensor
+        self,
+        images: Tensor,
+        masks: Tensor,
+        c2w: Tensor,
+        intrinsics: Tensor,
+        detail: Tensor,
+        detail_intrinsics: Tensor,
+        *,
+        mirrored: int = 0,
     ) -> LocalField:
         """Read the posed views of one object, in the model's frame.
 
         images: ``(V, S, S, 3)`` sRGB in [0, 1], straight.  masks: ``(V, S, S)``.  c2w: ``(V, 4, 4)`` OpenGL.
         intrinsics: ``(V, 4)`` pixels of ``images``.  detail: ``(V, D, D, 4)`` sRGB and signed distance to the
-        silhouette in pixels, from which colours are read; its intrinsics.  Gradients reach every parameter.
+        silhouette in pixels, from which colours are read; its intrinsics.  mirrored: how many of the last views are
+        mirror images: they tell the shape and the paint, not the light.  Gradients reach every parameter.
         """
         features, pixels, camera = self.read_pixels(images, masks, c2w, intrinsics, detail, detail_intrinsics)
         color, mask = shown_pixels(images, masks, camera)
         shape = torch.cat([pixels.depth, pixels.normal], -1).permute(0, 3, 1, 2)
         shape = functional.avg_pool2d(shape, camera.height // features.shape[1]).permute(0, 2, 3, 1)
         tokens = torch.cat([features, shape], -1).contiguous()
-        maps = ViewMaps(tokens, detail, Camera(c2w, detail_intrinsics, *detail.shape[2:0:-1]))
+        maps = ViewMaps(tokens, detail, Camera(c2w, detail_intrinsics, *detail.shape[2:0:-1]), mirrored)
         surface = torch.cat([pixels.depth * mask, mask], -1)
         volume = self.volume(maps, surface)
-        log_light = self._light(pixels, color, mask[..., 0], camera)
+        lit = mask[..., 0].clone()
+        lit[maps.taken :] = 0.0
+        log_light = self._light(pixels, color, lit, camera)
         return LocalField(maps, self, pixels, color, surface, volume, log_light)
 
     def read_pixels(
@@ -233,6 +244,7 @@ class LocalField(Field):
     def with_shading(self, position: Tensor, normal: Tensor, visible: Tensor) -> LocalField:
         """The field with the light on its surface, from some thousand points all over it; no gradient."""
         with torch.no_grad():
+            visible = torch.cat([visible[:, : self.maps.taken], torch.zeros_like(visible[:, self.maps.taken :])], 1)
             color = self.fused(position, normal, visible).logit.sigmoid()
             _, _, summary = summarize_views(self.maps.images, self.maps.camera, position, visible, normal)
             shown, seen = summary[:, :3], visible.amax(1)

@@ -22,12 +22,28 @@ from reli3d.nn.blocks import linear_of
 @dataclass(frozen=True)
 class ViewMaps:
     """Posed maps of one object: ``tokens (V, P, P, C)``, ``images (V, S, S, 4)`` = sRGB and signed silhouette
-    distance in pixels.
+    distance in pixels.  The last ``mirrored`` views are mirror images of others.
     """
 
     tokens: Tensor
     images: Tensor
     camera: Camera  # of ``images``
+    mirrored: int = 0
+
+    @property
+    def taken(self) -> int:
+        """Number of the views that are photographs."""
+        return len(self.images) - self.mirrored
+
+    @property
+    def photographs(self) -> ViewMaps:
+        """The same without mirror images."""
+        return ViewMaps(self.tokens[: self.taken], self.images[: self.taken], self.camera[: self.taken])
+
+    def photographs_first(self, visible: Tensor) -> Tensor:
+        """``visible (N, V)``, but mirror images only where no photograph sees the point."""
+        own, other = visible.split([self.taken, self.mirrored], 1)
+        return torch.cat([own, other * (1.0 - own.amax(1, keepdim=True))], 1) if self.mirrored else visible
 
 
 AHEAD = 4  # numbers of ahead_of_surface

@@ -1,0 +1,147 @@
+"""The upright mirror plane of an object, found from its silhouettes: each view then shows the other half, too.
+
+If an object is its own mirror image, its silhouettes and their mirror images are silhouettes of one thing, and their
+common visual hull still fills every one of them.  Under a wrong plane the mirrored silhouettes cut away what some view
+shows.  The amount is the silhouette coherence of Hernandez, Schmitt and Cipolla 2007, Silhouette Coherence for Camera
+Calibration under Circular Motion, here a function of a plane.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from reli3d._bridge import check
+from reli3d.geometry.camera import Camera, camera_rays, check_camera
+from reli3d.geometry.hull import hull_distance, hull_span
+
+RAYS, DEPTHS = 96, 16  # rays of a view, and points along each, at which hulls are compared
+ANGLES, OFFSETS = 60, 7  # planes of the first search
+REACH = 0.06  # greatest offset of the plane from the hull's centre, of the hull's longest side
+FINER = 9  # angles and offsets of the second search, within one step of the first
+LOST = 0.01  # of the longest side: a pixel whose ray misses the common hull by more is lost
+MOST_LOST = 0.004  # share of the pixels that may be lost: a part that is on one side alone would be cut off
+AS_GOOD = 3e-4  # mean miss, of the longest side, by which another plane may be worse and still be as good
+AMBIGUOUS = 0.028  # times the square of the number of views: share of the planes that may be as good
+ROUND = 0.95  # share of the planes from which on the object is one of revolution
+FEWEST = 3  # views: two silhouettes agree with many planes
+BLOCK = 64  # planes that are asked together
+ROLL = 0.17  # root mean square [rad] by which cameras may be rolled about their axes: else there is no upright
+APART = 0.2  # rms sine between the cameras' horizontal axes, below which nothing tells what is upright
+
+
+@dataclass(frozen=True)
+class MirrorPlane:
+    """The points ``x`` with ``normal . x = offset``; ``normal (3,)`` unit."""
+
+    normal: Tensor
+    offset: float
+
+    def mirrored(self, camera: Camera) -> Camera:
+        """Cameras that see the mirrored world as pictures whose columns are reversed."""
+        flip = torch.eye(4, device=camera.c2w.device)
+        flip[:3, :3] -= 2.0 * torch.outer(self.normal, self.normal)
+        flip[:3, 3] = 2.0 * self.offset * self.normal
+        c2w = flip @ camera.c2w
+        c2w = torch.cat([-c2w[..., :1], c2w[..., 1:]], -1)  # right-handed again
+        fx, fy, cx, cy = camera.intrinsics.unbind(-1)
+        return Camera(c2w, torch.stack([fx, fy, camera.width - cx, cy], -1), camera.width, camera.height)
+
+
+@torch.no_grad()
+def mirror_plane(distance: Tensor, camera: Camera) -> MirrorPlane | None:
+    """The upright plane in which the object of V views is its own mirror image, or None where none is sure.
+
+    distance: ``(V, H, W)`` from :func:`~reli3d.geometry.hull.mask_distance`, of whole silhouettes.  camera: of these
+    views; any frame and unit.  None for one or two views, for rolled cameras, where no plane lets the common hull fill
+    the silhouettes, and where many do, so that the views do not tell which.  Where nearly all do, the object is one of
+    revolution.  No gradient.  Raises TypeError or ValueError where shapes or devices disagree.
+    """
+    check("distance", distance)
+    check_camera(camera, like=distance, views=len(distance), size=distance.shape[1:])
+    up = upright(camera) if len(distance) >= FEWEST else None
+    if up is None:
+        return None
+    points, known = _hull_points(distance, camera)
+    inside = points[known]
+    if len(inside) == 0:
+        return None
+    low, high = inside.aminmax(dim=0)
+    centre, size = (low + high) / 2, float((high - low).max())
+    first = normalize(torch.linalg.cross(up, torch.eye(3, device=up.device)[int(up.abs().argmin())]), dim=0)
+    second = torch.linalg.cross(up, first)
+
+    def misses(angle: Tensor, offset: Tensor, every: int = 1) -> tuple[Tensor, Tensor]:
+        """Planes at these angles [rad] and offsets [sizes] from the centre: mean miss and share of lost pixels."""
+        normals = torch.outer(angle.cos(), first) + torch.outer(angle.sin(), second)
+        away = normals @ centre + size * offset
+        blocks = zip(normals.split(BLOCK), away.split(BLOCK), strict=True)
+        some, within = points[::every, ::every], known[::every, ::every]
+        miss = torch.cat([_miss(some, within, distance, camera, n, a) for n, a in blocks]) / size
+        return miss.clamp(max=0.1).mean(1), (miss > LOST).float().mean(1)
+
+    angles = torch.arange(ANGLES, device=up.device) * (math.pi / ANGLES)
+    offsets = torch.linspace(-REACH, REACH, OFFSETS, device=up.device)
+    miss, _ = misses(angles.repeat_interleave(OFFSETS), offsets.repeat(ANGLES), every=2)
+    by_angle, at = miss.view(ANGLES, OFFSETS).min(1)
+    best = int(by_angle.argmin())
+    as_good = float((by_angle < by_angle[best] + AS_GOOD).float().mean())
+    if AMBIGUOUS * len(distance) ** 2 < as_good < ROUND:
+        return None
+    around = torch.linspace(-1.0, 1.0, FINER, device=up.device)
+    angle = (angles[best] + around * (math.pi / ANGLES)).repeat_interleave(FINER)
+    offset = (offsets[at[best]] + around * (2 * REACH / (OFFSETS - 1))).repeat(FINER)
+    miss, _ = misses(angle, offset)
+    alike = miss <= miss.min() + 0.2 * AS_GOOD  # the middle of what is equally good
+    angle, offset = angle[alike].mean(), offset[alike].mean()
+    if float(misses(angle[None], offset[None])[1]) > MOST_LOST:
+        return None
+    normal = angle.cos() * first + angle.sin() * second
+    return MirrorPlane(normal, float(normal @ centre + size * offset))
+
+
+def upright(camera: Camera) -> Tensor | None:
+    """The direction ``(3,)`` that is up for cameras that are not rolled, or None: right angles to all their X axes."""
+    right = camera.c2w[:, :3, 0]
+    _, spread, axes = torch.linalg.svd(right / max(len(right), 1) ** 0.5, full_matrices=True)
+    if len(right) < 2 or float(spread[1]) < APART or (len(right) > 2 and float(spread[2]) > ROLL):
+        return None
+    up = axes[-1]
+    return up if float(up @ camera.c2w[:, :3, 1].sum(0)) > 0 else -up
+
+
+def _hull_points(distance: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+    """Points ``(R, D, 3)`` along rays of pixels inside the silhouettes, and which lie in the hull ``(R, D)``."""
+    origins: list[Tensor] = []
+    directions: list[Tensor] = []
+    for view in range(len(distance)):
+        inside = (distance[view] > 0.5).reshape(-1).nonzero()[:, 0]
+        chosen = inside[torch.linspace(0, max(len(inside) - 1, 0), min(RAYS, len(inside))).long().to(inside.device)]
+        of_view = (rays.reshape(-1, 3)[chosen] for rays in camera_rays(camera[view]))
+        for rays, more in zip((origins, directions), of_view):
+            rays.append(more)
+    origin, direction = torch.cat(origins).contiguous(), torch.cat(directions).contiguous()
+    radius = 2.0 * float(camera.position.norm(dim=1).max())
+    span = hull_span(origin, direction, min(radius, 99.0), distance, camera)
+    share = (torch.arange(DEPTHS, device=origin.device) + 0.5) / DEPTHS
+    depth = torch.lerp(span[:, :1], span[:, 1:], share)
+    points = origin[:, None] + direction[:, None] * depth[..., None]
+    within = hull_distance(points.reshape(-1, 3), distance, camera).view(depth.shape)
+    pixel = camera.position.norm(dim=1).mean() / camera.intrinsics[:, 0].mean()
+    return points, within > -pixel
+
+
+def _miss(points: Tensor, known: Tensor, distance: Tensor, camera: Camera, normal: Tensor, offset: Tensor) -> Tensor:
+    """How far each ray's best point lies outside the hull mirrored at each plane, ``(P, R)``.
+
+    normal: ``(P, 3)``.  offset: ``(P,)``.  The hull's own points are mirrored, which is the same.
+    """
+    flat, normal = points.reshape(-1, 3), normal[:, None]
+    mirrored = flat - 2.0 * ((normal * flat).sum(-1) - offset[:, None])[..., None] * normal
+    within = hull_distance(mirrored.reshape(-1, 3), distance, camera).view(-1, *known.shape)
+    best = torch.where(known, within, within.new_tensor(-math.inf)).amax(-1)
+    return torch.where(known.any(-1), (-best).clamp(min=0.0), 0.0)
