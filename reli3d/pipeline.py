@@ -14,14 +14,11 @@ from torch import Tensor
 
 from reli3d._bridge import expect, present
 from reli3d.geometry.bake import bake
-from reli3d.geometry.camera import Camera
 from reli3d.geometry.cover import cover_silhouettes
-from reli3d.geometry.hull import mask_distance
 from reli3d.geometry.mesh import Mesh, largest_components, vertex_normals, weld
 from reli3d.geometry.rays import RayScene
 from reli3d.geometry.smooth import taubin_smooth
 from reli3d.geometry.surface import extract_surface
-from reli3d.geometry.symmetry import MirrorPlane, mirror_plane
 from reli3d.geometry.tangents import encode_normals, vertex_tangents
 from reli3d.geometry.uv import unwrap, unwrap_xatlas
 from reli3d.geometry.visibility import visible_from
@@ -32,62 +29,29 @@ from reli3d.nn.presets import LocalPreset, Preset
 from reli3d.nn.reni import map_directions
 from reli3d.nn.view_features import ViewMaps
 from reli3d.nn.weights import Network, load_model
+from reli3d.prepare import Prepared, completed, prepare, published_input
 from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.environment import Environment
 from reli3d.render.exposure import estimate_paint_and_light
 from reli3d.views.normalize import FAR, normalize
-from reli3d.views.published_views import background_shown, hero_first, placement_notes, published_views
+from reli3d.views.published_views import background_shown, hero_first, placement_notes
 from reli3d.views.similarity import Similarity, output_frame
-from reli3d.views.views import ViewBatch, Views
+from reli3d.views.views import Views
 
 if TYPE_CHECKING:
     from reli3d.fit.refine import Refinement
 
-DETAIL = 512  # pixels of the views that colours and silhouettes are read from; the network's own input is smaller
 REFINED = 384  # pixels of the views that a refinement compares with
 INSIDE = 2.0  # pixels of such a view that a silhouette's edge may spill over
 SMALLEST_PART = 0.01  # share of the faces below which a separate piece is dropped
 SHADING_POINTS = 4096  # vertices by which the light on the object is judged
 OUTSIDE = 1.0  # level given to grid points that the silhouettes exclude
 COARSE = 4  # cells of the surface grid along a cell of the one that looks for the silhouettes' hull first
-MOST_MIRRORED = 8  # views: a network reads 16, mirror images too
 MARGIN_CELLS = 2.5  # cells around the silhouettes' hull in which the field is still evaluated
 
 
 class NoSurface(ValueError):
     """The field of an object has one sign in its whole box."""
-
-
-@dataclass(frozen=True)
-class Prepared:
-    """Views in the model's frame: the network's input, and maps of ``DETAIL`` pixels that are looked up at points."""
-
-    batch: ViewBatch
-    images: Tensor  # (V, D, D, 4) sRGB and signed silhouette distance
-    camera: Camera  # of ``images``
-    mirrored: int = 0  # how many of the last views are mirror images
-
-    def with_mirror(self, plane: MirrorPlane) -> Prepared:
-        """Twice as many views: each is also a view of the other half of an object that ``plane`` mirrors."""
-        batch, flipped = self.batch, plane.mirrored(self.batch.camera)
-        parts = [torch.cat([t, t.flip(2)]) for t in (batch.images, batch.masks, self.images)]
-        c2w, intrinsics = (torch.cat([getattr(batch, name), getattr(flipped, name)]) for name in ("c2w", "intrinsics"))
-        camera, other = self.camera, plane.mirrored(self.camera)
-        camera = Camera(c2w, torch.cat([camera.intrinsics, other.intrinsics]), camera.width, camera.height)
-        return Prepared(ViewBatch(parts[0], parts[1], c2w, intrinsics, 2 * batch.names), parts[2], camera, len(batch))
-
-
-def prepare(model: Network, views: Views, model_from_input: Similarity) -> Prepared:
-    """Resample ``views`` for ``model``: cropped to the object, or as the release does where the preset says so."""
-    moved = views.transformed(model_from_input).to(model.device)
-    published = published_input(model.preset)
-    if published:
-        batch = published_views(moved.to("cpu"), model.preset.image_size).to(model.device)  # the codec runs there
-    else:
-        batch = moved.resampled(model.preset.image_size)
-    detail = moved.resampled(DETAIL, crop=not published)
-    silhouette = mask_distance(detail.masks)
-    return Prepared(batch, torch.cat([detail.images, silhouette[..., None]], -1).contiguous(), detail.camera)
 
 
 def encode(model: Network, prepared: Prepared, *, background: bool = False) -> Field:
@@ -291,11 +255,6 @@ class Stopwatch:
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - began
 
 
-def published_input(preset: Preset | LocalPreset) -> bool:
-    """Whether views go in as the release prepares them."""
-    return isinstance(preset, Preset) and preset.published_input
-
-
 def default_normalization(preset: Preset | LocalPreset) -> str:
     """``none`` where views go in as the release prepares them, poses as stored; else ``auto``."""
     return "none" if published_input(preset) else "auto"
@@ -388,14 +347,13 @@ def reconstruct_placed(placed: Placed, model: Network, options: ReconstructOptio
     torch.manual_seed(options.seed)
     with watch.stage("prepare"):
         prepared = prepare(model, placed.views, placed.model_from_input)
-    if options.symmetry == "auto" and isinstance(model, LocalReconstructor) and len(placed.views) <= MOST_MIRRORED:
+    if options.symmetry == "auto" and isinstance(model, LocalReconstructor):
         with watch.stage("symmetry"):
-            plane = mirror_plane(prepared.images[..., 3].contiguous(), prepared.camera)
-            if plane is not None:
-                prepared = prepared.with_mirror(plane)
-                watch.notes.append(
-                    "symmetry: the object is its own mirror image, so each view is also one of the other half"
-                )
+            prepared = completed(prepared)
+        if prepared.mirrored:
+            watch.notes.append(
+                "symmetry: the object is its own mirror image; photographs are read as views of both halves"
+            )
     with watch.stage("network"):
         field = encode(model, prepared, background=shown)
     with watch.stage("surface"):

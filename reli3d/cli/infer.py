@@ -243,6 +243,7 @@ class Job:
             hero,
             args.background,
             args.seed,
+            symmetry=args.symmetry,
         )
         if args.download:
             _fetch(args.weights)
@@ -301,6 +302,7 @@ class Job:
                 asset = reconstruct_placed(placed, self.model, self.options, watch)
             seconds[label] = {k: round(v, 4) for k, v in {**before, **watch.seconds}.items()}
         self.cold = False
+        steps.tell(watch.notes)
         shown, compared, first, record = views.transformed(output), None, None, {}
         if self.budget:
             steps("refine")
@@ -318,7 +320,7 @@ class Job:
             "views": list(views.names),
             "views_in_folder": views.in_folder,
             "coordinate_system": views.coordinate_system,
-            "notes": list(views.notes),
+            "notes": [*views.notes, *watch.notes],
             **frames,
             "weights": results.weights_record(self.manifest, self.digest),
             "preset": self.model.preset.name,

@@ -82,6 +82,13 @@ def parser() -> argparse.ArgumentParser:
         "too; auto: visible where all views have one and the weights know how",
     )
     p.add_argument(
+        "--symmetry",
+        choices=("auto", "off"),
+        default="auto",
+        help="auto (default): where 3 to 8 silhouettes show that the object is its own mirror image, photographs are "
+        "read as views of both halves",
+    )
+    p.add_argument(
         "--frame", choices=("input", "model"), default="input", help="frame of the mesh (default the cameras')"
     )
     p.add_argument("--up", choices=AXES, default="y", help="axis of that frame to turn to +Y")

@@ -7,7 +7,6 @@ steps of one process with all threads: the operations of a small network are too
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -47,12 +46,11 @@ class Workers:
         """End the group, and this process with exit code 0 where there are several.
 
         Gloo's threads give up the tensors of an operation some time after it has ended, and need the interpreter for
-        it.  One that comes while the interpreter ends aborts the process, so the process ends without that.
+        it.  One that comes while the interpreter ends aborts the process, so the process ends without that: what the
+        program has printed must be flushed before.
         """
         if self.count == 1:
             return
         distributed.barrier()
         distributed.destroy_process_group()
-        sys.stdout.flush()
-        sys.stderr.flush()
         os._exit(0)

@@ -8,6 +8,7 @@ LAYERS = [
     {"render"},
     {"io", "fit"},
     {"views", "synthetic", "nn"},
+    {"prepare"},
     {"pipeline"},
     {"output"},
     {"train"},

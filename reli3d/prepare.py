@@ -1,0 +1,65 @@
+"""Photographs as a network reads them: resampled, with distances to the silhouettes, mirrored where that helps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from reli3d.geometry.camera import Camera
+from reli3d.geometry.hull import mask_distance
+from reli3d.geometry.symmetry import MirrorPlane, mirror_plane
+from reli3d.nn.presets import LocalPreset, Preset
+from reli3d.nn.weights import Network
+from reli3d.views.published_views import published_views
+from reli3d.views.similarity import Similarity
+from reli3d.views.views import ViewBatch, Views
+
+DETAIL = 512  # pixels of the views that colours and silhouettes are read from; the network's own input is smaller
+MOST_MIRRORED = 8  # views: a network reads 16, mirror images too
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """Views in the model's frame: the network's input, and maps of ``DETAIL`` pixels that are looked up at points."""
+
+    batch: ViewBatch
+    images: Tensor  # (V, D, D, 4) sRGB and signed silhouette distance
+    camera: Camera  # of ``images``
+    mirrored: int = 0  # how many of the last views are mirror images
+
+    def with_mirror(self, plane: MirrorPlane) -> Prepared:
+        """Twice as many views: each is also a view of the other half of an object that ``plane`` mirrors."""
+        batch, flipped = self.batch, plane.mirrored(self.batch.camera)
+        parts = [torch.cat([t, t.flip(2)]) for t in (batch.images, batch.masks, self.images)]
+        c2w, intrinsics = (torch.cat([getattr(batch, name), getattr(flipped, name)]) for name in ("c2w", "intrinsics"))
+        camera, other = self.camera, plane.mirrored(self.camera)
+        camera = Camera(c2w, torch.cat([camera.intrinsics, other.intrinsics]), camera.width, camera.height)
+        return Prepared(ViewBatch(parts[0], parts[1], c2w, intrinsics, 2 * batch.names), parts[2], camera, len(batch))
+
+
+def prepare(model: Network, views: Views, model_from_input: Similarity) -> Prepared:
+    """Resample ``views`` for ``model``: cropped to the object, or as the release does where the preset says so."""
+    moved = views.transformed(model_from_input).to(model.device)
+    published = published_input(model.preset)
+    if published:
+        batch = published_views(moved.to("cpu"), model.preset.image_size).to(model.device)  # the codec runs there
+    else:
+        batch = moved.resampled(model.preset.image_size)
+    detail = moved.resampled(DETAIL, crop=not published)
+    silhouette = mask_distance(detail.masks)
+    return Prepared(batch, torch.cat([detail.images, silhouette[..., None]], -1).contiguous(), detail.camera)
+
+
+def completed(prepared: Prepared) -> Prepared:
+    """``prepared`` with mirror images, if there are at most ``MOST_MIRRORED`` views and they show a mirror plane."""
+    plane = None
+    if len(prepared.batch) <= MOST_MIRRORED:
+        plane = mirror_plane(prepared.images[..., 3].contiguous(), prepared.camera)
+    return prepared if plane is None else prepared.with_mirror(plane)
+
+
+def published_input(preset: Preset | LocalPreset) -> bool:
+    """Whether views go in as the release prepares them."""
+    return isinstance(preset, Preset) and preset.published_input

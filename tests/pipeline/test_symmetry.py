@@ -1,0 +1,105 @@
+"""Views of a symmetric object as views of both halves: balls whose silhouettes and volume are closed forms."""
+
+from dataclasses import fields
+
+import pytest
+import torch
+
+from reli3d.geometry.camera import Camera, camera_rays, look_at
+from reli3d.geometry.rays import RayScene
+from reli3d.nn.local import PixelMaps, shown_pixels
+from reli3d.nn.view_features import ViewMaps
+from reli3d.nn.weights import load_model
+from reli3d.pipeline import ReconstructOptions, Stopwatch, encode, reconstruct
+from reli3d.prepare import completed, prepare
+from reli3d.views.normalize import normalize
+from reli3d.views.views import Views
+
+SIZE = 192
+BALLS = [((0.0, 0.0, 0.0), 0.3), ((0.35, 0.1, 0.25), 0.14), ((-0.35, 0.1, 0.25), 0.14), ((0.0, 0.3, -0.2), 0.14)]
+EYES = [(0.3, 0.9, 2.4), (2.3, 0.4, -0.8), (1.9, 1.2, 1.4), (0.9, -0.3, 2.2)]  # hardly any sees the left half
+
+
+def depth_in_balls(points):
+    """Signed distance to the surface of the union, positive inside: where it is positive it is exact in sign."""
+    centres = torch.tensor([c for c, _ in BALLS])
+    radii = torch.tensor([r for _, r in BALLS])
+    return (radii - (points[:, None] - centres).norm(dim=-1)).amax(1)
+
+
+@pytest.fixture(scope="module")
+def views():
+    c2w = torch.stack([look_at(eye) for eye in EYES])
+    camera = Camera.from_fov(c2w, 0.6, SIZE, SIZE)
+    origin, direction = camera_rays(camera)
+    masks, images = [], []
+    for o, d in zip(origin, direction):
+        nearest, shade = torch.full((SIZE, SIZE), -1.0), torch.full((SIZE, SIZE), 0.5)
+        for centre, radius in BALLS:
+            along = ((torch.tensor(centre) - o) * d).sum(-1)
+            away = (torch.tensor(centre) - o - along[..., None] * d).norm(dim=-1)
+            clear = (radius - away) * camera.intrinsics[0, 0] / along
+            shade = torch.where(clear > nearest, 0.4 + 0.5 * (1 - away / radius).clamp(0, 1), shade)
+            nearest = torch.maximum(nearest, clear)
+        masks.append((nearest + 0.5).clamp(0, 1))
+        images.append(shade[..., None] * torch.tensor([0.9, 0.5, 0.3]))
+    return Views(tuple(images), tuple(masks), c2w, camera.intrinsics, tuple("abcd"))
+
+
+def overlap(asset):
+    """Intersection over union of mesh and balls on a grid; a point is inside where rays leave through the mesh."""
+    axis = torch.linspace(-0.55, 0.55, 45)
+    points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+    scene = RayScene(asset.mesh.vertices, asset.mesh.faces)
+    direction = torch.tensor([0.211, 0.943, 0.257]).expand_as(points).contiguous()
+    hit = scene.closest(points, direction)
+    corners = asset.mesh.vertices[asset.mesh.faces[hit.face.clamp(min=0).long()].long()]
+    out = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    inside = (hit.face >= 0) & ((out * direction).sum(-1) > 0)
+    true = depth_in_balls(points) > 0
+    return float((inside & true).sum() / (inside | true).sum())
+
+
+def test_the_other_half_comes_nearer_to_the_truth(views):
+    found = {}
+    for symmetry in ("off", "auto"):
+        watch = Stopwatch(torch.device("cpu"))
+        asset = reconstruct(views, options=ReconstructOptions(texture_size=256, symmetry=symmetry), watch=watch)
+        found[symmetry] = overlap(asset)
+        assert bool(watch.notes) == (symmetry == "auto")
+    assert found["auto"] > found["off"] + 0.05
+
+
+def test_mirror_images_tell_shape_and_paint_but_not_the_light(views):
+    model = load_model("small", "cpu")
+    plain = prepare(model, views, normalize(views, "auto"))
+    both = completed(plain)
+    assert both.mirrored == 4 and len(both.batch) == len(both.images) == 8
+    torch.testing.assert_close(both.batch.masks[4:], plain.batch.masks.flip(2))
+    with torch.no_grad():
+        one, two = encode(model, plain), encode(model, both)
+        taken = PixelMaps(*(getattr(two.pixels, f.name)[:4] for f in fields(PixelMaps)))
+        _, mask = shown_pixels(both.batch.images, both.batch.masks, both.batch.camera.resized(128, 128))
+        light = model._light(taken, two.color[:4], mask[:4, ..., 0], both.batch.camera[:4].resized(128, 128))
+    torch.testing.assert_close(two.log_light, light)
+    assert two.maps.taken == len(two.maps.photographs.images) == 4
+    points = torch.tensor([[0.0, 0.0, 0.0], [0.1, 0.2, 0.1]])
+    assert not torch.equal(one.level(points), two.level(points))
+
+
+def test_a_mirror_image_shows_a_point_only_where_no_photograph_does():
+    camera = Camera.from_fov(torch.eye(4).expand(4, 4, 4).contiguous(), 0.6, 8, 8)
+    maps = ViewMaps(torch.zeros(4, 4, 4, 1), torch.zeros(4, 8, 8, 4), camera, mirrored=2)
+    visible = torch.tensor([[1.0, 0, 1, 1], [0, 0, 1, 0], [0, 0, 0, 0]])
+    want = torch.tensor([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 0]])
+    assert torch.equal(maps.photographs_first(visible), want)
+    assert torch.equal(maps.photographs.photographs_first(visible[:, :2]), visible[:, :2])
+
+
+def test_many_views_and_other_words_are_left_alone(views):
+    with pytest.raises(ValueError, match="symmetry: expected auto or off, got yes"):
+        ReconstructOptions(symmetry="yes")
+    model = load_model("small", "cpu")
+    many = views.select([0, 1, 2, 3, 0, 1, 2, 3, 0])
+    prepared = prepare(model, many, normalize(many, "auto"))
+    assert completed(prepared) is prepared
