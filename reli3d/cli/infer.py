@@ -273,6 +273,7 @@ class Job:
         return "done"
 
     def _run(self, folder: Path | Packed, name: str, replacing: Callable, steps: Progress) -> None:
+        from reli3d.geometry.rays import RayScene
         from reli3d.output import results
         from reli3d.output.preview import comparison, preview
         from reli3d.pipeline import Stopwatch, place, published_input, reconstruct_placed, refined
@@ -311,7 +312,9 @@ class Job:
             first, asset = asset if result.kept == "result" else None, result.asset
             record = {"refinement": {"views": len(photographs), **self.budget, **result.record()}}
         steps("preview")
-        picture = preview(asset, shown.to(self.device))
+        scene = RayScene(asset.mesh.vertices, asset.mesh.faces)
+        on_device = shown.to(self.device)
+        picture = preview(asset, on_device, scene)
         frames, translation = results.frame_record(placed.model_from_input, output, views.origin, args.frame, args.up)
         info = {
             "object": name,
@@ -329,7 +332,7 @@ class Job:
             "seed": args.seed,
             "device": self.device,
             "mesh": results.mesh_statistics(asset.mesh),
-            "mask_iou": results.mask_iou(asset.mesh, shown.to(self.device)),
+            "mask_iou": results.mask_iou(scene, on_device),
             **record,
             "seconds": seconds,
             "seconds_since_start": round(time.monotonic() - STARTED, 3),
@@ -347,6 +350,7 @@ class Job:
             comparison=compared,
             before=first,
             translation=translation,
+            scene=scene,
         )
 
 

@@ -89,9 +89,7 @@ def comparison(before: Asset, after: Asset, views: Views) -> np.ndarray:
     return _sheet(rows, count)
 
 
-def _rendered(
-    asset: Asset, camera: Camera, scene: RayScene, lights: Sequence[Environment | None]
-) -> list[Render]:
+def _rendered(asset: Asset, camera: Camera, scene: RayScene, lights: Sequence[Environment | None]) -> list[Render]:
     return render_lights(asset, camera, lights, options=ShadeOptions(SAMPLES), supersampling=SUBPIXELS, scene=scene)
 
 

@@ -25,7 +25,7 @@ from reli3d.render.points import SurfacePoints
 from reli3d.render.shading import DEFAULT, ShadeOptions, shade
 
 PLAN_RAYS = 32768  # of a view, to find the points of a plan's pilot among
-BAND_RAYS = 1 << 18  # rays of one band of rows: bounds memory at about 40 MB whatever the image size
+BAND_RAYS = 1 << 17  # rays of one band of rows: bounds memory at about 20 MB whatever the image size
 
 
 @dataclass(frozen=True)
@@ -201,7 +201,7 @@ def _checked(
     asset: Asset | Sequence[Asset], camera: Camera, environments: Sequence[Environment | None]
 ) -> tuple[list[Asset], list[Environment]]:
     """The parts, and the lights: those given, or the first part's own for None."""
-    parts = list(asset) if isinstance(asset, (list, tuple)) else [asset]
+    parts: list[Asset] = list(asset) if isinstance(asset, (list, tuple)) else [asset]  # type: ignore[list-item]
     for part in parts:
         expect("asset", part, Asset)
     expect("camera", camera, Camera)
