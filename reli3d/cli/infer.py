@@ -248,8 +248,13 @@ class Job:
             _fetch(args.weights)
         path = weights.locate(args.weights)
         self.args, self.device, self.budget = args, device, refinement_budget(args, device)
-        trunk = args.precision and {"float32": torch.float32, "bfloat16": torch.bfloat16}[args.precision]
-        self.model, self.manifest = weights.load(path, trunk=trunk, device=device)
+        names: dict[str | None, weights.Trunk] = {
+            None: None,
+            "auto": "auto",
+            "float32": torch.float32,
+            "bfloat16": torch.bfloat16,
+        }
+        self.model, self.manifest = weights.load(path, trunk=names[args.precision], device=device)
         self.digest = weights.known_sha256(path)
         # takes half a minute the first time: not before the weights are known to be good
         ready_kernels(device, needed_kernels(device, type(self.model).__name__, refined=bool(self.budget)))

@@ -16,7 +16,9 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -29,6 +31,7 @@ from reli3d.nn.published import CHECKPOINT_PREFIX, our_key
 FORMAT = "reli3d 1"
 SMALL = Path(__file__).parents[1] / "assets" / "weights" / "small.safetensors"
 LARGE = 1 << 30  # bytes; hashing less takes about a second
+BFLOAT16 = ("avx512_bf16", "amx_bf16", "bf16")  # torch's names of the instructions: Intel and AMD, Intel, ARM
 HEADER_LIMIT = 100 << 20  # bytes, the safetensors library's own bound
 _DTYPES = {"F64": torch.float64, "F32": torch.float32, "F16": torch.float16, "BF16": torch.bfloat16}
 _NAMES = {dtype: name for name, dtype in _DTYPES.items()}
@@ -36,6 +39,7 @@ _NAMES = {dtype: name for name, dtype in _DTYPES.items()}
 
 AnyPreset = Preset | LocalPreset
 Network = Reconstructor | LocalReconstructor
+Trunk = torch.dtype | Literal["auto"] | None
 
 
 def network(preset: AnyPreset) -> Network:
@@ -199,7 +203,10 @@ def locate(weights: str | os.PathLike) -> Path:
 
 
 def load_model(
-    weights: str | os.PathLike, device: torch.device | str = "cpu", *, trunk: torch.dtype | None = None
+    weights: str | os.PathLike,
+    device: torch.device | str = "cpu",
+    *,
+    trunk: Trunk = None,
 ) -> Network:
     """The network of :func:`locate`'s file, see :func:`load`.  Raises WeightsError."""
     return load(locate(weights), trunk=trunk, device=device)[0]
@@ -210,20 +217,36 @@ def default_trunk(preset: AnyPreset, device: torch.device | str) -> torch.dtype:
     return torch.bfloat16 if preset.name == "official" and torch.device(device).type == "cuda" else torch.float32
 
 
+def computes_bfloat16(device: torch.device | str) -> bool:
+    """Whether ``device`` has instructions for products of bfloat16; without them such products take longer than those
+    of float32.  Torch before 2.10 does not tell of a CPU, which then counts as one without.
+    """
+    if torch.device(device).type == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    able: Mapping[str, bool] = getattr(torch.cpu, "get_capabilities", dict)()
+    return any(able.get(name, False) for name in BFLOAT16)
+
+
+def fastest_trunk(preset: AnyPreset, device: torch.device | str) -> torch.dtype:
+    """bfloat16 for networks with a trunk where the device has instructions for it, else float32."""
+    fast = isinstance(preset, Preset) and computes_bfloat16(device)
+    return torch.bfloat16 if fast else torch.float32
+
+
 def load(
     path: str | os.PathLike,
     preset: AnyPreset | None = None,
     *,
-    trunk: torch.dtype | None = None,
+    trunk: Trunk = None,
     device: torch.device | str = "cpu",
     expected_sha256: str | None = None,
 ) -> tuple[Network, Manifest]:
     """The network in a safetensors file, in evaluation mode, and the file's manifest.
 
     preset: what the file must hold; default the one in its header.  trunk: dtype of the trunk's parameters, default
-    :func:`default_trunk`; the rest is float32.  A tensor that is stored in the dtype asked for stays mapped from the
-    file on a CPU: it takes memory when it is read.  Names, shapes, length and, where given, the hash are checked before
-    anything is allocated.
+    :func:`default_trunk`, ``auto`` is :func:`fastest_trunk`; the rest is float32.  A tensor that is stored in the dtype
+    asked for stays mapped from the file on a CPU: it takes memory when it is read.  Names, shapes, length and, where
+    given, the hash are checked before anything is allocated.
     Raises WeightsError.
     """
     manifest = read_manifest(path)
@@ -233,6 +256,8 @@ def load(
         found = sha256(path)
         if found != expected_sha256:
             raise WeightsError(path, f"expected SHA-256 {expected_sha256}, got {found}; fetch it again")
+    if trunk == "auto":
+        trunk = fastest_trunk(preset, device)
     if isinstance(preset, LocalPreset) and trunk not in (None, torch.float32):
         raise WeightsError(path, f"expected float32 for the network of convolutions, got {trunk}")
     with torch.device("meta"):
@@ -250,6 +275,7 @@ def read_tensors(
     """The tensors named in ``wanted`` as the dtypes it gives.
 
     On a CPU a tensor of the dtype in the file is a part of the file's mapping: read when used, never written back.
+    Others are read one by one, so that what they were converted from does not stay in memory.
     """
     end = manifest.start + max((entry.end for entry in manifest.tensors.values()), default=0)
     body = torch.from_file(manifest.path, shared=False, size=end, dtype=torch.uint8)
@@ -257,8 +283,11 @@ def read_tensors(
     for name, dtype in wanted.items():
         entry = manifest.tensors[name]
         start = manifest.start + entry.start
-        raw = body[start : manifest.start + entry.end]
-        raw = raw if start % entry.dtype.itemsize == 0 else raw.clone()  # others' headers may end anywhere
+        if dtype == entry.dtype:
+            raw = body[start : manifest.start + entry.end]
+        else:
+            raw = torch.from_numpy(np.fromfile(manifest.path, np.uint8, entry.end - entry.start, offset=start))
+        raw = raw if raw.data_ptr() % entry.dtype.itemsize == 0 else raw.clone()  # others' headers may end anywhere
         result[name] = raw.view(entry.dtype).reshape(entry.shape).to(device, dtype)
     return result
 

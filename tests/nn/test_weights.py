@@ -3,7 +3,10 @@
 import json
 import os
 import pickle
+import subprocess
+import sys
 from collections import Counter
+from pathlib import Path
 
 import pytest
 import torch
@@ -15,8 +18,10 @@ from reli3d.nn.presets import OFFICIAL, SMALL
 from reli3d.nn.published import our_key
 from reli3d.nn.weights import (
     WeightsError,
+    computes_bfloat16,
     convert_checkpoint,
     default_trunk,
+    fastest_trunk,
     known_sha256,
     load,
     load_environment,
@@ -287,6 +292,49 @@ def test_bfloat16_is_the_default_for_the_published_sizes_on_cuda_alone(saved):
     ]
     path, _ = saved
     assert load_model(path).dtype == torch.float32 and load_model(path, trunk=torch.bfloat16).dtype == torch.bfloat16
+
+
+@pytest.mark.parametrize(
+    "able, has",
+    [
+        ({"avx512_bf16": True}, True),
+        ({"amx_bf16": True, "avx512_bf16": False}, True),
+        ({"bf16": True}, True),
+        ({"avx512_f": True, "avx512_bf16": False}, False),
+        ({}, False),
+    ],
+)
+def test_automatic_precision_asks_what_the_processor_has(saved, monkeypatch, able, has):
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: able, raising=False)
+    assert computes_bfloat16("cpu") == has
+    assert fastest_trunk(OFFICIAL, "cpu") == (torch.bfloat16 if has else torch.float32)
+    assert fastest_trunk(SMALL, "cpu") == torch.float32  # it has no trunk
+    assert load_model(saved[0], trunk="auto").dtype == fastest_trunk(NANO, "cpu")
+
+
+def test_converted_weights_leave_nothing_of_the_file_in_memory(tmp_path):
+    """64 MiB of float32 as bfloat16 take 32: what is mapped and what is read must not stay."""
+    path, code = (
+        tmp_path / "large.safetensors",
+        """
+import sys, torch
+from pathlib import Path
+from reli3d.nn.weights import read_manifest, read_tensors
+def held():
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return sum(int(line.split()[1]) for line in lines if line[:6] in ("RssAno", "RssFil"))
+manifest = read_manifest(sys.argv[1])
+read_tensors(manifest, {"0": torch.bfloat16})
+before = held()
+kept = read_tensors(manifest, {str(k): torch.bfloat16 for k in range(16)})
+print((held() - before) / 1024)
+""",
+    )
+    if not Path("/proc/self/status").exists():
+        pytest.skip("the system does not tell what a process holds")
+    weights.write(path, {str(k): torch.full((1 << 20,), float(k)) for k in range(16)}, {})
+    done = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=True)
+    assert 30 < float(done.stdout) < 64  # 32 MiB, and what the allocator holds; with the mapped file it would be 96
 
 
 def test_published_environment_weights_load(goldens, saved):
