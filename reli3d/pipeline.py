@@ -27,6 +27,7 @@ from reli3d.geometry.visibility import visible_from
 from reli3d.nn.blocks import in_rows
 from reli3d.nn.field import CHUNK, Field, TriplaneField
 from reli3d.nn.local import LocalField, LocalReconstructor
+from reli3d.nn.precision import heads_dtype
 from reli3d.nn.presets import LocalPreset, Preset
 from reli3d.nn.reni import map_directions
 from reli3d.nn.view_features import ViewMaps
@@ -78,10 +79,12 @@ def prepare(model: Network, views: Views, model_from_input: Similarity) -> Prepa
     return Prepared(batch, torch.cat([detail.images, silhouette[..., None]], -1).contiguous(), detail.camera)
 
 
-def encode(model: Network, prepared: Prepared, *, background: bool = False) -> Field:
+def encode(model: Network, prepared: Prepared, *, background: bool = False,
+           heads: torch.dtype = torch.float32) -> Field:  # fmt: skip
     """Run the network on the views of one object.
 
-    background: whether the illumination path of a :class:`Reconstructor` may look past the masks.
+    background: whether the illumination path of a :class:`Reconstructor` may look past the masks.  heads: in which its
+    material heads compute.
     """
     batch = prepared.batch
     if isinstance(model, LocalReconstructor):
@@ -93,7 +96,7 @@ def encode(model: Network, prepared: Prepared, *, background: bool = False) -> F
         batch.images[None], batch.masks[None], batch.c2w[None], batch.intrinsics[None], background_visible=shown
     )
     maps = ViewMaps(code.view_tokens[0].float(), prepared.images, prepared.camera)
-    return TriplaneField(maps, model, code)
+    return TriplaneField(maps, model, code, heads)
 
 
 def extract(field: Field, resolution: int) -> Mesh:
@@ -117,14 +120,10 @@ def _free_surface(field: TriplaneField, resolution: int) -> Mesh:
     level = field.grid_level(flat[: resolution + 1, 2])
     _check_signs(level)
     found = field.cube_weights(flat, level)
+    names = ("deformation", "alpha", "beta", "gamma", "cubes")
+    deformation, alpha, beta, gamma, cubes = (found[name] for name in names)
     return extract_surface(
-        level,
-        radius=radius,
-        deformation=found["deformation"],
-        alpha=found["alpha"],
-        beta=found["beta"],
-        gamma=found["gamma"],
-        cubes=found["cubes"],
+        level, radius=radius, deformation=deformation, alpha=alpha, beta=beta, gamma=gamma, cubes=cubes
     )
 
 
@@ -290,6 +289,7 @@ class ReconstructOptions:
     :func:`default_normalization`.  frame: ``input`` (that of the cameras) or ``model``.  up: the axis of that frame
     that shall become +Y.  uv: ``project`` or ``xatlas``.  hero: index of the network's main view, or ``random``.
     background: ``masked``, ``visible`` or ``auto``, see :func:`~reli3d.views.published_views.background_shown`.
+    heads: precision of a triplane's material heads, see :func:`~reli3d.nn.precision.heads_dtype`.
     """
 
     texture_size: int = 1024
@@ -301,6 +301,7 @@ class ReconstructOptions:
     hero: int | str = 0
     background: str = "masked"
     seed: int = 0
+    heads: str = "float32"
 
     def __post_init__(self):
         if not 256 <= self.texture_size <= 4096:
@@ -360,11 +361,12 @@ def reconstruct_placed(placed: Placed, model: Network, options: ReconstructOptio
     shown = background_shown(
         placed.views, options.background, readable=getattr(model.preset, "reads_background", False)
     )
+    heads = heads_dtype(model.preset, model.device, options.heads)
     torch.manual_seed(options.seed)
     with watch.stage("prepare"):
         prepared = prepare(model, placed.views, placed.model_from_input)
     with watch.stage("network"):
-        field = encode(model, prepared, background=shown)
+        field = encode(model, prepared, background=shown, heads=heads)
     with watch.stage("surface"):
         mesh = extract(field, options.resolution or model.preset.resolution)
     with watch.stage("textures"):

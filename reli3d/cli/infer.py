@@ -243,6 +243,7 @@ class Job:
             hero,
             args.background,
             args.seed,
+            args.heads,
         )
         if args.download:
             _fetch(args.weights)

@@ -80,6 +80,7 @@ class TriplaneField(Field):
 
     model: Reconstructor
     code: Code  # of one object
+    heads: torch.dtype = torch.float32  # of the hidden layers of the material's heads
 
     reads_views: ClassVar[bool] = False
 
@@ -136,7 +137,7 @@ class TriplaneField(Field):
         }
 
     def _material(self, position: Tensor, normal: Tensor, visible: Tensor) -> dict[str, Tensor]:
-        values = {k: v[0] for k, v in self.model.query(self.code, position[None], MATERIAL).items()}
+        values = {k: v[0] for k, v in self.model.query(self.code, position[None], MATERIAL, dtype=self.heads).items()}
         return {
             "base_color": values["base_color"],
             "roughness": values["roughness"][:, 0],

@@ -25,13 +25,13 @@ from torch import Tensor
 from reli3d.io.files import InputError, file_size, replacing
 from reli3d.nn.local import LocalReconstructor
 from reli3d.nn.model import Reconstructor
+from reli3d.nn.precision import fastest
 from reli3d.nn.presets import OFFICIAL, LocalPreset, Preset, from_json, to_json
 from reli3d.nn.published import CHECKPOINT_PREFIX, our_key
 
 FORMAT = "reli3d 1"
 SMALL = Path(__file__).parents[1] / "assets" / "weights" / "small.safetensors"
 LARGE = 1 << 30  # bytes; hashing less takes about a second
-BFLOAT16 = ("avx512_bf16", "amx_bf16", "bf16")  # torch's names of the instructions: Intel and AMD, Intel, ARM
 HEADER_LIMIT = 100 << 20  # bytes, the safetensors library's own bound
 _DTYPES = {"F64": torch.float64, "F32": torch.float32, "F16": torch.float16, "BF16": torch.bfloat16}
 _NAMES = {dtype: name for name, dtype in _DTYPES.items()}
@@ -217,22 +217,6 @@ def default_trunk(preset: AnyPreset, device: torch.device | str) -> torch.dtype:
     return torch.bfloat16 if preset.name == "official" and torch.device(device).type == "cuda" else torch.float32
 
 
-def computes_bfloat16(device: torch.device | str) -> bool:
-    """Whether ``device`` has instructions for products of bfloat16; without them such products take longer than those
-    of float32.  Torch before 2.10 does not tell of a CPU, which then counts as one without.
-    """
-    if torch.device(device).type == "cuda":
-        return torch.cuda.is_bf16_supported(including_emulation=False)
-    able: Mapping[str, bool] = getattr(torch.cpu, "get_capabilities", dict)()
-    return any(able.get(name, False) for name in BFLOAT16)
-
-
-def fastest_trunk(preset: AnyPreset, device: torch.device | str) -> torch.dtype:
-    """bfloat16 for networks with a trunk where the device has instructions for it, else float32."""
-    fast = isinstance(preset, Preset) and computes_bfloat16(device)
-    return torch.bfloat16 if fast else torch.float32
-
-
 def load(
     path: str | os.PathLike,
     preset: AnyPreset | None = None,
@@ -244,9 +228,9 @@ def load(
     """The network in a safetensors file, in evaluation mode, and the file's manifest.
 
     preset: what the file must hold; default the one in its header.  trunk: dtype of the trunk's parameters, default
-    :func:`default_trunk`, ``auto`` is :func:`fastest_trunk`; the rest is float32.  A tensor that is stored in the dtype
-    asked for stays mapped from the file on a CPU: it takes memory when it is read.  Names, shapes, length and, where
-    given, the hash are checked before anything is allocated.
+    :func:`default_trunk`, ``auto`` is :func:`~reli3d.nn.precision.fastest`; the rest is float32.  A tensor that is
+    stored in the dtype asked for stays mapped from the file on a CPU: it takes memory when it is read.  Names, shapes,
+    length and, where given, the hash are checked before anything is allocated.
     Raises WeightsError.
     """
     manifest = read_manifest(path)
@@ -257,7 +241,7 @@ def load(
         if found != expected_sha256:
             raise WeightsError(path, f"expected SHA-256 {expected_sha256}, got {found}; fetch it again")
     if trunk == "auto":
-        trunk = fastest_trunk(preset, device)
+        trunk = fastest(preset, device)
     if isinstance(preset, LocalPreset) and trunk not in (None, torch.float32):
         raise WeightsError(path, f"expected float32 for the network of convolutions, got {trunk}")
     with torch.device("meta"):

@@ -18,10 +18,8 @@ from reli3d.nn.presets import OFFICIAL, SMALL
 from reli3d.nn.published import our_key
 from reli3d.nn.weights import (
     WeightsError,
-    computes_bfloat16,
     convert_checkpoint,
     default_trunk,
-    fastest_trunk,
     known_sha256,
     load,
     load_environment,
@@ -292,24 +290,6 @@ def test_bfloat16_is_the_default_for_the_published_sizes_on_cuda_alone(saved):
     ]
     path, _ = saved
     assert load_model(path).dtype == torch.float32 and load_model(path, trunk=torch.bfloat16).dtype == torch.bfloat16
-
-
-@pytest.mark.parametrize(
-    "able, has",
-    [
-        ({"avx512_bf16": True}, True),
-        ({"amx_bf16": True, "avx512_bf16": False}, True),
-        ({"bf16": True}, True),
-        ({"avx512_f": True, "avx512_bf16": False}, False),
-        ({}, False),
-    ],
-)
-def test_automatic_precision_asks_what_the_processor_has(saved, monkeypatch, able, has):
-    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: able, raising=False)
-    assert computes_bfloat16("cpu") == has
-    assert fastest_trunk(OFFICIAL, "cpu") == (torch.bfloat16 if has else torch.float32)
-    assert fastest_trunk(SMALL, "cpu") == torch.float32  # it has no trunk
-    assert load_model(saved[0], trunk="auto").dtype == fastest_trunk(NANO, "cpu")
 
 
 def test_converted_weights_leave_nothing_of_the_file_in_memory(tmp_path):
