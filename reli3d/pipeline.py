@@ -136,10 +136,9 @@ def _bounded_surface(field: LocalField, resolution: int) -> Mesh:
     bound = field.bound(flat)
     level, margin = bound.clamp(min=OUTSIDE), MARGIN_CELLS * 2 * radius / resolution / preset.softness
     for part in (bound < margin).nonzero()[:, 0].split(CHUNK):
-        level[part] = field.free_level(flat[part])
+        level[part] = field.level_within(flat[part], bound[part])
     level = torch.maximum(level, bound).view((resolution + 1,) * 3)
-    silhouette = maps.images[..., 3].contiguous()
-    level = cover_silhouettes(level, bound.view_as(level), silhouette, maps.camera, radius=radius)
+    level = cover_silhouettes(level, bound.view_as(level), maps.silhouette, maps.camera, radius=radius)
     _check_signs(level)
     return extract_surface(level, radius=radius)
 

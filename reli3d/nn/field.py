@@ -40,7 +40,7 @@ def bound_level(maps: ViewMaps, points: Tensor, softness: float) -> Tensor:
     """Level ``(N,)`` of the hull of the views' silhouettes at ``points (N, 3)``, in units of ``softness``; no
     gradient.
     """
-    return -hull_distance(points, maps.images[..., 3].contiguous(), maps.camera) / softness
+    return -hull_distance(points, maps.silhouette, maps.camera) / softness
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ Wang et al. 2021, IBRNet).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor, nn
@@ -28,6 +29,11 @@ class ViewMaps:
     tokens: Tensor
     images: Tensor
     camera: Camera  # of ``images``
+
+    @cached_property
+    def silhouette(self) -> Tensor:
+        """The signed distances alone, ``(V, S, S)`` contiguous, as look-ups of many blocks of points read them."""
+        return self.images[..., 3].contiguous()
 
 
 AHEAD = 4  # numbers of ahead_of_surface
