@@ -5,12 +5,16 @@ from the published output by the norm of that output.  int8 is torch's dynamic q
 (weights by tensor or by channel, activations by tensor) in a float32 stream; the others stay float32.  The last rows
 are one feed-forward layer of the published width with random weights, with its time: the second has one input channel
 60 times as large as the others, as trained transformers have.
+
+``--meshes FOLDER`` prints instead what bfloat16 does to the material of the published heads at the vertices of GLB
+files: peak signal to noise against float32, and degrees between the normals.
 """
 
 from __future__ import annotations
 
 import argparse
 import copy
+import math
 import statistics
 import sys
 import time
@@ -19,8 +23,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
+import trimesh
 from torch import Tensor, nn
 
+from reli3d.geometry.triplane import sample_triplane
+from reli3d.nn.heads import Heads
 from reli3d.nn.illumination import Transformer1D
 from reli3d.nn.presets import BackboneSizes, EncoderSizes, IlluminationSizes, UpsamplerSizes
 from reli3d.nn.published import our_key
@@ -78,6 +85,31 @@ def error(got: Tensor, want: Tensor) -> float:
     return float((got.float() - want).norm() / want.norm())
 
 
+@torch.no_grad()
+def material(goldens: Path, meshes: Path) -> list[str]:
+    """Rows of Markdown: a mesh, its points, and how far the published heads in bfloat16 are from float32."""
+    with np.load(goldens / "object_representation_heads.npz") as file:
+        held = {k: torch.from_numpy(file[k]) for k in file.files if file[k].dtype.kind in "fi"}
+    names, heads = ("base_color", "roughness", "metallic", "normal"), Heads(120, 64).eval()
+    prefix = "param.net.heads."
+    state = {k[len("param.") :]: v for k, v in held.items() if k.startswith(prefix)}
+    heads.load_state_dict({our_key("object_representation." + k)[len("heads.") :]: v for k, v in state.items()})
+    rows = [f"| mesh | points | {', '.join(names[:3])}, dB | normal, degrees: mean, 99 % |", "|---|---|---|---|"]
+    for path in sorted(meshes.glob("*.glb")):
+        shape = trimesh.load(path, force="mesh", process=False)
+        points = torch.from_numpy(np.array(shape.vertices, np.float32))
+        low, high = points.aminmax(dim=0)
+        points = (2.0 * points - low - high) / float((high - low).max())
+        features = sample_triplane(held["triplane"], points[None])[0]
+        full, low16 = heads(features, names), heads(features, names, torch.bfloat16)
+        noise = [-10.0 * math.log10(float((low16[k] - full[k]).square().mean())) for k in names[:3]]
+        cosine = (low16["normal"].double() * full["normal"].double()).sum(-1)
+        angle = torch.rad2deg(torch.acos((cosine / low16["normal"].double().norm(dim=-1)).clamp(-1, 1)))
+        decibels = ", ".join(f"{v:.1f}" for v in noise)
+        rows.append(f"| {path.stem} | {len(points)} | {decibels} | {angle.mean():.3f}, {angle.quantile(0.99):.3f} |")
+    return rows
+
+
 def like(module: nn.Module, *values: Tensor) -> list[Tensor]:
     """``values`` in the dtype of the module's parameters."""
     dtype = next((p.dtype for p in module.parameters()), torch.float32)
@@ -119,7 +151,11 @@ def feed_forward(large: float) -> dict[str, tuple[float, float]]:
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m bench.studies.precision", description=__doc__.splitlines()[0])
     parser.add_argument("goldens", type=Path)
+    parser.add_argument("--meshes", type=Path, help="folder of GLB files: only the table of materials")
     options = parser.parse_args(argv)
+    if options.meshes is not None:
+        sys.stdout.write("\n".join(material(options.goldens, options.meshes)) + "\n")
+        return 0
     warnings.filterwarnings("ignore", category=DeprecationWarning)
     torch.backends.quantized.engine = "onednn"
     rows = {name: {k: f"{v:.1e}" for k, v in published(options.goldens, name).items()} for name in MODULES}

@@ -280,6 +280,7 @@ class Job:
 
     def _run(self, folder: Path | Packed, name: str, replacing: Callable, steps: Progress) -> None:
         from reli3d.geometry.rays import RayScene
+        from reli3d.nn.precision import heads_dtype
         from reli3d.output import results
         from reli3d.output.preview import comparison, preview
         from reli3d.pipeline import Stopwatch, place, published_input, reconstruct_placed, refined
@@ -319,8 +320,7 @@ class Job:
             record = {"refinement": {"views": len(photographs), **self.budget, **result.record()}}
         steps("preview")
         scene = RayScene(asset.mesh.vertices, asset.mesh.faces)
-        on_device = shown.to(self.device)
-        picture = preview(asset, on_device, scene)
+        picture = preview(asset, on_device := shown.to(self.device), scene)
         frames, translation = results.frame_record(placed.model_from_input, output, views.origin, args.frame, args.up)
         info = {
             "object": name,
@@ -332,6 +332,7 @@ class Job:
             "weights": results.weights_record(self.manifest, self.digest),
             "preset": self.model.preset.name,
             "precision": str(self.model.dtype).removeprefix("torch."),
+            "precision_of_heads": str(heads_dtype(self.model.preset, self.device, args.heads)).removeprefix("torch."),
             "texture_size": args.texture_size,
             "resolution": args.resolution or self.model.preset.resolution,
             "background": args.background,
