@@ -199,7 +199,7 @@ def test_a_half_hidden_everywhere_is_a_stop_less(tmp_path, asset, views, monkeyp
     with chromium() as tab:
         for hidden, stops in ((0.5, 0), (0.0, -1)):
             monkeypatch.setattr(
-                viewer, "blocked_transfer", lambda m, h=hidden: h * cosine * spherical_harmonics(m.normals)
+                viewer, "blocked_transfer", lambda m, scene, h=hidden: h * cosine * spherical_harmonics(m.normals)
             )
             page = one_page(asset, views, sky())
             (tmp_path / f"{stops}.html").write_text(page)
