@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,7 +25,7 @@ from reli3d.render.points import SurfacePoints
 from reli3d.render.shading import DEFAULT, ShadeOptions, shade
 
 PLAN_RAYS = 32768  # of a view, to find the points of a plan's pilot among
-BAND_RAYS = 1 << 17  # rays of one band of rows: bounds memory at about 20 MB whatever the image size
+BAND_RAYS = 1 << 18  # rays of one band of rows: bounds memory at about 40 MB whatever the image size
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,7 @@ def render_lights(
         rows = min(band, fine.height - row)
         part = Camera(fine.c2w, fine.intrinsics - fine.intrinsics.new_tensor([0.0, 0.0, 0.0, row]), fine.width, rows)
         layers = _band(parts, part, lights, scene, row * fine.width, shadows, background, options)
-        bands.append([_resolve(layer, supersampling) for layer in layers])
+        bands.append([_resolve(layer, supersampling) for layer in layers])  # one at a time: they are large
         if progress is not None:
             progress((row + rows) / fine.height)
     *radiances, alpha, base_color, orm, normal, position, depth = (torch.cat(p) for p in zip(*bands))
@@ -241,7 +241,7 @@ def _points(parts: Sequence[Asset], face: Tensor, bary: Tensor) -> SurfacePoints
     return SurfacePoints(*(torch.cat(columns)[back] for columns in zip(*(vars(p).values() for p in pieces))))
 
 
-def _band(parts, camera, lights, scene, first, shadows, background, options) -> list[Tensor]:
+def _band(parts, camera, lights, scene, first, shadows, background, options) -> Iterator[Tensor]:
     """Premultiplied layers ``(rows, W, C)`` of one band of subpixels: the radiance of each light, then the others, in
     the order that :func:`render_lights` takes apart.
     """
@@ -262,16 +262,12 @@ def _band(parts, camera, lights, scene, first, shadows, background, options) -> 
         points.position,
         depth,
     ]
-    full = []
-    for layer in layers:
-        image = layer.new_zeros(directions.shape[0], layer.shape[1])
-        full.append(image.index_copy(0, index, layer).reshape(camera.height, camera.width, -1))
-    if background == "environment":
-        alpha = full[len(lights)]
-        for k, light in enumerate(lights):
-            behind = light.lookup(directions).reshape(camera.height, camera.width, 3)
-            full[k] = torch.where(alpha > 0.0, full[k], behind)
-    return full
+    seen = (hits.face >= 0)[:, None]
+    for k, layer in enumerate(layers):
+        image = layer.new_zeros(directions.shape[0], layer.shape[1]).index_copy(0, index, layer)
+        if background == "environment" and k < len(lights):
+            image = torch.where(seen, image, lights[k].lookup(directions))
+        yield image.reshape(camera.height, camera.width, -1)
 
 
 def _resolve(layer: Tensor, factor: int) -> Tensor:
