@@ -25,6 +25,7 @@ from reli3d.geometry.visibility import visible_from
 from reli3d.nn.blocks import in_rows
 from reli3d.nn.field import CHUNK, Field, TriplaneField
 from reli3d.nn.local import LocalField, LocalReconstructor
+from reli3d.nn.precision import heads_dtype
 from reli3d.nn.presets import LocalPreset, Preset
 from reli3d.nn.reni import map_directions
 from reli3d.nn.view_features import ViewMaps
@@ -54,10 +55,12 @@ class NoSurface(ValueError):
     """The field of an object has one sign in its whole box."""
 
 
-def encode(model: Network, prepared: Prepared, *, background: bool = False) -> Field:
+def encode(model: Network, prepared: Prepared, *, background: bool = False,
+           heads: torch.dtype = torch.float32) -> Field:  # fmt: skip
     """Run the network on the views of one object.
 
-    background: whether the illumination path of a :class:`Reconstructor` may look past the masks.
+    background: whether the illumination path of a :class:`Reconstructor` may look past the masks.  heads: in which its
+    material heads compute.
     """
     batch = prepared.batch
     if isinstance(model, LocalReconstructor):
@@ -75,7 +78,7 @@ def encode(model: Network, prepared: Prepared, *, background: bool = False) -> F
         batch.images[None], batch.masks[None], batch.c2w[None], batch.intrinsics[None], background_visible=shown
     )
     maps = ViewMaps(code.view_tokens[0].float(), prepared.images, prepared.camera)
-    return TriplaneField(maps, model, code)
+    return TriplaneField(maps, model, code, heads)
 
 
 def extract(field: Field, resolution: int) -> Mesh:
@@ -99,14 +102,10 @@ def _free_surface(field: TriplaneField, resolution: int) -> Mesh:
     level = field.grid_level(flat[: resolution + 1, 2])
     _check_signs(level)
     found = field.cube_weights(flat, level)
+    names = ("deformation", "alpha", "beta", "gamma", "cubes")
+    deformation, alpha, beta, gamma, cubes = (found[name] for name in names)
     return extract_surface(
-        level,
-        radius=radius,
-        deformation=found["deformation"],
-        alpha=found["alpha"],
-        beta=found["beta"],
-        gamma=found["gamma"],
-        cubes=found["cubes"],
+        level, radius=radius, deformation=deformation, alpha=alpha, beta=beta, gamma=gamma, cubes=cubes
     )
 
 
@@ -119,10 +118,9 @@ def _bounded_surface(field: LocalField, resolution: int) -> Mesh:
     bound = field.bound(flat)
     level, margin = bound.clamp(min=OUTSIDE), MARGIN_CELLS * 2 * radius / resolution / preset.softness
     for part in (bound < margin).nonzero()[:, 0].split(CHUNK):
-        level[part] = field.free_level(flat[part])
+        level[part] = field.level_within(flat[part], bound[part])
     level = torch.maximum(level, bound).view((resolution + 1,) * 3)
-    silhouette = maps.images[..., 3].contiguous()
-    level = cover_silhouettes(level, bound.view_as(level), silhouette, maps.camera, radius=radius)
+    level = cover_silhouettes(level, bound.view_as(level), maps.silhouette, maps.camera, radius=radius)
     _check_signs(level)
     return extract_surface(level, radius=radius)
 
@@ -269,6 +267,7 @@ class ReconstructOptions:
     :func:`default_normalization`.  frame: ``input`` (that of the cameras) or ``model``.  up: the axis of that frame
     that shall become +Y.  uv: ``project`` or ``xatlas``.  hero: index of the network's main view, or ``random``.
     background: ``masked``, ``visible`` or ``auto``, see :func:`~reli3d.views.published_views.background_shown`.
+    heads: precision of a triplane's material heads, see :func:`~reli3d.nn.precision.heads_dtype`.
     symmetry: ``auto`` lets a network of convolutions see 3 to 8 views of an object that is its own mirror image as
     views of both halves, see :func:`~reli3d.geometry.symmetry.mirror_plane`; or ``off``.
     """
@@ -282,6 +281,7 @@ class ReconstructOptions:
     hero: int | str = 0
     background: str = "masked"
     seed: int = 0
+    heads: str = "float32"
     symmetry: str = "auto"
 
     def __post_init__(self):
@@ -344,6 +344,7 @@ def reconstruct_placed(placed: Placed, model: Network, options: ReconstructOptio
     shown = background_shown(
         placed.views, options.background, readable=getattr(model.preset, "reads_background", False)
     )
+    heads = heads_dtype(model.preset, model.device, options.heads)
     torch.manual_seed(options.seed)
     with watch.stage("prepare"):
         prepared = prepare(model, placed.views, placed.model_from_input)
@@ -355,7 +356,7 @@ def reconstruct_placed(placed: Placed, model: Network, options: ReconstructOptio
                 "symmetry: the object is its own mirror image; photographs are read as views of both halves"
             )
     with watch.stage("network"):
-        field = encode(model, prepared, background=shown)
+        field = encode(model, prepared, background=shown, heads=heads)
     with watch.stage("surface"):
         mesh = extract(field, options.resolution or model.preset.resolution)
     with watch.stage("textures"):

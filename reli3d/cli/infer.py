@@ -243,13 +243,14 @@ class Job:
             hero,
             args.background,
             args.seed,
+            args.heads,
             symmetry=args.symmetry,
         )
         if args.download:
             _fetch(args.weights)
         path = weights.locate(args.weights)
         self.args, self.device, self.budget = args, device, refinement_budget(args, device)
-        trunk = args.precision and {"float32": torch.float32, "bfloat16": torch.bfloat16}[args.precision]
+        trunk = args.precision if args.precision in (None, "auto") else getattr(torch, args.precision)
         self.model, self.manifest = weights.load(path, trunk=trunk, device=device)
         self.digest = weights.known_sha256(path)
         # takes half a minute the first time: not before the weights are known to be good
@@ -274,6 +275,8 @@ class Job:
         return "done"
 
     def _run(self, folder: Path | Packed, name: str, replacing: Callable, steps: Progress) -> None:
+        from reli3d.geometry.rays import RayScene
+        from reli3d.nn.precision import heads_dtype
         from reli3d.output import results
         from reli3d.output.preview import comparison, preview
         from reli3d.pipeline import Stopwatch, place, published_input, reconstruct_placed, refined
@@ -313,7 +316,8 @@ class Job:
             first, asset = asset if result.kept == "result" else None, result.asset
             record = {"refinement": {"views": len(photographs), **self.budget, **result.record()}}
         steps("preview")
-        picture = preview(asset, shown.to(self.device))
+        scene = RayScene(asset.mesh.vertices, asset.mesh.faces)
+        picture = preview(asset, on_device := shown.to(self.device), scene)
         frames, translation = results.frame_record(placed.model_from_input, output, views.origin, args.frame, args.up)
         info = {
             "object": name,
@@ -325,13 +329,14 @@ class Job:
             "weights": results.weights_record(self.manifest, self.digest),
             "preset": self.model.preset.name,
             "precision": str(self.model.dtype).removeprefix("torch."),
+            "precision_of_heads": str(heads_dtype(self.model.preset, self.device, args.heads)).removeprefix("torch."),
             "texture_size": args.texture_size,
             "resolution": args.resolution or self.model.preset.resolution,
             "background": args.background,
             "seed": args.seed,
             "device": self.device,
             "mesh": results.mesh_statistics(asset.mesh),
-            "mask_iou": results.mask_iou(asset.mesh, shown.to(self.device)),
+            "mask_iou": results.mask_iou(scene, on_device),
             **record,
             "seconds": seconds,
             "seconds_since_start": round(time.monotonic() - STARTED, 3),
@@ -349,6 +354,7 @@ class Job:
             comparison=compared,
             before=first,
             translation=translation,
+            scene=scene,
         )
 
 

@@ -52,8 +52,15 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="auto: cuda where there is one")
     p.add_argument(
         "--precision",
-        choices=("float32", "bfloat16"),
-        help="of the network's large parts; default float32, for official weights on CUDA bfloat16",
+        choices=("float32", "bfloat16", "auto"),
+        help="of the network's large parts; default float32, for official weights on CUDA bfloat16; auto: for official "
+        "weights bfloat16 wherever the processor has instructions for it",
+    )
+    p.add_argument(
+        "--heads",
+        choices=("float32", "bfloat16", "auto"),
+        default="float32",
+        help="precision of the official network's material heads; auto: bfloat16 where the processor has it",
     )
     p.add_argument("--texture-size", type=int, default=1024, help="texels, 256 to 4096 (default 1024)")
     p.add_argument(

@@ -11,11 +11,10 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components as graph_components
 from torch import Tensor
 
 from reli3d._bridge import check, tensor_of
+from reli3d.geometry.components import graph_components
 
 NORMAL_MIN = 1.0e-20  # squared length of an area-weighted normal sum below which it counts as zero (published release)
 
@@ -180,7 +179,7 @@ def face_components(mesh: Mesh) -> Tensor:
         return torch.zeros(0, dtype=torch.int64, device=mesh.faces.device)
     n = int(faces.max()) + 1
     rows, cols = faces[:, [0, 1]].reshape(-1), faces[:, [1, 2]].reshape(-1)
-    _, label = graph_components(coo_matrix((np.ones(len(rows), np.int8), (rows, cols)), shape=(n, n)), directed=False)
+    label = graph_components(rows, cols, n)
     if not label.any():
         return torch.zeros(len(faces), dtype=torch.int64, device=mesh.faces.device)
     _, first, inverse = np.unique(label[faces[:, 0]], return_index=True, return_inverse=True)
@@ -250,14 +249,12 @@ def report(mesh: Mesh) -> MeshReport:
     same = tail[one] == tail[other]
     join_a = np.concatenate([one, after[one]])
     join_b = np.concatenate([np.where(same, other, after[other]), np.where(same, after[other], other)])
-    graph = coo_matrix((np.ones(len(join_a), np.int8), (join_a, join_b)), shape=(len(tail), len(tail)))
-    _, fan = graph_components(graph, directed=False)
-    fan_vertex = np.unique(fan * n + tail) % n  # one entry for every fan
+    fan = graph_components(join_a, join_b, len(tail))
+    fan_vertex = np.unique(fan.astype(np.int64) * n + tail) % n  # one entry for every fan
     fans = np.bincount(fan_vertex, minlength=n)
     used = fans > 0
 
-    links = coo_matrix((np.ones(len(tail), np.int8), (tail, head)), shape=(n, n))
-    _, label = graph_components(links, directed=False)
+    label = graph_components(tail, head, n)
     counts = {
         "welded_vertices": int(used.sum()),
         "components": len(np.unique(label[used])),

@@ -40,7 +40,7 @@ def bound_level(maps: ViewMaps, points: Tensor, softness: float) -> Tensor:
     """Level ``(N,)`` of the hull of the views' silhouettes at ``points (N, 3)``, in units of ``softness``; no
     gradient.
     """
-    return -hull_distance(points, maps.images[..., 3].contiguous(), maps.camera) / softness
+    return -hull_distance(points, maps.silhouette, maps.camera) / softness
 
 
 @dataclass(frozen=True)
@@ -80,6 +80,7 @@ class TriplaneField(Field):
 
     model: Reconstructor
     code: Code  # of one object
+    heads: torch.dtype = torch.float32  # of the hidden layers of the material's heads
 
     reads_views: ClassVar[bool] = False
 
@@ -136,7 +137,7 @@ class TriplaneField(Field):
         }
 
     def _material(self, position: Tensor, normal: Tensor, visible: Tensor) -> dict[str, Tensor]:
-        values = {k: v[0] for k, v in self.model.query(self.code, position[None], MATERIAL).items()}
+        values = {k: v[0] for k, v in self.model.query(self.code, position[None], MATERIAL, dtype=self.heads).items()}
         return {
             "base_color": values["base_color"],
             "roughness": values["roughness"][:, 0],

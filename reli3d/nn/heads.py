@@ -51,13 +51,18 @@ def mlp(inputs: int, width: int, outputs: int, hidden: int) -> nn.Sequential:
 
 
 def _rest(layers: nn.Module, x: Tensor) -> Tensor:
-    """What :func:`mlp` makes of its first activation ``x (width, N)``, ``(outputs, N)``; without gradient."""
-    for layer in list(layers.children())[2:]:
+    """What :func:`mlp` makes of its first activation ``x (width, N)``, ``(outputs, N)`` float32; without gradient.
+
+    Hidden layers are computed in the dtype of ``x``, the last one in float32.
+    """
+    *hidden, _ = list(layers.children())[2:]
+    last = linear_of(layers, -1)
+    for layer in hidden:
         if isinstance(layer, nn.Linear):
-            x = torch.addmm(layer.bias[:, None], layer.weight, x)
+            x = torch.addmm(layer.bias.to(x.dtype)[:, None], layer.weight.to(x.dtype), x)
         else:
             x = functional.silu(x, inplace=True)
-    return x
+    return torch.addmm(last.bias[:, None], last.weight, x.float())
 
 
 def activate(name: str, raw: Tensor) -> Tensor:
@@ -87,21 +92,24 @@ class Heads(nn.ModuleDict):
     def __init__(self, features: int, width: int):
         super().__init__({name: mlp(features, width, head.outputs, head.hidden) for name, head in HEADS.items()})
 
-    def forward(self, features: Tensor, names: Sequence[str]) -> dict[str, Tensor]:
-        """``{name: (..., outputs)}`` of features ``(..., features)``; values as :func:`activate` describes them."""
+    def forward(self, features: Tensor, names: Sequence[str], dtype: torch.dtype = torch.float32) -> dict[str, Tensor]:
+        """``{name: (..., outputs)}`` of features ``(..., features)``; values as :func:`activate` describes them.
+
+        dtype: of the hidden layers where no gradient is recorded; inputs and values are float32.
+        """
         for name in names:
             if name not in self:
                 raise ValueError(f"heads: expected some of {', '.join(self)}, got {name}")
         if torch.is_grad_enabled():
             raw = {name: self[name](features) for name in names}
         else:
-            raw = self._inferred(features, names)
+            raw = self._inferred(features, names, dtype)
         return {name: activate(name, value) for name, value in raw.items()}
 
-    def _inferred(self, features: Tensor, names: Sequence[str]) -> dict[str, Tensor]:
+    def _inferred(self, features: Tensor, names: Sequence[str], dtype: torch.dtype) -> dict[str, Tensor]:
         """The MLPs without gradient: one matrix for all first layers, what nobody will ask again is overwritten."""
-        weight, bias = self.first_layer(names)
-        hidden = torch.addmm(bias[:, None], weight, features.reshape(-1, features.shape[-1]).T)
+        weight, bias = (v.to(dtype) for v in self.first_layer(names))
+        hidden = torch.addmm(bias[:, None], weight, features.reshape(-1, features.shape[-1]).to(dtype).T)
         raw = self.after_first(hidden, names)
         return {name: value.reshape(*features.shape[:-1], value.shape[-1]) for name, value in raw.items()}
 

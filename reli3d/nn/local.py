@@ -202,7 +202,14 @@ class LocalField(Field):
         return bound_level(self.maps, points, self.model.preset.softness)
 
     def _level(self, points: Tensor) -> Tensor:
-        return self.model.level(self._features(points))[:, 0] - self._offset()
+        return self._level_within(points, self.bound(points))
+
+    def level_within(self, points: Tensor, bound: Tensor) -> Tensor:
+        """:meth:`free_level` of points whose :meth:`bound` ``(N,)`` is known."""
+        return in_rows(lambda *at: {"level": self._level_within(*at)}, points, bound)["level"]
+
+    def _level_within(self, points: Tensor, bound: Tensor) -> Tensor:
+        return self.model.level(self._features(points, bound))[:, 0] - self._offset()
 
     def _offset(self) -> float:
         """Moves the surface outward."""
@@ -211,11 +218,14 @@ class LocalField(Field):
 
     def level(self, points: Tensor) -> Tensor:
         """Level ``(N,)``: negative inside, zero on the surface, in units of ``softness``."""
-        return torch.maximum(self.free_level(points), self.bound(points))
+        bound = self.bound(points)
+        return torch.maximum(self.level_within(points, bound), bound)
 
-    def _features(self, points: Tensor, visible: Tensor | None = None, normal: Tensor | None = None) -> Tensor:
+    def _features(
+        self, points: Tensor, bound: Tensor, visible: Tensor | None = None, normal: Tensor | None = None
+    ) -> Tensor:
         model = self.model
-        hull = -self.bound(points) * model.preset.softness
+        hull = -bound * model.preset.softness
         of_views, _ = model.view_features(self.maps, points, visible, normal)
         of_space = model.volume.sample(self.volume, points)
         rest = [(hull / HULL_SCALE).clamp(-2, 2), torch.full_like(hull, 1.0 / len(self.maps.images))]
@@ -280,7 +290,7 @@ class LocalField(Field):
         if self.shading is None:
             raise ValueError("field: expected one with_shading, got one that does not know the light on its surface")
         parts = [
-            self._features(position, visible, normal),
+            self._features(position, self.bound(position), visible, normal),
             fused.numbers,
             fused.logit,
             self.shading.features(normal, fused.logit.detach().sigmoid()),

@@ -141,16 +141,24 @@ class Reconstructor(nn.Module):
         """
         return self.environment.radiance(code.latent, code.rotation, code.strength, reni_frame(directions))
 
-    def query(self, code: Code, points: Tensor, heads: Sequence[str] = tuple(HEADS)) -> dict[str, Tensor]:
+    def query(
+        self,
+        code: Code,
+        points: Tensor,
+        heads: Sequence[str] = tuple(HEADS),
+        *,
+        dtype: torch.dtype = torch.float32,
+    ) -> dict[str, Tensor]:
         """Values of the named heads at points of the model's cube, ``{name: (B, N, outputs)}``, float32.
 
         points: ``(B, N, 3)``, inside plus or minus the preset's radius; features fade to zero outside.  ``density`` is
         the raw value, see :meth:`level`; ``base_color`` is sRGB-encoded; ``roughness`` is perceptual; ``normal`` is
         unit in the frame of :mod:`reli3d.render.bump`; ``deformation`` and ``flexicubes`` are raw, see
-        :mod:`reli3d.nn.heads`.  Gradients reach the triplane, the points and the heads.
+        :mod:`reli3d.nn.heads`.  dtype: of the heads' hidden layers without gradient.  Gradients reach the triplane, the
+        points and the heads.
         """
         with torch.autocast(points.device.type, enabled=False):
-            values = self.heads(sample_triplane(code.triplane, points / self.preset.radius), heads)
+            values = self.heads(sample_triplane(code.triplane, points / self.preset.radius), heads, dtype)
             if self.preset.roughness_is_alpha and "roughness" in values:
                 values["roughness"] = values["roughness"].sqrt()
         return values

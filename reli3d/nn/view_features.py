@@ -9,6 +9,7 @@ Wang et al. 2021, IBRNet).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor, nn
@@ -44,6 +45,11 @@ class ViewMaps:
         """``visible (N, V)``, but mirror images only where no photograph sees the point."""
         own, other = visible.split([self.taken, self.mirrored], 1)
         return torch.cat([own, other * (1.0 - own.amax(1, keepdim=True))], 1) if self.mirrored else visible
+
+    @cached_property
+    def silhouette(self) -> Tensor:
+        """The signed distances alone, ``(V, S, S)`` contiguous, as look-ups of many blocks of points read them."""
+        return self.images[..., 3].contiguous()
 
 
 AHEAD = 4  # numbers of ahead_of_surface

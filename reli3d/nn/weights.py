@@ -16,13 +16,16 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from reli3d.io.files import InputError, file_size, replacing
 from reli3d.nn.local import LocalReconstructor
 from reli3d.nn.model import Reconstructor
+from reli3d.nn.precision import fastest
 from reli3d.nn.presets import OFFICIAL, LocalPreset, Preset, from_json, to_json
 from reli3d.nn.published import CHECKPOINT_PREFIX, our_key
 
@@ -36,6 +39,7 @@ _NAMES = {dtype: name for name, dtype in _DTYPES.items()}
 
 AnyPreset = Preset | LocalPreset
 Network = Reconstructor | LocalReconstructor
+Trunk = torch.dtype | Literal["auto"] | None
 
 
 def network(preset: AnyPreset) -> Network:
@@ -199,7 +203,10 @@ def locate(weights: str | os.PathLike) -> Path:
 
 
 def load_model(
-    weights: str | os.PathLike, device: torch.device | str = "cpu", *, trunk: torch.dtype | None = None
+    weights: str | os.PathLike,
+    device: torch.device | str = "cpu",
+    *,
+    trunk: Trunk = None,
 ) -> Network:
     """The network of :func:`locate`'s file, see :func:`load`.  Raises WeightsError."""
     return load(locate(weights), trunk=trunk, device=device)[0]
@@ -214,16 +221,16 @@ def load(
     path: str | os.PathLike,
     preset: AnyPreset | None = None,
     *,
-    trunk: torch.dtype | None = None,
+    trunk: Trunk = None,
     device: torch.device | str = "cpu",
     expected_sha256: str | None = None,
 ) -> tuple[Network, Manifest]:
     """The network in a safetensors file, in evaluation mode, and the file's manifest.
 
     preset: what the file must hold; default the one in its header.  trunk: dtype of the trunk's parameters, default
-    :func:`default_trunk`; the rest is float32.  A tensor that is stored in the dtype asked for stays mapped from the
-    file on a CPU: it takes memory when it is read.  Names, shapes, length and, where given, the hash are checked before
-    anything is allocated.
+    :func:`default_trunk`, ``auto`` is :func:`~reli3d.nn.precision.fastest`; the rest is float32.  A tensor that is
+    stored in the dtype asked for stays mapped from the file on a CPU: it takes memory when it is read.  Names, shapes,
+    length and, where given, the hash are checked before anything is allocated.
     Raises WeightsError.
     """
     manifest = read_manifest(path)
@@ -233,6 +240,8 @@ def load(
         found = sha256(path)
         if found != expected_sha256:
             raise WeightsError(path, f"expected SHA-256 {expected_sha256}, got {found}; fetch it again")
+    if trunk == "auto":
+        trunk = fastest(preset, device)
     if isinstance(preset, LocalPreset) and trunk not in (None, torch.float32):
         raise WeightsError(path, f"expected float32 for the network of convolutions, got {trunk}")
     with torch.device("meta"):
@@ -250,6 +259,7 @@ def read_tensors(
     """The tensors named in ``wanted`` as the dtypes it gives.
 
     On a CPU a tensor of the dtype in the file is a part of the file's mapping: read when used, never written back.
+    Others are read one by one, so that what they were converted from does not stay in memory.
     """
     end = manifest.start + max((entry.end for entry in manifest.tensors.values()), default=0)
     body = torch.from_file(manifest.path, shared=False, size=end, dtype=torch.uint8)
@@ -257,8 +267,11 @@ def read_tensors(
     for name, dtype in wanted.items():
         entry = manifest.tensors[name]
         start = manifest.start + entry.start
-        raw = body[start : manifest.start + entry.end]
-        raw = raw if start % entry.dtype.itemsize == 0 else raw.clone()  # others' headers may end anywhere
+        if dtype == entry.dtype:
+            raw = body[start : manifest.start + entry.end]
+        else:
+            raw = torch.from_numpy(np.fromfile(manifest.path, np.uint8, entry.end - entry.start, offset=start))
+        raw = raw if raw.data_ptr() % entry.dtype.itemsize == 0 else raw.clone()  # others' headers may end anywhere
         result[name] = raw.view(entry.dtype).reshape(entry.shape).to(device, dtype)
     return result
 

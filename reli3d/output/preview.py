@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -10,6 +11,7 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 from torch.nn.functional import interpolate, normalize, pad
 
+from reli3d._bridge import over_rows
 from reli3d.geometry.camera import Camera, look_at
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene
@@ -18,7 +20,7 @@ from reli3d.render.asset import Asset
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
 from reli3d.render.lights import studio
-from reli3d.render.render import Render, render
+from reli3d.render.render import Render, render_lights
 from reli3d.render.shading import ShadeOptions
 from reli3d.views.choose import choose_views
 from reli3d.views.views import Views
@@ -38,21 +40,27 @@ ELEVATIONS = (5.0, 30.0)  # degrees, of views that nobody took
 AZIMUTHS = 24  # places around the object to choose from
 
 
-def preview(asset: Asset, views: Views) -> np.ndarray:
+def preview(asset: Asset, views: Views, scene: RayScene | None = None) -> np.ndarray:
     """Picture ``(H, W, 3)`` uint8: up to four input views; four views that nobody photographed under the asset's own
     light, then under the studio of :mod:`reli3d.render.lights`; the maps of the first of them; the own light, row 0
     up, centre +X as in its files, exposed so that its mean is ``MEAN``.
 
-    views: in the frame of ``asset``.
+    views: in the frame of ``asset``.  scene: rays against its mesh, made here if None.
     """
     taken = views.select(choose_views(views.c2w, COLUMNS)).resampled(TILE, crop=True)
-    scene = RayScene(asset.mesh.vertices, asset.mesh.faces)
-    relight = Environment(studio().radiance.to(asset.mesh.vertices.device))
-    cameras = unseen_cameras(asset.mesh, views.c2w)
-    in_own_light, relit = (
-        [_rendered(asset, camera, scene, light) for camera in cameras] for light in (asset.environment, relight)
-    )
-    first = in_own_light[0]
+    mesh = asset.mesh
+    scene = scene if scene is not None else RayScene(mesh.vertices, mesh.faces)
+    lights = (asset.environment, Environment(studio().radiance.to(mesh.vertices.device)))
+    cameras = unseen_cameras(mesh, views.c2w)
+
+    def shown(start: int, _stop: int) -> tuple[Render, list[Tensor]]:
+        shots = _rendered(asset, cameras[start], scene, lights)
+        return shots[0], [_lit(radiance, shots[0].alpha) for radiance in _smoothed(*shots)]
+
+    count = len(cameras)
+    on_device = mesh.vertices.is_cuda  # one camera after the other there; on a CPU each in a thread of its own
+    found = [shown(k, k + 1) for k in range(count)] if on_device else over_rows(count, 1, shown)
+    first = found[0][0]
     maps = [
         linear_to_srgb(first.base_color),
         first.roughness[..., None].expand(-1, -1, 3),
@@ -61,8 +69,8 @@ def preview(asset: Asset, views: Views) -> np.ndarray:
     ]
     rows = [
         ("input", [_on_paper(i, m) for i, m in zip(taken.images, taken.masks, strict=True)]),
-        ("views that nobody photographed, own light", [_lit(_smoothed(s), s.alpha) for s in in_own_light]),
-        ("the same views in a studio", [_lit(_smoothed(s), s.alpha) for s in relit]),
+        ("views that nobody photographed, own light", [tiles[0] for _, tiles in found]),
+        ("the same views in a studio", [tiles[1] for _, tiles in found]),
         ("base colour, roughness, metallic, normal", [_on_paper(m, first.alpha) for m in maps]),
         ("own light, its mean at a quarter", [_map(asset.light)]),
     ]
@@ -76,33 +84,37 @@ def comparison(before: Asset, after: Asset, views: Views) -> np.ndarray:
     rows = [("input", [_on_paper(i, m) for i, m in zip(batch.images, batch.masks, strict=True)])]
     for title, asset in (("before", before), ("after refinement", after)):
         scene = RayScene(asset.mesh.vertices, asset.mesh.faces)
-        shots = [_rendered(asset, batch.camera[i], scene) for i in range(count)]
-        rows.append((title, [_lit(_smoothed(s), s.alpha) for s in shots]))
+        shots = [_rendered(asset, batch.camera[i], scene, (None,))[0] for i in range(count)]
+        rows.append((title, [_lit(_smoothed(s)[0], s.alpha) for s in shots]))
     return _sheet(rows, count)
 
 
-def _rendered(asset: Asset, camera: Camera, scene: RayScene, light: Environment | None = None) -> Render:
-    return render(asset, camera, light, options=ShadeOptions(SAMPLES), supersampling=SUBPIXELS, scene=scene)
+def _rendered(asset: Asset, camera: Camera, scene: RayScene, lights: Sequence[Environment | None]) -> list[Render]:
+    return render_lights(asset, camera, lights, options=ShadeOptions(SAMPLES), supersampling=SUBPIXELS, scene=scene)
 
 
-def _smoothed(shot: Render) -> Tensor:
-    """The radiance with less noise: its ratio to the base colour, averaged over pixels of about the same normal.
+def _smoothed(*shots: Render) -> list[Tensor]:
+    """The radiance of each shot with less noise: its ratio to the base colour, averaged over pixels of about the same
+    normal.
 
-    A joint bilateral filter (Petschnigg and others 2004): Monte Carlo noise is in the light, edges are in the maps.
+    shots: of one camera, in several lights.  A joint bilateral filter (Petschnigg and others 2004): Monte Carlo noise
+    is in the light, edges are in the maps, and so are the weights.
     """
+    shot, count = shots[0], 3 * len(shots)
     paint = (shot.base_color + GLOSS) * shot.alpha[..., None]
-    guides = torch.cat([shot.radiance / paint.clamp(min=1e-6), shot.normal, shot.alpha[..., None]], -1)
+    ratios = [s.radiance / paint.clamp(min=1e-6) for s in shots]
+    guides = torch.cat([*ratios, shot.normal, shot.alpha[..., None]], -1)
     padded = pad(guides.permute(2, 0, 1)[None], (WINDOW,) * 4)[0].permute(1, 2, 0)
     height, width = shot.alpha.shape
-    total, weights = torch.zeros_like(shot.radiance), torch.zeros_like(shot.alpha)[..., None]
+    total, weights = guides.new_zeros(height, width, count), torch.zeros_like(shot.alpha)[..., None]
     for row in range(2 * WINDOW + 1):
         for column in range(2 * WINDOW + 1):
             near = padded[row : row + height, column : column + width]
             apart = ((row - WINDOW) ** 2 + (column - WINDOW) ** 2) / (2 * WINDOW)
-            bent = (near[..., 3:6] - shot.normal).square().sum(-1, keepdim=True) / SAME_NORMAL**2
-            weight = torch.exp(-apart - bent) * near[..., 6:]
-            total, weights = total + weight * near[..., :3], weights + weight
-    return total / weights.clamp(min=1e-6) * paint
+            bent = (near[..., count:-1] - shot.normal).square().sum(-1, keepdim=True) / SAME_NORMAL**2
+            weight = torch.exp(-apart - bent) * near[..., -1:]
+            total, weights = total + weight * near[..., :count], weights + weight
+    return [mean * paint for mean in (total / weights.clamp(min=1e-6)).split(3, -1)]
 
 
 def _sheet(rows: list[tuple[str, list[Tensor]]], columns: int, *, last: int = TILE) -> np.ndarray:

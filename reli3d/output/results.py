@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from dataclasses import asdict
 from importlib.metadata import version
@@ -21,7 +22,7 @@ from reli3d.io.hdr import write_environment
 from reli3d.io.images import write_png
 from reli3d.nn.weights import Manifest
 from reli3d.output.folder import claimed
-from reli3d.output.viewer import viewer_page
+from reli3d.output.viewer import Shown, photograph_stops, viewer_page
 from reli3d.render.asset import Asset
 from reli3d.render.gbuffer import primary_hits
 from reli3d.views.similarity import Similarity
@@ -54,10 +55,13 @@ def mesh_statistics(mesh: Mesh) -> dict:
     return asdict(report(mesh))
 
 
-def mask_iou(mesh: Mesh, views: Views) -> float:
-    """Mean intersection over union of the silhouettes of ``mesh`` and the masks of ``views``, in one frame, to 1e-4."""
+def mask_iou(scene: RayScene, views: Views) -> float:
+    """Mean intersection over union of the silhouettes of a mesh and the masks of ``views``, in one frame, to 1e-4.
+
+    scene: rays against the mesh.
+    """
     batch = views.resampled(SILHOUETTE, crop=True)
-    seen = primary_hits(RayScene(mesh.vertices, mesh.faces), batch.camera)[0].face >= 0
+    seen = primary_hits(scene, batch.camera)[0].face >= 0
     masks = batch.masks > 0.5
     both, either = ((a.sum((1, 2)).double()) for a in (masks & seen, masks | seen))
     return round(float((both / either.clamp(min=1)).mean()), 4)
@@ -84,6 +88,7 @@ def write_results(
     comparison: np.ndarray | None = None,
     before: Asset | None = None,
     translation: Sequence[float] = (0.0, 0.0, 0.0),
+    scene: RayScene | None = None,
 ) -> None:
     """Write :data:`FILES`; an error leaves what was there before.  Raises OSError, ValueError.
 
@@ -92,11 +97,14 @@ def write_results(
     info: what ``run_info.json`` holds, the convention of the light apart.
     compatible: write the light as :data:`PUBLISHED_LIGHT` as well.  comparison: the picture of a refinement.  before:
     the asset without it, which the page shows too.
-    translation: of ``mesh.glb``, see :func:`~reli3d.io.glb.write_glb`; the page shows it where it is.
+    translation: of ``mesh.glb``, see :func:`~reli3d.io.glb.write_glb`; the page shows it where it is.  scene: rays
+    against the mesh of ``asset``.
     """
     radiance = asset.light.radiance
     info = {**info, "environment_centre": "+X"}
-    with replacing() as new:
+    with replacing() as new, ThreadPoolExecutor(2) as pool:  # encoders of images run without the interpreter lock
+        stops = pool.submit(photograph_stops, views)
+        sheet = pool.submit(write_png, new / "preview.png", picture)
         extras = {k: info[k] for k in ("output_from_input", "model_from_input", "weights")}
         glb = glb_bytes(asset, extras=extras)
         placed = glb_bytes(asset, extras=extras, translation=translation) if any(translation) else glb
@@ -105,14 +113,15 @@ def write_results(
             write_environment(new / name, radiance)
         if compatible:
             write_environment(new / PUBLISHED_LIGHT, radiance, centre="-Z")
-        write_png(new / "preview.png", picture)
         if comparison is not None:
             write_png(new / COMPARISON, comparison)
         low, high = asset.mesh.vertices.aminmax(dim=0)
-        shown = {"mesh" if before is None else "after": (glb, asset.mesh)}
+        shown = {"mesh" if before is None else "after": Shown(glb, asset.mesh, scene)}
         if before is not None:
-            shown["before"] = (glb_bytes(before), before.mesh)
-        page = viewer_page(info["object"], shown, radiance, (low + high) / 2, float((high - low).norm()) / 2, views)
+            shown["before"] = Shown(glb_bytes(before), before.mesh)
+        middle, radius = (low + high) / 2, float((high - low).norm()) / 2
+        page = viewer_page(info["object"], shown, radiance, middle, radius, stops.result())
+        sheet.result()
         (new / "viewer.html").write_text(page, encoding="utf-8")
         (new / "run_info.json").write_text(json.dumps(info, indent=1) + "\n")
 

@@ -7,7 +7,8 @@ import html
 import io
 import json
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from torch import Tensor
 
 import reli3d
 from reli3d.geometry.mesh import Mesh
+from reli3d.geometry.rays import RayScene
 from reli3d.io.hdr import environment_bytes
 from reli3d.render.environment import Environment
 from reli3d.render.lights import LIGHTS
@@ -30,21 +32,28 @@ LEVEL = 1  # of deflate: 2.3 times smaller; more effort gains a tenth
 TINY = 1e-20  # instead of a division by zero where nothing is blocked
 
 
-def viewer_page(
-    name: str, meshes: Mapping[str, tuple[bytes, Mesh]], light: Tensor, middle: Tensor, radius: float, views: Views
-) -> str:
-    """HTML page of ``meshes`` under ``light`` ``(H, 2H, 3)`` and two lights of the package.
+@dataclass(frozen=True)
+class Shown:
+    """A GLB file and the mesh in it, whose shadows on itself the page shows; scene: rays against the mesh."""
 
-    meshes: by name the GLB file and the mesh in it, whose shadows on itself the page shows.  middle ``(3,)``, radius:
-    of the object, for the camera.  views: the photographs, in the frame of the meshes; they become stops of the camera,
-    scaled down to ``PHOTOGRAPH`` pixels and cut out by their masks.
+    glb: bytes
+    mesh: Mesh
+    scene: RayScene | None = None
+
+
+def viewer_page(
+    name: str, meshes: Mapping[str, Shown], light: Tensor, middle: Tensor, radius: float, stops: Sequence[dict]
+) -> str:
+    """HTML page of ``meshes``, by name, under ``light`` ``(H, 2H, 3)`` and two lights of the package.
+
+    middle ``(3,)``, radius: of the object, for the camera.  stops: of :func:`photograph_stops`.
     """
     lights = {"own light": light, **{k: make().radiance for k, make in LIGHTS.items()}}
     data = {
         "name": name,
-        "meshes": [{"name": k, "glb": _base64(glb), **_shadow(mesh)} for k, (glb, mesh) in meshes.items()],
+        "meshes": [{"name": k, "glb": _base64(v.glb), **_shadow(v)} for k, v in meshes.items()],
         "lights": [_light(k, v) for k, v in lights.items()],
-        "views": [_stop(views, i) for i in range(len(views))],
+        "views": list(stops),
         "middle": middle.tolist(),
         "radius": radius,
     }
@@ -59,13 +68,20 @@ def viewer_page(
     return head + "".join(fillings[part.split("}}", 1)[0]] + part.split("}}", 1)[1] for part in rest)
 
 
+def photograph_stops(views: Views) -> list[dict]:
+    """Stops of the page's camera at the photographs ``views``, in the frame of its meshes: scaled down to
+    ``PHOTOGRAPH`` pixels and cut out by their masks.
+    """
+    return [_stop(views, i) for i in range(len(views))]
+
+
 def _base64(data: bytes) -> str:
     return base64.b64encode(data).decode()
 
 
-def _shadow(mesh: Mesh) -> dict:
+def _shadow(shown: Shown) -> dict:
     """The light that every vertex misses, 16 bytes each, deflated: harmonics in steps of ``largest`` / 127."""
-    blocked = blocked_transfer(mesh).cpu()
+    blocked = blocked_transfer(shown.mesh, scene=shown.scene).cpu()
     largest = float(blocked.abs().amax()) if blocked.numel() else 0.0
     steps = (blocked * (127.0 / max(largest, TINY))).round().to(torch.int8)
     return {"blocked": _base64(zlib.compress(steps.numpy().tobytes(), LEVEL)), "largest": largest}

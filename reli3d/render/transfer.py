@@ -57,12 +57,13 @@ def light_harmonics(light: Environment) -> Tensor:
     return torch.einsum("hwk,hwc->kc", weight, light.radiance.detach().cpu().double()).float()
 
 
-def blocked_transfer(mesh: Mesh, *, directions: int = 64) -> Tensor:
+def blocked_transfer(mesh: Mesh, *, directions: int = 64, scene: RayScene | None = None) -> Tensor:
     """What the mesh keeps from its vertices: ``(V, 16)``, integrals of hidden cosine times harmonics, no gradient.
 
     Row i times the coefficients of a light (:func:`light_harmonics`) is the irradiance that vertex i misses.  mesh:
     with normals.  directions: over the whole sphere, on a spiral of equal areas and the same for all vertices, so that
-    neighbours differ by their geometry alone.  Exactly 0 where no ray is hidden.  Raises TypeError, ValueError.
+    neighbours differ by their geometry alone.  scene: rays against the mesh, made here if None.  Exactly 0 where no ray
+    is hidden.  Raises TypeError, ValueError.
     """
     normals = present("normals", mesh.normals).detach()
     check("vertices", mesh.vertices, last=3, like=normals)
@@ -78,7 +79,8 @@ def blocked_transfer(mesh: Mesh, *, directions: int = 64) -> Tensor:
     above = cosine > 0.0
     vertex, which = above.nonzero(as_tuple=True)  # rays of one vertex are neighbours
     far = torch.full((len(vertex),), torch.inf, device=device)
-    free = RayScene(mesh.vertices, mesh.faces).unoccluded(start[vertex], toward[which], far)
+    scene = scene if scene is not None else RayScene(mesh.vertices, mesh.faces)
+    free = scene.unoccluded(start[vertex], toward[which], far)
     cosine.masked_fill_(torch.zeros_like(above).masked_scatter_(above, free), 0.0)
     blocked = cosine @ (spherical_harmonics(toward) * (4.0 * math.pi / directions))
     return blocked[torch.from_numpy(label).to(device)]

@@ -86,6 +86,15 @@ def asked(field):
     return field.free_level(1.2 * position), material, field.radiance_map()
 
 
+@torch.no_grad()
+def test_a_level_whose_bound_is_known_is_the_level(model):
+    field = encoded(model, *sphere(2))
+    points = torch.rand(300, 3, generator=torch.Generator().manual_seed(6)) - 0.5
+    bound = field.bound(points)
+    assert torch.equal(field.level_within(points, bound), field.free_level(points))
+    assert not torch.equal(field.level_within(points, bound + 1.0), field.free_level(points))
+
+
 @pytest.mark.parametrize("views", [1, 2, 5, 16])
 def test_any_number_of_views_in_any_order(model, views):
     inputs = sphere(views)

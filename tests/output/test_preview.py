@@ -83,7 +83,7 @@ def test_the_filter_takes_noise_and_leaves_edges(asset):
         render(checkered, camera, options=ShadeOptions(samples), supersampling=2, scene=scene)
         for samples in (preview.SAMPLES, (400, 80, 20))
     )
-    smooth = preview._smoothed(few)
+    (smooth,) = preview._smoothed(few)
     before, after = ((x - many.radiance).square().mean() for x in (few.radiance, smooth))
     assert float(after) < 0.15 * float(before)  # 0.06; a box of the same size, blind to paint and normals, has 0.34
     assert float((smooth.mean() / few.radiance.mean() - 1).abs()) < 0.01

@@ -18,7 +18,7 @@ from reli3d.geometry.tangents import with_tangents
 from reli3d.io.glb import glb_bytes, read_glb, write_glb
 from reli3d.io.hdr import read_environment
 from reli3d.output import viewer
-from reli3d.output.viewer import viewer_page
+from reli3d.output.viewer import Shown, photograph_stops, viewer_page
 from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
@@ -103,15 +103,21 @@ def choose(**values) -> str:
     return code
 
 
+def one_page(asset: Asset, views: Views, light: Environment | None = None) -> str:
+    shown = {"mesh": Shown(glb_bytes(asset), asset.mesh)}
+    radiance = (light or asset.light).radiance
+    return viewer_page("x", shown, radiance, torch.zeros(3), 0.7, photograph_stops(views))
+
+
 def test_the_page_shows_the_asset_as_the_renderer_does(tmp_path, asset, views):
     glb = glb_bytes(asset)
     page = viewer_page(
         "a <ball>",
-        {"before": (glb, asset.mesh), "after": (glb, asset.mesh)},
+        {"before": Shown(glb, asset.mesh), "after": Shown(glb, asset.mesh)},
         asset.environment.radiance,
         torch.zeros(3),
         0.7,
-        views,
+        photograph_stops(views),
     )
     (tmp_path / "viewer.html").write_text(page)
     with chromium() as tab:
@@ -155,7 +161,7 @@ def test_the_page_shows_the_asset_as_the_renderer_does(tmp_path, asset, views):
 
 def test_the_page_shows_what_a_surface_hides_from_itself(tmp_path, waisted, views):
     """In each light, turned and brightened: nearer to our renderer than without, and near."""
-    page = viewer_page("x", {"mesh": (glb_bytes(waisted), waisted.mesh)}, studio().radiance, torch.zeros(3), 0.7, views)
+    page = one_page(waisted, views, studio())
     (tmp_path / "viewer.html").write_text(page)
     found = {}
     with chromium() as tab:
@@ -193,9 +199,9 @@ def test_a_half_hidden_everywhere_is_a_stop_less(tmp_path, asset, views, monkeyp
     with chromium() as tab:
         for hidden, stops in ((0.5, 0), (0.0, -1)):
             monkeypatch.setattr(
-                viewer, "blocked_transfer", lambda m, h=hidden: h * cosine * spherical_harmonics(m.normals)
+                viewer, "blocked_transfer", lambda m, scene, h=hidden: h * cosine * spherical_harmonics(m.normals)
             )
-            page = viewer_page("x", {"m": (glb_bytes(asset), asset.mesh)}, sky().radiance, torch.zeros(3), 0.7, views)
+            page = one_page(asset, views, sky())
             (tmp_path / f"{stops}.html").write_text(page)
             tab.open((tmp_path / f"{stops}.html").as_uri(), size=(WIDE, SIZE)).wait("document.body.dataset.ready")
             pictures.append(pixels(tab.ask("take(0); " + choose(turn=40, stopsof=stops) + "picture()")).astype(int))
@@ -219,9 +225,7 @@ def test_the_page_of_the_example_looks_as_its_picture_by_the_renderer(tmp_path):
 
 
 def test_the_page_of_a_reconstruction_holds_all_it_needs(asset, views):
-    page = viewer_page(
-        "x", {"mesh": (glb_bytes(asset), asset.mesh)}, asset.environment.radiance, torch.zeros(3), 0.7, views
-    )
+    page = one_page(asset, views)
     assert not re.search(r"""(src|href)=["']?(https?:)?//""", page)
     assert page.count("</script>") == 3  # a name cannot end the data
     data = json.loads(re.search(r'id="data">(.*?)</script>', page, re.DOTALL)[1])
@@ -233,7 +237,7 @@ def test_the_page_of_a_reconstruction_holds_all_it_needs(asset, views):
 def test_large_photographs_are_scaled_with_their_cameras(asset):
     image, mask = torch.rand(1000, 2000, 3), torch.ones(1000, 2000)
     views = Views((image,), (mask,), torch.eye(4)[None], torch.tensor([[3000.0, 2900.0, 990.0, 510.0]]), ("a",))
-    page = viewer_page("x", {"mesh": (b"", asset.mesh)}, asset.environment.radiance, torch.zeros(3), 0.7, views)
+    page = one_page(asset, views)
     (view,) = json.loads(re.search(r'id="data">(.*?)</script>', page, re.DOTALL)[1])["views"]
     assert (view["width"], view["height"]) == (640, 320)
     np.testing.assert_allclose(view["intrinsics"], [960.0, 928.0, 316.8, 163.2])

@@ -10,12 +10,13 @@ import torch
 from reli3d.geometry.camera import Camera, camera_rays, look_at, project
 from reli3d.geometry.hits import interpolate
 from reli3d.geometry.mesh import Mesh
+from reli3d.geometry.rays import RayScene
 from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.color import srgb_to_linear
 from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import sample_texture, surface_points
 from reli3d.render.material import PAINTS
-from reli3d.render.render import render
+from reli3d.render.render import _resolve, render, render_lights
 from reli3d.render.shading import ShadeOptions
 from tests.support import reference
 from tests.support.scenes import ball, eye, textures
@@ -119,6 +120,30 @@ def test_bands_progress_and_supersampling_do_not_change_the_mean(device, monkeyp
     inside = whole.alpha > 0
     assert abs(fine.radiance.mean() / whole.radiance.mean() - 1) < 0.03  # 40 pixels of silhouette in 500
     assert float((fine.normal.norm(dim=-1)[inside & (fine.alpha > 0)] - 1).abs().max()) < 1e-5
+
+
+@pytest.mark.parametrize("background", ["transparent", "environment"])
+def test_several_lights_give_the_bits_of_one_light_each_and_trace_the_camera_once(device, background, monkeypatch):
+    asset, camera = Asset(square(device), textures(8, device)), Camera.from_fov(eye(device, 0.4, 0.7, 3.0), 0.9, 40, 32)
+    rng = torch.Generator().manual_seed(3)
+    lights = [Environment(torch.rand(8, 16, 3, generator=rng).to(device)) for _ in range(2)]
+    options = dict(options=ShadeOptions((4, 2, 1)), supersampling=2, background=background)
+    alone = [render(asset, camera, light, **options) for light in lights]
+    calls, closest = [], RayScene.closest
+    monkeypatch.setattr(RayScene, "closest", lambda self, *a, **k: calls.append(1) or closest(self, *a, **k))
+    together = render_lights(asset, camera, lights, **options)
+    assert len(calls) == 1
+    for one, other in zip(alone, together, strict=True):
+        for field in fields(one):
+            assert torch.equal(getattr(one, field.name), getattr(other, field.name)), field.name
+    assert not torch.equal(together[0].radiance, together[1].radiance)
+
+
+@pytest.mark.parametrize("factor", [1, 2, 3])
+def test_subpixels_are_resolved_to_their_mean(device, factor):
+    layer = torch.rand(6 * factor, 5 * factor, 2, generator=torch.Generator().manual_seed(4)).to(device)
+    want = layer.double().reshape(6, factor, 5, factor, 2).mean((1, 3))
+    torch.testing.assert_close(_resolve(layer, factor).double(), want, rtol=0, atol=2e-7)  # three roundings below 1
 
 
 def test_image_gradient_reaches_textures_and_light(device):
