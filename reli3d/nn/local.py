@@ -224,12 +224,12 @@ class LocalField(Field):
     def _features(
         self, points: Tensor, bound: Tensor, visible: Tensor | None = None, normal: Tensor | None = None
     ) -> Tensor:
-        model = self.model
+        model, maps = self.model, self.maps.photographs  # the volume knows the mirror images: twice the time, no gain
         hull = -bound * model.preset.softness
-        of_views, _ = model.view_features(self.maps, points, visible, normal)
+        of_views, _ = model.view_features(maps, points, None if visible is None else visible[:, : maps.taken], normal)
         of_space = model.volume.sample(self.volume, points)
         rest = [(hull / HULL_SCALE).clamp(-2, 2), torch.full_like(hull, 1.0 / len(self.maps.images))]
-        ahead = ahead_of_surface(self.surface, self.maps, points)
+        ahead = ahead_of_surface(self.surface[: maps.taken], maps, points)
         return torch.cat([of_space, of_views, torch.stack(rest, -1), ahead], -1)
 
     def fused(self, position: Tensor, normal: Tensor, visible: Tensor) -> Fused:

@@ -36,9 +36,11 @@ class ViewMaps:
         """Number of the views that are photographs."""
         return len(self.images) - self.mirrored
 
-    @property
+    @cached_property
     def photographs(self) -> ViewMaps:
         """The same without mirror images."""
+        if not self.mirrored:
+            return self
         return ViewMaps(self.tokens[: self.taken], self.images[: self.taken], self.camera[: self.taken])
 
     def photographs_first(self, visible: Tensor) -> Tensor:
