@@ -13,10 +13,10 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
+from torch.nn import functional
 
 from reli3d._bridge import check
-from reli3d.geometry.camera import Camera, camera_rays, check_camera
+from reli3d.geometry.camera import Camera, check_camera
 from reli3d.geometry.hull import hull_distance, hull_span
 
 RAYS, DEPTHS = 96, 16  # rays of a view, and points along each, at which hulls are compared
@@ -26,6 +26,7 @@ FINER = 9  # angles and offsets of the second search, within one step of the fir
 LOST = 0.01  # of the longest side: a pixel whose ray misses the common hull by more is lost
 MOST_LOST = 0.006  # share of the pixels that may be lost: a part that is on one side alone would be cut off
 AS_GOOD = 3e-4  # mean miss, of the longest side, by which another plane may be worse and still be as good
+EQUAL = 6e-5  # mean miss by which planes count as equal: of them the one that shows most is taken
 AMBIGUOUS = 0.028  # times the square of the number of views: share of the planes that may be as good
 ROUND = 0.95  # share of the planes from which on the object is one of revolution
 FEWEST = 3  # views: two silhouettes agree with many planes
@@ -72,7 +73,7 @@ def mirror_plane(distance: Tensor, camera: Camera) -> MirrorPlane | None:
         return None
     low, high = inside.aminmax(dim=0)
     centre, size = (low + high) / 2, float((high - low).max())
-    first = normalize(torch.linalg.cross(up, torch.eye(3, device=up.device)[int(up.abs().argmin())]), dim=0)
+    first = functional.normalize(torch.linalg.cross(up, torch.eye(3, device=up.device)[int(up.abs().argmin())]), dim=0)
     second = torch.linalg.cross(up, first)
 
     def misses(angle: Tensor, offset: Tensor, every: int = 1) -> tuple[Tensor, Tensor]:
@@ -86,22 +87,46 @@ def mirror_plane(distance: Tensor, camera: Camera) -> MirrorPlane | None:
 
     angles = torch.arange(ANGLES, device=up.device) * (math.pi / ANGLES)
     offsets = torch.linspace(-REACH, REACH, OFFSETS, device=up.device)
-    miss, _ = misses(angles.repeat_interleave(OFFSETS), offsets.repeat(ANGLES), every=2)
-    by_angle, at = miss.view(ANGLES, OFFSETS).min(1)
-    best = int(by_angle.argmin())
-    as_good = float((by_angle < by_angle[best] + AS_GOOD).float().mean())
+    miss, _ = misses(angles.repeat_interleave(OFFSETS), offsets.repeat(ANGLES), every=3)
+    miss = miss.view(ANGLES, OFFSETS)
+    by_angle = miss.amin(1)
+    as_good = float((by_angle < by_angle.min() + AS_GOOD).float().mean())
     if AMBIGUOUS * len(distance) ** 2 < as_good < ROUND:
         return None
+    planes = torch.tensor(_middles((by_angle <= by_angle.min() + EQUAL).tolist()), device=up.device)
+    normals = torch.outer(angles[planes].cos(), first) + torch.outer(angles[planes].sin(), second)
+    best = int(planes[_novelty(normals, functional.normalize(camera.position - centre, dim=1)).argmax()])
+    equal = miss[best] <= miss[best].min() + EQUAL
     around = torch.linspace(-1.0, 1.0, FINER, device=up.device)
     angle = (angles[best] + around * (math.pi / ANGLES)).repeat_interleave(FINER)
-    offset = (offsets[at[best]] + around * (2 * REACH / (OFFSETS - 1))).repeat(FINER)
+    offset = (offsets[equal].mean() + around * (2 * REACH / (OFFSETS - 1))).repeat(FINER)
     miss, _ = misses(angle, offset)
-    alike = miss <= miss.min() + 0.2 * AS_GOOD  # the middle of what is equally good
+    alike = miss <= miss.min() + EQUAL  # the middle of what is equally good
     angle, offset = angle[alike].mean(), offset[alike].mean()
     if float(misses(angle[None], offset[None])[1]) > MOST_LOST:
         return None
     normal = angle.cos() * first + angle.sin() * second
     return MirrorPlane(normal, float(normal @ centre + size * offset))
+
+
+def _middles(good: list[bool]) -> list[int]:
+    """The middle index of each run of true values on a circle; every index where all are true."""
+    count = len(good)
+    if all(good):
+        return list(range(count))
+    found = []
+    for begin in (k for k in range(count) if good[k] and not good[k - 1]):
+        length = next(j for j in range(1, count) if not good[(begin + j) % count])
+        found.append((begin + length // 2) % count)
+    return found
+
+
+def _novelty(normals: Tensor, directions: Tensor) -> Tensor:
+    """Mean angle [rad] between the mirrored view directions and the nearest of the given ones ``(V, 3)``, for P planes
+    ``(P, 3)``.  Views from opposite sides have nearly the same silhouette, so a direction counts as its opposite.
+    """
+    mirrored = directions - 2.0 * (normals @ directions.T)[..., None] * normals[:, None]
+    return (mirrored @ directions.T).abs().amax(-1).clamp(max=1.0).acos().mean(-1)
 
 
 def upright(camera: Camera) -> Tensor | None:
@@ -116,15 +141,16 @@ def upright(camera: Camera) -> Tensor | None:
 
 def _hull_points(distance: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
     """Points ``(R, D, 3)`` along rays of pixels inside the silhouettes, and which lie in the hull ``(R, D)``."""
-    origins: list[Tensor] = []
-    directions: list[Tensor] = []
-    for view in range(len(distance)):
-        inside = (distance[view] > 0.5).reshape(-1).nonzero()[:, 0]
-        chosen = inside[torch.linspace(0, max(len(inside) - 1, 0), min(RAYS, len(inside))).long().to(inside.device)]
-        of_view = (rays.reshape(-1, 3)[chosen] for rays in camera_rays(camera[view]))
-        for rays, more in zip((origins, directions), of_view):
-            rays.append(more)
-    origin, direction = torch.cat(origins).contiguous(), torch.cat(directions).contiguous()
+    places: list[Tensor] = []
+    for number, inside in enumerate(distance > 0.5):
+        found = inside.nonzero()
+        every = torch.linspace(0, max(len(found) - 1, 0), min(RAYS, len(found)), device=found.device).long()
+        places.append(functional.pad(found[every], (1, 0), value=number))
+    view, row, column = torch.cat(places).unbind(1)
+    fx, fy, cx, cy = camera.intrinsics[view].unbind(1)
+    local = torch.stack([(column + 0.5 - cx) / fx, -(row + 0.5 - cy) / fy, -torch.ones_like(fx)], 1)
+    direction = functional.normalize((camera.c2w[view, :3, :3] @ local[..., None])[..., 0], dim=1)
+    origin = camera.position[view].contiguous()
     radius = 2.0 * float(camera.position.norm(dim=1).max())
     span = hull_span(origin, direction, min(radius, 99.0), distance, camera)
     share = (torch.arange(DEPTHS, device=origin.device) + 0.5) / DEPTHS
