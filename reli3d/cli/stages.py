@@ -53,9 +53,12 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--export", type=Path, help="write the averaged weights of the checkpoint to this file and stop")
     p.add_argument("--licence", default="not stated", help="of the exported weights")
     p.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
+    own = {"default": argparse.SUPPRESS, "help": "of the stage's own"}
     for name in OVERRIDES:
-        kind = float if name == "rate" else int
-        p.add_argument(f"--{name.replace('_', '-')}", type=kind, default=argparse.SUPPRESS, help="of the stage's own")
+        p.add_argument(f"--{name.replace('_', '-')}", type=float if name == "rate" else int, **own)
+    counts = ("LIGHT", "NORMALS", "COSINE")
+    p.add_argument("--samples", type=int, nargs=3, metavar=counts, **own)
+    p.add_argument("--shadows", action=argparse.BooleanOptionalAction, **own)
     return p
 
 
@@ -70,7 +73,9 @@ def run_of(args: argparse.Namespace):
     stages = PAPER if args.preset == "official" else TINY
     if args.stage not in stages:
         raise ValueError(f"stage: expected {', '.join(stages)} for {args.preset}, got {args.stage}")
-    given = {name: getattr(args, name) for name in OVERRIDES if hasattr(args, name)}
+    given = {name: getattr(args, name) for name in (*OVERRIDES, "samples", "shadows") if hasattr(args, name)}
+    if "samples" in given:
+        given["samples"] = tuple(given["samples"])
     check_ranges(args, steps=(0, 10**9), batch=(1, 4096), rate=(1e-9, 10.0), save_every=(1, 10**9), seed=(0, 10**9))
     check_ranges(args, image_size=(8, 2048), patch=(0, 2048), targets=(1, 16), lobes=(1, 4096), resolution=(4, 256))
     check_folder(args.export.parent if args.export else args.output)
