@@ -4,9 +4,9 @@ usage: python -m bench.studies.estimators OUT --train SAMPLES --held-back SAMPLE
 
 Each run begins with the averaged parameters of STATE and takes the same steps of the same draws; the renderer alone
 differs.  ``images`` leaves out the truth of materials and normals, so that renders alone teach them.  A call goes on
-where the one before was stopped; ``--seeds`` and ``--arms`` let several processes share the runs.  Then each
+where the one before was stopped; ``--seeds``, ``--arms`` and ``--groups`` let several processes share it.  Then each
 object of both folders is read from four views and compared in two others with its truth, also under two held-back maps
-of light; the truth is the procedural object itself, rendered with shadows.  Prints tables in Markdown, with 95 %
+of light; the truth is the procedural object itself, rendered with shadows.  Prints a table in Markdown, with 95 %
 intervals of means over the objects by bootstrap.
 """
 
@@ -52,6 +52,7 @@ ARMS = {
 IMAGES = replace(LAST.weights, material=0.0, normal=0.0)
 TRUTHS = {"all": LAST.weights, "images": IMAGES}  # what the losses know
 READ, SEEN = 4, 2  # views of a sample that are read, and the next that are compared
+GROUPS = {"train": "training", "held_back": "held-back"}  # by the options that name their folders
 SIZE = 64  # pixels of what is compared
 SAMPLES = (16, 16, 4)  # of the render that is compared, whichever the training had
 TRUE_SAMPLES = (16, 12, 4)  # of each of the rays of a pixel
@@ -181,9 +182,7 @@ def figures(model: Reconstructor, truth: Truth) -> dict[str, float]:
 
 
 def evaluated(args: argparse.Namespace) -> dict[str, dict[str, list[dict]]]:
-    """Rows of figures of all objects by the group of objects and the run; kept in ``OUT/figures.json``."""
-    kept = args.out / "figures.json"
-    known = json.loads(kept.read_text()) if kept.exists() else {}
+    """Rows of figures of all objects by the group of objects and the run; kept in ``OUT``, a file for each group."""
     model = Reconstructor(TINY)
     load_prior(model, args.prior)
     maps, names = load_maps(args.maps)
@@ -192,20 +191,20 @@ def evaluated(args: argparse.Namespace) -> dict[str, dict[str, list[dict]]]:
     for truth in args.truths:
         for arm in args.arms:
             states |= {f"{truth}/{arm}/{s}": folder_of(args.out, truth, arm, s) / "state.pt" for s in args.seeds}
-    networks = {}
-    for group, folder in (("training", args.train), ("held-back", args.held_back)):
-        files = sorted(folder.glob("*.safetensors"))
-        rows = known.setdefault(group, {})
-        missing = [name for name in states if len(rows.get(name, ())) != len(files)]
-        for name in missing:
-            rows[name] = []
-            networks[name] = networks.get(name) or averaged(model, load_state(states[name], model)["average"])
-        for path in files if missing else ():
+    known = {}
+    for group in args.groups:
+        kept = args.out / f"{group}.json"
+        rows = json.loads(kept.read_text()) if kept.exists() else {}
+        missing = {name: state for name, state in states.items() if name not in rows}
+        networks = {name: averaged(model, load_state(state, model)["average"]) for name, state in missing.items()}
+        made: dict[str, list[dict]] = {name: [] for name in missing}
+        for path in sorted(getattr(args, group).glob("*.safetensors")) if missing else ():
             truth = truth_of(path, maps)
-            for name in missing:
-                rows[name].append(figures(networks[name], truth))
+            for name, network in networks.items():
+                made[name].append(figures(network, truth))
             print(f"{group}: {path.stem}", file=sys.stderr, flush=True)
-        kept.write_text(json.dumps(known))
+        kept.write_text(json.dumps(rows | made))
+        known[group] = rows | made
     return known
 
 
@@ -213,32 +212,27 @@ def column(rows: list[dict], name: str) -> np.ndarray:
     return np.array([r.get(name, np.nan) for r in rows])
 
 
-def tables(known: dict[str, dict[str, list[dict]]], args: argparse.Namespace) -> str:
-    """Means over the objects, of the start and of each arm; then the arms less Monte Carlo, object by object.
+def table(known: dict[str, dict[str, list[dict]]], args: argparse.Namespace) -> str:
+    """Means over the objects of the start and of the first arm; the other arms less the first, object by object.
 
     Means are over objects for which all runs have the figure.  In brackets: the interval over objects of the mean over
     seeds; after it, the least and the largest mean of a seed.
     """
-    head = ["objects", "truth", "renderer", *(f"{n} ({better} is better)" for n, better in METRICS.items())]
-    top = f"| {' | '.join(head)} |\n|{'---|' * len(head)}\n"
-    means, less = top, top
+    first, *others = args.arms
+    head = ["objects", "truth", "figure", "start", first, *(f"{arm} less {first}" for arm in others)]
+    lines = [f"| {' | '.join(head)} |", f"|{'---|' * len(head)}"]
     for group, rows in known.items():
-        whole = {name: np.isfinite([column(r, name) for r in rows.values()]).all(0) for name in METRICS}
-        print(group, {name: int(w.sum()) for name, w in whole.items()}, file=sys.stderr)
-        start = [interval(column(rows["start"], name)[whole[name]]) for name in METRICS]
-        means += f"| {group} | | start | {' | '.join(start)} |\n"
         for truth in args.truths:
-            first: dict[str, np.ndarray] = {}
-            for arm in args.arms:
-                values = {
-                    n: np.stack([column(rows[f"{truth}/{arm}/{s}"], n)[whole[n]] for s in args.seeds]) for n in METRICS
-                }
-                first = first or values
-                means += f"| {group} | {truth} | {arm} | {' | '.join(map(cell, values.values()))} |\n"
-                if first is not values:
-                    cells = [cell(values[n] - first[n]) for n in METRICS]
-                    less += f"| {group} | {truth} | {arm} | {' | '.join(cells)} |\n"
-    return f"{means}\nless {args.arms[0]}\n\n{less}"
+            for name, better in METRICS.items():
+                runs = {arm: [rows[f"{truth}/{arm}/{s}"] for s in args.seeds] for arm in args.arms}
+                values = {arm: np.stack([column(r, name) for r in of_seeds]) for arm, of_seeds in runs.items()}
+                start = column(rows["start"], name)
+                whole = np.isfinite(np.stack([start, *(v for of in values.values() for v in of)])).all(0)
+                values = {arm: v[:, whole] for arm, v in values.items()}
+                cells = [f"{GROUPS[group]} {whole.sum()}", truth, f"{name} ({better})", interval(start[whole])]
+                cells += [cell(values[first]), *(cell(values[arm] - values[first]) for arm in others)]
+                lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
 
 
 def cell(values: np.ndarray) -> str:
@@ -258,13 +252,14 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--arms", nargs="+", choices=ARMS, default=list(ARMS))
     parser.add_argument("--truths", nargs="+", choices=TRUTHS, default=list(TRUTHS))
+    parser.add_argument("--groups", nargs="+", choices=GROUPS, default=list(GROUPS), help="objects to compare")
     parser.add_argument("--only-train", action="store_true", help="for one of several processes")
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     args.latents = args.latents or args.out / "training.latents"
     train_all(args)
     if not args.only_train:
-        report = tables(evaluated(args), args)
+        report = table(evaluated(args), args)
         (args.out / "estimators.md").write_text(report)
         print(report)
 
