@@ -6,6 +6,7 @@ import argparse
 import dataclasses
 import sys
 from pathlib import Path
+from typing import Any
 
 from reli3d.cli.exit_codes import check_ranges, command, tell
 from reli3d.cli.help_format import Defaults
@@ -53,7 +54,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--export", type=Path, help="write the averaged weights of the checkpoint to this file and stop")
     p.add_argument("--licence", default="not stated", help="of the exported weights")
     p.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
-    own = {"default": argparse.SUPPRESS, "help": "of the stage's own"}
+    own: dict[str, Any] = {"default": argparse.SUPPRESS, "help": "of the stage's own"}
     for name in OVERRIDES:
         p.add_argument(f"--{name.replace('_', '-')}", type=float if name == "rate" else int, **own)
     counts = ("LIGHT", "NORMALS", "COSINE")
