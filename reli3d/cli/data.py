@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 from reli3d.cli import objects, shards
-from reli3d.cli.exit_codes import check_range, command
+from reli3d.cli.exit_codes import check_ranges, command
 from reli3d.cli.help_format import Defaults
 from reli3d.cli.samples import SampleJob, Wanted
 
@@ -88,14 +88,7 @@ def _wanted(args: argparse.Namespace) -> Wanted:
     from reli3d.synthetic.maps import held_back, load_maps
     from reli3d.synthetic.protocol import LIGHTS
 
-    for name, low, high in (
-        ("first", 0, 10**9),
-        ("count", 1, 10**9),
-        ("views", 1, 64),
-        ("size", 16, 2048),
-        ("workers", 1, 1024),
-    ):
-        check_range(name, getattr(args, name), low, high)
+    check_ranges(args, first=(0, 10**9), count=(1, 10**9), views=(1, 64), size=(16, 2048), workers=(1, 1024))
     paper = args.protocol == "paper"
     if paper and args.views is not None:
         raise ValueError(f"--views: expected none with --protocol paper, got {args.views}; it has its own numbers")

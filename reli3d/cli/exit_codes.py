@@ -6,6 +6,7 @@ closed or full, or that cannot hold a letter, changes no exit code.
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import functools
 import os
@@ -89,6 +90,17 @@ def check_range(name: str, value: float | None, low: float, high: float) -> None
     """Raise ValueError where the option ``--name`` is given and not within ``low`` and ``high``."""
     if value is not None and not low <= value <= high:
         raise ValueError(f"--{name}: expected {low:g} to {high:g}, got {value}")
+
+
+def check_ranges(args: argparse.Namespace, **ranges: tuple[float, float]) -> None:
+    """:func:`check_range` of options by name, each with its ``(low, high)``; what ``args`` have not is not given."""
+    for name, (low, high) in ranges.items():
+        check_range(name.replace("_", "-"), getattr(args, name, None), low, high)
+
+
+def tell(line: str) -> None:
+    """Write a line of progress to stderr, at once."""
+    print(line, file=sys.stderr, flush=True)
 
 
 def _report(name: str, text: str, code: int) -> int:

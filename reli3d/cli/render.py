@@ -10,7 +10,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from reli3d.cli.exit_codes import check_range, command
+from reli3d.cli.exit_codes import check_ranges, command
 from reli3d.cli.help_format import Defaults
 
 FORMATS = ("png", "exr", "webp", "gif", "mp4")
@@ -149,14 +149,7 @@ def _check(args: argparse.Namespace) -> None:
     from reli3d.cli.infer import choose_device
     from reli3d.output.folder import check_folder
 
-    for name, low, high in (
-        ("frames", 1, 3600),
-        ("size", 1, 8192),
-        ("supersampling", 1, 16),
-        ("plan", 1, 65536),
-        ("seed", 0, 10**9),
-    ):
-        check_range(name, getattr(args, name), low, high)
+    check_ranges(args, frames=(1, 3600), size=(1, 8192), supersampling=(1, 16), plan=(1, 65536), seed=(0, 10**9))
     if not all(0 <= k <= 65536 for k in args.samples) or sum(args.samples) == 0:
         raise ValueError(f"--samples: expected three counts of 0 to 65536, one above 0, got {tuple(args.samples)}")
     if args.output.suffix.lower() in OTHER_FILMS:

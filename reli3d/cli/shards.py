@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
 
-from reli3d.cli.exit_codes import check_range
+from reli3d.cli.exit_codes import check_range, tell
 from reli3d.cli.help_format import Defaults
 from reli3d.io.files import InputError
 from reli3d.io.shards import fault, folder_files, pack_in_parts, read_index, write_shard
@@ -55,10 +54,6 @@ def add(actions) -> None:
     p.set_defaults(run=show)
 
 
-def report(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)
-
-
 def _object_folders(source: Path) -> list[Path]:
     if not source.is_dir():
         raise InputError(source, "expected a folder of object folders, got none")
@@ -76,7 +71,7 @@ def _write(source: Path, output: Path, each: int, part: tuple[int, int], whole: 
             objects = ((folders[k].name, folder_files(folders[k])) for k in numbers)
             return write_shard(output, number, objects)
 
-        pack_in_parts(output, [p.name for p in folders], write, each=each, part=part, progress=report)
+        pack_in_parts(output, [p.name for p in folders], write, each=each, part=part, progress=tell)
         return
     import torch
 
@@ -88,7 +83,7 @@ def _write(source: Path, output: Path, each: int, part: tuple[int, int], whole: 
     torch.set_num_threads(1)
     found = reader(source)
     assert isinstance(found, Samples | Captures)  # shards were refused
-    shards.pack(found, output, each=each, part=part, progress=report)
+    shards.pack(found, output, each=each, part=part, progress=tell)
 
 
 def pack(args: argparse.Namespace) -> int:
@@ -105,7 +100,7 @@ def pack(args: argparse.Namespace) -> int:
         raise ValueError(f"input: expected samples or captures, got shards in {args.input}")
     if isinstance(found, Captures):
         for name, reason in found.refused.items():
-            report(f"{name}: left out, {reason}")
+            tell(f"{name}: left out, {reason}")
     if args.workers == 1:
         _write(args.input, args.output, args.each, (0, 1), args.folders)
         return 0
@@ -122,7 +117,7 @@ def check(args: argparse.Namespace) -> int:
     wrong = [w for w in (fault(args.input, row, hashed=True) for row in rows) if w]
     for line in wrong:
         print(line)
-    report(f"{len(rows) - len(wrong)} of {len(rows)} shards are whole")
+    tell(f"{len(rows) - len(wrong)} of {len(rows)} shards are whole")
     return 1 if wrong else 0
 
 

@@ -6,8 +6,9 @@ import argparse
 import dataclasses
 import sys
 from pathlib import Path
+from typing import Any
 
-from reli3d.cli.exit_codes import check_range, command
+from reli3d.cli.exit_codes import check_ranges, command, tell
 from reli3d.cli.help_format import Defaults
 
 HELD = 3  # objects in the pictures
@@ -53,14 +54,13 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--export", type=Path, help="write the averaged weights of the checkpoint to this file and stop")
     p.add_argument("--licence", default="not stated", help="of the exported weights")
     p.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
+    own: dict[str, Any] = {"default": argparse.SUPPRESS, "help": "of the stage's own"}
     for name in OVERRIDES:
-        kind = float if name == "rate" else int
-        p.add_argument(f"--{name.replace('_', '-')}", type=kind, default=argparse.SUPPRESS, help="of the stage's own")
+        p.add_argument(f"--{name.replace('_', '-')}", type=float if name == "rate" else int, **own)
+    counts = ("LIGHT", "NORMALS", "COSINE")
+    p.add_argument("--samples", type=int, nargs=3, metavar=counts, **own)
+    p.add_argument("--shadows", action=argparse.BooleanOptionalAction, **own)
     return p
-
-
-def report(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)
 
 
 def run_of(args: argparse.Namespace):
@@ -74,20 +74,11 @@ def run_of(args: argparse.Namespace):
     stages = PAPER if args.preset == "official" else TINY
     if args.stage not in stages:
         raise ValueError(f"stage: expected {', '.join(stages)} for {args.preset}, got {args.stage}")
-    given = {name: getattr(args, name) for name in OVERRIDES if hasattr(args, name)}
-    for name, low, high in (
-        ("steps", 0, 10**9),
-        ("batch", 1, 4096),
-        ("rate", 1e-9, 10.0),
-        ("image_size", 8, 2048),
-        ("patch", 0, 2048),
-        ("targets", 1, 16),
-        ("lobes", 1, 4096),
-        ("resolution", 4, 256),
-    ):
-        check_range(name.replace("_", "-"), given.get(name), low, high)
-    check_range("save-every", args.save_every, 1, 10**9)
-    check_range("seed", args.seed, 0, 10**9)
+    given = {name: getattr(args, name) for name in (*OVERRIDES, "samples", "shadows") if hasattr(args, name)}
+    if "samples" in given:
+        given["samples"] = tuple(given["samples"])
+    check_ranges(args, steps=(0, 10**9), batch=(1, 4096), rate=(1e-9, 10.0), save_every=(1, 10**9), seed=(0, 10**9))
+    check_ranges(args, image_size=(8, 2048), patch=(0, 2048), targets=(1, 16), lobes=(1, 4096), resolution=(4, 256))
     check_folder(args.export.parent if args.export else args.output)
     if args.tensorboard:
         check_folder(args.tensorboard)
@@ -125,15 +116,16 @@ def main(argv: list[str] | None = None) -> int:
 
     if args.device == "cuda" and not torch.cuda.is_available():
         raise ValueError("--device: expected a CUDA device, got none; leave it out to train on the CPU")
+    preset = TINY if args.preset == "tiny" else OFFICIAL
     if args.export:
-        model = Reconstructor(TINY if args.preset == "tiny" else OFFICIAL)
+        model = Reconstructor(preset)
         model = averaged(model, load_state(args.output / "state.pt", model)["average"])
         print(weights.save(args.export, model, licence=args.licence).path)
         return 0
     sources = [source(folder) for folder in args.data]
     held = source(args.validation) if args.validation else None
     torch.manual_seed(args.seed)
-    model = Reconstructor(TINY if args.preset == "tiny" else OFFICIAL)
+    model = Reconstructor(preset)
     if args.start:
         load_state(args.start, model)
     if args.prior:
@@ -143,9 +135,9 @@ def main(argv: list[str] | None = None) -> int:
         for one, folder in zip(sources, args.data, strict=True):
             if isinstance(one, Samples):
                 cache = args.output / f"{folder.name}.{workers.rank}.latents"
-                one.latents = fitted(model.environment, one.files, cache, progress=report)
+                one.latents = fitted(model.environment, one.files, cache, progress=tell)
     if workers.rank == 0:
-        report(run.text())
+        tell(run.text())
     pictured = (
         [
             drawn(dataclasses.replace(run, stage=dataclasses.replace(run.stage, patch=0)), [held], model, 0, k)

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from reli3d.cli.exit_codes import check_range, command
+from reli3d.cli.exit_codes import check_ranges, command, tell
 from reli3d.cli.help_format import Defaults
 
 if TYPE_CHECKING:
@@ -62,25 +62,13 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
-def report(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)
-
-
 def _check(args: argparse.Namespace) -> None:
     """Raise InputError or ValueError for what would end the work later."""
     from reli3d.output.folder import check_folder
     from reli3d.synthetic.stored import check_samples
 
-    for name, low, high in (
-        ("steps", 1, 10**9),
-        ("minutes", 1e-3, math.inf),
-        ("batch", 1, 4096),
-        ("points", 2, 16384),
-        ("max-views", 1, 16),
-        ("rate", 1e-9, 10.0),
-        ("seed", 0, 10**9),
-    ):
-        check_range(name, getattr(args, name.replace("-", "_")), low, high)
+    check_ranges(args, steps=(1, 10**9), minutes=(1e-3, math.inf), batch=(1, 4096), points=(2, 16384))
+    check_ranges(args, max_views=(1, 16), rate=(1e-9, 10.0), seed=(0, 10**9))
     check_folder(args.output)
     if args.export:
         check_folder(args.export.parent)
@@ -151,10 +139,10 @@ def main(argv: list[str] | None = None) -> int:
         _check_state(state, model)
     if args.export:
         averaged_model(state, model)
-        for views, tried in calibrate(model, args.validation or args.samples, progress=report).items():
+        for views, tried in calibrate(model, args.validation or args.samples, progress=tell).items():
             row = ", ".join(f"{offset:g}: {iou:.4f}" for offset, iou in tried.items())
-            report(f"silhouette IoU by surface offset, {views} views: {row}")
-        report(f"chosen: {model.preset.offset_one_view:g}, of many views {model.preset.offset_many_views:g}")
+            tell(f"silhouette IoU by surface offset, {views} views: {row}")
+        tell(f"chosen: {model.preset.offset_one_view:g}, of many views {model.preset.offset_many_views:g}")
         print(weights.save(args.export, model, licence=LICENCE).path)
         return 0
     workers = Workers.join()

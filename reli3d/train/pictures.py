@@ -16,33 +16,36 @@ from reli3d.pipeline import Network, NoSurface, ReconstructOptions, reconstruct
 from reli3d.views.views import Views
 
 WIDTH, HEIGHT, MARGIN = 420, 180, 34
+BESIDE = ("step", "seconds", "bad")  # of a row of the log: no curves
 
 
 def write_curves(log: Path, target: Path) -> None:
-    """One panel a logged quantity over the steps, logarithmic where it is positive; nothing is written without two
-    points.
+    """One panel a logged quantity over the steps, logarithmic where it is positive; one that is nowhere finite has
+    none.  Nothing is written without two points.
     """
     rows = [r for r in map(json.loads, log.read_text().splitlines()) if "config" not in r]
     if len(rows) < 2:
         return
-    names = [k for k in rows[-1] if k not in ("step", "seconds", "bad")]
+    logged = {k: np.array([r.get(k, np.nan) for r in rows], float) for k in rows[-1] if k not in BESIDE}
+    logged = {k: values for k, values in logged.items() if np.isfinite(values).any()}
     columns = 3
-    sheet = Image.new("RGB", (WIDTH * columns, HEIGHT * -(-len(names) // columns)), "white")
+    sheet = Image.new("RGB", (WIDTH * columns, max(1, HEIGHT * -(-len(logged) // columns))), "white")
     draw = ImageDraw.Draw(sheet)
     steps = np.array([r["step"] for r in rows], float)
-    for i, name in enumerate(names):
+    for i, (name, values) in enumerate(logged.items()):
         x0, y0 = WIDTH * (i % columns) + MARGIN, HEIGHT * (i // columns) + 16
         w, h = WIDTH - MARGIN - 10, HEIGHT - 34
-        values = np.array([r.get(name, np.nan) for r in rows], float)
-        shown = np.log10(values) if np.nanmin(values) > 0 else values
-        low, high = np.nanmin(shown), max(np.nanmax(shown), np.nanmin(shown) + 1e-9)
-        xs = x0 + w * (steps - steps[0]) / max(steps[-1] - steps[0], 1)
+        known = np.isfinite(values)
+        least, most = values[known].min(), values[known].max()
+        shown = np.log10(values[known]) if least > 0 else values[known]
+        low, high = shown.min(), max(shown.max(), shown.min() + 1e-9)
+        xs = x0 + w * (steps[known] - steps[0]) / max(steps[-1] - steps[0], 1)
         ys = y0 + h * (1 - (shown - low) / (high - low))
         draw.rectangle([x0, y0, x0 + w, y0 + h], outline="#bbbbbb")
-        draw.line([(x, y) for x, y in zip(xs, ys, strict=True) if np.isfinite(y)], fill="#1f5fa8")
+        draw.line(list(zip(xs, ys, strict=True)), fill="#1f5fa8")
         draw.text((x0, y0 - 13), f"{name}: {values[-1]:.4g} at step {int(steps[-1])}", fill="black")
-        draw.text((2 + WIDTH * (i % columns), y0), f"{np.nanmax(values):.2g}", fill="#777777")
-        draw.text((2 + WIDTH * (i % columns), y0 + h - 10), f"{np.nanmin(values):.2g}", fill="#777777")
+        draw.text((2 + WIDTH * (i % columns), y0), f"{most:.2g}", fill="#777777")
+        draw.text((2 + WIDTH * (i % columns), y0 + h - 10), f"{least:.2g}", fill="#777777")
     temporary = target.with_suffix(".tmp.png")
     sheet.save(temporary)
     os.replace(temporary, target)

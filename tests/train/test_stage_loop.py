@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 from dataclasses import replace
 
 import pytest
@@ -17,6 +18,7 @@ from reli3d.cli import stages
 from reli3d.io.files import InputError
 from reli3d.nn.model import Reconstructor
 from reli3d.nn.weights import load_model
+from reli3d.train.pictures import HEIGHT, write_curves
 from reli3d.train.stages import loop
 from reli3d.train.stages.config import Run, Stage
 from reli3d.train.stages.loop import drawn, load_state, open_log, train
@@ -262,7 +264,26 @@ def test_tensorboard_that_is_missing_is_told_in_one_line(folder, tmp_path, monke
     call = ["volume", str(tmp_path / "run"), str(folder), "--tensorboard", str(tmp_path / "board")]
     assert stages.main(call) == 2
     told = capsys.readouterr().err
-    assert "pip install reli3d[train]" in told and told.count("\n") == 1 and not (tmp_path / "run").exists()
+    assert told.endswith("got none; pip install tensorboard\n") and told.count("\n") == 1
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_strategies_of_a_stage_can_be_chosen(folder, tmp_path):
+    call = ["monte_carlo", str(tmp_path), str(folder), "--samples", "16", "0", "0", "--no-shadows"]
+    stage = stages.run_of(stages.parser().parse_args(call)).stage
+    assert stage.samples == (16, 0, 0) and not stage.shadows
+    plain = stages.run_of(stages.parser().parse_args(call[:3])).stage
+    assert plain.samples == (6, 8, 2) and plain.shadows
+
+
+def test_curves_leave_out_what_is_nowhere_finite(tmp_path):
+    rows = [{"step": k, "loss": 1.0 / k, "norm": float("nan"), "rate": 0.1, "image": k - 1.0} for k in (1, 2, 3)]
+    (tmp_path / "log").write_text("".join(json.dumps(r) + "\n" for r in rows))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        write_curves(tmp_path / "log", tmp_path / "curves.png")
+    with Image.open(tmp_path / "curves.png") as sheet:  # three panels are one row, four would be two
+        assert sheet.height == HEIGHT
 
 
 def test_no_option_is_the_beginning_of_one_of_torchruns():

@@ -11,11 +11,12 @@ from reli3d.nn.model import Reconstructor
 from reli3d.nn.presets import TINY
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.gaussians import shade_gaussians
+from reli3d.render.points import SurfacePoints
 from reli3d.train.stages.config import PAPER, Run, Stage, Weights
 from reli3d.train.stages.config import TINY as TINY_STAGES
 from reli3d.train.stages.losses import gradients, light_terms, lpips_distance, shown_colors
 from reli3d.train.stages.picture import Picture, display, lobes
-from reli3d.train.stages.step import encode, object_losses, pictures, total
+from reli3d.train.stages.step import encode, object_losses, pictures, shader_of, total
 from reli3d.train.stages.surface import render_surface, surface
 from reli3d.train.stages.views import ObjectViews, Samples, draw
 from reli3d.train.stages.volume import occupied, render_volume
@@ -146,6 +147,35 @@ def test_a_ball_is_shown_as_a_ball(stage, one):
     assert float(picture.cover[core].min()) > 0.95
     base = picture.material[core][:, :3]
     assert 0.2 < float(base.mean()) < 0.8  # the head starts near one half
+
+
+def test_the_lights_samples_alone_and_all_strategies_show_the_same_radiance(monkeypatch, one):
+    """Both are estimates without bias, so with many samples they agree; fewer strategies are no other light."""
+    model = ball_model()
+    code = encode(model, one)
+    map_ = torch.full((1, 16, 32, 3), 0.3)
+    map_[0, 3:5, 6:9] = 20.0  # a lamp
+    monkeypatch.setattr(model, "decode_environment", lambda code: map_)
+    rng = torch.Generator().manual_seed(0)
+    normal = torch.nn.functional.normalize(torch.randn(300, 3, generator=rng), dim=-1)
+    toward = torch.nn.functional.normalize(normal + 0.5 * torch.randn(300, 3, generator=rng), dim=-1)
+    rough = 0.3 + 0.7 * torch.rand(300, generator=rng)  # a sharper highlight needs more samples of the light alone
+    points = SurfacePoints(torch.zeros(300, 3), normal, normal, torch.full((300, 3), 0.6), rough, rough.round())
+    shown = {}
+    for samples in ((4096, 0, 0), (2048, 2048, 512)):
+        stage = replace(MONTE_CARLO, samples=samples, shadows=False)
+        shown[samples] = shader_of(model, code, stage, 5)(points, toward, None)
+    alone, together = shown.values()
+    assert float(together.max() / together.median()) > 3  # some points show the lamp
+    # 4096 samples of a highlight that a hundredth of them meets: some per cent of a point, less of the mean
+    assert float((alone - together).abs().mean() / together.mean()) < 0.02
+    assert float(alone.mean() / together.mean()) == pytest.approx(1.0, abs=0.005)
+
+
+@pytest.mark.parametrize("samples", [(0, 0, 0), (4, -1, 2), (4, 4)])
+def test_a_stage_without_samples_is_refused(samples):
+    with pytest.raises(ValueError, match="^samples: expected three counts of at least 0, one above 0, got "):
+        replace(MONTE_CARLO, samples=samples)
 
 
 def test_what_is_not_known_is_not_asked(one):

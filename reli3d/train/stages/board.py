@@ -12,9 +12,7 @@ def writer_class() -> type:
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError:
-        raise ValueError(
-            "--tensorboard: expected the package tensorboard, got none; install it with pip install reli3d[train]"
-        ) from None
+        raise ValueError("--tensorboard: expected the package tensorboard, got none; pip install tensorboard") from None
     return SummaryWriter
 
 

@@ -45,7 +45,7 @@ class Stage:
     resolution: int = 0  # cubes along each side of the surface grid; 0: the preset's
     grid: int = 16  # cells along each side of the volume's occupancy grid
     samples_along: int = 64  # samples of a ray across the model's cube
-    samples: tuple[int, int, int] = (20, 40, 4)  # by the light, by visible normals, by the cosine
+    samples: tuple[int, int, int] = (20, 40, 4)  # by the light, by visible normals, by the cosine; 0: without it
     shadows: bool = True  # of monte_carlo
     batch: int = 4  # objects a step
     steps: int = 60_000
@@ -57,6 +57,8 @@ class Stage:
             raise ValueError(f"renderer: expected {', '.join(RENDERERS)}, got {self.renderer!r}")
         if not 0 <= self.patch <= self.image_size:
             raise ValueError(f"patch: expected 0 to image_size {self.image_size}, got {self.patch}")
+        if len(self.samples) != 3 or min(self.samples) < 0 or sum(self.samples) == 0:
+            raise ValueError(f"samples: expected three counts of at least 0, one above 0, got {self.samples}")
 
 
 @dataclass(frozen=True)
