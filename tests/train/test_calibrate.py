@@ -17,13 +17,13 @@ from tests.support.samples import SEEDS
 class _Thin(LocalReconstructor):
     """Knows the shape of one object exactly, and draws it 1.5 units too thin."""
 
-    def encode(self, *inputs):
-        known = super().encode(*inputs)
+    def encode(self, *inputs, mirrored=0):
+        known = super().encode(*inputs, mirrored=mirrored)
         return _ThinField(*(getattr(known, f.name) for f in dataclasses.fields(known)))
 
 
 class _ThinField(LocalField):
-    def free_level(self, points):
+    def _level_within(self, points, bound):
         distance = signed_distance(*self.model.shape, points.contiguous())
         return distance / self.model.preset.softness + 1.5 - self._offset()
 
