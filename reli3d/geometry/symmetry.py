@@ -30,6 +30,7 @@ EQUAL = 6e-5  # mean miss by which planes count as equal: of them the one that s
 AMBIGUOUS = 0.028  # times the square of the number of views: share of the planes that may be as good
 ROUND = 0.95  # share of the planes from which on the object is one of revolution
 FEWEST = 3  # views: two silhouettes agree with many planes
+REACHED = 50.0  # from the middle of the cameras, in their greatest distance from it: farther off there is no object
 BLOCK = 64  # planes that are asked together
 ROLL = 0.17  # root mean square [rad] by which cameras may be rolled about their axes: else there is no upright
 APART = 0.2  # rms sine between the cameras' horizontal axes, below which nothing tells what is upright
@@ -58,15 +59,22 @@ def mirror_plane(distance: Tensor, camera: Camera) -> MirrorPlane | None:
     """The upright plane in which the object of V views is its own mirror image, or None where none is sure.
 
     distance: ``(V, H, W)`` from :func:`~reli3d.geometry.hull.mask_distance`, of whole silhouettes.  camera: of these
-    views; any frame and unit.  None for one or two views, for rolled cameras, where no plane lets the common hull fill
-    the silhouettes, and where many do, so that the views do not tell which.  Where nearly all do, the object is one of
-    revolution.  No gradient.  Raises TypeError or ValueError where shapes or devices disagree.
+    views; any frame and unit.  None for one or two views, for rolled cameras and cameras in one place, where no plane
+    lets the common hull fill the silhouettes, and where many do, so that the views do not tell which.  Where nearly all
+    do, the object is one of revolution.  No gradient.  Raises TypeError or ValueError where shapes or devices disagree.
     """
     check("distance", distance)
     check_camera(camera, like=distance, views=len(distance), size=distance.shape[1:])
     up = upright(camera) if len(distance) >= FEWEST else None
     if up is None:
         return None
+    shift = camera.position.mean(0)
+    unit = (camera.position - shift).norm(dim=1).max()
+    if float(unit) <= 1e-6 * float(shift.norm()):  # all cameras are in one place
+        return None
+    c2w = camera.c2w.clone()
+    c2w[:, :3, 3] = (camera.position - shift) / unit
+    camera = Camera(c2w, camera.intrinsics, camera.width, camera.height)
     points, known = _hull_points(distance, camera)
     inside = points[known]
     if len(inside) == 0:
@@ -106,7 +114,7 @@ def mirror_plane(distance: Tensor, camera: Camera) -> MirrorPlane | None:
     if float(misses(angle[None], offset[None])[1]) > MOST_LOST:
         return None
     normal = angle.cos() * first + angle.sin() * second
-    return MirrorPlane(normal, float(normal @ centre + size * offset))
+    return MirrorPlane(normal, float(unit * (normal @ centre + size * offset) + normal @ shift))
 
 
 def _middles(good: list[bool]) -> list[int]:
@@ -151,13 +159,12 @@ def _hull_points(distance: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
     local = torch.stack([(column + 0.5 - cx) / fx, -(row + 0.5 - cy) / fy, -torch.ones_like(fx)], 1)
     direction = functional.normalize((camera.c2w[view, :3, :3] @ local[..., None])[..., 0], dim=1)
     origin = camera.position[view].contiguous()
-    radius = 2.0 * float(camera.position.norm(dim=1).max())
-    span = hull_span(origin, direction, min(radius, 99.0), distance, camera)
+    span = hull_span(origin, direction, REACHED, distance, camera)
     share = (torch.arange(DEPTHS, device=origin.device) + 0.5) / DEPTHS
     depth = torch.lerp(span[:, :1], span[:, 1:], share)
     points = origin[:, None] + direction[:, None] * depth[..., None]
     within = hull_distance(points.reshape(-1, 3), distance, camera).view(depth.shape)
-    pixel = camera.position.norm(dim=1).mean() / camera.intrinsics[:, 0].mean()
+    pixel = (points - origin[:, None]).norm(dim=2).mean() / camera.intrinsics[:, 0].mean()
     return points, within > -pixel
 
 

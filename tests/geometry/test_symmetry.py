@@ -64,7 +64,8 @@ def test_a_mirrored_camera_sees_the_reflected_point_at_the_mirrored_pixel():
 @pytest.mark.parametrize("up, centre, unit", [
     ((0.0, 1.0, 0.0), (0.0, 0.0, 0.0), 1.0),
     ((0.0, 0.0, 1.0), (0.3, -0.2, 0.1), 1.0),
-    ((0.48, 0.6, -0.64), (3.0, 1.0, -2.0), 10.0),
+    ((0.48, 0.6, -0.64), (300.0, 100.0, -200.0), 1000.0),
+    ((0.0, 1.0, 0.0), (0.001, 0.0, 0.002), 0.01),
 ])  # fmt: skip
 def test_the_plane_of_twin_balls_is_found_in_any_frame(up, centre, unit, device):
     camera = cameras(up=up, centre=centre, unit=unit)
@@ -110,6 +111,21 @@ def test_upright_is_a_right_angle_to_what_is_level():
     torch.testing.assert_close(upright(cameras(up=tuple(up.tolist()))), up, rtol=0, atol=1e-5)
     low = cameras(eyes=[(0.0, -1.0, 2.0), (2.0, -1.0, 0.1), (-2.0, -0.5, 0.0)])  # from below
     torch.testing.assert_close(upright(low), torch.tensor([0.0, 1.0, 0.0]), rtol=0, atol=1e-5)
+
+
+def test_cameras_in_one_place_tell_nothing():
+    eye = look_at((0.3, 0.9, 2.4))
+    camera = Camera.from_fov(eye.repeat(4, 1, 1), 0.7, SIZE, SIZE)
+    assert mirror_plane(distances(TWIN, camera), camera) is None
+    turned_on_the_spot = torch.stack([eye @ yawed(angle) for angle in (-0.6, 0.0, 0.6)])
+    camera = Camera.from_fov(turned_on_the_spot, 2.2, SIZE, SIZE)
+    assert mirror_plane(distances(TWIN, camera), camera) is None
+
+
+def yawed(angle):
+    """A turn about the camera's own Y axis."""
+    c, s = math.cos(angle), math.sin(angle)
+    return torch.tensor([[c, 0, s, 0], [0, 1, 0, 0], [-s, 0, c, 0], [0, 0, 0, 1.0]])
 
 
 def test_wrong_shapes_are_refused():
