@@ -353,7 +353,7 @@ def reconstruct_placed(placed: Placed, model: Network, options: ReconstructOptio
             prepared = completed(prepared)
         if prepared.mirrored:
             watch.notes.append(
-                "symmetry: the object is its own mirror image; photographs are read as views of both halves"
+                "symmetry: the silhouettes fit a mirror plane; photographs are also read as views of the other half"
             )
     with watch.stage("network"):
         field = encode(model, prepared, background=shown, heads=heads)

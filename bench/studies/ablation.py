@@ -95,8 +95,8 @@ class FreeField(LocalField):
 class WithoutBound(LocalReconstructor):
     """The silhouettes' hull is a feature, but the surface may leave it."""
 
-    def encode(self, *views: Tensor) -> LocalField:
-        field = super().encode(*views)
+    def encode(self, *views: Tensor, mirrored: int = 0) -> LocalField:
+        field = super().encode(*views, mirrored=mirrored)
         return FreeField(*(getattr(field, f.name) for f in dataclasses.fields(field)))
 
 

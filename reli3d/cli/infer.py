@@ -333,6 +333,7 @@ class Job:
             "texture_size": args.texture_size,
             "resolution": args.resolution or self.model.preset.resolution,
             "background": args.background,
+            "symmetry": args.symmetry,
             "seed": args.seed,
             "device": self.device,
             "mesh": results.mesh_statistics(asset.mesh),

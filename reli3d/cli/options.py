@@ -92,8 +92,8 @@ def parser() -> argparse.ArgumentParser:
         "--symmetry",
         choices=("auto", "off"),
         default="auto",
-        help="auto (default): where 3 to 8 silhouettes show that the object is its own mirror image, photographs are "
-        "read as views of both halves",
+        help="auto (default): where 3 to 8 silhouettes fit a mirror plane, the small network reads photographs as "
+        "views of the other half, too",
     )
     p.add_argument(
         "--frame", choices=("input", "model"), default="input", help="frame of the mesh (default the cameras')"

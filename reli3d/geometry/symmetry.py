@@ -24,13 +24,15 @@ ANGLES, OFFSETS = 60, 7  # planes of the first search
 REACH = 0.06  # greatest offset of the plane from the hull's centre, of the hull's longest side
 FINER = 9  # angles and offsets of the second search, within one step of the first
 LOST = 0.01  # of the longest side: a pixel whose ray misses the common hull by more is lost
-MOST_LOST = 0.006  # share of the pixels that may be lost: a part that is on one side alone would be cut off
+MOST_LOST = 0.008  # share of the pixels that may be lost: a part that is on one side alone would be cut off
 AS_GOOD = 3e-4  # mean miss, of the longest side, by which another plane may be worse and still be as good
 EQUAL = 6e-5  # mean miss by which planes count as equal: of them the one that shows most is taken
-AMBIGUOUS = 0.028  # times the square of the number of views: share of the planes that may be as good
+AMBIGUOUS = 0.03, 0.5  # share of the planes that may be as good: times the square of the number of views; at most
+ONE_SIDED = 0.75  # length of the mean of the level view directions: from one side many things look symmetric
+UNKNOWN = 0.05  # share of the rays that may have no point in the hull: else masks and cameras do not agree
 ROUND = 0.95  # share of the planes from which on the object is one of revolution
 FEWEST = 3  # views: two silhouettes agree with many planes
-REACHED = 50.0  # from the middle of the cameras, in their greatest distance from it: farther off there is no object
+FARTHEST = 50.0  # from the middle of the cameras, in their greatest distance from it: farther off there is no object
 BLOCK = 64  # planes that are asked together
 ROLL = 0.17  # root mean square [rad] by which cameras may be rolled about their axes: else there is no upright
 APART = 0.2  # rms sine between the cameras' horizontal axes, below which nothing tells what is upright
@@ -38,13 +40,13 @@ APART = 0.2  # rms sine between the cameras' horizontal axes, below which nothin
 
 @dataclass(frozen=True)
 class MirrorPlane:
-    """The points ``x`` with ``normal . x = offset``; ``normal (3,)`` unit."""
+    """The points ``x`` with ``normal . x = offset``; ``normal (3,)`` unit, ``offset`` in the world's unit."""
 
     normal: Tensor
     offset: float
 
     def mirrored(self, camera: Camera) -> Camera:
-        """Cameras that see the mirrored world as pictures whose columns are reversed."""
+        """Cameras ``(V,)`` whose pictures of the object are those of ``camera (V,)`` with the columns reversed."""
         flip = torch.eye(4, device=camera.c2w.device)
         flip[:3, :3] -= 2.0 * torch.outer(self.normal, self.normal)
         flip[:3, 3] = 2.0 * self.offset * self.normal
@@ -59,9 +61,11 @@ def mirror_plane(distance: Tensor, camera: Camera) -> MirrorPlane | None:
     """The upright plane in which the object of V views is its own mirror image, or None where none is sure.
 
     distance: ``(V, H, W)`` from :func:`~reli3d.geometry.hull.mask_distance`, of whole silhouettes.  camera: of these
-    views; any frame and unit.  None for one or two views, for rolled cameras and cameras in one place, where no plane
-    lets the common hull fill the silhouettes, and where many do, so that the views do not tell which.  Where nearly all
-    do, the object is one of revolution.  No gradient.  Raises TypeError or ValueError where shapes or devices disagree.
+    views; any frame and unit.  None for one or two views, for cameras that are rolled, in one place or on one side,
+    where no plane lets the common hull fill the silhouettes, and where many do, so that the views do not tell which.
+    Where nearly all do, the object is one of revolution.  Silhouettes do not tell everything: an object that is not
+    symmetric where they do not show it may lose some per cent of itself.  No gradient.  Raises TypeError or ValueError
+    where shapes or devices disagree.
     """
     check("distance", distance)
     check_camera(camera, like=distance, views=len(distance), size=distance.shape[1:])
@@ -76,11 +80,15 @@ def mirror_plane(distance: Tensor, camera: Camera) -> MirrorPlane | None:
     c2w[:, :3, 3] = (camera.position - shift) / unit
     camera = Camera(c2w, camera.intrinsics, camera.width, camera.height)
     points, known = _hull_points(distance, camera)
-    inside = points[known]
-    if len(inside) == 0:
+    inside, seen = points[known], known.any(1)
+    if len(inside) == 0 or float(seen.float().mean()) < 1.0 - UNKNOWN:
         return None
+    points, known = points[seen], known[seen]
     low, high = inside.aminmax(dim=0)
     centre, size = (low + high) / 2, float((high - low).max())
+    views = functional.normalize(camera.position - centre, dim=1)
+    if float(functional.normalize(views - (views @ up)[:, None] * up, dim=1).mean(0).norm()) > ONE_SIDED:
+        return None
     first = functional.normalize(torch.linalg.cross(up, torch.eye(3, device=up.device)[int(up.abs().argmin())]), dim=0)
     second = torch.linalg.cross(up, first)
 
@@ -99,18 +107,20 @@ def mirror_plane(distance: Tensor, camera: Camera) -> MirrorPlane | None:
     miss = miss.view(ANGLES, OFFSETS)
     by_angle = miss.amin(1)
     as_good = float((by_angle < by_angle.min() + AS_GOOD).float().mean())
-    if AMBIGUOUS * len(distance) ** 2 < as_good < ROUND:
+    if min(AMBIGUOUS[0] * len(distance) ** 2, AMBIGUOUS[1]) < as_good < ROUND:
         return None
     planes = torch.tensor(_middles((by_angle <= by_angle.min() + EQUAL).tolist()), device=up.device)
     normals = torch.outer(angles[planes].cos(), first) + torch.outer(angles[planes].sin(), second)
-    best = int(planes[_novelty(normals, functional.normalize(camera.position - centre, dim=1)).argmax()])
+    best = int(planes[_novelty(normals, views).argmax()])
     equal = miss[best] <= miss[best].min() + EQUAL
     around = torch.linspace(-1.0, 1.0, FINER, device=up.device)
     angle = (angles[best] + around * (math.pi / ANGLES)).repeat_interleave(FINER)
     offset = (offsets[equal].mean() + around * (2 * REACH / (OFFSETS - 1))).repeat(FINER)
     miss, _ = misses(angle, offset)
-    alike = miss <= miss.min() + EQUAL  # the middle of what is equally good
-    angle, offset = angle[alike].mean(), offset[alike].mean()
+    alike = (miss <= miss.min() + EQUAL).nonzero()[:, 0]
+    equally = torch.stack([angle[alike], offset[alike]], 1)
+    middle = int(alike[(equally - equally.mean(0)).norm(dim=1).argmin()])
+    angle, offset = angle[middle], offset[middle]
     if float(misses(angle[None], offset[None])[1]) > MOST_LOST:
         return None
     normal = angle.cos() * first + angle.sin() * second
@@ -159,7 +169,7 @@ def _hull_points(distance: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
     local = torch.stack([(column + 0.5 - cx) / fx, -(row + 0.5 - cy) / fy, -torch.ones_like(fx)], 1)
     direction = functional.normalize((camera.c2w[view, :3, :3] @ local[..., None])[..., 0], dim=1)
     origin = camera.position[view].contiguous()
-    span = hull_span(origin, direction, REACHED, distance, camera)
+    span = hull_span(origin, direction, FARTHEST, distance, camera)
     share = (torch.arange(DEPTHS, device=origin.device) + 0.5) / DEPTHS
     depth = torch.lerp(span[:, :1], span[:, 1:], share)
     points = origin[:, None] + direction[:, None] * depth[..., None]
@@ -176,5 +186,4 @@ def _miss(points: Tensor, known: Tensor, distance: Tensor, camera: Camera, norma
     flat, normal = points.reshape(-1, 3), normal[:, None]
     mirrored = flat - 2.0 * ((normal * flat).sum(-1) - offset[:, None])[..., None] * normal
     within = hull_distance(mirrored.reshape(-1, 3), distance, camera).view(-1, *known.shape)
-    best = torch.where(known, within, within.new_tensor(-math.inf)).amax(-1)
-    return torch.where(known.any(-1), (-best).clamp(min=0.0), 0.0)
+    return (-torch.where(known, within, within.new_tensor(-math.inf)).amax(-1)).clamp(min=0.0)

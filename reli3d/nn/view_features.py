@@ -44,7 +44,7 @@ class ViewMaps:
         return ViewMaps(self.tokens[: self.taken], self.images[: self.taken], self.camera[: self.taken])
 
     def photographs_first(self, visible: Tensor) -> Tensor:
-        """``visible (N, V)``, but mirror images only where no photograph sees the point."""
+        """``visible (N, V)`` float32 in [0, 1], but mirror images only where no photograph sees the point."""
         own, other = visible.split([self.taken, self.mirrored], 1)
         return torch.cat([own, other * (1.0 - own.amax(1, keepdim=True))], 1) if self.mirrored else visible
 

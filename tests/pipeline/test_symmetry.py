@@ -17,11 +17,11 @@ from reli3d.views.views import Views
 
 SIZE = 192
 BALLS = [((0.0, 0.0, 0.0), 0.3), ((0.35, 0.1, 0.25), 0.14), ((-0.35, 0.1, 0.25), 0.14), ((0.0, 0.3, -0.2), 0.14)]
-EYES = [(0.3, 0.9, 2.4), (2.3, 0.4, -0.8), (1.9, 1.2, 1.4), (0.9, -0.3, 2.2)]  # hardly any sees the left half
+EYES = [(0.3, 0.9, 2.4), (2.3, 0.4, -0.8), (1.9, 1.2, 1.4), (0.2, -0.3, -2.2)]  # hardly any sees the left half
 
 
 def depth_in_balls(points):
-    """Signed distance to the surface of the union, positive inside: where it is positive it is exact in sign."""
+    """Positive inside the union, negative outside, ``(N,)``."""
     centres = torch.tensor([c for c, _ in BALLS])
     radii = torch.tensor([r for _, r in BALLS])
     return (radii - (points[:, None] - centres).norm(dim=-1)).amax(1)
