@@ -268,8 +268,7 @@ class ReconstructOptions:
     that shall become +Y.  uv: ``project`` or ``xatlas``.  hero: index of the network's main view, or ``random``.
     background: ``masked``, ``visible`` or ``auto``, see :func:`~reli3d.views.published_views.background_shown`.
     heads: precision of a triplane's material heads, see :func:`~reli3d.nn.precision.heads_dtype`.
-    symmetry: ``auto`` lets a network of convolutions see 3 to 8 views of an object that is its own mirror image as
-    views of both halves, see :func:`~reli3d.geometry.symmetry.mirror_plane`; or ``off``.
+    symmetry: ``auto`` or ``off``, see :func:`~reli3d.prepare.completed`; for the network of convolutions.
     """
 
     texture_size: int = 1024

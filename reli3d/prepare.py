@@ -53,7 +53,10 @@ def prepare(model: Network, views: Views, model_from_input: Similarity) -> Prepa
 
 
 def completed(prepared: Prepared) -> Prepared:
-    """``prepared`` with mirror images, if there are at most ``MOST_MIRRORED`` views and they show a mirror plane."""
+    """``prepared`` with mirror images, if its 3 to ``MOST_MIRRORED`` silhouettes fit a mirror plane, else itself.
+
+    See :func:`~reli3d.geometry.symmetry.mirror_plane`.
+    """
     plane = None
     if len(prepared.batch) <= MOST_MIRRORED:
         plane = mirror_plane(prepared.images[..., 3].contiguous(), prepared.camera)

@@ -2,12 +2,11 @@
 
 usage: python -m bench.studies.estimators OUT --train SAMPLES --held-back SAMPLES --maps FILE --prior FILE --start STATE
 
-Each run begins with the averaged parameters of STATE and takes the same steps of the same draws; the renderer alone
-differs.  ``images`` leaves out the truth of materials and normals, so that renders alone teach them.  A call goes on
-where the one before was stopped; ``--seeds``, ``--arms`` and ``--groups`` let several processes share it.  Then each
-object of both folders is read from four views and compared in two others with its truth, also under two held-back maps
-of light; the truth is the procedural object itself, rendered with shadows.  Prints a table in Markdown, with 95 %
-intervals of means over the objects by bootstrap.
+Runs begin with the averaged parameters of STATE and take the same steps of the same draws; the renderer alone differs.
+``images`` leaves out the truth of materials and normals.  A call goes on where the one before was stopped; ``--seeds``,
+``--arms`` and ``--groups`` let several processes share it.  Then each object is read from four views and compared in
+two others with the procedural object itself, rendered with shadows, also under two held-back lights.  Prints a table in
+Markdown, with 95 % intervals of means over the objects by bootstrap.
 """
 
 from __future__ import annotations

@@ -2,12 +2,10 @@
 
 GOLDENS: a folder of inputs, parameters and outputs of the published modules.  The error is the norm of the difference
 from the published output by the norm of that output.  int8 is torch's dynamic quantisation of the feed-forward layers
-(weights by tensor or by channel, activations by tensor) in a float32 stream; the others stay float32.  The last rows
-are one feed-forward layer of the published width with random weights, with its time: the second has one input channel
-60 times as large as the others, as trained transformers have.
+(weights by tensor or by channel, activations by tensor).  The last rows are one feed-forward layer of the published
+width with random weights, with its time: the second has one input channel 60 times as large as the others.
 
-``--meshes FOLDER`` prints instead what bfloat16 does to the material of the published heads at the vertices of GLB
-files: peak signal to noise against float32, and degrees between the normals.
+``--meshes FOLDER`` prints instead what bfloat16 does to the published heads' material at the vertices of GLB files.
 """
 
 from __future__ import annotations

@@ -63,9 +63,8 @@ def mirror_plane(distance: Tensor, camera: Camera) -> MirrorPlane | None:
     distance: ``(V, H, W)`` from :func:`~reli3d.geometry.hull.mask_distance`, of whole silhouettes.  camera: of these
     views; any frame and unit.  None for one or two views, for cameras that are rolled, in one place or on one side,
     where no plane lets the common hull fill the silhouettes, and where many do, so that the views do not tell which.
-    Where nearly all do, the object is one of revolution.  Silhouettes do not tell everything: an object that is not
-    symmetric where they do not show it may lose some per cent of itself.  No gradient.  Raises TypeError or ValueError
-    where shapes or devices disagree.
+    Where nearly all do, the object is one of revolution.  An object that is not symmetric where no silhouette shows it
+    may get a plane.  No gradient.  Raises TypeError or ValueError where shapes or devices disagree.
     """
     check("distance", distance)
     check_camera(camera, like=distance, views=len(distance), size=distance.shape[1:])

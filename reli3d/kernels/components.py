@@ -2,17 +2,9 @@
 
 import warp as wp
 
+from reli3d.kernels.uv import root_of
+
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
-
-
-@wp.func
-def lowest(parent: wp.array[wp.int32], node: wp.int32) -> wp.int32:
-    """Root of the set that ``node`` is in; halves the way to it for the next time."""
-    at = wp.int32(node)
-    while parent[at] != at:
-        parent[at] = parent[parent[at]]
-        at = parent[at]
-    return at
 
 
 @wp.kernel
@@ -26,8 +18,8 @@ def components_kernel(
 ):
     if start + wp.tid() == 0:  # a single thread: the links are taken one after the other
         for k in range(a.shape[0]):
-            one = lowest(parent, a[k])
-            other = lowest(parent, b[k])
+            one = root_of(parent, a[k])
+            other = root_of(parent, b[k])
             parent[wp.max(one, other)] = wp.min(one, other)
         for n in range(parent.shape[0]):
-            parent[n] = lowest(parent, n)
+            parent[n] = root_of(parent, n)
