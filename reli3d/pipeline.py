@@ -18,6 +18,7 @@ from reli3d.geometry.cover import cover_silhouettes
 from reli3d.geometry.mesh import Mesh, largest_components, vertex_normals, weld
 from reli3d.geometry.rays import RayScene
 from reli3d.geometry.smooth import taubin_smooth
+from reli3d.geometry.sparse_level import sparse_level
 from reli3d.geometry.surface import extract_surface
 from reli3d.geometry.tangents import encode_normals, vertex_tangents
 from reli3d.geometry.uv import unwrap, unwrap_xatlas
@@ -116,10 +117,13 @@ def _bounded_surface(field: LocalField, resolution: int) -> Mesh:
     radius = min(radius, _hull_reach(field, resolution) + 2 * MARGIN_CELLS * radius / resolution)
     flat = _grid(resolution, radius, maps.images.device).reshape(-1, 3)
     bound = field.bound(flat)
-    level, margin = bound.clamp(min=OUTSIDE), MARGIN_CELLS * 2 * radius / resolution / preset.softness
-    for part in (bound < margin).nonzero()[:, 0].split(CHUNK):
-        level[part] = field.level_within(flat[part], bound[part])
-    level = torch.maximum(level, bound).view((resolution + 1,) * 3)
+    level = bound.clamp(min=OUTSIDE).view((resolution + 1,) * 3)
+    near = bound.view_as(level) < MARGIN_CELLS * 2 * radius / resolution / preset.softness
+
+    def evaluate(index: Tensor) -> Tensor:
+        return torch.cat([torch.maximum(field.level_within(flat[k], bound[k]), bound[k]) for k in index.split(CHUNK)])
+
+    level = sparse_level(level, near, evaluate)
     level = cover_silhouettes(level, bound.view_as(level), maps.silhouette, maps.camera, radius=radius)
     _check_signs(level)
     return extract_surface(level, radius=radius)
