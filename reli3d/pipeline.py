@@ -14,7 +14,7 @@ from torch import Tensor
 
 from reli3d._bridge import expect, present
 from reli3d.geometry.bake import bake
-from reli3d.geometry.cover import cover_silhouettes
+from reli3d.geometry.cover import REACH, cover_silhouettes
 from reli3d.geometry.mesh import Mesh, largest_components, vertex_normals, weld
 from reli3d.geometry.rays import RayScene
 from reli3d.geometry.smooth import taubin_smooth
@@ -116,9 +116,10 @@ def _bounded_surface(field: LocalField, resolution: int) -> Mesh:
     radius = preset.radius
     radius = min(radius, _hull_reach(field, resolution) + 2 * MARGIN_CELLS * radius / resolution)
     flat = _grid(resolution, radius, maps.images.device).reshape(-1, 3)
-    bound = field.bound(flat)
+    cell = 2 * radius / resolution / preset.softness
+    bound = field.bound(flat, REACH + 4 * cell)  # what is farther outside than REACH changes nothing
     level = bound.clamp(min=OUTSIDE).view((resolution + 1,) * 3)
-    near = bound.view_as(level) < MARGIN_CELLS * 2 * radius / resolution / preset.softness
+    near = bound.view_as(level) < MARGIN_CELLS * cell
 
     def evaluate(index: Tensor) -> Tensor:
         return torch.cat([torch.maximum(field.level_within(flat[k], bound[k]), bound[k]) for k in index.split(CHUNK)])
@@ -143,12 +144,12 @@ def _hull_reach(field: LocalField, resolution: int) -> float:
     radius, device = field.model.preset.radius, field.maps.images.device
     coarse = -(-resolution // COARSE)
     apart = 2 * radius / coarse
-    level = field.bound(_grid(coarse, radius, device).reshape(-1, 3))
     slack = 3**0.5 * apart / field.model.preset.softness  # twice half a diagonal: distances stretch off the axis
+    level = field.bound(_grid(coarse, radius, device).reshape(-1, 3), slack)
     near = (level < slack).reshape((coarse + 1,) * 3)
     k = ((torch.linspace(-radius, radius, resolution + 1, device=device) + radius) / apart).round().long()
     flat = _grid(resolution, radius, device)[near[k][:, k][:, :, k]]
-    inside = flat[field.bound(flat) < 0]
+    inside = flat[field.bound(flat, 0.0) < 0]
     if len(inside) == 0:
         raise ValueError("masks: expected masks that overlap in space, got none inside all of them; run --check")
     return float(inside.abs().max())

@@ -50,7 +50,7 @@ class FeatureVolume(nn.Module):
         """``(N, N, N, F)``, indexed x, y, z.  surface: as in :func:`~reli3d.nn.view_features.ahead_of_surface`."""
         axis = torch.linspace(-self.radius, self.radius, self.side, device=maps.images.device)
         grid = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
-        hull = hull_distance(grid, maps.silhouette, maps.camera)
+        hull = hull_distance(grid, maps.silhouette, maps.camera, far=NEAR_HULL)
         near = (hull > -NEAR_HULL).nonzero()[:, 0]
         pooled = self._pooled(maps, surface, grid[near], hull[near])
         x = pooled.new_zeros(len(grid), pooled.shape[1]).index_copy(0, near, pooled)
