@@ -7,6 +7,7 @@ from __future__ import annotations
 import time
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import torch
@@ -21,9 +22,9 @@ from reli3d.geometry.smooth import taubin_smooth
 from reli3d.geometry.sparse_level import sparse_level
 from reli3d.geometry.surface import extract_surface
 from reli3d.geometry.tangents import encode_normals, vertex_tangents
-from reli3d.geometry.uv import unwrap, unwrap_xatlas
+from reli3d.geometry.uv import source_vertices, unwrap, unwrap_xatlas
 from reli3d.geometry.visibility import visible_from
-from reli3d.nn.blocks import in_rows
+from reli3d.nn.blocks import beside, in_rows
 from reli3d.nn.field import CHUNK, Field, TriplaneField
 from reli3d.nn.local import LocalField, LocalReconstructor
 from reli3d.nn.precision import heads_dtype
@@ -174,18 +175,21 @@ def texture(
     def seen(position: Tensor, normal: Tensor) -> Tensor:
         return maps.photographs_first(visible_from(present("scene", scene), position, normal, maps.camera).float())
 
-    local = None
-    if isinstance(field, LocalField):
+    def at_vertices(field: LocalField, mesh: Mesh) -> tuple[LocalField, Tensor]:
+        """The field with its light, and its heads at the vertices, which lie as close as the network's cells."""
         every = slice(None, None, max(1, len(mesh.vertices) // SHADING_POINTS))
-        position, normal = mesh.vertices[every].contiguous(), present("mesh.normals", mesh.normals)[every].contiguous()
-        local = field.with_shading(position, normal, seen(position, normal))
+        position, normal = mesh.vertices, present("mesh.normals", mesh.normals)
+        visible = seen(position, normal)
+        field = field.with_shading(*(v[every].contiguous() for v in (position, normal, visible)))
+        return field, field.heads(position, normal, visible)
+
+    asked = beside(partial(at_vertices, field, mesh), mesh.vertices.device) if isinstance(field, LocalField) else None
+    whole = mesh
     mesh = unwrap(mesh, texture_size=size) if uv == "project" else unwrap_xatlas(mesh, texture_size=size)
     mesh = replace(mesh, tangents=vertex_tangents(mesh))
-
-    heads = None
-    if local is not None:  # evaluated at the vertices, which lie as close as the network's cells
-        normals = present("mesh.normals", mesh.normals)
-        heads = local.heads(mesh.vertices, normals, seen(mesh.vertices, normals))
+    local, heads = asked() if asked else (None, None)
+    if heads is not None:
+        heads = heads.index_select(0, source_vertices(whole, mesh))
 
     def surface(position: Tensor, normal: Tensor, tangent: Tensor, *values: Tensor) -> dict[str, Tensor]:
         if local is not None:
