@@ -23,7 +23,6 @@ from reli3d.geometry.sparse_level import sparse_level
 from reli3d.geometry.surface import extract_surface
 from reli3d.geometry.tangents import encode_normals, vertex_tangents
 from reli3d.geometry.uv import source_vertices, unwrap, unwrap_xatlas
-from reli3d.geometry.visibility import visible_from
 from reli3d.nn.blocks import beside, in_rows
 from reli3d.nn.field import CHUNK, Field, TriplaneField
 from reli3d.nn.local import LocalField, LocalReconstructor
@@ -172,14 +171,11 @@ def texture(
         raise ValueError(f"uv: expected project or xatlas, got {uv}")
     maps = field.maps
 
-    def seen(position: Tensor, normal: Tensor) -> Tensor:
-        return maps.photographs_first(visible_from(present("scene", scene), position, normal, maps.camera).float())
-
     def at_vertices(field: LocalField, mesh: Mesh) -> tuple[LocalField, Tensor]:
         """The field with its light, and its heads at the vertices, which lie as close as the network's cells."""
         every = slice(None, None, max(1, len(mesh.vertices) // SHADING_POINTS))
         position, normal = mesh.vertices, present("mesh.normals", mesh.normals)
-        visible = seen(position, normal)
+        visible = maps.seen(present("scene", scene), position, normal)
         field = field.with_shading(*(v[every].contiguous() for v in (position, normal, visible)))
         return field, field.heads(position, normal, visible)
 
@@ -193,7 +189,8 @@ def texture(
 
     def surface(position: Tensor, normal: Tensor, tangent: Tensor, *values: Tensor) -> dict[str, Tensor]:
         if local is not None:
-            got = local.painted(values[0], position, normal, seen(position, normal))
+            visible = maps.seen(present("scene", scene), position, normal)
+            got = local.painted(values[0], position, normal, visible)
         else:
             got = field.material(position, normal, position.new_zeros(len(position), len(maps.images)))
         found = {"base_color": got.base_color, "roughness": got.roughness[:, None], "metallic": got.metallic[:, None]}
