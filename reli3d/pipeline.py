@@ -25,7 +25,7 @@ from reli3d.geometry.tangents import encode_normals, vertex_tangents
 from reli3d.geometry.uv import source_vertices, unwrap, unwrap_xatlas
 from reli3d.nn.blocks import beside, in_rows
 from reli3d.nn.field import CHUNK, Field, TriplaneField
-from reli3d.nn.local import LocalField, LocalReconstructor
+from reli3d.nn.local import HEADS, LocalField, LocalReconstructor
 from reli3d.nn.precision import heads_dtype
 from reli3d.nn.presets import LocalPreset, Preset
 from reli3d.nn.reni import map_directions
@@ -172,31 +172,32 @@ def texture(
     maps = field.maps
 
     def at_vertices(field: LocalField, mesh: Mesh) -> tuple[LocalField, Tensor]:
-        """The field with its light, and its heads at the vertices, which lie as close as the network's cells."""
+        """The field with its light, and, at vertices, which lie as close as the network's cells, heads and who sees."""
         every = slice(None, None, max(1, len(mesh.vertices) // SHADING_POINTS))
         position, normal = mesh.vertices, present("mesh.normals", mesh.normals)
         visible = maps.seen(present("scene", scene), position, normal)
         field = field.with_shading(*(v[every].contiguous() for v in (position, normal, visible)))
-        return field, field.heads(position, normal, visible)
+        return field, torch.cat([field.heads(position, normal, visible), visible], 1)
 
     asked = beside(partial(at_vertices, field, mesh), mesh.vertices.device) if isinstance(field, LocalField) else None
     whole = mesh
     mesh = unwrap(mesh, texture_size=size) if uv == "project" else unwrap_xatlas(mesh, texture_size=size)
     mesh = replace(mesh, tangents=vertex_tangents(mesh))
-    local, heads = asked() if asked else (None, None)
-    if heads is not None:
-        heads = heads.index_select(0, source_vertices(whole, mesh))
+    local, known = asked() if asked else (None, None)
+    if known is not None:
+        known = known.index_select(0, source_vertices(whole, mesh))
 
     def surface(position: Tensor, normal: Tensor, tangent: Tensor, *values: Tensor) -> dict[str, Tensor]:
         if local is not None:
-            visible = maps.seen(present("scene", scene), position, normal)
-            got = local.painted(values[0], position, normal, visible)
+            heads, corners = values[0].split([HEADS, len(maps.images)], 1)
+            visible = maps.seen_within(present("scene", scene), position, normal, corners)
+            got = local.painted(heads, position, normal, visible)
         else:
             got = field.material(position, normal, position.new_zeros(len(position), len(maps.images)))
         found = {"base_color": got.base_color, "roughness": got.roughness[:, None], "metallic": got.metallic[:, None]}
         return {**found, "normal": encode_normals(got.normal, normal, tangent)}
 
-    baked = bake(mesh, size, lambda *at: in_rows(surface, *at), chunk=CHUNK, tangents=True, values=heads)
+    baked = bake(mesh, size, lambda *at: in_rows(surface, *at), chunk=CHUNK, tangents=True, values=known)
     return mesh, TextureSet(**{k: v.clamp(0, 1).contiguous() for k, v in baked.items()})
 
 

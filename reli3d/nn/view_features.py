@@ -21,6 +21,8 @@ from reli3d.geometry.rays import RayScene
 from reli3d.geometry.visibility import visible_from
 from reli3d.nn.blocks import linear_of
 
+ROUNDING = 1e-4  # of interpolated 0 and 1
+
 
 @dataclass(frozen=True)
 class ViewMaps:
@@ -56,6 +58,16 @@ class ViewMaps:
             visible = pad(visible, (0, self.mirrored))
             visible[rest, self.taken :] = visible_from(scene, position[rest], normal[rest], self.camera[self.taken :])
         return visible.float()
+
+    def seen_within(self, scene: RayScene, position: Tensor, normal: Tensor, corners: Tensor) -> Tensor:
+        """:meth:`seen` of points in faces, with rays only where the corners of a face differ.
+
+        corners: ``(N, V)`` :meth:`seen` of the corners, interpolated at the points.
+        """
+        visible = corners.round()
+        mixed = ((corners - visible).abs() > ROUNDING).any(1).nonzero()[:, 0]
+        visible[mixed] = self.seen(scene, position[mixed], normal[mixed])
+        return visible
 
     @cached_property
     def silhouette(self) -> Tensor:

@@ -115,3 +115,22 @@ def test_many_views_and_other_words_are_left_alone(views):
     many = views.select([0, 1, 2, 3, 0, 1, 2, 3, 0])
     prepared = prepare(model, many, normalize(many, "auto"))
     assert completed(prepared) is prepared
+
+
+def test_rays_only_where_the_corners_of_a_face_differ():
+    camera = Camera.from_fov(torch.stack([look_at((0.0, 0.0, 2.4)), look_at((2.4, 0.0, 0.0))]), 0.6, 8, 8)
+    maps = ViewMaps(torch.zeros(2, 4, 4, 1), torch.zeros(2, 8, 8, 4), camera)
+    mesh = from_trimesh(trimesh.creation.icosphere(subdivisions=3, radius=0.5))
+    scene, normal = RayScene(mesh.vertices, mesh.faces), mesh.vertices / 0.5
+    at_vertices = maps.seen(scene, mesh.vertices, normal)[mesh.faces.long()]  # (F, 3, V)
+    share = torch.tensor([0.2, 0.3, 0.5])
+    corners = (at_vertices * share[:, None]).sum(1)
+    middle = (mesh.vertices[mesh.faces.long()] * share[:, None]).sum(1)
+    outward = middle / middle.norm(dim=1, keepdim=True)
+    same = (at_vertices == at_vertices[:, :1]).all(1).all(1)
+    assert 0.5 < float(same.float().mean()) < 0.95
+    got, want = maps.seen_within(scene, middle, outward, corners), maps.seen(scene, middle, outward)
+    assert torch.equal(got[~same], want[~same]) and torch.equal(got[same], at_vertices[same, 0])
+    assert torch.equal(got, want), "a ball has no shadow inside a face"
+    none = RayScene(mesh.vertices + 9.0, mesh.faces)  # would hide nothing
+    assert torch.equal(maps.seen_within(none, middle[same], outward[same], corners[same]), got[same])
