@@ -7,6 +7,7 @@ from __future__ import annotations
 import time
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import torch
@@ -14,17 +15,17 @@ from torch import Tensor
 
 from reli3d._bridge import expect, present
 from reli3d.geometry.bake import bake
-from reli3d.geometry.cover import cover_silhouettes
+from reli3d.geometry.cover import REACH, cover_silhouettes
 from reli3d.geometry.mesh import Mesh, largest_components, vertex_normals, weld
 from reli3d.geometry.rays import RayScene
 from reli3d.geometry.smooth import taubin_smooth
+from reli3d.geometry.sparse_level import sparse_level
 from reli3d.geometry.surface import extract_surface
 from reli3d.geometry.tangents import encode_normals, vertex_tangents
-from reli3d.geometry.uv import unwrap, unwrap_xatlas
-from reli3d.geometry.visibility import visible_from
-from reli3d.nn.blocks import in_rows
+from reli3d.geometry.uv import source_vertices, unwrap, unwrap_xatlas
+from reli3d.nn.blocks import beside, in_rows
 from reli3d.nn.field import CHUNK, Field, TriplaneField
-from reli3d.nn.local import LocalField, LocalReconstructor
+from reli3d.nn.local import HEADS, LocalField, LocalReconstructor
 from reli3d.nn.precision import heads_dtype
 from reli3d.nn.presets import LocalPreset, Preset
 from reli3d.nn.reni import map_directions
@@ -115,11 +116,15 @@ def _bounded_surface(field: LocalField, resolution: int) -> Mesh:
     radius = preset.radius
     radius = min(radius, _hull_reach(field, resolution) + 2 * MARGIN_CELLS * radius / resolution)
     flat = _grid(resolution, radius, maps.images.device).reshape(-1, 3)
-    bound = field.bound(flat)
-    level, margin = bound.clamp(min=OUTSIDE), MARGIN_CELLS * 2 * radius / resolution / preset.softness
-    for part in (bound < margin).nonzero()[:, 0].split(CHUNK):
-        level[part] = field.level_within(flat[part], bound[part])
-    level = torch.maximum(level, bound).view((resolution + 1,) * 3)
+    cell = 2 * radius / resolution / preset.softness
+    bound = field.bound(flat, REACH + 4 * cell)  # what is farther outside than REACH changes nothing
+    level = bound.clamp(min=OUTSIDE).view((resolution + 1,) * 3)
+    near = bound.view_as(level) < MARGIN_CELLS * cell
+
+    def evaluate(index: Tensor) -> Tensor:
+        return torch.cat([torch.maximum(field.level_within(flat[k], bound[k]), bound[k]) for k in index.split(CHUNK)])
+
+    level = sparse_level(level, near, evaluate)
     level = cover_silhouettes(level, bound.view_as(level), maps.silhouette, maps.camera, radius=radius)
     _check_signs(level)
     return extract_surface(level, radius=radius)
@@ -139,12 +144,12 @@ def _hull_reach(field: LocalField, resolution: int) -> float:
     radius, device = field.model.preset.radius, field.maps.images.device
     coarse = -(-resolution // COARSE)
     apart = 2 * radius / coarse
-    level = field.bound(_grid(coarse, radius, device).reshape(-1, 3))
     slack = 3**0.5 * apart / field.model.preset.softness  # twice half a diagonal: distances stretch off the axis
+    level = field.bound(_grid(coarse, radius, device).reshape(-1, 3), slack)
     near = (level < slack).reshape((coarse + 1,) * 3)
     k = ((torch.linspace(-radius, radius, resolution + 1, device=device) + radius) / apart).round().long()
     flat = _grid(resolution, radius, device)[near[k][:, k][:, :, k]]
-    inside = flat[field.bound(flat) < 0]
+    inside = flat[field.bound(flat, 0.0) < 0]
     if len(inside) == 0:
         raise ValueError("masks: expected masks that overlap in space, got none inside all of them; run --check")
     return float(inside.abs().max())
@@ -166,31 +171,33 @@ def texture(
         raise ValueError(f"uv: expected project or xatlas, got {uv}")
     maps = field.maps
 
-    def seen(position: Tensor, normal: Tensor) -> Tensor:
-        return maps.photographs_first(visible_from(present("scene", scene), position, normal, maps.camera).float())
-
-    local = None
-    if isinstance(field, LocalField):
+    def at_vertices(field: LocalField, mesh: Mesh) -> tuple[LocalField, Tensor]:
+        """The field with its light, and, at vertices, which lie as close as the network's cells, heads and who sees."""
         every = slice(None, None, max(1, len(mesh.vertices) // SHADING_POINTS))
-        position, normal = mesh.vertices[every].contiguous(), present("mesh.normals", mesh.normals)[every].contiguous()
-        local = field.with_shading(position, normal, seen(position, normal))
+        position, normal = mesh.vertices, present("mesh.normals", mesh.normals)
+        visible = maps.seen(present("scene", scene), position, normal)
+        field = field.with_shading(*(v[every].contiguous() for v in (position, normal, visible)))
+        return field, torch.cat([field.heads(position, normal, visible), visible], 1)
+
+    asked = beside(partial(at_vertices, field, mesh), mesh.vertices.device) if isinstance(field, LocalField) else None
+    whole = mesh
     mesh = unwrap(mesh, texture_size=size) if uv == "project" else unwrap_xatlas(mesh, texture_size=size)
     mesh = replace(mesh, tangents=vertex_tangents(mesh))
-
-    heads = None
-    if local is not None:  # evaluated at the vertices, which lie as close as the network's cells
-        normals = present("mesh.normals", mesh.normals)
-        heads = local.heads(mesh.vertices, normals, seen(mesh.vertices, normals))
+    local, known = asked() if asked else (None, None)
+    if known is not None:
+        known = known.index_select(0, source_vertices(whole, mesh))
 
     def surface(position: Tensor, normal: Tensor, tangent: Tensor, *values: Tensor) -> dict[str, Tensor]:
         if local is not None:
-            got = local.painted(values[0], position, normal, seen(position, normal))
+            heads, corners = values[0].split([HEADS, len(maps.images)], 1)
+            visible = maps.seen_within(present("scene", scene), position, normal, corners)
+            got = local.painted(heads, position, normal, visible)
         else:
             got = field.material(position, normal, position.new_zeros(len(position), len(maps.images)))
         found = {"base_color": got.base_color, "roughness": got.roughness[:, None], "metallic": got.metallic[:, None]}
         return {**found, "normal": encode_normals(got.normal, normal, tangent)}
 
-    baked = bake(mesh, size, lambda *at: in_rows(surface, *at), chunk=CHUNK, tangents=True, values=heads)
+    baked = bake(mesh, size, lambda *at: in_rows(surface, *at), chunk=CHUNK, tangents=True, values=known)
     return mesh, TextureSet(**{k: v.clamp(0, 1).contiguous() for k, v in baked.items()})
 
 

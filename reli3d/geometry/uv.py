@@ -299,6 +299,16 @@ def unwrap_xatlas(mesh: Mesh, *, texture_size: int = 1024, timeout_s: float = 12
     )
 
 
+def source_vertices(whole: Mesh, mesh: Mesh) -> Tensor:
+    """Which vertex of ``whole`` each vertex of ``mesh``, the same after :func:`unwrap`, was split from: ``(V,)`` int32.
+
+    Raises ValueError where the numbers of faces differ.
+    """
+    if whole.faces.shape != mesh.faces.shape:
+        raise ValueError(f"mesh.faces: expected {len(whole.faces)} faces, got {len(mesh.faces)}")
+    return mesh.faces.new_empty(len(mesh.vertices)).index_put_((mesh.faces.long(),), whole.faces)
+
+
 def uv_faces(mesh: Mesh) -> Tensor:
     """UV of the corners of every face, ``(F, 3, 2)``."""
     return _bridge.present("mesh.uv", mesh.uv)[mesh.faces.long()]

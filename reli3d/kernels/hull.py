@@ -239,11 +239,13 @@ def mask_distance_kernel(
 
 @wp.func
 def distance_to_hull(
-    point: wp.vec3, distance: wp.array3d[float], c2w: wp.array[wp.mat44], intrinsics: wp.array[wp.vec4]
+    point: wp.vec3, distance: wp.array3d[float], c2w: wp.array[wp.mat44], intrinsics: wp.array[wp.vec4], far: float
 ) -> float:
-    """Least over the views of the pixel distance at a point's image times the size of a pixel at its depth."""
+    """Least over the views of the pixel distance at a point's image times the size of a pixel at its depth; views
+    after one that gives less than ``-far`` are left out."""
     best = wp.float32(-BEHIND)
-    for view in range(c2w.shape[0]):
+    view = wp.int32(0)
+    while view < c2w.shape[0] and best >= -far:
         m = c2w[view]
         away = point - wp.vec3(m[0, 3], m[1, 3], m[2, 3])
         right = m[0, 0] * away[0] + m[1, 0] * away[1] + m[2, 0] * away[2]
@@ -255,6 +257,7 @@ def distance_to_hull(
             best = wp.min(best, value * depth * 2.0 / (k[0] + k[1]))
         else:
             best = BEHIND
+        view += 1
     return best
 
 
@@ -266,11 +269,12 @@ def hull_distance_kernel(
     distance: wp.array3d[float],
     c2w: wp.array[wp.mat44],
     intrinsics: wp.array[wp.vec4],
+    far: float,
     # out
     hull: wp.array[float],
 ):
     i = start + wp.tid()
-    hull[i] = distance_to_hull(points[i], distance, c2w, intrinsics)
+    hull[i] = distance_to_hull(points[i], distance, c2w, intrinsics, far)
 
 
 @wp.kernel
@@ -301,7 +305,7 @@ def hull_span_kernel(
     first = wp.float32(low)
     inside = wp.bool(False)
     while first <= high and not inside:
-        h = distance_to_hull(o + d * first, distance, c2w, intrinsics)
+        h = distance_to_hull(o + d * first, distance, c2w, intrinsics, -BEHIND)
         if h > best:
             best = h
             nearest = first
@@ -315,7 +319,7 @@ def hull_span_kernel(
     last = wp.float32(high)
     inside = wp.bool(False)
     while last > first and not inside:
-        h = distance_to_hull(o + d * last, distance, c2w, intrinsics)
+        h = distance_to_hull(o + d * last, distance, c2w, intrinsics, -BEHIND)
         if h >= -REACHED:
             inside = True
         else:

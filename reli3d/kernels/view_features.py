@@ -209,6 +209,13 @@ def color_logit(color: wp.vec4) -> wp.vec3:
     return value
 
 
+@wp.func
+def mix_four(images: wp.array3d[wp.vec4], view: int, i: int, j: int, share: wp.vec4) -> wp.vec4:
+    """Pixels (j, i) and right, below and both of image ``view``, times their shares."""
+    upper = images[view, j, i] * share[0] + images[view, j, i + 1] * share[1]
+    return upper + images[view, j + 1, i] * share[2] + images[view, j + 1, i + 1] * share[3]
+
+
 @wp.kernel
 def fuse_views_kernel(
     start: int,
@@ -239,10 +246,12 @@ def fuse_views_kernel(
         q = project_point(p, pose, viewed.intrinsics[v])
         seen, share = view_numbers(viewed.image, v, p, q, pose, 1, viewed.visible[n, v], normal)
         greatest = wp.max(greatest, share)
-        x = q[0] * scale
-        y = q[1] * scale
-        change = look_up(paint, v, x, y)
-        of_view = look_up(rough_metal, v, x, y)
+        at = between_pixels(q[0] * scale, q[1] * scale, paint.shape[1], paint.shape[2])
+        x = at[2]
+        y = at[3]
+        four = wp.vec4((1.0 - x) * (1.0 - y), x * (1.0 - y), (1.0 - x) * y, x * y)  # once for all maps, as above
+        change = mix_four(paint, v, int(at[0]), int(at[1]), four)
+        of_view = mix_four(rough_metal, v, int(at[0]), int(at[1]), four)
         weight = share * share * wp.exp(of_view[0])
         color = color_logit(wp.vec4(seen[0], seen[1], seen[2], 0.0)) * change[0]
         color += wp.vec3(change[1], change[2], change[3])
@@ -252,7 +261,7 @@ def fuse_views_kernel(
         spread += weight * wp.dot(away, color - mean)
         gain += weight * change[0]
         surface += of_view * weight
-        direction += look_up(bent, v, x, y) * weight
+        direction += mix_four(bent, v, int(at[0]), int(at[1]), four) * weight
     unit = wp.vec3(direction[0], direction[1], direction[2]) / total + 1.0e-3 * normal
     unit = unit / wp.max(wp.length(unit), 1.0e-12)
     logit[n] = mean

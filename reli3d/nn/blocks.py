@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TypeVar
 
 import torch
 from torch import Tensor, nn
 
-from reli3d._bridge import over_rows
+from reli3d._bridge import _pool, _serial, over_rows
 
 ROWS = 8192  # points at a time without gradient: their features stay in the cache, which halves the time of the heads
+
+T = TypeVar("T")
 
 
 def linear_of(layers: nn.Module, index: int) -> nn.Linear:
@@ -30,3 +33,15 @@ def in_rows(evaluate: Callable[..., dict[str, Tensor]], *inputs: Tensor) -> dict
         return evaluate(*inputs)
     parts = over_rows(n, ROWS, lambda start, stop: evaluate(*(x[start:stop] for x in inputs)))
     return {name: torch.cat([p[name] for p in parts]) for name in parts[0]}
+
+
+def beside(work: Callable[[], T], device: torch.device) -> Callable[[], T]:
+    """Begin ``work()`` on one thread of the bridge's pool, without gradient; the result gives its value when called.
+
+    For long chains that leave a processor idle.  The work is done at once where the caller computes alone, and on CUDA,
+    which does not wait.
+    """
+    if _serial() or device.type == "cuda":
+        value = work()
+        return lambda: value
+    return _pool().submit(torch.no_grad()(work)).result

@@ -6,6 +6,7 @@ convolutions.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar
@@ -36,11 +37,11 @@ class PointMaterial:
     normal: Tensor  # (N, 3) unit, world: of shading
 
 
-def bound_level(maps: ViewMaps, points: Tensor, softness: float) -> Tensor:
-    """Level ``(N,)`` of the hull of the views' silhouettes at ``points (N, 3)``, in units of ``softness``; no
-    gradient.
+def bound_level(maps: ViewMaps, points: Tensor, softness: float, far: float = math.inf) -> Tensor:
+    """Level ``(N,)`` of the hull of the views' silhouettes at ``points (N, 3)``, in units of ``softness``, or some
+    level above ``far`` where that is higher; no gradient.
     """
-    return -hull_distance(points, maps.silhouette, maps.camera) / softness
+    return -hull_distance(points, maps.silhouette, maps.camera, far=far * softness) / softness
 
 
 @dataclass(frozen=True)

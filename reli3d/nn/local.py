@@ -8,6 +8,7 @@ the views and to the object, so what is learned in one place holds everywhere.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar
@@ -197,9 +198,11 @@ class LocalField(Field):
 
     reads_views: ClassVar[bool] = True
 
-    def bound(self, points: Tensor) -> Tensor:
-        """Level ``(N,)`` of the silhouettes' hull: no point is further inside than this; no gradient."""
-        return bound_level(self.maps, points, self.model.preset.softness)
+    def bound(self, points: Tensor, far: float = math.inf) -> Tensor:
+        """Level ``(N,)`` of the silhouettes' hull: no point is further inside than this.  Where it exceeds ``far`` it
+        is some level above ``far``.  No gradient.
+        """
+        return bound_level(self.maps, points, self.model.preset.softness, far)
 
     def _level(self, points: Tensor) -> Tensor:
         return self._level_within(points, self.bound(points))

@@ -13,11 +13,15 @@ from functools import cached_property
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import linear
+from torch.nn.functional import linear, pad
 
 from reli3d.geometry.camera import Camera
 from reli3d.geometry.projection import NUMBERS, gather_views, pool_views, summarize_views
+from reli3d.geometry.rays import RayScene
+from reli3d.geometry.visibility import visible_from
 from reli3d.nn.blocks import linear_of
+
+ROUNDING = 1e-4  # of interpolated 0 and 1
 
 
 @dataclass(frozen=True)
@@ -43,10 +47,27 @@ class ViewMaps:
             return self
         return ViewMaps(self.tokens[: self.taken], self.images[: self.taken], self.camera[: self.taken])
 
-    def photographs_first(self, visible: Tensor) -> Tensor:
-        """``visible (N, V)`` float32 in [0, 1], but mirror images only where no photograph sees the point."""
-        own, other = visible.split([self.taken, self.mirrored], 1)
-        return torch.cat([own, other * (1.0 - own.amax(1, keepdim=True))], 1) if self.mirrored else visible
+    def seen(self, scene: RayScene, position: Tensor, normal: Tensor) -> Tensor:
+        """``(N, V)`` float32, 1 where a view sees a surface point; mirror images only where no photograph does.
+
+        position, normal: ``(N, 3)``, the normal unit.  scene: of the surface.  No gradient.
+        """
+        visible = visible_from(scene, position, normal, self.photographs.camera)
+        if self.mirrored:
+            rest = (~visible.any(1)).nonzero()[:, 0]
+            visible = pad(visible, (0, self.mirrored))
+            visible[rest, self.taken :] = visible_from(scene, position[rest], normal[rest], self.camera[self.taken :])
+        return visible.float()
+
+    def seen_within(self, scene: RayScene, position: Tensor, normal: Tensor, corners: Tensor) -> Tensor:
+        """:meth:`seen` of points in faces, with rays only where the corners of a face differ.
+
+        corners: ``(N, V)`` :meth:`seen` of the corners, interpolated at the points.
+        """
+        visible = corners.round()
+        mixed = ((corners - visible).abs() > ROUNDING).any(1).nonzero()[:, 0]
+        visible[mixed] = self.seen(scene, position[mixed], normal[mixed])
+        return visible
 
     @cached_property
     def silhouette(self) -> Tensor:

@@ -9,6 +9,7 @@ from torch.nn import functional
 from reli3d.geometry.grid import sample_grid
 from reli3d.geometry.hull import hull_distance
 from reli3d.geometry.projection import NUMBERS, gather_views, summarize_views
+from reli3d.nn.blocks import in_rows
 from reli3d.nn.presets import VolumeSizes
 from reli3d.nn.view_features import AHEAD, ViewMaps, ahead_of_surface
 
@@ -50,9 +51,13 @@ class FeatureVolume(nn.Module):
         """``(N, N, N, F)``, indexed x, y, z.  surface: as in :func:`~reli3d.nn.view_features.ahead_of_surface`."""
         axis = torch.linspace(-self.radius, self.radius, self.side, device=maps.images.device)
         grid = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
-        hull = hull_distance(grid, maps.silhouette, maps.camera)
+        hull = hull_distance(grid, maps.silhouette, maps.camera, far=NEAR_HULL)
         near = (hull > -NEAR_HULL).nonzero()[:, 0]
-        pooled = self._pooled(maps, surface, grid[near], hull[near])
+
+        def ask(points: Tensor, hull: Tensor) -> dict[str, Tensor]:
+            return {"pooled": self._pooled(maps, surface, points, hull)}
+
+        pooled = in_rows(ask, grid[near], hull[near])["pooled"]
         x = pooled.new_zeros(len(grid), pooled.shape[1]).index_copy(0, near, pooled)
         x = x.reshape(1, self.side, self.side, self.side, -1).permute(0, 4, 1, 2, 3)  # channels last: half the time
         with torch.autocast(x.device.type, torch.bfloat16, enabled=self.in_bfloat16):

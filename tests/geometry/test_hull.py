@@ -124,6 +124,16 @@ def test_sphere_seen_by_eight_cameras(device):
     assert bool((got[true < -0.002] < 0).all())
 
 
+def test_only_what_is_far_outside_may_differ_where_far_is_given(device):
+    masks, camera = sphere_views(device)
+    distance = mask_distance(masks)
+    points = (torch.rand(4000, 3, generator=torch.Generator().manual_seed(2)) * 3.0 - 1.5).to(device)
+    whole, got = hull_distance(points, distance, camera), hull_distance(points, distance, camera, far=0.3)
+    near = whole >= -0.3
+    assert torch.equal(got[near], whole[near]) and bool((got[~near] < -0.3).all())
+    assert int((got != whole).sum()) > 500, "views are left out"
+
+
 def test_rays_enter_and_leave_the_cones_of_sight(device):
     """Against the cones in float64, looked at every 0.001 along the ray."""
     masks, camera = sphere_views(device)

@@ -10,7 +10,7 @@ from reli3d.geometry import charts, uv
 from reli3d.geometry.bake import coverage, nearest_valid
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.surface import extract_surface
-from reli3d.geometry.uv import atlas_report, guard_band, unwrap, unwrap_xatlas
+from reli3d.geometry.uv import atlas_report, guard_band, source_vertices, unwrap, unwrap_xatlas
 from tests.support.meshes import QUICK, SLOW, loaded, mesh_of
 
 slow = pytest.mark.slow
@@ -197,6 +197,16 @@ def test_normals_are_taken_over_and_gradients_reach_the_vertices():
     split = torch.bincount(torch.cdist(result.vertices.detach(), mesh.vertices).argmin(1), minlength=len(mesh.vertices))
     torch.testing.assert_close(vertices.grad, split[:, None].float().expand(-1, 3))
     assert not result.uv.requires_grad
+
+
+def test_split_vertices_know_what_they_were():
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    whole = mesh_of(ball.vertices, ball.faces)
+    mesh = unwrap(whole)
+    assert len(mesh.vertices) > len(whole.vertices)
+    assert torch.equal(whole.vertices[source_vertices(whole, mesh).long()], mesh.vertices)
+    with pytest.raises(ValueError, match=r"mesh.faces: expected 1 faces, got 320"):
+        source_vertices(Mesh(whole.vertices, whole.faces[:1]), mesh)
 
 
 def test_neighbours_skip_borders_and_crowded_edges():

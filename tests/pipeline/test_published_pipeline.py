@@ -149,7 +149,7 @@ def test_hero_background_and_frame_reach_the_network(tiny, monkeypatch):
 @pytest.fixture(scope="module")
 def asset(tiny):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pipeline, "visible_from", None)  # nothing asks which view sees a point
+        patch.setattr(pipeline.ViewMaps, "seen", None)  # nothing asks which view sees a point
         patch.setattr(pipeline, "RayScene", None)
         return reconstruct(EXAMPLE, weights=tiny, options=ReconstructOptions(256, 16))
 

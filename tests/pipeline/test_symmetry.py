@@ -4,9 +4,12 @@ from dataclasses import fields
 
 import pytest
 import torch
+import trimesh
 
 from reli3d.geometry.camera import Camera, camera_rays, look_at
+from reli3d.geometry.mesh import from_trimesh
 from reli3d.geometry.rays import RayScene
+from reli3d.geometry.visibility import GRAZING
 from reli3d.nn.local import PixelMaps, shown_pixels
 from reli3d.nn.view_features import ViewMaps
 from reli3d.nn.weights import load_model
@@ -88,12 +91,21 @@ def test_mirror_images_tell_shape_and_paint_but_not_the_light(views):
 
 
 def test_a_mirror_image_shows_a_point_only_where_no_photograph_does():
-    camera = Camera.from_fov(torch.eye(4).expand(4, 4, 4).contiguous(), 0.6, 8, 8)
+    eyes = torch.tensor([[0.0, 0.0, 2.4], [2.4, 0.0, 0.0], [0.0, 0.0, -2.4], [0.3, 0.0, -2.4]])
+    camera = Camera.from_fov(torch.stack([look_at(tuple(eye.tolist())) for eye in eyes]), 0.6, 8, 8)
     maps = ViewMaps(torch.zeros(4, 4, 4, 1), torch.zeros(4, 8, 8, 4), camera, mirrored=2)
-    visible = torch.tensor([[1.0, 0, 1, 1], [0, 0, 1, 0], [0, 0, 0, 0]])
-    want = torch.tensor([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 0]])
-    assert torch.equal(maps.photographs_first(visible), want)
-    assert torch.equal(maps.photographs.photographs_first(visible[:, :2]), visible[:, :2])
+    mesh = from_trimesh(trimesh.creation.icosphere(subdivisions=4, radius=0.5))
+    normal = mesh.vertices / mesh.vertices.norm(dim=1, keepdim=True)
+    away = eyes - mesh.vertices[:, None]
+    cosine = (away * normal[:, None]).sum(-1) / away.norm(dim=-1)  # from outside a ball hides what faces away
+    visible = (cosine > 0.0).float()
+    own, other = visible.split(2, 1)
+    want = torch.cat([own, other * (1.0 - own.amax(1, keepdim=True))], 1)
+    sure = ((cosine - GRAZING).abs() > 0.06).all(1)
+    got = maps.seen(RayScene(mesh.vertices, mesh.faces), mesh.vertices, normal)
+    assert torch.equal(got[sure], want[sure])
+    assert bool(want[sure, 2:].any()) and bool((visible[sure] != want[sure]).any())
+    assert torch.equal(maps.photographs.seen(RayScene(mesh.vertices, mesh.faces), mesh.vertices, normal), got[:, :2])
 
 
 def test_many_views_and_other_words_are_left_alone(views):
@@ -103,3 +115,22 @@ def test_many_views_and_other_words_are_left_alone(views):
     many = views.select([0, 1, 2, 3, 0, 1, 2, 3, 0])
     prepared = prepare(model, many, normalize(many, "auto"))
     assert completed(prepared) is prepared
+
+
+def test_rays_only_where_the_corners_of_a_face_differ():
+    camera = Camera.from_fov(torch.stack([look_at((0.0, 0.0, 2.4)), look_at((2.4, 0.0, 0.0))]), 0.6, 8, 8)
+    maps = ViewMaps(torch.zeros(2, 4, 4, 1), torch.zeros(2, 8, 8, 4), camera)
+    mesh = from_trimesh(trimesh.creation.icosphere(subdivisions=3, radius=0.5))
+    scene, normal = RayScene(mesh.vertices, mesh.faces), mesh.vertices / 0.5
+    at_vertices = maps.seen(scene, mesh.vertices, normal)[mesh.faces.long()]  # (F, 3, V)
+    share = torch.tensor([0.2, 0.3, 0.5])
+    corners = (at_vertices * share[:, None]).sum(1)
+    middle = (mesh.vertices[mesh.faces.long()] * share[:, None]).sum(1)
+    outward = middle / middle.norm(dim=1, keepdim=True)
+    same = (at_vertices == at_vertices[:, :1]).all(1).all(1)
+    assert 0.5 < float(same.float().mean()) < 0.95
+    got, want = maps.seen_within(scene, middle, outward, corners), maps.seen(scene, middle, outward)
+    assert torch.equal(got[~same], want[~same]) and torch.equal(got[same], at_vertices[same, 0])
+    assert torch.equal(got, want), "a ball has no shadow inside a face"
+    none = RayScene(mesh.vertices + 9.0, mesh.faces)  # would hide nothing
+    assert torch.equal(maps.seen_within(none, middle[same], outward[same], corners[same]), got[same])

@@ -1,0 +1,69 @@
+"""Levels evaluated where the surface may pass, against levels evaluated everywhere."""
+
+import pytest
+import torch
+
+from reli3d.geometry.sparse_level import SURE, sparse_level
+from reli3d.geometry.surface import extract_surface
+
+
+def grid(count):
+    axis = torch.linspace(-1.0, 1.0, count)
+    return torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
+
+
+def lumps(points):
+    """A ball with waves on it and a rod through it, two points wide."""
+    ball = (points.norm(dim=-1) - 0.6 - 0.05 * (9.0 * points).sin().prod(-1)) / 0.05
+    rod = (points[..., :2].norm(dim=-1) - 0.03) / 0.05
+    return torch.minimum(ball, rod)
+
+
+def sparse(level, near, known=None):
+    asked = []
+
+    def evaluate(index):
+        asked.append(index)
+        return level.view(-1)[index]
+
+    got = sparse_level(torch.full_like(level, 9.0) if known is None else known, near, evaluate)
+    return got, torch.cat(asked)
+
+
+@pytest.mark.parametrize("count", [49, 56])  # with and without a last point outside all coarse cells
+def test_same_surface_to_the_bit_from_fewer_points(count):
+    level = lumps(grid(count))
+    near = level < 2.0
+    got, asked = sparse(level, near)
+    assert len(asked) == len(asked.unique()), "a point is evaluated once"
+    assert len(asked) < 0.75 * int(near.sum())
+    want = extract_surface(torch.where(near, level, 9.0), radius=1.0)
+    mesh = extract_surface(got, radius=1.0)
+    assert torch.equal(mesh.vertices, want.vertices) and torch.equal(mesh.faces, want.faces)
+
+
+def test_every_level_above_the_depth_is_exact():
+    level = lumps(grid(33))
+    near = level < 2.0
+    got, _ = sparse(level, near)
+    shallow = near & (got != -SURE)
+    assert torch.equal(got[shallow], level[shallow]) and bool((got[~near] == 9.0).all())
+    assert bool((level[~shallow & near] < 0.0).all())
+
+
+def test_a_surface_that_leaves_the_region_is_followed():
+    level = (grid(33)[..., 2].abs() - 0.5) / 0.05  # a slab, of which the region has a column
+    near = torch.zeros_like(level, dtype=torch.bool)
+    near[14:19, 14:19] = True
+    got, _ = sparse(level, near)
+    for axis in range(3):
+        before, after = (got.narrow(axis, k, 32) < 0 for k in (0, 1))
+        for k in (0, 1):
+            ends = before != after
+            assert torch.equal(got.narrow(axis, k, 32)[ends], level.narrow(axis, k, 32)[ends])
+
+
+def test_nothing_near_asks_for_nothing():
+    level = torch.ones(8, 8, 8)
+    got, asked = sparse(level, torch.zeros(8, 8, 8, dtype=torch.bool), known=level)
+    assert len(asked) == 0 and torch.equal(got, level)

@@ -1,0 +1,39 @@
+"""Work beside the caller's: on another thread, alone there, without gradient."""
+
+import threading
+
+import pytest
+import torch
+
+from reli3d._bridge import WORKER
+from reli3d.nn.blocks import beside
+
+CPU = torch.device("cpu")
+
+
+def facts():
+    return threading.current_thread().name, torch.get_num_threads(), torch.is_grad_enabled()
+
+
+def test_work_runs_on_a_thread_of_the_pool_that_computes_alone(threads):
+    threads(2)
+    name, count, grad = beside(facts, CPU)()
+    assert name.startswith(WORKER) and count == 1 and not grad
+
+
+def test_one_thread_does_it_at_once(threads):
+    threads(1)
+    done = []
+    result = beside(lambda: done.append(facts()[0]), CPU)
+    assert done == [threading.current_thread().name] and result() is None
+
+
+def test_an_error_reaches_who_asks_for_the_value(threads):
+    threads(2)
+
+    def fail():
+        raise ValueError("no surface")
+
+    result = beside(fail, CPU)
+    with pytest.raises(ValueError, match="no surface"):
+        result()
