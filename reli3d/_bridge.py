@@ -77,10 +77,10 @@ def _start() -> None:
 
 
 @lru_cache(1)
-def _pool() -> ThreadPoolExecutor:
+def pool() -> ThreadPoolExecutor:
     """Threads for slices and blocks; torch inside each of them uses that one thread alone."""
     threads = max(1, torch.get_num_threads())
-    pool = ThreadPoolExecutor(max_workers=threads, thread_name_prefix=WORKER)
+    made = ThreadPoolExecutor(max_workers=threads, thread_name_prefix=WORKER)
     started = threading.Barrier(threads)
 
     def start(_) -> None:
@@ -88,13 +88,13 @@ def _pool() -> ThreadPoolExecutor:
         torch.get_num_threads()  # a thread takes over torch's number at its first call, which must come before
         torch.set_num_threads(1)
 
-    list(pool.map(start, range(threads)))
+    list(made.map(start, range(threads)))
     torch.set_num_threads(threads)  # what torch gives to threads that start later; each keeps its own number
-    return pool
+    return made
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_pool.cache_clear)  # a fork copies no threads: the child starts its own
+    os.register_at_fork(after_in_child=pool.cache_clear)  # a fork copies no threads: the child starts its own
 
 
 def slices(n: int, slice_min: int = SLICE_MIN) -> list[tuple[int, int]]:
@@ -127,10 +127,10 @@ def over_rows(n: int, rows: int, work) -> list:
 
 
 def _mapped(work, items: Iterable) -> list:
-    return [work(item) for item in items] if _serial() else list(_pool().map(work, items))
+    return [work(item) for item in items] if serial() else list(pool().map(work, items))
 
 
-def _serial() -> bool:
+def serial() -> bool:
     """Whether the calling thread computes alone.
 
     It does where torch has one thread, in a thread of the pool (it would wait for itself for ever), and in Warp's debug
@@ -232,7 +232,7 @@ def launch(kernel, n: int, args: Sequence, device: torch.device, *, slice_min: i
             wp.launch(kernel, n, [0, *values], device=name)
             return
         _load(kernel)
-        if _serial():
+        if serial():
             wp.launch(kernel, n, [0, *values], device="cpu")  # no thread would take a slice
             return
         over_slices(

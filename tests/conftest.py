@@ -23,7 +23,7 @@ def threads():
 
     def use(n):
         torch.set_num_threads(n)
-        _bridge._pool.cache_clear()  # it is made once, for the number of its first call
+        _bridge.pool.cache_clear()  # it is made once, for the number of its first call
 
     yield use
     use(before)

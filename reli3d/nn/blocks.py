@@ -8,7 +8,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor, nn
 
-from reli3d._bridge import _pool, _serial, over_rows
+from reli3d._bridge import over_rows, pool, serial
 
 ROWS = 8192  # points at a time without gradient: their features stay in the cache, which halves the time of the heads
 
@@ -41,7 +41,7 @@ def beside(work: Callable[[], T], device: torch.device) -> Callable[[], T]:
     For long chains that leave a processor idle.  The work is done at once where the caller computes alone, and on CUDA,
     which does not wait.
     """
-    if _serial() or device.type == "cuda":
+    if serial() or device.type == "cuda":
         value = work()
         return lambda: value
-    return _pool().submit(torch.no_grad()(work)).result
+    return pool().submit(torch.no_grad()(work)).result
