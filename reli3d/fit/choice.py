@@ -1,0 +1,169 @@
+"""Which parts of a fit are taken: surface, paint and light, by pictures of views whose colours it did not use."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from reli3d.fit.photographs import Photographs
+from reli3d.fit.shading import radiance
+from reli3d.fit.transfer import changed
+from reli3d.fit.unknowns import Start, Unknowns, environment
+from reli3d.geometry.rays import RayScene
+from reli3d.render.asset import Asset
+from reli3d.render.color import linear_to_srgb
+from reli3d.render.environment import Environment
+from reli3d.render.gbuffer import primary_hits, surface_points
+
+CHECK_PIXELS = 96  # of a photograph, a side, by which candidates are compared
+CHECK_SAMPLES = (16, 16, 4)
+STRENGTHS = tuple(math.exp(0.05 * k) for k in range(-12, 13))
+SLACK = 0.02  # dB: the noise of a comparison
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Shares of a fit in what is returned, 0 the start and 1 the fit: surface (0 or 1), paint (of the changes of the
+    materials' logits), light (of the changes of log radiance)."""
+
+    surface: float
+    paint: float
+    light: float
+
+    def __str__(self) -> str:
+        words = {0.0: "of the start", 0.5: "half fitted", 1.0: "fitted"}
+        return ", ".join(f"{name} {words[value]}" for name, value in vars(self).items())
+
+
+NOTHING = Parts(0.0, 0.0, 0.0)
+# Relighting shows surface and paint, so of them most is kept: the light goes first, then half of the paint.
+SHARES = ((1.0, 1.0), (1.0, 0.5), (0.5, 1.0), (0.5, 0.5), (1.0, 0.0), (0.5, 0.0), (0.0, 1.0), (0.0, 0.5), (0.0, 0.0))
+ORDER = tuple(Parts(surface, *shares) for surface in (1.0, 0.0) for shares in SHARES)[:-1]
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A start and what a fit made of it.
+
+    first: the start.  surface: the new surface with the maps and light of the start; ``first`` where it did not move.
+    photographs: with the cameras of the start, and as corrected.
+    """
+
+    first: Asset
+    surface: Asset
+    start: Start
+    unknowns: Unknowns
+    photographs: tuple[Photographs, Photographs]
+
+    @torch.no_grad()
+    def mixed(self, parts: Parts) -> Asset:
+        """The start with these shares of the changes.
+
+        On the start's surface the paint has the changes in space alone, as the texture's detail is on the new atlas.
+        """
+        asset = self.surface if parts.surface else self.first
+        if parts.paint:
+            detail = parts.paint * self.unknowns.detail
+            if asset is not self.surface:
+                detail = torch.zeros_like(detail)
+            material = [parts.paint * grid for grid in self.unknowns.material]
+            asset = changed(asset, replace(self.unknowns, material=material, detail=detail))
+        if parts.light:
+            light = [parts.light * values for values in self.unknowns.light]
+            asset = replace(asset, environment=environment(replace(self.unknowns, light=light), self.start))
+        return asset
+
+
+class Pictures:
+    """Small photographs, and what their rays hit of one surface, traced once."""
+
+    @torch.no_grad()
+    def __init__(self, asset: Asset, photographs: Photographs):
+        small = photographs.resized(min(CHECK_PIXELS, photographs.size))
+        self.mesh, self.scene = asset.mesh, RayScene(asset.mesh.vertices, asset.mesh.faces)
+        shown = linear_to_srgb(small.color.clamp(0.0, 1.0))
+        self.wanted = torch.lerp(torch.ones_like(shown), shown, small.mask[..., None])
+        self.rays, self.inside, inside = [], [], small.inside()
+        for view in range(len(small)):
+            hits, _, directions = primary_hits(self.scene, small.camera[view])
+            seen = hits.face >= 0
+            self.rays.append((seen, hits.face[seen], hits.bary[seen], -directions[seen]))
+            self.inside.append(inside[view][seen])
+
+    @torch.no_grad()
+    def lit(self, asset: Asset) -> list[Tensor]:
+        """Linear radiance that the rays meet under the light of ``asset``, which has this surface.  The random numbers
+        depend on the view alone."""
+        lit = []
+        for view, (_, face, bary, wo) in enumerate(self.rays):
+            at = surface_points(self.mesh, asset.textures, face, bary)
+            lit.append(radiance(at, wo, asset.light, samples=CHECK_SAMPLES, scene=self.scene, seed=view))
+        return lit
+
+    @torch.no_grad()
+    def errors(self, lit: list[Tensor], strength: float = 1.0) -> Tensor:
+        """Mean squared display error ``(V,)`` of whole pictures on white; light times ``strength``."""
+        errors = []
+        for values, (seen, *_), wanted in zip(lit, self.rays, self.wanted, strict=True):
+            image = torch.ones_like(wanted)
+            image[seen] = linear_to_srgb((strength * values).clamp(0.0, 1.0))
+            errors.append((image - wanted).square().mean())
+        return torch.stack(errors)
+
+    @torch.no_grad()
+    def strength(self, lit: list[Tensor], views: list[int]) -> float:
+        """The one of ``STRENGTHS`` that ``views`` show, by pixels well inside the masks: white shines in at the rim."""
+        got = torch.cat([lit[view][self.inside[view]] for view in views])
+        want = torch.cat([self.wanted[view][self.rays[view][0]][self.inside[view]] for view in views])
+        if not len(got):
+            return 1.0
+        return min(STRENGTHS, key=lambda k: float((linear_to_srgb((k * got).clamp(0.0, 1.0)) - want).square().mean()))
+
+
+def picture_error(asset: Asset, photographs: Photographs) -> Tensor:
+    """Mean squared display error ``(V,)`` of whole pictures on white under the asset's own light, at pixel centres."""
+    pictures = Pictures(asset, photographs)
+    return pictures.errors(pictures.lit(asset))
+
+
+def decibels(errors: Tensor) -> float:
+    """Mean PSNR over views, NaN of none."""
+    return float((-10.0 * errors.clamp(min=1e-9).log10()).mean()) if len(errors) else math.nan
+
+
+@dataclass(frozen=True)
+class Choice:
+    """An asset with ``parts`` of a fit, the photographs as its surface has them, and the errors ``(V,)`` of its
+    pictures."""
+
+    asset: Asset
+    parts: Parts
+    photographs: Photographs
+    errors: Tensor
+
+
+@torch.no_grad()
+def chosen(fitted: Fitted, used: list[int], held: list[int], before: Tensor) -> Choice:
+    """The first of ``ORDER`` that is no worse than the start on the views used and on those held out, else the start.
+
+    before: ``(V,)`` errors of the start's pictures.  The strength of each candidate's light is the one that the used
+    views show best: the fit's error is that of the display's tangent, which rises faster than the display, so the fit
+    ends too dark; and a mean of logarithms is darker than either of its lights.
+    """
+    pictures: dict[float, Pictures] = {}
+    for wanted in ORDER:
+        parts = replace(wanted, surface=0.0) if fitted.surface is fitted.first else wanted
+        asset, photographs = fitted.mixed(parts), fitted.photographs[int(parts.surface)]
+        if parts.surface not in pictures:
+            pictures[parts.surface] = Pictures(asset, photographs)
+        shown = pictures[parts.surface]
+        lit = shown.lit(asset)
+        strength = shown.strength(lit, used) if parts.light else 1.0
+        errors = shown.errors(lit, strength)
+        if all(decibels(errors[which]) >= decibels(before[which]) - SLACK for which in (used, held) if which):
+            light = Environment(strength * asset.light.radiance)
+            return Choice(replace(asset, environment=light), parts, photographs, errors)
+    return Choice(fitted.first, NOTHING, fitted.photographs[0], before)
