@@ -39,9 +39,9 @@ class Parts:
 
 
 NOTHING = Parts(0.0, 0.0, 0.0)
-# Relighting shows surface and paint, so of them most is kept: the light goes first, then half of the paint.
-SHARES = ((1.0, 1.0), (1.0, 0.5), (0.5, 1.0), (0.5, 0.5), (1.0, 0.0), (0.5, 0.0), (0.0, 1.0), (0.0, 0.5), (0.0, 0.0))
-ORDER = tuple(Parts(surface, *shares) for surface in (1.0, 0.0) for shares in SHARES)[:-1]
+# Shares of paint and light.  Relighting shows surface and paint, not the light, so half of the light goes first.  Paint
+# fitted beside a light of which no half is right is not trusted; the surface is, as the masks hold it.
+ORDER = ((1.0, 1.0), (1.0, 0.5), (0.5, 1.0), (0.5, 0.5), (0.0, 1.0), (0.0, 0.5), (0.0, 0.0))
 
 
 @dataclass(frozen=True)
@@ -49,31 +49,25 @@ class Fitted:
     """A start and what a fit made of it.
 
     first: the start.  surface: the new surface with the maps and light of the start; ``first`` where it did not move.
-    photographs: with the cameras of the start, and as corrected.
+    photographs: with their cameras as corrected.
     """
 
     first: Asset
     surface: Asset
     start: Start
     unknowns: Unknowns
-    photographs: tuple[Photographs, Photographs]
+    photographs: Photographs
 
     @torch.no_grad()
-    def mixed(self, parts: Parts) -> Asset:
-        """The start with these shares of the changes.
-
-        On the start's surface the paint has the changes in space alone, as the texture's detail is on the new atlas.
-        """
-        asset = self.surface if parts.surface else self.first
-        if parts.paint:
-            detail = parts.paint * self.unknowns.detail
-            if asset is not self.surface:
-                detail = torch.zeros_like(detail)
-            material = [parts.paint * grid for grid in self.unknowns.material]
-            asset = changed(asset, replace(self.unknowns, material=material, detail=detail))
-        if parts.light:
-            light = [parts.light * values for values in self.unknowns.light]
-            asset = replace(asset, environment=environment(replace(self.unknowns, light=light), self.start))
+    def mixed(self, paint: float, light: float) -> Asset:
+        """The new surface with these shares of the other changes."""
+        asset, unknowns = self.surface, self.unknowns
+        if paint:
+            material = [paint * grid for grid in unknowns.material]
+            asset = changed(asset, replace(unknowns, material=material, detail=paint * unknowns.detail))
+        if light:
+            maps = [light * values for values in unknowns.light]
+            asset = replace(asset, environment=environment(replace(unknowns, light=maps), self.start))
         return asset
 
 
@@ -134,36 +128,22 @@ def decibels(errors: Tensor) -> float:
     return float((-10.0 * errors.clamp(min=1e-9).log10()).mean()) if len(errors) else math.nan
 
 
-@dataclass(frozen=True)
-class Choice:
-    """An asset with ``parts`` of a fit, the photographs as its surface has them, and the errors ``(V,)`` of its
-    pictures."""
-
-    asset: Asset
-    parts: Parts
-    photographs: Photographs
-    errors: Tensor
-
-
 @torch.no_grad()
-def chosen(fitted: Fitted, used: list[int], held: list[int], before: Tensor) -> Choice:
-    """The first of ``ORDER`` that is no worse than the start on the views used and on those held out, else the start.
+def chosen(fitted: Fitted, used: list[int], held: list[int], before: Tensor) -> tuple[Asset, Parts, Tensor]:
+    """The first of ``ORDER`` that is no worse than the start on the views used and on those held out, else the start;
+    its parts, and the errors ``(V,)`` of its pictures.
 
-    before: ``(V,)`` errors of the start's pictures.  The strength of each candidate's light is the one that the used
-    views show best: the fit's error is that of the display's tangent, which rises faster than the display, so the fit
-    ends too dark; and a mean of logarithms is darker than either of its lights.
+    before: those of the start.  The strength of each candidate's light is the one that the used views show best: the
+    fit's error is that of the display's tangent, which rises faster than the display, so the fit ends too dark; and a
+    mean of logarithms is darker than either of its lights.
     """
-    pictures: dict[float, Pictures] = {}
-    for wanted in ORDER:
-        parts = replace(wanted, surface=0.0) if fitted.surface is fitted.first else wanted
-        asset, photographs = fitted.mixed(parts), fitted.photographs[int(parts.surface)]
-        if parts.surface not in pictures:
-            pictures[parts.surface] = Pictures(asset, photographs)
-        shown = pictures[parts.surface]
-        lit = shown.lit(asset)
-        strength = shown.strength(lit, used) if parts.light else 1.0
-        errors = shown.errors(lit, strength)
+    pictures, moved = Pictures(fitted.surface, fitted.photographs), float(fitted.surface is not fitted.first)
+    for paint, light in ORDER:
+        asset = fitted.mixed(paint, light)
+        lit = pictures.lit(asset)
+        strength = pictures.strength(lit, used) if light else 1.0
+        errors = pictures.errors(lit, strength)
         if all(decibels(errors[which]) >= decibels(before[which]) - SLACK for which in (used, held) if which):
-            light = Environment(strength * asset.light.radiance)
-            return Choice(replace(asset, environment=light), parts, photographs, errors)
-    return Choice(fitted.first, NOTHING, fitted.photographs[0], before)
+            asset = replace(asset, environment=Environment(strength * asset.light.radiance))
+            return asset, Parts(moved, paint, light), errors
+    return fitted.first, NOTHING, before

@@ -110,16 +110,15 @@ def refine(
     notes: list[str] = []
     with torch.random.fork_rng(devices=[]), _interruptible(budget, notes):
         fitted = _fitted(first, near, used, resolution, weights, budget, notes, seed=seed, cameras=cameras)
-    choice = chosen(fitted, used, list(held), before)
+    kept, parts, after = chosen(fitted, used, list(held), before)
     if budget.bar is not None:
         budget.bar.close()
-    notes.append(f"refinement: {choice.parts}")
-    kept, c2w = asset, views.c2w
-    if choice.parts != NOTHING:
-        kept = _moved(choice.asset, -scale * shift, 1.0 / scale)
-        c2w = choice.photographs.moved(-scale * shift, 1.0 / scale).camera.c2w
-    was, now = ((decibels(e[used]), decibels(e[list(held)])) for e in (before, choice.errors))
-    return Refinement(kept, choice.parts, was, now, held, c2w, tuple(notes), budget.curve, budget.counts)
+    notes.append(f"refinement: {parts}")
+    was, now = ((decibels(e[used]), decibels(e[list(held)])) for e in (before, after))
+    if parts == NOTHING:
+        return Refinement(asset, parts, was, now, held, views.c2w, tuple(notes), budget.curve, budget.counts)
+    kept, near = _moved(kept, -scale * shift, 1.0 / scale), fitted.photographs.moved(-scale * shift, 1.0 / scale)
+    return Refinement(kept, parts, was, now, held, near.camera.c2w, tuple(notes), budget.curve, budget.counts)
 
 
 def _fitted(
@@ -140,18 +139,18 @@ def _fitted(
     level = start_level(first.mesh, grid) if closed else first.mesh.vertices.new_ones(grid.shape)
     unknowns = Unknowns.zero(level, len(photographs), texels)
     fit_maps(unknowns, start, first, photographs, used, weights, budget, LIGHT, seed=seed)
-    surface, posed = first, photographs
+    surface = first
     if closed:
         bound = bound_level(photographs, grid)
         data = ShapeData.of(start, level, bound, grid, photographs, used)
         fit_shape(unknowns, data, weights, budget, SHAPE_UNTIL, seed=seed, cameras=cameras)
         mesh = finished(unknowns.level, bound, grid)
         surface = dressed(mesh, first, first.textures.size)
-        posed = replace(photographs, camera=corrected(photographs.camera, unknowns.pose))
+        photographs = replace(photographs, camera=corrected(photographs.camera, unknowns.pose))
     else:
         notes.append("refinement: the surface is not closed, so only its maps and light are fitted")
-    fit_maps(unknowns, start, surface, posed, used, weights, budget, MAPS, seed=seed)
-    return Fitted(first, surface, start, unknowns, (photographs, posed))
+    fit_maps(unknowns, start, surface, photographs, used, weights, budget, MAPS, seed=seed)
+    return Fitted(first, surface, start, unknowns, photographs)
 
 
 def _check_asset(asset: Asset, photographs: Photographs) -> None:

@@ -91,7 +91,7 @@ def test_a_worse_result_gives_the_start_and_says_so(start, views, monkeypatch):
         unknowns.material[0][..., :3] = torch.tensor([-8.0, 8.0, -8.0])
         unknowns.light[0][:] = torch.tensor([4.0, -4.0, 4.0])
         small = replace(first, mesh=replace(first.mesh, vertices=0.5 * first.mesh.vertices))
-        return Fitted(first, small, Start.of(first), unknowns, (photographs, photographs))
+        return Fitted(first, small, Start.of(first), unknowns, photographs)
 
     monkeypatch.setattr(fit, "_fitted", spoiled)
     result = fit.refine(start, views, steps=1)
