@@ -19,8 +19,8 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from reli3d.eval.metrics import psnr
+from reli3d.fit.choice import decibels, picture_error
 from reli3d.fit.photographs import Photographs
-from reli3d.fit.refine import decibels, picture_error
 from reli3d.geometry.camera import Camera
 from reli3d.geometry.rays import RayScene
 from reli3d.nn.weights import load_model
@@ -84,13 +84,13 @@ def main() -> int:
             asset = reconstruct(views, weights=model, options=options)
             result = refined(asset, views, steps=args.steps)
             was = scores(asset, sample, given, unseen)
-            now = scores(result.asset, sample, given, unseen) if result.kept == "result" else was
+            now = scores(result.asset, sample, given, unseen) if result.changed else was
             rows.append((was, now))
-            kept += result.kept == "start"
+            kept += not result.changed
             lost[0] += now["input"] < was["input"] - INPUT_LOSS
             lost[1] += now["unseen"] < was["unseen"] - UNSEEN_LOSS
             pairs = ", ".join(f"{name} {was[name]:.3g} to {now[name]:.3g}" for name in COLUMNS)
-            print(f"{path.stem}, {number} views, {result.kept}: {pairs}", flush=True)
+            print(f"{path.stem}, {number} views, {result.parts}: {pairs}", flush=True)
     means = {name: sum(now[name] - was[name] for was, now in rows) / max(len(rows), 1) for name in COLUMNS}
     worst = {name: min((now[name] - was[name] for was, now in rows), default=0.0) for name in COLUMNS}
     print("mean change: " + ", ".join(f"{name} {value:+.3f}" for name, value in means.items()))

@@ -313,7 +313,7 @@ class Job:
             result = refined(asset, photographs, seed=args.seed, cameras=args.refine_cameras, bar=True, **self.budget)
             steps.tell(result.notes)
             compared = comparison(asset, result.asset, shown.to(self.device))
-            first, asset = asset if result.kept == "result" else None, result.asset
+            first, asset = asset if result.changed else None, result.asset
             record = {"refinement": {"views": len(photographs), **self.budget, **result.record()}}
         steps("preview")
         scene = RayScene(asset.mesh.vertices, asset.mesh.faces)

@@ -11,40 +11,33 @@ from torch import Tensor
 
 from reli3d.fit import losses
 from reli3d.fit.budget import Budget, progress_bar
+from reli3d.fit.choice import NOTHING, Fitted, Parts, chosen, decibels, picture_error
 from reli3d.fit.maps import MapsStage, fit_maps
 from reli3d.fit.photographs import Photographs, PosedImages
-from reli3d.fit.shading import radiance
 from reli3d.fit.shape import Grid, ShapeData, bound_level, finished, fit_shape, start_level
-from reli3d.fit.transfer import changed, dressed
-from reli3d.fit.unknowns import Start, Unknowns, corrected, environment
+from reli3d.fit.transfer import dressed
+from reli3d.fit.unknowns import Start, Unknowns, corrected
 from reli3d.geometry.mesh import watertight
-from reli3d.geometry.rays import RayScene
 from reli3d.render.asset import Asset
-from reli3d.render.color import linear_to_srgb
-from reli3d.render.gbuffer import primary_hits, surface_points
 
 RESOLUTION = 128  # cells along the longest side
 LIGHT = MapsStage("light", until=0.12, detail=False)  # first the light, then the surface, then all maps
 SHAPE_UNTIL = 0.5  # of the budget
 MAPS = MapsStage("maps", until=1.0)
-CHECK_PIXELS = 96  # of a photograph, a side, by which start and result are compared
-CHECK_SAMPLES = (16, 16, 4)
 TEXELS = 512  # of the base colour's detail, at most
-SLACK = 0.02  # dB: the noise of a comparison
 
 
 @dataclass(frozen=True)
 class Refinement:
     """What :func:`refine` gives.
 
-    asset: the refined one, or the start where that is better.  kept: which of them.  before, after: mean PSNR [dB] on
-    white of the photographs that were used and of those held out (NaN without any).  held: their indices.  c2w:
-    ``(V, 4, 4)``, the cameras as corrected.  notes: one line each.  curve,
-    steps: what the run did.
+    asset: the refined one, or the start where no part of it is better.  parts: what of the fit it has.  before, after:
+    mean PSNR [dB] on white of the photographs that were used and of those held out (NaN without any).  held: their
+    indices.  c2w: ``(V, 4, 4)``, the cameras as corrected.  notes: one line each.  curve, steps: what the run did.
     """
 
     asset: Asset
-    kept: str
+    parts: Parts
     before: tuple[float, float]
     after: tuple[float, float]
     held: tuple[int, ...]
@@ -53,6 +46,11 @@ class Refinement:
     curve: list[dict] = field(default_factory=list)
     steps: dict[str, int] = field(default_factory=dict)
 
+    @property
+    def changed(self) -> bool:
+        """False where ``asset`` is the start."""
+        return self.parts != NOTHING
+
     def record(self) -> dict:
         """What a file may hold of it: plain values, without the asset."""
         pairs = {
@@ -60,7 +58,7 @@ class Refinement:
             for name, values in (("psnr_before", self.before), ("psnr_after", self.after))
         }
         return {
-            "kept": self.kept,
+            "kept": vars(self.parts),
             **pairs,
             "views_held_out": list(self.held),
             "steps": self.steps,
@@ -72,31 +70,6 @@ class Refinement:
 def held_out(count: int) -> tuple[int, ...]:
     """Views whose colours no fit may use: none of fewer than three, one of fewer than twelve, else two."""
     return () if count < 3 else (count // 2,) if count < 12 else (count // 3, 2 * count // 3)
-
-
-@torch.no_grad()
-def picture_error(asset: Asset, photographs: Photographs) -> Tensor:
-    """Mean squared display error ``(V,)`` of whole pictures on white under the asset's own light, at pixel centres."""
-    small = photographs.resized(min(CHECK_PIXELS, photographs.size))
-    scene = RayScene(asset.mesh.vertices, asset.mesh.faces)
-    errors = []
-    for view in range(len(small)):
-        hits, _, directions = primary_hits(scene, small.camera[view])
-        seen = hits.face >= 0
-        at = surface_points(asset.mesh, asset.textures, hits.face[seen], hits.bary[seen])
-        image = torch.ones_like(small.color[view])
-        lit = radiance(at, -directions[seen], asset.light, samples=CHECK_SAMPLES, scene=scene, seed=view)
-        image[seen] = linear_to_srgb(lit.clamp(0.0, 1.0))
-        wanted = torch.lerp(
-            torch.ones_like(image), linear_to_srgb(small.color[view].clamp(0, 1)), small.mask[view][..., None]
-        )
-        errors.append((image - wanted).square().mean())
-    return torch.stack(errors)
-
-
-def decibels(errors: Tensor) -> float:
-    """Mean PSNR over views, NaN of none."""
-    return float((-10.0 * errors.clamp(min=1e-9).log10()).mean()) if len(errors) else math.nan
 
 
 @torch.enable_grad()
@@ -119,7 +92,8 @@ def refine(
     bar: progress on stderr.  Ctrl-C ends the fit and the best so far is taken.
 
     With three views or more some are held out: their masks bound the surface, their colours are not used.  Where the
-    result shows any views worse than the start does, the start is returned.  Raises TypeError or ValueError where the
+    fit shows any views worse than the start does, some of its parts are taken (:func:`~reli3d.fit.choice.chosen`), or
+    the start is returned.  Raises TypeError or ValueError where the
     parts do not fit together, and on an asset without light, atlas or faces.
     """
     photographs, weights = Photographs.of(views), weights or losses.Weights()
@@ -135,18 +109,16 @@ def refine(
     before = picture_error(first, near)
     notes: list[str] = []
     with torch.random.fork_rng(devices=[]), _interruptible(budget, notes):
-        result, near = _fitted(first, near, used, resolution, weights, budget, notes, seed=seed, cameras=cameras)
-    after = picture_error(result, near)
+        fitted = _fitted(first, near, used, resolution, weights, budget, notes, seed=seed, cameras=cameras)
+    kept, parts, after = chosen(fitted, used, list(held), before)
     if budget.bar is not None:
         budget.bar.close()
+    notes.append(f"refinement: {parts}")
     was, now = ((decibels(e[used]), decibels(e[list(held)])) for e in (before, after))
-    worse = [name for name, a, b in zip(("input", "held-out"), was, now) if b < a - SLACK]
-    if worse:
-        notes.append(f"refinement: kept the start, as the result is worse on {' and '.join(worse)} views")
-    kept = asset if worse else _moved(result, -scale * shift, 1.0 / scale)
-    c2w = views.c2w if worse else near.moved(-scale * shift, 1.0 / scale).camera.c2w
-    name = "start" if worse else "result"
-    return Refinement(kept, name, was, now, held, c2w, tuple(notes), budget.curve, budget.counts)
+    if parts == NOTHING:
+        return Refinement(asset, parts, was, now, held, views.c2w, tuple(notes), budget.curve, budget.counts)
+    kept, near = _moved(kept, -scale * shift, 1.0 / scale), fitted.photographs.moved(-scale * shift, 1.0 / scale)
+    return Refinement(kept, parts, was, now, held, near.camera.c2w, tuple(notes), budget.curve, budget.counts)
 
 
 def _fitted(
@@ -160,8 +132,7 @@ def _fitted(
     *,
     seed: int,
     cameras: bool,
-) -> tuple[Asset, Photographs]:
-    """The fitted asset, and the photographs with their cameras corrected."""
+) -> Fitted:
     start, texels = Start.of(first), min(TEXELS, first.textures.size)
     closed = watertight(first.mesh)
     grid = Grid.around(first.mesh.vertices, resolution)
@@ -179,8 +150,7 @@ def _fitted(
     else:
         notes.append("refinement: the surface is not closed, so only its maps and light are fitted")
     fit_maps(unknowns, start, surface, photographs, used, weights, budget, MAPS, seed=seed)
-    with torch.no_grad():
-        return replace(changed(surface, unknowns), environment=environment(unknowns, start)), photographs
+    return Fitted(first, surface, start, unknowns, photographs)
 
 
 def _check_asset(asset: Asset, photographs: Photographs) -> None:

@@ -1,0 +1,150 @@
+"""Which parts of a fit are taken: surface, paint and light, by pictures of views whose colours it did not use."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from reli3d.fit.photographs import Photographs
+from reli3d.fit.shading import radiance
+from reli3d.fit.transfer import changed
+from reli3d.fit.unknowns import Start, Unknowns, environment
+from reli3d.geometry.rays import RayScene
+from reli3d.render.asset import Asset
+from reli3d.render.color import linear_to_srgb
+from reli3d.render.environment import Environment
+from reli3d.render.gbuffer import primary_hits, surface_points
+
+CHECK_PIXELS = 96  # of a photograph, a side, by which candidates are compared
+CHECK_SAMPLES = (16, 16, 4)
+STRENGTHS = tuple(math.exp(0.05 * k) for k in range(-12, 13))
+SLACK = 0.02  # dB: the noise of a comparison
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Shares of a fit in what is returned, 0 the start and 1 the fit: surface (0 or 1), paint (of the changes of the
+    materials' logits), light (of the changes of log radiance)."""
+
+    surface: float
+    paint: float
+    light: float
+
+    def __str__(self) -> str:
+        words = {0.0: "of the start", 0.5: "half fitted", 1.0: "fitted"}
+        return ", ".join(f"{name} {words[value]}" for name, value in vars(self).items())
+
+
+NOTHING = Parts(0.0, 0.0, 0.0)
+# Shares of paint and light.  Relighting shows surface and paint, not the light, so half of the light goes first.  Paint
+# fitted beside a light of which no half is right is not trusted; the surface is, as the masks hold it.
+FEW = 4  # views used, below which half of the paint's change at most is taken: most of it is shading then
+ORDER = ((1.0, 1.0), (1.0, 0.5), (0.5, 1.0), (0.5, 0.5), (0.0, 1.0), (0.0, 0.5), (0.0, 0.0))
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A start and what a fit made of it.
+
+    first: the start.  surface: the new surface with the maps and light of the start; ``first`` where it did not move.
+    photographs: with their cameras as corrected.
+    """
+
+    first: Asset
+    surface: Asset
+    start: Start
+    unknowns: Unknowns
+    photographs: Photographs
+
+    @torch.no_grad()
+    def mixed(self, paint: float, light: float) -> Asset:
+        """The new surface with these shares of the other changes."""
+        asset, unknowns = self.surface, self.unknowns
+        if paint:
+            material = [paint * grid for grid in unknowns.material]
+            asset = changed(asset, replace(unknowns, material=material, detail=paint * unknowns.detail))
+        if light:
+            maps = [light * values for values in unknowns.light]
+            asset = replace(asset, environment=environment(replace(unknowns, light=maps), self.start))
+        return asset
+
+
+class Pictures:
+    """Small photographs, and what their rays hit of one surface, traced once."""
+
+    @torch.no_grad()
+    def __init__(self, asset: Asset, photographs: Photographs):
+        small = photographs.resized(min(CHECK_PIXELS, photographs.size))
+        self.mesh, self.scene = asset.mesh, RayScene(asset.mesh.vertices, asset.mesh.faces)
+        shown = linear_to_srgb(small.color.clamp(0.0, 1.0))
+        self.wanted = torch.lerp(torch.ones_like(shown), shown, small.mask[..., None])
+        self.rays, self.inside, inside = [], [], small.inside()
+        for view in range(len(small)):
+            hits, _, directions = primary_hits(self.scene, small.camera[view])
+            seen = hits.face >= 0
+            self.rays.append((seen, hits.face[seen], hits.bary[seen], -directions[seen]))
+            self.inside.append(inside[view][seen])
+
+    @torch.no_grad()
+    def lit(self, asset: Asset) -> list[Tensor]:
+        """Linear radiance that the rays meet under the light of ``asset``, which has this surface.  The random numbers
+        depend on the view alone."""
+        lit = []
+        for view, (_, face, bary, wo) in enumerate(self.rays):
+            at = surface_points(self.mesh, asset.textures, face, bary)
+            lit.append(radiance(at, wo, asset.light, samples=CHECK_SAMPLES, scene=self.scene, seed=view))
+        return lit
+
+    @torch.no_grad()
+    def errors(self, lit: list[Tensor], strength: float = 1.0) -> Tensor:
+        """Mean squared display error ``(V,)`` of whole pictures on white; light times ``strength``."""
+        errors = []
+        for values, (seen, *_), wanted in zip(lit, self.rays, self.wanted, strict=True):
+            image = torch.ones_like(wanted)
+            image[seen] = linear_to_srgb((strength * values).clamp(0.0, 1.0))
+            errors.append((image - wanted).square().mean())
+        return torch.stack(errors)
+
+    @torch.no_grad()
+    def strength(self, lit: list[Tensor], views: list[int]) -> float:
+        """The one of ``STRENGTHS`` that ``views`` show, by pixels well inside the masks: white shines in at the rim."""
+        got = torch.cat([lit[view][self.inside[view]] for view in views])
+        want = torch.cat([self.wanted[view][self.rays[view][0]][self.inside[view]] for view in views])
+        if not len(got):
+            return 1.0
+        return min(STRENGTHS, key=lambda k: float((linear_to_srgb((k * got).clamp(0.0, 1.0)) - want).square().mean()))
+
+
+def picture_error(asset: Asset, photographs: Photographs) -> Tensor:
+    """Mean squared display error ``(V,)`` of whole pictures on white under the asset's own light, at pixel centres."""
+    pictures = Pictures(asset, photographs)
+    return pictures.errors(pictures.lit(asset))
+
+
+def decibels(errors: Tensor) -> float:
+    """Mean PSNR over views, NaN of none."""
+    return float((-10.0 * errors.clamp(min=1e-9).log10()).mean()) if len(errors) else math.nan
+
+
+@torch.no_grad()
+def chosen(fitted: Fitted, used: list[int], held: list[int], before: Tensor) -> tuple[Asset, Parts, Tensor]:
+    """The first of ``ORDER`` that is no worse than the start on the views used and on those held out, else the start;
+    its parts, and the errors ``(V,)`` of its pictures.
+
+    before: those of the start.  The strength of each candidate's light is the one that the used views show best: the
+    fit's error is that of the display's tangent, which rises faster than the display, so the fit ends too dark; and a
+    mean of logarithms is darker than either of its lights.
+    """
+    pictures, moved = Pictures(fitted.surface, fitted.photographs), float(fitted.surface is not fitted.first)
+    for paint, light in ORDER[2 if len(used) < FEW else 0 :]:
+        asset = fitted.mixed(paint, light)
+        lit = pictures.lit(asset)
+        strength = pictures.strength(lit, used) if light else 1.0
+        errors = pictures.errors(lit, strength)
+        if all(decibels(errors[which]) >= decibels(before[which]) - SLACK for which in (used, held) if which):
+            asset = replace(asset, environment=Environment(strength * asset.light.radiance))
+            return asset, Parts(moved, paint, light), errors
+    return fitted.first, NOTHING, before

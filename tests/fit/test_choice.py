@@ -1,0 +1,74 @@
+"""Which parts of a fit are taken: those that are right, by pictures of a scene that is known."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from reli3d.fit.choice import Fitted, Parts, chosen, picture_error
+from reli3d.fit.photographs import Photographs
+from reli3d.fit.unknowns import LIGHT_ROWS, Start, Unknowns
+from reli3d.render.environment import Environment
+from tests.support import small_scene
+
+VIEWS, USED, HELD = 5, [0, 1, 3, 4], [2]
+EVEN = Environment(torch.full((16, 32, 3), 0.5))
+
+
+@pytest.fixture(scope="module")
+def true():
+    return small_scene.painted(small_scene.ball())
+
+
+@pytest.fixture(scope="module")
+def photographs(true):
+    return Photographs.of(small_scene.photographs(true, VIEWS, 48))
+
+
+def fitted(first, photographs, *, light=None, paint=0.0, surface=None) -> Fitted:
+    """A fit that ended with this light, this change of the paint's logits, and this surface."""
+    start, unknowns = Start.of(first), Unknowns.zero(torch.ones(2, 2, 2), VIEWS, small_scene.TEXELS)
+    if light is not None:
+        unknowns.light[-1] = light.resized(LIGHT_ROWS).radiance.log() - start.light
+    unknowns.material[0][..., :3] = paint
+    moved = first if surface is None else replace(surface, environment=first.environment)
+    return Fitted(first, moved, start, unknowns, photographs)
+
+
+def choice(fit, photographs):
+    return chosen(fit, USED, HELD, picture_error(fit.first, photographs))
+
+
+def test_a_right_light_is_taken_without_the_wrong_paint_beside_it(true, photographs):
+    first = replace(true, environment=EVEN)
+    wrong = torch.tensor([3.0, -3.0, 3.0])
+    asset, parts, errors = choice(fitted(first, photographs, light=true.light, paint=wrong), photographs)
+    assert parts == Parts(0.0, 0.0, 1.0)
+    assert torch.equal(asset.textures.base_color, first.textures.base_color)
+    assert float(errors.mean()) < 0.5 * float(picture_error(first, photographs).mean())
+
+
+def test_a_right_surface_is_taken_without_the_wrong_light_beside_it(true, photographs):
+    first = replace(small_scene.painted(small_scene.ball(squeeze=0.9)), environment=true.light)
+    glare = Environment(64.0 * true.light.radiance)
+    asset, parts, errors = choice(fitted(first, photographs, light=glare, surface=true), photographs)
+    assert (parts.surface, parts.light) == (1.0, 0.0)
+    assert asset.mesh is true.mesh and torch.equal(asset.light.radiance, true.light.radiance)
+
+
+def test_the_light_gets_the_strength_that_the_photographs_show(true, photographs):
+    first = replace(true, environment=EVEN)
+    dark = Environment(0.8 * true.light.radiance)
+    asset, parts, errors = choice(fitted(first, photographs, light=dark), photographs)
+    ratio = asset.light.radiance.mean() / true.light.radiance.mean()
+    assert parts.light == 1.0 and float(ratio) == pytest.approx(1.0, abs=0.06)  # strengths are 5 % apart
+
+
+def test_a_fit_of_input_views_alone_is_not_taken(true, photographs):
+    """The held-out view decides where the views that were used gain."""
+    first = replace(true, environment=EVEN)
+    fit = fitted(first, photographs, light=true.light)
+    before = picture_error(first, photographs)
+    before[HELD] = 1e-8  # nothing is as good as that
+    assert chosen(fit, USED, HELD, before)[0] is first
+    assert chosen(fit, USED, [], before)[1].light == 1.0
