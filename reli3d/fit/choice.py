@@ -41,8 +41,8 @@ class Parts:
 NOTHING = Parts(0.0, 0.0, 0.0)
 # Shares of paint and light.  Relighting shows surface and paint, not the light, so half of the light goes first.  Paint
 # fitted beside a light of which no half is right is not trusted; the surface is, as the masks hold it.
-FEW = 4  # views used, below which half of the paint's change at most is taken: most of it is shading then
 ORDER = ((1.0, 1.0), (1.0, 0.5), (0.5, 1.0), (0.5, 0.5), (0.0, 1.0), (0.0, 0.5), (0.0, 0.0))
+FEW = 4  # views used, below which half of the paint is the most that is taken, and, of three or four views, of the light
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,8 @@ def chosen(fitted: Fitted, used: list[int], held: list[int], before: Tensor) -> 
     mean of logarithms is darker than either of its lights.
     """
     pictures, moved = Pictures(fitted.surface, fitted.photographs), float(fitted.surface is not fitted.first)
-    for paint, light in ORDER[2 if len(used) < FEW else 0 :]:
+    first = 0 if len(used) >= FEW else 3 if held else 2
+    for paint, light in ORDER[first:]:
         asset = fitted.mixed(paint, light)
         lit = pictures.lit(asset)
         strength = pictures.strength(lit, used) if light else 1.0
