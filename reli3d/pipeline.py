@@ -124,7 +124,7 @@ def _bounded_surface(field: LocalField, resolution: int) -> Mesh:
     def evaluate(index: Tensor) -> Tensor:
         return torch.cat([torch.maximum(field.level_within(flat[k], bound[k]), bound[k]) for k in index.split(CHUNK)])
 
-    level = sparse_level(level, near, evaluate)
+    level = torch.maximum(sparse_level(level, near, evaluate), bound.view_as(level))
     level = cover_silhouettes(level, bound.view_as(level), maps.silhouette, maps.camera, radius=radius)
     _check_signs(level)
     return extract_surface(level, radius=radius)
@@ -181,9 +181,11 @@ def texture(
 
     asked = beside(partial(at_vertices, field, mesh), mesh.vertices.device) if isinstance(field, LocalField) else None
     whole = mesh
-    mesh = unwrap(mesh, texture_size=size) if uv == "project" else unwrap_xatlas(mesh, texture_size=size)
-    mesh = replace(mesh, tangents=vertex_tangents(mesh))
-    local, known = asked() if asked else (None, None)
+    try:
+        mesh = unwrap(mesh, texture_size=size) if uv == "project" else unwrap_xatlas(mesh, texture_size=size)
+        mesh = replace(mesh, tangents=vertex_tangents(mesh))
+    finally:
+        local, known = asked() if asked else (None, None)
     if known is not None:
         known = known.index_select(0, source_vertices(whole, mesh))
 
@@ -380,7 +382,7 @@ def reconstruct_placed(placed: Placed, model: Network, options: ReconstructOptio
 
 
 def refine(asset: Asset, views: Views, *, seconds: float | None = None, steps: int | None = None, **options) -> Asset:
-    """``asset`` fitted to its photographs, or as it was where that is better; see :func:`reli3d.fit.refine.refine`.
+    """``asset`` with what a fit to its photographs makes no worse; see :func:`reli3d.fit.refine.refine`.
 
     views: any number, in the frame of ``asset`` (that of :func:`reconstruct`, unless its options name another).
     seconds or steps: one of the two.

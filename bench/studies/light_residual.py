@@ -4,7 +4,7 @@ usage: python -m bench.studies.light_residual WEIGHTS MAP.hdr [MAP.hdr ...] [--s
 
 WEIGHTS: the published decoder (``reni++L49.safetensors``).  Each map is brought to 64 rows and its latents are fitted.
 The residual is the logarithm of true by fitted radiance, averaged over the solid angle of each cell of a map of 8, 16
-or 32 rows, and added back with bilinear look-ups; so it is the best that such a map can do.  Three figures of each,
+or 32 rows, and added back with bilinear look-ups.  Three figures of each,
 in Markdown, means over the maps: the mean of the difference of log radiance; the share of the light's power in the
 brightest hundredth of the sphere, of that of the truth; and the error of the light on a white dull ball, in per cent
 of its mean.
@@ -30,7 +30,7 @@ ROWS = 64
 RESIDUALS = (8, 16, 32)
 
 
-def solid_angle(rows: int) -> Tensor:
+def texel_weights(rows: int) -> Tensor:
     """Weights ``(rows, 2 rows)`` of the texels of a map, sum 1."""
     weight = texel_solid_angles(rows, 2 * rows).float()[:, None].expand(rows, 2 * rows)
     return weight / weight.sum()
@@ -38,7 +38,7 @@ def solid_angle(rows: int) -> Tensor:
 
 def figures(got: Tensor, true: Tensor) -> list[float]:
     """Difference of logarithms, share of the peak's power, and error of the irradiance of maps ``(64, 128, 3)``."""
-    weight = solid_angle(ROWS)
+    weight = texel_weights(ROWS)
     floor = FLOOR * float((true.mean(-1) * weight).sum())
     difference = ((got + floor).log() - (true + floor).log()).abs().mean(-1)
     shade, other = true.mean(-1), got.mean(-1)
@@ -55,7 +55,7 @@ def figures(got: Tensor, true: Tensor) -> list[float]:
 def with_residual(got: Tensor, true: Tensor, rows: int) -> Tensor:
     """``got`` times the factors of a map of ``rows`` rows that bring its cells nearest to ``true``."""
     floor = FLOOR * float(true.mean())
-    weight = solid_angle(ROWS)[..., None]
+    weight = texel_weights(ROWS)[..., None]
     ratio = ((true + floor).log() - (got + floor).log()) * weight
     cell = ROWS // rows
     means = [functional.avg_pool2d(t.permute(2, 0, 1)[None], cell) for t in (ratio, weight)]

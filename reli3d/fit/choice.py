@@ -42,7 +42,7 @@ NOTHING = Parts(0.0, 0.0, 0.0)
 # Shares of paint and light.  Relighting shows surface and paint, not the light, so half of the light goes first.  Paint
 # fitted beside a light of which no half is right is not trusted; the surface is, as the masks hold it.
 ORDER = ((1.0, 1.0), (1.0, 0.5), (0.5, 1.0), (0.5, 0.5), (0.0, 1.0), (0.0, 0.5), (0.0, 0.0))
-FEW = 4  # views used, below which half of the paint is the most that is taken, and, of three or four views, of the light
+FEW = 4  # views used: of fewer, at most half of the paint is taken, and, where a view is held out, half of the light
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,11 @@ class Fitted:
 
 
 class Pictures:
-    """Small photographs, and what their rays hit of one surface, traced once."""
+    """Small photographs, and what their rays hit of one surface, traced once.
+
+    Of each of V views: ``wanted (V, S, S, 3)`` display values on white; ``rays``: which pixels hit ``(S, S)``, their
+    faces ``(N,)``, barycentrics ``(N, 2)`` and unit directions to the eye ``(N, 3)``; ``inside (N,)``: well in masks.
+    """
 
     @torch.no_grad()
     def __init__(self, asset: Asset, photographs: Photographs):
@@ -90,8 +94,10 @@ class Pictures:
 
     @torch.no_grad()
     def lit(self, asset: Asset) -> list[Tensor]:
-        """Linear radiance that the rays meet under the light of ``asset``, which has this surface.  The random numbers
-        depend on the view alone."""
+        """Linear radiance ``(N, 3)`` of each view's rays under the light of ``asset``, which has this surface.
+
+        The random numbers depend on the view alone.
+        """
         lit = []
         for view, (_, face, bary, wo) in enumerate(self.rays):
             at = surface_points(self.mesh, asset.textures, face, bary)
@@ -131,16 +137,18 @@ def decibels(errors: Tensor) -> float:
 
 @torch.no_grad()
 def chosen(fitted: Fitted, used: list[int], held: list[int], before: Tensor) -> tuple[Asset, Parts, Tensor]:
-    """The first of ``ORDER`` that is no worse than the start on the views used and on those held out, else the start;
-    its parts, and the errors ``(V,)`` of its pictures.
+    """The first of ``ORDER``, of few views with less (``FEW``), that is no worse than the start on the views ``used``
+    and on those ``held`` out, else the start; its parts, and the errors ``(V,)`` of its pictures.
 
-    before: those of the start.  The strength of each candidate's light is the one that the used views show best: the
-    fit's error is that of the display's tangent, which rises faster than the display, so the fit ends too dark; and a
-    mean of logarithms is darker than either of its lights.
+    used, held: indices of photographs.  before: errors ``(V,)`` of the start.  The strength of each candidate's light
+    is the one that the used views show best: the fit's error is that of the display's tangent, which rises faster than
+    the display, so the fit ends too dark; and a mean of logarithms is darker than either of its lights.
     """
     pictures, moved = Pictures(fitted.surface, fitted.photographs), float(fitted.surface is not fitted.first)
-    first = 0 if len(used) >= FEW else 3 if held else 2
-    for paint, light in ORDER[first:]:
+    few = len(used) < FEW
+    for paint, light in ORDER:
+        if few and (paint > 0.5 or (held and light > 0.5)):
+            continue
         asset = fitted.mixed(paint, light)
         lit = pictures.lit(asset)
         strength = pictures.strength(lit, used) if light else 1.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -31,9 +31,10 @@ TEXELS = 512  # of the base colour's detail, at most
 class Refinement:
     """What :func:`refine` gives.
 
-    asset: the refined one, or the start where no part of it is better.  parts: what of the fit it has.  before, after:
-    mean PSNR [dB] on white of the photographs that were used and of those held out (NaN without any).  held: their
-    indices.  c2w: ``(V, 4, 4)``, the cameras as corrected.  notes: one line each.  curve, steps: what the run did.
+    asset: the refined one, or the start where no mixture of its parts is as good.  parts: what of the fit it has.
+    before, after: mean PSNR [dB] on white of the photographs that were used and of those held out (NaN without any).
+    held: their indices.  c2w: ``(V, 4, 4)``, the cameras as corrected.  notes: one line each.  curve, steps: what the
+    run did.
     """
 
     asset: Asset
@@ -58,7 +59,7 @@ class Refinement:
             for name, values in (("psnr_before", self.before), ("psnr_after", self.after))
         }
         return {
-            "kept": vars(self.parts),
+            "kept": asdict(self.parts),
             **pairs,
             "views_held_out": list(self.held),
             "steps": self.steps,
@@ -93,8 +94,8 @@ def refine(
 
     With three views or more some are held out: their masks bound the surface, their colours are not used.  Where the
     fit shows any views worse than the start does, some of its parts are taken (:func:`~reli3d.fit.choice.chosen`), or
-    the start is returned.  Raises TypeError or ValueError where the
-    parts do not fit together, and on an asset without light, atlas or faces.
+    the start is returned.  Raises TypeError or ValueError where asset and views do not fit together, and on an asset
+    without light, atlas or faces.
     """
     photographs, weights = Photographs.of(views), weights or losses.Weights()
     _check_asset(asset, photographs)
@@ -110,7 +111,7 @@ def refine(
     notes: list[str] = []
     with torch.random.fork_rng(devices=[]), _interruptible(budget, notes):
         fitted = _fitted(first, near, used, resolution, weights, budget, notes, seed=seed, cameras=cameras)
-    kept, parts, after = chosen(fitted, used, list(held), before)
+        kept, parts, after = chosen(fitted, used, list(held), before)
     if budget.bar is not None:
         budget.bar.close()
     notes.append(f"refinement: {parts}")

@@ -69,12 +69,15 @@ def hull_distance(points: Tensor, distance: Tensor, camera: Camera, *, far: floa
     A view's distance is the pixel distance where the point projects, times depth / focal length.  It is up to 1 / cos^2
     of the angle to the optical axis too long.  Outside an image the value of its border is taken, so an object that the
     border cuts is unbounded there.  A point at or behind a camera's plane gets -1000.  Without views every point gets
-    +1000.  far: a point that is outside by more gets some value below ``-far``, in less time.  No gradient.
+    +1000.  far: at least 0, world units; a point that is
+    outside by more gets some value below ``-far``, in less time.  No gradient.
     """
     check("points", points, last=3)
     if points.ndim != 2:
         raise ValueError(f"points: expected shape (N, 3), got {tuple(points.shape)}")
     _check_views(points, distance, camera)
+    if not far >= 0.0:
+        raise ValueError(f"far: expected at least 0, got {far}")
     hull = torch.empty(len(points), device=points.device)
     inputs = [(points.detach().contiguous(), wp.vec3), *_views(distance, camera), far, (hull, wp.float32)]
     launch(kernels.hull_distance_kernel, len(points), inputs, points.device)

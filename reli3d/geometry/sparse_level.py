@@ -14,11 +14,18 @@ SURE = 0.2  # depth of the level at all corners of a cell of two points a side i
 def sparse_level(known: Tensor, near: Tensor, evaluate: Callable[[Tensor], Tensor]) -> Tensor:
     """Levels ``(X, Y, Z)`` as of a dense evaluation, but ``-SURE`` deep inside.
 
-    known: ``(X, Y, Z)``, kept where ``near (X, Y, Z)`` is false and no neighbour has another sign.  evaluate: levels
-    ``(N,)`` of points with flat indices ``(N,)``.  Every other point of ``near`` along each axis is evaluated first,
-    then what lies between them outside the cells whose corners all are below ``-SURE``, then, until none is left, what
-    lies across a change of sign.  A hole inside one such cell is missed.  No gradient.
+    known: ``(X, Y, Z)``, at least 3 a side, kept where ``near (X, Y, Z)``, bool, is false and no neighbour has another
+    sign.  evaluate: levels ``(N,)`` of points with flat indices ``(N,)``.  Every other point of ``near`` along each
+    axis is evaluated first, then what lies between them outside the cells whose corners all are below ``-SURE``, then,
+    until none is left, what lies across a change of sign.  A closed hollow that no point of the first kind meets is
+    missed.  No gradient.  Raises ValueError for other shapes, TypeError for another kind of ``near``.
     """
+    if known.ndim != 3 or min(known.shape) < 3 or near.shape != known.shape:
+        raise ValueError(
+            f"known, near: expected one shape (X, Y, Z) from 3, got {tuple(known.shape)}, {tuple(near.shape)}"
+        )
+    if near.dtype != torch.bool:
+        raise TypeError(f"near: expected torch.bool, got {near.dtype}")
     level, done = known.clone(), torch.zeros_like(near)
 
     def ask(wanted: Tensor) -> None:
@@ -32,7 +39,7 @@ def sparse_level(known: Tensor, near: Tensor, evaluate: Callable[[Tensor], Tenso
     deep = _all_corners(level[::2, ::2, ::2] < -SURE)
     inside = torch.zeros_like(near)
     inside[tuple(slice(2 * n + 1) for n in deep.shape)] = ~_points_of(~deep)
-    inside &= ~done
+    inside &= near & ~done
     level[inside] = -SURE
     ask(near & ~done & ~inside)
     while True:

@@ -302,11 +302,12 @@ def unwrap_xatlas(mesh: Mesh, *, texture_size: int = 1024, timeout_s: float = 12
 def source_vertices(whole: Mesh, mesh: Mesh) -> Tensor:
     """Which vertex of ``whole`` each vertex of ``mesh``, the same after :func:`unwrap`, was split from: ``(V,)`` int32.
 
-    Raises ValueError where the numbers of faces differ.
+    Faces and their corners have the same order in both; a vertex without a face gets 0.  Raises ValueError where the
+    numbers of faces differ.
     """
     if whole.faces.shape != mesh.faces.shape:
         raise ValueError(f"mesh.faces: expected {len(whole.faces)} faces, got {len(mesh.faces)}")
-    return mesh.faces.new_empty(len(mesh.vertices)).index_put_((mesh.faces.long(),), whole.faces)
+    return mesh.faces.new_zeros(len(mesh.vertices)).index_put_((mesh.faces.long(),), whole.faces)
 
 
 def uv_faces(mesh: Mesh) -> Tensor:

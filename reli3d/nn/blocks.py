@@ -38,10 +38,11 @@ def in_rows(evaluate: Callable[..., dict[str, Tensor]], *inputs: Tensor) -> dict
 def beside(work: Callable[[], T], device: torch.device) -> Callable[[], T]:
     """Begin ``work()`` on one thread of the bridge's pool, without gradient; the result gives its value when called.
 
-    For long chains that leave a processor idle.  The work is done at once where the caller computes alone, and on CUDA,
-    which does not wait.
+    For long chains that leave a processor idle.  The work is done at once where the caller computes alone, and on CUDA.
+    What it raises comes out of the result, or at once.
     """
+    work = torch.no_grad()(work)
     if serial() or device.type == "cuda":
         value = work()
         return lambda: value
-    return pool().submit(torch.no_grad()(work)).result
+    return pool().submit(work).result

@@ -48,6 +48,13 @@ def test_a_right_light_is_taken_without_the_wrong_paint_beside_it(true, photogra
     assert float(errors.mean()) < 0.5 * float(picture_error(first, photographs).mean())
 
 
+def test_of_few_views_half_of_the_light_is_taken(true, photographs):
+    first = replace(true, environment=EVEN)
+    fit = fitted(first, photographs, light=true.light, paint=torch.tensor([3.0, -3.0, 3.0]))
+    _, parts, _ = chosen(fit, USED[:3], HELD, picture_error(first, photographs))
+    assert parts == Parts(0.0, 0.0, 0.5)
+
+
 def test_a_right_surface_is_taken_without_the_wrong_light_beside_it(true, photographs):
     first = replace(small_scene.painted(small_scene.ball(squeeze=0.9)), environment=true.light)
     glare = Environment(64.0 * true.light.radiance)

@@ -67,3 +67,16 @@ def test_nothing_near_asks_for_nothing():
     level = torch.ones(8, 8, 8)
     got, asked = sparse(level, torch.zeros(8, 8, 8, dtype=torch.bool), known=level)
     assert len(asked) == 0 and torch.equal(got, level)
+
+
+def test_known_levels_outside_the_region_are_kept():
+    known = torch.full((9, 9, 9), -5.0)
+    got, asked = sparse(known, torch.zeros(9, 9, 9, dtype=torch.bool), known=known)
+    assert len(asked) == 0 and torch.equal(got, known)
+
+
+def test_wrong_grids_are_named():
+    with pytest.raises(ValueError, match=r"known, near: expected one shape \(X, Y, Z\) from 3, got"):
+        sparse(torch.zeros(2, 9, 9), torch.ones(2, 9, 9, dtype=torch.bool))
+    with pytest.raises(TypeError, match="near: expected torch.bool"):
+        sparse(torch.zeros(9, 9, 9), torch.ones(9, 9, 9))

@@ -112,7 +112,7 @@ TINY = {  # for `tiny`: a network from scratch takes forty times the rate of one
         Stage("volume", "volume", 32, patch=24, lobes=32, grid=10, samples_along=32, steps=1500, rate=2e-3),
         Stage("gaussians", "gaussians", 48, lobes=48, steps=1000, rate=1e-3),
         Stage("surface", "gaussians", 64, lobes=64, steps=500, rate=5e-4),
-        # four views an object: half of the gradient's noise is between views, and tracing three more costs little
+        # four views an object: half of the gradient's noise is between views; a step takes 1.8 times as long
         Stage("monte_carlo", "monte_carlo", 48, targets=4, samples=(6, 8, 2), steps=350, rate=1e-3),
     )
 }
