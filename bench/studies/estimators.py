@@ -2,7 +2,7 @@
 
 usage: python -m bench.studies.estimators OUT --train SAMPLES --held-back SAMPLES --maps FILE --prior FILE --start STATE
 
-Runs begin with the averaged parameters of STATE and take the same steps of the same draws; the renderer alone differs.
+Runs begin with the averaged parameters of STATE and take the same draws; the renderer alone differs.
 ``images`` leaves out the truth of materials and normals.  A call goes on where the one before was stopped; ``--seeds``,
 ``--arms`` and ``--groups`` let several processes share it.  Then each object is read from four views and compared in
 two others with the procedural object itself, rendered with shadows, also under two held-back lights.  Prints a table in

@@ -3,11 +3,9 @@
 usage: python -m bench.studies.light_residual WEIGHTS MAP.hdr [MAP.hdr ...] [--steps 300]
 
 WEIGHTS: the published decoder (``reni++L49.safetensors``).  Each map is brought to 64 rows and its latents are fitted.
-The residual is the logarithm of true by fitted radiance, averaged over the solid angle of each cell of a map of 8, 16
-or 32 rows, and added back with bilinear look-ups.  Three figures of each,
-in Markdown, means over the maps: the mean of the difference of log radiance; the share of the light's power in the
-brightest hundredth of the sphere, of that of the truth; and the error of the light on a white dull ball, in per cent
-of its mean.
+The residual is the logarithm of true by fitted radiance, averaged over each cell of a map of 8, 16 or 32 rows, and
+added back with bilinear look-ups.  Prints means over the maps in Markdown: the difference of log radiance; the power of
+the brightest hundredth of the sphere, by the truth's; the error of the irradiance, in per cent of its mean.
 """
 
 from __future__ import annotations

@@ -92,10 +92,9 @@ def refine(
     cells of the surface's grid along the longest side.  weights: of the losses.  cameras: correct the cameras as well.
     bar: progress on stderr.  Ctrl-C ends the fit and the best so far is taken.
 
-    With three views or more some are held out: their masks bound the surface, their colours are not used.  Where the
-    fit shows any views worse than the start does, some of its parts are taken (:func:`~reli3d.fit.choice.chosen`), or
-    the start is returned.  Raises TypeError or ValueError where asset and views do not fit together, and on an asset
-    without light, atlas or faces.
+    Of three views or more some are held out: their masks bound the surface, their colours are not used.  What of the
+    fit is taken says :func:`~reli3d.fit.choice.chosen`.  Raises TypeError or ValueError where asset and views do not
+    belong together, and on an asset without light, atlas or faces.
     """
     photographs, weights = Photographs.of(views), weights or losses.Weights()
     _check_asset(asset, photographs)

@@ -66,11 +66,10 @@ def hull_distance(points: Tensor, distance: Tensor, camera: Camera, *, far: floa
     """Signed distance ``(N,)`` of points to the visual hull, world units, positive inside: the least over the views.
 
     points: ``(N, 3)``.  distance: ``(V, H, W)`` from :func:`mask_distance`.  camera: of these V views and pixels.
-    A view's distance is the pixel distance where the point projects, times depth / focal length.  It is up to 1 / cos^2
-    of the angle to the optical axis too long.  Outside an image the value of its border is taken, so an object that the
-    border cuts is unbounded there.  A point at or behind a camera's plane gets -1000.  Without views every point gets
-    +1000.  far: at least 0, world units; a point that is
-    outside by more gets some value below ``-far``, in less time.  No gradient.
+    A view's distance is the pixel distance where the point projects, times depth / focal length: up to 1 / cos^2 of the
+    angle to the optical axis too long.  Outside an image its border's value is taken: an object that is cut there is
+    unbounded.  A point at or behind a camera's plane gets -1000.  Without views every point gets +1000.  far: at least
+    0, else ValueError, world units; a point farther outside gets some value below ``-far``, in less time.  No gradient.
     """
     check("points", points, last=3)
     if points.ndim != 2:

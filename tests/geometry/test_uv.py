@@ -199,10 +199,10 @@ def test_normals_are_taken_over_and_gradients_reach_the_vertices():
     assert not result.uv.requires_grad
 
 
-def test_split_vertices_know_what_they_were():
-    ball = trimesh.creation.icosphere(subdivisions=2)
-    whole = mesh_of(ball.vertices, ball.faces)
-    mesh = unwrap(whole)
+@pytest.mark.parametrize("atlas", [unwrap, unwrap_xatlas])
+def test_split_vertices_know_what_they_were(atlas):
+    whole = icosphere(2)
+    mesh = atlas(whole)
     assert len(mesh.vertices) > len(whole.vertices)
     assert torch.equal(whole.vertices[source_vertices(whole, mesh).long()], mesh.vertices)
     with pytest.raises(ValueError, match=r"mesh.faces: expected 1 faces, got 320"):
