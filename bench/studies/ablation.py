@@ -45,8 +45,8 @@ from reli3d.train.losses import (
     GRADIENT_STEP,
     WEIGHTS,
     astray,
-    color_loss,
     encode_sample,
+    excess_entropy,
     losses,
     pattern_loss,
 )
@@ -140,10 +140,10 @@ class Trunk(nn.Module):
             "occupancy": functional.binary_cross_entropy_with_logits(-self.level(field, sample.points), target),
             "surface": functional.smooth_l1_loss(on_surface, torch.zeros_like(on_surface)),
             "gradient": (1 - cosine(slope, normal[:GRADIENT_POINTS], dim=-1, eps=1e-6)).mean(),
-            "base_color": color_loss(got.base_color.clamp(1e-4, 1 - 1e-4), base),
+            "base_color": excess_entropy(got.base_color.clamp(1e-4, 1 - 1e-4), base),
             "pattern": pattern_loss(got.base_color, base),
-            "roughness": functional.mse_loss(got.roughness, rough),
-            "metallic": functional.mse_loss(got.metallic, metal),
+            "roughness": excess_entropy(got.roughness, rough),
+            "metallic": excess_entropy(got.metallic.clamp(1e-4, 1 - 1e-4), metal),
             "normal": (1 - cosine(got.normal, bumped, dim=-1)).mean(),
         }
 

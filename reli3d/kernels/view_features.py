@@ -249,7 +249,7 @@ def fuse_views_kernel(
         at = between_pixels(q[0] * scale, q[1] * scale, paint.shape[1], paint.shape[2])
         x = at[2]
         y = at[3]
-        four = wp.vec4((1.0 - x) * (1.0 - y), x * (1.0 - y), (1.0 - x) * y, x * y)  # once for all maps, as above
+        four = wp.vec4((1.0 - x) * (1.0 - y), x * (1.0 - y), (1.0 - x) * y, x * y)  # as in pool_views_kernel
         change = mix_four(paint, v, int(at[0]), int(at[1]), four)
         of_view = mix_four(rough_metal, v, int(at[0]), int(at[1]), four)
         weight = share * share * wp.exp(of_view[0])

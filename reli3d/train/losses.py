@@ -15,14 +15,14 @@ WEIGHTS = {
     "surface": 0.02,
     "gradient": 0.6,
     "base_color": 2.0,
-    "pattern": 12.0,
-    "roughness": 1.5,
-    "metallic": 1.5,
+    "pattern": 0.24,
+    "roughness": 2.0,
+    "metallic": 2.0,
     "normal": 1.0,
     "pixel_color": 1.5,
-    "pixel_pattern": 12.0,
-    "pixel_roughness": 1.0,
-    "pixel_metallic": 1.0,
+    "pixel_pattern": 0.24,
+    "pixel_roughness": 2.0,
+    "pixel_metallic": 2.0,
     "pixel_normal": 1.0,
     "pixel_depth": 0.3,
     "light": 0.4,
@@ -31,6 +31,7 @@ WEIGHTS = {
 }
 ASTRAY = 0.02, 0.3  # greatest deviation of position [model's cube] and normal [radian] of an extracted surface
 GRADIENT_POINTS, GRADIENT_STEP = 384, 0.012  # surface points whose level's slope is asked, over about a grid cell
+PLAIN = 0.002  # mean square error of a pattern (27 dB) that is as good as none
 DEPTH_UNIT = 0.1  # of the object's longest side
 NORMALS = 192  # directions at which the irradiance is compared
 
@@ -95,10 +96,10 @@ def _paint(field: LocalField, sample: Sample, position: Tensor, normal: Tensor, 
     got = field.material(*astray(position, normal), sample.visible)
     base, rough, metal = sample.material[:, :3], sample.material[:, 3], sample.material[:, 4]
     return {
-        "base_color": color_loss(got.base_color, base),
+        "base_color": excess_entropy(got.base_color, base),
         "pattern": pattern_loss(got.base_color, base),
-        "roughness": functional.mse_loss(got.roughness, rough),
-        "metallic": functional.mse_loss(got.metallic, metal),
+        "roughness": excess_entropy(got.roughness, rough),
+        "metallic": excess_entropy(got.metallic, metal),
         "normal": (1 - functional.cosine_similarity(got.normal, bumped, dim=-1)).mean(),
     }
 
@@ -114,24 +115,27 @@ def astray(position: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
     return position + distance * normal, functional.normalize(normal + tilt, dim=-1)
 
 
-def color_loss(color: Tensor, target: Tensor) -> Tensor:
-    """Cross-entropy of colours ``(N, 3)`` in [0, 1] over its least value, which is 0 where they are equal.
+def excess_entropy(value: Tensor, target: Tensor) -> Tensor:
+    """Cross-entropy of values in [0, 1] over its least value: 0 where they are equal.
 
-    The mean square has no slope where a sigmoid has gone to black or white: colours that are there would stay.
+    The mean square has hardly a slope where a sigmoid is near 0 or 1: black colours would stay black, and a metallic
+    of 0.1 everywhere would stay so.
     """
     least = functional.binary_cross_entropy(target, target)
-    return functional.binary_cross_entropy(color, target) - least
+    return functional.binary_cross_entropy(value, target) - least
 
 
 def pattern_loss(color: Tensor, target: Tensor) -> Tensor:
-    """Mean square difference of base colours ``(N, 3)``, sRGB, after each channel's best factor in linear light.
+    """Logarithm of the mean square difference of base colours ``(N, 3)``, sRGB, after each channel's best factor in
+    linear light; PLAIN is added, and 0 is no difference.
 
     How bright an albedo is no image tells: a longer exposure looks the same.  How it varies over the surface, they do.
-    The factor has its gradient, else the colours would drift: the mean square is that of encoded colours.
+    The factor has its gradient, else the colours would drift: the mean square is that of encoded colours.  By the
+    logarithm a stain on a plain object counts as much as a lost pattern.
     """
     p, t = srgb_to_linear(color), srgb_to_linear(target)
     factor = (p * t).sum(0) / p.square().sum(0).clamp(min=1e-4)
-    return functional.mse_loss(linear_to_srgb((p * factor).clamp(0.0, 1.0)), target)
+    return torch.log1p(functional.mse_loss(linear_to_srgb((p * factor).clamp(0.0, 1.0)), target) / PLAIN)
 
 
 def _pixels(pixels: PixelMaps, shown: Tensor, sample: Sample) -> dict[str, Tensor]:
@@ -143,10 +147,10 @@ def _pixels(pixels: PixelMaps, shown: Tensor, sample: Sample) -> dict[str, Tenso
     want = sample.view_material[valid]
     color = pixels.base_logit(shown)[valid].sigmoid()
     return {
-        "pixel_color": color_loss(color, want[:, :3]),
+        "pixel_color": excess_entropy(color, want[:, :3]),
         "pixel_pattern": pattern_loss(color, want[:, :3]),
-        "pixel_roughness": functional.mse_loss(pixels.roughness[valid][:, 0].sigmoid(), want[:, 3]),
-        "pixel_metallic": functional.mse_loss(pixels.metallic[valid][:, 0].sigmoid(), want[:, 4]),
+        "pixel_roughness": excess_entropy(pixels.roughness[valid][:, 0].sigmoid(), want[:, 3]),
+        "pixel_metallic": excess_entropy(pixels.metallic[valid][:, 0].sigmoid(), want[:, 4]),
         "pixel_normal": (1 - (pixels.normal[valid] * sample.view_normal[valid]).sum(-1)).mean(),
         "pixel_depth": functional.smooth_l1_loss(
             pixels.depth[valid][:, 0] / DEPTH_UNIT, sample.view_depth[valid] / DEPTH_UNIT, beta=0.2
