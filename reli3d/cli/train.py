@@ -90,7 +90,7 @@ def _check_state(path: Path, model) -> None:
         state = torch.load(path, weights_only=True, mmap=True)
         shapes = [{k: tuple(v.shape) for k, v in state[name].items()} for name in ("model", "average")]
         groups, step, seconds = state["optimizer"]["param_groups"], state["step"], state["seconds"]
-        whole = len(groups) == 2 and isinstance(step, int) and step >= 0 and seconds >= 0
+        whole = all("times" in group for group in groups) and isinstance(step, int) and step >= 0 and seconds >= 0
     except Exception as error:  # of a broken file torch, pickle and zipfile raise almost anything
         reason = shown(" ".join(str(error).split()))
         raise InputError(

@@ -7,6 +7,7 @@ import math
 import os
 import sys
 import time
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from functools import reduce
 from pathlib import Path
@@ -44,6 +45,8 @@ class TrainConfig:
     validation: str = ""  # folder of held-back samples; the first ones are drawn at every checkpoint
 
 
+LAST_LAYERS = ("pyramid.pixels.1.", "color.4.", "surface.4.", "light.out.")
+LAST_RATE = 10.0  # times the rate for these: they begin at zero, and Adam moves a number by hardly more than the rate
 PICTURED = 3  # validation objects in the picture, from one and from four views
 
 
@@ -55,6 +58,15 @@ def progress(config: TrainConfig, step: int, seconds: float) -> float:
 def predicts(name: str) -> bool:
     """Whether the predictions of pixels need the parameter ``name``."""
     return name.startswith("pyramid.") and not name.startswith("pyramid.features.")
+
+
+def parameter_groups(parameters: Iterable[tuple[str, nn.Parameter]], config: TrainConfig) -> list[dict]:
+    """Groups of an optimizer: with and without weight decay, and the last layers, whose ``times`` is LAST_RATE."""
+    groups: dict[tuple[float, float], list[nn.Parameter]] = {}
+    for name, parameter in parameters:
+        decay = config.weight_decay if parameter.ndim > 1 else 0.0
+        groups.setdefault((decay, LAST_RATE if name.startswith(LAST_LAYERS) else 1.0), []).append(parameter)
+    return [{"params": group, "weight_decay": decay, "times": times} for (decay, times), group in groups.items()]
 
 
 def rate_at(config: TrainConfig, step: int, done: float) -> float:
@@ -75,12 +87,9 @@ def train(model: LocalReconstructor, config: TrainConfig, workers: Workers | Non
     folder.mkdir(parents=True, exist_ok=True)
     model.pyramid.in_bfloat16 = model.volume.in_bfloat16 = config.bfloat16
     ask, names = (pixel_losses, PIXEL_TERMS) if config.pixels else (losses, tuple(WEIGHTS))
-    trained = [p for name, p in model.named_parameters() if p.requires_grad and (not config.pixels or predicts(name))]
-    groups = [
-        {"params": [p for p in trained if p.ndim > 1], "weight_decay": config.weight_decay},
-        {"params": [p for p in trained if p.ndim <= 1], "weight_decay": 0.0},
-    ]
-    optimizer = torch.optim.AdamW(groups, lr=config.rate, betas=(0.9, 0.98), fused=True)
+    named = [(k, p) for k, p in model.named_parameters() if p.requires_grad and (not config.pixels or predicts(k))]
+    trained = [p for _, p in named]
+    optimizer = torch.optim.AdamW(parameter_groups(named, config), lr=config.rate, betas=(0.9, 0.98), fused=True)
     average = {k: v.detach().clone() for k, v in model.state_dict().items()}
     step, seconds = 0, 0.0
     if (folder / "state.pt").exists():
@@ -107,7 +116,7 @@ def train(model: LocalReconstructor, config: TrainConfig, workers: Workers | Non
     while progress(config, step, seconds) < 1.0:
         done = progress(config, step, seconds)
         for group in optimizer.param_groups:
-            group["lr"] = rate_at(config, step, done)
+            group["lr"] = group["times"] * rate_at(config, step, done)
         optimizer.zero_grad(set_to_none=True)
         values = torch.zeros(len(names) + 1)
         samples = next(source)
@@ -128,7 +137,7 @@ def train(model: LocalReconstructor, config: TrainConfig, workers: Workers | Non
             means = {k: round(v / 50, 5) for k, v in sums.items()}
             sums = {}
             if log:
-                row = {"step": step, "seconds": round(seconds), "rate": optimizer.param_groups[0]["lr"], **means}
+                row = {"step": step, "seconds": round(seconds), "rate": rate_at(config, step, done), **means}
                 log.write(json.dumps(row) + "\n")
                 print(f"step {step} {seconds:.0f} s {means}", file=sys.stderr, flush=True)
         if log and time.monotonic() - saved > config.checkpoint_seconds:

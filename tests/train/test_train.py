@@ -18,7 +18,16 @@ from reli3d.nn.weights import load_model
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.train.batches import OF_VIEWS, batches, groups, load_sample, random_turn
 from reli3d.train.light_prior import fit, scale_free
-from reli3d.train.loop import TrainConfig, averaged_model, predicts, progress, rate_at, train
+from reli3d.train.loop import (
+    LAST_RATE,
+    TrainConfig,
+    averaged_model,
+    parameter_groups,
+    predicts,
+    progress,
+    rate_at,
+    train,
+)
 from reli3d.train.losses import (
     ASTRAY,
     PIXEL_TERMS,
@@ -147,6 +156,17 @@ def test_every_parameter_gets_a_gradient(samples):
                 p -= 1e-3 * p.grad
     for name, p in model.named_parameters():
         assert bool(torch.isfinite(p.grad).all()) and float(p.grad.abs().max()) > 0, name
+
+
+def test_every_parameter_is_in_one_group_and_last_layers_learn_faster():
+    model, config = LocalReconstructor(SMALL), TrainConfig("", "")
+    groups = parameter_groups(model.named_parameters(), config)
+    times = {id(p): (group["times"], group["weight_decay"]) for group in groups for p in group["params"]}
+    assert len(times) == sum(len(group["params"]) for group in groups) == len(list(model.parameters()))
+    last = (model.pyramid.pixels[-1], model.light.out, model.color[-1], model.surface[-1])
+    fast = {id(p) for layer in last for p in layer.parameters()}
+    for p in model.parameters():
+        assert times[id(p)] == (LAST_RATE if id(p) in fast else 1.0, config.weight_decay if p.ndim > 1 else 0.0)
 
 
 def test_training_learns_logs_and_resumes(folder, tmp_path):
