@@ -2,6 +2,7 @@
 
 import json
 import os
+import random
 import signal
 import subprocess
 import sys
@@ -162,6 +163,36 @@ def test_killed_at_any_moment_a_run_goes_on_as_if_never_stopped(folder, tmp_path
                 break
             time.sleep(0.01)
     subprocess.run([*call, state.parent, "6"], env=env, check=True, capture_output=True, timeout=300)
+    a, b = (torch.load(tmp_path / n / "state.pt", weights_only=True) for n in ("whole", "killed"))
+    assert all(torch.equal(v, b["model"][k]) for k, v in a["model"].items())
+    losses = [[r for r in rows(tmp_path / n) if "config" not in r] for n in ("whole", "killed")]
+    assert losses[0] == losses[1]
+
+
+@pytest.mark.slow
+def test_killed_twenty_times_a_run_has_the_curve_of_one_that_never_was(folder, tmp_path):
+    (tmp_path / "worker.py").write_text(WORKER)
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
+    call = [sys.executable, tmp_path / "worker.py", folder]
+    subprocess.run([*call, tmp_path / "whole", "100"], env=env, check=True, capture_output=True, timeout=300)
+    out, rng = tmp_path / "killed", random.Random(0)
+    for _ in range(20):
+        log = out / "log.jsonl"
+        until = rng.randrange(5) + (
+            log.read_bytes().count(b"\n") if log.exists() else 0
+        )  # a call's first row is no step
+        with subprocess.Popen([*call, out, "100"], env=env, stderr=subprocess.DEVNULL) as process:
+            end = time.monotonic() + 120
+            while process.poll() is None and time.monotonic() < end:
+                if log.exists() and log.read_bytes().count(b"\n") >= until:
+                    break
+                time.sleep(0.005)
+            time.sleep(rng.uniform(0.0, 0.5))  # also while a checkpoint is written
+            assert process.poll() is None
+            process.send_signal(signal.SIGKILL)
+        if (out / "state.pt").exists():
+            load_state(out / "state.pt", ball_model())  # whole
+    subprocess.run([*call, out, "100"], env=env, check=True, capture_output=True, timeout=300)
     a, b = (torch.load(tmp_path / n / "state.pt", weights_only=True) for n in ("whole", "killed"))
     assert all(torch.equal(v, b["model"][k]) for k, v in a["model"].items())
     losses = [[r for r in rows(tmp_path / n) if "config" not in r] for n in ("whole", "killed")]
