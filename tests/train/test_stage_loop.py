@@ -178,9 +178,7 @@ def test_killed_twenty_times_a_run_has_the_curve_of_one_that_never_was(folder, t
     out, rng = tmp_path / "killed", random.Random(0)
     for _ in range(20):
         log = out / "log.jsonl"
-        until = rng.randrange(5) + (
-            log.read_bytes().count(b"\n") if log.exists() else 0
-        )  # a call's first row is no step
+        until = rng.randrange(5) + (log.read_bytes().count(b"\n") if log.exists() else 0)
         with subprocess.Popen([*call, out, "100"], env=env, stderr=subprocess.DEVNULL) as process:
             end = time.monotonic() + 120
             while process.poll() is None and time.monotonic() < end:
