@@ -42,7 +42,7 @@ from reli3d.train.stages.step import encode
 from reli3d.train.stages.surface import render_surface, surface
 from reli3d.train.stages.views import Draw, ObjectViews, Samples
 
-LAST = replace(config.TINY["monte_carlo"], targets=1, rate=5e-4)  # three fifths of the time of four views
+LAST = replace(config.TINY["monte_carlo"], targets=1, rate=5e-4)  # two thirds of the time of four views
 ARMS = {
     "Monte Carlo": LAST,
     "light's samples": replace(LAST, samples=(sum(LAST.samples), 0, 0)),  # as many, with shadows

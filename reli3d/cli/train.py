@@ -13,6 +13,7 @@ from reli3d.cli.help_format import Defaults
 
 if TYPE_CHECKING:
     from reli3d.nn.local import LocalReconstructor
+    from reli3d.train.loop import TrainConfig
 
 LICENCE = "Apache-2.0; trained by the reli3d authors, see docs/weights.md for the data"
 CALIBRATED = 5  # views of a sample: four are input, one is looked at
@@ -78,19 +79,25 @@ def _check(args: argparse.Namespace) -> None:
         check_samples(args.validation, "validation", views=CALIBRATED)
 
 
-def _check_state(path: Path, model) -> None:
-    """Raise InputError where ``path`` is not a whole checkpoint of ``model``."""
+def _check_state(path: Path, model, config: TrainConfig | None = None) -> None:
+    """Raise InputError where ``path`` is not a whole checkpoint of ``model``, or where ``config`` cannot go on from
+    it.
+    """
     import torch
 
     from reli3d.io.files import InputError, file_size, shown
     from reli3d.nn.weights import check_keys
+    from reli3d.train.loop import parameter_groups
+
+    def sizes(groups: list[dict]) -> list[tuple]:
+        return [(len(group["params"]), group.get("times")) for group in groups]
 
     file_size(path)
     try:
         state = torch.load(path, weights_only=True, mmap=True)
         shapes = [{k: tuple(v.shape) for k, v in state[name].items()} for name in ("model", "average")]
-        groups, step, seconds = state["optimizer"]["param_groups"], state["step"], state["seconds"]
-        whole = all("times" in group for group in groups) and isinstance(step, int) and step >= 0 and seconds >= 0
+        found_sizes, step, seconds = sizes(state["optimizer"]["param_groups"]), state["step"], state["seconds"]
+        whole = isinstance(step, int) and step >= 0 and seconds >= 0
     except Exception as error:  # of a broken file torch, pickle and zipfile raise almost anything
         reason = shown(" ".join(str(error).split()))
         raise InputError(
@@ -100,6 +107,12 @@ def _check_state(path: Path, model) -> None:
         check_keys(path, found, {k: tuple(v.shape) for k, v in model.state_dict().items()})
     if not whole:
         raise InputError(path, "expected a checkpoint of this training, got another one; remove it to start again")
+    if config and found_sizes != sizes(parameter_groups(model, config)):
+        raise InputError(
+            path,
+            "expected a checkpoint of the same training, got one of other parameters or an earlier version; "
+            "name another output folder, and this file by --weights",
+        )
 
 
 def _begun(start: Path | None) -> LocalReconstructor:
@@ -135,8 +148,23 @@ def main(argv: list[str] | None = None) -> int:
     torch.manual_seed(args.seed)
     model = _begun(args.weights)
     state = args.output / "state.pt"
+    config = TrainConfig(
+        samples=str(args.samples),
+        output=str(args.output),
+        steps=args.steps,
+        minutes=args.minutes,
+        batch=args.batch,
+        points=args.points,
+        max_views=args.max_views,
+        rate=args.rate,
+        seed=args.seed,
+        pixels=args.pixels,
+        bfloat16=args.bfloat16,
+        maps=str(args.maps or ""),
+        validation=str(args.validation or ""),
+    )
     if args.export or state.exists():
-        _check_state(state, model)
+        _check_state(state, model, None if args.export else config)
     if args.export:
         averaged_model(state, model)
         for views, tried in calibrate(model, args.validation or args.samples, progress=tell).items():
@@ -146,25 +174,7 @@ def main(argv: list[str] | None = None) -> int:
         print(weights.save(args.export, model, licence=LICENCE).path)
         return 0
     workers = Workers.join()
-    train(
-        model,
-        TrainConfig(
-            samples=str(args.samples),
-            output=str(args.output),
-            steps=args.steps,
-            minutes=args.minutes,
-            batch=args.batch,
-            points=args.points,
-            max_views=args.max_views,
-            rate=args.rate,
-            seed=args.seed,
-            pixels=args.pixels,
-            bfloat16=args.bfloat16,
-            maps=str(args.maps or ""),
-            validation=str(args.validation or ""),
-        ),
-        workers,
-    )
+    train(model, config, workers)
     workers.leave()
     return 0
 

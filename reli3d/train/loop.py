@@ -7,7 +7,6 @@ import math
 import os
 import sys
 import time
-from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from functools import reduce
 from pathlib import Path
@@ -46,7 +45,7 @@ class TrainConfig:
 
 
 LAST_LAYERS = ("pyramid.pixels.1.", "color.4.", "surface.4.", "light.out.")
-LAST_RATE = 10.0  # times the rate for these: they begin at zero, and Adam moves a number by hardly more than the rate
+LAST_RATE = 10.0  # times the rate for these: they begin near zero, and Adam moves a number by hardly more than the rate
 PICTURED = 3  # validation objects in the picture, from one and from four views
 
 
@@ -60,12 +59,15 @@ def predicts(name: str) -> bool:
     return name.startswith("pyramid.") and not name.startswith("pyramid.features.")
 
 
-def parameter_groups(parameters: Iterable[tuple[str, nn.Parameter]], config: TrainConfig) -> list[dict]:
-    """Groups of an optimizer: with and without weight decay, and the last layers, whose ``times`` is LAST_RATE."""
+def parameter_groups(model: LocalReconstructor, config: TrainConfig) -> list[dict]:
+    """What ``config`` trains, in groups of an optimizer: with and without weight decay, and the last layers, whose
+    ``times`` is LAST_RATE.
+    """
     groups: dict[tuple[float, float], list[nn.Parameter]] = {}
-    for name, parameter in parameters:
-        decay = config.weight_decay if parameter.ndim > 1 else 0.0
-        groups.setdefault((decay, LAST_RATE if name.startswith(LAST_LAYERS) else 1.0), []).append(parameter)
+    for name, parameter in model.named_parameters():
+        if parameter.requires_grad and (not config.pixels or predicts(name)):
+            decay = config.weight_decay if parameter.ndim > 1 else 0.0
+            groups.setdefault((decay, LAST_RATE if name.startswith(LAST_LAYERS) else 1.0), []).append(parameter)
     return [{"params": group, "weight_decay": decay, "times": times} for (decay, times), group in groups.items()]
 
 
@@ -87,9 +89,9 @@ def train(model: LocalReconstructor, config: TrainConfig, workers: Workers | Non
     folder.mkdir(parents=True, exist_ok=True)
     model.pyramid.in_bfloat16 = model.volume.in_bfloat16 = config.bfloat16
     ask, names = (pixel_losses, PIXEL_TERMS) if config.pixels else (losses, tuple(WEIGHTS))
-    named = [(k, p) for k, p in model.named_parameters() if p.requires_grad and (not config.pixels or predicts(k))]
-    trained = [p for _, p in named]
-    optimizer = torch.optim.AdamW(parameter_groups(named, config), lr=config.rate, betas=(0.9, 0.98), fused=True)
+    parts = parameter_groups(model, config)
+    trained = [p for part in parts for p in part["params"]]
+    optimizer = torch.optim.AdamW(parts, lr=config.rate, betas=(0.9, 0.98), fused=True)
     average = {k: v.detach().clone() for k, v in model.state_dict().items()}
     step, seconds = 0, 0.0
     if (folder / "state.pt").exists():

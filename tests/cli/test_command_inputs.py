@@ -54,7 +54,7 @@ def place(tmp_path, monkeypatch):
                 "average": {},
                 "step": 0,
                 "seconds": 0.0,
-                "optimizer": {"param_groups": [{"times": 1.0}]},
+                "optimizer": {"param_groups": [{"params": [0], "times": 1.0}]},
             },
         ),
     ):

@@ -174,12 +174,12 @@ def test_killed_twenty_times_a_run_has_the_curve_of_one_that_never_was(folder, t
     (tmp_path / "worker.py").write_text(WORKER)
     env = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
     call = [sys.executable, tmp_path / "worker.py", folder]
-    subprocess.run([*call, tmp_path / "whole", "100"], env=env, check=True, capture_output=True, timeout=300)
+    subprocess.run([*call, tmp_path / "whole", "300"], env=env, check=True, capture_output=True, timeout=300)
     out, rng = tmp_path / "killed", random.Random(0)
     for _ in range(20):
         log = out / "log.jsonl"
         until = rng.randrange(5) + (log.read_bytes().count(b"\n") if log.exists() else 0)
-        with subprocess.Popen([*call, out, "100"], env=env, stderr=subprocess.DEVNULL) as process:
+        with subprocess.Popen([*call, out, "300"], env=env, stderr=subprocess.DEVNULL) as process:
             end = time.monotonic() + 120
             while process.poll() is None and time.monotonic() < end:
                 if log.exists() and log.read_bytes().count(b"\n") >= until:
@@ -190,7 +190,7 @@ def test_killed_twenty_times_a_run_has_the_curve_of_one_that_never_was(folder, t
             process.send_signal(signal.SIGKILL)
         if (out / "state.pt").exists():
             load_state(out / "state.pt", ball_model())  # whole
-    subprocess.run([*call, out, "100"], env=env, check=True, capture_output=True, timeout=300)
+    subprocess.run([*call, out, "300"], env=env, check=True, capture_output=True, timeout=300)
     a, b = (torch.load(tmp_path / n / "state.pt", weights_only=True) for n in ("whole", "killed"))
     assert all(torch.equal(v, b["model"][k]) for k, v in a["model"].items())
     losses = [[r for r in rows(tmp_path / n) if "config" not in r] for n in ("whole", "killed")]

@@ -160,7 +160,7 @@ def test_every_parameter_gets_a_gradient(samples):
 
 def test_every_parameter_is_in_one_group_and_last_layers_learn_faster():
     model, config = LocalReconstructor(SMALL), TrainConfig("", "")
-    groups = parameter_groups(model.named_parameters(), config)
+    groups = parameter_groups(model, config)
     times = {id(p): (group["times"], group["weight_decay"]) for group in groups for p in group["params"]}
     assert len(times) == sum(len(group["params"]) for group in groups) == len(list(model.parameters()))
     last = (model.pyramid.pixels[-1], model.light.out, model.color[-1], model.surface[-1])
@@ -237,6 +237,13 @@ def test_training_of_pixels_teaches_the_2d_u_net_alone(folder, tmp_path):
     first = torch.load(tmp_path / "state.pt", weights_only=True)["average"]
     then = step_from(folder, tmp_path / "next", str(tmp_path / "state.pt"))
     assert all(float((then[k] - v).abs().max()) < 1e-6 for k, v in first.items())
+
+
+def test_a_checkpoint_of_other_parameters_does_not_go_on_and_gives_its_weights(folder, tmp_path, capsys):
+    train(LocalReconstructor(SMALL), TrainConfig(str(folder), str(tmp_path), steps=1, batch=1, points=64, pixels=True))
+    assert main([str(folder), str(tmp_path), "--steps", "2", "--batch", "1"]) == 2
+    assert "name another output folder, and this file by --weights" in capsys.readouterr().err
+    step_from(folder, tmp_path / "next", str(tmp_path / "state.pt"))
 
 
 def step_from(folder, out, weights):
