@@ -2,11 +2,11 @@
 
 usage: python -m bench.studies.stages RUNS --train SAMPLES --held-back SAMPLES --prior FILE --out FOLDER
 
-RUNS holds ``seed0/volume`` and so on, as ``reli3d-stages`` wrote them; a stage of another seed that lacks the one before
-started from that of ``seed0``.  The loss of a stage is asked twice on the same views: with the averaged parameters that
-it starts from and with those at its end.  ``shown`` is its part that compares pictures; where there is no surface the
-picture is black.  Intervals (95 %) are of the mean over objects, by bootstrap.  Writes ``stages.md``, ``stages.png``
-and ``stages.jpg``.
+RUNS holds ``seed0/volume`` and so on, as ``reli3d-stages`` wrote them; a stage of another seed that lacks the one
+before started from that of ``seed0``.  The loss of a stage is asked twice on the same views: with the averaged
+parameters that it starts from and with those at its end.  ``shown`` is its part that compares pictures; where there is
+no surface the picture is black.  Intervals (95 %) are of the mean over objects, by bootstrap.  Writes ``stages.md``,
+``stages.png`` and ``stages.jpg``.
 """
 
 from __future__ import annotations
