@@ -83,7 +83,7 @@ class WithoutPixels(LocalReconstructor):
         features, pixels, camera = super().read_pixels(*views)
         shape = (*pixels.depth.shape[:3], 12)
         span = pixels.depth.detach().expand(*shape[:3], 2)  # of neutral predictions only the depth is read from it
-        return features, PixelMaps.of(pixels.depth.new_zeros(shape), span, camera), camera
+        return features, PixelMaps.of(pixels.depth.new_zeros(shape), span, camera, span.new_zeros(())), camera
 
 
 @dataclasses.dataclass(frozen=True)

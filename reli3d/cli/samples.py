@@ -26,6 +26,7 @@ class Wanted:
     size: int
     meshes: tuple[Path, ...]
     shapes: tuple[Path, ...]
+    views_only: bool = False  # without points, for the 2D U-Net alone
 
 
 class SampleJob:
@@ -89,7 +90,8 @@ class SampleJob:
         light = self.lights[int(rng.integers(len(self.lights)))]
         if not self.wanted.held and rng.random() < LAMPS:
             light = with_lamps(light, rng)
-        return synthesize(surface, light, rng, size=self.wanted.size, views=self.wanted.views)
+        wanted = self.wanted
+        return synthesize(surface, light, rng, size=wanted.size, views=wanted.views, views_only=wanted.views_only)
 
     def _paper(self, seed: int, light: int) -> dict[str, Tensor]:
         import numpy as np

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from reli3d.train.loop import TrainConfig
 
 LICENCE = "Apache-2.0; trained by the reli3d authors, see docs/weights.md for the data"
+SIDES = 64, 128, 256  # of the pictures for the 2D U-Net alone
 CALIBRATED = 5  # views of a sample: four are input, one is looked at
 
 
@@ -34,12 +35,23 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--points", type=int, default=2048, help="volume points an object")
     p.add_argument("--max-views", type=int, default=6)
     p.add_argument("--rate", type=float, default=1.5e-3, help="peak learning rate")
+    p.add_argument(
+        "--pyramid-rate",
+        type=float,
+        default=1.0,
+        metavar="TIMES",
+        help="of the 2D U-Net, in units of --rate: 0.1 keeps what --pixels taught it",
+    )
     p.add_argument("--seed", type=int, default=0)
     p.add_argument(
         "--pixels",
-        action="store_true",
-        help="train the 2D U-Net alone, on what the pixels of all views "
-        "show: three times as many photographs an hour; then go on without",
+        type=int,
+        choices=SIDES,
+        default=0,
+        metavar="SIDE",
+        help="train the 2D U-Net alone, on what the pixels of all views show, in pictures of 64, 128 or 256 "
+        "pixels: first the coarse levels on small pictures, many of them in an hour, then finer ones; then go on "
+        "without",
     )
     p.add_argument("--bfloat16", action="store_true", help="of the convolutions: faster where the processor has it")
     p.add_argument(
@@ -69,12 +81,15 @@ def _check(args: argparse.Namespace) -> None:
     from reli3d.synthetic.stored import check_samples
 
     check_ranges(args, steps=(1, 10**9), minutes=(1e-3, math.inf), batch=(1, 4096), points=(2, 16384))
-    check_ranges(args, max_views=(1, 16), rate=(1e-9, 10.0), seed=(0, 10**9))
+    check_ranges(args, max_views=(1, 16), rate=(1e-9, 10.0), pyramid_rate=(1e-6, 10.0))
+    check_ranges(args, seed=(0, 10**9))
     check_folder(args.output)
+    if args.pixels and (args.maps or args.export):
+        raise ValueError(f"--pixels: expected neither --maps nor --export with it, got {args.maps or args.export}")
     if args.export:
         check_folder(args.export.parent)
     if not args.export or not args.validation:
-        check_samples(args.samples, "samples", views=CALIBRATED if args.export else 1)
+        check_samples(args.samples, "samples", views=CALIBRATED if args.export else 1, points=not args.pixels)
     if args.validation:
         check_samples(args.validation, "validation", views=CALIBRATED)
 
@@ -103,8 +118,11 @@ def _check_state(path: Path, model, config: TrainConfig | None = None) -> None:
         raise InputError(
             path, f"expected a checkpoint of this training, got a broken file ({reason}); remove it to start again"
         ) from None
+    wanted = {k: tuple(v.shape) for k, v in model.state_dict().items()}
     for found in shapes:
-        check_keys(path, found, {k: tuple(v.shape) for k, v in model.state_dict().items()})
+        if config is None and "pyramid.reads.0.0.weight" not in found:  # from small pictures: finer levels begin anew
+            found = {**{k: shape for k, shape in wanted.items() if k.startswith("pyramid.")}, **found}
+        check_keys(path, found, wanted)
     if not whole:
         raise InputError(path, "expected a checkpoint of this training, got another one; remove it to start again")
     if config and found_sizes != sizes(parameter_groups(model, config)):
@@ -115,8 +133,18 @@ def _check_state(path: Path, model, config: TrainConfig | None = None) -> None:
         )
 
 
-def _begun(start: Path | None) -> LocalReconstructor:
-    """The network with the weights of ``start``, or with random ones.  Raises ValueError for another network's."""
+def _begun(start: Path | None, pixels: int) -> LocalReconstructor:
+    """The network with the weights of ``start``, or with random ones; the one for pictures of ``pixels`` a side.
+    Raises ValueError for another network's.
+    """
+    from reli3d.train.pixels import for_small_pictures
+
+    model = _whole(start)
+    finest = SIDES[::-1].index(pixels) if pixels else 0
+    return for_small_pictures(model, finest).train() if finest else model
+
+
+def _whole(start: Path | None) -> LocalReconstructor:
     from reli3d.nn import weights
     from reli3d.nn.local import LocalReconstructor
     from reli3d.nn.presets import SMALL
@@ -146,7 +174,7 @@ def main(argv: list[str] | None = None) -> int:
     from reli3d.train.workers import Workers
 
     torch.manual_seed(args.seed)
-    model = _begun(args.weights)
+    model = _begun(args.weights, args.pixels)
     state = args.output / "state.pt"
     config = TrainConfig(
         samples=str(args.samples),
@@ -157,6 +185,7 @@ def main(argv: list[str] | None = None) -> int:
         points=args.points,
         max_views=args.max_views,
         rate=args.rate,
+        pyramid_rate=args.pyramid_rate,
         seed=args.seed,
         pixels=args.pixels,
         bfloat16=args.bfloat16,

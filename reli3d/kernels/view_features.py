@@ -221,8 +221,8 @@ def fuse_views_kernel(
     start: int,
     # in
     viewed: Viewed,  # points of surfaces
-    paint: wp.array3d[wp.vec4],  # (V, P, P) gain and shift of the colour's logit
-    rough_metal: wp.array3d[wp.vec4],  # (V, P, P) confidence, roughness, metallic; 0
+    paint: wp.array3d[wp.vec4],  # (V, P, P) gain of the mean logit of the colour, shift of its logits
+    rough_metal: wp.array3d[wp.vec4],  # (V, P, P) confidence, roughness, metallic, gain of the logits less their mean
     bent: wp.array3d[wp.vec4],  # (V, P, P) normal; 0
     # out
     logit: wp.array[wp.vec3],  # (N,)
@@ -253,8 +253,10 @@ def fuse_views_kernel(
         change = mix_four(paint, v, int(at[0]), int(at[1]), four)
         of_view = mix_four(rough_metal, v, int(at[0]), int(at[1]), four)
         weight = share * share * wp.exp(of_view[0])
-        color = color_logit(wp.vec4(seen[0], seen[1], seen[2], 0.0)) * change[0]
-        color += wp.vec3(change[1], change[2], change[3])
+        color = color_logit(wp.vec4(seen[0], seen[1], seen[2], 0.0))
+        level = (color[0] + color[1] + color[2]) / 3.0
+        grey = wp.vec3(level, level, level)
+        color = (color - grey) * of_view[3] + grey * change[0] + wp.vec3(change[1], change[2], change[3])
         total += weight
         away = color - mean
         mean += away * (weight / total)  # Welford's update, as in pool_views_kernel

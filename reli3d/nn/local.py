@@ -43,20 +43,24 @@ SHARPNESS = 2.0  # power of a view's share: the view that looks straightest spea
 class PixelMaps:
     """What the pyramid predicts of every pixel, at half the views' resolution."""
 
-    gain: Tensor  # (V, P, P, 1) of the logit of the colour seen: 0 where a highlight hides the paint
-    shift: Tensor  # (V, P, P, 3) of that logit
+    gain: Tensor  # (V, P, P, 1) of the mean logit of the colour seen: 0 where a highlight hides the paint
+    shift: Tensor  # (V, P, P, 3) of the colour's logit
     confidence: Tensor  # (V, P, P, 1) logarithm of a weight among the views
     roughness: Tensor  # (V, P, P, 1) logit
     metallic: Tensor  # (V, P, P, 1) logit
+    chroma: Tensor  # (V, P, P, 1) gain of what the logits of the three channels differ from their mean
     normal: Tensor  # (V, P, P, 3) world, unit
     depth: Tensor  # (V, P, P, 1) along the camera's axis, from the world's origin
 
     @staticmethod
-    def of(raw: Tensor, span: Tensor, camera: Camera) -> PixelMaps:
-        """From the pyramid's 12 numbers ``(V, P, P, 12)``, whose pixels are those of ``camera``, and the hull's ``span
-        (V, Q, Q, 2)``.
+    def of(raw: Tensor, span: Tensor, camera: Camera, level: Tensor) -> PixelMaps:
+        """From the pyramid's 12 numbers ``(V, P, P, 12)``, whose pixels are those of ``camera``, the hull's ``span
+        (V, Q, Q, 2)`` and the object's :func:`mean_logit`, which broadcasts over the pixels.
+
+        The gain is that of the difference to ``level``: how bright an object is in a photograph says nothing of its
+        paint, for the exposure follows it, but the colour and the pattern that are seen do.
         """
-        gain, shift, confidence, rough, metal, normal, depth, _ = raw.split([1, 3, 1, 1, 1, 3, 1, 1], -1)
+        gain, shift, confidence, rough, metal, normal, depth, chroma = raw.split([1, 3, 1, 1, 1, 3, 1, 1], -1)
         x, y = image_plane(camera)
         toward = -functional.normalize(torch.stack([x, y, -torch.ones_like(x)], -1), dim=-1)  # to the camera
         normal = functional.normalize(0.3 * toward + normal, dim=-1)
@@ -64,21 +68,35 @@ class PixelMaps:
         size = camera.height, camera.width
         span = functional.interpolate(span.permute(0, 3, 1, 2), size=size, mode="nearest").permute(0, 2, 3, 1)
         depth = torch.lerp(span[..., :1], span[..., 1:], (depth - 1.0).sigmoid())  # the surface lies within
-        return PixelMaps((gain + 2.0).sigmoid(), shift, confidence, rough, metal - 2.0, world, depth)
+        gain, chroma = (gain + 2.0).sigmoid(), 2.0 * chroma.sigmoid()
+        return PixelMaps(gain, shift - gain * level, confidence, rough, metal - 2.0, chroma, world, depth)
 
     def stacked(self) -> Tensor:
-        """``(V, P, P, 10)``, all but the depth."""
-        return torch.cat([self.gain, self.shift, self.confidence, self.roughness, self.metallic, self.normal], -1)
+        """``(V, P, P, 11)``, all but the depth."""
+        paint = [self.gain, self.shift, self.confidence, self.roughness, self.metallic, self.chroma]
+        return torch.cat([*paint, self.normal], -1)
 
     @cached_property
     def packed(self) -> Tensor:
         """The same as :func:`~reli3d.geometry.projection.fuse_views` reads it, without gradient."""
-        parts = self.stacked().detach().split([4, 3, 3], -1)
+        parts = self.stacked().detach().split([4, 4, 3], -1)
         return torch.stack([functional.pad(part, (0, 4 - part.shape[-1])) for part in parts])
 
     def base_logit(self, color: Tensor) -> Tensor:
         """Logit of the base colour of pixels of ``color (V, P, P, 3)`` sRGB."""
-        return self.gain * color_logit(color) + self.shift
+        return paint_logit(color, self.gain, self.chroma, self.shift)
+
+
+def paint_logit(color: Tensor, gain: Tensor, chroma: Tensor, shift: Tensor) -> Tensor:
+    """Logit ``(..., 3)`` of the base colour where ``color (..., 3)`` sRGB is seen; the rest as in PixelMaps."""
+    logit = color_logit(color)
+    mean = logit.mean(-1, keepdim=True)
+    return gain * mean + chroma * (logit - mean) + shift
+
+
+def mean_logit(color: Tensor, mask: Tensor) -> Tensor:
+    """Mean logit ``()`` of the object's colours ``(V, P, P, 3)`` sRGB, weighted by its coverage ``(V, P, P, 1)``."""
+    return (color_logit(color).mean(-1, keepdim=True) * mask).sum() / mask.sum().clamp(min=1.0)
 
 
 @dataclass(frozen=True)
@@ -163,7 +181,8 @@ class LocalReconstructor(nn.Module):
         span = span_of_pixels(detail[..., 3], outlined, quarter, camera.resized(*quarter.shape[:0:-1]))
         features, raw = self.pyramid(images, masks, place_of_pixels(camera), span)
         coarse = camera.resized(*raw.shape[2:0:-1])
-        return features, PixelMaps.of(raw, span, coarse), coarse
+        level = mean_logit(*shown_pixels(images, masks, coarse))
+        return features, PixelMaps.of(raw, span, coarse, level), coarse
 
     def _light(self, pixels: PixelMaps, color: Tensor, mask: Tensor, camera: Camera) -> Tensor:
         v, y, x = (mask > 0.9).nonzero(as_tuple=True)
@@ -171,7 +190,8 @@ class LocalReconstructor(nn.Module):
         local = torch.stack([right, up, -torch.ones_like(right)], -1)
         wo = -functional.normalize((camera.c2w[v, :3, :3] @ local[..., None])[..., 0], dim=-1)
         seen = color[v, y, x]
-        albedo = srgb_to_linear((pixels.gain[v, y, x] * color_logit(seen) + pixels.shift[v, y, x]).sigmoid())
+        logit = paint_logit(seen, pixels.gain[v, y, x], pixels.chroma[v, y, x], pixels.shift[v, y, x])
+        albedo = srgb_to_linear(logit.sigmoid())
         gloss = 1.0 - pixels.roughness[v, y, x, 0].sigmoid()
         return self.light(srgb_to_linear(seen), albedo, gloss, pixels.normal[v, y, x], wo)
 
@@ -243,9 +263,9 @@ class LocalField(Field):
         pixels = self.pixels.stacked()
         got, _ = gather_views(pixels, position, maps.camera)
         shown, share, summary = summarize_views(maps.images, maps.camera, position, visible, normal)
-        gain, shift, confidence, rough, metal, bent = got.split([1, 3, 1, 1, 1, 3], -1)
+        gain, shift, confidence, rough, metal, chroma, bent = got.split([1, 3, 1, 1, 1, 1, 3], -1)
         weight = (SHARPNESS * share.log() + confidence[..., 0]).softmax(-1)[..., None]
-        each = gain * color_logit(shown[..., :3]) + shift
+        each = paint_logit(shown[..., :3], gain, chroma, shift)
         logit = (each * weight).sum(1)
         spread = ((each - logit[:, None]).square() * weight).sum((1, 2), keepdim=True)[..., 0].clamp(min=1e-6).sqrt()
         bent = functional.normalize((bent * weight).sum(1) + 1e-3 * normal, dim=-1)

@@ -81,6 +81,7 @@ class PyramidSizes:
 
     widths: tuple[int, ...]  # channels at 1/2, 1/4, ... of the image
     features: int  # that leave it
+    reading: int  # the finest levels, which read the picture at their own resolution and predict
 
 
 @dataclass(frozen=True)
@@ -233,7 +234,7 @@ TINY = Preset(
 SMALL = LocalPreset(
     name="small",
     image_size=256,
-    pyramid=PyramidSizes(widths=(16, 48, 96, 160, 256), features=24),
+    pyramid=PyramidSizes(widths=(16, 48, 96, 160, 256), features=24, reading=3),
     volume=VolumeSizes(side=40, radius=0.56, widths=(16, 56, 96, 128), features=24),
     light=LightMapSizes(height=32, widths=(32, 64, 96, 128)),
     view_width=40,

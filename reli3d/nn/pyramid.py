@@ -6,6 +6,8 @@ learns from millions.  Source of the form: Ronneberger et al. 2015, U-Net, arXiv
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -15,7 +17,7 @@ from reli3d.geometry.hull import hull_span
 from reli3d.nn.presets import PyramidSizes
 
 INPUTS = 9  # colour times mask, mask, place in the world, where the ray enters and leaves the hull, 1 / views
-PREDICTED = 12  # see PixelMaps, which reads 11: the last is a weight of trained networks, without a meaning
+PREDICTED = 12  # see PixelMaps
 SEEN = 0.1  # least coverage of a pixel whose ray is intersected with the hull
 REACH = 0.87  # radius of the sphere around the origin that the hull is cut off at: of a cube of side 1
 
@@ -27,7 +29,7 @@ def block(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
     )
 
 
-def _channels_last(x: Tensor) -> Tensor:
+def channels_last(x: Tensor) -> Tensor:
     return x.float().permute(0, 2, 3, 1).contiguous()
 
 
@@ -60,49 +62,93 @@ def span_of_pixels(silhouette: Tensor, outlined: Camera, seen: Tensor, camera: C
     return span.new_zeros(*seen.shape, 2).index_put((v, y, x), span)
 
 
+def pyramid_input(images: Tensor, masks: Tensor, place: Tensor, span: Tensor, counts: Sequence[int]) -> Tensor:
+    """What the first convolution reads, ``(V, INPUTS, S, S)``; see :meth:`ImagePyramid.forward`."""
+    few = torch.cat([masks.new_full((count,), 1.0 / count) for count in counts])
+    few = few[:, None, None, None].expand(*masks.shape, 1)
+    x = torch.cat([images * masks[..., None], masks[..., None], place, few], -1).permute(0, 3, 1, 2)
+    return torch.cat([x, functional.interpolate(span.permute(0, 3, 1, 2), size=x.shape[-2:], mode="nearest")], 1)
+
+
 class ImagePyramid(nn.Module):
     """Features of every view at a quarter of its resolution, predictions at half.
 
-    The coarsest level exchanges one mean vector between the views: they stand under one light.  ``in_bfloat16``:
-    whether convolutions compute in it; parameters and results are float32.
+    Level ``k`` has ``S / 2**(k + 1)`` pixels a side.  The finest levels, ``sizes.reading`` of them, read the picture at
+    their own resolution too, and predict: each adds to what the coarser ones say.  So coarse levels can learn alone
+    from small pictures, and finer ones then begin by adding nothing.  The coarsest level exchanges one mean vector
+    between the views: they stand under one light.  ``in_bfloat16``: whether convolutions compute in it; parameters and
+    results are float32.
     """
 
     in_bfloat16 = False
 
-    def __init__(self, sizes: PyramidSizes):
+    def __init__(self, sizes: PyramidSizes, finest: int = 0):
+        """finest: the level that the pictures enter, which are ``2**finest`` times smaller; the finer ones are left
+        out, and there are no features where it is not 0.
+        """
         super().__init__()
-        widths = sizes.widths
-        self.down = nn.ModuleList()
-        for a, b in zip((INPUTS, *widths[:-1]), widths, strict=True):
-            self.down.append(nn.Sequential(block(a, b, 2), block(b, b)))
+        widths, reading = sizes.widths, range(finest, sizes.reading)
+        if not reading or sizes.reading >= len(widths):
+            raise ValueError(f"finest: expected a level of 0 to {sizes.reading - 1}, got {finest}")
+        pairs = {str(k): (widths[k], widths[k + 1]) for k in range(finest, len(widths) - 1)}
+        self.finest, self.deepest = finest, len(widths) - 1
+        self.reads = nn.ModuleDict({str(k): block(INPUTS, widths[k], 2) for k in reading})
+        self.down = nn.ModuleDict({str(k): block(widths[k - 1], widths[k], 2) for k in range(finest + 1, len(widths))})
+        self.body = nn.ModuleDict({str(k): block(widths[k], widths[k]) for k in range(finest, len(widths))})
         self.shared = nn.Linear(widths[-1], widths[-1])
-        self.across = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in zip(widths[:-1], widths[1:], strict=True))
-        self.up = nn.ModuleList(block(a, a) for a in widths[:-1])
-        self.features = nn.Conv2d(widths[1], sizes.features, 1)
-        self.pixels = nn.Sequential(block(widths[0], widths[0]), nn.Conv2d(widths[0], PREDICTED, 1))
-        for value in self.pixels[1].parameters():
-            nn.init.zeros_(value)
+        self.across = nn.ModuleDict({k: nn.Conv2d(coarse, fine, 1) for k, (fine, coarse) in pairs.items()})
+        self.up = nn.ModuleDict({k: block(fine, fine) for k, (fine, _) in pairs.items()})
+        self.says = nn.ModuleDict(
+            {str(k): nn.Sequential(block(widths[k], widths[k]), nn.Conv2d(widths[k], PREDICTED, 1)) for k in reading}
+        )
+        if finest == 0:
+            self.features = nn.Conv2d(widths[1], sizes.features, 1)
+        for head in self.says.values():
+            for value in head[1].parameters():
+                nn.init.zeros_(value)
+        for k in reading[1:]:  # a finer level begins by adding nothing
+            for value in self.down[str(k)][1].parameters():
+                nn.init.zeros_(value)
 
-    def forward(self, images: Tensor, masks: Tensor, place: Tensor, span: Tensor) -> tuple[Tensor, Tensor]:
-        """Features ``(V, S/4, S/4, F)`` and raw predictions ``(V, S/2, S/2, 12)`` of one object's views.
+    def forward(
+        self, images: Tensor, masks: Tensor, place: Tensor, span: Tensor, counts: Sequence[int] | None = None
+    ) -> tuple[Tensor | None, Tensor]:
+        """Features ``(V, S/4, S/4, F)`` and raw predictions ``(V, S/2, S/2, 12)`` of views.
 
         images: ``(V, S, S, 3)`` sRGB.  masks: ``(V, S, S)``.  place: ``(V, S, S, 2)`` from :func:`place_of_pixels`.
         span: ``(V, S / k, S / k, 2)`` from :func:`span_of_pixels`.  S is a multiple of two to the number of levels.
+        counts: how many views each object has, one after the other; all are of one object without it.
         """
-        few = torch.full_like(masks, 1.0 / len(masks))
-        x = torch.cat([images * masks[..., None], masks[..., None], place, few[..., None]], -1).permute(0, 3, 1, 2)
-        span = functional.interpolate(span.permute(0, 3, 1, 2), size=x.shape[-2:], mode="nearest")
+        counts = [len(masks)] if counts is None else counts
+        x = pyramid_input(images, masks, place, span, counts)
         with torch.autocast(x.device.type, torch.bfloat16, enabled=self.in_bfloat16):
-            features, pixels = self._convolved(torch.cat([x, span], 1))
-        return _channels_last(features), _channels_last(pixels)
+            quarter, pixels = self._convolved(x, counts)
+            features = self.features(quarter) if self.finest == 0 else None
+        return None if features is None else channels_last(features), channels_last(pixels)
 
-    def _convolved(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        levels = []
-        for down in self.down:
-            x = down(x)
-            levels.append(x)
-        x = x + self.shared(x.mean((0, 2, 3)))[:, None, None]
-        for across, up, finer in zip(reversed(self.across), reversed(self.up), reversed(levels[:-1]), strict=True):
-            coarse = functional.interpolate(across(x), size=finer.shape[-2:], mode="bilinear", align_corners=False)
-            quarter, x = x, up(finer + coarse)
-        return self.features(quarter), self.pixels(x)
+    def _convolved(self, x: Tensor, counts: Sequence[int]) -> tuple[Tensor | None, Tensor]:
+        """What leaves level 1 on the way up, and the predictions of the finest level."""
+        levels: dict[str, Tensor] = {}
+        for k in range(self.finest, self.deepest + 1):
+            at = str(k)
+            parts = [self.reads[at](functional.avg_pool2d(x, 1 << k - self.finest))] if at in self.reads else []
+            if k > self.finest:
+                parts.append(self.down[at](levels[str(k - 1)]))
+            levels[at] = self.body[at](sum(parts[1:], parts[0]))
+        y = levels[str(self.deepest)]
+        means = [self.shared(part.mean((0, 2, 3))).expand(len(part), -1) for part in y.split(list(counts))]
+        y = y + torch.cat(means)[:, :, None, None]
+        quarter = pixels = None
+        for k in reversed(range(self.finest, self.deepest)):
+            at = str(k)
+            y = self.up[at](levels[at] + _twice(self.across[at](y), levels[at]))
+            quarter = y if k == 1 else quarter
+            if at in self.says:
+                said = self.says[at](y)
+                pixels = said if pixels is None else said + _twice(pixels, said)
+        return quarter, pixels
+
+
+def _twice(coarse: Tensor, fine: Tensor) -> Tensor:
+    """``coarse`` at the resolution of ``fine``, bilinear."""
+    return functional.interpolate(coarse, size=fine.shape[-2:], mode="bilinear", align_corners=False)

@@ -97,59 +97,65 @@ def _render(surface: Surface, camera: Camera, light: Environment, seed: int):
 
 
 def synthesize(
-    surface: Surface, light: Tensor, rng: np.random.Generator, *, size: int = 192, views: int = 6
+    surface: Surface,
+    light: Tensor,
+    rng: np.random.Generator,
+    *,
+    size: int = 192,
+    views: int = 6,
+    views_only: bool = False,
 ) -> dict[str, Tensor]:
-    """One sample of an object under the lat-long map ``light`` ``(H, 2H, 3)``, turned by a random yaw; see the table
-    above.
+    """One sample of an object under the lat-long map ``light`` ``(H, 2H, 3)``, turned by a random yaw.  views_only: as
+    in :func:`render_sample`.
     """
     environment = Environment(torch.roll(light, int(rng.integers(light.shape[1])), 1).contiguous())
     c2w = torch.as_tensor(np.asarray(sample_cameras(rng, views)[0]), dtype=torch.float32)
     intrinsics = torch.stack([crop_camera(surface.vertices, m, size, rng.uniform(0.04, 0.12)) for m in c2w])
-    return render_sample(surface, environment, Camera(c2w, intrinsics, size, size), rng)
+    return render_sample(surface, environment, Camera(c2w, intrinsics, size, size), rng, views_only=views_only)
 
 
 def render_sample(
-    surface: Surface, environment: Environment, cameras: Camera, rng: np.random.Generator
+    surface: Surface, environment: Environment, cameras: Camera, rng: np.random.Generator, *, views_only: bool = False
 ) -> dict[str, Tensor]:
-    """The sample of an object under ``environment``, seen by ``V`` square ``cameras``."""
+    """The sample of an object under ``environment``, seen by ``V`` square ``cameras``.
+
+    views_only: one ray a pixel, and no points of the volume and the surface: what training of the 2D U-Net alone needs.
+    """
     c2w, views, size = cameras.c2w, len(cameras.c2w), cameras.width
+    fine = 1 if views_only else FINE
     sample: dict[str, Tensor] = {}
     exposure, images, pixels, pixel_radiance = 0.0, [], [], []
     maps: dict[str, list[Tensor]] = {"view_material": [], "view_normal": [], "view_depth": []}
     for k in range(views):
         image, seen, points, wo, radiance = _render(
-            surface, cameras[k].scaled(FINE), environment, int(rng.integers(1 << 30))
+            surface, cameras[k].scaled(fine), environment, int(rng.integers(1 << 30))
         )
         if k == 0:
             exposure = EXPOSED / max(float(radiance.mean(-1).quantile(0.9)), 1e-3) * float(np.exp(rng.normal(0, 0.25)))
-        alpha = _coverage(surface.scene, cameras[k])
-        image = pooled_pixels((image * exposure).clamp(0, 4), size).clamp(0, 1)  # a sensor saturates, late
+        alpha = _coverage(surface.scene, cameras[k], fine + 1)
+        image = pooled_pixels((image * exposure).clamp(0, 4), size, fine).clamp(0, 1)  # a sensor saturates, late
         encoded = torch.cat([linear_to_srgb(image), alpha[..., None]], -1)
         images.append((encoded * 255 + 0.5).to(torch.uint8))
-        for name, value in _view_maps(points, seen, c2w[k], size).items():
+        for name, value in _view_maps(points, seen, c2w[k], size, fine).items():
             maps[name].append(value)
         pick = torch.as_tensor(rng.integers(len(seen), size=PIXELS))
         pixels.append(torch.stack([points.position, points.normal, wo], 1)[pick])
         pixel_radiance.append((radiance[pick] * exposure).clamp(max=64.0))
-    sample.update(
-        images=torch.stack(images),
-        c2w=c2w,
-        intrinsics=cameras.intrinsics,
-        pixels=torch.stack(pixels).half(),
-        pixel_radiance=torch.stack(pixel_radiance).half(),
-    )
+    sample.update(images=torch.stack(images), c2w=c2w, intrinsics=cameras.intrinsics)
     sample.update({name: torch.stack(values) for name, values in maps.items()})
     pooled = torch.nn.functional.interpolate(
         (environment.radiance * exposure).permute(2, 0, 1)[None], (32, 64), mode="area"
     )
     sample["environment"] = pooled[0].permute(1, 2, 0).clamp(max=6e4).half()
-    sample.update(_volume(surface, rng), **_surface_points(surface, cameras, rng))
+    if not views_only:
+        sample.update(pixels=torch.stack(pixels).half(), pixel_radiance=torch.stack(pixel_radiance).half())
+        sample.update(_volume(surface, rng), **_surface_points(surface, cameras, rng))
     return {k: v.contiguous() for k, v in sample.items()}
 
 
-def _view_maps(points: SurfacePoints, seen: Tensor, c2w: Tensor, size: int) -> dict[str, Tensor]:
-    """True maps of one view, see the table above, from the ``points`` that the rays ``seen (N,)`` hit."""
-    rays = (size * FINE) ** 2
+def _view_maps(points: SurfacePoints, seen: Tensor, c2w: Tensor, size: int, fine: int) -> dict[str, Tensor]:
+    """True maps of one view from the ``points`` that the rays ``seen (N,)`` hit."""
+    rays = (size * fine) ** 2
     depth = -((points.position - c2w[:3, 3]) @ c2w[:3, 2])
     values = [
         points.base_color.clamp(0, 1),
@@ -160,8 +166,8 @@ def _view_maps(points: SurfacePoints, seen: Tensor, c2w: Tensor, size: int) -> d
         torch.ones_like(depth)[:, None],
     ]
     dense = torch.zeros(rays, 10).index_copy_(0, seen, torch.cat(values, -1))
-    base, rest, normal, depth, hit = pooled_pixels(dense, size).split([3, 2, 3, 1, 1], -1)
-    share = hit.clamp(min=0.5 / FINE**2)
+    base, rest, normal, depth, hit = pooled_pixels(dense, size, fine).split([3, 2, 3, 1, 1], -1)
+    share = hit.clamp(min=0.5 / fine**2)
     material = torch.cat([linear_to_srgb((base / share).clamp(0, 1)), rest / share], -1)
     normal = torch.nn.functional.normalize(normal, dim=-1)
     whole = hit > 0.5
@@ -172,13 +178,13 @@ def _view_maps(points: SurfacePoints, seen: Tensor, c2w: Tensor, size: int) -> d
     }
 
 
-def pooled_pixels(rays: Tensor, size: int) -> Tensor:
-    """Means ``(S, S, C)`` over the ``FINE**2`` rays of each pixel, of values ``(rays, C)``."""
-    image = rays.reshape(1, size * FINE, size * FINE, -1).permute(0, 3, 1, 2)
-    return torch.nn.functional.avg_pool2d(image, FINE)[0].permute(1, 2, 0)
+def pooled_pixels(rays: Tensor, size: int, fine: int = FINE) -> Tensor:
+    """Means ``(S, S, C)`` over the ``fine**2`` rays of each pixel, of values ``(rays, C)``."""
+    image = rays.reshape(1, size * fine, size * fine, -1).permute(0, 3, 1, 2)
+    return torch.nn.functional.avg_pool2d(image, fine)[0].permute(1, 2, 0)
 
 
-def _coverage(scene: RayScene, camera: Camera, grid: int = 3) -> Tensor:
+def _coverage(scene: RayScene, camera: Camera, grid: int) -> Tensor:
     """Antialiased alpha ``(S, S)``: share of ``grid**2`` sub-pixel rays that hit."""
     origins, directions = camera_rays(camera.scaled(grid))
     hit = scene.occluded(origins, directions).float()

@@ -25,10 +25,14 @@ TENSORS = {
     "view_normal": ("V S S 3", "I8"),
     "view_depth": ("V S S", "F16"),
 }
+OF_POINTS = ("points", "distance", "surface", "material", "visible")  # not in samples of views alone
 
 
-def check_sample(path: str | os.PathLike, *, views: int = 1) -> None:
-    """Raise InputError where ``path`` is no whole sample of at least ``views`` views.  Values are not read."""
+def check_sample(path: str | os.PathLike, *, views: int = 1, points: bool = True) -> None:
+    """Raise InputError where ``path`` is no whole sample of at least ``views`` views.  Values are not read.
+
+    points: whether it must hold those of the volume and the surface.
+    """
     file_size(path)
     try:
         with safe_open(path, "pt") as file:
@@ -40,6 +44,8 @@ def check_sample(path: str | os.PathLike, *, views: int = 1) -> None:
         ) from None
     sizes: dict[str, int] = {}
     for name, (axes, dtype) in TENSORS.items():
+        if name in OF_POINTS and not points:
+            continue
         shape, got = found.get(name, ((), None))
         wanted = axes.split()
         if got != dtype or len(shape) != len(wanted):
@@ -56,11 +62,17 @@ def check_sample(path: str | os.PathLike, *, views: int = 1) -> None:
 
 
 def check_samples(
-    folder: Path, name: str, *, views: int = 1, also: Callable[[Path], None] = lambda path: None
+    folder: Path,
+    name: str,
+    *,
+    views: int = 1,
+    points: bool = True,
+    also: Callable[[Path], None] = lambda path: None,
 ) -> list[Path]:
     """Files of all samples in ``folder``, checked.  Raises InputError where one is broken or there is none.
 
-    name: of the option or argument that gave the folder.  also: what else must hold of each file.
+    name: of the option or argument that gave the folder.  points: as in :func:`check_sample`.  also: what else must
+    hold of each file.
     """
     if not folder.is_dir():
         raise InputError(name, f"expected a folder of samples, got {shown(str(folder))}; make them with reli3d-data")
@@ -69,5 +81,5 @@ def check_samples(
         raise InputError(name, f"expected *.safetensors files, got none in {folder}; make them with reli3d-data")
     for path in files:
         also(path)
-        check_sample(path, views=views)
+        check_sample(path, views=views, points=points)
     return files

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,18 +19,6 @@ from reli3d.train.relight import Finish, draw_light, relit
 TURNED_UP = 0.12  # share of objects whose world is not +Y up: captures come in any frame
 NOISE = 0.012  # greatest standard deviation of a photograph's noise, sRGB
 RELIT = 0.5  # share of the objects whose photographs are made anew under another light
-MOST = 64  # views of a file
-OF_VIEWS = (
-    "images",
-    "masks",
-    "silhouette",
-    "c2w",
-    "intrinsics",
-    "view_material",
-    "view_normal",
-    "view_depth",
-    "view_valid",
-)
 KEPT = 0.75  # share of the augmented objects that stay the right way round in a mirror, and keep their channels
 
 
@@ -68,11 +56,6 @@ class Sample:
     visible: Tensor  # (N, V)
     light_directions: Tensor  # (2048, 3)
     light: Tensor  # (2048, 3) linear radiance
-
-    def of_views(self, chosen: Tensor) -> Sample:
-        """The sample with the views ``chosen (W,)`` int64 alone."""
-        parts = {name: getattr(self, name)[chosen] for name in OF_VIEWS}
-        return replace(self, visible=self.visible[:, chosen], **parts)
 
 
 def load_sample(
@@ -160,16 +143,6 @@ def load_sample(
     )
 
 
-def groups(sample: Sample, most: int, rng: np.random.Generator) -> list[Sample]:
-    """The views of ``sample`` parted into groups of 1 to ``most``."""
-    out, rest = [], torch.arange(len(sample.images))
-    while len(rest):
-        count = int(rng.integers(1, most + 1))
-        out.append(sample.of_views(rest[:count]))
-        rest = rest[count:]
-    return out
-
-
 def batches(
     folder: Path,
     *,
@@ -180,11 +153,10 @@ def batches(
     start: int = 0,
     rank: int = 0,
     lights: Tensor | None = None,
-    every_view: bool = False,
 ) -> Iterator[list[Sample]]:
     """Endless lists of ``size`` objects, each with 1 to ``max_views`` views; step ``k`` is a function of ``seed`` and
     ``k`` alone for a fixed folder, so training resumes; ``rank`` tells processes apart that share a step; ``lights``
-    as in :func:`load_sample`.  every_view: all views of each object, in :func:`groups`.
+    as in :func:`load_sample`.
     """
     files, step = sorted(folder.glob("*.safetensors")), start
     if not files:
@@ -196,7 +168,6 @@ def batches(
         drawn = []
         for _ in range(size):
             file, count = files[int(rng.integers(len(files)))], int(rng.integers(1, max_views + 1))
-            sample = load_sample(file, MOST if every_view else count, points, rng, lights=lights)
-            drawn += groups(sample, max_views, rng) if every_view else [sample]
+            drawn.append(load_sample(file, count, points, rng, lights=lights))
         yield drawn
         step += 1

@@ -7,6 +7,7 @@ import math
 import os
 import sys
 import time
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from functools import reduce
 from pathlib import Path
@@ -19,6 +20,7 @@ from reli3d.synthetic.maps import training_maps
 from reli3d.train.batches import batches
 from reli3d.train.losses import PIXEL_TERMS, WEIGHTS, losses, pixel_losses
 from reli3d.train.pictures import write_curves, write_validation
+from reli3d.train.pixels import groups_of_views, predicts, take_levels
 from reli3d.train.workers import Workers
 
 
@@ -32,19 +34,20 @@ class TrainConfig:
     points: int = 2048  # volume points an object; half as many surface points
     max_views: int = 6  # an object is read from 1 to this many views
     rate: float = 1.5e-3  # peak learning rate; convolutions from scratch take thirty times the paper's 5e-5
+    pyramid_rate: float = 1.0  # times the rate for the 2D U-Net: with few objects a step it forgets at the full rate
     warmup: int = 100  # steps
     weight_decay: float = 0.02
     clip: float = 5.0  # of the gradient norm
     average: float = 0.999  # decay of the averaged weights that are saved for use
     checkpoint_seconds: float = 300.0
     seed: int = 0
-    pixels: bool = False  # the 2D U-Net alone, on what the pixels of all views of an object show
+    pixels: int = 0  # side of the pictures from which the 2D U-Net alone learns; 0 is the whole network
     bfloat16: bool = False  # of the convolutions; parameters and their updates are float32
     maps: str = ""  # file of environment maps, .npz, under which some samples are relit
     validation: str = ""  # folder of held-back samples; the first ones are drawn at every checkpoint
 
 
-LAST_LAYERS = ("pyramid.pixels.1.", "color.4.", "surface.4.", "light.out.")
+LAST_LAYERS = (*(f"pyramid.says.{k}.1." for k in range(3)), "color.4.", "surface.4.", "light.out.")
 LAST_RATE = 10.0  # times the rate for these: they begin near zero, and Adam moves a number by hardly more than the rate
 PICTURED = 3  # validation objects in the picture, from one and from four views
 
@@ -54,20 +57,17 @@ def progress(config: TrainConfig, step: int, seconds: float) -> float:
     return min(1.0, max(step / config.steps, seconds / (60 * config.minutes)))
 
 
-def predicts(name: str) -> bool:
-    """Whether the predictions of pixels need the parameter ``name``."""
-    return name.startswith("pyramid.") and not name.startswith("pyramid.features.")
-
-
 def parameter_groups(model: LocalReconstructor, config: TrainConfig) -> list[dict]:
-    """What ``config`` trains, in groups of an optimizer: with and without weight decay, and the last layers, whose
-    ``times`` is LAST_RATE.
+    """What ``config`` trains, in groups of an optimizer: with and without weight decay, and by ``times`` the rate,
+    which is LAST_RATE for last layers.
     """
     groups: dict[tuple[float, float], list[nn.Parameter]] = {}
     for name, parameter in model.named_parameters():
         if parameter.requires_grad and (not config.pixels or predicts(name)):
             decay = config.weight_decay if parameter.ndim > 1 else 0.0
-            groups.setdefault((decay, LAST_RATE if name.startswith(LAST_LAYERS) else 1.0), []).append(parameter)
+            times = LAST_RATE if name.startswith(LAST_LAYERS) else 1.0
+            times *= config.pyramid_rate if predicts(name) else 1.0
+            groups.setdefault((decay, times), []).append(parameter)
     return [{"params": group, "weight_decay": decay, "times": times} for (decay, times), group in groups.items()]
 
 
@@ -102,17 +102,7 @@ def train(model: LocalReconstructor, config: TrainConfig, workers: Workers | Non
     if workers.rank == 0:
         log = open(folder / "log.jsonl", "a", buffering=1)  # noqa: SIM115 - open for the whole run
         log.write(json.dumps({"step": step, "config": asdict(config), "processes": workers.count}) + "\n")
-    source = batches(
-        Path(config.samples),
-        size=config.batch // workers.count,
-        points=config.points,
-        max_views=config.max_views,
-        seed=config.seed,
-        start=step,
-        rank=workers.rank,
-        lights=training_maps(Path(config.maps)) if config.maps else None,
-        every_view=config.pixels,
-    )
+    source = _source(model, config, workers, step)
     began, saved = time.monotonic() - seconds, time.monotonic()
     sums: dict[str, float] = {}
     while progress(config, step, seconds) < 1.0:
@@ -122,7 +112,7 @@ def train(model: LocalReconstructor, config: TrainConfig, workers: Workers | Non
         optimizer.zero_grad(set_to_none=True)
         values = torch.zeros(len(names) + 1)
         samples = next(source)
-        for sample in samples:  # one after the other: they have different numbers of views
+        for sample in samples:  # whole ones go one after the other: they have different numbers of views
             terms = ask(model, sample)
             (reduce(torch.add, [WEIGHTS[k] * v for k, v in terms.items()]) / len(samples)).backward()
             values[:-1] += torch.stack([terms[k].detach() for k in names]) / len(samples)
@@ -150,6 +140,16 @@ def train(model: LocalReconstructor, config: TrainConfig, workers: Workers | Non
         log.close()
 
 
+def _source(model: LocalReconstructor, config: TrainConfig, workers: Workers, start: int) -> Iterator[list]:
+    """What the steps from ``start`` on learn from, the share of this process."""
+    places = {"size": config.batch // workers.count, "seed": config.seed, "start": start, "rank": workers.rank}
+    if config.pixels:
+        finest = model.pyramid.finest
+        return groups_of_views(Path(config.samples), finest=finest, max_views=config.max_views, **places)
+    lights = training_maps(Path(config.maps)) if config.maps else None
+    return batches(Path(config.samples), points=config.points, max_views=config.max_views, lights=lights, **places)
+
+
 def update_average(average: dict[str, Tensor], model: nn.Module, decay: float) -> None:
     with torch.no_grad():
         for key, value in model.state_dict().items():
@@ -170,12 +170,10 @@ def save(folder: Path, model, optimizer, average, step: int, seconds: float, con
     os.replace(folder / "state.tmp", folder / "state.pt")
     write_curves(folder / "log.jsonl", folder / "curves.png")
     if config.validation:
-        averaged = LocalReconstructor(model.preset)
-        averaged.load_state_dict(average)
+        averaged = take_levels(LocalReconstructor(model.preset), average)
         write_validation(averaged.eval(), sorted(Path(config.validation).glob("*.safetensors"))[:PICTURED], folder)
 
 
 def averaged_model(state: Path, model: LocalReconstructor) -> LocalReconstructor:
-    """``model`` with the averaged weights of a checkpoint, for use."""
-    model.load_state_dict(torch.load(state, weights_only=True)["average"])
-    return model.eval()
+    """``model`` with the averaged weights of a checkpoint, for use; see :func:`~reli3d.train.pixels.take_levels`."""
+    return take_levels(model, torch.load(state, weights_only=True)["average"]).eval()

@@ -6,9 +6,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from reli3d.nn.local import LocalField, LocalReconstructor, PixelMaps, shown_pixels
+from reli3d.nn.local import LocalField, LocalReconstructor, PixelMaps
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.train.batches import Sample
+from reli3d.train.pixels import Group, Pictures, predicted
 
 WEIGHTS = {
     "occupancy": 1.0,
@@ -49,10 +50,10 @@ def _views_of(sample: Sample) -> tuple[Tensor, ...]:
     return sample.images, sample.masks, sample.c2w, sample.intrinsics, detail, sample.intrinsics
 
 
-def pixel_losses(model: LocalReconstructor, sample: Sample) -> dict[str, Tensor]:
+def pixel_losses(model: LocalReconstructor, group: Group) -> dict[str, Tensor]:
     """The terms PIXEL_TERMS alone; gradients reach the predictions of the 2D U-Net."""
-    _, pixels, camera = model.read_pixels(*_views_of(sample))
-    return _pixels(pixels, shown_pixels(sample.images, sample.masks, camera)[0], sample)
+    pixels, color = predicted(model, group)
+    return _pixels(pixels, color, group.views, group.counts)
 
 
 def losses(model: LocalReconstructor, sample: Sample) -> dict[str, Tensor]:
@@ -64,7 +65,7 @@ def losses(model: LocalReconstructor, sample: Sample) -> dict[str, Tensor]:
     return {
         **_shape(field, sample, position, normal),
         **_paint(field, sample, position, normal, bumped),
-        **_pixels(field.pixels, field.color, sample),
+        **_pixels(field.pixels, field.color, sample, (len(sample.images),)),
         **_light(field, sample),
     }
 
@@ -138,22 +139,25 @@ def pattern_loss(color: Tensor, target: Tensor) -> Tensor:
     return torch.log1p(functional.mse_loss(linear_to_srgb((p * factor).clamp(0.0, 1.0)), target) / PLAIN)
 
 
-def _pixels(pixels: PixelMaps, shown: Tensor, sample: Sample) -> dict[str, Tensor]:
+def _pixels(pixels: PixelMaps, shown: Tensor, views: Sample | Pictures, counts: tuple[int, ...]) -> dict[str, Tensor]:
     """The pyramid's predictions against the maps of the views, at pixels that show the surface alone.
 
-    shown: ``(V, P, P, 3)`` sRGB, the colours of these pixels.
+    shown: ``(V, P, P, 3)`` sRGB, the colours of these pixels.  counts: views of each object, side by side.
     """
-    valid = sample.view_valid
-    want = sample.view_material[valid]
+    valid = views.view_valid
+    want = views.view_material[valid]
     color = pixels.base_logit(shown)[valid].sigmoid()
+    of_objects = [int(part.sum()) for part in valid.split(list(counts))]
+    patterns = [pattern_loss(c, w) for c, w in zip(color.split(of_objects), want[:, :3].split(of_objects), strict=True)]
+    share = color.new_tensor(counts) / sum(counts)
     return {
         "pixel_color": excess_entropy(color, want[:, :3]),
-        "pixel_pattern": pattern_loss(color, want[:, :3]),
+        "pixel_pattern": (torch.stack(patterns) * share).sum(),
         "pixel_roughness": excess_entropy(pixels.roughness[valid][:, 0].sigmoid(), want[:, 3]),
         "pixel_metallic": excess_entropy(pixels.metallic[valid][:, 0].sigmoid(), want[:, 4]),
-        "pixel_normal": (1 - (pixels.normal[valid] * sample.view_normal[valid]).sum(-1)).mean(),
+        "pixel_normal": (1 - (pixels.normal[valid] * views.view_normal[valid]).sum(-1)).mean(),
         "pixel_depth": functional.smooth_l1_loss(
-            pixels.depth[valid][:, 0] / DEPTH_UNIT, sample.view_depth[valid] / DEPTH_UNIT, beta=0.2
+            pixels.depth[valid][:, 0] / DEPTH_UNIT, views.view_depth[valid] / DEPTH_UNIT, beta=0.2
         ),
     }
 

@@ -11,7 +11,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from reli3d.geometry.camera import Camera, look_at, project
 from reli3d.geometry.hull import mask_distance
 from reli3d.nn.light_map import LightMap, gathered, texel_of
-from reli3d.nn.local import LocalReconstructor, PixelMaps
+from reli3d.nn.local import LocalReconstructor, PixelMaps, mean_logit
 from reli3d.nn.presets import SMALL, LightMapSizes, PyramidSizes, VolumeSizes
 from reli3d.nn.pyramid import place_of_pixels, span_of_pixels
 from reli3d.nn.reni import map_directions
@@ -21,7 +21,7 @@ from reli3d.nn.volume import FeatureVolume
 TINY = dataclasses.replace(
     SMALL,
     image_size=64,
-    pyramid=PyramidSizes((8, 8, 16), 8),
+    pyramid=PyramidSizes((8, 8, 16), 8, 2),
     volume=VolumeSizes(12, 0.56, (8, 16), 8),
     light=LightMapSizes(16, (8, 16, 16)),
     view_width=24,
@@ -129,8 +129,8 @@ def test_a_turn_of_the_world_turns_the_light(model):
         other = encoded(model, images, masks, turned(c2w, yaw), intrinsics).log_light
         expected = torch.roll(field.log_light, -4, 2)  # from -Z, the centre, towards -X, which lies to the left
         wrong = torch.roll(field.log_light, 4, 2)
-        # pixels beside the border of a texel may fall to its other side
-        assert float((other - expected).abs().mean()) < 0.02 * float((wrong - expected).abs().mean())
+        # pixels beside the border of a texel may fall to its other side: 2 to 4 % with four seeds of the weights
+        assert float((other - expected).abs().mean()) < 0.08 * float((wrong - expected).abs().mean())
 
 
 def test_directions_fall_into_their_own_texels():
@@ -159,10 +159,30 @@ def test_a_mirror_shows_the_light_where_it_reflects_it():
 def test_pixels_start_as_what_they_show(model):
     """Of zeros: the normal looks at the camera, nothing is added to the colour."""
     _, _, c2w, intrinsics = sphere(4)
-    maps = PixelMaps.of(torch.zeros(4, 32, 32, 12), torch.zeros(4, 16, 16, 2), Camera(c2w, intrinsics / 2, 32, 32))
+    camera = Camera(c2w, intrinsics / 2, 32, 32)
+    maps = PixelMaps.of(torch.zeros(4, 32, 32, 12), torch.zeros(4, 16, 16, 2), camera, torch.tensor(0.0))
     centre = maps.normal[:, 15:17, 15:17].mean((1, 2))
     torch.testing.assert_close(normalize(centre, dim=-1), c2w[:, :3, 2], rtol=0, atol=1e-3)  # +Z of a camera looks back
     assert float(maps.shift.abs().max()) == 0.0 and float(maps.gain.min()) == pytest.approx(0.8808, abs=1e-4)
+    assert float(maps.chroma.min()) == float(maps.chroma.max()) == 1.0
+
+
+def test_paint_does_not_follow_the_exposure():
+    """Colours whose logits are all higher by the same number have the same paint; their hue and pattern remain."""
+    _, _, c2w, intrinsics = sphere(4)
+    camera, span = Camera(c2w, intrinsics / 2, 32, 32), torch.zeros(4, 16, 16, 2)
+    raw = torch.randn(4, 32, 32, 12, generator=torch.Generator().manual_seed(0))
+    color = 0.2 + 0.6 * torch.rand(4, 32, 32, 3, generator=torch.Generator().manual_seed(1))
+    mask = (torch.rand(4, 32, 32, 1, generator=torch.Generator().manual_seed(2)) > 0.5).float()
+    brighter = (color.logit() + 1.0).sigmoid()
+    assert float(mean_logit(brighter, mask)) == pytest.approx(float(mean_logit(color, mask)) + 1.0, abs=1e-5)
+    one, two = (PixelMaps.of(raw, span, camera, mean_logit(c, mask)).base_logit(c) for c in (color, brighter))
+    torch.testing.assert_close(one, two, rtol=0, atol=1e-4)  # float32 logits
+    maps = PixelMaps.of(0 * raw, span, camera, mean_logit(color, mask))
+    grey = color.logit().mean(-1, keepdim=True)
+    torch.testing.assert_close(
+        maps.base_logit(color), color.logit() - grey + 0.8808 * (grey - mean_logit(color, mask)), rtol=0, atol=1e-3
+    )  # the gain has four digits here
 
 
 def test_pixels_know_their_place():
@@ -197,7 +217,8 @@ def test_the_view_that_sees_a_point_speaks(model):
     field = encoded(model, images, masks, c2w, intrinsics)
     plain = torch.zeros(2, 32, 32, 12)
     camera = Camera(c2w, intrinsics / 2, 32, 32)
-    field = dataclasses.replace(field, pixels=PixelMaps.of(plain, torch.zeros(2, 16, 16, 2), camera))
+    level = torch.tensor(0.0)
+    field = dataclasses.replace(field, pixels=PixelMaps.of(plain, torch.zeros(2, 16, 16, 2), camera, level))
     position = 0.4 * normalize(c2w[:, :3, 3], dim=-1)  # the nearest point to each camera
     visible = torch.eye(2)
     with torch.no_grad():

@@ -16,28 +16,25 @@ from reli3d.nn.presets import OFFICIAL, SMALL
 from reli3d.nn.reni import map_directions
 from reli3d.nn.weights import load_model
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
-from reli3d.train.batches import OF_VIEWS, batches, groups, load_sample, random_turn
+from reli3d.train.batches import batches, random_turn
 from reli3d.train.light_prior import fit, scale_free
 from reli3d.train.loop import (
     LAST_RATE,
     TrainConfig,
     averaged_model,
     parameter_groups,
-    predicts,
     progress,
     rate_at,
     train,
 )
 from reli3d.train.losses import (
     ASTRAY,
-    PIXEL_TERMS,
     PLAIN,
     WEIGHTS,
     astray,
     excess_entropy,
     losses,
     pattern_loss,
-    pixel_losses,
 )
 
 
@@ -163,10 +160,15 @@ def test_every_parameter_is_in_one_group_and_last_layers_learn_faster():
     groups = parameter_groups(model, config)
     times = {id(p): (group["times"], group["weight_decay"]) for group in groups for p in group["params"]}
     assert len(times) == sum(len(group["params"]) for group in groups) == len(list(model.parameters()))
-    last = (model.pyramid.pixels[-1], model.light.out, model.color[-1], model.surface[-1])
+    last = (*(head[-1] for head in model.pyramid.says.values()), model.light.out, model.color[-1], model.surface[-1])
     fast = {id(p) for layer in last for p in layer.parameters()}
     for p in model.parameters():
         assert times[id(p)] == (LAST_RATE if id(p) in fast else 1.0, config.weight_decay if p.ndim > 1 else 0.0)
+    slow = {id(p) for name, p in model.pyramid.named_parameters() if not name.startswith("features")}
+    groups = parameter_groups(model, dataclasses.replace(config, pyramid_rate=0.1))
+    for group in groups:
+        for p in group["params"]:
+            assert group["times"] == pytest.approx(times[id(p)][0] * (0.1 if id(p) in slow else 1.0))
 
 
 def test_training_learns_logs_and_resumes(folder, tmp_path):
@@ -188,27 +190,6 @@ def test_training_learns_logs_and_resumes(folder, tmp_path):
     assert torch.equal(model.state_dict()["level.0.weight"], state["average"]["level.0.weight"])
 
 
-def test_views_are_parted_into_groups_and_stay_what_they_are(folder):
-    sample = load_sample(sorted(folder.glob("*"))[0], 6, 64, np.random.default_rng(0))
-    sizes = set()
-    for seed in range(5):
-        parts = groups(sample, 3, np.random.default_rng(seed))
-        sizes |= {len(part.images) for part in parts}
-        for name in OF_VIEWS:
-            assert torch.equal(torch.cat([getattr(part, name) for part in parts]), getattr(sample, name)), name
-        assert torch.equal(torch.cat([part.visible for part in parts], 1), sample.visible)
-    assert sizes == {1, 2, 3}
-
-
-def test_the_pixels_alone_are_asked_as_with_all_else(samples):
-    torch.manual_seed(0)
-    model = LocalReconstructor(SMALL)
-    alone, whole = pixel_losses(model, samples[0]), losses(model, samples[0])
-    assert set(alone) == set(PIXEL_TERMS) < set(whole)
-    for name, value in alone.items():
-        assert torch.equal(value, whole[name]), name
-
-
 def test_convolutions_in_bfloat16_change_the_losses_by_their_rounding(samples):
     """Eight bits of mantissa, a relative error of 2^-9 each; sums over layers and pixels keep the losses to 1 %."""
     model = load_model("small", "cpu").requires_grad_(True)
@@ -222,25 +203,15 @@ def test_convolutions_in_bfloat16_change_the_losses_by_their_rounding(samples):
         found.append((terms, torch.cat([p.grad.flatten() for p in model.parameters()])))
     assert all(p.dtype == torch.float32 for p in model.parameters())
     for name, value in found[0][0].items():
-        assert float(found[1][0][name]) == pytest.approx(float(value), rel=0.01), name
+        # light_level is the mean of differences of logarithms, which may lie near zero
+        near = 0.01 if name == "light_level" else 0.0
+        assert float(found[1][0][name]) == pytest.approx(float(value), rel=0.01, abs=near), name
         assert not torch.equal(found[1][0][name], value), name
     assert float(torch.nn.functional.cosine_similarity(found[0][1], found[1][1], 0)) > 0.999
 
 
-def test_training_of_pixels_teaches_the_2d_u_net_alone(folder, tmp_path):
-    torch.manual_seed(0)
-    model = LocalReconstructor(SMALL)
-    before = {k: v.clone() for k, v in model.state_dict().items()}
-    train(model, TrainConfig(str(folder), str(tmp_path), steps=3, batch=1, points=64, warmup=1, seed=3, pixels=True))
-    changed = {k for k, v in model.state_dict().items() if not torch.equal(v, before[k])}
-    assert changed == {k for k in before if predicts(k)} and len(changed) > 20
-    first = torch.load(tmp_path / "state.pt", weights_only=True)["average"]
-    then = step_from(folder, tmp_path / "next", str(tmp_path / "state.pt"))
-    assert all(float((then[k] - v).abs().max()) < 1e-6 for k, v in first.items())
-
-
 def test_a_checkpoint_of_other_parameters_does_not_go_on_and_gives_its_weights(folder, tmp_path, capsys):
-    train(LocalReconstructor(SMALL), TrainConfig(str(folder), str(tmp_path), steps=1, batch=1, points=64, pixels=True))
+    train(LocalReconstructor(SMALL), TrainConfig(str(folder), str(tmp_path), steps=1, batch=1, points=64, pixels=256))
     assert main([str(folder), str(tmp_path), "--steps", "2", "--batch", "1"]) == 2
     assert "name another output folder, and this file by --weights" in capsys.readouterr().err
     step_from(folder, tmp_path / "next", str(tmp_path / "state.pt"))

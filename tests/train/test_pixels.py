@@ -1,0 +1,182 @@
+"""Training of the 2D U-Net alone: pictures of any size, objects side by side, levels that grow."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from torch.nn.functional import avg_pool2d, interpolate
+
+from reli3d.cli.data import main as data
+from reli3d.cli.train import main
+from reli3d.geometry.camera import Camera
+from reli3d.geometry.hull import hull_distance
+from reli3d.nn.local import LocalReconstructor
+from reli3d.nn.presets import SMALL
+from reli3d.nn.pyramid import ImagePyramid
+from reli3d.train.batches import load_sample
+from reli3d.train.loop import TrainConfig, train
+from reli3d.train.losses import PIXEL_TERMS, losses, pixel_losses
+from reli3d.train.pixels import (
+    Group,
+    Pictures,
+    augmented,
+    for_small_pictures,
+    groups_of_views,
+    predicted,
+    predicts,
+    read_pictures,
+)
+
+
+@pytest.fixture(scope="module")
+def files(folder):
+    return sorted(folder.glob("*.safetensors"))
+
+
+def learned(finest: int = 0) -> LocalReconstructor:
+    """A network whose last layers are not zero."""
+    torch.manual_seed(0)
+    model = LocalReconstructor(SMALL)
+    for head in model.pyramid.says.values():
+        torch.nn.init.normal_(head[1].weight, std=0.3)
+    return for_small_pictures(model, finest) if finest else model
+
+
+def test_pictures_of_the_full_size_are_those_of_a_sample(files):
+    got, want = read_pictures(files[0], 1), load_sample(files[0], 6, 64, np.random.default_rng(0), augment=False)
+    for field in dataclasses.fields(Pictures):
+        a, b = getattr(got, field.name), getattr(want, field.name)
+        torch.testing.assert_close(a, b, rtol=0, atol=1e-5, msg=field.name)
+
+
+@pytest.mark.parametrize("factor", [2, 4])
+def test_small_pictures_show_the_same_object(files, factor):
+    """Points of the true surface lie in all silhouettes, and the pixels' truth is the mean of the finer ones."""
+    small, fine = read_pictures(files[0], factor), read_pictures(files[0], 1)
+    size = fine.masks.shape[1] // factor
+    assert small.images.shape[1:] == (size, size, 3) and small.view_normal.shape[1:] == (size // 2, size // 2, 3)
+    sample = load_sample(files[0], 1, 2048, np.random.default_rng(0), augment=False)
+    camera = Camera(small.c2w, small.intrinsics, size, size)
+    pixel = 3.0 / float(small.intrinsics[:, 0].min())  # world size of a pixel at the farthest camera, about 3 away
+    assert float(hull_distance(sample.surface[:, 0].contiguous(), small.silhouette, camera).min()) > -pixel
+    valid = small.view_valid & (avg_pool2d(fine.view_valid.float()[:, None], factor)[:, 0] == 1)
+    assert int(valid.sum()) > 100
+    mean = avg_pool2d(fine.view_depth[:, None], factor)[:, 0]
+    torch.testing.assert_close(small.view_depth[valid], mean[valid], rtol=0, atol=1e-5)
+
+
+def test_mirrored_pictures_are_those_of_the_mirrored_object(files):
+    views = read_pictures(files[0], 2)
+    sample = load_sample(files[0], 1, 2048, np.random.default_rng(0), augment=False)
+    for seed in range(20):
+        got = augmented(views, np.random.default_rng(seed))
+        side = "left" if float((got.c2w[:, :3, 3].sum(0) - views.c2w[:, :3, 3].sum(0)).abs()[0]) > 1e-3 else "right"
+        points = sample.surface[:, 0] * torch.tensor([-1.0 if side == "left" else 1.0, 1.0, 1.0])
+        camera = Camera(got.c2w, got.intrinsics, *got.masks.shape[:0:-1])
+        assert float(torch.linalg.det(got.c2w[:, :3, :3]).min()) == pytest.approx(1.0, abs=1e-4)
+        assert float(hull_distance(points.contiguous(), got.silhouette, camera).min()) > -0.03  # two pixels
+        toward = got.c2w[:, None, None, :3, 3] / got.c2w[:, None, None, :3, 3].norm(dim=-1, keepdim=True)
+        facing = (got.view_normal * toward).sum(-1)[got.view_valid]
+        assert float((facing > -0.3).float().mean()) > 0.99  # what is seen faces the camera; normals are bumped
+        if side == "left":
+            return
+    raise AssertionError("expected a mirrored object among 20")
+
+
+@pytest.mark.parametrize("finest", [0, 1, 2])
+def test_objects_side_by_side_are_read_as_each_alone(files, finest):
+    model = learned(finest)
+    objects = [read_pictures(f, 1 << finest).of_views(slice(0, n)) for f, n in zip(files, (3, 2), strict=True)]
+    with torch.no_grad():
+        both, _ = predicted(model, Group.of(objects))
+        first = 0
+        for one in objects:
+            alone, _ = predicted(model, Group.of([one]))
+            for field in dataclasses.fields(alone):
+                part = getattr(both, field.name)[first : first + len(one.masks)]
+                # float32 convolutions of another batch
+                torch.testing.assert_close(part, getattr(alone, field.name), rtol=0, atol=2e-3, msg=field.name)
+            first += len(one.masks)
+
+
+@pytest.mark.parametrize("finest", [1, 2])
+def test_a_finer_level_begins_by_adding_nothing(finest):
+    torch.manual_seed(0)
+    coarse = ImagePyramid(SMALL.pyramid, finest)
+    for head in coarse.says.values():
+        torch.nn.init.normal_(head[1].weight)
+    fine = ImagePyramid(SMALL.pyramid, finest - 1)
+    fine.load_state_dict(coarse.state_dict(), strict=False)
+    x = torch.rand(2, 9, 64, 64)
+    with torch.no_grad():
+        _, small = coarse._convolved(avg_pool2d(x, 2), [2])
+        _, got = fine._convolved(x, [2])
+    want = interpolate(small, scale_factor=2, mode="bilinear", align_corners=False)
+    torch.testing.assert_close(got, want, rtol=0, atol=1e-4)
+    assert float(want.std()) > 0.1
+
+
+def test_the_pixels_alone_are_asked_as_with_all_else(files):
+    model = learned()
+    sample = load_sample(files[0], 3, 512, np.random.default_rng(0), augment=False)
+    whole = losses(model, sample)
+    alone = pixel_losses(model, Group.of([read_pictures(files[0], 1).of_views(slice(0, 3))]))
+    assert set(alone) == set(PIXEL_TERMS) < set(whole)
+    for name, value in alone.items():
+        torch.testing.assert_close(value, whole[name], rtol=1e-4, atol=1e-6, msg=name)
+
+
+def test_every_view_of_a_drawn_object_is_read_once(folder):
+    (group,) = next(groups_of_views(folder, size=3, finest=2, max_views=4, seed=1))
+    assert sum(group.counts) == len(group.views.masks) == 18 and max(group.counts) <= 4
+    (again,) = next(groups_of_views(folder, size=3, finest=2, max_views=4, seed=1))
+    assert again.counts == group.counts and torch.equal(again.views.images, group.views.images)
+    (other,) = next(groups_of_views(folder, size=3, finest=2, max_views=4, seed=1, rank=1))
+    assert not torch.equal(other.views.c2w, group.views.c2w)
+
+
+def test_levels_are_taught_one_after_the_other(folder, tmp_path):
+    """From pictures of 64 pixels to the whole network by the command; each stage keeps what the one before knew."""
+    start = ["--steps", "2", "--batch", "2", "--rate", "1e-9", "--points", "64"]
+    assert main([str(folder), str(tmp_path / "64"), "--pixels", "64", *start]) == 0
+    from_64, from_128 = (["--weights", str(tmp_path / name / "state.pt")] for name in ("64", "128"))
+    assert main([str(folder), str(tmp_path / "128"), "--pixels", "128", *from_64, *start]) == 0
+    assert main([str(folder), str(tmp_path / "all"), *from_128, *start]) == 0
+    small, middle, whole = (
+        torch.load(tmp_path / name / "state.pt", weights_only=True)["average"] for name in ("64", "128", "all")
+    )
+    assert "pyramid.reads.1.0.weight" not in small and "pyramid.reads.0.0.weight" not in middle
+    assert set(small) - set(middle) == set() and set(middle) < set(whole)
+    for fewer, more in ((small, middle), (middle, whole)):
+        assert all(float((more[k] - v).abs().max()) < 1e-6 for k, v in fewer.items())
+
+
+def test_training_of_pixels_teaches_the_2d_u_net_alone(folder, tmp_path):
+    for side, finest in ((256, 0), (64, 2)):
+        model = learned(finest)
+        before = {k: v.clone() for k, v in model.state_dict().items()}
+        train(model, TrainConfig(str(folder), str(tmp_path / str(side)), steps=3, batch=1, warmup=1, pixels=side))
+        changed = {k for k, v in model.state_dict().items() if not torch.equal(v, before[k])}
+        assert changed == {k for k in before if predicts(k)} and len(changed) > 20
+
+
+def test_samples_of_views_alone_teach_the_2d_u_net_and_nothing_else(tmp_path, capsys):
+    light = np.random.default_rng(0).random((6, 8, 16, 3), dtype=np.float32)
+    np.savez(tmp_path / "maps.npz", env=light, names=np.array([f"map{k}" for k in range(6)]))
+    wanted = ["--maps", str(tmp_path / "maps.npz"), "--count", "2", "--views", "3", "--size", "64", "--workers", "1"]
+    assert data(["render", str(tmp_path / "views"), "--views-only", *wanted]) == 0
+    assert data(["render", str(tmp_path / "whole"), *wanted]) == 0
+    for path in (tmp_path / "views").glob("*"):
+        views, whole = read_pictures(path, 1), read_pictures(tmp_path / "whole" / path.name, 1)
+        assert torch.equal(views.c2w, whole.c2w)
+        both = views.view_valid & whole.view_valid
+        assert float(both.sum() / whole.view_valid.sum()) > 0.9
+        # one ray of four: pixels differ by noise and by what is smaller than they are, not by a shift
+        assert float((views.view_depth - whole.view_depth)[both].abs().mean()) < 0.005
+        one, other = (avg_pool2d(v.images.permute(0, 3, 1, 2), 8) for v in (views, whole))
+        assert float((one - other).abs().mean()) < 0.03
+    few = ["--steps", "1", "--batch", "1", "--points", "64"]
+    assert main([str(tmp_path / "views"), str(tmp_path / "run"), "--pixels", "64", *few]) == 0
+    assert main([str(tmp_path / "views"), str(tmp_path / "other"), *few]) == 2
+    assert "points: expected F16" in capsys.readouterr().err
