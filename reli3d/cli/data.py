@@ -60,8 +60,8 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--views-only",
         action="store_true",
-        help="photographs and maps of the views alone, one ray a pixel: for reli3d-train --pixels, in a third of the "
-        "time",
+        help="photographs and maps of the views alone, one ray a pixel: for reli3d-train --pixels, in less than "
+        "half of the time",
     )
     where = p.add_mutually_exclusive_group()
     where.add_argument("--workers", type=int, help="processes of this machine; default one a core")

@@ -50,8 +50,8 @@ def parser() -> argparse.ArgumentParser:
         default=0,
         metavar="SIDE",
         help="train the 2D U-Net alone, on what the pixels of all views show, in pictures of 64, 128 or 256 "
-        "pixels: first the coarse levels on small pictures, many of them in an hour, then finer ones; then go on "
-        "without",
+        "pixels (of samples of 256): first the coarse levels on small pictures, many of them in an hour, then finer "
+        "ones; then go on without",
     )
     p.add_argument("--bfloat16", action="store_true", help="of the convolutions: faster where the processor has it")
     p.add_argument(
@@ -94,15 +94,16 @@ def _check(args: argparse.Namespace) -> None:
         check_samples(args.validation, "validation", views=CALIBRATED)
 
 
-def _check_state(path: Path, model, config: TrainConfig | None = None) -> None:
+def _check_state(path: Path, model, config: TrainConfig | None = None, *, partly: bool = False) -> None:
     """Raise InputError where ``path`` is not a whole checkpoint of ``model``, or where ``config`` cannot go on from
-    it.
+    it.  partly: it may be one of small pictures.
     """
     import torch
 
     from reli3d.io.files import InputError, file_size, shown
     from reli3d.nn.weights import check_keys
     from reli3d.train.loop import parameter_groups
+    from reli3d.train.pixels import lacking
 
     def sizes(groups: list[dict]) -> list[tuple]:
         return [(len(group["params"]), group.get("times")) for group in groups]
@@ -118,19 +119,18 @@ def _check_state(path: Path, model, config: TrainConfig | None = None) -> None:
         raise InputError(
             path, f"expected a checkpoint of this training, got a broken file ({reason}); remove it to start again"
         ) from None
-    wanted = {k: tuple(v.shape) for k, v in model.state_dict().items()}
-    for found in shapes:
-        if config is None and "pyramid.reads.0.0.weight" not in found:  # from small pictures: finer levels begin anew
-            found = {**{k: shape for k, shape in wanted.items() if k.startswith("pyramid.")}, **found}
-        check_keys(path, found, wanted)
-    if not whole:
-        raise InputError(path, "expected a checkpoint of this training, got another one; remove it to start again")
     if config and found_sizes != sizes(parameter_groups(model, config)):
         raise InputError(
             path,
             "expected a checkpoint of the same training, got one of other parameters or an earlier version; "
             "name another output folder, and this file by --weights",
         )
+    wanted = {k: tuple(v.shape) for k, v in model.state_dict().items()}
+    for found in shapes:
+        begun_anew = lacking(model.preset, found) if partly else set()
+        check_keys(path, found, {k: shape for k, shape in wanted.items() if k not in begun_anew})
+    if not whole:
+        raise InputError(path, "expected a checkpoint of this training, got another one; remove it to start again")
 
 
 def _begun(start: Path | None, pixels: int) -> LocalReconstructor:
@@ -145,16 +145,18 @@ def _begun(start: Path | None, pixels: int) -> LocalReconstructor:
 
 
 def _whole(start: Path | None) -> LocalReconstructor:
+    import torch
+
     from reli3d.nn import weights
     from reli3d.nn.local import LocalReconstructor
     from reli3d.nn.presets import SMALL
-    from reli3d.train.loop import averaged_model
+    from reli3d.train.pixels import take_levels
 
     if start is None or start.suffix == ".pt":
         model = LocalReconstructor(SMALL)
         if start:
-            _check_state(start, model)
-            averaged_model(start, model)
+            _check_state(start, model, partly=True)
+            take_levels(model, torch.load(start, weights_only=True)["average"])
         return model.train()
     found = weights.load_model(str(start), "cpu")
     if not isinstance(found, LocalReconstructor):

@@ -88,26 +88,28 @@ class ImagePyramid(nn.Module):
         """
         super().__init__()
         widths, reading = sizes.widths, range(finest, sizes.reading)
-        if not reading or sizes.reading >= len(widths):
+        if not 0 < sizes.reading < len(widths) or len(widths) < 3:
+            raise ValueError(f"reading: expected less than the levels, of which there are 3 or more, got {sizes}")
+        if not reading:
             raise ValueError(f"finest: expected a level of 0 to {sizes.reading - 1}, got {finest}")
         pairs = {str(k): (widths[k], widths[k + 1]) for k in range(finest, len(widths) - 1)}
         self.finest, self.deepest = finest, len(widths) - 1
         self.reads = nn.ModuleDict({str(k): block(INPUTS, widths[k], 2) for k in reading})
-        self.down = nn.ModuleDict({str(k): block(widths[k - 1], widths[k], 2) for k in range(finest + 1, len(widths))})
+        down = {str(k): block(widths[k - 1], widths[k], 2) for k in range(finest + 1, len(widths))}
+        self.down = nn.ModuleDict(down)
         self.body = nn.ModuleDict({str(k): block(widths[k], widths[k]) for k in range(finest, len(widths))})
         self.shared = nn.Linear(widths[-1], widths[-1])
         self.across = nn.ModuleDict({k: nn.Conv2d(coarse, fine, 1) for k, (fine, coarse) in pairs.items()})
         self.up = nn.ModuleDict({k: block(fine, fine) for k, (fine, _) in pairs.items()})
-        self.says = nn.ModuleDict(
-            {str(k): nn.Sequential(block(widths[k], widths[k]), nn.Conv2d(widths[k], PREDICTED, 1)) for k in reading}
-        )
+        said = {str(k): nn.Sequential(block(widths[k], widths[k]), nn.Conv2d(widths[k], PREDICTED, 1)) for k in reading}
+        self.says = nn.ModuleDict(said)
         if finest == 0:
             self.features = nn.Conv2d(widths[1], sizes.features, 1)
-        for head in self.says.values():
+        for head in said.values():
             for value in head[1].parameters():
                 nn.init.zeros_(value)
         for k in reading[1:]:  # a finer level begins by adding nothing
-            for value in self.down[str(k)][1].parameters():
+            for value in down[str(k)][1].parameters():
                 nn.init.zeros_(value)
 
     def forward(
@@ -126,8 +128,8 @@ class ImagePyramid(nn.Module):
             features = self.features(quarter) if self.finest == 0 else None
         return None if features is None else channels_last(features), channels_last(pixels)
 
-    def _convolved(self, x: Tensor, counts: Sequence[int]) -> tuple[Tensor | None, Tensor]:
-        """What leaves level 1 on the way up, and the predictions of the finest level."""
+    def _convolved(self, x: Tensor, counts: Sequence[int]) -> tuple[Tensor, Tensor]:
+        """What leaves level 1 on the way up, or the finest one, and the predictions of the finest level."""
         levels: dict[str, Tensor] = {}
         for k in range(self.finest, self.deepest + 1):
             at = str(k)
@@ -138,14 +140,14 @@ class ImagePyramid(nn.Module):
         y = levels[str(self.deepest)]
         means = [self.shared(part.mean((0, 2, 3))).expand(len(part), -1) for part in y.split(list(counts))]
         y = y + torch.cat(means)[:, :, None, None]
-        quarter = pixels = None
+        quarter, pixels = y, y.new_zeros(())
         for k in reversed(range(self.finest, self.deepest)):
             at = str(k)
             y = self.up[at](levels[at] + _twice(self.across[at](y), levels[at]))
-            quarter = y if k == 1 else quarter
+            quarter = y if k >= 1 else quarter
             if at in self.says:
                 said = self.says[at](y)
-                pixels = said if pixels is None else said + _twice(pixels, said)
+                pixels = said + _twice(pixels, said) if pixels.ndim else said
         return quarter, pixels
 
 

@@ -16,11 +16,12 @@ import torch
 from torch import Tensor, nn
 
 from reli3d.nn.local import LocalReconstructor
+from reli3d.nn.presets import SMALL
 from reli3d.synthetic.maps import training_maps
 from reli3d.train.batches import batches
 from reli3d.train.losses import PIXEL_TERMS, WEIGHTS, losses, pixel_losses
 from reli3d.train.pictures import write_curves, write_validation
-from reli3d.train.pixels import groups_of_views, predicts, take_levels
+from reli3d.train.pixels import groups_of_views, predicts
 from reli3d.train.workers import Workers
 
 
@@ -41,13 +42,13 @@ class TrainConfig:
     average: float = 0.999  # decay of the averaged weights that are saved for use
     checkpoint_seconds: float = 300.0
     seed: int = 0
-    pixels: int = 0  # side of the pictures from which the 2D U-Net alone learns; 0 is the whole network
+    pixels: int = 0  # side of the pictures from which the 2D U-Net alone learns, all views of each object; 0: the whole
     bfloat16: bool = False  # of the convolutions; parameters and their updates are float32
     maps: str = ""  # file of environment maps, .npz, under which some samples are relit
     validation: str = ""  # folder of held-back samples; the first ones are drawn at every checkpoint
 
 
-LAST_LAYERS = (*(f"pyramid.says.{k}.1." for k in range(3)), "color.4.", "surface.4.", "light.out.")
+LAST_LAYERS = (*(f"pyramid.says.{k}.1." for k in range(SMALL.pyramid.reading)), "color.4.", "surface.4.", "light.out.")
 LAST_RATE = 10.0  # times the rate for these: they begin near zero, and Adam moves a number by hardly more than the rate
 PICTURED = 3  # validation objects in the picture, from one and from four views
 
@@ -169,11 +170,13 @@ def save(folder: Path, model, optimizer, average, step: int, seconds: float, con
     torch.save(state, folder / "state.tmp")
     os.replace(folder / "state.tmp", folder / "state.pt")
     write_curves(folder / "log.jsonl", folder / "curves.png")
-    if config.validation:
-        averaged = take_levels(LocalReconstructor(model.preset), average)
+    if config.validation and model.pyramid.finest == 0:  # else it is no whole network yet
+        averaged = LocalReconstructor(model.preset)
+        averaged.load_state_dict(average)
         write_validation(averaged.eval(), sorted(Path(config.validation).glob("*.safetensors"))[:PICTURED], folder)
 
 
 def averaged_model(state: Path, model: LocalReconstructor) -> LocalReconstructor:
-    """``model`` with the averaged weights of a checkpoint, for use; see :func:`~reli3d.train.pixels.take_levels`."""
-    return take_levels(model, torch.load(state, weights_only=True)["average"]).eval()
+    """``model`` with the averaged weights of a checkpoint, for use."""
+    model.load_state_dict(torch.load(state, weights_only=True)["average"])
+    return model.eval()

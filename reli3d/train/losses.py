@@ -147,12 +147,13 @@ def _pixels(pixels: PixelMaps, shown: Tensor, views: Sample | Pictures, counts: 
     valid = views.view_valid
     want = views.view_material[valid]
     color = pixels.base_logit(shown)[valid].sigmoid()
-    of_objects = [int(part.sum()) for part in valid.split(list(counts))]
-    patterns = [pattern_loss(c, w) for c, w in zip(color.split(of_objects), want[:, :3].split(of_objects), strict=True)]
-    share = color.new_tensor(counts) / sum(counts)
+    of_objects = [int(part.sum()) for part in valid.split(list(counts))]  # none of a thin one in a small picture
+    pairs = zip(color.split(of_objects), want[:, :3].split(of_objects), strict=True)
+    patterns = [pattern_loss(c, w) if len(w) else w.sum() for c, w in pairs]
+    share = color.new_tensor([views if n else 0 for views, n in zip(counts, of_objects, strict=True)])
     return {
         "pixel_color": excess_entropy(color, want[:, :3]),
-        "pixel_pattern": (torch.stack(patterns) * share).sum(),
+        "pixel_pattern": (torch.stack(patterns) * share).sum() / share.sum(),
         "pixel_roughness": excess_entropy(pixels.roughness[valid][:, 0].sigmoid(), want[:, 3]),
         "pixel_metallic": excess_entropy(pixels.metallic[valid][:, 0].sigmoid(), want[:, 4]),
         "pixel_normal": (1 - (pixels.normal[valid] * views.view_normal[valid]).sum(-1)).mean(),

@@ -7,7 +7,7 @@ nothing (after Karras and others 2018, Progressive Growing of GANs, arXiv 1710.1
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
@@ -20,6 +20,7 @@ from torch.nn import functional
 from reli3d.geometry.camera import Camera
 from reli3d.geometry.hull import mask_distance
 from reli3d.nn.local import QUARTER, LocalReconstructor, PixelMaps, mean_logit, shown_pixels
+from reli3d.nn.presets import LocalPreset
 from reli3d.nn.pyramid import ImagePyramid, place_of_pixels, span_of_pixels
 from reli3d.train.batches import KEPT, NOISE
 
@@ -66,12 +67,22 @@ def for_small_pictures(model: LocalReconstructor, finest: int) -> LocalReconstru
     return small
 
 
+def lacking(preset: LocalPreset, names: Container[str]) -> set[str]:
+    """Parameters of the network that a training on small pictures has not, if ``names`` are those of one."""
+    if "pyramid.reads.0.0.weight" in names:
+        return set()
+    finest = 1 if "pyramid.reads.1.0.weight" in names else 2
+    with torch.device("meta"):
+        whole, small = (set(ImagePyramid(preset.pyramid, k).state_dict()) for k in (0, finest))
+    return {f"pyramid.{name}" for name in whole - small}
+
+
 def take_levels(model: LocalReconstructor, state: dict[str, Tensor]) -> LocalReconstructor:
     """``model`` with the parameters of ``state``, which may lack the finer levels of the 2D U-Net, as small pictures
     leave it.  Raises ValueError where others are missing.
     """
     missing, unknown = model.load_state_dict(state, strict=False)
-    if lost := [*unknown, *(k for k in missing if not k.startswith("pyramid."))]:
+    if lost := [*unknown, *(set(missing) - lacking(model.preset, state))]:
         raise ValueError(f"state: expected the parameters of the network, got a difference in {lost[0]}")
     return model
 

@@ -26,6 +26,7 @@ from reli3d.train.pixels import (
     predicted,
     predicts,
     read_pictures,
+    take_levels,
 )
 
 
@@ -125,6 +126,29 @@ def test_the_pixels_alone_are_asked_as_with_all_else(files):
     assert set(alone) == set(PIXEL_TERMS) < set(whole)
     for name, value in alone.items():
         torch.testing.assert_close(value, whole[name], rtol=1e-4, atol=1e-6, msg=name)
+
+
+def test_an_object_without_a_whole_pixel_says_nothing(files):
+    """A thin object in a small picture: the others are asked as they are without it."""
+    model = learned(2)
+    objects = [read_pictures(f, 4).of_views(slice(0, 2)) for f in files]
+    empty = dataclasses.replace(objects[1], view_valid=torch.zeros_like(objects[1].view_valid))
+    both, alone = (pixel_losses(model, Group.of(parts)) for parts in ([objects[0], empty], objects[:1]))
+    for name, value in alone.items():
+        torch.testing.assert_close(both[name], value, rtol=1e-3, atol=1e-5, msg=name)
+
+
+def test_a_checkpoint_of_small_pictures_is_no_whole_network(folder, tmp_path, capsys):
+    few = ["--steps", "1", "--batch", "1", "--points", "64"]
+    assert main([str(folder), str(tmp_path / "64"), "--pixels", "64", *few]) == 0
+    assert main([str(folder), str(tmp_path / "64"), "--export", str(tmp_path / "net.safetensors")]) == 2
+    assert not (tmp_path / "net.safetensors").exists()
+    assert main([str(folder), str(tmp_path / "64"), "--pixels", "128", *few]) == 2
+    assert "name another output folder, and this file by --weights" in capsys.readouterr().err
+    state = torch.load(tmp_path / "64" / "state.pt", weights_only=True)
+    del state["average"]["pyramid.shared.weight"]
+    with pytest.raises(ValueError, match="pyramid.shared.weight"):
+        take_levels(LocalReconstructor(SMALL), state["average"])
 
 
 def test_every_view_of_a_drawn_object_is_read_once(folder):
