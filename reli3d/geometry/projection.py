@@ -99,9 +99,8 @@ def fuse_views(
     pixels: ``(3, V, P, P, 4)``: gain and three shifts; confidence, roughness, metallic, chroma; normal, 0.  A view's
     colour is ``gain * m + chroma * (l - m) + shift`` with the logits ``l`` of the colour seen and their mean ``m``.
     Its weight is the square of its share in :func:`summarize_views` times exp(confidence).  The numbers: roughness,
-    metallic, gain, normal less ``normal``, their cosine, greatest share, confidence, spread of the logit.  The rest of
-    the arguments as in :func:`summarize_views`.  No gradient: :class:`reli3d.nn.local.LocalField` has the same in torch
-    with one.
+    metallic, gain, normal less ``normal``, their cosine, greatest share, confidence, spread of the logit.  The rest as
+    in :func:`summarize_views`.  No gradient: :class:`reli3d.nn.local.LocalField` has the same in torch.
     """
     check("pixels", pixels, last=4, like=images)
     if pixels.ndim != 5 or pixels.shape[:2] != (3, len(images)) or min(pixels.shape[2:4]) < 2:

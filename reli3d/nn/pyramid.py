@@ -115,7 +115,8 @@ class ImagePyramid(nn.Module):
     def forward(
         self, images: Tensor, masks: Tensor, place: Tensor, span: Tensor, counts: Sequence[int] | None = None
     ) -> tuple[Tensor | None, Tensor]:
-        """Features ``(V, S/4, S/4, F)`` and raw predictions ``(V, S/2, S/2, 12)`` of views.
+        """Features ``(V, S/4, S/4, F)``, none of small pictures, and raw predictions ``(V, S/2, S/2, 12)`` of views.
+        Gradients reach every parameter.
 
         images: ``(V, S, S, 3)`` sRGB.  masks: ``(V, S, S)``.  place: ``(V, S, S, 2)`` from :func:`place_of_pixels`.
         span: ``(V, S / k, S / k, 2)`` from :func:`span_of_pixels`.  S is a multiple of two to the number of levels.
@@ -140,15 +141,15 @@ class ImagePyramid(nn.Module):
         y = levels[str(self.deepest)]
         means = [self.shared(part.mean((0, 2, 3))).expand(len(part), -1) for part in y.split(list(counts))]
         y = y + torch.cat(means)[:, :, None, None]
-        quarter, pixels = y, y.new_zeros(())
+        quarter, said = y, list[Tensor]()
         for k in reversed(range(self.finest, self.deepest)):
             at = str(k)
             y = self.up[at](levels[at] + _twice(self.across[at](y), levels[at]))
             quarter = y if k >= 1 else quarter
             if at in self.says:
-                said = self.says[at](y)
-                pixels = said + _twice(pixels, said) if pixels.ndim else said
-        return quarter, pixels
+                more = self.says[at](y)
+                said.append(more + _twice(said[-1], more) if said else more)
+        return quarter, said[-1]
 
 
 def _twice(coarse: Tensor, fine: Tensor) -> Tensor:

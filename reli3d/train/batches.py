@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -37,8 +37,8 @@ def random_turn(rng: np.random.Generator) -> Tensor:
 
 
 @dataclass(frozen=True)
-class Sample:
-    """``V`` input views of ``S`` by ``S`` pixels, maps of ``P = S/2``; float32; the world turned at random."""
+class Pictures:
+    """``V`` views of ``S`` by ``S`` pixels, the truth for ``P = S/2``; float32."""
 
     images: Tensor  # (V, S, S, 3) sRGB
     masks: Tensor  # (V, S, S)
@@ -49,6 +49,16 @@ class Sample:
     view_normal: Tensor  # (V, P, P, 3) world, unit
     view_depth: Tensor  # (V, P, P) from the world's origin along the camera's axis
     view_valid: Tensor  # (V, P, P) bool: the pixel shows the surface alone
+
+    def of_views(self, chosen: slice | Tensor) -> Pictures:
+        """The ``chosen`` views alone."""
+        return Pictures(**{f.name: getattr(self, f.name)[chosen] for f in fields(self)})
+
+
+@dataclass(frozen=True)
+class Sample(Pictures):
+    """One object, with points in and on it and its light; the world turned at random."""
+
     points: Tensor  # (M, 3)
     distance: Tensor  # (M,)
     surface: Tensor  # (N, 3, 3) position, normal, bumped normal

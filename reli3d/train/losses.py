@@ -8,8 +8,8 @@ from torch.nn import functional
 
 from reli3d.nn.local import LocalField, LocalReconstructor, PixelMaps
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
-from reli3d.train.batches import Sample
-from reli3d.train.pixels import Group, Pictures, predicted
+from reli3d.train.batches import Pictures, Sample
+from reli3d.train.pixels import Group, predicted
 
 WEIGHTS = {
     "occupancy": 1.0,
@@ -139,7 +139,7 @@ def pattern_loss(color: Tensor, target: Tensor) -> Tensor:
     return torch.log1p(functional.mse_loss(linear_to_srgb((p * factor).clamp(0.0, 1.0)), target) / PLAIN)
 
 
-def _pixels(pixels: PixelMaps, shown: Tensor, views: Sample | Pictures, counts: tuple[int, ...]) -> dict[str, Tensor]:
+def _pixels(pixels: PixelMaps, shown: Tensor, views: Pictures, counts: tuple[int, ...]) -> dict[str, Tensor]:
     """The pyramid's predictions against the maps of the views, at pixels that show the surface alone.
 
     shown: ``(V, P, P, 3)`` sRGB, the colours of these pixels.  counts: views of each object, side by side.
@@ -150,7 +150,7 @@ def _pixels(pixels: PixelMaps, shown: Tensor, views: Sample | Pictures, counts: 
     of_objects = [int(part.sum()) for part in valid.split(list(counts))]  # none of a thin one in a small picture
     pairs = zip(color.split(of_objects), want[:, :3].split(of_objects), strict=True)
     patterns = [pattern_loss(c, w) if len(w) else w.sum() for c, w in pairs]
-    share = color.new_tensor([views if n else 0 for views, n in zip(counts, of_objects, strict=True)])
+    share = color.new_tensor([count if n else 0 for count, n in zip(counts, of_objects, strict=True)])
     return {
         "pixel_color": excess_entropy(color, want[:, :3]),
         "pixel_pattern": (torch.stack(patterns) * share).sum() / share.sum(),

@@ -22,27 +22,9 @@ from reli3d.geometry.hull import mask_distance
 from reli3d.nn.local import QUARTER, LocalReconstructor, PixelMaps, mean_logit, shown_pixels
 from reli3d.nn.presets import LocalPreset
 from reli3d.nn.pyramid import ImagePyramid, place_of_pixels, span_of_pixels
-from reli3d.train.batches import KEPT, NOISE
+from reli3d.train.batches import KEPT, NOISE, Pictures
 
 KEEPS = 1 << 31  # bytes of small pictures that a process holds, so that they are not read again
-
-
-@dataclass(frozen=True)
-class Pictures:
-    """``V`` views of ``S`` by ``S`` pixels, the truth for ``P = S/2``; the views of an object lie side by side."""
-
-    images: Tensor  # (V, S, S, 3) sRGB
-    masks: Tensor  # (V, S, S)
-    silhouette: Tensor  # (V, S, S) pixels
-    c2w: Tensor  # (V, 4, 4)
-    intrinsics: Tensor  # (V, 4)
-    view_material: Tensor  # (V, P, P, 5) base colour (sRGB), roughness, metallic
-    view_normal: Tensor  # (V, P, P, 3) world, unit
-    view_depth: Tensor  # (V, P, P) from the world's origin along the camera's axis
-    view_valid: Tensor  # (V, P, P) bool: the pixel shows the surface alone
-
-    def of_views(self, chosen) -> Pictures:
-        return Pictures(**{f.name: getattr(self, f.name)[chosen] for f in fields(self)})
 
 
 @dataclass(frozen=True)

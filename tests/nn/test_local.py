@@ -130,7 +130,7 @@ def test_a_turn_of_the_world_turns_the_light(model):
         expected = torch.roll(field.log_light, -4, 2)  # from -Z, the centre, towards -X, which lies to the left
         wrong = torch.roll(field.log_light, 4, 2)
         # pixels beside the border of a texel may fall to its other side: 2 to 4 % with four seeds of the weights
-        assert float((other - expected).abs().mean()) < 0.08 * float((wrong - expected).abs().mean())
+        assert float((other - expected).abs().mean()) < 0.06 * float((wrong - expected).abs().mean())
 
 
 def test_directions_fall_into_their_own_texels():

@@ -14,12 +14,11 @@ from reli3d.geometry.hull import hull_distance
 from reli3d.nn.local import LocalReconstructor
 from reli3d.nn.presets import SMALL
 from reli3d.nn.pyramid import ImagePyramid
-from reli3d.train.batches import load_sample
+from reli3d.train.batches import Pictures, load_sample
 from reli3d.train.loop import TrainConfig, train
 from reli3d.train.losses import PIXEL_TERMS, losses, pixel_losses
 from reli3d.train.pixels import (
     Group,
-    Pictures,
     augmented,
     for_small_pictures,
     groups_of_views,
