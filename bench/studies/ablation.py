@@ -214,7 +214,7 @@ def run(name: str, seed: int, args: argparse.Namespace) -> dict:
     torch.manual_seed(seed)
     model = VARIANTS[name]()
     if isinstance(model, LocalReconstructor):
-        model.pyramid.in_bfloat16 = model.volume.in_bfloat16 = True
+        model.to_compute(torch.bfloat16)
     average, steps = trained(model, args, seed)
     model.load_state_dict(average)
     model.eval()

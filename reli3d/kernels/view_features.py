@@ -196,6 +196,7 @@ def pool_views_kernel(
     write_summary(summary, n, color, spread / total, least, greatest, p)
 
 
+SURE = wp.constant(0.25)  # share of a view that needs no help from views that do not see the point
 LOGIT_MARGIN = wp.constant(0.02)  # as nn.heads.COLOR_MARGIN: the logit of black and of white stays within reach
 
 
@@ -229,9 +230,14 @@ def fuse_views_kernel(
     numbers: wp.array2d[float],  # (N, 10): roughness, metallic, gain, bend, facing, greatest share, confidence, spread
     shading: wp.array[wp.vec3],  # (N,) unit
 ):
-    """Means over the views of what they predict, weighted by the square of their share times exp(confidence)."""
+    """Means over the views of what they predict, weighted by the square of their share times exp(confidence).
+
+    A view that does not see the point is left out where another has a share of SURE: it would have less than 1 % of
+    that view's weight, at equal confidence.
+    """
     n = start + wp.tid()
     p = viewed.points[n]
+    views = viewed.image.shape[0]
     scale = float(paint.shape[1]) / float(viewed.image.shape[1])
     normal = viewed.normal[n]
     total = wp.float32(0.0)
@@ -241,29 +247,33 @@ def fuse_views_kernel(
     gain = wp.float32(0.0)
     surface = wp.vec4()
     direction = wp.vec4()
-    for v in range(viewed.image.shape[0]):
-        pose = viewed.c2w[v]
-        q = project_point(p, pose, viewed.intrinsics[v])
-        seen, share = view_numbers(viewed.image, v, p, q, pose, 1, viewed.visible[n, v], normal)
-        greatest = wp.max(greatest, share)
-        at = between_pixels(q[0] * scale, q[1] * scale, paint.shape[1], paint.shape[2])
-        x = at[2]
-        y = at[3]
-        four = wp.vec4((1.0 - x) * (1.0 - y), x * (1.0 - y), (1.0 - x) * y, x * y)  # as in pool_views_kernel
-        change = mix_four(paint, v, int(at[0]), int(at[1]), four)
-        of_view = mix_four(rough_metal, v, int(at[0]), int(at[1]), four)
-        weight = share * share * wp.exp(of_view[0])
-        color = color_logit(wp.vec4(seen[0], seen[1], seen[2], 0.0))
-        level = (color[0] + color[1] + color[2]) / 3.0
-        grey = wp.vec3(level, level, level)
-        color = (color - grey) * of_view[3] + grey * change[0] + wp.vec3(change[1], change[2], change[3])
-        total += weight
-        away = color - mean
-        mean += away * (weight / total)  # Welford's update, as in pool_views_kernel
-        spread += weight * wp.dot(away, color - mean)
-        gain += weight * change[0]
-        surface += of_view * weight
-        direction += mix_four(bent, v, int(at[0]), int(at[1]), four) * weight
+    for k in range(2 * views):
+        v = k % views
+        sees = viewed.visible[n, v] > 0.0
+        # views that see the point come first; the others speak where none of those is sure
+        if (k < views and sees) or (k >= views and not sees and greatest < SURE):
+            pose = viewed.c2w[v]
+            q = project_point(p, pose, viewed.intrinsics[v])
+            seen, share = view_numbers(viewed.image, v, p, q, pose, 1, viewed.visible[n, v], normal)
+            greatest = wp.max(greatest, share)
+            at = between_pixels(q[0] * scale, q[1] * scale, paint.shape[1], paint.shape[2])
+            x = at[2]
+            y = at[3]
+            four = wp.vec4((1.0 - x) * (1.0 - y), x * (1.0 - y), (1.0 - x) * y, x * y)  # as in pool_views_kernel
+            change = mix_four(paint, v, int(at[0]), int(at[1]), four)
+            of_view = mix_four(rough_metal, v, int(at[0]), int(at[1]), four)
+            weight = share * share * wp.exp(of_view[0])
+            color = color_logit(wp.vec4(seen[0], seen[1], seen[2], 0.0))
+            level = (color[0] + color[1] + color[2]) / 3.0
+            grey = wp.vec3(level, level, level)
+            color = (color - grey) * of_view[3] + grey * change[0] + wp.vec3(change[1], change[2], change[3])
+            total += weight
+            away = color - mean
+            mean += away * (weight / total)  # Welford's update, as in pool_views_kernel
+            spread += weight * wp.dot(away, color - mean)
+            gain += weight * change[0]
+            surface += of_view * weight
+            direction += mix_four(bent, v, int(at[0]), int(at[1]), four) * weight
     unit = wp.vec3(direction[0], direction[1], direction[2]) / total + 1.0e-3 * normal
     unit = unit / wp.max(wp.length(unit), 1.0e-12)
     logit[n] = mean

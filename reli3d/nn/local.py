@@ -19,13 +19,14 @@ from torch.nn import functional
 
 from reli3d.geometry.camera import Camera, image_plane
 from reli3d.geometry.projection import fuse_views, gather_views, summarize_views
+from reli3d.kernels.view_features import SURE
 from reli3d.nn.blocks import in_rows, linear_of
 from reli3d.nn.field import Field, PointMaterial, bound_level
 from reli3d.nn.heads import ROUGHNESS_MIN, color_logit, mlp
 from reli3d.nn.light_features import Shading, brightness_at, brightness_over_normal, palette_of, unshaded
 from reli3d.nn.light_map import LightMap
 from reli3d.nn.presets import LocalPreset
-from reli3d.nn.pyramid import ImagePyramid, place_of_pixels, span_of_pixels
+from reli3d.nn.pyramid import PREDICTED, ImagePyramid, depth_of_origin, place_of_pixels, span_of_pixels
 from reli3d.nn.view_features import AHEAD, ViewFeatures, ViewMaps, ahead_of_surface
 from reli3d.nn.volume import HULL_SCALE, FeatureVolume
 from reli3d.render.color import srgb_to_linear
@@ -36,6 +37,8 @@ TOKEN_EXTRA = 4  # depth and world normal, beside the pyramid's features
 QUARTER = 4  # pixels of a view along a pixel whose ray is intersected with the hull
 FUSED = 10  # numbers of Fused beside the colour
 HEADS = 13  # numbers of LocalField.heads
+SIGN_OF_MIRRORED = torch.ones(PREDICTED)  # of what the pyramid predicts in the mirror image of a photograph
+SIGN_OF_MIRRORED[7] = -1.0  # the normal's component to the right, see PixelMaps.of
 SHARPNESS = 2.0  # power of a view's share: the view that looks straightest speaks, with smooth seams
 
 
@@ -135,8 +138,16 @@ class LocalReconstructor(nn.Module):
 
     @property
     def dtype(self) -> torch.dtype:
-        """In which it computes: float32."""
-        return linear_of(self.level, 0).weight.dtype
+        """In which its large convolutions compute."""
+        return torch.bfloat16 if self.pyramid.in_bfloat16 else torch.float32
+
+    def to_compute(self, dtype: torch.dtype) -> None:
+        """Have the convolutions over pictures and space compute in float32 or bfloat16; parameters and results stay
+        float32.  Raises ValueError for another dtype.
+        """
+        if dtype not in (torch.float32, torch.bfloat16):
+            raise ValueError(f"dtype: expected float32 or bfloat16, got {dtype}")
+        self.pyramid.in_bfloat16 = self.volume.in_bfloat16 = dtype == torch.bfloat16
 
     def encode(
         self,
@@ -154,9 +165,10 @@ class LocalReconstructor(nn.Module):
         images: ``(V, S, S, 3)`` sRGB in [0, 1], straight.  masks: ``(V, S, S)``.  c2w: ``(V, 4, 4)`` OpenGL.
         intrinsics: ``(V, 4)`` pixels of ``images``.  detail: ``(V, D, D, 4)`` sRGB and signed distance to the
         silhouette in pixels, from which colours are read; its intrinsics.  mirrored: how many of the last views are
-        mirror images: they tell the shape and the paint, not the light.  Gradients reach every parameter.
+        the first ones flipped left to right, seen by mirrored cameras: they tell the shape and the paint, not the
+        light.  Gradients reach every parameter.
         """
-        features, pixels, camera = self.read_pixels(images, masks, c2w, intrinsics, detail, detail_intrinsics)
+        features, pixels, camera = self.read_pixels(images, masks, c2w, intrinsics, detail, detail_intrinsics, mirrored)
         color, mask = shown_pixels(images, masks, camera)
         shape = torch.cat([pixels.depth, pixels.normal], -1).permute(0, 3, 1, 2)
         shape = functional.avg_pool2d(shape, camera.height // features.shape[1]).permute(0, 2, 3, 1)
@@ -170,18 +182,33 @@ class LocalReconstructor(nn.Module):
         return LocalField(maps, self, pixels, color, surface, volume, log_light)
 
     def read_pixels(
-        self, images: Tensor, masks: Tensor, c2w: Tensor, intrinsics: Tensor, detail: Tensor, detail_intrinsics: Tensor
+        self,
+        images: Tensor,
+        masks: Tensor,
+        c2w: Tensor,
+        intrinsics: Tensor,
+        detail: Tensor,
+        detail_intrinsics: Tensor,
+        mirrored: int = 0,
     ) -> tuple[Tensor, PixelMaps, Camera]:
         """The first part of :meth:`encode`, each view by itself: features of a quarter of the resolution, predictions
-        of half of it, and the cameras of these.
+        of half of it, and the cameras of these.  Mirror images are not read: their maps are those of the photographs,
+        flipped.
         """
+        taken = len(images) - mirrored
         camera = Camera(c2w, intrinsics, *images.shape[2:0:-1])
-        quarter = functional.avg_pool2d(masks[:, None], QUARTER)[:, 0]
+        read = camera[:taken]
+        quarter = functional.avg_pool2d(masks[:taken, None], QUARTER)[:, 0]
         outlined = Camera(c2w, detail_intrinsics, *detail.shape[2:0:-1])
-        span = span_of_pixels(detail[..., 3], outlined, quarter, camera.resized(*quarter.shape[:0:-1]))
-        features, raw = self.pyramid(images, masks, place_of_pixels(camera), span)
+        span = span_of_pixels(detail[..., 3], outlined, quarter, read.resized(*quarter.shape[:0:-1]))
+        features, raw = self.pyramid(images[:taken], masks[:taken], place_of_pixels(read), span)
         coarse = camera.resized(*raw.shape[2:0:-1])
-        level = mean_logit(*shown_pixels(images, masks, coarse))
+        level = mean_logit(*shown_pixels(images[:taken], masks[:taken], coarse[:taken]))
+        if mirrored:
+            nearer = depth_of_origin(c2w[:mirrored]) - depth_of_origin(c2w[taken:])
+            turned = raw[:mirrored].flip(2) * SIGN_OF_MIRRORED.to(raw)
+            span = torch.cat([span, span[:mirrored].flip(2) + nearer[:, None, None, None]])
+            features, raw = torch.cat([features, features[:mirrored].flip(2)]), torch.cat([raw, turned])
         return features, PixelMaps.of(raw, span, coarse, level), coarse
 
     def _light(self, pixels: PixelMaps, color: Tensor, mask: Tensor, camera: Camera) -> Tensor:
@@ -264,7 +291,8 @@ class LocalField(Field):
         got, _ = gather_views(pixels, position, maps.camera)
         shown, share, summary = summarize_views(maps.images, maps.camera, position, visible, normal)
         gain, shift, confidence, rough, metal, chroma, bent = got.split([1, 3, 1, 1, 1, 1, 3], -1)
-        weight = (SHARPNESS * share.log() + confidence[..., 0]).softmax(-1)[..., None]
+        hidden = (visible <= 0.0) & (summary[:, 5:6] >= SURE)  # and a view that sees the point is sure
+        weight = (SHARPNESS * share.log() + confidence[..., 0]).masked_fill(hidden, -math.inf).softmax(-1)[..., None]
         each = paint_logit(shown[..., :3], gain, chroma, shift)
         logit = (each * weight).sum(1)
         spread = ((each - logit[:, None]).square() * weight).sum((1, 2), keepdim=True)[..., 0].clamp(min=1e-6).sqrt()

@@ -22,13 +22,14 @@ def computes_bfloat16(device: torch.device | str) -> bool:
     return any(able.get(name, False) for name in INSTRUCTIONS)
 
 
-def fastest(preset: Preset | LocalPreset, device: torch.device | str) -> torch.dtype:
-    """bfloat16 for networks with a triplane where the device has instructions for it, else float32."""
-    return torch.bfloat16 if isinstance(preset, Preset) and computes_bfloat16(device) else torch.float32
+def fastest(device: torch.device | str) -> torch.dtype:
+    """bfloat16 where the device has instructions for it, else float32."""
+    return torch.bfloat16 if computes_bfloat16(device) else torch.float32
 
 
 def heads_dtype(preset: Preset | LocalPreset, device: torch.device | str, choice: str) -> torch.dtype:
-    """The dtype of a network's material heads for one of :data:`CHOICES`; ``auto`` is :func:`fastest`.
+    """The dtype of a network's material heads for one of :data:`CHOICES`; ``auto`` is :func:`fastest`, and float32 for
+    the network of convolutions, whose heads are small.
 
     Raises ValueError for another choice, and for bfloat16 where the network has no such heads.
     """
@@ -36,4 +37,6 @@ def heads_dtype(preset: Preset | LocalPreset, device: torch.device | str, choice
         raise ValueError(f"heads: expected {', '.join(CHOICES)}, got {choice}")
     if choice == "bfloat16" and isinstance(preset, LocalPreset):
         raise ValueError("heads: expected float32 or auto for the network of convolutions, got bfloat16")
-    return fastest(preset, device) if choice == "auto" else getattr(torch, choice)
+    if choice == "auto":
+        return fastest(device) if isinstance(preset, Preset) else torch.float32
+    return getattr(torch, choice)

@@ -33,6 +33,11 @@ def channels_last(x: Tensor) -> Tensor:
     return x.float().permute(0, 2, 3, 1).contiguous()
 
 
+def depth_of_origin(c2w: Tensor) -> Tensor:
+    """Depth ``(V,)`` of the world's origin along the cameras' axes."""
+    return (c2w[:, :3, 3] * c2w[:, :3, 2]).sum(-1)
+
+
 def place_of_pixels(camera: Camera) -> Tensor:
     """Right and up, ``(V, S, S, 2)`` in world units, of where the pixels' rays meet the plane through the world's
     origin that faces the camera: a crop alone shows neither the scale of a picture nor where its middle is.
@@ -40,7 +45,7 @@ def place_of_pixels(camera: Camera) -> Tensor:
     camera: ``V`` views of ``S`` by ``S`` pixels.
     """
     c2w = camera.c2w
-    depth = (c2w[:, :3, 3] * c2w[:, :3, 2]).sum(-1)[:, None, None]  # of the origin
+    depth = depth_of_origin(c2w)[:, None, None]
     x, y = image_plane(camera)
     origin = -(c2w[:, :3, :2] * c2w[:, :3, 3:]).sum(1)[:, None, None]  # in the camera's axes
     return torch.stack([x * depth, y * depth], -1) - origin
@@ -57,8 +62,8 @@ def span_of_pixels(silhouette: Tensor, outlined: Camera, seen: Tensor, camera: C
     right, up = (t[v, y, x] for t in image_plane(camera))
     local = torch.stack([right, up, -torch.ones_like(right)], -1)
     directions = (c2w[v, :3, :3] @ local[..., None])[..., 0]  # of depth 1
-    depth = (c2w[:, :3, 3] * c2w[:, :3, 2]).sum(-1)  # of the origin
-    span = hull_span(c2w[v, :3, 3].contiguous(), directions, REACH, silhouette, outlined) - depth[v, None]
+    span = hull_span(c2w[v, :3, 3].contiguous(), directions, REACH, silhouette, outlined)
+    span = span - depth_of_origin(c2w)[v, None]
     return span.new_zeros(*seen.shape, 2).index_put((v, y, x), span)
 
 

@@ -227,8 +227,9 @@ def load(
 ) -> tuple[Network, Manifest]:
     """The network in a safetensors file, in evaluation mode, and the file's manifest.
 
-    preset: what the file must hold; default the one in its header.  trunk: dtype of the trunk's parameters, default
-    :func:`default_trunk`, ``auto`` is :func:`~reli3d.nn.precision.fastest`; the rest is float32.  A tensor that is
+    preset: what the file must hold; default the one in its header.  trunk: dtype of the trunk's parameters, or in
+    which the convolutions of the small network compute; default :func:`default_trunk`, ``auto`` is
+    :func:`~reli3d.nn.precision.fastest`; the rest is float32.  A tensor that is
     stored in the dtype asked for stays mapped from the file on a CPU: it takes memory when it is read.  Names, shapes,
     length and, where given, the hash are checked before anything is allocated.
     Raises WeightsError.
@@ -241,13 +242,10 @@ def load(
         if found != expected_sha256:
             raise WeightsError(path, f"expected SHA-256 {expected_sha256}, got {found}; fetch it again")
     if trunk == "auto":
-        trunk = fastest(preset, device)
-    if isinstance(preset, LocalPreset) and trunk not in (None, torch.float32):
-        raise WeightsError(path, f"expected float32 for the network of convolutions, got {trunk}")
+        trunk = fastest(device)
     with torch.device("meta"):
         model = network(preset)
-        if isinstance(model, Reconstructor):
-            model.to_compute(trunk or default_trunk(preset, device))
+        model.to_compute(trunk or default_trunk(preset, device))
     wanted = {name: value.dtype for name, value in model.state_dict().items()}
     model.load_state_dict(read_tensors(manifest, wanted, device), strict=True, assign=True)
     return model.eval(), manifest

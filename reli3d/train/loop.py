@@ -88,7 +88,7 @@ def train(model: LocalReconstructor, config: TrainConfig, workers: Workers | Non
         raise ValueError(f"batch: expected a multiple of the {workers.count} processes, got {config.batch}")
     folder = Path(config.output)
     folder.mkdir(parents=True, exist_ok=True)
-    model.pyramid.in_bfloat16 = model.volume.in_bfloat16 = config.bfloat16
+    model.to_compute(torch.bfloat16 if config.bfloat16 else torch.float32)
     ask, names = (pixel_losses, PIXEL_TERMS) if config.pixels else (losses, tuple(WEIGHTS))
     parts = parameter_groups(model, config)
     trained = [p for part in parts for p in part["params"]]

@@ -8,8 +8,9 @@ import torch
 from torch.nn.functional import avg_pool2d, normalize
 from torch.utils.flop_counter import FlopCounterMode
 
-from reli3d.geometry.camera import Camera, look_at, project
+from reli3d.geometry.camera import Camera, image_plane, look_at, project
 from reli3d.geometry.hull import mask_distance
+from reli3d.geometry.symmetry import MirrorPlane
 from reli3d.nn.light_map import LightMap, gathered, texel_of
 from reli3d.nn.local import LocalReconstructor, PixelMaps, mean_logit
 from reli3d.nn.presets import SMALL, LightMapSizes, PyramidSizes, VolumeSizes
@@ -108,6 +109,29 @@ def test_any_number_of_views_in_any_order(model, views):
     torch.testing.assert_close(other_light, light, rtol=2e-3, atol=1e-3)
     for a, b in zip(vars(other_material).values(), vars(material).values(), strict=True):
         torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-3)
+
+
+@torch.no_grad()
+def test_mirror_images_have_the_mirrored_maps(model):
+    """The 2D U-Net does not read them; normals and points that they show are the photographs' ones, mirrored."""
+    images, masks, c2w, intrinsics = sphere(3)
+    intrinsics = intrinsics + torch.tensor([0.0, 0.0, 1.5, -0.5])  # a picture that is not symmetric about its middle
+    plane = MirrorPlane(normalize(torch.tensor([2.0, 0.3, 1.0]), dim=0), 0.07)
+    other = plane.mirrored(Camera(c2w, intrinsics, SIZE, SIZE))
+    views = [torch.cat([t, t.flip(2)]) for t in (images, masks)]
+    poses = [torch.cat([c2w, other.c2w]), torch.cat([intrinsics, other.intrinsics])]
+    detail = torch.cat([views[0], mask_distance(views[1])[..., None]], -1).contiguous()
+    read = model.read_pixels(*views, *poses, detail, poses[1], mirrored=3)
+    features, pixels, camera = read
+    assert torch.equal(features[3:], features[:3].flip(2))
+    depth = pixels.depth[..., 0] + (camera.c2w[:, :3, 3] * camera.c2w[:, :3, 2]).sum(-1)[:, None, None]
+    x, y = image_plane(camera)
+    local = torch.stack([x, y, -torch.ones_like(x)], -1) * depth[..., None]
+    point = torch.einsum("vij,vxyj->vxyi", camera.c2w[:, :3, :3], local) + camera.c2w[:, None, None, :3, 3]
+    for values, offset in ((pixels.normal, 0.0), (point, plane.offset)):
+        want = values - 2.0 * ((values @ plane.normal) - offset)[..., None] * plane.normal
+        torch.testing.assert_close(values[3:], want[:3].flip(2), rtol=0, atol=1e-5)  # rounding of the rotations
+    assert pixels.gain.std() > 0.01 and pixels.normal.std() > 0.1
 
 
 def test_every_view_is_read(model):

@@ -194,8 +194,8 @@ def test_convolutions_in_bfloat16_change_the_losses_by_their_rounding(samples):
     """Eight bits of mantissa, a relative error of 2^-9 each; sums over layers and pixels keep the losses to 1 %."""
     model = load_model("small", "cpu").requires_grad_(True)
     found = []
-    for model.pyramid.in_bfloat16 in (False, True):
-        model.volume.in_bfloat16 = model.pyramid.in_bfloat16
+    for dtype in (torch.float32, torch.bfloat16):
+        model.to_compute(dtype)
         model.zero_grad()
         torch.manual_seed(1)  # points go astray at random
         terms = losses(model, samples[0])
