@@ -10,17 +10,26 @@ from pathlib import Path
 from reli3d.cli.exit_codes import command
 from reli3d.cli.help_format import Defaults
 
+MOST = 16  # views that the small network reads
+
 
 def parser() -> argparse.ArgumentParser:
     p = argparse.ArgumentParser(
         formatter_class=Defaults, prog="reli3d-eval", description="Measure the network on held-back procedural objects."
     )
-    p.add_argument("samples", type=Path, help="folder made by reli3d-data render --held-back test --views 12")
+    p.add_argument("samples", type=Path, help="folder made by reli3d-data render --held-back test --views 24")
     p.add_argument("--maps", type=Path, required=True, help=".npz of environment maps that the training drew from")
     p.add_argument("--weights", default="small", help="small, or a safetensors file")
     p.add_argument(
-        "--views", type=int, nargs="+", choices=(1, 2, 3, 4), default=(1, 2, 4), help="numbers of input views"
+        "--views",
+        type=int,
+        nargs="+",
+        choices=range(1, MOST + 1),
+        metavar="N",
+        default=(1, 2, 4),
+        help=f"numbers of input views, 1 to {MOST}; the last 8 views of a sample are looked at",
     )
+    p.add_argument("--symmetry", choices=("auto", "off"), default="auto", help="as of reli3d-infer")
     p.add_argument("--json", type=Path, help="also write the table to this file")
     return p
 
@@ -35,14 +44,14 @@ def _seeded(path: Path) -> None:
 @command("reli3d-eval")
 def main(argv: list[str] | None = None) -> int:
     args = parser().parse_args(argv)
-    from reli3d.eval.heldout import INPUTS, UNSEEN, mean_environment, table
+    from reli3d.eval.heldout import UNSEEN, mean_environment, table
     from reli3d.io.files import InputError, write_bytes
     from reli3d.nn.weights import load_model
     from reli3d.output.folder import check_folder
     from reli3d.synthetic.maps import held_back, load_maps
     from reli3d.synthetic.stored import check_samples
 
-    check_samples(args.samples, "samples", views=INPUTS + UNSEEN, also=_seeded)
+    check_samples(args.samples, "samples", views=max(args.views) + UNSEEN, also=_seeded)
     if args.json:
         if args.json.is_dir():
             raise InputError(args.json, "expected a file for --json, got a folder")
@@ -50,7 +59,9 @@ def main(argv: list[str] | None = None) -> int:
     maps, names = load_maps(args.maps)
     mean = mean_environment(maps[[not h for h in held_back(names)]])
     model = load_model(args.weights)
-    figures = table(model, args.samples, mean, args.views, lambda line: print(line, file=sys.stderr))
+    figures = table(
+        model, args.samples, mean, args.views, lambda line: print(line, file=sys.stderr), symmetry=args.symmetry
+    )
     text = json.dumps(figures, indent=1)
     print(text)
     if args.json:

@@ -53,8 +53,8 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--precision",
         choices=("float32", "bfloat16", "auto"),
-        help="of the network's large parts; default float32, for official weights on CUDA bfloat16; auto: for official "
-        "weights bfloat16 wherever the processor has instructions for it",
+        help="of the network's large parts; default float32, for official weights on CUDA bfloat16; auto: bfloat16 "
+        "wherever the processor has instructions for it",
     )
     p.add_argument(
         "--heads",

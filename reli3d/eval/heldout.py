@@ -27,7 +27,7 @@ from reli3d.synthetic.samples import ObjectSurface
 from reli3d.train.light_prior import scale_free
 from reli3d.train.pictures import sample_views
 
-INPUTS, UNSEEN = 4, 8  # the first views are input, the next are looked at
+UNSEEN = 8  # the last views are looked at, the first are input
 BLACK = 0.01  # added to radiance before the logarithm
 
 
@@ -83,20 +83,24 @@ def light_error(predicted: Tensor, target: Tensor) -> float:
     return float((difference.abs() * weight).sum() / weight.sum())
 
 
-def evaluate(model: Network, sample: dict[str, Tensor], seed: int, count: int, mean_light: Tensor) -> dict[str, float]:
-    """Figures of one object reconstructed from ``count`` views; colours are compared where truth and result are seen.
+def evaluate(
+    model: Network, sample: dict[str, Tensor], seed: int, count: int, mean_light: Tensor, *, symmetry: str = "auto"
+) -> dict[str, float]:
+    """Figures of one object reconstructed from the first ``count`` views, at most all but ``UNSEEN``; colours are
+    compared where truth and result are seen.  symmetry: of :class:`~reli3d.pipeline.ReconstructOptions`.
 
     ``*_mse`` are square errors of the base colour, ``single_*`` those of the best single colour of this very object.
     ``empty`` is 1 where the field has no surface: IoU 0 and nothing else to compare.  Without a pixel that both cover
     there are no colours.
     """
     try:
-        options = ReconstructOptions(texture_size=512)
+        options = ReconstructOptions(texture_size=512, symmetry=symmetry)
         asset = reconstruct(sample_views(sample, count), weights=model, options=options)
     except NoSurface:
         return {"empty": 1.0, "iou": 0.0}
     scene, size = RayScene(asset.mesh.vertices, asset.mesh.faces), sample["images"].shape[1]
-    chosen = range(INPUTS, INPUTS + UNSEEN)
+    last = len(sample["c2w"])
+    chosen = range(last - UNSEEN, last)
     cameras = [Camera(sample["c2w"][i], sample["intrinsics"][i], size, size) for i in chosen]
     ious, got_all, want_all = [], [], []
     for camera, (mask, want) in zip(cameras, truth_colors(seed, cameras), strict=True):
@@ -152,10 +156,16 @@ def mean_environment(maps: Tensor) -> Tensor:
 
 
 def table(
-    model: Network, folder: Path, mean_light: Tensor, counts: Sequence[int], progress: Callable[[str], None]
+    model: Network,
+    folder: Path,
+    mean_light: Tensor,
+    counts: Sequence[int],
+    progress: Callable[[str], None],
+    *,
+    symmetry: str = "auto",
 ) -> dict[int, dict]:
-    """:func:`summary` of the samples in ``folder`` for each number of views (at most ``INPUTS``); ``progress`` gets a
-    line an object.  Raises ValueError where the folder holds no samples.
+    """:func:`summary` of the samples in ``folder`` for each number of views; ``progress`` gets a line an object.  The
+    rest as in :func:`evaluate`.  Raises ValueError where the folder holds no samples.
     """
     files = sorted(folder.glob("*.safetensors"))
     if not files:
@@ -164,7 +174,7 @@ def table(
     for count in counts:
         rows = []
         for path in files:
-            rows.append(evaluate(model, load_file(path), int(path.stem), count, mean_light))
+            rows.append(evaluate(model, load_file(path), int(path.stem), count, mean_light, symmetry=symmetry))
             progress(f"{count} views, {path.stem}: " + ", ".join(f"{k} {v:.4f}" for k, v in rows[-1].items()))
         out[count] = summary(rows)
     return out

@@ -160,6 +160,7 @@ CASES = [
             ("good", "maps.npz", ["--json", "file/x"], "a file"),
             ("good", "maps.npz", ["--json", "good"], "a folder"),
             ("good", "maps.npz", ["--weights", "none"], "none"),
+            ("good", "maps.npz", ["--views", "8"], "expected at least 16, got 12"),
         ]
     ),
 ]

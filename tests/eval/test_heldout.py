@@ -57,7 +57,11 @@ def test_an_empty_field_counts_as_nothing_found_and_spoils_no_mean(monkeypatch):
     light = Environment(torch.ones(32, 64, 3))
     away = SimpleNamespace(mesh=mesh, textures=None, environment=light, light=light)
     monkeypatch.setattr(heldout, "reconstruct", lambda *args, **kwargs: away)
+    looked = []
+    truth = heldout.truth_colors
+    monkeypatch.setattr(heldout, "truth_colors", lambda seed, cameras: looked.extend(cameras) or truth(seed, cameras))
     row = evaluate(None, sample, seed, 4, torch.ones(32, 64, 3))
+    assert torch.equal(torch.stack([c.c2w for c in looked]), sample["c2w"][-8:])  # none of the views that are input
     assert (row["empty"], row["iou"]) == (0.0, 0.0) and not any(key.endswith("mse") for key in row)
 
 
