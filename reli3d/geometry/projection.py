@@ -8,10 +8,18 @@ from torch import Tensor
 from reli3d._bridge import call, check, launch, struct_of
 from reli3d.geometry.camera import Camera, check_camera
 from reli3d.kernels.projection import gather_views_kernel
-from reli3d.kernels.view_features import Viewed, fuse_views_kernel, pool_views_kernel, vec8, view_summary_kernel
+from reli3d.kernels.view_features import (
+    Viewed,
+    fuse_views_kernel,
+    pool_views_kernel,
+    spread_views_kernel,
+    vec8,
+    view_summary_kernel,
+)
 
 BLOCK = 8  # floats of a kernels.vec8
 NUMBERS = 9  # numbers that a view says of a point, and as many that sum up all views
+HIDDEN, SPREAD = 32, 24  # widths of the two layers of spread_views, whose kernel has them written out
 
 
 def gather_views(maps: Tensor, points: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
@@ -86,6 +94,34 @@ def pool_views(
     layer = [(t.detach().contiguous().unflatten(-1, (-1, BLOCK)), vec8) for t in (tokens, mix)]
     outs = [(pooled.unflatten(-1, (-1, BLOCK)), vec8), (out, wp.float32)]
     launch(pool_views_kernel, n, [viewed, *layer, *outs], points.device)
+    return pooled, out
+
+
+def spread_views(
+    images: Tensor, tokens: Tensor, mix: Tensor, last: Tensor, bias: Tensor, camera: Camera, points: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Two layers at ``points (N, 3)`` in space: weighted mean over the views and mean square difference to it, ``(N, 2
+    SPREAD)``, and the summary ``(N, 9)`` of :func:`summarize_views`.
+
+    The layers of a view are ``silu(token + numbers @ mix) @ last + bias``: tokens, mix and numbers as in
+    :func:`pool_views` with H = HIDDEN.  last: ``(HIDDEN, SPREAD)``.  bias: ``(SPREAD,)``.  The rest as there.  No
+    gradient: :class:`reli3d.nn.volume.FeatureVolume` has the same in torch.
+    """
+    n, out, viewed = _summary(images, camera, points, None, None)
+    shapes = {
+        "tokens": (tokens, (len(images), *tokens.shape[1:3], HIDDEN)),
+        "mix": (mix, (NUMBERS, HIDDEN)),
+        "last": (last, (HIDDEN, SPREAD)),
+        "bias": (bias, (SPREAD,)),
+    }
+    for name, (value, shape) in shapes.items():
+        check(name, value, like=images)
+        if tuple(value.shape) != shape or (name == "tokens" and min(shape[1:3]) < 2):
+            raise ValueError(f"{name}: expected shape {shape}, got {tuple(value.shape)}")
+    layers = [(value.detach().contiguous().unflatten(-1, (-1, BLOCK)), vec8) for value, _ in shapes.values()]
+    pooled = points.new_empty(n, 2 * SPREAD)
+    outs = [(pooled.unflatten(-1, (-1, BLOCK)), vec8), (out, wp.float32)]
+    launch(spread_views_kernel, n, [viewed, *layers, *outs], points.device)
     return pooled, out
 
 

@@ -196,6 +196,85 @@ def pool_views_kernel(
     write_summary(summary, n, color, spread / total, least, greatest, p)
 
 
+@wp.kernel
+def spread_views_kernel(
+    start: int,
+    # in
+    viewed: Viewed,
+    tokens: wp.array4d[vec8],  # (V, P, P, 4) what the hidden layer makes of a token, with its bias
+    mix: wp.array2d[vec8],  # (9, 4) what it makes of the numbers of view_numbers
+    last: wp.array2d[vec8],  # (32, 3) the layer after it
+    bias: wp.array[vec8],  # (3,) of that layer
+    # out
+    pooled: wp.array2d[vec8],  # (N, 6) mean over the views of the last layer, and their mean square difference to it
+    summary: wp.array2d[float],  # (N, 9) as of view_summary_kernel
+):
+    """Both layers of every view, and mean and spread of the second, in one pass."""
+    n = start + wp.tid()
+    p = viewed.points[n]
+    scale = float(tokens.shape[1]) / float(viewed.image.shape[1])
+    total = wp.float32(0.0)
+    greatest = wp.float32(0.0)
+    least = wp.float32(1.0)
+    color = wp.vec3(0.0, 0.0, 0.0)
+    spread = wp.float32(0.0)
+    mean0 = vec8()
+    mean1 = vec8()
+    mean2 = vec8()
+    apart0 = vec8()
+    apart1 = vec8()
+    apart2 = vec8()
+    for v in range(viewed.image.shape[0]):
+        pose = viewed.c2w[v]
+        q = project_point(p, pose, viewed.intrinsics[v])
+        seen, normal = surface_point(viewed, n, v)
+        numbers, share = view_numbers(viewed.image, v, p, q, pose, viewed.normal.shape[0], seen, normal)
+        total += share
+        greatest = wp.max(greatest, share)
+        least = wp.min(least, numbers[3])
+        away = wp.vec3(numbers[0], numbers[1], numbers[2]) - color
+        color += away * (share / total)
+        spread += share * wp.dot(away, wp.vec3(numbers[0], numbers[1], numbers[2]) - color)
+        at = between_pixels(q[0] * scale, q[1] * scale, tokens.shape[1], tokens.shape[2])
+        i = int(at[0])
+        j = int(at[1])
+        w00 = (1.0 - at[2]) * (1.0 - at[3])
+        w01 = at[2] * (1.0 - at[3])
+        w10 = (1.0 - at[2]) * at[3]
+        w11 = at[2] * at[3]
+        out0 = bias[0]
+        out1 = bias[1]
+        out2 = bias[2]
+        for b in range(mix.shape[1]):
+            h = tokens[v, j, i, b] * w00 + tokens[v, j, i + 1, b] * w01
+            h += tokens[v, j + 1, i, b] * w10 + tokens[v, j + 1, i + 1, b] * w11
+            for k in range(9):
+                h += mix[k, b] * numbers[k]
+            h = silu(h)
+            for k in range(8):
+                row = 8 * b + k
+                out0 += last[row, 0] * h[k]
+                out1 += last[row, 1] * h[k]
+                out2 += last[row, 2] * h[k]
+        part = share / total
+        d0 = out0 - mean0
+        d1 = out1 - mean1
+        d2 = out2 - mean2
+        mean0 += d0 * part
+        mean1 += d1 * part
+        mean2 += d2 * part
+        apart0 += wp.cw_mul(d0, out0 - mean0) * share
+        apart1 += wp.cw_mul(d1, out1 - mean1) * share
+        apart2 += wp.cw_mul(d2, out2 - mean2) * share
+    pooled[n, 0] = mean0
+    pooled[n, 1] = mean1
+    pooled[n, 2] = mean2
+    pooled[n, 3] = apart0 / total
+    pooled[n, 4] = apart1 / total
+    pooled[n, 5] = apart2 / total
+    write_summary(summary, n, color, spread / total, least, greatest, p)
+
+
 SURE = wp.constant(0.25)  # share of a view that needs no help from views that do not see the point
 LOGIT_MARGIN = wp.constant(0.02)  # as nn.heads.COLOR_MARGIN: the logit of black and of white stays within reach
 

@@ -8,14 +8,13 @@ from torch.nn import functional
 
 from reli3d.geometry.grid import sample_grid
 from reli3d.geometry.hull import hull_distance
-from reli3d.geometry.projection import NUMBERS, gather_views, summarize_views
-from reli3d.nn.blocks import in_rows
+from reli3d.geometry.projection import HIDDEN, NUMBERS, SPREAD, gather_views, spread_views, summarize_views
+from reli3d.nn.blocks import in_rows, linear_of
 from reli3d.nn.presets import VolumeSizes
 from reli3d.nn.view_features import AHEAD, ViewMaps, ahead_of_surface
 
 NEAR_HULL = 0.08  # farther outside the silhouettes' hull there is nothing: views are not read
 HULL_SCALE = 0.1  # unit of the hull's distance as a feature
-MIXED = 24  # channels of a view at a point, and as many of their spread
 
 
 def _block(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
@@ -35,8 +34,8 @@ class FeatureVolume(nn.Module):
     def __init__(self, sizes: VolumeSizes, features: int):
         super().__init__()
         widths = sizes.widths
-        self.mix = nn.Sequential(nn.Linear(features + NUMBERS, 32), nn.SiLU(), nn.Linear(32, MIXED))
-        self.reduce = nn.Sequential(nn.Linear(2 * MIXED + NUMBERS + 2 + AHEAD, widths[0]), nn.SiLU())
+        self.mix = nn.Sequential(nn.Linear(features + NUMBERS, HIDDEN), nn.SiLU(), nn.Linear(HIDDEN, SPREAD))
+        self.reduce = nn.Sequential(nn.Linear(2 * SPREAD + NUMBERS + 2 + AHEAD, widths[0]), nn.SiLU())
         self.first = _block(widths[0], widths[0])
         self.down = nn.ModuleList(
             nn.Sequential(_block(a, b, 2), _block(b, b)) for a, b in zip(widths[:-1], widths[1:], strict=True)
@@ -54,8 +53,10 @@ class FeatureVolume(nn.Module):
         hull = hull_distance(grid, maps.silhouette, maps.camera, far=NEAR_HULL)
         near = (hull > -NEAR_HULL).nonzero()[:, 0]
 
+        mixed = None if torch.is_grad_enabled() else self._tokens(maps)
+
         def ask(points: Tensor, hull: Tensor) -> dict[str, Tensor]:
-            return {"pooled": self._pooled(maps, surface, points, hull)}
+            return {"pooled": self._pooled(maps, mixed, surface, points, hull)}
 
         pooled = in_rows(ask, grid[near], hull[near])["pooled"]
         x = pooled.new_zeros(len(grid), pooled.shape[1]).index_copy(0, near, pooled)
@@ -75,14 +76,24 @@ class FeatureVolume(nn.Module):
             x = up(finer + coarse)
         return self.out(x)
 
-    def _pooled(self, maps: ViewMaps, surface: Tensor, points: Tensor, hull: Tensor) -> Tensor:
-        gathered, _ = gather_views(maps.tokens, points, maps.camera)
-        numbers, weight, summary = summarize_views(maps.images, maps.camera, points, None, None)
-        mixed = self.mix(torch.cat([gathered, numbers], -1))
-        mean = (mixed * weight[..., None]).sum(1)
-        spread = ((mixed - mean[:, None]).square() * weight[..., None]).sum(1)
+    def _tokens(self, maps: ViewMaps) -> Tensor:
+        """What the first layer makes of the tokens: bilinear weights sum to 1, so it may come before the look-up."""
+        first = linear_of(self.mix, 0)
+        return functional.linear(maps.tokens, first.weight[:, :-NUMBERS], first.bias)
+
+    def _pooled(self, maps: ViewMaps, tokens: Tensor | None, surface: Tensor, points: Tensor, hull: Tensor) -> Tensor:
+        first, last = linear_of(self.mix, 0), linear_of(self.mix, 2)
+        if tokens is not None:
+            layers = tokens, first.weight[:, -NUMBERS:].T, last.weight.T, last.bias
+            pooled, summary = spread_views(maps.images, *layers, maps.camera, points)
+        else:
+            gathered, _ = gather_views(maps.tokens, points, maps.camera)
+            numbers, weight, summary = summarize_views(maps.images, maps.camera, points, None, None)
+            mixed = self.mix(torch.cat([gathered, numbers], -1))
+            mean = (mixed * weight[..., None]).sum(1)
+            pooled = torch.cat([mean, ((mixed - mean[:, None]).square() * weight[..., None]).sum(1)], -1)
         rest = torch.stack([(hull / HULL_SCALE).clamp(-2, 2), torch.full_like(hull, 1.0 / len(maps.images))], -1)
-        return self.reduce(torch.cat([mean, spread, summary, rest, ahead_of_surface(surface, maps, points)], -1))
+        return self.reduce(torch.cat([pooled, summary, rest, ahead_of_surface(surface, maps, points)], -1))
 
     def sample(self, volume: Tensor, points: Tensor) -> Tensor:
         """Trilinear values ``(N, F)`` of a ``volume`` at ``points (N, 3)``; outside, its border's."""

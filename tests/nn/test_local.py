@@ -10,6 +10,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from reli3d.geometry.camera import Camera, image_plane, look_at, project
 from reli3d.geometry.hull import mask_distance
+from reli3d.geometry.projection import spread_views
 from reli3d.geometry.symmetry import MirrorPlane
 from reli3d.nn.light_map import LightMap, gathered, texel_of
 from reli3d.nn.local import LocalReconstructor, PixelMaps, mean_logit
@@ -266,6 +267,30 @@ def test_the_fused_pass_is_the_one_that_trains(model):
     torch.testing.assert_close(got.numbers[:, :9], want.numbers[:, :9].detach(), rtol=0, atol=5e-5)
     # the root of a difference of squares: 1e-3 where the views agree
     torch.testing.assert_close(got.numbers[:, 9], want.numbers[:, 9].detach(), rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("views", [1, 5])
+def test_the_volume_of_inference_is_the_one_that_trains(model, views):
+    """Two layers and their spread over the views in one kernel, against torch's operations, which have the gradient."""
+    images, masks, c2w, intrinsics = sphere(views)
+    want = encoded(model, images, masks, c2w, intrinsics)
+    with torch.no_grad():
+        got = encoded(model, images, masks, c2w, intrinsics)
+    assert want.volume.requires_grad
+    wanted = want.volume.detach()
+    assert wanted.std() > 0.05
+    # sums of 32 float32 terms in another order, through six convolutions
+    torch.testing.assert_close(got.volume, wanted, rtol=0, atol=1e-4 * float(wanted.abs().max()))
+
+
+def test_layers_of_other_widths_than_the_kernel_has_are_refused():
+    images, points = torch.rand(2, 8, 8, 4), torch.rand(5, 3)
+    camera = Camera(torch.eye(4).expand(2, 4, 4).contiguous(), torch.tensor([[8.0, 8, 4, 4]] * 2), 8, 8)
+    layers = [torch.rand(2, 4, 4, 32), torch.rand(9, 32), torch.rand(32, 24), torch.rand(24)]
+    wrong = {"tokens": (2, 4, 4, 16), "mix": (8, 32), "last": (32, 16), "bias": (8,)}
+    for k, (name, shape) in enumerate(wrong.items()):
+        with pytest.raises(ValueError, match=f"{name}: expected shape"):
+            spread_views(images, *layers[:k], torch.rand(shape), *layers[k + 1 :], camera, points)
 
 
 def test_the_volume_is_read_where_it_was_written():

@@ -93,7 +93,11 @@ def seen_from(points, normal):
     pooled, _ = projection.pool_views(images, tokens, mix, camera, points, visible.float(), normal)
     pixels = uniform(3, 3, 8, 8, 4, seed=6).to(points)
     fused = projection.fuse_views(images, pixels, camera, points, visible.float(), normal)
-    return visible, own, share, total, pooled, *fused
+    layers = [
+        uniform(*shape, seed=7 + k).to(points) for k, shape in enumerate([(3, 8, 8, 32), (9, 32), (32, 24), (24,)])
+    ]
+    spread, _ = projection.spread_views(images, *layers, camera, points)
+    return visible, own, share, total, pooled, *fused, spread
 
 
 def hulls(masks, points):
