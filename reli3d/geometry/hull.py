@@ -83,6 +83,38 @@ def hull_distance(points: Tensor, distance: Tensor, camera: Camera, *, far: floa
     return hull
 
 
+def mirror_miss(
+    points: Tensor, known: Tensor, normal: Tensor, offset: Tensor, most: float, distance: Tensor, camera: Camera
+) -> Tensor:
+    """How far outside the visual hull each ray's best point lies when planes mirror it, ``(P, R)``, at most ``most``.
+
+    points: ``(R, D, 3)``, D along each ray.  known: ``(R, D)`` bool, which of them count; a ray without any gets
+    ``most``.  normal: ``(P, 3)`` unit, offset: ``(P,)``, of P planes.  most: at least 0, else ValueError, world units.
+    The other arguments are those of :func:`hull_distance`.  No gradient.
+    """
+    check("points", points, last=3)
+    check("normal", normal, last=3, like=points)
+    check("offset", offset, like=points)
+    if points.ndim != 3 or tuple(known.shape) != points.shape[:2] or known.dtype != torch.bool:
+        raise ValueError(
+            f"points, known: expected (R, D, 3) and (R, D) bool, got {tuple(points.shape)} and "
+            f"{tuple(known.shape)} {known.dtype}"
+        )
+    if normal.ndim != 2 or tuple(offset.shape) != normal.shape[:1]:
+        raise ValueError(f"normal, offset: expected (P, 3) and (P,), got {tuple(normal.shape)}, {tuple(offset.shape)}")
+    if known.device != points.device:
+        raise ValueError(f"known: expected it on {points.device}, got {known.device}")
+    if not most >= 0.0:
+        raise ValueError(f"most: expected at least 0, got {most}")
+    _check_views(points, distance, camera)
+    miss = points.new_empty(len(normal), len(points))
+    rays = [(points.detach().contiguous(), wp.vec3), (known.contiguous(), wp.bool)]
+    planes = [(normal.detach().contiguous(), wp.vec3), (offset.detach().contiguous(), wp.float32)]
+    inputs = [*rays, *planes, float(most), *_views(distance, camera), (miss, wp.float32)]
+    launch(kernels.mirror_miss_kernel, miss.numel(), inputs, points.device)
+    return miss
+
+
 def hull_span(origins: Tensor, directions: Tensor, radius: float, distance: Tensor, camera: Camera) -> Tensor:
     """Where rays enter the visual hull first and leave it last, ``(N, 2)``, in lengths of their ``directions``.
 

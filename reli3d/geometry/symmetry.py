@@ -17,7 +17,7 @@ from torch.nn import functional
 
 from reli3d._bridge import check
 from reli3d.geometry.camera import Camera, check_camera
-from reli3d.geometry.hull import hull_distance, hull_span
+from reli3d.geometry.hull import hull_distance, hull_span, mirror_miss
 
 RAYS, DEPTHS = 96, 16  # rays of a view, and points along each, at which hulls are compared
 ANGLES, OFFSETS = 60, 7  # planes of the first search
@@ -33,7 +33,7 @@ UNKNOWN = 0.05  # share of the rays that may have no point in the hull: else mas
 ROUND = 0.95  # share of the planes from which on the object is one of revolution
 FEWEST = 3  # views: two silhouettes agree with many planes
 FARTHEST = 50.0  # from the middle of the cameras, in their greatest distance from it: farther off there is no object
-BLOCK = 64  # planes that are asked together
+FAR = 0.1  # of the longest side: rays that miss by more count as much
 ROLL = 0.17  # root mean square [rad] by which cameras may be rolled about their axes: else there is no upright
 APART = 0.2  # rms sine between the cameras' horizontal axes, below which nothing tells what is upright
 
@@ -95,10 +95,9 @@ def mirror_plane(distance: Tensor, camera: Camera) -> MirrorPlane | None:
         """Planes at these angles [rad] and offsets [sizes] from the centre: mean miss and share of lost pixels."""
         normals = torch.outer(angle.cos(), first) + torch.outer(angle.sin(), second)
         away = normals @ centre + size * offset
-        blocks = zip(normals.split(BLOCK), away.split(BLOCK), strict=True)
         some, within = points[::every, ::every], known[::every, ::every]
-        miss = torch.cat([_miss(some, within, distance, camera, n, a) for n, a in blocks]) / size
-        return miss.clamp(max=0.1).mean(1), (miss > LOST).float().mean(1)
+        miss = mirror_miss(some, within, normals, away, FAR * size, distance, camera) / size
+        return miss.mean(1), (miss > LOST).float().mean(1)
 
     angles = torch.arange(ANGLES, device=up.device) * (math.pi / ANGLES)
     offsets = torch.linspace(-REACH, REACH, OFFSETS, device=up.device)
@@ -175,14 +174,3 @@ def _hull_points(distance: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
     within = hull_distance(points.reshape(-1, 3), distance, camera).view(depth.shape)
     pixel = (points - origin[:, None]).norm(dim=2).mean() / camera.intrinsics[:, 0].mean()
     return points, within > -pixel
-
-
-def _miss(points: Tensor, known: Tensor, distance: Tensor, camera: Camera, normal: Tensor, offset: Tensor) -> Tensor:
-    """How far each ray's best point lies outside the hull mirrored at each plane, ``(P, R)``.
-
-    normal: ``(P, 3)``.  offset: ``(P,)``.  The hull's own points are mirrored, which is the same.
-    """
-    flat, normal = points.reshape(-1, 3), normal[:, None]
-    mirrored = flat - 2.0 * ((normal * flat).sum(-1) - offset[:, None])[..., None] * normal
-    within = hull_distance(mirrored.reshape(-1, 3), distance, camera).view(-1, *known.shape)
-    return (-torch.where(known, within, within.new_tensor(-math.inf)).amax(-1)).clamp(min=0.0)

@@ -278,6 +278,38 @@ def hull_distance_kernel(
 
 
 @wp.kernel
+def mirror_miss_kernel(
+    start: int,
+    # in
+    points: wp.array2d[wp.vec3],  # (R, D) along rays
+    known: wp.array2d[bool],  # (R, D) whether the point lies in the hull
+    normal: wp.array[wp.vec3],  # (P,) of planes, unit
+    offset: wp.array[float],  # (P,)
+    most: float,
+    distance: wp.array3d[float],
+    c2w: wp.array[wp.mat44],
+    intrinsics: wp.array[wp.vec4],
+    # out
+    miss: wp.array2d[float],  # (P, R)
+):
+    """How far the mirror image of a ray's best known point lies outside the hull, at most ``most``; a point that is
+    farther outside than the best so far is not measured."""
+    i = start + wp.tid()
+    plane = i // points.shape[0]
+    ray = i % points.shape[0]
+    n = normal[plane]
+    best = wp.float32(-most)
+    k = wp.int32(0)
+    while k < points.shape[1] and best < 0.0:
+        if known[ray, k]:
+            p = points[ray, k]
+            mirrored = p - 2.0 * (wp.dot(n, p) - offset[plane]) * n
+            best = wp.max(best, distance_to_hull(mirrored, distance, c2w, intrinsics, -best))
+        k += 1
+    miss[plane, ray] = wp.max(-best, 0.0)
+
+
+@wp.kernel
 def hull_span_kernel(
     start: int,
     # in

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from reli3d import pipeline
 from reli3d.geometry.camera import Camera
-from reli3d.geometry.hull import hull_distance, hull_span, mask_distance
+from reli3d.geometry.hull import hull_distance, hull_span, mask_distance, mirror_miss
 from reli3d.nn.field import bound_level
 from reli3d.nn.local import LocalField
 from reli3d.nn.presets import SMALL
@@ -132,6 +132,52 @@ def test_only_what_is_far_outside_may_differ_where_far_is_given(device):
     near = whole >= -0.3
     assert torch.equal(got[near], whole[near]) and bool((got[~near] < -0.3).all())
     assert int((got != whole).sum()) > 500, "views are left out"
+
+
+def mirrored_rays(device):
+    """Points along rays, which of them count, and planes of which some leave the ball of :func:`sphere_views`."""
+    generator = torch.Generator().manual_seed(3)
+    points = torch.rand(60, 5, 3, generator=generator) * 0.8 - 0.4
+    known = torch.rand(60, 5, generator=generator) > 0.4
+    known[0] = False
+    normal = torch.nn.functional.normalize(torch.randn(30, 3, generator=generator), dim=-1)
+    offset = torch.rand(30, generator=generator) - 0.5
+    return [t.to(device) for t in (points, known, normal, offset)]
+
+
+def test_how_far_mirrored_rays_miss_the_hull(device):
+    """Against the distance to the cones of sight in float64, with every point measured."""
+    masks, camera = sphere_views(device)
+    points, known, normal, offset = mirrored_rays(device)
+    got = mirror_miss(points, known, normal, offset, 0.2, mask_distance(masks), camera).cpu().double()
+    flat, n = points.cpu().double().reshape(-1, 3), normal.cpu().double()[:, None]
+    mirrored = flat - 2.0 * ((flat * n).sum(-1) - offset.cpu().double()[:, None])[..., None] * n
+    inside = cone_distance(mirrored.reshape(-1, 3), camera.c2w.cpu()).view(30, 60, 5)
+    want = (-torch.where(known.cpu(), inside, -math.inf).amax(-1)).clamp(0.0, 0.2)
+    assert bool((got[:, 0] == torch.tensor(0.2).double()).all())  # a ray of which nothing is known
+    shown = want < 0.05  # as in test_sphere_seen_by_eight_cameras: farther off the axis distances stretch
+    assert shown[:, 1:].sum() > 200 and int((want == 0).sum()) > 100
+    assert float((got - want)[shown].abs().max()) < 0.001 + 0.05 * 0.06
+    assert bool((got[want > 0.19] > 0.18).all())
+
+
+@pytest.mark.parametrize(
+    "name, value",
+    [
+        ("points", torch.zeros(60, 3)),
+        ("known", torch.ones(60, 4, dtype=torch.bool)),
+        ("known", torch.ones(60, 5)),
+        ("offset", torch.zeros(29)),
+        ("most", -0.1),
+        ("most", math.nan),
+    ],
+)
+def test_wrong_rays_and_planes_are_named(name, value):
+    masks, camera = sphere_views("cpu", size=16)
+    points, known, normal, offset = mirrored_rays("cpu")
+    inputs = dict(points=points, known=known, normal=normal, offset=offset, most=0.2) | {name: value}
+    with pytest.raises(ValueError, match=name):
+        mirror_miss(**inputs, distance=mask_distance(masks), camera=camera)
 
 
 def test_rays_enter_and_leave_the_cones_of_sight(device):

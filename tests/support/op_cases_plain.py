@@ -104,7 +104,11 @@ def hulls(masks, points):
     camera = rig(points.device)
     distance = hull.mask_distance(masks)
     span = hull.hull_span(3.0 * points, -points, 1.0, distance, camera)
-    return distance, hull.hull_distance(points, distance, camera), span
+    rays = points.reshape(1, -1, 3)
+    known = torch.ones(rays.shape[:2], dtype=torch.bool, device=points.device)
+    normal, offset = points.new_tensor([[1.0, 0.0, 0.0]]), points.new_tensor([0.1])
+    miss = hull.mirror_miss(rays, known, normal, offset, 0.5, distance, camera)
+    return distance, hull.hull_distance(points, distance, camera), span, miss
 
 
 def hull_masks():
