@@ -49,6 +49,7 @@ _TORCH = {
     wp.vec2: (torch.float32, (2,)),
     wp.vec3: (torch.float32, (3,)),
     wp.vec4: (torch.float32, (4,)),
+    wp.vec4d: (torch.float64, (4,)),
     wp.mat33: (torch.float32, (3, 3)),
     wp.mat44: (torch.float32, (4, 4)),
 }

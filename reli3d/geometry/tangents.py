@@ -10,10 +10,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import torch
+import warp as wp
 from torch import Tensor
 
-from reli3d._bridge import check, expect, present
+from reli3d._bridge import check, expect, launch, present
 from reli3d.geometry.mesh import Mesh, weld_rows
+from reli3d.kernels.tangents import corner_shares_kernel
 
 PARALLEL = 1.0e-12  # length of a projected direction, relative, below which it has no direction in float64
 
@@ -43,23 +45,15 @@ def vertex_tangents(mesh: Mesh) -> Tensor:
         raise ValueError("mesh.normals: expected a tensor, got None (see Mesh.with_normals)")
     if mesh.uv is None:
         raise ValueError("mesh.uv: expected a tensor, got None (see unwrap)")
-    corners = mesh.faces.long().T.contiguous()  # vectors are columns: torch sums a short last axis slowly
-    vertices, uv, normals = (x.detach().double().T.contiguous() for x in (mesh.vertices, mesh.uv, mesh.normals))
-    p, n = [vertices[:, c] for c in corners], _unit(normals)[0]
-    s, t = (uv[:, c] - uv[:, corners[0]] for c in corners[1:])
-    area = s[0] * t[1] - s[1] * t[0]  # v is down: a face that is not mirrored is clockwise here
-    along_u = _unit((t[1] * (p[1] - p[0]) - s[1] * (p[2] - p[0])) * area.sign())[0]
-    same = _merged(mesh)
-    count = len(mesh.vertices)
-    side = same[corners] + torch.where(area < 0, 0, count)  # two accumulators a vertex: plain, mirrored
-    total = torch.zeros(2 * count, 4, dtype=torch.float64, device=n.device)
-    for k in range(3):
-        normal = n[:, corners[k]]
-        e1 = _unit(_flat(p[(k + 1) % 3] - p[k], normal))[0]
-        e2 = _unit(_flat(p[(k + 2) % 3] - p[k], normal))[0]
-        angle = torch.acos((e1 * e2).sum(0).clamp(-1.0, 1.0)) * (area != 0)
-        share = torch.cat([_unit(_flat(along_u, normal))[0] * angle, angle[None]])
-        total.index_add_(0, side[k], share.T.contiguous())
+    vertices, uv, normals = (x.detach().contiguous() for x in (mesh.vertices, mesh.uv, mesh.normals))
+    same, count = _merged(mesh), len(mesh.vertices)
+    share = torch.empty(3, len(mesh.faces), 4, dtype=torch.float64, device=vertices.device)
+    side = torch.empty(3, len(mesh.faces), dtype=torch.int32, device=vertices.device)
+    ins = [(vertices, wp.vec3), (normals, wp.vec3), (uv, wp.vec2), (mesh.faces.contiguous(), wp.int32)]
+    outs = [(same.int(), wp.int32), (share, wp.vec4d), (side, wp.int32)]
+    launch(corner_shares_kernel, len(mesh.faces), [*ins, *outs], vertices.device)
+    total = share.new_zeros(2 * count, 4).index_add_(0, side.flatten(), share.flatten(0, 1))  # plain, mirrored
+    n = _unit(normals.double().T.contiguous())[0]  # vectors are columns: torch sums a short last axis slowly
     plain, mirrored = total[:count][same].T, total[count:][same].T
     flip = mirrored[3] > plain[3]
     tangent, length = _unit(torch.where(flip, mirrored, plain)[:3])

@@ -104,10 +104,9 @@ def hulls(masks, points):
     camera = rig(points.device)
     distance = hull.mask_distance(masks)
     span = hull.hull_span(3.0 * points, -points, 1.0, distance, camera)
-    rays = points.reshape(1, -1, 3)
-    known = torch.ones(rays.shape[:2], dtype=torch.bool, device=points.device)
-    normal, offset = points.new_tensor([[1.0, 0.0, 0.0]]), points.new_tensor([0.1])
-    miss = hull.mirror_miss(rays, known, normal, offset, 0.5, distance, camera)
+    known = torch.ones(len(points), 1, dtype=torch.bool, device=points.device)
+    normal, offset = points.new_tensor([[1.0, 0.0, 0.0]]), points.new_tensor([0.9])  # to where the hull is not
+    miss = hull.mirror_miss(points[:, None], known, normal, offset, 9.0, distance, camera)
     return distance, hull.hull_distance(points, distance, camera), span, miss
 
 
