@@ -39,8 +39,6 @@ _LOADING = threading.Lock()  # Warp has none: it would be started, and a module 
 
 _TORCH = {
     wp.float32: (torch.float32, ()),
-    wp.float16: (torch.float16, ()),
-    wp.bfloat16: (torch.bfloat16, ()),
     wp.int16: (torch.int16, ()),
     wp.int32: (torch.int32, ()),
     wp.int64: (torch.int64, ()),

@@ -95,15 +95,13 @@ def mirror_miss(
     check("points", points, last=3)
     check("normal", normal, last=3, like=points)
     check("offset", offset, like=points)
-    if points.ndim != 3 or tuple(known.shape) != points.shape[:2] or known.dtype != torch.bool:
+    check("known", known, like=points, dtype=torch.bool)
+    if points.ndim != 3 or known.shape != points.shape[:2]:
         raise ValueError(
-            f"points, known: expected (R, D, 3) and (R, D) bool, got {tuple(points.shape)} and "
-            f"{tuple(known.shape)} {known.dtype}"
+            f"points, known: expected (R, D, 3) and (R, D), got {tuple(points.shape)}, {tuple(known.shape)}"
         )
     if normal.ndim != 2 or tuple(offset.shape) != normal.shape[:1]:
         raise ValueError(f"normal, offset: expected (P, 3) and (P,), got {tuple(normal.shape)}, {tuple(offset.shape)}")
-    if known.device != points.device:
-        raise ValueError(f"known: expected it on {points.device}, got {known.device}")
     if not most >= 0.0:
         raise ValueError(f"most: expected at least 0, got {most}")
     _check_views(points, distance, camera)
