@@ -27,7 +27,7 @@ class Prepared:
     batch: ViewBatch
     images: Tensor  # (V, D, D, 4) sRGB and signed silhouette distance
     camera: Camera  # of ``images``
-    mirrored: int = 0  # how many of the last views are mirror images
+    mirrored: int = 0  # how many of the last views are mirror images of the first ones, in order
 
     def with_mirror(self, plane: MirrorPlane) -> Prepared:
         """Twice as many views: each is also a view of the other half of an object that ``plane`` mirrors."""

@@ -88,18 +88,21 @@ def evaluate(
 ) -> dict[str, float]:
     """Figures of one object reconstructed from the first ``count`` views, at most all but ``UNSEEN``; colours are
     compared where truth and result are seen.  symmetry: of :class:`~reli3d.pipeline.ReconstructOptions`.
+    Raises ValueError for more views.
 
     ``*_mse`` are square errors of the base colour, ``single_*`` those of the best single colour of this very object.
     ``empty`` is 1 where the field has no surface: IoU 0 and nothing else to compare.  Without a pixel that both cover
     there are no colours.
     """
+    last = len(sample["c2w"])
+    if not 1 <= count <= last - UNSEEN:
+        raise ValueError(f"count: expected 1 to {last - UNSEEN} of {last} views, got {count}")
     try:
         options = ReconstructOptions(texture_size=512, symmetry=symmetry)
         asset = reconstruct(sample_views(sample, count), weights=model, options=options)
     except NoSurface:
         return {"empty": 1.0, "iou": 0.0}
     scene, size = RayScene(asset.mesh.vertices, asset.mesh.faces), sample["images"].shape[1]
-    last = len(sample["c2w"])
     chosen = range(last - UNSEEN, last)
     cameras = [Camera(sample["c2w"][i], sample["intrinsics"][i], size, size) for i in chosen]
     ious, got_all, want_all = [], [], []

@@ -17,7 +17,7 @@ from reli3d._bridge import check, expect, launch, present
 from reli3d.geometry.mesh import Mesh, weld_rows
 from reli3d.kernels.tangents import corner_shares_kernel
 
-PARALLEL = 1.0e-12  # length of a projected direction, relative, below which it has no direction in float64
+PARALLEL = 1.0e-12  # length of a projected direction below which it has no direction in float64
 
 
 def _unit(v: Tensor) -> tuple[Tensor, Tensor]:

@@ -4,7 +4,7 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
 
-PARALLEL = wp.constant(wp.float64(1.0e-12))  # length of a projected direction below which it has none
+PARALLEL = wp.constant(wp.float64(1.0e-12))  # as in geometry.tangents
 ZERO = wp.constant(wp.float64(0.0))
 ONE = wp.constant(wp.float64(1.0))
 
@@ -35,7 +35,7 @@ def corner_shares_kernel(
     same: wp.array[wp.int32],
     # out
     share: wp.array2d[wp.vec4d],  # (3, F) direction of +u at the corner times its angle; the angle
-    side: wp.array2d[wp.int32],  # (3, F) ``same`` of the vertex, plus the number of vertices in a plain face
+    side: wp.array2d[wp.int32],  # (3, F) ``same`` of the vertex, plus the number of vertices unless the face is plain
 ):
     f = start + wp.tid()
     a = uv[faces[f, 0]]

@@ -141,13 +141,14 @@ class LocalReconstructor(nn.Module):
         """In which its large convolutions compute."""
         return torch.bfloat16 if self.pyramid.in_bfloat16 else torch.float32
 
-    def to_compute(self, dtype: torch.dtype) -> None:
+    def to_compute(self, dtype: torch.dtype) -> LocalReconstructor:
         """Have the convolutions over pictures and space compute in float32 or bfloat16; parameters and results stay
         float32.  Raises ValueError for another dtype.
         """
         if dtype not in (torch.float32, torch.bfloat16):
             raise ValueError(f"dtype: expected float32 or bfloat16, got {dtype}")
         self.pyramid.in_bfloat16 = self.volume.in_bfloat16 = dtype == torch.bfloat16
+        return self
 
     def encode(
         self,
@@ -165,8 +166,8 @@ class LocalReconstructor(nn.Module):
         images: ``(V, S, S, 3)`` sRGB in [0, 1], straight.  masks: ``(V, S, S)``.  c2w: ``(V, 4, 4)`` OpenGL.
         intrinsics: ``(V, 4)`` pixels of ``images``.  detail: ``(V, D, D, 4)`` sRGB and signed distance to the
         silhouette in pixels, from which colours are read; its intrinsics.  mirrored: how many of the last views are
-        the first ones flipped left to right, seen by mirrored cameras: they tell the shape and the paint, not the
-        light.  Gradients reach every parameter.
+        the first ones in order, flipped left to right, seen by mirrored cameras: they tell the shape and the paint,
+        not the light.  Gradients reach every parameter.  Raises ValueError where they are more than half.
         """
         features, pixels, camera = self.read_pixels(images, masks, c2w, intrinsics, detail, detail_intrinsics, mirrored)
         color, mask = shown_pixels(images, masks, camera)
@@ -195,6 +196,8 @@ class LocalReconstructor(nn.Module):
         of half of it, and the cameras of these.  Mirror images are not read: their maps are those of the photographs,
         flipped.
         """
+        if not 0 <= 2 * mirrored <= len(images):
+            raise ValueError(f"mirrored: expected at most half of the {len(images)} views, got {mirrored}")
         taken = len(images) - mirrored
         camera = Camera(c2w, intrinsics, *images.shape[2:0:-1])
         read = camera[:taken]

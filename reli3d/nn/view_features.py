@@ -27,7 +27,7 @@ ROUNDING = 1e-4  # of interpolated 0 and 1
 @dataclass(frozen=True)
 class ViewMaps:
     """Posed maps of one object: ``tokens (V, P, P, C)``, ``images (V, S, S, 4)`` = sRGB and signed silhouette
-    distance in pixels.  The last ``mirrored`` views are mirror images of others.
+    distance in pixels.  The last ``mirrored`` views are mirror images of the first ones, in order.
     """
 
     tokens: Tensor

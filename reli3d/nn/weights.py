@@ -229,9 +229,9 @@ def load(
 
     preset: what the file must hold; default the one in its header.  trunk: dtype of the trunk's parameters, or in
     which the convolutions of the small network compute; default :func:`default_trunk`, ``auto`` is
-    :func:`~reli3d.nn.precision.fastest`; the rest is float32.  A tensor that is
-    stored in the dtype asked for stays mapped from the file on a CPU: it takes memory when it is read.  Names, shapes,
-    length and, where given, the hash are checked before anything is allocated.
+    :func:`~reli3d.nn.precision.fastest`.  All other parameters are float32.  A tensor that is stored in the dtype
+    asked for stays mapped from the file on a CPU: it takes memory when it is read.  Names, shapes, length and, where
+    given, the hash are checked before anything is allocated.
     Raises WeightsError.
     """
     manifest = read_manifest(path)
@@ -243,6 +243,8 @@ def load(
             raise WeightsError(path, f"expected SHA-256 {expected_sha256}, got {found}; fetch it again")
     if trunk == "auto":
         trunk = fastest(device)
+    if isinstance(preset, LocalPreset) and trunk not in (None, torch.float32, torch.bfloat16):
+        raise WeightsError(path, f"expected float32 or bfloat16 for the network of convolutions, got {trunk}")
     with torch.device("meta"):
         model = network(preset)
         model.to_compute(trunk or default_trunk(preset, device))
