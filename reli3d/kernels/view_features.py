@@ -211,7 +211,7 @@ def spread_views_kernel(
 ):
     """Both layers of every view, and mean and spread of the second, in one pass.
 
-    The first is that of pool_views_kernel, written out again: in a function that both call, both take longer, 1.3 and 1.7
+    The first is that of pool_views_kernel, written out again: with a function that both call they take 1.3 and 1.7
     times as long on a Xeon with AMX.
     """
     n = start + wp.tid()
