@@ -135,7 +135,7 @@ def maps_loss(
 
 
 def fading(progress: float, settled: bool) -> float:
-    """Share of the full rate: the end of each of the two parts has small steps."""
+    """Share of the full rate: it falls from 0.6 of a part on, and once more from 1 after the paint."""
     since = (progress - PAINT_UNTIL) / (1.0 - PAINT_UNTIL) if settled else (progress - 0.6) / 0.4
     return 1.0 - 0.9 * min(max(since, 0.0), 1.0)
 
