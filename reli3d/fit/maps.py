@@ -109,7 +109,7 @@ def maps_loss(
 ) -> Tensor:
     """Loss of one step over ``rows`` of the pixels, with gradients to material, detail, bend, light and exposure.
 
-    bend: weight of the squared bend of the normals, over ``views``.
+    bend: weight of the squared bend of the normals.
     """
     position, view, target = pixels.position[rows], pixels.view[rows], pixels.target[rows]
     change = material_change(unknowns, position)
@@ -126,7 +126,7 @@ def maps_loss(
     loss = weights.picture * losses.display_error(image, other, target, target > WHITE)
     loss = loss + weights.palette * losses.palette(points.base_color.clamp(min=losses.DARK).log(), target)
     loss = loss + losses.priors(unknowns, weights, views) + losses.near_paint(change[:, :3], weights, views)
-    loss = loss + bend / views * turned.square().sum(1).mean()
+    loss = loss + bend * turned.square().sum(1).mean()
     if weights.demodulation:
         bright = other.detach().mean(1) / points.base_color.detach().mean(1).clamp(min=0.02)
         shading = bright.clamp(min=1e-3).log()

@@ -26,6 +26,7 @@ ROUGHEST, SMOOTHEST = 1.0, 0.05  # roughness: below, a lobe is narrower than the
 MATERIAL_GRIDS = (4, 8, 16, 32)  # points along a side of the box
 FINISH_GRIDS = 2  # how many of them roughness and metallic take part in: photographs tell little of them
 START_GRID = 32
+MOST_BENT = 0.3  # 17 degrees
 BEND_GRIDS = (8, 16, 32, 64)  # finer than the paint's: what it takes must not be left to them
 LIGHT_ROWS = 32
 LIGHT_MAPS = (4, 8, 16, 32)
@@ -124,8 +125,12 @@ def material_change(unknowns: Unknowns, position: Tensor) -> Tensor:
 
 
 def bent(unknowns: Unknowns, position: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
-    """Shading normals ``(N, 3)`` that ``normal`` becomes at ``position``, unit, and what was added ``(N, 3)``."""
+    """Shading normals ``(N, 3)`` that ``normal`` becomes at ``position``, unit, and what was added ``(N, 3)``.
+
+    What is added is shorter than ``MOST_BENT``: a normal that may turn away from the light explains black paint.
+    """
     bend = space_field(unknowns.bend, position)
+    bend = bend / (1.0 + (bend.square().sum(1, keepdim=True) / MOST_BENT**2)).sqrt()
     return unit(normal + bend), bend
 
 

@@ -1,5 +1,6 @@
 """Bent shading normals: they take the errors that would be painted on, and only what is held is kept."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -10,7 +11,7 @@ from reli3d.fit.budget import Budget
 from reli3d.fit.losses import Weights
 from reli3d.fit.photographs import Photographs
 from reli3d.fit.transfer import changed
-from reli3d.fit.unknowns import Start, Unknowns, bent
+from reli3d.fit.unknowns import MOST_BENT, Start, Unknowns, bent
 from reli3d.geometry.bake import interpolate, rasterize_texels
 from reli3d.render.gbuffer import surface_points
 from tests.support import small_scene
@@ -69,9 +70,19 @@ def test_the_bend_is_written_into_the_normal_map(start):
     got = surface_points(
         asset.mesh, asset.textures, found.face.reshape(-1)[index], found.bary.reshape(-1, 2)[index]
     ).normal
-    want = torch.nn.functional.normalize(plain + torch.tensor([0.3, 0.0, 0.0]), dim=-1)
+    length = 0.3 / math.sqrt(1.0 + (0.3 / MOST_BENT) ** 2)
+    want = torch.nn.functional.normalize(plain + torch.tensor([length, 0.0, 0.0]), dim=-1)
     assert torch.allclose(bent(unknowns, position, plain)[0], want, atol=1e-6)
     assert float((got - want).norm(dim=1).median()) < 0.01  # 8 bits hold a direction to 0.004
+
+
+def test_no_bend_turns_a_normal_away():
+    # a normal that may turn to the dark side explains black paint
+    unknowns = Unknowns.zero(torch.ones(2, 2, 2), VIEWS, small_scene.TEXELS)
+    unknowns.bend[0] += torch.tensor([1e3, 0.0, 0.0])
+    normal = torch.nn.functional.normalize(torch.randn(100, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
+    turned = bent(unknowns, torch.zeros(100, 3), normal)[0]
+    assert float((turned * normal).sum(1).min()) > math.cos(math.asin(MOST_BENT)) - 1e-6
 
 
 def test_an_interrupted_fit_keeps_no_free_bend(start, photographs, monkeypatch):
