@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -104,13 +104,9 @@ def maps_loss(
     samples: tuple[int, int, int],
     views: int,
     seed: int,
-    bend: float = 0.0,
     independent: bool = True,
 ) -> Tensor:
-    """Loss of one step over ``rows`` of the pixels, with gradients to material, detail, bend, light and exposure.
-
-    bend: weight of the squared bend of the normals.
-    """
+    """Loss of one step over ``rows`` of the pixels, with gradients to material, detail, bend, light and exposure."""
     position, view, target = pixels.position[rows], pixels.view[rows], pixels.target[rows]
     change = material_change(unknowns, position)
     fine = sample_texture(unknowns.detail, pixels.uv[rows])
@@ -126,7 +122,7 @@ def maps_loss(
     loss = weights.picture * losses.display_error(image, other, target, target > WHITE)
     loss = loss + weights.palette * losses.palette(points.base_color.clamp(min=losses.DARK).log(), target)
     loss = loss + losses.priors(unknowns, weights, views) + losses.near_paint(change[:, :3], weights, views)
-    loss = loss + bend * turned.square().sum(1).mean()
+    loss = loss + weights.bend * turned.square().sum(1).mean()
     if weights.demodulation:
         bright = other.detach().mean(1) / points.base_color.detach().mean(1).clamp(min=0.02)
         shading = bright.clamp(min=1e-3).log()
@@ -190,11 +186,10 @@ def fit_maps(
             pixels,
             rows,
             scene,
-            weights,
+            weights if settled else replace(weights, bend=weights.free_bend),
             samples=samples,
             views=len(views),
             seed=seed * 1_000_003 + step,
-            bend=weights.bend if settled else weights.free_bend,
         )
         optimizer.zero_grad()  # those without gradient stay as they are
         loss.backward()
