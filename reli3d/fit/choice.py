@@ -27,7 +27,7 @@ SLACK = 0.02  # dB: the noise of a comparison
 @dataclass(frozen=True)
 class Parts:
     """Shares of a fit in what is returned, 0 the start and 1 the fit: surface (0 or 1), paint (of the changes of the
-    materials' logits and of the bend of the normals), light (of the changes of log radiance)."""
+    materials' logits), light (of the changes of log radiance)."""
 
     surface: float
     paint: float
@@ -64,8 +64,8 @@ class Fitted:
         """The new surface with these shares of the other changes."""
         asset, unknowns = self.surface, self.unknowns
         if paint:
-            material, bend = ([paint * grid for grid in grids] for grids in (unknowns.material, unknowns.bend))
-            asset = changed(asset, replace(unknowns, material=material, bend=bend, detail=paint * unknowns.detail))
+            material = [paint * grid for grid in unknowns.material]
+            asset = changed(asset, replace(unknowns, material=material, detail=paint * unknowns.detail))
         if light:
             maps = [light * values for values in unknowns.light]
             asset = replace(asset, environment=environment(replace(unknowns, light=maps), self.start))

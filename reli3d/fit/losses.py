@@ -37,8 +37,6 @@ class Weights:
     light_slope: float = 2e-3  # of :func:`slopes` of the light
     exposure: float = 0.1  # of exposures, whose mean the light already has
     demodulation: float = 0.3  # of :func:`shared_pattern`
-    free_bend: float = 0.002  # of the squared bend of the normals while the paint is fitted
-    bend: float = 0.1  # the same afterwards, of the bend that is kept
 
 
 def display_slope(target: Tensor) -> Tensor:
