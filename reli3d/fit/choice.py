@@ -22,12 +22,15 @@ CHECK_PIXELS = 96  # of a photograph, a side, by which candidates are compared
 CHECK_SAMPLES = (16, 16, 4)
 STRENGTHS = tuple(math.exp(0.05 * k) for k in range(-12, 13))
 SLACK = 0.02  # dB: the noise of a comparison
+# dB that the surface alone may lose on the views used and on those held out: the masks of all views have bounded it,
+# while the start's paint and light hold shading of the start's surface
+ALONE = (0.1, 0.3)
 
 
 @dataclass(frozen=True)
 class Parts:
     """Shares of a fit in what is returned, 0 the start and 1 the fit: surface (0 or 1), paint (of the changes of the
-    materials' logits), light (of the changes of log radiance)."""
+    materials' logits and of the bend of the normals), light (of the changes of log radiance)."""
 
     surface: float
     paint: float
@@ -64,8 +67,8 @@ class Fitted:
         """The new surface with these shares of the other changes."""
         asset, unknowns = self.surface, self.unknowns
         if paint:
-            material = [paint * grid for grid in unknowns.material]
-            asset = changed(asset, replace(unknowns, material=material, detail=paint * unknowns.detail))
+            material, bend = ([paint * grid for grid in grids] for grids in (unknowns.material, unknowns.bend))
+            asset = changed(asset, replace(unknowns, material=material, bend=bend, detail=paint * unknowns.detail))
         if light:
             maps = [light * values for values in unknowns.light]
             asset = replace(asset, environment=environment(replace(unknowns, light=maps), self.start))
@@ -138,7 +141,8 @@ def decibels(errors: Tensor) -> float:
 @torch.no_grad()
 def chosen(fitted: Fitted, used: list[int], held: list[int], before: Tensor) -> tuple[Asset, Parts, Tensor]:
     """The first of ``ORDER``, of few views with less (``FEW``), that is no worse than the start on the views ``used``
-    and on those ``held`` out, else the start; its parts, and the errors ``(V,)`` of its pictures.
+    and on those ``held`` out (the surface alone: hardly worse, ``ALONE``), else the start; its parts, and the errors
+    ``(V,)`` of its pictures.
 
     used, held: indices of photographs.  before: errors ``(V,)`` of the start.  The strength of each candidate's light
     is the one that the used views show best: the fit's error is that of the display's tangent, which rises faster than
@@ -153,7 +157,12 @@ def chosen(fitted: Fitted, used: list[int], held: list[int], before: Tensor) -> 
         lit = pictures.lit(asset)
         strength = pictures.strength(lit, used) if light else 1.0
         errors = pictures.errors(lit, strength)
-        if all(decibels(errors[which]) >= decibels(before[which]) - SLACK for which in (used, held) if which):
+        slack = (SLACK, SLACK) if paint or light else ALONE
+        if all(
+            decibels(errors[which]) >= decibels(before[which]) - most
+            for which, most in zip((used, held), slack, strict=True)
+            if which
+        ):
             asset = replace(asset, environment=Environment(strength * asset.light.radiance))
             return asset, Parts(moved, paint, light), errors
     return fitted.first, NOTHING, before

@@ -29,7 +29,8 @@ class Weights:
     curvature: float = 0.01  # of :func:`curvature`
     stay: float = 2e-3  # of the level's distance from the start, over the number of views
     picture: float = 1.0  # of :func:`display_error` in the fit of the maps and the light
-    palette: float = 0.02  # of :func:`palette`
+    palette: float = 0.03  # of :func:`palette`
+    hue: float = 0.3  # of :func:`hue_drift`
     base_coarse: float = 0.02  # prior of the base colour's coarse field towards the start, over the number of views
     paint: float = 20.0  # of :func:`near_paint`, over the fourth power of the number of views whose colours are used
     finish: float = 0.05  # prior of roughness and metallic towards the start, over the number of views
@@ -37,6 +38,8 @@ class Weights:
     light_slope: float = 2e-3  # of :func:`slopes` of the light
     exposure: float = 0.1  # of exposures, whose mean the light already has
     demodulation: float = 0.3  # of :func:`shared_pattern`
+    free_bend: float = 2e-3  # of the squared bend of the normals while the paint is fitted, times the number of views
+    bend: float = 0.1  # the same afterwards, of the bend that is kept
 
 
 def display_slope(target: Tensor) -> Tensor:
@@ -139,6 +142,18 @@ def palette(color: Tensor, tint: Tensor) -> Tensor:
     alike = torch.exp(-(logs - logs.roll(1, 0)).square().sum(1) / (2.0 * TINT * TINT))
     square = (color - color.roll(1, 0)).square().mean(1)
     return (alike * square / (square + PALETTE * PALETTE)).mean()
+
+
+def hue_drift(color: Tensor, start: Tensor) -> Tensor:
+    """How far the object's mean hue has moved, squared.
+
+    color, start: ``(N, 3)`` logarithms of base colour at the same points.  One factor a channel is free between paint
+    and light: photographs do not tell a red object under white light from a white one under red light, and the other
+    terms pick one.  The start has read many objects and knows better.  The brightness is left free: a start is often
+    too dark or too bright as a whole.
+    """
+    drift = (color - start).mean(0)
+    return (drift - drift.mean()).square().mean()
 
 
 def priors(unknowns: Unknowns, weights: Weights, views: int) -> Tensor:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -15,6 +15,7 @@ from reli3d.fit.shading import radiance
 from reli3d.fit.unknowns import (
     Start,
     Unknowns,
+    bent,
     environment,
     material_change,
     material_logits,
@@ -29,9 +30,10 @@ from reli3d.render.points import SurfacePoints
 BATCH = 6144  # pixels a step
 SAMPLES = ((6, 6, 2), (12, 12, 4))  # of a pixel at the start and the end: coarse steps need no clean images
 PIXELS = 400_000  # of all photographs that are kept: 40 MB; of more, a random part
-RATES = {"material": 0.04, "detail": 0.03, "light": 0.04, "exposure": 0.01}
-OPENING = 0.15  # share of the part after which the next finer map or grid joins in
-DETAIL_FROM = 0.5
+RATES = {"material": 0.04, "detail": 0.03, "bend": 0.02, "light": 0.04, "exposure": 0.01}
+OPENING = 0.1  # share of the part after which the next finer map or grid joins in
+DETAIL_FROM = 0.35
+PAINT_UNTIL = 0.7  # of the part that fits the paint; after it the paint stays, and the bend starts anew, held more
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,7 @@ class MapsStage:
 
     name: str
     until: float  # share of the budget used at its end
-    detail: bool = True  # fit the textures, too
+    paint: bool = True  # fit the textures and the bend of the normals, too
 
 
 @dataclass(frozen=True)
@@ -104,12 +106,13 @@ def maps_loss(
     seed: int,
     independent: bool = True,
 ) -> Tensor:
-    """Loss of one step over ``rows`` of the pixels, with gradients to material, detail, light and exposure."""
+    """Loss of one step over ``rows`` of the pixels, with gradients to material, detail, bend, light and exposure."""
     position, view, target = pixels.position[rows], pixels.view[rows], pixels.target[rows]
     change = material_change(unknowns, position)
     fine = sample_texture(unknowns.detail, pixels.uv[rows])
     change = torch.cat([change[:, :3] + fine, change[:, 3:]], 1)
-    points = SurfacePoints(position, pixels.ng[rows], pixels.normal[rows], *material_of(pixels.logits[rows] + change))
+    normal, turned = bent(unknowns, position, pixels.normal[rows])
+    points = SurfacePoints(position, pixels.ng[rows], normal, *material_of(pixels.logits[rows] + change))
     light, exposure = environment(unknowns, start), unknowns.exposure.exp()[view, None]
     image = radiance(points, pixels.wo[rows], light, samples=samples, scene=scene, seed=2 * seed) * exposure
     other = image
@@ -117,13 +120,21 @@ def maps_loss(
         with torch.no_grad():
             other = radiance(points, pixels.wo[rows], light, samples=samples, scene=scene, seed=2 * seed + 1) * exposure
     loss = weights.picture * losses.display_error(image, other, target, target > WHITE)
-    loss = loss + weights.palette * losses.palette(points.base_color.clamp(min=losses.DARK).log(), target)
+    color, was = (c.clamp(min=losses.DARK).log() for c in (points.base_color, material_of(pixels.logits[rows])[0]))
+    loss = loss + weights.palette * losses.palette(color, target) + weights.hue * losses.hue_drift(color, was)
     loss = loss + losses.priors(unknowns, weights, views) + losses.near_paint(change[:, :3], weights, views)
+    loss = loss + weights.bend * turned.square().sum(1).mean()
     if weights.demodulation:
         bright = other.detach().mean(1) / points.base_color.detach().mean(1).clamp(min=0.02)
         shading = bright.clamp(min=1e-3).log()
         loss = loss + weights.demodulation * losses.shared_pattern(change[:, :3].mean(1), shading)
     return loss
+
+
+def fading(progress: float, settled: bool) -> float:
+    """Share of the full rate: it falls from 0.6 of a part on, and once more from 1 after the paint."""
+    since = (progress - PAINT_UNTIL) / (1.0 - PAINT_UNTIL) if settled else (progress - 0.6) / 0.4
+    return 1.0 - 0.9 * min(max(since, 0.0), 1.0)
 
 
 def fit_maps(
@@ -138,13 +149,18 @@ def fit_maps(
     *,
     seed: int,
 ) -> None:
-    """Fit light, exposures and materials on the surface of ``asset``, coarse parts first."""
+    """Fit light, exposures and materials on the surface of ``asset``, coarse parts first.
+
+    Errors of normals, shadows and bounced light look like paint.  While the paint is fitted the shading normals may
+    bend almost freely and take these errors.  Then the paint stays, and the bend begins again at zero, held so that it
+    takes only what many pixels ask for: this one is written into the asset.
+    """
     scene = RayScene(asset.mesh.vertices, asset.mesh.faces)
     pixels = traced(asset, scene, photographs, views, seed)
     count = len(pixels.order)
     if count == 0:
         return
-    names = ("light", "exposure", "material", *(("detail",) if stage.detail else ()))
+    names = ("light", "exposure", "material", *(("detail", "bend") if stage.paint else ()))
     groups, opens = [], []
     for which in names:
         for k, value in enumerate(unknowns.groups()[which]):
@@ -152,10 +168,15 @@ def fit_maps(
             opens.append(DETAIL_FROM if which == "detail" else OPENING * k)
             value.requires_grad_(True)
     optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99))
-    first = 0
+    first, settled = 0, False
     for step, progress in budget.part(stage.name, stage.until):
+        if stage.paint and progress >= PAINT_UNTIL and not settled:
+            settled = True
+            for value in (*unknowns.material, unknowns.detail):
+                value.requires_grad_(False)
+            unknowns.straighten()
+        fade = fading(progress, settled)
         for group, opening in zip(optimizer.param_groups, opens, strict=True):
-            fade = 1.0 if progress < 0.6 else 1.0 - 0.9 * (progress - 0.6) / 0.4
             group["lr"] = group["full"] * fade if progress >= opening else 0.0
         rows = pixels.order[torch.arange(first, first + min(BATCH, count), device=pixels.order.device) % count]
         first = (first + BATCH) % count
@@ -166,14 +187,16 @@ def fit_maps(
             pixels,
             rows,
             scene,
-            weights,
+            weights if settled else replace(weights, bend=weights.free_bend * len(views)),
             samples=samples,
             views=len(views),
             seed=seed * 1_000_003 + step,
         )
-        optimizer.zero_grad()
+        optimizer.zero_grad()  # those without gradient stay as they are
         loss.backward()
         optimizer.step()
         budget.tell(stage.name, step, float(loss.detach()))
     for group in optimizer.param_groups:
         group["params"][0].requires_grad_(False)
+    if not settled:  # interrupted
+        unknowns.straighten()

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from reli3d._bridge import present
-from reli3d.fit.unknowns import Unknowns, material_change, material_logits, material_of, unit
+from reli3d.fit.unknowns import Unknowns, bent, material_change, material_logits, material_of, unit
 from reli3d.geometry.bake import Texels, dilate, interpolate, interpolate_tangents, rasterize_texels
 from reli3d.geometry.hits import interpolate as at_hits
 from reli3d.geometry.mesh import Mesh
@@ -57,7 +57,7 @@ def dressed(mesh: Mesh, source: Asset, size: int) -> Asset:
 
 
 def changed(asset: Asset, unknowns: Unknowns) -> Asset:
-    """``asset`` with the changes of its materials written into its textures."""
+    """``asset`` with the changes of its materials and shading normals written into its textures."""
     size = asset.textures.size
     texels = rasterize_texels(asset.mesh, size)
     index = torch.nonzero(texels.valid.reshape(-1))[:, 0]
@@ -69,8 +69,9 @@ def changed(asset: Asset, unknowns: Unknowns) -> Asset:
     logits = material_logits(old) + material_change(unknowns, position)
     logits[:, :3] += sample_texture(unknowns.detail, uv)
     color, roughness, metallic = material_of(logits)
-    new = SurfacePoints(position, old.ng, old.normal, color, roughness, metallic)
-    return replace(asset, textures=_textures(asset.mesh, texels, index, new, old.normal, normal))
+    world, _ = bent(unknowns, position, old.normal)
+    new = SurfacePoints(position, old.ng, world, color, roughness, metallic)
+    return replace(asset, textures=_textures(asset.mesh, texels, index, new, world, normal))
 
 
 def _textures(

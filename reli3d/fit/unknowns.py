@@ -26,6 +26,8 @@ ROUGHEST, SMOOTHEST = 1.0, 0.05  # roughness: below, a lobe is narrower than the
 MATERIAL_GRIDS = (4, 8, 16, 32)  # points along a side of the box
 FINISH_GRIDS = 2  # how many of them roughness and metallic take part in: photographs tell little of them
 START_GRID = 32
+MOST_BENT = 0.3  # 17 degrees
+BEND_GRIDS = (8, 16, 32, 64)  # finer than the paint's: what it takes must not be left to them
 LIGHT_ROWS = 32
 LIGHT_MAPS = (4, 8, 16, 32)
 DARKEST = 1e-4  # of the start's mean radiance: its logarithm must exist
@@ -36,13 +38,15 @@ class Unknowns:
     """Everything that gradients may reach.  Lengths are those of the fit's own box, [-1, 1]^3 and what lies around.
 
     level: ``(X, Y, Z)`` negative inside.  material: grids ``(n, n, n, 5)`` over the box.  detail: ``(T, T, 3)`` base
-    colour over the atlas.  light: maps ``(h, 2h, 3)``.  exposure: ``(V,)`` logarithms.  pose: ``(V, 6)``, a rotation
-    vector [rad] and a shift in the camera's own axes.
+    colour over the atlas.  bend: grids ``(n, n, n, 3)`` over the box, added to the shading normal, which has length 1.
+    light: maps ``(h, 2h, 3)``.  exposure: ``(V,)`` logarithms.  pose: ``(V, 6)``, a rotation vector [rad] and a shift
+    in the camera's own axes.
     """
 
     level: Tensor
     material: list[Tensor]
     detail: Tensor
+    bend: list[Tensor]
     light: list[Tensor]
     exposure: Tensor
     pose: Tensor
@@ -55,6 +59,7 @@ class Unknowns:
             level.clone(),
             [torch.zeros(n, n, n, 5, device=device) for n in MATERIAL_GRIDS],
             torch.zeros(texels, texels, 3, device=device),
+            [torch.zeros(n, n, n, 3, device=device) for n in BEND_GRIDS],
             [torch.zeros(n, 2 * n, 3, device=device) for n in LIGHT_MAPS],
             torch.zeros(views, device=device),
             torch.zeros(views, 6, device=device),
@@ -63,6 +68,12 @@ class Unknowns:
     def groups(self) -> dict[str, list[Tensor]]:
         """The tensors by name."""
         return {name: value if isinstance(value, list) else [value] for name, value in vars(self).items()}
+
+    @torch.no_grad()
+    def straighten(self) -> None:
+        """No bend of any normal."""
+        for grid in self.bend:
+            grid.zero_()
 
     def clone(self) -> Unknowns:
         """A copy that shares nothing."""
@@ -111,6 +122,16 @@ def material_change(unknowns: Unknowns, position: Tensor) -> Tensor:
     both = space_field(unknowns.material[:FINISH_GRIDS], position)
     fine = space_field([grid[..., :3] for grid in unknowns.material[FINISH_GRIDS:]], position)
     return both + torch.cat([fine, torch.zeros_like(both[:, 3:])], 1)
+
+
+def bent(unknowns: Unknowns, position: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
+    """Shading normals ``(N, 3)`` that ``normal`` becomes at ``position``, unit, and what was added ``(N, 3)``.
+
+    What is added is shorter than ``MOST_BENT``: a normal that may turn away from the light explains black paint.
+    """
+    bend = space_field(unknowns.bend, position)
+    bend = bend / (1.0 + (bend.square().sum(1, keepdim=True) / MOST_BENT**2)).sqrt()
+    return unit(normal + bend), bend
 
 
 def environment(unknowns: Unknowns, start: Start) -> Environment:

@@ -63,6 +63,17 @@ def test_a_right_surface_is_taken_without_the_wrong_light_beside_it(true, photog
     assert asset.mesh is true.mesh and torch.equal(asset.light.radiance, true.light.radiance)
 
 
+def test_a_surface_alone_may_lose_a_little_of_the_held_out_view(true, photographs):
+    first = replace(small_scene.painted(small_scene.ball(squeeze=0.9)), environment=true.light)
+    fit = fitted(first, photographs, light=Environment(64.0 * true.light.radiance), surface=true)
+    before = picture_error(first, photographs)
+    _, _, errors = chosen(fit, USED, HELD, before)
+    before[HELD] = errors[HELD] * 10.0**-0.02  # 0.2 dB better than the new surface
+    assert chosen(fit, USED, HELD, before)[1] == Parts(1.0, 0.0, 0.0)
+    before[HELD] = errors[HELD] * 10.0**-0.04
+    assert chosen(fit, USED, HELD, before)[0] is first
+
+
 def test_the_light_gets_the_strength_that_the_photographs_show(true, photographs):
     first = replace(true, environment=EVEN)
     dark = Environment(0.8 * true.light.radiance)

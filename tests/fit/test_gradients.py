@@ -11,10 +11,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from reli3d.fit import shape
+from reli3d.fit import maps, shape
 from reli3d.fit.losses import Weights
 from reli3d.fit.photographs import Photographs
 from reli3d.fit.unknowns import Start, Unknowns
+from reli3d.geometry.rays import RayScene
 from tests.support import small_scene
 
 SIZE = 40
@@ -98,3 +99,31 @@ def test_a_step_has_the_slope_of_central_differences(case, monkeypatch):
         ends.append(float(loss().double()))
     want = (ends[0] - ends[1]) / (2.0 * step)
     assert got == pytest.approx(want, rel=tolerance)
+
+
+@pytest.mark.parametrize("terms", [{"picture": 1.0}, {"bend": 1.0}], ids=["picture", "prior"])
+def test_the_bend_has_the_slope_of_central_differences(terms, monkeypatch):
+    unknowns, data = scene(plain=False)
+    asset, photographs = replace(small_scene.ball(), environment=small_scene.sky()), data.photographs
+    pixels = maps.traced(asset, RayScene(asset.mesh.vertices, asset.mesh.faces), photographs, [0, 1, 2], seed=0)
+    rng = torch.Generator().manual_seed(3)
+    for grid in unknowns.bend:
+        grid += 0.1 * torch.randn(grid.shape, generator=rng)
+    directions = towards("all", unknowns.bend)
+    options = {"samples": LIGHT, "views": 3, "seed": 1, "independent": False}
+
+    def loss() -> Tensor:
+        weights = Weights(**{**NONE, **terms})
+        return maps.maps_loss(unknowns, data.start, pixels, pixels.order[:400], None, weights, **options)
+
+    for grid in unknowns.bend:
+        grid.requires_grad_(True)
+    slopes = torch.autograd.grad(loss(), unknowns.bend)
+    got = sum(float((g * d).sum()) for g, d in zip(slopes, directions, strict=True))
+    step, ends = 1e-3, []
+    with torch.no_grad():
+        for sign in (1.0, -2.0):
+            for grid, direction in zip(unknowns.bend, directions, strict=True):
+                grid += sign * step * direction
+            ends.append(float(loss().double()))
+    assert got == pytest.approx((ends[0] - ends[1]) / (2.0 * step), rel=0.02)  # float32 sums of 400 points

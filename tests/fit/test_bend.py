@@ -1,0 +1,133 @@
+"""Bent shading normals: they take the errors that would be painted on, and only what is held is kept."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from reli3d.fit import maps
+from reli3d.fit.budget import Budget
+from reli3d.fit.losses import Weights
+from reli3d.fit.photographs import Photographs
+from reli3d.fit.transfer import changed
+from reli3d.fit.unknowns import MOST_BENT, Start, Unknowns, bent
+from reli3d.geometry.bake import interpolate, rasterize_texels
+from reli3d.render.environment import Environment
+from reli3d.render.gbuffer import surface_points
+from tests.support import small_scene
+
+VIEWS, SIZE = 6, 48
+STAGE = maps.MapsStage("maps", until=1.0)
+
+
+@pytest.fixture(scope="module")
+def start():
+    """A grey ball under the true light."""
+    return replace(small_scene.ball(), environment=small_scene.sky())
+
+
+@pytest.fixture(scope="module")
+def photographs(start):
+    """Of the same ball with waves in its normal map."""
+    size = small_scene.TEXELS
+    row, column = torch.meshgrid(torch.arange(size), torch.arange(size), indexing="ij")
+    waves = torch.stack([(0.3 * column).sin(), (0.3 * row).sin(), 2.0 * torch.ones(size, size)], -1)
+    normal = 0.5 + 0.5 * torch.nn.functional.normalize(waves, dim=-1)
+    wavy = replace(start, textures=replace(start.textures, normal=normal))
+    return Photographs.of(small_scene.photographs(wavy, VIEWS, SIZE))
+
+
+def fitted(start, photographs, weights: Weights, steps: int = 40) -> Unknowns:
+    unknowns = Unknowns.zero(torch.ones(2, 2, 2), VIEWS, small_scene.TEXELS)
+    views, budget = list(range(VIEWS)), Budget(steps=steps)
+    maps.fit_maps(unknowns, Start.of(start), start, photographs, views, weights, budget, STAGE, seed=0)
+    return unknowns
+
+
+def patches(asset) -> float:
+    """Standard deviation of the logarithm of the base colour over the faces."""
+    face = torch.arange(len(asset.mesh.faces), dtype=torch.int32)
+    at = surface_points(asset.mesh, asset.textures, face, torch.full((len(face), 2), 1 / 3))
+    return float(at.base_color.log().std(0).mean())
+
+
+def test_waves_of_the_normals_are_painted_less(start, photographs):
+    # the true paint is even; weights that leave no bend are the fit without it
+    free, straight = (
+        patches(changed(start, fitted(start, photographs, weights)))
+        for weights in (Weights(palette=0.0), Weights(palette=0.0, free_bend=1e6, bend=1e6))
+    )
+    assert free < 0.9 * straight
+
+
+def hue(asset) -> torch.Tensor:
+    """Mean logarithm of the base colour ``(3,)`` without its brightness."""
+    face = torch.arange(len(asset.mesh.faces), dtype=torch.int32)
+    color = surface_points(asset.mesh, asset.textures, face, torch.full((len(face), 2), 1 / 3)).base_color.log().mean(0)
+    return color - color.mean()
+
+
+def test_a_light_of_another_colour_leaves_the_hue_of_the_paint(start, photographs):
+    # the start's paint has the true hue; its light is yellow where the photographs' is blue
+    other = replace(start, environment=Environment(start.environment.radiance * torch.tensor([1.6, 1.0, 0.5])))
+    held, free = (
+        float((hue(changed(other, fitted(other, photographs, weights))) - hue(start)).norm())
+        for weights in (Weights(), Weights(hue=0.0))
+    )
+    assert held < 0.5 * free
+
+
+def test_the_bend_is_written_into_the_normal_map(start):
+    unknowns = Unknowns.zero(torch.ones(2, 2, 2), VIEWS, small_scene.TEXELS)
+    unknowns.bend[0] += torch.tensor([0.3, 0.0, 0.0])
+    asset = changed(start, unknowns)
+    found = rasterize_texels(asset.mesh, small_scene.TEXELS)
+    index = torch.nonzero(found.valid.reshape(-1))[:, 0]
+    position, plain = interpolate(start.mesh, found, index)
+    got = surface_points(
+        asset.mesh, asset.textures, found.face.reshape(-1)[index], found.bary.reshape(-1, 2)[index]
+    ).normal
+    length = 0.3 / math.sqrt(1.0 + (0.3 / MOST_BENT) ** 2)
+    want = torch.nn.functional.normalize(plain + torch.tensor([length, 0.0, 0.0]), dim=-1)
+    assert torch.allclose(bent(unknowns, position, plain)[0], want, atol=1e-6)
+    assert float((got - want).norm(dim=1).median()) < 0.01  # 8 bits hold a direction to 0.004
+
+
+def test_no_bend_turns_a_normal_away():
+    # a normal that may turn to the dark side explains black paint
+    unknowns = Unknowns.zero(torch.ones(2, 2, 2), VIEWS, small_scene.TEXELS)
+    unknowns.bend[0] += torch.tensor([1e3, 0.0, 0.0])
+    normal = torch.nn.functional.normalize(torch.randn(100, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
+    turned = bent(unknowns, torch.zeros(100, 3), normal)[0]
+    assert float((turned * normal).sum(1).min()) > math.cos(math.asin(MOST_BENT)) - 1e-6
+
+
+def test_an_interrupted_fit_keeps_no_free_bend(start, photographs, monkeypatch):
+    tell = Budget.tell
+
+    def pressing(self, name, step, loss):
+        tell(self, name, step, loss)
+        self.interrupted = step == 5
+
+    monkeypatch.setattr(Budget, "tell", pressing)
+    unknowns = fitted(start, photographs, Weights())
+    assert unknowns.material[0].abs().max() > 0.0
+    assert all(float(grid.abs().max()) == 0.0 for grid in unknowns.bend)
+
+
+def test_the_paint_stays_while_the_kept_bend_is_fitted(start, photographs, monkeypatch):
+    tell, seen = Budget.tell, []
+
+    def looking(self, name, step, loss):
+        tell(self, name, step, loss)
+        seen.append((unknowns.material[0].clone(), unknowns.light[0].clone()))
+
+    monkeypatch.setattr(Budget, "tell", looking)
+    unknowns = Unknowns.zero(torch.ones(2, 2, 2), VIEWS, small_scene.TEXELS)
+    budget = Budget(steps=20)
+    maps.fit_maps(unknowns, Start.of(start), start, photographs, list(range(VIEWS)), Weights(), budget, STAGE, seed=0)
+    first = int(maps.PAINT_UNTIL * 20)
+    assert not torch.equal(seen[first - 2][0], seen[first - 1][0])
+    assert torch.equal(seen[first][0], seen[-1][0]) and not torch.equal(seen[first][1], seen[-1][1])
+    assert all(float(grid.abs().max()) > 0.0 for grid in unknowns.bend)
