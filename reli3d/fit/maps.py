@@ -169,6 +169,7 @@ def fit_maps(
             value.requires_grad_(True)
     optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99))
     first, settled = 0, False
+    free, kept = weights.free_bend * len(views), weights.bend / len(views) ** 2
     for step, progress in budget.part(stage.name, stage.until):
         if stage.paint and progress >= PAINT_UNTIL and not settled:
             settled = True
@@ -187,7 +188,7 @@ def fit_maps(
             pixels,
             rows,
             scene,
-            weights if settled else replace(weights, bend=weights.free_bend * len(views)),
+            replace(weights, bend=kept if settled else free),
             samples=samples,
             views=len(views),
             seed=seed * 1_000_003 + step,
