@@ -55,8 +55,7 @@ def test_a_small_scene_is_recovered(refined, start):
     want = srgb_to_linear(torch.tensor([[0.8, 0.25, 0.2], [0.25, 0.6, 0.3]]))
     # one factor a channel is free between paint and light: the ratio of the halves is not
     error = ((got[0] / got[1]).log() - (want[0] / want[1]).log()).abs()
-    # measured 0.61 of what grey is off: 60 steps are few, and the palette draws
-    # colours together
+    # measured 0.61 of what grey is off: 60 steps are few, and the palette draws colours together at first
     assert float(error.max()) < 0.65 * float((want[0] / want[1]).log().abs().max())
 
 
