@@ -38,7 +38,7 @@ class Weights:
     light_slope: float = 2e-3  # of :func:`slopes` of the light
     exposure: float = 0.1  # of exposures, whose mean the light already has
     demodulation: float = 0.3  # of :func:`shared_pattern`
-    free_bend: float = 0.1  # of the squared bend of the normals while the paint is fitted
+    free_bend: float = 2e-3  # of the squared bend of the normals while the paint is fitted, times the number of views
     bend: float = 20.0  # the same afterwards, of the bend that is kept, over the square of the number of views
 
 

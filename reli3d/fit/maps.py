@@ -169,7 +169,7 @@ def fit_maps(
             value.requires_grad_(True)
     optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99))
     first, settled = 0, False
-    kept = weights.bend / len(views) ** 2
+    free, kept = weights.free_bend * len(views), weights.bend / len(views) ** 2
     for step, progress in budget.part(stage.name, stage.until):
         if stage.paint and progress >= PAINT_UNTIL and not settled:
             settled = True
@@ -188,7 +188,7 @@ def fit_maps(
             pixels,
             rows,
             scene,
-            replace(weights, bend=kept if settled else weights.free_bend),
+            replace(weights, bend=kept if settled else free),
             samples=samples,
             views=len(views),
             seed=seed * 1_000_003 + step,
