@@ -25,8 +25,8 @@ class Weights:
 
     outline: float = 10.0  # of :func:`outline`
     agreement: float = 0.3  # of :func:`agreement`
-    shading: float = 2.0  # of :func:`display_error` while the surface moves
-    curvature: float = 0.01  # of :func:`curvature`
+    shading: float = 30.0  # of :func:`display_error` while the surface moves
+    curvature: float = 0.5  # of :func:`curvature`
     stay: float = 2e-3  # of the level's distance from the start, over the number of views
     picture: float = 1.0  # of :func:`display_error` in the fit of the maps and the light
     palette: float = 0.03  # of :func:`palette`
