@@ -23,10 +23,10 @@ TINT = 0.25  # of the logarithm of colour without brightness: what the light's o
 class Weights:
     """Weights of all terms; lengths in cells of the grid, colours in the display's range."""
 
-    outline: float = 10.0  # of :func:`outline`
+    outline: float = 100.0  # of :func:`outline`
     agreement: float = 0.3  # of :func:`agreement`
     shading: float = 30.0  # of :func:`display_error` while the surface moves
-    curvature: float = 0.5  # of :func:`curvature`
+    curvature: float = 0.1  # of :func:`curvature`
     stay: float = 2e-3  # of the level's distance from the start, over the number of views
     picture: float = 1.0  # of :func:`display_error` in the fit of the maps and the light
     palette: float = 0.03  # of :func:`palette`
