@@ -23,7 +23,7 @@ TINT = 0.25  # of the logarithm of colour without brightness: what the light's o
 class Weights:
     """Weights of all terms; lengths in cells of the grid, colours in the display's range."""
 
-    outline: float = 100.0  # of :func:`outline`; with 10 the curvature eats thin blades
+    outline: float = 100.0  # of :func:`outline`; with 10 the curvature removes thin blades
     agreement: float = 0.3  # of :func:`agreement`
     shading: float = 30.0  # of :func:`display_error` while the surface moves
     curvature: float = 0.1  # of :func:`curvature`
