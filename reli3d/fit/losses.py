@@ -23,10 +23,10 @@ TINT = 0.25  # of the logarithm of colour without brightness: what the light's o
 class Weights:
     """Weights of all terms; lengths in cells of the grid, colours in the display's range."""
 
-    outline: float = 100.0  # of :func:`outline`; with 10 the curvature removes thin blades
+    outline: float = 30.0  # of :func:`outline`
     agreement: float = 0.3  # of :func:`agreement`
     shading: float = 30.0  # of :func:`display_error` while the surface moves
-    curvature: float = 0.1  # of :func:`curvature`
+    curvature: float = 0.5  # of :func:`curvature`
     stay: float = 2e-3  # of the level's distance from the start, over the number of views
     picture: float = 1.0  # of :func:`display_error` in the fit of the maps and the light
     palette: float = 0.03  # of :func:`palette`
@@ -88,12 +88,14 @@ def outline(cover: Tensor, mask: Tensor) -> Tensor:
     return (cover - mask).abs().mean()
 
 
-def curvature(level: Tensor, cell: float, near: Tensor) -> Tensor:
-    """Mean squared Laplacian of the level in the band that ``near`` marks, in cells: bumps that no photograph asks for.
+def curvature(level: Tensor, cell: float, share: Tensor) -> Tensor:
+    """Mean squared Laplacian of the level, in cells, over points whose ``share`` is not 0: bumps that no photograph
+    asks for.
 
-    Silhouettes and colours leave the surface free between what they see; a plain grid answers with noise.
+    share: ``(X, Y, Z)``, how much the square counts at a point.  Silhouettes and colours leave the surface free between
+    what they see; a plain grid answers with noise.
     """
-    x, near = level / cell, near[1:-1, 1:-1, 1:-1].to(level)
+    x, share = level / cell, share[1:-1, 1:-1, 1:-1]
     around = (
         x[2:, 1:-1, 1:-1]
         + x[:-2, 1:-1, 1:-1]
@@ -102,7 +104,7 @@ def curvature(level: Tensor, cell: float, near: Tensor) -> Tensor:
         + x[1:-1, 1:-1, 2:]
         + x[1:-1, 1:-1, :-2]
     )
-    return ((around - 6.0 * x[1:-1, 1:-1, 1:-1]).square() * near).sum() / near.sum().clamp(min=1.0)
+    return ((around - 6.0 * x[1:-1, 1:-1, 1:-1]).square() * share).sum() / (share > 0.0).sum().clamp(min=1)
 
 
 def slopes(values: Tensor) -> Tensor:

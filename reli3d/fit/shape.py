@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import grid_sample, interpolate
+from torch.nn.functional import grid_sample, interpolate, max_pool3d
 
 from reli3d.fit import losses
 from reli3d.fit.budget import Budget
@@ -31,6 +31,8 @@ from reli3d.render.silhouette import antialias, mesh_edges
 
 MARGIN = 3  # cells around the object
 BAND = 4.0  # cells from the surface within which the level's distance is exact at the start
+THICK = 3.0  # cells of depth that a thick part has
+THIN = 0.02  # share of the curvature's weight in thin parts
 COARSE = 4  # cells of the grid along a cell of the one that is asked first
 POINTS, SHADED = 8192, 3072  # on the surface, a step, whose colours are compared, and that are shaded
 OUTLINES, OUTLINE_PIXELS = 2, 160  # views a step whose outlines are compared, and their size
@@ -90,6 +92,24 @@ def bound_level(photographs: Photographs, grid: Grid) -> Tensor:
     return -inside.reshape(grid.shape)
 
 
+@torch.no_grad()
+def curvature_share(level: Tensor, bound: Tensor, cell: float) -> Tensor:
+    """How much :func:`losses.curvature` counts at each point of the grid, ``(X, Y, Z)``.
+
+    1 near parts at least ``2 THICK`` cells thick, ``THIN`` near thinner ones, 0 beyond ``BAND`` cells from the surface.
+    The level of a thin part has its ridge next to the surface.  A weaker ridge has less curvature, so the term would
+    remove the part.  Points of depth ``THICK`` are the core of thick parts; what is farther from every core than the
+    band reaches is thin.
+    """
+    core = (torch.maximum(level, bound) < -THICK * cell).to(level)[None, None]
+    reach = round(THICK + BAND) + 1
+    for axis in range(3):
+        size, pad = [1, 1, 1], [0, 0, 0]
+        size[axis], pad[axis] = 2 * reach + 1, reach
+        core = max_pool3d(core, size, 1, pad)
+    return (THIN + (1.0 - THIN) * core[0, 0]) * (level.abs() < BAND * cell)
+
+
 def extracted(level: Tensor, bound: Tensor, grid: Grid) -> Mesh:
     """The surface of the level within the bound, with normals."""
     mesh = extract_surface(torch.maximum(level, bound), radius=grid.radius)
@@ -128,6 +148,7 @@ class ShapeData:
     grid: Grid
     bound: Tensor
     first: Tensor  # the level at the start
+    smooth: Tensor  # of :func:`curvature_share`
     start: Start
     photographs: Photographs  # for outlines
     planes: list[Tensor]  # of :func:`display_planes`, small to large
@@ -142,7 +163,8 @@ class ShapeData:
         used = photographs.select(colored)
         planes = [display_planes(used.resized(size)) for size in sizes]
         small = photographs.resized(min(OUTLINE_PIXELS, photographs.size))
-        return cls(grid, bound, level.clone(), start, small, planes, colored)
+        smooth = curvature_share(level, bound, grid.cell)
+        return cls(grid, bound, level.clone(), smooth, start, small, planes, colored)
 
 
 def shape_loss(
@@ -164,8 +186,8 @@ def shape_loss(
     scene = RayScene(mesh.vertices, mesh.faces)
     views, grid = len(data.photographs), data.grid
     moved = (unknowns.level - data.first) / grid.cell
-    near = data.first.abs() < BAND * grid.cell
-    loss = weights.curvature * losses.curvature(unknowns.level, grid.cell, near)
+    near = data.smooth > 0.0
+    loss = weights.curvature * losses.curvature(unknowns.level, grid.cell, data.smooth)
     loss = loss + weights.stay / views * (moved.square() * near).sum() / near.sum()
     loss = loss + weights.outline * _outlines(unknowns, data, mesh, scene, rng)
     loss = loss + _colors(unknowns, data, mesh, scene, weights, progress, rng, seed, independent)

@@ -1,0 +1,52 @@
+"""The curvature's share: thick parts are smoothed, thin ones are kept."""
+
+import torch
+
+from reli3d.fit import losses
+from reli3d.fit.shape import BAND, THIN, curvature_share
+
+
+def box(points, low, high):
+    """Signed distance of a box, exact inside and beside a face."""
+    outside = torch.maximum(torch.tensor(low) - points, points - torch.tensor(high))
+    return outside.clamp(min=0.0).norm(dim=-1) + outside.amax(-1).clamp(max=0.0)
+
+
+def block_and_sheet():
+    """A block 16 cells wide at x < 22 and a sheet 3 cells thick from it to x = 58, on points one cell apart."""
+    axes = [torch.arange(float(n)) for n in (64, 32, 32)]
+    points = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1)
+    sheet = box(points, [20.0, 8.0, 14.5], [58.0, 24.0, 17.5])
+    return torch.minimum(box(points, [6.0, 8.0, 8.0], [22.0, 24.0, 24.0]), sheet)
+
+
+def test_thick_parts_count_in_full_thin_ones_little_and_the_rest_not():
+    level = block_and_sheet()
+    share = curvature_share(level, level, 1.0)
+    near = level.abs() < BAND
+    # the core ends at x = 19 and reaches 8 cells farther along each axis: all that is near the block
+    assert (share[:23][near[:23]] == 1.0).all()
+    assert torch.allclose(share[28:][near[28:]], torch.tensor(THIN))
+    assert (share[~near] == 0.0).all()
+
+
+def test_a_bound_that_leaves_a_thin_part_makes_it_thin():
+    level = block_and_sheet()
+    axis = torch.arange(32.0)[None, None, :]
+    bound = ((axis - 16.0).abs() - 1.5).expand_as(level)  # silhouettes allow three cells of the block
+    share = curvature_share(level, bound, 1.0)
+    assert torch.allclose(share[level.abs() < BAND], torch.tensor(THIN))
+
+
+def test_descent_of_the_curvature_keeps_a_thin_sheet():
+    """Steps of the term alone: without the share the ridge in the sheet sinks and opens it."""
+    for held, survives in ((True, True), (False, False)):
+        first = block_and_sheet()
+        share = curvature_share(first, first, 1.0) if held else (first.abs() < BAND).float()
+        level = first.clone().requires_grad_(True)
+        for _ in range(1000):
+            (slope,) = torch.autograd.grad(losses.curvature(level, 1.0, share), level)
+            with torch.no_grad():
+                level -= 0.006 * (share > 0.0).sum() * slope  # stable below 1 / 12**2
+        inside = level.detach()[32:54, 10:22, 16]
+        assert bool((inside < 0.0).all()) is survives
