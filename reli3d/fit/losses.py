@@ -10,6 +10,7 @@ from torch import Tensor
 
 from reli3d.fit.fields import light_field
 from reli3d.fit.unknowns import LIGHT_ROWS, Unknowns
+from reli3d.geometry.grid import squared_laplacian
 
 DARK = 0.02  # linear; below it errors count as at it: there photographs hold noise and eyes see little
 ROBUST = 0.25  # of the display range; an error beyond it counts linearly: mirrored surroundings, glare, wrong masks
@@ -89,22 +90,12 @@ def outline(cover: Tensor, mask: Tensor) -> Tensor:
 
 
 def curvature(level: Tensor, cell: float, share: Tensor) -> Tensor:
-    """Mean squared Laplacian of the level, in cells, over points whose ``share`` is not 0: bumps that no photograph
-    asks for.
+    """Squared Laplacian of the level, in cells, summed with the weights ``share``: bumps that no photograph asks for.
 
-    share: ``(X, Y, Z)``, how much the square counts at a point.  Silhouettes and colours leave the surface free between
-    what they see; a plain grid answers with noise.
+    level, share: ``(X, Y, Z)``.  Silhouettes and colours leave the surface free between what they see; a plain grid
+    answers with noise.
     """
-    x, share = level / cell, share[1:-1, 1:-1, 1:-1]
-    around = (
-        x[2:, 1:-1, 1:-1]
-        + x[:-2, 1:-1, 1:-1]
-        + x[1:-1, 2:, 1:-1]
-        + x[1:-1, :-2, 1:-1]
-        + x[1:-1, 1:-1, 2:]
-        + x[1:-1, 1:-1, :-2]
-    )
-    return ((around - 6.0 * x[1:-1, 1:-1, 1:-1]).square() * share).sum() / (share > 0.0).sum().clamp(min=1)
+    return squared_laplacian(level, share) / (cell * cell)
 
 
 def slopes(values: Tensor) -> Tensor:

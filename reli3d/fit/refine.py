@@ -14,7 +14,7 @@ from reli3d.fit.budget import Budget, progress_bar
 from reli3d.fit.choice import NOTHING, Fitted, Parts, chosen, decibels, picture_error
 from reli3d.fit.maps import MapsStage, fit_maps
 from reli3d.fit.photographs import Photographs, PosedImages
-from reli3d.fit.shape import Grid, ShapeData, bound_level, finished, fit_shape, start_level
+from reli3d.fit.shape import ShapeData, finished, fit_shape, start_grid
 from reli3d.fit.transfer import dressed
 from reli3d.fit.unknowns import Start, Unknowns, corrected
 from reli3d.geometry.mesh import watertight
@@ -89,8 +89,9 @@ def refine(
     """``asset`` fitted to the photographs ``views``, in whose frame it lies.
 
     seconds or steps: one of the two; with ``steps`` the result is the same on every run of one machine.  resolution:
-    cells of the surface's grid along the longest side.  weights: of the losses.  cameras: correct the cameras as well.
-    bar: progress on stderr.  Ctrl-C ends the fit and the best so far is taken.
+    cells of the surface's grid along the longest side, more where it is thin (:func:`~reli3d.fit.shape.start_grid`).
+    weights: of the losses.  cameras: correct the cameras as well.  bar: progress on stderr.  Ctrl-C ends the fit and
+    the best so far is taken.
 
     Of three views or more some are held out: their masks bound the surface, their colours are not used.  What of the
     fit is taken says :func:`~reli3d.fit.choice.chosen`.  Raises TypeError or ValueError where asset and views do not
@@ -135,13 +136,13 @@ def _fitted(
 ) -> Fitted:
     start, texels = Start.of(first), min(TEXELS, first.textures.size)
     closed = watertight(first.mesh)
-    grid = Grid.around(first.mesh.vertices, resolution)
-    level = start_level(first.mesh, grid) if closed else first.mesh.vertices.new_ones(grid.shape)
+    level = first.mesh.vertices.new_ones(2, 2, 2)
+    if closed:
+        grid, level, bound = start_grid(first.mesh, photographs, resolution)
     unknowns = Unknowns.zero(level, len(photographs), texels)
     fit_maps(unknowns, start, first, photographs, used, weights, budget, LIGHT, seed=seed)
     surface = first
     if closed:
-        bound = bound_level(photographs, grid)
         data = ShapeData.of(start, level, bound, grid, photographs, used)
         fit_shape(unknowns, data, weights, budget, SHAPE_UNTIL, seed=seed, cameras=cameras)
         mesh = finished(unknowns.level, bound, grid)

@@ -33,6 +33,9 @@ MARGIN = 3  # cells around the object
 BAND = 4.0  # cells from the surface within which the level's distance is exact at the start
 THICK = 3.0  # cells of depth that a thick part has
 THIN = 0.02  # share of the curvature's weight in thin parts
+MUCH = 0.2  # share of the points near the surface that are near thin parts, beyond which the grid gets finer
+FINER = (2.0, 1.5)  # times, the first of which the grid has at most LARGEST points
+LARGEST = 4_500_000  # a step of the fit on such a grid takes twice the time of one on the usual grid
 COARSE = 4  # cells of the grid along a cell of the one that is asked first
 POINTS, SHADED = 8192, 3072  # on the surface, a step, whose colours are compared, and that are shaded
 OUTLINES, OUTLINE_PIXELS = 2, 160  # views a step whose outlines are compared, and their size
@@ -110,6 +113,22 @@ def curvature_share(level: Tensor, bound: Tensor, cell: float) -> Tensor:
     return (THIN + (1.0 - THIN) * core[0, 0]) * (level.abs() < BAND * cell)
 
 
+def start_grid(mesh: Mesh, photographs: Photographs, resolution: int) -> tuple[Grid, Tensor, Tensor]:
+    """The grid of a closed mesh, the level of the mesh on it and that of the masks' hull.
+
+    About ``resolution`` cells along the longest side, up to twice as many where much of the surface is thin: a sheet of
+    two cells loses its holes and rims.
+    """
+    grid = Grid.around(mesh.vertices, resolution)
+    level, bound = start_level(mesh, grid), bound_level(photographs, grid)
+    share = curvature_share(level, bound, grid.cell)
+    if int(((share > 0.0) & (share < 1.0)).sum()) <= MUCH * int((share > 0.0).sum()):
+        return grid, level, bound
+    grids = [Grid.around(mesh.vertices, round(finer * resolution)) for finer in FINER]
+    grid = next((finer for finer in grids if math.prod(finer.shape) <= LARGEST), grid)
+    return grid, start_level(mesh, grid), bound_level(photographs, grid)
+
+
 def extracted(level: Tensor, bound: Tensor, grid: Grid) -> Mesh:
     """The surface of the level within the bound, with normals."""
     mesh = extract_surface(torch.maximum(level, bound), radius=grid.radius)
@@ -147,8 +166,9 @@ class ShapeData:
 
     grid: Grid
     bound: Tensor
-    first: Tensor  # the level at the start
-    smooth: Tensor  # of :func:`curvature_share`
+    near: Tensor  # (N,) grid points within the band around the start's surface
+    first: Tensor  # (N,) their level at the start
+    smooth: Tensor  # of :func:`curvature_share`, over N
     start: Start
     photographs: Photographs  # for outlines
     planes: list[Tensor]  # of :func:`display_planes`, small to large
@@ -164,7 +184,9 @@ class ShapeData:
         planes = [display_planes(used.resized(size)) for size in sizes]
         small = photographs.resized(min(OUTLINE_PIXELS, photographs.size))
         smooth = curvature_share(level, bound, grid.cell)
-        return cls(grid, bound, level.clone(), smooth, start, small, planes, colored)
+        near = torch.nonzero(smooth.reshape(-1))[:, 0]
+        smooth = smooth / max(len(near), 1)
+        return cls(grid, bound, near, level.reshape(-1)[near], smooth, start, small, planes, colored)
 
 
 def shape_loss(
@@ -185,10 +207,9 @@ def shape_loss(
     mesh = extracted(unknowns.level, data.bound, data.grid)
     scene = RayScene(mesh.vertices, mesh.faces)
     views, grid = len(data.photographs), data.grid
-    moved = (unknowns.level - data.first) / grid.cell
-    near = data.smooth > 0.0
+    moved = (unknowns.level.reshape(-1).index_select(0, data.near) - data.first) / grid.cell
     loss = weights.curvature * losses.curvature(unknowns.level, grid.cell, data.smooth)
-    loss = loss + weights.stay / views * (moved.square() * near).sum() / near.sum()
+    loss = loss + weights.stay / views * moved.square().mean()
     loss = loss + weights.outline * _outlines(unknowns, data, mesh, scene, rng)
     loss = loss + _colors(unknowns, data, mesh, scene, weights, progress, rng, seed, independent)
     return loss

@@ -1,4 +1,4 @@
-"""Look-up of points in a grid of features, channel last: one thread a point, all channels of its eight neighbours."""
+"""Grids: features at points, channel last, one thread a point; the squared Laplacian of a level, one thread a row."""
 
 import warp as wp
 
@@ -45,3 +45,78 @@ def sample_grid_kernel(
             y[1],
         )
         features[n, c] = wp.lerp(low, high, x[1])
+
+
+@wp.func
+def laplacian(values: wp.array3d[float], i: int, j: int, k: int) -> float:
+    """Sum of the six neighbours less six times the value, of a point that is not at the border."""
+    return (
+        (values[i + 1, j, k] + values[i - 1, j, k])
+        + (values[i, j + 1, k] + values[i, j - 1, k])
+        + (values[i, j, k + 1] + values[i, j, k - 1])
+        - 6.0 * values[i, j, k]
+    )
+
+
+@wp.func
+def value_or_none(values: wp.array3d[float], i: int, j: int, k: int) -> float:
+    """0 beyond the border."""
+    if i < 0 or j < 0 or k < 0 or i >= values.shape[0] or j >= values.shape[1] or k >= values.shape[2]:
+        return 0.0
+    return values[i, j, k]
+
+
+@wp.kernel(enable_backward=False)
+def weighted_laplacian_kernel(
+    start: int,
+    # in
+    level: wp.array3d[float],
+    share: wp.array3d[float],
+    # out
+    product: wp.array3d[float],  # share * laplacian, 0 at the border
+    total: wp.array[float],  # of share * laplacian**2 in a row of the grid
+):
+    row = start + wp.tid()
+    i = row // level.shape[1]
+    j = row % level.shape[1]
+    last = level.shape[2] - 1
+    inside = i > 0 and j > 0 and i < level.shape[0] - 1 and j < level.shape[1] - 1
+    amount = wp.float32(0.0)
+    for k in range(level.shape[2]):
+        product[i, j, k] = 0.0
+        if inside and k > 0 and k < last and share[i, j, k] != 0.0:
+            bend = laplacian(level, i, j, k)
+            product[i, j, k] = share[i, j, k] * bend
+            amount += share[i, j, k] * bend * bend
+    total[row] = amount
+
+
+@wp.kernel(enable_backward=False)
+def weighted_laplacian_adjoint_kernel(
+    start: int,
+    # in
+    product: wp.array3d[float],
+    scale: wp.array[float],  # one number
+    # out
+    slope: wp.array3d[float],
+):
+    """The Laplacian is its own transpose."""
+    row = start + wp.tid()
+    i = row // product.shape[1]
+    j = row % product.shape[1]
+    last = product.shape[2] - 1
+    inside = i > 0 and j > 0 and i < product.shape[0] - 1 and j < product.shape[1] - 1
+    for k in range(product.shape[2]):
+        value = wp.float32(0.0)
+        if inside and k > 0 and k < last:
+            value = laplacian(product, i, j, k)
+        else:
+            value = (
+                value_or_none(product, i + 1, j, k)
+                + value_or_none(product, i - 1, j, k)
+                + value_or_none(product, i, j + 1, k)
+                + value_or_none(product, i, j - 1, k)
+                + value_or_none(product, i, j, k + 1)
+                + value_or_none(product, i, j, k - 1)
+            )
+        slope[i, j, k] = 2.0 * scale[0] * value

@@ -1,9 +1,16 @@
-"""The curvature's share: thick parts are smoothed, thin ones are kept."""
+"""The surface's grid and the curvature's share: thick parts are smoothed, thin ones are kept and get finer cells."""
 
+import math
+
+import pytest
 import torch
+import trimesh
 
 from reli3d.fit import losses
-from reli3d.fit.shape import BAND, THIN, curvature_share
+from reli3d.fit.photographs import Photographs
+from reli3d.fit.shape import BAND, THIN, Grid, curvature_share, start_grid
+from reli3d.geometry.camera import Camera
+from reli3d.geometry.mesh import Mesh
 
 
 def box(points, low, high):
@@ -42,11 +49,39 @@ def test_descent_of_the_curvature_keeps_a_thin_sheet():
     """Steps of the term alone: without the share the ridge in the sheet sinks and opens it."""
     for held, survives in ((True, True), (False, False)):
         first = block_and_sheet()
-        share = curvature_share(first, first, 1.0) if held else (first.abs() < BAND).float()
+        near = (first.abs() < BAND).float()
+        share = curvature_share(first, first, 1.0) if held else near
         level = first.clone().requires_grad_(True)
         for _ in range(1000):
             (slope,) = torch.autograd.grad(losses.curvature(level, 1.0, share), level)
             with torch.no_grad():
-                level -= 0.006 * (share > 0.0).sum() * slope  # stable below 1 / 12**2
+                level -= 0.006 * slope  # stable below 1 / 12**2
         inside = level.detach()[32:54, 10:22, 16]
         assert bool((inside < 0.0).all()) is survives
+
+
+def slab(depth):
+    box = trimesh.creation.box((1.8, 2.0, depth))
+    return Mesh(torch.tensor(box.vertices).float(), torch.tensor(box.faces).int())
+
+
+def unbounded():
+    """A photograph, from far away, whose mask excludes nothing."""
+    c2w = torch.eye(4)
+    c2w[2, 3] = 10.0
+    camera = Camera(c2w[None], torch.tensor([[32.0, 32.0, 16.0, 16.0]]), 32, 32)
+    return Photographs(torch.ones(1, 32, 32, 3), torch.ones(1, 32, 32), camera)
+
+
+@pytest.mark.parametrize("depth, finer", [(1.6, 1.0), (0.12, 2.0)])
+def test_thin_objects_get_a_finer_grid(depth, finer):
+    grid, level, bound = start_grid(slab(depth), unbounded(), 32)
+    assert grid.cell == pytest.approx(2.0 / 32 / finer)
+    assert level.shape == bound.shape == grid.shape
+
+
+def test_a_finer_grid_has_at_most_so_many_points(monkeypatch):
+    mesh = slab(0.12)
+    for most, cells in ((math.prod(Grid.around(mesh.vertices, 48).shape), 48), (1, 32)):
+        monkeypatch.setattr("reli3d.fit.shape.LARGEST", most)
+        assert start_grid(mesh, unbounded(), 32)[0].cell == pytest.approx(2.0 / cells)

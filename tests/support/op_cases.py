@@ -17,7 +17,7 @@ from torch.nn.functional import normalize
 
 from reli3d.geometry import projection
 from reli3d.geometry.camera import Camera, camera_rays, look_at, project
-from reli3d.geometry.grid import sample_grid
+from reli3d.geometry.grid import sample_grid, squared_laplacian
 from reli3d.geometry.hits import evaluate_hits, hit_normals, interpolate
 from reli3d.geometry.mesh import Mesh, vertex_normals
 from reli3d.geometry.rays import Hits, RayScene
@@ -343,6 +343,9 @@ CASES = {
     "sample_grid": Case(
         lambda n: {"grid": uniform(6, 5, 7, 4, seed=1), "points": uniform(n, 3, low=-1.2, high=1.2)},
         lambda grid, points: (sample_grid(grid, points),), ("grid", "points"), ("points",)),
+    "squared_laplacian": Case(
+        lambda n: {"level": uniform(18, 16, 12, seed=1), "share": uniform(18, 16, 12, seed=2)},
+        lambda level, share: (squared_laplacian(level, share),), ("level",)),
     "project": Case(
         lambda n: {"points": uniform(n, 3, low=-0.8, high=0.8)},
         lambda points: project(points, rig(points.device).c2w[0], rig(points.device).intrinsics[0]), ("points",),
