@@ -8,10 +8,12 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from reli3d.fit.bounce import gathered, thrown_back
 from reli3d.fit.photographs import Photographs
 from reli3d.fit.shading import radiance
 from reli3d.fit.transfer import changed
 from reli3d.fit.unknowns import Start, Unknowns, environment
+from reli3d.geometry.hits import interpolate
 from reli3d.geometry.rays import RayScene
 from reli3d.render.asset import Asset
 from reli3d.render.color import linear_to_srgb
@@ -78,17 +80,19 @@ class Fitted:
 class Pictures:
     """Small photographs, and what their rays hit of one surface, traced once.
 
-    Of each of V views: ``wanted (V, S, S, 3)`` display values on white; ``rays``: which pixels hit ``(S, S)``, their
-    faces ``(N,)``, barycentrics ``(N, 2)`` and unit directions to the eye ``(N, 3)``; ``inside (N,)``: well in masks.
+    views: whose colours say what the object throws on itself.  Of each of V views: ``wanted (V, S, S, 3)`` display
+    values on white; ``rays``: which pixels hit ``(S, S)``, their faces ``(N,)``, barycentrics ``(N, 2)`` and unit
+    directions to the eye ``(N, 3)``; ``inside (N,)``: well in masks.
     """
 
     @torch.no_grad()
-    def __init__(self, asset: Asset, photographs: Photographs):
+    def __init__(self, asset: Asset, photographs: Photographs, views: list[int]):
         small = photographs.resized(min(CHECK_PIXELS, photographs.size))
         self.mesh, self.scene = asset.mesh, RayScene(asset.mesh.vertices, asset.mesh.faces)
         shown = linear_to_srgb(small.color.clamp(0.0, 1.0))
         self.wanted = torch.lerp(torch.ones_like(shown), shown, small.mask[..., None])
         self.rays, self.inside, inside = [], [], small.inside()
+        self.received = gathered(asset.mesh, self.scene, photographs, views, seed=0)
         for view in range(len(small)):
             hits, _, directions = primary_hits(self.scene, small.camera[view])
             seen = hits.face >= 0
@@ -96,40 +100,47 @@ class Pictures:
             self.inside.append(inside[view][seen])
 
     @torch.no_grad()
-    def lit(self, asset: Asset) -> list[Tensor]:
-        """Linear radiance ``(N, 3)`` of each view's rays under the light of ``asset``, which has this surface.
-
-        The random numbers depend on the view alone.
+    def lit(self, asset: Asset) -> list[tuple[Tensor, Tensor]]:
+        """Linear radiance of each view's rays, by the light of ``asset``, which has this surface, and by what it throws
+        on itself, ``(N, 3)`` each.  The random numbers depend on the view alone.
         """
         lit = []
         for view, (_, face, bary, wo) in enumerate(self.rays):
             at = surface_points(self.mesh, asset.textures, face, bary)
-            lit.append(radiance(at, wo, asset.light, samples=CHECK_SAMPLES, scene=self.scene, seed=view))
+            own = thrown_back(at, interpolate(self.received, self.mesh.faces, face, bary))
+            lit.append((radiance(at, wo, asset.light, samples=CHECK_SAMPLES, scene=self.scene, seed=view), own))
         return lit
 
     @torch.no_grad()
-    def errors(self, lit: list[Tensor], strength: float = 1.0) -> Tensor:
+    def errors(self, lit: list[tuple[Tensor, Tensor]], strength: float = 1.0) -> Tensor:
         """Mean squared display error ``(V,)`` of whole pictures on white; light times ``strength``."""
         errors = []
-        for values, (seen, *_), wanted in zip(lit, self.rays, self.wanted, strict=True):
+        for (direct, own), (seen, *_), wanted in zip(lit, self.rays, self.wanted, strict=True):
             image = torch.ones_like(wanted)
-            image[seen] = linear_to_srgb((strength * values).clamp(0.0, 1.0))
+            image[seen] = linear_to_srgb((strength * direct + own).clamp(0.0, 1.0))
             errors.append((image - wanted).square().mean())
         return torch.stack(errors)
 
     @torch.no_grad()
-    def strength(self, lit: list[Tensor], views: list[int]) -> float:
+    def strength(self, lit: list[tuple[Tensor, Tensor]], views: list[int]) -> float:
         """The one of ``STRENGTHS`` that ``views`` show, by pixels well inside the masks: white shines in at the rim."""
-        got = torch.cat([lit[view][self.inside[view]] for view in views])
+        got, own = (torch.cat([lit[view][k][self.inside[view]] for view in views]) for k in range(2))
         want = torch.cat([self.wanted[view][self.rays[view][0]][self.inside[view]] for view in views])
         if not len(got):
             return 1.0
-        return min(STRENGTHS, key=lambda k: float((linear_to_srgb((k * got).clamp(0.0, 1.0)) - want).square().mean()))
+
+        def error(strength: float) -> float:
+            return float((linear_to_srgb((strength * got + own).clamp(0.0, 1.0)) - want).square().mean())
+
+        return min(STRENGTHS, key=error)
 
 
-def picture_error(asset: Asset, photographs: Photographs) -> Tensor:
-    """Mean squared display error ``(V,)`` of whole pictures on white under the asset's own light, at pixel centres."""
-    pictures = Pictures(asset, photographs)
+def picture_error(asset: Asset, photographs: Photographs, views: list[int] | None = None) -> Tensor:
+    """Mean squared display error ``(V,)`` of whole pictures on white under the asset's own light, at pixel centres.
+
+    views: whose colours say what the object throws on itself; all where None.
+    """
+    pictures = Pictures(asset, photographs, list(range(len(photographs))) if views is None else views)
     return pictures.errors(pictures.lit(asset))
 
 
@@ -148,7 +159,8 @@ def chosen(fitted: Fitted, used: list[int], held: list[int], before: Tensor) -> 
     is the one that the used views show best: the fit's error is that of the display's tangent, which rises faster than
     the display, so the fit ends too dark; and a mean of logarithms is darker than either of its lights.
     """
-    pictures, moved = Pictures(fitted.surface, fitted.photographs), float(fitted.surface is not fitted.first)
+    pictures = Pictures(fitted.surface, fitted.photographs, used)
+    moved = float(fitted.surface is not fitted.first)
     few = len(used) < FEW
     for paint, light in ORDER:
         if few and (paint > 0.5 or (held and light > 0.5)):

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from reli3d._bridge import present
 from reli3d.fit import losses
+from reli3d.fit.bounce import gathered, thrown_back
 from reli3d.fit.budget import Budget
 from reli3d.fit.photographs import WHITE, Photographs
 from reli3d.fit.shading import radiance
@@ -57,6 +58,7 @@ class Pixels:
     uv: Tensor
     logits: Tensor  # of the start's material
     target: Tensor  # (N, 3) linear
+    received: Tensor  # (N, 3) of :func:`~reli3d.fit.bounce.gathered`
     order: Tensor  # random, so that a run of it is a fair sample
 
 
@@ -64,6 +66,7 @@ class Pixels:
 def traced(asset: Asset, scene: RayScene, photographs: Photographs, views: list[int], seed: int) -> Pixels:
     """The pixels of ``views`` well inside the masks at which ``asset`` is hit."""
     inside, mesh, parts = photographs.inside(), asset.mesh, []
+    received = gathered(mesh, scene, photographs, views, seed)
     for view in views:
         hits, _, directions = primary_hits(scene, photographs.camera[view])
         both = inside[view] & (hits.face >= 0)
@@ -81,6 +84,7 @@ def traced(asset: Asset, scene: RayScene, photographs: Photographs, views: list[
                 uv,
                 material_logits(at),
                 photographs.color[view][both],
+                interpolate(received, mesh.faces, face, bary),
             )
         )
     columns = [torch.cat(column) for column in zip(*parts)]
@@ -89,8 +93,8 @@ def traced(asset: Asset, scene: RayScene, photographs: Photographs, views: list[
     if len(order) > PIXELS:
         order = order[:PIXELS]
         columns, order = [column[order] for column in columns], torch.arange(PIXELS, device=order.device)
-    which, position, normal, ng, wo, uv, logits, target = columns
-    return Pixels(which, position, normal, ng, wo, uv, logits, target, order)
+    which, position, normal, ng, wo, uv, logits, target, received = columns
+    return Pixels(which, position, normal, ng, wo, uv, logits, target, received, order)
 
 
 def maps_loss(
@@ -114,11 +118,13 @@ def maps_loss(
     normal, turned = bent(unknowns, position, pixels.normal[rows])
     points = SurfacePoints(position, pixels.ng[rows], normal, *material_of(pixels.logits[rows] + change))
     light, exposure = environment(unknowns, start), unknowns.exposure.exp()[view, None]
-    image = radiance(points, pixels.wo[rows], light, samples=samples, scene=scene, seed=2 * seed) * exposure
+    own = thrown_back(points, pixels.received[rows])
+    image = (own + radiance(points, pixels.wo[rows], light, samples=samples, scene=scene, seed=2 * seed)) * exposure
     other = image
     if independent:
         with torch.no_grad():
-            other = radiance(points, pixels.wo[rows], light, samples=samples, scene=scene, seed=2 * seed + 1) * exposure
+            other = radiance(points, pixels.wo[rows], light, samples=samples, scene=scene, seed=2 * seed + 1)
+            other = (own + other) * exposure
     loss = weights.picture * losses.display_error(image, other, target, target > WHITE)
     color, was = (c.clamp(min=losses.DARK).log() for c in (points.base_color, material_of(pixels.logits[rows])[0]))
     loss = loss + weights.palette * losses.palette(color, target) + weights.hue * losses.hue_drift(color, was)

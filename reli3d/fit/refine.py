@@ -10,14 +10,16 @@ import torch
 from torch import Tensor
 
 from reli3d.fit import losses
+from reli3d.fit.bounce import gathered
 from reli3d.fit.budget import Budget, progress_bar
 from reli3d.fit.choice import NOTHING, Fitted, Parts, chosen, decibels, picture_error
 from reli3d.fit.maps import MapsStage, fit_maps
 from reli3d.fit.photographs import Photographs, PosedImages
 from reli3d.fit.shape import ShapeData, finished, fit_shape, start_grid
 from reli3d.fit.transfer import dressed
-from reli3d.fit.unknowns import Start, Unknowns, corrected
+from reli3d.fit.unknowns import START_GRID, Start, Unknowns, corrected, filled_grid
 from reli3d.geometry.mesh import watertight
+from reli3d.geometry.rays import RayScene
 from reli3d.render.asset import Asset
 
 RESOLUTION = 128  # cells along the longest side
@@ -107,7 +109,7 @@ def refine(
     low, high = asset.mesh.vertices.amin(0), asset.mesh.vertices.amax(0)
     shift, scale = (low + high) / 2, 2.0 / float((high - low).max())
     first, near = _moved(asset, shift, scale), photographs.moved(shift, scale)
-    before = picture_error(first, near)
+    before = picture_error(first, near, used)
     notes: list[str] = []
     with torch.random.fork_rng(devices=[]), _interruptible(budget, notes):
         fitted = _fitted(first, near, used, resolution, weights, budget, notes, seed=seed, cameras=cameras)
@@ -143,7 +145,9 @@ def _fitted(
     fit_maps(unknowns, start, first, photographs, used, weights, budget, LIGHT, seed=seed)
     surface = first
     if closed:
-        data = ShapeData.of(start, level, bound, grid, photographs, used)
+        received = gathered(first.mesh, RayScene(first.mesh.vertices, first.mesh.faces), photographs, used, seed)
+        received = filled_grid(first.mesh.vertices, received, START_GRID)
+        data = ShapeData.of(start, level, bound, grid, received, photographs, used)
         fit_shape(unknowns, data, weights, budget, SHAPE_UNTIL, seed=seed, cameras=cameras)
         mesh = finished(unknowns.level, bound, grid)
         surface = dressed(mesh, first, first.textures.size)

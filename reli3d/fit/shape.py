@@ -7,24 +7,24 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import grid_sample, interpolate, max_pool3d
+from torch.nn.functional import interpolate, max_pool3d
 
 from reli3d.fit import losses
+from reli3d.fit.bounce import thrown_back
 from reli3d.fit.budget import Budget
 from reli3d.fit.facets import flattened
 from reli3d.fit.fields import EvenAdam, blurred_grid
 from reli3d.fit.photographs import WHITE, Photographs
+from reli3d.fit.seen import display_planes, seen_colors, sight
 from reli3d.fit.shading import radiance
 from reli3d.fit.unknowns import Start, Unknowns, corrected, environment, material_change, material_of, unit
-from reli3d.geometry.camera import Camera, project
 from reli3d.geometry.distance import signed_distance
 from reli3d.geometry.grid import sample_grid
 from reli3d.geometry.hull import hull_distance, mask_distance
 from reli3d.geometry.mesh import Mesh, largest_components, vertex_normals
 from reli3d.geometry.rays import RayScene
 from reli3d.geometry.surface import extract_surface
-from reli3d.geometry.visibility import visible_from
-from reli3d.render.color import linear_to_srgb, srgb_to_linear
+from reli3d.render.color import srgb_to_linear
 from reli3d.render.gbuffer import primary_hits
 from reli3d.render.points import SurfacePoints
 from reli3d.render.silhouette import antialias, mesh_edges
@@ -44,7 +44,6 @@ RATE = (0.6, 0.08)  # largest move of the surface in a step, in cells, at the st
 BLUR = (8, 2)  # cells over which a move is spread, at the start and the end
 DETAIL = (0.25, 1.0)  # of the photographs' size, in which colours are compared at the start and the end
 SMALLEST_PART = 0.01  # share of the faces below which a separate piece is dropped
-LEAST = 0.2  # cosine of the view from which a colour counts in full
 
 
 @dataclass(frozen=True)
@@ -141,25 +140,6 @@ def finished(level: Tensor, bound: Tensor, grid: Grid) -> Mesh:
     return flattened(mesh).with_normals()
 
 
-def seen_colors(display: Tensor, position: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Colours ``(N, V, 3)`` and coverage ``(N, V)`` of the photographs where ``position (N, 3)`` projects.
-
-    display: ``(V, 4, S, S)``, display values times coverage, and coverage.  camera: of all V.  Gradients reach the
-    points and the cameras.
-    """
-    pixels, _ = project(position[None], camera.c2w[:, None], camera.intrinsics[:, None])
-    where = 2.0 * pixels[:, :, None] / camera.width - 1.0
-    values = grid_sample(display, where, mode="bilinear", padding_mode="zeros", align_corners=False)[..., 0]
-    cover = values[:, 3]
-    return (values[:, :3] / cover.clamp(min=1e-2)[:, None]).permute(2, 0, 1), cover.T
-
-
-def display_planes(photographs: Photographs) -> Tensor:
-    """What :func:`seen_colors` reads."""
-    shown = linear_to_srgb(photographs.color.clamp(0.0, 1.0)) * photographs.mask[..., None]
-    return torch.cat([shown, photographs.mask[..., None]], -1).permute(0, 3, 1, 2).contiguous()
-
-
 @dataclass(frozen=True)
 class ShapeData:
     """What does not change while the surface does."""
@@ -170,13 +150,21 @@ class ShapeData:
     first: Tensor  # (N,) their level at the start
     smooth: Tensor  # of :func:`curvature_share`, over N
     start: Start
+    received: Tensor  # (n, n, n, 3) of :func:`~reli3d.fit.bounce.gathered` in space
     photographs: Photographs  # for outlines
     planes: list[Tensor]  # of :func:`display_planes`, small to large
     colored: list[int]  # views whose colours may be used
 
     @classmethod
     def of(
-        cls, start: Start, level: Tensor, bound: Tensor, grid: Grid, photographs: Photographs, colored: list[int]
+        cls,
+        start: Start,
+        level: Tensor,
+        bound: Tensor,
+        grid: Grid,
+        received: Tensor,
+        photographs: Photographs,
+        colored: list[int],
     ) -> ShapeData:
         """Photographs in the sizes that a fit asks for."""
         sizes = sorted({max(16, round(photographs.size * s)) for s in (DETAIL[0], sum(DETAIL) / 2, DETAIL[1])})
@@ -186,7 +174,7 @@ class ShapeData:
         smooth = curvature_share(level, bound, grid.cell)
         near = torch.nonzero(smooth.reshape(-1))[:, 0]
         smooth = smooth / max(len(near), 1)
-        return cls(grid, bound, near, level.reshape(-1)[near], smooth, start, small, planes, colored)
+        return cls(grid, bound, near, level.reshape(-1)[near], smooth, start, received, small, planes, colored)
 
 
 def shape_loss(
@@ -250,11 +238,12 @@ def _colors(unknowns, data, mesh, scene, weights, progress, rng, seed, independe
     points = SurfacePoints(position, normal.detach(), normal, *material_of(logits))
     light = environment(unknowns, data.start)
     wo = unit(camera.c2w[view, :3, 3] - position).detach()
-    image = radiance(points, wo, light, samples=SAMPLES, scene=scene, seed=2 * seed) * exposure[view, None]
+    own, exposure = thrown_back(points, sample_grid(data.received, position)), exposure[view, None]
+    image = (own + radiance(points, wo, light, samples=SAMPLES, scene=scene, seed=2 * seed)) * exposure
     other = image
     if independent:
         with torch.no_grad():
-            other = radiance(points, wo, light, samples=SAMPLES, scene=scene, seed=2 * seed + 1) * exposure[view, None]
+            other = (own + radiance(points, wo, light, samples=SAMPLES, scene=scene, seed=2 * seed + 1)) * exposure
     loss = loss + weights.shading * losses.display_error(image, other, target, target > WHITE)
     # as strong beside the shading as in the fit of the maps
     loss = loss + weights.shading * weights.palette * losses.palette(
@@ -262,17 +251,6 @@ def _colors(unknowns, data, mesh, scene, weights, progress, rng, seed, independe
     )
     loss = loss + weights.shading * losses.near_paint(change[:, :3], weights, len(data.colored))
     return loss + weights.shading * losses.priors(unknowns, weights, len(data.photographs))
-
-
-@torch.no_grad()
-def sight(scene: RayScene, position: Tensor, normal: Tensor, camera: Camera) -> Tensor:
-    """How well each camera sees the points, ``(N, V)`` in [0, 1]: 0 where they are hidden, less where they are grazed.
-
-    No gradient: no surface shall turn away to be seen less.
-    """
-    seen = visible_from(scene, position, normal, camera)
-    to_eye = unit(camera.c2w[None, :, :3, 3] - position[:, None])
-    return seen * ((to_eye * normal[:, None]).sum(-1) / LEAST).clamp(0.0, 1.0)
 
 
 def fit_shape(

@@ -29,7 +29,8 @@ def scene(plain: bool):
     photographs, asset = Photographs.of(views), replace(small_scene.ball(0.76), environment=small_scene.sky())
     grid = shape.Grid.around(asset.mesh.vertices, 16)
     level = shape.start_level(asset.mesh, grid)
-    data = shape.ShapeData.of(Start.of(asset), level, torch.full_like(level, -9.0), grid, photographs, [0, 1, 2])
+    bound, received = torch.full_like(level, -9.0), torch.full((2, 2, 2, 3), 0.1)
+    data = shape.ShapeData.of(Start.of(asset), level, bound, grid, received, photographs, [0, 1, 2])
     unknowns = Unknowns.zero(level + 0.02 * grid.cell, 3, 8)
     rng = torch.Generator().manual_seed(2)
     for values in (*unknowns.material, *unknowns.light, unknowns.exposure):
