@@ -35,8 +35,8 @@ def views_to_glb(device, texture_size, resolution):
 
 
 def process(device, arguments):
-    """``reli3d-infer`` from the start of the process to its files, with the kernels compiled before."""
-    code = "import sys; from reli3d.cli.infer import main; sys.exit(main())"
+    """``reli3d-infer`` from the start of the process to its end, with the kernels compiled before."""
+    code = "from reli3d.cli.program import infer; infer()"
 
     def step():
         with tempfile.TemporaryDirectory() as folder:
