@@ -30,3 +30,17 @@ def test_the_command_of_all_commands_does_so_too(thresholds, monkeypatch, capsys
     monkeypatch.setattr("sys.argv", ["reli3d"])
     assert reli3d.main() == 0 and "COMMAND" in capsys.readouterr().out
     assert gc.get_threshold()[0] == collector.OBJECTS
+
+
+def test_a_program_imports_without_collections_and_a_call_as_before(thresholds):
+    seen = []
+    with collector.importing():
+        seen.append(gc.isenabled())
+    gc.set_threshold(collector.OBJECTS, *thresholds[1:])
+    try:
+        with pytest.raises(ImportError), collector.importing():
+            seen.append(gc.isenabled())
+            raise ImportError
+        assert seen == [True, False] and gc.isenabled() and gc.get_freeze_count() > 0
+    finally:
+        gc.unfreeze()
