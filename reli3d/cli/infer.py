@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from reli3d.cli import objects
+from reli3d.cli import collector, objects
 from reli3d.cli.checking import SUSPECT, Check, diagnosed
 from reli3d.cli.exit_codes import check_range, command, reason
 from reli3d.cli.help_format import joined
@@ -58,8 +58,9 @@ class Plan:
 
 def _plan(args: argparse.Namespace, held: contextlib.ExitStack) -> Plan:
     """What the command will do; what is wrong with it is raised here.  Raises ValueError, OSError."""
-    from reli3d.output import results
-    from reli3d.output.folder import check_place
+    with collector.importing():  # torch and Warp too
+        from reli3d.output import results
+        from reli3d.output.folder import check_place
 
     for name, high in (("workers", 1024), ("shards_out", 10**6)):
         check_range(name.replace("_", "-"), getattr(args, name), 1, high)
@@ -317,8 +318,11 @@ class Job:
             record = {"refinement": {"views": len(photographs), **self.budget, **result.record()}}
         steps("preview")
         scene = RayScene(asset.mesh.vertices, asset.mesh.faces)
-        picture = preview(asset, on_device := shown.to(self.device), scene)
-        frames, translation = results.frame_record(placed.model_from_input, output, views.origin, args.frame, args.up)
+        frames, moved = results.frame_record(placed.model_from_input, output, views.origin, args.frame, args.up)
+        frames["weights"] = results.weights_record(self.manifest, self.digest)
+        encoded = results.encode(asset, shown, frames, before=first, translation=moved, scene=scene)
+        measured = results.measure(asset.mesh, scene, on_device := shown.to(self.device))
+        picture = preview(asset, on_device, scene)
         info = {
             "object": name,
             "views": list(views.names),
@@ -326,7 +330,6 @@ class Job:
             "coordinate_system": views.coordinate_system,
             "notes": [*views.notes, *watch.notes],
             **frames,
-            "weights": results.weights_record(self.manifest, self.digest),
             "preset": self.model.preset.name,
             "precision": str(self.model.dtype).removeprefix("torch."),
             "precision_of_heads": str(heads_dtype(self.model.preset, self.device, args.heads)).removeprefix("torch."),
@@ -336,8 +339,7 @@ class Job:
             "symmetry": args.symmetry,
             "seed": args.seed,
             "device": self.device,
-            "mesh": results.mesh_statistics(asset.mesh),
-            "mask_iou": results.mask_iou(scene, on_device),
+            **measured(),
             **record,
             "seconds": seconds,
             "seconds_since_start": round(time.monotonic() - STARTED, 3),
@@ -345,18 +347,7 @@ class Job:
             "versions": results.versions(),
         }
         steps("writing")
-        results.write_results(
-            replacing,
-            asset,
-            shown,
-            picture,
-            info,
-            compatible=args.compatible_names,
-            comparison=compared,
-            before=first,
-            translation=translation,
-            scene=scene,
-        )
+        results.write_results(replacing, encoded, picture, info, compatible=args.compatible_names, comparison=compared)
 
 
 def refinement_budget(args: argparse.Namespace, device: str) -> dict[str, float | int]:

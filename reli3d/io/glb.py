@@ -38,9 +38,16 @@ LINEAR, LINEAR_MIPMAP_LINEAR, CLAMP_TO_EDGE = 9729, 9987, 33071
 
 def encode_image(values: Tensor, kind: str = "png") -> bytes:
     """PNG or lossless WebP file, 8 bit RGB, of ``(H, W, 3)`` values in [0, 1], rounded to the nearest step."""
-    pixels = (values.detach() * 255.0).round_().to(torch.uint8).cpu().numpy()
+    return _file(_pixels(values), kind)
+
+
+def _pixels(values: Tensor) -> np.ndarray:
+    return np.ascontiguousarray((values.detach() * 255.0).round_().to(torch.uint8).cpu().numpy())
+
+
+def _file(pixels: np.ndarray, kind: str) -> bytes:
     buffer = io.BytesIO()
-    Image.fromarray(np.ascontiguousarray(pixels)).save(buffer, kind.upper(), **ENCODERS[kind])
+    Image.fromarray(pixels).save(buffer, kind.upper(), **ENCODERS[kind])
     return buffer.getvalue()
 
 
@@ -49,8 +56,10 @@ def texture_images(asset: Asset, kind: str = "png") -> dict[str, bytes]:
     rough = asset.textures.roughness
     orm = torch.stack([torch.ones_like(rough), rough, asset.textures.metallic], -1)  # no occlusion is baked
     maps = {"base_color": asset.textures.base_color, "metallic_roughness": orm, "normal": asset.textures.normal}
+    # in this thread: in each of the others torch would start threads of its own
+    pixels = {name: _pixels(values) for name, values in maps.items()}
     with ThreadPoolExecutor(3) as pool:  # the encoder runs without the interpreter lock
-        images = {name: pool.submit(encode_image, values, kind) for name, values in maps.items()}
+        images = {name: pool.submit(_file, values, kind) for name, values in pixels.items()}
         return {name: image.result() for name, image in images.items()}
 
 

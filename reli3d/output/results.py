@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 
@@ -19,10 +19,11 @@ from reli3d.geometry.mesh import Mesh, report
 from reli3d.geometry.rays import RayScene
 from reli3d.io.glb import glb_bytes
 from reli3d.io.hdr import write_environment
-from reli3d.io.images import write_png
+from reli3d.io.images import png_bytes, write_png
+from reli3d.nn.blocks import beside
 from reli3d.nn.weights import Manifest
 from reli3d.output.folder import claimed
-from reli3d.output.viewer import Shown, photograph_stops, viewer_page
+from reli3d.output.viewer import Shown, photograph_stops, shadow, viewer_page
 from reli3d.render.asset import Asset
 from reli3d.render.gbuffer import primary_hits
 from reli3d.views.similarity import Similarity
@@ -50,9 +51,11 @@ def claim(folder: Path) -> AbstractContextManager[Callable]:
     return claimed(folder, OURS)
 
 
-def mesh_statistics(mesh: Mesh) -> dict:
-    """The report of the mesh welded across its UV seams, as plain values."""
-    return asdict(report(mesh))
+def measure(mesh: Mesh, scene: RayScene, views: Views) -> Callable[[], dict]:
+    """Begin to measure a result, beside the caller's work: ``mesh``, the report of the mesh welded across its UV seams,
+    and ``mask_iou``, see :func:`mask_iou`, as plain values.
+    """
+    return beside(lambda: {"mesh": asdict(report(mesh)), "mask_iou": mask_iou(scene, views)}, mesh.vertices.device)
 
 
 def mask_iou(scene: RayScene, views: Views) -> float:
@@ -77,38 +80,76 @@ def peak_memory_mib() -> float | None:
     return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20, 1)
 
 
-def write_results(
-    replacing: Callable,
+@dataclass(frozen=True)
+class Encoded:
+    """What the files of a result hold besides its preview; what is called gives it when it is there.
+
+    glb: the asset where its mesh lies, and with ``placed`` where ``mesh.glb`` puts it.  before: the asset without its
+    refinement, for the page.
+    """
+
+    asset: Asset
+    stops: Callable[[], list[dict]]
+    glb: Callable[[], bytes]
+    placed: Callable[[], bytes]
+    shadow: Callable[[], Mapping[str, str | float]]
+    before: Callable[[], Shown] | None
+
+
+def encode(
     asset: Asset,
     views: Views,
+    record: Mapping,
+    *,
+    before: Asset | None = None,
+    translation: Sequence[float] = (0.0, 0.0, 0.0),
+    scene: RayScene | None = None,
+) -> Encoded:
+    """Begin to encode a result, beside the caller's work: encoders run without the interpreter lock.
+
+    views: the photographs, in the frame of ``asset``.  record: of ``run_info.json``, whose frames and weights
+    ``mesh.glb`` names too.  translation: of the latter, see :func:`~reli3d.io.glb.write_glb`; the page shows the mesh
+    where it is.  before: the asset without its refinement, which the page shows too.  scene: rays against the mesh of
+    ``asset``.
+    """
+    device = asset.mesh.vertices.device
+    extras = {k: record[k] for k in ("output_from_input", "model_from_input", "weights")}
+    glb = beside(partial(glb_bytes, asset, extras=extras), device)
+    moved = partial(glb_bytes, asset, extras=extras, translation=translation)
+    return Encoded(
+        asset,
+        beside(partial(photograph_stops, views), device),
+        glb,
+        beside(moved, device) if any(translation) else glb,
+        beside(partial(shadow, asset.mesh, scene), device),
+        None if before is None else beside(partial(_shown, before), device),
+    )
+
+
+def _shown(asset: Asset) -> Shown:
+    return Shown(glb_bytes(asset), shadow(asset.mesh))
+
+
+def write_results(
+    replacing: Callable,
+    encoded: Encoded,
     picture: np.ndarray,
     info: dict,
     *,
     compatible: bool = False,
     comparison: np.ndarray | None = None,
-    before: Asset | None = None,
-    translation: Sequence[float] = (0.0, 0.0, 0.0),
-    scene: RayScene | None = None,
 ) -> None:
     """Write :data:`FILES`; an error leaves what was there before.  Raises OSError, ValueError.
 
-    replacing: what :func:`claim` of the folder gives.
-    views: the photographs, in the frame of ``asset``.  picture: :func:`~reli3d.output.preview.preview` of both.
+    replacing: what :func:`claim` of the folder gives.  picture: :func:`~reli3d.output.preview.preview` of the asset.
     info: what ``run_info.json`` holds, the convention of the light apart.
-    compatible: write the light as :data:`PUBLISHED_LIGHT` as well.  comparison: the picture of a refinement.  before:
-    the asset without it, which the page shows too.
-    translation: of ``mesh.glb``, see :func:`~reli3d.io.glb.write_glb`; the page shows it where it is.  scene: rays
-    against the mesh of ``asset``.
+    compatible: write the light as :data:`PUBLISHED_LIGHT` as well.  comparison: the picture of a refinement.
     """
-    radiance = asset.light.radiance
+    asset, radiance = encoded.asset, encoded.asset.light.radiance
     info = {**info, "environment_centre": "+X"}
-    with replacing() as new, ThreadPoolExecutor(2) as pool:  # encoders of images run without the interpreter lock
-        stops = pool.submit(photograph_stops, views)
-        sheet = pool.submit(write_png, new / "preview.png", picture)
-        extras = {k: info[k] for k in ("output_from_input", "model_from_input", "weights")}
-        glb = glb_bytes(asset, extras=extras)
-        placed = glb_bytes(asset, extras=extras, translation=translation) if any(translation) else glb
-        (new / "mesh.glb").write_bytes(placed)
+    with replacing() as new:
+        sheet = beside(partial(png_bytes, picture), asset.mesh.vertices.device)
+        (new / "mesh.glb").write_bytes(encoded.placed())
         for name in ("environment.exr", "environment.hdr"):
             write_environment(new / name, radiance)
         if compatible:
@@ -116,13 +157,13 @@ def write_results(
         if comparison is not None:
             write_png(new / COMPARISON, comparison)
         low, high = asset.mesh.vertices.aminmax(dim=0)
-        shown = {"mesh" if before is None else "after": Shown(glb, asset.mesh, scene)}
-        if before is not None:
-            shown["before"] = Shown(glb_bytes(before), before.mesh)
+        shown = {"mesh" if encoded.before is None else "after": Shown(encoded.glb(), encoded.shadow())}
+        if encoded.before is not None:
+            shown["before"] = encoded.before()
         middle, radius = (low + high) / 2, float((high - low).norm()) / 2
-        page = viewer_page(info["object"], shown, radiance, middle, radius, stops.result())
-        sheet.result()
+        page = viewer_page(info["object"], shown, radiance, middle, radius, encoded.stops())
         (new / "viewer.html").write_text(page, encoding="utf-8")
+        (new / "preview.png").write_bytes(sheet())
         (new / "run_info.json").write_text(json.dumps(info, indent=1) + "\n")
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import Image
+from PIL import Image, WebPImagePlugin
 from torch import Tensor
 
 import reli3d
@@ -34,11 +34,10 @@ TINY = 1e-20  # instead of a division by zero where nothing is blocked
 
 @dataclass(frozen=True)
 class Shown:
-    """A GLB file and the mesh in it, whose shadows on itself the page shows; scene: rays against the mesh."""
+    """A GLB file, and the :func:`shadow` of the mesh in it."""
 
     glb: bytes
-    mesh: Mesh
-    scene: RayScene | None = None
+    shadow: Mapping[str, str | float]
 
 
 def viewer_page(
@@ -51,7 +50,7 @@ def viewer_page(
     lights = {"own light": light, **{k: make().radiance for k, make in LIGHTS.items()}}
     data = {
         "name": name,
-        "meshes": [{"name": k, "glb": _base64(v.glb), **_shadow(v)} for k, v in meshes.items()],
+        "meshes": [{"name": k, "glb": _base64(v.glb), **v.shadow} for k, v in meshes.items()],
         "lights": [_light(k, v) for k, v in lights.items()],
         "views": list(stops),
         "middle": middle.tolist(),
@@ -79,9 +78,13 @@ def _base64(data: bytes) -> str:
     return base64.b64encode(data).decode()
 
 
-def _shadow(shown: Shown) -> dict:
-    """The light that every vertex misses, 16 bytes each, deflated: harmonics in steps of ``largest`` / 127."""
-    blocked = blocked_transfer(shown.mesh, scene=shown.scene).cpu()
+def shadow(mesh: Mesh, scene: RayScene | None = None) -> dict[str, str | float]:
+    """The light that every vertex of ``mesh`` keeps from itself, 16 bytes each, deflated: harmonics in steps of
+    ``largest`` / 127.
+
+    scene: rays against the mesh, made here if None.
+    """
+    blocked = blocked_transfer(mesh, scene=scene).cpu()
     largest = float(blocked.abs().amax()) if blocked.numel() else 0.0
     steps = (blocked * (127.0 / max(largest, TINY))).round().to(torch.int8)
     return {"blocked": _base64(zlib.compress(steps.numpy().tobytes(), LEVEL)), "largest": largest}
@@ -103,7 +106,8 @@ def _stop(views: Views, i: int) -> dict:
     if size != picture.size:
         picture = picture.resize(size, Image.Resampling.BOX)
     data = io.BytesIO()
-    picture.save(data, "WEBP", quality=QUALITY)
+    # a name that Pillow does not know yet would have it import all its formats
+    picture.save(data, WebPImagePlugin.WebPImageFile.format, quality=QUALITY)
     fx, fy, cx, cy = views.intrinsics[i].tolist()
     sx, sy = size[0] / width, size[1] / height
     return {

@@ -18,7 +18,7 @@ from reli3d.geometry.tangents import with_tangents
 from reli3d.io.glb import glb_bytes, read_glb, write_glb
 from reli3d.io.hdr import read_environment
 from reli3d.output import viewer
-from reli3d.output.viewer import Shown, photograph_stops, viewer_page
+from reli3d.output.viewer import Shown, photograph_stops, shadow, viewer_page
 from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
@@ -104,16 +104,16 @@ def choose(**values) -> str:
 
 
 def one_page(asset: Asset, views: Views, light: Environment | None = None) -> str:
-    shown = {"mesh": Shown(glb_bytes(asset), asset.mesh)}
+    shown = {"mesh": Shown(glb_bytes(asset), shadow(asset.mesh))}
     radiance = (light or asset.light).radiance
     return viewer_page("x", shown, radiance, torch.zeros(3), 0.7, photograph_stops(views))
 
 
 def test_the_page_shows_the_asset_as_the_renderer_does(tmp_path, asset, views):
-    glb = glb_bytes(asset)
+    shown = Shown(glb_bytes(asset), shadow(asset.mesh))
     page = viewer_page(
         "a <ball>",
-        {"before": Shown(glb, asset.mesh), "after": Shown(glb, asset.mesh)},
+        {"before": shown, "after": shown},
         asset.environment.radiance,
         torch.zeros(3),
         0.7,
