@@ -162,8 +162,16 @@ def _size(path: str | os.PathLike) -> int:
 
 def shapes(preset: AnyPreset) -> dict[str, tuple[int, ...]]:
     """Name and shape of every stored tensor of the network; allocates nothing."""
+    return _shapes(_unallocated(preset))
+
+
+def _unallocated(preset: AnyPreset) -> Network:
     with torch.device("meta"):
-        return {name: tuple(value.shape) for name, value in network(preset).state_dict().items()}
+        return network(preset)
+
+
+def _shapes(model: Network) -> dict[str, tuple[int, ...]]:
+    return {name: tuple(value.shape) for name, value in model.state_dict().items()}
 
 
 def check_keys(where: object, got: Mapping[str, tuple[int, ...]], expected: Mapping[str, tuple[int, ...]]) -> None:
@@ -236,7 +244,8 @@ def load(
     """
     manifest = read_manifest(path)
     preset = preset or manifest.preset()
-    check_keys(path, {name: entry.shape for name, entry in manifest.tensors.items()}, shapes(preset))
+    model = _unallocated(preset)
+    check_keys(path, {name: entry.shape for name, entry in manifest.tensors.items()}, _shapes(model))
     if expected_sha256 is not None:
         found = sha256(path)
         if found != expected_sha256:
@@ -245,9 +254,7 @@ def load(
         trunk = fastest(device)
     if isinstance(preset, LocalPreset) and trunk not in (None, torch.float32, torch.bfloat16):
         raise WeightsError(path, f"expected float32 or bfloat16 for the network of convolutions, got {trunk}")
-    with torch.device("meta"):
-        model = network(preset)
-        model.to_compute(trunk or default_trunk(preset, device))
+    model.to_compute(trunk or default_trunk(preset, device))
     wanted = {name: value.dtype for name, value in model.state_dict().items()}
     model.load_state_dict(read_tensors(manifest, wanted, device), strict=True, assign=True)
     return model.eval(), manifest
