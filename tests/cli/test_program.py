@@ -23,9 +23,13 @@ program.run("stand_in")
 """
 
 
-def ran(text: str, *options: str, **streams) -> subprocess.CompletedProcess:
+UNSET = ("PYTHONUNBUFFERED", "GOMP_SPINCOUNT", "OMP_WAIT_POLICY")  # the first: nothing would be left to be flushed
+
+
+def ran(text: str, *options: str, more: dict[str, str] | None = None, **streams) -> subprocess.CompletedProcess:
+    """more: of the environment, which says nothing about threads else."""
     streams = streams or {"capture_output": True}
-    env = {k: v for k, v in os.environ.items() if k != "PYTHONUNBUFFERED"}  # nothing would be left to be flushed
+    env = {k: v for k, v in os.environ.items() if k not in UNSET} | (more or {})
     return subprocess.run([sys.executable, "-c", PROGRAM, text, *options], text=True, timeout=60, env=env, **streams)
 
 
@@ -62,6 +66,13 @@ def main(): return 0
 """
     assert ran(text).stdout == ""
     assert ran(text.replace("return 0", "raise SystemExit(0)")).stdout == "taken apart\n"
+
+
+def test_threads_wait_asleep_unless_the_environment_says_otherwise():
+    text = "import os\ndef main(): print(os.environ.get('GOMP_SPINCOUNT')); return 0"
+    assert ran(text).stdout.strip() == program.SPINS
+    assert ran(text, more={"GOMP_SPINCOUNT": "7"}).stdout.strip() == "7"
+    assert ran(text, more={"OMP_WAIT_POLICY": "active"}).stdout.strip() == "None"
 
 
 def test_help_and_errors_end_as_ever():
