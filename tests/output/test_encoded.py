@@ -1,0 +1,61 @@
+"""Files that are encoded beside the preview: those of the functions themselves, and errors that leave an old result."""
+
+import base64
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from reli3d.geometry.camera import look_at
+from reli3d.io.glb import glb_bytes
+from reli3d.output import results
+from reli3d.render.asset import Asset
+from reli3d.render.lights import studio
+from reli3d.views.views import Views
+from tests.support.scenes import ball_mesh, textures
+
+RECORD = {"frame": "input", "output_from_input": [1], "model_from_input": [2], "weights": {"file": "x"}}
+PICTURE = np.zeros((8, 8, 3), np.uint8)
+MOVED = (1.0, 2.0, 3.0)
+
+
+@pytest.fixture
+def asset():
+    return Asset(ball_mesh(2, 0.7), textures(16, "cpu", (0.6, 0.6, 0.6), 0.5), studio())
+
+
+@pytest.fixture
+def views():
+    c2w = look_at(torch.tensor([0.0, 0.0, 3.0]), torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))[None]
+    return Views((torch.ones(8, 8, 3),), (torch.ones(8, 8),), c2w, torch.tensor([[9.0, 9.0, 4.0, 4.0]]), ("a.png",))
+
+
+def written(folder, encoded):
+    with results.claim(folder) as replacing:
+        results.write_results(replacing, encoded, PICTURE, {**RECORD, "object": "ball"})
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_the_mesh_lies_where_it_is_moved_to_and_the_page_has_it_where_it_is(tmp_path, asset, views, threads, count):
+    threads(count)
+    written(tmp_path / "ball", results.encode(asset, views, RECORD, translation=MOVED))
+    extras = {k: RECORD[k] for k in ("output_from_input", "model_from_input", "weights")}
+    assert (tmp_path / "ball" / "mesh.glb").read_bytes() == glb_bytes(asset, extras=extras, translation=MOVED)
+    (shown,) = re.findall(r'"glb": "([^"]*)"', (tmp_path / "ball" / "viewer.html").read_text())
+    assert base64.b64decode(shown) == glb_bytes(asset, extras=extras)
+    assert results.complete(tmp_path / "ball")
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_what_cannot_be_encoded_leaves_the_old_result(tmp_path, asset, views, threads, count):
+    threads(count)
+    folder = tmp_path / "ball"
+    written(folder, results.encode(asset, views, RECORD))
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    broken = replace(asset, textures=replace(asset.textures, base_color=asset.textures.base_color * torch.nan))
+    with pytest.raises(ValueError, match="base_color"):
+        written(folder, results.encode(broken, views, RECORD))
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+    assert [path.name for path in tmp_path.iterdir()] == ["ball"]
