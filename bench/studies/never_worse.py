@@ -19,6 +19,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from reli3d.eval.metrics import psnr
+from reli3d.fit.bounce import gathered
 from reli3d.fit.choice import decibels, picture_error
 from reli3d.fit.photographs import Photographs
 from reli3d.geometry.camera import Camera
@@ -46,10 +47,12 @@ def views_of(sample: dict[str, Tensor], which: list[int]) -> Views:
 @torch.no_grad()
 def scores(asset: Asset, sample: dict[str, Tensor], given: list[int], unseen: list[int]) -> dict[str, float]:
     """PSNR [dB] of whole pictures, of base colour on shared pixels after the best factors and as it is, and IoU."""
-    row = {
-        name: decibels(picture_error(asset, Photographs.of(views_of(sample, which).resampled(REFINED))))
+    shown = {
+        name: Photographs.of(views_of(sample, which).resampled(REFINED))
         for name, which in (("input", given), ("unseen", unseen))
     }
+    received = gathered(asset.mesh, shown["input"], seed=0)
+    row = {name: decibels(picture_error(asset, received, photographs)) for name, photographs in shown.items()}
     scene, size = RayScene(asset.mesh.vertices, asset.mesh.faces), sample["images"].shape[1]
     hits, _, _ = primary_hits(scene, Camera(sample["c2w"][unseen], sample["intrinsics"][unseen], size, size))
     hit, mask = hits.face >= 0, sample["images"][unseen][..., 3] > 127

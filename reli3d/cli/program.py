@@ -17,9 +17,9 @@ def run(module: str) -> NoReturn:
 
     Between two operations torch's threads look for the next one in a loop, which takes the processor from our own and
     from other programs: they do so for ``SPINS`` turns, unless the environment says otherwise.
-    Taking torch apart, module by module, would take another sixth of a second.  So the interpreter ends as ever, with
-    its threads and all that is registered to be done at its end, and leaves then.  Where ``main`` raises, as for
-    ``--help``, nothing is cut short.
+    Taking torch apart, module by module, would take another tenth of a second.  So the interpreter ends as ever, with
+    its threads and all that is registered, after this call, to be done at its end, and leaves then.  Where ``main``
+    raises, as for ``--help``, nothing is cut short.
     """
     if "OMP_WAIT_POLICY" not in os.environ:
         os.environ.setdefault("GOMP_SPINCOUNT", SPINS)  # libgomp reads it when torch is imported

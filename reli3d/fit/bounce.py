@@ -7,7 +7,7 @@ from torch import Tensor
 
 from reli3d._bridge import present
 from reli3d.fit.photographs import Photographs
-from reli3d.fit.seen import display_planes, seen_colors, sight
+from reli3d.fit.seen import COVERED, display_planes, seen_colors, sight
 from reli3d.fit.unknowns import unit
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene
@@ -16,19 +16,23 @@ from reli3d.render.points import SurfacePoints
 
 RAYS = 32  # of a vertex; their noise is averaged over the pixels around it
 BLOCK = 8192  # vertices at once: 10 MB of rays
-LIFT = 1e-3  # of the box's half side, where rays start above the surface
+LIFT = 1e-3  # where rays start above the surface: a fifteenth of a cell of 128, so that they do not meet their own face
 
 
 @torch.no_grad()
-def gathered(mesh: Mesh, scene: RayScene, photographs: Photographs, views: list[int], seed: int) -> Tensor:
+def gathered(mesh: Mesh, photographs: Photographs, *, seed: int) -> Tensor:
     """Radiance ``(V, 3)`` that reaches each vertex from the mesh itself: its mean over the hemisphere by the cosine.
 
     What leaves the surface, after all bounces, is in the photographs: a point sends what the cameras that see it show,
     on average, into every direction (a final gathering without a recursion).  A point that no camera sees sends the
-    mean of the others.  views: whose colours may be used.  Their exposures count as 1.
+    mean of the others.  Backs of faces send what their fronts do.
+
+    mesh: with normals, in the fit's box of half side 1.  photographs: whose colours may be used; exposures count as 1.
+    No gradient.  Raises ValueError without normals.
     """
     position, normal = mesh.vertices, present("mesh.normals", mesh.normals)
-    leaving, known = _leaving(position, normal, scene, photographs.select(views))
+    scene = RayScene(position, mesh.faces)
+    leaving, known = _leaving(position, normal, scene, photographs)
     if not bool(known.any()):
         return torch.zeros_like(position)
     leaving[~known] = leaving[known].mean(0)
@@ -48,7 +52,7 @@ def _leaving(position: Tensor, normal: Tensor, scene: RayScene, photographs: Pho
     planes, parts, seen = display_planes(photographs), [], []
     for at, n in zip(position.split(BLOCK), normal.split(BLOCK), strict=True):
         color, cover = seen_colors(planes, at, photographs.camera)
-        weight = sight(scene, at, n, photographs.camera) * (cover > 0.9)
+        weight = sight(scene, at, n, photographs.camera) * (cover > COVERED)
         total = weight.sum(1, keepdim=True)
         parts.append((weight[..., None] * srgb_to_linear(color.clamp(0.0, 1.0))).sum(1) / total.clamp(min=1e-6))
         seen.append(total[:, 0] > 0.0)

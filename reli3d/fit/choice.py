@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from reli3d.fit.bounce import gathered, thrown_back
+from reli3d.fit.bounce import thrown_back
 from reli3d.fit.photographs import Photographs
 from reli3d.fit.shading import radiance
 from reli3d.fit.transfer import changed
@@ -55,11 +55,13 @@ class Fitted:
     """A start and what a fit made of it.
 
     first: the start.  surface: the new surface with the maps and light of the start; ``first`` where it did not move.
+    received: ``(V, 3)``, of :func:`~reli3d.fit.bounce.gathered` at the vertices of ``surface``.
     photographs: with their cameras as corrected.
     """
 
     first: Asset
     surface: Asset
+    received: Tensor
     start: Start
     unknowns: Unknowns
     photographs: Photographs
@@ -80,19 +82,19 @@ class Fitted:
 class Pictures:
     """Small photographs, and what their rays hit of one surface, traced once.
 
-    views: whose colours say what the object throws on itself.  Of each of V views: ``wanted (V, S, S, 3)`` display
-    values on white; ``rays``: which pixels hit ``(S, S)``, their faces ``(N,)``, barycentrics ``(N, 2)`` and unit
-    directions to the eye ``(N, 3)``; ``inside (N,)``: well in masks.
+    received: ``(V, 3)``, of :func:`~reli3d.fit.bounce.gathered` at the vertices.  Of each of V views: ``wanted (V, S,
+    S, 3)`` display values on white; ``rays``: which pixels hit ``(S, S)``, their faces ``(N,)``, barycentrics ``(N,
+    2)`` and unit directions to the eye ``(N, 3)``; ``inside (N,)``: well in masks.
     """
 
     @torch.no_grad()
-    def __init__(self, asset: Asset, photographs: Photographs, views: list[int]):
+    def __init__(self, asset: Asset, received: Tensor, photographs: Photographs):
         small = photographs.resized(min(CHECK_PIXELS, photographs.size))
         self.mesh, self.scene = asset.mesh, RayScene(asset.mesh.vertices, asset.mesh.faces)
         shown = linear_to_srgb(small.color.clamp(0.0, 1.0))
         self.wanted = torch.lerp(torch.ones_like(shown), shown, small.mask[..., None])
         self.rays, self.inside, inside = [], [], small.inside()
-        self.received = gathered(asset.mesh, self.scene, photographs, views, seed=0)
+        self.received = received
         for view in range(len(small)):
             hits, _, directions = primary_hits(self.scene, small.camera[view])
             seen = hits.face >= 0
@@ -107,40 +109,38 @@ class Pictures:
         lit = []
         for view, (_, face, bary, wo) in enumerate(self.rays):
             at = surface_points(self.mesh, asset.textures, face, bary)
-            own = thrown_back(at, interpolate(self.received, self.mesh.faces, face, bary))
-            lit.append((radiance(at, wo, asset.light, samples=CHECK_SAMPLES, scene=self.scene, seed=view), own))
+            bounced = thrown_back(at, interpolate(self.received, self.mesh.faces, face, bary))
+            lit.append((radiance(at, wo, asset.light, samples=CHECK_SAMPLES, scene=self.scene, seed=view), bounced))
         return lit
 
     @torch.no_grad()
     def errors(self, lit: list[tuple[Tensor, Tensor]], strength: float = 1.0) -> Tensor:
         """Mean squared display error ``(V,)`` of whole pictures on white; light times ``strength``."""
         errors = []
-        for (direct, own), (seen, *_), wanted in zip(lit, self.rays, self.wanted, strict=True):
+        for (direct, bounced), (seen, *_), wanted in zip(lit, self.rays, self.wanted, strict=True):
             image = torch.ones_like(wanted)
-            image[seen] = linear_to_srgb((strength * direct + own).clamp(0.0, 1.0))
+            image[seen] = linear_to_srgb((strength * direct + bounced).clamp(0.0, 1.0))
             errors.append((image - wanted).square().mean())
         return torch.stack(errors)
 
     @torch.no_grad()
     def strength(self, lit: list[tuple[Tensor, Tensor]], views: list[int]) -> float:
         """The one of ``STRENGTHS`` that ``views`` show, by pixels well inside the masks: white shines in at the rim."""
-        got, own = (torch.cat([lit[view][k][self.inside[view]] for view in views]) for k in range(2))
+        got, bounced = (torch.cat([lit[view][k][self.inside[view]] for view in views]) for k in range(2))
         want = torch.cat([self.wanted[view][self.rays[view][0]][self.inside[view]] for view in views])
         if not len(got):
             return 1.0
 
         def error(strength: float) -> float:
-            return float((linear_to_srgb((strength * got + own).clamp(0.0, 1.0)) - want).square().mean())
+            return float((linear_to_srgb((strength * got + bounced).clamp(0.0, 1.0)) - want).square().mean())
 
         return min(STRENGTHS, key=error)
 
 
-def picture_error(asset: Asset, photographs: Photographs, views: list[int] | None = None) -> Tensor:
-    """Mean squared display error ``(V,)`` of whole pictures on white under the asset's own light, at pixel centres.
-
-    views: whose colours say what the object throws on itself; all where None.
-    """
-    pictures = Pictures(asset, photographs, list(range(len(photographs))) if views is None else views)
+def picture_error(asset: Asset, received: Tensor, photographs: Photographs) -> Tensor:
+    """Mean squared display error ``(V,)`` of whole pictures on white, at pixel centres, under the asset's own light and
+    what it throws on itself: ``received``, of :func:`~reli3d.fit.bounce.gathered` at its vertices."""
+    pictures = Pictures(asset, received, photographs)
     return pictures.errors(pictures.lit(asset))
 
 
@@ -159,7 +159,7 @@ def chosen(fitted: Fitted, used: list[int], held: list[int], before: Tensor) -> 
     is the one that the used views show best: the fit's error is that of the display's tangent, which rises faster than
     the display, so the fit ends too dark; and a mean of logarithms is darker than either of its lights.
     """
-    pictures = Pictures(fitted.surface, fitted.photographs, used)
+    pictures = Pictures(fitted.surface, fitted.received, fitted.photographs)
     moved = float(fitted.surface is not fitted.first)
     few = len(used) < FEW
     for paint, light in ORDER:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from reli3d._bridge import present
 from reli3d.fit import losses
-from reli3d.fit.bounce import gathered, thrown_back
+from reli3d.fit.bounce import thrown_back
 from reli3d.fit.budget import Budget
 from reli3d.fit.photographs import WHITE, Photographs
 from reli3d.fit.shading import radiance
@@ -30,7 +30,7 @@ from reli3d.render.points import SurfacePoints
 
 BATCH = 6144  # pixels a step
 SAMPLES = ((6, 6, 2), (12, 12, 4))  # of a pixel at the start and the end: coarse steps need no clean images
-PIXELS = 400_000  # of all photographs that are kept: 40 MB; of more, a random part
+PIXELS = 400_000  # of all photographs that are kept: 46 MB; of more, a random part
 RATES = {"material": 0.04, "detail": 0.03, "bend": 0.02, "light": 0.04, "exposure": 0.01}
 OPENING = 0.1  # share of the part after which the next finer map or grid joins in
 DETAIL_FROM = 0.35
@@ -63,10 +63,11 @@ class Pixels:
 
 
 @torch.no_grad()
-def traced(asset: Asset, scene: RayScene, photographs: Photographs, views: list[int], seed: int) -> Pixels:
-    """The pixels of ``views`` well inside the masks at which ``asset`` is hit."""
+def traced(
+    asset: Asset, received: Tensor, scene: RayScene, photographs: Photographs, views: list[int], seed: int
+) -> Pixels:
+    """The pixels of ``views`` well inside the masks at which ``asset``, whose vertices receive ``received``, is hit."""
     inside, mesh, parts = photographs.inside(), asset.mesh, []
-    received = gathered(mesh, scene, photographs, views, seed)
     for view in views:
         hits, _, directions = primary_hits(scene, photographs.camera[view])
         both = inside[view] & (hits.face >= 0)
@@ -118,13 +119,13 @@ def maps_loss(
     normal, turned = bent(unknowns, position, pixels.normal[rows])
     points = SurfacePoints(position, pixels.ng[rows], normal, *material_of(pixels.logits[rows] + change))
     light, exposure = environment(unknowns, start), unknowns.exposure.exp()[view, None]
-    own = thrown_back(points, pixels.received[rows])
-    image = (own + radiance(points, pixels.wo[rows], light, samples=samples, scene=scene, seed=2 * seed)) * exposure
+    bounced = thrown_back(points, pixels.received[rows])
+    image = (bounced + radiance(points, pixels.wo[rows], light, samples=samples, scene=scene, seed=2 * seed)) * exposure
     other = image
     if independent:
         with torch.no_grad():
             other = radiance(points, pixels.wo[rows], light, samples=samples, scene=scene, seed=2 * seed + 1)
-            other = (own + other) * exposure
+            other = (bounced + other) * exposure
     loss = weights.picture * losses.display_error(image, other, target, target > WHITE)
     color, was = (c.clamp(min=losses.DARK).log() for c in (points.base_color, material_of(pixels.logits[rows])[0]))
     loss = loss + weights.palette * losses.palette(color, target) + weights.hue * losses.hue_drift(color, was)
@@ -147,6 +148,7 @@ def fit_maps(
     unknowns: Unknowns,
     start: Start,
     asset: Asset,
+    received: Tensor,
     photographs: Photographs,
     views: list[int],
     weights: losses.Weights,
@@ -157,12 +159,14 @@ def fit_maps(
 ) -> None:
     """Fit light, exposures and materials on the surface of ``asset``, coarse parts first.
 
+    received: ``(V, 3)``, of :func:`~reli3d.fit.bounce.gathered` at its vertices.
+
     Errors of normals, shadows and bounced light look like paint.  While the paint is fitted the shading normals may
     bend almost freely and take these errors.  Then the paint stays, and the bend begins again at zero, held so that it
     takes only what many pixels ask for: this one is written into the asset.
     """
     scene = RayScene(asset.mesh.vertices, asset.mesh.faces)
-    pixels = traced(asset, scene, photographs, views, seed)
+    pixels = traced(asset, received, scene, photographs, views, seed)
     count = len(pixels.order)
     if count == 0:
         return

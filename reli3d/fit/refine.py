@@ -19,7 +19,6 @@ from reli3d.fit.shape import ShapeData, finished, fit_shape, start_grid
 from reli3d.fit.transfer import dressed
 from reli3d.fit.unknowns import START_GRID, Start, Unknowns, corrected, filled_grid
 from reli3d.geometry.mesh import watertight
-from reli3d.geometry.rays import RayScene
 from reli3d.render.asset import Asset
 
 RESOLUTION = 128  # cells along the longest side
@@ -34,7 +33,8 @@ class Refinement:
     """What :func:`refine` gives.
 
     asset: the refined one, or the start where no mixture of its parts is as good.  parts: what of the fit it has.
-    before, after: mean PSNR [dB] on white of the photographs that were used and of those held out (NaN without any).
+    before, after: mean PSNR [dB] on white of the photographs that were used and of those held out (NaN without any), by
+    pictures with direct light and what the object throws on itself (:func:`~reli3d.fit.bounce.gathered`).
     held: their indices.  c2w: ``(V, 4, 4)``, the cameras as corrected.  notes: one line each.  curve, steps: what the
     run did.
     """
@@ -109,10 +109,11 @@ def refine(
     low, high = asset.mesh.vertices.amin(0), asset.mesh.vertices.amax(0)
     shift, scale = (low + high) / 2, 2.0 / float((high - low).max())
     first, near = _moved(asset, shift, scale), photographs.moved(shift, scale)
-    before = picture_error(first, near, used)
+    received = gathered(first.mesh, near.select(used), seed=seed)
+    before = picture_error(first, received, near)
     notes: list[str] = []
     with torch.random.fork_rng(devices=[]), _interruptible(budget, notes):
-        fitted = _fitted(first, near, used, resolution, weights, budget, notes, seed=seed, cameras=cameras)
+        fitted = _fitted(first, received, near, used, resolution, weights, budget, notes, seed=seed, cameras=cameras)
         kept, parts, after = chosen(fitted, used, list(held), before)
     if budget.bar is not None:
         budget.bar.close()
@@ -126,6 +127,7 @@ def refine(
 
 def _fitted(
     first: Asset,
+    received: Tensor,
     photographs: Photographs,
     used: list[int],
     resolution: int,
@@ -138,24 +140,24 @@ def _fitted(
 ) -> Fitted:
     start, texels = Start.of(first), min(TEXELS, first.textures.size)
     closed = watertight(first.mesh)
-    level = first.mesh.vertices.new_ones(2, 2, 2)
+    level = first.mesh.vertices.new_ones(2, 2, 2)  # stands in where the surface is open and has no level
     if closed:
         grid, level, bound = start_grid(first.mesh, photographs, resolution)
     unknowns = Unknowns.zero(level, len(photographs), texels)
-    fit_maps(unknowns, start, first, photographs, used, weights, budget, LIGHT, seed=seed)
+    fit_maps(unknowns, start, first, received, photographs, used, weights, budget, LIGHT, seed=seed)
     surface = first
     if closed:
-        received = gathered(first.mesh, RayScene(first.mesh.vertices, first.mesh.faces), photographs, used, seed)
-        received = filled_grid(first.mesh.vertices, received, START_GRID)
-        data = ShapeData.of(start, level, bound, grid, received, photographs, used)
+        around = filled_grid(first.mesh.vertices, received, START_GRID)
+        data = ShapeData.of(start, level, bound, grid, around, photographs, used)
         fit_shape(unknowns, data, weights, budget, SHAPE_UNTIL, seed=seed, cameras=cameras)
         mesh = finished(unknowns.level, bound, grid)
         surface = dressed(mesh, first, first.textures.size)
         photographs = replace(photographs, camera=corrected(photographs.camera, unknowns.pose))
+        received = gathered(surface.mesh, photographs.select(used), seed=seed)
     else:
         notes.append("refinement: the surface is not closed, so only its maps and light are fitted")
-    fit_maps(unknowns, start, surface, photographs, used, weights, budget, MAPS, seed=seed)
-    return Fitted(first, surface, start, unknowns, photographs)
+    fit_maps(unknowns, start, surface, received, photographs, used, weights, budget, MAPS, seed=seed)
+    return Fitted(first, surface, received, start, unknowns, photographs)
 
 
 def _check_asset(asset: Asset, photographs: Photographs) -> None:

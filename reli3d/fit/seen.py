@@ -13,6 +13,7 @@ from reli3d.geometry.rays import RayScene
 from reli3d.geometry.visibility import visible_from
 from reli3d.render.color import linear_to_srgb
 
+COVERED = 0.9  # coverage from which a colour counts: less of it is the object's rim
 LEAST = 0.2  # cosine of the view from which a colour counts in full
 
 
@@ -30,7 +31,7 @@ def seen_colors(display: Tensor, position: Tensor, camera: Camera) -> tuple[Tens
 
 
 def display_planes(photographs: Photographs) -> Tensor:
-    """What :func:`seen_colors` reads."""
+    """What :func:`seen_colors` reads, ``(V, 4, S, S)``: display values times coverage, and coverage."""
     shown = linear_to_srgb(photographs.color.clamp(0.0, 1.0)) * photographs.mask[..., None]
     return torch.cat([shown, photographs.mask[..., None]], -1).permute(0, 3, 1, 2).contiguous()
 

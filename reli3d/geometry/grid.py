@@ -9,7 +9,7 @@ from torch import Tensor
 from reli3d._bridge import call, check, launch, once_differentiable
 from reli3d.kernels.grid import sample_grid_kernel, weighted_laplacian_adjoint_kernel, weighted_laplacian_kernel
 
-ROWS_MIN = 256  # fewest rows of a grid in a slice of a launch on a CPU: 10,000 points
+ROWS_MIN = 256  # fewest rows of a grid in a slice of a launch on a CPU: some 30,000 points
 
 
 def sample_grid(grid: Tensor, points: Tensor) -> Tensor:
@@ -34,7 +34,7 @@ def squared_laplacian(level: Tensor, share: Tensor) -> Tensor:
     """Sum ``()`` over inner points of ``share`` times the square of six neighbours less six times the point's value.
 
     level, share: ``(X, Y, Z)`` float32.  Points of the border count as neighbours only, and so do those where ``share``
-    is 0, at no cost.  Gradients reach ``level`` once; ``share`` is a constant.  Raises TypeError or ValueError.
+    is 0.  Gradients reach ``level`` once; ``share`` is a constant.  Raises TypeError or ValueError.
     """
     check("level", level)
     check("share", share, like=level)

@@ -59,7 +59,7 @@ def laplacian(values: wp.array3d[float], i: int, j: int, k: int) -> float:
 
 
 @wp.func
-def value_or_none(values: wp.array3d[float], i: int, j: int, k: int) -> float:
+def value_or_zero(values: wp.array3d[float], i: int, j: int, k: int) -> float:
     """0 beyond the border."""
     if i < 0 or j < 0 or k < 0 or i >= values.shape[0] or j >= values.shape[1] or k >= values.shape[2]:
         return 0.0
@@ -112,11 +112,11 @@ def weighted_laplacian_adjoint_kernel(
             value = laplacian(product, i, j, k)
         else:
             value = (
-                value_or_none(product, i + 1, j, k)
-                + value_or_none(product, i - 1, j, k)
-                + value_or_none(product, i, j + 1, k)
-                + value_or_none(product, i, j - 1, k)
-                + value_or_none(product, i, j, k + 1)
-                + value_or_none(product, i, j, k - 1)
+                value_or_zero(product, i + 1, j, k)
+                + value_or_zero(product, i - 1, j, k)
+                + value_or_zero(product, i, j + 1, k)
+                + value_or_zero(product, i, j - 1, k)
+                + value_or_zero(product, i, j, k + 1)
+                + value_or_zero(product, i, j, k - 1)
             )
         slope[i, j, k] = 2.0 * scale[0] * value

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-import reli3d
 from reli3d.cli import program
+from tests.support.checkout import ROOT
 
 # A module stands in for a command; what it leaves to the end of the process must be done, and nothing after that.
 PROGRAM = """
@@ -89,7 +89,7 @@ def test_a_result_that_cannot_be_written_is_no_success():
 
 
 def test_each_installed_command_runs_a_module_that_has_a_main():
-    text = (Path(reli3d.__file__).parents[1] / "pyproject.toml").read_text()
+    text = (ROOT / "pyproject.toml").read_text()
     scripts = re.findall(r'^(reli3d[a-z-]*) = "(.*):(.*)"$', text, re.MULTILINE)
     assert len(scripts) >= 8
     for name, module, function in scripts:

@@ -41,7 +41,8 @@ def photographs(start):
 def fitted(start, photographs, weights: Weights, steps: int = 40) -> Unknowns:
     unknowns = Unknowns.zero(torch.ones(2, 2, 2), VIEWS, small_scene.TEXELS)
     views, budget = list(range(VIEWS)), Budget(steps=steps)
-    maps.fit_maps(unknowns, Start.of(start), start, photographs, views, weights, budget, STAGE, seed=0)
+    none = torch.zeros_like(start.mesh.vertices)
+    maps.fit_maps(unknowns, Start.of(start), start, none, photographs, views, weights, budget, STAGE, seed=0)
     return unknowns
 
 
@@ -125,8 +126,8 @@ def test_the_paint_stays_while_the_kept_bend_is_fitted(start, photographs, monke
 
     monkeypatch.setattr(Budget, "tell", looking)
     unknowns = Unknowns.zero(torch.ones(2, 2, 2), VIEWS, small_scene.TEXELS)
-    budget = Budget(steps=20)
-    maps.fit_maps(unknowns, Start.of(start), start, photographs, list(range(VIEWS)), Weights(), budget, STAGE, seed=0)
+    budget, views, none = Budget(steps=20), list(range(VIEWS)), torch.zeros_like(start.mesh.vertices)
+    maps.fit_maps(unknowns, Start.of(start), start, none, photographs, views, Weights(), budget, STAGE, seed=0)
     first = int(maps.PAINT_UNTIL * 20)
     assert not torch.equal(seen[first - 2][0], seen[first - 1][0])
     assert torch.equal(seen[first][0], seen[-1][0]) and not torch.equal(seen[first][1], seen[-1][1])

@@ -1,19 +1,25 @@
 """Light that an object throws on itself: view factors in closed form, colours of photographs."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 import trimesh
 
-from reli3d.fit.bounce import gathered, thrown_back
+from reli3d.fit import maps
+from reli3d.fit.bounce import RAYS, gathered, thrown_back
+from reli3d.fit.losses import Weights
 from reli3d.fit.photographs import Photographs
+from reli3d.fit.unknowns import Start, Unknowns, material_of
 from reli3d.geometry.camera import Camera, look_at
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene
 from reli3d.render.points import SurfacePoints
+from tests.support import small_scene
 
 COLOR = torch.tensor([0.5, 0.2, 0.05])  # linear
+COPIES = 401  # vertices at each distance: 13,000 rays
 
 
 def photographs(eye, device, count=1):
@@ -27,7 +33,7 @@ def photographs(eye, device, count=1):
 def corner(height, device):
     """A floor of many vertices, y = 0, before a wall at z = 0; both a hundred times as wide as the wall is high."""
     wide = 100.0 * height
-    x = torch.linspace(-0.2, 0.2, 21) * height
+    x = torch.linspace(-0.2, 0.2, COPIES) * height
     z = torch.tensor([0.05, 0.25, 0.5, 1.0, 2.0]) * height
     points = torch.stack([*torch.meshgrid(x, torch.zeros(1), z, indexing="ij")], -1).reshape(-1, 3)
     ends = torch.tensor([[-wide, 0.0, 0.0], [wide, 0.0, 0.0], [wide, height, 0.0], [-wide, height, 0.0]])
@@ -35,22 +41,18 @@ def corner(height, device):
     vertices = torch.cat([points, ends])
     faces = torch.tensor([[n, n + 1, n + 2], [n, n + 2, n + 3]], dtype=torch.int32)
     normals = torch.tensor([[0.0, 1.0, 0.0]] * n + [[0.0, 0.0, 1.0]] * 4)
-    return Mesh(vertices, faces, normals).to(device), z.repeat(21).to(device)
-
-
-def received(mesh, seen):
-    return gathered(mesh, RayScene(mesh.vertices, mesh.faces), seen, list(range(len(seen))), seed=0)
+    return Mesh(vertices, faces, normals).to(device), z.repeat(COPIES).to(device)
 
 
 def test_a_floor_receives_the_view_factor_of_its_wall(device):
     height = 0.5
     mesh, distance = corner(height, device)
-    got = received(mesh, photographs((0.0, 2.0, 4.0), device))[: len(distance)]
+    got = gathered(mesh, photographs((0.0, 2.0, 4.0), device), seed=0)[: len(distance)]
     # the cosine over pi, integrated over the directions from a point of the floor to an endless wall
     factor = 0.5 * (1.0 - distance / (distance.square() + height**2).sqrt())
     for d in distance.unique():
         row = distance == d
-        share, count = factor[row][0], int(row.sum()) * 32
+        share, count = factor[row][0], int(row.sum()) * RAYS
         mean, want = got[row].mean(0), share * COLOR.to(device)
         error = COLOR.to(device) * math.sqrt(float(share * (1 - share)) / count)
         assert bool(((mean - want).abs() < 4.0 * error + 1e-3).all())  # four standard deviations; starts are lifted
@@ -61,24 +63,57 @@ def test_a_convex_body_receives_nothing_and_a_closed_room_one_colour(device):
     vertices, faces = torch.tensor(ball.vertices).float(), torch.tensor(ball.faces).int()
     outside, inside = Mesh(vertices, faces, vertices).to(device), Mesh(vertices, faces.flip(1), -vertices).to(device)
     seen = photographs((0.0, 0.0, 0.2), device)
-    assert not received(outside, photographs((0.0, 0.0, 4.0), device)).any()
-    torch.testing.assert_close(received(inside, seen), COLOR.to(device).expand(len(vertices), 3), rtol=1e-3, atol=0.0)
+    assert not gathered(outside, photographs((0.0, 0.0, 4.0), device), seed=0).any()
+    torch.testing.assert_close(
+        gathered(inside, seen, seed=0), COLOR.to(device).expand(len(vertices), 3), rtol=1e-3, atol=0.0
+    )
 
 
 def test_where_no_camera_sees_anything_nothing_is_received(device):
     mesh, _ = corner(0.5, device)
-    assert not received(mesh, photographs((0.0, -3.0, 0.1), device)).any()
+    assert not gathered(mesh, photographs((0.0, -3.0, 0.1), device), seed=0).any()
 
 
-def test_colours_of_views_that_may_not_be_used_are_not(device):
-    mesh, _ = corner(0.5, device)
-    both = photographs((0.0, 2.0, 4.0), device, count=2)
-    changed = both.color.clone()
-    changed[1] = 0.0
-    other = Photographs(changed, both.mask, both.camera)
-    scene = RayScene(mesh.vertices, mesh.faces)
-    assert torch.equal(gathered(mesh, scene, both, [0], seed=0), gathered(mesh, scene, other, [0], seed=0))
-    assert not torch.equal(gathered(mesh, scene, both, [0, 1], seed=0), gathered(mesh, scene, other, [0, 1], seed=0))
+def test_a_floor_receives_the_colour_of_the_wall_beside_it(device):
+    """Two walls that face each other, one red and one blue in the photograph."""
+    walls = []
+    for x in (-1.0, 1.0):
+        ends = [(x, 0.0, -1.0), (x, 1.0, -1.0), (x, 1.0, 1.0), (x, 0.0, 1.0)]
+        walls.append(torch.tensor(ends if x < 0.0 else ends[::-1]))
+    floor = torch.tensor([[-0.8, 0.0, 0.0], [0.8, 0.0, 0.0]]).repeat(COPIES, 1)
+    n = len(floor)
+    quad = torch.tensor([[0, 1, 2], [0, 2, 3]], dtype=torch.int32)
+    normals = torch.tensor([[0.0, 1.0, 0.0]] * n + [[1.0, 0.0, 0.0]] * 4 + [[-1.0, 0.0, 0.0]] * 4)
+    mesh = Mesh(torch.cat([floor, *walls]), torch.cat([quad + n, quad + n + 4]), normals).to(device)
+    seen = photographs((0.0, 2.0, 4.0), device)
+    color = torch.zeros(1, 16, 16, 3, device=device)
+    color[:, :, :8, 0], color[:, :, 8:, 2] = 1.0, 1.0
+    got = gathered(mesh, replace(seen, color=color), seed=0)[:n]
+    left, right = got[0::2].mean(0), got[1::2].mean(0)
+    assert (
+        float(left[0]) > 4.0 * float(left[2]) > 0.0
+    )  # the near wall covers a third of the hemisphere, the far one 4 %
+    torch.testing.assert_close(left, right.flip(0), rtol=0.1, atol=0.01)  # mirror images, 13,000 rays each
+
+
+def test_a_fit_of_maps_compares_pictures_with_what_is_thrown_back(monkeypatch):
+    """Without a light the picture is what the paint returns of what it receives, times the exposure."""
+    asset, photos = small_scene.ball(), small_scene.photographs(small_scene.ball(), 3, 32)
+    photos, mesh = Photographs.of(photos), asset.mesh
+    received = torch.linspace(0.1, 0.5, len(mesh.vertices))[:, None].expand(-1, 3).contiguous()
+    pixels = maps.traced(asset, received, RayScene(mesh.vertices, mesh.faces), photos, [0, 1, 2], seed=0)
+    paint, _, metallic = material_of(pixels.logits)
+    shown = replace(pixels, target=1.5 * paint * (1.0 - metallic[:, None]) * pixels.received)
+    monkeypatch.setattr(maps, "radiance", lambda points, *args, **options: torch.zeros_like(points.base_color))
+    weights = Weights(**{**dict.fromkeys(vars(Weights()), 0.0), "picture": 1.0})
+    unknowns = Unknowns.zero(torch.ones(2, 2, 2), 3, 8)
+    unknowns.exposure += math.log(1.5)
+    options = {"samples": (1, 0, 0), "views": 3, "seed": 0}
+    right, wrong = (
+        float(maps.maps_loss(unknowns, Start.of(asset), p, pixels.order, None, weights, **options))
+        for p in (shown, replace(shown, received=torch.zeros_like(pixels.received)))
+    )
+    assert right < 1e-10 < 1e-4 < wrong
 
 
 @pytest.mark.parametrize("metallic, share", [(0.0, 1.0), (0.25, 0.75), (1.0, 0.0)])

@@ -82,6 +82,7 @@ def test_thin_objects_get_a_finer_grid(depth, finer):
 
 def test_a_finer_grid_has_at_most_so_many_points(monkeypatch):
     mesh = slab(0.12)
-    for most, cells in ((math.prod(Grid.around(mesh.vertices, 48).shape), 48), (1, 32)):
+    points = math.prod(Grid.around(mesh.vertices, 32).shape)
+    for most, cells in ((3.375 * points, 48), (points, 32)):
         monkeypatch.setattr("reli3d.fit.shape.LARGEST", most)
         assert start_grid(mesh, unbounded(), 32)[0].cell == pytest.approx(2.0 / cells)

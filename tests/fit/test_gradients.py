@@ -29,7 +29,8 @@ def scene(plain: bool):
     photographs, asset = Photographs.of(views), replace(small_scene.ball(0.76), environment=small_scene.sky())
     grid = shape.Grid.around(asset.mesh.vertices, 16)
     level = shape.start_level(asset.mesh, grid)
-    bound, received = torch.full_like(level, -9.0), torch.full((2, 2, 2, 3), 0.1)
+    received = torch.rand(5, 5, 5, 3, generator=torch.Generator().manual_seed(4))
+    bound = torch.full_like(level, -9.0)
     data = shape.ShapeData.of(Start.of(asset), level, bound, grid, received, photographs, [0, 1, 2])
     unknowns = Unknowns.zero(level + 0.02 * grid.cell, 3, 8)
     rng = torch.Generator().manual_seed(2)
@@ -106,7 +107,8 @@ def test_a_step_has_the_slope_of_central_differences(case, monkeypatch):
 def test_the_bend_has_the_slope_of_central_differences(terms, monkeypatch):
     unknowns, data = scene(plain=False)
     asset, photographs = replace(small_scene.ball(), environment=small_scene.sky()), data.photographs
-    pixels = maps.traced(asset, RayScene(asset.mesh.vertices, asset.mesh.faces), photographs, [0, 1, 2], seed=0)
+    scene_of_rays, none = RayScene(asset.mesh.vertices, asset.mesh.faces), torch.zeros_like(asset.mesh.vertices)
+    pixels = maps.traced(asset, none, scene_of_rays, photographs, [0, 1, 2], seed=0)
     rng = torch.Generator().manual_seed(3)
     for grid in unknowns.bend:
         grid += 0.1 * torch.randn(grid.shape, generator=rng)

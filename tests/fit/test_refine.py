@@ -86,12 +86,12 @@ def test_the_same_steps_and_seed_give_the_same_bits(refined, start, views):
 
 
 def test_a_worse_result_gives_the_start_and_says_so(start, views, monkeypatch):
-    def spoiled(first, photographs, *args, **options):
+    def spoiled(first, received, photographs, *args, **options):
         unknowns = Unknowns.zero(torch.ones(2, 2, 2), VIEWS, 8)
         unknowns.material[0][..., :3] = torch.tensor([-8.0, 8.0, -8.0])
         unknowns.light[0][:] = torch.tensor([4.0, -4.0, 4.0])
         small = replace(first, mesh=replace(first.mesh, vertices=0.5 * first.mesh.vertices))
-        return Fitted(first, small, Start.of(first), unknowns, photographs)
+        return Fitted(first, small, received, Start.of(first), unknowns, photographs)
 
     monkeypatch.setattr(fit, "_fitted", spoiled)
     result = fit.refine(start, views, steps=1)

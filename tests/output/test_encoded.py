@@ -48,6 +48,16 @@ def test_the_mesh_lies_where_it_is_moved_to_and_the_page_has_it_where_it_is(tmp_
     assert results.complete(tmp_path / "ball")
 
 
+def test_the_page_of_a_refined_result_has_both(tmp_path, asset, views):
+    start = replace(asset, mesh=ball_mesh(2, 0.6))
+    written(tmp_path / "ball", results.encode(asset, views, RECORD, before=start))
+    page = (tmp_path / "ball" / "viewer.html").read_text()
+    extras = {k: RECORD[k] for k in ("output_from_input", "model_from_input", "weights")}
+    shown = dict(re.findall(r'"name": "(after|before)", "glb": "([^"]*)"', page))
+    assert base64.b64decode(shown["after"]) == glb_bytes(asset, extras=extras)
+    assert base64.b64decode(shown["before"]) == glb_bytes(start)
+
+
 @pytest.mark.parametrize("count", [1, 2])
 def test_what_cannot_be_encoded_leaves_the_old_result(tmp_path, asset, views, threads, count):
     threads(count)

@@ -344,7 +344,7 @@ CASES = {
         lambda n: {"grid": uniform(6, 5, 7, 4, seed=1), "points": uniform(n, 3, low=-1.2, high=1.2)},
         lambda grid, points: (sample_grid(grid, points),), ("grid", "points"), ("points",)),
     "squared_laplacian": Case(
-        lambda n: {"level": uniform(18, 16, 12, seed=1), "share": uniform(18, 16, 12, seed=2)},
+        lambda n: {"level": uniform(48, 40, 6, seed=1), "share": uniform(48, 40, 6, seed=2)},
         lambda level, share: (squared_laplacian(level, share),), ("level",)),
     "project": Case(
         lambda n: {"points": uniform(n, 3, low=-0.8, high=0.8)},
