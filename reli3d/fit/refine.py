@@ -23,7 +23,7 @@ from reli3d.render.asset import Asset
 
 RESOLUTION = 128  # cells along the longest side
 LIGHT = MapsStage("light", until=0.12, paint=False)  # first the light, then the surface, then all maps
-SHAPE_UNTIL = 0.4  # of the budget
+SHAPE_UNTIL = 0.5  # of the budget
 MAPS = MapsStage("maps", until=1.0)
 TEXELS = 512  # of the base colour's detail, at most
 
