@@ -335,12 +335,10 @@ class _DualVertices(torch.autograd.Function):
 def corner_vertices(t: _Topology) -> Tensor:
     """Grid vertex before padding at every corner of the surface cubes, ``(S, 8)``; a padding's one is the border's it
     stands at."""
-    cells = t.cells.long()
+    cells, k = t.cells.long(), torch.arange(8, device=t.cells.device)
     if t.pad == 0:  # the common case, ten times faster
-        k = torch.arange(8, device=cells.device)
         return cells[:, None] + ((k & 1) * t.shape[1] + (k >> 1 & 1)) * t.shape[2] + (k >> 2)
     at = torch.stack([cells // (t.shape[1] * t.shape[2]), cells // t.shape[2] % t.shape[1], cells % t.shape[2]], -1)
-    k = torch.arange(8, device=cells.device)
     at = at[:, None] + torch.stack([k & 1, k >> 1 & 1, k >> 2], -1) - t.pad
     at = torch.minimum(at.clamp(min=0), torch.tensor(t.cubes, device=cells.device))
     return (at[..., 0] * (t.cubes[1] + 1) + at[..., 1]) * (t.cubes[2] + 1) + at[..., 2]
