@@ -7,7 +7,7 @@ import pytest
 import torch
 import trimesh
 
-from reli3d.fit import maps
+from reli3d.fit import maps, shape
 from reli3d.fit.bounce import RAYS, gathered, thrown_back
 from reli3d.fit.losses import Weights
 from reli3d.fit.photographs import Photographs
@@ -15,6 +15,7 @@ from reli3d.fit.unknowns import Start, Unknowns, material_of
 from reli3d.geometry.camera import Camera, look_at
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene
+from reli3d.render.color import srgb_to_linear
 from reli3d.render.points import SurfacePoints
 from tests.support import small_scene
 
@@ -22,16 +23,15 @@ COLOR = torch.tensor([0.5, 0.2, 0.05])  # linear
 COPIES = 401  # vertices at each distance: 13,000 rays
 
 
-def photographs(eye, device, count=1):
-    """Of one colour everywhere."""
+def photographs(eye, device):
+    """One, of one colour everywhere."""
     up = torch.tensor([0.0, 1.0, 0.1])
-    c2w = torch.stack([look_at(torch.tensor(eye), torch.zeros(3), up)] * count).to(device)
-    camera = Camera.from_fov(c2w, 1.2, 16, 16)
-    return Photographs(COLOR.to(device).expand(count, 16, 16, 3), torch.ones(count, 16, 16, device=device), camera)
+    camera = Camera.from_fov(look_at(torch.tensor(eye), torch.zeros(3), up)[None].to(device), 1.2, 16, 16)
+    return Photographs(COLOR.to(device).expand(1, 16, 16, 3), torch.ones(1, 16, 16, device=device), camera)
 
 
 def corner(height, device):
-    """A floor of many vertices, y = 0, before a wall at z = 0; both a hundred times as wide as the wall is high."""
+    """Points of a floor, y = 0, at five distances from a wall at z = 0 that is 200 times as wide as it is high."""
     wide = 100.0 * height
     x = torch.linspace(-0.2, 0.2, COPIES) * height
     z = torch.tensor([0.05, 0.25, 0.5, 1.0, 2.0]) * height
@@ -90,9 +90,8 @@ def test_a_floor_receives_the_colour_of_the_wall_beside_it(device):
     color[:, :, :8, 0], color[:, :, 8:, 2] = 1.0, 1.0
     got = gathered(mesh, replace(seen, color=color), seed=0)[:n]
     left, right = got[0::2].mean(0), got[1::2].mean(0)
-    assert (
-        float(left[0]) > 4.0 * float(left[2]) > 0.0
-    )  # the near wall covers a third of the hemisphere, the far one 4 %
+    # endless walls would cover 40 % of the hemisphere, at 0.2 heights, and 6 %, at 1.8 heights
+    assert float(left[0]) > 4.0 * float(left[2]) > 0.0
     torch.testing.assert_close(left, right.flip(0), rtol=0.1, atol=0.01)  # mirror images, 13,000 rays each
 
 
@@ -109,11 +108,37 @@ def test_a_fit_of_maps_compares_pictures_with_what_is_thrown_back(monkeypatch):
     unknowns = Unknowns.zero(torch.ones(2, 2, 2), 3, 8)
     unknowns.exposure += math.log(1.5)
     options = {"samples": (1, 0, 0), "views": 3, "seed": 0}
-    right, wrong = (
-        float(maps.maps_loss(unknowns, Start.of(asset), p, pixels.order, None, weights, **options))
-        for p in (shown, replace(shown, received=torch.zeros_like(pixels.received)))
-    )
-    assert right < 1e-10 < 1e-4 < wrong
+
+    def loss(share: float, independent: bool) -> float:
+        rows = replace(shown, received=share * pixels.received)
+        result = maps.maps_loss(
+            unknowns, Start.of(asset), rows, pixels.order, None, weights, independent=independent, **options
+        )
+        return float(result)
+
+    assert loss(1.0, False) < 1e-10 < 1e-4 < loss(0.5, False)
+    assert loss(0.5, True) == loss(0.5, False)  # both estimates have it, and there is no noise
+
+
+def test_a_fit_of_the_surface_compares_colours_with_what_is_thrown_back(monkeypatch):
+    """Without a light an even ball has the colour of even photographs where it receives the right amount."""
+    asset, views = small_scene.ball(), small_scene.photographs(small_scene.ball(), 3, 32)
+    photos = Photographs.of(replace(views, images=torch.full_like(views.images, 0.5)))
+    grid = shape.Grid.around(asset.mesh.vertices, 16)
+    level, start = shape.start_level(asset.mesh, grid), Start.of(asset)
+    paint, _, metallic = material_of(start.material.reshape(-1, 5))
+    target = srgb_to_linear(torch.tensor(0.5)) / (paint * (1.0 - metallic[:, None]))
+    target = target.reshape(*start.material.shape[:3], 3)
+    monkeypatch.setattr(shape, "radiance", lambda points, *args, **options: torch.zeros_like(points.base_color))
+    weights = Weights(**{**dict.fromkeys(vars(Weights()), 0.0), "shading": 1.0})
+    bound, unknowns = torch.full_like(level, -9.0), Unknowns.zero(level, 3, 8)
+
+    def loss(share: float, independent: bool) -> float:
+        data = shape.ShapeData.of(start, level, bound, grid, share * target, photos, [0, 1, 2])
+        return float(shape.shape_loss(unknowns, data, weights, progress=0.9, seed=1, independent=independent))
+
+    assert loss(1.0, False) < 1e-6 < 1e-2 < loss(0.5, False)  # colours read from photographs are rounded
+    assert loss(0.5, True) == loss(0.5, False)  # both estimates have it, and there is no noise
 
 
 @pytest.mark.parametrize("metallic, share", [(0.0, 1.0), (0.25, 0.75), (1.0, 0.0)])

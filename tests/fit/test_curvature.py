@@ -31,7 +31,7 @@ def test_thick_parts_count_in_full_thin_ones_little_and_the_rest_not():
     level = block_and_sheet()
     share = curvature_share(level, level, 1.0)
     near = level.abs() < BAND
-    # the core ends at x = 19 and reaches 8 cells farther along each axis: all that is near the block
+    # the core ends at x = 18 and reaches 8 cells farther along each axis: all that is near the block
     assert (share[:23][near[:23]] == 1.0).all()
     assert torch.allclose(share[28:][near[28:]], torch.tensor(THIN))
     assert (share[~near] == 0.0).all()
@@ -47,7 +47,7 @@ def test_a_bound_that_leaves_a_thin_part_makes_it_thin():
 
 def test_descent_of_the_curvature_keeps_a_thin_sheet():
     """Steps of the term alone: without the share the ridge in the sheet sinks and opens it."""
-    for held, survives in ((True, True), (False, False)):
+    for held in (True, False):
         first = block_and_sheet()
         near = (first.abs() < BAND).float()
         share = curvature_share(first, first, 1.0) if held else near
@@ -57,7 +57,7 @@ def test_descent_of_the_curvature_keeps_a_thin_sheet():
             with torch.no_grad():
                 level -= 0.006 * slope  # stable below 1 / 12**2
         inside = level.detach()[32:54, 10:22, 16]
-        assert bool((inside < 0.0).all()) is survives
+        assert bool((inside < 0.0).all()) is held
 
 
 def slab(depth):
