@@ -30,8 +30,8 @@ class Weights:
     curvature: float = 0.5  # of :func:`curvature`
     stay: float = 2e-3  # of the level's distance from the start, over the number of views
     picture: float = 1.0  # of :func:`display_error` in the fit of the maps and the light
-    palette: float = 0.03  # of :func:`palette`
-    hue: float = 0.3  # of :func:`hue_drift`
+    palette: float = 0.01  # of :func:`palette`
+    hue: float = 0.1  # of :func:`hue_drift`
     base_coarse: float = 0.02  # prior of the base colour's coarse field towards the start, over the number of views
     paint: float = 20.0  # of :func:`near_paint`, over the fourth power of the number of views whose colours are used
     finish: float = 0.05  # prior of roughness and metallic towards the start, over the number of views
