@@ -81,6 +81,25 @@ def test_a_surface_alone_may_lose_a_little_of_the_held_out_view(true, photograph
     assert chosen(fit, USED, HELD, before)[0] is first
 
 
+def test_a_surface_alone_may_lose_very_little_of_all_views_together(true, photographs):
+    first = replace(small_scene.painted(small_scene.ball(squeeze=0.9)), environment=true.light)
+    fit = fitted(first, photographs, light=Environment(64.0 * true.light.radiance), surface=true)
+    _, _, errors = chosen(fit, USED, HELD, error_of(first, photographs))
+
+    def taken(used: float, held: float) -> bool:
+        """Where the start is better by so many dB."""
+        before = errors.clone()
+        before[USED] *= 10.0 ** (-used / 10.0)
+        before[HELD] *= 10.0 ** (-held / 10.0)
+        return chosen(fit, USED, HELD, before)[1] == Parts(1.0, 0.0, 0.0)
+
+    assert taken(0.1, -0.4)  # 0 of all five
+    assert taken(-0.1, 0.28)
+    assert taken(0.04, 0.04)
+    assert not taken(0.06, 0.06)
+    assert not taken(0.1, 0.0)  # 0.08 of all five
+
+
 def test_the_light_gets_the_strength_that_the_photographs_show(true, photographs):
     first = replace(true, environment=EVEN)
     dark = Environment(0.8 * true.light.radiance)
