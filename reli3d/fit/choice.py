@@ -24,8 +24,8 @@ CHECK_PIXELS = 96  # of a photograph, a side, by which candidates are compared
 CHECK_SAMPLES = (16, 16, 4)
 STRENGTHS = tuple(math.exp(0.05 * k) for k in range(-12, 13))
 SLACK = 0.02  # dB: the noise of a comparison
-# dB that the surface alone may lose on all views and on those held out: the masks of all views have bounded it, while
-# the start's paint and light hold shading of the start's surface
+# dB that the surface alone may lose in the mean of all views and in that of those held out: the masks of all views have
+# bounded it, while the start's paint and light hold shading of the start's surface
 ALONE = (0.05, 0.3)
 
 
@@ -152,8 +152,8 @@ def decibels(errors: Tensor) -> float:
 @torch.no_grad()
 def chosen(fitted: Fitted, used: list[int], held: list[int], before: Tensor) -> tuple[Asset, Parts, Tensor]:
     """The first of ``ORDER``, of few views with less (``FEW``), that is no worse than the start on the views ``used``
-    and on those ``held`` out (the surface alone: hardly worse on both together, and on the latter, ``ALONE``), else the
-    start; its parts, and the errors ``(V,)`` of its pictures.
+    and on those ``held`` out, else the start.  The surface alone may be worse by ``ALONE`` on all views together and on
+    those held out.  Returns its parts as well, and the errors ``(V,)`` of its pictures.
 
     used, held: indices of photographs.  before: errors ``(V,)`` of the start.  The strength of each candidate's light
     is the one that the used views show best: the fit's error is that of the display's tangent, which rises faster than

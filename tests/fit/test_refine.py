@@ -48,14 +48,14 @@ def half_colors(asset) -> torch.Tensor:
 
 def test_a_small_scene_is_recovered(refined, start):
     assert refined.parts == ALL
-    # 60 coarse steps; the bounds are half of what was measured (input +11 dB, held out +11 dB)
+    # 60 coarse steps; the bounds are about half of what was measured (input +11 dB, held out +8 dB)
     assert refined.after[0] > refined.before[0] + 5.0
     assert refined.after[1] > refined.before[1] + 5.0
     got = half_colors(refined.asset)
     want = srgb_to_linear(torch.tensor([[0.8, 0.25, 0.2], [0.25, 0.6, 0.3]]))
     # one factor a channel is free between paint and light: the ratio of the halves is not
     error = ((got[0] / got[1]).log() - (want[0] / want[1]).log()).abs()
-    # measured 0.61 of what grey is off: 60 steps are few, and the palette draws colours together at first
+    # measured 0.63 of what grey is off: 60 steps are few, and the palette draws colours together at first
     assert float(error.max()) < 0.65 * float((want[0] / want[1]).log().abs().max())
 
 
