@@ -24,9 +24,9 @@ CHECK_PIXELS = 96  # of a photograph, a side, by which candidates are compared
 CHECK_SAMPLES = (16, 16, 4)
 STRENGTHS = tuple(math.exp(0.05 * k) for k in range(-12, 13))
 SLACK = 0.02  # dB: the noise of a comparison
-# dB that the surface alone may lose in the mean of all views and in that of those held out: the masks of all views have
-# bounded it, while the start's paint and light hold shading of the start's surface
-ALONE = (0.05, 0.3)
+# dB that the surface alone may lose in the mean of the views used, of those held out, and of all: the masks of all
+# views have bounded it, while the start's paint and light hold shading of the start's surface
+ALONE = (0.1, 0.3, 0.05)
 
 
 @dataclass(frozen=True)
@@ -152,8 +152,8 @@ def decibels(errors: Tensor) -> float:
 @torch.no_grad()
 def chosen(fitted: Fitted, used: list[int], held: list[int], before: Tensor) -> tuple[Asset, Parts, Tensor]:
     """The first of ``ORDER``, of few views with less (``FEW``), that is no worse than the start on the views ``used``
-    and on those ``held`` out, else the start.  The surface alone may be worse by ``ALONE`` on all views together and on
-    those held out.  Returns its parts as well, and the errors ``(V,)`` of its pictures.
+    and on those ``held`` out, else the start.  The surface alone may be worse by ``ALONE`` on these and on
+    all together.  Returns its parts as well, and the errors ``(V,)`` of its pictures.
 
     used, held: indices of photographs.  before: errors ``(V,)`` of the start.  The strength of each candidate's light
     is the one that the used views show best: the fit's error is that of the display's tangent, which rises faster than
@@ -169,7 +169,8 @@ def chosen(fitted: Fitted, used: list[int], held: list[int], before: Tensor) -> 
         lit = pictures.lit(asset)
         strength = pictures.strength(lit, used) if light else 1.0
         errors = pictures.errors(lit, strength)
-        asked = ((used, SLACK), (held, SLACK)) if paint or light else (([*used, *held], ALONE[0]), (held, ALONE[1]))
+        slack = (SLACK, SLACK, SLACK) if paint or light else ALONE
+        asked = zip((used, held, [*used, *held]), slack, strict=True)
         if all(decibels(errors[which]) >= decibels(before[which]) - most for which, most in asked if which):
             asset = replace(asset, environment=Environment(strength * asset.light.radiance))
             return asset, Parts(moved, paint, light), errors
