@@ -48,7 +48,6 @@ INSIDE = 2.0  # pixels of such a view that a silhouette's edge may spill over
 SMALLEST_PART = 0.01  # share of the faces below which a separate piece is dropped
 SHADING_POINTS = 4096  # vertices by which the light on the object is judged
 OUTSIDE = 1.0  # level given to grid points that the silhouettes exclude
-COARSE = 4  # cells of the surface grid along a cell of the one that looks for the silhouettes' hull first
 MARGIN_CELLS = 2.5  # cells around the silhouettes' hull in which the field is still evaluated
 
 
@@ -115,17 +114,17 @@ def _bounded_surface(field: LocalField, resolution: int) -> Mesh:
     preset, maps = field.model.preset, field.maps
     radius = preset.radius
     radius = min(radius, _hull_reach(field, resolution) + 2 * MARGIN_CELLS * radius / resolution)
-    flat = _grid(resolution, radius, maps.images.device).reshape(-1, 3)
+    axis = torch.linspace(-radius, radius, resolution + 1, device=maps.images.device)
     cell = 2 * radius / resolution / preset.softness
-    bound = field.bound(flat, REACH + 4 * cell)  # what is farther outside than REACH changes nothing
-    level = bound.clamp(min=OUTSIDE).view((resolution + 1,) * 3)
-    near = bound.view_as(level) < MARGIN_CELLS * cell
+    bound = field.grid_bound(axis, REACH + 4 * cell)  # what is farther outside than REACH changes nothing
+    near = bound < MARGIN_CELLS * cell
 
     def evaluate(index: Tensor) -> Tensor:
-        return torch.cat([torch.maximum(field.level_within(flat[k], bound[k]), bound[k]) for k in index.split(CHUNK)])
+        parts = [(_grid_points(axis, k), bound.view(-1)[k]) for k in index.split(CHUNK)]
+        return torch.cat([torch.maximum(field.level_within(*part), part[1]) for part in parts])
 
-    level = torch.maximum(sparse_level(level, near, evaluate), bound.view_as(level))
-    level = cover_silhouettes(level, bound.view_as(level), maps.silhouette, maps.camera, radius=radius)
+    level = torch.maximum(sparse_level(bound.clamp(min=OUTSIDE), near, evaluate), bound)
+    level = cover_silhouettes(level, bound, maps.silhouette, maps.camera, radius=radius)
     _check_signs(level)
     return extract_surface(level, radius=radius)
 
@@ -137,22 +136,20 @@ def _check_signs(level: Tensor) -> None:
 
 
 def _hull_reach(field: LocalField, resolution: int) -> float:
-    """Largest coordinate of the points of the model's grid that lie inside all silhouettes.
-
-    Evaluated coarsely first: a point inside has a coarse neighbour that is outside by no more than their distance.
-    """
-    radius, device = field.model.preset.radius, field.maps.images.device
-    coarse = -(-resolution // COARSE)
-    apart = 2 * radius / coarse
-    slack = 3**0.5 * apart / field.model.preset.softness  # twice half a diagonal: distances stretch off the axis
-    level = field.bound(_grid(coarse, radius, device).reshape(-1, 3), slack)
-    near = (level < slack).reshape((coarse + 1,) * 3)
-    k = ((torch.linspace(-radius, radius, resolution + 1, device=device) + radius) / apart).round().long()
-    flat = _grid(resolution, radius, device)[near[k][:, k][:, :, k]]
-    inside = flat[field.bound(flat, 0.0) < 0]
-    if len(inside) == 0:
+    """Largest coordinate of the points of the model's grid that lie inside all silhouettes."""
+    radius = field.model.preset.radius
+    axis = torch.linspace(-radius, radius, resolution + 1, device=field.maps.images.device)
+    inside = field.grid_bound(axis, 0.0) < 0
+    reach = axis.abs()[inside.nonzero()]
+    if len(reach) == 0:
         raise ValueError("masks: expected masks that overlap in space, got none inside all of them; run --check")
-    return float(inside.abs().max())
+    return float(reach.max())
+
+
+def _grid_points(axis: Tensor, index: Tensor) -> Tensor:
+    """Points ``(N, 3)`` of the grid along ``axis (n,)`` with the flat indices ``index (N,)``."""
+    n = len(axis)
+    return torch.stack([axis[index // (n * n)], axis[index // n % n], axis[index % n]], 1)
 
 
 def _grid(resolution: int, radius: float, device: torch.device) -> Tensor:

@@ -17,6 +17,7 @@ import warp as wp
 from reli3d import _bridge
 from reli3d.geometry.mesh import group
 from reli3d.kernels import uv as kernels
+from reli3d.kernels.cuts import cuts_kernel, vec8d
 
 CPU = torch.device("cpu")
 COS_LABEL = 0.4  # a face keeps an axis only up to 66 degrees from its normal: at most 2.5 times stretched
@@ -30,7 +31,7 @@ CUT_WASTE = 0.002  # of the atlas: empty share of its box that makes a chart wor
 CUT_FILL = 0.6  # of its box: a chart that covers more is left whole
 CUT_GAIN = 0.85  # boxes of the two pieces over the box of the chart, at most ...
 CUT_HOLLOW, CUT_HOLLOW_GAIN = 0.25, 1.02  # ... but a ring gains by the second cut only: no gain needed below this fill
-CUT_ANGLES = 8  # directions in [0, 180) degrees of the cut, and of the boxes that judge it
+CUT_ANGLES = 8  # directions in [0, 180) degrees of the cut, and of the boxes that judge it, as in kernels.cuts
 ANGLES = 24  # directions in [0, 90) degrees tried for the smallest bounding box of a chart: within 2 degrees of it
 LIGHT = 8192  # faces a CPU slice of the steps that take a few nanoseconds a face: less costs more to launch than to run
 GROW_MAX = 2.0  # a chart seen obliquely is enlarged to its area on the surface, up to this factor
@@ -195,6 +196,19 @@ def _upright(right: np.ndarray, up: np.ndarray, points: np.ndarray, chart: np.nd
     return right * cos - up * sin, right * sin + up * cos, low
 
 
+def cuts(along: np.ndarray, begin: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Cuts across each direction, in the middle of a chart and at the mean of its points: their places and the area of
+    the pieces' smallest boxes, both ``(C, CUT_ANGLES, 2)`` float64.
+
+    along: ``(P, CUT_ANGLES)`` float64, points along the directions, one chart after the other.  begin: ``(C + 1,)``
+    int32, where those of a chart begin.
+    """
+    at, area = torch.empty(2, len(begin) - 1, CUT_ANGLES, 2, dtype=torch.float64)
+    ins = (torch.from_numpy(along), vec8d), (torch.from_numpy(begin), wp.int32)
+    _bridge.launch(cuts_kernel, area.numel(), [*ins, (at, wp.float64), (area, wp.float64)], CPU, slice_min=CUT_ANGLES)
+    return at.numpy(), area.numpy()
+
+
 def _cut_bulky(
     points: np.ndarray,
     chart: np.ndarray,
@@ -233,21 +247,16 @@ def _cut_bulky(
     owner = (np.cumsum(bulky) - 1)[chart[outer]]
     count = int(bulky.sum())
     least = np.where(area < CUT_HOLLOW * box, CUT_HOLLOW_GAIN, CUT_GAIN) * box
+    start = np.searchsorted(owner, np.arange(count + 1)).astype(np.int32)
+    at, total = cuts(np.stack(turned, 1), start)
     best, best_angle, best_at = least[bulky], np.full(count, -1), np.zeros(count)
     axis = np.where(long, axis, -1)[bulky]
-    start = np.searchsorted(owner, np.arange(count))
-    for k, v in enumerate(turned):
-        middle = 0.5 * (np.maximum.reduceat(v, start) + np.minimum.reduceat(v, start))
-        mean = np.bincount(owner, v, count) / np.bincount(owner, minlength=count)
-        for at in (middle, mean):
-            side = 2 * owner + (v > at[owner])
-            rows, begin = group(side)
-            total = np.bincount(side[rows[begin]] // 2, boxes(extents(begin, [w[rows] for w in turned])), count)
-            total = np.where(axis < 0, total, np.where(axis == k, 0.0, np.inf))
-            better = total < best * (1 - 1e-6)
-            best, best_angle, best_at = (
-                np.where(better, new, old) for new, old in ((total, best), (k, best_angle), (at, best_at))
-            )
+    for k, kind in np.ndindex(CUT_ANGLES, 2):
+        boxed = np.where(axis < 0, total[:, k, kind], np.where(axis == k, 0.0, np.inf))
+        better = boxed < best * (1 - 1e-6)
+        best, best_angle, best_at = (
+            np.where(better, new, old) for new, old in ((boxed, best), (k, best_angle), (at[:, k, kind], best_at))
+        )
     cut = np.flatnonzero(bulky)[best_angle >= 0]
     if not len(cut):
         return None

@@ -44,13 +44,22 @@ def cover_silhouettes(level: Tensor, bound: Tensor, distance: Tensor, camera: Ca
     if views == 0:
         return level.detach().clone()
     level, bound, distance = (v.detach().contiguous() for v in (level, bound, distance))
+    lowest = _lowest(level)
     lacking = level.new_empty(views, height // STRIDE, width // STRIDE)
     posed = (camera.c2w, wp.mat44), (camera.intrinsics, wp.vec4)
     cameras = [(v.detach().contiguous(), kind) for v, kind in posed]
     launch(
         kernels.lacking_kernel,
         lacking.numel(),
-        [(level, wp.float32), (distance, wp.float32), *cameras, radius, DEPTH, REACH, STRIDE, (lacking, wp.float32)],
+        [
+            *((v, wp.float32) for v in (level, lowest, distance)),
+            *cameras,
+            radius,
+            DEPTH,
+            REACH,
+            STRIDE,
+            (lacking, wp.float32),
+        ],
         level.device,
     )
     lacking = max_pool2d(lacking, 3, 1, 1)  # as far as the silhouette's edge, between two rays
@@ -71,3 +80,13 @@ def cover_silhouettes(level: Tensor, bound: Tensor, distance: Tensor, camera: Ca
         level.device,
     )
     return lowered
+
+
+def _lowest(level: Tensor) -> Tensor:
+    """Least level of each block of ``kernels.BLOCK`` cells a side, those on its border included."""
+    for axis in range(3):
+        cells = level.shape[axis] - 1
+        most = torch.arange(-(-cells // kernels.BLOCK), device=level.device) * kernels.BLOCK
+        points = [level.index_select(axis, (most + k).clamp(max=cells)) for k in range(kernels.BLOCK + 1)]
+        level = torch.stack(points).amin(0)
+    return level.contiguous()

@@ -11,6 +11,9 @@ from torch import Tensor
 from reli3d._bridge import check, launch
 from reli3d.geometry.camera import Camera, check_camera
 from reli3d.kernels import hull as kernels
+from reli3d.kernels import mask_distance as pixels
+
+BLOCKS_MIN = 64  # blocks of a grid in a CPU slice: each of them has 64 points
 
 
 def mask_distance(masks: Tensor) -> Tensor:
@@ -31,7 +34,7 @@ def mask_distance(masks: Tensor) -> Tensor:
         raise ValueError("masks: expected values in [0, 1], got others")
     distance = torch.empty_like(masks)
     launch(
-        kernels.mask_distance_kernel,
+        pixels.mask_distance_kernel,
         masks.numel(),
         [
             (masks, wp.float32),
@@ -52,9 +55,9 @@ def _nearest_crossing(masks: Tensor) -> list:
     views, height, width = masks.shape
     rows, begin = torch.empty_like(masks), torch.empty_like(masks)
     apex, nearest = (torch.empty_like(masks, dtype=torch.int32) for _ in range(2))
-    launch(kernels.column_kernel, views * width, [(masks, wp.float32), (rows, wp.float32)], masks.device)
+    launch(pixels.column_kernel, views * width, [(masks, wp.float32), (rows, wp.float32)], masks.device)
     launch(
-        kernels.row_kernel,
+        pixels.row_kernel,
         views * height,
         [(rows, wp.float32), (apex, wp.int32), (begin, wp.float32), (nearest, wp.int32)],
         masks.device,
@@ -80,6 +83,25 @@ def hull_distance(points: Tensor, distance: Tensor, camera: Camera, *, far: floa
     hull = torch.empty(len(points), device=points.device)
     inputs = [(points.detach().contiguous(), wp.vec3), *_views(distance, camera), far, (hull, wp.float32)]
     launch(kernels.hull_distance_kernel, len(points), inputs, points.device)
+    return hull
+
+
+def hull_grid(axis: Tensor, distance: Tensor, camera: Camera, *, far: float = math.inf) -> Tensor:
+    """:func:`hull_distance` at the points ``(axis[i], axis[j], axis[k])``, ``(n, n, n)``, in less time.
+
+    axis: ``(n,)`` ascending, world units.  distance: of :func:`mask_distance`, unlike which a view's distance may not
+    change faster than by a pixel a pixel.  The rest is as there, and the values are equal.
+    """
+    check("axis", axis)
+    if axis.ndim != 1:
+        raise ValueError(f"axis: expected shape (n,), got {tuple(axis.shape)}")
+    _check_views(axis, distance, camera)
+    if not far >= 0.0:
+        raise ValueError(f"far: expected at least 0, got {far}")
+    n = len(axis)
+    hull = axis.new_empty(n, n, n)
+    inputs = [(axis.detach().contiguous(), wp.float32), *_views(distance, camera), far, (hull, wp.float32)]
+    launch(kernels.hull_grid_kernel, (-(-n // kernels.BLOCK)) ** 3, inputs, axis.device, slice_min=BLOCKS_MIN)
     return hull
 
 

@@ -10,6 +10,7 @@ import io
 import json
 import os
 import struct
+import zlib
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -28,7 +29,7 @@ from reli3d.render.asset import Asset
 
 UNIT = 1.0e-3  # deviation from length 1 that readers accept
 ENCODERS: dict[str, dict[str, Any]] = {
-    "png": {"compress_level": 1},  # zlib level: 2 is 1.3 times slower for 2 % less; baked maps are smooth
+    "png": {"compress_level": 1, "compress_type": zlib.Z_RLE},  # baked maps are smooth: a fifth smaller, and faster
     "webp": {"lossless": True, "exact": True},
 }
 WEBP = "EXT_texture_webp"

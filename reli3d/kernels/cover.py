@@ -12,6 +12,7 @@ from reli3d.kernels.volume import cube_range
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
 
 STEP = wp.constant(0.5)  # of a cell, between two looks at the level along a ray
+BLOCK = wp.constant(4)  # cells along a side of a block whose least level is known
 INNER = wp.constant(1.0)  # pixels that a point must lie inside a silhouette, whose edge pixels are half background
 
 
@@ -34,11 +35,25 @@ def level_at(level: wp.array3d[float], cell: wp.vec3) -> float:
     return wp.lerp(wp.lerp(v00, v01, y), wp.lerp(v10, v11, y), x)
 
 
+@wp.func
+def out_of_block(cell: wp.vec3, along: wp.vec3, block: wp.vec3i) -> float:
+    """How far a ray that goes ``along`` cells a unit from ``cell`` stays in ``block``."""
+    far = wp.float32(3.0e38)
+    for axis in range(3):
+        side = float(block[axis] * BLOCK)
+        if along[axis] > 0.0:
+            side += float(BLOCK)
+        if along[axis] != 0.0:
+            far = wp.min(far, (side - cell[axis]) / along[axis])
+    return far
+
+
 @wp.kernel
 def lacking_kernel(
     start: int,
     # in
     level: wp.array3d[float],
+    lowest: wp.array3d[float],  # of each block of BLOCK cells a side, border included
     distance: wp.array3d[float],
     c2w: wp.array[wp.mat44],
     intrinsics: wp.array[wp.vec4],
@@ -75,7 +90,17 @@ def lacking_kernel(
         while t < span[1] and least > -depth:
             p = origin + direction * t
             cell = wp.cw_mul(p + wp.vec3(radius, radius, radius), scale)
-            least = wp.min(least, level_at(level, cell))
+            block = wp.vec3i(
+                wp.clamp(int(cell[0]) // BLOCK, 0, lowest.shape[0] - 1),
+                wp.clamp(int(cell[1]) // BLOCK, 0, lowest.shape[1] - 1),
+                wp.clamp(int(cell[2]) // BLOCK, 0, lowest.shape[2] - 1),
+            )
+            if lowest[block[0], block[1], block[2]] < least:
+                least = wp.min(least, level_at(level, cell))
+            else:  # no look in this block could change anything
+                end = t + out_of_block(cell, wp.cw_mul(direction, scale), block) - step
+                while t < end:
+                    t += step
             t += step
         if least < reach:
             lacking[view, i, j] = wp.max(least + depth, 0.0)

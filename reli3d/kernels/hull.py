@@ -1,240 +1,42 @@
-"""Signed distance of pixels to a mask's contour, and of points to the visual hull of several masks.
-
-Pixel (row y, column x) has its centre at (x + 0.5, y + 0.5).  The contour is where the mask, bilinear between pixel
-centres, is 0.5: in a *cell* of four neighbouring centres one or two segments (marching squares).  Cell (y, x) has the
-pixels (y, x), (y, x + 1), (y + 1, x), (y + 1, x + 1); there are (H - 1) * (W - 1).
-"""
+"""Signed distance of points to the visual hull of several masks, whose pixels hold distances to their contours."""
 
 import warp as wp
 
 from reli3d.kernels.bilinear import look_up
 
-wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
+wp.set_module_options(
+    # functions that several kernels call: a call copies the arrays' shapes and strides
+    {"enable_backward": False, "cpu_compiler_flags": "-march=native -mllvm=-inline-threshold=5000"}
+)
 
-NEVER = wp.constant(65536.0)  # rows to a crossing where a column has none: beyond any image
-NEAR = wp.constant(4.0)  # pixels; beyond, other segments are at most sqrt(16.5) - 4 = 0.06 pixels nearer
-FAR = wp.constant(16.0)  # pixels; beyond, the end of a segment is at most 0.25 / 16 pixels farther than the segment
 BEHIND = wp.constant(-1.0e3)  # distance of a point that a camera cannot see, in world units: below that of any other
 REACHED = wp.constant(1.0e-3)  # a ray this close to the hull is on it, in world units
-CAREFUL = wp.constant(
-    0.7
-)  # share of the distance that a ray may go: distances are up to 1 / cos^2 of an angle too long
+CAREFUL = wp.constant(0.7)  # of the distance that a ray may go: distances are up to 1 / cos^2 of an angle too long
 STEP_MIN = wp.constant(4.0e-3)  # thinner parts of the hull may be missed
 STEP_MAX = wp.constant(0.25)
 DEPTH_MIN = wp.constant(1.0e-4)  # a point this close to a camera's plane counts as behind it
+BLOCK = wp.constant(4)  # points along a side of a block of a grid
+FEW = wp.constant(32)  # views that a block of a grid tells apart; further ones are asked at every point
+
+few = wp.types.vector(length=32, dtype=wp.float32)
+few_numbers = wp.types.vector(length=32, dtype=wp.int32)
 
 
 @wp.func
-def crosses(mask: wp.array3d[float], view: int, y: int, x: int) -> bool:
-    """Whether the contour runs through a cell."""
-    count = wp.int32(0)
-    for k in range(4):
-        if mask[view, y + k // 2, x + k % 2] >= 0.5:
-            count += 1
-    return count > 0 and count < 4
-
-
-@wp.func
-def squared_to_segment(p: wp.vec2, a: wp.vec2, b: wp.vec2) -> float:
-    ab = b - a
-    t = wp.clamp(wp.dot(p - a, ab) / wp.max(wp.dot(ab, ab), 1.0e-12), 0.0, 1.0)
-    away = p - a - ab * t
-    return wp.dot(away, away)
-
-
-@wp.func
-def crossing(a: float, b: float) -> float:
-    """Where between 0 and 1 a value that runs from ``a`` to ``b`` is 0.5."""
-    return wp.clamp((0.5 - a) / (b - a), 0.0, 1.0)
-
-
-@wp.func
-def squared_to_contour(mask: wp.array3d[float], view: int, y: int, x: int, p: wp.vec2) -> float:
-    """Squared distance of ``p`` (column, row in pixel centres) to the contour inside cell (y, x), which it crosses."""
-    m00 = mask[view, y, x]
-    m01 = mask[view, y, x + 1]
-    m10 = mask[view, y + 1, x]
-    m11 = mask[view, y + 1, x + 1]
-    q = p - wp.vec2(float(x), float(y))
-    top = (m00 >= 0.5) != (m01 >= 0.5)
-    bottom = (m10 >= 0.5) != (m11 >= 0.5)
-    left = (m00 >= 0.5) != (m10 >= 0.5)
-    right = (m01 >= 0.5) != (m11 >= 0.5)
-    t = wp.vec2()
-    b = wp.vec2()
-    l = wp.vec2()
-    r = wp.vec2()
-    if top:
-        t = wp.vec2(crossing(m00, m01), 0.0)
-    if bottom:
-        b = wp.vec2(crossing(m10, m11), 1.0)
-    if left:
-        l = wp.vec2(0.0, crossing(m00, m10))
-    if right:
-        r = wp.vec2(1.0, crossing(m01, m11))
-    if top and bottom and left and right:
-        # saddle: the corners with the sign of the centre are joined, the other two are cut off
-        if (0.25 * (m00 + m01 + m10 + m11) >= 0.5) == (m00 >= 0.5):
-            return wp.min(squared_to_segment(q, t, r), squared_to_segment(q, l, b))
-        return wp.min(squared_to_segment(q, t, l), squared_to_segment(q, r, b))
-    one = t
-    other = b
-    if left and top:
-        other = l
-    if right and top:
-        other = r
-    if left and bottom:
-        one = l
-    if right and bottom:
-        one = r
-    if left and right:
-        one = l
-        other = r
-    return squared_to_segment(q, one, other)
-
-
-@wp.kernel
-def column_kernel(
-    start: int,
-    # in
-    mask: wp.array3d[float],
-    # out
-    row: wp.array3d[float],
-):
-    """Row of the nearest crossing of the contour with a pixel's column, ``NEVER`` away without one; a thread is a
-    column."""
-    i = start + wp.tid()
-    height = mask.shape[1]
-    width = mask.shape[2]
-    view = i // width
-    x = i % width
-    last = wp.float32(-NEVER)
-    for y in range(height):
-        row[view, y, x] = last
-        if y + 1 < height:
-            a = mask[view, y, x]
-            b = mask[view, y + 1, x]
-            if (a >= 0.5) != (b >= 0.5):
-                last = float(y) + crossing(a, b)
-    last = wp.float32(2.0 * NEVER)
-    for k in range(height):
-        y = height - 1 - k
-        if y + 1 < height:
-            a = mask[view, y, x]
-            b = mask[view, y + 1, x]
-            if (a >= 0.5) != (b >= 0.5):
-                last = float(y) + crossing(a, b)
-        if last - float(y) < float(y) - row[view, y, x]:
-            row[view, y, x] = last
-
-
-@wp.kernel
-def row_kernel(
-    start: int,
-    # in
-    row: wp.array3d[float],
-    # scratch
-    apex: wp.array3d[wp.int32],
-    begin: wp.array3d[float],
-    # out
-    nearest: wp.array3d[wp.int32],
-):
-    """Column whose crossing, at its ``row``, is the nearest one of all columns; -1 without any.  A thread is a row.
-
-    Lower envelope of parabolas, Felzenszwalb and Huttenlocher 2012, Distance Transforms of Sampled Functions.
-    """
-    i = start + wp.tid()
-    height = row.shape[1]
-    width = row.shape[2]
-    view = i // height
-    y = i % height
-    top = wp.int32(-1)
-    for x in range(width):
-        dy = row[view, y, x] - float(y)
-        if wp.abs(dy) < 0.5 * NEVER:
-            height_x = dy * dy + float(x * x)
-            at = wp.float32(-1.0e9)
-            search = top >= 0
-            while search:
-                other = apex[view, y, top]
-                dy = row[view, y, other] - float(y)
-                at = (height_x - (dy * dy + float(other * other))) / float(2 * (x - other))
-                if at > begin[view, y, top]:
-                    search = False
-                else:
-                    top -= 1
-                    if top < 0:
-                        at = -1.0e9
-                        search = False
-            top += 1
-            apex[view, y, top] = x
-            begin[view, y, top] = at
-    k = wp.int32(0)
-    for x in range(width):
-        while k < top and begin[view, y, k + 1] < float(x):
-            k += 1
-        if top < 0:
-            nearest[view, y, x] = -1
-        else:
-            nearest[view, y, x] = apex[view, y, k]
-
-
-@wp.kernel
-def mask_distance_kernel(
-    start: int,
-    # in
-    mask: wp.array3d[float],
-    row: wp.array3d[float],
-    nearest_x: wp.array3d[wp.int32],
-    column: wp.array3d[float],
-    nearest_y: wp.array3d[wp.int32],
-    far: float,
-    # out
-    distance: wp.array3d[float],
-):
-    """Signed distance to the contour, ``far`` without one.
-
-    The nearest crossing with any column (``row``, ``nearest_x``) or row (``column``, ``nearest_y``, both transposed)
-    is an end of a segment; measured are the segments of the cells beside it, and of their neighbours where it is
-    near.
-    """
-    i = start + wp.tid()
-    height = mask.shape[1]
-    width = mask.shape[2]
-    view = i // (height * width)
-    y = (i // width) % height
-    x = i % width
-    p = wp.vec2(float(x), float(y))
-    best = far * far
-    cell_x = wp.int32(-9)
-    cell_y = wp.int32(-9)
-    near_x = nearest_x[view, y, x]
-    near_y = nearest_y[view, x, y]
-    if near_x >= 0:
-        at = wp.vec2(float(near_x), row[view, y, near_x])
-        cell_x = near_x
-        cell_y = int(at[1])
-        best = wp.length_sq(at - p)
-    if near_y >= 0:
-        at = wp.vec2(column[view, x, near_y], float(near_y))
-        if wp.length_sq(at - p) < best:
-            cell_x = int(at[0])
-            cell_y = near_y
-            best = wp.length_sq(at - p)
-    reach = wp.int32(1)  # the cell's lower neighbours, which share the crossing
-    if best < NEAR * NEAR:
-        reach = 2
-    if best > FAR * FAR:
-        reach = -1  # no cell
-    for v in range(cell_y - 1, cell_y + reach):
-        for u in range(cell_x - 1, cell_x + reach):
-            inner = v >= 0 and v < height - 1 and u >= 0 and u < width - 1
-            if inner and crosses(mask, view, v, u):
-                best = wp.min(best, squared_to_contour(mask, view, v, u, p))
-    if mask[view, y, x] >= 0.5:
-        distance[view, y, x] = wp.sqrt(best)
-    else:
-        distance[view, y, x] = -wp.sqrt(best)
+def distance_in_view(
+    point: wp.vec3, view: int, distance: wp.array3d[float], c2w: wp.array[wp.mat44], intrinsics: wp.array[wp.vec4]
+) -> float:
+    """Pixel distance at a point's image times the size of a pixel at its depth."""
+    m = c2w[view]
+    away = point - wp.vec3(m[0, 3], m[1, 3], m[2, 3])
+    right = m[0, 0] * away[0] + m[1, 0] * away[1] + m[2, 0] * away[2]
+    up = m[0, 1] * away[0] + m[1, 1] * away[1] + m[2, 1] * away[2]
+    depth = -(m[0, 2] * away[0] + m[1, 2] * away[1] + m[2, 2] * away[2])
+    if depth > DEPTH_MIN:  # False for NaN too
+        k = intrinsics[view]
+        value = look_up(distance, view, k[2] + k[0] * right / depth, k[3] - k[1] * up / depth)
+        return value * depth * 2.0 / (k[0] + k[1])
+    return BEHIND
 
 
 @wp.func
@@ -246,17 +48,7 @@ def distance_to_hull(
     best = wp.float32(-BEHIND)
     view = wp.int32(0)
     while view < c2w.shape[0] and best >= -far:
-        m = c2w[view]
-        away = point - wp.vec3(m[0, 3], m[1, 3], m[2, 3])
-        right = m[0, 0] * away[0] + m[1, 0] * away[1] + m[2, 0] * away[2]
-        up = m[0, 1] * away[0] + m[1, 1] * away[1] + m[2, 1] * away[2]
-        depth = -(m[0, 2] * away[0] + m[1, 2] * away[1] + m[2, 2] * away[2])
-        if depth > DEPTH_MIN:  # False for NaN too
-            k = intrinsics[view]
-            value = look_up(distance, view, k[2] + k[0] * right / depth, k[3] - k[1] * up / depth)
-            best = wp.min(best, value * depth * 2.0 / (k[0] + k[1]))
-        else:
-            best = BEHIND
+        best = wp.min(best, distance_in_view(point, view, distance, c2w, intrinsics))
         view += 1
     return best
 
@@ -275,6 +67,86 @@ def hull_distance_kernel(
 ):
     i = start + wp.tid()
     hull[i] = distance_to_hull(points[i], distance, c2w, intrinsics, far)
+
+
+@wp.func
+def change_in_view(centre: wp.vec3, radius: float, value: float, pose: wp.mat44, k: wp.vec4) -> float:
+    """By how much :func:`distance_in_view`, ``value`` at ``centre``, can differ within ``radius`` of it; -1 where a
+    point there may lie behind the camera.
+
+    A distance changes by at most sqrt(2) a pixel between pixel centres, and mask_distance_kernel is 1 pixel off at
+    most.
+    """
+    away = centre - wp.vec3(pose[0, 3], pose[1, 3], pose[2, 3])
+    depth = -(pose[0, 2] * away[0] + pose[1, 2] * away[1] + pose[2, 2] * away[2])
+    if not (depth - radius > DEPTH_MIN):
+        return -1.0
+    moved = wp.max(k[0], k[1]) * radius * (wp.length(away) / depth) / (depth - radius)  # pixels
+    pixel = 2.0 / (k[0] + k[1])
+    return (1.4143 * moved + 1.0) * pixel * (depth + radius) + wp.abs(value) / depth * radius
+
+
+@wp.kernel
+def hull_grid_kernel(
+    start: int,
+    # in
+    axis: wp.array[float],  # (N,) ascending
+    distance: wp.array3d[float],
+    c2w: wp.array[wp.mat44],
+    intrinsics: wp.array[wp.vec4],
+    far: float,
+    # out
+    hull: wp.array3d[float],  # (N, N, N)
+):
+    """A thread is a block of points, at which only the views are asked that may have the least distance in it."""
+    i = start + wp.tid()
+    n = axis.shape[0]
+    blocks = (n + BLOCK - 1) // BLOCK
+    x0 = i // (blocks * blocks) * BLOCK
+    y0 = i // blocks % blocks * BLOCK
+    z0 = i % blocks * BLOCK
+    x1 = wp.min(x0 + BLOCK, n)
+    y1 = wp.min(y0 + BLOCK, n)
+    z1 = wp.min(z0 + BLOCK, n)
+    low = wp.vec3(axis[x0], axis[y0], axis[z0])
+    high = wp.vec3(axis[x1 - 1], axis[y1 - 1], axis[z1 - 1])
+    centre = 0.5 * (low + high)
+    radius = 0.5 * wp.length(high - low)
+    greatest = wp.float32(-BEHIND)  # no point of the block is farther inside
+    least = few()  # of each view
+    views = wp.min(c2w.shape[0], FEW)
+    for v in range(views):
+        value = distance_in_view(centre, v, distance, c2w, intrinsics)
+        change = change_in_view(centre, radius, value, c2w[v], intrinsics[v])
+        least[v] = BEHIND
+        if change >= 0.0:
+            least[v] = value - change
+            greatest = wp.min(greatest, value + change)
+    asked = few_numbers()
+    count = wp.int32(0)
+    for v in range(views):
+        if least[v] <= greatest:
+            asked[count] = v
+            if least[v] < least[asked[0]]:  # first the one that is likely to tell that a point lies far outside
+                asked[count] = asked[0]
+                asked[0] = v
+            count += 1
+    for x in range(x0, x1):
+        for y in range(y0, y1):
+            for z in range(z0, z1):
+                best = greatest
+                if greatest >= -far:
+                    p = wp.vec3(axis[x], axis[y], axis[z])
+                    best = wp.float32(-BEHIND)
+                    k = wp.int32(0)
+                    while k < count and best >= -far:
+                        best = wp.min(best, distance_in_view(p, asked[k], distance, c2w, intrinsics))
+                        k += 1
+                    v = views
+                    while v < c2w.shape[0] and best >= -far:
+                        best = wp.min(best, distance_in_view(p, v, distance, c2w, intrinsics))
+                        v += 1
+                hull[x, y, z] = best
 
 
 @wp.kernel

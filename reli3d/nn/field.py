@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from reli3d._bridge import over_rows
-from reli3d.geometry.hull import hull_distance
+from reli3d.geometry.hull import hull_distance, hull_grid
 from reli3d.geometry.surface import surface_cubes
 from reli3d.nn.blocks import ROWS, in_rows
 from reli3d.nn.heads import deformation
@@ -42,6 +42,11 @@ def bound_level(maps: ViewMaps, points: Tensor, softness: float, far: float = ma
     level above ``far`` where that is higher; no gradient.
     """
     return -hull_distance(points, maps.silhouette, maps.camera, far=far * softness) / softness
+
+
+def grid_bound_level(maps: ViewMaps, axis: Tensor, softness: float, far: float = math.inf) -> Tensor:
+    """:func:`bound_level` at the points ``(axis[i], axis[j], axis[k])``, ``(n, n, n)``; axis: ``(n,)`` ascending."""
+    return -hull_grid(axis, maps.silhouette, maps.camera, far=far * softness) / softness
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from reli3d.geometry.camera import Camera, image_plane
 from reli3d.geometry.projection import fuse_views, gather_views, summarize_views
 from reli3d.kernels.view_features import SURE
 from reli3d.nn.blocks import in_rows, linear_of
-from reli3d.nn.field import Field, PointMaterial, bound_level
+from reli3d.nn.field import Field, PointMaterial, bound_level, grid_bound_level
 from reli3d.nn.heads import ROUGHNESS_MIN, color_logit, mlp
 from reli3d.nn.light_features import Shading, brightness_at, brightness_over_normal, palette_of, unshaded
 from reli3d.nn.light_map import LightMap
@@ -253,6 +253,10 @@ class LocalField(Field):
         is some level above ``far``.  No gradient.
         """
         return bound_level(self.maps, points, self.model.preset.softness, far)
+
+    def grid_bound(self, axis: Tensor, far: float = math.inf) -> Tensor:
+        """:meth:`bound` at the points ``(axis[i], axis[j], axis[k])``, ``(n, n, n)``; axis: ``(n,)`` ascending."""
+        return grid_bound_level(self.maps, axis, self.model.preset.softness, far)
 
     def _level(self, points: Tensor) -> Tensor:
         return self._level_within(points, self.bound(points))

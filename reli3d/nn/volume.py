@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from reli3d.geometry.grid import sample_grid
-from reli3d.geometry.hull import hull_distance
+from reli3d.geometry.hull import hull_grid
 from reli3d.geometry.projection import HIDDEN, NUMBERS, SPREAD, gather_views, spread_views, summarize_views
 from reli3d.nn.blocks import in_rows, linear_of
 from reli3d.nn.presets import VolumeSizes
@@ -50,7 +50,7 @@ class FeatureVolume(nn.Module):
         """``(N, N, N, F)``, indexed x, y, z.  surface: as in :func:`~reli3d.nn.view_features.ahead_of_surface`."""
         axis = torch.linspace(-self.radius, self.radius, self.side, device=maps.images.device)
         grid = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
-        hull = hull_distance(grid, maps.silhouette, maps.camera, far=NEAR_HULL)
+        hull = hull_grid(axis, maps.silhouette, maps.camera, far=NEAR_HULL).view(-1)
         near = (hull > -NEAR_HULL).nonzero()[:, 0]
 
         mixed = None if torch.is_grad_enabled() else self._tokens(maps)

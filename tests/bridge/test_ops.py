@@ -303,7 +303,14 @@ def test_no_kernel_is_left_out(monkeypatch):
             gradients(case, leaves, outs)
     found = set()
     for module in pkgutil.iter_modules(kernels.__path__):
-        if module.name not in ("noise", "distance", "uv", "components", "allocation"):  # of data; CPU alone; of counts
+        if module.name not in (
+            "noise",
+            "distance",
+            "uv",
+            "cuts",
+            "components",
+            "allocation",
+        ):  # of data; CPU alone; of counts
             values = vars(importlib.import_module(f"reli3d.kernels.{module.name}")).values()
             found |= {v.key for v in values if isinstance(v, wp.Kernel)}
     assert found - launched == {

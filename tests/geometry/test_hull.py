@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from reli3d import pipeline
 from reli3d.geometry.camera import Camera
-from reli3d.geometry.hull import hull_distance, hull_span, mask_distance, mirror_miss
+from reli3d.geometry.hull import hull_distance, hull_grid, hull_span, mask_distance, mirror_miss
 from reli3d.nn.field import bound_level
 from reli3d.nn.local import LocalField
 from reli3d.nn.presets import SMALL
@@ -132,6 +132,23 @@ def test_only_what_is_far_outside_may_differ_where_far_is_given(device):
     near = whole >= -0.3
     assert torch.equal(got[near], whole[near]) and bool((got[~near] < -0.3).all())
     assert int((got != whole).sum()) > 500, "views are left out"
+
+
+@pytest.mark.parametrize("views, eyes, focal", [(8, 3.0, 300.0), (40, 1.2, 120.0), (3, 0.6, 60.0), (1, 3.0, 300.0)])
+@pytest.mark.parametrize("far", [math.inf, 0.2, 0.0])
+def test_a_grid_has_the_values_of_its_points(device, views, eyes, focal, far):
+    """Of ragged masks, of wide angles, of more views than a block tells apart, and of points behind cameras."""
+    _, camera = sphere_views(device, n=views, distance=eyes, size=128, focal=focal)
+    noise = torch.rand(views, 1, 16, 16, generator=torch.Generator().manual_seed(views))
+    masks = torch.nn.functional.interpolate(noise, size=(128, 128), mode="bilinear")[:, 0]
+    masks = ((masks - 0.4) * 20.0).clamp(0, 1).to(device)
+    distance, axis = mask_distance(masks), torch.linspace(-0.7, 0.7, 42, device=device)
+    points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+    whole = hull_distance(points, distance, camera)
+    got = hull_grid(axis, distance, camera, far=far).view(-1)
+    near = whole >= -far
+    assert torch.equal(got[near], whole[near]) and bool((got[~near] < -far).all())
+    assert eyes > 1.0 or int((whole == -1000.0).sum()) > 100, "cameras stand among the points"
 
 
 def mirrored_rays(device):
@@ -258,13 +275,14 @@ def test_result_does_not_depend_on_the_number_of_threads(threads):
     results = []
     for count in (1, 2, 5):
         threads(count)
-        results.append(hull_distance(points, mask_distance(masks), camera))
+        distance, axis = mask_distance(masks), torch.linspace(-0.5, 0.5, 40)
+        results.append(torch.cat([hull_distance(points, distance, camera), hull_grid(axis, distance, camera).view(-1)]))
     assert all(torch.equal(results[0], other) for other in results[1:])
 
 
 @pytest.mark.parametrize("radius, views", [(0.5, 8), (0.06, 3), (0.3, 1)])
-def test_the_coarse_look_finds_the_reach_of_the_dense_one(device, radius, views):
-    """Also of a ball thinner than a coarse cell (0.087), and of one view's cone that runs to the end of the grid."""
+def test_the_reach_is_that_of_the_points_inside(device, radius, views):
+    """Also of a thin ball, and of one view's cone that runs to the end of the grid."""
     masks, camera = sphere_views(device, n=views, radius=radius)
     images = torch.cat([torch.zeros(*masks.shape, 3, device=device), mask_distance(masks)[..., None]], -1)
     maps = ViewMaps(images.new_empty(views, 1, 1, 1), images, camera)
