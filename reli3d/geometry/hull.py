@@ -89,8 +89,8 @@ def hull_distance(points: Tensor, distance: Tensor, camera: Camera, *, far: floa
 def hull_grid(axis: Tensor, distance: Tensor, camera: Camera, *, far: float = math.inf) -> Tensor:
     """:func:`hull_distance` at the points ``(axis[i], axis[j], axis[k])``, ``(n, n, n)``, in less time.
 
-    axis: ``(n,)`` ascending, world units.  distance: ``(V, H, W)`` from :func:`mask_distance`; other maps must not change
-    by more than 1 from a pixel to the next.  camera, far: as there, and the values are equal.
+    axis: ``(n,)`` ascending, world units.  distance: ``(V, H, W)`` from :func:`mask_distance`; other maps must not
+    change by more than 1 from a pixel to the next.  camera, far: as there, and the values are equal.
     """
     check("axis", axis)
     if axis.ndim != 1:
