@@ -196,8 +196,9 @@ def texture(
         found = {"base_color": got.base_color, "roughness": got.roughness[:, None], "metallic": got.metallic[:, None]}
         return {**found, "normal": encode_normals(got.normal, normal, tangent)}
 
-    baked = bake(mesh, size, lambda *at: in_rows(surface, *at), chunk=CHUNK, tangents=True, values=known)
-    return mesh, TextureSet(**{k: v.clamp(0, 1).contiguous() for k, v in baked.items()})
+    ask = surface if local is None else partial(in_rows, surface)
+    baked = bake(mesh, size, ask, chunk=CHUNK, tangents=True, values=known)
+    return mesh, TextureSet(**{k: v.clamp_(0, 1) for k, v in baked.items()})
 
 
 def light(field: Field) -> Environment:

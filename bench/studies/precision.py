@@ -24,7 +24,6 @@ import torch
 import trimesh
 from torch import Tensor, nn
 
-from reli3d.geometry.triplane import sample_triplane
 from reli3d.nn.heads import Heads
 from reli3d.nn.illumination import Transformer1D
 from reli3d.nn.presets import BackboneSizes, EncoderSizes, IlluminationSizes, UpsamplerSizes
@@ -98,8 +97,8 @@ def material(goldens: Path, meshes: Path) -> list[str]:
         points = torch.from_numpy(np.array(shape.vertices, np.float32))
         low, high = points.aminmax(dim=0)
         points = (2.0 * points - low - high) / float((high - low).max())
-        features = sample_triplane(held["triplane"], points[None])[0]
-        full, low16 = heads(features, names), heads(features, names, torch.bfloat16)
+        asked = held["triplane"], points[None], names
+        full, low16 = heads.at(*asked), heads.at(*asked, torch.bfloat16)
         noise = [-10.0 * math.log10(float((low16[k] - full[k]).square().mean())) for k in names[:3]]
         cosine = (low16["normal"].double() * full["normal"].double()).sum(-1)
         angle = torch.rad2deg(torch.acos((cosine / low16["normal"].double().norm(dim=-1)).clamp(-1, 1)))

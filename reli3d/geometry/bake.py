@@ -250,8 +250,12 @@ def bake(
                 if value.shape[1] != maps[name].shape[1]:
                     raise ValueError(f"fn()[{name!r}]: expected {maps[name].shape[1]} channels, got {value.shape[1]}")
                 maps[name][part] = value
-    result = {name: value.reshape(size, size, -1) for name, value in maps.items()}
-    return dilate(result, texels.valid) if fill else result
+    result = {name: value.view(size, size, -1) for name, value in maps.items()}
+    if fill:
+        nearest = nearest_valid(texels.valid)
+        for value in result.values():
+            _fill(value, *nearest)
+    return result
 
 
 def nearest_valid(valid: Tensor) -> tuple[Tensor, Tensor]:
@@ -308,16 +312,16 @@ def dilate(
         if value.ndim != 3 or value.shape[:2] != valid.shape:
             raise ValueError(f"{name}: expected shape {(*valid.shape, 'C')}, got {tuple(value.shape)}")
         result = value.detach().clone(memory_format=torch.contiguous_format)
-        nearest = (source.reshape(-1), wp.int32), (square.reshape(-1), wp.float32)
-        channels = value.shape[2]
-        _bridge.launch(
-            kernels.fill_kernel,
-            valid.numel(),
-            [*nearest, limit, channels, (result.view(-1, channels), wp.float32)],
-            value.device,
-        )
+        _fill(result, source, square, limit)
         return result
 
     if isinstance(maps, Tensor):
         return filled("maps", maps)
     return {name: filled(f"maps[{name!r}]", value) for name, value in maps.items()}
+
+
+def _fill(value: Tensor, source: Tensor, square: Tensor, limit: float = float("inf")) -> None:
+    """Copy texels of ``value (H, W, C)``, in place, from those that :func:`nearest_valid` found within ``limit``."""
+    nearest = (source.reshape(-1), wp.int32), (square.reshape(-1), wp.float32)
+    flat = value.view(-1, value.shape[2])
+    _bridge.launch(kernels.fill_kernel, len(flat), [*nearest, limit, flat.shape[1], (flat, wp.float32)], value.device)

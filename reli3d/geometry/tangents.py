@@ -15,6 +15,7 @@ from torch import Tensor
 
 from reli3d._bridge import check, expect, launch, present
 from reli3d.geometry.mesh import Mesh, weld_rows
+from reli3d.kernels.normal_maps import encode_normals_kernel
 from reli3d.kernels.tangents import corner_shares_kernel
 
 PARALLEL = 1.0e-12  # length of a projected direction below which it has no direction in float64
@@ -90,9 +91,13 @@ def _dot(a: Tensor, b: Tensor) -> Tensor:
     return product[..., 0] + product[..., 1] + product[..., 2]
 
 
-def _frame(normal: Tensor, tangent: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _check_frame(normal: Tensor, tangent: Tensor) -> None:
     check("normal", normal, last=3)
     check("tangent", tangent, last=4, like=normal)
+
+
+def _frame(normal: Tensor, tangent: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    _check_frame(normal, tangent)
     t, n = tangent[..., :3], normal
     b = torch.linalg.cross(n, t) * tangent[..., 3:]
     return t, b, n
@@ -106,8 +111,16 @@ def encode_normals(world: Tensor, normal: Tensor, tangent: Tensor) -> Tensor:
     ``world`` back.  A normal below the surface is bent up to it, since viewers expect none there.  Gradients reach
     ``world``.
     """
-    t, b, n = _frame(normal, tangent)
+    _check_frame(normal, tangent)
     check("world", world, last=3, like=normal)
+    same = world.shape[:-1] == normal.shape[:-1] == tangent.shape[:-1]
+    if same and not (torch.is_grad_enabled() and world.requires_grad):
+        rows = [v.detach().reshape(-1, v.shape[-1]).contiguous() for v in (world, normal, tangent)]
+        out = torch.empty_like(rows[1])
+        arrays = list(zip((*rows, out), (wp.vec3, wp.vec3, wp.vec4, wp.vec3), strict=True))
+        launch(encode_normals_kernel, len(out), arrays, out.device)
+        return out.view(normal.shape)
+    t, b, n = _frame(normal, tangent)
     tt, tn, nn = _dot(t, t), _dot(t, n), _dot(n, n)
     wt, wn = _dot(world, t), _dot(world, n)
     determinant = (tt * nn - tn * tn).clamp(min=1e-6)  # b is orthogonal to both, so that two equations remain

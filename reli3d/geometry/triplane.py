@@ -43,9 +43,9 @@ class _SampleTriplane(torch.autograd.Function):
         if ctx.needs_input_grad[0] or scattered:
             order, edges = _by_cell_row(points, height, width)
         features = points.new_empty(batch, n, 3, blocks * BLOCK)
-        packed = planes.detach() if by_rows else _packed(planes)
+        packed = planes.detach() if by_rows else packed_planes(planes)
         inputs = (points.view(-1, 3), kernels.wp.vec3), (order.view(-1), kernels.wp.int32)
-        out, sizes = (features.view(-1, BLOCK), kernels.vec8), _sizes(n, height, width, blocks)
+        out, sizes = (features.view(-1, BLOCK), kernels.vec8), sizes_of(n, height, width, blocks)
         if by_rows:
             scratch = points.new_empty(batch * 3 * BANDS * 2 * (width + 2) * blocks, BLOCK)
             launch(
@@ -90,11 +90,11 @@ class _SampleTriplane(torch.autograd.Function):
         return g_planes, g_points
 
 
-def _sizes(points: int, height: int, width: int, blocks: int) -> kernels.Sizes:
+def sizes_of(points: int, height: int, width: int, blocks: int) -> kernels.Sizes:
     return struct_of(kernels.Sizes, points=points, height=height, width=width, blocks=blocks)
 
 
-def _packed(planes: Tensor) -> Tensor:
+def packed_planes(planes: Tensor) -> Tensor:
     """``(B, 3, H, W, C')`` float32, C' the next multiple of 8; no copy where float32 planes lie in memory so."""
     packed = planes.detach().permute(0, 1, 3, 4, 2)
     packed = torch.nn.functional.pad(packed, (0, -planes.shape[2] % BLOCK)) if planes.shape[2] % BLOCK else packed
@@ -117,7 +117,7 @@ def _by_cell_row(points: Tensor, height: int, width: int) -> tuple[Tensor, Tenso
     launch(
         kernels.cell_key_kernel,
         slabs * n,
-        [(points.view(-1, 3), kernels.wp.vec3), _sizes(n, height, width, 0), bins, (keys.view(-1), kernels.wp.int32)],
+        [(points.view(-1, 3), kernels.wp.vec3), sizes_of(n, height, width, 0), bins, (keys.view(-1), kernels.wp.int32)],
         points.device,
     )
     edges = keys.new_zeros(slabs, height + 2)
@@ -149,7 +149,7 @@ def _points_adjoint(packed: Tensor, points: Tensor, g: Tensor) -> Tensor:
             (packed.view(-1, BLOCK), kernels.vec8),
             (points.view(-1, 3), kernels.wp.vec3),
             (g.view(-1, BLOCK), kernels.vec8),
-            _sizes(n, height, width, channels // BLOCK),
+            sizes_of(n, height, width, channels // BLOCK),
             (g_points.view(-1, 3), kernels.wp.vec3),
         ],
         points.device,
@@ -162,7 +162,7 @@ def _planes_adjoint(points: Tensor, g: Tensor, order: Tensor, edges: Tensor, sha
     channels, height, width = shape[2:]
     blocks = g.shape[-1] // BLOCK
     g_planes = torch.zeros(batch, 3, height, width, blocks * BLOCK, device=points.device)
-    split, sizes = 1 if points.device.type == "cpu" else blocks, _sizes(n, height, width, blocks)
+    split, sizes = 1 if points.device.type == "cpu" else blocks, sizes_of(n, height, width, blocks)
     for parity in (0, 1):
         launch(
             kernels.planes_adjoint_kernel,
@@ -194,6 +194,12 @@ def sample_triplane(planes: Tensor, points: Tensor) -> Tensor:
     Gradients reach ``planes`` (in their dtype) and ``points`` (one-sided at texel centres), with the same bits for any
     number of threads.  Raises TypeError or ValueError, also for sizes beyond 32-bit indices.
     """
+    check_triplane(planes, points)
+    return _SampleTriplane.apply(planes, points.contiguous())
+
+
+def check_triplane(planes: Tensor, points: Tensor) -> None:
+    """Raise TypeError or ValueError where :func:`sample_triplane` cannot take these."""
     if not isinstance(planes, Tensor):
         raise TypeError(f"planes: expected a tensor, got {type(planes).__name__}")
     if planes.dtype not in (torch.float32, torch.bfloat16, torch.float16):
@@ -210,4 +216,3 @@ def sample_triplane(planes: Tensor, points: Tensor) -> Tensor:
     largest = 3 * batch * max(height * width * blocks, (height + 2) * blocks, points.shape[1] * blocks)
     if largest >= 2**31:
         raise ValueError(f"planes, points: expected fewer than 2**31 blocks of 8 channels, got {largest}")
-    return _SampleTriplane.apply(planes, points.contiguous())

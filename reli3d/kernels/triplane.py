@@ -65,33 +65,47 @@ def texel(planes: wp.array[vec8], base: int, x: int, y: int, sizes: Sizes) -> ve
     return planes[base + (y * sizes.width + x) * sizes.blocks]
 
 
-@wp.kernel
-def sample_kernel(
-    start: int,
-    # in
+@wp.func_native("""
+const float *a = &planes.data[top].c[0], *b = &planes.data[bottom].c[0];
+float* out = &features.data[at].c[0];
+#ifndef __CUDA_ARCH__
+#pragma clang loop vectorize(assume_safety)
+#endif
+for (int c = 0; c < 8 * blocks; c++)
+    out[c] = a[c] * w00 + a[c + 8 * blocks] * w01 + b[c] * w10 + b[c + 8 * blocks] * w11;
+""")
+def blend(
     planes: wp.array[vec8],
-    points: wp.array[wp.vec3],
-    order: wp.array[wp.int32],
-    sizes: Sizes,
-    split: int,
-    # out
+    top: int,
+    bottom: int,
+    blocks: int,
+    w00: float,
+    w01: float,
+    w10: float,
+    w11: float,
     features: wp.array[vec8],
+    at: int,
 ):
-    """A thread is a plane, a point and every ``split``-th block; points come by ``order`` if that has entries."""
-    i = start + wp.tid()
+    """All blocks of two neighbouring texels from ``top`` on and of two from ``bottom`` on, weighted, to ``at``."""
+    ...
+
+
+@wp.func
+def sample_point(
+    planes: wp.array[vec8],
+    point: wp.vec3,
+    slab: int,  # batch * 3 + plane
+    sizes: Sizes,
+    first: int,
+    split: int,
+    features: wp.array[vec8],
+    out: int,
+):
+    """Every ``split``-th block of a point's features in one plane, to ``features`` from ``out`` on."""
     height = sizes.height
     width = sizes.width
     blocks = sizes.blocks
-    first = i % split
-    i = i // split
-    slab = i // sizes.points  # batch * 3 + plane
-    plane = slab % 3
-    point = i % sizes.points
-    if order.shape[0] > 0:
-        point = order[i]
-    point += (slab // 3) * sizes.points
-    at = texel_position(points[point], plane, sizes)
-    out = (point * 3 + plane) * blocks
+    at = texel_position(point, slab % 3, sizes)
     if touches(at, sizes):
         x = int(wp.floor(at[0]))
         y = int(wp.floor(at[1]))
@@ -105,7 +119,9 @@ def sample_kernel(
         if x >= 0 and y >= 0 and x + 1 < width and y + 1 < height:
             top = base + (y * width + x) * blocks
             bottom = top + width * blocks
-            for q in range(first, blocks, split):
+            if split == 1:
+                blend(planes, top, bottom, blocks, w00, w01, w10, w11, features, out)
+            for q in range(first, wp.where(split == 1, 0, blocks), split):
                 features[out + q] = (
                     planes[top + q] * w00
                     + planes[top + blocks + q] * w01
@@ -123,6 +139,31 @@ def sample_kernel(
     else:
         for q in range(first, blocks, split):
             features[out + q] = vec8()
+
+
+@wp.kernel
+def sample_kernel(
+    start: int,
+    # in
+    planes: wp.array[vec8],
+    points: wp.array[wp.vec3],
+    order: wp.array[wp.int32],
+    sizes: Sizes,
+    split: int,
+    # out
+    features: wp.array[vec8],
+):
+    """A thread is a plane, a point and every ``split``-th block; points come by ``order`` if that has entries."""
+    i = start + wp.tid()
+    first = i % split
+    i = i // split
+    slab = i // sizes.points  # batch * 3 + plane
+    point = i % sizes.points
+    if order.shape[0] > 0:
+        point = order[i]
+    point += (slab // 3) * sizes.points
+    out = (point * 3 + slab % 3) * sizes.blocks
+    sample_point(planes, points[point], slab, sizes, first, split, features, out)
 
 
 @wp.func

@@ -14,10 +14,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from reli3d._bridge import over_rows
 from reli3d.geometry.hull import hull_distance, hull_grid
 from reli3d.geometry.surface import surface_cubes
-from reli3d.nn.blocks import ROWS, in_rows
+from reli3d.nn.blocks import in_rows
 from reli3d.nn.heads import deformation
 from reli3d.nn.model import Code, Reconstructor
 from reli3d.nn.view_features import ViewMaps
@@ -63,11 +62,11 @@ class Field(ABC):
         """
         return in_rows(lambda points: {"level": self._level(points)}, points)["level"]
 
+    @abstractmethod
     def material(self, position: Tensor, normal: Tensor, visible: Tensor) -> PointMaterial:
         """Material at surface points: ``position``, geometric ``normal`` ``(N, 3)`` unit, ``visible (N, V)``, 1 where
         the view sees the point.
         """
-        return PointMaterial(**in_rows(self._material, position, normal, visible))
 
     @abstractmethod
     def radiance_map(self, height: int | None = None) -> Tensor:
@@ -75,9 +74,6 @@ class Field(ABC):
 
     @abstractmethod
     def _level(self, points: Tensor) -> Tensor: ...
-
-    @abstractmethod
-    def _material(self, position: Tensor, normal: Tensor, visible: Tensor) -> dict[str, Tensor]: ...
 
 
 @dataclass(frozen=True)
@@ -98,16 +94,7 @@ class TriplaneField(Field):
         """:meth:`free_level` at ``(axis[i], axis[j], axis[k])``, ``(n, n, n)``, in a fifth of the time, see
         :meth:`Reconstructor.grid_density`.
         """
-        n, ask = len(axis), self.model.grid_density(self.code, axis)
-        lines = n if axis.is_cuda else max(1, ROWS // n)
-        blocks = [(i, slice(j, j + lines)) for i in range(n) for j in range(0, n, lines)]
-
-        def density(start: int, _stop: int) -> Tensor:
-            return ask(*blocks[start])
-
-        every = range(len(blocks))
-        parts = [density(k, k + 1) for k in every] if axis.is_cuda else over_rows(len(blocks), 1, density)
-        return self.model.level(torch.cat(parts).view(n, n, n))
+        return self.model.level(self.model.grid_density(self.code, axis))
 
     @torch.no_grad()
     def cube_weights(self, points: Tensor, level: Tensor) -> dict[str, Tensor]:
@@ -142,14 +129,14 @@ class TriplaneField(Field):
             "cubes": cubes,
         }
 
-    def _material(self, position: Tensor, normal: Tensor, visible: Tensor) -> dict[str, Tensor]:
+    def material(self, position: Tensor, normal: Tensor, visible: Tensor) -> PointMaterial:
         values = {k: v[0] for k, v in self.model.query(self.code, position[None], MATERIAL, dtype=self.heads).items()}
-        return {
-            "base_color": values["base_color"],
-            "roughness": values["roughness"][:, 0],
-            "metallic": values["metallic"][:, 0],
-            "normal": radial_bump(position, normal, values["normal"]),
-        }
+        return PointMaterial(
+            values["base_color"],
+            values["roughness"][:, 0],
+            values["metallic"][:, 0],
+            radial_bump(position, normal, values["normal"]),
+        )
 
     def radiance_map(self, height: int | None = None) -> Tensor:
         return self.model.decode_environment(self.code, height)[0].contiguous()

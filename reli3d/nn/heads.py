@@ -12,7 +12,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from reli3d.nn.blocks import linear_of
+from reli3d.geometry.triplane import check_triplane, sample_triplane
+from reli3d.nn.packed_heads import PackedHeads, pack_heads
 
 ROUGHNESS_MIN = 0.1  # range [0.1, 1] of the published head
 NORMALIZE_EPS = 1.0e-7
@@ -50,19 +51,18 @@ def mlp(inputs: int, width: int, outputs: int, hidden: int) -> nn.Sequential:
     return nn.Sequential(*layers[:-1])
 
 
-def _rest(layers: nn.Module, x: Tensor) -> Tensor:
-    """What :func:`mlp` makes of its first activation ``x (width, N)``, ``(outputs, N)`` float32; without gradient.
+def linear_layers(layers: nn.Module) -> list[nn.Linear]:
+    """The linear layers of an :func:`mlp`."""
+    return [layer for layer in layers.children() if isinstance(layer, nn.Linear)]
 
-    Hidden layers are computed in the dtype of ``x``, the last one in float32.
-    """
-    *hidden, _ = list(layers.children())[2:]
-    last = linear_of(layers, -1)
+
+def _low(layers: nn.Module, x: Tensor, dtype: torch.dtype) -> Tensor:
+    """What :func:`mlp` makes of ``x``, hidden layers in ``dtype``, the last one in float32."""
+    *hidden, last = linear_layers(layers)
+    x = x.to(dtype)
     for layer in hidden:
-        if isinstance(layer, nn.Linear):
-            x = torch.addmm(layer.bias.to(x.dtype)[:, None], layer.weight.to(x.dtype), x)
-        else:
-            x = functional.silu(x, inplace=True)
-    return torch.addmm(last.bias[:, None], last.weight, x.float())
+        x = functional.silu(functional.linear(x, layer.weight.to(dtype), layer.bias.to(dtype)))
+    return last(x.float())
 
 
 def activate(name: str, raw: Tensor) -> Tensor:
@@ -97,36 +97,36 @@ class Heads(nn.ModuleDict):
 
         dtype: of the hidden layers where no gradient is recorded; inputs and values are float32.
         """
+        self._check(names)
+        if torch.is_grad_enabled() or dtype == torch.float32:
+            return {name: activate(name, self[name](features)) for name in names}
+        return {name: activate(name, _low(self[name], features, dtype)) for name in names}
+
+    def at(
+        self, triplane: Tensor, points: Tensor, names: Sequence[str], dtype: torch.dtype = torch.float32
+    ) -> dict[str, Tensor]:
+        """``{name: (B, N, outputs)}`` at ``points (B, N, 3)`` of a triplane, both as for
+        :func:`~reli3d.geometry.triplane.sample_triplane`.
+
+        dtype: as for a call.  On a CPU without gradient one kernel looks up and computes.
+        """
+        if torch.is_grad_enabled() or triplane.is_cuda:
+            return self(sample_triplane(triplane, points), names, dtype)
+        self._check(names)
+        check_triplane(triplane, points)
+        packed = self.packed(names, dtype)
+        raw = torch.stack([packed.at(planes, at.contiguous()) for planes, at in zip(triplane, points, strict=True)])
+        parts = raw.split(packed.outputs, 1)
+        return {name: activate(name, part.transpose(1, 2)) for name, part in zip(names, parts, strict=True)}
+
+    def packed(self, names: Sequence[str], dtype: torch.dtype = torch.float32) -> PackedHeads:
+        """The named MLPs for the kernels."""
+        return pack_heads([linear_layers(self[name]) for name in names], dtype)
+
+    def _check(self, names: Sequence[str]) -> None:
         for name in names:
             if name not in self:
                 raise ValueError(f"heads: expected some of {', '.join(self)}, got {name}")
-        if torch.is_grad_enabled():
-            raw = {name: self[name](features) for name in names}
-        else:
-            raw = self._inferred(features, names, dtype)
-        return {name: activate(name, value) for name, value in raw.items()}
-
-    def _inferred(self, features: Tensor, names: Sequence[str], dtype: torch.dtype) -> dict[str, Tensor]:
-        """The MLPs without gradient: one matrix for all first layers, what nobody will ask again is overwritten."""
-        weight, bias = (v.to(dtype) for v in self.first_layer(names))
-        hidden = torch.addmm(bias[:, None], weight, features.reshape(-1, features.shape[-1]).to(dtype).T)
-        raw = self.after_first(hidden, names)
-        return {name: value.reshape(*features.shape[:-1], value.shape[-1]) for name, value in raw.items()}
-
-    def first_layer(self, names: Sequence[str]) -> tuple[Tensor, Tensor]:
-        """Weight ``(K, features)`` and bias ``(K,)`` of the first layers of the named heads, one below the other."""
-        first = [linear_of(self[name], 0) for name in names]
-        return torch.cat([layer.weight for layer in first]), torch.cat([layer.bias for layer in first])
-
-    def after_first(self, hidden: Tensor, names: Sequence[str]) -> dict[str, Tensor]:
-        """Outputs ``(N, outputs)`` before :func:`activate`, from what the first layers give, ``(K, N)``, which is
-        overwritten; no gradient.
-
-        A point is a column: products with 64 by 64 weights take half the time of points as rows.
-        """
-        functional.silu(hidden, inplace=True)
-        parts = hidden.split([linear_of(self[name], 0).out_features for name in names])
-        return {name: _rest(self[name], part).T for name, part in zip(names, parts, strict=True)}
 
 
 class _TruncatedExp(torch.autograd.Function):

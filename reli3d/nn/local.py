@@ -321,9 +321,12 @@ class LocalField(Field):
             irradiance = Environment(self.radiance_map(LIGHT_ROWS).detach().contiguous()).irradiance()
             return replace(self, shading=Shading(irradiance, observed, palette_of(color, plain, seen)))
 
-    def _material(self, position: Tensor, normal: Tensor, visible: Tensor) -> dict[str, Tensor]:
-        fused = self.fused(position, normal, visible)
-        return _painted(fused, self._heads(fused, position, normal, visible), normal)
+    def material(self, position: Tensor, normal: Tensor, visible: Tensor) -> PointMaterial:
+        def ask(position: Tensor, normal: Tensor, visible: Tensor) -> dict[str, Tensor]:
+            fused = self.fused(position, normal, visible)
+            return _painted(fused, self._heads(fused, position, normal, visible), normal)
+
+        return PointMaterial(**in_rows(ask, position, normal, visible))
 
     def heads(self, position: Tensor, normal: Tensor, visible: Tensor) -> Tensor:
         """What the heads say of surface points, ``(N, HEADS)``, for :meth:`painted`; arguments of :meth:`material`.

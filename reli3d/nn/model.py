@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor, nn
 
 from reli3d.geometry.triplane import sample_triplane
+from reli3d.nn.blocks import linear_of
 from reli3d.nn.camera import CameraEmbedder, camera_vector
 from reli3d.nn.heads import HEADS, Heads, WeightMerger, truncated_exp
 from reli3d.nn.illumination import Illumination
@@ -158,14 +159,14 @@ class Reconstructor(nn.Module):
         points and the heads.
         """
         with torch.autocast(points.device.type, enabled=False):
-            values = self.heads(sample_triplane(code.triplane, points / self.preset.radius), heads, dtype)
+            values = self.heads.at(code.triplane, points / self.preset.radius, heads, dtype)
             if self.preset.roughness_is_alpha and "roughness" in values:
                 values["roughness"] = values["roughness"].sqrt()
         return values
 
-    def grid_density(self, code: Code, axis: Tensor) -> Callable[[int, slice], Tensor]:
-        """The ``density`` of :meth:`query` at the points ``(axis[i], axis[j], axis[k])`` of one object, without
-        gradient: a function of a number ``i`` and a slice of ``j`` that gives ``(J, n)``.
+    @torch.no_grad()
+    def grid_density(self, code: Code, axis: Tensor) -> Tensor:
+        """The ``density`` of :meth:`query` at the points ``(axis[i], axis[j], axis[k])`` of one object, ``(n, n, n)``.
 
         axis: ``(n,)``, model units.  A plane of features has ``n * n`` different points, and the head's first layer is
         linear: it is done on the three planes' points and added up.  Values differ from :meth:`query`'s by rounding.
@@ -174,17 +175,15 @@ class Reconstructor(nn.Module):
         a, b = (c.reshape(-1) for c in torch.meshgrid(at, at, indexing="ij"))
         xy, xz, _ = sample_triplane(code.triplane, torch.stack([a, b, b], -1)[None])[0].split(channels, -1)
         yz = sample_triplane(code.triplane, torch.stack([b, a, b], -1)[None])[0][:, 2 * channels :]
-        weight, bias = self.heads.first_layer(("density",))
+        first = linear_of(self.heads["density"], 0)
         of_xy, of_xz, of_yz = (
-            torch.mm(w, f.T).view(-1, n, n) for w, f in zip(weight.split(channels, 1), (xy, xz, yz), strict=True)
+            torch.mm(f, w.T).view(n, n, -1) for w, f in zip(first.weight.split(channels, 1), (xy, xz, yz), strict=True)
         )
-        of_xy += bias[:, None, None]
-
-        def ask(i: int, j: slice) -> Tensor:
-            hidden = (of_yz[:, j] + of_xz[:, i, None]).add_(of_xy[:, i, j, None])
-            return self.heads.after_first(hidden.flatten(1), ("density",))["density"].reshape(-1, n)
-
-        return ask
+        of_xy += first.bias
+        if axis.is_cuda:
+            rest = nn.Sequential(*list(self.heads["density"].children())[1:])
+            return torch.stack([rest(of_xy[i, :, None] + of_xz[i] + of_yz)[..., 0] for i in range(n)])
+        return self.heads.packed(("density",)).on_grid(of_xy, of_xz, of_yz)[0]
 
     def level(self, density: Tensor) -> Tensor:
         """Surface level of the ``density`` head's raw values: negative inside, zero on the surface."""

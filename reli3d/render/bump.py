@@ -6,6 +6,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from reli3d._bridge import launch
+from reli3d.kernels import normal_maps as kernels
+
 EPS = 1.0e-7  # of the published normalisation; on the vertical axis, where the frame vanishes, the bump is lost
 
 
@@ -17,6 +20,12 @@ def radial_bump(position: Tensor, normal: Tensor, bump: Tensor) -> Tensor:
     frame is data.
     """
     position, normal = position.detach(), normal.detach()
+    values = (position, normal, bump)
+    if not (torch.is_grad_enabled() and bump.requires_grad) and all(v.dtype == torch.float32 for v in values):
+        rows = [v.detach().reshape(-1, 3).contiguous() for v in torch.broadcast_tensors(*values)]
+        out = torch.empty_like(rows[0])
+        launch(kernels.radial_bump_kernel, len(out), [(v, kernels.wp.vec3) for v in (*rows, out)], out.device)
+        return out.view(torch.broadcast_shapes(*(v.shape for v in values)))
     around = torch.stack([position[..., 2], torch.zeros_like(position[..., 0]), -position[..., 0]], -1)
     tangent = normalize(torch.linalg.cross(normal, torch.linalg.cross(around, normal)), dim=-1, eps=EPS)
     return _in_frame(tangent, normalize(torch.linalg.cross(normal, tangent), dim=-1, eps=EPS), normal, bump)

@@ -312,3 +312,16 @@ def test_encoding_bends_normals_up_and_gives_exact_ones_back():
     # w = -1 turns green; below: on the horizon
     want = torch.tensor([[0.8, 0.5, 0.9], [0.5, 0.2, 0.9], [1.0, 0.5, 0.5]])
     torch.testing.assert_close(encode_normals(world, n, t), want)
+
+
+def test_the_kernel_that_encodes_normals_is_the_formula_that_has_gradients(device):
+    g = torch.Generator().manual_seed(2)
+    world, n, t = (torch.nn.functional.normalize(torch.randn(30, 40, 3, generator=g), dim=-1) for _ in range(3))
+    t = torch.nn.functional.normalize(t - 0.9 * (t * n).sum(-1, keepdim=True) * n, dim=-1)  # not quite orthogonal
+    t = torch.cat([t, torch.where(torch.rand(30, 40, 1, generator=g) < 0.5, -1.0, 1.0)], -1)
+    world, n, t = (v.to(device) for v in (world, n, t))
+    got = encode_normals(world, n, t)
+    # float32 sums of three products in another order, and a normalisation; frames nearly without area magnify them
+    torch.testing.assert_close(got, encode_normals(world.clone().requires_grad_(), n, t).detach(), rtol=0, atol=2e-5)
+    above = got[..., 2] > 0.5 + 0.02  # not bent up; where the frame has little area rounding is magnified
+    torch.testing.assert_close(decode_normals(got, n, t)[above], world[above], rtol=0, atol=1e-4)

@@ -10,14 +10,16 @@ from reli3d.geometry.cover import cover_silhouettes
 from reli3d.geometry.hits import interpolate
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene, offset_origin
-from reli3d.geometry.tangents import vertex_tangents
+from reli3d.geometry.tangents import encode_normals, vertex_tangents
 from reli3d.geometry.visibility import visible_from
 from reli3d.render import material, sampling
+from reli3d.render.bump import radial_bump
 from reli3d.render.environment import Environment
 from reli3d.render.reni_light import ReniLight
 from reli3d.render.shading import ShadeOptions, shade_light
 from reli3d.render.volume import OccupancyGrid, march_rays, sample_weights
 from tests.support.op_cases import (
+    FRAME,
     MAP,
     Case,
     above,
@@ -144,6 +146,11 @@ def asked_of_reni(directions):
     return light.lookup(directions), light.environment(8).radiance
 
 
+def bent(world):
+    normal, tangent = (v[: len(world)].to(world.device) for v in FRAME.values())
+    return encode_normals(world, normal, tangent), radial_bump(units(len(world), 2).to(world), normal, world)
+
+
 def four(values, bary):
     return (interpolate(values, *soup(values, len(bary)), bary),)
 
@@ -190,6 +197,7 @@ CASES = {
         covered,
     ),
     "ReniLight": Case(lambda n: {"directions": units(n, 1)}, asked_of_reni, rows=("directions",)),
+    "normal maps": Case(lambda n: {"world": units(n, 1)}, bent, rows=("world",)),
     "interpolate tangents": Case(
         lambda n: {"values": uniform(180, 4, seed=1), "bary": weights(n)}, four, ("values", "bary"), ("bary",)
     ),
