@@ -10,10 +10,7 @@ import io
 import json
 import os
 import struct
-import zlib
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from typing import Any
 
 import numpy as np
 import torch
@@ -21,17 +18,15 @@ from PIL import Image
 from torch import Tensor
 
 import reli3d
-from reli3d._bridge import expect, present
+from reli3d._bridge import expect, over_rows, present
 from reli3d.geometry.mesh import watertight
+from reli3d.io import png
 from reli3d.io.files import write_bytes
 from reli3d.io.gltf_parts import read_parts
 from reli3d.render.asset import Asset
 
 UNIT = 1.0e-3  # deviation from length 1 that readers accept
-ENCODERS: dict[str, dict[str, Any]] = {
-    "png": {"compress_level": 1, "compress_type": zlib.Z_RLE},  # baked maps are smooth: a fifth smaller, and faster
-    "webp": {"lossless": True, "exact": True},
-}
+KINDS = ("png", "webp")  # of textures
 WEBP = "EXT_texture_webp"
 FLOAT, UINT = 5126, 5125
 LINEAR, LINEAR_MIPMAP_LINEAR, CLAMP_TO_EDGE = 9729, 9987, 33071
@@ -39,16 +34,11 @@ LINEAR, LINEAR_MIPMAP_LINEAR, CLAMP_TO_EDGE = 9729, 9987, 33071
 
 def encode_image(values: Tensor, kind: str = "png") -> bytes:
     """PNG or lossless WebP file, 8 bit RGB, of ``(H, W, 3)`` values in [0, 1], rounded to the nearest step."""
-    return _file(_pixels(values), kind)
-
-
-def _pixels(values: Tensor) -> np.ndarray:
-    return np.ascontiguousarray((values.detach() * 255.0).round_().to(torch.uint8).cpu().numpy())
-
-
-def _file(pixels: np.ndarray, kind: str) -> bytes:
+    pixels = np.ascontiguousarray((values.detach() * 255.0).round_().to(torch.uint8).cpu().numpy())
+    if kind == "png":
+        return png.encode(pixels)
     buffer = io.BytesIO()
-    Image.fromarray(pixels).save(buffer, kind.upper(), **ENCODERS[kind])
+    Image.fromarray(pixels).save(buffer, "WEBP", lossless=True, exact=True)
     return buffer.getvalue()
 
 
@@ -57,11 +47,10 @@ def texture_images(asset: Asset, kind: str = "png") -> dict[str, bytes]:
     rough = asset.textures.roughness
     orm = torch.stack([torch.ones_like(rough), rough, asset.textures.metallic], -1)  # no occlusion is baked
     maps = {"base_color": asset.textures.base_color, "metallic_roughness": orm, "normal": asset.textures.normal}
-    # in this thread: in each of the others torch would start threads of its own
-    pixels = {name: _pixels(values) for name, values in maps.items()}
-    with ThreadPoolExecutor(3) as pool:  # the encoder runs without the interpreter lock
-        images = {name: pool.submit(_file, values, kind) for name, values in pixels.items()}
-        return {name: image.result() for name, image in images.items()}
+    if kind == "png":  # strips of it are compressed side by side
+        return {name: encode_image(values, kind) for name, values in maps.items()}
+    values = list(maps.values())
+    return dict(zip(maps, over_rows(len(values), 1, lambda k, _: encode_image(values[k], kind)), strict=True))
 
 
 def check_asset(asset: Asset) -> None:
@@ -101,8 +90,8 @@ def glb_bytes(
 ) -> bytes:
     """The GLB file of :func:`write_glb` as bytes."""
     check_asset(asset)
-    if textures not in ENCODERS:
-        raise ValueError(f"textures: expected {' or '.join(ENCODERS)}, got {textures}")
+    if textures not in KINDS:
+        raise ValueError(f"textures: expected {' or '.join(KINDS)}, got {textures}")
     mesh = asset.mesh
     if double_sided is None:
         double_sided = not watertight(mesh)
