@@ -46,6 +46,8 @@ def accumulate_kernel(
     start: int,
     # in
     first: int,
+    hits: int,
+    group: int,
     count: int,
     occluded16: wp.uint64,
     scene: wp.uint64,
@@ -58,18 +60,23 @@ def accumulate_kernel(
     out: wp.array[wp.vec3],
     visible: wp.array2d[wp.int32],
 ):
-    """Second half: the sum of a hit's values whose shadow rays nothing stops; ``t_max`` of the others becomes -1."""
-    j = start + wp.tid()
-    block_rays(occluded16, scene, origins, directions, j * count, count, t_max)
-    total = wp.vec3(0.0, 0.0, 0.0)
-    word = wp.int32(0)
-    for s in range(count):
-        k = j * count + s
-        if t_max[k] >= 0.0:
-            total = total + values[k]
-            word = word | (1 << (s & 31))
-        if (s & 31) == 31 or s == count - 1:
-            if s // 32 < visible.shape[1]:
-                visible[first + j, s // 32] = word
-            word = 0
-    out[first + j] = total
+    """Second half: the sum of a hit's values whose shadow rays nothing stops; ``t_max`` of the others becomes -1.
+
+    ``group`` hits of the chunk's ``hits`` a thread, whose rays fill Embree's packets together.
+    """
+    begin = (start + wp.tid()) * group
+    end = wp.min(begin + group, hits)
+    block_rays(occluded16, scene, origins, directions, begin * count, (end - begin) * count, t_max)
+    for j in range(begin, end):
+        total = wp.vec3(0.0, 0.0, 0.0)
+        word = wp.int32(0)
+        for s in range(count):
+            k = j * count + s
+            if t_max[k] >= 0.0:
+                total = total + values[k]
+                word = word | (1 << (s & 31))
+            if (s & 31) == 31 or s == count - 1:
+                if s // 32 < visible.shape[1]:
+                    visible[first + j, s // 32] = word
+                word = 0
+        out[first + j] = total
