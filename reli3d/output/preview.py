@@ -103,18 +103,21 @@ def _smoothed(*shots: Render) -> list[Tensor]:
     shot, count = shots[0], 3 * len(shots)
     paint = (shot.base_color + GLOSS) * shot.alpha[..., None]
     ratios = [s.radiance / paint.clamp(min=1e-6) for s in shots]
-    guides = torch.cat([*ratios, shot.normal, shot.alpha[..., None]], -1)
-    padded = pad(guides.permute(2, 0, 1)[None], (WINDOW,) * 4)[0].permute(1, 2, 0)
+    # channels first: a weight of each pixel then meets whole rows of a channel, in half the time
+    guides = torch.cat([*ratios, shot.normal, shot.alpha[..., None]], -1).permute(2, 0, 1).contiguous()
+    padded, normal = pad(guides, (WINDOW,) * 4), guides[count:-1]
     height, width = shot.alpha.shape
-    total, weights = guides.new_zeros(height, width, count), torch.zeros_like(shot.alpha)[..., None]
+    total, weights = guides.new_zeros(count, height, width), torch.zeros_like(shot.alpha)
     for row in range(2 * WINDOW + 1):
         for column in range(2 * WINDOW + 1):
-            near = padded[row : row + height, column : column + width]
+            near = padded[:, row : row + height, column : column + width]
             apart = ((row - WINDOW) ** 2 + (column - WINDOW) ** 2) / (2 * WINDOW)
-            bent = (near[..., count:-1] - shot.normal).square().sum(-1, keepdim=True) / SAME_NORMAL**2
-            weight = torch.exp(-apart - bent) * near[..., -1:]
-            total, weights = total + weight * near[..., :count], weights + weight
-    return [mean * paint for mean in (total / weights.clamp(min=1e-6)).split(3, -1)]
+            bent = (near[count:-1] - normal).square().sum(0) / SAME_NORMAL**2
+            weight = torch.exp(-apart - bent) * near[-1]
+            total += weight * near[:count]
+            weights += weight
+    means = (total / weights.clamp(min=1e-6)).permute(1, 2, 0).contiguous()
+    return [mean * paint for mean in means.split(3, -1)]
 
 
 def _sheet(rows: list[tuple[str, list[Tensor]]], columns: int, *, last: int = TILE) -> np.ndarray:
