@@ -9,6 +9,7 @@ edge, both cubes keep the outside corners apart (cases C16 and C19 of Wenger 201
 """
 
 from functools import lru_cache
+from itertools import permutations
 from typing import NamedTuple
 
 import numpy as np
@@ -37,27 +38,29 @@ def faces() -> list[tuple[int, tuple[int, ...]]]:
     return found
 
 
-def groups(case: int) -> list[int]:
-    """Loop of every edge, -1 if not crossed.
+def groups() -> np.ndarray:
+    """``(256, 12)``: loop of every edge in every case, -1 if not crossed.
 
     Loops are numbered by their first edge when edges are sorted by their higher, then their lower corner, which is
     the order of the published tables.
     """
-    inside = [case >> k & 1 for k in range(8)]
-    crossed = [inside[a] != inside[b] for a, b in EDGES]
-    label = [e if crossed[e] else -1 for e in range(12)]
+    inside = (np.arange(256)[:, None] >> np.arange(8) & 1).astype(bool)
+    low, high = np.array(EDGES).T
+    crossed = inside[:, low] != inside[:, high]
+    label = np.where(crossed, np.arange(12), -1)
     for _, edges in faces():
-        on = [e for e in edges if crossed[e]]
-        for e in on:
-            for f in on:
-                shared = set(EDGES[e]) & set(EDGES[f])
-                if e != f and (len(on) == 2 or (shared and inside[min(shared)])):
-                    label = [label[e] if v == label[f] else v for v in label]
-    order = []
+        alone = crossed[:, edges].sum(1) == 2
+        for e, f in permutations(edges, 2):
+            shared = set(EDGES[e]) & set(EDGES[f])
+            pair = alone | inside[:, min(shared)] if shared else alone
+            joined = crossed[:, e] & crossed[:, f] & pair
+            label = np.where(joined[:, None] & (label == label[:, [f]]), label[:, [e]], label)
+    loop, count = np.full((256, 12), -1, np.int32), np.zeros(256, np.int32)
     for e in sorted(range(12), key=lambda e: sorted(EDGES[e], reverse=True)):
-        if crossed[e] and label[e] not in order:
-            order.append(label[e])
-    return [order.index(v) if v >= 0 else -1 for v in label]
+        first = crossed[:, e] & (loop[:, e] < 0)
+        loop = np.where(first[:, None] & (label == label[:, [e]]), count[:, None], loop)
+        count += first
+    return loop
 
 
 def _around(axis: int) -> list[int]:
@@ -74,12 +77,11 @@ def _around(axis: int) -> list[int]:
 @lru_cache(1)
 def tables() -> Tables:
     """The tables of all 256 cases."""
-    group = np.array([groups(case) for case in range(256)], np.int32)
+    group = groups()
     neighbour = np.full(256, -1, np.int32)
-    for case in range(256):
-        for face, edges in faces():
-            on = group[case, list(edges)]
-            if (on >= 0).all() and len(set(on)) == 1:  # ambiguous, and the only ambiguous face of such a case
-                neighbour[case] = face
+    for face, edges in faces():
+        on = group[:, edges]
+        same = (on[:, 0] >= 0) & (on == on[:, :1]).all(1)
+        neighbour[same] = face  # ambiguous, and the only ambiguous face of such a case
     around = np.array([_around(axis) for axis in range(3)], np.int32)
     return Tables(group.max(1) + 1, group, neighbour, np.array(EDGES, np.int32), around)
