@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 import reli3d
+from reli3d.geometry.camera import camera_rays
 from reli3d.geometry.mesh import Mesh, report
 from reli3d.geometry.rays import RayScene
 from reli3d.io.glb import glb_bytes
@@ -25,7 +26,6 @@ from reli3d.nn.weights import Manifest
 from reli3d.output.folder import claimed
 from reli3d.output.viewer import Shown, photograph_stops, shadow, viewer_page
 from reli3d.render.asset import Asset
-from reli3d.render.gbuffer import primary_hits
 from reli3d.views.similarity import Similarity
 from reli3d.views.views import Views
 
@@ -64,7 +64,10 @@ def mask_iou(scene: RayScene, views: Views) -> float:
     scene: rays against the mesh.
     """
     batch = views.resampled(SILHOUETTE, crop=True)
-    seen = primary_hits(scene, batch.camera)[0].face >= 0
+    origins, directions = camera_rays(batch.camera)
+    far = torch.full((directions[..., 0].numel(),), torch.inf, device=directions.device)
+    free = scene.unoccluded(origins.reshape(-1, 3), directions.reshape(-1, 3), far)  # the rays of a camera go together
+    seen = ~free.reshape(directions.shape[:-1])
     masks = batch.masks > 0.5
     both, either = ((a.sum((1, 2)).double()) for a in (masks & seen, masks | seen))
     return round(float((both / either.clamp(min=1)).mean()), 4)
