@@ -6,8 +6,8 @@ The grid ``(X, Y, Z)`` fills the cube [-radius, radius]^3, its outermost points 
 import warp as wp
 
 from reli3d.kernels.bilinear import look_up
+from reli3d.kernels.math import cube_range
 from reli3d.kernels.projection import project_point
-from reli3d.kernels.volume import cube_range
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
 

@@ -9,30 +9,12 @@ Optical depth is summed, not a product of transmittances carried: ``T = exp(-sum
 
 import warp as wp
 
+from reli3d.kernels.math import PARALLEL, cube_range
+
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
 
 STEPS_MAX = wp.constant(1 << 24)  # float32 counts steps exactly up to here
 OPAQUE = wp.constant(80.0)  # optical depth behind which nothing is seen: exp(-80) is 2e-35
-PARALLEL = wp.constant(1.0e-12)  # a direction's component below it never leaves its slab of cells
-
-
-@wp.func
-def cube_range(origin: wp.vec3, direction: wp.vec3, radius: float, near: float, far: float) -> wp.vec2:
-    """Entry and exit of a ray in the cube, within [near, far]; entry >= exit for none.  Kay and Kajiya 1986."""
-    low = wp.float32(near)
-    high = wp.float32(far)
-    if not (wp.isfinite(origin) and wp.isfinite(direction)) or wp.length_sq(direction) < PARALLEL * PARALLEL:
-        high = -1.0
-    for k in range(3):
-        if wp.abs(direction[k]) > PARALLEL:
-            a = (-radius - origin[k]) / direction[k]
-            b = (radius - origin[k]) / direction[k]
-            low = wp.max(low, wp.min(a, b))
-            high = wp.min(high, wp.max(a, b))
-        else:
-            if wp.abs(origin[k]) > radius:
-                high = -1.0
-    return wp.vec2(low, high)
 
 
 @wp.func

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from reli3d.geometry.triplane import check_triplane, sample_triplane
-from reli3d.nn.packed_heads import PackedHeads, pack_heads
+if TYPE_CHECKING:
+    from reli3d.nn.packed_heads import PackedHeads
 
 ROUGHNESS_MIN = 0.1  # range [0.1, 1] of the published head
 NORMALIZE_EPS = 1.0e-7
@@ -110,6 +111,9 @@ class Heads(nn.ModuleDict):
 
         dtype: as for a call.  On a CPU without gradient one kernel looks up and computes.
         """
+        # not before: the small network, which needs the rest of this module, needs none of its kernels
+        from reli3d.geometry.triplane import check_triplane, sample_triplane
+
         if torch.is_grad_enabled() or triplane.is_cuda:
             return self(sample_triplane(triplane, points), names, dtype)
         self._check(names)

@@ -9,7 +9,6 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor, nn
 
-from reli3d.geometry.triplane import sample_triplane
 from reli3d.nn.blocks import linear_of
 from reli3d.nn.camera import CameraEmbedder, camera_vector
 from reli3d.nn.heads import HEADS, Heads, WeightMerger, truncated_exp
@@ -171,6 +170,8 @@ class Reconstructor(nn.Module):
         axis: ``(n,)``, model units.  A plane of features has ``n * n`` different points, and the head's first layer is
         linear: it is done on the three planes' points and added up.  Values differ from :meth:`query`'s by rounding.
         """
+        from reli3d.geometry.triplane import sample_triplane  # not before: the small network needs none of its kernels
+
         n, channels, at = len(axis), code.triplane.shape[2], axis / self.preset.radius
         a, b = (c.reshape(-1) for c in torch.meshgrid(at, at, indexing="ij"))
         xy, xz, _ = sample_triplane(code.triplane, torch.stack([a, b, b], -1)[None])[0].split(channels, -1)

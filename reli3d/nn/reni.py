@@ -8,6 +8,7 @@ decoder works in a z-up frame, D = (z, x, y) of the y-up world direction (x, y, 
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
@@ -15,7 +16,9 @@ from torch.nn import functional
 
 from reli3d.nn.heads import truncated_exp
 from reli3d.nn.presets import ReniSizes
-from reli3d.render.reni_light import ReniLight
+
+if TYPE_CHECKING:
+    from reli3d.render.reni_light import ReniLight
 
 FREQUENCIES = (1.0, 4.0)  # of the positional encoding, without a factor of pi
 VN_EPS = 1.0e-6  # floor of the published vector-neuron ReLU
@@ -209,6 +212,8 @@ class EnvironmentDecoder(nn.Module):
         here, once.  The values are those of :meth:`radiance` to float32 rounding; no gradient passes.  Raises
         ValueError for another shape and where the decoder is not 128 wide, as the kernel is.
         """
+        from reli3d.render.reni_light import ReniLight  # not before: its kernels are seldom needed
+
         net, (latents, width) = self.field.network, (self.latents, self.field.network.fc.in_features)
         for name, value, shape in (
             ("latent", latent, (latents, 3)),

@@ -7,6 +7,7 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
 from PIL import Image
@@ -16,13 +17,15 @@ from torch.nn.functional import normalize
 from reli3d._bridge import expect
 from reli3d.geometry.camera import Camera, camera_rays
 from reli3d.geometry.rays import RayScene
-from reli3d.render.allocation import SamplePlan, plan_samples, spread_rows
 from reli3d.render.asset import Asset
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import surface_points
 from reli3d.render.points import SurfacePoints
 from reli3d.render.shading import DEFAULT, ShadeOptions, shade
+
+if TYPE_CHECKING:
+    from reli3d.render.allocation import SamplePlan
 
 PLAN_RAYS = 32768  # of a view, to find the points of a plan's pilot among
 BAND_RAYS = 1 << 18  # rays of one band of rows: bounds memory at about 40 MB whatever the image size
@@ -176,6 +179,8 @@ def plan_render(
     for points among those that 32768 rays of the camera hit.  No gradient.  Raises ValueError without any environment
     and where the camera sees nothing.
     """
+    from reli3d.render.allocation import plan_samples, spread_rows  # not before: few pictures have a plan
+
     parts, (light,) = _checked(asset, camera, (environment,))
     scene = scene if scene is not None else joined_scene(parts)
     origins, directions = (v.reshape(-1, 3) for v in camera_rays(camera))

@@ -27,7 +27,6 @@ from reli3d._bridge import (
 from reli3d.geometry import embree
 from reli3d.geometry.rays import RayScene
 from reli3d.kernels import shade as kernels
-from reli3d.kernels import shade_adjoint as adjoint
 from reli3d.kernels import shade_rays as halves
 from reli3d.render.environment import Environment, EnvironmentTable
 from reli3d.render.material import PAINTS, choice
@@ -205,6 +204,8 @@ class _Shade(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, g_out: Tensor):
+        from reli3d.kernels import shade_adjoint as adjoint  # not before: a picture needs no gradient
+
         *tensors, visible = ctx.saved_tensors
         n, device, wanted = g_out.shape[0], g_out.device, ctx.needs_input_grad[1:]
         parts = len(slices(n)) if device.type == "cpu" else 1
