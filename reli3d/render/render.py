@@ -22,7 +22,7 @@ from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import surface_points
 from reli3d.render.points import SurfacePoints
-from reli3d.render.shading import DEFAULT, ShadeOptions, shade
+from reli3d.render.shading import DEFAULT, ShadeOptions, shade_lights
 
 if TYPE_CHECKING:
     from reli3d.render.allocation import SamplePlan
@@ -255,7 +255,7 @@ def _band(parts, camera, lights, scene, first, shadows, background, options) -> 
     index = torch.nonzero(hits.face >= 0)[:, 0]
     points = _points(parts, hits.face[index], hits.bary[index])
     shadowed, pixels, wo = scene if shadows else None, (index + first).int(), -directions[index]
-    lit = [shade(points, wo, light, scene=shadowed, options=options, pixels=pixels) for light in lights]
+    lit = shade_lights(points, wo, lights, scene=shadowed, options=options, pixels=pixels)
     axis = -camera.c2w[:3, 2]
     depth = ((points.position - camera.position) * axis).sum(-1, keepdim=True)
     layers = [

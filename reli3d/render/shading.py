@@ -106,17 +106,44 @@ def shade(
     of threads.  Raises TypeError, ValueError.  Estimator: Veach and Guibas 1995 over the material of
     ``reli3d.kernels.bsdf``.
     """
+    return _Shade.apply(*_task(points, wo, environment, scene, options, pixels))
+
+
+def shade_lights(
+    points: SurfacePoints,
+    wo: Tensor,
+    environments: Sequence[Environment],
+    *,
+    scene: RayScene | None = None,
+    options: ShadeOptions = DEFAULT,
+    pixels: Tensor | None = None,
+) -> list[Tensor]:
+    """:func:`shade` under each of ``environments``, the same bits; the other arguments are those of it.
+
+    Of several lights without a gradient Embree tests the samples that do not depend on the light once.
+    """
+    tasks = [_task(points, wo, light, scene, options, pixels) for light in environments]
+    recorded = torch.is_grad_enabled() and any(v.requires_grad for _, *tensors in tasks for v in tensors)
+    if recorded or len(tasks) < 2 or scene is None or scene.backend != "embree":
+        return [_Shade.apply(*task) for task in tasks]
+    (job, *tensors), *others = tasks
+    first, known = _direct(job, tensors, words=job.words)
+    return [first, *(_direct(replace(job, known=known), tensors)[0] for job, *tensors in others)]
+
+
+def _task(points, wo, environment, scene, options, pixels) -> tuple:
+    """What :class:`_Shade` takes, from the arguments of :func:`shade`."""
     values = shaded_arrays(points, wo, environment, scene, options)
     plan, offsets = sampling_plan(options, scene)
     n, device = len(points), points.position.device
-    job = _Job(plan, sum(options.samples), scene, environment.table, offsets.to(device))
+    job = _Job(plan, sum(options.samples), scene, environment.table, offsets.to(device), _nothing_known(device))
     if pixels is None:
         pixels = torch.arange(n, dtype=torch.int32, device=device)
     check("pixels", pixels, like=points.position, dtype=torch.int32)
     if pixels.shape != (n,):
         raise ValueError(f"pixels: expected shape ({n},), got {tuple(pixels.shape)}")
     values = (*values, environment.radiance, pixels)
-    return _Shade.apply(job, *(v.contiguous() for v in values))
+    return job, *(v.contiguous() for v in values)
 
 
 class Light(Protocol):
@@ -146,7 +173,7 @@ def shade_light(
     n, device, count = len(points), points.position.device, sum(options.samples)
     pixels = torch.arange(n, dtype=torch.int32, device=device)
     white = torch.ones(1, 2, 3, device=device)  # what a sample adds under unit light; the light's radiance comes after
-    job = _Job(plan, count, scene, proposal.table, offsets.to(device))
+    job = _Job(plan, count, scene, proposal.table, offsets.to(device), _nothing_known(device))
     ins = _inputs([v.contiguous() for v in (*values, white, pixels)], job)
     out = nan_where_not_finite(values).expand(n, 3).clone()
     size = max(1, LIGHT_RAYS // max(1, count))
@@ -155,7 +182,7 @@ def shade_light(
         origins, directions, value = (torch.empty(hits * count, 3, device=device) for _ in range(3))
         far = torch.empty(hits * count, device=device)
         buffers = [(origins, wp.vec3), (directions, wp.vec3), (far, wp.float32), (value, wp.vec3)]
-        launch(halves.shade_rays_kernel, hits, [first, *ins, plan, *buffers], device)
+        launch(halves.shade_rays_kernel, hits, [first, *ins, plan, (job.known, wp.int32), *buffers], device)
         lit = (far > 0.0).nonzero()[:, 0]
         if scene is not None and scene.faces.shape[0]:
             lit = lit[~scene.occluded(origins[lit], directions[lit])]
@@ -178,6 +205,32 @@ class _Job:
     scene: RayScene | None
     table: EnvironmentTable
     offsets: Tensor
+    known: Tensor  # ``visible`` of the same hits and samples under another light, without columns for none
+
+    @property
+    def words(self) -> int:
+        """Columns of ``visible``: a bit a sample."""
+        return -(-self.count // 32)
+
+
+def _nothing_known(device: torch.device) -> Tensor:
+    return torch.empty(0, 0, dtype=torch.int32, device=device)
+
+
+def _direct(job: _Job, tensors: Sequence[Tensor], words: int = 0) -> tuple[Tensor, Tensor]:
+    """Radiance ``(N, 3)``, and ``visible (N, words)``: which samples are lit, as the kernels say."""
+    position, n = tensors[0], tensors[0].shape[0]
+    visible = torch.zeros(n, words, dtype=torch.int32, device=position.device)
+    out = empty((n,), wp.vec3, position.device)
+    ins = _inputs(tensors, job)
+    outs = [(out, wp.vec3), (visible, wp.int32)]
+    if job.scene is not None and job.scene.backend == "embree" and job.scene.faces.shape[0]:
+        _shade_embree(n, ins, job, outs)
+    else:
+        mesh = job.scene.mesh_id if job.scene is not None else 0
+        launch(kernels.shade_kernel, n, [*ins, job.plan, mesh, int(mesh != 0), *outs], position.device)
+    out += nan_where_not_finite(tensors[:7])
+    return out, visible
 
 
 class _Shade(torch.autograd.Function):
@@ -185,18 +238,7 @@ class _Shade(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, job: _Job, *tensors: Tensor) -> Tensor:
-        position, n = tensors[0], tensors[0].shape[0]
-        words = -(-job.count // 32) if any(ctx.needs_input_grad[1:]) else 0
-        visible = torch.zeros(n, words, dtype=torch.int32, device=position.device)
-        out = empty((n,), wp.vec3, position.device)
-        ins = _inputs(tensors, job)
-        outs = [(out, wp.vec3), (visible, wp.int32)]
-        if job.scene is not None and job.scene.backend == "embree" and job.scene.faces.shape[0]:
-            _shade_embree(n, ins, job, outs)
-        else:
-            mesh = job.scene.mesh_id if job.scene is not None else 0
-            launch(kernels.shade_kernel, n, [*ins, job.plan, mesh, int(mesh != 0), *outs], position.device)
-        out += nan_where_not_finite(tensors[:7])
+        out, visible = _direct(job, tensors, words=job.words if any(ctx.needs_input_grad[1:]) else 0)
         ctx.job = job
         ctx.save_for_backward(*tensors, visible)
         return out
@@ -275,16 +317,18 @@ def _shade_embree(n: int, ins: list, job: _Job, outs: list) -> None:
     size = max(1, min(SLICE_MIN, CHUNK_RAYS // count))
     group = max(1, GROUP_RAYS // count)
     outs = views(outs)  # once: a third of what a chunk costs besides its rays
+    (known,) = views([(job.known, wp.int32)])
 
     def work(_, start, length):
-        rays = [torch.empty(min(size, length) * count, 3) for _ in range(3)]
+        buffers = [torch.empty(min(size, length) * count, 3) for _ in range(3)]
         far = torch.empty(min(size, length) * count)
-        origins, directions, values, t_max = views([*((v, wp.vec3) for v in rays), (far, wp.float32)])
+        origins, directions, values, t_max = views([*((v, wp.vec3) for v in buffers), (far, wp.float32)])
         for first in range(start, start + length, size):
             hits = min(size, start + length - first)
-            args = [first, *ins, job.plan, origins, directions, t_max, values]
+            args = [first, *ins, job.plan, known, origins, directions, t_max, values]
             launch(halves.shade_rays_kernel, hits, args, out.device)
-            args = [first, hits, group, count, *tracer, origins, directions, values, t_max, *outs]
+            rays = [origins, directions, values, job.plan.n_environment, known, t_max]
+            args = [first, hits, group, count, *tracer, *rays, *outs]
             launch(halves.accumulate_kernel, -(-hits // group), args, out.device)
 
     if n:

@@ -17,9 +17,10 @@ from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import sample_texture, surface_points
 from reli3d.render.material import PAINTS
 from reli3d.render.render import _resolve, render, render_lights
-from reli3d.render.shading import ShadeOptions
+from reli3d.render.shading import ShadeOptions, shade, shade_lights
 from tests.support import reference
-from tests.support.scenes import ball, eye, textures
+from tests.support.scenes import ball, eye, shadow_caster, sky, textures
+from tests.support.surfaces import inputs, on_ball
 
 
 def square(device, normals=True):
@@ -137,6 +138,23 @@ def test_several_lights_give_the_bits_of_one_light_each_and_trace_the_camera_onc
         for field in fields(one):
             assert torch.equal(getattr(one, field.name), getattr(other, field.name)), field.name
     assert not torch.equal(together[0].radiance, together[1].radiance)
+
+
+@pytest.mark.parametrize("counts", [(2, 1, 1), (20, 40, 4), (0, 3, 2), (5, 0, 0)])
+@pytest.mark.parametrize("sequence", ["halton", "random"])
+def test_shadows_found_for_one_light_are_those_of_the_others(device, counts, sequence):
+    """More than 32 samples take two words of bits; without gradient and with one."""
+    normal, wo, *rest = inputs(3000, device)
+    scene, options = shadow_caster(device), ShadeOptions(counts, sequence=sequence)
+    lights = [sky(seed=1).to(device), Environment(torch.zeros(8, 16, 3, device=device)), sky(seed=2).to(device)]
+    for base in (rest[0], rest[0].clone().requires_grad_()):
+        args = on_ball(normal, wo, base, *rest[1:])
+        together = shade_lights(*args, lights, scene=scene, options=options)
+        for light, got in zip(lights, together, strict=True):
+            assert torch.equal(got, shade(*args, light, scene=scene, options=options))
+            assert got.requires_grad == base.requires_grad
+        free = shade(*args, lights[2], options=options)
+        assert bool((together[2] < 0.9 * free).any())  # the ball is in the way of something
 
 
 @pytest.mark.parametrize("factor", [1, 2, 3])
