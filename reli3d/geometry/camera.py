@@ -12,6 +12,7 @@ Other conventions are converted in ``reli3d.views`` and ``reli3d.io`` and nowher
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -20,6 +21,8 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from reli3d._bridge import check, expect, tensor_of
+
+NEAR = 0.01  # least depth of points over their largest distance for their box: nearer to 0 it is rounded too much
 
 
 @dataclass(frozen=True)
@@ -138,6 +141,28 @@ def project(points: Tensor, c2w: Tensor, intrinsics: Tensor) -> tuple[Tensor, Te
     fx, fy, cx, cy = intrinsics.unbind(-1)
     pixels = torch.stack([fx * local[..., 0] / depth + cx, -fy * local[..., 1] / depth + cy], -1)
     return pixels, depth
+
+
+def box_of(points: Tensor, camera: Camera) -> tuple[int, int, int, int]:
+    """Pixel box ``(x0, y0, x1, y1)``, ends exclusive, outside of which one camera sees nothing that lies between
+    ``points (N, 3)``; all of the picture where one of them is near the plane of the eye or behind it.
+
+    At least a pixel, also where all points lie beside the picture.  No gradient.
+    """
+    points, eye = points.detach(), camera.position.detach()
+    pixels, depth = project(points, camera.c2w.detach(), camera.intrinsics.detach())
+    if not len(points) or not float(depth.min()) > NEAR * float((points - eye).norm(dim=-1).max()):
+        return 0, 0, camera.width, camera.height
+    (x0, y0), (x1, y1) = pixels.amin(0).tolist(), pixels.amax(0).tolist()
+    left, right = _pixels_between(x0, x1, camera.width)
+    top, bottom = _pixels_between(y0, y1, camera.height)
+    return left, top, right, bottom
+
+
+def _pixels_between(low: float, high: float, count: int) -> tuple[int, int]:
+    """First pixel and the end of those of ``count`` that touch [low, high], and of one more on each side."""
+    first = min(max(math.floor(low) - 1, 0), count - 1)
+    return first, max(min(math.ceil(high) + 1, count), first + 1)
 
 
 def look_at(

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from reli3d._bridge import expect
-from reli3d.geometry.camera import Camera, camera_rays
+from reli3d.geometry.camera import Camera, box_of, camera_rays
 from reli3d.geometry.rays import RayScene
 from reli3d.render.asset import Asset
 from reli3d.render.color import linear_to_srgb
@@ -248,13 +248,18 @@ def _points(parts: Sequence[Asset], face: Tensor, bary: Tensor) -> SurfacePoints
 
 def _band(parts, camera, lights, scene, first, shadows, background, options) -> Iterator[Tensor]:
     """Premultiplied layers ``(rows, W, C)`` of one band of subpixels: the radiance of each light, then the others, in
-    the order that :func:`render_lights` takes apart.
+    the order that :func:`render_lights` takes apart.  Where no background is seen only the asset's box has rays.
     """
-    origins, directions = (v.reshape(-1, 3) for v in camera_rays(camera))
+    whole = (0, 0, camera.width, camera.height)
+    left, top, right, bottom = box_of(scene.vertices, camera) if background == "transparent" else whole
+    corner = camera.intrinsics.new_tensor([0.0, 0.0, left, top])  # whole numbers: the rays keep their bits
+    inner = Camera(camera.c2w, camera.intrinsics - corner, right - left, bottom - top)
+    origins, directions = (v.reshape(-1, 3) for v in camera_rays(inner))
     hits = scene.closest(origins, directions)
-    index = torch.nonzero(hits.face >= 0)[:, 0]
-    points = _points(parts, hits.face[index], hits.bary[index])
-    shadowed, pixels, wo = scene if shadows else None, (index + first).int(), -directions[index]
+    seen = torch.nonzero(hits.face >= 0)[:, 0]
+    index = (seen // inner.width + top) * camera.width + seen % inner.width + left
+    points = _points(parts, hits.face[seen], hits.bary[seen])
+    shadowed, pixels, wo = scene if shadows else None, (index + first).int(), -directions[seen]
     lit = shade_lights(points, wo, lights, scene=shadowed, options=options, pixels=pixels)
     axis = -camera.c2w[:3, 2]
     depth = ((points.position - camera.position) * axis).sum(-1, keepdim=True)
@@ -267,11 +272,10 @@ def _band(parts, camera, lights, scene, first, shadows, background, options) -> 
         points.position,
         depth,
     ]
-    seen = (hits.face >= 0)[:, None]
     for k, layer in enumerate(layers):
-        image = layer.new_zeros(directions.shape[0], layer.shape[1]).index_copy(0, index, layer)
+        image = layer.new_zeros(camera.height * camera.width, layer.shape[1]).index_copy(0, index, layer)
         if background == "environment" and k < len(lights):
-            image = torch.where(seen, image, lights[k].lookup(directions))
+            image = torch.where((hits.face >= 0)[:, None], image, lights[k].lookup(directions))
         yield image.reshape(camera.height, camera.width, -1)
 
 

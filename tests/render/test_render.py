@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from reli3d.geometry.camera import Camera, camera_rays, look_at, project
+from reli3d.geometry.camera import Camera, box_of, camera_rays, look_at, project
 from reli3d.geometry.hits import interpolate
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene
@@ -138,6 +138,39 @@ def test_several_lights_give_the_bits_of_one_light_each_and_trace_the_camera_onc
         for field in fields(one):
             assert torch.equal(getattr(one, field.name), getattr(other, field.name)), field.name
     assert not torch.equal(together[0].radiance, together[1].radiance)
+
+
+def test_box_of_points_holds_their_pixels_and_is_no_larger_than_it_must_be(device):
+    rng = torch.Generator().manual_seed(5)
+    for _ in range(50):
+        points = (torch.randn(20, 3, generator=rng) * 0.3).to(device)
+        camera = Camera.from_fov(look_at(torch.randn(3, generator=rng).to(device) * 2.0 + 0.5), 0.7, 60, 40)
+        pixels, depth = project(points, camera.c2w, camera.intrinsics)
+        x0, y0, x1, y1 = box_of(points, camera)
+        assert 0 <= x0 < x1 <= 60 and 0 <= y0 < y1 <= 40
+        if float(depth.min()) <= 0.0:
+            assert (x0, y0, x1, y1) == (0, 0, 60, 40)
+        elif float(depth.min()) > 0.1 * float((points - camera.position).norm(dim=-1).max()):
+            for axis, (low, high, count) in enumerate(((x0, x1, 60), (y0, y1, 40))):
+                inside = pixels[:, axis].clamp(0, count)
+                assert low <= float(inside.min()) and float(inside.max()) <= high
+                least, most = float(pixels[:, axis].min()), float(pixels[:, axis].max())
+                assert low >= min(least - 2.0, count - 1) and high <= max(most + 2.0, low + 1)
+    assert box_of(points[:0], camera) == (0, 0, 60, 40)
+
+
+def test_rays_beside_the_asset_are_left_out_without_a_trace_in_the_image(device, monkeypatch):
+    """A box on the border, one beside the picture and the whole one, the eye within the asset's reach."""
+    asset, env = ball(device), Environment(torch.rand(8, 16, 3, generator=torch.Generator().manual_seed(2)).to(device))
+    for place in ((0.3, 1.0, 4.0), (0.4, 0.1, 1.01)):
+        for cx in (7.25, 24.0, 400.0):
+            camera = Camera(eye(device, *place), torch.tensor([40.0, 44.0, cx, 20.3], device=device), 48, 32)
+            boxed = render(asset, camera, env, supersampling=2)
+            with monkeypatch.context() as patch:
+                patch.setattr("reli3d.render.render.box_of", lambda _, camera: (0, 0, camera.width, camera.height))
+                whole = render(asset, camera, env, supersampling=2)
+            for field in fields(whole):
+                assert torch.equal(getattr(boxed, field.name), getattr(whole, field.name)), (place, cx, field.name)
 
 
 @pytest.mark.parametrize("counts", [(2, 1, 1), (20, 40, 4), (0, 3, 2), (5, 0, 0)])
