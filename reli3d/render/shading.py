@@ -314,7 +314,7 @@ def _shade_embree(n: int, ins: list, job: _Job, outs: list) -> None:
     if count == 0:
         out.zero_()
         return
-    size = max(1, min(SLICE_MIN, CHUNK_RAYS // count))
+    size = max(1, CHUNK_RAYS // count)
     group = max(1, GROUP_RAYS // count)
     outs = views(outs)  # once: a third of what a chunk costs besides its rays
     (known,) = views([(job.known, wp.int32)])
