@@ -125,6 +125,8 @@ class Heads(nn.ModuleDict):
 
     def packed(self, names: Sequence[str], dtype: torch.dtype = torch.float32) -> PackedHeads:
         """The named MLPs for the kernels."""
+        from reli3d.nn.packed_heads import pack_heads  # as in at
+
         return pack_heads([linear_layers(self[name]) for name in names], dtype)
 
     def _check(self, names: Sequence[str]) -> None:
