@@ -320,7 +320,7 @@ class Job:
         scene = RayScene(asset.mesh.vertices, asset.mesh.faces)
         frames, moved = results.frame_record(placed.model_from_input, output, views.origin, args.frame, args.up)
         frames["weights"] = results.weights_record(self.manifest, self.digest)
-        encoded = results.encode(asset, shown, frames, before=first, translation=moved, scene=scene)
+        encoded = results.encode(asset, shown, frames, name=name, before=first, translation=moved, scene=scene)
         measured = results.measure(asset.mesh, scene, on_device := shown.to(self.device))
         picture = preview(asset, on_device, scene)
         info = {

@@ -87,16 +87,12 @@ def peak_memory_mib() -> float | None:
 class Encoded:
     """What the files of a result hold besides its preview; what is called gives it when it is there.
 
-    glb: the asset where its mesh lies, and with ``placed`` where ``mesh.glb`` puts it.  before: the asset without its
-    refinement, for the page.
+    placed: ``mesh.glb``.  page: ``viewer.html``, which shows the asset where its mesh lies.
     """
 
     asset: Asset
-    stops: Callable[[], list[dict]]
-    glb: Callable[[], bytes]
     placed: Callable[[], bytes]
-    shadow: Callable[[], Mapping[str, str | float]]
-    before: Callable[[], Shown] | None
+    page: Callable[[], str]
 
 
 def encode(
@@ -104,6 +100,7 @@ def encode(
     views: Views,
     record: Mapping,
     *,
+    name: str,
     before: Asset | None = None,
     translation: Sequence[float] = (0.0, 0.0, 0.0),
     scene: RayScene | None = None,
@@ -111,22 +108,28 @@ def encode(
     """Begin to encode a result, beside the caller's work: encoders run without the interpreter lock.
 
     views: the photographs, in the frame of ``asset``.  record: of ``run_info.json``, whose frames and weights
-    ``mesh.glb`` names too.  translation: of the latter, see :func:`~reli3d.io.glb.write_glb`; the page shows the mesh
-    where it is.  before: the asset without its refinement, which the page shows too.  scene: rays against the mesh of
-    ``asset``.
+    ``mesh.glb`` names too.  name: title of the page.  before: the asset without its refinement, shown there too.
+    translation: of the mesh in ``mesh.glb``, see :func:`~reli3d.io.glb.write_glb`; the page shows the mesh where it is.
+    scene: rays against the mesh of ``asset``.
     """
     device = asset.mesh.vertices.device
     extras = {k: record[k] for k in ("output_from_input", "model_from_input", "weights")}
     glb = beside(partial(glb_bytes, asset, extras=extras), device)
     moved = partial(glb_bytes, asset, extras=extras, translation=translation)
-    return Encoded(
-        asset,
-        beside(partial(photograph_stops, views), device),
-        glb,
-        beside(moved, device) if any(translation) else glb,
-        beside(partial(shadow, asset.mesh, scene), device),
-        None if before is None else beside(partial(_shown, before), device),
-    )
+    stops = beside(partial(photograph_stops, views), device)
+    started = None if before is None else beside(partial(_shown, before), device)
+
+    def page() -> str:
+        kept = shadow(asset.mesh, scene)  # the longest: the others, which began before, are done then
+        shown = {"mesh" if started is None else "after": Shown(glb(), kept)}
+        if started is not None:
+            shown["before"] = started()
+        low, high = asset.mesh.vertices.aminmax(dim=0)
+        middle, radius = (low + high) / 2, float((high - low).norm()) / 2
+        return viewer_page(name, shown, asset.light.radiance, middle, radius, stops())
+
+    placed = beside(moved, device) if any(translation) else glb
+    return Encoded(asset, placed, beside(page, device))
 
 
 def _shown(asset: Asset) -> Shown:
@@ -148,10 +151,10 @@ def write_results(
     info: what ``run_info.json`` holds, the convention of the light apart.
     compatible: write the light as :data:`PUBLISHED_LIGHT` as well.  comparison: the picture of a refinement.
     """
-    asset, radiance = encoded.asset, encoded.asset.light.radiance
+    radiance = encoded.asset.light.radiance
     info = {**info, "environment_centre": "+X"}
     with replacing() as new:
-        sheet = beside(partial(png_bytes, picture), asset.mesh.vertices.device)
+        (new / "preview.png").write_bytes(png_bytes(picture))
         (new / "mesh.glb").write_bytes(encoded.placed())
         for name in ("environment.exr", "environment.hdr"):
             write_environment(new / name, radiance)
@@ -159,14 +162,7 @@ def write_results(
             write_environment(new / PUBLISHED_LIGHT, radiance, centre="-Z")
         if comparison is not None:
             write_png(new / COMPARISON, comparison)
-        low, high = asset.mesh.vertices.aminmax(dim=0)
-        shown = {"mesh" if encoded.before is None else "after": Shown(encoded.glb(), encoded.shadow())}
-        if encoded.before is not None:
-            shown["before"] = encoded.before()
-        middle, radius = (low + high) / 2, float((high - low).norm()) / 2
-        page = viewer_page(info["object"], shown, radiance, middle, radius, encoded.stops())
-        (new / "viewer.html").write_text(page, encoding="utf-8")
-        (new / "preview.png").write_bytes(sheet())
+        (new / "viewer.html").write_text(encoded.page(), encoding="utf-8")
         (new / "run_info.json").write_text(json.dumps(info, indent=1) + "\n")
 
 

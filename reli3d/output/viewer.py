@@ -27,7 +27,7 @@ from reli3d.views.views import Views
 
 PARTS = Path(reli3d.__file__).parent / "assets" / "viewer"
 PHOTOGRAPH = 640  # pixels of the longer side: 16 of them take less than a megabyte
-QUALITY = 80  # of their WebP
+QUALITY, METHOD = 80, 2  # of their WebP: method 4 takes twice as long for 7 % less
 LEVEL = 1  # of deflate: 2.3 times smaller; more effort gains a tenth
 TINY = 1e-20  # instead of a division by zero where nothing is blocked
 
@@ -107,7 +107,7 @@ def _stop(views: Views, i: int) -> dict:
         picture = picture.resize(size, Image.Resampling.BOX)
     data = io.BytesIO()
     # a name that Pillow does not know yet would have it import all its formats
-    picture.save(data, WebPImagePlugin.WebPImageFile.format, quality=QUALITY)
+    picture.save(data, WebPImagePlugin.WebPImageFile.format, quality=QUALITY, method=METHOD)
     fx, fy, cx, cy = views.intrinsics[i].tolist()
     sx, sy = size[0] / width, size[1] / height
     return {
