@@ -15,9 +15,10 @@ from torch import Tensor
 
 from reli3d._bridge import check, expect, launch, present
 from reli3d.geometry.mesh import Mesh, weld_rows
-from reli3d.kernels.normal_maps import encode_normals_kernel
+from reli3d.kernels.normal_maps import ENCODE_EPS, encode_normals_kernel
 from reli3d.kernels.tangents import corner_shares_kernel
 
+EPS = float(ENCODE_EPS)
 PARALLEL = 1.0e-12  # length of a projected direction below which it has no direction in float64
 
 
@@ -114,7 +115,8 @@ def encode_normals(world: Tensor, normal: Tensor, tangent: Tensor) -> Tensor:
     _check_frame(normal, tangent)
     check("world", world, last=3, like=normal)
     same = world.shape[:-1] == normal.shape[:-1] == tangent.shape[:-1]
-    if same and not (torch.is_grad_enabled() and world.requires_grad):
+    asked = torch.is_grad_enabled() and any(v.requires_grad for v in (world, normal, tangent))
+    if same and not asked:
         rows = [v.detach().reshape(-1, v.shape[-1]).contiguous() for v in (world, normal, tangent)]
         out = torch.empty_like(rows[1])
         arrays = list(zip((*rows, out), (wp.vec3, wp.vec3, wp.vec4, wp.vec3), strict=True))
@@ -123,12 +125,12 @@ def encode_normals(world: Tensor, normal: Tensor, tangent: Tensor) -> Tensor:
     t, b, n = _frame(normal, tangent)
     tt, tn, nn = _dot(t, t), _dot(t, n), _dot(n, n)
     wt, wn = _dot(world, t), _dot(world, n)
-    determinant = (tt * nn - tn * tn).clamp(min=1e-6)  # b is orthogonal to both, so that two equations remain
+    determinant = (tt * nn - tn * tn).clamp(min=EPS)  # b is orthogonal to both, so that two equations remain
     x = (nn * wt - tn * wn) / determinant
     z = (tt * wn - tn * wt) / determinant
-    y = _dot(world, b) / _dot(b, b).clamp(min=1e-6)
+    y = _dot(world, b) / _dot(b, b).clamp(min=EPS)
     local = torch.stack([x, y, z.clamp(min=0.0)], -1)
-    return torch.nn.functional.normalize(local, dim=-1, eps=1e-6) * 0.5 + 0.5
+    return torch.nn.functional.normalize(local, dim=-1, eps=EPS) * 0.5 + 0.5
 
 
 def decode_normals(encoded: Tensor, normal: Tensor, tangent: Tensor) -> Tensor:
@@ -137,4 +139,4 @@ def decode_normals(encoded: Tensor, normal: Tensor, tangent: Tensor) -> Tensor:
     check("encoded", encoded, last=3, like=normal)
     local = encoded * 2.0 - 1.0
     world = local[..., :1] * t + local[..., 1:2] * b + local[..., 2:] * n
-    return torch.nn.functional.normalize(world, dim=-1, eps=1e-6)
+    return torch.nn.functional.normalize(world, dim=-1, eps=EPS)

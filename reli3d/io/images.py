@@ -163,8 +163,6 @@ def png_bytes(pixels: Tensor | np.ndarray) -> bytes:
     array = pixels.detach().cpu().numpy() if isinstance(pixels, Tensor) else np.asarray(pixels)
     if array.dtype not in (np.uint8, np.float32, np.float64):
         raise TypeError(f"pixels: expected uint8 or float32, got {array.dtype}")
-    if array.ndim not in (2, 3) or 0 in array.shape or (array.ndim == 3 and array.shape[2] not in (3, 4)):
-        raise ValueError(f"pixels: expected shape (H, W), (H, W, 3) or (H, W, 4), got {array.shape}")
     if array.dtype != np.uint8:
         if not np.isfinite(array).all():
             raise ValueError("pixels: expected finite values, got NaN or infinity")

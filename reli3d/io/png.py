@@ -1,6 +1,6 @@
 """PNG files: a kernel filters the rows, zlib compresses strips of them side by side.
 
-Pillow, whose files are as large, takes three times as long: it filters a byte at a time, on one thread.
+Pillow takes 1.8 to 3 times as long: it filters a byte at a time, on one thread.  Files are 0.1 % larger than its.
 """
 
 from __future__ import annotations
@@ -21,10 +21,14 @@ LEVEL = 1  # runs of bytes alone: no level finds more
 
 
 def encode(pixels: np.ndarray) -> bytes:
-    """PNG file of ``(H, W)``, ``(H, W, 3)`` or ``(H, W, 4)`` uint8 pixels."""
+    """PNG file of ``(H, W)``, ``(H, W, 3)`` or ``(H, W, 4)`` uint8 pixels.  Raises TypeError, ValueError for others."""
+    if pixels.dtype != np.uint8:
+        raise TypeError(f"pixels: expected uint8, got {pixels.dtype}")
+    if pixels.ndim not in (2, 3) or 0 in pixels.shape or (pixels.ndim == 3 and pixels.shape[2] not in (3, 4)):
+        raise ValueError(f"pixels: expected shape (H, W), (H, W, 3) or (H, W, 4), got {pixels.shape}")
     height, width = pixels.shape[:2]
     channels = pixels.shape[2] if pixels.ndim == 3 else 1
-    flat = torch.from_numpy(np.require(pixels, np.uint8, ["C", "W"]).reshape(height, width * channels))
+    flat = torch.from_numpy(np.require(pixels, requirements=["C", "W"]).reshape(height, width * channels))
     rows, none = torch.empty(height, width * channels + 1, dtype=torch.uint8), torch.zeros_like(flat[0])
     arrays = [(flat, kernels.wp.uint8), (none, kernels.wp.uint8), channels, (rows, kernels.wp.uint8)]
     launch(kernels.filter_rows_kernel, height, arrays, flat.device, slice_min=ROWS_MIN)

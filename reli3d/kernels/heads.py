@@ -11,6 +11,7 @@ from reli3d.kernels.triplane import Sizes, sample_point, vec8
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native -mllvm=-inline-threshold=5000"})
 
+GROUP, LANES = 64, 16  # outputs of a layer that lie together, and those of a vector
 TILE = wp.constant(48)  # points at a time: a multiple of POINTS, few enough for the cache
 
 
@@ -31,7 +32,8 @@ class Heads:
 
 
 # Vectors of 16 outputs.  POINTS by VECTORS sums stay in registers: AVX-512 has 32 of a vector each.
-SHAPE = """
+SHAPE = (
+    """
 #ifndef __CUDA_ARCH__
 #pragma clang fp contract(fast)
 typedef float Lanes __attribute__((vector_size(64), aligned(4)));
@@ -46,8 +48,9 @@ constexpr int POINTS = 6, VECTORS = 4;
 #else
 constexpr int POINTS = 2, VECTORS = 2;
 #endif
-constexpr int LANES = 16, GROUP = 64;
 """
+    + f"constexpr int LANES = {LANES}, GROUP = {GROUP};\n"
+)
 
 # x becomes x / (1 + exp(-x)).  2^f of f in [0, 1) is a polynomial of least relative error, 8e-8.
 SILU = """{
@@ -245,7 +248,8 @@ def add_layer(
 def other_layers(heads: Heads, hidden: wp.array[float], first: int, count: int, out: wp.array2d[float]):
     """What the heads make of the first activations of ``count`` points, to the columns of ``out`` from ``first`` on.
 
-    hidden: room for ``2 * TILE`` rows of the activations of all heads, which are in the first of them.
+    hidden: ``2 * TILE`` rows, each with the activations of all heads.  The first ``TILE`` rows hold those of the first
+    layer; the others are scratch.
     """
     width = heads.width
     words = width // heads.pack
@@ -279,7 +283,7 @@ def point_heads_kernel(
     heads: Heads,
     # scratch
     features: wp.array[vec8],  # of TILE points
-    values: wp.array[float],  # the same memory, and as much again
+    values: wp.array[float],  # the same memory as ``features``, and as much scratch after it
     hidden: wp.array[float],
     # out
     out: wp.array2d[float],

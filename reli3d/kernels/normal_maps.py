@@ -7,13 +7,21 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
 
-BUMP_EPS = wp.constant(1.0e-7)  # as in render.bump
-ENCODE_EPS = wp.constant(1.0e-6)  # as in geometry.tangents
+BUMP_EPS = wp.constant(1.0e-7)
+ENCODE_EPS = wp.constant(1.0e-6)
+
+
+@wp.func
+def at_least(value: float, limit: float) -> float:
+    """The larger one; NaN stays NaN, which ``wp.max`` does not promise."""
+    if value < limit:
+        return limit
+    return value
 
 
 @wp.func
 def unit(v: wp.vec3, eps: float) -> wp.vec3:
-    return v / wp.max(wp.length(v), eps)
+    return v / at_least(wp.length(v), eps)
 
 
 @wp.kernel
@@ -55,8 +63,8 @@ def encode_normals_kernel(
     nn = wp.dot(n, n)
     wt = wp.dot(w, t)
     wn = wp.dot(w, n)
-    determinant = wp.max(tt * nn - tn * tn, ENCODE_EPS)
+    determinant = at_least(tt * nn - tn * tn, ENCODE_EPS)
     x = (nn * wt - tn * wn) / determinant
-    y = wp.dot(w, b) / wp.max(wp.dot(b, b), ENCODE_EPS)
+    y = wp.dot(w, b) / at_least(wp.dot(b, b), ENCODE_EPS)
     z = (tt * wn - tn * wt) / determinant
-    out[i] = unit(wp.vec3(x, y, wp.max(z, 0.0)), ENCODE_EPS) * 0.5 + wp.vec3(0.5)
+    out[i] = unit(wp.vec3(x, y, at_least(z, 0.0)), ENCODE_EPS) * 0.5 + wp.vec3(0.5)

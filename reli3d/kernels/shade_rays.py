@@ -12,7 +12,7 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": f"-march=
 
 
 @wp.func
-def answers(known: wp.array2d[wp.int32], n_environment: int, sample: int) -> bool:
+def is_known(known: wp.array2d[wp.int32], n_environment: int, sample: int) -> bool:
     """Whether ``known`` has a bit of this sample: its direction does not depend on the light."""
     return known.shape[1] > 0 and sample >= n_environment
 
@@ -34,7 +34,8 @@ def shade_rays_kernel(
 ):
     """First half of the estimator for a chunk of hits: shadow rays (``t_max`` < 0 where none is needed) and values.
 
-    known: ``visible`` of :func:`accumulate_kernel` under another light, which answers for all samples but the light's.
+    known: ``visible`` of :func:`accumulate_kernel` under another light.  It holds for all samples but those drawn from
+    the light.
     """
     j = start + wp.tid()
     i = first + j
@@ -44,9 +45,9 @@ def shade_rays_kernel(
         d = draw_sample(surface, plan, light, s)
         k = j * count + s
         t_max[k] = -1.0
-        found = answers(known, plan.n_environment, s)
+        found = is_known(known, plan.n_environment, s)
         if found:
-            values[k] = wp.vec3(0.0, 0.0, 0.0)  # a sample that counts under the other light alone
+            values[k] = wp.vec3(0.0, 0.0, 0.0)  # its bit may be set although it adds nothing here
         if d.factor > 0.0:
             if not found:
                 t_max[k] = wp.inf
@@ -89,7 +90,7 @@ def accumulate_kernel(
         for s in range(count):
             k = j * count + s
             lit = t_max[k] >= 0.0
-            if answers(known, n_environment, s):
+            if is_known(known, n_environment, s):
                 lit = (known[first + j, s // 32] >> (s & 31)) & 1 == 1
             if lit:
                 total = total + values[k]

@@ -86,7 +86,9 @@ def blend(
     features: wp.array[vec8],
     at: int,
 ):
-    """All blocks of two neighbouring texels from ``top`` on and of two from ``bottom`` on, weighted, to ``at``."""
+    """Weighted sum of all blocks of four texels, two neighbours from block ``top`` on and two from ``bottom`` on, to
+    the blocks from ``at`` on.
+    """
     ...
 
 

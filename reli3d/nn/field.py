@@ -91,7 +91,7 @@ class TriplaneField(Field):
 
     @torch.no_grad()
     def grid_level(self, axis: Tensor) -> Tensor:
-        """:meth:`free_level` at ``(axis[i], axis[j], axis[k])``, ``(n, n, n)``, in a fifth of the time, see
+        """:meth:`free_level` at ``(axis[i], axis[j], axis[k])``, ``(n, n, n)``, in less time, see
         :meth:`Reconstructor.grid_density`.
         """
         return self.model.level(self.model.grid_density(self.code, axis))

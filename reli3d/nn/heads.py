@@ -109,9 +109,10 @@ class Heads(nn.ModuleDict):
         """``{name: (B, N, outputs)}`` at ``points (B, N, 3)`` of a triplane, both as for
         :func:`~reli3d.geometry.triplane.sample_triplane`.
 
-        dtype: as for a call.  On a CPU without gradient one kernel looks up and computes.
+        dtype: of the hidden layers where no gradient is recorded, float32 or bfloat16; another raises ValueError on a
+        CPU, where one kernel then looks up and computes.
         """
-        # not before: the small network, which needs the rest of this module, needs none of its kernels
+        # imported here because the small network, which needs this module too, does not need these kernels
         from reli3d.geometry.triplane import check_triplane, sample_triplane
 
         if torch.is_grad_enabled() or triplane.is_cuda:
@@ -125,7 +126,7 @@ class Heads(nn.ModuleDict):
 
     def packed(self, names: Sequence[str], dtype: torch.dtype = torch.float32) -> PackedHeads:
         """The named MLPs for the kernels."""
-        from reli3d.nn.packed_heads import pack_heads  # as in at
+        from reli3d.nn.packed_heads import pack_heads  # imported here as in :meth:`at`
 
         return pack_heads([linear_layers(self[name]) for name in names], dtype)
 

@@ -170,21 +170,23 @@ class Reconstructor(nn.Module):
         axis: ``(n,)``, model units.  A plane of features has ``n * n`` different points, and the head's first layer is
         linear: it is done on the three planes' points and added up.  Values differ from :meth:`query`'s by rounding.
         """
-        from reli3d.geometry.triplane import sample_triplane  # not before: the small network needs none of its kernels
+        from reli3d.geometry.triplane import sample_triplane  # here because the small network does not need its kernels
 
-        n, channels, at = len(axis), code.triplane.shape[2], axis / self.preset.radius
-        a, b = (c.reshape(-1) for c in torch.meshgrid(at, at, indexing="ij"))
-        xy, xz, _ = sample_triplane(code.triplane, torch.stack([a, b, b], -1)[None])[0].split(channels, -1)
-        yz = sample_triplane(code.triplane, torch.stack([b, a, b], -1)[None])[0][:, 2 * channels :]
-        first = linear_of(self.heads["density"], 0)
-        of_xy, of_xz, of_yz = (
-            torch.mm(f, w.T).view(n, n, -1) for w, f in zip(first.weight.split(channels, 1), (xy, xz, yz), strict=True)
-        )
-        of_xy += first.bias
-        if axis.is_cuda:
-            rest = nn.Sequential(*list(self.heads["density"].children())[1:])
-            return torch.stack([rest(of_xy[i, :, None] + of_xz[i] + of_yz)[..., 0] for i in range(n)])
-        return self.heads.packed(("density",)).on_grid(of_xy, of_xz, of_yz)[0]
+        with torch.autocast(axis.device.type, enabled=False):
+            n, channels, at = len(axis), code.triplane.shape[2], axis / self.preset.radius
+            a, b = (c.reshape(-1) for c in torch.meshgrid(at, at, indexing="ij"))
+            xy, xz, _ = sample_triplane(code.triplane, torch.stack([a, b, b], -1)[None])[0].split(channels, -1)
+            yz = sample_triplane(code.triplane, torch.stack([b, a, b], -1)[None])[0][:, 2 * channels :]
+            first = linear_of(self.heads["density"], 0)
+            of_xy, of_xz, of_yz = (
+                torch.mm(f, w.T).view(n, n, -1)
+                for w, f in zip(first.weight.split(channels, 1), (xy, xz, yz), strict=True)
+            )
+            of_xy += first.bias
+            if axis.is_cuda:
+                rest = nn.Sequential(*list(self.heads["density"].children())[1:])
+                return torch.stack([rest(of_xy[i, :, None] + of_xz[i] + of_yz)[..., 0] for i in range(n)])
+            return self.heads.packed(("density",)).on_grid(of_xy, of_xz, of_yz)[0]
 
     def level(self, density: Tensor) -> Tensor:
         """Surface level of the ``density`` head's raw values: negative inside, zero on the surface."""

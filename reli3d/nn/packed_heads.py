@@ -12,10 +12,9 @@ from torch.nn.functional import pad
 from reli3d._bridge import SLICE_MIN, launch, over_slices, struct_of
 from reli3d.geometry.triplane import BLOCK, packed_planes, sizes_of
 from reli3d.kernels import heads as kernels
+from reli3d.kernels.heads import GROUP, LANES
 from reli3d.kernels.triplane import vec8
 
-GROUP = 64  # outputs of a layer that the kernel computes together
-LANES = 16
 PACK = {torch.float32: 1, torch.bfloat16: 2}  # numbers in a word of 32 bits
 
 
@@ -73,8 +72,12 @@ class PackedHeads:
         """Outputs ``(outputs, n, n, n)`` of one MLP in float32 on a grid.
 
         Its first layer gives point (i, j, k) the sum of ``of_xy[i, j]``, ``of_xz[i, k]`` and ``of_yz[j, k]``, each
-        ``(n, n, width)``.
+        ``(n, n, width)``.  Raises ValueError for several MLPs, or bfloat16.
         """
+        if len(self.outputs) != 1 or self.pack != 1:
+            raise ValueError(
+                f"heads: expected one in float32 for a grid, got {', '.join(map(str, self.outputs))} outputs"
+            )
         n = len(of_xy)
         of_xy, of_xz, of_yz = (pad(t, (0, self.width - t.shape[2])) for t in (of_xy, of_xz, of_yz))
         out = of_xy.new_empty(*self.outputs, n**3)

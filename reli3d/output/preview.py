@@ -103,7 +103,7 @@ def _smoothed(*shots: Render) -> list[Tensor]:
     shot, count = shots[0], 3 * len(shots)
     paint = (shot.base_color + GLOSS) * shot.alpha[..., None]
     ratios = [s.radiance / paint.clamp(min=1e-6) for s in shots]
-    # channels first: a weight of each pixel then meets whole rows of a channel, in half the time
+    # channels first: the products with the weights then run along rows, in half the time
     guides = torch.cat([*ratios, shot.normal, shot.alpha[..., None]], -1).permute(2, 0, 1).contiguous()
     padded, normal = pad(guides, (WINDOW,) * 4), guides[count:-1]
     height, width = shot.alpha.shape

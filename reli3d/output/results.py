@@ -85,7 +85,7 @@ def peak_memory_mib() -> float | None:
 
 @dataclass(frozen=True)
 class Encoded:
-    """What the files of a result hold besides its preview; what is called gives it when it is there.
+    """What the files of a result hold besides its preview.  A call waits until it is there.
 
     placed: ``mesh.glb``.  page: ``viewer.html``, which shows the asset where its mesh lies.
     """
@@ -120,7 +120,9 @@ def encode(
     started = None if before is None else beside(partial(_shown, before), device)
 
     def page() -> str:
-        kept = shadow(asset.mesh, scene)  # the longest: the others, which began before, are done then
+        # The longest first.  This is a thread of the pool: it may wait for tasks that were submitted before it and that
+        # wait for none.
+        kept = shadow(asset.mesh, scene)
         shown = {"mesh" if started is None else "after": Shown(glb(), kept)}
         if started is not None:
             shown["before"] = started()

@@ -9,7 +9,7 @@ from torch.nn.functional import normalize
 from reli3d._bridge import launch
 from reli3d.kernels import normal_maps as kernels
 
-EPS = 1.0e-7  # of the published normalisation; on the vertical axis, where the frame vanishes, the bump is lost
+EPS = float(kernels.BUMP_EPS)  # of the published normalisation; on the vertical axis there is no frame and no bump
 
 
 def radial_bump(position: Tensor, normal: Tensor, bump: Tensor) -> Tensor:
@@ -17,10 +17,15 @@ def radial_bump(position: Tensor, normal: Tensor, bump: Tensor) -> Tensor:
 
     position: ``(..., 3)`` model frame.  normal: ``(..., 3)`` unit, geometric.  The tangent is ``y x position`` made
     orthogonal to the normal, the bitangent ``normal x tangent``.  Gradients reach ``bump`` only, as published: the
-    frame is data.
+    frame is data.  Raises ValueError for another last axis, or another device than that of ``bump``.
     """
     position, normal = position.detach(), normal.detach()
     values = (position, normal, bump)
+    for name, value in zip(("position", "normal", "bump"), values, strict=True):
+        if value.shape[-1:] != (3,):
+            raise ValueError(f"{name}: expected shape (..., 3), got {tuple(value.shape)}")
+        if value.device != bump.device:
+            raise ValueError(f"{name}: expected device {bump.device}, got {value.device}")
     if not (torch.is_grad_enabled() and bump.requires_grad) and all(v.dtype == torch.float32 for v in values):
         rows = [v.detach().reshape(-1, 3).contiguous() for v in torch.broadcast_tensors(*values)]
         out = torch.empty_like(rows[0])

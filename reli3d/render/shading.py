@@ -43,7 +43,7 @@ CHOICES = {
     "paint": PAINTS,
 }
 CHUNK_RAYS = 65536  # shadow rays of a chunk and their values take 2.6 MB a thread: near the cache, far above call costs
-GROUP_RAYS = 64  # of neighbouring hits with few samples, traced together: four full packets, not one quarter full a hit
+GROUP_RAYS = 64  # of neighbouring hits, traced together: so packets of 16 are full where a hit has fewer
 
 
 @dataclass(frozen=True)

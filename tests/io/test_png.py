@@ -66,6 +66,14 @@ def test_the_file_is_the_same_for_any_number_of_threads_and_the_pixels_may_be_re
     data, threads = encode(pixels), torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        assert encode(pixels[:, ::-1][:, ::-1]) == data
+        assert encode(np.asfortranarray(pixels)) == data
     finally:
         torch.set_num_threads(threads)
+
+
+def test_what_is_no_picture_is_refused():
+    with pytest.raises(TypeError, match="pixels: expected uint8, got float32"):
+        encode(np.zeros((2, 2, 3), np.float32))
+    for shape in ((2, 2, 2), (0, 2), (4,)):
+        with pytest.raises(ValueError, match="pixels: expected shape"):
+            encode(np.zeros(shape, np.uint8))

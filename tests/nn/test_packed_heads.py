@@ -29,7 +29,7 @@ def rounded(x):
 
 
 def in_bfloat16(layers, features):
-    """Float64, but numbers between the layers, and the weights of hidden ones, with eight bits."""
+    """Float64, but numbers between the layers, and the weights of hidden ones, have eight significant bits."""
     *hidden, last = (m for m in layers if isinstance(m, nn.Linear))
     x = rounded(features)
     for layer in hidden:

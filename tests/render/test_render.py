@@ -162,10 +162,21 @@ def test_box_of_points_holds_their_pixels_and_is_no_larger_than_it_must_be(devic
 def test_rays_beside_the_asset_are_left_out_without_a_trace_in_the_image(device, monkeypatch):
     """A box on the border, one beside the picture and the whole one, the eye within the asset's reach."""
     asset, env = ball(device), Environment(torch.rand(8, 16, 3, generator=torch.Generator().manual_seed(2)).to(device))
+    rays, closest = [], RayScene.closest
+
+    def counted(scene, origins, directions):
+        rays.append(len(origins))
+        return closest(scene, origins, directions)
+
     for place in ((0.3, 1.0, 4.0), (0.4, 0.1, 1.01)):
         for cx in (7.25, 24.0, 400.0):
             camera = Camera(eye(device, *place), torch.tensor([40.0, 44.0, cx, 20.3], device=device), 48, 32)
-            boxed = render(asset, camera, env, supersampling=2)
+            rays.clear()
+            with monkeypatch.context() as patch:
+                patch.setattr(RayScene, "closest", counted)
+                boxed = render(asset, camera, env, supersampling=2)
+            if place[2] > 2.0:
+                assert sum(rays) < 0.7 * 4 * 48 * 32
             with monkeypatch.context() as patch:
                 patch.setattr("reli3d.render.render.box_of", lambda _, camera: (0, 0, camera.width, camera.height))
                 whole = render(asset, camera, env, supersampling=2)
@@ -183,7 +194,8 @@ def test_shadows_found_for_one_light_are_those_of_the_others(device, counts, seq
     for base in (rest[0], rest[0].clone().requires_grad_()):
         args = on_ball(normal, wo, base, *rest[1:])
         together = shade_lights(*args, lights, scene=scene, options=options)
-        for light, got in zip(lights, together, strict=True):
+        black_first = shade_lights(*args, lights[1:], scene=scene, options=options)
+        for light, got in zip((*lights, *lights[1:]), (*together, *black_first), strict=True):
             assert torch.equal(got, shade(*args, light, scene=scene, options=options))
             assert got.requires_grad == base.requires_grad
         free = shade(*args, lights[2], options=options)
