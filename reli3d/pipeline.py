@@ -46,6 +46,7 @@ if TYPE_CHECKING:
 REFINED = 384  # pixels of the views that a refinement compares with
 INSIDE = 2.0  # pixels of such a view that a silhouette's edge may spill over
 SMALLEST_PART = 0.01  # share of the faces below which a separate piece is dropped
+TEXELS = 1 << 19  # evaluated at once on a CPU, where no features are kept: 100 bytes each
 SHADING_POINTS = 4096  # vertices by which the light on the object is judged
 OUTSIDE = 1.0  # level given to grid points that the silhouettes exclude
 MARGIN_CELLS = 2.5  # cells around the silhouettes' hull in which the field is still evaluated
@@ -197,7 +198,8 @@ def texture(
         return {**found, "normal": encode_normals(got.normal, normal, tangent)}
 
     ask = surface if local is None else partial(in_rows, surface)
-    baked = bake(mesh, size, ask, chunk=CHUNK, tangents=True, values=known)
+    chunk = CHUNK if mesh.vertices.is_cuda else TEXELS
+    baked = bake(mesh, size, ask, chunk=chunk, tangents=True, values=known)
     return mesh, TextureSet(**{k: v.clamp_(0, 1) for k, v in baked.items()})
 
 
