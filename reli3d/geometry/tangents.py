@@ -98,7 +98,6 @@ def _check_frame(normal: Tensor, tangent: Tensor) -> None:
 
 
 def _frame(normal: Tensor, tangent: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    _check_frame(normal, tangent)
     t, n = tangent[..., :3], normal
     b = torch.linalg.cross(n, t) * tangent[..., 3:]
     return t, b, n
@@ -135,8 +134,9 @@ def encode_normals(world: Tensor, normal: Tensor, tangent: Tensor) -> Tensor:
 
 def decode_normals(encoded: Tensor, normal: Tensor, tangent: Tensor) -> Tensor:
     """Unit world-space normals ``(..., 3)`` of normal map values ``(..., 3)``: inverse of :func:`encode_normals`."""
-    t, b, n = _frame(normal, tangent)
+    _check_frame(normal, tangent)
     check("encoded", encoded, last=3, like=normal)
+    t, b, n = _frame(normal, tangent)
     local = encoded * 2.0 - 1.0
     world = local[..., :1] * t + local[..., 1:2] * b + local[..., 2:] * n
     return torch.nn.functional.normalize(world, dim=-1, eps=EPS)

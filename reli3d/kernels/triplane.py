@@ -65,33 +65,6 @@ def texel(planes: wp.array[vec8], base: int, x: int, y: int, sizes: Sizes) -> ve
     return planes[base + (y * sizes.width + x) * sizes.blocks]
 
 
-@wp.func_native("""
-const float *a = &planes.data[top].c[0], *b = &planes.data[bottom].c[0];
-float* out = &features.data[at].c[0];
-#ifndef __CUDA_ARCH__
-#pragma clang loop vectorize(assume_safety)
-#endif
-for (int c = 0; c < 8 * blocks; c++)
-    out[c] = a[c] * w00 + a[c + 8 * blocks] * w01 + b[c] * w10 + b[c + 8 * blocks] * w11;
-""")
-def blend(
-    planes: wp.array[vec8],
-    top: int,
-    bottom: int,
-    blocks: int,
-    w00: float,
-    w01: float,
-    w10: float,
-    w11: float,
-    features: wp.array[vec8],
-    at: int,
-):
-    """Weighted sum of all blocks of four texels, two neighbours from block ``top`` on and two from ``bottom`` on, to
-    the blocks from ``at`` on.
-    """
-    ...
-
-
 @wp.func
 def sample_point(
     planes: wp.array[vec8],
@@ -121,9 +94,7 @@ def sample_point(
         if x >= 0 and y >= 0 and x + 1 < width and y + 1 < height:
             top = base + (y * width + x) * blocks
             bottom = top + width * blocks
-            if split == 1:
-                blend(planes, top, bottom, blocks, w00, w01, w10, w11, features, out)
-            for q in range(first, wp.where(split == 1, 0, blocks), split):
+            for q in range(first, blocks, split):
                 features[out + q] = (
                     planes[top + q] * w00
                     + planes[top + blocks + q] * w01

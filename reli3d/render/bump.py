@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from reli3d._bridge import launch
+from reli3d._bridge import check, launch
 from reli3d.kernels import normal_maps as kernels
 
 EPS = float(kernels.BUMP_EPS)  # of the published normalisation; on the vertical axis there is no frame and no bump
@@ -22,10 +22,7 @@ def radial_bump(position: Tensor, normal: Tensor, bump: Tensor) -> Tensor:
     position, normal = position.detach(), normal.detach()
     values = (position, normal, bump)
     for name, value in zip(("position", "normal", "bump"), values, strict=True):
-        if value.shape[-1:] != (3,):
-            raise ValueError(f"{name}: expected shape (..., 3), got {tuple(value.shape)}")
-        if value.device != bump.device:
-            raise ValueError(f"{name}: expected device {bump.device}, got {value.device}")
+        check(name, value, last=3, like=bump, dtype=value.dtype)
     if not (torch.is_grad_enabled() and bump.requires_grad) and all(v.dtype == torch.float32 for v in values):
         rows = [v.detach().reshape(-1, 3).contiguous() for v in torch.broadcast_tensors(*values)]
         out = torch.empty_like(rows[0])
