@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import sys
 import threading
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -25,17 +24,14 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from reli3d.kernels.cache import no_driver_warning, private_folder, repaired
+from reli3d.kernels.cache import CPU_BLOCK, LOADING, initialise, repaired
 
 WORKER = "reli3d-slice"  # how the threads of the pool are called
 SLICES = 16  # several a thread balance uneven rays on 2 to 8 cores; more only add 20 us of launch each
-CPU_BLOCK = 1  # block size of Warp's CPU launches; loading a module for its default one would compile it once more
 COMPILERS = 4  # modules compiled at once; each thread builds its own precompiled header, 1.5 CPU seconds
 SLICE_MIN = 1024  # below this many threads a slice costs about as much to launch as to run
 
 T = TypeVar("T")
-
-_LOADING = threading.Lock()  # Warp has none: it would be started, and a module compiled, by two threads at once
 
 _TORCH = {
     wp.float32: (torch.float32, ()),
@@ -51,28 +47,6 @@ _TORCH = {
     wp.mat33: (torch.float32, (3, 3)),
     wp.mat44: (torch.float32, (4, 4)),
 }
-
-
-def initialise() -> None:
-    """Start Warp once: quiet on stdout, and with a kernel cache that can be written."""
-    with _LOADING:
-        _start()
-
-
-@lru_cache(1)
-def _start() -> None:
-    wp.config.log_level = wp.LOG_WARNING
-    try:
-        with no_driver_warning():
-            wp.init()
-        writable = os.access(str(wp.config.kernel_cache_dir), os.W_OK)
-    except OSError:
-        writable = False
-    if not writable:
-        fallback = private_folder()
-        print(f"reli3d: kernel cache {wp.config.kernel_cache_dir} cannot be written; using {fallback}", file=sys.stderr)
-        wp.config.kernel_cache_dir = fallback
-        wp.init()
 
 
 @lru_cache(1)
@@ -188,14 +162,6 @@ def empty(shape: Sequence[int], dtype, device: torch.device) -> Tensor:
     return torch.empty((*shape, *tail), dtype=torch_dtype, device=device)
 
 
-def compiled(modules: Sequence[ModuleType], device: torch.device) -> bool:
-    """Whether the kernel cache has all of these kernel modules for ``device``, so that loading them takes no time."""
-    initialise()
-    block = CPU_BLOCK if device.type == "cpu" else None
-    names = [wp.get_module(m.__name__).get_module_identifier(block_dim=block) for m in modules]
-    return all(os.path.isdir(os.path.join(str(wp.config.kernel_cache_dir), name)) for name in names)
-
-
 def load_modules(modules: Sequence[ModuleType], device: torch.device) -> None:
     """Load kernel modules (:mod:`reli3d.kernels`), compiling several at once what the kernel cache lacks.
 
@@ -213,7 +179,7 @@ def load_modules(modules: Sequence[ModuleType], device: torch.device) -> None:
 
 def _load(kernel) -> None:
     """Have a kernel's module ready on the CPU."""
-    with _LOADING:
+    with LOADING:
         repaired(kernel.module, CPU_BLOCK, lambda: kernel.module.load(wp.get_device("cpu"), block_dim=CPU_BLOCK))
 
 

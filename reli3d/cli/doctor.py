@@ -67,9 +67,9 @@ def _devices() -> Iterator[tuple[str, str]]:
     import torch
     import warp as wp
 
-    from reli3d import _bridge
+    from reli3d.kernels import cache
 
-    _bridge.initialise()
+    cache.initialise()
     yield "cpu", f"{os.cpu_count()} cores, {torch.get_num_threads()} threads of torch"
     if not wp.is_cuda_available():
         yield "driver", "no NVIDIA driver with a device found: all runs on the CPU, which is no error"
@@ -86,9 +86,9 @@ def _devices() -> Iterator[tuple[str, str]]:
 def _cache() -> Iterator[tuple[str, str]]:
     import warp as wp
 
-    from reli3d import _bridge
+    from reli3d.kernels import cache
 
-    _bridge.initialise()
+    cache.initialise()
     folder = Path(str(wp.config.kernel_cache_dir))
     try:
         with tempfile.TemporaryFile(dir=folder):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import functools
-import importlib
 import itertools
 import json
 import sys
@@ -14,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from reli3d.cli import collector, objects
+from reli3d.cli import collector, imports, objects
 from reli3d.cli.checking import SUSPECT, Check, diagnosed
 from reli3d.cli.exit_codes import check_range, command, reason
 from reli3d.cli.help_format import joined
@@ -58,7 +57,8 @@ class Plan:
 
 def _plan(args: argparse.Namespace, held: contextlib.ExitStack) -> Plan:
     """What the command will do; what is wrong with it is raised here.  Raises ValueError, OSError."""
-    with collector.importing():  # torch and Warp too
+    with collector.importing():
+        imports.beside_torch(json.loads(KERNELS.read_text())["LocalReconstructor"])
         from reli3d.output import results
         from reli3d.output.folder import check_place
 
@@ -376,10 +376,11 @@ def ready_kernels(device: str, names: list[str]) -> None:
     """Compile side by side what the first run would compile piece by piece; says so on stderr if there is something."""
     import torch
 
-    from reli3d._bridge import compiled, load_modules
+    from reli3d._bridge import load_modules
+    from reli3d.kernels.cache import compiled
 
-    modules = [importlib.import_module(f"reli3d.kernels.{name}") for name in names]
-    if not compiled(modules, torch.device(device)):
+    modules = imports.kernel_modules(names)
+    if not compiled(modules, device):
         print("compiling kernels (first run only)", file=sys.stderr)
         load_modules(modules, torch.device(device))
 

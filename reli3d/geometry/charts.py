@@ -17,6 +17,7 @@ import warp as wp
 from reli3d import _bridge
 from reli3d.geometry.mesh import group
 from reli3d.kernels import uv as kernels
+from reli3d.kernels.cache import initialise
 from reli3d.kernels.cuts import cuts_kernel, vec8d
 
 CPU = torch.device("cpu")
@@ -278,7 +279,7 @@ def _overlaps(charts: Charts, boxes: np.ndarray, query: np.ndarray):
     z = charts.chart[boxes].astype(np.float32)
     lower = torch.from_numpy(np.column_stack([np.minimum(np.minimum(a, b), c), z]))
     upper = torch.from_numpy(np.column_stack([np.maximum(np.maximum(a, b), c), z]))
-    _bridge.initialise()
+    initialise()
     bvh = wp.Bvh(_bridge.array_of(lower, wp.vec3), _bridge.array_of(upper, wp.vec3))
     count = torch.zeros(len(query), dtype=torch.int32)
     none = torch.zeros(1, dtype=torch.int64), torch.zeros(1, dtype=torch.int32)

@@ -5,8 +5,45 @@ import os
 import shutil
 import sys
 import tempfile
+import threading
+from collections.abc import Sequence
+from functools import lru_cache
+from types import ModuleType
 
 import warp as wp
+
+CPU_BLOCK = 1  # block size of Warp's CPU launches; loading a module for its default one would compile it once more
+LOADING = threading.Lock()  # Warp has none: it would be started, and a module compiled, by two threads at once
+
+
+def initialise() -> None:
+    """Start Warp once: quiet on stdout, and with a kernel cache that can be written."""
+    with LOADING:
+        _start()
+
+
+@lru_cache(1)
+def _start() -> None:
+    wp.config.log_level = wp.LOG_WARNING
+    try:
+        with no_driver_warning():
+            wp.init()
+        writable = os.access(str(wp.config.kernel_cache_dir), os.W_OK)
+    except OSError:
+        writable = False
+    if not writable:
+        fallback = private_folder()
+        print(f"reli3d: kernel cache {wp.config.kernel_cache_dir} cannot be written; using {fallback}", file=sys.stderr)
+        wp.config.kernel_cache_dir = fallback
+        wp.init()
+
+
+def compiled(modules: Sequence[ModuleType], kind: str) -> bool:
+    """Whether the kernel cache has all of these kernel modules for ``cpu`` or ``cuda``: loading them takes no time."""
+    initialise()
+    block = CPU_BLOCK if kind == "cpu" else None
+    names = [wp.get_module(m.__name__).get_module_identifier(block_dim=block) for m in modules]
+    return all(os.path.isdir(os.path.join(str(wp.config.kernel_cache_dir), name)) for name in names)
 
 
 @contextlib.contextmanager

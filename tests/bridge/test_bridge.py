@@ -11,6 +11,7 @@ import torch
 import warp as wp
 
 from reli3d import _bridge
+from reli3d.kernels import cache
 from tests.support.checkout import ROOT
 
 wp.set_module_options({"enable_backward": True, "cpu_compiler_flags": ""})
@@ -319,9 +320,9 @@ def test_modules_load_together_and_are_known_as_compiled(tmp_path, monkeypatch, 
     from reli3d.kernels import distance, noise
 
     _bridge.load_modules([distance, noise], device)
-    assert _bridge.compiled([distance, noise], device)
+    assert cache.compiled([distance, noise], device.type)
     monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
-    assert not _bridge.compiled([distance, noise], device)
+    assert not cache.compiled([distance, noise], device.type)
 
 
 @pytest.mark.parametrize("count", [1, 2, 5])
@@ -374,9 +375,9 @@ def test_threads_start_warp_once(monkeypatch):
     """Warp forgets its modules' hashes while it starts; a thread that already loads one would stumble over that."""
     started = []
     monkeypatch.setattr(wp, "init", lambda: (time.sleep(0.05), started.append(1)))
-    _bridge._start.cache_clear()
+    cache._start.cache_clear()
     with ThreadPoolExecutor(4) as pool:
-        list(pool.map(lambda _: (_bridge.initialise(), started.append(0)), range(4)))
+        list(pool.map(lambda _: (cache.initialise(), started.append(0)), range(4)))
     assert started == [1, 0, 0, 0, 0]
 
 
@@ -384,10 +385,10 @@ def test_threads_start_warp_once(monkeypatch):
 def test_a_missing_driver_is_no_warning_and_other_words_are_passed_on():
     code = """
 import os, warp as wp
-from reli3d import _bridge
+from reli3d.kernels.cache import initialise
 init = wp.init
 wp.init = lambda: (os.write(2, b"other words\\n"), init())
-_bridge.initialise()
+initialise()
 os.write(2, b"later\\n")
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)

@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 
 from reli3d import kernels
-from reli3d._bridge import initialise
+from reli3d.kernels.cache import initialise
 
 FOUND = [importlib.import_module(f"{kernels.__name__}.{info.name}") for info in pkgutil.iter_modules(kernels.__path__)]
 MODULES = {module.__name__.rpartition(".")[2]: module for module in FOUND if wp.get_module(module.__name__).kernels}
