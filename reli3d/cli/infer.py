@@ -320,9 +320,11 @@ class Job:
         scene = RayScene(asset.mesh.vertices, asset.mesh.faces)
         frames, moved = results.frame_record(placed.model_from_input, output, views.origin, args.frame, args.up)
         frames["weights"] = results.weights_record(self.manifest, self.digest)
+        on_device = shown.to(self.device)
+        picture = preview(asset, on_device, scene)  # the longest tasks first, so that the threads end at about one time
+        measured = results.measure(asset.mesh, scene, on_device)
         encoded = results.encode(asset, shown, frames, name=name, before=first, translation=moved, scene=scene)
-        measured = results.measure(asset.mesh, scene, on_device := shown.to(self.device))
-        picture = preview(asset, on_device, scene)
+        drawn = picture()
         info = {
             "object": name,
             "views": list(views.names),
@@ -347,7 +349,7 @@ class Job:
             "versions": results.versions(),
         }
         steps("writing")
-        results.write_results(replacing, encoded, picture, info, compatible=args.compatible_names, comparison=compared)
+        results.write_results(replacing, encoded, drawn, info, compatible=args.compatible_names, comparison=compared)
 
 
 def refinement_budget(args: argparse.Namespace, device: str) -> dict[str, float | int]:

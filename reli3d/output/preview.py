@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 import torch
@@ -11,11 +12,11 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 from torch.nn.functional import interpolate, normalize, pad
 
-from reli3d._bridge import over_rows
 from reli3d.geometry.camera import Camera, look_at
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene
 from reli3d.io.hdr import quarter_turn
+from reli3d.nn.blocks import beside
 from reli3d.render.asset import Asset
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
@@ -40,52 +41,53 @@ ELEVATIONS = (5.0, 30.0)  # degrees, of views that nobody took
 AZIMUTHS = 24  # places around the object to choose from
 
 
-def preview(asset: Asset, views: Views, scene: RayScene | None = None) -> np.ndarray:
-    """Picture ``(H, W, 3)`` uint8: up to four input views; four views that nobody photographed under the asset's own
-    light, then under the studio of :mod:`reli3d.render.lights`; the maps of the first of them; the own light, row 0
-    up, centre +X as in its files, exposed so that its mean is ``MEAN``.
+def preview(asset: Asset, views: Views, scene: RayScene | None = None) -> Callable[[], np.ndarray]:
+    """Begin to render, beside the caller's work, what a call of the result gives: a picture ``(H, W, 3)`` uint8.
+
+    Up to four input views; four views that nobody photographed under the asset's own light, then under the studio of
+    :mod:`reli3d.render.lights`; the maps of the first of them; the own light, row 0 up, centre +X as in its files,
+    exposed so that its mean is ``MEAN``.
 
     views: in the frame of ``asset``.  scene: rays against its mesh, made here if None.
     """
-    taken = views.select(choose_views(views.c2w, COLUMNS)).resampled(TILE, crop=True)
     mesh = asset.mesh
-    scene = scene if scene is not None else RayScene(mesh.vertices, mesh.faces)
+    rays = scene if scene is not None else RayScene(mesh.vertices, mesh.faces)
     lights = (asset.environment, Environment(studio().radiance.to(mesh.vertices.device)))
+
+    def tiles(camera: Camera, with_maps: bool) -> list[Image.Image]:
+        shots = _rendered(asset, camera, rays, lights)
+        lit = [_lit(radiance, shots[0].alpha) for radiance in _smoothed(*shots)]
+        return [_image(tile) for tile in lit + (_maps(shots[0]) if with_maps else [])]
+
     cameras = unseen_cameras(mesh, views.c2w)
+    begun = [beside(partial(tiles, camera, k == 0), mesh.vertices.device) for k, camera in enumerate(cameras)]
 
-    def shown(start: int, _stop: int) -> tuple[Render, list[Tensor]]:
-        shots = _rendered(asset, cameras[start], scene, lights)
-        return shots[0], [_lit(radiance, shots[0].alpha) for radiance in _smoothed(*shots)]
+    def picture() -> np.ndarray:
+        taken = views.select(choose_views(views.c2w, COLUMNS)).resampled(TILE, crop=True)
+        inputs = [_image(_on_paper(i, m)) for i, m in zip(taken.images, taken.masks, strict=True)]
+        light = _image(_map(asset.light))
+        found = [tiles() for tiles in begun]
+        rows = [
+            ("input", inputs),
+            ("views that nobody photographed, own light", [own for own, *_ in found]),
+            ("the same views in a studio", [lit for _, lit, *_ in found]),
+            ("base colour, roughness, metallic, normal", found[0][2:]),
+            ("own light, its mean at a quarter", [light]),
+        ]
+        return _sheet(rows, COLUMNS, last=TILE // 2)
 
-    count = len(cameras)
-    on_device = mesh.vertices.is_cuda  # one camera after the other there; on a CPU each in a thread of its own
-    found = [shown(k, k + 1) for k in range(count)] if on_device else over_rows(count, 1, shown)
-    first = found[0][0]
-    maps = [
-        linear_to_srgb(first.base_color),
-        first.roughness[..., None].expand(-1, -1, 3),
-        first.metallic[..., None].expand(-1, -1, 3),
-        first.normal * 0.5 + 0.5,
-    ]
-    rows = [
-        ("input", [_on_paper(i, m) for i, m in zip(taken.images, taken.masks, strict=True)]),
-        ("views that nobody photographed, own light", [tiles[0] for _, tiles in found]),
-        ("the same views in a studio", [tiles[1] for _, tiles in found]),
-        ("base colour, roughness, metallic, normal", [_on_paper(m, first.alpha) for m in maps]),
-        ("own light, its mean at a quarter", [_map(asset.light)]),
-    ]
-    return _sheet(rows, COLUMNS, last=TILE // 2)
+    return picture
 
 
 def comparison(before: Asset, after: Asset, views: Views) -> np.ndarray:
     """Picture ``(H, W, 3)`` uint8 of three views: photographs, ``before`` and ``after`` in their own light."""
     count = min(len(views), 3)
     batch = views.select([k * len(views) // count for k in range(count)]).resampled(TILE, crop=True)
-    rows = [("input", [_on_paper(i, m) for i, m in zip(batch.images, batch.masks, strict=True)])]
+    rows = [("input", [_image(_on_paper(i, m)) for i, m in zip(batch.images, batch.masks, strict=True)])]
     for title, asset in (("before", before), ("after refinement", after)):
         scene = RayScene(asset.mesh.vertices, asset.mesh.faces)
         shots = [_rendered(asset, batch.camera[i], scene, (None,))[0] for i in range(count)]
-        rows.append((title, [_lit(_smoothed(s)[0], s.alpha) for s in shots]))
+        rows.append((title, [_image(_lit(_smoothed(s)[0], s.alpha)) for s in shots]))
     return _sheet(rows, count)
 
 
@@ -120,7 +122,7 @@ def _smoothed(*shots: Render) -> list[Tensor]:
     return [mean * paint for mean in means.split(3, -1)]
 
 
-def _sheet(rows: list[tuple[str, list[Tensor]]], columns: int, *, last: int = TILE) -> np.ndarray:
+def _sheet(rows: list[tuple[str, list[Image.Image]]], columns: int, *, last: int = TILE) -> np.ndarray:
     """Rows of tiles under their titles, ``(H, W, 3)`` uint8; last: height of the last row's tiles."""
     height = TITLE + TILE
     sheet = Image.new("RGB", (columns * TILE, len(rows) * height - TILE + last), "white")
@@ -128,7 +130,7 @@ def _sheet(rows: list[tuple[str, list[Tensor]]], columns: int, *, last: int = TI
     for r, (title, tiles) in enumerate(rows):
         draw.text((3, r * height + 1), title, fill="black")
         for c, tile in enumerate(tiles):
-            sheet.paste(_image(tile), (c * TILE, r * height + TITLE))
+            sheet.paste(tile, (c * TILE, r * height + TITLE))
     return np.asarray(sheet)
 
 
@@ -164,6 +166,13 @@ def _lit(radiance: Tensor, alpha: Tensor) -> Tensor:
 
 def _on_paper(color: Tensor, alpha: Tensor) -> Tensor:
     return torch.lerp(torch.full_like(color, PAPER), color, alpha[..., None])
+
+
+def _maps(shot: Render) -> list[Tensor]:
+    """Tiles of what was rendered: base colour, roughness, metallic, normal."""
+    grey = (value[..., None].expand(-1, -1, 3) for value in (shot.roughness, shot.metallic))
+    shown = (linear_to_srgb(shot.base_color), *grey, shot.normal * 0.5 + 0.5)
+    return [_on_paper(tile, shot.alpha) for tile in shown]
 
 
 def _map(light: Environment) -> Tensor:

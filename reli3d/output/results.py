@@ -113,6 +113,7 @@ def encode(
     scene: rays against the mesh of ``asset``.
     """
     device = asset.mesh.vertices.device
+    kept = beside(partial(shadow, asset.mesh, scene), device)  # the longest first
     extras = {k: record[k] for k in ("output_from_input", "model_from_input", "weights")}
     glb = beside(partial(glb_bytes, asset, extras=extras), device)
     moved = partial(glb_bytes, asset, extras=extras, translation=translation)
@@ -120,10 +121,8 @@ def encode(
     started = None if before is None else beside(partial(_shown, before), device)
 
     def page() -> str:
-        # The longest first.  This is a thread of the pool: it may wait for tasks that were submitted before it and that
-        # wait for none.
-        kept = shadow(asset.mesh, scene)
-        shown = {"mesh" if started is None else "after": Shown(glb(), kept)}
+        # This is a thread of the pool: it may wait for tasks that were submitted before it and that wait for none.
+        shown = {"mesh" if started is None else "after": Shown(glb(), kept())}
         if started is not None:
             shown["before"] = started()
         low, high = asset.mesh.vertices.aminmax(dim=0)

@@ -75,7 +75,7 @@ def write_validation(model: Network, samples: list[Path], folder: Path) -> None:
             views = sample_views(sample, count)
             try:
                 asset = reconstruct(views, weights=model, options=ReconstructOptions(texture_size=256))
-                row.append(preview(asset, sample_views(sample, 4)))
+                row.append(preview(asset, sample_views(sample, 4))())
             except NoSurface:  # early in training
                 continue
         if row:

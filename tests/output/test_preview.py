@@ -48,7 +48,7 @@ def test_the_sheet_holds_the_inputs_unseen_views_maps_and_a_small_light(asset):
     blue = torch.tensor([0.0, 0.0, 1.0]).expand(64, 64, 3).contiguous()
     intrinsics = torch.tensor([[120.0, 120.0, 32.0, 32.0]] * 2)
     views = Views((blue,) * 2, (torch.ones(64, 64),) * 2, cameras, intrinsics, ("a", "b"))
-    sheet = torch.from_numpy(preview.preview(asset, views).copy())
+    sheet = torch.from_numpy(preview.preview(asset, views)().copy())
     tile, row = preview.TILE, preview.TILE + preview.TITLE
     assert tile >= 256 and sheet.shape == (4 * row + preview.TITLE + tile // 2, 4 * tile, 3)
     middle = [[sheet[r * row + row // 2, c * tile + tile // 2].tolist() for c in range(4)] for r in range(4)]
