@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 import warp as wp
 from torch import Tensor
 
@@ -13,20 +14,33 @@ from reli3d.kernels.intersect import sight_kernel
 GRAZING = 0.05  # cosine below which a pixel smears over 20 times its width of surface and says nothing about the point
 
 
-def visible_from(scene: RayScene, position: Tensor, normal: Tensor, camera: Camera) -> Tensor:
+def visible_from(
+    scene: RayScene, position: Tensor, normal: Tensor, camera: Camera, asked: Tensor | None = None
+) -> Tensor:
     """``(N, V)`` bool: the point faces the camera, projects into its image and nothing stands between.
 
-    position, normal: ``(N, 3)`` world, the normal unit.  camera: of V views.  No gradient.
+    position, normal: ``(N, 3)`` world, the normal unit.  camera: of V views.  asked: ``(N, V)`` bool, what is wanted;
+    the rest is False.  No gradient.
     """
     check("position", position, last=3)
     check("normal", normal, last=3, like=position)
     check_camera(camera, like=position)
     n, views = len(position), len(camera.c2w)
-    origin, direction = (position.new_empty(n * views, 3) for _ in range(2))
-    distance = position.new_empty(n * views)
-    ins = (position, wp.vec3), (normal, wp.vec3), (camera.c2w, wp.mat44), (camera.intrinsics, wp.vec4)
+    pair = torch.empty(0, dtype=torch.int32, device=position.device)  # all
+    if asked is not None:
+        check("asked", asked, last=views, like=position, dtype=torch.bool)
+        if len(asked) != n:
+            raise ValueError(f"asked: expected shape {(n, views)}, got {tuple(asked.shape)}")
+        pair = asked.T.reshape(-1).nonzero()[:, 0].int()
+    count = n * views if asked is None else len(pair)
+    origin, direction = (position.new_empty(count, 3) for _ in range(2))
+    distance = position.new_empty(count)
+    ins = (position, wp.vec3), (normal, wp.vec3), (camera.c2w, wp.mat44), (camera.intrinsics, wp.vec4), (pair, wp.int32)
     outs = (origin, wp.vec3), (direction, wp.vec3), (distance, wp.float32)
     arrays = [(v.detach().contiguous(), kind) for v, kind in ins]
     size = wp.vec2(float(camera.width), float(camera.height))
-    launch(sight_kernel, n * views, [*arrays, size, GRAZING, *outs], position.device)
-    return scene.unoccluded(origin, direction, distance).view(n, views)
+    launch(sight_kernel, count, [*arrays, size, GRAZING, *outs], position.device)
+    free = scene.unoccluded(origin, direction, distance)
+    if asked is not None:
+        free = asked.T.clone(memory_format=torch.contiguous_format).masked_scatter_(asked.T, free)
+    return free.view(views, n).T.contiguous()

@@ -113,6 +113,7 @@ def sight_kernel(
     normal: wp.array[wp.vec3],
     c2w: wp.array[wp.mat44],
     intrinsics: wp.array[wp.vec4],
+    pair: wp.array[wp.int32],
     size: wp.vec2,
     grazing: float,
     # out
@@ -122,11 +123,15 @@ def sight_kernel(
 ):
     """Ray from a point of a surface to a camera; ``t_max`` is -1 where the point looks away or lies off the image.
 
-    A thread is a point and a camera, the camera running faster.
+    pair: the ray is of camera ``pair // N`` and point ``pair % N``, so that neighbours go to one camera from about one
+    place; without any, the ray's own number.
     """
     i = start + wp.tid()
-    point = i // c2w.shape[0]
-    camera = i % c2w.shape[0]
+    number = i
+    if pair.shape[0] > 0:
+        number = pair[i]
+    point = number % position.shape[0]
+    camera = number // position.shape[0]
     p = position[point]
     n = normal[point]
     pose = c2w[camera]

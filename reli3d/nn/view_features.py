@@ -13,7 +13,7 @@ from functools import cached_property
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import linear, pad
+from torch.nn.functional import linear
 
 from reli3d.geometry.camera import Camera
 from reli3d.geometry.projection import NUMBERS, gather_views, pool_views, summarize_views
@@ -52,21 +52,32 @@ class ViewMaps:
 
         position, normal: ``(N, 3)``, the normal unit.  scene: of the surface.  No gradient.
         """
-        visible = visible_from(scene, position, normal, self.photographs.camera)
+        visible = visible_from(scene, position, normal, self.photographs.camera).float()
         if self.mirrored:
-            rest = (~visible.any(1)).nonzero()[:, 0]
-            visible = pad(visible, (0, self.mirrored))
-            visible[rest, self.taken :] = visible_from(scene, position[rest], normal[rest], self.camera[self.taken :])
-        return visible.float()
+            visible = torch.cat([visible, self._mirrored(scene, position, normal, visible)], 1)
+        return visible
+
+    def _mirrored(self, scene: RayScene, position: Tensor, normal: Tensor, seen: Tensor) -> Tensor:
+        """``(N, mirrored)`` float32, 1 where a mirror image sees a point that no photograph does.  seen: by those."""
+        rest = (~seen.any(1)).nonzero()[:, 0]
+        found = position.new_zeros(len(position), self.mirrored)
+        found[rest] = visible_from(scene, position[rest], normal[rest], self.camera[self.taken :]).float()
+        return found
 
     def seen_within(self, scene: RayScene, position: Tensor, normal: Tensor, corners: Tensor) -> Tensor:
-        """:meth:`seen` of points in faces, with rays only where the corners of a face differ.
+        """:meth:`seen` of points in faces, with rays only to views that the corners of a face do not see alike.
 
         corners: ``(N, V)`` :meth:`seen` of the corners, interpolated at the points.
         """
         visible = corners.round()
-        mixed = ((corners - visible).abs() > ROUNDING).any(1).nonzero()[:, 0]
-        visible[mixed] = self.seen(scene, position[mixed], normal[mixed])
+        unsure = (corners - visible).abs() > ROUNDING
+        mixed = unsure.any(1).nonzero()[:, 0]
+        position, normal, unsure, part = position[mixed], normal[mixed], unsure[mixed], visible[mixed]
+        asked, known = unsure[:, : self.taken], part[:, : self.taken]
+        known[asked] = visible_from(scene, position, normal, self.photographs.camera, asked)[asked].float()
+        if self.mirrored:
+            part[:, self.taken :] = self._mirrored(scene, position, normal, known)
+        visible[mixed] = part
         return visible
 
     @cached_property

@@ -68,6 +68,18 @@ def test_what_stands_between_hides(device):
     assert torch.equal(got[behind, 1:], want[behind, 1:])
 
 
+@pytest.mark.parametrize("share", [0.0, 0.1, 1.0])
+def test_what_is_not_asked_is_false_and_the_rest_as_without(device, share):
+    camera, p = rig(device), points(device)
+    ball = trimesh.creation.icosphere(3)  # below some of the points: all answers occur
+    scene = RayScene(torch.tensor(ball.vertices, dtype=torch.float32, device=device), torch.tensor(ball.faces))
+    every = visible_from(scene, p, p, camera)
+    asked = (torch.rand(every.shape, generator=torch.Generator().manual_seed(1)) < share).to(device)
+    got = visible_from(scene, p, p, camera, asked)
+    assert got.is_contiguous() and torch.equal(got, every & asked)
+    assert not share or 0.1 < got[asked].float().mean() < 0.9
+
+
 def test_wrong_inputs_are_told(device):
     camera = rig(device)
     scene = RayScene(torch.zeros(0, 3, device=device), torch.zeros(0, 3, dtype=torch.int32, device=device))
@@ -77,3 +89,9 @@ def test_wrong_inputs_are_told(device):
         visible_from(scene, p, p[:, :2], camera)
     with pytest.raises(TypeError, match="position: expected torch.float32"):
         visible_from(scene, p.double(), p, camera)
+    with pytest.raises(ValueError, match="asked: expected shape"):
+        visible_from(scene, p, p, camera, torch.ones(4, 2, dtype=torch.bool, device=device))
+    with pytest.raises(ValueError, match="asked: expected shape"):
+        visible_from(scene, p, p, camera, torch.ones(3, 3, dtype=torch.bool, device=device))
+    with pytest.raises(TypeError, match="asked: expected torch.bool"):
+        visible_from(scene, p, p, camera, torch.ones(4, 3, device=device))

@@ -1,6 +1,6 @@
 """Views of a symmetric object as views of both halves: balls whose silhouettes and volume are closed forms."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import pytest
 import torch
@@ -134,3 +134,12 @@ def test_rays_only_where_the_corners_of_a_face_differ():
     assert torch.equal(got, want), "a ball has no shadow inside a face"
     none = RayScene(mesh.vertices + 9.0, mesh.faces)  # would hide nothing
     assert torch.equal(maps.seen_within(none, middle[same], outward[same], corners[same]), got[same])
+    alike = (at_vertices == at_vertices[:, :1]).all(1)  # of a view
+    found = maps.seen_within(none, middle, outward, corners)
+    assert torch.equal(found, torch.where(alike, at_vertices[:, 0], maps.seen(none, middle, outward)))
+    assert bool((alike & ~same[:, None]).any())
+    half = replace(maps, mirrored=1)
+    at_vertices = half.seen(scene, mesh.vertices, normal)[mesh.faces.long()]
+    corners = (at_vertices * share[:, None]).sum(1)
+    got = half.seen_within(scene, middle, outward, corners)
+    assert torch.equal(got, half.seen(scene, middle, outward)) and 0.1 < float(got[:, 1].mean()) < 0.4
