@@ -25,17 +25,17 @@ def beside_torch(names: Sequence[str]) -> None:
     from reli3d.kernels import cache
 
     cache.initialise()
-    if sys.platform == "linux" and "torch" not in sys.modules:
-        threading.Thread(target=_load_torch, daemon=True).start()
+    path = None if "torch" in sys.modules else _library()
+    dlopen = getattr(ctypes.CDLL(None), "dlopen", None) if path else None
+    if path and dlopen:  # a function that ctypes calls does not hold the interpreter; ctypes.CDLL(path) does
+        dlopen.argtypes, dlopen.restype = (ctypes.c_char_p, ctypes.c_int), ctypes.c_void_p
+        threading.Thread(target=dlopen, args=(os.fsencode(path), os.RTLD_NOW), daemon=True).start()
     cache.compiled(kernel_modules(names), "cpu")  # Warp keeps the hashes
 
 
-def _load_torch() -> None:
-    """Load what ``import torch`` will ask for; where that fails, the import will say why."""
-    found = importlib.util.find_spec("torch")
-    if found is None or not found.submodule_search_locations:
-        return
-    path = os.path.join(found.submodule_search_locations[0], "lib", "libtorch_cpu.so")
-    dlopen = ctypes.CDLL(None).dlopen  # a function called through ctypes does not hold the interpreter, CDLL(path) does
-    dlopen.argtypes, dlopen.restype = (ctypes.c_char_p, ctypes.c_int), ctypes.c_void_p
-    dlopen(os.fsencode(path), os.RTLD_NOW)
+def _library() -> str | None:
+    """What ``import torch`` loads on Linux; None where it is not there: the import will say why."""
+    found = importlib.util.find_spec("torch") if sys.platform == "linux" else None
+    folders = found.submodule_search_locations if found else None
+    path = os.path.join(folders[0], "lib", "libtorch_cpu.so") if folders else ""
+    return path if os.path.isfile(path) else None

@@ -47,9 +47,10 @@ def test_a_process_that_has_torch_starts_no_thread_and_knows_its_hashes(monkeypa
 
 @pytest.mark.parametrize("folders", [None, [], ["/nowhere"]])
 def test_a_torch_without_that_library_is_left_to_its_import(monkeypatch, folders):
+    monkeypatch.setattr(imports.threading, "Thread", lambda **_: pytest.fail("a thread"))
+    monkeypatch.delitem(sys.modules, "torch")
     spec = importlib.machinery.ModuleSpec("torch", None)
     spec.submodule_search_locations = folders
-    monkeypatch.setattr(imports.importlib.util, "find_spec", lambda _: spec)
-    imports._load_torch()
-    monkeypatch.setattr(imports.importlib.util, "find_spec", lambda _: None)
-    imports._load_torch()
+    for found in (spec, None):
+        monkeypatch.setattr(imports.importlib.util, "find_spec", lambda _, found=found: found)
+        imports.beside_torch(["noise"])
