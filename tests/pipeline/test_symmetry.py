@@ -135,9 +135,10 @@ def test_rays_only_where_the_corners_of_a_face_differ():
     none = RayScene(mesh.vertices + 9.0, mesh.faces)  # would hide nothing
     assert torch.equal(maps.seen_within(none, middle[same], outward[same], corners[same]), got[same])
     alike = (at_vertices == at_vertices[:, :1]).all(1)  # of a view
-    found = maps.seen_within(none, middle, outward, corners)
-    assert torch.equal(found, torch.where(alike, at_vertices[:, 0], maps.seen(none, middle, outward)))
-    assert bool((alike & ~same[:, None]).any())
+    shell = RayScene(mesh.vertices * 1.5, mesh.faces)  # hides all
+    assert not bool(maps.seen(shell, middle, outward).any())
+    assert torch.equal(maps.seen_within(shell, middle, outward, corners), torch.where(alike, at_vertices[:, 0], 0.0))
+    assert bool((alike & ~same[:, None] & (at_vertices[:, 0] > 0)).any())
     half = replace(maps, mirrored=1)
     at_vertices = half.seen(scene, mesh.vertices, normal)[mesh.faces.long()]
     corners = (at_vertices * share[:, None]).sum(1)
