@@ -9,9 +9,10 @@ import os
 import sys
 import threading
 from collections.abc import Sequence
+from types import ModuleType
 
 
-def kernel_modules(names: Sequence[str]) -> list:
+def kernel_modules(names: Sequence[str]) -> list[ModuleType]:
     """Kernel modules of these names (:mod:`reli3d.kernels`), which import no torch."""
     return [importlib.import_module(f"reli3d.kernels.{name}") for name in names]
 

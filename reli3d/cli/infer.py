@@ -58,6 +58,7 @@ class Plan:
 def _plan(args: argparse.Namespace, held: contextlib.ExitStack) -> Plan:
     """What the command will do; what is wrong with it is raised here.  Raises ValueError, OSError."""
     with collector.importing():
+        # the longest list: of a module too many an import takes milliseconds
         imports.beside_torch(json.loads(KERNELS.read_text())["LocalReconstructor"])
         from reli3d.output import results
         from reli3d.output.folder import check_place

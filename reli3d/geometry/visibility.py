@@ -20,7 +20,7 @@ def visible_from(
     """``(N, V)`` bool: the point faces the camera, projects into its image and nothing stands between.
 
     position, normal: ``(N, 3)`` world, the normal unit.  camera: of V views.  asked: ``(N, V)`` bool, what is wanted;
-    the rest is False.  No gradient.
+    the rest is False.  No gradient.  Raises TypeError, ValueError.
     """
     check("position", position, last=3)
     check("normal", normal, last=3, like=position)
@@ -29,7 +29,7 @@ def visible_from(
     pair = torch.empty(0, dtype=torch.int32, device=position.device)  # all
     if asked is not None:
         check("asked", asked, last=views, like=position, dtype=torch.bool)
-        if len(asked) != n:
+        if asked.shape != (n, views):
             raise ValueError(f"asked: expected shape {(n, views)}, got {tuple(asked.shape)}")
         pair = asked.T.reshape(-1).nonzero()[:, 0].int()
     count = n * views if asked is None else len(pair)

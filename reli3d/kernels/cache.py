@@ -35,7 +35,8 @@ def _start() -> None:
         fallback = private_folder()
         print(f"reli3d: kernel cache {wp.config.kernel_cache_dir} cannot be written; using {fallback}", file=sys.stderr)
         wp.config.kernel_cache_dir = fallback
-        wp.init()
+        with no_driver_warning():
+            wp.init()
 
 
 def compiled(modules: Sequence[ModuleType], kind: str) -> bool:

@@ -67,6 +67,8 @@ class ViewMaps:
     def seen_within(self, scene: RayScene, position: Tensor, normal: Tensor, corners: Tensor) -> Tensor:
         """:meth:`seen` of points in faces, with rays only to views that the corners of a face do not see alike.
 
+        Of such a face a point that no photograph sees has rays to all mirror images.
+
         corners: ``(N, V)`` :meth:`seen` of the corners, interpolated at the points.
         """
         visible = corners.round()

@@ -42,8 +42,9 @@ AZIMUTHS = 24  # places around the object to choose from
 
 
 def preview(asset: Asset, views: Views, scene: RayScene | None = None) -> Callable[[], np.ndarray]:
-    """Begin to render, beside the caller's work, what a call of the result gives: a picture ``(H, W, 3)`` uint8.
+    """Begin to render a picture beside the caller's work; the result gives it, ``(H, W, 3)`` uint8, when called.
 
+    An error comes out of that call, or at once on CUDA and where the caller computes alone.
     Up to four input views; four views that nobody photographed under the asset's own light, then under the studio of
     :mod:`reli3d.render.lights`; the maps of the first of them; the own light, row 0 up, centre +X as in its files,
     exposed so that its mean is ``MEAN``.
@@ -66,7 +67,7 @@ def preview(asset: Asset, views: Views, scene: RayScene | None = None) -> Callab
         taken = views.select(choose_views(views.c2w, COLUMNS)).resampled(TILE, crop=True)
         inputs = [_image(_on_paper(i, m)) for i, m in zip(taken.images, taken.masks, strict=True)]
         light = _image(_map(asset.light))
-        found = [tiles() for tiles in begun]
+        found = [result() for result in begun]
         rows = [
             ("input", inputs),
             ("views that nobody photographed, own light", [own for own, *_ in found]),

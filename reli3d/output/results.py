@@ -148,8 +148,8 @@ def write_results(
 ) -> None:
     """Write :data:`FILES`; an error leaves what was there before.  Raises OSError, ValueError.
 
-    replacing: what :func:`claim` of the folder gives.  picture: :func:`~reli3d.output.preview.preview` of the asset.
-    info: what ``run_info.json`` holds, the convention of the light apart.
+    replacing: what :func:`claim` of the folder gives.  picture: of the asset, from
+    :func:`~reli3d.output.preview.preview`.  info: what ``run_info.json`` holds, the convention of the light apart.
     compatible: write the light as :data:`PUBLISHED_LIGHT` as well.  comparison: the picture of a refinement.
     """
     radiance = encoded.asset.light.radiance

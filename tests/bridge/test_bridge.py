@@ -313,7 +313,7 @@ def test_a_forked_child_can_launch_after_its_parent():
 def test_a_cpu_launch_compiles_its_module_once():
     square(torch.ones(3))
     cpu = wp.get_device("cpu").context
-    assert {block for context, block in square_kernel.module.execs if context == cpu} == {_bridge.CPU_BLOCK}
+    assert {block for context, block in square_kernel.module.execs if context == cpu} == {cache.CPU_BLOCK}
 
 
 def test_modules_load_together_and_are_known_as_compiled(tmp_path, monkeypatch, device):

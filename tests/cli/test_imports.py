@@ -6,10 +6,8 @@ import subprocess
 import sys
 
 import pytest
-import warp as wp
 
 from reli3d.cli import imports
-from reli3d.kernels import cache
 from tests.support.checkout import ROOT
 
 BESIDE = """
@@ -20,7 +18,8 @@ def mapped():
     return {line.split()[-1] for line in open("/proc/self/maps") if "libtorch_cpu.so" in line}
 
 imports.beside_torch(["noise", "distance"])
-print("torch" in sys.modules, "reli3d.kernels.noise" in sys.modules)
+import warp as wp
+print("torch" in sys.modules, 1 in wp.get_module("reli3d.kernels.noise").hashers)
 for thread in threading.enumerate():
     if thread is not threading.main_thread():
         thread.join()
@@ -38,11 +37,21 @@ def test_the_library_is_there_before_torch_and_is_the_one_that_torch_takes():
     assert done.stdout.split() == ["False", "True", "1", "True", "6.0"]
 
 
-def test_a_process_that_has_torch_starts_no_thread_and_knows_its_hashes(monkeypatch):
+def test_a_process_that_has_torch_starts_no_thread(monkeypatch):
     monkeypatch.setattr(imports.threading, "Thread", lambda **_: pytest.fail("a thread"))
     imports.beside_torch(["noise"])
-    monkeypatch.setattr(wp.Module, "hash_module", lambda *_: pytest.fail("computed once more"))
-    cache.compiled(imports.kernel_modules(["noise"]), "cpu")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="Linux alone loads the library beside")
+def test_a_library_that_cannot_be_loaded_is_left_to_the_import(tmp_path):
+    (tmp_path / "torch" / "lib").mkdir(parents=True)
+    (tmp_path / "torch" / "__init__.py").write_text("raise ImportError('says why')")
+    (tmp_path / "torch" / "lib" / "libtorch_cpu.so").write_text("no library")
+    env = os.environ | {"PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}"}
+    code = "from reli3d.cli import imports; imports.beside_torch(['noise']); import torch"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, env=env)
+    assert done.returncode == 1 and done.stderr.splitlines()[-1] == "ImportError: says why"
+    assert done.stderr.count("Traceback") == 1  # none of a thread
 
 
 @pytest.mark.parametrize("folders", [None, [], ["/nowhere"]])

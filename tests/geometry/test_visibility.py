@@ -72,7 +72,8 @@ def test_what_stands_between_hides(device):
 def test_what_is_not_asked_is_false_and_the_rest_as_without(device, share):
     camera, p = rig(device), points(device)
     ball = trimesh.creation.icosphere(3)  # below some of the points: all answers occur
-    scene = RayScene(torch.tensor(ball.vertices, dtype=torch.float32, device=device), torch.tensor(ball.faces))
+    vertices = torch.tensor(ball.vertices, dtype=torch.float32, device=device)
+    scene = RayScene(vertices, torch.tensor(ball.faces, dtype=torch.int32, device=device))
     every = visible_from(scene, p, p, camera)
     asked = (torch.rand(every.shape, generator=torch.Generator().manual_seed(1)) < share).to(device)
     got = visible_from(scene, p, p, camera, asked)
@@ -93,5 +94,7 @@ def test_wrong_inputs_are_told(device):
         visible_from(scene, p, p, camera, torch.ones(4, 2, dtype=torch.bool, device=device))
     with pytest.raises(ValueError, match="asked: expected shape"):
         visible_from(scene, p, p, camera, torch.ones(3, 3, dtype=torch.bool, device=device))
+    with pytest.raises(ValueError, match="asked: expected shape"):
+        visible_from(scene, p, p, camera, torch.ones(4, 1, 3, dtype=torch.bool, device=device))
     with pytest.raises(TypeError, match="asked: expected torch.bool"):
         visible_from(scene, p, p, camera, torch.ones(4, 3, device=device))

@@ -1,11 +1,14 @@
 """The picture of a reconstruction: views that nobody took, whole, and what its tiles hold."""
 
 import math
+import threading
+import time
 from dataclasses import replace
 
 import pytest
 import torch
 
+from reli3d._bridge import WORKER
 from reli3d.geometry.camera import project
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene
@@ -88,3 +91,27 @@ def test_the_filter_takes_noise_and_leaves_edges(asset):
     assert float(after) < 0.15 * float(before)  # 0.06; a box of the same size, blind to paint and normals, has 0.34
     assert float((smooth.mean() / few.radiance.mean() - 1).abs()) < 0.01
     assert bool((smooth[few.alpha == 0] == 0).all())
+
+
+def test_the_rendering_begins_before_the_picture_is_asked_for(asset, threads, monkeypatch):
+    threads(2)
+    began = []
+    rendered = preview._rendered
+
+    def seen(*args):
+        began.append(threading.current_thread().name.startswith(WORKER))
+        if len(began) == 4:
+            raise ValueError("a tile")
+        return rendered(*args)
+
+    monkeypatch.setattr(preview, "_rendered", seen)
+    cameras, intrinsics = rig((0, 15, 3), target=(2.0, 2.0, 2.0)), torch.tensor([[120.0, 120.0, 32.0, 32.0]])
+    views = Views((torch.ones(64, 64, 3),), (torch.ones(64, 64),), cameras, intrinsics, ("a",))
+    picture = preview.preview(asset, views)
+    for _ in range(600):
+        if len(began) == 4:
+            break
+        time.sleep(0.1)
+    assert began == [True] * 4
+    with pytest.raises(ValueError, match="a tile"):
+        picture()
