@@ -44,12 +44,12 @@ AZIMUTHS = 24  # places around the object to choose from
 def preview(asset: Asset, views: Views, scene: RayScene | None = None) -> Callable[[], np.ndarray]:
     """Begin to render a picture beside the caller's work; the result gives it, ``(H, W, 3)`` uint8, when called.
 
-    An error comes out of that call, or at once on CUDA and where the caller computes alone.
-    Up to four input views; four views that nobody photographed under the asset's own light, then under the studio of
+    It shows up to four input views; four views that nobody photographed under the asset's own light, then under the studio of
     :mod:`reli3d.render.lights`; the maps of the first of them; the own light, row 0 up, centre +X as in its files,
     exposed so that its mean is ``MEAN``.
 
-    views: in the frame of ``asset``.  scene: rays against its mesh, made here if None.
+    views: in the frame of ``asset``.  scene: rays against its mesh, made here if None.  An error is raised by the call,
+    or at once on CUDA and where the caller computes alone.
     """
     mesh = asset.mesh
     rays = scene if scene is not None else RayScene(mesh.vertices, mesh.faces)
