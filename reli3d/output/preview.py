@@ -44,9 +44,9 @@ AZIMUTHS = 24  # places around the object to choose from
 def preview(asset: Asset, views: Views, scene: RayScene | None = None) -> Callable[[], np.ndarray]:
     """Begin to render a picture beside the caller's work; the result gives it, ``(H, W, 3)`` uint8, when called.
 
-    It shows up to four input views; four views that nobody photographed under the asset's own light, then under the studio of
-    :mod:`reli3d.render.lights`; the maps of the first of them; the own light, row 0 up, centre +X as in its files,
-    exposed so that its mean is ``MEAN``.
+    It shows up to four input views; four views that nobody photographed under the asset's own light, then under the
+    studio of :mod:`reli3d.render.lights`; the maps of the first of them; the own light, row 0 up, centre +X as in its
+    files, exposed so that its mean is ``MEAN``.
 
     views: in the frame of ``asset``.  scene: rays against its mesh, made here if None.  An error is raised by the call,
     or at once on CUDA and where the caller computes alone.
