@@ -9,8 +9,8 @@ import json
 
 import pytest
 
+from bench import official
 from bench.run import BASELINE, collect, kind, line, measure
-from bench.studies import official
 from reli3d.nn.presets import OFFICIAL
 
 TOLERANCE = 1.5  # other work on the machine moved a ratio of medians by up to 1.25 between runs; a lost factor is 2

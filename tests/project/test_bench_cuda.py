@@ -1,11 +1,11 @@
-"""``python -m bench.studies.cuda`` without CUDA: its dry run ends well, and a piece that does not ends only itself."""
+"""``python -m bench.cuda`` without CUDA: its dry run ends well, and a piece that does not ends only itself."""
 
 from pathlib import Path
 
 import pytest
 
-from bench.studies import cuda
-from bench.studies.cuda import Piece, main, pieces, report, run_piece
+from bench import cuda
+from bench.cuda import Piece, main, pieces, report, run_piece
 
 
 @pytest.mark.skipif(cuda.torch.cuda.is_available(), reason="needs a machine without CUDA")

@@ -1,4 +1,4 @@
-"""All that a GPU has to show, in under eight minutes: ``python -m bench.studies.cuda``.
+"""All that a GPU has to show, in under eight minutes: ``python -m bench.cuda``.
 
 Needs nothing but pip's torch with CUDA, this checkout and pytest.  Each piece runs in a process of its own under a
 limit of time; one that fails or runs out is told in the report, and the next one runs.  The report, Markdown with the
@@ -20,7 +20,7 @@ from pathlib import Path
 
 import torch
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[1]
 LIMIT = 470.0  # seconds of all pieces together
 TAIL = 4000  # characters of a piece's output that the report keeps
 BUILD = 4.0  # of the raw density at the centre of the ball that stands for a trained object, above the surface's
@@ -38,7 +38,7 @@ class Piece:
 
 def pieces(device: str, dry: bool) -> list[Piece]:
     """What runs, in this order."""
-    own = ("-m", "bench.studies.cuda", "--device", device, *(("--dry-run",) if dry else ()), "--piece")
+    own = ("-m", "bench.cuda", "--device", device, *(("--dry-run",) if dry else ()), "--piece")
     tests = ("-m", "pytest", "-q", "-p", "no:cacheprovider", "--no-header", "-x" if dry else "--maxfail=50")
     few = ("tests/geometry/test_grid.py",) if dry else ("tests",)
     cases = ("triplane.sample_1",) if dry else ("rays", "shading", "triplane", "surface", "environment", "volume")
@@ -125,7 +125,7 @@ def ball(preset):
 
 def drawn(preset, stage, device):
     """An object of four random pictures, one more to compare with."""
-    from bench.studies.official import views
+    from bench.official import views
     from reli3d.train.stages.views import Draw, ObjectViews
 
     images, masks, c2w, intrinsics = (t[0] for t in views(preset, 5, device))
@@ -183,7 +183,7 @@ def stages(device: torch.device, dry: bool) -> dict:
 
 def official(device: torch.device, dry: bool) -> dict:
     """The published sizes with random weights: views to code, light and surface."""
-    from bench.studies.official import views
+    from bench.official import views
     from reli3d.nn.presets import OFFICIAL, TINY
     from reli3d.train.stages.surface import surface
 
@@ -231,7 +231,7 @@ def run_piece(piece: Piece, cache: Path, left: float) -> dict:
 def report(rows: list[dict], device: str, dry: bool) -> str:
     """Markdown of what is known so far."""
     text = [
-        f"# bench.studies.cuda on {device}{', a dry run' if dry else ''}",
+        f"# bench.cuda on {device}{', a dry run' if dry else ''}",
         "",
         "| piece | end | seconds |",
         "|---|---|---|",
@@ -244,7 +244,7 @@ def report(rows: list[dict], device: str, dry: bool) -> str:
 
 def main(argv: list[str] | None = None) -> int:
     """0 where every piece ended well, 1 where one did not, 2 where there is no CUDA device."""
-    parser = argparse.ArgumentParser(prog="python -m bench.studies.cuda", description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(prog="python -m bench.cuda", description=__doc__.splitlines()[0])
     parser.add_argument("--output", type=Path, default=ROOT / "bench" / "results" / "cuda.md")
     parser.add_argument("--dry-run", action="store_true", help="on the CPU, at small sizes")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cuda", help=argparse.SUPPRESS)
@@ -253,7 +253,7 @@ def main(argv: list[str] | None = None) -> int:
     device = "cpu" if options.dry_run else options.device
     if device == "cuda" and not torch.cuda.is_available():
         print(
-            "bench.studies.cuda: expected a CUDA device, got none; --dry-run takes the same way on the CPU",
+            "bench.cuda: expected a CUDA device, got none; --dry-run takes the same way on the CPU",
             file=sys.stderr,
         )
         return 2

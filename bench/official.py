@@ -1,4 +1,4 @@
-"""A whole forward of a preset at its published size, part by part: ``python -m bench.studies.official --views 4``.
+"""A whole forward of a preset at its published size, part by part: ``python -m bench.official --views 4``.
 
 It takes minutes and gigabytes, so it has no CASES and runs only when asked.  Random weights (those that training starts
 from) are written to a file by a process of their own and then mapped, as published ones would be.  FLOPs are counted
@@ -28,7 +28,6 @@ from reli3d.nn.presets import OFFICIAL, EncoderSizes, Preset
 from reli3d.nn.reni import EnvironmentDecoder
 from reli3d.nn.view_features import ViewMaps
 
-CASES: dict = {}
 PARTS = ("camera", "encoder", "bank", "backbone", "upsampler", "illumination", "environment", "heads", "merger")
 # Parameters as the specification counts them, by part of ours.  It gives no number for the illumination: that is its
 # whole, 1,574,452,729, less the others, 24,576 numbers of map directions and 10 of tone mapping, buffers here.
@@ -236,7 +235,7 @@ def forward(path: Path, count: int, trunk: torch.dtype, device: torch.device, ru
 
 
 def main(argv: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m bench.studies.official", description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(prog="python -m bench.official", description=__doc__.splitlines()[0])
     parser.add_argument("--views", type=int, nargs="+", default=[1, 4])
     parser.add_argument("--precision", choices=("float32", "bfloat16"), default="float32", help="of the trunk")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
