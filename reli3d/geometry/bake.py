@@ -17,7 +17,7 @@ from torch import Tensor
 from reli3d import _bridge
 from reli3d._bridge import check, expect, struct_of
 from reli3d.geometry.mesh import Mesh, sorted_keys, vertex_normals
-from reli3d.kernels import raster as kernels
+from reli3d.kernels import bake as kernels
 
 REACH = 1.5  # texels: a bilinear tap of a point of the surface has its centre within sqrt(2)
 TILE = {"cpu": 16, "cuda": 4}  # a thread a tile: large ones share set-up, small ones fill a GPU; results are the same

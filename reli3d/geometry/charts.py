@@ -16,9 +16,8 @@ import warp as wp
 
 from reli3d import _bridge
 from reli3d.geometry.mesh import group
-from reli3d.kernels import uv as kernels
+from reli3d.kernels import charts as kernels
 from reli3d.kernels.cache import initialise
-from reli3d.kernels.cuts import cuts_kernel, vec8d
 
 CPU = torch.device("cpu")
 COS_LABEL = 0.4  # a face keeps an axis only up to 66 degrees from its normal: at most 2.5 times stretched
@@ -32,7 +31,7 @@ CUT_WASTE = 0.002  # of the atlas: empty share of its box that makes a chart wor
 CUT_FILL = 0.6  # of its box: a chart that covers more is left whole
 CUT_GAIN = 0.85  # boxes of the two pieces over the box of the chart, at most ...
 CUT_HOLLOW, CUT_HOLLOW_GAIN = 0.25, 1.02  # ... but a ring gains by the second cut only: no gain needed below this fill
-CUT_ANGLES = 8  # directions in [0, 180) degrees of the cut, and of the boxes that judge it, as in kernels.cuts
+CUT_ANGLES = 8  # directions in [0, 180) degrees of the cut, and of the boxes that judge it, as in kernels.charts
 ANGLES = 24  # directions in [0, 90) degrees tried for the smallest bounding box of a chart: within 2 degrees of it
 LIGHT = 8192  # faces a CPU slice of the steps that take a few nanoseconds a face: less costs more to launch than to run
 GROW_MAX = 2.0  # a chart seen obliquely is enlarged to its area on the surface, up to this factor
@@ -205,8 +204,10 @@ def cuts(along: np.ndarray, begin: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     int32, where those of a chart begin.
     """
     at, area = torch.empty(2, len(begin) - 1, CUT_ANGLES, 2, dtype=torch.float64)
-    ins = (torch.from_numpy(along), vec8d), (torch.from_numpy(begin), wp.int32)
-    _bridge.launch(cuts_kernel, area.numel(), [*ins, (at, wp.float64), (area, wp.float64)], CPU, slice_min=CUT_ANGLES)
+    ins = (torch.from_numpy(along), kernels.vec8d), (torch.from_numpy(begin), wp.int32)
+    _bridge.launch(
+        kernels.cuts_kernel, area.numel(), [*ins, (at, wp.float64), (area, wp.float64)], CPU, slice_min=CUT_ANGLES
+    )
     return at.numpy(), area.numpy()
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from reli3d._bridge import call, check
 from reli3d.geometry.rays import Hits
-from reli3d.kernels import attributes as kernels
+from reli3d.kernels import hits as kernels
 
 _INTERPOLATE = {
     2: (kernels.interpolate2_kernel, wp.vec2),

@@ -11,7 +11,6 @@ from torch import Tensor
 from reli3d._bridge import check, launch
 from reli3d.geometry.camera import Camera, check_camera
 from reli3d.kernels import hull as kernels
-from reli3d.kernels import mask_distance as pixels
 
 BLOCKS_MIN = 64  # blocks of a grid in a CPU slice: each of them has 64 points
 
@@ -34,7 +33,7 @@ def mask_distance(masks: Tensor) -> Tensor:
         raise ValueError("masks: expected values in [0, 1], got others")
     distance = torch.empty_like(masks)
     launch(
-        pixels.mask_distance_kernel,
+        kernels.mask_distance_kernel,
         masks.numel(),
         [
             (masks, wp.float32),
@@ -55,9 +54,9 @@ def _nearest_crossing(masks: Tensor) -> list:
     views, height, width = masks.shape
     rows, begin = torch.empty_like(masks), torch.empty_like(masks)
     apex, nearest = (torch.empty_like(masks, dtype=torch.int32) for _ in range(2))
-    launch(pixels.column_kernel, views * width, [(masks, wp.float32), (rows, wp.float32)], masks.device)
+    launch(kernels.column_kernel, views * width, [(masks, wp.float32), (rows, wp.float32)], masks.device)
     launch(
-        pixels.row_kernel,
+        kernels.row_kernel,
         views * height,
         [(rows, wp.float32), (apex, wp.int32), (begin, wp.float32), (nearest, wp.int32)],
         masks.device,
@@ -68,7 +67,7 @@ def _nearest_crossing(masks: Tensor) -> list:
 def hull_distance(points: Tensor, distance: Tensor, camera: Camera, *, far: float = math.inf) -> Tensor:
     """Signed distance ``(N,)`` of points to the visual hull, world units, positive inside: the least over the views.
 
-    points: ``(N, 3)``.  distance: ``(V, H, W)`` from :func:`mask_distance`.  camera: of these V views and pixels.
+    points: ``(N, 3)``.  distance: ``(V, H, W)`` from :func:`mask_distance`.  camera: of these V views and kernels.
     A view's distance is the pixel distance where the point projects, times depth / focal length: up to 1 / cos^2 of the
     angle to the optical axis too long.  Outside an image its border's value is taken: an object that is cut there is
     unbounded.  A point at or behind a camera's plane gets -1000.  Without views every point gets +1000.  far: at least

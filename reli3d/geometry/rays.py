@@ -17,7 +17,7 @@ from torch import Tensor
 from reli3d._bridge import array_of, check, empty, launch, over_slices, stream, tensor_of
 from reli3d.geometry import embree
 from reli3d.kernels import embree as embree_kernels
-from reli3d.kernels import intersect as kernels
+from reli3d.kernels import rays as kernels
 
 BACKENDS = ("auto", "embree", "warp")
 SLICE_RAYS = 8192  # fewest of an Embree slice, and of one whose rays are ordered: below it costs more than it gains

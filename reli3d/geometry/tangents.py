@@ -15,7 +15,7 @@ from torch import Tensor
 
 from reli3d._bridge import check, expect, launch, present
 from reli3d.geometry.mesh import Mesh, weld_rows
-from reli3d.kernels.normal_maps import ENCODE_EPS, encode_normals_kernel
+from reli3d.kernels.bump import ENCODE_EPS, encode_normals_kernel
 from reli3d.kernels.tangents import corner_shares_kernel
 
 EPS = float(ENCODE_EPS)

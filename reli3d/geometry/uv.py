@@ -22,7 +22,7 @@ from torch import Tensor
 from reli3d import _bridge
 from reli3d.geometry import charts as parts
 from reli3d.geometry.mesh import Mesh, group, vertex_normals, weld
-from reli3d.kernels import uv as kernels
+from reli3d.kernels import charts as kernels
 
 FILL = 0.62  # share of the atlas that charts are expected to cover; sets the unit of the chart step only
 LONGEST = 1.0  # of the atlas's side at the expected scale: a longer chart is cut

@@ -9,7 +9,7 @@ from torch import Tensor
 from reli3d._bridge import check, launch
 from reli3d.geometry.camera import Camera, check_camera
 from reli3d.geometry.rays import RayScene
-from reli3d.kernels.intersect import sight_kernel
+from reli3d.kernels.rays import sight_kernel
 
 GRAZING = 0.05  # cosine below which a pixel smears over 20 times its width of surface and says nothing about the point
 

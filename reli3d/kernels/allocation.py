@@ -4,8 +4,8 @@ import warp as wp
 
 from reli3d.kernels.bsdf import pdf_lobes
 from reli3d.kernels.envmap import lookup_envmap_uv, pdf_envmap_uv
-from reli3d.kernels.intersect import offset_origin
 from reli3d.kernels.math import CONTRACT, INLINE
+from reli3d.kernels.rays import offset_origin
 from reli3d.kernels.shade import Light, Plan, Points, draw_sample, make_surface, sample_value
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": f"-march=native {INLINE} {CONTRACT}"})

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from reli3d.kernels.uv import root_of
+from reli3d.kernels.charts import root_of
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
 

@@ -7,8 +7,8 @@ two words at the end of a hit are for instances, of which there are none.
 
 import warp as wp
 
-from reli3d.kernels.intersect import ray_is_valid
 from reli3d.kernels.math import INLINE, largest
+from reli3d.kernels.rays import ray_is_valid
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native " + INLINE})
 

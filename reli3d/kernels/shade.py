@@ -11,7 +11,6 @@ import warp as wp
 
 from reli3d.kernels.bsdf import eval_bsdf, pdf_lobes
 from reli3d.kernels.envmap import direction_to_uv, lookup_envmap_uv, pdf_envmap_uv, sample_envmap
-from reli3d.kernels.intersect import hit_occluded, offset_origin
 from reli3d.kernels.math import INLINE, tangent_frame
 from reli3d.kernels.microfacet import (
     ALPHA_MIN,
@@ -24,6 +23,7 @@ from reli3d.kernels.microfacet import (
 )
 from reli3d.kernels.mis import mis_factor
 from reli3d.kernels.random import random_pair, rotate_point
+from reli3d.kernels.rays import hit_occluded, offset_origin
 from reli3d.kernels.sampling import mirror, opposite, reflect, sample_cosine
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native " + INLINE})

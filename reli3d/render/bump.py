@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from reli3d._bridge import check, launch
-from reli3d.kernels import normal_maps as kernels
+from reli3d.kernels import bump as kernels
 
 EPS = float(kernels.BUMP_EPS)  # of the published normalisation; on the vertical axis there is no frame and no bump
 

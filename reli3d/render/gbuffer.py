@@ -12,7 +12,7 @@ from reli3d.geometry.camera import Camera, camera_rays
 from reli3d.geometry.hits import hit_normals, interpolate
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import Hits, RayScene
-from reli3d.kernels import attributes as kernels
+from reli3d.kernels import hits as kernels
 from reli3d.render.asset import TextureSet
 from reli3d.render.points import SurfacePoints
 

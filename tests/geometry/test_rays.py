@@ -286,5 +286,5 @@ def test_no_module_that_traces_rays_rounds_a_product_and_its_sum_once():
     """Warp's test of a triangle is compiled into the module; so contracted, 0.5 % of rays leak at edges."""
     folder = Path(kernels.__file__).parent
     tracers = [p for p in folder.glob("*.py") if "mesh_query" in p.read_text() or "hit_occluded(" in p.read_text()]
-    assert {p.name for p in tracers} >= {"intersect.py", "shade.py"}
+    assert {p.name for p in tracers} >= {"rays.py", "shade.py"}
     assert not [p.name for p in tracers if "CONTRACT" in p.read_text()]

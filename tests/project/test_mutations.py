@@ -33,7 +33,7 @@ BROKEN = {
         "nn/test_packed_heads.py -k bfloat16_rounds",
     ),
     "green of a normal map": (
-        "kernels/normal_maps.py",
+        "kernels/bump.py",
         "wp.cross(n, t) * tangent[i][3]",
         "wp.cross(n, t)",
         "geometry/test_bake.py -k formula",
