@@ -22,7 +22,6 @@ from reli3d.geometry.camera import Camera
 from reli3d.io.glb import glb_bytes
 from reli3d.nn.field import TriplaneField
 from reli3d.nn.model import Code, Reconstructor
-from reli3d.nn.precision import computes_bfloat16
 from reli3d.nn.presets import OFFICIAL, BackboneSizes, EncoderSizes
 from reli3d.nn.view_features import ViewMaps
 from reli3d.pipeline import extract, texture
@@ -44,8 +43,8 @@ def _field(n, device):
     return field(n, device)
 
 
-def random_field(device, heads=torch.float32):
-    """The heads of the published preset, in the precision ``heads``, and a random channel-last triplane of its size."""
+def random_field(device):
+    """The heads of the published preset and a random channel-last triplane of its size."""
     torch.manual_seed(0)
     tiny = EncoderSizes(hidden=32, layers=1, heads=2, patch=14, grid=4, mask_channel=True)  # the trunk is not run
     preset = replace(
@@ -60,7 +59,7 @@ def random_field(device, heads=torch.float32):
     planes = torch.randn(1, 3, PLANE, PLANE, preset.upsampler.channels, device=device).movedim(-1, 2)
     nothing = torch.zeros(1, 4, device=device)
     maps = ViewMaps(nothing[None, None], nothing[None, None], Camera(torch.eye(4, device=device)[None], nothing, 1, 1))
-    return TriplaneField(maps, model, Code(planes, nothing[None, None], nothing[None], nothing, nothing[:, :1]), heads)
+    return TriplaneField(maps, model, Code(planes, nothing[None, None], nothing[None], nothing, nothing[:, :1]))
 
 
 @torch.no_grad()
@@ -82,16 +81,13 @@ def stages(field, resolution, size) -> dict[str, float]:
     return dict(zip(("surface", "textures", "glb"), (b - a for a, b in zip(clock[:-1], clock[1:]))))
 
 
-def mesh_stage(device, resolution, size, heads="float32"):
-    if heads == "bfloat16" and not computes_bfloat16(device):
-        return None
-    known = random_field(device, getattr(torch, heads))
+def mesh_stage(device, resolution, size):
+    known = random_field(device)
     return lambda: stages(known, resolution, size), {"texels": size * size}
 
 
 CASES = {
     "published_sizes": (mesh_stage, dict(resolution=80, size=1024)),
-    "published_sizes_bfloat16": (mesh_stage, dict(resolution=80, size=1024, heads="bfloat16")),
 }
 
 

@@ -26,7 +26,6 @@ from reli3d.geometry.uv import source_vertices, unwrap, unwrap_xatlas
 from reli3d.nn.blocks import beside, in_rows
 from reli3d.nn.field import CHUNK, Field, TriplaneField
 from reli3d.nn.local import HEADS, LocalField, LocalReconstructor
-from reli3d.nn.precision import heads_dtype
 from reli3d.nn.presets import LocalPreset, Preset
 from reli3d.nn.reni import map_directions
 from reli3d.nn.view_features import ViewMaps
@@ -56,12 +55,10 @@ class NoSurface(ValueError):
     """The field of an object has one sign in its whole box."""
 
 
-def encode(model: Network, prepared: Prepared, *, background: bool = False,
-           heads: torch.dtype = torch.float32) -> Field:  # fmt: skip
+def encode(model: Network, prepared: Prepared, *, background: bool = False) -> Field:
     """Run the network on the views of one object.
 
-    background: whether the illumination path of a :class:`Reconstructor` may look past the masks.  heads: in which its
-    material heads compute.
+    background: whether the illumination path of a :class:`Reconstructor` may look past the masks.
     """
     batch = prepared.batch
     if isinstance(model, LocalReconstructor):
@@ -79,7 +76,7 @@ def encode(model: Network, prepared: Prepared, *, background: bool = False,
         batch.images[None], batch.masks[None], batch.c2w[None], batch.intrinsics[None], background_visible=shown
     )
     maps = ViewMaps(code.view_tokens[0].float(), prepared.images, prepared.camera)
-    return TriplaneField(maps, model, code, heads)
+    return TriplaneField(maps, model, code)
 
 
 def extract(field: Field, resolution: int) -> Mesh:
@@ -197,7 +194,7 @@ def texture(
         found = {"base_color": got.base_color, "roughness": got.roughness[:, None], "metallic": got.metallic[:, None]}
         return {**found, "normal": encode_normals(got.normal, normal, tangent)}
 
-    ask = surface if local is None else partial(in_rows, surface)
+    ask = partial(in_rows, surface)
     chunk = CHUNK if mesh.vertices.is_cuda else TEXELS
     baked = bake(mesh, size, ask, chunk=chunk, tangents=True, values=known)
     return mesh, TextureSet(**{k: v.clamp_(0, 1) for k, v in baked.items()})
@@ -276,7 +273,6 @@ class ReconstructOptions:
     :func:`default_normalization`.  frame: ``input`` (that of the cameras) or ``model``.  up: the axis of that frame
     that shall become +Y.  uv: ``project`` or ``xatlas``.  hero: index of the network's main view, or ``random``.
     background: ``masked``, ``visible`` or ``auto``, see :func:`~reli3d.views.published_views.background_shown`.
-    heads: precision of a triplane's material heads, see :func:`~reli3d.nn.precision.heads_dtype`.
     symmetry: ``auto`` or ``off``, see :func:`~reli3d.prepare.completed`; for the network of convolutions.
     """
 
@@ -289,7 +285,6 @@ class ReconstructOptions:
     hero: int | str = 0
     background: str = "masked"
     seed: int = 0
-    heads: str = "float32"
     symmetry: str = "auto"
 
     def __post_init__(self):
@@ -352,7 +347,6 @@ def reconstruct_placed(placed: Placed, model: Network, options: ReconstructOptio
     shown = background_shown(
         placed.views, options.background, readable=getattr(model.preset, "reads_background", False)
     )
-    heads = heads_dtype(model.preset, model.device, options.heads)
     torch.manual_seed(options.seed)
     with watch.stage("prepare"):
         prepared = prepare(model, placed.views, placed.model_from_input)
@@ -364,7 +358,7 @@ def reconstruct_placed(placed: Placed, model: Network, options: ReconstructOptio
                 "symmetry: the silhouettes fit a mirror plane; photographs are also read as views of the other half"
             )
     with watch.stage("network"):
-        field = encode(model, prepared, background=shown, heads=heads)
+        field = encode(model, prepared, background=shown)
     with watch.stage("surface"):
         mesh = extract(field, options.resolution or model.preset.resolution)
     with watch.stage("textures"):

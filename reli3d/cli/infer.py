@@ -245,7 +245,6 @@ class Job:
             hero,
             args.background,
             args.seed,
-            args.heads,
             symmetry=args.symmetry,
         )
         if args.download:
@@ -278,7 +277,6 @@ class Job:
 
     def _run(self, folder: Path | Packed, name: str, replacing: Callable, steps: Progress) -> None:
         from reli3d.geometry.rays import RayScene
-        from reli3d.nn.precision import heads_dtype
         from reli3d.output import results
         from reli3d.output.preview import comparison, preview
         from reli3d.pipeline import Stopwatch, place, published_input, reconstruct_placed, refined
@@ -335,7 +333,6 @@ class Job:
             **frames,
             "preset": self.model.preset.name,
             "precision": str(self.model.dtype).removeprefix("torch."),
-            "precision_of_heads": str(heads_dtype(self.model.preset, self.device, args.heads)).removeprefix("torch."),
             "texture_size": args.texture_size,
             "resolution": args.resolution or self.model.preset.resolution,
             "background": args.background,

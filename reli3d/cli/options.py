@@ -56,12 +56,6 @@ def parser() -> argparse.ArgumentParser:
         help="of the network's large parts; default float32, for official weights on CUDA bfloat16; auto: bfloat16 "
         "wherever the processor has instructions for it",
     )
-    p.add_argument(
-        "--heads",
-        choices=("float32", "bfloat16", "auto"),
-        default="float32",
-        help="precision of the official network's material heads; auto: bfloat16 where the processor has it",
-    )
     p.add_argument("--texture-size", type=int, default=1024, help="texels, 256 to 4096 (default 1024)")
     p.add_argument(
         "--resolution", type=int, help="cubes along a side of the surface grid, 16 to 256 (default the preset's)"

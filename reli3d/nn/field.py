@@ -82,7 +82,6 @@ class TriplaneField(Field):
 
     model: Reconstructor
     code: Code  # of one object
-    heads: torch.dtype = torch.float32  # of the hidden layers of the material's heads
 
     reads_views: ClassVar[bool] = False
 
@@ -130,7 +129,7 @@ class TriplaneField(Field):
         }
 
     def material(self, position: Tensor, normal: Tensor, visible: Tensor) -> PointMaterial:
-        values = {k: v[0] for k, v in self.model.query(self.code, position[None], MATERIAL, dtype=self.heads).items()}
+        values = {k: v[0] for k, v in self.model.query(self.code, position[None], MATERIAL).items()}
         return PointMaterial(
             values["base_color"],
             values["roughness"][:, 0],

@@ -7,14 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
-if TYPE_CHECKING:
-    from reli3d.nn.packed_heads import PackedHeads
+from reli3d.geometry.triplane import sample_triplane
 
 ROUGHNESS_MIN = 0.1  # range [0.1, 1] of the published head
 NORMALIZE_EPS = 1.0e-7
@@ -52,20 +49,6 @@ def mlp(inputs: int, width: int, outputs: int, hidden: int) -> nn.Sequential:
     return nn.Sequential(*layers[:-1])
 
 
-def linear_layers(layers: nn.Module) -> list[nn.Linear]:
-    """The linear layers of an :func:`mlp`."""
-    return [layer for layer in layers.children() if isinstance(layer, nn.Linear)]
-
-
-def _low(layers: nn.Module, x: Tensor, dtype: torch.dtype) -> Tensor:
-    """What :func:`mlp` makes of ``x``, hidden layers in ``dtype``, the last one in float32."""
-    *hidden, last = linear_layers(layers)
-    x = x.to(dtype)
-    for layer in hidden:
-        x = functional.silu(functional.linear(x, layer.weight.to(dtype), layer.bias.to(dtype)))
-    return last(x.float())
-
-
 def activate(name: str, raw: Tensor) -> Tensor:
     """The named head's value from its MLP's output.
 
@@ -93,47 +76,21 @@ class Heads(nn.ModuleDict):
     def __init__(self, features: int, width: int):
         super().__init__({name: mlp(features, width, head.outputs, head.hidden) for name, head in HEADS.items()})
 
-    def forward(self, features: Tensor, names: Sequence[str], dtype: torch.dtype = torch.float32) -> dict[str, Tensor]:
+    def forward(self, features: Tensor, names: Sequence[str]) -> dict[str, Tensor]:
         """``{name: (..., outputs)}`` of features ``(..., features)``; values as :func:`activate` describes them.
 
-        dtype: of the hidden layers where no gradient is recorded; inputs and values are float32.
+        Raises ValueError for an unknown name.
         """
-        self._check(names)
-        if torch.is_grad_enabled() or dtype == torch.float32:
-            return {name: activate(name, self[name](features)) for name in names}
-        return {name: activate(name, _low(self[name], features, dtype)) for name in names}
-
-    def at(
-        self, triplane: Tensor, points: Tensor, names: Sequence[str], dtype: torch.dtype = torch.float32
-    ) -> dict[str, Tensor]:
-        """``{name: (B, N, outputs)}`` at ``points (B, N, 3)`` of a triplane, both as for
-        :func:`~reli3d.geometry.triplane.sample_triplane`.
-
-        dtype: of the hidden layers where no gradient is recorded, float32 or bfloat16; another raises ValueError on a
-        CPU, where one kernel then looks up and computes.
-        """
-        # imported here because the small network, which needs this module too, does not need these kernels
-        from reli3d.geometry.triplane import check_triplane, sample_triplane
-
-        if torch.is_grad_enabled() or triplane.is_cuda:
-            return self(sample_triplane(triplane, points), names, dtype)
-        self._check(names)
-        check_triplane(triplane, points)
-        packed = self.packed(names, dtype)
-        raw = torch.stack([packed.at(planes, at.contiguous()) for planes, at in zip(triplane, points, strict=True)])
-        parts = raw.split(packed.outputs, 1)
-        return {name: activate(name, part.transpose(1, 2)) for name, part in zip(names, parts, strict=True)}
-
-    def packed(self, names: Sequence[str], dtype: torch.dtype = torch.float32) -> PackedHeads:
-        """The named MLPs for the kernels."""
-        from reli3d.nn.packed_heads import pack_heads  # imported here as in :meth:`at`
-
-        return pack_heads([linear_layers(self[name]) for name in names], dtype)
-
-    def _check(self, names: Sequence[str]) -> None:
         for name in names:
             if name not in self:
                 raise ValueError(f"heads: expected some of {', '.join(self)}, got {name}")
+        return {name: activate(name, self[name](features)) for name in names}
+
+    def at(self, triplane: Tensor, points: Tensor, names: Sequence[str]) -> dict[str, Tensor]:
+        """``{name: (B, N, outputs)}`` at ``points (B, N, 3)`` of a triplane, both as for
+        :func:`~reli3d.geometry.triplane.sample_triplane`.  Gradients reach the triplane, the points and the heads.
+        """
+        return self(sample_triplane(triplane, points), names)
 
 
 class _TruncatedExp(torch.autograd.Function):

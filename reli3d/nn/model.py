@@ -9,6 +9,7 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor, nn
 
+from reli3d.geometry.triplane import sample_triplane
 from reli3d.nn.blocks import linear_of
 from reli3d.nn.camera import CameraEmbedder, camera_vector
 from reli3d.nn.heads import HEADS, Heads, WeightMerger, truncated_exp
@@ -146,19 +147,16 @@ class Reconstructor(nn.Module):
         code: Code,
         points: Tensor,
         heads: Sequence[str] = tuple(HEADS),
-        *,
-        dtype: torch.dtype = torch.float32,
     ) -> dict[str, Tensor]:
         """Values of the named heads at points of the model's cube, ``{name: (B, N, outputs)}``, float32.
 
         points: ``(B, N, 3)``, inside plus or minus the preset's radius; features fade to zero outside.  ``density`` is
         the raw value, see :meth:`level`; ``base_color`` is sRGB-encoded; ``roughness`` is perceptual; ``normal`` is
         unit in the frame of :mod:`reli3d.render.bump`; ``deformation`` and ``flexicubes`` are raw, see
-        :mod:`reli3d.nn.heads`.  dtype: of the heads' hidden layers without gradient.  Gradients reach the triplane, the
-        points and the heads.
+        :mod:`reli3d.nn.heads`.  Gradients reach the triplane, the points and the heads.
         """
         with torch.autocast(points.device.type, enabled=False):
-            values = self.heads.at(code.triplane, points / self.preset.radius, heads, dtype)
+            values = self.heads.at(code.triplane, points / self.preset.radius, heads)
             if self.preset.roughness_is_alpha and "roughness" in values:
                 values["roughness"] = values["roughness"].sqrt()
         return values
@@ -170,8 +168,6 @@ class Reconstructor(nn.Module):
         axis: ``(n,)``, model units.  A plane of features has ``n * n`` different points, and the head's first layer is
         linear: it is done on the three planes' points and added up.  Values differ from :meth:`query`'s by rounding.
         """
-        from reli3d.geometry.triplane import sample_triplane  # here because the small network does not need its kernels
-
         with torch.autocast(axis.device.type, enabled=False):
             n, channels, at = len(axis), code.triplane.shape[2], axis / self.preset.radius
             a, b = (c.reshape(-1) for c in torch.meshgrid(at, at, indexing="ij"))
@@ -183,10 +179,8 @@ class Reconstructor(nn.Module):
                 for w, f in zip(first.weight.split(channels, 1), (xy, xz, yz), strict=True)
             )
             of_xy += first.bias
-            if axis.is_cuda:
-                rest = nn.Sequential(*list(self.heads["density"].children())[1:])
-                return torch.stack([rest(of_xy[i, :, None] + of_xz[i] + of_yz)[..., 0] for i in range(n)])
-            return self.heads.packed(("density",)).on_grid(of_xy, of_xz, of_yz)[0]
+            rest = nn.Sequential(*list(self.heads["density"].children())[1:])
+            return torch.stack([rest(of_xy[i, :, None] + of_xz[i] + of_yz)[..., 0] for i in range(n)])
 
     def level(self, density: Tensor) -> Tensor:
         """Surface level of the ``density`` head's raw values: negative inside, zero on the surface."""

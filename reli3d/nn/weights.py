@@ -25,7 +25,6 @@ from torch import Tensor
 from reli3d.io.files import InputError, file_size, replacing
 from reli3d.nn.local import LocalReconstructor
 from reli3d.nn.model import Reconstructor
-from reli3d.nn.precision import fastest
 from reli3d.nn.presets import OFFICIAL, LocalPreset, Preset, from_json, to_json
 from reli3d.nn.published import CHECKPOINT_PREFIX, our_key
 
@@ -34,6 +33,7 @@ SMALL = Path(__file__).parents[1] / "assets" / "weights" / "small.safetensors"
 LARGE = 1 << 30  # bytes; hashing less takes about a second
 HEADER_LIMIT = 100 << 20  # bytes, the safetensors library's own bound
 _DTYPES = {"F64": torch.float64, "F32": torch.float32, "F16": torch.float16, "BF16": torch.bfloat16}
+BFLOAT16_INSTRUCTIONS = ("avx512_bf16", "amx_bf16", "bf16")  # as torch.cpu names them: AMD and Intel, Intel, ARM
 _NAMES = {dtype: name for name, dtype in _DTYPES.items()}
 
 
@@ -225,6 +225,16 @@ def default_trunk(preset: AnyPreset, device: torch.device | str) -> torch.dtype:
     return torch.bfloat16 if preset.name == "official" and torch.device(device).type == "cuda" else torch.float32
 
 
+def fastest_dtype(device: torch.device | str) -> torch.dtype:
+    """bfloat16 if ``device`` multiplies matrices of bfloat16 in hardware, else float32, which is then faster."""
+    if torch.device(device).type == "cuda":
+        able = torch.cuda.is_bf16_supported(including_emulation=False)
+    else:
+        found: Mapping[str, bool] = getattr(torch.cpu, "get_capabilities", dict)()  # not in every supported torch
+        able = any(found.get(name, False) for name in BFLOAT16_INSTRUCTIONS)
+    return torch.bfloat16 if able else torch.float32
+
+
 def load(
     path: str | os.PathLike,
     preset: AnyPreset | None = None,
@@ -237,7 +247,7 @@ def load(
 
     preset: what the file must hold; default the one in its header.  trunk: dtype of the trunk's parameters, or in
     which the convolutions of the small network compute; default :func:`default_trunk`, ``auto`` is
-    :func:`~reli3d.nn.precision.fastest`.  All other parameters are float32.  A tensor that is stored in the dtype
+    :func:`fastest_dtype`.  All other parameters are float32.  A tensor that is stored in the dtype
     asked for stays mapped from the file on a CPU: it takes memory when it is read.  Names, shapes, length and, where
     given, the hash are checked before anything is allocated.
     Raises WeightsError.
@@ -251,7 +261,7 @@ def load(
         if found != expected_sha256:
             raise WeightsError(path, f"expected SHA-256 {expected_sha256}, got {found}; fetch it again")
     if trunk == "auto":
-        trunk = fastest(device)
+        trunk = fastest_dtype(device)
     if isinstance(preset, LocalPreset) and trunk not in (None, torch.float32, torch.bfloat16):
         raise WeightsError(path, f"expected float32 or bfloat16 for the network of convolutions, got {trunk}")
     model.to_compute(trunk or default_trunk(preset, device))

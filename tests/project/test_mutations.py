@@ -20,18 +20,6 @@ BROKEN = {
         "w11 = 1.03 * u * v\n        base",
         "geometry/test_triplane.py -k float64",
     ),
-    "activation of the heads": (
-        "kernels/heads.py",
-        "f + 0.2401644501f",
-        "f + 0.2473f",
-        "nn/test_packed_heads.py -k float64",
-    ),
-    "pairs of the heads": (
-        "nn/packed_heads.py",
-        "unflatten(1, (-1, 2, LANES)).transpose(2, 3)",
-        "unflatten(1, (-1, LANES, 2))",
-        "nn/test_packed_heads.py -k bfloat16_rounds",
-    ),
     "green of a normal map": (
         "kernels/bump.py",
         "wp.cross(n, t) * tangent[i][3]",
