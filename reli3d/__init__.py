@@ -30,6 +30,7 @@ _HOME = {
     "unwrap": "reli3d.geometry.uv",
     "bake": "reli3d.geometry.bake",
     "sample_triplane": "reli3d.geometry.triplane",
+    "write_image": "reli3d.io.images",
     "write_glb": "reli3d.io.glb",
     "read_glb": "reli3d.io.glb",
 }

@@ -20,9 +20,9 @@ from torch import Tensor
 import reli3d
 from reli3d._bridge import expect, over_rows, present
 from reli3d.geometry.mesh import watertight
-from reli3d.io import png
 from reli3d.io.files import write_bytes
 from reli3d.io.gltf_parts import read_parts
+from reli3d.io.images import png_bytes
 from reli3d.render.asset import Asset
 
 UNIT = 1.0e-3  # deviation from length 1 that readers accept
@@ -36,7 +36,7 @@ def encode_image(values: Tensor, kind: str = "png") -> bytes:
     """PNG or lossless WebP file, 8 bit RGB, of ``(H, W, 3)`` values in [0, 1], rounded to the nearest step."""
     pixels = np.ascontiguousarray((values.detach() * 255.0).round_().to(torch.uint8).cpu().numpy())
     if kind == "png":
-        return png.encode(pixels)
+        return png_bytes(pixels)
     buffer = io.BytesIO()
     Image.fromarray(pixels).save(buffer, "WEBP", lossless=True, exact=True)
     return buffer.getvalue()
@@ -47,8 +47,6 @@ def texture_images(asset: Asset, kind: str = "png") -> dict[str, bytes]:
     rough = asset.textures.roughness
     orm = torch.stack([torch.ones_like(rough), rough, asset.textures.metallic], -1)  # no occlusion is baked
     maps = {"base_color": asset.textures.base_color, "metallic_roughness": orm, "normal": asset.textures.normal}
-    if kind == "png":  # strips of it are compressed side by side
-        return {name: encode_image(values, kind) for name, values in maps.items()}
     values = list(maps.values())
     return dict(zip(maps, over_rows(len(values), 1, lambda k, _: encode_image(values[k], kind)), strict=True))
 

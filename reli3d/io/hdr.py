@@ -90,16 +90,18 @@ def read_hdr_image(path: str | os.PathLike, *, notes: list[str] | None = None) -
 
 
 def write_exr(path: str | os.PathLike, image: Tensor, *, half: bool = True) -> int:
-    """Write ``image`` ``(H, W, 3)`` as OpenEXR with ZIP compression, in half or float; the whole file or nothing.
+    """Write ``image`` as OpenEXR with ZIP compression, in half or float; the whole file or nothing.
 
+    image: ``(H, W)`` luminance Y, ``(H, W, 3)`` RGB or ``(H, W, 4)`` RGBA, premultiplied by alpha.
     Returns the number of values clamped to 65504.  Raises ValueError on NaN or negative values, OSError where it cannot
     be written.
     """
-    pixels, clamped = _writable(image, HALF_MAX if half else float(np.finfo(np.float32).max))
+    pixels, clamped = _writable(image, HALF_MAX if half else float(np.finfo(np.float32).max), layouts=((), (3,), (4,)))
+    name = "Y" if pixels.ndim == 2 else "RGBA"[: pixels.shape[2]]
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with replacing(path) as temporary:
         temporary.touch()  # an unwritable folder gives an OSError here instead of the library's own exception
-        with OpenEXR.File(header, {"RGB": pixels.astype(np.float16) if half else pixels}) as file:
+        with OpenEXR.File(header, {name: pixels.astype(np.float16) if half else pixels}) as file:
             file.write(str(temporary))
     return clamped
 
@@ -115,11 +117,12 @@ def write_hdr(path: str | os.PathLike, image: Tensor) -> int:
     return clamped
 
 
-def _writable(image: Tensor, limit: float) -> tuple[np.ndarray, int]:
+def _writable(image: Tensor, limit: float, layouts: tuple[tuple[int, ...], ...] = ((3,),)) -> tuple[np.ndarray, int]:
     if not isinstance(image, Tensor) or image.dtype != torch.float32:
         raise TypeError(f"image: expected a float32 tensor, got {getattr(image, 'dtype', type(image).__name__)}")
-    if image.ndim != 3 or image.shape[2] != 3 or image.numel() == 0:
-        raise ValueError(f"image: expected shape (H, W, 3), got {tuple(image.shape)}")
+    if image.ndim < 2 or image.shape[2:] not in layouts or image.numel() == 0:
+        wanted = " or ".join(f"(H, W{''.join(f', {n}' for n in layout)})" for layout in layouts)
+        raise ValueError(f"image: expected shape {wanted}, got {tuple(image.shape)}")
     pixels = image.detach().cpu().numpy()
     if np.isnan(pixels).any() or (pixels < 0).any():
         raise ValueError(f"image: expected values >= 0, got NaN or negative at {int((~(pixels >= 0)).sum())} places")

@@ -1,13 +1,16 @@
+import math
 import os
 import tracemalloc
 
 import numpy as np
+import OpenEXR
 import pytest
 import torch
 from PIL import Image
 
 from reli3d.io.files import InputError, printable, read_bytes, shown, write_bytes
-from reli3d.io.images import colour, png_bytes, read_image, write_png
+from reli3d.io.hdr import read_hdr_image
+from reli3d.io.images import colour, png_bytes, read_image, write_image, write_png
 
 NOISE = np.random.default_rng(3).integers(0, 256, (9, 14, 4), np.uint8)
 
@@ -96,6 +99,53 @@ def test_png_round_trip(tmp_path):
 def test_png_refuses(pixels, error):
     with pytest.raises(error, match="pixels: expected"):
         png_bytes(pixels)
+
+
+def srgb(linear: np.ndarray) -> np.ndarray:
+    """IEC 61966-2-1."""
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
+
+
+def test_a_linear_image_is_encoded_as_its_suffix_asks(tmp_path):
+    image = torch.rand(6, 9, 4, generator=torch.Generator().manual_seed(0)) * 1.5
+    alpha = image[..., 3] = image[..., 3].clamp(0.1, 1.0)
+    alpha[0, 0] = image[0, 0] = 0.0
+    for linear in (image[..., :3], image[..., 0]):
+        write_image(tmp_path / "a.png", linear)
+        got = np.asarray(Image.open(tmp_path / "a.png"))
+        np.testing.assert_allclose(got, 255 * srgb(linear.numpy()).clip(0, 1), atol=0.5 + 1e-3)  # 8 bits
+    write_image(tmp_path / "a.PNG", image)
+    got = np.asarray(Image.open(tmp_path / "a.PNG"))
+    straight = image[..., :3] / alpha[..., None].clamp(min=1e-6)
+    np.testing.assert_allclose(got[..., :3], 255 * srgb(straight.numpy()).clip(0, 1), atol=0.5 + 1e-3)
+    np.testing.assert_allclose(got[..., 3], 255 * alpha.numpy(), atol=0.5 + 1e-3)
+    for channels, name in ((image, "RGBA"), (image[..., :3], "RGB"), (image[..., 0], "Y")):
+        write_image(tmp_path / "a.exr", channels)
+        with OpenEXR.File(str(tmp_path / "a.exr")) as file:
+            assert np.array_equal(file.channels()[name].pixels, channels.numpy())
+    write_image(tmp_path / "a.hdr", image[..., :3])
+    largest = image[..., :3].amax(-1, keepdim=True)
+    assert bool(((read_hdr_image(tmp_path / "a.hdr") - image[..., :3]).abs() <= largest / 255).all())  # RGBE's step
+
+
+@pytest.mark.parametrize(
+    "name, image, error",
+    [
+        ("a.jpg", torch.ones(4, 4, 3), "path: expected"),
+        ("a.hdr", torch.ones(4, 4, 4), "image: expected shape"),
+        ("a.png", torch.ones(4, 4, 2), "image: expected shape"),
+        ("a.exr", torch.ones(0, 4, 3), "image: expected shape"),
+        ("a.png", torch.full((4, 4, 3), math.nan), "image: expected finite"),
+        ("a.hdr", torch.full((4, 4, 3), -1.0), "image: expected finite"),
+        ("a.exr", torch.full((4, 4, 3), math.inf), "image: expected finite"),
+    ],
+)
+def test_what_is_no_linear_image_is_not_written(tmp_path, name, image, error):
+    with pytest.raises(ValueError, match=error):
+        write_image(tmp_path / name, image)
+    with pytest.raises(TypeError, match="image: expected a float32 tensor"):
+        write_image(tmp_path / "a.png", NOISE)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):

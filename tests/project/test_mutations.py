@@ -26,12 +26,6 @@ BROKEN = {
         "wp.cross(n, t)",
         "geometry/test_bake.py -k formula",
     ),
-    "Paeth's choice": (
-        "kernels/png.py",
-        "to_b <= to_c ? b : c",
-        "to_b < to_c ? b : c",
-        "io/test_png.py",
-    ),
     "slope of a plane": (
         "kernels/triplane.py",
         "wp.dot(down, one) * 0.5 *",
