@@ -104,16 +104,16 @@ def choose(**values) -> str:
 
 
 def one_page(asset: Asset, views: Views, light: Environment | None = None) -> str:
-    shown = {"mesh": Shown(glb_bytes(asset), shadow(asset.mesh))}
+    meshes = {"mesh": Shown(glb_bytes(asset), shadow(asset.mesh))}
     radiance = (light or asset.light).radiance
-    return viewer_page("x", shown, radiance, torch.zeros(3), 0.7, photograph_stops(views))
+    return viewer_page("x", meshes, radiance, torch.zeros(3), 0.7, photograph_stops(views))
 
 
 def test_the_page_shows_the_asset_as_the_renderer_does(tmp_path, asset, views):
-    shown = Shown(glb_bytes(asset), shadow(asset.mesh))
+    mesh = Shown(glb_bytes(asset), shadow(asset.mesh))
     page = viewer_page(
         "a <ball>",
-        {"before": shown, "after": shown},
+        {"before": mesh, "after": mesh},
         asset.environment.radiance,
         torch.zeros(3),
         0.7,

@@ -117,4 +117,5 @@ def test_the_design_names_the_rooms_of_the_import_test_in_their_order_and_is_sho
 def test_citation_and_changelog_have_the_version():
     citation, changelog = ((ROOT / name).read_text() for name in ("CITATION.cff", "CHANGELOG.md"))
     assert f"\nversion: {reli3d.__version__}\n" in citation
-    assert re.search(r"^## (\S+)", changelog, re.MULTILINE).group(1) == reli3d.__version__
+    released = [v for v in re.findall(r"^## (\S+)", changelog, re.MULTILINE) if v != "Unreleased"]
+    assert released[0] == reli3d.__version__

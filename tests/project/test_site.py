@@ -10,7 +10,7 @@ from tests.support.checkout import ROOT
 
 def test_the_site_builds_strictly(tmp_path):
     pytest.importorskip("material", reason="needs mkdocs-material (extra docs)")
-    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(tmp_path / "site")]
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     start = (tmp_path / "site/index.html").read_text()
