@@ -8,7 +8,6 @@ decoder works in a z-up frame, D = (z, x, y) of the y-up world direction (x, y, 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
@@ -16,9 +15,6 @@ from torch.nn import functional
 
 from reli3d.nn.heads import truncated_exp
 from reli3d.nn.presets import ReniSizes
-
-if TYPE_CHECKING:
-    from reli3d.render.reni_light import ReniLight
 
 FREQUENCIES = (1.0, 4.0)  # of the positional encoding, without a factor of pi
 VN_EPS = 1.0e-6  # floor of the published vector-neuron ReLU
@@ -203,51 +199,6 @@ class EnvironmentDecoder(nn.Module):
             turned = latent.float() @ rotation.float().transpose(1, 2)
             log_radiance = self.field(turned, directions.float())
             return truncated_exp(log_radiance) * truncated_exp(strength.float())[:, None, None]
-
-    @torch.no_grad()
-    def light(self, latent: Tensor, rotation: Tensor, strength: Tensor) -> ReniLight:
-        """The light of one object as :class:`~reli3d.render.reni_light.ReniLight`, for lookups without a map.
-
-        latent: ``(L, 3)``.  rotation: ``(3, 3)``.  strength: ``()``.  What depends on the latent alone is computed
-        here, once.  The values are those of :meth:`radiance` to float32 rounding; no gradient passes.  Raises
-        ValueError for another shape and where the decoder is not 128 wide, as the kernel is.
-        """
-        from reli3d.render.reni_light import ReniLight  # not before: its kernels are seldom needed
-
-        net, (latents, width) = self.field.network, (self.latents, self.field.network.fc.in_features)
-        for name, value, shape in (
-            ("latent", latent, (latents, 3)),
-            ("rotation", rotation, (3, 3)),
-            ("strength", strength, ()),
-            ("decoder width", torch.empty(width), (128,)),
-        ):
-            if value.shape != shape:
-                raise ValueError(f"{name}: expected shape {shape}, got {tuple(value.shape)}")
-        turned = latent.float() @ rotation.float().T
-        condition, features = self.field.conditioning(turned[None])[0], latents + 2
-        codes, raw = net.residual_projection.weight.T.split((4 * features, features))
-        # published order: sines of all features, frequencies fastest, then the shifted ones, then the features
-        codes = codes.reshape(2, features, 2, width).transpose(0, 1).reshape(features, 4, width)
-        first = torch.cat([torch.cat([codes, raw[:, None]], 1).flatten(0, 1), net.residual_projection.bias[None]])
-        matrices = torch.cat([w.T for layer in net.layers for w in (layer.fc[0].weight, layer.fc[2].weight)])
-        vectors = torch.stack(
-            [
-                v
-                for layer in net.layers
-                for v in (
-                    layer.mha(condition),
-                    layer.norm1.weight,
-                    layer.norm1.bias,
-                    layer.fc[0].bias,
-                    layer.fc[2].bias,
-                    layer.norm2.weight,
-                    layer.norm2.bias,
-                )
-            ]
-        )
-        offset = (net.fc.bias + strength.float())[None]
-        parts = turned[:, :2], first, matrices, vectors, net.fc.weight, offset
-        return ReniLight(*(part.detach().contiguous() for part in parts))
 
 
 def _turn(angle: Tensor) -> Tensor:

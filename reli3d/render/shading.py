@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Protocol
 
 import torch
 import warp as wp
@@ -34,7 +33,6 @@ from reli3d.render.points import SurfacePoints, check_values, nan_where_not_fini
 from reli3d.render.sampling import halton
 
 SAMPLES = (20, 40, 4)  # environment, visible normals, cosine: the published counts
-LIGHT_RAYS = 1 << 20  # directions in which a light is evaluated at once: 45 MB of rays
 CHOICES = {
     "antithetic": ("none", "opposite", "mirrored"),
     "heuristic": ("balance", "power"),
@@ -144,56 +142,6 @@ def _task(points, wo, environment, scene, options, pixels) -> tuple:
         raise ValueError(f"pixels: expected shape ({n},), got {tuple(pixels.shape)}")
     values = (*values, environment.radiance, pixels)
     return job, *(v.contiguous() for v in values)
-
-
-class Light(Protocol):
-    """Distant light that can be evaluated: ``Environment``, ``SphericalGaussians``, ``ReniLight``."""
-
-    def lookup(self, directions: Tensor) -> Tensor: ...
-
-
-@torch.no_grad()
-def shade_light(
-    points: SurfacePoints,
-    wo: Tensor,
-    light: Light,
-    proposal: Environment,
-    *,
-    scene: RayScene | None = None,
-    options: ShadeOptions = DEFAULT,
-) -> Tensor:
-    """:func:`shade` with the radiance of ``light`` in each sample's direction instead of a map's, ``(N, 3)``.
-
-    The other arguments are those of :func:`shade`.  proposal: a coarse map of the light, whose table the
-    environment strategy draws from; where it is dark and the light is not, the other strategies stand in, so the mean
-    does not depend on it.  No gradient.
-    """
-    values = shaded_arrays(points, wo, proposal, scene, options)
-    plan, offsets = sampling_plan(replace(options, clamp=None), scene)  # what is cut is the product with the light
-    n, device, count = len(points), points.position.device, sum(options.samples)
-    pixels = torch.arange(n, dtype=torch.int32, device=device)
-    white = torch.ones(1, 2, 3, device=device)  # what a sample adds under unit light; the light's radiance comes after
-    job = _Job(plan, count, scene, proposal.table, offsets.to(device), _nothing_known(device))
-    ins = _inputs([v.contiguous() for v in (*values, white, pixels)], job)
-    out = nan_where_not_finite(values).expand(n, 3).clone()
-    size = max(1, LIGHT_RAYS // max(1, count))
-    for first in range(0, n if count else 0, size):
-        hits = min(size, n - first)
-        origins, directions, value = (torch.empty(hits * count, 3, device=device) for _ in range(3))
-        far = torch.empty(hits * count, device=device)
-        buffers = [(origins, wp.vec3), (directions, wp.vec3), (far, wp.float32), (value, wp.vec3)]
-        launch(halves.shade_rays_kernel, hits, [first, *ins, plan, (job.known, wp.int32), *buffers], device)
-        lit = (far > 0.0).nonzero()[:, 0]
-        if scene is not None and scene.faces.shape[0]:
-            lit = lit[~scene.occluded(origins[lit], directions[lit])]
-        added = torch.zeros_like(value)
-        added[lit] = value[lit] * light.lookup(directions[lit])
-        added = added.view(hits, count, 3)
-        if options.clamp is not None:
-            counts = torch.tensor(options.samples, device=device)
-            added = added.minimum((options.clamp / counts).repeat_interleave(counts)[:, None])
-        out[first : first + hits] += added.sum(1)
-    return out
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import torch
 from reli3d.render.environment import Environment
 from reli3d.render.gaussians import SphericalGaussians, shade_gaussians
 from reli3d.render.points import SurfacePoints
-from reli3d.render.shading import ShadeOptions, shade, shade_light
+from reli3d.render.shading import ShadeOptions, shade
 from tests.support.scenes import shadow_caster, sky
 from tests.support.surfaces import points
 
@@ -58,7 +58,6 @@ def test_what_is_not_finite_gives_nan_and_its_neighbours_stay(device, name, valu
         lambda p, wo, s=s: shade(p, wo, light, scene=s)
         for s in (None, shadow_caster(device), shadow_caster(device, "warp"))
     ]
-    calls += [lambda p, wo: shade_light(p, wo, light, light)]
     if name not in ("position", "ng"):  # which play no part in it
         calls += [lambda p, wo: shade_gaussians(p, wo, lobe)]
     for call in calls:
@@ -94,12 +93,3 @@ def test_directions_and_ranges_are_checked_on_request(device):
             light,
             options=asked,
         )
-
-
-def test_a_clamp_holds_for_a_light_that_is_asked_too(device):
-    normal, wo = (v.to(device) for v in points(500))
-    light, at = Environment(sky().radiance.to(device)), SurfacePoints(normal, normal, normal, 0.7, 0.4, 0.3)
-    for clamp in (None, 0.5, 2.0):
-        options = ShadeOptions((6, 8, 3), clamp=clamp)
-        got, want = shade_light(at, wo, light, light, options=options), shade(at, wo, light, options=options)
-        torch.testing.assert_close(got, want, rtol=1e-4, atol=1e-5)  # the same samples in another order

@@ -15,12 +15,9 @@ from reli3d.geometry.visibility import visible_from
 from reli3d.render import material, sampling
 from reli3d.render.bump import radial_bump
 from reli3d.render.environment import Environment
-from reli3d.render.reni_light import ReniLight
-from reli3d.render.shading import ShadeOptions, shade_light
 from reli3d.render.volume import OccupancyGrid, march_rays, sample_weights
 from tests.support.op_cases import (
     FRAME,
-    MAP,
     Case,
     above,
     ball,
@@ -29,20 +26,11 @@ from tests.support.op_cases import (
     packed,
     rig,
     rng,
-    shaded,
     soup,
     uniform,
     units,
     weights,
 )
-from tests.support.surfaces import at
-
-
-def asked(normal, base_color, metallic, roughness, radiance):
-    light = Environment(radiance)
-    wo = normalize(normal + 0.5 * units(len(normal), 6).to(normal), dim=-1)
-    points, wo = at(0.2 * normal, normal, normal, wo, base_color, roughness, metallic)
-    return (shade_light(points, wo, light, light, options=ShadeOptions(seed=3)),)
 
 
 def traced(backend):
@@ -138,14 +126,6 @@ def drawn(u, radiance, wo, alpha):
     )
 
 
-def asked_of_reni(directions):
-    """Two layers of random numbers of the size that training leaves."""
-    rows = {"first": 5 * 11 + 1, "matrices": 512, "vectors": 14, "last": 3}
-    parts = {k: 0.1 * torch.randn(n, 128, generator=rng(n)).to(directions) for k, n in rows.items()}
-    light = ReniLight(uniform(9, 2, seed=1).to(directions), **parts, offset=uniform(1, 3, seed=2).to(directions))
-    return light.lookup(directions), light.environment(8).radiance
-
-
 def bent(world):
     normal, tangent = (v[: len(world)].to(world.device) for v in FRAME.values())
     return encode_normals(world, normal, tangent), radial_bump(units(len(world), 2).to(world), normal, world)
@@ -168,7 +148,6 @@ CASES = {
         drawn,
         rows=("u", "wo", "alpha"),
     ),
-    "shade_light": Case(shaded, asked, rows=MAP),
     "sample_weights": Case(
         lambda n: {"density": uniform(n, seed=1, low=-3.0, high=27.0)},
         lambda density: (sample_weights(density, packed(density)),),
@@ -196,7 +175,6 @@ CASES = {
         },
         covered,
     ),
-    "ReniLight": Case(lambda n: {"directions": units(n, 1)}, asked_of_reni, rows=("directions",)),
     "normal maps": Case(lambda n: {"world": units(n, 1)}, bent, rows=("world",)),
     "interpolate tangents": Case(
         lambda n: {"values": uniform(180, 4, seed=1), "bary": weights(n)}, four, ("values", "bary"), ("bary",)

@@ -1,0 +1,69 @@
+"""RENI++ latents fitted to a map."""
+
+import math
+
+import pytest
+import torch
+
+from reli3d.nn.presets import OFFICIAL
+from reli3d.nn.reni import EnvironmentDecoder
+from reli3d.nn.reni_fit import fit_latent
+from reli3d.nn.weights import read_manifest, read_tensors
+
+
+@pytest.fixture(params=["random", "published"])
+def decoder(request, device):
+    if request.param == "random":
+        torch.manual_seed(0)
+        return EnvironmentDecoder(OFFICIAL.reni).to(device).eval()
+    path = request.getfixturevalue("goldens").parent / "reni++L49.safetensors"
+    decoder, manifest = EnvironmentDecoder(OFFICIAL.reni), read_manifest(path)
+    decoder.field.load_state_dict(read_tensors(manifest, {name: torch.float32 for name in manifest.tensors}))
+    return decoder.eval().to(device)
+
+
+def code(seed, device, spread=1.0):
+    generator = torch.Generator().manual_seed(seed)
+    rotation = torch.linalg.qr(torch.randn(3, 3, generator=generator))[0]
+    latent = spread * torch.randn(49, 3, generator=generator)
+    return latent.to(device), rotation.to(device), torch.tensor(0.3, device=device)
+
+
+@pytest.mark.parametrize("height", [20, pytest.param(32, marks=pytest.mark.slow)])
+def test_a_decoded_map_is_found_again(decoder, height):
+    device = decoder.sample_directions.device
+    latent, _, _ = code(7, device)
+    with torch.no_grad():
+        radiance = decoder(
+            latent[None], torch.eye(3, device=device)[None], torch.full((1,), 2.0, device=device), height
+        )
+    before = [p.clone() for p in decoder.parameters()]
+    fit = fit_latent(decoder, radiance[0], steps=120)
+    spread = float((radiance.log() - radiance.log().mean()).abs().mean())
+    assert fit.error < 0.3 * spread  # 120 steps of the 500
+    with torch.no_grad():
+        again = decoder(fit.latent[None], fit.rotation[None], fit.strength[None], height)
+    rows = torch.sin((torch.arange(height, device=device) + 0.5) * math.pi / height)[:, None, None]
+    measured = float(((again.log() - radiance.log()).abs() * rows).mean() / rows.mean())
+    assert measured < 1.3 * fit.error  # what it says, but for the floor of the logarithm
+    twice = fit_latent(decoder, 2.0 * radiance[0], steps=120)
+    torch.testing.assert_close(
+        twice.strength - fit.strength, torch.tensor(math.log(2.0), device=device), rtol=0, atol=1e-3
+    )
+    assert all(torch.equal(a, b) and b.grad is None for a, b in zip(before, decoder.parameters(), strict=True))
+
+
+def test_maps_that_cannot_be_fitted_are_named():
+    torch.manual_seed(0)
+    decoder = EnvironmentDecoder(OFFICIAL.reni).eval()
+    for radiance, message in [
+        (torch.ones(8, 15, 3), r"expected \(H, 2H, 3\) with H at least 8, got \(8, 15, 3\)"),
+        (torch.ones(4, 8, 3), "H at least 8"),
+        (torch.zeros(8, 16, 3), "got NaN, infinity, negative or black"),
+        (torch.full((8, 16, 3), math.nan), "got NaN, infinity, negative or black"),
+        (-torch.ones(8, 16, 3), "got NaN, infinity, negative or black"),
+    ]:
+        with pytest.raises(ValueError, match="radiance: .*" + message):
+            fit_latent(decoder, radiance)
+    with pytest.raises(TypeError, match="radiance: expected torch.float32"):
+        fit_latent(decoder, torch.ones(8, 16, 3, dtype=torch.float64))
