@@ -70,8 +70,8 @@ def _check(args: argparse.Namespace) -> None:
 def export(args: argparse.Namespace) -> tuple[list[Path], dict]:
     """Write the files; their paths, and what was written in numbers."""
     from reli3d.fit.transfer import dressed
+    from reli3d.geometry.decimate import decimate
     from reli3d.geometry.mesh import vertex_normals
-    from reli3d.geometry.remesh import decimate
     from reli3d.io.files import write_bytes
     from reli3d.io.glb import glb_bytes, read_glb
     from reli3d.io.obj import obj_files

@@ -152,14 +152,6 @@ def interpolate_tangents(mesh: Mesh, texels: Texels, index: Tensor) -> Tensor:
     return _tangents(mesh, _checked_places(mesh, texels, index), index)
 
 
-def interpolate_values(mesh: Mesh, values: Tensor, texels: Texels, index: Tensor) -> Tensor:
-    """Numbers of the vertices, ``values (V, C)``, at the texels with the flat indices ``index`` (N,) int64: ``(N, C)``.
-
-    No gradient.
-    """
-    return _values(mesh, values, _checked_places(mesh, texels, index), index)
-
-
 def _checked_places(mesh: Mesh, texels: Texels, index: Tensor) -> kernels.Places:
     check("index", index, dtype=torch.int64, like=texels.bary)
     if index.ndim != 1 or (len(index) and not bool((texels.face.reshape(-1)[index] >= 0).all())):

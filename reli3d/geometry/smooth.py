@@ -13,8 +13,6 @@ from torch import Tensor
 
 from reli3d.geometry.mesh import Mesh, sorted_keys, weld
 
-BORDERS = ("fixed", "along")
-
 
 @dataclass(frozen=True)
 class _Umbrella:
@@ -35,7 +33,7 @@ class _Umbrella:
         return total * self.inverse - positions * (self.inverse > 0)
 
 
-def _umbrella(mesh: Mesh, border: str) -> _Umbrella:
+def _umbrella(mesh: Mesh) -> _Umbrella:
     first, label = weld(mesh.vertices)
     n = len(first)
     faces = label[mesh.faces.long()]
@@ -48,8 +46,6 @@ def _umbrella(mesh: Mesh, border: str) -> _Umbrella:
     at_border = torch.zeros(n, dtype=torch.bool, device=key.device)
     at_border[moved[open_edge]] = True
     keep = ~at_border[moved]
-    if border == "along":
-        keep |= open_edge
     key, moved = key[keep], moved[keep]
     degree = torch.bincount(moved, minlength=n)
     start = torch.cumsum(degree, 0) - degree
@@ -58,12 +54,10 @@ def _umbrella(mesh: Mesh, border: str) -> _Umbrella:
     return _Umbrella(label, share, key - moved * n, start, inverse)
 
 
-def _smoothed(mesh: Mesh, steps: list[float], border: str) -> Mesh:
-    if border not in BORDERS:
-        raise ValueError(f"border: expected one of {', '.join(BORDERS)}, got {border}")
+def _smoothed(mesh: Mesh, steps: list[float]) -> Mesh:
     if not steps or not len(mesh.faces):
         return replace(mesh, normals=None, tangents=None)
-    operator = _umbrella(mesh, border)
+    operator = _umbrella(mesh)
     start = positions = operator.welded(mesh.vertices)
     for step in steps:
         positions = positions + step * operator(positions)
@@ -71,34 +65,18 @@ def _smoothed(mesh: Mesh, steps: list[float], border: str) -> Mesh:
     return replace(mesh, vertices=vertices, normals=None, tangents=None)
 
 
-def _check_steps(iterations: int, step: float) -> None:
+def taubin_smooth(mesh: Mesh, *, iterations: int = 10, step: float = 0.5, pass_band: float = 0.1) -> Mesh:
+    """The mesh after ``iterations`` pairs of a shrinking and an inflating step: denoised, its volume preserved.
+
+    Taubin 1995, A signal processing approach to fair surface design: steps ``step`` and ``mu`` with ``1 / step + 1 /
+    mu = pass_band``; frequencies of the umbrella operator below ``pass_band`` are kept or raised a little.  pass_band
+    in (0, 1 / step), small; step in (0, 1].  Vertices of open borders stay.  Gradients reach the vertices; sums over
+    neighbours have a fixed order on CPU.  Raises ValueError for values out of range.
+    """
     if iterations < 0:
         raise ValueError(f"iterations: expected at least 0, got {iterations}")
     if not 0.0 < step <= 1.0:
         raise ValueError(f"step: expected a value in (0, 1], got {step}")
-
-
-def laplacian_smooth(mesh: Mesh, *, iterations: int = 10, step: float = 0.5, border: str = "fixed") -> Mesh:
-    """The mesh after ``iterations`` of moving every vertex by ``step`` of its umbrella vector; it shrinks.
-
-    step in (0, 1].  border: "fixed" keeps the vertices of open borders, "along" smooths them as a curve among
-    themselves.  Gradients reach the vertices; sums over neighbours have a fixed order on CPU.  Raises ValueError for
-    values out of range.
-    """
-    _check_steps(iterations, step)
-    return _smoothed(mesh, [step] * iterations, border)
-
-
-def taubin_smooth(
-    mesh: Mesh, *, iterations: int = 10, step: float = 0.5, pass_band: float = 0.1, border: str = "fixed"
-) -> Mesh:
-    """The mesh after ``iterations`` pairs of a shrinking and an inflating step: noise goes, the volume stays.
-
-    Taubin 1995, A signal processing approach to fair surface design: steps ``step`` and ``mu`` with ``1 / step + 1 /
-    mu = pass_band``; frequencies of the umbrella operator below ``pass_band`` are kept or raised a little.  pass_band
-    in (0, 1 / step), small.  The rest as :func:`laplacian_smooth`.
-    """
-    _check_steps(iterations, step)
     if not 0.0 < pass_band < 1.0 / step:
         raise ValueError(f"pass_band: expected a value in (0, {1.0 / step:.4g}), got {pass_band}")
-    return _smoothed(mesh, [step, 1.0 / (pass_band - 1.0 / step)] * iterations, border)
+    return _smoothed(mesh, [step, 1.0 / (pass_band - 1.0 / step)] * iterations)

@@ -121,37 +121,6 @@ def extract_surface(
     return Mesh(vertices, faces.reshape(-1, 3))
 
 
-def extract_surfaces(
-    levels: Tensor | Sequence[Tensor],
-    *,
-    radius: float | Sequence[float],
-    closed: bool = True,
-    centre: bool = False,
-    **fields: Tensor | Sequence[Tensor] | None,
-) -> list[Mesh]:
-    """:func:`extract_surface` of every field of a batch, one mesh for each; the same bits as alone.
-
-    levels: ``(B, X + 1, Y + 1, Z + 1)``, or a sequence of grids that may differ in shape.  fields: deformation, alpha,
-    beta, gamma, cubes, each with a leading axis B or as a sequence of B.  Raises as the single function, and ValueError
-    where the batch sizes differ or the batch is empty.
-    """
-    unknown = sorted(set(fields) - {"deformation", "alpha", "beta", "gamma", "cubes"})
-    if unknown:
-        raise TypeError(f"fields: expected deformation, alpha, beta, gamma or cubes, got {', '.join(unknown)}")
-    if not len(levels):
-        raise ValueError("levels: expected at least one field, got none")
-    given = {name: value for name, value in fields.items() if value is not None}
-    for name, value in given.items():
-        if len(value) != len(levels):
-            raise ValueError(f"{name}: expected {len(levels)} fields, got {len(value)}")
-    return [
-        extract_surface(
-            level, radius=radius, closed=closed, centre=centre, **{name: value[i] for name, value in given.items()}
-        )
-        for i, level in enumerate(levels)
-    ]
-
-
 def check_fields(
     level: Tensor,
     radius: float | Sequence[float],

@@ -308,8 +308,3 @@ def source_vertices(whole: Mesh, mesh: Mesh) -> Tensor:
     if whole.faces.shape != mesh.faces.shape:
         raise ValueError(f"mesh.faces: expected {len(whole.faces)} faces, got {len(mesh.faces)}")
     return mesh.faces.new_zeros(len(mesh.vertices)).index_put_((mesh.faces.long(),), whole.faces)
-
-
-def uv_faces(mesh: Mesh) -> Tensor:
-    """UV of the corners of every face, ``(F, 3, 2)``."""
-    return _bridge.present("mesh.uv", mesh.uv)[mesh.faces.long()]

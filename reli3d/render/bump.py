@@ -33,21 +33,5 @@ def radial_bump(position: Tensor, normal: Tensor, bump: Tensor) -> Tensor:
     return _in_frame(tangent, normalize(torch.linalg.cross(normal, tangent), dim=-1, eps=EPS), normal, bump)
 
 
-def world_bump(normal: Tensor, bump: Tensor) -> Tensor:
-    """Unit shading normal ``(..., 3)`` of a tangent-space ``bump (..., 3)`` in a frame that the world's axes align.
-
-    normal: ``(..., 3)`` unit.  The bitangent is ``y x normal`` where the normal is nearer to the x axis than to the y
-    axis, and ``normal x x`` elsewhere; the tangent is ``bitangent x normal``.  No UV and no vertical axis without a
-    frame, but a seam where ``|x| = |y|``.  Gradients reach both.  Source: the paper's tangent space (after Vainer et
-    al. 2024) in the form of the published model's shader.
-    """
-    x, y, z = normal.unbind(-1)
-    none = torch.zeros_like(x)
-    side = (x.abs() > y.abs())[..., None]
-    bitangent = torch.where(side, torch.stack([z, none, -x], -1), torch.stack([none, z, -y], -1))
-    bitangent = normalize(bitangent, dim=-1, eps=EPS)
-    return _in_frame(torch.linalg.cross(bitangent, normal), bitangent, normal, bump)
-
-
 def _in_frame(tangent: Tensor, bitangent: Tensor, normal: Tensor, bump: Tensor) -> Tensor:
     return normalize(tangent * bump[..., :1] + bitangent * bump[..., 1:2] + normal * bump[..., 2:], dim=-1, eps=EPS)

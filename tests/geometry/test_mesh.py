@@ -9,16 +9,15 @@ from reli3d.geometry import mesh as module
 from reli3d.geometry.mesh import (
     Mesh,
     face_components,
-    from_trimesh,
     largest_components,
     select_faces,
-    to_trimesh,
     vertex_normals,
     volume,
     watertight,
     weld,
     weld_rows,
 )
+from tests.support.meshes import mesh_from
 
 
 def report(mesh):
@@ -27,16 +26,12 @@ def report(mesh):
     return found
 
 
-def mesh_of(source, device="cpu"):
-    return from_trimesh(source, device=device)
-
-
 def joined(*sources):
-    return mesh_of(trimesh.util.concatenate(sources))
+    return mesh_from(trimesh.util.concatenate(sources))
 
 
 def test_normals_of_a_sphere_are_radial_and_unit(device):
-    sphere = mesh_of(trimesh.creation.icosphere(4), device).with_normals()
+    sphere = mesh_from(trimesh.creation.icosphere(4), device).with_normals()
     # area weights on an icosphere of 2562 vertices: the worst vertex leans by about a tenth of an edge angle
     torch.testing.assert_close(sphere.normals, sphere.vertices, rtol=0, atol=0.01)
     torch.testing.assert_close(sphere.normals.norm(dim=-1), torch.ones(2562, device=device), rtol=0, atol=1e-6)
@@ -52,7 +47,7 @@ def test_normals_are_weighted_by_area():
 
 def test_normal_gradient_matches_float64(device):
     rng = torch.Generator().manual_seed(0)
-    source = mesh_of(trimesh.creation.icosphere(2), device)
+    source = mesh_from(trimesh.creation.icosphere(2), device)
     vertices = (source.vertices + 0.05 * torch.randn(162, 3, generator=rng).to(device)).requires_grad_()
     weights = torch.randn(162, 3, generator=rng).to(device)
     (got,) = torch.autograd.grad((vertex_normals(vertices, source.faces) * weights).sum(), vertices)
@@ -96,19 +91,19 @@ def test_rows_are_welded_as_numpy_does_even_where_all_hashes_collide(monkeypatch
     [(trimesh.creation.icosphere(2), 2), (trimesh.creation.torus(1.0, 0.3), 0), (trimesh.creation.box(), 2)],
 )
 def test_closed_surfaces_and_their_euler_number(source, euler):
-    got = report(mesh_of(source))
+    got = report(mesh_from(source))
     assert got.watertight and got.manifold
     assert (got.euler, got.components, got.faces) == (euler, 1, len(source.faces))
     soup = source.copy()
     soup.unmerge_vertices()  # three vertices a face: the welded mesh is the same
-    again = report(mesh_of(soup))
+    again = report(mesh_from(soup))
     assert again.vertices == 3 * len(source.faces)
     assert (again.euler, again.watertight, again.manifold) == (euler, True, True)
     assert again.welded_vertices == len(source.vertices)
 
 
 def test_defects_are_counted():
-    cap = mesh_of(trimesh.creation.icosphere(1))
+    cap = mesh_from(trimesh.creation.icosphere(1))
     opened = report(select_faces(cap, torch.arange(80) > 0))
     assert (opened.boundary_edges, opened.watertight, opened.manifold) == (3, False, True)
     flipped = cap.faces.clone()
@@ -142,7 +137,7 @@ def test_components_and_the_largest():
 
 
 def test_select_faces_keeps_attributes_and_gradients():
-    source = mesh_of(trimesh.creation.icosphere(1))
+    source = mesh_from(trimesh.creation.icosphere(1))
     v = source.vertices.requires_grad_()
     uv = torch.rand(len(v), 2, generator=torch.Generator().manual_seed(0))
     kept = select_faces(Mesh(v, source.faces, uv=uv), torch.arange(80) < 5)
@@ -150,21 +145,6 @@ def test_select_faces_keeps_attributes_and_gradients():
     torch.testing.assert_close(kept.vertices[kept.faces.long()], v[source.faces[:5].long()])
     torch.testing.assert_close(kept.uv[kept.faces.long()], uv[source.faces[:5].long()])
     assert torch.autograd.grad(kept.vertices.sum(), v)[0].sum() == 3 * len(kept.vertices)
-
-
-def test_trimesh_round_trip_is_exact():
-    rng = torch.Generator().manual_seed(0)
-    source = mesh_of(trimesh.creation.icosphere(1)).with_normals()
-    n = len(source.vertices)
-    direction = torch.nn.functional.normalize(torch.randn(n, 3, generator=rng), dim=-1)
-    tangents = torch.cat([direction, torch.ones(n, 1)], -1)
-    mesh = Mesh(source.vertices, source.faces, source.normals, torch.rand(n, 2, generator=rng), tangents)
-    there = to_trimesh(mesh)
-    np.testing.assert_allclose(there.visual.uv[:, 1], 1 - mesh.uv[:, 1].numpy().astype(np.float64), rtol=0, atol=0)
-    back = from_trimesh(there)
-    for name in ("vertices", "faces", "normals", "uv", "tangents"):
-        assert torch.equal(getattr(back, name), getattr(mesh, name)), name
-    assert from_trimesh(trimesh.creation.icosphere(1)).normals is None
 
 
 @pytest.mark.parametrize(
@@ -190,7 +170,7 @@ def test_real_meshes_report_the_same_as_trimesh(shared_data):
     files = sorted((shared_data / "meshes").rglob("*.glb"))[:3]
     for file in files:
         source = trimesh.load(file, force="mesh")
-        got = report(from_trimesh(source))
+        got = report(mesh_from(source))
         merged = trimesh.Trimesh(np.asarray(source.vertices, np.float32), source.faces, process=False)
         merged.merge_vertices(merge_tex=True, merge_norm=True, digits_vertex=12)
         assert got.faces == len(source.faces)

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from reli3d.geometry.mesh import report
 from reli3d.geometry.regularize import sign_entropy, vertex_deviation
-from reli3d.geometry.surface import extract_surface, extract_surfaces, surface_cubes
+from reli3d.geometry.surface import extract_surface, surface_cubes
 from tests.support import reference_surface
 from tests.support.reference_surface import random_weights, sphere
 
@@ -109,18 +109,6 @@ def test_entropy_removes_a_floater_that_nothing_holds():
     assert float(level[1, 1, 1].detach()) > 0.0
 
 
-def test_a_batch_is_the_fields_one_by_one(device):
-    levels = torch.stack([sphere(5, radius, device) for radius in (0.4, 0.7)])
-    weights = [random_weights((6,) * 3, seed, device) for seed in (0, 1)]
-    stacked = {name: torch.stack([w[name] for w in weights]) for name in weights[0]}
-    for fields in (stacked, {name: list(value) for name, value in stacked.items()}):
-        for level, own, got in zip(levels, weights, extract_surfaces(levels, radius=1.0, **fields), strict=True):
-            alone = extract_surface(level, radius=1.0, **own)
-            assert torch.equal(got.vertices, alone.vertices) and torch.equal(got.faces, alone.faces)
-    sizes = [len(m.vertices) for m in extract_surfaces([sphere(4), sphere(6)], radius=1.0)]
-    assert sizes[0] < sizes[1]
-
-
 @pytest.mark.parametrize(
     "call, error, name",
     [
@@ -132,9 +120,6 @@ def test_a_batch_is_the_fields_one_by_one(device):
         (lambda: vertex_deviation(sphere(4), radius=-1.0), ValueError, "radius"),
         (lambda: vertex_deviation(sphere(4), radius=1.0, beta=torch.zeros(64, 12)), ValueError, "beta"),
         (lambda: vertex_deviation(sphere(4), radius=1.0, alpha=torch.ones(9, 8)), ValueError, "alpha"),
-        (lambda: extract_surfaces([], radius=1.0), ValueError, "levels"),
-        (lambda: extract_surfaces([sphere(4)], radius=1.0, alpha=torch.ones(2, 64, 8)), ValueError, "alpha"),
-        (lambda: extract_surfaces([sphere(4)], radius=1.0, delta=torch.ones(1)), TypeError, "delta"),
     ],
 )
 def test_wrong_input_is_named(call, error, name):

@@ -7,7 +7,6 @@ import torch
 import trimesh
 
 from reli3d.geometry.camera import Camera, camera_rays, look_at
-from reli3d.geometry.mesh import from_trimesh
 from reli3d.geometry.rays import RayScene
 from reli3d.geometry.visibility import GRAZING
 from reli3d.nn.local import PixelMaps, shown_pixels
@@ -17,6 +16,7 @@ from reli3d.pipeline import ReconstructOptions, Stopwatch, encode, reconstruct
 from reli3d.prepare import completed, prepare
 from reli3d.views.normalize import normalize
 from reli3d.views.views import Views
+from tests.support.meshes import mesh_from
 
 SIZE = 192
 BALLS = [((0.0, 0.0, 0.0), 0.3), ((0.35, 0.1, 0.25), 0.14), ((-0.35, 0.1, 0.25), 0.14), ((0.0, 0.3, -0.2), 0.14)]
@@ -94,7 +94,7 @@ def test_a_mirror_image_shows_a_point_only_where_no_photograph_does():
     eyes = torch.tensor([[0.0, 0.0, 2.4], [2.4, 0.0, 0.0], [0.0, 0.0, -2.4], [0.3, 0.0, -2.4]])
     camera = Camera.from_fov(torch.stack([look_at(tuple(eye.tolist())) for eye in eyes]), 0.6, 8, 8)
     maps = ViewMaps(torch.zeros(4, 4, 4, 1), torch.zeros(4, 8, 8, 4), camera, mirrored=2)
-    mesh = from_trimesh(trimesh.creation.icosphere(subdivisions=4, radius=0.5))
+    mesh = mesh_from(trimesh.creation.icosphere(subdivisions=4, radius=0.5))
     normal = mesh.vertices / mesh.vertices.norm(dim=1, keepdim=True)
     away = eyes - mesh.vertices[:, None]
     cosine = (away * normal[:, None]).sum(-1) / away.norm(dim=-1)  # from outside a ball hides what faces away
@@ -120,7 +120,7 @@ def test_many_views_and_other_words_are_left_alone(views):
 def test_rays_only_where_the_corners_of_a_face_differ():
     camera = Camera.from_fov(torch.stack([look_at((0.0, 0.0, 2.4)), look_at((2.4, 0.0, 0.0))]), 0.6, 8, 8)
     maps = ViewMaps(torch.zeros(2, 4, 4, 1), torch.zeros(2, 8, 8, 4), camera)
-    mesh = from_trimesh(trimesh.creation.icosphere(subdivisions=3, radius=0.5))
+    mesh = mesh_from(trimesh.creation.icosphere(subdivisions=3, radius=0.5))
     scene, normal = RayScene(mesh.vertices, mesh.faces), mesh.vertices / 0.5
     at_vertices = maps.seen(scene, mesh.vertices, normal)[mesh.faces.long()]  # (F, 3, V)
     share = torch.tensor([0.2, 0.3, 0.5])

@@ -33,10 +33,14 @@ def mesh_of(vertices, faces) -> Mesh:
     )
 
 
+def mesh_from(shape: trimesh.Trimesh, device="cpu") -> Mesh:
+    return mesh_of(shape.vertices, shape.faces).to(device)
+
+
 def loaded(path) -> Mesh:
     """The whole file as one mesh, without texture coordinates."""
     shape = trimesh.load(path, force="mesh", process=False)
-    return mesh_of(shape.vertices, shape.faces)
+    return mesh_from(shape)
 
 
 def sheet(n=9):

@@ -28,7 +28,7 @@ from reli3d.geometry.tangents import decode_normals, encode_normals
 from reli3d.geometry.triplane import sample_triplane
 from reli3d.render import color, gbuffer, material, sampling
 from reli3d.render.asset import TextureSet
-from reli3d.render.bump import radial_bump, world_bump
+from reli3d.render.bump import radial_bump
 from reli3d.render.environment import Environment
 from reli3d.render.gaussians import SphericalGaussians, shade_gaussians
 from reli3d.render.shading import ShadeOptions, shade
@@ -356,9 +356,6 @@ CASES = {
         second=("c2w", "intrinsics")),
     "radial_bump": Case(
         lambda n: {"bump": above(n, 1)}, bumped, ("bump",), ("bump",), second=("bump",), dtypes=("bump",)),
-    "world_bump": Case(
-        lambda n: {"normal": units(n, 3), "bump": above(n, 1)}, lambda normal, bump: (world_bump(normal, bump),),
-        ("normal", "bump"), ("normal", "bump"), second=("normal", "bump"), dtypes=("normal", "bump")),
     "encode_normals": Case(
         lambda n: {"world": units(n, 1)},
         lambda world: (encode_normals(world, *(v[: len(world)].to(world.device) for v in FRAME.values())),), ("world",),

@@ -68,7 +68,7 @@ def texels(vertices):
     mesh = Mesh(vertices, faces, mesh.normals, uv, tangents)
     along = bake.bake(mesh, 64, lambda position, normal, tangent: tangent, texels=found, tangents=True)
     colors = uniform(n, 5, seed=7).to(vertices)
-    of_vertices = bake.interpolate_values(mesh, colors, found, found.valid.reshape(-1).nonzero().squeeze(1))
+    of_vertices = bake.bake(mesh, 64, lambda position, normal, value: value, texels=found, values=colors)["value"]
     covered = bake.coverage(mesh, 64)
     return found.face, found.bary, near, square, maps["value"], along["value"], covered, tangents, of_vertices
 

@@ -1,0 +1,70 @@
+"""Fewer triangles for a surface, through ``fast-simplification`` (MIT), an optional install.
+
+``manifold3d`` can simplify too, but takes a tolerance instead of a count, and solids only.
+"""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import torch
+
+from reli3d.geometry.mesh import Mesh, weld, welded_faces
+
+_ONE_AT_A_TIME = threading.Lock()  # fast-simplification keeps its mesh in a global
+
+
+def _arrays(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+    """Welded positions ``(W, 3)`` float32 and the faces ``(F, 3)`` int32 that are not degenerate, used ones only."""
+    if not bool(torch.isfinite(mesh.vertices.detach()).all()):
+        raise ValueError("mesh.vertices: expected finite positions, got NaN or infinity")
+    faces, sound = welded_faces(mesh)
+    faces = faces[sound]
+    if not len(faces):
+        raise ValueError("mesh: expected faces with three different corners, got none")
+    positions = mesh.vertices.detach().cpu().numpy()[weld(mesh.vertices)[0].cpu().numpy()]
+    return _used(positions, faces)
+
+
+def _used(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    used, faces = np.unique(faces, return_inverse=True)
+    return positions[used], faces.reshape(-1, 3).astype(np.int32)
+
+
+def _mesh(positions: np.ndarray, faces: np.ndarray, like: Mesh) -> Mesh:
+    device = like.vertices.device
+    return Mesh(
+        torch.from_numpy(np.array(positions, np.float32, order="C")).to(device),
+        torch.from_numpy(np.array(faces, np.int32, order="C")).to(device),
+    )
+
+
+def decimate(mesh: Mesh, faces: int) -> Mesh:
+    """The surface with about ``faces`` triangles, by collapsing edges in the order of their quadric error.
+
+    Works on the welded positions on the CPU.  The result has positions and faces alone, on the device of ``mesh``, and
+    no gradient: normals, UV and tangents belong to the old triangles.
+
+    Garland and Heckbert 1997, Surface simplification using quadric error metrics, through ``fast-simplification``
+    (``pip install 'reli3d[mesh]'``).  The result has at most ``faces`` faces unless no collapse is left that turns no
+    face over, and it may have a few non-manifold edges (:func:`reli3d.geometry.mesh.report` counts them).
+    Deterministic.  A surface that has no more than ``faces`` comes back welded.
+
+    Raises ValueError unless ``faces`` is at least 4 and positions are finite, ImportError without the library.
+    """
+    if faces < 4:
+        raise ValueError(f"faces: expected at least 4, got {faces}")
+    try:
+        from fast_simplification import simplify
+    except ModuleNotFoundError as error:
+        raise ImportError(
+            "fast_simplification is not installed: pip install 'reli3d[mesh]'", name=error.name
+        ) from error
+    positions, triangles = _arrays(mesh)
+    if len(triangles) <= faces:
+        return _mesh(positions, triangles, mesh)
+    centre, size = positions.mean(0, dtype=np.float64), float(np.ptp(positions, axis=0).max())
+    with _ONE_AT_A_TIME:  # unit size: the library's error thresholds are absolute
+        points, triangles = simplify((positions - centre) / size, triangles, target_count=int(faces))
+    return _mesh(*_used(points * size + centre, triangles), mesh)
