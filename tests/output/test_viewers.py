@@ -87,11 +87,14 @@ def of_rgba(rgba: np.ndarray) -> Seen:
     return Seen(rgba[..., 3] > 127, rgba[..., :3])
 
 
-@pytest.mark.parametrize("client", [clients.three_js, clients.model_viewer, clients.blender])
+@pytest.mark.parametrize(
+    "client", [clients.three_js, clients.model_viewer, pytest.param(clients.blender, marks=pytest.mark.slow)]
+)
 def test_a_client_shows_the_light_where_we_do(client, folder, ours):
     agree(of_rgba(client(folder, SHOT)), ours)
 
 
+@pytest.mark.slow  # bpy is a third of a gigabyte, for one version of Python
 def test_blender_shows_the_exports_as_the_glb(folder, tmp_path):
     """A ball of four colours, of which a half is rough and another half is metal: a map that is lost, flipped or taken
     for another gives another picture, as the halves exchanged show.
