@@ -27,13 +27,13 @@ from reli3d.nn.blocks import beside, in_rows
 from reli3d.nn.field import CHUNK, Field, TriplaneField
 from reli3d.nn.local import HEADS, LocalField, LocalReconstructor
 from reli3d.nn.presets import LocalPreset, Preset
-from reli3d.nn.reni import map_directions
 from reli3d.nn.view_features import ViewMaps
 from reli3d.nn.weights import Network, load_model
 from reli3d.prepare import Prepared, completed, prepare, published_input
 from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.environment import Environment
 from reli3d.render.exposure import estimate_paint_and_light
+from reli3d.render.latlong import lat_long_directions
 from reli3d.views.normalize import FAR, normalize
 from reli3d.views.published_views import background_shown, hero_first, placement_notes
 from reli3d.views.similarity import Similarity, output_frame
@@ -223,7 +223,7 @@ def transform_asset(asset: Asset, similarity: Similarity) -> Asset:
     environment = asset.environment
     if environment is not None and not torch.equal(rotation, torch.eye(3).to(rotation)):
         rows = environment.radiance.shape[0]
-        environment = Environment(environment.lookup((map_directions(rows).to(rotation) @ rotation).contiguous()))
+        environment = Environment(environment.lookup((lat_long_directions(rows).to(rotation) @ rotation).contiguous()))
     return replace(asset, mesh=moved, environment=environment)
 
 

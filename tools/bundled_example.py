@@ -15,9 +15,9 @@ import torch
 
 from reli3d.geometry.camera import Camera, camera_rays, look_at
 from reli3d.io.images import write_png
-from reli3d.nn.reni import map_directions
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
+from reli3d.render.latlong import lat_long_directions
 from reli3d.render.shading import ShadeOptions, shade
 from reli3d.synthetic.procedural import FRAME_RADIUS, example_object
 from reli3d.synthetic.samples import EXPOSED, PAINT, ObjectSurface
@@ -35,7 +35,7 @@ SAMPLES = (24, 24, 4)
 
 def room() -> Environment:
     """Warm walls, a dark floor, a bluish window on one side and two lamps in the ceiling."""
-    d = map_directions(128)
+    d = lat_long_directions(128)
     x, y, z = d.unbind(-1)
     light = torch.lerp(torch.tensor([0.10, 0.08, 0.06]), torch.tensor([0.55, 0.50, 0.44]), (y[..., None] + 1) / 2)
     light = light * (1 + 0.3 * torch.sin(3 * torch.atan2(x, -z))[..., None])

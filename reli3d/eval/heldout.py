@@ -22,6 +22,7 @@ from reli3d.pipeline import Network, NoSurface, ReconstructOptions, reconstruct
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import surface_points
+from reli3d.render.latlong import quarter_turn
 from reli3d.synthetic.procedural import make_object
 from reli3d.synthetic.samples import ObjectSurface
 from reli3d.train.light_prior import scale_free
@@ -113,7 +114,7 @@ def evaluate(
         got_all.append(got[both])
         want_all.append(want[both])
     got, want = torch.cat(got_all), torch.cat(want_all)
-    target = sample["environment"].float()
+    target = quarter_turn(sample["environment"].float(), -1)  # stored with -Z in the centre column
     predicted = asset.light.resized(len(target)).radiance
     exposure = target.mean() / mean_light.mean()
     found = {

@@ -1,8 +1,7 @@
 """Environment maps and other linear images: OpenEXR through the OpenEXR package, Radiance RGBE by our own code.
 
-Pixels are linear Rec. 709 radiance, row 0 at the top, +Y of an environment.  The centre column of an environment's file
-looks to +X and right of it lies +Z, as three.js, model-viewer and Blender read it.  In the program the centre column
-looks to -Z and right of it lies +X, as in the published release.  The quarter turn is done here alone.
+Pixels are linear Rec. 709 radiance, row 0 at the top, +Y of an environment.  The centre column of an environment looks
+to +X and right of it lies +Z, in files and in memory, as three.js, model-viewer and Blender read it.
 
 NaN and negative values are never written: they are refused.  Infinity and, in half precision, values above 65504 are
 clamped to 65504 and counted.  On reading, NaN is refused, negative values become 0 and infinity 65504.
@@ -26,47 +25,36 @@ MAX_BYTES = 1 << 28  # MAX_PIXELS of RGBE, run lengths that do not pay, and a he
 
 
 def read_environment(path: str | os.PathLike, *, notes: list[str] | None = None) -> Tensor:
-    """Lat-long map ``(H, 2H, 3)``, float32 linear radiance, centre column -Z, from a ``.hdr`` or ``.exr`` file.
+    """Lat-long map ``(H, 2H, 3)``, float32 linear radiance, from a ``.hdr`` or ``.exr`` file; its content tells which.
 
-    The file's centre column is +X; a map of an odd height is blended by half a texel.  The kind of file is
-    found by its content.  What was clamped is appended to ``notes``.
-    Raises InputError on a broken file, NaN, a shape other than 2:1, or a map above 8192 x 4096.
+    Row 0 is +Y, the centre column +X, right of it +Z.  What was clamped is appended to ``notes``.  Raises InputError on
+    a broken file, NaN, a shape other than 2:1, or a map above 8192 x 4096.
     """
     image = read_hdr_image(path, notes=notes)
     height, width = image.shape[:2]
     if width != 2 * height:
         raise InputError(path, f"size: expected a map twice as wide as high, got {width} x {height}; convert it")
-    return quarter_turn(image, 1)
+    return image
 
 
-def write_environment(path: str | os.PathLike, radiance: Tensor, *, centre: str = "+X") -> int:
-    """Write the map ``radiance`` ``(H, 2H, 3)``, centre column -Z, as ``.exr`` or ``.hdr``, by the ending of ``path``.
+def write_environment(path: str | os.PathLike, radiance: Tensor) -> int:
+    """Write the map ``radiance`` ``(H, 2H, 3)`` as ``.exr`` or ``.hdr``, by the suffix of ``path``.
 
-    centre: where the centre column of the file looks, ``+X`` (which :func:`read_environment` expects) or ``-Z`` (the
-    published release's).  Returns the number of values clamped.  Raises ValueError on NaN, negative values or another
-    shape, OSError where it cannot be written.
+    Returns the number of values clamped.  Raises ValueError on NaN, negative values or another shape, OSError where it
+    cannot be written.
     """
     write = {".exr": write_exr, ".hdr": write_hdr}.get(os.path.splitext(path)[1].lower())
     if write is None:
         raise ValueError(f"path: expected a name that ends in .exr or .hdr, got {shown(os.path.basename(path))}")
-    if centre not in ("+X", "-Z"):
-        raise ValueError(f"centre: expected +X or -Z, got {centre}")
     if radiance.ndim != 3 or radiance.shape[1] != 2 * radiance.shape[0]:
         raise ValueError(f"radiance: expected shape (H, 2H, 3), got {tuple(radiance.shape)}")
-    return write(path, quarter_turn(radiance, -1) if centre == "+X" else radiance)
+    return write(path, radiance)
 
 
 def environment_bytes(radiance: Tensor) -> bytes:
     """What :func:`write_environment` writes into a ``.hdr`` file.  Raises as it does."""
     pixels, _ = _writable(radiance, float(np.finfo(np.float32).max) / 2)
-    return rgbe_bytes(np.ascontiguousarray(quarter_turn(torch.from_numpy(pixels), -1).numpy()))
-
-
-def quarter_turn(radiance: Tensor, sign: int) -> Tensor:
-    """Columns moved right by ``sign`` times a quarter of the width; an odd height needs a mean of two texels."""
-    height = radiance.shape[0]
-    moved = radiance.roll(sign * (height // 2), 1)
-    return moved if height % 2 == 0 else 0.5 * (moved + moved.roll(sign, 1))
+    return rgbe_bytes(pixels)
 
 
 def read_hdr_image(path: str | os.PathLike, *, notes: list[str] | None = None) -> Tensor:

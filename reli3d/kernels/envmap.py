@@ -1,7 +1,7 @@
 """Lat-long environment maps: lookup, importance table, sampling.
 
-Row 0 is +Y; the centre column looks to -Z, right of it +X: with theta = 2 pi u - pi and phi = pi v the direction is
-(sin theta sin phi, cos phi, -cos theta sin phi).  A texel has its centre at ((column + .5) / W, (row + .5) / H).
+Row 0 is +Y; the centre column looks to +X, right of it +Z: with phi = 2 pi u - pi and theta = pi v the direction is
+(cos phi sin theta, cos theta, sin phi sin theta).  A texel has its centre at ((column + .5) / W, (row + .5) / H).
 Radiance is bilinear between centres, periodic in u, constant beyond the first and last row.  Sampling is piecewise
 constant over texels with respect to solid angle; densities are per steradian.
 """
@@ -17,7 +17,7 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": f"-march=
 def direction_to_uv(d: wp.vec3) -> wp.vec2:
     """Map coordinates in [0, 1]^2 of the unit direction ``d``; at the poles u is 0.5 and its slope stays finite."""
     s = safe_sqrt(d[0] * d[0] + d[2] * d[2])
-    return wp.vec2(0.5 + turn_atan2(d[0], -d[2]), 2.0 * turn_atan2(s, d[1]))
+    return wp.vec2(0.5 + turn_atan2(d[2], d[0]), 2.0 * turn_atan2(s, d[1]))
 
 
 @wp.func
@@ -25,7 +25,7 @@ def uv_to_direction(uv: wp.vec2) -> wp.vec3:
     """Unit direction of map coordinates."""
     a = turn_cos_sin(uv[0])
     p = turn_cos_sin(0.5 * uv[1])
-    return wp.vec3(-a[1] * p[1], p[0], a[0] * p[1])
+    return wp.vec3(-a[0] * p[1], p[0], -a[1] * p[1])
 
 
 @wp.struct
@@ -138,7 +138,7 @@ def sample_envmap(
     out = MapSample()
     out.uv = wp.vec2((float(c) + wp.min(in_column, 0.99999)) / float(width), v / float(height))
     turn = turn_cos_sin(out.uv[0])
-    out.direction = wp.vec3(-turn[1] * s, y, turn[0] * s)
+    out.direction = wp.vec3(-turn[0] * s, y, -turn[1] * s)
     return out
 
 
@@ -179,7 +179,7 @@ def lookup_adjoint_kernel(
 ):
     """Adjoints of the lookups from ``first``; an output without rows is left out.  ``g_radiance`` is added to.
 
-    u and v are angles: their slopes are those of atan2(x, -z) / 2 pi and atan2(sqrt(x^2 + z^2), y) / pi.
+    u and v are angles: their derivatives are those of atan2(z, x) / 2 pi and atan2(sqrt(x^2 + z^2), y) / pi.
     """
     i = first + start + wp.tid()
     d = directions[i]

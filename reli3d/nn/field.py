@@ -70,7 +70,7 @@ class Field(ABC):
 
     @abstractmethod
     def radiance_map(self, height: int | None = None) -> Tensor:
-        """Linear radiance ``(H, 2H, 3)``, row 0 is +Y, the centre column -Z; default height the preset's."""
+        """Linear radiance ``(H, 2H, 3)``, row 0 is +Y, the centre column +X; default height the preset's."""
 
     @abstractmethod
     def _level(self, points: Tensor) -> Tensor: ...

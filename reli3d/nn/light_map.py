@@ -2,32 +2,22 @@
 
 A glossy pixel shows the light in its mirror direction, a matt one the light around its normal.  Both are laid into
 lat-long maps; what no pixel shows is completed by convolutions that wrap around the azimuth, so a turn of the world
-about +Y turns the answer.  Layout of the maps: row 0 is +Y, the centre column -Z, right of it +X.
+about +Y turns the answer.  The maps are laid out as :mod:`reli3d.render.latlong`.
 """
 
 from __future__ import annotations
-
-import math
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from reli3d.nn.presets import LightMapSizes
-from reli3d.nn.reni import map_directions
+from reli3d.render.latlong import lat_long_directions, lat_long_texels
 
 BLACK = 0.01  # added to a radiance before its logarithm
 PAINT_FLOOR = 0.04  # of the albedo that a pixel is divided by: a dielectric reflects as much at least
 CHANNELS = 14
 LIMIT = 12.0  # of the logarithm of a radiance: a sun of exp(12)
-
-
-def texel_of(directions: Tensor, height: int) -> Tensor:
-    """Index ``(N,)`` of the texel of a flattened ``(height, 2 height)`` map that holds unit ``directions (N, 3)``."""
-    x, y, z = directions.unbind(-1)
-    row = (y.clamp(-1, 1).acos() * (height / math.pi)).long().clamp(0, height - 1)
-    column = ((torch.atan2(x, -z) + math.pi) * (height / math.pi)).long() % (2 * height)
-    return row * 2 * height + column
 
 
 def gathered(values: Tensor, weight: Tensor, texel: Tensor, height: int) -> tuple[Tensor, Tensor]:
@@ -78,12 +68,14 @@ class LightMap(nn.Module):
         demodulated = log - (albedo + PAINT_FLOOR).log()
         level = (demodulated * facing[:, None]).sum(0) / facing.sum().clamp(min=1e-4)
         scale = 256.0 / max(1, len(radiance))  # weights do not depend on the resolution of the views
-        at_mirror = texel_of(mirror, self.height)
+        at_mirror = lat_long_texels(mirror, self.height)
         shown, shown_weight = gathered(
             torch.cat([log - level, demodulated - level], -1), facing * (0.05 + gloss) * scale, at_mirror, self.height
         )
-        under, under_weight = gathered(demodulated - level, facing * scale, texel_of(normal, self.height), self.height)
-        y = map_directions(self.height, radiance.device)[..., 1][None]
+        under, under_weight = gathered(
+            demodulated - level, facing * scale, lat_long_texels(normal, self.height), self.height
+        )
+        y = lat_long_directions(self.height, device=radiance.device)[..., 1][None]
         rest = torch.cat([y, y.square(), torch.ones_like(y) * level.mean()])
         x = self.first(torch.cat([shown, shown_weight, under, under_weight, rest])[None])
         levels = [x]

@@ -3,6 +3,9 @@
 Source: Gardner, Egger and Smith 2023, "RENI++", arXiv 2311.09361, in the form and with the parameter names of the file
 published with ReLi3D.  An environment is a set of latent 3-vectors; turning them about the vertical turns the map.  The
 decoder works in a z-up frame, D = (z, x, y) of the y-up world direction (x, y, z).  All of it runs in float32.
+
+The published maps have -Z in the centre column and +X right of it; :func:`from_published` and :func:`to_published`
+convert.  Maps of this package are those of :mod:`reli3d.render.latlong`.
 """
 
 from __future__ import annotations
@@ -15,24 +18,21 @@ from torch.nn import functional
 
 from reli3d.nn.heads import truncated_exp
 from reli3d.nn.presets import ReniSizes
+from reli3d.render.latlong import lat_long_directions, quarter_turn
 
 FREQUENCIES = (1.0, 4.0)  # of the positional encoding, without a factor of pi
 VN_EPS = 1.0e-6  # floor of the published vector-neuron ReLU
 NORM2_MIN = 1.0e-20  # squared length: keeps the slope of the square root finite at a zero latent
 
 
-def map_directions(height: int, device: torch.device | None = None) -> Tensor:
-    """Unit world directions of the pixel centres of a lat-long map, ``(height, 2*height, 3)``.
+def from_published(maps: Tensor) -> Tensor:
+    """Lat-long maps ``(..., H, 2H, C)`` with -Z in the centre column, as published, in our mapping; H even."""
+    return quarter_turn(maps, -1)
 
-    Row 0 is +Y; the centre column looks along -Z, the one right of it towards +X.
-    """
-    column, row = (torch.arange(n, dtype=torch.float64, device=device) + 0.5 for n in (2 * height, height))
-    theta = math.pi * column / height - math.pi
-    phi = math.pi * row / height
-    sin_phi = phi.sin()[:, None]
-    up = phi.cos()[:, None].expand(height, 2 * height)
-    directions = torch.stack([theta.sin() * sin_phi, up, -theta.cos() * sin_phi], dim=-1)
-    return directions.to(torch.float32)
+
+def to_published(maps: Tensor) -> Tensor:
+    """Inverse of :func:`from_published`."""
+    return quarter_turn(maps, 1)
 
 
 def reni_frame(directions: Tensor) -> Tensor:
@@ -160,14 +160,14 @@ class ReniField(nn.Module):
 class EnvironmentDecoder(nn.Module):
     """Latents, their rotation and a strength to an environment map."""
 
-    sample_directions: Tensor  # (H * 2H, 3)
+    sample_directions: Tensor  # (H * 2H, 3), in the order of the published map, as its checkpoint has them
 
     def __init__(self, sizes: ReniSizes):
         super().__init__()
         self.height, self.latents = sizes.height, sizes.latents
         self.field = ReniField(sizes)
-        directions = reni_frame(map_directions(sizes.height, torch.device("cpu"))).flatten(0, 1)  # arange: as torch.eye
-        self.register_buffer("sample_directions", directions.to(torch.empty(0).device))
+        directions = to_published(reni_frame(lat_long_directions(sizes.height, device="cpu")))  # arange: as torch.eye
+        self.register_buffer("sample_directions", directions.flatten(0, 1).to(torch.empty(0).device))
 
     def forward(
         self,
@@ -178,16 +178,13 @@ class EnvironmentDecoder(nn.Module):
         *,
         z_rotation: Tensor | None = None,
     ) -> Tensor:
-        """Linear radiance ``(B, H, 2H, 3)``, row 0 up, laid out as :func:`map_directions`.
+        """Linear radiance ``(B, H, 2H, 3)``, row 0 +Y, the centre column +X.
 
         latent: ``(B, L, 3)``.  rotation: ``(B, 3, 3)`` applied to every latent.  strength: ``(B,)``, natural logarithm
         of a factor.  z_rotation: ``(B,)`` radians; turns the map by twice this angle, as published.
         """
         height = height or self.height
-        if height == self.height:
-            directions = self.sample_directions.unsqueeze(0)
-        else:
-            directions = reni_frame(map_directions(height, latent.device)).reshape(1, -1, 3)
+        directions = reni_frame(lat_long_directions(height, device=latent.device)).reshape(1, -1, 3)
         if z_rotation is not None:
             directions = directions @ _turn(-2.0 * z_rotation)
         radiance = self.radiance(latent, rotation, strength, directions)

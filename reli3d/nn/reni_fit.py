@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from reli3d.nn.reni import EnvironmentDecoder, map_directions, reni_frame
+from reli3d.nn.reni import EnvironmentDecoder, reni_frame
+from reli3d.render.latlong import lat_long_directions
 
 FLOOR = 1e-2  # of the geometric mean: darker counts as this dark
 RATES = 0.1, 1e-3  # step of Adam at the start and the end
@@ -31,7 +32,7 @@ def fit_latent(
 ) -> LightFit:
     """Latents and strength whose decoded map is nearest to ``radiance``.
 
-    radiance: ``(H, 2H, 3)`` linear, at least 0, row 0 up, laid out as :func:`~reli3d.nn.reni.map_directions`, on the
+    radiance: ``(H, 2H, 3)`` linear, at least 0, row 0 up, laid out as :mod:`reli3d.render.latlong`, on the
     decoder's device; H at least 8.  steps: of Adam, each on ``rays`` texels of the map, drawn evenly over the sphere.
     The strength starts at the logarithm of the geometric mean.  The loss is the difference of logarithms, floored at a
     hundredth of the mean, and one minus the cosine of the colours, which sees the lamps.  The decoder stays as it is.
@@ -80,6 +81,6 @@ def _rays(decoder: EnvironmentDecoder, radiance: Tensor) -> tuple[Tensor, Tensor
         raise ValueError(f"radiance: expected device {decoder.sample_directions.device}, got {radiance.device}")
     if not bool(radiance.isfinite().all()) or bool((radiance < 0).any()) or not bool(radiance.any()):
         raise ValueError("radiance: expected finite light of at least 0, got NaN, infinity, negative or black")
-    directions = reni_frame(map_directions(height, radiance.device)).reshape(-1, 3)
+    directions = reni_frame(lat_long_directions(height, device=radiance.device)).reshape(-1, 3)
     rows = torch.sin((torch.arange(height, device=radiance.device) + 0.5) * math.pi / height)
     return directions, radiance.detach().reshape(-1, 3), rows.repeat_interleave(2 * height)

@@ -22,6 +22,7 @@ from reli3d.io.glb import glb_bytes
 from reli3d.io.hdr import write_environment
 from reli3d.io.images import png_bytes, write_png
 from reli3d.nn.blocks import beside
+from reli3d.nn.reni import to_published
 from reli3d.nn.weights import Manifest
 from reli3d.output.folder import claimed
 from reli3d.output.viewer import Shown, photograph_stops, shadow, viewer_page
@@ -160,7 +161,7 @@ def write_results(
         for name in ("environment.exr", "environment.hdr"):
             write_environment(new / name, radiance)
         if compatible:
-            write_environment(new / PUBLISHED_LIGHT, radiance, centre="-Z")
+            write_environment(new / PUBLISHED_LIGHT, to_published(radiance))
         if comparison is not None:
             write_png(new / COMPARISON, comparison)
         (new / "viewer.html").write_text(encoded.page(), encoding="utf-8")

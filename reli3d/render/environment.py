@@ -1,6 +1,6 @@
 """Distant light as a lat-long map: lookup with gradients, importance table, sampling.
 
-The direction mapping stands in ``reli3d.kernels.envmap``: row 0 is +Y, the centre column -Z, right of it +X.
+The mapping is that of :mod:`reli3d.render.latlong`: row 0 is +Y, the centre column +X, right of it +Z.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from torch import Tensor
 
 from reli3d._bridge import SLICE_MIN, check, empty, launch, once_differentiable, over_slices, slices, tensor_of
 from reli3d.kernels import envmap as kernels
+from reli3d.render.latlong import lat_long_directions, texel_solid_angles
 
 _LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709
 
@@ -42,12 +43,6 @@ class EnvironmentTable:
             (self.row_guide, wp.int32),
             (self.column_guide, wp.int32),
         ]
-
-
-def texel_solid_angles(height: int, width: int, device: torch.device | None = None) -> Tensor:
-    """Solid angle [sr] of a texel in each row, ``(H,)`` float64; times W they sum to 4 pi."""
-    edges = torch.cos(torch.linspace(0.0, torch.pi, height + 1, dtype=torch.float64, device=device))
-    return (edges[:-1] - edges[1:]) * (2.0 * torch.pi / width)
 
 
 @dataclass(frozen=True)
@@ -95,12 +90,9 @@ class Environment:
         Gradients reach the texels.
         """
         height, width = self.radiance.shape[:2]
-        phi = (torch.arange(width, dtype=torch.float64) + 0.5) * (2 * torch.pi / width)
-        theta = (torch.arange(height, dtype=torch.float64) + 0.5) * (torch.pi / height)
-        across = theta.sin()[:, None] * torch.stack([phi.cos(), phi.sin()])[:, None]  # (2, H, W), any zero of azimuth
-        directions = torch.cat([across.reshape(2, -1), theta.cos()[:, None].expand(-1, width).reshape(1, -1)])
+        directions = lat_long_directions(height, width, dtype=torch.float64).reshape(-1, 3)
         angle = texel_solid_angles(height, width)[:, None].expand(-1, width).reshape(-1)
-        weight = ((directions.T @ directions).clamp(min=0.0) * angle).to(self.radiance)
+        weight = ((directions @ directions.T).clamp(min=0.0) * angle).to(self.radiance)
         return Environment((weight @ self.radiance.reshape(-1, 3)).reshape(self.radiance.shape))
 
     def rotated(self, yaw: float) -> Environment:

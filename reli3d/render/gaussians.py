@@ -16,7 +16,8 @@ from torch.nn.functional import normalize, softplus
 
 from reli3d._bridge import call, check, expect
 from reli3d.kernels import sg as kernels
-from reli3d.render.environment import Environment, texel_solid_angles
+from reli3d.render.environment import Environment
+from reli3d.render.latlong import lat_long_directions, texel_solid_angles
 from reli3d.render.points import SurfacePoints, nan_where_not_finite, of_rows
 
 GOLDEN = 0.6180339887498949  # turns between neighbours of a spiral: the slowest to come round
@@ -55,7 +56,7 @@ class SphericalGaussians:
 
     def environment(self, height: int) -> Environment:
         """The mixture at the texel centres of a lat-long map of ``height`` x 2 ``height``."""
-        return Environment(self.lookup(_texel_directions(height, 2 * height, self.axis.device)))
+        return Environment(self.lookup(lat_long_directions(height, device=self.axis.device)))
 
     def _sum(self, kernel, name: str, at: Tensor) -> Tensor:
         check(name, at, last=3, like=self.axis)
@@ -120,19 +121,11 @@ def fit_gaussians(environment: Environment, count: int, *, steps: int = 0, rate:
     axis, density = spread.sample(u)
     texel = float(angle.max())
     sharpness = (OVERLAP * density * count).clamp(max=OVERLAP / texel)  # none sharper than the map can show
-    directions = _texel_directions(height, width, device).reshape(-1, 3)
+    directions = lat_long_directions(height, width, device=device).reshape(-1, 3)
     weight = angle.repeat_interleave(width)
     target = radiance.reshape(-1, 3)
     amplitude = _solve_amplitudes(directions, weight, target.double(), axis, sharpness)
     return _refine(directions, weight.float(), target, axis, sharpness, amplitude.float(), texel, steps, rate)
-
-
-def _texel_directions(height: int, width: int, device: torch.device) -> Tensor:
-    """Directions ``(H, W, 3)`` of texel centres, by the mapping of ``reli3d.kernels.envmap``."""
-    phi = ((torch.arange(height, dtype=torch.float64, device=device) + 0.5) / height * torch.pi)[:, None]
-    theta = ((torch.arange(width, dtype=torch.float64, device=device) + 0.5) / width * 2.0 - 1.0) * torch.pi
-    x, z = torch.sin(theta) * torch.sin(phi), -torch.cos(theta) * torch.sin(phi)
-    return torch.stack([x, torch.cos(phi).expand_as(x), z], -1).float()
 
 
 def _moments(directions: Tensor) -> Tensor:

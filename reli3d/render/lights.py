@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from reli3d.render.environment import Environment, texel_solid_angles
+from reli3d.render.environment import Environment
+from reli3d.render.latlong import lat_long_directions, texel_solid_angles
 
 SUN_RADIUS = 0.055  # rad, twelve times the real one: a texel of a small map is 0.05 wide
 SUN_SHARE = 0.45  # of all the light
@@ -25,7 +26,7 @@ SOFTBOXES = (  # direction of the middle, half width and half height [tangents o
 
 def studio(height: int = 64) -> Environment:
     """A grey room with four softboxes: a key at the left, a strip at the right, one behind and one above."""
-    d = _directions(height)
+    d = lat_long_directions(height)
     y = d[..., 1:2]
     light = (0.22 + 0.12 * y).expand(-1, -1, 3)
     edge = 2.0 * math.pi / height  # a softbox fades over two texels
@@ -42,7 +43,7 @@ def studio(height: int = 64) -> Environment:
 
 def sky(height: int = 64) -> Environment:
     """A clear sky over brown ground, the sun 40 degrees high in front at the right."""
-    d = _directions(height)
+    d = lat_long_directions(height)
     y = d[..., 1:2]
     up = torch.lerp(torch.tensor([0.75, 0.85, 1.0]), torch.tensor([0.16, 0.36, 0.85]), y.clamp(min=0.0).sqrt())
     ground = torch.tensor([0.2, 0.17, 0.13])
@@ -54,14 +55,6 @@ def sky(height: int = 64) -> Environment:
 
 
 LIGHTS = {"studio": studio, "sky": sky}
-
-
-def _directions(height: int) -> Tensor:
-    """``(H, 2H, 3)`` unit directions of the texels' centres, laid out as :mod:`reli3d.kernels.envmap` has them."""
-    theta = (torch.arange(2 * height) + 0.5) * (math.pi / height) - math.pi
-    phi = ((torch.arange(height) + 0.5) * (math.pi / height))[:, None]
-    up = phi.cos().expand(-1, 2 * height)
-    return torch.stack([theta.sin() * phi.sin(), up, -theta.cos() * phi.sin()], -1)
 
 
 def _mean(light: Tensor) -> float:

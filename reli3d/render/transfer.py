@@ -15,7 +15,8 @@ from torch import Tensor
 from reli3d._bridge import check, present
 from reli3d.geometry.mesh import Mesh, weld_rows
 from reli3d.geometry.rays import RayScene
-from reli3d.render.environment import Environment, texel_solid_angles
+from reli3d.render.environment import Environment
+from reli3d.render.latlong import lat_long_directions, texel_solid_angles
 
 HEIGHT = 0.05  # of a mean edge, from where rays start: above the facets of a smooth surface that is convex
 
@@ -50,9 +51,7 @@ def spherical_harmonics(directions: Tensor) -> Tensor:
 def light_harmonics(light: Environment) -> Tensor:
     """Coefficients ``(16, 3)`` of a light: its texels' solid angles times their values, summed in float64."""
     height, width = light.radiance.shape[:2]
-    phi = (torch.arange(width, dtype=torch.float64) + 0.5) * (2.0 * math.pi / width) - math.pi
-    theta = (torch.arange(height, dtype=torch.float64)[:, None] + 0.5) * (math.pi / height)
-    d = torch.stack([phi.sin() * theta.sin(), theta.cos().expand(-1, width), -phi.cos() * theta.sin()], -1)
+    d = lat_long_directions(height, width, dtype=torch.float64)
     weight = spherical_harmonics(d) * texel_solid_angles(height, width)[:, None, None]
     return torch.einsum("hwk,hwc->kc", weight, light.radiance.detach().cpu().double()).float()
 

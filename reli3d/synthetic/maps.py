@@ -9,14 +9,17 @@ import torch
 from torch import Tensor
 
 from reli3d.io.files import InputError, file_size, shown
+from reli3d.render.latlong import lat_long_directions, quarter_turn, texel_solid_angles
 
 ROWS = 64
 HELD_BACK = 6  # every sixth map is left out of the fit and of all training
 
 
 def load_maps(path: Path) -> tuple[Tensor, list[str]]:
-    """Maps ``(n, 64, 128, 3)`` linear, row 0 up, area-averaged, and their names, from an .npz of ``env`` and
-    ``names``.  Raises InputError for anything else.
+    """Maps ``(n, 64, 128, 3)``, linear, area-averaged, the centre column +X, and their names, of an ``.npz``.
+
+    The file has ``env (n, H, 2H, 3)``, linear, row 0 +Y, the centre column -Z and right of it +X, and ``names``.
+    Raises InputError for anything else.
     """
     file_size(path)
     try:
@@ -32,7 +35,7 @@ def load_maps(path: Path) -> tuple[Tensor, list[str]]:
         raise InputError(path, f"names: expected {len(env)}, one a map, got {len(names)}")
     maps = torch.as_tensor(env.astype(np.float32)).permute(0, 3, 1, 2)
     maps = torch.nn.functional.interpolate(maps, (ROWS, 2 * ROWS), mode="area").permute(0, 2, 3, 1)
-    return maps.contiguous(), names
+    return quarter_turn(maps, -1).contiguous(), names  # the file has -Z in the centre column
 
 
 def held_back(names: list[str]) -> list[bool]:
@@ -50,11 +53,8 @@ def training_maps(path: Path) -> Tensor:
 def with_lamps(light: Tensor, rng: np.random.Generator) -> Tensor:
     """The lat-long map ``(H, 2H, 3)`` with one to three lamps: soft discs that bring a good part of its light."""
     rows = light.shape[0]
-    theta, phi = torch.meshgrid(
-        (torch.arange(rows) + 0.5) * np.pi / rows, (torch.arange(2 * rows) + 0.5) * np.pi / rows, indexing="ij"
-    )
-    directions = torch.stack([theta.sin() * phi.cos(), theta.cos(), theta.sin() * phi.sin()], -1)
-    area = theta.sin()[..., None]
+    directions = lat_long_directions(rows)
+    area = texel_solid_angles(rows, 2 * rows).float()[:, None, None]
     total = float((light.mean(-1, keepdim=True) * area).sum())
     out = light.clone()
     for _ in range(int(rng.integers(1, 4))):

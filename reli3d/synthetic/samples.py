@@ -19,6 +19,7 @@ from reli3d.geometry.rays import RayScene
 from reli3d.geometry.visibility import visible_from
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
+from reli3d.render.latlong import quarter_turn
 from reli3d.render.points import SurfacePoints
 from reli3d.render.shading import ShadeOptions, shade
 from reli3d.synthetic.procedural import ProceduralObject, sample_cameras
@@ -146,7 +147,8 @@ def render_sample(
     pooled = torch.nn.functional.interpolate(
         (environment.radiance * exposure).permute(2, 0, 1)[None], (32, 64), mode="area"
     )
-    sample["environment"] = pooled[0].permute(1, 2, 0).clamp(max=6e4).half()
+    # stored with -Z in the centre column, as samples always were
+    sample["environment"] = quarter_turn(pooled[0].permute(1, 2, 0), 1).clamp(max=6e4).half()
     if not views_only:
         sample.update(pixels=torch.stack(pixels).half(), pixel_radiance=torch.stack(pixel_radiance).half())
         sample.update(_volume(surface, rng), **_surface_points(surface, cameras, rng))

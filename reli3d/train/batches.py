@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from reli3d.geometry.hull import mask_distance
-from reli3d.nn.reni import map_directions
+from reli3d.render.latlong import lat_long_directions, quarter_turn
 from reli3d.train.relight import Finish, draw_light, relit
 
 TURNED_UP = 0.12  # share of objects whose world is not +Y up: captures come in any frame
@@ -98,7 +98,7 @@ def load_sample(
         images, c2w, intrinsics = of_views("images").float() / 255, of_views("c2w"), of_views("intrinsics")
         of_pixels = of_views("view_material").float() / 255
         normal, depth = of_views("view_normal").float() / 127, of_views("view_depth").float()
-        light = file.get_tensor("environment").float()
+        light = quarter_turn(file.get_tensor("environment").float(), -1)  # stored with -Z in the centre column
     valid = depth > 0
     if augment and lights is not None and rng.random() < RELIT:
         finish = Finish.draw(rng)
@@ -148,7 +148,7 @@ def load_sample(
         surface=surface @ turn.T,
         material=material,
         visible=visible,
-        light_directions=map_directions(light.shape[0]).reshape(-1, 3) @ turn.T,
+        light_directions=lat_long_directions(light.shape[0]).reshape(-1, 3) @ turn.T,
         light=light.reshape(-1, 3),
     )
 

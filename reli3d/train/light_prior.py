@@ -19,8 +19,9 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from reli3d.nn.presets import OFFICIAL, TINY
-from reli3d.nn.reni import EnvironmentDecoder, map_directions, reni_frame
+from reli3d.nn.reni import EnvironmentDecoder, reni_frame
 from reli3d.nn.reni_fit import fit_latent
+from reli3d.render.latlong import lat_long_directions
 from reli3d.synthetic.maps import ROWS, held_back, load_maps
 
 FLOOR = 1e-2  # of the geometric mean: darker is black
@@ -66,7 +67,7 @@ def fit(
     base = [1e-2, 1e-3]
     groups = zip(([latents], list(decoder.field.parameters())), base, strict=True)
     optimizer = torch.optim.Adam([{"params": values, "lr": rate} for values, rate in groups])
-    directions, flat = reni_frame(map_directions(ROWS)).reshape(-1, 3), maps.reshape(len(maps), -1, 3)
+    directions, flat = reni_frame(lat_long_directions(ROWS)).reshape(-1, 3), maps.reshape(len(maps), -1, 3)
     height = torch.sin((torch.arange(ROWS) + 0.5) * torch.pi / ROWS).repeat_interleave(2 * ROWS)
     began, mean = time.monotonic(), 0.0
     for step in range(steps):

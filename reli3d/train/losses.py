@@ -8,6 +8,7 @@ from torch.nn import functional
 
 from reli3d.nn.local import LocalField, LocalReconstructor, PixelMaps
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
+from reli3d.render.environment import Environment
 from reli3d.train.batches import Pictures, Sample
 from reli3d.train.pixels import Group, predicted
 
@@ -173,7 +174,7 @@ def _light(field: LocalField, sample: Sample) -> dict[str, Tensor]:
     count = len(sample.light)
     rows = int((count // 2) ** 0.5)
     angle = torch.sin((torch.arange(count) // (2 * rows) + 0.5) * torch.pi / rows).to(log)
-    got = _lookup(log, sample.light_directions)
+    got = Environment(log.permute(1, 2, 0).contiguous()).lookup(sample.light_directions)
     error = torch.logaddexp(got, got.new_tensor(-4.6)) - (sample.light + 0.01).log()
     angle = angle / angle.sum()
     level = (error * angle[:, None]).sum(0)
@@ -187,14 +188,3 @@ def _light(field: LocalField, sample: Sample) -> dict[str, Tensor]:
         "light_level": level.abs().mean(),
         "irradiance": (under - under.mean(0)).abs().mean(),
     }
-
-
-def _lookup(log: Tensor, directions: Tensor) -> Tensor:
-    """Bilinear values ``(N, 3)`` of the lat-long map ``log (3, H, 2H)``, periodic in azimuth."""
-    x, y, z = directions.unbind(-1)
-    wrapped = functional.pad(log[None], (1, 1, 0, 0), mode="circular")
-    width = log.shape[2]
-    u = (torch.atan2(x, -z) + torch.pi) / (2 * torch.pi) * width + 1.0  # in texels of the padded map
-    v = y.clamp(-1, 1).acos() / torch.pi * 2 - 1
-    at = torch.stack([2 * u / (width + 2) - 1, v], -1)[None, None]
-    return functional.grid_sample(wrapped, at, align_corners=False, padding_mode="border")[0, :, 0].T

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from reli3d.cli import data, objects
-from reli3d.nn.reni import map_directions
+from reli3d.render.latlong import lat_long_directions
 from tests.support.checkout import ROOT
 
 COUNT = 6
@@ -22,7 +22,7 @@ PLACES = [pytest.param(["--workers", "2"], id="processes"), pytest.param(["--ray
 @pytest.fixture(scope="module")
 def maps(tmp_path_factory):
     path = tmp_path_factory.mktemp("maps") / "maps.npz"
-    sky = 0.2 + 3.0 * map_directions(16)[..., :1].clamp(min=0).expand(-1, -1, 3).numpy()
+    sky = 0.2 + 3.0 * lat_long_directions(16)[..., :1].clamp(min=0).expand(-1, -1, 3).numpy()
     np.savez(path, env=np.stack([sky * (1 + 0.2 * k) for k in range(6)]), names=[f"m{k}" for k in range(6)])
     return path
 

@@ -10,11 +10,11 @@ from reli3d.eval import heldout
 from reli3d.eval.heldout import evaluate, light_error, mean_environment, scaled_square_error, square_error, summary
 from reli3d.eval.heldout import table as table_of
 from reli3d.geometry.mesh import Mesh
-from reli3d.nn.reni import map_directions
 from reli3d.nn.weights import load_model
 from reli3d.pipeline import NoSurface
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.render.environment import Environment
+from reli3d.render.latlong import lat_long_directions
 from reli3d.synthetic.procedural import make_object
 from reli3d.synthetic.samples import ObjectSurface, synthesize
 
@@ -28,7 +28,7 @@ def test_a_factor_a_channel_is_forgiven_and_a_pattern_is_not():
 
 
 def test_light_error_forgives_exposure_alone():
-    sky = 0.5 + map_directions(32)[..., 1:2].clamp(min=0).expand(-1, -1, 3)
+    sky = 0.5 + lat_long_directions(32)[..., 1:2].clamp(min=0).expand(-1, -1, 3)
     assert light_error(sky * 7.0 + 0.06, sky) < 1e-3  # 0.06 = 6 * 0.01: the floor is scaled too
     assert light_error(sky.flip(0), sky) > 0.3
 
@@ -69,10 +69,10 @@ def test_an_empty_field_counts_as_nothing_found_and_spoils_no_mean(monkeypatch):
 def test_the_shipped_weights_beat_a_guess_on_an_object(tmp_path):
     """One held-back object end to end: shape far better than chance, light better than the mean of two other skies."""
     seed = 1_000_000_002
-    light = 0.2 + 3.0 * map_directions(32)[..., 1:2].clamp(min=0).expand(-1, -1, 3).contiguous()
+    light = 0.2 + 3.0 * lat_long_directions(32)[..., 1:2].clamp(min=0).expand(-1, -1, 3).contiguous()
     sample = synthesize(ObjectSurface(make_object(seed)), light, np.random.default_rng(seed), views=12)
     mean = mean_environment(
-        torch.stack([torch.ones(32, 64, 3), 0.2 + map_directions(32)[..., :1].abs().expand(-1, -1, 3)])
+        torch.stack([torch.ones(32, 64, 3), 0.2 + lat_long_directions(32)[..., :1].abs().expand(-1, -1, 3)])
     )
     got = evaluate(load_model("small"), sample, seed, 4, mean)
     assert got["iou"] > 0.6

@@ -13,8 +13,8 @@ from reli3d.cli import tables
 from reli3d.eval import objects
 from reli3d.eval.metrics import geometry, psnr, ssim, surface_samples
 from reli3d.io.glb import write_glb
-from reli3d.nn.reni import map_directions
 from reli3d.render.environment import Environment
+from reli3d.render.latlong import lat_long_directions
 from tests.support import small_scene
 
 
@@ -62,7 +62,7 @@ def test_psnr_and_ssim_of_known_pictures():
 def place(tmp_path_factory):
     folder = tmp_path_factory.mktemp("tables")
     write_glb(folder / "ball.glb", replace(small_scene.ball(), environment=None))
-    sky = (0.3 + map_directions(64).clamp(min=0)).numpy()[None].repeat(12, 0)
+    sky = (0.3 + lat_long_directions(64).clamp(min=0)).numpy()[None].repeat(12, 0)
     names = [f"{k:02d}" for k in range(12)]
     np.savez(folder / "maps.npz", env=sky * (1 + np.arange(12)[:, None, None, None] / 12), names=names)
     return folder

@@ -12,13 +12,13 @@ from reli3d.geometry.camera import Camera, image_plane, look_at, project
 from reli3d.geometry.hull import mask_distance
 from reli3d.geometry.projection import spread_views
 from reli3d.geometry.symmetry import MirrorPlane
-from reli3d.nn.light_map import LightMap, gathered, texel_of
+from reli3d.nn.light_map import LightMap, gathered
 from reli3d.nn.local import LocalReconstructor, PixelMaps, mean_logit
 from reli3d.nn.presets import SMALL, LightMapSizes, PyramidSizes, VolumeSizes
 from reli3d.nn.pyramid import place_of_pixels, span_of_pixels
-from reli3d.nn.reni import map_directions
 from reli3d.nn.view_features import ViewMaps, ahead_of_surface
 from reli3d.nn.volume import FeatureVolume
+from reli3d.render.latlong import lat_long_directions, lat_long_texels
 
 TINY = dataclasses.replace(
     SMALL,
@@ -152,17 +152,17 @@ def test_a_turn_of_the_world_turns_the_light(model):
     yaw = 2 * math.pi * 4 / 32
     with torch.no_grad():
         other = encoded(model, images, masks, turned(c2w, yaw), intrinsics).log_light
-        expected = torch.roll(field.log_light, -4, 2)  # from -Z, the centre, towards -X, which lies to the left
+        expected = torch.roll(field.log_light, -4, 2)  # from +X, the centre, towards -Z, which lies to the left
         wrong = torch.roll(field.log_light, 4, 2)
         # pixels beside the border of a texel may fall to its other side: 2 to 4 % with four seeds of the weights
         assert float((other - expected).abs().mean()) < 0.06 * float((wrong - expected).abs().mean())
 
 
 def test_directions_fall_into_their_own_texels():
-    flat = map_directions(16).reshape(-1, 3)
-    assert torch.equal(texel_of(flat, 16), torch.arange(512))
+    flat = lat_long_directions(16).reshape(-1, 3)
+    assert torch.equal(lat_long_texels(flat, 16), torch.arange(512))
     values, weight = torch.randn(512, 2), torch.rand(512) + 0.5
-    mean, total = gathered(values, weight, texel_of(flat, 16), 16)
+    mean, total = gathered(values, weight, lat_long_texels(flat, 16), 16)
     torch.testing.assert_close(mean.reshape(2, -1).T, values, rtol=1e-6, atol=1e-6)
     torch.testing.assert_close(total.reshape(-1), torch.log1p(weight))
 
@@ -178,7 +178,7 @@ def test_a_mirror_shows_the_light_where_it_reflects_it():
         light(torch.ones(1, 3), torch.full((1, 3), 0.5), torch.ones(1), normal, wo)
     weight = seen[0][6]  # after six means
     assert int((weight > 0).sum()) == 1
-    assert int(weight.argmax()) == int(texel_of(mirror, 16))  # the view from +Y goes towards +Z
+    assert int(weight.argmax()) == int(lat_long_texels(mirror, 16))  # the view from +Y goes towards +Z
 
 
 def test_pixels_start_as_what_they_show(model):

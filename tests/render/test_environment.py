@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from reli3d.nn.reni import from_published
 from reli3d.render.environment import Environment
+from reli3d.render.latlong import lat_long_directions, lat_long_texels, quarter_turn
 from tests.support import chi2, mitsuba_scene, reference
 
 
@@ -36,13 +38,23 @@ def maps():
 
 def test_axes_are_those_of_the_convention(device):
     marks = torch.zeros(4, 8, 3, device=device)
-    marks[:, 3:5, 0] = 1.0  # centre: -Z
-    marks[:, 5:7, 1] = 1.0  # right of it: +X
+    marks[:, 3:5, 0] = 1.0  # centre: +X
+    marks[:, 5:7, 1] = 1.0  # right of it: +Z
     marks[0, :, 2] = 1.0  # first row: +Y
     env = Environment(marks)
-    axes = torch.tensor([[0.0, 0, -1], [1, 0, 0], [0, 0, 1], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], device=device)
+    axes = torch.tensor([[1.0, 0, 0], [0, 0, 1], [-1, 0, 0], [0, 0, -1], [0, 1, 0], [0, -1, 0]], device=device)
     want = torch.tensor([[1.0, 0, 0], [0, 1, 0], [0, 0, 0], [0, 0, 0], [1, 0, 1], [1, 0, 0]], device=device)
     torch.testing.assert_close(env.lookup(axes), want, atol=1e-5, rtol=0)  # at a pole u is 0.5
+
+
+def test_texels_are_found_from_their_directions_and_looked_up_there(device):
+    d = lat_long_directions(16, device=device)
+    assert torch.equal(lat_long_texels(d, 16), torch.arange(512, device=device).reshape(16, 32))
+    radiance = torch.rand(16, 32, 3, generator=torch.Generator().manual_seed(2)).to(device)
+    # u errs by 1e-7, a texel is 1 / 32 wide
+    torch.testing.assert_close(Environment(radiance).lookup(d), radiance, atol=1e-5, rtol=0)
+    with pytest.raises(ValueError, match="maps: expected a width that is a multiple of 4, got 6"):
+        quarter_turn(torch.ones(3, 6, 3), 1)
 
 
 def test_directions_of_the_published_parametrisation(goldens):
@@ -51,7 +63,7 @@ def test_directions_of_the_published_parametrisation(goldens):
     ramp = torch.zeros(64, 128, 3)
     ramp[..., 0] = (torch.arange(128) + 0.5) / 128
     ramp[..., 1] = ((torch.arange(64) + 0.5) / 64)[:, None]
-    got = Environment(ramp).lookup(want)[:, :2].numpy()
+    got = Environment(from_published(ramp)).lookup(want)[:, :2].numpy()
     inside = (uv[:, 0] > 0.01) & (uv[:, 0] < 0.99) & (uv[:, 1] > 0.01) & (uv[:, 1] < 0.99)
     assert np.abs(got - uv)[inside].max() < 1e-5
 
@@ -113,12 +125,12 @@ def test_density_is_the_light_of_a_texel_by_its_solid_angle(device, name):
     for a, b in ((0.25, 0.25), (0.25, 0.75), (0.75, 0.25), (0.75, 0.75)):
         phi = ((torch.arange(width).double() + a) / width - 0.5) * 2.0 * math.pi
         theta = (torch.arange(height).double()[:, None] + b) / height * math.pi
-        axes = [theta.sin() * phi.sin(), theta.cos().expand(height, width), -theta.sin() * phi.cos()]
+        axes = [theta.sin() * phi.cos(), theta.cos().expand(height, width), theta.sin() * phi.sin()]
         mean += reference.lookup_envmap(light, torch.stack(axes, -1))[..., 0] / 4.0
     edge = torch.cos(torch.arange(height + 1).double() / height * math.pi)
     angle = (edge[:-1] - edge[1:])[:, None] * 2.0 * math.pi / width
     d = directions(20_000, 4).double()
-    across = (torch.atan2(d[:, 0], -d[:, 2]) / (2.0 * math.pi) + 0.5) * width
+    across = (torch.atan2(d[:, 2], d[:, 0]) / (2.0 * math.pi) + 0.5) * width
     down = torch.acos(d[:, 1]) / math.pi * height
     inside = ((across - across.round()).abs() > 1e-4) & ((down - down.round()).abs() > 1e-4)  # off a texel's border
     d, column, row = d[inside], across[inside].long(), down[inside].long()

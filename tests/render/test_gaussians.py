@@ -7,8 +7,9 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from reli3d.render.environment import Environment, texel_solid_angles
+from reli3d.render.environment import Environment
 from reli3d.render.gaussians import SphericalGaussians, fit_gaussians, shade_gaussians
+from reli3d.render.latlong import texel_solid_angles
 from tests.support import reference
 from tests.support.surfaces import on_ball
 

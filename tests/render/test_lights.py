@@ -5,7 +5,8 @@ import math
 import pytest
 import torch
 
-from reli3d.render.environment import Environment, texel_solid_angles
+from reli3d.render.environment import Environment
+from reli3d.render.latlong import texel_solid_angles
 from reli3d.render.lights import LIGHTS, sky, studio
 
 

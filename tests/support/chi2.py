@@ -66,12 +66,12 @@ class Map:
 
     def places(self, d: Tensor) -> tuple[Tensor, Tensor]:
         x, y, z = d.double().unbind(-1)
-        return torch.atan2(torch.hypot(x, z), y) / math.pi, torch.atan2(x, -z) / (2 * math.pi) + 0.5
+        return torch.atan2(torch.hypot(x, z), y) / math.pi, torch.atan2(z, x) / (2 * math.pi) + 0.5
 
     def at(self, y: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
         theta, turn = math.pi * y, 2 * math.pi * x
         s = theta.sin()
-        return torch.stack([-turn.sin() * s, theta.cos(), turn.cos() * s], -1), s * (2 * math.pi**2)
+        return torch.stack([-turn.cos() * s, theta.cos(), -turn.sin() * s], -1), s * (2 * math.pi**2)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from safetensors.torch import save_file
 from reli3d.geometry.camera import Camera, look_at
 from reli3d.nn.model import Reconstructor
 from reli3d.nn.presets import TINY
-from reli3d.nn.reni import map_directions
+from reli3d.render.latlong import lat_long_directions
 from reli3d.synthetic.procedural import make_object
 from reli3d.synthetic.samples import ObjectSurface, synthesize
 
@@ -44,7 +44,7 @@ def camera(size: int) -> Camera:
 
 def write_samples(folder: Path, seeds=(3, 12), views: int = 4) -> Path:
     """Samples of 48 pixels under a sky that is bright towards +X."""
-    light = 0.2 + 3.0 * map_directions(32)[..., :1].clamp(min=0).expand(-1, -1, 3).contiguous()
+    light = 0.2 + 3.0 * lat_long_directions(32)[..., :1].clamp(min=0).expand(-1, -1, 3).contiguous()
     for seed in seeds:
         sample = synthesize(ObjectSurface(make_object(seed)), light, np.random.default_rng(seed), size=48, views=views)
         save_file(sample, folder / f"{seed:010d}.safetensors")

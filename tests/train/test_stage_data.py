@@ -16,7 +16,7 @@ from reli3d.io.files import InputError
 from reli3d.io.shards import INDEX, read_index
 from reli3d.nn.model import Reconstructor
 from reli3d.nn.presets import TINY
-from reli3d.nn.reni import map_directions
+from reli3d.render.latlong import lat_long_directions
 from reli3d.train.stages.captures import Captures
 from reli3d.train.stages.config import Stage
 from reli3d.train.stages.latents import fitted, load_prior
@@ -184,7 +184,7 @@ def test_latents_decode_to_the_light_and_are_kept(samples, tmp_path):
     latent, strength = found[files[0].stem]
     with torch.no_grad():
         radiance = model.environment(latent[None], torch.eye(3)[None], strength[None], 16)[0]
-    bright = radiance.mean(-1)[map_directions(16)[..., 0].abs() > 0.8]
+    bright = radiance.mean(-1)[lat_long_directions(16)[..., 0].abs() > 0.8]
     assert float(bright.max()) > 1.3 * float(bright.min())  # by a decoder that nothing was taught
     other = fitted(model.environment, files[:1], tmp_path / "cache", steps=40)
     assert not torch.equal(other[files[0].stem][0], latent)  # another number of steps is another fit

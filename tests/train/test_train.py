@@ -13,9 +13,9 @@ from reli3d.geometry.camera import Camera, project
 from reli3d.geometry.hull import hull_distance
 from reli3d.nn.local import LocalReconstructor
 from reli3d.nn.presets import OFFICIAL, SMALL
-from reli3d.nn.reni import map_directions
 from reli3d.nn.weights import load_model
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
+from reli3d.render.latlong import lat_long_directions
 from reli3d.train.batches import batches, random_turn
 from reli3d.train.light_prior import fit, scale_free
 from reli3d.train.loop import (
@@ -243,7 +243,7 @@ def test_the_light_prior_fits_a_map():
     torch.manual_seed(0)
     from reli3d.nn.reni import EnvironmentDecoder
 
-    maps = scale_free(0.3 + map_directions(64)[None, ..., 1:2].clamp(min=0).expand(-1, -1, -1, 3) * 2.0)
+    maps = scale_free(0.3 + lat_long_directions(64)[None, ..., 1:2].clamp(min=0).expand(-1, -1, -1, 3) * 2.0)
     decoder = EnvironmentDecoder(OFFICIAL.reni)
     latents = fit(decoder, maps, steps=60, minutes=5.0, rays=256, batch=1)
     with torch.no_grad():

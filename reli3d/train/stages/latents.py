@@ -14,6 +14,7 @@ from reli3d.io.files import InputError, replacing
 from reli3d.nn.model import Reconstructor
 from reli3d.nn.reni import EnvironmentDecoder
 from reli3d.nn.reni_fit import fit_latent
+from reli3d.render.latlong import quarter_turn
 
 Latents = dict[str, tuple[Tensor, Tensor]]  # of a file's stem: (L, 3) and ()
 
@@ -57,7 +58,7 @@ def fitted(
     missing = [p for p in files if f"{p.stem}.latent" not in known]
     for done, path in enumerate(missing):
         with safe_open(path, "pt") as file:
-            light = file.get_tensor("environment").float()
+            light = quarter_turn(file.get_tensor("environment").float(), -1)  # stored with -Z in the centre column
         found = fit_latent(decoder, light.to(decoder.sample_directions.device), steps=steps)
         known[f"{path.stem}.latent"], known[f"{path.stem}.strength"] = found.latent.cpu(), found.strength.cpu()
         if done % 16 == 15:

@@ -1,0 +1,56 @@
+"""Lat-long maps: directions of texels, texels of directions, solid angles.
+
+A map has H rows and W columns, normally W = 2 H.  Row 0 is +Y; the centre column looks to +X and right of it lies +Z:
+with phi = 2 pi (u - 1/2) and theta = pi v the direction is (cos phi sin theta, cos theta, sin phi sin theta).  Texel
+centres are at u = (column + 1/2) / W, v = (row + 1/2) / H.  ``reli3d.kernels.envmap`` has the same mapping for kernels.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+
+def lat_long_directions(
+    height: int,
+    width: int | None = None,
+    *,
+    device: torch.device | str | None = None,
+    dtype: torch.dtype = torch.float32,
+) -> Tensor:
+    """Unit directions ``(height, width, 3)`` of the texel centres, rounded from float64; ``width`` is 2 ``height``."""
+    width = 2 * height if width is None else width
+    phi = (torch.arange(width, dtype=torch.float64, device=device) + 0.5) * (2.0 * math.pi / width) - math.pi
+    theta = ((torch.arange(height, dtype=torch.float64, device=device) + 0.5) * (math.pi / height))[:, None]
+    up = theta.cos().expand(height, width)
+    return torch.stack([phi.cos() * theta.sin(), up, phi.sin() * theta.sin()], -1).to(dtype)
+
+
+def lat_long_texels(directions: Tensor, height: int) -> Tensor:
+    """Index ``(...)``, int64, of the texel of a flattened ``(height, 2 height)`` map that holds unit ``directions (...,
+    3)``.
+    """
+    x, y, z = directions.unbind(-1)
+    row = (y.clamp(-1.0, 1.0).acos() * (height / math.pi)).long().clamp(0, height - 1)
+    column = ((torch.atan2(z, x) + math.pi) * (height / math.pi)).long() % (2 * height)
+    return row * 2 * height + column
+
+
+def texel_solid_angles(height: int, width: int, device: torch.device | None = None) -> Tensor:
+    """Solid angle [sr] of a texel in each row, ``(height,)`` float64; times ``width`` they sum to 4 pi."""
+    edges = torch.cos(torch.linspace(0.0, math.pi, height + 1, dtype=torch.float64, device=device))
+    return (edges[:-1] - edges[1:]) * (2.0 * math.pi / width)
+
+
+def quarter_turn(maps: Tensor, quarters: int) -> Tensor:
+    """``maps (..., H, W, C)`` with columns moved right by ``quarters`` quarters of the width.
+
+    By -1 a map whose centre column looks to -Z, as published, gets +X there.  Raises ValueError unless W is a multiple
+    of 4.
+    """
+    width = maps.shape[-2]
+    if width % 4:
+        raise ValueError(f"maps: expected a width that is a multiple of 4, got {width}")
+    return maps.roll(quarters * (width // 4), -2)
