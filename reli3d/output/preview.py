@@ -15,7 +15,6 @@ from torch.nn.functional import interpolate, normalize, pad
 from reli3d.geometry.camera import Camera, look_at
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene
-from reli3d.io.hdr import quarter_turn
 from reli3d.nn.blocks import beside
 from reli3d.render.asset import Asset
 from reli3d.render.color import linear_to_srgb
@@ -178,7 +177,7 @@ def _maps(shot: Render) -> list[Tensor]:
 
 def _map(light: Environment) -> Tensor:
     """The light as a tile of half the height."""
-    radiance = quarter_turn(light.radiance, -1)
+    radiance = light.radiance
     shown = linear_to_srgb((radiance * (MEAN / radiance.mean().clamp(min=1e-6))).clamp(0, 1)).permute(2, 0, 1)[None]
     return interpolate(shown, (TILE // 2, TILE), mode="bilinear", align_corners=False)[0].permute(1, 2, 0)
 
