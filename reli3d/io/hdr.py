@@ -1,4 +1,4 @@
-"""Environment maps and other linear images: OpenEXR through the OpenEXR package, Radiance RGBE by our own code.
+"""Environment maps and other linear images, in OpenEXR (``exr.py``) or Radiance RGBE (``rgbe.py``).
 
 Pixels are linear Rec. 709 radiance, row 0 at the top, +Y of an environment.  The centre column of an environment looks
 to +X and right of it lies +Z, in files and in memory, as three.js, model-viewer and Blender read it.
@@ -16,19 +16,20 @@ import OpenEXR
 import torch
 from torch import Tensor
 
-from reli3d.io.exr_header import read_exr_header
-from reli3d.io.files import InputError, file_size, read_bytes, replacing, shown, write_bytes
+from reli3d.io.exr import read_exr
+from reli3d.io.files import InputError, file_size, replacing, shown, write_bytes
+from reli3d.io.rgbe import read_rgbe, rgbe_bytes
 
 HALF_MAX = 65504.0  # largest finite half
 MAX_PIXELS = 1 << 25  # 8192 x 4096
-MAX_BYTES = 1 << 28  # MAX_PIXELS of RGBE, run lengths that do not pay, and a header
 
 
 def read_environment(path: str | os.PathLike, *, notes: list[str] | None = None) -> Tensor:
     """Lat-long map ``(H, 2H, 3)``, float32 linear radiance, from a ``.hdr`` or ``.exr`` file; its content tells which.
 
-    Row 0 is +Y, the centre column +X, right of it +Z.  What was clamped is appended to ``notes``.  Raises InputError on
-    a broken file, NaN, a shape other than 2:1, or a map above 8192 x 4096.
+    Row 0 is +Y, the center column +X, right of it +Z.  What was converted, clamped or not applied is appended to
+    ``notes``, one line each.  Raises InputError on a broken file, NaN, a shape other than 2:1, or a map above
+    8192 x 4096.
     """
     image = read_hdr_image(path, notes=notes)
     height, width = image.shape[:2]
@@ -58,22 +59,34 @@ def environment_bytes(radiance: Tensor) -> bytes:
 
 
 def read_hdr_image(path: str | os.PathLike, *, notes: list[str] | None = None) -> Tensor:
-    """Linear image ``(H, W, 3)``, float32, finite and not negative, of a ``.hdr`` or ``.exr`` file (see the module)."""
+    """Linear Rec. 709 image ``(H, W, 3)``, float32, finite and not negative, of a ``.hdr`` or ``.exr`` file.
+
+    An OpenEXR file gives its display window, black outside its data.  Colors of other primaries are converted.
+    ``notes`` and errors as :func:`read_environment`.
+    """
     file_size(path)  # raises for a pipe, which would block
     try:
         with open(path, "rb") as file:
             start = file.read(4)
     except OSError as error:
         raise InputError(path, f"cannot be read ({error.strerror or error}); check its permissions") from None
-    pixels = _read_exr(path) if start == b"\x76\x2f\x31\x01" else _read_rgbe(path)
+    found: list[str] = []
+    pixels, matrix = (read_exr if start == b"\x76\x2f\x31\x01" else read_rgbe)(path, MAX_PIXELS, found)
     if np.isnan(pixels).any():
         count = int(np.isnan(pixels).any(-1).sum())
         raise InputError(path, f"pixels: expected numbers, got NaN at {count} pixels; render it again")
-    high, low = np.isposinf(pixels), pixels < 0
-    if notes is not None and (high.any() or low.any()):
+    infinite = np.isinf(pixels)
+    high = infinite & (pixels > 0)
+    pixels[infinite] = np.copysign(np.float32(HALF_MAX), pixels[infinite])  # finite before channels are mixed
+    if matrix is not None:
+        pixels = (pixels @ matrix.T).astype(np.float32)
+    low = pixels < 0
+    pixels[low] = 0.0
+    if high.any() or low.any():
         counts = f"{int(high.sum())} infinite values set to 65504, {int(low.sum())} negative to 0"
-        notes.append(f"{os.path.basename(path)}: {counts}")
-    pixels[high], pixels[low] = HALF_MAX, 0.0
+        found.append(f"{os.path.basename(path)}: {counts}")
+    if notes is not None:
+        notes += found
     return torch.from_numpy(pixels)
 
 
@@ -116,151 +129,3 @@ def _writable(image: Tensor, limit: float, layouts: tuple[tuple[int, ...], ...] 
         raise ValueError(f"image: expected values >= 0, got NaN or negative at {int((~(pixels >= 0)).sum())} places")
     over = pixels > limit
     return np.ascontiguousarray(np.where(over, np.float32(HALF_MAX), pixels)), int(over.sum())
-
-
-def _read_exr(path) -> np.ndarray:
-    header = read_exr_header(path)
-    if header.width * header.height > MAX_PIXELS:
-        size = f"{header.width} x {header.height}"
-        raise InputError(path, f"size: expected at most {MAX_PIXELS} pixels, got {size}; scale the map down")
-    names = [n for n in "RGB" if n in header.channels] or [n for n in "Y" if n in header.channels]
-    if len(names) not in (1, 3) or names == ["R"]:
-        got = shown(sorted(header.channels))
-        raise InputError(path, f"channels: expected R, G, B or Y, got {got}; save as plain RGB")
-    try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            planes = [np.asarray(file.channels()[n].pixels, dtype=np.float32) for n in names]
-    except Exception as error:  # the binding raises RuntimeError, ValueError, TypeError ... for a broken file
-        raise InputError(path, f"pixels: cannot be decoded ({shown(str(error))}); save the file again") from None
-    if any(p.shape != (header.height, header.width) for p in planes):
-        raise InputError(path, "pixels: expected the size of the header; save the file again")
-    return np.stack(planes * (3 // len(planes)), axis=-1)
-
-
-# Radiance RGBE.  Source: Ward, Real Pixels, Graphics Gems II (1991), and the file format notes of Radiance.  A pixel is
-# three mantissas and the exponent they share: value = mantissa / 256 * 2 ** (exponent - 128).
-
-
-def rgbe_bytes(pixels: np.ndarray) -> bytes:
-    """Radiance file of ``(H, W, 3)`` float32 pixels, finite and not negative."""
-    height, width = pixels.shape[:2]
-    quads = _to_rgbe(pixels)
-    out = bytearray(f"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y {height} +X {width}\n".encode())
-    if not 8 <= width < 32768:  # the run-length form has no place for other widths
-        return bytes(out) + quads.tobytes()
-    lead = bytes((2, 2, width >> 8, width & 255))
-    for row in quads:
-        out += lead
-        for channel in range(4):
-            _pack(out, np.ascontiguousarray(row[:, channel]))
-    return bytes(out)
-
-
-def _to_rgbe(pixels: np.ndarray) -> np.ndarray:
-    largest = pixels.max(axis=-1)
-    _, exponent = np.frexp(largest.astype(np.float64))
-    rounded_up = np.rint(np.ldexp(largest.astype(np.float64), 8 - exponent)) > 255  # 256 does not fit the byte
-    exponent += rounded_up.astype(exponent.dtype)
-    mantissa = np.rint(np.ldexp(pixels.astype(np.float64), (8 - exponent)[..., None]))
-    quads = np.concatenate((mantissa, (exponent + 128)[..., None]), axis=-1)
-    quads[(exponent < -127) | (largest == 0)] = 0  # below 2e-39 the format has only zero
-    return quads.astype(np.uint8)
-
-
-def _pack(out: bytearray, line: np.ndarray) -> None:
-    """Append one channel of a scanline: runs of 4 to 127 equal bytes, the rest in literals of up to 128."""
-    data = line.tobytes()
-    starts = np.flatnonzero(np.concatenate(([True], line[1:] != line[:-1])))
-    lengths = np.diff(np.append(starts, len(line)))
-    literal = 0  # first byte not yet written
-    for start, length in zip(starts[lengths >= 4].tolist(), lengths[lengths >= 4].tolist()):
-        _literals(out, data[literal:start])
-        literal = start + length
-        while length > 0:
-            part = min(length, 127)
-            out += bytes((128 + part, data[start]))
-            length -= part
-    _literals(out, data[literal:])
-
-
-def _literals(out: bytearray, data: bytes) -> None:
-    for at in range(0, len(data), 128):
-        part = data[at : at + 128]
-        out.append(len(part))
-        out += part
-
-
-def _read_rgbe(path) -> np.ndarray:
-    data = read_bytes(path, MAX_BYTES)
-    if data[:10] != b"#?RADIANCE" and data[:6] != b"#?RGBE":
-        raise InputError(path, "expected a Radiance .hdr or OpenEXR .exr file, got something else; convert the map")
-    end = data.find(b"\n\n", 0, 1 << 16)
-    line_end = data.find(b"\n", end + 2, end + 2 + 256)
-    if end < 0 or line_end < 0:
-        raise InputError(path, "header: expected an empty line and a resolution line, got neither; save the file again")
-    exposure = 1.0
-    for line in data[:end].split(b"\n"):
-        key, _, value = line.partition(b"=")
-        if key == b"FORMAT" and value.strip() != b"32-bit_rle_rgbe":
-            got = shown(value.decode("latin-1"))
-            raise InputError(path, f"FORMAT: expected 32-bit_rle_rgbe, got {got}; convert to RGB")
-        if key == b"EXPOSURE":
-            exposure *= _positive(path, "EXPOSURE", value)
-    words = data[end + 2 : line_end].split()
-    if len(words) != 4 or words[0] != b"-Y" or words[2] != b"+X" or not (words[1] + words[3]).isdigit():
-        size = data[end + 2 : line_end].decode("latin-1")
-        raise InputError(path, f"resolution: expected '-Y height +X width', got {shown(size)}; save the file again")
-    if len(words[1]) > 8 or len(words[3]) > 8 or not 0 < int(words[1]) * int(words[3]) <= MAX_PIXELS:
-        size = f"{shown(words[3].decode())} x {shown(words[1].decode())}"
-        raise InputError(path, f"resolution: expected 1 to {MAX_PIXELS} pixels, got {size}; scale the map down")
-    height, width = int(words[1]), int(words[3])
-    quads = _unpack(path, data, line_end + 1, height, width)
-    scale = np.ldexp(np.float64(1 / exposure), quads[..., 3].astype(np.int32) - 136)
-    pixels = quads[..., :3] * np.where(quads[..., 3] == 0, 0.0, scale)[..., None]
-    with np.errstate(over="ignore"):  # a tiny EXPOSURE; the caller clamps infinity
-        return pixels.astype(np.float32)
-
-
-def _positive(path, field: str, value: bytes) -> float:
-    try:
-        number = float(value)
-    except ValueError:
-        number = 0.0
-    if not 1e-12 < number < 1e12:
-        got = shown(value.decode("latin-1"))
-        raise InputError(path, f"{field}: expected a positive number, got {got}; correct the header")
-    return number
-
-
-def _unpack(path, data: bytes, at: int, height: int, width: int) -> np.ndarray:
-    truncated = InputError(path, "pixels: expected all scanlines, got a shorter or broken file; save the file again")
-    if data[at : at + 2] != b"\2\2" or not 8 <= width < 32768:
-        need = 4 * height * width
-        if len(data) - at < need:
-            raise truncated  # the run lengths of before 1991 end here as well
-        return np.frombuffer(data, np.uint8, need, at).reshape(height, width, 4)
-    if len(data) - at < height * (4 + 8 * -(-width // 127)):  # the shortest scanline that the format can hold
-        raise truncated
-    lead, planes = bytes((2, 2, width >> 8, width & 255)), []
-    for _ in range(height):
-        if data[at : at + 4] != lead:
-            raise truncated
-        at += 4
-        line = bytearray()
-        for channel in range(1, 5):
-            while len(line) < channel * width:
-                if at + 1 >= len(data):
-                    raise truncated
-                count = data[at]
-                if count > 128:
-                    line += data[at + 1 : at + 2] * (count - 128)
-                    at += 2
-                else:
-                    line += data[at + 1 : at + 1 + count]
-                    at += 1 + count
-                if count == 0:
-                    raise truncated
-            if len(line) != channel * width:  # a run may not cross into the next channel
-                raise truncated
-        planes.append(line)
-    return np.frombuffer(b"".join(planes), np.uint8).reshape(height, 4, width).transpose(0, 2, 1)

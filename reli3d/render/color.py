@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -16,6 +19,8 @@ _AGX_OUT = (
     (-0.0528968517574562, 1.15190312990417, -0.0989611768448433),
     (-0.0529716355144438, -0.0980434501171241, 1.15107367264116),
 )
+_REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)  # x, y of red, green, blue and white (D65)
+_BRADFORD = ((0.8951, 0.2664, -0.1614), (-0.7502, 1.7135, 0.0367), (0.0389, -0.0685, 1.0296))  # XYZ to cone responses
 _AGX_EV = (-12.47393, 4.026069)  # log2 range mapped to [0, 1]
 
 
@@ -50,3 +55,34 @@ def agx(radiance: Tensor) -> Tensor:
     curve = (-0.01 + 1.053 / (1.0 + torch.exp(-8.1282 * (x - 0.6152)))).clamp(min=0.0)
     linear = (curve @ radiance.new_tensor(_AGX_OUT).T).clamp(0.0, 1.0) ** 2.2
     return linear_to_srgb(linear)
+
+
+def rec709_from_primaries(primaries: Sequence[float]) -> np.ndarray | None:
+    """Matrix ``(3, 3)`` float64 that takes linear RGB of other primaries to Rec. 709; None where they are the same.
+
+    primaries: CIE 1931 x, y of red, green, blue and white, eight numbers.  White is adapted by the Bradford transform
+    (Lam 1985), so that equal RGB stays equal.  Up to a difference of 1e-3 primaries are the same.  Raises ValueError
+    unless they span a space with positive white.
+    """
+    xy = np.array(primaries, np.float64)
+    if xy.shape != (8,) or not np.isfinite(xy).all() or np.abs(xy).max() > 10.0:
+        raise ValueError(f"primaries: expected eight numbers, got {primaries}")
+    if np.abs(xy - _REC709).max() <= 1e-3:
+        return None
+    (source, white), (target, d65) = _xyz_from_rgb(xy), _xyz_from_rgb(np.array(_REC709))
+    cones = np.array(_BRADFORD)
+    adapted = np.linalg.inv(cones) @ np.diag((cones @ d65) / (cones @ white)) @ cones
+    return np.linalg.inv(target) @ adapted @ source
+
+
+def _xyz_from_rgb(xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Matrix from RGB to XYZ and the XYZ of white at Y = 1 (SMPTE RP 177)."""
+    x, y = xy[0::2], xy[1::2]
+    columns = np.stack([x, y, 1.0 - x - y])[:, :3]
+    if abs(np.linalg.det(columns)) < 1e-4 or y[3] < 1e-2:
+        raise ValueError(f"primaries: expected a triangle and a white, got {xy.tolist()}")
+    white = np.array([x[3], y[3], 1.0 - x[3] - y[3]]) / y[3]
+    scale = np.linalg.solve(columns, white)
+    if not (scale > 0.0).all():
+        raise ValueError(f"primaries: expected white within their triangle, got {xy.tolist()}")
+    return columns * scale, white

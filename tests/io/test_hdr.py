@@ -1,4 +1,5 @@
 import math
+import struct
 
 import numpy as np
 import OpenEXR
@@ -156,6 +157,23 @@ def test_an_environment_is_refused_by_name_and_shape(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def window(*corners: int) -> tuple[np.ndarray, np.ndarray]:
+    """Left, top, right, bottom, all inside, as the binding takes them."""
+    return np.array(corners[:2], np.int32), np.array(corners[2:], np.int32)
+
+
+def tiles(mode) -> OpenEXR.TileDescription:
+    description = OpenEXR.TileDescription()
+    description.xSize, description.ySize, description.mode = 16, 16, mode
+    return description
+
+
+def exr(path, planes: dict, **header) -> None:
+    """An EXR file written by OpenEXR itself."""
+    with OpenEXR.File({"type": OpenEXR.scanlineimage, **header}, dict(planes)) as file:
+        file.write(str(path))
+
+
 @pytest.mark.parametrize(
     "options, dtype",
     [
@@ -163,16 +181,18 @@ def test_an_environment_is_refused_by_name_and_shape(tmp_path):
         ({"compression": OpenEXR.NO_COMPRESSION}, np.float16),
         ({"compression": OpenEXR.RLE_COMPRESSION}, np.float32),
         ({"compression": OpenEXR.ZIPS_COMPRESSION}, np.float16),
+        ({"compression": OpenEXR.ZIP_COMPRESSION}, np.uint32),
+        ({"type": OpenEXR.tiledimage, "tiles": tiles(OpenEXR.ONE_LEVEL)}, np.float32),
     ],
 )
 def test_exr_of_other_writers_reads(tmp_path, options, dtype):
-    planes = {c: np.random.default_rng(0).random((40, 80)).astype(dtype) for c in ("A", "B", "G", "R", "Z")}
-    window = (np.array([3, 7], np.int32), np.array([82, 46], np.int32))
-    header = {"type": OpenEXR.scanlineimage, "dataWindow": window, **options}
-    with OpenEXR.File(header, dict(planes)) as file:
-        file.write(str(tmp_path / "a.exr"))
-    got = read_hdr_image(tmp_path / "a.exr")
-    assert np.array_equal(got.numpy(), np.stack([planes[c] for c in "RGB"], -1).astype(np.float32))
+    rng = np.random.default_rng(0)
+    planes = {c: (rng.random((40, 80), np.float32) * 9).astype(dtype) for c in ("A", "B", "G", "R", "Z")}
+    place = {"dataWindow": window(3, 7, 82, 46), "displayWindow": window(3, 7, 82, 46)}
+    exr(tmp_path / "a.exr", planes, **place, **options)
+    notes: list[str] = []
+    got = read_hdr_image(tmp_path / "a.exr", notes=notes)
+    assert np.array_equal(got.numpy(), np.stack([planes[c] for c in "RGB"], -1).astype(np.float32)) and not notes
 
 
 def test_grey_and_cleaned_pixels(tmp_path):
@@ -191,10 +211,225 @@ def test_grey_and_cleaned_pixels(tmp_path):
         read_hdr_image(tmp_path / "a.exr")
 
 
-def test_exposure_of_the_header_is_divided_out(tmp_path):
-    data = rgbe_bytes(np.ones((4, 8, 3), np.float32)).replace(b"\n\n", b"\nEXPOSURE= 2.0\nEXPOSURE=4\n\n", 1)
-    (tmp_path / "a.hdr").write_bytes(data)
-    assert float(read_hdr_image(tmp_path / "a.hdr").max()) == 0.125
+@pytest.mark.parametrize(
+    "display",
+    [(0, 0, 31, 15), (2, 3, 9, 6), (-5, -4, 12, 5), (4, 2, 20, 3), (20, 2, 30, 4), (-9, 2, -2, 4), (0, 9, 7, 12)],
+)
+def test_the_display_window_is_the_image(tmp_path, display):
+    rng = np.random.default_rng(1)
+    planes, (left, top, right, bottom) = {c: rng.random((4, 8), np.float32) for c in "RGB"}, display
+    exr(tmp_path / "a.exr", planes, dataWindow=window(2, 3, 9, 6), displayWindow=window(*display))
+    notes: list[str] = []
+    got = read_hdr_image(tmp_path / "a.exr", notes=notes).numpy()
+    assert got.shape == (bottom - top + 1, right - left + 1, 3)
+    for y in range(top, bottom + 1):
+        for x in range(left, right + 1):
+            inside = 2 <= x <= 9 and 3 <= y <= 6
+            want = [planes[c][y - 3, x - 2] for c in "RGB"] if inside else [0.0] * 3
+            assert got[y - top, x - left].tolist() == want
+    assert [("dataWindow" in note) for note in notes] == ([True] if display != (2, 3, 9, 6) else [])
+
+
+REC2020 = (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, 0.3127, 0.3290)
+AP1 = (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767)
+AP0 = (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767)
+TO_REC709 = {  # ITU-R BT.2087-0; ACES with Bradford's adaptation, as OpenColorIO's built-in transforms have it
+    REC2020: [[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]],
+    AP1: [[1.70505, -0.62179, -0.08326], [-0.13026, 1.14080, -0.01055], [-0.02400, -0.12897, 1.15297]],
+    AP0: [[2.52169, -1.13413, -0.38756], [-0.27648, 1.37272, -0.09624], [-0.01538, -0.15298, 1.16835]],
+}
+INSIDE = np.array([[0.5, 0.4, 0.3], [0.2, 0.25, 0.2], [0.9, 0.9, 0.9], [0.3, 0.4, 0.5]], np.float32)  # of every gamut
+
+
+@pytest.mark.parametrize(
+    "header, primaries",
+    [
+        ({"chromaticities": REC2020}, REC2020),
+        ({"chromaticities": AP1}, AP1),
+        ({"colorInteropID": "lin_ap1_scene"}, AP1),
+        ({"colorInteropID": "lin_rec2020_scene"}, REC2020),
+        ({"acesImageContainerFlag": 1}, AP0),
+        ({"chromaticities": (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)}, None),
+        ({"colorInteropID": "lin_rec709_scene"}, None),
+    ],
+)
+def test_primaries_of_an_exr_are_converted(tmp_path, header, primaries):
+    image = np.tile(INSIDE, (3, 2, 1))
+    exr(tmp_path / "a.exr", {c: np.ascontiguousarray(image[..., k]) for k, c in enumerate("RGB")}, **header)
+    notes: list[str] = []
+    got = read_hdr_image(tmp_path / "a.exr", notes=notes).numpy()
+    want = image @ np.array(TO_REC709[primaries] if primaries else np.eye(3)).T
+    np.testing.assert_allclose(got, want, rtol=0, atol=2e-4)  # the recommendation has four digits
+    assert len(notes) == bool(primaries) and all("Rec. 709" in note for note in notes)
+
+
+def test_primaries_of_a_radiance_picture_are_converted(tmp_path):
+    image = np.tile(INSIDE, (4, 2, 1))
+    write_hdr(tmp_path / "a.hdr", torch.from_numpy(image))
+    stored = read_hdr_image(tmp_path / "a.hdr").numpy()
+    line = b"\nPRIMARIES= " + " ".join(map(str, REC2020)).encode() + b"\n\n"
+    (tmp_path / "b.hdr").write_bytes((tmp_path / "a.hdr").read_bytes().replace(b"\n\n", line, 1))
+    got = read_hdr_image(tmp_path / "b.hdr").numpy()
+    np.testing.assert_allclose(got, stored @ np.array(TO_REC709[REC2020]).T, rtol=0, atol=2e-4)
+
+
+def test_colors_outside_rec709_are_clamped_and_counted(tmp_path):
+    exr(tmp_path / "a.exr", {c: np.full((2, 4), float(c == "G"), np.float32) for c in "RGB"}, chromaticities=AP1)
+    notes: list[str] = []
+    assert read_hdr_image(tmp_path / "a.exr", notes=notes)[0, 0].tolist() == pytest.approx([0, 1.1408, 0], abs=1e-4)
+    assert notes[1] == "a.exr: 0 infinite values set to 65504, 16 negative to 0"
+
+
+PLANE = np.ones((4, 8), np.float32)
+
+
+@pytest.mark.parametrize(
+    "planes, header, said",
+    [
+        ({"Y": PLANE, "RY": PLANE, "BY": PLANE}, {}, "channels: expected R, G, B or Y, got"),
+        ({"R": PLANE, "G": PLANE}, {}, "channels: expected R, G, B or Y, got"),
+        ({"left.R": PLANE, "left.G": PLANE, "left.B": PLANE}, {}, "channels: expected R, G, B or Y, got"),
+        ({"Y": PLANE}, {"type": OpenEXR.tiledimage, "tiles": tiles(OpenEXR.MIPMAP_LEVELS)}, "EXR tiles: expected one"),
+        ({"Y": PLANE}, {"envmap": OpenEXR.ENVMAP_CUBE}, "envmap: expected a lat-long map"),
+        ({"Y": PLANE}, {"chromaticities": (0.3,) * 8}, "chromaticities: expected primaries and a white"),
+        ({"Y": PLANE}, {"colorInteropID": "srgb_rec709_scene"}, "colorInteropID: expected a linear RGB space"),
+    ],
+)
+def test_an_exr_that_would_be_misread_is_refused(tmp_path, planes, header, said):
+    exr(tmp_path / "a.exr", planes, **header)
+    with pytest.raises(InputError, match=said):
+        read_hdr_image(tmp_path / "a.exr")
+
+
+def test_subsampled_channels_are_refused(tmp_path):
+    exr(tmp_path / "a.exr", {"Y": PLANE})
+    data, steps = (tmp_path / "a.exr").read_bytes(), [struct.pack("<iIii", 2, 0, n, n) for n in (1, 2)]
+    (tmp_path / "a.exr").write_bytes(data.replace(*steps))
+    with pytest.raises(InputError, match="channels: expected one sample for each pixel"):
+        read_hdr_image(tmp_path / "a.exr")
+
+
+def test_several_parts_are_refused(tmp_path):
+    parts = [OpenEXR.Part({}, {c: PLANE.copy() for c in "RGB"}, name) for name in ("a", "b")]
+    with OpenEXR.File(parts) as file:
+        file.write(str(tmp_path / "a.exr"))
+    with pytest.raises(InputError, match="EXR kind: expected one flat image"):
+        read_hdr_image(tmp_path / "a.exr")
+
+
+def test_what_is_not_applied_is_noted(tmp_path):
+    exr(tmp_path / "a.exr", {"Y": PLANE}, envmap=OpenEXR.ENVMAP_LATLONG, pixelAspectRatio=2.0)
+    write_hdr(tmp_path / "b.hdr", torch.ones(4, 8, 3))
+    data = (tmp_path / "b.hdr").read_bytes().replace(b"\n\n", b"\nPIXASPECT=0.5\n\n", 1)
+    (tmp_path / "b.hdr").write_bytes(data)
+    notes: list[str] = []
+    for name in ("a.exr", "b.hdr"):
+        read_environment(tmp_path / name, notes=notes)
+    assert [note.split(":")[1].split()[0] for note in notes] == ["envmap", "pixelAspectRatio", "PIXASPECT"]
+
+
+QUADS = np.random.default_rng(5).integers(0, 256, (6, 12, 4), dtype=np.uint8)
+QUADS[..., 3] = 128  # value: mantissa over 256
+HEAD = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n"
+
+
+def picture(path, resolution: str, pixels: bytes, head: bytes = HEAD) -> np.ndarray:
+    """Mantissas that are read from a file of ``pixels``."""
+    path.write_bytes(head + resolution.encode() + b"\n" + pixels)
+    return np.rint(read_hdr_image(path).numpy() * 256)
+
+
+@pytest.mark.parametrize(
+    "resolution, placed",
+    [  # how the rows of a picture lie in the file: Radiance's "File Formats", resolution string
+        ("-Y 6 +X 12", lambda q: q),
+        ("-Y 6 -X 12", lambda q: q[:, ::-1]),
+        ("+Y 6 -X 12", lambda q: q[::-1, ::-1]),
+        ("+Y 6 +X 12", lambda q: q[::-1]),
+        ("+X 12 -Y 6", lambda q: q.transpose(1, 0, 2)),
+        ("-X 12 -Y 6", lambda q: q[:, ::-1].transpose(1, 0, 2)),
+        ("-X 12 +Y 6", lambda q: q[::-1, ::-1].transpose(1, 0, 2)),
+        ("+X 12 +Y 6", lambda q: q[::-1].transpose(1, 0, 2)),
+    ],
+)
+def test_pictures_of_all_orientations(tmp_path, resolution, placed):
+    got = picture(tmp_path / "a.hdr", resolution, placed(QUADS).tobytes())
+    assert np.array_equal(got, QUADS[..., :3])
+
+
+@pytest.mark.parametrize("first", [(2, 2, 128, 9), (2, 2, 255, 128), (2, 2, 0, 128), (2, 2, 1, 12), (2, 3, 0, 12)])
+def test_flat_pixels_that_begin_like_run_lengths(tmp_path, first):
+    quads = QUADS.copy()
+    quads[0, 0] = quads[3, 0] = first
+    got = picture(tmp_path / "a.hdr", "-Y 6 +X 12", quads.tobytes())
+    want = quads[..., :3] * 2.0 ** (quads[..., 3:].astype(float) - 128)
+    assert np.array_equal(got, np.rint(want))
+
+
+def test_run_lengths_of_before_1991(tmp_path):
+    """(1, 1, 1, n) repeats the pixel before; repeats in a row are the bytes of one count, the lowest first."""
+    a, b, c = bytes((9, 8, 7, 128)), bytes((1, 1, 2, 128)), bytes((200, 2, 2, 128))
+
+    def again(n):
+        return bytes((1, 1, 1, n))
+
+    lines = a + again(0) + again(1) + b * 2 + c + again(41)  # 1 + 256 + 2 + 1 + 41 pixels
+    lines += b + again(44) + again(1)  # 1 + 44 + 256 pixels
+    lines += c * 300 + again(200)  # more than the scanline has
+    got = picture(tmp_path / "a.hdr", "-Y 3 +X 301", lines)
+    want = [[a] * 257 + [b] * 2 + [c] * 42, [b] * 301, [c] * 301]
+    assert np.array_equal(got, np.frombuffer(b"".join(sum(want, [])), np.uint8).reshape(3, 301, 4)[..., :3])
+    for broken in (a * 200, a + again(10)):
+        with pytest.raises(InputError, match="pixels: expected all scanlines"):
+            picture(tmp_path / "b.hdr", "-Y 1 +X 301", broken)
+
+
+def test_scanlines_of_several_kinds_in_one_picture(tmp_path):
+    rle = bytes((2, 2, 0, 12)) + b"".join(b"\x0c" + QUADS[1, :, k].tobytes() for k in range(4))
+    old = QUADS[2].copy()
+    old[5:] = old[4]
+    pixels = QUADS[0].tobytes() + rle + old[:5].tobytes() + bytes((1, 1, 1, 7))
+    got = picture(tmp_path / "a.hdr", "-Y 3 +X 12", pixels)
+    assert np.array_equal(got, np.stack([*QUADS[:2], old])[..., :3])
+
+
+@pytest.mark.parametrize(
+    "head, factor",
+    [
+        (b"#?RADIANCE\nEXPOSURE=2\nEXPOSURE= 0.25\nFORMAT=32-bit_rle_rgbe\n\n", [2, 2, 2]),
+        (b"#?RADIANCE\nCOLORCORR=2 1 0.5\nCOLORCORR= 1 4 1\nEXPOSURE=0.5\n\n", [1, 0.5, 4]),
+        (b"#?RADIANCE\n\tEXPOSURE=2\n# a comment\npcomb -s 2 EXPOSURE=3\nFORMAT=32-bit_rle_rgbe\n\n", [1, 1, 1]),
+        (b"#?RGBE\r\nEXPOSURE=2\r\n\r\n", [0.5] * 3),
+        (b"#?other\nFORMAT= 32-bit_rle_rgbe \n\n", [1, 1, 1]),
+    ],
+)
+def test_exposure_and_color_correction_are_divided_out(tmp_path, head, factor):
+    path = tmp_path / "a.hdr"
+    path.write_bytes(head + b"-Y 6 +X 12\n" + QUADS.tobytes())
+    np.testing.assert_allclose(read_hdr_image(path).numpy(), QUADS[..., :3] / 256.0 * factor, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "line, said",
+    [
+        (b"FORMAT=32-bit_rle_xyze", "FORMAT: expected 32-bit_rle_rgbe"),
+        (b"COLORCORR=1 2", "COLORCORR: expected 3 positive numbers"),
+        (b"EXPOSURE=-1", "EXPOSURE: expected a positive number"),
+        (b"PRIMARIES=0.3 0.3 0.3 0.3 0.3 0.3 0.3 0.3", "PRIMARIES: expected"),
+        (b"PRIMARIES=0.64 0.33", "PRIMARIES: expected"),
+    ],
+)
+def test_header_lines_that_cannot_be_applied_are_refused(tmp_path, line, said):
+    with pytest.raises(InputError, match=said):
+        picture(tmp_path / "a.hdr", "-Y 6 +X 12", QUADS.tobytes(), b"#?RADIANCE\n" + line + b"\n\n")
+
+
+@pytest.mark.parametrize(
+    "resolution", ["-Y 6 -Y 12", "Y 6 X 12", "-Y 6 +X", "-Y -6 +X 12", "-Y 6 +X 12 1", "-Z 6 +X 12"]
+)
+def test_resolutions_that_are_none_are_refused(tmp_path, resolution):
+    with pytest.raises(InputError, match="resolution: expected"):
+        picture(tmp_path / "a.hdr", resolution, QUADS.tobytes())
 
 
 def test_writing_to_a_place_that_is_not_there_is_an_oserror(tmp_path):

@@ -50,7 +50,6 @@ def cases() -> list[tuple[str, bytes]]:
         ("hdr_bomb", head + b"-Y 100000 +X 200000\n" + row),
         ("hdr_bomb_digits", head + b"-Y 9999999999999999 +X 2\n" + row),
         ("hdr_zero", head + b"-Y 0 +X 0\n"),
-        ("hdr_flipped", head + b"+Y 8 +X 16\n" + row * 8),
         ("hdr_words", head + b"-Y eight +X 16\n" + row * 8),
         ("hdr_truncated", head + line + row * 7),
         ("hdr_truncated_run", head + line + row * 7 + row[:-1]),
