@@ -129,11 +129,6 @@ def test_an_image_is_saved_as_it_is_shown(tmp_path, device):
     assert not (tmp_path / "c.png").exists()
 
 
-def test_the_names_of_the_readme_example_are_lent():
-    for name in ("look_at", "read_environment", "SurfacePoints", "ShadeOptions", "Camera", "Environment"):
-        assert callable(getattr(reli3d, name))
-
-
 def test_points_take_numbers_of_any_kind_and_numpy_arrays():
     position = np.random.default_rng(0).random((5, 3), dtype=np.float32)
     normal = np.array([0.0, 0.0, 1.0], np.float32)
