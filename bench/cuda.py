@@ -79,7 +79,7 @@ def kernels(device: torch.device, dry: bool) -> dict:
     from reli3d.geometry.triplane import sample_triplane
     from reli3d.render.asset import Asset
     from reli3d.render.environment import Environment
-    from reli3d.render.render import render
+    from reli3d.render.image import render_asset
     from reli3d.render.shading import ShadeOptions
 
     found = {}
@@ -102,7 +102,9 @@ def kernels(device: torch.device, dry: bool) -> dict:
     mesh = timed("surface_s", lambda: extract_surface(level.contiguous(), radius=1.0).with_normals())
     camera = Camera.from_fov(look_at(torch.tensor([0.5, 0.5, 3.0], device=device)), 0.8, 64, 64)
     light = Environment.constant(torch.ones(3, device=device))
-    picture = timed("render_s", lambda: render(Asset(mesh, None, light), camera, options=ShadeOptions((4, 4, 2))))
+    picture = timed(
+        "render_s", lambda: render_asset(Asset(mesh, None, light), camera, options=ShadeOptions(samples=(4, 4, 2)))
+    )
     found["mean_radiance"] = round(float(picture.radiance.mean()), 4)
     return found
 

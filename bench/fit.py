@@ -23,8 +23,8 @@ from reli3d.fit.shape import Grid, extracted
 from reli3d.fit.unknowns import LIGHT_ROWS, START_GRID, Start, Unknowns, environment, material_change, material_of, unit
 from reli3d.geometry.camera import Camera, look_at
 from reli3d.geometry.grid import sample_grid
-from reli3d.geometry.hits import evaluate_hits, interpolate
-from reli3d.geometry.rays import Hits, RayScene
+from reli3d.geometry.hits import Hits, evaluate_hits, interpolate
+from reli3d.geometry.rays import RayScene
 from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import primary_hits
 from reli3d.render.points import SurfacePoints

@@ -63,7 +63,7 @@ def direct(device, size, roughness, backward, samples=SAMPLES, subdivisions=6):
         position = origins[index] + directions[index] * found.t[index, None]
         normal = torch.nn.functional.normalize(position, dim=-1)
         points = SurfacePoints(position, normal, normal, base.expand(n, 3), roughness, 0.0)
-        out = shade(points, wo, environment, scene=scene, options=ShadeOptions(samples, seed))
+        out = shade(points, wo, environment, scene=scene, options=ShadeOptions(samples=samples, seed=seed))
         return torch.autograd.grad(out.sum(), (base, light)) if backward else out
 
     return step, {"samples": hit * sum(samples)}

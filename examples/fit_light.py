@@ -11,10 +11,6 @@ from pathlib import Path
 import torch
 
 import reli3d
-from reli3d.geometry.camera import camera_rays
-from reli3d.io.images import write_png
-from reli3d.render.color import linear_to_srgb
-from reli3d.render.environment import Environment
 
 parser = argparse.ArgumentParser()
 parser.add_argument("output", type=Path)
@@ -30,16 +26,16 @@ x, y, z = torch.meshgrid(*[torch.linspace(-1, 1, 41)] * 3, indexing="ij")
 ball = reli3d.extract_surface((x**2 + y**2 + z**2).sqrt() - 0.8, radius=1.0)
 camera = reli3d.Camera.from_fov(reli3d.look_at([0.0, 0.4, 3.0]), 0.6, args.size, args.size)
 
-origins, directions = (v.reshape(-1, 3) for v in camera_rays(camera))
-hits = reli3d.RayScene(ball.vertices, ball.faces).closest(origins, directions)
-seen = hits.face >= 0
+origins, directions = (v.reshape(-1, 3) for v in reli3d.camera_rays(camera))
+hits = reli3d.RayScene(ball).intersect(origins, directions)
+seen = hits.valid
 normal = torch.nn.functional.normalize(origins[seen] + hits.t[seen, None] * directions[seen], dim=-1)
 points = reli3d.SurfacePoints(0.8 * normal, normal, normal, base_color=0.9, roughness=0.2, metallic=1.0)
 
 
 def image(radiance: torch.Tensor, seed: int, samples: tuple = (8, 8, 2)) -> torch.Tensor:
     options = reli3d.ShadeOptions(samples=samples, seed=seed)
-    return reli3d.shade(points, -directions[seen], Environment(radiance), options=options)
+    return reli3d.shade(points, -directions[seen], reli3d.Environment(radiance), options=options)
 
 
 photograph = image(truth, seed=1, samples=(64, 64, 16))
@@ -55,4 +51,4 @@ for step in range(args.steps):
 
 print(f"mean error of the log radiance: {(log.detach() - truth.log()).abs().mean():.3f}")
 for name, radiance in (("found", log.detach().exp()), ("true", truth)):
-    write_png(args.output / f"{name}.png", linear_to_srgb((0.5 * radiance).roll(-8, 1)).clamp(0, 1))
+    reli3d.write_image(args.output / f"{name}.png", 0.5 * radiance)

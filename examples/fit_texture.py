@@ -13,10 +13,8 @@ import torch
 
 import reli3d
 from reli3d.io.images import write_png
-from reli3d.render.environment import Environment
-from reli3d.render.render import render
 
-TEXELS = 64
+TEXELS, SAMPLES = 64, reli3d.Samples(light=4, bsdf=4, cosine=2)
 
 parser = argparse.ArgumentParser()
 parser.add_argument("output", type=Path)
@@ -31,13 +29,13 @@ mesh = reli3d.unwrap(torus, texture_size=TEXELS)
 checker = reli3d.bake(mesh, TEXELS, lambda position, _: 0.2 + 0.6 * ((6 * position).floor() % 2))["value"]
 truth = reli3d.Asset(mesh, reli3d.TextureSet(checker, roughness=0.4, metallic=0.0))
 
-light = Environment(torch.linspace(2.0, 0.2, 16)[:, None, None].expand(16, 32, 3).contiguous())  # bright above
+light = reli3d.Environment(torch.linspace(2.0, 0.2, 16)[:, None, None].expand(16, 32, 3).contiguous())  # bright above
 poses = [reli3d.look_at([2.5 * math.cos(k), 1.5 * (-1) ** k, 2.5 * math.sin(k)]) for k in range(8)]
 cameras = [reli3d.Camera.from_fov(pose, 0.9, args.size, args.size) for pose in poses]
 
 
 def image(asset: reli3d.Asset, camera: reli3d.Camera, seed: int) -> torch.Tensor:
-    return render(asset, camera, light, options=reli3d.ShadeOptions(samples=(4, 4, 2), seed=seed)).radiance
+    return reli3d.render_asset(asset, camera, light, options=reli3d.ShadeOptions(samples=SAMPLES, seed=seed)).radiance
 
 
 with torch.no_grad():

@@ -14,8 +14,7 @@ import torch
 from PIL import Image
 
 import reli3d
-from reli3d.render.environment import Environment
-from reli3d.render.render import joined_scene, render
+from reli3d.render.image import joined_scene
 
 parser = argparse.ArgumentParser()
 parser.add_argument("output", type=Path)
@@ -35,7 +34,7 @@ else:
 studio = torch.full((32, 64, 3), 0.2)
 studio[6:12, 8:20] = 6.0  # a large lamp at one side
 studio[8:10, 44:48] = torch.tensor([4.0, 8.0, 16.0])  # a small blue one at the other
-studio = Environment(studio)
+studio = reli3d.Environment(studio)
 own = next((part.environment for part in parts if part.environment is not None), studio)
 
 vertices = torch.cat([part.mesh.vertices for part in parts])
@@ -49,7 +48,8 @@ for name in ("turn", "light"):
         camera = reli3d.Camera.from_fov(reli3d.look_at(eye, centre), 0.75, args.size, args.size)
         light = own if name == "turn" else studio.rotated(angle)
         path = args.output / f"{name}_{i:02d}.png"
-        options = reli3d.ShadeOptions(samples=(8, 12, 2))  # for each of four subpixels
-        render(parts, camera, light, scene=scene, supersampling=2, options=options).save_png(path)
+        options = reli3d.ShadeOptions(samples=reli3d.Samples(light=8, bsdf=12, cosine=2))  # for each of four subpixels
+        image = reli3d.render_asset(parts, camera, light, scene=scene, supersampling=2, options=options)
+        reli3d.write_image(path, image.rgba)
         frames.append(Image.open(path).convert("RGBA"))
 frames[0].save(args.output / "turntable.webp", save_all=True, append_images=frames[1:], duration=80, loop=0)

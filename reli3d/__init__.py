@@ -1,45 +1,46 @@
-"""Relightable 3D assets from a few posed photographs.
+"""Relightable 3D assets from posed photographs, and the differentiable operations they are made of.
 
-The names of the README example are loaded on first use: ``import reli3d`` alone starts neither torch nor Warp and
-loads no network.  The function ``render`` stays in its module, ``reli3d.render.render``, because a name cannot be
-both a subpackage and a function.
+The public names are those of ``reli3d.__all__``; ``help(reli3d.shade)`` documents one.  Each is loaded from its module
+on first use: ``import reli3d`` alone loads neither torch nor Warp.
 """
 
 from importlib import import_module
 
 __version__ = "0.2.0"
 
-_HOME = {
-    "reconstruct": "reli3d.pipeline",
-    "ReconstructOptions": "reli3d.pipeline",
-    "refine": "reli3d.pipeline",
-    "load_views": "reli3d.views.folder",
-    "Views": "reli3d.views.views",
-    "Camera": "reli3d.geometry.camera",
-    "look_at": "reli3d.geometry.camera",
-    "Environment": "reli3d.render.environment",
-    "read_environment": "reli3d.io.hdr",
-    "Asset": "reli3d.render.asset",
-    "TextureSet": "reli3d.render.asset",
-    "SurfacePoints": "reli3d.render.points",
-    "ShadeOptions": "reli3d.render.shading",
-    "shade": "reli3d.render.shading",
-    "Mesh": "reli3d.geometry.mesh",
-    "RayScene": "reli3d.geometry.rays",
-    "extract_surface": "reli3d.geometry.surface",
-    "unwrap": "reli3d.geometry.uv",
-    "bake": "reli3d.geometry.bake",
-    "sample_triplane": "reli3d.geometry.triplane",
-    "write_image": "reli3d.io.images",
-    "write_glb": "reli3d.io.glb",
-    "read_glb": "reli3d.io.glb",
+_MODULES = {
+    "pipeline": ("reconstruct", "ReconstructOptions", "refine"),
+    "views.folder": ("load_views",),
+    "views.views": ("Views",),
+    "geometry.camera": ("Camera", "camera_rays", "look_at"),
+    "geometry.mesh": ("Mesh",),
+    "geometry.rays": ("RayScene",),
+    "geometry.hits": ("Hits",),
+    "geometry.surface": ("extract_surface",),
+    "geometry.triplane": ("sample_triplane",),
+    "geometry.uv": ("unwrap",),
+    "geometry.bake": ("bake",),
+    "render.asset": ("Asset", "TextureSet"),
+    "render.color": ("linear_to_srgb", "srgb_to_linear"),
+    "render.environment": ("Environment",),
+    "render.gbuffer": ("surface_points",),
+    "render.image": ("Render", "render_asset"),
+    "render.material": ("eval_bsdf", "pdf_bsdf", "sample_bsdf"),
+    "render.points": ("SurfacePoints",),
+    "render.sampling": ("antithetic", "pdf_ggx_vndf", "reflect", "sample_ggx_vndf", "tangent_frame"),
+    "render.shading": ("Samples", "ShadeOptions", "shade"),
+    "render.silhouette": ("antialias",),
+    "io.glb": ("read_glb", "write_glb"),
+    "io.hdr": ("read_environment", "write_environment"),
+    "io.images": ("write_image",),
 }
-__all__ = ["__version__", *_HOME]
+_HOME = {name: f"{__name__}.{module}" for module, names in _MODULES.items() for name in names}
+__all__ = ["__version__", *sorted(_HOME)]
 
 
 def __getattr__(name: str):
     if name not in _HOME:
-        raise AttributeError(f"module 'reli3d' has no attribute {name!r}")
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(import_module(_HOME[name]), name)
     globals()[name] = value
     return value

@@ -16,7 +16,6 @@ import pytest
 from PIL import Image, ImageDraw
 
 from reli3d.io.hdr import read_environment, write_environment
-from reli3d.render.environment import Environment
 from reli3d.render.lights import studio
 from tests.support import clients
 
@@ -39,8 +38,8 @@ def main(argv: list[str] | None = None) -> int:
             shutil.copy(args.folder / name, folder)
         if args.studio:
             for name in ("environment.hdr", "environment.exr"):
-                write_environment(folder / name, studio(256).radiance)
-        light = Environment(read_environment(folder / "environment.exr"))
+                write_environment(folder / name, studio(256))
+        light = read_environment(folder / "environment.exr")
         try:
             pictures = {
                 "reli3d-render": clients.ours(folder / "mesh.glb", light, shot, SAMPLES),

@@ -20,7 +20,7 @@ from reli3d.render.environment import Environment
 from reli3d.render.latlong import lat_long_directions
 from reli3d.render.shading import ShadeOptions, shade
 from reli3d.synthetic.procedural import FRAME_RADIUS, example_object
-from reli3d.synthetic.samples import EXPOSED, PAINT, ObjectSurface
+from reli3d.synthetic.samples import DIFFUSE_MODEL, EXPOSED, ObjectSurface
 
 SIZE, SUBPIXELS = 512, 2
 FOV = math.radians(30.0)
@@ -62,7 +62,7 @@ def main(folder: Path) -> None:
         seen = (hits.face >= 0).nonzero()[:, 0]
         image = light.lookup(directions)
         points = surface.points_at(hits.face[seen].long(), hits.bary[seen])
-        options = ShadeOptions(SAMPLES, seed=i, paint=PAINT)
+        options = ShadeOptions(samples=SAMPLES, seed=i, diffuse_model=DIFFUSE_MODEL)
         image[seen] = shade(points, -directions[seen], light, scene=surface.scene, options=options)
         if exposure is None:
             exposure = EXPOSED / float(image[seen].mean(-1).quantile(0.9))

@@ -8,7 +8,7 @@ from reli3d.render.asset import TextureSet
 from reli3d.render.color import srgb_to_linear
 
 
-def material(mi, base_color, alpha, metallic, paint="conserving", maps: TextureSet | None = None):
+def material(mi, base_color, alpha, metallic, diffuse_model="conserving", maps: TextureSet | None = None):
     """A Mitsuba BSDF that evaluates the metallic-roughness formula; sampled by cosine and visible normals.
 
     maps: in place of the numbers, looked up by Mitsuba's own ``bitmap``.
@@ -64,7 +64,7 @@ def material(mi, base_color, alpha, metallic, paint="conserving", maps: TextureS
             schlick = lambda cos: f0 + (1 - f0) * (1 - cos) ** 5  # noqa: E731
             f = schlick(dr.dot(i, h))
             left = 1 - f
-            if paint == "conserving":
+            if diffuse_model == "conserving":
                 left_i, left_o = (0.96 * (1 - (1 - (z + alpha) / (1 + alpha)) ** 5) for z in (i.z, o.z))
                 left = left_i * left_o
             value = left * base * (1 - metallic) / dr.pi + f * d * g / (4 * i.z * o.z)

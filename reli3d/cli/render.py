@@ -83,11 +83,11 @@ def parser() -> argparse.ArgumentParser:
     )
     p.add_argument("--supersampling", type=int, help="subpixels along a side of a pixel (default that of --quality)")
     p.add_argument(
-        "--paint",
+        "--diffuse-model",
         choices=("conserving", "published"),
         default="conserving",
-        help="what the coat leaves to the paint: conserving (default; no surface sends out more than it "
-        "gets) or published (glTF viewers' formula; white paint gains light at grazing angles)",
+        help="energy transmitted to the diffuse layer: conserving (default; no surface reflects more than it "
+        "receives) or published (glTF viewers' formula; a white diffuse base gains energy at grazing angles)",
     )
     p.add_argument("--background", choices=("transparent", "environment"), default="transparent")
     p.add_argument(
@@ -180,20 +180,21 @@ def render_files(args: argparse.Namespace) -> list[Path]:
     from reli3d.io.glb import read_glb
     from reli3d.io.hdr import read_environment, write_exr
     from reli3d.render.environment import Environment
-    from reli3d.render.render import joined_scene, plan_render, render
+    from reli3d.render.image import joined_scene, plan_render, render_asset
     from reli3d.render.shading import ShadeOptions
 
     device = torch.device(args.device)
     parts = [part.to(device) for part in read_glb(args.glb)]
-    light = torch.ones(8, 16, 3) if args.light is None else read_environment(args.light)
-    environment = Environment(light.to(device))
+    light = Environment(torch.ones(8, 16, 3)) if args.light is None else read_environment(args.light)
+    environment = light.to(device)
     scene = joined_scene(parts)
     low, high = scene.vertices.amin(0), scene.vertices.amax(0)
     centre, radius = (low + high) / 2, float((high - low).norm()) / 2
     distance = args.distance or 1.02 * radius / math.sin(math.radians(args.fov) / 2)
     up = torch.tensor([0.0, 1.0, 0.0], device=device)
     args.output.mkdir(parents=True, exist_ok=True)
-    written, animation, options = [], [], ShadeOptions(tuple(args.samples), args.seed, paint=args.paint)
+    written, animation = [], []
+    options = ShadeOptions(samples=tuple(args.samples), seed=args.seed, diffuse_model=args.diffuse_model)
     bar = tqdm(total=args.frames, unit="frame", file=sys.stderr, disable=None)
     for frame in range(args.frames):
         turn = 2.0 * math.pi * frame / args.frames
@@ -215,7 +216,7 @@ def render_files(args: argparse.Namespace) -> list[Path]:
             )
             options = replace(options, samples=plan.samples, antithetic="none")
             print("reli3d-render: samples by strategy", *plan.samples, file=sys.stderr)
-        image = render(
+        image = render_asset(
             parts,
             camera,
             environment if args.turn == "camera" else environment.rotated(turn),
@@ -254,7 +255,7 @@ def _picture(image, args):
     from reli3d.render.color import agx, linear_to_srgb
 
     tone = {"srgb": linear_to_srgb, "agx": agx, "none": lambda v: v}[args.tone]
-    shown = image.picture(exposure=args.exposure, tone=tone, transparent=args.background == "transparent")
+    shown = image.display(exposure=args.exposure, tone=tone, transparent=args.background == "transparent")
     return Image.fromarray((shown * 255.0 + 0.5).to(torch.uint8).cpu().numpy())
 
 

@@ -25,7 +25,7 @@ from reli3d.pipeline import Network, NoSurface, ReconstructOptions, reconstruct
 from reli3d.render.asset import Asset
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
-from reli3d.render.render import render
+from reli3d.render.image import render_asset
 from reli3d.render.shading import ShadeOptions
 from reli3d.synthetic.procedural import sample_cameras
 from reli3d.views.views import Views
@@ -76,8 +76,8 @@ def layers(
     exposures: tuple[float, float],
 ) -> dict[str, Tensor]:
     """Pictures ``(H, W, 3)`` in [0, 1] over black: in both lights, and the maps; and ``alpha (H, W)``."""
-    first = render(asset, camera, light, options=ShadeOptions(SAMPLES, 1))
-    lit = render(asset, camera, other, options=ShadeOptions(SAMPLES, 2))
+    first = render_asset(asset, camera, light, options=ShadeOptions(samples=SAMPLES, seed=1))
+    lit = render_asset(asset, camera, other, options=ShadeOptions(samples=SAMPLES, seed=2))
     shown = {"alpha": first.alpha}
     for name, picture, exposure in (("image", first, exposures[0]), ("relit", lit, exposures[1])):
         shown[name] = linear_to_srgb((picture.radiance * exposure).clamp(0.0, 1.0))
@@ -90,7 +90,7 @@ def layers(
 
 def exposure_of(truth: Truth, light: Environment) -> float:
     """What brings the first view's 90th percentile to :data:`EXPOSED`."""
-    picture = render(truth.parts, truth.cameras[0], light, options=ShadeOptions(SAMPLES, 0))
+    picture = render_asset(truth.parts, truth.cameras[0], light, options=ShadeOptions(samples=SAMPLES, seed=0))
     shown = picture.radiance[picture.alpha > 0.99].mean(-1)
     return EXPOSED / max(float(shown.quantile(0.9)) if len(shown) else 1.0, 1e-3)
 
@@ -100,11 +100,11 @@ def input_views(truth: Truth, count: int, hero: int, exposure: float) -> Views:
     order = [hero, *(k for k in range(count) if k != hero)]
     images, masks = [], []
     for k in order:
-        picture = render(
+        picture = render_asset(
             truth.parts,
             truth.cameras[k],
             truth.light,
-            options=ShadeOptions(SAMPLES, 3),
+            options=ShadeOptions(samples=SAMPLES, seed=3),
             background="environment",
             supersampling=2,
         )

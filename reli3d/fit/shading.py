@@ -9,7 +9,7 @@ from reli3d.render.environment import Environment
 from reli3d.render.points import SurfacePoints
 from reli3d.render.shading import ShadeOptions, shade
 
-PAINT = "published"  # glTF's own formula: what viewers show, and what the shipped weights learned from
+DIFFUSE_MODEL = "published"  # glTF's own formula: what viewers show, and what the shipped weights learned from
 
 
 def radiance(
@@ -22,5 +22,5 @@ def radiance(
     seed: int,
 ) -> Tensor:
     """Radiance ``(N, 3)`` that leaves ``points`` towards ``wo``: direct light with shadows, linear."""
-    options = ShadeOptions(samples=samples, seed=seed, paint=PAINT)
+    options = ShadeOptions(samples=samples, seed=seed, diffuse_model=DIFFUSE_MODEL)
     return shade(points, wo, light, scene=scene, options=options)

@@ -5,13 +5,29 @@ Which face is hit has no gradient; everything evaluated at the hit has one.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 import warp as wp
 from torch import Tensor
 
 from reli3d._bridge import call, check
-from reli3d.geometry.rays import Hits
 from reli3d.kernels import hits as kernels
+
+
+@dataclass(frozen=True)
+class Hits:
+    """face ``(...)`` int32, -1 for a miss; t ``(...)``, inf for a miss; bary ``(..., 2)``: weights of vertices 1, 2."""
+
+    face: Tensor
+    t: Tensor
+    bary: Tensor
+
+    @property
+    def valid(self) -> Tensor:
+        """Whether the ray hit, ``(...)`` bool."""
+        return self.face >= 0
+
 
 _INTERPOLATE = {
     2: (kernels.interpolate2_kernel, wp.vec2),

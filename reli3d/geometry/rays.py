@@ -2,20 +2,20 @@
 
 Directions need not have unit length; ``t`` counts in their lengths, from 0 inclusive to ``t_max`` exclusive.  A ray
 misses where nothing is hit, where it holds a NaN, an infinity or a zero direction, and where ``t`` leaves float32.  A
-miss has ``face = -1``, ``t = inf``, ``bary = 0``.  Nothing here has a gradient: :func:`evaluate_hits` gives one.
+miss has ``face = -1``, ``t = inf``, ``bary = 0``.  :meth:`RayScene.intersect` has gradients, the others have none.
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 import torch
 import warp as wp
 from torch import Tensor
 
-from reli3d._bridge import array_of, check, empty, launch, over_slices, stream, tensor_of
+from reli3d._bridge import array_of, check, empty, expect, launch, over_slices, stream, tensor_of
 from reli3d.geometry import embree
+from reli3d.geometry.hits import Hits, evaluate_hits
+from reli3d.geometry.mesh import Mesh
 from reli3d.kernels import embree as embree_kernels
 from reli3d.kernels import rays as kernels
 
@@ -24,31 +24,31 @@ SLICE_RAYS = 8192  # fewest of an Embree slice, and of one whose rays are ordere
 THREAD_SLICES = 2  # of a large call for each thread: the more rays are ordered together, the closer are neighbours
 
 
-@dataclass(frozen=True)
-class Hits:
-    """face ``(...)`` int32, -1 for a miss; t ``(...)``, inf for a miss; bary ``(..., 2)``: weights of vertices 1, 2."""
-
-    face: Tensor
-    t: Tensor
-    bary: Tensor
-
-
 class RayScene:
-    """Acceleration structure over one mesh; keeps its own copy of the geometry.
+    """Acceleration structure for rays against one triangle mesh; keeps its own copy of the geometry.
 
-    vertices: ``(V, 3)`` float32.  faces: ``(F, 3)`` int32.  Numpy arrays and other integers are taken where no value
-    changes.  Faces without area are never hit; without faces every ray misses.  backend: ``embree`` (CPU only, robust
-    mode), ``warp``, or ``auto``: Embree on the CPU, where it is some three times faster, Warp on CUDA.  Warp's tree is
-    split by surface area, since its other trees lose more rays at vertices; on CUDA it is built on the host, and
-    :meth:`refit` is the fast way to move vertices.  Raises TypeError or ValueError for a wrong dtype or shape, an index
-    out of range or a vertex that is not finite.
+    mesh: a :class:`~reli3d.geometry.mesh.Mesh`, or its vertices ``(V, 3)`` float32 with ``faces (F, 3)`` int32.  Numpy
+    arrays and other integers are taken if the conversion is exact.  Faces without area are never hit; without faces
+    every ray misses.  backend: ``embree`` (CPU, robust mode), ``warp`` (CPU and CUDA), or ``auto``: Embree on the CPU,
+    where it is about 3 times faster on incoherent rays, Warp on CUDA.  Warp's tree is split by surface area, since its
+    other trees lose more rays at vertices; on CUDA it is built on the host, and :meth:`refit` is the fast way to move
+    vertices.  Raises TypeError or ValueError for a wrong kind, dtype or shape, an index out of range or a vertex that
+    is not finite.
+
+    >>> scene = reli3d.RayScene(mesh)
+    >>> hits = scene.intersect(origins, directions)
     """
 
     vertices: Tensor  # (V, 3), a copy
 
-    def __init__(self, vertices: Tensor, faces: Tensor, backend: str = "auto"):
+    def __init__(self, mesh: Mesh | Tensor, faces: Tensor | None = None, *, backend: str = "auto"):
         if backend not in BACKENDS:
             raise ValueError(f"backend: expected one of {', '.join(BACKENDS)}, got {backend}")
+        if isinstance(mesh, Mesh) and faces is not None:
+            raise TypeError("faces: expected none beside a mesh, got some")
+        if faces is None:
+            expect("mesh", mesh, Mesh)
+        vertices, faces = (mesh.vertices, mesh.faces) if isinstance(mesh, Mesh) else (mesh, faces)
         vertices, faces = tensor_of(vertices), tensor_of(faces, torch.int32)
         check("faces", faces, last=3, dtype=torch.int32)
         if faces.ndim != 2:
@@ -83,6 +83,37 @@ class RayScene:
         self.vertices = held  # the memory that the structure points to
         with stream(self.device):
             self._warp.refit()
+
+    def intersect(
+        self,
+        origins: Tensor,
+        directions: Tensor,
+        *,
+        vertices: Tensor | None = None,
+        t_max: Tensor | float = float("inf"),
+    ) -> Hits:
+        """First hit of every ray, differentiable in the rays and in ``vertices``.
+
+        origins, directions: ``(..., 3)``, broadcast; ``t`` counts in lengths of ``directions``.  vertices: ``(V, 3)``,
+        the positions of this scene as a tensor of the caller's, which then has gradients; call :meth:`refit` before
+        after a change.  t_max: a number or ``(...)``, exclusive.  A miss has ``face = -1``, ``t = inf``, ``bary = 0``
+        and gradient 0.
+
+        Gradients of ``t`` and ``bary`` reach origins, directions and vertices; which face is hit has none, so
+        silhouettes need :func:`~reli3d.render.silhouette.antialias`.  ``origins + t directions`` is the point with the
+        most digits.  Raises TypeError for a dtype, ValueError for a shape, a device, or positions that are not the
+        scene's.  Source: Moller and Trumbore 1997, in float64.
+
+        >>> hits = scene.intersect(origins, directions, vertices=v)
+        >>> points = origins[hits.valid] + hits.t[hits.valid][:, None] * directions[hits.valid]
+        """
+        if vertices is None:
+            vertices = self.vertices
+        elif vertices.shape != self.vertices.shape or not torch.equal(vertices.detach(), self.vertices):
+            raise ValueError("vertices: expected the positions of the scene, got others; call refit first")
+        hits = self.closest(origins, directions, t_max=t_max)
+        origins, directions = tensor_of(origins), tensor_of(directions)
+        return evaluate_hits(vertices, self.faces, hits, origins, directions)
 
     def closest(self, origins: Tensor, directions: Tensor, *, t_max: Tensor | float = float("inf")) -> Hits:
         """First hit of every ray: origins and directions ``(..., 3)`` broadcast; ``t_max`` a number or ``(...)``."""

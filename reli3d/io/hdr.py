@@ -16,44 +16,54 @@ import OpenEXR
 import torch
 from torch import Tensor
 
+from reli3d._bridge import expect
 from reli3d.io.exr import read_exr
 from reli3d.io.files import InputError, file_size, replacing, shown, write_bytes
 from reli3d.io.rgbe import read_rgbe, rgbe_bytes
+from reli3d.render.environment import Environment
 
 HALF_MAX = 65504.0  # largest finite half
 MAX_PIXELS = 1 << 25  # 8192 x 4096
 
 
-def read_environment(path: str | os.PathLike, *, notes: list[str] | None = None) -> Tensor:
-    """Lat-long map ``(H, 2H, 3)``, float32 linear radiance, from a ``.hdr`` or ``.exr`` file; its content tells which.
+def read_environment(path: str | os.PathLike, *, notes: list[str] | None = None) -> Environment:
+    """Environment of a lat-long ``.hdr`` or ``.exr`` file, ``(H, 2H, 3)`` linear radiance; its content tells which.
 
     Row 0 is +Y, the center column +X, right of it +Z.  What was converted, clamped or not applied is appended to
     ``notes``, one line each.  Raises InputError on a broken file, NaN, a shape other than 2:1, or a map above
     8192 x 4096.
+
+    >>> light = reli3d.read_environment("studio.hdr").rotated(math.pi / 2)
+    >>> image = reli3d.render_asset(asset, camera, light)
     """
     image = read_hdr_image(path, notes=notes)
     height, width = image.shape[:2]
     if width != 2 * height:
         raise InputError(path, f"size: expected a map twice as wide as high, got {width} x {height}; convert it")
-    return image
+    return Environment(image)
 
 
-def write_environment(path: str | os.PathLike, radiance: Tensor) -> int:
-    """Write the map ``radiance`` ``(H, 2H, 3)`` as ``.exr`` or ``.hdr``, by the suffix of ``path``.
+def write_environment(path: str | os.PathLike, environment: Environment) -> int:
+    """Write ``environment``, ``(H, 2H, 3)``, as ``.exr`` (half floats) or ``.hdr``, by the suffix of ``path``.
 
-    Returns the number of values clamped.  Raises ValueError on NaN, negative values or another shape, OSError where it
-    cannot be written.
+    Returns the number of values clamped.  Raises TypeError for another kind, ValueError on NaN, negative values or
+    another shape, OSError where it cannot be written; then nothing is written.
+
+    >>> reli3d.write_environment("light.exr", asset.environment)
+    >>> again = reli3d.read_environment("light.exr")
     """
     write = {".exr": write_exr, ".hdr": write_hdr}.get(os.path.splitext(path)[1].lower())
     if write is None:
         raise ValueError(f"path: expected a name that ends in .exr or .hdr, got {shown(os.path.basename(path))}")
-    if radiance.ndim != 3 or radiance.shape[1] != 2 * radiance.shape[0]:
-        raise ValueError(f"radiance: expected shape (H, 2H, 3), got {tuple(radiance.shape)}")
-    return write(path, radiance)
+    expect("environment", environment, Environment)
+    height, width = environment.radiance.shape[:2]
+    if width != 2 * height:
+        raise ValueError(f"environment: expected a map (H, 2H, 3), got {tuple(environment.radiance.shape)}")
+    return write(path, environment.radiance)
 
 
 def environment_bytes(radiance: Tensor) -> bytes:
-    """What :func:`write_environment` writes into a ``.hdr`` file.  Raises as it does."""
+    """What :func:`write_environment` writes into a ``.hdr`` file, of ``radiance (H, 2H, 3)``.  Raises as it does."""
     pixels, _ = _writable(radiance, float(np.finfo(np.float32).max) / 2)
     return rgbe_bytes(pixels)
 

@@ -19,8 +19,8 @@ from reli3d.nn.blocks import beside
 from reli3d.render.asset import Asset
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
+from reli3d.render.image import Render, render_lights
 from reli3d.render.lights import studio
-from reli3d.render.render import Render, render_lights
 from reli3d.render.shading import ShadeOptions
 from reli3d.views.choose import choose_views
 from reli3d.views.views import Views
@@ -92,7 +92,8 @@ def comparison(before: Asset, after: Asset, views: Views) -> np.ndarray:
 
 
 def _rendered(asset: Asset, camera: Camera, scene: RayScene, lights: Sequence[Environment | None]) -> list[Render]:
-    return render_lights(asset, camera, lights, options=ShadeOptions(SAMPLES), supersampling=SUBPIXELS, scene=scene)
+    options = ShadeOptions(samples=SAMPLES)
+    return render_lights(asset, camera, lights, options=options, supersampling=SUBPIXELS, scene=scene)
 
 
 def _smoothed(*shots: Render) -> list[Tensor]:

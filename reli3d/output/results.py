@@ -27,6 +27,7 @@ from reli3d.nn.weights import Manifest
 from reli3d.output.folder import claimed
 from reli3d.output.viewer import Shown, photograph_stops, shadow, viewer_page
 from reli3d.render.asset import Asset
+from reli3d.render.environment import Environment
 from reli3d.views.similarity import Similarity
 from reli3d.views.views import Views
 
@@ -153,15 +154,15 @@ def write_results(
     :func:`~reli3d.output.preview.preview`.  info: what ``run_info.json`` holds, the convention of the light apart.
     compatible: write the light as :data:`PUBLISHED_LIGHT` as well.  comparison: the picture of a refinement.
     """
-    radiance = encoded.asset.light.radiance
+    light = encoded.asset.light
     info = {**info, "environment_centre": "+X"}
     with replacing() as new:
         (new / "preview.png").write_bytes(png_bytes(picture))
         (new / "mesh.glb").write_bytes(encoded.placed())
         for name in ("environment.exr", "environment.hdr"):
-            write_environment(new / name, radiance)
+            write_environment(new / name, light)
         if compatible:
-            write_environment(new / PUBLISHED_LIGHT, to_published(radiance))
+            write_environment(new / PUBLISHED_LIGHT, Environment(to_published(light.radiance)))
         if comparison is not None:
             write_png(new / COMPARISON, comparison)
         (new / "viewer.html").write_text(encoded.page(), encoding="utf-8")

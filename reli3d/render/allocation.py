@@ -59,7 +59,7 @@ def plan_samples(
     """Counts of the three strategies, ``total`` together, with the least variance for these points under this light.
 
     Arguments are those of :func:`reli3d.render.shading.shade`; N is at least 1.  Of ``options`` the seed, ``sequence``,
-    ``alpha`` and ``paint`` count.  One plan holds for all points: the sum of their variances is least, with
+    ``alpha`` and ``diffuse_model`` count.  One plan holds for all points: the sum of their variances is least, with
     ``relative`` of the variances over the squared radiance.
 
     A pilot's samples estimate the variance of any split, see docs/renderer.md.  A plan is for images, not for fits.
@@ -126,7 +126,9 @@ def _draw(
     none.
     """
     n, count, device = len(values[0]), 3 * each, values[0].device
-    options = ShadeOptions((each, each, each), options.seed, antithetic="none", paint=options.paint)
+    options = replace(
+        DEFAULT, samples=(each,) * 3, seed=options.seed, antithetic="none", diffuse_model=options.diffuse_model
+    )
     plan, offsets = sampling_plan(options, scene)
     light = struct_of_light(environment.radiance.contiguous(), environment.table, offsets.to(device))
     pixels = torch.arange(n, dtype=torch.int32, device=device)
@@ -147,8 +149,8 @@ def _tried(values: list[Tensor], share: Tensor, environment, counts: Tensor, sce
     """Variance of a point, mean by ``share (P,)``, that :func:`reli3d.render.shading.shade` has with ``counts``."""
     runs = TRIED // len(share)
     position, normal, ng, wo, *material = (v.repeat(runs, *[1] * (v.ndim - 1)) for v in values)
-    options = ShadeOptions(
-        _whole(counts), options.seed, antithetic="none", sequence=options.sequence, alpha="linear", paint=options.paint
+    options = replace(
+        options, samples=_whole(counts), antithetic="none", alpha="linear", heuristic="balance", clamp=None
     )
     drawn = shade(SurfacePoints(position, ng, normal, *material), wo, environment, scene=scene, options=options)
     return float(share @ drawn.double().unflatten(0, (runs, -1)).var(0).sum(1))

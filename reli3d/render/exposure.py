@@ -58,7 +58,7 @@ def photograph_ratio(asset: Asset, images: Tensor, inside: Tensor, camera: Camer
     at which the asset is hit and the photograph is not overexposed.  No gradient.  Raises ValueError for fewer pixels.
     """
     seen, at, directions = _seen(asset, images, inside, camera, scene)
-    shown = shade(at, -directions, asset.light, scene=scene, options=ShadeOptions(SAMPLES))
+    shown = shade(at, -directions, asset.light, scene=scene, options=ShadeOptions(samples=SAMPLES))
     count = max(1, len(shown))
     photograph, rendered = seen.sum(0) / count + BLACK, shown.sum(0) / count + BLACK
     tint = (photograph / rendered * (rendered.sum() / photograph.sum())).clamp(1.0 / TINT, TINT)

@@ -9,9 +9,9 @@ from torch.nn.functional import normalize
 
 from reli3d._bridge import call, check, present
 from reli3d.geometry.camera import Camera, camera_rays
-from reli3d.geometry.hits import hit_normals, interpolate
+from reli3d.geometry.hits import Hits, hit_normals, interpolate
 from reli3d.geometry.mesh import Mesh
-from reli3d.geometry.rays import Hits, RayScene
+from reli3d.geometry.rays import RayScene
 from reli3d.kernels import hits as kernels
 from reli3d.render.asset import TextureSet
 from reli3d.render.points import SurfacePoints

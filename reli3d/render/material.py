@@ -1,6 +1,7 @@
 """Metallic-roughness material in the local frame: normal +z, ``wo`` to the viewer, ``wi`` to the light, both unit.
 
-The formulas stand in ``reli3d.kernels.bsdf``.  ``alpha = roughness**2`` unless the caller says otherwise.
+Arguments come in one order: ``wo``, the material, then what is evaluated (``wi``) or drawn with (``u``).  ``alpha`` is
+the GGX width, ``roughness**2``.  The formulas stand in ``reli3d.kernels.bsdf``.
 """
 
 from __future__ import annotations
@@ -13,7 +14,8 @@ from reli3d._bridge import call, check, empty, launch
 from reli3d.kernels import bsdf as kernels
 from reli3d.render.sampling import mirror, reflect, sample_cosine, sample_ggx_vndf
 
-PAINTS = ("conserving", "published")  # what the coat leaves to the paint: reli3d.kernels.bsdf
+DIFFUSE_MODELS = ("conserving", "published")  # energy transmitted to the diffuse layer: reli3d.kernels.bsdf
+LOBES = ("visible", "mirrored", "cosine")  # in the order of the kernel's columns
 
 
 def _flat(items: list[tuple[str, Tensor, int]]) -> tuple[torch.Size, list[Tensor]]:
@@ -34,17 +36,21 @@ def choice(name: str, value: str, allowed: tuple[str, ...]) -> int:
 
 
 def eval_bsdf(
-    wo: Tensor, wi: Tensor, base_color: Tensor, alpha: Tensor, metallic: Tensor, *, paint: str = "conserving"
+    wo: Tensor, base_color: Tensor, alpha: Tensor, metallic: Tensor, wi: Tensor, *, diffuse_model: str = "conserving"
 ) -> Tensor:
-    """Value ``(..., 3)`` [1/sr] without the cosine; 0 below the horizon on either side.
+    """BSDF value ``(..., 3)`` [1/sr] without the cosine; 0 below the horizon on either side.
 
-    wo, wi: ``(..., 3)`` unit.  base_color: ``(..., 3)`` linear in [0, 1].  alpha, metallic: ``(...)``.  Leading axes
-    broadcast.  paint: what the coat leaves to the paint below it, ``conserving`` (1 - F of the surface on the way in
-    and out), which never sends out more than comes in, or ``published`` (1 - F of the microfacet), the formula of the
-    published model's shader and of glTF 2.0's appendix B.  Gradients reach all five; that of ``alpha`` is 0 below
-    ``ALPHA_MIN`` = 1e-3.  Raises ValueError for another ``paint``.
+    wo, wi: ``(..., 3)`` unit, local frame.  base_color: ``(..., 3)`` linear in [0, 1].  alpha, metallic: ``(...)``.
+    Leading axes broadcast.  diffuse_model: energy transmitted to the diffuse layer, ``conserving`` (1 - F of the
+    surface on the way in and out; the albedo is at most 1) or ``published`` (1 - F of the microfacet, the formula of
+    the published model's shader and of glTF 2.0's appendix B).  Gradients reach all five tensors; that of ``alpha`` is
+    0 below ``ALPHA_MIN`` = 1e-3.  Raises TypeError unless float32, ValueError for a shape, a device or another model.
+    Source: glTF 2.0, appendix B; GGX of Walter et al. 2007 with Smith's height-correlated masking.
+
+    >>> up, half = torch.tensor([0.0, 0.0, 1.0]), torch.tensor(0.5)
+    >>> value = reli3d.eval_bsdf(up, torch.full((3,), 0.8), half, half, up)
     """
-    conserving = int(choice("paint", paint, PAINTS) == 0)
+    conserving = int(choice("diffuse_model", diffuse_model, DIFFUSE_MODELS) == 0)
     batch, flat = _flat(
         [("wo", wo, 3), ("wi", wi, 3), ("base_color", base_color, 3), ("alpha", alpha, 0), ("metallic", metallic, 0)]
     )
@@ -54,33 +60,48 @@ def eval_bsdf(
     return out.reshape(*batch, 3)
 
 
-def pdf_lobes(wo: Tensor, wi: Tensor, alpha: Tensor) -> Tensor:
-    """Densities ``(..., 3)`` [1/sr] at ``wi`` of reflection at a visible normal, at a mirrored one, and the cosine.
+def sample_bsdf(wo: Tensor, alpha: Tensor, u: Tensor, *, lobe: str = "visible") -> Tensor:
+    """Directions to the light ``(..., 3)``, unit, drawn from one lobe; density :func:`pdf_bsdf` of the same ``lobe``.
 
-    wo, wi: ``(..., 3)`` unit.  alpha: ``(...)``.  No gradient.
+    wo: ``(..., 3)`` unit, local frame.  alpha: ``(...)`` GGX width.  u: ``(..., 2)`` uniform in [0, 1).  Leading axes
+    broadcast.  lobe: ``visible`` (reflection at a visible normal), ``mirrored`` (at that normal turned by pi about the
+    surface normal) or ``cosine``.  A direction below the horizon, and one of a mirrored normal that faces away from
+    ``wo``, has value and density 0.  The antithetic partner of ``u`` is ``visible`` with
+    :func:`~reli3d.render.sampling.antithetic` of ``u`` or, as published, ``mirrored`` with ``u``.  Gradients reach
+    ``wo`` and ``alpha``.  Raises TypeError unless float32, ValueError for a shape, a device or another lobe.  Source:
+    Dupuy and Benyoub 2023.
+
+    >>> wi = reli3d.sample_bsdf(wo, alpha, torch.rand(1000, 2))
+    >>> weight = reli3d.eval_bsdf(wo, color, alpha, metallic, wi) * wi[:, 2:] / reli3d.pdf_bsdf(wo, alpha, wi)[:, None]
     """
-    batch, flat = _flat([("wo", wo, 3), ("wi", wi, 3), ("alpha", alpha, 0)])
-    ins = [(t.detach().contiguous(), kind) for t, kind in zip(flat, (wp.vec3, wp.vec3, wp.float32))]
-    out = empty((flat[0].shape[0],), wp.vec3, wo.device)
-    launch(kernels.pdf_lobes_kernel, out.shape[0], [*ins, (out, wp.vec3)], wo.device)
-    return out.reshape(*batch, 3)
-
-
-def sample_bsdf(wo: Tensor, alpha: Tensor, u: Tensor, lobe: str = "visible") -> Tensor:
-    """Directions to the light ``(..., 3)`` for uniform ``u (..., 2)``; density: that column of :func:`pdf_lobes`.
-
-    lobe: ``visible`` (reflection at a visible normal), ``mirrored`` (at that normal mirrored about the surface normal)
-    or ``cosine``.  A direction below the horizon, or a mirrored normal that faces away from ``wo``, has value and
-    density 0.  Antithetic partners are ``visible`` with :func:`~reli3d.render.sampling.opposite` of ``u``, or, as
-    published, ``mirrored`` with ``u``.
-    Gradients reach ``wo`` and ``alpha``.
-    """
-    if lobe == "cosine":
+    if choice("lobe", lobe, LOBES) == 2:
         return sample_cosine(u).expand(*torch.broadcast_shapes(wo.shape[:-1], alpha.shape, u.shape[:-1]), 3)
     wm = sample_ggx_vndf(wo, alpha, u)
-    if choice("lobe", lobe, ("visible", "mirrored", "cosine")) == 0:
+    if lobe == "visible":
         return reflect(wo, wm)
     wm = mirror(wm)
     wi = reflect(wo, wm)
     away = (wo * wm).sum(-1, keepdim=True) <= 0.0
     return torch.where(away, torch.stack([wi[..., 0], wi[..., 1], -wi[..., 2].abs()], -1), wi)
+
+
+def pdf_bsdf(wo: Tensor, alpha: Tensor, wi: Tensor, *, lobe: str = "visible") -> Tensor:
+    """Density ``(...)`` [1/sr] of :func:`sample_bsdf` at ``wi``; 0 below the horizon.
+
+    wo, wi: ``(..., 3)`` unit, local frame.  alpha: ``(...)`` GGX width.  Leading axes broadcast.  lobe: as there.  No
+    gradient: samples are drawn detached.  Raises TypeError unless float32, ValueError for a shape, a device or another
+    lobe.
+
+    >>> u = torch.rand(1000, 2)
+    >>> density = reli3d.pdf_bsdf(wo, alpha, reli3d.sample_bsdf(wo, alpha, u))
+    """
+    return pdf_lobes(wo, alpha, wi)[..., choice("lobe", lobe, LOBES)]
+
+
+def pdf_lobes(wo: Tensor, alpha: Tensor, wi: Tensor) -> Tensor:
+    """:func:`pdf_bsdf` of all :data:`LOBES`, ``(..., 3)``."""
+    batch, flat = _flat([("wo", wo, 3), ("wi", wi, 3), ("alpha", alpha, 0)])
+    ins = [(t.detach().contiguous(), kind) for t, kind in zip(flat, (wp.vec3, wp.vec3, wp.float32))]
+    out = empty((flat[0].shape[0],), wp.vec3, wo.device)
+    launch(kernels.pdf_lobes_kernel, out.shape[0], [*ins, (out, wp.vec3)], wo.device)
+    return out.reshape(*batch, 3)

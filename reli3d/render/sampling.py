@@ -30,10 +30,15 @@ def pdf_cosine(wi: Tensor) -> Tensor:
 
 
 def sample_ggx_vndf(wo: Tensor, alpha: Tensor, u: Tensor) -> Tensor:
-    """GGX microfacet normals visible from ``wo``, ``(..., 3)`` unit.
+    """GGX microfacet normals visible from ``wo``, ``(..., 3)`` unit, local frame (+z the surface normal).
 
-    wo: ``(..., 3)`` unit, z > 0.  alpha: ``(...)`` GGX width in (0, 1], floored at 1e-3.  u: ``(..., 2)``.  Gradients
-    reach ``wo`` and ``alpha``.  Source: Dupuy and Benyoub 2023, spherical caps.  Density: :func:`pdf_ggx_vndf`.
+    wo: ``(..., 3)`` unit, z > 0.  alpha: ``(...)`` GGX width ``roughness**2`` in (0, 1], floored at 1e-3.  u: ``(...,
+    2)`` uniform in [0, 1).  Leading axes broadcast.  Gradients reach ``wo`` and ``alpha``; ``u`` is a constant.  Raises
+    TypeError unless float32, ValueError for a shape or device.  Source: Dupuy and Benyoub 2023, spherical caps.
+    Density: :func:`pdf_ggx_vndf`.
+
+    >>> wo, alpha = torch.tensor([0.6, 0.0, 0.8]), torch.tensor(0.25)
+    >>> wm = reli3d.sample_ggx_vndf(wo, alpha, torch.rand(1000, 2))
     """
     check("wo", wo, last=3)
     check("alpha", alpha, like=wo)
@@ -50,9 +55,14 @@ def sample_ggx_vndf(wo: Tensor, alpha: Tensor, u: Tensor) -> Tensor:
 
 
 def pdf_ggx_vndf(wo: Tensor, alpha: Tensor, wm: Tensor) -> Tensor:
-    """Density ``(...)`` [1/sr of ``wm``] of visible normals; 0 where ``wm`` faces away from ``wo``.
+    """Density ``(...)`` [1/sr of ``wm``] of :func:`sample_ggx_vndf`; 0 where ``wm`` faces away from ``wo``.
 
-    Shapes and gradients as in :func:`sample_ggx_vndf`; gradients also reach ``wm``.
+    wo, wm: ``(..., 3)`` unit, local frame.  alpha: ``(...)`` GGX width.  Leading axes broadcast.  Gradients reach
+    ``wo``, ``alpha`` and ``wm``.  Divide by ``4 wo.wm`` for the density of the reflected direction.  Raises TypeError
+    unless float32, ValueError for a shape or device.
+
+    >>> wm = reli3d.sample_ggx_vndf(wo, alpha, u)
+    >>> density = reli3d.pdf_ggx_vndf(wo, alpha, wm)
     """
     check("wo", wo, last=3)
     check("alpha", alpha, like=wo)
@@ -68,15 +78,39 @@ def pdf_ggx_vndf(wo: Tensor, alpha: Tensor, wm: Tensor) -> Tensor:
     return pdf.reshape(batch)
 
 
-def opposite(u: Tensor) -> Tensor:
+def antithetic(u: Tensor) -> Tensor:
     """Numbers ``(..., 2)`` of the antithetic partners of visible normals drawn with ``u (..., 2)``.
 
-    The first is half a turn on, the second counts from the other end, exactly if ``u`` are multiples of 2^-24: uniform
-    if ``u`` is.  So the partner leans to the other side, and far where its original leans little.
+    Uniform if ``u`` is.  The partner lies across the lobe: the first number is half a turn on, the second counts from
+    the other end, exactly if ``u`` are multiples of 2^-24.  The mean of both integrands has less variance than two
+    independent ones where the integrand is near to odd about the lobe's centre, as derivatives in ``alpha`` and the
+    normal are.  Its own inverse.  No gradient.  Raises TypeError unless float32, ValueError for a shape.
+
+    >>> u = torch.rand(1000, 2)
+    >>> first, second = (reli3d.sample_ggx_vndf(wo, alpha, v) for v in (u, reli3d.antithetic(u)))
     """
     check("u", u, last=2)
     turn, height = u.unbind(-1)
     return torch.stack([torch.where(turn < 0.5, turn + 0.5, turn - 0.5), (1.0 - 2.0**-24) - height], -1)
+
+
+def tangent_frame(normal: Tensor) -> Tensor:
+    """Rotations ``(..., 3, 3)`` to the local frame: rows tangent, bitangent, ``normal``; ``local = frame @ world``.
+
+    normal: ``(..., 3)`` unit.  Right-handed.  Continuous except at z = 0 from below.  Gradients reach ``normal``.
+    Raises TypeError unless float32, ValueError for a shape.  Source: Duff et al. 2017, Building an Orthonormal Basis,
+    Revisited.
+
+    >>> frame = reli3d.tangent_frame(normal)
+    >>> local, world = (frame @ wo[..., None])[..., 0], (frame.mT @ wi[..., None])[..., 0]
+    """
+    check("normal", normal, last=3)
+    x, y, z = normal.unbind(-1)
+    sign = torch.where(z < 0.0, -1.0, 1.0)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    rows = [1.0 + sign * x * x * a, sign * b, -sign * x, b, sign + y * y * a, -y, x, y, z]
+    return torch.stack(rows, -1).unflatten(-1, (3, 3))
 
 
 def mirror(wm: Tensor) -> Tensor:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import NamedTuple
 
 import torch
 import warp as wp
@@ -28,49 +29,64 @@ from reli3d.geometry.rays import RayScene
 from reli3d.kernels import shade as kernels
 from reli3d.kernels import shade_rays as halves
 from reli3d.render.environment import Environment, EnvironmentTable
-from reli3d.render.material import PAINTS, choice
+from reli3d.render.material import DIFFUSE_MODELS, choice
 from reli3d.render.points import SurfacePoints, check_values, nan_where_not_finite, of_rows
 from reli3d.render.sampling import halton
 
-SAMPLES = (20, 40, 4)  # environment, visible normals, cosine: the published counts
 CHOICES = {
     "antithetic": ("none", "opposite", "mirrored"),
     "heuristic": ("balance", "power"),
     "sequence": ("halton", "random"),
     "alpha": ("squared", "linear"),
-    "paint": PAINTS,
+    "diffuse_model": DIFFUSE_MODELS,
 }
 CHUNK_RAYS = 65536  # shadow rays of a chunk and their values take 2.6 MB a thread: near the cache, far above call costs
 GROUP_RAYS = 64  # of neighbouring hits, traced together: so packets of 16 are full where a hit has fewer
 
 
-@dataclass(frozen=True)
-class ShadeOptions:
-    """How :func:`shade` draws and weighs its samples, and which formulas the material has.
+class Samples(NamedTuple):
+    """Numbers of samples of each point by strategy; the defaults are the published counts.
 
-    samples: counts from the environment table, from visible normals and from the cosine.  antithetic: partners of
-    visible normals, ``opposite`` (across the lobe, :func:`reli3d.render.sampling.opposite`), ``mirrored`` (about the
-    normal, as published) or ``none``.  heuristic: ``balance`` or ``power``.  sequence: ``halton`` (rotated per point
-    and strategy) or ``random``.  alpha: GGX width, ``squared`` roughness or, as published, ``linear``.  paint: what the
-    coat leaves to it, ``conserving`` or ``published``, see :func:`reli3d.render.material.eval_bsdf`.  clamp: largest
-    value of one sample times its strategy's count, per channel.  check_inputs: raise ValueError for directions that are
-    not unit and materials beyond [0, 1].  Raises ValueError for a count or choice.
+    light: from the environment's importance table.  bsdf: from visible normals.  cosine: from the cosine.
+
+    >>> options = reli3d.ShadeOptions(samples=reli3d.Samples(light=8, bsdf=16, cosine=2))
     """
 
-    samples: tuple[int, int, int] = SAMPLES
+    light: int = 20
+    bsdf: int = 40
+    cosine: int = 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShadeOptions:
+    """How :func:`shade` draws and weights its samples, and which formulas the material has.
+
+    samples: :class:`Samples`, or three counts in its order.  seed: of the random numbers; another seed gives
+    independent noise.  antithetic: partners of visible normals, ``opposite`` (across the lobe,
+    :func:`reli3d.render.sampling.antithetic`), ``mirrored`` (about the normal, as published) or ``none``.  heuristic:
+    ``balance`` or ``power``.  sequence: ``halton`` (rotated per point and strategy) or ``random``.  alpha: GGX width,
+    ``squared`` roughness or, as published, ``linear``.  diffuse_model: ``conserving`` or ``published``, see
+    :func:`reli3d.render.material.eval_bsdf`.  clamp: largest value of one sample times its strategy's count, per
+    channel.  check_inputs: raise ValueError for directions that are not unit and materials beyond [0, 1].  Raises
+    ValueError for a count or choice.
+
+    >>> fast = reli3d.ShadeOptions(samples=reli3d.Samples(light=4, bsdf=4, cosine=2), seed=1)
+    """
+
+    samples: Samples | tuple[int, int, int] = Samples()
     seed: int = 0
     antithetic: str = "opposite"
     heuristic: str = "balance"
     sequence: str = "halton"
     alpha: str = "squared"
-    paint: str = "conserving"
+    diffuse_model: str = "conserving"
     clamp: float | None = None
     check_inputs: bool = False
 
     def __post_init__(self):
         expect("samples", self.samples, Sequence)
         if len(self.samples) != 3 or any(int(k) != k or k < 0 for k in self.samples):
-            raise ValueError(f"samples: expected three counts of at least 0, got {self.samples}")
+            raise ValueError(f"samples: expected three counts of at least 0, got {tuple(self.samples)}")
         for name, allowed in CHOICES.items():
             choice(name, getattr(self, name), allowed)
         if self.clamp is not None and not self.clamp > 0.0:
@@ -95,14 +111,19 @@ def shade(
 ) -> Tensor:
     """Radiance ``(N, 3)`` that leaves surface ``points`` towards ``wo``, lit by ``environment``; linear Rec. 709.
 
-    wo: ``(N, 3)`` unit, to the viewer, or one row for all.  A face seen from behind is shaded as its other side. scene:
-    mesh that casts shadows, None for none.  pixels: ``(N,)`` int32 counters of the random numbers, by default the row.
-    A point with a value that is not finite is NaN.
+    points: N points with their material.  wo: ``(N, 3)`` unit, world, to the viewer, or one row for all.  A face seen
+    from behind is shaded as its other side.  scene: mesh that casts shadows, None for none.  options: sample counts,
+    seed and formulas.  pixels: ``(N,)`` int32 counters of the random numbers, by default the row.  A point with a value
+    that is not finite is NaN.
 
-    Gradients reach normal, base_color, roughness, metallic and the texels of ``environment``; sampling is detached. The
-    part of the normal's gradient along the normal has no meaning.  Once differentiable.  The same bits for any number
-    of threads.  Raises TypeError, ValueError.  Estimator: Veach and Guibas 1995 over the material of
-    ``reli3d.kernels.bsdf``.
+    Gradients reach normal, base_color, roughness, metallic and the texels of ``environment``; sampling is detached, and
+    positions and shadows have no gradient.  The part of the normal's gradient along the normal has no meaning.  Once
+    differentiable.  Bitwise identical for any number of threads.  Raises TypeError for a kind or dtype, ValueError for
+    a shape or device.  Estimator: multiple importance sampling (Veach and Guibas 1995) over the material of
+    :func:`reli3d.render.material.eval_bsdf`.
+
+    >>> points = reli3d.SurfacePoints(position, normal, normal, base_color=0.8, roughness=0.4, metallic=0.0)
+    >>> radiance = reli3d.shade(points, wo, reli3d.Environment.constant(torch.ones(3)))
     """
     return _Shade.apply(*_task(points, wo, environment, scene, options, pixels))
 
@@ -310,7 +331,7 @@ def sampling_plan(options: ShadeOptions, scene: RayScene | None) -> tuple[kernel
     plan.antithetic = CHOICES["antithetic"].index(options.antithetic)
     plan.power = CHOICES["heuristic"].index(options.heuristic)
     plan.rotate = 1 - CHOICES["sequence"].index(options.sequence)
-    plan.conserving = 1 - PAINTS.index(options.paint)
+    plan.conserving = 1 - DIFFUSE_MODELS.index(options.diffuse_model)
     plan.seed = int(options.seed) & 0x7FFFFFFF
     plan.clamp = float("inf") if options.clamp is None else float(options.clamp)
     plan.scale = 0.0 if scene is None else scene.scale

@@ -26,7 +26,7 @@ from reli3d.synthetic.procedural import ProceduralObject, sample_cameras
 
 SAMPLES = (4, 3, 1)  # light, GGX and cosine samples a ray: with FINE**2 rays a pixel the noise left is a photograph's
 FINE = 2  # rays along each side of a pixel
-PAINT = "published"  # what the shipped weights learned from, and what viewers show of an asset
+DIFFUSE_MODEL = "published"  # what the shipped weights learned from, and what viewers show of an asset
 EXPOSED = 0.6  # linear value of the 90th percentile of the object in the first view
 VOLUME_POINTS, SURFACE_POINTS, PIXELS = 16384, 8192, 1024
 
@@ -91,7 +91,8 @@ def _render(surface: Surface, camera: Camera, light: Environment, seed: int):
     seen = (hits.face >= 0).nonzero()[:, 0]
     points = surface.points_at(hits.face[seen].long(), hits.bary[seen])
     wo = -directions[seen]
-    radiance = shade(points, wo, light, scene=surface.scene, options=ShadeOptions(SAMPLES, seed, paint=PAINT))
+    options = ShadeOptions(samples=SAMPLES, seed=seed, diffuse_model=DIFFUSE_MODEL)
+    radiance = shade(points, wo, light, scene=surface.scene, options=options)
     image = light.lookup(directions)
     image[seen] = radiance
     return image, seen, points, wo, radiance

@@ -15,7 +15,7 @@ from reli3d.render.environment import Environment
 from reli3d.render.points import SurfacePoints
 from reli3d.render.shading import ShadeOptions, shade
 from reli3d.synthetic.maps import with_lamps
-from reli3d.synthetic.samples import EXPOSED, PAINT
+from reli3d.synthetic.samples import DIFFUSE_MODEL, EXPOSED
 
 SAMPLES = (12, 5, 5)  # light, GGX and cosine samples a pixel: what noise is left, a photograph in poor light has
 LAMPS = 0.6  # share of the lights that get lamps
@@ -88,7 +88,7 @@ def relit(
     n = functional.normalize(n + (0.02 - behind).clamp(min=0.0) * wo, dim=-1)  # a mean of normals may face away
     paint = material[valid]
     points = SurfacePoints(torch.zeros_like(n), n, n, srgb_to_linear(paint[:, :3]), paint[:, 3], paint[:, 4])
-    options = ShadeOptions(SAMPLES, int(rng.integers(1 << 30)), paint=PAINT)
+    options = ShadeOptions(samples=SAMPLES, seed=int(rng.integers(1 << 30)), diffuse_model=DIFFUSE_MODEL)
     radiance = shade(points, wo, environment, options=options)
     first_view = int(valid[0].sum()) or len(radiance)
     bright = float(radiance[:first_view].mean(-1).quantile(0.9))

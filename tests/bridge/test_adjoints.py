@@ -241,7 +241,7 @@ def reflections(g, small, lobe) -> Op:
     u = op_cases.numbers(n)
     return Op(
         {"wo": op_cases.above(n, 1), "alpha": torch.rand(n, generator=g) * 0.95 + 0.05},
-        lambda wo, alpha: sample_bsdf(wo, alpha, u.to(wo), lobe),
+        lambda wo, alpha: sample_bsdf(wo, alpha, u.to(wo), lobe=lobe),
         lambda wo, alpha: reference.reflected_visible_normal(wo, alpha, u.double(), lobe == "mirrored"),
         ("wo",),
     )

@@ -15,8 +15,7 @@ from reli3d.io.glb import read_glb
 from reli3d.io.hdr import read_environment
 from reli3d.output import results
 from reli3d.render.color import srgb_to_linear
-from reli3d.render.environment import Environment
-from reli3d.render.render import render
+from reli3d.render.image import render_asset
 from reli3d.views.folder import load_views
 from tests.support import evil
 from tests.support.example import QUICK, moved_example
@@ -51,19 +50,19 @@ def test_peak_memory_is_none_where_python_has_no_count(monkeypatch):
 
 
 def test_both_environments_hold_the_same_light(example):
-    exr, hdr = (read_environment(example / f"environment.{kind}") for kind in ("exr", "hdr"))
+    exr, hdr = (read_environment(example / f"environment.{kind}").radiance for kind in ("exr", "hdr"))
     assert exr.shape == (32, 64, 3) and bool((exr > 0).all())
     peak = exr.amax(-1, keepdim=True)
     assert bool(((exr - hdr).abs() <= peak / 100).all())  # RGBE keeps 8 bits of the largest channel
 
 
 def test_its_light_shows_it_as_bright_as_the_photographs(example):
-    views, light = load_views(infer.EXAMPLE, views=4), Environment(read_environment(example / "environment.exr"))
+    views, light = load_views(infer.EXAMPLE, views=4), read_environment(example / "environment.exr")
     (asset,) = read_glb(example / "mesh.glb")
     seen, shown = [], []
     for image, mask, c2w, intrinsics in zip(views.images, views.masks, views.c2w, views.intrinsics, strict=True):
         height, width = mask.shape
-        picture = render(asset, Camera(c2w, intrinsics / 8, width // 8, height // 8), light)
+        picture = render_asset(asset, Camera(c2w, intrinsics / 8, width // 8, height // 8), light)
         image = torch.nn.functional.avg_pool2d(srgb_to_linear(image).movedim(-1, 0), 8).movedim(0, -1)
         inside = torch.nn.functional.avg_pool2d(mask[None], 8)[0] > 0.999
         both = inside & (picture.alpha > 0) & (image.amax(-1) < 0.97)

@@ -1,4 +1,4 @@
-"""``reli3d-render``: its files against :func:`reli3d.render.render.render` of the same view, and how it ends."""
+"""``reli3d-render``: its files against :func:`reli3d.render.image.render_asset` of the same view, and how it ends."""
 
 import contextlib
 import io
@@ -20,7 +20,7 @@ from reli3d.io.hdr import read_environment, read_hdr_image, write_environment
 from reli3d.render.asset import Asset
 from reli3d.render.color import agx, linear_to_srgb
 from reli3d.render.environment import Environment
-from reli3d.render.render import render
+from reli3d.render.image import render_asset
 from reli3d.render.shading import ShadeOptions
 from tests.support.scenes import ball
 
@@ -41,8 +41,8 @@ def scene(tmp_path_factory):
     )
     light = torch.full((8, 16, 3), 0.0625)
     light[:, :8] = torch.tensor([2.0, 1.0, 1.0])
-    write_environment(folder / "half.hdr", light)
-    write_environment(folder / "half.exr", light)
+    write_environment(folder / "half.hdr", Environment(light))
+    write_environment(folder / "half.exr", Environment(light))
     return folder
 
 
@@ -65,8 +65,8 @@ def expected(folder, *, azimuth=30.0, yaw=0.0, seed=0, **options):
     away = torch.tensor([math.cos(lift) * math.sin(a), math.sin(lift), math.cos(lift) * math.cos(a)])
     pose = look_at((low + high) / 2 + DISTANCE * away, (low + high) / 2, torch.tensor([0.0, 1.0, 0.0]))
     camera = Camera.from_fov(pose, math.radians(32.0), SIZE, SIZE)
-    light = Environment(read_environment(folder / "half.hdr")).rotated(yaw)
-    return render(parts, camera, light, options=ShadeOptions(seed=seed), **options), camera, light
+    light = read_environment(folder / "half.hdr").rotated(yaw)
+    return render_asset(parts, camera, light, options=ShadeOptions(seed=seed), **options), camera, light
 
 
 def pixels(path):
@@ -164,11 +164,14 @@ def test_turntables_are_their_frames(scene, turn, monkeypatch):
 
 def test_paint_and_wrong_options(scene, capsys):
     picture = pixels(run(scene, light=None)["ball.png"])
-    changed = pixels(run(scene, "--paint", "published", light=None)["ball.png"])[..., :3].int() - picture[..., :3].int()
+    changed = (
+        pixels(run(scene, "--diffuse-model", "published", light=None)["ball.png"])[..., :3].int()
+        - picture[..., :3].int()
+    )
     assert int(changed.max()) > 3 and int(changed.min()) >= -1  # more light at the rim, the same noise
     common = [str(scene / "ball.glb"), "--output", str(scene / "none")]
     with pytest.raises(SystemExit) as stopped:
-        main([*common, "--paint", "white"])
+        main([*common, "--diffuse-model", "white"])
     assert stopped.value.code == 2
     capsys.readouterr()
     for wrong in (

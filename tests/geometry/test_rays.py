@@ -9,8 +9,9 @@ import trimesh
 import warp as wp
 
 from reli3d import kernels
-from reli3d.geometry.hits import evaluate_hits, hit_normals, interpolate
-from reli3d.geometry.rays import Hits, RayScene, offset_origin
+from reli3d.geometry.hits import Hits, evaluate_hits, hit_normals, interpolate
+from reli3d.geometry.mesh import Mesh
+from reli3d.geometry.rays import RayScene, offset_origin
 from tests.support import reference
 from tests.support.rays import BACKENDS, PLACES, make, placed, rays, soup
 
@@ -288,3 +289,27 @@ def test_no_module_that_traces_rays_rounds_a_product_and_its_sum_once():
     tracers = [p for p in folder.glob("*.py") if "mesh_query" in p.read_text() or "hit_occluded(" in p.read_text()]
     assert {p.name for p in tracers} >= {"rays.py", "shade.py"}
     assert not [p.name for p in tracers if "CONTRACT" in p.read_text()]
+
+
+def test_intersect_is_closest_with_gradients_in_rays_and_vertices(device):
+    """The values of ``closest`` to float32 rounding; gradients of :func:`evaluate_hits`, 0 at a miss."""
+    vertices, faces = soup(7, 400)
+    v, f = torch.tensor(vertices, device=device), torch.tensor(faces, device=device)
+    scene, (o, d) = RayScene(Mesh(v, f)), (t.to(device) for t in rays(5000, 4))
+    first = RayScene(v, f).closest(o, d)
+    leaves = [t.clone().requires_grad_() for t in (v, o, d)]
+    hits = scene.intersect(leaves[1], leaves[2], vertices=leaves[0])
+    assert torch.equal(hits.face, first.face) and torch.equal(hits.valid, first.face >= 0)
+    assert torch.equal(hits.t.detach(), scene.intersect(o, d).t)  # with or without a gradient
+    near = (hits.t.detach() - first.t)[hits.valid].abs() < 1e-4 * first.t[hits.valid]
+    assert float(near.float().mean()) > 0.999  # grazing hits have fewer digits
+    assert bool((hits.t[~hits.valid] == torch.inf).all())
+    seen = hits.valid
+    got = torch.autograd.grad(hits.t[seen].sum(), leaves)
+    want_hits = evaluate_hits(leaves[0], f, first, leaves[1], leaves[2])
+    want = torch.autograd.grad(want_hits.t[seen].sum(), leaves)
+    assert all(torch.equal(a, b) for a, b in zip(got, want, strict=True)) and float(got[1][~seen].abs().sum()) == 0.0
+    with pytest.raises(ValueError, match="vertices: expected the positions of the scene"):
+        scene.intersect(o, d, vertices=v + 1.0)
+    with pytest.raises(TypeError, match="mesh: expected"):
+        RayScene(v)

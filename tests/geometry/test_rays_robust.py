@@ -194,21 +194,21 @@ def refused(name, act):
 for backend in ("embree", "warp"):
     for index in (3, -1, 2**31 - 1, -(2**31)):
         wrong = torch.tensor([[0, 1, 2], [0, index, 2]], dtype=torch.int32)
-        refused("faces", lambda: RayScene(corners, wrong, backend))
-    refused("faces", lambda: RayScene(corners[:0], one, backend))
-    single = RayScene(corners, one, backend)
+        refused("faces", lambda: RayScene(corners, wrong, backend=backend))
+    refused("faces", lambda: RayScene(corners[:0], one, backend=backend))
+    single = RayScene(corners, one, backend=backend)
     assert ask(single) == (1.0, True, 20_000, False)
     for value in (float("nan"), float("inf")):
         broken = corners.clone()
         broken[1, 1] = value
-        refused("vertices", lambda: RayScene(broken, one, backend))
+        refused("vertices", lambda: RayScene(broken, one, backend=backend))
         refused("vertices", lambda: single.refit(broken))
         assert ask(single) == (1.0, True, 20_000, False) and single.scale == 1.0  # as it was
     refused("vertices", lambda: single.refit(corners[:2]))
     single.refit(corners - torch.tensor([0.0, 0.0, 1.0]))
     assert ask(single) == (2.0, True, 20_000, False)
     for vertices in (corners, corners[:0]):
-        empty = RayScene(vertices, one[:0], backend)
+        empty = RayScene(vertices, one[:0], backend=backend)
         for _ in range(2):
             assert ask(empty) == (float("inf"), False, 0, True) and empty.mesh_id == 0
             empty.refit(vertices.clone())

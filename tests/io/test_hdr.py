@@ -16,6 +16,7 @@ from reli3d.io.hdr import (
     write_exr,
     write_hdr,
 )
+from reli3d.render.environment import Environment
 
 
 def sky(height: int = 16, seed: int = 0, spread: float = 3.0) -> torch.Tensor:
@@ -120,7 +121,7 @@ def test_mitsuba_sees_the_sun_where_we_put_it(tmp_path, suffix):
     for row, column in ((16, 32), (16, 48), (4, 10), (27, 60)):
         image = torch.full((height, 2 * height, 3), 0.01)
         image[row - 1 : row + 2, column - 1 : column + 2] = 100.0
-        write_environment(tmp_path / f"sun.{suffix}", image)
+        write_environment(tmp_path / f"sun.{suffix}", Environment(image))
         phi = 2 * math.pi * (column + 0.5) / (2 * height) - math.pi
         theta = math.pi * (row + 0.5) / height
         d = [math.cos(phi) * math.sin(theta), math.cos(theta), math.sin(phi) * math.sin(theta)]
@@ -140,20 +141,22 @@ def test_mitsuba_sees_the_sun_where_we_put_it(tmp_path, suffix):
 
 def test_an_environment_comes_back(tmp_path):
     image = sky(8)
-    assert write_environment(tmp_path / "a.exr", image) == 0
-    torch.testing.assert_close(read_environment(tmp_path / "a.exr"), image, rtol=2**-11, atol=2**-25)  # half floats
+    assert write_environment(tmp_path / "a.exr", Environment(image)) == 0
+    torch.testing.assert_close(
+        read_environment(tmp_path / "a.exr").radiance, image, rtol=2**-11, atol=2**-25
+    )  # half floats
     columns = torch.arange(6.0)[None, :, None].expand(3, 6, 3).contiguous()
     write_exr(tmp_path / "odd.exr", columns, half=False)
-    assert torch.equal(read_environment(tmp_path / "odd.exr"), columns)
+    assert torch.equal(read_environment(tmp_path / "odd.exr").radiance, columns)
 
 
 def test_an_environment_is_refused_by_name_and_shape(tmp_path):
     for path, image, said in (
         ("a.png", sky(), "path: expected"),
-        ("a.exr", sky()[:8], "radiance: expected shape"),
+        ("a.exr", sky()[:8], "environment: expected a map"),
     ):
         with pytest.raises(ValueError, match=said):
-            write_environment(tmp_path / path, image)
+            write_environment(tmp_path / path, Environment(image))
     assert list(tmp_path.iterdir()) == []
 
 

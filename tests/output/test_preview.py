@@ -16,8 +16,8 @@ from reli3d.io.hdr import read_hdr_image, write_environment
 from reli3d.output import preview
 from reli3d.render.asset import Asset
 from reli3d.render.environment import Environment
+from reli3d.render.image import render_asset
 from reli3d.render.lights import sky
-from reli3d.render.render import render
 from reli3d.render.shading import ShadeOptions
 from reli3d.views.views import Views
 from tests.support.rigs import rig
@@ -68,7 +68,7 @@ def test_the_sheet_holds_the_inputs_unseen_views_maps_and_a_small_light(asset):
 def test_the_light_is_drawn_as_its_file_holds_it(asset, tmp_path):
     radiance = torch.full((32, 64, 3), 0.1)
     radiance[8:12, 5:9] = 5.0
-    write_environment(tmp_path / "light.hdr", radiance)
+    write_environment(tmp_path / "light.hdr", Environment(radiance))
     stored = read_hdr_image(tmp_path / "light.hdr")
     drawn = preview._map(Environment(radiance))
     peak = [int(m.mean(-1).amax(0).argmax()) / m.shape[1] for m in (stored, drawn)]
@@ -83,7 +83,7 @@ def test_the_filter_takes_noise_and_leaves_edges(asset):
     scene = RayScene(asset.mesh.vertices, asset.mesh.faces)
     camera = preview.unseen_cameras(asset.mesh, rig((0, 15, 3), target=(2.0, 2.0, 2.0)))[0]
     few, many = (
-        render(checkered, camera, options=ShadeOptions(samples), supersampling=2, scene=scene)
+        render_asset(checkered, camera, options=ShadeOptions(samples=samples), supersampling=2, scene=scene)
         for samples in (preview.SAMPLES, (400, 80, 20))
     )
     (smooth,) = preview._smoothed(few)

@@ -22,8 +22,8 @@ from reli3d.output.viewer import Shown, photograph_stops, shadow, viewer_page
 from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
+from reli3d.render.image import Render, render_asset
 from reli3d.render.lights import sky, studio
-from reli3d.render.render import Render, render
 from reli3d.render.transfer import spherical_harmonics
 from reli3d.views.views import Views
 from tests.support.browser import chromium, pixels
@@ -77,7 +77,7 @@ def views() -> Views:
 def ours(asset: Asset, views: Views, i: int, light: Environment, **options) -> Render:
     """The view of the page's window: the photograph's, with more at its sides."""
     camera = views.intrinsics[i] + torch.tensor([0.0, 0.0, (WIDE - SIZE) / 2, 0.0])
-    return render(asset, Camera(views.c2w[i], camera, WIDE, SIZE), light, supersampling=2, **options)
+    return render_asset(asset, Camera(views.c2w[i], camera, WIDE, SIZE), light, supersampling=2, **options)
 
 
 def psnr(picture: np.ndarray, color: torch.Tensor, alpha: torch.Tensor, *, shared: float = 0.99) -> float:
@@ -213,14 +213,14 @@ def test_the_page_of_the_example_looks_as_its_picture_by_the_renderer(tmp_path):
     """The own light from the first photograph, at the command's own sizes."""
     assert infer.main(["--output", str(tmp_path), "--device", "cpu"]) == 0
     (part,) = read_glb(tmp_path / "example" / "mesh.glb")
-    light = Environment(read_environment(tmp_path / "example" / "environment.exr"))
+    light = read_environment(tmp_path / "example" / "environment.exr")
     with chromium() as tab:
         tab.open((tmp_path / "example" / "viewer.html").as_uri(), size=(SIZE, SIZE)).wait("document.body.dataset.ready")
         (view, *_) = tab.ask("data.views")
         picture = pixels(tab.ask("take(0); picture()"))
         assert tab.problems == []
     camera = torch.tensor(view["intrinsics"]) * (SIZE / view["width"])
-    image = render(part, Camera(torch.tensor(view["c2w"]), camera, SIZE, SIZE), light, supersampling=2)
+    image = render_asset(part, Camera(torch.tensor(view["c2w"]), camera, SIZE, SIZE), light, supersampling=2)
     assert psnr(picture, shown(image), image.alpha, shared=0.98) > 30.0  # its handle is thin
 
 

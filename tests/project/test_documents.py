@@ -12,6 +12,7 @@ import torch
 
 import reli3d
 from reli3d.io.hdr import write_environment
+from reli3d.render.environment import Environment
 from tests.support.checkout import ROOT, copied
 from tests.support.layers import LAYERS
 
@@ -41,7 +42,9 @@ WITH_CODE = [page for page in PAGES if any(not FILE.match(code.lstrip("\n")) for
 def folder(tmp_path, monkeypatch) -> Path:
     """Working folder with what a reader has: an object folder ``photos/shoe`` and a light ``studio.hdr``."""
     shutil.copytree(Path(reli3d.__file__).parent / "assets" / "example", tmp_path / "photos" / "shoe")
-    write_environment(tmp_path / "studio.hdr", torch.rand(16, 32, 3, generator=torch.Generator().manual_seed(0)))
+    write_environment(
+        tmp_path / "studio.hdr", Environment(torch.rand(16, 32, 3, generator=torch.Generator().manual_seed(0)))
+    )
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

@@ -1,5 +1,6 @@
-"""The small examples run with nothing but the package, and find what they look for."""
+"""The examples and the library page's snippets run with nothing but the package, and find what they look for."""
 
+import re
 import runpy
 import sys
 
@@ -8,6 +9,7 @@ import torch
 
 from reli3d.io.glb import read_glb
 from reli3d.io.images import read_image
+from tests.support import reference
 from tests.support.checkout import ROOT
 
 EXAMPLES = ROOT / "examples"
@@ -54,3 +56,53 @@ def test_object_and_light_turn(run, tmp_path):
     assert all(float(alpha.max()) == 1.0 and torch.isfinite(color).all() for color, alpha in frames)
     assert not torch.equal(frames[3][0], frames[4][0])
     assert (tmp_path / "turntable.webp").stat().st_size > 500
+
+
+def test_the_snippets_of_the_library_page_are_short_and_find_what_they_look_for(tmp_path, monkeypatch):
+    page = (ROOT / "docs" / "library.md").read_text()
+    scene, *snippets = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    assert len(snippets) == 6 and max(len(code.splitlines()) for code in snippets) <= 12
+    monkeypatch.chdir(tmp_path)
+    found, names = [], {}
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        exec(scene, names)
+        for code in snippets:
+            exec(code, names)
+            found.append(dict(names))
+    texture, light, rays, normals, pairs, _ = found
+    start = (0.5 - 0.6) ** 2  # of the texels, where the loss has seen them
+    seen = texture["logits"].detach().abs().amax(-1) > 0.05
+    assert int(seen.sum()) > 200
+    assert float((texture["logits"].detach().sigmoid()[seen] - 0.6).square().mean()) < 0.5 * start
+    above = light["guess"].radiance[:4].mean() - light["guess"].radiance[4:].mean()
+    assert float(above) > 0.3  # brighter above, as the true light is
+    # closed form: moving all vertices by e along the viewing axis f moves t by e (n . f) / (n . d)
+    gradient, hits = rays["vertices"].grad, rays["hits"]
+    forward = -rays["camera"].c2w[:3, 2]
+    slope = (2.0 * (rays["depth"].detach() - 2.5) / len(rays["depth"])).double()
+    along = rays["directions"][hits.valid].double()
+    normal = torch.nn.functional.normalize(face_normals(rays["mesh"], hits), dim=-1)
+    want = (slope * (normal @ forward.double()) / (normal * along).sum(-1)).sum()
+    assert float((gradient.double() @ forward.double()).sum()) == pytest.approx(float(want), rel=1e-3)  # float32 sum
+    truth = [albedo_by_quadrature(0.25 + step) for step in (0.0, -1e-3, 1e-3)]
+    assert normals["albedo"].tolist() == pytest.approx([truth[0]] * 3, abs=0.01)  # 4096 samples of a nearly even weight
+    assert float(pairs["slope"]) == pytest.approx((truth[2] - truth[1]) / 2e-3, abs=0.05)
+    color, alpha = read_image(tmp_path / "relit.png")
+    assert color.shape == (48, 48, 3) and 0.0 < float(alpha.mean()) < 1.0
+
+
+def face_normals(mesh, hits):
+    corners = mesh.vertices.double()[mesh.faces[hits.face[hits.valid].long()].long()]
+    return torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+
+def albedo_by_quadrature(alpha: float) -> float:
+    """Of a white mirror of GGX width ``alpha`` seen at a cosine of 0.8: the float64 twin summed over the sphere."""
+    wi, angle = reference.sphere_grid(600)
+    wi = wi.roll(1, -1)  # its pole is y, here z
+    wi = wi[wi[:, 2] > 1e-6]
+    one = torch.ones(len(wi), dtype=torch.float64)
+    wo = torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64).expand(len(wi), 3)
+    value = reference.eval_bsdf(wo, wi, one[:, None].expand(-1, 3), alpha * one, one)
+    return float((value[:, 0] * wi[:, 2]).sum() * angle)

@@ -86,7 +86,7 @@ def test_imports_point_down(path):
         ("import torch", "reli3d.kernels.math", False),
         ("from .. import _bridge", "reli3d.kernels.math", False),
         ("from .._bridge import call", "reli3d.kernels.math", False),
-        ("def f():\n    from reli3d.nn.model import Reconstructor", "reli3d.render.render", False),
+        ("def f():\n    from reli3d.nn.model import Reconstructor", "reli3d.render.image", False),
         ("from reli3d import reconstruct", "reli3d.nn.model", False),
         ("from ..pipeline import reconstruct", "reli3d.nn", True),
         ("import reli3d.cli.infer", "reli3d.pipeline", False),

@@ -15,9 +15,9 @@ from reli3d.geometry.surface import extract_surface
 from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
+from reli3d.render.image import render_asset
 from reli3d.render.points import SurfacePoints
-from reli3d.render.render import render
-from reli3d.render.shading import ShadeOptions, shade
+from reli3d.render.shading import Samples, ShadeOptions, shade
 from tests.support.scenes import ball, textures
 
 VERTICES = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype=np.float32)
@@ -111,22 +111,17 @@ def test_an_asset_moves_detaches_and_says_what_it_is(device):
     assert light.to("cpu") is light and not Environment(light.radiance.requires_grad_()).detach().radiance.requires_grad
 
 
-def test_an_image_is_saved_as_it_is_shown(tmp_path, device):
+def test_an_image_is_written_as_it_is_displayed(tmp_path, device):
     asset = Asset(ball(device).mesh, textures(4, device))
     camera = Camera.from_fov(look_at([0.0, 0.0, 2.0]), 0.8, 16, 16).to(device)
-    image = render(asset, camera, Environment.constant(torch.ones(3, device=device)), options=ShadeOptions((4, 4, 4)))
-    image.save_png(tmp_path / "a.png", exposure=-1.0)
+    options = ShadeOptions(samples=Samples(light=4, bsdf=4, cosine=4))
+    image = render_asset(asset, camera, Environment.constant(torch.ones(3, device=device)), options=options)
+    reli3d.write_image(tmp_path / "a.png", image.rgba.cpu())
     got = torch.from_numpy(np.asarray(Image.open(tmp_path / "a.png")).copy()).float() / 255.0
-    want = torch.cat([linear_to_srgb(image.radiance * 0.5), image.alpha[..., None]], -1).cpu()
-    inside = want[..., 3] == 1.0  # without subpixels alpha is 0 or 1
-    assert 0 < int(inside.sum()) < inside.numel() and bool((got[~inside] == 0.0).all())
-    torch.testing.assert_close(got[inside], want[inside].clamp(0, 1), rtol=0, atol=0.5 / 255 + 1e-5)  # 8 bits
-    image.save_png(tmp_path / "b.png", transparent=False)
-    assert Image.open(tmp_path / "b.png").mode == "RGB"
-    image.radiance[3, 3] = torch.nan
-    with pytest.raises(ValueError, match="radiance: expected finite"):
-        image.save_png(tmp_path / "c.png")
-    assert not (tmp_path / "c.png").exists()
+    assert 0 < int((got[..., 3] == 1.0).sum()) < got[..., 3].numel()  # without subpixels alpha is 0 or 1
+    torch.testing.assert_close(got, image.display().cpu(), rtol=0, atol=0.5 / 255 + 1e-5)  # 8 bits
+    darker = image.display(exposure=-1.0, transparent=False).cpu()
+    torch.testing.assert_close(darker, linear_to_srgb(0.5 * image.radiance).clamp(0, 1).cpu())
 
 
 def test_points_take_numbers_of_any_kind_and_numpy_arrays():
@@ -152,9 +147,9 @@ def test_a_wrong_kind_is_a_type_error_that_names_the_argument():
     for name, call in (
         ("views", lambda: reli3d.reconstruct("photos")),
         ("c2w", lambda: Camera.from_fov(None, 0.7, 8, 8)),
-        ("asset", lambda: render(asset.mesh, camera, light)),
-        ("camera", lambda: render(asset, look_at([0.0, 0.0, 3.0]), light)),
-        ("environment", lambda: render(asset, camera, torch.ones(4, 8, 3))),
+        ("asset", lambda: render_asset(asset.mesh, camera, light)),
+        ("camera", lambda: render_asset(asset, look_at([0.0, 0.0, 3.0]), light)),
+        ("environment", lambda: render_asset(asset, camera, torch.ones(4, 8, 3))),
         ("mesh", lambda: Asset(1, 2)),
         ("textures", lambda: Asset(asset.mesh, 2)),
         ("mesh", lambda: bake(asset, 64, None)),

@@ -12,7 +12,7 @@ from reli3d.io.glb import write_glb
 from reli3d.render.allocation import plan_samples
 from reli3d.render.asset import Asset
 from reli3d.render.environment import Environment
-from reli3d.render.render import plan_render, render
+from reli3d.render.image import plan_render, render_asset
 from reli3d.render.shading import ShadeOptions, shade
 from tests.support import reference
 from tests.support.bootstrap import interval
@@ -266,7 +266,12 @@ def test_an_image_has_less_noise_by_its_plan(device):
     plan = plan_render(asset, camera, env)
     images = {
         counts: torch.stack(
-            [render(asset, camera, env, options=ShadeOptions(counts, k, pairs)).radiance for k in range(12)]
+            [
+                render_asset(
+                    asset, camera, env, options=ShadeOptions(samples=counts, seed=k, antithetic=pairs)
+                ).radiance
+                for k in range(12)
+            ]
         )
         for counts, pairs in ((plan.samples, "none"), ((20, 40, 4), "opposite"))
     }

@@ -66,15 +66,15 @@ def test_white_metal_sends_out_its_directional_albedo_and_never_more_than_comes_
     assert abs(z.mean()) < 3.0 / 64**0.5  # all of them together: a bias of 1e-4; measured 0.04
 
 
-def albedo(wo, alpha, base, metallic, u, **paint):
+def albedo(wo, alpha, base, metallic, u, **options):
     """Directional albedo, float64, of every channel of ``base``: visible normals and the cosine by the balance
     heuristic."""
     total = 0.0
     for lobe, k in (("visible", 0), ("cosine", 2)):
-        wi = sample_bsdf(wo, alpha, u, lobe)
-        pdf = pdf_lobes(wo, wi, alpha)
+        wi = sample_bsdf(wo, alpha, u, lobe=lobe)
+        pdf = pdf_lobes(wo, alpha, wi)
         both = (pdf[:, 0] + pdf[:, 2]).clamp(min=1e-20)
-        value = eval_bsdf(wo, wi, base, alpha, metallic, **paint) * (wi[:, 2] / both)[:, None]
+        value = eval_bsdf(wo, base, alpha, metallic, wi, **options) * (wi[:, 2] / both)[:, None]
         total = total + torch.where(pdf[:, k : k + 1] > 0, value, 0.0).double().mean(0)
     return total
 
@@ -91,7 +91,7 @@ def test_neither_coat_nor_paint_nor_metal_gains_energy(device, alpha):
     width, one = torch.tensor(alpha, device=device), torch.ones((), device=device)
     for cos_o in (0.02, *COSINES):
         metal, white, coat = (
-            albedo(view(cos_o, device), width, c * one.expand(3), m * one, u, paint="published")[0]
+            albedo(view(cos_o, device), width, c * one.expand(3), m * one, u, diffuse_model="published")[0]
             for c, m in ((1, 1.0), (1, 0.0), (0, 0.0))
         )
         assert max(metal, white - coat, coat) <= 1.0 + 1e-3, cos_o  # measured 3e-5, of the Halton points
@@ -112,7 +112,7 @@ def test_no_surface_sends_out_more_than_comes_in(device):
                 dielectric += [float(sent[0])] if metallic == 0.0 else []
     assert highest <= 1.0 + 1e-3
     assert min(dielectric) > 0.75 and max(dielectric) > 0.97  # and it does so without making white paint grey
-    published = albedo(view(0.05, device), number(0.1), base, number(0.0), u, paint="published")
+    published = albedo(view(0.05, device), number(0.1), base, number(0.0), u, diffuse_model="published")
     assert float(published[0]) > 1.2  # what the test is there to see: 1.30
 
 
@@ -177,5 +177,5 @@ def test_a_white_surface_in_the_furnace_of_the_shader(device):
             assert abs(got - want) < 4 * noise + 2e-4 and got < 1.0 + 1e-3  # 2e-4: of the points in the quadrature
             assert (
                 cos_o > 0.1
-                or shade(points, wo, light, options=ShadeOptions(paint="published"))[:, 0].mean() > got + 0.02
+                or shade(points, wo, light, options=ShadeOptions(diffuse_model="published"))[:, 0].mean() > got + 0.02
             )

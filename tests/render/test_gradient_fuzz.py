@@ -5,15 +5,14 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from reli3d.geometry.hits import evaluate_hits, hit_normals, interpolate
+from reli3d.geometry.hits import Hits, evaluate_hits, hit_normals, interpolate
 from reli3d.geometry.mesh import Mesh
-from reli3d.geometry.rays import Hits
 from reli3d.kernels.microfacet import ALPHA_MIN, COS_MIN
 from reli3d.kernels.shade import COS_VIEW_MIN
 from reli3d.render.asset import TextureSet
 from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import surface_points
-from reli3d.render.material import PAINTS, eval_bsdf, sample_bsdf
+from reli3d.render.material import DIFFUSE_MODELS, eval_bsdf, sample_bsdf
 from reli3d.render.sampling import random_pairs
 from reli3d.render.shading import ShadeOptions, shade
 from tests.support import reference
@@ -66,13 +65,14 @@ def close(got, want, share, within=2e-3):
     return float((off < within).double().mean()) > share
 
 
-@pytest.mark.parametrize("paint", PAINTS)
-def test_gradients_of_the_material(device, paint):
+@pytest.mark.parametrize("diffuse_model", DIFFUSE_MODELS)
+def test_gradients_of_the_material(device, diffuse_model):
     normal, _, wo, wi, base, alpha, metallic = drawn(N)
     turn = frame(normal)
     local = [(turn @ v[..., None])[..., 0] for v in (wo, wi)]
     leaves = [v.to(device).requires_grad_() for v in (*local, base, alpha, metallic)]
-    value = eval_bsdf(*leaves, paint=paint)
+    wo, wi, *material = leaves
+    value = eval_bsdf(wo, *material, wi, diffuse_model=diffuse_model)
     weight = torch.rand(N, 3, generator=torch.Generator().manual_seed(1))
     grads = torch.autograd.grad((value * weight.to(device)).sum(), leaves)
     assert bool(torch.isfinite(value).all()) and all(bool(torch.isfinite(g).all()) for g in grads)
@@ -82,7 +82,7 @@ def test_gradients_of_the_material(device, paint):
     keep = (local[0][:, 2] > 1e-2) & (local[1][:, 2] > 1e-2) & (alpha >= 0.01)
     assert keep.sum() > 10_000
     twin = [v.detach()[keep].cpu().double().requires_grad_() for v in leaves]
-    want = reference.eval_bsdf(*twin, paint)
+    want = reference.eval_bsdf(*twin, diffuse_model)
     truth = torch.autograd.grad((want * weight[keep].double()).sum(), twin)
     assert close(value.detach()[keep], want.detach(), 0.999, 1e-5)
     for k, (g, t) in enumerate(zip(grads, truth, strict=True)):
@@ -99,7 +99,7 @@ def bent(normal, ng, wo):
     return torch.where(cos < COS_VIEW_MIN, normalize(facing + wo * (COS_VIEW_MIN - cos), dim=-1), facing)
 
 
-def twin(leaves, ng, wo, draws, density, light, paint):
+def twin(leaves, ng, wo, draws, density, light, diffuse_model):
     """Radiance ``(N, 3)``: mean over constant directions ``draws`` of value, cosine and ``light`` over ``density``."""
     normal, base, alpha, metallic = leaves
     wo, n = (
@@ -114,7 +114,7 @@ def twin(leaves, ng, wo, draws, density, light, paint):
         o, i = (torch.cat([(turn @ (v - n * c)[..., None])[..., 0], c], -1) for v, c in zip((wo, d), cos))
         above = i[:, 2:] > COS_MIN
         i = torch.where(above, i, i.new_tensor([0.0, 0.6, 0.8]))
-        value = reference.eval_bsdf(o, i, base, alpha.clamp(min=FLOOR), metallic, paint) * i[:, 2:]
+        value = reference.eval_bsdf(o, i, base, alpha.clamp(min=FLOOR), metallic, diffuse_model) * i[:, 2:]
         out = out + torch.where(above, value * radiance / p[:, None].clamp(min=1e-30), 0.0)
     return out / len(draws)
 
@@ -123,7 +123,7 @@ def world_directions(normal, ng, wo, alpha, u):
     """Reflections at visible normals for ``u``, drawn in the shader's frame, and their float64 density."""
     turn = frame(bent(normal, ng, wo))
     local, width = (turn @ wo[..., None])[..., 0], alpha.clamp(min=FLOOR)
-    d = (turn.mT @ sample_bsdf(local, width, u, "visible")[..., None])[..., 0]
+    d = (turn.mT @ sample_bsdf(local, width, u)[..., None])[..., 0]
     turn = frame(normalize(bent(normal.double(), ng.double(), wo.double()), dim=-1))
     o, i = ((turn @ normalize(v.double(), dim=-1)[..., None])[..., 0] for v in (wo, d))
     wm = normalize(o + i, dim=-1)
@@ -131,9 +131,9 @@ def world_directions(normal, ng, wo, alpha, u):
     return d, torch.where(i[:, 2] > COS_MIN, pdf, 0.0)
 
 
-@pytest.mark.parametrize("paint", PAINTS)
+@pytest.mark.parametrize("diffuse_model", DIFFUSE_MODELS)
 @pytest.mark.parametrize("strategy", ["map", "visible"])
-def test_gradients_of_the_estimator(device, strategy, paint):
+def test_gradients_of_the_estimator(device, strategy, diffuse_model):
     """Two samples a point of one strategy, so that the twin can draw them too."""
     normal, ng, wo, _, base, alpha, metallic = drawn(N, 2)
     generator = torch.Generator().manual_seed(3)
@@ -165,7 +165,12 @@ def test_gradients_of_the_estimator(device, strategy, paint):
             *at(leaves[0].detach(), leaves[0], ng.to(device), wo.to(device), leaves[1], leaves[2], leaves[3]),
             Environment(leaves[4]),
             options=ShadeOptions(
-                samples=counts, seed=seed, antithetic="none", sequence="random", alpha="linear", paint=paint
+                samples=counts,
+                seed=seed,
+                antithetic="none",
+                sequence="random",
+                alpha="linear",
+                diffuse_model=diffuse_model,
             ),
         )
         return out.detach(), torch.autograd.grad((out * weight.to(device)).sum(), leaves)
@@ -178,7 +183,12 @@ def test_gradients_of_the_estimator(device, strategy, paint):
     radiance = texels.double().requires_grad_()
     light = [reference.lookup_envmap(radiance, d[smooth]) for d in draws]
     want = twin(
-        part, *(v[smooth] for v in exact), [d[smooth] for d in draws], [p[smooth] for p in density], light, paint
+        part,
+        *(v[smooth] for v in exact),
+        [d[smooth] for d in draws],
+        [p[smooth] for p in density],
+        light,
+        diffuse_model,
     )
     *truth, g_texels = torch.autograd.grad((want * weight.double()[smooth]).sum(), [*part, radiance])
     assert reference.share_within(value[smooth], want) >= 0.999
@@ -199,7 +209,7 @@ def test_gradients_of_the_estimator(device, strategy, paint):
     "options",
     [
         {},
-        {"paint": "published", "heuristic": "power", "sequence": "random"},
+        {"diffuse_model": "published", "heuristic": "power", "sequence": "random"},
         {"antithetic": "mirrored"},
         {"antithetic": "none", "clamp": 0.5},
     ],

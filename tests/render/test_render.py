@@ -15,8 +15,8 @@ from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.color import srgb_to_linear
 from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import sample_texture, surface_points
-from reli3d.render.material import PAINTS
-from reli3d.render.render import _resolve, render, render_lights
+from reli3d.render.image import _resolve, render_asset, render_lights
+from reli3d.render.material import DIFFUSE_MODELS
 from reli3d.render.shading import ShadeOptions, shade, shade_lights
 from tests.support import reference
 from tests.support.scenes import ball, eye, shadow_caster, sky, textures
@@ -96,28 +96,28 @@ def test_picture_on_a_square_is_upright_and_resolved(device):
     asset = Asset(square(device), replace(textures(8, device), base_color=picture))
     camera = Camera(eye(device, 0.0, 0.0, 4.0), torch.tensor([16.0, 16.0, 4.0, 4.0], device=device), 8, 8)
     env = Environment.constant(torch.ones(3, device=device))
-    image = render(asset, camera, env)
+    image = render_asset(asset, camera, env)
 
     torch.testing.assert_close(image.base_color, srgb_to_linear(picture), rtol=0, atol=1e-4)  # one texel a pixel
     assert float(image.alpha.min()) == 1.0
     torch.testing.assert_close(image.depth, torch.full_like(image.depth, 4.0), rtol=1e-5, atol=0)
     wide = Camera(camera.c2w, torch.tensor([16.0, 16.0, 6.0, 4.0], device=device), 12, 8)
-    fine = render(asset, wide, env, supersampling=3, background="environment")
+    fine = render_asset(asset, wide, env, supersampling=3, background="environment")
     assert fine.alpha[:, :2].sum() == 0 and torch.isinf(fine.depth[:, 0]).all()
     torch.testing.assert_close(fine.radiance[:, 0], torch.ones(8, 3, device=device), rtol=1e-5, atol=0)
-    assert float(render(asset, wide, env).radiance[:, 0].abs().max()) == 0.0
+    assert float(render_asset(asset, wide, env).radiance[:, 0].abs().max()) == 0.0
 
 
 def test_bands_progress_and_supersampling_do_not_change_the_mean(device, monkeypatch):
     asset, env = ball(device), Environment(torch.rand(8, 16, 3, generator=torch.Generator().manual_seed(1)).to(device))
     camera = Camera.from_fov(eye(device, 0.5, 1.0, 2.0), 0.8, 40, 40)
-    whole = render(asset, camera, env)
+    whole = render_asset(asset, camera, env)
     seen = []
-    monkeypatch.setattr("reli3d.render.render.BAND_RAYS", 200)
-    banded = render(asset, camera, env, progress=seen.append)
+    monkeypatch.setattr("reli3d.render.image.BAND_RAYS", 200)
+    banded = render_asset(asset, camera, env, progress=seen.append)
     torch.testing.assert_close(banded.radiance, whole.radiance, rtol=1e-4, atol=1e-4)  # ray origins round differently
     assert seen[-1] == 1.0 and len(seen) == 8
-    fine = render(asset, camera, env, supersampling=3)
+    fine = render_asset(asset, camera, env, supersampling=3)
     inside = whole.alpha > 0
     assert abs(fine.radiance.mean() / whole.radiance.mean() - 1) < 0.03  # 40 pixels of silhouette in 500
     assert float((fine.normal.norm(dim=-1)[inside & (fine.alpha > 0)] - 1).abs().max()) < 1e-5
@@ -128,8 +128,8 @@ def test_several_lights_give_the_bits_of_one_light_each_and_trace_the_camera_onc
     asset, camera = Asset(square(device), textures(8, device)), Camera.from_fov(eye(device, 0.4, 0.7, 3.0), 0.9, 40, 32)
     rng = torch.Generator().manual_seed(3)
     lights = [Environment(torch.rand(8, 16, 3, generator=rng).to(device)) for _ in range(2)]
-    options = dict(options=ShadeOptions((4, 2, 1)), supersampling=2, background=background)
-    alone = [render(asset, camera, light, **options) for light in lights]
+    options = dict(options=ShadeOptions(samples=(4, 2, 1)), supersampling=2, background=background)
+    alone = [render_asset(asset, camera, light, **options) for light in lights]
     calls, closest = [], RayScene.closest
     monkeypatch.setattr(RayScene, "closest", lambda self, *a, **k: calls.append(1) or closest(self, *a, **k))
     together = render_lights(asset, camera, lights, **options)
@@ -174,12 +174,12 @@ def test_rays_beside_the_asset_are_left_out_without_a_trace_in_the_image(device,
             rays.clear()
             with monkeypatch.context() as patch:
                 patch.setattr(RayScene, "closest", counted)
-                boxed = render(asset, camera, env, supersampling=2)
+                boxed = render_asset(asset, camera, env, supersampling=2)
             if place[2] > 2.0:
                 assert sum(rays) < 0.7 * 4 * 48 * 32
             with monkeypatch.context() as patch:
-                patch.setattr("reli3d.render.render.box_of", lambda _, camera: (0, 0, camera.width, camera.height))
-                whole = render(asset, camera, env, supersampling=2)
+                patch.setattr("reli3d.render.image.box_of", lambda _, camera: (0, 0, camera.width, camera.height))
+                whole = render_asset(asset, camera, env, supersampling=2)
             for field in fields(whole):
                 assert torch.equal(getattr(boxed, field.name), getattr(whole, field.name)), (place, cx, field.name)
 
@@ -189,7 +189,7 @@ def test_rays_beside_the_asset_are_left_out_without_a_trace_in_the_image(device,
 def test_shadows_found_for_one_light_are_those_of_the_others(device, counts, sequence):
     """More than 32 samples take two words of bits; without gradient and with one."""
     normal, wo, *rest = inputs(3000, device)
-    scene, options = shadow_caster(device), ShadeOptions(counts, sequence=sequence)
+    scene, options = shadow_caster(device), ShadeOptions(samples=counts, sequence=sequence)
     lights = [sky(seed=1).to(device), Environment(torch.zeros(8, 16, 3, device=device)), sky(seed=2).to(device)]
     for base in (rest[0], rest[0].clone().requires_grad_()):
         args = on_ball(normal, wo, base, *rest[1:])
@@ -213,7 +213,7 @@ def test_image_gradient_reaches_textures_and_light(device):
     asset = ball(device)
     maps = [getattr(asset.textures, f.name).clone().requires_grad_() for f in fields(asset.textures)]
     light = torch.rand(8, 16, 3, generator=torch.Generator().manual_seed(1)).to(device).requires_grad_()
-    image = render(
+    image = render_asset(
         Asset(asset.mesh, TextureSet(*maps)),
         Camera.from_fov(eye(device, 0.0, 0.5, 2.0), 0.8, 24, 24),
         Environment(light),
@@ -231,24 +231,35 @@ def test_no_light_is_gained_at_the_rim_but_with_the_published_paint(device):
         Environment.constant(torch.ones(3, device=device)),
     )
     asset = Asset(asset.mesh, textures(4, device, (1.0, 1.0, 1.0), roughness=0.2))
-    images = {paint: render(asset, camera, white, options=ShadeOptions((64, 64, 64), paint=paint)) for paint in PAINTS}
+    images = {
+        diffuse_model: render_asset(
+            asset, camera, white, options=ShadeOptions(samples=(64, 64, 64), diffuse_model=diffuse_model)
+        )
+        for diffuse_model in DIFFUSE_MODELS
+    }
     inside = images["published"].alpha > 0
-    bright = {paint: image.radiance[inside] for paint, image in images.items()}
+    bright = {diffuse_model: image.radiance[inside] for diffuse_model, image in images.items()}
     assert float(bright["published"].max()) > 1.1
     assert float(bright["conserving"].max()) < 1.05 and float(bright["conserving"].mean()) > 0.85  # 192 samples' noise
     assert torch.equal(
-        images["conserving"].radiance, render(asset, camera, white, options=ShadeOptions((64, 64, 64))).radiance
+        images["conserving"].radiance,
+        render_asset(asset, camera, white, options=ShadeOptions(samples=(64, 64, 64))).radiance,
     )
 
 
 def test_bad_input_is_named(device):
     asset, camera = ball(device), Camera.from_fov(eye(device, 0.0, 0.5, 2.0), 0.8, 4, 4)
     with pytest.raises(ValueError, match="environment: expected"):
-        render(asset, camera)
+        render_asset(asset, camera)
     with pytest.raises(ValueError, match="background: expected"):
-        render(asset, camera, Environment.constant(torch.ones(3, device=device)), background="pink")
-    with pytest.raises(ValueError, match="paint: expected"):
-        render(asset, camera, Environment.constant(torch.ones(3, device=device)), options=ShadeOptions(paint="white"))
+        render_asset(asset, camera, Environment.constant(torch.ones(3, device=device)), background="pink")
+    with pytest.raises(ValueError, match="diffuse_model: expected"):
+        render_asset(
+            asset,
+            camera,
+            Environment.constant(torch.ones(3, device=device)),
+            options=ShadeOptions(diffuse_model="white"),
+        )
     faces, values = asset.mesh.faces, asset.mesh.vertices
     with pytest.raises(ValueError, match="face: expected"):
         interpolate(
@@ -267,11 +278,11 @@ def test_parts_shadow_each_other_and_keep_their_paint(device):
     floor = Mesh(flat + torch.tensor([0, -0.6, 0], device=device), floor.faces, None, floor.uv)
     parts = [ball(device, (0.9, 0.1, 0.1)), Asset(floor, textures(4, device, (0.1, 0.1, 0.9)))]
     camera = Camera.from_fov(eye(device, 0.0, 2.0, 3.0), 0.9, 48, 48)
-    image = render(parts, camera, Environment.constant(torch.ones(3, device=device)))
+    image = render_asset(parts, camera, Environment.constant(torch.ones(3, device=device)))
     assert image.base_color[24, 24, 0] > 10 * image.base_color[24, 24, 2]
     below = image.position[..., 1] < -0.59
     assert bool(below.any()) and bool((image.base_color[below][:, 2] > 10 * image.base_color[below][:, 0]).all())
-    alone = render(parts[1:], camera, Environment.constant(torch.ones(3, device=device)))
+    alone = render_asset(parts[1:], camera, Environment.constant(torch.ones(3, device=device)))
     near = below & (image.position.norm(dim=-1) < 0.9)
     assert float(image.radiance[near].mean()) < 0.9 * float(alone.radiance[near].mean())
 

@@ -9,8 +9,8 @@ import torch
 from reli3d.render.environment import Environment
 from reli3d.render.material import eval_bsdf, pdf_lobes, sample_bsdf
 from reli3d.render.sampling import (
+    antithetic,
     halton,
-    opposite,
     pdf_cosine,
     pdf_ggx_vndf,
     random_pairs,
@@ -55,19 +55,19 @@ def test_lobes_follow_their_densities(device, alpha, deg, phi, drawn, seed):
     valid, total = [], 0
     while sum(map(len, valid)) < 100_000:
         u = torch.rand(N, 2, generator=g).to(device)
-        wi = sample_bsdf(wo, a, opposite(u), "visible") if drawn == "opposite" else sample_bsdf(wo, a, u, drawn)
+        wi = sample_bsdf(wo, a, antithetic(u)) if drawn == "opposite" else sample_bsdf(wo, a, u, lobe=drawn)
         valid.append(wi[wi[:, 2] > 1e-6])
         total += N
     k = int(drawn == "mirrored")
-    pdf = lambda d: pdf_lobes(wo, d, a)[:, k]  # noqa: E731
-    wrong = {"width": lambda d: pdf_lobes(wo, d, 1.02 * a)[:, k]}
+    pdf = lambda d: pdf_lobes(wo, a, d)[:, k]  # noqa: E731
+    wrong = {"width": lambda d: pdf_lobes(wo, 1.02 * a, d)[:, k]}
     if deg >= 45:  # near the normal mirrored ones have almost the density of their originals
-        wrong["the other's"] = lambda d: pdf_lobes(wo, d, a)[:, 1 - k]
+        wrong["the other's"] = lambda d: pdf_lobes(wo, a, d)[:, 1 - k]
     if deg == 89 and (drawn == "mirrored" or alpha < 0.05):  # a degree or less beside the horizon
         whole = chi2.masses(chi2.Sphere(141), pdf, device).sum()
         assert not chi2.lost(sum(map(len, valid)), whole, total)
         grid = chi2.Window(wo, alpha, drawn == "mirrored")
-        wrong["view"] = lambda d: pdf_lobes(view(89.1, device, phi), d, a)[:, k]
+        wrong["view"] = lambda d: pdf_lobes(view(89.1, device, phi), a, d)[:, k]
     return chi2.check(grid, torch.cat(valid), pdf, wrong, total)
 
 
@@ -75,26 +75,26 @@ def test_cosine_follows_its_density(device):
     wrong = {"exponent": lambda d: 2.05 / (2 * math.pi) * d[:, 2].clamp(min=0.0) ** 1.05}
     chi2.check(chi2.Sphere(45), sample_cosine(uniform(N, device)), pdf_cosine, wrong)
     assert torch.equal(
-        sample_bsdf(view(60, device), torch.tensor(0.3, device=device), uniform(9, device), "cosine"),
+        sample_bsdf(view(60, device), torch.tensor(0.3, device=device), uniform(9, device), lobe="cosine"),
         sample_cosine(uniform(9, device)),
     )
     wo, wi, a = view(60, device), sample_cosine(uniform(1000, device)), torch.tensor(0.3, device=device)
-    torch.testing.assert_close(pdf_lobes(wo, wi, a)[:, 2], pdf_cosine(wi), rtol=1e-6, atol=0)  # 1 / pi is rounded
+    torch.testing.assert_close(pdf_lobes(wo, a, wi)[:, 2], pdf_cosine(wi), rtol=1e-6, atol=0)  # 1 / pi is rounded
 
 
 def test_opposite_numbers_are_each_of_them_once(device):
     """Of the 2^24 there are, on either axis: what is uniform stays so.  Twice the same is where it began."""
     every = torch.arange(2**24, dtype=torch.float64, device=device) / 2**24
     u = torch.stack([every.float(), every.float().flip(0)], -1)
-    got = opposite(u)
-    assert torch.equal(opposite(got), u)
+    got = antithetic(u)
+    assert torch.equal(antithetic(got), u)
     assert bool(((got[:, 0].double() - every).abs() == 0.5).all())
     assert torch.equal(got[:, 1].double(), every)
 
 
-@pytest.mark.parametrize("antithetic", ["opposite", "mirrored"])
+@pytest.mark.parametrize("pairs", ["opposite", "mirrored"])
 @pytest.mark.parametrize("points", ["random", "halton"])
-def test_pairs_of_the_shader_are_those_of_the_samplers(device, points, antithetic):
+def test_pairs_of_the_shader_are_those_of_the_samplers(device, points, pairs):
     """One pair a point under even light: value over the sum of both densities, of which each is its own sample's."""
     n, seed = 20_000, 3
     g = torch.Generator().manual_seed(5)
@@ -107,41 +107,41 @@ def test_pairs_of_the_shader_are_those_of_the_samplers(device, points, antitheti
     if points == "halton":
         u = (u + halton(1, device=device)) % 1.0
     pair = ("visible", u), ("mirrored", u)
-    if antithetic == "opposite":
-        pair = ("visible", u), ("visible", opposite(u))
+    if pairs == "opposite":
+        pair = ("visible", u), ("visible", antithetic(u))
     want = torch.zeros(n, 3, device=device)
     for lobe, numbers in pair:
-        wi = sample_bsdf(wo, rough**2, numbers, lobe)
-        lobes = pdf_lobes(wo, wi, rough**2)
+        wi = sample_bsdf(wo, rough**2, numbers, lobe=lobe)
+        lobes = pdf_lobes(wo, rough**2, wi)
         density = sum(lobes[:, int(name == "mirrored"), None] for name, _ in pair)
-        want += torch.where(wi[:, 2:] > 1e-6, eval_bsdf(wo, wi, base, rough**2, metal) * wi[:, 2:] / density, 0.0)
+        want += torch.where(wi[:, 2:] > 1e-6, eval_bsdf(wo, base, rough**2, metal, wi) * wi[:, 2:] / density, 0.0)
     env = Environment(torch.full((4, 8, 3), 0.7, device=device))
     got = shade(
         *at(up, up, up, wo, base, rough, metal),
         env,
-        options=ShadeOptions(samples=(0, 2, 0), seed=seed, sequence=points, antithetic=antithetic),
+        options=ShadeOptions(samples=(0, 2, 0), seed=seed, sequence=points, antithetic=pairs),
     )
     # sharp lobes have few digits of the half vector
     assert reference.share_within(got.cpu(), 0.7 * want.cpu()) > 0.999
 
 
-@pytest.mark.parametrize("antithetic", ["opposite", "mirrored"])
+@pytest.mark.parametrize("pairs", ["opposite", "mirrored"])
 @pytest.mark.parametrize("alpha, deg", chi2.MIXTURES)
-def test_the_mixture_of_all_strategies_follows_the_sum_of_their_densities(device, alpha, deg, antithetic):
+def test_the_mixture_of_all_strategies_follows_the_sum_of_their_densities(device, alpha, deg, pairs):
     """What the balance heuristic divides by: draws of every strategy in its share, invalid ones counted."""
     map_ = torch.rand(16, 32, 3, generator=torch.Generator().manual_seed(3)) ** 4
     wo, a, env = view(deg, device), torch.tensor(alpha, device=device), Environment(map_.to(device))
     per, seed = N // 64, 10 * chi2.MIXTURES.index((alpha, deg))
     u = [uniform(per * k, device, seed + i) for i, k in enumerate((20, 20, 20, 4))]
-    partner = ("mirrored", u[2]) if antithetic == "mirrored" else ("visible", opposite(u[2]))
-    drawn = [sample_bsdf(wo, a, v, lobe) for lobe, v in (("visible", u[1]), partner, ("cosine", u[3]))]
+    partner = ("mirrored", u[2]) if pairs == "mirrored" else ("visible", antithetic(u[2]))
+    drawn = [sample_bsdf(wo, a, v, lobe=lobe) for lobe, v in (("visible", u[1]), partner, ("cosine", u[3]))]
     draws = [env.sample(u[0])[0], *drawn]
     wi = torch.cat(draws)
     # below the horizon the map's own samples count too: the whole sphere is the domain, the lobes' share there is lost
     kept = torch.cat([torch.ones(len(draws[0]), dtype=torch.bool, device=device), torch.cat(draws[1:])[:, 2] > 1e-6])
 
     def mixture(d, table=20):
-        lobes = pdf_lobes(wo, d, a)
+        lobes = pdf_lobes(wo, a, d)
         visible = lobes[:, 0] + lobes[:, int(antithetic == "mirrored")]
         return (table * env.pdf(d) + (30 - table / 2) * visible + 4 * lobes[:, 2]) / 64
 
@@ -279,5 +279,5 @@ def test_bad_input_is_named(device):
     with pytest.raises(ValueError, match="u: expected shape"):
         sample_ggx_vndf(wo, alpha, wo)
     with pytest.raises(ValueError, match="lobe: expected"):
-        sample_bsdf(wo, alpha, u, "other")
+        sample_bsdf(wo, alpha, u, lobe="other")
     assert sample_ggx_vndf(wo[:0], alpha[:0], u[:0]).shape == (0, 3)

@@ -9,7 +9,7 @@ import trimesh
 from bench.timing import peak_bytes
 from reli3d.geometry.rays import RayScene
 from reli3d.render.environment import Environment
-from reli3d.render.material import PAINTS
+from reli3d.render.material import DIFFUSE_MODELS
 from reli3d.render.points import SurfacePoints
 from reli3d.render.shading import ShadeOptions, shade
 from tests.support import reference
@@ -61,9 +61,9 @@ def test_every_strategy_and_mix_converges_to_the_quadrature(device, counts, roug
             assert z < 4.5, (extra, got.mean(0), truth)  # 6e-6 a number, about 300 numbers in the family
 
 
-@pytest.mark.parametrize("paint", PAINTS)
+@pytest.mark.parametrize("diffuse_model", DIFFUSE_MODELS)
 @pytest.mark.parametrize("cos_o", [1.0, 0.5, 0.1])
-def test_lambert_under_constant_light_is_its_closed_form(device, paint, cos_o):
+def test_lambert_under_constant_light_is_its_closed_form(device, diffuse_model, cos_o):
     """With base 0 only the coat is left, so the difference to base kd is the diffuse part, per channel kd c times the
     mean of: of roughness 1, where the cosine that counts is (1 + cos) / 2, (1 - F(c_o)) (1 - F(c_i)); published,
     1 - F(wo.wm)."""
@@ -73,7 +73,7 @@ def test_lambert_under_constant_light_is_its_closed_form(device, paint, cos_o):
     normal, wo, base, one, zero = (v.to(device) for v in repeat(n, up, view, kd[None], torch.ones(1), torch.zeros(1)))
     env = Environment.constant(c.to(device))
     lit = [
-        shade(*at(normal, normal, normal, wo, b, one, zero), env, options=ShadeOptions(paint=paint))
+        shade(*at(normal, normal, normal, wo, b, one, zero), env, options=ShadeOptions(diffuse_model=diffuse_model))
         for b in (torch.zeros_like(base), base)
     ]
     got = (lit[1] - lit[0]).double().cpu()
@@ -81,7 +81,7 @@ def test_lambert_under_constant_light_is_its_closed_form(device, paint, cos_o):
     d = d[d[:, 1] > 0]
     schlick = lambda cos: 0.04 + 0.96 * (1 - cos) ** 5  # noqa: E731
     left = (1 - schlick((1 + d[:, 1]) / 2)) * (1 - schlick((1 + cos_o) / 2))
-    if paint == "published":
+    if diffuse_model == "published":
         left = 1 - schlick((d + view.double()).norm(dim=-1) / 2)
     truth = kd * c * float((left * d[:, 1]).sum() * angle / torch.pi)
     error = got.std(0) / n**0.5
@@ -200,7 +200,7 @@ def test_bad_input_is_named(device):
         ({"samples": (-1, 2, 3)}, ValueError, "samples"),
         ({"heuristic": "x"}, ValueError, "heuristic"),
         ({"clamp": 0.0}, ValueError, "clamp"),
-        ({"paint": "white"}, ValueError, "paint"),
+        ({"diffuse_model": "white"}, ValueError, "diffuse_model"),
         ({"antithetic": True}, ValueError, "antithetic"),
         ({"pixels": torch.arange(3, dtype=torch.int32, device=device)}, ValueError, "pixels"),
         ({"environment": env.radiance}, TypeError, "environment"),
@@ -230,8 +230,10 @@ def gradient_inputs(device, n=400):
     return wo.to(device), [v.to(device).requires_grad_() for v in values]
 
 
-@pytest.mark.parametrize("paint, clamped", [*((paint, False) for paint in PAINTS), (PAINTS[0], True)])
-def test_gradient_is_that_of_the_estimator_where_the_samples_stand_still(device, paint, clamped):
+@pytest.mark.parametrize(
+    "diffuse_model, clamped", [*((diffuse_model, False) for diffuse_model in DIFFUSE_MODELS), (DIFFUSE_MODELS[0], True)]
+)
+def test_gradient_is_that_of_the_estimator_where_the_samples_stand_still(device, diffuse_model, clamped):
     """With environment samples alone nothing drawn depends on the material, so finite differences see the same
     samples, and the same ones are cut by a clamp that half of them reach."""
     wo, inputs = gradient_inputs(device)
@@ -243,7 +245,7 @@ def test_gradient_is_that_of_the_estimator_where_the_samples_stand_still(device,
         got = shade(
             *at(normal, normal, normal, wo, base, roughness, metallic),
             env,
-            options=ShadeOptions(samples=(48, 0, 0), paint=paint, clamp=clamp),
+            options=ShadeOptions(samples=(48, 0, 0), diffuse_model=diffuse_model, clamp=clamp),
         )
         return (got * weight).double().sum()
 
@@ -253,7 +255,7 @@ def test_gradient_is_that_of_the_estimator_where_the_samples_stand_still(device,
         single = shade(
             *at(normal, normal, normal, wo, *rest[:3]),
             Environment(rest[3]),
-            options=ShadeOptions(samples=(1, 0, 0), paint=paint),
+            options=ShadeOptions(samples=(1, 0, 0), diffuse_model=diffuse_model),
         )
         clamp = float(single[single > 0].median())
     grads = torch.autograd.grad(loss(*inputs), inputs)
@@ -281,7 +283,7 @@ MEANS = [
     ((20, 40, 4), {}),
     ((0, 0, 64), {}),
     ((0, 64, 0), {}),
-    ((20, 40, 4), {"paint": "published"}),
+    ((20, 40, 4), {"diffuse_model": "published"}),
     ((20, 40, 4), {"heuristic": "power"}),
     ((20, 40, 4), {"sequence": "random"}),
     ((20, 40, 4), {"antithetic": "none"}),
@@ -303,7 +305,7 @@ def test_mean_gradient_is_that_of_the_integral(device, counts, options):
         truth_in = [v.requires_grad_() for v in truth_in]
         value = reference.direct_light(
             truth_in[0] / truth_in[0].norm(), wo[k].double(), truth_in[1], truth_in[2] ** 2, truth_in[3], truth_in[4],
-            192, options.get("paint", "conserving"),
+            192, options.get("diffuse_model", "conserving"),
         )  # fmt: skip
         truth = torch.autograd.grad(value.sum(), truth_in)
         rows = repeat(

@@ -17,8 +17,8 @@ from reli3d.geometry.rays import RayScene
 from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.render.environment import Environment
-from reli3d.render.render import render
-from reli3d.render.shading import SAMPLES, ShadeOptions, shade
+from reli3d.render.image import render_asset
+from reli3d.render.shading import Samples, ShadeOptions, shade
 from tests.support import mitsuba_scene
 from tests.support.surfaces import at
 
@@ -54,7 +54,7 @@ class Stage:
         pose = look_at(torch.tensor([1.2, 1.6, 1.9]), torch.zeros(3), torch.tensor([0.0, 1, 0]))
         camera = Camera.from_fov(pose, 0.6, size, size)
         origins, directions = (v.reshape(-1, 3).contiguous() for v in camera_rays(camera))
-        self.device, self.scene = device, RayScene(self.vertices.to(device), self.faces.to(device), backend)
+        self.device, self.scene = device, RayScene(self.vertices.to(device), self.faces.to(device), backend=backend)
         hits = RayScene(self.vertices, self.faces).closest(origins, directions)
         normal = interpolate(self.normals, self.faces, hits.face, hits.bary)
         normal = torch.nn.functional.normalize(normal, dim=-1)
@@ -136,7 +136,7 @@ def compare_image(material, sky, stage):
 
 def runs_for(rays):
     """How often ``rays`` points are shaded to spend the budget."""
-    return -(-BUDGET // (rays * sum(SAMPLES)))
+    return -(-BUDGET // (rays * sum(Samples())))
 
 
 def compare(runs, want, variance, theirs):
@@ -147,7 +147,7 @@ def compare(runs, want, variance, theirs):
     of Mitsuba's path draws two, one by the light and one by the material.
     """
     got = runs.mean(0)
-    assert 1.0 - rejected(got, want, variance, len(runs) * sum(SAMPLES)).mean() >= ACCEPT
+    assert 1.0 - rejected(got, want, variance, len(runs) * sum(Samples())).mean() >= ACCEPT
     own = runs.mean((1, 2)).var(ddof=1) / len(runs)
     sigma = np.sqrt(own + variance.sum() / theirs / got.size**2)
     stripes = 1.0 + 0.02 * np.where(np.arange(len(got)) % 2, 1.0, -1.0)[:, None]
@@ -210,19 +210,20 @@ def test_render_equals_mitsubas_sensor_textures_and_light(device):
 
     def runs(asset, camera):
         images = (
-            render(asset, camera, sky, supersampling=fine, options=ShadeOptions(seed=k)).radiance for k in range(count)
+            render_asset(asset, camera, sky, supersampling=fine, options=ShadeOptions(seed=k)).radiance
+            for k in range(count)
         )
         return np.stack([v.cpu().double().numpy()[kept] for v in images])
 
     compare(runs(asset, camera), want, variance, 2 * draws * passes)
-    samples = count * sum(SAMPLES)
+    samples = count * sum(Samples())
     aside = replace(camera, intrinsics=camera.intrinsics + torch.tensor([0.0, 0.0, 0.05, 0.0], device=device))
     raw = replace(asset, textures=replace(asset.textures, base_color=srgb_to_linear(asset.textures.base_color)))
     turned = replace(asset, textures=asset.textures._changed(lambda v: v.flip(0)))
     for wrong in ((asset, aside), (raw, camera), (turned, camera)):  # what the z-test is there to see
         assert rejected(runs(*wrong).mean(0), want, variance, samples).mean() > 4 * (1.0 - ACCEPT)  # measured 3 to 98 %
 
-    full = partial(render, asset, camera, sky, options=ShadeOptions((1, 0, 0)), shadows=False)
+    full = partial(render_asset, asset, camera, sky, options=ShadeOptions(samples=(1, 0, 0)), shadows=False)
     off = full(supersampling=fine).alpha.cpu().numpy() - pixels(hit).mean((2, 3))
     assert (off != 0.0).mean() < 2e-3  # rays that graze the outline; measured 0
     film = mitsuba_scene.sensor(mi, eye, target, fov, width, height)

@@ -25,7 +25,7 @@ from reli3d.geometry.camera import Camera, look_at
 from reli3d.io.glb import read_glb
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
-from reli3d.render.render import render
+from reli3d.render.image import render_asset
 from reli3d.render.shading import ShadeOptions
 from tests.support.browser import chromium, pixels, served
 
@@ -52,7 +52,7 @@ def ours(glb: Path, light: Environment, shot: Shot, samples: tuple[int, int, int
     """RGBA ``(H, W, 4)`` in [0, 255], sRGB, as all others are."""
     pose = look_at(torch.tensor(shot.eye, dtype=torch.float32), torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))
     camera = Camera.from_fov(pose, math.radians(shot.fov), shot.size, shot.size)
-    image = render(read_glb(glb), camera, light, options=ShadeOptions(samples), supersampling=2)
+    image = render_asset(read_glb(glb), camera, light, options=ShadeOptions(samples=samples), supersampling=2)
     color = linear_to_srgb((image.radiance / image.alpha[..., None].clamp(min=1e-6)).clamp(0, 1))
     return 255.0 * torch.cat([color, image.alpha[..., None]], -1).numpy()
 

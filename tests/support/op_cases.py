@@ -18,9 +18,9 @@ from torch.nn.functional import normalize
 from reli3d.geometry import projection
 from reli3d.geometry.camera import Camera, camera_rays, look_at, project
 from reli3d.geometry.grid import sample_grid, squared_laplacian
-from reli3d.geometry.hits import evaluate_hits, hit_normals, interpolate
+from reli3d.geometry.hits import Hits, evaluate_hits, hit_normals, interpolate
 from reli3d.geometry.mesh import Mesh, vertex_normals
-from reli3d.geometry.rays import Hits, RayScene
+from reli3d.geometry.rays import RayScene
 from reli3d.geometry.regularize import sign_entropy, vertex_deviation
 from reli3d.geometry.smooth import taubin_smooth
 from reli3d.geometry.surface import extract_surface
@@ -181,7 +181,7 @@ def composited(density, color):
 
 def outlines(image, vertices):
     _, faces = ball(vertices.device)
-    return (antialias(image, vertices, faces, camera(vertices.device), RayScene(vertices, faces, "warp")),)
+    return (antialias(image, vertices, faces, camera(vertices.device), RayScene(vertices, faces, backend="warp")),)
 
 
 def grid_inputs(_, shape=(7, 6, 8), seed: int = 3) -> dict[str, Tensor]:
@@ -235,9 +235,9 @@ def lobes(n: int, name: str) -> dict[str, Tensor]:
     }
 
 
-def bsdf(paint):
+def bsdf(diffuse_model):
     return lambda wo, wi, base_color, alpha, metallic: (
-        material.eval_bsdf(wo, wi, base_color, alpha, metallic, paint=paint),
+        material.eval_bsdf(wo, base_color, alpha, metallic, wi, diffuse_model=diffuse_model),
     )
 
 
@@ -294,7 +294,10 @@ CASES = {
         lambda wo, alpha, wm: (sampling.pdf_ggx_vndf(wo, alpha, wm),), ("wo", "alpha", "wm"), ("wo", "alpha", "wm")),
     "sample_bsdf": Case(
         lambda n: {"wo": above(n, 1), "alpha": uniform(n, seed=2, low=0.1), "u": numbers(n)},
-        lambda wo, alpha, u: (material.sample_bsdf(wo, alpha, u, "mirrored"),), ("wo", "alpha"), ("wo", "alpha", "u")),
+        lambda wo, alpha, u: (material.sample_bsdf(wo, alpha, u, lobe="mirrored"),),
+        ("wo", "alpha"),
+        ("wo", "alpha", "u"),
+    ),
     "Environment.lookup": Case(
         lambda n: {"radiance": uniform(8, 16, 3, seed=1), "directions": units(n, 2)},
         lambda radiance, directions: (Environment(radiance).lookup(directions),), ("radiance", "directions"),

@@ -35,7 +35,7 @@ from tests.support.op_cases import (
 
 def traced(backend):
     def run(origins, directions):
-        scene = RayScene(*ball(origins.device, 3), backend if origins.device.type == "cpu" else "warp")
+        scene = RayScene(*ball(origins.device, 3), backend=backend if origins.device.type == "cpu" else "warp")
         hits = scene.closest(origins, directions)
         free = scene.unoccluded(origins, directions, origins[:, 0])  # some limits are below 0
         return hits.face, hits.t, hits.bary, scene.occluded(origins, directions, t_max=1.5), free
@@ -75,7 +75,7 @@ def texels(vertices):
 
 def seen_from(points, normal):
     camera = rig(points.device, 24, 24)
-    scene = RayScene(*ball(points.device, radius=0.3), "warp")
+    scene = RayScene(*ball(points.device, radius=0.3), backend="warp")
     images = uniform(3, 24, 24, 4, seed=2).to(points)
     visible = visible_from(scene, points, normal, camera)
     own, share, total = projection.summarize_views(images, camera, points, visible.float(), normal)
@@ -119,7 +119,7 @@ def drawn(u, radiance, wo, alpha):
         density,
         light.pdf(wi),
         wi,
-        material.pdf_lobes(wo, wi, alpha),
+        material.pdf_lobes(wo, alpha, wi),
         sampling.random_pairs(len(u), seed=4, device=u.device),
         sampling.halton(len(u), device=u.device),
         offset_origin(wo, wi, directions),

@@ -25,7 +25,7 @@ def make(vertices, faces, backend, device):
     if backend == "embree" and device.type != "cpu":
         pytest.skip("Embree runs on CPU only")
     v = torch.as_tensor(np.asarray(vertices), dtype=torch.float32, device=device)
-    return RayScene(v, torch.as_tensor(np.asarray(faces), dtype=torch.int32, device=device), backend)
+    return RayScene(v, torch.as_tensor(np.asarray(faces), dtype=torch.int32, device=device), backend=backend)
 
 
 def soup(seed, count=60):

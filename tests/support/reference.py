@@ -70,7 +70,7 @@ def sample_ggx_vndf(wo: Tensor, alpha: Tensor, u: Tensor) -> Tensor:
 
 
 def eval_bsdf(
-    wo: Tensor, wi: Tensor, base_color: Tensor, alpha: Tensor, metallic: Tensor, paint: str = "conserving"
+    wo: Tensor, wi: Tensor, base_color: Tensor, alpha: Tensor, metallic: Tensor, diffuse_model: str = "conserving"
 ) -> Tensor:
     """Lambert below Schlick, GGX with height-correlated Smith; directions above the horizon.
 
@@ -82,7 +82,7 @@ def eval_bsdf(
     schlick = lambda cos: f0 + (1.0 - f0) * (1.0 - cos) ** 5  # noqa: E731
     fresnel = schlick((wo * wm).sum(-1, keepdim=True))
     left = 1.0 - fresnel
-    if paint == "conserving":
+    if diffuse_model == "conserving":
         cosines = ((w[..., 2:] + alpha[..., None]) / (1.0 + alpha[..., None]) for w in (wo, wi))
         left_o, left_i = (0.96 * (1.0 - (1.0 - cos) ** 5) for cos in cosines)  # of the dielectric alone
         left = left_o * left_i
@@ -191,7 +191,7 @@ def direct_light(
     metallic: Tensor,
     radiance: Tensor,
     height: int = 256,
-    paint: str = "conserving",
+    diffuse_model: str = "conserving",
 ) -> Tensor:
     """Radiance ``(3,)`` of one unshadowed point by midpoint quadrature over the sphere."""
     d, angle = sphere_grid(height)
@@ -200,7 +200,7 @@ def direct_light(
     t = torch.nn.functional.normalize(torch.linalg.cross(helper, normal), dim=-1)
     frame = torch.stack([t, torch.linalg.cross(normal, t), normal])
     wi, o = d @ frame.T, (frame @ wo).expand(len(d), 3)
-    value = eval_bsdf(o, wi, base_color.expand(len(d), 3), alpha.expand(len(d)), metallic.expand(len(d)), paint)
+    value = eval_bsdf(o, wi, base_color.expand(len(d), 3), alpha.expand(len(d)), metallic.expand(len(d)), diffuse_model)
     return (value * wi[:, 2:] * lookup_envmap(radiance, d)).sum(0) * angle
 
 

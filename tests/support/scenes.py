@@ -53,7 +53,7 @@ def shadow_caster(device, backend="auto"):
     mesh = trimesh.creation.icosphere(subdivisions=3, radius=0.4)
     mesh.apply_translation([0, 1.2, 0])
     vertices, faces = torch.tensor(mesh.vertices).float().to(device), torch.tensor(mesh.faces).int().to(device)
-    return RayScene(vertices, faces, backend)
+    return RayScene(vertices, faces, backend=backend)
 
 
 def sky(height=16, seed=0, power=3.0):

@@ -12,7 +12,7 @@ from reli3d.geometry.uv import unwrap
 from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
-from reli3d.render.render import render
+from reli3d.render.image import render_asset
 from reli3d.render.shading import ShadeOptions
 from reli3d.views.views import ViewBatch
 from tests.support.rigs import eyes_around
@@ -55,8 +55,8 @@ def photographs(asset: Asset, count: int, size: int) -> ViewBatch:
     eyes = eyes_around(count, 3.2).float()
     c2w = look_at(eyes, torch.zeros(3), torch.tensor([0.05, 1.0, 0.02]))
     camera = Camera.from_fov(c2w, math.radians(38.0), size, size)
-    options = ShadeOptions(samples=(32, 16, 8), paint="published")
+    options = ShadeOptions(samples=(32, 16, 8), diffuse_model="published")
     cameras = [Camera(c2w[i], camera.intrinsics[i], size, size) for i in range(count)]
-    shots = [render(asset, c, options=options, supersampling=2) for c in cameras]
+    shots = [render_asset(asset, c, options=options, supersampling=2) for c in cameras]
     colors = torch.stack([linear_to_srgb((s.radiance / s.alpha.clamp(min=1e-3)[..., None]).clamp(0, 1)) for s in shots])
     return ViewBatch(colors, torch.stack([s.alpha for s in shots]), camera.c2w, camera.intrinsics)

@@ -35,7 +35,7 @@ def test_the_untouched_folders_load(tmp_path):
     evil.colmap(tmp_path / "colmap")
     assert len(load_views(tmp_path / "json")) == len(load_views(tmp_path / "colmap")) == 3
     (tmp_path / "good.exr").write_bytes(evil_maps.exr_bytes())
-    assert read_environment(tmp_path / "good.exr").shape == (16, 32, 3)
+    assert read_environment(tmp_path / "good.exr").radiance.shape == (16, 32, 3)
 
 
 @pytest.mark.parametrize("name, make", evil.cases(), ids=[name for name, _ in evil.cases()])

@@ -22,7 +22,7 @@ from reli3d.train.stages.surface import Shader, render_surface, seed_surface, su
 from reli3d.train.stages.views import Draw
 from reli3d.train.stages.volume import occupied, render_volume
 
-PAINT = "published"  # the formula of the images of reli3d.synthetic.samples
+DIFFUSE_MODEL = "published"  # the formula of the images of reli3d.synthetic.samples
 
 
 def encode(model: Reconstructor, drawn: Draw, *, bfloat16: bool = False) -> Code:
@@ -41,7 +41,7 @@ def shader_of(model: Reconstructor, code: Code, stage: Stage, seed: int) -> Shad
         light = lobes(model, code, stage.lobes)
         return lambda points, wo, scene: shade_gaussians(points, wo, light)
     environment = Environment(model.decode_environment(code)[0].contiguous())
-    options = ShadeOptions(samples=stage.samples, seed=seed, paint=PAINT)
+    options = ShadeOptions(samples=stage.samples, seed=seed, diffuse_model=DIFFUSE_MODEL)
 
     def lit(points: SurfacePoints, wo: Tensor, scene: RayScene) -> Tensor:
         return shade(points, wo, environment, scene=scene if stage.shadows else None, options=options)

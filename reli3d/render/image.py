@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import io
-import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
-from PIL import Image
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -33,11 +29,15 @@ BAND_RAYS = 1 << 18  # rays of one band of rows: bounds memory at about 40 MB wh
 
 @dataclass(frozen=True)
 class Render:
-    """One image.  Values are means over the covered subpixels, but ``radiance``, which is over all of them.
+    """One image of an asset.  Values are means over the covered subpixels; ``radiance`` is the mean over all of them.
 
-    radiance: ``(H, W, 3)`` linear, premultiplied by alpha unless the background was asked for.  alpha: ``(H, W)``.
-    base_color: ``(H, W, 3)`` LINEAR.  roughness, metallic: ``(H, W)``.  normal: ``(H, W, 3)`` unit, world.  position:
-    ``(H, W, 3)`` world.  depth: ``(H, W)`` along the viewing axis, inf where nothing is.  The others are 0 there.
+    radiance: ``(H, W, 3)`` linear Rec. 709, premultiplied by alpha unless the background was rendered.  alpha: ``(H,
+    W)``.  base_color: ``(H, W, 3)`` linear.  roughness, metallic: ``(H, W)``.  normal: ``(H, W, 3)`` unit, world.
+    position: ``(H, W, 3)`` world.  depth: ``(H, W)`` along the viewing axis, inf where nothing is.  The others are 0
+    there.
+
+    >>> image = reli3d.render_asset(asset, camera, light)
+    >>> reli3d.write_image("image.png", image.rgba)
     """
 
     radiance: Tensor
@@ -49,38 +49,31 @@ class Render:
     position: Tensor
     depth: Tensor
 
-    def picture(
+    @property
+    def rgba(self) -> Tensor:
+        """``(H, W, 4)``: radiance, premultiplied, and alpha, as :func:`reli3d.io.images.write_image` takes it."""
+        return torch.cat([self.radiance, self.alpha[..., None]], -1)
+
+    def display(
         self,
         *,
         exposure: float = 0.0,
         tone: Callable[[Tensor], Tensor] = linear_to_srgb,
         transparent: bool = True,
     ) -> Tensor:
-        """What is shown of ``radiance``, in [0, 1]: ``(H, W, 4)`` with straight alpha, else ``(H, W, 3)``.
+        """Display values of ``radiance`` in [0, 1]: ``(H, W, 4)`` with straight alpha, else ``(H, W, 3)``.
 
         exposure: in stops.  tone: from linear radiance to display values.  transparent: False where the background was
         rendered.
         """
         radiance = self.radiance * 2.0**exposure
-        if transparent:  # the transform is not linear: it takes the colour, not the premultiplied one
+        if transparent:  # the transform is not linear: it takes the color, not the premultiplied one
             radiance = radiance / self.alpha[..., None].clamp(min=1e-6)
         shown = tone(radiance).clamp(0.0, 1.0)
         return torch.cat([shown, self.alpha[..., None]], -1) if transparent else shown
 
-    def save_png(self, path: str | os.PathLike, **options) -> None:
-        """Write :meth:`picture`, which takes ``options``, as a PNG of 8 bits.
 
-        Raises ValueError, and writes nothing, where a value is not finite.
-        """
-        shown = self.picture(**options).detach()
-        if not bool(torch.isfinite(shown).all()):
-            raise ValueError("radiance: expected finite values, got NaN or infinity")
-        buffer = io.BytesIO()
-        Image.fromarray((shown * 255.0 + 0.5).to(torch.uint8).cpu().numpy()).save(buffer, "PNG")
-        Path(path).write_bytes(buffer.getvalue())
-
-
-def render(
+def render_asset(
     asset: Asset | Sequence[Asset],
     camera: Camera,
     environment: Environment | None = None,
@@ -94,12 +87,16 @@ def render(
 ) -> Render:
     """Image of ``asset`` under ``environment`` (default: the asset's own) with direct light and shadows.
 
-    asset: one, or the parts of one that cast shadows on each other.  camera: one camera, no batch.  options: of
-    :func:`reli3d.render.shading.shade`.  supersampling: side of the subpixel grid; samples are per subpixel.
-    background: ``transparent`` or ``environment``.  scene: rays against :func:`joined_scene`, made here if None.
-    progress: called with the fraction done.  Gradients
-    reach textures, mesh attributes and environment where ``shade`` has them; silhouettes have none.  Raises ValueError
-    without any environment.
+    asset: one, or the parts of one that cast shadows on each other; without textures a grey dielectric.  camera: one
+    camera, no batch.  options: of :func:`reli3d.render.shading.shade`.  supersampling: side of the subpixel grid;
+    samples are per subpixel.  shadows: trace shadow rays.  background: ``transparent`` or ``environment``.  scene: rays
+    against :func:`joined_scene`, built here if None.  progress: called with the fraction done.
+
+    Gradients reach textures, mesh attributes and environment as in ``shade``; silhouettes have none.  Raises TypeError
+    for a wrong kind, ValueError without any environment.
+
+    >>> camera = reli3d.Camera.from_fov(reli3d.look_at([0.0, 0.5, 3.0]), 0.7, 512, 512)
+    >>> image = reli3d.render_asset(asset, camera, reli3d.Environment.constant(torch.ones(3)), supersampling=2)
     """
     (image,) = render_lights(
         asset,
@@ -127,9 +124,9 @@ def render_lights(
     scene: RayScene | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> list[Render]:
-    """:func:`render` under each of ``environments``, the same bits; what the camera sees is looked up once.
+    """:func:`render_asset` under each of ``environments``, the same bits; what the camera sees is looked up once.
 
-    The images share all layers but ``radiance``.  The other arguments are those of :func:`render`.
+    The images share all layers but ``radiance``.  The other arguments are those of :func:`render_asset`.
     """
     parts, lights = _checked(asset, camera, environments)
     if background not in ("transparent", "environment"):
@@ -173,11 +170,11 @@ def plan_render(
     scene: RayScene | None = None,
     relative: bool = False,
 ) -> SamplePlan:
-    """Counts of ``total`` samples for :func:`render` of this view, to be given to it with ``antithetic="none"``.
+    """Counts of ``total`` samples for :func:`render_asset` of this view, to be given to it with ``antithetic="none"``.
 
-    Arguments as for :func:`render`; total, relative: as for :func:`reli3d.render.allocation.plan_samples`, which plans
-    for points among those that 32768 rays of the camera hit.  No gradient.  Raises ValueError without any environment
-    and where the camera sees nothing.
+    Arguments as for :func:`render_asset`; total, relative: as for :func:`reli3d.render.allocation.plan_samples`, which
+    plans for points among those that 32768 rays of the camera hit.  No gradient.  Raises ValueError without any
+    environment and where the camera sees nothing.
     """
     from reli3d.render.allocation import plan_samples, spread_rows  # not before: few pictures have a plan
 
