@@ -12,7 +12,6 @@ from pathlib import Path
 import torch
 
 import reli3d
-from reli3d.io.images import write_png
 
 TEXELS, SAMPLES = 64, reli3d.Samples(light=4, bsdf=4, cosine=2)
 
@@ -54,5 +53,5 @@ for step in range(args.steps):
 side = reli3d.Camera.from_fov(reli3d.look_at([0.0, 3.0, 0.5]), 0.9, args.size, args.size)
 error = (image(asset.detach(), side, 1) - image(truth, side, 1)).square().mean().sqrt()
 print(f"root mean square error from a new side: {error:.4f}")
-write_png(args.output / "found.png", color.detach().sigmoid())
-write_png(args.output / "true.png", checker)
+reli3d.write_image(args.output / "found.png", color.detach().sigmoid())
+reli3d.write_image(args.output / "true.png", checker)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from reli3d.render.asset import TextureSet
-from reli3d.render.color import srgb_to_linear
 
 
 def material(mi, base_color, alpha, metallic, diffuse_model="conserving", maps: TextureSet | None = None):
@@ -18,7 +17,7 @@ def material(mi, base_color, alpha, metallic, diffuse_model="conserving", maps: 
     numbers = mi.Color3f(*base_color), mi.Float(alpha), mi.Float(metallic)
     dr.make_opaque(*numbers)  # not literals: materials share a compiled kernel
     if maps is not None:
-        planes = srgb_to_linear(maps.base_color), maps.roughness[..., None], maps.metallic[..., None]
+        planes = maps.base_color, maps.roughness[..., None], maps.metallic[..., None]
         bitmaps = [mi.Bitmap(np.ascontiguousarray(v.cpu().numpy(), np.float32)) for v in planes]
         textures = [mi.load_dict({"type": "bitmap", "bitmap": b, "raw": True}) for b in bitmaps]
 

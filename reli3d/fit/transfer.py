@@ -17,7 +17,6 @@ from reli3d.geometry.rays import RayScene
 from reli3d.geometry.tangents import encode_normals, vertex_tangents
 from reli3d.geometry.uv import unwrap
 from reli3d.render.asset import Asset, TextureSet
-from reli3d.render.color import linear_to_srgb
 from reli3d.render.gbuffer import sample_texture, surface_points
 from reli3d.render.points import SurfacePoints
 
@@ -81,7 +80,7 @@ def _textures(
     encoded = encode_normals(world, normal, interpolate_tangents(mesh, texels, index))
     maps = {}
     for name, value in (
-        ("base_color", linear_to_srgb(at.base_color)),
+        ("base_color", at.base_color),
         ("roughness", at.roughness[:, None]),
         ("metallic", at.metallic[:, None]),
         ("normal", encoded),

@@ -24,6 +24,7 @@ from reli3d.io.files import write_bytes
 from reli3d.io.gltf_parts import read_parts
 from reli3d.io.images import png_bytes
 from reli3d.render.asset import Asset
+from reli3d.render.color import linear_to_srgb
 
 UNIT = 1.0e-3  # deviation from length 1 that readers accept
 KINDS = ("png", "webp")  # of textures
@@ -46,7 +47,8 @@ def texture_images(asset: Asset, kind: str = "png") -> dict[str, bytes]:
     """The files of ``base_color``, ``metallic_roughness`` (green roughness, blue metallic, red 1) and ``normal``."""
     rough = asset.textures.roughness
     orm = torch.stack([torch.ones_like(rough), rough, asset.textures.metallic], -1)  # no occlusion is baked
-    maps = {"base_color": asset.textures.base_color, "metallic_roughness": orm, "normal": asset.textures.normal}
+    base_color = linear_to_srgb(asset.textures.base_color)
+    maps = {"base_color": base_color, "metallic_roughness": orm, "normal": asset.textures.normal}
     values = list(maps.values())
     return dict(zip(maps, over_rows(len(values), 1, lambda k, _: encode_image(values[k], kind)), strict=True))
 

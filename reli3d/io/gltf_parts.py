@@ -17,7 +17,7 @@ from reli3d.geometry.tangents import with_tangents
 from reli3d.io.files import InputError, shown
 from reli3d.io.gltf import Document
 from reli3d.render.asset import Asset, TextureSet
-from reli3d.render.color import linear_to_srgb, srgb_to_linear
+from reli3d.render.color import srgb_to_linear
 
 FORMATS = ("PNG", "JPEG", "WEBP")
 MAX_PARTS = 4096  # primitives as placed: each is a mesh with textures of its own
@@ -202,7 +202,7 @@ class _Materials:
                 )
         base, orm, normal = (_square(i, size) for i in images)
         factor = torch.tensor(color).clamp(0.0, 1.0)
-        base = linear_to_srgb((srgb_to_linear(base) if base is not None else torch.ones(size, size, 3)) * factor)
+        base = (srgb_to_linear(base) if base is not None else torch.ones(size, size, 3)) * factor
         orm = orm if orm is not None else torch.ones(size, size, 3)
         rough, metal = (orm[..., k] * min(max(v, 0.0), 1.0) for k, v in ((1, roughness), (2, metallic)))
         if normal is not None and scale != 1.0:

@@ -13,6 +13,7 @@ import numpy as np
 from reli3d._bridge import present
 from reli3d.io.glb import check_asset, encode_image
 from reli3d.render.asset import Asset
+from reli3d.render.color import linear_to_srgb
 
 MATERIAL = """newmtl baked
 Kd 1 1 1
@@ -41,7 +42,7 @@ def obj_files(asset: Asset, name: str) -> dict[str, bytes]:
     corners = np.repeat(mesh.faces.cpu().numpy() + 1, 3, axis=1)
     np.savetxt(text, corners, fmt="f %d/%d/%d %d/%d/%d %d/%d/%d")
     grey = {k: getattr(textures, k)[..., None].expand(-1, -1, 3) for k in ("roughness", "metallic")}
-    maps = {"base_color": textures.base_color, **grey, "normal": textures.normal}
+    maps = {"base_color": linear_to_srgb(textures.base_color), **grey, "normal": textures.normal}
     return {
         f"{name}.obj": text.getvalue().encode(),
         f"{name}.mtl": MATERIAL.format(name=name).encode(),

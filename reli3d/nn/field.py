@@ -21,6 +21,7 @@ from reli3d.nn.heads import deformation
 from reli3d.nn.model import Code, Reconstructor
 from reli3d.nn.view_features import ViewMaps
 from reli3d.render.bump import radial_bump
+from reli3d.render.color import srgb_to_linear
 
 CHUNK = 1 << 17  # points a query: 200 MB of features
 MATERIAL = ("base_color", "roughness", "metallic", "normal")
@@ -30,7 +31,7 @@ MATERIAL = ("base_color", "roughness", "metallic", "normal")
 class PointMaterial:
     """Material at N surface points."""
 
-    base_color: Tensor  # (N, 3) sRGB-encoded
+    base_color: Tensor  # (N, 3) linear; the heads give sRGB
     roughness: Tensor  # (N,) perceptual
     metallic: Tensor  # (N,)
     normal: Tensor  # (N, 3) unit, world: of shading
@@ -131,7 +132,7 @@ class TriplaneField(Field):
     def material(self, position: Tensor, normal: Tensor, visible: Tensor) -> PointMaterial:
         values = {k: v[0] for k, v in self.model.query(self.code, position[None], MATERIAL).items()}
         return PointMaterial(
-            values["base_color"],
+            srgb_to_linear(values["base_color"]),
             values["roughness"][:, 0],
             values["metallic"][:, 0],
             radial_bump(position, normal, values["normal"]),

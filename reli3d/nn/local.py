@@ -373,7 +373,7 @@ def _painted(fused: Fused, heads: Tensor, normal: Tensor) -> dict[str, Tensor]:
     shaded = functional.normalize(normal + turn.sigmoid() * (fused.normal - normal) + bend, dim=-1)
     rough, metal = (v[:, 0] for v in (rough + fused.numbers[:, :1], metal + fused.numbers[:, 1:2]))
     return {
-        "base_color": base.sigmoid(),
+        "base_color": srgb_to_linear(base.sigmoid()),
         "metallic": metal.sigmoid(),
         "normal": shaded,
         "roughness": ROUGHNESS_MIN + (1 - ROUGHNESS_MIN) * rough.sigmoid(),

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from reli3d._bridge import check, expect, present, tensor_of
 from reli3d.geometry.mesh import Mesh
-from reli3d.render.color import srgb_to_linear
 from reli3d.render.environment import Environment
 
 if TYPE_CHECKING:
@@ -18,14 +17,14 @@ if TYPE_CHECKING:
     from typing import Any
 
 FLAT = (0.5, 0.5, 1.0)  # a normal map's texel where nothing is bent
-KEPT = 2048  # texels a side up to which look-ups are kept: 100 MB
+KEPT = 2048  # texels a side up to which lookups are kept: 50 MB
 
 
 @dataclass(frozen=True, repr=False)
 class TextureSet:
     """Square maps of one size, values in [0, 1]; row 0 is v = 0 (glTF: v down), texel centres at +0.5.
 
-    base_color: ``(T, T, 3)``, sRGB-encoded.  roughness: ``(T, T)`` or ``(T, T, 1)``, perceptual.  metallic: the same.
+    base_color: ``(T, T, 3)``, linear.  roughness: ``(T, T)`` or ``(T, T, 1)``, perceptual.  metallic: the same.
     Either may be a number.  normal: ``(T, T, 3)``, tangent-space unit normal as ``n * 0.5 + 0.5``, green along the
     bitangent; None is flat.  Fields are ``(T, T, 3)`` and ``(T, T)`` tensors after construction.  Raises TypeError for
     a wrong kind or dtype, ValueError for a shape or device.
@@ -74,20 +73,20 @@ class TextureSet:
         """Texels along a side."""
         return self.base_color.shape[0]
 
-    def lookups(self) -> tuple[Tensor, Tensor]:
-        """What a renderer looks up: linear base colour, and roughness with metallic twice, both ``(T, T, 3)``.
+    def rough_metal(self) -> Tensor:
+        """Roughness, metallic and metallic again, ``(T, T, 3)``, for one lookup of both.
 
         Computed once for maps of at most ``KEPT`` texels a side, without gradient, that nothing has written to since.
         """
-        sources = self.base_color, self.roughness, self.metallic
+        sources = self.roughness, self.metallic
         changing = any(s.is_inference() or (s.requires_grad and torch.is_grad_enabled()) for s in sources)
         lasting = self.size <= KEPT and not changing
         written = tuple(s._version for s in sources) if lasting else None
-        kept, values = vars(self).get("_lookups", (None, None))
+        kept, values = vars(self).get("_rough_metal", (None, None))
         if not lasting or kept != written:
-            values = srgb_to_linear(self.base_color), torch.stack([self.roughness, self.metallic, self.metallic], -1)
+            values = torch.stack([self.roughness, self.metallic, self.metallic], -1)
         if lasting:
-            object.__setattr__(self, "_lookups", (written, values))
+            object.__setattr__(self, "_rough_metal", (written, values))
         return values
 
     def to(self, device: torch.device | str) -> TextureSet:

@@ -15,7 +15,7 @@ from torch import Tensor
 from reli3d.geometry.camera import Camera
 from reli3d.geometry.rays import RayScene
 from reli3d.render.asset import Asset
-from reli3d.render.color import linear_to_srgb, srgb_to_linear
+from reli3d.render.color import srgb_to_linear
 from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import primary_hits, surface_points
 from reli3d.render.points import SurfacePoints
@@ -44,8 +44,8 @@ FARTHEST = 4.0  # factor by which a guess is changed at most
 def estimate_paint_and_light(asset: Asset, images: Tensor, inside: Tensor, camera: Camera, scene: RayScene) -> Asset:
     """``asset`` with its paint times :func:`paint_factor`, and then its light times :func:`photograph_ratio`."""
     views = images, inside, camera, scene
-    paint = srgb_to_linear(asset.textures.base_color) * paint_factor(asset, *views)
-    asset = replace(asset, textures=replace(asset.textures, base_color=linear_to_srgb(paint.clamp(max=1.0))))
+    base_color = (asset.textures.base_color * paint_factor(asset, *views)).clamp(max=1.0)
+    asset = replace(asset, textures=replace(asset.textures, base_color=base_color))
     return replace(asset, environment=Environment(asset.light.radiance * photograph_ratio(asset, *views)))
 
 

@@ -77,14 +77,13 @@ def surface_points(mesh: Mesh, textures: TextureSet | None, face: Tensor, bary: 
     if mesh.uv is None:
         raise ValueError("mesh.uv: expected texture coordinates for a textured asset, got None")
     uv = interpolate(mesh.uv, mesh.faces, face, bary)
-    linear, rough_metal = textures.lookups()
-    rough_metal = sample_texture(rough_metal, uv)  # one look-up for both
+    rough_metal = sample_texture(textures.rough_metal(), uv)  # one lookup for both
     mapped = sample_texture(textures.normal, uv) * 2.0 - 1.0
     return SurfacePoints(
         position,
         ng,
         tangent_normals(mesh, face, bary, normal, mapped),
-        sample_texture(linear, uv),
+        sample_texture(textures.base_color, uv),
         rough_metal[:, 0],
         rough_metal[:, 1],
     )

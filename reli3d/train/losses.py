@@ -97,9 +97,10 @@ def _paint(field: LocalField, sample: Sample, position: Tensor, normal: Tensor, 
     """Material at surface points, asked a little off the surface and with a tilted normal, as extraction errs."""
     got = field.material(*astray(position, normal), sample.visible)
     base, rough, metal = sample.material[:, :3], sample.material[:, 3], sample.material[:, 4]
+    color = linear_to_srgb(got.base_color)  # as samples store it
     return {
-        "base_color": excess_entropy(got.base_color, base),
-        "pattern": pattern_loss(got.base_color, base),
+        "base_color": excess_entropy(color, base),
+        "pattern": pattern_loss(color, base),
         "roughness": excess_entropy(got.roughness, rough),
         "metallic": excess_entropy(got.metallic, metal),
         "normal": (1 - functional.cosine_similarity(got.normal, bumped, dim=-1)).mean(),

@@ -16,6 +16,7 @@ from reli3d.geometry.tangents import decode_normals, encode_normals, vertex_tang
 from reli3d.geometry.uv import unwrap
 from reli3d.io.glb import write_glb
 from reli3d.render.asset import Asset, TextureSet
+from reli3d.render.color import srgb_to_linear
 from tests.support.texels import bilinear, color
 
 SIZE = 256
@@ -137,7 +138,12 @@ def test_known_colour_reads_back(sphere):
 def test_known_colour_reads_back_through_the_file_at_every_mip(sphere, tmp_path):
     def material(p, n, t):
         one = torch.ones_like(p[:, :1])
-        return {"base_color": color(p), "roughness": one, "metallic": one, "normal": encode_normals(n, n, t)}
+        return {
+            "base_color": srgb_to_linear(color(p)),
+            "roughness": one,
+            "metallic": one,
+            "normal": encode_normals(n, n, t),
+        }
 
     write_glb(tmp_path / "ball.glb", Asset(sphere, TextureSet(**bake(sphere, SIZE, material, tangents=True))))
     read = trimesh.load(tmp_path / "ball.glb", force="mesh", process=False)

@@ -17,6 +17,7 @@ from reli3d.geometry.tangents import encode_normals, with_tangents
 from reli3d.geometry.uv import unwrap
 from reli3d.io.glb import encode_image, write_glb
 from reli3d.render.asset import Asset, TextureSet
+from reli3d.render.color import srgb_to_linear
 from tests.support.meshes import QUICK, SLOW, loaded
 from tests.support.texels import bilinear, color
 
@@ -36,7 +37,12 @@ def baked(mesh: Mesh, size: int) -> Asset:
 
     def material(p, n, t):
         rough, metal = ((0.5 + 0.4 * p[:, k : k + 1]).clamp(0, 1) for k in (1, 2))
-        return {"base_color": color(p), "roughness": rough, "metallic": metal, "normal": encode_normals(n, n, t)}
+        return {
+            "base_color": srgb_to_linear(color(p)),
+            "roughness": rough,
+            "metallic": metal,
+            "normal": encode_normals(n, n, t),
+        }
 
     return Asset(mesh, TextureSet(**bake(mesh, size, material, tangents=True)))
 

@@ -15,6 +15,7 @@ from reli3d.geometry.uv import unwrap
 from reli3d.io.obj import obj_files
 from reli3d.io.usd import usdz_bytes
 from reli3d.render.asset import Asset, TextureSet
+from reli3d.render.color import linear_to_srgb
 
 SIZE = 64
 
@@ -48,7 +49,7 @@ def test_trimesh_reads_the_obj_back(asset, tmp_path):
     expected = asset.mesh.uv[asset.mesh.faces.long()].numpy() * (1, -1) + (0, 1)
     np.testing.assert_allclose(uv, expected, atol=1e-7)  # v up, float32
     image = np.asarray(shape.visual.material.image.convert("RGB"))
-    assert np.array_equal(image, np.rint(asset.textures.base_color.numpy() * 255).astype(np.uint8))
+    assert np.array_equal(image, np.rint(linear_to_srgb(asset.textures.base_color).numpy() * 255).astype(np.uint8))
     words = dict(line.split(" ", 1) for line in files["ball.mtl"].decode().splitlines())
     for word, map_of in (("map_Kd", "base_color"), ("map_Pr", "roughness"), ("map_Pm", "metallic"), ("norm", "normal")):
         assert words[word] in files and map_of in words[word]

@@ -24,6 +24,7 @@ from reli3d.geometry.tangents import encode_normals, with_tangents
 from reli3d.geometry.uv import unwrap
 from reli3d.io.glb import glb_bytes, read_glb, write_glb
 from reli3d.render.asset import Asset, TextureSet
+from reli3d.render.color import linear_to_srgb, srgb_to_linear
 
 SIZE = 128
 STEP = 1 / 255
@@ -48,7 +49,12 @@ def asset() -> Asset:
     def fn(p, n, t):
         bumped = torch.nn.functional.normalize(n + 0.2 * torch.sin(6 * p), dim=1)
         rough, metal = (torch.full((len(p), 1), v) for v in (0.25, 0.75))
-        return {"base_color": color(p), "roughness": rough, "metallic": metal, "normal": encode_normals(bumped, n, t)}
+        return {
+            "base_color": srgb_to_linear(color(p)),
+            "roughness": rough,
+            "metallic": metal,
+            "normal": encode_normals(bumped, n, t),
+        }
 
     return Asset(mesh, TextureSet(**bake(mesh, SIZE, fn, tangents=True)))
 
@@ -155,7 +161,7 @@ def test_trimesh_reads_the_same_surface_and_colours(asset, tmp_path):
 def test_pygltflib_reads_constants_back_exactly(asset, tmp_path, level):
     pygltflib = pytest.importorskip("pygltflib")
     flat = torch.full((8, 8, 3), level * STEP)
-    write_glb(tmp_path / "a.glb", Asset(asset.mesh, TextureSet(flat, 0.2, 0.6, flat)))
+    write_glb(tmp_path / "a.glb", Asset(asset.mesh, TextureSet(srgb_to_linear(flat), 0.2, 0.6, flat)))
     document = pygltflib.GLTF2().load(str(tmp_path / "a.glb"))
 
     def pixels(texture):
@@ -177,8 +183,9 @@ def test_own_reader_gives_the_asset_back(asset, tmp_path):
     for name in ("normals", "tangents"):
         torch.testing.assert_close(getattr(back.mesh, name), getattr(asset.mesh, name), rtol=0, atol=1e-6)
     for name in ("base_color", "roughness", "metallic", "normal"):
-        difference = getattr(back.textures, name) - getattr(asset.textures, name)
-        assert float(difference.abs().max()) <= 0.5 * STEP + 1e-4  # 8 bit; the colour passes through linear and back
+        stored = linear_to_srgb if name == "base_color" else lambda value: value
+        difference = stored(getattr(back.textures, name)) - stored(getattr(asset.textures, name))
+        assert float(difference.abs().max()) <= 0.5 * STEP + 1e-4  # 8 bit
 
 
 def test_an_unsymmetric_arrow_keeps_its_axes(tmp_path, asset):
@@ -222,9 +229,7 @@ def test_factors_and_missing_parts(asset, tmp_path):
         del document["meshes"][0]["primitives"][0]["attributes"][name]
     (tmp_path / "a.glb").write_bytes(packed(document, binary))
     (part,) = read_glb(tmp_path / "a.glb")
-    # sRGB encoding of 0.5 and 0.25 (IEC 61966-2-1)
-    want = torch.tensor([0.735357, 0.537099, 1.0])
-    torch.testing.assert_close(part.textures.base_color[0, 0], want, rtol=0, atol=1e-5)
+    assert part.textures.base_color[0, 0].tolist() == [0.5, 0.25, 1.0]  # factors of glTF are linear
     assert float(part.textures.roughness[0, 0]) == 0.5 and float(part.textures.metallic[0, 0]) == 1.0
     a, b, c = (part.mesh.vertices[part.mesh.faces[:, k].long()] for k in range(3))
     flat = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=1)
@@ -334,3 +339,12 @@ def test_what_an_asset_lacks_is_named(asset, tmp_path):
     with pytest.raises(ValueError, match="asset.textures.base_color: expected values in"):
         write_glb(tmp_path / "a.glb", Asset(m, bad))
     assert os.listdir(tmp_path) == []  # nothing half-written stays behind
+
+
+def test_every_code_of_a_color_is_kept_from_file_to_file(asset, tmp_path):
+    codes = torch.arange(256).reshape(16, 16, 1).expand(-1, -1, 3)
+    write_glb(tmp_path / "a.glb", Asset(asset.mesh, TextureSet(srgb_to_linear(codes / 255), 0.5, 0.0)))
+    first = read_glb(tmp_path / "a.glb")[0].textures
+    assert torch.equal((linear_to_srgb(first.base_color) * 255).round().long(), codes)
+    # IEC 61966-2-1 at code 188
+    assert float(first.base_color[11, 12, 0]) == pytest.approx(0.502886, abs=1e-5)

@@ -12,7 +12,6 @@ from reli3d.geometry.hits import interpolate
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene
 from reli3d.render.asset import Asset, TextureSet
-from reli3d.render.color import srgb_to_linear
 from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import sample_texture, surface_points
 from reli3d.render.image import _resolve, render_asset, render_lights
@@ -98,7 +97,7 @@ def test_picture_on_a_square_is_upright_and_resolved(device):
     env = Environment.constant(torch.ones(3, device=device))
     image = render_asset(asset, camera, env)
 
-    torch.testing.assert_close(image.base_color, srgb_to_linear(picture), rtol=0, atol=1e-4)  # one texel a pixel
+    torch.testing.assert_close(image.base_color, picture, rtol=0, atol=1e-4)  # one texel a pixel
     assert float(image.alpha.min()) == 1.0
     torch.testing.assert_close(image.depth, torch.full_like(image.depth, 4.0), rtol=1e-5, atol=0)
     wide = Camera(camera.c2w, torch.tensor([16.0, 16.0, 6.0, 4.0], device=device), 12, 8)
@@ -276,7 +275,7 @@ def test_parts_shadow_each_other_and_keep_their_paint(device):
     floor = square(device)
     flat = floor.vertices[:, [0, 2, 1]] * torch.tensor([2.0, 1.0, -2.0], device=device)
     floor = Mesh(flat + torch.tensor([0, -0.6, 0], device=device), floor.faces, None, floor.uv)
-    parts = [ball(device, (0.9, 0.1, 0.1)), Asset(floor, textures(4, device, (0.1, 0.1, 0.9)))]
+    parts = [ball(device, (0.9, 0.05, 0.05)), Asset(floor, textures(4, device, (0.05, 0.05, 0.9)))]
     camera = Camera.from_fov(eye(device, 0.0, 2.0, 3.0), 0.9, 48, 48)
     image = render_asset(parts, camera, Environment.constant(torch.ones(3, device=device)))
     assert image.base_color[24, 24, 0] > 10 * image.base_color[24, 24, 2]
@@ -289,16 +288,14 @@ def test_parts_shadow_each_other_and_keep_their_paint(device):
 
 def test_what_is_looked_up_follows_the_maps(device):
     maps = textures(8, device, (0.5, 0.2, 0.1), roughness=0.3)
-    linear, rough_metal = maps.lookups()
-    assert maps.lookups()[0] is linear  # kept
-    maps.base_color.mul_(0.5)
+    first = maps.rough_metal()
+    assert maps.rough_metal() is first  # kept
     maps.roughness.fill_(0.9)
-    again, rough = maps.lookups()
-    torch.testing.assert_close(again, srgb_to_linear(maps.base_color), rtol=0, atol=0)
-    assert float(rough[..., 0].min()) == pytest.approx(0.9) and float(rough_metal[..., 0].max()) == pytest.approx(0.3)
-    leaf = TextureSet(maps.base_color.clone().requires_grad_(), 0.5, 0.0)
+    again = maps.rough_metal()
+    assert float(again[..., 0].min()) == pytest.approx(0.9) and float(first[..., 0].max()) == pytest.approx(0.3)
+    leaf = TextureSet(maps.base_color, maps.roughness.clone().requires_grad_(), 0.0)
     for _ in range(2):  # a graph for each
-        leaf.lookups()[0].sum().backward()
-    assert float(leaf.base_color.grad.min()) > 0
+        leaf.rough_metal().sum().backward()
+    assert float(leaf.roughness.grad.min()) > 0
     with torch.inference_mode():
-        torch.testing.assert_close(textures(8, device).lookups()[1][..., 0], torch.full((8, 8), 0.5, device=device))
+        torch.testing.assert_close(textures(8, device).rough_metal()[..., 0], torch.full((8, 8), 0.5, device=device))

@@ -15,7 +15,7 @@ from reli3d.geometry.hits import hit_normals, interpolate
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene
 from reli3d.render.asset import Asset, TextureSet
-from reli3d.render.color import linear_to_srgb, srgb_to_linear
+from reli3d.render.color import srgb_to_linear
 from reli3d.render.environment import Environment
 from reli3d.render.image import render_asset
 from reli3d.render.shading import Samples, ShadeOptions, shade
@@ -169,7 +169,7 @@ def mapped_ball_in_ring():
     g = torch.Generator().manual_seed(12)
     base, orm = 0.1 + 0.8 * torch.rand(8, 8, 3, generator=g), torch.rand(8, 8, 3, generator=g)
     orm[..., 1] = 0.3 + 0.7 * orm[..., 1]
-    return Asset(Mesh(vertices, faces, normals, uv), TextureSet(linear_to_srgb(base), orm[..., 1], orm[..., 2]))
+    return Asset(Mesh(vertices, faces, normals, uv), TextureSet(base, orm[..., 1], orm[..., 2]))
 
 
 def test_render_equals_mitsubas_sensor_textures_and_light(device):

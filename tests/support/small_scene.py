@@ -10,7 +10,7 @@ from reli3d.geometry.surface import extract_surface
 from reli3d.geometry.tangents import vertex_tangents
 from reli3d.geometry.uv import unwrap
 from reli3d.render.asset import Asset, TextureSet
-from reli3d.render.color import linear_to_srgb
+from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.render.environment import Environment
 from reli3d.render.image import render_asset
 from reli3d.render.shading import ShadeOptions
@@ -27,7 +27,7 @@ def ball(radius: float = 0.8, cells: int = 24, squeeze: float = 1.0) -> Asset:
     level = (points / torch.tensor([1.0, squeeze, 1.0])).norm(dim=-1) - radius
     mesh = unwrap(extract_surface(level, radius=1.0).with_normals(), texture_size=TEXELS)
     mesh = replace(mesh, tangents=vertex_tangents(mesh))
-    grey = torch.full((TEXELS, TEXELS, 3), 0.6)
+    grey = srgb_to_linear(torch.full((TEXELS, TEXELS, 3), 0.6))
     return Asset(mesh, TextureSet(grey, 0.6, 0.1), Environment(torch.full((16, 32, 3), 0.5)))
 
 
@@ -46,7 +46,7 @@ def painted(asset: Asset) -> Asset:
         side = torch.sigmoid(40.0 * position[:, :1])
         return side * torch.tensor([0.8, 0.25, 0.2]) + (1.0 - side) * torch.tensor([0.25, 0.6, 0.3])
 
-    color = bake(asset.mesh, TEXELS, paint)["value"]
+    color = srgb_to_linear(bake(asset.mesh, TEXELS, paint)["value"])
     return Asset(asset.mesh, replace(asset.textures, base_color=color), sky())
 
 
