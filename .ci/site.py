@@ -35,7 +35,8 @@ def linked(text: str, source: str, page: str) -> str:
             path = f"{path}/README.md"
         if not path.startswith("docs/"):
             return words
-        return f"{mark}[{words}]({os.path.relpath(path.removeprefix('docs/'), os.path.dirname(page) or '.')}{anchor or ''})"
+        path = os.path.relpath(path.removeprefix("docs/"), os.path.dirname(page) or ".")
+        return f"{mark}[{words}]({path}{anchor or ''})"
 
     return "".join(part if k % 2 else LINK.sub(link, part) for k, part in enumerate(CODE.split(text)))
 
