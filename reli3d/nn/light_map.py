@@ -2,7 +2,8 @@
 
 A glossy pixel shows the light in its mirror direction, a matt one the light around its normal.  Both are laid into
 lat-long maps; what no pixel shows is completed by convolutions that wrap around the azimuth, so a turn of the world
-about +Y turns the answer.  The maps are laid out as :mod:`reli3d.render.latlong`.
+about +Y turns the answer.  The network was trained on maps with -Z in the centre column and +X right of it; what it
+gives is laid out as :mod:`reli3d.render.latlong`.
 """
 
 from __future__ import annotations
@@ -18,6 +19,12 @@ BLACK = 0.01  # added to a radiance before its logarithm
 PAINT_FLOOR = 0.04  # of the albedo that a pixel is divided by: a dielectric reflects as much at least
 CHANNELS = 14
 LIMIT = 12.0  # of the logarithm of a radiance: a sun of exp(12)
+
+
+def trained_texels(directions: Tensor, height: int) -> Tensor:
+    """Texels ``(N,)`` of unit world ``directions (N, 3)`` in the layout that the network was trained on."""
+    x, y, z = directions.unbind(-1)
+    return lat_long_texels(torch.stack([-z, y, x], -1), height)
 
 
 def gathered(values: Tensor, weight: Tensor, texel: Tensor, height: int) -> tuple[Tensor, Tensor]:
@@ -68,12 +75,12 @@ class LightMap(nn.Module):
         demodulated = log - (albedo + PAINT_FLOOR).log()
         level = (demodulated * facing[:, None]).sum(0) / facing.sum().clamp(min=1e-4)
         scale = 256.0 / max(1, len(radiance))  # weights do not depend on the resolution of the views
-        at_mirror = lat_long_texels(mirror, self.height)
+        at_mirror = trained_texels(mirror, self.height)
         shown, shown_weight = gathered(
             torch.cat([log - level, demodulated - level], -1), facing * (0.05 + gloss) * scale, at_mirror, self.height
         )
         under, under_weight = gathered(
-            demodulated - level, facing * scale, lat_long_texels(normal, self.height), self.height
+            demodulated - level, facing * scale, trained_texels(normal, self.height), self.height
         )
         y = lat_long_directions(self.height, device=radiance.device)[..., 1][None]
         rest = torch.cat([y, y.square(), torch.ones_like(y) * level.mean()])
@@ -85,4 +92,5 @@ class LightMap(nn.Module):
         for across, up, finer in zip(reversed(self.across), reversed(self.up), reversed(levels[:-1]), strict=True):
             coarse = functional.interpolate(across(x), size=finer.shape[-2:], mode="bilinear", align_corners=False)
             x = up(finer + coarse)
-        return (self.out(x)[0] + level[:, None, None]).clamp(max=LIMIT)
+        log = (self.out(x)[0] + level[:, None, None]).clamp(max=LIMIT)
+        return log.roll(-(self.height // 2), 2)  # a quarter of the width, to +X in the centre column

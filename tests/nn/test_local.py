@@ -12,7 +12,7 @@ from reli3d.geometry.camera import Camera, image_plane, look_at, project
 from reli3d.geometry.hull import mask_distance
 from reli3d.geometry.projection import spread_views
 from reli3d.geometry.symmetry import MirrorPlane
-from reli3d.nn.light_map import LightMap, gathered
+from reli3d.nn.light_map import LightMap, gathered, trained_texels
 from reli3d.nn.local import LocalReconstructor, PixelMaps, mean_logit
 from reli3d.nn.presets import SMALL, LightMapSizes, PyramidSizes, VolumeSizes
 from reli3d.nn.pyramid import place_of_pixels, span_of_pixels
@@ -178,7 +178,7 @@ def test_a_mirror_shows_the_light_where_it_reflects_it():
         light(torch.ones(1, 3), torch.full((1, 3), 0.5), torch.ones(1), normal, wo)
     weight = seen[0][6]  # after six means
     assert int((weight > 0).sum()) == 1
-    assert int(weight.argmax()) == int(lat_long_texels(mirror, 16))  # the view from +Y goes towards +Z
+    assert int(weight.argmax()) == int(trained_texels(mirror, 16))  # the view from +Y goes towards +Z
 
 
 def test_pixels_start_as_what_they_show(model):
