@@ -274,6 +274,9 @@ class ReconstructOptions:
     that shall become +Y.  uv: ``project`` or ``xatlas``.  hero: index of the network's main view, or ``random``.
     background: ``masked``, ``visible`` or ``auto``, see :func:`~reli3d.views.published_views.background_shown`.
     symmetry: ``auto`` or ``off``, see :func:`~reli3d.prepare.completed`; for the network of convolutions.
+
+    >>> options = reli3d.ReconstructOptions(texture_size=512, symmetry="off")
+    >>> asset = reli3d.reconstruct(reli3d.load_views("photos/shoe"), options=options)
     """
 
     texture_size: int = 1024
@@ -332,6 +335,9 @@ def reconstruct(views: Views, *, weights: str | Network = "small", device: str =
     file, or a loaded network.  watch: filled with the seconds of each stage.  The same input and options give the same
     asset.  Raises ValueError on options out of range and where the masks hold no object, NoSurface where the field
     holds none.
+
+    >>> asset = reli3d.reconstruct(reli3d.load_views("photos/shoe", views=4))
+    >>> reli3d.write_glb("shoe.glb", asset)
     """
     expect("views", views, Views)
     model = weights if isinstance(weights, Network) else load_model(weights, device)
@@ -376,10 +382,13 @@ def reconstruct_placed(placed: Placed, model: Network, options: ReconstructOptio
 
 
 def refine(asset: Asset, views: Views, *, seconds: float | None = None, steps: int | None = None, **options) -> Asset:
-    """``asset`` with what a fit to its photographs makes no worse; see :func:`reli3d.fit.refine.refine`.
+    """``asset`` fitted to its photographs; parts of the fit that make held-out views worse are not taken.
 
     views: any number, in the frame of ``asset`` (that of :func:`reconstruct`, unless its options name another).
-    seconds or steps: one of the two.
+    seconds or steps: one of the two.  options: of :func:`reli3d.fit.refine.refine`.  Raises TypeError, ValueError.
+
+    >>> views = reli3d.load_views("photos/shoe")
+    >>> asset = reli3d.refine(reli3d.reconstruct(views), views, seconds=60)
     """
     return refined(asset, views, seconds=seconds, steps=steps, **options).asset
 

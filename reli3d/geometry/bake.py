@@ -213,6 +213,9 @@ def bake(
     argument.  values: numbers of the vertices, ``(V, C)``, which ``fn`` takes, interpolated, as last argument.  fill:
     every other texel takes the value of the nearest valid one (:func:`dilate`); otherwise it is 0.  Raises ValueError
     if the surface covers no texel, or ``fn`` changes its outputs from chunk to chunk.
+
+    >>> maps = reli3d.bake(mesh, 64, lambda position, normal: 0.5 + 0.5 * normal)
+    >>> textures = reli3d.TextureSet(maps["value"], roughness=0.5, metallic=0.0)
     """
     if chunk < 1:
         raise ValueError(f"chunk: expected at least 1, got {chunk}")

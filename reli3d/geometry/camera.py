@@ -27,9 +27,14 @@ NEAR = 0.01  # least depth of points over their largest distance for their box: 
 
 @dataclass(frozen=True)
 class Camera:
-    """One camera or a batch of cameras of the same image size.
+    """One pinhole camera, or a batch of cameras of one image size.
 
-    c2w: ``(..., 4, 4)``.  intrinsics: ``(..., 4)`` as ``fx, fy, cx, cy`` in pixels.  Leading axes are equal.
+    c2w: ``(..., 4, 4)`` camera-to-world, OpenGL axes: +X right, +Y up, looks along -Z.  intrinsics: ``(..., 4)`` as
+    ``fx, fy, cx, cy`` in pixels, y down, pixel centers at +0.5.  width, height: pixels.  Leading axes are equal.
+    Gradients pass through.  Raises TypeError or ValueError for a dtype, shape or device.
+
+    >>> camera = reli3d.Camera.from_fov(reli3d.look_at([0.0, 0.5, 3.0]), 0.7, 64, 48)  # fov_x in radians
+    >>> origins, directions = reli3d.camera_rays(camera)
     """
 
     c2w: Tensor
@@ -118,6 +123,9 @@ def camera_rays(camera: Camera) -> tuple[Tensor, Tensor]:
     """Origins and unit directions through all pixel centres, both ``(..., H, W, 3)``, world frame.
 
     The origins are an expanded view of the eye.  Gradients reach ``c2w`` and ``intrinsics``.
+
+    >>> origins, directions = reli3d.camera_rays(camera)  # (H, W, 3) each
+    >>> hits = reli3d.RayScene(mesh).intersect(origins, directions)
     """
     x, y = image_plane(camera)
     local = normalize(torch.stack([x, y, -torch.ones_like(x)], -1), dim=-1)
@@ -174,6 +182,9 @@ def look_at(
 
     Lists of numbers are taken too, on the device of the first tensor among the three.  Batch axes broadcast.  ``up``
     parallel to the view raises ValueError.
+
+    >>> pose = reli3d.look_at([0.0, 0.5, 3.0], [0.0, 0.0, 0.0])
+    >>> camera = reli3d.Camera.from_fov(pose, 0.7, 64, 48)
     """
     device = next((v.device for v in (eye, target, up) if isinstance(v, Tensor)), None)
     given = [

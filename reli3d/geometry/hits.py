@@ -17,7 +17,14 @@ from reli3d.kernels import hits as kernels
 
 @dataclass(frozen=True)
 class Hits:
-    """face ``(...)`` int32, -1 for a miss; t ``(...)``, inf for a miss; bary ``(..., 2)``: weights of vertices 1, 2."""
+    """First hits of rays: ``face (...)`` int32, -1 for a miss; ``t (...)``, inf for a miss; ``bary (..., 2)``.
+
+    bary: weights of the face's vertices 1 and 2; vertex 0 has the rest.  ``valid``: ``face >= 0``.  Given by
+    :meth:`~reli3d.geometry.rays.RayScene.intersect`, with gradients in ``t`` and ``bary``.
+
+    >>> hits = reli3d.RayScene(mesh).intersect(origins, directions)
+    >>> points = reli3d.surface_points(mesh, None, hits.face[hits.valid], hits.bary[hits.valid])
+    """
 
     face: Tensor
     t: Tensor

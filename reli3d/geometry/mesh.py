@@ -23,8 +23,13 @@ NORMAL_MIN = 1.0e-20  # squared length of an area-weighted normal sum below whic
 class Mesh:
     """Triangle mesh on one device, without textures.
 
-    Arrays of numpy, and faces of other integers, are taken where nothing is lost.  Raises TypeError or ValueError for a
-    wrong dtype, shape, device or a face index out of range.
+    vertices: ``(V, 3)`` float32.  faces: ``(F, 3)`` int32, counter-clockwise seen from outside.  normals: ``(V, 3)``
+    unit.  uv: ``(V, 2)``, u right, v down, as glTF.  tangents: ``(V, 4)`` unit, w = +-1, bitangent = w cross(normal,
+    tangent).  The last three may be None.  Numpy arrays and other integers are taken if the conversion is exact.
+    Gradients pass through.  Raises TypeError or ValueError for a dtype, shape, device or a face index out of range.
+
+    >>> triangle = reli3d.Mesh(torch.eye(3), torch.tensor([[0, 1, 2]]))
+    >>> scene = reli3d.RayScene(triangle)
     """
 
     vertices: Tensor  # (V, 3) float32

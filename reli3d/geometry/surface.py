@@ -102,6 +102,9 @@ def extract_surface(
 
     A level of one sign gives no faces or the whole box.  Gradients: all but ``radius``; gamma with ``centre``.
     Same bits for any number of threads.  Raises TypeError or ValueError.
+
+    >>> x = torch.linspace(-1, 1, 17)
+    >>> ball = reli3d.extract_surface((x**2 + x[:, None] ** 2 + x[:, None, None] ** 2).sqrt() - 0.5, radius=1.0)
     """
     level, deformation, alpha, beta, gamma = (tensor_of(v) for v in (level, deformation, alpha, beta, gamma))
     cubes = tensor_of(cubes, torch.int64)

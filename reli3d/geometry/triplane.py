@@ -194,6 +194,9 @@ def sample_triplane(planes: Tensor, points: Tensor) -> Tensor:
 
     Gradients reach ``planes`` (in their dtype) and ``points`` (one-sided at texel centres), with the same bits for any
     number of threads.  Raises TypeError or ValueError, also for sizes beyond 32-bit indices.
+
+    >>> planes = torch.rand(1, 3, 8, 16, 16, requires_grad=True)
+    >>> features = reli3d.sample_triplane(planes, torch.zeros(1, 100, 3))  # (1, 100, 24)
     """
     check_triplane(planes, points)
     return _SampleTriplane.apply(planes, points.contiguous())

@@ -80,6 +80,9 @@ def unwrap(mesh: Mesh, *, texture_size: int = 1024) -> Mesh:
     if there are too many charts for the texture.  Normals are kept, or computed before the split, so that shading is
     smooth across charts.  Any triangle mesh is taken: open, non-manifold, in pieces, with faces without area.  The same
     input gives the same bits.  Raises TypeError or ValueError for a wrong mesh, no faces, or NaN.
+
+    >>> charted = reli3d.unwrap(mesh, texture_size=64)
+    >>> maps = reli3d.bake(charted, 64, lambda position, normal: position.abs())
     """
     _check(mesh, texture_size)
     source_faces = mesh.faces.cpu().numpy()

@@ -199,6 +199,9 @@ def write_glb(
     float32 vertices would lose their shape.  textures: ``png``, or ``webp``, lossless too, smaller, and required from a
     viewer by ``EXT_texture_webp``.  Raises TypeError, ValueError for an asset that lacks something or is not finite,
     OSError where the file cannot be written.
+
+    >>> reli3d.write_glb("object.glb", asset, extras={"license": "CC0-1.0"})
+    >>> parts = reli3d.read_glb("object.glb")
     """
     data = glb_bytes(asset, extras=extras, double_sided=double_sided, translation=translation, textures=textures)
     write_bytes(path, data)
@@ -211,5 +214,8 @@ def read_glb(path: str | os.PathLike, **limits: int) -> list[Asset]:
     emission, alpha, animation, points and lines are left out.  Missing normals are those of the faces, missing tangents
     MikkTSpace's.  limits: see :func:`reli3d.io.gltf_parts.read_parts`.  Raises InputError, a ValueError that names
     field, value and fix.
+
+    >>> reli3d.write_glb("object.glb", asset)
+    >>> parts = reli3d.read_glb("object.glb")
     """
     return read_parts(path, **limits)

@@ -192,6 +192,9 @@ def write_image(path: str | os.PathLike, image: Tensor) -> None:
     ``.exr``: values as given, premultiplied as OpenEXR has it.  ``.hdr``: has neither grey nor alpha; ``(H, W, 3)``
     alone.  Writes the whole file or nothing.  Raises TypeError for another dtype, ValueError for another suffix or
     shape, NaN, infinity or negative values, OSError where the file cannot be written.
+
+    >>> image = reli3d.render_asset(asset, camera, light)
+    >>> reli3d.write_image("image.png", image.rgba)
     """
     suffix = os.path.splitext(path)[1].lower()
     if suffix not in (".png", ".exr", ".hdr"):

@@ -22,12 +22,15 @@ KEPT = 2048  # texels a side up to which lookups are kept: 50 MB
 
 @dataclass(frozen=True, repr=False)
 class TextureSet:
-    """Square maps of one size, values in [0, 1]; row 0 is v = 0 (glTF: v down), texel centres at +0.5.
+    """Square maps of one size, values in [0, 1]; row 0 is v = 0 (glTF: v down), texel centers at +0.5.
 
-    base_color: ``(T, T, 3)``, linear.  roughness: ``(T, T)`` or ``(T, T, 1)``, perceptual.  metallic: the same.
-    Either may be a number.  normal: ``(T, T, 3)``, tangent-space unit normal as ``n * 0.5 + 0.5``, green along the
-    bitangent; None is flat.  Fields are ``(T, T, 3)`` and ``(T, T)`` tensors after construction.  Raises TypeError for
-    a wrong kind or dtype, ValueError for a shape or device.
+    base_color: ``(T, T, 3)``, linear; files hold sRGB.  roughness: ``(T, T)`` or ``(T, T, 1)``, perceptual.  metallic:
+    the same.  Either may be a number.  normal: ``(T, T, 3)``, tangent-space unit normal as ``n * 0.5 + 0.5``, green
+    along the bitangent; None is flat.  Fields are ``(T, T, 3)`` and ``(T, T)`` tensors after construction.  Gradients
+    pass through.  Raises TypeError for a wrong kind or dtype, ValueError for a shape or device.
+
+    >>> textures = reli3d.TextureSet(torch.full((64, 64, 3), 0.5), roughness=0.4, metallic=0.0)
+    >>> asset = reli3d.Asset(mesh, textures)
     """
 
     base_color: Tensor
@@ -106,7 +109,15 @@ class TextureSet:
 
 @dataclass(frozen=True, repr=False)
 class Asset:
-    """A relightable object.  ``environment`` is the light it was captured under, where that is known."""
+    """A relightable object: mesh, textures and the light it was captured under, where that is known.
+
+    mesh: a :class:`~reli3d.geometry.mesh.Mesh`.  textures: a :class:`TextureSet`; renderers take None as a grey
+    dielectric.  environment: an :class:`~reli3d.render.environment.Environment` or None.  ``.to(device)`` and
+    ``.detach()`` give copies; gradients pass through.  Raises TypeError for another kind.
+
+    >>> asset = reli3d.Asset(mesh, reli3d.TextureSet(torch.full((64, 64, 3), 0.5), roughness=0.4, metallic=0.0))
+    >>> image = reli3d.render_asset(asset, camera, light)
+    """
 
     mesh: Mesh
     textures: TextureSet

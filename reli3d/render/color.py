@@ -25,16 +25,26 @@ _AGX_EV = (-12.47393, 4.026069)  # log2 range mapped to [0, 1]
 
 
 def srgb_to_linear(value: Tensor) -> Tensor:
-    """Linear radiance of an sRGB-encoded value, any shape (IEC 61966-2-1; toe below 0.04045).
+    """Linear value of an sRGB-encoded one, any shape.
 
-    Not clamped: values above 1 follow the power, negative ones the toe.  Gradients everywhere.
+    Not clamped: values above 1 follow the power, negative ones the toe.  Gradients everywhere.  Source: IEC 61966-2-1,
+    the toe below 0.04045.
+
+    >>> base_color = reli3d.srgb_to_linear(torch.full((64, 64, 3), 0.5))
+    >>> textures = reli3d.TextureSet(base_color, roughness=0.5, metallic=0.0)
     """
     power = ((value.clamp(min=0.04045) + 0.055) / 1.055) ** 2.4  # the clamp keeps a NaN slope out of the unused branch
     return torch.where(value <= 0.04045, value / 12.92, power)
 
 
 def linear_to_srgb(value: Tensor) -> Tensor:
-    """sRGB encoding of linear radiance, any shape; inverse of :func:`srgb_to_linear`, not clamped."""
+    """sRGB encoding of linear values, any shape; inverse of :func:`srgb_to_linear`, not clamped.
+
+    Gradients everywhere.  Source: IEC 61966-2-1.
+
+    >>> encoded = reli3d.linear_to_srgb(torch.tensor([0.0, 0.18, 1.0]))
+    >>> pixels = (255 * encoded).round().byte()
+    """
     power = 1.055 * value.clamp(min=0.0031308) ** (1.0 / 2.4) - 0.055
     return torch.where(value <= 0.0031308, value * 12.92, power)
 

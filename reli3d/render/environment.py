@@ -47,9 +47,15 @@ class EnvironmentTable:
 
 @dataclass(frozen=True)
 class Environment:
-    """Radiance from infinitely far, ``radiance (H, W, 3)``, normally W = 2 H; linear Rec. 709.
+    """Distant light as a lat-long map: ``radiance (H, W, 3)``, normally W = 2 H, linear Rec. 709.
 
-    The sampling table is made once, on first use; do not edit ``radiance`` in place afterwards.
+    Row 0 is +Y, the centre column +X, right of it +Z.  ``.lookup(directions)``, ``.rotated(yaw)``,
+    ``.resized(height)``, ``.sample(u)``, ``.pdf(directions)``, ``.irradiance()``.  Gradients reach the texels.  The
+    sampling table is made once, on first use: do not edit ``radiance`` in place afterwards.  Raises TypeError for a
+    dtype, ValueError for a shape.
+
+    >>> light = reli3d.Environment(torch.rand(16, 32, 3))
+    >>> radiance = light.rotated(0.5).lookup(torch.tensor([0.0, 1.0, 0.0]))
     """
 
     radiance: Tensor

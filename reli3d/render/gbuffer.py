@@ -59,10 +59,15 @@ def tangent_normals(mesh: Mesh, face: Tensor, bary: Tensor, normal: Tensor, mapp
 
 
 def surface_points(mesh: Mesh, textures: TextureSet | None, face: Tensor, bary: Tensor) -> SurfacePoints:
-    """Geometry and material of hits: ``face (N,)`` int32, none missing, and ``bary (N, 2)``.
+    """Geometry and material at hits of a mesh, as :func:`~reli3d.render.shading.shade` takes them.
 
-    Without vertex normals the shading normal is the geometric one.  Without textures the base colour is 0.5,
-    roughness 0.5, metallic 0.  Gradients reach the mesh's arrays, the textures and ``bary``.
+    mesh: with uv for textures.  textures: a :class:`~reli3d.render.asset.TextureSet` or None for a grey dielectric:
+    base color 0.5, roughness 0.5, metallic 0.  face: ``(N,)`` int32, no miss among them.  bary: ``(N, 2)``.  Without
+    vertex normals the shading normal is the geometric one.  Gradients reach the mesh's arrays, the textures and
+    ``bary``.  Raises TypeError, ValueError.
+
+    >>> hits = reli3d.RayScene(mesh).intersect(*reli3d.camera_rays(camera))
+    >>> points = reli3d.surface_points(mesh, asset.textures, hits.face[hits.valid], hits.bary[hits.valid])
     """
     position = interpolate(mesh.vertices, mesh.faces, face, bary)
     ng = hit_normals(mesh.vertices, mesh.faces, face)

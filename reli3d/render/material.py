@@ -71,7 +71,7 @@ def sample_bsdf(wo: Tensor, alpha: Tensor, u: Tensor, *, lobe: str = "visible") 
     ``wo`` and ``alpha``.  Raises TypeError unless float32, ValueError for a shape, a device or another lobe.  Source:
     Dupuy and Benyoub 2023.
 
-    >>> wi = reli3d.sample_bsdf(wo, alpha, torch.rand(1000, 2))
+    >>> wi = reli3d.sample_bsdf(wo, alpha, u)
     >>> weight = reli3d.eval_bsdf(wo, color, alpha, metallic, wi) * wi[:, 2:] / reli3d.pdf_bsdf(wo, alpha, wi)[:, None]
     """
     if choice("lobe", lobe, LOBES) == 2:
@@ -92,8 +92,8 @@ def pdf_bsdf(wo: Tensor, alpha: Tensor, wi: Tensor, *, lobe: str = "visible") ->
     gradient: samples are drawn detached.  Raises TypeError unless float32, ValueError for a shape, a device or another
     lobe.
 
-    >>> u = torch.rand(1000, 2)
-    >>> density = reli3d.pdf_bsdf(wo, alpha, reli3d.sample_bsdf(wo, alpha, u))
+    >>> wi = reli3d.sample_bsdf(wo, alpha, u)
+    >>> density = reli3d.pdf_bsdf(wo, alpha, wi)
     """
     return pdf_lobes(wo, alpha, wi)[..., choice("lobe", lobe, LOBES)]
 

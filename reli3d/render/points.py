@@ -18,13 +18,16 @@ NUMBERS = ("base_color", "roughness", "metallic")  # may be a plain number: grey
 
 @dataclass(frozen=True)
 class SurfacePoints:
-    """What the shader needs of N points; directions unit, world frame.
+    """Geometry and material of N points to be shaded; directions unit, world frame.
 
     position: ``(N, 3)``.  ng: ``(N, 3)`` geometric normal, outward.  normal: ``(N, 3)`` shading normal.  base_color:
-    ``(N, 3)`` LINEAR.  roughness: ``(N,)`` perceptual.  metallic: ``(N,)``.  All but ``position`` may be one row, which
-    then holds for all points, and the material may be single numbers.  Arrays of numpy are taken where nothing is lost.
-    Fields have N rows after construction.  Raises TypeError for a wrong kind or dtype, ValueError for a shape or
-    device.
+    ``(N, 3)`` linear.  roughness: ``(N,)`` perceptual.  metallic: ``(N,)``.  All but ``position`` may be one row for
+    all points, and the material may be single numbers.  Numpy arrays are taken if the conversion is exact.  Fields have
+    N rows after construction.  Gradients pass through.  Raises TypeError for a wrong kind or dtype, ValueError for a
+    shape or device.
+
+    >>> points = reli3d.SurfacePoints(position, normal, normal, base_color=0.8, roughness=0.4, metallic=0.0)
+    >>> radiance = reli3d.shade(points, wo, light)
     """
 
     position: Tensor

@@ -38,7 +38,7 @@ def sample_ggx_vndf(wo: Tensor, alpha: Tensor, u: Tensor) -> Tensor:
     Density: :func:`pdf_ggx_vndf`.
 
     >>> wo, alpha = torch.tensor([0.6, 0.0, 0.8]), torch.tensor(0.25)
-    >>> wm = reli3d.sample_ggx_vndf(wo, alpha, torch.rand(1000, 2))
+    >>> wm = reli3d.sample_ggx_vndf(wo, alpha, torch.rand(4096, 2))
     """
     check("wo", wo, last=3)
     check("alpha", alpha, like=wo)
@@ -86,8 +86,8 @@ def antithetic(u: Tensor) -> Tensor:
     independent ones where the integrand is near to odd about the lobe's centre, as derivatives in ``alpha`` and the
     normal are.  Its own inverse.  No gradient.  Raises TypeError unless float32, ValueError for a shape.
 
-    >>> u = torch.rand(1000, 2)
-    >>> first, second = (reli3d.sample_ggx_vndf(wo, alpha, v) for v in (u, reli3d.antithetic(u)))
+    >>> partners = reli3d.antithetic(u)
+    >>> first, second = (reli3d.sample_ggx_vndf(wo, alpha, v) for v in (u, partners))
     """
     check("u", u, last=2)
     turn, height = u.unbind(-1)
@@ -120,7 +120,14 @@ def mirror(wm: Tensor) -> Tensor:
 
 
 def reflect(wo: Tensor, wm: Tensor) -> Tensor:
-    """``wo`` mirrored at ``wm``, ``(..., 3)``."""
+    """``wo`` mirrored at the microfacet normal ``wm``: ``2 (wo.wm) wm - wo``, ``(..., 3)``.
+
+    wo, wm: ``(..., 3)`` unit, any common frame.  Gradients reach both.  Raises TypeError unless float32, ValueError for
+    a shape or device.
+
+    >>> wm = reli3d.sample_ggx_vndf(wo, alpha, u)
+    >>> wi = reli3d.reflect(wo, wm)
+    """
     check("wo", wo, last=3)
     check("wm", wm, last=3, like=wo)
     return 2.0 * (wo * wm).sum(-1, keepdim=True) * wm - wo

@@ -50,6 +50,7 @@ class Samples(NamedTuple):
     light: from the environment's importance table.  bsdf: from visible normals.  cosine: from the cosine.
 
     >>> options = reli3d.ShadeOptions(samples=reli3d.Samples(light=8, bsdf=16, cosine=2))
+    >>> image = reli3d.render_asset(asset, camera, light, options=options)
     """
 
     light: int = 20
@@ -71,6 +72,7 @@ class ShadeOptions:
     ValueError for a count or choice.
 
     >>> fast = reli3d.ShadeOptions(samples=reli3d.Samples(light=4, bsdf=4, cosine=2), seed=1)
+    >>> image = reli3d.render_asset(asset, camera, light, options=fast)
     """
 
     samples: Samples | tuple[int, int, int] = Samples()

@@ -140,15 +140,18 @@ def antialias(
     *,
     edges: Tensor | None = None,
 ) -> Tensor:
-    """``image (H, W, C)`` with antialiased outlines of the mesh; float32, any number of layers (mask, colour, normal).
+    """``image (H, W, C)`` with antialiased silhouettes of the mesh, differentiable in the vertices.
 
-    image: values at the first hits of the camera's rays through the pixel centres.  vertices: ``(V, 3)``.  faces:
-    ``(F, 3)`` int32.  camera: one of the image's size.  scene: what hides edges, made of the mesh here if None.
-    edges: of :func:`mesh_edges`, made here if None; they hold for as long as the faces do.
+    image: float32, any number of layers, values at the first hits of the camera's rays through the pixel centers.
+    vertices: ``(V, 3)``.  faces: ``(F, 3)`` int32.  camera: one of the image's size.  scene: what hides edges, built of
+    the mesh here if None.  edges: of :func:`mesh_edges`, built here if None; they hold as long as the faces do.
 
-    Gradients reach the image, the vertices and the camera; they are the same bits for any number of CPU threads.
-    Values inside faces are the caller's: only outlines move with the vertices here, not seams of colour or lines where
-    faces cut through each other.
+    Gradients reach the image, the vertices and the camera; bitwise identical for any number of CPU threads.  Values
+    inside faces are the caller's: only silhouettes move with the vertices here, not seams of color or lines where faces
+    cut through each other.  Raises TypeError or ValueError.  Source: Laine et al. 2020, section 3.4.
+
+    >>> mask = reli3d.RayScene(mesh).intersect(*reli3d.camera_rays(camera)).valid[..., None].float()
+    >>> smooth = reli3d.antialias(mask, mesh.vertices, mesh.faces, camera)
     """
     check("image", image, like=vertices)
     if image.ndim != 3 or image.shape[:2] != (camera.height, camera.width):

@@ -58,6 +58,9 @@ def load_views(
     none; may download.
 
     Cameras far from their origin are moved by ``-origin``.  Raises InputError, one line.
+
+    >>> views = reli3d.load_views("photos/shoe", views=4)
+    >>> notes = views.notes
     """
     for name, value in (("views", views), ("first_views", first_views)):
         if value is not None and (isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= MAX_VIEWS):

@@ -51,6 +51,9 @@ class Views:
     images: ``(H, W, 3)`` each, float32 sRGB in [0, 1].  masks: ``(H, W)`` each, float32 alpha in [0, 1].
     c2w: ``(V, 4, 4)`` rotations and translations.  intrinsics: ``(V, 4)``.  All on one device, without gradient.
     Raises TypeError or ValueError where shapes, kinds or devices disagree.
+
+    >>> views = reli3d.load_views("photos/shoe")
+    >>> size = [image.shape for image in views.images]
     """
 
     images: tuple[Tensor, ...]

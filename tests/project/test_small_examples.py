@@ -1,18 +1,25 @@
 """The examples and the library page's snippets run with nothing but the package, and find what they look for."""
 
+import math
 import re
 import runpy
+import shutil
 import sys
+from pathlib import Path
 
 import pytest
 import torch
 
+import reli3d
+from reli3d.geometry.tangents import with_tangents
 from reli3d.io.glb import read_glb
 from reli3d.io.images import read_image
 from tests.support import reference
 from tests.support.checkout import ROOT
 
 EXAMPLES = ROOT / "examples"
+PAGE = (ROOT / "docs" / "library.md").read_text()
+SNIPPETS = re.findall(r"^```python\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)
 
 
 @pytest.fixture
@@ -59,8 +66,7 @@ def test_object_and_light_turn(run, tmp_path):
 
 
 def test_the_snippets_of_the_library_page_are_short_and_find_what_they_look_for(tmp_path, monkeypatch):
-    page = (ROOT / "docs" / "library.md").read_text()
-    scene, *snippets = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    scene, *snippets = SNIPPETS
     assert len(snippets) == 6 and max(len(code.splitlines()) for code in snippets) <= 12
     monkeypatch.chdir(tmp_path)
     found, names = [], {}
@@ -106,3 +112,36 @@ def albedo_by_quadrature(alpha: float) -> float:
     wo = torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64).expand(len(wi), 3)
     value = reference.eval_bsdf(wo, wi, one[:, None].expand(-1, 3), alpha * one, one)
     return float((value[:, 0] * wi[:, 2]).sum() * angle)
+
+
+RECONSTRUCTING = ("reconstruct", "refine", "ReconstructOptions")  # minutes; the README's block runs the same calls
+
+
+def test_the_examples_of_the_public_names_run(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(Path(reli3d.__file__).parent / "assets" / "example", tmp_path / "photos" / "shoe")
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        names = {"math": math}
+        exec(SNIPPETS[0], names)
+        scene, light, normal = names["mesh"], names["light"], torch.nn.functional.normalize(torch.randn(8, 3), dim=-1)
+        names |= {"u": torch.rand(8, 2), "alpha": torch.tensor(0.25), "metallic": torch.tensor(0.5)}
+        names |= {
+            "wo": normal,
+            "wi": normal,
+            "wm": normal,
+            "normal": normal,
+            "position": normal,
+            "color": torch.ones(3),
+        }
+        names |= dict(zip(("origins", "directions"), reli3d.camera_rays(names["camera"]), strict=True))
+        names |= {"v": scene.vertices.clone().requires_grad_(), "scene": reli3d.RayScene(scene)}
+        maps = reli3d.TextureSet(torch.full((64, 64, 3), 0.5), 0.5, 0.0)
+        names["asset"] = reli3d.Asset(with_tangents(scene), maps, light)
+        reli3d.write_environment("studio.hdr", light)
+        for name in reli3d.__all__[1:]:
+            code = "\n".join(re.findall(r"^ *>>> (.*)$", getattr(reli3d, name).__doc__, re.MULTILINE))
+            assert len(code.splitlines()) >= 2, name
+            compiled = compile(code, name, "exec")
+            if name not in RECONSTRUCTING:
+                exec(compiled, dict(names))
