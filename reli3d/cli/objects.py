@@ -100,7 +100,7 @@ def sources(paths: Sequence[Path]) -> list[Path | Packed]:
     """The folders among ``paths``, and the objects of the tar files.  Raises InputError for a file that is none."""
     found: list[Path | Packed] = []
     for path in paths:
-        if path.suffix == ".tar" and not path.is_dir() or path.is_file():
+        if path.suffix == ".tar" and not path.is_dir():
             found += packed_objects(path)
         else:
             found.append(path)
@@ -129,7 +129,7 @@ def items_of(folders: Sequence[Path | Packed], output: Path, *, dots: bool = Tru
 def listed(path: Path) -> list[Path]:
     """What a text file names, one folder or tar file a line, relative to where the command runs.  Raises InputError."""
     try:
-        lines = read_bytes(path, MAX_LIST).decode().splitlines()
+        lines = read_bytes(path, MAX_LIST).decode("utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
         raise InputError(path, f"expected UTF-8 text, got other bytes at {error.start}; save it as UTF-8") from None
     folders = [Path(line.strip()) for line in lines if line.strip()]

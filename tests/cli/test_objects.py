@@ -176,6 +176,8 @@ def test_names_are_different_and_quick_for_many(tmp_path):
 def test_a_list_names_folders(tmp_path):
     (tmp_path / "list.txt").write_text("one\n\n  two/three  \nmit größe\n")
     assert objects.listed(tmp_path / "list.txt") == [Path("one"), Path("two/three"), Path("mit größe")]
+    (tmp_path / "list.txt").write_bytes(b"\xef\xbb\xbfone\r\ntwo\r\n")  # as Windows' editors save it
+    assert objects.listed(tmp_path / "list.txt") == [Path("one"), Path("two")]
     (tmp_path / "empty").write_text("\n \n")
     (tmp_path / "bytes").write_bytes(b"\xff\xfe")
     for name, word in (("empty", "got none"), ("bytes", "UTF-8"), ("missing", "not found"), (".", "regular file")):
