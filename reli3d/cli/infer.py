@@ -73,8 +73,6 @@ def _plan(args: argparse.Namespace, held: contextlib.ExitStack) -> Plan:
     listed = [] if args.list is None else objects.listed(args.list)
     named = [*args.folder, *listed] or [EXAMPLE]
     items = objects.items_of(objects.sources(named), args.output, dots=args.shards_out is None)
-    if args.allow_outside and any(isinstance(item.folder, Packed) for item in items):
-        raise ValueError("--allow-outside: expected folders with it, got a tar file, which has all its images")
     for item in items:
         check_place(item.target)  # before minutes of work
     if (args.output / objects.SUMMARY).is_dir():
@@ -210,7 +208,6 @@ def _read(folder: Path | Packed, args: argparse.Namespace, *, every: bool = Fals
             views=args.views,
             first_views=args.first_views,
             masks=args.masks,
-            allow_outside=args.allow_outside,
             every=every,
             whole=whole,
             remove_background=args.remove_background,
@@ -328,7 +325,6 @@ class Job:
             "object": name,
             "views": list(views.names),
             "views_in_folder": views.in_folder,
-            "coordinate_system": views.coordinate_system,
             "notes": [*views.notes, *watch.notes],
             **frames,
             "preset": self.model.preset.name,

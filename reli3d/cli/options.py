@@ -140,7 +140,6 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--warm", action="store_true", help="reconstruct every object twice and record the second time as well"
     )
-    p.add_argument("--allow-outside", action="store_true", help="let a camera file name images outside its folder")
     p.add_argument("--check", action="store_true", help="explain the cameras and draw the rig; reconstruct nothing")
     p.add_argument("-v", "--verbose", action="store_true", help="print the seconds of every stage, and the memory")
     p.add_argument(

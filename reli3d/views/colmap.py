@@ -8,19 +8,23 @@ Source: https://colmap.github.io/format.html and the list of camera models there
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from pathlib import Path
+import os
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path, PurePath
 
 import numpy as np
 
 from reli3d.io.files import InputError, file_size, shown
 from reli3d.views import colmap_binary
-from reli3d.views.shots import Lens, Shot, cleaned, inside, number
+from reli3d.views.file_names import FolderIndex, images_below, images_in
+from reli3d.views.frames import Frame, Lens, file_within, nearest_rigid, number
 
 MAX_BYTES = 1 << 28  # images.txt lists every matched point
 MAX_LINE = 1 << 24  # an image's points: 30 characters each
 MAX_IMAGES = 100_000
-PLACES = ("sparse/0", "sparse", "colmap/sparse/0", "")
+PLACES = ("sparse/0", "sparse", "sparse/*", "colmap/sparse/0", "colmap/sparse", "colmap/sparse/*", "")
+_POINTS = re.compile(r"(?:[-+.0-9eE]+\s+[-+.0-9eE]+\s+-?\d+(?:\s+|$))+")  # x, y, number of the 3D point or -1
 # model: numbers of focal lengths, radial and tangential parameters; the centre stands after the focal lengths
 _MODELS = {
     "SIMPLE_PINHOLE": (1, 0, 0),
@@ -31,51 +35,99 @@ _MODELS = {
 }
 
 
-def find_colmap(folder: Path) -> Path | None:
-    """Folder of the model in ``folder``, or None.  Of a text and a binary one the text, which people edit."""
-    for ending in ("txt", "bin"):
-        for place in PLACES:
-            at = folder / place
-            if (at / f"cameras.{ending}").exists() and (at / f"images.{ending}").exists():
-                return at
-    return None
+def find_colmap(folder: Path) -> list[Path]:
+    """The ``images.txt`` and ``images.bin`` of the models in ``folder``, each beside its cameras.
+
+    Of a model in both forms the text, which people edit, comes first.
+    """
+    places = [at for place in PLACES for at in (sorted(folder.glob(place)) if place else [folder])]
+    found = [
+        at / f"images.{ending}"
+        for at in dict.fromkeys(places)
+        for ending in ("txt", "bin")
+        if all(os.path.lexists(at / f"{name}.{ending}") for name in ("cameras", "images"))
+    ]
+    return found
 
 
-def read_colmap(folder: Path, model: Path, *, outside: bool = False) -> tuple[list[Shot], list[str]]:
-    """All shots by image name of the model in ``model``, image files below ``folder``, and notes.
+def read_colmap(folder: Path, models: Sequence[Path]) -> tuple[list[Frame], list[str]]:
+    """All frames by image name of the model with most images, image files below ``folder``, and notes.
 
-    Raises InputError naming the line, or the entry of a binary file, and the field.
+    models: as :func:`find_colmap` gives them; the first of the largest is read.  Images that are missing in the folder
+    are left out with a note.  Raises InputError naming the line, or the entry of a binary file, and the field.
     """
     notes = ["COLMAP models have no up direction and no scale: the mesh comes out as the cameras stand"]
-    text = (model / "cameras.txt").exists() and (model / "images.txt").exists()
-    path = model / ("images.txt" if text else "images.bin")
-    lenses = _lenses(_text_cameras(model / "cameras.txt") if text else colmap_binary.cameras(model / "cameras.bin"))
-    if not lenses:
-        raise InputError(model, "cameras: expected at least one camera, got none; export the model again")
-    entries = []
-    for entry in _text_images(path) if text else colmap_binary.images(path):
-        entries.append(entry)
-        if len(entries) > MAX_IMAGES:
-            raise InputError(path, f"expected at most {MAX_IMAGES} images; export the views to be used")
-    if not entries:
+    entries = [_entries(path) for path in models]
+    best = max(range(len(models)), key=lambda k: len(entries[k]))
+    path = models[best]
+    if len(models) > 1:
+        sizes = ", ".join(f"{_short(folder, p)} {len(e)}" for p, e in zip(models, entries))
+        notes.append(f"{len(models)} COLMAP models, with numbers of images {sizes}: {_short(folder, path)} is used")
+    if not entries[best]:
         raise InputError(path, "expected at least one image, got none; export the model again")
-    images = folder / "images" if (folder / "images").is_dir() else folder
-    shots = []
-    for name, where, pose, camera in sorted(entries, key=lambda entry: entry[0]):
+    cameras = path.with_name("cameras" + path.suffix)
+    lenses = _lenses(_text_cameras(cameras) if path.suffix == ".txt" else colmap_binary.cameras(cameras))
+    if not lenses:
+        raise InputError(cameras, "expected at least one camera, got none; export the model again")
+    index, names = FolderIndex(), [PurePath(name) for name, *_ in entries[best]]
+    places = [at for at in (folder / "images", folder) if at.is_dir()]
+    images = max(places, key=lambda at: sum(index.find(at, name) is not None for name in names))
+    frames, missing = [], []
+    for name, where, pose, camera in sorted(entries[best], key=lambda entry: entry[0]):
         if camera not in lenses:
             raise InputError(
                 where, f"CAMERA_ID: expected one of the model's cameras, got {shown(camera)}; export it again"
             )
-        image = inside(images, where, "NAME", name, outside=outside)
-        shots.append(Shot(where, name, image, None, _pose(where, pose), lenses[camera]))
-    return shots, notes
+        image = file_within(images, where, "NAME", name)
+        found = image if os.path.isfile(image) else index.find(images, PurePath(name))
+        c2w = _pose(where, pose)
+        if found is None:
+            missing.append(name)
+        else:
+            frames.append(Frame(where, name, found, None, c2w, lenses[camera]))
+    if not frames:
+        raise InputError(
+            path, f"NAME: expected images in {images}, got {shown(missing[0])} which does not exist; copy them in"
+        )
+    return frames, notes + _counted(folder, images, frames, missing)
+
+
+def _short(folder: Path, path: Path) -> str:
+    return path.relative_to(folder).as_posix()
+
+
+def _counted(folder: Path, images: Path, frames: list[Frame], missing: list[str]) -> list[str]:
+    """Notes on images that the model does not list, and on listed ones that are missing."""
+    used = {os.path.realpath(frame.image) for frame in frames}
+    there = images_below(images) if images != folder else images_in(folder)
+    notes = []
+    if any(os.path.realpath(p) not in used for p in there):
+        notes.append(f"the model lists {len(frames)} of the {len(there)} images in the folder")
+    if missing:
+        names = ", ".join(shown(name) for name in missing[:4]) + (", ..." if len(missing) > 4 else "")
+        count = len(frames) + len(missing)
+        notes.append(f"of the {count} images that the model lists {len(missing)} are missing in the folder: {names}")
+    return notes
+
+
+def _entries(path: Path) -> list[tuple[str, str, list[float], object]]:
+    entries: list[tuple[str, str, list[float], object]] = []
+    for entry in _text_images(path) if path.suffix == ".txt" else colmap_binary.images(path):
+        entries.append(entry)
+        if len(entries) > MAX_IMAGES:
+            raise InputError(path, f"expected at most {MAX_IMAGES} images; export the views to be used")
+    return entries
 
 
 def _text_images(path: Path) -> Iterator[tuple[str, str, list[float], str]]:
-    """``(name, where, rotation and translation, camera)`` of each image."""
-    lines = _lines(path)
-    for n, line in lines:
-        next(lines, None)  # the second line of each image lists its points, which are not needed
+    """``(name, where, rotation and translation, camera)`` of each image.
+
+    Lines of points are recognized by their form: for an image without points COLMAP writes an empty one, other
+    programs none.
+    """
+    for n, line in _lines(path):
+        if _POINTS.fullmatch(line):
+            continue
         words = line.split(maxsplit=9)
         where = f"{path}: line {n}"
         if len(words) != 10:
@@ -103,15 +155,13 @@ def _pose(where: str, values: list[float]) -> np.ndarray:
     c2w = np.eye(4)
     c2w[:3, :3] = rotation.T * (1, -1, -1)  # columns y and z turned: OpenCV to OpenGL axes
     c2w[:3, 3] = -rotation.T @ np.array(t)
-    return cleaned(where, "QVEC TVEC", c2w)
+    return nearest_rigid(where, "QVEC TVEC", c2w)
 
 
 def _text_cameras(path: Path) -> Iterator[tuple[str, str, str, list[float], list[float]]]:
     """``(where, id, model, width and height, parameters)`` of each camera."""
     for n, line in _lines(path):
         where, words = f"{path}: line {n}", line.split()
-        if not words:
-            continue
         if len(words) < 5:
             raise InputError(
                 where, f"expected ID, model, width, height, parameters, got {shown(line)}; export it again"
@@ -159,17 +209,18 @@ def _real(where: str, field: str, word: str) -> float:
 
 
 def _lines(path: Path):
-    """``(number, text)`` of the lines that are no comment; empty ones count, as images.txt needs them."""
+    """``(number, text)`` of the lines that are neither empty nor a comment."""
     size = file_size(path)
     if size > MAX_BYTES:
         raise InputError(path, f"expected at most {MAX_BYTES} bytes, got {size}; export the model without points")
     try:
-        with open(path, encoding="utf-8", errors="strict") as file:
+        with open(path, encoding="utf-8-sig", errors="strict") as file:
             for n, line in enumerate(iter(lambda: file.readline(MAX_LINE + 1), ""), 1):
                 if len(line) > MAX_LINE:
                     raise InputError(path, f"line {n}: expected at most {MAX_LINE} characters; export it again")
-                if not line.startswith("#"):
-                    yield n, line.strip()
+                line = line.strip()
+                if line and not line.startswith("#"):
+                    yield n, line
     except UnicodeDecodeError:
         raise InputError(path, "expected UTF-8 text, got other bytes; export the model again") from None
     except OSError as error:

@@ -11,7 +11,7 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 
 from reli3d.io.files import InputError, file_size, shown
-from reli3d.views.shots import MAX_PATH
+from reli3d.views.frames import MAX_PATH
 
 # in the order of their numbers; the pinhole cameras and those with a polynomial lens have so many parameters
 _NAMES = (

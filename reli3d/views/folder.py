@@ -1,8 +1,8 @@
 """A folder of posed photographs -> Views.
 
-Read are: an object folder as published (``transforms.json`` with per-frame ``camera_fov``), a Blender or nerfstudio
-``transforms.json``, and a COLMAP model (``sparse/0`` beside ``images``).  The object is separated from the background
-by the images' alpha, by ``mask_path``, or by a ``masks`` folder with a file of the same stem for each image.
+Read are ``transforms.json`` (object folders as published, Blender, nerfstudio, instant-ngp), NeRF-synthetic's
+``transforms_train.json``, a COLMAP model, LLFF's ``poses_bounds.npy`` and IDR's and NeuS's ``cameras_sphere.npz``.  The
+object is separated from the background by the images' alpha, by ``mask_path``, or by files in a folder ``masks``.
 """
 
 from __future__ import annotations
@@ -10,30 +10,34 @@ from __future__ import annotations
 import math
 import os
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
+from dataclasses import replace
+from pathlib import Path, PurePath
 
 import numpy as np
 import torch
-from PIL import Image, ImageChops
+from PIL import Image
 from torch import Tensor
 
 from reli3d._bridge import present
 from reli3d.io.files import InputError, shown
 from reli3d.io.images import above, colour, read_picture, unit
-from reli3d.views.advice import no_cameras
+from reli3d.views.array_cameras import NEUS, read_llff, read_neus
 from reli3d.views.background import Remover
 from reli3d.views.choose import NEAR, choose_views, spread_notes
 from reli3d.views.colmap import find_colmap, read_colmap
+from reli3d.views.file_names import ENDINGS, FolderIndex
+from reli3d.views.frames import Frame, Lens, check_distortion, file_within
+from reli3d.views.masks import MaskFiles, alpha_values, check_one_label, mask_values
+from reli3d.views.missing_cameras import no_cameras
 from reli3d.views.normalize import near_origin
 from reli3d.views.reduce import LARGE, OBJECT, cut
-from reli3d.views.shots import Lens, Shot, inside, straight
 from reli3d.views.transforms import read_transforms
 from reli3d.views.views import MASK_EDGE, Views
 
 MAX_VIEWS = 16
 MIN_SIDE = 8  # pixels; below it there is nothing to see, and a mistake is likely
 MIN_OBJECT = 16  # pixels of the mask
-ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".PNG", ".JPG", ".JPEG")
+SPLITS = tuple(f"transforms_{name}.json" for name in ("train", "val", "test"))  # of NeRF-synthetic
 ASPECT = 0.01  # relative difference of the image's aspect and the camera's up to which the intrinsics are rescaled
 
 
@@ -43,7 +47,6 @@ def load_views(
     views: int | None = None,
     first_views: int | None = None,
     masks: str | os.PathLike | None = None,
-    allow_outside: bool = False,
     every: bool = False,
     whole: bool = False,
     remove_background: bool = False,
@@ -51,11 +54,10 @@ def load_views(
     """Photographs of an object folder, with their cameras and masks, in the order of the folder.
 
     views: how many, farthest apart, the first among them.  first_views: how many from the beginning.  Neither: all,
-    at most 16.  every: all; :meth:`Views.taken` are those without it.  masks: folder of masks with the images' stems;
-    else ``mask_path`` of a frame, alpha, or a folder ``masks`` or ``mask``, in this order.  allow_outside: the camera
-    file may name images outside ``folder``.  whole: keep all of photographs of more than two megapixels, scaled to
-    two, not the object alone at 768 pixels.  remove_background: masks by ``rembg`` (extra ``masks``) where there are
-    none; may download.
+    at most 16.  every: all; :meth:`Views.taken` are those without it.  masks: folder of masks; else ``mask_path`` of
+    a frame, alpha, or a folder ``masks`` or ``mask``, in this order.  whole: keep all of photographs of more than two
+    megapixels, scaled to two, not the object alone at 768 pixels.  remove_background: masks by ``rembg`` (extra
+    ``masks``) where there are none; may download.
 
     Cameras far from their origin are moved by ``-origin``.  Raises InputError, one line.
 
@@ -73,29 +75,25 @@ def load_views(
     except (OSError, ValueError):
         is_folder = False
     if not is_folder:
-        raise InputError(folder, "expected a folder with transforms.json or a COLMAP model; check the path")
+        raise no_cameras(root)
     if masks is not None and not Path(masks).is_dir():
         raise InputError(masks, "masks: expected a folder of mask images, got none; check the path")
-    system = None
-    if (root / "transforms.json").exists() or (root / "transforms.json").is_symlink():
-        cameras = inside(root, str(root), "transforms.json", "transforms.json", outside=allow_outside)
-        shots, notes, system = read_transforms(cameras, outside=allow_outside)
-    else:
-        model = find_colmap(root)
-        if model is None:
-            raise no_cameras(root)
-        shots, notes = read_colmap(root, model, outside=allow_outside)
-    offered = len(shots)
-    origin, moved = _origin(shots, folder)
+    frames, notes = _read_cameras(root)
+    index = FolderIndex()
+    frames = [replace(f, image=_existing(root, f.image, index) or f.image) for f in frames]
+    files = MaskFiles(root, frames, None if masks is None else Path(masks))
+    offered = len(frames)
+    origin, moved = _origin(frames, folder)
     notes += moved
-    taken, choice = _chosen(shots, views, first_views)
-    shots = shots if every else [shots[i] for i in taken]
-    notes += choice + [note for shot in shots for note in shot.notes]
+    taken, choice = _chosen(frames, views, first_views)
+    frames = frames if every else [frames[i] for i in taken]
+    notes += choice + [note for frame in frames for note in frame.notes]
     remover = Remover() if remove_background else None
     # decoding releases the GIL; torch is not used there, as each of these threads would start threads of its own
     with ThreadPoolExecutor(max_workers=min(4, os.cpu_count() or 1)) as pool:
-        loaded = list(pool.map(lambda shot: _load(root, shot, masks, allow_outside, whole, remover), shots))
+        loaded = list(pool.map(lambda frame: _load(root, frame, files, whole, remover), frames))
     notes += [note for *_, found, _ in loaded for note in found]
+    check_one_label(root, notes)
     if reduced := sum(smaller for *_, smaller in loaded):
         kept = f"scaled down to {LARGE} pixels" if whole else f"cut to the object, at most {OBJECT} pixels of it"
         notes.append(f"{reduced} of {len(loaded)} photographs have more than {LARGE} pixels: {kept}")
@@ -104,36 +102,57 @@ def load_views(
     return Views(
         images=tuple(image for image, *_ in loaded),
         masks=tuple(mask for _, mask, *_ in loaded),
-        c2w=_poses(shots, origin),
+        c2w=_poses(frames, origin),
         intrinsics=torch.tensor([k for _, _, k, *_ in loaded], dtype=torch.float32),
-        names=tuple(s.name for s in shots),
+        names=tuple(f.name for f in frames),
         notes=tuple(dict.fromkeys(notes)),
-        coordinate_system=system,
         in_folder=offered,
         chosen=tuple(taken) if every else None,
         origin=origin,
     )
 
 
-def _origin(shots: list[Shot], folder) -> tuple[tuple[float, float, float], list[str]]:
+def _read_cameras(root: Path) -> tuple[list[Frame], list[str]]:
+    """Frames and notes of the first form of cameras in ``root``; a note names it where it is not the only one."""
+    forms = [name for name in ("transforms.json", *SPLITS) if os.path.lexists(root / name)]
+    models = find_colmap(root)
+    forms += [models[0].parent.relative_to(root).as_posix() + " (COLMAP)"] if models else []
+    forms += [name for name in ("poses_bounds.npy", *NEUS) if os.path.lexists(root / name)]
+    if not forms:
+        raise no_cameras(root)
+    used = forms[0]
+    if used.endswith(".json"):
+        frames, notes = read_transforms(file_within(root, str(root), used, used))
+    elif models:
+        frames, notes = read_colmap(root, models)
+    else:
+        path = file_within(root, str(root), used, used)
+        frames, notes = (read_llff if used == "poses_bounds.npy" else read_neus)(root, path)
+    if len(forms) > 1 or used != "transforms.json" and not models:
+        others = f"; not read: {', '.join(forms[1:])}" if len(forms) > 1 else ""
+        notes.insert(0, f"cameras of {len(frames)} images from {used}{others}")
+    return frames, notes
+
+
+def _origin(frames: list[Frame], folder) -> tuple[tuple[float, float, float], list[str]]:
     """Where the frame of the views begins, in the folder's, and a note where that is elsewhere."""
     try:
-        at = tuple(near_origin(torch.from_numpy(np.stack([s.c2w for s in shots]))).tolist())
+        at = tuple(near_origin(torch.from_numpy(np.stack([f.c2w for f in frames]))).tolist())
     except ValueError as error:
         raise InputError(folder, str(error)) from None
     place = ", ".join(f"{v:.6g}" for v in at)
     return at, [f"the cameras are far from their origin: work is done about ({place})"] if any(at) else []
 
 
-def _poses(shots: list[Shot], origin: tuple[float, float, float]) -> Tensor:
-    poses = np.stack([s.c2w for s in shots])
+def _poses(frames: list[Frame], origin: tuple[float, float, float]) -> Tensor:
+    poses = np.stack([f.c2w for f in frames])
     poses[:, :3, 3] -= origin
     return torch.from_numpy(poses.astype(np.float32))
 
 
-def _chosen(shots: list[Shot], views: int | None, first_views: int | None) -> tuple[list[int], list[str]]:
+def _chosen(frames: list[Frame], views: int | None, first_views: int | None) -> tuple[list[int], list[str]]:
     """Indices of the shots for a network, and notes on the choice and on how they lie."""
-    poses, count, notes = torch.from_numpy(np.stack([s.c2w for s in shots])), len(shots), []
+    poses, count, notes = torch.from_numpy(np.stack([f.c2w for f in frames])), len(frames), []
     if first_views is not None:
         taken = list(range(min(first_views, count)))
     elif views is not None or count > MAX_VIEWS:
@@ -150,25 +169,25 @@ def _chosen(shots: list[Shot], views: int | None, first_views: int | None) -> tu
 
 
 def _load(
-    root: Path, shot: Shot, masks, outside: bool, whole: bool, remover: Remover | None
+    root: Path, frame: Frame, files: MaskFiles, whole: bool, remover: Remover | None
 ) -> tuple[Tensor, Tensor, list[float], list[str], bool]:
-    """Image, mask, intrinsics and notes of one shot, and whether less than the whole picture is kept."""
+    """Image, mask, intrinsics and notes of one frame, and whether less than the whole picture is kept."""
     notes: list[str] = []
-    path = _existing(shot.image)
-    if path is None:
+    path = frame.image
+    if not os.path.exists(path):
         raise InputError(
-            shot.where,
-            f"file_path: expected an image, got {shown(shot.name)} which does not exist; "
+            frame.where,
+            f"file_path: expected an image, got {shown(frame.name)} which does not exist; "
             "paths are relative to the camera file and use /",
         )
-    _still_inside(root, path, shot, outside)
-    picture = read_picture(path, notes=notes, calibrated=shot.lens.size)
+    _still_inside(root, path, frame)
+    picture = read_picture(path, notes=notes, calibrated=frame.lens.size)
     width, height = picture.size
     if min(height, width) < MIN_SIDE:
         raise InputError(
             path, f"expected at least {MIN_SIDE} pixels a side, got {width} x {height}; give a larger image"
         )
-    mask = _mask(root, shot, path, picture, masks, notes, outside, remover)
+    mask = _mask(root, frame, picture, files, notes, remover)
     if mask.size != (width, height):
         got = f"{mask.size[0]} x {mask.size[1]}"
         raise InputError(
@@ -180,7 +199,7 @@ def _load(
             "mask: expected the object to be opaque (white), got a mask that is empty; "
             "check that it is neither blank nor inverted",
         )
-    camera = intrinsics_of(shot.lens, width, height, shot.where, notes)
+    camera = intrinsics_of(frame.lens, width, height, frame.where, notes)
     part = cut(picture.size, above(mask, MASK_EDGE), whole=whole)
     if part is not None:
         picture, mask, camera = part.pixels(picture), part.pixels(mask), part.intrinsics(camera)
@@ -209,89 +228,58 @@ def looks_premultiplied(image: np.ndarray, mask: np.ndarray) -> bool:
 
 
 def _mask(
-    root: Path,
-    shot: Shot,
-    path: Path,
-    picture: Image.Image,
-    masks,
-    notes: list[str],
-    outside: bool,
-    remover: Remover | None,
+    root: Path, frame: Frame, picture: Image.Image, files: MaskFiles, notes: list[str], remover: Remover | None
 ) -> Image.Image:
-    """The mask of a shot in full size, of mode L or F."""
-    if masks is not None:
-        found = _beside(Path(masks), path)
-        if found is None:
-            raise InputError(masks, f"masks: expected a file with the stem of {shown(path.name)}, got none; add it")
-        return _grey(found, notes, shot.lens.size)
-    if shot.mask is not None:
-        found = _existing(shot.mask)
-        if found is None:
-            raise InputError(
-                shot.where,
-                f"mask_path: expected an image, got {shown(shot.mask.name)} which does not exist; correct the path",
-            )
-        _still_inside(root, found, shot, outside)
-        return _grey(found, notes, shot.lens.size)
-    alpha = _alpha(picture)
+    """The mask of a frame in full size, of mode L or F."""
+    alpha = None if files.given or frame.mask is not None else alpha_values(picture, notes)
     if alpha is not None:
         return alpha
-    for name in ("masks", "mask"):
-        found = _beside(root / name, path)
-        if found is not None:
-            _still_inside(root, found, shot, outside)
-            return _grey(found, notes, shot.lens.size)
+    found = files.of(frame)
+    if found is not None:
+        if not os.path.exists(found):
+            raise InputError(
+                frame.where,
+                f"mask_path: expected an image, got {shown(found.name)} which does not exist; correct the path",
+            )
+        if files.given is None:
+            _still_inside(root, found, frame)
+        return mask_values(found, read_picture(found, notes=notes, calibrated=frame.lens.size), notes)
+    if files.given is not None:
+        raise InputError(
+            files.given, f"masks: expected a file with the stem of {shown(frame.image.name)}, got none; add it"
+        )
     if remover is not None:
         return remover.mask(picture)
     got = "alpha that is opaque everywhere" if picture.mode == "RGBA" else "no alpha"
     raise InputError(
-        path,
-        f"expected alpha or a mask that tells the object from the background, got {got}; save RGBA "
-        "images, put white-on-black masks of the same names into a folder 'masks', or give "
-        "--remove-background",
+        frame.image,
+        f"expected alpha or a foreground mask, got {got}; save RGBA images, put white-on-black masks of the same names "
+        "(and sub-folders) into a folder 'masks', or give --remove-background",
     )
 
 
-def _alpha(picture: Image.Image) -> Image.Image | None:
-    """The alpha of a picture that has one which is used."""
-    alpha = picture.getchannel("A") if picture.mode == "RGBA" else None
-    if alpha is None:
-        return None
-    return alpha if np.asarray(alpha).min() < 128 else None
-
-
-def _grey(path: Path, notes: list[str], calibrated: tuple[int, int] | None) -> Image.Image:
-    """A mask file as grey: its alpha where that is used, else its brightest channel."""
-    picture = read_picture(path, notes=notes, calibrated=calibrated)
-    if picture.mode in ("L", "F"):
-        return picture
-    red, green, blue, *_ = picture.split()
-    return _alpha(picture) or ImageChops.lighter(ImageChops.lighter(red, green), blue)
-
-
-def _existing(path: Path) -> Path | None:
-    """``path``, or ``path`` with the ending of an image that exists (Blender's exporter leaves it out)."""
+def _existing(root: Path, path: Path, index: FolderIndex) -> Path | None:
+    """``path``, or that with the ending of an image (Blender's exporter leaves it out), or with other cases."""
     try:
-        for candidate in (path, *(path.with_name(path.name + ending) for ending in ENDINGS)):
+        candidates = (path, *(path.with_name(path.name + ending) for ending in ENDINGS))
+        for candidate in candidates:
             if candidate.is_file():
                 return candidate
-        return path if path.exists() else None
-    except (OSError, ValueError):
-        return None
+        below = os.path.relpath(path.parent, root)
+        for candidate in candidates:
+            found = index.find(root, PurePath(os.path.normpath(os.path.join(below, candidate.name))))
+            if found is not None and found.is_file():
+                return found
+    except (OSError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+    return None
 
 
-def _beside(folder: Path, image: Path) -> Path | None:
-    """The mask of ``image`` in ``folder``: the same stem or the full name (COLMAP), with the ending of an image."""
-    names = (image.name, *(stem + ending for stem in (image.stem, image.name) for ending in ENDINGS))
-    return next(
-        (folder / name for name in names if os.path.isfile(folder / name)), None
-    )  # False, too, for a name too long
-
-
-def _still_inside(root: Path, path: Path, shot: Shot, outside: bool) -> None:
-    if not outside and not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(root)):
+def _still_inside(root: Path, path: Path, frame: Frame) -> None:
+    if not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(root)):
         raise InputError(
-            shot.where,
+            frame.where,
             f"file_path: expected a file within the folder, got {shown(path.name)} which "
             "links out of it; copy the file in",
         )
@@ -318,9 +306,17 @@ def intrinsics_of(lens: Lens, width: int, height: int, where: str, notes: list[s
         across, upright = present("lens.fov", lens.fov)
         fx = 0.5 * width / math.tan(0.5 * across)
         fy = fx if math.isnan(upright) else 0.5 * height / math.tan(0.5 * upright)
-    note = straight(where, lens, fx, width, height)
+    note = check_distortion(where, lens, fx, width, height)
     notes.extend([note] if note else [])
-    cx, cy = (0.5 * width, 0.5 * height) if lens.centre is None else (lens.centre[0] * sx, lens.centre[1] * sy)
+    given = (math.nan, math.nan) if lens.centre is None else lens.centre
+    cx = 0.5 * width if math.isnan(given[0]) else given[0] * sx
+    cy = 0.5 * height if math.isnan(given[1]) else given[1] * sy
+    if 0 < given[0] <= 1 and 0 < given[1] <= 1:
+        raise InputError(
+            where,
+            f"cx, cy: expected pixels, got {given[0]:.6g} and {given[1]:.6g}, fractions of the image; multiply them by "
+            "its width and height",
+        )
     for name, value, side in (("cx", cx, width), ("cy", cy, height)):
         if not -side < value < 2 * side:
             raise InputError(

@@ -1,4 +1,4 @@
-"""One photograph as a camera file describes it, before its image is read: pose, lens and file, checked."""
+"""One frame of a camera file, checked, before its image is read: image file, pose and lens."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from reli3d.io.files import InputError, shown
 MAX_PATH = 1024
 ORTHONORMAL = 1e-3  # largest entry of R^T R - 1: four digits in a text file; beyond it is a shear or a scale
 MAX_DISTANCE = 1e6  # float32 poses keep a tenth of a unit there
-BEND = 1.0  # pixels a lens may bend a corner of the image and still count as straight
+MAX_DISTORTION_PIXELS = 1.0  # displacement of a pixel up to which a lens is used as a pinhole
+RADII = 32  # of an image's diagonal at which distortion is evaluated
 
 
 @dataclass(frozen=True)
@@ -23,14 +24,14 @@ class Lens:
 
     fov: tuple[float, float] | None = None  # (x, y); y is NaN where the focal length is that of x
     focal: tuple[float, float] | None = None
-    centre: tuple[float, float] | None = None  # None: the middle
+    centre: tuple[float, float] | None = None  # None or NaN: the middle
     size: tuple[int, int] | None = None
     radial: tuple[float, ...] = ()  # k1, k2, ... of OpenCV's polynomial; accepted where it does not matter
     tangential: tuple[float, ...] = ()  # p1, p2
 
 
 @dataclass(frozen=True)
-class Shot:
+class Frame:
     """A posed image file.  ``where`` names it in error messages: the camera file and the frame."""
 
     where: str
@@ -71,10 +72,10 @@ def rigid(where: str, field: str, value: object) -> np.ndarray:
         transposed = np.abs(matrix[:, 3] - (0, 0, 0, 1)).max() <= 1e-6
         fix = "transpose it" if transposed else "write the camera-to-world matrix row by row"
         raise InputError(where, f"{field}: expected the last row 0 0 0 1, got {shown(matrix[3].tolist())}; {fix}")
-    return cleaned(where, field, matrix)
+    return nearest_rigid(where, field, matrix)
 
 
-def cleaned(where: str, field: str, matrix: np.ndarray) -> np.ndarray:
+def nearest_rigid(where: str, field: str, matrix: np.ndarray) -> np.ndarray:
     """``matrix`` with the nearest rotation in place of its upper left block.  Raises InputError if that is far."""
     block = matrix[:3, :3]
     with np.errstate(over="ignore", invalid="ignore"):
@@ -116,11 +117,11 @@ def shape_of(value: object) -> str:
     return f"{len(value)} rows of {sorted({len(r) if isinstance(r, list) else 'no list' for r in value}, key=str)[:4]}"
 
 
-def inside(root: Path, where: str, field: str, value: object, *, outside: bool = False) -> Path:
+def file_within(root: Path, where: str, field: str, value: object) -> Path:
     """Path of the file that ``value`` names relative to ``root``.  Raises InputError if it leaves ``root``.
 
-    Refused: anything but text, URLs, NUL, absolute paths, and (through ``..`` or a link) files outside, unless
-    ``outside`` allows the last two.  The file need not exist.
+    Refused: anything but text, URLs, NUL, absolute paths, and files outside ``root`` (through ``..`` or a link).  The
+    file need not exist.
     """
     if not isinstance(value, str) or not value.strip():
         raise InputError(where, f"{field}: expected the path of a file, got {shown(value)}; correct the camera file")
@@ -134,8 +135,7 @@ def inside(root: Path, where: str, field: str, value: object, *, outside: bool =
         raise InputError(
             where, f"{field}: expected a file of the folder, got the URL {shown(value)}; download it first"
         )
-    absolute = Path(value).is_absolute() or bool(PureWindowsPath(value).drive) or value.startswith(("\\", "~"))
-    if absolute and not outside:
+    if Path(value).is_absolute() or PureWindowsPath(value).drive or value.startswith(("\\", "~")):
         raise InputError(
             where,
             f"{field}: expected a path within the folder, got the absolute {shown(value)}; "
@@ -146,7 +146,7 @@ def inside(root: Path, where: str, field: str, value: object, *, outside: bool =
         real, base = Path(os.path.realpath(path)), Path(os.path.realpath(root))
     except (OSError, ValueError):
         raise InputError(where, f"{field}: expected the path of a file, got {shown(value)}; correct it") from None
-    if not outside and not real.is_relative_to(base):
+    if not real.is_relative_to(base):
         raise InputError(
             where,
             f"{field}: expected a file within the folder, got {shown(value)} which leads out of it; copy the file in",
@@ -154,29 +154,38 @@ def inside(root: Path, where: str, field: str, value: object, *, outside: bool =
     return path
 
 
-def straight(where: str, lens: Lens, focal: float, width: int, height: int) -> str | None:
-    """Check that ``lens`` moves the corner of its image by at most BEND pixels; a note where it moves it at all."""
+def check_distortion(where: str, lens: Lens, focal: float, width: int, height: int) -> str | None:
+    """A note where ``lens`` has distortion of at most MAX_DISTORTION_PIXELS.  Raises InputError where it has more."""
     if not any(lens.radial + lens.tangential):
         return None
     try:
-        bend = bend_of(focal, width, height, lens.radial, lens.tangential)
+        moved = distortion_pixels(focal, width, height, lens.radial, lens.tangential)
     except OverflowError:  # a focal length next to nothing
-        bend = math.inf
-    if not bend <= BEND:
+        moved = math.inf
+    if not moved <= MAX_DISTORTION_PIXELS:
         raise InputError(
             where,
-            f"distortion: expected an undistorted lens, got {bend:.3g} pixels at the corner of the "
-            "image; undistort the images (colmap image_undistorter)",
+            f"distortion: expected an undistorted lens, got a displacement of {moved:.3g} pixels; undistort the images "
+            "(colmap image_undistorter)",
         )
-    return f"{where}: lens distortion of {bend:.2g} pixels at the corner ignored"
+    return f"{where}: lens distortion of at most {moved:.2g} pixels ignored"
 
 
-def bend_of(focal: float, width: int, height: int, radial: tuple[float, ...], tangential: tuple[float, ...]) -> float:
-    """Pixels by which a polynomial lens moves the image corner: radial k1, k2, ..., tangential p1, p2 (OpenCV)."""
-    x, y = 0.5 * width / focal, 0.5 * height / focal
-    r2 = x * x + y * y
-    factor = abs(sum(k * r2 ** (i + 1) for i, k in enumerate(radial)))
+def distortion_pixels(
+    focal: float, width: int, height: int, radial: tuple[float, ...], tangential: tuple[float, ...]
+) -> float:
+    """Largest displacement [px] by a polynomial lens: radial k1, k2, ..., tangential p1, p2 (OpenCV).
+
+    Evaluated along the diagonal, as coefficients of opposite sign cancel at the corner and not before it.
+    """
+    corner = 0.5 * width / focal, 0.5 * height / focal
     p1, p2 = tangential or (0.0, 0.0)
-    dx = x * factor + abs(2 * p1 * x * y) + abs(p2 * (r2 + 2 * x * x))
-    dy = y * factor + abs(p1 * (r2 + 2 * y * y)) + abs(2 * p2 * x * y)
-    return focal * math.hypot(dx, dy)
+    largest = 0.0
+    for step in range(1, RADII + 1):
+        x, y = (v * step / RADII for v in corner)
+        r2 = x * x + y * y
+        factor = abs(sum(k * r2 ** (i + 1) for i, k in enumerate(radial)))
+        dx = x * factor + abs(2 * p1 * x * y) + abs(p2 * (r2 + 2 * x * x))
+        dy = y * factor + abs(p1 * (r2 + 2 * y * y)) + abs(2 * p2 * x * y)
+        largest = max(largest, focal * math.hypot(dx, dy))
+    return largest

@@ -1,51 +1,62 @@
-"""What to do with a folder of photographs that has no cameras: the commands that make them."""
+"""The error for an input without cameras, with the command that makes them."""
 
 from __future__ import annotations
 
+import os
 import shlex
 from pathlib import Path
 
 from reli3d.io.files import InputError
+from reli3d.views.file_names import ENDINGS, images_in
 
-ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff")
-UNREAD = (".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw")  # of telephones and cameras
+VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
+PHOTOGRAPHS = (*ENDINGS, ".heic", ".heif")  # that reli3d capture reads
+RAW = (".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw")
+CAMERA_FILES = ("transforms.json", "transforms_train.json", "sparse", "poses_bounds.npy", "cameras_sphere.npz")
 
 
-def no_cameras(folder: Path) -> InputError:
-    """The error for ``folder`` without cameras: with commands for COLMAP's program where it holds photographs.
+def no_cameras(source: Path) -> InputError:
+    """The error for ``source``, which is no folder with cameras.
 
-    The camera is a pinhole, so that photographs and masks stay as they are and no undistortion is needed.
+    Names the exact ``reli3d capture`` for photographs in it, in its ``images`` or in one of its sub-folders, and for a
+    video.
     """
-    photographs = _images(folder / "images")
-    move = ""
-    if not photographs and (photographs := _images(folder)):
-        names = " ".join(sorted({f"{shlex.quote(str(folder))}/*{p.suffix}" for p in photographs}))
-        images = shlex.quote(str(folder / "images"))
-        move = f"mkdir {images} && mv {names} {images} && "  # COLMAP would take the masks for photographs
-    unread = [p for place in (folder, folder / "images") for p in _images(place, UNREAD)]
-    if not photographs and unread:
-        return InputError(
-            unread[0], "expected PNG, JPEG, WebP or TIFF photographs; convert them to JPEG, at full size and uncropped"
-        )
-    if len(photographs) < 2:
-        return InputError(
-            folder, "expected transforms.json or a COLMAP model (sparse/0), got neither; see docs/inputs.md"
-        )
-    images, database, sparse = (shlex.quote(str(folder / name)) for name in ("images", "database.db", "sparse"))
-    masked = any((folder / name).is_dir() for name in ("masks", "mask"))
+    if source.suffix.lower() in VIDEOS and source.is_file():
+        return _capture(source, source, "a video")
+    try:
+        folders = sorted(p for p in source.iterdir() if p.is_dir())
+    except (OSError, ValueError):
+        return InputError(source, "expected a folder with transforms.json or a COLMAP model; check the path")
+    for place in (source / "images", source):
+        photographs = images_in(place, PHOTOGRAPHS)
+        if len(photographs) > 1:
+            return _capture(source, place, f"{len(photographs)} photographs")
+        if not photographs and (videos := images_in(place, VIDEOS)):
+            return _capture(source, videos[0], f"{len(videos)} video{'s' if len(videos) > 1 else ''}")
+        if raw := images_in(place, RAW):
+            return InputError(
+                raw[0], "expected JPEG, HEIC or PNG photographs; convert them, at full size and uncropped"
+            )
+    ready = [p for p in folders if any((p / name).exists() for name in CAMERA_FILES)]
+    if ready:
+        return InputError(source, f"expected one object, got {len(ready)} folders of objects; give {_quoted(ready[0])}")
+    for folder in folders:
+        for place in (folder / "images", folder):
+            if len(photographs := images_in(place, PHOTOGRAPHS)) > 1:
+                return _capture(source, place, f"{len(photographs)} photographs in {folder.name}", folder)
+    return InputError(source, "expected transforms.json or a COLMAP model (sparse/0), got neither; see docs/inputs.md")
+
+
+def _capture(source: Path, place: Path, got: str, target: Path | None = None) -> InputError:
+    base = Path(os.path.abspath(target or source))
+    out = base.with_name(f"{base.stem if base.is_file() else base.name}-object")
+    if not (target or source).is_absolute():
+        out = Path(os.path.relpath(out))
     return InputError(
-        folder,
-        f"expected cameras, got {len(photographs)} photographs without; make them with COLMAP: "
-        f"{move}colmap feature_extractor --database_path {database} --image_path {images} "
-        "--ImageReader.single_camera 1 --ImageReader.camera_model PINHOLE && "
-        f"colmap exhaustive_matcher --database_path {database} && mkdir {sparse} && "
-        f"colmap mapper --database_path {database} --image_path {images} --output_path {sparse}; then "
-        f"run this again{'' if masked else ', with masks or --remove-background'}",
+        source,
+        f"expected a folder with cameras, got {got} without; run: reli3d capture {_quoted(place)} {_quoted(out)}",
     )
 
 
-def _images(folder: Path, endings: tuple[str, ...] = ENDINGS) -> list[Path]:
-    try:
-        return sorted(p for p in folder.iterdir() if p.suffix.lower() in endings and p.is_file())
-    except OSError:
-        return []
+def _quoted(path: Path) -> str:
+    return shlex.quote(str(path))

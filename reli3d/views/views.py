@@ -62,7 +62,6 @@ class Views:
     intrinsics: Tensor
     names: tuple[str, ...]
     notes: tuple[str, ...] = ()  # what reading changed or guessed, one line each
-    coordinate_system: str | None = None  # as the folder states it; recorded only, it turns nothing
     in_folder: int | None = None  # views that the folder offered
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the frame as read, in that of the folder
     chosen: tuple[int, ...] | None = None  # of all of a folder: those for a network, which reads 16 at most

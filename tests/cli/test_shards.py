@@ -125,7 +125,6 @@ def test_hostile_tar_files_end_with_2_before_the_work(tmp_path, capsys, monkeypa
         (["a.tar"], "not found"),
         (["--shards-out", "0"], "--shards-out"),
         (["--shards-out", "4", "--check"], "--check"),
-        (["good.tar", "--allow-outside"], "--allow-outside"),
     ],
 )
 def test_wrong_options_end_with_2_before_the_work(tmp_path, capsys, monkeypatch, options, word):

@@ -17,9 +17,8 @@ from reli3d.io.hdr import read_environment, read_hdr_image
 from reli3d.io.images import _several, read_image
 from reli3d.nn.presets import OFFICIAL, SMALL, from_json, to_json
 from reli3d.nn.weights import WeightsError, read_manifest
-from reli3d.views.colmap import _text_cameras
-from reli3d.views.folder import _beside, intrinsics_of
-from reli3d.views.shots import Lens, cleaned
+from reli3d.views.folder import intrinsics_of
+from reli3d.views.frames import Lens, nearest_rigid
 from reli3d.views.transforms import read_json, read_transforms
 
 AT_ONCE = 5.0  # seconds of the processor: what is meant is less than one, against minutes
@@ -65,9 +64,9 @@ def test_a_skew_is_not_called_a_scale():
     matrix[0, 1] = 0.0009  # with the scale below R^T R leaves 1 by more than is allowed, and without it by less
     matrix[0, 0] = 1.0006
     with pytest.raises(InputError, match="right angles"):
-        cleaned("here", "transform_matrix", matrix)
+        nearest_rigid("here", "transform_matrix", matrix)
     with pytest.raises(InputError, match="got scale 1.01"):
-        cleaned("here", "transform_matrix", np.diag([1.01, 1.01, 1.01, 1.0]))
+        nearest_rigid("here", "transform_matrix", np.diag([1.01, 1.01, 1.01, 1.0]))
 
 
 def test_many_keys_of_which_one_stands_twice(tmp_path):
@@ -77,18 +76,10 @@ def test_many_keys_of_which_one_stands_twice(tmp_path):
         read_json(path)
 
 
-def test_a_line_without_end(tmp_path):
-    path = tmp_path / "cameras.txt"
-    path.write_text("1 PINHOLE 8 8 " + "9 " * 30_000_000)
-    with pytest.raises(InputError, match="line 1"):
-        list(_text_cameras(path))
-
-
 def test_names_of_255_letters(tmp_path):
     write_bytes(tmp_path / ("n" * 251 + ".png"), b"data")
     write_bytes(tmp_path / ("n." + "s" * 253), b"data")
     assert len(list(tmp_path.iterdir())) == 2
-    assert _beside(tmp_path, tmp_path / ("m" * 251 + ".png")) is None
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs pipes")

@@ -217,18 +217,43 @@ def plain(folder, masks=True, inner="images"):
     return folder
 
 
-def test_photographs_without_cameras_are_answered_with_commands(tmp_path):
-    with pytest.raises(InputError, match="got 3 photographs without") as caught:
-        load_views(plain(tmp_path / "my shoe"))
-    text = str(caught.value)
-    for command in ("feature_extractor", "exhaustive_matcher", "mapper"):
-        assert f"colmap {command} --database_path '{tmp_path / 'my shoe' / 'database.db'}'" in text
-    assert "remove-background" not in text and "mv " not in text
-    with pytest.raises(InputError, match=r"mv .*\*\.jpg .*--remove-background"):
-        load_views(plain(tmp_path / "flat", masks=False, inner="."))
+def command(source):
+    with pytest.raises(InputError) as caught:
+        load_views(source)
+    return str(caught.value)
+
+
+def test_photographs_without_cameras_are_answered_with_the_command(tmp_path, monkeypatch):
+    """In one line, with quoted names: photographs in a folder or its ``images``, a video, the parent of an album."""
+    shoe = plain(tmp_path / "my shoe")
+    line = f"got 3 photographs without; run: reli3d capture '{shoe}/images' '{shoe}-object'"
+    assert line in command(shoe)
+    flat = plain(tmp_path / "flat", masks=False, inner=".")
+    assert f"reli3d capture {flat} {flat}-object" in command(flat)
+    parent = tmp_path / "DCIM"
+    album = plain(parent / "100APPLE", masks=False, inner=".")
+    assert f"got 3 photographs in 100APPLE without; run: reli3d capture {album} {album}-object" in command(parent)
+    video = tmp_path / "turn.MOV"
+    video.write_bytes(b"video")
+    assert f"got a video without; run: reli3d capture {video} {tmp_path}/turn-object" in command(video)
+    (tmp_path / "clips").mkdir()
+    video = video.rename(tmp_path / "clips/turn.mp4")
+    assert f"reli3d capture {video} {tmp_path}/clips-object" in command(tmp_path / "clips")
+    phone = tmp_path / "phone"
+    phone.mkdir()
+    for k in range(3):
+        (phone / f"IMG_{k}.HEIC").write_bytes(b"photograph")
+    assert f"reli3d capture {phone} {phone}-object" in command(phone)
+    monkeypatch.chdir(tmp_path)
+    assert "run: reli3d capture flat flat-object" in command("flat")
+    monkeypatch.chdir(flat)
+    assert "run: reli3d capture . ../flat-object" in command(".")
+    capture(tmp_path / "objects/one", 400, 300, (100, 50, 300, 250))
+    assert f"expected one object, got 1 folders of objects; give {tmp_path}/objects/one" in command(
+        tmp_path / "objects"
+    )
     (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match="expected transforms.json or a COLMAP model"):
-        load_views(tmp_path / "empty")
+    assert "expected transforms.json or a COLMAP model" in command(tmp_path / "empty")
 
 
 def without_masks(folder):
@@ -240,7 +265,7 @@ def without_masks(folder):
 
 def test_backgrounds_are_removed_on_request_alone(tmp_path, monkeypatch):
     folder = without_masks(tmp_path / "object")
-    with pytest.raises(InputError, match="expected alpha or a mask.*--remove-background"):
+    with pytest.raises(InputError, match="expected alpha or a foreground mask.*--remove-background"):
         load_views(folder)
     asked = []
     box = Image.new("L", (400, 300))
@@ -264,7 +289,6 @@ def test_backgrounds_are_removed_on_request_alone(tmp_path, monkeypatch):
         load_views(folder, remove_background=True)
 
 
-def test_photographs_of_a_kind_that_is_not_read_are_named(tmp_path):
-    (tmp_path / "IMG_1.HEIC").write_bytes(b"photograph")
-    with pytest.raises(InputError, match="IMG_1.HEIC: expected PNG, JPEG, WebP or TIFF photographs; convert"):
-        load_views(tmp_path)
+def test_camera_raw_is_refused(tmp_path):
+    (tmp_path / "IMG_1.DNG").write_bytes(b"photograph")
+    assert "IMG_1.DNG: expected JPEG, HEIC or PNG photographs; convert" in command(tmp_path)

@@ -1,0 +1,65 @@
+"""Names of files as users and their programs write them: image endings, upper and lower case."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path, PurePath
+
+from reli3d.io.files import InputError, shown
+
+ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff")
+
+
+class FolderIndex:
+    """Names in folders, each listed once: finds files by their names, or else without regard to case."""
+
+    def __init__(self) -> None:
+        self._names: dict[str, dict[str, list[str]]] = {}
+
+    def find(self, folder: str | os.PathLike, relative: PurePath) -> Path | None:
+        """The path below ``folder``, in which no part is ``..``; None where there is none.
+
+        Raises InputError where several differ from ``relative`` in case alone.
+        """
+        at = Path(folder)
+        for part in relative.parts:
+            key = str(at)
+            if key not in self._names:
+                found: dict[str, list[str]] = {}
+                for name in _listed(at):
+                    found.setdefault(name.casefold(), []).append(name)
+                self._names[key] = found
+            names = self._names[key].get(part.casefold(), [])
+            if part in names:
+                at = at / part
+            elif len(names) == 1:
+                at = at / names[0]
+            elif names:
+                raise InputError(at, f"expected {shown(part)}, got {', '.join(sorted(names))}; rename one of them")
+            else:
+                return None
+        return at
+
+
+def _listed(folder: Path) -> list[str]:
+    try:
+        return os.listdir(folder)
+    except (OSError, ValueError):
+        return []
+
+
+def named(folder: Path, names: Sequence[str]) -> list[str]:
+    """Names in ``folder`` that are ``names`` without regard to case, in the order of ``names``."""
+    there = sorted(_listed(folder))
+    return [found for name in names for found in there if found.casefold() == name]
+
+
+def images_in(folder: Path, endings: Sequence[str] = ENDINGS) -> list[Path]:
+    """The files of ``folder`` with one of ``endings`` in any case, sorted; empty where there is no folder."""
+    return sorted(p for p in (folder / name for name in _listed(folder)) if p.suffix.lower() in endings and p.is_file())
+
+
+def images_below(folder: Path) -> list[Path]:
+    """The images of ``folder`` and its sub-folders, sorted."""
+    return sorted(Path(at, n) for at, _, names in os.walk(folder) for n in names if Path(n).suffix.lower() in ENDINGS)

@@ -1,0 +1,256 @@
+"""The lens of a frame of ``transforms.json``: the spellings that are read, and keys that are refused.
+
+Read, in this order, from the frame, else from the file:
+
+- a 3x3 matrix in pixels: ``intrinsics``, ``K``, ``intrinsic_matrix``, ``camera_intrinsics``, ``camera_matrix``, ...
+- focal lengths in pixels: ``fl_x``, ``fl_y``, or ``fx``, ``fy``
+- ``x_fov``, ``y_fov`` in degrees (instant-ngp)
+- ``camera_angle_x``, ``camera_angle_y`` in radians (Blender)
+- ``camera_fov``, ``fov_rad`` in radians, one number or two (the published object folders)
+- ``focal_length`` and ``sensor_width`` in the same unit
+
+0.7 radians, as in the published release, only where neither the frame nor the file has a key of a lens.  A key that
+looks like one and is none of these is refused, as are lenses that are no pinhole.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from reli3d.io.files import InputError, shown
+from reli3d.views.frames import Lens, number
+
+DEFAULT_FOV = 0.7  # radians, of the published release
+MIN_FOV = 1e-6  # radians: the tangent of a much smaller angle is 0
+AGREE = 0.02  # relative difference up to which two spellings of one focal length agree
+MAX_SKEW = 1e-3  # of the focal length: half a pixel across an image
+_PINHOLE = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "RADIAL", "SIMPLE_RADIAL", "FULL_OPENCV", "PERSPECTIVE", "PERSP")
+_MATRICES = (
+    "intrinsics",
+    "K",
+    "intrinsic_matrix",
+    "intrinsics_matrix",
+    "intrinsic",
+    "camera_intrinsics",
+    "camera_matrix",
+    "cam_K",
+)
+_FOCALS = (("fl_x", "fl_y"), ("fx", "fy"))
+_ANGLES = (("x_fov", "y_fov", math.pi / 180), ("camera_angle_x", "camera_angle_y", 1.0))
+_FOVS = ("camera_fov", "fov_rad")
+_SIDES = (("w", "width", "image_width"), ("h", "height", "image_height"))
+_RADIAL, _TANGENTIAL = ("k1", "k2", "k3", "k4"), ("p1", "p2")
+_READ = {
+    *_MATRICES,
+    *_FOVS,
+    *_RADIAL,
+    *_TANGENTIAL,
+    *(key for pair in (*_FOCALS, *_ANGLES, *_SIDES) for key in pair if isinstance(key, str)),
+    *("cx", "cy", "camera_principal_point", "focal_length", "sensor_width"),
+}
+# words are keys in lower case without punctuation
+_MODEL = re.compile(r"(camera|lens|distortion|projection)(model|mode|type)|projection")
+_KIND = re.compile(r"(camera|cam|lens|sensor)?(model|mode|type|kind|name)?")
+_NO_PINHOLE = re.compile(
+    r"fisheye|ftheta|latlong|equirect|equidist|kannala|thinprism|panoram|spherical|omnidir|orthograph|isortho|vr180"
+)
+_BENT = re.compile(
+    r"[kps]\d+|.*(distort|distcoef|skew|rollingshutter|pixelaspect|lensshift|camerashift).*|(shift|tau)[xy]"
+)
+_LENS = re.compile(
+    r".*(focal|fov|fieldofview|angleofview|cameraangle|intrinsic|principal|sensor|calib|cameramatrix).*"
+    r"|(camera|cam)(param(eter)?s?|info|data)?|fl[xy]?|f[xy]?|c[xy]|k|kmatrix|camk|hwf|lens"
+)
+_AXES = re.compile(r"(coordinate|coord|axis|axes|pose|camera)*(system|convention|coordinates?|axes)")
+_OPENCV = re.compile(r".*(opencv|colmap|rdf).*|cv")
+
+
+def check_keys(where: str, values: dict) -> None:
+    """Raises InputError for a key that changes the camera and is not read.  Null, false and 0 change nothing."""
+    for key, value in values.items():
+        word = _word(key)
+        if isinstance(value, str) and _AXES.fullmatch(word) and _OPENCV.fullmatch(value.lower().strip()):
+            raise InputError(
+                where,
+                f"{key}: expected camera-to-world matrices in OpenGL axes, got {shown(value)}; negate the second and "
+                "third column of each matrix and remove the key",
+            )
+        if key in _READ or _nothing(value):
+            continue
+        if _MODEL.fullmatch(word) and isinstance(value, str):
+            if re.sub(r"[^A-Z0-9]+", "_", value.upper().strip()) not in _PINHOLE:
+                raise InputError(
+                    where, f"{key}: expected a pinhole camera, got {shown(value)}; undistort the images first"
+                )
+        elif _NO_PINHOLE.search(word) or (
+            isinstance(value, str) and _KIND.fullmatch(word) and _NO_PINHOLE.search(_word(value))
+        ):
+            raise InputError(where, f"{key}: expected a pinhole camera, got {shown(value)}; undistort the images first")
+        elif _BENT.fullmatch(word) and not (word.startswith("s") and isinstance(value, str)):
+            raise InputError(
+                where,
+                f"{key}: expected 0 or none, as it is not read, got {shown(value)}; undistort the images first",
+            )
+        elif _LENS.fullmatch(word) and not _words(value):
+            raise InputError(
+                where,
+                f"{key}: expected fl_x in pixels, camera_angle_x in radians or a 3x3 matrix intrinsics, got a key of "
+                f"the lens that is not read, {shown(value)}; write one of these and remove it",
+            )
+
+
+def _word(text: str) -> str:
+    return re.sub(r"[^a-z0-9]", "", text.lower())
+
+
+def _nothing(value: object) -> bool:
+    """Whether a flag or a coefficient of this value is the same as none."""
+    if isinstance(value, list):
+        return all(_nothing(v) for v in value)
+    return value is None or value in (False, 0) or value in ("", "false", "False", "none", "None")
+
+
+def _words(value: object) -> bool:
+    """Whether ``value`` is a name rather than a quantity."""
+    return isinstance(value, str) and not re.match(r"\s*[-+.]?\d", value)
+
+
+def lens_of(where: str, frame: dict, data: dict, notes: list[str]) -> Lens:
+    """The lens of ``frame`` in a file with the fields ``data``; both have passed :func:`check_keys`.
+
+    Raises InputError naming the field where values are no lens or two spellings disagree.
+    """
+
+    def found(key: str, low: float = -1e6, high: float = 1e6) -> float | None:
+        value = frame.get(key, data.get(key))
+        return None if value is None else number(where, key, value, low, high)
+
+    size, centre = _size(where, found), _centre(where, frame, data, found)
+    lens = None
+    for source in (frame, data):
+        spellings = list(_spellings(where, source, data, size))
+        if spellings:
+            name, lens, ratio = spellings[0]
+            for other, _, value in spellings[1:]:
+                if abs(ratio - value) > AGREE * ratio:  # False where one is not known, NaN
+                    raise InputError(
+                        where,
+                        f"{other}: expected the focal length of {name}, {ratio:.4g} image widths, got {value:.4g}; "
+                        "remove the wrong one",
+                    )
+            if lens.centre is None:
+                lens = replace(lens, centre=centre)
+            if name not in _FOVS or lens.centre is not None:
+                lens = replace(lens, size=size)
+            break
+    if lens is None:
+        notes.append(f"{where}: no field of view given, {DEFAULT_FOV} radians assumed as in the published release")
+        lens = Lens(fov=(DEFAULT_FOV, DEFAULT_FOV), centre=centre)
+    radial, tangential = (tuple(found(k) or 0.0 for k in keys) for keys in (_RADIAL, _TANGENTIAL))
+    model = frame.get("camera_model", data.get("camera_model"))
+    if radial[3] and isinstance(model, str) and model.upper() == "FULL_OPENCV":  # of a denominator there
+        raise InputError(where, f"k4: expected 0 for FULL_OPENCV, got {radial[3]:g}; undistort the images first")
+    return replace(lens, radial=radial, tangential=tangential)
+
+
+def _spellings(where: str, source: dict, data: dict, size) -> Iterator[tuple[str, Lens, float]]:
+    """``(key, lens, focal length in image widths)`` of each spelling in ``source``, in the order of preference.
+
+    The ratio is NaN where the width is not known.
+    """
+    width = math.nan if size is None else size[0]
+    for key in _MATRICES:
+        if source.get(key) is not None:
+            fx, fy, cx, cy = _matrix(where, key, source[key])
+            yield key, Lens(focal=(fx, fy), centre=(cx, cy)), fx / width
+    for x_key, y_key in _FOCALS:
+        if source.get(x_key) is not None or source.get(y_key) is not None:
+            fx = number(where, x_key, source.get(x_key, data.get(x_key)), 0, 1e9)
+            fy = fx if source.get(y_key) is None else number(where, y_key, source[y_key], 0, 1e9)
+            yield x_key, Lens(focal=(fx, fy)), fx / width
+    for x_key, y_key, unit in _ANGLES:
+        if source.get(x_key) is not None or source.get(y_key) is not None:
+            low, high = MIN_FOV / unit, math.pi / unit
+            x = unit * number(where, x_key, source.get(x_key, data.get(x_key)), low, high)
+            y = math.nan if source.get(y_key) is None else unit * number(where, y_key, source[y_key], low, high)
+            yield x_key, Lens(fov=(x, y)), _widths(x)
+    for key in _FOVS:
+        if source.get(key) is not None:
+            fov = _fov(where, key, source[key])
+            yield key, Lens(fov=fov), _widths(fov[0])
+    if source.get("focal_length") is not None:
+        sensor = source.get("sensor_width", data.get("sensor_width"))
+        if sensor is None:
+            raise InputError(
+                where,
+                f"focal_length: expected sensor_width beside it, got {shown(source['focal_length'])} of an unknown "
+                "unit; write fl_x in pixels",
+            )
+        ratio = number(where, "focal_length", source["focal_length"], 0, 1e9) / number(
+            where, "sensor_width", sensor, 0, 1e9
+        )
+        yield "focal_length", Lens(fov=(2 * math.atan(0.5 / ratio), math.nan)), ratio
+
+
+def _widths(fov: float) -> float:
+    return 0.5 / math.tan(0.5 * fov)
+
+
+def _size(where: str, found) -> tuple[int, int] | None:
+    sides = []
+    for keys in _SIDES:
+        sides.append(next((v for v in (found(key, 0) for key in keys) if v is not None), None))
+    w, h = sides
+    if any(side is not None and side < 1 for side in sides):
+        raise InputError(where, f"w, h: expected at least 1 pixel, got {w} x {h}; correct the camera file")
+    if (w is None) != (h is None):
+        raise InputError(where, f"w, h: expected both or none, got {w} x {h}; write the size of the images")
+    return None if w is None or h is None else (int(w), int(h))
+
+
+def _centre(where: str, frame: dict, data: dict, found) -> tuple[float, float] | None:
+    for source in (frame, data):
+        if source.get("camera_principal_point") is not None:
+            return _pair(where, "camera_principal_point", source["camera_principal_point"], -1e6, 1e6)
+        if source.get("cx") is not None or source.get("cy") is not None:
+            cx, cy = found("cx"), found("cy")
+            return (math.nan if cx is None else cx, math.nan if cy is None else cy)
+    return None
+
+
+def _matrix(where: str, key: str, value: object) -> tuple[float, float, float, float]:
+    """Focal lengths and centre of a 3x3 matrix, its 9 numbers by rows, or a 4x4 matrix that holds it."""
+    rows = value if isinstance(value, list) else []
+    if len(rows) == 9:
+        rows = [rows[0:3], rows[3:6], rows[6:9]]
+    if len(rows) not in (3, 4) or any(not isinstance(row, list) or len(row) not in (3, 4) for row in rows):
+        raise InputError(where, f"{key}: expected a 3x3 matrix in pixels, got {shown(value)}; write it row by row")
+    m = np.array([[number(where, key, v, -1e9, 1e9) for v in row[:3]] for row in rows[:3]])
+    fx, fy, cx, cy = m[0, 0], m[1, 1], m[0, 2], m[1, 2]
+    if not (min(fx, fy) > 0 and np.abs(m[2] - (0, 0, 1)).max() < 1e-6 and abs(m[1, 0]) + abs(m[0, 1]) <= MAX_SKEW * fx):
+        raise InputError(
+            where,
+            f"{key}: expected the rows fx 0 cx, 0 fy cy, 0 0 1 in pixels with fx and fy above 0, got "
+            f"{shown(m.tolist(), 120)}; correct the camera file",
+        )
+    return float(fx), float(fy), float(cx), float(cy)
+
+
+def _fov(where: str, key: str, value: object) -> tuple[float, float]:
+    if isinstance(value, list) and len(value) == 1:
+        value = value[0]
+    if isinstance(value, list):
+        return _pair(where, key, value, MIN_FOV, math.pi)
+    angle = number(where, key, value, MIN_FOV, math.pi)
+    return angle, angle
+
+
+def _pair(where: str, key: str, value: object, low: float, high: float) -> tuple[float, float]:
+    if not isinstance(value, list) or len(value) != 2:
+        raise InputError(where, f"{key}: expected two numbers, got {shown(value)}; correct the camera file")
+    return number(where, key, value[0], low, high), number(where, key, value[1], low, high)

@@ -1,0 +1,210 @@
+"""Masks of images: which file belongs to which image, and what its pixel values mean."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path, PurePath
+
+import numpy as np
+from PIL import Image, ImageChops
+
+from reli3d.io.files import InputError, shown
+from reli3d.views.file_names import ENDINGS, FolderIndex, images_below, named
+from reli3d.views.frames import Frame
+
+FOLDERS = ("masks", "mask")
+OPAQUE = 250 / 255  # from here on a value counts as white: networks and JPEG rarely reach 1
+FEW_VALUES = 16  # up to which a mask has no noise of a codec, so that every value counts
+NOISE = 16 / 255  # of values near black and white where there are more
+PLATEAU = 0.2  # fraction of the pixels between black and white in flat 3x3 blocks, above which these are labels
+SOLID = 0.3  # fraction of the object at the highest value, from which that value is its opaque part
+GREY_SPREAD = 16  # of 255: difference of channels up to which a pixel is grey; JPEG's chroma
+MAX_COLORS = 4096
+LABEL = "masks: the object has "
+_TOP = {"L": 255.0, "F": 65535.0}
+
+
+def mask_values(path: os.PathLike, picture: Image.Image, notes: list[str]) -> Image.Image:
+    """The coverage of the object, mode L or F, that a mask file of ``read_picture`` holds.
+
+    Alpha where it is used, else grey, or one color on black.  Grey values between black and white are coverage
+    (antialiasing).  Of a mask with two values, black and one below white, nonzero is the object, with a note.  Raises
+    InputError with the values found for several labels and for what has no black.
+    """
+    alpha = used_alpha(picture)
+    if alpha is not None:
+        return _coverage(path, alpha, notes)
+    if picture.mode in _TOP:
+        return _coverage(path, picture, notes)
+    return _color_coverage(path, picture.convert("RGB"), notes)
+
+
+def alpha_values(picture: Image.Image, notes: list[str]) -> Image.Image | None:
+    """The alpha of an image as coverage; None where it has none, or one that is opaque nearly everywhere.
+
+    Of two values, 0 and one below white, nonzero is the object, with a note.
+    """
+    alpha = used_alpha(picture)
+    if alpha is None:
+        return None
+    levels = _levels(alpha)
+    return _nonzero(alpha, levels[1], notes) if len(levels) == 2 and levels[0] == 0 else alpha
+
+
+def used_alpha(picture: Image.Image) -> Image.Image | None:
+    """The alpha channel of ``picture`` where it is below one half somewhere."""
+    if picture.mode != "RGBA":
+        return None
+    alpha = picture.getchannel("A")
+    return alpha if int(np.asarray(alpha).min()) < 128 else None
+
+
+def _levels(channel: Image.Image) -> list[int]:
+    """The values that occur, ascending."""
+    if channel.mode == "L":
+        return [value for value, count in enumerate(channel.histogram()) if count]
+    return [int(v) for v in np.unique(np.asarray(channel).astype(np.uint16))]
+
+
+def _nonzero(channel: Image.Image, value: int, notes: list[str]) -> Image.Image:
+    """``channel``, of which ``value`` is the only value above 0, as 0 and 255."""
+    if value >= OPAQUE * _TOP[channel.mode]:
+        return channel
+    return _labelled(channel, f"the value {value}", notes)
+
+
+def _labelled(channel: Image.Image, label: str, notes: list[str]) -> Image.Image:
+    notes.append(f"{LABEL}{label} instead of white; nonzero pixels are taken as the object")
+    return Image.fromarray(np.where(np.asarray(channel) > 0, np.uint8(255), np.uint8(0)))
+
+
+def check_one_label(folder: os.PathLike, notes: Sequence[str]) -> None:
+    """Raises InputError where the notes of several masks name different values or colors of the object."""
+    labels = sorted({note.removeprefix(LABEL).partition(" instead")[0] for note in notes if note.startswith(LABEL)})
+    if len(labels) > 1:
+        raise InputError(
+            folder, f"masks: expected one label in all masks, got {', '.join(labels[:4])}; save masks of one object"
+        )
+
+
+def _coverage(path: os.PathLike, channel: Image.Image, notes: list[str]) -> Image.Image:
+    levels, top = _levels(channel), _TOP[channel.mode]
+    if len(levels) == 1 and 0 < levels[0] < OPAQUE * top or len(levels) == 2 and levels[0] > 0:
+        raise _not_a_mask(path, f"the values {', '.join(map(str, levels))} without 0")
+    if len(levels) == 2:
+        return _nonzero(channel, levels[1], notes)
+    if len(levels) == 1:
+        return channel
+    values, peak, few = np.asarray(channel), levels[-1], len(levels) <= FEW_VALUES
+    high = min(peak, OPAQUE * top) if few else (1 - NOISE) * min(peak, top)
+    between = (values > (0 if few else NOISE * top)) & (values < high)
+    flat = _flat(values)
+    if int((between[1:-1, 1:-1] & flat).sum()) > PLATEAU * int(between.sum()):
+        some = ", ".join(map(str, levels[:8])) + (", ..." if len(levels) > 8 else "")
+        raise _not_a_mask(path, f"{len(levels)} values in flat areas ({some}), as of several labels")
+    if peak < OPAQUE * top and int(((values == peak)[1:-1, 1:-1] & flat).sum()) > SOLID * int((values > 0).sum()):
+        notes.append(f"masks: the highest value, {peak}, is taken as opaque instead of white")
+        return Image.fromarray(np.rint(values * np.float32(255 / peak)).astype(np.uint8))
+    return channel
+
+
+def _flat(values: np.ndarray) -> np.ndarray:
+    """``(H - 2, W - 2)`` bool: whether all 8 neighbors have the pixel's value."""
+    rows = (values[:, 1:-1] == values[:, :-2]) & (values[:, 1:-1] == values[:, 2:])
+    middle = values[:, 1:-1]
+    return rows[1:-1] & rows[:-2] & rows[2:] & (middle[1:-1] == middle[:-2]) & (middle[1:-1] == middle[2:])
+
+
+def _color_coverage(path: os.PathLike, picture: Image.Image, notes: list[str]) -> Image.Image:
+    """Coverage of ``picture``, which is grey or has multiples of one color alone, from its brightest channel."""
+    red, green, blue = picture.split()
+    high = ImageChops.lighter(ImageChops.lighter(red, green), blue)
+    low = ImageChops.darker(ImageChops.darker(red, green), blue)
+    if int(np.asarray(ImageChops.difference(high, low)).max()) <= GREY_SPREAD:
+        return _coverage(path, high, notes)
+    colors = picture.getcolors(MAX_COLORS)
+    if colors is None:
+        raise _not_a_mask(path, f"more than {MAX_COLORS} colors")
+    found = np.array(sorted(color for _, color in colors), dtype=np.float64)
+    brightest = found[found.sum(1).argmax()]
+    along = np.outer(found @ brightest / (brightest @ brightest), brightest)
+    if np.abs(found - along).max() > GREY_SPREAD:
+        some = ", ".join(str(tuple(int(v) for v in color)) for color in found[:4])
+        raise _not_a_mask(path, f"{len(found)} colors ({some}{', ...' if len(found) > 4 else ''})")
+    if len(found) == 2 and not found[0].any():
+        return _labelled(high, f"the color {tuple(int(v) for v in brightest)}", notes)
+    return _coverage(path, high, notes)
+
+
+def _not_a_mask(path: os.PathLike, got: str) -> InputError:
+    return InputError(path, f"mask: expected the object white on black, got {got}; save one mask of this object")
+
+
+class MaskFiles:
+    """Finds the mask file of each of ``frames``, and never one file for two images.
+
+    Looked for are, below ``folder`` (else ``masks`` and ``mask`` in ``root``): the image's path relative to ``root``,
+    then without its first folder, without its first two, and so on to the bare name; with the image's own ending,
+    with another in its place, or with another after it (COLMAP's ``a.jpg.png``).
+    """
+
+    def __init__(self, root: Path, frames: Sequence[Frame], folder: Path | None):
+        self.given, self._root, self._index = folder, root, FolderIndex()
+        self._folders = [folder] if folder is not None else [root / name for name in named(root, FOLDERS)]
+        self._images: dict[str, list[Path]] = {}  # of each mask file
+        images = {os.path.realpath(frame.image): frame.image for frame in frames}
+        for image in (*images.values(), *self._beside(images)):
+            if (found := self._find(image)) is not None:
+                self._images.setdefault(os.path.realpath(found), []).append(image)
+        for frame in frames:
+            if frame.mask is not None:
+                self._claim(frame.mask, frame.image)
+
+    def _claim(self, mask: Path, image: Path) -> None:
+        others = self._images.setdefault(os.path.realpath(mask), [])
+        if os.path.realpath(image) not in map(os.path.realpath, others):
+            others.append(image)
+
+    def _beside(self, images: dict[str, Path]) -> Iterator[Path]:
+        """Images in nested folders that are no frames: a mask named after one of these may be another's."""
+        frames = {(image.parent, image.stem) for image in images.values()}  # the same photograph in another format
+        tops = {part.parts[0] for part in map(self._relative, images.values()) if len(part.parts) > 2}
+        for top in sorted(tops):
+            yield from (p for p in images_below(self._root / top) if (p.parent, p.stem) not in frames)
+
+    def _relative(self, image: Path) -> PurePath:
+        try:
+            return Path(os.path.normpath(image)).relative_to(os.path.normpath(self._root))
+        except ValueError:
+            return PurePath(image.name)
+
+    def _find(self, image: Path) -> Path | None:
+        relative = self._relative(image)
+        endings = [e for ending in ENDINGS for e in (ending, ending.upper())]
+        names = (image.name, *(stem + ending for stem in (image.stem, image.name) for ending in endings))
+        for folder in self._folders:
+            for first in range(len(relative.parts)):
+                for name in dict.fromkeys(names):
+                    found = self._index.find(folder, PurePath(*relative.parts[first:-1], name))
+                    if found is not None and os.path.isfile(found):
+                        return found
+        return None
+
+    def of(self, frame: Frame) -> Path | None:
+        """The mask file of ``frame``: in ``folder`` where one is given, its own, or found by name; None without any.
+
+        Raises InputError where it is that of another image as well.
+        """
+        mask = self._find(frame.image) if self.given or frame.mask is None else frame.mask
+        if mask is None:
+            return None
+        images = self._images.get(os.path.realpath(mask), [])
+        if len({os.path.realpath(p) for p in images}) > 1:
+            first, second = (self._relative(p).as_posix() for p in images[:2])
+            raise InputError(
+                mask,
+                f"expected the mask of one image, got that of {shown(first)} and {shown(second)}; put masks into "
+                "sub-folders as the images are",
+            )
+        return mask

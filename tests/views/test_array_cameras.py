@@ -1,0 +1,184 @@
+"""LLFF's poses_bounds.npy and NeuS's cameras_sphere.npz, written in closed form by the conventions of these formats."""
+
+import io
+import json
+import zipfile
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from reli3d.io.files import InputError
+from reli3d.views.check import verdict
+from reli3d.views.folder import load_views
+from tests.support.rigs import sphere_views
+
+COUNT, WIDTH, HEIGHT = 5, 120, 96
+
+
+@pytest.fixture
+def rig():
+    return sphere_views(count=COUNT, size=(WIDTH, HEIGHT))
+
+
+def images(folder, rig, names, scale=1):
+    folder.mkdir(parents=True)
+    for name, mask in zip(names, rig.masks):
+        pixels = np.repeat((mask.numpy() * 255).astype(np.uint8)[..., None], 4, -1)
+        Image.fromarray(pixels).resize((WIDTH // scale, HEIGHT // scale), Image.Resampling.BOX).save(folder / name)
+
+
+def llff(folder, rig, place="images", scale=1):
+    """poses_bounds.npy with the columns [down, right, back], position, and height, width, focal."""
+    c2w, k = rig.c2w.double().numpy(), rig.intrinsics.double().numpy()
+    right, up, back, eye = (c2w[:, :3, j] for j in range(4))
+    size = np.repeat([[HEIGHT, WIDTH]], COUNT, 0)
+    table = np.stack([-up, right, back, eye, np.concatenate([size, k[:, :1]], 1)], -1).reshape(COUNT, 15)
+    images(folder / place, rig, [f"IMG_{j}.png" for j in range(COUNT)], scale)
+    np.save(folder / "poses_bounds.npy", np.concatenate([table, np.ones((COUNT, 2))], 1))
+
+
+@pytest.mark.parametrize("place, scale", [("images", 1), ("images_4", 4)])
+def test_llff(tmp_path, rig, place, scale):
+    llff(tmp_path, rig, place, scale)
+    views = load_views(tmp_path)
+    assert views.names == tuple(f"{place}/IMG_{j}.png" for j in range(COUNT))
+    np.testing.assert_allclose(views.c2w, rig.c2w, atol=1e-6)  # float32
+    focal = rig.intrinsics[0, 0] / scale
+    expected = [focal, focal, WIDTH / scale / 2, HEIGHT / scale / 2]  # the format has no principal point
+    np.testing.assert_allclose(views.intrinsics, [expected] * COUNT, rtol=1e-6)
+    assert any("poses_bounds.npy" in note for note in views.notes)
+
+
+def projections(rig, moved, size):
+    """NeuS's matrices of the rig: x = K [R | t] X in OpenCV axes, with factors of any sign, and the unit sphere of an
+    object at ``moved`` with the radius ``size``."""
+    arrays = {}
+    scale = np.diag([size, size, size, 1.0])
+    scale[:3, 3] = moved
+    for j, (pose, (fx, fy, cx, cy)) in enumerate(zip(rig.c2w.double().numpy(), rig.intrinsics.double().numpy())):
+        rotation, eye = pose[:3, :3] * (1, -1, -1), size * pose[:3, 3] + moved
+        k = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+        world = np.eye(4)
+        world[:3] = (-1.0) ** j * (0.3 + j) * k @ np.concatenate([rotation.T, -rotation.T @ eye[:, None]], 1)
+        arrays |= {f"world_mat_{j}": world, f"scale_mat_{j}": scale, f"world_mat_inv_{j}": np.linalg.inv(world)}
+    return arrays
+
+
+def neus(folder, rig, **changes):
+    images(folder / "image", rig, [f"{j:06d}.png" for j in range(COUNT)])
+    (folder / "mask").mkdir()
+    for j, mask in enumerate(rig.masks):
+        Image.fromarray((mask.numpy() * 255).astype(np.uint8)).convert("RGB").save(folder / f"mask/{j:03d}.png")
+        image = Image.open(folder / f"image/{j:06d}.png").convert("RGB")
+        image.save(folder / f"image/{j:06d}.png")
+    np.savez(folder / "cameras_sphere.npz", **{**projections(rig, np.array([3.0, -40.0, 700.0]), 25.0), **changes})
+
+
+def test_neus(tmp_path, rig):
+    neus(tmp_path, rig)
+    views = load_views(tmp_path)
+    assert views.names == tuple(f"image/{j:06d}.png" for j in range(COUNT))
+    np.testing.assert_allclose(views.c2w, rig.c2w, atol=2e-6)  # float32
+    np.testing.assert_allclose(views.intrinsics, rig.intrinsics, rtol=1e-6, atol=1e-4)  # float32 principal point
+    for ours, true in zip(views.masks, rig.masks):
+        np.testing.assert_array_equal(ours, true)
+    assert any("cameras_sphere.npz" in note for note in views.notes)
+    assert verdict(views).startswith("cameras agree")
+
+
+def test_idr_has_the_same_under_another_name(tmp_path, rig):
+    neus(tmp_path, rig)
+    (tmp_path / "cameras_sphere.npz").rename(tmp_path / "cameras.npz")
+    np.testing.assert_allclose(load_views(tmp_path).c2w, rig.c2w, atol=2e-6)
+
+
+def pickled(folder):
+    np.save(folder / "poses_bounds.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
+
+
+def write(name, value):
+    return lambda folder: np.save(folder / name, value)
+
+
+def claiming(folder):
+    """A header that claims 10^12 rows."""
+    data = io.BytesIO()
+    np.lib.format.write_array_header_1_0(data, {"descr": "<f8", "fortran_order": False, "shape": (10**12, 17)})
+    (folder / "poses_bounds.npy").write_bytes(data.getvalue())
+
+
+BROKEN_LLFF = {
+    "pickle": pickled,
+    "shape": write("poses_bounds.npy", np.ones((COUNT, 15))),
+    "not finite": write("poses_bounds.npy", np.full((COUNT, 17), np.nan)),
+    "fewer than images": write("poses_bounds.npy", np.ones((COUNT - 1, 17))),
+    "zero": write("poses_bounds.npy", np.zeros((COUNT, 17))),
+    "no rotation": write("poses_bounds.npy", np.ones((COUNT, 17))),
+    "text": lambda folder: (folder / "poses_bounds.npy").write_bytes(b"1 2 3"),
+    "cut off": lambda folder: (folder / "poses_bounds.npy").write_bytes(
+        (folder / "poses_bounds.npy").read_bytes()[:99]
+    ),
+    "claims more": claiming,
+}
+
+
+@pytest.mark.parametrize("name", BROKEN_LLFF)
+def test_a_broken_poses_bounds_is_refused(tmp_path, rig, name):
+    llff(tmp_path, rig)
+    BROKEN_LLFF[name](tmp_path)
+    with pytest.raises(InputError, match="poses_bounds.npy: .*; "):
+        load_views(tmp_path)
+
+
+def bomb(folder):
+    with zipfile.ZipFile(folder / "cameras_sphere.npz", "w", zipfile.ZIP_DEFLATED) as file:
+        file.writestr("world_mat_0.npy", bytes(1 << 27))
+
+
+BROKEN_NEUS = {
+    "singular": lambda folder, rig: neus(folder, rig, world_mat_2=np.zeros((4, 4))),
+    "shape": lambda folder, rig: neus(folder, rig, scale_mat_1=np.eye(3)),
+    "not finite": lambda folder, rig: neus(folder, rig, world_mat_1=np.full((4, 4), np.inf)),
+    "skew": lambda folder, rig: neus(folder, rig, world_mat_0=np.eye(4) + 0.2 * np.eye(4, k=1)),
+    "pickle": lambda folder, rig: neus(folder, rig, world_mat_0=np.array([{}], dtype=object)),
+    "no scale": lambda folder, rig: (neus(folder, rig), np.savez(folder / "cameras_sphere.npz", world_mat_0=np.eye(4))),
+    "more images": lambda folder, rig: (neus(folder, rig), Image.new("RGB", (9, 9)).save(folder / "image/9.png")),
+    "bomb": lambda folder, rig: (neus(folder, rig), bomb(folder)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BROKEN_NEUS)
+def test_a_broken_cameras_sphere_is_refused(tmp_path, rig, name):
+    BROKEN_NEUS[name](tmp_path, rig)
+    with pytest.raises(InputError, match="cameras_sphere.npz: .*; "):
+        load_views(tmp_path)
+
+
+def test_another_number_of_masks_is_refused(tmp_path, rig):
+    neus(tmp_path, rig)
+    (tmp_path / "mask/001.png").unlink()
+    with pytest.raises(InputError, match=f"mask: expected {COUNT} masks, one for each image, got {COUNT - 1}"):
+        load_views(tmp_path)
+
+
+def test_splits_of_nerf_synthetic(tmp_path, rig):
+    """The training split, and a note of the others; another split where that is missing."""
+    for split, part in (("train", slice(0, 3)), ("test", slice(3, 4)), ("val", slice(4, 5))):
+        names = [f"r_{j}.png" for j in range(COUNT)][part]
+        folder = tmp_path / split
+        folder.mkdir()
+        for name, mask in zip(names, rig.masks[part]):
+            Image.fromarray(np.repeat((mask.numpy() * 255).astype(np.uint8)[..., None], 4, -1)).save(folder / name)
+        frames = [
+            {"file_path": f"./{split}/{name[:-4]}", "rotation": 0.0, "transform_matrix": pose.tolist()}
+            for name, pose in zip(names, rig.c2w[part])
+        ]
+        (tmp_path / f"transforms_{split}.json").write_text(json.dumps({"camera_angle_x": 0.7, "frames": frames}))
+    views = load_views(tmp_path)
+    assert views.names == ("./train/r_0", "./train/r_1", "./train/r_2")
+    np.testing.assert_allclose(views.intrinsics[:, 0], rig.intrinsics[0, 0], rtol=1e-6)
+    used = "cameras of 3 images from transforms_train.json; not read: transforms_val.json, transforms_test.json"
+    assert used in views.notes
+    (tmp_path / "transforms_train.json").unlink()
+    assert "cameras of 1 images from transforms_val.json; not read: transforms_test.json" in load_views(tmp_path).notes

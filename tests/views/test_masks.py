@@ -1,0 +1,232 @@
+"""Mask files: what their values mean, and which belongs to which image."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from reli3d.io.files import InputError
+from reli3d.views.folder import load_views
+from tests.support import evil
+
+SIDE = 48
+DISK = np.hypot(*(np.mgrid[:SIDE, :SIDE] - 23.5)) < 15
+
+
+def antialiased(side=SIDE, radius=15.0):
+    """Coverage of a disk by each pixel, of 8 x 8 samples."""
+    fine = np.hypot(*(np.mgrid[: 8 * side, : 8 * side] / 8 - (side / 2 - 1 / 16))) < radius
+    return fine.reshape(side, 8, side, 8).mean((1, 3))
+
+
+def folder(root, images, **top):
+    """A folder of these image files without alpha, a camera for each."""
+    frames = []
+    for k, name in enumerate(images):
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(np.full((SIDE, SIDE, 3), 90 + k, np.uint8)).save(root / name)
+        frames.append({"file_path": name, "transform_matrix": evil.pose(2.1 * k), "camera_fov": 0.6})
+    (root / "transforms.json").write_text(json.dumps({**top, "frames": frames}))
+
+
+def palette(labels, colors):
+    picture = Image.fromarray(labels.astype(np.uint8), "L").convert("P")
+    picture.putdata(labels.ravel().tolist())
+    picture.putpalette([v for color in colors for v in color] + [0] * (768 - 3 * len(colors)))
+    return picture
+
+
+def mask_of(tmp_path, picture, ending=".png", **options):
+    """The mask and notes of one view whose mask file is ``picture``."""
+    folder(tmp_path, ["images/a.png"])
+    (tmp_path / "masks").mkdir()
+    picture = Image.fromarray(picture) if isinstance(picture, np.ndarray) else picture
+    picture.save(tmp_path / f"masks/a{ending}", **options)
+    views = load_views(tmp_path)
+    return views.masks[0].numpy(), views.notes
+
+
+DAVIS = [(0, 0, 0), (128, 0, 0), (0, 128, 0), (128, 128, 0), (0, 0, 128)]
+TWO_VALUES = {
+    "white": lambda: np.where(DISK, 255, 0).astype(np.uint8),
+    "label 1": lambda: DISK.astype(np.uint8),
+    "label 38": lambda: np.where(DISK, 38, 0).astype(np.uint8),
+    "label 128": lambda: np.where(DISK, 128, 0).astype(np.uint8),
+    "1 bit": lambda: DISK,
+    "16 bit, white": lambda: np.where(DISK, 65535, 0).astype(np.uint16),
+    "16 bit, label 1": lambda: DISK.astype(np.uint16),
+    "16 bit, value 255": lambda: np.where(DISK, 255, 0).astype(np.uint16),
+    "DAVIS entry 1": lambda: palette(DISK.astype(np.uint8), DAVIS),
+    "DAVIS entry 3": lambda: palette(np.where(DISK, 3, 0), DAVIS),
+    "palette, white first": lambda: palette(np.where(DISK, 0, 1), [(255, 255, 255), (0, 0, 0)]),
+    "RGB, one color": lambda: np.where(DISK[..., None], (20, 90, 200), 0).astype(np.uint8),
+    "grey and alpha": lambda: Image.merge(
+        "LA", [Image.new("L", (SIDE, SIDE), 77), Image.fromarray(np.where(DISK, 255, 0).astype(np.uint8))]
+    ),
+    "white on black, opaque": lambda: Image.fromarray(np.where(DISK, 255, 0).astype(np.uint8)).convert("RGBA"),
+    "label in alpha": lambda: np.dstack([np.full((SIDE, SIDE, 3), 9, np.uint8), DISK.astype(np.uint8)]),
+}
+
+
+@pytest.mark.parametrize("name", TWO_VALUES)
+def test_of_two_values_nonzero_is_the_object(tmp_path, name):
+    mask, notes = mask_of(tmp_path, TWO_VALUES[name]())
+    np.testing.assert_array_equal(mask, DISK.astype(np.float32))
+    plain = name in ("white", "1 bit", "16 bit, white", "palette, white first", "grey and alpha")
+    assert any("nonzero pixels are taken as the object" in n for n in notes) != (plain or "opaque" in name)
+
+
+@pytest.mark.parametrize("levels", [255, 16, 4])
+def test_grey_edges_are_coverage(tmp_path, levels):
+    """Antialiased in many or in few steps."""
+    stored = np.rint(np.rint(antialiased() * levels) / levels * 255).astype(np.uint8)
+    mask, notes = mask_of(tmp_path, stored)
+    np.testing.assert_array_equal(mask, stored / np.float32(255))
+    assert not any("mask" in n for n in notes)
+
+
+def test_grey_edges_of_a_label_are_scaled(tmp_path):
+    """An antialiased label 38; 16 bits with the values of 8."""
+    for k, (top, kind) in enumerate(((38, np.uint8), (255, np.uint16))):
+        stored = np.rint(antialiased() * top)
+        mask, notes = mask_of(tmp_path / str(k), stored.astype(kind))
+        np.testing.assert_allclose(mask, stored / top, rtol=0, atol=0.51 / 255)  # rounded to 8 bits
+        assert any(f"the highest value, {top}, is taken as opaque" in n for n in notes)
+
+
+def test_masks_of_jpeg_are_coverage(tmp_path):
+    for quality in (95, 60, 20):
+        stored = Image.fromarray(np.rint(antialiased() * 255).astype(np.uint8))
+        mask, _ = mask_of(tmp_path / str(quality), stored, ".jpg", quality=quality)
+        assert float(np.abs(mask - antialiased()).mean()) < 0.03  # the codec's ringing; a wrong scale gives 0.3
+
+
+REFUSED = {
+    "two labels": (lambda: np.where(DISK, 1, 0).astype(np.uint8) + (np.arange(SIDE) > 23) * DISK, "0, 1, 2"),
+    "labels and a void border": (lambda: np.where(DISK, 1, 255 * (np.arange(SIDE) > 40)).astype(np.uint8), "0, 1, 255"),
+    "no black": (lambda: np.where(DISK, 2, 1).astype(np.uint8), "1, 2"),
+    "video range": (lambda: np.where(DISK, 235, 16).astype(np.uint8), "16, 235"),
+    "one label everywhere": (lambda: np.full((SIDE, SIDE), 7, np.uint8), "7 without 0"),
+    "many labels": (lambda: np.kron(np.arange(36).reshape(6, 6) * 7, np.ones((8, 8))).astype(np.uint8), "36 values"),
+    "two DAVIS entries": (lambda: palette(DISK + 1 * (np.arange(SIDE) > 23) * DISK, DAVIS), "(0, 128, 0), (128, 0, 0)"),
+    "16-bit labels": (lambda: (DISK * (300 + 7 * (np.arange(SIDE) > 23))).astype(np.uint16), "0, 300, 307"),
+    "colored background": (lambda: np.where(DISK[..., None], (255, 0, 0), 255).astype(np.uint8), "(255, 255, 255)"),
+    "a photograph": (
+        lambda: np.random.default_rng(0).integers(0, 255, (SIDE, SIDE, 3), dtype=np.uint8),
+        "colors",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_cannot_be_interpreted_is_refused_with_the_values(tmp_path, name):
+    make, words = REFUSED[name]
+    with pytest.raises(InputError) as caught:
+        mask_of(tmp_path, make())
+    assert "masks/a.png: mask: expected the object white on black, got" in str(caught.value)
+    assert words in str(caught.value)
+
+
+@pytest.mark.parametrize("second, words", [(2, "the value 2"), (DAVIS, "the color")])
+def test_masks_of_different_labels_are_refused(tmp_path, second, words):
+    folder(tmp_path, ["a.png", "b.png"])
+    (tmp_path / "masks").mkdir()
+    Image.fromarray(DISK.astype(np.uint8)).save(tmp_path / "masks/a.png")
+    other = palette(3 * DISK, DAVIS) if second is DAVIS else Image.fromarray(2 * DISK.astype(np.uint8))
+    other.save(tmp_path / "masks/b.png")
+    with pytest.raises(InputError, match=f"expected one label in all masks, got .*{words}"):
+        load_views(tmp_path)
+
+
+def test_labels_in_the_alpha_of_an_image(tmp_path):
+    folder(tmp_path, ["a.png"])
+    pixels = np.dstack([np.full((SIDE, SIDE, 3), 90, np.uint8), DISK.astype(np.uint8)])
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    views = load_views(tmp_path)
+    np.testing.assert_array_equal(views.masks[0].numpy(), DISK.astype(np.float32))
+    assert any("the value 1 instead of white" in n for n in views.notes)
+
+
+def disk(k):
+    """Disks that tell masks from each other by their areas."""
+    return np.where(np.hypot(*(np.mgrid[:SIDE, :SIDE] - 23.5)) < 8 + k, 255, 0).astype(np.uint8)
+
+
+def areas(views):
+    return [int(mask.sum()) for mask in views.masks]
+
+
+def put(root, names):
+    for k, name in enumerate(names):
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(disk(k)).save(root / name)
+
+
+NESTED = ["images/front/0.png", "images/back/0.png", "images/front/1.png"]
+LAYOUTS = {
+    "mirrored": ["masks/front/0.png", "masks/back/0.png", "masks/front/1.png"],
+    "mirrored from the root": ["masks/images/front/0.png", "masks/images/back/0.png", "masks/images/front/1.png"],
+    "ending after ending": ["masks/front/0.png.png", "masks/back/0.png.png", "masks/front/1.png.png"],
+    "another ending": ["masks/front/0.tif", "masks/back/0.tif", "masks/front/1.tif"],
+    "folder mask": ["mask/front/0.png", "mask/back/0.png", "mask/front/1.png"],
+}
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_masks_mirror_the_folders_of_the_images(tmp_path, name):
+    folder(tmp_path, NESTED)
+    put(tmp_path, LAYOUTS[name])
+    assert areas(load_views(tmp_path)) == [int((disk(k) > 0).sum()) for k in range(3)]
+
+
+def test_masks_of_a_given_folder_mirror_the_images(tmp_path):
+    folder(tmp_path / "object", NESTED)
+    put(tmp_path, ["given/front/0.png", "given/back/0.png", "given/front/1.png"])
+    assert areas(load_views(tmp_path / "object", masks=tmp_path / "given")) == [
+        int((disk(k) > 0).sum()) for k in range(3)
+    ]
+
+
+def test_names_are_found_in_other_cases(tmp_path):
+    folder(tmp_path, ["images/IMG_1.JPG", "images/img_2.jpg"])
+    put(tmp_path, ["Masks/img_1.png", "Masks/IMG_2.PNG"])
+    assert areas(load_views(tmp_path)) == [int((disk(k) > 0).sum()) for k in range(2)]
+    data = json.loads((tmp_path / "transforms.json").read_text())
+    data["frames"][0]["file_path"] = "Images/img_1.jpg"
+    (tmp_path / "transforms.json").write_text(json.dumps(data))
+    assert areas(load_views(tmp_path)) == [int((disk(k) > 0).sum()) for k in range(2)]
+
+
+@pytest.mark.parametrize("listed", [NESTED[:2], NESTED[:1]])
+def test_one_mask_is_never_that_of_two_images(tmp_path, listed):
+    """Also where the camera file lists but one of the images that the mask is named after."""
+    folder(tmp_path, NESTED[:2])
+    folder(tmp_path, listed)
+    put(tmp_path, ["masks/0.png"])
+    with pytest.raises(InputError, match=r"masks/0.png: expected the mask of one image, got that of 'images/"):
+        load_views(tmp_path)
+    (tmp_path / "images/back/0.png").rename(tmp_path / "images/back/5.png")
+    folder(tmp_path, NESTED[:1])
+    assert len(load_views(tmp_path)) == 1  # nothing else is named so
+
+
+def test_a_mask_path_is_never_that_of_two_images(tmp_path):
+    folder(tmp_path, ["a.png", "b.png"])
+    put(tmp_path, ["m.png"])
+    data = json.loads((tmp_path / "transforms.json").read_text())
+    for frame in data["frames"]:
+        frame["mask_path"] = "m.png"
+    (tmp_path / "transforms.json").write_text(json.dumps(data))
+    with pytest.raises(InputError, match="m.png: expected the mask of one image, got that of 'a.png' and 'b.png'"):
+        load_views(tmp_path)
+
+
+def test_images_that_differ_in_their_ending_have_a_mask_each(tmp_path):
+    folder(tmp_path, ["a.png", "a.jpg"])
+    put(tmp_path, ["masks/a.png"])
+    with pytest.raises(InputError, match="expected the mask of one image"):
+        load_views(tmp_path)
+    put(tmp_path, ["masks/a.png.png", "masks/a.jpg.png"])
+    (tmp_path / "masks/a.png").unlink()
+    assert areas(load_views(tmp_path)) == [int((disk(k) > 0).sum()) for k in range(2)]
