@@ -18,6 +18,7 @@ LONGEST = 0.55  # longest side from which an object in the cube needs no rescali
 OFF_CENTRE = 0.3  # as far as the hull's centre of such an object may lie from the origin
 GRIDS = (24, 44)  # cells a side, coarse and refined: the last is 2 to 3 % of the object
 BALL = 1.3  # diameter of the ball that limits the hull, in mask widths: a generic view shows 0.8 of the longest side
+ONE_SIDED = math.radians(90.0)  # between eyes: beyond it the views bound each other's depth
 PARALLEL = 0.01  # mean squared sine between the axes (6 degrees) below which depth is guessed, not triangulated
 FAR = 10.0  # distances to the object from which the origin is moved to it: float32 then loses a digit of each position
 SMALLEST = 1e-6  # distance to the object below which squares of areas of a mesh's faces leave float32
@@ -47,19 +48,46 @@ def normalize(views: Views, mode: str = "auto") -> Similarity:
 
     mode ``none``: identity.  ``hull``: the box of the visual hull is centred and its longest side becomes 1, as in
     training.  ``auto``: identity where the hull already sits well in the network's cube of half side 0.87, else
-    ``hull``.  One view (or views from one direction) has no scale: the depth of the object is guessed as its width, at
-    the point of the ray that is nearest to the origin.  Raises ValueError where no point lies inside all masks.
+    ``hull``.
+
+    Captures from one side, all eyes within 90 degrees seen from the object, leave its depth open: it is at most 1.3
+    widths of the masks, where the hull is cut, and the box is aligned with the mean viewing direction, so that the
+    scale does not depend on the frame.  One view (or views from one direction) has no scale: the depth is guessed as
+    the width, at the point of the ray that is nearest to the origin.  Raises ValueError where no point lies inside all
+    masks.
     """
     if mode not in ("auto", "none", "hull"):
         raise ValueError(f"mode: expected auto, none or hull, got {mode!r}")
     if mode == "none":
         return Similarity.identity()
-    low, high = visual_hull(views).box()
-    longest, centre = float((high - low).max()), (low + high) / 2
+    hull = visual_hull(views)
+    low, high = hull.box()
     inside = float(torch.maximum(-low, high).max()) <= SLACK * RADIUS
+    basis = _one_sided_basis(views, hull)
+    points = hull.points @ basis
+    low, high = points.amin(0), points.amax(0)
+    longest, centre = float((high - low).max()), basis @ ((low + high) / 2)
     if mode == "auto" and inside and longest >= LONGEST and float(centre.norm()) <= OFF_CENTRE:
         return Similarity.identity()
     return Similarity(1.0 / longest, torch.eye(3, dtype=torch.float64), -centre / longest)
+
+
+def _one_sided_basis(views: Views, hull: Hull) -> Tensor:
+    """Orthonormal columns along which the hull's sides are measured: the axes, or those of a one-sided capture.
+
+    Where all eyes lie within ONE_SIDED of each other seen from the object, the silhouettes leave the depth open and the
+    ball cuts the hull.  The last column is then the mean viewing direction, the first the horizontal of view 0: sides
+    in other axes would depend on how the frame is turned.
+    """
+    c2w = views.c2w.double().cpu()
+    away = torch.nn.functional.normalize(c2w[:, :3, 3] - hull.aim, dim=-1)
+    axis = torch.nn.functional.normalize(away.mean(0), dim=-1)
+    across = torch.linalg.cross(c2w[0, :3, 1], axis)
+    parallel = meeting_point(c2w[:, :3, 3], -away)[1] < PARALLEL
+    if parallel or float((away @ away.T).min()) < math.cos(ONE_SIDED) or float(across.norm()) < 1e-3:
+        return torch.eye(3, dtype=torch.float64)
+    right = torch.nn.functional.normalize(across, dim=-1)
+    return torch.stack([right, torch.linalg.cross(axis, right), axis], -1)
 
 
 def visual_hull(views: Views) -> Hull:

@@ -1,5 +1,6 @@
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -20,6 +21,35 @@ def turn(seed: int) -> torch.Tensor:
 def some_similarity(seed: int) -> Similarity:
     shift = torch.randn(3, generator=torch.Generator().manual_seed(seed + 9), dtype=torch.float64)
     return Similarity(0.3 + seed, turn(seed), shift)
+
+
+def some_turn(seed: int, scale: float) -> Similarity:
+    return Similarity(scale, turn(seed), torch.tensor([5.0, -9.0, 2.0], dtype=torch.float64))
+
+
+ROD = tuple((0.0, 0.05 * k, 0.0, 0.1) for k in range(-8, 9))  # 1.0 long, 0.2 thick
+
+
+def one_sided(spheres):
+    """Five eyes within 60 degrees about +Z."""
+    angles = torch.tensor([[0, 0], [28, 5], [-28, 0], [5, 28], [0, -28]], dtype=torch.float64).deg2rad()
+    a, e = angles.unbind(-1)
+    eyes = 3.0 * torch.stack([e.cos() * a.sin(), e.sin(), e.cos() * a.cos()], -1)
+    return sphere_views(spheres, eyes=eyes, fov=0.6, size=(160, 160))
+
+
+@pytest.mark.parametrize("k", range(4))
+def test_the_scale_of_a_one_sided_capture_does_not_depend_on_the_frame(k):
+    """A rod across the views is 1 long; one along them is as deep as its silhouettes leave open, or 1.3 widths."""
+    across, along = one_sided(ROD), one_sided(tuple((x, z, y, r) for x, y, z, r in ROD))
+    sizes = []
+    for views in (across, along):
+        there = normalize(views.transformed(some_turn(k, 7.0)), "hull")
+        sizes.append(1.0 / (7.0 * there.scale))
+        assert float(there.apply(some_turn(k, 7.0).translation).norm()) < 0.25  # the middle, but for the open depth
+    assert sizes[0] == pytest.approx(1.0, abs=0.06)  # a cell and two pixels
+    assert sizes[1] == pytest.approx(1.3 * visual_hull(along).extent, rel=0.06)
+    assert sizes[1] == pytest.approx(1.0 / normalize(along, "hull").scale, rel=0.06)
 
 
 def test_similarities_are_a_group():
@@ -158,6 +188,9 @@ def test_cameras_that_agree_on_nothing_are_an_error():
 def test_real_captures_are_left_alone_until_they_are_moved(shared_data, name):
     views = load_views(shared_data / "captures" / name)
     assert normalize(views).is_identity()
+    scales = [12.0 * normalize(views.transformed(some_turn(k, 12.0)), "hull").scale for k in range(4)]
+    if name.startswith("UCO3D"):  # one-sided: the frame changes nothing but where the grid's cells lie, 3 % of a side
+        np.testing.assert_allclose(scales, normalize(views, "hull").scale, rtol=0.06)
     move = Similarity(12.0, turn(3), torch.tensor([5.0, -9.0, 2.0], dtype=torch.float64))
     similarity = normalize(views.transformed(move))
     size = 12.0 * similarity.scale  # of the capture in the network's frame; its longest side was 0.87 to 1.07
