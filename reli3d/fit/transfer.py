@@ -44,7 +44,7 @@ def nearest_hits(mesh: Mesh, position: Tensor, normal: Tensor) -> tuple[Tensor, 
 def dressed(mesh: Mesh, source: Asset, size: int) -> Asset:
     """``mesh`` with an atlas, and the maps that ``source`` has beside it; the light of ``source``."""
     mesh = unwrap(mesh, texture_size=size)
-    mesh = replace(mesh, tangents=vertex_tangents(mesh))
+    mesh = replace(mesh, tangents=vertex_tangents(mesh), colors=None)  # the maps below have them
     texels = rasterize_texels(mesh, size)
     index = torch.nonzero(texels.valid.reshape(-1))[:, 0]
     position, normal = interpolate(mesh, texels, index)

@@ -37,13 +37,14 @@ class Mesh:
     normals: Tensor | None = None  # (V, 3) unit
     uv: Tensor | None = None  # (V, 2) glTF: u right, v down
     tangents: Tensor | None = None  # (V, 4) unit, w = +-1: bitangent = w * cross(normal, tangent)
+    colors: Tensor | None = None  # (V, 3) linear factors of the base color
 
     def __post_init__(self) -> None:
         for f in fields(self):
             kind = torch.int32 if f.name == "faces" else torch.float32
             object.__setattr__(self, f.name, tensor_of(getattr(self, f.name), kind))
         _check_topology(self.vertices, self.faces)
-        for name, last in (("normals", 3), ("uv", 2), ("tangents", 4)):
+        for name, last in (("normals", 3), ("uv", 2), ("tangents", 4), ("colors", 3)):
             value = getattr(self, name)
             if value is not None:
                 check(name, value, last=last, like=self.vertices)
@@ -59,8 +60,8 @@ class Mesh:
         return self._changed(lambda value: value.detach())
 
     def _changed(self, change: Callable[[Tensor], Tensor]) -> Mesh:
-        rest = (None if value is None else change(value) for value in (self.normals, self.uv, self.tangents))
-        return Mesh(change(self.vertices), change(self.faces), *rest)
+        present = {f.name: value for f in fields(self) if (value := getattr(self, f.name)) is not None}
+        return Mesh(**{name: change(value) for name, value in present.items()})
 
     def with_normals(self) -> Mesh:
         """The same mesh with :func:`vertex_normals`."""

@@ -131,6 +131,7 @@ def _joined(mesh: Mesh, faces: np.ndarray, charts: parts.Charts, uv: np.ndarray)
         vertices=mesh.vertices.index_select(0, source),  # a gradient that adds up in a fixed order
         faces=torch.from_numpy(vertex.reshape(-1, 3)).to(device),
         normals=normals.index_select(0, source),
+        colors=mesh.colors.index_select(0, source) if mesh.colors is not None else None,
         uv=torch.from_numpy(uv.reshape(-1, 2)[corners]).to(device),
     )
 
@@ -298,6 +299,7 @@ def unwrap_xatlas(mesh: Mesh, *, texture_size: int = 1024, timeout_s: float = 12
         vertices=mesh.vertices.index_select(0, index),
         faces=torch.from_numpy(faces.astype(np.int32)).to(device),
         normals=normals.index_select(0, index),
+        colors=mesh.colors.index_select(0, index) if mesh.colors is not None else None,
         uv=torch.from_numpy(uv.astype(np.float32)).to(device),
     )
 

@@ -30,7 +30,8 @@ UNIT = 1.0e-3  # deviation from length 1 that readers accept
 KINDS = ("png", "webp")  # of textures
 WEBP = "EXT_texture_webp"
 FLOAT, UINT = 5126, 5125
-LINEAR, LINEAR_MIPMAP_LINEAR, CLAMP_TO_EDGE = 9729, 9987, 33071
+LINEAR, LINEAR_MIPMAP_LINEAR = 9729, 9987
+WRAPS = {"repeat": 10497, "mirror": 33648, "clamp": 33071}
 
 
 def encode_image(values: Tensor, kind: str = "png") -> bytes:
@@ -51,6 +52,14 @@ def texture_images(asset: Asset, kind: str = "png") -> dict[str, bytes]:
     maps = {"base_color": base_color, "metallic_roughness": orm, "normal": asset.textures.normal}
     values = list(maps.values())
     return dict(zip(maps, over_rows(len(values), 1, lambda k, _: encode_image(values[k], kind)), strict=True))
+
+
+def addressing(asset: Asset) -> tuple[str, str]:
+    """Wrap modes for a file: those of the textures, but "clamp" for "repeat" where uv stay within [0, 1]."""
+    low, high = torch.aminmax(present("uv", asset.mesh.uv).detach(), dim=0)
+    inside = ((low >= 0.0) & (high <= 1.0)).tolist()
+    first, second = ("clamp" if m == "repeat" and i else m for m, i in zip(asset.textures.wrap, inside, strict=True))
+    return first, second
 
 
 def check_asset(asset: Asset) -> None:
@@ -99,7 +108,8 @@ def glb_bytes(
     document, chunks = _geometry(mesh)
     names, chunks = tuple(images), chunks + list(images.values())
     views, offset = [], 0
-    targets = [34962] * 4 + [34963]  # vertex attributes, indices; images have none
+    targets = [34962] * (len(document["accessors"]) - 1) + [34963]  # vertex attributes, indices; images have none
+    wrap_s, wrap_t = (WRAPS[mode] for mode in addressing(asset))
     for k, chunk in enumerate(chunks):
         view = {"buffer": 0, "byteOffset": offset, "byteLength": len(chunk)}
         views.append({**view, "target": targets[k]} if k < len(targets) else view)
@@ -131,9 +141,7 @@ def glb_bytes(
             {"bufferView": len(targets) + k, "mimeType": f"image/{textures}", "name": name}
             for k, name in enumerate(names)
         ],
-        "samplers": [
-            {"magFilter": LINEAR, "minFilter": LINEAR_MIPMAP_LINEAR, "wrapS": CLAMP_TO_EDGE, "wrapT": CLAMP_TO_EDGE}
-        ],
+        "samplers": [{"magFilter": LINEAR, "minFilter": LINEAR_MIPMAP_LINEAR, "wrapS": wrap_s, "wrapT": wrap_t}],
         "bufferViews": views,
         "buffers": [{"byteLength": offset}],
     }
@@ -163,6 +171,8 @@ def _source(image: int, kind: str) -> dict:
 def _geometry(mesh) -> tuple[dict, list[bytes]]:
     """Accessors with their mesh, and the bytes of the first buffer views."""
     arrays = {"POSITION": mesh.vertices, "NORMAL": mesh.normals, "TANGENT": mesh.tangents, "TEXCOORD_0": mesh.uv}
+    if mesh.colors is not None:
+        arrays["COLOR_0"] = mesh.colors
     accessors, chunks = [], []
     for k, (name, tensor) in enumerate(arrays.items()):
         value = np.ascontiguousarray(tensor.detach().cpu().numpy(), dtype="<f4")
@@ -207,15 +217,20 @@ def write_glb(
     write_bytes(path, data)
 
 
-def read_glb(path: str | os.PathLike, **limits: int) -> list[Asset]:
+def read_glb(path: str | os.PathLike, *, notes: list[str] | None = None, **limits: int) -> list[Asset]:
     """The surfaces of a GLB file, one :class:`Asset` for each primitive, in the axes of its scene; no environment.
 
-    Node transforms are applied.  Textures come out square and of one size, with all factors multiplied in.  Occlusion,
-    emission, alpha, animation, points and lines are left out.  Missing normals are those of the faces, missing tangents
-    MikkTSpace's.  limits: see :func:`reli3d.io.gltf_parts.read_parts`.  Raises InputError, a ValueError that names
-    field, value and fix.
+    Meshes are at rest: node transforms or skins, and morph targets by their default weights, are applied.  Vertex
+    colors are ``Mesh.colors``, or part of the textures where all are equal.  Textures come out square and of one size,
+    with all factors, and transforms of texture coordinates, applied; faces are seen from both sides.  Missing normals
+    are those of the faces, missing tangents MikkTSpace's.
+
+    Specular-glossiness materials are converted.  What is left out (animation, emission, occlusion, alpha, points,
+    lines, extensions that core glTF approximates, such as clearcoat) is appended to ``notes``, one line each.  What
+    must be decoded (Draco, meshopt, KTX2) is refused.  limits: see :func:`reli3d.io.gltf_parts.read_parts`.  Raises
+    InputError, a ValueError that names field, value and fix.
 
     >>> reli3d.write_glb("object.glb", asset)
     >>> parts = reli3d.read_glb("object.glb")
     """
-    return read_parts(path, **limits)
+    return read_parts(path, notes=notes, **limits)

@@ -1,7 +1,8 @@
-"""GLB in: the container, accessors and nodes of any glTF 2.0 file, checked before use.
+"""GLB in: the container, accessors, nodes and skins of any glTF 2.0 file, checked before use.
 
 Nothing outside the file is opened (data URIs only).  Sizes are limited before memory is taken.  Every fault is an
-InputError that names the field.  Primitives and materials are read in ``gltf_parts.py``.
+InputError that names the field; what is left out is a note.  Primitives are read in ``gltf_parts.py``, materials in
+``gltf_materials.py``.  Source: https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html.
 """
 
 from __future__ import annotations
@@ -12,30 +13,57 @@ import json
 import math
 import os
 import struct
+from dataclasses import dataclass
 from typing import NoReturn
 
 import numpy as np
 
-from reli3d.io.files import InputError, read_bytes, shown
+from reli3d.io.files import InputError, printable, read_bytes, shown
 
 DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-SHAPES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
-EXTENSIONS = {"EXT_texture_webp", "KHR_materials_unlit", "KHR_mesh_quantization", "KHR_lights_punctual"}  # readable
+SHAPES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+SUPPORTED = {
+    "EXT_texture_webp",
+    "KHR_materials_pbrSpecularGlossiness",
+    "KHR_mesh_quantization",
+    "KHR_node_visibility",
+    "KHR_texture_transform",
+}
+MATERIALS = "anisotropy clearcoat diffuse_transmission dispersion emissive_strength ior iridescence sheen specular"
+LEFT_OUT = {  # which core glTF approximates, or which have no part in a surface at rest
+    *(f"KHR_materials_{name}" for name in (*MATERIALS.split(), "transmission", "unlit", "variants", "volume")),
+    "KHR_animation_pointer",
+    "KHR_lights_punctual",
+    "KHR_xmp_json_ld",
+}
 EMPTY = 1 << 20  # values of an accessor without a buffer view: all zero, and not limited by the file's size
 DEPTH = 256  # of the node tree
 TRIANGLES, STRIP, FAN = 4, 5, 6
 _KINDS: dict[type, str] = {list: "a list", dict: "an object", str: "a string"}
 
 
+@dataclass(frozen=True)
+class Placed:
+    """A mesh of the scene: its JSON, name, node transform (4, 4), joint matrices (J, 4, 4) and morph weights."""
+
+    mesh: dict
+    name: str
+    world: np.ndarray
+    joints: np.ndarray | None
+    weights: list[float]
+
+
 class Document:
     """A parsed GLB: typed access to its JSON and its accessors.
 
-    Every getter raises InputError with the place in the file for a wrong type, index or range.
+    Every getter raises InputError with the place in the file for a wrong type, index or range.  What is left out is
+    appended to ``notes``, one line each.
     """
 
     def __init__(self, path: str | os.PathLike, *, max_bytes: int, max_vertices: int):
         self.path, self.max_bytes, self.max_vertices = path, max_bytes, max_vertices
         self.taken = 0  # accessor elements read so far, over all meshes
+        self.notes: list[str] = []
         self.json, self.binary = self._container(read_bytes(path, max_bytes))
         version = self.get(self.get(self.json, "asset", dict, "asset"), "version", str, "asset.version")
         if not version.startswith("2."):
@@ -43,15 +71,33 @@ class Document:
         needed = self.get(self.json, "extensionsRequired", list, "extensionsRequired", [])
         if not all(isinstance(name, str) for name in needed):
             self.fail("extensionsRequired", "expected names", needed)
-        needed = set(needed)
-        if not needed <= EXTENSIONS:
-            self.fail(
-                "extensionsRequired",
-                "expected none that must be decoded",
-                sorted(needed - EXTENSIONS),
-                "export without compression or extensions",
-            )
+        unknown = set(needed) - SUPPORTED - LEFT_OUT
+        if unknown:
+            fix = "export without compression or extensions"
+            self.fail("extensionsRequired", "expected none that must be decoded", sorted(unknown), fix)
+        for name in sorted(set(needed) & LEFT_OUT):
+            self.leave_out(name)
+        if self.json.get("animations"):
+            self.leave_out("animation")
         self._buffers: dict[int, bytes] = {}
+
+    def note(self, text: str) -> None:
+        """Append a note on the file, once."""
+        line = f"{printable(os.path.basename(self.path))}: {printable(text)}"
+        if line not in self.notes:
+            self.notes.append(line)
+
+    def leave_out(self, what: str) -> None:
+        """Note that ``what`` is not in the result."""
+        self.note(f"{what[:80]} is left out")
+
+    def extensions(self, node: dict, field: str, *quiet: str) -> dict:
+        """Extensions of ``node``.  Those that are neither supported nor in ``quiet`` are noted as left out."""
+        found = self.get(node, "extensions", dict, f"{field}.extensions", {})
+        for name in found:
+            if name not in SUPPORTED and name not in quiet:
+                self.leave_out(name)
+        return found
 
     def fail(self, field: str, expected: str, got: object, fix: str = "export the file again") -> NoReturn:
         """Raise the InputError of ``field``."""
@@ -167,14 +213,26 @@ class Document:
         self.taken += max(count, 0)
         if count < 0 or self.taken > 8 * self.max_vertices:
             self.fail(f"{where}.count", f"expected at most {self.max_vertices} vertices", count, "simplify the mesh")
-        if "sparse" in entry:
-            self.fail(f"{where}.sparse", "expected a dense accessor", "sparse", "export without sparse accessors")
         dtype, width = np.dtype(DTYPES[code]), SHAPES[kind]
-        if "bufferView" not in entry:
-            if count > EMPTY:
-                self.fail(f"{where}.count", f"expected at most {EMPTY} values without data", count)
-            return np.zeros((count, width), np.float32 if code == 5126 else dtype)
-        data, stride = self.view(entry["bufferView"], f"{where}.bufferView")
+        if "bufferView" in entry:
+            values = self._rows(entry, count, dtype, width, where)
+        elif count > EMPTY:
+            self.fail(f"{where}.count", f"expected at most {EMPTY} values without data", count)
+        else:
+            values = np.zeros((count, width), dtype)
+        if "sparse" in entry:
+            values = self._replaced(values, self.get(entry, "sparse", dict, f"{where}.sparse"), f"{where}.sparse")
+        if code == 5126:
+            if not np.isfinite(values).all():
+                self.fail(where, "expected finite values", "NaN or infinity")
+            return values.astype(np.float32)
+        if self.get(entry, "normalized", bool, f"{where}.normalized", False):
+            return np.maximum(values.astype(np.float32) / np.iinfo(dtype).max, -1.0)
+        return values
+
+    def _rows(self, entry: dict, count: int, dtype: np.dtype, width: int, where: str) -> np.ndarray:
+        """``(count, width)`` values of the buffer view and offset that ``entry`` names."""
+        data, stride = self.view(entry.get("bufferView"), f"{where}.bufferView")
         offset = self.get(entry, "byteOffset", int, f"{where}.byteOffset", 0)
         item = dtype.itemsize * width
         stride = stride or item
@@ -184,19 +242,30 @@ class Document:
             return np.zeros((0, width), dtype)
         flat = np.frombuffer(data, np.uint8)
         rows = np.lib.stride_tricks.as_strided(flat[offset:], (count, item), (stride, 1), writeable=False)
-        values = np.ascontiguousarray(rows).view(dtype).reshape(count, width)
-        if code == 5126:
-            if not np.isfinite(values).all():
-                self.fail(where, "expected finite values", "NaN or infinity")
-            return values.astype(np.float32)
-        if self.get(entry, "normalized", bool, f"{where}.normalized", False):
-            return np.maximum(values.astype(np.float32) / np.iinfo(dtype).max, -1.0)
+        return np.ascontiguousarray(rows).view(dtype).reshape(count, width)
+
+    def _replaced(self, values: np.ndarray, sparse: dict, where: str) -> np.ndarray:
+        """``values`` with the rows of a sparse accessor in place of some."""
+        count = self.get(sparse, "count", int, f"{where}.count")
+        if not 0 <= count <= len(values):
+            self.fail(f"{where}.count", f"expected at most {len(values)}", count)
+        indices = self.get(sparse, "indices", dict, f"{where}.indices")
+        code = self.get(indices, "componentType", int, f"{where}.indices.componentType")
+        if code not in (5121, 5123, 5125):
+            self.fail(f"{where}.indices.componentType", "expected an unsigned integer", code)
+        index = self._rows(indices, count, np.dtype(DTYPES[code]), 1, f"{where}.indices")[:, 0]
+        if count and int(index.max()) >= len(values):
+            self.fail(f"{where}.indices", f"expected indices below {len(values)}", int(index.max()))
+        rows = self.get(sparse, "values", dict, f"{where}.values")
+        values = values.copy()
+        values[index] = self._rows(rows, count, values.dtype, values.shape[1], f"{where}.values")
         return values
 
     def triangles(self, primitive: dict, vertices: int, field: str) -> np.ndarray | None:
         """Faces ``(F, 3)`` int32 of a primitive, None for points and lines."""
         mode = self.get(primitive, "mode", int, f"{field}.mode", TRIANGLES)
         if mode not in (TRIANGLES, STRIP, FAN):
+            self.leave_out("what consists of points or lines")
             return None
         if "indices" in primitive:
             index = self.accessor(primitive["indices"], f"{field}.indices", ("SCALAR",))[:, 0]
@@ -215,8 +284,8 @@ class Document:
             return np.stack([index[k + 1], index[k + 2], np.broadcast_to(index[:1], count)], 1).astype(np.int32)
         return np.stack([index[k], index[k + 1 + k % 2], index[k + 2 - k % 2]], 1)
 
-    def placed_meshes(self) -> list[tuple[dict, np.ndarray, str]]:
-        """``(mesh, world transform 4x4, name of the mesh)`` of every node of the scene that has a mesh."""
+    def placed_meshes(self) -> list[Placed]:
+        """The mesh of every visible node of the scene that has one."""
         scenes = self.get(self.json, "scenes", list, "scenes", [])
         nodes = self.get(self.json, "nodes", list, "nodes", [])
         if scenes:
@@ -229,24 +298,50 @@ class Document:
             ]
             children = {c for items in lists for c in items if isinstance(c, int)}
             roots = [k for k in range(len(nodes)) if k not in children]
-        stack = [(r, np.eye(4), 0) for r in reversed(roots)]
-        seen: set[int] = set()
+        stack = [(r, np.eye(4), 0, False) for r in reversed(roots)]
+        worlds: dict[int, np.ndarray] = {}
         found = []
         while stack:
-            number, parent, depth = stack.pop()
+            number, parent, depth, hidden = stack.pop()
             node = self.item("nodes", number, "children")
-            if number in seen or depth > DEPTH:
+            if number in worlds or depth > DEPTH:
                 self.fail(f"nodes[{number}]", "expected a tree", "a node with two parents or a cycle")
-            seen.add(number)
             world = parent @ self._local(node, f"nodes[{number}]")
             if not np.isfinite(world).all():
                 self.fail(f"nodes[{number}]", "expected a finite transform", "an overflow")
-            if "mesh" in node:
-                mesh = self.item("meshes", node["mesh"], f"nodes[{number}].mesh")
-                found.append((mesh, world, f"meshes[{node['mesh']}]"))
+            worlds[number] = world
+            where, extensions = f"nodes[{number}].extensions", self.extensions(node, f"nodes[{number}]")
+            visibility = self.get(extensions, "KHR_node_visibility", dict, where, {})
+            hidden = hidden or not self.get(visibility, "visible", bool, f"{where}.visible", True)
+            if "mesh" in node and not hidden:
+                found.append(number)
             children = self.get(node, "children", list, f"nodes[{number}].children", [])
-            stack += [(c, world, depth + 1) for c in reversed(children)]
-        return found
+            stack += [(c, world, depth + 1, hidden) for c in reversed(children)]
+        return [self._placed(number, worlds) for number in found]
+
+    def _placed(self, number: int, worlds: dict[int, np.ndarray]) -> Placed:
+        node, field = self.item("nodes", number, "nodes"), f"nodes[{number}]"
+        mesh = self.item("meshes", node["mesh"], f"{field}.mesh")
+        name = f"meshes[{node['mesh']}]"
+        owner, where = (node, field) if "weights" in node else (mesh, name)
+        weights = self.get(owner, "weights", list, f"{where}.weights", [])
+        weights = self.numbers(owner, "weights", len(weights), f"{where}.weights", [])
+        joints = self._joints(node["skin"], worlds, f"{field}.skin") if "skin" in node else None
+        return Placed(mesh, name, worlds[number], joints, weights)
+
+    def _joints(self, index: object, worlds: dict[int, np.ndarray], field: str) -> np.ndarray:
+        """Joint matrices ``(J, 4, 4)`` of a skin at rest: the joint's transform times its inverse bind matrix."""
+        skin, where = self.item("skins", index, field), f"skins[{index}]"
+        numbers = self.get(skin, "joints", list, f"{where}.joints")
+        if not numbers or not all(isinstance(n, int) and n in worlds for n in numbers):
+            self.fail(f"{where}.joints", "expected nodes of the scene", numbers)
+        joints = np.stack([worlds[n] for n in numbers])
+        if "inverseBindMatrices" in skin:
+            binds = self.accessor(skin["inverseBindMatrices"], f"{where}.inverseBindMatrices", ("MAT4",))
+            if len(binds) < len(joints):
+                self.fail(f"{where}.inverseBindMatrices", f"expected {len(joints)} matrices", len(binds))
+            joints = joints @ binds[: len(joints)].astype(np.float64).reshape(-1, 4, 4).transpose(0, 2, 1)
+        return joints
 
     def _local(self, node: dict, field: str) -> np.ndarray:
         if "matrix" in node:

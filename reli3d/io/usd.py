@@ -9,7 +9,7 @@ import numpy as np
 
 from reli3d._bridge import present
 from reli3d.geometry.mesh import watertight
-from reli3d.io.glb import check_asset, texture_images
+from reli3d.io.glb import addressing, check_asset, texture_images
 from reli3d.render.asset import Asset
 
 
@@ -19,6 +19,8 @@ def usdz_bytes(asset: Asset, name: str = "object") -> bytes:
     Roughness and metallic are channels of one texture, as in glTF; texture coordinates have v up, as USD has them.
     """
     check_asset(asset)
+    if asset.mesh.colors is not None:
+        raise ValueError("asset.mesh.colors: expected None, which USD's surface has no input for; bake them")
     try:
         from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdUtils, Vt
     except ModuleNotFoundError as error:
@@ -52,9 +54,10 @@ def usdz_bytes(asset: Asset, name: str = "object") -> bytes:
         reader = _shader(stage, "st", "UsdPrimvarReader_float2")
         reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("st")
         surface = _shader(stage, "surface", "UsdPreviewSurface")
-        base = _texture(stage, reader, "base_color", "sRGB")
-        packed = _texture(stage, reader, "metallic_roughness", "raw")
-        normal = _texture(stage, reader, "normal", "raw")
+        wrap = addressing(asset)
+        base = _texture(stage, reader, "base_color", "sRGB", wrap)
+        packed = _texture(stage, reader, "metallic_roughness", "raw", wrap)
+        normal = _texture(stage, reader, "normal", "raw", wrap)
         normal.CreateInput("scale", Sdf.ValueTypeNames.Float4).Set(Gf.Vec4f(2, 2, 2, 1))
         normal.CreateInput("bias", Sdf.ValueTypeNames.Float4).Set(Gf.Vec4f(-1, -1, -1, 0))
         for slot, kind, source, channel in (
@@ -81,15 +84,15 @@ def _shader(stage, name: str, kind: str):
     return shader
 
 
-def _texture(stage, reader, name: str, space: str):
+def _texture(stage, reader, name: str, space: str, wrap: tuple[str, str]):
     """Shader that reads ``NAME.png`` with the texture coordinates of ``reader``."""
     from pxr import Sdf
 
     shader = _shader(stage, name, "UsdUVTexture")
     shader.CreateInput("file", Sdf.ValueTypeNames.Asset).Set(Sdf.AssetPath(f"./{name}.png"))
     shader.CreateInput("sourceColorSpace", Sdf.ValueTypeNames.Token).Set(space)
-    for side in ("wrapS", "wrapT"):
-        shader.CreateInput(side, Sdf.ValueTypeNames.Token).Set("clamp")
+    for side, mode in zip(("wrapS", "wrapT"), wrap, strict=True):
+        shader.CreateInput(side, Sdf.ValueTypeNames.Token).Set(mode)
     shader.CreateInput("st", Sdf.ValueTypeNames.Float2).ConnectToSource(reader.ConnectableAPI(), "result")
     for channel, kind in (
         ("rgb", Sdf.ValueTypeNames.Float3),

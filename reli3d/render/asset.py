@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from typing import Any
 
 FLAT = (0.5, 0.5, 1.0)  # a normal map's texel where nothing is bent
+WRAPS = ("repeat", "mirror", "clamp")  # glTF's REPEAT, MIRRORED_REPEAT, CLAMP_TO_EDGE
 KEPT = 2048  # texels a side up to which lookups are kept: 50 MB
 
 
@@ -26,8 +27,9 @@ class TextureSet:
 
     base_color: ``(T, T, 3)``, linear; files hold sRGB.  roughness: ``(T, T)`` or ``(T, T, 1)``, perceptual.  metallic:
     the same.  Either may be a number.  normal: ``(T, T, 3)``, tangent-space unit normal as ``n * 0.5 + 0.5``, green
-    along the bitangent; None is flat.  Fields are ``(T, T, 3)`` and ``(T, T)`` tensors after construction.  Gradients
-    pass through.  Raises TypeError for a wrong kind or dtype, ValueError for a shape or device.
+    along the bitangent; None is flat.  wrap: addressing of uv outside [0, 1] along u and v, each of ``WRAPS``.  Fields
+    are ``(T, T, 3)`` and ``(T, T)`` tensors after construction.  Gradients pass through.  Raises TypeError for a wrong
+    kind or dtype, ValueError for a shape, device or mode.
 
     >>> textures = reli3d.TextureSet(torch.full((64, 64, 3), 0.5), roughness=0.4, metallic=0.0)
     >>> asset = reli3d.Asset(mesh, textures)
@@ -37,6 +39,7 @@ class TextureSet:
     roughness: Tensor
     metallic: Tensor
     normal: Tensor = None  # type: ignore[assignment] # flat after construction
+    wrap: tuple[str, str] = ("repeat", "repeat")
 
     if TYPE_CHECKING:  # what a caller may give, beside what the fields hold
 
@@ -46,9 +49,12 @@ class TextureSet:
             roughness: Tensor | float,
             metallic: Tensor | float,
             normal: Tensor | None = None,
+            wrap: tuple[str, str] = ("repeat", "repeat"),
         ) -> None: ...
 
     def __post_init__(self):
+        if len(self.wrap) != 2 or not set(self.wrap) <= set(WRAPS):
+            raise ValueError(f"wrap: expected two of {', '.join(WRAPS)}, got {self.wrap}")
         self._set("base_color", self.base_color, 3)
         for name in ("roughness", "metallic"):
             value = getattr(self, name)
@@ -101,7 +107,8 @@ class TextureSet:
         return self._changed(lambda value: value.detach())
 
     def _changed(self, change: Callable[[Tensor], Tensor]) -> TextureSet:
-        return TextureSet(*(change(getattr(self, f.name)) for f in fields(self)))
+        maps: dict[str, Any] = {f.name: change(getattr(self, f.name)) for f in fields(self) if f.name != "wrap"}
+        return replace(self, **maps)
 
     def __repr__(self) -> str:
         return f"TextureSet({self.size} x {self.size} texels, {self.base_color.device})"

@@ -41,6 +41,23 @@ def sample_texture(texture: Tensor, uv: Tensor) -> Tensor:
     return out.reshape(*uv.shape[:-1], 3)
 
 
+def wrap_uv(uv: Tensor, wrap: tuple[str, str], size: tuple[int, int]) -> Tensor:
+    """``uv (..., 2)`` such that :func:`sample_texture`, which repeats, gives the addressing ``wrap`` along u and v.
+
+    size: texels along u and v.  Gradients pass, 0 where clamped.
+    """
+    if wrap == ("repeat", "repeat"):
+        return uv
+    axes = []
+    for value, mode, texels in zip(uv.unbind(-1), wrap, size, strict=True):
+        if mode == "mirror":
+            value = 1.0 - (value.remainder(2.0) - 1.0).abs()
+        if mode != "repeat":  # from the outermost centers on the lookup has no neighbor to blend with
+            value = value.clamp(0.5 / texels, 1.0 - 0.5 / texels)
+        axes.append(value)
+    return torch.stack(axes, -1)
+
+
 def tangent_normals(mesh: Mesh, face: Tensor, bary: Tensor, normal: Tensor, mapped: Tensor) -> Tensor:
     """World normals ``(N, 3)`` of tangent-space normals ``mapped (N, 3)`` around ``normal (N, 3)``.
 
@@ -81,14 +98,17 @@ def surface_points(mesh: Mesh, textures: TextureSet | None, face: Tensor, bary: 
         return SurfacePoints(position, ng, normal, grey[:, None].expand(-1, 3), grey, torch.zeros_like(grey))
     if mesh.uv is None:
         raise ValueError("mesh.uv: expected texture coordinates for a textured asset, got None")
-    uv = interpolate(mesh.uv, mesh.faces, face, bary)
+    uv = wrap_uv(interpolate(mesh.uv, mesh.faces, face, bary), textures.wrap, (textures.size, textures.size))
     rough_metal = sample_texture(textures.rough_metal(), uv)  # one lookup for both
     mapped = sample_texture(textures.normal, uv) * 2.0 - 1.0
+    color = sample_texture(textures.base_color, uv)
+    if mesh.colors is not None:
+        color = color * interpolate(mesh.colors, mesh.faces, face, bary)
     return SurfacePoints(
         position,
         ng,
         tangent_normals(mesh, face, bary, normal, mapped),
-        sample_texture(textures.base_color, uv),
+        color,
         rough_metal[:, 0],
         rough_metal[:, 1],
     )

@@ -277,7 +277,7 @@ HOSTILE = {
     "image": (change(["images", 0, "bufferView"], 0), "images[0]: expected a PNG, JPEG or WebP image"),
     "version": (change(["asset", "version"], "1.0"), "asset.version: expected 2.x"),
     "nothing": (change(["scenes", 0, "nodes"], []), "expected triangles in its scene"),
-    "sparse": (change(["accessors", 0, "sparse"], {"count": 1}), "accessors[0].sparse: expected a dense accessor"),
+    "sparse": (change(["accessors", 0, "sparse"], {"count": 1}), "accessors[0].sparse.indices: expected a value"),
     "points": (change(["meshes", 0, "primitives", 0, "mode"], 0), "expected triangles in its scene"),
 }
 
