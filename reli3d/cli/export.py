@@ -73,18 +73,21 @@ def export(args: argparse.Namespace) -> tuple[list[Path], dict]:
     from reli3d.geometry.decimate import decimate
     from reli3d.geometry.mesh import vertex_normals
     from reli3d.io.files import write_bytes
-    from reli3d.io.glb import glb_bytes, read_glb
+    from reli3d.io.glb import glb_bytes, portable, read_glb
     from reli3d.io.obj import obj_files
     from reli3d.io.usd import usdz_bytes
 
-    parts = read_glb(args.glb)
+    notes: list[str] = []
+    parts = read_glb(args.glb, notes=notes)
+    for note in notes:
+        print(f"reli3d-export: {note}", file=sys.stderr)
     if len(parts) != 1:
         raise ValueError(f"{args.glb}: expected a GLB with one surface, got {len(parts)}")
     asset, size = parts[0], args.texture_size or parts[0].textures.size
     if args.decimate is not None and len(asset.mesh.faces) > args.decimate:
         mesh = decimate(asset.mesh, args.decimate)
         asset = dressed(replace(mesh, normals=vertex_normals(mesh.vertices, mesh.faces)), asset, size)
-    elif size != asset.textures.size:
+    elif size != asset.textures.size or (args.format != "glb" and not portable(asset)):
         asset = dressed(asset.mesh, asset, size)
     name = args.glb.stem
     if args.format == "glb":

@@ -184,8 +184,11 @@ def render_files(args: argparse.Namespace) -> list[Path]:
     from reli3d.render.shading import ShadeOptions
 
     device = torch.device(args.device)
-    parts = [part.to(device) for part in read_glb(args.glb)]
-    light = Environment(torch.ones(8, 16, 3)) if args.light is None else read_environment(args.light)
+    notes: list[str] = []
+    parts = [part.to(device) for part in read_glb(args.glb, notes=notes)]
+    light = Environment(torch.ones(8, 16, 3)) if args.light is None else read_environment(args.light, notes=notes)
+    for note in notes:
+        print(f"reli3d-render: {note}", file=sys.stderr)
     environment = light.to(device)
     scene = joined_scene(parts)
     low, high = scene.vertices.amin(0), scene.vertices.amax(0)

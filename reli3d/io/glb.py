@@ -62,6 +62,13 @@ def addressing(asset: Asset) -> tuple[str, str]:
     return first, second
 
 
+def portable(asset: Asset) -> bool:
+    """Whether OBJ and USD can hold ``asset``: no vertex colors, and textures that repeat or are used within [0, 1]."""
+    uv = present("uv", asset.mesh.uv).detach()
+    inside = bool(((uv >= 0.0) & (uv <= 1.0)).all())
+    return asset.mesh.colors is None and (inside or asset.textures.wrap == ("repeat", "repeat"))
+
+
 def check_asset(asset: Asset) -> None:
     """Raise TypeError or ValueError for an asset that lacks what a file needs, or is not finite."""
     expect("asset", asset, Asset)

@@ -11,7 +11,7 @@ import io
 import numpy as np
 
 from reli3d._bridge import present
-from reli3d.io.glb import addressing, check_asset, encode_image
+from reli3d.io.glb import check_asset, encode_image, portable
 from reli3d.render.asset import Asset
 from reli3d.render.color import linear_to_srgb
 
@@ -31,17 +31,14 @@ def obj_files(asset: Asset, name: str) -> dict[str, bytes]:
     Corners share positions, normals and texture coordinates by the same index.  v goes up in OBJ, so it is turned.
     """
     check_asset(asset)
-    if asset.mesh.colors is not None:
-        raise ValueError("asset.mesh.colors: expected None, which OBJ has no place for; bake them")
-    wrap, uv = addressing(asset), present("uv", asset.mesh.uv).detach()
-    if "mirror" in wrap or ("clamp" in wrap and not bool(((uv >= 0.0) & (uv <= 1.0)).all())):
-        raise ValueError(f"asset.textures.wrap: expected repeat, which OBJ has, got {wrap}; bake the textures")
+    if not portable(asset):
+        raise ValueError("asset: expected no mesh.colors, and uv in [0, 1] or textures.wrap repeat; bake it anew")
     mesh, textures = asset.mesh, asset.textures
     text = io.StringIO()
     text.write(f"mtllib {name}.mtl\no object\n")
-    turned = uv.cpu().double().numpy() * (1, -1) + (0, 1)
+    uv = present("uv", mesh.uv).detach().cpu().double().numpy() * (1, -1) + (0, 1)
     vertices, normals = (t.detach().cpu().numpy() for t in (mesh.vertices, present("normals", mesh.normals)))
-    for word, values in (("v", vertices), ("vn", normals), ("vt", turned)):
+    for word, values in (("v", vertices), ("vn", normals), ("vt", uv)):
         np.savetxt(text, values, fmt=" ".join([word, *["%.9g"] * values.shape[1]]))
     text.write("usemtl baked\n")
     corners = np.repeat(mesh.faces.cpu().numpy() + 1, 3, axis=1)

@@ -9,7 +9,7 @@ import numpy as np
 
 from reli3d._bridge import present
 from reli3d.geometry.mesh import watertight
-from reli3d.io.glb import addressing, check_asset, texture_images
+from reli3d.io.glb import addressing, check_asset, portable, texture_images
 from reli3d.render.asset import Asset
 
 
@@ -19,8 +19,8 @@ def usdz_bytes(asset: Asset, name: str = "object") -> bytes:
     Roughness and metallic are channels of one texture, as in glTF; texture coordinates have v up, as USD has them.
     """
     check_asset(asset)
-    if asset.mesh.colors is not None:
-        raise ValueError("asset.mesh.colors: expected None, which USD's surface has no input for; bake them")
+    if not portable(asset):
+        raise ValueError("asset: expected no mesh.colors, and uv in [0, 1] or textures.wrap repeat; bake it anew")
     try:
         from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdUtils, Vt
     except ModuleNotFoundError as error:
@@ -54,10 +54,10 @@ def usdz_bytes(asset: Asset, name: str = "object") -> bytes:
         reader = _shader(stage, "st", "UsdPrimvarReader_float2")
         reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("st")
         surface = _shader(stage, "surface", "UsdPreviewSurface")
-        wrap = addressing(asset)
-        base = _texture(stage, reader, "base_color", "sRGB", wrap)
-        packed = _texture(stage, reader, "metallic_roughness", "raw", wrap)
-        normal = _texture(stage, reader, "normal", "raw", wrap)
+        wrap_s, wrap_t = addressing(asset)
+        base = _texture(stage, reader, "base_color", "sRGB", wrap_s, wrap_t)
+        packed = _texture(stage, reader, "metallic_roughness", "raw", wrap_s, wrap_t)
+        normal = _texture(stage, reader, "normal", "raw", wrap_s, wrap_t)
         normal.CreateInput("scale", Sdf.ValueTypeNames.Float4).Set(Gf.Vec4f(2, 2, 2, 1))
         normal.CreateInput("bias", Sdf.ValueTypeNames.Float4).Set(Gf.Vec4f(-1, -1, -1, 0))
         for slot, kind, source, channel in (
@@ -84,14 +84,14 @@ def _shader(stage, name: str, kind: str):
     return shader
 
 
-def _texture(stage, reader, name: str, space: str, wrap: tuple[str, str]):
+def _texture(stage, reader, name: str, space: str, wrap_s: str, wrap_t: str):
     """Shader that reads ``NAME.png`` with the texture coordinates of ``reader``."""
     from pxr import Sdf
 
     shader = _shader(stage, name, "UsdUVTexture")
     shader.CreateInput("file", Sdf.ValueTypeNames.Asset).Set(Sdf.AssetPath(f"./{name}.png"))
     shader.CreateInput("sourceColorSpace", Sdf.ValueTypeNames.Token).Set(space)
-    for side, mode in zip(("wrapS", "wrapT"), wrap, strict=True):
+    for side, mode in (("wrapS", wrap_s), ("wrapT", wrap_t)):
         shader.CreateInput(side, Sdf.ValueTypeNames.Token).Set(mode)
     shader.CreateInput("st", Sdf.ValueTypeNames.Float2).ConnectToSource(reader.ConnectableAPI(), "result")
     for channel, kind in (

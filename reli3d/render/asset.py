@@ -49,7 +49,7 @@ class TextureSet:
             roughness: Tensor | float,
             metallic: Tensor | float,
             normal: Tensor | None = None,
-            wrap: tuple[str, str] = ("repeat", "repeat"),
+            wrap: Any = ("repeat", "repeat"),  # two names; Any, because callers unpack maps
         ) -> None: ...
 
     def __post_init__(self):

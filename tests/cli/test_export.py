@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -62,6 +63,25 @@ def test_fewer_triangles_keep_the_shape_and_the_paint(glb, tmp_path, capsys):
     paint = asset.textures.base_color[uv[:, 1], uv[:, 0]]
     # a texel is 0.03 of the ball, where the paint changes by 0.012; borders of charts are a texel off
     assert float((paint - (0.5 + 0.4 * asset.mesh.vertices)).abs().mean()) < 0.03
+
+
+def test_vertex_colors_are_baked_where_the_format_has_none_and_notes_are_printed(glb, tmp_path, capsys):
+    (asset,) = read_glb(glb)
+    colors = 0.5 + 0.5 * asset.mesh.vertices.clamp(-1, 1)
+    white = torch.ones_like(asset.textures.base_color)
+    asset = replace(asset, mesh=replace(asset.mesh, colors=colors), textures=replace(asset.textures, base_color=white))
+    write_glb(tmp_path / "mesh.glb", asset)
+    data = (tmp_path / "mesh.glb").read_bytes()
+    (tmp_path / "mesh.glb").write_bytes(data.replace(b'"doubleSided":false', b'"alphaMode":"BLEND"'))
+    assert main([str(tmp_path / "mesh.glb"), "--format", "obj", "--output", str(tmp_path)]) == 0
+    assert "reli3d-export: mesh.glb: alpha is left out\n" in capsys.readouterr().err
+    shape = trimesh.load(tmp_path / "mesh.obj", process=False, force="mesh")
+    image = np.asarray(shape.visual.material.image.convert("RGB")).astype(float) / 255.0
+    row, column = ((1 - shape.visual.uv[:, 1]) * 128).astype(int), (shape.visual.uv[:, 0] * 128).astype(int)
+    got = torch.from_numpy(image[row.clip(0, 127), column.clip(0, 127)])
+    got = torch.where(got <= 0.04045, got / 12.92, ((got + 0.055) / 1.055) ** 2.4)
+    want = 0.5 + 0.5 * torch.from_numpy(np.array(shape.vertices)).clamp(-1, 1)
+    assert float((got - want).abs().mean()) < 0.03  # as above
 
 
 @pytest.mark.parametrize(
