@@ -158,7 +158,7 @@ def test_modules_import_each_other_in_no_circle():
     assert circle(sources) == []
     down = next(n for n in imports(sources["reli3d.geometry.rays"], "reli3d.geometry.rays", False) if n in sources)
     sources[down] += "\nfrom reli3d.geometry import rays\n"
-    assert set(circle(sources)) == {down, "reli3d.geometry.rays"}
+    assert {down, "reli3d.geometry.rays"} <= set(circle(sources))  # other modules may lie between the two
 
 
 def writes_to_stdout(source: str) -> list[int]:
