@@ -180,27 +180,6 @@ def composite_kernel(
 
 
 @wp.kernel
-def weights_kernel(
-    start: int,
-    # in
-    density: wp.array[float],
-    first: wp.array[wp.int32],
-    step: float,
-    # out
-    weight: wp.array[float],
-):
-    """Only as far as light comes through: ``weight`` holds zeros before."""
-    i = start + wp.tid()
-    thickness = wp.float32(0.0)
-    k = first[i]
-    while k < first[i + 1] and thickness < OPAQUE:
-        layer = step_thickness(density[k], step)
-        weight[k] = wp.exp(-thickness) * absorbed(layer)
-        thickness = thickness + layer
-        k = k + 1
-
-
-@wp.kernel
 def composite_adjoint_kernel(
     start: int,
     # in

@@ -158,15 +158,6 @@ def composite(density: Tensor, color: Tensor, samples: RaySamples) -> Composite:
     return Composite(*_Composite.apply(samples, density.contiguous(), color.contiguous()))
 
 
-def sample_weights(density: Tensor, samples: RaySamples) -> Tensor:
-    """Weight ``(S,)`` that each sample has in :func:`composite`; no gradient."""
-    _check_samples(density, samples)
-    weight = torch.zeros_like(density.detach().contiguous())
-    args = [(density.detach().contiguous(), wp.float32), (samples.first, wp.int32), samples.step, (weight, wp.float32)]
-    launch(kernels.weights_kernel, len(samples.first) - 1, args, density.device)
-    return weight
-
-
 def _check_samples(density: Tensor, samples: RaySamples) -> None:
     check("density", density, like=samples.t)
     if density.shape != samples.t.shape:

@@ -15,7 +15,7 @@ from reli3d.geometry.visibility import visible_from
 from reli3d.render import material, sampling
 from reli3d.render.bump import radial_bump
 from reli3d.render.environment import Environment
-from reli3d.render.volume import OccupancyGrid, march_rays, sample_weights
+from reli3d.render.volume import OccupancyGrid, march_rays
 from tests.support.op_cases import (
     FRAME,
     Case,
@@ -23,7 +23,6 @@ from tests.support.op_cases import (
     ball,
     corners,
     numbers,
-    packed,
     rig,
     rng,
     soup,
@@ -147,11 +146,6 @@ CASES = {
         },
         drawn,
         rows=("u", "wo", "alpha"),
-    ),
-    "sample_weights": Case(
-        lambda n: {"density": uniform(n, seed=1, low=-3.0, high=27.0)},
-        lambda density: (sample_weights(density, packed(density)),),
-        rows=("density",),
     ),
     "march_rays": Case(
         lambda n: {"origins": 2.0 * units(n, 1), "directions": units(n, 2)}, marched, rows=("origins", "directions")
