@@ -19,7 +19,7 @@ from PIL import Image
 from torch import Tensor
 
 from reli3d._bridge import present
-from reli3d.io.files import InputError, shown
+from reli3d.io.files import InputError, printable, shown
 from reli3d.io.images import above, colour, read_picture, unit
 from reli3d.views.array_cameras import NEUS, read_llff, read_neus
 from reli3d.views.background import Remover
@@ -32,7 +32,7 @@ from reli3d.views.missing_cameras import no_cameras
 from reli3d.views.normalize import near_origin
 from reli3d.views.reduce import LARGE, OBJECT, cut
 from reli3d.views.transforms import read_transforms
-from reli3d.views.views import MASK_EDGE, Views
+from reli3d.views.views import LEAST_WHOLE, MASK_EDGE, Views, touches_border
 
 MAX_VIEWS = 16
 MIN_SIDE = 8  # pixels; below it there is nothing to see, and a mistake is likely
@@ -82,21 +82,31 @@ def load_views(
     index = FolderIndex()
     frames = [replace(f, image=_existing(root, f.image, index) or f.image) for f in frames]
     files = MaskFiles(root, frames, None if masks is None else Path(masks))
-    offered = len(frames)
+    offered, names = len(frames), [frame.name for frame in frames]
     origin, moved = _origin(frames, folder)
     notes += moved
-    taken, choice = _chosen(frames, views, first_views)
-    frames = frames if every else [frames[i] for i in taken]
-    notes += choice + [note for frame in frames for note in frame.notes]
     remover = Remover() if remove_background else None
-    # decoding releases the GIL; torch is not used there, as each of these threads would start threads of its own
-    with ThreadPoolExecutor(max_workers=min(4, os.cpu_count() or 1)) as pool:
-        loaded = list(pool.map(lambda frame: _load(root, frame, files, whole, remover), frames))
+    read: dict[int, tuple[Tensor, Tensor, list[float], list[str], bool]] = {}
+    usable = list(range(len(frames)))  # for the choice: not those whose mask touches the border
+    while True:
+        taken, choice = _chosen(frames, usable, views, first_views)
+        kept = list(range(len(frames))) if every else taken
+        missing = [i for i in kept if i not in read]
+        # decoding releases the GIL; torch is not used there, as each of these threads would start threads of its own
+        with ThreadPoolExecutor(max_workers=min(4, os.cpu_count() or 1)) as pool:
+            read |= zip(missing, pool.map(lambda i: _load(root, frames[i], files, whole, remover), missing))
+        cut_off = [i for i in sorted(read) if touches_border(read[i][1])]
+        others = [i for i in usable if i not in cut_off]
+        if first_views is not None or len(others) < LEAST_WHOLE or len(others) == len(usable):
+            break
+        usable = others
+    frames, loaded = [frames[i] for i in kept], [read[i] for i in kept]
+    notes += choice + [note for frame in frames for note in frame.notes] + _cut_off(names, cut_off, usable)
     notes += [note for *_, found, _ in loaded for note in found]
     check_one_label(root, notes)
     if reduced := sum(smaller for *_, smaller in loaded):
-        kept = f"scaled down to {LARGE} pixels" if whole else f"cut to the object, at most {OBJECT} pixels of it"
-        notes.append(f"{reduced} of {len(loaded)} photographs have more than {LARGE} pixels: {kept}")
+        part = f"scaled down to {LARGE} pixels" if whole else f"cut to the object, at most {OBJECT} pixels of it"
+        notes.append(f"{reduced} of {len(loaded)} photographs have more than {LARGE} pixels: {part}")
     if remover and remover.masks:
         notes.append(f"{remover.masks} of {len(loaded)} masks made by rembg ({remover.network})")
     return Views(
@@ -150,22 +160,35 @@ def _poses(frames: list[Frame], origin: tuple[float, float, float]) -> Tensor:
     return torch.from_numpy(poses.astype(np.float32))
 
 
-def _chosen(frames: list[Frame], views: int | None, first_views: int | None) -> tuple[list[int], list[str]]:
-    """Indices of the shots for a network, and notes on the choice and on how they lie."""
-    poses, count, notes = torch.from_numpy(np.stack([f.c2w for f in frames])), len(frames), []
+def _chosen(
+    frames: list[Frame], usable: list[int], views: int | None, first_views: int | None
+) -> tuple[list[int], list[str]]:
+    """Indices of the frames for a network, of those in ``usable``, and notes on the choice and on how they lie."""
+    poses, count, notes = torch.from_numpy(np.stack([frames[i].c2w for i in usable])), len(usable), []
     if first_views is not None:
         taken = list(range(min(first_views, count)))
     elif views is not None or count > MAX_VIEWS:
         taken = choose_views(poses, views or MAX_VIEWS, apart=0.0 if views else NEAR)
         if len(taken) < count:
-            names = ", ".join(str(i) for i in taken)
+            indices = ", ".join(str(usable[i]) for i in taken)
             notes.append(
-                f"{len(taken)} of {count} views taken, farthest apart in direction and distance: {names}; "
+                f"{len(taken)} of {len(frames)} views taken, farthest apart in direction and distance: {indices}; "
                 "--first-views N takes the first N"
             )
     else:
         taken = list(range(count))
-    return taken, notes + spread_notes(poses[taken])
+    return [usable[i] for i in taken], notes + spread_notes(poses[taken])
+
+
+def _cut_off(names: list[str], cut_off: list[int], usable: list[int]) -> list[str]:
+    """Notes on the views whose mask touches the border: those left out, and those that are used all the same."""
+    notes = []
+    for left_out, what in ((True, "left out of the hull and of the choice of views"), (False, "used all the same")):
+        which = [i for i in cut_off if (i not in usable) == left_out]
+        if which:
+            some = ", ".join(f"{i} ({printable(names[i])})" for i in which[:4]) + (", ..." if len(which) > 4 else "")
+            notes.append(f"{len(which)} masks touch the image's border, where the object is cut off: {some}; {what}")
+    return notes
 
 
 def _load(

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d, pad
 
 from reli3d.views.similarity import Similarity
-from reli3d.views.views import Views, mask_box
+from reli3d.views.views import LEAST_WHOLE, Views, mask_box, touches_border
 
 RADIUS = 0.87  # half side of the network's cube
 SLACK = 1.1  # a hull of few views exceeds its object by about a tenth, so it may exceed the cube by as much
@@ -95,8 +95,12 @@ def visual_hull(views: Views) -> Hull:
 
     A cell counts where the masks' maximum over its footprint exceeds one half, so that thin parts are not lost; beyond
     the border of an image the mask goes on as at the border.  The hull is limited to the ball that the masks' width
-    suggests, which bounds it along rays that no other view crosses.
+    suggests, which bounds it along rays that no other view crosses.  Views whose mask touches the border do not count
+    where at least LEAST_WHOLE others are there.
     """
+    whole = [i for i, mask in enumerate(views.masks) if not touches_border(mask)]
+    if LEAST_WHOLE <= len(whole) < len(views):
+        views = views.select(whole)
     c2w, intrinsics = views.c2w.double().cpu(), views.intrinsics.double().cpu()
     masks = [m.cpu() for m in views.masks]
     origins, rays = c2w[:, :3, 3], centre_rays(masks, c2w, intrinsics)

@@ -17,6 +17,7 @@ from reli3d._bridge import check
 from reli3d.geometry.camera import Camera
 from reli3d.views.similarity import Similarity
 
+LEAST_WHOLE = 8  # views with the whole object, from which on those that cut it off are left out
 MASK_EDGE = 0.1  # alpha from which a pixel counts into the bounding box: keeps hair and thin wires, drops codec noise
 
 
@@ -153,6 +154,11 @@ def mask_box(mask: Tensor) -> tuple[int, int, int, int]:
     if len(rows) == 0:
         raise ValueError(f"mask: expected a pixel above {MASK_EDGE}, got an empty mask")
     return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
+
+
+def touches_border(mask: Tensor) -> bool:
+    """Whether ``mask (H, W)`` is above one half in a pixel of the image's border: the object may be cut off there."""
+    return any(bool((line > 0.5).any()) for line in (mask[0], mask[-1], mask[:, 0], mask[:, -1]))
 
 
 def _window(mask: Tensor, padding: float) -> tuple[int, int, int, int]:

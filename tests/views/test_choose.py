@@ -4,8 +4,10 @@ import itertools
 import json
 import math
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from reli3d.io.files import InputError
 from reli3d.views.choose import NEAR, choose_views, spread_notes, view_distances
@@ -97,3 +99,38 @@ def test_a_folder_of_sixty_is_read_as_its_four_distinct_views(tmp_path):
     assert len(load_views(tmp_path, views=MAX_VIEWS)) == MAX_VIEWS
     with pytest.raises(InputError, match="got both"):
         load_views(tmp_path, views=4, first_views=4)
+
+
+def cut_off(path, count, which) -> None:
+    """A folder of ``count`` views around, of which those in ``which`` show the object at the border."""
+    folder(path, rig(*[(360 * k / count, 20, 2) for k in range(count)]))
+    data = json.loads((path / "transforms.json").read_text())
+    for k, frame in enumerate(data["frames"]):
+        pixels = evil.picture()
+        frame["file_path"] = f"rgba/{k:02d}.png"
+        Image.fromarray(np.roll(pixels, evil.SIDE // 2, 1) if k in which else pixels).save(path / frame["file_path"])
+    (path / "transforms.json").write_text(json.dumps(data))
+
+
+def test_views_that_cut_the_object_off_are_left_out_while_eight_remain(tmp_path):
+    cut_off(tmp_path / "twelve", 12, (0, 3, 7))
+    others = tuple(f"rgba/{k:02d}.png" for k in range(12) if k not in (0, 3, 7))
+    named = "3 masks touch the image's border, where the object is cut off: 0 (rgba/00.png), 3 (rgba/03.png), 7"
+    views = load_views(tmp_path / "twelve")
+    assert views.names == others and views.in_folder == 12
+    (note,) = (n for n in views.notes if n.startswith(named))
+    assert note.endswith("; left out of the hull and of the choice of views")
+    every = load_views(tmp_path / "twelve", every=True)
+    assert len(every) == 12 and every.taken().names == others
+    assert set(load_views(tmp_path / "twelve", views=4).names) <= set(others)
+    first = load_views(tmp_path / "twelve", first_views=4)  # as asked for
+    assert len(first) == 4 and any(n.endswith("; used all the same") for n in first.notes)
+    cut_off(tmp_path / "ten", 10, (0, 3, 7))  # seven others
+    views = load_views(tmp_path / "ten")
+    assert len(views) == 10 and any(n.startswith(named) and n.endswith("; used all the same") for n in views.notes)
+
+
+def test_of_many_views_those_that_cut_the_object_off_are_replaced(tmp_path):
+    cut_off(tmp_path, 24, range(0, 24, 3))
+    views = load_views(tmp_path)
+    assert len(views) == 16 and not any(int(name[5:7]) % 3 == 0 for name in views.names)

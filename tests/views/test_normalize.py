@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -158,6 +159,19 @@ def test_an_object_cut_by_the_border_is_not_lost():
     hull = visual_hull(views)
     assert len(hull.points) > 1000
     assert float(hull.points.norm(dim=-1).max()) < 2.2
+
+
+def test_views_that_cut_the_object_off_do_not_carve_the_hull():
+    """One of nine masks, shifted to the border, would leave a part of the hull; with seven others it still counts."""
+    views = sphere_views(count=9)
+    wrong = torch.zeros_like(views.masks[4])
+    wrong[:, :60] = views.masks[4][:, 60:]
+    wrong[40:44, 0] = 1.0
+    cut = replace(views, masks=(*views.masks[:4], wrong, *views.masks[5:]))
+    rest = [i for i in range(9) if i != 4]
+    assert torch.equal(visual_hull(cut).points, visual_hull(views.select(rest)).points)
+    fewer = rest[:7]
+    assert len(visual_hull(cut.select([*fewer, 4])).points) != len(visual_hull(cut.select(fewer)).points)
 
 
 def test_rays_meet():
