@@ -22,12 +22,14 @@ from reli3d.io.images import write_png
 from reli3d.views.normalize import AT_EYE, RADIUS, Hull, centre_rays, meeting_point, normalize, visual_hull
 from reli3d.views.views import Views
 
-GOOD = 0.8  # share of every mask that the hull of right cameras fills; masks a few pixels off still reach 0.9
-CLEAN = 0.97  # mean share from which no mistake is looked for
+MIN_FILLED = 0.8  # fraction of every mask that the hull of right cameras fills; masks a few pixels off still reach 0.9
+SURELY_FILLED = 0.97  # mean fraction from which no mistake is looked for
 BETTER = 3.0  # an alternative is named where it leaves that many times less of the masks unfilled
-TOLD = 0.1  # mean squared sine by which the up axis must be nearer to the horizon's than another: 18 degrees about it
+UP_MARGIN = (
+    0.1  # mean squared sine by which the up axis must be nearer to the horizon's than another: 18 degrees about it
+)
 NEAR_AXIS = 0.94  # cosine, 20 degrees: what is farther from every axis no --up puts right
-BORDER = 0.6  # share of the image border inside the mask from which the mask looks inverted
+INVERTED_BORDER = 0.6  # fraction of the image border inside the mask from which the mask looks inverted
 
 _FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
 _HALF_TURN = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0]))
@@ -35,7 +37,7 @@ _HALF_TURN = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0]))
 
 def explain_cameras(views: Views) -> list[str]:
     """One line per view, one on the up axis where it is not +Y, and last the :func:`verdict` on the cameras."""
-    hull, shares = agreement(views)
+    hull, filled = agreement(views)
     c2w, intrinsics = views.c2w.double().cpu(), views.intrinsics.double().cpu()
     rays = centre_rays([m.cpu() for m in views.masks], c2w, intrinsics)
     target = hull.points.mean(0) if len(hull.points) else meeting_point(c2w[:, :3, 3], rays)[0]
@@ -50,12 +52,12 @@ def explain_cameras(views: Views) -> list[str]:
         lines.append(
             f"view {i} {printable(name)}: {width} x {height}, field of view {fov[0]:.1f} x {fov[1]:.1f} deg, "
             f"eye {_triple(c2w[i, :3, 3])}, {float(away.norm()):.3g} from the meeting point ({side}), "
-            f"mask {100 * cover:.0f} % of the image, hull fills {100 * shares[i]:.0f} % of it"
+            f"mask {100 * cover:.0f} % of the image, hull fills {100 * filled[i]:.0f} % of it"
         )
     axis = up_axis(views.c2w)
     if axis not in (None, "y"):
         lines.append(f"up: the cameras stand upright about {axis}, not y; give --up {axis}")
-    return [*lines, _verdict(views, hull, shares)]
+    return [*lines, _verdict(views, hull, filled)]
 
 
 def verdict(views: Views) -> str:
@@ -64,7 +66,7 @@ def verdict(views: Views) -> str:
 
 
 def up_axis(c2w: Tensor) -> str | None:
-    """The axis (``y``, ``-z``, ...) that is up for cameras held upright; None where they do not tell.
+    """The axis (``y``, ``-z``, ...) that is up for cameras held upright; None where they leave it open.
 
     c2w: ``(V, 4, 4)``.  A camera held upright has its right axis on the horizon: up is the direction most nearly at
     right angles to all of them, on the side of the cameras' own up axes.
@@ -72,7 +74,7 @@ def up_axis(c2w: Tensor) -> str | None:
     right, above = c2w[:, :3, 0].double().cpu(), c2w[:, :3, 1].double().cpu().mean(0)
     spread, directions = torch.linalg.eigh(right.T @ right / len(right))
     up = directions[:, 0] * torch.sign(directions[:, 0] @ above)
-    if float(spread[1] - spread[0]) < TOLD or float(up @ above) < TOLD:
+    if float(spread[1] - spread[0]) < UP_MARGIN or float(up @ above) < UP_MARGIN:
         return None
     k = int(up.abs().argmax())
     return ("" if up[k] > 0 else "-") + "xyz"[k] if float(up.abs()[k]) > NEAR_AXIS else None
@@ -83,7 +85,7 @@ def _triple(values: Tensor) -> str:
 
 
 def agreement(views: Views) -> tuple[Hull, list[float]]:
-    """The visual hull and the share of each mask that its silhouette fills, all 0 where the hull is empty."""
+    """The visual hull and the fraction of each mask that its silhouette fills, all 0 where the hull is empty."""
     hull = visual_hull(views)
     if len(hull.points) == 0:
         return hull, [0.0] * len(views)
@@ -144,35 +146,35 @@ def _alternatives(views: Views):
         yield what, "store them as they were calibrated", _quarter_turn(views, sign)
 
 
-def _verdict(views: Views, hull: Hull, shares: list[float]) -> str:
+def _verdict(views: Views, hull: Hull, filled: list[float]) -> str:
     border = min(float((torch.cat([m[0], m[-1], m[:, 0], m[:, -1]]) > 0.5).float().mean()) for m in views.masks)
-    if border > BORDER:
+    if border > INVERTED_BORDER:
         return (
             f"suspect: the masks look inverted (they cover {100 * border:.0f} % of the image border); "
             "make the object white, the background black"
         )
     if len(views) == 1:
         return _single(views, hull)
-    given = sum(shares) / len(shares)
+    given = sum(filled) / len(filled)
     cause, fix, best = "", "", 1.0 - (1.0 - given) / BETTER
-    for what, how, other in _alternatives(views) if given < CLEAN else ():
+    for what, how, other in _alternatives(views) if given < SURELY_FILLED else ():
         score = sum(agreement(other)[1]) / len(views)
-        if score >= max(best, GOOD):
+        if score >= max(best, MIN_FILLED):
             cause, fix, best = what, how, score
     if cause:
         return (
             f"suspect: {cause}; {fix} (the hull then fills {100 * best:.0f} % of the masks instead of "
             f"{100 * given:.0f} %)"
         )
-    if min(shares) >= GOOD:
+    if min(filled) >= MIN_FILLED:
         low, high = hull.box()
         size = " x ".join(f"{v:.3g}" for v in (high - low).tolist())
         return (
-            f"cameras agree: the visual hull fills at least {100 * min(shares):.0f} % of every mask; its box is {size} "
+            f"cameras agree: the visual hull fills at least {100 * min(filled):.0f} % of every mask; its box is {size} "
             f"about {_triple((low + high) / 2)}; {_scaling(views)}"
         )
     for i in range(len(views) if len(views) > 2 else 0):
-        if min(agreement(views.select([j for j in range(len(views)) if j != i]))[1]) >= GOOD:
+        if min(agreement(views.select([j for j in range(len(views)) if j != i]))[1]) >= MIN_FILLED:
             return (
                 f"suspect: view {i} ({printable(views.names[i])}) does not agree with the others, which agree without "
                 "it; check its camera and mask, or leave it out"
@@ -189,7 +191,7 @@ def _verdict(views: Views, hull: Hull, shares: list[float]) -> str:
             "object, or the masks show different things"
         )
     return (
-        f"suspect: the visual hull fills only {100 * min(shares):.0f} % of a mask: cameras or masks are inaccurate, or "
+        f"suspect: the visual hull fills only {100 * min(filled):.0f} % of a mask: cameras or masks are inaccurate, or "
         "the object moved; look at the picture of the rig"
     )
 
@@ -199,7 +201,7 @@ def _single(views: Views, hull: Hull) -> str:
     if float(pose[:3, 3] @ pose[:3, 2]) < 0:  # positive where the origin lies before an OpenGL camera
         return (
             "suspect: the camera looks away from the origin: its axes may be flipped (OpenCV given, OpenGL expected), "
-            "or its matrix world-to-camera; one view cannot tell"
+            "or its matrix world-to-camera; one view leaves it open"
         )
     if len(hull.points) == 0:
         return "suspect: no point lies inside the mask; check the field of view and the mask"
@@ -223,7 +225,7 @@ def rig_picture(views: Views, path: str | os.PathLike) -> None:
     On the thumbnails the mask's outline is green and the hull's cells are red dots.  Raises OSError where ``path``
     cannot be written.
     """
-    hull, shares = agreement(views)
+    hull, filled = agreement(views)
     c2w, intrinsics = views.c2w.double().cpu(), views.intrinsics.double().cpu()
     target = hull.points.mean(0) if len(hull.points) else hull.aim
     eyes = c2w[:, :3, 3]
@@ -243,7 +245,7 @@ def rig_picture(views: Views, path: str | os.PathLike) -> None:
     for i in range(len(views)):
         at = (MARGIN + i % columns * (THUMB + MARGIN), PANEL + 2 * MARGIN + i // columns * (THUMB + 18 + MARGIN))
         canvas.paste(_thumbnail(views, hull, i), at)
-        label = f"{i} {os.path.basename(views.names[i])[:18]}  {100 * shares[i]:.0f} %"
+        label = f"{i} {os.path.basename(views.names[i])[:18]}  {100 * filled[i]:.0f} %"
         ImageDraw.Draw(canvas).text((at[0], at[1] + THUMB + 2), _latin(label), fill=_COLOURS[i % len(_COLOURS)])
     write_png(path, np.asarray(canvas))
 

@@ -71,7 +71,7 @@ def spread_notes(c2w: Tensor) -> list[str]:
         which = ", ".join(str(i) for i in again.nonzero()[:, 0].tolist()[:8]) + (", ..." if again.sum() > 8 else "")
         notes.append(
             f"{int(again.sum())} of {len(c2w)} views lie within {math.degrees(NEAR):.0f} degrees of an "
-            f"earlier one and tell little more: {which}"
+            f"earlier one and add little: {which}"
         )
     widest = float(angle.max())
     if len(c2w) > 1 and widest < NARROW:

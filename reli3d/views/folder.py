@@ -226,10 +226,10 @@ def _load(
     part = cut(picture.size, above(mask, MASK_EDGE), whole=whole)
     if part is not None:
         picture, mask, camera = part.pixels(picture), part.pixels(mask), part.intrinsics(camera)
-    image, share = colour(picture), unit(mask)
-    if looks_premultiplied(image.numpy(), share):
+    image, alpha = colour(picture), unit(mask)
+    if looks_premultiplied(image.numpy(), alpha):
         notes.append(f"{path.name}: the colour looks multiplied by alpha, edges will be dark; save straight alpha")
-    return image, torch.from_numpy(share), camera, notes, part is not None
+    return image, torch.from_numpy(alpha), camera, notes, part is not None
 
 
 def looks_premultiplied(image: np.ndarray, mask: np.ndarray) -> bool:
@@ -237,7 +237,7 @@ def looks_premultiplied(image: np.ndarray, mask: np.ndarray) -> bool:
 
     Of a straight image with a bright object the faint edge pixels are brighter than their alpha.
     """
-    if (image[::8, ::8].max(-1)[mask[::8, ::8] < 0.02] > 0.02).any():  # a background: the usual case, seen by a few
+    if (image[::8, ::8].max(-1)[mask[::8, ::8] < 0.02] > 0.02).any():  # a background: the usual case, found in a few
         return False
     edge = mask > 0.02
     if not (edge & (mask < 0.5)).any():  # a binary mask

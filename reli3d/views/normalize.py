@@ -1,4 +1,4 @@
-"""From the frame of the input cameras to the frame of the network: the coarse visual hull says where the object is."""
+"""From the frame of the input cameras to the frame of the network: the coarse visual hull locates the object."""
 
 from __future__ import annotations
 

@@ -30,21 +30,6 @@ class Similarity:
         """The map that changes nothing."""
         return Similarity(1.0, torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
 
-    @staticmethod
-    def from_matrix(matrix: Tensor) -> Similarity:
-        """The map of a 4x4 ``matrix``.  Raises ValueError unless it is a rotation with one positive scale."""
-        m = torch.as_tensor(matrix, dtype=torch.float64)
-        if m.shape != (4, 4) or not bool(torch.isfinite(m).all()):
-            raise ValueError(f"matrix: expected finite numbers of shape (4, 4), got {tuple(m.shape)}")
-        determinant = float(torch.linalg.det(m[:3, :3]))
-        scale = determinant ** (1 / 3) if determinant > 0 else 0.0
-        gram = m[:3, :3].T @ m[:3, :3]
-        last = m[3] - m.new_tensor([0.0, 0.0, 0.0, 1.0])
-        # 1e-5: a matrix that was stored in float32
-        if scale == 0 or float((gram - scale**2 * torch.eye(3)).abs().max()) > 1e-5 * scale**2 or bool(last.any()):
-            raise ValueError("matrix: expected a rotation times a positive scale, got a shear, a mirror or worse")
-        return Similarity(scale, m[:3, :3] / scale, m[:3, 3].clone())
-
     def matrix(self) -> Tensor:
         """``(4, 4)`` float64 matrix on column vectors."""
         rows = torch.cat([self.scale * self.rotation, self.translation[:, None]], -1)
