@@ -32,7 +32,7 @@ from reli3d.nn.weights import Network, load_model
 from reli3d.prepare import Prepared, completed, prepare, published_input
 from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.environment import Environment
-from reli3d.render.exposure import estimate_paint_and_light
+from reli3d.render.exposure import estimate_base_color_and_light
 from reli3d.render.latlong import lat_long_directions
 from reli3d.views.normalize import FAR, normalize
 from reli3d.views.published_views import background_shown, hero_first, placement_notes
@@ -211,7 +211,7 @@ def match_brightness(asset: Asset, maps: ViewMaps, scene: RayScene) -> Asset:
     Photographs determine only the product of paint and light; see :mod:`reli3d.render.exposure`.
     """
     maps = maps.photographs
-    return estimate_paint_and_light(asset, maps.images[..., :3], maps.images[..., 3] > INSIDE, maps.camera, scene)
+    return estimate_base_color_and_light(asset, maps.images[..., :3], maps.images[..., 3] > INSIDE, maps.camera, scene)
 
 
 def transform_asset(asset: Asset, similarity: Similarity) -> Asset:

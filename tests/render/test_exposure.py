@@ -9,7 +9,7 @@ from reli3d.render import exposure
 from reli3d.render.asset import Asset
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
-from reli3d.render.exposure import TINT, estimate_paint_and_light, paint_factor, photograph_ratio
+from reli3d.render.exposure import TINT, base_color_factor, estimate_base_color_and_light, photograph_ratio
 from tests.support.scenes import ball, textures
 
 SIZE = (160, 224)
@@ -81,7 +81,7 @@ def painted(device, scene, *color):
 
 def factor(asset, images, inside, camera):
     rays = RayScene(asset.mesh.vertices, asset.mesh.faces)
-    return paint_factor(asset, images, inside, camera, rays).cpu()
+    return base_color_factor(asset, images, inside, camera, rays).cpu()
 
 
 def test_the_tint_of_photographs_goes_to_the_light(device, scene):
@@ -98,13 +98,15 @@ def test_the_tint_of_photographs_goes_to_the_light(device, scene):
 
 def test_the_likeliest_paint_is_the_mean_of_three_normal_distributions(device, scene):
     """Where paint, light and guess are at the prior means nothing changes; else each pulls by its weight."""
-    prior = float(torch.tensor(exposure.PAINT).exp())
+    prior = float(torch.tensor(exposure.ALBEDO).exp())
     lit = prior * float(torch.tensor(exposure.LIGHT).exp())
     asset, camera, inside = painted(device, scene, prior, prior, prior)
     # two conversions to sRGB and back in float32
     plain = factor(asset, photographs(device, lit, lit, lit), inside, camera)
     torch.testing.assert_close(plain, torch.ones(3), rtol=1e-4, atol=0)
-    shares = torch.tensor([s**-2.0 for s in (exposure.PAINT_SPREAD, exposure.LIGHT_SPREAD, exposure.GUESS_SPREAD)])
+    shares = torch.tensor(
+        [s**-2.0 for s in (exposure.ALBEDO_SPREAD, exposure.LIGHT_SPREAD, exposure.PREDICTION_SPREAD)]
+    )
     shares = shares / shares.sum()
     dark = factor(asset, photographs(device, *3 * [lit / 3]), inside, camera)
     torch.testing.assert_close(dark, torch.full((3,), float((1 / 3) ** shares[1])), rtol=1e-4, atol=0)
@@ -126,7 +128,7 @@ def test_the_estimated_asset_shows_the_photographs_colour(device, scene):
     asset, camera, inside = painted(device, scene, 0.03, 0.1, 0.15)
     images = photographs(device, 0.010, 0.013, 0.018)
     rays = RayScene(asset.mesh.vertices, asset.mesh.faces)
-    after = estimate_paint_and_light(asset, images, inside, camera, rays)
+    after = estimate_base_color_and_light(asset, images, inside, camera, rays)
     found = photograph_ratio(after, images, inside, camera, rays).cpu()
     # same seed and samples, so only the tint that the light may not take, and BLACK, are left
     torch.testing.assert_close(found, torch.ones(3), rtol=0.1, atol=0)
