@@ -23,7 +23,7 @@ from reli3d.render.shading import (
     struct_of_points,
 )
 
-SCOUTED = 16384  # points looked at with one sample of each strategy, to find those that matter
+SCOUTED = 16384  # points of a first pass with one sample of each strategy, among which the pilot's are drawn
 PILOT_SAMPLES = 24576  # then, in all; an image of 512 x 512, half of it covered, takes 8.4 million
 PILOT_POINTS = 256  # so at least 32 samples of each strategy for each of them
 TRIED = 1024  # points, some of them more than once, that a mixture and its rival are tried at
@@ -72,21 +72,21 @@ def plan_samples(
         raise ValueError("position: expected at least one point, got none")
     if int(total) != total or total < 1:
         raise ValueError(f"total: expected a count of at least 1, got {total}")
-    rows, share = _pilot_points(values, environment, scene, options)
+    rows, weights = _pilot_points(values, environment, scene, options)
     values = [v[rows] for v in values]
     drawn = _draw(values, environment, PILOT_SAMPLES // (3 * len(rows)), scene, options)
     if relative:
         radiance = drawn[0].sum(1).mean(1)
-        share = share / (radiance.square() + (DARK * (share @ radiance)) ** 2).clamp(min=1e-30)
-    counts = _splits(int(total)).to(share.device)
-    variance = _variances(*drawn, share, counts)
+        weights = weights / (radiance.square() + (DARK * (weights @ radiance)) ** 2).clamp(min=1e-30)
+    counts = _splits(int(total)).to(weights.device)
+    variance = _variances(*drawn, weights, counts)
     finer = counts[variance.argmin()] + _MOVES.to(counts) * max(1, int(total) // 16)
     finer = finer[(finer >= 0.0).all(1)]
-    counts, variance = torch.cat([counts, finer]), torch.cat([variance, _variances(*drawn, share, finer)])
+    counts, variance = torch.cat([counts, finer]), torch.cat([variance, _variances(*drawn, weights, finer)])
     alone = (counts > 0.0).sum(1) == 1
     best, single = int(variance.argmin()), int(torch.where(alone, variance, torch.inf).argmin())
     if best != single and float(variance[single]) < RIVAL * float(variance[best]):
-        mixture, one = (_tried(values, share, environment, counts[k], scene, options) for k in (best, single))
+        mixture, one = (_tried(values, weights, environment, counts[k], scene, options) for k in (best, single))
         best = best if mixture < PREFER_ONE * one else single
     return SamplePlan(_whole(counts[best]), float(variance[best]))
 
@@ -145,15 +145,15 @@ def _draw(
     return value.double(), density, density / (density.sum(1) + lost)[:, None]
 
 
-def _tried(values: list[Tensor], share: Tensor, environment, counts: Tensor, scene, options: ShadeOptions) -> float:
-    """Variance of a point, mean by ``share (P,)``, that :func:`reli3d.render.shading.shade` has with ``counts``."""
-    runs = TRIED // len(share)
+def _tried(values: list[Tensor], weights: Tensor, environment, counts: Tensor, scene, options: ShadeOptions) -> float:
+    """Variance of a point, mean by ``weights (P,)``, that :func:`reli3d.render.shading.shade` has with ``counts``."""
+    runs = TRIED // len(weights)
     position, normal, ng, wo, *material = (v.repeat(runs, *[1] * (v.ndim - 1)) for v in values)
     options = replace(
         options, samples=_whole(counts), antithetic="none", alpha="linear", heuristic="balance", clamp=None
     )
     drawn = shade(SurfacePoints(position, ng, normal, *material), wo, environment, scene=scene, options=options)
-    return float(share @ drawn.double().unflatten(0, (runs, -1)).var(0).sum(1))
+    return float(weights @ drawn.double().unflatten(0, (runs, -1)).var(0).sum(1))
 
 
 def _whole(counts: Tensor) -> tuple[int, int, int]:
@@ -171,8 +171,8 @@ def _splits(total: int) -> Tensor:
 _MOVES = torch.tensor([[1, -1, 0], [-1, 1, 0], [1, 0, -1], [-1, 0, 1], [0, 1, -1], [0, -1, 1]])
 
 
-def _variances(value: Tensor, density: Tensor, weight: Tensor, share: Tensor, counts: Tensor) -> Tensor:
-    """Variance of a point, mean by ``share (P,)``, for each of ``counts (C, 3)``; the others from :func:`_draw`."""
+def _variances(value: Tensor, density: Tensor, weight: Tensor, weights: Tensor, counts: Tensor) -> Tensor:
+    """Variance of a point, mean by ``weights (P,)``, for each of ``counts (C, 3)``; the others from :func:`_draw`."""
     points, samples = value.shape[:2]
     total = torch.zeros(len(counts), dtype=torch.float64, device=counts.device)
     size = max(1, BLOCK // (samples * len(counts)))
@@ -181,5 +181,5 @@ def _variances(value: Tensor, density: Tensor, weight: Tensor, share: Tensor, co
         inverse = 1.0 / (counts @ p.mT).clamp(min=1e-30)  # (P, C, S): the pilot's q over the candidate's
         square = (counts @ (w * v.square().sum(2, keepdim=True)).mT * inverse.square()).sum(2)
         mean = (inverse @ (w[..., None] * v[:, :, None]).flatten(2)).unflatten(2, (3, 3))  # strategy, channel
-        total += share[first : first + size] @ (square - (counts * mean.square().sum(3)).sum(2))
+        total += weights[first : first + size] @ (square - (counts * mean.square().sum(3)).sum(2))
     return total

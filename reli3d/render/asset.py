@@ -1,4 +1,4 @@
-"""What a reconstruction gives and a renderer takes: a mesh, its textures and a light."""
+"""Asset: a mesh, its textures and a light."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from typing import Any
 
-FLAT = (0.5, 0.5, 1.0)  # a normal map's texel where nothing is bent
+FLAT = (0.5, 0.5, 1.0)  # texel of a normal map without perturbation
 WRAPS = ("repeat", "mirror", "clamp")  # glTF's REPEAT, MIRRORED_REPEAT, CLAMP_TO_EDGE
 KEPT = 2048  # texels a side up to which lookups are kept: 50 MB
 
@@ -41,7 +41,7 @@ class TextureSet:
     normal: Tensor = None  # type: ignore[assignment] # flat after construction
     wrap: tuple[str, str] = ("repeat", "repeat")
 
-    if TYPE_CHECKING:  # what a caller may give, beside what the fields hold
+    if TYPE_CHECKING:  # types that the constructor accepts
 
         def __init__(
             self,

@@ -1,6 +1,6 @@
 """Distant light as a lat-long map: lookup with gradients, importance table, sampling.
 
-The mapping is that of :mod:`reli3d.render.latlong`: row 0 is +Y, the centre column +X, right of it +Z.
+The mapping is that of :mod:`reli3d.render.latlong`: row 0 is +Y, the center column +X, right of it +Z.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class EnvironmentTable:
 class Environment:
     """Distant light as a lat-long map: ``radiance (H, W, 3)``, normally W = 2 H, linear Rec. 709.
 
-    Row 0 is +Y, the centre column +X, right of it +Z.  ``.lookup(directions)``, ``.rotated(yaw)``,
+    Row 0 is +Y, the center column +X, right of it +Z.  ``.lookup(directions)``, ``.rotated(yaw)``,
     ``.resized(height)``, ``.sample(u)``, ``.pdf(directions)``, ``.irradiance()``.  Gradients reach the texels.  The
     sampling table is made once, on first use: do not edit ``radiance`` in place afterwards.  Raises TypeError for a
     dtype, ValueError for a shape.
@@ -73,7 +73,7 @@ class Environment:
         return cls(rgb.expand(height, 2 * height, 3).contiguous())
 
     def to(self, device: torch.device | str) -> Environment:
-        """The same light on ``device``; this very one where it is there, with its table."""
+        """The same light on ``device``; ``self``, with its table, if it is there already."""
         return self if torch.device(device) == self.radiance.device else Environment(self.radiance.to(device))
 
     def detach(self) -> Environment:
@@ -81,7 +81,7 @@ class Environment:
         return Environment(self.radiance.detach())
 
     def lookup(self, directions: Tensor) -> Tensor:
-        """Radiance ``(..., 3)`` from unit ``directions (..., 3)``: bilinear between texel centres, periodic in azimuth.
+        """Radiance ``(..., 3)`` from unit ``directions (..., 3)``: bilinear between texel centers, periodic in azimuth.
 
         Gradients reach the texels and the directions (not at a pole, where the azimuth has none).
         """
@@ -172,7 +172,7 @@ class Environment:
 
 
 class _Lookup(torch.autograd.Function):
-    """Own backward: Warp's adjoint would go through the direction's angles where only texels are wanted."""
+    """Own backward: Warp's adjoint would go through the direction's angles where only the texels need a gradient."""
 
     @staticmethod
     def forward(ctx, radiance: Tensor, directions: Tensor) -> Tensor:
@@ -186,12 +186,12 @@ class _Lookup(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, g_out: Tensor):
         radiance, directions = ctx.saved_tensors
-        n, device, wanted = directions.shape[0], directions.device, ctx.needs_input_grad
+        n, device, needed = directions.shape[0], directions.device, ctx.needs_input_grad
         height, width = radiance.shape[:2]
         least = max(SLICE_MIN, height * width)  # a slice's own accumulator must not cost more than its lookups
         parts = slices(n, least) if device.type == "cpu" else [(0, n)]
-        g_radiance = torch.zeros(len(parts), height if wanted[0] else 0, width, 3, device=device)
-        g_directions = torch.empty(n if wanted[1] else 0, 3, device=device)
+        g_radiance = torch.zeros(len(parts), height if needed[0] else 0, width, 3, device=device)
+        g_directions = torch.empty(n if needed[1] else 0, 3, device=device)
         ins = [(radiance, wp.vec3), (directions, wp.vec3), (g_out.contiguous(), wp.vec3)]
 
         def work(k, start, count):
@@ -202,7 +202,7 @@ class _Lookup(torch.autograd.Function):
             over_slices(n, work, slice_min=least)
         elif n:
             work(0, 0, n)
-        return g_radiance.sum(0) if wanted[0] else None, g_directions if wanted[1] else None
+        return g_radiance.sum(0) if needed[0] else None, g_directions if needed[1] else None
 
 
 def _cdf(weight: Tensor) -> Tensor:

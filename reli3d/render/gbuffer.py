@@ -1,4 +1,4 @@
-"""Primary visibility and what is seen there: hits of a camera, textures and materials at hits, with gradients."""
+"""Primary visibility: hits of a camera, textures and materials at hits, with gradients."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from reli3d.render.points import SurfacePoints
 
 
 def primary_hits(scene: RayScene, camera: Camera) -> tuple[Hits, Tensor, Tensor]:
-    """Closest hits ``(..., H, W)`` through the pixel centres, and the rays' origins and unit directions."""
+    """Closest hits ``(..., H, W)`` through the pixel centers, and the rays' origins and unit directions."""
     origins, directions = camera_rays(camera)
     return scene.closest(origins, directions), origins, directions
 

@@ -124,9 +124,10 @@ def render_lights(
     scene: RayScene | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> list[Render]:
-    """:func:`render_asset` under each of ``environments``, the same bits; what the camera sees is looked up once.
+    """:func:`render_asset` under each of ``environments``, bitwise identical.
 
-    The images share all layers but ``radiance``.  The other arguments are those of :func:`render_asset`.
+    Primary hits and materials are evaluated once.  The images share all layers but ``radiance``.  The other arguments
+    are those of :func:`render_asset`.
     """
     parts, lights = _checked(asset, camera, environments)
     if background not in ("transparent", "environment"):
@@ -176,7 +177,7 @@ def plan_render(
     plans for points among those that 32768 rays of the camera hit.  No gradient.  Raises ValueError without any
     environment and where the camera sees nothing.
     """
-    from reli3d.render.allocation import plan_samples, spread_rows  # not before: few pictures have a plan
+    from reli3d.render.allocation import plan_samples, spread_rows  # lazily: few images have a plan
 
     parts, (light,) = _checked(asset, camera, (environment,))
     scene = scene if scene is not None else joined_scene(parts)

@@ -1,8 +1,8 @@
 """Lat-long maps: directions of texels, texels of directions, solid angles.
 
-A map has H rows and W columns, normally W = 2 H.  Row 0 is +Y; the centre column looks to +X and right of it lies +Z:
+A map has H rows and W columns, normally W = 2 H.  Row 0 is +Y; the center column looks to +X and right of it lies +Z:
 with phi = 2 pi (u - 1/2) and theta = pi v the direction is (cos phi sin theta, cos theta, sin phi sin theta).  Texel
-centres are at u = (column + 1/2) / W, v = (row + 1/2) / H.  ``reli3d.kernels.envmap`` has the same mapping for kernels.
+centers are at u = (column + 1/2) / W, v = (row + 1/2) / H.  ``reli3d.kernels.envmap`` has the same mapping for kernels.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ def lat_long_directions(
     device: torch.device | str | None = None,
     dtype: torch.dtype = torch.float32,
 ) -> Tensor:
-    """Unit directions ``(height, width, 3)`` of the texel centres, rounded from float64; ``width`` is 2 ``height``."""
+    """Unit directions ``(height, width, 3)`` of the texel centers, rounded from float64; ``width`` is 2 ``height``."""
     width = 2 * height if width is None else width
     phi = (torch.arange(width, dtype=torch.float64, device=device) + 0.5) * (2.0 * math.pi / width) - math.pi
     theta = ((torch.arange(height, dtype=torch.float64, device=device) + 0.5) * (math.pi / height))[:, None]
@@ -47,7 +47,7 @@ def texel_solid_angles(height: int, width: int, device: torch.device | None = No
 def quarter_turn(maps: Tensor, quarters: int) -> Tensor:
     """``maps (..., H, W, C)`` with columns moved right by ``quarters`` quarters of the width.
 
-    By -1 a map whose centre column looks to -Z, as published, gets +X there.  Raises ValueError unless W is a multiple
+    By -1 a map whose center column looks to -Z, as published, gets +X there.  Raises ValueError unless W is a multiple
     of 4.
     """
     width = maps.shape[-2]

@@ -1,6 +1,6 @@
 """Two lights of the package's own: a studio and an open sky, by formulas.
 
-Both have a mean radiance of 1 over the sphere, so that paint shows about as bright as it is.
+Both have a mean radiance of 1 over the sphere, so that a matte surface has about the radiance of its albedo.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from reli3d.render.environment import Environment
 from reli3d.render.latlong import lat_long_directions, texel_solid_angles
 
 SUN_RADIUS = 0.055  # rad, twelve times the real one: a texel of a small map is 0.05 wide
-SUN_SHARE = 0.45  # of all the light
+SUN_FRACTION = 0.45  # of the total radiance
 SOFTBOXES = (  # direction of the middle, half width and half height [tangents of angles], radiance
     ((-0.75, 0.5, 0.6), 0.45, 0.6, (9.0, 8.8, 8.4)),  # key
     ((0.9, 0.25, 0.35), 0.16, 0.8, (3.6, 3.8, 4.2)),  # strip
@@ -51,7 +51,7 @@ def sky(height: int = 64) -> Environment:
     sun = normalize(torch.tensor([0.5, math.sin(math.radians(40.0)), 0.58]), dim=0)
     away = torch.linalg.cross(d, sun.expand_as(d)).norm(dim=-1).atan2(d @ sun)
     disc = torch.sigmoid((SUN_RADIUS - away) * (2.0 * height / math.pi))[..., None] * torch.tensor([1.0, 0.9, 0.75])
-    return _of_mean_one(light / _mean(light) + disc / _mean(disc) * (SUN_SHARE / (1.0 - SUN_SHARE)))
+    return _of_mean_one(light / _mean(light) + disc / _mean(disc) * (SUN_FRACTION / (1.0 - SUN_FRACTION)))
 
 
 LIGHTS = {"studio": studio, "sky": sky}

@@ -1,4 +1,4 @@
-"""Points of surfaces with their material: what is shaded."""
+"""Surface points with their material."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class SurfacePoints:
     roughness: Tensor
     metallic: Tensor
 
-    if TYPE_CHECKING:  # what a caller may give, beside what the fields hold
+    if TYPE_CHECKING:  # types that the constructor accepts
 
         def __init__(
             self,
@@ -92,14 +92,14 @@ def check_values(points: SurfacePoints, wo: Tensor) -> None:
     given = {f.name: getattr(points, f.name).detach() for f in fields(points)} | {"wo": wo.detach()}
     for name, value in given.items():
         if name in NUMBERS:
-            bad, wanted = ~((value >= 0.0) & (value <= 1.0)), "values in [0, 1]"
+            bad, expected = ~((value >= 0.0) & (value <= 1.0)), "values in [0, 1]"
         elif name == "position":
-            bad, wanted = ~torch.isfinite(value), "finite values"
+            bad, expected = ~torch.isfinite(value), "finite values"
         else:
-            bad, wanted = ~((value.norm(dim=1) - 1.0).abs() <= UNIT), "unit vectors"
+            bad, expected = ~((value.norm(dim=1) - 1.0).abs() <= UNIT), "unit vectors"
         rows = bad.reshape(len(value), -1).any(1).nonzero()
         if len(rows):
-            raise ValueError(f"{name}: expected {wanted}, got {value[rows[0, 0]].tolist()} in row {int(rows[0, 0])}")
+            raise ValueError(f"{name}: expected {expected}, got {value[rows[0, 0]].tolist()} in row {int(rows[0, 0])}")
 
 
 def of_rows(name: str, value: Tensor | float, position: Tensor, last: int) -> Tensor:

@@ -41,7 +41,7 @@ CHOICES = {
     "diffuse_model": DIFFUSE_MODELS,
 }
 CHUNK_RAYS = 65536  # shadow rays of a chunk and their values take 2.6 MB a thread: near the cache, far above call costs
-GROUP_RAYS = 64  # of neighbouring hits, traced together: so packets of 16 are full where a hit has fewer
+GROUP_RAYS = 64  # of neighboring hits, traced together: so packets of 16 are full where a hit has fewer
 
 
 class Samples(NamedTuple):
@@ -139,7 +139,7 @@ def shade_lights(
     options: ShadeOptions = DEFAULT,
     pixels: Tensor | None = None,
 ) -> list[Tensor]:
-    """:func:`shade` under each of ``environments``, the same bits; the other arguments are those of it.
+    """:func:`shade` under each of ``environments``, bitwise identical; the other arguments are the same.
 
     Of several lights without a gradient Embree tests the samples that do not depend on the light once.
     """
@@ -189,7 +189,7 @@ def _nothing_known(device: torch.device) -> Tensor:
 
 
 def _direct(job: _Job, tensors: Sequence[Tensor], words: int = 0) -> tuple[Tensor, Tensor]:
-    """Radiance ``(N, 3)``, and ``visible (N, words)``: which samples are lit, as the kernels say."""
+    """Radiance ``(N, 3)``, and ``visible (N, words)``: a bit for each sample that is lit."""
     position, n = tensors[0], tensors[0].shape[0]
     visible = torch.zeros(n, words, dtype=torch.int32, device=position.device)
     out = empty((n,), wp.vec3, position.device)
@@ -217,14 +217,14 @@ class _Shade(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, g_out: Tensor):
-        from reli3d.kernels import shade_adjoint as adjoint  # not before: a picture needs no gradient
+        from reli3d.kernels import shade_adjoint as adjoint  # lazily: an image needs no gradient
 
         *tensors, visible = ctx.saved_tensors
-        n, device, wanted = g_out.shape[0], g_out.device, ctx.needs_input_grad[1:]
+        n, device, needed = g_out.shape[0], g_out.device, ctx.needs_input_grad[1:]
         parts = len(slices(n)) if device.type == "cpu" else 1
-        # what is not requested has no rows: the kernel leaves it out
+        # gradients that are not needed have no rows, and the kernel skips them
         g_normal, g_base, g_alpha, g_metallic, texels = (
-            torch.zeros_like(tensors[k] if wanted[k] else tensors[k][:0]) for k in (1, 4, 5, 6, 7)
+            torch.zeros_like(tensors[k] if needed[k] else tensors[k][:0]) for k in (1, 4, 5, 6, 7)
         )
         g_radiance = texels.repeat(parts, 1, 1, 1)  # of each slice
         ins = _inputs(tensors, ctx.job)
@@ -244,7 +244,7 @@ class _Shade(torch.autograd.Function):
             else:
                 work(0, 0, n)
         grads = [None, g_normal, None, None, g_base, g_alpha, g_metallic, g_radiance.sum(0), None]
-        return None, *(g if w else None for g, w in zip(grads, wanted, strict=True))
+        return None, *(g if w else None for g, w in zip(grads, needed, strict=True))
 
 
 def _inputs(tensors: Sequence[Tensor], job: _Job) -> list:

@@ -1,8 +1,8 @@
-"""Antialiased outlines whose gradient reaches the vertices, for any image that was made through the pixel centres.
+"""Antialiased outlines whose gradient reaches the vertices, for any image that was made through the pixel centers.
 
-After Laine et al. 2020, Modular Primitives for High-Performance Differentiable Rendering, section 3.4: two neighbouring
+After Laine et al. 2020, Modular Primitives for High-Performance Differentiable Rendering, section 3.4: two neighboring
 pixels are blended where an outline crosses the line between their centres.  There the edge belongs to the triangle that
-a pixel shows, which fails for small triangles.  Here every edge's crossings with the rows or columns of pixel centres
+a pixel shows, which fails for small triangles.  Here every edge's crossings with the rows or columns of pixel centers
 are listed, and a ray decides whether one is seen.
 
 Sums over an image have the derivative of the area.  Single pixels err by 0.02 on average, gradients of squared
@@ -23,13 +23,13 @@ from reli3d.geometry.mesh import weld
 from reli3d.geometry.rays import RayScene
 from reli3d.kernels import silhouette as kernels
 
-OUTSIDE = 0.01  # pixels that the visibility ray passes beside the edge, so as not to graze its own faces
-IN_FRONT = 1e-3  # share of the distance by which something must be nearer to hide an edge; spares folds of float32
+OUTSIDE = 0.01  # pixels from the edge to the visibility ray, so that it does not graze the edge's own faces
+IN_FRONT = 1e-3  # fraction of the distance by which an occluder must be nearer; above float32 rounding at folds
 
 
 @dataclass(frozen=True)
 class Crossings:
-    """Where visible outlines pass between pixel centres; M pairs of neighbours, each at most once a direction.
+    """Where visible silhouettes pass between pixel centers; M pairs of neighbors, each at most once a direction.
 
     inner, outer: ``(M,)`` int64 pixel (row * W + column) on the surface's side and beyond.  place: ``(M,)`` in [0, 1],
     distance of the crossing from the inner centre in pixels.  Gradients reach the vertices and the camera.
@@ -75,10 +75,11 @@ def mesh_edges(vertices: Tensor, faces: Tensor) -> Tensor:
 
 
 def outline_crossings(vertices: Tensor, edges: Tensor, camera: Camera, scene: RayScene) -> Crossings:
-    """Crossings of the visible outlines of ``vertices (V, 3)`` and ``edges`` (of :func:`mesh_edges`) with pixel lines.
+    """Crossings of visible silhouettes with the lines between pixel centers.
 
-    camera: one, no batch.  scene: what may hide an edge, normally the mesh itself and anything beside it.  An edge
-    with an end behind the eye is left out.  Of several crossings of one pair in one direction the outermost stays.
+    vertices: ``(V, 3)``.  edges: of :func:`mesh_edges`.  camera: one, no batch.  scene: what may hide an edge, normally
+    the mesh itself and everything else in the scene.  An edge with an end behind the eye is left out.  Of several
+    crossings of one pair in one direction the outermost stays.
     """
     check("vertices", vertices, last=3)
     check("edges", edges, last=4, like=vertices, dtype=torch.int32)
@@ -101,8 +102,8 @@ def outline_crossings(vertices: Tensor, edges: Tensor, camera: Camera, scene: Ra
     place = (across - inner_at - 0.5) * outward
     keep = (low >= 0.0) & (low < size - 1)
     depth = 1.0 / ((1.0 - part) / za + part / zb)
-    beside = torch.stack([centre, across + OUTSIDE * outward], 1).detach()
-    keep &= _seen(torch.where(steep[:, None], beside.flip(1), beside), depth.detach(), camera, scene)
+    offset = torch.stack([centre, across + OUTSIDE * outward], 1).detach()
+    keep &= _seen(torch.where(steep[:, None], offset.flip(1), offset), depth.detach(), camera, scene)
     stride = torch.where(steep, 1, camera.width)
     inner = torch.where(steep, line * camera.width + inner_at.long(), inner_at.long() * camera.width + line)
     outer = inner + stride * outward.long()
@@ -114,7 +115,7 @@ def blend_outlines(image: Tensor, crossings: Crossings) -> Tensor:
     """``image (H, W, C)`` with each pair of pixels at an outline blended by where the outline passes.
 
     The outline's side of a pixel border decides which of the two changes; several pairs add up, their weights scaled
-    down where they exceed 1, so a value stays between its neighbours'.  Gradients reach the image and the crossings.
+    down where they exceed 1, so a value stays between its neighbors'.  Gradients reach the image and the crossings.
     """
     check("image", image, like=crossings.place)
     if image.ndim != 3:

@@ -1,4 +1,4 @@
-"""Light that a surface keeps from itself, as spherical harmonics of its directions: precomputed radiance transfer.
+"""Self-occlusion of irradiance in spherical harmonics: precomputed radiance transfer.
 
 Sloan, Kautz and Snyder 2002, "Precomputed Radiance Transfer for Real-Time Rendering in Dynamic, Low-Frequency Lighting
 Environments".  The harmonics are real, orthonormal, up to degree 3, with +Y as the polar axis, so that a light turned
@@ -57,12 +57,12 @@ def light_harmonics(light: Environment) -> Tensor:
 
 
 def blocked_transfer(mesh: Mesh, *, directions: int = 64, scene: RayScene | None = None) -> Tensor:
-    """What the mesh keeps from its vertices: ``(V, 16)``, integrals of hidden cosine times harmonics, no gradient.
+    """Blocked transfer ``(V, 16)``: integrals of the occluded cosine times harmonics at each vertex; no gradient.
 
-    Row i times the coefficients of a light (:func:`light_harmonics`) is the irradiance that vertex i misses.  mesh:
-    with normals.  directions: over the whole sphere, on a spiral of equal areas and the same for all vertices, so that
-    neighbours differ by their geometry alone.  scene: rays against the mesh, made here if None.  Exactly 0 where no ray
-    is hidden.  Raises TypeError, ValueError.
+    Row i times the coefficients of a light (:func:`light_harmonics`) is the irradiance that is occluded at vertex i.
+    mesh: with normals.  directions: over the whole sphere, on a spiral of equal areas and the same for all vertices, so
+    that neighbors differ by their geometry alone.  scene: rays against the mesh, made here if None.  Exactly 0 where no
+    ray is hidden.  Raises TypeError, ValueError.
     """
     normals = present("normals", mesh.normals).detach()
     check("vertices", mesh.vertices, last=3, like=normals)
@@ -76,7 +76,7 @@ def blocked_transfer(mesh: Mesh, *, directions: int = 64, scene: RayScene | None
     toward = sphere_spiral(directions).to(device)
     cosine = (normal @ toward.T).clamp(min=0.0)
     above = cosine > 0.0
-    vertex, which = above.nonzero(as_tuple=True)  # rays of one vertex are neighbours
+    vertex, which = above.nonzero(as_tuple=True)  # rays of one vertex are consecutive
     far = torch.full((len(vertex),), torch.inf, device=device)
     scene = scene if scene is not None else RayScene(mesh.vertices, mesh.faces)
     # index_select takes rows in a third of the time of an index
@@ -87,7 +87,7 @@ def blocked_transfer(mesh: Mesh, *, directions: int = 64, scene: RayScene | None
 
 
 def sphere_spiral(count: int) -> Tensor:
-    """``(count, 3)`` unit directions, each in the middle of an equal share of the sphere (a Fibonacci spiral)."""
+    """``(count, 3)`` unit directions, each in the middle of an equal area of the sphere (a Fibonacci spiral)."""
     k = torch.arange(count, dtype=torch.float64) + 0.5
     height, turn = 1.0 - 2.0 * k / count, k * (math.pi * (3.0 - math.sqrt(5.0)))
     across = (1.0 - height * height).sqrt()

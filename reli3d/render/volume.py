@@ -145,11 +145,11 @@ def march_rays(
 
 
 def composite(density: Tensor, color: Tensor, samples: RaySamples) -> Composite:
-    """Colour, opacity and depth of every ray; add ``(1 - opacity) * background`` for a background.
+    """Color, opacity and depth of every ray; add ``(1 - opacity) * background`` for a background.
 
     density: ``(S,)`` per length of the direction, negative counts as 0.  color: ``(S, 3)`` linear.  Gradients reach
-    both, exactly 0 for a density that is not positive; once differentiable; the same bits for any number of threads.
-    Max 1995, Optical Models for Direct Volume Rendering.
+    both, exactly 0 for a density that is not positive; once differentiable; bitwise identical for any number of
+    threads.  Max 1995, Optical Models for Direct Volume Rendering.
     """
     _check_samples(density, samples)
     check("color", color, last=3, like=density)
@@ -180,18 +180,18 @@ class _Composite(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, g_color: Tensor, g_opacity: Tensor, g_depth: Tensor):
-        tensors, (_, *wanted) = ctx.saved_tensors, ctx.needs_input_grad
-        # what is not requested has no rows: the kernel leaves it out
+        tensors, (_, *needed) = ctx.saved_tensors, ctx.needs_input_grad
+        # gradients that are not needed have no rows, and the kernel skips them
         outs = [
             (torch.zeros_like(v if w else v[:0]), kind)
-            for v, w, kind in zip(tensors, wanted, (wp.float32, wp.vec3), strict=False)
+            for v, w, kind in zip(tensors, needed, (wp.float32, wp.vec3), strict=False)
         ]
         gs = [(g_color.contiguous(), wp.vec3), (g_opacity.contiguous(), wp.float32), (g_depth.contiguous(), wp.float32)]
         args = [*_inputs(tensors, ctx.step), *gs, *outs]
         launch(kernels.composite_adjoint_kernel, len(tensors[3]) - 1, args, g_color.device)
-        return None, *(g if w else None for (g, _), w in zip(outs, wanted, strict=True))
+        return None, *(g if w else None for (g, _), w in zip(outs, needed, strict=True))
 
 
 def _inputs(tensors: tuple[Tensor, ...], step: float) -> list:
-    kinds = (wp.float32, wp.vec3, wp.float32, wp.int32)  # density, colour, t, first
+    kinds = (wp.float32, wp.vec3, wp.float32, wp.int32)  # density, color, t, first
     return [*zip(tensors, kinds, strict=True), step]
