@@ -274,9 +274,11 @@ def unwrap_xatlas(mesh: Mesh, *, texture_size: int = 1024, timeout_s: float = 12
     _check(mesh, texture_size)
     with tempfile.TemporaryDirectory() as folder:
         job, result = os.path.join(folder, "job.npz"), os.path.join(folder, "result.npz")
+        points = mesh.vertices.detach().cpu().numpy().astype(np.float64)
+        size = float(np.ptp(points, axis=0).max()) or 1.0
         np.savez(
             job,
-            vertices=mesh.vertices.detach().cpu().numpy(),
+            vertices=((points - points.min(0)) / size).astype(np.float32),  # its thresholds are absolute
             faces=mesh.faces.cpu().numpy().astype(np.uint32),
             size=texture_size,
             guard=guard_band(texture_size),
@@ -292,6 +294,8 @@ def unwrap_xatlas(mesh: Mesh, *, texture_size: int = 1024, timeout_s: float = 12
             raise RuntimeError(f"unwrap_xatlas: xatlas ended with code {done.returncode} ({tail[0]}); use unwrap")
         with np.load(result) as data:
             source, faces, uv = data["source"], data["faces"], data["uv"]
+    if not np.isfinite(uv).all():
+        raise RuntimeError("unwrap_xatlas: expected finite texture coordinates, got NaN from xatlas; use unwrap")
     device = mesh.vertices.device
     index = torch.from_numpy(source.astype(np.int64)).to(device)
     normals = mesh.normals if mesh.normals is not None else vertex_normals(mesh.vertices, mesh.faces)

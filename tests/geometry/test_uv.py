@@ -263,3 +263,18 @@ def test_xatlas_gives_an_atlas_or_a_named_end():
 
 def test_guard_band_grows_with_the_texture():
     assert [uv.guard_band(s) for s in (128, 256, 512, 1024, 2048, 4096)] == [2, 2, 4, 4, 8, 16]
+
+
+@pytest.mark.parametrize("radius, center", [(0.7e-3, 0.0), (1e-9, 0.0), (1e12, 0.0), (0.7e-3, 0.5)])
+def test_xatlas_takes_meshes_of_any_size(radius, center):
+    ball = trimesh.creation.icosphere(3)
+    result = unwrap_xatlas(mesh_of(ball.vertices * radius + center, ball.faces), texture_size=256)
+    assert bool(torch.isfinite(result.uv).all())
+    report = atlas_report(result, texture_size=256)
+    assert report.utilisation > 0.4 and report.overlap < 0.01
+
+
+def test_an_atlas_of_xatlas_with_nan_is_refused(monkeypatch):
+    monkeypatch.setattr(uv, "XATLAS", uv.XATLAS.replace("uv=uv", "uv=uv * numpy.nan"))
+    with pytest.raises(RuntimeError, match="unwrap_xatlas: expected finite texture coordinates"):
+        unwrap_xatlas(icosphere(1), texture_size=64)
