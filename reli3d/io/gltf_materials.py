@@ -83,8 +83,8 @@ class Materials:
 
         coordinates: gives a set ``(N, 2)`` of texture coordinates of the primitive.
         """
+        entry = {} if index is None else self.document.item("materials", index, field)
         if index not in self.parsed:
-            entry = {} if index is None else self.document.item("materials", index, field)
             self.parsed[index] = self._parse(entry, f"materials[{index}]")
         material = self.parsed[index]
         layouts = {slot.layout for slot in material.slots if slot is not None}
@@ -119,11 +119,12 @@ class Materials:
 
     def _resampled(self, material: _Material, low: np.ndarray, span: np.ndarray, field: str) -> TextureSet:
         """Textures of different layouts, looked up at the texel centers of the box ``low``, ``span`` of the uv."""
-        sides = [
-            np.abs(np.array(s.layout.transform).reshape(2, 3)[:, :2] * span).sum(1) * s.image.shape[1::-1]
-            for s in material.slots
-            if s is not None
-        ]
+        with np.errstate(all="ignore"):  # what overflows is refused below
+            sides = [
+                np.abs(np.array(s.layout.transform).reshape(2, 3)[:, :2] * span).sum(1) * s.image.shape[1::-1]
+                for s in material.slots
+                if s is not None
+            ]
         largest = float(np.max(sides))
         if not largest <= MAX_SIDE:
             wanted = f"expected transforms and wrap modes of its textures that fit one of {MAX_SIDE} texels"

@@ -201,6 +201,7 @@ def test_an_image_of_twenty_materials_is_decoded_once(tmp_path, monkeypatch):
         ({"meshes": [{"primitives": [{"attributes": {"POSITION": 0}}] * 5000}]}, "primitives as placed"),
         (textured((30000, 1)), "made square"),
         (textured((8, 8), scale=1e308), "scale"),
+        ({"meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "material": []}]}]}, "material"),
     ],
 )
 def test_glb_fields(tmp_path, fields, word):
