@@ -39,17 +39,6 @@ class Code:
         return Code(*(getattr(self, field.name)[b : b + 1] for field in fields(self)))
 
 
-class ToneMappingConstants(nn.Module):
-    """Identity colour decision list: the published checkpoint stores it, and it has no effect there either."""
-
-    def __init__(self):
-        super().__init__()
-        self.register_buffer("cdl_slope", torch.ones(3))
-        self.register_buffer("cdl_offset", torch.zeros(3))
-        self.register_buffer("cdl_power", torch.ones(3))
-        self.register_buffer("cdl_saturation", torch.ones(()))
-
-
 class Reconstructor(nn.Module):
     """The ReLi3D network with the sizes of ``preset``, its parameters ready for training from scratch.
 
@@ -70,8 +59,6 @@ class Reconstructor(nn.Module):
         self.environment = EnvironmentDecoder(preset.reni)
         self.heads = Heads(3 * preset.upsampler.channels, preset.head_width)
         self.merger = WeightMerger(preset.head_width)
-        if preset.tone_mapping:
-            self.tone_mapping = ToneMappingConstants()
         if self.device.type != "meta":  # there are no values there, and torch would import its compiler to say so
             initialise(self)
 

@@ -10,15 +10,64 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import typing
 from dataclasses import dataclass
 
-MOST = 8192  # of any number of a preset in a file: several times what a network of this kind has
-DEEP, MOST_LAYERS = ("layers", "blocks", "basic_blocks", "experts", "convolutions", "smoothing"), 64
+MAX_SIZE, MAX_LAYERS, MAX_LEVELS = 8192, 64, 8  # several times what a network of this kind has
+LAYERS = ("layers", "blocks", "basic_blocks", "convolutions")
+LIMITS = {  # inclusive; all other integers lie in 1 to MAX_SIZE
+    **dict.fromkeys(LAYERS, (1, MAX_LAYERS)),
+    **dict.fromkeys(("experts", "experts_from", "smoothing"), (0, MAX_LAYERS)),
+    "tokens": (2, MAX_SIZE),
+    "view_width": (10, MAX_SIZE),  # nine of them are the numbers of summarize_views
+    "side": (4, 256),
+    "height": (4, 512),
+    "resolution": (4, 512),
+    "image_size": (8, 4096),
+    "radius": (1e-3, 1e3),
+    "softness": (1e-5, 1e3),
+    "density_threshold": (1e-5, 1e5),
+    "density_bias": (-100.0, 100.0),
+    "offset_one_view": (-1e3, 1e3),
+    "offset_many_views": (-1e3, 1e3),
+}
+
+
+class _Checked:
+    """Base of dataclasses whose fields are checked when one is made: ValueError, ``field: expected X, got Y``."""
+
+    def __post_init__(self):
+        for name, kind in typing.get_type_hints(type(self)).items():
+            self._check(name, kind, getattr(self, name))
+
+    def _check(self, name: str, kind: type, value) -> None:
+        low, high = LIMITS.get(name, (1, MAX_SIZE))
+        if kind in (int, float):
+            kinds = (int,) if kind is int else (int, float)
+            what = "an integer" if kind is int else "a number"
+            _expect(type(value) in kinds and low <= value <= high, name, f"{what} from {low:g} to {high:g}", value)
+        elif typing.get_origin(kind) is tuple:
+            known = isinstance(value, tuple) and all(type(v) is int for v in value)
+            known = known and 1 <= len(value) <= MAX_LEVELS
+            widths = known and all(2 <= v < 16 or 16 <= v <= MAX_SIZE and v % 8 == 0 for v in value)
+            expected = f"1 to {MAX_LEVELS} widths, each 2 to 15 or a multiple of 8 up to {MAX_SIZE}"
+            _expect(widths, name, expected, value)  # normalized over groups of eight channels
+        else:
+            _expect(isinstance(value, kind), name, kind.__name__, value)
+
+
+def _expect(holds: bool, name: str, expected: str, value) -> None:
+    if not holds:
+        raise ValueError(f"{name}: expected {expected}, got {repr(value)[:60]}")
+
+
+def _divides(name: str, parts: int, whole: str, size: int) -> None:
+    _expect(size % parts == 0, name, f"a divisor of {whole}, {size}", parts)
 
 
 @dataclass(frozen=True)
-class EncoderSizes:
+class EncoderSizes(_Checked):
     """An image tokenizer of the DINOv2 form whose norms are modulated by the camera."""
 
     hidden: int
@@ -28,13 +77,17 @@ class EncoderSizes:
     grid: int  # side of the stored position grid; resampled for another number of patches
     mask_channel: bool  # the mask as input channel after RGB
 
+    def __post_init__(self):
+        super().__post_init__()
+        _divides("heads", self.heads, "hidden", self.hidden)
+
     @property
     def channels(self) -> int:
         return 3 + int(self.mask_channel)
 
 
 @dataclass(frozen=True)
-class BackboneSizes:
+class BackboneSizes(_Checked):
     """The two-stream transformer; its width is also the width of encoder and triplane bank."""
 
     heads: int
@@ -47,14 +100,14 @@ class BackboneSizes:
 
 
 @dataclass(frozen=True)
-class UpsamplerSizes:
+class UpsamplerSizes(_Checked):
     convolutions: int
     scale: int
     channels: int  # of the triplane that is sampled
 
 
 @dataclass(frozen=True)
-class IlluminationSizes:
+class IlluminationSizes(_Checked):
     encoder: EncoderSizes
     tokens: int  # tokens * token_width numbers come out, of which latents*3 + 1 + 6 are read
     token_width: int
@@ -63,9 +116,14 @@ class IlluminationSizes:
     layers: int
     groups: int
 
+    def __post_init__(self):
+        super().__post_init__()
+        _divides("heads", self.heads, "width", self.width)
+        _divides("groups", self.groups, "token_width", self.token_width)
+
 
 @dataclass(frozen=True)
-class ReniSizes:
+class ReniSizes(_Checked):
     """The RENI++ decoder; 49 latent vectors, 128 wide, 6 layers are the published file's sizes."""
 
     latents: int
@@ -76,16 +134,21 @@ class ReniSizes:
 
 
 @dataclass(frozen=True)
-class PyramidSizes:
+class PyramidSizes(_Checked):
     """The 2D U-Net of a view, :mod:`reli3d.nn.pyramid`."""
 
     widths: tuple[int, ...]  # channels at 1/2, 1/4, ... of the image
     features: int  # that leave it
-    reading: int  # the finest levels, which read the picture at their own resolution and predict
+    reading: int  # the finest levels, which read the image at their own resolution and predict
+
+    def __post_init__(self):
+        super().__post_init__()
+        _expect(len(self.widths) >= 3, "widths", "3 or more levels", self.widths)
+        _expect(self.reading < len(self.widths), "reading", f"fewer than the {len(self.widths)} levels", self.reading)
 
 
 @dataclass(frozen=True)
-class VolumeSizes:
+class VolumeSizes(_Checked):
     """The 3D U-Net over pooled views, :mod:`reli3d.nn.volume`."""
 
     side: int  # grid points
@@ -95,15 +158,20 @@ class VolumeSizes:
 
 
 @dataclass(frozen=True)
-class LightMapSizes:
+class LightMapSizes(_Checked):
     """The U-Net on the sphere of directions, :mod:`reli3d.nn.light_map`."""
 
     height: int  # rows of the map
     widths: tuple[int, ...]
 
+    def __post_init__(self):
+        super().__post_init__()
+        coarsest = 2 ** (len(self.widths) - 1)
+        _expect(self.height % coarsest == 0, "height", f"a multiple of {coarsest}, as there are levels", self.height)
+
 
 @dataclass(frozen=True)
-class LocalPreset:
+class LocalPreset(_Checked):
     """A network of convolutions over images and space, :mod:`reli3d.nn.local`."""
 
     name: str
@@ -120,9 +188,15 @@ class LocalPreset:
     offset_many_views: float = 0.0  # the same in the limit of many views; in between by the inverse of their number
     smoothing: int = 8  # iterations of Taubin smoothing of the extracted surface
 
+    def __post_init__(self):
+        super().__post_init__()
+        coarsest = 2 ** len(self.pyramid.widths)
+        holds = self.image_size % coarsest == 0
+        _expect(holds, "image_size", f"a multiple of {coarsest}, as there are levels of pyramid", self.image_size)
+
 
 @dataclass(frozen=True)
-class Preset:
+class Preset(_Checked):
     name: str
     image_size: int  # square network input, pixels
     camera_width: int  # of the camera embedding
@@ -140,7 +214,18 @@ class Preset:
     roughness_is_alpha: bool = False  # the roughness head predicts the GGX width; query() returns its square root
     published_input: bool = False  # views prepared as by the release: JPEG, not cropped, poses as stored unless asked
     reads_background: bool = False  # the illumination path was trained with visible backgrounds too
-    tone_mapping: bool = False  # carry the published tone-mapping constants, which nothing here reads
+
+    def __post_init__(self):
+        super().__post_init__()
+        light = self.illumination
+        _divides("backbone.heads", self.backbone.heads, "encoder.hidden", self.encoder.hidden)
+        _divides("backbone.groups", self.backbone.groups, "encoder.hidden", self.encoder.hidden)
+        for name, patch in (("encoder.patch", self.encoder.patch), ("illumination.encoder.patch", light.encoder.patch)):
+            _expect(patch <= self.image_size, name, f"at most image_size, {self.image_size}", patch)
+        numbers, needed = light.tokens * light.token_width, 3 * self.reni.latents + 7
+        _expect(
+            numbers >= needed, "illumination.tokens", f"{math.ceil(needed / light.token_width)} or more", light.tokens
+        )
 
 
 def to_json(preset: Preset | LocalPreset) -> str:
@@ -149,37 +234,31 @@ def to_json(preset: Preset | LocalPreset) -> str:
 
 
 def from_json(text: str) -> Preset | LocalPreset:
-    """The preset that :func:`to_json` wrote.  Raises ValueError for anything else."""
+    """The preset that :func:`to_json` wrote.  Raises ValueError, one line that names the field, for anything else."""
     try:
         values = json.loads(text)
-        return _build(LocalPreset if "pyramid" in values else Preset, values)
-    except (ValueError, AttributeError, KeyError, TypeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"preset: expected the JSON of a preset, got {error}") from None
+    return _build(LocalPreset if isinstance(values, dict) and "pyramid" in values else Preset, values, "preset")
 
 
-def _build(kind, values: dict):
-    """``kind(**values)``, nested dataclasses from nested dictionaries; TypeError for a value of another type."""
-    fields = typing.get_type_hints(kind)
-    built = {}
-    for key, value in values.items():
-        if key not in fields:
-            raise TypeError(f"no field {key}; it is of another version")
-        expected = fields[key]
-        if dataclasses.is_dataclass(expected):
-            built[key] = _build(expected, value)
-        elif typing.get_origin(expected) is tuple:  # JSON has lists
-            if not isinstance(value, list) or not all(type(v) is int and 0 < v <= MOST for v in value):
-                raise TypeError(f"{key} = {value!r}")
-            built[key] = tuple(value)
-        elif isinstance(value, bool) == (expected is bool) and isinstance(value, expected):
-            built[key] = value
-            if isinstance(value, float) and not abs(value) <= MOST:
-                raise ValueError(f"{key} = {value!r}")
-            if isinstance(value, int) and not 0 <= value <= (MOST_LAYERS if key in DEEP else MOST):
-                raise ValueError(f"{key} = {value!r}")
-        else:
-            raise TypeError(f"{key} = {value!r}")
-    return kind(**built)
+def _build(kind, values, path: str):
+    """``kind(**values)``, nested dataclasses from nested dictionaries."""
+    _expect(isinstance(values, dict), path, "fields and values", values)
+    kinds, built = typing.get_type_hints(kind), {}
+    needed = {f.name for f in dataclasses.fields(kind) if f.default is dataclasses.MISSING}
+    for name in sorted(needed - values.keys()):
+        raise ValueError(f"{path}.{name}: expected a value, got none")
+    for name, value in values.items():
+        if name not in kinds:
+            raise ValueError(f"{path}.{name[:60]}: not a field of this version; convert or train the weights again")
+        if dataclasses.is_dataclass(kinds[name]):
+            value = _build(kinds[name], value, f"{path}.{name}")
+        built[name] = tuple(value) if isinstance(value, list) else value  # JSON has no tuples
+    try:
+        return kind(**built)
+    except ValueError as error:
+        raise ValueError(f"{path}.{error}") from None
 
 
 OFFICIAL = Preset(
@@ -205,7 +284,6 @@ OFFICIAL = Preset(
     roughness_is_alpha=True,
     published_input=True,
     reads_background=True,
-    tone_mapping=True,
 )
 
 TINY = Preset(

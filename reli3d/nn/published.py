@@ -30,8 +30,8 @@ KEY_MAP = (  # published, ours
     ("object_representation.net.heads.metallic.", "heads.metallic."),
     ("object_representation.net.heads.flexicubes-weight.", "heads.flexicubes."),
     ("object_representation.indices_merging_mlp.heads.flexicubes-weight.", "merger.mlp."),
-    ("material.tone_mapping.", "tone_mapping."),
 )
+UNUSED = "material.tone_mapping."  # constants of an identity, which have no effect in the published model either
 _ALIAS = re.compile(r"(encoder\.)modulations\.(\d+)\.")
 
 

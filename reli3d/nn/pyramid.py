@@ -93,8 +93,6 @@ class ImagePyramid(nn.Module):
         """
         super().__init__()
         widths, reading = sizes.widths, range(finest, sizes.reading)
-        if not 0 < sizes.reading < len(widths) or len(widths) < 3:
-            raise ValueError(f"reading: expected less than the levels, of which there are 3 or more, got {sizes}")
         if not reading:
             raise ValueError(f"finest: expected a level of 0 to {sizes.reading - 1}, got {finest}")
         pairs = {str(k): (widths[k], widths[k + 1]) for k in range(finest, len(widths) - 1)}

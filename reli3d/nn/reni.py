@@ -166,8 +166,10 @@ class EnvironmentDecoder(nn.Module):
         super().__init__()
         self.height, self.latents = sizes.height, sizes.latents
         self.field = ReniField(sizes)
-        directions = to_published(reni_frame(lat_long_directions(sizes.height, device="cpu")))  # arange: as torch.eye
-        self.register_buffer("sample_directions", directions.flatten(0, 1).to(torch.empty(0).device))
+        directions = torch.empty(2 * sizes.height**2, 3)
+        if directions.device.type != "meta":
+            directions = to_published(reni_frame(lat_long_directions(sizes.height))).flatten(0, 1)
+        self.register_buffer("sample_directions", directions)
 
     def forward(
         self,

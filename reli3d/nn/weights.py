@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import json
-import math
 import os
 import pickle
 import re
@@ -18,23 +16,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
 import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
 from torch import Tensor
 
 from reli3d.io.files import InputError, file_size, replacing
 from reli3d.nn.local import LocalReconstructor
 from reli3d.nn.model import Reconstructor
 from reli3d.nn.presets import OFFICIAL, LocalPreset, Preset, from_json, to_json
-from reli3d.nn.published import CHECKPOINT_PREFIX, our_key
+from reli3d.nn.published import CHECKPOINT_PREFIX, UNUSED, our_key
 
 FORMAT = "reli3d 1"
 SMALL = Path(__file__).parents[1] / "assets" / "weights" / "small.safetensors"
 LARGE = 1 << 30  # bytes; hashing less takes about a second
-HEADER_LIMIT = 100 << 20  # bytes, the safetensors library's own bound
 _DTYPES = {"F64": torch.float64, "F32": torch.float32, "F16": torch.float16, "BF16": torch.bfloat16}
 BFLOAT16_INSTRUCTIONS = ("avx512_bf16", "amx_bf16", "bf16")  # as torch.cpu names them: AMD and Intel, Intel, ARM
-_NAMES = {dtype: name for name, dtype in _DTYPES.items()}
 
 
 AnyPreset = Preset | LocalPreset
@@ -55,8 +52,6 @@ class WeightsError(InputError):
 class Stored:
     dtype: torch.dtype
     shape: tuple[int, ...]
-    start: int  # bytes from the first tensor
-    end: int
 
 
 @dataclass(frozen=True)
@@ -64,7 +59,6 @@ class Manifest:
     """What a safetensors file says it holds."""
 
     path: str
-    start: int  # of the first tensor in the file, bytes
     tensors: dict[str, Stored]
     metadata: dict[str, str]  # of our files: format, preset, licence, and what the writer added
 
@@ -115,42 +109,27 @@ def known_sha256(path: str | os.PathLike) -> str:
 def read_manifest(path: str | os.PathLike) -> Manifest:
     """Names, shapes and metadata of a safetensors file; reads the header only.
 
-    Raises WeightsError unless the header is whole and the file as long as the header says.
+    Raises WeightsError unless the header is whole, every tensor is of floating point and the file has the length that
+    the header states.
     """
-    size = _size(path)
+    _size(path)
     with open(path, "rb") as file:
-        start = file.read(8)
-        if start.startswith(b"PK\x03\x04"):
+        if file.read(4) == b"PK\x03\x04":
             raise WeightsError(
                 path, "is a torch checkpoint, expected safetensors; convert it first, see docs/network.md"
             )
-        length = int.from_bytes(start, "little")
-        if size < 8 or length > min(HEADER_LIMIT, size - 8):
-            raise WeightsError(path, "is not a safetensors file, or it is cut off in its header; fetch it again")
-        text = file.read(length)
     try:
-        header = json.loads(text)
-        metadata = {str(k): str(v) for k, v in header.pop("__metadata__", {}).items()}
-        tensors = {name: _stored(entry) for name, entry in header.items()}
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        raise WeightsError(path, "has a header that is not safetensors'; fetch it again") from None
-    end = 0
-    for name, entry in sorted(tensors.items(), key=lambda item: item[1].start):
-        if entry.start != end or entry.end - entry.start != math.prod(entry.shape) * entry.dtype.itemsize:
-            raise WeightsError(path, f"{name}: shape and place in the file do not agree; fetch it again")
-        end = entry.end
-    if size != 8 + length + end:
-        raise WeightsError(path, f"expected {8 + length + end} bytes, got {size}: cut off or overlong; fetch it again")
-    return Manifest(os.fspath(path), 8 + length, tensors, metadata)
-
-
-def _stored(entry: dict) -> Stored:
-    (start, end), shape = entry["data_offsets"], tuple(entry["shape"])
-    if not all(type(value) is int for value in (start, end, *shape)):
-        raise TypeError("no integers")
-    if min((start, *shape)) < 0:
-        raise ValueError("negative")
-    return Stored(_DTYPES[entry["dtype"]], shape, start, end)
+        with safe_open(path, "pt") as opened:
+            metadata, names = opened.metadata() or {}, opened.keys()
+            entries = {name: opened.get_slice(name) for name in names}
+            stored = {name: (entry.get_dtype(), tuple(entry.get_shape())) for name, entry in entries.items()}
+    except (SafetensorError, OSError) as error:
+        reason = " ".join(str(error).split())[:160]
+        raise WeightsError(path, f"is not a safetensors file, or it is cut off ({reason}); fetch it again") from None
+    for name, (dtype, _) in stored.items():
+        if dtype not in _DTYPES:
+            raise WeightsError(path, f"{name}: expected floating-point values, got {dtype}")
+    return Manifest(os.fspath(path), {name: Stored(_DTYPES[d], shape) for name, (d, shape) in stored.items()}, metadata)
 
 
 def _size(path: str | os.PathLike) -> int:
@@ -249,8 +228,7 @@ def load(
     which the convolutions of the small network compute; default :func:`default_trunk`, ``auto`` is
     :func:`fastest_dtype`.  All other parameters are float32.  A tensor that is stored in the dtype
     asked for stays mapped from the file on a CPU: it takes memory when it is read.  Names, shapes, length and, where
-    given, the hash are checked before anything is allocated.
-    Raises WeightsError.
+    given, the hash are checked before anything is allocated.  Raises WeightsError.
     """
     manifest = read_manifest(path)
     preset = preset or manifest.preset()
@@ -276,21 +254,9 @@ def read_tensors(
     """The tensors named in ``wanted`` as the dtypes it gives.
 
     On a CPU a tensor of the dtype in the file is a part of the file's mapping: read when used, never written back.
-    Others are read one by one, so that what they were converted from does not stay in memory.
     """
-    end = manifest.start + max((entry.end for entry in manifest.tensors.values()), default=0)
-    body = torch.from_file(manifest.path, shared=False, size=end, dtype=torch.uint8)
-    result = {}
-    for name, dtype in wanted.items():
-        entry = manifest.tensors[name]
-        start = manifest.start + entry.start
-        if dtype == entry.dtype:
-            raw = body[start : manifest.start + entry.end]
-        else:
-            raw = torch.from_numpy(np.fromfile(manifest.path, np.uint8, entry.end - entry.start, offset=start))
-        raw = raw if raw.data_ptr() % entry.dtype.itemsize == 0 else raw.clone()  # others' headers may end anywhere
-        result[name] = raw.view(entry.dtype).reshape(entry.shape).to(device, dtype)
-    return result
+    with safe_open(manifest.path, "pt") as opened:
+        return {name: opened.get_tensor(name).to(device, dtype) for name, dtype in wanted.items()}
 
 
 def save(
@@ -316,23 +282,9 @@ def save(
 
 
 def write(path: str | os.PathLike, state: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
-    """Write CPU tensors as safetensors, one after the other, so that mapped ones never lie in memory together."""
-    header: dict[str, object] = {"__metadata__": dict(metadata)}
-    end = 0
-    for name in sorted(state):
-        size = state[name].numel() * state[name].dtype.itemsize
-        header[name] = {
-            "dtype": _NAMES[state[name].dtype],
-            "shape": list(state[name].shape),
-            "data_offsets": [end, end + size],
-        }
-        end += size
-    text = json.dumps(header).encode()
-    text += b" " * (-len(text) % 8)  # the format asks for tensors that start at a multiple of 8
-    with replacing(path) as temporary, open(temporary, "wb") as file:
-        file.write(len(text).to_bytes(8, "little") + text)
-        for name in sorted(state):
-            file.write(state[name].contiguous().reshape(-1).view(torch.uint8).numpy().data)
+    """Write CPU tensors as safetensors, whole or not at all."""
+    with replacing(path) as temporary:
+        save_file({name: value.contiguous() for name, value in state.items()}, temporary, dict(metadata))
 
 
 def convert_checkpoint(
@@ -372,10 +324,12 @@ def published_state(published: Mapping[str, Tensor], where: object) -> dict[str,
     """Tensors by our names from published ones.  Raises WeightsError for an unknown name or unequal aliases."""
     state: dict[str, Tensor] = {}
     for name, value in published.items():
+        if name.startswith(UNUSED):
+            continue
         ours = our_key(name)
         if ours is None:
             raise WeightsError(where, f"{name}: not a tensor of the published model")
-        if value.dtype not in _NAMES:
+        if value.dtype not in _DTYPES.values():
             raise WeightsError(where, f"{name}: expected floating-point values, got {value.dtype}")
         other = state.setdefault(ours, value)
         if other is not value and not (other.data_ptr() == value.data_ptr() or torch.equal(other, value)):

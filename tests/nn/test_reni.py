@@ -127,5 +127,5 @@ def test_a_cut_off_file_is_one_line(goldens, tmp_path):
     data = (goldens.parent / "reni++L49.safetensors").read_bytes()
     cut = tmp_path / "cut.safetensors"
     cut.write_bytes(data[:-100])
-    with pytest.raises(WeightsError, match="cut.safetensors: expected 2649352 bytes, got 2649252"):
+    with pytest.raises(WeightsError, match="cut.safetensors: is not a safetensors file, or it is cut off"):
         read_manifest(cut)

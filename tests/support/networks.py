@@ -53,7 +53,6 @@ NANO = replace(  # the paper's network at sizes that run in milliseconds, withou
     roughness_is_alpha=False,
     published_input=False,
     reads_background=False,
-    tone_mapping=False,
 )
 
 
