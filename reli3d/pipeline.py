@@ -62,7 +62,7 @@ def encode(model: Network, prepared: Prepared, *, background: bool = False) -> F
     """
     batch = prepared.batch
     if isinstance(model, LocalReconstructor):
-        return model.encode(
+        return model.encode_for_inference(
             batch.images,
             batch.masks,
             batch.c2w,

@@ -24,13 +24,14 @@ def linear_of(layers: nn.Module, index: int) -> nn.Linear:
 
 
 def in_rows(evaluate: Callable[..., dict[str, Tensor]], *inputs: Tensor) -> dict[str, Tensor]:
-    """``evaluate(*inputs)``; on CPU, where no gradient is recorded, block by block of ROWS rows of the inputs.
+    """``evaluate(*inputs)`` without gradient; on a CPU in blocks of ROWS rows of the inputs.
 
     The blocks run on the threads of the bridge's pool, so ``evaluate`` must work row by row and keep no state.
     """
     n = len(inputs[0])
-    if torch.is_grad_enabled() or inputs[0].is_cuda or n == 0:
-        return evaluate(*inputs)
+    if inputs[0].is_cuda or n == 0:
+        with torch.no_grad():
+            return evaluate(*inputs)
     parts = over_rows(n, ROWS, lambda start, stop: evaluate(*(x[start:stop] for x in inputs)))
     return {name: torch.cat([p[name] for p in parts]) for name in parts[0]}
 

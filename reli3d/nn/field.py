@@ -16,7 +16,6 @@ from torch import Tensor
 
 from reli3d.geometry.hull import hull_distance, hull_grid
 from reli3d.geometry.surface import surface_cubes
-from reli3d.nn.blocks import in_rows
 from reli3d.nn.heads import deformation
 from reli3d.nn.model import Code, Reconstructor
 from reli3d.nn.view_features import ViewMaps
@@ -57,11 +56,11 @@ class Field(ABC):
 
     maps: ViewMaps
 
+    @abstractmethod
     def free_level(self, points: Tensor) -> Tensor:
         """Level ``(N,)`` that the network gives ``points (N, 3)``: negative inside, zero on the surface; the
         silhouettes do not bound it.  Gradients reach the network.
         """
-        return in_rows(lambda points: {"level": self._level(points)}, points)["level"]
 
     @abstractmethod
     def material(self, position: Tensor, normal: Tensor, visible: Tensor) -> PointMaterial:
@@ -73,9 +72,6 @@ class Field(ABC):
     def radiance_map(self, height: int | None = None) -> Tensor:
         """Linear radiance ``(H, 2H, 3)``, row 0 is +Y, the centre column +X; default height the preset's."""
 
-    @abstractmethod
-    def _level(self, points: Tensor) -> Tensor: ...
-
 
 @dataclass(frozen=True)
 class TriplaneField(Field):
@@ -86,7 +82,7 @@ class TriplaneField(Field):
 
     reads_views: ClassVar[bool] = False
 
-    def _level(self, points: Tensor) -> Tensor:
+    def free_level(self, points: Tensor) -> Tensor:
         return self.model.level(self.model.query(self.code, points[None], ("density",))["density"][0, :, 0])
 
     @torch.no_grad()

@@ -9,6 +9,7 @@ the views and to the object, so what is learned in one place holds everywhere.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar
@@ -18,7 +19,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from reli3d.geometry.camera import Camera, image_plane
-from reli3d.geometry.projection import fuse_views, gather_views, summarize_views
+from reli3d.geometry.projection import gather_views
 from reli3d.kernels.view_features import SURE
 from reli3d.nn.blocks import in_rows, linear_of
 from reli3d.nn.field import Field, PointMaterial, bound_level, grid_bound_level
@@ -28,6 +29,7 @@ from reli3d.nn.light_map import LightMap
 from reli3d.nn.presets import LocalPreset
 from reli3d.nn.pyramid import PREDICTED, ImagePyramid, depth_of_origin, place_of_pixels, span_of_pixels
 from reli3d.nn.view_features import AHEAD, ViewFeatures, ViewMaps, ahead_of_surface
+from reli3d.nn.view_lookup import fuse_views, summarize_views
 from reli3d.nn.volume import HULL_SCALE, FeatureVolume
 from reli3d.render.color import srgb_to_linear
 from reli3d.render.environment import Environment
@@ -81,7 +83,7 @@ class PixelMaps:
 
     @cached_property
     def packed(self) -> Tensor:
-        """The same as :func:`~reli3d.geometry.projection.fuse_views` reads it, without gradient."""
+        """The same as :func:`~reli3d.nn.view_lookup.fuse_views` reads it, without gradient."""
         parts = self.stacked().detach().split([4, 4, 3], -1)
         return torch.stack([functional.pad(part, (0, 4 - part.shape[-1])) for part in parts])
 
@@ -169,6 +171,30 @@ class LocalReconstructor(nn.Module):
         the first ones in order, flipped left to right, seen by mirrored cameras: they tell the shape and the paint,
         not the light.  Gradients reach every parameter.  Raises ValueError where they are more than half.
         """
+        views = images, masks, c2w, intrinsics, detail, detail_intrinsics
+        return self._encoded(views, mirrored, inference=False)
+
+    @torch.no_grad()
+    def encode_for_inference(
+        self,
+        images: Tensor,
+        masks: Tensor,
+        c2w: Tensor,
+        intrinsics: Tensor,
+        detail: Tensor,
+        detail_intrinsics: Tensor,
+        *,
+        mirrored: int = 0,
+    ) -> LocalField:
+        """:meth:`encode` by fused kernels; its field evaluates points by them too, in blocks that stay in the cache.
+
+        The values are those of :meth:`encode` to float32 rounding.  No gradient passes.
+        """
+        views = images, masks, c2w, intrinsics, detail, detail_intrinsics
+        return self._encoded(views, mirrored, inference=True)
+
+    def _encoded(self, views: tuple[Tensor, ...], mirrored: int, *, inference: bool) -> LocalField:
+        images, masks, c2w, intrinsics, detail, detail_intrinsics = views
         features, pixels, camera = self.read_pixels(images, masks, c2w, intrinsics, detail, detail_intrinsics, mirrored)
         color, mask = shown_pixels(images, masks, camera)
         shape = torch.cat([pixels.depth, pixels.normal], -1).permute(0, 3, 1, 2)
@@ -176,11 +202,11 @@ class LocalReconstructor(nn.Module):
         tokens = torch.cat([features, shape], -1).contiguous()
         maps = ViewMaps(tokens, detail, Camera(c2w, detail_intrinsics, *detail.shape[2:0:-1]), mirrored)
         surface = torch.cat([pixels.depth * mask, mask], -1)
-        volume = self.volume(maps, surface)
+        volume = (self.volume.fused if inference else self.volume)(maps, surface)
         lit = mask[..., 0].clone()
         lit[maps.taken :] = 0.0
         log_light = self._light(pixels, color, lit, camera)
-        return LocalField(maps, self, pixels, color, surface, volume, log_light)
+        return LocalField(maps, self, pixels, color, surface, volume, log_light, inference=inference)
 
     def read_pixels(
         self,
@@ -245,6 +271,7 @@ class LocalField(Field):
     volume: Tensor  # (N, N, N, F)
     log_light: Tensor  # (3, H, 2H)
     shading: Shading | None = None
+    inference: bool = False  # from encode_for_inference: points are evaluated without gradient
 
     reads_views: ClassVar[bool] = True
 
@@ -258,12 +285,15 @@ class LocalField(Field):
         """:meth:`bound` at the points ``(axis[i], axis[j], axis[k])``, ``(n, n, n)``; axis: ``(n,)`` ascending."""
         return grid_bound_level(self.maps, axis, self.model.preset.softness, far)
 
-    def _level(self, points: Tensor) -> Tensor:
-        return self._level_within(points, self.bound(points))
+    def _rows(self, evaluate: Callable[..., dict[str, Tensor]], *inputs: Tensor) -> dict[str, Tensor]:
+        return in_rows(evaluate, *inputs) if self.inference else evaluate(*inputs)
+
+    def free_level(self, points: Tensor) -> Tensor:
+        return self.level_within(points, self.bound(points))
 
     def level_within(self, points: Tensor, bound: Tensor) -> Tensor:
         """:meth:`free_level` of points whose :meth:`bound` ``(N,)`` is known."""
-        return in_rows(lambda *at: {"level": self._level_within(*at)}, points, bound)["level"]
+        return self._rows(lambda *at: {"level": self._level_within(*at)}, points, bound)["level"]
 
     def _level_within(self, points: Tensor, bound: Tensor) -> Tensor:
         return self.model.level(self._features(points, bound))[:, 0] - self._offset()
@@ -283,7 +313,8 @@ class LocalField(Field):
     ) -> Tensor:
         model, maps = self.model, self.maps.photographs  # the volume knows the mirror images: twice the time, no gain
         hull = -bound * model.preset.softness
-        of_views, _ = model.view_features(maps, points, None if visible is None else visible[:, : maps.taken], normal)
+        views = model.view_features.fused if self.inference else model.view_features
+        of_views, _ = views(maps, points, None if visible is None else visible[:, : maps.taken], normal)
         of_space = model.volume.sample(self.volume, points)
         rest = [(hull / HULL_SCALE).clamp(-2, 2), torch.full_like(hull, 1.0 / len(self.maps.images))]
         ahead = ahead_of_surface(self.surface[: maps.taken], maps, points)
@@ -291,9 +322,9 @@ class LocalField(Field):
 
     def fused(self, position: Tensor, normal: Tensor, visible: Tensor) -> Fused:
         """The views' predictions at surface points: ``position``, ``normal`` ``(N, 3)``, ``visible (N, V)``."""
+        if self.inference:
+            return self._fused_by_kernel(position, normal, visible)
         maps = self.maps
-        if not torch.is_grad_enabled():
-            return Fused(*fuse_views(maps.images, self.pixels.packed, maps.camera, position, visible, normal))
         pixels = self.pixels.stacked()
         got, _ = gather_views(pixels, position, maps.camera)
         shown, share, summary = summarize_views(maps.images, maps.camera, position, visible, normal)
@@ -309,11 +340,16 @@ class LocalField(Field):
         numbers = torch.cat([*mean, bent - normal, facing, summary[:, 5:6], (confidence * weight).sum(1), spread], -1)
         return Fused(logit, numbers, bent)
 
+    def _fused_by_kernel(self, position: Tensor, normal: Tensor, visible: Tensor) -> Fused:
+        """:meth:`fused` to float32 rounding, without gradient."""
+        maps = self.maps
+        return Fused(*fuse_views(maps.images, self.pixels.packed, maps.camera, position, visible, normal))
+
     def with_shading(self, position: Tensor, normal: Tensor, visible: Tensor) -> LocalField:
         """The field with the light on its surface, from some thousand points all over it; no gradient."""
         with torch.no_grad():
             visible = torch.cat([visible[:, : self.maps.taken], torch.zeros_like(visible[:, self.maps.taken :])], 1)
-            color = self.fused(position, normal, visible).logit.sigmoid()
+            color = self._fused_by_kernel(position, normal, visible).logit.sigmoid()
             _, _, summary = summarize_views(self.maps.images, self.maps.camera, position, visible, normal)
             shown, seen = summary[:, :3], visible.amax(1)
             observed = brightness_over_normal(srgb_to_linear(shown), seen, normal)
@@ -326,7 +362,7 @@ class LocalField(Field):
             fused = self.fused(position, normal, visible)
             return _painted(fused, self._heads(fused, position, normal, visible), normal)
 
-        return PointMaterial(**in_rows(ask, position, normal, visible))
+        return PointMaterial(**self._rows(ask, position, normal, visible))
 
     def heads(self, position: Tensor, normal: Tensor, visible: Tensor) -> Tensor:
         """What the heads say of surface points, ``(N, HEADS)``, for :meth:`painted`; arguments of :meth:`material`.
@@ -337,7 +373,7 @@ class LocalField(Field):
         def ask(position: Tensor, normal: Tensor, visible: Tensor) -> dict[str, Tensor]:
             return {"heads": self._heads(self.fused(position, normal, visible), position, normal, visible)}
 
-        return in_rows(ask, position, normal, visible)["heads"]
+        return self._rows(ask, position, normal, visible)["heads"]
 
     def painted(self, heads: Tensor, position: Tensor, normal: Tensor, visible: Tensor) -> PointMaterial:
         """Material at surface points where ``heads (N, HEADS)`` are known: what the views show is looked up again."""
@@ -345,7 +381,7 @@ class LocalField(Field):
         def ask(heads: Tensor, position: Tensor, normal: Tensor, visible: Tensor) -> dict[str, Tensor]:
             return _painted(self.fused(position, normal, visible), heads, normal)
 
-        return PointMaterial(**in_rows(ask, heads, position, normal, visible))
+        return PointMaterial(**self._rows(ask, heads, position, normal, visible))
 
     def _heads(self, fused: Fused, position: Tensor, normal: Tensor, visible: Tensor) -> Tensor:
         if self.shading is None:

@@ -16,10 +16,11 @@ from torch import Tensor, nn
 from torch.nn.functional import linear
 
 from reli3d.geometry.camera import Camera
-from reli3d.geometry.projection import NUMBERS, gather_views, pool_views, summarize_views
+from reli3d.geometry.projection import gather_views
 from reli3d.geometry.rays import RayScene
 from reli3d.geometry.visibility import visible_from
 from reli3d.nn.blocks import linear_of
+from reli3d.nn.view_lookup import NUMBERS, pool_views, summarize_views
 
 ROUNDING = 1e-4  # of interpolated 0 and 1
 
@@ -131,14 +132,19 @@ class ViewFeatures(nn.Module):
         in free space. normal: ``(N, 3)`` unit, outward, beside ``visible``.  Gradients reach the tokens.
         """
         first, activation, last = linear_of(self.per_view, 0), self.per_view[1], self.per_view[2]
-        tokens, channels = self.tokens(maps.tokens), self.tokens.out_features
-        of_tokens, of_numbers = first.weight[:, :channels], first.weight[:, channels:]
-        if torch.is_grad_enabled():
-            gathered, _ = gather_views(tokens, points, maps.camera)
-            numbers, weight, summary = summarize_views(maps.images, maps.camera, points, visible, normal)
-            hidden = linear(gathered, of_tokens) + linear(numbers, of_numbers, first.bias)
-            pooled = (weight[:, None] @ activation(hidden))[:, 0]
-        else:  # bilinear weights sum to 1: the layer and its bias may come before the look-up
-            tokens = linear(tokens, of_tokens, first.bias)
-            pooled, summary = pool_views(maps.images, tokens, of_numbers.T, maps.camera, points, visible, normal)
+        channels = self.tokens.out_features
+        gathered, _ = gather_views(self.tokens(maps.tokens), points, maps.camera)
+        numbers, weight, summary = summarize_views(maps.images, maps.camera, points, visible, normal)
+        hidden = linear(gathered, first.weight[:, :channels]) + linear(numbers, first.weight[:, channels:], first.bias)
+        pooled = (weight[:, None] @ activation(hidden))[:, 0]
         return torch.cat([last(pooled), summary], -1), summary[:, :3]  # pooled before the last layer: it is linear
+
+    @torch.no_grad()
+    def fused(self, maps: ViewMaps, points: Tensor, visible: Tensor | None = None, normal: Tensor | None = None):
+        """:meth:`forward` by :func:`~reli3d.nn.view_lookup.pool_views`: to float32 rounding, without gradient."""
+        first, channels = linear_of(self.per_view, 0), self.tokens.out_features
+        # bilinear weights sum to 1: the layer and its bias may come before the look-up
+        tokens = linear(self.tokens(maps.tokens), first.weight[:, :channels], first.bias)
+        mix = first.weight[:, channels:].T
+        pooled, summary = pool_views(maps.images, tokens, mix, maps.camera, points, visible, normal)
+        return torch.cat([linear_of(self.per_view, 2)(pooled), summary], -1), summary[:, :3]

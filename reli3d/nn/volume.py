@@ -8,10 +8,11 @@ from torch.nn import functional
 
 from reli3d.geometry.grid import sample_grid
 from reli3d.geometry.hull import hull_grid
-from reli3d.geometry.projection import HIDDEN, NUMBERS, SPREAD, gather_views, spread_views, summarize_views
+from reli3d.geometry.projection import gather_views
 from reli3d.nn.blocks import in_rows, linear_of
 from reli3d.nn.presets import VolumeSizes
 from reli3d.nn.view_features import AHEAD, ViewMaps, ahead_of_surface
+from reli3d.nn.view_lookup import HIDDEN, NUMBERS, SPREAD, spread_views, summarize_views
 
 NEAR_HULL = 0.08  # farther outside the silhouettes' hull there is nothing: views are not read
 HULL_SCALE = 0.1  # unit of the hull's distance as a feature
@@ -47,19 +48,38 @@ class FeatureVolume(nn.Module):
         self.side, self.radius = sizes.side, sizes.radius
 
     def forward(self, maps: ViewMaps, surface: Tensor) -> Tensor:
-        """``(N, N, N, F)``, indexed x, y, z.  surface: as in :func:`~reli3d.nn.view_features.ahead_of_surface`."""
+        """``(N, N, N, F)``, indexed x, y, z.  surface: as in :func:`~reli3d.nn.view_features.ahead_of_surface`.
+
+        Gradients reach the tokens, the surface and every parameter.
+        """
+        grid, near, hull = self._near_hull(maps)
+        return self._filled(near, self._reduced(maps, surface, grid[near], hull[near], *self._pooled(maps, grid[near])))
+
+    @torch.no_grad()
+    def fused(self, maps: ViewMaps, surface: Tensor) -> Tensor:
+        """:meth:`forward` by :func:`~reli3d.nn.view_lookup.spread_views`: to float32 rounding, without gradient."""
+        first, last = linear_of(self.mix, 0), linear_of(self.mix, 2)
+        # bilinear weights sum to 1: the first layer may come before the look-up
+        tokens = functional.linear(maps.tokens, first.weight[:, :-NUMBERS], first.bias)
+        layers = tokens, first.weight[:, -NUMBERS:].T, last.weight.T, last.bias
+
+        def reduced(points: Tensor, hull: Tensor) -> dict[str, Tensor]:
+            pooled, summary = spread_views(maps.images, *layers, maps.camera, points)
+            return {"reduced": self._reduced(maps, surface, points, hull, pooled, summary)}
+
+        grid, near, hull = self._near_hull(maps)
+        return self._filled(near, in_rows(reduced, grid[near], hull[near])["reduced"])
+
+    def _near_hull(self, maps: ViewMaps) -> tuple[Tensor, Tensor, Tensor]:
+        """All grid points ``(N**3, 3)``, the index of those near the silhouettes' hull, and the distance to it."""
         axis = torch.linspace(-self.radius, self.radius, self.side, device=maps.images.device)
         grid = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
         hull = hull_grid(axis, maps.silhouette, maps.camera, far=NEAR_HULL).view(-1)
-        near = (hull > -NEAR_HULL).nonzero()[:, 0]
+        return grid, (hull > -NEAR_HULL).nonzero()[:, 0], hull
 
-        mixed = None if torch.is_grad_enabled() else self._tokens(maps)
-
-        def ask(points: Tensor, hull: Tensor) -> dict[str, Tensor]:
-            return {"pooled": self._pooled(maps, mixed, surface, points, hull)}
-
-        pooled = in_rows(ask, grid[near], hull[near])["pooled"]
-        x = pooled.new_zeros(len(grid), pooled.shape[1]).index_copy(0, near, pooled)
+    def _filled(self, near: Tensor, reduced: Tensor) -> Tensor:
+        """The convolved volume of ``reduced`` features at the grid points ``near``, zero elsewhere."""
+        x = reduced.new_zeros(self.side**3, reduced.shape[1]).index_copy(0, near, reduced)
         x = x.reshape(1, self.side, self.side, self.side, -1).permute(0, 4, 1, 2, 3)  # channels last: half the time
         with torch.autocast(x.device.type, torch.bfloat16, enabled=self.in_bfloat16):
             x = self._convolved(x)
@@ -76,22 +96,17 @@ class FeatureVolume(nn.Module):
             x = up(finer + coarse)
         return self.out(x)
 
-    def _tokens(self, maps: ViewMaps) -> Tensor:
-        """What the first layer makes of the tokens: bilinear weights sum to 1, so it may come before the look-up."""
-        first = linear_of(self.mix, 0)
-        return functional.linear(maps.tokens, first.weight[:, :-NUMBERS], first.bias)
+    def _pooled(self, maps: ViewMaps, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Weighted mean and variance over the views of two layers ``(N, 2 SPREAD)``, and the summary ``(N, 9)``."""
+        gathered, _ = gather_views(maps.tokens, points, maps.camera)
+        numbers, weight, summary = summarize_views(maps.images, maps.camera, points, None, None)
+        mixed = self.mix(torch.cat([gathered, numbers], -1))
+        mean = (mixed * weight[..., None]).sum(1)
+        return torch.cat([mean, ((mixed - mean[:, None]).square() * weight[..., None]).sum(1)], -1), summary
 
-    def _pooled(self, maps: ViewMaps, tokens: Tensor | None, surface: Tensor, points: Tensor, hull: Tensor) -> Tensor:
-        first, last = linear_of(self.mix, 0), linear_of(self.mix, 2)
-        if tokens is not None:
-            layers = tokens, first.weight[:, -NUMBERS:].T, last.weight.T, last.bias
-            pooled, summary = spread_views(maps.images, *layers, maps.camera, points)
-        else:
-            gathered, _ = gather_views(maps.tokens, points, maps.camera)
-            numbers, weight, summary = summarize_views(maps.images, maps.camera, points, None, None)
-            mixed = self.mix(torch.cat([gathered, numbers], -1))
-            mean = (mixed * weight[..., None]).sum(1)
-            pooled = torch.cat([mean, ((mixed - mean[:, None]).square() * weight[..., None]).sum(1)], -1)
+    def _reduced(
+        self, maps: ViewMaps, surface: Tensor, points: Tensor, hull: Tensor, pooled: Tensor, summary: Tensor
+    ) -> Tensor:
         rest = torch.stack([(hull / HULL_SCALE).clamp(-2, 2), torch.full_like(hull, 1.0 / len(maps.images))], -1)
         return self.reduce(torch.cat([pooled, summary, rest, ahead_of_surface(surface, maps, points)], -1))
 

@@ -10,13 +10,13 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from reli3d.geometry.camera import Camera, image_plane, look_at, project
 from reli3d.geometry.hull import mask_distance
-from reli3d.geometry.projection import spread_views
 from reli3d.geometry.symmetry import MirrorPlane
 from reli3d.nn.light_map import LightMap, gathered, trained_texels
 from reli3d.nn.local import LocalReconstructor, PixelMaps, mean_logit
 from reli3d.nn.presets import SMALL, LightMapSizes, PyramidSizes, VolumeSizes
 from reli3d.nn.pyramid import place_of_pixels, span_of_pixels
 from reli3d.nn.view_features import ViewMaps, ahead_of_surface
+from reli3d.nn.view_lookup import spread_views
 from reli3d.nn.volume import FeatureVolume
 from reli3d.render.latlong import lat_long_directions, lat_long_texels
 
@@ -68,9 +68,10 @@ def turned(c2w: torch.Tensor, yaw: float) -> torch.Tensor:
     return moved
 
 
-def encoded(model, images, masks, c2w, intrinsics):
+def encoded(model, images, masks, c2w, intrinsics, *, inference=False):
     detail = torch.cat([images, mask_distance(masks)[..., None]], -1).contiguous()
-    return model.encode(images, masks, c2w, intrinsics, detail, intrinsics)
+    encode = model.encode_for_inference if inference else model.encode
+    return encode(images, masks, c2w, intrinsics, detail, intrinsics)
 
 
 def surface_of_ball(n: int = 200):
@@ -253,14 +254,36 @@ def test_the_view_that_sees_a_point_speaks(model):
     torch.testing.assert_close(logit, gain * torch.tensor([[white], [black]]).expand(2, 3), rtol=0, atol=0.01)
 
 
+def outputs(field, inputs):
+    """All that a field gives, at points of its surface."""
+    position, normal = surface_of_ball(500)
+    visible = (torch.rand(500, len(inputs[0]), generator=torch.Generator().manual_seed(2)) > 0.5).float()
+    field = field.with_shading(position, normal, visible)
+    fused, material = field.fused(position, normal, visible), field.material(position, normal, visible)
+    heads = field.heads(position, normal, visible)
+    plain = [field.free_level(position), field.level(1.2 * position), heads, field.radiance_map(), field.volume]
+    return [*vars(fused).values(), *vars(material).values(), *plain]
+
+
+@pytest.mark.parametrize("views", [1, 5])
+def test_a_forward_pass_gives_the_same_numbers_with_and_without_gradient(model, views):
+    inputs = sphere(views)
+    recorded = outputs(encoded(model, *inputs), inputs)
+    with torch.no_grad():
+        plain = outputs(encoded(model, *inputs), inputs)
+    assert any(value.requires_grad for value in recorded)
+    for a, b in zip(plain, recorded, strict=True):
+        assert torch.equal(a, b)
+
+
 def test_the_fused_pass_is_the_one_that_trains(model):
     """The kernel of inference against torch's operations, which have the gradient."""
     position, normal = surface_of_ball(3000)
-    field = encoded(model, *sphere(5))
+    inputs = sphere(5)
     visible = (torch.rand(3000, 5, generator=torch.Generator().manual_seed(2)) > 0.5).float()
-    want = field.fused(position, normal, visible)
-    with torch.no_grad():
-        got = field.fused(position, normal, visible)
+    want = encoded(model, *inputs).fused(position, normal, visible)
+    got = encoded(model, *inputs, inference=True).fused(position, normal, visible)
+    assert want.logit.requires_grad and not got.logit.requires_grad
     # sums of five float32 terms in another order; logits of up to 4, and exp of the confidence
     torch.testing.assert_close(got.logit, want.logit.detach(), rtol=0, atol=2e-5)
     torch.testing.assert_close(got.normal, want.normal.detach(), rtol=0, atol=2e-5)
@@ -272,11 +295,9 @@ def test_the_fused_pass_is_the_one_that_trains(model):
 @pytest.mark.parametrize("views", [1, 5])
 def test_the_volume_of_inference_is_the_one_that_trains(model, views):
     """Two layers and their spread over the views in one kernel, against torch's operations, which have the gradient."""
-    images, masks, c2w, intrinsics = sphere(views)
-    want = encoded(model, images, masks, c2w, intrinsics)
-    with torch.no_grad():
-        got = encoded(model, images, masks, c2w, intrinsics)
-    assert want.volume.requires_grad
+    inputs = sphere(views)
+    want, got = encoded(model, *inputs), encoded(model, *inputs, inference=True)
+    assert want.volume.requires_grad and not got.volume.requires_grad
     wanted = want.volume.detach()
     assert wanted.std() > 0.05
     # sums of 32 float32 terms in another order, through six convolutions
@@ -301,19 +322,17 @@ def test_the_volume_is_read_where_it_was_written():
     torch.testing.assert_close(volume.sample(grid, points), points, rtol=0, atol=1e-6)
 
 
-def test_blocks_of_points_give_what_all_at_once_give(model):
-    position, normal = surface_of_ball(9000)
-    field = encoded(model, *sphere(2))
-    visible = torch.ones(9000, 2)
-    with torch.no_grad():
-        field = field.with_shading(position, normal, visible)
-        blocks = field.material(position, normal, visible)  # in blocks of 8192
-        level = field.level(position)
-    whole = field.material(position, normal, visible)  # with gradient: at once
-    # the fused pass without gradient sums in another order
+def test_inference_in_blocks_of_points_gives_what_training_gives(model):
+    position, normal = surface_of_ball(9000)  # blocks have 8192
+    visible, inputs = torch.ones(9000, 2), sphere(2)
+    field, trained = encoded(model, *inputs, inference=True), encoded(model, *inputs)
+    trained = trained.with_shading(position, normal, visible)
+    blocks = field.with_shading(position, normal, visible).material(position, normal, visible)
+    whole = trained.material(position, normal, visible)
+    # the fused pass sums in another order, behind a dozen layers
     torch.testing.assert_close(blocks.base_color, whole.base_color.detach(), rtol=0, atol=1e-4)
     torch.testing.assert_close(blocks.normal, whole.normal.detach(), rtol=0, atol=1e-3)
-    torch.testing.assert_close(level, field.level(position).detach(), rtol=0, atol=2e-3)
+    torch.testing.assert_close(field.level(position), trained.level(position).detach(), rtol=0, atol=2e-3)
 
 
 def test_points_know_whether_they_lie_before_a_surface():

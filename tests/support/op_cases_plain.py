@@ -5,13 +5,14 @@ from __future__ import annotations
 import torch
 from torch.nn.functional import normalize
 
-from reli3d.geometry import bake, hull, projection
+from reli3d.geometry import bake, hull
 from reli3d.geometry.cover import cover_silhouettes
 from reli3d.geometry.hits import interpolate
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene, offset_origin
 from reli3d.geometry.tangents import encode_normals, vertex_tangents
 from reli3d.geometry.visibility import visible_from
+from reli3d.nn import view_lookup
 from reli3d.render import material, sampling
 from reli3d.render.bump import radial_bump
 from reli3d.render.environment import Environment
@@ -77,15 +78,15 @@ def seen_from(points, normal):
     scene = RayScene(*ball(points.device, radius=0.3), backend="warp")
     images = uniform(3, 24, 24, 4, seed=2).to(points)
     visible = visible_from(scene, points, normal, camera)
-    own, share, total = projection.summarize_views(images, camera, points, visible.float(), normal)
+    own, share, total = view_lookup.summarize_views(images, camera, points, visible.float(), normal)
     tokens, mix = uniform(3, 4, 4, 8, seed=4).to(points), uniform(9, 8, seed=5).to(points)
-    pooled, _ = projection.pool_views(images, tokens, mix, camera, points, visible.float(), normal)
+    pooled, _ = view_lookup.pool_views(images, tokens, mix, camera, points, visible.float(), normal)
     pixels = uniform(3, 3, 8, 8, 4, seed=6).to(points)
-    fused = projection.fuse_views(images, pixels, camera, points, visible.float(), normal)
+    fused = view_lookup.fuse_views(images, pixels, camera, points, visible.float(), normal)
     layers = [
         uniform(*shape, seed=7 + k).to(points) for k, shape in enumerate([(3, 8, 8, 32), (9, 32), (32, 24), (24,)])
     ]
-    spread, _ = projection.spread_views(images, *layers, camera, points)
+    spread, _ = view_lookup.spread_views(images, *layers, camera, points)
     return visible, own, share, total, pooled, *fused, spread
 
 

@@ -1,0 +1,159 @@
+"""What posed images show of points, as the network of convolutions reads it.
+
+:func:`summarize_views` gives the numbers of each view.  The other functions evaluate layers on these numbers and pool
+over the views in one kernel, without gradient; the modules that call them have the same in torch, with gradients.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+from torch import Tensor
+
+from reli3d._bridge import check, launch, struct_of
+from reli3d.geometry.camera import Camera, check_camera
+from reli3d.kernels.view_features import (
+    Viewed,
+    fuse_views_kernel,
+    pool_views_kernel,
+    spread_views_kernel,
+    vec8,
+    view_summary_kernel,
+)
+
+BLOCK = 8  # floats of a kernels.vec8
+NUMBERS = 9  # of a view at a point, and as many of the summary over the views
+HIDDEN, SPREAD = 32, 24  # widths of the two layers of spread_views, which its kernel has written out
+
+
+def summarize_views(
+    images: Tensor, camera: Camera, points: Tensor, visible: Tensor | None, normal: Tensor | None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """What the images show of ``points (N, 3)``: numbers ``(N, V, 9)`` and weight ``(N, V)`` of each view, summary
+    ``(N, 9)``.
+
+    images: ``(V, S, S, 4)``, sRGB and signed distance to the silhouette in pixels.  camera: of these images.
+    visible: ``(N, V)``, 1 where a view sees the surface point, 0 where it is hidden.  normal: ``(N, 3)`` unit.  Both
+    are None for points in space.  :mod:`reli3d.kernels.view_features` lists the numbers.  No gradient.  Raises
+    TypeError unless float32, ValueError on wrong shapes or mixed devices.
+    """
+    n, out, viewed = _summary(images, camera, points, visible, normal)
+    numbers, weight = points.new_empty(n, len(images), NUMBERS), points.new_empty(n, len(images))
+    outs = [(numbers, wp.float32), (weight, wp.float32), (out, wp.float32)]
+    launch(view_summary_kernel, n, [viewed, *outs], points.device)
+    return numbers, weight, out
+
+
+def pool_views(
+    images: Tensor,
+    tokens: Tensor,
+    mix: Tensor,
+    camera: Camera,
+    points: Tensor,
+    visible: Tensor | None,
+    normal: Tensor | None,
+) -> tuple[Tensor, Tensor]:
+    """A hidden layer at ``points (N, 3)``: the weighted mean over the views, ``(N, H)``, and the summary ``(N, 9)`` of
+    :func:`summarize_views`.
+
+    The layer of a view is ``silu(token + numbers @ mix)``: its ``tokens (V, P, P, H)``, looked up where the point
+    projects, and the 9 numbers of :func:`summarize_views` times ``mix (9, H)``.  H is a multiple of 8.  The other
+    arguments are those of :func:`summarize_views`.  No gradient: with :func:`gather_views` and torch the same has one
+    and takes five times as long.
+    """
+    n, out, viewed = _summary(images, camera, points, visible, normal)
+    check("tokens", tokens, like=images)
+    check("mix", mix, like=images)
+    hidden = tokens.shape[-1]
+    if tokens.ndim != 4 or tokens.shape[0] != len(images) or min(tokens.shape[1:3]) < 2 or hidden % BLOCK:
+        raise ValueError(
+            f"tokens: expected ({len(images)}, P, P, H), P at least 2 and H a multiple of {BLOCK}, "
+            f"got {tuple(tokens.shape)}"
+        )
+    if tuple(mix.shape) != (NUMBERS, hidden):
+        raise ValueError(f"mix: expected shape {(NUMBERS, hidden)}, got {tuple(mix.shape)}")
+    pooled = points.new_empty(n, hidden)
+    layer = [(t.detach().contiguous().unflatten(-1, (-1, BLOCK)), vec8) for t in (tokens, mix)]
+    outs = [(pooled.unflatten(-1, (-1, BLOCK)), vec8), (out, wp.float32)]
+    launch(pool_views_kernel, n, [viewed, *layer, *outs], points.device)
+    return pooled, out
+
+
+def spread_views(
+    images: Tensor, tokens: Tensor, mix: Tensor, last: Tensor, bias: Tensor, camera: Camera, points: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Two layers at ``points (N, 3)`` in space: weighted mean over the views and mean square difference to it, ``(N, 2
+    SPREAD)``, and the summary ``(N, 9)`` of :func:`summarize_views`.
+
+    The layers of a view are ``silu(token + numbers @ mix) @ last + bias``: tokens, mix and numbers as in
+    :func:`pool_views` with H = HIDDEN.  last: ``(HIDDEN, SPREAD)``.  bias: ``(SPREAD,)``.  The rest as there.  No
+    gradient: :class:`reli3d.nn.volume.FeatureVolume` has the same in torch.
+    """
+    n, out, viewed = _summary(images, camera, points, None, None)
+    shapes = {
+        "tokens": (tokens, (len(images), *tokens.shape[1:3], HIDDEN)),
+        "mix": (mix, (NUMBERS, HIDDEN)),
+        "last": (last, (HIDDEN, SPREAD)),
+        "bias": (bias, (SPREAD,)),
+    }
+    for name, (value, shape) in shapes.items():
+        check(name, value, like=images)
+        if tuple(value.shape) != shape or (name == "tokens" and min(shape[1:3]) < 2):
+            raise ValueError(f"{name}: expected shape {shape}, got {tuple(value.shape)}")
+    layers = [(value.detach().contiguous().unflatten(-1, (-1, BLOCK)), vec8) for value, _ in shapes.values()]
+    pooled = points.new_empty(n, 2 * SPREAD)
+    outs = [(pooled.unflatten(-1, (-1, BLOCK)), vec8), (out, wp.float32)]
+    launch(spread_views_kernel, n, [viewed, *layers, *outs], points.device)
+    return pooled, out
+
+
+def fuse_views(
+    images: Tensor, pixels: Tensor, camera: Camera, points: Tensor, visible: Tensor, normal: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """What the views predict of surface ``points (N, 3)``; the view that sees a point best speaks loudest.
+
+    Gives the colour's logit ``(N, 3)``, numbers ``(N, 10)`` and the unit normal ``(N, 3)``.
+
+    pixels: ``(3, V, P, P, 4)``: gain and three shifts; confidence, roughness, metallic, chroma; normal, 0.  A view's
+    colour is ``gain * m + chroma * (l - m) + shift`` with the logits ``l`` of the colour seen and their mean ``m``.
+    Its weight is the square of its share in :func:`summarize_views` times exp(confidence).  The numbers: roughness,
+    metallic, gain, normal less ``normal``, their cosine, greatest share, confidence, spread of the logit.  The rest as
+    in :func:`summarize_views`.  No gradient: :class:`reli3d.nn.local.LocalField` has the same in torch.
+    """
+    check("pixels", pixels, last=4, like=images)
+    if pixels.ndim != 5 or pixels.shape[:2] != (3, len(images)) or min(pixels.shape[2:4]) < 2:
+        raise ValueError(f"pixels: expected (3, {len(images)}, P, P, 4), P at least 2, got {tuple(pixels.shape)}")
+    n, _, viewed = _summary(images, camera, points, visible, normal)
+    maps = [(part, wp.vec4) for part in pixels.detach().contiguous()]
+    logit, numbers, shading = points.new_empty(n, 3), points.new_empty(n, 10), points.new_empty(n, 3)
+    outs = [(logit, wp.vec3), (numbers, wp.float32), (shading, wp.vec3)]
+    launch(fuse_views_kernel, n, [viewed, *maps, *outs], points.device)
+    return logit, numbers, shading
+
+
+def _summary(images, camera, points, visible, normal) -> tuple[int, Tensor, Viewed]:
+    """Number of points, the empty summary and what the kernels have in common, checked."""
+    views, n = len(images), len(points)
+    check("images", images, last=4)
+    check("points", points, last=3, like=images)
+    if images.ndim != 4 or images.shape[1] != images.shape[2] or images.shape[1] < 2:
+        raise ValueError(f"images: expected (V, S, S, 4) with S of at least 2, got {tuple(images.shape)}")
+    check_camera(camera, like=images, views=views, size=images.shape[1:3])
+    if (visible is None) != (normal is None):
+        raise ValueError("visible, normal: expected both or none, got one")
+    if visible is None:
+        visible, normal = points.new_empty(0, views), points.new_empty(0, 3)
+    else:
+        check("visible", visible, last=views, like=points)
+        check("normal", normal, last=3, like=points)
+        if len(visible) != n or len(normal) != n:
+            raise ValueError(f"visible, normal: expected {n} rows, got {len(visible)} and {len(normal)}")
+    arrays = {
+        "image": (images, wp.vec4),
+        "c2w": (camera.c2w, wp.mat44),
+        "intrinsics": (camera.intrinsics, wp.vec4),
+        "points": (points, wp.vec3),
+        "normal": (normal, wp.vec3),
+        "visible": (visible, wp.float32),
+    }
+    viewed = struct_of(Viewed, **{name: (v.detach().contiguous(), kind) for name, (v, kind) in arrays.items()})
+    return n, points.new_empty(n, NUMBERS), viewed
