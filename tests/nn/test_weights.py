@@ -52,7 +52,8 @@ def test_every_published_tensor_has_one_place_and_none_is_left(published):
     twice = Counter(places.values())
     assert sum(count - 1 for count in twice.values()) == 144 and max(twice.values()) == 2
     numbers = sum(torch.Size(shape).numel() for shape in ours.values())
-    assert numbers == 1_574_452_729 + 1024 + 384  # parameters of the listing, and the two unused mask tokens
+    # parameters of the listing without the ten of tone mapping, and the two unused mask tokens
+    assert numbers == 1_574_452_729 - 10 + 1024 + 384
 
 
 def aliased(published_names, model):
