@@ -132,6 +132,10 @@ class ReniSizes(_Checked):
     heads: int
     height: int  # rows of the map that the network itself decodes
 
+    def __post_init__(self):
+        super().__post_init__()
+        _expect(self.height % 2 == 0, "height", "an even number, as maps turn by a quarter", self.height)
+
 
 @dataclass(frozen=True)
 class PyramidSizes(_Checked):
@@ -223,9 +227,8 @@ class Preset(_Checked):
         for name, patch in (("encoder.patch", self.encoder.patch), ("illumination.encoder.patch", light.encoder.patch)):
             _expect(patch <= self.image_size, name, f"at most image_size, {self.image_size}", patch)
         numbers, needed = light.tokens * light.token_width, 3 * self.reni.latents + 7
-        _expect(
-            numbers >= needed, "illumination.tokens", f"{math.ceil(needed / light.token_width)} or more", light.tokens
-        )
+        enough = f"{math.ceil(needed / light.token_width)} or more for reni.latents of {self.reni.latents}"
+        _expect(numbers >= needed, "illumination.tokens", enough, light.tokens)
 
 
 def to_json(preset: Preset | LocalPreset) -> str:

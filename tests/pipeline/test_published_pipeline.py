@@ -17,7 +17,7 @@ from reli3d.nn import field
 from reli3d.nn.heads import deformation
 from reli3d.nn.model import Code, Reconstructor
 from reli3d.nn.published import our_key
-from reli3d.nn.weights import load_model, read_manifest, read_tensors, save
+from reli3d.nn.weights import load_model, published_state, read_manifest, read_tensors, save
 from reli3d.output import results
 from reli3d.pipeline import NoSurface, ReconstructOptions, default_normalization, prepare, reconstruct
 from reli3d.views.folder import load_views
@@ -37,7 +37,8 @@ def tiny():
         pytest.skip("needs the folder ../shared/reference/goldens beside the checkout")
     model = Reconstructor(TINY).eval()
     with np.load(goldens / "tiny_system.npz") as file:
-        state = {our_key(k[6:]): torch.from_numpy(file[k]) for k in file.files if k.startswith("param.")}
+        stored = {k[6:]: torch.from_numpy(file[k]) for k in file.files if k.startswith("param.")}
+        state = published_state(stored, "golden")
     published = read_manifest(goldens.parent / "reni++L49.safetensors")
     reni = read_tensors(published, {name: torch.float32 for name in published.tensors})
     state |= {"environment.field." + k: v for k, v in reni.items()}
