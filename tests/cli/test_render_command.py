@@ -31,7 +31,7 @@ SIZE, DISTANCE = 24, 2.6
 def scene(tmp_path_factory):
     """Folder with a red ball and, as .hdr and .exr, a light whose one half is dark; exact in either format."""
     folder = tmp_path_factory.mktemp("render")
-    asset = ball(torch.device("cpu"), (0.9, 0.1, 0.1))
+    asset = ball(torch.device("cpu"), (0.79, 0.01, 0.01))
     n = asset.mesh.normals
     tangent = torch.linalg.cross(n.new_tensor([0.3, 0.5, 0.81]).expand_as(n), n)
     tangent = torch.cat([torch.nn.functional.normalize(tangent, dim=-1), torch.ones(len(n), 1)], -1)
@@ -41,6 +41,7 @@ def scene(tmp_path_factory):
     )
     light = torch.full((8, 16, 3), 0.0625)
     light[:, :8] = torch.tensor([2.0, 1.0, 1.0])
+    light = light.roll(-4, 1)  # the borders of the halves look to -Z and +Z
     write_environment(folder / "half.hdr", Environment(light))
     write_environment(folder / "half.exr", Environment(light))
     return folder

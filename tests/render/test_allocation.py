@@ -13,6 +13,7 @@ from reli3d.render.allocation import plan_samples
 from reli3d.render.asset import Asset
 from reli3d.render.environment import Environment
 from reli3d.render.image import plan_render, render_asset
+from reli3d.render.latlong import lat_long_directions
 from reli3d.render.shading import ShadeOptions, shade
 from tests.support import reference
 from tests.support.bootstrap import interval
@@ -170,9 +171,7 @@ def test_no_strategy_alone_is_better_than_the_plan_anywhere_on_the_grid(device, 
 def test_the_pilot_sees_shadows(device):
     """A ball before the sun: samples towards it are wasted, and the plan gives the other strategies more."""
     arguments, env = surface(device, 0.5, 1.0), light("sun", device)
-    sun = torch.tensor([[20.5 / 64.0, 7.5 / 32.0]], dtype=torch.float64) * torch.pi
-    theta, phi = 2.0 * sun[0, 0] - torch.pi, sun[0, 1]
-    where = torch.stack([theta.sin() * phi.sin(), phi.cos(), -theta.cos() * phi.sin()])
+    where = lat_long_directions(32, dtype=torch.float64)[7, 4]
     mesh = trimesh.creation.icosphere(subdivisions=3, radius=1.5)
     vertices = torch.tensor(mesh.vertices) + 3.0 * where
     scene = RayScene(vertices.float().to(device), torch.tensor(mesh.faces, dtype=torch.int32, device=device))

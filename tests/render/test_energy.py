@@ -146,10 +146,10 @@ def test_partly_metallic_white_loses_no_more_than_its_parts(device):
     def sent(metallic):
         value = eval_bsdf(
             wo.float().to(device),
-            wi.float().to(device),
             torch.ones(3, device=device),
             torch.tensor(0.09, device=device),
             torch.tensor(metallic, device=device),
+            wi.float().to(device),
         )
         return float((value[:, 0].double().cpu() * share).sum() * torch.pi)
 

@@ -69,5 +69,5 @@ def light(name, device):
     if name == "constant":
         map_ = torch.full((32, 64, 3), 0.7)
     if name == "sun":
-        map_[7, 20] = 2000.0
+        map_[7, 4] = 2000.0
     return Environment(map_.to(device))

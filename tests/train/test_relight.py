@@ -125,6 +125,6 @@ def test_lights_are_drawn_from_the_maps_that_training_may_see(tmp_path):
     maps = np.random.default_rng(0).random((12, 64, 128, 3)).astype(np.float32)
     np.savez(tmp_path / "maps.npz", env=maps, names=[f"map{k:02d}" for k in range(12)])
     lights = training_maps(tmp_path / "maps.npz")
-    assert len(lights) == 10 and torch.equal(lights[0], torch.from_numpy(maps[0]))
+    assert len(lights) == 10 and torch.equal(lights[0], quarter_turn(torch.from_numpy(maps[0]), -1))
     drawn = draw_light(lights, np.random.default_rng(1))
     assert drawn.shape == (64, 128, 3) and float(drawn.min()) > 0
