@@ -6,6 +6,7 @@ import io
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from random import Random
 
 import numpy as np
 import torch
@@ -24,16 +25,19 @@ from reli3d.synthetic.maps import load_maps
 from reli3d.views.check import explain_cameras
 from reli3d.views.folder import load_views
 from tests.support import evil, evil_maps, tars
+from tests.support.known import KINDS
+from tests.support.misread import Case
 from tests.support.scenes import ball_mesh, textures
 
 
 @dataclass(frozen=True)
 class Target:
-    """files: by their names in the folder that ``read`` is called with."""
+    """files: by their names in the folder that ``read`` is called with.  known: makes an input with its truth."""
 
     name: str
     files: dict[str, bytes]
     read: Callable[[Path], object]
+    known: Callable[[Random], Case] | None = None
 
 
 def _folder(make: Callable[[Path], object], root: Path) -> dict[str, bytes]:
@@ -88,7 +92,11 @@ def targets(root: Path) -> list[Target]:
         Target("tar", {"a.tar": tars.written(*tars.GOOD)}, _unpacked),
         Target("list", {"a.txt": b"one\ntwo/three\n"}, lambda f: listed(f / "a.txt")),
     ]
-    return found
+    return found + [Target(name, {}, _nothing, make) for name, make in KINDS.items()]
+
+
+def _nothing(folder: Path) -> None:
+    """A target with a truth reads by itself."""
 
 
 def _unpacked(folder: Path) -> None:

@@ -1,0 +1,217 @@
+"""GLB files of one quad with random features of glTF 2.0, and what they look like by the standard."""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from random import Random
+
+import numpy as np
+import torch
+from PIL import Image
+
+from reli3d.geometry.camera import Camera, look_at
+from reli3d.render.asset import Asset
+from reli3d.render.environment import Environment
+from reli3d.render.image import render_asset
+from reli3d.render.shading import Samples, ShadeOptions
+from tests.support.misread import check
+
+CELLS, CELL, SIZE = 4, 32, 24  # blocks of one color a side, their texels, pixels of the view
+ONE_RAY = ShadeOptions(samples=Samples(light=1, bsdf=1, cosine=1))
+WRAPS = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
+SPEC_GLOSS = "KHR_materials_pbrSpecularGlossiness"
+READABLE = ("KHR_materials_clearcoat", "KHR_materials_sheen", "KHR_materials_specular", "KHR_materials_ior")
+CODED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_texture_basisu", "NO_such_extension")
+
+
+@dataclass(frozen=True)
+class Look:
+    """low, high: bounds of the vertices.  color: linear base color at points ``x, y`` of the unit quad and whether the
+    point is clear of the borders between texels' blocks.
+    """
+
+    low: np.ndarray
+    high: np.ndarray
+    color: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+    roughness: float
+    metallic: float
+    refused: bool
+    plain: bool  # of core glTF alone: a refusal is a fault
+
+
+def linear(srgb: np.ndarray) -> np.ndarray:
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+
+
+def wrapped(t: np.ndarray, mode: int) -> np.ndarray:
+    if mode == 33071:
+        return t.clip(0.0, 1.0 - 1e-9)
+    if mode == 33648:
+        t = t % 2.0
+        return np.where(t >= 1.0, 2.0 - t, t).clip(0.0, 1.0 - 1e-9)
+    return t % 1.0
+
+
+def quad(rng: Random) -> tuple[bytes, Look]:
+    numbers = np.random.default_rng(rng.getrandbits(32))
+    binary, views, accessors = b"", [], []
+
+    def view(data: bytes) -> int:
+        nonlocal binary
+        views.append({"buffer": 0, "byteOffset": len(binary), "byteLength": len(data)})
+        binary += data + bytes(-len(data) % 4)
+        return len(views) - 1
+
+    def accessor(values: np.ndarray, kind: str, code: int, **more) -> int:
+        entry = {"bufferView": view(values.tobytes()), "componentType": code, "count": len(values), "type": kind}
+        accessors.append({**entry, **more})
+        return len(accessors) - 1
+
+    corners = np.float32([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    uv_scale, uv_offset = rng.choice((1.0, 2.0)), rng.choice((0.03, -0.27))
+    uv = np.float32([[0, 1], [1, 1], [1, 0], [0, 0]]) * np.float32(uv_scale) + np.float32(uv_offset)
+    attributes = {
+        "POSITION": accessor(corners, "VEC3", 5126, min=[-1, -1, 0], max=[1, 1, 0]),
+        "NORMAL": accessor(np.float32([[0, 0, 1]] * 4), "VEC3", 5126),
+        "TEXCOORD_0": accessor(uv, "VEC2", 5126),
+    }
+    extensions, used, required, plain = {}, [], [], True
+    modes = [rng.choice(list(WRAPS)) for _ in range(2)]
+    blocks = numbers.integers(20, 256, (CELLS, CELLS, 3), dtype=np.uint8)
+    images, textures = [], []
+
+    def texture(image: Image.Image) -> dict:
+        data = io.BytesIO()
+        image.save(data, "PNG")
+        images.append({"bufferView": view(data.getvalue()), "mimeType": "image/png"})
+        textures.append({"source": len(images) - 1, "sampler": 0})
+        return {"index": len(textures) - 1}
+
+    base = texture(Image.fromarray(blocks.repeat(CELL, 0).repeat(CELL, 1)))
+    move, stretch = np.zeros(2), np.ones(2)
+    if rng.random() < 0.3:
+        move, stretch = (
+            np.array([rng.choice((0.0, 0.25, 0.5)) for _ in range(2)]),
+            np.array([rng.choice((0.5, 2.0))] * 2),
+        )
+        base["extensions"] = {"KHR_texture_transform": {"offset": move.tolist(), "scale": stretch.tolist()}}
+        used.append("KHR_texture_transform")
+        required += used if rng.random() < 0.5 else []
+    factor = np.array([rng.uniform(0.2, 1.0) for _ in range(3)])
+    roughness, metallic = rng.uniform(0.1, 1.0), rng.uniform(0.0, 1.0)
+    pbr: dict = {"baseColorTexture": base, "baseColorFactor": [*factor, 1.0]}
+    packed = rng.choice(["factor", "8 bits", "16 bits grey"])
+    if packed == "factor":
+        pbr |= {"roughnessFactor": roughness, "metallicFactor": metallic}
+    elif packed == "8 bits":
+        rough, metal = rng.randrange(30, 256), rng.randrange(256)
+        pbr["metallicRoughnessTexture"] = texture(Image.new("RGB", (4, 4), (rng.randrange(256), rough, metal)))
+        roughness, metallic = rough / 255, metal / 255
+    else:
+        grey = rng.randrange(8000, 65536)
+        pbr["metallicRoughnessTexture"] = texture(Image.fromarray(np.full((4, 4), grey, np.uint16)))
+        roughness = metallic = grey / 65535
+    vertex = np.ones(3)
+    if rng.random() < 0.4:
+        vertex = np.array([rng.choice((0.2, 0.4, 0.6, 0.8, 1.0)) for _ in range(3)])
+        code, kind, top = rng.choice([(5121, np.uint8, 255), (5123, np.uint16, 65535), (5126, np.float32, 1)])
+        color = (np.append(vertex, 1.0) * top).astype(kind)[None].repeat(4, 0)
+        more = {} if top == 1 else {"normalized": True}
+        attributes["COLOR_0"] = accessor(color, "VEC4", code, **more)
+    material: dict = {"pbrMetallicRoughness": pbr}
+    if rng.random() < 0.15:  # below the dielectric's reflectance, so that nothing is metal
+        material = {"extensions": {SPEC_GLOSS: {"diffuseTexture": base, "diffuseFactor": [*factor, 1.0]}}}
+        material["extensions"][SPEC_GLOSS] |= {"specularFactor": [0.03] * 3, "glossinessFactor": 1.0 - roughness}
+        metallic = 0.0
+        vertex = vertex * 0.97 / 0.96  # what the specular layer transmits, theirs and the dielectric's
+        used.append(SPEC_GLOSS)
+        plain = False
+    if rng.random() < 0.15:
+        name = rng.choice(READABLE)
+        used.append(name)
+        required += [name] if rng.random() < 0.5 else []
+        material.setdefault("extensions", {})[name] = {}
+    refused = rng.random() < 0.1
+    if refused:
+        name = rng.choice(CODED)
+        used.append(name)
+        required.append(name)
+    grow, shift = rng.choice((0.5, 1.0, 3.0)), np.array([rng.uniform(-1, 1) for _ in range(3)])
+    nodes: list[dict] = [{"children": [1], "translation": shift.tolist()}, {"mesh": 0, "scale": [grow] * 3}]
+    if rng.random() < 0.2:  # a skin: the node's own transform is ignored, the joint's counts
+        nodes = [{"mesh": 0, "skin": 0, "scale": [100.0] * 3}]
+        nodes.append({"translation": shift.tolist(), "scale": [grow] * 3})
+        attributes["JOINTS_0"] = accessor(np.zeros((4, 4), np.uint8), "VEC4", 5121)
+        attributes["WEIGHTS_0"] = accessor(np.float32([[1, 0, 0, 0]] * 4), "VEC4", 5126)
+        extensions["skins"] = [{"joints": [1]}]
+    indices = accessor(np.uint16([0, 1, 2, 0, 2, 3]), "SCALAR", 5123)
+    document = {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0, 1] if "skins" in extensions else [0]}],
+        "nodes": nodes,
+        "meshes": [{"primitives": [{"attributes": attributes, "indices": indices, "material": 0}]}],
+        "materials": [material],
+        "textures": textures,
+        "images": images,
+        "samplers": [{"wrapS": modes[0], "wrapT": modes[1]}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": len(binary)}],
+        **extensions,
+    }
+    if used:
+        document["extensionsUsed"] = used
+    if required:
+        document["extensionsRequired"] = required
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
+
+    def color(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        cells, clear = [], np.ones(x.shape, bool)
+        for k, (t, mode) in enumerate((((1 + x) / 2, modes[0]), ((1 - y) / 2, modes[1]))):
+            t = wrapped((t * uv_scale + uv_offset) * stretch[k] + move[k], mode) * CELLS
+            cells.append(t.astype(int).clip(0, CELLS - 1))
+            off = np.abs(t - np.rint(t))
+            clear &= off > 2.5 / CELL  # bilinear, and texels of another size
+        return linear(blocks[cells[1], cells[0]] / 255.0) * factor * vertex, clear
+
+    look = Look(
+        np.array([-grow, -grow, 0.0]) + shift,
+        np.array([grow, grow, 0.0]) + shift,
+        color,
+        roughness,
+        metallic,
+        refused,
+        plain and not used and not refused,
+    )
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks, look
+
+
+def compare(parts: list[Asset], look: Look, notes: list[str]) -> None:
+    check(len(parts) == 1, f"{len(parts)} parts")
+    (asset,) = parts
+    vertices = asset.mesh.vertices.numpy()
+    for name, got, want in (("low", vertices.min(0), look.low), ("high", vertices.max(0), look.high)):
+        check(np.abs(got - want).max() < 1e-4, f"bounds: {name} {got.tolist()}, not {want.tolist()}; notes {notes}")
+    middle, grow = (look.low + look.high) / 2, (look.high[0] - look.low[0]) / 2
+    eye = middle + np.array([0.0, 0.0, 4.0 * grow])
+    pose = look_at(eye.tolist(), middle.tolist())
+    camera = Camera.from_fov(pose, 0.45, SIZE, SIZE)
+    image = render_asset(asset, camera, Environment(torch.ones(4, 8, 3)), options=ONE_RAY)
+    check(bool((image.alpha > 0.999).all()), "the quad does not fill the view")
+    pixel = (np.arange(SIZE) + 0.5 - SIZE / 2) * 4.0 / float(camera.intrinsics[0])
+    x, y = np.meshgrid(pixel, -pixel)
+    want, clear = look.color(x, y)
+    off = np.abs(image.base_color.numpy() - want)[clear]
+    check(
+        clear.sum() > 20 and off.max() < 0.02, f"base color differs by {off.max():.3f}; notes {notes}"
+    )  # 8 bits, sRGB
+    for name, value in (("roughness", look.roughness), ("metallic", look.metallic)):
+        off = np.abs(getattr(image, name).numpy() - value).max()
+        check(off < 0.01, f"{name} differs by {off:.3f} from {value:.3f}; notes {notes}")
