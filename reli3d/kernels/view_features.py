@@ -305,7 +305,7 @@ def spread_views_kernel(
     write_summary(summary, n, color, spread / total, least, greatest, p)
 
 
-SURE = wp.constant(0.25)  # share of a view that needs no help from views that do not see the point
+CONFIDENT_WEIGHT = wp.constant(0.25)  # share of a view that needs no help from views that do not see the point
 LOGIT_MARGIN = wp.constant(0.02)  # as nn.heads.COLOR_MARGIN: the logit of black and of white stays within reach
 
 
@@ -341,8 +341,8 @@ def fuse_views_kernel(
 ):
     """Means over the views of what they predict, weighted by the square of their share times exp(confidence).
 
-    A view that does not see the point is left out where another has a share of SURE: it would have less than 1 % of
-    that view's weight, at equal confidence.
+    A view that does not see the point is left out where another has at least CONFIDENT_WEIGHT: it would have less than
+    1 % of that view's weight, at equal confidence.
     """
     n = start + wp.tid()
     prefetch_views(viewed, n + 1, True)
@@ -361,7 +361,7 @@ def fuse_views_kernel(
         v = k % views
         sees = viewed.visible[n, v] > 0.0
         # views that see the point come first; the others speak where none of those is sure
-        if (k < views and sees) or (k >= views and not sees and greatest < SURE):
+        if (k < views and sees) or (k >= views and not sees and greatest < CONFIDENT_WEIGHT):
             pose = viewed.c2w[v]
             q = project_point(p, pose, viewed.intrinsics[v])
             seen, share = view_numbers(viewed.image, v, p, q, pose, 1, viewed.visible[n, v], normal)

@@ -20,7 +20,7 @@ from torch.nn import functional
 
 from reli3d.geometry.camera import Camera, image_plane
 from reli3d.geometry.projection import gather_views
-from reli3d.kernels.view_features import SURE
+from reli3d.kernels.view_features import CONFIDENT_WEIGHT
 from reli3d.nn.blocks import in_rows, linear_of
 from reli3d.nn.field import Field, PointMaterial, bound_level, grid_bound_level
 from reli3d.nn.heads import ROUGHNESS_MIN, color_logit, mlp
@@ -329,7 +329,7 @@ class LocalField(Field):
         got, _ = gather_views(pixels, position, maps.camera)
         shown, share, summary = summarize_views(maps.images, maps.camera, position, visible, normal)
         gain, shift, confidence, rough, metal, chroma, bent = got.split([1, 3, 1, 1, 1, 1, 3], -1)
-        hidden = (visible <= 0.0) & (summary[:, 5:6] >= SURE)  # and a view that sees the point is sure
+        hidden = (visible <= 0.0) & (summary[:, 5:6] >= CONFIDENT_WEIGHT)  # and a view that sees the point is sure
         weight = (SHARPNESS * share.log() + confidence[..., 0]).masked_fill(hidden, -math.inf).softmax(-1)[..., None]
         each = paint_logit(shown[..., :3], gain, chroma, shift)
         logit = (each * weight).sum(1)

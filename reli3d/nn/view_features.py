@@ -90,16 +90,17 @@ class ViewMaps:
 
 
 AHEAD = 4  # numbers of ahead_of_surface
-NEAR, FAR = 0.05, 0.2  # units in which they measure a distance, in those of the world
+NEAR_DISTANCE, FAR_DISTANCE = 0.05, 0.2  # units in which they measure a distance, in those of the world
 
 
 def ahead_of_surface(surface: Tensor, maps: ViewMaps, points: Tensor) -> Tensor:
     """How far ``points (N, 3)`` lie before the surfaces that the views show, as seen from each, ``(N, AHEAD)``.
 
     surface: ``(V, P, P, 2)`` depth of a pixel from the world's origin along the camera's axis, times coverage, and
-    coverage.  The numbers are the greatest and the mean over the views that show the object there, of a distance that
-    saturates at NEAR, its mean at FAR, and the share of these views.  Before a surface that a view shows there is
-    nothing; far behind it a view has no information.  Gradients reach the surface.
+    coverage.  The numbers are, of the views that show the object there: the greatest and the mean distance, as
+    tanh(distance / NEAR_DISTANCE), the mean of tanh(distance / FAR_DISTANCE), and the fraction of these views.  In
+    front of a surface that a view shows there is nothing; far behind it a view has no information.  Gradients reach
+    the surface.
     """
     got, pixel = gather_views(surface, points, maps.camera)
     covered = got[..., 1].clamp(min=0.1)
@@ -107,7 +108,7 @@ def ahead_of_surface(surface: Tensor, maps: ViewMaps, points: Tensor) -> Tensor:
     origin = (c2w[:, :3, 3] * c2w[:, :3, 2]).sum(-1)
     ahead = got[..., 0] / covered - (pixel[..., 2] - origin)
     shown = (got[..., 1] > 0.5).to(ahead)
-    near, far = (ahead / NEAR).tanh() * shown, (ahead / FAR).tanh() * shown
+    near, far = (ahead / NEAR_DISTANCE).tanh() * shown, (ahead / FAR_DISTANCE).tanh() * shown
     share = shown.mean(1)
     few = share.clamp(min=0.5 / len(c2w))
     greatest = (near - 2.0 * (1.0 - shown)).amax(1).clamp(min=-1.0)
