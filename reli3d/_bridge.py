@@ -11,9 +11,10 @@ Outputs must be disjoint per ``i``.  Warp's CPU atomics are not atomic.  In a ba
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import threading
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from types import ModuleType
@@ -32,6 +33,7 @@ COMPILERS = 4  # modules compiled at once; each thread builds its own precompile
 SLICE_MIN = 1024  # below this many threads a slice costs about as much to launch as to run
 
 T = TypeVar("T")
+F = TypeVar("F", bound=Callable)
 
 _TORCH = {
     wp.float32: (torch.float32, ()),
@@ -115,6 +117,25 @@ def serial() -> bool:
     return torch.get_num_threads() == 1 or threading.current_thread().name.startswith(WORKER)
 
 
+def full_precision(function: F) -> F:
+    """Decorator: ``function`` runs with autocast disabled on every device, so that matrix products stay in float32.
+
+    Torch's backward pass takes the autocast state of where it is called, as for any other operation.
+    """
+
+    @functools.wraps(function)
+    def wrapper(*args, **kwargs):
+        enabled = [kind for kind in ("cpu", "cuda") if torch.is_autocast_enabled(kind)]
+        if not enabled:
+            return function(*args, **kwargs)
+        with contextlib.ExitStack() as stack:
+            for kind in enabled:
+                stack.enter_context(torch.autocast(kind, enabled=False))
+            return function(*args, **kwargs)
+
+    return cast(F, wrapper)
+
+
 @contextlib.contextmanager
 def stream(device: torch.device):
     """Order Warp's launches after torch's on CUDA; yields the Warp device name."""
@@ -152,8 +173,16 @@ def struct_of(kind, **fields):
     native = made.__ctype__()  # what a launch takes; Warp's own setters want arrays, which cost twice as much to make
     for name, value in fields.items():
         setattr(native, name, view(*value) if isinstance(value, tuple) else value)
-    vars(made)["fields"] = fields  # or the tensors' memory would go to others
+    vars(made)["tensors"] = [v[0] for v in fields.values() if isinstance(v, tuple)]  # or their memory would be freed
     return made
+
+
+def _check_device(args: Iterable, device: torch.device) -> None:
+    """Raise ValueError for a tensor on another device, whose memory a kernel must not read."""
+    for value in args:
+        for tensor in (value[0],) if isinstance(value, tuple) else getattr(value, "tensors", ()):
+            if tensor.device != device:
+                raise ValueError(f"tensor {tuple(tensor.shape)}: expected device {device}, got {tensor.device}")
 
 
 def empty(shape: Sequence[int], dtype, device: torch.device) -> Tensor:
@@ -191,6 +220,7 @@ def launch(kernel, n: int, args: Sequence, device: torch.device, *, slice_min: i
     """
     if n == 0:
         return
+    _check_device(args, device)
     with stream(device) as name:
         values = views(args)
         if name != "cpu":
@@ -227,7 +257,7 @@ def once_differentiable(backward):
 
     def wrapper(ctx, *g_outs):
         with torch.no_grad():
-            grads = backward(ctx, *g_outs)
+            grads = full_precision(backward)(ctx, *g_outs)
         if not torch.is_grad_enabled():
             return grads
         several = isinstance(grads, tuple)
@@ -275,6 +305,7 @@ class _KernelOp(torch.autograd.Function):
         ins = _fill(plain, zip(tensors, types, strict=True))
         if n > 0:
             with stream(device) as name:
+                _check_device([*ins, *((g,) for g in g_results if g is not None)], device)
                 values, out_values = views(ins), views(_typed(results, outs))
                 adj_out = [None if g is None else view(g, d) for g, (_, d) in zip(g_results, outs, strict=True)]
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from reli3d._bridge import expect, present
+from reli3d._bridge import expect, full_precision, present
 from reli3d.geometry.bake import bake
 from reli3d.geometry.cover import REACH, cover_silhouettes
 from reli3d.geometry.mesh import Mesh, largest_components, vertex_normals, weld
@@ -71,7 +71,7 @@ def encode(model: Network, prepared: Prepared, *, background: bool = False) -> F
             prepared.camera.intrinsics,
             mirrored=prepared.mirrored,
         )
-    shown = torch.tensor([background], device=batch.images.device)
+    shown = torch.tensor([background], device=batch.images.device, dtype=torch.bool)
     code = model.encode(
         batch.images[None], batch.masks[None], batch.c2w[None], batch.intrinsics[None], background_visible=shown
     )
@@ -112,7 +112,7 @@ def _bounded_surface(field: LocalField, resolution: int) -> Mesh:
     preset, maps = field.model.preset, field.maps
     radius = preset.radius
     radius = min(radius, _hull_reach(field, resolution) + 2 * MARGIN_CELLS * radius / resolution)
-    axis = torch.linspace(-radius, radius, resolution + 1, device=maps.images.device)
+    axis = torch.linspace(-radius, radius, resolution + 1, device=maps.images.device, dtype=torch.float32)
     cell = 2 * radius / resolution / preset.softness
     bound = field.grid_bound(axis, REACH + 4 * cell)  # what is farther outside than REACH changes nothing
     near = bound < MARGIN_CELLS * cell
@@ -136,7 +136,7 @@ def _check_signs(level: Tensor) -> None:
 def _hull_reach(field: LocalField, resolution: int) -> float:
     """Largest coordinate of the points of the model's grid that lie inside all silhouettes."""
     radius = field.model.preset.radius
-    axis = torch.linspace(-radius, radius, resolution + 1, device=field.maps.images.device)
+    axis = torch.linspace(-radius, radius, resolution + 1, device=field.maps.images.device, dtype=torch.float32)
     inside = field.grid_bound(axis, 0.0) < 0
     reach = axis.abs()[inside.nonzero()]
     if len(reach) == 0:
@@ -151,7 +151,7 @@ def _grid_points(axis: Tensor, index: Tensor) -> Tensor:
 
 
 def _grid(resolution: int, radius: float, device: torch.device) -> Tensor:
-    axis = torch.linspace(-radius, radius, resolution + 1, device=device)
+    axis = torch.linspace(-radius, radius, resolution + 1, device=device, dtype=torch.float32)
     return torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
 
 
@@ -214,6 +214,7 @@ def match_brightness(asset: Asset, maps: ViewMaps, scene: RayScene) -> Asset:
     return estimate_base_color_and_light(asset, maps.images[..., :3], maps.images[..., 3] > INSIDE, maps.camera, scene)
 
 
+@full_precision
 def transform_asset(asset: Asset, similarity: Similarity) -> Asset:
     """``asset`` moved by ``similarity``; normals, tangents and the light turn with it."""
     mesh, rotation = asset.mesh, similarity.rotation.to(asset.mesh.vertices)
@@ -221,7 +222,9 @@ def transform_asset(asset: Asset, similarity: Similarity) -> Asset:
     tangents = torch.cat([tangents[:, :3] @ rotation.T, tangents[:, 3:]], -1)
     moved = replace(mesh, vertices=similarity.apply(mesh.vertices), normals=normals @ rotation.T, tangents=tangents)
     environment = asset.environment
-    if environment is not None and not torch.equal(rotation, torch.eye(3).to(rotation)):
+    if environment is not None and not torch.equal(
+        rotation, torch.eye(3, dtype=torch.float32, device="cpu").to(rotation)
+    ):
         rows = environment.radiance.shape[0]
         environment = Environment(environment.lookup((lat_long_directions(rows).to(rotation) @ rotation).contiguous()))
     return replace(asset, mesh=moved, environment=environment)
@@ -311,6 +314,7 @@ class Placed:
     output_from_input: Similarity
 
 
+@full_precision
 def place(views: Views, preset: Preset | LocalPreset, options: ReconstructOptions = DEFAULT) -> Placed:
     """The views with the hero first, and the frames.
 
@@ -327,6 +331,7 @@ def place(views: Views, preset: Preset | LocalPreset, options: ReconstructOption
 
 
 @torch.no_grad()
+@full_precision
 def reconstruct(views: Views, *, weights: str | Network = "small", device: str = "cpu",
                 options: ReconstructOptions = DEFAULT, watch: Stopwatch | None = None) -> Asset:  # fmt: skip
     """A relightable asset from posed photographs of one object.
@@ -348,6 +353,7 @@ def reconstruct(views: Views, *, weights: str | Network = "small", device: str =
 
 
 @torch.no_grad()
+@full_precision
 def reconstruct_placed(placed: Placed, model: Network, options: ReconstructOptions, watch: Stopwatch) -> Asset:
     """:func:`reconstruct` after its first stage, :func:`place`."""
     shown = background_shown(
@@ -381,6 +387,7 @@ def reconstruct_placed(placed: Placed, model: Network, options: ReconstructOptio
     return asset
 
 
+@full_precision
 def refine(asset: Asset, views: Views, *, seconds: float | None = None, steps: int | None = None, **options) -> Asset:
     """``asset`` fitted to its photographs; parts of the fit that make held-out views worse are not taken.
 
@@ -393,6 +400,7 @@ def refine(asset: Asset, views: Views, *, seconds: float | None = None, steps: i
     return refined(asset, views, seconds=seconds, steps=steps, **options).asset
 
 
+@full_precision
 def refined(asset: Asset, views: Views, **options) -> Refinement:
     """:func:`refine` with its record."""
     from reli3d.fit import refine as fit  # not before it is asked for: the command without it starts earlier

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from reli3d._bridge import full_precision
 from reli3d.geometry.camera import Camera
 from reli3d.geometry.hull import mask_distance
 from reli3d.geometry.symmetry import MirrorPlane, mirror_plane
@@ -39,6 +40,7 @@ class Prepared:
         return Prepared(ViewBatch(parts[0], parts[1], c2w, intrinsics, 2 * batch.names), parts[2], camera, len(batch))
 
 
+@full_precision
 def prepare(model: Network, views: Views, model_from_input: Similarity) -> Prepared:
     """Resample ``views`` for ``model``: cropped to the object, or as the release does where the preset says so."""
     moved = views.transformed(model_from_input).to(model.device)
@@ -52,6 +54,7 @@ def prepare(model: Network, views: Views, model_from_input: Similarity) -> Prepa
     return Prepared(batch, torch.cat([detail.images, silhouette[..., None]], -1).contiguous(), detail.camera)
 
 
+@full_precision
 def completed(prepared: Prepared) -> Prepared:
     """``prepared`` with mirror images, if its 3 to ``MOST_MIRRORED`` silhouettes fit a mirror plane, else itself.
 

@@ -105,7 +105,10 @@ def _kernels() -> Iterator[tuple[str, str]]:
 
     for device in ["cpu"] + (["cuda"] if torch.cuda.is_available() else []):
         start = time.perf_counter()
-        value = sample_triplane(torch.ones(1, 3, 2, 4, 4, device=device), torch.zeros(1, 5, 3, device=device))
+        value = sample_triplane(
+            torch.ones(1, 3, 2, 4, 4, device=device, dtype=torch.float32),
+            torch.zeros(1, 5, 3, device=device, dtype=torch.float32),
+        )
         seconds = time.perf_counter() - start
         right = bool((value == 1).all())
         yield f"kernels, {device}", f"run ({seconds:.1f} s)" if right else f"{PROBLEM}a triplane of ones is not 1"

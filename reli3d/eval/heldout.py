@@ -42,7 +42,7 @@ def truth_colors(seed: int, cameras: list[Camera]) -> list[tuple[Tensor, Tensor]
         origins, directions = (r.reshape(-1, 3) for r in camera_rays(camera))
         hits = surface.scene.closest(origins, directions)
         seen = (hits.face >= 0).nonzero()[:, 0]
-        color = torch.zeros(len(origins), 3)
+        color = torch.zeros(len(origins), 3, dtype=torch.float32, device="cpu")
         color[seen] = linear_to_srgb(surface.points_at(hits.face[seen].long(), hits.bary[seen]).base_color.clamp(0, 1))
         shape = (camera.height, camera.width)
         out.append(((hits.face >= 0).reshape(shape), color.reshape(*shape, 3)))
@@ -54,7 +54,7 @@ def asset_colors(asset, scene: RayScene, camera: Camera) -> tuple[Tensor, Tensor
     origins, directions = (r.reshape(-1, 3) for r in camera_rays(camera))
     hits = scene.closest(origins, directions)
     seen = (hits.face >= 0).nonzero()[:, 0]
-    color = torch.zeros(len(origins), 3)
+    color = torch.zeros(len(origins), 3, dtype=torch.float32, device="cpu")
     color[seen] = linear_to_srgb(
         surface_points(asset.mesh, asset.textures, hits.face[seen], hits.bary[seen]).base_color
     )
@@ -78,7 +78,9 @@ def scaled_square_error(color: Tensor, truth: Tensor) -> float:
 
 def light_error(predicted: Tensor, target: Tensor) -> float:
     """Mean absolute difference of log radiance over the sphere of two maps ``(H, 2H, 3)``, up to one exposure."""
-    weight = torch.sin((torch.arange(len(target)) + 0.5) * torch.pi / len(target))[:, None, None].expand_as(target)
+    weight = torch.sin((torch.arange(len(target), dtype=torch.float32, device="cpu") + 0.5) * torch.pi / len(target))[
+        :, None, None
+    ].expand_as(target)
     difference = torch.log(predicted + BLACK) - torch.log(target + BLACK)
     difference = difference - (difference * weight).sum() / weight.sum()
     return float((difference.abs() * weight).sum() / weight.sum())

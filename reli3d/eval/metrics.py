@@ -64,7 +64,7 @@ def ssim(got: Tensor, want: Tensor) -> float:
     """
     if min(got.shape[:2]) < WINDOW:
         raise ValueError(f"got: expected at least {WINDOW} pixels a side, got {tuple(got.shape)}")
-    at = torch.arange(WINDOW, dtype=torch.float64) - WINDOW // 2
+    at = torch.arange(WINDOW, dtype=torch.float64, device="cpu") - WINDOW // 2
     line = torch.exp(-at.square() / (2.0 * SIGMA**2))
     kernel = (line[:, None] * line)[None, None] / line.sum() ** 2
 

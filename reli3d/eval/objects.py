@@ -64,7 +64,9 @@ def load_truth(path: Path, light: Environment, other: Environment, *, inputs: in
         for p in parts
     ]
     c2w, fov = sample_cameras(np.random.default_rng((seed, 5)), inputs + UNSEEN)
-    cameras = [Camera.from_fov(torch.as_tensor(m), float(f), size, size) for m, f in zip(c2w, fov, strict=True)]
+    cameras = [
+        Camera.from_fov(torch.as_tensor(m, device="cpu"), float(f), size, size) for m, f in zip(c2w, fov, strict=True)
+    ]
     return Truth(path.stem, moved, light, other, cameras)
 
 

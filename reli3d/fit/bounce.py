@@ -40,7 +40,7 @@ def gathered(mesh: Mesh, photographs: Photographs, *, seed: int) -> Tensor:
     rng = torch.Generator().manual_seed(seed)
     parts = []
     for at, n in zip(position.split(BLOCK), normal.split(BLOCK), strict=True):
-        ball = unit(torch.randn(len(n), RAYS, 3, generator=rng)).to(n.device)
+        ball = unit(torch.randn(len(n), RAYS, 3, generator=rng, dtype=torch.float32, device="cpu")).to(n.device)
         directions = unit(n[:, None] + ball)  # their density is the cosine over pi
         face = scene.closest((at + LIFT * n)[:, None], directions).face.long()
         parts.append((of_face[face.clamp(min=0)] * (face >= 0)[..., None]).mean(1))

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from reli3d.fit.unknowns import unit
 from reli3d.geometry.mesh import Mesh
+from reli3d.geometry.topology import face_neighbours
 
 SAME_FACET = 0.2  # distance of unit normals, 11 degrees: faces that differ by much more lie on two sides of an edge
 ROUNDS = 10  # of the filter of the normals: reaches as many faces far
@@ -16,15 +17,9 @@ MOVES = 20  # of the vertices towards their faces' planes
 def neighbours(faces: Tensor) -> Tensor:
     """``(F, 3)`` int64: the face across each edge ``(0, 1), (1, 2), (2, 0)`` of ``faces (F, 3)``, the face itself where
     there is not exactly one."""
-    corners = faces.long()
-    ends = torch.stack([corners, corners.roll(-1, 1)], -1).reshape(-1, 2).sort(1).values
-    key, order = torch.sort(ends[:, 0] * (int(faces.max()) + 1 if len(faces) else 1) + ends[:, 1], stable=True)
-    _, times = torch.unique_consecutive(key, return_counts=True)
-    first = (times.cumsum(0) - times)[times == 2]
-    one, other = order[first], order[first + 1]
-    across = torch.arange(len(faces), device=faces.device).repeat_interleave(3)
-    across[one], across[other] = other // 3, one // 3
-    return across.reshape(-1, 3)
+    across = torch.from_numpy(face_neighbours(faces.cpu().numpy())).to(faces.device).long()
+    own = torch.arange(len(faces), device=faces.device, dtype=torch.int64)[:, None]
+    return torch.where(across < 0, own, across)
 
 
 @torch.no_grad()

@@ -90,10 +90,13 @@ def traced(
         )
     columns = [torch.cat(column) for column in zip(*parts)]
     rng = torch.Generator().manual_seed(seed)
-    order = torch.randperm(len(columns[0]), generator=rng).to(columns[0].device)
+    order = torch.randperm(len(columns[0]), generator=rng, dtype=torch.int64, device="cpu").to(columns[0].device)
     if len(order) > PIXELS:
         order = order[:PIXELS]
-        columns, order = [column[order] for column in columns], torch.arange(PIXELS, device=order.device)
+        columns, order = (
+            [column[order] for column in columns],
+            torch.arange(PIXELS, device=order.device, dtype=torch.int64),
+        )
     which, position, normal, ng, wo, uv, logits, target, received = columns
     return Pixels(which, position, normal, ng, wo, uv, logits, target, received, order)
 
@@ -189,7 +192,9 @@ def fit_maps(
         fade = fading(progress, settled)
         for group, opening in zip(optimizer.param_groups, opens, strict=True):
             group["lr"] = group["full"] * fade if progress >= opening else 0.0
-        rows = pixels.order[torch.arange(first, first + min(BATCH, count), device=pixels.order.device) % count]
+        rows = pixels.order[
+            torch.arange(first, first + min(BATCH, count), device=pixels.order.device, dtype=torch.int64) % count
+        ]
         first = (first + BATCH) % count
         samples = SAMPLES[0] if progress < 0.5 else SAMPLES[1]
         loss = maps_loss(

@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, field, replace
 import torch
 from torch import Tensor
 
+from reli3d._bridge import full_precision
 from reli3d.fit import losses
 from reli3d.fit.bounce import gathered
 from reli3d.fit.budget import Budget, progress_bar
@@ -76,6 +77,7 @@ def held_out(count: int) -> tuple[int, ...]:
 
 
 @torch.enable_grad()
+@full_precision
 def refine(
     asset: Asset,
     views: PosedImages,

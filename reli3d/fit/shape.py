@@ -67,7 +67,7 @@ class Grid:
 
     def points(self, device) -> Tensor:
         """``(X, Y, Z, 3)``."""
-        axes = [torch.linspace(-r, r, n, device=device) for r, n in zip(self.radius, self.shape)]
+        axes = [torch.linspace(-r, r, n, device=device, dtype=torch.float32) for r, n in zip(self.radius, self.shape)]
         return torch.stack(torch.meshgrid(*axes, indexing="ij"), -1)
 
 
@@ -76,7 +76,7 @@ def start_level(mesh: Mesh, grid: Grid) -> Tensor:
     """Signed distance of a closed mesh at the points of ``grid``: exact within ``BAND`` cells, blended beyond."""
     at = grid.points(mesh.vertices.device)
     few = tuple(max(2, (n - 1) // COARSE + 1) for n in grid.shape)
-    axes = [torch.linspace(-r, r, n, device=at.device) for r, n in zip(grid.radius, few)]
+    axes = [torch.linspace(-r, r, n, device=at.device, dtype=torch.float32) for r, n in zip(grid.radius, few)]
     coarse = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1)
     coarse = signed_distance(mesh.vertices, mesh.faces, coarse.reshape(-1, 3)).reshape(few)
     level = interpolate(coarse[None, None], grid.shape, mode="trilinear", align_corners=True)[0, 0].contiguous()
@@ -206,7 +206,7 @@ def shape_loss(
 def _outlines(unknowns: Unknowns, data: ShapeData, mesh: Mesh, scene: RayScene, rng) -> Tensor:
     edges, small = mesh_edges(mesh.vertices, mesh.faces), data.photographs
     total = small.color.new_zeros(())
-    chosen = torch.randperm(len(small), generator=rng)[:OUTLINES].tolist()
+    chosen = torch.randperm(len(small), generator=rng, dtype=torch.int64, device="cpu")[:OUTLINES].tolist()
     for view in chosen:
         camera = corrected(small.camera[view], unknowns.pose[view])
         cover = (primary_hits(scene, camera.detach())[0].face >= 0).float()[..., None]
@@ -219,7 +219,9 @@ def _colors(unknowns, data, mesh, scene, weights, progress, rng, seed, independe
     planes = data.planes[min(int(progress * len(data.planes)), len(data.planes) - 1)]
     size, photographs = planes.shape[-1], data.photographs.select(data.colored)
     camera = corrected(photographs.camera.resized(size, size), unknowns.pose[data.colored])
-    pick = torch.randint(len(mesh.vertices), (POINTS,), generator=rng).to(mesh.vertices.device)
+    pick = torch.randint(len(mesh.vertices), (POINTS,), generator=rng, dtype=torch.int64, device="cpu").to(
+        mesh.vertices.device
+    )
     position, normal = (v.index_select(0, pick) for v in (mesh.vertices, mesh.normals))
     color, cover = seen_colors(planes, position, camera)
     weight = sight(scene, position, normal, camera) * (cover.detach() > COVERED)

@@ -32,10 +32,10 @@ def nearest_hits(mesh: Mesh, position: Tensor, normal: Tensor) -> tuple[Tensor, 
     missed = torch.nonzero(face < 0)[:, 0]
     if len(missed):
         corner = torch.zeros(len(mesh.vertices), dtype=torch.long, device=face.device)
-        corner[mesh.faces.reshape(-1).long()] = torch.arange(mesh.faces.numel(), device=face.device)
+        corner[mesh.faces.reshape(-1).long()] = torch.arange(mesh.faces.numel(), device=face.device, dtype=torch.int64)
         used = torch.unique(mesh.faces).long()
         _, found = cKDTree(mesh.vertices[used].cpu().numpy()).query(position[missed].cpu().numpy())
-        at = corner[used[torch.as_tensor(found, device=face.device)]]
+        at = corner[used[torch.as_tensor(found, device=face.device, dtype=torch.int64)]]
         face[missed] = (at // 3).int()
         bary[missed] = torch.stack([at % 3 == 1, at % 3 == 2], -1).float()
     return face, bary
@@ -64,7 +64,7 @@ def changed(asset: Asset, unknowns: Unknowns) -> Asset:
     found = texels.face.reshape(-1)[index], texels.bary.reshape(-1, 2)[index]
     old = surface_points(asset.mesh, asset.textures, *found)
     row, column = torch.div(index, size, rounding_mode="floor"), index % size
-    uv = (torch.stack([column, row], -1) + 0.5) / size
+    uv = (torch.stack([column, row], -1).float() + 0.5) / size
     logits = material_logits(old) + material_change(unknowns, position)
     logits[:, :3] += sample_texture(unknowns.detail, uv)
     color, roughness, metallic = material_of(logits)

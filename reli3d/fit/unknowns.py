@@ -57,12 +57,12 @@ class Unknowns:
         device = level.device
         return cls(
             level.clone(),
-            [torch.zeros(n, n, n, 5, device=device) for n in MATERIAL_GRIDS],
-            torch.zeros(texels, texels, 3, device=device),
-            [torch.zeros(n, n, n, 3, device=device) for n in BEND_GRIDS],
-            [torch.zeros(n, 2 * n, 3, device=device) for n in LIGHT_MAPS],
-            torch.zeros(views, device=device),
-            torch.zeros(views, 6, device=device),
+            [torch.zeros(n, n, n, 5, device=device, dtype=torch.float32) for n in MATERIAL_GRIDS],
+            torch.zeros(texels, texels, 3, device=device, dtype=torch.float32),
+            [torch.zeros(n, n, n, 3, device=device, dtype=torch.float32) for n in BEND_GRIDS],
+            [torch.zeros(n, 2 * n, 3, device=device, dtype=torch.float32) for n in LIGHT_MAPS],
+            torch.zeros(views, device=device, dtype=torch.float32),
+            torch.zeros(views, 6, device=device, dtype=torch.float32),
         )
 
     def groups(self) -> dict[str, list[Tensor]]:
@@ -144,7 +144,7 @@ def corrected(camera: Camera, pose: Tensor) -> Camera:
 
     The turn is the Cayley map, a rotation for any vector and to second order the exponential one.
     """
-    half, eye = 0.5 * pose[..., :3], torch.eye(3, device=pose.device)
+    half, eye = 0.5 * pose[..., :3], torch.eye(3, device=pose.device, dtype=torch.float32)
     x, y, z = half.unbind(-1)
     none = torch.zeros_like(x)
     skew = torch.stack([none, -z, y, z, none, -x, -y, x, none], -1).reshape(*x.shape, 3, 3)

@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import overload
 
+import numpy as np
 import torch
 import warp as wp
 from torch import Tensor
@@ -17,6 +18,7 @@ from torch import Tensor
 from reli3d import _bridge
 from reli3d._bridge import check, expect, struct_of
 from reli3d.geometry.mesh import Mesh, sorted_keys, vertex_normals
+from reli3d.geometry.topology import edges_of
 from reli3d.kernels import bake as kernels
 
 REACH = 1.5  # texels: a bilinear tap of a point of the surface has its centre within sqrt(2)
@@ -61,11 +63,13 @@ def _bins(lower: Tensor, upper: Tensor, size: int, tile: int) -> tuple[Tensor, T
     extent = (last - first + 1).clamp(min=0)
     count = extent[:, 0] * extent[:, 1]
     item = torch.repeat_interleave(count)
-    local = torch.arange(len(item), device=item.device) - (torch.cumsum(count, 0) - count)[item]
+    local = torch.arange(len(item), device=item.device, dtype=torch.int64) - (torch.cumsum(count, 0) - count)[item]
     wide = extent[:, 0][item]
     tile_of = (first[:, 1][item] + local // wide) * tiles + first[:, 0][item] + local % wide
     order = sorted_keys(tile_of * len(lower) + item)
-    start = torch.searchsorted(order, torch.arange(tiles * tiles + 1, device=item.device) * max(len(lower), 1))
+    start = torch.searchsorted(
+        order, torch.arange(tiles * tiles + 1, device=item.device, dtype=torch.int64) * max(len(lower), 1)
+    )
     return start.to(torch.int32), (order % max(len(lower), 1)).to(torch.int32)
 
 
@@ -78,17 +82,8 @@ def _tiles(corners: Tensor, lower: Tensor, upper: Tensor, size: int, tile: int) 
 
 def _border_segments(faces: Tensor) -> Tensor:
     """``3 * face + corner``, ascending, of the edges that only one face has."""
-    head, tail = faces.long().reshape(-1), faces[:, [1, 2, 0]].long().reshape(-1)
-    vertices = int(head.max()) + 1
-    key, n = torch.minimum(head, tail) * vertices + torch.maximum(head, tail), len(head)
-    if vertices * vertices * n < 1 << 62:
-        packed = sorted_keys(key * n + torch.arange(n, device=key.device))
-        ordered, order = packed // n, packed % n
-    else:
-        ordered, order = torch.sort(key)
-    new = torch.ones(n + 1, dtype=torch.bool, device=key.device)
-    new[1:-1] = ordered[1:] != ordered[:-1]
-    return sorted_keys(order[new[1:] & new[:-1]]).to(torch.int32)
+    single = np.sort(edges_of(faces.cpu().numpy()).of_valence(1)[0]).astype(np.int32)
+    return torch.from_numpy(single).to(faces.device)
 
 
 def rasterize_texels(mesh: Mesh, size: int) -> Texels:
@@ -102,8 +97,8 @@ def rasterize_texels(mesh: Mesh, size: int) -> Texels:
     corners = _corners(mesh, size)
     device = corners.device
     face = torch.empty(size, size, dtype=torch.int32, device=device)
-    bary = torch.empty(size, size, 2, device=device)
-    distance = torch.empty(size, size, device=device)
+    bary = torch.empty(size, size, 2, device=device, dtype=torch.float32)
+    distance = torch.empty(size, size, device=device, dtype=torch.float32)
     if len(mesh.faces) == 0:
         return Texels(face.fill_(-1), bary.zero_(), torch.zeros_like(face, dtype=torch.bool))
     tile = TILE[device.type]
@@ -168,7 +163,7 @@ def _places(mesh: Mesh, texels: Texels, index: Tensor) -> kernels.Places:
 
 def _positions_normals(mesh: Mesh, places: kernels.Places, index: Tensor) -> tuple[Tensor, Tensor]:
     normals = mesh.normals if mesh.normals is not None else vertex_normals(mesh.vertices, mesh.faces)
-    position, normal = (torch.empty(len(index), 3, device=index.device) for _ in range(2))
+    position, normal = (torch.empty(len(index), 3, device=index.device, dtype=torch.float32) for _ in range(2))
     sources = [(v.detach().contiguous(), wp.vec3) for v in (mesh.vertices, normals)]
     inputs = [places, *sources, (position, wp.vec3), (normal, wp.vec3)]
     _bridge.launch(kernels.attributes_kernel, len(index), inputs, index.device)
@@ -178,7 +173,7 @@ def _positions_normals(mesh: Mesh, places: kernels.Places, index: Tensor) -> tup
 def _tangents(mesh: Mesh, places: kernels.Places, index: Tensor) -> Tensor:
     if mesh.tangents is None:
         raise ValueError("mesh.tangents: expected tangents, got None (see vertex_tangents)")
-    tangent = torch.empty(len(index), 4, device=index.device)
+    tangent = torch.empty(len(index), 4, device=index.device, dtype=torch.float32)
     inputs = [places, (mesh.tangents.detach().contiguous(), wp.vec4), (tangent, wp.vec4)]
     _bridge.launch(kernels.tangents_kernel, len(index), inputs, index.device)
     return tangent
@@ -188,7 +183,7 @@ def _values(mesh: Mesh, values: Tensor, places: kernels.Places, index: Tensor) -
     check("values", values, like=mesh.vertices)
     if values.ndim != 2 or len(values) != len(mesh.vertices):
         raise ValueError(f"values: expected ({len(mesh.vertices)}, C), got {tuple(values.shape)}")
-    out = torch.empty(len(index), values.shape[1], device=index.device)
+    out = torch.empty(len(index), values.shape[1], device=index.device, dtype=torch.float32)
     inputs = [places, (values.detach().contiguous(), wp.float32), (out, wp.float32)]
     _bridge.launch(kernels.values_kernel, len(index), inputs, index.device)
     return out
@@ -263,7 +258,7 @@ def nearest_valid(valid: Tensor) -> tuple[Tensor, Tensor]:
         raise ValueError(f"valid: expected shape (H, W), got {tuple(valid.shape)}")
     (h, w), device = valid.shape, valid.device
     row, site, source = (torch.empty(h, w, dtype=torch.int32, device=device) for _ in range(3))
-    border, square = (torch.empty(h, w, device=device) for _ in range(2))
+    border, square = (torch.empty(h, w, device=device, dtype=torch.float32) for _ in range(2))
     if valid.numel() == 0:
         return source, square
     strips = -(-w // STRIP)

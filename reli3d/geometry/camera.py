@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from reli3d._bridge import check, expect, tensor_of
+from reli3d._bridge import check, expect, full_precision, tensor_of
 
 NEAR = 0.01  # least depth of points over their largest distance for their box: nearer to 0 it is rounded too much
 
@@ -62,7 +62,7 @@ class Camera:
         check("c2w", c2w, last=4)
         if not 0.0 < fov_x < torch.pi:
             raise ValueError(f"fov_x: expected radians in (0, pi), got {fov_x}")
-        f = 0.5 * width / torch.tan(torch.tensor(0.5 * fov_x, dtype=torch.float64)).item()
+        f = 0.5 * width / torch.tan(torch.tensor(0.5 * fov_x, dtype=torch.float64, device="cpu")).item()
         row = torch.tensor([f, f, 0.5 * width, 0.5 * height], dtype=torch.float32, device=c2w.device)
         return cls(c2w, row.expand(*c2w.shape[:-2], 4).contiguous(), width, height)
 
@@ -119,6 +119,7 @@ def image_plane(camera: Camera) -> tuple[Tensor, Tensor]:
     return x, y
 
 
+@full_precision
 def camera_rays(camera: Camera) -> tuple[Tensor, Tensor]:
     """Origins and unit directions through all pixel centres, both ``(..., H, W, 3)``, world frame.
 
@@ -134,6 +135,7 @@ def camera_rays(camera: Camera) -> tuple[Tensor, Tensor]:
     return camera.position[..., None, None, :].expand_as(directions), directions
 
 
+@full_precision
 def project(points: Tensor, c2w: Tensor, intrinsics: Tensor) -> tuple[Tensor, Tensor]:
     """Pixel coordinates ``(..., 2)`` and depth along the viewing axis ``(...)`` of world points.
 
@@ -186,7 +188,7 @@ def look_at(
     >>> pose = reli3d.look_at([0.0, 0.5, 3.0], [0.0, 0.0, 0.0])
     >>> camera = reli3d.Camera.from_fov(pose, 0.7, 64, 48)
     """
-    device = next((v.device for v in (eye, target, up) if isinstance(v, Tensor)), None)
+    device = next((v.device for v in (eye, target, up) if isinstance(v, Tensor)), torch.device("cpu"))
     given = [
         v if isinstance(v, Tensor) else torch.as_tensor(v, dtype=torch.float32, device=device)
         for v in (eye, target, up)

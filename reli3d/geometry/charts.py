@@ -15,7 +15,7 @@ import torch
 import warp as wp
 
 from reli3d import _bridge
-from reli3d.geometry.mesh import group
+from reli3d.geometry.topology import face_neighbours, graph_components, group
 from reli3d.kernels import charts as kernels
 from reli3d.kernels.cache import initialise
 
@@ -50,26 +50,10 @@ class Charts:
     count: int
 
 
-def face_neighbours(faces: np.ndarray) -> np.ndarray:
-    """Face across each edge, ``(F, 3)`` int32: -1 where the edge has not exactly two different faces."""
-    tail, head = faces.ravel().astype(np.int64), faces[:, [1, 2, 0]].ravel().astype(np.int64)
-    order, first = group(np.minimum(tail, head) * (int(tail.max()) + 1) + np.maximum(tail, head))
-    pair = first[np.diff(first, append=len(order)) == 2]
-    a, b = order[pair], order[pair + 1]
-    face_a, face_b = a // 3, b // 3
-    result = np.full(len(order), -1, np.int32)
-    apart = face_a != face_b
-    result[a[apart]], result[b[apart]] = face_b[apart], face_a[apart]
-    return result.reshape(-1, 3)
-
-
 def components(neighbours: np.ndarray, labels: np.ndarray) -> tuple[np.ndarray, int]:
     """Connected faces of equal label, ``(F,)`` int32 numbered by their first face, and their number."""
-    parent = torch.empty(len(labels), dtype=torch.int32)
-    _bridge.launch(
-        kernels.components_serial_kernel, 1, [_ints(neighbours), _ints(labels), len(labels), (parent, wp.int32)], CPU
-    )
-    root = parent.numpy()
+    face, side = np.nonzero((neighbours >= 0) & (labels[neighbours] == labels[:, None]))
+    root = graph_components(face, neighbours[face, side], len(labels))
     number = np.cumsum(root == np.arange(len(root)), dtype=np.int32) - 1
     return number[root], int(number[-1]) + 1
 
@@ -99,7 +83,7 @@ def axis_labels(normal: torch.Tensor, neighbours: np.ndarray) -> np.ndarray:
     for _ in range(SMOOTHING):
         rough, smoothed = smoothed, torch.empty_like(normal)
         _bridge.launch(kernels.smooth_kernel, n, [links, (rough, wp.vec3), (smoothed, wp.vec3)], CPU, slice_min=LIGHT)
-    label = torch.empty(n, dtype=torch.int32)
+    label = torch.empty(n, dtype=torch.int32, device="cpu")
     _bridge.launch(
         kernels.labels_kernel,
         n,
@@ -152,7 +136,7 @@ def _frames(normal: torch.Tensor, label: np.ndarray, chart: np.ndarray, count: i
     total = np.stack([np.bincount(chart, array[:, k], count) for k in range(3)], 1)
     length = np.linalg.norm(total, axis=1, keepdims=True)
     toward = total / np.maximum(length, 1e-300)
-    oblique = torch.zeros(count, dtype=torch.uint8)
+    oblique = torch.zeros(count, dtype=torch.uint8, device="cpu")
     _bridge.launch(
         kernels.oblique_kernel,
         len(chart),
@@ -203,7 +187,7 @@ def cuts(along: np.ndarray, begin: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     along: ``(P, CUT_ANGLES)`` float64, points along the directions, one chart after the other.  begin: ``(C + 1,)``
     int32, where those of a chart begin.
     """
-    at, area = torch.empty(2, len(begin) - 1, CUT_ANGLES, 2, dtype=torch.float64)
+    at, area = torch.empty(2, len(begin) - 1, CUT_ANGLES, 2, dtype=torch.float64, device="cpu")
     ins = (torch.from_numpy(along), kernels.vec8d), (torch.from_numpy(begin), wp.int32)
     _bridge.launch(
         kernels.cuts_kernel, area.numel(), [*ins, (at, wp.float64), (area, wp.float64)], CPU, slice_min=CUT_ANGLES
@@ -282,8 +266,8 @@ def _overlaps(charts: Charts, boxes: np.ndarray, query: np.ndarray):
     upper = torch.from_numpy(np.column_stack([np.maximum(np.maximum(a, b), c), z]))
     initialise()
     bvh = wp.Bvh(_bridge.array_of(lower, wp.vec3), _bridge.array_of(upper, wp.vec3))
-    count = torch.zeros(len(query), dtype=torch.int32)
-    none = torch.zeros(1, dtype=torch.int64), torch.zeros(1, dtype=torch.int32)
+    count = torch.zeros(len(query), dtype=torch.int32, device="cpu")
+    none = torch.zeros(1, dtype=torch.int64, device="cpu"), torch.zeros(1, dtype=torch.int32, device="cpu")
     ins = _ints(boxes), _ints(query), (corners, wp.vec2)
 
     def find(emit: int = 0, offset: torch.Tensor = none[0], partner: torch.Tensor = none[1]) -> torch.Tensor:
@@ -320,7 +304,7 @@ def split_overlaps(charts: Charts) -> bool:
             charts.count += 1
         count = find()
     offset = torch.cumsum(count.long(), 0) - count
-    partner = torch.empty(max(int(count.sum(dtype=torch.int64)), 1), dtype=torch.int32)
+    partner = torch.empty(max(int(count.sum(dtype=torch.int64)), 1), dtype=torch.int32, device="cpu")
     find(1, offset, partner)
     rank = np.full(len(everything), -1, np.int32)
     rank[members] = np.arange(len(members), dtype=np.int32)
@@ -328,11 +312,11 @@ def split_overlaps(charts: Charts) -> bool:
     near = np.where(near >= 0, rank[near], -1)
     # faces without overlap first: they grow large charts
     seeds = np.lexsort((np.arange(len(members)), count.numpy() > 0))
-    owner = torch.full((len(members),), -1, dtype=torch.int32)
+    owner = torch.full((len(members),), -1, dtype=torch.int32, device="cpu")
+    queue = torch.empty(3 * len(members) + 1, dtype=torch.int32, device="cpu")
     _bridge.launch(kernels.split_serial_kernel, 1, [
         _ints(near), _ints(charts.chart[members]), _ints(seeds), (offset, wp.int64), (count, wp.int32),
-        _ints(rank[partner.numpy()]), charts.count, (torch.empty(3 * len(members) + 1, dtype=torch.int32), wp.int32),
-        (owner, wp.int32)], CPU)  # fmt: skip
+        _ints(rank[partner.numpy()]), charts.count, (queue, wp.int32), (owner, wp.int32)], CPU)  # fmt: skip
     charts.chart[members] = owner.numpy()
     used, number = np.unique(charts.chart, return_inverse=True)
     spare = int(used[0] < 0)
@@ -353,7 +337,7 @@ def make_charts(
     centre = 0.5 * (points.min(0).astype(np.float64) + points.max(0))
     reach = np.abs(points - centre).max() or 1.0
     local = ((points - centre) / reach).astype(np.float32)  # at most 1: products cannot overflow
-    normal = torch.empty(len(faces), 3)
+    normal = torch.empty(len(faces), 3, dtype=torch.float32, device="cpu")
     _bridge.launch(
         kernels.normals_kernel,
         len(faces),
@@ -382,7 +366,10 @@ def make_charts(
     outer = outer_faces(chart, neighbours)
     tips = local[faces[outer]].reshape(-1, 3).astype(np.float64)
     right, up, low = _upright(right, up, tips, np.repeat(chart[outer], 3))
-    corners, flat = torch.empty(len(faces), 3, 2), torch.empty(len(faces), dtype=torch.uint8)
+    corners, flat = (
+        torch.empty(len(faces), 3, 2, dtype=torch.float32, device="cpu"),
+        torch.empty(len(faces), dtype=torch.uint8, device="cpu"),
+    )
     _bridge.launch(kernels.project_kernel, len(faces), [
         _floats(local, wp.vec3), _ints(faces), _ints(chart), _floats(right, wp.vec3), _floats(up, wp.vec3),
         _floats(low, wp.vec2), sliver, (corners, wp.vec2), (flat, wp.uint8)], CPU, slice_min=LIGHT)  # fmt: skip

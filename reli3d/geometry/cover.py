@@ -86,7 +86,7 @@ def _lowest(level: Tensor) -> Tensor:
     """Least level of each block of ``kernels.BLOCK`` cells a side, those on its border included."""
     for axis in range(3):
         cells = level.shape[axis] - 1
-        most = torch.arange(-(-cells // kernels.BLOCK), device=level.device) * kernels.BLOCK
+        most = torch.arange(-(-cells // kernels.BLOCK), device=level.device, dtype=torch.int64) * kernels.BLOCK
         points = [level.index_select(axis, (most + k).clamp(max=cells)) for k in range(kernels.BLOCK + 1)]
         level = torch.stack(points).amin(0)
     return level.contiguous()

@@ -79,7 +79,7 @@ def hull_distance(points: Tensor, distance: Tensor, camera: Camera, *, far: floa
     _check_views(points, distance, camera)
     if not far >= 0.0:
         raise ValueError(f"far: expected at least 0, got {far}")
-    hull = torch.empty(len(points), device=points.device)
+    hull = torch.empty(len(points), device=points.device, dtype=torch.float32)
     inputs = [(points.detach().contiguous(), wp.vec3), *_views(distance, camera), far, (hull, wp.float32)]
     launch(kernels.hull_distance_kernel, len(points), inputs, points.device)
     return hull
@@ -150,7 +150,7 @@ def hull_span(origins: Tensor, directions: Tensor, radius: float, distance: Tens
     if not 0.0 < radius < 100.0:
         raise ValueError(f"radius: expected between 0 and 100, got {radius}")
     _check_views(origins, distance, camera)
-    span = torch.empty(len(origins), 2, device=origins.device)
+    span = torch.empty(len(origins), 2, device=origins.device, dtype=torch.float32)
     rays = [(v.detach().contiguous(), wp.vec3) for v in (origins, directions)]
     inputs = [*rays, float(radius), *_views(distance, camera), (span, wp.vec2)]
     launch(kernels.hull_span_kernel, len(origins), inputs, origins.device)

@@ -212,7 +212,7 @@ class RayScene:
             check("t_max", t_max, like=self.faces)
             far = t_max.detach()
         else:
-            far = torch.tensor(float(t_max), device=self.device)
+            far = torch.tensor(float(t_max), device=self.device, dtype=torch.float32)
         shape = np.broadcast_shapes(origins.shape[:-1], directions.shape[:-1], far.shape)
         o = origins.detach().expand(*shape, 3).reshape(-1, 3).contiguous()
         d = directions.detach().expand(*shape, 3).reshape(-1, 3).contiguous()

@@ -46,7 +46,7 @@ def vertex_deviation(
     owner = t.base.long()[cell] + group[cell, edge]
     row = t.rows.long()[cell]
     corner = surface.corner_vertices(t)
-    step = torch.tensor([t.shape[1] * t.shape[2], t.shape[2], 1], device=device)
+    step = torch.tensor([t.shape[1] * t.shape[2], t.shape[2], 1], device=device, dtype=torch.int64)
 
     def weight(values: Tensor | None, column: Tensor) -> Tensor:
         if values is None:
@@ -106,7 +106,7 @@ def sign_entropy(level: Tensor) -> Tensor:
         n = level.shape[axis] - 1
         crossed = inside.narrow(axis, 0, n) != inside.narrow(axis, 1, n)
         a, b = level.narrow(axis, 0, n)[crossed], level.narrow(axis, 1, n)[crossed]
-        turn = torch.where(a < 0.0, 1.0, -1.0)  # the other end's sign is the opposite of one's own
+        turn = torch.where(a < 0.0, 1.0, -1.0).to(a)  # the other end's sign is the opposite of one's own
         total = total + torch.nn.functional.softplus(-turn * a).sum() + torch.nn.functional.softplus(turn * b).sum()
         count += a.numel()
     return total / max(count, 1)

@@ -8,10 +8,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from reli3d.geometry.mesh import Mesh, sorted_keys, weld
+from reli3d.geometry.mesh import Mesh, weld, welded_faces
+from reli3d.geometry.topology import edges_of
 
 
 @dataclass(frozen=True)
@@ -36,17 +38,15 @@ class _Umbrella:
 def _umbrella(mesh: Mesh) -> _Umbrella:
     first, label = weld(mesh.vertices)
     n = len(first)
-    faces = label[mesh.faces.long()]
-    tail, head = faces.reshape(-1), faces[:, [1, 2, 0]].reshape(-1)
-    real = tail != head
-    tail, head = tail[real], head[real]
-    both = sorted_keys(torch.cat([tail * n + head, head * n + tail]))
-    key, count = torch.unique_consecutive(both, return_counts=True)  # every edge from both its ends
-    moved, open_edge = key // n, count == 1
-    at_border = torch.zeros(n, dtype=torch.bool, device=key.device)
-    at_border[moved[open_edge]] = True
-    keep = ~at_border[moved]
-    key, moved = key[keep], moved[keep]
+    faces, sound = welded_faces(mesh)
+    edges = edges_of(faces[sound])
+    lead = edges.order[edges.start]
+    ends = np.stack([edges.tail[lead], edges.head[lead]])
+    at_border = np.zeros(n, bool)
+    at_border[ends[:, edges.valence == 1]] = True
+    directed = np.sort(np.concatenate([ends[0] * n + ends[1], ends[1] * n + ends[0]]))  # every edge from both its ends
+    key = torch.from_numpy(directed[~at_border[directed // n]]).to(label.device)
+    moved = key // n
     degree = torch.bincount(moved, minlength=n)
     start = torch.cumsum(degree, 0) - degree
     inverse = torch.where(degree > 0, 1.0 / degree.clamp(min=1), 0.0)[:, None].to(mesh.vertices.dtype)

@@ -199,7 +199,7 @@ def topology_of(level: Tensor, cubes: Tensor | None, closed: bool) -> tuple[_Top
         if not torch.equal(weight_rows, cubes):
             count = len(weight_rows)
             raise ValueError(f"cubes: expected surface_cubes(level), {count} of them, got {len(cubes)} others")
-        index = torch.cumsum(real, 0) - 1 if pad else torch.arange(len(cells), device=device)
+        index = torch.cumsum(real, 0) - 1 if pad else torch.arange(len(cells), device=device, dtype=torch.int64)
         rows = torch.where(real, index, -1) if pad else index
     cells, rows = cells.to(torch.int32), rows.to(torch.int32)
     resolved, counts = torch.empty_like(cells), torch.empty_like(cells)
@@ -245,7 +245,7 @@ class _DualVertices(torch.autograd.Function):
         order = torch.argsort(t.base)
         cube = torch.repeat_interleave(order, counts[order]).to(torch.int32)
         group = torch.arange(len(cube), dtype=torch.int32, device=device) - t.base[cube.long()]
-        vertices = torch.empty(len(cube), 3, device=device)
+        vertices = torch.empty(len(cube), 3, device=device, dtype=torch.float32)
         inputs = [None if v is None else v.detach().contiguous() for v in (deformation, alpha, beta)]
         launch(
             kernels.dual_vertex_kernel,
@@ -274,8 +274,8 @@ class _DualVertices(torch.autograd.Function):
         rest = iter(rest)
         inputs = [next(rest).contiguous() if given else None for given in ctx.given]
         n = len(t.cells)
-        g_level, g_alpha, g_beta = (torch.zeros(n, width, device=device) for width in (8, 8, 12))
-        g_shift = torch.zeros(n, 8, 3, device=device)
+        g_level, g_alpha, g_beta = (torch.zeros(n, width, device=device, dtype=torch.float32) for width in (8, 8, 12))
+        g_shift = torch.zeros(n, 8, 3, device=device, dtype=torch.float32)
         launch(
             flexicubes_adjoint.dual_vertex_adjoint_kernel,
             n,
@@ -307,12 +307,12 @@ class _DualVertices(torch.autograd.Function):
 def corner_vertices(t: _Topology) -> Tensor:
     """Grid vertex before padding at every corner of the surface cubes, ``(S, 8)``; a padding's one is the border's it
     stands at."""
-    cells, k = t.cells.long(), torch.arange(8, device=t.cells.device)
+    cells, k = t.cells.long(), torch.arange(8, device=t.cells.device, dtype=torch.int64)
     if t.pad == 0:  # the common case, ten times faster
         return cells[:, None] + ((k & 1) * t.shape[1] + (k >> 1 & 1)) * t.shape[2] + (k >> 2)
     at = torch.stack([cells // (t.shape[1] * t.shape[2]), cells // t.shape[2] % t.shape[1], cells % t.shape[2]], -1)
     at = at[:, None] + torch.stack([k & 1, k >> 1 & 1, k >> 2], -1) - t.pad
-    at = torch.minimum(at.clamp(min=0), torch.tensor(t.cubes, device=cells.device))
+    at = torch.minimum(at.clamp(min=0), torch.tensor(t.cubes, device=cells.device, dtype=torch.int64))
     return (at[..., 0] * (t.cubes[1] + 1) + at[..., 1]) * (t.cubes[2] + 1) + at[..., 2]
 
 
@@ -324,7 +324,7 @@ def _quads(t: _Topology, padded: Tensor, crossed: Tensor, gamma: Tensor | None) 
     which, direction = (crossed.view(-1)[starts][:, None] & bits).nonzero(as_tuple=True)
     origin, direction = starts[which].to(torch.int32), direction.to(torch.int32)
     quads = torch.empty(len(origin), 4, dtype=torch.int32, device=device)
-    split = torch.empty(len(origin), 4, device=device)
+    split = torch.empty(len(origin), 4, device=device, dtype=torch.float32)
     launch(
         kernels.quad_kernel,
         len(origin),
@@ -347,7 +347,7 @@ def _gamma_of(t: _Topology, quads: Tensor, gamma: Tensor) -> Tensor:
     """Gamma of the cubes of every quad, ``(Q, 4)``, with its gradient; 1 in the padding."""
     rows = torch.repeat_interleave(t.rows.long(), t.counts.long())
     first = torch.repeat_interleave(t.base.long(), t.counts.long())
-    inner = torch.arange(len(first), device=first.device)
+    inner = torch.arange(len(first), device=first.device, dtype=torch.int64)
     inner = inner - torch.repeat_interleave(torch.cumsum(t.counts.long(), 0) - t.counts, t.counts.long())
     row_of = torch.empty_like(rows)
     row_of[first + inner] = rows

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from reli3d._bridge import check
+from reli3d._bridge import check, full_precision
 from reli3d.geometry.camera import Camera, check_camera
 from reli3d.geometry.hull import hull_distance, hull_span, mirror_miss
 
@@ -45,9 +45,10 @@ class MirrorPlane:
     normal: Tensor
     offset: float
 
+    @full_precision
     def mirrored(self, camera: Camera) -> Camera:
         """Cameras ``(V,)`` whose pictures of the object are those of ``camera (V,)`` with the columns reversed."""
-        flip = torch.eye(4, device=camera.c2w.device)
+        flip = torch.eye(4, device=camera.c2w.device, dtype=torch.float32)
         flip[:3, :3] -= 2.0 * torch.outer(self.normal, self.normal)
         flip[:3, 3] = 2.0 * self.offset * self.normal
         c2w = flip @ camera.c2w
@@ -57,6 +58,7 @@ class MirrorPlane:
 
 
 @torch.no_grad()
+@full_precision
 def mirror_plane(distance: Tensor, camera: Camera) -> MirrorPlane | None:
     """The upright plane in which the object of V views is its own mirror image, or None where none is sure.
 
@@ -88,7 +90,9 @@ def mirror_plane(distance: Tensor, camera: Camera) -> MirrorPlane | None:
     views = functional.normalize(camera.position - centre, dim=1)
     if float(functional.normalize(views - (views @ up)[:, None] * up, dim=1).mean(0).norm()) > ONE_SIDED:
         return None
-    first = functional.normalize(torch.linalg.cross(up, torch.eye(3, device=up.device)[int(up.abs().argmin())]), dim=0)
+    first = functional.normalize(
+        torch.linalg.cross(up, torch.eye(3, device=up.device, dtype=torch.float32)[int(up.abs().argmin())]), dim=0
+    )
     second = torch.linalg.cross(up, first)
 
     def misses(angle: Tensor, offset: Tensor, every: int = 1) -> tuple[Tensor, Tensor]:
@@ -99,19 +103,19 @@ def mirror_plane(distance: Tensor, camera: Camera) -> MirrorPlane | None:
         miss = mirror_miss(some, within, normals, away, FAR * size, distance, camera) / size
         return miss.mean(1), (miss > LOST).float().mean(1)
 
-    angles = torch.arange(ANGLES, device=up.device) * (math.pi / ANGLES)
-    offsets = torch.linspace(-REACH, REACH, OFFSETS, device=up.device)
+    angles = torch.arange(ANGLES, device=up.device, dtype=torch.float32) * (math.pi / ANGLES)
+    offsets = torch.linspace(-REACH, REACH, OFFSETS, device=up.device, dtype=torch.float32)
     miss, _ = misses(angles.repeat_interleave(OFFSETS), offsets.repeat(ANGLES), every=3)
     miss = miss.view(ANGLES, OFFSETS)
     by_angle = miss.amin(1)
     as_good = float((by_angle < by_angle.min() + AS_GOOD).float().mean())
     if min(AMBIGUOUS[0] * len(distance) ** 2, AMBIGUOUS[1]) < as_good < ROUND:
         return None
-    planes = torch.tensor(_middles((by_angle <= by_angle.min() + EQUAL).tolist()), device=up.device)
+    planes = torch.tensor(_middles((by_angle <= by_angle.min() + EQUAL).tolist()), device=up.device, dtype=torch.int64)
     normals = torch.outer(angles[planes].cos(), first) + torch.outer(angles[planes].sin(), second)
     best = int(planes[_novelty(normals, views).argmax()])
     equal = miss[best] <= miss[best].min() + EQUAL
-    around = torch.linspace(-1.0, 1.0, FINER, device=up.device)
+    around = torch.linspace(-1.0, 1.0, FINER, device=up.device, dtype=torch.float32)
     angle = (angles[best] + around * (math.pi / ANGLES)).repeat_interleave(FINER)
     offset = (offsets[equal].mean() + around * (2 * REACH / (OFFSETS - 1))).repeat(FINER)
     miss, _ = misses(angle, offset)
@@ -145,6 +149,7 @@ def _novelty(normals: Tensor, directions: Tensor) -> Tensor:
     return (mirrored @ directions.T).abs().amax(-1).clamp(max=1.0).acos().mean(-1)
 
 
+@full_precision
 def upright(camera: Camera) -> Tensor | None:
     """The direction ``(3,)`` that is up for cameras that are not rolled, or None: right angles to all their X axes."""
     right = camera.c2w[:, :3, 0]
@@ -160,15 +165,18 @@ def _hull_points(distance: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
     places: list[Tensor] = []
     for number, inside in enumerate(distance > 0.5):
         found = inside.nonzero()
-        every = torch.linspace(0, max(len(found) - 1, 0), min(RAYS, len(found)), device=found.device).long()
+        every = torch.linspace(
+            0, max(len(found) - 1, 0), min(RAYS, len(found)), device=found.device, dtype=torch.float32
+        ).long()
         places.append(functional.pad(found[every], (1, 0), value=number))
     view, row, column = torch.cat(places).unbind(1)
     fx, fy, cx, cy = camera.intrinsics[view].unbind(1)
-    local = torch.stack([(column + 0.5 - cx) / fx, -(row + 0.5 - cy) / fy, -torch.ones_like(fx)], 1)
+    x, y = column.to(cx.dtype) + 0.5, row.to(cy.dtype) + 0.5
+    local = torch.stack([(x - cx) / fx, -(y - cy) / fy, -torch.ones_like(fx)], 1)
     direction = functional.normalize((camera.c2w[view, :3, :3] @ local[..., None])[..., 0], dim=1)
     origin = camera.position[view].contiguous()
     span = hull_span(origin, direction, FARTHEST, distance, camera)
-    share = (torch.arange(DEPTHS, device=origin.device) + 0.5) / DEPTHS
+    share = (torch.arange(DEPTHS, device=origin.device, dtype=torch.float32) + 0.5) / DEPTHS
     depth = torch.lerp(span[:, :1], span[:, 1:], share)
     points = origin[:, None] + direction[:, None] * depth[..., None]
     within = hull_distance(points.reshape(-1, 3), distance, camera).view(depth.shape)

@@ -124,7 +124,7 @@ def _by_cell_row(points: Tensor, height: int, width: int) -> tuple[Tensor, Tenso
     edges = keys.new_zeros(slabs, height + 2)
     if points.is_cuda:
         order = torch.argsort(keys, dim=1, stable=True).to(torch.int32)
-        rows = keys // bins + torch.arange(slabs, device=points.device)[:, None] * (height + 2)
+        rows = keys // bins + torch.arange(slabs, device=points.device, dtype=torch.int64)[:, None] * (height + 2)
         count = torch.bincount(rows.view(-1), minlength=slabs * (height + 2)).view(slabs, height + 2)
         edges[:, 1:] = count[:, :-1].cumsum(1)
         return order, edges
@@ -162,7 +162,7 @@ def _planes_adjoint(points: Tensor, g: Tensor, order: Tensor, edges: Tensor, sha
     batch, n, _ = points.shape
     channels, height, width = shape[2:]
     blocks = g.shape[-1] // BLOCK
-    g_planes = torch.zeros(batch, 3, height, width, blocks * BLOCK, device=points.device)
+    g_planes = torch.zeros(batch, 3, height, width, blocks * BLOCK, device=points.device, dtype=torch.float32)
     split, sizes = 1 if points.device.type == "cpu" else blocks, sizes_of(n, height, width, blocks)
     for parity in (0, 1):
         launch(

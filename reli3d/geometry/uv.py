@@ -21,7 +21,8 @@ from torch import Tensor
 
 from reli3d import _bridge
 from reli3d.geometry import charts as parts
-from reli3d.geometry.mesh import Mesh, group, vertex_normals, weld
+from reli3d.geometry.mesh import Mesh, vertex_normals, weld
+from reli3d.geometry.topology import face_neighbours, group
 from reli3d.kernels import charts as kernels
 
 FILL = 0.62  # share of the atlas that charts are expected to cover; sets the unit of the chart step only
@@ -173,8 +174,11 @@ def _place(charts: parts.Charts, faces: np.ndarray, size: int, guard: float, res
     cells = int(size / cell)
     sequence = torch.from_numpy(np.lexsort((np.arange(count), -extent[:, 0], -extent[:, 1])).astype(np.int32))
     inputs = (torch.from_numpy(edge_start), wp.int32), (torch.from_numpy(edges), wp.vec2)
-    place, top_cell = torch.empty(count, 4, dtype=torch.int32), torch.empty(1, dtype=torch.int32)
-    horizon = torch.empty(cells, dtype=torch.int32)
+    place, top_cell = (
+        torch.empty(count, 4, dtype=torch.int32, device="cpu"),
+        torch.empty(1, dtype=torch.int32, device="cpu"),
+    )
+    horizon = torch.empty(cells, dtype=torch.int32, device="cpu")
     strip = int(np.ceil((reserved + 0.5 * guard) / cell)) if reserved else 0
 
     def drop(scale: float, guard: float) -> int:
@@ -184,7 +188,7 @@ def _place(charts: parts.Charts, faces: np.ndarray, size: int, guard: float, res
             return 1 << 30
         column_start = np.concatenate([[0], np.cumsum(width)]).astype(np.int32)
         start = torch.from_numpy(column_start), wp.int32
-        bottom, top = torch.empty(2, int(column_start[-1]), dtype=torch.int32)
+        bottom, top = torch.empty(2, int(column_start[-1]), dtype=torch.int32, device="cpu")
         outline = (bottom, wp.int32), (top, wp.int32)
         _bridge.launch(
             kernels.outline_kernel, count, [*inputs, start, scale / cell, margin / cell, *outline], parts.CPU
@@ -252,7 +256,7 @@ def atlas_report(mesh: Mesh, *, texture_size: int = 1024) -> AtlasReport:
     longest = np.sqrt(0.5 * (a + c + np.sqrt((a - c) ** 2 + 4 * b * b)))
     mean = np.sqrt(area.sum() / max(0.5 * np.abs(twice).sum(), 1e-300))
     joined = weld(torch.nn.functional.pad(mesh.uv.detach(), (0, 1)))[1].cpu().numpy()[faces]  # equal UV, split or not
-    _, chart_count = parts.components(parts.face_neighbours(joined), np.zeros(len(faces), np.int32))
+    _, chart_count = parts.components(face_neighbours(joined), np.zeros(len(faces), np.int32))
     covered = max(int((hits > 0).sum()), 1)
     return AtlasReport(
         charts=chart_count,

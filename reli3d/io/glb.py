@@ -18,7 +18,7 @@ from PIL import Image
 from torch import Tensor
 
 import reli3d
-from reli3d._bridge import expect, over_rows, present
+from reli3d._bridge import expect, full_precision, over_rows, present
 from reli3d.geometry.mesh import watertight
 from reli3d.io.files import write_bytes
 from reli3d.io.gltf_parts import read_parts
@@ -224,6 +224,7 @@ def write_glb(
     write_bytes(path, data)
 
 
+@full_precision
 def read_glb(path: str | os.PathLike, *, notes: list[str] | None = None, **limits: int) -> list[Asset]:
     """The surfaces of a GLB file, one :class:`Asset` for each primitive, in the axes of its scene; no environment.
 

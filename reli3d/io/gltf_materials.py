@@ -157,19 +157,25 @@ class Materials:
                 self.document.fail(field, wanted, size, "use smaller textures or fewer materials")
 
     def _make(self, material: _Material, maps: list[Tensor | None], size: int, wrap: tuple[str, str]) -> TextureSet:
-        white = torch.ones(size, size, 4)
+        white = torch.ones(size, size, 4, dtype=torch.float32, device="cpu")
         color, parameters = (white if m is None else m for m in maps[:2])
-        color = srgb_to_linear(color[..., :3]) * torch.tensor(material.color).clamp(0.0, 1.0)
+        color = srgb_to_linear(color[..., :3]) * torch.tensor(material.color, dtype=torch.float32, device="cpu").clamp(
+            0.0, 1.0
+        )
         if material.specular is None:
             rough = parameters[..., 1] * min(max(material.roughness, 0.0), 1.0)
             metal = parameters[..., 2] * min(max(material.metallic, 0.0), 1.0)
         else:
-            specular = srgb_to_linear(parameters[..., :3]) * torch.tensor(material.specular).clamp(0.0, 1.0)
+            specular = srgb_to_linear(parameters[..., :3]) * torch.tensor(
+                material.specular, dtype=torch.float32, device="cpu"
+            ).clamp(0.0, 1.0)
             rough = 1.0 - parameters[..., 3] * min(max(material.glossiness, 0.0), 1.0)
             color, metal = metallic_from_specular(color, specular)
         normal = None if maps[2] is None else maps[2][..., :3]
         if normal is not None and material.normal_scale != 1.0:
-            bent = (normal * 2.0 - 1.0) * torch.tensor([material.normal_scale, material.normal_scale, 1.0])
+            bent = (normal * 2.0 - 1.0) * torch.tensor(
+                [material.normal_scale, material.normal_scale, 1.0], dtype=torch.float32, device="cpu"
+            )
             normal = torch.nn.functional.normalize(bent, dim=-1, eps=1e-6) * 0.5 + 0.5
         return TextureSet(color.clamp(0.0, 1.0), rough.contiguous(), metal.contiguous(), normal, wrap=wrap)
 

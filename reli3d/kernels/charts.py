@@ -145,41 +145,6 @@ def project_kernel(
 
 
 @wp.func
-def root_of(parent: wp.array[wp.int32], i: int) -> int:
-    """Smallest member of the set of ``i``; halves the path on its way."""
-    r = int(i)
-    while parent[r] != r:
-        parent[r] = parent[parent[r]]
-        r = parent[r]
-    return r
-
-
-@wp.kernel
-def components_serial_kernel(
-    start: int,
-    # in
-    neighbours: wp.array2d[wp.int32], group: wp.array[wp.int32], count: int,
-    # out
-    parent: wp.array[wp.int32],
-):  # fmt: skip
-    """Join faces of one ``group`` across their edges; ``parent`` becomes the smallest face of each set."""
-    for i in range(count):
-        parent[i] = i
-    for i in range(count):
-        for k in range(3):
-            j = neighbours[i, k]
-            if j > i and group[j] == group[i]:
-                a = root_of(parent, i)
-                b = root_of(parent, j)
-                if a < b:
-                    parent[b] = a
-                elif b < a:
-                    parent[a] = b
-    for i in range(count):  # every parent is smaller and already final
-        parent[i] = parent[parent[i]]
-
-
-@wp.func
 def side(a: wp.vec2, b: wp.vec2, p: wp.vec2) -> float:
     """Distance of ``p`` to the right of the line from ``a`` to ``b``: outside of a counter-clockwise triangle."""
     e = b - a

@@ -102,7 +102,7 @@ class TriplaneField(Field):
         cubes, (y, z) = surface_cubes(level), level.shape[1:]
         i, rest = cubes // ((y - 1) * (z - 1)), cubes % ((y - 1) * (z - 1))
         lowest = (i * y + rest // (z - 1)) * z + rest % (z - 1)
-        k = torch.arange(8, device=points.device)
+        k = torch.arange(8, device=points.device, dtype=torch.int64)
         corners = lowest[:, None] + ((k & 1) * y + (k >> 1 & 1)) * z + (k >> 2)
         needed = torch.zeros_like(level, dtype=torch.bool)
         for side in range(3):  # where the inside reaches the box, the cap stands on the border's vertices

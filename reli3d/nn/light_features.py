@@ -76,7 +76,7 @@ def brightness_over_normal(color: Tensor, seen: Tensor, normal: Tensor) -> Tenso
     weight = (seen + 1e-6)[:, None]
     total, mean = weight.sum(), (weight * color).sum(0) / weight.sum()
     basis = harmonics(normal)
-    ridge = torch.full((9,), RIDGE, device=color.device)
+    ridge = torch.full((9,), RIDGE, device=color.device, dtype=torch.float32)
     ridge[0] = 0.0
     gram = (basis * weight).T @ basis / total + torch.diag(ridge)
     fit = torch.linalg.solve(gram, (basis * weight).T @ (color / mean.clamp(min=1e-3)) / total)

@@ -39,7 +39,8 @@ TOKEN_EXTRA = 4  # depth and world normal, beside the pyramid's features
 QUARTER = 4  # pixels of a view along a pixel whose ray is intersected with the hull
 FUSED = 10  # numbers of Fused beside the colour
 HEADS = 13  # numbers of LocalField.heads
-SIGN_OF_MIRRORED = torch.ones(PREDICTED)  # of what the pyramid predicts in the mirror image of a photograph
+# of what the pyramid predicts in the mirror image of a photograph
+SIGN_OF_MIRRORED = torch.ones(PREDICTED, dtype=torch.float32, device="cpu")
 SIGN_OF_MIRRORED[7] = -1.0  # the normal's component to the right, see PixelMaps.of
 SHARPNESS = 2.0  # power of a view's share: the view that looks straightest speaks, with smooth seams
 

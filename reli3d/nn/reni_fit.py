@@ -44,9 +44,9 @@ def fit_latent(
     mean = (((shade + 1e-4 * shade.mean()).log() * weight).sum() / weight.sum()).exp()
     target, floor = target / mean, radiance.new_tensor(math.log(FLOOR))
     generator = torch.Generator().manual_seed(seed)
-    start = 0.1 * torch.randn(decoder.latents, 3, generator=generator)
+    start = 0.1 * torch.randn(decoder.latents, 3, generator=generator, dtype=torch.float32, device="cpu")
     latent = start.to(radiance.device).requires_grad_()
-    strength = torch.zeros((), device=radiance.device, requires_grad=True)
+    strength = torch.zeros((), device=radiance.device, requires_grad=True, dtype=torch.float32)
     optimizer = torch.optim.Adam([latent, strength], lr=RATES[0])
 
     def logarithm(directions: Tensor) -> Tensor:
@@ -66,7 +66,7 @@ def fit_latent(
     with torch.no_grad():
         difference = (torch.logaddexp(logarithm(directions), floor) - (target + FLOOR).log()).abs().mean(-1)
         error = float((difference * weight).sum() / weight.sum())
-        eye = torch.eye(3, device=radiance.device)
+        eye = torch.eye(3, device=radiance.device, dtype=torch.float32)
         return LightFit(latent.detach(), eye, strength.detach() + mean.log(), error)
 
 
@@ -82,5 +82,5 @@ def _rays(decoder: EnvironmentDecoder, radiance: Tensor) -> tuple[Tensor, Tensor
     if not bool(radiance.isfinite().all()) or bool((radiance < 0).any()) or not bool(radiance.any()):
         raise ValueError("radiance: expected finite light of at least 0, got NaN, infinity, negative or black")
     directions = reni_frame(lat_long_directions(height, device=radiance.device)).reshape(-1, 3)
-    rows = torch.sin((torch.arange(height, device=radiance.device) + 0.5) * math.pi / height)
+    rows = torch.sin((torch.arange(height, device=radiance.device, dtype=torch.float32) + 0.5) * math.pi / height)
     return directions, radiance.detach().reshape(-1, 3), rows.repeat_interleave(2 * height)

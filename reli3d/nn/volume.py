@@ -72,7 +72,7 @@ class FeatureVolume(nn.Module):
 
     def _near_hull(self, maps: ViewMaps) -> tuple[Tensor, Tensor, Tensor]:
         """All grid points ``(N**3, 3)``, the index of those near the silhouettes' hull, and the distance to it."""
-        axis = torch.linspace(-self.radius, self.radius, self.side, device=maps.images.device)
+        axis = torch.linspace(-self.radius, self.radius, self.side, device=maps.images.device, dtype=torch.float32)
         grid = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
         hull = hull_grid(axis, maps.silhouette, maps.camera, far=NEAR_HULL).view(-1)
         return grid, (hull > -NEAR_HULL).nonzero()[:, 0], hull

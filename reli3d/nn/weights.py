@@ -146,7 +146,7 @@ def shapes(preset: AnyPreset) -> dict[str, tuple[int, ...]]:
 
 def _unallocated(preset: AnyPreset) -> Network:
     with torch.device("meta"):
-        return network(preset)
+        return network(preset).float()  # whatever the default dtype is
 
 
 def _shapes(model: Network) -> dict[str, tuple[int, ...]]:

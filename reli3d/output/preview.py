@@ -144,7 +144,7 @@ def unseen_cameras(mesh: Mesh, c2w: Tensor) -> list[Camera]:
     low, high = mesh.vertices.aminmax(dim=0)
     centre = (low + high) / 2
     radius = float((mesh.vertices - centre).norm(dim=-1).max())
-    azimuth = torch.arange(AZIMUTHS) * (2.0 * math.pi / AZIMUTHS)
+    azimuth = torch.arange(AZIMUTHS, dtype=torch.float32, device="cpu") * (2.0 * math.pi / AZIMUTHS)
     places = []
     for lift in map(math.radians, ELEVATIONS):
         level = torch.full_like(azimuth, math.sin(lift))
@@ -156,7 +156,7 @@ def unseen_cameras(mesh: Mesh, c2w: Tensor) -> list[Camera]:
         chosen.append(int(nearest.argmin()))
         nearest = torch.maximum(nearest, offered @ offered[chosen[-1]])
     eyes = centre + offered[sorted(chosen, key=lambda k: k % AZIMUTHS)] * (radius / math.sin(FOV / 2))
-    up = torch.tensor([0.0, 1.0, 0.0]).to(centre)
+    up = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float32, device="cpu").to(centre)
     return [Camera.from_fov(look_at(eye, centre, up), FOV, TILE, TILE) for eye in eyes]
 
 

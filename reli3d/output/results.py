@@ -67,7 +67,7 @@ def mask_iou(scene: RayScene, views: Views) -> float:
     """
     batch = views.resampled(SILHOUETTE, crop=True)
     origins, directions = camera_rays(batch.camera)
-    far = torch.full((directions[..., 0].numel(),), torch.inf, device=directions.device)
+    far = torch.full((directions[..., 0].numel(),), torch.inf, device=directions.device, dtype=torch.float32)
     free = scene.unoccluded(origins.reshape(-1, 3), directions.reshape(-1, 3), far)  # the rays of a camera go together
     seen = ~free.reshape(directions.shape[:-1])
     masks = batch.masks > 0.5
@@ -176,8 +176,8 @@ def frame_record(
 
     origin: of the frame of the views, in that of the folder, which the matrices begin with.
     """
-    began = torch.tensor(origin, dtype=torch.float64)
-    read = Similarity(1.0, torch.eye(3, dtype=torch.float64), -began)
+    began = torch.tensor(origin, dtype=torch.float64, device="cpu")
+    read = Similarity(1.0, torch.eye(3, dtype=torch.float64, device="cpu"), -began)
     back = output_from_views.rotation @ began if frame == "input" else torch.zeros_like(began)
     output = Similarity(output_from_views.scale, output_from_views.rotation, output_from_views.translation + back)
     return {

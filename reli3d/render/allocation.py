@@ -8,7 +8,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from reli3d._bridge import launch
+from reli3d._bridge import full_precision, launch
 from reli3d.geometry.rays import RayScene
 from reli3d.kernels import allocation as kernels
 from reli3d.render.environment import Environment
@@ -46,6 +46,7 @@ class SamplePlan:
 
 
 @torch.no_grad()
+@full_precision
 def plan_samples(
     points: SurfacePoints,
     wo: Tensor,
@@ -98,15 +99,17 @@ def spread_rows(n: int, count: int, seed: int) -> Tensor:
 
 def _spread(count: int, seed: int) -> Tensor:
     """A number at random in each of ``count`` equal parts of [0, 1), float64."""
-    jitter = torch.rand(count, dtype=torch.float64, generator=torch.Generator().manual_seed(int(seed)))
-    return (torch.arange(count) + jitter) / count
+    jitter = torch.rand(count, dtype=torch.float64, generator=torch.Generator().manual_seed(int(seed)), device="cpu")
+    return (torch.arange(count, dtype=torch.float32, device="cpu") + jitter) / count
 
 
 def _pilot_points(values: list[Tensor], environment, scene, options: ShadeOptions) -> tuple[Tensor, Tensor]:
     """Rows of the pilot's points and what each counts in the mean over all points, both ``(P,)``."""
     n, device, seed = len(values[0]), values[0].device, options.seed
     if n <= PILOT_POINTS:
-        return torch.arange(n, device=device), torch.full((n,), 1.0 / n, dtype=torch.float64, device=device)
+        return torch.arange(n, device=device, dtype=torch.int64), torch.full(
+            (n,), 1.0 / n, dtype=torch.float64, device=device
+        )
     rows = spread_rows(n, min(n, SCOUTED), seed).to(device)
     first = _draw([v[rows] for v in values], environment, 1, scene, replace(options, seed=seed + 1))
     square = first[0].square().sum((1, 2))
@@ -133,7 +136,9 @@ def _draw(
     light = struct_of_light(environment.radiance.contiguous(), environment.table, offsets.to(device))
     pixels = torch.arange(n, dtype=torch.int32, device=device)
     ins = [struct_of_points([v.contiguous() for v in values], pixels), light, plan]
-    origins, directions, value, density = (torch.empty(n, count, 3, device=device) for _ in range(4))
+    origins, directions, value, density = (
+        torch.empty(n, count, 3, device=device, dtype=torch.float32) for _ in range(4)
+    )
     outs = [(v, wp.vec3) for v in (origins, directions, value, density)]
     launch(kernels.pilot_kernel, n, [*ins, *outs], device, slice_min=8)
     if scene is not None and scene.faces.shape[0]:
@@ -165,10 +170,12 @@ def _splits(total: int) -> Tensor:
     """``total`` split into three counts by eighths (by ones below 8), ``(C, 3)`` float64, C at most 45."""
     steps = min(total, 8)
     edges = [(total * a // steps, total * b // steps) for a in range(steps + 1) for b in range(a, steps + 1)]
-    return torch.tensor([(a, b - a, total - b) for a, b in edges], dtype=torch.float64)
+    return torch.tensor([(a, b - a, total - b) for a, b in edges], dtype=torch.float64, device="cpu")
 
 
-_MOVES = torch.tensor([[1, -1, 0], [-1, 1, 0], [1, 0, -1], [-1, 0, 1], [0, 1, -1], [0, -1, 1]])
+_MOVES = torch.tensor(
+    [[1, -1, 0], [-1, 1, 0], [1, 0, -1], [-1, 0, 1], [0, 1, -1], [0, -1, 1]], dtype=torch.int64, device="cpu"
+)
 
 
 def _variances(value: Tensor, density: Tensor, weight: Tensor, weights: Tensor, counts: Tensor) -> Tensor:

@@ -8,6 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from reli3d._bridge import full_precision
+
 # AgX with Rec. 709 primaries as the published model was trained with: rows of the inset matrix and its inverse
 _AGX_IN = (
     (0.842479062253094, 0.0784335999999992, 0.0792237451477643),
@@ -51,6 +53,7 @@ def linear_to_srgb(value: Tensor) -> Tensor:
     return torch.where(value <= 0.0031308, value * 12.92, power)
 
 
+@full_precision
 def agx(radiance: Tensor) -> Tensor:
     """Display value in [0, 1], sRGB-encoded, of linear radiance ``(..., 3)``: AgX, default look.
 

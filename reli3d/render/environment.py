@@ -12,7 +12,17 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from reli3d._bridge import SLICE_MIN, check, empty, launch, once_differentiable, over_slices, slices, tensor_of
+from reli3d._bridge import (
+    SLICE_MIN,
+    check,
+    empty,
+    full_precision,
+    launch,
+    once_differentiable,
+    over_slices,
+    slices,
+    tensor_of,
+)
 from reli3d.kernels import envmap as kernels
 from reli3d.render.latlong import lat_long_directions, texel_solid_angles
 
@@ -89,6 +99,7 @@ class Environment:
         flat = directions.reshape(-1, 3).contiguous()
         return _Lookup.apply(self.radiance.contiguous(), flat).reshape(directions.shape)
 
+    @full_precision
     def irradiance(self) -> Environment:
         """Irradiance [radiance times sr] on a surface of each normal, as a map of the same size: pi times a constant.
 
@@ -123,6 +134,7 @@ class Environment:
         return Environment(out[0].permute(1, 2, 0).contiguous())
 
     @cached_property
+    @full_precision
     def table(self) -> EnvironmentTable:
         """Importance table; a texel's weight is the integral of the bilinear luminance over it.
 
@@ -190,8 +202,8 @@ class _Lookup(torch.autograd.Function):
         height, width = radiance.shape[:2]
         least = max(SLICE_MIN, height * width)  # a slice's own accumulator must not cost more than its lookups
         parts = slices(n, least) if device.type == "cpu" else [(0, n)]
-        g_radiance = torch.zeros(len(parts), height if needed[0] else 0, width, 3, device=device)
-        g_directions = torch.empty(n if needed[1] else 0, 3, device=device)
+        g_radiance = torch.zeros(len(parts), height if needed[0] else 0, width, 3, device=device, dtype=torch.float32)
+        g_directions = torch.empty(n if needed[1] else 0, 3, device=device, dtype=torch.float32)
         ins = [(radiance, wp.vec3), (directions, wp.vec3), (g_out.contiguous(), wp.vec3)]
 
         def work(k, start, count):

@@ -12,6 +12,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from reli3d._bridge import full_precision
 from reli3d.geometry.camera import Camera
 from reli3d.geometry.rays import RayScene
 from reli3d.render.asset import Asset
@@ -52,6 +53,7 @@ def estimate_base_color_and_light(
 
 
 @torch.no_grad()
+@full_precision
 def photograph_ratio(asset: Asset, images: Tensor, inside: Tensor, camera: Camera, scene: RayScene) -> Tensor:
     """Mean linear color of photographs over that of ``asset`` under its own light with shadows, ``(3,)``.
 

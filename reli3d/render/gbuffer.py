@@ -66,7 +66,7 @@ def tangent_normals(mesh: Mesh, face: Tensor, bary: Tensor, normal: Tensor, mapp
     """
     if mesh.tangents is not None:
         tangent = interpolate(mesh.tangents, mesh.faces, face, bary)
-        tangent, sign = tangent[:, :3], torch.where(tangent[:, 3:] < 0.0, -1.0, 1.0)
+        tangent, sign = tangent[:, :3], torch.where(tangent[:, 3:] < 0.0, -1.0, 1.0).to(tangent)
     else:
         tangent, sign = _uv_tangent(mesh, face)
     tangent = normalize(tangent - (tangent * normal).sum(-1, keepdim=True) * normal, dim=-1)
@@ -121,7 +121,7 @@ def _uv_tangent(mesh: Mesh, face: Tensor) -> tuple[Tensor, Tensor]:
     e1, e2 = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
     d1, d2 = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
     area = d1[:, :1] * d2[:, 1:] - d1[:, 1:] * d2[:, :1]
-    side = torch.where(area < 0.0, -1.0, 1.0)
+    side = torch.where(area < 0.0, -1.0, 1.0).to(area)
     along_u = side * (e1 * d2[:, 1:] - e2 * d1[:, 1:])
     fallback = torch.linalg.cross(torch.linalg.cross(e1, e2), e1)  # any tangent serves a face without uv area
     along_u = torch.where(area.abs() > 1e-20, along_u, fallback)

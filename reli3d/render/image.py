@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from reli3d._bridge import expect
+from reli3d._bridge import expect, full_precision
 from reli3d.geometry.camera import Camera, box_of, camera_rays
 from reli3d.geometry.rays import RayScene
 from reli3d.render.asset import Asset
@@ -73,6 +73,7 @@ class Render:
         return torch.cat([shown, self.alpha[..., None]], -1) if transparent else shown
 
 
+@full_precision
 def render_asset(
     asset: Asset | Sequence[Asset],
     camera: Camera,
@@ -112,6 +113,7 @@ def render_asset(
     return image
 
 
+@full_precision
 def render_lights(
     asset: Asset | Sequence[Asset],
     camera: Camera,
@@ -160,6 +162,7 @@ def render_lights(
     return [Render(radiance, *shared) for radiance in radiances]
 
 
+@full_precision
 def plan_render(
     asset: Asset | Sequence[Asset],
     camera: Camera,

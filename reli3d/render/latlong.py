@@ -17,7 +17,7 @@ def lat_long_directions(
     height: int,
     width: int | None = None,
     *,
-    device: torch.device | str | None = None,
+    device: torch.device | str = "cpu",
     dtype: torch.dtype = torch.float32,
 ) -> Tensor:
     """Unit directions ``(height, width, 3)`` of the texel centers, rounded from float64; ``width`` is 2 ``height``."""
@@ -38,7 +38,7 @@ def lat_long_texels(directions: Tensor, height: int) -> Tensor:
     return row * 2 * height + column
 
 
-def texel_solid_angles(height: int, width: int, device: torch.device | None = None) -> Tensor:
+def texel_solid_angles(height: int, width: int, device: torch.device | str = "cpu") -> Tensor:
     """Solid angle [sr] of a texel in each row, ``(height,)`` float64; times ``width`` they sum to 4 pi."""
     edges = torch.cos(torch.linspace(0.0, math.pi, height + 1, dtype=torch.float64, device=device))
     return (edges[:-1] - edges[1:]) * (2.0 * math.pi / width)

@@ -6,11 +6,13 @@ Both have a mean radiance of 1 over the sphere, so that a matte surface has abou
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from reli3d._bridge import full_precision
 from reli3d.render.environment import Environment
 from reli3d.render.latlong import lat_long_directions, texel_solid_angles
 
@@ -24,6 +26,11 @@ SOFTBOXES = (  # direction of the middle, half width and half height [tangents o
 )
 
 
+def _vector(values: Sequence[float]) -> Tensor:
+    return torch.tensor(values, dtype=torch.float32, device="cpu")
+
+
+@full_precision
 def studio(height: int = 64) -> Environment:
     """A grey room with four softboxes: a key at the left, a strip at the right, one behind and one above."""
     d = lat_long_directions(height)
@@ -31,26 +38,31 @@ def studio(height: int = 64) -> Environment:
     light = (0.22 + 0.12 * y).expand(-1, -1, 3)
     edge = 2.0 * math.pi / height  # a softbox fades over two texels
     for middle, width, rise, radiance in SOFTBOXES:
-        axis = normalize(torch.tensor(middle), dim=0)
-        right = normalize(torch.linalg.cross(torch.tensor([0.0, 1.0, 1e-3]), axis), dim=0)
+        axis = normalize(_vector(middle), dim=0)
+        right = normalize(torch.linalg.cross(_vector([0.0, 1.0, 1e-3]), axis), dim=0)
         depth = d @ axis
         across = (d @ right).abs() / depth.clamp(min=1e-3)
         above = (d @ torch.linalg.cross(axis, right)).abs() / depth.clamp(min=1e-3)
         inside = torch.sigmoid(4.0 * (width - across) / edge) * torch.sigmoid(4.0 * (rise - above) / edge)
-        light = light + (inside * (depth > 0))[..., None] * torch.tensor(radiance)
+        light = light + (inside * (depth > 0))[..., None] * _vector(radiance)
     return _of_mean_one(light)
 
 
+@full_precision
 def sky(height: int = 64) -> Environment:
     """A clear sky over brown ground, the sun 40 degrees high in front at the right."""
     d = lat_long_directions(height)
     y = d[..., 1:2]
-    up = torch.lerp(torch.tensor([0.75, 0.85, 1.0]), torch.tensor([0.16, 0.36, 0.85]), y.clamp(min=0.0).sqrt())
-    ground = torch.tensor([0.2, 0.17, 0.13])
+    up = torch.lerp(
+        _vector([0.75, 0.85, 1.0]),
+        _vector([0.16, 0.36, 0.85]),
+        y.clamp(min=0.0).sqrt(),
+    )
+    ground = _vector([0.2, 0.17, 0.13])
     light = torch.lerp(ground.expand_as(up), up, torch.sigmoid(y * height))  # the horizon fades over a texel
-    sun = normalize(torch.tensor([0.5, math.sin(math.radians(40.0)), 0.58]), dim=0)
+    sun = normalize(_vector([0.5, math.sin(math.radians(40.0)), 0.58]), dim=0)
     away = torch.linalg.cross(d, sun.expand_as(d)).norm(dim=-1).atan2(d @ sun)
-    disc = torch.sigmoid((SUN_RADIUS - away) * (2.0 * height / math.pi))[..., None] * torch.tensor([1.0, 0.9, 0.75])
+    disc = torch.sigmoid((SUN_RADIUS - away) * (2.0 * height / math.pi))[..., None] * _vector([1.0, 0.9, 0.75])
     return _of_mean_one(light / _mean(light) + disc / _mean(disc) * (SUN_FRACTION / (1.0 - SUN_FRACTION)))
 
 

@@ -291,8 +291,8 @@ def _shade_embree(n: int, ins: list, job: _Job, outs: list) -> None:
     (known,) = views([(job.known, wp.int32)])
 
     def work(_, start, length):
-        buffers = [torch.empty(min(size, length) * count, 3) for _ in range(3)]
-        far = torch.empty(min(size, length) * count)
+        buffers = [torch.empty(min(size, length) * count, 3, dtype=torch.float32, device="cpu") for _ in range(3)]
+        far = torch.empty(min(size, length) * count, dtype=torch.float32, device="cpu")
         origins, directions, values, t_max = views([*((v, wp.vec3) for v in buffers), (far, wp.float32)])
         for first in range(start, start + length, size):
             hits = min(size, start + length - first)

@@ -13,14 +13,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 import warp as wp
 from torch import Tensor
 
-from reli3d._bridge import check, launch
+from reli3d._bridge import check, full_precision, launch
 from reli3d.geometry.camera import Camera, project
 from reli3d.geometry.mesh import weld
 from reli3d.geometry.rays import RayScene
+from reli3d.geometry.topology import edges_of
 from reli3d.kernels import silhouette as kernels
 
 OUTSIDE = 0.01  # pixels from the edge to the visibility ray, so that it does not graze the edge's own faces
@@ -60,20 +62,17 @@ def mesh_edges(vertices: Tensor, faces: Tensor) -> Tensor:
     first, label = weld(vertices)
     corners = first[label[faces.long()]]
     corners = corners[(corners != corners.roll(1, 1)).all(1)]  # a face that welding closes has no edge to show
-    ends = torch.cat([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]).sort(1).values
-    opposite = torch.cat([corners[:, 2], corners[:, 0], corners[:, 1]])
-    key, order = torch.sort(ends[:, 0] * len(vertices) + ends[:, 1], stable=True)
-    ends, opposite = ends[order], opposite[order]
-    _, times = torch.unique_consecutive(key, return_counts=True)
-    begin = times.cumsum(0) - times
-    pair = begin[times == 2]
-    alone = torch.ones(len(ends), dtype=torch.bool, device=faces.device)
-    alone[pair] = alone[pair + 1] = False
-    both = torch.cat([ends[pair], opposite[pair, None], opposite[pair + 1, None]], 1)
-    single = torch.cat([ends[alone], opposite[alone, None], opposite.new_full((int(alone.sum()), 1), -1)], 1)
-    return torch.cat([both, single]).int()
+    edges = edges_of(corners.cpu().numpy())
+    opposite = corners[:, [2, 0, 1]].reshape(-1).cpu().numpy()  # of each half-edge
+    both = edges.of_valence(2)
+    alone = edges.order[np.repeat(edges.valence != 2, edges.valence)]
+    lead, second = np.concatenate([both[0], alone]), np.concatenate([opposite[both[1]], np.full(len(alone), -1)])
+    tail, head = edges.tail[lead], edges.head[lead]
+    rows = np.stack([np.minimum(tail, head), np.maximum(tail, head), opposite[lead], second], 1)
+    return torch.from_numpy(rows.astype(np.int32)).to(faces.device)
 
 
+@full_precision
 def outline_crossings(vertices: Tensor, edges: Tensor, camera: Camera, scene: RayScene) -> Crossings:
     """Crossings of visible silhouettes with the lines between pixel centers.
 
@@ -93,7 +92,7 @@ def outline_crossings(vertices: Tensor, edges: Tensor, camera: Camera, scene: Ra
     ends = [vertices.index_select(0, k) for k in edges.long()[edge, :2].unbind(1)]
     (a, za), (b, zb) = (project(p, camera.c2w, camera.intrinsics) for p in ends)
     a, b = (torch.where(steep[:, None], p.flip(1), p) for p in (a, b))  # the coordinate that runs over lines first
-    centre = line + 0.5
+    centre = line.to(vertices.dtype) + 0.5
     part = (centre - a[:, 0]) / (b[:, 0] - a[:, 0])
     across = a[:, 1] + part * (b[:, 1] - a[:, 1])
     low = torch.floor(across.detach() - 0.5)
@@ -132,6 +131,7 @@ def blend_outlines(image: Tensor, crossings: Crossings) -> Tensor:
     return flat.index_add(0, into, (weight / total.index_select(0, into))[:, None] * contrast).reshape(image.shape)
 
 
+@full_precision
 def antialias(
     image: Tensor,
     vertices: Tensor,
@@ -166,7 +166,7 @@ def _lines(vertices: Tensor, edges: Tensor, camera: Camera) -> tuple[Tensor, Ten
     """Edge, pixel line, steepness and direction away from the surface (1 or -1) of every crossing, each ``(M,)``."""
     n, device = len(edges), vertices.device
     first, count = (torch.empty(n, dtype=torch.int32, device=device) for _ in range(2))
-    outward = torch.empty(n, device=device)
+    outward = torch.empty(n, device=device, dtype=torch.float32)
     steep = torch.empty(n, dtype=torch.bool, device=device)
     c2w, intrinsics = camera.c2w.detach().tolist(), camera.intrinsics.detach().tolist()
     launch(
@@ -187,9 +187,9 @@ def _lines(vertices: Tensor, edges: Tensor, camera: Camera) -> tuple[Tensor, Ten
         device,
     )
     count = count.long()
-    edge = torch.repeat_interleave(torch.arange(n, device=device), count)
+    edge = torch.repeat_interleave(torch.arange(n, device=device, dtype=torch.int64), count)
     begin = count.cumsum(0) - count
-    line = first.long()[edge] + torch.arange(len(edge), device=device) - begin[edge]
+    line = first.long()[edge] + torch.arange(len(edge), device=device, dtype=torch.int64) - begin[edge]
     return edge, line, steep[edge], outward[edge]
 
 
@@ -207,5 +207,5 @@ def _outermost(keep: Tensor, key: Tensor, place: Tensor, keys: int) -> Tensor:
     key, place = key[rows], place[rows]
     best = place.new_full((keys,), -1.0).scatter_reduce(0, key, place, "amax")
     rows, key = rows[place == best[key]], key[place == best[key]]
-    first = torch.full((keys,), len(keep), device=key.device).scatter_reduce(0, key, rows, "amin")
+    first = torch.full((keys,), len(keep), device=key.device, dtype=torch.int64).scatter_reduce(0, key, rows, "amin")
     return rows[rows == first[key]]

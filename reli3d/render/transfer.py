@@ -12,7 +12,7 @@ import math
 import torch
 from torch import Tensor
 
-from reli3d._bridge import check, present
+from reli3d._bridge import check, full_precision, present
 from reli3d.geometry.mesh import Mesh, weld_rows
 from reli3d.geometry.rays import RayScene
 from reli3d.render.environment import Environment
@@ -48,6 +48,7 @@ def spherical_harmonics(directions: Tensor) -> Tensor:
     return torch.stack([math.sqrt(square / math.pi) * value for square, value in values], -1)
 
 
+@full_precision
 def light_harmonics(light: Environment) -> Tensor:
     """Coefficients ``(16, 3)`` of a light: its texels' solid angles times their values, summed in float64."""
     height, width = light.radiance.shape[:2]
@@ -56,6 +57,7 @@ def light_harmonics(light: Environment) -> Tensor:
     return torch.einsum("hwk,hwc->kc", weight, light.radiance.detach().cpu().double()).float()
 
 
+@full_precision
 def blocked_transfer(mesh: Mesh, *, directions: int = 64, scene: RayScene | None = None) -> Tensor:
     """Blocked transfer ``(V, 16)``: integrals of the occluded cosine times harmonics at each vertex; no gradient.
 
@@ -77,7 +79,7 @@ def blocked_transfer(mesh: Mesh, *, directions: int = 64, scene: RayScene | None
     cosine = (normal @ toward.T).clamp(min=0.0)
     above = cosine > 0.0
     vertex, which = above.nonzero(as_tuple=True)  # rays of one vertex are consecutive
-    far = torch.full((len(vertex),), torch.inf, device=device)
+    far = torch.full((len(vertex),), torch.inf, device=device, dtype=torch.float32)
     scene = scene if scene is not None else RayScene(mesh.vertices, mesh.faces)
     # index_select takes rows in a third of the time of an index
     free = scene.unoccluded(start.index_select(0, vertex), toward.index_select(0, which), far)
@@ -88,7 +90,7 @@ def blocked_transfer(mesh: Mesh, *, directions: int = 64, scene: RayScene | None
 
 def sphere_spiral(count: int) -> Tensor:
     """``(count, 3)`` unit directions, each in the middle of an equal area of the sphere (a Fibonacci spiral)."""
-    k = torch.arange(count, dtype=torch.float64) + 0.5
+    k = torch.arange(count, dtype=torch.float64, device="cpu") + 0.5
     height, turn = 1.0 - 2.0 * k / count, k * (math.pi * (3.0 - math.sqrt(5.0)))
     across = (1.0 - height * height).sqrt()
     return torch.stack([across * turn.cos(), height, across * turn.sin()], -1).float()

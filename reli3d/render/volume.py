@@ -54,7 +54,7 @@ class OccupancyGrid:
         field: densities ``(N,)`` of points ``(N, 3)``; evaluated without gradient, in chunks.  Detail of less than half
         a cell between those points may be missed.
         """
-        k = (torch.arange(2 * resolution + 1, device=device) / resolution - 1.0) * radius
+        k = (torch.arange(2 * resolution + 1, device=device, dtype=torch.float32) / resolution - 1.0) * radius
         values = []
         with torch.no_grad():
             points = torch.stack(torch.meshgrid(k, k, k, indexing="ij"), -1).reshape(-1, 3)
@@ -138,7 +138,7 @@ def march_rays(
         raise ValueError(f"step: expected fewer than 2**31 samples, got {int(total[-1])}")
     first = total.int()
     ray = torch.empty(int(total[-1]), dtype=torch.int32, device=device)
-    t = torch.empty(int(total[-1]), device=device)
+    t = torch.empty(int(total[-1]), device=device, dtype=torch.float32)
     outs = [(ray, wp.int32), (t, wp.float32)]
     launch(kernels.emit_samples_kernel, n, [*rays, *numbers, (first, wp.int32), *outs], device)
     return RaySamples(ray, t, first, float(step))

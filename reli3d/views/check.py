@@ -16,6 +16,7 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 from torch.nn.functional import max_pool2d, pad
 
+from reli3d._bridge import full_precision
 from reli3d.geometry.camera import project
 from reli3d.io.files import printable
 from reli3d.io.images import write_png
@@ -31,10 +32,11 @@ UP_MARGIN = (
 NEAR_AXIS = 0.94  # cosine, 20 degrees: what is farther from every axis no --up puts right
 INVERTED_BORDER = 0.6  # fraction of the image border inside the mask from which the mask looks inverted
 
-_FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
-_HALF_TURN = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0]))
+_FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float32, device="cpu"))
+_HALF_TURN = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0], dtype=torch.float32, device="cpu"))
 
 
+@full_precision
 def explain_cameras(views: Views) -> list[str]:
     """One line per view, one on the up axis where it is not +Y, and last the :func:`verdict` on the cameras."""
     hull, filled = agreement(views)
@@ -60,11 +62,13 @@ def explain_cameras(views: Views) -> list[str]:
     return [*lines, _verdict(views, hull, filled)]
 
 
+@full_precision
 def verdict(views: Views) -> str:
     """One line that begins with ``cameras agree``, or with ``suspect`` and names the likely cause, or ``one view``."""
     return _verdict(views, *agreement(views))
 
 
+@full_precision
 def up_axis(c2w: Tensor) -> str | None:
     """The axis (``y``, ``-z``, ...) that is up for cameras held upright; None where they leave it open.
 
@@ -84,6 +88,7 @@ def _triple(values: Tensor) -> str:
     return "(" + ", ".join(f"{v:.3g}" for v in values.tolist()) + ")"
 
 
+@full_precision
 def agreement(views: Views) -> tuple[Hull, list[float]]:
     """The visual hull and the fraction of each mask that its silhouette fills, all 0 where the hull is empty."""
     hull = visual_hull(views)
@@ -98,7 +103,7 @@ def _filled(hull: Hull, mask: Tensor, pose: Tensor, camera: Tensor) -> float:
     height, width = mask.shape
     blocks = max_pool2d(pad(mask.cpu(), (0, -width % step, 0, -height % step))[None], step)[0] > 0.5
     inside = (pixels >= 0).all(-1) & (pixels[:, 0] < width) & (pixels[:, 1] < height)
-    hit = torch.zeros(blocks.shape)
+    hit = torch.zeros(blocks.shape, dtype=torch.float32, device="cpu")
     x, y = (pixels[inside] / step).long().unbind(-1)
     hit[y, x] = 1.0
     hit = max_pool2d(hit[None], 3, 1, 1)[0] > 0  # cells and blocks do not line up: allow a block on each side
@@ -107,7 +112,11 @@ def _filled(hull: Hull, mask: Tensor, pose: Tensor, camera: Tensor) -> float:
 
 def _quarter_turn(views: Views, sign: float) -> Views:
     """The views as if every image had been turned by 90 degrees without its camera."""
-    turn = torch.tensor([[0.0, sign, 0.0, 0.0], [-sign, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+    turn = torch.tensor(
+        [[0.0, sign, 0.0, 0.0], [-sign, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]],
+        dtype=torch.float32,
+        device="cpu",
+    )
     return replace(views, c2w=views.c2w @ turn.to(views.c2w))
 
 
@@ -256,7 +265,9 @@ def _latin(text: str) -> str:
 
 def _frustum(pose: Tensor, camera: Tensor, shape: tuple[int, ...], length: float) -> np.ndarray:
     """``(5, 3)`` world points: the eye and the four image corners at depth ``length``."""
-    corners = torch.tensor([[0, 0], [shape[1], 0], [shape[1], shape[0]], [0, shape[0]]], dtype=torch.float64)
+    corners = torch.tensor(
+        [[0, 0], [shape[1], 0], [shape[1], shape[0]], [0, shape[0]]], dtype=torch.float64, device="cpu"
+    )
     x, y = ((corners - camera[2:]) / camera[:2]).unbind(-1)
     local = length * torch.stack([x, -y, -torch.ones_like(x)], -1)
     return torch.cat([pose[:3, 3][None], local @ pose[:3, :3].T + pose[:3, 3]]).numpy()
@@ -264,7 +275,7 @@ def _frustum(pose: Tensor, camera: Tensor, shape: tuple[int, ...], length: float
 
 def _cube(views: Views) -> np.ndarray:
     """``(8, 3)`` corners of the network's cube in the frame of the cameras."""
-    corners = torch.cartesian_prod(*[torch.tensor([-RADIUS, RADIUS], dtype=torch.float64)] * 3)
+    corners = torch.cartesian_prod(*[torch.tensor([-RADIUS, RADIUS], dtype=torch.float64, device="cpu")] * 3)
     return normalize(views).inverse().apply(corners).numpy()
 
 

@@ -7,6 +7,7 @@ import math
 import torch
 from torch import Tensor
 
+from reli3d._bridge import full_precision
 from reli3d.views.normalize import meeting_point
 
 NEAR = math.radians(3.0)  # views nearer than this show the same: a hand's breadth at two metres
@@ -14,6 +15,7 @@ NARROW = math.radians(25.0)  # views all within this angle leave the depth of th
 CLOSER = 0.5  # radians that a factor e in distance counts for: half the distance is worth 20 degrees
 
 
+@full_precision
 def view_distances(c2w: Tensor) -> tuple[Tensor, Tensor]:
     """Angles [rad] between the views ``(V, V)`` and their distances ``(V, V)``, float64.
 
@@ -36,12 +38,13 @@ def _looked_at(eyes: Tensor, axes: Tensor) -> Tensor:
 
     A weight of 1e-5 of an axis leaves the point to axes that differ by a degree.
     """
-    one = torch.eye(3, dtype=axes.dtype)
+    one = torch.eye(3, dtype=axes.dtype, device=axes.device)
     across = one - axes[:, :, None] * axes[:, None]
     right = (across @ eyes[..., None]).mean(0)[:, 0]
     return torch.linalg.solve(across.mean(0) + 1e-5 * one, right + 1e-5 * meeting_point(eyes, axes)[0])
 
 
+@full_precision
 def choose_views(c2w: Tensor, count: int, *, apart: float = 0.0) -> list[int]:
     """Indices, ascending, of up to ``count`` views: view 0, then each time the one farthest from those taken.
 

@@ -18,7 +18,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from reli3d._bridge import present
+from reli3d._bridge import full_precision, present
 from reli3d.io.files import InputError, printable, shown
 from reli3d.io.images import above, colour, read_picture, unit
 from reli3d.views.array_cameras import NEUS, read_llff, read_neus
@@ -41,6 +41,7 @@ SPLITS = tuple(f"transforms_{name}.json" for name in ("train", "val", "test"))  
 ASPECT = 0.01  # relative difference of the image's aspect and the camera's up to which the intrinsics are rescaled
 
 
+@full_precision
 def load_views(
     folder: str | os.PathLike,
     *,
@@ -113,7 +114,7 @@ def load_views(
         images=tuple(image for image, *_ in loaded),
         masks=tuple(mask for _, mask, *_ in loaded),
         c2w=_poses(frames, origin),
-        intrinsics=torch.tensor([k for _, _, k, *_ in loaded], dtype=torch.float32),
+        intrinsics=torch.tensor([k for _, _, k, *_ in loaded], dtype=torch.float32, device="cpu"),
         names=tuple(f.name for f in frames),
         notes=tuple(dict.fromkeys(notes)),
         in_folder=offered,

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d, pad
 
+from reli3d._bridge import full_precision
 from reli3d.views.similarity import Similarity
 from reli3d.views.views import LEAST_WHOLE, Views, mask_box, touches_border
 
@@ -43,6 +44,7 @@ class Hull:
         return self.points.amin(0), self.points.amax(0)  # the border runs through the outermost cells
 
 
+@full_precision
 def normalize(views: Views, mode: str = "auto") -> Similarity:
     """The map from the frame of the input cameras to the network's frame (no rotation).
 
@@ -69,7 +71,7 @@ def normalize(views: Views, mode: str = "auto") -> Similarity:
     longest, centre = float((high - low).max()), basis @ ((low + high) / 2)
     if mode == "auto" and inside and longest >= LONGEST and float(centre.norm()) <= OFF_CENTRE:
         return Similarity.identity()
-    return Similarity(1.0 / longest, torch.eye(3, dtype=torch.float64), -centre / longest)
+    return Similarity(1.0 / longest, torch.eye(3, dtype=torch.float64, device="cpu"), -centre / longest)
 
 
 def _one_sided_basis(views: Views, hull: Hull) -> Tensor:
@@ -85,11 +87,12 @@ def _one_sided_basis(views: Views, hull: Hull) -> Tensor:
     across = torch.linalg.cross(c2w[0, :3, 1], axis)
     parallel = meeting_point(c2w[:, :3, 3], -away)[1] < PARALLEL
     if parallel or float((away @ away.T).min()) < math.cos(ONE_SIDED) or float(across.norm()) < 1e-3:
-        return torch.eye(3, dtype=torch.float64)
+        return torch.eye(3, dtype=torch.float64, device="cpu")
     right = torch.nn.functional.normalize(across, dim=-1)
     return torch.stack([right, torch.linalg.cross(axis, right), axis], -1)
 
 
+@full_precision
 def visual_hull(views: Views) -> Hull:
     """Coarse visual hull of ``views``, on the CPU: a grid where the views meet, refined once to the box of its cells.
 
@@ -108,14 +111,16 @@ def visual_hull(views: Views) -> Hull:
     depth = ((aim - origins)[:, None] @ -c2w[:, :3, 2:3])[:, 0, 0]  # along the viewing axes
     if not bool((depth > AT_EYE * origins.norm(dim=-1).max()).all()):
         return Hull(origins.new_zeros(0, 3), 0.0, aim, 0.0)
-    boxes = torch.tensor([mask_box(m) for m in masks], dtype=torch.float64)
+    boxes = torch.tensor([mask_box(m) for m in masks], dtype=torch.float64, device="cpu")
     sides = (boxes[:, 2:] - boxes[:, :2]) / intrinsics[:, :2] * depth[:, None]
     extent = float(sides.max())
     ball = 0.5 * extent * (BALL if spread >= PARALLEL else 1.0)  # views from one side: as deep as wide
     low, high = aim - ball, aim + ball
     for grid in GRIDS:
         cell = float((high - low).max()) / grid
-        axes = [torch.arange(math.ceil(float(h - l) / cell), dtype=torch.float64) for l, h in zip(low, high)]
+        axes = [
+            torch.arange(math.ceil(float(h - l) / cell), dtype=torch.float64, device="cpu") for l, h in zip(low, high)
+        ]
         points = low + (torch.cartesian_prod(*axes) + 0.5) * cell
         points = points[(points - aim).norm(dim=-1) <= ball]
         for mask, pose, camera in zip(masks, c2w, intrinsics):
@@ -126,22 +131,24 @@ def visual_hull(views: Views) -> Hull:
     return Hull(points, cell, aim, extent)
 
 
+@full_precision
 def centre_rays(masks: list[Tensor], c2w: Tensor, intrinsics: Tensor) -> Tensor:
     """Unit rays ``(V, 3)`` through the middle of each mask's box, world frame."""
-    boxes = torch.tensor([mask_box(m) for m in masks], dtype=c2w.dtype)
+    boxes = torch.tensor([mask_box(m) for m in masks], dtype=c2w.dtype, device="cpu")
     middle = (boxes[:, :2] + boxes[:, 2:]) / 2
     x, y = ((middle - intrinsics[:, 2:]) / intrinsics[:, :2]).unbind(-1)
     local = torch.stack([x, -y, -torch.ones_like(x)], -1)
     return torch.nn.functional.normalize((c2w[:, :3, :3] @ local[..., None])[..., 0], dim=-1)
 
 
+@full_precision
 def meeting_point(origins: Tensor, rays: Tensor) -> tuple[Tensor, float]:
     """The point ``(3,)`` nearest to all rays, and how well they fix it: the smallest mean squared sine, 0 if parallel.
 
     Below PARALLEL it is, along the mean ray, the point nearest to the world origin, or at unit distance if that lies
     behind a camera.
     """
-    across = torch.eye(3, dtype=rays.dtype) - rays[:, :, None] * rays[:, None]
+    across = torch.eye(3, dtype=rays.dtype, device=rays.device) - rays[:, :, None] * rays[:, None]
     system = across.mean(0)
     spread = float(torch.linalg.eigvalsh(system)[0])
     if spread >= PARALLEL:
@@ -182,6 +189,6 @@ def _covered(points: Tensor, mask: Tensor, pose: Tensor, camera: Tensor, cell: f
         mask = max_pool2d(pad(mask, (0, -width % step, 0, -height % step))[None], step)
         mask = max_pool2d(mask, 3, 1, 1)[0]
     scaled = torch.stack([camera[0] * local[:, 0], -camera[1] * local[:, 1]], -1) / depth[:, None] + camera[2:]
-    limit = torch.tensor([width - 1, height - 1], dtype=torch.float64)
+    limit = torch.tensor([width - 1, height - 1], dtype=torch.float64, device="cpu")
     pixel = torch.minimum(scaled.floor().clamp_min(0), limit).long() // step
     return (mask[pixel[:, 1], pixel[:, 0]] > 0.5) & (local[:, 2] < 0)

@@ -7,13 +7,15 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from reli3d._bridge import full_precision
+
 UP = {  # rotations that carry an axis to +Y
-    "y": torch.eye(3),
-    "-y": torch.diag(torch.tensor([1.0, -1.0, -1.0])),
-    "x": torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
-    "-x": torch.tensor([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
-    "z": torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
-    "-z": torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
+    "y": torch.eye(3, dtype=torch.float32, device="cpu"),
+    "-y": torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float32, device="cpu")),
+    "x": torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float32, device="cpu"),
+    "-x": torch.tensor([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float32, device="cpu"),
+    "z": torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]], dtype=torch.float32, device="cpu"),
+    "-z": torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]], dtype=torch.float32, device="cpu"),
 }
 
 
@@ -28,17 +30,21 @@ class Similarity:
     @staticmethod
     def identity() -> Similarity:
         """The map that changes nothing."""
-        return Similarity(1.0, torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
+        return Similarity(
+            1.0, torch.eye(3, dtype=torch.float64, device="cpu"), torch.zeros(3, dtype=torch.float64, device="cpu")
+        )
 
     def matrix(self) -> Tensor:
         """``(4, 4)`` float64 matrix on column vectors."""
         rows = torch.cat([self.scale * self.rotation, self.translation[:, None]], -1)
         return torch.cat([rows, rows.new_tensor([[0.0, 0.0, 0.0, 1.0]])])
 
+    @full_precision
     def apply(self, points: Tensor) -> Tensor:
         """Mapped ``points (..., 3)``, in their dtype and on their device.  Gradients reach the points."""
         return self.scale * points @ self.rotation.to(points).T + self.translation.to(points)
 
+    @full_precision
     def inverse(self) -> Similarity:
         """The map back."""
         return Similarity(1 / self.scale, self.rotation.T, -(self.rotation.T @ self.translation) / self.scale)
@@ -49,7 +55,7 @@ class Similarity:
 
     def is_identity(self) -> bool:
         """Whether the map changes nothing, to the last bit."""
-        same = torch.equal(self.rotation, torch.eye(3, dtype=torch.float64))
+        same = torch.equal(self.rotation, torch.eye(3, dtype=torch.float64, device="cpu"))
         return self.scale == 1.0 and same and not bool(self.translation.any())
 
 
@@ -59,5 +65,5 @@ def output_frame(model_from_input: Similarity, frame: str, up: str) -> Similarit
         raise ValueError(f"frame: expected input or model, got {frame}")
     if up not in UP:
         raise ValueError(f"up: expected one of {', '.join(UP)}, got {up}")
-    turn = Similarity(1.0, UP[up].double(), torch.zeros(3, dtype=torch.float64))
+    turn = Similarity(1.0, UP[up].double(), torch.zeros(3, dtype=torch.float64, device="cpu"))
     return turn.compose(model_from_input) if frame == "model" else turn

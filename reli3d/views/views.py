@@ -173,7 +173,7 @@ def _cut(image: Tensor, mask: Tensor, x: int, y: int, width: int, height: int) -
     left, top = max(0, -x), max(0, -y)
     right, bottom = max(0, x + width - columns), max(0, y + height - rows)
     inner = slice(y + top, y + height - bottom), slice(x + left, x + width - right)
-    pixels = torch.empty((4, height - top - bottom, width - left - right), device=image.device)
+    pixels = torch.empty((4, height - top - bottom, width - left - right), device=image.device, dtype=torch.float32)
     pixels[:3] = image[inner].permute(2, 0, 1)
     pixels[3] = mask[inner]
     if not (left or top or right or bottom):

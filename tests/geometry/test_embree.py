@@ -63,7 +63,7 @@ def test_scenes_in_many_threads_answer_as_alone_and_are_given_back(device):
 
     def work(k):
         for _ in range(10):
-            scene = RayScene(*(torch.from_numpy(a) for a in meshes[k]), "embree")
+            scene = RayScene(*(torch.from_numpy(a) for a in meshes[k]), backend="embree")
             if not torch.equal(scene.closest(o, d).face, want[k]):
                 failed.append(k)
 

@@ -10,6 +10,7 @@ from reli3d.geometry import charts, uv
 from reli3d.geometry.bake import coverage, nearest_valid
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.surface import extract_surface
+from reli3d.geometry.topology import face_neighbours
 from reli3d.geometry.uv import atlas_report, guard_band, source_vertices, unwrap, unwrap_xatlas
 from tests.support.meshes import QUICK, SLOW, loaded, mesh_of
 
@@ -127,7 +128,7 @@ def test_stretch_of_a_plane_is_one_and_of_a_squeezed_one_is_known():
 @pytest.mark.parametrize("size", [256, 512])
 def test_charts_keep_the_guard_band(size):
     result = unwrap(icosphere(3), texture_size=size)
-    neighbours = charts.face_neighbours(result.faces.numpy())
+    neighbours = face_neighbours(result.faces.numpy())
     chart, count = charts.components(neighbours, np.zeros(len(neighbours), np.int32))
     fine = 2  # samples along a texel
     for c in range(count):
@@ -234,7 +235,7 @@ def test_split_vertices_know_what_they_were(atlas):
 
 def test_neighbours_skip_borders_and_crowded_edges():
     faces = np.array([[0, 1, 2], [2, 1, 3], [4, 5, 6], [5, 4, 7], [4, 5, 8]])
-    assert charts.face_neighbours(faces).tolist() == [[-1, 1, -1], [0, -1, -1], [-1] * 3, [-1] * 3, [-1] * 3]
+    assert face_neighbours(faces).tolist() == [[-1, 1, -1], [0, -1, -1], [-1] * 3, [-1] * 3, [-1] * 3]
 
 
 def test_faults_are_named():

@@ -46,7 +46,7 @@ def test_a_ball_is_seen_where_it_faces_the_camera_and_lies_in_the_image(device, 
     scene = RayScene(
         torch.tensor(ball.vertices, dtype=torch.float32, device=device),
         torch.tensor(ball.faces, dtype=torch.int32, device=device),
-        backend,
+        backend=backend,
     )
     camera, p = rig(device, *size), points(device)
     got = visible_from(scene, p * 1.001, p, camera)

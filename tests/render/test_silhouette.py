@@ -205,7 +205,7 @@ def test_edges_of_split_vertices_and_open_borders(device):
     faces = torch.tensor([[0, 1, 2], [3, 4, 5]], dtype=torch.int32, device=device)
     edges = mesh_edges(v[[0, 1, 2, 0, 2, 3]], faces)
     assert len(edges) == 5 and int((edges[:, 3] >= 0).sum()) == 1
-    assert edges[edges[:, 3] >= 0].tolist() == [[0, 2, 5, 1]]
+    assert edges[edges[:, 3] >= 0].tolist() == [[0, 2, 1, 5]]
     assert mesh_edges(v, faces[:0]).shape == (0, 4)
     with pytest.raises(ValueError, match="faces: expected indices"):
         mesh_edges(v, faces)

@@ -37,6 +37,7 @@ from reli3d.render.volume import RaySamples, composite
 from tests.support.surfaces import at, on_ball
 
 N = 5200  # rows: five slices of a CPU launch
+HOST = {"dtype": torch.float32, "device": "cpu"}
 
 
 @dataclass(frozen=True)
@@ -61,18 +62,18 @@ def rng(seed: int = 0) -> torch.Generator:
 
 
 def uniform(*shape: int, seed: int = 0, low: float = 0.0, high: float = 1.0) -> Tensor:
-    return low + (high - low) * torch.rand(*shape, generator=rng(seed))
+    return low + (high - low) * torch.rand(*shape, generator=rng(seed), **HOST)
 
 
 def units(n: int, seed: int = 0) -> Tensor:
-    return normalize(torch.randn(n, 3, generator=rng(seed)), dim=-1)
+    return normalize(torch.randn(n, 3, generator=rng(seed), **HOST), dim=-1)
 
 
 def above(n: int, seed: int = 0) -> Tensor:
     """Unit directions at least 0.1 above the horizon of +z."""
     return normalize(
-        units(n, seed) * torch.tensor([1.0, 1.0, 0.0])
-        + uniform(n, 1, seed=seed + 50, low=0.15, high=2.0) * torch.tensor([0.0, 0.0, 1.0]),
+        units(n, seed) * torch.tensor([1.0, 1.0, 0.0], **HOST)
+        + uniform(n, 1, seed=seed + 50, low=0.15, high=2.0) * torch.tensor([0.0, 0.0, 1.0], **HOST),
         dim=-1,
     )
 
@@ -92,7 +93,7 @@ def ball(device, subdivisions: int = 2, radius: float = 0.5) -> tuple[Tensor, Te
 
 def corners(count: int) -> Tensor:
     centre = uniform(count, 1, 3, seed=1, low=-1.0)
-    return (centre + 0.3 * torch.randn(count, 3, 3, generator=rng(2))).reshape(-1, 3)
+    return (centre + 0.3 * torch.randn(count, 3, 3, generator=rng(2), **HOST)).reshape(-1, 3)
 
 
 def soup(vertices: Tensor, n: int) -> tuple[Tensor, Tensor]:
@@ -124,14 +125,18 @@ def reevaluate(vertices, origins, directions):
 
 
 def camera(device, size: int = 32) -> Camera:
-    at = torch.tensor([0.7, 0.9, 2.0], device=device)
-    pose = look_at(at, torch.zeros(3, device=device), torch.tensor([0.0, 1.0, 0.0], device=device))
+    at = torch.tensor([0.7, 0.9, 2.0], device=device, dtype=torch.float32)
+    pose = look_at(
+        at,
+        torch.zeros(3, device=device, dtype=torch.float32),
+        torch.tensor([0.0, 1.0, 0.0], device=device, dtype=torch.float32),
+    )
     return Camera.from_fov(pose, 0.7, size, size)
 
 
 def rig(device, width: int = 20, height: int = 24) -> Camera:
-    poses = [look_at(2.5 * e, torch.zeros(3), torch.tensor([0.0, 1.0, 0.0])) for e in units(3, 9)]
-    intrinsics = torch.tensor([30.0, 28.0, 11.0, 13.0]).expand(3, 4).contiguous()
+    poses = [look_at(2.5 * e, torch.zeros(3, **HOST), torch.tensor([0.0, 1.0, 0.0], **HOST)) for e in units(3, 9)]
+    intrinsics = torch.tensor([30.0, 28.0, 11.0, 13.0], **HOST).expand(3, 4).contiguous()
     return Camera(torch.stack(poses), intrinsics, width, height).to(device)
 
 
@@ -154,9 +159,9 @@ def lit(shadows: str | None = None, **options):
         if shadows:
             vertices, faces = ball(normal.device)
             scene = RayScene(
-                vertices + torch.tensor([0.0, 1.0, 0.0], device=normal.device),
+                vertices + torch.tensor([0.0, 1.0, 0.0], device=normal.device, dtype=torch.float32),
                 faces,
-                shadows if normal.device.type == "cpu" else "warp",
+                backend=shadows if normal.device.type == "cpu" else "warp",
             )
         points, wo = at(0.2 * ng, normal, ng, wo, base_color, roughness, metallic)
         return (shade(points, wo, Environment(radiance), scene=scene, options=ShadeOptions(seed=3, **options)),)
@@ -167,10 +172,10 @@ def lit(shadows: str | None = None, **options):
 def packed(density) -> RaySamples:
     """Rays of 0, 1, 2 ... samples, as many as there are."""
     n, device = len(density), density.device
-    ray = torch.repeat_interleave(torch.arange(n + 1), torch.arange(n + 1))[:n]
+    ray = torch.repeat_interleave(torch.arange(n + 1, device="cpu"), torch.arange(n + 1, device="cpu"))[:n]
     rays = int(ray[-1]) + 1 if n else 1
-    first = torch.searchsorted(ray, torch.arange(rays + 1))
-    t = 0.3 + 0.05 * (torch.arange(n) - first[ray])
+    first = torch.searchsorted(ray, torch.arange(rays + 1, device="cpu"))
+    t = 0.3 + 0.05 * (torch.arange(n, **HOST) - first[ray])
     return RaySamples(ray.int().to(device), t.float().to(device), first.int().to(device), 0.05)
 
 
@@ -185,7 +190,7 @@ def outlines(image, vertices):
 
 
 def grid_inputs(_, shape=(7, 6, 8), seed: int = 3) -> dict[str, Tensor]:
-    level = torch.nn.functional.pad(torch.randn(shape, generator=rng(seed)), (1,) * 6, value=0.7)
+    level = torch.nn.functional.pad(torch.randn(shape, generator=rng(seed), **HOST), (1,) * 6, value=0.7)
     level = level + 0.2 * level.sign()  # no crossing beside a grid point, where slopes have no bound
     cubes = (level.shape[0] - 1) * (level.shape[1] - 1) * (level.shape[2] - 1)
     return {
@@ -322,7 +327,8 @@ CASES = {
         lambda n: {"density": uniform(n, seed=1, low=-3.0, high=27.0), "color": uniform(n, 3, seed=2)}, composited,
         ("density", "color"), ("density", "color")),
     "sample_triplane": Case(
-        lambda n: {"planes": torch.randn(1, 3, 5, 9, 7, generator=rng(1)), "points": uniform(n, 3, low=-1.3, high=1.3)},
+        lambda n: {"planes": torch.randn(1, 3, 5, 9, 7, generator=rng(1), **HOST),
+                   "points": uniform(n, 3, low=-1.3, high=1.3)},
         lambda planes, points: (sample_triplane(planes, points[None])[0],), ("planes", "points"), ("points",),
         dtypes=("planes",)),
     "antialias": Case(
@@ -333,8 +339,8 @@ CASES = {
         # few crossings, none within 3e-4 of a kink of the mean absolute deviation
         lambda n: {k: v for k, v in grid_inputs(n, (3, 3, 4), 24).items() if k in GRID}, deviation, GRID, second=GRID),
     "sign_entropy": Case(
-        lambda n: {"level": torch.randn(6, 7, 8, generator=rng(1))}, lambda level: (sign_entropy(level),), ("level",),
-        second=("level",)),
+        lambda n: {"level": torch.randn(6, 7, 8, generator=rng(1), **HOST)}, lambda level: (sign_entropy(level),),
+        ("level",), second=("level",)),
     "vertex_normals": Case(
         lambda n: {"vertices": ball("cpu")[0]}, lambda vertices: (vertex_normals(vertices, ball(vertices.device)[1]),),
         ("vertices",), second=("vertices",)),

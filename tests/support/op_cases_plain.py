@@ -19,6 +19,7 @@ from reli3d.render.environment import Environment
 from reli3d.render.volume import OccupancyGrid, march_rays
 from tests.support.op_cases import (
     FRAME,
+    HOST,
     Case,
     above,
     ball,
@@ -44,11 +45,11 @@ def traced(backend):
 
 
 def rays(n):
-    return {"origins": uniform(n, 3, seed=1, low=-1.0), "directions": torch.randn(n, 3, generator=rng(2))}
+    return {"origins": uniform(n, 3, seed=1, low=-1.0), "directions": torch.randn(n, 3, generator=rng(2), **HOST)}
 
 
 def marched(origins, directions):
-    occupied = (torch.rand(12, 12, 12, generator=rng(5)) < 0.3).to(origins.device)
+    occupied = (torch.rand(12, 12, 12, generator=rng(5), **HOST) < 0.3).to(origins.device)
     samples = march_rays(origins, directions, OccupancyGrid(occupied, 0.8), 0.013)
     ray = samples.ray.long()
     return samples.first.diff(), samples.t.new_zeros(len(origins)).index_add(0, ray, samples.t)
@@ -57,7 +58,9 @@ def marched(origins, directions):
 def texels(vertices):
     n = len(vertices)
     faces, _ = soup(vertices, 0)
-    uv = torch.tensor([[0.05, 0.1], [0.9, 0.2], [0.15, 0.85]], device=vertices.device).repeat(n // 3, 1)
+    uv = torch.tensor([[0.05, 0.1], [0.9, 0.2], [0.15, 0.85]], device=vertices.device, dtype=torch.float32).repeat(
+        n // 3, 1
+    )
     cell = torch.arange(n // 3, device=vertices.device).repeat_interleave(3)
     uv = (uv + torch.stack([cell % 4, cell // 4], -1)) / 4.0
     mesh = Mesh(vertices, faces, normalize(vertices.contiguous(), dim=-1), uv)
@@ -97,12 +100,12 @@ def hulls(masks, points):
     known = torch.ones(len(points), 1, dtype=torch.bool, device=points.device)
     normal, offset = points.new_tensor([[1.0, 0.0, 0.0]]), points.new_tensor([0.9])  # to where the hull is not
     miss = hull.mirror_miss(points[:, None], known, normal, offset, 9.0, distance, camera)
-    grid = hull.hull_grid(torch.linspace(-0.5, 0.5, 9, device=points.device), distance, camera)
+    grid = hull.hull_grid(torch.linspace(-0.5, 0.5, 9, device=points.device, dtype=torch.float32), distance, camera)
     return distance, hull.hull_distance(points, distance, camera), grid, span, miss
 
 
 def hull_masks():
-    y, x = torch.meshgrid(torch.arange(24.0), torch.arange(20.0), indexing="ij")
+    y, x = torch.meshgrid(torch.arange(24.0, **HOST), torch.arange(20.0, **HOST), indexing="ij")
     return ((y - 12.5).square() + (x - 10.5).square() < 60.0).float().expand(3, 24, 20).contiguous()
 
 

@@ -5,7 +5,7 @@ import pytest
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from reli3d.geometry.components import graph_components
+from reli3d.geometry.topology import graph_components
 
 
 @pytest.mark.parametrize("count, links", [(1, 0), (5, 0), (2000, 300), (2000, 1500), (2000, 4000), (50_000, 45_000)])

@@ -1,0 +1,77 @@
+"""Edges of a triangle mesh (half-edges, their order by edge, the face across each) and connected components.
+
+Half-edge ``3 * face + corner`` runs from that corner to the next one of its face.  The half-edges of an edge join the
+same two vertices, in either direction.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import warp as wp
+
+from reli3d._bridge import launch
+from reli3d.kernels import topology as kernels
+
+
+@dataclass(frozen=True)
+class Edges:
+    """Half-edges of ``F`` faces, grouped by edge."""
+
+    tail: np.ndarray  # (3 F,) int64, first vertex of each half-edge
+    head: np.ndarray  # (3 F,) int64, second vertex
+    order: np.ndarray  # (3 F,) int64, half-edges sorted by edge; those of one edge ascend
+    start: np.ndarray  # (E,) where in ``order`` each edge begins
+    valence: np.ndarray  # (E,) half-edges of each edge
+
+    def of_valence(self, count: int) -> np.ndarray:
+        """Half-edges ``(count, N)`` of the N edges that have ``count`` of them; ascending along the first axis."""
+        return self.order[self.start[self.valence == count] + np.arange(count)[:, None]]
+
+
+def group(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """``(order, first)``: stable order that sorts ``keys`` >= 0, and where in it each run of equal keys begins."""
+    n = len(keys)
+    low = max(1, int(n - 1).bit_length())
+    # sorting key and index as one number: 5 times faster than argsort
+    if n and int(keys.max()).bit_length() + low <= 63:
+        packed = np.sort((keys.astype(np.int64) << low) | np.arange(n, dtype=np.int64))
+        order, ordered = packed & ((1 << low) - 1), packed >> low
+    else:
+        order = np.argsort(keys, kind="stable")
+        ordered = keys[order]
+    return order, np.flatnonzero(np.concatenate([[True], ordered[1:] != ordered[:-1]])) if n else np.zeros(0, np.int64)
+
+
+def edges_of(faces: np.ndarray) -> Edges:
+    """Half-edges of ``faces (F, 3)``, grouped by edge."""
+    tail, head = faces.reshape(-1).astype(np.int64), faces[:, [1, 2, 0]].reshape(-1).astype(np.int64)
+    count = int(faces.max()) + 1 if len(faces) else 1
+    order, start = group(np.minimum(tail, head) * count + np.maximum(tail, head))
+    return Edges(tail, head, order, start, np.diff(start, append=len(order)))
+
+
+def face_neighbours(faces: np.ndarray) -> np.ndarray:
+    """Face across each edge, ``(F, 3)`` int32: -1 where the edge has not exactly two different faces."""
+    one, other = edges_of(faces).of_valence(2)
+    two = one // 3 != other // 3
+    across = np.full(faces.size, -1, np.int32)
+    across[one[two]], across[other[two]] = other[two] // 3, one[two] // 3
+    return across.reshape(-1, 3)
+
+
+def graph_components(a: np.ndarray, b: np.ndarray, count: int) -> np.ndarray:
+    """Lowest node ``(count,)`` int32 of the component of every node.
+
+    a, b: ``(L,)`` integers in [0, count), the nodes that each link joins.  Raises ValueError for other numbers.
+    """
+    if a.shape != b.shape or a.ndim != 1:
+        raise ValueError(f"b: expected shape (L,) as a, got {a.shape} and {b.shape}")
+    if len(a) and not (min(a.min(), b.min()) >= 0 and max(a.max(), b.max()) < count):
+        raise ValueError(f"a, b: expected nodes in [0, {count}), got others")
+    parent = torch.arange(count, dtype=torch.int32, device="cpu")
+    ends = [(torch.from_numpy(np.ascontiguousarray(v, dtype=np.int32)), wp.int32) for v in (a, b)]
+    launch(kernels.components_kernel, 1, [*ends, (parent, wp.int32)], parent.device)
+    return parent.numpy()
