@@ -142,7 +142,7 @@ def test_the_mixture_of_all_strategies_follows_the_sum_of_their_densities(device
 
     def mixture(d, table=20):
         lobes = pdf_lobes(wo, a, d)
-        visible = lobes[:, 0] + lobes[:, int(antithetic == "mirrored")]
+        visible = lobes[:, 0] + lobes[:, int(pairs == "mirrored")]
         return (table * env.pdf(d) + (30 - table / 2) * visible + 4 * lobes[:, 2]) / 64
 
     wrong = {"counts": lambda d: mixture(d, 21)}
