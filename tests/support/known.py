@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import math
@@ -15,8 +16,14 @@ from random import Random
 
 import numpy as np
 import OpenEXR
+import torch
+import trimesh
 from PIL import Image
 
+import reli3d
+from reli3d.geometry.camera import project
+from reli3d.geometry.mesh import vertex_normals
+from reli3d.geometry.tangents import with_tangents
 from reli3d.io.glb import read_glb
 from reli3d.io.hdr import read_hdr_image
 from reli3d.views.folder import load_views
@@ -423,6 +430,94 @@ def gltf(rng: Random) -> Case:
     return Case({"a.glb": content}, read, must_refuse=look.refused, must_read=look.plain)
 
 
+PARTS = (
+    "surface",
+    "triplane",
+    "atlas",
+    "normals",
+    "camera",
+    "rays",
+    "light",
+    "image",
+    "shading",
+)
+
+
+def operation(name: str, seed: int) -> list[torch.Tensor]:
+    """Results of a public operation on random inputs of explicit dtype and device."""
+    rng = torch.Generator("cpu").manual_seed(seed)
+
+    def random(*shape: int) -> torch.Tensor:
+        return torch.rand(shape, generator=rng, dtype=torch.float32, device="cpu")
+
+    pose = reli3d.look_at([0.3, 1.0, 2.5])
+    camera = reli3d.Camera.from_fov(pose, 0.8, 16, 12)
+    if name == "triplane":
+        return [reli3d.sample_triplane(random(1, 3, 4, 8, 8) - 0.5, random(1, 9, 3) - 0.5)]
+    if name == "camera":
+        pixels, depth = project(random(20, 3) - 0.5, camera.c2w, camera.intrinsics)
+        return [pose, camera.intrinsics, pixels, depth]
+    if name == "light":
+        light = reli3d.Environment(random(8, 16, 3) + 0.1)
+        return [light.rotated(0.7).radiance, light.lookup(pose[:3, 2].expand(4, 3))]
+    ball = trimesh.creation.icosphere(1)
+    mesh = reli3d.Mesh(ball.vertices.astype(np.float32), ball.faces.astype(np.int32))
+    if name == "surface":
+        axes = [torch.linspace(-1, 1, 9, dtype=torch.float32, device="cpu")] * 3
+        x, y, z = torch.meshgrid(*axes, indexing="ij")
+        found = reli3d.extract_surface((x**2 + y**2 + z**2).sqrt() - 0.6, radius=1.0)
+        return [found.vertices, found.faces]
+    if name == "normals":
+        return [vertex_normals(mesh.vertices, mesh.faces)]
+    if name == "rays":
+        hits = reli3d.RayScene(mesh.vertices, mesh.faces).closest(random(9, 3) + 2.0, -random(9, 3) - 2.0)
+        return [hits.face, hits.t, hits.bary]
+    textured = with_tangents(reli3d.unwrap(mesh, texture_size=64))
+    if name == "atlas":
+        return [textured.vertices, textured.uv]
+    light = reli3d.Environment(random(8, 16, 3) + 0.1)
+    if name == "shading":
+        normal = torch.nn.functional.normalize(random(9, 3), dim=-1)
+        points = reli3d.SurfacePoints(random(9, 3), normal, normal, random(9, 3), 0.5, 0.25)
+        return [reli3d.shade(points, normal, light)]
+    maps = reli3d.TextureSet(random(64, 64, 3), 0.5, 0.25)
+    return [reli3d.render_asset(reli3d.Asset(textured, maps), camera, light).radiance]
+
+
+STATES = ("autocast", "dtype", "device")
+
+
+@contextlib.contextmanager
+def torch_state(name: str):
+    """A global state of torch that another program may have set; meta stands for a GPU."""
+    dtype = torch.get_default_dtype()
+    try:
+        if name == "dtype":
+            torch.set_default_dtype(torch.float64)
+        elif name == "device":
+            torch.set_default_device("meta")
+        with torch.autocast("cpu", dtype=torch.bfloat16, enabled=name == "autocast"):
+            yield
+    finally:
+        torch.set_default_dtype(dtype)
+        torch.set_default_device(None)
+
+
+def torch_states(rng: Random) -> Case:
+    """A public operation under a global state of torch gives the bits that it gives without."""
+    name, state, seed = rng.choice(PARTS), rng.choice(STATES), rng.getrandbits(16)
+
+    def read(folder: Path) -> None:
+        want = operation(name, seed)
+        with torch_state(state):
+            got = operation(name, seed)
+        for a, b in zip(got, want, strict=True):
+            same = a.dtype == b.dtype and a.device == b.device and torch.equal(a, b)
+            check(same, f"{name} under {state}: {a.dtype} on {a.device}, another result")
+
+    return Case({}, read, must_read=True)
+
+
 KINDS: dict[str, Callable[[Random], Case]] = {
     "known masks": masks,
     "known names": names,
@@ -432,4 +527,5 @@ KINDS: dict[str, Callable[[Random], Case]] = {
     "known exr": exr,
     "known rgbe": rgbe,
     "known gltf": gltf,
+    "known torch state": torch_states,
 }
