@@ -15,7 +15,7 @@ from torch import Tensor
 
 from reli3d._bridge import expect, full_precision, present
 from reli3d.geometry.bake import bake
-from reli3d.geometry.cover import REACH, cover_silhouettes
+from reli3d.geometry.cover import FIELD_MAX, cover_silhouettes
 from reli3d.geometry.mesh import Mesh, largest_components, vertex_normals, weld
 from reli3d.geometry.rays import RayScene
 from reli3d.geometry.smooth import taubin_smooth
@@ -114,7 +114,7 @@ def _bounded_surface(field: LocalField, resolution: int) -> Mesh:
     radius = min(radius, _hull_reach(field, resolution) + 2 * MARGIN_CELLS * radius / resolution)
     axis = torch.linspace(-radius, radius, resolution + 1, device=maps.images.device, dtype=torch.float32)
     cell = 2 * radius / resolution / preset.softness
-    bound = field.grid_bound(axis, REACH + 4 * cell)  # what is farther outside than REACH changes nothing
+    bound = field.grid_bound(axis, FIELD_MAX + 4 * cell)  # what is farther outside than FIELD_MAX changes nothing
     near = bound < MARGIN_CELLS * cell
 
     def evaluate(index: Tensor) -> Tensor:

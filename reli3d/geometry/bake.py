@@ -21,7 +21,7 @@ from reli3d.geometry.mesh import Mesh, sorted_keys, vertex_normals
 from reli3d.geometry.topology import edges_of
 from reli3d.kernels import bake as kernels
 
-REACH = 1.5  # texels: a bilinear tap of a point of the surface has its centre within sqrt(2)
+BORDER_TEXELS = 1.5  # texels: a bilinear tap of a point of the surface has its centre within sqrt(2)
 TILE = {"cpu": 16, "cuda": 4}  # a thread a tile: large ones share set-up, small ones fill a GPU; results are the same
 STRIP = 64  # columns a thread sweeps in the column pass: one cache line of the mask
 ROWS_MIN = 16  # rows of texels a CPU slice of the row pass
@@ -107,12 +107,12 @@ def rasterize_texels(mesh: Mesh, size: int) -> Texels:
     segments = _border_segments(mesh.faces)
     ends = torch.stack([corners.reshape(-1, 2), corners.roll(-1, 1).reshape(-1, 2)], 1)[segments.long()]
     lower, upper = torch.aminmax(ends, dim=1)
-    segment_start, segment_list = _bins(lower - REACH, upper + REACH, size, tile)
+    segment_start, segment_list = _bins(lower - BORDER_TEXELS, upper + BORDER_TEXELS, size, tile)
     borders = [(t, wp.int32) for t in (segment_start, segment_list, segments)]
     _bridge.launch(
         kernels.texels_kernel,
         (-(-size // tile)) ** 2,
-        [tiles, *borders, REACH, (distance, wp.float32), (face, wp.int32), (bary, wp.vec2)],
+        [tiles, *borders, BORDER_TEXELS, (distance, wp.float32), (face, wp.int32), (bary, wp.vec2)],
         device,
         slice_min=TILES_MIN,
     )

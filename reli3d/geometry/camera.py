@@ -22,7 +22,9 @@ from torch.nn.functional import normalize
 
 from reli3d._bridge import check, expect, full_precision, tensor_of
 
-NEAR = 0.01  # least depth of points over their largest distance for their box: nearer to 0 it is rounded too much
+DEPTH_RATIO_MIN = (
+    0.01  # least depth of points over their largest distance for their box: nearer to 0 it is rounded too much
+)
 
 
 @dataclass(frozen=True)
@@ -161,7 +163,7 @@ def box_of(points: Tensor, camera: Camera) -> tuple[int, int, int, int]:
     """
     points, eye = points.detach(), camera.position.detach()
     pixels, depth = project(points, camera.c2w.detach(), camera.intrinsics.detach())
-    if not len(points) or not float(depth.min()) > NEAR * float((points - eye).norm(dim=-1).max()):
+    if not len(points) or not float(depth.min()) > DEPTH_RATIO_MIN * float((points - eye).norm(dim=-1).max()):
         return 0, 0, camera.width, camera.height
     (x0, y0), (x1, y1) = pixels.amin(0).tolist(), pixels.amax(0).tolist()
     left, right = _pixels_between(x0, x1, camera.width)

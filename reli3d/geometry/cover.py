@@ -13,7 +13,7 @@ from reli3d.kernels import cover as kernels
 
 STRIDE = 4  # pixels between rays
 DEPTH = 0.05  # level below the surface that a ray reaches: enough to make one; more thickens what was right already
-REACH = 3.0  # rays whose least level is this high meet nothing: masks disagree, or a rod is thinner than a cell
+FIELD_MAX = 3.0  # rays whose least level is this high meet nothing: masks disagree, or a rod is thinner than a cell
 
 
 def cover_silhouettes(level: Tensor, bound: Tensor, distance: Tensor, camera: Camera, *, radius: float) -> Tensor:
@@ -25,7 +25,7 @@ def cover_silhouettes(level: Tensor, bound: Tensor, distance: Tensor, camera: Ca
 
     A field that is not sure of a thin part stays a little above 0 along the rays that show it.  Every ``STRIDE``-th
     pixel has a ray.  What its least level is above ``-DEPTH`` is subtracted along the ray, unless it is above
-    ``REACH``.  Source: own.  Raises TypeError or ValueError.
+    ``FIELD_MAX``.  Source: own.  Raises TypeError or ValueError.
     """
     check("level", level)
     if level.ndim != 3 or min(level.shape) < 2:
@@ -56,7 +56,7 @@ def cover_silhouettes(level: Tensor, bound: Tensor, distance: Tensor, camera: Ca
             *cameras,
             radius,
             DEPTH,
-            REACH,
+            FIELD_MAX,
             STRIDE,
             (lacking, wp.float32),
         ],
@@ -73,7 +73,7 @@ def cover_silhouettes(level: Tensor, bound: Tensor, distance: Tensor, camera: Ca
             (lacking, wp.float32),
             *cameras,
             radius,
-            REACH,
+            FIELD_MAX,
             STRIDE,
             (lowered, wp.float32),
         ],
@@ -83,10 +83,12 @@ def cover_silhouettes(level: Tensor, bound: Tensor, distance: Tensor, camera: Ca
 
 
 def _lowest(level: Tensor) -> Tensor:
-    """Least level of each block of ``kernels.BLOCK`` cells a side, those on its border included."""
+    """Least level of each block of ``kernels.BLOCK_CELLS`` cells a side, those on its border included."""
     for axis in range(3):
         cells = level.shape[axis] - 1
-        most = torch.arange(-(-cells // kernels.BLOCK), device=level.device, dtype=torch.int64) * kernels.BLOCK
-        points = [level.index_select(axis, (most + k).clamp(max=cells)) for k in range(kernels.BLOCK + 1)]
+        most = (
+            torch.arange(-(-cells // kernels.BLOCK_CELLS), device=level.device, dtype=torch.int64) * kernels.BLOCK_CELLS
+        )
+        points = [level.index_select(axis, (most + k).clamp(max=cells)) for k in range(kernels.BLOCK_CELLS + 1)]
         level = torch.stack(points).amin(0)
     return level.contiguous()

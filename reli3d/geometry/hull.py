@@ -100,7 +100,7 @@ def hull_grid(axis: Tensor, distance: Tensor, camera: Camera, *, far: float = ma
     n = len(axis)
     hull = axis.new_empty(n, n, n)
     inputs = [(axis.detach().contiguous(), wp.float32), *_views(distance, camera), far, (hull, wp.float32)]
-    launch(kernels.hull_grid_kernel, (-(-n // kernels.BLOCK)) ** 3, inputs, axis.device, slice_min=BLOCKS_MIN)
+    launch(kernels.hull_grid_kernel, (-(-n // kernels.BLOCK_POINTS)) ** 3, inputs, axis.device, slice_min=BLOCKS_MIN)
     return hull
 
 

@@ -7,16 +7,19 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-SURE = 0.2  # depth of the level at all corners of a cell of two points a side in which nothing more is evaluated
+INSIDE_DEPTH = (
+    0.2  # depth of the level at all corners of a cell of two points a side in which nothing more is evaluated
+)
 
 
 @torch.no_grad()
 def sparse_level(known: Tensor, near: Tensor, evaluate: Callable[[Tensor], Tensor]) -> Tensor:
-    """Levels ``(X, Y, Z)`` as of a dense evaluation, but ``-SURE`` deep inside.
+    """Levels ``(X, Y, Z)`` as of a dense evaluation, but ``-INSIDE_DEPTH`` deep inside.
 
     known: ``(X, Y, Z)``, at least 3 a side, kept where ``near (X, Y, Z)``, bool, is false and no neighbour has another
     sign.  evaluate: levels ``(N,)`` of points with flat indices ``(N,)``.  Every other point of ``near`` along each
-    axis is evaluated first, then what lies between them outside the cells whose corners all are below ``-SURE``, then,
+    axis is evaluated first, then what lies between them outside the cells whose corners are all below
+    ``-INSIDE_DEPTH``, then,
     until none is left, what lies across a change of sign.  A closed hollow that no point of the first kind meets is
     missed.  No gradient.  Raises ValueError for other shapes, TypeError for another kind of ``near``.
     """
@@ -36,11 +39,11 @@ def sparse_level(known: Tensor, near: Tensor, evaluate: Callable[[Tensor], Tenso
     every_other = torch.zeros_like(near)
     every_other[::2, ::2, ::2] = near[::2, ::2, ::2]
     ask(every_other)
-    deep = _all_corners(level[::2, ::2, ::2] < -SURE)
+    deep = _all_corners(level[::2, ::2, ::2] < -INSIDE_DEPTH)
     inside = torch.zeros_like(near)
     inside[tuple(slice(2 * n + 1) for n in deep.shape)] = ~_points_of(~deep)
     inside &= near & ~done
-    level[inside] = -SURE
+    level[inside] = -INSIDE_DEPTH
     ask(near & ~done & ~inside)
     while True:
         across = _beside_other_sign(level < 0) & ~done

@@ -21,7 +21,7 @@ from reli3d.geometry.hull import hull_distance, hull_span, mirror_miss
 
 RAYS, DEPTHS = 96, 16  # rays of a view, and points along each, at which hulls are compared
 ANGLES, OFFSETS = 60, 7  # planes of the first search
-REACH = 0.06  # greatest offset of the plane from the hull's centre, of the hull's longest side
+OFFSET_MAX = 0.06  # greatest offset of the plane from the hull's centre, of the hull's longest side
 FINER = 9  # angles and offsets of the second search, within one step of the first
 LOST = 0.01  # of the longest side: a pixel whose ray misses the common hull by more is lost
 MOST_LOST = 0.008  # share of the pixels that may be lost: a part that is on one side alone would be cut off
@@ -104,7 +104,7 @@ def mirror_plane(distance: Tensor, camera: Camera) -> MirrorPlane | None:
         return miss.mean(1), (miss > LOST).float().mean(1)
 
     angles = torch.arange(ANGLES, device=up.device, dtype=torch.float32) * (math.pi / ANGLES)
-    offsets = torch.linspace(-REACH, REACH, OFFSETS, device=up.device, dtype=torch.float32)
+    offsets = torch.linspace(-OFFSET_MAX, OFFSET_MAX, OFFSETS, device=up.device, dtype=torch.float32)
     miss, _ = misses(angles.repeat_interleave(OFFSETS), offsets.repeat(ANGLES), every=3)
     miss = miss.view(ANGLES, OFFSETS)
     by_angle = miss.amin(1)
@@ -117,7 +117,7 @@ def mirror_plane(distance: Tensor, camera: Camera) -> MirrorPlane | None:
     equal = miss[best] <= miss[best].min() + EQUAL
     around = torch.linspace(-1.0, 1.0, FINER, device=up.device, dtype=torch.float32)
     angle = (angles[best] + around * (math.pi / ANGLES)).repeat_interleave(FINER)
-    offset = (offsets[equal].mean() + around * (2 * REACH / (OFFSETS - 1))).repeat(FINER)
+    offset = (offsets[equal].mean() + around * (2 * OFFSET_MAX / (OFFSETS - 1))).repeat(FINER)
     miss, _ = misses(angle, offset)
     alike = (miss <= miss.min() + EQUAL).nonzero()[:, 0]
     equally = torch.stack([angle[alike], offset[alike]], 1)

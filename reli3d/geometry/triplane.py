@@ -9,11 +9,15 @@ from torch import Tensor
 from reli3d._bridge import check, launch, once_differentiable, over_rows, struct_of
 from reli3d.kernels import triplane as kernels
 
-BLOCK = 8  # channels of a kernels.vec8
+BLOCK_CHANNELS = 8  # channels of a kernels.vec8
 ROWS_MIN = 8  # rows of cells a CPU slice of the planes' adjoint: each adds all the points that fall in it
 CACHED = 1 << 16  # floats of a plane that stay in a core's second-level cache whatever the order of the points
 BANDS = 16  # of the rows of a plane, a CPU thread each: more copy more rows twice
-PROBED, NEAR, WALK = 4096, 8.0, 0.8  # points looked at, texels from one to the next, and the share that makes a walk
+PROBED, STEP_TEXELS_MAX, WALK = (
+    4096,
+    8.0,
+    0.8,
+)  # points looked at, texels from one to the next, and the share that makes a walk
 
 
 class _SampleTriplane(torch.autograd.Function):
@@ -28,10 +32,12 @@ class _SampleTriplane(torch.autograd.Function):
     @staticmethod
     def forward(ctx, planes: Tensor, points: Tensor) -> Tensor:
         batch, _, channels, height, width = planes.shape
-        n, blocks = points.shape[1], -(-channels // BLOCK)
+        n, blocks = points.shape[1], -(-channels // BLOCK_CHANNELS)
         order = edges = points.new_empty(0, dtype=torch.int32)
         scattered = (
-            not planes.is_cuda and height * width * blocks * BLOCK > CACHED and not _is_walk(points, max(height, width))
+            not planes.is_cuda
+            and height * width * blocks * BLOCK_CHANNELS > CACHED
+            and not _is_walk(points, max(height, width))
         )
         by_rows = (
             scattered
@@ -42,12 +48,12 @@ class _SampleTriplane(torch.autograd.Function):
         )
         if ctx.needs_input_grad[0] or scattered:
             order, edges = _by_cell_row(points, height, width)
-        features = points.new_empty(batch, n, 3, blocks * BLOCK)
+        features = points.new_empty(batch, n, 3, blocks * BLOCK_CHANNELS)
         packed = planes.detach() if by_rows else packed_planes(planes)
         inputs = (points.view(-1, 3), kernels.wp.vec3), (order.view(-1), kernels.wp.int32)
-        out, sizes = (features.view(-1, BLOCK), kernels.vec8), sizes_of(n, height, width, blocks)
+        out, sizes = (features.view(-1, BLOCK_CHANNELS), kernels.vec8), sizes_of(n, height, width, blocks)
         if by_rows:
-            scratch = points.new_empty(batch * 3 * BANDS * 2 * (width + 2) * blocks, BLOCK)
+            scratch = points.new_empty(batch * 3 * BANDS * 2 * (width + 2) * blocks, BLOCK_CHANNELS)
             launch(
                 kernels.sample_rows_kernel,
                 batch * 3 * BANDS,
@@ -69,7 +75,7 @@ class _SampleTriplane(torch.autograd.Function):
             launch(
                 kernels.sample_kernel,
                 batch * n * 3 * split,
-                [(packed.view(-1, BLOCK), kernels.vec8), *inputs, sizes, split, out],
+                [(packed.view(-1, BLOCK_CHANNELS), kernels.vec8), *inputs, sizes, split, out],
                 planes.device,
             )
         sorted_points = (order, edges) if ctx.needs_input_grad[0] else (None, None)
@@ -84,7 +90,11 @@ class _SampleTriplane(torch.autograd.Function):
         points, packed, order, edges, _ = ctx.saved_tensors
         channels = ctx.shape[2]
         g = g_out.reshape(*points.shape[:2], 3, channels)
-        g = torch.nn.functional.pad(g, (0, -channels % BLOCK)).contiguous() if channels % BLOCK else g.contiguous()
+        g = (
+            torch.nn.functional.pad(g, (0, -channels % BLOCK_CHANNELS)).contiguous()
+            if channels % BLOCK_CHANNELS
+            else g.contiguous()
+        )
         g_planes = _planes_adjoint(points, g, order, edges, ctx.shape).to(ctx.dtype) if order is not None else None
         g_points = _points_adjoint(packed, points, g) if packed is not None else None
         return g_planes, g_points
@@ -98,14 +108,18 @@ def sizes_of(points: int, height: int, width: int, blocks: int) -> kernels.Sizes
 def packed_planes(planes: Tensor) -> Tensor:
     """``(B, 3, H, W, C')`` float32, C' the next multiple of 8; no copy where float32 planes lie in memory so."""
     packed = planes.detach().permute(0, 1, 3, 4, 2)
-    packed = torch.nn.functional.pad(packed, (0, -planes.shape[2] % BLOCK)) if planes.shape[2] % BLOCK else packed
+    packed = (
+        torch.nn.functional.pad(packed, (0, -planes.shape[2] % BLOCK_CHANNELS))
+        if planes.shape[2] % BLOCK_CHANNELS
+        else packed
+    )
     return packed.to(torch.float32).contiguous()
 
 
 def _is_walk(points: Tensor, size: int) -> bool:
     """Whether the first points mostly lie within a few texels, ``size`` along a plane, of those before them."""
     probed = points[:, :PROBED]
-    near = (probed[:, 1:] - probed[:, :-1]).abs().amax(-1) < NEAR * 2.0 / size
+    near = (probed[:, 1:] - probed[:, :-1]).abs().amax(-1) < STEP_TEXELS_MAX * 2.0 / size
     return bool(near.sum() > WALK * near.numel())
 
 
@@ -147,10 +161,10 @@ def _points_adjoint(packed: Tensor, points: Tensor, g: Tensor) -> Tensor:
         kernels.points_adjoint_kernel,
         batch * n,
         [
-            (packed.view(-1, BLOCK), kernels.vec8),
+            (packed.view(-1, BLOCK_CHANNELS), kernels.vec8),
             (points.view(-1, 3), kernels.wp.vec3),
-            (g.view(-1, BLOCK), kernels.vec8),
-            sizes_of(n, height, width, channels // BLOCK),
+            (g.view(-1, BLOCK_CHANNELS), kernels.vec8),
+            sizes_of(n, height, width, channels // BLOCK_CHANNELS),
             (g_points.view(-1, 3), kernels.wp.vec3),
         ],
         points.device,
@@ -161,8 +175,8 @@ def _points_adjoint(packed: Tensor, points: Tensor, g: Tensor) -> Tensor:
 def _planes_adjoint(points: Tensor, g: Tensor, order: Tensor, edges: Tensor, shape: torch.Size) -> Tensor:
     batch, n, _ = points.shape
     channels, height, width = shape[2:]
-    blocks = g.shape[-1] // BLOCK
-    g_planes = torch.zeros(batch, 3, height, width, blocks * BLOCK, device=points.device, dtype=torch.float32)
+    blocks = g.shape[-1] // BLOCK_CHANNELS
+    g_planes = torch.zeros(batch, 3, height, width, blocks * BLOCK_CHANNELS, device=points.device, dtype=torch.float32)
     split, sizes = 1 if points.device.type == "cpu" else blocks, sizes_of(n, height, width, blocks)
     for parity in (0, 1):
         launch(
@@ -170,13 +184,13 @@ def _planes_adjoint(points: Tensor, g: Tensor, order: Tensor, edges: Tensor, sha
             batch * 3 * ((height + 2 - parity) // 2) * split,
             [
                 (points.view(-1, 3), kernels.wp.vec3),
-                (g.view(-1, BLOCK), kernels.vec8),
+                (g.view(-1, BLOCK_CHANNELS), kernels.vec8),
                 (order.view(-1), kernels.wp.int32),
                 (edges.view(-1), kernels.wp.int32),
                 sizes,
                 parity,
                 split,
-                (g_planes.view(-1, BLOCK), kernels.vec8),
+                (g_planes.view(-1, BLOCK_CHANNELS), kernels.vec8),
             ],
             points.device,
             slice_min=ROWS_MIN,
@@ -216,7 +230,7 @@ def check_triplane(planes: Tensor, points: Tensor) -> None:
     batch, _, channels, height, width = planes.shape
     if max(height, width) > 32000:
         raise ValueError(f"planes: expected at most 32000 rows and columns, got {(height, width)}")  # 16-bit keys
-    blocks = -(-channels // BLOCK)
+    blocks = -(-channels // BLOCK_CHANNELS)
     largest = 3 * batch * max(height * width * blocks, (height + 2) * blocks, points.shape[1] * blocks)
     if largest >= 2**31:
         raise ValueError(f"planes, points: expected fewer than 2**31 blocks of 8 channels, got {largest}")

@@ -12,7 +12,7 @@ from reli3d.kernels.projection import project_point
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
 
 STEP = wp.constant(0.5)  # of a cell, between two looks at the level along a ray
-BLOCK = wp.constant(4)  # cells along a side of a block whose least level is known
+BLOCK_CELLS = wp.constant(4)  # cells along a side of a block whose least level is known
 INNER = wp.constant(1.0)  # pixels that a point must lie inside a silhouette, whose edge pixels are half background
 
 
@@ -40,9 +40,9 @@ def out_of_block(cell: wp.vec3, along: wp.vec3, block: wp.vec3i) -> float:
     """How far a ray that goes ``along`` cells a unit from ``cell`` stays in ``block``."""
     far = wp.float32(3.0e38)
     for axis in range(3):
-        side = float(block[axis] * BLOCK)
+        side = float(block[axis] * BLOCK_CELLS)
         if along[axis] > 0.0:
-            side += float(BLOCK)
+            side += float(BLOCK_CELLS)
         if along[axis] != 0.0:
             far = wp.min(far, (side - cell[axis]) / along[axis])
     return far
@@ -53,7 +53,7 @@ def lacking_kernel(
     start: int,
     # in
     level: wp.array3d[float],
-    lowest: wp.array3d[float],  # of each block of BLOCK cells a side, border included
+    lowest: wp.array3d[float],  # of each block of BLOCK_CELLS cells a side, border included
     distance: wp.array3d[float],
     c2w: wp.array[wp.mat44],
     intrinsics: wp.array[wp.vec4],
@@ -91,9 +91,9 @@ def lacking_kernel(
             p = origin + direction * t
             cell = wp.cw_mul(p + wp.vec3(radius, radius, radius), scale)
             block = wp.vec3i(
-                wp.clamp(int(cell[0]) // BLOCK, 0, lowest.shape[0] - 1),
-                wp.clamp(int(cell[1]) // BLOCK, 0, lowest.shape[1] - 1),
-                wp.clamp(int(cell[2]) // BLOCK, 0, lowest.shape[2] - 1),
+                wp.clamp(int(cell[0]) // BLOCK_CELLS, 0, lowest.shape[0] - 1),
+                wp.clamp(int(cell[1]) // BLOCK_CELLS, 0, lowest.shape[1] - 1),
+                wp.clamp(int(cell[2]) // BLOCK_CELLS, 0, lowest.shape[2] - 1),
             )
             if lowest[block[0], block[1], block[2]] < least:
                 least = wp.min(least, level_at(level, cell))

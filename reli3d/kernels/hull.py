@@ -20,8 +20,8 @@ CAREFUL = wp.constant(0.7)  # of the distance that a ray may go: distances are u
 STEP_MIN = wp.constant(4.0e-3)  # thinner parts of the hull may be missed
 STEP_MAX = wp.constant(0.25)
 DEPTH_MIN = wp.constant(1.0e-4)  # a point this close to a camera's plane counts as behind it
-BLOCK = wp.constant(4)  # points along a side of a block of a grid
-FEW = wp.constant(32)  # views that a block of a grid tells apart; further ones are asked at every point
+BLOCK_POINTS = wp.constant(4)  # points along a side of a block of a grid
+BLOCK_VIEWS_MAX = wp.constant(32)  # views that a block of a grid tells apart; further ones are asked at every point
 NO_CROSSING_ROWS = wp.constant(65536.0)  # rows to a crossing where a column has none: beyond any image
 EXACT_PIXELS = wp.constant(4.0)  # pixels; beyond, other segments are at most sqrt(16.5) - 4 = 0.06 pixels nearer
 SEGMENT_PIXELS = wp.constant(
@@ -111,20 +111,20 @@ def hull_grid_kernel(
     """A thread is a block of points, at which only the views are asked that may have the least distance in it."""
     i = start + wp.tid()
     n = axis.shape[0]
-    blocks = (n + BLOCK - 1) // BLOCK
-    x0 = i // (blocks * blocks) * BLOCK
-    y0 = i // blocks % blocks * BLOCK
-    z0 = i % blocks * BLOCK
-    x1 = wp.min(x0 + BLOCK, n)
-    y1 = wp.min(y0 + BLOCK, n)
-    z1 = wp.min(z0 + BLOCK, n)
+    blocks = (n + BLOCK_POINTS - 1) // BLOCK_POINTS
+    x0 = i // (blocks * blocks) * BLOCK_POINTS
+    y0 = i // blocks % blocks * BLOCK_POINTS
+    z0 = i % blocks * BLOCK_POINTS
+    x1 = wp.min(x0 + BLOCK_POINTS, n)
+    y1 = wp.min(y0 + BLOCK_POINTS, n)
+    z1 = wp.min(z0 + BLOCK_POINTS, n)
     low = wp.vec3(axis[x0], axis[y0], axis[z0])
     high = wp.vec3(axis[x1 - 1], axis[y1 - 1], axis[z1 - 1])
     centre = 0.5 * (low + high)
     radius = 0.5 * wp.length(high - low)
     greatest = wp.float32(-BEHIND)  # no point of the block is farther inside
     least = few()  # of each view
-    views = wp.min(c2w.shape[0], FEW)
+    views = wp.min(c2w.shape[0], BLOCK_VIEWS_MAX)
     for v in range(views):
         value = distance_in_view(centre, v, distance, c2w, intrinsics)
         change = change_in_view(centre, radius, value, c2w[v], intrinsics[v])

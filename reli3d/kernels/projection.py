@@ -9,17 +9,17 @@ from reli3d.kernels.bilinear import between_pixels, blend
 
 wp.set_module_options({"enable_backward": True, "cpu_compiler_flags": "-march=native"})
 
-NEAR = wp.constant(1.0e-3)  # a point closer than this to the camera plane is treated as being on it
+DEPTH_MIN = wp.constant(1.0e-3)  # a point closer than this to the camera plane is treated as being on it
 
 
 @wp.func
 def project_point(p: wp.vec3, c2w: wp.mat44, k: wp.vec4) -> wp.vec3:
-    """Pixel x, y and depth of ``p``; the pixel of a point behind the camera is that of depth NEAR."""
+    """Pixel x, y and depth of ``p``; the pixel of a point behind the camera is that of depth DEPTH_MIN."""
     d = wp.vec3(p[0] - c2w[0, 3], p[1] - c2w[1, 3], p[2] - c2w[2, 3])
     x = d[0] * c2w[0, 0] + d[1] * c2w[1, 0] + d[2] * c2w[2, 0]
     y = d[0] * c2w[0, 1] + d[1] * c2w[1, 1] + d[2] * c2w[2, 1]
     depth = -(d[0] * c2w[0, 2] + d[1] * c2w[1, 2] + d[2] * c2w[2, 2])
-    z = wp.max(depth, NEAR)
+    z = wp.max(depth, DEPTH_MIN)
     return wp.vec3(k[0] * x / z + k[2], k[3] - k[1] * y / z, depth)
 
 

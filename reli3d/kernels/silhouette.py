@@ -9,7 +9,9 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
 
-NEAR = wp.constant(1.0e-6)  # depth below which an end counts as behind the eye; its pixel would be beyond any image
+DEPTH_MIN = wp.constant(
+    1.0e-6
+)  # depth below which an end counts as behind the eye; its pixel would be beyond any image
 
 
 @wp.func
@@ -22,7 +24,7 @@ def side_of_edge(eye: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3) -> float:
 def pixel_of(frame: wp.mat33, eye: wp.vec3, intrinsics: wp.vec4, p: wp.vec3) -> wp.vec3:
     """Pixel coordinates and depth of a world point; rows of ``frame`` are the camera's axes."""
     q = frame * (p - eye)
-    z = wp.max(-q[2], NEAR)
+    z = wp.max(-q[2], DEPTH_MIN)
     return wp.vec3(intrinsics[0] * q[0] / z + intrinsics[2], intrinsics[3] - intrinsics[1] * q[1] / z, -q[2])
 
 
@@ -70,7 +72,7 @@ def outline_kernel(
     if s * r >= 0.0 and (s != 0.0 or r != 0.0):
         p = pixel_of(frame, eye, intrinsics, a)
         q = pixel_of(frame, eye, intrinsics, b)
-        if p[2] > NEAR and q[2] > NEAR:
+        if p[2] > DEPTH_MIN and q[2] > DEPTH_MIN:
             span = line_range(p[0], q[0], width)
             towards = -wp.vec3(frame[1, 0], frame[1, 1], frame[1, 2])
             if wp.abs(q[1] - p[1]) > wp.abs(q[0] - p[0]):

@@ -11,7 +11,7 @@ import reli3d
 from reli3d import pipeline
 from reli3d.geometry import cover
 from reli3d.geometry.camera import Camera, camera_rays, look_at, project
-from reli3d.geometry.cover import DEPTH, REACH, STRIDE, cover_silhouettes
+from reli3d.geometry.cover import DEPTH, FIELD_MAX, STRIDE, cover_silhouettes
 from reli3d.geometry.hull import hull_distance, mask_distance
 from reli3d.geometry.rays import RayScene
 from reli3d.geometry.surface import extract_surface
@@ -48,7 +48,7 @@ def test_an_unsure_sheet_becomes_a_surface_as_thick_as_it_is_unsure(device):
     got = cover_silhouettes(*args, radius=RADIUS).cpu()
     radius = points[..., :2].norm(dim=-1)
     inner, outer = radius < (40 - STRIDE) * 0.9 / 128, radius > (40 + 2 * STRIDE) * 0.9 / 128
-    want = torch.where(level < REACH, level - 0.5 - DEPTH, level)
+    want = torch.where(level < FIELD_MAX, level - 0.5 - DEPTH, level)
     # a ray looks every half cell, so it may miss the lowest point by a quarter of a cell of 0.03
     torch.testing.assert_close(got[inner], want[inner], rtol=0, atol=(0.0075 / s) ** 2 + 1e-4)
     assert torch.equal(got[outer], level[outer])
@@ -67,7 +67,7 @@ def test_blocks_that_are_left_out_change_nothing(device, monkeypatch):
     got = cover_silhouettes(*args, radius=RADIUS)
     lowest = cover._lowest(level)
     assert tuple(lowest.shape) == (9, 11, 8) and float(lowest.min()) == float(level.min())
-    assert 0.02 < float((lowest >= REACH).float().mean()) < 0.9, "some blocks are left out"
+    assert 0.02 < float((lowest >= FIELD_MAX).float().mean()) < 0.9, "some blocks are left out"
     monkeypatch.setattr(cover, "_lowest", lambda level: torch.full_like(lowest, -1e30))
     assert torch.equal(got, cover_silhouettes(*args, radius=RADIUS))
     assert int((got != level).sum()) > 500
@@ -89,7 +89,7 @@ def test_the_bound_holds_and_hopeless_rays_are_left(device):
     start = torch.maximum(level, bound)
     got = cover_silhouettes(start, bound, mask, camera, radius=RADIUS)
     assert bool((got >= bound).all()) and bool((got <= start).all()) and float(got.min()) <= -DEPTH
-    high = torch.full_like(level, REACH + 0.1)
+    high = torch.full_like(level, FIELD_MAX + 0.1)
     assert torch.equal(cover_silhouettes(high, high - 5.0, mask, camera, radius=RADIUS), high)
 
 
@@ -113,7 +113,7 @@ def twin(level, bound, distance, cameras):
         x, y = torch.meshgrid(torch.arange(columns), torch.arange(rows), indexing="xy")
         centre = (torch.stack([x, y], -1) + 0.5) * STRIDE * 2 / torch.tensor([distance.shape[2], distance.shape[1]]) - 1
         inside = grid_sample(distance[None, v : v + 1], centre[None].double(), align_corners=False)[0, 0].reshape(-1)
-        lacks = torch.where((inside > 1.0) & (least < REACH), (least + DEPTH).clamp(min=0.0), 0.0).view(
+        lacks = torch.where((inside > 1.0) & (least < FIELD_MAX), (least + DEPTH).clamp(min=0.0), 0.0).view(
             1, 1, rows, columns
         )
         pixel, _ = project(points.float(), c2w, cameras.intrinsics[v])
@@ -123,7 +123,7 @@ def twin(level, bound, distance, cameras):
         )[0, 0, :, 0]
         most = torch.maximum(most, torch.where((place.abs() < 1.0).all(1), value, 0.0))
     flat = level.reshape(-1)
-    return torch.where(flat.abs() < REACH, torch.maximum(flat - most, bound.reshape(-1)), flat).view_as(level)
+    return torch.where(flat.abs() < FIELD_MAX, torch.maximum(flat - most, bound.reshape(-1)), flat).view_as(level)
 
 
 def test_equals_its_twin_on_a_rough_field(device):
@@ -140,7 +140,7 @@ def test_equals_its_twin_on_a_rough_field(device):
     got = cover_silhouettes(*args, radius=RADIUS).cpu()
     want = twin(level.double(), bound.double(), distance.double(), camera)
     assert float((want != level).double().mean()) > 0.2
-    # float32 has rays enter the cube 1e-5 of a step aside; one whose least level is REACH falls to either side
+    # float32 has rays enter the cube 1e-5 of a step aside; one whose least level is FIELD_MAX falls to either side
     assert float(((got - want).abs() < 2e-4).double().mean()) > 0.999
 
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from reli3d.geometry.sparse_level import SURE, sparse_level
+from reli3d.geometry.sparse_level import INSIDE_DEPTH, sparse_level
 from reli3d.geometry.surface import extract_surface
 
 
@@ -46,7 +46,7 @@ def test_every_level_above_the_depth_is_exact():
     level = lumps(grid(33))
     near = level < 2.0
     got, _ = sparse(level, near)
-    shallow = near & (got != -SURE)
+    shallow = near & (got != -INSIDE_DEPTH)
     assert torch.equal(got[shallow], level[shallow]) and bool((got[~near] == 9.0).all())
     assert bool((level[~shallow & near] < 0.0).all())
 
