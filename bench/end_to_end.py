@@ -36,7 +36,7 @@ def views_to_glb(device, texture_size, resolution):
 
 def process(device, arguments):
     """``reli3d-infer`` from the start of the process to its end, with the kernels compiled before."""
-    code = "from reli3d.cli.program import infer; infer()"
+    code = "import sys; from reli3d.cli.infer import main; sys.exit(main())"
 
     def step():
         with tempfile.TemporaryDirectory() as folder:
@@ -48,5 +48,5 @@ def process(device, arguments):
 
 CASES = {
     "views_to_glb": (views_to_glb, dict(texture_size=512, resolution=None)),  # the preset's own resolution
-    "process": (process, dict(arguments=["--texture-size", "512", "--first-views", "4"])),
+    "process": (process, dict(arguments=["--texture-size", "512", "--views", "4"])),
 }

@@ -1,19 +1,22 @@
-"""From posed photographs to a relightable asset: one function a stage, and :func:`reconstruct` that runs them in
-order.
+"""From posed photographs to a relightable asset: one function a stage, :func:`reconstruct` that runs them in order, and
+:func:`reconstruct_folder` from the files of an object to those of its result.
 """
 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from reli3d._bridge import expect, full_precision, present
+from reli3d.errors import InputError
 from reli3d.geometry.bake import bake
 from reli3d.geometry.cover import FIELD_MAX, cover_silhouettes
 from reli3d.geometry.mesh import Mesh, largest_components, vertex_normals, weld
@@ -34,6 +37,8 @@ from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.environment import Environment
 from reli3d.render.exposure import estimate_base_color_and_light
 from reli3d.render.latlong import lat_long_directions
+from reli3d.views.check import up_axis, verdict
+from reli3d.views.folder import load_views
 from reli3d.views.normalize import FAR, normalize
 from reli3d.views.published_views import background_shown, hero_first, placement_notes
 from reli3d.views.similarity import Similarity, output_frame
@@ -51,7 +56,7 @@ OUTSIDE = 1.0  # level given to grid points that the silhouettes exclude
 MARGIN_CELLS = 2.5  # cells around the silhouettes' hull in which the field is still evaluated
 
 
-class NoSurface(ValueError):
+class NoSurface(InputError):
     """The field of an object has one sign in its whole box."""
 
 
@@ -82,7 +87,7 @@ def encode(model: Network, prepared: Prepared, *, background: bool = False) -> F
 def extract(field: Field, resolution: int) -> Mesh:
     """Closed surface of the field on ``resolution`` cubes a side, without small loose pieces; model frame.
 
-    Raises NoSurface, a ValueError, where the field has none.
+    Raises NoSurface, an InputError, where the field has none.
     """
     if isinstance(field, LocalField):
         mesh = largest_components(_bounded_surface(field, resolution), SMALLEST_PART)
@@ -130,7 +135,7 @@ def _bounded_surface(field: LocalField, resolution: int) -> Mesh:
 def _check_signs(level: Tensor) -> None:
     low, high = (float(v) for v in torch.aminmax(level))
     if low >= 0.0 or high < 0.0:
-        raise NoSurface(f"level: expected values on both sides of 0, got [{low:.4g}, {high:.4g}]: no surface")
+        raise NoSurface("level", f"expected values on both sides of 0, got [{low:.4g}, {high:.4g}]: no surface")
 
 
 def _hull_reach(field: LocalField, resolution: int) -> float:
@@ -140,7 +145,7 @@ def _hull_reach(field: LocalField, resolution: int) -> float:
     inside = field.grid_bound(axis, 0.0) < 0
     reach = axis.abs()[inside.nonzero()]
     if len(reach) == 0:
-        raise ValueError("masks: expected masks that overlap in space, got none inside all of them; run --check")
+        raise InputError("masks", "expected masks that overlap in space, got none inside all of them; run reli3d check")
     return float(reach.max())
 
 
@@ -163,7 +168,7 @@ def texture(
     scene: rays against ``mesh``, for a network that uses which view sees a point, else None.
     """
     if uv not in ("project", "xatlas"):
-        raise ValueError(f"uv: expected project or xatlas, got {uv}")
+        raise InputError("uv", f"expected project or xatlas, got {uv}")
     maps = field.maps
 
     def at_vertices(field: LocalField, mesh: Mesh) -> tuple[LocalField, Tensor]:
@@ -231,15 +236,16 @@ def transform_asset(asset: Asset, similarity: Similarity) -> Asset:
 
 
 def _check_place(near: Mesh, mesh: Mesh) -> None:
-    """Raise ValueError where vertices that differ in ``near`` meet in ``mesh``, the same elsewhere: float32 is coarse
+    """Raise InputError where vertices that differ in ``near`` meet in ``mesh``, the same elsewhere: float32 is coarse
     far from the origin.
     """
     low, high = mesh.vertices.aminmax(dim=0)
     far, size = float(torch.maximum(-low, high).max()), float((high - low).max())
     if far > FAR * size and len(weld(mesh.vertices)[0]) < len(weld(near.vertices)[0]):
-        raise ValueError(
-            f"views: expected an object near the origin, got one of size {size:.3g} at {far:.3g}; "
-            "subtract its place from the positions of the cameras"
+        raise InputError(
+            "views",
+            f"expected an object near the origin, got one of size {size:.3g} at {far:.3g}; "
+            "subtract its place from the positions of the cameras",
         )
 
 
@@ -269,12 +275,12 @@ def default_normalization(preset: Preset | LocalPreset) -> str:
 
 @dataclass(frozen=True)
 class ReconstructOptions:
-    """How :func:`reconstruct` works.  Raises ValueError on a size out of range.
+    """How :func:`reconstruct` works.  Raises InputError on a value out of range.
 
     texture_size: 256 to 4096 texels.  resolution: cubes a side of the surface grid, 16 to 256; None is the preset's.
     normalization: ``auto``, ``hull``, ``none``, or the map from the input frame to the model's; None is
-    :func:`default_normalization`.  frame: ``input`` (that of the cameras) or ``model``.  up: the axis of that frame
-    that shall become +Y.  uv: ``project`` or ``xatlas``.  hero: index of the network's main view, or ``random``.
+    :func:`default_normalization`.  up: the axis of the cameras' frame that becomes +Y in the asset.  uv: ``project`` or
+    ``xatlas``.  hero: index of the reference view.
     background: ``masked``, ``visible`` or ``auto``, see :func:`~reli3d.views.published_views.background_shown`.
     symmetry: ``auto`` or ``off``, see :func:`~reli3d.prepare.completed`; for the network of convolutions.
 
@@ -285,21 +291,20 @@ class ReconstructOptions:
     texture_size: int = 1024
     resolution: int | None = None
     normalization: str | Similarity | None = None
-    frame: str = "input"
     up: str = "y"
     uv: str = "project"
-    hero: int | str = 0
+    hero: int = 0
     background: str = "masked"
     seed: int = 0
     symmetry: str = "auto"
 
     def __post_init__(self):
         if self.symmetry not in ("auto", "off"):
-            raise ValueError(f"symmetry: expected auto or off, got {self.symmetry}")
+            raise InputError("symmetry", f"expected auto or off, got {self.symmetry}")
         if not 256 <= self.texture_size <= 4096:
-            raise ValueError(f"texture_size: expected 256 to 4096 texels, got {self.texture_size}")
+            raise InputError("texture_size", f"expected 256 to 4096 texels, got {self.texture_size}")
         if self.resolution is not None and not 16 <= self.resolution <= 256:
-            raise ValueError(f"resolution: expected 16 to 256 cubes, got {self.resolution}")
+            raise InputError("resolution", f"expected 16 to 256 cubes, got {self.resolution}")
 
 
 DEFAULT = ReconstructOptions()
@@ -325,9 +330,9 @@ def place(views: Views, preset: Preset | LocalPreset, options: ReconstructOption
         normalization = default_normalization(preset)
         if normalization == "none":
             views = replace(views, notes=(*views.notes, *placement_notes(views)))
-    views = hero_first(views, options.hero, options.seed)
+    views = hero_first(views, options.hero)
     to_model = normalization if isinstance(normalization, Similarity) else normalize(views, normalization)
-    return Placed(views, to_model, output_frame(to_model, options.frame, options.up))
+    return Placed(views, to_model, output_frame(options.up))
 
 
 @torch.no_grad()
@@ -338,8 +343,7 @@ def reconstruct(views: Views, *, weights: str | Network = "small", device: str =
 
     views: 1 to 16, see :func:`reli3d.views.folder.load_views`.  weights: ``small`` (in the package), a safetensors
     file, or a loaded network.  watch: filled with the seconds of each stage.  The same input and options give the same
-    asset.  Raises ValueError on options out of range and where the masks hold no object, NoSurface where the field
-    holds none.
+    asset.  Raises InputError where the masks hold no object, NoSurface where the field holds none.
 
     >>> asset = reli3d.reconstruct(reli3d.load_views("photos/shoe", views=4))
     >>> reli3d.write_glb("shoe.glb", asset)
@@ -403,7 +407,136 @@ def refine(asset: Asset, views: Views, *, seconds: float | None = None, steps: i
 @full_precision
 def refined(asset: Asset, views: Views, **options) -> Refinement:
     """:func:`refine` with its record."""
-    from reli3d.fit import refine as fit  # not before it is asked for: the command without it starts earlier
+    from reli3d.fit import refine as fit  # imported where it is used: it loads kernels of its own
 
     device = asset.mesh.vertices.device
     return fit.refine(asset, views.to(device).resampled(REFINED), **options)
+
+
+class Progress:
+    """What :func:`reconstruct_folder` reports to: nothing here; commands show a bar."""
+
+    def __call__(self, stage: str) -> None:
+        """A stage begins."""
+
+    def tell(self, notes: Iterable[str]) -> None:
+        """Notes on the object, a line each."""
+
+
+@dataclass(frozen=True)
+class FolderOptions:
+    """Which photographs of a folder :func:`reconstruct_folder` reads, and whether it refines the result.
+
+    views, masks, remove_background: of :func:`~reli3d.views.folder.load_views`.  budget: ``seconds`` or ``steps`` of a
+    refinement to all photographs, empty for none.  cameras: it corrects the cameras as well.  interrupt: as of
+    :func:`reli3d.fit.refine.refine`.
+    """
+
+    views: int | None = None
+    masks: Path | None = None
+    remove_background: bool = False
+    budget: Mapping[str, float | int] | None = None
+    cameras: bool = False
+    interrupt: Callable[[], bool] | None = None
+
+    def read(self, folder: Path, *, whole: bool) -> Views:
+        """The views of ``folder``; whole: see :func:`~reli3d.views.folder.load_views`."""
+        return load_views(
+            folder,
+            views=self.views,
+            masks=self.masks,
+            remove_background=self.remove_background,
+            every=bool(self.budget) and self.views is None,
+            whole=whole,
+        )
+
+
+def reconstruct_folder(
+    folder: Path,
+    name: str,
+    replacing: Callable,
+    model: Network,
+    weights: Mapping[str, Any],
+    *,
+    reading: FolderOptions = FolderOptions(),  # noqa: B008 # it is frozen
+    options: ReconstructOptions = DEFAULT,
+    progress: Progress | None = None,
+) -> None:
+    """Reconstruct the object of ``folder``, refine it where ``reading`` has a budget, and write its result.
+
+    name: title of the viewer page.  replacing: of :func:`reli3d.output.results.claim`.  weights: their record.
+    Raises InputError, with the likely cause where the cameras are suspect, and OSError; the old result then stays.
+    """
+    from reli3d.output import results
+    from reli3d.output.preview import comparison, preview
+
+    progress = progress or Progress()
+    watch = Stopwatch(model.device, progress)
+    with watch.stage("reading"):
+        whole = published_input(model.preset) or options.background != "masked"
+        photographs = reading.read(folder, whole=whole)
+    views = photographs.taken()
+    if options.up == "y" and (axis := up_axis(views.c2w)) not in (None, "y"):
+        views = replace(views, notes=(*views.notes, f"the cameras stand upright about {axis}: try --up {axis}"))
+    progress.tell(views.notes)
+    with _diagnosed(views):
+        with watch.stage("normalize"):
+            placed = place(views, model.preset, options)
+        progress.tell(placed.views.notes[len(views.notes) :])
+        views = placed.views
+        asset = reconstruct_placed(placed, model, options, watch)
+    progress.tell(watch.notes)
+    output = placed.output_from_input
+    shown, compared, first, record = views.transformed(output), None, None, {}
+    if reading.budget:
+        with watch.stage("refine"):
+            photographs = photographs.transformed(output)
+            fit: dict[str, Any] = {"seed": options.seed, "cameras": reading.cameras, "interrupt": reading.interrupt}
+            result = refined(asset, photographs, bar=True, **fit, **reading.budget)
+            compared = comparison(asset, result.asset, shown.to(model.device))
+        progress.tell(result.notes)
+        first, asset = asset if result.changed else None, result.asset
+        record = {"refinement": {"views": len(photographs), **reading.budget, **result.record()}}
+    with watch.stage("preview"):
+        scene = RayScene(asset.mesh.vertices, asset.mesh.faces)
+        frames, moved = results.frame_record(placed.model_from_input, output, views.origin, options.up)
+        frames["weights"] = dict(weights)
+        on_device = shown.to(model.device)
+        picture = preview(asset, on_device, scene)  # the longest tasks first, so that the threads end at about one time
+        measured = results.measure(asset.mesh, scene, on_device)
+        encoded = results.encode(asset, shown, frames, name=name, before=first, translation=moved, scene=scene)
+        drawn, measures = picture(), measured()
+    info = {
+        "object": name,
+        "views": list(views.names),
+        "views_in_folder": views.in_folder,
+        "notes": [*views.notes, *watch.notes],
+        **frames,
+        "preset": model.preset.name,
+        "precision": str(model.dtype).removeprefix("torch."),
+        "texture_size": options.texture_size,
+        "resolution": options.resolution or model.preset.resolution,
+        "background": options.background,
+        "symmetry": options.symmetry,
+        "seed": options.seed,
+        "device": model.device.type,
+        **measures,
+        **record,
+        "seconds": {stage: round(value, 4) for stage, value in watch.seconds.items()},
+        "peak_memory_mib": results.peak_memory_mib(),
+        "versions": results.versions(),
+    }
+    progress("writing")
+    results.write_results(replacing, encoded, drawn, info, comparison=compared)
+
+
+@contextmanager
+def _diagnosed(views: Views) -> Iterator[None]:
+    """Adds what :mod:`reli3d.views.check` suspects to an InputError of the block, where it suspects something."""
+    try:
+        yield
+    except InputError as error:
+        found = verdict(views)
+        if not found.startswith("suspect"):
+            raise
+        raise InputError(error.where, f"{error.problem}; {found}") from None

@@ -1,40 +1,51 @@
-"""What the commands say of the cameras: ``--check``, and beside an error that wrong cameras may have caused."""
+"""``reli3d check``: what the cameras of a folder look like, without a reconstruction."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+import json
+import sys
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from reli3d.cli.exit_codes import reason
+from reli3d.cli import objects
+from reli3d.cli.exit_codes import Parser, command, show_traceback
+from reli3d.cli.infer import checked_items
+from reli3d.cli.options import add_reading
 
 if TYPE_CHECKING:
-    from reli3d.io.tar import Packed
-    from reli3d.views.views import Views
+    from reli3d.pipeline import FolderOptions
 
-SUSPECT = 3  # exit code of --check where it does not trust the cameras
+SUSPECT = 3  # exit code where the cameras are not trusted
 
 
+def parser() -> Parser:
+    p = Parser(
+        prog="reli3d check",
+        description="Explain the cameras of object folders, one line a view, and draw the rig with the visual hull.",
+        epilog="Exit code: 0 plausible, 1 some folders failed, 2 wrong input, 3 cameras or masks are suspect.",
+    )
+    add_reading(p)
+    return p
+
+
+@dataclass
 class Check:
-    """Explains cameras instead of a reconstruction: a :class:`~reli3d.cli.objects.Job`.
+    """Explains the cameras of objects: a :class:`~reli3d.cli.objects.Job`.  found: by the names of the objects."""
 
-    read: the views of a folder.  silent: print nothing; ``found`` has it all, by the names of the objects.
-    """
+    reading: FolderOptions
+    silent: bool
+    found: dict[str, dict] = field(default_factory=dict)
 
-    def __init__(self, read: Callable[[Path | Packed], Views], silent: bool):
-        self._read, self._silent = read, silent
-        self.found: dict[str, dict] = {}
-
-    def run(self, folder: Path | Packed, name: str, target: Path) -> str:
-        """Print what the cameras look like, one line a view, and write the picture of the rig."""
+    def run(self, folder: Path, name: str, target: Path) -> str:
+        """Print what the cameras look like, one line a view, and draw the rig."""
         from reli3d.views.check import explain_cameras, rig_picture
 
-        views = self._read(folder)
+        views = self.reading.read(folder, whole=True)
         lines = explain_cameras(views)
         target.mkdir(parents=True, exist_ok=True)
         rig_picture(views, target / "rig.png")
-        if not self._silent:
+        if not self.silent:
             print(*views.notes, *lines, target / "rig.png", sep="\n")
         self.found[name] = {
             "suspect": lines[-1].startswith("suspect"),
@@ -45,20 +56,23 @@ class Check:
         }
         return "done"
 
-    def suspects(self) -> bool:
-        """Whether the cameras of an object are not trusted."""
-        return any(found["suspect"] for found in self.found.values())
+
+@command("reli3d check")
+def main(argv: list[str] | None = None) -> int:
+    args = parser().parse_args(argv)
+    items = checked_items(args)
+    from reli3d.pipeline import FolderOptions
+
+    job = Check(FolderOptions(args.views, args.masks, args.remove_background), args.json)
+    rows = (objects.make(job, item, lambda error: show_traceback(error, args)) for item in items)
+    ended, code = objects.collect("reli3d check", rows, items, lambda row: None)
+    if not code and any(found["suspect"] for found in job.found.values()):
+        code = SUSPECT
+    if args.json:
+        entries = [asdict(row) | job.found.get(row.object, {}) for row in ended]
+        print(json.dumps({"objects": entries, "exit_code": code}))
+    return code
 
 
-@contextmanager
-def diagnosed(views: Views) -> Iterator[None]:
-    """Adds what :mod:`reli3d.views.check` suspects to an error of the block, where it suspects something."""
-    from reli3d.views.check import verdict
-
-    try:
-        yield
-    except ValueError as error:
-        found = verdict(views)
-        if not found.startswith("suspect"):
-            raise
-        raise ValueError(f"{reason(error)}; {found}") from None
+if __name__ == "__main__":
+    sys.exit(main())

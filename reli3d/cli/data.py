@@ -10,22 +10,21 @@ import sys
 from pathlib import Path
 
 from reli3d.cli import objects, shards
-from reli3d.cli.exit_codes import check_ranges, command
-from reli3d.cli.help_format import Defaults
+from reli3d.cli.exit_codes import Parser, check_ranges, command
 from reli3d.cli.samples import SampleJob, Wanted
+from reli3d.errors import InputError
 
 COUNT, VIEWS = 1000, 6  # seeds and views where nothing else is asked for
 
 
 def parser() -> argparse.ArgumentParser:
-    whole = argparse.ArgumentParser(
-        formatter_class=Defaults,
+    whole = Parser(
         prog="reli3d-data",
         description="Make training samples, and put objects into shards.",
     )
     actions = whole.add_subparsers(dest="action", required=True, metavar="ACTION")
     about = "make training samples of procedural objects, or of textured meshes"
-    p = actions.add_parser("render", formatter_class=Defaults, help=about, description=f"{about.capitalize()}.")
+    p = actions.add_parser("render", help=about, description=f"{about.capitalize()}.")
     p.add_argument("output", type=Path, help="folder for NNNNNNNNNN.safetensors; those that exist are kept")
     p.add_argument("--maps", type=Path, required=True, help=".npz of environment maps: env (n, H, 2H, 3) linear, names")
     p.add_argument("--first", type=int, default=0, help="first seed")
@@ -75,7 +74,7 @@ def glb_files(paths: list[Path] | None) -> tuple[Path, ...]:
     """The files among ``paths``, and in the place of a folder all GLB files in it.  Raises InputError where there is
     none.
     """
-    from reli3d.io.files import InputError, file_size
+    from reli3d.io.files import file_size
 
     found: list[Path] = []
     for path in paths or ():
@@ -97,17 +96,17 @@ def _wanted(args: argparse.Namespace) -> Wanted:
     check_ranges(args, first=(0, 10**9), count=(1, 10**9), views=(1, 64), size=(16, 2048), workers=(1, 1024))
     paper = args.protocol == "paper"
     if paper and args.views is not None:
-        raise ValueError(f"--views: expected none with --protocol paper, got {args.views}; it has its own numbers")
+        raise InputError("--views", f"expected none with --protocol paper, got {args.views}; it has its own numbers")
     check_folder(args.output)
     meshes, shapes = glb_files(args.meshes), glb_files(args.shapes)
     fit = held_back(load_maps(args.maps)[1]).count(bool(args.held_back))
     if not fit:
-        raise ValueError("--maps: expected at least six maps for --held-back, got fewer")
+        raise InputError("--maps", "expected at least six maps for --held-back, got fewer")
     if paper and fit < LIGHTS:
-        raise ValueError(f"--maps: expected at least {LIGHTS} for --protocol paper, got {fit} that may be taken")
+        raise InputError("--maps", f"expected at least {LIGHTS} for --protocol paper, got {fit} that may be taken")
     maps = args.maps.absolute()
     if paper and args.views_only:
-        raise ValueError("--views-only: expected --protocol own with it, got paper")
+        raise InputError("--views-only", "expected --protocol own with it, got paper")
     views = args.views or VIEWS
     return Wanted(maps, bool(args.held_back), paper, views, args.size, meshes, shapes, args.views_only)
 
@@ -144,11 +143,11 @@ def render(args: argparse.Namespace) -> int:
             bar.update()
             if row.result in ("done", "skipped"):
                 continue
-            told = "; ".join(row.notes)
-            if row.result == "failed" and objects.KILLED not in row.notes:  # a full disk: the others would fail too
-                raise OSError(f"{row.object}: {told}")
+            notes = "; ".join(row.notes)
+            if row.result == "failed" and objects.CRASHED not in row.notes:  # a full disk: the others would fail too
+                raise OSError(f"{row.object}: {notes}")
             lost += 1
-            tqdm.write(f"{row.object}: {told}", file=sys.stderr)
+            tqdm.write(f"{row.object}: {notes}", file=sys.stderr)
     return 1 if lost else 0
 
 

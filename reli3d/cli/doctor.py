@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import argparse
 import hashlib
+import json
 import os
 import platform
 import shutil
@@ -11,11 +11,12 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from importlib import metadata
 from pathlib import Path
 
 import reli3d
+from reli3d.cli.exit_codes import Parser, command
 
 REQUIRED = (
     "torch",
@@ -35,22 +36,20 @@ ASSETS = Path(reli3d.__file__).parent / "assets"
 PROBLEM = "PROBLEM: "  # starts the value of a line that keeps the package from working
 
 
-def report() -> str:
-    """The report as aligned text: what must be mended says ``PROBLEM``, the last line is the verdict."""
-    return examine()[0]
+def examine() -> tuple[list[tuple[str, str]], bool]:
+    """Rows ``(name, value)``, and whether the package is usable: no value begins with ``PROBLEM``.
 
-
-def examine() -> tuple[str, bool]:
-    """``(report, usable)``.  Compiles one kernel where the cache has none, which takes some seconds the first time."""
+    Compiles one kernel where the cache has none, which takes some seconds the first time.
+    """
     rows = []
     for part in (_versions, _devices, _cache, _kernels, _files, _tools):
         try:
             rows += list(part())
-        except Exception as error:  # the doctor reports what fails, whatever it is, and goes on
+        except Exception as error:  # whatever fails is reported, and the rest goes on
             rows.append((part.__name__[1:], f"{PROBLEM}{type(error).__name__}: {error}"))
     problems = sum(value.startswith(PROBLEM) for _, value in rows)
     verdict = "usable" if problems == 0 else f"not usable: {problems} problem{'s' if problems > 1 else ''}"
-    return "\n".join(f"{name:16s} {value}" for name, value in [*rows, ("verdict", verdict)]), problems == 0
+    return [*rows, ("verdict", verdict)], problems == 0
 
 
 def _versions() -> Iterator[tuple[str, str]]:
@@ -135,15 +134,21 @@ def _tools() -> Iterator[tuple[str, str]]:
     yield "node", done.stdout.strip() or f"{node} does not run"
 
 
+@command("reli3d doctor")
 def main(argv: list[str] | None = None) -> int:
     """The command ``reli3d doctor``; 0 when usable, 1 when something must be mended, 2 for a wrong call."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="reli3d doctor", description="Print versions, devices, kernel cache and weights, and the verdict."
     )
-    parser.parse_args(argv)
-    text, usable = examine()
-    sys.stdout.write(text + "\n")
+    parser.add_argument("--json", action="store_true", help="print one JSON object: the rows by name, and usable")
+    args = parser.parse_args(argv)
+    rows, usable = examine()
+    print(json.dumps({**dict(rows), "usable": usable}) if args.json else aligned(rows))
     return 0 if usable else 1
+
+
+def aligned(rows: Sequence[tuple[str, str]]) -> str:
+    return "\n".join(f"{name:16s} {value}" for name, value in rows)
 
 
 if __name__ == "__main__":

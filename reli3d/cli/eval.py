@@ -7,16 +7,14 @@ import json
 import sys
 from pathlib import Path
 
-from reli3d.cli.exit_codes import command
-from reli3d.cli.help_format import Defaults
+from reli3d.cli.exit_codes import Parser, command
+from reli3d.errors import InputError
 
 MOST = 16  # views that the small network reads
 
 
 def parser() -> argparse.ArgumentParser:
-    p = argparse.ArgumentParser(
-        formatter_class=Defaults, prog="reli3d-eval", description="Measure the network on held-back procedural objects."
-    )
+    p = Parser(prog="reli3d-eval", description="Measure the network on held-back procedural objects.")
     p.add_argument("samples", type=Path, help="folder made by reli3d-data render --held-back test --views 24")
     p.add_argument("--maps", type=Path, required=True, help=".npz of environment maps that the training drew from")
     p.add_argument("--weights", default="small", help="small, or a safetensors file")
@@ -35,8 +33,6 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _seeded(path: Path) -> None:
-    from reli3d.io.files import InputError
-
     if not (path.stem.isascii() and path.stem.isdecimal()):
         raise InputError(path, "expected the seed of the object as its name; give samples of procedural objects")
 
@@ -45,7 +41,7 @@ def _seeded(path: Path) -> None:
 def main(argv: list[str] | None = None) -> int:
     args = parser().parse_args(argv)
     from reli3d.eval.heldout import UNSEEN, mean_environment, table
-    from reli3d.io.files import InputError, write_bytes
+    from reli3d.io.files import write_bytes
     from reli3d.nn.weights import load_model
     from reli3d.output.folder import check_folder
     from reli3d.synthetic.maps import held_back, load_maps

@@ -1,24 +1,31 @@
 """How every command ends: an exit code and at most one line, whatever comes from outside.
 
-Ctrl-C ends with 130, SIGTERM and SIGHUP with 143 and 129, after the files half written are gone.  A stream that is
-closed or full, or that cannot hold a letter, changes no exit code.
+2 is input that the user can correct (:class:`~reli3d.errors.InputError`, also a wrong option), 1 every other exception,
+whose traceback goes to a log file and, with ``--traceback``, to stderr.  Ctrl-C is 130, SIGTERM 143 and SIGHUP 129,
+after half-written files are removed.  A stream that is closed or full, or that cannot encode a letter, changes no code.
 """
 
 from __future__ import annotations
 
 import argparse
+import atexit
 import contextlib
 import functools
 import os
 import signal
 import sys
 import threading
+import traceback
 from collections.abc import Callable, Iterator
+from contextvars import ContextVar
+from pathlib import Path
+from typing import Any
 
-from reli3d.cli import collector
-from reli3d.io.files import printable
+from reli3d.cli.help_format import Defaults
+from reli3d.errors import InputError, printable
 
-FAULTS = (ValueError, TypeError, OSError, MemoryError, ImportError)  # the last: an extra is not installed
+ENDING = {"SIGINT": "interrupted", "SIGTERM": "ended by SIGTERM", "SIGHUP": "ended by SIGHUP"}
+_parsed: ContextVar[argparse.Namespace | None] = ContextVar("parsed", default=None)  # of the command at work
 
 
 class Stopped(BaseException):
@@ -27,6 +34,24 @@ class Stopped(BaseException):
     def __init__(self, number: int):
         super().__init__(number)
         self.number = number
+
+
+class Parser(argparse.ArgumentParser):
+    """Arguments of a command: help with defaults, ``--traceback``, and InputError for wrong ones."""
+
+    def __init__(self, **options: Any):
+        super().__init__(**{"formatter_class": Defaults, **options})
+        self.add_argument(
+            "--traceback", action="store_true", default=argparse.SUPPRESS, help="print the traceback of an error"
+        )
+
+    def parse_args(self, args=None, namespace=None):
+        found = super().parse_args(args, namespace)
+        _parsed.set(found)
+        return found
+
+    def error(self, message: str):
+        raise InputError("arguments", f"{message}; see {self.prog} --help")
 
 
 class _Stream:
@@ -55,23 +80,28 @@ class _Stream:
 def command(name: str) -> Callable:
     """Decorator of a command's ``main``: its exit code for everything that may happen.  name: of the command.
 
-    Without arguments of its own ``main`` is the program: the garbage collector is relaxed.
+    Without arguments of its own ``main`` is the program: its signals are handled until the interpreter has ended.
     """
 
-    def decorate(main: Callable) -> Callable:
+    def decorate(main: Callable[[list[str] | None], int]) -> Callable[..., int]:
         @functools.wraps(main)
         def run(argv: list[str] | None = None) -> int:
-            if argv is None:
-                collector.relax()
-            with _streams(), signals():
+            ended: list[int] = []  # its exit code: from then on a signal finds nothing to clean up
+            with _streams(), signals(name if argv is None else None, ended):
                 try:
-                    return main(argv)
+                    _parsed.set(None)
+                    try:
+                        code = main(argv)
+                    except InputError as error:
+                        code = _report(name, str(error), 2)
+                    except Exception as error:
+                        code = _failed(name, error)
+                    ended.append(code)
                 except KeyboardInterrupt:
-                    return _report(name, "interrupted", 128 + signal.SIGINT)
+                    ended.append(_report(name, ENDING["SIGINT"], 128 + signal.SIGINT))
                 except Stopped as stop:
-                    return _report(name, f"ended by {signal.Signals(stop.number).name}", 128 + stop.number)
-                except FAULTS as error:
-                    return _report(name, reason(error), 2)
+                    ended.append(_report(name, ENDING[signal.Signals(stop.number).name], 128 + stop.number))
+            return ended[0]
 
         return run
 
@@ -79,17 +109,65 @@ def command(name: str) -> Callable:
 
 
 def reason(error: BaseException) -> str:
-    """What an error says, as one line."""
+    """What an error says, as one line; the class too where no message was written for a user."""
+    if isinstance(error, InputError):
+        return str(error)
     if isinstance(error, OSError) and error.strerror:
         files = [os.fsdecode(f) for f in (error.filename, error.filename2) if isinstance(f, str | bytes | os.PathLike)]
         return " ".join(printable(f"{' -> '.join(files)}: {error.strerror}" if files else error.strerror).split())
-    return " ".join(str(error).split()) or type(error).__name__
+    text = " ".join(printable(line) for line in str(error).split())
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__
+
+
+def _failed(name: str, error: Exception) -> int:
+    """One line for an exception that no input explains, and its traceback where it belongs; the exit code."""
+    args = _parsed.get()
+    show_traceback(error, args)
+    output = getattr(args, "output", None)
+    log = write_log(output, error) if isinstance(output, Path) else None
+    where = f"; traceback in {printable(str(log))}" if log else "; --traceback prints where"
+    return _report(name, reason(error) + where, 1)
+
+
+def show_traceback(error: BaseException, args: argparse.Namespace | None) -> None:
+    """Print the traceback of ``error`` on stderr where ``--traceback`` was given."""
+    if getattr(args, "traceback", False):
+        sys.stderr.write("".join(traceback.format_exception(error)))
+
+
+def write_log(target: Path, error: BaseException) -> Path | None:
+    """Write the traceback of ``error`` to :func:`log_of` the target; its path, None where it cannot be written."""
+    from reli3d.io.files import write_bytes
+
+    path = log_of(target)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_bytes(path, "".join(traceback.format_exception(error)).encode(errors="backslashreplace"))
+    except OSError:
+        return None
+    return path
+
+
+def log_of(target: Path) -> Path:
+    """The file beside the output ``target`` that has the traceback of its failure."""
+    from reli3d.output.folder import sibling
+
+    return sibling(Path(os.path.abspath(target)), "", ".reli3d.log")
+
+
+@contextlib.contextmanager
+def extra(option: str) -> Iterator[None]:
+    """In this block a package that an option needs and that is not installed is an InputError of the option."""
+    try:
+        yield
+    except ImportError as error:
+        raise InputError(option, str(error)) from None
 
 
 def check_range(name: str, value: float | None, low: float, high: float) -> None:
-    """Raise ValueError where the option ``--name`` is given and not within ``low`` and ``high``."""
+    """Raise InputError where the option ``--name`` is given and not within ``low`` and ``high``."""
     if value is not None and not low <= value <= high:
-        raise ValueError(f"--{name}: expected {low:g} to {high:g}, got {value}")
+        raise InputError(f"--{name}", f"expected {low:g} to {high:g}, got {value}")
 
 
 def check_ranges(args: argparse.Namespace, **ranges: tuple[float, float]) -> None:
@@ -109,26 +187,43 @@ def _report(name: str, text: str, code: int) -> int:
 
 
 @contextlib.contextmanager
-def signals() -> Iterator[None]:
-    """Signals that would end the process at once raise :class:`Stopped` instead; the next ones are not heeded."""
+def signals(program: str | None = None, ended: list[int] | None = None) -> Iterator[None]:
+    """SIGTERM and SIGHUP raise :class:`Stopped`; after the first signal the next ones are ignored.
+
+    program: name of the command that this process is, or None to restore the handlers at the end.  Its signals stay
+    handled, SIGINT too: once ``ended`` has its exit code, one prints its line and ends the process at once.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    numbers = [getattr(signal, n) for n in ("SIGTERM", "SIGHUP") if hasattr(signal, n)]
-    numbers = [n for n in numbers if signal.getsignal(n) == signal.SIG_DFL]  # nohup's stays
+    numbers = [getattr(signal, n) for n in ENDING if hasattr(signal, n)]
+    usual = (signal.SIG_DFL, signal.default_int_handler)
+    before = {n: signal.getsignal(n) for n in numbers if signal.getsignal(n) in usual}  # nohup's SIG_IGN stays
+    if not program:
+        before.pop(signal.SIGINT, None)  # raises KeyboardInterrupt already
 
     def stop(number: int, _) -> None:
-        for other in numbers:
+        for other in before:
             signal.signal(other, signal.SIG_IGN)
-        raise Stopped(number)
+        if ended:
+            os.write(2, f"{program}: {ENDING[signal.Signals(number).name]}\n".encode())
+            os._exit(128 + number)  # the interpreter is ending: no exception would reach a handler
+        raise KeyboardInterrupt if number == signal.SIGINT else Stopped(number)
 
-    for number in numbers:
+    def ignore() -> None:
+        for number in before:
+            signal.signal(number, signal.SIG_IGN)
+
+    if program:
+        atexit.register(ignore)  # registered first, called last: what follows runs no Python
+    for number in before:
         signal.signal(number, stop)
     try:
         yield
     finally:
-        for number in numbers:
-            signal.signal(number, signal.SIG_DFL)
+        if not program:
+            for number, handler in before.items():
+                signal.signal(number, handler)
 
 
 @contextlib.contextmanager

@@ -8,15 +8,14 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from reli3d.cli.exit_codes import check_range, command
-from reli3d.cli.help_format import Defaults
+from reli3d.cli.exit_codes import Parser, check_range, command, extra
+from reli3d.errors import InputError
 
 FORMATS = ("glb", "obj", "usdz")
 
 
 def parser() -> argparse.ArgumentParser:
-    p = argparse.ArgumentParser(
-        formatter_class=Defaults,
+    p = Parser(
         prog="reli3d export",
         description="Write a GLB of one surface in another format.  The files' names go to stdout.",
         epilog="Exit code: 0 done, 2 wrong input.",
@@ -63,7 +62,7 @@ def _check(args: argparse.Namespace) -> None:
     check_range("decimate", args.decimate, 16, 10**7)
     check_range("texture-size", args.texture_size, 64, 4096)
     if args.textures != "png" and args.format != "glb":
-        raise ValueError(f"--textures: expected png with --format {args.format}, got {args.textures}")
+        raise InputError("--textures", f"expected png with --format {args.format}, got {args.textures}")
     check_folder(args.output)
 
 
@@ -82,10 +81,11 @@ def export(args: argparse.Namespace) -> tuple[list[Path], dict]:
     for note in notes:
         print(f"reli3d-export: {note}", file=sys.stderr)
     if len(parts) != 1:
-        raise ValueError(f"{args.glb}: expected a GLB with one surface, got {len(parts)}")
+        raise InputError(args.glb, f"expected a GLB with one surface, got {len(parts)}")
     asset, size = parts[0], args.texture_size or parts[0].textures.size
     if args.decimate is not None and len(asset.mesh.faces) > args.decimate:
-        mesh = decimate(asset.mesh, args.decimate)
+        with extra("--decimate"):
+            mesh = decimate(asset.mesh, args.decimate)
         asset = dressed(replace(mesh, normals=vertex_normals(mesh.vertices, mesh.faces)), asset, size)
     elif size != asset.textures.size or (args.format != "glb" and not portable(asset)):
         asset = dressed(asset.mesh, asset, size)
@@ -95,7 +95,8 @@ def export(args: argparse.Namespace) -> tuple[list[Path], dict]:
     elif args.format == "obj":
         files = obj_files(asset, name)
     else:
-        files = {f"{name}.usdz": usdz_bytes(asset)}
+        with extra("--format usdz"):
+            files = {f"{name}.usdz": usdz_bytes(asset)}
     args.output.mkdir(parents=True, exist_ok=True)
     for file, data in files.items():
         write_bytes(args.output / file, data)

@@ -7,27 +7,29 @@ import importlib
 import sys
 
 import reli3d
-from reli3d.cli import collector
+from reli3d.cli.exit_codes import Parser, command
 
-COMMANDS = {  # module of reli3d.cli, arguments put before the given ones, what it does
-    "infer": ("infer", (), "photographs with cameras to a relightable asset (also reli3d-infer)"),
-    "view": ("view", (), "show a reconstruction in the browser"),
-    "check": ("infer", ("--check",), "explain the cameras of a folder, reconstruct nothing"),
-    "render": ("render", (), "views and turntables of a GLB under any light (also reli3d-render)"),
-    "export": ("export", (), "write a GLB as OBJ, USDZ or GLB, with fewer triangles or smaller textures"),
-    "data": ("data", (), "make training samples (also reli3d-data)"),
-    "train": ("train", (), "train the network (also reli3d-train)"),
-    "stages": ("stages", (), "train the paper's network stage by stage (also reli3d-stages)"),
-    "eval": ("eval", (), "measure the network on held-back objects (also reli3d-eval)"),
-    "tables": ("tables", (), "the paper's tables on a folder of GLB files (also reli3d-tables)"),
-    "doctor": ("doctor", (), "say what is installed, where it runs and whether it can"),
+COMMANDS = {  # module of reli3d.cli, what it does
+    "infer": ("infer", "photographs with cameras to a relightable asset (also reli3d-infer)"),
+    "view": ("view", "show a reconstruction in the browser"),
+    "check": ("checking", "explain the cameras of a folder, reconstruct nothing"),
+    "render": ("render", "views and turntables of a GLB under any light (also reli3d-render)"),
+    "export": ("export", "write a GLB as OBJ, USDZ or GLB, with fewer triangles or smaller textures"),
+    "download": ("download", "fetch and convert the official weights"),
+    "data": ("data", "make training samples (also reli3d-data)"),
+    "train": ("train", "train the network (also reli3d-train)"),
+    "stages": ("stages", "train the paper's network stage by stage (also reli3d-stages)"),
+    "eval": ("eval", "measure the network on held-out objects (also reli3d-eval)"),
+    "tables": ("tables", "the paper's tables on a folder of GLB files (also reli3d-tables)"),
+    "doctor": ("doctor", "print what is installed, where it runs and whether it can"),
 }
 
 
+@command("reli3d")
 def main(argv: list[str] | None = None) -> int:
     """Run the named command; its exit code.  2 for a name that is none."""
-    rows = "\n".join(f"  {name:8s} {what}" for name, (_, _, what) in COMMANDS.items())
-    parser = argparse.ArgumentParser(
+    rows = "\n".join(f"  {name:8s} {what}" for name, (_, what) in COMMANDS.items())
+    parser = Parser(
         prog="reli3d",
         description="Relightable 3D assets from a few posed photographs.",
         usage="reli3d COMMAND [OPTION ...]",
@@ -37,14 +39,12 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--version", action="version", version=f"reli3d {reli3d.__version__}")
     parser.add_argument("command", choices=COMMANDS, metavar="COMMAND", help="one of those below")
     parser.add_argument("options", nargs=argparse.REMAINDER, help=argparse.SUPPRESS)
-    if argv is None:
-        collector.relax()
     if not (sys.argv[1:] if argv is None else argv):
         parser.print_help()
         return 0
     args = parser.parse_args(argv)
-    module, before, _ = COMMANDS[args.command]
-    return importlib.import_module(f"reli3d.cli.{module}").main([*before, *args.options])
+    module, _ = COMMANDS[args.command]
+    return importlib.import_module(f"reli3d.cli.{module}").main(args.options)
 
 
 if __name__ == "__main__":

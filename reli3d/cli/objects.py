@@ -1,48 +1,52 @@
-"""Many objects: the function that makes the folder of one, and the places where it is called for each.
+"""Many objects: the function that makes the result of one, here, in processes of this machine or on a Ray cluster.
 
-A place is this process, other processes of this machine, or a Ray cluster.  Where a process dies its object is made
-once more; who dies of it again has failed.  Other processes have one thread each: the same bits for any number.
+An object whose worker crashed is made once more, in processes while nothing else runs.  A worker has one thread:
+results are equal bit for bit for any number of workers.
 """
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import functools
-import importlib
 import io
 import json
 import logging
 import os
 import pickle
 import signal
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
-from multiprocessing import get_context
-from multiprocessing.connection import Connection, wait
+from multiprocessing import active_children, get_context, parent_process
 from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import Protocol
 
-from reli3d.cli.exit_codes import Stopped, reason, signals
-from reli3d.io.files import InputError, printable, read_bytes, write_bytes
-from reli3d.io.tar import Packed, packed_objects
+from tqdm import tqdm
+
+from reli3d.cli.exit_codes import Stopped, log_of, reason, signals, tell, write_log
+from reli3d.errors import InputError, printable
+from reli3d.io.files import read_bytes, write_bytes
 
 MAX_LIST = 1 << 28  # bytes of a list of folders: a million names of 250 letters
 SUMMARY = "summary.csv"
-KILLED = "expected its process to live, got one that died twice; is there too little memory?"
+CRASHED = "its worker crashed twice; is there too little memory?"
 PATIENCE = 10.0  # seconds for a process to end before it is killed
+COLUMNS = ("object", "result", "seconds", "mask_iou", "faces", "retried", "notes")
 
 
 class Job(Protocol):
-    def run(self, folder: Path | Packed, name: str, target: Path) -> str:
+    def run(self, folder: Path, name: str, target: Path) -> str:
         """Make ``target`` from ``folder``; the result of its row."""
 
 
 @dataclass(frozen=True)
 class Item:
-    folder: Path | Packed
+    folder: Path
     name: str
     target: Path
 
@@ -56,68 +60,82 @@ class Row:
     seconds: float | None = None  # of this command
     mask_iou: float | None = None
     faces: int | None = None
+    retried: bool = False  # its worker crashed once
     notes: tuple[str, ...] = ()  # of the object, or its error
 
 
 Rows = Generator[Row, None, None]
 
 
-def make(job: Job, item: Item) -> Row:
-    """Make one object; an error becomes its row."""
+def make(job: Job, item: Item, failed: Callable[[Exception], None] = lambda error: None) -> Row:
+    """Make one object; an error becomes its row, and its traceback a log file beside the target.
+
+    failed: called with an error that no input explains.
+    """
     began = time.monotonic()
     try:
         row = Row(item.name, job.run(item.folder, item.name, item.target))
-    except ValueError as error:
+    except InputError as error:
         return Row(item.name, "refused", notes=(reason(error),))
-    except (OSError, RuntimeError, MemoryError) as error:
-        return Row(item.name, "failed", notes=(reason(error),))
+    except Exception as error:
+        failed(error)
+        log = write_log(item.target, error)
+        return Row(item.name, "failed", notes=(reason(error), *([f"traceback in {log}"] if log else [])))
+    with contextlib.suppress(OSError):
+        log_of(item.target).unlink()  # of an earlier run
     seconds = round(time.monotonic() - began, 3) if row.result == "done" else None
     return replace(row, seconds=seconds, **_recorded(item.target))
 
 
-def _recorded(target: Path) -> dict:
-    try:
-        return recorded((target / "run_info.json").read_bytes())
-    except OSError:
-        return {}
+def collect(
+    name: str, rows: Rows, items: Sequence[Item], done: Callable[[Row], None], summary: Path | None = None
+) -> tuple[list[Row], int]:
+    """All rows, and the exit code that they give.
 
-
-def recorded(data: bytes) -> dict:
-    """What ``run_info.json`` says that a summary holds; nothing where it is broken."""
-    try:
-        info = json.loads(data)
-        return {"mask_iou": info["mask_iou"], "faces": info["mesh"]["faces"], "notes": tuple(info["notes"])}
-    except (ValueError, LookupError, TypeError):
-        return {}
-
-
-def opened(folder: Path | Packed) -> AbstractContextManager[Path]:
-    """The folder of an object, a temporary one where it stands in a tar file."""
-    return folder.unpacked() if isinstance(folder, Packed) else nullcontext(folder)
-
-
-def sources(paths: Sequence[Path]) -> list[Path | Packed]:
-    """The folders among ``paths``, and the objects of the tar files.  Raises InputError for a file that is none."""
-    found: list[Path | Packed] = []
-    for path in paths:
-        if path.suffix == ".tar" and not path.is_dir():
-            found += packed_objects(path)
-        else:
-            found.append(path)
-    return found
-
-
-def items_of(folders: Sequence[Path | Packed], output: Path, *, dots: bool = True) -> list[Item]:
-    """Each folder with a name of its own in ``output``: that of the folder, with a number where two are alike.
-
-    dots: leave them in names; in a name of WebDataset what follows the first is no longer the object's.
+    An object that is not done is reported on stderr as it ends; ``done`` is called with each that is.  summary: file of
+    the table, in the order of ``items``, which an interrupted command writes too.
     """
+    ended: list[Row] = []
+    try:
+        with contextlib.closing(rows):
+            for row in rows:
+                ended.append(row)
+                if row.result in ("refused", "failed"):
+                    which = "" if row.result == "refused" and len(items) == 1 else f"{printable(row.object)}: "
+                    tell(f"{name}: {which}{'; '.join(row.notes)}")
+                elif row.result == "skipped":
+                    tell(f"{printable(row.object)}: all files are there, skipped")
+                else:
+                    done(row)
+    finally:
+        if summary:
+            order = {item.name: k for k, item in enumerate(items)}
+            write_summary(summary, sorted(ended, key=lambda row: order[row.object]))
+    results = {row.result for row in ended}
+    if {"refused", "failed"} & results:
+        return ended, 2 if results == {"refused"} else 1
+    return ended, 0
+
+
+def _recorded(target: Path) -> dict:
+    """What ``run_info.json`` says that a summary holds; nothing where it is missing or broken."""
+    try:
+        info = json.loads((target / "run_info.json").read_bytes())
+        return {"mask_iou": info["mask_iou"], "faces": info["mesh"]["faces"], "notes": tuple(info["notes"])}
+    except (OSError, ValueError, LookupError, TypeError):
+        return {}
+
+
+def items_of(paths: Sequence[Path], output: Path) -> list[Item]:
+    """The folders among ``paths`` and those that list files among them name, each with a name of its own in ``output``:
+    that of the folder, with a number where two are alike.  Raises InputError.
+    """
+    folders = [folder for path in paths for folder in (listed(path) if path.is_file() else [path])]
     taken = {SUMMARY}
     last: dict[str, int] = {}
     items = []
     for folder in folders:
-        base = folder.name if isinstance(folder, Packed) else Path(os.path.abspath(folder)).name or "object"
-        base = name = base if dots else base.replace(".", "_")
+        base = name = Path(os.path.abspath(folder)).name or "object"
         while name in taken:
             last[base] = last.get(base, 1) + 1
             name = f"{base}-{last[base]}"
@@ -127,7 +145,7 @@ def items_of(folders: Sequence[Path | Packed], output: Path, *, dots: bool = Tru
 
 
 def listed(path: Path) -> list[Path]:
-    """What a text file names, one folder or tar file a line, relative to where the command runs.  Raises InputError."""
+    """The folders that a text file names, one a line, relative to where the command runs.  Raises InputError."""
     try:
         lines = read_bytes(path, MAX_LIST).decode("utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
@@ -135,119 +153,150 @@ def listed(path: Path) -> list[Path]:
     folders = [Path(line.strip()) for line in lines if line.strip()]
     if not folders:
         raise InputError(path, "expected a folder on each line, got none; name the objects")
+    for folder in folders:
+        if "\0" in str(folder):
+            raise InputError(path, "expected a text file that names folders, got a zero byte; name a folder")
     return folders
 
 
 def in_processes(start: Callable[[], Job], items: Sequence[Item], count: int) -> Rows:
-    """Rows in the order of their ends.  start: makes the job of a process; it is pickled, and must leave one thread.
+    """Rows in the order in which they end.  start: makes the job of a process; it is pickled."""
+    job, pool = pickle.dumps((os.getcwd(), start)), _pool(count)
 
-    A process has one object at a time, so that one which dies takes no other with it.
-    """
-    context, left, again = get_context("spawn"), deque(items), set()
-    busy: dict = {}  # end of the pipe: process, item
-    idle: list = []
-
-    def give(pipe, process) -> None:
-        """The next object, or None where there is no more."""
-        try:
-            pipe.send(left[0] if left else None)
-        except OSError:  # it died between two objects
-            idle.append(process)
-            return
-        if left:
-            busy[pipe] = process, left.popleft()
-        else:
-            idle.append(process)
+    def submit(item: Item) -> Future:
+        nonlocal pool
+        with _blocked_interrupts():
+            try:
+                return pool.submit(_made, job, item)
+            except BrokenProcessPool:  # a worker crashed before
+                pool = _pool(count)
+                return pool.submit(_made, job, item)
 
     try:
-        while left or busy:
-            while left and len(busy) < count:
-                pipe, theirs = context.Pipe()
-                process = context.Process(target=_serve, args=(theirs, start), daemon=True)
-                process.start()
-                theirs.close()
-                give(pipe, process)
-            for ready in cast(list[Connection], wait(list(busy))):
-                process, item = busy.pop(ready)
-                try:
-                    row = ready.recv()
-                except (EOFError, OSError):
-                    idle.append(process)
-                    if item.name not in again:
-                        again.add(item.name)
-                        left.append(item)
-                        continue
-                    row = Row(item.name, "failed", notes=(KILLED,))
-                else:
-                    give(ready, process)
-                yield row
-    finally:
-        for process, _ in busy.values():
+        yield from _rows(submit, items, lambda: count, BrokenProcessPool, alone=True)
+        pool.shutdown()
+    except BaseException:  # also where the caller wants no more rows
+        pool.shutdown(wait=False, cancel_futures=True)
+        children = active_children()
+        for process in children:
             process.terminate()  # it removes what is half written
-            idle.append(process)
-        for process in idle:
+        for process in children:
             process.join(PATIENCE)
             process.kill()
-
-
-def _serve(pipe, start: Callable[[], Job]) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the command ends its processes itself
-    with signals():
-        try:
-            os.environ["TQDM_DISABLE"] = "1"  # bars of several processes in one terminal
-            job = start()
-            for item in iter(pipe.recv, None):
-                pipe.send(make(job, item))
-        except (Stopped, EOFError, BrokenPipeError):  # the command has ended
-            pass
+        raise
 
 
 def on_ray(start: Callable[[], Job], items: Sequence[Item], address: str, *, gpu: bool = False) -> Rows:
     """As :func:`in_processes` on a Ray cluster.  address: of it, ``auto`` for the one of this machine, ``local`` to
     start one.  All its machines must see the folders by the same paths, and have this package.
 
-    The connection is made at once.  Raises ValueError where there is none.
+    The connection is made at once.  Raises InputError where there is none.
     """
     try:
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is sent anywhere
         import ray
     except ImportError:
-        raise ValueError("--ray: expected Ray, got none; install it with pip install reli3d[ray]") from None
+        raise InputError("--ray", "expected Ray, got none; install it with pip install reli3d[ray]") from None
     before = signal.getsignal(signal.SIGTERM)
     try:
         ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
     except Exception as error:  # of many kinds
-        raise ValueError(f"--ray: expected a cluster at {printable(address)}, got {reason(error)}") from None
+        raise InputError("--ray", f"expected a cluster at {address}, got {reason(error)}") from None
     finally:
         signal.signal(signal.SIGTERM, before)
     return _on_ray(ray, start, items, gpu)
 
 
 def _on_ray(ray, start: Callable[[], Job], items: Sequence[Item], gpu: bool) -> Rows:
-    task = ray.remote(num_cpus=1, num_gpus=int(gpu), max_retries=1)(_made)
-    job, left = pickle.dumps((os.getcwd(), start)), deque(items)
-    running: dict[Any, Item] = {}
+    task = ray.remote(num_cpus=1, num_gpus=int(gpu), max_retries=0)(_made)
+    job = pickle.dumps((os.getcwd(), start))
+
+    def ahead() -> int:  # enough that no worker waits, and few to keep
+        return 2 * int(ray.cluster_resources().get("CPU", 1)) + 2
+
     try:
-        while left or running:
-            ahead = 2 * int(ray.cluster_resources().get("CPU", 1)) + 2  # enough that no worker waits, and few to keep
-            while left and len(running) < ahead:
-                item = left.popleft()
-                running[task.remote(job, item)] = item
-            for done in ray.wait(list(running))[0]:
-                item = running.pop(done)
-                try:
-                    yield ray.get(done)
-                except ray.exceptions.WorkerCrashedError:
-                    yield Row(item.name, "failed", notes=(KILLED,))
-                except ray.exceptions.RayError as error:
-                    said = [line for line in str(error).splitlines() if line.strip()] or [type(error).__name__]
-                    yield Row(item.name, "failed", notes=(printable(said[-1].strip()),))
+        submit = lambda item: task.remote(job, item).future()  # noqa: E731
+        yield from _rows(submit, items, ahead, ray.exceptions.WorkerCrashedError, alone=False)
     finally:
         ray.shutdown()
 
 
+def _rows(
+    submit: Callable[[Item], Future],
+    items: Sequence[Item],
+    limit: Callable[[], int],
+    crash: type[Exception],
+    *,
+    alone: bool,
+) -> Rows:
+    """Keep up to ``limit()`` objects submitted; one whose future raises ``crash`` is submitted once more.
+
+    alone: a crash ends all futures, so an object is retried while no other one is submitted.
+    """
+    left, again, running = deque(items), deque[Item](), dict[Future, tuple[Item, bool]]()
+    while left or again or running:
+        if again and not (alone and running):
+            item = again.popleft()
+            running[submit(item)] = item, True
+        while left and len(running) < limit() and not (alone and (again or any(r for _, r in running.values()))):
+            item = left.popleft()
+            running[submit(item)] = item, False
+        for future in wait(running, return_when=FIRST_COMPLETED).done:
+            item, retried = running.pop(future)
+            try:
+                row = future.result()
+                made = "done" if retried and row.result == "skipped" else row.result  # before another worker crashed
+                yield replace(row, result=made, retried=retried)
+            except crash:
+                if retried:
+                    yield Row(item.name, "failed", retried=True, notes=(CRASHED,))
+                    continue
+                tell(f"{printable(item.name)}: its worker crashed; it is made once more")
+                again.append(item)
+            except Exception as error:  # the job of the worker could not be made
+                yield Row(item.name, "failed", retried=retried, notes=(reason(error),))
+
+
+def _pool(count: int) -> ProcessPoolExecutor:
+    return ProcessPoolExecutor(count, mp_context=get_context("spawn"), initializer=_begin)
+
+
+def _begin() -> None:
+    """In a worker: no bars, as several would share one terminal, and an end with the command, however that ends."""
+    os.environ["TQDM_DISABLE"] = "1"
+    tqdm.set_lock(threading.RLock())  # its own one is a semaphore that a process which is killed would leave behind
+    parent = parent_process()
+
+    def watch() -> None:
+        if parent:
+            parent.join()
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+@contextlib.contextmanager
+def _blocked_interrupts():
+    """Processes that start in this block inherit that Ctrl-C does not reach them: the command ends them itself."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def _made(job: bytes, item: Item) -> Row:
-    return make(_kept(job), item)
+    """In a worker: make one object; SIGTERM ends the process after what is half written is removed."""
+    try:
+        with signals():
+            return make(_kept(job), item)
+    except Stopped as stop:
+        signal.signal(stop.number, signal.SIG_DFL)
+        signal.raise_signal(stop.number)
+        raise
 
 
 @functools.lru_cache(1)
@@ -258,25 +307,14 @@ def _kept(job: bytes) -> Job:
     return start()
 
 
-def called(module: str, name: str, *args) -> Any:
-    """What the function ``name`` of ``module`` gives: in another process ``__main__`` is another module."""
-    return getattr(importlib.import_module(module), name)(*args)
-
-
 def write_summary(path: Path, rows: Sequence[Row]) -> None:
     """Write a CSV table, a line an object; its folder is made.  Raises OSError."""
     path.parent.mkdir(parents=True, exist_ok=True)
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
-    table.writerow(["object", "result", "seconds", "mask_iou", "faces", "notes"])
+    table.writerow(COLUMNS)
     for row in rows:
-        values = [row.seconds, row.mask_iou, row.faces]
-        table.writerow(
-            [
-                printable(row.object),
-                row.result,
-                *("" if v is None else v for v in values),
-                printable("; ".join(row.notes)),
-            ]
-        )
+        values = ["" if v is None else v for v in (row.seconds, row.mask_iou, row.faces)]
+        name, notes = printable(row.object), printable("; ".join(row.notes))
+        table.writerow([name, row.result, *values, "yes" if row.retried else "", notes])
     write_bytes(path, text.getvalue().encode())

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import importlib
 import json
 import math
 import sys
 from dataclasses import replace
 from pathlib import Path
 
-from reli3d.cli.exit_codes import check_ranges, command
-from reli3d.cli.help_format import Defaults
+from reli3d.cli.exit_codes import Parser, check_ranges, command, extra
+from reli3d.errors import InputError
 
 FORMATS = ("png", "exr", "webp", "gif", "mp4")
 OTHER_FILMS = (".mov", ".avi", ".mkv", ".webm", ".m4v", ".apng")  # not written
@@ -22,8 +21,7 @@ QUALITIES = {"draft": ((6, 12, 2), 1), "good": ((20, 40, 4), 2), "best": ((64, 1
 
 
 def parser() -> argparse.ArgumentParser:
-    p = argparse.ArgumentParser(
-        formatter_class=Defaults,
+    p = Parser(
         prog="reli3d-render",
         description="Render a GLB with direct light and shadows under an HDR environment.",
         epilog="Exit code: 0 done, 2 wrong input.  The files' names go to stdout, progress to stderr.",
@@ -132,13 +130,13 @@ def _completed(args: argparse.Namespace) -> argparse.Namespace:
     args.file = args.output if ending in FORMATS and not args.output.is_dir() else None
     if args.file is not None:
         if args.format not in (None, ending):
-            raise ValueError(f"--format: expected {ending} as in the name of the output, got {args.format}")
+            raise InputError("--format", f"expected {ending} as in the name of the output, got {args.format}")
         args.format, args.output = ending, args.file.parent
     args.format = args.format or "png"
     moves = args.file is not None and args.format in MOVING
     args.frames = args.frames if args.frames is not None else 72 if moves else 1
     if args.file is not None and not moves and args.frames > 1:
-        raise ValueError(f"--frames: expected 1 where --output names one {ending}, got {args.frames}; name a folder")
+        raise InputError("--frames", f"expected 1 where --output names one {ending}, got {args.frames}; name a folder")
     samples, supersampling = QUALITIES[args.quality]
     args.samples = tuple(args.samples or samples)
     args.supersampling = args.supersampling if args.supersampling is not None else supersampling
@@ -151,22 +149,25 @@ def _check(args: argparse.Namespace) -> None:
 
     check_ranges(args, frames=(1, 3600), size=(1, 8192), supersampling=(1, 16), plan=(1, 65536), seed=(0, 10**9))
     if not all(0 <= k <= 65536 for k in args.samples) or sum(args.samples) == 0:
-        raise ValueError(f"--samples: expected three counts of 0 to 65536, one above 0, got {tuple(args.samples)}")
+        raise InputError("--samples", f"expected three counts of 0 to 65536, one above 0, got {tuple(args.samples)}")
     if args.output.suffix.lower() in OTHER_FILMS:
-        raise ValueError(
-            f"--output: expected a folder, or a name that ends in .png, .exr, .webp, .gif or .mp4, got {args.output}"
+        raise InputError(
+            "--output", f"expected a folder, or a name that ends in .png, .exr, .webp, .gif or .mp4, got {args.output}"
         )
     if args.format == "mp4":
         if args.size % 2:
-            raise ValueError(f"--size: expected an even number of pixels for mp4, got {args.size}")
-        importlib.import_module("reli3d.output.video").library()  # before minutes of work
+            raise InputError("--size", f"expected an even number of pixels for mp4, got {args.size}")
+        from reli3d.output import video
+
+        with extra("--format mp4"):
+            video.library()  # before minutes of work
     if not 1.0 <= args.fov <= 150.0:
-        raise ValueError(f"--fov: expected 1 to 150 degrees, got {args.fov}")
+        raise InputError("--fov", f"expected 1 to 150 degrees, got {args.fov}")
     for name, limit in (("elevation", 89.0), ("azimuth", 3600.0), ("exposure", 32.0)):
         if not abs(getattr(args, name)) <= limit:
-            raise ValueError(f"--{name}: expected {-limit:g} to {limit:g}, got {getattr(args, name)}")
+            raise InputError(f"--{name}", f"expected {-limit:g} to {limit:g}, got {getattr(args, name)}")
     if args.distance is not None and not 0.0 < args.distance < math.inf:
-        raise ValueError(f"--distance: expected a positive length, got {args.distance}")
+        raise InputError("--distance", f"expected a positive length, got {args.distance}")
     choose_device(args.device)
     check_folder(args.output)
 

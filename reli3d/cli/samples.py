@@ -45,14 +45,14 @@ class SampleJob:
     def run(self, folder: object, name: str, target: Path) -> str:
         """Write the sample ``name``: a seed, by the paper's protocol with the number of a light behind it.
 
-        Raises ValueError where the object cannot be made.
+        Raises InputError where the object cannot be made.
         """
         from safetensors import SafetensorError
         from safetensors.torch import save_file
 
         from reli3d.io.files import replacing
 
-        if target.exists():  # by a process that died after it
+        if target.exists():  # by a worker that crashed after it
             return "skipped"
         seed, _, light = name.partition("_")
         sample = self._paper(int(seed), int(light)) if self.wanted.paper else self._own(int(seed))

@@ -8,35 +8,25 @@ from multiprocessing import get_context
 from pathlib import Path
 
 from reli3d.cli.exit_codes import check_range, tell
-from reli3d.cli.help_format import Defaults
-from reli3d.io.files import InputError
-from reli3d.io.shards import fault, folder_files, pack_in_parts, read_index, write_shard
+from reli3d.errors import InputError
+from reli3d.io.shards import fault, read_index
 
 
 def add(actions) -> None:
     """Add the three to the sub-commands of ``reli3d-data``."""
     p = actions.add_parser(
         "pack",
-        formatter_class=Defaults,
         help="write samples or captures as shards",
         description="Write a folder of samples or captures as tar files of the WebDataset form; "
         "those that are there are kept.",
     )
-    p.add_argument(
-        "input", type=Path, help="folder of samples, of captures with transforms.json each, or of object folders"
-    )
+    p.add_argument("input", type=Path, help="folder of samples, or of captures with transforms.json each")
     p.add_argument("output", type=Path, help="folder for NNNNNN.tar and index.json")
     p.add_argument("--each", type=int, default=64, help="objects of a shard")
     p.add_argument("--workers", type=int, default=1)
-    p.add_argument(
-        "--folders",
-        action="store_true",
-        help="the files of object folders as they are, for reli3d-infer, instead of what a training reads",
-    )
     p.set_defaults(run=pack)
     p = actions.add_parser(
         "check",
-        formatter_class=Defaults,
         help="compare shards with their checksums",
         description="Read all shards and compare them with their index.",
     )
@@ -44,7 +34,6 @@ def add(actions) -> None:
     p.set_defaults(run=check)
     p = actions.add_parser(
         "show",
-        formatter_class=Defaults,
         help="list the objects of shards",
         description="List the objects: views, size, and what is known.",
     )
@@ -54,25 +43,7 @@ def add(actions) -> None:
     p.set_defaults(run=show)
 
 
-def _object_folders(source: Path) -> list[Path]:
-    if not source.is_dir():
-        raise InputError(source, "expected a folder of object folders, got none")
-    found = [p for p in sorted(source.iterdir()) if p.is_dir() and not p.name.startswith(".")]
-    if not found:
-        raise InputError(source, "expected object folders in it, got none; name the folder above them")
-    return found
-
-
-def _write(source: Path, output: Path, each: int, part: tuple[int, int], whole: bool) -> None:
-    if whole:
-        folders = _object_folders(source)
-
-        def write(number: int, numbers: range) -> dict:
-            objects = ((folders[k].name, folder_files(folders[k])) for k in numbers)
-            return write_shard(output, number, objects)
-
-        pack_in_parts(output, [p.name for p in folders], write, each=each, part=part, progress=tell)
-        return
+def _write(source: Path, output: Path, each: int, part: tuple[int, int]) -> None:
     import torch
 
     from reli3d.train.stages import shards
@@ -95,18 +66,18 @@ def pack(args: argparse.Namespace) -> int:
     check_range("each", args.each, 1, 10**6)
     check_range("workers", args.workers, 1, 1024)
     check_folder(args.output)
-    found = _object_folders(args.input) if args.folders else source(args.input)
+    found = source(args.input)
     if isinstance(found, Shards):
-        raise ValueError(f"input: expected samples or captures, got shards in {args.input}")
+        raise InputError("input", f"expected samples or captures, got shards in {args.input}")
     if isinstance(found, Captures):
         for name, reason in found.refused.items():
             tell(f"{name}: left out, {reason}")
     if args.workers == 1:
-        _write(args.input, args.output, args.each, (0, 1), args.folders)
+        _write(args.input, args.output, args.each, (0, 1))
         return 0
     with ProcessPoolExecutor(args.workers, get_context("spawn")) as pool:
         parts = [(k, args.workers) for k in range(args.workers)]
-        jobs = [pool.submit(_write, args.input, args.output, args.each, part, args.folders) for part in parts]
+        jobs = [pool.submit(_write, args.input, args.output, args.each, part) for part in parts]
         for job in jobs:
             job.result()
     return 0

@@ -8,16 +8,15 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from reli3d.cli.exit_codes import check_ranges, command, tell
-from reli3d.cli.help_format import Defaults
+from reli3d.cli.exit_codes import Parser, check_ranges, command, tell
+from reli3d.errors import InputError
 
 HELD = 3  # objects in the pictures
 OVERRIDES = ("steps", "batch", "rate", "image_size", "patch", "targets", "lobes", "resolution")  # of a stage
 
 
 def parser() -> argparse.ArgumentParser:
-    p = argparse.ArgumentParser(
-        formatter_class=Defaults,
+    p = Parser(
         prog="reli3d-stages",
         description="Train the paper's network, one stage a call; continues where it stopped.  Under torchrun the "
         "processes share each batch.",
@@ -64,16 +63,16 @@ def parser() -> argparse.ArgumentParser:
 
 
 def run_of(args: argparse.Namespace):
-    """The configuration that the arguments ask for.  Raises ValueError for what would end the work later."""
+    """The configuration that the arguments ask for.  Raises InputError for what would end the work later."""
     from reli3d.output.folder import check_folder
     from reli3d.train.stages.board import writer_class
     from reli3d.train.stages.config import PAPER, TINY, Run
 
     if not args.data and not args.export:
-        raise ValueError("data: expected folders of samples, captures or shards, got none")
+        raise InputError("data", "expected folders of samples, captures or shards, got none")
     stages = PAPER if args.preset == "official" else TINY
     if args.stage not in stages:
-        raise ValueError(f"stage: expected {', '.join(stages)} for {args.preset}, got {args.stage}")
+        raise InputError("stage", f"expected {', '.join(stages)} for {args.preset}, got {args.stage}")
     given = {name: getattr(args, name) for name in (*OVERRIDES, "samples", "shadows") if hasattr(args, name)}
     if "samples" in given:
         given["samples"] = tuple(given["samples"])
@@ -115,7 +114,7 @@ def main(argv: list[str] | None = None) -> int:
     from reli3d.train.workers import Workers
 
     if args.device == "cuda" and not torch.cuda.is_available():
-        raise ValueError("--device: expected a CUDA device, got none; leave it out to train on the CPU")
+        raise InputError("--device", "expected a CUDA device, got none; leave it out to train on the CPU")
     preset = TINY if args.preset == "tiny" else OFFICIAL
     if args.export:
         model = Reconstructor(preset)

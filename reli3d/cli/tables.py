@@ -6,15 +6,14 @@ import argparse
 import sys
 from pathlib import Path
 
-from reli3d.cli.exit_codes import check_range, command
-from reli3d.cli.help_format import Defaults
+from reli3d.cli.exit_codes import Parser, check_range, command
+from reli3d.errors import InputError
 
 MOST = 16  # input views
 
 
 def parser() -> argparse.ArgumentParser:
-    p = argparse.ArgumentParser(
-        formatter_class=Defaults,
+    p = Parser(
         prog="reli3d-tables",
         description="Render objects, reconstruct them from some of the views, and compare in the others.",
     )
@@ -51,7 +50,7 @@ def main(argv: list[str] | None = None) -> int:
     maps, names = load_maps(args.maps)
     lights = [Environment(m) for m, held in zip(maps, held_back(names), strict=True) if held]
     if len(lights) < 2:
-        raise ValueError("--maps: expected two held-back maps, so twelve maps, got fewer")
+        raise InputError("--maps", "expected two held-back maps, so twelve maps, got fewer")
     model = load_model(args.weights)
     tables, rows, sheet = table(
         model,

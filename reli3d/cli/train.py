@@ -8,8 +8,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from reli3d.cli.exit_codes import check_ranges, command, tell
-from reli3d.cli.help_format import Defaults
+from reli3d.cli.exit_codes import Parser, check_ranges, command, tell
+from reli3d.errors import InputError
 
 if TYPE_CHECKING:
     from reli3d.nn.local import LocalReconstructor
@@ -21,8 +21,7 @@ CALIBRATED = 5  # views of a sample: four are input, one is looked at
 
 
 def parser() -> argparse.ArgumentParser:
-    p = argparse.ArgumentParser(
-        formatter_class=Defaults,
+    p = Parser(
         prog="reli3d-train",
         description="Train the small network; continues where it stopped.  Under torchrun the processes share "
         "each batch.",
@@ -76,7 +75,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _check(args: argparse.Namespace) -> None:
-    """Raise InputError or ValueError for what would end the work later."""
+    """Raise InputError for what would end the work later."""
     from reli3d.output.folder import check_folder
     from reli3d.synthetic.stored import check_samples
 
@@ -85,7 +84,7 @@ def _check(args: argparse.Namespace) -> None:
     check_ranges(args, seed=(0, 10**9))
     check_folder(args.output)
     if args.pixels and (args.maps or args.export):
-        raise ValueError(f"--pixels: expected neither --maps nor --export with it, got {args.maps or args.export}")
+        raise InputError("--pixels", f"expected neither --maps nor --export with it, got {args.maps or args.export}")
     if args.export:
         check_folder(args.export.parent)
     if not args.export or not args.validation:
@@ -100,7 +99,7 @@ def _check_state(path: Path, model, config: TrainConfig | None = None, *, partly
     """
     import torch
 
-    from reli3d.io.files import InputError, file_size, shown
+    from reli3d.io.files import file_size, shown
     from reli3d.nn.weights import check_keys
     from reli3d.train.loop import parameter_groups
     from reli3d.train.pixels import lacking
@@ -135,7 +134,7 @@ def _check_state(path: Path, model, config: TrainConfig | None = None, *, partly
 
 def _begun(start: Path | None, pixels: int) -> LocalReconstructor:
     """The network with the weights of ``start``, or with random ones; the one for pictures of ``pixels`` a side.
-    Raises ValueError for another network's.
+    Raises InputError for another network's.
     """
     from reli3d.train.pixels import for_small_pictures
 
@@ -160,7 +159,7 @@ def _whole(start: Path | None) -> LocalReconstructor:
         return model.train()
     found = weights.load_model(str(start), "cpu")
     if not isinstance(found, LocalReconstructor):
-        raise ValueError(f"--weights: expected a network of convolutions, got the preset {found.preset.name}")
+        raise InputError("--weights", f"expected a network of convolutions, got the preset {found.preset.name}")
     return found.train().requires_grad_(True)
 
 

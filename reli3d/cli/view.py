@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import functools
 import http.server
 import sys
@@ -10,14 +11,15 @@ import webbrowser
 from pathlib import Path
 from urllib.parse import quote
 
-from reli3d.cli.help_format import Defaults
+from reli3d.cli.exit_codes import Parser, check_range, command
+from reli3d.errors import InputError
 
 PAGE = "viewer.html"
+HOSTS = ("localhost", "127.0.0.1", "[::1]")
 
 
 def parser() -> argparse.ArgumentParser:
-    p = argparse.ArgumentParser(
-        formatter_class=Defaults,
+    p = Parser(
         prog="reli3d view",
         description="Show a reconstruction in the browser: orbit, relight, its maps, the photographs over it.",
         epilog="The page also opens by itself, as a file.  Its address goes to stdout; Ctrl-C ends.",
@@ -28,34 +30,45 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
-class _Handler(http.server.SimpleHTTPRequestHandler):
+class Handler(http.server.SimpleHTTPRequestHandler):
+    """Files of one folder, for pages of this machine alone.
+
+    A request whose ``Host`` is not the server's own address is refused: a web page of another site, whose name has been
+    made to lead to 127.0.0.1 (DNS rebinding), would otherwise read the files.
+    """
+
+    def parse_request(self) -> bool:
+        if not super().parse_request():
+            return False
+        port = self.connection.getsockname()[1]
+        if self.headers.get_all("Host", []) in [[f"{name}:{port}"] for name in HOSTS]:
+            return True
+        self.send_error(403, "expected the address that reli3d view printed as Host")
+        return False
+
     def log_message(self, *_) -> None:
         """Requests are not logged."""
 
 
+@command("reli3d view")
 def main(argv: list[str] | None = None) -> int:
     args = parser().parse_args(argv)
+    if not (args.folder / PAGE).is_file():
+        below = [str(p.parent) for p in sorted(args.folder.glob(f"*/{PAGE}"))[:3]]
+        fix = f"give {' or '.join(below)}" if below else "make it with reli3d infer"
+        raise InputError(args.folder, f"expected a folder with {PAGE}, got none; {fix}")
+    check_range("port", args.port, 0, 65535)
+    handler = functools.partial(Handler, directory=str(args.folder))
     try:
-        if not (args.folder / PAGE).is_file():
-            below = [str(p.parent) for p in sorted(args.folder.glob(f"*/{PAGE}"))[:3]]
-            fix = f"give {' or '.join(below)}" if below else "make it with reli3d infer"
-            raise ValueError(f"{args.folder}: expected a folder with {PAGE}, got none; {fix}")
-        if not 0 <= args.port <= 65535:
-            raise ValueError(f"--port: expected 0 to 65535, got {args.port}")
-        handler = functools.partial(_Handler, directory=str(args.folder))
         server = http.server.ThreadingHTTPServer(("127.0.0.1", args.port), handler)
-    except (OSError, ValueError) as error:
-        print(f"reli3d view: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
-    with server:
+    except OSError as error:
+        raise InputError("--port", f"expected a free one, got {args.port} ({error.strerror}); leave it out") from None
+    with server, contextlib.suppress(KeyboardInterrupt):
         url = f"http://127.0.0.1:{server.server_port}/{quote(PAGE)}"
         print(url, flush=True)
         if not args.no_browser:
             webbrowser.open(url)
-        try:
-            server.serve_forever()
-        except KeyboardInterrupt:
-            return 0
+        server.serve_forever()
     return 0
 
 

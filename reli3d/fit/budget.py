@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 from tqdm import tqdm
@@ -14,8 +14,8 @@ from tqdm import tqdm
 class Budget:
     """Seconds or steps for the parts of a fit; ``steps`` alone gives the same result on every run.
 
-    curve: one entry every ``EVERY`` steps, ``{part, step, seconds, loss}``.  interrupted: Ctrl-C was pressed; parts
-    that are running end at once and later ones do not begin.
+    curve: one entry every ``EVERY`` steps, ``{part, step, seconds, loss}``.  interrupt: asked before every
+    step.  interrupted: it was true; parts that are running end at once and later ones do not begin.
     """
 
     seconds: float | None = None
@@ -23,6 +23,7 @@ class Budget:
     bar: tqdm | None = None
     curve: list[dict] = field(default_factory=list)
     counts: dict[str, int] = field(default_factory=dict)
+    interrupt: Callable[[], bool] | None = None
     interrupted: bool = False
     began: float = field(default_factory=time.perf_counter)
 
@@ -44,7 +45,10 @@ class Budget:
         started = time.perf_counter() - self.began
         done = sum(self.counts.values())
         count = self.counts[name] = 0
-        while not self.interrupted:
+        while True:
+            self.interrupted |= self.interrupt is not None and self.interrupt()
+            if self.interrupted:
+                return
             if self.steps is not None:
                 total = round(self.steps * until) - done
                 progress = count / max(total, 1)

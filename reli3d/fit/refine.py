@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 
 import torch
@@ -89,13 +89,14 @@ def refine(
     cameras: bool = False,
     seed: int = 0,
     bar: bool = False,
+    interrupt: Callable[[], bool] | None = None,
 ) -> Refinement:
     """``asset`` fitted to the photographs ``views``, in whose frame it lies.
 
     seconds or steps: one of the two; with ``steps`` the result is the same on every run of one machine.  resolution:
     cells of the surface's grid along the longest side, more where it is thin (:func:`~reli3d.fit.shape.start_grid`).
-    weights: of the losses.  cameras: correct the cameras as well.  bar: progress on stderr.  Ctrl-C ends the fit and
-    the best so far is taken.
+    weights: of the losses.  cameras: correct the cameras as well.  bar: progress on stderr.  interrupt:
+    asked before every step; once it is true the fit ends and the best so far is taken.
 
     Of three views or more some are held out: their masks bound the surface, their colours are not used.  What of the
     fit is taken says :func:`~reli3d.fit.choice.chosen`.  Raises TypeError or ValueError where asset and views do not
@@ -103,7 +104,7 @@ def refine(
     """
     photographs, weights = Photographs.of(views), weights or losses.Weights()
     _check_asset(asset, photographs)
-    budget = Budget(seconds, steps)
+    budget = Budget(seconds, steps, interrupt=interrupt)
     if bar:
         budget.bar = progress_bar(seconds or steps or 0, "s" if seconds else "steps")
     held = held_out(len(photographs))
@@ -114,11 +115,13 @@ def refine(
     received = gathered(first.mesh, near.select(used), seed=seed)
     before = picture_error(first, received, near)
     notes: list[str] = []
-    with torch.random.fork_rng(devices=[]), _interruptible(budget, notes):
+    with torch.random.fork_rng(devices=[]):
         fitted = _fitted(first, received, near, used, resolution, weights, budget, notes, seed=seed, cameras=cameras)
         kept, parts, after = chosen(fitted, used, list(held), before)
     if budget.bar is not None:
         budget.bar.close()
+    if budget.interrupted:
+        notes.append("refinement: interrupted, the best so far is taken")
     notes.append(f"refinement: {parts}")
     was, now = ((decibels(e[used]), decibels(e[list(held)])) for e in (before, after))
     if parts == NOTHING:
@@ -174,26 +177,3 @@ def _check_asset(asset: Asset, photographs: Photographs) -> None:
 def _moved(asset: Asset, shift: Tensor, scale: float) -> Asset:
     """``asset`` in the frame ``scale * (x - shift)``."""
     return replace(asset, mesh=replace(asset.mesh, vertices=scale * (asset.mesh.vertices - shift)))
-
-
-@contextmanager
-def _interruptible(budget: Budget, notes: list[str]):
-    """Ctrl-C ends the parts of a fit instead of the program."""
-    import signal
-    import threading
-
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def stop(number, frame):
-        if budget.interrupted:
-            raise KeyboardInterrupt
-        budget.interrupted = True
-        notes.append("refinement: interrupted, the best so far is taken")
-
-    before = signal.signal(signal.SIGINT, stop)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)

@@ -48,7 +48,7 @@ def read_exr(path: str | os.PathLike, max_pixels: int, notes: list[str]) -> tupl
     """
     header, names = _header(path, notes, max_pixels)
     try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
+        with OpenEXR.File(os.fsencode(path), separate_channels=True) as file:
             planes = [np.asarray(file.channels()[n].pixels, dtype=np.float32) for n in names]
     except Exception as error:  # the binding raises RuntimeError, ValueError, TypeError ... for a broken file
         raise InputError(path, f"pixels: cannot be decoded ({shown(str(error))}); save the file again") from None
@@ -73,7 +73,7 @@ def _header(path, notes: list[str], max_pixels: int) -> tuple[dict, list[str]]:
     data = read_bytes(path, MAX_BYTES)
     table = _header_end(path, data)
     try:
-        with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
+        with OpenEXR.File(os.fsencode(path), separate_channels=True, header_only=True) as file:
             parts, header = len(file.parts), dict(file.header())  # the file empties its own
             channels = {c.name: (c.xSampling, c.ySampling) for c in header["channels"]}
     except Exception as error:

@@ -7,29 +7,9 @@ import os
 import stat
 from pathlib import Path
 
+from reli3d.errors import InputError, printable, shown
 
-class InputError(ValueError):
-    """What a user gave cannot be used.  The text is one line that names the file, the field, the value and the fix."""
-
-    def __init__(self, where: object, problem: str):
-        super().__init__(" ".join(f"{printable(str(where))}: {printable(problem)}".split()))
-
-
-def printable(text: str) -> str:
-    """``text`` with control characters and what no terminal can show as escapes."""
-    return "".join(c if c.isprintable() else c.encode("unicode_escape", "replace").decode() for c in text)
-
-
-def shown(value: object, limit: int = 60) -> str:
-    """``value`` as it stands in a message: its repr on one line, cut after ``limit`` characters."""
-    try:
-        if isinstance(value, list | dict) and len(value) > 16:
-            text = f"{type(value).__name__} of {len(value)}"
-        else:
-            text = repr(value)
-    except (ValueError, RecursionError):  # an int of more digits than Python prints, a list nested without end
-        text = type(value).__name__
-    return text if len(text) <= limit else text[: limit - 3] + "..."
+__all__ = ["InputError", "file_size", "printable", "read_bytes", "replacing", "shown", "write_bytes"]
 
 
 def read_bytes(path: str | os.PathLike, limit: int) -> bytes:

@@ -113,7 +113,7 @@ def write_exr(path: str | os.PathLike, image: Tensor, *, half: bool = True) -> i
     with replacing(path) as temporary:
         temporary.touch()  # an unwritable folder gives an OSError here instead of the library's own exception
         with OpenEXR.File(header, {name: pixels.astype(np.float16) if half else pixels}) as file:
-            file.write(str(temporary))
+            file.write(os.fsencode(temporary))  # bytes: a name need not be UTF-8
     return clamped
 
 

@@ -8,12 +8,10 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import tarfile
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from reli3d.io.files import InputError, read_bytes, replacing, shown, write_bytes
+from reli3d.io.files import InputError, read_bytes, shown, write_bytes
 
 INDEX = "index.json"
 INDEX_LIMIT = 1 << 30  # bytes
@@ -21,26 +19,6 @@ INDEX_LIMIT = 1 << 30  # bytes
 
 def shard_name(number: int) -> str:
     return f"{number:06d}.tar"
-
-
-def write_shard(folder: Path, number: int, objects: Iterable[tuple[str, Sequence[tuple[str, Path]]]]) -> dict:
-    """Write files as one shard, whole or not at all, and its entry, which comes back.  Raises OSError.
-
-    objects: the name of each, and its files with the names that they get in the tar file.  The same files give the
-    same bytes.
-    """
-    names = []
-    with replacing(folder / shard_name(number)) as temporary:
-        with tarfile.open(temporary, "w", format=tarfile.PAX_FORMAT) as tar:
-            for name, files in objects:
-                names.append(name)
-                for stored, path in files:
-                    info = tarfile.TarInfo(stored)
-                    with open(path, "rb") as file:
-                        info.size = os.fstat(file.fileno()).st_size
-                        tar.addfile(info, file)
-        synced(temporary)  # the files may be deleted when the shard is there
-    return write_entry(folder, number, names)
 
 
 def pack_in_parts(
@@ -71,22 +49,6 @@ def pack_in_parts(
         write_index(folder, [json.loads(p.read_text()) for p in entries])
 
 
-def folder_files(folder: Path) -> list[tuple[str, Path]]:
-    """The files below a folder, with the names that they get in a tar file; those of hidden names are left out."""
-    below = ((path, path.relative_to(folder)) for path in sorted(folder.rglob("*")))
-    return [
-        (f"{folder.name}/{name.as_posix()}", path)
-        for path, name in below
-        if path.is_file() and not any(part.startswith(".") for part in name.parts)
-    ]
-
-
-def synced(path: Path) -> None:
-    """Have a file on the disk before what comes next."""
-    with open(path, "rb+") as file:
-        os.fsync(file.fileno())
-
-
 def write_entry(folder: Path, number: int, names: Sequence[str]) -> dict:
     """Write ``NNNNNN.json`` of a shard with the objects ``names``."""
     path = folder / shard_name(number)
@@ -113,15 +75,6 @@ def read_index(folder: Path) -> list[dict]:
     """Rows of the index.  Raises InputError for a broken one."""
     path = folder / INDEX
     return _rows(path, lambda stored: stored["shards"])
-
-
-def read_entries(folder: Path) -> dict[int, dict]:
-    """The entry of each shard, by its number, whether there is an index or not.  Raises InputError for a broken one."""
-    found = {}
-    for path in sorted(folder.glob("[0-9]*.json")):
-        if path.stem.isdecimal() and path.stem.isascii():
-            found[int(path.stem)] = _rows(path, lambda stored: [stored])[0]
-    return found
 
 
 def _rows(path: Path, rows_of) -> list[dict]:

@@ -1,6 +1,5 @@
 """Warp at its start, and the folder that holds compiled kernels."""
 
-import contextlib
 import os
 import shutil
 import sys
@@ -13,6 +12,7 @@ from types import ModuleType
 import warp as wp
 
 CPU_BLOCK = 1  # block size of Warp's CPU launches; loading a module for its default one would compile it once more
+EMBREE = ("embree", "shade_rays")  # modules whose kernels call Embree, which runs on a CPU alone
 LOADING = threading.Lock()  # Warp has none: it would be started, and a module compiled, by two threads at once
 
 
@@ -26,8 +26,7 @@ def initialise() -> None:
 def _start() -> None:
     wp.config.log_level = wp.LOG_WARNING
     try:
-        with no_driver_warning():
-            wp.init()
+        wp.init()
         writable = os.access(str(wp.config.kernel_cache_dir), os.W_OK)
     except OSError:
         writable = False
@@ -35,8 +34,14 @@ def _start() -> None:
         fallback = private_folder()
         print(f"reli3d: kernel cache {wp.config.kernel_cache_dir} cannot be written; using {fallback}", file=sys.stderr)
         wp.config.kernel_cache_dir = fallback
-        with no_driver_warning():
-            wp.init()
+        wp.init()
+
+
+def imported(kind: str) -> list[ModuleType]:
+    """The modules of :mod:`reli3d.kernels` with kernels for ``cpu`` or ``cuda`` that this process has imported."""
+    found = [m for name, m in sorted(sys.modules.items()) if name.startswith("reli3d.kernels.")]
+    found = [m for m in found if kind == "cpu" or m.__name__.rpartition(".")[2] not in EMBREE]
+    return [m for m in found if any(isinstance(value, wp.Kernel) for value in vars(m).values())]
 
 
 def compiled(modules: Sequence[ModuleType], kind: str) -> bool:
@@ -45,31 +50,6 @@ def compiled(modules: Sequence[ModuleType], kind: str) -> bool:
     block = CPU_BLOCK if kind == "cpu" else None
     names = [wp.get_module(m.__name__).get_module_identifier(block_dim=block) for m in modules]
     return all(os.path.isdir(os.path.join(str(wp.config.kernel_cache_dir), name)) for name in names)
-
-
-@contextlib.contextmanager
-def no_driver_warning():
-    """Keeps a line of Warp's native code from the terminal: that there is no NVIDIA driver.
-
-    Without one that is no news (``reli3d doctor`` says it), and it is written past Python to file descriptor 2.  What
-    else is written there meanwhile is passed on.
-    """
-    try:
-        terminal = os.dup(2)
-    except OSError:  # a process without that stream
-        yield
-        return
-    with tempfile.TemporaryFile() as caught:
-        os.dup2(caught.fileno(), 2)
-        try:
-            yield
-        finally:
-            os.dup2(terminal, 2)
-            os.close(terminal)
-            caught.seek(0)
-            rest = b"".join(line for line in caught if b"Could not find or load the NVIDIA CUDA driver" not in line)
-            if rest:
-                os.write(2, rest)
 
 
 def private_folder() -> str:

@@ -60,7 +60,7 @@ def _download(folder: Path) -> tuple[Path, str]:
     try:
         from huggingface_hub import errors, get_hf_file_metadata, hf_hub_download, hf_hub_url
     except ImportError:
-        raise WeightsError(CHECKPOINT, "--download needs huggingface_hub: pip install 'reli3d[hub]'") from None
+        raise WeightsError(CHECKPOINT, "reli3d download needs huggingface_hub: pip install 'reli3d[hub]'") from None
     endpoint = os.environ.get("HF_ENDPOINT")
     url = hf_hub_url(REPOSITORY, CHECKPOINT, endpoint=endpoint)
     try:

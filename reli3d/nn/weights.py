@@ -181,7 +181,7 @@ def locate(weights: str | os.PathLike) -> Path:
         path, fix = SMALL, "install the package again"
     elif os.fspath(weights) == "official":
         path = official_path()
-        fix = "fetch them with --download (about 7 GB, Stability AI Community License), or give a converted file"
+        fix = "fetch them with reli3d download (about 7 GB, Stability AI Community License), or give a converted file"
     else:
         path, fix = Path(weights), "check the path"
     if not path.is_file():

@@ -1,14 +1,17 @@
-"""A result folder changes at once: its files are written beside it, then two renames put them in its place.
+"""A result folder changes at once: its files are written beside it, then exchanged with it.
 
 While ``NAME`` is made, ``.NAME.partial`` lies beside it.  It holds ``lock`` (the process at work has it), ``new`` (the
 files) and, during the exchange, ``old``.  A process that is killed leaves it behind; the next one that claims ``NAME``
-ends the exchange or throws the files away.  Between the two renames ``NAME`` is missing, and ``new`` is whole.
+ends the exchange or removes the files.  Linux exchanges two folders in one step (renameat2 with RENAME_EXCHANGE).
+Elsewhere two renames do it; between them ``NAME`` is missing, and ``new`` is whole.
 """
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import errno
+import hashlib
 import os
 import shutil
 from collections.abc import Callable, Collection, Iterator
@@ -23,25 +26,19 @@ except ImportError:  # Windows: another process at the same folder is not notice
 
 PARTIAL = ".partial"
 LONGEST = 255  # bytes of a name, on every usual file system
+AT_FDCWD, RENAME_EXCHANGE = -100, 2  # of Linux: fcntl.h, linux/fs.h
 NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.ENOLCK)  # file systems that have none: the same
 
 
-def check_folder(folder: Path, *, longest: int = LONGEST) -> Path:
-    """``folder``, there or not, with links resolved; nothing is written.  Raises InputError where it takes no file.
-
-    longest: bytes of its own name.
-    """
+def check_folder(folder: Path) -> Path:
+    """``folder``, there or not, with links resolved; nothing is written.  Raises InputError where it takes no file."""
     folder = Path(os.path.realpath(folder))
-    try:
-        str(folder).encode()
-    except UnicodeEncodeError:
-        raise InputError(folder, "expected an output folder with a name in UTF-8; give another --output") from None
-    for part, limit in (*((p, LONGEST) for p in folder.parts[:-1]), (folder.name, longest)):
-        if len(part.encode()) > limit:
+    for part in folder.parts:
+        if (size := len(os.fsencode(part))) > LONGEST:
             raise InputError(
                 shown(part),
-                f"expected a name of at most {limit} bytes for the output, got "
-                f"{len(part.encode())}; rename the folder or give another --output",
+                f"expected a name of at most {LONGEST} bytes for the output, got {size}; rename the folder or give "
+                "another --output",
             )
     above = folder
     while not os.path.lexists(above):
@@ -54,8 +51,8 @@ def check_folder(folder: Path, *, longest: int = LONGEST) -> Path:
 
 
 def check_place(folder: Path) -> Path:
-    """:func:`check_folder` of a result folder, which others of its name must fit beside."""
-    folder = check_folder(folder, longest=LONGEST - len(".") - len(PARTIAL))
+    """:func:`check_folder` of a result folder, beside which others can be written."""
+    folder = check_folder(folder)
     check_folder(folder.parent)
     if os.path.ismount(folder):
         raise InputError(folder, "expected a folder that can be renamed, got a mount point; mount its parent")
@@ -96,13 +93,18 @@ def claimed(folder: Path, ours: Collection[str]) -> Iterator[Callable]:
 
 @contextlib.contextmanager
 def _replacing(work: Path, folder: Path, ours: Collection[str]) -> Iterator[Path]:
-    new = work / "new"
+    new, old = work / "new", work / "old"
     new.mkdir()
     yield new
     if folder.exists():
         shutil.copymode(folder, new)
-        os.rename(folder, work / "old")
-    os.rename(new, folder)
+        os.rename(new, old)  # what has this name is kept until nothing foreign is in it
+        if not exchanged(old, folder):
+            os.rename(old, new)
+            os.rename(folder, old)
+            os.rename(new, folder)
+    else:
+        os.rename(new, folder)
     _settle(work, folder, ours)
 
 
@@ -119,8 +121,31 @@ def _settle(work: Path, folder: Path, ours: Collection[str]) -> None:
     shutil.rmtree(new, ignore_errors=True)
 
 
+def exchanged(first: Path, second: Path) -> bool:
+    """Exchange the names of two files or folders in one step; False, and nothing done, where the system cannot."""
+    try:
+        rename = ctypes.CDLL(None, use_errno=True).renameat2  # of glibc 2.28 and musl on Linux
+    except (AttributeError, OSError, TypeError):
+        return False
+    rename.argtypes = (ctypes.c_int, ctypes.c_char_p, ctypes.c_int, ctypes.c_char_p, ctypes.c_uint)
+    if rename(AT_FDCWD, os.fsencode(first), AT_FDCWD, os.fsencode(second), RENAME_EXCHANGE) == 0:
+        return True
+    code = ctypes.get_errno()
+    if code in (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP):  # the kernel or the file system cannot
+        return False
+    raise OSError(code, os.strerror(code), str(first), None, str(second))
+
+
+def sibling(path: Path, before: str, after: str) -> Path:
+    """``path`` with its name between ``before`` and ``after``, or in its place a hash where that would be too long."""
+    name = f"{before}{path.name}{after}"
+    if len(os.fsencode(name)) > LONGEST:
+        name = f"{before}{hashlib.sha256(os.fsencode(path.name)).hexdigest()[:32]}{after}"
+    return path.with_name(name)
+
+
 def _work(folder: Path) -> Path:
-    return folder.with_name(f".{folder.name}{PARTIAL}")
+    return sibling(folder, ".", PARTIAL)
 
 
 def _locked(work: Path, folder: Path) -> int:

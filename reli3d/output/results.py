@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 import reli3d
+from reli3d.errors import printable
 from reli3d.geometry.camera import camera_rays
 from reli3d.geometry.mesh import Mesh, report
 from reli3d.geometry.rays import RayScene
@@ -22,30 +23,22 @@ from reli3d.io.glb import glb_bytes
 from reli3d.io.hdr import write_environment
 from reli3d.io.images import png_bytes, write_png
 from reli3d.nn.blocks import beside
-from reli3d.nn.reni import to_published
 from reli3d.nn.weights import Manifest
 from reli3d.output.folder import claimed
 from reli3d.output.viewer import Shown, photograph_stops, shadow, viewer_page
 from reli3d.render.asset import Asset
-from reli3d.render.environment import Environment
 from reli3d.views.similarity import Similarity
 from reli3d.views.views import Views
 
 FILES = ("mesh.glb", "environment.exr", "environment.hdr", "preview.png", "viewer.html", "run_info.json")
 COMPARISON = "refine.png"  # of a refinement
-PUBLISHED_LIGHT = "illumination.hdr"  # name of the light in the published release, whose centre column is -Z
 SILHOUETTE = 256  # pixels a side by which mesh and masks are compared
-OURS = (*FILES, COMPARISON, PUBLISHED_LIGHT)  # what a new result never leaves of an old one
+OURS = (*FILES, COMPARISON, "illumination.hdr")  # what a new result never leaves of an old one
 
 
-def complete(folder: Path, *, compatible: bool = False, refined: bool = False) -> bool:
-    """Whether ``folder`` holds every file of a reconstruction, with ``compatible`` the published name too."""
-    return all((folder / name).is_file() for name in names(compatible=compatible, refined=refined))
-
-
-def names(*, compatible: bool = False, refined: bool = False) -> tuple[str, ...]:
-    """The files of a reconstruction."""
-    return (*FILES, *([PUBLISHED_LIGHT] if compatible else []), *([COMPARISON] if refined else []))
+def complete(folder: Path, *, refined: bool = False) -> bool:
+    """Whether ``folder`` holds every file of a reconstruction."""
+    return all((folder / name).is_file() for name in (*FILES, *([COMPARISON] if refined else [])))
 
 
 def claim(folder: Path) -> AbstractContextManager[Callable]:
@@ -129,7 +122,7 @@ def encode(
             shown["before"] = started()
         low, high = asset.mesh.vertices.aminmax(dim=0)
         middle, radius = (low + high) / 2, float((high - low).norm()) / 2
-        return viewer_page(name, shown, asset.light.radiance, middle, radius, stops())
+        return viewer_page(printable(name), shown, asset.light.radiance, middle, radius, stops())
 
     placed = beside(moved, device) if any(translation) else glb
     return Encoded(asset, placed, beside(page, device))
@@ -145,14 +138,13 @@ def write_results(
     picture: np.ndarray,
     info: dict,
     *,
-    compatible: bool = False,
     comparison: np.ndarray | None = None,
 ) -> None:
     """Write :data:`FILES`; an error leaves what was there before.  Raises OSError, ValueError.
 
     replacing: what :func:`claim` of the folder gives.  picture: of the asset, from
     :func:`~reli3d.output.preview.preview`.  info: what ``run_info.json`` holds, the convention of the light apart.
-    compatible: write the light as :data:`PUBLISHED_LIGHT` as well.  comparison: the picture of a refinement.
+    comparison: the picture of a refinement.
     """
     light = encoded.asset.light
     info = {**info, "environment_centre": "+X"}
@@ -161,8 +153,6 @@ def write_results(
         (new / "mesh.glb").write_bytes(encoded.placed())
         for name in ("environment.exr", "environment.hdr"):
             write_environment(new / name, light)
-        if compatible:
-            write_environment(new / PUBLISHED_LIGHT, Environment(to_published(light.radiance)))
         if comparison is not None:
             write_png(new / COMPARISON, comparison)
         (new / "viewer.html").write_text(encoded.page(), encoding="utf-8")
@@ -170,7 +160,7 @@ def write_results(
 
 
 def frame_record(
-    model_from_views: Similarity, output_from_views: Similarity, origin: Sequence[float], frame: str, up: str
+    model_from_views: Similarity, output_from_views: Similarity, origin: Sequence[float], up: str
 ) -> tuple[dict, list[float]]:
     """The frames of the output, as matrices on column vectors, and the translation that its mesh needs.
 
@@ -178,10 +168,9 @@ def frame_record(
     """
     began = torch.tensor(origin, dtype=torch.float64, device="cpu")
     read = Similarity(1.0, torch.eye(3, dtype=torch.float64, device="cpu"), -began)
-    back = output_from_views.rotation @ began if frame == "input" else torch.zeros_like(began)
+    back = output_from_views.rotation @ began
     output = Similarity(output_from_views.scale, output_from_views.rotation, output_from_views.translation + back)
     return {
-        "frame": frame,
         "up": up,
         "model_from_input": model_from_views.compose(read).matrix().tolist(),
         "output_from_input": output.compose(read).matrix().tolist(),

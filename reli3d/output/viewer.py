@@ -17,6 +17,7 @@ from PIL import Image, WebPImagePlugin
 from torch import Tensor
 
 import reli3d
+from reli3d.errors import printable
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene
 from reli3d.io.hdr import environment_bytes
@@ -111,7 +112,7 @@ def _stop(views: Views, i: int) -> dict:
     fx, fy, cx, cy = views.intrinsics[i].tolist()
     sx, sy = size[0] / width, size[1] / height
     return {
-        "name": views.names[i],
+        "name": printable(views.names[i]),
         "image": f"data:image/webp;base64,{_base64(data.getvalue())}",
         "width": size[0],
         "height": size[1],

@@ -174,7 +174,7 @@ def _chosen(
             indices = ", ".join(str(usable[i]) for i in taken)
             notes.append(
                 f"{len(taken)} of {len(frames)} views taken, farthest apart in direction and distance: {indices}; "
-                "--first-views N takes the first N"
+                "load_views(first_views=N) takes the first N"
             )
     else:
         taken = list(range(count))

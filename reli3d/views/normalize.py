@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d, pad
 
 from reli3d._bridge import full_precision
+from reli3d.errors import InputError
 from reli3d.views.similarity import Similarity
 from reli3d.views.views import LEAST_WHOLE, Views, mask_box, touches_border
 
@@ -40,7 +41,7 @@ class Hull:
     def box(self) -> tuple[Tensor, Tensor]:
         """Lower and upper corner ``(3,)``, to half a cell.  ValueError on an empty hull."""
         if len(self.points) == 0:
-            raise ValueError("hull: expected a point inside all masks, got none; run --check to see the cameras")
+            raise InputError("hull", "expected a point inside all masks, got none; run reli3d check to see the cameras")
         return self.points.amin(0), self.points.amax(0)  # the border runs through the outermost cells
 
 
@@ -55,7 +56,7 @@ def normalize(views: Views, mode: str = "auto") -> Similarity:
     Captures from one side, all eyes within 90 degrees seen from the object, leave its depth open: it is at most 1.3
     widths of the masks, where the hull is cut, and the box is aligned with the mean viewing direction, so that the
     scale does not depend on the frame.  One view (or views from one direction) has no scale: the depth is guessed as
-    the width, at the point of the ray that is nearest to the origin.  Raises ValueError where no point lies inside all
+    the width, at the point of the ray that is nearest to the origin.  Raises InputError where no point lies inside all
     masks.
     """
     if mode not in ("auto", "none", "hull"):
@@ -162,7 +163,7 @@ def near_origin(c2w: Tensor) -> Tensor:
     """The point ``(3,)`` float64 that shall be the origin of cameras ``c2w (V, 4, 4)`` float64: where they look, if
     the origin of their frame is more than FAR times as far from there as they are; else zero.
 
-    Raises ValueError where they are nearer to it than SMALLEST, unless all stand in one point, as the eyes of a rig
+    Raises InputError where they are nearer to it than SMALLEST, unless all stand in one point, as the eyes of a rig
     about the origin do where its matrices are world-to-camera.
     """
     eyes = c2w[:, :3, 3]
@@ -171,9 +172,9 @@ def near_origin(c2w: Tensor) -> Tensor:
     aim = meeting_point(eyes, -c2w[:, :3, 2])[0]
     reach = float((eyes - aim).norm(dim=-1).median())
     if reach < SMALLEST and float((eyes - aim).abs().max()) > WRITTEN * float(eyes.abs().max()):
-        raise ValueError(
-            f"cameras: expected a distance of {SMALLEST:g} or more to the object, got {reach:.3g}; "
-            "scale the positions up"
+        raise InputError(
+            "cameras",
+            f"expected a distance of {SMALLEST:g} or more to the object, got {reach:.3g}; scale the positions up",
         )
     return aim if float(aim.norm()) > FAR * reach and reach >= SMALLEST else torch.zeros_like(aim)
 

@@ -15,6 +15,7 @@ from PIL import Image
 from torch import Tensor
 from torch.nn.functional import interpolate
 
+from reli3d.errors import InputError
 from reli3d.views.normalize import normalize
 from reli3d.views.views import ViewBatch, Views
 
@@ -64,25 +65,22 @@ def _resized(pixels: Tensor, size: int) -> Tensor:
     return moved[0].permute(1, 2, 0)
 
 
-def hero_first(views: Views, hero: int | str, seed: int = 0) -> Views:
-    """``views`` with the one of index ``hero`` first and the rest in their order; ``random``: the one ``seed`` draws.
-
-    Raises ValueError on an index that is none.
+def hero_first(views: Views, hero: int) -> Views:
+    """``views`` with the one of index ``hero`` first and the rest in their order.  Raises InputError on an index that
+    is none.
     """
     count = len(views)
-    if hero == "random":
-        hero = int(np.random.default_rng(seed).integers(count))
     if isinstance(hero, bool) or not isinstance(hero, int) or not 0 <= hero < count:
-        raise ValueError(f"hero: expected random or 0 to {count - 1} with {count} views, got {hero}")
+        raise InputError("hero", f"expected 0 to {count - 1} with {count} views, got {hero}")
     return views if hero == 0 else views.select([hero, *(i for i in range(count) if i != hero)])
 
 
 def background_shown(views: Views, background: str, *, readable: bool) -> bool:
     """Whether the illumination path may look at the background: never if ``masked``, always if ``visible``, and if
-    ``auto`` where the weights were trained to (``readable``) and every view has one.  ValueError on another word.
+    ``auto`` where the weights were trained to (``readable``) and every view has one.  InputError on another word.
     """
     if background not in BACKGROUNDS:
-        raise ValueError(f"background: expected {', '.join(BACKGROUNDS)}, got {background}")
+        raise InputError("background", f"expected {', '.join(BACKGROUNDS)}, got {background}")
     if background != "auto":
         return background == "visible"
     return readable and all(has_background(i, m) for i, m in zip(views.images, views.masks, strict=True))

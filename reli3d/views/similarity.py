@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from reli3d._bridge import full_precision
+from reli3d.errors import InputError
 
 UP = {  # rotations that carry an axis to +Y
     "y": torch.eye(3, dtype=torch.float32, device="cpu"),
@@ -59,11 +60,10 @@ class Similarity:
         return self.scale == 1.0 and same and not bool(self.translation.any())
 
 
-def output_frame(model_from_input: Similarity, frame: str, up: str) -> Similarity:
-    """The frame of the asset from the frame of the input cameras.  Raises ValueError on a name that is none."""
-    if frame not in ("input", "model"):
-        raise ValueError(f"frame: expected input or model, got {frame}")
+def output_frame(up: str) -> Similarity:
+    """The frame of the asset, whose +Y is the axis ``up`` of the input cameras' frame.  Raises InputError on another
+    word.
+    """
     if up not in UP:
-        raise ValueError(f"up: expected one of {', '.join(UP)}, got {up}")
-    turn = Similarity(1.0, UP[up].double(), torch.zeros(3, dtype=torch.float64, device="cpu"))
-    return turn.compose(model_from_input) if frame == "model" else turn
+        raise InputError("up", f"expected one of {', '.join(UP)}, got {up}")
+    return Similarity(1.0, UP[up].double(), torch.zeros(3, dtype=torch.float64, device="cpu"))

@@ -379,17 +379,3 @@ def test_threads_start_warp_once(monkeypatch):
     with ThreadPoolExecutor(4) as pool:
         list(pool.map(lambda _: (cache.initialise(), started.append(0)), range(4)))
     assert started == [1, 0, 0, 0, 0]
-
-
-@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
-def test_a_missing_driver_is_no_warning_and_other_words_are_passed_on():
-    code = """
-import os, warp as wp
-from reli3d.kernels.cache import initialise
-init = wp.init
-wp.init = lambda: (os.write(2, b"other words\\n"), init())
-initialise()
-os.write(2, b"later\\n")
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0 and done.stderr == "other words\nlater\n"

@@ -1,9 +1,13 @@
 """``reli3d``: every command by its name; ``reli3d view`` serves the page of a folder and nothing else."""
 
+import functools
+import http.client
+import http.server
 import re
 import signal
 import subprocess
 import sys
+import threading
 import urllib.error
 import urllib.request
 
@@ -16,7 +20,7 @@ from tests.support.signals import heed_signals
 def test_help_names_every_command_and_the_old_names(capsys):
     assert main.main([]) == 0
     text = capsys.readouterr().out
-    for name in ("infer", "view", "check", "render", "data", "train", "stages", "eval", "tables", "doctor"):
+    for name in ("infer", "view", "check", "render", "download", "data", "train", "stages", "eval", "tables", "doctor"):
         assert re.search(rf"^  {name} ", text, re.MULTILINE)
     for name in ("infer", "render", "data", "train", "stages", "eval", "tables"):
         assert f"reli3d-{name}" in text
@@ -30,14 +34,13 @@ def test_every_command_has_its_help(name, capsys):
 
 
 def test_options_reach_the_command_and_so_does_its_exit_code(monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(doctor, "examine", lambda: ("ill", False))
-    assert main.main(["doctor"]) == 1 and capsys.readouterr().out == "ill\n"
+    monkeypatch.setattr(doctor, "examine", lambda: ([("state", "ill")], False))
+    assert main.main(["doctor"]) == 1 and capsys.readouterr().out.split() == ["state", "ill"]
     assert main.main(["view", str(tmp_path)]) == 2
     assert capsys.readouterr().err.startswith("reli3d view: ")
     assert main.main(["check", str(tmp_path), "--output", str(tmp_path)]) == 2  # not an object folder
-    with pytest.raises(SystemExit) as stop:
-        main.main(["infr"])
-    assert stop.value.code == 2
+    assert main.main(["infr"]) == 2
+    assert "invalid choice: 'infr'" in capsys.readouterr().err
 
 
 def test_view_serves_the_folder_on_this_machine_until_it_is_told_to_stop(tmp_path):
@@ -59,6 +62,38 @@ def test_view_serves_the_folder_on_this_machine_until_it_is_told_to_stop(tmp_pat
             process.send_signal(signal.SIGINT)
             assert process.wait(30) == 0
         assert process.stderr.read() == ""
+
+
+def test_view_answers_its_own_address_alone(tmp_path):
+    """A page of another site whose name leads to 127.0.0.1 (DNS rebinding) sends that name as ``Host``."""
+    (tmp_path / view.PAGE).write_text("the page")
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(view.Handler, directory=str(tmp_path)))
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    port = server.server_port
+
+    def status(*hosts: str) -> int:
+        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
+        connection.putrequest("GET", f"/{view.PAGE}", skip_host=True)
+        for host in hosts:
+            connection.putheader("Host", host)
+        connection.endheaders()
+        return connection.getresponse().status
+
+    try:
+        for name in ("localhost", "127.0.0.1", "[::1]"):
+            assert status(f"{name}:{port}") == 200
+        for host in (
+            "evil.example",
+            f"evil.example:{port}",
+            "localhost",
+            f"127.0.0.1:{port + 1}",
+            f"127.0.0.1.x:{port}",
+        ):
+            assert status(host) == 403, host
+        assert status() == 403 and status(f"localhost:{port}", "evil.example") == 403
+    finally:
+        server.shutdown()
+        server.server_close()
 
 
 @pytest.mark.parametrize("arguments", [["none"], [".", "--port", "70000"]])

@@ -14,26 +14,29 @@ from tests.support.signals import heed_signals
 
 # reli3d-infer without torch, which takes seconds to load, and without a network: its one object is {body}
 QUICK = """
-import sys, time, types
-from pathlib import Path
+import atexit, sys, threading, time, types
 from reli3d.cli import infer
 from reli3d.output.folder import claimed
-sys.modules["reli3d.output.results"] = types.SimpleNamespace(claim=lambda folder: claimed(folder, ["mesh.glb"]))
+class Job:
+    def __init__(self, args, device, budget):
+        pass
+    def run(self, folder, name, target):
+        with claimed(target, ["mesh.glb"]) as replacing:
+            {body}
+        return "done"
+sys.modules["reli3d.cli.job"] = types.SimpleNamespace(FolderJob=Job, worker=Job)
 infer.choose_device = lambda wanted: wanted
-class Job(infer.Job):
-    def __init__(self, args, device):
-        self.args = args
-    def _run(self, folder, name, replacing, steps):
-        {body}
-infer.Job = Job
-sys.exit(infer.main(sys.argv[1:]))
+sys.exit(infer.main())
 """
 WRITES = """with replacing() as new:
-            (new / "mesh.glb").write_text("mesh")"""
+                (new / "mesh.glb").write_text("mesh")"""
 WAITS = """with replacing() as new:
-            (new / "mesh.glb").write_text("mesh")
-            print("working", flush=True)
-            time.sleep(60)"""
+                (new / "mesh.glb").write_text("mesh")
+                print("working", flush=True)
+                time.sleep(60)"""
+ENDS_LATE = f"""{WRITES}
+            threading.Thread(target=time.sleep, args=(0.4,)).start()
+            atexit.register(time.sleep, 0.4)"""
 
 
 def start(arguments, *, body=WRITES, **options) -> subprocess.Popen:
@@ -42,7 +45,7 @@ def start(arguments, *, body=WRITES, **options) -> subprocess.Popen:
     return subprocess.Popen([sys.executable, "-c", QUICK.format(body=body), *map(str, arguments)], **options)
 
 
-def told(text: str) -> list[str]:
+def lines_of(text: str) -> list[str]:
     """The command's own lines; the bar is redrawn with carriage returns."""
     return [line for line in re.split("[\r\n]", text) if line.startswith("reli3d-infer: ")]
 
@@ -57,12 +60,12 @@ def test_a_signal_ends_with_one_line_and_leaves_nothing_behind(tmp_path, number,
     process.send_signal(number)
     out, err = process.communicate(timeout=30)
     assert process.returncode == code and out == "" and "Traceback" not in err
-    assert len(told(err)) == 1 and text in told(err)[0]
+    assert len(lines_of(err)) == 1 and text in lines_of(err)[0]
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_place_that_cannot_be_written_is_told_before_the_weights_are_read(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(infer, "Job", None)  # a call raises TypeError
+def test_a_place_that_cannot_be_written_is_refused_before_the_weights_are_read(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(infer, "refinement_budget", None)  # called before the weights are read: TypeError
     (tmp_path / "file").touch()
     for output in (tmp_path / "file", tmp_path / "file" / "out", tmp_path / ("n" * 300)):
         began = time.monotonic()
@@ -83,12 +86,12 @@ def test_ascii_streams_change_nothing(tmp_path):
     assert out.endswith("\\xf6\\xdfe/example/mesh.glb\n") and "Traceback" not in err
     process = start(
         [tmp_path / "größer"],
-        body="raise ValueError('größer')",
+        body="from reli3d.errors import InputError; raise InputError('größer', 'expected another')",
         cwd=tmp_path,
         env={**os.environ, "PYTHONIOENCODING": "ascii:strict"},
     )
     err = process.communicate(timeout=60)[1]
-    assert process.returncode == 2 and told(err) == ["reli3d-infer: gr\\xf6\\xdfer"]
+    assert process.returncode == 2 and lines_of(err) == ["reli3d-infer: gr\\xf6\\xdfer: expected another"]
 
 
 @pytest.mark.parametrize("streams", [(1,), (2,), (0, 1, 2)])
@@ -124,11 +127,63 @@ def test_a_full_disk_is_one_line_and_leaves_the_old_result(tmp_path):
     (tmp_path / "out/example").mkdir(parents=True)
     (tmp_path / "out/example/mesh.glb").write_text("old")
     body = """import resource
-        resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
-        with replacing() as new:
-            (new / "mesh.glb").write_bytes(bytes(1 << 20))"""
+            resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
+            with replacing() as new:
+                (new / "mesh.glb").write_bytes(bytes(1 << 20))"""
     process = start(["--output", tmp_path / "out"], body=body)
     out, err = process.communicate(timeout=60)
     assert process.returncode == 1 and out == ""
-    assert len(told(err)) == 1 and "File too large" in told(err)[0] and "Traceback" not in err
-    assert (tmp_path / "out/example/mesh.glb").read_text() == "old" and len(list((tmp_path / "out").iterdir())) == 1
+    assert len(lines_of(err)) == 1 and "File too large" in lines_of(err)[0] and "Traceback" not in err
+    assert (tmp_path / "out/example/mesh.glb").read_text() == "old"
+    assert {p.name for p in (tmp_path / "out").iterdir()} <= {"example", "example.reli3d.log"}
+
+
+@pytest.mark.skipif(os.name == "nt", reason="needs signals")
+@pytest.mark.parametrize("number, code", [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_while_the_interpreter_ends_is_one_line_too(tmp_path, number, code):
+    """After the path is printed the process waits for a thread, then for what is registered at exit."""
+    codes = []
+    for k in range(6):
+        process = start(["--output", tmp_path / "out"], body=ENDS_LATE)
+        assert process.stdout.readline().endswith("mesh.glb\n")
+        printed = time.monotonic()
+        time.sleep(0.15 * k)
+        early = time.monotonic() - printed < 0.75  # of 0.8
+        process.send_signal(number)
+        _, err = process.communicate(timeout=30)
+        found = (process.returncode, len(lines_of(err)))
+        assert found == (code, 1) or (not early and found == (0, 0)), (k, found, err)
+        assert "Traceback" not in err and "Exception" not in err
+        codes.append(process.returncode)
+    assert code in codes
+    assert (tmp_path / "out/example/mesh.glb").read_text() == "mesh"
+
+
+@pytest.mark.parametrize("error", ["TypeError", "ValueError", "ImportError", "KeyError", "OSError"])
+def test_what_no_input_explains_is_one_line_exit_code_1_and_a_log(tmp_path, error):
+    body = f"raise {error}('spoon')"
+    for options, traces in ([], 0), (["--traceback"], 1):
+        process = start(["--output", tmp_path / "out", *options], body=body)
+        out, err = process.communicate(timeout=60)
+        assert process.returncode == 1 and out == "" and err.count("Traceback") == traces
+        (line,) = lines_of(err)
+        assert error in line and "spoon" in line and "example.reli3d.log" in line
+        assert "Traceback" in (tmp_path / "out" / "example.reli3d.log").read_text()
+    process = start(["--output", tmp_path / "out"])
+    assert process.wait(60) == 0 and not (tmp_path / "out" / "example.reli3d.log").exists()
+    process.communicate()
+
+
+def test_a_bug_outside_of_the_objects_is_logged_beside_the_output(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(infer, "refinement_budget", lambda *_: 1 + "a")
+    assert infer.main(["--output", str(tmp_path / "out"), "--device", "cpu"]) == 1
+    out, err = capsys.readouterr()
+    assert out == "" and err.startswith("reli3d-infer: TypeError: ") and err.count("\n") == 1
+    assert "Traceback" in (tmp_path / "out.reli3d.log").read_text()
+
+
+def test_wrong_arguments_are_one_line_too(tmp_path, capsys):
+    for arguments in (["--no-such-option"], ["--device", "abacus"], ["--views", "many"]):
+        assert infer.main(arguments) == 2
+        out, err = capsys.readouterr()
+        assert out == "" and err.startswith("reli3d-infer: arguments: ") and err.count("\n") == 1

@@ -182,9 +182,8 @@ def test_wrong_input_ends_with_one_line_that_names_it(place, capsys):
 
 @pytest.mark.parametrize("device", ["nonsense", "cuda:99", "meta"])
 def test_a_device_is_cpu_or_cuda(device, capsys):
-    with pytest.raises(SystemExit) as stop:
-        render.main(["x.glb", "--device", device])
-    assert stop.value.code == 2 and "--device" in capsys.readouterr().err
+    assert render.main(["x.glb", "--device", device]) == 2
+    assert "--device" in capsys.readouterr().err
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")

@@ -11,7 +11,7 @@ import threading
 import pytest
 import torch
 
-from reli3d.cli import infer
+from reli3d.cli import download, infer
 from reli3d.nn import hub
 from reli3d.nn.model import Reconstructor
 from reli3d.nn.published import KEY_MAP
@@ -168,7 +168,7 @@ def test_no_extra_no_network_and_no_space_are_one_line(server, checkpoint, monke
         fails("no space left in .*: set RELI3D_WEIGHTS")
     with monkeypatch.context() as patch:
         patch.setitem(sys.modules, "huggingface_hub", None)
-        fails(r"--download needs huggingface_hub: pip install 'reli3d\[hub\]'")
+        fails(r"reli3d download needs huggingface_hub: pip install 'reli3d\[hub\]'")
     assert left() == []
 
 
@@ -192,15 +192,14 @@ def test_the_command_uses_the_network_with_download_alone_and_ends_with_2_where_
 ):
     server.content = checkpoint[0][:-1]  # of the size that the hub states, but no checkpoint
 
-    def ended(*arguments: str) -> str:
-        options = ["--output", str(tmp_path / "out"), "--device", "cpu", "--weights", *arguments]
-        assert infer.main([str(infer.EXAMPLE), *options]) == 2 and not (tmp_path / "out").exists()
+    def ended(code: int) -> str:
         out, err = capsys.readouterr()
-        (line,) = [line for line in err.split("\n") if line.startswith("reli3d-infer: ")]
-        assert out == ""
+        (line,) = [line for line in err.split("\n") if line.startswith(("reli3d-infer: ", "reli3d download: "))]
+        assert code == 2 and out == "" and not (tmp_path / "out").exists()
         return line
 
-    assert "fetch them with --download" in ended("official") and server.requests == []
-    assert "is not a torch checkpoint, or it is cut off" in ended("official", "--download") and left() == []
+    options = ["--output", str(tmp_path / "out"), "--device", "cpu", "--weights", "official"]
+    assert "fetch them with reli3d download" in ended(infer.main([str(infer.EXAMPLE), *options]))
+    assert server.requests == []
+    assert "is not a torch checkpoint, or it is cut off" in ended(download.main([])) and left() == []
     assert any(path == "/store" for _, path, _ in server.requests)
-    assert "download: expected --weights official" in ended("small", "--download")

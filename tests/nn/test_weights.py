@@ -250,7 +250,7 @@ def test_names_and_paths_find_their_file(saved, monkeypatch):
     path, _ = saved
     assert load_model(path).preset == NANO and load_model(str(path)).preset == NANO
     monkeypatch.setenv("RELI3D_WEIGHTS", str(path.parent))
-    with pytest.raises(WeightsError, match="official.safetensors: no such file of weights; fetch them with --download"):
+    with pytest.raises(WeightsError, match="official.safetensors: no such file of weights; fetch them with reli3d"):
         load_model("official")
     path.rename(path.with_name("official.safetensors"))
     assert load_model("official").preset == NANO

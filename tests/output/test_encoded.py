@@ -16,7 +16,7 @@ from reli3d.render.lights import studio
 from reli3d.views.views import Views
 from tests.support.scenes import ball_mesh, textures
 
-RECORD = {"frame": "input", "output_from_input": [1], "model_from_input": [2], "weights": {"file": "x"}}
+RECORD = {"output_from_input": [1], "model_from_input": [2], "weights": {"file": "x"}}
 PICTURE = np.zeros((8, 8, 3), np.uint8)
 MOVED = (1.0, 2.0, 3.0)
 

@@ -1,5 +1,7 @@
 """A job without a network: objects are small files that say what shall happen to them."""
 
+from __future__ import annotations
+
 import json
 import os
 import signal
@@ -7,7 +9,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from reli3d.cli.objects import opened
+from reli3d.errors import InputError
 from reli3d.output.folder import claimed
 
 FILES = ("mesh.glb", "environment.exr", "environment.hdr", "preview.png", "viewer.html", "run_info.json")
@@ -18,21 +20,17 @@ class WordJob:
     """Writes the word of ``folder/word`` in ``target``, and a line in ``log`` for every result that it finishes.
 
     The words ``die`` and ``die once`` kill the process in the middle of the work, ``wait`` waits there for a file
-      ``go``; ``refuse`` and ``fail`` are errors.  What they leave stands in ``folder``, or beside the tar file that the
-      object is in.
+      ``go``; ``refuse`` and ``fail`` are errors.  What they leave stands in ``folder``.
     """
 
     log: Path
 
     def run(self, folder, name: str, target: Path) -> str:
-        with opened(folder) as found:
-            word = (found / "word").read_text()
-        folder = folder if isinstance(folder, Path) else folder.shard.with_name(f"{folder.name}-marks")
-        folder.mkdir(exist_ok=True)
+        word = (folder / "word").read_text()
         if (target / "mesh.glb").exists():
             return "skipped"
         if word == "refuse":
-            raise ValueError("word: expected another, got refuse")
+            raise InputError("word", "expected another, got refuse")
         if word == "fail":
             raise RuntimeError("it failed")
         with claimed(target, FILES) as replacing, replacing() as new:
@@ -51,6 +49,10 @@ class WordJob:
         with open(self.log, "a") as log:
             log.write(f"{name}\n")
         return "done"
+
+    def start(self) -> Start:
+        """Makes this job in another process."""
+        return Start(self.log)
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 # A room may import itself and every room of a line above; rooms of one line know nothing of each other.
 LAYERS = [
+    {"errors"},
     {"kernels"},
     {"_bridge"},
     {"geometry"},
@@ -9,8 +10,8 @@ LAYERS = [
     {"io", "fit"},
     {"views", "synthetic", "nn"},
     {"prepare"},
-    {"pipeline"},
     {"output"},
+    {"pipeline"},
     {"train"},
     {"eval"},
     {"cli"},

@@ -17,14 +17,13 @@ from reli3d.cli.objects import listed
 from reli3d.io.glb import glb_bytes, read_glb
 from reli3d.io.hdr import environment_bytes, read_environment
 from reli3d.io.images import read_image
-from reli3d.io.tar import packed_objects
 from reli3d.nn.presets import SMALL, to_json
 from reli3d.nn.weights import read_manifest
 from reli3d.render.asset import Asset
 from reli3d.synthetic.maps import load_maps
 from reli3d.views.check import explain_cameras
 from reli3d.views.folder import load_views
-from tests.support import evil, evil_maps, tars
+from tests.support import evil, evil_maps
 from tests.support.known import KINDS
 from tests.support.misread import Case
 from tests.support.scenes import ball_mesh, textures
@@ -89,7 +88,6 @@ def targets(root: Path) -> list[Target]:
         Target("glb", {"a.glb": glb_bytes(asset)}, lambda f: read_glb(f / "a.glb")),
         Target("weights", {"a.safetensors": _weights()}, lambda f: read_manifest(f / "a.safetensors").preset()),
         Target("maps", {"a.npz": maps.getvalue()}, lambda f: load_maps(f / "a.npz")),
-        Target("tar", {"a.tar": tars.written(*tars.GOOD)}, _unpacked),
         Target("list", {"a.txt": b"one\ntwo/three\n"}, lambda f: listed(f / "a.txt")),
     ]
     return found + [Target(name, {}, _nothing, make) for name, make in KINDS.items()]
@@ -97,12 +95,6 @@ def targets(root: Path) -> list[Target]:
 
 def _nothing(folder: Path) -> None:
     """A target with a truth reads by itself."""
-
-
-def _unpacked(folder: Path) -> None:
-    for found in packed_objects(folder / "a.tar"):
-        with found.unpacked():
-            pass
 
 
 def _with_pictures(folder: Path) -> None:

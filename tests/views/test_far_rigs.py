@@ -4,14 +4,12 @@ Float32 is 0.06 apart at 900,000: poses and vertices that went there lost their 
 """
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 from reli3d.cli import infer
-from reli3d.geometry.mesh import report
 from reli3d.io.files import InputError
 from reli3d.io.glb import glb_bytes, read_glb
 from reli3d.nn.weights import load_model
@@ -91,7 +89,7 @@ def test_a_far_folder_reads_as_a_near_one(tmp_path):
     assert load_views(tmp_path / "far", first_views=2).origin == every.origin == far.origin
 
 
-@pytest.mark.parametrize("options", [[], ["--up", "z"], ["--frame", "model"]])
+@pytest.mark.parametrize("options", [[], ["--up", "z"]])
 def test_the_mesh_of_far_cameras_is_closed_and_in_its_place(tmp_path, options):
     folder = moved(tmp_path / "far", FARTHEST)
     arguments = [str(infer.EXAMPLE), str(folder), "--output", str(tmp_path / "out"), "--normalize", "hull"]
@@ -106,7 +104,7 @@ def test_the_mesh_of_far_cameras_is_closed_and_in_its_place(tmp_path, options):
         records.append(json.loads((tmp_path / "out" / name / "run_info.json").read_text()))
     record = records[1]["mesh"]
     assert record["watertight"] and record["manifold"] and record["degenerate_faces"] == 0
-    x, y, z = FARTHEST if "model" not in options else (0, 0, 0)
+    x, y, z = FARTHEST
     there = (x, z, -y) if "z" in options else (x, y, z)
     # the meeting point of the axes is some 1e-7 beside the cameras' own origin, and the hull's grid begins elsewhere
     for near, far in zip(*boxes):
@@ -123,8 +121,6 @@ def test_views_that_are_far_in_float32_are_refused_where_the_mesh_would_break():
     weights, options = load_model("small"), ReconstructOptions(texture_size=256, resolution=40)
     with pytest.raises(ValueError, match="views: expected an object near the origin, got one of size"):
         reconstruct(views.transformed(shift), weights=weights, options=options)
-    own = replace(options, frame="model")
-    assert report(reconstruct(views.transformed(shift), weights=weights, options=own).mesh).watertight
 
 
 def test_a_translation_goes_to_the_node_and_back(tmp_path):

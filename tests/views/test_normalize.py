@@ -173,7 +173,7 @@ def test_cameras_that_agree_on_nothing_are_an_error():
     views = sphere_views(count=3)
     flipped = views.c2w @ torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
     wrong = Views(views.images, views.masks, flipped, views.intrinsics, views.names)
-    with pytest.raises(ValueError, match="--check"):
+    with pytest.raises(ValueError, match="reli3d check"):
         normalize(wrong)
     assert normalize(wrong, "none").is_identity()
     with pytest.raises(ValueError, match="mode"):

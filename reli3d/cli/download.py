@@ -1,0 +1,28 @@
+"""``reli3d download``: the official weights, fetched and converted once."""
+
+from __future__ import annotations
+
+import sys
+
+from reli3d.cli.exit_codes import Parser, command
+
+
+def parser() -> Parser:
+    return Parser(
+        prog="reli3d download",
+        description="Fetch the published checkpoint and convert it for --weights official, unless that is done.  "
+        "The file's path goes to stdout.",
+    )
+
+
+@command("reli3d download")
+def main(argv: list[str] | None = None) -> int:
+    parser().parse_args(argv)
+    from reli3d.nn import hub
+
+    print(hub.fetch_official())
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
