@@ -108,4 +108,4 @@ def test_citation_and_changelog_have_the_version():
     citation, changelog = ((ROOT / name).read_text() for name in ("CITATION.cff", "CHANGELOG.md"))
     assert f"\nversion: {reli3d.__version__}\n" in citation
     released = [v for v in re.findall(r"^## (\S+)", changelog, re.MULTILINE) if v != "Unreleased"]
-    assert released[0] == reli3d.__version__
+    assert released[0] == reli3d.__version__ and len(set(released)) == len(released)
