@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import os
 import re
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePath
 
@@ -70,6 +71,11 @@ def read_colmap(folder: Path, models: Sequence[Path]) -> tuple[list[Frame], list
     if not lenses:
         raise InputError(cameras, "expected at least one camera, got none; export the model again")
     index, names = FolderIndex(), [PurePath(name) for name, *_ in entries[best]]
+    name, count = Counter(name for name, *_ in entries[best]).most_common(1)[0]
+    if count > 1:
+        raise InputError(
+            path, f"NAME: expected each image once, got {shown(name)} {count} times; export the model again"
+        )
     places = [at for at in (folder / "images", folder) if at.is_dir()]
     images = max(places, key=lambda at: sum(index.find(at, name) is not None for name in names))
     frames, missing = [], []

@@ -117,3 +117,10 @@ def test_names_relative_to_the_folder_itself(model):
     folder, lines = model
     write(folder, [line.replace(name, f"images/{name}") for line, name in zip(lines[::2], NAMES)])
     assert load_views(folder).names == tuple(f"images/{name}" for name in NAMES)
+
+
+def test_an_image_that_is_listed_twice_is_refused(model):
+    folder, lines = model
+    write(folder, [*lines, *lines[:2]])
+    with pytest.raises(InputError, match=r"NAME: expected each image once, got '0.png' 2 times"):
+        load_views(folder)
