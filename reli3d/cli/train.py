@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from reli3d.nn.local import LocalReconstructor
     from reli3d.train.loop import TrainConfig
 
-LICENCE = "Apache-2.0; trained by the reli3d authors, see docs/weights.md for the data"
+LICENCE = "Apache-2.0; trained by the reli3d authors, see docs/model.md for the data"
 SIDES = 64, 128, 256  # of the pictures for the 2D U-Net alone
 CALIBRATED = 5  # views of a sample: four are input, one is looked at
 

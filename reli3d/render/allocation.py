@@ -63,7 +63,7 @@ def plan_samples(
     ``alpha`` and ``diffuse_model`` count.  One plan holds for all points: the sum of their variances is least, with
     ``relative`` of the variances over the squared radiance.
 
-    A pilot's samples estimate the variance of any split, see docs/renderer.md.  A plan is for images, not for fits.
+    A pilot's samples estimate the variance of any split, see docs/library.md.  A plan is for images, not for fits.
 
     No gradient.  The result depends on the inputs and the seed alone.  Raises TypeError for a wrong dtype, ValueError
     for a shape, device, count, choice or a value that is not finite.

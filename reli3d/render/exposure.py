@@ -30,7 +30,7 @@ TINT = 1.5  # largest change of the light's color, as a factor of a channel
 
 # Prior mean and standard deviation of the logarithms of mean linear base color and of the light on it (photograph over
 # base color); last the standard deviation of a prediction.  Chosen on 20 meshes, as they are and dark:
-# docs/measurements/paint_and_light.md.
+# docs/results.md.
 ALBEDO, ALBEDO_SPREAD = -2.1, 1.2
 LIGHT, LIGHT_SPREAD = -0.3, 0.9
 PREDICTION_SPREAD = 0.7

@@ -1,6 +1,6 @@
 """Training samples: one object under one light, seen by a few cameras, with the truth at points in and on it.
 
-A sample is a dictionary of tensors, one safetensors file on disk.  ``docs/training.md``, "A sample", lists its entries
+A sample is a dictionary of tensors, one safetensors file on disk.  ``docs/model.md``, "A sample", lists its entries
 with shapes and units.  There are ``V`` views of ``S`` by ``S`` pixels, cropped to the object as the network's input
 is.  World +Y up, object centred, longest side 1.  Radiance is scaled so that the first view is well exposed.
 """

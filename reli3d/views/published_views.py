@@ -2,7 +2,7 @@
 
 The release stores its training views as JPEG and sends every input the same way: a round trip through JPEG, a plain
 bilinear resize, a mask that is cut at one half after it.  A network that was trained on such pictures gets such
-pictures; every step stands in docs/network.md.
+pictures; every step stands in docs/model.md.
 """
 
 from __future__ import annotations

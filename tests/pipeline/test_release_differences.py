@@ -1,7 +1,7 @@
 """Where the published release is wrong and this package is not, each with the size of the difference.
 
 What the release does comes from its own values where there are some, else from its formula.  Other such differences
-are shown where their part is tested; docs/network.md lists them all.
+are shown where their part is tested; docs/model.md lists them all.
 """
 
 import io

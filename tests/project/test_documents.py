@@ -99,8 +99,8 @@ def test_links_and_paths_of_a_page_lead_somewhere(page):
         return
     for path in re.findall(r"`((?:reli3d|tests|bench|examples|tools|docs)/[\w/.-]*\w)`", text):
         assert (ROOT / path).exists(), path
-    rooms = "|".join(set().union(*LAYERS))
-    for path in re.findall(rf"`((?:{rooms})/\w+\.py)`", text):
+    layers = "|".join(set().union(*LAYERS))
+    for path in re.findall(rf"`((?:{layers})/\w+\.py)`", text):
         assert (ROOT / "reli3d" / path).exists(), path
 
 

@@ -293,7 +293,7 @@ def test_the_balance_heuristic_keeps_its_bound(device, name):
 @pytest.mark.slow
 def test_the_mixture_wins_mixed_cases_and_its_worst_case_is_a_hundred_times_better(device):
     """Against all 64 samples by one strategy.  No fixed mixture stays within 1.05 of the best: where the integrand is a
-    multiple of one density, that strategy has no variance at all (docs/measurements/variance.md)."""
+    multiple of one density, that strategy has no variance at all (docs/results.md)."""
     counts = (20, 40, 4), (64, 0, 0), (0, 64, 0), (0, 0, 64)
     worst, wins = [0.0] * 4, set()
     for name in SKIES:

@@ -126,7 +126,7 @@ def planes_read(planes, points):
 
 def test_a_triplane_is_marched_and_composited_as_in_float64(device):
     """The first training stage: occupancy of the field, samples, features, heads, colour and opacity of rays; values
-    and gradients to planes and heads, as docs/renderer.md joins them."""
+    and gradients to planes and heads, as docs/library.md joins them."""
     rng = torch.Generator().manual_seed(8)
     radius = 0.8
     leaves = [torch.randn(1, 3, 4, 6, 6, generator=rng), torch.randn(4, 12, generator=rng) * 0.7]

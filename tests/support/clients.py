@@ -121,7 +121,7 @@ load = {"glb": bpy.ops.import_scene.gltf, "usdz": bpy.ops.wm.usd_import, "obj": 
 load[path.rsplit(".", 1)[1]](filepath=path)
 for image in bpy.data.images:
     if path.endswith("obj") and ("roughness" in image.name or "metallic" in image.name):
-        image.colorspace_settings.name = "Non-Color"  # as docs/viewers.md says
+        image.colorspace_settings.name = "Non-Color"  # as docs/guide.md says
 scene = bpy.context.scene
 scene.world = bpy.data.worlds.new("light")
 scene.world.use_nodes = True

@@ -1,6 +1,6 @@
-"""The rooms of the package, from the lowest to the highest."""
+"""The layers of the package, from the lowest to the highest."""
 
-# A room may import itself and every room of a line above; rooms of one line know nothing of each other.
+# A layer may import itself and every layer of a line above; layers of one line do not import each other.
 LAYERS = [
     {"errors"},
     {"kernels"},

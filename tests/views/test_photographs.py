@@ -51,7 +51,7 @@ def grey(k):
     return lambda v: np.repeat(v[..., k : k + 1], 3, -1)
 
 
-# name in docs/inputs.md: how a file of it is written, colour that is expected, tolerance [levels of 255]
+# kind of image: how a file of it is written, expected color, tolerance [levels of 255]
 ACCEPTED = {
     "8-bit colour": (saver("RGB", ".png"), lambda v: v[..., :3], 0),
     "8-bit colour, TIFF": (saver("RGB", ".tif"), lambda v: v[..., :3], 0),
@@ -99,15 +99,6 @@ def test_what_is_refused_ends_in_one_line(tmp_path, name):
     (path,) = tmp_path.iterdir()
     with pytest.raises(InputError, match=r"a\.\w+: expected .*; "):
         read_image(path)
-
-
-def test_the_table_of_the_documents_names_what_is_tested():
-    text = (ROOT / "docs/inputs.md").read_text()
-    table = text[text.index("## Images") : text.index("## Masks")]
-    for name in ACCEPTED:
-        assert name.split(",")[0].replace(" with alpha", "").lower() in table.lower()
-    for word in ("EXIF", "32-bit", "LAB", "HEIC", "AVIF", "raw"):
-        assert word in table
 
 
 def capture(folder, width, height, box, *, exif=None, mask_at=None, **lens):
