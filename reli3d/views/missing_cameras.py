@@ -44,7 +44,7 @@ def no_cameras(source: Path) -> InputError:
         for place in (folder / "images", folder):
             if len(photographs := images_in(place, PHOTOGRAPHS)) > 1:
                 return _capture(source, place, f"{len(photographs)} photographs in {folder.name}", folder)
-    return InputError(source, "expected transforms.json or a COLMAP model (sparse/0), got neither; see docs/inputs.md")
+    return InputError(source, "expected transforms.json or a COLMAP model (sparse/0), got neither; see docs/guide.md")
 
 
 def _capture(source: Path, place: Path, got: str, target: Path | None = None) -> InputError:
