@@ -17,7 +17,6 @@ from reli3d.io.images import read_image
 from reli3d.views.folder import load_views
 from reli3d.views.reduce import LARGE, OBJECT, cut
 from tests.support import evil
-from tests.support.checkout import ROOT
 from tests.support.evil import pose
 
 SIZE = (40, 24)  # width, height
