@@ -11,6 +11,7 @@ from reli3d.cli.exit_codes import Parser, command
 
 COMMANDS = {  # module of reli3d.cli, what it does
     "infer": ("infer", "photographs with cameras to a relightable asset (also reli3d-infer)"),
+    "capture": ("capture", "photographs or a video without cameras to an object folder"),
     "view": ("view", "show a reconstruction in the browser"),
     "check": ("checking", "explain the cameras of a folder, reconstruct nothing"),
     "render": ("render", "views and turntables of a GLB under any light (also reli3d-render)"),

@@ -9,7 +9,7 @@ LAYERS = [
     {"render"},
     {"io", "fit"},
     {"views", "synthetic", "nn"},
-    {"prepare"},
+    {"capture", "prepare"},
     {"output"},
     {"pipeline"},
     {"train"},

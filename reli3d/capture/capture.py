@@ -1,0 +1,474 @@
+"""Photographs or a video of one object, without cameras, to an object folder with cameras and masks."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import shutil
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from PIL import Image
+
+from reli3d.capture.mapping import Map, View, map_photos
+from reli3d.capture.masks import grabcut_mask, key_mask, moving_region, touches_border
+from reli3d.capture.photos import FEWEST, Photo, Progress, read_photos
+from reli3d.capture.scene import Plane, Scene, find_scene
+from reli3d.capture.sheet import contact_sheet
+from reli3d.io.files import InputError, printable
+from reli3d.io.images import read_image
+from reli3d.views.background import Remover
+from reli3d.views.check import agreement
+from reli3d.views.choose import choose_views
+from reli3d.views.views import Views
+
+MASK_METHODS = ("grabcut", "key", "rembg")
+MOST_VIEWS = 60  # of the object folder; more are thinned by the distance between their cameras
+MASK_SIDE = 512  # pixels of masks by which the visual hull is judged
+KEPT_FRACTION = 0.9  # of the first map's images that the second must register
+SAME_RIG = 0.02  # of the distance: residual of camera positions up to which two maps are the same but for a similarity
+OUTLIER_AGREEMENT = 0.8  # of the median: a view whose mask the hull fills less is left out
+LEAST_REGISTERED, MOST_ERROR, WIDEST_GAP = 0.8, 1.0, 60.0
+LEAST_POINTS, LEAST_AGREEMENT, LEAST_MASK = 200, 0.85, 0.03
+
+
+@dataclass(frozen=True)
+class CaptureOptions:
+    """masks: folder of masks with the images' names, instead of a method.  turntable: the object turns in front of a
+    fixed camera; None detects it.  size: longest side of the object in millimeters, for an object folder in meters.
+    """
+
+    masks: Path | None = None
+    mask_method: str = "grabcut"
+    turntable: bool | None = None
+    size: float | None = None
+
+
+@dataclass
+class CaptureReport:
+    """What was found, and which checks failed; written to ``capture.json``."""
+
+    images: int
+    registered: int = 0
+    lost: list[str] = field(default_factory=list)  # not registered
+    left_out: dict[str, str] = field(default_factory=dict)  # registered, but of no use: name and reason
+    views: list[str] = field(default_factory=list)
+    reprojection_error: float = 0.0  # pixels, mean
+    object_points: int = 0
+    gap: float = 0.0  # degrees, the widest between neighboring cameras around the object
+    agreement: float = 0.0  # median fraction of a mask that the visual hull fills
+    mask_fraction: float = 0.0  # median fraction of an image that the mask covers
+    mask_method: str = ""
+    plane: bool = False
+    second_map: bool = False  # cameras are those of features inside the masks
+    lighting: str = "object"  # frame in which the lighting is fixed: object or camera
+    unit: str = "longest side"
+    failed: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class _Segmented:
+    """A map and the masks of its views, by name."""
+
+    found: Map
+    masks: dict[str, np.ndarray]
+
+    @property
+    def views(self) -> list[View]:
+        return [v for v in self.found.views if v.photo.name in self.masks]
+
+
+def capture(
+    source: str | os.PathLike,
+    output: str | os.PathLike,
+    options: CaptureOptions | None = None,
+    progress: Progress = lambda stage, done, total: None,
+) -> CaptureReport:
+    """Write the object folder ``output`` of the photographs or the video ``source``.
+
+    It holds ``images``, ``masks``, ``transforms.json`` (pinhole cameras, +Y up, the ground at y = 0, the object's
+    longest side 1), ``capture.json`` (the report) and ``capture.png`` (masks, cameras and points).  The folder appears
+    whole or not at all.  Checks that fail are in ``failed`` of the report.  Raises InputError where no object folder
+    can be made: fewer than 8 images, no map, no object, or fewer than 8 views that show the whole object.
+    """
+    options = options or CaptureOptions()
+    source, output = Path(source), Path(output)
+    _check_options(options)
+    _check_output(output)
+    photos, notes = read_photos(source, progress)
+    report = CaptureReport(len(photos), notes=notes, mask_method="given" if options.masks else options.mask_method)
+    region = None if options.turntable is False else moving_region([p.pixels for p in photos])
+    if options.turntable and region is None:
+        raise InputError("turntable", "expected images of a fixed camera in which the object turns, got others")
+    if region is not None:
+        notes.append("turntable: the camera is fixed and the object turns; the lighting is fixed to the camera")
+    if region is not None or any(p.flash for p in photos):
+        report.lighting = "camera"
+    known = _known_masks(photos, options, progress)
+    first = map_photos(photos, progress, None if region is None else [region] * len(photos))
+    scene = find_scene(first)
+    segmented = _Segmented(first, _masks(first, scene, known, None, progress))
+    if len(segmented.masks) < FEWEST:
+        raise InputError(
+            source,
+            f"expected an object that stands out in at least {FEWEST} images, got {len(segmented.masks)} of "
+            f"{len(photos)} ({len(first.views)} registered); give --masks, or take sharper images nearer to it",
+        )
+    final, up, ground = _refined(segmented, scene, known, report, progress)
+    report.registered = len(final.found.views)
+    registered = {v.photo.name for v in final.found.views}
+    report.lost = [p.name for p in photos if p.name not in registered]
+    report.reprojection_error = round(final.found.mean_error, 3)
+    report.plane = scene.plane is not None
+    views = _whole_views(source, final, report)
+    if len(views) > MOST_VIEWS:
+        taken = choose_views(torch.from_numpy(np.stack([_c2w(v) for v in views])), MOST_VIEWS)
+        report.notes.append(f"{len(views)} views thinned to {MOST_VIEWS} by the distance between their cameras")
+        views = [views[k] for k in taken]
+    hull, filled = agreement(_as_views(views, final.masks))
+    if len(hull.points) == 0:
+        raise InputError(source, "expected masks of one object, got masks that no point lies inside of; give --masks")
+    frame = _frame(hull.points.numpy(), up, ground, options.size)
+    report.agreement = round(float(np.median(filled)), 3)
+    report.mask_fraction = round(float(np.median([(final.masks[v.photo.name] > 127).mean() for v in views])), 4)
+    report.views = [v.photo.name for v in views]
+    report.unit = "meter" if options.size else "longest side"
+    inside = _object_points(final, views)
+    report.object_points = len(inside)
+    report.gap = round(_widest_gap(np.stack([frame.apply(v.eye) for v in views])), 1)
+    _check(report)
+    _write(output, views, final.masks, frame, report, frame.apply(inside), progress)
+    return report
+
+
+def _check_options(options: CaptureOptions) -> None:
+    if options.mask_method not in MASK_METHODS:
+        raise InputError("mask-method", f"expected {', '.join(MASK_METHODS)}, got {options.mask_method!r}")
+    if options.masks and not options.masks.is_dir():
+        raise InputError(options.masks, "masks: expected a folder of mask images, got none; check the path")
+    if options.size is not None and not 0.1 <= options.size <= 1e6:
+        raise InputError("size", f"expected 0.1 to 1000000 millimeters, got {options.size}")
+
+
+def _check_output(output: Path) -> None:
+    if output.exists() and not output.is_dir():
+        raise InputError(output, "expected a folder for the result, got a file; give another")
+    if output.is_dir() and any(output.iterdir()) and not (output / "capture.json").exists():
+        raise InputError(output, "expected an empty folder or an earlier capture, got other files; give another")
+
+
+def _known_masks(photos: Sequence[Photo], options: CaptureOptions, progress: Progress) -> dict[str, np.ndarray] | None:
+    """Masks that need no map: given ones, by color, or by a network.  None for those of the map's points."""
+    if options.masks is None and options.mask_method == "grabcut":
+        return None
+    found: dict[str, np.ndarray] = {}
+    remover = Remover() if options.masks is None and options.mask_method == "rembg" else None
+    for k, photo in enumerate(photos):
+        progress("masks", k, len(photos))
+        if options.masks:
+            mask = _given_mask(options.masks, photo)
+        elif remover:
+            mask = np.asarray(remover.mask(Image.fromarray(photo.pixels)))
+        else:
+            mask = key_mask(photo.pixels)
+        if mask is not None:
+            found[photo.name] = mask
+    return found
+
+
+def _given_mask(folder: Path, photo: Photo) -> np.ndarray | None:
+    stem = Path(photo.name).stem
+    files = sorted(p for p in folder.iterdir() if p.is_file() and photo.name in (p.stem, p.name) or p.stem == stem)
+    if not files:
+        return None
+    if len(files) > 1:
+        raise InputError(folder, f"expected one mask of {printable(photo.name)}, got {files[0].name}, {files[1].name}")
+    color, alpha = read_image(files[0])
+    mask = np.rint((color.mean(-1) if alpha is None else alpha).numpy() * 255).astype(np.uint8)
+    if abs(mask.shape[1] * photo.size[1] / (mask.shape[0] * photo.size[0]) - 1) > 0.01:
+        raise InputError(files[0], f"expected the aspect of {photo.size[0]} x {photo.size[1]}, got {mask.shape[::-1]}")
+    return cv2.resize(mask, photo.size, interpolation=cv2.INTER_AREA)
+
+
+def _masks(
+    found: Map, scene: Scene, known: dict | None, support: dict[str, np.ndarray] | None, progress: Progress
+) -> dict[str, np.ndarray]:
+    """Masks of the views of a map by the names of their photos, of those that have one."""
+    if known is not None:
+        return {v.photo.name: known[v.photo.name] for v in found.views if v.photo.name in known}
+    masks = {}
+    for k, view in enumerate(found.views):
+        progress("masks", k, len(found.views))
+        seeds = None if support is None else support.get(view.photo.name, np.zeros((0, 2)))
+        mask = grabcut_mask(view, found, scene, seeds)
+        if mask is not None:
+            masks[view.photo.name] = mask
+    progress("masks", len(found.views), len(found.views))
+    return masks
+
+
+def _refined(segmented: _Segmented, scene: Scene, known, report: CaptureReport, progress: Progress):
+    """The map of the features inside the masks, if it is the better one, with its masks; the upward direction ``(3,)``
+    and the ground's height along it (None: unknown) in the frame of the map that is kept.
+
+    Features of the background agree among themselves even where the object was moved: only the object's own count.
+    """
+    first = segmented.found
+    up = scene.plane.normal if scene.plane else _mean_up(first)
+    ground = -scene.plane.offset if scene.plane else None
+    views = segmented.views
+    try:
+        second = map_photos([v.photo for v in views], progress, [segmented.masks[v.photo.name] for v in views])
+    except InputError:
+        return segmented, up, ground
+    before = _agreement(views, segmented.masks)
+    again = [v for v in second.views if v.photo.name in segmented.masks]
+    if len(second.views) < KEPT_FRACTION * len(first.views) or _agreement(again, segmented.masks) <= before:
+        return segmented, up, ground
+    report.second_map = True
+    by_name = {v.photo.name: v for v in first.views}
+    pairs = [(by_name[v.photo.name], v) for v in second.views]
+    directions = np.stack([b.rotation.T @ a.rotation @ up for a, b in pairs])
+    middle = directions.mean(0)
+    nearest = directions[np.argsort(-(directions @ middle))[: max(3, len(directions) // 2)]].mean(0)
+    support = None
+    if known is None:
+        support = {v.photo.name: v.pixels[scene.support[v.points]] for v in first.views}
+    object_points = (second.error < 2.0) & (second.tracks >= 3)
+    scene_2 = Scene(scene.center, scene.distance, None, object_points, np.zeros(len(second.points), bool))
+    masks = _masks(second, scene_2, known, support, progress)
+    refined = _Segmented(second, masks)
+    if len(masks) < KEPT_FRACTION * len(segmented.masks) or (
+        known is None and _agreement(refined.views, masks) < _agreement(again, segmented.masks)
+    ):
+        refined = _Segmented(second, {v.photo.name: segmented.masks[v.photo.name] for v in again})
+    return refined, nearest / np.linalg.norm(nearest), _ground(pairs, scene.plane)
+
+
+def _ground(pairs: list[tuple[View, View]], plane: Plane | None) -> float | None:
+    """Height of the plane of the first map of ``pairs`` in the second, where the two rigs are similar."""
+    if plane is None or len(pairs) < 3:
+        return None
+    a, b = (np.stack([pair[k].eye for pair in pairs]) for k in (0, 1))
+    a0, b0 = a.mean(0), b.mean(0)
+    u, s, vt = np.linalg.svd((b - b0).T @ (a - a0))
+    sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    turn = u @ sign @ vt
+    scale = float((s * np.diag(sign)).sum() / ((a - a0) ** 2).sum())
+    residual = np.linalg.norm(scale * (a - a0) @ turn.T - (b - b0), axis=1)
+    if float(np.median(residual)) > SAME_RIG * float(np.median(np.linalg.norm(b - b0, axis=1))):
+        return None
+    on_plane = a0 - plane.height(a0[None])[0] * plane.normal
+    return float((b0 + scale * turn @ (on_plane - a0)) @ (turn @ plane.normal))
+
+
+def _mean_up(found: Map) -> np.ndarray:
+    up = -np.stack([v.rotation[1] for v in found.views]).mean(0)
+    return up / max(np.linalg.norm(up), 1e-9)
+
+
+def _c2w(view: View) -> np.ndarray:
+    """Camera to world ``(4, 4)`` in OpenGL axes."""
+    pose = np.eye(4)
+    pose[:3, :3] = view.rotation.T @ np.diag([1.0, -1.0, -1.0])
+    pose[:3, 3] = view.eye
+    return pose
+
+
+def _as_views(views: Sequence[View], masks: dict[str, np.ndarray]) -> Views:
+    """Small undistorted masks and their cameras; the images are black."""
+    small, cameras = [], []
+    for view in views:
+        w, h = view.photo.size
+        scale = min(1.0, MASK_SIDE / max(w, h))
+        mask = cv2.resize(masks[view.photo.name], (round(w * scale), round(h * scale)), interpolation=cv2.INTER_AREA)
+        small.append(torch.from_numpy(view.undistorted(mask).astype(np.float32) / 255).clamp(0, 1))
+        cameras.append([view.focal * scale, view.focal * scale, *(view.principal * scale)])
+    return Views(
+        images=tuple(torch.zeros(1, dtype=torch.float32).expand(*m.shape, 3) for m in small),
+        masks=tuple(small),
+        c2w=torch.from_numpy(np.stack([_c2w(v) for v in views]).astype(np.float32)),
+        intrinsics=torch.tensor(cameras, dtype=torch.float32),
+        names=tuple(v.photo.name for v in views),
+    )
+
+
+def _agreement(views: Sequence[View], masks: dict[str, np.ndarray]) -> float:
+    """Mean fraction of the masks that the visual hull fills."""
+    whole = [v for v in views if not touches_border(masks[v.photo.name])]
+    return float(np.mean(agreement(_as_views(whole, masks))[1])) if len(whole) >= 2 else 0.0
+
+
+def _whole_views(source: Path, final: _Segmented, report: CaptureReport) -> list[View]:
+    """Views that show the whole object and agree with the others; the rest is named in the report."""
+    views = final.views
+    for view in final.found.views:
+        if view.photo.name not in final.masks:
+            report.left_out[view.photo.name] = "no mask"
+    for view in views:
+        if touches_border(final.masks[view.photo.name]):
+            report.left_out[view.photo.name] = "the object is cut off by the image's border"
+    views = [v for v in views if v.photo.name not in report.left_out]
+    while len(views) >= FEWEST:
+        filled = np.array(agreement(_as_views(views, final.masks))[1])
+        worst = int(filled.argmin())
+        if filled.max() > 0 and filled[worst] >= OUTLIER_AGREEMENT * np.median(filled):
+            break
+        worst = worst if filled.max() > 0 else _least_compatible(views, final.masks)
+        report.left_out[views[worst].photo.name] = "its mask does not agree with the others"
+        views = [v for k, v in enumerate(views) if k != worst]
+    if len(views) < FEWEST:
+        cut = sum("border" in reason for reason in report.left_out.values())
+        fix = "step back: the whole object must be in the image" if cut else "take sharper images, or give --masks"
+        raise InputError(
+            source, f"expected at least {FEWEST} views that show the whole object, got {len(views)}; {fix}"
+        )
+    return views
+
+
+def _least_compatible(views: Sequence[View], masks: dict[str, np.ndarray]) -> int:
+    """The view without which the hull of the others is fullest, where all together have none."""
+    scores = []
+    for k in range(len(views)):
+        rest = [v for j, v in enumerate(views) if j != k]
+        scores.append(float(np.mean(agreement(_as_views(rest, masks))[1])))
+    return int(np.argmax(scores))
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """``x -> scale (turn x) + shift``."""
+
+    scale: float
+    turn: np.ndarray  # (3, 3)
+    shift: np.ndarray  # (3,)
+
+    def apply(self, points: np.ndarray) -> np.ndarray:
+        return self.scale * points @ self.turn.T + self.shift
+
+
+def _frame(hull: np.ndarray, up: np.ndarray, ground: float | None, size: float | None) -> _Frame:
+    """``up`` to +Y, the ground at 0, the middle of the ``hull (N, 3)`` above the origin, its longest side 1 or
+    ``size`` millimeters.
+    """
+    y = up / np.linalg.norm(up)
+    x = np.cross(y, np.eye(3)[np.abs(y).argmin()])
+    x /= np.linalg.norm(x)
+    turn = np.stack([x, y, np.cross(x, y)])
+    turned = hull @ turn.T
+    bottom = turned[:, 1].min() if ground is None else max(ground, turned[:, 1].min())
+    above = turned[turned[:, 1] >= bottom]
+    turned = above if len(above) > 0.2 * len(turned) else turned
+    bottom = max(bottom, turned[:, 1].min()) if ground is None else bottom
+    low, high = turned.min(0), turned.max(0)
+    scale = (1.0 if size is None else size / 1000.0) / float((high - low).max())
+    middle = (low + high) / 2
+    middle[1] = bottom
+    return _Frame(scale, turn, -scale * middle)
+
+
+def _object_points(final: _Segmented, views: Sequence[View]) -> np.ndarray:
+    """Points of the map that lie inside the masks of the views that observe them."""
+    hits, count = np.zeros(len(final.found.points)), np.zeros(len(final.found.points))
+    for view in views:
+        mask = final.masks[view.photo.name]
+        x, y = np.clip(view.pixels.astype(int), 0, np.array(mask.shape[::-1]) - 1).T
+        np.add.at(hits, view.points, mask[y, x] > 127)
+        np.add.at(count, view.points, 1)
+    return final.found.points[(count >= 2) & (hits > 0.7 * count)]
+
+
+def _widest_gap(eyes: np.ndarray) -> float:
+    """Degrees of the widest gap between neighboring cameras about the vertical axis."""
+    azimuth = np.sort(np.degrees(np.arctan2(eyes[:, 0], eyes[:, 2])))
+    return float(np.max(np.diff(azimuth, append=azimuth[0] + 360.0)))
+
+
+def _check(report: CaptureReport) -> None:
+    """Fill ``failed`` with a line for each check that fails."""
+    registered = report.registered / report.images
+    checks = (
+        (registered >= LEAST_REGISTERED, f"{100 * registered:.0f} % of the images registered, at least 80 % expected"),
+        (
+            report.reprojection_error < MOST_ERROR,
+            f"reprojection error {report.reprojection_error} px, below 1 expected",
+        ),
+        (report.gap < WIDEST_GAP, f"no view within a sector of {report.gap:.0f} degrees, at most 60 expected"),
+        (report.object_points >= LEAST_POINTS, f"{report.object_points} points on the object, at least 200 expected"),
+        (
+            report.agreement >= LEAST_AGREEMENT,
+            f"the visual hull fills {100 * report.agreement:.0f} % of a mask, at least 85 % expected",
+        ),
+        (
+            report.mask_fraction >= LEAST_MASK,
+            f"the object covers {100 * report.mask_fraction:.1f} % of an image, at least 3 % expected",
+        ),
+    )
+    report.failed = [text for passed, text in checks if not passed]
+
+
+def _write(output, views, masks, frame: _Frame, report: CaptureReport, points: np.ndarray, progress: Progress) -> None:
+    output.parent.mkdir(parents=True, exist_ok=True)
+    work = output.with_name(f".{os.getpid()}.{os.urandom(4).hex()}.capture")
+    try:
+        frames, thumbnails = [], []
+        for name in ("images", "masks"):
+            (work / name).mkdir(parents=True)
+        for k, view in enumerate(views):
+            progress("writing", k, len(views))
+            stem = Path(view.photo.name).stem if views_are_unique(views) else f"{k:04d}"
+            image = view.undistorted(view.photo.pixels)
+            mask = view.undistorted(masks[view.photo.name])
+            Image.fromarray(image).save(work / "images" / f"{stem}.jpg", quality=95, subsampling=0)
+            Image.fromarray(mask).save(work / "masks" / f"{stem}.png")
+            pose = _c2w(view)
+            pose[:3, :3] = frame.turn @ pose[:3, :3]
+            pose[:3, 3] = frame.apply(view.eye)
+            frames.append(
+                {
+                    "file_path": f"images/{stem}.jpg",
+                    "mask_path": f"masks/{stem}.png",
+                    "transform_matrix": pose.tolist(),
+                    "fl_x": view.focal,
+                    "fl_y": view.focal,
+                    "cx": float(view.principal[0]),
+                    "cy": float(view.principal[1]),
+                    "w": view.photo.size[0],
+                    "h": view.photo.size[1],
+                }
+            )
+            thumbnails.append((view.photo.name, image, mask, replace(view, radial=0.0)))
+        turn, back = frame, lambda p: (p - frame.shift) @ frame.turn / frame.scale
+        content = {"camera_model": "PINHOLE", "lighting": report.lighting, "unit": report.unit, "frames": frames}
+        (work / "transforms.json").write_text(json.dumps(content, indent=1))
+        (work / "capture.json").write_text(json.dumps(asdict(report), indent=1))
+        eyes = np.stack([turn.apply(v.eye) for v in views])
+        contact_sheet(thumbnails, points, eyes, back, report).save(work / "capture.png")
+        old = output.with_name(f".{os.getpid()}.{os.urandom(4).hex()}.old")
+        if output.exists():
+            os.replace(output, old)
+        os.replace(work, output)
+        shutil.rmtree(old, ignore_errors=True)
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+    progress("writing", len(views), len(views))
+
+
+def views_are_unique(views: Sequence[View]) -> bool:
+    """Whether the names of the photos differ without their suffixes."""
+    return len({Path(v.photo.name).stem for v in views}) == len(views)
+
+
+def summary(report: CaptureReport) -> str:
+    """One line on the result."""
+    return (
+        f"{report.registered} of {report.images} images registered, {len(report.views)} views kept, "
+        f"reprojection error {report.reprojection_error:.2f} px, widest gap {math.floor(report.gap)} degrees, "
+        f"visual hull fills {100 * report.agreement:.0f} % of the masks"
+    )

@@ -1,0 +1,222 @@
+"""Structure from motion by COLMAP (pycolmap): cameras and sparse points of photographs.
+
+Cameras are world-to-camera in OpenCV axes here (+X right, +Y down, looking along +Z), as COLMAP has them.
+"""
+
+from __future__ import annotations
+
+import importlib
+import math
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from reli3d.capture.photos import Photo, Progress
+from reli3d.io.files import InputError
+
+FEATURES = 4096  # SIFT features of an image
+MAP_SIDES = 1000, 2000  # pixels along the longer side, first and where too few images are registered
+LOW_PEAK = 0.003  # SIFT's peak threshold where too few are registered; its default is 0.0067
+ENOUGH = 0.8  # fraction of the images whose registration needs no retry
+EXHAUSTIVE = 100  # images up to which each is matched with each
+SEED = 0
+DEFAULT_FOCAL = 1.2  # of the longer side, where EXIF has none: a phone's main camera, and COLMAP's own default
+MASK_MARGIN = 0.01  # of the longer side, by which masks are grown before features are limited to them
+
+
+@dataclass(frozen=True)
+class View:
+    """A registered image: its pose, its lens and which of the map's points it shows where."""
+
+    photo: Photo
+    rotation: np.ndarray  # (3, 3) world to camera
+    translation: np.ndarray  # (3,)
+    focal: float  # pixels of the photo
+    principal: np.ndarray  # (2,) pixels
+    radial: float  # k1 of x (1 + k1 r^2)
+    pixels: np.ndarray  # (K, 2) of observed points, of the photo as it is
+    points: np.ndarray  # (K,) index of these points
+
+    @property
+    def eye(self) -> np.ndarray:
+        """Position ``(3,)`` of the camera."""
+        return -self.rotation.T @ self.translation
+
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Pixels ``(N, 2)`` of the photo and depths ``(N,)`` of ``points (N, 3)``, with the lens's distortion."""
+        local = points @ self.rotation.T + self.translation
+        depth = np.where(np.abs(local[:, 2]) > 1e-9, local[:, 2], 1e-9)
+        flat = local[:, :2] / depth[:, None]
+        bent = flat * (1.0 + self.radial * (flat**2).sum(-1, keepdims=True))
+        return bent * self.focal + self.principal, local[:, 2]
+
+    def undistorted(self, image: np.ndarray, *, nearest: bool = False) -> np.ndarray:
+        """``image`` as a pinhole of the same focal length and principal point shows it; black beyond its border."""
+        h, w = self.photo.pixels.shape[:2]
+        scale = np.array([image.shape[1] / w, image.shape[0] / h, 1.0])
+        matrix = np.array([[self.focal, 0, self.principal[0]], [0, self.focal, self.principal[1]], [0, 0, 1.0]])
+        matrix = matrix * scale[:, None]
+        matrix[:2, 2] -= 0.5  # OpenCV's pixel centers are at whole numbers
+        lens = np.array([self.radial, 0.0, 0.0, 0.0])
+        at = cv2.initUndistortRectifyMap(matrix, lens, None, matrix, (image.shape[1], image.shape[0]), cv2.CV_32FC1)
+        return cv2.remap(image, *at, cv2.INTER_NEAREST if nearest else cv2.INTER_CUBIC)
+
+
+@dataclass(frozen=True)
+class Map:
+    """Registered views, and points with their mean reprojection errors."""
+
+    views: tuple[View, ...]
+    points: np.ndarray  # (P, 3)
+    error: np.ndarray  # (P,) pixels
+    tracks: np.ndarray  # (P,) number of views that observe the point
+
+    @property
+    def mean_error(self) -> float:
+        """Pixels, over all observations."""
+        return float(np.average(self.error, weights=self.tracks)) if len(self.error) else math.inf
+
+
+def map_photos(photos: Sequence[Photo], progress: Progress, masks: Sequence[np.ndarray] | None = None) -> Map:
+    """The largest map of ``photos``.
+
+    masks: ``(H, W)`` of each photo, nonzero where features are looked for.  Where less than ENOUGH of the photos are
+    registered it is tried again with a lower contrast threshold and a relaxed first pair, then with larger images; the
+    map of most images is kept.  With masks, which leave few features, the threshold is low at once.  The seed is
+    fixed.  Raises InputError where no two images can be matched.
+    """
+    best: Map | None = None
+    attempts = [(MAP_SIDES[0], False), (MAP_SIDES[0], True), (MAP_SIDES[1], True)]
+    if masks is not None:
+        del attempts[0]
+    if max(max(p.size) for p in photos) <= 1.2 * MAP_SIDES[0]:
+        del attempts[-1]
+    for side, relaxed in attempts:
+        with tempfile.TemporaryDirectory(prefix="reli3d-map-") as folder:
+            found = _mapped(photos, masks, Path(folder), side, relaxed, progress)
+        if found and (best is None or len(found.views) > len(best.views)):
+            best = found
+        if best and len(best.views) >= ENOUGH * len(photos):
+            break
+    if best is None:
+        raise InputError(
+            "photographs",
+            "expected images that overlap, got none that match; take sharp ones with small steps around an object "
+            "with texture, or on a printed sheet of newspaper",
+        )
+    return best
+
+
+def _mapped(photos, masks, work: Path, side: int, relaxed: bool, progress: Progress) -> Map | None:
+    try:
+        pycolmap = importlib.import_module("pycolmap")
+    except ModuleNotFoundError:
+        raise InputError("pycolmap", "is not installed: pip install 'reli3d[capture]'") from None
+    pycolmap.logging.minloglevel = 3
+    pycolmap.set_random_seed(SEED)
+    lenses = sorted({p.lens for p in photos}, key=str)
+    images, database, scales, by_path = work / "images", work / "database.db", {}, {}
+    for k, photo in enumerate(photos):
+        path = f"{lenses.index(photo.lens)}/{k:05d}.png"
+        scales[path], by_path[path] = min(1.0, side / max(photo.size)), photo
+        _write(images / path, photo.pixels, scales[path])
+        if masks is not None:
+            _write(work / "masks" / f"{path}.png", _grown(masks[k]), scales[path])
+    extraction = pycolmap.FeatureExtractionOptions()
+    extraction.sift.max_num_features = FEATURES
+    if relaxed:
+        extraction.sift.peak_threshold = LOW_PEAK
+    done = 0
+    for k in range(len(lenses)):
+        names = [path for path in by_path if path.startswith(f"{k}/")]
+        photo = by_path[names[0]]
+        reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL", default_focal_length_factor=DEFAULT_FOCAL)
+        if masks is not None:
+            reader.mask_path = str(work / "masks")
+        if photo.focal:
+            width, height = (round(s * scales[names[0]]) for s in photo.size)
+            reader.camera_params = f"{photo.focal * scales[names[0]]},{width / 2},{height / 2},0"
+        for first in range(0, len(names), 4):  # a few at a time: the bar moves
+            progress("features", done, len(photos))
+            if first:
+                reader.existing_camera_id = k + 1
+            mode = pycolmap.CameraMode.PER_FOLDER if first == 0 else pycolmap.CameraMode.AUTO
+            group = names[first : first + 4]
+            pycolmap.extract_features(
+                database, images, group, camera_mode=mode, reader_options=reader, extraction_options=extraction
+            )
+            done += len(group)
+    progress("matching", 0, 1)
+    if len(photos) <= EXHAUSTIVE:
+        pycolmap.match_exhaustive(database)
+    else:
+        pairing = pycolmap.SequentialPairingOptions()
+        pairing.overlap, pairing.quadratic_overlap = 15, True  # offsets of 1 to 15, 16, 32, ...: these close loops
+        pycolmap.match_sequential(database, pairing_options=pairing)
+    options = pycolmap.IncrementalPipelineOptions(min_model_size=3, random_seed=SEED, extract_colors=False)
+    if relaxed:
+        options.mapper.init_min_num_inliers = 50
+        options.mapper.init_min_tri_angle = 8.0
+        options.mapper.abs_pose_min_num_inliers = 20
+    registered = [0]
+
+    def on_next() -> None:
+        registered[0] += 1
+        progress("mapping", min(registered[0], len(photos)), len(photos))
+
+    progress("mapping", 0, len(photos))
+    (work / "sparse").mkdir()
+    models = pycolmap.incremental_mapping(database, images, work / "sparse", options, next_image_callback=on_next)
+    if not models:
+        return None
+    largest = max(models.values(), key=lambda m: m.num_reg_images())
+    return _read_model(largest, by_path, scales)
+
+
+def _write(path: Path, pixels: np.ndarray, scale: float) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if scale < 1.0:
+        size = round(pixels.shape[1] * scale), round(pixels.shape[0] * scale)
+        pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
+    ok = cv2.imwrite(str(path), pixels[..., ::-1] if pixels.ndim == 3 else pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    if not ok:
+        raise OSError(f"{path}: cannot be written")
+
+
+def _grown(mask: np.ndarray) -> np.ndarray:
+    """``mask`` grown by MASK_MARGIN: features sit on the object's outline too."""
+    size = 2 * round(MASK_MARGIN * max(mask.shape)) + 1
+    return cv2.dilate((mask > 0).astype(np.uint8) * 255, np.ones((size, size), np.uint8))
+
+
+def _read_model(model, by_path: dict[str, Photo], scales: dict[str, float]) -> Map:
+    index = {identifier: k for k, identifier in enumerate(model.points3D)}
+    points = np.array([p.xyz for p in model.points3D.values()]).reshape(-1, 3)
+    error = np.array([p.error for p in model.points3D.values()])
+    tracks = np.array([p.track.length() for p in model.points3D.values()])
+    views = []
+    for image in model.images.values():
+        if not image.has_pose:
+            continue
+        scale, camera, pose = scales[image.name], model.cameras[image.camera_id], image.cam_from_world()
+        focal, cx, cy, radial = camera.params
+        observed = [p for p in image.points2D if p.has_point3D()]
+        views.append(
+            View(
+                by_path[image.name],
+                pose.rotation.matrix(),
+                np.asarray(pose.translation),
+                focal / scale,
+                np.array([cx, cy]) / scale,
+                float(radial),
+                np.array([p.xy for p in observed]).reshape(-1, 2) / scale,
+                np.array([index[p.point3D_id] for p in observed], dtype=np.int64),
+            )
+        )
+    order = {id(photo): k for k, photo in enumerate(by_path.values())}
+    views.sort(key=lambda v: order[id(v.photo)])
+    return Map(tuple(views), points, error, tracks)

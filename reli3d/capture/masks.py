@@ -1,0 +1,137 @@
+"""Masks of the object without a network: GrabCut seeded by the points of the map, or a uniform background's color."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from scipy.spatial import ConvexHull, QhullError
+
+from reli3d.capture.mapping import Map, View
+from reli3d.capture.scene import Scene
+
+SIDE = 1000  # pixels along the longer side of the image that is segmented
+OUTER_GROWTH = 0.18  # of the object's projected hull: beyond it nothing is the object
+SEED_RADIUS = 0.004  # of the longer side: disks around keypoints that are certain
+CONTEXT = 0.25  # of the outer limit's size: background around it that the color model sees
+ROUNDS = 5  # of GrabCut
+FEWEST_SEEDS = 6  # keypoints of the object, below which a view has no mask
+HOLE = 0.002  # of the mask's area: smaller holes and islands are noise
+KEY_SIGMAS = 4.0  # standard deviations of the border's color beyond which a pixel is the object
+
+
+def grabcut_mask(view: View, found: Map, scene: Scene, support: np.ndarray | None = None) -> np.ndarray | None:
+    """Mask ``(H, W)`` uint8, 255 inside, of the object in a view; None where the view shows too few of its points.
+
+    Keypoints of the object's points are foreground, those of the support plane background.  The hull of all the
+    object's points, grown by OUTER_GROWTH, is the outer limit (Rother and others 2004, GrabCut).  support: pixels
+    ``(K, 2)`` of background seeds, in the place of the map's.
+    """
+    image, scale = _reduced(view.photo.pixels)
+    h, w = image.shape[:2]
+    pixels, depth = view.project(found.points[scene.object])
+    pixels = pixels[depth > 0] * scale
+    seeds = view.pixels[scene.object[view.points]] * scale
+    if len(seeds) < FEWEST_SEEDS or len(pixels) < FEWEST_SEEDS:
+        return None
+    try:
+        outline = pixels[ConvexHull(pixels).vertices]
+    except QhullError:
+        return None
+    middle = outline.mean(0)
+    limit = np.zeros((h, w), np.uint8)
+    cv2.fillConvexPoly(limit, np.rint(middle + (outline - middle) * (1 + OUTER_GROWTH)).astype(np.int32), 1)
+    labels = np.where(limit > 0, cv2.GC_PR_FGD, cv2.GC_BGD).astype(np.uint8)
+    radius = max(2, round(SEED_RADIUS * max(h, w)))
+    ground = view.pixels[scene.support[view.points]] if support is None else support
+    for at in np.rint(ground * scale).astype(int):
+        cv2.circle(labels, at.tolist(), radius, cv2.GC_BGD, -1)
+    for at in np.rint(seeds).astype(int):
+        cv2.circle(labels, at.tolist(), radius, cv2.GC_FGD, -1)
+    ys, xs = limit.nonzero()
+    pad = round(CONTEXT * max(np.ptp(ys), np.ptp(xs)) + 8) if len(ys) else 0
+    if len(ys) == 0 or not (labels == cv2.GC_FGD).any():
+        return None
+    y0, y1, x0, x1 = max(0, ys.min() - pad), ys.max() + pad, max(0, xs.min() - pad), xs.max() + pad
+    part = np.ascontiguousarray(labels[y0:y1, x0:x1])
+    if not (part == cv2.GC_BGD).any():
+        return None
+    cv2.setRNGSeed(0)
+    models = np.zeros((1, 65)), np.zeros((1, 65))
+    crop = np.ascontiguousarray(image[y0:y1, x0:x1, ::-1])
+    cv2.grabCut(crop, part, None, *models, ROUNDS, cv2.GC_INIT_WITH_MASK)
+    mask = np.zeros((h, w), np.uint8)
+    mask[y0:y1, x0:x1] = ((part == cv2.GC_FGD) | (part == cv2.GC_PR_FGD)) * 255
+    return _full_size(cleaned(mask, seeds), view.photo.pixels.shape)
+
+
+def key_mask(pixels: np.ndarray) -> np.ndarray | None:
+    """Mask of what differs from the color of the image's border; None where the border has no one color."""
+    image, _ = _reduced(pixels)
+    lab = cv2.cvtColor(image, cv2.COLOR_RGB2LAB).astype(np.float32)
+    border = np.concatenate([lab[0], lab[-1], lab[:, 0], lab[:, -1]])
+    middle = np.median(border, 0)
+    spread = np.maximum(1.4826 * np.median(np.abs(border - middle), 0), 2.0)
+    mask = ((np.abs(lab - middle) / spread).max(-1) > KEY_SIGMAS).astype(np.uint8) * 255
+    mask = cleaned(cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)), None)
+    inside = float((mask > 0).mean())
+    return _full_size(mask, pixels.shape) if 0.002 < inside < 0.8 else None
+
+
+def cleaned(mask: np.ndarray, seeds: np.ndarray | None) -> np.ndarray:
+    """``mask`` without small islands and holes.  Islands that hold a seed ``(K, 2)`` stay, else the largest alone."""
+    count, label, stats, _ = cv2.connectedComponentsWithStats(mask)
+    if count < 2:
+        return mask
+    area = stats[:, cv2.CC_STAT_AREA].astype(np.float64)
+    area[0] = 0
+    keep = area == area.max()
+    if seeds is not None:
+        at = np.rint(seeds).astype(int)
+        at = at[(at >= 0).all(1) & (at[:, 0] < mask.shape[1]) & (at[:, 1] < mask.shape[0])]
+        hit = np.bincount(label[at[:, 1], at[:, 0]], minlength=count) > 0
+        keep |= hit & (area > HOLE * area.max())
+    keep[0] = False
+    mask = keep[label].astype(np.uint8) * 255
+    count, label, stats, _ = cv2.connectedComponentsWithStats(255 - mask)
+    small = stats[:, cv2.CC_STAT_AREA] < HOLE * area.max()
+    small[0] = False
+    mask[small[label]] = 255
+    return mask
+
+
+def moving_region(pixels: list[np.ndarray]) -> np.ndarray | None:
+    """Mask of where images of a fixed camera differ from each other: the turntable and what stands on it; None where
+    the cameras move, or nothing does.
+    """
+    if len({p.shape for p in pixels}) != 1:
+        return None
+    small = np.stack([cv2.resize(p, (160, max(1, round(160 * p.shape[0] / p.shape[1])))) for p in pixels])
+    spread = cv2.blur(small.astype(np.float32).std(0).max(-1), (3, 3))
+    ring = np.concatenate([spread[:4].ravel(), spread[-4:].ravel(), spread[:, :4].ravel(), spread[:, -4:].ravel()])
+    still = float(np.quantile(ring, 0.8))
+    if still > 5.0 or float(np.quantile(spread, 0.97)) < max(12.0, 4.0 * still):
+        return None
+    moving = (spread > max(6.0, 3.0 * still)).astype(np.uint8) * 255
+    moving = cleaned(cv2.morphologyEx(moving, cv2.MORPH_CLOSE, np.ones((9, 9), np.uint8)), None)
+    return cv2.resize(moving, pixels[0].shape[1::-1], interpolation=cv2.INTER_NEAREST)
+
+
+def touches_border(mask: np.ndarray) -> bool:
+    """Whether more than a few pixels of the mask lie on the image's border."""
+    inside = mask > 127
+    edge = np.concatenate([inside[0], inside[-1], inside[:, 0], inside[:, -1]])
+    return int(edge.sum()) > 0.004 * max(mask.shape)
+
+
+def _reduced(pixels: np.ndarray) -> tuple[np.ndarray, float]:
+    scale = min(1.0, SIDE / max(pixels.shape[:2]))
+    if scale == 1.0:
+        return pixels, 1.0
+    size = round(pixels.shape[1] * scale), round(pixels.shape[0] * scale)
+    return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), scale
+
+
+def _full_size(mask: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    if mask.shape == shape[:2]:
+        return mask
+    return cv2.resize(mask, (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR)

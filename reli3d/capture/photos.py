@@ -1,0 +1,193 @@
+"""Photographs of a folder, or sharp frames of a video, with what their files say about the lens."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+
+import cv2
+import numpy as np
+from PIL import ExifTags, Image, ImageOps
+
+from reli3d.io.files import InputError, file_size, shown
+
+LONGEST_SIDE = 2000  # pixels of a photograph that is kept
+FRAME_COUNT = 60  # frames taken from a video
+MOST_PHOTOS = 120  # of a folder: of more every second, third, ... is read
+FEWEST = 8  # photographs, below which no closed shape can be expected
+MAX_PIXELS = 1 << 27
+PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".heic", ".heif", ".webp", ".tif", ".tiff")
+VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
+SHARPNESS_SIDE = 640  # pixels at which sharpness is compared
+MILLIMETERS = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # EXIF FocalPlaneResolutionUnit
+
+Progress = Callable[[str, int, int], None]  # stage, steps done, steps in all
+
+
+@dataclass(frozen=True)
+class Photo:
+    """One image as the mapping reads it."""
+
+    name: str  # unique; without suffix
+    pixels: np.ndarray  # (H, W, 3) uint8, sRGB, upright
+    focal: float | None  # pixels, from EXIF; None where it says nothing
+    lens: tuple  # equal for photographs that share a lens and a size
+    flash: bool = False
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height."""
+        return self.pixels.shape[1], self.pixels.shape[0]
+
+
+def read_photos(source: Path, progress: Progress) -> tuple[list[Photo], list[str]]:
+    """Photographs of a folder in the order of their names, or frames of a video, and notes on them.
+
+    Images are turned by their EXIF orientation and reduced to LONGEST_SIDE.  Raises InputError where ``source`` is
+    neither, where a file is broken, and where there are fewer than FEWEST images.
+    """
+    if source.is_dir():
+        photos, notes = _read_folder(source, progress)
+    elif source.suffix.lower() in VIDEO_SUFFIXES:
+        photos, notes = _read_video(source, progress)
+    else:
+        file_size(source)
+        raise InputError(source, "expected a folder of photographs or a video (mp4, mov); check the path")
+    if len(photos) < FEWEST:
+        raise InputError(
+            source, f"expected at least {FEWEST} photographs, got {len(photos)}; take 20 to 60 all around the object"
+        )
+    sizes = {p.size for p in photos}
+    if len(sizes) > 1:
+        notes.append(f"{len(sizes)} image sizes: each is calibrated as a camera of its own")
+    flashes = sum(p.flash for p in photos)
+    if flashes:
+        notes.append(
+            f"{flashes} of {len(photos)} photographs were taken with flash: the lighting moves with the camera"
+        )
+    return photos, notes
+
+
+def _read_folder(folder: Path, progress: Progress) -> tuple[list[Photo], list[str]]:
+    files = sorted(p for p in folder.iterdir() if p.suffix.lower() in PHOTO_SUFFIXES and not p.name.startswith("."))
+    if not files and (folder / "images").is_dir():
+        return _read_folder(folder / "images", progress)
+    if any(p.suffix.lower() in (".heic", ".heif") for p in files):
+        _extra("pillow_heif").register_heif_opener()
+    notes, step = [], -(-len(files) // MOST_PHOTOS)
+    if step > 1:
+        notes.append(f"one of {step} photographs is read: {len(files[::step])} of {len(files)}")
+        files = files[::step]
+    stems = [p.stem for p in files]
+    photos = []
+    for k, path in enumerate(files):
+        progress("reading", k, len(files))
+        name = path.stem if stems.count(path.stem) == 1 else path.name
+        photos.append(_read_photo(path, name))
+    progress("reading", len(files), len(files))
+    return photos, notes
+
+
+def _extra(module: str) -> ModuleType:
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError:
+        raise InputError(module, "is not installed: pip install 'reli3d[capture]'") from None
+
+
+def _read_photo(path: Path, name: str) -> Photo:
+    file_size(path)
+    try:
+        with Image.open(path) as image:
+            if image.width * image.height > MAX_PIXELS:
+                raise InputError(path, f"expected at most {MAX_PIXELS} pixels, got {image.width} x {image.height}")
+            exif = image.getexif()
+            tags = {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
+            stored = image.size
+            image.draft("RGB", (LONGEST_SIDE, LONGEST_SIDE))
+            upright = ImageOps.exif_transpose(image).convert("RGB")
+            upright.thumbnail((LONGEST_SIDE, LONGEST_SIDE), Image.Resampling.BOX, reducing_gap=None)
+    except InputError:
+        raise
+    except Exception as error:  # decoders raise almost anything on a broken file
+        raise InputError(path, f"cannot be decoded ({shown(str(error))}); leave it out or save it again") from None
+    longest = max(upright.size)
+    focal = focal_from_exif(tags, stored, longest)
+    lens = (upright.size, str(tags.get(ExifTags.Base.Model, "")), round(focal) if focal else None)
+    return Photo(name, np.asarray(upright), focal, lens, bool(_number(tags.get(ExifTags.Base.Flash), 0.0)) % 2 == 1)
+
+
+def focal_from_exif(tags: dict, stored: tuple[int, int], longest: int) -> float | None:
+    """Focal length in pixels of an image reduced to ``longest`` pixels along its longer side, or None.
+
+    From FocalLength and FocalPlaneXResolution where both are there (Canon has no other), else from
+    FocalLengthIn35mmFilm, which refers to a frame 36 mm wide.  stored: width and height of the file.
+    """
+    base = ExifTags.Base
+    length = _number(tags.get(base.FocalLength), 0.0)
+    density = _number(tags.get(base.FocalPlaneXResolution), 0.0)
+    unit = MILLIMETERS.get(int(_number(tags.get(base.FocalPlaneResolutionUnit), 2.0)))
+    taken = max(_number(tags.get(base.ExifImageWidth), 0.0), _number(tags.get(base.ExifImageHeight), 0.0), *stored)
+    found = 0.0
+    if length > 0 and density > 0 and unit:
+        found = length / unit * density * longest / taken
+    elif (film := _number(tags.get(base.FocalLengthIn35mmFilm), 0.0)) > 0:
+        found = film / 36.0 * longest
+    return found if 0.3 * longest < found < 20.0 * longest else None
+
+
+def _number(value: object, default: float) -> float:
+    try:
+        return float(value)  # type: ignore[arg-type] # IFDRational, int, or something broken
+    except (TypeError, ValueError, ZeroDivisionError):
+        return default
+
+
+def sharpness(pixels: np.ndarray) -> float:
+    """Variance of the Laplacian of the luma at SHARPNESS_SIDE pixels, over the luma's variance; 0 for a plain image."""
+    gray = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
+    scale = SHARPNESS_SIDE / max(gray.shape)
+    if scale < 1.0:
+        gray = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return float(cv2.Laplacian(gray, cv2.CV_32F).var() / max(float(gray.var()), 1.0))
+
+
+def _read_video(path: Path, progress: Progress) -> tuple[list[Photo], list[str]]:
+    """The sharpest frame of each of FRAME_COUNT windows of equal length."""
+    av = _extra("av")
+    file_size(path)
+    best: dict[int, tuple[float, np.ndarray]] = {}
+    count = 0
+    try:
+        with av.open(str(path)) as file:
+            if not file.streams.video:
+                raise InputError(path, "expected a video, got a file without a picture stream; check the path")
+            stream = file.streams.video[0]
+            stream.thread_type = "AUTO"
+            total = stream.frames or round(float((file.duration or 0) / 1e6 * float(stream.average_rate or 30)))
+            window = max(1.0, total / FRAME_COUNT)
+            for frame in file.decode(stream):
+                pixels = _frame_pixels(frame)
+                score, at = sharpness(pixels), min(FRAME_COUNT - 1, int(count / window))
+                if at not in best or score > best[at][0]:
+                    best[at] = score, pixels
+                count += 1
+                progress("reading", min(count, total), total)
+    except InputError:
+        raise
+    except Exception as error:  # FFmpeg's errors have many classes
+        if len(best) < FEWEST:
+            raise InputError(path, f"cannot be decoded ({shown(str(error))}); record it again") from None
+    photos = [Photo(f"frame_{k:04d}", best[k][1], None, (best[k][1].shape,)) for k in sorted(best)]
+    return photos, [f"{len(photos)} sharp frames taken of {count} of the video"]
+
+
+def _frame_pixels(frame) -> np.ndarray:
+    """RGB of a decoded frame, upright, reduced to LONGEST_SIDE."""
+    scale = min(1.0, LONGEST_SIDE / max(frame.width, frame.height))
+    pixels = frame.to_ndarray(format="rgb24", width=round(frame.width * scale), height=round(frame.height * scale))
+    turns = round(float(getattr(frame, "rotation", 0) or 0) / 90.0) % 4  # degrees counter-clockwise
+    return np.ascontiguousarray(np.rot90(pixels, turns))

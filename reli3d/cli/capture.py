@@ -1,0 +1,99 @@
+"""``reli3d capture``: photographs or a video without cameras to an object folder."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+from reli3d.cli.exit_codes import command
+from reli3d.cli.help_format import Defaults
+
+FAILED_CHECKS = 3  # exit code
+LEAST_IOU = 0.9  # of the asset's silhouettes with the masks
+
+
+def parser() -> argparse.ArgumentParser:
+    p = argparse.ArgumentParser(
+        formatter_class=Defaults,
+        prog="reli3d capture",
+        description="Find the cameras and the masks of photographs or a video of one object, and write an object "
+        "folder that reli3d-infer reads.  Needs the extra: pip install 'reli3d[capture]'.",
+        epilog="Exit code: 0 all checks passed, 2 wrong input, 3 a check failed (the folder is written), 130 "
+        "interrupted.  The folder's path goes to stdout.",
+    )
+    p.add_argument("source", type=Path, help="folder of JPEG, HEIC or PNG photographs, or a video (mp4, mov)")
+    p.add_argument("output", type=Path, help="object folder to write, with capture.json and capture.png")
+    p.add_argument("--masks", type=Path, help="folder of masks with the photographs' names, instead of --mask-method")
+    p.add_argument(
+        "--mask-method",
+        choices=("grabcut", "key", "rembg"),
+        default="grabcut",
+        help="grabcut: from the points of the object and of what it stands on; key: what differs from a uniform "
+        "background; rembg: a network (pip install 'reli3d[masks]'), fetched once",
+    )
+    p.add_argument(
+        "--turntable",
+        action=argparse.BooleanOptionalAction,
+        help="the object turns in front of a fixed camera (default: detected)",
+    )
+    p.add_argument(
+        "--size", type=float, metavar="MM", help="longest side of the object in millimeters: units are meters"
+    )
+    p.add_argument("--infer", action="store_true", help="go on to the asset, in OUTPUT/asset")
+    return p
+
+
+class _Bar:
+    """A progress bar of one stage after the other, on stderr where that is a terminal."""
+
+    def __init__(self) -> None:
+        from tqdm import tqdm
+
+        self.bar = tqdm(file=sys.stderr, disable=None, bar_format="{desc}: {bar:20} {n_fmt}/{total_fmt} {elapsed}")
+
+    def __call__(self, stage: str, done: int, total: int) -> None:
+        self.bar.set_description(stage, refresh=False)
+        self.bar.n, self.bar.total = done, total
+        self.bar.refresh()
+
+
+@command("reli3d capture")
+def main(argv: list[str] | None = None) -> int:
+    args = parser().parse_args(argv)
+    from reli3d.capture.capture import CaptureOptions, capture, summary
+
+    bar = _Bar()
+    try:
+        options = CaptureOptions(args.masks, args.mask_method, args.turntable, args.size)
+        report = capture(args.source, args.output, options, bar)
+    finally:
+        bar.bar.close()
+    lines = [*report.notes, *(f"left out {name}: {why}" for name, why in report.left_out.items())]
+    if report.lost:
+        lines.append(f"not registered: {', '.join(report.lost)}")
+    for line in [*lines, summary(report), *(f"check failed: {text}" for text in report.failed)]:
+        print(f"reli3d capture: {line}", file=sys.stderr)
+    print(args.output)
+    if args.infer and _infer(args.output):
+        return FAILED_CHECKS
+    return FAILED_CHECKS if report.failed else 0
+
+
+def _infer(folder: Path) -> bool:
+    """Reconstruct ``folder``; whether the asset's silhouettes do not fill the masks."""
+    from reli3d.cli import infer
+
+    code = infer.main([str(folder), "--output", str(folder / "asset")])
+    if code:
+        return True
+    info = next((folder / "asset").glob("*/run_info.json"))
+    iou = json.loads(info.read_text())["mask_iou"]
+    if iou < LEAST_IOU:
+        print(f"reli3d capture: check failed: mask IoU of the asset {iou:.3f}, at least 0.9 expected", file=sys.stderr)
+    return iou < LEAST_IOU
+
+
+if __name__ == "__main__":
+    sys.exit(main())

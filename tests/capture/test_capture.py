@@ -1,0 +1,81 @@
+"""A capture from end to end, against a synthetic scene whose cameras and masks are known."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from reli3d.capture.capture import capture
+from reli3d.io.files import InputError
+from reli3d.views.folder import load_views
+from tests.support.capture_scene import render_capture
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return render_capture(views=20)
+
+
+@pytest.fixture(scope="module")
+def captured(truth, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("capture")
+    report = capture(truth.write(folder / "photographs"), folder / "object")
+    return report, folder / "object"
+
+
+def similarity(a: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """Scale, rotation and shift that take the points ``a (N, 3)`` to ``b`` with the least squares (Umeyama 1991)."""
+    a0, b0 = a.mean(0), b.mean(0)
+    u, s, vt = np.linalg.svd((b - b0).T @ (a - a0))
+    sign = np.diag([1.0, 1.0, np.linalg.det(u @ vt)])
+    scale = float((s * np.diag(sign)).sum() / ((a - a0) ** 2).sum())
+    turn = u @ sign @ vt
+    return scale, turn, b0 - scale * turn @ a0
+
+
+def test_cameras_are_those_of_the_scene(truth, captured):
+    report, folder = captured
+    frames = json.loads((folder / "transforms.json").read_text())["frames"]
+    assert report.registered == len(truth.images) and not report.lost
+    index = [int(f["file_path"][7:10]) for f in frames]
+    got, want = np.array([f["transform_matrix"] for f in frames]), truth.c2w[index]
+    scale, turn, shift = similarity(got[:, :3, 3], want[:, :3, 3])
+    away = np.linalg.norm(scale * got[:, :3, 3] @ turn.T + shift - want[:, :3, 3], axis=1)
+    assert away.max() < 0.005 * np.linalg.norm(want[:, :3, 3], axis=1).mean()  # 0.5 % of the distance
+    relative = turn @ got[:, :3, :3] @ want[:, :3, :3].transpose(0, 2, 1)
+    angle = np.degrees(np.arccos(np.clip((np.trace(relative, axis1=1, axis2=2) - 1) / 2, -1, 1)))
+    assert angle.max() < 0.3
+    assert abs(frames[0]["fl_x"] / truth.focal - 1) < 0.01
+
+
+def test_masks_are_those_of_the_scene_and_views_agree(truth, captured):
+    report, folder = captured
+    views = load_views(folder, every=True)
+    for name, mask in zip(views.names, views.masks, strict=True):
+        want = truth.masks[int(name.split("/")[-1][:3])]
+        got = mask.numpy() > 0.5
+        if got.shape == want.shape:  # views of more than two megapixels are cut
+            assert (got & want).sum() / (got | want).sum() > 0.93
+    assert report.agreement > 0.9 and not report.failed
+
+
+def test_the_frame_is_upright_with_the_ground_at_zero(truth, captured):
+    _, folder = captured
+    frames = json.loads((folder / "transforms.json").read_text())["frames"]
+    index = [int(f["file_path"][7:10]) for f in frames]
+    got, want = np.array([f["transform_matrix"] for f in frames])[:, :3, 3], truth.c2w[index, :3, 3]
+    scale, turn, shift = similarity(want, got)
+    assert (turn @ [0, 1, 0])[1] > np.cos(np.radians(1.0))
+    assert abs(scale - 1.0) < 0.1  # the object's longest side is 1; a hull is larger than its object
+
+
+def test_the_folder_is_whole_and_is_replaced_only_if_it_is_a_capture(truth, captured, tmp_path):
+    _, folder = captured
+    assert {p.name for p in folder.iterdir()} == {"images", "masks", "transforms.json", "capture.json", "capture.png"}
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "letter.txt").write_text("mine")
+    with pytest.raises(InputError, match="empty folder or an earlier capture"):
+        capture(folder / "images", tmp_path / "full")
+    assert (tmp_path / "full" / "letter.txt").read_text() == "mine"

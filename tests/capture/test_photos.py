@@ -1,0 +1,105 @@
+"""Reading photographs and videos for a capture: EXIF, order, sharpness, refusals."""
+
+from __future__ import annotations
+
+import av
+import numpy as np
+import pytest
+from PIL import ExifTags, Image
+
+from reli3d.capture.photos import FRAME_COUNT, focal_from_exif, read_photos, sharpness
+from reli3d.io.files import InputError
+
+BASE = ExifTags.Base
+
+
+def quiet(stage: str, done: int, total: int) -> None:
+    """A progress callback that shows nothing."""
+
+
+def textured(seed: int, width: int = 320, height: int = 240) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    coarse = Image.fromarray(rng.integers(0, 255, (height // 4, width // 4, 3), dtype=np.uint8))
+    return np.asarray(coarse.resize((width, height), Image.Resampling.NEAREST))
+
+
+def test_focal_length_of_a_canon_comes_from_its_sensor():
+    """100 mm on a sensor 22.3 mm wide, at 5184 pixels: 100 / 22.3 of the width, whatever the file was reduced to."""
+    tags = {
+        BASE.FocalLength: 100.0,
+        BASE.FocalPlaneXResolution: 5184 / (22.3 / 25.4),
+        BASE.FocalPlaneResolutionUnit: 2,
+        BASE.ExifImageWidth: 5184,
+        BASE.ExifImageHeight: 3456,
+    }
+    assert focal_from_exif(tags, (1000, 667), 1000) == pytest.approx(1000 * 100 / 22.3, rel=1e-6)  # closed form
+    tags[BASE.FocalPlaneResolutionUnit] = 3  # the same number for a centimeter is another sensor
+    assert focal_from_exif(tags, (1000, 667), 1000) == pytest.approx(1000 * 100 / 22.3 * 2.54, rel=1e-6)
+
+
+def test_focal_length_of_a_phone_comes_from_its_35_mm_equivalent():
+    assert focal_from_exif({BASE.FocalLengthIn35mmFilm: 26}, (4032, 3024), 2000) == pytest.approx(2000 * 26 / 36)
+    assert focal_from_exif({}, (4032, 3024), 2000) is None
+    assert focal_from_exif({BASE.FocalLengthIn35mmFilm: 0}, (4032, 3024), 2000) is None
+
+
+def test_photographs_are_upright_reduced_and_in_order(tmp_path):
+    exif = Image.Exif()
+    exif[BASE.Orientation] = 6  # turn by 90 degrees clockwise to show
+    for k in range(8):
+        Image.fromarray(textured(k, 2400, 1200)).save(tmp_path / f"{9 - k}.jpg", exif=exif)
+    photos, _ = read_photos(tmp_path, quiet)
+    assert [p.name for p in photos] == [str(k) for k in range(2, 10)]
+    assert photos[0].size == (1000, 2000)
+    want = Image.fromarray(np.rot90(textured(7, 2400, 1200), -1)).resize((1000, 2000), Image.Resampling.BOX)
+    difference = np.abs(photos[0].pixels.astype(int) - np.asarray(want).astype(int))
+    assert difference.mean() < 25  # JPEG of noise; a wrong turn differs by 85
+
+
+def test_flash_and_mixed_sizes_are_reported(tmp_path):
+    exif = Image.Exif()
+    exif.get_ifd(ExifTags.IFD.Exif)[BASE.Flash] = 0x19  # fired, auto
+    for k in range(8):
+        pixels = textured(k) if k else textured(k, 200, 200)
+        Image.fromarray(pixels).save(tmp_path / f"{k}.jpg", **({"exif": exif} if k < 3 else {}))
+    _, notes = read_photos(tmp_path, quiet)
+    assert any("3 of 8" in n and "flash" in n for n in notes)
+    assert any("2 image sizes" in n for n in notes)
+
+
+def test_the_sharpest_frame_of_each_window_of_a_video_is_taken(tmp_path):
+    """Every third frame is sharp, the others are blurred; there are three frames a window."""
+    path = tmp_path / "clip.mp4"
+    with av.open(str(path), "w") as file:
+        stream = file.add_stream("libx264", rate=30, options={"crf": "12"})
+        stream.width, stream.height, stream.pix_fmt = 320, 240, "yuv420p"
+        for k in range(3 * FRAME_COUNT):
+            image = Image.fromarray(textured(k // 3))
+            if k % 3 != 1:
+                image = image.resize((20, 15), Image.Resampling.BOX).resize((320, 240))
+            file.mux(stream.encode(av.VideoFrame.from_image(image)))
+        file.mux(stream.encode())
+    photos, notes = read_photos(path, quiet)
+    assert len(photos) == FRAME_COUNT
+    assert min(sharpness(p.pixels) for p in photos) > 0.5 * sharpness(textured(0))  # blurred ones have a tenth
+    assert "60 sharp frames taken of 180" in notes[0]
+
+
+def test_what_is_no_capture_is_refused_in_one_line(tmp_path):
+    with pytest.raises(InputError, match="file not found"):
+        read_photos(tmp_path / "nothing.jpg", quiet)
+    (tmp_path / "notes.txt").write_text("no photograph")
+    with pytest.raises(InputError, match="folder of photographs or a video"):
+        read_photos(tmp_path / "notes.txt", quiet)
+    few = tmp_path / "few"
+    few.mkdir()
+    for k in range(3):
+        Image.fromarray(textured(k)).save(few / f"{k}.png")
+    with pytest.raises(InputError, match="at least 8 photographs, got 3"):
+        read_photos(few, quiet)
+    (few / "3.jpg").write_bytes(b"\xff\xd8\xff\xe0 broken")
+    with pytest.raises(InputError, match=r"3\.jpg: cannot be decoded"):
+        read_photos(few, quiet)
+    (tmp_path / "broken.mp4").write_bytes(b"\0\0\0\x18ftypmp42" + bytes(400))
+    with pytest.raises(InputError, match="cannot be decoded|without a picture stream"):
+        read_photos(tmp_path / "broken.mp4", quiet)

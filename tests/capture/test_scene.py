@@ -1,0 +1,81 @@
+"""Parts of a capture by themselves: support plane, masks by color, turntables, and masks cut off by the border."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from reli3d.capture.masks import cleaned, key_mask, moving_region, touches_border
+from reli3d.capture.scene import find_plane
+
+
+def test_the_support_plane_is_the_largest_area_and_not_the_most_points():
+    """A cube of 6,000 points stands on a table of 800: the plane is the table, not a face of the cube."""
+    rng = np.random.default_rng(0)
+    table = np.concatenate([rng.uniform(-1, 1, (800, 2)), rng.normal(0, 0.002, (800, 1))], 1)
+    faces = []
+    for axis in range(3):
+        for side in (-0.2, 0.2):
+            face = rng.uniform(-0.2, 0.2, (1000, 3))
+            face[:, axis] = side
+            faces.append(face + [0, 0, 0.2])
+    angles = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    eyes = np.stack([2 * np.cos(angles), 2 * np.sin(angles), np.full(24, 1.0)], 1)
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    points = np.concatenate([table, *faces]) @ turn.T + [3, 4, 5]
+    plane = find_plane(points, eyes @ turn.T + [3, 4, 5], 2.2)
+    assert plane is not None
+    assert plane.normal @ turn[:, 2] > np.cos(np.radians(0.5))  # noise of 0.002 over a side of 2
+    assert abs(plane.height(np.array([[3.0, 4.0, 5.0]]))[0]) < 0.005
+    assert find_plane(rng.normal(size=(500, 3)), eyes, 2.2) is None  # a cloud has none
+
+
+def test_masks_by_color():
+    image = np.full((200, 300, 3), (200, 205, 210), np.uint8)
+    cv2.circle(image, (150, 100), 50, (120, 40, 30), -1)
+    image = np.clip(image + np.random.default_rng(0).normal(0, 3, image.shape), 0, 255).astype(np.uint8)
+    truth = np.zeros((200, 300), np.uint8)
+    cv2.circle(truth, (150, 100), 50, 255, -1)
+    mask = key_mask(image)
+    assert mask is not None
+    inside, expected = mask > 127, truth > 127
+    assert (inside & expected).sum() / (inside | expected).sum() > 0.97  # half a pixel of the circle's edge is 2 %
+    noise = np.random.default_rng(1).integers(0, 255, (200, 300, 3), dtype=np.uint8)
+    assert key_mask(noise) is None
+
+
+def test_islands_and_holes_of_a_mask():
+    mask = np.zeros((200, 200), np.uint8)
+    mask[50:150, 50:150] = 255
+    mask[90:110, 90:110] = 0  # 4 % of the area: the hole of a handle stays
+    mask[60:62, 60:62] = 0  # noise
+    mask[10:20, 10:20] = 255  # an island without a seed
+    mask[170:190, 170:190] = 255  # one with a seed
+    result = cleaned(mask, np.array([[100.0, 60.0], [180.0, 180.0]]))
+    assert result[100, 100] == 0 and result[61, 61] == 255 and result[15, 15] == 0 and result[180, 180] == 255
+
+
+def test_a_fixed_camera_and_a_turning_object_are_a_turntable():
+    rng = np.random.default_rng(0)
+    background = cv2.resize(rng.integers(0, 255, (30, 40, 3), dtype=np.uint8), (320, 240))
+    images = []
+    for _ in range(10):
+        image = background.copy()
+        image[80:200, 100:220] = cv2.resize(rng.integers(0, 255, (12, 12, 3), dtype=np.uint8), (120, 120))
+        images.append(image)
+    region = moving_region(images)
+    assert region is not None
+    truth = np.zeros((240, 320), bool)
+    truth[80:200, 100:220] = True
+    inside = region > 0
+    assert (inside & truth).sum() / (inside | truth).sum() > 0.8  # the region is found at 160 pixels
+    moving = [np.roll(background, 9 * k, 1) for k in range(10)]
+    assert moving_region(moving) is None  # a camera that moves
+
+
+def test_a_mask_that_is_cut_off_touches_the_border():
+    mask = np.zeros((100, 100), np.uint8)
+    mask[20:80, 20:80] = 255
+    assert not touches_border(mask)
+    mask[20:80, 80:] = 255
+    assert touches_border(mask)
