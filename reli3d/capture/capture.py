@@ -449,7 +449,8 @@ def _write(output, views, masks, frame: _Frame, report: CaptureReport, points: n
         (work / "transforms.json").write_text(json.dumps(content, indent=1))
         (work / "capture.json").write_text(json.dumps(asdict(report), indent=1))
         eyes = np.stack([turn.apply(v.eye) for v in views])
-        contact_sheet(thumbnails, points, eyes, back, report).save(work / "capture.png")
+        lines = [summary(report), *(f"check failed: {text}" for text in report.failed[:1])]
+        contact_sheet(thumbnails, points, eyes, back, lines).save(work / "capture.png")
         old = output.with_name(f".{os.getpid()}.{os.urandom(4).hex()}.old")
         if output.exists():
             os.replace(output, old)

@@ -4,64 +4,87 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
 
 from reli3d.capture.mapping import Map, View
 from reli3d.capture.scene import Scene
 
 SIDE = 1000  # pixels along the longer side of the image that is segmented
 OUTER_GROWTH = 0.18  # of the object's projected hull: beyond it nothing is the object
+GROWTH_STEPS = 4  # times the limit grows at most: parts without a point are missing in the hull
+MOST_REACHED = 0.02  # fraction of the limit's edge up to which the mask does not count as cut off by it
 SEED_RADIUS = 0.004  # of the longer side: disks around keypoints that are certain
 CONTEXT = 0.25  # of the outer limit's size: background around it that the color model sees
 ROUNDS = 5  # of GrabCut
-FEWEST_SEEDS = 6  # keypoints of the object, below which a view has no mask
+FEWEST_SEEDS = 6  # keypoints of the object: fewer do not show its colors
 HOLE = 0.002  # of the mask's area: smaller holes and islands are noise
 KEY_SIGMAS = 4.0  # standard deviations of the border's color beyond which a pixel is the object
 
 
 def grabcut_mask(view: View, found: Map, scene: Scene, support: np.ndarray | None = None) -> np.ndarray | None:
-    """Mask ``(H, W)`` uint8, 255 inside, of the object in a view; None where the view shows too few of its points.
+    """Mask ``(H, W)`` uint8, 255 inside, of the object in a view; None where the object's points lie elsewhere.
 
-    Keypoints of the object's points are foreground, those of the support plane background.  The hull of all the
-    object's points, grown by OUTER_GROWTH, is the outer limit (Rother and others 2004, GrabCut).  support: pixels
-    ``(K, 2)`` of background seeds, in the place of the map's.
+    GrabCut (Rother and others 2004) with the map's points as seeds.  Foreground are the keypoints of the object's
+    points, or all of its points, projected, where the view observes less than FEWEST_SEEDS of them.  Background are the
+    keypoints of the support plane and what lies beyond an outer limit: the hull of the object's points and of their
+    feet on the plane, grown by OUTER_GROWTH, and once more as long as the mask reaches it.  support: pixels ``(K, 2)``
+    of background seeds, in the place of the map's.
     """
     image, scale = _reduced(view.photo.pixels)
     h, w = image.shape[:2]
-    pixels, depth = view.project(found.points[scene.object])
+    points = found.points[scene.object]
+    feet = points - scene.plane.height(points)[:, None] * scene.plane.normal if scene.plane else points[:0]
+    pixels, depth = view.project(points)
     pixels = pixels[depth > 0] * scale
+    foot_pixels, depth = view.project(feet)
     seeds = view.pixels[scene.object[view.points]] * scale
-    if len(seeds) < FEWEST_SEEDS or len(pixels) < FEWEST_SEEDS:
+    seeds = seeds if len(seeds) >= FEWEST_SEEDS else pixels
+    inside = ((seeds > 0) & (seeds < (w - 1, h - 1))).all(1)
+    if inside.sum() < FEWEST_SEEDS:
         return None
-    try:
-        outline = pixels[ConvexHull(pixels).vertices]
-    except QhullError:
-        return None
-    middle = outline.mean(0)
-    limit = np.zeros((h, w), np.uint8)
-    cv2.fillConvexPoly(limit, np.rint(middle + (outline - middle) * (1 + OUTER_GROWTH)).astype(np.int32), 1)
+    outline = cv2.convexHull(np.concatenate([pixels, foot_pixels[depth > 0] * scale]).astype(np.float32))[:, 0]
+    ground = view.pixels[scene.support[view.points]] if support is None else support
+    middle, masks = outline.mean(0), []
+    for step in range(1, GROWTH_STEPS + 1):
+        limit = np.zeros((h, w), np.uint8)
+        grown = middle + (outline - middle) * (1 + OUTER_GROWTH * step)
+        cv2.fillConvexPoly(limit, np.rint(grown).astype(np.int32), 1)
+        mask = _grabcut(image, limit, seeds[inside], ground * scale)
+        if mask is None:
+            return None
+        masks.append(mask)
+        if _reached(limit, mask) <= MOST_REACHED:
+            break
+    else:  # it leaks into the background without end
+        mask = masks[0]
+    return _full_size(cleaned(mask, seeds), view.photo.pixels.shape)
+
+
+def _grabcut(image: np.ndarray, limit: np.ndarray, seeds: np.ndarray, ground: np.ndarray) -> np.ndarray | None:
+    """The segmentation ``(H, W)`` within ``limit``; None where no background is in sight."""
+    h, w = limit.shape
     labels = np.where(limit > 0, cv2.GC_PR_FGD, cv2.GC_BGD).astype(np.uint8)
     radius = max(2, round(SEED_RADIUS * max(h, w)))
-    ground = view.pixels[scene.support[view.points]] if support is None else support
-    for at in np.rint(ground * scale).astype(int):
-        cv2.circle(labels, at.tolist(), radius, cv2.GC_BGD, -1)
-    for at in np.rint(seeds).astype(int):
-        cv2.circle(labels, at.tolist(), radius, cv2.GC_FGD, -1)
+    for points, label in ((ground, cv2.GC_BGD), (seeds, cv2.GC_FGD)):
+        for at in np.rint(points).astype(int):
+            cv2.circle(labels, at.tolist(), radius, label, -1)
     ys, xs = limit.nonzero()
-    pad = round(CONTEXT * max(np.ptp(ys), np.ptp(xs)) + 8) if len(ys) else 0
-    if len(ys) == 0 or not (labels == cv2.GC_FGD).any():
-        return None
-    y0, y1, x0, x1 = max(0, ys.min() - pad), ys.max() + pad, max(0, xs.min() - pad), xs.max() + pad
-    part = np.ascontiguousarray(labels[y0:y1, x0:x1])
+    pad = round(CONTEXT * max(np.ptp(ys), np.ptp(xs)) + 8)
+    box = slice(max(0, ys.min() - pad), ys.max() + pad), slice(max(0, xs.min() - pad), xs.max() + pad)
+    part = np.ascontiguousarray(labels[box])
     if not (part == cv2.GC_BGD).any():
         return None
     cv2.setRNGSeed(0)
-    models = np.zeros((1, 65)), np.zeros((1, 65))
-    crop = np.ascontiguousarray(image[y0:y1, x0:x1, ::-1])
-    cv2.grabCut(crop, part, None, *models, ROUNDS, cv2.GC_INIT_WITH_MASK)
+    crop, colors = np.ascontiguousarray(image[box][..., ::-1]), (np.zeros((1, 65)), np.zeros((1, 65)))
+    cv2.grabCut(crop, part, (0, 0, 0, 0), *colors, ROUNDS, cv2.GC_INIT_WITH_MASK)
     mask = np.zeros((h, w), np.uint8)
-    mask[y0:y1, x0:x1] = ((part == cv2.GC_FGD) | (part == cv2.GC_PR_FGD)) * 255
-    return _full_size(cleaned(mask, seeds), view.photo.pixels.shape)
+    mask[box] = ((part == cv2.GC_FGD) | (part == cv2.GC_PR_FGD)) * 255
+    return mask
+
+
+def _reached(limit: np.ndarray, mask: np.ndarray) -> float:
+    """Fraction of the limit's edge, but for the image's border, at which the mask is inside."""
+    edge = (limit > 0) & (cv2.erode(limit, np.ones((5, 5), np.uint8), borderValue=1) == 0)
+    return float((mask[edge] > 0).mean()) if edge.any() else 0.0
 
 
 def key_mask(pixels: np.ndarray) -> np.ndarray | None:

@@ -93,7 +93,9 @@ def find_plane(points: np.ndarray, eyes: np.ndarray, distance: float) -> Plane |
             continue
         if plane_area(plane, points, distance) > area and _below(plane, points, tolerance) <= MOST_BELOW:
             best, area = plane, plane_area(plane, points, distance)
-    for _ in range(3 if best else 0):
+    for _ in range(3):
+        if best is None:
+            break
         inside = points[np.abs(best.height(points)) < tolerance]
         middle = inside.mean(0)
         normal = np.linalg.svd(inside - middle, full_matrices=False)[2][2]

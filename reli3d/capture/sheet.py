@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from PIL import Image, ImageDraw
 
 from reli3d.capture.mapping import View
-
-if TYPE_CHECKING:
-    from reli3d.capture.capture import CaptureReport
 
 THUMBNAIL, PANEL, MARGIN, COLUMNS = 160, 480, 8, 6
 MOST_POINTS = 4000
@@ -23,20 +19,15 @@ def contact_sheet(
     points: np.ndarray,
     eyes: np.ndarray,
     to_map: Callable[[np.ndarray], np.ndarray],
-    report: CaptureReport,
+    lines: Sequence[str],
 ) -> Image.Image:
     """The sheet.  images: name, pixels, mask and pinhole view.  points ``(P, 3)``, eyes ``(V, 3)``: in the frame of the
-    object folder, which ``to_map`` takes back to that of the views.
+    object folder, which ``to_map`` takes back to that of the views.  lines: at most two, written on top.
     """
     rows = -(-len(images) // COLUMNS)
     width = max(2 * PANEL + 3 * MARGIN, COLUMNS * (THUMBNAIL + MARGIN) + MARGIN)
     sheet = Image.new("RGB", (width, PANEL + 60 + rows * (THUMBNAIL + 22)), "white")
     draw = ImageDraw.Draw(sheet)
-    lines = [
-        f"{report.registered} of {report.images} registered, {len(report.views)} views, "
-        f"error {report.reprojection_error} px, hull fills {100 * report.agreement:.0f} % of the masks",
-        *(f"failed: {text}" for text in report.failed[:1]),
-    ]
     draw.text((MARGIN, 4), "\n".join(lines), fill="black")
     some = points[:: max(1, len(points) // MOST_POINTS)]
     sheet.paste(_panel("from above", some[:, [0, 2]], eyes[:, [0, 2]]), (MARGIN, 36))

@@ -12,7 +12,7 @@ from PIL import Image
 from reli3d.geometry.camera import Camera, camera_rays, look_at
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
-from reli3d.render.shading import ShadeOptions, shade
+from reli3d.render.shading import Samples, ShadeOptions, shade
 from reli3d.synthetic.materials import Coat, Material
 from reli3d.synthetic.patterns import Mosaic
 from reli3d.synthetic.procedural import ProceduralObject, make_object
@@ -100,6 +100,7 @@ def render_capture(
     light = rows.clone()
     light[4:8, 10:18] = 6.0
     environment = Environment(light.contiguous())
+    samples = Samples(light=4, bsdf=2, cosine=2)
     images, masks, poses = [], [], []
     for k in range(views):
         shift = 0.35 if moved_after is not None and k >= moved_after else 0.0
@@ -113,7 +114,7 @@ def render_capture(
         points = surface.points_at(hits.face[seen].long(), hits.bary[seen])
         image = environment.lookup(directions) * 0.5
         image[seen] = shade(
-            points, -directions[seen], environment, scene=surface.scene, options=ShadeOptions((4, 2, 2), k)
+            points, -directions[seen], environment, scene=surface.scene, options=ShadeOptions(samples=samples, seed=k)
         )
         on_object = (hits.face >= 0) & (hits.face < faces)
         pooled = torch.nn.functional.avg_pool2d
