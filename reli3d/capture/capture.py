@@ -20,7 +20,7 @@ from reli3d.capture.masks import grabcut_mask, key_mask, moving_region, touches_
 from reli3d.capture.photos import FEWEST, Photo, Progress, read_photos
 from reli3d.capture.scene import Plane, Scene, find_scene
 from reli3d.capture.sheet import contact_sheet
-from reli3d.io.files import InputError, printable
+from reli3d.errors import InputError, printable
 from reli3d.io.images import read_image
 from reli3d.views.background import Remover
 from reli3d.views.check import agreement

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from reli3d.capture.photos import Photo, Progress
-from reli3d.io.files import InputError
+from reli3d.errors import InputError
 
 FEATURES = 4096  # SIFT features of an image
 MAP_SIDES = 1000, 2000  # pixels along the longer side, first and where too few images are registered

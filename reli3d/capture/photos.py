@@ -12,7 +12,8 @@ import cv2
 import numpy as np
 from PIL import ExifTags, Image, ImageOps
 
-from reli3d.io.files import InputError, file_size, shown
+from reli3d.errors import InputError, shown
+from reli3d.io.files import file_size
 
 LONGEST_SIDE = 2000  # pixels of a photograph that is kept
 FRAME_COUNT = 60  # frames taken from a video

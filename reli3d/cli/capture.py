@@ -7,16 +7,14 @@ import json
 import sys
 from pathlib import Path
 
-from reli3d.cli.exit_codes import command
-from reli3d.cli.help_format import Defaults
+from reli3d.cli.exit_codes import Parser, command
 
 FAILED_CHECKS = 3  # exit code
 LEAST_IOU = 0.9  # of the asset's silhouettes with the masks
 
 
-def parser() -> argparse.ArgumentParser:
-    p = argparse.ArgumentParser(
-        formatter_class=Defaults,
+def parser() -> Parser:
+    p = Parser(
         prog="reli3d capture",
         description="Find the cameras and the masks of photographs or a video of one object, and write an object "
         "folder that reli3d-infer reads.  Needs the extra: pip install 'reli3d[capture]'.",

@@ -115,9 +115,7 @@ def read_manifest(path: str | os.PathLike) -> Manifest:
     _size(path)
     with open(path, "rb") as file:
         if file.read(4) == b"PK\x03\x04":
-            raise WeightsError(
-                path, "is a torch checkpoint, expected safetensors; convert it first, see docs/model.md"
-            )
+            raise WeightsError(path, "is a torch checkpoint, expected safetensors; convert it first, see docs/model.md")
     try:
         with safe_open(path, "pt") as opened:
             metadata, names = opened.metadata() or {}, opened.keys()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from reli3d.capture.capture import capture
-from reli3d.io.files import InputError
+from reli3d.errors import InputError
 from reli3d.views.folder import load_views
 from tests.support.capture_scene import render_capture
 

@@ -8,7 +8,7 @@ import pytest
 from PIL import ExifTags, Image
 
 from reli3d.capture.photos import FRAME_COUNT, focal_from_exif, read_photos, sharpness
-from reli3d.io.files import InputError
+from reli3d.errors import InputError
 
 BASE = ExifTags.Base
 
