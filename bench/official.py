@@ -223,7 +223,7 @@ def forward(path: Path, count: int, trunk: torch.dtype, device: torch.device, ru
         camera = Camera(c2w, intrinsics, *masks.shape[:0:-1])
         maps = ViewMaps(code.view_tokens[0].float(), torch.cat([images, masks[..., None]], -1), camera)
         began, side = time.perf_counter(), torch.linspace(-0.87, 0.87, model.preset.resolution + 1, device=device)
-        TriplaneField(maps, model, code).free_level(torch.cartesian_prod(side, side, side))
+        TriplaneField(maps, model, code).free_sdf(torch.cartesian_prod(side, side, side))
         synchronise(device)
         print(f"  {'level, grid':16s} {time.perf_counter() - began:8.3f} s")
         if device.type == "cuda":

@@ -22,7 +22,7 @@ from reli3d.geometry.cover import FIELD_MAX, cover_silhouettes
 from reli3d.geometry.mesh import Mesh, largest_components, vertex_normals, weld
 from reli3d.geometry.rays import RayScene
 from reli3d.geometry.smooth import taubin_smooth
-from reli3d.geometry.sparse_level import sparse_level
+from reli3d.geometry.sparse_sdf import sparse_sdf
 from reli3d.geometry.surface import extract_surface
 from reli3d.geometry.tangents import encode_normals, vertex_tangents
 from reli3d.geometry.uv import source_vertices, unwrap, unwrap_xatlas
@@ -102,7 +102,7 @@ def extract(field: Field, resolution: int) -> Mesh:
 def _free_surface(field: TriplaneField, resolution: int) -> Mesh:
     radius = field.model.preset.radius
     flat = _grid(resolution, radius, field.maps.images.device).reshape(-1, 3)
-    level = field.grid_level(flat[: resolution + 1, 2])
+    level = field.grid_sdf(flat[: resolution + 1, 2])
     _check_signs(level)
     found = field.cube_weights(flat, level)
     names = ("deformation", "alpha", "beta", "gamma", "cubes")
@@ -124,9 +124,9 @@ def _bounded_surface(field: LocalField, resolution: int) -> Mesh:
 
     def evaluate(index: Tensor) -> Tensor:
         parts = [(_grid_points(axis, k), bound.view(-1)[k]) for k in index.split(CHUNK)]
-        return torch.cat([torch.maximum(field.level_within(*part), part[1]) for part in parts])
+        return torch.cat([torch.maximum(field.sdf_within(*part), part[1]) for part in parts])
 
-    level = torch.maximum(sparse_level(bound.clamp(min=OUTSIDE), near, evaluate), bound)
+    level = torch.maximum(sparse_sdf(bound.clamp(min=OUTSIDE), near, evaluate), bound)
     level = cover_silhouettes(level, bound, maps.silhouette, maps.camera, radius=radius)
     _check_signs(level)
     return extract_surface(level, radius=radius)
@@ -135,7 +135,7 @@ def _bounded_surface(field: LocalField, resolution: int) -> Mesh:
 def _check_signs(level: Tensor) -> None:
     low, high = (float(v) for v in torch.aminmax(level))
     if low >= 0.0 or high < 0.0:
-        raise NoSurface("level", f"expected values on both sides of 0, got [{low:.4g}, {high:.4g}]: no surface")
+        raise NoSurface("sdf", f"expected values on both sides of 0, got [{low:.4g}, {high:.4g}]: no surface")
 
 
 def _hull_reach(field: LocalField, resolution: int) -> float:

@@ -1,4 +1,4 @@
-"""Levels lowered along the rays of pixels inside a silhouette that meet no surface."""
+"""Silhouette coverage: lowers a signed field along the rays of silhouette pixels that hit no surface."""
 
 from __future__ import annotations
 
@@ -12,47 +12,48 @@ from reli3d.geometry.camera import Camera, check_camera
 from reli3d.kernels import cover as kernels
 
 STRIDE = 4  # pixels between rays
-DEPTH = 0.05  # level below the surface that a ray reaches: enough to make one; more thickens what was right already
-FIELD_MAX = 3.0  # rays whose least level is this high meet nothing: masks disagree, or a rod is thinner than a cell
+DEPTH = 0.05  # field value reached below 0 along a lowered ray: creates a surface without thickening correct parts
+FIELD_MAX = 3.0  # rays whose minimum is above this stay empty: inconsistent masks, or a rod thinner than a cell
 
 
-def cover_silhouettes(level: Tensor, bound: Tensor, distance: Tensor, camera: Camera, *, radius: float) -> Tensor:
-    """``level (X, Y, Z)``, lowered so that every ray inside the views' silhouettes meets the surface; no gradient.
+def cover_silhouettes(sdf: Tensor, bound: Tensor, distance: Tensor, camera: Camera, *, radius: float) -> Tensor:
+    """Lowers ``sdf (X, Y, Z)`` so that every ray inside the views' silhouettes hits the surface; no gradient.
 
-    level: negative inside, on a grid over [-radius, radius]^3, in logits of occupancy or in distances over the
-    softness.  bound: ``(X, Y, Z)``; neither ``level`` nor the result is below it.  distance, camera: as in
-    :func:`reli3d.geometry.hull.hull_distance`, at least ``2 STRIDE`` pixels a side.  Without views nothing changes.
+    sdf: negative inside, on a grid over [-radius, radius]^3, in occupancy logits or in distances divided by the
+    softness.  bound: ``(X, Y, Z)``, a lower bound of ``sdf`` and of the result.  distance, camera: as in
+    :func:`reli3d.geometry.hull.hull_distance`, at least ``2 STRIDE`` pixels a side.  Without views the result is a copy
+    of ``sdf``.
 
-    A field that is not sure of a thin part stays a little above 0 along the rays that show it.  Every ``STRIDE``-th
-    pixel has a ray.  What its least level is above ``-DEPTH`` is subtracted along the ray, unless it is above
-    ``FIELD_MAX``.  Source: own.  Raises TypeError or ValueError.
+    Predicted fields often stay slightly above 0 along rays through thin parts.  One ray is traced for every
+    ``STRIDE``-th pixel of each axis; if the minimum m along it is in (-DEPTH, FIELD_MAX), m + DEPTH is subtracted along
+    the ray.  Source: own.  Raises TypeError or ValueError.
     """
-    check("level", level)
-    if level.ndim != 3 or min(level.shape) < 2:
-        raise ValueError(f"level: expected shape (X, Y, Z) of at least 2 points a side, got {tuple(level.shape)}")
-    check("bound", bound, like=level)
-    check("distance", distance, like=level)
-    if bound.shape != level.shape:
-        raise ValueError(f"bound: expected shape {tuple(level.shape)}, got {tuple(bound.shape)}")
+    check("sdf", sdf)
+    if sdf.ndim != 3 or min(sdf.shape) < 2:
+        raise ValueError(f"sdf: expected shape (X, Y, Z) of at least 2 points a side, got {tuple(sdf.shape)}")
+    check("bound", bound, like=sdf)
+    check("distance", distance, like=sdf)
+    if bound.shape != sdf.shape:
+        raise ValueError(f"bound: expected shape {tuple(sdf.shape)}, got {tuple(bound.shape)}")
     if distance.ndim != 3 or min(distance.shape[1:]) < 2 * STRIDE:
         expected = f"(V, H, W) with H and W of at least {2 * STRIDE}"
         raise ValueError(f"distance: expected shape {expected}, got {tuple(distance.shape)}")
     views, height, width = distance.shape
-    check_camera(camera, like=level, views=views, size=(height, width))
+    check_camera(camera, like=sdf, views=views, size=(height, width))
     if not 0.0 < radius < float("inf"):
         raise ValueError(f"radius: expected a positive number, got {radius}")
     if views == 0:
-        return level.detach().clone()
-    level, bound, distance = (v.detach().contiguous() for v in (level, bound, distance))
-    lowest = _lowest(level)
-    lacking = level.new_empty(views, height // STRIDE, width // STRIDE)
+        return sdf.detach().clone()
+    sdf, bound, distance = (v.detach().contiguous() for v in (sdf, bound, distance))
+    lowest = _lowest(sdf)
+    lacking = sdf.new_empty(views, height // STRIDE, width // STRIDE)
     posed = (camera.c2w, wp.mat44), (camera.intrinsics, wp.vec4)
     cameras = [(v.detach().contiguous(), kind) for v, kind in posed]
     launch(
         kernels.lacking_kernel,
         lacking.numel(),
         [
-            *((v, wp.float32) for v in (level, lowest, distance)),
+            *((v, wp.float32) for v in (sdf, lowest, distance)),
             *cameras,
             radius,
             DEPTH,
@@ -60,15 +61,15 @@ def cover_silhouettes(level: Tensor, bound: Tensor, distance: Tensor, camera: Ca
             STRIDE,
             (lacking, wp.float32),
         ],
-        level.device,
+        sdf.device,
     )
-    lacking = max_pool2d(lacking, 3, 1, 1)  # as far as the silhouette's edge, between two rays
-    lowered = torch.empty_like(level)
+    lacking = max_pool2d(lacking, 3, 1, 1)  # dilated by a ray, so that interpolation reaches the silhouette's edge
+    lowered = torch.empty_like(sdf)
     launch(
         kernels.lower_kernel,
-        level.numel(),
+        sdf.numel(),
         [
-            (level, wp.float32),
+            (sdf, wp.float32),
             (bound, wp.float32),
             (lacking, wp.float32),
             *cameras,
@@ -77,18 +78,18 @@ def cover_silhouettes(level: Tensor, bound: Tensor, distance: Tensor, camera: Ca
             STRIDE,
             (lowered, wp.float32),
         ],
-        level.device,
+        sdf.device,
     )
     return lowered
 
 
-def _lowest(level: Tensor) -> Tensor:
-    """Least level of each block of ``kernels.BLOCK_CELLS`` cells a side, those on its border included."""
+def _lowest(sdf: Tensor) -> Tensor:
+    """Minimum of ``sdf`` over each block of ``kernels.BLOCK_CELLS`` cells a side, border points included."""
     for axis in range(3):
-        cells = level.shape[axis] - 1
+        cells = sdf.shape[axis] - 1
         most = (
-            torch.arange(-(-cells // kernels.BLOCK_CELLS), device=level.device, dtype=torch.int64) * kernels.BLOCK_CELLS
+            torch.arange(-(-cells // kernels.BLOCK_CELLS), device=sdf.device, dtype=torch.int64) * kernels.BLOCK_CELLS
         )
-        points = [level.index_select(axis, (most + k).clamp(max=cells)) for k in range(kernels.BLOCK_CELLS + 1)]
-        level = torch.stack(points).amin(0)
-    return level.contiguous()
+        points = [sdf.index_select(axis, (most + k).clamp(max=cells)) for k in range(kernels.BLOCK_CELLS + 1)]
+        sdf = torch.stack(points).amin(0)
+    return sdf.contiguous()

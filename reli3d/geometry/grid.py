@@ -1,4 +1,4 @@
-"""Values on grids: features of points between them, and how much they bend."""
+"""Regular grids: trilinear interpolation and the weighted squared Laplacian."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ ROWS_MIN = 256  # fewest rows of a grid in a slice of a launch on a CPU: some 30
 
 
 def sample_grid(grid: Tensor, points: Tensor) -> Tensor:
-    """Trilinear values ``(N, C)`` of ``grid (X, Y, Z, C)``, which spans [-1, 1]^3, at ``points (N, 3)``.
+    """Trilinear interpolation ``(N, C)`` of ``grid (X, Y, Z, C)``, which spans [-1, 1]^3, at ``points (N, 3)``.
 
-    -1 and 1 are the outermost grid points; beyond them the border's value is taken.  At least 2 points along each
-    axis.  Gradients reach both.  Raises TypeError unless float32, ValueError on wrong shapes or mixed devices.
+    The outermost grid points lie at -1 and 1; points outside are clamped to the border.  At least 2 grid points along
+    each axis.  Gradients reach both arguments.  Raises TypeError unless float32, ValueError on wrong shapes or mixed
+    devices.
     """
     check("grid", grid)
     check("points", points, last=3, like=grid)
@@ -30,37 +31,37 @@ def sample_grid(grid: Tensor, points: Tensor) -> Tensor:
     return out
 
 
-def squared_laplacian(level: Tensor, share: Tensor) -> Tensor:
-    """Sum ``()`` over inner points of ``share`` times the square of six neighbours less six times the point's value.
+def squared_laplacian(field: Tensor, weight: Tensor) -> Tensor:
+    """Weighted sum ``()`` of the squared 7-point Laplacian over the inner points of a grid.
 
-    level, share: ``(X, Y, Z)`` float32.  Points of the border count as neighbours only, and so do those where ``share``
-    is 0.  Gradients reach ``level`` once; ``share`` is a constant.  Raises TypeError or ValueError.
+    field, weight: ``(X, Y, Z)`` float32.  Border points, and points whose ``weight`` is 0, enter as neighbours only.
+    First-order gradients reach ``field``; ``weight`` is a constant.  Raises TypeError or ValueError.
     """
-    check("level", level)
-    check("share", share, like=level)
-    if level.ndim != 3 or share.shape != level.shape:
-        got = f"{tuple(level.shape)} and {tuple(share.shape)}"
-        raise ValueError(f"level, share: expected (X, Y, Z) twice, got {got}")
-    return _SquaredLaplacian.apply(level.contiguous(), share.detach().contiguous())
+    check("field", field)
+    check("weight", weight, like=field)
+    if field.ndim != 3 or weight.shape != field.shape:
+        got = f"{tuple(field.shape)} and {tuple(weight.shape)}"
+        raise ValueError(f"field, weight: expected one shape (X, Y, Z), got {got}")
+    return _SquaredLaplacian.apply(field.contiguous(), weight.detach().contiguous())
 
 
 class _SquaredLaplacian(torch.autograd.Function):
-    """Own adjoint: the operator is its own transpose, so a point gathers its slope and no slices are added up."""
+    """Analytic adjoint: the Laplacian is self-adjoint, so each point gathers its gradient without atomics."""
 
     @staticmethod
-    def forward(ctx, level, share):
-        product, rows = torch.empty_like(level), level.shape[0] * level.shape[1]
-        total = level.new_empty(rows)
-        arrays = [(level, wp.float32), (share, wp.float32), (product, wp.float32), (total, wp.float32)]
-        launch(weighted_laplacian_kernel, rows, arrays, level.device, slice_min=ROWS_MIN)
-        ctx.save_for_backward(level, product)
+    def forward(ctx, field, weight):
+        product, rows = torch.empty_like(field), field.shape[0] * field.shape[1]
+        total = field.new_empty(rows)
+        arrays = [(field, wp.float32), (weight, wp.float32), (product, wp.float32), (total, wp.float32)]
+        launch(weighted_laplacian_kernel, rows, arrays, field.device, slice_min=ROWS_MIN)
+        ctx.save_for_backward(field, product)
         return total.sum()
 
     @staticmethod
     @once_differentiable
     def backward(ctx, g_total):
-        level, product = ctx.saved_tensors
-        slope, rows = torch.empty_like(level), level.shape[0] * level.shape[1]
-        arrays = [(product, wp.float32), (g_total.reshape(1).contiguous(), wp.float32), (slope, wp.float32)]
-        launch(weighted_laplacian_adjoint_kernel, rows, arrays, level.device, slice_min=ROWS_MIN)
-        return slope, None
+        field, product = ctx.saved_tensors
+        g_field, rows = torch.empty_like(field), field.shape[0] * field.shape[1]
+        arrays = [(product, wp.float32), (g_total.reshape(1).contiguous(), wp.float32), (g_field, wp.float32)]
+        launch(weighted_laplacian_adjoint_kernel, rows, arrays, field.device, slice_min=ROWS_MIN)
+        return g_field, None

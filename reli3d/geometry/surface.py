@@ -1,10 +1,10 @@
-"""Triangle mesh of the zero level of a grid: FlexiCubes (Shen et al. 2023, Flexible Isosurface Extraction, SIGGRAPH).
+"""FlexiCubes isosurface extraction (Shen et al. 2023, Flexible Isosurface Extraction, SIGGRAPH).
 
 A grid of X * Y * Z cubes fills the box [-radius, radius]^3.  Its vertices are ``(X + 1, Y + 1, Z + 1)``, x first and z
 fastest, its cubes ``(X, Y, Z)`` in the same order.  Corners of a cube are numbered x first: (0,0,0), (1,0,0), (0,1,0),
 (1,1,0), (0,0,1), ...; edges as in ``kernels.flexicubes_tables.EDGES``.  Vertices and faces come in the order of the
-published release.  After one pass over the grid the work is proportional to the surface.  Left out: the tetrahedra of
-the paper's section 4.5, and dual vertices placed by the field's gradient.
+published release.  After one pass over the grid the cost is proportional to the number of surface cubes.  Not
+implemented: the tetrahedra of the paper's section 4.5, and dual vertices placed by the field's gradient.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ I32 = wp.int32
 
 @dataclass(frozen=True)
 class _Topology:
-    """Integers that say what is connected; constants of the extraction."""
+    """Connectivity of the extracted surface, integer; constant under differentiation."""
 
     shape: tuple[int, ...]  # (3,) vertices of the grid, padded
     cubes: tuple[int, ...]  # (3,) before padding
@@ -41,16 +41,16 @@ class _Topology:
 
     @cached_property
     def surface(self) -> kernels.SurfaceCubes:
-        """What the kernels read of it."""
+        """The kernels' view of it."""
         names = ("cells", "rows", "resolved", "counts", "base", "slot")
         return struct_of(kernels.SurfaceCubes, **{name: (getattr(self, name), I32) for name in names})
 
-    def grid(self, level: Tensor, shift: Tensor | None) -> kernels.Grid:
-        """The kernels' grid of the padded ``level`` and the offsets before padding."""
-        shift = level.new_empty(0, 3) if shift is None else shift.view(-1, 3)
+    def grid(self, sdf: Tensor, shift: Tensor | None) -> kernels.Grid:
+        """The kernels' grid of the padded ``sdf`` and the offsets before padding."""
+        shift = sdf.new_empty(0, 3) if shift is None else shift.view(-1, 3)
         return struct_of(
             kernels.Grid,
-            level=(level.view(-1), wp.float32),
+            sdf=(sdf.view(-1), wp.float32),
             shift=(shift, wp.vec3),
             ny=self.shape[1],
             nz=self.shape[2],
@@ -70,18 +70,18 @@ def _struct_of_tables(device: torch.device) -> kernels.Tables:
     return struct_of(kernels.Tables, **{name: (table[name], I32) for name in ("group", "ends", "around")})
 
 
-def surface_cubes(level: Tensor) -> Tensor:
-    """Cubes with a sign change, ``(K,)`` int64 ascending, ``(x * Y + y) * Z + z``: the only ones whose weights matter.
+def surface_cubes(sdf: Tensor) -> Tensor:
+    """Index ``(x * Y + y) * Z + z`` of the cubes with a sign change, ``(K,)`` int64 ascending; only these have weights.
 
-    level: ``(X + 1, Y + 1, Z + 1)`` float32.
+    sdf: ``(X + 1, Y + 1, Z + 1)`` float32.
     """
-    _check_level(level)
-    case, _ = _classify(level.detach().contiguous())
+    _check_sdf(sdf)
+    case, _ = _classify(sdf.detach().contiguous())
     return case[:-1, :-1, :-1].reshape(-1).nonzero().squeeze(1)
 
 
 def extract_surface(
-    level: Tensor,
+    sdf: Tensor,
     *,
     radius: float | Sequence[float],
     deformation: Tensor | None = None,
@@ -92,26 +92,27 @@ def extract_surface(
     closed: bool = True,
     centre: bool = False,
 ) -> Mesh:
-    """Mesh of ``level == 0`` inside the box, faces counter-clockwise from the positive side.
+    """Mesh of the isosurface ``sdf == 0`` inside the box, faces counter-clockwise seen from the positive side.
 
-    level: ``(X + 1, Y + 1, Z + 1)``, negative inside.  radius: half extent of the box, one or three numbers.
-    deformation: ``(*level.shape, 3)`` offsets of the grid vertices in box extents.  Positive weights, 1 if None: alpha
-    ``(cubes, 8)``, beta ``(cubes, 12)`` of edges, gamma ``(cubes,)`` of the quads' split.  cubes:
-    :func:`surface_cubes`, where weights have rows for these alone.  closed: a flat cap at the border.  centre: four
-    triangles for each quad, else two.
+    sdf: ``(X + 1, Y + 1, Z + 1)`` float32, a signed distance or any other field that is negative inside.  radius: half
+    extent of the box, one or three numbers.  deformation: ``(*sdf.shape, 3)`` offsets of the grid vertices in box
+    extents.  Positive weights, 1 if None: alpha ``(cubes, 8)`` of cube corners, beta ``(cubes, 12)`` of cube edges,
+    gamma ``(cubes,)`` for the split of quads.  cubes: :func:`surface_cubes`, if the weights have rows for these alone.
+    closed: cap the surface flat at the border.  centre: four triangles for each quad instead of two.
 
-    A level of one sign gives no faces or the whole box.  Gradients: all but ``radius``; gamma with ``centre``.
-    Same bits for any number of threads.  Raises TypeError or ValueError.
+    A field of one sign gives no faces (positive) or, if closed, the whole box (negative).  Gradients reach all but
+    ``radius``; gamma only with ``centre``.  Bitwise identical for any number of threads.  Raises TypeError or
+    ValueError.
 
     >>> x = torch.linspace(-1, 1, 17)
     >>> ball = reli3d.extract_surface((x**2 + x[:, None] ** 2 + x[:, None, None] ** 2).sqrt() - 0.5, radius=1.0)
     """
-    level, deformation, alpha, beta, gamma = (tensor_of(v) for v in (level, deformation, alpha, beta, gamma))
+    sdf, deformation, alpha, beta, gamma = (tensor_of(v) for v in (sdf, deformation, alpha, beta, gamma))
     cubes = tensor_of(cubes, torch.int64)
-    extent = check_fields(level, radius, deformation, alpha, beta, gamma, cubes)
-    topology, padded, crossed = topology_of(level.detach().contiguous(), cubes, closed)
+    extent = check_fields(sdf, radius, deformation, alpha, beta, gamma, cubes)
+    topology, padded, crossed = topology_of(sdf.detach().contiguous(), cubes, closed)
     scale = tuple(2.0 * float(r) for r in extent)
-    vertices = _DualVertices.apply(topology, scale, padded, level, deformation, alpha, beta)
+    vertices = _DualVertices.apply(topology, scale, padded, sdf, deformation, alpha, beta)
     if not bool(torch.isfinite(vertices.detach()).all()):
         raise ValueError("alpha, beta, deformation: expected positive weights and finite offsets, got others")
     if gamma is not None and not bool((gamma.detach() > 0).all()):
@@ -125,7 +126,7 @@ def extract_surface(
 
 
 def check_fields(
-    level: Tensor,
+    sdf: Tensor,
     radius: float | Sequence[float],
     deformation: Tensor | None,
     alpha: Tensor | None,
@@ -134,61 +135,61 @@ def check_fields(
     cubes: Tensor | None,
 ) -> list[float]:
     """Raise for what :func:`extract_surface` cannot take; returns the three radii."""
-    _check_level(level)
-    size = tuple(n - 1 for n in level.shape)
+    _check_sdf(sdf)
+    size = tuple(n - 1 for n in sdf.shape)
     extent = [radius] * 3 if isinstance(radius, (int, float)) else list(radius)
     if len(extent) != 3 or not all(0.0 < r < float("inf") for r in extent):
         raise ValueError(f"radius: expected one or three positive numbers, got {radius}")
     n_cubes = size[0] * size[1] * size[2]
     if cubes is not None:
-        check("cubes", cubes, like=level, dtype=torch.int64)
+        check("cubes", cubes, like=sdf, dtype=torch.int64)
     for name, value, shape in (
-        ("deformation", deformation, (*level.shape, 3)),
+        ("deformation", deformation, (*sdf.shape, 3)),
         ("alpha", alpha, (n_cubes if cubes is None else len(cubes), 8)),
         ("beta", beta, (n_cubes if cubes is None else len(cubes), 12)),
         ("gamma", gamma, (n_cubes if cubes is None else len(cubes),)),
     ):
         if value is not None:
-            check(name, value, like=level)
+            check(name, value, like=sdf)
             if tuple(value.shape) != tuple(shape):
                 raise ValueError(f"{name}: expected shape {tuple(shape)}, got {tuple(value.shape)}")
     return extent
 
 
-def _check_level(level: Tensor) -> None:
-    check("level", level)
-    if level.ndim != 3 or min(level.shape) < 2:
-        raise ValueError(f"level: expected shape (X + 1, Y + 1, Z + 1) with a cube at least, got {tuple(level.shape)}")
-    if (level.shape[0] + 2) * (level.shape[1] + 2) * (level.shape[2] + 2) >= 2**31:
-        raise ValueError(f"level: expected fewer than 2**31 grid vertices, got {tuple(level.shape)}")
-    if not bool(torch.isfinite(level.detach()).all()):
-        raise ValueError("level: expected finite values, got NaN or infinity")
+def _check_sdf(sdf: Tensor) -> None:
+    check("sdf", sdf)
+    if sdf.ndim != 3 or min(sdf.shape) < 2:
+        raise ValueError(f"sdf: expected shape (X + 1, Y + 1, Z + 1) with a cube at least, got {tuple(sdf.shape)}")
+    if (sdf.shape[0] + 2) * (sdf.shape[1] + 2) * (sdf.shape[2] + 2) >= 2**31:
+        raise ValueError(f"sdf: expected fewer than 2**31 grid vertices, got {tuple(sdf.shape)}")
+    if not bool(torch.isfinite(sdf.detach()).all()):
+        raise ValueError("sdf: expected finite values, got NaN or infinity")
 
 
-def _classify(level: Tensor) -> tuple[Tensor, Tensor]:
-    case, crossed = torch.empty_like(level, dtype=torch.uint8), torch.empty_like(level, dtype=torch.uint8)
+def _classify(sdf: Tensor) -> tuple[Tensor, Tensor]:
+    case, crossed = torch.empty_like(sdf, dtype=torch.uint8), torch.empty_like(sdf, dtype=torch.uint8)
     launch(
         kernels.classify_kernel,
-        level.shape[0] * level.shape[1],
-        [(level.view(-1), wp.float32), *level.shape, (case.view(-1), wp.uint8), (crossed.view(-1), wp.uint8)],
-        level.device,
+        sdf.shape[0] * sdf.shape[1],
+        [(sdf.view(-1), wp.float32), *sdf.shape, (case.view(-1), wp.uint8), (crossed.view(-1), wp.uint8)],
+        sdf.device,
     )
     return case, crossed
 
 
-def topology_of(level: Tensor, cubes: Tensor | None, closed: bool) -> tuple[_Topology, Tensor, Tensor]:
-    """Topology, the padded level and the crossed edges of its vertices."""
-    device, size = level.device, tuple(n - 1 for n in level.shape)
-    border = [level[0], level[-1], level[:, 0], level[:, -1], level[:, :, 0], level[:, :, -1]]
+def topology_of(sdf: Tensor, cubes: Tensor | None, closed: bool) -> tuple[_Topology, Tensor, Tensor]:
+    """Topology, the padded sdf and the crossed edges of its vertices."""
+    device, size = sdf.device, tuple(n - 1 for n in sdf.shape)
+    border = [sdf[0], sdf[-1], sdf[:, 0], sdf[:, -1], sdf[:, :, 0], sdf[:, :, -1]]
     pad = int(closed and any(bool((side < 0).any()) for side in border))
     if pad:
-        level = torch.nn.functional.pad(level, (1,) * 6, value=1.0)
-    case, crossed = _classify(level)
+        sdf = torch.nn.functional.pad(sdf, (1,) * 6, value=1.0)
+    case, crossed = _classify(sdf)
     cells = case.view(-1).nonzero().squeeze(1)
     i, j, k = (
-        cells // (level.shape[1] * level.shape[2]) - pad,
-        cells // level.shape[2] % level.shape[1] - pad,
-        cells % level.shape[2] - pad,
+        cells // (sdf.shape[1] * sdf.shape[2]) - pad,
+        cells // sdf.shape[2] % sdf.shape[1] - pad,
+        cells % sdf.shape[2] - pad,
     )
     rows = (i * size[1] + j) * size[2] + k
     if pad:
@@ -198,12 +199,12 @@ def topology_of(level: Tensor, cubes: Tensor | None, closed: bool) -> tuple[_Top
         weight_rows = rows if not pad else rows[real]
         if not torch.equal(weight_rows, cubes):
             count = len(weight_rows)
-            raise ValueError(f"cubes: expected surface_cubes(level), {count} of them, got {len(cubes)} others")
+            raise ValueError(f"cubes: expected surface_cubes(sdf), {count} of them, got {len(cubes)} others")
         index = torch.cumsum(real, 0) - 1 if pad else torch.arange(len(cells), device=device, dtype=torch.int64)
         rows = torch.where(real, index, -1) if pad else index
     cells, rows = cells.to(torch.int32), rows.to(torch.int32)
     resolved, counts = torch.empty_like(cells), torch.empty_like(cells)
-    slot = torch.empty(level.numel(), dtype=torch.int32, device=device)
+    slot = torch.empty(sdf.numel(), dtype=torch.int32, device=device)
     table = tables_on(device)
     launch(
         kernels.resolve_kernel,
@@ -213,7 +214,7 @@ def topology_of(level: Tensor, cubes: Tensor | None, closed: bool) -> tuple[_Top
             (case.view(-1), wp.uint8),
             (table["neighbour"], I32),
             (table["count"], I32),
-            *level.shape[1:],
+            *sdf.shape[1:],
             (resolved, I32),
             (counts, I32),
             (slot, I32),
@@ -226,7 +227,7 @@ def topology_of(level: Tensor, cubes: Tensor | None, closed: bool) -> tuple[_Top
         mine = counts == n
         base += torch.where(mine, (torch.cumsum(mine, 0, dtype=torch.int32) - 1) * n + start, 0)
         start += n * int(mine.sum())
-    return _Topology(tuple(level.shape), size, pad, cells, rows, resolved, counts, base, slot), level, crossed
+    return _Topology(tuple(sdf.shape), size, pad, cells, rows, resolved, counts, base, slot), sdf, crossed
 
 
 def _scatter(index: Tensor, values: Tensor, length: int) -> Tensor:
@@ -239,8 +240,8 @@ class _DualVertices(torch.autograd.Function):
     """Own adjoint: the topology is discrete, and a thread a cube with a gather by vertex needs no atomics."""
 
     @staticmethod
-    def forward(ctx, topology, scale, padded, level, deformation, alpha, beta):
-        t, device = topology, level.device
+    def forward(ctx, topology, scale, padded, sdf, deformation, alpha, beta):
+        t, device = topology, sdf.device
         counts = t.counts.long()
         order = torch.argsort(t.base)
         cube = torch.repeat_interleave(order, counts[order]).to(torch.int32)
@@ -254,7 +255,7 @@ class _DualVertices(torch.autograd.Function):
             device,
         )
         ctx.topology, ctx.scale, ctx.given = topology, scale, [v is not None for v in (deformation, alpha, beta)]
-        ctx.save_for_backward(padded, level, *(v for v in (deformation, alpha, beta) if v is not None))
+        ctx.save_for_backward(padded, sdf, *(v for v in (deformation, alpha, beta) if v is not None))
         return vertices
 
     @staticmethod
@@ -270,11 +271,11 @@ class _DualVertices(torch.autograd.Function):
         from reli3d.kernels import flexicubes_adjoint
 
         t, device = ctx.topology, g_vertices.device
-        padded, level, *rest = ctx.saved_tensors
+        padded, sdf, *rest = ctx.saved_tensors
         rest = iter(rest)
         inputs = [next(rest).contiguous() if given else None for given in ctx.given]
         n = len(t.cells)
-        g_level, g_alpha, g_beta = (torch.zeros(n, width, device=device, dtype=torch.float32) for width in (8, 8, 12))
+        g_sdf, g_alpha, g_beta = (torch.zeros(n, width, device=device, dtype=torch.float32) for width in (8, 8, 12))
         g_shift = torch.zeros(n, 8, 3, device=device, dtype=torch.float32)
         launch(
             flexicubes_adjoint.dual_vertex_adjoint_kernel,
@@ -282,7 +283,7 @@ class _DualVertices(torch.autograd.Function):
             [
                 *_DualVertices.arguments(t, padded, inputs, ctx.scale),
                 (g_vertices.contiguous(), wp.vec3),
-                (g_level.view(-1), wp.float32),
+                (g_sdf.view(-1), wp.float32),
                 (g_shift.view(-1, 3), wp.vec3),
                 (g_alpha.view(-1), wp.float32),
                 (g_beta.view(-1), wp.float32),
@@ -292,9 +293,9 @@ class _DualVertices(torch.autograd.Function):
         corner = corner_vertices(t).view(-1)
         grads: list[Tensor | None] = [None, None, None, None]
         if ctx.needs_input_grad[3]:
-            grads[0] = _scatter(corner, g_level.view(-1, 1), level.numel()).view(level.shape)
+            grads[0] = _scatter(corner, g_sdf.view(-1, 1), sdf.numel()).view(sdf.shape)
         if ctx.needs_input_grad[4]:
-            grads[1] = _scatter(corner, g_shift.view(-1, 3), level.numel()).view(*level.shape, 3)
+            grads[1] = _scatter(corner, g_shift.view(-1, 3), sdf.numel()).view(*sdf.shape, 3)
         real = t.rows >= 0
         for i, value, g in ((2, inputs[1], g_alpha), (3, inputs[2], g_beta)):
             if ctx.needs_input_grad[3 + i] and value is not None:
@@ -305,10 +306,9 @@ class _DualVertices(torch.autograd.Function):
 
 
 def corner_vertices(t: _Topology) -> Tensor:
-    """Grid vertex before padding at every corner of the surface cubes, ``(S, 8)``; a padding's one is the border's it
-    stands at."""
+    """Unpadded grid vertex at every corner of the surface cubes, ``(S, 8)``; padding maps to the border vertex."""
     cells, k = t.cells.long(), torch.arange(8, device=t.cells.device, dtype=torch.int64)
-    if t.pad == 0:  # the common case, ten times faster
+    if t.pad == 0:  # the common case, about 10 times faster
         return cells[:, None] + ((k & 1) * t.shape[1] + (k >> 1 & 1)) * t.shape[2] + (k >> 2)
     at = torch.stack([cells // (t.shape[1] * t.shape[2]), cells // t.shape[2] % t.shape[1], cells % t.shape[2]], -1)
     at = at[:, None] + torch.stack([k & 1, k >> 1 & 1, k >> 2], -1) - t.pad
@@ -357,14 +357,14 @@ def _gamma_of(t: _Topology, quads: Tensor, gamma: Tensor) -> Tensor:
 
 def _with_centres(vertices: Tensor, quads: Tensor, gamma: Tensor) -> Mesh:
     """Four triangles a quad around the mean of its diagonals' midpoints, each weighted by the gammas at its ends."""
-    # the gradient of index_select adds up in the order of the list, that of indexing with brackets in any
+    # the backward of index_select sums in index order, that of advanced indexing in any order
     corner = vertices.index_select(0, quads.view(-1).long()).view(-1, 4, 3)
-    gamma = gamma.double()  # products of small weights would vanish
+    gamma = gamma.double()  # products of small weights underflow in float32
     one, other = gamma[:, 0] * gamma[:, 2], gamma[:, 1] * gamma[:, 3]
-    share = (one / (one + other)).float()[:, None]
-    # the midpoints nearly coincide where the surface is smooth: their difference from those of neighbours
-    apart = (corner[:, 0] - corner[:, 1]) + (corner[:, 2] - corner[:, 3])
-    middle = 0.5 * (corner[:, 1] + corner[:, 3] + share * apart)
+    weight = (one / (one + other)).float()[:, None]
+    # twice the difference of the midpoints, which nearly coincide on smooth surfaces: from edges, to keep digits
+    difference = (corner[:, 0] - corner[:, 1]) + (corner[:, 2] - corner[:, 3])
+    middle = 0.5 * (corner[:, 1] + corner[:, 3] + weight * difference)
     index = torch.arange(len(quads), dtype=torch.int32, device=quads.device) + len(vertices)
     faces = torch.stack([torch.stack([quads[:, k], quads[:, (k + 1) % 4], index], -1) for k in range(4)], 1)
     return Mesh(torch.cat([vertices, middle]), faces.reshape(-1, 3))

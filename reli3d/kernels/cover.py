@@ -1,4 +1,4 @@
-"""Rays of a picture through a grid of levels, and the grid lowered where they met no surface.
+"""Silhouette coverage: the minimum of a signed field along pixel rays, and the field lowered where rays miss.
 
 The grid ``(X, Y, Z)`` fills the cube [-radius, radius]^3, its outermost points on the faces; negative is inside.
 """
@@ -11,33 +11,33 @@ from reli3d.kernels.projection import project_point
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
 
-STEP = wp.constant(0.5)  # of a cell, between two looks at the level along a ray
-BLOCK_CELLS = wp.constant(4)  # cells along a side of a block whose least level is known
-INNER = wp.constant(1.0)  # pixels that a point must lie inside a silhouette, whose edge pixels are half background
+STEP_CELLS = wp.constant(0.5)  # between two samples of the field along a ray
+BLOCK_CELLS = wp.constant(4)  # side of a block whose minimum is known
+INSET_PIXELS = wp.constant(1.0)  # least distance to the silhouette's edge, whose pixels mix with the background
 
 
 @wp.func
-def level_at(level: wp.array3d[float], cell: wp.vec3) -> float:
-    """Trilinear value at ``cell``, a point in units of cells, clamped to the grid."""
-    x = wp.clamp(cell[0], 0.0, float(level.shape[0] - 1))
-    y = wp.clamp(cell[1], 0.0, float(level.shape[1] - 1))
-    z = wp.clamp(cell[2], 0.0, float(level.shape[2] - 1))
-    i = wp.min(int(x), level.shape[0] - 2)
-    j = wp.min(int(y), level.shape[1] - 2)
-    k = wp.min(int(z), level.shape[2] - 2)
+def sdf_at(sdf: wp.array3d[float], cell: wp.vec3) -> float:
+    """Trilinear interpolation at ``cell``, a point in units of cells, clamped to the grid."""
+    x = wp.clamp(cell[0], 0.0, float(sdf.shape[0] - 1))
+    y = wp.clamp(cell[1], 0.0, float(sdf.shape[1] - 1))
+    z = wp.clamp(cell[2], 0.0, float(sdf.shape[2] - 1))
+    i = wp.min(int(x), sdf.shape[0] - 2)
+    j = wp.min(int(y), sdf.shape[1] - 2)
+    k = wp.min(int(z), sdf.shape[2] - 2)
     x -= float(i)
     y -= float(j)
     z -= float(k)
-    v00 = wp.lerp(level[i, j, k], level[i, j, k + 1], z)
-    v01 = wp.lerp(level[i, j + 1, k], level[i, j + 1, k + 1], z)
-    v10 = wp.lerp(level[i + 1, j, k], level[i + 1, j, k + 1], z)
-    v11 = wp.lerp(level[i + 1, j + 1, k], level[i + 1, j + 1, k + 1], z)
+    v00 = wp.lerp(sdf[i, j, k], sdf[i, j, k + 1], z)
+    v01 = wp.lerp(sdf[i, j + 1, k], sdf[i, j + 1, k + 1], z)
+    v10 = wp.lerp(sdf[i + 1, j, k], sdf[i + 1, j, k + 1], z)
+    v11 = wp.lerp(sdf[i + 1, j + 1, k], sdf[i + 1, j + 1, k + 1], z)
     return wp.lerp(wp.lerp(v00, v01, y), wp.lerp(v10, v11, y), x)
 
 
 @wp.func
 def out_of_block(cell: wp.vec3, along: wp.vec3, block: wp.vec3i) -> float:
-    """How far a ray that goes ``along`` cells a unit from ``cell`` stays in ``block``."""
+    """Ray parameter at which the ray ``cell + t * along``, in units of cells, leaves ``block``."""
     far = wp.float32(3.0e38)
     for axis in range(3):
         side = float(block[axis] * BLOCK_CELLS)
@@ -52,20 +52,20 @@ def out_of_block(cell: wp.vec3, along: wp.vec3, block: wp.vec3i) -> float:
 def lacking_kernel(
     start: int,
     # in
-    level: wp.array3d[float],
+    sdf: wp.array3d[float],
     lowest: wp.array3d[float],  # of each block of BLOCK_CELLS cells a side, border included
     distance: wp.array3d[float],
     c2w: wp.array[wp.mat44],
     intrinsics: wp.array[wp.vec4],
     radius: float,
     depth: float,
-    reach: float,
+    field_max: float,
     stride: int,
     # out
     lacking: wp.array3d[float],  # (V, H // stride, W // stride)
 ):
-    """By how much the least level along a pixel's ray exceeds ``-depth``; 0 outside the silhouette, and where it
-    exceeds 0 by ``reach``.
+    """Excess over ``-depth`` of the minimum along a pixel's ray; 0 outside the silhouette and for minima of at least
+    ``field_max``.
     """
     n = start + wp.tid()
     rows = lacking.shape[1]
@@ -76,17 +76,17 @@ def lacking_kernel(
     x = (float(j) + 0.5) * float(stride)
     y = (float(i) + 0.5) * float(stride)
     lacking[view, i, j] = 0.0
-    if look_up(distance, view, x, y) > INNER:
+    if look_up(distance, view, x, y) > INSET_PIXELS:
         k = intrinsics[view]
         pose = c2w[view]
         origin = wp.vec3(pose[0, 3], pose[1, 3], pose[2, 3])
         direction = wp.normalize(wp.transform_vector(pose, wp.vec3((x - k[2]) / k[0], (k[3] - y) / k[1], -1.0)))
-        size = wp.vec3(float(level.shape[0] - 1), float(level.shape[1] - 1), float(level.shape[2] - 1))
-        scale = size * (0.5 / radius)  # cells a unit
-        step = STEP / wp.max(wp.max(scale[0], scale[1]), scale[2])
+        size = wp.vec3(float(sdf.shape[0] - 1), float(sdf.shape[1] - 1), float(sdf.shape[2] - 1))
+        scale = size * (0.5 / radius)  # cells per unit length
+        step = STEP_CELLS / wp.max(wp.max(scale[0], scale[1]), scale[2])
         span = cube_range(origin, direction, radius, 0.0, 3.0e38)
         t = span[0]
-        least = wp.float32(reach)
+        least = wp.float32(field_max)
         while t < span[1] and least > -depth:
             p = origin + direction * t
             cell = wp.cw_mul(p + wp.vec3(radius, radius, radius), scale)
@@ -96,13 +96,13 @@ def lacking_kernel(
                 wp.clamp(int(cell[2]) // BLOCK_CELLS, 0, lowest.shape[2] - 1),
             )
             if lowest[block[0], block[1], block[2]] < least:
-                least = wp.min(least, level_at(level, cell))
-            else:  # no look in this block could change anything
+                least = wp.min(least, sdf_at(sdf, cell))
+            else:  # no sample in this block can lower the minimum
                 end = t + out_of_block(cell, wp.cw_mul(direction, scale), block) - step
                 while t < end:
                     t += step
             t += step
-        if least < reach:
+        if least < field_max:
             lacking[view, i, j] = wp.max(least + depth, 0.0)
 
 
@@ -110,29 +110,29 @@ def lacking_kernel(
 def lower_kernel(
     start: int,
     # in
-    level: wp.array3d[float],
+    sdf: wp.array3d[float],
     bound: wp.array3d[float],
     lacking: wp.array3d[float],
     c2w: wp.array[wp.mat44],
     intrinsics: wp.array[wp.vec4],
     radius: float,
-    reach: float,
+    field_max: float,
     stride: int,
     # out
     lowered: wp.array3d[float],
 ):
-    """Level less the most that the views' rays through a point lack, but not below the bound."""
+    """Field minus the largest excess of the rays through a point, clamped from below to ``bound``."""
     n = start + wp.tid()
-    z = n % level.shape[2]
-    y = (n // level.shape[2]) % level.shape[1]
-    x = n // (level.shape[2] * level.shape[1])
-    value = level[x, y, z]
-    if wp.abs(value) < reach:
+    z = n % sdf.shape[2]
+    y = (n // sdf.shape[2]) % sdf.shape[1]
+    x = n // (sdf.shape[2] * sdf.shape[1])
+    value = sdf[x, y, z]
+    if wp.abs(value) < field_max:
         edge = 2.0 * radius
         p = wp.vec3(
-            edge * float(x) / float(level.shape[0] - 1) - radius,
-            edge * float(y) / float(level.shape[1] - 1) - radius,
-            edge * float(z) / float(level.shape[2] - 1) - radius,
+            edge * float(x) / float(sdf.shape[0] - 1) - radius,
+            edge * float(y) / float(sdf.shape[1] - 1) - radius,
+            edge * float(z) / float(sdf.shape[2] - 1) - radius,
         )
         most = wp.float32(0.0)
         for view in range(c2w.shape[0]):

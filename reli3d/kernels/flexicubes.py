@@ -1,26 +1,27 @@
 """FlexiCubes (Shen et al. 2023), forward: classify the grid, resolve ambiguous cubes, place dual vertices, emit
 quads.
 
-The grid has ``nx * ny * nz`` vertices, index ``(i * ny + j) * nz + k``; a cube has the index of its lowest vertex, so
-the last layers of indices are no cubes.  Inside is level < 0.  ``pad`` is 1 where the grid was padded by one layer of
-outside vertices that stand *at* the border vertices: cubes of no thickness that close the surface flat on the box.
+The grid has ``nx * ny * nz`` vertices with index ``(i * ny + j) * nz + k``; a cube has the index of its lowest vertex,
+so the last index along each axis is no cube.  Inside is sdf < 0.  ``pad`` is 1 if the grid was padded by one layer of
+outside vertices at the positions of the border vertices: cubes of zero thickness that close the surface flat on the
+box.
 """
 
 import warp as wp
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
 
-LEVEL_MIN = wp.constant(1.0e-20)  # slopes are 1 / level: an edge whose levels are both smaller passes none to them
+SDF_MIN = wp.constant(1.0e-20)  # gradients scale with 1 / sdf: an edge with both ends below this magnitude passes none
 
 
 @wp.struct
 class Grid:
-    """Levels of the padded grid's vertices, offsets of those before padding (empty for none), and the shape.
+    """Field values of the padded grid, offsets of the unpadded vertices (empty for none), and the shape.
 
-    ``cubes`` counts those before padding.
+    ``cubes`` is the number of unpadded cubes along each axis.
     """
 
-    level: wp.array[float]
+    sdf: wp.array[float]
     shift: wp.array[wp.vec3]
     ny: int
     nz: int
@@ -30,8 +31,8 @@ class Grid:
 
 @wp.struct
 class SurfaceCubes:
-    """A row for each cube with a sign change: its lowest vertex, the case whose groups it uses, its row in the weights
-    (-1 in the padding), the number of its dual vertices and the first of them; ``slot`` has the row of a vertex.
+    """A row for each cube with a sign change: its lowest vertex, its resolved case, its row in the weights (-1 in the
+    padding), the number of its dual vertices and the index of the first; ``slot`` maps a vertex to its row.
     """
 
     cells: wp.array[wp.int32]
@@ -70,8 +71,8 @@ def corner_index(cell: int, corner: int, ny: int, nz: int) -> int:
 
 
 @wp.func
-def inside_bit(level: wp.array[float], index: int) -> int:
-    if level[index] < 0.0:
+def inside_bit(sdf: wp.array[float], index: int) -> int:
+    if sdf[index] < 0.0:
         return 1
     return 0
 
@@ -115,26 +116,26 @@ def weight(values: wp.array[float], row: int, width: int, column: int) -> float:
 
 
 @wp.func
-def end_shares(alpha_a: float, level_a: float, alpha_b: float, level_b: float) -> wp.vec3d:
-    """The crossing's way from a, its way from b, in parts of the edge, and the sum of the weighted levels' sizes.
+def crossing_fractions(alpha_a: float, sdf_a: float, alpha_b: float, sdf_b: float) -> wp.vec3d:
+    """Distance of the crossing from a and from b as fractions of the edge, and |alpha_a sdf_a| + |alpha_b sdf_b|.
 
-    In float64: products and sums of weighted levels would leave float32, and 1 - way loses what is near an end.
+    In float64: the products leave the range of float32, and 1 - fraction cancels near an end.
     """
-    a = wp.float64(alpha_a) * wp.abs(wp.float64(level_a))
-    b = wp.float64(alpha_b) * wp.abs(wp.float64(level_b))
+    a = wp.float64(alpha_a) * wp.abs(wp.float64(sdf_a))
+    b = wp.float64(alpha_b) * wp.abs(wp.float64(sdf_b))
     return wp.vec3d(a / (a + b), b / (a + b), a + b)
 
 
 @wp.func
-def column_bits(level: wp.array[float], index: int, step_x: int, step_y: int, has_x: bool, has_y: bool) -> int:
-    """Inside bits of four grid vertices of one height, as corners 0 to 3 of a cube; 0 beyond the grid."""
-    bits = inside_bit(level, index)
+def column_bits(sdf: wp.array[float], index: int, step_x: int, step_y: int, has_x: bool, has_y: bool) -> int:
+    """Inside bits of four grid vertices with one z, as corners 0 to 3 of a cube; 0 outside the grid."""
+    bits = inside_bit(sdf, index)
     if has_x:
-        bits += inside_bit(level, index + step_x) << 1
+        bits += inside_bit(sdf, index + step_x) << 1
     if has_y:
-        bits += inside_bit(level, index + step_y) << 2
+        bits += inside_bit(sdf, index + step_y) << 2
     if has_x and has_y:
-        bits += inside_bit(level, index + step_x + step_y) << 3
+        bits += inside_bit(sdf, index + step_x + step_y) << 3
     return bits
 
 
@@ -142,7 +143,7 @@ def column_bits(level: wp.array[float], index: int, step_x: int, step_y: int, ha
 def classify_kernel(
     start: int,
     # in
-    level: wp.array[float],
+    sdf: wp.array[float],
     nx: int,
     ny: int,
     nz: int,
@@ -150,10 +151,10 @@ def classify_kernel(
     codes: wp.array[wp.uint8],
     crossed: wp.array[wp.uint8],
 ):
-    """Case of every cube (0 where it is all inside), and which edges of a vertex have a quad: bit 0 y, 1 z, 2 x.
+    """Case of every cube (0 if all inside), and the edges of every vertex that have a quad: bit 0 y, 1 z, 2 x.
 
-    An edge belongs to the end that comes first in EDGES: the low end along x and z, the high end along y.  A thread is
-    a column of vertices along z, so that a cube hands four of its corners to the next.
+    An edge belongs to the end that comes first in EDGES: the low end along x and z, the high end along y.  One thread
+    per column of vertices along z, so that neighboring cubes reuse four corners.
     """
     i = start + wp.tid()
     base = i * nz
@@ -164,21 +165,21 @@ def classify_kernel(
     has_y = y + 1 < ny
     inner_x = x > 0 and has_x
     inner_y = y > 0 and has_y
-    low = column_bits(level, base, step, nz, has_x, has_y)
+    low = column_bits(sdf, base, step, nz, has_x, has_y)
     for z in range(nz):
         v = base + z
         has_z = z + 1 < nz
         inner_z = z > 0 and has_z
         high = wp.int32(0)
         if has_z:
-            high = column_bits(level, v + 1, step, nz, has_x, has_y)
+            high = column_bits(sdf, v + 1, step, nz, has_x, has_y)
         code = low + (high << 4)
         if code == 255 or not (has_x and has_y and has_z):
             code = 0
         codes[v] = wp.uint8(code)
         edges = wp.int32(0)
         if inner_x and inner_z and y > 0:
-            edges += (low & 1) ^ inside_bit(level, v - nz)
+            edges += (low & 1) ^ inside_bit(sdf, v - nz)
         if inner_x and inner_y and has_z:
             edges += ((low ^ high) & 1) << 1
         if inner_y and inner_z and has_x:
@@ -202,7 +203,7 @@ def resolve_kernel(
     counts: wp.array[wp.int32],
     slot: wp.array[wp.int32],
 ):
-    """Case whose groups a surface cube uses: the complement's if both cubes at its ambiguous face would join there."""
+    """Case of a surface cube: inverted if both cubes at its ambiguous face would otherwise connect through it."""
     s = start + wp.tid()
     cell = cells[s]
     code = int(codes[cell])
@@ -239,7 +240,7 @@ def dual_vertex_kernel(
     # out
     vertices: wp.array[wp.vec3],
 ):
-    """Mean of the crossings of a ``group`` of the edges of surface cube ``cube``, weighted by beta; NaN if a weight it
+    """Mean, weighted by beta, of the zero crossings of edge ``group`` of surface cube ``cube``; NaN if a weight that it
     uses is not positive.
     """
     v = start + wp.tid()
@@ -257,9 +258,9 @@ def dual_vertex_kernel(
             alpha_a = weight(weights.alpha, row, 8, a)
             alpha_b = weight(weights.alpha, row, 8, b)
             beta_e = weight(weights.beta, row, 12, e)
-            level_a = grid.level[corner_index(cell, a, grid.ny, grid.nz)]
-            level_b = grid.level[corner_index(cell, b, grid.ny, grid.nz)]
-            t = float(end_shares(alpha_a, level_a, alpha_b, level_b)[0])
+            sdf_a = grid.sdf[corner_index(cell, a, grid.ny, grid.nz)]
+            sdf_b = grid.sdf[corner_index(cell, b, grid.ny, grid.nz)]
+            t = float(crossing_fractions(alpha_a, sdf_a, alpha_b, sdf_b)[0])
             x_a = grid_position(at + wp.vec3i(a & 1, a >> 1 & 1, a >> 2), grid)
             x_b = grid_position(at + wp.vec3i(b & 1, b >> 1 & 1, b >> 2), grid)
             if not (alpha_a > 0.0 and alpha_b > 0.0 and beta_e > 0.0):
@@ -285,7 +286,7 @@ def quad_kernel(
 ):
     """Dual vertices around a crossed edge, counter-clockwise seen from outside, and the gammas of their cubes.
 
-    ``direction``: 0 y (downwards), 1 z, 2 x, as the bits of :func:`classify_kernel`.
+    ``direction``: 0 y (downwards), 1 z, 2 x, the bits of :func:`classify_kernel`.
     """
     q = start + wp.tid()
     v = origin[q]
@@ -301,9 +302,9 @@ def quad_kernel(
         first = grid.nz
         second = 1
         axis = 0
-    outward = grid.level[v] < 0.0
+    outward = grid.sdf[v] < 0.0
     for corner in range(4):
-        # positions 0, 1, 3, 2 run around the edge; seen from the other end 2, 3, 1, 0
+        # the order around the edge is 0, 1, 3, 2; seen from the other end 2, 3, 1, 0
         turn = corner
         if outward:
             turn = 3 - corner

@@ -3,13 +3,13 @@
 import warp as wp
 
 from reli3d.kernels.flexicubes import (
-    LEVEL_MIN,
+    SDF_MIN,
     Grid,
     SurfaceCubes,
     Tables,
     Weights,
     corner_index,
-    end_shares,
+    crossing_fractions,
     exact_position,
     split_index,
     weight,
@@ -29,14 +29,14 @@ def dual_vertex_adjoint_kernel(
     scale: wp.vec3,
     g_vertices: wp.array[wp.vec3],
     # out, zeroed
-    g_level: wp.array[float],
+    g_sdf: wp.array[float],
     g_shift: wp.array[wp.vec3],
     g_alpha: wp.array[float],
     g_beta: wp.array[float],
 ):
-    """A thread is a surface cube and owns its 8 entries of g_level, g_shift, g_alpha and its 12 of g_beta.
+    """One thread per surface cube, which writes its own 8 entries of g_sdf, g_shift, g_alpha and its 12 of g_beta.
 
-    In float64: a point less the mean, and ends of an edge, are differences of a small part of their size.
+    In float64, because differences between crossings and their mean, and between the ends of an edge, cancel.
     """
     s = start + wp.tid()
     cell = surface.cells[s]
@@ -50,16 +50,16 @@ def dual_vertex_adjoint_kernel(
             if tables.group[code * 12 + e] == group:
                 a = tables.ends[2 * e]
                 b = tables.ends[2 * e + 1]
-                ways = end_shares(
+                fraction = crossing_fractions(
                     weight(weights.alpha, row, 8, a),
-                    grid.level[corner_index(cell, a, grid.ny, grid.nz)],
+                    grid.sdf[corner_index(cell, a, grid.ny, grid.nz)],
                     weight(weights.alpha, row, 8, b),
-                    grid.level[corner_index(cell, b, grid.ny, grid.nz)],
+                    grid.sdf[corner_index(cell, b, grid.ny, grid.nz)],
                 )
                 x_a = exact_position(at + wp.vec3i(a & 1, a >> 1 & 1, a >> 2), grid)
                 x_b = exact_position(at + wp.vec3i(b & 1, b >> 1 & 1, b >> 2), grid)
                 beta_e = wp.float64(weight(weights.beta, row, 12, e))
-                mean += (x_a * ways[1] + x_b * ways[0]) * beta_e
+                mean += (x_a * fraction[1] + x_b * fraction[0]) * beta_e
                 total += beta_e
         mean = mean / total
         g = wp.vec3d(wp.cw_mul(g_vertices[surface.base[s] + group], scale)) / total
@@ -69,22 +69,22 @@ def dual_vertex_adjoint_kernel(
                 b = tables.ends[2 * e + 1]
                 alpha_a = wp.float64(weight(weights.alpha, row, 8, a))
                 alpha_b = wp.float64(weight(weights.alpha, row, 8, b))
-                level_a = grid.level[corner_index(cell, a, grid.ny, grid.nz)]
-                level_b = grid.level[corner_index(cell, b, grid.ny, grid.nz)]
-                ways = end_shares(float(alpha_a), level_a, float(alpha_b), level_b)
+                sdf_a = grid.sdf[corner_index(cell, a, grid.ny, grid.nz)]
+                sdf_b = grid.sdf[corner_index(cell, b, grid.ny, grid.nz)]
+                fraction = crossing_fractions(float(alpha_a), sdf_a, float(alpha_b), sdf_b)
                 x_a = exact_position(at + wp.vec3i(a & 1, a >> 1 & 1, a >> 2), grid)
                 x_b = exact_position(at + wp.vec3i(b & 1, b >> 1 & 1, b >> 2), grid)
-                g_beta[s * 12 + e] = float(wp.dot(x_a * ways[1] + x_b * ways[0] - mean, g))
+                g_beta[s * 12 + e] = float(wp.dot(x_a * fraction[1] + x_b * fraction[0] - mean, g))
                 g_point = g * wp.float64(weight(weights.beta, row, 12, e))
                 g_t = wp.dot(x_b - x_a, g_point)
-                g_size = g_t * ways[0] * ways[1]  # of the logarithms of the two sizes, with opposite signs
+                g_size = g_t * fraction[0] * fraction[1]  # of log |alpha_a sdf_a|; that of b is its negative
                 g_alpha[s * 8 + a] = g_alpha[s * 8 + a] + float(g_size / alpha_a)
                 g_alpha[s * 8 + b] = g_alpha[s * 8 + b] - float(g_size / alpha_b)
-                if wp.max(wp.abs(level_a), wp.abs(level_b)) >= LEVEL_MIN:
-                    g_t = g_t / ways[2]
-                    if level_a < 0.0:
+                if wp.max(wp.abs(sdf_a), wp.abs(sdf_b)) >= SDF_MIN:
+                    g_t = g_t / fraction[2]
+                    if sdf_a < 0.0:
                         g_t = -g_t
-                    g_level[s * 8 + a] = g_level[s * 8 + a] + float(alpha_a * ways[1] * g_t)
-                    g_level[s * 8 + b] = g_level[s * 8 + b] + float(alpha_b * ways[0] * g_t)
-                g_shift[s * 8 + a] = g_shift[s * 8 + a] + wp.vec3(g_point * ways[1])
-                g_shift[s * 8 + b] = g_shift[s * 8 + b] + wp.vec3(g_point * ways[0])
+                    g_sdf[s * 8 + a] = g_sdf[s * 8 + a] + float(alpha_a * fraction[1] * g_t)
+                    g_sdf[s * 8 + b] = g_sdf[s * 8 + b] + float(alpha_b * fraction[0] * g_t)
+                g_shift[s * 8 + a] = g_shift[s * 8 + a] + wp.vec3(g_point * fraction[1])
+                g_shift[s * 8 + b] = g_shift[s * 8 + b] + wp.vec3(g_point * fraction[0])

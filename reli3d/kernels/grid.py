@@ -1,4 +1,4 @@
-"""Grids: features at points, channel last, one thread a point; the squared Laplacian of a level, one thread a row."""
+"""Regular grids: trilinear interpolation (a thread per point) and the squared Laplacian (a thread per row)."""
 
 import warp as wp
 
@@ -7,9 +7,9 @@ wp.set_module_options({"enable_backward": True, "cpu_compiler_flags": "-march=na
 
 @wp.func
 def between_points(x: float, count: int) -> wp.vec2:
-    """Index of the lower of two grid points about coordinate ``x``, counted in cells, and the place between them.
+    """Lower grid index and fraction in [0, 1] for linear interpolation at ``x``, in cells, clamped to the grid.
 
-    Beyond the outermost points theirs is taken.  count: at least 2.
+    count: grid points along the axis, at least 2.
     """
     u = wp.clamp(x, 0.0, float(count - 1))
     low = float(wp.min(int(u), count - 2))
@@ -49,7 +49,7 @@ def sample_grid_kernel(
 
 @wp.func
 def laplacian(values: wp.array3d[float], i: int, j: int, k: int) -> float:
-    """Sum of the six neighbours less six times the value, of a point that is not at the border."""
+    """7-point Laplacian at an inner point: the sum of the six neighbors minus six times the value."""
     return (
         (values[i + 1, j, k] + values[i - 1, j, k])
         + (values[i, j + 1, k] + values[i, j - 1, k])
@@ -60,7 +60,7 @@ def laplacian(values: wp.array3d[float], i: int, j: int, k: int) -> float:
 
 @wp.func
 def value_or_zero(values: wp.array3d[float], i: int, j: int, k: int) -> float:
-    """0 beyond the border."""
+    """Value of the grid, 0 outside."""
     if i < 0 or j < 0 or k < 0 or i >= values.shape[0] or j >= values.shape[1] or k >= values.shape[2]:
         return 0.0
     return values[i, j, k]
@@ -70,24 +70,24 @@ def value_or_zero(values: wp.array3d[float], i: int, j: int, k: int) -> float:
 def weighted_laplacian_kernel(
     start: int,
     # in
-    level: wp.array3d[float],
-    share: wp.array3d[float],
+    field: wp.array3d[float],
+    weight: wp.array3d[float],
     # out
-    product: wp.array3d[float],  # share * laplacian, 0 at the border
-    total: wp.array[float],  # of share * laplacian**2 in a row of the grid
+    product: wp.array3d[float],  # weight * laplacian, 0 at the border
+    total: wp.array[float],  # sum of weight * laplacian**2 over a row of the grid
 ):
     row = start + wp.tid()
-    i = row // level.shape[1]
-    j = row % level.shape[1]
-    last = level.shape[2] - 1
-    inside = i > 0 and j > 0 and i < level.shape[0] - 1 and j < level.shape[1] - 1
+    i = row // field.shape[1]
+    j = row % field.shape[1]
+    last = field.shape[2] - 1
+    inside = i > 0 and j > 0 and i < field.shape[0] - 1 and j < field.shape[1] - 1
     amount = wp.float32(0.0)
-    for k in range(level.shape[2]):
+    for k in range(field.shape[2]):
         product[i, j, k] = 0.0
-        if inside and k > 0 and k < last and share[i, j, k] != 0.0:
-            bend = laplacian(level, i, j, k)
-            product[i, j, k] = share[i, j, k] * bend
-            amount += share[i, j, k] * bend * bend
+        if inside and k > 0 and k < last and weight[i, j, k] != 0.0:
+            value = laplacian(field, i, j, k)
+            product[i, j, k] = weight[i, j, k] * value
+            amount += weight[i, j, k] * value * value
     total[row] = amount
 
 
@@ -98,9 +98,9 @@ def weighted_laplacian_adjoint_kernel(
     product: wp.array3d[float],
     scale: wp.array[float],  # one number
     # out
-    slope: wp.array3d[float],
+    g_field: wp.array3d[float],
 ):
-    """The Laplacian is its own transpose."""
+    """Gradient of the weighted squared Laplacian; the Laplacian is self-adjoint."""
     row = start + wp.tid()
     i = row // product.shape[1]
     j = row % product.shape[1]
@@ -119,4 +119,4 @@ def weighted_laplacian_adjoint_kernel(
                 + value_or_zero(product, i, j, k + 1)
                 + value_or_zero(product, i, j, k - 1)
             )
-        slope[i, j, k] = 2.0 * scale[0] * value
+        g_field[i, j, k] = 2.0 * scale[0] * value

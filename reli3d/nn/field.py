@@ -1,7 +1,7 @@
-"""The field of one object: level in its volume, material on its surface, its light.
+"""Neural field of one object: signed field values in its volume, material on its surface, and its lighting.
 
-:class:`TriplaneField` is what the paper's network gives, :class:`reli3d.nn.local.LocalField` the network of
-convolutions.
+:class:`TriplaneField` is decoded from the triplane of the published network, :class:`reli3d.nn.local.LocalField` from
+the volume and the pixel maps of the convolutional one.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from reli3d.nn.view_features import ViewMaps
 from reli3d.render.bump import radial_bump
 from reli3d.render.color import srgb_to_linear
 
-CHUNK = 1 << 17  # points a query: 200 MB of features
+CHUNK = 1 << 17  # points per query: 200 MB of features
 MATERIAL = ("base_color", "roughness", "metallic", "normal")
 
 
@@ -30,36 +30,38 @@ MATERIAL = ("base_color", "roughness", "metallic", "normal")
 class PointMaterial:
     """Material at N surface points."""
 
-    base_color: Tensor  # (N, 3) linear; the heads give sRGB
+    base_color: Tensor  # (N, 3) linear; the decoder heads give sRGB
     roughness: Tensor  # (N,) perceptual
     metallic: Tensor  # (N,)
-    normal: Tensor  # (N, 3) unit, world: of shading
+    normal: Tensor  # (N, 3) unit shading normal, world
 
 
-def bound_level(maps: ViewMaps, points: Tensor, softness: float, far: float = math.inf) -> Tensor:
-    """Level ``(N,)`` of the hull of the views' silhouettes at ``points (N, 3)``, in units of ``softness``, or some
-    level above ``far`` where that is higher; no gradient.
+def bound_sdf(maps: ViewMaps, points: Tensor, softness: float, far: float = math.inf) -> Tensor:
+    """Signed distance ``(N,)`` to the visual hull at ``points (N, 3)``, in units of ``softness``; no gradient.
+
+    Negative inside.  Where the distance exceeds ``far``, the result is any value above ``far``.
     """
     return -hull_distance(points, maps.silhouette, maps.camera, far=far * softness) / softness
 
 
-def grid_bound_level(maps: ViewMaps, axis: Tensor, softness: float, far: float = math.inf) -> Tensor:
-    """:func:`bound_level` at the points ``(axis[i], axis[j], axis[k])``, ``(n, n, n)``; axis: ``(n,)`` ascending."""
+def grid_bound_sdf(maps: ViewMaps, axis: Tensor, softness: float, far: float = math.inf) -> Tensor:
+    """:func:`bound_sdf` at the points ``(axis[i], axis[j], axis[k])``, ``(n, n, n)``; axis: ``(n,)`` ascending."""
     return -hull_grid(axis, maps.silhouette, maps.camera, far=far * softness) / softness
 
 
 @dataclass(frozen=True)
 class Field(ABC):
-    """Network output for one object, and its input views.  Frame: the model's."""
+    """Network output for one object, and its input views, in the model's frame."""
 
     reads_views: ClassVar[bool]  # whether the material depends on which view sees a point
 
     maps: ViewMaps
 
     @abstractmethod
-    def free_level(self, points: Tensor) -> Tensor:
-        """Level ``(N,)`` that the network gives ``points (N, 3)``: negative inside, zero on the surface; the
-        silhouettes do not bound it.  Gradients reach the network.
+    def free_sdf(self, points: Tensor) -> Tensor:
+        """Predicted field values ``(N,)`` at ``points (N, 3)``: negative inside, zero on the surface.
+
+        Not clamped to the visual hull.  Gradients reach the network.
         """
 
     @abstractmethod
@@ -70,7 +72,7 @@ class Field(ABC):
 
     @abstractmethod
     def radiance_map(self, height: int | None = None) -> Tensor:
-        """Linear radiance ``(H, 2H, 3)``, row 0 is +Y, the centre column +X; default height the preset's."""
+        """Linear radiance ``(H, 2H, 3)``, row 0 at +Y, the centre column at +X; default height: the preset's."""
 
 
 @dataclass(frozen=True)
@@ -82,43 +84,43 @@ class TriplaneField(Field):
 
     reads_views: ClassVar[bool] = False
 
-    def free_level(self, points: Tensor) -> Tensor:
-        return self.model.level(self.model.query(self.code, points[None], ("density",))["density"][0, :, 0])
+    def free_sdf(self, points: Tensor) -> Tensor:
+        return self.model.sdf(self.model.query(self.code, points[None], ("density",))["density"][0, :, 0])
 
     @torch.no_grad()
-    def grid_level(self, axis: Tensor) -> Tensor:
-        """:meth:`free_level` at ``(axis[i], axis[j], axis[k])``, ``(n, n, n)``, in less time, see
+    def grid_sdf(self, axis: Tensor) -> Tensor:
+        """:meth:`free_sdf` on the grid ``(axis[i], axis[j], axis[k])``, ``(n, n, n)``, by
         :meth:`Reconstructor.grid_density`.
         """
-        return self.model.level(self.model.grid_density(self.code, axis))
+        return self.model.sdf(self.model.grid_density(self.code, axis))
 
     @torch.no_grad()
-    def cube_weights(self, points: Tensor, level: Tensor) -> dict[str, Tensor]:
-        """Deformation and weights for ``extract_surface``, evaluated only where the surface passes.
+    def cube_weights(self, points: Tensor, sdf: Tensor) -> dict[str, Tensor]:
+        """Deformation and weights for ``extract_surface``, evaluated only at the surface cubes.
 
-        points: ``(N, 3)`` the grid's, in the order of ``level``.
+        points: ``(N, 3)``, the grid points in the order of ``sdf``.
         """
         model = self.model
-        cubes, (y, z) = surface_cubes(level), level.shape[1:]
+        cubes, (y, z) = surface_cubes(sdf), sdf.shape[1:]
         i, rest = cubes // ((y - 1) * (z - 1)), cubes % ((y - 1) * (z - 1))
         lowest = (i * y + rest // (z - 1)) * z + rest % (z - 1)
         k = torch.arange(8, device=points.device, dtype=torch.int64)
         corners = lowest[:, None] + ((k & 1) * y + (k >> 1 & 1)) * z + (k >> 2)
-        needed = torch.zeros_like(level, dtype=torch.bool)
-        for side in range(3):  # where the inside reaches the box, the cap stands on the border's vertices
+        needed = torch.zeros_like(sdf, dtype=torch.bool)
+        for side in range(3):  # where the object reaches the box, the cap uses the border vertices
             for end in (0, -1):
-                needed.select(side, end)[level.select(side, end) < 0] = True
+                needed.select(side, end)[sdf.select(side, end) < 0] = True
         needed.view(-1)[corners] = True
         at = needed.view(-1).nonzero()[:, 0]
         raw = [model.query(self.code, points[part][None], ("deformation", "flexicubes")) for part in at.split(CHUNK)]
         offset = points.new_zeros(len(points), 3)
-        offset[at] = deformation(torch.cat([r["deformation"][0] for r in raw]), level.shape[0] - 1)
+        offset[at] = deformation(torch.cat([r["deformation"][0] for r in raw]), sdf.shape[0] - 1)
         corner = torch.cat([r["flexicubes"][0] for r in raw])
         row = torch.cumsum(needed.view(-1), 0) - 1
         merged = [model.merger(corner[row[part]]) for part in corners.split(CHUNK)]
         alpha, beta, gamma = (torch.cat([getattr(m, name) for m in merged]) for name in ("alpha", "beta", "gamma"))
         return {
-            "deformation": offset.reshape(*level.shape, 3),
+            "deformation": offset.reshape(*sdf.shape, 3),
             "alpha": alpha,
             "beta": beta,
             "gamma": gamma,

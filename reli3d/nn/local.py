@@ -22,7 +22,7 @@ from reli3d.geometry.camera import Camera, image_plane
 from reli3d.geometry.projection import gather_views
 from reli3d.kernels.view_features import CONFIDENT_WEIGHT
 from reli3d.nn.blocks import in_rows, linear_of
-from reli3d.nn.field import Field, PointMaterial, bound_level, grid_bound_level
+from reli3d.nn.field import Field, PointMaterial, bound_sdf, grid_bound_sdf
 from reli3d.nn.heads import ROUGHNESS_MIN, color_logit, mlp
 from reli3d.nn.light_features import Shading, brightness_at, brightness_over_normal, palette_of, unshaded
 from reli3d.nn.light_map import LightMap
@@ -59,12 +59,12 @@ class PixelMaps:
     depth: Tensor  # (V, P, P, 1) along the camera's axis, from the world's origin
 
     @staticmethod
-    def of(raw: Tensor, span: Tensor, camera: Camera, level: Tensor) -> PixelMaps:
-        """From the pyramid's 12 numbers ``(V, P, P, 12)``, whose pixels are those of ``camera``, the hull's ``span
-        (V, Q, Q, 2)`` and the object's :func:`mean_logit`, which broadcasts over the pixels.
+    def of(raw: Tensor, span: Tensor, camera: Camera, mean: Tensor) -> PixelMaps:
+        """Decodes the pyramid's output ``raw (V, P, P, 12)`` at the pixels of ``camera``.
 
-        The gain is that of the difference to ``level``: how bright an object is in a photograph says nothing of its
-        paint, for the exposure follows it, but the colour and the pattern that are seen do.
+        span: ``(V, Q, Q, 2)``, depths at which each ray enters and leaves the hull.  mean: :func:`mean_logit` of the
+        object, broadcast over the pixels.  The gain applies to the difference from ``mean``, because exposure makes the
+        absolute brightness of an object ambiguous, but not its hue and contrast.
         """
         gain, shift, confidence, rough, metal, normal, depth, chroma = raw.split([1, 3, 1, 1, 1, 3, 1, 1], -1)
         x, y = image_plane(camera)
@@ -75,7 +75,7 @@ class PixelMaps:
         span = functional.interpolate(span.permute(0, 3, 1, 2), size=size, mode="nearest").permute(0, 2, 3, 1)
         depth = torch.lerp(span[..., :1], span[..., 1:], (depth - 1.0).sigmoid())  # the surface lies within
         gain, chroma = (gain + 2.0).sigmoid(), 2.0 * chroma.sigmoid()
-        return PixelMaps(gain, shift - gain * level, confidence, rough, metal - 2.0, chroma, world, depth)
+        return PixelMaps(gain, shift - gain * mean, confidence, rough, metal - 2.0, chroma, world, depth)
 
     def stacked(self) -> Tensor:
         """``(V, P, P, 11)``, all but the depth."""
@@ -233,13 +233,13 @@ class LocalReconstructor(nn.Module):
         span = span_of_pixels(detail[..., 3], outlined, quarter, read.resized(*quarter.shape[:0:-1]))
         features, raw = self.pyramid(images[:taken], masks[:taken], place_of_pixels(read), span)
         coarse = camera.resized(*raw.shape[2:0:-1])
-        level = mean_logit(*shown_pixels(images[:taken], masks[:taken], coarse[:taken]))
+        mean = mean_logit(*shown_pixels(images[:taken], masks[:taken], coarse[:taken]))
         if mirrored:
             nearer = depth_of_origin(c2w[:mirrored]) - depth_of_origin(c2w[taken:])
             turned = raw[:mirrored].flip(2) * SIGN_OF_MIRRORED.to(raw)
             span = torch.cat([span, span[:mirrored].flip(2) + nearer[:, None, None, None]])
             features, raw = torch.cat([features, features[:mirrored].flip(2)]), torch.cat([raw, turned])
-        return features, PixelMaps.of(raw, span, coarse, level), coarse
+        return features, PixelMaps.of(raw, span, coarse, mean), coarse
 
     def _light(self, pixels: PixelMaps, color: Tensor, mask: Tensor, camera: Camera) -> Tensor:
         v, y, x = (mask > 0.9).nonzero(as_tuple=True)
@@ -277,26 +277,27 @@ class LocalField(Field):
     reads_views: ClassVar[bool] = True
 
     def bound(self, points: Tensor, far: float = math.inf) -> Tensor:
-        """Level ``(N,)`` of the silhouettes' hull: no point is further inside than this.  Where it exceeds ``far`` it
-        is some level above ``far``.  No gradient.
+        """Signed distance ``(N,)`` to the visual hull in units of ``softness``, a lower bound of :meth:`sdf`.
+
+        Where it exceeds ``far``, the result is any value above ``far``.  No gradient.
         """
-        return bound_level(self.maps, points, self.model.preset.softness, far)
+        return bound_sdf(self.maps, points, self.model.preset.softness, far)
 
     def grid_bound(self, axis: Tensor, far: float = math.inf) -> Tensor:
         """:meth:`bound` at the points ``(axis[i], axis[j], axis[k])``, ``(n, n, n)``; axis: ``(n,)`` ascending."""
-        return grid_bound_level(self.maps, axis, self.model.preset.softness, far)
+        return grid_bound_sdf(self.maps, axis, self.model.preset.softness, far)
 
     def _rows(self, evaluate: Callable[..., dict[str, Tensor]], *inputs: Tensor) -> dict[str, Tensor]:
         return in_rows(evaluate, *inputs) if self.inference else evaluate(*inputs)
 
-    def free_level(self, points: Tensor) -> Tensor:
-        return self.level_within(points, self.bound(points))
+    def free_sdf(self, points: Tensor) -> Tensor:
+        return self.sdf_within(points, self.bound(points))
 
-    def level_within(self, points: Tensor, bound: Tensor) -> Tensor:
-        """:meth:`free_level` of points whose :meth:`bound` ``(N,)`` is known."""
-        return self._rows(lambda *at: {"level": self._level_within(*at)}, points, bound)["level"]
+    def sdf_within(self, points: Tensor, bound: Tensor) -> Tensor:
+        """:meth:`free_sdf` of points whose :meth:`bound` ``(N,)`` is known."""
+        return self._rows(lambda *at: {"sdf": self._sdf_within(*at)}, points, bound)["sdf"]
 
-    def _level_within(self, points: Tensor, bound: Tensor) -> Tensor:
+    def _sdf_within(self, points: Tensor, bound: Tensor) -> Tensor:
         return self.model.level(self._features(points, bound))[:, 0] - self._offset()
 
     def _offset(self) -> float:
@@ -304,10 +305,10 @@ class LocalField(Field):
         many, one = self.model.preset.offset_many_views, self.model.preset.offset_one_view
         return many + (one - many) / len(self.maps.images)
 
-    def level(self, points: Tensor) -> Tensor:
-        """Level ``(N,)``: negative inside, zero on the surface, in units of ``softness``."""
+    def sdf(self, points: Tensor) -> Tensor:
+        """Field values ``(N,)``: negative inside, zero on the surface, in units of ``softness``."""
         bound = self.bound(points)
-        return torch.maximum(self.level_within(points, bound), bound)
+        return torch.maximum(self.sdf_within(points, bound), bound)
 
     def _features(
         self, points: Tensor, bound: Tensor, visible: Tensor | None = None, normal: Tensor | None = None

@@ -138,7 +138,7 @@ class Reconstructor(nn.Module):
         """Values of the named heads at points of the model's cube, ``{name: (B, N, outputs)}``, float32.
 
         points: ``(B, N, 3)``, inside plus or minus the preset's radius; features fade to zero outside.  ``density`` is
-        the raw value, see :meth:`level`; ``base_color`` is sRGB-encoded; ``roughness`` is perceptual; ``normal`` is
+        the raw value, see :meth:`sdf`; ``base_color`` is sRGB-encoded; ``roughness`` is perceptual; ``normal`` is
         unit in the frame of :mod:`reli3d.render.bump`; ``deformation`` and ``flexicubes`` are raw, see
         :mod:`reli3d.nn.heads`.  Gradients reach the triplane, the points and the heads.
         """
@@ -169,13 +169,13 @@ class Reconstructor(nn.Module):
             rest = nn.Sequential(*list(self.heads["density"].children())[1:])
             return torch.stack([rest(of_xy[i, :, None] + of_xz[i] + of_yz)[..., 0] for i in range(n)])
 
-    def level(self, density: Tensor) -> Tensor:
-        """Surface level of the ``density`` head's raw values: negative inside, zero on the surface."""
+    def sdf(self, density: Tensor) -> Tensor:
+        """Signed field values from the raw output of the ``density`` head: negative inside, zero on the surface."""
         return self.preset.density_threshold - truncated_exp(density + self.preset.density_bias)
 
     @property
     def surface_density(self) -> float:
-        """Raw density on the surface: :meth:`level` is zero there."""
+        """Raw density on the surface: :meth:`sdf` is zero there."""
         return math.log(self.preset.density_threshold) - self.preset.density_bias
 
 

@@ -187,8 +187,8 @@ class LocalPreset(_Checked):
     head_width: int
     resolution: int  # cubes along each side of the surface grid
     radius: float = 0.87  # half side of the model's cube
-    softness: float = 0.02  # model units from occupancy 1/2 to 0.73: unit of the level
-    offset_one_view: float = 0.0  # of the surface, in units of the level, outward; see reli3d.train.calibrate
+    softness: float = 0.02  # unit of the signed distance: occupancy is sigmoid(-distance / softness)
+    offset_one_view: float = 0.0  # outward offset of the surface, in units of softness; see reli3d.train.calibrate
     offset_many_views: float = 0.0  # the same in the limit of many views; in between by the inverse of their number
     smoothing: int = 8  # iterations of Taubin smoothing of the extracted surface
 

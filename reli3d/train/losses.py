@@ -78,14 +78,14 @@ def _shape(field: LocalField, sample: Sample, position: Tensor, normal: Tensor) 
     around points a little off the surface, as the surface that is drawn errs.
     """
     softness = field.model.preset.softness
-    level = field.level(sample.points)
+    level = field.sdf(sample.points)
     target = (-sample.distance / softness).sigmoid()
     corners = GRADIENT_STEP * position.new_tensor([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
     few = position[:GRADIENT_POINTS]
     near, _ = astray(few, normal[:GRADIENT_POINTS])
-    around = field.free_level((near[:, None] + corners).reshape(-1, 3)).reshape(-1, 4)
+    around = field.free_sdf((near[:, None] + corners).reshape(-1, 3)).reshape(-1, 4)
     slope = (around[..., None] * corners).sum(1)
-    on_surface = field.free_level(few)
+    on_surface = field.free_sdf(few)
     return {
         "occupancy": functional.binary_cross_entropy_with_logits(-level, target),
         "surface": functional.smooth_l1_loss(on_surface, torch.zeros_like(on_surface)),

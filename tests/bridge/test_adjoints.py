@@ -30,7 +30,7 @@ from tests.support.reference_surface import random_weights, torus
 from tests.support.surfaces import on_ball
 
 F = torch.nn.functional
-ORDER = ("level", "deformation", "alpha", "beta")
+ORDER = ("sdf", "deformation", "alpha", "beta")
 
 
 @dataclass
@@ -64,24 +64,24 @@ def triplane(g, small) -> Op:
 
 
 def surface_leaves(g, small):
-    level = torus(40) + 0.02 * torch.randn(41, 41, 41, generator=g)
+    sdf = torus(40) + 0.02 * torch.randn(41, 41, 41, generator=g)
     if small:  # inside at two corners of a face
-        level = torch.tensor([[[-0.4, 0.3], [0.5, -0.7]]])
-    level = F.pad(level, (1,) * 6, value=0.7)
-    return {"level": level, **random_weights(level.shape, 3, spread=0.5)}
+        sdf = torch.tensor([[[-0.4, 0.3], [0.5, -0.7]]])
+    sdf = F.pad(sdf, (1,) * 6, value=0.7)
+    return {"sdf": sdf, **random_weights(sdf.shape, 3, spread=0.5)}
 
 
 def flexicubes(g, small) -> Op:
     leaves = surface_leaves(g, small)
     gamma = leaves.pop("gamma")
 
-    def ours(level, alpha, beta, deformation):
+    def ours(sdf, alpha, beta, deformation):
         return extract_surface(
-            level, radius=0.8, alpha=alpha, beta=beta, deformation=deformation, gamma=gamma.to(level)
+            sdf, radius=0.8, alpha=alpha, beta=beta, deformation=deformation, gamma=gamma.to(sdf)
         ).vertices
 
-    def twin(level, alpha, beta, deformation):
-        return reference_surface.flexicubes_vertices(level, deformation, alpha, beta, 1.6)[0]
+    def twin(sdf, alpha, beta, deformation):
+        return reference_surface.flexicubes_vertices(sdf, deformation, alpha, beta, 1.6)[0]
 
     return Op(leaves, ours, twin)
 
@@ -90,16 +90,16 @@ def centres(g, small) -> Op:
     """The vertices that split the quads, of dual vertices that stay."""
     leaves = surface_leaves(g, small)
     gamma = leaves.pop("gamma")
-    plain = extract_surface(leaves["level"], radius=0.8, **{k: v for k, v in leaves.items() if k != "level"})
+    plain = extract_surface(leaves["sdf"], radius=0.8, **{k: v for k, v in leaves.items() if k != "sdf"})
     count = len(plain.vertices)
 
     def ours(gamma):
         fields = {k: v.to(gamma) for k, v in leaves.items()}
-        return extract_surface(fields.pop("level"), radius=0.8, gamma=gamma, centre=True, **fields).vertices[count:]
+        return extract_surface(fields.pop("sdf"), radius=0.8, gamma=gamma, centre=True, **fields).vertices[count:]
 
     def twin(gamma):
-        fields = {k: v for k, v in leaves.items() if k != "level"}
-        mesh = extract_surface(leaves["level"], radius=0.8, centre=True, **fields)
+        fields = {k: v for k, v in leaves.items() if k != "sdf"}
+        mesh = extract_surface(leaves["sdf"], radius=0.8, centre=True, **fields)
         quads = mesh.faces.long().view(-1, 4, 3)[:, :, 0]
         cube = reference_surface.flexicubes_vertices(*(leaves[k] for k in ORDER), 1.6)[1]
         corner, weight = mesh.vertices[:count].double()[quads], gamma[cube[quads]]
@@ -114,11 +114,11 @@ def deviation(g, small) -> Op:
     leaves = surface_leaves(g, small)
     leaves.pop("gamma")
 
-    def ours(level, alpha, beta, deformation):
-        return vertex_deviation(level, radius=0.8, alpha=alpha, beta=beta, deformation=deformation)
+    def ours(sdf, alpha, beta, deformation):
+        return vertex_deviation(sdf, radius=0.8, alpha=alpha, beta=beta, deformation=deformation)
 
-    def twin(level, alpha, beta, deformation):
-        return reference_surface.flexicubes_deviation(level, deformation, alpha, beta, 1.6)
+    def twin(sdf, alpha, beta, deformation):
+        return reference_surface.flexicubes_deviation(sdf, deformation, alpha, beta, 1.6)
 
     return Op(leaves, ours, twin)
 

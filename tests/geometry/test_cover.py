@@ -1,4 +1,4 @@
-"""Levels lowered where a pixel of a silhouette would see no surface: closed forms, and a twin in torch's float64."""
+"""Silhouette coverage: closed forms, and a float64 reference in torch."""
 
 import math
 from pathlib import Path
@@ -41,17 +41,17 @@ def disc(size, radius):
 
 
 def test_an_unsure_sheet_becomes_a_surface_as_thick_as_it_is_unsure(device):
-    """Level 0.5 + (z / s)^2 has no inside; lowered to (z / s)^2 - DEPTH it has one for |z| < s sqrt(DEPTH)."""
+    """0.5 + (z / s)^2 has no inside; lowered to (z / s)^2 - DEPTH it is negative for |z| < s sqrt(DEPTH)."""
     points, s = grid((41, 41, 41)), 0.4
-    level = 0.5 + (points[..., 2] / s).square()
-    args = [v.to(device) for v in (level, torch.full_like(level, FREE), disc(128, 40.0), far_camera())]
+    sdf = 0.5 + (points[..., 2] / s).square()
+    args = [v.to(device) for v in (sdf, torch.full_like(sdf, FREE), disc(128, 40.0), far_camera())]
     got = cover_silhouettes(*args, radius=RADIUS).cpu()
     radius = points[..., :2].norm(dim=-1)
     inner, outer = radius < (40 - STRIDE) * 0.9 / 128, radius > (40 + 2 * STRIDE) * 0.9 / 128
-    want = torch.where(level < FIELD_MAX, level - 0.5 - DEPTH, level)
+    want = torch.where(sdf < FIELD_MAX, sdf - 0.5 - DEPTH, sdf)
     # a ray looks every half cell, so it may miss the lowest point by a quarter of a cell of 0.03
     torch.testing.assert_close(got[inner], want[inner], rtol=0, atol=(0.0075 / s) ** 2 + 1e-4)
-    assert torch.equal(got[outer], level[outer])
+    assert torch.equal(got[outer], sdf[outer])
     mesh = extract_surface(got, radius=RADIUS)
     assert abs(float(mesh.vertices[:, 2].max()) - s * math.sqrt(DEPTH)) < 0.003  # a tenth of a cell
     beyond = float(mesh.vertices[:, :2].norm(dim=-1).max()) - 40 * 0.9 / 128
@@ -59,45 +59,45 @@ def test_an_unsure_sheet_becomes_a_surface_as_thick_as_it_is_unsure(device):
 
 
 def test_blocks_that_are_left_out_change_nothing(device, monkeypatch):
-    """Equal to the bit: a block whose least level is no lower than what its ray has met is not looked at."""
+    """Skipping blocks whose minimum cannot lower the ray's changes nothing: bitwise identical."""
     points = grid((37, 42, 30))
     wave = (9.0 * points).sin().sum(-1)
-    level = torch.where(wave > 0.8, 3.0 + wave, wave - 0.3).to(device)
-    args = level, torch.full_like(level, FREE), disc(128, 55.0).to(device), far_camera().to(device)
+    sdf = torch.where(wave > 0.8, 3.0 + wave, wave - 0.3).to(device)
+    args = sdf, torch.full_like(sdf, FREE), disc(128, 55.0).to(device), far_camera().to(device)
     got = cover_silhouettes(*args, radius=RADIUS)
-    lowest = cover._lowest(level)
-    assert tuple(lowest.shape) == (9, 11, 8) and float(lowest.min()) == float(level.min())
+    lowest = cover._lowest(sdf)
+    assert tuple(lowest.shape) == (9, 11, 8) and float(lowest.min()) == float(sdf.min())
     assert 0.02 < float((lowest >= FIELD_MAX).float().mean()) < 0.9, "some blocks are left out"
-    monkeypatch.setattr(cover, "_lowest", lambda level: torch.full_like(lowest, -1e30))
+    monkeypatch.setattr(cover, "_lowest", lambda sdf: torch.full_like(lowest, -1e30))
     assert torch.equal(got, cover_silhouettes(*args, radius=RADIUS))
-    assert int((got != level).sum()) > 500
+    assert int((got != sdf).sum()) > 500
 
 
 def test_a_surface_that_covers_its_silhouettes_stays_as_it_is(device):
     points = grid((31, 33, 35))
-    level = (points.norm(dim=-1) - 0.4) / 0.02
-    args = [v.to(device) for v in (level, torch.full_like(level, FREE), disc(128, 0.385 * 128 / 0.9), far_camera())]
-    assert torch.equal(cover_silhouettes(*args, radius=RADIUS).cpu(), level)
+    sdf = (points.norm(dim=-1) - 0.4) / 0.02
+    args = [v.to(device) for v in (sdf, torch.full_like(sdf, FREE), disc(128, 0.385 * 128 / 0.9), far_camera())]
+    assert torch.equal(cover_silhouettes(*args, radius=RADIUS).cpu(), sdf)
 
 
 def test_the_bound_holds_and_hopeless_rays_are_left(device):
     points = grid((31, 31, 31))
     camera = far_camera().to(device)
     mask = disc(128, 40.0).to(device)
-    level = torch.full(points.shape[:3], 0.4).to(device)
-    bound = -hull_distance(points.reshape(-1, 3).to(device), mask, camera).view_as(level) / 0.02
-    start = torch.maximum(level, bound)
+    sdf = torch.full(points.shape[:3], 0.4).to(device)
+    bound = -hull_distance(points.reshape(-1, 3).to(device), mask, camera).view_as(sdf) / 0.02
+    start = torch.maximum(sdf, bound)
     got = cover_silhouettes(start, bound, mask, camera, radius=RADIUS)
     assert bool((got >= bound).all()) and bool((got <= start).all()) and float(got.min()) <= -DEPTH
-    high = torch.full_like(level, FIELD_MAX + 0.1)
+    high = torch.full_like(sdf, FIELD_MAX + 0.1)
     assert torch.equal(cover_silhouettes(high, high - 5.0, mask, camera, radius=RADIUS), high)
 
 
-def twin(level, bound, distance, cameras):
+def twin(sdf, bound, distance, cameras):
     """Rays by ``camera_rays``, trilinear and bilinear values by ``grid_sample``, all steps of a ray at once."""
     rows, columns = (k // STRIDE for k in distance.shape[1:])
-    step = RADIUS / (max(level.shape) - 1)  # half a cell
-    points = grid(level.shape, torch.float64).reshape(-1, 3)
+    step = RADIUS / (max(sdf.shape) - 1)  # half a cell
+    points = grid(sdf.shape, torch.float64).reshape(-1, 3)
     most = torch.zeros(len(points), dtype=torch.float64)
     for v, c2w in enumerate(cameras.c2w):
         camera = Camera(c2w, cameras.intrinsics[v] / STRIDE, columns, rows)
@@ -106,9 +106,9 @@ def twin(level, bound, distance, cameras):
         near, far = ends.amin(0).amax(1).clamp(min=0.0), ends.amax(0).amin(1)
         t = near[:, None] + step * torch.arange(int(4 * RADIUS / step))
         at = (o[:, None] + t[..., None] * d[:, None]) / RADIUS
-        value = grid_sample(
-            level[None, None], at.flip(-1)[None, :, :, None], align_corners=True, padding_mode="border"
-        )[0, 0, :, :, 0]
+        value = grid_sample(sdf[None, None], at.flip(-1)[None, :, :, None], align_corners=True, padding_mode="border")[
+            0, 0, :, :, 0
+        ]
         least = torch.where(t < far[:, None], value, torch.inf).amin(1)
         x, y = torch.meshgrid(torch.arange(columns), torch.arange(rows), indexing="xy")
         centre = (torch.stack([x, y], -1) + 0.5) * STRIDE * 2 / torch.tensor([distance.shape[2], distance.shape[1]]) - 1
@@ -122,25 +122,25 @@ def twin(level, bound, distance, cameras):
             max_pool2d(lacks, 3, 1, 1), place[None, :, None], align_corners=False, padding_mode="border"
         )[0, 0, :, 0]
         most = torch.maximum(most, torch.where((place.abs() < 1.0).all(1), value, 0.0))
-    flat = level.reshape(-1)
-    return torch.where(flat.abs() < FIELD_MAX, torch.maximum(flat - most, bound.reshape(-1)), flat).view_as(level)
+    flat = sdf.reshape(-1)
+    return torch.where(flat.abs() < FIELD_MAX, torch.maximum(flat - most, bound.reshape(-1)), flat).view_as(sdf)
 
 
 def test_equals_its_twin_on_a_rough_field(device):
     g = torch.Generator().manual_seed(3)
     coarse = torch.randn(1, 1, 6, 6, 6, generator=g)
-    level = torch.nn.functional.interpolate(coarse, (25, 23, 27), mode="trilinear", align_corners=True)[0, 0] * 2 + 1.0
-    bound = level - 2.0 * torch.rand(level.shape, generator=g)
+    sdf = torch.nn.functional.interpolate(coarse, (25, 23, 27), mode="trilinear", align_corners=True)[0, 0] * 2 + 1.0
+    bound = sdf - 2.0 * torch.rand(sdf.shape, generator=g)
     eyes = torch.tensor([[1.5, 0.4, 1.0], [-1.2, 0.3, 1.4], [0.3, -1.5, 0.8]])
     c2w = torch.stack([look_at(e, torch.zeros(3), torch.tensor([0.0, 1.0, 0.0])) for e in eyes])
     camera = Camera(c2w, torch.tensor([[70.0, 75.0, 31.0, 33.0]]).expand(3, 4).contiguous(), 64, 64)
     masks = (torch.rand(3, 8, 8, generator=g) > 0.3).float().repeat_interleave(8, 1).repeat_interleave(8, 2)
     distance = mask_distance(masks)
-    args = [v.to(device) for v in (level, bound, distance, camera)]
+    args = [v.to(device) for v in (sdf, bound, distance, camera)]
     got = cover_silhouettes(*args, radius=RADIUS).cpu()
-    want = twin(level.double(), bound.double(), distance.double(), camera)
-    assert float((want != level).double().mean()) > 0.2
-    # float32 has rays enter the cube 1e-5 of a step aside; one whose least level is FIELD_MAX falls to either side
+    want = twin(sdf.double(), bound.double(), distance.double(), camera)
+    assert float((want != sdf).double().mean()) > 0.2
+    # float32 has rays enter the cube 1e-5 of a step aside; one whose least sdf is FIELD_MAX falls to either side
     assert float(((got - want).abs() < 2e-4).double().mean()) > 0.999
 
 
@@ -162,21 +162,21 @@ def test_the_mesh_shows_what_the_photographs_show(count, least, monkeypatch):
     views = load_views(Path(reli3d.__file__).parent / "assets/example", views=count)
     share, exact = seen_share(model, views)
     assert share > least and exact > 0.975
-    monkeypatch.setattr(pipeline, "cover_silhouettes", lambda level, *args, **options: level)
+    monkeypatch.setattr(pipeline, "cover_silhouettes", lambda sdf, *args, **options: sdf)
     assert seen_share(model, views)[0] < least
 
 
-def test_without_views_the_level_comes_back(device):
-    level = grid((5, 6, 7)).sum(-1).to(device)
+def test_without_views_the_field_is_returned_unchanged(device):
+    sdf = grid((5, 6, 7)).sum(-1).to(device)
     none = torch.zeros(0, 16, 16, device=device), Camera(torch.zeros(0, 4, 4), torch.zeros(0, 4), 16, 16).to(device)
-    assert torch.equal(cover_silhouettes(level, level - 1.0, *none, radius=RADIUS), level)
+    assert torch.equal(cover_silhouettes(sdf, sdf - 1.0, *none, radius=RADIUS), sdf)
 
 
 def test_bad_input_is_named():
-    level, camera = torch.zeros(4, 4, 4), far_camera(32)
-    good = {"level": level, "bound": level, "distance": disc(32, 9.0), "camera": camera}
+    sdf, camera = torch.zeros(4, 4, 4), far_camera(32)
+    good = {"sdf": sdf, "bound": sdf, "distance": disc(32, 9.0), "camera": camera}
     for change, message in (
-        ({"level": torch.zeros(4, 4)}, r"level: expected shape \(X, Y, Z\)"),
+        ({"sdf": torch.zeros(4, 4)}, r"sdf: expected shape \(X, Y, Z\)"),
         ({"bound": torch.zeros(4, 4, 5)}, r"bound: expected shape \(4, 4, 4\)"),
         ({"distance": torch.zeros(1, 4, 40)}, r"distance: expected shape \(V, H, W\)"),
         ({"camera": camera[0]}, "camera: expected 1 views"),
@@ -188,4 +188,4 @@ def test_bad_input_is_named():
         with pytest.raises(ValueError, match="radius: expected a positive number"):
             cover_silhouettes(**good, radius=radius)
     with pytest.raises(TypeError, match="bound: expected torch.float32"):
-        cover_silhouettes(**{**good, "bound": level.double()}, radius=1.0)
+        cover_silhouettes(**{**good, "bound": sdf.double()}, radius=1.0)

@@ -26,34 +26,34 @@ NOTHING = Mesh(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.int32))
 @pytest.mark.parametrize("centre", [False, True])
 @pytest.mark.parametrize("value, closed", [(1.0, True), (0.0, True), (-0.0, True), (1.0, False), (-1.0, False)])
 def test_a_field_without_a_change_of_sign_has_no_faces_and_gradients_of_zero(device, value, closed, centre):
-    level = torch.full(SHAPE, value, device=device).requires_grad_()
+    sdf = torch.full(SHAPE, value, device=device).requires_grad_()
     weights = {k: v.requires_grad_() for k, v in random_weights(SHAPE, 0, device).items()}
-    mesh = extract_surface(level, radius=1.0, closed=closed, centre=centre, **weights)
-    assert mesh.vertices.shape == (0, 3) and mesh.faces.shape == (0, 3) and mesh.vertices.device == level.device
-    assert len(surface_cubes(level)) == 0
-    leaves = [level, *(weights[k] for k in ("deformation", "alpha", "beta"))]
+    mesh = extract_surface(sdf, radius=1.0, closed=closed, centre=centre, **weights)
+    assert mesh.vertices.shape == (0, 3) and mesh.faces.shape == (0, 3) and mesh.vertices.device == sdf.device
+    assert len(surface_cubes(sdf)) == 0
+    leaves = [sdf, *(weights[k] for k in ("deformation", "alpha", "beta"))]
     for g, leaf in zip(torch.autograd.grad(mesh.vertices.sum(), leaves), leaves, strict=True):
         assert g.shape == leaf.shape and float(g.abs().max()) == 0.0
     rows = {k: v.detach() if k == "deformation" else v.detach()[:0] for k, v in weights.items()}
     cubes = torch.zeros(0, dtype=torch.int64, device=device)
-    assert len(extract_surface(level, radius=1.0, closed=closed, centre=centre, cubes=cubes, **rows).faces) == 0
+    assert len(extract_surface(sdf, radius=1.0, closed=closed, centre=centre, cubes=cubes, **rows).faces) == 0
     weights.pop("gamma")
-    spread = vertex_deviation(level, radius=1.0, closed=closed, **weights)
+    spread = vertex_deviation(sdf, radius=1.0, closed=closed, **weights)
     assert spread.shape == (0,)
     assert all(float(g.abs().max()) == 0.0 for g in torch.autograd.grad(spread.sum(), leaves))
-    assert float(sign_entropy(level.detach())) == 0.0
+    assert float(sign_entropy(sdf.detach())) == 0.0
 
 
 def test_a_full_field_is_the_box_with_its_edges_cut_off(device):
     """Dual vertices stand at the centres of the border's squares: the convex hull of those is the whole surface."""
-    level = -torch.ones(SHAPE, device=device)
-    mesh = extract_surface(level, radius=(1.0, 1.5, 2.0))
+    sdf = -torch.ones(SHAPE, device=device)
+    mesh = extract_surface(sdf, radius=(1.0, 1.5, 2.0))
     found = report(mesh)
     assert found.watertight and found.manifold and found.euler == 2 and float(volume(mesh)) > 0
     hull = trimesh.Trimesh(mesh.vertices.cpu().numpy()).convex_hull
     assert float(volume(mesh)) == pytest.approx(hull.volume, rel=1e-5)
     assert mesh.vertices.abs().amax(0).tolist() == [1.0, 1.5, 2.0]
-    leaf = level.requires_grad_()
+    leaf = sdf.requires_grad_()
     for centre in (False, True):  # a crossing between a vertex and its copy in the padding does not move
         moved = extract_surface(leaf, radius=1.0, centre=centre)
         assert float(torch.autograd.grad(moved.vertices.square().sum(), leaf)[0].abs().max()) == 0.0

@@ -16,7 +16,7 @@ from reli3d.geometry.smooth import taubin_smooth
 from reli3d.geometry.surface import extract_surface
 from reli3d.geometry.tangents import decode_normals, encode_normals, vertex_tangents
 from reli3d.geometry.triplane import sample_triplane
-from reli3d.kernels.flexicubes import LEVEL_MIN
+from reli3d.kernels.flexicubes import SDF_MIN
 from tests.support import reference_surface
 
 N = 100_000
@@ -24,7 +24,7 @@ CUBES = 47  # a side: 103,823 cubes
 # Of the change by a relative step of an input, where an edge of 0.02 and a random share of 1 give up to 0.02: digits
 # that float32 lacks where terms of that size cancel, and float64 in the twin's differences of shares.  Centres are
 # means of vertices that are rounded in the box of 1, not in a cube.
-FLOOR = {"level": 3e-9, "deformation": 1e-9, "alpha": 3e-9, "beta": 3e-9, "gamma": 1e-7}
+FLOOR = {"sdf": 3e-9, "deformation": 1e-9, "alpha": 3e-9, "beta": 3e-9, "gamma": 1e-7}
 
 
 def agree(got, want, floor=0.0, share=0.999, within=1e-4):
@@ -58,24 +58,24 @@ def wild_weights(shape, generator, reach):
 def test_gradients_of_flexicubes(device, reach):
     """``reach``: the published activations' range, then all that is allowed."""
     g, n = torch.Generator().manual_seed(reach), CUBES**3
-    level = wild((CUBES + 1,) * 3, g)
+    sdf = wild((CUBES + 1,) * 3, g)
     for axis in range(3):  # outside at the border: no padding, which the twin has not
-        level.select(axis, 0).abs_(), level.select(axis, -1).abs_()
+        sdf.select(axis, 0).abs_(), sdf.select(axis, -1).abs_()
     leaves = {
-        "level": level,
-        "deformation": (torch.randint(3, (*level.shape, 3), generator=g) - 1) * (0.49 / CUBES),
+        "sdf": sdf,
+        "deformation": (torch.randint(3, (*sdf.shape, 3), generator=g) - 1) * (0.49 / CUBES),
         "alpha": wild_weights((n, 8), g, reach),
         "beta": wild_weights((n, 12), g, reach),
         "gamma": wild_weights((n,), g, reach),
     }
     ours = {k: v.to(device).requires_grad_() for k, v in leaves.items()}
-    mesh = extract_surface(ours["level"], radius=0.5, centre=True, **{k: ours[k] for k in leaves if k != "level"})
+    mesh = extract_surface(ours["sdf"], radius=0.5, centre=True, **{k: ours[k] for k in leaves if k != "sdf"})
     share = torch.randn(mesh.vertices.shape, generator=g)
     got = torch.autograd.grad((mesh.vertices * share.to(device)).sum(), list(ours.values()))
     assert finite(mesh.vertices, *got)
     double = {k: v.double().requires_grad_() for k, v in leaves.items()}
     dual, cube_of = reference_surface.flexicubes_vertices(
-        *(double[k] for k in ("level", "deformation", "alpha", "beta")), 1.0, LEVEL_MIN
+        *(double[k] for k in ("sdf", "deformation", "alpha", "beta")), 1.0, SDF_MIN
     )
     quads = mesh.faces.cpu().long().view(-1, 4, 3)[:, :, 0]
     corner, weight = dual[quads], double["gamma"][cube_of[quads]]
@@ -94,12 +94,12 @@ def test_gradients_of_flexicubes(device, reach):
 @pytest.mark.parametrize("reach", [0, 6])
 def test_gradients_of_the_deviation(device, reach):
     g, n = torch.Generator().manual_seed(10 + reach), CUBES**3
-    level = wild((CUBES + 1,) * 3, g)
+    sdf = wild((CUBES + 1,) * 3, g)
     for axis in range(3):
-        level.select(axis, 0).abs_(), level.select(axis, -1).abs_()
+        sdf.select(axis, 0).abs_(), sdf.select(axis, -1).abs_()
     leaves = [
-        level,
-        (torch.randint(3, (*level.shape, 3), generator=g) - 1) * (0.49 / CUBES),
+        sdf,
+        (torch.randint(3, (*sdf.shape, 3), generator=g) - 1) * (0.49 / CUBES),
         wild_weights((n, 8), g, reach),
         wild_weights((n, 12), g, reach),
     ]

@@ -56,42 +56,42 @@ def test_bad_input_is_named():
     assert sample_grid(grid, points[:0]).shape == (0, 11)
 
 
-def laplacian_twin(level, share):
-    stencil = torch.zeros(3, 3, 3, dtype=torch.float64, device=level.device)
+def laplacian_twin(field, weight):
+    stencil = torch.zeros(3, 3, 3, dtype=torch.float64, device=field.device)
     stencil[1, 1, [0, 2]] = stencil[1, [0, 2], 1] = stencil[[0, 2], 1, 1] = 1.0
     stencil[1, 1, 1] = -6.0
-    bend = conv3d(level.double()[None, None], stencil[None, None])[0, 0]
-    return (share[1:-1, 1:-1, 1:-1] * bend.square()).sum()
+    bend = conv3d(field.double()[None, None], stencil[None, None])[0, 0]
+    return (weight[1:-1, 1:-1, 1:-1] * bend.square()).sum()
 
 
 @pytest.mark.parametrize("shape", [(9, 7, 8), (40, 30, 21), (3, 3, 3)])
 def test_the_squared_laplacian_is_that_of_a_convolution(device, shape):
     generator = torch.Generator().manual_seed(2)
-    level = torch.randn(shape, generator=generator).to(device).requires_grad_()
-    share = torch.rand(shape, generator=generator)
-    share = (share * (torch.rand(shape, generator=generator) < 0.5)).to(device)  # borders are not 0
-    got, want = squared_laplacian(level, share), laplacian_twin(level, share)
+    field = torch.randn(shape, generator=generator).to(device).requires_grad_()
+    weight = torch.rand(shape, generator=generator)
+    weight = (weight * (torch.rand(shape, generator=generator) < 0.5)).to(device)  # borders are not 0
+    got, want = squared_laplacian(field, weight), laplacian_twin(field, weight)
     torch.testing.assert_close(got.double(), want, rtol=1e-5, atol=1e-6)  # sums of 1e4 squares in float32
-    slopes = [torch.autograd.grad(3.0 * value, level)[0] for value in (got, want)]
+    slopes = [torch.autograd.grad(3.0 * value, field)[0] for value in (got, want)]
     torch.testing.assert_close(*slopes, rtol=1e-5, atol=1e-3)  # of 7 products of up to 100
 
 
 def test_a_plane_has_no_squared_laplacian(device):
     axes = torch.meshgrid(*[torch.arange(6.0, device=device)] * 3, indexing="ij")
-    level = 2.0 * axes[0] - 3.0 * axes[1] + axes[2]  # whole numbers: no rounding
-    assert float(squared_laplacian(level, torch.ones_like(level))) == 0.0
+    field = 2.0 * axes[0] - 3.0 * axes[1] + axes[2]  # whole numbers: no rounding
+    assert float(squared_laplacian(field, torch.ones_like(field))) == 0.0
 
 
 def test_a_grid_without_inner_points_has_none(device):
-    level = torch.randn(2, 5, 5, generator=torch.Generator().manual_seed(0)).to(device).requires_grad_()
-    total = squared_laplacian(level, torch.ones_like(level))
-    (slope,) = torch.autograd.grad(total, level)
+    field = torch.randn(2, 5, 5, generator=torch.Generator().manual_seed(0)).to(device).requires_grad_()
+    total = squared_laplacian(field, torch.ones_like(field))
+    (slope,) = torch.autograd.grad(total, field)
     assert float(total.detach()) == 0.0 and not slope.any()
 
 
-def test_bad_levels_are_named():
-    level = torch.zeros(4, 5, 6)
-    with pytest.raises(ValueError, match=r"level, share: expected \(X, Y, Z\) twice"):
-        squared_laplacian(level, level[1:])
-    with pytest.raises(TypeError, match="share: expected torch.float32"):
-        squared_laplacian(level, level.double())
+def test_bad_fields_are_named():
+    field = torch.zeros(4, 5, 6)
+    with pytest.raises(ValueError, match=r"field, weight: expected one shape"):
+        squared_laplacian(field, field[1:])
+    with pytest.raises(TypeError, match="weight: expected torch.float32"):
+        squared_laplacian(field, field.double())

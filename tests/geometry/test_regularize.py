@@ -17,15 +17,15 @@ F = torch.nn.functional
 
 def test_deviation_and_gradients_match_the_plain_float64_formulation(device):
     rng = torch.Generator().manual_seed(3)
-    level = F.pad(torch.randn(6, 5, 7, generator=rng), (1,) * 6, value=0.7)  # no cube of the padding is needed
-    weights = random_weights(level.shape, 5, spread=0.5)
+    sdf = F.pad(torch.randn(6, 5, 7, generator=rng), (1,) * 6, value=0.7)  # no cube of the padding is needed
+    weights = random_weights(sdf.shape, 5, spread=0.5)
     weights.pop("gamma")
-    leaves = {"level": level, **weights}
+    leaves = {"sdf": sdf, **weights}
     ours = {k: v.to(device).requires_grad_() for k, v in leaves.items()}
     double = {k: v.double().requires_grad_() for k, v in leaves.items()}
-    arguments = {k: v for k, v in ours.items() if k != "level"}
-    spread = vertex_deviation(ours["level"], radius=0.8, **arguments)
-    mesh = extract_surface(ours["level"], radius=0.8, **arguments)
+    arguments = {k: v for k, v in ours.items() if k != "sdf"}
+    spread = vertex_deviation(ours["sdf"], radius=0.8, **arguments)
+    mesh = extract_surface(ours["sdf"], radius=0.8, **arguments)
     plain, _ = reference_surface.flexicubes_vertices(**double, scale=1.6)
     want = reference_surface.flexicubes_deviation(**double, scale=1.6)
     _, match = cKDTree(mesh.vertices.detach().cpu().numpy()).query(plain.detach().numpy())
@@ -57,25 +57,25 @@ def test_deviation_of_a_flat_cut_vanishes_and_pulls_a_skewed_one_back():
 
 
 def test_deviation_follows_the_vertices_of_a_closed_field_at_the_box(device):
-    level = sphere(6, radius=1.1, device=device).requires_grad_()
-    cubes = surface_cubes(level)
+    sdf = sphere(6, radius=1.1, device=device).requires_grad_()
+    cubes = surface_cubes(sdf)
     weights = {
         name: value[cubes.cpu()].to(device)
         for name, value in random_weights((7,) * 3, 2).items()
         if name in ("alpha", "beta")
     }
-    spread = vertex_deviation(level, radius=1.0, cubes=cubes, **weights)
-    assert len(spread) == len(extract_surface(level, radius=1.0, cubes=cubes, **weights).vertices)
-    (g,) = torch.autograd.grad(spread.mean(), level)
+    spread = vertex_deviation(sdf, radius=1.0, cubes=cubes, **weights)
+    assert len(spread) == len(extract_surface(sdf, radius=1.0, cubes=cubes, **weights).vertices)
+    (g,) = torch.autograd.grad(spread.mean(), sdf)
     assert bool(torch.isfinite(spread).all() & torch.isfinite(g).all()) and float(g.abs().max()) > 0
 
 
 def test_entropy_matches_cross_entropy_in_float64(device):
-    level = torch.randn(2, 4, 5, 6, generator=torch.Generator().manual_seed(0)) * 3
-    ours, double = level.to(device).requires_grad_(), level.double().requires_grad_()
+    sdf = torch.randn(2, 4, 5, 6, generator=torch.Generator().manual_seed(0)) * 3
+    ours, double = sdf.to(device).requires_grad_(), sdf.double().requires_grad_()
     terms = []
     for axis in (1, 2, 3):
-        n = level.shape[axis]
+        n = sdf.shape[axis]
         a, b = double.narrow(axis, 0, n - 1), double.narrow(axis, 1, n - 1)
         change = (a < 0) != (b < 0)
         a, b = a[change], b[change]
@@ -91,32 +91,32 @@ def test_entropy_matches_cross_entropy_in_float64(device):
 
 
 def test_entropy_of_one_change_is_the_closed_form_and_a_uniform_field_has_none():
-    level = torch.ones(2, 2, 2)
-    level[0] = -1.0
-    assert float(sign_entropy(level)) == pytest.approx(2 * math.log1p(math.e), rel=1e-6)
+    sdf = torch.ones(2, 2, 2)
+    sdf[0] = -1.0
+    assert float(sign_entropy(sdf)) == pytest.approx(2 * math.log1p(math.e), rel=1e-6)
     one_sign = torch.ones(3, 3, 3, requires_grad=True)
     sign_entropy(one_sign).backward()
     assert float(sign_entropy(one_sign.detach())) == 0.0 and float(one_sign.grad.abs().max()) == 0.0
 
 
 def test_entropy_removes_a_floater_that_nothing_holds():
-    level = sphere(8, radius=0.5)
-    level[1, 1, 1] = -0.05
-    assert report(extract_surface(level, radius=1.0)).components == 2
+    sdf = sphere(8, radius=0.5)
+    sdf[1, 1, 1] = -0.05
+    assert report(extract_surface(sdf, radius=1.0)).components == 2
     for _ in range(5):
-        level = level.detach().requires_grad_()
-        level = level - 3.0 * torch.autograd.grad(sign_entropy(level), level)[0]
-    assert float(level[1, 1, 1].detach()) > 0.0
+        sdf = sdf.detach().requires_grad_()
+        sdf = sdf - 3.0 * torch.autograd.grad(sign_entropy(sdf), sdf)[0]
+    assert float(sdf[1, 1, 1].detach()) > 0.0
 
 
 @pytest.mark.parametrize(
     "call, error, name",
     [
-        (lambda: sign_entropy(torch.ones(3, 3)), ValueError, "level"),
-        (lambda: sign_entropy(torch.ones(3, 3, 1)), ValueError, "level"),
-        (lambda: sign_entropy(torch.ones(3, 3, 3, dtype=torch.float64)), TypeError, "level"),
-        (lambda: sign_entropy(torch.full((3, 3, 3), float("nan"))), ValueError, "level"),
-        (lambda: vertex_deviation(torch.ones(3, 3), radius=1.0), ValueError, "level"),
+        (lambda: sign_entropy(torch.ones(3, 3)), ValueError, "sdf"),
+        (lambda: sign_entropy(torch.ones(3, 3, 1)), ValueError, "sdf"),
+        (lambda: sign_entropy(torch.ones(3, 3, 3, dtype=torch.float64)), TypeError, "sdf"),
+        (lambda: sign_entropy(torch.full((3, 3, 3), float("nan"))), ValueError, "sdf"),
+        (lambda: vertex_deviation(torch.ones(3, 3), radius=1.0), ValueError, "sdf"),
         (lambda: vertex_deviation(sphere(4), radius=-1.0), ValueError, "radius"),
         (lambda: vertex_deviation(sphere(4), radius=1.0, beta=torch.zeros(64, 12)), ValueError, "beta"),
         (lambda: vertex_deviation(sphere(4), radius=1.0, alpha=torch.ones(9, 8)), ValueError, "alpha"),

@@ -19,7 +19,7 @@ F = torch.nn.functional
 def test_vertices_and_faces_are_the_published_ones_in_their_order(goldens, device, name):
     data = np.load(goldens / "flexicubes_16.npz")
     raw = torch.from_numpy(data["weights21"]).to(device)
-    level = torch.from_numpy(data[f"{name}.level"]).view(17, 17, 17).to(device)
+    sdf = torch.from_numpy(data[f"{name}.level"]).view(17, 17, 17).to(device)
     weights = {}
     if name != "sphere":
         shift = torch.from_numpy(data["deformation"]).view(17, 17, 17, 3).to(device)
@@ -29,7 +29,7 @@ def test_vertices_and_faces_are_the_published_ones_in_their_order(goldens, devic
             gamma=0.25 + 0.5 * raw[:, 20].sigmoid(),
             deformation=shift.tanh() * (1 - 1e-8) / 32,
         )
-    got = extract_surface(level, radius=0.5, closed=False, **weights)
+    got = extract_surface(sdf, radius=0.5, closed=False, **weights)
     assert np.array_equal(got.faces.cpu().numpy(), data[f"{name}.f"])
     # coordinates up to 0.53 as quotients of a few float32 terms
     np.testing.assert_allclose(got.vertices.cpu().numpy(), data[f"{name}.v"], rtol=0, atol=3e-7)
@@ -47,14 +47,14 @@ def test_mesh_of_the_published_heads(goldens):
     heads = np.load(goldens / "object_representation_heads.npz")
     p = {k.removeprefix("param."): torch.from_numpy(heads[k]) for k in heads if k.startswith("param.")}
     features = sample_triplane(torch.from_numpy(data["triplane"]), grid(16).view(1, -1, 3))[0]
-    level = 10 - (mlp(p, "net.heads.density", features, 3) - 1).exp().view(17, 17, 17)
+    sdf = 10 - (mlp(p, "net.heads.density", features, 3) - 1).exp().view(17, 17, 17)
     offset = mlp(p, "net.heads.vertex-offset", features, 3).view(17, 17, 17, 3)
     corner = mlp(p, "net.heads.flexicubes-weight", features, 2).view(17, 17, 17, 16)
     eight = [corner[i : i + 16, j : j + 16, k : k + 16] for k in (0, 1) for j in (0, 1) for i in (0, 1)]
     merged = 0.1 * mlp(p, "indices_merging_mlp.heads.flexicubes-weight", torch.cat(eight, -1).view(-1, 128), 3)
     np.testing.assert_allclose(merged[:64].numpy(), data["weight21_first64"], rtol=0, atol=2e-6)
     got = extract_surface(
-        level,
+        sdf,
         radius=0.87,
         closed=False,
         deformation=offset.tanh() * (1 - 1e-8) / 32,
@@ -70,7 +70,7 @@ def test_mesh_of_the_published_heads(goldens):
 
 
 def sign_pattern(case):
-    """Level of one cube, ``(2, 2, 2)``, with random sizes."""
+    """Field values ``(2, 2, 2)`` of one cube with the signs of ``case`` and random magnitudes."""
     size = torch.rand(8, generator=torch.Generator().manual_seed(case)) + 0.01
     inside = torch.tensor([case >> k & 1 for k in range(8)], dtype=torch.bool)
     return torch.where(inside, -size, size).view(2, 2, 2).permute(2, 1, 0)  # corner 1 is one step in x
@@ -78,11 +78,11 @@ def sign_pattern(case):
 
 def test_every_sign_pattern_is_a_closed_outward_manifold(device):
     blocks = [F.pad(sign_pattern(case), (1,) * 6, value=0.5) for case in range(256)]
-    level = torch.cat([torch.cat(blocks[16 * k : 16 * k + 16], 0) for k in range(16)], 1).to(device)
-    found = report(extract_surface(level, radius=1.0, **random_weights(level.shape, 0, device)))
+    sdf = torch.cat([torch.cat(blocks[16 * k : 16 * k + 16], 0) for k in range(16)], 1).to(device)
+    found = report(extract_surface(sdf, radius=1.0, **random_weights(sdf.shape, 0, device)))
     assert found.watertight and found.manifold and found.degenerate_faces == 0, found
     # weights beyond the range of the published activations may fold a thin part over; within it none does
-    mesh = extract_surface(level, radius=1.0, **random_weights(level.shape, 0, device, spread=0.5))
+    mesh = extract_surface(sdf, radius=1.0, **random_weights(sdf.shape, 0, device, spread=0.5))
     label = face_components(mesh)
     a, b, c = (mesh.vertices[mesh.faces[:, k].long()].double() for k in range(3))
     volumes = torch.zeros(int(label.max()) + 1, device=device, dtype=torch.float64)
@@ -94,16 +94,17 @@ def test_every_sign_pattern_has_a_ball_for_every_connected_part(device):
     """Corners inside that no edge of the cube joins are apart; nothing has a hole or a bridge: Euler number 2 each."""
     blocks = [F.pad(sign_pattern(case), (1,) * 6, value=0.5) for case in range(256)]
     parts = sum(ndimage.label(block.numpy() < 0)[1] for block in blocks)
-    level = torch.cat([torch.cat(blocks[16 * k : 16 * k + 16], 0) for k in range(16)], 1).to(device)
-    found = report(extract_surface(level, radius=1.0, **random_weights(level.shape, 0, device)))
+    sdf = torch.cat([torch.cat(blocks[16 * k : 16 * k + 16], 0) for k in range(16)], 1).to(device)
+    found = report(extract_surface(sdf, radius=1.0, **random_weights(sdf.shape, 0, device)))
     assert (found.components, found.euler) == (parts, 2 * parts)
 
 
 def test_one_inside_vertex_has_the_eight_dual_vertices_of_the_closed_form(device):
-    """Level -0.8 among 0.2: every edge is crossed at 0.8 of a cube of 1/4, a dual vertex is the mean of three."""
-    level = torch.full((5, 5, 5), 0.2, device=device)
-    level[2, 2, 2] = -0.8
-    mesh = extract_surface(level, radius=0.5)
+    """One vertex at -0.8, all others at 0.2: each edge is crossed at 0.8 of its length of 1/4, and a dual vertex is the
+    mean of three crossings."""
+    sdf = torch.full((5, 5, 5), 0.2, device=device)
+    sdf[2, 2, 2] = -0.8
+    mesh = extract_surface(sdf, radius=0.5)
     assert mesh.faces.shape == (12, 3) and report(mesh).watertight
     sign = torch.tensor([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * 0.8 / 4 / 3
     got = mesh.vertices.cpu()
@@ -114,8 +115,8 @@ def test_one_inside_vertex_has_the_eight_dual_vertices_of_the_closed_form(device
 
 @pytest.mark.parametrize("case", range(1, 255, 11))
 def test_one_cube_is_closed_at_the_box(device, case):
-    level = sign_pattern(case).contiguous().to(device)
-    mesh = extract_surface(level, radius=1.0, **random_weights(level.shape, case, device))
+    sdf = sign_pattern(case).contiguous().to(device)
+    mesh = extract_surface(sdf, radius=1.0, **random_weights(sdf.shape, case, device))
     found = report(mesh)
     assert found.watertight and found.manifold, found
     assert float(volume(mesh)) > 0
@@ -124,30 +125,30 @@ def test_one_cube_is_closed_at_the_box(device, case):
 @pytest.mark.parametrize("seed", range(6))
 def test_noise_is_a_closed_manifold_with_the_inside_on_the_inner_side(device, seed):
     rng = torch.Generator().manual_seed(seed)
-    level = torch.randn(9, 10, 12, generator=rng).to(device)  # all ambiguous cases, faces at the box too
-    level[level.abs() < 0.05] = 0.0
-    mesh = extract_surface(level, radius=(0.5, 1.0, 2.0), **random_weights(level.shape, seed, device))
+    sdf = torch.randn(9, 10, 12, generator=rng).to(device)  # all ambiguous cases, faces at the box too
+    sdf[sdf.abs() < 0.05] = 0.0
+    mesh = extract_surface(sdf, radius=(0.5, 1.0, 2.0), **random_weights(sdf.shape, seed, device))
     found = report(mesh)
     assert found.watertight and found.manifold, found
     half = torch.tensor([0.5, 1.0, 2.0], device=device)
-    margin = half / (torch.tensor(level.shape, device=device) - 1)  # the grid's own vertices move by half a cube
+    margin = half / (torch.tensor(sdf.shape, device=device) - 1)  # the grid's own vertices move by half a cube
     assert bool((mesh.vertices.abs() <= half + margin).all())
     # without weights a quad's normal has a positive product with the step from its inside to its outside end
-    plain = extract_surface(level, radius=(0.5, 1.0, 2.0))
-    inside_volume = (level < 0).float().mean()
+    plain = extract_surface(sdf, radius=(0.5, 1.0, 2.0))
+    inside_volume = (sdf < 0).float().mean()
     assert 0.3 < float(volume(plain)) / (8 * 0.5 * 1.0 * 2.0) / float(inside_volume) < 1.7
 
 
 def test_a_half_space_is_closed_flat_at_the_box(device):
-    level = grid(12, device=device)[..., 1] - 0.05
-    closed = extract_surface(level, radius=1.5)
+    sdf = grid(12, device=device)[..., 1] - 0.05
+    closed = extract_surface(sdf, radius=1.5)
     found = report(closed)
     assert found.watertight and found.manifold and found.euler == 2
     assert closed.vertices.abs().max() == 1.5
     # box of 3 x 1.575 x 3 but for the chamfered edges, half a cube of 0.25 on each side: under 3 % of the volume
     exact = 3.0 * 3.0 * 1.5 * 1.05
     assert 0.97 * exact < float(volume(closed)) <= exact * (1 + 1e-6)
-    opened = report(extract_surface(level, radius=1.5, closed=False))
+    opened = report(extract_surface(sdf, radius=1.5, closed=False))
     assert opened.boundary_edges > 0
     away = sphere(12, device=device)
     one, other = extract_surface(away, radius=1.0), extract_surface(away, radius=1.0, closed=False)
@@ -155,11 +156,11 @@ def test_a_half_space_is_closed_flat_at_the_box(device):
 
 
 def test_the_peer_that_is_timed_gives_the_same_surface():
-    level = F.pad(torch.randn(9, 8, 10, generator=torch.Generator().manual_seed(8)), (1,) * 6, value=0.7)
-    weights = random_weights(level.shape, 2, spread=0.5)
-    mesh = extract_surface(level, radius=0.8, **weights)
+    sdf = F.pad(torch.randn(9, 8, 10, generator=torch.Generator().manual_seed(8)), (1,) * 6, value=0.7)
+    weights = random_weights(sdf.shape, 2, spread=0.5)
+    mesh = extract_surface(sdf, radius=0.8, **weights)
     vertices, faces = flexicubes(
-        level, *(weights[k] for k in ("deformation", "alpha", "beta", "gamma")), cube_list(level.shape), 1.6
+        sdf, *(weights[k] for k in ("deformation", "alpha", "beta", "gamma")), cube_list(sdf.shape), 1.6
     )
     distance, match = cKDTree(mesh.vertices.numpy()).query(vertices.numpy())
     assert len(vertices) == len(mesh.vertices) and distance.max() < 1e-6  # float32 quotients of coordinates below 1
@@ -172,29 +173,29 @@ def test_the_peer_that_is_timed_gives_the_same_surface():
 
 
 def test_weights_of_surface_cubes_only(device):
-    for level in (sphere(10, device=device), grid(10, device=device)[..., 2] + 0.03):
-        weights = random_weights(level.shape, 0, device)
-        dense = extract_surface(level, radius=1.0, **weights)
-        cubes = surface_cubes(level)
+    for sdf in (sphere(10, device=device), grid(10, device=device)[..., 2] + 0.03):
+        weights = random_weights(sdf.shape, 0, device)
+        dense = extract_surface(sdf, radius=1.0, **weights)
+        cubes = surface_cubes(sdf)
         rows = {k: v if k == "deformation" else v[cubes].requires_grad_() for k, v in weights.items()}
-        got = extract_surface(level, radius=1.0, cubes=cubes, **rows)
+        got = extract_surface(sdf, radius=1.0, cubes=cubes, **rows)
         assert torch.equal(got.vertices, dense.vertices) and torch.equal(got.faces, dense.faces)
         g_alpha, g_beta = torch.autograd.grad(got.vertices.square().sum(), (rows["alpha"], rows["beta"]))
         full = {k: v.clone().requires_grad_() for k, v in weights.items()}
-        again = extract_surface(level, radius=1.0, **full)
+        again = extract_surface(sdf, radius=1.0, **full)
         f_alpha, f_beta = torch.autograd.grad(again.vertices.square().sum(), (full["alpha"], full["beta"]))
         assert torch.equal(g_alpha, f_alpha[cubes]) and torch.equal(g_beta, f_beta[cubes])
         with pytest.raises(ValueError, match="cubes"):
-            extract_surface(level, radius=1.0, cubes=cubes.flip(0), **rows)
+            extract_surface(sdf, radius=1.0, cubes=cubes.flip(0), **rows)
 
 
 def test_the_same_bits_for_any_number_of_threads(threads):
-    level = torus(40) + 0.01 * torch.randn(41, 41, 41, generator=torch.Generator().manual_seed(0))
-    weights = random_weights(level.shape, 0)
+    sdf = torus(40) + 0.01 * torch.randn(41, 41, 41, generator=torch.Generator().manual_seed(0))
+    weights = random_weights(sdf.shape, 0)
     results = []
     for count in (1, 2, 5):
         threads(count)
-        leaves = [level.clone().requires_grad_(), weights["deformation"].clone().requires_grad_()]
+        leaves = [sdf.clone().requires_grad_(), weights["deformation"].clone().requires_grad_()]
         mesh = extract_surface(leaves[0], radius=1.0, **{**weights, "deformation": leaves[1]})
         grads = torch.autograd.grad(mesh.vertices.square().sum(), leaves)
         results.append((mesh.vertices.detach(), mesh.faces, *grads))
@@ -205,11 +206,11 @@ def test_the_same_bits_for_any_number_of_threads(threads):
 @pytest.mark.parametrize(
     "change, error, name",
     [
-        (dict(level=torch.full((4, 4, 4), float("nan"))), ValueError, "level"),
-        (dict(level=torch.eye(4).expand(4, 4, 4).sub(0.5) * float("inf")), ValueError, "level"),
-        (dict(level=torch.ones(4, 4)), ValueError, "level"),
-        (dict(level=torch.ones(1, 4, 4)), ValueError, "level"),
-        (dict(level=torch.ones(4, 4, 4, dtype=torch.float64)), TypeError, "level"),
+        (dict(sdf=torch.full((4, 4, 4), float("nan"))), ValueError, "sdf"),
+        (dict(sdf=torch.eye(4).expand(4, 4, 4).sub(0.5) * float("inf")), ValueError, "sdf"),
+        (dict(sdf=torch.ones(4, 4)), ValueError, "sdf"),
+        (dict(sdf=torch.ones(1, 4, 4)), ValueError, "sdf"),
+        (dict(sdf=torch.ones(4, 4, 4, dtype=torch.float64)), TypeError, "sdf"),
         (dict(radius=0.0), ValueError, "radius"),
         (dict(radius=(1.0, 2.0)), ValueError, "radius"),
         (dict(alpha=torch.ones(63, 8)), ValueError, "alpha"),
@@ -225,6 +226,6 @@ def test_the_same_bits_for_any_number_of_threads(threads):
     ],
 )
 def test_wrong_input_is_named(change, error, name):
-    arguments = dict(level=sphere(4), radius=1.0) | change
+    arguments = dict(sdf=sphere(4), radius=1.0) | change
     with pytest.raises(error, match=name):
-        extract_surface(arguments.pop("level"), **arguments)
+        extract_surface(arguments.pop("sdf"), **arguments)

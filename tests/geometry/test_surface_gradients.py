@@ -17,16 +17,16 @@ F = torch.nn.functional
 
 def test_gradients_match_the_plain_float64_formulation(device):
     rng = torch.Generator().manual_seed(3)
-    level = torch.randn(7, 6, 8, generator=rng)
-    level = F.pad(level, (1,) * 6, value=0.7)  # the plain formulation has no padding; away from the box both agree
-    weights = random_weights(level.shape, 5, spread=0.5)
+    sdf = torch.randn(7, 6, 8, generator=rng)
+    sdf = F.pad(sdf, (1,) * 6, value=0.7)  # the plain formulation has no padding; away from the box both agree
+    weights = random_weights(sdf.shape, 5, spread=0.5)
     gamma = weights.pop("gamma")
-    leaves = {"level": level, **weights}
+    leaves = {"sdf": sdf, **weights}
     ours = {k: v.to(device).requires_grad_() for k, v in leaves.items()}
-    mesh = extract_surface(ours["level"], radius=0.8, gamma=gamma.to(device), **{k: ours[k] for k in weights})
+    mesh = extract_surface(ours["sdf"], radius=0.8, gamma=gamma.to(device), **{k: ours[k] for k in weights})
     double = {k: v.double().requires_grad_() for k, v in leaves.items()}
     want, _ = reference_surface.flexicubes_vertices(
-        double["level"], double["deformation"], double["alpha"], double["beta"], 1.6
+        double["sdf"], double["deformation"], double["alpha"], double["beta"], 1.6
     )
     tree = cKDTree(mesh.vertices.detach().cpu().numpy())
     distance, match = tree.query(want.detach().numpy())
@@ -43,13 +43,13 @@ def test_gradients_match_the_plain_float64_formulation(device):
 
 
 def test_layout_of_the_inputs_does_not_matter_and_gradients_stop_where_none_is_asked(device):
-    level = torus(10, device)
-    weights = random_weights(level.shape, 4, device)
+    sdf = torus(10, device)
+    weights = random_weights(sdf.shape, 4, device)
     weights["alpha"] = weights["alpha"][:1].expand(1000, 8)
-    want = extract_surface(level, radius=1.0, **weights)
+    want = extract_surface(sdf, radius=1.0, **weights)
     strided = {name: torch.stack([value, value], -1)[..., 1] for name, value in weights.items()}
     beta = strided["beta"] = strided["beta"].requires_grad_()
-    turned = level.permute(2, 0, 1).contiguous().permute(1, 2, 0)
+    turned = sdf.permute(2, 0, 1).contiguous().permute(1, 2, 0)
     assert not turned.is_contiguous() and not beta.is_contiguous()
     got = extract_surface(turned, radius=1.0, **strided)
     assert torch.equal(got.vertices.detach(), want.vertices) and torch.equal(got.faces, want.faces)
@@ -59,7 +59,7 @@ def test_layout_of_the_inputs_does_not_matter_and_gradients_stop_where_none_is_a
     (twice,) = torch.autograd.grad(loss, beta, create_graph=True)
     with pytest.raises(RuntimeError, match="once_differentiable"):
         twice.sum().backward()
-    leaf = level.clone().requires_grad_()
+    leaf = sdf.clone().requires_grad_()
     held = leaf * 1.0
     mesh = extract_surface(held, radius=1.0)
     held.mul_(2.0)
@@ -68,15 +68,15 @@ def test_layout_of_the_inputs_does_not_matter_and_gradients_stop_where_none_is_a
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_levels_and_weights_of_any_size_give_finite_vertices_and_gradients(device, seed):
+def test_fields_and_weights_of_any_size_give_finite_vertices_and_gradients(device, seed):
     rng = torch.Generator().manual_seed(seed)
     shape = (12, 11, 10)
-    level = torch.randn(shape, generator=rng) * 10.0 ** torch.randint(-6, 7, shape, generator=rng)
-    level[torch.rand(shape, generator=rng) < 0.1] = 0.0
-    level[torch.rand(shape, generator=rng) < 0.1] = -0.0
+    sdf = torch.randn(shape, generator=rng) * 10.0 ** torch.randint(-6, 7, shape, generator=rng)
+    sdf[torch.rand(shape, generator=rng) < 0.1] = 0.0
+    sdf[torch.rand(shape, generator=rng) < 0.1] = -0.0
     cubes = 11 * 10 * 9
     alpha, beta = (10.0 ** torch.randint(-3, 4, (cubes, n), generator=rng) for n in (8, 12))
-    leaves = [v.to(device).requires_grad_() for v in (level, alpha, beta)]
+    leaves = [v.to(device).requires_grad_() for v in (sdf, alpha, beta)]
     mesh = extract_surface(leaves[0], radius=1.0, alpha=leaves[1], beta=leaves[2])
     found = report(mesh.detach())
     assert found.boundary_edges == 0 and float(mesh.vertices.detach().abs().max()) <= 1.0 + 1e-6  # rounding of a mean
@@ -86,16 +86,16 @@ def test_levels_and_weights_of_any_size_give_finite_vertices_and_gradients(devic
 
 def test_gradients_behind_the_mesh_are_the_same_bits_for_any_number_of_threads(threads):
     """Centre vertices, deviation, normals, smoothing, atlas: torch's own scatters add up in any order."""
-    level = torus(40) + 0.01 * torch.randn(41, 41, 41, generator=torch.Generator().manual_seed(0))
-    weights = {"level": level, **random_weights(level.shape, 0, spread=0.5)}
+    sdf = torus(40) + 0.01 * torch.randn(41, 41, 41, generator=torch.Generator().manual_seed(0))
+    weights = {"sdf": sdf, **random_weights(sdf.shape, 0, spread=0.5)}
     results = []
     for count in (1, 2, 5, 5):
         threads(count)
         leaves = {k: v.clone().requires_grad_() for k, v in weights.items()}
-        given = {k: v for k, v in leaves.items() if k not in ("level", "gamma")}
-        mesh = extract_surface(leaves["level"], radius=1.0, centre=True, gamma=leaves["gamma"], **given)
+        given = {k: v for k, v in leaves.items() if k not in ("sdf", "gamma")}
+        mesh = extract_surface(leaves["sdf"], radius=1.0, centre=True, gamma=leaves["gamma"], **given)
         shown = unwrap(taubin_smooth(mesh.with_normals(), iterations=2), texture_size=64)
-        spread = vertex_deviation(leaves["level"], radius=1.0, **given)
+        spread = vertex_deviation(leaves["sdf"], radius=1.0, **given)
         seen = [mesh.vertices, shown.vertices, shown.normals, spread]
         rng = torch.Generator().manual_seed(1)
         share = [torch.randn(v.shape, generator=rng) for v in seen]
@@ -105,41 +105,41 @@ def test_gradients_behind_the_mesh_are_the_same_bits_for_any_number_of_threads(t
 
 
 def test_gradients_match_finite_differences_of_the_kernel(device):
-    level = sphere(6, device=device) + 0.05
+    sdf = sphere(6, device=device) + 0.05
     rng = torch.Generator().manual_seed(0)
-    weights = random_weights(level.shape, 1, device, spread=0.4)
-    direction = torch.randn(level.shape, generator=rng).to(device)
+    weights = random_weights(sdf.shape, 1, device, spread=0.4)
+    direction = torch.randn(sdf.shape, generator=rng).to(device)
     share = None
     values = []
-    leaf = level.clone().requires_grad_()
+    leaf = sdf.clone().requires_grad_()
     for step in (-1e-2, 1e-2, 0.0):
-        mesh = extract_surface(leaf + step * direction * level.abs(), radius=1.0, centre=True, **weights)
+        mesh = extract_surface(leaf + step * direction * sdf.abs(), radius=1.0, centre=True, **weights)
         if share is None:
             share = torch.randn(mesh.vertices.shape, generator=rng).to(device)
         values.append((mesh.vertices * share).sum())
     (got,) = torch.autograd.grad(values[2], leaf)
-    slope = float(((values[1] - values[0]) / 2e-2).detach())  # steps that scale with the level keep its signs
-    assert abs(float((got * direction * level.abs()).sum()) - slope) < 2e-3 * max(1.0, abs(slope))  # float32, step**2
+    slope = float(((values[1] - values[0]) / 2e-2).detach())  # steps that scale with the sdf keep its signs
+    assert abs(float((got * direction * sdf.abs()).sum()) - slope) < 2e-3 * max(1.0, abs(slope))  # float32, step**2
 
 
 def test_gradients_in_the_padding_reach_what_they_stand_at(device):
-    level = grid(5, device=device)[..., 0] + 0.1
-    leaf = level.clone().requires_grad_()
+    sdf = grid(5, device=device)[..., 0] + 0.1
+    leaf = sdf.clone().requires_grad_()
     shift = torch.zeros(6, 6, 6, 3, device=device).requires_grad_()
     mesh = extract_surface(leaf, radius=1.0, deformation=shift)
-    g_level, g_shift = torch.autograd.grad(mesh.vertices.square().sum(), (leaf, shift))
-    assert bool(torch.isfinite(g_level).all()) and bool(torch.isfinite(g_shift).all())
+    g_sdf, g_shift = torch.autograd.grad(mesh.vertices.square().sum(), (leaf, shift))
+    assert bool(torch.isfinite(g_sdf).all()) and bool(torch.isfinite(g_shift).all())
     # the total weight of a vertex is one: moving the whole grid moves every vertex
     (whole,) = torch.autograd.grad(extract_surface(leaf, radius=1.0, deformation=shift).vertices.sum(), shift)
     torch.testing.assert_close(whole.sum((0, 1, 2)), torch.full((3,), 2.0 * len(mesh.vertices), device=device))
 
 
 def test_centre_vertices_split_quads_in_four_with_gradient_to_gamma(device):
-    level = torus(12, device)
-    weights = random_weights(level.shape, 2, device)
+    sdf = torus(12, device)
+    weights = random_weights(sdf.shape, 2, device)
     gamma = weights["gamma"].requires_grad_()
-    two = extract_surface(level, radius=1.0, **weights)
-    four = extract_surface(level, radius=1.0, centre=True, **weights)
+    two = extract_surface(sdf, radius=1.0, **weights)
+    four = extract_surface(sdf, radius=1.0, centre=True, **weights)
     quads = len(two.faces) // 2
     assert len(four.faces) == 4 * quads and len(four.vertices) == len(two.vertices) + quads
     found = report(four.detach())
@@ -152,7 +152,7 @@ def test_centre_vertices_split_quads_in_four_with_gradient_to_gamma(device):
     ends = []
     for step in (-1e-3, 1e-3):
         weights["gamma"] = gamma.detach() + step * direction
-        moved = extract_surface(level, radius=1.0, centre=True, **weights).vertices
+        moved = extract_surface(sdf, radius=1.0, centre=True, **weights).vertices
         ends.append((moved.double() * share.double()).sum())
     slope = float((ends[1] - ends[0]) / 2e-3)
     assert abs(float((got * direction).sum()) - slope) < 2e-2 * max(1.0, abs(slope))  # float32 over a step of 1e-3

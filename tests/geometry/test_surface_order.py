@@ -25,10 +25,10 @@ FIELDS = {"sphere": lambda n, device: sphere(n, device=device), "torus": torus, 
 
 
 def gyroid(p):
-    """Level and gradient of the gyroid, in its own units."""
+    """Value and gradient of the gyroid, in its own units."""
     s, c = p.sin(), p.cos()
-    level = s[..., 0] * c[..., 1] + s[..., 1] * c[..., 2] + s[..., 2] * c[..., 0]
-    return level, c * c.roll(-1, -1) - s * s.roll(1, -1)
+    sdf = s[..., 0] * c[..., 1] + s[..., 1] * c[..., 2] + s[..., 2] * c[..., 0]
+    return sdf, c * c.roll(-1, -1) - s * s.roll(1, -1)
 
 
 def share_below(offset, n):
@@ -84,7 +84,7 @@ def test_volume_of_the_gyroid_converges_with_second_order(device, offset):
     errors = []
     for n in RESOLUTIONS:
         fields = [gyroid(np.pi * grid(n, device=device) + at.to(device))[0] - offset for at in begins]
-        off = [volume64(extract_surface(level, radius=1.0)) - exact[1] for level in fields]
+        off = [volume64(extract_surface(sdf, radius=1.0)) - exact[1] for sdf in fields]
         errors.append(float(np.sqrt(np.mean(np.square(off)))))
     assert errors[-1] > 1e-3 and min(slopes(errors)) >= 1.8, errors
 
@@ -94,8 +94,8 @@ def test_a_cubic_cell_of_the_gyroid_has_genus_five(device, cells):
     """Euler number 2 - 2 * 5 of the surface that repeats (Schoen 1970, NASA TN D-5541: genus 3 in the primitive cell,
     half of the cubic one): vertices, edges and faces whose middle lies in one period.
     """
-    level = gyroid(1.25 * np.pi * grid(cells * 5 // 4, device=device) + 0.1234)[0]
-    mesh = extract_surface(level, radius=1.25, closed=False)
+    sdf = gyroid(1.25 * np.pi * grid(cells * 5 // 4, device=device) + 0.1234)[0]
+    mesh = extract_surface(sdf, radius=1.25, closed=False)
     vertices, faces = mesh.vertices.cpu().double(), mesh.faces.cpu().long()
     edges = torch.stack([faces, faces.roll(-1, 1)], -1).reshape(-1, 2).sort(1).values.unique(dim=0)
     begin = torch.tensor([0.0123, 0.0077, 0.0191], dtype=torch.float64) - 1.0
@@ -117,12 +117,12 @@ def test_gyroid_is_within_a_cube_both_ways_and_of_one_genus_at_any_resolution(de
         euler.append(found.euler)
         cube = 2 / n
         inner = mesh.vertices[mesh.vertices.abs().amax(-1) < 1 - cube].cpu().double()  # not the caps at the box
-        level, slope = gyroid(scale * inner)
-        assert float((level.abs() / (scale * slope.norm(dim=-1))).max()) < cube  # to first order, and 0.1 cubes in fact
+        sdf, slope = gyroid(scale * inner)
+        assert float((sdf.abs() / (scale * slope.norm(dim=-1))).max()) < cube  # to first order, and 0.1 cubes in fact
         points = torch.rand(4000, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 1.6 - 0.8
         for _ in range(20):  # Newton: onto the surface
-            level, slope = gyroid(scale * points)
-            points = points - slope * (level / (scale * slope.square().sum(-1).clamp(min=0.1)))[:, None]
+            sdf, slope = gyroid(scale * points)
+            points = points - slope * (sdf / (scale * slope.square().sum(-1).clamp(min=0.1)))[:, None]
         points = points[(points.abs().amax(-1) < 0.9) & (gyroid(scale * points)[0].abs() < 1e-9)]
         assert len(points) > 3000
         assert cKDTree(samples_of(mesh)).query(points.numpy())[0].max() < cube

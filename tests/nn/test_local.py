@@ -86,28 +86,28 @@ def asked(field):
     visible = ((eyes[None] - position[:, None]) * normal[:, None]).sum(-1).gt(0).float()
     field = field.with_shading(position, normal, visible)
     material = field.material(position, normal, visible)
-    return field.free_level(1.2 * position), material, field.radiance_map()
+    return field.free_sdf(1.2 * position), material, field.radiance_map()
 
 
 @torch.no_grad()
-def test_a_level_whose_bound_is_known_is_the_level(model):
+def test_sdf_within_equals_free_sdf_for_the_same_bound(model):
     field = encoded(model, *sphere(2))
     points = torch.rand(300, 3, generator=torch.Generator().manual_seed(6)) - 0.5
     bound = field.bound(points)
-    assert torch.equal(field.level_within(points, bound), field.free_level(points))
-    assert not torch.equal(field.level_within(points, bound + 1.0), field.free_level(points))
+    assert torch.equal(field.sdf_within(points, bound), field.free_sdf(points))
+    assert not torch.equal(field.sdf_within(points, bound + 1.0), field.free_sdf(points))
 
 
 @pytest.mark.parametrize("views", [1, 2, 5, 16])
 def test_any_number_of_views_in_any_order(model, views):
     inputs = sphere(views)
-    level, material, light = asked(encoded(model, *inputs))
-    assert level.shape == (200,) and material.base_color.shape == (200, 3) and light.shape == (16, 32, 3)
-    assert all(bool(torch.isfinite(v).all()) for v in (level, light, *vars(material).values()))
+    sdf, material, light = asked(encoded(model, *inputs))
+    assert sdf.shape == (200,) and material.base_color.shape == (200, 3) and light.shape == (16, 32, 3)
+    assert all(bool(torch.isfinite(v).all()) for v in (sdf, light, *vars(material).values()))
     order = torch.randperm(views, generator=torch.Generator().manual_seed(1))
     other, other_material, other_light = asked(encoded(model, *(t[order] for t in inputs)))
     # sums over the views in another order, behind a dozen layers: float32 rounding, amplified
-    torch.testing.assert_close(other, level, rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(other, sdf, rtol=1e-3, atol=1e-3)
     torch.testing.assert_close(other_light, light, rtol=2e-3, atol=1e-3)
     for a, b in zip(vars(other_material).values(), vars(material).values(), strict=True):
         torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-3)
@@ -138,11 +138,11 @@ def test_mirror_images_have_the_mirrored_maps(model):
 
 def test_every_view_is_read(model):
     images, masks, c2w, intrinsics = sphere(3)
-    level, material, light = asked(encoded(model, images, masks, c2w, intrinsics))
+    sdf, material, light = asked(encoded(model, images, masks, c2w, intrinsics))
     changed = images.clone()
     changed[2] = 1 - changed[2]
     other, other_material, other_light = asked(encoded(model, changed, masks, c2w, intrinsics))
-    assert float((other - level).abs().max()) > 1e-3 and float((other_light - light).abs().max()) > 1e-3
+    assert float((other - sdf).abs().max()) > 1e-3 and float((other_light - light).abs().max()) > 1e-3
     assert float((other_material.base_color - material.base_color).abs().max()) > 1e-3
 
 
@@ -243,8 +243,8 @@ def test_the_view_that_sees_a_point_speaks(model):
     field = encoded(model, images, masks, c2w, intrinsics)
     plain = torch.zeros(2, 32, 32, 12)
     camera = Camera(c2w, intrinsics / 2, 32, 32)
-    level = torch.tensor(0.0)
-    field = dataclasses.replace(field, pixels=PixelMaps.of(plain, torch.zeros(2, 16, 16, 2), camera, level))
+    mean = torch.tensor(0.0)
+    field = dataclasses.replace(field, pixels=PixelMaps.of(plain, torch.zeros(2, 16, 16, 2), camera, mean))
     position = 0.4 * normalize(c2w[:, :3, 3], dim=-1)  # the nearest point to each camera
     visible = torch.eye(2)
     with torch.no_grad():
@@ -261,7 +261,7 @@ def outputs(field, inputs):
     field = field.with_shading(position, normal, visible)
     fused, material = field.fused(position, normal, visible), field.material(position, normal, visible)
     heads = field.heads(position, normal, visible)
-    plain = [field.free_level(position), field.level(1.2 * position), heads, field.radiance_map(), field.volume]
+    plain = [field.free_sdf(position), field.sdf(1.2 * position), heads, field.radiance_map(), field.volume]
     return [*vars(fused).values(), *vars(material).values(), *plain]
 
 
@@ -332,7 +332,7 @@ def test_inference_in_blocks_of_points_gives_what_training_gives(model):
     # the fused pass sums in another order, behind a dozen layers
     torch.testing.assert_close(blocks.base_color, whole.base_color.detach(), rtol=0, atol=1e-4)
     torch.testing.assert_close(blocks.normal, whole.normal.detach(), rtol=0, atol=1e-3)
-    torch.testing.assert_close(field.level(position), trained.level(position).detach(), rtol=0, atol=2e-3)
+    torch.testing.assert_close(field.sdf(position), trained.sdf(position).detach(), rtol=0, atol=2e-3)
 
 
 def test_points_know_whether_they_lie_before_a_surface():

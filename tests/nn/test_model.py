@@ -119,17 +119,17 @@ def test_the_field_starts_outside():
     model = Reconstructor(NANO).eval()
     points = torch.rand(1, 500, 3) * 1.7 - 0.85
     density = model.query(model.encode(*views(1, 2, 32)), points, ["density"])["density"]
-    assert (model.level(density) > 0).all()
+    assert (model.sdf(density) > 0).all()
 
 
-def test_level_is_zero_where_the_density_is_the_threshold():
+def test_sdf_is_zero_where_the_density_is_the_threshold():
     for preset in (OFFICIAL, NANO):
         with torch.device("meta"):
             model = Reconstructor(preset)
         assert model.surface_density == pytest.approx(3.302585, abs=1e-6)  # 1 + ln 10
         raw = torch.tensor([model.surface_density, 5.0, 0.0])
-        level = model.level(raw)
-        assert abs(level[0]) < 1e-5 and level[1] < 0 < level[2]
+        sdf = model.sdf(raw)
+        assert abs(sdf[0]) < 1e-5 and sdf[1] < 0 < sdf[2]
 
 
 def test_official_roughness_is_the_root_of_its_alpha(tiny):

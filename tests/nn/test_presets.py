@@ -66,7 +66,7 @@ def run(preset) -> None:
     field = model.encode(images[0], masks[0], c2w, intrinsics[0].contiguous(), detail, intrinsics[0].contiguous())
     position, visible = torch.rand(5, 3) - 0.5, torch.ones(5, 2)
     normal = torch.nn.functional.normalize(position, dim=-1)
-    assert field.level(position).shape == (5,)
+    assert field.sdf(position).shape == (5,)
     assert field.with_shading(position, normal, visible).material(position, normal, visible).base_color.shape == (5, 3)
 
 

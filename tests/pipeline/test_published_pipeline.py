@@ -56,9 +56,9 @@ def test_weights_asked_for_near_the_surface_give_the_published_mesh(goldens):
     none = torch.zeros(1)
     code = Code(torch.from_numpy(data["triplane"]), none, none, none, none)
     flat = pipeline._grid(16, 0.87, torch.device("cpu")).reshape(-1, 3)
-    level = model.level(model.query(code, flat[None], ("density",))["density"])[0, :, 0].view(17, 17, 17)
-    weights = field.TriplaneField(None, model, code).cube_weights(flat, level)
-    got = extract_surface(level, radius=0.87, closed=False, **weights)
+    sdf = model.sdf(model.query(code, flat[None], ("density",))["density"])[0, :, 0].view(17, 17, 17)
+    weights = field.TriplaneField(None, model, code).cube_weights(flat, sdf)
+    got = extract_surface(sdf, radius=0.87, closed=False, **weights)
     assert np.array_equal(got.faces.numpy(), data["faces"])
     # density is exp of a sum of 64 products: 1e-5 relative, over slopes of about 1 a cell of 0.1
     np.testing.assert_allclose(got.vertices.numpy(), data["v_pos"], rtol=0, atol=1e-5)
@@ -71,38 +71,38 @@ def test_weights_near_the_surface_are_those_of_the_whole_grid(tiny, half_space):
     code, n = tiny.encode(*views(1, 2, 76)), 12
     flat = pipeline._grid(n, 0.87, torch.device("cpu")).reshape(-1, 3)
     raw = tiny.query(code, flat[None], ("density", "deformation", "flexicubes"))
-    level = tiny.level(raw["density"])[0, :, 0].view(13, 13, 13)
+    sdf = tiny.sdf(raw["density"])[0, :, 0].view(13, 13, 13)
     if half_space:
-        level = (flat[:, 1] - 0.05).view(13, 13, 13)
+        sdf = (flat[:, 1] - 0.05).view(13, 13, 13)
     corner = raw["flexicubes"][0].view(13, 13, 13, 16)
     eight = [corner[i : i + n, j : j + n, k : k + n] for k in (0, 1) for j in (0, 1) for i in (0, 1)]
     dense = tiny.merger(torch.stack(eight, -2).view(n**3, 8, 16))
     want = extract_surface(
-        level,
+        sdf,
         radius=0.87,
         deformation=deformation(raw["deformation"][0], n).view(13, 13, 13, 3),
         alpha=dense.alpha,
         beta=dense.beta,
         gamma=dense.gamma,
     )
-    weights = field.TriplaneField(None, tiny, code).cube_weights(flat, level)
-    assert len(weights["alpha"]) == len(surface_cubes(level))
-    got = extract_surface(level, radius=0.87, **weights)
+    weights = field.TriplaneField(None, tiny, code).cube_weights(flat, sdf)
+    assert len(weights["alpha"]) == len(surface_cubes(sdf))
+    got = extract_surface(sdf, radius=0.87, **weights)
     assert torch.equal(got.faces, want.faces)
     # products of other shapes sum in another order: a few units in the last place of 0.87
     torch.testing.assert_close(got.vertices, want.vertices, rtol=0, atol=2e-6)
 
 
 @torch.no_grad()
-def test_the_grid_is_asked_by_planes_and_gives_the_level_of_its_points(tiny):
+def test_grid_sdf_equals_free_sdf_at_the_grid_points(tiny):
     """Also with the box of one axis away from the middle."""
     code, maps = tiny.encode(*views(1, 2, 76)), SimpleNamespace(c2w=torch.zeros(2, 4, 4))
     axis = torch.linspace(-0.8, 0.6, 61)  # points of more than one tile of the kernel
     own = field.TriplaneField(maps, tiny, code)
-    want = own.free_level(torch.cartesian_prod(axis, axis, axis)).view(61, 61, 61)
+    want = own.free_sdf(torch.cartesian_prod(axis, axis, axis)).view(61, 61, 61)
     assert float(want.min()) < 0 < float(want.max())
     # sums of 24 float32 products in another order, behind exp
-    torch.testing.assert_close(own.grid_level(axis), want, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(own.grid_sdf(axis), want, rtol=1e-4, atol=1e-4)
 
 
 @torch.no_grad()
@@ -166,7 +166,7 @@ def test_a_field_of_one_sign_is_an_error_and_not_a_box(tiny, bias):
     empty.load_state_dict(tiny.state_dict())
     with torch.no_grad():
         empty.heads["density"][-1].bias.fill_(bias)
-    with pytest.raises(NoSurface, match=r"^level: expected values on both sides of 0, got \[.*\]: no surface$"):
+    with pytest.raises(NoSurface, match=r"^sdf: expected values on both sides of 0, got \[.*\]: no surface$"):
         reconstruct(EXAMPLE, weights=empty, options=ReconstructOptions(256, 16))
 
 

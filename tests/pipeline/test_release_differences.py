@@ -103,10 +103,10 @@ def test_normal_and_material_maps_are_stored_without_loss(ball, tmp_path):
 def test_an_empty_field_has_no_faces_and_a_full_one_is_an_outward_box(goldens, name):
     data = np.load(goldens / "flexicubes_16.npz")
     assert len(data[f"{name}.f"]) > 0  # the release makes a box of it
-    level = torch.from_numpy(data[f"{name}.level"]).view(17, 17, 17)
+    sdf = torch.from_numpy(data[f"{name}.level"]).view(17, 17, 17)
     release = Mesh(torch.from_numpy(data[f"{name}.v"]), torch.from_numpy(data[f"{name}.f"]).int())
     assert float(volume(release)) < 0.0  # inward
-    ours = extract_surface(level, radius=0.5)
+    ours = extract_surface(sdf, radius=0.5)
     assert len(ours.faces) == 0 if name == "allpos" else float(volume(ours)) > 0.95  # of a box of volume 1
 
 

@@ -87,7 +87,7 @@ def test_mirror_images_tell_shape_and_paint_but_not_the_light(views):
     torch.testing.assert_close(two.log_light, light)
     assert two.maps.taken == len(two.maps.photographs.images) == 4
     points = torch.tensor([[0.0, 0.0, 0.0], [0.1, 0.2, 0.1]])
-    assert not torch.equal(one.level(points), two.level(points))
+    assert not torch.equal(one.sdf(points), two.sdf(points))
 
 
 def test_a_mirror_image_shows_a_point_only_where_no_photograph_does():

@@ -190,25 +190,25 @@ def outlines(image, vertices):
 
 
 def grid_inputs(_, shape=(7, 6, 8), seed: int = 3) -> dict[str, Tensor]:
-    level = torch.nn.functional.pad(torch.randn(shape, generator=rng(seed), **HOST), (1,) * 6, value=0.7)
-    level = level + 0.2 * level.sign()  # no crossing beside a grid point, where slopes have no bound
-    cubes = (level.shape[0] - 1) * (level.shape[1] - 1) * (level.shape[2] - 1)
+    sdf = torch.nn.functional.pad(torch.randn(shape, generator=rng(seed), **HOST), (1,) * 6, value=0.7)
+    sdf = sdf + 0.2 * sdf.sign()  # no crossing beside a grid point, where slopes have no bound
+    cubes = (sdf.shape[0] - 1) * (sdf.shape[1] - 1) * (sdf.shape[2] - 1)
     return {
-        "level": level,
-        "deformation": uniform(*level.shape, 3, seed=4, low=-0.02, high=0.02),
+        "sdf": sdf,
+        "deformation": uniform(*sdf.shape, 3, seed=4, low=-0.02, high=0.02),
         "alpha": uniform(cubes, 8, seed=5, low=0.5),
         "beta": uniform(cubes, 12, seed=6, low=0.5),
         "gamma": uniform(cubes, seed=7, low=0.5),
     }
 
 
-def surface(level, deformation, alpha, beta, gamma):
-    mesh = extract_surface(level, radius=0.8, deformation=deformation, alpha=alpha, beta=beta, gamma=gamma, centre=True)
+def surface(sdf, deformation, alpha, beta, gamma):
+    mesh = extract_surface(sdf, radius=0.8, deformation=deformation, alpha=alpha, beta=beta, gamma=gamma, centre=True)
     return mesh.vertices, mesh.faces
 
 
-def deviation(level, deformation, alpha, beta):
-    return (vertex_deviation(level, radius=0.8, deformation=deformation, alpha=alpha, beta=beta),)
+def deviation(sdf, deformation, alpha, beta):
+    return (vertex_deviation(sdf, radius=0.8, deformation=deformation, alpha=alpha, beta=beta),)
 
 
 def points_of(vertices, normals, uv, base_color, roughness, metallic, normal, bary):
@@ -272,7 +272,7 @@ def posed(c2w, intrinsics):
 FRAME = dict(normal=units(N, 5), tangent=torch.nn.functional.pad(units(N, 6), (0, 1), value=1.0))
 SG, MAP = ("axis", "sharpness", "amplitude"), ("normal", "base_color", "metallic", "roughness")
 MATERIAL = ("wo", "wi", "base_color", "alpha", "metallic")
-GRID = ("level", "deformation", "alpha", "beta")
+GRID = ("sdf", "deformation", "alpha", "beta")
 
 CASES = {
     "interpolate": Case(
@@ -339,8 +339,8 @@ CASES = {
         # few crossings, none within 3e-4 of a kink of the mean absolute deviation
         lambda n: {k: v for k, v in grid_inputs(n, (3, 3, 4), 24).items() if k in GRID}, deviation, GRID, second=GRID),
     "sign_entropy": Case(
-        lambda n: {"level": torch.randn(6, 7, 8, generator=rng(1), **HOST)}, lambda level: (sign_entropy(level),),
-        ("level",), second=("level",)),
+        lambda n: {"sdf": torch.randn(6, 7, 8, generator=rng(1), **HOST)}, lambda sdf: (sign_entropy(sdf),),
+        ("sdf",), second=("sdf",)),
     "vertex_normals": Case(
         lambda n: {"vertices": ball("cpu")[0]}, lambda vertices: (vertex_normals(vertices, ball(vertices.device)[1]),),
         ("vertices",), second=("vertices",)),
@@ -353,8 +353,8 @@ CASES = {
         lambda n: {"grid": uniform(6, 5, 7, 4, seed=1), "points": uniform(n, 3, low=-1.2, high=1.2)},
         lambda grid, points: (sample_grid(grid, points),), ("grid", "points"), ("points",)),
     "squared_laplacian": Case(
-        lambda n: {"level": uniform(48, 40, 6, seed=1), "share": uniform(48, 40, 6, seed=2)},
-        lambda level, share: (squared_laplacian(level, share),), ("level",)),
+        lambda n: {"field": uniform(48, 40, 6, seed=1), "weight": uniform(48, 40, 6, seed=2)},
+        lambda field, weight: (squared_laplacian(field, weight),), ("field",)),
     "project": Case(
         lambda n: {"points": uniform(n, 3, low=-0.8, high=0.8)},
         lambda points: project(points, rig(points.device).c2w[0], rig(points.device).intrinsics[0]), ("points",),

@@ -109,8 +109,8 @@ def hull_masks():
     return ((y - 12.5).square() + (x - 10.5).square() < 60.0).float().expand(3, 24, 20).contiguous()
 
 
-def covered(level, bound, masks):
-    return (cover_silhouettes(level, bound, hull.mask_distance(masks), rig(level.device), radius=0.7),)
+def covered(sdf, bound, masks):
+    return (cover_silhouettes(sdf, bound, hull.mask_distance(masks), rig(sdf.device), radius=0.7),)
 
 
 def drawn(u, radiance, wo, alpha):
@@ -167,7 +167,7 @@ CASES = {
     ),
     "cover_silhouettes": Case(
         lambda n: {
-            "level": uniform(12, 11, 10, seed=1, low=0.1, high=2.0),
+            "sdf": uniform(12, 11, 10, seed=1, low=0.1, high=2.0),
             "bound": uniform(12, 11, 10, low=-3.0),
             "masks": hull_masks(),
         },

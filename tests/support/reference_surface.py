@@ -62,19 +62,19 @@ def loop_tables():
     return table, torch.tensor([-1 if face is None else face for face in faces])
 
 
-def flexicubes_crossings(level, deformation, alpha, beta, tiny=0.0):
+def flexicubes_crossings(sdf, deformation, alpha, beta, tiny=0.0):
     """Crossings ``(E, 3)`` in [-0.5, 0.5], their beta ``(E,)``, dual vertex ``(E,)``, and the cube of every dual vertex
-    ``(V,)``, dual vertices in the release's order; inside is level < 0.  An edge whose levels are both below ``tiny``
+    ``(V,)``, dual vertices in the release's order; inside is sdf < 0.  An edge whose ends are both below ``tiny``
     passes no gradient to them.
     """
     table, face_of = loop_tables()
-    shape = level.shape
-    index = torch.arange(level.numel()).view(shape)
+    shape = sdf.shape
+    index = torch.arange(sdf.numel()).view(shape)
     offsets = [tuple(slice(o, n - 1 + o) for o, n in zip(c, shape)) for c in CORNERS]
     cubes = torch.stack([index[o].reshape(-1) for o in offsets], -1)  # (cubes, 8)
-    axes = [torch.arange(n, dtype=level.dtype) / (n - 1) - 0.5 for n in shape]
+    axes = [torch.arange(n, dtype=sdf.dtype) / (n - 1) - 0.5 for n in shape]
     position = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).view(-1, 3) + deformation.view(-1, 3)
-    inside = (level.view(-1) < 0)[cubes]
+    inside = (sdf.view(-1) < 0)[cubes]
     case = (inside.long() << torch.arange(8)).sum(-1)
     surface = ((case > 0) & (case < 255)).nonzero().squeeze(1)
     own, grid_of = case[surface], case.view([n - 1 for n in shape])
@@ -93,7 +93,7 @@ def flexicubes_crossings(level, deformation, alpha, beta, tiny=0.0):
     row, edge = (group >= 0).nonzero(as_tuple=True)
     ends = torch.tensor(EDGES)[edge]
     corner = cubes[surface][row[:, None], ends]  # (E, 2)
-    value = level.view(-1)[corner]
+    value = sdf.view(-1)[corner]
     value = torch.where((value.detach().abs().amax(1) < tiny)[:, None], value.detach(), value)
     s, x = value * alpha[surface][row[:, None], ends], position[corner]
     u = (x[:, 0] * s[:, 1:] - x[:, 1] * s[:, :1]) / (s[:, 1:] - s[:, :1])
@@ -101,17 +101,17 @@ def flexicubes_crossings(level, deformation, alpha, beta, tiny=0.0):
     return u, beta[surface][row, edge], base[row] + group[row, edge], cube_of
 
 
-def flexicubes_vertices(level, deformation, alpha, beta, scale, tiny=0.0):
+def flexicubes_vertices(sdf, deformation, alpha, beta, scale, tiny=0.0):
     """Dual vertices ``(V, 3)`` in the release's order, and their cubes."""
-    u, b, owner, cube_of = flexicubes_crossings(level, deformation, alpha, beta, tiny)
+    u, b, owner, cube_of = flexicubes_crossings(sdf, deformation, alpha, beta, tiny)
     mass = b.new_zeros(len(cube_of)).index_add(0, owner, b)
     return u.new_zeros(len(cube_of), 3).index_add(0, owner, u * (b / mass[owner])[:, None]) * scale, cube_of
 
 
-def flexicubes_deviation(level, deformation, alpha, beta, scale, tiny=0.0):
+def flexicubes_deviation(sdf, deformation, alpha, beta, scale, tiny=0.0):
     """Mean absolute deviation of the distances from a dual vertex to its crossings, ``(V,)``."""
-    u, _, owner, cube_of = flexicubes_crossings(level, deformation, alpha, beta, tiny)
-    vertices = flexicubes_vertices(level, deformation, alpha, beta, scale, tiny)[0]
+    u, _, owner, cube_of = flexicubes_crossings(sdf, deformation, alpha, beta, tiny)
+    vertices = flexicubes_vertices(sdf, deformation, alpha, beta, scale, tiny)[0]
     distance = (vertices[owner] - u * scale).norm(dim=-1)
     none, count = u.new_zeros(len(cube_of)), torch.bincount(owner)
     mean = none.index_add(0, owner, distance) / count

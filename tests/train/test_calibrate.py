@@ -23,7 +23,7 @@ class _Thin(LocalReconstructor):
 
 
 class _ThinField(LocalField):
-    def _level_within(self, points, bound):
+    def _sdf_within(self, points, bound):
         distance = signed_distance(*self.model.shape, points.contiguous())
         return distance / self.model.preset.softness + 1.5 - self._offset()
 

@@ -79,7 +79,7 @@ def surface(model: Reconstructor, code: Code, resolution: int) -> Surface | None
     axis = torch.linspace(-radius, radius, resolution + 1, device=code.latent.device)
     points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
     with torch.no_grad():
-        free = model.level(_densities(model, code, points)).view((resolution + 1,) * 3) / threshold
+        free = model.sdf(_densities(model, code, points)).view((resolution + 1,) * 3) / threshold
         cubes = surface_cubes(free)
         if len(cubes) == 0:
             return None
@@ -92,7 +92,7 @@ def surface(model: Reconstructor, code: Code, resolution: int) -> Surface | None
         at = needed.view(-1).nonzero()[:, 0]
         row = torch.cumsum(needed.view(-1), 0) - 1
     raw = ask(model, code, points[at], ("density", "deformation", "flexicubes"))
-    known = model.level(raw["density"][:, 0]) / threshold
+    known = model.sdf(raw["density"][:, 0]) / threshold
     # the two passes round differently, and a sign that flips would not fit the cubes
     known = torch.where((known < 0) == (free.view(-1)[at] < 0), known, free.view(-1)[at])
     level = free.reshape(-1).index_copy(0, at, known).view_as(free)

@@ -1,9 +1,9 @@
-"""Levels evaluated where the surface may pass, against levels evaluated everywhere."""
+"""Sparse evaluation of a signed field against a dense one."""
 
 import pytest
 import torch
 
-from reli3d.geometry.sparse_level import INSIDE_DEPTH, sparse_level
+from reli3d.geometry.sparse_sdf import INSIDE_DEPTH, sparse_sdf
 from reli3d.geometry.surface import extract_surface
 
 
@@ -19,64 +19,64 @@ def lumps(points):
     return torch.minimum(ball, rod)
 
 
-def sparse(level, near, known=None):
+def sparse(sdf, near, known=None):
     asked = []
 
     def evaluate(index):
         asked.append(index)
-        return level.view(-1)[index]
+        return sdf.view(-1)[index]
 
-    got = sparse_level(torch.full_like(level, 9.0) if known is None else known, near, evaluate)
+    got = sparse_sdf(torch.full_like(sdf, 9.0) if known is None else known, near, evaluate)
     return got, torch.cat(asked)
 
 
 @pytest.mark.parametrize("count", [49, 56])  # with and without a last point outside all coarse cells
 def test_same_surface_to_the_bit_from_fewer_points(count):
-    level = lumps(grid(count))
-    near = level < 2.0
-    got, asked = sparse(level, near)
+    sdf = lumps(grid(count))
+    near = sdf < 2.0
+    got, asked = sparse(sdf, near)
     assert len(asked) == len(asked.unique()), "a point is evaluated once"
     assert len(asked) < 0.75 * int(near.sum())
-    want = extract_surface(torch.where(near, level, 9.0), radius=1.0)
+    want = extract_surface(torch.where(near, sdf, 9.0), radius=1.0)
     mesh = extract_surface(got, radius=1.0)
     assert torch.equal(mesh.vertices, want.vertices) and torch.equal(mesh.faces, want.faces)
 
 
-def test_every_level_above_the_depth_is_exact():
-    level = lumps(grid(33))
-    near = level < 2.0
-    got, _ = sparse(level, near)
+def test_every_value_above_the_depth_is_exact():
+    sdf = lumps(grid(33))
+    near = sdf < 2.0
+    got, _ = sparse(sdf, near)
     shallow = near & (got != -INSIDE_DEPTH)
-    assert torch.equal(got[shallow], level[shallow]) and bool((got[~near] == 9.0).all())
-    assert bool((level[~shallow & near] < 0.0).all())
+    assert torch.equal(got[shallow], sdf[shallow]) and bool((got[~near] == 9.0).all())
+    assert bool((sdf[~shallow & near] < 0.0).all())
 
 
 def test_a_surface_that_leaves_the_region_is_followed():
-    level = (grid(33)[..., 2].abs() - 0.5) / 0.05  # a slab, of which the region has a column
-    near = torch.zeros_like(level, dtype=torch.bool)
+    sdf = (grid(33)[..., 2].abs() - 0.5) / 0.05  # a slab, of which the region has a column
+    near = torch.zeros_like(sdf, dtype=torch.bool)
     near[14:19, 14:19] = True
-    got, _ = sparse(level, near)
+    got, _ = sparse(sdf, near)
     for axis in range(3):
         before, after = (got.narrow(axis, k, 32) < 0 for k in (0, 1))
         for k in (0, 1):
             ends = before != after
-            assert torch.equal(got.narrow(axis, k, 32)[ends], level.narrow(axis, k, 32)[ends])
+            assert torch.equal(got.narrow(axis, k, 32)[ends], sdf.narrow(axis, k, 32)[ends])
 
 
 def test_nothing_near_asks_for_nothing():
-    level = torch.ones(8, 8, 8)
-    got, asked = sparse(level, torch.zeros(8, 8, 8, dtype=torch.bool), known=level)
-    assert len(asked) == 0 and torch.equal(got, level)
+    sdf = torch.ones(8, 8, 8)
+    got, asked = sparse(sdf, torch.zeros(8, 8, 8, dtype=torch.bool), known=sdf)
+    assert len(asked) == 0 and torch.equal(got, sdf)
 
 
-def test_known_levels_outside_the_region_are_kept():
+def test_known_values_outside_the_region_are_kept():
     known = torch.full((9, 9, 9), -5.0)
     got, asked = sparse(known, torch.zeros(9, 9, 9, dtype=torch.bool), known=known)
     assert len(asked) == 0 and torch.equal(got, known)
 
 
 def test_wrong_grids_are_named():
-    with pytest.raises(ValueError, match=r"known, near: expected one shape \(X, Y, Z\) from 3, got"):
+    with pytest.raises(ValueError, match=r"known, near: expected one shape \(X, Y, Z\) of 3 or more, got"):
         sparse(torch.zeros(2, 9, 9), torch.ones(2, 9, 9, dtype=torch.bool))
     with pytest.raises(TypeError, match="near: expected torch.bool"):
         sparse(torch.zeros(9, 9, 9), torch.ones(9, 9, 9))
