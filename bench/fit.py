@@ -1,10 +1,10 @@
-"""One step of a fit of surface, material and light to four photographs, stage by stage, beside Mitsuba's llvm variant.
+"""One step of a fit of surface, material and light to four images, by stage, compared with Mitsuba's llvm variant.
 
-Ours extracts the surface of 128 cells from its levels, traces and shades the pixels with shadows, compares colours and
-antialiased silhouettes, and moves levels, material grids, light maps and exposures by their gradients.  Mitsuba's
-surface stands still, so it neither extracts nor antialiases: it traces the same rays, takes as many samples in two
-strategies (``direct``: emitter and BSDF, material ``principled``), compares the same colours by the same loss, and
-moves the material at the same mesh's vertices and the texels of the light.
+Ours extracts the surface from a signed distance grid of 128 cells, traces and shades the pixels with shadows, compares
+colours and antialiased silhouettes, and updates distances, material grids, light maps and exposures by their gradients.
+Mitsuba's surface stands still, so it neither extracts nor antialiases: it traces the same rays, takes as many samples
+in two strategies (``direct``: emitter and BSDF, material ``principled``), compares the same colours by the same loss,
+and updates the material at the same mesh's vertices and the texels of the light.
 """
 
 from __future__ import annotations
@@ -30,21 +30,21 @@ from reli3d.render.gbuffer import primary_hits
 from reli3d.render.points import SurfacePoints
 from reli3d.render.silhouette import antialias, mesh_edges
 
-SAMPLES = (7, 7, 2)  # of 16; Mitsuba's are 8 and 8
-RATE = 1e-6  # of all unknowns: each run does the same work
+SHADING_SAMPLES = (7, 7, 2)  # of 16; Mitsuba's are 8 and 8
+LEARNING_RATE = 1e-6  # of all unknowns: each run does the same work
 COLOR, ROUGHNESS, METALLIC = 0.5, 0.5, 0.1  # where both begin
 VIEWS, TARGET = 4, 0.3
 
 
 def body(resolution: int) -> tuple[torch.Tensor, Grid]:
-    """Level of a ball with dents on a grid."""
+    """Signed distance of a ball with dents on a grid."""
     grid = Grid.around(torch.as_tensor(trimesh.creation.icosphere(radius=0.9).vertices).float(), resolution)
     at = grid.points(torch.device("cpu"))
     return at.norm(dim=-1) - 0.8 + 0.06 * (6.0 * at).sin().prod(-1), grid
 
 
 def cameras(device, size: int) -> Camera:
-    """Four views from around and a little above; the object fills two thirds of a picture's side."""
+    """Four views from around and a little above; the object fills two thirds of an image's side."""
     angle = torch.arange(VIEWS) * (2.0 * torch.pi / VIEWS)
     eyes = torch.stack([2.6 * angle.sin(), 0.4 + 0.2 * angle, 2.6 * angle.cos()], -1).to(device)
     poses = look_at(eyes, torch.zeros(3, device=device), torch.tensor([0.0, 1.0, 0.0], device=device))
@@ -56,7 +56,7 @@ def sky() -> torch.Tensor:
     return torch.rand(LIGHT_ROWS, 2 * LIGHT_ROWS, 3, generator=torch.Generator().manual_seed(0)) - 0.5
 
 
-def apart(tensors) -> list[torch.Tensor]:
+def detached(tensors) -> list[torch.Tensor]:
     """The values as new leaves: the backward pass of each stage is timed alone."""
     return [t.detach().requires_grad_() for t in tensors]
 
@@ -76,60 +76,60 @@ class Clock:
 
 
 def step_of_a_fit(device, size, resolution):
-    level, grid = body(resolution)
-    level = level.to(device)
-    unknowns, bound = Unknowns.zero(level, VIEWS, 1), torch.full_like(level, -9.0)
+    sdf, grid = body(resolution)
+    sdf = sdf.to(device)
+    unknowns, bound = Unknowns.zero(sdf, VIEWS, 1), torch.full_like(sdf, -9.0)
     middle = (COLOR, COLOR, COLOR, (ROUGHNESS - 0.05) / 0.95, METALLIC)
     logits = torch.logit(torch.tensor(middle, device=device)).expand(START_GRID, START_GRID, START_GRID, 5)
     start, camera = Start(logits.contiguous(), sky().to(device)), cameras(device, size)
     mask = torch.zeros(VIEWS, size, size, device=device)
     maps = [*unknowns.material, *unknowns.light, unknowns.exposure]
-    moving, mover = torch.optim.Adam(maps, lr=RATE), EvenAdam(unknowns.level)
-    for value in (unknowns.level, *maps):
+    moving, mover = torch.optim.Adam(maps, lr=LEARNING_RATE), EvenAdam(unknowns.sdf)
+    for value in (unknowns.sdf, *maps):
         value.requires_grad_(True)
 
     def run():
         tick = Clock(device)
-        mesh = extracted(unknowns.level, bound, grid)
+        mesh = extracted(unknowns.sdf, bound, grid)
         ends = [mesh.vertices, present("mesh.normals", mesh.normals)]
-        vertices, normals = apart(ends)
+        vertices, normals = detached(ends)
         tick("extract")
         scene = RayScene(vertices.detach(), mesh.faces)
         hits, origins, directions = primary_hits(scene, camera)
-        seen = hits.face >= 0
+        hit = hits.face >= 0
         tick("rays")
-        wo, view = -directions[seen], torch.nonzero(seen)[:, 0]
-        eye, found = origins.expand_as(directions)[seen], Hits(hits.face[seen], hits.t[seen], hits.bary[seen])
+        wo, view = -directions[hit], torch.nonzero(hit)[:, 0]
+        eye, found = origins.expand_as(directions)[hit], Hits(hits.face[hit], hits.t[hit], hits.bary[hit])
         found = evaluate_hits(vertices, mesh.faces, found, eye, -wo)
         position = eye - found.t[:, None] * wo
         normal = unit(interpolate(normals, mesh.faces, found.face, found.bary))
-        paint = material_of(sample_grid(start.material, position) + material_change(unknowns, position))
+        material = material_of(sample_grid(start.material, position) + material_change(unknowns, position))
         light = environment(unknowns, start).radiance
-        given = [normal, *paint, light, unknowns.exposure.exp()[view, None]]
+        given = [normal, *material, light, unknowns.exposure.exp()[view, None]]
         tick("points")
-        leaves = apart(given)
+        leaves = detached(given)
         points = SurfacePoints(position.detach(), normal.detach(), *leaves[:4])
-        image = radiance(points, wo, Environment(leaves[4]), samples=SAMPLES, scene=scene, seed=0) * leaves[5]
+        image = radiance(points, wo, Environment(leaves[4]), samples=SHADING_SAMPLES, scene=scene, seed=0) * leaves[5]
         target = torch.full_like(image, TARGET)
         loss = losses.display_error(image, image, target, target > 1.0)
         tick("shade, forward")
-        slopes = torch.autograd.grad(loss, leaves)
+        gradients = torch.autograd.grad(loss, leaves)
         tick("shade, backward")
         edges = mesh_edges(vertices, mesh.faces)
         covers = [
-            antialias(seen[k].float()[..., None], vertices, mesh.faces, camera[k], scene, edges=edges)[..., 0]
+            antialias(hit[k].float()[..., None], vertices, mesh.faces, camera[k], scene, edges=edges)[..., 0]
             for k in range(VIEWS)
         ]
         (outline,) = torch.autograd.grad(losses.outline(torch.stack(covers), mask), vertices)
         tick("antialias")
-        of_vertices, of_normals, *of_maps = torch.autograd.grad(given, [vertices, normals, *maps], slopes)
+        of_vertices, of_normals, *of_maps = torch.autograd.grad(given, [vertices, normals, *maps], gradients)
         tick("points")
-        (of_level,) = torch.autograd.grad(ends, unknowns.level, [of_vertices + outline, of_normals])
+        (of_sdf,) = torch.autograd.grad(ends, unknowns.sdf, [of_vertices + outline, of_normals])
         tick("extract")
-        for value, slope in zip(maps, of_maps, strict=True):
-            value.grad = slope
+        for value, gradient in zip(maps, of_maps, strict=True):
+            value.grad = gradient
         moving.step()
-        mover.step(blurred_grid(of_level, 4), RATE)
+        mover.step(blurred_grid(of_sdf, 4), LEARNING_RATE)
         tick("optimiser")
         return tick.seconds
 
@@ -141,12 +141,12 @@ def mitsuba_step(device, size, resolution):
     mi = mitsuba(device)
     if mi is None:
         return None
-    level, grid = body(resolution)
-    mesh = extracted(level, torch.full_like(level, -9.0), grid)
+    sdf, grid = body(resolution)
+    mesh = extracted(sdf, torch.full_like(sdf, -9.0), grid)
     material = COLOR, ROUGHNESS, METALLIC
-    return fit_step(mi, mesh, sky().exp(), cameras(device, size), material, TARGET, sum(SAMPLES) // 2, RATE), {
-        "steps": 1
-    }
+    samples = sum(SHADING_SAMPLES) // 2
+    run = fit_step(mi, mesh, sky().exp(), cameras(device, size), material, TARGET, samples, LEARNING_RATE)
+    return run, {"steps": 1}
 
 
 CASES = {"step": (step_of_a_fit, dict(size=256, resolution=128))}

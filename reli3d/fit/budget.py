@@ -1,4 +1,4 @@
-"""How long a fit may take, how far it is, and what it tells while it runs."""
+"""Time and step budget of a fit, its progress and its loss curve."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from tqdm import tqdm
 class Budget:
     """Seconds or steps for the parts of a fit; ``steps`` alone gives the same result on every run.
 
-    curve: one entry every ``EVERY`` steps, ``{part, step, seconds, loss}``.  interrupt: asked before every
-    step.  interrupted: it was true; parts that are running end at once and later ones do not begin.
+    curve: one entry every ``CURVE_STEPS`` steps, ``{part, step, seconds, loss}``.  interrupt: called before every
+    step.  interrupted: whether it returned True; then the running part ends and later ones take no step.
     """
 
     seconds: float | None = None
@@ -27,7 +27,7 @@ class Budget:
     interrupted: bool = False
     began: float = field(default_factory=time.perf_counter)
 
-    EVERY = 10
+    CURVE_STEPS = 10
 
     def __post_init__(self):
         if (self.seconds is None) == (self.steps is None):
@@ -66,9 +66,9 @@ class Budget:
             count += 1
             self.counts[name] = count
 
-    def tell(self, name: str, step: int, loss: float) -> None:
-        """Record the loss of a step and show it."""
-        if step % self.EVERY == 0:
+    def record(self, name: str, step: int, loss: float) -> None:
+        """Record the loss of a step in the curve and on the progress bar."""
+        if step % self.CURVE_STEPS == 0:
             seconds = round(time.perf_counter() - self.began, 3)
             self.curve.append({"part": name, "step": step, "seconds": seconds, "loss": round(loss, 6)})
         if self.bar is not None:

@@ -1,4 +1,4 @@
-"""Which parts of a fit are taken: surface, paint and light, by pictures of views whose colours it did not use."""
+"""Selects which parts of a fit are kept (surface, material, light) by the errors of input and held-out views."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from reli3d.fit.bounce import thrown_back
-from reli3d.fit.photographs import Photographs
+from reli3d.fit.bounce import reflected
+from reli3d.fit.input_images import InputImages
 from reli3d.fit.shading import radiance
 from reli3d.fit.transfer import changed
 from reli3d.fit.unknowns import Start, Unknowns, environment
@@ -20,43 +20,48 @@ from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import primary_hits, surface_points
 
-CHECK_PIXELS = 96  # of a photograph, a side, by which candidates are compared
+CHECK_PIXELS = 96  # along a side of the images by which candidates are compared
 CHECK_SAMPLES = (16, 16, 4)
-STRENGTHS = tuple(math.exp(0.05 * k) for k in range(-12, 13))
-SLACK = 0.02  # dB: the noise of a comparison
-# dB that the surface alone may lose in the mean of the views used, of those held out, and of all: the masks of all
-# views have bounded it, while the start's paint and light hold shading of the start's surface
-ALONE = (0.1, 0.3, 0.05)
+LIGHT_SCALES = tuple(math.exp(0.05 * k) for k in range(-12, 13))
+PSNR_TOLERANCE_DB = 0.02  # the noise of a comparison
+# Tolerances of the mean PSNR over input views, held-out views and all views when only the surface is kept: the masks of
+# all views have bounded the surface, while the start's material and light contain shading of the start's surface.
+SURFACE_TOLERANCES_DB = (0.1, 0.3, 0.05)
 
 
 @dataclass(frozen=True)
 class Parts:
-    """Shares of a fit in what is returned, 0 the start and 1 the fit: surface (0 or 1), paint (of the changes of the
-    materials' logits and of the bend of the normals), light (of the changes of log radiance)."""
+    """Blend weights between start (0) and fit (1).
+
+    surface: 0 or 1.  material: factor of the changes of the material's logits and of the bend of the normals.  light:
+    factor of the changes of log radiance.
+    """
 
     surface: float
-    paint: float
+    material: float
     light: float
 
     def __str__(self) -> str:
-        words = {0.0: "of the start", 0.5: "half fitted", 1.0: "fitted"}
-        return ", ".join(f"{name} {words[value]}" for name, value in vars(self).items())
+        words = {0.0: "start", 0.5: "half fitted", 1.0: "fitted"}
+        return ", ".join(f"{name}: {words[value]}" for name, value in vars(self).items())
 
 
-NOTHING = Parts(0.0, 0.0, 0.0)
-# Shares of paint and light.  Relighting shows surface and paint, not the light, so half of the light goes first.  Paint
-# fitted beside a light of which no half is right is not trusted; the surface is, as the masks hold it.
-ORDER = ((1.0, 1.0), (1.0, 0.5), (0.5, 1.0), (0.5, 0.5), (0.0, 1.0), (0.0, 0.5), (0.0, 0.0))
-FEW = 4  # views used: of fewer, at most half of the paint is taken, and, where a view is held out, half of the light
+UNCHANGED = Parts(0.0, 0.0, 0.0)
+# Weights of material and light in the order of trial.  Relighting shows surface and material but not the estimated
+# light, so the light is reduced first.  Fitted material without any of the light fitted with it is not tried.
+CANDIDATES = ((1.0, 1.0), (1.0, 0.5), (0.5, 1.0), (0.5, 0.5), (0.0, 1.0), (0.0, 0.5), (0.0, 0.0))
+MIN_VIEWS_FULL_WEIGHT = (
+    4  # with fewer input views the material's weight, and with a held-out view the light's, is <= 0.5
+)
 
 
 @dataclass(frozen=True)
 class Fitted:
-    """A start and what a fit made of it.
+    """A start and the result of a fit.
 
     first: the start.  surface: the new surface with the maps and light of the start; ``first`` where it did not move.
     received: ``(V, 3)``, of :func:`~reli3d.fit.bounce.gathered` at the vertices of ``surface``.
-    photographs: with their cameras as corrected.
+    images: with corrected cameras.
     """
 
     first: Asset
@@ -64,114 +69,118 @@ class Fitted:
     received: Tensor
     start: Start
     unknowns: Unknowns
-    photographs: Photographs
+    images: InputImages
 
     @torch.no_grad()
-    def mixed(self, paint: float, light: float) -> Asset:
-        """The new surface with these shares of the other changes."""
+    def blended(self, material: float, light: float) -> Asset:
+        """The fitted surface with the changes of material and light scaled by these weights."""
         asset, unknowns = self.surface, self.unknowns
-        if paint:
-            material, bend = ([paint * grid for grid in grids] for grids in (unknowns.material, unknowns.bend))
-            asset = changed(asset, replace(unknowns, material=material, bend=bend, detail=paint * unknowns.detail))
+        if material:
+            grids, bend = ([material * grid for grid in grids] for grids in (unknowns.material, unknowns.bend))
+            asset = changed(asset, replace(unknowns, material=grids, bend=bend, detail=material * unknowns.detail))
         if light:
             maps = [light * values for values in unknowns.light]
             asset = replace(asset, environment=environment(replace(unknowns, light=maps), self.start))
         return asset
 
 
-class Pictures:
-    """Small photographs, and what their rays hit of one surface, traced once.
+class ViewRenderer:
+    """Renders one surface in all views at low resolution and compares with the input images; rays are traced once.
 
-    received: ``(V, 3)``, of :func:`~reli3d.fit.bounce.gathered` at the vertices.  Of each of V views: ``wanted (V, S,
-    S, 3)`` display values on white; ``rays``: which pixels hit ``(S, S)``, their faces ``(N,)``, barycentrics ``(N,
-    2)`` and unit directions to the eye ``(N, 3)``; ``inside (N,)``: well in masks.
+    received: ``(vertices, 3)``, of :func:`~reli3d.fit.bounce.gathered`.  For V views: ``target (V, S, S, 3)`` display
+    values on white; ``rays``: hit mask ``(S, S)``, faces ``(N,)``, barycentrics ``(N, 2)`` and unit directions to the
+    eye ``(N, 3)``; ``inside (N,)``: whether the hit lies inside the mask by a pixel.
     """
 
     @torch.no_grad()
-    def __init__(self, asset: Asset, received: Tensor, photographs: Photographs):
-        small = photographs.resized(min(CHECK_PIXELS, photographs.size))
+    def __init__(self, asset: Asset, received: Tensor, images: InputImages):
+        small = images.resized(min(CHECK_PIXELS, images.size))
         self.mesh, self.scene = asset.mesh, RayScene(asset.mesh.vertices, asset.mesh.faces)
-        shown = linear_to_srgb(small.color.clamp(0.0, 1.0))
-        self.wanted = torch.lerp(torch.ones_like(shown), shown, small.mask[..., None])
+        display = linear_to_srgb(small.color.clamp(0.0, 1.0))
+        self.target = torch.lerp(torch.ones_like(display), display, small.mask[..., None])
         self.rays, self.inside, inside = [], [], small.inside()
         self.received = received
         for view in range(len(small)):
             hits, _, directions = primary_hits(self.scene, small.camera[view])
-            seen = hits.face >= 0
-            self.rays.append((seen, hits.face[seen], hits.bary[seen], -directions[seen]))
-            self.inside.append(inside[view][seen])
+            hit = hits.face >= 0
+            self.rays.append((hit, hits.face[hit], hits.bary[hit], -directions[hit]))
+            self.inside.append(inside[view][hit])
 
     @torch.no_grad()
     def lit(self, asset: Asset) -> list[tuple[Tensor, Tensor]]:
-        """Linear radiance of each view's rays, by the light of ``asset``, which has this surface, and by what it throws
-        on itself, ``(N, 3)`` each.  The random numbers depend on the view alone.
+        """For each view, linear radiance ``(N, 3)`` by the light of ``asset``, which has this surface, and by
+        one-bounce interreflection ``(N, 3)``.  The random numbers depend on the view alone.
         """
         lit = []
         for view, (_, face, bary, wo) in enumerate(self.rays):
             at = surface_points(self.mesh, asset.textures, face, bary)
-            bounced = thrown_back(at, interpolate(self.received, self.mesh.faces, face, bary))
+            bounced = reflected(at, interpolate(self.received, self.mesh.faces, face, bary))
             lit.append((radiance(at, wo, asset.light, samples=CHECK_SAMPLES, scene=self.scene, seed=view), bounced))
         return lit
 
     @torch.no_grad()
-    def errors(self, lit: list[tuple[Tensor, Tensor]], strength: float = 1.0) -> Tensor:
-        """Mean squared display error ``(V,)`` of whole pictures on white; light times ``strength``."""
+    def errors(self, lit: list[tuple[Tensor, Tensor]], light_scale: float = 1.0) -> Tensor:
+        """Mean squared display error ``(V,)`` of whole images on white, with direct light scaled by ``light_scale``."""
         errors = []
-        for (direct, bounced), (seen, *_), wanted in zip(lit, self.rays, self.wanted, strict=True):
-            image = torch.ones_like(wanted)
-            image[seen] = linear_to_srgb((strength * direct + bounced).clamp(0.0, 1.0))
-            errors.append((image - wanted).square().mean())
+        for (direct, bounced), (hit, *_), target in zip(lit, self.rays, self.target, strict=True):
+            image = torch.ones_like(target)
+            image[hit] = linear_to_srgb((light_scale * direct + bounced).clamp(0.0, 1.0))
+            errors.append((image - target).square().mean())
         return torch.stack(errors)
 
     @torch.no_grad()
-    def strength(self, lit: list[tuple[Tensor, Tensor]], views: list[int]) -> float:
-        """The one of ``STRENGTHS`` that ``views`` show, by pixels well inside the masks: white shines in at the rim."""
+    def light_scale(self, lit: list[tuple[Tensor, Tensor]], views: list[int]) -> float:
+        """The one of ``LIGHT_SCALES`` with the least error in ``views``, over pixels inside the masks: pixels of the
+        rim contain background."""
         got, bounced = (torch.cat([lit[view][k][self.inside[view]] for view in views]) for k in range(2))
-        want = torch.cat([self.wanted[view][self.rays[view][0]][self.inside[view]] for view in views])
+        target = torch.cat([self.target[view][self.rays[view][0]][self.inside[view]] for view in views])
         if not len(got):
             return 1.0
 
-        def error(strength: float) -> float:
-            return float((linear_to_srgb((strength * got + bounced).clamp(0.0, 1.0)) - want).square().mean())
+        def error(light_scale: float) -> float:
+            return float((linear_to_srgb((light_scale * got + bounced).clamp(0.0, 1.0)) - target).square().mean())
 
-        return min(STRENGTHS, key=error)
-
-
-def picture_error(asset: Asset, received: Tensor, photographs: Photographs) -> Tensor:
-    """Mean squared display error ``(V,)`` of whole pictures on white, at pixel centres, under the asset's own light and
-    what it throws on itself: ``received``, of :func:`~reli3d.fit.bounce.gathered` at its vertices."""
-    pictures = Pictures(asset, received, photographs)
-    return pictures.errors(pictures.lit(asset))
+        return min(LIGHT_SCALES, key=error)
 
 
-def decibels(errors: Tensor) -> float:
+def view_errors(asset: Asset, received: Tensor, images: InputImages) -> Tensor:
+    """Mean squared display error ``(V,)`` of renderings on white, at pixel centres, with the asset's environment
+    and one-bounce interreflection: ``received``, of :func:`~reli3d.fit.bounce.gathered` at its vertices."""
+    renderer = ViewRenderer(asset, received, images)
+    return renderer.errors(renderer.lit(asset))
+
+
+def mean_psnr(errors: Tensor) -> float:
     """Mean PSNR over views, NaN of none."""
     return float((-10.0 * errors.clamp(min=1e-9).log10()).mean()) if len(errors) else math.nan
 
 
 @torch.no_grad()
 def chosen(fitted: Fitted, used: list[int], held: list[int], before: Tensor) -> tuple[Asset, Parts, Tensor]:
-    """The first of ``ORDER``, of few views with less (``FEW``), that is no worse than the start on the views ``used``
-    and on those ``held`` out, else the start.  The surface alone may be worse by ``ALONE`` on these and on
-    all together.  Returns its parts as well, and the errors ``(V,)`` of its pictures.
+    """Selects the first of ``CANDIDATES`` that is no worse than the start; returns asset, weights, errors ``(V,)``.
 
-    used, held: indices of photographs.  before: errors ``(V,)`` of the start.  The strength of each candidate's light
-    is the one that the used views show best: the fit's error is that of the display's tangent, which rises faster than
-    the display, so the fit ends too dark; and a mean of logarithms is darker than either of its lights.
+    A candidate is accepted if its mean PSNR is within ``PSNR_TOLERANCE_DB`` of the start's on the ``used`` views, on
+    the ``held`` ones and on all; within ``SURFACE_TOLERANCES_DB`` if only the surface changes.  With fewer than
+    ``MIN_VIEWS_FULL_WEIGHT`` input views, larger weights are not tried.  Without an accepted candidate the start is
+    returned.
+
+    used, held: indices of views.  before: errors ``(V,)`` of the start.  The scale of each candidate's light is fitted
+    to the used views, because the fit underestimates it: its loss uses the tangent of the display curve, which rises
+    faster than the curve, and a blend of log radiance is darker than the blend of radiance.
     """
-    pictures = Pictures(fitted.surface, fitted.received, fitted.photographs)
+    renderer = ViewRenderer(fitted.surface, fitted.received, fitted.images)
     moved = float(fitted.surface is not fitted.first)
-    few = len(used) < FEW
-    for paint, light in ORDER:
-        if few and (paint > 0.5 or (held and light > 0.5)):
+    few = len(used) < MIN_VIEWS_FULL_WEIGHT
+    for material, light in CANDIDATES:
+        if few and (material > 0.5 or (held and light > 0.5)):
             continue
-        asset = fitted.mixed(paint, light)
-        lit = pictures.lit(asset)
-        strength = pictures.strength(lit, used) if light else 1.0
-        errors = pictures.errors(lit, strength)
-        slack = (SLACK, SLACK, SLACK) if paint or light else ALONE
-        asked = zip((used, held, [*used, *held]), slack, strict=True)
-        if all(decibels(errors[which]) >= decibels(before[which]) - most for which, most in asked if which):
-            asset = replace(asset, environment=Environment(strength * asset.light.radiance))
-            return asset, Parts(moved, paint, light), errors
-    return fitted.first, NOTHING, before
+        asset = fitted.blended(material, light)
+        lit = renderer.lit(asset)
+        light_scale = renderer.light_scale(lit, used) if light else 1.0
+        errors = renderer.errors(lit, light_scale)
+        tolerances = (PSNR_TOLERANCE_DB,) * 3 if material or light else SURFACE_TOLERANCES_DB
+        checks = zip((used, held, [*used, *held]), tolerances, strict=True)
+        if all(mean_psnr(errors[v]) >= mean_psnr(before[v]) - tolerance for v, tolerance in checks if v):
+            asset = replace(asset, environment=Environment(light_scale * asset.light.radiance))
+            return asset, Parts(moved, material, light), errors
+    return fitted.first, UNCHANGED, before

@@ -1,4 +1,4 @@
-"""The end of a surface: the grid's ripple and the hull's shallow ridges go, edges stay."""
+"""Feature-preserving denoising of an extracted surface: flattens grid artifacts and shallow ridges, keeps edges."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from reli3d.fit.unknowns import unit
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.topology import face_neighbours
 
-SAME_FACET = 0.2  # distance of unit normals, 11 degrees: faces that differ by much more lie on two sides of an edge
-ROUNDS = 10  # of the filter of the normals: reaches as many faces far
-MOVES = 20  # of the vertices towards their faces' planes
+NORMAL_SIGMA = 0.2  # standard deviation of the range kernel: distance of unit normals, 11 degrees
+NORMAL_ITERATIONS = 10  # of the filter of the normals; its support in faces
+VERTEX_ITERATIONS = 20  # that move the vertices towards their faces' planes
 
 
-def neighbours(faces: Tensor) -> Tensor:
+def neighbor_faces(faces: Tensor) -> Tensor:
     """``(F, 3)`` int64: the face across each edge ``(0, 1), (1, 2), (2, 0)`` of ``faces (F, 3)``, the face itself where
     there is not exactly one."""
     across = torch.from_numpy(face_neighbours(faces.cpu().numpy())).to(faces.device).long()
@@ -23,29 +23,31 @@ def neighbours(faces: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def flattened(mesh: Mesh, *, rounds: int = ROUNDS, moves: int = MOVES) -> Mesh:
-    """``mesh`` with its faces turned towards the mean normal of the facet that they lie on; positions and faces.
+def flattened(
+    mesh: Mesh, *, normal_iterations: int = NORMAL_ITERATIONS, vertex_iterations: int = VERTEX_ITERATIONS
+) -> Mesh:
+    """``mesh`` denoised by bilateral filtering of its face normals; vertices and faces only.
 
-    A bilateral filter of the faces' normals, weighed by area and by how near two normals are (Zheng, Fu, Au and Tai
-    2011, Bilateral normal filtering for mesh denoising), then vertices moved until their faces have these normals (Sun,
-    Rosin, Martin and Langbein 2007, Fast and effective feature-preserving mesh denoising, section 4).  Unlike smoothing
-    of positions it leaves edges sharp and thin parts as thick as they were.
+    The normals are averaged over neighbours with weights of area and of the distance of normals (Zheng, Fu, Au and Tai
+    2011, Bilateral normal filtering for mesh denoising); then the vertices are moved to match the filtered normals
+    (Sun, Rosin, Martin and Langbein 2007, Fast and effective feature-preserving mesh denoising, section 4).  Unlike
+    smoothing of positions this keeps sharp edges and the thickness of thin parts.
     """
-    vertices, corners, across = mesh.vertices.detach(), mesh.faces.long(), neighbours(mesh.faces)
+    vertices, corners, across = mesh.vertices.detach(), mesh.faces.long(), neighbor_faces(mesh.faces)
     a, b, c = (vertices.index_select(0, k) for k in corners.unbind(1))
     doubled = torch.linalg.cross(b - a, c - a)
     area = doubled.norm(dim=1, keepdim=True)
     normal = doubled / area.clamp(min=1e-20)
-    for _ in range(rounds):
+    for _ in range(normal_iterations):
         total = area * normal
         for side in across.unbind(1):
-            beside = normal.index_select(0, side)
-            near = torch.exp(-(beside - normal).square().sum(1, keepdim=True) / (2.0 * SAME_FACET**2))
-            total = total + area.index_select(0, side) * near * beside
+            other = normal.index_select(0, side)
+            near = torch.exp(-(other - normal).square().sum(1, keepdim=True) / (2.0 * NORMAL_SIGMA**2))
+            total = total + area.index_select(0, side) * near * other
         normal = unit(total)
     count = vertices.new_zeros(len(vertices), 1)
     count.index_add_(0, corners.reshape(-1), count.new_ones(corners.numel(), 1))
-    for _ in range(moves):
+    for _ in range(vertex_iterations):
         ends = [vertices.index_select(0, k) for k in corners.unbind(1)]
         middle, step = sum(ends) / 3.0, torch.zeros_like(vertices)
         for k, end in zip(corners.unbind(1), ends, strict=True):

@@ -1,4 +1,4 @@
-"""Values on grids, coarse to fine: what a fit changes, and how coarse parts go before fine ones."""
+"""Multiresolution fields: sums of grids or lat-long maps, smoothing of gradients, and the optimizer of the surface."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from reli3d.geometry.grid import sample_grid
 
 
 def space_field(grids: Sequence[Tensor], points: Tensor) -> Tensor:
-    """Sum ``(N, C)`` at ``points (N, 3)`` of grids ``(n, n, n, C)`` over [-1, 1]^3 of rising resolution.
+    """Sum ``(N, C)`` at ``points (N, 3)`` of trilinear grids ``(n, n, n, C)`` over [-1, 1]^3 of rising resolution.
 
-    Coarse grids carry what is smooth, so that a step moves whole regions; fine ones only what those cannot.
+    An optimizer step on a coarse grid changes whole regions, so the coarse grids converge to the low frequencies.
     """
     return torch.stack([sample_grid(grid.contiguous(), points) for grid in grids]).sum(0)
 

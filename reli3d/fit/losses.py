@@ -1,4 +1,4 @@
-"""What a fit makes small: one function a term with its reason, and all weights in :class:`Weights`."""
+"""Terms of the loss of a fit, one function each, and their weights, :class:`Weights`."""
 
 from __future__ import annotations
 
@@ -12,158 +12,158 @@ from reli3d.fit.fields import light_field
 from reli3d.fit.unknowns import LIGHT_ROWS, Unknowns
 from reli3d.geometry.grid import squared_laplacian
 
-DARK = 0.02  # linear; below it errors count as at it: there photographs hold noise and eyes see little
-ROBUST = 0.25  # of the display range; an error beyond it counts linearly: mirrored surroundings, glare, wrong masks
-SAME = 0.1  # of the display range; colours of one point that differ by more are another surface or a highlight
-REPAINT = 0.25  # of the logits of base colour: a point that changes by more had the wrong paint at the start
-PALETTE = 0.5  # of the logarithm of base colour: beyond it two points are of two paints rather than of two shades
-TINT = 0.25  # of the logarithm of colour without brightness: what the light's own colours do to one paint
+MIN_LINEAR = 0.02  # linear radiance below which the display's derivative is constant: there images contain mostly noise
+HUBER_DELTA = 0.25  # display values; larger residuals count linearly: reflected surroundings, glare, wrong masks
+AGREEMENT_SIGMA = 0.1  # display values; larger differences at one point come from other surfaces or highlights
+BASE_COLOR_SCALE = 0.25  # logits; a larger change of base colour corrects a wrong start, a smaller one may be shading
+PALETTE_SCALE = 0.5  # log base colour; points that differ by more have different materials, not different shading
+CHROMATICITY_SIGMA = 0.25  # log colour without brightness: variation that coloured light causes on one material
 
 
 @dataclass(frozen=True)
 class Weights:
-    """Weights of all terms; lengths in cells of the grid, colours in the display's range."""
+    """Weights of all terms; lengths in cells of the grid, colours in display values."""
 
     outline: float = 30.0  # of :func:`outline`
     agreement: float = 0.3  # of :func:`agreement`
-    shading: float = 30.0  # of :func:`display_error` while the surface moves
+    shading: float = 30.0  # of :func:`display_error` while the surface is fitted
     curvature: float = 0.5  # of :func:`curvature`
-    stay: float = 2e-3  # of the level's distance from the start, over the number of views
-    picture: float = 1.0  # of :func:`display_error` in the fit of the maps and the light
+    sdf_change: float = 2e-3  # of the squared change of the signed distance, over the number of views
+    image: float = 1.0  # of :func:`display_error` in the fit of the maps and the light
     palette: float = 0.01  # of :func:`palette`
     hue: float = 0.1  # of :func:`hue_drift`
     base_coarse: float = 0.02  # prior of the base colour's coarse field towards the start, over the number of views
-    paint: float = 20.0  # of :func:`near_paint`, over the fourth power of the number of views whose colours are used
+    base_color: float = 20.0  # of :func:`near_base_color`, over the 4th power of the number of views with used colours
     finish: float = 0.05  # prior of roughness and metallic towards the start, over the number of views
     light: float = 2e-3  # prior of the light's maps towards the start
-    light_slope: float = 2e-3  # of :func:`slopes` of the light
-    exposure: float = 0.1  # of exposures, whose mean the light already has
+    light_variation: float = 2e-3  # of :func:`total_variation` of the light
+    exposure: float = 0.1  # of squared log exposures; their mean is ambiguous with the light's scale
     demodulation: float = 0.3  # of :func:`shared_pattern`
-    free_bend: float = 2e-3  # of the squared bend of the normals while the paint is fitted, times the number of views
-    bend: float = 20.0  # the same afterwards, of the bend that is kept, over the square of the number of views
+    free_bend: float = 2e-3  # of the squared bend of the normals while the material is fitted, times the views
+    bend: float = 20.0  # of the squared bend of the normals that is kept, over the square of the number of views
 
 
-def display_slope(target: Tensor) -> Tensor:
-    """Slope of the display's curve at linear ``target``, about x^(1/2.2), level below ``DARK``."""
-    return (1.0 / 2.2) * target.clamp(min=DARK) ** (1.0 / 2.2 - 1.0)
+def display_derivative(target: Tensor) -> Tensor:
+    """Derivative of the display curve x^(1/2.2) at linear ``target``, constant below ``MIN_LINEAR``."""
+    return (1.0 / 2.2) * target.clamp(min=MIN_LINEAR) ** (1.0 / 2.2 - 1.0)
 
 
 def display_error(image: Tensor, other: Tensor, target: Tensor, bright: Tensor) -> Tensor:
-    """Mean squared error of ``image (N, 3)`` in the display's range, as a value whose gradient has no bias.
+    """Huber loss of ``image (N, 3)`` in display values, mean over all; unbiased value and gradient of noisy images.
 
-    image, other: two independent estimates of the same linear radiance.  d (I - T)^2 = 2 (I - T) dI: one estimate
-    tells the difference, the other the slope, so the noise does not multiply with itself as in a square.  The display's
-    curve is replaced by its tangent at the photograph, because a curve of a noisy value has another mean than the
-    curve of the mean.  Beyond ``ROBUST`` the error grows linearly.  bright: ``(N, 3)`` bool, photographs at the upper
-    end of their range, where only what is too dark is an error.
+    image, other: two independent estimates of the same linear radiance.  The gradient of (I - T)^2 is 2 (I - T) dI: one
+    estimate gives the residual I - T, the other dI, so that their noise is uncorrelated.  The display curve is replaced
+    by its tangent at ``target``, because a nonlinear function of a noisy value is biased.  Residuals above
+    ``HUBER_DELTA`` count linearly.
+
+    target: ``(N, 3)`` linear radiance of the input images.  bright: ``(N, 3)`` bool, saturated values of ``target``,
+    where only a negative residual counts.
     """
-    slope = display_slope(target)
-    miss = ((other - target) * slope).detach()
-    miss = torch.where(bright, miss.clamp(max=0.0), miss)
-    whole, miss = miss, miss * (ROBUST / miss.abs().clamp(min=ROBUST))
-    apart = (image.detach() - target) * slope
-    value = miss * torch.where(bright, apart.clamp(max=0.0), apart) + miss * (whole - miss)  # squared, then linear
-    pull = 2.0 * miss * slope * image
-    return (value + pull - pull.detach()).mean()
+    derivative = display_derivative(target)
+    residual = ((other - target) * derivative).detach()
+    residual = torch.where(bright, residual.clamp(max=0.0), residual)
+    full, residual = residual, residual * (HUBER_DELTA / residual.abs().clamp(min=HUBER_DELTA))
+    difference = (image.detach() - target) * derivative
+    difference = torch.where(bright, difference.clamp(max=0.0), difference)
+    value = residual * difference + residual * (full - residual)  # quadratic, then linear
+    surrogate = 2.0 * residual * derivative * image  # has the gradient
+    return (value + surrogate - surrogate.detach()).mean()
 
 
 def agreement(color: Tensor, weight: Tensor) -> Tensor:
-    """How much the views disagree on the colour of a point, mean over points.
+    """Photo-consistency: weighted variance of a point's colour over the views, robust, mean over points.
 
-    color: ``(N, V, 3)`` display values where the point projects.  weight: ``(N, V)``, 0 where it is not seen.  A point
-    on the true surface has one colour in all views that see it, but for highlights; a point beside it has another in
-    each.  Neither light nor material is needed, so this term works before they are fitted.  Points that fewer than two
-    views see do not count.
+    color: ``(N, V, 3)`` display values where the point projects.  weight: ``(N, V)``, 0 where it is occluded.  Apart
+    from highlights, a point on the true surface has the same colour in all views.  The term needs neither light nor
+    material, so it is used before they are fitted.  Points that fewer than two views see do not count.
     """
     total = weight.sum(1)
-    seen = (weight > 0.0).sum(1) >= 2
-    share = weight / total.clamp(min=1e-6)[:, None]
-    mean = (share[..., None] * color).sum(1, keepdim=True)
+    valid = (weight > 0.0).sum(1) >= 2
+    weight = weight / total.clamp(min=1e-6)[:, None]
+    mean = (weight[..., None] * color).sum(1, keepdim=True)
     square = (color - mean).square().sum(-1)
-    apart = SAME * SAME * (1.0 - torch.exp(-square / (2.0 * SAME * SAME)))  # bounded: an outlier pulls no surface
-    return ((share * apart).sum(1) * seen).sum() / seen.sum().clamp(min=1) / (SAME * SAME)
+    variance = AGREEMENT_SIGMA**2
+    robust = variance * (1.0 - torch.exp(-square / (2.0 * variance)))  # bounded: outliers have no gradient
+    return ((weight * robust).sum(1) * valid).sum() / valid.sum().clamp(min=1) / variance
 
 
 def outline(cover: Tensor, mask: Tensor) -> Tensor:
-    """Mean absolute difference of antialiased coverage and mask: what the silhouettes miss and what is too much."""
+    """Mean absolute difference of antialiased coverage and mask."""
     return (cover - mask).abs().mean()
 
 
-def curvature(level: Tensor, cell: float, share: Tensor) -> Tensor:
-    """Squared Laplacian of the level, in cells, summed with the weights ``share``: bumps that no photograph asks for.
+def curvature(sdf: Tensor, cell: float, weight: Tensor) -> Tensor:
+    """Weighted sum of the squared Laplacian of the signed distance, in cells.
 
-    level, share: ``(X, Y, Z)``.  Silhouettes and colours leave the surface free between what they see; a plain grid
-    answers with noise.
+    sdf, weight: ``(X, Y, Z)``.  cell: side of a cell.  The term regularizes the surface where silhouettes and colours
+    do not constrain it.
     """
-    return squared_laplacian(level, share) / (cell * cell)
+    return squared_laplacian(sdf, weight) / (cell * cell)
 
 
-def slopes(values: Tensor) -> Tensor:
-    """Mean absolute difference of neighbours of a map ``(H, W, C)`` that is periodic along W: edges may stay, noise
-    goes."""
+def total_variation(values: Tensor) -> Tensor:
+    """Total variation: mean absolute difference of neighbours of a map ``(H, W, C)`` that is periodic along W."""
     return values.diff(dim=0).abs().mean() + (values - values.roll(1, 1)).abs().mean()
 
 
 def near_start(grids: Sequence[Tensor]) -> Tensor:
-    """Sum over grids of the mean squared change: parameters without data stay at the start."""
+    """Sum over grids of the mean squared change; keeps parameters without data at the start."""
     return torch.stack([grid.square().mean() for grid in grids]).sum()
 
 
-def near_paint(change: Tensor, weights: Weights, views: int) -> Tensor:
-    """A bounded distance of the paint from the start: ``change (N, 3)`` of the logits of base colour at points, mean.
+def near_base_color(change: Tensor, weights: Weights, views: int) -> Tensor:
+    """Robust prior of the base colour towards the start, mean over points; change: ``(N, 3)``, of its logits.
 
-    With few views the normals are far off and the light is hardly told.  What these two leave unexplained is shading,
-    and it would be painted on: a small change of most points.  Where the start has the wrong paint the change is large;
-    beyond ``REPAINT`` the gradient fades.  The fourth power of the number of views makes the weight 0.25 with 3 of
-    them, where five meshes lose at most 0.2 dB of base colour, and 5e-4 with 14.
+    Few views constrain normals and light poorly, and the residual shading would be baked into the base colour as a
+    small change of most points.  A wrong base colour of the start needs a large change; above ``BASE_COLOR_SCALE`` the
+    gradient decreases.  The weight is divided by ``views**4``: 0.25 at 3 views and 5e-4 at 14.
     """
     square = change.square().mean(1)
-    return weights.paint / views**4 * (square / (1.0 + square / (REPAINT * REPAINT))).mean()
+    return weights.base_color / views**4 * (square / (1.0 + square / (BASE_COLOR_SCALE * BASE_COLOR_SCALE))).mean()
 
 
 def palette(color: Tensor, tint: Tensor) -> Tensor:
-    """How many base colours an object has: mean over random pairs of points of a bounded distance of their colours.
+    """Sparsity of base colours: mean over random pairs of points of a robust distance of their colours.
 
     color: ``(N, 3)`` logarithms of base colour at points in random order, each paired with the next.  tint: ``(N, 3)``
-    photographed colour, any brightness; pairs of another tint count less.  Shading makes shades of one colour, which
-    this draws together so that the light has to explain them; pairs that differ by much more than ``PALETTE`` have
+    linear colour in the input images, of any scale; pairs of different chromaticity count less.  Variation within one
+    material is reduced, so that the light explains it; pairs that differ by much more than ``PALETTE_SCALE`` have
     almost no gradient (the global sparsity of reflectances of Barron and Malik 2015, Shape, Illumination, and
     Reflectance from Shading, section 4.1.2, on pairs).
     """
-    logs = tint.clamp(min=DARK).log()
+    logs = tint.clamp(min=MIN_LINEAR).log()
     logs = logs - logs.mean(1, keepdim=True)
-    alike = torch.exp(-(logs - logs.roll(1, 0)).square().sum(1) / (2.0 * TINT * TINT))
+    similarity = torch.exp(-(logs - logs.roll(1, 0)).square().sum(1) / (2.0 * CHROMATICITY_SIGMA * CHROMATICITY_SIGMA))
     square = (color - color.roll(1, 0)).square().mean(1)
-    return (alike * square / (square + PALETTE * PALETTE)).mean()
+    return (similarity * square / (square + PALETTE_SCALE * PALETTE_SCALE)).mean()
 
 
 def hue_drift(color: Tensor, start: Tensor) -> Tensor:
-    """How far the object's mean hue has moved, squared.
+    """Squared change of the object's mean chromaticity, in log base colour.
 
-    color, start: ``(N, 3)`` logarithms of base colour at the same points.  One factor a channel is free between paint
-    and light: photographs do not tell a red object under white light from a white one under red light, and the other
-    terms pick one.  The start has read many objects and knows better.  The brightness is left free: a start is often
-    too dark or too bright as a whole.
+    color, start: ``(N, 3)`` logarithms of base colour at the same points.  A factor per channel is ambiguous between
+    base colour and light: a red object under white light looks like a white one under red light.  The start, a
+    prediction from learned priors, resolves it.  The brightness is not constrained, as that of a start is often wrong.
     """
     drift = (color - start).mean(0)
     return (drift - drift.mean()).square().mean()
 
 
 def priors(unknowns: Unknowns, weights: Weights, views: int) -> Tensor:
-    """What holds material, light and exposures to the start: less, the more photographs there are."""
+    """Priors of material, light and exposures towards the start; those of the material are divided by ``views``."""
     base, finish = ([grid[..., part] for grid in unknowns.material] for part in (slice(0, 3), slice(3, 5)))
     loss = weights.base_coarse / views * near_start(base) + weights.finish / views * near_start(finish)
     loss = loss + weights.light * near_start(unknowns.light)
-    loss = loss + weights.light_slope * slopes(light_field(unknowns.light, LIGHT_ROWS))
+    loss = loss + weights.light_variation * total_variation(light_field(unknowns.light, LIGHT_ROWS))
     return loss + weights.exposure * unknowns.exposure.square().mean()
 
 
 def shared_pattern(change: Tensor, shading: Tensor) -> Tensor:
     """Squared correlation, over points, of the change of log base colour ``(N,)`` and log shading ``(N,)``.
 
-    Paint has no reason to follow the light.  Where a change of the paint repeats the pattern of the shading, or its
-    negative, the light's error is being written into the paint (after Hasselgren, Hofmann and Munkberg 2022, Shape,
-    Light, and Material Decomposition, section 3: demodulation).
+    Base colour and shading are independent.  A change of the base colour that correlates with the shading, positively
+    or negatively, bakes an error of the light into it (after Hasselgren, Hofmann and Munkberg 2022, Shape, Light, and
+    Material Decomposition, section 3: demodulation).
     """
     a, b = change - change.mean(), (shading - shading.mean()).detach()
     return (a * b).mean().square() / (b.square().mean() + 1e-4)

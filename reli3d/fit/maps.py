@@ -1,4 +1,4 @@
-"""Light and maps of a fixed surface: primary rays are traced once, random pixels are shaded at every step."""
+"""Fits light and material on a fixed surface: primary rays are traced once, random pixels are shaded at every step."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from torch import Tensor
 
 from reli3d._bridge import present
 from reli3d.fit import losses
-from reli3d.fit.bounce import thrown_back
+from reli3d.fit.bounce import reflected
 from reli3d.fit.budget import Budget
-from reli3d.fit.photographs import WHITE, Photographs
+from reli3d.fit.input_images import SATURATED_LINEAR, InputImages
 from reli3d.fit.shading import radiance
 from reli3d.fit.unknowns import (
     Start,
@@ -28,13 +28,13 @@ from reli3d.render.asset import Asset
 from reli3d.render.gbuffer import primary_hits, sample_texture, surface_points
 from reli3d.render.points import SurfacePoints
 
-BATCH = 6144  # pixels a step
-SAMPLES = ((6, 6, 2), (12, 12, 4))  # of a pixel at the start and the end: coarse steps need no clean images
-PIXELS = 400_000  # of all photographs that are kept: 46 MB; of more, a random part
-RATES = {"material": 0.04, "detail": 0.03, "bend": 0.02, "light": 0.04, "exposure": 0.01}
-OPENING = 0.1  # share of the part after which the next finer map or grid joins in
-DETAIL_FROM = 0.35
-PAINT_UNTIL = 0.7  # of the part that fits the paint; after it the paint stays, and the bend starts anew, held more
+PIXELS_PER_STEP = 6144
+SHADING_SAMPLES = ((6, 6, 2), (12, 12, 4))  # of light, BSDF and cosine, in the first and the second half of a stage
+MAX_PIXELS = 400_000  # of all images: 46 MB; of more, a random subset
+LEARNING_RATES = {"material": 0.04, "detail": 0.03, "bend": 0.02, "light": 0.04, "exposure": 0.01}
+GRID_INTERVAL = 0.1  # of a stage's progress, after which the next finer map or grid is optimized as well
+DETAIL_FROM = 0.35  # progress from which the texture detail is optimized
+MATERIAL_UNTIL = 0.7  # progress at which the material is frozen, and the bend is reset and fitted with a stronger prior
 
 
 @dataclass(frozen=True)
@@ -42,13 +42,13 @@ class MapsStage:
     """A part of a fit on a fixed surface."""
 
     name: str
-    until: float  # share of the budget used at its end
-    paint: bool = True  # fit the textures and the bend of the normals, too
+    until: float  # fraction of the budget used at its end
+    detail: bool = True  # fit the texture detail and the bend of the normals as well
 
 
 @dataclass(frozen=True)
 class Pixels:
-    """Pixels that show the object, and what their rays hit; N rows."""
+    """Pixels inside the object's masks and the surface points that they show; N rows."""
 
     view: Tensor
     position: Tensor
@@ -59,17 +59,18 @@ class Pixels:
     logits: Tensor  # of the start's material
     target: Tensor  # (N, 3) linear
     received: Tensor  # (N, 3) of :func:`~reli3d.fit.bounce.gathered`
-    order: Tensor  # random, so that a run of it is a fair sample
+    order: Tensor  # random permutation; consecutive entries are a uniform sample
 
 
 @torch.no_grad()
-def traced(
-    asset: Asset, received: Tensor, scene: RayScene, photographs: Photographs, views: list[int], seed: int
-) -> Pixels:
-    """The pixels of ``views`` well inside the masks at which ``asset``, whose vertices receive ``received``, is hit."""
-    inside, mesh, parts = photographs.inside(), asset.mesh, []
+def traced(asset: Asset, received: Tensor, scene: RayScene, images: InputImages, views: list[int], seed: int) -> Pixels:
+    """The pixels of ``views`` that lie inside the masks by a pixel and whose rays hit ``asset``.
+
+    received: ``(vertices, 3)``, of :func:`~reli3d.fit.bounce.gathered`.  seed: of the order.
+    """
+    inside, mesh, parts = images.inside(), asset.mesh, []
     for view in views:
-        hits, _, directions = primary_hits(scene, photographs.camera[view])
+        hits, _, directions = primary_hits(scene, images.camera[view])
         both = inside[view] & (hits.face >= 0)
         face, bary = hits.face[both], hits.bary[both]
         at = surface_points(mesh, asset.textures, face, bary)
@@ -84,18 +85,18 @@ def traced(
                 -directions[both],
                 uv,
                 material_logits(at),
-                photographs.color[view][both],
+                images.color[view][both],
                 interpolate(received, mesh.faces, face, bary),
             )
         )
     columns = [torch.cat(column) for column in zip(*parts)]
     rng = torch.Generator().manual_seed(seed)
     order = torch.randperm(len(columns[0]), generator=rng, dtype=torch.int64, device="cpu").to(columns[0].device)
-    if len(order) > PIXELS:
-        order = order[:PIXELS]
+    if len(order) > MAX_PIXELS:
+        order = order[:MAX_PIXELS]
         columns, order = (
             [column[order] for column in columns],
-            torch.arange(PIXELS, device=order.device, dtype=torch.int64),
+            torch.arange(MAX_PIXELS, device=order.device, dtype=torch.int64),
         )
     which, position, normal, ng, wo, uv, logits, target, received = columns
     return Pixels(which, position, normal, ng, wo, uv, logits, target, received, order)
@@ -122,17 +123,19 @@ def maps_loss(
     normal, turned = bent(unknowns, position, pixels.normal[rows])
     points = SurfacePoints(position, pixels.ng[rows], normal, *material_of(pixels.logits[rows] + change))
     light, exposure = environment(unknowns, start), unknowns.exposure.exp()[view, None]
-    bounced = thrown_back(points, pixels.received[rows])
+    bounced = reflected(points, pixels.received[rows])
     image = (bounced + radiance(points, pixels.wo[rows], light, samples=samples, scene=scene, seed=2 * seed)) * exposure
     other = image
     if independent:
         with torch.no_grad():
             other = radiance(points, pixels.wo[rows], light, samples=samples, scene=scene, seed=2 * seed + 1)
             other = (bounced + other) * exposure
-    loss = weights.picture * losses.display_error(image, other, target, target > WHITE)
-    color, was = (c.clamp(min=losses.DARK).log() for c in (points.base_color, material_of(pixels.logits[rows])[0]))
+    loss = weights.image * losses.display_error(image, other, target, target > SATURATED_LINEAR)
+    color, was = (
+        c.clamp(min=losses.MIN_LINEAR).log() for c in (points.base_color, material_of(pixels.logits[rows])[0])
+    )
     loss = loss + weights.palette * losses.palette(color, target) + weights.hue * losses.hue_drift(color, was)
-    loss = loss + losses.priors(unknowns, weights, views) + losses.near_paint(change[:, :3], weights, views)
+    loss = loss + losses.priors(unknowns, weights, views) + losses.near_base_color(change[:, :3], weights, views)
     loss = loss + weights.bend * turned.square().sum(1).mean()
     if weights.demodulation:
         bright = other.detach().mean(1) / points.base_color.detach().mean(1).clamp(min=0.02)
@@ -142,8 +145,9 @@ def maps_loss(
 
 
 def fading(progress: float, settled: bool) -> float:
-    """Share of the full rate: it falls from 0.6 of a part on, and once more from 1 after the paint."""
-    since = (progress - PAINT_UNTIL) / (1.0 - PAINT_UNTIL) if settled else (progress - 0.6) / 0.4
+    """Factor of the learning rate: falls linearly from 1 to 0.1 after progress 0.6, or, once the material is frozen
+    (``settled``), after ``MATERIAL_UNTIL``."""
+    since = (progress - MATERIAL_UNTIL) / (1.0 - MATERIAL_UNTIL) if settled else (progress - 0.6) / 0.4
     return 1.0 - 0.9 * min(max(since, 0.0), 1.0)
 
 
@@ -152,7 +156,7 @@ def fit_maps(
     start: Start,
     asset: Asset,
     received: Tensor,
-    photographs: Photographs,
+    images: InputImages,
     views: list[int],
     weights: losses.Weights,
     budget: Budget,
@@ -160,43 +164,44 @@ def fit_maps(
     *,
     seed: int,
 ) -> None:
-    """Fit light, exposures and materials on the surface of ``asset``, coarse parts first.
+    """Fit light, exposures and material on the surface of ``asset``, coarse to fine.
 
-    received: ``(V, 3)``, of :func:`~reli3d.fit.bounce.gathered` at its vertices.
+    received: ``(vertices, 3)``, of :func:`~reli3d.fit.bounce.gathered`.
 
-    Errors of normals, shadows and bounced light look like paint.  While the paint is fitted the shading normals may
-    bend almost freely and take these errors.  Then the paint stays, and the bend begins again at zero, held so that it
-    takes only what many pixels ask for: this one is written into the asset.
+    Errors of normals, shadows and interreflection would be baked into the base colour.  While the material is fitted,
+    a weakly regularized bend of the shading normals absorbs them.  Then the material is frozen and the bend is reset
+    and fitted again with a stronger prior; only this bend is kept.
     """
     scene = RayScene(asset.mesh.vertices, asset.mesh.faces)
-    pixels = traced(asset, received, scene, photographs, views, seed)
+    pixels = traced(asset, received, scene, images, views, seed)
     count = len(pixels.order)
     if count == 0:
         return
-    names = ("light", "exposure", "material", *(("detail", "bend") if stage.paint else ()))
+    names = ("light", "exposure", "material", *(("detail", "bend") if stage.detail else ()))
     groups, opens = [], []
     for which in names:
         for k, value in enumerate(unknowns.groups()[which]):
-            groups.append({"params": [value], "lr": 0.0, "full": RATES[which]})
-            opens.append(DETAIL_FROM if which == "detail" else OPENING * k)
+            groups.append({"params": [value], "lr": 0.0, "full": LEARNING_RATES[which]})
+            opens.append(DETAIL_FROM if which == "detail" else GRID_INTERVAL * k)
             value.requires_grad_(True)
     optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99))
     first, settled = 0, False
     free, kept = weights.free_bend * len(views), weights.bend / len(views) ** 2
     for step, progress in budget.part(stage.name, stage.until):
-        if stage.paint and progress >= PAINT_UNTIL and not settled:
+        if stage.detail and progress >= MATERIAL_UNTIL and not settled:
             settled = True
             for value in (*unknowns.material, unknowns.detail):
                 value.requires_grad_(False)
-            unknowns.straighten()
+            unknowns.reset_bend()
         fade = fading(progress, settled)
         for group, opening in zip(optimizer.param_groups, opens, strict=True):
             group["lr"] = group["full"] * fade if progress >= opening else 0.0
         rows = pixels.order[
-            torch.arange(first, first + min(BATCH, count), device=pixels.order.device, dtype=torch.int64) % count
+            torch.arange(first, first + min(PIXELS_PER_STEP, count), device=pixels.order.device, dtype=torch.int64)
+            % count
         ]
-        first = (first + BATCH) % count
-        samples = SAMPLES[0] if progress < 0.5 else SAMPLES[1]
+        first = (first + PIXELS_PER_STEP) % count
+        samples = SHADING_SAMPLES[0] if progress < 0.5 else SHADING_SAMPLES[1]
         loss = maps_loss(
             unknowns,
             start,
@@ -208,11 +213,11 @@ def fit_maps(
             views=len(views),
             seed=seed * 1_000_003 + step,
         )
-        optimizer.zero_grad()  # those without gradient stay as they are
+        optimizer.zero_grad()  # to None: Adam skips frozen tensors
         loss.backward()
         optimizer.step()
-        budget.tell(stage.name, step, float(loss.detach()))
+        budget.record(stage.name, step, float(loss.detach()))
     for group in optimizer.param_groups:
         group["params"][0].requires_grad_(False)
     if not settled:  # interrupted
-        unknowns.straighten()
+        unknowns.reset_bend()

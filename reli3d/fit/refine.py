@@ -1,4 +1,4 @@
-"""From an asset and its photographs to an asset that matches them: the order of a fit, and its safety."""
+"""Refinement of an asset by inverse rendering: fits surface, material and light to posed images."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from reli3d._bridge import full_precision
 from reli3d.fit import losses
 from reli3d.fit.bounce import gathered
 from reli3d.fit.budget import Budget, progress_bar
-from reli3d.fit.choice import NOTHING, Fitted, Parts, chosen, decibels, picture_error
+from reli3d.fit.choice import UNCHANGED, Fitted, Parts, chosen, mean_psnr, view_errors
+from reli3d.fit.input_images import InputImages, PosedImages
 from reli3d.fit.maps import MapsStage, fit_maps
-from reli3d.fit.photographs import Photographs, PosedImages
 from reli3d.fit.shape import ShapeData, finished, fit_shape, start_grid
 from reli3d.fit.transfer import dressed
 from reli3d.fit.unknowns import START_GRID, Start, Unknowns, corrected, filled_grid
@@ -23,21 +23,21 @@ from reli3d.geometry.mesh import watertight
 from reli3d.render.asset import Asset
 
 RESOLUTION = 128  # cells along the longest side
-LIGHT = MapsStage("light", until=0.12, paint=False)  # first the light, then the surface, then all maps
-SHAPE_UNTIL = 0.5  # of the budget
+LIGHT = MapsStage("light", until=0.12, detail=False)  # first the light, then the surface, then all maps
+SHAPE_UNTIL = 0.5  # fraction of the budget
 MAPS = MapsStage("maps", until=1.0)
-TEXELS = 512  # of the base colour's detail, at most
+MAX_DETAIL_TEXELS = 512  # along a side of the base colour's detail map
 
 
 @dataclass(frozen=True)
 class Refinement:
-    """What :func:`refine` gives.
+    """Result of :func:`refine`.
 
-    asset: the refined one, or the start where no mixture of its parts is as good.  parts: what of the fit it has.
-    before, after: mean PSNR [dB] on white of the photographs that were used and of those held out (NaN without any), by
-    pictures with direct light and what the object throws on itself (:func:`~reli3d.fit.bounce.gathered`).
-    held: their indices.  c2w: ``(V, 4, 4)``, the cameras as corrected.  notes: one line each.  curve, steps: what the
-    run did.
+    asset: the refined asset, or the start if no blend of fit and start is at least as good.  parts: the blend weights.
+    before, after: mean PSNR [dB] on white over the input views that were used and over the held-out ones (NaN without
+    any), of renderings with direct light and one-bounce interreflection (:func:`~reli3d.fit.bounce.gathered`).
+    held: indices of the held-out views.  c2w: ``(V, 4, 4)``, the corrected cameras.  notes: one line each.  curve: the
+    losses of the run, as in :class:`~reli3d.fit.budget.Budget`.  steps: steps of each stage.
     """
 
     asset: Asset
@@ -52,11 +52,11 @@ class Refinement:
 
     @property
     def changed(self) -> bool:
-        """False where ``asset`` is the start."""
-        return self.parts != NOTHING
+        """False if ``asset`` is the start."""
+        return self.parts != UNCHANGED
 
     def record(self) -> dict:
-        """What a file may hold of it: plain values, without the asset."""
+        """The result without the asset and the cameras, in plain values for a JSON file."""
         pairs = {
             name: dict(zip(("input", "held_out"), (None if math.isnan(v) else round(v, 3) for v in values)))
             for name, values in (("psnr_before", self.before), ("psnr_after", self.after))
@@ -72,7 +72,7 @@ class Refinement:
 
 
 def held_out(count: int) -> tuple[int, ...]:
-    """Views whose colours no fit may use: none of fewer than three, one of fewer than twelve, else two."""
+    """Indices of the held-out views: none of fewer than three, one of fewer than twelve, else two."""
     return () if count < 3 else (count // 2,) if count < 12 else (count // 3, 2 * count // 3)
 
 
@@ -91,29 +91,30 @@ def refine(
     bar: bool = False,
     interrupt: Callable[[], bool] | None = None,
 ) -> Refinement:
-    """``asset`` fitted to the photographs ``views``, in whose frame it lies.
+    """Fits surface, material and light of ``asset`` to posed images by inverse rendering.
 
-    seconds or steps: one of the two; with ``steps`` the result is the same on every run of one machine.  resolution:
-    cells of the surface's grid along the longest side, more where it is thin (:func:`~reli3d.fit.shape.start_grid`).
-    weights: of the losses.  cameras: correct the cameras as well.  bar: progress on stderr.  interrupt:
-    asked before every step; once it is true the fit ends and the best so far is taken.
+    views: images, masks and cameras in the frame of ``asset``.  seconds, steps: the budget, one of the two; with
+    ``steps`` the result is deterministic on one machine.  resolution: cells of the surface's grid along the longest
+    side, more for thin objects (:func:`~reli3d.fit.shape.start_grid`).  weights: of the loss terms.  cameras: optimize
+    the camera poses as well.  seed: of all random numbers.  bar: show progress on stderr.  interrupt: called before
+    every step; once it returns True the fit ends with the best result so far.
 
-    Of three views or more some are held out: their masks bound the surface, their colours are not used.  What of the
-    fit is taken says :func:`~reli3d.fit.choice.chosen`.  Raises TypeError or ValueError where asset and views do not
-    belong together, and on an asset without light, atlas or faces.
+    With three or more views some are held out (:func:`held_out`): their masks are used, their colours only to select
+    which parts of the fit are kept (:func:`~reli3d.fit.choice.chosen`).  Raises TypeError or ValueError if asset and
+    views have different devices, if shapes do not match, or if the asset lacks an environment, an atlas or faces.
     """
-    photographs, weights = Photographs.of(views), weights or losses.Weights()
-    _check_asset(asset, photographs)
+    images, weights = InputImages.of(views), weights or losses.Weights()
+    _check_asset(asset, images)
     budget = Budget(seconds, steps, interrupt=interrupt)
     if bar:
         budget.bar = progress_bar(seconds or steps or 0, "s" if seconds else "steps")
-    held = held_out(len(photographs))
-    used = [v for v in range(len(photographs)) if v not in held]
+    held = held_out(len(images))
+    used = [v for v in range(len(images)) if v not in held]
     low, high = asset.mesh.vertices.amin(0), asset.mesh.vertices.amax(0)
     shift, scale = (low + high) / 2, 2.0 / float((high - low).max())
-    first, near = _moved(asset, shift, scale), photographs.moved(shift, scale)
+    first, near = _moved(asset, shift, scale), images.moved(shift, scale)
     received = gathered(first.mesh, near.select(used), seed=seed)
-    before = picture_error(first, received, near)
+    before = view_errors(first, received, near)
     notes: list[str] = []
     with torch.random.fork_rng(devices=[]):
         fitted = _fitted(first, received, near, used, resolution, weights, budget, notes, seed=seed, cameras=cameras)
@@ -121,19 +122,19 @@ def refine(
     if budget.bar is not None:
         budget.bar.close()
     if budget.interrupted:
-        notes.append("refinement: interrupted, the best so far is taken")
+        notes.append("refinement: interrupted, the best result so far is kept")
     notes.append(f"refinement: {parts}")
-    was, now = ((decibels(e[used]), decibels(e[list(held)])) for e in (before, after))
-    if parts == NOTHING:
+    was, now = ((mean_psnr(e[used]), mean_psnr(e[list(held)])) for e in (before, after))
+    if parts == UNCHANGED:
         return Refinement(asset, parts, was, now, held, views.c2w, tuple(notes), budget.curve, budget.counts)
-    kept, near = _moved(kept, -scale * shift, 1.0 / scale), fitted.photographs.moved(-scale * shift, 1.0 / scale)
+    kept, near = _moved(kept, -scale * shift, 1.0 / scale), fitted.images.moved(-scale * shift, 1.0 / scale)
     return Refinement(kept, parts, was, now, held, near.camera.c2w, tuple(notes), budget.curve, budget.counts)
 
 
 def _fitted(
     first: Asset,
     received: Tensor,
-    photographs: Photographs,
+    images: InputImages,
     used: list[int],
     resolution: int,
     weights: losses.Weights,
@@ -143,35 +144,35 @@ def _fitted(
     seed: int,
     cameras: bool,
 ) -> Fitted:
-    start, texels = Start.of(first), min(TEXELS, first.textures.size)
+    start, texels = Start.of(first), min(MAX_DETAIL_TEXELS, first.textures.size)
     closed = watertight(first.mesh)
-    level = first.mesh.vertices.new_ones(2, 2, 2)  # stands in where the surface is open and has no level
+    sdf = first.mesh.vertices.new_ones(2, 2, 2)  # unused placeholder: an open surface has no signed distance
     if closed:
-        grid, level, bound = start_grid(first.mesh, photographs, resolution)
-    unknowns = Unknowns.zero(level, len(photographs), texels)
-    fit_maps(unknowns, start, first, received, photographs, used, weights, budget, LIGHT, seed=seed)
+        grid, sdf, bound = start_grid(first.mesh, images, resolution)
+    unknowns = Unknowns.zero(sdf, len(images), texels)
+    fit_maps(unknowns, start, first, received, images, used, weights, budget, LIGHT, seed=seed)
     surface = first
     if closed:
         around = filled_grid(first.mesh.vertices, received, START_GRID)
-        data = ShapeData.of(start, level, bound, grid, around, photographs, used)
+        data = ShapeData.of(start, sdf, bound, grid, around, images, used)
         fit_shape(unknowns, data, weights, budget, SHAPE_UNTIL, seed=seed, cameras=cameras)
-        mesh = finished(unknowns.level, bound, grid)
+        mesh = finished(unknowns.sdf, bound, grid)
         surface = dressed(mesh, first, first.textures.size)
-        photographs = replace(photographs, camera=corrected(photographs.camera, unknowns.pose))
-        received = gathered(surface.mesh, photographs.select(used), seed=seed)
+        images = replace(images, camera=corrected(images.camera, unknowns.pose))
+        received = gathered(surface.mesh, images.select(used), seed=seed)
     else:
-        notes.append("refinement: the surface is not closed, so only its maps and light are fitted")
-    fit_maps(unknowns, start, surface, received, photographs, used, weights, budget, MAPS, seed=seed)
-    return Fitted(first, surface, received, start, unknowns, photographs)
+        notes.append("refinement: the surface is not closed, so only maps and light are fitted")
+    fit_maps(unknowns, start, surface, received, images, used, weights, budget, MAPS, seed=seed)
+    return Fitted(first, surface, received, start, unknowns, images)
 
 
-def _check_asset(asset: Asset, photographs: Photographs) -> None:
+def _check_asset(asset: Asset, images: InputImages) -> None:
     if asset.environment is None:
         raise ValueError("asset.environment: expected a light to start from, got None")
     if asset.mesh.uv is None or asset.mesh.normals is None or asset.mesh.tangents is None or not len(asset.mesh.faces):
         raise ValueError("asset.mesh: expected faces with normals, uv and tangents, got none")
-    if asset.mesh.vertices.device != photographs.color.device:
-        raise ValueError(f"views: expected device {asset.mesh.vertices.device}, got {photographs.color.device}")
+    if asset.mesh.vertices.device != images.color.device:
+        raise ValueError(f"views: expected device {asset.mesh.vertices.device}, got {images.color.device}")
 
 
 def _moved(asset: Asset, shift: Tensor, scale: float) -> Asset:

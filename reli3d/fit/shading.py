@@ -1,4 +1,4 @@
-"""The one place where a fit asks the renderer for radiance."""
+"""Direct lighting with the BRDF of a fit."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from reli3d.render.environment import Environment
 from reli3d.render.points import SurfacePoints
 from reli3d.render.shading import ShadeOptions, shade
 
-DIFFUSE_MODEL = "published"  # glTF's own formula: what viewers show, and what the shipped weights learned from
+DIFFUSE_MODEL = "published"  # glTF's formula: that of viewers and of the shipped weights' training data
 
 
 def radiance(
@@ -21,6 +21,7 @@ def radiance(
     scene: RayScene | None,
     seed: int,
 ) -> Tensor:
-    """Radiance ``(N, 3)`` that leaves ``points`` towards ``wo``: direct light with shadows, linear."""
+    """Linear radiance ``(N, 3)`` from ``points`` towards ``wo (N, 3)``: direct light, with shadows if ``scene`` is
+    given."""
     options = ShadeOptions(samples=samples, seed=seed, diffuse_model=DIFFUSE_MODEL)
     return shade(points, wo, light, scene=scene, options=options)

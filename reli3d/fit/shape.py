@@ -1,4 +1,4 @@
-"""The surface: levels on a grid, extracted at every step, held by silhouettes, agreement of the views and shading."""
+"""Fits the surface: a signed distance grid, extracted at every step, by silhouettes, photo-consistency and shading."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from torch import Tensor
 from torch.nn.functional import interpolate, max_pool3d
 
 from reli3d.fit import losses
-from reli3d.fit.bounce import thrown_back
+from reli3d.fit.bounce import reflected
 from reli3d.fit.budget import Budget
 from reli3d.fit.facets import flattened
 from reli3d.fit.fields import EvenAdam, blurred_grid
-from reli3d.fit.photographs import WHITE, Photographs
-from reli3d.fit.seen import COVERED, display_planes, seen_colors, sight
+from reli3d.fit.input_images import SATURATED_LINEAR, InputImages
 from reli3d.fit.shading import radiance
 from reli3d.fit.unknowns import Start, Unknowns, corrected, environment, material_change, material_of, unit
+from reli3d.fit.view_colors import MIN_COVERAGE, display_planes, view_colors, view_weights
 from reli3d.geometry.distance import signed_distance
 from reli3d.geometry.grid import sample_grid
 from reli3d.geometry.hull import hull_distance, mask_distance
@@ -29,36 +29,36 @@ from reli3d.render.gbuffer import primary_hits
 from reli3d.render.points import SurfacePoints
 from reli3d.render.silhouette import antialias, mesh_edges
 
-MARGIN = 3  # cells around the object
-BAND = 4.0  # cells from the surface within which the level's distance is exact at the start
-THICK = 3.0  # cells of depth that a thick part has: the level's ridge then lies outside the band, or nearly
-THIN = 0.02  # share of the curvature's weight in thin parts: a sheet of three cells keeps two thirds of its depth
-MUCH = 0.2  # share of thin points from which the grid gets finer: chairs, blades and sails have 0.3 to 1, others 0.1
-FINER = 2.0  # times as many cells a side, at most
-LARGEST = 4_500_000  # points of a finer grid, about: a step then takes twice the time of one on the usual grid
-COARSE = 4  # cells of the grid along a cell of the one that is asked first
-POINTS, SHADED = 8192, 3072  # on the surface, a step, whose colours are compared, and that are shaded
-OUTLINES, OUTLINE_PIXELS = 2, 160  # views a step whose outlines are compared, and their size
-SAMPLES = (8, 8, 2)
-RATE = (0.6, 0.08)  # largest move of the surface in a step, in cells, at the start and the end
-BLUR = (8, 2)  # cells over which a move is spread, at the start and the end
-DETAIL = (0.25, 1.0)  # of the photographs' size, in which colours are compared at the start and the end
-SMALLEST_PART = 0.01  # share of the faces below which a separate piece is dropped
+MARGIN_CELLS = 3  # around the object
+BAND_CELLS = 4.0  # from the surface, within which the signed distance is exact at the start
+CORE_DEPTH_CELLS = 3.0  # depth from which a point is the core of a thick part: its medial axis lies beyond the band
+THIN_WEIGHT = 0.02  # of the curvature in thin parts: a sheet of three cells keeps 2/3 of its depth
+MIN_THIN_FRACTION = 0.2  # of band points, from which the grid is refined: chairs, blades and sails have 0.3 to 1
+MAX_REFINEMENT = 2.0  # factor of the cells along a side
+MAX_GRID_POINTS = 4_500_000  # of a refined grid, about: a step takes about 2 times as long as on the usual grid
+COARSE_RATIO = 4  # cells along a cell of the grid on which distances are computed first
+CONSISTENCY_POINTS, SHADED_POINTS = 8192, 3072  # surface points a step, for photo-consistency and for shading
+OUTLINE_VIEWS, OUTLINE_PIXELS = 2, 160  # views a step whose silhouettes are compared, and their size
+SHADING_SAMPLES = (8, 8, 2)  # of light, BSDF and cosine
+STEP_CELLS = (0.6, 0.08)  # largest change of the signed distance in a step, at the start and the end
+BLUR_CELLS = (8, 2)  # width of the filter of the gradient, at the start and the end
+IMAGE_SCALES = (0.25, 1.0)  # of the images in which colours are compared, at the start and the end
+MIN_PART_FRACTION = 0.01  # of the faces; smaller components are removed
 
 
 @dataclass(frozen=True)
 class Grid:
-    """A grid of ``shape`` points, ``cell`` apart, whose centre is 0."""
+    """A grid of ``shape`` points with spacing ``cell``, centred at the origin."""
 
     shape: tuple[int, int, int]
     cell: float
 
     @classmethod
     def around(cls, vertices: Tensor, resolution: int) -> Grid:
-        """About ``resolution`` cells along the longest side of what ``vertices`` span around 0."""
+        """About ``resolution`` cells along the longest side of the origin-centred bounding box of ``vertices``."""
         reach = vertices.abs().amax(0)
         cell = 2.0 * float(reach.max()) / resolution
-        return cls(tuple(2 * (math.ceil(r / cell) + MARGIN) + 1 for r in reach.tolist()), cell)
+        return cls(tuple(2 * (math.ceil(r / cell) + MARGIN_CELLS) + 1 for r in reach.tolist()), cell)
 
     @property
     def radius(self) -> tuple[float, ...]:
@@ -72,86 +72,88 @@ class Grid:
 
 
 @torch.no_grad()
-def start_level(mesh: Mesh, grid: Grid) -> Tensor:
-    """Signed distance of a closed mesh at the points of ``grid``: exact within ``BAND`` cells, blended beyond."""
+def start_sdf(mesh: Mesh, grid: Grid) -> Tensor:
+    """Signed distance of a closed mesh at the points of ``grid``: exact within ``BAND_CELLS``, interpolated beyond."""
     at = grid.points(mesh.vertices.device)
-    few = tuple(max(2, (n - 1) // COARSE + 1) for n in grid.shape)
+    few = tuple(max(2, (n - 1) // COARSE_RATIO + 1) for n in grid.shape)
     axes = [torch.linspace(-r, r, n, device=at.device, dtype=torch.float32) for r, n in zip(grid.radius, few)]
     coarse = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1)
     coarse = signed_distance(mesh.vertices, mesh.faces, coarse.reshape(-1, 3)).reshape(few)
-    level = interpolate(coarse[None, None], grid.shape, mode="trilinear", align_corners=True)[0, 0].contiguous()
-    apart = max(2.0 * r / (n - 1) for r, n in zip(grid.radius, few))
-    near = level.abs() < BAND * grid.cell + apart  # the blend errs by less than half the coarse cell's diagonal
-    level[near] = signed_distance(mesh.vertices, mesh.faces, at[near])
-    return level
+    sdf = interpolate(coarse[None, None], grid.shape, mode="trilinear", align_corners=True)[0, 0].contiguous()
+    spacing = max(2.0 * r / (n - 1) for r, n in zip(grid.radius, few))
+    near = (
+        sdf.abs() < BAND_CELLS * grid.cell + spacing
+    )  # interpolation errors are below half the coarse cell's diagonal
+    sdf[near] = signed_distance(mesh.vertices, mesh.faces, at[near])
+    return sdf
 
 
 @torch.no_grad()
-def bound_level(photographs: Photographs, grid: Grid) -> Tensor:
-    """Level of the visual hull of all masks: no surface lies outside any silhouette."""
-    at = grid.points(photographs.mask.device).reshape(-1, 3)
-    inside = hull_distance(at, mask_distance(photographs.mask), photographs.camera)
+def hull_sdf(images: InputImages, grid: Grid) -> Tensor:
+    """Signed distance of the visual hull of all masks, a lower bound of the surface's."""
+    at = grid.points(images.mask.device).reshape(-1, 3)
+    inside = hull_distance(at, mask_distance(images.mask), images.camera)
     return -inside.reshape(grid.shape)
 
 
 @torch.no_grad()
-def curvature_share(level: Tensor, bound: Tensor, cell: float) -> Tensor:
-    """How much :func:`losses.curvature` counts at each point of the grid, ``(X, Y, Z)``.
+def curvature_weight(sdf: Tensor, bound: Tensor, cell: float) -> Tensor:
+    """Weights ``(X, Y, Z)`` of :func:`losses.curvature` at the points of the grid.
 
-    1 near parts at least ``2 THICK`` cells thick, ``THIN`` near thinner ones, 0 beyond ``BAND`` cells from the surface.
-    The level of a thin part has its ridge next to the surface.  A weaker ridge has less curvature, so the term would
-    remove the part.  Points of depth ``THICK`` are the core of thick parts; what is farther from every core than the
-    band reaches is thin.
+    1 near parts at least ``2 CORE_DEPTH_CELLS`` thick, ``THIN_WEIGHT`` near thinner ones, 0 beyond ``BAND_CELLS`` from
+    the surface.  The signed distance of a thin part has its medial axis, where its curvature is large, inside the band,
+    so with full weight the term would remove the part.  Points deeper than ``CORE_DEPTH_CELLS`` are the core of thick
+    parts; points of the band that no core reaches are thin.
     """
-    core = (torch.maximum(level, bound) < -THICK * cell).to(level)[None, None]
-    reach = round(THICK + BAND) + 1
+    core = (torch.maximum(sdf, bound) < -CORE_DEPTH_CELLS * cell).to(sdf)[None, None]
+    reach = round(CORE_DEPTH_CELLS + BAND_CELLS) + 1
     for axis in range(3):
         size, pad = [1, 1, 1], [0, 0, 0]
         size[axis], pad[axis] = 2 * reach + 1, reach
         core = max_pool3d(core, size, 1, pad)
-    return torch.where(core[0, 0] > 0.0, 1.0, THIN) * (level.abs() < BAND * cell)
+    return torch.where(core[0, 0] > 0.0, 1.0, THIN_WEIGHT) * (sdf.abs() < BAND_CELLS * cell)
 
 
-def start_grid(mesh: Mesh, photographs: Photographs, resolution: int) -> tuple[Grid, Tensor, Tensor]:
-    """The grid of a closed mesh, the level of the mesh on it and that of the masks' hull.
+def start_grid(mesh: Mesh, images: InputImages, resolution: int) -> tuple[Grid, Tensor, Tensor]:
+    """A grid for a closed mesh, with the signed distances of the mesh and of the masks' visual hull.
 
-    About ``resolution`` cells along the longest side, up to ``FINER`` times as many where much of the surface is thin,
-    as far as the grid has about ``LARGEST`` points: a sheet of two cells loses its holes and rims.
+    About ``resolution`` cells along the longest side; up to ``MAX_REFINEMENT`` times as many, within about
+    ``MAX_GRID_POINTS``, if much of the surface is thin: a sheet of two cells loses its holes and rims.
     """
     grid = Grid.around(mesh.vertices, resolution)
-    level, bound = start_level(mesh, grid), bound_level(photographs, grid)
-    share = curvature_share(level, bound, grid.cell)
-    finer = min(FINER, (LARGEST / math.prod(grid.shape)) ** (1.0 / 3.0))
-    if finer <= 1.0 or int((share == THIN).sum()) <= MUCH * int((share > 0.0).sum()):
-        return grid, level, bound
+    sdf, bound = start_sdf(mesh, grid), hull_sdf(images, grid)
+    weight = curvature_weight(sdf, bound, grid.cell)
+    finer = min(MAX_REFINEMENT, (MAX_GRID_POINTS / math.prod(grid.shape)) ** (1.0 / 3.0))
+    if finer <= 1.0 or int((weight == THIN_WEIGHT).sum()) <= MIN_THIN_FRACTION * int((weight > 0.0).sum()):
+        return grid, sdf, bound
     grid = Grid.around(mesh.vertices, round(finer * resolution))
-    return grid, start_level(mesh, grid), bound_level(photographs, grid)
+    return grid, start_sdf(mesh, grid), hull_sdf(images, grid)
 
 
-def extracted(level: Tensor, bound: Tensor, grid: Grid) -> Mesh:
-    """The surface of the level within the bound, with normals."""
-    mesh = extract_surface(torch.maximum(level, bound), radius=grid.radius)
+def extracted(sdf: Tensor, bound: Tensor, grid: Grid) -> Mesh:
+    """The zero set of ``max(sdf, bound)`` as a mesh with normals."""
+    mesh = extract_surface(torch.maximum(sdf, bound), radius=grid.radius)
     return Mesh(mesh.vertices, mesh.faces, vertex_normals(mesh.vertices, mesh.faces))
 
 
-def finished(level: Tensor, bound: Tensor, grid: Grid) -> Mesh:
-    """The surface without small loose pieces and without the grid's own ripple."""
-    mesh = largest_components(extracted(level, bound, grid).detach(), SMALLEST_PART)
+def finished(sdf: Tensor, bound: Tensor, grid: Grid) -> Mesh:
+    """The surface without small components, denoised (:func:`~reli3d.fit.facets.flattened`)."""
+    mesh = largest_components(extracted(sdf, bound, grid).detach(), MIN_PART_FRACTION)
     return flattened(mesh).with_normals()
 
 
 @dataclass(frozen=True)
 class ShapeData:
-    """What does not change while the surface does."""
+    """Constants of the fit of a surface."""
 
     grid: Grid
     bound: Tensor
     near: Tensor  # (N,) grid points within the band around the start's surface
-    first: Tensor  # (N,) their level at the start
-    smooth: Tensor  # of :func:`curvature_share`, divided by N
+    first: Tensor  # (N,) their signed distance at the start
+    smooth: Tensor  # of :func:`curvature_weight`, divided by N
     start: Start
-    received: Tensor  # (n, n, n, 3) of :func:`~reli3d.fit.bounce.gathered` in space, both sides of a thin wall alike
-    photographs: Photographs  # for outlines
+    received: Tensor  # (n, n, n, 3) grid of :func:`~reli3d.fit.bounce.gathered`, equal on both sides of a thin wall
+    images: InputImages  # for silhouettes
     planes: list[Tensor]  # of :func:`display_planes`, small to large
     colored: list[int]  # views whose colours may be used
 
@@ -159,22 +161,24 @@ class ShapeData:
     def of(
         cls,
         start: Start,
-        level: Tensor,
+        sdf: Tensor,
         bound: Tensor,
         grid: Grid,
         received: Tensor,
-        photographs: Photographs,
+        images: InputImages,
         colored: list[int],
     ) -> ShapeData:
-        """Photographs in the sizes that a fit asks for."""
-        sizes = sorted({max(16, round(photographs.size * s)) for s in (DETAIL[0], sum(DETAIL) / 2, DETAIL[1])})
-        used = photographs.select(colored)
+        """Resamples the images to the sizes of the fit and computes the weights of the grid's points."""
+        sizes = sorted(
+            {max(16, round(images.size * s)) for s in (IMAGE_SCALES[0], sum(IMAGE_SCALES) / 2, IMAGE_SCALES[1])}
+        )
+        used = images.select(colored)
         planes = [display_planes(used.resized(size)) for size in sizes]
-        small = photographs.resized(min(OUTLINE_PIXELS, photographs.size))
-        smooth = curvature_share(level, bound, grid.cell)
+        small = images.resized(min(OUTLINE_PIXELS, images.size))
+        smooth = curvature_weight(sdf, bound, grid.cell)
         near = torch.nonzero(smooth.reshape(-1))[:, 0]
         smooth = smooth / len(near)
-        return cls(grid, bound, near, level.reshape(-1)[near], smooth, start, received, small, planes, colored)
+        return cls(grid, bound, near, sdf.reshape(-1)[near], smooth, start, received, small, planes, colored)
 
 
 def shape_loss(
@@ -188,25 +192,25 @@ def shape_loss(
 ) -> Tensor:
     """Loss of one step over the surface, with gradients to every part of ``unknowns`` but the detail.
 
-    progress: in [0, 1], how far the fit is; seed: of the step's points, views and light samples.  independent: two
-    estimates of the shading; False gives the value whose slope the gradient is, for tests.
+    progress: of the fit, in [0, 1].  seed: of the step's points, views and light samples.  independent: use two
+    independent estimates of the shading; with False the gradient is that of the returned value, for tests.
     """
     rng = torch.Generator().manual_seed(seed)
-    mesh = extracted(unknowns.level, data.bound, data.grid)
+    mesh = extracted(unknowns.sdf, data.bound, data.grid)
     scene = RayScene(mesh.vertices, mesh.faces)
-    views, grid = len(data.photographs), data.grid
-    moved = (unknowns.level.reshape(-1).index_select(0, data.near) - data.first) / grid.cell
-    loss = weights.curvature * losses.curvature(unknowns.level, grid.cell, data.smooth)
-    loss = loss + weights.stay / views * moved.square().mean()
+    views, grid = len(data.images), data.grid
+    moved = (unknowns.sdf.reshape(-1).index_select(0, data.near) - data.first) / grid.cell
+    loss = weights.curvature * losses.curvature(unknowns.sdf, grid.cell, data.smooth)
+    loss = loss + weights.sdf_change / views * moved.square().mean()
     loss = loss + weights.outline * _outlines(unknowns, data, mesh, scene, rng)
     loss = loss + _colors(unknowns, data, mesh, scene, weights, progress, rng, seed, independent)
     return loss
 
 
 def _outlines(unknowns: Unknowns, data: ShapeData, mesh: Mesh, scene: RayScene, rng) -> Tensor:
-    edges, small = mesh_edges(mesh.vertices, mesh.faces), data.photographs
+    edges, small = mesh_edges(mesh.vertices, mesh.faces), data.images
     total = small.color.new_zeros(())
-    chosen = torch.randperm(len(small), generator=rng, dtype=torch.int64, device="cpu")[:OUTLINES].tolist()
+    chosen = torch.randperm(len(small), generator=rng, dtype=torch.int64, device="cpu")[:OUTLINE_VIEWS].tolist()
     for view in chosen:
         camera = corrected(small.camera[view], unknowns.pose[view])
         cover = (primary_hits(scene, camera.detach())[0].face >= 0).float()[..., None]
@@ -217,19 +221,19 @@ def _outlines(unknowns: Unknowns, data: ShapeData, mesh: Mesh, scene: RayScene, 
 
 def _colors(unknowns, data, mesh, scene, weights, progress, rng, seed, independent) -> Tensor:
     planes = data.planes[min(int(progress * len(data.planes)), len(data.planes) - 1)]
-    size, photographs = planes.shape[-1], data.photographs.select(data.colored)
-    camera = corrected(photographs.camera.resized(size, size), unknowns.pose[data.colored])
-    pick = torch.randint(len(mesh.vertices), (POINTS,), generator=rng, dtype=torch.int64, device="cpu").to(
+    size, images = planes.shape[-1], data.images.select(data.colored)
+    camera = corrected(images.camera.resized(size, size), unknowns.pose[data.colored])
+    pick = torch.randint(len(mesh.vertices), (CONSISTENCY_POINTS,), generator=rng, dtype=torch.int64, device="cpu").to(
         mesh.vertices.device
     )
     position, normal = (v.index_select(0, pick) for v in (mesh.vertices, mesh.normals))
-    color, cover = seen_colors(planes, position, camera)
-    weight = sight(scene, position, normal, camera) * (cover.detach() > COVERED)
+    color, cover = view_colors(planes, position, camera)
+    weight = view_weights(scene, position, normal, camera) * (cover.detach() > MIN_COVERAGE)
     exposure = unknowns.exposure[data.colored].exp()
     loss = weights.agreement * losses.agreement(color, weight) if len(data.colored) > 1 else color.new_zeros(())
     if weights.shading == 0.0:
         return loss
-    row = torch.nonzero(weight.sum(1) > 0.0)[:SHADED, 0]
+    row = torch.nonzero(weight.sum(1) > 0.0)[:SHADED_POINTS, 0]
     if len(row) == 0:
         return loss
     view = torch.multinomial(weight[row].cpu(), 1, generator=rng)[:, 0].to(row.device)
@@ -240,19 +244,21 @@ def _colors(unknowns, data, mesh, scene, weights, progress, rng, seed, independe
     points = SurfacePoints(position, normal.detach(), normal, *material_of(logits))
     light = environment(unknowns, data.start)
     wo = unit(camera.c2w[view, :3, 3] - position).detach()
-    bounced, exposure = thrown_back(points, sample_grid(data.received, position)), exposure[view, None]
-    image = (bounced + radiance(points, wo, light, samples=SAMPLES, scene=scene, seed=2 * seed)) * exposure
+    bounced, exposure = reflected(points, sample_grid(data.received, position)), exposure[view, None]
+    image = (bounced + radiance(points, wo, light, samples=SHADING_SAMPLES, scene=scene, seed=2 * seed)) * exposure
     other = image
     if independent:
         with torch.no_grad():
-            other = (bounced + radiance(points, wo, light, samples=SAMPLES, scene=scene, seed=2 * seed + 1)) * exposure
-    loss = loss + weights.shading * losses.display_error(image, other, target, target > WHITE)
-    # as strong beside the shading as in the fit of the maps
+            other = (
+                bounced + radiance(points, wo, light, samples=SHADING_SAMPLES, scene=scene, seed=2 * seed + 1)
+            ) * exposure
+    loss = loss + weights.shading * losses.display_error(image, other, target, target > SATURATED_LINEAR)
+    # the same ratio of the terms as in the fit of the maps
     loss = loss + weights.shading * weights.palette * losses.palette(
-        points.base_color.clamp(min=losses.DARK).log(), target
+        points.base_color.clamp(min=losses.MIN_LINEAR).log(), target
     )
-    loss = loss + weights.shading * losses.near_paint(change[:, :3], weights, len(data.colored))
-    return loss + weights.shading * losses.priors(unknowns, weights, len(data.photographs))
+    loss = loss + weights.shading * losses.near_base_color(change[:, :3], weights, len(data.colored))
+    return loss + weights.shading * losses.priors(unknowns, weights, len(data.images))
 
 
 def fit_shape(
@@ -265,27 +271,28 @@ def fit_shape(
     seed: int,
     cameras: bool,
 ) -> None:
-    """Move ``unknowns.level``, and with it what else :func:`shape_loss` reaches, until ``until`` of the budget."""
-    level = EvenAdam(unknowns.level)
+    """Optimizes ``unknowns.sdf`` with material, light and exposures, and poses if ``cameras``, up to the fraction
+    ``until`` of the budget."""
+    surface = EvenAdam(unknowns.sdf)
     rates = {"material": 0.03, "light": 0.02, "exposure": 0.01, **({"pose": 2e-4} if cameras else {})}
     changed = {name: unknowns.groups()[name] for name in rates}
     groups = [{"params": changed[name], "lr": rate} for name, rate in rates.items()]
     others = torch.optim.Adam(groups, betas=(0.9, 0.99))
-    wanted = [unknowns.level, *(value for values in changed.values() for value in values)]
+    variables = [unknowns.sdf, *(value for values in changed.values() for value in values)]
     for step, progress in budget.part("shape", until):
-        for value in wanted:
+        for value in variables:
             value.requires_grad_(True)
         loss = shape_loss(unknowns, data, weights, progress=progress, seed=seed * 1_000_003 + step)
         others.zero_grad()
-        gradient, *rest = torch.autograd.grad(loss, wanted, allow_unused=True)
-        for value, slope in zip(wanted[1:], rest, strict=True):
+        gradient, *rest = torch.autograd.grad(loss, variables, allow_unused=True)
+        for value, derivative in zip(variables[1:], rest, strict=True):
             value.requires_grad_(False)
-            value.grad = slope
-        unknowns.level.requires_grad_(False)
-        cells = round(BLUR[0] * (BLUR[1] / BLUR[0]) ** progress)
-        rate = data.grid.cell * RATE[0] * (RATE[1] / RATE[0]) ** progress
-        level.step(blurred_grid(gradient, cells), rate)
+            value.grad = derivative
+        unknowns.sdf.requires_grad_(False)
+        cells = round(BLUR_CELLS[0] * (BLUR_CELLS[1] / BLUR_CELLS[0]) ** progress)
+        rate = data.grid.cell * STEP_CELLS[0] * (STEP_CELLS[1] / STEP_CELLS[0]) ** progress
+        surface.step(blurred_grid(gradient, cells), rate)
         others.step()
-        budget.tell("shape", step, float(loss.detach()))
-    for value in wanted:
+        budget.record("shape", step, float(loss.detach()))
+    for value in variables:
         value.requires_grad_(False)

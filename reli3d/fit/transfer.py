@@ -1,4 +1,4 @@
-"""Maps from one surface to another that lies close to it, and changes of maps written into textures."""
+"""Transfer of texture maps between nearby surfaces, and baking of fitted changes into textures."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.gbuffer import sample_texture, surface_points
 from reli3d.render.points import SurfacePoints
 
-REACH = 0.08  # of the box's half side: how far apart the surfaces may lie along the new one's normal
+MAX_DISTANCE = 0.08  # of the surfaces along the new one's normal, in the box [-1, 1]^3
 
 
 def nearest_hits(mesh: Mesh, position: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
-    """Face ``(N,)`` and barycentrics ``(N, 2)`` of ``mesh`` beside points of another surface: where a line along the
-    normal meets it from outside, else its nearest vertex."""
+    """Face ``(N,)`` and barycentrics ``(N, 2)`` of ``mesh`` that correspond to points of another surface: the first hit
+    from outside along the normal within ``MAX_DISTANCE``, else the nearest vertex."""
     scene = RayScene(mesh.vertices, mesh.faces)
-    hits = scene.closest(position + REACH * normal, -normal, t_max=2.0 * REACH)
+    hits = scene.closest(position + MAX_DISTANCE * normal, -normal, t_max=2.0 * MAX_DISTANCE)
     face, bary = hits.face.clone(), hits.bary.clone()
     missed = torch.nonzero(face < 0)[:, 0]
     if len(missed):
@@ -42,9 +42,9 @@ def nearest_hits(mesh: Mesh, position: Tensor, normal: Tensor) -> tuple[Tensor, 
 
 
 def dressed(mesh: Mesh, source: Asset, size: int) -> Asset:
-    """``mesh`` with an atlas, and the maps that ``source`` has beside it; the light of ``source``."""
+    """``mesh`` with a new atlas of ``size`` texels, the maps of ``source`` at corresponding points, and its light."""
     mesh = unwrap(mesh, texture_size=size)
-    mesh = replace(mesh, tangents=vertex_tangents(mesh), colors=None)  # the maps below have them
+    mesh = replace(mesh, tangents=vertex_tangents(mesh), colors=None)  # vertex colors are baked into the maps below
     texels = rasterize_texels(mesh, size)
     index = torch.nonzero(texels.valid.reshape(-1))[:, 0]
     position, normal = interpolate(mesh, texels, index)
@@ -56,7 +56,7 @@ def dressed(mesh: Mesh, source: Asset, size: int) -> Asset:
 
 
 def changed(asset: Asset, unknowns: Unknowns) -> Asset:
-    """``asset`` with the changes of its materials and shading normals written into its textures."""
+    """``asset`` with the changes of material and shading normals baked into its textures."""
     size = asset.textures.size
     texels = rasterize_texels(asset.mesh, size)
     index = torch.nonzero(texels.valid.reshape(-1))[:, 0]

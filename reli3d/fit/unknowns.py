@@ -1,7 +1,7 @@
-"""What a fit may change, as plain tensors, and what they mean.
+"""Variables of a fit and the quantities that they parameterize.
 
-Material and light are held as changes of the start in spaces without bounds (logits of base colour, roughness and
-metallic; logarithms of radiance), so zero is the start and every value is allowed.
+Material and light are changes relative to the start in unbounded spaces (logits of base colour, roughness and metallic;
+logarithms of radiance): zero is the start, and every value is valid.
 """
 
 from __future__ import annotations
@@ -21,29 +21,29 @@ from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import surface_points
 from reli3d.render.points import SurfacePoints
 
-ROOM = 0.005  # base colours and metallic end this far from 0 and 1, where their logits are still near
-ROUGHEST, SMOOTHEST = 1.0, 0.05  # roughness: below, a lobe is narrower than the light's texels
+LOGIT_MARGIN = 0.005  # from 0 and 1 at which values are clamped before the logit
+MAX_ROUGHNESS, MIN_ROUGHNESS = 1.0, 0.05  # below, a lobe is narrower than the light's texels
 MATERIAL_GRIDS = (4, 8, 16, 32)  # points along a side of the box
-FINISH_GRIDS = 2  # how many of them roughness and metallic take part in: photographs tell little of them
-START_GRID = 32
-MOST_BENT = 0.3  # 17 degrees
-BEND_GRIDS = (8, 16, 32, 64)  # finer than the paint's: what it takes must not be left to them
+FINISH_GRIDS = 2  # number of them that roughness and metallic have: images constrain these poorly
+START_GRID = 32  # points along a side of the box
+MAX_BEND = 0.3  # length of the vector added to a unit normal: 17 degrees
+BEND_GRIDS = (8, 16, 32, 64)  # finer than the material's, which must not explain errors of the normals
 LIGHT_ROWS = 32
-LIGHT_MAPS = (4, 8, 16, 32)
-DARKEST = 1e-4  # of the start's mean radiance: its logarithm must exist
+LIGHT_MAPS = (4, 8, 16, 32)  # rows of the maps
+MIN_RELATIVE_RADIANCE = 1e-4  # of the start's mean; its logarithm must be finite
 
 
 @dataclass
 class Unknowns:
-    """Everything that gradients may reach.  Lengths are those of the fit's own box, [-1, 1]^3 and what lies around.
+    """Variables of the optimization, in a frame in which the object fills the box [-1, 1]^3.
 
-    level: ``(X, Y, Z)`` negative inside.  material: grids ``(n, n, n, 5)`` over the box.  detail: ``(T, T, 3)`` base
-    colour over the atlas.  bend: grids ``(n, n, n, 3)`` over the box, added to the shading normal, which has length 1.
-    light: maps ``(h, 2h, 3)``.  exposure: ``(V,)`` logarithms.  pose: ``(V, 6)``, a rotation vector [rad] and a shift
-    in the camera's own axes.
+    sdf: ``(X, Y, Z)`` signed distance, negative inside.  material: grids ``(n, n, n, 5)`` over the box, changes of
+    logits.  detail: ``(T, T, 3)`` over the atlas, changes of the base colour's logits.  bend: grids ``(n, n, n, 3)``
+    over the box, added to the unit shading normal.  light: maps ``(h, 2h, 3)``, changes of log radiance.  exposure:
+    ``(V,)`` logarithms.  pose: ``(V, 6)``, a rotation vector [rad] and a translation in the camera's axes.
     """
 
-    level: Tensor
+    sdf: Tensor
     material: list[Tensor]
     detail: Tensor
     bend: list[Tensor]
@@ -52,11 +52,11 @@ class Unknowns:
     pose: Tensor
 
     @classmethod
-    def zero(cls, level: Tensor, views: int, texels: int) -> Unknowns:
-        """No change of anything; ``level`` as given."""
-        device = level.device
+    def zero(cls, sdf: Tensor, views: int, texels: int) -> Unknowns:
+        """No change; ``sdf`` as given."""
+        device = sdf.device
         return cls(
-            level.clone(),
+            sdf.clone(),
             [torch.zeros(n, n, n, 5, device=device, dtype=torch.float32) for n in MATERIAL_GRIDS],
             torch.zeros(texels, texels, 3, device=device, dtype=torch.float32),
             [torch.zeros(n, n, n, 3, device=device, dtype=torch.float32) for n in BEND_GRIDS],
@@ -70,13 +70,13 @@ class Unknowns:
         return {name: value if isinstance(value, list) else [value] for name, value in vars(self).items()}
 
     @torch.no_grad()
-    def straighten(self) -> None:
-        """No bend of any normal."""
+    def reset_bend(self) -> None:
+        """Sets the bend of all normals to zero."""
         for grid in self.bend:
             grid.zero_()
 
     def clone(self) -> Unknowns:
-        """A copy that shares nothing."""
+        """A deep copy, detached."""
         copy: dict[str, Any] = {
             name: [t.detach().clone() for t in value] if isinstance(value, list) else value.detach().clone()
             for name, value in vars(self).items()
@@ -86,14 +86,14 @@ class Unknowns:
 
 @dataclass(frozen=True)
 class Start:
-    """What the changes count from: logits of the material on a grid ``(n, n, n, 5)``, log radiance ``(h, 2h, 3)``."""
+    """Initial values: logits of the material on a grid ``(n, n, n, 5)`` and log radiance ``(h, 2h, 3)``."""
 
     material: Tensor
     light: Tensor
 
     @classmethod
     def of(cls, asset: Asset, texels: int = 256) -> Start:
-        """The start that an asset in the fit's box gives; its surface's material fills space around it."""
+        """Initial values of an asset in the box [-1, 1]^3; the material is extrapolated from its surface."""
         found = rasterize_texels(asset.mesh, texels)
         valid = found.face.reshape(-1) >= 0
         points = surface_points(
@@ -101,20 +101,20 @@ class Start:
         )
         material = filled_grid(points.position, material_logits(points), START_GRID)
         radiance = asset.light.resized(LIGHT_ROWS).radiance
-        return cls(material, radiance.clamp(min=DARKEST * float(radiance.mean())).log())
+        return cls(material, radiance.clamp(min=MIN_RELATIVE_RADIANCE * float(radiance.mean())).log())
 
 
 def material_logits(points: SurfacePoints) -> Tensor:
-    """``(N, 5)``: logits of linear base colour, roughness in its range, and metallic."""
-    rough = (points.roughness - SMOOTHEST) / (ROUGHEST - SMOOTHEST)
+    """``(N, 5)``: logits of linear base colour, of roughness mapped from its range to [0, 1], and of metallic."""
+    rough = (points.roughness - MIN_ROUGHNESS) / (MAX_ROUGHNESS - MIN_ROUGHNESS)
     values = torch.cat([points.base_color, rough[:, None], points.metallic[:, None]], 1)
-    return torch.logit(values.clamp(ROOM, 1.0 - ROOM))
+    return torch.logit(values.clamp(LOGIT_MARGIN, 1.0 - LOGIT_MARGIN))
 
 
 def material_of(logits: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Base colour ``(N, 3)`` linear, roughness and metallic ``(N,)``."""
     values = torch.sigmoid(logits)
-    return values[:, :3], SMOOTHEST + (ROUGHEST - SMOOTHEST) * values[:, 3], values[:, 4]
+    return values[:, :3], MIN_ROUGHNESS + (MAX_ROUGHNESS - MIN_ROUGHNESS) * values[:, 3], values[:, 4]
 
 
 def material_change(unknowns: Unknowns, position: Tensor) -> Tensor:
@@ -125,24 +125,24 @@ def material_change(unknowns: Unknowns, position: Tensor) -> Tensor:
 
 
 def bent(unknowns: Unknowns, position: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
-    """Shading normals ``(N, 3)`` that ``normal`` becomes at ``position``, unit, and what was added ``(N, 3)``.
+    """Unit shading normals ``(N, 3)``, ``normal`` plus the bend at ``position``, and the bend ``(N, 3)``.
 
-    What is added is shorter than ``MOST_BENT``: a normal that may turn away from the light explains black paint.
+    The bend is shorter than ``MAX_BEND``: a normal turned away from the light would explain a black base colour.
     """
     bend = space_field(unknowns.bend, position)
-    bend = bend / (1.0 + (bend.square().sum(1, keepdim=True) / MOST_BENT**2)).sqrt()
+    bend = bend / (1.0 + (bend.square().sum(1, keepdim=True) / MAX_BEND**2)).sqrt()
     return unit(normal + bend), bend
 
 
 def environment(unknowns: Unknowns, start: Start) -> Environment:
-    """The light."""
+    """The environment of the start with the changes of ``unknowns``."""
     return Environment((start.light + light_field(unknowns.light, LIGHT_ROWS)).exp().contiguous())
 
 
 def corrected(camera: Camera, pose: Tensor) -> Camera:
-    """``camera`` turned and moved by ``pose (..., 6)`` in its own axes.  Gradients reach ``pose``.
+    """``camera`` rotated and translated by ``pose (..., 6)`` in its own axes.  Gradient with respect to ``pose``.
 
-    The turn is the Cayley map, a rotation for any vector and to second order the exponential one.
+    The rotation is the Cayley map of its vector, which equals the exponential map to second order.
     """
     half, eye = 0.5 * pose[..., :3], torch.eye(3, device=pose.device, dtype=torch.float32)
     x, y, z = half.unbind(-1)
@@ -156,10 +156,10 @@ def corrected(camera: Camera, pose: Tensor) -> Camera:
 
 
 def filled_grid(position: Tensor, values: Tensor, n: int) -> Tensor:
-    """Grid ``(n, n, n, C)`` over [-1, 1]^3 of the means of ``values (N, C)`` near its points; empty ones take what lies
-    around.
+    """Grid ``(n, n, n, C)`` over [-1, 1]^3 of the means of the ``values (N, C)`` nearest to each point, with gaps
+    filled.
 
-    Means over ever larger blocks fill what is empty (pull and push; Grossman and Dally 1998, Point Sample Rendering).
+    Gaps are filled by pull-push over a mip pyramid (Grossman and Dally 1998, Point Sample Rendering).
     """
     index = ((position.detach().clamp(-1.0, 1.0) + 1.0) * (0.5 * (n - 1))).round().long()
     index = (index[:, 0] * n + index[:, 1]) * n + index[:, 2]

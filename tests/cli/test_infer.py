@@ -186,7 +186,7 @@ def test_a_refinement_writes_its_picture_and_its_curve(tmp_path):
     assert sorted(p.name for p in folder.iterdir()) == sorted((*results.FILES, results.COMPARISON))
     record = json.loads((folder / "run_info.json").read_text())["refinement"]
     assert sum(record["steps"].values()) == 6 and record["curve"]
-    assert set(record["kept"]) == {"surface", "paint", "light"}
+    assert set(record["kept"]) == {"surface", "material", "light"}
     assert record["psnr_after"]["input"] is not None and record["views_held_out"] == [1]
     page = (folder / "viewer.html").read_text()
     names = re.findall(r'"name": "(mesh|before|after)"', page)

@@ -1,4 +1,4 @@
-"""Bent shading normals: they take the errors that would be painted on, and only what is held is kept."""
+"""Bent shading normals: they absorb errors that would be baked into the base color; only a regularized bend is kept."""
 
 import math
 from dataclasses import replace
@@ -8,10 +8,10 @@ import torch
 
 from reli3d.fit import maps
 from reli3d.fit.budget import Budget
+from reli3d.fit.input_images import InputImages
 from reli3d.fit.losses import Weights
-from reli3d.fit.photographs import Photographs
 from reli3d.fit.transfer import changed
-from reli3d.fit.unknowns import MOST_BENT, Start, Unknowns, bent
+from reli3d.fit.unknowns import MAX_BEND, Start, Unknowns, bent
 from reli3d.geometry.bake import interpolate, rasterize_texels
 from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import surface_points
@@ -28,21 +28,21 @@ def start():
 
 
 @pytest.fixture(scope="module")
-def photographs(start):
+def images(start):
     """Of the same ball with waves in its normal map."""
     size = small_scene.TEXELS
     row, column = torch.meshgrid(torch.arange(size), torch.arange(size), indexing="ij")
     waves = torch.stack([(0.3 * column).sin(), (0.3 * row).sin(), 2.0 * torch.ones(size, size)], -1)
     normal = 0.5 + 0.5 * torch.nn.functional.normalize(waves, dim=-1)
     wavy = replace(start, textures=replace(start.textures, normal=normal))
-    return Photographs.of(small_scene.photographs(wavy, VIEWS, SIZE))
+    return InputImages.of(small_scene.input_views(wavy, VIEWS, SIZE))
 
 
-def fitted(start, photographs, weights: Weights, steps: int = 40) -> Unknowns:
+def fitted(start, images, weights: Weights, steps: int = 40) -> Unknowns:
     unknowns = Unknowns.zero(torch.ones(2, 2, 2), VIEWS, small_scene.TEXELS)
     views, budget = list(range(VIEWS)), Budget(steps=steps)
     none = torch.zeros_like(start.mesh.vertices)
-    maps.fit_maps(unknowns, Start.of(start), start, none, photographs, views, weights, budget, STAGE, seed=0)
+    maps.fit_maps(unknowns, Start.of(start), start, none, images, views, weights, budget, STAGE, seed=0)
     return unknowns
 
 
@@ -53,10 +53,10 @@ def patches(asset) -> float:
     return float(at.base_color.log().std(0).mean())
 
 
-def test_waves_of_the_normals_are_painted_less(start, photographs):
-    # the true paint is even; weights that leave no bend are the fit without it
+def test_waves_of_the_normals_are_baked_into_the_base_color_less(start, images):
+    # the true base color is uniform; the large weights disable the bend
     free, straight = (
-        patches(changed(start, fitted(start, photographs, weights)))
+        patches(changed(start, fitted(start, images, weights)))
         for weights in (Weights(palette=0.0), Weights(palette=0.0, free_bend=1e6, bend=1e6))
     )
     assert free < 0.9 * straight
@@ -69,11 +69,11 @@ def hue(asset) -> torch.Tensor:
     return color - color.mean()
 
 
-def test_a_light_of_another_colour_leaves_the_hue_of_the_paint(start, photographs):
-    # the start's paint has the true hue; its light is yellow where the photographs' is blue
+def test_a_light_of_another_color_leaves_the_hue_of_the_base_color(start, images):
+    # the start's base color has the true hue; its light is yellow, that of the images blue
     other = replace(start, environment=Environment(start.environment.radiance * torch.tensor([1.6, 1.0, 0.5])))
     held, free = (
-        float((hue(changed(other, fitted(other, photographs, weights))) - hue(start)).norm())
+        float((hue(changed(other, fitted(other, images, weights))) - hue(start)).norm())
         for weights in (Weights(), Weights(hue=0.0))
     )
     assert held < 0.5 * free
@@ -89,46 +89,46 @@ def test_the_bend_is_written_into_the_normal_map(start):
     got = surface_points(
         asset.mesh, asset.textures, found.face.reshape(-1)[index], found.bary.reshape(-1, 2)[index]
     ).normal
-    length = 0.3 / math.sqrt(1.0 + (0.3 / MOST_BENT) ** 2)
+    length = 0.3 / math.sqrt(1.0 + (0.3 / MAX_BEND) ** 2)
     want = torch.nn.functional.normalize(plain + torch.tensor([length, 0.0, 0.0]), dim=-1)
     assert torch.allclose(bent(unknowns, position, plain)[0], want, atol=1e-6)
     assert float((got - want).norm(dim=1).median()) < 0.01  # 8 bits hold a direction to 0.004
 
 
 def test_no_bend_turns_a_normal_away():
-    # a normal that may turn to the dark side explains black paint
+    # a normal turned to the dark side would explain a black base color
     unknowns = Unknowns.zero(torch.ones(2, 2, 2), VIEWS, small_scene.TEXELS)
     unknowns.bend[0] += torch.tensor([1e3, 0.0, 0.0])
     normal = torch.nn.functional.normalize(torch.randn(100, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
     turned = bent(unknowns, torch.zeros(100, 3), normal)[0]
-    assert float((turned * normal).sum(1).min()) > math.cos(math.asin(MOST_BENT)) - 1e-6
+    assert float((turned * normal).sum(1).min()) > math.cos(math.asin(MAX_BEND)) - 1e-6
 
 
-def test_an_interrupted_fit_keeps_no_free_bend(start, photographs, monkeypatch):
-    tell = Budget.tell
+def test_an_interrupted_fit_keeps_no_free_bend(start, images, monkeypatch):
+    record = Budget.record
 
     def pressing(self, name, step, loss):
-        tell(self, name, step, loss)
+        record(self, name, step, loss)
         self.interrupted = step == 5
 
-    monkeypatch.setattr(Budget, "tell", pressing)
-    unknowns = fitted(start, photographs, Weights())
+    monkeypatch.setattr(Budget, "record", pressing)
+    unknowns = fitted(start, images, Weights())
     assert unknowns.material[0].abs().max() > 0.0
     assert all(float(grid.abs().max()) == 0.0 for grid in unknowns.bend)
 
 
-def test_the_paint_stays_while_the_kept_bend_is_fitted(start, photographs, monkeypatch):
-    tell, seen = Budget.tell, []
+def test_the_material_is_frozen_while_the_kept_bend_is_fitted(start, images, monkeypatch):
+    record, seen = Budget.record, []
 
     def looking(self, name, step, loss):
-        tell(self, name, step, loss)
+        record(self, name, step, loss)
         seen.append((unknowns.material[0].clone(), unknowns.light[0].clone()))
 
-    monkeypatch.setattr(Budget, "tell", looking)
+    monkeypatch.setattr(Budget, "record", looking)
     unknowns = Unknowns.zero(torch.ones(2, 2, 2), VIEWS, small_scene.TEXELS)
     budget, views, none = Budget(steps=20), list(range(VIEWS)), torch.zeros_like(start.mesh.vertices)
-    maps.fit_maps(unknowns, Start.of(start), start, none, photographs, views, Weights(), budget, STAGE, seed=0)
-    first = int(maps.PAINT_UNTIL * 20)
+    maps.fit_maps(unknowns, Start.of(start), start, none, images, views, Weights(), budget, STAGE, seed=0)
+    first = int(maps.MATERIAL_UNTIL * 20)
     assert not torch.equal(seen[first - 2][0], seen[first - 1][0])
     assert torch.equal(seen[first][0], seen[-1][0]) and not torch.equal(seen[first][1], seen[-1][1])
     assert all(float(grid.abs().max()) > 0.0 for grid in unknowns.bend)

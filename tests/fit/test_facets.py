@@ -1,9 +1,9 @@
-"""The filter that ends a surface: noise goes, edges and sizes stay."""
+"""Bilateral denoising of a mesh: noise is removed, edges and sizes are kept."""
 
 import pytest
 import torch
 
-from reli3d.fit.facets import flattened, neighbours
+from reli3d.fit.facets import flattened, neighbor_faces
 from reli3d.fit.unknowns import unit
 from reli3d.geometry.mesh import Mesh, face_normals, volume
 from reli3d.geometry.smooth import taubin_smooth
@@ -13,12 +13,12 @@ CELLS = 20
 
 
 def box(noise: float) -> Mesh:
-    """A box of half side 0.6 between the points of a grid, whose level has ``noise``, in cells."""
+    """A box of half side 0.6 between the points of a grid, whose signed distance has ``noise``, in cells."""
     axis = torch.linspace(-1.0, 1.0, CELLS + 1)
     points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
-    level = points.abs().amax(-1) - 0.63
-    level += noise * 2.0 / CELLS * torch.randn(level.shape, generator=torch.Generator().manual_seed(3))
-    return extract_surface(level, radius=1.0)
+    sdf = points.abs().amax(-1) - 0.63
+    sdf += noise * 2.0 / CELLS * torch.randn(sdf.shape, generator=torch.Generator().manual_seed(3))
+    return extract_surface(sdf, radius=1.0)
 
 
 def off_axis(mesh: Mesh) -> torch.Tensor:
@@ -29,8 +29,8 @@ def off_axis(mesh: Mesh) -> torch.Tensor:
 
 def test_each_face_knows_the_face_across_each_edge():
     faces = torch.tensor([[0, 1, 2], [0, 3, 1], [1, 3, 2], [2, 3, 0]], dtype=torch.int32)
-    assert neighbours(faces).tolist() == [[1, 2, 3], [3, 2, 0], [1, 3, 0], [2, 1, 0]]
-    assert neighbours(faces[:2]).tolist() == [[1, 0, 0], [1, 1, 0]]  # an open edge has the face itself
+    assert neighbor_faces(faces).tolist() == [[1, 2, 3], [3, 2, 0], [1, 3, 0], [2, 1, 0]]
+    assert neighbor_faces(faces[:2]).tolist() == [[1, 0, 0], [1, 1, 0]]  # an open edge has the face itself
 
 
 def test_noise_goes_and_edges_stay():
@@ -49,8 +49,10 @@ def test_noise_goes_and_edges_stay():
 
 def test_planes_and_nothing_to_do_change_nothing():
     mesh = box(0.08)
-    assert torch.equal(flattened(mesh, rounds=0, moves=0).vertices, mesh.vertices)
-    still = flattened(mesh, rounds=0)  # each face already has its own normal, so no vertex is off its faces' planes
+    assert torch.equal(flattened(mesh, normal_iterations=0, vertex_iterations=0).vertices, mesh.vertices)
+    still = flattened(
+        mesh, normal_iterations=0
+    )  # each face already has its own normal, so no vertex is off its faces' planes
     assert torch.allclose(still.vertices, mesh.vertices, atol=1e-6)
     empty = Mesh(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.int32))
     assert flattened(empty).vertices.shape == (0, 3)

@@ -1,8 +1,8 @@
 """The gradient of a whole step of a fit against central differences with the same random numbers on both sides.
 
-Directions and densities of light samples are constants of the backward pass.  So levels, materials, exposures and
+Directions and densities of light samples are constants of the backward pass.  So distances, materials, exposures and
 cameras are tried with samples of the light alone, which do not move with them, and the light with samples of the
-cosine alone.  What is seen from where, and in which direction, is a constant too: it is taken once and kept.
+cosine alone.  Visibility and viewing directions are constants too: they are computed once and reused.
 """
 
 from dataclasses import replace
@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from reli3d.fit import maps, shape
+from reli3d.fit.input_images import InputImages
 from reli3d.fit.losses import Weights
-from reli3d.fit.photographs import Photographs
 from reli3d.fit.unknowns import Start, Unknowns
 from reli3d.geometry.rays import RayScene
 from tests.support import small_scene
@@ -22,17 +22,17 @@ SIZE = 40
 
 
 def scene(plain: bool):
-    """Data and unknowns of a ball that is not quite the photographed one; plain: photographs of one even colour."""
-    views = small_scene.photographs(small_scene.painted(small_scene.ball()), 3, SIZE)
-    if plain:  # the slope of a photograph's colour along the surface is no part of the shading's gradient
+    """Data and unknowns of a ball close to that of the images; plain: images of uniform color."""
+    views = small_scene.input_views(small_scene.two_colored(small_scene.ball()), 3, SIZE)
+    if plain:  # the shading's gradient does not include the image gradient
         views = replace(views, images=torch.full_like(views.images, 0.5))
-    photographs, asset = Photographs.of(views), replace(small_scene.ball(0.76), environment=small_scene.sky())
+    images, asset = InputImages.of(views), replace(small_scene.ball(0.76), environment=small_scene.sky())
     grid = shape.Grid.around(asset.mesh.vertices, 16)
-    level = shape.start_level(asset.mesh, grid)
+    sdf = shape.start_sdf(asset.mesh, grid)
     received = torch.rand(5, 5, 5, 3, generator=torch.Generator().manual_seed(4))
-    bound = torch.full_like(level, -9.0)
-    data = shape.ShapeData.of(Start.of(asset), level, bound, grid, received, photographs, [0, 1, 2])
-    unknowns = Unknowns.zero(level + 0.02 * grid.cell, 3, 8)
+    bound = torch.full_like(sdf, -9.0)
+    data = shape.ShapeData.of(Start.of(asset), sdf, bound, grid, received, images, [0, 1, 2])
+    unknowns = Unknowns.zero(sdf + 0.02 * grid.cell, 3, 8)
     rng = torch.Generator().manual_seed(2)
     for values in (*unknowns.material, *unknowns.light, unknowns.exposure):
         values += 0.1 * torch.randn(values.shape, generator=rng)
@@ -41,7 +41,7 @@ def scene(plain: bool):
 
 
 def towards(kind: str, values: list[Tensor]) -> list[Tensor]:
-    """A direction of change: all entries, all a little alike; smooth bumps; or the camera's own axis."""
+    """A direction of change: all entries, by similar amounts; smooth bumps; or the camera's own axis."""
     rng = torch.Generator().manual_seed(5)
     if kind == "bumps":
         coarse = torch.randn(1, 1, 6, 6, 6, generator=rng)
@@ -53,13 +53,13 @@ def towards(kind: str, values: list[Tensor]) -> list[Tensor]:
 
 NONE = dict.fromkeys(vars(Weights()), 0.0)
 LIGHT, COSINE = (64, 0, 0), (0, 0, 64)
-# an outline goes from pixel to pixel by small jumps, which only a wide step averages; the rest is smooth, and float32
+# coverage changes in small jumps, which a wide step averages; the other terms are smooth, in float32
 CASES = {
-    "level, outlines": ("level", {"outline": 1.0}, "all", LIGHT, False, 5e-3, 0.1),
-    "level, agreement": ("level", {"agreement": 1.0}, "all", LIGHT, False, 1e-4, 0.02),
-    "level, shading": ("level", {"shading": 1.0}, "bumps", LIGHT, True, 3e-4, 0.05),
-    "level, priors": ("level", {"curvature": 1.0, "stay": 1.0}, "all", LIGHT, False, 1e-3, 0.02),
-    "material": ("material", {"shading": 1.0, "paint": 1.0}, "all", LIGHT, True, 1e-2, 0.02),
+    "sdf, outlines": ("sdf", {"outline": 1.0}, "all", LIGHT, False, 5e-3, 0.1),
+    "sdf, agreement": ("sdf", {"agreement": 1.0}, "all", LIGHT, False, 1e-4, 0.02),
+    "sdf, shading": ("sdf", {"shading": 1.0}, "bumps", LIGHT, True, 3e-4, 0.05),
+    "sdf, priors": ("sdf", {"curvature": 1.0, "sdf_change": 1.0}, "all", LIGHT, False, 1e-3, 0.02),
+    "material": ("material", {"shading": 1.0, "base_color": 1.0}, "all", LIGHT, True, 1e-2, 0.02),
     "light": ("light", {"shading": 1.0}, "all", COSINE, True, 1e-3, 0.02),
     "exposure": ("exposure", {"shading": 1.0}, "all", LIGHT, True, 1e-2, 0.02),
     "camera, outlines": ("pose", {"outline": 1.0}, "axis", LIGHT, False, 1e-2, 0.1),
@@ -68,17 +68,17 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_a_step_has_the_slope_of_central_differences(case, monkeypatch):
+def test_the_gradient_of_a_step_matches_central_differences(case, monkeypatch):
     name, terms, kind, samples, plain, step, tolerance = CASES[case]
     weights = Weights(**{**NONE, **terms})
-    monkeypatch.setattr(shape, "SAMPLES", samples)
+    monkeypatch.setattr(shape, "SHADING_SAMPLES", samples)
     unknowns, data = scene(plain)
-    sight, kept = shape.sight, []
-    monkeypatch.setattr(shape, "sight", lambda *a: (kept or kept.append(sight(*a)) or kept)[0])
+    view_weights, kept = shape.view_weights, []
+    monkeypatch.setattr(shape, "view_weights", lambda *a: (kept or kept.append(view_weights(*a)) or kept)[0])
     radiance, eyes = shape.radiance, []
 
     def shown(points, wo, light, **options):
-        """Without shadows and with the directions to the eye kept: both move with the surface, and have no slope."""
+        """Without shadows and with the directions to the eye kept: both move with the surface, and have no gradient."""
         return radiance(points, (eyes or eyes.append(wo) or eyes)[0], light, **{**options, "scene": None})
 
     monkeypatch.setattr(shape, "radiance", shown)
@@ -90,8 +90,8 @@ def test_a_step_has_the_slope_of_central_differences(case, monkeypatch):
 
     for value in values:
         value.requires_grad_(True)
-    slopes = torch.autograd.grad(loss(), values, allow_unused=True)
-    got = sum(float((g * d).sum()) for g, d in zip(slopes, directions, strict=True) if g is not None)
+    gradients = torch.autograd.grad(loss(), values, allow_unused=True)
+    got = sum(float((g * d).sum()) for g, d in zip(gradients, directions, strict=True) if g is not None)
     for value in values:
         value.requires_grad_(False)
     ends = []
@@ -103,12 +103,12 @@ def test_a_step_has_the_slope_of_central_differences(case, monkeypatch):
     assert got == pytest.approx(want, rel=tolerance)
 
 
-@pytest.mark.parametrize("terms", [{"picture": 1.0}, {"bend": 1.0}], ids=["picture", "prior"])
-def test_the_bend_has_the_slope_of_central_differences(terms, monkeypatch):
+@pytest.mark.parametrize("terms", [{"image": 1.0}, {"bend": 1.0}], ids=["image", "prior"])
+def test_the_gradient_of_the_bend_matches_central_differences(terms, monkeypatch):
     unknowns, data = scene(plain=False)
-    asset, photographs = replace(small_scene.ball(), environment=small_scene.sky()), data.photographs
+    asset, images = replace(small_scene.ball(), environment=small_scene.sky()), data.images
     scene_of_rays, none = RayScene(asset.mesh.vertices, asset.mesh.faces), torch.zeros_like(asset.mesh.vertices)
-    pixels = maps.traced(asset, none, scene_of_rays, photographs, [0, 1, 2], seed=0)
+    pixels = maps.traced(asset, none, scene_of_rays, images, [0, 1, 2], seed=0)
     rng = torch.Generator().manual_seed(3)
     for grid in unknowns.bend:
         grid += 0.1 * torch.randn(grid.shape, generator=rng)
@@ -121,8 +121,8 @@ def test_the_bend_has_the_slope_of_central_differences(terms, monkeypatch):
 
     for grid in unknowns.bend:
         grid.requires_grad_(True)
-    slopes = torch.autograd.grad(loss(), unknowns.bend)
-    got = sum(float((g * d).sum()) for g, d in zip(slopes, directions, strict=True))
+    gradients = torch.autograd.grad(loss(), unknowns.bend)
+    got = sum(float((g * d).sum()) for g, d in zip(gradients, directions, strict=True))
     step, ends = 1e-3, []
     with torch.no_grad():
         for sign in (1.0, -2.0):

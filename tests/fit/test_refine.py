@@ -1,4 +1,4 @@
-"""The fit of an asset to photographs: it recovers what is known, is never worse than its start, and repeats itself."""
+"""Refinement: recovers a known scene, is never worse than its start, and is deterministic."""
 
 import math
 from dataclasses import replace
@@ -8,9 +8,9 @@ import torch
 
 from reli3d.fit import refine as fit
 from reli3d.fit.budget import Budget
-from reli3d.fit.choice import SLACK, Fitted, Parts
+from reli3d.fit.choice import PSNR_TOLERANCE_DB, Fitted, Parts
+from reli3d.fit.input_images import InputImages
 from reli3d.fit.losses import Weights, agreement, display_error, hue_drift, palette, shared_pattern
-from reli3d.fit.photographs import Photographs
 from reli3d.fit.transfer import dressed
 from reli3d.fit.unknowns import Start, Unknowns
 from reli3d.render.color import srgb_to_linear
@@ -23,7 +23,7 @@ ALL = Parts(1.0, 1.0, 1.0)
 
 @pytest.fixture(scope="module")
 def views():
-    return small_scene.photographs(small_scene.painted(small_scene.ball()), VIEWS, SIZE)
+    return small_scene.input_views(small_scene.two_colored(small_scene.ball()), VIEWS, SIZE)
 
 
 @pytest.fixture(scope="module")
@@ -52,24 +52,24 @@ def test_a_small_scene_is_recovered(refined, start):
     assert refined.after[1] > refined.before[1] + 5.0
     got = half_colors(refined.asset)
     want = srgb_to_linear(torch.tensor([[0.8, 0.25, 0.2], [0.25, 0.6, 0.3]]))
-    # one factor a channel is free between paint and light: the ratio of the halves is not
+    # a factor per channel is ambiguous between base color and light; the ratio of the halves is not
     error = ((got[0] / got[1]).log() - (want[0] / want[1]).log()).abs()
     # measured 0.63 of what grey is off: 60 steps are few, and the palette draws colours together at first
     assert float(error.max()) < 0.65 * float((want[0] / want[1]).log().abs().max())
 
 
-def test_few_views_fit_the_light_and_leave_the_paint(views):
-    true = small_scene.painted(small_scene.ball())
+def test_few_views_fit_the_light_and_keep_the_base_color(views):
+    true = small_scene.two_colored(small_scene.ball())
     first = replace(true, environment=Environment(torch.full((16, 32, 3), 0.5)))
     few = replace(
         views, **{name: getattr(views, name)[:3] for name in ("images", "masks", "c2w", "intrinsics")}, names=()
     )
     off = []
-    for weights in (Weights(), Weights(paint=0.0)):
+    for weights in (Weights(), Weights(base_color=0.0)):
         result = fit.refine(first, few, steps=30, resolution=24, weights=weights)
         assert result.parts.light == 0.5 and result.after[0] > result.before[0] + 1.0
         off.append(float((half_colors(result.asset) / half_colors(true)).log().abs().mean()))
-    assert off[0] < 0.5 * off[1]  # the paint was right at the start, the light was not
+    assert off[0] < 0.5 * off[1]  # the base color was right at the start, the light was not
 
 
 def test_the_surface_moves_towards_the_silhouettes(refined, start):
@@ -77,39 +77,39 @@ def test_the_surface_moves_towards_the_silhouettes(refined, start):
     assert off[1] < 0.6 * off[0]  # the squeezed ball grows back; between the silhouettes of six views some is free
 
 
-def test_the_same_steps_and_seed_give_the_same_bits(refined, start, views):
+def test_the_same_steps_and_seed_give_bitwise_identical_results(refined, start, views):
     again = fit.refine(start, views, steps=STEPS, resolution=24, seed=3)
     assert torch.equal(again.asset.mesh.vertices, refined.asset.mesh.vertices)
     assert torch.equal(again.asset.textures.base_color, refined.asset.textures.base_color)
     assert torch.equal(again.asset.environment.radiance, refined.asset.environment.radiance)
 
 
-def test_a_worse_result_gives_the_start_and_says_so(start, views, monkeypatch):
-    def spoiled(first, received, photographs, *args, **options):
+def test_a_worse_result_gives_the_start_and_is_reported(start, views, monkeypatch):
+    def spoiled(first, received, images, *args, **options):
         unknowns = Unknowns.zero(torch.ones(2, 2, 2), VIEWS, 8)
         unknowns.material[0][..., :3] = torch.tensor([-8.0, 8.0, -8.0])
         unknowns.light[0][:] = torch.tensor([4.0, -4.0, 4.0])
         small = replace(first, mesh=replace(first.mesh, vertices=0.5 * first.mesh.vertices))
-        return Fitted(first, small, received, Start.of(first), unknowns, photographs)
+        return Fitted(first, small, received, Start.of(first), unknowns, images)
 
     monkeypatch.setattr(fit, "_fitted", spoiled)
     result = fit.refine(start, views, steps=1)
     assert result.asset is start and not result.changed
-    assert "surface of the start, paint of the start, light of the start" in result.notes[-1]
+    assert "surface: start, material: start, light: start" in result.notes[-1]
 
 
 def test_an_interrupt_gives_the_best_so_far(start, views, monkeypatch):
-    tell, pressed = Budget.tell, []
+    record, pressed = Budget.record, []
 
     def pressing(self, name, step, loss):
-        tell(self, name, step, loss)
+        record(self, name, step, loss)
         if name == "shape" and step == 2:
             pressed.append(True)
 
-    monkeypatch.setattr(Budget, "tell", pressing)
+    monkeypatch.setattr(Budget, "record", pressing)
     result = fit.refine(start, views, steps=STEPS, resolution=24, interrupt=lambda: bool(pressed))
     assert sum(result.steps.values()) < STEPS / 2 and any("interrupted" in note for note in result.notes)
-    assert result.after[0] >= result.before[0] - SLACK
+    assert result.after[0] >= result.before[0] - PSNR_TOLERANCE_DB
 
 
 def test_cameras_that_are_off_move_back(start, views):
@@ -117,7 +117,7 @@ def test_cameras_that_are_off_move_back(start, views):
     c2w[:, :3, 3] += 0.03 * torch.randn(VIEWS, 3, generator=torch.Generator().manual_seed(4))
     result = fit.refine(small_scene.ball(), replace(views, c2w=c2w), steps=90, resolution=24, cameras=True)
     off = [(c[:, :3, 3] - views.c2w[:, :3, 3]) for c in (c2w, result.c2w)]
-    # silhouettes of a ball tell shifts across the view, little along it; the common shift is free
+    # silhouettes of a ball constrain shifts across the view, hardly those along it; the common shift is ambiguous
     across = [
         (o - o.mean(0)) - ((o - o.mean(0)) * views.c2w[:, :3, 2]).sum(-1, keepdim=True) * views.c2w[:, :3, 2]
         for o in off
@@ -136,14 +136,14 @@ def test_what_does_not_fit_together_is_refused(start, views):
     with pytest.raises(ValueError, match="environment: expected a light"):
         fit.refine(replace(start, environment=None), views, steps=1)
     with pytest.raises(ValueError, match="masks: expected"):
-        Photographs.of(replace(views, masks=views.masks[:, 1:]))
+        InputImages.of(replace(views, masks=views.masks[:, 1:]))
     with pytest.raises(ValueError, match="seconds, steps: expected one"):
         fit.refine(start, views)
     with pytest.raises(ValueError, match="steps: expected at least 1"):
         Budget(steps=0)
 
 
-def test_steps_are_shared_out_among_the_parts():
+def test_steps_are_divided_among_the_parts():
     budget = Budget(steps=10)
     parts = [[p for _, p in budget.part(name, until)] for name, until in (("a", 0.2), ("b", 0.5), ("c", 1.0))]
     assert [len(p) for p in parts] == [2, 3, 5]
@@ -156,9 +156,9 @@ def test_the_squared_error_of_noisy_estimates_has_no_bias():
     noisy = image + 0.1 * torch.randn(image.shape, generator=rng)
     other = image.detach() + 0.1 * torch.randn(image.shape, generator=rng)
     target, none = torch.full_like(image, 0.3), torch.zeros(image.shape, dtype=torch.bool)
-    (slope,) = torch.autograd.grad(display_error(noisy, other, target, none), image)
+    (gradient,) = torch.autograd.grad(display_error(noisy, other, target, none), image)
     square = display_error(noisy, noisy, target, none)
-    assert abs(float(slope.sum())) < 5 / math.sqrt(600_000)  # five standard errors of a mean of numbers below 1
+    assert abs(float(gradient.sum())) < 5 / math.sqrt(600_000)  # five standard errors of a mean of numbers below 1
     assert float(square.detach()) > 0.005  # the square of one estimate holds its noise
 
 
@@ -172,13 +172,13 @@ def test_agreement_is_least_where_views_show_one_color():
     assert float(agreement(color, weight)) == 0.0
 
 
-def test_the_palette_draws_shades_together_and_leaves_paints_apart():
+def test_the_palette_merges_shades_and_keeps_distinct_base_colors():
     near, far = torch.tensor([[-1.0] * 3, [-1.2] * 3]), torch.tensor([[-0.1] * 3, [-3.5] * 3])
     pull = []
     for pair in (near, far):
         pair = pair.requires_grad_(True)
-        (slope,) = torch.autograd.grad(palette(pair, torch.ones_like(pair)), pair)
-        pull.append(float(slope.abs().max()))
+        (gradient,) = torch.autograd.grad(palette(pair, torch.ones_like(pair)), pair)
+        pull.append(float(gradient.abs().max()))
     assert pull[0] > 10 * pull[1]
     tinted = torch.tensor([[0.9, 0.2, 0.2], [0.2, 0.2, 0.9]])
     assert float(palette(near, tinted)) < 1e-3 * float(palette(near, torch.ones_like(near)))
@@ -199,9 +199,9 @@ def test_the_shared_pattern_sees_baked_shading():
 
 
 def test_maps_move_to_another_surface():
-    painted = small_scene.painted(small_scene.ball())
+    painted = small_scene.two_colored(small_scene.ball())
     moved = dressed(small_scene.ball(squeeze=0.96).mesh, painted, small_scene.TEXELS)
-    # texels blend over the seam of the paints, little of each half
+    # texels blend over the seam of the two colors, a small part of each half
     assert torch.allclose(half_colors(moved), half_colors(painted), atol=0.02)
 
 

@@ -1,4 +1,4 @@
-"""A small known scene for fits: a ball of two paints under a sky, photographed by the renderer from all around."""
+"""A small synthetic scene for fits: a ball of two colors under a sky, rendered from all around."""
 
 import math
 from dataclasses import replace
@@ -24,8 +24,8 @@ def ball(radius: float = 0.8, cells: int = 24, squeeze: float = 1.0) -> Asset:
     """A closed ball with an atlas, grey maps and an even light; ``squeeze`` scales its height."""
     axis = torch.linspace(-1.0, 1.0, cells + 1)
     points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
-    level = (points / torch.tensor([1.0, squeeze, 1.0])).norm(dim=-1) - radius
-    mesh = unwrap(extract_surface(level, radius=1.0).with_normals(), texture_size=TEXELS)
+    sdf = (points / torch.tensor([1.0, squeeze, 1.0])).norm(dim=-1) - radius
+    mesh = unwrap(extract_surface(sdf, radius=1.0).with_normals(), texture_size=TEXELS)
     mesh = replace(mesh, tangents=vertex_tangents(mesh))
     grey = srgb_to_linear(torch.full((TEXELS, TEXELS, 3), 0.6))
     return Asset(mesh, TextureSet(grey, 0.6, 0.1), Environment(torch.full((16, 32, 3), 0.5)))
@@ -38,25 +38,25 @@ def sky() -> Environment:
     return Environment((row * column * torch.tensor([0.9, 1.0, 1.1])).contiguous())
 
 
-def painted(asset: Asset) -> Asset:
+def two_colored(asset: Asset) -> Asset:
     """The ball with a red and a green half and the sky around it."""
     from reli3d.geometry.bake import bake
 
-    def paint(position, normal):
+    def base_color(position, normal):
         side = torch.sigmoid(40.0 * position[:, :1])
         return side * torch.tensor([0.8, 0.25, 0.2]) + (1.0 - side) * torch.tensor([0.25, 0.6, 0.3])
 
-    color = srgb_to_linear(bake(asset.mesh, TEXELS, paint)["value"])
+    color = srgb_to_linear(bake(asset.mesh, TEXELS, base_color)["value"])
     return Asset(asset.mesh, replace(asset.textures, base_color=color), sky())
 
 
-def photographs(asset: Asset, count: int, size: int) -> ViewBatch:
-    """``count`` pictures of ``asset`` in its own light, little noise, antialiased masks."""
+def input_views(asset: Asset, count: int, size: int) -> ViewBatch:
+    """``count`` renderings of ``asset`` in its environment, with little noise and antialiased masks."""
     eyes = eyes_around(count, 3.2).float()
     c2w = look_at(eyes, torch.zeros(3), torch.tensor([0.05, 1.0, 0.02]))
     camera = Camera.from_fov(c2w, math.radians(38.0), size, size)
     options = ShadeOptions(samples=(32, 16, 8), diffuse_model="published")
     cameras = [Camera(c2w[i], camera.intrinsics[i], size, size) for i in range(count)]
-    shots = [render_asset(asset, c, options=options, supersampling=2) for c in cameras]
-    colors = torch.stack([linear_to_srgb((s.radiance / s.alpha.clamp(min=1e-3)[..., None]).clamp(0, 1)) for s in shots])
-    return ViewBatch(colors, torch.stack([s.alpha for s in shots]), camera.c2w, camera.intrinsics)
+    renderings = [render_asset(asset, c, options=options, supersampling=2) for c in cameras]
+    colors = [linear_to_srgb((r.radiance / r.alpha.clamp(min=1e-3)[..., None]).clamp(0, 1)) for r in renderings]
+    return ViewBatch(torch.stack(colors), torch.stack([r.alpha for r in renderings]), camera.c2w, camera.intrinsics)

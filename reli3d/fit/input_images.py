@@ -1,4 +1,4 @@
-"""Posed photographs as a fit takes them: linear light, what can be trusted in them, and their cameras."""
+"""Posed input images of a fit: linear colours, masks and cameras."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from reli3d._bridge import check
 from reli3d.geometry.camera import Camera
 from reli3d.render.color import srgb_to_linear
 
-WHITE = 0.97  # linear; a brighter pixel may be cut off, so it only says that the surface is at least as bright
-INSIDE = 0.99  # coverage from which a pixel, and its neighbours, show nothing but the object
+SATURATED_LINEAR = 0.97  # a brighter pixel may be clipped: its value is a lower bound
+INSIDE_COVERAGE = 0.99  # minimum of a pixel and its neighbours that contain only the object
 
 
 class PosedImages(Protocol):
-    """What :meth:`reli3d.views.views.Views.resampled` gives, or anything like it."""
+    """Batch of posed images, such as :meth:`reli3d.views.views.Views.resampled` returns."""
 
     @property
     def images(self) -> Tensor:
@@ -42,10 +42,10 @@ class PosedImages(Protocol):
 
 
 @dataclass(frozen=True)
-class Photographs:
-    """``V`` photographs of one size and device.
+class InputImages:
+    """``V`` input images of one size on one device.
 
-    color: ``(V, S, S, 3)`` linear.  mask: ``(V, S, S)`` coverage in [0, 1].  camera: of all of them.
+    color: ``(V, S, S, 3)`` linear.  mask: ``(V, S, S)`` coverage in [0, 1].  camera: batch of V cameras.
     """
 
     color: Tensor
@@ -53,8 +53,8 @@ class Photographs:
     camera: Camera
 
     @classmethod
-    def of(cls, views: PosedImages) -> Photographs:
-        """Photographs from sRGB images.  Raises TypeError or ValueError where the parts do not fit together."""
+    def of(cls, views: PosedImages) -> InputImages:
+        """Converts sRGB images to linear.  Raises TypeError or ValueError if shapes or devices do not match."""
         images, masks = views.images, views.masks
         check("images", images, last=3)
         check("masks", masks, like=images)
@@ -79,26 +79,26 @@ class Photographs:
         """Pixels along a side."""
         return self.color.shape[1]
 
-    def select(self, views: list[int]) -> Photographs:
-        """The photographs of these indices, in this order."""
-        return Photographs(self.color[views], self.mask[views], self.camera[views])
+    def select(self, views: list[int]) -> InputImages:
+        """The images of these indices, in this order."""
+        return InputImages(self.color[views], self.mask[views], self.camera[views])
 
-    def resized(self, size: int) -> Photographs:
-        """The same photographs with ``size`` pixels a side; colours are averaged over what the object covers."""
+    def resized(self, size: int) -> InputImages:
+        """The images resampled to ``size`` pixels a side; colours are averaged with the masks as weights."""
         if size == self.size:
             return self
         planes = torch.cat([self.color * self.mask[..., None], self.mask[..., None]], -1).permute(0, 3, 1, 2)
         planes = interpolate(planes, (size, size), mode="bilinear", align_corners=False, antialias=True)
         cover = planes[:, 3]
         color = planes[:, :3].permute(0, 2, 3, 1) / cover.clamp(min=1e-4)[..., None]
-        return Photographs(color.contiguous(), cover.clamp(0.0, 1.0), self.camera.resized(size, size))
+        return InputImages(color.contiguous(), cover.clamp(0.0, 1.0), self.camera.resized(size, size))
 
-    def moved(self, shift: Tensor, scale: float) -> Photographs:
-        """The same photographs in the frame ``scale * (x - shift)``."""
+    def moved(self, shift: Tensor, scale: float) -> InputImages:
+        """The images with cameras in the frame ``scale * (x - shift)``."""
         c2w = self.camera.c2w.clone()
         c2w[:, :3, 3] = scale * (c2w[:, :3, 3] - shift)
         return replace(self, camera=replace(self.camera, c2w=c2w))
 
     def inside(self) -> Tensor:
-        """``(V, S, S)`` bool: pixels that show nothing but the object, and neither do their neighbours."""
-        return max_pool2d(1.0 - self.mask[:, None], 3, 1, 1)[:, 0] < 1.0 - INSIDE
+        """``(V, S, S)`` bool: pixels that, with their 8 neighbours, contain only the object."""
+        return max_pool2d(1.0 - self.mask[:, None], 3, 1, 1)[:, 0] < 1.0 - INSIDE_COVERAGE

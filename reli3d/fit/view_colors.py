@@ -1,0 +1,48 @@
+"""Colours of the input images at surface points, and the weights of the views there."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn.functional import grid_sample
+
+from reli3d.fit.input_images import InputImages
+from reli3d.fit.unknowns import unit
+from reli3d.geometry.camera import Camera, project
+from reli3d.geometry.rays import RayScene
+from reli3d.geometry.visibility import visible_from
+from reli3d.render.color import linear_to_srgb
+
+MIN_COVERAGE = 0.9  # of the mask, from which a colour is used: pixels at the rim contain background
+FULL_WEIGHT_COSINE = 0.2  # between normal and direction to the eye, from which a view has its full weight
+
+
+def view_colors(display: Tensor, position: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+    """Samples colours ``(N, V, 3)`` and coverage ``(N, V)`` of the images at the projections of ``position (N, 3)``.
+
+    display: ``(V, 4, S, S)``, of :func:`display_planes`.  camera: batch of V.  Bilinear.  Gradients with respect to
+    ``position`` and the cameras.
+    """
+    pixels, _ = project(position[None], camera.c2w[:, None], camera.intrinsics[:, None])
+    where = 2.0 * pixels[:, :, None] / camera.width - 1.0
+    values = grid_sample(display, where, mode="bilinear", padding_mode="zeros", align_corners=False)[..., 0]
+    cover = values[:, 3]
+    return (values[:, :3] / cover.clamp(min=1e-2)[:, None]).permute(2, 0, 1), cover.T
+
+
+def display_planes(images: InputImages) -> Tensor:
+    """``(V, 4, S, S)``: display values times coverage, and coverage."""
+    shown = linear_to_srgb(images.color.clamp(0.0, 1.0)) * images.mask[..., None]
+    return torch.cat([shown, images.mask[..., None]], -1).permute(0, 3, 1, 2).contiguous()
+
+
+@torch.no_grad()
+def view_weights(scene: RayScene, position: Tensor, normal: Tensor, camera: Camera) -> Tensor:
+    """Weights ``(N, V)`` in [0, 1] of the cameras: visibility times the cosine of the viewing angle, which is clamped
+    at ``FULL_WEIGHT_COSINE`` and divided by it.
+
+    No gradient: otherwise the loss could be reduced by turning the surface away from the cameras.
+    """
+    visible = visible_from(scene, position, normal, camera)
+    to_eye = unit(camera.c2w[None, :, :3, 3] - position[:, None])
+    return visible * ((to_eye * normal[:, None]).sum(-1) / FULL_WEIGHT_COSINE).clamp(0.0, 1.0)
