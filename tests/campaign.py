@@ -29,7 +29,7 @@ from random import Random
 
 import torch
 
-from reli3d.io.files import printable
+from reli3d.errors import printable
 from tests.support.mutators import edited
 from tests.support.readers import Target, targets
 

@@ -12,7 +12,8 @@ import struct
 import numpy as np
 import OpenEXR
 
-from reli3d.io.files import InputError, read_bytes, shown
+from reli3d.errors import InputError, shown
+from reli3d.io.files import read_bytes
 from reli3d.render.color import rec709_from_primaries
 
 MAX_BYTES = 1 << 29  # MAX_SAMPLES in float32, which ZIP never exceeds

@@ -18,7 +18,8 @@ from typing import NoReturn
 
 import numpy as np
 
-from reli3d.io.files import InputError, printable, read_bytes, shown
+from reli3d.errors import InputError, printable, shown
+from reli3d.io.files import read_bytes
 
 DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 SHAPES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}

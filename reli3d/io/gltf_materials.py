@@ -13,7 +13,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from reli3d.io.files import InputError, shown
+from reli3d.errors import InputError, shown
 from reli3d.io.gltf import Document
 from reli3d.render.asset import TextureSet
 from reli3d.render.color import srgb_to_linear

@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from reli3d.errors import InputError
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.tangents import with_tangents
-from reli3d.io.files import InputError
 from reli3d.io.gltf import Document, Placed
 from reli3d.io.gltf_materials import Materials
 from reli3d.render.asset import Asset

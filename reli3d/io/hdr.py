@@ -17,8 +17,9 @@ import torch
 from torch import Tensor
 
 from reli3d._bridge import expect
+from reli3d.errors import InputError, shown
 from reli3d.io.exr import read_exr
-from reli3d.io.files import InputError, file_size, replacing, shown, write_bytes
+from reli3d.io.files import file_size, replacing, write_bytes
 from reli3d.io.rgbe import read_rgbe, rgbe_bytes
 from reli3d.render.environment import Environment
 

@@ -18,7 +18,8 @@ import torch
 from PIL import Image, ImageOps
 from torch import Tensor
 
-from reli3d.io.files import InputError, file_size, shown, write_bytes
+from reli3d.errors import InputError, shown
+from reli3d.io.files import file_size, write_bytes
 from reli3d.io.hdr import write_exr, write_hdr
 from reli3d.render.color import linear_to_srgb
 

@@ -10,7 +10,8 @@ import os
 
 import numpy as np
 
-from reli3d.io.files import InputError, read_bytes, shown
+from reli3d.errors import InputError, shown
+from reli3d.io.files import read_bytes
 from reli3d.render.color import rec709_from_primaries
 
 MAX_BYTES = 1 << 28  # 8192 x 4096 pixels, run lengths that do not pay, and a header

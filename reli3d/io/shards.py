@@ -11,7 +11,8 @@ import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from reli3d.io.files import InputError, read_bytes, shown, write_bytes
+from reli3d.errors import InputError, shown
+from reli3d.io.files import read_bytes, write_bytes
 
 INDEX = "index.json"
 INDEX_LIMIT = 1 << 30  # bytes

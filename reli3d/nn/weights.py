@@ -21,7 +21,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from reli3d.io.files import InputError, file_size, replacing
+from reli3d.errors import InputError
+from reli3d.io.files import file_size, replacing
 from reli3d.nn.local import LocalReconstructor
 from reli3d.nn.model import Reconstructor
 from reli3d.nn.presets import OFFICIAL, LocalPreset, Preset, from_json, to_json

@@ -17,7 +17,7 @@ import shutil
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 
-from reli3d.io.files import InputError, shown
+from reli3d.errors import InputError, shown
 
 try:
     import fcntl

@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 from scipy.linalg import rq
 
-from reli3d.io.files import InputError, read_bytes, shown
+from reli3d.errors import InputError, shown
+from reli3d.io.files import read_bytes
 from reli3d.views.file_names import images_in, named
 from reli3d.views.frames import Frame, Lens, nearest_rigid
 

@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 from PIL import Image
 
-from reli3d.io.files import InputError
+from reli3d.errors import InputError
 
 NETWORK = "isnet-general-use"  # Qin and others 2022, Highly accurate dichotomous image segmentation; Apache-2.0
 

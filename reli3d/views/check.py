@@ -17,8 +17,8 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d, pad
 
 from reli3d._bridge import full_precision
+from reli3d.errors import printable
 from reli3d.geometry.camera import project
-from reli3d.io.files import printable
 from reli3d.io.images import write_png
 from reli3d.views.normalize import AT_EYE, RADIUS, Hull, centre_rays, meeting_point, normalize, visual_hull
 from reli3d.views.views import Views

@@ -16,7 +16,8 @@ from pathlib import Path, PurePath
 
 import numpy as np
 
-from reli3d.io.files import InputError, file_size, shown
+from reli3d.errors import InputError, shown
+from reli3d.io.files import file_size
 from reli3d.views import colmap_binary
 from reli3d.views.file_names import FolderIndex, images_below, images_in
 from reli3d.views.frames import Frame, Lens, file_within, nearest_rigid, number

@@ -10,7 +10,8 @@ import struct
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
-from reli3d.io.files import InputError, file_size, shown
+from reli3d.errors import InputError, shown
+from reli3d.io.files import file_size
 from reli3d.views.frames import MAX_PATH
 
 # in the order of their numbers; the pinhole cameras and those with a polynomial lens have so many parameters

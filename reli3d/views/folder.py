@@ -19,7 +19,7 @@ from PIL import Image
 from torch import Tensor
 
 from reli3d._bridge import full_precision, present
-from reli3d.io.files import InputError, printable, shown
+from reli3d.errors import InputError, printable, shown
 from reli3d.io.images import above, colour, read_picture, unit
 from reli3d.views.array_cameras import NEUS, read_llff, read_neus
 from reli3d.views.background import Remover

@@ -9,7 +9,7 @@ from pathlib import Path, PureWindowsPath
 
 import numpy as np
 
-from reli3d.io.files import InputError, shown
+from reli3d.errors import InputError, shown
 
 MAX_PATH = 1024
 ORTHONORMAL = 1e-3  # largest entry of R^T R - 1: four digits in a text file; beyond it is a shear or a scale

@@ -22,7 +22,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from reli3d.io.files import InputError, shown
+from reli3d.errors import InputError, shown
 from reli3d.views.frames import Lens, number
 
 DEFAULT_FOV = 0.7  # radians, of the published release

@@ -9,7 +9,7 @@ from pathlib import Path, PurePath
 import numpy as np
 from PIL import Image, ImageChops
 
-from reli3d.io.files import InputError, shown
+from reli3d.errors import InputError, shown
 from reli3d.views.file_names import ENDINGS, FolderIndex, images_below, named
 from reli3d.views.frames import Frame
 

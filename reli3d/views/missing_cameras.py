@@ -6,7 +6,7 @@ import os
 import shlex
 from pathlib import Path
 
-from reli3d.io.files import InputError
+from reli3d.errors import InputError
 from reli3d.views.file_names import ENDINGS, images_in
 
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")

@@ -9,7 +9,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from reli3d.io.files import InputError, read_bytes, shown
+from reli3d.errors import InputError, shown
+from reli3d.io.files import read_bytes
 from reli3d.views.frames import Frame, file_within, number, rigid
 from reli3d.views.lens_keys import check_keys, lens_of
 

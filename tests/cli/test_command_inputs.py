@@ -7,7 +7,7 @@ from safetensors.torch import save_file
 
 from reli3d.cli import data, render, stages, train
 from reli3d.cli import eval as evaluation
-from reli3d.io.files import InputError
+from reli3d.errors import InputError
 from reli3d.synthetic.stored import TENSORS, check_sample
 
 TYPES = {"U8": torch.uint8, "I8": torch.int8, "F16": torch.float16, "F32": torch.float32}

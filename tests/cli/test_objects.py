@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from reli3d.cli import infer, job, objects
-from reli3d.io.files import InputError
+from reli3d.errors import InputError
 from tests.support.checkout import ROOT
 from tests.support.jobs import Start, WordJob
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
-from reli3d.io.files import InputError
+from reli3d.errors import InputError
 from reli3d.io.glb import read_glb, write_glb
 from reli3d.io.gltf import LEFT_OUT
 from reli3d.io.obj import obj_files

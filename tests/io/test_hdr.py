@@ -6,7 +6,7 @@ import OpenEXR
 import pytest
 import torch
 
-from reli3d.io.files import InputError
+from reli3d.errors import InputError
 from reli3d.io.hdr import (
     HALF_MAX,
     read_environment,

@@ -8,7 +8,8 @@ import pytest
 import torch
 from PIL import Image
 
-from reli3d.io.files import InputError, printable, read_bytes, shown, write_bytes
+from reli3d.errors import InputError, printable, shown
+from reli3d.io.files import read_bytes, write_bytes
 from reli3d.io.hdr import read_hdr_image
 from reli3d.io.images import colour, png_bytes, read_image, write_image, write_png
 

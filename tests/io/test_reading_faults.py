@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from reli3d.io.files import InputError, write_bytes
+from reli3d.errors import InputError
+from reli3d.io.files import write_bytes
 from reli3d.io.glb import read_glb
 from reli3d.io.hdr import read_environment, read_hdr_image
 from reli3d.io.images import _several, read_image

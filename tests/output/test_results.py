@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from reli3d.io.files import InputError
+from reli3d.errors import InputError
 from reli3d.output.folder import check_place, claimed, exchanged
 
 OURS = ("a", "b", "c")

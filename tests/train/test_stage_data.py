@@ -11,8 +11,8 @@ import torch
 from PIL import Image
 
 from reli3d.cli import data
+from reli3d.errors import InputError
 from reli3d.geometry.camera import look_at, project
-from reli3d.io.files import InputError
 from reli3d.io.shards import INDEX, read_index
 from reli3d.nn.model import Reconstructor
 from reli3d.nn.presets import TINY

@@ -16,7 +16,7 @@ from PIL import Image
 from torch.distributed.run import get_args_parser
 
 from reli3d.cli import stages
-from reli3d.io.files import InputError
+from reli3d.errors import InputError
 from reli3d.nn.model import Reconstructor
 from reli3d.nn.weights import load_model
 from reli3d.train.pictures import HEIGHT, write_curves

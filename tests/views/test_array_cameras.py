@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from reli3d.io.files import InputError
+from reli3d.errors import InputError
 from reli3d.views.check import verdict
 from reli3d.views.folder import load_views
 from tests.support.rigs import sphere_views

@@ -9,7 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
-from reli3d.io.files import InputError
+from reli3d.errors import InputError
 from reli3d.views.choose import NEAR, choose_views, spread_notes, view_distances
 from reli3d.views.folder import MAX_VIEWS, load_views
 from tests.support import evil

@@ -5,7 +5,7 @@ import pytest
 import torch
 from PIL import Image
 
-from reli3d.io.files import InputError
+from reli3d.errors import InputError
 from reli3d.views.folder import load_views
 from tests.support import colmap_model
 from tests.support.colmap_model import CAMERAS_BIN, IMAGES_BIN

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from reli3d.io.files import InputError
+from reli3d.errors import InputError
 from reli3d.views.folder import load_views
 from tests.support import evil
 from tests.support.colmap_model import write_binary, write_text

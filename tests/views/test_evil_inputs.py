@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from reli3d.io.files import InputError
+from reli3d.errors import InputError
 from reli3d.io.hdr import read_environment
 from reli3d.views.folder import load_views
 from tests.support import evil, evil_maps
@@ -65,7 +65,7 @@ from pathlib import Path
 import torch
 torch.set_num_threads(1)
 from reli3d.views.folder import load_views
-from reli3d.io.files import InputError
+from reli3d.errors import InputError
 from reli3d.io.hdr import read_environment
 from tests.support import evil, evil_maps
 used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()

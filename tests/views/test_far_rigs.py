@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from reli3d.cli import infer
-from reli3d.io.files import InputError
+from reli3d.errors import InputError
 from reli3d.io.glb import glb_bytes, read_glb
 from reli3d.nn.weights import load_model
 from reli3d.pipeline import ReconstructOptions, reconstruct

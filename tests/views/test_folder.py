@@ -6,8 +6,8 @@ import pytest
 import torch
 from PIL import Image
 
+from reli3d.errors import InputError
 from reli3d.geometry.camera import project
-from reli3d.io.files import InputError
 from reli3d.views.folder import MAX_VIEWS, load_views
 from reli3d.views.frames import distortion_pixels
 from tests.support import evil

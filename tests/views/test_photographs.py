@@ -11,8 +11,8 @@ import pytest
 import torch
 from PIL import Image
 
+from reli3d.errors import InputError
 from reli3d.geometry.camera import project
-from reli3d.io.files import InputError
 from reli3d.io.images import read_image
 from reli3d.views.folder import load_views
 from reli3d.views.reduce import LARGE, OBJECT, cut
