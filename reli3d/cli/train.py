@@ -100,7 +100,7 @@ def _check_state(path: Path, model, config: TrainConfig | None = None, *, partly
     import torch
 
     from reli3d.errors import shown
-from reli3d.io.files import file_size
+    from reli3d.io.files import file_size
     from reli3d.nn.weights import check_keys
     from reli3d.train.loop import parameter_groups
     from reli3d.train.pixels import lacking
