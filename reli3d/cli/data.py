@@ -9,8 +9,8 @@ import os
 import sys
 from pathlib import Path
 
-from reli3d.cli import objects, shards
-from reli3d.cli.exit_codes import Parser, check_ranges, command
+from reli3d.cli import objects
+from reli3d.cli.exit_codes import Parser, check_ranges, command, tell
 from reli3d.cli.samples import SampleJob, Wanted
 from reli3d.errors import InputError
 
@@ -66,7 +66,12 @@ def parser() -> argparse.ArgumentParser:
     where.add_argument("--workers", type=int, help="processes of this machine; default one a core")
     where.add_argument("--ray", metavar="ADDRESS", help="render on a Ray cluster: auto, local, or its address")
     p.set_defaults(run=render)
-    shards.add(actions)
+    about = "write samples or captures as tar files (WebDataset)"
+    p = actions.add_parser("pack", help=about, description=f"{about}; keeps existing ones.")
+    p.add_argument("input", type=Path, help="folder of samples, or of captures with transforms.json each")
+    p.add_argument("output", type=Path, help="folder for NNNNNN.tar")
+    p.add_argument("--each", type=int, default=64, help="objects of a tar file")
+    p.set_defaults(run=pack)
     return whole
 
 
@@ -149,6 +154,26 @@ def render(args: argparse.Namespace) -> int:
             lost += 1
             tqdm.write(f"{row.object}: {notes}", file=sys.stderr)
     return 1 if lost else 0
+
+
+def pack(args: argparse.Namespace) -> int:
+    """Write the tar files; captures that are left out are reported."""
+    from reli3d.output.folder import check_folder
+    from reli3d.train.stages import shards
+    from reli3d.train.stages.captures import Captures
+    from reli3d.train.stages.sources import source
+    from reli3d.train.stages.views import Samples
+
+    check_ranges(args, each=(1, 10**6))
+    check_folder(args.output)
+    found = source(args.input)
+    if not isinstance(found, Samples | Captures):
+        raise InputError(args.input, "expected samples or captures, got tar files")
+    if isinstance(found, Captures):
+        for name, reason in found.refused.items():
+            tell(f"{name}: left out, {reason}")
+    shards.pack(found, args.output, each=args.each, progress=tell)
+    return 0
 
 
 if __name__ == "__main__":

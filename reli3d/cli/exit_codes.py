@@ -50,6 +50,11 @@ class Parser(argparse.ArgumentParser):
         _parsed.set(found)
         return found
 
+    def parse_intermixed_args(self, args=None, namespace=None):
+        found = super().parse_intermixed_args(args, namespace)
+        _parsed.set(found)
+        return found
+
     def error(self, message: str):
         raise InputError("arguments", f"{message}; see {self.prog} --help")
 

@@ -19,7 +19,6 @@ COMMANDS = {  # module of reli3d.cli, what it does
     "download": ("download", "fetch and convert the official weights"),
     "data": ("data", "make training samples (also reli3d-data)"),
     "train": ("train", "train the network (also reli3d-train)"),
-    "stages": ("stages", "train the paper's network stage by stage (also reli3d-stages)"),
     "eval": ("eval", "measure the network on held-out objects (also reli3d-eval)"),
     "tables": ("tables", "the paper's tables on a folder of GLB files (also reli3d-tables)"),
     "doctor": ("doctor", "print what is installed, where it runs and whether it can"),

@@ -1,211 +1,279 @@
-"""``reli3d-train``: train the small network on samples that ``reli3d-data`` made."""
+"""``reli3d-train``: train a network, one stage a call."""
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import math
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from reli3d.cli.exit_codes import Parser, check_ranges, command, tell
 from reli3d.errors import InputError
 
 if TYPE_CHECKING:
     from reli3d.nn.local import LocalReconstructor
-    from reli3d.train.loop import TrainConfig
+    from reli3d.nn.model import Reconstructor
+    from reli3d.train.stage import Stage
 
-LICENCE = "Apache-2.0; trained by the reli3d authors, see docs/model.md for the data"
-SIDES = 64, 128, 256  # of the pictures for the 2D U-Net alone
-CALIBRATED = 5  # views of a sample: four are input, one is looked at
+SMALL_STAGES = ("pixels", "small")
+SIDES = 64, 128, 256  # of the images of stage pixels
+CALIBRATED = 5  # views of a sample: four are input, one is compared
+OF_LOOP = ("steps", "minutes", "batch", "rate", "seed", "save_every", "tensorboard")
+OF_ALL = (*OF_LOOP, "weights", "validation", "export", "licence", "max_views", "bfloat16")
+OF_SMALL = ("points", "pyramid_rate", "maps")
+OF_CONFIG = ("image_size", "patch", "targets", "lobes", "resolution", "samples", "shadows")  # of a StageConfig
+OF_PAPER = (*OF_CONFIG, "preset", "prior", "perceptual", "checkpointing", "shard", "device")
 
 
 def parser() -> argparse.ArgumentParser:
     p = Parser(
         prog="reli3d-train",
-        description="Train the small network; continues where it stopped.  Under torchrun the processes share "
-        "each batch.",
+        description="Train a network, one stage a call; continues where it stopped.  Under torchrun the processes "
+        "share each batch.",
+        argument_default=argparse.SUPPRESS,
     )
-    p.add_argument("samples", type=Path, help="folder of samples made by reli3d-data")
-    p.add_argument("output", type=Path, help="folder of the checkpoint, the log, the curves and validation pictures")
-    p.add_argument("--steps", type=int, default=20000)
-    p.add_argument("--minutes", type=float, default=float("inf"), help="end of the schedule in minutes of training")
-    p.add_argument("--batch", type=int, default=4, help="objects a step")
-    p.add_argument("--points", type=int, default=2048, help="volume points an object")
-    p.add_argument("--max-views", type=int, default=6)
-    p.add_argument("--rate", type=float, default=1.5e-3, help="peak learning rate")
+    # torchrun reads the whole line first: an option that is the beginning of one of its own would be ambiguous
     p.add_argument(
-        "--pyramid-rate",
-        type=float,
-        default=1.0,
-        metavar="TIMES",
-        help="of the 2D U-Net, in units of --rate: 0.1 keeps what --pixels taught it",
+        "data", type=Path, nargs="*", default=[], help="folders of samples; of the paper's stages also captures, shards"
     )
-    p.add_argument("--seed", type=int, default=0)
+    p.add_argument("output", type=Path, help="folder of the checkpoint, the log, the curves and validation images")
     p.add_argument(
-        "--pixels",
-        type=int,
-        choices=SIDES,
-        default=0,
-        metavar="SIDE",
-        help="train the 2D U-Net alone, on what the pixels of all views show, in pictures of 64, 128 or 256 "
-        "pixels (of samples of 256): first the coarse levels on small pictures, many of them in an hour, then finer "
-        "ones; then go on without",
+        "--stage",
+        default="small",
+        help="pixels, small: the small network, its 2D U-Net alone or all of it; volume, gaussians, surface, "
+        "monte_carlo: the paper's network of preset tiny; volume, gaussians128, gaussians256, gaussians512, "
+        "monte_carlo: of preset official",
     )
-    p.add_argument("--bfloat16", action="store_true", help="of the convolutions: faster where the processor has it")
     p.add_argument(
         "--weights",
-        type=Path,
-        help="begin with these weights, not with random ones: small, "
-        "a safetensors file, or the averaged ones of another run's state.pt",
+        help="initial weights: the averaged ones of a checkpoint (state.pt of this or the stage before), a safetensors "
+        "file, or small; random without it",
     )
-    p.add_argument("--maps", type=Path, help="environment maps, .npz, under which about half of the draws are relit")
-    p.add_argument(
-        "--validation",
-        type=Path,
-        help="folder of held-back samples: drawn at every checkpoint; what --export calibrates on",
+    p.add_argument("--validation", type=Path, help="folder of held-out objects: shown at every checkpoint")
+    p.add_argument("--export", type=Path, help="write the averaged weights of the checkpoint to this file and stop")
+    p.add_argument("--licence", help="of the exported weights")
+    loop = p.add_argument_group("schedule (defaults of the stage)")
+    loop.add_argument("--steps", type=int)
+    loop.add_argument("--minutes", type=float, help="of training, if the steps take longer")
+    loop.add_argument("--batch", type=int, help="objects a step, over all processes")
+    loop.add_argument("--rate", type=float, help="peak learning rate")
+    loop.add_argument("--max-views", type=int, help="an object is read from 1 to this many views")
+    loop.add_argument("--seed", type=int)
+    loop.add_argument("--save-every", type=int, metavar="STEPS")
+    loop.add_argument("--bfloat16", action="store_true", help="convolutions, or the trunk, in bfloat16")
+    loop.add_argument("--tensorboard", type=Path, metavar="DIR", help="also write event files to this folder")
+    small = p.add_argument_group("stages pixels and small")
+    small.add_argument("--points", type=int, help="volume points an object")
+    small.add_argument(
+        "--pyramid-rate",
+        type=float,
+        metavar="TIMES",
+        help="of the 2D U-Net over --rate: 0.1 keeps what pixels taught",
     )
-    p.add_argument(
-        "--export",
-        type=Path,
-        help="write the averaged weights of the checkpoint, calibrated on --validation or else the samples, to this "
-        "file and stop",
-    )
+    small.add_argument("--maps", type=Path, help="environment maps, .npz: half of the draws are relit under them")
+    paper = p.add_argument_group("stages of the paper's network, and --image-size of pixels")
+    paper.add_argument("--image-size", type=int, help="pixels of a side; of stage pixels 64 (default), 128 or 256")
+    paper.add_argument("--preset", choices=("tiny", "official"))
+    paper.add_argument("--prior", type=Path, help="light prior of reli3d.train.light_prior, fixed; adds a loss")
+    paper.add_argument("--perceptual", choices=("gradients", "lpips"))
+    paper.add_argument("--checkpointing", action="store_true", help="recompute the trunk's layers in the backward pass")
+    paper.add_argument("--shard", action="store_true", help="divide the trunk among the processes of torchrun (FSDP)")
+    paper.add_argument("--device", choices=("cpu", "cuda"))
+    for name in ("patch", "targets", "lobes", "resolution"):
+        paper.add_argument(f"--{name}", type=int)
+    paper.add_argument("--samples", type=int, nargs=3, metavar=("LIGHT", "NORMALS", "COSINE"))
+    paper.add_argument("--shadows", action=argparse.BooleanOptionalAction)
     return p
 
 
-def _check(args: argparse.Namespace) -> None:
-    """Raise InputError for what would end the work later."""
+def parsed(argv: list[str] | None) -> argparse.Namespace:
+    """The arguments, checked as far as possible without reading data.  Raises InputError."""
     from reli3d.output.folder import check_folder
-    from reli3d.synthetic.stored import check_samples
+    from reli3d.train.log import summary_writer
 
-    check_ranges(args, steps=(1, 10**9), minutes=(1e-3, math.inf), batch=(1, 4096), points=(2, 16384))
-    check_ranges(args, max_views=(1, 16), rate=(1e-9, 10.0), pyramid_rate=(1e-6, 10.0))
-    check_ranges(args, seed=(0, 10**9))
+    args = parser().parse_intermixed_args(argv)
+    own = OF_SMALL if args.stage in SMALL_STAGES else OF_PAPER
+    own = (*own, "image_size") if args.stage == "pixels" else own
+    for name in vars(args):
+        if name not in ("data", "output", "stage", "traceback", *OF_ALL, *own):
+            raise InputError(f"--{name.replace('_', '-')}", f"expected none for stage {args.stage}; leave it out")
+    check_ranges(args, steps=(0, 10**9), minutes=(1e-3, math.inf), batch=(1, 4096), rate=(1e-9, 10.0), seed=(0, 10**9))
+    check_ranges(args, save_every=(1, 10**9), max_views=(1, 16), points=(2, 16384), pyramid_rate=(1e-6, 10.0))
+    check_ranges(args, image_size=(8, 2048), patch=(0, 2048), targets=(1, 16), lobes=(1, 4096), resolution=(4, 256))
     check_folder(args.output)
-    if args.pixels and (args.maps or args.export):
-        raise InputError("--pixels", f"expected neither --maps nor --export with it, got {args.maps or args.export}")
-    if args.export:
+    if "export" in args:
         check_folder(args.export.parent)
-    if not args.export or not args.validation:
-        check_samples(args.samples, "samples", views=CALIBRATED if args.export else 1, points=not args.pixels)
-    if args.validation:
-        check_samples(args.validation, "validation", views=CALIBRATED)
+    if "tensorboard" in args:
+        check_folder(args.tensorboard)
+        summary_writer()
+    return args
 
 
-def _check_state(path: Path, model, config: TrainConfig | None = None, *, partly: bool = False) -> None:
-    """Raise InputError where ``path`` is not a whole checkpoint of ``model``, or where ``config`` cannot go on from
-    it.  partly: it may be one of small pictures.
-    """
-    import torch
-
-    from reli3d.errors import shown
-    from reli3d.io.files import file_size
-    from reli3d.nn.weights import check_keys
-    from reli3d.train.loop import parameter_groups
-    from reli3d.train.pixels import lacking
-
-    def sizes(groups: list[dict]) -> list[tuple]:
-        return [(len(group["params"]), group.get("times")) for group in groups]
-
-    file_size(path)
-    try:
-        state = torch.load(path, weights_only=True, mmap=True)
-        shapes = [{k: tuple(v.shape) for k, v in state[name].items()} for name in ("model", "average")]
-        found_sizes, step, seconds = sizes(state["optimizer"]["param_groups"]), state["step"], state["seconds"]
-        whole = isinstance(step, int) and step >= 0 and seconds >= 0
-    except Exception as error:  # of a broken file torch, pickle and zipfile raise almost anything
-        reason = shown(" ".join(str(error).split()))
-        raise InputError(
-            path, f"expected a checkpoint of this training, got a broken file ({reason}); remove it to start again"
-        ) from None
-    if config and found_sizes != sizes(parameter_groups(model, config)):
-        raise InputError(
-            path,
-            "expected a checkpoint of the same training, got one of other parameters or an earlier version; "
-            "name another output folder, and this file by --weights",
-        )
-    wanted = {k: tuple(v.shape) for k, v in model.state_dict().items()}
-    for found in shapes:
-        begun_anew = lacking(model.preset, found) if partly else set()
-        check_keys(path, found, {k: shape for k, shape in wanted.items() if k not in begun_anew})
-    if not whole:
-        raise InputError(path, "expected a checkpoint of this training, got another one; remove it to start again")
+def given(args: argparse.Namespace, *names: str) -> dict[str, Any]:
+    """Those of the options that are given."""
+    return {name: getattr(args, name) for name in names if name in args}
 
 
-def _begun(start: Path | None, pixels: int) -> LocalReconstructor:
-    """The network with the weights of ``start``, or with random ones; the one for pictures of ``pixels`` a side.
-    Raises InputError for another network's.
-    """
+def small_stage(args: argparse.Namespace) -> Stage:
+    """The stages pixels and small."""
+    from reli3d.synthetic.stored import check_samples
     from reli3d.train.pixels import for_small_pictures
+    from reli3d.train.small import PixelStage, SmallStage
 
-    model = _whole(start)
-    finest = SIDES[::-1].index(pixels) if pixels else 0
-    return for_small_pictures(model, finest).train() if finest else model
+    pixels = args.stage == "pixels"
+    if pixels and "export" in args:
+        raise InputError("--export", "expected stage small, got pixels; train --stage small from it first")
+    exporting = "export" in args
+    if not args.data and not (exporting and "validation" in args):
+        raise InputError("data", "expected folders of samples, got none; make them with reli3d-data")
+    if not (exporting and "validation" in args):
+        for folder in args.data:
+            check_samples(folder, "data", views=CALIBRATED if exporting else 1, points=not pixels)
+    if "validation" in args:
+        check_samples(args.validation, "validation", views=CALIBRATED)
+    side = getattr(args, "image_size", SIDES[0])
+    if pixels and side not in SIDES:
+        raise InputError("--image-size", f"expected {', '.join(map(str, SIDES))} for stage pixels, got {side}")
+    model = small_network(getattr(args, "weights", None))
+    finest = SIDES[::-1].index(side) if pixels else 0
+    model = for_small_pictures(model, finest).train() if finest else model
+    names = ("seed", "max_views", "points", "pyramid_rate", "bfloat16", "maps", "validation")
+    return (PixelStage if pixels else SmallStage)(model, args.data, **given(args, *names))
 
 
-def _whole(start: Path | None) -> LocalReconstructor:
-    import torch
-
+def small_network(start: str | None) -> LocalReconstructor:
+    """The small network with the weights of ``start``, or with random ones.  A checkpoint may lack the finer levels."""
     from reli3d.nn import weights
     from reli3d.nn.local import LocalReconstructor
     from reli3d.nn.presets import SMALL
-    from reli3d.train.pixels import take_levels
+    from reli3d.train import checkpoint
+    from reli3d.train.pixels import lacking, take_levels
 
-    if start is None or start.suffix == ".pt":
+    if start is None or start.endswith(".pt"):
         model = LocalReconstructor(SMALL)
         if start:
-            _check_state(start, model, partly=True)
-            take_levels(model, torch.load(start, weights_only=True)["average"])
+            average = checkpoint.load(Path(start))["average"]
+            checkpoint.check_shapes(Path(start), average, model, lacking(model.preset, average))
+            take_levels(model, average)
         return model.train()
-    found = weights.load_model(str(start), "cpu")
+    found = weights.load_model(start, "cpu")
     if not isinstance(found, LocalReconstructor):
-        raise InputError("--weights", f"expected a network of convolutions, got the preset {found.preset.name}")
+        raise InputError("--weights", f"expected the small network, got the preset {found.preset.name}")
     return found.train().requires_grad_(True)
+
+
+def paper_stage(args: argparse.Namespace) -> Stage:
+    """The stages of the paper's network."""
+    import torch
+
+    from reli3d.nn.model import Reconstructor
+    from reli3d.nn.presets import OFFICIAL, TINY
+    from reli3d.train.stages import config
+    from reli3d.train.stages.latents import fitted, load_prior
+    from reli3d.train.stages.sources import source
+    from reli3d.train.stages.stage import PaperStage
+    from reli3d.train.stages.views import Samples
+
+    preset, stages = (OFFICIAL, config.PAPER) if getattr(args, "preset", "") == "official" else (TINY, config.TINY)
+    if args.stage not in stages:
+        known = ", ".join((*SMALL_STAGES, *stages))
+        raise InputError("--stage", f"expected {known} for preset {preset.name}, got {args.stage}")
+    if not args.data and "export" not in args:
+        raise InputError("data", "expected folders of samples, captures or shards, got none")
+    device = getattr(args, "device", "cpu")
+    if device == "cuda" and not torch.cuda.is_available():
+        raise InputError("--device", "expected a CUDA device, got none; leave it out to train on the CPU")
+    numbers = given(args, *OF_CONFIG)
+    if "samples" in numbers:
+        numbers["samples"] = tuple(numbers["samples"])
+    one = dataclasses.replace(stages[args.stage], **numbers)
+    sources = [source(folder) for folder in args.data]
+    held_out = source(args.validation) if "validation" in args and "export" not in args else None
+    model = Reconstructor(preset)
+    if "weights" in args:
+        start_from(args.weights, model)
+    if "prior" in args:
+        load_prior(model, args.prior)
+        for folder, samples in zip(args.data, sources, strict=True):
+            if isinstance(samples, Samples):
+                cache = args.output / f"{folder.name}.latents"
+                samples.latents = fitted(model.environment, samples.files, cache, progress=tell)
+    names = ("seed", "max_views", "bfloat16", "checkpointing")
+    return PaperStage(
+        model.to(device),
+        one,
+        sources,
+        distance=getattr(args, "perceptual", "gradients"),
+        validation=held_out,
+        folders=[str(folder) for folder in args.data],
+        **given(args, *names),
+    )
+
+
+def start_from(start: str, model: Reconstructor) -> None:
+    """Load the averaged weights of a checkpoint, or a file of weights, into ``model``.  Raises InputError."""
+    from reli3d.nn import weights
+    from reli3d.train import checkpoint
+
+    if start.endswith(".pt"):
+        average = checkpoint.load(Path(start))["average"]
+        checkpoint.check_shapes(Path(start), average, model)
+    else:
+        found = weights.load_model(start, "cpu")
+        if found.preset != model.preset:
+            raise InputError("--weights", f"expected preset {model.preset.name}, got {found.preset.name}")
+        average = found.state_dict()
+    model.load_state_dict(average)
+
+
+def export(args: argparse.Namespace, stage: Stage) -> LocalReconstructor | Reconstructor:
+    """The averaged network of the checkpoint, calibrated if it is the small one.  Raises InputError for one that has
+    no surface.
+    """
+    from reli3d.nn.local import LocalReconstructor
+    from reli3d.train import checkpoint
+    from reli3d.train.calibrate import calibrate
+
+    model: Any = stage.model
+    path = args.output / "state.pt"
+    state = checkpoint.load(path)
+    checkpoint.check_shapes(path, state["average"], model)
+    model.load_state_dict(state["average"])
+    model.eval()
+    if state["measures"].get("surface", 1.0) == 0.0:
+        from reli3d.train.stages.stage import no_surface
+
+        raise no_surface(path)
+    if isinstance(model, LocalReconstructor):
+        samples = args.validation if "validation" in args else args.data[0]
+        for views, tried in calibrate(model, samples, progress=tell).items():
+            row = ", ".join(f"{offset:g}: {iou:.4f}" for offset, iou in tried.items())
+            tell(f"silhouette IoU by surface offset, {views} views: {row}")
+        tell(f"chosen: {model.preset.offset_one_view:g}, of many views {model.preset.offset_many_views:g}")
+    return model
 
 
 @command("reli3d-train")
 def main(argv: list[str] | None = None) -> int:
-    args = parser().parse_args(argv)
-    _check(args)
+    args = parsed(argv)
     import torch
 
     from reli3d.nn import weights
-    from reli3d.train.calibrate import calibrate
-    from reli3d.train.loop import TrainConfig, averaged_model, train
+    from reli3d.train.loop import train
     from reli3d.train.workers import Workers
 
-    torch.manual_seed(args.seed)
-    model = _begun(args.weights, args.pixels)
-    state = args.output / "state.pt"
-    config = TrainConfig(
-        samples=str(args.samples),
-        output=str(args.output),
-        steps=args.steps,
-        minutes=args.minutes,
-        batch=args.batch,
-        points=args.points,
-        max_views=args.max_views,
-        rate=args.rate,
-        pyramid_rate=args.pyramid_rate,
-        seed=args.seed,
-        pixels=args.pixels,
-        bfloat16=args.bfloat16,
-        maps=str(args.maps or ""),
-        validation=str(args.validation or ""),
-    )
-    if args.export or state.exists():
-        _check_state(state, model, None if args.export else config)
-    if args.export:
-        averaged_model(state, model)
-        for views, tried in calibrate(model, args.validation or args.samples, progress=tell).items():
-            row = ", ".join(f"{offset:g}: {iou:.4f}" for offset, iou in tried.items())
-            tell(f"silhouette IoU by surface offset, {views} views: {row}")
-        tell(f"chosen: {model.preset.offset_one_view:g}, of many views {model.preset.offset_many_views:g}")
-        print(weights.save(args.export, model, licence=LICENCE).path)
+    torch.manual_seed(getattr(args, "seed", 0))
+    stage = (small_stage if args.stage in SMALL_STAGES else paper_stage)(args)
+    if "export" in args:
+        print(weights.save(args.export, export(args, stage), licence=getattr(args, "licence", "not stated")).path)
         return 0
+    settings = given(args, *OF_LOOP, "shard")
+    if "tensorboard" in settings:
+        settings["tensorboard"] = str(settings["tensorboard"])
     workers = Workers.join()
-    train(model, config, workers)
+    train(stage, stage.options(str(args.output), **settings), workers)
     workers.leave()
     return 0
 

@@ -25,8 +25,8 @@ from reli3d.render.gbuffer import surface_points
 from reli3d.render.latlong import quarter_turn
 from reli3d.synthetic.procedural import make_object
 from reli3d.synthetic.samples import ObjectSurface
+from reli3d.train.batches import stored_views
 from reli3d.train.light_prior import scale_free
-from reli3d.train.pictures import sample_views
 
 UNSEEN = 8  # the last views are looked at, the first are input
 BLACK = 0.01  # added to radiance before the logarithm
@@ -102,7 +102,7 @@ def evaluate(
         raise ValueError(f"count: expected 1 to {last - UNSEEN} of {last} views, got {count}")
     try:
         options = ReconstructOptions(texture_size=512, symmetry=symmetry)
-        asset = reconstruct(sample_views(sample, count), weights=model, options=options)
+        asset = reconstruct(stored_views(sample, count), weights=model, options=options)
     except NoSurface:
         return {"empty": 1.0, "iou": 0.0}
     scene, size = RayScene(asset.mesh.vertices, asset.mesh.faces), sample["images"].shape[1]

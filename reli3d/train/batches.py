@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from torch.nn import functional
 from reli3d.geometry.hull import mask_distance
 from reli3d.render.latlong import lat_long_directions, quarter_turn
 from reli3d.train.relight import Finish, draw_light, relit
+from reli3d.views.views import Views
 
 TURNED_UP = 0.12  # share of objects whose world is not +Y up: captures come in any frame
 NOISE = 0.012  # greatest standard deviation of a photograph's noise, sRGB
@@ -153,31 +154,30 @@ def load_sample(
     )
 
 
-def batches(
-    folder: Path,
+def draw_samples(
+    files: Sequence[Path],
+    seeds: Iterable[tuple[int, ...]],
     *,
-    size: int,
     points: int,
     max_views: int,
-    seed: int,
-    start: int = 0,
-    rank: int = 0,
     lights: Tensor | None = None,
-) -> Iterator[list[Sample]]:
-    """Endless lists of ``size`` objects, each with 1 to ``max_views`` views; step ``k`` is a function of ``seed`` and
-    ``k`` alone for a fixed folder, so training resumes; ``rank`` tells processes apart that share a step; ``lights``
-    as in :func:`load_sample`.
-    """
-    files, step = sorted(folder.glob("*.safetensors")), start
-    if not files:
-        raise ValueError(f"samples: expected *.safetensors files, got none in {folder}")
-    while True:
-        if step % 50 == 0:  # samples may still be arriving
-            files = sorted(folder.glob("*.safetensors"))
-        rng = np.random.default_rng((seed, step, rank))
-        drawn = []
-        for _ in range(size):
-            file, count = files[int(rng.integers(len(files)))], int(rng.integers(1, max_views + 1))
-            drawn.append(load_sample(file, count, points, rng, lights=lights))
-        yield drawn
-        step += 1
+) -> list[Sample]:
+    """A random object of ``files`` for each of ``seeds``, read from 1 to ``max_views`` views."""
+    drawn = []
+    for seed in seeds:
+        rng = np.random.default_rng(seed)
+        file, views = files[int(rng.integers(len(files)))], int(rng.integers(1, max_views + 1))
+        drawn.append(load_sample(file, views, points, rng, lights=lights))
+    return drawn
+
+
+def stored_views(sample: dict[str, Tensor], count: int) -> Views:
+    """The first ``count`` views of a stored sample, as the pipeline takes them."""
+    images = sample["images"][:count].float() / 255
+    return Views(
+        tuple(images[..., :3].contiguous()),
+        tuple(images[..., 3].contiguous()),
+        sample["c2w"][:count],
+        sample["intrinsics"][:count],
+        tuple(f"{i:04d}" for i in range(count)),
+    )

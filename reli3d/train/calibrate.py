@@ -21,7 +21,7 @@ from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene
 from reli3d.nn.presets import LocalPreset
 from reli3d.pipeline import Network, NoSurface, encode, extract, prepare
-from reli3d.train.pictures import sample_views
+from reli3d.train.batches import stored_views
 from reli3d.views.similarity import Similarity
 
 OFFSETS = (0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 3.0, 5.0)  # of the logit; the last: the hull
@@ -57,7 +57,7 @@ def calibrate(
     for k in chosen:
         sample = load_file(files[k])
         for count, rows in scores.items():
-            field = encode(model, prepare(model, sample_views(sample, count), Similarity.identity()))
+            field = encode(model, prepare(model, stored_views(sample, count), Similarity.identity()))
             rows.append([])
             for offset in OFFSETS:
                 model.preset = replace(plain, offset_one_view=offset, offset_many_views=offset)

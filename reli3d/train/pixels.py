@@ -7,7 +7,7 @@ nothing (after Karras and others 2018, Progressive Growing of GANs, arXiv 1710.1
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterator
+from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
@@ -24,7 +24,7 @@ from reli3d.nn.presets import LocalPreset
 from reli3d.nn.pyramid import ImagePyramid, place_of_pixels, span_of_pixels
 from reli3d.train.batches import KEPT, NOISE, Pictures
 
-KEEPS = 1 << 31  # bytes of small pictures that a process holds, so that they are not read again
+CACHE_BYTES = 1 << 31  # of small images in the memory of a process
 
 
 @dataclass(frozen=True)
@@ -145,34 +145,30 @@ def augmented(views: Pictures, rng: np.random.Generator) -> Pictures:
     return replace(views, images=color, view_material=material.contiguous(), **changed)
 
 
-def groups_of_views(
-    folder: Path, *, size: int, finest: int, max_views: int, seed: int, start: int = 0, rank: int = 0
-) -> Iterator[list[Group]]:
-    """Endless lists of one Group: all views of ``size`` files, parted into objects of 1 to ``max_views`` views.
+class ViewCache:
+    """All views of samples, ``2**finest`` times smaller; up to ``CACHE_BYTES`` of them stay in memory."""
 
-    The pictures are as large as level ``finest`` of the 2D U-Net reads them.  Step ``k`` is a function of ``seed`` and
-    ``k`` alone for a fixed folder; ``rank`` tells processes apart.
-    """
-    files, step = sorted(folder.glob("*.safetensors")), start
-    if not files:
-        raise ValueError(f"samples: expected *.safetensors files, got none in {folder}")
-    kept: dict[Path, Pictures] = {}
-    held = 0
-    while True:
-        if step % 50 == 0:  # samples may still be arriving
-            files = sorted(folder.glob("*.safetensors"))
-        rng = np.random.default_rng((seed, step, rank))
-        objects = []
-        for _ in range(size):
-            path = files[int(rng.integers(len(files)))]
-            views = kept.get(path) or read_pictures(path, 1 << finest)
-            if path not in kept and held < KEEPS:
-                kept[path] = views
-                held += sum(getattr(views, f.name).nbytes for f in fields(views))
-            views, first = augmented(views, rng), 0
-            while first < len(views.masks):
-                count = int(rng.integers(1, max_views + 1))
-                objects.append(views.of_views(slice(first, first + count)))
-                first += count
-        yield [Group.of(objects)]
-        step += 1
+    def __init__(self, finest: int):
+        self.finest, self._kept, self._bytes = finest, dict[Path, Pictures](), 0
+
+    def __getitem__(self, path: Path) -> Pictures:
+        if path in self._kept:
+            return self._kept[path]
+        views = read_pictures(path, 1 << self.finest)
+        if self._bytes < CACHE_BYTES:
+            self._kept[path] = views
+            self._bytes += sum(getattr(views, f.name).nbytes for f in fields(views))
+        return views
+
+
+def draw_group(files: Sequence[Path], seeds: Iterable[tuple[int, ...]], cache: ViewCache, *, max_views: int) -> Group:
+    """All views of a random file for each of ``seeds``, divided into objects of 1 to ``max_views`` views."""
+    objects = []
+    for seed in seeds:
+        rng = np.random.default_rng(seed)
+        views, first = augmented(cache[files[int(rng.integers(len(files)))]], rng), 0
+        while first < len(views.masks):
+            count = int(rng.integers(1, max_views + 1))
+            objects.append(views.of_views(slice(first, first + count)))
+            first += count
+    return Group.of(objects)

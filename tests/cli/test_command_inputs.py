@@ -5,7 +5,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from reli3d.cli import data, render, stages, train
+from reli3d.cli import data, render, train
 from reli3d.cli import eval as evaluation
 from reli3d.errors import InputError
 from reli3d.synthetic.stored import TENSORS, check_sample
@@ -104,18 +104,17 @@ CASES = [
     (data, ["pack", "none", "out"], "none"),
     (data, ["pack", "empty", "out"], "captures"),
     (data, ["pack", "good", "out", "--each", "0"], "--each"),
-    (data, ["check", "empty"], "not found"),
-    (data, ["show", "empty"], "not found"),
     *(
-        (stages, [stage, "out", "good", *options], word)
-        for stage, options, word in [
-            ("nothing", [], "stage"),
-            ("volume", ["--steps", "-1"], "--steps"),
-            ("volume", ["--rate", "nan"], "--rate"),
-            ("volume", ["--inputs", "17"], "inputs"),
-            ("volume", ["--start-from", "none"], "none"),
-            ("volume", ["--prior", "file"], "light prior"),
-            ("volume", ["--patch", "999"], "patch"),
+        (train, ["good", "out", "--stage", *options], word)
+        for options, word in [
+            (["nothing"], "--stage"),
+            (["volume", "--steps", "-1"], "--steps"),
+            (["volume", "--rate", "nan"], "--rate"),
+            (["volume", "--max-views", "17"], "--max-views"),
+            (["volume", "--weights", "none.pt"], "none.pt: file not found"),
+            (["volume", "--prior", "file"], "light prior"),
+            (["volume", "--patch", "999"], "patch"),
+            (["pixels", "--image-size", "32"], "--image-size"),
         ]
     ),
     *(
@@ -135,7 +134,7 @@ CASES = [
         (train, ["good", "out", *options], word)
         for options, word in [
             (["--batch", "0"], "--batch"),
-            (["--steps", "0"], "--steps"),
+            (["--steps", "-1"], "--steps"),
             (["--minutes", "nan"], "--minutes"),
             (["--points", "0"], "--points"),
             (["--max-views", "0"], "--max-views"),

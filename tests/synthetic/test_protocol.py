@@ -14,7 +14,7 @@ from reli3d.synthetic import protocol
 from reli3d.synthetic.procedural import make_object
 from reli3d.synthetic.protocol import fields_of_view, framed_cameras, lights_of, protocol_sample
 from reli3d.synthetic.samples import ObjectSurface
-from reli3d.train.stages.config import Stage
+from reli3d.train.stages.config import StageConfig
 from reli3d.train.stages.losses import gradients
 from reli3d.train.stages.step import object_losses
 from reli3d.train.stages.views import Samples, draw
@@ -135,7 +135,7 @@ def test_the_command_writes_a_file_for_each_light(rendered):
 
 
 def test_what_is_not_known_is_none_and_takes_part_in_no_loss(rendered):
-    stage = Stage("gaussians", "gaussians", 16, lobes=16)
+    stage = StageConfig("gaussians", "gaussians", 16, lobes=16)
     sizes = dict(inputs=2, targets=1, background=1.0, input_size=32, target_size=16, patch=0)
     for name, known in (("rgb", False), ("pbr", True)):
         source = Samples(rendered / name)

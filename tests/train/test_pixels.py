@@ -15,18 +15,20 @@ from reli3d.nn.local import LocalReconstructor
 from reli3d.nn.presets import SMALL
 from reli3d.nn.pyramid import ImagePyramid
 from reli3d.train.batches import Pictures, load_sample
-from reli3d.train.loop import TrainConfig, train
+from reli3d.train.loop import train
 from reli3d.train.losses import PIXEL_TERMS, losses, pixel_losses
 from reli3d.train.pixels import (
     Group,
+    ViewCache,
     augmented,
+    draw_group,
     for_small_pictures,
-    groups_of_views,
     predicted,
     predicts,
     read_pictures,
     take_levels,
 )
+from reli3d.train.small import PixelStage
 
 
 @pytest.fixture(scope="module")
@@ -138,11 +140,11 @@ def test_an_object_without_a_whole_pixel_says_nothing(files):
 
 
 def test_a_checkpoint_of_small_pictures_is_no_whole_network(folder, tmp_path, capsys):
-    few = ["--steps", "1", "--batch", "1", "--points", "64"]
-    assert main([str(folder), str(tmp_path / "64"), "--pixels", "64", *few]) == 0
+    few = ["--steps", "1", "--batch", "1"]
+    assert main([str(folder), str(tmp_path / "64"), "--stage", "pixels", "--image-size", "64", *few]) == 0
     assert main([str(folder), str(tmp_path / "64"), "--export", str(tmp_path / "net.safetensors")]) == 2
     assert not (tmp_path / "net.safetensors").exists()
-    assert main([str(folder), str(tmp_path / "64"), "--pixels", "128", *few]) == 2
+    assert main([str(folder), str(tmp_path / "64"), "--stage", "pixels", "--image-size", "128", *few]) == 2
     assert "name another output folder, and this file by --weights" in capsys.readouterr().err
     state = torch.load(tmp_path / "64" / "state.pt", weights_only=True)
     del state["average"]["pyramid.shared.weight"]
@@ -151,20 +153,21 @@ def test_a_checkpoint_of_small_pictures_is_no_whole_network(folder, tmp_path, ca
 
 
 def test_every_view_of_a_drawn_object_is_read_once(folder):
-    (group,) = next(groups_of_views(folder, size=3, finest=2, max_views=4, seed=1))
+    files, cache = sorted(folder.glob("*.safetensors")), ViewCache(2)
+    group = draw_group(files, [(1, k) for k in range(3)], cache, max_views=4)
     assert sum(group.counts) == len(group.views.masks) == 18 and max(group.counts) <= 4
-    (again,) = next(groups_of_views(folder, size=3, finest=2, max_views=4, seed=1))
+    again = draw_group(files, [(1, k) for k in range(3)], cache, max_views=4)
     assert again.counts == group.counts and torch.equal(again.views.images, group.views.images)
-    (other,) = next(groups_of_views(folder, size=3, finest=2, max_views=4, seed=1, rank=1))
+    other = draw_group(files, [(2, k) for k in range(3)], cache, max_views=4)
     assert not torch.equal(other.views.c2w, group.views.c2w)
 
 
 def test_levels_are_taught_one_after_the_other(folder, tmp_path):
     """From pictures of 64 pixels to the whole network by the command; each stage keeps what the one before knew."""
-    start = ["--steps", "2", "--batch", "2", "--rate", "1e-9", "--points", "64"]
-    assert main([str(folder), str(tmp_path / "64"), "--pixels", "64", *start]) == 0
+    start = ["--steps", "2", "--batch", "2", "--rate", "1e-9"]
+    assert main([str(folder), str(tmp_path / "64"), "--stage", "pixels", "--image-size", "64", *start]) == 0
     from_64, from_128 = (["--weights", str(tmp_path / name / "state.pt")] for name in ("64", "128"))
-    assert main([str(folder), str(tmp_path / "128"), "--pixels", "128", *from_64, *start]) == 0
+    assert main([str(folder), str(tmp_path / "128"), "--stage", "pixels", "--image-size", "128", *from_64, *start]) == 0
     assert main([str(folder), str(tmp_path / "all"), *from_128, *start]) == 0
     small, middle, whole = (
         torch.load(tmp_path / name / "state.pt", weights_only=True)["average"] for name in ("64", "128", "all")
@@ -179,7 +182,8 @@ def test_training_of_pixels_teaches_the_2d_u_net_alone(folder, tmp_path):
     for side, finest in ((256, 0), (64, 2)):
         model = learned(finest)
         before = {k: v.clone() for k, v in model.state_dict().items()}
-        train(model, TrainConfig(str(folder), str(tmp_path / str(side)), steps=3, batch=1, warmup=1, pixels=side))
+        stage = PixelStage(model, [folder])
+        train(stage, stage.options(str(tmp_path / str(side)), steps=3, batch=1, warmup=1))
         changed = {k for k, v in model.state_dict().items() if not torch.equal(v, before[k])}
         assert changed == {k for k in before if predicts(k)} and len(changed) > 20
 
@@ -199,7 +203,7 @@ def test_samples_of_views_alone_teach_the_2d_u_net_and_nothing_else(tmp_path, ca
         assert float((views.view_depth - whole.view_depth)[both].abs().mean()) < 0.005
         one, other = (avg_pool2d(v.images.permute(0, 3, 1, 2), 8) for v in (views, whole))
         assert float((one - other).abs().mean()) < 0.03
-    few = ["--steps", "1", "--batch", "1", "--points", "64"]
-    assert main([str(tmp_path / "views"), str(tmp_path / "run"), "--pixels", "64", *few]) == 0
+    few = ["--steps", "1", "--batch", "1"]
+    assert main([str(tmp_path / "views"), str(tmp_path / "run"), "--stage", "pixels", "--image-size", "64", *few]) == 0
     assert main([str(tmp_path / "views"), str(tmp_path / "other"), *few]) == 2
     assert "points: expected F16" in capsys.readouterr().err

@@ -13,21 +13,21 @@ import pytest
 import torch
 
 from reli3d.train.stages import step as stage_step
-from reli3d.train.stages.config import Stage, Weights
+from reli3d.train.stages.config import StageConfig, Weights
 from reli3d.train.stages.losses import gradients
 from reli3d.train.stages.step import object_losses, total
 from reli3d.train.stages.surface import render_surface, surface
 from reli3d.train.stages.views import Samples, draw
 from tests.support.stages import ball_model, camera, write_samples
 
-VOLUME = Stage("volume", "volume", 24, lobes=16, grid=8, samples_along=32)
-GAUSSIANS = Stage("gaussians", "gaussians", 24, lobes=16)
+VOLUME = StageConfig("volume", "volume", 24, lobes=16, grid=8, samples_along=32)
+GAUSSIANS = StageConfig("gaussians", "gaussians", 24, lobes=16)
 NONE = dict.fromkeys(vars(Weights()), 0.0)
 OUTLINE = replace(GAUSSIANS, weights=Weights(**{**NONE, "mask": 10.0, "deviation": 0.5, "sign": 0.2, "spread": 0.1}))
 # where maps are compared follows the surface pixel by pixel, and has no slope: it would let a surface flee its material
 MOVING = replace(GAUSSIANS, weights=replace(Weights(), material=0.0, normal=0.0))
 NORMALS = replace(VOLUME, weights=Weights(**{**NONE, "normal": 4.0}))
-LIGHT = Stage("monte_carlo", "monte_carlo", 24, samples=(32, 0, 0))
+LIGHT = StageConfig("monte_carlo", "monte_carlo", 24, samples=(32, 0, 0))
 COSINE = replace(LIGHT, samples=(0, 0, 32))
 MATERIAL = ("heads.base_color", "heads.roughness", "heads.metallic")
 LATENT = ("illumination.bank", "illumination.transformer")

@@ -8,27 +8,28 @@ import subprocess
 import sys
 import time
 import warnings
-from dataclasses import replace
 
 import pytest
 import torch
 from PIL import Image
 from torch.distributed.run import get_args_parser
 
-from reli3d.cli import stages
+from reli3d.cli.train import main, paper_stage, parsed, parser
 from reli3d.errors import InputError
 from reli3d.nn.model import Reconstructor
+from reli3d.nn.presets import TINY
 from reli3d.nn.weights import load_model
-from reli3d.train.pictures import HEIGHT, write_curves
-from reli3d.train.stages import loop
-from reli3d.train.stages.config import Run, Stage
-from reli3d.train.stages.loop import drawn, load_state, open_log, train
+from reli3d.train import checkpoint
+from reli3d.train.log import HEIGHT, Log, write_curves
+from reli3d.train.loop import accumulate, train
+from reli3d.train.stages.config import StageConfig
 from reli3d.train.stages.losses import gradients
+from reli3d.train.stages.stage import PaperStage, averaged
 from reli3d.train.stages.step import checkpointed, object_losses, total
 from reli3d.train.stages.views import Samples, draw
-from tests.support.stages import SMALL, ball_model, write_samples
+from tests.support.stages import SMALL, BallModel, ball_model, write_samples
 
-GAUSSIANS = Stage("gaussians", "gaussians", 16, lobes=16, batch=2, steps=6, rate=1e-3)
+GAUSSIANS = StageConfig("gaussians", "gaussians", 16, lobes=16, batch=2, steps=6, rate=1e-3)
 SIZES = dict(inputs=2, targets=1, background=0.5, input_size=32, target_size=16, patch=0)
 
 
@@ -37,78 +38,62 @@ def folder(tmp_path_factory):
     return write_samples(tmp_path_factory.mktemp("loop"))
 
 
-def run_of(folder, out, **changes):
-    return Run((str(folder),), str(out), GAUSSIANS, **{"warmup": 2, "save_every": 2, "log_every": 1, **changes})
+def stage_of(folder, model=None, config=GAUSSIANS, **options):
+    return PaperStage(model or ball_model(), config, [Samples(folder)], folders=[str(folder)], **options)
+
+
+def options_of(stage, out, **changes):
+    return stage.options(str(out), **{"warmup": 2, "save_every": 2, "log_every": 1, **changes})
 
 
 def rows(folder):
     return [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
 
 
+def numbers(folder):
+    """Rows of the log without the configuration and the time."""
+    return [{k: v for k, v in row.items() if k != "seconds"} for row in rows(folder) if "config" not in row]
+
+
 def test_a_run_learns_logs_and_draws(folder, tmp_path):
-    run = run_of(folder, tmp_path, save_every=6)
-    run = replace(run, stage=replace(run.stage, steps=16, rate=3e-3))
-    model, source = ball_model(), Samples(folder)
-    held = [drawn(run, [source], model, 0, k) for k in range(2)]
-    before = [float(total(object_losses(model, d, run.stage, gradients), run.stage)) for d in held]
-    train(model, run, [source], held_back=held)
-    after = [float(total(object_losses(model, d, run.stage, gradients), run.stage)) for d in held]
+    stage = stage_of(folder, validation=Samples(folder))
+    draws = [stage.drawn(0, k) for k in range(2)]
+    before = [float(total(object_losses(stage.model, d, GAUSSIANS, gradients), GAUSSIANS)) for d in draws]
+    train(stage, options_of(stage, tmp_path, save_every=6, steps=16, rate=3e-3))
+    after = [float(total(object_losses(stage.model, d, GAUSSIANS, gradients), GAUSSIANS)) for d in draws]
     assert sum(after) < 0.9 * sum(before)
     found = rows(tmp_path)
-    assert found[0]["config"]["stage"]["lobes"] == 16 and found[-1]["step"] == 16
+    assert found[0]["config"]["config"]["lobes"] == 16 and found[-1]["step"] == 16
     assert {"loss", "image", "material", "normal", "sign", "neutral"} < set(found[-1]) and "latent" not in found[-1]
-    assert (tmp_path / "curves.png").exists() and (tmp_path / "pictures.png").exists()
-    assert json.loads(load_state(tmp_path / "state.pt", model)["run"]) == json.loads(run.text())
+    assert (tmp_path / "curves.png").exists() and (tmp_path / "validation.png").exists()
+    state = checkpoint.load(tmp_path / "state.pt")
+    assert json.loads(state["about"]) == found[0]["config"] and state["measures"] == {"surface": 1.0}
 
 
 def test_stopped_and_continued_is_the_same_run(folder, tmp_path):
-    whole, parts = run_of(folder, tmp_path / "whole"), run_of(folder, tmp_path / "parts")
-    train(ball_model(), whole, [Samples(folder)])
-    saved = loop.save
-
-    def stop(*args):
-        saved(*args)
-        if args[4] == 4:
-            raise KeyboardInterrupt
-
-    loop.save = stop
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            train(ball_model(), parts, [Samples(folder)])
-    finally:
-        loop.save = saved
-    train(ball_model(7), parts, [Samples(folder)])  # other parameters, which the checkpoint replaces
+    whole, part, other = stage_of(folder), stage_of(folder), stage_of(folder, ball_model(7))
+    train(whole, options_of(whole, tmp_path / "whole"))
+    batch = part.batch
+    part.batch = lambda step, objects: batch(step, objects) if step < 3 else 1 / 0  # a checkpoint is of step 2
+    with pytest.raises(ZeroDivisionError):
+        train(part, options_of(part, tmp_path / "parts"))
+    train(other, options_of(other, tmp_path / "parts"))  # other parameters, which the checkpoint replaces
     of = {name: torch.load(tmp_path / name / "state.pt", weights_only=True) for name in ("whole", "parts")}
-    for part in ("model", "average"):
-        for name, value in of["whole"][part].items():
-            assert torch.equal(value, of["parts"][part][name]), name
-    losses = [[r for r in rows(tmp_path / n) if "config" not in r] for n in ("whole", "parts")]
-    assert losses[0] == losses[1]
+    for key in ("model", "average"):
+        for name, value in of["whole"][key].items():
+            assert torch.equal(value, of["parts"][key][name]), name
+    assert numbers(tmp_path / "whole") == numbers(tmp_path / "parts")
 
 
-def test_a_stage_starts_from_the_average_of_the_one_before(folder, tmp_path):
-    first = run_of(folder, tmp_path / "one")
-    train(ball_model(), first, [Samples(folder)])
-    average = load_state(tmp_path / "one" / "state.pt", ball_model())["average"]
-    stage = Stage("monte_carlo", "monte_carlo", 16, samples=(2, 2, 0), batch=1, steps=0)
-    second = replace(run_of(folder, tmp_path / "two"), stage=stage, start=str(tmp_path / "one" / "state.pt"))
-    model = ball_model(5)
-    train(model, second, [Samples(folder)])
-    for name, value in model.state_dict().items():
-        assert torch.equal(value, average[name]), name
-
-
-def test_two_shares_of_a_batch_add_up_to_the_whole(folder, tmp_path):
+def test_two_shares_of_a_batch_add_up_to_the_whole(folder):
     """What the processes of a group have, one after the other here: their mean is the gradient of one process."""
-    run, source = run_of(folder, tmp_path), Samples(folder)
-    draws = [drawn(run, [source], ball_model(), 3, k) for k in range(4)]
     grads = []
-    for parts in ([draws], [draws[:2], draws[2:]]):
+    for parts in ([range(4)], [range(0, 4, 2), range(1, 4, 2)]):
         means = 0.0
         for part in parts:
-            model = ball_model()
-            loop.accumulate(model, run, part, gradients, len(part))
-            flat = [torch.zeros_like(p) if p.grad is None else p.grad for p in model.parameters()]
+            stage = stage_of(folder)
+            accumulate(stage, stage.batch(3, part))
+            flat = [torch.zeros_like(p) if p.grad is None else p.grad for p in stage.model.parameters()]
             means = means + torch.cat([g.reshape(-1) for g in flat]) / len(parts)
         grads.append(means)
     torch.testing.assert_close(*grads, rtol=1e-4, atol=1e-6)  # float32 sums in another order
@@ -119,16 +104,18 @@ import sys
 import torch
 from PIL import Image
 from pathlib import Path
-from reli3d.train.stages.config import Run, Stage
-from reli3d.train.stages.loop import train
+from reli3d.train.loop import train
+from reli3d.train.stages.config import StageConfig
+from reli3d.train.stages.stage import PaperStage
 from reli3d.train.stages.views import Samples
 from reli3d.train.workers import Workers
 from tests.support.stages import ball_model
 torch.set_num_threads(1)
 folder, out, steps = sys.argv[1:]
-stage = Stage("gaussians", "gaussians", 16, lobes=16, batch=2, steps=int(steps), rate=1e-3)
+config = StageConfig("gaussians", "gaussians", 16, lobes=16, batch=2, rate=1e-3)
 workers = Workers.join()
-train(ball_model(), Run((folder,), out, stage, warmup=2, save_every=2, log_every=1), [Samples(Path(folder))], workers)
+stage = PaperStage(ball_model(), config, [Samples(Path(folder))])
+train(stage, stage.options(out, steps=int(steps), warmup=2, save_every=2, log_every=1), workers)
 workers.leave()
 """
 
@@ -140,7 +127,7 @@ def test_two_processes_have_the_losses_of_one(folder, tmp_path):
     group = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", script]
     for name, start in (("one", [sys.executable, script]), ("two", group)):
         subprocess.run([*start, folder, tmp_path / name, "3"], env=env, check=True, capture_output=True, timeout=300)
-    one, two = ([r for r in rows(tmp_path / n) if "config" not in r] for n in ("one", "two"))
+    one, two = (numbers(tmp_path / n) for n in ("one", "two"))
     assert len(one) == len(two) == 3
     for a, b in zip(one, two, strict=True):
         for name in a:
@@ -165,8 +152,7 @@ def test_killed_at_any_moment_a_run_goes_on_as_if_never_stopped(folder, tmp_path
     subprocess.run([*call, state.parent, "6"], env=env, check=True, capture_output=True, timeout=300)
     a, b = (torch.load(tmp_path / n / "state.pt", weights_only=True) for n in ("whole", "killed"))
     assert all(torch.equal(v, b["model"][k]) for k, v in a["model"].items())
-    losses = [[r for r in rows(tmp_path / n) if "config" not in r] for n in ("whole", "killed")]
-    assert losses[0] == losses[1]
+    assert numbers(tmp_path / "whole") == numbers(tmp_path / "killed")
 
 
 @pytest.mark.slow
@@ -189,33 +175,28 @@ def test_killed_twenty_times_a_run_has_the_curve_of_one_that_never_was(folder, t
             assert process.poll() is None
             process.send_signal(signal.SIGKILL)
         if (out / "state.pt").exists():
-            load_state(out / "state.pt", ball_model())  # whole
+            checkpoint.load(out / "state.pt")  # whole
     subprocess.run([*call, out, "300"], env=env, check=True, capture_output=True, timeout=300)
     a, b = (torch.load(tmp_path / n / "state.pt", weights_only=True) for n in ("whole", "killed"))
     assert all(torch.equal(v, b["model"][k]) for k, v in a["model"].items())
-    losses = [[r for r in rows(tmp_path / n) if "config" not in r] for n in ("whole", "killed")]
-    assert losses[0] == losses[1]
+    assert numbers(tmp_path / "whole") == numbers(tmp_path / "killed")
 
 
 def test_a_log_loses_what_was_half_written_and_what_comes_again(tmp_path):
-    run = Run(("x",), str(tmp_path), GAUSSIANS)
     path = tmp_path / "log.jsonl"
     path.write_text('{"step": 1, "loss": 1.0}\n{"step": 2, "loss": 1.0}\n{"step": 3, "lo')
-    open_log(path, 1, run).close()
+    Log(path, 1, {}).close()
     assert [json.loads(line)["step"] for line in path.read_text().splitlines()] == [1, 1]
 
 
-def test_steps_without_finite_gradients_are_left_out_and_end_a_run(folder, tmp_path, monkeypatch):
-    run = replace(run_of(folder, tmp_path), bad_steps=3)
-    model = ball_model()
-    before = {k: v.clone() for k, v in model.state_dict().items()}
-    broken = loop.object_losses
-    monkeypatch.setattr(
-        loop, "object_losses", lambda *a, **k: {n: v * float("nan") for n, v in broken(*a, **k).items()}
-    )
+def test_steps_without_finite_gradients_are_left_out_and_end_a_run(folder, tmp_path):
+    stage = stage_of(folder)
+    before = {k: v.clone() for k, v in stage.model.state_dict().items()}
+    finite = stage.losses
+    stage.losses = lambda item: {n: v * float("nan") for n, v in finite(item).items()}
     with pytest.raises(RuntimeError, match="gradients: expected finite ones, got none in 3 steps"):
-        train(model, run, [Samples(folder)])
-    assert all(torch.equal(v, before[k]) for k, v in model.state_dict().items())
+        train(stage, options_of(stage, tmp_path, bad_steps=3))
+    assert all(torch.equal(v, before[k]) for k, v in stage.model.state_dict().items())
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 nothing", None])
@@ -226,7 +207,24 @@ def test_a_broken_or_foreign_checkpoint_is_refused_in_one_line(content, tmp_path
     else:
         path.write_bytes(content)
     with pytest.raises(InputError, match="expected a checkpoint of"):
-        load_state(path, ball_model())
+        checkpoint.load(path)
+
+
+def test_a_stage_of_the_surface_ends_at_once_without_one(folder, tmp_path, capsys):
+    """As by the command from scratch: only sign and latents would be trained.  From the volume it is reported."""
+    few = ["--steps", "1", "--batch", "1", "--image-size", "16", "--lobes", "8"]
+    assert main([str(folder), str(tmp_path / "direct"), "--stage", "gaussians", *few]) == 2
+    found = capsys.readouterr().err
+    assert "expected a network that has a surface, got none for 4 training objects" in found
+    assert "--stage volume (1500 steps by default)" in found and not (tmp_path / "direct" / "state.pt").exists()
+    volume = tmp_path / "volume"
+    assert main([str(folder), str(volume), "--stage", "volume", "--patch", "8", *few]) == 0
+    assert "surface 0" in capsys.readouterr().err
+    assert main([str(volume), "--stage", "volume", "--export", str(tmp_path / "x.safetensors")]) == 2
+    assert "got none for 4 training objects" in capsys.readouterr().err and not (tmp_path / "x.safetensors").exists()
+    missing = tmp_path / "none" / "state.pt"
+    assert main([str(folder), str(tmp_path / "next"), "--stage", "surface", "--weights", str(missing)]) == 2
+    assert f"{missing}: file not found" in capsys.readouterr().err
 
 
 def test_checkpointing_and_bfloat16_keep_the_loss(folder):
@@ -248,60 +246,65 @@ def test_checkpointing_and_bfloat16_keep_the_loss(folder):
 
 def test_the_average_is_a_network_of_its_own():
     model = ball_model()
-    other = loop.averaged(model, model.state_dict())
+    other = averaged(model, model.state_dict())
     assert isinstance(other, Reconstructor) and other.preset is SMALL and not other.training
 
 
-def test_the_command_trains_and_exports_what_the_pipeline_loads(folder, tmp_path, capsys):
-    out = tmp_path / "run"
-    small = ["--steps", "1", "--batch", "1", "--image-size", "16", "--patch", "8", "--lobes", "8"]
-    assert stages.main(["volume", str(out), str(folder), *small]) == 0
-    assert '"lobes": 8' in capsys.readouterr().err  # the configuration is printed
-    assert stages.main(["volume", str(out), "--export", str(tmp_path / "x.safetensors")]) == 0
+def test_a_checkpoint_is_exported_and_starts_the_next_stage(folder, tmp_path, capsys):
+    torch.manual_seed(0)
+    stage = stage_of(folder, BallModel(TINY))
+    train(stage, options_of(stage, tmp_path / "one", steps=0))
+    state = tmp_path / "one" / "state.pt"
+    average = checkpoint.load(state)["average"]
+    assert main([str(state.parent), "--stage", "gaussians", "--export", str(tmp_path / "x.safetensors")]) == 0
     model = load_model(str(tmp_path / "x.safetensors"))
-    state = torch.load(out / "state.pt", weights_only=True)
     assert model.preset.name == "tiny"  # stored in half precision
-    want = state["average"]["bank.embeddings"]
-    torch.testing.assert_close(model.bank.embeddings.detach(), want, rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(model.bank.embeddings, average["bank.embeddings"], rtol=1e-3, atol=1e-4)
+    call = [str(folder), str(tmp_path / "two"), "--stage", "volume", "--steps", "0", "--weights", str(state)]
+    assert main(call) == 0
+    begun = checkpoint.load(tmp_path / "two" / "state.pt")["model"]
+    assert all(torch.equal(value, average[name]) for name, value in begun.items())
 
 
-def test_tensorboard_has_the_numbers_of_the_log_and_the_pictures(folder, tmp_path):
+def test_tensorboard_has_the_numbers_of_the_log_and_the_images(folder, tmp_path):
     pytest.importorskip("tensorboard")
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    run = replace(run_of(folder, tmp_path / "run"), tensorboard=str(tmp_path / "board"))
-    run = replace(run, stage=replace(run.stage, steps=2))
-    source = Samples(folder)
-    train(ball_model(), run, [source], held_back=[drawn(run, [source], ball_model(), 0, 0)])
-    run = replace(run, stage=replace(run.stage, steps=4))
-    train(ball_model(), run, [source], held_back=[drawn(run, [source], ball_model(), 0, 0)])  # goes on at step 2
+    for steps in (2, 4):  # the second run goes on at step 2
+        stage = stage_of(folder, validation=Samples(folder))
+        train(stage, options_of(stage, tmp_path / "run", steps=steps, tensorboard=str(tmp_path / "board")))
     found = EventAccumulator(str(tmp_path / "board"), {"images": 0, "scalars": 0})
     found.Reload()
-    logged = [r for r in rows(tmp_path / "run") if "config" not in r]
+    logged = numbers(tmp_path / "run")
     assert [r["step"] for r in logged] == [1, 2, 3, 4]
     for name in ("loss", "image", "rate"):
         events = found.Scalars(name)
         assert [e.step for e in events] == [1, 2, 3, 4]
         assert [e.value for e in events] == pytest.approx([r[name] for r in logged], rel=1e-6)  # float32
-    pictures = found.Images("pictures")
-    with Image.open(tmp_path / "run" / "pictures.png") as grid:
-        assert [e.step for e in pictures] == [2, 4] and (pictures[-1].width, pictures[-1].height) == grid.size
+    images = found.Images("validation")
+    with Image.open(tmp_path / "run" / "validation.png") as grid:
+        assert [e.step for e in images] == [2, 4] and (images[-1].width, images[-1].height) == grid.size
 
 
-def test_tensorboard_that_is_missing_is_told_in_one_line(folder, tmp_path, monkeypatch, capsys):
+def test_a_missing_tensorboard_is_reported_in_one_line(folder, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)  # its import raises
-    call = ["volume", str(tmp_path / "run"), str(folder), "--tensorboard", str(tmp_path / "board")]
-    assert stages.main(call) == 2
-    told = capsys.readouterr().err
-    assert told.endswith("got none; pip install tensorboard\n") and told.count("\n") == 1
+    assert main([str(folder), str(tmp_path / "run"), "--tensorboard", str(tmp_path / "board")]) == 2
+    found = capsys.readouterr().err
+    assert found.endswith("got none; pip install tensorboard\n") and found.count("\n") == 1
     assert not (tmp_path / "run").exists()
 
 
+def test_options_of_another_stage_are_refused(folder, tmp_path, capsys):
+    for stage, option in (("small", "--lobes"), ("volume", "--points"), ("small", "--image-size")):
+        assert main([str(folder), str(tmp_path / "run"), "--stage", stage, option, "8"]) == 2
+        assert f"{option}: expected none for stage {stage}" in capsys.readouterr().err
+
+
 def test_the_strategies_of_a_stage_can_be_chosen(folder, tmp_path):
-    call = ["monte_carlo", str(tmp_path), str(folder), "--samples", "16", "0", "0", "--no-shadows"]
-    stage = stages.run_of(stages.parser().parse_args(call)).stage
-    assert stage.samples == (16, 0, 0) and not stage.shadows
-    plain = stages.run_of(stages.parser().parse_args(call[:3])).stage
+    call = [str(folder), str(tmp_path), "--stage", "monte_carlo", "--samples", "16", "0", "0", "--no-shadows"]
+    config = paper_stage(parsed(call)).config
+    assert config.samples == (16, 0, 0) and not config.shadows
+    plain = paper_stage(parsed(call[:4])).config
     assert plain.samples == (6, 8, 2) and plain.shadows
 
 
@@ -318,6 +321,6 @@ def test_curves_leave_out_what_is_nowhere_finite(tmp_path):
 def test_no_option_is_the_beginning_of_one_of_torchruns():
     """torchrun looks at the whole line, and takes such an option for its own or calls it ambiguous."""
     theirs = [o for action in get_args_parser()._actions for o in action.option_strings]
-    ours = [o for action in stages.parser()._actions for o in action.option_strings if o not in ("-h", "--help")]
-    assert "--start-method" in theirs and "--start-from" in ours
+    ours = [o for action in parser()._actions for o in action.option_strings if o not in ("-h", "--help")]
+    assert "--start-method" in theirs and "--weights" in ours
     assert [o for o in ours if any(t.startswith(o) for t in theirs)] == []

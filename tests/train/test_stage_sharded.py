@@ -1,51 +1,57 @@
 """Parameters of the trunk in parts on two processes: the losses of one process, and checkpoints that either reads."""
 
+import contextlib
 import json
 import os
 import subprocess
 import sys
-from dataclasses import replace
 
 import pytest
 import torch
 
-from reli3d.cli import stages
-from reli3d.train.stages import loop
-from reli3d.train.stages.config import Run, Stage
-from reli3d.train.stages.loop import train
+from reli3d.cli.train import main
+from reli3d.train.loop import train
+from reli3d.train.stages.config import StageConfig
+from reli3d.train.stages.stage import PaperStage
 from reli3d.train.stages.step import trunk_layers
 from reli3d.train.stages.views import Samples
 from tests.support.stages import ball_model, write_samples
 
-STAGE = Stage("gaussians", "gaussians", 16, lobes=16, batch=2, steps=4, rate=1e-3)
+CONFIG = StageConfig("gaussians", "gaussians", 16, lobes=16, batch=2, steps=4, rate=1e-3)
+STEPS = dict(warmup=2, save_every=2, log_every=1)
 WORKER = """
+import gc
 import json
 import sys
 from pathlib import Path
 import torch
 from torch.distributed.tensor import DTensor
-from reli3d.train.stages import loop
-from reli3d.train.stages.config import Run, Stage
+from reli3d.train.loop import train
+from reli3d.train.stages.config import StageConfig
+from reli3d.train.stages.stage import PaperStage
 from reli3d.train.stages.views import Samples
 from reli3d.train.workers import Workers
 from tests.support.stages import ball_model
 torch.set_num_threads(1)
 folder, out, stop = sys.argv[1:]
-saved = loop.save
-def save(folder, model, optimizer, average, step, *rest):
-    whole = saved(folder, model, optimizer, average, step, *rest)
-    if step == int(stop):
-        cut = [p for p in model.parameters() if isinstance(p, DTensor)]
-        moments = [v for s in optimizer.state.values() for v in s.values() if isinstance(v, DTensor)]
-        here = [sum(t.to_local().numel() for t in ts) / sum(t.numel() for t in ts) for ts in (cut, moments)]
-        (folder / f"share.{workers.rank}").write_text(json.dumps([len(cut), *here]))
-        workers.leave()
-    return whole
-loop.save = save
-stage = Stage("gaussians", "gaussians", 16, lobes=16, batch=2, steps=4, rate=1e-3)
+class Stops(PaperStage):
+    def batch(self, step, objects):
+        if step == int(stop) - 1:
+            share()
+        if step == int(stop):
+            workers.leave()
+        return super().batch(step, objects)
+def share():
+    optimizer = next(o for o in gc.get_objects() if isinstance(o, torch.optim.AdamW))
+    cut = [p for p in stage.model.parameters() if isinstance(p, DTensor)]
+    moments = [v for s in optimizer.state.values() for v in s.values() if isinstance(v, DTensor)]
+    here = [sum(t.to_local().numel() for t in ts) / sum(t.numel() for t in ts) for ts in (cut, moments)]
+    Path(out, f"share.{workers.rank}").write_text(json.dumps([len(cut), *here]))
+config = StageConfig("gaussians", "gaussians", 16, lobes=16, batch=2, steps=4, rate=1e-3)
 workers = Workers.join()
-run = Run((folder,), out, stage, warmup=2, save_every=2, log_every=1, shard=True, checkpointing=True)
-loop.train(ball_model(), run, [Samples(Path(folder))], workers)
+stage = Stops(ball_model(), config, [Samples(Path(folder))], checkpointing=True)
+train(stage, stage.options(out, warmup=2, save_every=2, log_every=1, shard=True), workers)
+workers.leave()
 """
 
 CLIP = """
@@ -80,21 +86,16 @@ def folder(tmp_path_factory):
 
 def alone(folder, out, stop=None):
     """The run of one process, ended after the checkpoint of step ``stop``."""
-    saved = loop.save
 
-    def save(*args):
-        whole = saved(*args)
-        if args[4] == stop:
-            raise KeyboardInterrupt
-        return whole
+    class Stops(PaperStage):
+        def batch(self, step, objects):
+            if step == stop:
+                raise KeyboardInterrupt
+            return super().batch(step, objects)
 
-    run = Run((str(folder),), str(out), STAGE, warmup=2, save_every=2, log_every=1)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(loop, "save", save)
-        try:
-            train(ball_model(), run, [Samples(folder)])
-        except KeyboardInterrupt:
-            assert stop
+    stage = Stops(ball_model(), CONFIG, [Samples(folder)])
+    with contextlib.suppress(KeyboardInterrupt):
+        train(stage, stage.options(str(out), **STEPS))
 
 
 def on_two(script, text, *arguments):
@@ -112,7 +113,8 @@ def together(folder, out, stop, script):
 
 
 def rows(out):
-    return [r for r in map(json.loads, (out / "log.jsonl").read_text().splitlines()) if "config" not in r]
+    found = [r for r in map(json.loads, (out / "log.jsonl").read_text().splitlines()) if "config" not in r]
+    return [{k: v for k, v in row.items() if k != "seconds"} for row in found]
 
 
 @pytest.fixture(scope="module")
@@ -168,10 +170,8 @@ def test_each_process_has_half_of_the_layers_and_of_their_moments(runs):
 
 
 def test_one_process_alone_is_refused(folder, tmp_path, capsys):
-    assert stages.main(["gaussians", str(tmp_path / "out"), str(folder), "--shard", "--steps", "1"]) == 2
+    assert main([str(folder), str(tmp_path / "out"), "--stage", "gaussians", "--shard", "--steps", "1"]) == 2
     assert "shard: expected several processes" in capsys.readouterr().err
-    with pytest.raises(ValueError, match="start with torchrun"):
-        train(ball_model(), replace(Run((str(folder),), str(tmp_path), STAGE), shard=True), [Samples(folder)])
 
 
 def test_norms_and_parts_are_those_of_whole_gradients(tmp_path):

@@ -12,7 +12,7 @@ from reli3d.nn.presets import TINY
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.gaussians import shade_gaussians
 from reli3d.render.points import SurfacePoints
-from reli3d.train.stages.config import PAPER, Run, Stage, Weights
+from reli3d.train.stages.config import PAPER, StageConfig, Weights
 from reli3d.train.stages.config import TINY as TINY_STAGES
 from reli3d.train.stages.losses import gradients, light_terms, lpips_distance, shown_colors
 from reli3d.train.stages.picture import Picture, display, lobes
@@ -22,9 +22,9 @@ from reli3d.train.stages.views import ObjectViews, Samples, draw
 from reli3d.train.stages.volume import occupied, render_volume
 from tests.support.stages import RADIUS, ball_model, camera, write_samples
 
-VOLUME = Stage("volume", "volume", 24, patch=16, lobes=32, grid=8, samples_along=48)
-GAUSSIANS = Stage("gaussians", "gaussians", 24, lobes=32)
-MONTE_CARLO = Stage("monte_carlo", "monte_carlo", 24, samples=(6, 6, 2))
+VOLUME = StageConfig("volume", "volume", 24, patch=16, lobes=32, grid=8, samples_along=48)
+GAUSSIANS = StageConfig("gaussians", "gaussians", 24, lobes=32)
+MONTE_CARLO = StageConfig("monte_carlo", "monte_carlo", 24, samples=(6, 6, 2))
 SIZES = dict(inputs=2, targets=1, background=0.5, input_size=32, target_size=24, patch=0)
 
 
@@ -60,7 +60,6 @@ def test_the_papers_numbers():
     assert [s.batch for s in PAPER.values()] == [64, 192, 192, 192, 32]
     assert {s.rate for s in PAPER.values()} == {5e-5} and {s.steps for s in PAPER.values()} == {60_000}
     assert PAPER["monte_carlo"].samples == (20, 40, 4) and PAPER["monte_carlo"].shadows
-    assert Run(("x",), "y", PAPER["volume"]).inputs == 4
 
 
 def test_a_draw_is_a_function_of_its_seed_and_compares_what_was_not_read(source):
@@ -241,7 +240,7 @@ def test_light_without_colour_is_neutral(one):
 
 def test_lpips_without_its_weights_is_refused_in_one_line(monkeypatch, tmp_path):
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
-    with pytest.raises(ValueError, match="^perceptual: expected .*, got none; "):
+    with pytest.raises(ValueError, match="^--perceptual: expected .*, got none; "):
         lpips_distance()
 
 

@@ -16,31 +16,31 @@ from reli3d.nn.presets import OFFICIAL, SMALL
 from reli3d.nn.weights import load_model
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.render.latlong import lat_long_directions
-from reli3d.train.batches import batches, random_turn
+from reli3d.train import checkpoint
+from reli3d.train.batches import draw_samples, random_turn
 from reli3d.train.light_prior import fit, scale_free
-from reli3d.train.loop import (
-    LAST_RATE,
-    TrainConfig,
-    averaged_model,
-    parameter_groups,
-    progress,
-    rate_at,
-    train,
-)
+from reli3d.train.loop import parameter_groups, progress, rate_at, train
 from reli3d.train.losses import (
     ASTRAY,
     PLAIN,
     WEIGHTS,
     astray,
+    encode_sample,
     excess_entropy,
     losses,
     pattern_loss,
 )
+from reli3d.train.small import LAST_RATE, PixelStage, SmallStage
+from reli3d.train.stage import Options
+
+
+def drawn(folder, seeds, *, points, max_views):
+    return draw_samples(sorted(folder.glob("*.safetensors")), [(s,) for s in seeds], points=points, max_views=max_views)
 
 
 @pytest.fixture(scope="module")
 def samples(folder):
-    return next(batches(folder, size=2, points=512, max_views=2, seed=1))
+    return drawn(folder, (1, 2), points=512, max_views=2)
 
 
 def test_surface_points_lie_in_every_silhouette(samples):
@@ -59,7 +59,7 @@ def test_signed_distance_is_zero_on_the_surface_and_positive_outside_the_hull(sa
 
 
 def test_seen_surface_points_face_the_camera(folder):
-    (s,) = next(batches(folder, size=1, points=4096, max_views=1, seed=2))
+    (s,) = drawn(folder, (2,), points=4096, max_views=1)
     seen = s.visible[:, 0] > 0
     assert 0.05 < float(seen.float().mean()) < 0.9
     toward = torch.nn.functional.normalize(s.c2w[0, :3, 3] - s.surface[:, 0], dim=-1)
@@ -68,7 +68,7 @@ def test_seen_surface_points_face_the_camera(folder):
 
 def test_augmented_maps_agree_with_the_points(folder):
     """Turned, mirrored or not: a seen surface point projects to a pixel of its own depth, normal and material."""
-    for (s,), _ in zip(batches(folder, size=1, points=4096, max_views=2, seed=5), range(6)):
+    for s in drawn(folder, range(6), points=4096, max_views=2):
         position, _, bumped = s.surface.unbind(1)
         scale = s.view_depth.shape[1] / s.images.shape[1]
         for v in range(len(s.c2w)):
@@ -88,7 +88,7 @@ def test_augmented_maps_agree_with_the_points(folder):
 
 def test_a_turn_carries_light_and_surface_together(folder):
     """+X is bright: whatever the turn or mirror, surface that faces the bright side is brighter."""
-    for (s,), _ in zip(batches(folder, size=1, points=2048, max_views=1, seed=5), range(6)):
+    for s in drawn(folder, range(6), points=2048, max_views=1):
         bright = s.light_directions[s.light.sum(-1).argmax()]
         valid = s.view_valid[0]
         shade = torch.nn.functional.avg_pool2d(s.images[0].mean(-1)[None, None], 2)[0, 0][valid]
@@ -131,13 +131,16 @@ def test_turns_are_rotations():
         assert float(torch.linalg.det(turn)) > 0
 
 
-def test_batches_are_a_function_of_seed_and_step(folder):
-    source = batches(folder, size=1, points=256, max_views=2, seed=7)
+def test_a_batch_is_a_function_of_seed_step_and_places_however_it_is_shared(folder):
+    stage = SmallStage(LocalReconstructor(SMALL), [folder], seed=7, points=256, max_views=2)
+    whole = stage.batch(2, range(4))
     torch.manual_seed(0)
-    first = [next(source) for _ in range(3)]
-    (again,) = next(batches(folder, size=1, points=256, max_views=2, seed=7, start=2))
-    for field in dataclasses.fields(again):
-        assert torch.equal(getattr(first[2][0], field.name), getattr(again, field.name)), field.name
+    shared = [stage.batch(2, range(rank, 4, 2)) for rank in range(2)]
+    for place in range(4):
+        for field in dataclasses.fields(whole[place]):
+            again = getattr(shared[place % 2][place // 2], field.name)
+            assert torch.equal(getattr(whole[place], field.name), again), field.name
+    assert not torch.equal(whole[0].points, stage.batch(3, range(1))[0].points)
 
 
 def test_every_parameter_gets_a_gradient(samples):
@@ -156,38 +159,66 @@ def test_every_parameter_gets_a_gradient(samples):
 
 
 def test_every_parameter_is_in_one_group_and_last_layers_learn_faster():
-    model, config = LocalReconstructor(SMALL), TrainConfig("", "")
-    groups = parameter_groups(model, config)
+    model = LocalReconstructor(SMALL)
+    groups = parameter_groups(SmallStage(model, []), 0.02)
     times = {id(p): (group["times"], group["weight_decay"]) for group in groups for p in group["params"]}
     assert len(times) == sum(len(group["params"]) for group in groups) == len(list(model.parameters()))
     last = (*(head[-1] for head in model.pyramid.says.values()), model.light.out, model.color[-1], model.surface[-1])
     fast = {id(p) for layer in last for p in layer.parameters()}
     for p in model.parameters():
-        assert times[id(p)] == (LAST_RATE if id(p) in fast else 1.0, config.weight_decay if p.ndim > 1 else 0.0)
+        assert times[id(p)] == (LAST_RATE if id(p) in fast else 1.0, 0.02 if p.ndim > 1 else 0.0)
     slow = {id(p) for name, p in model.pyramid.named_parameters() if not name.startswith("features")}
-    groups = parameter_groups(model, dataclasses.replace(config, pyramid_rate=0.1))
-    for group in groups:
+    for group in parameter_groups(SmallStage(model, [], pyramid_rate=0.1), 0.02):
         for p in group["params"]:
             assert group["times"] == pytest.approx(times[id(p)][0] * (0.1 if id(p) in slow else 1.0))
 
 
 def test_training_learns_logs_and_resumes(folder, tmp_path):
     torch.manual_seed(0)
-    config = TrainConfig(str(folder), str(tmp_path), steps=50, batch=1, points=256, max_views=1, warmup=5, seed=3)
-    model = LocalReconstructor(SMALL)
-    (sample,) = next(batches(folder, size=1, points=256, max_views=1, seed=3))
-    before = losses(model, sample)
-    train(model, config)
+    stage = SmallStage(LocalReconstructor(SMALL), [folder], seed=3, points=256, max_views=1)
+    options = stage.options(str(tmp_path), steps=50, batch=1, warmup=5, seed=3)
+    (sample,) = drawn(folder, (3,), points=256, max_views=1)
+    before = losses(stage.model, sample)
+    train(stage, options)
     rows = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
-    assert rows[-1]["step"] == 50 and set(WEIGHTS) < set(rows[-1])
-    after = losses(model, sample)
+    assert rows[0]["config"]["stage"] == "small" and rows[-1]["step"] == 50 and set(WEIGHTS) < set(rows[-1])
+    after = losses(stage.model, sample)
     whole = [float(sum(WEIGHTS[k] * v for k, v in terms.items())) for terms in (before, after)]
     assert whole[1] < 0.9 * whole[0]  # 50 steps on two objects
-    train(LocalReconstructor(SMALL), dataclasses.replace(config, steps=52))
-    state = torch.load(tmp_path / "state.pt", weights_only=True)
-    assert state["step"] == 52
-    model = averaged_model(tmp_path / "state.pt", LocalReconstructor(SMALL))
-    assert torch.equal(model.state_dict()["level.0.weight"], state["average"]["level.0.weight"])
+    again = SmallStage(LocalReconstructor(SMALL), [folder], seed=3, points=256, max_views=1)
+    train(again, dataclasses.replace(options, steps=52))
+    assert checkpoint.load(tmp_path / "state.pt")["step"] == 52
+
+
+def test_a_new_stage_is_a_subclass_with_its_terms(folder, tmp_path):
+    class Brightness(SmallStage):
+        name = "brightness"
+        weights = {"bright": 1.0}
+
+        def losses(self, item):
+            return {"bright": encode_sample(self.model, item).log_light.square().mean()}
+
+        def rate_factor(self, parameter):
+            return 1.0 if parameter.startswith("light.") else 0.0
+
+    stage = Brightness(LocalReconstructor(SMALL), [folder], points=64, max_views=1)
+    before = {k: v.clone() for k, v in stage.model.state_dict().items()}
+    train(stage, stage.options(str(tmp_path), steps=2, batch=1))
+    changed = {k for k, v in stage.model.state_dict().items() if not torch.equal(v, before[k])}
+    assert changed and all(k.startswith("light.") for k in changed)
+
+
+def test_a_checkpoint_of_version_0_2_gives_its_weights_and_resumes(folder, tmp_path):
+    """Those files hold model, optimizer, average, step and seconds alone."""
+    stage = SmallStage(LocalReconstructor(SMALL), [folder], points=64, max_views=1)
+    train(stage, stage.options(str(tmp_path), steps=1, batch=1))
+    path = tmp_path / "state.pt"
+    state = torch.load(path, weights_only=True)
+    torch.save({k: state[k] for k in ("model", "optimizer", "average", "step", "seconds")}, path)
+    then = step_from(folder, tmp_path / "next", str(path))
+    assert all(float((then[k] - v).abs().max()) < 1e-6 for k, v in state["average"].items())
+    train(stage, stage.options(str(tmp_path), steps=2, batch=1))
+    assert checkpoint.load(path)["step"] == 2
 
 
 def test_convolutions_in_bfloat16_change_the_losses_by_their_rounding(samples):
@@ -210,8 +241,9 @@ def test_convolutions_in_bfloat16_change_the_losses_by_their_rounding(samples):
     assert float(torch.nn.functional.cosine_similarity(found[0][1], found[1][1], 0)) > 0.999
 
 
-def test_a_checkpoint_of_other_parameters_does_not_go_on_and_gives_its_weights(folder, tmp_path, capsys):
-    train(LocalReconstructor(SMALL), TrainConfig(str(folder), str(tmp_path), steps=1, batch=1, points=64, pixels=256))
+def test_a_checkpoint_of_another_stage_does_not_go_on_and_gives_its_weights(folder, tmp_path, capsys):
+    stage = PixelStage(LocalReconstructor(SMALL), [folder])
+    train(stage, stage.options(str(tmp_path), steps=1, batch=1))
     assert main([str(folder), str(tmp_path), "--steps", "2", "--batch", "1"]) == 2
     assert "name another output folder, and this file by --weights" in capsys.readouterr().err
     step_from(folder, tmp_path / "next", str(tmp_path / "state.pt"))
@@ -229,14 +261,17 @@ def test_training_may_begin_with_the_weights_of_the_package_alone(folder, tmp_pa
     other = tmp_path / "other.pt"
     other.write_bytes(b"none")
     assert main([str(folder), str(tmp_path / "none"), "--weights", str(other)]) == 2
-    assert str(other) in capsys.readouterr().err and not (tmp_path / "none").exists()
+    assert "broken file" in capsys.readouterr().err
+    other.unlink()
+    assert main([str(folder), str(tmp_path / "none"), "--weights", str(other)]) == 2
+    assert f"{other}: file not found" in capsys.readouterr().err and not (tmp_path / "none").exists()
 
 
 def test_the_rate_warms_up_and_ends_low():
-    config = TrainConfig("", "", steps=1000, warmup=100)
-    assert rate_at(config, 0, 0.0) == pytest.approx(config.rate / 100)
-    assert rate_at(config, 999, progress(config, 999, 0)) < 0.03 * config.rate
-    assert progress(dataclasses.replace(config, minutes=10.0), 1, 600.0) == 1.0
+    options = Options("", steps=1000, warmup=100)
+    assert rate_at(options, 0, 0.0) == pytest.approx(options.rate / 100)
+    assert rate_at(options, 999, progress(options, 999, 0)) < 0.03 * options.rate
+    assert progress(dataclasses.replace(options, minutes=10.0), 1, 600.0) == 1.0
 
 
 def test_the_light_prior_fits_a_map():

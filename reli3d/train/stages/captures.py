@@ -9,7 +9,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from reli3d.io.files import InputError, read_bytes, shown
+from reli3d.errors import InputError, shown
+from reli3d.io.files import read_bytes
 from reli3d.train.stages.views import Chooser, ObjectViews
 from reli3d.views.folder import load_views
 from reli3d.views.normalize import normalize

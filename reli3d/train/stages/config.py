@@ -1,4 +1,4 @@
-"""What a stage of the paper's training is, in numbers: sizes, counts and weights.  All of it is stored with a run.
+"""Sizes, counts and weights of the stages of the paper's training.  All of them are stored with a run.
 
 The paper's section B and C in short: images of views that were not input are compared with renders of the predicted
 object, first of its volume, then of its surface under spherical Gaussians at rising resolution, last of its surface by
@@ -7,12 +7,11 @@ Monte Carlo integration with shadows.  Where the paper leaves a number open the 
 
 from __future__ import annotations
 
-import dataclasses
-import json
 from dataclasses import dataclass, field
 
+from reli3d.errors import InputError
+
 RENDERERS = ("volume", "gaussians", "monte_carlo")
-PERCEPTUAL = ("gradients", "lpips")
 
 
 @dataclass(frozen=True)
@@ -33,8 +32,8 @@ class Weights:
 
 
 @dataclass(frozen=True)
-class Stage:
-    """One stage.  Sizes are those of a whole object; the paper's are in :data:`PAPER`."""
+class StageConfig:
+    """Numbers of one stage.  The paper's are in :data:`PAPER`."""
 
     name: str
     renderer: str  # volume, gaussians or monte_carlo
@@ -47,72 +46,37 @@ class Stage:
     samples_along: int = 64  # samples of a ray across the model's cube
     samples: tuple[int, int, int] = (20, 40, 4)  # by the light, by visible normals, by the cosine; 0: without it
     shadows: bool = True  # of monte_carlo
-    batch: int = 4  # objects a step
+    batch: int = 4  # these three: defaults of the loop's options
     steps: int = 60_000
     rate: float = 5e-5
     weights: Weights = field(default_factory=Weights)
 
     def __post_init__(self):
         if self.renderer not in RENDERERS:
-            raise ValueError(f"renderer: expected {', '.join(RENDERERS)}, got {self.renderer!r}")
+            raise InputError("renderer", f"expected {', '.join(RENDERERS)}, got {self.renderer!r}")
         if not 0 <= self.patch <= self.image_size:
-            raise ValueError(f"patch: expected 0 to image_size {self.image_size}, got {self.patch}")
+            raise InputError("patch", f"expected 0 to image_size {self.image_size}, got {self.patch}")
         if len(self.samples) != 3 or min(self.samples) < 0 or sum(self.samples) == 0:
-            raise ValueError(f"samples: expected three counts of at least 0, one above 0, got {self.samples}")
-
-
-@dataclass(frozen=True)
-class Run:
-    """One training of one stage."""
-
-    data: tuple[str, ...]  # folders of samples, of captures, or of shards
-    output: str  # folder of the checkpoint, the log, curves and pictures
-    stage: Stage
-    start: str = ""  # checkpoint of the stage before; "": from scratch
-    seed: int = 0
-    inputs: int = 4  # an object is read from 1 to this many views; the first is the hero
-    background: float = 0.5  # share of the objects whose light may be read from the background
-    perceptual: str = "gradients"  # or lpips: needs the package of that name and its weights
-    warmup: int = 100  # steps
-    weight_decay: float = 0.01
-    clip: float = 1.0  # of the gradient norm
-    average: float = 0.999  # decay of the averaged weights
-    save_every: int = 200  # steps
-    log_every: int = 10  # steps
-    bfloat16: bool = False  # autocast of the trunk
-    checkpointing: bool = False  # of the trunk's layers: computed again in the backward pass
-    shard: bool = False  # cut parameters, gradients and moments of the trunk's layers among the processes
-    tensorboard: str = ""  # folder of event files; "": none
-    bad_steps: int = 20  # steps in a row without finite gradients after which a run gives up
-
-    def __post_init__(self):
-        if self.perceptual not in PERCEPTUAL:
-            raise ValueError(f"perceptual: expected {', '.join(PERCEPTUAL)}, got {self.perceptual!r}")
-        if not 1 <= self.inputs <= 16:
-            raise ValueError(f"inputs: expected 1 to 16, got {self.inputs}")
-
-    def text(self) -> str:
-        """JSON, stored with every checkpoint."""
-        return json.dumps(dataclasses.asdict(self), sort_keys=True)
+            raise InputError("samples", f"expected three counts of at least 0, one above 0, got {self.samples}")
 
 
 PAPER = {  # for `official`: batch sizes, resolutions and rate of the paper; lobes follow the resolution
     s.name: s
     for s in (
-        Stage("volume", "volume", 512, patch=128, grid=64, samples_along=256, batch=64),  # patch: open
-        Stage("gaussians128", "gaussians", 128, lobes=128, batch=192),
-        Stage("gaussians256", "gaussians", 256, lobes=256, batch=192),
-        Stage("gaussians512", "gaussians", 512, lobes=512, batch=192),
-        Stage("monte_carlo", "monte_carlo", 512, batch=32),
+        StageConfig("volume", "volume", 512, patch=128, grid=64, samples_along=256, batch=64),  # patch: open
+        StageConfig("gaussians128", "gaussians", 128, lobes=128, batch=192),
+        StageConfig("gaussians256", "gaussians", 256, lobes=256, batch=192),
+        StageConfig("gaussians512", "gaussians", 512, lobes=512, batch=192),
+        StageConfig("monte_carlo", "monte_carlo", 512, batch=32),
     )
 }
 TINY = {  # for `tiny`: a network from scratch takes forty times the rate of one with a pretrained encoder
     s.name: s
     for s in (
-        Stage("volume", "volume", 32, patch=24, lobes=32, grid=10, samples_along=32, steps=1500, rate=2e-3),
-        Stage("gaussians", "gaussians", 48, lobes=48, steps=1000, rate=1e-3),
-        Stage("surface", "gaussians", 64, lobes=64, steps=500, rate=5e-4),
+        StageConfig("volume", "volume", 32, patch=24, lobes=32, grid=10, samples_along=32, steps=1500, rate=2e-3),
+        StageConfig("gaussians", "gaussians", 48, lobes=48, steps=1000, rate=1e-3),
+        StageConfig("surface", "gaussians", 64, lobes=64, steps=500, rate=5e-4),
         # four views an object: half of the gradient's noise is between views; a step takes 1.8 times as long
-        Stage("monte_carlo", "monte_carlo", 48, targets=4, samples=(6, 8, 2), steps=350, rate=1e-3),
+        StageConfig("monte_carlo", "monte_carlo", 48, targets=4, samples=(6, 8, 2), steps=350, rate=1e-3),
     )
 }

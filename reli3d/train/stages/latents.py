@@ -10,7 +10,8 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from reli3d.io.files import InputError, replacing
+from reli3d.errors import InputError
+from reli3d.io.files import replacing
 from reli3d.nn.model import Reconstructor
 from reli3d.nn.reni import EnvironmentDecoder
 from reli3d.nn.reni_fit import fit_latent

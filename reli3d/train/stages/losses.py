@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, binary_cross_entropy
 
 from reli3d._bridge import present
+from reli3d.errors import InputError
 from reli3d.train.stages.picture import Picture
 from reli3d.train.stages.views import ObjectViews
 
@@ -57,16 +58,16 @@ def lpips_distance() -> Perceptual:
     try:
         import lpips
     except ImportError:
-        raise ValueError(
-            "perceptual: expected the package lpips for lpips, got none; pip install lpips, or take gradients"
+        raise InputError(
+            "--perceptual", "expected the package lpips for lpips, got none; pip install lpips, or take gradients"
         ) from None
     weights = torch.hub.get_dir() + "/checkpoints/vgg16-397923af.pth"
     try:
         with open(weights, "rb"):
             pass
     except OSError:
-        raise ValueError(
-            f"perceptual: expected the weights of VGG16 at {weights} for lpips, got none; take gradients"
+        raise InputError(
+            "--perceptual", f"expected the weights of VGG16 at {weights} for lpips, got none; take gradients"
         ) from None
     network = lpips.LPIPS(net="vgg", verbose=False).requires_grad_(False)
 

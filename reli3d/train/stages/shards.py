@@ -1,24 +1,19 @@
-"""Objects in tar files of the WebDataset form: written in parallel and resumable, read in any order, checked by hash.
-
-A shard holds ``<object>.safetensors`` entries.  :mod:`reli3d.io.shards` has the index beside them.  Any reader of
-WebDataset can stream them.
-"""
+"""Training objects in tar files of the WebDataset form: one ``<object>.safetensors`` for each object."""
 
 from __future__ import annotations
 
-import io
-import sys
 import tarfile
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import torch
+from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor
 
-from reli3d.io.files import InputError, replacing
-from reli3d.io.shards import fault, pack_in_parts, read_index, shard_name, write_entry
+from reli3d.errors import InputError
+from reli3d.io.files import replacing
 from reli3d.train.stages.captures import Captures
 from reli3d.train.stages.views import Chooser, ObjectViews, Samples, sample_views
 
@@ -26,7 +21,7 @@ OF_SAMPLE = ("images", "c2w", "intrinsics", "view_material", "view_normal", "vie
 
 
 def to_tensors(views: ObjectViews) -> dict[str, Tensor]:
-    """What is stored of captures; the layout of :mod:`reli3d.synthetic.samples`, and what it lacks is not there."""
+    """What is stored of captures; the layout of :mod:`reli3d.synthetic.samples`, without what captures lack."""
     images = torch.cat([views.images, views.masks[..., None]], -1)
     stored = {
         "images": (images * 255 + 0.5).to(torch.uint8),
@@ -39,8 +34,7 @@ def to_tensors(views: ObjectViews) -> dict[str, Tensor]:
     return {k: v.contiguous() for k, v in stored.items()}
 
 
-def objects(source: Samples | Captures, numbers: Iterable[int]) -> Iterator[tuple[str, bytes]]:
-    """Name and stored bytes of these objects of a folder of samples or captures."""
+def _objects(source: Samples | Captures, numbers: Iterable[int]) -> Iterator[tuple[str, bytes]]:
     for k in numbers:
         if isinstance(source, Samples):
             tensors = load(source.files[k].read_bytes())
@@ -50,82 +44,53 @@ def objects(source: Samples | Captures, numbers: Iterable[int]) -> Iterator[tupl
 
 
 def pack(
-    source: Samples | Captures,
-    folder: Path,
-    *,
-    each: int = 64,
-    progress: Callable[[str], None] = lambda line: None,
-    part: tuple[int, int] = (0, 1),
+    source: Samples | Captures, folder: Path, *, each: int = 64, progress: Callable[[str], None] = lambda line: None
 ) -> None:
-    """Write the objects of ``source`` as :func:`~reli3d.io.shards.pack_in_parts` does."""
-    from webdataset import TarWriter
+    """Write the objects of ``source`` as ``NNNNNN.tar`` of ``each`` objects; shards that exist are kept.
 
-    names = [p.stem for p in source.files] if isinstance(source, Samples) else [p.name for p in source.folders]
-
-    def write(number: int, numbers: range) -> dict:
-        with replacing(folder / shard_name(number)) as temporary, TarWriter(str(temporary)) as writer:
-            for name, data in objects(source, numbers):
+    Raises InputError where the package ``webdataset`` is missing.
+    """
+    try:
+        from webdataset import TarWriter
+    except ImportError:
+        raise InputError("pack", "expected the package webdataset, got none; pip install webdataset") from None
+    folder.mkdir(parents=True, exist_ok=True)
+    total = len(source)
+    for number, first in enumerate(range(0, total, each)):
+        path = folder / f"{number:06d}.tar"
+        if path.exists():
+            continue
+        with replacing(path) as temporary, TarWriter(str(temporary)) as writer:
+            for name, data in _objects(source, range(first, min(first + each, total))):
                 writer.write({"__key__": name, "safetensors": data})
-        return write_entry(folder, number, [names[k] for k in numbers])
-
-    pack_in_parts(folder, names, write, each=each, part=part, progress=progress)
+        progress(f"{path.name}: {min(first + each, total)} of {total} objects")
 
 
 class Shards:
-    """Objects of a folder of shards, by number; a shard that is not whole is told on stderr and left out.
-
-    Sizes are checked here, hashes by ``reli3d-data check``.
-    """
+    """Objects of a folder of shards, by number.  Raises InputError where a shard is broken or there is none."""
 
     def __init__(self, folder: Path):
-        self.places: list[tuple[Path, str, int, int]] = []  # shard, object, offset and length of its bytes
-        for row in read_index(folder):
-            wrong = fault(folder, row, hashed=False)
-            found = [] if wrong else _members(folder / row["shard"])
-            if found is None:
-                wrong = f"{row['shard']}: expected a tar file, got a broken one"
-            if wrong:
-                print(f"{folder}: left out {wrong}", file=sys.stderr, flush=True)
-            self.places += found or []
+        self.places: list[tuple[Path, int, int]] = []  # shard, offset and length of the object's bytes
+        for path in sorted(folder.glob("*.tar")):
+            try:
+                with tarfile.open(path, "r:") as tar:
+                    found = [(path, m.offset_data, m.size) for m in tar if m.name.endswith(".safetensors")]
+            except (tarfile.TarError, OSError) as error:
+                raise InputError(path, f"expected a tar file, got a broken one ({error}); pack it again") from None
+            self.places += found
         if not self.places:
-            raise InputError(folder, "expected a whole shard, got none; pack again")
+            raise InputError(folder, "expected tar files with *.safetensors entries, got none; pack again")
 
     def __len__(self) -> int:
         return len(self.places)
 
-    def tensors(self, index: int) -> dict[str, Tensor]:
-        """What is stored of an object."""
-        path, _, offset, length = self.places[index]
+    def load(self, index: int, choose: Chooser) -> ObjectViews:
+        path, offset, length = self.places[index]
         with open(path, "rb") as file:
             file.seek(offset)
-            return load(file.read(length))
-
-    def load(self, index: int, choose: Chooser) -> ObjectViews:
-        stored = self.tensors(index)
-        views = sample_views(stored.get, choose)
-        return replace(views, background=bool(stored.get("background", True)))
-
-
-def _members(path: Path) -> list[tuple[Path, str, int, int]] | None:
-    try:
-        with tarfile.open(path, "r:") as tar:
-            return [
-                (path, m.name.removesuffix(".safetensors"), m.offset_data, m.size)
-                for m in tar
-                if m.name.endswith(".safetensors")
-            ]
-    except (tarfile.TarError, OSError):
-        return None
-
-
-def picture(tensors: dict[str, Tensor]) -> bytes:
-    """PNG of all views of an object, with its base colours below where it has them."""
-    from reli3d.io.images import png_bytes
-
-    images = tensors["images"].float() / 255
-    rows = [torch.cat(list(images[..., :3] * images[..., 3:]), 1)]
-    if "view_material" in tensors:
-        rows.append(torch.cat(list(tensors["view_material"][..., :3].float() / 255), 1))
-    out = io.BytesIO()
-    out.write(png_bytes((torch.cat(rows) * 255 + 0.5).to(torch.uint8)))
-    return out.getvalue()
+            data = file.read(length)
+        try:
+            stored = load(data)
+        except SafetensorError as error:
+            raise InputError(path, f"expected a sample at byte {offset}, got a broken one ({error})") from None
+        return replace(sample_views(stored.get, choose), background=bool(stored.get("background", True)))

@@ -1,11 +1,10 @@
-"""Where objects come from: which reader a folder has."""
+"""Where objects come from: the reader of a folder."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from reli3d.io.files import InputError
-from reli3d.io.shards import INDEX
+from reli3d.errors import InputError
 from reli3d.train.stages.captures import Captures
 from reli3d.train.stages.shards import Shards
 from reli3d.train.stages.views import Samples, Source
@@ -15,7 +14,7 @@ def source(folder: Path) -> Source:
     """The objects of a folder: of shards, of samples, or of captures.  Raises InputError where it holds none."""
     if not folder.is_dir():
         raise InputError(folder, "expected a folder of samples, captures or shards, got none")
-    if (folder / INDEX).exists():
+    if any(folder.glob("*.tar")):
         return Shards(folder)
     if any(folder.glob("*.safetensors")):
         return Samples(folder)

@@ -16,7 +16,7 @@ from reli3d.render.gaussians import shade_gaussians
 from reli3d.render.points import SurfacePoints
 from reli3d.render.shading import ShadeOptions, shade
 from reli3d.train.stages import losses
-from reli3d.train.stages.config import Stage
+from reli3d.train.stages.config import StageConfig
 from reli3d.train.stages.picture import Picture, lobes
 from reli3d.train.stages.surface import Shader, render_surface, seed_surface, surface
 from reli3d.train.stages.views import Draw
@@ -35,7 +35,7 @@ def encode(model: Reconstructor, drawn: Draw, *, bfloat16: bool = False) -> Code
         )
 
 
-def shader_of(model: Reconstructor, code: Code, stage: Stage, seed: int) -> Shader:
+def shader_of(model: Reconstructor, code: Code, stage: StageConfig, seed: int) -> Shader:
     """The light of a stage on points of a surface."""
     if stage.renderer == "gaussians":
         light = lobes(model, code, stage.lobes)
@@ -49,7 +49,9 @@ def shader_of(model: Reconstructor, code: Code, stage: Stage, seed: int) -> Shad
     return lit
 
 
-def pictures(model: Reconstructor, code: Code, drawn: Draw, stage: Stage) -> tuple[list[Picture], dict[str, Tensor]]:
+def pictures(
+    model: Reconstructor, code: Code, drawn: Draw, stage: StageConfig
+) -> tuple[list[Picture], dict[str, Tensor]]:
     """The renders of the views to compare, and what the geometry itself asks for.
 
     No pictures where the field has no surface yet: then the terms say where one shall be.
@@ -69,7 +71,7 @@ def pictures(model: Reconstructor, code: Code, drawn: Draw, stage: Stage) -> tup
 
 
 def object_losses(
-    model: Reconstructor, drawn: Draw, stage: Stage, distance: losses.Perceptual, *, bfloat16: bool = False
+    model: Reconstructor, drawn: Draw, stage: StageConfig, distance: losses.Perceptual, *, bfloat16: bool = False
 ) -> dict[str, Tensor]:
     """Unweighted terms of one object, each a scalar, by the names of ``stage.weights``; what is not known is not in it.
 
@@ -95,7 +97,7 @@ def object_losses(
     return {**terms, **losses.light_terms(code.latent[0], code.rotation[0], code.strength[0], light, drawn.inputs)}
 
 
-def total(terms: dict[str, Tensor], stage: Stage) -> Tensor:
+def total(terms: dict[str, Tensor], stage: StageConfig) -> Tensor:
     """The weighted sum."""
     weights = vars(stage.weights)
     return sum((weights[name] * value for name, value in terms.items()), start=torch.zeros(()))

@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate, normalize
 
 from reli3d._bridge import present
+from reli3d.errors import InputError
 
 Chooser = Callable[[int], Sequence[int]]  # from the number of views that there are to the indices wanted
 
@@ -140,7 +141,7 @@ class Samples:
     def __init__(self, folder: Path, latents: dict[str, tuple[Tensor, Tensor]] | None = None):
         self.files, self.latents = sorted(folder.glob("*.safetensors")), latents or {}
         if not self.files:
-            raise ValueError(f"data: expected *.safetensors files, got none in {folder}")
+            raise InputError(folder, "expected *.safetensors files, got none")
 
     def __len__(self) -> int:
         return len(self.files)
@@ -161,6 +162,10 @@ class Draw:
     targets: ObjectViews
     background_visible: bool
     seed: int  # of everything random in the rendering
+
+    def to(self, device: torch.device | str) -> Draw:
+        """The same on ``device``."""
+        return replace(self, inputs=self.inputs.to(device), targets=self.targets.to(device))
 
 
 def draw(

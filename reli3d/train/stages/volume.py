@@ -14,7 +14,7 @@ from reli3d.render.color import srgb_to_linear
 from reli3d.render.gaussians import SphericalGaussians, shade_gaussians
 from reli3d.render.points import SurfacePoints
 from reli3d.render.volume import OccupancyGrid, composite, march_rays
-from reli3d.train.stages.config import Stage
+from reli3d.train.stages.config import StageConfig
 from reli3d.train.stages.picture import Picture, display
 
 EMPTY = 1e-3  # opacity of a step below which a cell is not asked
@@ -27,7 +27,7 @@ def density(model: Reconstructor, raw: Tensor) -> Tensor:
     return truncated_exp(raw + model.preset.density_bias)
 
 
-def occupied(model: Reconstructor, code: Code, stage: Stage) -> OccupancyGrid:
+def occupied(model: Reconstructor, code: Code, stage: StageConfig) -> OccupancyGrid:
     """Cells that a ray may not skip; no gradient."""
     radius = model.preset.radius
     step = 2.0 * radius / stage.samples_along
@@ -55,7 +55,7 @@ def render_volume(
     camera: Camera,
     light: SphericalGaussians,
     grid: OccupancyGrid,
-    stage: Stage,
+    stage: StageConfig,
     seed: int,
 ) -> Picture:
     """The view of one object from ``camera``; samples lie at random places of their steps, drawn from ``seed``.

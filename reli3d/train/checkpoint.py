@@ -1,0 +1,115 @@
+"""Checkpoints of a run: one file that holds all that it needs to go on, for every stage."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from reli3d.errors import InputError, shown
+from reli3d.io.files import file_size
+from reli3d.nn.presets import to_json
+from reli3d.nn.weights import check_keys
+from reli3d.train.sharded import gathered, scattered
+from reli3d.train.stage import Stage
+from reli3d.train.workers import Workers
+
+REMEDY = "name another output folder, and this file by --weights"
+
+
+def update_average(average: dict[str, Tensor], model: nn.Module, decay: float) -> None:
+    """Move ``average`` towards the parameters of ``model`` by ``1 - decay``, in place."""
+    with torch.no_grad():
+        for key, value in model.state_dict().items():
+            if value.is_floating_point():
+                average[key].lerp_(value, 1 - decay)
+
+
+def save(
+    folder: Path,
+    stage: Stage,
+    optimizer: torch.optim.Optimizer,
+    average: dict[str, Tensor],
+    step: int,
+    seconds: float,
+    about: dict[str, Any],
+    measures: dict[str, float],
+    workers: Workers,
+) -> dict[str, Tensor]:
+    """Replace ``folder/state.pt`` whole; the averaged weights.  All processes must call it, the first one writes."""
+    first = workers.rank == 0
+    state = {
+        "model": gathered(stage.model.state_dict(), first),
+        "optimizer": gathered(optimizer.state_dict(), first),
+        "average": gathered(average, first),
+        "step": step,
+        "seconds": seconds,
+        "stage": stage.name,
+        "preset": to_json(stage.model.preset),
+        "about": json.dumps(about, sort_keys=True),
+        "measures": measures,
+    }
+    if first:
+        with open(folder / "state.tmp", "wb") as file:
+            torch.save(state, file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(folder / "state.tmp", folder / "state.pt")
+    return state["average"]
+
+
+def load(path: Path, **options: Any) -> dict[str, Any]:
+    """What :func:`save` wrote; of a file of version 0.2 ``stage`` and ``measures`` are empty.
+
+    options: of ``torch.load``.  Raises InputError for a missing, broken or foreign file.
+    """
+    file_size(path)
+    try:
+        state = torch.load(path, weights_only=True, **options)
+        state["model"], state["average"], state["optimizer"]["param_groups"]
+        whole = isinstance(state["step"], int) and state["step"] >= 0
+    except Exception as error:  # of a broken file torch, pickle and zipfile raise almost anything
+        reason = shown(" ".join(str(error).split()))
+        raise InputError(path, f"expected a checkpoint of reli3d-train, got a broken file ({reason})") from None
+    if not whole:
+        raise InputError(path, f"step: expected a count, got {shown(state['step'])}; remove the file to start again")
+    return {"stage": "", "seconds": 0.0, "measures": {}, **state}
+
+
+def to_resume(path: Path, stage: Stage, groups: list[dict]) -> dict[str, Any]:
+    """The checkpoint that ``stage`` goes on from.  Raises InputError for one of another stage or network.
+
+    groups: of the optimizer that goes on.
+    """
+
+    def sizes(groups: list[dict]) -> list[tuple]:
+        return [(len(group["params"]), group.get("times")) for group in groups]
+
+    state = load(path)
+    if state["stage"] not in ("", stage.name):
+        raise InputError(path, f"expected a checkpoint of stage {stage.name}, got one of {state['stage']}; {REMEDY}")
+    if sizes(state["optimizer"]["param_groups"]) != sizes(groups):
+        raise InputError(path, f"expected a checkpoint of the same parameters, got one of others; {REMEDY}")
+    for part in ("model", "average"):
+        check_shapes(path, state[part], stage.model)
+    return state
+
+
+def check_shapes(path: Path, state: dict[str, Tensor], model: nn.Module, lacking: set[str] | None = None) -> None:
+    """Raise InputError unless ``state`` has the tensors of ``model`` but for those ``lacking``."""
+    wanted = {k: tuple(v.shape) for k, v in model.state_dict().items() if k not in (lacking or ())}
+    check_keys(path, {k: tuple(v.shape) for k, v in state.items()}, wanted)
+
+
+def restore(optimizer: torch.optim.Optimizer, state: dict) -> None:
+    """Give ``optimizer`` the whole moments of a checkpoint, sharded where its parameters are."""
+    parameters = [p for group in optimizer.param_groups for p in group["params"]]
+    for k, values in state["state"].items():
+        state["state"][k] = {name: scattered(value, parameters[k]) for name, value in values.items()}
+    for saved, group in zip(state["param_groups"], optimizer.param_groups, strict=True):
+        saved |= {key: group[key] for key in ("foreach", "fused")}
+    optimizer.load_state_dict(state)

@@ -1,0 +1,144 @@
+"""The stages of the small network: ``pixels``, the 2D U-Net alone, and ``small``, all of it.
+
+A further stage is a subclass: its ``weights`` name the terms, its ``losses`` computes them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors.torch import load_file
+from torch import Tensor
+
+from reli3d.errors import InputError
+from reli3d.nn.local import LocalReconstructor
+from reli3d.nn.presets import SMALL
+from reli3d.output.preview import preview
+from reli3d.pipeline import NoSurface, ReconstructOptions, reconstruct
+from reli3d.synthetic.maps import training_maps
+from reli3d.train.batches import draw_samples, stored_views
+from reli3d.train.losses import PIXEL_TERMS, WEIGHTS, losses, pixel_losses
+from reli3d.train.pixels import ViewCache, draw_group, predicts
+from reli3d.train.stage import Stage
+
+# Last layers begin near zero, and Adam moves a number by hardly more than the rate: they take a multiple of it
+LAST_LAYERS = (*(f"pyramid.says.{k}.1." for k in range(SMALL.pyramid.reading)), "color.4.", "surface.4.", "light.out.")
+LAST_RATE = 10.0
+SHOWN = 3  # validation objects in the image, from one and from four views
+LIST_EVERY = 50  # steps after which the folders are listed again: samples may still arrive
+
+
+class SmallStage(Stage):
+    """The whole network, on points, pixels and light of the samples in ``folders``."""
+
+    name = "small"
+    weights: dict[str, float] = WEIGHTS
+    settings: dict[str, Any] = {}
+    model: LocalReconstructor
+
+    def __init__(
+        self,
+        model: LocalReconstructor,
+        folders: Sequence[Path],
+        *,
+        seed: int = 0,
+        max_views: int = 6,
+        points: int = 2048,
+        pyramid_rate: float = 1.0,
+        bfloat16: bool = False,
+        maps: Path | None = None,
+        validation: Path | None = None,
+    ):
+        """folders: of ``*.safetensors`` that ``reli3d-data`` made.  max_views: an object is read from 1 to this many.
+        points: of the volume, an object; half as many of the surface.  pyramid_rate: multiplier of the 2D U-Net's
+        rate; with few objects a step it forgets at the full rate.  bfloat16: of the convolutions.  maps: environment
+        maps, .npz, under which some samples are relit.  validation: folder of held-out samples.
+        """
+        self.model, self.folders, self.seed = model, tuple(folders), seed
+        self.max_views, self.points, self.pyramid_rate = max_views, points, pyramid_rate
+        self.lights = training_maps(maps) if maps else None
+        self.held_out = sorted(validation.glob("*.safetensors"))[:SHOWN] if validation else []
+        self._files: list[Path] = []
+        self._numbers = {
+            "folders": [str(f) for f in folders],
+            "max_views": max_views,
+            "points": points,
+            "pyramid_rate": pyramid_rate,
+            "bfloat16": bfloat16,
+            "maps": str(maps or ""),
+            "validation": str(validation or ""),
+        }
+        model.to_compute(torch.bfloat16 if bfloat16 else torch.float32)
+
+    def files(self, step: int) -> list[Path]:
+        """The samples that the ``step`` draws from.  Raises ValueError where there is none."""
+        if step % LIST_EVERY == 0 or not self._files:
+            self._files = sorted(path for folder in self.folders for path in folder.glob("*.safetensors"))
+        if not self._files:
+            raise InputError(", ".join(map(str, self.folders)), "expected *.safetensors files, got none")
+        return self._files
+
+    def batch(self, step: int, objects: range) -> Sequence[Any]:
+        seeds = [(self.seed, step, k) for k in objects]
+        return draw_samples(self.files(step), seeds, points=self.points, max_views=self.max_views, lights=self.lights)
+
+    def losses(self, item: Any) -> dict[str, Tensor]:  # a Sample
+        return losses(self.model, item)
+
+    def rate_factor(self, parameter: str) -> float:
+        last = LAST_RATE if parameter.startswith(LAST_LAYERS) else 1.0
+        return last * (self.pyramid_rate if predicts(parameter) else 1.0)
+
+    def configuration(self) -> dict[str, Any]:
+        return self._numbers
+
+    def validation(self, average: dict[str, Tensor]) -> np.ndarray | None:
+        """Previews of held-out samples reconstructed from one and from four views; None where nothing has a surface."""
+        if not self.held_out:
+            return None
+        model = LocalReconstructor(self.model.preset)
+        model.load_state_dict(average)
+        rows = []
+        for path in self.held_out:
+            sample, row = load_file(path), []
+            for count in (1, 4):
+                try:
+                    options = ReconstructOptions(texture_size=256)
+                    asset = reconstruct(stored_views(sample, count), weights=model.eval(), options=options)
+                    row.append(preview(asset, stored_views(sample, 4))())
+                except NoSurface:  # early in training
+                    continue
+            if row:
+                rows.append(np.concatenate(row, 1))
+        width = max((row.shape[1] for row in rows), default=0)
+        padded = [np.pad(r, ((0, 0), (0, width - r.shape[1]), (0, 0)), constant_values=255) for r in rows]
+        return np.concatenate(padded, 0) if padded else None
+
+
+class PixelStage(SmallStage):
+    """The 2D U-Net alone, on the maps of all views; images may be 2 or 4 times smaller (``model.pyramid.finest``)."""
+
+    name = "pixels"
+    weights = {term: WEIGHTS[term] for term in PIXEL_TERMS}
+
+    def __init__(self, model: LocalReconstructor, folders: Sequence[Path], **options: Any):
+        super().__init__(model, folders, **options)
+        self._cache = ViewCache(model.pyramid.finest)
+
+    def batch(self, step: int, objects: range) -> Sequence[Any]:
+        """One item: convolutions of small images are faster for many views at once."""
+        seeds = [(self.seed, step, k) for k in objects]
+        return [draw_group(self.files(step), seeds, self._cache, max_views=self.max_views)]
+
+    def losses(self, item: Any) -> dict[str, Tensor]:  # a Group
+        return pixel_losses(self.model, item)
+
+    def rate_factor(self, parameter: str) -> float:
+        return super().rate_factor(parameter) if predicts(parameter) else 0.0
+
+    def validation(self, average: dict[str, Tensor]) -> np.ndarray | None:
+        return super().validation(average) if self.model.pyramid.finest == 0 else None

@@ -1,0 +1,160 @@
+"""The stages of the paper's network as the training loop takes them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from reli3d.errors import InputError
+from reli3d.nn.model import Reconstructor
+from reli3d.train.stage import Stage
+from reli3d.train.stages.config import TINY, StageConfig
+from reli3d.train.stages.losses import perceptual
+from reli3d.train.stages.step import checkpointed, encode, object_losses, pictures, trunk_layers
+from reli3d.train.stages.surface import surface
+from reli3d.train.stages.views import Draw, Source, draw
+
+CHECKED = 4  # objects whose surface is looked for at every checkpoint
+SHOWN = 3  # validation objects in the image
+TILE = 96  # pixels of a side of a tile of the image
+
+
+class PaperStage(Stage):
+    """Images of views that were not input, compared with renderings of the predicted object."""
+
+    model: Reconstructor
+
+    def __init__(
+        self,
+        model: Reconstructor,
+        config: StageConfig,
+        sources: Sequence[Source],
+        *,
+        seed: int = 0,
+        max_views: int = 4,
+        background: float = 0.5,
+        distance: str = "gradients",
+        bfloat16: bool = False,
+        checkpointing: bool = False,
+        validation: Source | None = None,
+        folders: Sequence[str] = (),
+    ):
+        """max_views: an object is read from 1 to this many; the first is the hero.  background: fraction of the
+        objects whose light may be read from the background.  distance: ``gradients`` or ``lpips``, the perceptual
+        term.  bfloat16: autocast of the trunk.  checkpointing: recompute the trunk's layers in the backward pass.
+        validation: held-out objects.  folders: of the sources, for the log.
+        """
+        if not 1 <= max_views <= 16:
+            raise ValueError(f"max_views: expected 1 to 16, got {max_views}")
+        self.name, self.weights = config.name, vars(config.weights)
+        self.settings = {
+            **{"steps": config.steps, "batch": config.batch, "rate": config.rate, "final_rate": 0.1},
+            **{"weight_decay": 0.01, "clip": 1.0},
+        }
+        self.model, self.config, self.sources = model, config, sources
+        self.seed, self.max_views, self.background, self.bfloat16 = seed, max_views, background, bfloat16
+        self.distance = perceptual(distance)
+        self._numbers = {
+            "config": asdict(config),
+            "folders": list(folders),
+            "max_views": max_views,
+            "background": background,
+            "distance": distance,
+            "bfloat16": bfloat16,
+            "checkpointing": checkpointing,
+        }
+        if checkpointing:
+            checkpointed(model)
+        self.held_out = [self.drawn(0, k, [validation], patch=0) for k in range(SHOWN)] if validation else []
+
+    def drawn(self, step: int, place: int, sources: Sequence[Source] | None = None, patch: int | None = None) -> Draw:
+        """The object at ``place`` of a step: a function of the seed, the step and the place."""
+        return draw(
+            sources or self.sources,
+            (self.seed, step, place),
+            inputs=self.max_views,
+            targets=self.config.targets,
+            background=self.background,
+            input_size=self.model.preset.image_size,
+            target_size=self.config.image_size,
+            patch=self.config.patch if patch is None else patch,
+        ).to(self.model.device)
+
+    def batch(self, step: int, objects: range) -> Sequence[Any]:
+        return [(step, place) for place in objects]  # read one after the other: a batch of images may not fit
+
+    def losses(self, item: tuple[int, int]) -> dict[str, Tensor]:
+        return object_losses(self.model, self.drawn(*item), self.config, self.distance, bfloat16=self.bfloat16)
+
+    def layers(self) -> list[torch.nn.Module]:
+        return trunk_layers(self.model)
+
+    def configuration(self) -> dict[str, Any]:
+        return self._numbers
+
+    @torch.no_grad()
+    def measures(self) -> dict[str, float]:
+        """``surface``: the fraction of a few training objects for which the network has a surface.
+
+        Raises InputError where a stage that renders the surface has none: its losses could not train the materials.
+        """
+        resolution = self.config.resolution or self.model.preset.resolution
+        draws = (self.drawn(0, place) for place in range(CHECKED))
+        found = [surface(self.model, encode(self.model, one), resolution) is not None for one in draws]
+        if self.config.renderer != "volume" and not any(found):
+            raise no_surface(f"stage {self.name}")
+        return {"surface": sum(found) / CHECKED}
+
+    @torch.no_grad()
+    def validation(self, average: dict[str, Tensor]) -> np.ndarray | None:
+        """A row for each object: hero, target, rendering, base color, roughness and metallic, normal, light."""
+        model = averaged(self.model, average)
+        rows = []
+        for one in self.held_out:
+            code = encode(model, one)
+            shown, _ = pictures(model, code, one, self.config)
+            target = one.targets
+            tiles = [
+                one.inputs.images[0] * one.inputs.masks[0][..., None],
+                target.images[0] * target.masks[0][..., None],
+            ]
+            if shown:
+                picture = shown[0]
+                cover = (picture.cover * picture.known)[..., None]
+                finish = torch.cat([picture.material[..., 3:], torch.zeros_like(cover)], -1) * cover
+                normal = 0.5 * (picture.normal + 1.0) * cover
+                tiles += [picture.color, picture.material[..., :3] * cover, finish, normal]
+            else:
+                tiles += [torch.zeros_like(tiles[1])] * 4
+            light = model.decode_environment(code)[0]
+            tiles.append((light / light.mean().clamp(min=1e-6) * 0.3).clamp(0, 1) ** (1 / 2.2))
+            rows.append(np.concatenate([_tile(t.clamp(0, 1).cpu().numpy()) for t in tiles], 1))
+        return np.concatenate(rows) if rows else None
+
+
+def no_surface(where: object) -> InputError:
+    """The error for a network that has no surface."""
+    return InputError(
+        where,
+        f"expected a network that has a surface, got none for {CHECKED} training objects; start from a longer "
+        f"--stage volume ({TINY['volume'].steps} steps by default), whose log has the fraction with a surface",
+    )
+
+
+def averaged(model: Reconstructor, average: dict[str, Tensor]) -> Reconstructor:
+    """A network of its own with the averaged parameters."""
+    other = Reconstructor(model.preset).to(model.device)
+    other.load_state_dict(average)
+    return other.eval()
+
+
+def _tile(values: np.ndarray) -> np.ndarray:
+    """Repeated pixels, ``TILE`` high."""
+    at = (np.arange(TILE) * values.shape[0]) // TILE
+    across = (np.arange(TILE) * values.shape[1]) // TILE
+    return (values[at][:, across] * 255 + 0.5).astype(np.uint8)
