@@ -26,9 +26,9 @@ from reli3d.geometry.sparse_sdf import sparse_sdf
 from reli3d.geometry.surface import extract_surface
 from reli3d.geometry.tangents import encode_normals, vertex_tangents
 from reli3d.geometry.uv import source_vertices, unwrap, unwrap_xatlas
-from reli3d.nn.blocks import beside, in_rows
+from reli3d.nn.blocks import in_rows, submit
 from reli3d.nn.field import CHUNK, Field, TriplaneField
-from reli3d.nn.local import HEADS, LocalField, LocalReconstructor
+from reli3d.nn.local import HEAD_OUTPUTS, LocalField, LocalReconstructor
 from reli3d.nn.presets import LocalPreset, Preset
 from reli3d.nn.view_features import ViewMaps
 from reli3d.nn.weights import Network, load_model
@@ -175,25 +175,25 @@ def texture(
         """The field with its light, and, at vertices, which lie as close as the network's cells, heads and who sees."""
         every = slice(None, None, max(1, len(mesh.vertices) // SHADING_POINTS))
         position, normal = mesh.vertices, present("mesh.normals", mesh.normals)
-        visible = maps.seen(present("scene", scene), position, normal)
+        visible = maps.visibility(present("scene", scene), position, normal)
         field = field.with_shading(*(v[every].contiguous() for v in (position, normal, visible)))
         return field, torch.cat([field.heads(position, normal, visible), visible], 1)
 
-    asked = beside(partial(at_vertices, field, mesh), mesh.vertices.device) if isinstance(field, LocalField) else None
+    pending = submit(partial(at_vertices, field, mesh), mesh.vertices.device) if isinstance(field, LocalField) else None
     whole = mesh
     try:
         mesh = unwrap(mesh, texture_size=size) if uv == "project" else unwrap_xatlas(mesh, texture_size=size)
         mesh = replace(mesh, tangents=vertex_tangents(mesh))
     finally:
-        local, known = asked() if asked else (None, None)
+        local, known = pending() if pending else (None, None)
     if known is not None:
         known = known.index_select(0, source_vertices(whole, mesh))
 
     def surface(position: Tensor, normal: Tensor, tangent: Tensor, *values: Tensor) -> dict[str, Tensor]:
         if local is not None:
-            heads, corners = values[0].split([HEADS, len(maps.images)], 1)
-            visible = maps.seen_within(present("scene", scene), position, normal, corners)
-            got = local.painted(heads, position, normal, visible)
+            heads, corners = values[0].split([HEAD_OUTPUTS, len(maps.images)], 1)
+            visible = maps.visibility_within(present("scene", scene), position, normal, corners)
+            got = local.material_from_heads(heads, position, normal, visible)
         else:
             got = field.material(position, normal, position.new_zeros(len(position), len(maps.images)))
         found = {"base_color": got.base_color, "roughness": got.roughness[:, None], "metallic": got.metallic[:, None]}
@@ -215,7 +215,7 @@ def match_brightness(asset: Asset, maps: ViewMaps, scene: RayScene) -> Asset:
 
     Photographs determine only the product of paint and light; see :mod:`reli3d.render.exposure`.
     """
-    maps = maps.photographs
+    maps = maps.inputs
     return estimate_base_color_and_light(asset, maps.images[..., :3], maps.images[..., 3] > INSIDE, maps.camera, scene)
 
 

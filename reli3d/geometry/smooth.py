@@ -1,7 +1,7 @@
-"""Smoothing of a mesh's positions with the umbrella operator: every vertex moves towards the mean of its neighbours.
+"""Mesh smoothing with the umbrella operator, which moves every vertex towards the mean of its neighbors.
 
-Neighbours are those of the welded mesh, so a surface does not tear where charts or exporters split its vertices.
-Only positions move: UV coordinates stay, normals and tangents, which no longer fit, are left out of the result.
+Neighbors are taken from the welded mesh, so that surfaces do not tear at UV seams or split vertices.  Positions change,
+UV coordinates are kept, and normals and tangents are dropped because they no longer fit.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from reli3d.geometry.topology import edges_of
 
 @dataclass(frozen=True)
 class _Umbrella:
-    """The sparse operator ``mean of the neighbours - own position`` of the welded mesh."""
+    """The sparse operator ``mean of the neighbors - position`` on the welded mesh."""
 
     label: Tensor  # (V,) welded vertex of every vertex
-    share: Tensor  # (V, 1) 1 / copies of a vertex
-    neighbours: Tensor  # (E,) of every welded vertex that moves, one after the other
-    start: Tensor  # (W,) where those of a vertex begin
-    inverse: Tensor  # (W, 1) 1 / neighbours, 0 for what stays
+    weight: Tensor  # (V, 1) 1 / copies of a vertex
+    neighbours: Tensor  # (E,) of every moving welded vertex, concatenated
+    start: Tensor  # (W,) first entry of a vertex in ``neighbours``
+    inverse: Tensor  # (W, 1) 1 / number of neighbors, 0 for fixed vertices
 
     def welded(self, values: Tensor) -> Tensor:
         out = values.new_zeros(len(self.inverse), values.shape[1])
-        return out.index_add(0, self.label, values * self.share)
+        return out.index_add(0, self.label, values * self.weight)
 
     def __call__(self, positions: Tensor) -> Tensor:
         total = torch.nn.functional.embedding_bag(self.neighbours, positions, self.start, mode="sum")
@@ -50,8 +50,8 @@ def _umbrella(mesh: Mesh) -> _Umbrella:
     degree = torch.bincount(moved, minlength=n)
     start = torch.cumsum(degree, 0) - degree
     inverse = torch.where(degree > 0, 1.0 / degree.clamp(min=1), 0.0)[:, None].to(mesh.vertices.dtype)
-    share = 1.0 / torch.bincount(label, minlength=n)[label][:, None].to(mesh.vertices.dtype)
-    return _Umbrella(label, share, key - moved * n, start, inverse)
+    weight = 1.0 / torch.bincount(label, minlength=n)[label][:, None].to(mesh.vertices.dtype)
+    return _Umbrella(label, weight, key - moved * n, start, inverse)
 
 
 def _smoothed(mesh: Mesh, steps: list[float]) -> Mesh:
@@ -66,12 +66,12 @@ def _smoothed(mesh: Mesh, steps: list[float]) -> Mesh:
 
 
 def taubin_smooth(mesh: Mesh, *, iterations: int = 10, step: float = 0.5, pass_band: float = 0.1) -> Mesh:
-    """The mesh after ``iterations`` pairs of a shrinking and an inflating step: denoised, its volume preserved.
+    """Taubin smoothing: ``iterations`` pairs of a shrinking and an inflating step, which preserve the volume.
 
-    Taubin 1995, A signal processing approach to fair surface design: steps ``step`` and ``mu`` with ``1 / step + 1 /
-    mu = pass_band``; frequencies of the umbrella operator below ``pass_band`` are kept or raised a little.  pass_band
-    in (0, 1 / step), small; step in (0, 1].  Vertices of open borders stay.  Gradients reach the vertices; sums over
-    neighbours have a fixed order on CPU.  Raises ValueError for values out of range.
+    The steps are ``step`` and ``mu`` with ``1 / step + 1 / mu = pass_band``; frequencies of the umbrella operator below
+    ``pass_band`` are kept or slightly amplified.  step: in (0, 1].  pass_band: in (0, 1 / step), small.  Vertices of
+    open borders are fixed.  Gradients reach the vertices.  Sums over neighbors have a fixed order on a CPU.  Raises
+    ValueError for values out of range.  Source: Taubin 1995, A signal processing approach to fair surface design.
     """
     if iterations < 0:
         raise ValueError(f"iterations: expected at least 0, got {iterations}")

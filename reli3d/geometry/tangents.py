@@ -1,8 +1,8 @@
-"""Tangent frames of a mesh with UV, and normals written in them.
+"""Tangent frames of a mesh with UV, and normal maps in these frames.
 
-The convention is MikkTSpace's, as in glTF.  The tangent follows +u.  The bitangent, w * cross(normal, tangent), points
-up on the image, which is -v; w is +1 where the texture is not mirrored.  A normal map holds n * 0.5 + 0.5, red along
-the tangent and green along the bitangent.
+The convention is MikkTSpace's, as in glTF.  The tangent points along +u.  The bitangent, w * cross(normal, tangent),
+points along -v, up on the image; w is +1 where the texture is not mirrored.  A normal map holds n * 0.5 + 0.5, red
+along the tangent and green along the bitangent.
 """
 
 from __future__ import annotations
@@ -16,31 +16,32 @@ from torch import Tensor
 from reli3d._bridge import check, expect, launch, present
 from reli3d.geometry.mesh import Mesh, weld_rows
 from reli3d.kernels.bump import ENCODE_EPS, encode_normals_kernel
-from reli3d.kernels.tangents import corner_shares_kernel
+from reli3d.kernels.tangents import corner_tangents_kernel
 
 EPS = float(ENCODE_EPS)
-PARALLEL = 1.0e-12  # length of a projected direction below which it has no direction in float64
+PARALLEL = 1.0e-12  # projected directions shorter than this are treated as zero, in float64
 
 
 def _unit(v: Tensor) -> tuple[Tensor, Tensor]:
-    """The columns of ``v (3, N)`` with unit length, 0 where shorter than PARALLEL, and their lengths ``(N,)``."""
+    """Normalized columns of ``v (3, N)``, 0 if shorter than PARALLEL, and their lengths ``(N,)``."""
     length = (v * v).sum(0).sqrt()
     return v * torch.where(length > PARALLEL, 1.0 / length.clamp(min=1e-300), 0.0), length
 
 
 def _flat(v: Tensor, n: Tensor) -> Tensor:
-    """The columns of ``v`` without their parts along the unit columns of ``n``."""
+    """The columns of ``v`` projected onto the planes with the unit normals ``n``."""
     return v - n * (n * v).sum(0)
 
 
 def vertex_tangents(mesh: Mesh) -> Tensor:
     """Tangents ``(V, 4)`` float32: unit, orthogonal to the normal, w = +-1.
 
-    Every corner adds the direction of +u of its face, projected onto the plane of the vertex normal and made unit,
-    times the angle of the corner.  Corners are one vertex where position, normal and UV are equal.  A vertex that joins
-    mirrored and plain faces, which MikkTSpace splits, takes the side with the larger angle; :func:`unwrap` makes none.
-    Without any direction (no UV area) the tangent is some vector orthogonal to the normal.  No gradient.  Raises
-    ValueError without normals or UV.  Source: Mikkelsen 2008, Simulation of wrinkled surfaces revisited; mikktspace.c.
+    The tangent of a vertex is the sum over its corners of the face's +u direction, projected onto the plane of the
+    vertex normal and normalized, times the angle of the corner.  Vertices with equal position, normal and UV are
+    merged.  A vertex between mirrored and unmirrored faces, which MikkTSpace splits, takes the side with the larger
+    angle; :func:`unwrap` produces none.  Where all faces have zero UV area the tangent is an arbitrary vector
+    orthogonal to the normal.  No gradient.  Raises ValueError without normals or UV.  Source: Mikkelsen 2008,
+    Simulation of wrinkled surfaces revisited; mikktspace.c.
     """
     expect("mesh", mesh, Mesh)
     if mesh.normals is None:
@@ -49,14 +50,14 @@ def vertex_tangents(mesh: Mesh) -> Tensor:
         raise ValueError("mesh.uv: expected a tensor, got None (see unwrap)")
     vertices, uv, normals = (x.detach().contiguous() for x in (mesh.vertices, mesh.uv, mesh.normals))
     same, count = _merged(mesh), len(mesh.vertices)
-    share = torch.empty(3, len(mesh.faces), 4, dtype=torch.float64, device=vertices.device)
+    corner = torch.empty(3, len(mesh.faces), 4, dtype=torch.float64, device=vertices.device)
     side = torch.empty(3, len(mesh.faces), dtype=torch.int32, device=vertices.device)
     ins = [(vertices, wp.vec3), (normals, wp.vec3), (uv, wp.vec2), (mesh.faces.contiguous(), wp.int32)]
-    outs = [(same.int(), wp.int32), (share, wp.vec4d), (side, wp.int32)]
-    launch(corner_shares_kernel, len(mesh.faces), [*ins, *outs], vertices.device)
-    side, shares = side.flatten(), share.flatten(0, 1).T.contiguous()
-    # plain, mirrored; index_add_ takes ten times as long
-    total = torch.stack([torch.bincount(side, part, 2 * count) for part in shares])
+    outs = [(same.int(), wp.int32), (corner, wp.vec4d), (side, wp.int32)]
+    launch(corner_tangents_kernel, len(mesh.faces), [*ins, *outs], vertices.device)
+    side, weighted = side.flatten(), corner.flatten(0, 1).T.contiguous()
+    # unmirrored, then mirrored; index_add_ is about 10 times slower
+    total = torch.stack([torch.bincount(side, part, 2 * count) for part in weighted])
     n = _unit(normals.double().T.contiguous())[0]  # vectors are columns: torch sums a short last axis slowly
     plain, mirrored = total[:, :count][:, same], total[:, count:][:, same]
     flip = mirrored[3] > plain[3]
@@ -87,7 +88,7 @@ def with_tangents(mesh: Mesh) -> Mesh:
 
 
 def _dot(a: Tensor, b: Tensor) -> Tensor:
-    """Products of vectors along the last axis, ``(...)``; a sum over so short an axis takes three times as long."""
+    """Dot products along the last axis, ``(...)``; ``sum`` over an axis of 3 is about 3 times slower."""
     product = a * b
     return product[..., 0] + product[..., 1] + product[..., 2]
 
@@ -107,15 +108,14 @@ def encode_normals(world: Tensor, normal: Tensor, tangent: Tensor) -> Tensor:
     """Normal map values ``(..., 3)`` in [0, 1] of the unit world-space normals ``world (..., 3)``.
 
     normal: ``(..., 3)`` unit, tangent: ``(..., 4)`` with unit direction, both interpolated at the texel.  The frame is
-    inverted, not transposed: interpolated tangents are not quite orthogonal, and :func:`decode_normals` must give
-    ``world`` back.  A normal below the surface is bent up to it, since viewers expect none there.  Gradients reach
-    ``world``.
+    inverted, not transposed, because interpolated tangents are not exactly orthogonal and :func:`decode_normals` must
+    return ``world``.  Normals below the surface are clamped to the tangent plane.  Gradients reach ``world``.
     """
     _check_frame(normal, tangent)
     check("world", world, last=3, like=normal)
     same = world.shape[:-1] == normal.shape[:-1] == tangent.shape[:-1]
-    asked = torch.is_grad_enabled() and any(v.requires_grad for v in (world, normal, tangent))
-    if same and not asked:
+    differentiable = torch.is_grad_enabled() and any(v.requires_grad for v in (world, normal, tangent))
+    if same and not differentiable:
         rows = [v.detach().reshape(-1, v.shape[-1]).contiguous() for v in (world, normal, tangent)]
         out = torch.empty_like(rows[1])
         arrays = list(zip((*rows, out), (wp.vec3, wp.vec3, wp.vec4, wp.vec3), strict=True))
@@ -124,7 +124,7 @@ def encode_normals(world: Tensor, normal: Tensor, tangent: Tensor) -> Tensor:
     t, b, n = _frame(normal, tangent)
     tt, tn, nn = _dot(t, t), _dot(t, n), _dot(n, n)
     wt, wn = _dot(world, t), _dot(world, n)
-    determinant = (tt * nn - tn * tn).clamp(min=EPS)  # b is orthogonal to both, so that two equations remain
+    determinant = (tt * nn - tn * tn).clamp(min=EPS)  # b is orthogonal to both: a 2x2 system remains
     x = (nn * wt - tn * wn) / determinant
     z = (tt * wn - tn * wt) / determinant
     y = _dot(world, b) / _dot(b, b).clamp(min=EPS)

@@ -25,13 +25,13 @@ from reli3d.geometry.mesh import Mesh, vertex_normals, weld
 from reli3d.geometry.topology import face_neighbours, group
 from reli3d.kernels import charts as kernels
 
-FILL = 0.62  # share of the atlas that charts are expected to cover; sets the unit of the chart step only
-LONGEST = 1.0  # of the atlas's side at the expected scale: a longer chart is cut
-ROUNDS = 10  # packings tried in the search for the scale; it stops earlier within 1 %
+FILL = 0.62  # expected fraction of the atlas covered by charts; sets only the length unit of the chart step
+MAX_CHART_LENGTH = 1.0  # in sides of the atlas at the expected scale: longer charts are cut
+MAX_PACKINGS = 10  # in the search for the scale, which also stops within 1 %
 CELLS = 1024  # resolution of the packing: cells along the atlas
-GUARD_MOST = 3.0  # boxes with guard band over boxes without: above, the charts are too many and the band is halved
+MAX_GUARD_RATIO = 3.0  # area of the boxes with guard band over without: above it the band is halved
 SLIVER_PITCH, SLIVER_SIDE = 3.0, 2.0  # texels: a face without area gets a right triangle of this side
-SLIVER_SHARE = 0.1  # of the atlas at most goes to faces without area
+SLIVER_FRACTION = 0.1  # greatest fraction of the atlas for faces without area
 XATLAS = """
 import sys, numpy, xatlas
 data = numpy.load(sys.argv[1])
@@ -50,8 +50,8 @@ class AtlasReport:
     """What :func:`atlas_report` measures; areas are of the unit square of UV."""
 
     charts: int  # connected through equal UV vertices
-    utilisation: float  # share of the square that faces cover, overlap counted once
-    overlap: float  # share of the covered samples with more than one face
+    utilisation: float  # fraction of the square that faces cover, overlap counted once
+    overlap: float  # fraction of the covered samples with more than one face
     stretch: float  # L2 of Sander et al. 2001 over the surface, 1 where lengths are kept; scale of the atlas removed
     # largest length on the surface per UV length of any face, relative to the mean; slivers left out
     stretch_max: float
@@ -95,7 +95,7 @@ def unwrap(mesh: Mesh, *, texture_size: int = 1024) -> Mesh:
         label[source_faces].astype(np.int32),
         texels=FILL * texture_size**2,
         least_texels=9.0 * guard * guard,
-        longest=LONGEST * texture_size,
+        longest=MAX_CHART_LENGTH * texture_size,
         sliver=4.0e-6 * texture_size,
     )
     uv = _pack(charts, texture_size, guard)
@@ -141,7 +141,7 @@ def _pack(charts: parts.Charts, size: int, guard: float) -> np.ndarray:
     """UV of the corners, ``(F, 3, 2)`` float32: all charts at one scale, the largest at which they fit."""
     uv = np.zeros((len(charts.chart), 3, 2))
     slivers = np.flatnonzero(charts.chart < 0)
-    pitch = min(SLIVER_PITCH, size * np.sqrt(SLIVER_SHARE / max(len(slivers), 1)))
+    pitch = min(SLIVER_PITCH, size * np.sqrt(SLIVER_FRACTION / max(len(slivers), 1)))
     columns = int((size - 1) // pitch)
     if len(slivers):
         legs = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]) * (pitch * SLIVER_SIDE / SLIVER_PITCH)
@@ -213,7 +213,7 @@ def _place(charts: parts.Charts, faces: np.ndarray, size: int, guard: float, res
         best, best_place = 0.0, np.empty((0, 4), np.int32)
         low, high = 0.0, float(cells / max(extent.max() / cell, 1e-9))
         scale = min(1.0, 0.98 * high)
-        for _ in range(ROUNDS):
+        for _ in range(MAX_PACKINGS):
             reached = drop(scale, guard)
             if reached <= cells:
                 low, best, best_place = scale, scale, place.numpy().copy()
@@ -225,7 +225,9 @@ def _place(charts: parts.Charts, faces: np.ndarray, size: int, guard: float, res
             scale = scale * ratio
             if not low * 1.002 < scale < high * 0.998:
                 scale = 0.5 * (low + high) if low else 0.7 * high
-        if best and ((extent * best + guard).prod(1).sum() < GUARD_MOST * (extent * best).prod(1).sum() or guard < 0.1):
+        if best and (
+            (extent * best + guard).prod(1).sum() < MAX_GUARD_RATIO * (extent * best).prod(1).sum() or guard < 0.1
+        ):
             break
         guard *= 0.5  # too many charts: the guard band would take most of the atlas
     inside = corners * best + 0.5 * guard

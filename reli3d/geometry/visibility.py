@@ -1,4 +1,4 @@
-"""Which cameras see a point of a surface."""
+"""Visibility of surface points in posed cameras."""
 
 from __future__ import annotations
 
@@ -11,36 +11,36 @@ from reli3d.geometry.camera import Camera, check_camera
 from reli3d.geometry.rays import RayScene
 from reli3d.kernels.rays import sight_kernel
 
-GRAZING = 0.05  # cosine below which a pixel smears over 20 times its width of surface and says nothing about the point
+MIN_COSINE = 0.05  # between normal and view direction: below it a pixel covers more than 20 times its width of surface
 
 
 def visible_from(
-    scene: RayScene, position: Tensor, normal: Tensor, camera: Camera, asked: Tensor | None = None
+    scene: RayScene, position: Tensor, normal: Tensor, camera: Camera, active: Tensor | None = None
 ) -> Tensor:
-    """``(N, V)`` bool: the point faces the camera, projects into its image and nothing stands between.
+    """``(N, V)`` bool, true where the point faces the camera, projects into its image and is not occluded.
 
-    position, normal: ``(N, 3)`` world, the normal unit.  camera: of V views.  asked: ``(N, V)`` bool, what is wanted;
-    the rest is False.  No gradient.  Raises TypeError, ValueError.
+    position, normal: ``(N, 3)`` world, the normal unit.  camera: of V views.  active: ``(N, V)`` bool, the pairs to
+    test; all others are False.  No gradient.  Raises TypeError, ValueError.
     """
     check("position", position, last=3)
     check("normal", normal, last=3, like=position)
     check_camera(camera, like=position)
     n, views = len(position), len(camera.c2w)
     pair = torch.empty(0, dtype=torch.int32, device=position.device)  # all
-    if asked is not None:
-        check("asked", asked, last=views, like=position, dtype=torch.bool)
-        if asked.shape != (n, views):
-            raise ValueError(f"asked: expected shape {(n, views)}, got {tuple(asked.shape)}")
-        pair = asked.T.reshape(-1).nonzero()[:, 0].int()
-    count = n * views if asked is None else len(pair)
+    if active is not None:
+        check("active", active, last=views, like=position, dtype=torch.bool)
+        if active.shape != (n, views):
+            raise ValueError(f"active: expected shape {(n, views)}, got {tuple(active.shape)}")
+        pair = active.T.reshape(-1).nonzero()[:, 0].int()
+    count = n * views if active is None else len(pair)
     origin, direction = (position.new_empty(count, 3) for _ in range(2))
     distance = position.new_empty(count)
     ins = (position, wp.vec3), (normal, wp.vec3), (camera.c2w, wp.mat44), (camera.intrinsics, wp.vec4), (pair, wp.int32)
     outs = (origin, wp.vec3), (direction, wp.vec3), (distance, wp.float32)
     arrays = [(v.detach().contiguous(), kind) for v, kind in ins]
     size = wp.vec2(float(camera.width), float(camera.height))
-    launch(sight_kernel, count, [*arrays, size, GRAZING, *outs], position.device)
+    launch(sight_kernel, count, [*arrays, size, MIN_COSINE, *outs], position.device)
     free = scene.unoccluded(origin, direction, distance)
-    if asked is not None:
-        free = asked.T.clone(memory_format=torch.contiguous_format).masked_scatter_(asked.T, free)
+    if active is not None:
+        free = active.T.clone(memory_format=torch.contiguous_format).masked_scatter_(active.T, free)
     return free.view(views, n).T.contiguous()

@@ -50,8 +50,8 @@ def cosine_integral_ends(sharpness: float) -> wp.vec2:
 
 
 @wp.func
-def cosine_share(sharpness: float, cos_axis: float) -> float:
-    """``cosine_integral`` over 2 pi / sharpness, from the smallest sharpness on: the cosine itself for narrow lobes."""
+def cosine_fraction(sharpness: float, cos_axis: float) -> float:
+    """``cosine_integral`` divided by 2 pi / sharpness, which tends to the cosine for narrow lobes."""
     s = sharpness
     c = wp.clamp(cos_axis, -1.0, 1.0)
     t = wp.sqrt(0.5 * s * (s * s + 2.978423 * s) / (s * s + 3.05127513 * s + 14.27419507))
@@ -70,7 +70,7 @@ def cosine_integral(sharpness: float, cos_axis: float) -> float:
     function; its width ``t`` is fitted here to quadrature over sharpness 0.05 to 3000.
     """
     s = wp.max(sharpness, SHARPNESS_MIN)
-    return 2.0 * PI / s * cosine_share(s, cos_axis)
+    return 2.0 * PI / s * cosine_fraction(s, cos_axis)
 
 
 @wp.func
@@ -103,7 +103,7 @@ def specular_lobe(
     root_o = wp.sqrt(a2 + (1.0 - a2) * cos_o * cos_o)
     root_i = wp.sqrt(a2 + (1.0 - a2) * cos_i * cos_i)
     visibility = 0.5 / (cos_i * root_o + cos_o * root_i)
-    total = height * cosine_share(length * warped, wp.dot(n, p)) * visibility
+    total = height * cosine_fraction(length * warped, wp.dot(n, p)) * visibility
     return schlick(f0, wp.max(wp.dot(wo, h), 0.0)) * total
 
 

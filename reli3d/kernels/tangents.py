@@ -1,4 +1,4 @@
-"""What the corners of faces say of the tangents at their vertices, in float64: differences of float32 values cancel."""
+"""Angle-weighted tangents at the corners of faces, in float64 because differences of float32 values cancel."""
 
 import warp as wp
 
@@ -11,7 +11,7 @@ ONE = wp.constant(wp.float64(1.0))
 
 @wp.func
 def unit(v: wp.vec3d) -> wp.vec3d:
-    """``v`` with length 1, 0 where it is shorter than PARALLEL."""
+    """``v`` normalized, 0 if it is shorter than PARALLEL."""
     length = wp.length(v)
     if length > PARALLEL:
         return v / length
@@ -20,12 +20,12 @@ def unit(v: wp.vec3d) -> wp.vec3d:
 
 @wp.func
 def flat(v: wp.vec3d, n: wp.vec3d) -> wp.vec3d:
-    """``v`` without its part along the unit ``n``."""
+    """``v`` projected onto the plane with unit normal ``n``."""
     return v - n * wp.dot(n, v)
 
 
 @wp.kernel
-def corner_shares_kernel(
+def corner_tangents_kernel(
     start: int,
     # in
     vertices: wp.array[wp.vec3],
@@ -34,7 +34,7 @@ def corner_shares_kernel(
     faces: wp.array2d[wp.int32],
     same: wp.array[wp.int32],
     # out
-    share: wp.array2d[wp.vec4d],  # (3, F) direction of +u at the corner times its angle; the angle
+    tangent: wp.array2d[wp.vec4d],  # (3, F) unit direction of +u times the corner's angle; the angle
     side: wp.array2d[wp.int32],  # (3, F) ``same`` of the vertex, plus the number of vertices unless the face is plain
 ):
     f = start + wp.tid()
@@ -45,7 +45,7 @@ def corner_shares_kernel(
     s1 = wp.float64(b[1]) - wp.float64(a[1])
     t0 = wp.float64(c[0]) - wp.float64(a[0])
     t1 = wp.float64(c[1]) - wp.float64(a[1])
-    area = s0 * t1 - s1 * t0  # v is down: a face that is not mirrored is clockwise here
+    area = s0 * t1 - s1 * t0  # negative unless mirrored, as v points down
     p = wp.vec3d(vertices[faces[f, 0]])
     q = wp.vec3d(vertices[faces[f, 1]])
     r = wp.vec3d(vertices[faces[f, 2]])
@@ -63,7 +63,7 @@ def corner_shares_kernel(
         if area != ZERO:
             angle = wp.acos(wp.clamp(wp.dot(e1, e2), -ONE, ONE))
         d = unit(flat(along_u, n)) * angle
-        share[k, f] = wp.vec4d(d[0], d[1], d[2], angle)
+        tangent[k, f] = wp.vec4d(d[0], d[1], d[2], angle)
         if area < ZERO:
             side[k, f] = same[vertex]
         else:

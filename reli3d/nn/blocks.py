@@ -1,4 +1,4 @@
-"""Large sets of points in blocks that stay in the processor's cache."""
+"""Evaluation of large point sets in blocks that fit the cache, and tasks on the thread pool."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from torch import Tensor, nn
 
 from reli3d._bridge import over_rows, pool, serial
 
-ROWS = 8192  # points at a time without gradient: their features stay in the cache, which halves the time of the heads
+ROWS = 8192  # points per block without gradient: features fit the cache, which halves the time of the heads
 
 T = TypeVar("T")
 
 
 def linear_of(layers: nn.Module, index: int) -> nn.Linear:
-    """Layer ``index`` of a stack, which is a linear one."""
+    """Layer ``index`` of ``layers`` as ``nn.Linear``.  Raises TypeError for another kind of layer."""
     layer = layers[index] if isinstance(layers, nn.Sequential) else None
     if not isinstance(layer, nn.Linear):
         raise TypeError(f"layers[{index}]: expected nn.Linear, got {type(layer).__name__}")
@@ -26,7 +26,7 @@ def linear_of(layers: nn.Module, index: int) -> nn.Linear:
 def in_rows(evaluate: Callable[..., dict[str, Tensor]], *inputs: Tensor) -> dict[str, Tensor]:
     """``evaluate(*inputs)`` without gradient; on a CPU in blocks of ROWS rows of the inputs.
 
-    The blocks run on the threads of the bridge's pool, so ``evaluate`` must work row by row and keep no state.
+    Blocks run on the bridge's thread pool, so ``evaluate`` must treat rows independently and be thread-safe.
     """
     n = len(inputs[0])
     if inputs[0].is_cuda or n == 0:
@@ -36,11 +36,11 @@ def in_rows(evaluate: Callable[..., dict[str, Tensor]], *inputs: Tensor) -> dict
     return {name: torch.cat([p[name] for p in parts]) for name in parts[0]}
 
 
-def beside(work: Callable[[], T], device: torch.device) -> Callable[[], T]:
-    """Begin ``work()`` on one thread of the bridge's pool, without gradient; the result gives its value when called.
+def submit(work: Callable[[], T], device: torch.device) -> Callable[[], T]:
+    """Submits ``work()`` to the bridge's thread pool, without gradient; returns a function that waits for the value.
 
-    For long chains that leave a processor idle.  The work is done at once where the caller computes alone, and on CUDA.
-    What it raises comes out of the result, or at once.
+    Runs ``work`` immediately on CUDA and when only one thread is used.  Exceptions are raised by the returned function,
+    or immediately in these cases.
     """
     work = torch.no_grad()(work)
     if serial() or device.type == "cuda":

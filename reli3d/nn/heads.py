@@ -1,6 +1,6 @@
-"""What a point of the triplane is: small independent MLPs on its features, and the merging of FlexiCubes weights.
+"""Decoder heads of the triplane: independent MLPs on point features, and the merging of FlexiCubes weights.
 
-Sizes are the published ones; names are spelt as Python names, :mod:`reli3d.nn.published` has the table.
+Sizes are the published ones; :mod:`reli3d.nn.published` maps the published names to these.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from reli3d.geometry.triplane import sample_triplane
 
 ROUGHNESS_MIN = 0.1  # range [0.1, 1] of the published head
 NORMALIZE_EPS = 1.0e-7
-COLOR_MARGIN = 0.02  # keeps the logit of black and of clipped highlights within reach of a correction
-WEIGHT_SCALE = 0.5  # of the FlexiCubes weights: how far alpha and beta may leave 1
-MERGED_MULTIPLIER = 0.1  # on the merging MLP's output: starts the weights near neutral
-DEFORMATION_LIMIT = 1.0 - 1.0e-8  # of half a cell, so that two grid vertices never meet
+COLOR_MARGIN = 0.02  # clamps colors before their logit, so that black and clipped highlights stay finite
+WEIGHT_SCALE = 0.5  # of the FlexiCubes weights: greatest deviation of alpha and beta from 1
+MERGED_MULTIPLIER = 0.1  # on the merging MLP's output: initial weights are near neutral
+DEFORMATION_LIMIT = 1.0 - 1.0e-8  # of half a cell, so that grid vertices never coincide
 
 
 @dataclass(frozen=True)
@@ -50,28 +50,28 @@ def mlp(inputs: int, width: int, outputs: int, hidden: int) -> nn.Sequential:
 
 
 def activate(name: str, raw: Tensor) -> Tensor:
-    """The named head's value from its MLP's output.
+    """Activation of the named head.
 
-    ``density``, ``deformation``, ``flexicubes``: as they are.  ``base_color`` (sRGB-encoded), ``metallic``: [0, 1].
-    ``roughness``: [0.1, 1].  ``normal``: unit, around +z of the surface's frame.
+    ``density``, ``deformation``, ``flexicubes``: identity.  ``base_color`` (sRGB-encoded), ``metallic``: [0, 1].
+    ``roughness``: [0.1, 1].  ``normal``: unit, relative to +z of the surface's frame.
     """
     if name in ("base_color", "metallic"):
         return raw.sigmoid()
     if name == "roughness":
         return ROUGHNESS_MIN + (1.0 - ROUGHNESS_MIN) * raw.sigmoid()
     if name == "normal":
-        normal = raw + raw.new_tensor((0.0, 0.0, 1.0))  # functional.normalize takes ten times as long for columns
+        normal = raw + raw.new_tensor((0.0, 0.0, 1.0))  # functional.normalize is about 10 times slower on columns
         return normal / (normal * normal).sum(-1, keepdim=True).clamp(min=NORMALIZE_EPS**2).sqrt()
     return raw
 
 
 def color_logit(color: Tensor) -> Tensor:
-    """Of colours in [0, 1], kept within reach: black and white are not infinite."""
+    """Logit of colors in [0, 1], clamped by COLOR_MARGIN so that it is finite."""
     return color.clamp(COLOR_MARGIN, 1.0 - COLOR_MARGIN).logit()
 
 
 class Heads(nn.ModuleDict):
-    """One MLP a head, on the same features."""
+    """One MLP per head, on shared features."""
 
     def __init__(self, features: int, width: int):
         super().__init__({name: mlp(features, width, head.outputs, head.hidden) for name, head in HEADS.items()})
@@ -94,7 +94,7 @@ class Heads(nn.ModuleDict):
 
 
 class _TruncatedExp(torch.autograd.Function):
-    """exp whose slope stops growing at exp(15), so that one point far inside cannot drown the batch."""
+    """exp whose derivative is clamped to exp(15), so that single points deep inside do not dominate a batch."""
 
     @staticmethod
     def forward(ctx, x: Tensor) -> Tensor:
@@ -123,14 +123,14 @@ class CubeWeights:
 
 
 class WeightMerger(nn.Module):
-    """The eight corners' vectors of a cube to its FlexiCubes weights."""
+    """MLP from the eight corner vectors of a cube to its FlexiCubes weights."""
 
     def __init__(self, width: int):
         super().__init__()
         self.mlp = mlp(CORNERS * HEADS["flexicubes"].outputs, width, MERGED, 2)
 
     def merged(self, corners: Tensor) -> Tensor:
-        """``(..., 8, 16)`` to the 21 numbers of each cube before their activation.
+        """Raw weights ``(..., 21)`` of cubes from their corners ``(..., 8, 16)``.
 
         Corner k lies at x = k & 1, y = k >> 1 & 1, z = k >> 2 of the cube.
         """
@@ -147,6 +147,6 @@ class WeightMerger(nn.Module):
 
 
 def deformation(raw: Tensor, resolution: int) -> Tensor:
-    """Displacement of grid vertices, from the head's values: less than half a cell of a unit cube of ``resolution``
+    """Displacement of grid vertices from raw head outputs: less than half a cell of a unit cube of ``resolution``
     cells a side."""
     return raw.tanh() * (DEFORMATION_LIMIT / (2 * resolution))

@@ -1,9 +1,9 @@
-"""The light from what the surface shows of it: pixels sorted by where they mirror, and a U-Net on the sphere.
+"""Environment estimation from surface radiance: splatting into lat-long maps, completed by a U-Net on the sphere.
 
-A glossy pixel shows the light in its mirror direction, a matt one the light around its normal.  Both are laid into
-lat-long maps; what no pixel shows is completed by convolutions that wrap around the azimuth, so a turn of the world
-about +Y turns the answer.  The network was trained on maps with -Z in the centre column and +X right of it; what it
-gives is laid out as :mod:`reli3d.render.latlong`.
+Glossy pixels reflect the light from their mirror direction, diffuse ones the light around their normal.  Both are
+splatted into lat-long maps.  The convolutions, which wrap in azimuth, complete unobserved directions; the result is
+equivariant to rotation about +Y.  The network was trained on maps with -Z in the centre column and +X to its right; the
+result has the layout of :mod:`reli3d.render.latlong`.
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ from torch.nn import functional
 from reli3d.nn.presets import LightMapSizes
 from reli3d.render.latlong import lat_long_directions, lat_long_texels
 
-BLACK = 0.01  # added to a radiance before its logarithm
-PAINT_FLOOR = 0.04  # of the albedo that a pixel is divided by: a dielectric reflects as much at least
+LOG_OFFSET = 0.01  # added to a radiance before its logarithm
+MIN_ALBEDO = 0.04  # added to the albedo that a radiance is divided by: the normal reflectance of a dielectric
 CHANNELS = 14
-LIMIT = 12.0  # of the logarithm of a radiance: a sun of exp(12)
+MAX_LOG_RADIANCE = 12.0
 
 
 def trained_texels(directions: Tensor, height: int) -> Tensor:
-    """Texels ``(N,)`` of unit world ``directions (N, 3)`` in the layout that the network was trained on."""
+    """Texel indices ``(N,)`` of unit world ``directions (N, 3)`` in the layout of the training maps."""
     x, y, z = directions.unbind(-1)
     return lat_long_texels(torch.stack([-z, y, x], -1), height)
 
 
 def gathered(values: Tensor, weight: Tensor, texel: Tensor, height: int) -> tuple[Tensor, Tensor]:
-    """Weighted means ``(C, H, 2H)`` of ``values (N, C)`` over the texels they fall in, and log(1 + weight) there."""
+    """Weighted mean ``(C, H, 2H)`` of ``values (N, C)`` in each texel, and log(1 + total weight) ``(1, H, 2H)``."""
     count = 2 * height * height
     total = weight.new_zeros(count).index_add(0, texel, weight)
     summed = values.new_zeros(count, values.shape[1]).index_add(0, texel, values * weight[:, None])
@@ -38,7 +38,7 @@ def gathered(values: Tensor, weight: Tensor, texel: Tensor, height: int) -> tupl
 
 
 class _Block(nn.Module):
-    """3x3 convolution around the sphere: wraps in azimuth, repeats the border row at the poles."""
+    """3x3 convolution on a lat-long map: circular padding in azimuth, replicated rows at the poles."""
 
     def __init__(self, inputs: int, outputs: int, stride: int = 1):
         super().__init__()
@@ -51,7 +51,7 @@ class _Block(nn.Module):
 
 
 class LightMap(nn.Module):
-    """Logarithm of the radiance, ``(3, H, 2H)``, from pixels of all views."""
+    """Log radiance ``(3, H, 2H)`` of the environment from pixels of all views."""
 
     def __init__(self, sizes: LightMapSizes):
         super().__init__()
@@ -71,19 +71,19 @@ class LightMap(nn.Module):
         """radiance, albedo: ``(N, 3)`` linear.  gloss: ``(N,)`` in [0, 1].  normal, wo: ``(N, 3)`` unit, world."""
         facing = (normal * wo).sum(-1).clamp(min=0.0)
         mirror = functional.normalize(2.0 * facing[:, None] * normal - wo, dim=-1)
-        log = (radiance + BLACK).log()
-        demodulated = log - (albedo + PAINT_FLOOR).log()
-        level = (demodulated * facing[:, None]).sum(0) / facing.sum().clamp(min=1e-4)
-        scale = 256.0 / max(1, len(radiance))  # weights do not depend on the resolution of the views
+        log = (radiance + LOG_OFFSET).log()
+        demodulated = log - (albedo + MIN_ALBEDO).log()
+        mean = (demodulated * facing[:, None]).sum(0) / facing.sum().clamp(min=1e-4)
+        scale = 256.0 / max(1, len(radiance))  # makes weights independent of the views' resolution
         at_mirror = trained_texels(mirror, self.height)
         shown, shown_weight = gathered(
-            torch.cat([log - level, demodulated - level], -1), facing * (0.05 + gloss) * scale, at_mirror, self.height
+            torch.cat([log - mean, demodulated - mean], -1), facing * (0.05 + gloss) * scale, at_mirror, self.height
         )
         under, under_weight = gathered(
-            demodulated - level, facing * scale, trained_texels(normal, self.height), self.height
+            demodulated - mean, facing * scale, trained_texels(normal, self.height), self.height
         )
         y = lat_long_directions(self.height, device=radiance.device)[..., 1][None]
-        rest = torch.cat([y, y.square(), torch.ones_like(y) * level.mean()])
+        rest = torch.cat([y, y.square(), torch.ones_like(y) * mean.mean()])
         x = self.first(torch.cat([shown, shown_weight, under, under_weight, rest])[None])
         levels = [x]
         for down in self.down:
@@ -92,5 +92,5 @@ class LightMap(nn.Module):
         for across, up, finer in zip(reversed(self.across), reversed(self.up), reversed(levels[:-1]), strict=True):
             coarse = functional.interpolate(across(x), size=finer.shape[-2:], mode="bilinear", align_corners=False)
             x = up(finer + coarse)
-        log = (self.out(x)[0] + level[:, None, None]).clamp(max=LIMIT)
-        return log.roll(-(self.height // 2), 2)  # a quarter of the width, to +X in the centre column
+        log = (self.out(x)[0] + mean[:, None, None]).clamp(max=MAX_LOG_RADIANCE)
+        return log.roll(-(self.height // 2), 2)  # by a quarter of the width: +X in the centre column

@@ -1,9 +1,9 @@
 """The small network: convolutions over each view, over space and over the sphere of directions.
 
-Every view goes through a 2D U-Net that predicts paint, normal and depth where it looks (``pyramid``); a volume pools
-what all views say of the object's space (``volume``); a map of directions gathers what the surface shows of the light
-(``light_map``).  Small MLPs then evaluate a point from all of them.  All parts see where a point is only relative to
-the views and to the object, so what is learned in one place holds everywhere.
+A 2D U-Net predicts base color, normal and depth per pixel of every view (``pyramid``); a 3D U-Net pools the views over
+the volume of the object (``volume``); a U-Net on lat-long maps completes the environment from the radiance that the
+surface reflects (``light_map``).  Small MLPs evaluate points from all three.  Positions enter only relative to the
+views and to the object.
 """
 
 from __future__ import annotations
@@ -34,29 +34,29 @@ from reli3d.nn.volume import HULL_SCALE, FeatureVolume
 from reli3d.render.color import srgb_to_linear
 from reli3d.render.environment import Environment
 
-LIGHT_ROWS = 16  # of the map whose irradiance the material heads read
-TOKEN_EXTRA = 4  # depth and world normal, beside the pyramid's features
-QUARTER = 4  # pixels of a view along a pixel whose ray is intersected with the hull
-FUSED = 10  # numbers of Fused beside the colour
-HEADS = 13  # numbers of LocalField.heads
-# of what the pyramid predicts in the mirror image of a photograph
+LIGHT_ROWS = 16  # rows of the map whose irradiance the material heads read
+TOKEN_EXTRA = 4  # depth and world normal, appended to the pyramid's features
+QUARTER = 4  # pixels of a view per side of a pixel whose ray is intersected with the hull
+FUSED_WIDTH = 10  # width of Fused.numbers
+HEAD_OUTPUTS = 13  # width of LocalField.heads
+# signs of the pyramid's predictions under a left-right flip of the image
 SIGN_OF_MIRRORED = torch.ones(PREDICTED, dtype=torch.float32, device="cpu")
 SIGN_OF_MIRRORED[7] = -1.0  # the normal's component to the right, see PixelMaps.of
-SHARPNESS = 2.0  # power of a view's share: the view that looks straightest speaks, with smooth seams
+VIEW_WEIGHT_POWER = 2.0  # exponent of the blend weights: favors frontal views, with smooth seams
 
 
 @dataclass(frozen=True)
 class PixelMaps:
-    """What the pyramid predicts of every pixel, at half the views' resolution."""
+    """Predictions of the pyramid per pixel, at half the views' resolution."""
 
-    gain: Tensor  # (V, P, P, 1) of the mean logit of the colour seen: 0 where a highlight hides the paint
-    shift: Tensor  # (V, P, P, 3) of the colour's logit
-    confidence: Tensor  # (V, P, P, 1) logarithm of a weight among the views
+    gain: Tensor  # (V, P, P, 1) of the mean logit of the observed color: 0 where a highlight hides the base color
+    shift: Tensor  # (V, P, P, 3) of the color logits
+    confidence: Tensor  # (V, P, P, 1) logarithm of a blend weight
     roughness: Tensor  # (V, P, P, 1) logit
     metallic: Tensor  # (V, P, P, 1) logit
-    chroma: Tensor  # (V, P, P, 1) gain of what the logits of the three channels differ from their mean
+    chroma: Tensor  # (V, P, P, 1) gain of the color logits minus their mean
     normal: Tensor  # (V, P, P, 3) world, unit
-    depth: Tensor  # (V, P, P, 1) along the camera's axis, from the world's origin
+    depth: Tensor  # (V, P, P, 1) along the camera axis, relative to the world origin's
 
     @staticmethod
     def of(raw: Tensor, span: Tensor, camera: Camera, mean: Tensor) -> PixelMaps:
@@ -68,49 +68,49 @@ class PixelMaps:
         """
         gain, shift, confidence, rough, metal, normal, depth, chroma = raw.split([1, 3, 1, 1, 1, 3, 1, 1], -1)
         x, y = image_plane(camera)
-        toward = -functional.normalize(torch.stack([x, y, -torch.ones_like(x)], -1), dim=-1)  # to the camera
+        toward = -functional.normalize(torch.stack([x, y, -torch.ones_like(x)], -1), dim=-1)  # towards the camera
         normal = functional.normalize(0.3 * toward + normal, dim=-1)
         world = torch.einsum("vij,vxyj->vxyi", camera.c2w[:, :3, :3], normal)
         size = camera.height, camera.width
         span = functional.interpolate(span.permute(0, 3, 1, 2), size=size, mode="nearest").permute(0, 2, 3, 1)
-        depth = torch.lerp(span[..., :1], span[..., 1:], (depth - 1.0).sigmoid())  # the surface lies within
+        depth = torch.lerp(span[..., :1], span[..., 1:], (depth - 1.0).sigmoid())  # inside the hull
         gain, chroma = (gain + 2.0).sigmoid(), 2.0 * chroma.sigmoid()
         return PixelMaps(gain, shift - gain * mean, confidence, rough, metal - 2.0, chroma, world, depth)
 
     def stacked(self) -> Tensor:
-        """``(V, P, P, 11)``, all but the depth."""
-        paint = [self.gain, self.shift, self.confidence, self.roughness, self.metallic, self.chroma]
-        return torch.cat([*paint, self.normal], -1)
+        """All maps but the depth, ``(V, P, P, 11)``."""
+        material = [self.gain, self.shift, self.confidence, self.roughness, self.metallic, self.chroma]
+        return torch.cat([*material, self.normal], -1)
 
     @cached_property
     def packed(self) -> Tensor:
-        """The same as :func:`~reli3d.nn.view_lookup.fuse_views` reads it, without gradient."""
+        """:meth:`stacked` in the layout of :func:`~reli3d.nn.view_lookup.fuse_views`, without gradient."""
         parts = self.stacked().detach().split([4, 4, 3], -1)
         return torch.stack([functional.pad(part, (0, 4 - part.shape[-1])) for part in parts])
 
     def base_logit(self, color: Tensor) -> Tensor:
-        """Logit of the base colour of pixels of ``color (V, P, P, 3)`` sRGB."""
-        return paint_logit(color, self.gain, self.chroma, self.shift)
+        """Base color logit ``(V, P, P, 3)`` of pixels with the observed ``color (V, P, P, 3)``, sRGB."""
+        return base_color_logit(color, self.gain, self.chroma, self.shift)
 
 
-def paint_logit(color: Tensor, gain: Tensor, chroma: Tensor, shift: Tensor) -> Tensor:
-    """Logit ``(..., 3)`` of the base colour where ``color (..., 3)`` sRGB is seen; the rest as in PixelMaps."""
+def base_color_logit(color: Tensor, gain: Tensor, chroma: Tensor, shift: Tensor) -> Tensor:
+    """Base color logit ``(..., 3)`` for the observed ``color (..., 3)``, sRGB; other arguments as in PixelMaps."""
     logit = color_logit(color)
     mean = logit.mean(-1, keepdim=True)
     return gain * mean + chroma * (logit - mean) + shift
 
 
 def mean_logit(color: Tensor, mask: Tensor) -> Tensor:
-    """Mean logit ``()`` of the object's colours ``(V, P, P, 3)`` sRGB, weighted by its coverage ``(V, P, P, 1)``."""
+    """Mean color logit ``()`` of ``color (V, P, P, 3)``, sRGB, weighted by the coverage ``mask (V, P, P, 1)``."""
     return (color_logit(color).mean(-1, keepdim=True) * mask).sum() / mask.sum().clamp(min=1.0)
 
 
 @dataclass(frozen=True)
 class Fused:
-    """The views' predictions at N surface points, the one that sees best loudest."""
+    """The views' predictions at N surface points, blended by visibility, viewing angle and confidence."""
 
-    logit: Tensor  # (N, 3) of the base colour
-    numbers: Tensor  # (N, FUSED): roughness, metallic, normal, its cosine to the surface's, seen, agreement
+    logit: Tensor  # (N, 3) of the base color
+    numbers: Tensor  # (N, FUSED_WIDTH), see :func:`~reli3d.nn.view_lookup.fuse_views`
     normal: Tensor  # (N, 3) unit
 
 
@@ -127,10 +127,10 @@ class LocalReconstructor(nn.Module):
         self.view_features = ViewFeatures(tokens, width=preset.view_width)
         inside = preset.volume.features + preset.view_width + 2 + AHEAD
         self.level = mlp(inside, preset.head_width, 1, 2)
-        surface = inside + FUSED + 3 + Shading.WIDTH
-        self.color = mlp(surface, preset.head_width, 7, 2)  # own guess, correction, share of the own guess
-        self.surface = mlp(surface, preset.head_width, 6, 2)  # roughness, metallic, bend of the normal, its share
-        if self.device.type != "meta":  # there are no values there, and torch would import its compiler to say so
+        surface = inside + FUSED_WIDTH + 3 + Shading.WIDTH
+        self.color = mlp(surface, preset.head_width, 7, 2)  # prediction, correction, weight of the prediction
+        self.surface = mlp(surface, preset.head_width, 6, 2)  # roughness, metallic, normal offset, weight of the views'
+        if self.device.type != "meta":  # on meta tensors torch.nn.init imports torch's compiler
             for head in (self.color, self.surface):
                 nn.init.normal_(linear_of(head, -1).weight, std=0.01)
                 nn.init.zeros_(linear_of(head, -1).bias)
@@ -141,11 +141,11 @@ class LocalReconstructor(nn.Module):
 
     @property
     def dtype(self) -> torch.dtype:
-        """In which its large convolutions compute."""
+        """Compute dtype of the large convolutions."""
         return torch.bfloat16 if self.pyramid.in_bfloat16 else torch.float32
 
     def to_compute(self, dtype: torch.dtype) -> LocalReconstructor:
-        """Have the convolutions over pictures and space compute in float32 or bfloat16; parameters and results stay
+        """Sets the compute dtype of the 2D and 3D convolutions, float32 or bfloat16; parameters and results stay
         float32.  Raises ValueError for another dtype.
         """
         if dtype not in (torch.float32, torch.bfloat16):
@@ -164,13 +164,14 @@ class LocalReconstructor(nn.Module):
         *,
         mirrored: int = 0,
     ) -> LocalField:
-        """Read the posed views of one object, in the model's frame.
+        """Encodes the posed views of one object, in the model's frame.
 
-        images: ``(V, S, S, 3)`` sRGB in [0, 1], straight.  masks: ``(V, S, S)``.  c2w: ``(V, 4, 4)`` OpenGL.
-        intrinsics: ``(V, 4)`` pixels of ``images``.  detail: ``(V, D, D, 4)`` sRGB and signed distance to the
-        silhouette in pixels, from which colours are read; its intrinsics.  mirrored: how many of the last views are
-        the first ones in order, flipped left to right, seen by mirrored cameras: they tell the shape and the paint,
-        not the light.  Gradients reach every parameter.  Raises ValueError where they are more than half.
+        images: ``(V, S, S, 3)`` sRGB in [0, 1], not premultiplied by the mask.  masks: ``(V, S, S)``.  c2w: ``(V, 4,
+        4)`` OpenGL.  intrinsics: ``(V, 4)`` in pixels of ``images``.  detail: ``(V, D, D, 4)``, sRGB and signed
+        silhouette distance in pixels, from which colors are read.  detail_intrinsics: ``(V, 4)`` in its pixels.
+        mirrored: number of views at the end that are the first views, flipped left to right, with mirrored cameras;
+        they are used for shape and material, not for lighting.  Gradients reach every parameter.  Raises ValueError if
+        more than half of the views are mirrored.
         """
         views = images, masks, c2w, intrinsics, detail, detail_intrinsics
         return self._encoded(views, mirrored, inference=False)
@@ -187,9 +188,9 @@ class LocalReconstructor(nn.Module):
         *,
         mirrored: int = 0,
     ) -> LocalField:
-        """:meth:`encode` by fused kernels; its field evaluates points by them too, in blocks that stay in the cache.
+        """:meth:`encode` by fused kernels, equal to float32 rounding; no gradient.
 
-        The values are those of :meth:`encode` to float32 rounding.  No gradient passes.
+        The field evaluates points by fused kernels too, in blocks that fit the cache.
         """
         views = images, masks, c2w, intrinsics, detail, detail_intrinsics
         return self._encoded(views, mirrored, inference=True)
@@ -205,7 +206,7 @@ class LocalReconstructor(nn.Module):
         surface = torch.cat([pixels.depth * mask, mask], -1)
         volume = (self.volume.fused if inference else self.volume)(maps, surface)
         lit = mask[..., 0].clone()
-        lit[maps.taken :] = 0.0
+        lit[maps.input_count :] = 0.0
         log_light = self._light(pixels, color, lit, camera)
         return LocalField(maps, self, pixels, color, surface, volume, log_light, inference=inference)
 
@@ -219,9 +220,8 @@ class LocalReconstructor(nn.Module):
         detail_intrinsics: Tensor,
         mirrored: int = 0,
     ) -> tuple[Tensor, PixelMaps, Camera]:
-        """The first part of :meth:`encode`, each view by itself: features of a quarter of the resolution, predictions
-        of half of it, and the cameras of these.  Mirror images are not read: their maps are those of the photographs,
-        flipped.
+        """The per-view part of :meth:`encode`: features at a quarter of the resolution, predictions at half, and the
+        cameras of the predictions.  The maps of mirror images are those of the input views, flipped.
         """
         if not 0 <= 2 * mirrored <= len(images):
             raise ValueError(f"mirrored: expected at most half of the {len(images)} views, got {mirrored}")
@@ -246,15 +246,15 @@ class LocalReconstructor(nn.Module):
         right, up = (t[v, y, x] for t in image_plane(camera))
         local = torch.stack([right, up, -torch.ones_like(right)], -1)
         wo = -functional.normalize((camera.c2w[v, :3, :3] @ local[..., None])[..., 0], dim=-1)
-        seen = color[v, y, x]
-        logit = paint_logit(seen, pixels.gain[v, y, x], pixels.chroma[v, y, x], pixels.shift[v, y, x])
+        observed = color[v, y, x]
+        logit = base_color_logit(observed, pixels.gain[v, y, x], pixels.chroma[v, y, x], pixels.shift[v, y, x])
         albedo = srgb_to_linear(logit.sigmoid())
         gloss = 1.0 - pixels.roughness[v, y, x, 0].sigmoid()
-        return self.light(srgb_to_linear(seen), albedo, gloss, pixels.normal[v, y, x], wo)
+        return self.light(srgb_to_linear(observed), albedo, gloss, pixels.normal[v, y, x], wo)
 
 
 def shown_pixels(images: Tensor, masks: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Colours ``(V, P, P, 3)`` and coverage ``(V, P, P, 1)`` of views at the resolution of ``camera``."""
+    """Colors ``(V, P, P, 3)`` and coverage ``(V, P, P, 1)`` of the views, downsampled to the size of ``camera``."""
     shown = torch.cat([images, masks[..., None]], -1).permute(0, 3, 1, 2)
     shown = functional.avg_pool2d(shown, images.shape[1] // camera.height)
     color, mask = shown.permute(0, 2, 3, 1).split([3, 1], -1)
@@ -267,12 +267,12 @@ class LocalField(Field):
 
     model: LocalReconstructor
     pixels: PixelMaps
-    color: Tensor  # (V, P, P, 3) sRGB, what the pixels of ``pixels`` show
-    surface: Tensor  # (V, P, P, 2) depth of ``pixels`` times coverage, and coverage
+    color: Tensor  # (V, P, P, 3) sRGB, observed
+    surface: Tensor  # (V, P, P, 2) predicted depth times coverage, and coverage
     volume: Tensor  # (N, N, N, F)
     log_light: Tensor  # (3, H, 2H)
     shading: Shading | None = None
-    inference: bool = False  # from encode_for_inference: points are evaluated without gradient
+    inference: bool = False  # by encode_for_inference: points are evaluated without gradient
 
     reads_views: ClassVar[bool] = True
 
@@ -301,7 +301,7 @@ class LocalField(Field):
         return self.model.level(self._features(points, bound))[:, 0] - self._offset()
 
     def _offset(self) -> float:
-        """Moves the surface outward."""
+        """Outward offset of the surface, in units of ``softness``."""
         many, one = self.model.preset.offset_many_views, self.model.preset.offset_one_view
         return many + (one - many) / len(self.maps.images)
 
@@ -313,27 +313,28 @@ class LocalField(Field):
     def _features(
         self, points: Tensor, bound: Tensor, visible: Tensor | None = None, normal: Tensor | None = None
     ) -> Tensor:
-        model, maps = self.model, self.maps.photographs  # the volume knows the mirror images: twice the time, no gain
+        model, maps = self.model, self.maps.inputs  # mirror images already contribute through the volume
         hull = -bound * model.preset.softness
         views = model.view_features.fused if self.inference else model.view_features
-        of_views, _ = views(maps, points, None if visible is None else visible[:, : maps.taken], normal)
+        of_views, _ = views(maps, points, None if visible is None else visible[:, : maps.input_count], normal)
         of_space = model.volume.sample(self.volume, points)
         rest = [(hull / HULL_SCALE).clamp(-2, 2), torch.full_like(hull, 1.0 / len(self.maps.images))]
-        ahead = ahead_of_surface(self.surface[: maps.taken], maps, points)
+        ahead = ahead_of_surface(self.surface[: maps.input_count], maps, points)
         return torch.cat([of_space, of_views, torch.stack(rest, -1), ahead], -1)
 
     def fused(self, position: Tensor, normal: Tensor, visible: Tensor) -> Fused:
-        """The views' predictions at surface points: ``position``, ``normal`` ``(N, 3)``, ``visible (N, V)``."""
+        """Blended predictions at surface points: ``position``, ``normal`` ``(N, 3)``, ``visible (N, V)``."""
         if self.inference:
             return self._fused_by_kernel(position, normal, visible)
         maps = self.maps
         pixels = self.pixels.stacked()
         got, _ = gather_views(pixels, position, maps.camera)
-        shown, share, summary = summarize_views(maps.images, maps.camera, position, visible, normal)
+        shown, view_weight, summary = summarize_views(maps.images, maps.camera, position, visible, normal)
         gain, shift, confidence, rough, metal, chroma, bent = got.split([1, 3, 1, 1, 1, 1, 3], -1)
-        hidden = (visible <= 0.0) & (summary[:, 5:6] >= CONFIDENT_WEIGHT)  # and a view that sees the point is sure
-        weight = (SHARPNESS * share.log() + confidence[..., 0]).masked_fill(hidden, -math.inf).softmax(-1)[..., None]
-        each = paint_logit(shown[..., :3], gain, chroma, shift)
+        hidden = (visible <= 0.0) & (summary[:, 5:6] >= CONFIDENT_WEIGHT)  # occluded, and another view is confident
+        log_weight = VIEW_WEIGHT_POWER * view_weight.log() + confidence[..., 0]
+        weight = log_weight.masked_fill(hidden, -math.inf).softmax(-1)[..., None]
+        each = base_color_logit(shown[..., :3], gain, chroma, shift)
         logit = (each * weight).sum(1)
         spread = ((each - logit[:, None]).square() * weight).sum((1, 2), keepdim=True)[..., 0].clamp(min=1e-6).sqrt()
         bent = functional.normalize((bent * weight).sum(1) + 1e-3 * normal, dim=-1)
@@ -343,51 +344,53 @@ class LocalField(Field):
         return Fused(logit, numbers, bent)
 
     def _fused_by_kernel(self, position: Tensor, normal: Tensor, visible: Tensor) -> Fused:
-        """:meth:`fused` to float32 rounding, without gradient."""
+        """:meth:`fused` by one kernel, equal to float32 rounding; no gradient."""
         maps = self.maps
         return Fused(*fuse_views(maps.images, self.pixels.packed, maps.camera, position, visible, normal))
 
     def with_shading(self, position: Tensor, normal: Tensor, visible: Tensor) -> LocalField:
-        """The field with the light on its surface, from some thousand points all over it; no gradient."""
+        """The field with :class:`Shading` estimated from some thousand points spread over the surface; no gradient."""
         with torch.no_grad():
-            visible = torch.cat([visible[:, : self.maps.taken], torch.zeros_like(visible[:, self.maps.taken :])], 1)
+            inputs = self.maps.input_count
+            visible = torch.cat([visible[:, :inputs], torch.zeros_like(visible[:, inputs:])], 1)
             color = self._fused_by_kernel(position, normal, visible).logit.sigmoid()
             _, _, summary = summarize_views(self.maps.images, self.maps.camera, position, visible, normal)
-            shown, seen = summary[:, :3], visible.amax(1)
-            observed = brightness_over_normal(srgb_to_linear(shown), seen, normal)
+            shown, visible_in_any = summary[:, :3], visible.amax(1)
+            observed = brightness_over_normal(srgb_to_linear(shown), visible_in_any, normal)
             plain = unshaded(shown, brightness_at(normal, observed))
             irradiance = Environment(self.radiance_map(LIGHT_ROWS).detach().contiguous()).irradiance()
-            return replace(self, shading=Shading(irradiance, observed, palette_of(color, plain, seen)))
+            return replace(self, shading=Shading(irradiance, observed, palette_of(color, plain, visible_in_any)))
 
     def material(self, position: Tensor, normal: Tensor, visible: Tensor) -> PointMaterial:
-        def ask(position: Tensor, normal: Tensor, visible: Tensor) -> dict[str, Tensor]:
+        def evaluate(position: Tensor, normal: Tensor, visible: Tensor) -> dict[str, Tensor]:
             fused = self.fused(position, normal, visible)
-            return _painted(fused, self._heads(fused, position, normal, visible), normal)
+            return _material(fused, self._heads(fused, position, normal, visible), normal)
 
-        return PointMaterial(**self._rows(ask, position, normal, visible))
+        return PointMaterial(**self._rows(evaluate, position, normal, visible))
 
     def heads(self, position: Tensor, normal: Tensor, visible: Tensor) -> Tensor:
-        """What the heads say of surface points, ``(N, HEADS)``, for :meth:`painted`; arguments of :meth:`material`.
+        """Raw head outputs ``(N, HEAD_OUTPUTS)`` at surface points, for :meth:`material_from_heads`.
 
-        It changes from cell to cell of the volume, not from texel to texel: values between points may be interpolated.
+        Arguments as in :meth:`material`.  The outputs vary at the scale of volume cells, not of texels, so they may be
+        evaluated at vertices and interpolated.
         """
 
-        def ask(position: Tensor, normal: Tensor, visible: Tensor) -> dict[str, Tensor]:
+        def evaluate(position: Tensor, normal: Tensor, visible: Tensor) -> dict[str, Tensor]:
             return {"heads": self._heads(self.fused(position, normal, visible), position, normal, visible)}
 
-        return self._rows(ask, position, normal, visible)["heads"]
+        return self._rows(evaluate, position, normal, visible)["heads"]
 
-    def painted(self, heads: Tensor, position: Tensor, normal: Tensor, visible: Tensor) -> PointMaterial:
-        """Material at surface points where ``heads (N, HEADS)`` are known: what the views show is looked up again."""
+    def material_from_heads(self, heads: Tensor, position: Tensor, normal: Tensor, visible: Tensor) -> PointMaterial:
+        """:meth:`material` at surface points with given, possibly interpolated ``heads (N, HEAD_OUTPUTS)``."""
 
-        def ask(heads: Tensor, position: Tensor, normal: Tensor, visible: Tensor) -> dict[str, Tensor]:
-            return _painted(self.fused(position, normal, visible), heads, normal)
+        def evaluate(heads: Tensor, position: Tensor, normal: Tensor, visible: Tensor) -> dict[str, Tensor]:
+            return _material(self.fused(position, normal, visible), heads, normal)
 
-        return PointMaterial(**self._rows(ask, heads, position, normal, visible))
+        return PointMaterial(**self._rows(evaluate, heads, position, normal, visible))
 
     def _heads(self, fused: Fused, position: Tensor, normal: Tensor, visible: Tensor) -> Tensor:
         if self.shading is None:
-            raise ValueError("field: expected one with_shading, got one that does not know the light on its surface")
+            raise ValueError("field: expected the result of with_shading, got a field without shading")
         parts = [
             self._features(position, self.bound(position), visible, normal),
             fused.numbers,
@@ -404,11 +407,11 @@ class LocalField(Field):
         return log.exp().permute(1, 2, 0)
 
 
-def _painted(fused: Fused, heads: Tensor, normal: Tensor) -> dict[str, Tensor]:
-    guess, correction, share, rough, metal, bend, turn = heads.split([3, 3, 1, 1, 1, 3, 1], -1)
-    share = (share - 3.0).sigmoid()
-    base = (1.0 - share) * fused.logit + share * guess + correction
-    shaded = functional.normalize(normal + turn.sigmoid() * (fused.normal - normal) + bend, dim=-1)
+def _material(fused: Fused, heads: Tensor, normal: Tensor) -> dict[str, Tensor]:
+    predicted, correction, weight, rough, metal, offset, of_views = heads.split([3, 3, 1, 1, 1, 3, 1], -1)
+    weight = (weight - 3.0).sigmoid()
+    base = (1.0 - weight) * fused.logit + weight * predicted + correction
+    shaded = functional.normalize(normal + of_views.sigmoid() * (fused.normal - normal) + offset, dim=-1)
     rough, metal = (v[:, 0] for v in (rough + fused.numbers[:, :1], metal + fused.numbers[:, 1:2]))
     return {
         "base_color": srgb_to_linear(base.sigmoid()),

@@ -1,7 +1,7 @@
-"""Each view by itself: a 2D U-Net that predicts, pixel by pixel, the paint under the light and the shape that is seen.
+"""2D U-Net on every view, which predicts base color, roughness, metallic, normal and depth per pixel.
 
-Convolutions are local and the same everywhere, so they learn from few objects what a transformer over large patches
-learns from millions.  Source of the form: Ronneberger et al. 2015, U-Net, arXiv 1505.04597.
+Convolutions are local and translation-equivariant and so need far fewer training objects than a transformer.  Source:
+Ronneberger et al. 2015, U-Net, arXiv 1505.04597.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from reli3d.geometry.camera import Camera, image_plane
 from reli3d.geometry.hull import hull_span
 from reli3d.nn.presets import PyramidSizes
 
-INPUTS = 9  # colour times mask, mask, place in the world, where the ray enters and leaves the hull, 1 / views
+INPUTS = 9  # color times mask (3), mask, position in the world (2), depths of the hull along the ray (2), 1 / views
 PREDICTED = 12  # see PixelMaps
-SEEN = 0.1  # least coverage of a pixel whose ray is intersected with the hull
-REACH = 0.87  # radius of the sphere around the origin that the hull is cut off at: of a cube of side 1
+MIN_COVERAGE = 0.1  # of a pixel whose ray is intersected with the hull
+CLIP_RADIUS = 0.87  # of the sphere around the origin that clips the hull: circumscribes a cube of side 1
 
 
 def block(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
@@ -39,8 +39,8 @@ def depth_of_origin(c2w: Tensor) -> Tensor:
 
 
 def place_of_pixels(camera: Camera) -> Tensor:
-    """Right and up, ``(V, S, S, 2)`` in world units, of where the pixels' rays meet the plane through the world's
-    origin that faces the camera: a crop alone shows neither the scale of a picture nor where its middle is.
+    """Coordinates ``(V, S, S, 2)`` [world units, right and up] where pixel rays hit the plane through the world origin
+    parallel to the image plane.  They encode the scale and the position of a crop.
 
     camera: ``V`` views of ``S`` by ``S`` pixels.
     """
@@ -51,45 +51,45 @@ def place_of_pixels(camera: Camera) -> Tensor:
     return torch.stack([x * depth, y * depth], -1) - origin
 
 
-def span_of_pixels(silhouette: Tensor, outlined: Camera, seen: Tensor, camera: Camera) -> Tensor:
-    """Depths, from the world's origin, ``(V, Q, Q, 2)`` at which pixels' rays enter and leave the silhouettes' hull.
+def span_of_pixels(silhouette: Tensor, outlined: Camera, coverage: Tensor, camera: Camera) -> Tensor:
+    """Depths ``(V, Q, Q, 2)``, relative to the world origin's, at which pixel rays enter and leave the visual hull.
 
-    silhouette: ``(V, D, D)`` signed distance in pixels of the cameras ``outlined``.  seen: ``(V, Q, Q)`` coverage
-    of the pixels of ``camera``: those above SEEN are evaluated, the others get 0.
+    silhouette: ``(V, D, D)`` signed distance in pixels of the cameras ``outlined``.  coverage: ``(V, Q, Q)`` of the
+    pixels of ``camera``; those of at most MIN_COVERAGE get 0.
     """
     c2w = camera.c2w
-    v, y, x = (seen > SEEN).nonzero(as_tuple=True)
+    v, y, x = (coverage > MIN_COVERAGE).nonzero(as_tuple=True)
     right, up = (t[v, y, x] for t in image_plane(camera))
     local = torch.stack([right, up, -torch.ones_like(right)], -1)
     directions = (c2w[v, :3, :3] @ local[..., None])[..., 0]  # of depth 1
-    span = hull_span(c2w[v, :3, 3].contiguous(), directions, REACH, silhouette, outlined)
+    span = hull_span(c2w[v, :3, 3].contiguous(), directions, CLIP_RADIUS, silhouette, outlined)
     span = span - depth_of_origin(c2w)[v, None]
-    return span.new_zeros(*seen.shape, 2).index_put((v, y, x), span)
+    return span.new_zeros(*coverage.shape, 2).index_put((v, y, x), span)
 
 
 def pyramid_input(images: Tensor, masks: Tensor, place: Tensor, span: Tensor, counts: Sequence[int]) -> Tensor:
-    """What the first convolution reads, ``(V, INPUTS, S, S)``; see :meth:`ImagePyramid.forward`."""
-    few = torch.cat([masks.new_full((count,), 1.0 / count) for count in counts])
-    few = few[:, None, None, None].expand(*masks.shape, 1)
-    x = torch.cat([images * masks[..., None], masks[..., None], place, few], -1).permute(0, 3, 1, 2)
+    """Input of the first convolution, ``(V, INPUTS, S, S)``; arguments as in :meth:`ImagePyramid.forward`."""
+    inverse = torch.cat([masks.new_full((count,), 1.0 / count) for count in counts])
+    inverse = inverse[:, None, None, None].expand(*masks.shape, 1)
+    x = torch.cat([images * masks[..., None], masks[..., None], place, inverse], -1).permute(0, 3, 1, 2)
     return torch.cat([x, functional.interpolate(span.permute(0, 3, 1, 2), size=x.shape[-2:], mode="nearest")], 1)
 
 
 class ImagePyramid(nn.Module):
-    """Features of every view at a quarter of its resolution, predictions at half.
+    """Features of every view at a quarter of its resolution and predictions at half.
 
-    Level ``k`` has ``S / 2**(k + 1)`` pixels a side.  The finest levels, ``sizes.reading`` of them, read the picture at
-    their own resolution too, and predict: each adds to what the coarser ones say.  So coarse levels can learn alone
-    from small pictures, and finer ones then begin by adding nothing.  The coarsest level exchanges one mean vector
-    between the views: they stand under one light.  ``in_bfloat16``: whether convolutions compute in it; parameters and
+    Level ``k`` has ``S / 2**(k + 1)`` pixels a side.  Each of the ``sizes.reading`` finest levels also reads the image
+    at its own resolution and adds a residual to the prediction of the coarser levels.  Coarse levels can therefore be
+    trained first, on small images; finer ones are initialized to add zero.  The coarsest level shares one mean vector
+    between the views, which have common lighting.  ``in_bfloat16``: compute dtype of the convolutions; parameters and
     results are float32.
     """
 
     in_bfloat16 = False
 
     def __init__(self, sizes: PyramidSizes, finest: int = 0):
-        """finest: the level that the pictures enter, which are ``2**finest`` times smaller; the finer ones are left
-        out, and there are no features where it is not 0.
+        """finest: the finest level that is built; images are ``2**finest`` times smaller, and unless it is 0 there are
+        no features.
         """
         super().__init__()
         widths, reading = sizes.widths, range(finest, sizes.reading)
@@ -104,26 +104,28 @@ class ImagePyramid(nn.Module):
         self.shared = nn.Linear(widths[-1], widths[-1])
         self.across = nn.ModuleDict({k: nn.Conv2d(coarse, fine, 1) for k, (fine, coarse) in pairs.items()})
         self.up = nn.ModuleDict({k: block(fine, fine) for k, (fine, _) in pairs.items()})
-        said = {str(k): nn.Sequential(block(widths[k], widths[k]), nn.Conv2d(widths[k], PREDICTED, 1)) for k in reading}
-        self.says = nn.ModuleDict(said)
+        predicted = {
+            str(k): nn.Sequential(block(widths[k], widths[k]), nn.Conv2d(widths[k], PREDICTED, 1)) for k in reading
+        }
+        self.says = nn.ModuleDict(predicted)
         if finest == 0:
             self.features = nn.Conv2d(widths[1], sizes.features, 1)
-        for head in said.values():
+        for head in predicted.values():
             for value in head[1].parameters():
                 nn.init.zeros_(value)
-        for k in reading[1:]:  # a finer level begins by adding nothing
+        for k in reading[1:]:  # finer levels start by adding zero
             for value in down[str(k)][1].parameters():
                 nn.init.zeros_(value)
 
     def forward(
         self, images: Tensor, masks: Tensor, place: Tensor, span: Tensor, counts: Sequence[int] | None = None
     ) -> tuple[Tensor | None, Tensor]:
-        """Features ``(V, S/4, S/4, F)``, none of small pictures, and raw predictions ``(V, S/2, S/2, 12)`` of views.
+        """Features ``(V, S/4, S/4, F)``, None if ``finest`` > 0, and raw predictions ``(V, S/2, S/2, 12)`` of views.
         Gradients reach every parameter.
 
         images: ``(V, S, S, 3)`` sRGB.  masks: ``(V, S, S)``.  place: ``(V, S, S, 2)`` from :func:`place_of_pixels`.
-        span: ``(V, S / k, S / k, 2)`` from :func:`span_of_pixels`.  S is a multiple of two to the number of levels.
-        counts: how many views each object has, one after the other; all are of one object without it.
+        span: ``(V, S / k, S / k, 2)`` from :func:`span_of_pixels`.  S is a multiple of ``2**levels``.  counts: number
+        of views of each object, in order; None if all are of one object.
         """
         counts = [len(masks)] if counts is None else counts
         x = pyramid_input(images, masks, place, span, counts)
@@ -133,7 +135,7 @@ class ImagePyramid(nn.Module):
         return None if features is None else channels_last(features), channels_last(pixels)
 
     def _convolved(self, x: Tensor, counts: Sequence[int]) -> tuple[Tensor, Tensor]:
-        """What leaves level 1 on the way up, or the finest one, and the predictions of the finest level."""
+        """Activations of level 1 (or of the finest level) in the decoder, and the predictions of the finest level."""
         levels: dict[str, Tensor] = {}
         for k in range(self.finest, self.deepest + 1):
             at = str(k)
@@ -144,15 +146,15 @@ class ImagePyramid(nn.Module):
         y = levels[str(self.deepest)]
         means = [self.shared(part.mean((0, 2, 3))).expand(len(part), -1) for part in y.split(list(counts))]
         y = y + torch.cat(means)[:, :, None, None]
-        quarter, said = y, list[Tensor]()
+        quarter, predicted = y, list[Tensor]()
         for k in reversed(range(self.finest, self.deepest)):
             at = str(k)
             y = self.up[at](levels[at] + _twice(self.across[at](y), levels[at]))
             quarter = y if k >= 1 else quarter
             if at in self.says:
-                more = self.says[at](y)
-                said.append(more + _twice(said[-1], more) if said else more)
-        return quarter, said[-1]
+                residual = self.says[at](y)
+                predicted.append(residual + _twice(predicted[-1], residual) if predicted else residual)
+        return quarter, predicted[-1]
 
 
 def _twice(coarse: Tensor, fine: Tensor) -> Tensor:

@@ -1,7 +1,7 @@
-"""What posed images show of points, as the network of convolutions reads it.
+"""Lookup of points in posed images for the convolutional network.
 
-:func:`summarize_views` gives the numbers of each view.  The other functions evaluate layers on these numbers and pool
-over the views in one kernel, without gradient; the modules that call them have the same in torch, with gradients.
+:func:`summarize_views` returns the features of each view.  The other functions fuse the layers on these features and
+the pooling over the views into one kernel, without gradient; their callers have the differentiable versions in torch.
 """
 
 from __future__ import annotations
@@ -21,19 +21,18 @@ from reli3d.kernels.view_features import (
 )
 
 BLOCK = 8  # floats of a kernels.vec8
-NUMBERS = 9  # of a view at a point, and as many of the summary over the views
-HIDDEN, SPREAD = 32, 24  # widths of the two layers of spread_views, which its kernel has written out
+NUMBERS = 9  # features of a view at a point; the summary over the views has the same width
+HIDDEN, SPREAD = 32, 24  # widths of the two layers of spread_views, fixed in its kernel
 
 
 def summarize_views(
     images: Tensor, camera: Camera, points: Tensor, visible: Tensor | None, normal: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """What the images show of ``points (N, 3)``: numbers ``(N, V, 9)`` and weight ``(N, V)`` of each view, summary
-    ``(N, 9)``.
+    """Features ``(N, V, 9)`` and blend weights ``(N, V)`` of each view at ``points (N, 3)``, and a summary ``(N, 9)``.
 
     images: ``(V, S, S, 4)``, sRGB and signed distance to the silhouette in pixels.  camera: of these images.
-    visible: ``(N, V)``, 1 where a view sees the surface point, 0 where it is hidden.  normal: ``(N, 3)`` unit.  Both
-    are None for points in space.  :mod:`reli3d.kernels.view_features` lists the numbers.  No gradient.  Raises
+    visible: ``(N, V)``, 1 where a surface point is visible, 0 where it is occluded.  normal: ``(N, 3)`` unit.  Both are
+    None for points in free space.  :mod:`reli3d.kernels.view_features` lists the features.  No gradient.  Raises
     TypeError unless float32, ValueError on wrong shapes or mixed devices.
     """
     n, out, viewed = _summary(images, camera, points, visible, normal)
@@ -52,13 +51,12 @@ def pool_views(
     visible: Tensor | None,
     normal: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
-    """A hidden layer at ``points (N, 3)``: the weighted mean over the views, ``(N, H)``, and the summary ``(N, 9)`` of
-    :func:`summarize_views`.
+    """Weighted mean over the views of a hidden layer at ``points (N, 3)``, ``(N, H)``, and the summary ``(N, 9)``.
 
-    The layer of a view is ``silu(token + numbers @ mix)``: its ``tokens (V, P, P, H)``, looked up where the point
-    projects, and the 9 numbers of :func:`summarize_views` times ``mix (9, H)``.  H is a multiple of 8.  The other
-    arguments are those of :func:`summarize_views`.  No gradient: with :func:`gather_views` and torch the same has one
-    and takes five times as long.
+    The layer of a view is ``silu(token + features @ mix)`` with ``tokens (V, P, P, H)`` interpolated where the point
+    projects, the 9 features of :func:`summarize_views` and ``mix (9, H)``.  H is a multiple of 8.  The other arguments
+    and the summary are those of :func:`summarize_views`.  No gradient; the differentiable version by
+    :func:`gather_views` and torch takes about 5 times as long.
     """
     n, out, viewed = _summary(images, camera, points, visible, normal)
     check("tokens", tokens, like=images)
@@ -81,12 +79,12 @@ def pool_views(
 def spread_views(
     images: Tensor, tokens: Tensor, mix: Tensor, last: Tensor, bias: Tensor, camera: Camera, points: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Two layers at ``points (N, 3)`` in space: weighted mean over the views and mean square difference to it, ``(N, 2
-    SPREAD)``, and the summary ``(N, 9)`` of :func:`summarize_views`.
+    """Weighted mean and variance over the views of two layers at ``points (N, 3)`` in free space, ``(N, 2 SPREAD)``,
+    and the summary ``(N, 9)`` of :func:`summarize_views`.
 
-    The layers of a view are ``silu(token + numbers @ mix) @ last + bias``: tokens, mix and numbers as in
-    :func:`pool_views` with H = HIDDEN.  last: ``(HIDDEN, SPREAD)``.  bias: ``(SPREAD,)``.  The rest as there.  No
-    gradient: :class:`reli3d.nn.volume.FeatureVolume` has the same in torch.
+    The layers of a view are ``silu(token + features @ mix) @ last + bias``, with tokens, features and mix as in
+    :func:`pool_views` for H = HIDDEN.  last: ``(HIDDEN, SPREAD)``.  bias: ``(SPREAD,)``.  No gradient;
+    :class:`reli3d.nn.volume.FeatureVolume` has the differentiable version in torch.
     """
     n, out, viewed = _summary(images, camera, points, None, None)
     shapes = {
@@ -109,15 +107,16 @@ def spread_views(
 def fuse_views(
     images: Tensor, pixels: Tensor, camera: Camera, points: Tensor, visible: Tensor, normal: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """What the views predict of surface ``points (N, 3)``; the view that sees a point best speaks loudest.
+    """Blends the views' material predictions at surface ``points (N, 3)`` by visibility and viewing angle.
 
-    Gives the colour's logit ``(N, 3)``, numbers ``(N, 10)`` and the unit normal ``(N, 3)``.
+    Returns the base color logit ``(N, 3)``, features ``(N, 10)`` and the unit normal ``(N, 3)``.
 
-    pixels: ``(3, V, P, P, 4)``: gain and three shifts; confidence, roughness, metallic, chroma; normal, 0.  A view's
-    colour is ``gain * m + chroma * (l - m) + shift`` with the logits ``l`` of the colour seen and their mean ``m``.
-    Its weight is the square of its share in :func:`summarize_views` times exp(confidence).  The numbers: roughness,
-    metallic, gain, normal less ``normal``, their cosine, greatest share, confidence, spread of the logit.  The rest as
-    in :func:`summarize_views`.  No gradient: :class:`reli3d.nn.local.LocalField` has the same in torch.
+    pixels: ``(3, V, P, P, 4)``: gain and three shifts; confidence, roughness, metallic, chroma; normal, 0.  The base
+    color logit of a view is ``gain * m + chroma * (l - m) + shift`` with the logits ``l`` of the observed color and
+    their mean ``m``.  The blend weight is ``w**2 * exp(confidence)`` with the unnormalized weight ``w`` of
+    :func:`summarize_views`.  Features: roughness, metallic, gain, blended normal minus ``normal``, their cosine,
+    greatest ``w``, confidence, standard deviation of the logit.  Other arguments as in :func:`summarize_views`.  No
+    gradient; :class:`reli3d.nn.local.LocalField` has the differentiable version in torch.
     """
     check("pixels", pixels, last=4, like=images)
     if pixels.ndim != 5 or pixels.shape[:2] != (3, len(images)) or min(pixels.shape[2:4]) < 2:
@@ -131,7 +130,7 @@ def fuse_views(
 
 
 def _summary(images, camera, points, visible, normal) -> tuple[int, Tensor, Viewed]:
-    """Number of points, the empty summary and what the kernels have in common, checked."""
+    """Number of points, an empty summary and the kernels' common inputs, checked."""
     views, n = len(images), len(points)
     check("images", images, last=4)
     check("points", points, last=3, like=images)

@@ -1,4 +1,4 @@
-"""What all views say about the space of the object: pooled on a grid, then a 3D U-Net, then looked up at points."""
+"""Feature volume of an object: view features pooled on a grid, a 3D U-Net, and trilinear lookup."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from reli3d.nn.presets import VolumeSizes
 from reli3d.nn.view_features import AHEAD, ViewMaps, ahead_of_surface
 from reli3d.nn.view_lookup import HIDDEN, NUMBERS, SPREAD, spread_views, summarize_views
 
-NEAR_HULL = 0.08  # farther outside the silhouettes' hull there is nothing: views are not read
-HULL_SCALE = 0.1  # unit of the hull's distance as a feature
+NEAR_HULL = 0.08  # model units: grid points farther outside the visual hull are left zero
+HULL_SCALE = 0.1  # model units per unit of the hull distance as a feature
 
 
 def _block(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
@@ -25,9 +25,9 @@ def _block(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
 
 
 class FeatureVolume(nn.Module):
-    """Features of the space ``[-R, R]^3``: ``N`` grid points a side, any number of views in any order.
+    """Features on a grid over ``[-R, R]^3`` with ``N`` points a side, order-invariant in any number of views.
 
-    ``in_bfloat16``: whether convolutions compute in it; parameters and results are float32.
+    ``in_bfloat16``: compute dtype of the convolutions; parameters and results are float32.
     """
 
     in_bfloat16 = False
@@ -48,7 +48,9 @@ class FeatureVolume(nn.Module):
         self.side, self.radius = sizes.side, sizes.radius
 
     def forward(self, maps: ViewMaps, surface: Tensor) -> Tensor:
-        """``(N, N, N, F)``, indexed x, y, z.  surface: as in :func:`~reli3d.nn.view_features.ahead_of_surface`.
+        """Features ``(N, N, N, F)``, indexed x, y, z.
+
+        surface: as in :func:`~reli3d.nn.view_features.ahead_of_surface`.
 
         Gradients reach the tokens, the surface and every parameter.
         """
@@ -57,9 +59,9 @@ class FeatureVolume(nn.Module):
 
     @torch.no_grad()
     def fused(self, maps: ViewMaps, surface: Tensor) -> Tensor:
-        """:meth:`forward` by :func:`~reli3d.nn.view_lookup.spread_views`: to float32 rounding, without gradient."""
+        """:meth:`forward` by :func:`~reli3d.nn.view_lookup.spread_views`, equal to float32 rounding; no gradient."""
         first, last = linear_of(self.mix, 0), linear_of(self.mix, 2)
-        # bilinear weights sum to 1: the first layer may come before the look-up
+        # bilinear weights sum to 1, so the first layer commutes with the lookup
         tokens = functional.linear(maps.tokens, first.weight[:, :-NUMBERS], first.bias)
         layers = tokens, first.weight[:, -NUMBERS:].T, last.weight.T, last.bias
 
@@ -71,14 +73,14 @@ class FeatureVolume(nn.Module):
         return self._filled(near, in_rows(reduced, grid[near], hull[near])["reduced"])
 
     def _near_hull(self, maps: ViewMaps) -> tuple[Tensor, Tensor, Tensor]:
-        """All grid points ``(N**3, 3)``, the index of those near the silhouettes' hull, and the distance to it."""
+        """All grid points ``(N**3, 3)``, the indices of those near the visual hull, and the distance to it."""
         axis = torch.linspace(-self.radius, self.radius, self.side, device=maps.images.device, dtype=torch.float32)
         grid = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
         hull = hull_grid(axis, maps.silhouette, maps.camera, far=NEAR_HULL).view(-1)
         return grid, (hull > -NEAR_HULL).nonzero()[:, 0], hull
 
     def _filled(self, near: Tensor, reduced: Tensor) -> Tensor:
-        """The convolved volume of ``reduced`` features at the grid points ``near``, zero elsewhere."""
+        """Output of the U-Net for ``reduced`` features at the grid points ``near``, zero elsewhere."""
         x = reduced.new_zeros(self.side**3, reduced.shape[1]).index_copy(0, near, reduced)
         x = x.reshape(1, self.side, self.side, self.side, -1).permute(0, 4, 1, 2, 3)  # channels last: half the time
         with torch.autocast(x.device.type, torch.bfloat16, enabled=self.in_bfloat16):
@@ -111,5 +113,5 @@ class FeatureVolume(nn.Module):
         return self.reduce(torch.cat([pooled, summary, rest, ahead_of_surface(surface, maps, points)], -1))
 
     def sample(self, volume: Tensor, points: Tensor) -> Tensor:
-        """Trilinear values ``(N, F)`` of a ``volume`` at ``points (N, 3)``; outside, its border's."""
+        """Trilinear interpolation ``(N, F)`` of ``volume`` at ``points (N, 3)``, clamped to the border."""
         return sample_grid(volume, points / self.radius)

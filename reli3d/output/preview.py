@@ -15,7 +15,7 @@ from torch.nn.functional import interpolate, normalize, pad
 from reli3d.geometry.camera import Camera, look_at
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene
-from reli3d.nn.blocks import beside
+from reli3d.nn.blocks import submit
 from reli3d.render.asset import Asset
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
@@ -60,7 +60,7 @@ def preview(asset: Asset, views: Views, scene: RayScene | None = None) -> Callab
         return [_image(tile) for tile in lit + (_maps(shots[0]) if with_maps else [])]
 
     cameras = unseen_cameras(mesh, views.c2w)
-    begun = [beside(partial(tiles, camera, k == 0), mesh.vertices.device) for k, camera in enumerate(cameras)]
+    begun = [submit(partial(tiles, camera, k == 0), mesh.vertices.device) for k, camera in enumerate(cameras)]
 
     def picture() -> np.ndarray:
         taken = views.select(choose_views(views.c2w, COLUMNS)).resampled(TILE, crop=True)

@@ -22,7 +22,7 @@ from reli3d.geometry.rays import RayScene
 from reli3d.io.glb import glb_bytes
 from reli3d.io.hdr import write_environment
 from reli3d.io.images import png_bytes, write_png
-from reli3d.nn.blocks import beside
+from reli3d.nn.blocks import submit
 from reli3d.nn.weights import Manifest
 from reli3d.output.folder import claimed
 from reli3d.output.viewer import Shown, photograph_stops, shadow, viewer_page
@@ -50,7 +50,7 @@ def measure(mesh: Mesh, scene: RayScene, views: Views) -> Callable[[], dict]:
     """Begin to measure a result, beside the caller's work: ``mesh``, the report of the mesh welded across its UV seams,
     and ``mask_iou``, see :func:`mask_iou`, as plain values.
     """
-    return beside(lambda: {"mesh": asdict(report(mesh)), "mask_iou": mask_iou(scene, views)}, mesh.vertices.device)
+    return submit(lambda: {"mesh": asdict(report(mesh)), "mask_iou": mask_iou(scene, views)}, mesh.vertices.device)
 
 
 def mask_iou(scene: RayScene, views: Views) -> float:
@@ -108,12 +108,12 @@ def encode(
     scene: rays against the mesh of ``asset``.
     """
     device = asset.mesh.vertices.device
-    kept = beside(partial(shadow, asset.mesh, scene), device)  # the longest first
+    kept = submit(partial(shadow, asset.mesh, scene), device)  # the longest first
     extras = {k: record[k] for k in ("output_from_input", "model_from_input", "weights")}
-    glb = beside(partial(glb_bytes, asset, extras=extras), device)
+    glb = submit(partial(glb_bytes, asset, extras=extras), device)
     moved = partial(glb_bytes, asset, extras=extras, translation=translation)
-    stops = beside(partial(photograph_stops, views), device)
-    started = None if before is None else beside(partial(_shown, before), device)
+    stops = submit(partial(photograph_stops, views), device)
+    started = None if before is None else submit(partial(_shown, before), device)
 
     def page() -> str:
         # This is a thread of the pool: it may wait for tasks that were submitted before it and that wait for none.
@@ -124,8 +124,8 @@ def encode(
         middle, radius = (low + high) / 2, float((high - low).norm()) / 2
         return viewer_page(printable(name), shown, asset.light.radiance, middle, radius, stops())
 
-    placed = beside(moved, device) if any(translation) else glb
-    return Encoded(asset, placed, beside(page, device))
+    placed = submit(moved, device) if any(translation) else glb
+    return Encoded(asset, placed, submit(page, device))
 
 
 def _shown(asset: Asset) -> Shown:

@@ -18,7 +18,6 @@ from reli3d.geometry.smooth import taubin_smooth
 from reli3d.geometry.surface import extract_surface
 from reli3d.geometry.triplane import sample_triplane
 from reli3d.render.asset import TextureSet
-from reli3d.render.color import srgb_to_linear
 from reli3d.render.gaussians import SphericalGaussians, shade_gaussians
 from reli3d.render.gbuffer import sample_texture, surface_points
 from reli3d.render.material import sample_bsdf
@@ -104,8 +103,8 @@ def centres(g, small) -> Op:
         cube = reference_surface.flexicubes_vertices(*(leaves[k] for k in ORDER), 1.6)[1]
         corner, weight = mesh.vertices[:count].double()[quads], gamma[cube[quads]]
         one, other = weight[:, 0] * weight[:, 2], weight[:, 1] * weight[:, 3]
-        share = (one / (one + other))[:, None]
-        return 0.5 * (share * (corner[:, 0] + corner[:, 2]) + (1 - share) * (corner[:, 1] + corner[:, 3]))
+        weight = (one / (one + other))[:, None]
+        return 0.5 * (weight * (corner[:, 0] + corner[:, 2]) + (1 - weight) * (corner[:, 1] + corner[:, 3]))
 
     return Op({"gamma": gamma}, ours, twin)
 
@@ -215,7 +214,7 @@ def points_of_a_mesh(g, small, tangents) -> Op:
         uv = at("uv")
         bent = in_texture(v["normal"], uv) * 2.0 - 1.0
         bent = bent[:, :1] * along + bent[:, 1:2] * side * torch.linalg.cross(n, along) + bent[:, 2:] * n
-        color = in_texture(srgb_to_linear(v["base_color"]), uv)
+        color = in_texture(v["base_color"], uv)
         return torch.cat(
             [
                 at("vertices"),
@@ -365,9 +364,9 @@ def test_the_adjoint_is_that_of_the_float64_twin(device, name):
     most = max(1.0, 0.1 * float(want.detach().abs().max()))  # densities go up to hundreds
     torch.testing.assert_close(got.detach().cpu().double(), want.detach(), rtol=1e-5, atol=2e-6 * most)
     draw = torch.rand if op.one_sign else torch.randn
-    share = draw(want.shape, generator=torch.Generator().manual_seed(8))
-    grads = torch.autograd.grad((got * share.to(device)).sum(), ours)
-    truth = torch.autograd.grad((want * share.double()).sum(), double)
+    cotangent = draw(want.shape, generator=torch.Generator().manual_seed(8))
+    grads = torch.autograd.grad((got * cotangent.to(device)).sum(), ours)
+    truth = torch.autograd.grad((want * cotangent.double()).sum(), double)
     for leaf, a, b in zip(op.leaves, grads, truth, strict=True):
         if leaf in op.unit:
             a, b = (reference.across(v, op.leaves[leaf]) for v in (a, b))

@@ -235,7 +235,7 @@ def test_second_derivatives_are_right_or_refused(device, name, of):
         assert abs(float(got.sum()) - want) < 2e-2 * float(got.abs().sum()) + 1e-3, (k, other)
 
 
-def shares(case: Case, first, second, spoil=lambda tensor: tensor) -> dict[str, float]:
+def fractions_within(case: Case, first, second, spoil=lambda tensor: tensor) -> dict[str, float]:
     """How many entries of every output and gradient on the device ``second`` are within 1e-4 of those on ``first``."""
     found, results = {}, []
     for device in (first, second):
@@ -270,15 +270,15 @@ def test_one_two_and_five_threads_give_the_same_bits(threads, name):
 def test_cpu_and_cuda_agree(name):
     if not torch.cuda.is_available():
         pytest.skip("needs CUDA")
-    for key, share in shares(CASES[name], "cpu", "cuda").items():
-        assert share >= 0.999, (key, share)
+    for key, fraction in fractions_within(CASES[name], "cpu", "cuda").items():
+        assert fraction >= 0.999, (key, fraction)
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_what_compares_devices_is_still_on_one_and_sees_an_error(name):
     """The judge of the test above: nothing differs between two runs on the CPU, and 3e-4 in one entry of 50 does."""
     case = CASES[name]
-    assert all(share == 1.0 for share in shares(case, "cpu", "cpu").values())
+    assert all(fraction == 1.0 for fraction in fractions_within(case, "cpu", "cpu").values())
 
     def spoil(tensor):
         flat = tensor.clone().reshape(-1)
@@ -289,7 +289,9 @@ def test_what_compares_devices_is_still_on_one_and_sees_an_error(name):
             flat[:: max(1, min(50, flat.numel() - 1))] += 1 if tensor.dtype != torch.bool else True
         return flat.reshape(tensor.shape)
 
-    assert all(share < 0.999 for share in shares(case, "cpu", "cpu", spoil).values() if share is not None)
+    assert all(
+        fraction < 0.999 for fraction in fractions_within(case, "cpu", "cpu", spoil).values() if fraction is not None
+    )
 
 
 def test_no_kernel_is_left_out(monkeypatch):

@@ -186,9 +186,9 @@ def test_numbers_of_the_vertices_reach_the_texels(sphere):
         bake(sphere, SIZE, lambda p, n, v: v, values=numbers[1:])
 
 
-@pytest.mark.parametrize("shape, share", [((64, 64), 0.02), ((33, 130), 0.3), ((1, 50), 0.1), ((50, 1), 0.1)])
-def test_nearest_valid_is_exact(device, shape, share):
-    valid = torch.rand(shape, generator=torch.Generator().manual_seed(5)) < share
+@pytest.mark.parametrize("shape, fraction", [((64, 64), 0.02), ((33, 130), 0.3), ((1, 50), 0.1), ((50, 1), 0.1)])
+def test_nearest_valid_is_exact(device, shape, fraction):
+    valid = torch.rand(shape, generator=torch.Generator().manual_seed(5)) < fraction
     valid[0, 0] = True
     source, square = (t.cpu() for t in nearest_valid(valid.to(device)))
     assert np.array_equal(np.rint(ndimage.distance_transform_edt(~valid.numpy()) ** 2), square.numpy())

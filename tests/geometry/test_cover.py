@@ -144,8 +144,8 @@ def test_equals_its_twin_on_a_rough_field(device):
     assert float(((got - want).abs() < 2e-4).double().mean()) > 0.999
 
 
-def seen_share(model, views):
-    """Share of the pixels inside the silhouettes whose rays meet the mesh; and of the mesh's that lie inside."""
+def covered_fractions(model, views):
+    """Fraction of the pixels inside the silhouettes whose rays meet the mesh; and of the mesh's that lie inside."""
     field = pipeline.encode(model, pipeline.prepare(model, views, pipeline.normalize(views, "auto")))
     mesh, maps = pipeline.extract(field, model.preset.resolution), field.maps
     scene = RayScene(mesh.vertices, mesh.faces)
@@ -160,10 +160,10 @@ def test_the_mesh_shows_what_the_photographs_show(count, least, monkeypatch):
     """What is left lies at the outline, where smoothing takes a fraction of a cell: more of it bulges from one view."""
     model = load_model("small", "cpu")
     views = load_views(Path(reli3d.__file__).parent / "assets/example", views=count)
-    share, exact = seen_share(model, views)
-    assert share > least and exact > 0.975
+    covered, exact = covered_fractions(model, views)
+    assert covered > least and exact > 0.975
     monkeypatch.setattr(pipeline, "cover_silhouettes", lambda sdf, *args, **options: sdf)
-    assert seen_share(model, views)[0] < least
+    assert covered_fractions(model, views)[0] < least
 
 
 def test_without_views_the_field_is_returned_unchanged(device):

@@ -21,16 +21,16 @@ from tests.support import reference_surface
 
 N = 100_000
 CUBES = 47  # a side: 103,823 cubes
-# Of the change by a relative step of an input, where an edge of 0.02 and a random share of 1 give up to 0.02: digits
-# that float32 lacks where terms of that size cancel, and float64 in the twin's differences of shares.  Centres are
+# Of the change by a relative step of an input, where an edge of 0.02 and a random fraction of 1 give up to 0.02: digits
+# that float32 lacks where terms of that size cancel, and float64 in the twin's differences of fractions.  Centres are
 # means of vertices that are rounded in the box of 1, not in a cube.
 FLOOR = {"sdf": 3e-9, "deformation": 1e-9, "alpha": 3e-9, "beta": 3e-9, "gamma": 1e-7}
 
 
-def agree(got, want, floor=0.0, share=0.999, within=1e-4):
-    """Whether ``share`` of the entries of ``got`` lie ``within`` that part of their float64 value, or the ``floor``."""
+def agree(got, want, floor=0.0, fraction=0.999, within=1e-4):
+    """Whether a ``fraction`` of ``got`` has a relative error of at most ``within``, or an absolute one of ``floor``."""
     off = (got.detach().cpu().double() - want.detach()).abs() - within * want.detach().abs()
-    return float((off <= floor).double().mean()) >= share
+    return float((off <= floor).double().mean()) >= fraction
 
 
 def finite(*tensors):
@@ -70,8 +70,8 @@ def test_gradients_of_flexicubes(device, reach):
     }
     ours = {k: v.to(device).requires_grad_() for k, v in leaves.items()}
     mesh = extract_surface(ours["sdf"], radius=0.5, centre=True, **{k: ours[k] for k in leaves if k != "sdf"})
-    share = torch.randn(mesh.vertices.shape, generator=g)
-    got = torch.autograd.grad((mesh.vertices * share.to(device)).sum(), list(ours.values()))
+    cotangent = torch.randn(mesh.vertices.shape, generator=g)
+    got = torch.autograd.grad((mesh.vertices * cotangent.to(device)).sum(), list(ours.values()))
     assert finite(mesh.vertices, *got)
     double = {k: v.double().requires_grad_() for k, v in leaves.items()}
     dual, cube_of = reference_surface.flexicubes_vertices(
@@ -85,7 +85,7 @@ def test_gradients_of_flexicubes(device, reach):
     assert len(dual) > N and len(want) == len(mesh.vertices)
     # a sum of twelve points of size 0.5; with weights of any size it has the same terms
     torch.testing.assert_close(mesh.vertices.detach().cpu().double(), want.detach(), rtol=0, atol=5e-7)
-    true = torch.autograd.grad((want * share.double()).sum(), list(double.values()))
+    true = torch.autograd.grad((want * cotangent.double()).sum(), list(double.values()))
     for name, a, b in zip(leaves, got, true, strict=True):
         size = 1.0 if name == "deformation" else leaves[name].double().abs().clamp(min=1e-30)
         assert agree(a, b, FLOOR[name] / size + 1e-37), name  # the least float32 number with all its digits
@@ -174,16 +174,16 @@ def test_gradients_of_normals(device):
     g = torch.Generator().manual_seed(20)
     corners, sound = wild_faces(g, 1e9)
     faces = torch.arange(3 * N, dtype=torch.int32).view(-1, 3)
-    share = torch.randn(3 * N, 3, generator=g)
+    cotangent = torch.randn(3 * N, 3, generator=g)
     leaf = corners.view(-1, 3).to(device).requires_grad_()
     normals = vertex_normals(leaf, faces.to(device))
-    (got,) = torch.autograd.grad((normals * share.to(device)).sum(), leaf)
+    (got,) = torch.autograd.grad((normals * cotangent.to(device)).sum(), leaf)
     assert finite(normals, got)
     torch.testing.assert_close(normals.detach().norm(dim=1).cpu(), torch.ones(3 * N), rtol=0, atol=1e-6)
     double = corners.view(-1, 3).double().requires_grad_()
     a, b, c = double.view(-1, 3, 3).unbind(1)
     cross = torch.linalg.cross(b - a, c - a)
-    (want,) = torch.autograd.grad((normalize(cross, dim=1).repeat_interleave(3, 0) * share.double()).sum(), double)
+    (want,) = torch.autograd.grad((normalize(cross, dim=1).repeat_interleave(3, 0) * cotangent.double()).sum(), double)
     length = (b - a).norm(dim=1) * (c - a).norm(dim=1)
     # a float32 cross product errs by 1e-7 of its sides' product: by 1e-5 of one that is a hundred times smaller
     plain = (sound & (cross.norm(dim=1) > 0.01 * length)).detach()

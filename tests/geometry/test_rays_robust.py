@@ -131,8 +131,8 @@ def test_hits_of_uniform_directions_measure_the_solid_angle(device, backend):
         hit = make(corners, [[0, 1, 2]], backend, device).occluded(torch.zeros(3, device=device), d)
         a, b, c = (p / np.linalg.norm(p) for p in corners)
         angle = 2 * abs(math.atan2(np.dot(a, np.cross(b, c)), 1 + a @ b + b @ c + c @ a))
-        share = angle / (4 * math.pi)
-        assert abs(float(hit.float().mean()) - share) < 4 * (share * (1 - share) / n) ** 0.5
+        fraction = angle / (4 * math.pi)
+        assert abs(float(hit.float().mean()) - fraction) < 4 * (fraction * (1 - fraction) / n) ** 0.5
 
 
 def shaded(scene, face, bary):

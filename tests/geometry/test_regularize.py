@@ -32,9 +32,9 @@ def test_deviation_and_gradients_match_the_plain_float64_formulation(device):
     assert len(spread) == len(want) == len(set(match.tolist()))
     got = spread[torch.from_numpy(match).to(device)]
     torch.testing.assert_close(got.cpu().double(), want, rtol=0, atol=1e-6)  # float32 differences of positions below 1
-    share = torch.rand(len(want), generator=rng)
-    got = torch.autograd.grad((got * share.to(device)).sum(), list(ours.values()))
-    true = torch.autograd.grad((want * share.double()).sum(), list(double.values()))
+    cotangent = torch.rand(len(want), generator=rng)
+    got = torch.autograd.grad((got * cotangent.to(device)).sum(), list(ours.values()))
+    true = torch.autograd.grad((want * cotangent.double()).sum(), list(double.values()))
     for name, a, b in zip(ours, got, true, strict=True):
         assert b.abs().max() > 0, name
         # float64 inside, so what is left is float32 sums over eight cubes

@@ -38,9 +38,9 @@ def test_values_and_gradients_match_the_dense_operator_in_float64(device):
     single = mesh.vertices.to(device).requires_grad_()
     got = taubin_smooth(Mesh(single, mesh.faces.to(device)), iterations=4, step=0.6).vertices
     torch.testing.assert_close(got.cpu().double(), want, rtol=0, atol=2e-6)  # eight float32 steps of unit positions
-    share = torch.randn(want.shape, generator=torch.Generator().manual_seed(1))
-    a = torch.autograd.grad((got * share.to(device)).sum(), single)[0]
-    b = torch.autograd.grad((want * share.double()).sum(), double)[0]
+    cotangent = torch.randn(want.shape, generator=torch.Generator().manual_seed(1))
+    a = torch.autograd.grad((got * cotangent.to(device)).sum(), single)[0]
+    b = torch.autograd.grad((want * cotangent.double()).sum(), double)[0]
     torch.testing.assert_close(a.cpu().double(), b, rtol=0, atol=1e-5)  # the same, of gradients up to 3
 
 

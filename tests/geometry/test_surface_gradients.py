@@ -32,11 +32,11 @@ def test_gradients_match_the_plain_float64_formulation(device):
     distance, match = tree.query(want.detach().numpy())
     assert len(want) == len(mesh.vertices) == len(set(match.tolist()))
     assert distance.max() < 1e-6  # float32 quotients of coordinates below 1
-    share = torch.randn(len(want), 3, generator=rng)
-    placed = torch.empty_like(share)
-    placed[torch.from_numpy(match)] = share
+    cotangent = torch.randn(len(want), 3, generator=rng)
+    placed = torch.empty_like(cotangent)
+    placed[torch.from_numpy(match)] = cotangent
     got = torch.autograd.grad((mesh.vertices * placed.to(device)).sum(), list(ours.values()))
-    true = torch.autograd.grad((want * share.double()).sum(), list(double.values()))
+    true = torch.autograd.grad((want * cotangent.double()).sum(), list(double.values()))
     for name, a, b in zip(ours, got, true, strict=True):
         # float64 inside, so what is left is float32 sums over eight cubes
         torch.testing.assert_close(a.cpu().double(), b, rtol=1e-5, atol=1e-7 * float(b.abs().max()), msg=name)
@@ -98,8 +98,8 @@ def test_gradients_behind_the_mesh_are_the_same_bits_for_any_number_of_threads(t
         spread = vertex_deviation(leaves["sdf"], radius=1.0, **given)
         seen = [mesh.vertices, shown.vertices, shown.normals, spread]
         rng = torch.Generator().manual_seed(1)
-        share = [torch.randn(v.shape, generator=rng) for v in seen]
-        results.append([*seen, *torch.autograd.grad(seen, list(leaves.values()), share)])
+        cotangent = [torch.randn(v.shape, generator=rng) for v in seen]
+        results.append([*seen, *torch.autograd.grad(seen, list(leaves.values()), cotangent)])
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
 
@@ -109,14 +109,14 @@ def test_gradients_match_finite_differences_of_the_kernel(device):
     rng = torch.Generator().manual_seed(0)
     weights = random_weights(sdf.shape, 1, device, spread=0.4)
     direction = torch.randn(sdf.shape, generator=rng).to(device)
-    share = None
+    cotangent = None
     values = []
     leaf = sdf.clone().requires_grad_()
     for step in (-1e-2, 1e-2, 0.0):
         mesh = extract_surface(leaf + step * direction * sdf.abs(), radius=1.0, centre=True, **weights)
-        if share is None:
-            share = torch.randn(mesh.vertices.shape, generator=rng).to(device)
-        values.append((mesh.vertices * share).sum())
+        if cotangent is None:
+            cotangent = torch.randn(mesh.vertices.shape, generator=rng).to(device)
+        values.append((mesh.vertices * cotangent).sum())
     (got,) = torch.autograd.grad(values[2], leaf)
     slope = float(((values[1] - values[0]) / 2e-2).detach())  # steps that scale with the sdf keep its signs
     assert abs(float((got * direction * sdf.abs()).sum()) - slope) < 2e-3 * max(1.0, abs(slope))  # float32, step**2
@@ -146,13 +146,13 @@ def test_centre_vertices_split_quads_in_four_with_gradient_to_gamma(device):
     assert found.watertight and found.manifold and found.euler == 0
     assert torch.equal(four.vertices[: len(two.vertices)], two.vertices)
     assert two.vertices.requires_grad is False
-    share = torch.randn(four.vertices.shape, generator=torch.Generator().manual_seed(0)).to(device)
-    (got,) = torch.autograd.grad((four.vertices * share).sum(), gamma)
+    cotangent = torch.randn(four.vertices.shape, generator=torch.Generator().manual_seed(0)).to(device)
+    (got,) = torch.autograd.grad((four.vertices * cotangent).sum(), gamma)
     direction = torch.rand(gamma.shape, generator=torch.Generator().manual_seed(1)).to(device) * gamma.detach()
     ends = []
     for step in (-1e-3, 1e-3):
         weights["gamma"] = gamma.detach() + step * direction
         moved = extract_surface(sdf, radius=1.0, centre=True, **weights).vertices
-        ends.append((moved.double() * share.double()).sum())
+        ends.append((moved.double() * cotangent.double()).sum())
     slope = float((ends[1] - ends[0]) / 2e-3)
     assert abs(float((got * direction).sum()) - slope) < 2e-2 * max(1.0, abs(slope))  # float32 over a step of 1e-3

@@ -32,7 +32,7 @@ def gyroid(p):
 
 
 def share_below(offset, n):
-    """Share of the space in which the gyroid is below ``offset``, float64: exact along x, ``n * n`` midpoints in y, z.
+    """Volume fraction in which the gyroid is below ``offset``, float64: exact along x, ``n * n`` midpoints in y, z.
 
     Along x the gyroid is ``hypot(cos y, sin z)`` times a sine, plus ``sin y cos z``.
     """

@@ -7,7 +7,7 @@ from torch.nn.functional import normalize
 
 from reli3d.geometry.camera import Camera, look_at
 from reli3d.geometry.rays import RayScene
-from reli3d.geometry.visibility import GRAZING, visible_from
+from reli3d.geometry.visibility import MIN_COSINE, visible_from
 
 SIZE, FOCAL = 64, 90.0
 
@@ -33,7 +33,7 @@ def closed_form(p, n, camera):
     x, y = k[:, 2] - k[:, 0] * local[..., 0] / local[..., 2], k[:, 3] + k[:, 1] * local[..., 1] / local[..., 2]
     inside = (x > 0) & (x < camera.width) & (y > 0) & (y < camera.height) & (local[..., 2] < 0)
     near = torch.stack([x, y, camera.width - x, camera.height - y]).abs().amin(0)
-    return (cosine > GRAZING) & inside, ((cosine - GRAZING).abs() < 0.03) | (near < 1e-3)
+    return (cosine > MIN_COSINE) & inside, ((cosine - MIN_COSINE).abs() < 0.03) | (near < 1e-3)
 
 
 @pytest.mark.parametrize("backend", ["embree", "warp"])
@@ -68,17 +68,17 @@ def test_what_stands_between_hides(device):
     assert torch.equal(got[behind, 1:], want[behind, 1:])
 
 
-@pytest.mark.parametrize("share", [0.0, 0.1, 1.0])
-def test_what_is_not_asked_is_false_and_the_rest_as_without(device, share):
+@pytest.mark.parametrize("fraction", [0.0, 0.1, 1.0])
+def test_inactive_pairs_are_false_and_the_others_unchanged(device, fraction):
     camera, p = rig(device), points(device)
     ball = trimesh.creation.icosphere(3)  # below some of the points: all answers occur
     vertices = torch.tensor(ball.vertices, dtype=torch.float32, device=device)
     scene = RayScene(vertices, torch.tensor(ball.faces, dtype=torch.int32, device=device))
     every = visible_from(scene, p, p, camera)
-    asked = (torch.rand(every.shape, generator=torch.Generator().manual_seed(1)) < share).to(device)
-    got = visible_from(scene, p, p, camera, asked)
-    assert got.is_contiguous() and torch.equal(got, every & asked)
-    assert not share or 0.1 < got[asked].float().mean() < 0.9
+    active = (torch.rand(every.shape, generator=torch.Generator().manual_seed(1)) < fraction).to(device)
+    got = visible_from(scene, p, p, camera, active)
+    assert got.is_contiguous() and torch.equal(got, every & active)
+    assert not fraction or 0.1 < got[active].float().mean() < 0.9
 
 
 def test_wrong_inputs_are_told(device):
@@ -90,11 +90,11 @@ def test_wrong_inputs_are_told(device):
         visible_from(scene, p, p[:, :2], camera)
     with pytest.raises(TypeError, match="position: expected torch.float32"):
         visible_from(scene, p.double(), p, camera)
-    with pytest.raises(ValueError, match="asked: expected shape"):
+    with pytest.raises(ValueError, match="active: expected shape"):
         visible_from(scene, p, p, camera, torch.ones(4, 2, dtype=torch.bool, device=device))
-    with pytest.raises(ValueError, match="asked: expected shape"):
+    with pytest.raises(ValueError, match="active: expected shape"):
         visible_from(scene, p, p, camera, torch.ones(3, 3, dtype=torch.bool, device=device))
-    with pytest.raises(ValueError, match="asked: expected shape"):
+    with pytest.raises(ValueError, match="active: expected shape"):
         visible_from(scene, p, p, camera, torch.ones(4, 1, 3, dtype=torch.bool, device=device))
-    with pytest.raises(TypeError, match="asked: expected torch.bool"):
+    with pytest.raises(TypeError, match="active: expected torch.bool"):
         visible_from(scene, p, p, camera, torch.ones(4, 3, device=device))

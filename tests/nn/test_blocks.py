@@ -1,4 +1,4 @@
-"""Work beside the caller's: on another thread, alone there, without gradient."""
+"""Tasks submitted to the pool: on another thread, single-threaded there, without gradient."""
 
 import threading
 
@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from reli3d._bridge import WORKER
-from reli3d.nn.blocks import beside
+from reli3d.nn.blocks import submit
 
 CPU = torch.device("cpu")
 
@@ -17,14 +17,14 @@ def facts():
 
 def test_work_runs_on_a_thread_of_the_pool_that_computes_alone(threads):
     threads(2)
-    name, count, grad = beside(facts, CPU)()
+    name, count, grad = submit(facts, CPU)()
     assert name.startswith(WORKER) and count == 1 and not grad
 
 
 def test_one_thread_does_it_at_once(threads):
     threads(1)
     done = []
-    result = beside(lambda: done.append(facts()), CPU)
+    result = submit(lambda: done.append(facts()), CPU)
     assert done[0][0] == threading.current_thread().name and not done[0][2] and result() is None
 
 
@@ -34,6 +34,6 @@ def test_an_error_reaches_who_asks_for_the_value(threads):
     def fail():
         raise ValueError("no surface")
 
-    result = beside(fail, CPU)
+    result = submit(fail, CPU)
     with pytest.raises(ValueError, match="no surface"):
         result()

@@ -36,7 +36,7 @@ SIZE = TINY.image_size
 def model():
     torch.manual_seed(0)
     model = LocalReconstructor(TINY)
-    with torch.no_grad():  # away from the zeros of the start, so that every path speaks
+    with torch.no_grad():  # away from the initial zeros, so that every path contributes
         for parameter in model.parameters():
             parameter += 0.1 * torch.randn_like(parameter)
     return model.eval()
@@ -80,7 +80,7 @@ def surface_of_ball(n: int = 200):
 
 
 @torch.no_grad()
-def asked(field):
+def evaluated(field):
     position, normal = surface_of_ball()
     eyes = field.maps.camera.position
     visible = ((eyes[None] - position[:, None]) * normal[:, None]).sum(-1).gt(0).float()
@@ -101,11 +101,11 @@ def test_sdf_within_equals_free_sdf_for_the_same_bound(model):
 @pytest.mark.parametrize("views", [1, 2, 5, 16])
 def test_any_number_of_views_in_any_order(model, views):
     inputs = sphere(views)
-    sdf, material, light = asked(encoded(model, *inputs))
+    sdf, material, light = evaluated(encoded(model, *inputs))
     assert sdf.shape == (200,) and material.base_color.shape == (200, 3) and light.shape == (16, 32, 3)
     assert all(bool(torch.isfinite(v).all()) for v in (sdf, light, *vars(material).values()))
     order = torch.randperm(views, generator=torch.Generator().manual_seed(1))
-    other, other_material, other_light = asked(encoded(model, *(t[order] for t in inputs)))
+    other, other_material, other_light = evaluated(encoded(model, *(t[order] for t in inputs)))
     # sums over the views in another order, behind a dozen layers: float32 rounding, amplified
     torch.testing.assert_close(other, sdf, rtol=1e-3, atol=1e-3)
     torch.testing.assert_close(other_light, light, rtol=2e-3, atol=1e-3)
@@ -138,10 +138,10 @@ def test_mirror_images_have_the_mirrored_maps(model):
 
 def test_every_view_is_read(model):
     images, masks, c2w, intrinsics = sphere(3)
-    sdf, material, light = asked(encoded(model, images, masks, c2w, intrinsics))
+    sdf, material, light = evaluated(encoded(model, images, masks, c2w, intrinsics))
     changed = images.clone()
     changed[2] = 1 - changed[2]
-    other, other_material, other_light = asked(encoded(model, changed, masks, c2w, intrinsics))
+    other, other_material, other_light = evaluated(encoded(model, changed, masks, c2w, intrinsics))
     assert float((other - sdf).abs().max()) > 1e-3 and float((other_light - light).abs().max()) > 1e-3
     assert float((other_material.base_color - material.base_color).abs().max()) > 1e-3
 
@@ -193,8 +193,8 @@ def test_pixels_start_as_what_they_show(model):
     assert float(maps.chroma.min()) == float(maps.chroma.max()) == 1.0
 
 
-def test_paint_does_not_follow_the_exposure():
-    """Colours whose logits are all higher by the same number have the same paint; their hue and pattern remain."""
+def test_base_color_does_not_follow_the_exposure():
+    """Adding a constant to all color logits leaves the base color; hue and contrast remain."""
     _, _, c2w, intrinsics = sphere(4)
     camera, span = Camera(c2w, intrinsics / 2, 32, 32), torch.zeros(4, 16, 16, 2)
     raw = torch.randn(4, 32, 32, 12, generator=torch.Generator().manual_seed(0))
@@ -212,7 +212,7 @@ def test_paint_does_not_follow_the_exposure():
 
 
 def test_pixels_know_their_place():
-    """Points of the plane that faces the camera project to pixels that are told the points' coordinates."""
+    """A point of the plane that faces the camera projects to the pixel that has the point's coordinates."""
     eye, target = torch.tensor([[0.7, 1.1, 2.0]]), torch.tensor([[0.1, -0.2, 0.3]])
     c2w = look_at(eye, target, torch.tensor([0.0, 1.0, 0.0]))
     intrinsics = torch.tensor([[SIZE * 1.7, SIZE * 1.9, SIZE / 2 + 3, SIZE / 2 - 5]])
@@ -236,7 +236,7 @@ def test_pixels_know_where_their_rays_meet_the_hull():
     assert float(span[seen <= 0.1].abs().max()) == 0.0
 
 
-def test_the_view_that_sees_a_point_speaks(model):
+def test_the_view_that_sees_a_point_has_the_weight(model):
     """A point that one view sees and another does not has the first one's colour, not the mean of both."""
     images, masks, c2w, intrinsics = sphere(2, seed=3)
     images[0], images[1] = 0.8, 0.2
@@ -250,7 +250,7 @@ def test_the_view_that_sees_a_point_speaks(model):
     with torch.no_grad():
         logit = field.fused(position, normalize(position, dim=-1), visible).logit
     gain, white, black = 0.8808, math.log(0.8 / 0.2), math.log(0.2 / 0.8)
-    # the hidden view keeps a share of 0.02 squared
+    # the hidden view keeps a weight of 0.02 squared
     torch.testing.assert_close(logit, gain * torch.tensor([[white], [black]]).expand(2, 3), rtol=0, atol=0.01)
 
 
@@ -336,7 +336,7 @@ def test_inference_in_blocks_of_points_gives_what_training_gives(model):
 
 
 def test_points_know_whether_they_lie_before_a_surface():
-    """A plane at depth 0 that two cameras on the axis Z see: before it +, behind it -, beside it nothing."""
+    """A plane at depth 0 and two cameras on the Z axis: in front of it +, behind it -, outside its coverage 0."""
     c2w = look_at(torch.tensor([[0.0, 0.0, 2.0], [0.0, 0.0, 3.0]]), torch.zeros(2, 3), torch.tensor([0.0, 1.0, 0.0]))
     intrinsics = torch.tensor([[SIZE * 1.2, SIZE * 1.2, SIZE / 2, SIZE / 2]]).expand(2, 4).contiguous()
     maps = ViewMaps(torch.zeros(2, 16, 16, 8), torch.zeros(2, SIZE, SIZE, 4), Camera(c2w, intrinsics, SIZE, SIZE))
@@ -360,7 +360,7 @@ def test_heads_known_before_give_the_same_material(model):
     visible = (torch.rand(300, 3, generator=torch.Generator().manual_seed(2)) > 0.3).float()
     field = encoded(model, *sphere(3)).with_shading(position, normal, visible)
     at_once = field.material(position, normal, visible)
-    later = field.painted(field.heads(position, normal, visible), position, normal, visible)
+    later = field.material_from_heads(field.heads(position, normal, visible), position, normal, visible)
     for a, b in zip(vars(at_once).values(), vars(later).values(), strict=True):
         assert torch.equal(a, b)
 

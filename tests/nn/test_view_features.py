@@ -1,4 +1,4 @@
-"""Points looked up in the views: the fused kernel against plain torch, and what pooling promises."""
+"""Lookup of points in views: the fused kernels against torch, order invariance and gradients."""
 
 import pytest
 import torch
@@ -33,7 +33,7 @@ def surface(n: int, views: int, device: torch.device):
 
 
 def plain(maps: ViewMaps, points, visible, normal):
-    """The same numbers in float64 torch, view by view."""
+    """Reference in float64 torch, view by view."""
     rows = []
     for v in range(len(maps.images)):
         camera, points64 = maps.camera[v], points.double()
@@ -45,25 +45,25 @@ def plain(maps: ViewMaps, points, visible, normal):
         )
         rgb, silhouette = image[0, :3, 0].T, image[0, 3:, 0].T
         inside = ((xy > 0) & (xy < SIZE)).all(-1, keepdim=True).double() * (depth[:, None] > 0)
-        seen, facing, share = torch.zeros_like(silhouette), torch.ones_like(silhouette), inside
+        seen, facing, view_weight = torch.zeros_like(silhouette), torch.ones_like(silhouette), inside
         if visible is not None:
             seen = visible[:, v : v + 1].double() * 2 - 1
             facing = (normalize(c2w[:3, 3] - points64, dim=-1) * normal.double()).sum(-1, keepdim=True).clamp(min=0)
-            share = inside * (float(kernels.HIDDEN_WEIGHT) + visible[:, v : v + 1].double() * facing**2)
-        edge = silhouette / (float(kernels.EDGE) * SIZE)
-        share = share * edge.clamp(float(kernels.EDGE_MIN), 1) + float(kernels.SHARE_MIN)
+            view_weight = inside * (float(kernels.HIDDEN_WEIGHT) + visible[:, v : v + 1].double() * facing**2)
+        edge = silhouette / (float(kernels.EDGE_WIDTH) * SIZE)
+        view_weight = view_weight * edge.clamp(float(kernels.MIN_EDGE_WEIGHT), 1) + float(kernels.MIN_WEIGHT)
         distance = (silhouette / SIZE).clamp(-0.15, 0.15) / 0.15
         offset = depth[:, None].double() - (c2w[:3, 3] * c2w[:3, 2]).sum()
-        rows.append(torch.cat([rgb, distance, offset, inside, seen, facing, edge.clamp(-1, 1), share], -1))
+        rows.append(torch.cat([rgb, distance, offset, inside, seen, facing, edge.clamp(-1, 1), view_weight], -1))
     rows = torch.stack(rows, 1)
-    own, share = rows[..., :9], rows[..., 9]
-    weight = share / share.sum(1, keepdim=True)
+    own, view_weight = rows[..., :9], rows[..., 9]
+    weight = view_weight / view_weight.sum(1, keepdim=True)
     color = (own[..., :3] * weight[..., None]).sum(1)
     spread = ((own[..., :3] - color[:, None]) ** 2 * weight[..., None]).sum(1).mean(-1, keepdim=True).sqrt()
     return (
         own,
         weight,
-        torch.cat([color, spread, own[..., 3].amin(1)[:, None], share.amax(1)[:, None], points.double()], -1),
+        torch.cat([color, spread, own[..., 3].amin(1)[:, None], view_weight.amax(1)[:, None], points.double()], -1),
     )
 
 
@@ -79,8 +79,8 @@ def test_the_kernel_matches_plain_torch(device, views, on_surface):
         plain(maps, points, visible, normal),
     )
     for g, w in zip(got, want, strict=True):
-        # projection in float32: 1e-5 pixel on values that change by up to 12 a pixel; 0.2 % of them divide by EDGE *
-        # size
+        # projection in float32: errors of 1e-5 pixel on values that change by up to 12 per pixel; 0.2 % of them are
+        # divided by EDGE_WIDTH * SIZE
         torch.testing.assert_close(g.double(), w, rtol=1e-4, atol=5e-4)
 
 

@@ -8,7 +8,7 @@ import trimesh
 
 from reli3d.geometry.camera import Camera, camera_rays, look_at
 from reli3d.geometry.rays import RayScene
-from reli3d.geometry.visibility import GRAZING
+from reli3d.geometry.visibility import MIN_COSINE
 from reli3d.nn.local import PixelMaps, shown_pixels
 from reli3d.nn.view_features import ViewMaps
 from reli3d.nn.weights import load_model
@@ -85,7 +85,7 @@ def test_mirror_images_tell_shape_and_paint_but_not_the_light(views):
         _, mask = shown_pixels(both.batch.images, both.batch.masks, both.batch.camera.resized(128, 128))
         light = model._light(taken, two.color[:4], mask[:4, ..., 0], both.batch.camera[:4].resized(128, 128))
     torch.testing.assert_close(two.log_light, light)
-    assert two.maps.taken == len(two.maps.photographs.images) == 4
+    assert two.maps.input_count == len(two.maps.inputs.images) == 4
     points = torch.tensor([[0.0, 0.0, 0.0], [0.1, 0.2, 0.1]])
     assert not torch.equal(one.sdf(points), two.sdf(points))
 
@@ -101,11 +101,11 @@ def test_a_mirror_image_shows_a_point_only_where_no_photograph_does():
     visible = (cosine > 0.0).float()
     own, other = visible.split(2, 1)
     want = torch.cat([own, other * (1.0 - own.amax(1, keepdim=True))], 1)
-    sure = ((cosine - GRAZING).abs() > 0.06).all(1)
-    got = maps.seen(RayScene(mesh.vertices, mesh.faces), mesh.vertices, normal)
+    sure = ((cosine - MIN_COSINE).abs() > 0.06).all(1)
+    got = maps.visibility(RayScene(mesh.vertices, mesh.faces), mesh.vertices, normal)
     assert torch.equal(got[sure], want[sure])
     assert bool(want[sure, 2:].any()) and bool((visible[sure] != want[sure]).any())
-    assert torch.equal(maps.photographs.seen(RayScene(mesh.vertices, mesh.faces), mesh.vertices, normal), got[:, :2])
+    assert torch.equal(maps.inputs.visibility(RayScene(mesh.vertices, mesh.faces), mesh.vertices, normal), got[:, :2])
 
 
 def test_many_views_and_other_words_are_left_alone(views):
@@ -122,25 +122,27 @@ def test_rays_only_where_the_corners_of_a_face_differ():
     maps = ViewMaps(torch.zeros(2, 4, 4, 1), torch.zeros(2, 8, 8, 4), camera)
     mesh = mesh_from(trimesh.creation.icosphere(subdivisions=3, radius=0.5))
     scene, normal = RayScene(mesh.vertices, mesh.faces), mesh.vertices / 0.5
-    at_vertices = maps.seen(scene, mesh.vertices, normal)[mesh.faces.long()]  # (F, 3, V)
-    share = torch.tensor([0.2, 0.3, 0.5])
-    corners = (at_vertices * share[:, None]).sum(1)
-    middle = (mesh.vertices[mesh.faces.long()] * share[:, None]).sum(1)
+    at_vertices = maps.visibility(scene, mesh.vertices, normal)[mesh.faces.long()]  # (F, 3, V)
+    barycentric = torch.tensor([0.2, 0.3, 0.5])
+    corners = (at_vertices * barycentric[:, None]).sum(1)
+    middle = (mesh.vertices[mesh.faces.long()] * barycentric[:, None]).sum(1)
     outward = middle / middle.norm(dim=1, keepdim=True)
     same = (at_vertices == at_vertices[:, :1]).all(1).all(1)
     assert 0.5 < float(same.float().mean()) < 0.95
-    got, want = maps.seen_within(scene, middle, outward, corners), maps.seen(scene, middle, outward)
+    got, want = maps.visibility_within(scene, middle, outward, corners), maps.visibility(scene, middle, outward)
     assert torch.equal(got[~same], want[~same]) and torch.equal(got[same], at_vertices[same, 0])
     assert torch.equal(got, want), "a ball has no shadow inside a face"
     none = RayScene(mesh.vertices + 9.0, mesh.faces)  # would hide nothing
-    assert torch.equal(maps.seen_within(none, middle[same], outward[same], corners[same]), got[same])
-    alike = (at_vertices == at_vertices[:, :1]).all(1)  # of a view
+    assert torch.equal(maps.visibility_within(none, middle[same], outward[same], corners[same]), got[same])
+    same_corners = (at_vertices == at_vertices[:, :1]).all(1)  # of a view
     shell = RayScene(mesh.vertices * 1.5, mesh.faces)  # hides all
-    assert not bool(maps.seen(shell, middle, outward).any())
-    assert torch.equal(maps.seen_within(shell, middle, outward, corners), torch.where(alike, at_vertices[:, 0], 0.0))
-    assert bool((alike & ~same[:, None] & (at_vertices[:, 0] > 0)).any())
+    assert not bool(maps.visibility(shell, middle, outward).any())
+    assert torch.equal(
+        maps.visibility_within(shell, middle, outward, corners), torch.where(same_corners, at_vertices[:, 0], 0.0)
+    )
+    assert bool((same_corners & ~same[:, None] & (at_vertices[:, 0] > 0)).any())
     half = replace(maps, mirrored=1)
-    at_vertices = half.seen(scene, mesh.vertices, normal)[mesh.faces.long()]
-    corners = (at_vertices * share[:, None]).sum(1)
-    got = half.seen_within(scene, middle, outward, corners)
-    assert torch.equal(got, half.seen(scene, middle, outward)) and 0.1 < float(got[:, 1].mean()) < 0.4
+    at_vertices = half.visibility(scene, mesh.vertices, normal)[mesh.faces.long()]
+    corners = (at_vertices * barycentric[:, None]).sum(1)
+    got = half.visibility_within(scene, middle, outward, corners)
+    assert torch.equal(got, half.visibility(scene, middle, outward)) and 0.1 < float(got[:, 1].mean()) < 0.4
