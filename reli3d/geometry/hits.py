@@ -20,7 +20,8 @@ class Hits:
     """First hits of rays: ``face (...)`` int32, -1 for a miss; ``t (...)``, inf for a miss; ``bary (..., 2)``.
 
     bary: weights of the face's vertices 1 and 2; vertex 0 has the rest.  ``valid``: ``face >= 0``.  Given by
-    :meth:`~reli3d.geometry.rays.RayScene.intersect`, with gradients in ``t`` and ``bary``.
+    :meth:`~reli3d.geometry.rays.RayScene.intersect`; ``t`` and ``bary`` have gradients to the rays, and to the mesh
+    where its argument ``vertices`` is given.
 
     >>> hits = reli3d.RayScene(mesh).intersect(origins, directions)
     >>> points = reli3d.surface_points(mesh, None, hits.face[hits.valid], hits.bary[hits.valid])

@@ -25,18 +25,18 @@ THREAD_SLICES = 2  # of a large call for each thread: the more rays are ordered 
 
 
 class RayScene:
-    """Acceleration structure for rays against one triangle mesh; keeps its own copy of the geometry.
+    """Acceleration structure for rays against one triangle mesh; keeps its own copy of the geometry, without gradient.
 
     mesh: a :class:`~reli3d.geometry.mesh.Mesh`, or its vertices ``(V, 3)`` float32 with ``faces (F, 3)`` int32.  Numpy
     arrays and other integers are taken if the conversion is exact.  Faces without area are never hit; without faces
     every ray misses.  backend: ``embree`` (CPU, robust mode), ``warp`` (CPU and CUDA), or ``auto``: Embree on the CPU,
     where it is about 3 times faster on incoherent rays, Warp on CUDA.  Warp's tree is split by surface area, since its
     other trees lose more rays at vertices; on CUDA it is built on the host, and :meth:`refit` is the fast way to move
-    vertices.  Raises TypeError or ValueError for a wrong kind, dtype or shape, an index out of range or a vertex that
-    is not finite.
+    vertices.  For gradients of the vertices pass them to :meth:`intersect` again.  Raises TypeError or ValueError for a
+    wrong kind, dtype or shape, an index out of range or a vertex that is not finite.
 
     >>> scene = reli3d.RayScene(mesh)
-    >>> hits = scene.intersect(origins, directions)
+    >>> hits = scene.intersect(origins, directions, vertices=mesh.vertices)
     """
 
     vertices: Tensor  # (V, 3), a copy
@@ -95,9 +95,9 @@ class RayScene:
         """First hit of every ray, differentiable in the rays and in ``vertices``.
 
         origins, directions: ``(..., 3)``, broadcast; ``t`` counts in lengths of ``directions``.  vertices: ``(V, 3)``,
-        the positions of this scene as a tensor of the caller's, which then has gradients; call :meth:`refit` before
-        after a change.  t_max: a number or ``(...)``, exclusive.  A miss has ``face = -1``, ``t = inf``, ``bary = 0``
-        and gradient 0.
+        the tensor that gradients go to, equal to the positions of the scene; without it the vertices have no gradient.
+        When it has changed, call :meth:`refit` with it first.  t_max: a number or ``(...)``, exclusive.  A miss has
+        ``face = -1``, ``t = inf``, ``bary = 0`` and gradient 0.
 
         Gradients of ``t`` and ``bary`` reach origins, directions and vertices; which face is hit has none, so
         silhouettes need :func:`~reli3d.render.silhouette.antialias`.  ``origins + t directions`` is the point with the
@@ -110,7 +110,7 @@ class RayScene:
         if vertices is None:
             vertices = self.vertices
         elif vertices.shape != self.vertices.shape or not torch.equal(vertices.detach(), self.vertices):
-            raise ValueError("vertices: expected the positions of the scene, got others; call refit first")
+            raise ValueError("vertices: expected the positions of the scene, got others; call refit(vertices) first")
         hits = self.closest(origins, directions, t_max=t_max)
         origins, directions = tensor_of(origins), tensor_of(directions)
         return evaluate_hits(vertices, self.faces, hits, origins, directions)
