@@ -118,8 +118,9 @@ class TextureSet:
 class Asset:
     """A relightable object: mesh, textures and the light it was captured under, where that is known.
 
-    mesh: a :class:`~reli3d.geometry.mesh.Mesh`.  textures: a :class:`TextureSet`; renderers take None as a grey
-    dielectric.  environment: an :class:`~reli3d.render.environment.Environment` or None.  ``.to(device)`` and
+    mesh: a :class:`~reli3d.geometry.mesh.Mesh`; renderers need its ``uv`` where there are textures
+    (:func:`~reli3d.geometry.uv.unwrap`).  textures: a :class:`TextureSet`; renderers take None as a grey dielectric.
+    environment: an :class:`~reli3d.render.environment.Environment` or None.  ``.to(device)`` and
     ``.detach()`` give copies; gradients pass through.  Raises TypeError for another kind.
 
     >>> asset = reli3d.Asset(mesh, reli3d.TextureSet(torch.full((64, 64, 3), 0.5), roughness=0.4, metallic=0.0))

@@ -97,7 +97,7 @@ def surface_points(mesh: Mesh, textures: TextureSet | None, face: Tensor, bary: 
         grey = position.new_full((len(position),), 0.5)
         return SurfacePoints(position, ng, normal, grey[:, None].expand(-1, 3), grey, torch.zeros_like(grey))
     if mesh.uv is None:
-        raise ValueError("mesh.uv: expected texture coordinates for a textured asset, got None")
+        raise ValueError("mesh.uv: expected texture coordinates for a textured asset, got None (see unwrap)")
     uv = wrap_uv(interpolate(mesh.uv, mesh.faces, face, bary), textures.wrap, (textures.size, textures.size))
     rough_metal = sample_texture(textures.rough_metal(), uv)  # one lookup for both
     mapped = sample_texture(textures.normal, uv) * 2.0 - 1.0
