@@ -40,12 +40,13 @@ def eval_bsdf(
 ) -> Tensor:
     """BSDF value ``(..., 3)`` [1/sr] without the cosine; 0 below the horizon on either side.
 
-    wo, wi: ``(..., 3)`` unit, local frame.  base_color: ``(..., 3)`` linear in [0, 1].  alpha, metallic: ``(...)``.
-    Leading axes broadcast.  diffuse_model: energy transmitted to the diffuse layer, ``conserving`` (1 - F of the
-    surface on the way in and out; the albedo is at most 1) or ``published`` (1 - F of the microfacet, the formula of
-    the published model's shader and of glTF 2.0's appendix B).  Gradients reach all five tensors; that of ``alpha`` is
-    0 below ``ALPHA_MIN`` = 1e-3.  Raises TypeError unless float32, ValueError for a shape, a device or another model.
-    Source: glTF 2.0, appendix B; GGX of Walter et al. 2007 with Smith's height-correlated masking.
+    wo, wi: ``(..., 3)`` unit, local frame.  base_color: ``(..., 3)`` linear in [0, 1].  alpha: ``(...)`` GGX width,
+    ``roughness**2``.  metallic: ``(...)``.  All are tensors; leading axes broadcast.  diffuse_model: energy transmitted
+    to the diffuse layer, ``conserving`` (1 - F of the surface on the way in and out; the albedo is at most 1) or
+    ``published`` (1 - F of the microfacet, the formula of the published model's shader and of glTF 2.0's appendix B).
+    Gradients reach all five tensors; that of ``alpha`` is 0 below ``ALPHA_MIN`` = 1e-3.  Raises TypeError unless
+    float32, ValueError for a shape, a device or another model.  Source: glTF 2.0, appendix B; GGX of Walter et al. 2007
+    with Smith's height-correlated masking.
 
     >>> up, half = torch.tensor([0.0, 0.0, 1.0]), torch.tensor(0.5)
     >>> value = reli3d.eval_bsdf(up, torch.full((3,), 0.8), half, half, up)
@@ -68,11 +69,13 @@ def sample_bsdf(wo: Tensor, alpha: Tensor, u: Tensor, *, lobe: str = "visible") 
     surface normal) or ``cosine``.  A direction below the horizon, and one of a mirrored normal that faces away from
     ``wo``, has value and density 0.  The antithetic partner of ``u`` is ``visible`` with
     :func:`~reli3d.render.sampling.antithetic` of ``u`` or, as published, ``mirrored`` with ``u``.  Gradients reach
-    ``wo`` and ``alpha``.  Raises TypeError unless float32, ValueError for a shape, a device or another lobe.  Source:
+    ``wo`` and ``alpha``, but :func:`pdf_bsdf` has none: detach the directions for the derivative of an estimate, which
+    is wrong otherwise.  Raises TypeError unless float32, ValueError for a shape, a device or another lobe.  Source:
     Dupuy and Benyoub 2023.
 
-    >>> wi = reli3d.sample_bsdf(wo, alpha, u)
-    >>> weight = reli3d.eval_bsdf(wo, color, alpha, metallic, wi) * wi[:, 2:] / reli3d.pdf_bsdf(wo, alpha, wi)[:, None]
+    >>> wi = reli3d.sample_bsdf(wo, alpha, u).detach()
+    >>> density = reli3d.pdf_bsdf(wo, alpha, wi).clamp(min=1e-12)  # 0 below the horizon, where the value is 0 too
+    >>> weight = reli3d.eval_bsdf(wo, color, alpha, metallic, wi) * wi[:, 2:] / density[:, None]
     """
     if choice("lobe", lobe, LOBES) == 2:
         return sample_cosine(u).expand(*torch.broadcast_shapes(wo.shape[:-1], alpha.shape, u.shape[:-1]), 3)
@@ -89,8 +92,9 @@ def pdf_bsdf(wo: Tensor, alpha: Tensor, wi: Tensor, *, lobe: str = "visible") ->
     """Density ``(...)`` [1/sr] of :func:`sample_bsdf` at ``wi``; 0 below the horizon.
 
     wo, wi: ``(..., 3)`` unit, local frame.  alpha: ``(...)`` GGX width.  Leading axes broadcast.  lobe: as there.  No
-    gradient: samples are drawn detached.  Raises TypeError unless float32, ValueError for a shape, a device or another
-    lobe.
+    gradient, so ``wi`` must be detached where an estimate is differentiated; :func:`pdf_ggx_vndf` has gradients.  0
+    also where the value is 0: clamp it before dividing.  Raises TypeError unless float32, ValueError for a shape,
+    a device or another lobe.
 
     >>> wi = reli3d.sample_bsdf(wo, alpha, u)
     >>> density = reli3d.pdf_bsdf(wo, alpha, wi)
