@@ -59,7 +59,7 @@ class EnvironmentTable:
 class Environment:
     """Distant light as a lat-long map: ``radiance (H, W, 3)``, normally W = 2 H, linear Rec. 709.
 
-    Row 0 is +Y, the center column +X, right of it +Z.  ``.lookup(directions)``, ``.rotated(yaw)``,
+    Row 0 is +Y, the center column +X, right of it +Z.  ``.lookup(directions)``, ``.rotated(yaw)`` [rad],
     ``.resized(height)``, ``.sample(u)``, ``.pdf(directions)``, ``.irradiance()``.  Gradients reach the texels.  The
     sampling table is made once, on first use: do not edit ``radiance`` in place afterwards.  Raises TypeError for a
     dtype, ValueError for a shape.

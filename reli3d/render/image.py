@@ -31,10 +31,10 @@ BAND_RAYS = 1 << 18  # rays of one band of rows: bounds memory at about 40 MB wh
 class Render:
     """One image of an asset.  Values are means over the covered subpixels; ``radiance`` is the mean over all of them.
 
-    radiance: ``(H, W, 3)`` linear Rec. 709, premultiplied by alpha unless the background was rendered.  alpha: ``(H,
-    W)``.  base_color: ``(H, W, 3)`` linear.  roughness, metallic: ``(H, W)``.  normal: ``(H, W, 3)`` unit, world.
-    position: ``(H, W, 3)`` world.  depth: ``(H, W)`` along the viewing axis, inf where nothing is.  The others are 0
-    there.
+    radiance: ``(H, W, 3)`` linear Rec. 709, premultiplied by alpha unless the background was rendered.  alpha:
+    ``(H, W)``, of the object even with a background: write ``radiance``, not ``rgba``, then.  base_color:
+    ``(H, W, 3)`` linear.  roughness, metallic: ``(H, W)``.  normal: ``(H, W, 3)`` unit, world.  position:
+    ``(H, W, 3)`` world.  depth: ``(H, W)`` along the viewing axis, inf where nothing is.  The others are 0 there.
 
     >>> image = reli3d.render_asset(asset, camera, light)
     >>> reli3d.write_image("image.png", image.rgba)
@@ -51,7 +51,10 @@ class Render:
 
     @property
     def rgba(self) -> Tensor:
-        """``(H, W, 4)``: radiance, premultiplied, and alpha, as :func:`reli3d.io.images.write_image` takes it."""
+        """``(H, W, 4)``: radiance, premultiplied, and alpha, as :func:`reli3d.io.images.write_image` takes it.
+
+        For a transparent background only: write ``radiance`` where the environment was rendered behind the object.
+        """
         return torch.cat([self.radiance, self.alpha[..., None]], -1)
 
     def display(
