@@ -19,9 +19,9 @@ def mask_distance(masks: Tensor) -> Tensor:
     """Signed distance of every pixel centre to the mask's contour, ``(V, H, W)`` in pixels, positive inside.
 
     masks: ``(V, H, W)`` float32 coverage in [0, 1].  The contour is where the mask, bilinear between pixel centres, is
-    0.5, as straight segments (marching squares).  Near the contour the distance is exact.  Far from it, it can be a
-    fraction of a pixel too long, since only the segments around the nearest cell with a contour are measured.  The
-    image border is no contour: a mask that reaches it continues outside.  A view without contour has the image diagonal
+    0.5, as straight segments (marching squares).  Near the contour the distance is exact; far from it, it can be a
+    fraction of a pixel too long, because only segments around the nearest crossing are evaluated.  The image border is
+    no contour: a mask that touches it continues outside.  A view without contour has the length of the image diagonal
     everywhere, positive or negative.  No gradient.
     """
     check("masks", masks)
@@ -48,9 +48,7 @@ def mask_distance(masks: Tensor) -> Tensor:
 
 
 def _nearest_crossing(masks: Tensor) -> list:
-    """Kernel arguments: the nearest row at which the contour crosses a pixel's column, and which column's is
-    nearest.
-    """
+    """Kernel arguments: the nearest contour crossing in each pixel's column, and the column of the nearest crossing."""
     views, height, width = masks.shape
     rows, begin = torch.empty_like(masks), torch.empty_like(masks)
     apex, nearest = (torch.empty_like(masks, dtype=torch.int32) for _ in range(2))
@@ -65,13 +63,13 @@ def _nearest_crossing(masks: Tensor) -> list:
 
 
 def hull_distance(points: Tensor, distance: Tensor, camera: Camera, *, far: float = math.inf) -> Tensor:
-    """Signed distance ``(N,)`` of points to the visual hull, world units, positive inside: the least over the views.
+    """Signed distance ``(N,)`` of points to the visual hull, world units, positive inside: the minimum over the views.
 
-    points: ``(N, 3)``.  distance: ``(V, H, W)`` from :func:`mask_distance`.  camera: of these V views and kernels.
-    A view's distance is the pixel distance where the point projects, times depth / focal length: up to 1 / cos^2 of the
-    angle to the optical axis too long.  Outside an image its border's value is taken: an object that is cut there is
-    unbounded.  A point at or behind a camera's plane gets -1000.  Without views every point gets +1000.  far: at least
-    0, else ValueError, world units; a point farther outside gets some value below ``-far``, in less time.  No gradient.
+    points: ``(N, 3)``.  distance: ``(V, H, W)`` from :func:`mask_distance`.  camera: of these V views.  The distance in
+    a view is the pixel distance where the point projects, times depth / focal length, which overestimates by up to 1 /
+    cos^2 of the angle to the optical axis.  Outside the image the border value is used, so a silhouette cut off there
+    is unbounded.  Points at or behind a camera's plane get -1000.  Without views every point gets +1000.  far: at least
+    0, world units, else ValueError; points farther outside get any value below ``-far``, to save time.  No gradient.
     """
     check("points", points, last=3)
     if points.ndim != 2:
@@ -86,10 +84,10 @@ def hull_distance(points: Tensor, distance: Tensor, camera: Camera, *, far: floa
 
 
 def hull_grid(axis: Tensor, distance: Tensor, camera: Camera, *, far: float = math.inf) -> Tensor:
-    """:func:`hull_distance` at the points ``(axis[i], axis[j], axis[k])``, ``(n, n, n)``, in less time.
+    """:func:`hull_distance` on the grid ``(axis[i], axis[j], axis[k])``, ``(n, n, n)``, faster and with equal values.
 
-    axis: ``(n,)`` ascending, world units.  distance: ``(V, H, W)`` from :func:`mask_distance`; other maps must not
-    change by more than 1 from a pixel to the next.  camera, far: as there, and the values are equal.
+    axis: ``(n,)`` ascending, world units.  distance: ``(V, H, W)`` from :func:`mask_distance`, or any map that changes
+    by at most 1 between adjacent pixels.  camera, far: as in :func:`hull_distance`.
     """
     check("axis", axis)
     if axis.ndim != 1:
@@ -104,14 +102,14 @@ def hull_grid(axis: Tensor, distance: Tensor, camera: Camera, *, far: float = ma
     return hull
 
 
-def mirror_miss(
+def mirror_residual(
     points: Tensor, known: Tensor, normal: Tensor, offset: Tensor, most: float, distance: Tensor, camera: Camera
 ) -> Tensor:
-    """How far outside the visual hull each ray's best point lies when planes mirror it, ``(P, R)``, at most ``most``.
+    """Least distance outside the visual hull of the mirror images of a ray's points, ``(P, R)``, clamped to ``most``.
 
-    points: ``(R, D, 3)``, D along each ray.  known: ``(R, D)`` bool, which of them count; a ray without any gets
-    ``most``.  normal: ``(P, 3)`` unit, offset: ``(P,)``, of P planes.  most: at least 0, else ValueError, world units.
-    The other arguments are those of :func:`hull_distance`.  No gradient.
+    points: ``(R, D, 3)``, D along each ray.  known: ``(R, D)`` bool, the points used; a ray without any gets ``most``.
+    normal: ``(P, 3)`` unit, offset: ``(P,)``, of P planes.  most: at least 0, world units, else ValueError.  The other
+    arguments are those of :func:`hull_distance`.  No gradient.
     """
     check("points", points, last=3)
     check("normal", normal, last=3, like=points)
@@ -126,21 +124,21 @@ def mirror_miss(
     if not most >= 0.0:
         raise ValueError(f"most: expected at least 0, got {most}")
     _check_views(points, distance, camera)
-    miss = points.new_empty(len(normal), len(points))
+    residual = points.new_empty(len(normal), len(points))
     rays = [(points.detach().contiguous(), wp.vec3), (known.contiguous(), wp.bool)]
     planes = [(normal.detach().contiguous(), wp.vec3), (offset.detach().contiguous(), wp.float32)]
-    inputs = [*rays, *planes, float(most), *_views(distance, camera), (miss, wp.float32)]
-    launch(kernels.mirror_miss_kernel, miss.numel(), inputs, points.device)
-    return miss
+    inputs = [*rays, *planes, float(most), *_views(distance, camera), (residual, wp.float32)]
+    launch(kernels.mirror_residual_kernel, residual.numel(), inputs, points.device)
+    return residual
 
 
 def hull_span(origins: Tensor, directions: Tensor, radius: float, distance: Tensor, camera: Camera) -> Tensor:
-    """Where rays enter the visual hull first and leave it last, ``(N, 2)``, in lengths of their ``directions``.
+    """Ray parameters ``(N, 2)`` of the first entry into the visual hull and the last exit.
 
-    origins, directions: ``(N, 3)``, no direction zero.  radius: of the sphere around the world's origin in which the
-    hull is looked for.  The other arguments are those of :func:`hull_distance`.  A ray that misses the hull gets,
-    twice, the place where it comes closest to it.  Parts thinner than 0.004 along the ray may be missed.  Sphere
-    tracing, Hart 1996.  No gradient.
+    origins, directions: ``(N, 3)``, directions nonzero, of any length.  radius: of a sphere around the world origin
+    that clips the hull.  The other arguments are those of :func:`hull_distance`.  For a ray that misses the hull both
+    are the parameter of the closest approach.  Parts thinner than 0.004 along the ray may be missed.  Sphere tracing,
+    Hart 1996.  No gradient.
     """
     check("origins", origins, last=3)
     check("directions", directions, last=3, like=origins)

@@ -1,9 +1,9 @@
-"""The upright mirror plane of an object, found from its silhouettes: each view then shows the other half, too.
+"""Vertical mirror plane of an object from its silhouettes, by which each view also shows the other half.
 
-If an object is its own mirror image, its silhouettes and their mirror images are silhouettes of one thing, and their
-common visual hull still fills every one of them.  Under a wrong plane the mirrored silhouettes cut away what some view
-shows.  The amount is the silhouette coherence of Hernandez, Schmitt and Cipolla 2007, Silhouette Coherence for Camera
-Calibration under Circular Motion, here a function of a plane.
+If the object is mirror-symmetric, the silhouettes and their mirror images are consistent: the visual hull of both sets
+still covers every silhouette.  Under a wrong plane the mirrored silhouettes carve parts away that some view shows.  The
+residual is the silhouette coherence of Hernandez, Schmitt and Cipolla 2007, Silhouette Coherence for Camera Calibration
+under Circular Motion, here as a function of a plane.
 """
 
 from __future__ import annotations
@@ -17,25 +17,26 @@ from torch.nn import functional
 
 from reli3d._bridge import check, full_precision
 from reli3d.geometry.camera import Camera, check_camera
-from reli3d.geometry.hull import hull_distance, hull_span, mirror_miss
+from reli3d.geometry.hull import hull_distance, hull_span, mirror_residual
 
-RAYS, DEPTHS = 96, 16  # rays of a view, and points along each, at which hulls are compared
-ANGLES, OFFSETS = 60, 7  # planes of the first search
-OFFSET_MAX = 0.06  # greatest offset of the plane from the hull's centre, of the hull's longest side
-FINER = 9  # angles and offsets of the second search, within one step of the first
-LOST = 0.01  # of the longest side: a pixel whose ray misses the common hull by more is lost
-MOST_LOST = 0.008  # share of the pixels that may be lost: a part that is on one side alone would be cut off
-AS_GOOD = 3e-4  # mean miss, of the longest side, by which another plane may be worse and still be as good
-EQUAL = 6e-5  # mean miss by which planes count as equal: of them the one that shows most is taken
-AMBIGUOUS = 0.03, 0.5  # share of the planes that may be as good: times the square of the number of views; at most
-ONE_SIDED = 0.75  # length of the mean of the level view directions: from one side many things look symmetric
-UNKNOWN = 0.05  # share of the rays that may have no point in the hull: else masks and cameras do not agree
-ROUND = 0.95  # share of the planes from which on the object is one of revolution
-FEWEST = 3  # views: two silhouettes agree with many planes
-FARTHEST = 50.0  # from the middle of the cameras, in their greatest distance from it: farther off there is no object
-FAR = 0.1  # of the longest side: rays that miss by more count as much
-ROLL = 0.17  # root mean square [rad] by which cameras may be rolled about their axes: else there is no upright
-APART = 0.2  # rms sine between the cameras' horizontal axes, below which nothing tells what is upright
+# Lengths are fractions of the longest side of the hull's bounding box unless noted.
+RAYS, DEPTHS = 96, 16  # rays per view, and points along each, at which hulls are compared
+ANGLES, OFFSETS = 60, 7  # planes of the coarse search
+MAX_OFFSET = 0.06  # of the plane from the hull's centre
+FINE_STEPS = 9  # angles and offsets of the fine search, within one coarse step
+LOST_RESIDUAL = 0.01  # a pixel whose ray has a larger residual is lost
+MAX_LOST_FRACTION = 0.008  # of the pixels: one-sided parts would be cut off
+SIMILAR_RESIDUAL = 3e-4  # planes whose mean residual is within this of the best are candidates
+EQUAL_RESIDUAL = 6e-5  # planes within this are equal; the one with the most novel views is chosen
+MAX_CANDIDATES = 0.03, 0.5  # fraction of the planes: per squared number of views, and overall
+MAX_MEAN_DIRECTION = 0.75  # length of the mean horizontal view direction: one-sided captures are ambiguous
+MAX_UNKNOWN_FRACTION = 0.05  # of rays without a point in the hull: more means inconsistent masks and cameras
+REVOLUTION_FRACTION = 0.95  # of planes that are candidates, from which the object is a solid of revolution
+MIN_VIEWS = 3  # two silhouettes are consistent with many planes
+MAX_DISTANCE = 50.0  # of the object from the cameras' centroid, in their greatest distance from it
+MAX_RESIDUAL = 0.1  # clamp on the residual of a ray
+MAX_ROLL = 0.17  # rms roll of the cameras about their axes [rad]: more leaves the vertical undefined
+MIN_AXIS_SINE = 0.2  # rms sine between the cameras' horizontal axes: less leaves the vertical undefined
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,7 @@ class MirrorPlane:
 
     @full_precision
     def mirrored(self, camera: Camera) -> Camera:
-        """Cameras ``(V,)`` whose pictures of the object are those of ``camera (V,)`` with the columns reversed."""
+        """Mirrored cameras ``(V,)``: images of the mirrored object are those of ``camera``, flipped left to right."""
         flip = torch.eye(4, device=camera.c2w.device, dtype=torch.float32)
         flip[:3, :3] -= 2.0 * torch.outer(self.normal, self.normal)
         flip[:3, 3] = 2.0 * self.offset * self.normal
@@ -60,77 +61,79 @@ class MirrorPlane:
 @torch.no_grad()
 @full_precision
 def mirror_plane(distance: Tensor, camera: Camera) -> MirrorPlane | None:
-    """The upright plane in which the object of V views is its own mirror image, or None where none is sure.
+    """Vertical mirror plane of the object in V views, or None if there is none or it is ambiguous.
 
-    distance: ``(V, H, W)`` from :func:`~reli3d.geometry.hull.mask_distance`, of whole silhouettes.  camera: of these
-    views; any frame and unit.  None for one or two views, for cameras that are rolled, in one place or on one side,
-    where no plane lets the common hull fill the silhouettes, and where many do, so that the views do not tell which.
-    Where nearly all do, the object is one of revolution.  An object that is not symmetric where no silhouette shows it
-    may get a plane.  No gradient.  Raises TypeError or ValueError where shapes or devices disagree.
+    distance: ``(V, H, W)`` from :func:`~reli3d.geometry.hull.mask_distance`, of silhouettes that do not touch the image
+    border.  camera: of these views, in any frame and unit.  None for one or two views; for cameras that are rolled, at
+    one position or all on one side; if no plane is consistent with the silhouettes; and if many are, unless nearly all
+    are (a solid of revolution).  Asymmetry that no silhouette shows is not detected.  No gradient.  Raises TypeError or
+    ValueError if shapes or devices disagree.
     """
     check("distance", distance)
     check_camera(camera, like=distance, views=len(distance), size=distance.shape[1:])
-    up = upright(camera) if len(distance) >= FEWEST else None
+    up = upright(camera) if len(distance) >= MIN_VIEWS else None
     if up is None:
         return None
     shift = camera.position.mean(0)
     unit = (camera.position - shift).norm(dim=1).max()
-    if float(unit) <= 1e-6 * float(shift.norm()):  # all cameras are in one place
+    if float(unit) <= 1e-6 * float(shift.norm()):  # all cameras at one position
         return None
     c2w = camera.c2w.clone()
     c2w[:, :3, 3] = (camera.position - shift) / unit
     camera = Camera(c2w, camera.intrinsics, camera.width, camera.height)
     points, known = _hull_points(distance, camera)
     inside, seen = points[known], known.any(1)
-    if len(inside) == 0 or float(seen.float().mean()) < 1.0 - UNKNOWN:
+    if len(inside) == 0 or float(seen.float().mean()) < 1.0 - MAX_UNKNOWN_FRACTION:
         return None
     points, known = points[seen], known[seen]
     low, high = inside.aminmax(dim=0)
     centre, size = (low + high) / 2, float((high - low).max())
     views = functional.normalize(camera.position - centre, dim=1)
-    if float(functional.normalize(views - (views @ up)[:, None] * up, dim=1).mean(0).norm()) > ONE_SIDED:
+    if float(functional.normalize(views - (views @ up)[:, None] * up, dim=1).mean(0).norm()) > MAX_MEAN_DIRECTION:
         return None
     first = functional.normalize(
         torch.linalg.cross(up, torch.eye(3, device=up.device, dtype=torch.float32)[int(up.abs().argmin())]), dim=0
     )
     second = torch.linalg.cross(up, first)
 
-    def misses(angle: Tensor, offset: Tensor, every: int = 1) -> tuple[Tensor, Tensor]:
-        """Planes at these angles [rad] and offsets [sizes] from the centre: mean miss and share of lost pixels."""
+    def residuals(angle: Tensor, offset: Tensor, every: int = 1) -> tuple[Tensor, Tensor]:
+        """Mean residual and fraction of lost pixels of the planes at these angles [rad] and offsets from the centre."""
         normals = torch.outer(angle.cos(), first) + torch.outer(angle.sin(), second)
         away = normals @ centre + size * offset
         some, within = points[::every, ::every], known[::every, ::every]
-        miss = mirror_miss(some, within, normals, away, FAR * size, distance, camera) / size
-        return miss.mean(1), (miss > LOST).float().mean(1)
+        residual = mirror_residual(some, within, normals, away, MAX_RESIDUAL * size, distance, camera) / size
+        return residual.mean(1), (residual > LOST_RESIDUAL).float().mean(1)
 
     angles = torch.arange(ANGLES, device=up.device, dtype=torch.float32) * (math.pi / ANGLES)
-    offsets = torch.linspace(-OFFSET_MAX, OFFSET_MAX, OFFSETS, device=up.device, dtype=torch.float32)
-    miss, _ = misses(angles.repeat_interleave(OFFSETS), offsets.repeat(ANGLES), every=3)
-    miss = miss.view(ANGLES, OFFSETS)
-    by_angle = miss.amin(1)
-    as_good = float((by_angle < by_angle.min() + AS_GOOD).float().mean())
-    if min(AMBIGUOUS[0] * len(distance) ** 2, AMBIGUOUS[1]) < as_good < ROUND:
+    offsets = torch.linspace(-MAX_OFFSET, MAX_OFFSET, OFFSETS, device=up.device, dtype=torch.float32)
+    residual, _ = residuals(angles.repeat_interleave(OFFSETS), offsets.repeat(ANGLES), every=3)
+    residual = residual.view(ANGLES, OFFSETS)
+    by_angle = residual.amin(1)
+    candidates_fraction = float((by_angle < by_angle.min() + SIMILAR_RESIDUAL).float().mean())
+    if min(MAX_CANDIDATES[0] * len(distance) ** 2, MAX_CANDIDATES[1]) < candidates_fraction < REVOLUTION_FRACTION:
         return None
-    planes = torch.tensor(_middles((by_angle <= by_angle.min() + EQUAL).tolist()), device=up.device, dtype=torch.int64)
+    planes = torch.tensor(
+        _middles((by_angle <= by_angle.min() + EQUAL_RESIDUAL).tolist()), device=up.device, dtype=torch.int64
+    )
     normals = torch.outer(angles[planes].cos(), first) + torch.outer(angles[planes].sin(), second)
     best = int(planes[_novelty(normals, views).argmax()])
-    equal = miss[best] <= miss[best].min() + EQUAL
-    around = torch.linspace(-1.0, 1.0, FINER, device=up.device, dtype=torch.float32)
-    angle = (angles[best] + around * (math.pi / ANGLES)).repeat_interleave(FINER)
-    offset = (offsets[equal].mean() + around * (2 * OFFSET_MAX / (OFFSETS - 1))).repeat(FINER)
-    miss, _ = misses(angle, offset)
-    alike = (miss <= miss.min() + EQUAL).nonzero()[:, 0]
-    equally = torch.stack([angle[alike], offset[alike]], 1)
-    middle = int(alike[(equally - equally.mean(0)).norm(dim=1).argmin()])
+    equal = residual[best] <= residual[best].min() + EQUAL_RESIDUAL
+    around = torch.linspace(-1.0, 1.0, FINE_STEPS, device=up.device, dtype=torch.float32)
+    angle = (angles[best] + around * (math.pi / ANGLES)).repeat_interleave(FINE_STEPS)
+    offset = (offsets[equal].mean() + around * (2 * MAX_OFFSET / (OFFSETS - 1))).repeat(FINE_STEPS)
+    residual, _ = residuals(angle, offset)
+    equal = (residual <= residual.min() + EQUAL_RESIDUAL).nonzero()[:, 0]
+    candidates = torch.stack([angle[equal], offset[equal]], 1)
+    middle = int(equal[(candidates - candidates.mean(0)).norm(dim=1).argmin()])
     angle, offset = angle[middle], offset[middle]
-    if float(misses(angle[None], offset[None])[1]) > MOST_LOST:
+    if float(residuals(angle[None], offset[None])[1]) > MAX_LOST_FRACTION:
         return None
     normal = angle.cos() * first + angle.sin() * second
     return MirrorPlane(normal, float(unit * (normal @ centre + size * offset) + normal @ shift))
 
 
 def _middles(good: list[bool]) -> list[int]:
-    """The middle index of each run of true values on a circle; every index where all are true."""
+    """Middle index of each cyclic run of true values; all indices if all are true."""
     count = len(good)
     if all(good):
         return list(range(count))
@@ -142,8 +145,9 @@ def _middles(good: list[bool]) -> list[int]:
 
 
 def _novelty(normals: Tensor, directions: Tensor) -> Tensor:
-    """Mean angle [rad] between the mirrored view directions and the nearest of the given ones ``(V, 3)``, for P planes
-    ``(P, 3)``.  Views from opposite sides have nearly the same silhouette, so a direction counts as its opposite.
+    """Mean angle [rad] from each mirrored view direction to the nearest given one ``(V, 3)``, for P planes ``(P, 3)``.
+
+    Opposite directions are identified, because their silhouettes are nearly equal.
     """
     mirrored = directions - 2.0 * (normals @ directions.T)[..., None] * normals[:, None]
     return (mirrored @ directions.T).abs().amax(-1).clamp(max=1.0).acos().mean(-1)
@@ -151,17 +155,17 @@ def _novelty(normals: Tensor, directions: Tensor) -> Tensor:
 
 @full_precision
 def upright(camera: Camera) -> Tensor | None:
-    """The direction ``(3,)`` that is up for cameras that are not rolled, or None: right angles to all their X axes."""
+    """Up direction ``(3,)`` orthogonal to the X axes of cameras without roll, or None if it is not determined."""
     right = camera.c2w[:, :3, 0]
     _, spread, axes = torch.linalg.svd(right / max(len(right), 1) ** 0.5, full_matrices=True)
-    if len(right) < 2 or float(spread[1]) < APART or (len(right) > 2 and float(spread[2]) > ROLL):
+    if len(right) < 2 or float(spread[1]) < MIN_AXIS_SINE or (len(right) > 2 and float(spread[2]) > MAX_ROLL):
         return None
     up = axes[-1]
     return up if float(up @ camera.c2w[:, :3, 1].sum(0)) > 0 else -up
 
 
 def _hull_points(distance: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Points ``(R, D, 3)`` along rays of pixels inside the silhouettes, and which lie in the hull ``(R, D)``."""
+    """Points ``(R, D, 3)`` along rays of silhouette pixels, and whether each lies in the hull ``(R, D)``."""
     places: list[Tensor] = []
     for number, inside in enumerate(distance > 0.5):
         found = inside.nonzero()
@@ -175,9 +179,9 @@ def _hull_points(distance: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
     local = torch.stack([(x - cx) / fx, -(y - cy) / fy, -torch.ones_like(fx)], 1)
     direction = functional.normalize((camera.c2w[view, :3, :3] @ local[..., None])[..., 0], dim=1)
     origin = camera.position[view].contiguous()
-    span = hull_span(origin, direction, FARTHEST, distance, camera)
-    share = (torch.arange(DEPTHS, device=origin.device, dtype=torch.float32) + 0.5) / DEPTHS
-    depth = torch.lerp(span[:, :1], span[:, 1:], share)
+    span = hull_span(origin, direction, MAX_DISTANCE, distance, camera)
+    fraction = (torch.arange(DEPTHS, device=origin.device, dtype=torch.float32) + 0.5) / DEPTHS
+    depth = torch.lerp(span[:, :1], span[:, 1:], fraction)
     points = origin[:, None] + direction[:, None] * depth[..., None]
     within = hull_distance(points.reshape(-1, 3), distance, camera).view(depth.shape)
     pixel = (points - origin[:, None]).norm(dim=2).mean() / camera.intrinsics[:, 0].mean()

@@ -1,4 +1,4 @@
-"""Metallic-roughness material in the local frame: normal +z, ``wo`` to the viewer, ``wi`` to the light, both unit.
+"""Metallic-roughness BSDF in the local frame: normal +z, ``wo`` towards the viewer, ``wi`` to the light, both unit.
 
 f = T (1 - metallic) base / pi + D G2 F / (4 cos_o cos_i) [1/sr], without the cosine; linear Rec. 709.
 F = F0 + (1 - F0)(1 - wo.wm)^5 (Schlick 1994), F0 = 0.04 for dielectrics, the base colour for metals.
@@ -36,7 +36,7 @@ def schlick(f0: wp.vec3, cos_m: float) -> wp.vec3:
 
 @wp.func
 def base_reflectance(base_color: wp.vec3, metallic: float) -> wp.vec3:
-    """F0: 0.04 blended to the base colour by ``metallic``."""
+    """F0: linear interpolation from 0.04 to the base color by ``metallic``."""
     return wp.vec3(F0_DIELECTRIC, F0_DIELECTRIC, F0_DIELECTRIC) * (1.0 - metallic) + base_color * metallic
 
 
@@ -50,11 +50,11 @@ def coat_schlick(cos: float) -> float:
 
 @wp.func
 def coat_cosine(cos: float, alpha: float) -> float:
-    """Cosine at which Schlick's formula gives what the coat as a whole reflects, or more, from a direction of ``cos``.
+    """Cosine at which Schlick's formula bounds the directional albedo of the rough coat for a direction of ``cos``.
 
-    The rougher, the less of its rise at grazing angles.  With this decay paint and coat together stay below 1 for every
-    width, colour and metallic (tests/render/test_energy.py) and above 0.75 for white; with none at all (alpha 0 here)
-    rough white paint would fall to 0.1 at the horizon.
+    Roughness attenuates the rise of the Fresnel term at grazing angles.  The directional albedo of both layers then
+    stays below 1 for every alpha, base color and metallic (tests/render/test_energy.py) and above 0.75 for white;
+    without attenuation (alpha 0 here) that of a rough white dielectric would fall to 0.1 at the horizon.
     """
     return 1.0 - (1.0 - cos) / (1.0 + alpha)
 
@@ -63,20 +63,22 @@ def coat_cosine(cos: float, alpha: float) -> float:
 def eval_bsdf(
     facet: Facet, wo: wp.vec3, wi: wp.vec3, base_color: wp.vec3, alpha: float, metallic: float, conserving: int
 ) -> wp.vec3:
-    """The value of the material [1/sr] for two directions above the horizon and the facet between them."""
+    """BSDF value [1/sr], without the cosine, for two directions above the horizon and the facet between them."""
     one = wp.vec3(1.0, 1.0, 1.0)
     f0 = base_reflectance(base_color, metallic)
     fresnel = schlick(f0, facet.cos_m)
     specular = facet.ndf * smith_visibility(facet, wo, wi)
-    left = one - fresnel  # what the coat leaves to the paint
+    transmitted = one - fresnel  # energy transmitted to the diffuse layer
     if conserving != 0:
-        left = one * ((1.0 - coat_schlick(coat_cosine(wo[2], alpha))) * (1.0 - coat_schlick(coat_cosine(wi[2], alpha))))
-    return wp.cw_mul(left, base_color) * ((1.0 - metallic) * INV_PI) + fresnel * specular
+        t_o = 1.0 - coat_schlick(coat_cosine(wo[2], alpha))
+        t_i = 1.0 - coat_schlick(coat_cosine(wi[2], alpha))
+        transmitted = one * (t_o * t_i)
+    return wp.cw_mul(transmitted, base_color) * ((1.0 - metallic) * INV_PI) + fresnel * specular
 
 
 @wp.func
 def pdf_lobes(facet: Facet, wo: wp.vec3, wi: wp.vec3) -> wp.vec3:
-    """Densities [1/sr] of the material strategies at ``wi``: visible normals, mirrored ones, cosine."""
+    """Densities [1/sr] of the BSDF sampling strategies at ``wi``: visible normals, mirrored normals, cosine."""
     return wp.vec3(pdf_vndf_reflection(facet, wo), pdf_vndf_mirrored(facet, wo), pdf_cosine(wi))
 
 

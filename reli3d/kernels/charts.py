@@ -159,7 +159,7 @@ def separates(a: wp.vec2, b: wp.vec2, p: wp.vec2, q: wp.vec2, r: wp.vec2, slack:
 
 @wp.func
 def overlap(corners: wp.array2d[wp.vec2], i: int, j: int, slack: float) -> bool:
-    """True if two counter-clockwise triangles share more than a strip of width ``slack`` (separating axes)."""
+    """True if two counter-clockwise triangles overlap by more than ``slack`` (separating axes)."""
     a0 = corners[i, 0]
     a1 = corners[i, 1]
     a2 = corners[i, 2]

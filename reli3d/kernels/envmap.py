@@ -15,7 +15,7 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": f"-march=
 
 @wp.func
 def direction_to_uv(d: wp.vec3) -> wp.vec2:
-    """Map coordinates in [0, 1]^2 of the unit direction ``d``; at the poles u is 0.5 and its slope stays finite."""
+    """Map coordinates in [0, 1]^2 of the unit direction ``d``; at the poles u is 0.5 and its gradient finite."""
     s = safe_sqrt(d[0] * d[0] + d[2] * d[2])
     return wp.vec2(0.5 + turn_atan2(d[2], d[0]), 2.0 * turn_atan2(s, d[1]))
 

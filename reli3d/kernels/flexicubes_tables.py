@@ -4,8 +4,8 @@ Corner k stands at (k & 1, k >> 1 & 1, k >> 2 & 1) in (x, y, z).  A case is the 
 corners.  A face joins its crossed edges in pairs; they form closed loops, and each loop is one dual vertex (Nielson
 2004, Dual Marching Cubes).
 
-A face with four crossed edges is ambiguous: its inside corners are kept apart.  Where four quads would meet in one dual
-edge, both cubes keep the outside corners apart (cases C16 and C19 of Wenger 2013, Isosurfaces; Shen et al. 2023).
+A face with four crossed edges is ambiguous: its inside corners are separated.  Where four quads would meet in one dual
+edge, both cubes separate the outside corners (cases C16 and C19 of Wenger 2013, Isosurfaces; Shen et al. 2023).
 """
 
 from functools import lru_cache

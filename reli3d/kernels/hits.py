@@ -1,7 +1,7 @@
 """Values at known hits: vertex attributes, geometric normals and textures, all with gradients.
 
-Normals and re-evaluated hits are computed in float64, and their adjoints too: differences of float32 positions cancel,
-and a slope goes with the square of what is left.
+Normals and re-evaluated hits, and their adjoints, are computed in float64: differences of float32 positions cancel, and
+gradients depend on the square of the result.
 
 ``bary`` are the weights of vertices 1 and 2 of a face.  Face -1 is a miss: value 0, no gradient.  Textures are bilinear
 between texel centres at ((column + .5) / T, (row + .5) / T) and repeat in both axes (glTF's default wrap).

@@ -14,19 +14,17 @@ wp.set_module_options(
     {"enable_backward": False, "cpu_compiler_flags": "-march=native -mllvm=-inline-threshold=5000"}
 )
 
-BEHIND = wp.constant(-1.0e3)  # distance of a point that a camera cannot see, in world units: below that of any other
-REACHED = wp.constant(1.0e-3)  # a ray this close to the hull is on it, in world units
-CAREFUL = wp.constant(0.7)  # of the distance that a ray may go: distances are up to 1 / cos^2 of an angle too long
-STEP_MIN = wp.constant(4.0e-3)  # thinner parts of the hull may be missed
+BEHIND = wp.constant(-1.0e3)  # world units: distance of a point behind a camera, below any other
+REACHED = wp.constant(1.0e-3)  # world units: a ray this close to the hull has hit it
+STEP_FACTOR = wp.constant(0.7)  # of sphere tracing, because distances are up to 1 / cos^2 of an angle too long
+STEP_MIN = wp.constant(4.0e-3)  # world units: thinner parts of the hull may be missed
 STEP_MAX = wp.constant(0.25)
-DEPTH_MIN = wp.constant(1.0e-4)  # a point this close to a camera's plane counts as behind it
-BLOCK_POINTS = wp.constant(4)  # points along a side of a block of a grid
-BLOCK_VIEWS_MAX = wp.constant(32)  # views that a block of a grid tells apart; further ones are asked at every point
-NO_CROSSING_ROWS = wp.constant(65536.0)  # rows to a crossing where a column has none: beyond any image
-EXACT_PIXELS = wp.constant(4.0)  # pixels; beyond, other segments are at most sqrt(16.5) - 4 = 0.06 pixels nearer
-SEGMENT_PIXELS = wp.constant(
-    16.0
-)  # pixels; beyond, a segment's end is at most 0.25 / 16 pixels farther than the segment
+DEPTH_MIN = wp.constant(1.0e-4)  # world units: points closer to a camera's plane count as behind it
+BLOCK_POINTS = wp.constant(4)  # side of a block of grid points
+BLOCK_VIEWS_MAX = wp.constant(32)  # views that are culled per block; further ones are evaluated at every point
+NO_CROSSING_ROWS = wp.constant(65536.0)  # distance in a column without a crossing: beyond any image
+EXACT_PIXELS = wp.constant(4.0)  # beyond, other segments are at most sqrt(16.5) - 4 = 0.06 pixels nearer
+SEGMENT_PIXELS = wp.constant(16.0)  # beyond, the end of a segment is at most 0.25 / 16 pixels farther than the segment
 
 few = wp.types.vector(length=32, dtype=wp.float32)
 few_numbers = wp.types.vector(length=32, dtype=wp.int32)
@@ -36,7 +34,7 @@ few_numbers = wp.types.vector(length=32, dtype=wp.int32)
 def distance_in_view(
     point: wp.vec3, view: int, distance: wp.array3d[float], c2w: wp.array[wp.mat44], intrinsics: wp.array[wp.vec4]
 ) -> float:
-    """Pixel distance at a point's image times the size of a pixel at its depth."""
+    """Silhouette distance where a point projects, times the size of a pixel at its depth."""
     m = c2w[view]
     away = point - wp.vec3(m[0, 3], m[1, 3], m[2, 3])
     right = m[0, 0] * away[0] + m[1, 0] * away[1] + m[2, 0] * away[2]
@@ -53,8 +51,7 @@ def distance_in_view(
 def distance_to_hull(
     point: wp.vec3, distance: wp.array3d[float], c2w: wp.array[wp.mat44], intrinsics: wp.array[wp.vec4], far: float
 ) -> float:
-    """Least over the views of the pixel distance at a point's image times the size of a pixel at its depth; views
-    after one that gives less than ``-far`` are left out."""
+    """Minimum of :func:`distance_in_view` over the views; stops at the first view below ``-far``."""
     best = wp.float32(-BEHIND)
     view = wp.int32(0)
     while view < c2w.shape[0] and best >= -far:
@@ -81,11 +78,10 @@ def hull_distance_kernel(
 
 @wp.func
 def change_in_view(centre: wp.vec3, radius: float, value: float, pose: wp.mat44, k: wp.vec4) -> float:
-    """By how much :func:`distance_in_view`, ``value`` at ``centre``, can differ within ``radius`` of it; -1 where a
-    point there may lie behind the camera.
+    """Bound on the change of :func:`distance_in_view`, ``value`` at ``centre``, within ``radius``; -1 if points there
+    may lie behind the camera.
 
-    A distance changes by at most sqrt(2) a pixel between pixel centres, and mask_distance_kernel is 1 pixel off at
-    most.
+    The map changes by at most sqrt(2) per pixel between pixel centres, and mask_distance_kernel errs by up to 1 pixel.
     """
     away = centre - wp.vec3(pose[0, 3], pose[1, 3], pose[2, 3])
     depth = -(pose[0, 2] * away[0] + pose[1, 2] * away[1] + pose[2, 2] * away[2])
@@ -108,7 +104,7 @@ def hull_grid_kernel(
     # out
     hull: wp.array3d[float],  # (N, N, N)
 ):
-    """A thread is a block of points, at which only the views are asked that may have the least distance in it."""
+    """One thread per block of points, which evaluates only the views that may have the minimum in the block."""
     i = start + wp.tid()
     n = axis.shape[0]
     blocks = (n + BLOCK_POINTS - 1) // BLOCK_POINTS
@@ -132,14 +128,14 @@ def hull_grid_kernel(
         if change >= 0.0:
             least[v] = value - change
             greatest = wp.min(greatest, value + change)
-    asked = few_numbers()
+    active = few_numbers()
     count = wp.int32(0)
     for v in range(views):
         if least[v] <= greatest:
-            asked[count] = v
-            if least[v] < least[asked[0]]:  # first the one that is likely to tell that a point lies far outside
-                asked[count] = asked[0]
-                asked[0] = v
+            active[count] = v
+            if least[v] < least[active[0]]:  # the lowest view first, because it is likely below -far
+                active[count] = active[0]
+                active[0] = v
             count += 1
     for x in range(x0, x1):
         for y in range(y0, y1):
@@ -150,7 +146,7 @@ def hull_grid_kernel(
                     best = wp.float32(-BEHIND)
                     k = wp.int32(0)
                     while k < count and best >= -far:
-                        best = wp.min(best, distance_in_view(p, asked[k], distance, c2w, intrinsics))
+                        best = wp.min(best, distance_in_view(p, active[k], distance, c2w, intrinsics))
                         k += 1
                     v = views
                     while v < c2w.shape[0] and best >= -far:
@@ -160,7 +156,7 @@ def hull_grid_kernel(
 
 
 @wp.kernel
-def mirror_miss_kernel(
+def mirror_residual_kernel(
     start: int,
     # in
     points: wp.array2d[wp.vec3],  # (R, D) along rays
@@ -172,10 +168,9 @@ def mirror_miss_kernel(
     c2w: wp.array[wp.mat44],
     intrinsics: wp.array[wp.vec4],
     # out
-    miss: wp.array2d[float],  # (P, R)
+    residual: wp.array2d[float],  # (P, R)
 ):
-    """How far the mirror image of a ray's best known point lies outside the hull, at most ``most``; a point that is
-    farther outside than the best so far is not measured."""
+    """Least distance outside the hull of the mirror images of a ray's known points, at most ``most``."""
     i = start + wp.tid()
     plane = i // points.shape[0]
     ray = i % points.shape[0]
@@ -188,7 +183,7 @@ def mirror_miss_kernel(
             mirrored = p - 2.0 * (wp.dot(n, p) - offset[plane]) * n
             best = wp.max(best, distance_to_hull(mirrored, distance, c2w, intrinsics, -best))
         k += 1
-    miss[plane, ray] = wp.max(-best, 0.0)
+    residual[plane, ray] = wp.max(-best, 0.0)
 
 
 @wp.kernel
@@ -204,7 +199,7 @@ def hull_span_kernel(
     # out
     span: wp.array[wp.vec2],
 ):
-    """Sphere tracing from both ends of the chord that a ray has in the sphere of ``radius`` around the origin."""
+    """Sphere tracing from both ends of a ray's chord in the sphere of ``radius`` around the origin."""
     i = start + wp.tid()
     o = origins[i]
     d = directions[i]
@@ -214,7 +209,7 @@ def hull_span_kernel(
     low = -b / a - half
     high = -b / a + half
     unit = 1.0 / wp.sqrt(a)
-    nearest = wp.float32(low)  # where the ray comes closest to the hull: what a ray that misses it gets
+    nearest = wp.float32(low)  # closest approach to the hull, the result if the ray misses it
     best = wp.float32(BEHIND)
     first = wp.float32(low)
     inside = wp.bool(False)
@@ -226,7 +221,7 @@ def hull_span_kernel(
         if h >= -REACHED:
             inside = True
         else:
-            first += wp.clamp(-h * CAREFUL, STEP_MIN, STEP_MAX) * unit
+            first += wp.clamp(-h * STEP_FACTOR, STEP_MIN, STEP_MAX) * unit
     if not inside:
         span[i] = wp.vec2(nearest, nearest)
         return
@@ -237,7 +232,7 @@ def hull_span_kernel(
         if h >= -REACHED:
             inside = True
         else:
-            last -= wp.clamp(-h * CAREFUL, STEP_MIN, STEP_MAX) * unit
+            last -= wp.clamp(-h * STEP_FACTOR, STEP_MIN, STEP_MAX) * unit
     span[i] = wp.vec2(first, wp.max(first, last))
 
 
@@ -261,7 +256,7 @@ def squared_to_segment(p: wp.vec2, a: wp.vec2, b: wp.vec2) -> float:
 
 @wp.func
 def crossing(a: float, b: float) -> float:
-    """Where between 0 and 1 a value that runs from ``a`` to ``b`` is 0.5."""
+    """Parameter in [0, 1] at which linear interpolation from ``a`` to ``b`` is 0.5."""
     return wp.clamp((0.5 - a) / (b - a), 0.0, 1.0)
 
 
@@ -318,9 +313,9 @@ def column_kernel(
     # out
     row: wp.array3d[float],
 ):
-    """Row of the nearest crossing of the contour with a pixel's column, ``NO_CROSSING_ROWS`` away without one.
+    """Row of the nearest contour crossing in a pixel's column; ``NO_CROSSING_ROWS`` away if there is none.
 
-    A thread computes one column.
+    One thread per column.
     """
     i = start + wp.tid()
     height = mask.shape[1]
@@ -358,7 +353,8 @@ def row_kernel(
     # out
     nearest: wp.array3d[wp.int32],
 ):
-    """Column whose crossing, at its ``row``, is the nearest one of all columns; -1 without any.  A thread is a row.
+    """Column of the nearest crossing, given the nearest one of each column in ``row``; -1 without any.  One thread per
+    row.
 
     Lower envelope of parabolas, Felzenszwalb and Huttenlocher 2012, Distance Transforms of Sampled Functions.
     """
@@ -413,9 +409,9 @@ def mask_distance_kernel(
 ):
     """Signed distance to the contour, ``far`` without one.
 
-    The nearest crossing with any column (``row``, ``nearest_x``) or row (``column``, ``nearest_y``, both transposed)
-    is an end of a segment; measured are the segments of the cells beside it, and of their neighbours where it is
-    near.
+    The nearest crossing with any column (``row``, ``nearest_x``) or row (``column``, ``nearest_y``, both transposed) is
+    an end of a segment.  The distance is evaluated to the segments of the two cells at that crossing, and also to those
+    of their neighbors if it is closer than EXACT_PIXELS.
     """
     i = start + wp.tid()
     height = mask.shape[1]

@@ -1,4 +1,4 @@
-"""Shared numbers and small vector functions of the kernels.  Local frames have the surface normal on +z."""
+"""Constants and small vector functions of the kernels.  Local frames have the surface normal on +z."""
 
 import warp as wp
 
@@ -16,7 +16,7 @@ PARALLEL = wp.constant(1.0e-12)  # a direction's component below it never leaves
 
 @wp.func
 def safe_sqrt(x: float) -> float:
-    """``sqrt(max(x, 0))`` with a finite slope at 0."""
+    """``sqrt(max(x, 0))`` with a finite derivative at 0."""
     return wp.sqrt(wp.max(x, TINY))
 
 

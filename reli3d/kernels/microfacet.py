@@ -30,7 +30,7 @@ def ggx_root(w: wp.vec3, alpha: float) -> float:
 
 @wp.struct
 class Facet:
-    """The microfacet that reflects ``wo`` into ``wi``, with what value and densities of the pair share."""
+    """The microfacet that reflects ``wo`` into ``wi``, and the common terms of the BSDF value and the densities."""
 
     wm: wp.vec3
     cos_m: float  # wo.wm
@@ -42,13 +42,13 @@ class Facet:
 
 @wp.func
 def facet_between(wo: wp.vec3, wi: wp.vec3, alpha: float, root_o: float) -> Facet:
-    """Facet of two directions above the horizon; its normal and both cosines with it are then positive.
+    """Facet of two directions above the horizon, whose cosines with the half vector are then positive.
 
-    root_o: ``ggx_root(wo, alpha)``, which many directions ``wi`` share.
+    root_o: ``ggx_root(wo, alpha)``, independent of ``wi``.
     """
     facet = Facet()
     h = wo + wi
-    length = wp.sqrt(wp.dot(h, h))  # 2 wo.wm for unit vectors, and the same from both; above the horizon not 0
+    length = wp.sqrt(wp.dot(h, h))  # 2 wo.wm = 2 wi.wm for unit vectors; positive above the horizon
     per_length = 1.0 / length
     facet.wm = h * per_length
     facet.cos_m = 0.5 * length
@@ -67,17 +67,16 @@ def smith_visibility(facet: Facet, wo: wp.vec3, wi: wp.vec3) -> float:
 
 @wp.func
 def stretch_view(wo: wp.vec3, alpha: float) -> wp.vec3:
-    """``wo`` over the surface stretched until it is a hemisphere; unit."""
+    """``wo`` in the space where the GGX distribution is a hemisphere, normalized."""
     return wp.normalize(wp.vec3(alpha * wo[0], alpha * wo[1], wo[2]))
 
 
 @wp.func
 def sample_ggx_vndf(w: wp.vec3, alpha: float, u: wp.vec2) -> wp.vec3:
-    """Normal visible from ``wo`` for uniform ``u`` in [0, 1)^2, ``w`` its ``stretch_view``; density
-    :func:`pdf_ggx_vndf`.
+    """Samples a visible normal with density :func:`pdf_ggx_vndf`.
 
-    Spherical caps, Dupuy and Benyoub 2023, doi 10.1111/cgf.14867: take a point of the cap z in [-w.z, 1] above the
-    stretched surface, add, unstretch.
+    w: ``stretch_view(wo, alpha)``.  u: uniform in [0, 1)^2.  Spherical caps, Dupuy and Benyoub 2023, doi
+    10.1111/cgf.14867: sample the cap z in [-w.z, 1] of the unit sphere, add ``w``, and transform back.
     """
     h = w + sample_cap(w, u)
     x = alpha * h[0]

@@ -83,7 +83,7 @@ def fbm_kernel(
     i = start + wp.tid()
     q = points[i]
     total = wp.float32(0.0)
-    slope = wp.vec3()
+    grad = wp.vec3()
     weight = wp.float32(1.0)
     scale = wp.float32(1.0)
     for octave in range(octaves):
@@ -92,11 +92,11 @@ def fbm_kernel(
         if ridged == 1 and n[0] < 0.0:
             sign = -1.0
         total += sign * weight * n[0]
-        slope += (sign * weight * scale) * wp.vec3(n[1], n[2], n[3])
+        grad += (sign * weight * scale) * wp.vec3(n[1], n[2], n[3])
         weight *= gain
         scale *= LACUNARITY
     value[i] = total
-    gradient[i] = slope
+    gradient[i] = grad
 
 
 @wp.kernel

@@ -12,8 +12,8 @@ from reli3d.kernels.microfacet import ALPHA_MIN, COS_MIN
 
 wp.set_module_options({"enable_backward": True, "cpu_compiler_flags": "-march=native"})
 
-SHARPNESS_MIN = wp.constant(0.01)  # a lobe within 2 % of constant; keeps 1 / sharpness and its slope finite
-SERIES = wp.constant(0.5)  # here slopes of the closed forms, which cancel, and of the series both err by 1e-5
+SHARPNESS_MIN = wp.constant(0.01)  # a lobe within 2 % of constant; keeps 1 / sharpness and its derivative finite
+SERIES = wp.constant(0.5)  # where derivatives of the closed forms, which cancel, and of the series both err by 1e-5
 COSINE_SHARPNESS = wp.constant(2.133)  # of the Gaussian nearest to a clamped cosine, Wang et al. 2009
 
 # (1 + x)^-2 = sum of weight exp(-rate x), fitted here over x in [0, 300] to 6e-4: GGX's slopes as a mixture of normals
@@ -66,8 +66,8 @@ def cosine_integral(sharpness: float, cos_axis: float) -> float:
     """Integral over the sphere of a lobe of amplitude 1 times the clamped cosine; error below 0.2 % of its maximum.
 
     Exact at the two ends (axis along and against the normal).  Between them, after Tokuyoshi et al. 2024,
-    Hierarchical Light Sampling with Accurate Spherical Gaussian Lighting, the slope in the cosine follows an error
-    function; its width ``t`` is fitted here to quadrature over sharpness 0.05 to 3000.
+    Hierarchical Light Sampling with Accurate Spherical Gaussian Lighting, the derivative with respect to the cosine is
+    an error function; its width ``t`` is fitted here to quadrature over sharpness 0.05 to 3000.
     """
     s = wp.max(sharpness, SHARPNESS_MIN)
     return 2.0 * PI / s * cosine_fraction(s, cos_axis)
@@ -77,13 +77,13 @@ def cosine_integral(sharpness: float, cos_axis: float) -> float:
 def specular_lobe(
     n: wp.vec3, wo: wp.vec3, f0: wp.vec3, alpha: float, axis: wp.vec3, sharpness: float, rate: float, weight: float
 ) -> wp.vec3:
-    """Reflected radiance of one lobe of light by one normal distribution of slopes.
+    """Reflected radiance of one light lobe by one normal distribution of microfacet slopes.
 
     Wang et al. 2009, All-Frequency Rendering of Dynamic, Spatially-Varying Reflectance, section 4: the microfacet lobe
-    is warped to the mirror direction, its product with the light is again a lobe, and the smooth factors are taken at
-    that lobe's axis.  The cosine is integrated with the product instead of taken there, so horizons stay smooth.
-    A narrow lobe's height goes with alpha^-2 and its area with alpha^2: sharpnesses are taken over the warped one's,
-    so that neither is there to lose the other's digits, in the slope least of all.
+    is warped to the mirror direction, its product with the light is again a lobe, and the smooth factors are evaluated
+    at that lobe's axis.  The cosine is integrated with the product instead of evaluated there, so horizons stay smooth.
+    Sharpnesses are divided by that of the warped lobe, because the height of a narrow lobe scales with alpha^-2 and its
+    area with alpha^2, and their product, especially its gradient, would lose digits.
     """
     cos_o = wp.max(wp.dot(n, wo), COS_MIN)
     of_normals = 2.0 * rate / (alpha * alpha)

@@ -1,10 +1,11 @@
-"""Direct light of a hit by multiple importance sampling: all strategies in one loop, no per-sample arrays in memory.
+"""Direct lighting of a hit by multiple importance sampling: all strategies in one loop, no per-sample arrays.
 
 Strategies in the order of the sample index: environment table, visible normals (in antithetic pairs: even index the
-original, odd its partner), cosine.  Every sample counts ``f L cos w / (n p)`` with the densities of all strategies in
-the weight.  A face seen from behind is shaded as its other side.
+original, odd its partner), cosine.  Every sample contributes ``f L cos w / (n p)`` with the densities of all strategies
+in the MIS weight ``w``.  Back faces are shaded two-sided.
 
-``visible`` keeps one bit a sample for the adjoint: lit, and above the horizon.  Without columns nothing is kept.
+``visible`` stores one bit per sample for the adjoint: unoccluded and above the horizon.  With no columns nothing is
+stored.
 """
 
 import warp as wp
@@ -28,14 +29,14 @@ from reli3d.kernels.sampling import mirror, opposite, reflect, sample_cosine
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native " + INLINE})
 
-OPPOSITE = wp.constant(1)  # how visible normals are paired; 0 is not at all
+OPPOSITE = wp.constant(1)  # pairing of visible normals; 0 for none
 MIRRORED = wp.constant(2)
-COS_VIEW_MIN = wp.constant(1.0e-3)  # an interpolated normal that turns away is bent until the view is this far above it
+COS_VIEW_MIN = wp.constant(1.0e-3)  # interpolated normals are bent until their cosine with the view is at least this
 
 
 @wp.struct
 class Points:
-    """Arrays of the hits, a row each; ``pixel`` counts their random numbers."""
+    """Arrays with a row per hit; ``pixel`` seeds its random numbers."""
 
     position: wp.array[wp.vec3]
     normal: wp.array[wp.vec3]
@@ -49,7 +50,7 @@ class Points:
 
 @wp.struct
 class Light:
-    """Texels of the map, its sampling table, and the even points that all hits turn."""
+    """Texels of the map, its sampling table, and the low-discrepancy points, which each hit shifts."""
 
     radiance: wp.array2d[wp.vec3]
     rows: wp.array2d[float]
@@ -62,9 +63,9 @@ class Light:
 
 @wp.struct
 class Surface:
-    """What the samples of one hit share; ``wo`` in the local frame, whose axes are the rows of ``frame``.
+    """Data common to all samples of a hit; ``wo`` is in the local frame, whose axes are the rows of ``frame``.
 
-    The shifts turn the even points of each strategy (Cranley and Patterson); unused where points are independent.
+    The shifts are Cranley-Patterson rotations of each strategy's points; unused for independent samples.
     """
 
     pixel: int
@@ -148,7 +149,7 @@ def make_surface(plan: Plan, points: Points, i: int) -> Surface:
 
 @wp.func
 def draw_pair(plan: Plan, points: wp.array[wp.vec2], shift: wp.vec2, pixel: int, index: int, strategy: int) -> wp.vec2:
-    """Uniform pair of a sample: independent, or the shifted point of an even set."""
+    """Uniform pair of a sample: independent, or a shifted point of the low-discrepancy set."""
     u = rotate_point(points[index], shift)
     if plan.rotate == 0:
         u = random_pair(plan.seed, pixel, index, strategy)
@@ -157,7 +158,7 @@ def draw_pair(plan: Plan, points: wp.array[wp.vec2], shift: wp.vec2, pixel: int,
 
 @wp.func
 def visible_normal(surface: Surface, plan: Plan, points: wp.array[wp.vec2], k: int) -> wp.vec3:
-    """Microfacet normal of the ``k``-th sample of the visible normals; both of a pair share their numbers."""
+    """Microfacet normal of the ``k``-th visible-normal sample; both samples of a pair use the same random numbers."""
     index = k
     how = wp.int32(0)
     if plan.antithetic != 0:

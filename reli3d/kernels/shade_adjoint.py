@@ -28,7 +28,7 @@ class SurfaceGradient:
 
 
 @wp.func
-def schlick_slope(cos: float) -> float:
+def schlick_d_f0(cos: float) -> float:
     """dF / dF0 of :func:`schlick`: 1 - (1 - cos)^5."""
     rest = wp.max(1.0 - cos, 0.0)
     return 1.0 - rest * rest * rest * rest * rest
@@ -61,30 +61,30 @@ def add_sample_gradient(
     wm = facet.wm
     f0 = base_reflectance(base_color, metallic)
     fresnel = schlick(f0, facet.cos_m)
-    slope = schlick_slope(facet.cos_m)
+    d_fresnel = schlick_d_f0(facet.cos_m)
     visibility = smith_visibility(facet, wo, wi)
     specular = facet.ndf * visibility
     diffuse = (1.0 - metallic) * INV_PI
     g = weight * wi[2]
-    g_left = wp.cw_mul(g, base_color) * diffuse  # to what the coat leaves to the paint
-    left = one - fresnel
-    d_left = one * (-slope)  # to F0
+    g_transmitted = wp.cw_mul(g, base_color) * diffuse
+    transmitted = one - fresnel
+    d_transmitted = one * (-d_fresnel)  # with respect to F0
     if conserving != 0:
         c_o = coat_cosine(wo[2], alpha)
         c_i = coat_cosine(wi[2], alpha)
-        left_o = 1.0 - coat_schlick(c_o)
-        left_i = 1.0 - coat_schlick(c_i)
-        left = one * (left_o * left_i)
-        d_left = wp.vec3(0.0, 0.0, 0.0)  # the coat's F0 is a constant
-        g_c = wp.dot(g_left, one) * ((1.0 - F0_DIELECTRIC) / (1.0 + alpha))
-        g_o = g_c * left_i * schlick_turn(c_o)  # to cos_o
-        g_i = g_c * left_o * schlick_turn(c_i)
+        t_o = 1.0 - coat_schlick(c_o)
+        t_i = 1.0 - coat_schlick(c_i)
+        transmitted = one * (t_o * t_i)
+        d_transmitted = wp.vec3(0.0, 0.0, 0.0)  # the coat's F0 is constant
+        g_c = wp.dot(g_transmitted, one) * ((1.0 - F0_DIELECTRIC) / (1.0 + alpha))
+        g_o = g_c * t_i * schlick_turn(c_o)  # with respect to cos_o
+        g_i = g_c * t_o * schlick_turn(c_i)
         out.n = out.n + wo * g_o + wi * g_i
         out.alpha = out.alpha + g_o * (1.0 - c_o) + g_i * (1.0 - c_i)
-    g_f0 = g * (specular * slope) + wp.cw_mul(g_left, d_left)
-    out.base_color = out.base_color + wp.cw_mul(g, left) * diffuse + g_f0 * metallic
+    g_f0 = g * (specular * d_fresnel) + wp.cw_mul(g_transmitted, d_transmitted)
+    out.base_color = out.base_color + wp.cw_mul(g, transmitted) * diffuse + g_f0 * metallic
     out.metallic = out.metallic + wp.dot(g_f0, base_color - one * F0_DIELECTRIC)
-    out.metallic = out.metallic - wp.dot(g, wp.cw_mul(left, base_color)) * INV_PI
+    out.metallic = out.metallic - wp.dot(g, wp.cw_mul(transmitted, base_color)) * INV_PI
     g_specular = wp.dot(g, fresnel) * specular
     a2 = alpha * alpha
     inverse_k = 1.0 / (a2 * wm[2] * wm[2] + wm[0] * wm[0] + wm[1] * wm[1])

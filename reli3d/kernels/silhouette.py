@@ -1,8 +1,8 @@
-"""Which edges of a mesh are outlines seen from an eye, and how many pixel lines each of them crosses.
+"""Silhouette edges of a mesh seen from a viewpoint, and the number of pixel lines that each of them crosses.
 
-An edge is ``(a, b, c, d)``: its two ends and the vertices opposite to it in its two faces, ``d = -1`` where it has one
-face.  It is an outline where both faces project to the same side of it, whatever their winding.  It crosses lines of
-one kind: pixel rows where its picture is steeper than 45 degrees, else columns, so that no stretch counts twice.
+An edge is ``(a, b, c, d)``: its two ends and the vertices opposite to it in its two faces, ``d = -1`` if it has one
+face.  It is a silhouette edge if both faces project to the same side of it, regardless of winding.  It is intersected
+with pixel rows if its projection is steeper than 45 degrees, else with columns, so that no part counts twice.
 """
 
 import warp as wp
@@ -16,7 +16,7 @@ DEPTH_MIN = wp.constant(
 
 @wp.func
 def side_of_edge(eye: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3) -> float:
-    """Signed volume whose sign says on which side of the plane through the eye and the edge ``c`` lies."""
+    """Signed volume; its sign is the side of the plane through the eye and the edge on which ``c`` lies."""
     return wp.dot(wp.cross(a - eye, b - eye), c - a)
 
 

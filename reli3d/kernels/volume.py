@@ -1,10 +1,10 @@
 """Ray marching through an occupancy grid and compositing of its samples, forward and adjoint.
 
-The grid fills the cube [-radius, radius]^3 with R^3 cells, index (x, y, z).  Samples of a ray stand at the middles of
-equal steps from where it enters the cube, shifted by a share of a step, and are kept where their cell is occupied.  A
-ray is one thread; its samples lie side by side, ``first[i]`` to ``first[i + 1]``.
+The grid fills the cube [-radius, radius]^3 with R^3 cells, index (x, y, z).  Samples lie at the midpoints of equal
+steps from the ray's entry into the cube, shifted by a fraction of a step; those in occupied cells are kept.  One thread
+per ray; its samples are contiguous, ``first[i]`` to ``first[i + 1]``.
 
-Optical depth is summed, not a product of transmittances carried: ``T = exp(-sum)``.  The adjoint is written out.
+Transmittance is ``T = exp(-sum)`` of the accumulated optical depth.  The adjoint is analytic.
 """
 
 import warp as wp
@@ -14,7 +14,7 @@ from reli3d.kernels.math import PARALLEL, cube_range
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
 
 STEPS_MAX = wp.constant(1 << 24)  # float32 counts steps exactly up to here
-OPAQUE = wp.constant(80.0)  # optical depth behind which nothing is seen: exp(-80) is 2e-35
+OPAQUE = wp.constant(80.0)  # optical depth at which marching ends: exp(-80) is 2e-35
 
 
 @wp.func

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from reli3d import pipeline
 from reli3d.geometry.camera import Camera
-from reli3d.geometry.hull import hull_distance, hull_grid, hull_span, mask_distance, mirror_miss
+from reli3d.geometry.hull import hull_distance, hull_grid, hull_span, mask_distance, mirror_residual
 from reli3d.nn.field import bound_sdf
 from reli3d.nn.local import LocalField
 from reli3d.nn.presets import SMALL
@@ -166,7 +166,7 @@ def test_how_far_mirrored_rays_miss_the_hull(device):
     """Against the distance to the cones of sight in float64, with every point measured."""
     masks, camera = sphere_views(device)
     points, known, normal, offset = mirrored_rays(device)
-    got = mirror_miss(points, known, normal, offset, 0.2, mask_distance(masks), camera).cpu().double()
+    got = mirror_residual(points, known, normal, offset, 0.2, mask_distance(masks), camera).cpu().double()
     flat, n = points.cpu().double().reshape(-1, 3), normal.cpu().double()[:, None]
     mirrored = flat - 2.0 * ((flat * n).sum(-1) - offset.cpu().double()[:, None])[..., None] * n
     inside = cone_distance(mirrored.reshape(-1, 3), camera.c2w.cpu()).view(30, 60, 5)
@@ -194,7 +194,7 @@ def test_wrong_rays_and_planes_are_named(name, value):
     points, known, normal, offset = mirrored_rays("cpu")
     inputs = dict(points=points, known=known, normal=normal, offset=offset, most=0.2) | {name: value}
     with pytest.raises((TypeError, ValueError), match=name):
-        mirror_miss(**inputs, distance=mask_distance(masks), camera=camera)
+        mirror_residual(**inputs, distance=mask_distance(masks), camera=camera)
 
 
 def test_rays_enter_and_leave_the_cones_of_sight(device):

@@ -99,7 +99,7 @@ def hulls(masks, points):
     span = hull.hull_span(3.0 * points, -points, 1.0, distance, camera)
     known = torch.ones(len(points), 1, dtype=torch.bool, device=points.device)
     normal, offset = points.new_tensor([[1.0, 0.0, 0.0]]), points.new_tensor([0.9])  # to where the hull is not
-    miss = hull.mirror_miss(points[:, None], known, normal, offset, 9.0, distance, camera)
+    miss = hull.mirror_residual(points[:, None], known, normal, offset, 9.0, distance, camera)
     grid = hull.hull_grid(torch.linspace(-0.5, 0.5, 9, device=points.device, dtype=torch.float32), distance, camera)
     return distance, hull.hull_distance(points, distance, camera), grid, span, miss
 
