@@ -194,7 +194,8 @@ def _coverage(scene: RayScene, camera: Camera, grid: int) -> Tensor:
     return torch.nn.functional.avg_pool2d(hit[None, None], grid)[0, 0]
 
 
-def _random_faces(surface: Surface, count: int, rng: np.random.Generator):
+def random_faces(surface: Surface, count: int, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
+    """Faces ``(N,)`` and barycentrics ``(N, 2)`` of points that are uniform over the area."""
     corners = surface.vertices[surface.faces.long()].numpy()
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1)
     face = rng.choice(len(area), count, p=area / area.sum())
@@ -207,7 +208,7 @@ def _volume(surface: Surface, rng: np.random.Generator) -> dict[str, Tensor]:
     """Half the points beside the surface (normal offsets of 0.01 and 0.05), half uniform in a box slightly larger
     than the object.
     """
-    near = surface.points_at(*_random_faces(surface, VOLUME_POINTS // 2, rng)).position.numpy()
+    near = surface.points_at(*random_faces(surface, VOLUME_POINTS // 2, rng)).position.numpy()
     near = near + rng.normal(size=near.shape) * rng.choice([0.01, 0.05], (len(near), 1))
     box = surface.vertices.abs().amax(0).numpy() + 0.12
     points = torch.as_tensor(
@@ -218,7 +219,7 @@ def _volume(surface: Surface, rng: np.random.Generator) -> dict[str, Tensor]:
 
 
 def _surface_points(surface: Surface, cameras: Camera, rng: np.random.Generator) -> dict[str, Tensor]:
-    points = surface.points_at(*_random_faces(surface, SURFACE_POINTS, rng))
+    points = surface.points_at(*random_faces(surface, SURFACE_POINTS, rng))
     visible = visible_from(surface.scene, points.position, points.ng, cameras)
     encoded = torch.cat(
         [linear_to_srgb(points.base_color.clamp(0, 1)), points.roughness[:, None], points.metallic[:, None]], -1
