@@ -57,6 +57,12 @@ def parser() -> argparse.ArgumentParser:
         help="GLB files whose shapes are put together and dressed by finishes of their own",
     )
     p.add_argument(
+        "--materials",
+        type=Path,
+        help="folder of material sets (basecolor, roughness, metallic, normal): surfaces are divided into regions with "
+        "finishes of their own",
+    )
+    p.add_argument(
         "--views-only",
         action="store_true",
         help="photographs and maps of the views alone, one ray a pixel: for reli3d-train --pixels, in less than "
@@ -95,6 +101,7 @@ def glb_files(paths: list[Path] | None) -> tuple[Path, ...]:
 def _wanted(args: argparse.Namespace) -> Wanted:
     """What the arguments ask for, checked."""
     from reli3d.output.folder import check_folder
+    from reli3d.synthetic.dressed import material_sets
     from reli3d.synthetic.maps import held_back, load_maps
     from reli3d.synthetic.protocol import LIGHTS
 
@@ -112,8 +119,11 @@ def _wanted(args: argparse.Namespace) -> Wanted:
     maps = args.maps.absolute()
     if paper and args.views_only:
         raise InputError("--views-only", "expected --protocol own with it, got paper")
+    if paper and args.materials:
+        raise InputError("--materials", "expected --protocol own with it, got paper")
     views = args.views or VIEWS
-    return Wanted(maps, bool(args.held_back), paper, views, args.size, meshes, shapes, args.views_only)
+    sets = material_sets(args.materials) if args.materials else ()
+    return Wanted(maps, bool(args.held_back), paper, views, args.size, meshes, shapes, args.views_only, sets)
 
 
 @command("reli3d-data")

@@ -27,6 +27,7 @@ class Wanted:
     meshes: tuple[Path, ...]
     shapes: tuple[Path, ...]
     views_only: bool = False  # without points, for the 2D U-Net alone
+    materials: tuple[Path, ...] = ()  # material sets; with any, surfaces get finishes of their own
 
 
 class SampleJob:
@@ -65,16 +66,28 @@ class SampleJob:
 
     def _surface(self, seed: int, rng: np.random.Generator) -> Surface:
         """The object of a seed.  ``rng`` stretches and tints a mesh, which the paper's protocol leaves as it is."""
+        from reli3d.synthetic.dressed import DressedSurface
         from reli3d.synthetic.procedural import make_object
         from reli3d.synthetic.samples import ObjectSurface
         from reli3d.synthetic.scanned import ScannedSurface
         from reli3d.synthetic.shapes import ShapeSurface
 
         if self.wanted.shapes:
-            return ShapeSurface(self.wanted.shapes, rng)
-        if self.wanted.meshes:
-            return ScannedSurface(self._mesh(seed), None if self.wanted.paper else rng)
-        return ObjectSurface(make_object(seed))
+            surface: Surface = ShapeSurface(self.wanted.shapes, rng)
+        elif self.wanted.meshes:
+            surface = ScannedSurface(self._mesh(seed), None if self.wanted.paper else rng)
+        else:
+            surface = ObjectSurface(make_object(seed))
+        if self.wanted.materials:
+            texels = 2 * self.wanted.size
+            return DressedSurface(surface, self.wanted.materials, rng, measured=self._measured(seed), texels=texels)
+        return surface
+
+    def _measured(self, seed: int) -> bool:
+        """Whether roughness and metallic values of the object are a truth, not the placeholders of a scan."""
+        from reli3d.io.gltf_parts import has_material_maps
+
+        return not self.wanted.meshes or bool(self.wanted.shapes) or has_material_maps(self._mesh(seed))
 
     def _mesh(self, seed: int) -> Path:
         return self.wanted.meshes[seed % len(self.wanted.meshes)]
@@ -96,9 +109,7 @@ class SampleJob:
     def _paper(self, seed: int, light: int) -> dict[str, Tensor]:
         import numpy as np
 
-        from reli3d.io.gltf_parts import has_material_maps
         from reli3d.synthetic.protocol import protocol_sample
 
         surface = self._surface(seed, np.random.default_rng((seed, 1)))
-        known = not self.wanted.meshes or bool(self.wanted.shapes) or has_material_maps(self._mesh(seed))
-        return protocol_sample(surface, self.lights, seed, light, pbr=known, size=self.wanted.size)
+        return protocol_sample(surface, self.lights, seed, light, pbr=self._measured(seed), size=self.wanted.size)

@@ -24,6 +24,7 @@ from reli3d.nn.presets import LocalPreset
 from reli3d.nn.pyramid import ImagePyramid, place_of_pixels, span_of_pixels
 from reli3d.train.batches import KEPT, NOISE, Pictures
 
+FULL_SIDE = 256  # pixels of an image at the finest level
 CACHE_BYTES = 1 << 31  # of small images in the memory of a process
 
 
@@ -93,6 +94,15 @@ def predicted(model: LocalReconstructor, group: Group) -> tuple[PixelMaps, Tenso
     return PixelMaps.of(raw, span, half, level), color
 
 
+def reduction(path: Path, finest: int) -> int:
+    """Factor by which the views of a sample are reduced for level ``finest``: to ``FULL_SIDE >> finest`` pixels, or
+    somewhat more where that does not divide their size.
+    """
+    with safe_open(path, "pt") as file:
+        size = file.get_slice("images").get_shape()[1]
+    return max(1, (size << finest) // FULL_SIDE)
+
+
 def read_pictures(path: Path, factor: int) -> Pictures:
     """All views of a sample, ``factor`` times smaller."""
     with safe_open(path, "pt") as file:
@@ -146,7 +156,7 @@ def augmented(views: Pictures, rng: np.random.Generator) -> Pictures:
 
 
 class ViewCache:
-    """All views of samples, ``2**finest`` times smaller; up to ``CACHE_BYTES`` of them stay in memory."""
+    """All views of samples as level ``finest`` of the 2D U-Net reads them; at most ``CACHE_BYTES`` stay in memory."""
 
     def __init__(self, finest: int):
         self.finest, self._kept, self._bytes = finest, dict[Path, Pictures](), 0
@@ -154,7 +164,7 @@ class ViewCache:
     def __getitem__(self, path: Path) -> Pictures:
         if path in self._kept:
             return self._kept[path]
-        views = read_pictures(path, 1 << self.finest)
+        views = read_pictures(path, reduction(path, self.finest))
         if self._bytes < CACHE_BYTES:
             self._kept[path] = views
             self._bytes += sum(getattr(views, f.name).nbytes for f in fields(views))
