@@ -192,7 +192,7 @@ def test_gradients_of_normals(device):
     row = (got.cpu().double() - want).view(N, 9).norm(dim=1) / want.view(N, 9).norm(dim=1)
     assert float((row[plain] < 1e-4).double().mean()) > 0.999
     # smoothing is linear: an edge of no length or a face of no area changes nothing about it
-    moved = taubin_smooth(Mesh(leaf, faces.to(device)), iterations=1, border="along").vertices
+    moved = taubin_smooth(Mesh(leaf, faces.to(device)), iterations=1).vertices
     assert finite(moved, *torch.autograd.grad(moved.sum(), leaf))
 
 

@@ -55,7 +55,7 @@ def smooth_light(degree, height=32):
     coefficients[0] = 3.0
     phi = (torch.arange(2 * height) + 0.5) * (math.pi / height) - math.pi
     theta = ((torch.arange(height) + 0.5) * (math.pi / height))[:, None]
-    d = torch.stack([phi.sin() * theta.sin(), theta.cos().expand(-1, 2 * height), -phi.cos() * theta.sin()], -1)
+    d = torch.stack([phi.cos() * theta.sin(), theta.cos().expand(-1, 2 * height), phi.sin() * theta.sin()], -1)
     return Environment(spherical_harmonics(d)[..., : len(coefficients)] @ coefficients), coefficients, d
 
 
