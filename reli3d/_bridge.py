@@ -1,11 +1,11 @@
-"""The one crossing between torch and Warp: zero-copy views, streams, CPU slices and adjoints.
+"""Interface between torch and Warp: zero-copy views, streams, parallel CPU launches and adjoints.
 
-A kernel launched from here takes ``start: int`` first and works on ``i = start + wp.tid()``.  Warp runs a CPU launch on
-one thread and releases the GIL.  A large CPU launch is therefore cut into slices over a thread pool.  Their number
-depends on the size and the operation alone, so the bits do not depend on the number of threads.
+Every kernel takes ``start: int`` first and processes ``i = start + wp.tid()``.  Warp runs a CPU launch on one thread
+and releases the GIL, so large CPU launches are split into slices over a thread pool.  The number of slices depends only
+on the size and the operation, so results are bitwise identical for any number of threads.
 
-Outputs must be disjoint per ``i``.  Warp's CPU atomics are not atomic.  In a backward pass every input that several
-``i`` read (named in ``shared``) gets one accumulator for each slice; they are added up in the order of the slices.
+Outputs must be disjoint per ``i``, because Warp's CPU atomics are not atomic.  In the backward pass, each input that
+several ``i`` read (listed in ``shared``) has one accumulator per slice; they are summed in the order of the slices.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from torch import Tensor
 
 from reli3d.kernels.cache import CPU_BLOCK, LOADING, initialise, repaired
 
-WORKER = "reli3d-slice"  # how the threads of the pool are called
-SLICES = 16  # several a thread balance uneven rays on 2 to 8 cores; more only add 20 us of launch each
-COMPILERS = 4  # modules compiled at once; each thread builds its own precompiled header, 1.5 CPU seconds
-SLICE_MIN = 1024  # below this many threads a slice costs about as much to launch as to run
+WORKER = "reli3d-slice"  # name prefix of the pool's threads
+SLICES = 16  # per launch: balances uneven work on 2 to 8 cores; each adds 20 us of launch overhead
+COMPILERS = 4  # modules compiled concurrently; each thread builds its own precompiled header, 1.5 CPU seconds
+SLICE_MIN = 1024  # kernel threads per slice: below this a slice costs about as much to launch as to run
 
 T = TypeVar("T")
 F = TypeVar("F", bound=Callable)
@@ -53,34 +53,34 @@ _TORCH = {
 
 @lru_cache(1)
 def pool() -> ThreadPoolExecutor:
-    """Threads for slices and blocks; torch inside each of them uses that one thread alone."""
+    """Thread pool for slices and blocks; torch runs single-threaded inside its threads."""
     threads = max(1, torch.get_num_threads())
     made = ThreadPoolExecutor(max_workers=threads, thread_name_prefix=WORKER)
     started = threading.Barrier(threads)
 
     def start(_) -> None:
-        started.wait()  # so that every task has a thread of its own
-        torch.get_num_threads()  # a thread takes over torch's number at its first call, which must come before
+        started.wait()  # one task per thread
+        torch.get_num_threads()  # a thread inherits torch's number at its first call, which must precede the next line
         torch.set_num_threads(1)
 
     list(made.map(start, range(threads)))
-    torch.set_num_threads(threads)  # what torch gives to threads that start later; each keeps its own number
+    torch.set_num_threads(threads)  # restores the default of later threads; the pool's keep theirs
     return made
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=pool.cache_clear)  # a fork copies no threads: the child starts its own
+    os.register_at_fork(after_in_child=pool.cache_clear)  # threads do not survive a fork: the child starts its own pool
 
 
 def slices(n: int, slice_min: int = SLICE_MIN) -> list[tuple[int, int]]:
-    """``[(start, count), ...]`` of a CPU launch over ``n`` threads; depends on ``n`` and ``slice_min`` alone."""
+    """``[(start, count), ...]`` of a CPU launch over ``n`` threads; a function of ``n`` and ``slice_min`` only."""
     parts = max(1, min(SLICES, n // slice_min))
     edges = [n * k // parts for k in range(parts + 1)]
     return [(a, b - a) for a, b in zip(edges[:-1], edges[1:], strict=True)]
 
 
 def over_slices(n: int, work, *, slice_min: int = SLICE_MIN) -> list:
-    """``[work(k, start, count), ...]`` for every slice of ``n``, on the thread pool where there is more than one."""
+    """``[work(k, start, count), ...]`` for every slice of ``n``, on the thread pool if there is more than one."""
     parts = slices(n, slice_min)
     if len(parts) == 1:
         return [work(0, *parts[0])]
@@ -90,12 +90,12 @@ def over_slices(n: int, work, *, slice_min: int = SLICE_MIN) -> list:
 def over_rows(n: int, rows: int, work) -> list:
     """``[work(start, stop), ...]`` for blocks of ``rows`` of ``n`` rows, on the thread pool; no gradient is recorded.
 
-    For chains of torch operations: the intermediate values of a block stay in the cache of a core.  Torch computes a
-    block in one thread, so the bits do not depend on the number of threads.
+    For chains of torch operations, whose intermediate values then fit the cache of a core.  Torch evaluates a block in
+    one thread, so results are bitwise identical for any number of threads.
     """
 
     def block(start: int):
-        with torch.no_grad():  # the mode belongs to the thread
+        with torch.no_grad():  # grad mode is thread-local
             return work(start, min(start + rows, n))
 
     return _mapped(block, range(0, n, rows))
@@ -106,11 +106,10 @@ def _mapped(work, items: Iterable) -> list:
 
 
 def serial() -> bool:
-    """Whether the calling thread computes alone.
+    """Whether work of the calling thread is not distributed over the pool.
 
-    It does where torch has one thread, in a thread of the pool (it would wait for itself for ever), and in Warp's debug
-    mode: there two kernels at a time crash over a static pointer (``shared_tile_storage`` in Warp's tile.h), which only
-    optimised code does not have.
+    True if torch uses one thread, in threads of the pool (which would deadlock), and in Warp's debug mode, where
+    concurrent kernels crash on a static pointer (``shared_tile_storage`` in Warp's tile.h) that release builds lack.
     """
     if wp.config.mode == "debug":
         return True
@@ -118,9 +117,9 @@ def serial() -> bool:
 
 
 def full_precision(function: F) -> F:
-    """Decorator: ``function`` runs with autocast disabled on every device, so that matrix products stay in float32.
+    """Decorator: runs ``function`` with autocast disabled on every device, so that matrix products stay in float32.
 
-    Torch's backward pass takes the autocast state of where it is called, as for any other operation.
+    The backward pass uses the autocast state of its caller, as for any other operation.
     """
 
     @functools.wraps(function)
@@ -138,7 +137,7 @@ def full_precision(function: F) -> F:
 
 @contextlib.contextmanager
 def stream(device: torch.device):
-    """Order Warp's launches after torch's on CUDA; yields the Warp device name."""
+    """Context in which Warp launches on torch's current CUDA stream; yields the Warp device name."""
     initialise()
     if device.type == "cuda":
         with wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device))):
@@ -148,37 +147,36 @@ def stream(device: torch.device):
 
 
 def view(tensor: Tensor, dtype):
-    """Zero-copy Warp descriptor of a contiguous tensor, without gradient."""
+    """Zero-copy Warp array descriptor of a contiguous tensor, without gradient."""
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
 
 
 def array_of(tensor: Tensor, dtype) -> wp.array:
-    """Warp array over the memory of a contiguous tensor, without gradient, for what Warp itself keeps."""
+    """Warp array that shares the memory of a contiguous tensor, without gradient, for objects that Warp keeps."""
     return cast(wp.array, wp.from_torch(tensor, dtype=dtype, requires_grad=False))
 
 
 def views(args: Sequence) -> list:
-    """What :func:`launch` makes of its ``args``, for those that go to many launches; the caller keeps the tensors."""
+    """``args`` of :func:`launch` converted for Warp, for several launches; the caller keeps the tensors alive."""
     return [view(*a) if isinstance(a, tuple) else a for a in args]
 
 
 def struct_of(kind, **fields):
-    """Warp struct ``kind`` with ``(tensor, warp type)`` or plain values in the fields named; it keeps the tensors.
+    """Warp struct ``kind`` with ``(tensor, warp type)`` pairs or plain values as fields; it keeps the tensors alive.
 
-    For contiguous arrays that always go together, without gradient: what :func:`call` differentiates stays an argument
-    of its own.
+    Tensors must be contiguous and have no gradient: inputs that :func:`call` differentiates are separate arguments.
     """
     initialise()
     made = kind()
-    native = made.__ctype__()  # what a launch takes; Warp's own setters want arrays, which cost twice as much to make
+    native = made.__ctype__()  # Warp's own setters require arrays, which take twice as long to create
     for name, value in fields.items():
         setattr(native, name, view(*value) if isinstance(value, tuple) else value)
-    vars(made)["tensors"] = [v[0] for v in fields.values() if isinstance(v, tuple)]  # or their memory would be freed
+    vars(made)["tensors"] = [v[0] for v in fields.values() if isinstance(v, tuple)]  # keeps their memory alive
     return made
 
 
 def _check_device(args: Iterable, device: torch.device) -> None:
-    """Raise ValueError for a tensor on another device, whose memory a kernel must not read."""
+    """Raises ValueError for a tensor that is not on ``device``."""
     for value in args:
         for tensor in (value[0],) if isinstance(value, tuple) else getattr(value, "tensors", ()):
             if tensor.device != device:
@@ -186,15 +184,15 @@ def _check_device(args: Iterable, device: torch.device) -> None:
 
 
 def empty(shape: Sequence[int], dtype, device: torch.device) -> Tensor:
-    """Uninitialised torch tensor that holds an array of ``shape`` of the Warp type ``dtype``."""
+    """Uninitialized torch tensor for a Warp array of ``shape`` and type ``dtype``."""
     torch_dtype, tail = _TORCH[dtype]
     return torch.empty((*shape, *tail), dtype=torch_dtype, device=device)
 
 
 def load_modules(modules: Sequence[ModuleType], device: torch.device) -> None:
-    """Load kernel modules (:mod:`reli3d.kernels`), compiling several at once what the kernel cache lacks.
+    """Loads kernel modules (:mod:`reli3d.kernels`), compiling those missing from the kernel cache concurrently.
 
-    Without it every module compiles at its first launch, one after the other.  The compiler releases the GIL.
+    Otherwise every module is compiled at its first launch.  The compiler releases the GIL.
     """
     with stream(device) as name:
         loaded = [wp.get_module(m.__name__) for m in modules]
@@ -207,16 +205,16 @@ def load_modules(modules: Sequence[ModuleType], device: torch.device) -> None:
 
 
 def _load(kernel) -> None:
-    """Have a kernel's module ready on the CPU."""
+    """Loads the module of a kernel on the CPU."""
     with LOADING:
         repaired(kernel.module, CPU_BLOCK, lambda: kernel.module.load(wp.get_device("cpu"), block_dim=CPU_BLOCK))
 
 
 def launch(kernel, n: int, args: Sequence, device: torch.device, *, slice_min: int = SLICE_MIN) -> None:
-    """Run ``kernel(start, *args)`` over ``n`` threads.  ``args``: ``(tensor, warp type)`` pairs or plain values.
+    """Launches ``kernel(start, *args)`` over ``n`` threads, without gradient.
 
-    Tensors must be contiguous and on ``device``; nothing is copied and no gradient is recorded.  slice_min: fewest
-    threads of a CPU slice; a small number cuts launches of few threads that do much each.
+    args: ``(tensor, warp type)`` pairs or plain values; tensors contiguous, on ``device``, not copied.  slice_min:
+    least number of threads per CPU slice, small for kernels with much work per thread.
     """
     if n == 0:
         return
@@ -228,7 +226,7 @@ def launch(kernel, n: int, args: Sequence, device: torch.device, *, slice_min: i
             return
         _load(kernel)
         if serial():
-            wp.launch(kernel, n, [0, *values], device="cpu")  # no thread would take a slice
+            wp.launch(kernel, n, [0, *values], device="cpu")
             return
         over_slices(
             n, lambda k, start, count: wp.launch(kernel, count, [start, *values], device="cpu"), slice_min=slice_min
@@ -236,7 +234,7 @@ def launch(kernel, n: int, args: Sequence, device: torch.device, *, slice_min: i
 
 
 class _Once(torch.autograd.Function):
-    """A gradient that refuses to be differentiated again; ``sources`` are what it depends on."""
+    """Identity on a gradient that raises when differentiated; ``sources`` are the tensors that it depends on."""
 
     @staticmethod
     def forward(ctx, grad: Tensor, *sources: Tensor) -> Tensor:
@@ -248,11 +246,11 @@ class _Once(torch.autograd.Function):
 
 
 def once_differentiable(backward):
-    """Decorator of a ``backward`` without gradient: a second derivative raises RuntimeError.
+    """Decorator of a ``backward`` that is not differentiable: second derivatives raise RuntimeError.
 
-    Torch's own decorator raises only where the incoming gradient has one.  For a loss that is linear in the result it
-    would leave out the inputs' part of the second derivative and say nothing.  Tensors saved for backward must be the
-    inputs themselves, made contiguous before ``apply``, where that is recorded.
+    Torch's own decorator raises only if the incoming gradient requires one; for a loss that is linear in the result it
+    would silently omit the inputs' part of the second derivative.  Tensors saved for backward must be the inputs
+    themselves, made contiguous before ``apply``, where autograd records it.
     """
 
     def wrapper(ctx, *g_outs):
@@ -291,11 +289,11 @@ class _KernelOp(torch.autograd.Function):
     def backward(ctx, *g_outs):
         kernel, n, slice_min, plain, types, shared, outs, device = ctx.op
         tensors, results = ctx.saved_tensors[: len(types)], ctx.saved_tensors[len(types) :]
-        wanted = ctx.needs_input_grad[8:]
+        needed = ctx.needs_input_grad[8:]
         parts = slices(n, slice_min) if device.type == "cpu" else [(0, n)]
         grads = [
             torch.zeros((len(parts) if i in shared else 1, *t.shape), dtype=t.dtype, device=device) if w else None
-            for i, (t, w) in enumerate(zip(tensors, wanted, strict=True))
+            for i, (t, w) in enumerate(zip(tensors, needed, strict=True))
         ]
         g_results = [None if g is None else g.contiguous() for g in g_outs]
         g_results = [
@@ -326,7 +324,7 @@ class _KernelOp(torch.autograd.Function):
         return None, None, None, None, None, None, None, None, *(None if g is None else g.sum(0) for g in grads)
 
 
-_SLOT = object()  # marks the place of a tensor among the plain arguments
+_SLOT = object()  # placeholder of a tensor among the plain arguments
 
 
 def _fill(plain, items, pattern=None):
@@ -342,9 +340,9 @@ def call(kernel, n: int, ins: Sequence, outs: Sequence, *, device: torch.device,
          slice_min: int = SLICE_MIN):  # fmt: skip
     """Differentiable launch: new tensors ``outs = [(shape, warp type), ...]`` from ``kernel(start, *ins, *outs)``.
 
-    ``ins``: ``(tensor, warp type)`` pairs or plain values.  Gradients reach every floating-point tensor of ``ins`` that
-    asks for one, through the kernel's own adjoint (its module needs ``enable_backward``).  ``shared``: positions,
-    counted among the tensors, of inputs that more than one thread reads.  ``slice_min``: as for :func:`launch`.
+    ins: ``(tensor, warp type)`` pairs or plain values.  Gradients reach every floating-point tensor of ``ins`` that
+    requires one, by the kernel's adjoint (its module needs ``enable_backward``).  shared: indices, among the tensors of
+    ``ins``, of those that more than one thread reads.  slice_min: as for :func:`launch`.
     """
     tensors = [a[0].contiguous() for a in ins if isinstance(a, tuple)]
     types = [a[1] for a in ins if isinstance(a, tuple)]
@@ -353,8 +351,8 @@ def call(kernel, n: int, ins: Sequence, outs: Sequence, *, device: torch.device,
 
 
 def tensor_of(value, dtype: torch.dtype = torch.float32):
-    """``value`` as a tensor of ``dtype`` where nothing is lost: numpy arrays, and for int32, int64 any integers.
-    Anything else comes back as it is, for :func:`check` to refuse."""
+    """``value`` as a tensor of ``dtype`` if that is lossless: numpy arrays, and for int32 and int64 any integers.
+    Other values are returned unchanged, for :func:`check` to refuse."""
     if isinstance(value, np.ndarray):
         if value.dtype.name not in ("float32", "float64", "int64", "int32", "int16", "uint8", "uint16", "uint32"):
             return value
@@ -369,14 +367,14 @@ def tensor_of(value, dtype: torch.dtype = torch.float32):
 
 
 def present(name: str, value: T | None) -> T:
-    """``value``; raises ValueError where it is None."""
+    """``value``.  Raises ValueError if it is None."""
     if value is None:
         raise ValueError(f"{name}: expected a value, got None")
     return value
 
 
 def expect(name: str, value: object, kind: type) -> None:
-    """Raise TypeError as ``name: expected X, got Y`` for a value that is no ``kind``."""
+    """Raises TypeError, ``name: expected X, got Y``, unless ``value`` is a ``kind``."""
     if not isinstance(value, kind):
         raise TypeError(f"{name}: expected {kind.__name__}, got {type(value).__name__}")
 
@@ -384,7 +382,7 @@ def expect(name: str, value: object, kind: type) -> None:
 def check(
     name: str, value: object, *, last: int | None = None, like: Tensor | None = None, dtype: torch.dtype = torch.float32
 ) -> None:
-    """Raise TypeError or ValueError as ``name: expected X, got Y`` for a wrong kind, dtype, last axis or device."""
+    """Raises TypeError or ValueError, ``name: expected X, got Y``, for a wrong type, dtype, last axis or device."""
     if not isinstance(value, Tensor):
         raise TypeError(f"{name}: expected a tensor, got {type(value).__name__}")
     if value.dtype != dtype:

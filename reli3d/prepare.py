@@ -1,4 +1,4 @@
-"""Photographs as a network reads them: resampled, with distances to the silhouettes, mirrored where that helps."""
+"""Network input from views: resampling, silhouette distances, and mirror images of symmetric objects."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from reli3d.views.published_views import published_views
 from reli3d.views.similarity import Similarity
 from reli3d.views.views import ViewBatch, Views
 
-DETAIL = 512  # pixels of the views that colours and silhouettes are read from; the network's own input is smaller
-MOST_MIRRORED = 8  # views: a network reads 16, mirror images too
+DETAIL = 512  # side [pixels] of the images that colors and silhouettes are read from, larger than the network's input
+MAX_MIRRORED = 8  # views: the network reads 16 including mirror images
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """Views in the model's frame: the network's input, and maps of ``DETAIL`` pixels that are looked up at points."""
+    """Views in the model's frame: the network's input, and images of ``DETAIL`` pixels for lookup at points."""
 
     batch: ViewBatch
     images: Tensor  # (V, D, D, 4) sRGB and signed silhouette distance
     camera: Camera  # of ``images``
-    mirrored: int = 0  # how many of the last views are mirror images of the first ones, in order
+    mirrored: int = 0  # number of views at the end that are mirror images of the first ones, in order
 
     def with_mirror(self, plane: MirrorPlane) -> Prepared:
-        """Twice as many views: each is also a view of the other half of an object that ``plane`` mirrors."""
+        """The views, followed by their mirror images: flipped images with cameras mirrored at ``plane``."""
         batch, flipped = self.batch, plane.mirrored(self.batch.camera)
         parts = [torch.cat([t, t.flip(2)]) for t in (batch.images, batch.masks, self.images)]
         c2w, intrinsics = (torch.cat([getattr(batch, name), getattr(flipped, name)]) for name in ("c2w", "intrinsics"))
@@ -42,7 +42,7 @@ class Prepared:
 
 @full_precision
 def prepare(model: Network, views: Views, model_from_input: Similarity) -> Prepared:
-    """Resample ``views`` for ``model``: cropped to the object, or as the release does where the preset says so."""
+    """Resamples ``views`` for ``model``: cropped to the object, or as in the release if ``published_input``."""
     moved = views.transformed(model_from_input).to(model.device)
     published = published_input(model.preset)
     if published:
@@ -56,16 +56,16 @@ def prepare(model: Network, views: Views, model_from_input: Similarity) -> Prepa
 
 @full_precision
 def completed(prepared: Prepared) -> Prepared:
-    """``prepared`` with mirror images, if its 3 to ``MOST_MIRRORED`` silhouettes fit a mirror plane, else itself.
+    """``prepared`` with mirror images, if its 3 to ``MAX_MIRRORED`` silhouettes fit a mirror plane, else unchanged.
 
     See :func:`~reli3d.geometry.symmetry.mirror_plane`.
     """
     plane = None
-    if len(prepared.batch) <= MOST_MIRRORED:
+    if len(prepared.batch) <= MAX_MIRRORED:
         plane = mirror_plane(prepared.images[..., 3].contiguous(), prepared.camera)
     return prepared if plane is None else prepared.with_mirror(plane)
 
 
 def published_input(preset: Preset | LocalPreset) -> bool:
-    """Whether views go in as the release prepares them."""
+    """Whether views are prepared as in the release."""
     return isinstance(preset, Preset) and preset.published_input

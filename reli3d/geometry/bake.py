@@ -22,7 +22,7 @@ from reli3d.geometry.topology import edges_of
 from reli3d.kernels import bake as kernels
 
 BORDER_TEXELS = 1.5  # texels: a bilinear tap of a point of the surface has its centre within sqrt(2)
-TILE = {"cpu": 16, "cuda": 4}  # a thread a tile: large ones share set-up, small ones fill a GPU; results are the same
+TILE = {"cpu": 16, "cuda": 4}  # side of a thread's tile in texels: large amortizes setup, small fills a GPU
 STRIP = 64  # columns a thread sweeps in the column pass: one cache line of the mask
 ROWS_MIN = 16  # rows of texels a CPU slice of the row pass
 TILES_MIN = 16  # tiles a CPU slice: each of them walks its list of faces for 256 texels
@@ -89,9 +89,9 @@ def _border_segments(faces: Tensor) -> Tensor:
 def rasterize_texels(mesh: Mesh, size: int) -> Texels:
     """Face and barycentrics of every texel of a ``size`` x ``size`` map over the UV of ``mesh``.
 
-    A texel whose centre lies in a face takes that face, the lowest where there are several.  A texel whose centre is
-    within 1.5 texels of a chart takes the nearest point of the chart's border.  So a bilinear look-up on the surface
-    reads texels of the surface only.  The same bits for any number of threads.  Peak memory: 24 bytes a texel.  Raises
+    A texel whose centre lies in a face takes that face, the first of several.  A texel whose centre is within 1.5
+    texels of a chart takes the nearest point of the chart's border, so that bilinear lookups on the surface read only
+    texels of the surface.  Bitwise identical for any number of threads.  Peak memory: 24 bytes per texel.  Raises
     ValueError without UV.
     """
     corners = _corners(mesh, size)
@@ -155,7 +155,7 @@ def _checked_places(mesh: Mesh, texels: Texels, index: Tensor) -> kernels.Places
 
 
 def _places(mesh: Mesh, texels: Texels, index: Tensor) -> kernels.Places:
-    """What the kernels read of the texels of ``index``."""
+    """Kernel struct of the texels of ``index``."""
     face, bary = (texels.face.reshape(-1), wp.int32), (texels.bary.reshape(-1, 2), wp.vec2)
     faces = mesh.faces.contiguous(), wp.int32
     return struct_of(kernels.Places, texel=(index, wp.int64), face=face, bary=bary, faces=faces)

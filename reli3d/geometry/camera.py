@@ -156,10 +156,10 @@ def project(points: Tensor, c2w: Tensor, intrinsics: Tensor) -> tuple[Tensor, Te
 
 
 def box_of(points: Tensor, camera: Camera) -> tuple[int, int, int, int]:
-    """Pixel box ``(x0, y0, x1, y1)``, ends exclusive, outside of which one camera sees nothing that lies between
-    ``points (N, 3)``; all of the picture where one of them is near the plane of the eye or behind it.
+    """Pixel box ``(x0, y0, x1, y1)``, ends exclusive, that contains the projection of the convex hull of ``points (N,
+    3)`` in one camera, clipped to the image; the whole image if a point is near or behind the camera's plane.
 
-    At least a pixel, also where all points lie beside the picture.  No gradient.
+    At least one pixel, even if all points project outside the image.  No gradient.
     """
     points, eye = points.detach(), camera.position.detach()
     pixels, depth = project(points, camera.c2w.detach(), camera.intrinsics.detach())
@@ -172,7 +172,7 @@ def box_of(points: Tensor, camera: Camera) -> tuple[int, int, int, int]:
 
 
 def _pixels_between(low: float, high: float, count: int) -> tuple[int, int]:
-    """First pixel and the end of those of ``count`` that touch [low, high], and of one more on each side."""
+    """Begin and end of the pixels of ``count`` that overlap [low, high], extended by one on each side."""
     first = min(max(math.floor(low) - 1, 0), count - 1)
     return first, max(min(math.ceil(high) + 1, count), first + 1)
 

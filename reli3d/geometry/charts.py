@@ -27,7 +27,7 @@ SMOOTHING = 2  # rounds in which the normal takes up those of the neighbours
 MAJORITY = 4  # rounds of the majority vote along label borders
 MERGING = 4  # rounds in which small charts join their neighbours
 CUTTING = 4  # rounds in which charts that fill their box badly are cut in two
-CUT_WASTE = 0.002  # of the atlas: empty share of its box that makes a chart worth a cut
+CUT_WASTE = 0.002  # of the atlas: empty area of a chart's box from which a cut is tried
 CUT_FILL = 0.6  # of its box: a chart that covers more is left whole
 CUT_GAIN = 0.85  # boxes of the two pieces over the box of the chart, at most ...
 CUT_HOLLOW, CUT_HOLLOW_GAIN = 0.25, 1.02  # ... but a ring gains by the second cut only: no gain needed below this fill
@@ -42,7 +42,7 @@ AXES = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, -1, 0], [0, 0,
 
 @dataclass
 class Charts:
-    """Chart number of every face (-1: no area, kept apart) and the corners in the plane of their chart."""
+    """Chart number of every face (-1: no area, packed separately) and the corners in the plane of their chart."""
 
     chart: np.ndarray  # (F,) int32
     corners: np.ndarray  # (F, 3, 2) float32, expected texels, x right, y up; counter-clockwise

@@ -40,13 +40,13 @@ def _embree() -> tuple[ctypes.CDLL, int]:
     import embreex
     from embreex import rtcore_scene
 
-    beside = sorted(Path(embreex.__file__).parents[1].glob("embreex.libs/*embree4*"))
-    for path in (Path(rtcore_scene.__file__), *beside):  # where the loader finds names of what a library needs: itself
+    bundled = sorted(Path(embreex.__file__).parents[1].glob("embreex.libs/*embree4*"))
+    for path in (Path(rtcore_scene.__file__), *bundled):  # on some platforms the extension itself exports the symbols
         library = ctypes.CDLL(str(path))
         if hasattr(library, "rtcNewDevice"):
             break
     else:
-        raise ImportError(f"embreex: expected a wheel with Embree's library, found none beside {embreex.__file__}")
+        raise ImportError(f"embreex: expected a wheel with Embree's library, found none next to {embreex.__file__}")
     for name, (result, *arguments) in SIGNATURES.items():
         function = getattr(library, name)
         function.restype, function.argtypes = result, arguments

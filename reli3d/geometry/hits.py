@@ -76,13 +76,13 @@ def hit_normals(vertices: Tensor, faces: Tensor, face: Tensor) -> Tensor:
 
 
 def evaluate_hits(vertices: Tensor, faces: Tensor, hits: Hits, origins: Tensor, directions: Tensor) -> Hits:
-    """The hits with ``t`` and ``bary`` computed again from their faces, so that gradients flow.
+    """``hits`` with differentiable ``t`` and ``bary``, recomputed from their faces.
 
     vertices: ``(V, 3)``.  faces: ``(F, 3)`` int32.  origins, directions: ``(..., 3)`` of the rays that gave ``hits``.
-    Gradients reach vertices, origins and directions; which face is hit has none.  Value and gradient are computed in
-    float64.  A face that is too thin, or seen too nearly from its edge, keeps the hit as it was, with gradient 0.  Use
-    ``origins + t directions`` for the point: its slope in the vertices has more digits than that of an interpolated
-    position.  Source: Moller and Trumbore 1997.
+    Gradients reach vertices, origins and directions; visibility is constant.  Values and gradients are computed in
+    float64.  Hits on faces that are nearly degenerate or seen nearly edge-on are kept unchanged, with gradient 0.  Use
+    ``origins + t directions`` for the point, whose gradient in the vertices is more accurate than that of an
+    interpolated position.  Source: Moller and Trumbore 1997.
     """
     check("vertices", vertices, last=3)
     _check_faces(vertices.shape[0], faces, hits.face, vertices)

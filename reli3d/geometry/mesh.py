@@ -70,7 +70,7 @@ class Mesh:
 
 @dataclass(frozen=True)
 class MeshReport:
-    """What :func:`report` finds.  Counts are of the welded mesh, but ``vertices`` and ``faces`` are as stored."""
+    """Result of :func:`report`.  Counts are of the welded mesh, except ``vertices`` and ``faces``: as stored."""
 
     vertices: int
     faces: int
@@ -80,7 +80,7 @@ class MeshReport:
     boundary_edges: int  # with one face
     nonmanifold_edges: int  # with three or more faces
     flipped_edges: int  # with two faces that run through it in the same direction
-    nonmanifold_vertices: int  # whose faces fall apart into several fans
+    nonmanifold_vertices: int  # whose faces form several fans
     degenerate_faces: int  # with two corners at one position; left out of every other count
     watertight: bool  # faces present, every edge has two or more faces, an even number
     manifold: bool  # no non-manifold edge or vertex and no flipped edge; a border is allowed
@@ -113,7 +113,7 @@ def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     """
     per_face = face_normals(vertices, faces)
     total = torch.zeros_like(vertices)
-    for corner in faces.long().T.contiguous():  # index_add takes ten times as long with int32
+    for corner in faces.long().T.contiguous():  # index_add is about 10 times slower with int32
         total = total.index_add(0, corner, per_face)
     square = (total * total).sum(-1, keepdim=True)
     valid = square > NORMAL_MIN
@@ -122,7 +122,7 @@ def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
 
 
 def weld(vertices: Tensor) -> tuple[Tensor, Tensor]:
-    """``(first (W,), label (V,))`` int64: vertices at bit-identical positions share a label.
+    """``(first (W,), label (V,))`` int64: vertices at bitwise identical positions have one label.
 
     ``first`` is the lowest vertex of a label.  Labels count up in the order of ``first``.  -0 equals +0.
     """
@@ -140,11 +140,11 @@ def weld_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         key = (key ^ (key >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
         key = (key ^ (key >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
         key ^= key >> np.uint64(31)
-    spare = np.uint64(1 + max(1, len(bits).bit_length()))  # room for the index beside the key
+    spare = np.uint64(1 + max(1, len(bits).bit_length()))  # bits left for the index
     order, start = group((key >> spare).astype(np.int64))
     lowest = np.empty(len(bits), np.int64)
     lowest[order] = np.repeat(order[start], np.diff(start, append=len(order)))
-    if not np.array_equal(bits[lowest], bits):  # two rows with one hash
+    if not np.array_equal(bits[lowest], bits):  # hash collision
         _, first, label = np.unique(bits, axis=0, return_index=True, return_inverse=True)
         lowest = first[label.reshape(-1)]
     leads = lowest == np.arange(len(bits))
@@ -165,7 +165,7 @@ def welded_faces(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
 
 
 def face_components(mesh: Mesh) -> Tensor:
-    """Component of every face, ``(F,)`` int64, numbered by their lowest face; faces that share a position connect."""
+    """Component of every face, ``(F,)`` int64, numbered by lowest face; faces with a common position are connected."""
     faces, _ = welded_faces(mesh)
     if not len(faces):
         return torch.zeros(0, dtype=torch.int64, device=mesh.faces.device)

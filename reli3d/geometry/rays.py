@@ -45,7 +45,7 @@ class RayScene:
         if backend not in BACKENDS:
             raise ValueError(f"backend: expected one of {', '.join(BACKENDS)}, got {backend}")
         if isinstance(mesh, Mesh) and faces is not None:
-            raise TypeError("faces: expected none beside a mesh, got some")
+            raise TypeError("faces: expected None with a mesh, got faces")
         if faces is None:
             expect("mesh", mesh, Mesh)
         vertices, faces = (mesh.vertices, mesh.faces) if isinstance(mesh, Mesh) else (mesh, faces)

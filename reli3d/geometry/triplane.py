@@ -13,20 +13,17 @@ BLOCK_CHANNELS = 8  # channels of a kernels.vec8
 ROWS_MIN = 8  # rows of cells a CPU slice of the planes' adjoint: each adds all the points that fall in it
 CACHED = 1 << 16  # floats of a plane that stay in a core's second-level cache whatever the order of the points
 BANDS = 16  # of the rows of a plane, a CPU thread each: more copy more rows twice
-PROBED, STEP_TEXELS_MAX, WALK = (
-    4096,
-    8.0,
-    0.8,
-)  # points looked at, texels from one to the next, and the share that makes a walk
+PROBED = 4096  # consecutive points tested for coherence
+STEP_TEXELS_MAX = 8.0  # distance of coherent consecutive points
+WALK = 0.8  # fraction of coherent points from which the points are not sorted
 
 
 class _SampleTriplane(torch.autograd.Function):
-    """Own backward: adding up point by point needs atomics, which Warp's CPU launches lack and CUDA runs in any order.
+    """Custom backward without atomics, which Warp lacks on CPUs and which are not deterministic on CUDA.
 
-    Points are sorted by their row of cells, and one thread owns the rows of texels to which it adds.  On the CPU the
-    forward pass takes the same order, since rows of a large plane then stay in the cache; it turns channel-first rows
-    into channel-last ones as it needs them.  Points in which neighbours follow each other (a grid, texels of an atlas)
-    are not sorted.
+    Points are sorted by row of cells, and each thread owns the rows of texels that it accumulates into.  On a CPU the
+    forward pass uses the same order, which keeps rows of large planes in the cache, and transposes channel-first rows
+    to channel-last on the fly.  Coherent points (a grid, texels of an atlas) are not sorted.
     """
 
     @staticmethod
@@ -206,7 +203,7 @@ def sample_triplane(planes: Tensor, points: Tensor) -> Tensor:
     the border gets half.  Channel-last strides, float32, C a multiple of 8, are read in place; other planes are
     copied.  points: ``(B, N, 3)`` float32; NaN gives zeros.
 
-    Gradients reach ``planes`` (in their dtype) and ``points`` (one-sided at texel centres), with the same bits for any
+    Gradients reach ``planes`` (in their dtype) and ``points`` (one-sided at texel centres), bitwise identical for any
     number of threads.  Raises TypeError or ValueError, also for sizes beyond 32-bit indices.
 
     >>> planes = torch.rand(1, 3, 8, 16, 16, requires_grad=True)

@@ -77,10 +77,10 @@ def _check(mesh: Mesh, texture_size: int) -> None:
 def unwrap(mesh: Mesh, *, texture_size: int = 1024) -> Mesh:
     """The mesh with ``uv``; vertices are split at the borders of charts, the faces keep their order.
 
-    Every face has positive UV area.  Faces of different charts are a guard band apart (:func:`guard_band`), less only
+    Every face has positive UV area.  Charts are separated by a guard band (:func:`guard_band`), which is smaller only
     if there are too many charts for the texture.  Normals are kept, or computed before the split, so that shading is
-    smooth across charts.  Any triangle mesh is taken: open, non-manifold, in pieces, with faces without area.  The same
-    input gives the same bits.  Raises TypeError or ValueError for a wrong mesh, no faces, or NaN.
+    smooth across charts.  Any triangle mesh is accepted: open, non-manifold, disconnected, with degenerate faces.  The
+    result is deterministic.  Raises TypeError or ValueError for an invalid mesh, no faces, or NaN.
 
     >>> charted = reli3d.unwrap(mesh, texture_size=64)
     >>> maps = reli3d.bake(charted, 64, lambda position, normal: position.abs())
@@ -275,7 +275,7 @@ def unwrap_xatlas(mesh: Mesh, *, texture_size: int = 1024, timeout_s: float = 12
     """As :func:`unwrap` with the charts of xatlas (Young 2018), in a process of its own that ends after ``timeout_s``.
 
     Its time grows with the square of the number of charts and it can crash; here that is a TimeoutError or RuntimeError
-    instead of a hang.  Faces xatlas could not chart may share UV; :func:`atlas_report` counts them.
+    instead of a hang.  Faces that xatlas could not chart may overlap in UV; :func:`atlas_report` counts them.
     """
     _check(mesh, texture_size)
     with tempfile.TemporaryDirectory() as folder:

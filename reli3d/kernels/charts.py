@@ -227,7 +227,7 @@ def split_serial_kernel(
 ):  # fmt: skip
     """Grow connected charts without overlap, breadth first, from ``seeds`` in order; they are numbered from ``first``.
 
-    ``owner`` is -1 for the faces to share out.  A face joins unless one of its overlap partners is in the same new
+    ``owner`` is -1 for unassigned faces.  A face joins unless one of its overlap partners is in the same new
     chart.
     """
     current = int(first)

@@ -26,11 +26,11 @@ NOTICE = (
 
 
 def fetch_official(*, preset: Preset = OFFICIAL) -> Path:
-    """Path of the converted official weights; where there is none yet, the checkpoint is fetched and converted first.
+    """Path of the converted official weights; downloads and converts the checkpoint if there are none.
 
-    A ``reli3d_final.ckpt`` beside that path is converted without the network and kept.  A fetched one is compared with
-    the SHA-256 that the hub states and removed after the conversion; a transfer that was cut off resumes at the next
-    call.  Raises WeightsError, one line, without the extra, network, access, file or disk space.
+    A ``reli3d_final.ckpt`` in the same folder is converted without network access and kept.  A downloaded one is
+    verified with the hub's SHA-256 and removed after the conversion; interrupted downloads resume at the next call.
+    Raises WeightsError if the extra ``hub``, network, access rights, the file or disk space is missing.
     """
     target = official_path()
     if target.is_file():

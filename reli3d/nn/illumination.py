@@ -1,7 +1,7 @@
-"""The illumination path: what the views and the triplane say about the light, as RENI++ latents.
+"""Illumination path: RENI++ latents from the views and the triplane.
 
-The views are tokenized a second time together with their masks, so that hidden background (mask 0) differs from
-black; a bank of learned tokens reads them and the triplane.  Parameter names are the published checkpoint's.
+The views are tokenized a second time together with their masks, so that masked background differs from black; a bank of
+learned tokens attends to them and to the triplane.  Parameter names are the published checkpoint's.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from reli3d.nn.reni import rotation_from_6d
 from reli3d.nn.tokenizers import ImageTokenizer
 from reli3d.nn.transformer import GROUP_NORM_EPS, FeedForward, attention
 
-STRENGTH_BIAS = 1.0  # natural logarithm of the radiance factor where the network says nothing
+STRENGTH_BIAS = 1.0  # added to the predicted natural logarithm of the radiance factor
 
 
 class _CrossAttention(nn.Module):
@@ -45,7 +45,7 @@ class _Block(nn.Module):
 
 
 class Transformer1D(nn.Module):
-    """Tokens that read each other and a context; the outer residual is the input before its GroupNorm."""
+    """Tokens with self attention and cross attention to a context; the outer residual is the input before GroupNorm."""
 
     def __init__(self, sizes: IlluminationSizes):
         super().__init__()
@@ -94,9 +94,9 @@ class Illumination(nn.Module):
     def forward(self, images: Tensor, extra: Tensor | None, camera: Tensor, planes: Tensor) -> tuple[Tensor, ...]:
         """Latents ``(B, L, 3)``, rotation ``(B, 3, 3)``, strength ``(B,)``, float32.
 
-        images: ``(B, V, S, S, 3)`` sRGB, hidden background black.  extra: ``(B, V, K, S, S)``, the mask (all ones where
-        the background is shown) and ray maps as the preset says.  camera: ``(B, V, W)``.
-        planes: ``(B, 3, C, P, P)`` before upsampling.
+        images: ``(B, V, S, S, 3)`` sRGB, masked background black.  extra: ``(B, V, K, S, S)``, the mask (all ones where
+        the background is visible), if the preset has a mask channel.  camera: ``(B, V, W)``.  planes: ``(B, 3, C, P,
+        P)`` before upsampling.
         """
         views = self.encoder(images, camera, extra).flatten(1, 2)
         context = torch.cat([views, self.plane_tokens(planes)], dim=1)

@@ -91,7 +91,7 @@ class BackboneSizes(_Checked):
     """The two-stream transformer; its width is also the width of encoder and triplane bank."""
 
     heads: int
-    latents: int  # learned latent tokens, beside the hero view's own
+    latents: int  # learned latent tokens, in addition to the hero view's tokens
     blocks: int
     basic_blocks: int  # in each block
     experts: int  # 0: none
@@ -216,7 +216,7 @@ class Preset(_Checked):
     density_threshold: float = 10.0  # the surface is where exp(raw + density_bias) has this value
     density_bias: float = -1.0
     roughness_is_alpha: bool = False  # the roughness head predicts the GGX width; query() returns its square root
-    published_input: bool = False  # views prepared as by the release: JPEG, not cropped, poses as stored unless asked
+    published_input: bool = False  # views prepared as in the release: JPEG, not cropped, poses as stored by default
     reads_background: bool = False  # the illumination path was trained with visible backgrounds too
 
     def __post_init__(self):

@@ -1,8 +1,8 @@
-"""RENI++: a decoder of natural illumination, equivariant to turns about the vertical axis.
+"""RENI++: a decoder of natural illumination, equivariant to rotation about the vertical axis.
 
 Source: Gardner, Egger and Smith 2023, "RENI++", arXiv 2311.09361, in the form and with the parameter names of the file
-published with ReLi3D.  An environment is a set of latent 3-vectors; turning them about the vertical turns the map.  The
-decoder works in a z-up frame, D = (z, x, y) of the y-up world direction (x, y, z).  All of it runs in float32.
+published with ReLi3D.  An environment is a set of latent 3-vectors; rotating them about the vertical rotates the map.
+The decoder uses a z-up frame, D = (z, x, y) of the y-up world direction (x, y, z).  It is evaluated in float32.
 
 The published maps have -Z in the centre column and +X right of it; :func:`from_published` and :func:`to_published`
 convert.  Maps of this package are those of :mod:`reli3d.render.latlong`.
@@ -22,7 +22,7 @@ from reli3d.render.latlong import lat_long_directions, quarter_turn
 
 FREQUENCIES = (1.0, 4.0)  # of the positional encoding, without a factor of pi
 VN_EPS = 1.0e-6  # floor of the published vector-neuron ReLU
-NORM2_MIN = 1.0e-20  # squared length: keeps the slope of the square root finite at a zero latent
+NORM2_MIN = 1.0e-20  # squared length: keeps the gradient of the square root finite at a zero latent
 
 
 def from_published(maps: Tensor) -> Tensor:
@@ -41,7 +41,7 @@ def reni_frame(directions: Tensor) -> Tensor:
 
 
 class _VnLinear(nn.Module):
-    """Mixes vector channels; acts on the scalar weights of one vector that every channel is a multiple of."""
+    """Linear map of vector channels, stored as scalars because every channel is a multiple of one vector."""
 
     def __init__(self, inputs: int, outputs: int):
         super().__init__()
@@ -51,16 +51,16 @@ class _VnLinear(nn.Module):
 class _VnRelu(nn.Module):
     def __init__(self, channels: int):
         super().__init__()
-        # not torch.eye: on the meta device, where weights.load builds, it imports torch's compiler, for 2 seconds
+        # torch.eye on the meta device, on which weights.load builds, imports torch's compiler (2 seconds)
         self.W, self.U = (nn.Parameter(torch.zeros(channels, channels).fill_diagonal_(1.0)) for _ in range(2))
 
 
 class _VnInvariant(nn.Module):
-    """Two numbers of a plane vector p that do not change when p turns: <p, out_o> of a small vector-neuron network.
+    """Two rotation invariants of a 2D vector p: <p, out_o> of a small vector-neuron network.
 
     Every channel of that network is a multiple of p, so only the factors are computed: with alpha = W a, beta = U a and
-    n = |p| the result is alpha n^2, less the part along k = beta p where alpha and beta differ in sign.  The
-    published network multiplies by k itself there and not by its unit vector, and so does this.
+    n = |p| the result is alpha n^2, minus the component along k = beta p where alpha and beta differ in sign.  As in
+    the published network, the projection uses k and not its unit vector.
     """
 
     def __init__(self):
@@ -78,10 +78,10 @@ class _VnInvariant(nn.Module):
 
 
 class _Conditioning(nn.Module):
-    """The published attention of a ray over one single conditioning token.
+    """Attention of a ray to a single conditioning token, as published.
 
-    A softmax over one key is 1, so the result is ``fc_out(value(condition))`` for every ray: query and key have their
-    place in the file and no effect.
+    A softmax over one key is 1, so the result is ``fc_out(value(condition))`` for every ray; query and key exist only
+    for the checkpoint.
     """
 
     def __init__(self, width: int, condition: int):
@@ -122,7 +122,7 @@ class _Decoder(nn.Module):
 
 
 def positional_encoding(x: Tensor) -> Tensor:
-    """``(..., F)`` to ``(..., 5 F)``: sines, sines shifted by a quarter turn, then ``x``; frequencies run fastest."""
+    """``(..., F)`` to ``(..., 5 F)``: sines, sines shifted by pi / 2, then ``x``; frequencies vary fastest."""
     s = (x.unsqueeze(-1) * x.new_tensor(FREQUENCIES)).flatten(-2)
     return torch.cat([s.sin(), (s + 0.5 * math.pi).sin(), x], dim=-1)
 
@@ -158,7 +158,7 @@ class ReniField(nn.Module):
 
 
 class EnvironmentDecoder(nn.Module):
-    """Latents, their rotation and a strength to an environment map."""
+    """Environment map from latents, their rotation and a strength."""
 
     sample_directions: Tensor  # (H * 2H, 3), in the order of the published map, as its checkpoint has them
 
@@ -183,7 +183,7 @@ class EnvironmentDecoder(nn.Module):
         """Linear radiance ``(B, H, 2H, 3)``, row 0 +Y, the centre column +X.
 
         latent: ``(B, L, 3)``.  rotation: ``(B, 3, 3)`` applied to every latent.  strength: ``(B,)``, natural logarithm
-        of a factor.  z_rotation: ``(B,)`` radians; turns the map by twice this angle, as published.
+        of a factor.  z_rotation: ``(B,)`` radians; rotates the map by twice this angle, as published.
         """
         height = height or self.height
         directions = reni_frame(lat_long_directions(height, device=latent.device)).reshape(1, -1, 3)
@@ -207,7 +207,7 @@ def _turn(angle: Tensor) -> Tensor:
 
 
 def rotation_from_6d(d: Tensor) -> Tensor:
-    """Rotation matrices ``(..., 3, 3)`` of ``(..., 6)``: two columns, made orthonormal, and their cross product.
+    """Rotation matrices ``(..., 3, 3)`` from ``(..., 6)``: two columns, orthonormalized, and their cross product.
 
     Source: Zhou et al. 2019, arXiv 1812.07035.  Zero input gives a zero matrix.
     """

@@ -1,4 +1,4 @@
-"""Latents of a given map, found without an encoder: descent through the frozen RENI++ decoder."""
+"""RENI++ latents of a given map, by gradient descent through the frozen decoder."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from torch import Tensor
 from reli3d.nn.reni import EnvironmentDecoder, reni_frame
 from reli3d.render.latlong import lat_long_directions
 
-FLOOR = 1e-2  # of the geometric mean: darker counts as this dark
-RATES = 0.1, 1e-3  # step of Adam at the start and the end
-COSINE = 0.3  # weight of the colours' direction beside the logarithm
-PRIOR = 1e-4  # of a squared latent: the decoder was fitted with normal ones
+FLOOR = 1e-2  # of the geometric mean: added to radiances before their logarithm
+RATES = 0.1, 1e-3  # learning rate of Adam at the start and the end
+COSINE = 0.3  # weight of the color cosine loss
+PRIOR = 1e-4  # weight of the squared latents, which had a normal prior in training
 
 
 @dataclass(frozen=True)
 class LightFit:
-    """What ``EnvironmentDecoder`` takes; ``error`` is the mean over the sphere of |log radiance - log map|."""
+    """Arguments of ``EnvironmentDecoder``; ``error`` is the mean over the sphere of |log radiance - log map|."""
 
     latent: Tensor  # (L, 3)
-    rotation: Tensor  # (3, 3), the identity: a turn is in the latents
+    rotation: Tensor  # (3, 3), the identity: rotation is absorbed by the latents
     strength: Tensor  # ()
     error: float
 
@@ -30,14 +30,14 @@ class LightFit:
 def fit_latent(
     decoder: EnvironmentDecoder, radiance: Tensor, *, steps: int = 500, rays: int = 512, seed: int = 0
 ) -> LightFit:
-    """Latents and strength whose decoded map is nearest to ``radiance``.
+    """Fits latents and strength so that the decoded map approximates ``radiance``.
 
-    radiance: ``(H, 2H, 3)`` linear, at least 0, row 0 up, laid out as :mod:`reli3d.render.latlong`, on the
-    decoder's device; H at least 8.  steps: of Adam, each on ``rays`` texels of the map, drawn evenly over the sphere.
-    The strength starts at the logarithm of the geometric mean.  The loss is the difference of logarithms, floored at a
-    hundredth of the mean, and one minus the cosine of the colours, which sees the lamps.  The decoder stays as it is.
-    Raises TypeError unless float32, ValueError for another shape, a map that is not finite, negative or black. Source:
-    Gardner and others 2023, RENI++, section 4.
+    radiance: ``(H, 2H, 3)`` linear, nonnegative, in the layout of :mod:`reli3d.render.latlong`, on the decoder's
+    device; H at least 8.  steps: of Adam, each on ``rays`` texels sampled uniformly over the sphere.  The strength is
+    initialized to the logarithm of the geometric mean.  The loss is the absolute difference of logarithms, with a floor
+    of a hundredth of the mean, plus one minus the cosine of the colors, which emphasizes light sources.  The decoder is
+    not changed.  Raises TypeError unless float32, ValueError for another shape and for a map that is not finite,
+    negative or black.  Source: Gardner et al. 2023, RENI++, section 4.
     """
     directions, target, weight = _rays(decoder, radiance)
     shade = target.mean(-1)

@@ -19,8 +19,8 @@ from reli3d.nn.transformer import attention, by_tokens
 IMAGE_MEAN = (0.485, 0.456, 0.406)  # of ImageNet in sRGB, as DINOv2 was trained
 IMAGE_STD = (0.229, 0.224, 0.225)
 NORM_EPS = 1.0e-6
-# The published network asks for (patches + 0.1) / grid as scale factor, so the sampling positions use this and not
-# patches / grid; the trick guards the floor in the size computation.
+# The published network passes (patches + 0.1) / grid as scale factor, to guard the floor in the size computation; the
+# sampling positions then use this factor and not patches / grid.
 RESAMPLE_OFFSET = 0.1
 
 
@@ -176,7 +176,7 @@ class ImageTokenizer(nn.Module):
 
 
 def patch_grid(tokens: Tensor) -> Tensor:
-    """The patch tokens of :class:`ImageTokenizer` ``(B, V, 1 + P*P + 1, C)`` as a picture ``(B, V, P, P, C)``."""
+    """The patch tokens of :class:`ImageTokenizer` ``(B, V, 1 + P*P + 1, C)`` as an image ``(B, V, P, P, C)``."""
     side = math.isqrt(tokens.shape[2] - 2)
     return tokens[:, :, 1:-1].unflatten(2, (side, side))
 

@@ -1,4 +1,4 @@
-"""The two-stream transformer: a stream of triplane tokens and a stream of latents that read each other in turns.
+"""Two-stream transformer: triplane tokens and latents, which attend to each other alternately.
 
 Source: section 3 of the paper, in the form of its release (the hero view's tokens join the latents, all views' tokens
 are read by cross attention, the last blocks mix experts).  Parameter names are the published checkpoint's.
@@ -19,13 +19,11 @@ FEED_FORWARD_RATIO = 4
 # Widest intermediate on a CPU: 28 MiB in float32.  A tenth faster than 64 MiB at 1024 wide: it stays
 # in the cache, and below 32 MiB glibc hands the same pages out again instead of fresh ones.
 CHUNK_NUMBERS = 7 << 20
-CONFLICT = 1024  # numbers: rows of heads that lie this far apart share cache sets
+CONFLICT = 1024  # floats: rows of heads at a multiple of this distance map to the same cache sets
 
 
 def by_tokens(function: Callable[[Tensor], Tensor], x: Tensor, inner: int) -> Tensor:
-    """``function(x)``, which treats every token ``(..., C)`` alone and whose intermediates are ``inner`` wide; on a CPU
-    in chunks of tokens.
-    """
+    """``function(x)`` of independent tokens ``(..., C)`` with intermediates of width ``inner``; in chunks on a CPU."""
     rows = max(1, CHUNK_NUMBERS // inner)
     if x.device.type != "cpu" or x.shape[:-1].numel() <= rows:
         return function(x)
@@ -39,7 +37,7 @@ def attention(q: Tensor, k: Tensor, v: Tensor, heads: int) -> Tensor:
     """
     batch, conflict = max(len(q), len(k)), k.device.type == "cpu" and k.shape[-1] % CONFLICT == 0
     q, k, v = (x.unflatten(-1, (heads, -1)).transpose(1, 2) for x in (q, k, v))
-    if conflict:  # a copy head by head makes the whole a fifth faster
+    if conflict:  # copying head by head makes the attention about 1.2 times faster
         k, v = k.contiguous(), v.contiguous()
     q, k, v = (x.expand(batch, -1, -1, -1) for x in (q, k, v))
     return functional.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2)

@@ -57,7 +57,7 @@ class Stored:
 
 @dataclass(frozen=True)
 class Manifest:
-    """What a safetensors file says it holds."""
+    """Tensors and metadata in the header of a safetensors file."""
 
     path: str
     tensors: dict[str, Stored]
@@ -88,10 +88,9 @@ def sha256(path: str | os.PathLike) -> str:
 
 
 def known_sha256(path: str | os.PathLike) -> str:
-    """:func:`sha256` of a large file, for the record, read once: a note ``<file>.sha256`` beside it keeps the hash with
-    the file's size and time of change, and counts as long as both are the same.
+    """:func:`sha256`, cached for large files in ``<file>.sha256`` with the file's size and modification time.
 
-    It never stands in for a check: :func:`load` and the download hash what they compare.
+    For records only: :func:`load` and the download verify hashes that they compute.
     """
     path = Path(path)
     if _size(path) < LARGE:
@@ -102,7 +101,7 @@ def known_sha256(path: str | os.PathLike) -> str:
         if rest == about and re.fullmatch("[0-9a-f]{64}", digest):
             return digest
     digest = sha256(path)
-    with contextlib.suppress(OSError), replacing(note) as temporary:  # a folder that is read-only is hashed each time
+    with contextlib.suppress(OSError), replacing(note) as temporary:  # not cached in a read-only folder
         Path(temporary).write_text(f"{digest} {about}\n")
     return digest
 
@@ -223,11 +222,10 @@ def load(
 ) -> tuple[Network, Manifest]:
     """The network in a safetensors file, in evaluation mode, and the file's manifest.
 
-    preset: what the file must hold; default the one in its header.  trunk: dtype of the trunk's parameters, or in
-    which the convolutions of the small network compute; default :func:`default_trunk`, ``auto`` is
-    :func:`fastest_dtype`.  All other parameters are float32.  A tensor that is stored in the dtype
-    asked for stays mapped from the file on a CPU: it takes memory when it is read.  Names, shapes, length and, where
-    given, the hash are checked before anything is allocated.  Raises WeightsError.
+    preset: expected architecture; default the one in the header.  trunk: dtype of the trunk's parameters, or compute
+    dtype of the small network's convolutions; default :func:`default_trunk`, ``auto`` is :func:`fastest_dtype`.  All
+    other parameters are float32.  On a CPU, tensors stored in the requested dtype stay memory-mapped.  Names, shapes,
+    file length and, if given, the hash are checked before anything is allocated.  Raises WeightsError.
     """
     manifest = read_manifest(path)
     preset = preset or manifest.preset()

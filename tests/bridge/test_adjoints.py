@@ -1,6 +1,6 @@
 """Float32 adjoints against float64 twins, 999 entries in a thousand to 1e-4, and the twins against differences.
 
-Those of the estimator of light, of compositing and of light's lookups stand beside their own tests.
+Those of the estimator of light, of compositing and of light's lookups are in the tests of these operations.
 """
 
 from collections.abc import Callable

@@ -349,14 +349,14 @@ def test_bits_of_a_block_of_torch_do_not_depend_on_the_threads(threads):
 def test_threads_load_a_kernel_one_after_the_other(threads, monkeypatch):
     """Slices that launch kernels of their own, as the ray caster's do: Warp would compile a module in each thread."""
     threads(4)
-    began, beside_the_first = [], []
+    began, concurrent_with_first = [], []
     load = wp.Module.load
 
     def slow_at_first(module, *args, **kwargs):
         began.append(1)
         if len(began) == 1:
             time.sleep(0.1)  # as if it compiled
-            beside_the_first.append(len(began) - 1)
+            concurrent_with_first.append(len(began) - 1)
         return load(module, *args, **kwargs)
 
     monkeypatch.setattr(wp.Module, "load", slow_at_first)
@@ -367,7 +367,7 @@ def test_threads_load_a_kernel_one_after_the_other(threads, monkeypatch):
         _bridge.launch(count_kernel, count, [(part, wp.int32)], part.device, slice_min=count)
 
     _bridge.over_slices(len(visits), work)
-    assert beside_the_first == [0] and len(began) >= 8
+    assert concurrent_with_first == [0] and len(began) >= 8
     assert torch.equal(visits, torch.arange(len(visits), dtype=torch.int32) % _bridge.SLICE_MIN)
 
 

@@ -1,4 +1,4 @@
-"""A broken file in the kernel cache is compiled again, as a missing one is, and told in one line."""
+"""A broken file in the kernel cache is recompiled, as a missing one is, and reported in one line."""
 
 import os
 import subprocess

@@ -16,12 +16,12 @@ from tests.support.op_cases import Case, N, rng
 CASES = {**op_cases.CASES, **op_cases_plain.CASES}
 DIFFERENTIABLE = [name for name, case in CASES.items() if case.grads]
 FEW = 40  # rows where their number does not matter
-STEP = 3e-5  # of a difference of slopes: longer ones cross kinks of the mean absolute deviation
+STEP = 3e-5  # of finite differences of derivatives: longer steps cross kinks of the mean absolute deviation
 
 
-def leaves_of(case: Case, device, n: int = FEW, asked=None) -> dict:
-    asked = case.grads if asked is None else asked
-    return {k: v.to(device).requires_grad_(k in asked) for k, v in case.inputs(n).items()}
+def leaves_of(case: Case, device, n: int = FEW, requires_grad=None) -> dict:
+    requires_grad = case.grads if requires_grad is None else requires_grad
+    return {k: v.to(device).requires_grad_(k in requires_grad) for k, v in case.inputs(n).items()}
 
 
 def strided(leaves: dict) -> dict:
@@ -93,11 +93,11 @@ def test_one_gradient_alone_is_that_of_all_and_backward_can_be_repeated(device, 
     assert all(same(truth[k], again[k]) for k in truth)
     assert all(float(g.abs().max()) > 0.0 for g in truth.values())
     for k in case.grads:
-        alone = leaves_of(case, device, asked=(k,))
+        alone = leaves_of(case, device, requires_grad=(k,))
         loss_of(case.run(**alone)).backward()
         assert same(alone[k].grad, truth[k]), k
         assert all(v.grad is None for other, v in alone.items() if other != k)
-    none = case.run(**leaves_of(case, device, asked=()))
+    none = case.run(**leaves_of(case, device, requires_grad=()))
     assert not any(out.requires_grad for out in none)
 
 
@@ -176,8 +176,8 @@ def test_a_compiled_function_around_an_operation_gives_the_same_bits(device, hel
 @pytest.mark.parametrize("name", CASES)
 def test_other_floating_point_types_are_named_or_taken(device, name, kind):
     case = CASES[name]
-    for k, value in leaves_of(case, device, asked=()).items():
-        changed = {**leaves_of(case, device, asked=()), k: value.to(kind)}
+    for k, value in leaves_of(case, device, requires_grad=()).items():
+        changed = {**leaves_of(case, device, requires_grad=()), k: value.to(kind)}
         if k in case.dtypes and (kind == torch.float16 or name != "sample_triplane"):
             assert all(bool(torch.isfinite(out).all()) for out in case.run(**changed))
             continue
@@ -204,14 +204,14 @@ def test_second_derivatives_are_right_or_refused(device, name, of):
     case, noise = CASES[name], rng(4)
     moves = {k: torch.randn(v.shape, generator=noise).to(device) for k, v in leaves_of(case, device).items()}
 
-    def slope(leaves, k, **options):
+    def derivative(leaves, k, **options):
         """Along a random direction of the input ``k``."""
         loss = loss_of(tuple(of(out) for out in case.run(**leaves) if out.is_floating_point()))
         return (torch.autograd.grad(loss, leaves[k], **options)[0] * moves[k]).double()
 
     def bend(k, other):
-        leaves = strided(leaves_of(case, device))  # a copy of an input is not what the second derivative is asked of
-        along = slope(leaves, k, create_graph=True).sum()
+        leaves = strided(leaves_of(case, device))  # the second derivative is taken of the inputs, not of copies
+        along = derivative(leaves, k, create_graph=True).sum()
         return torch.autograd.grad(along, leaves[other], allow_unused=True)[0] if along.requires_grad else None
 
     for k, other in itertools.product(case.grads, repeat=2):
@@ -225,13 +225,13 @@ def test_second_derivatives_are_right_or_refused(device, name, of):
         for sign in (1.0, -1.0):
             moved = leaves_of(case, device)
             moved[other] = (moved[other].detach() + sign * STEP * moves[other]).requires_grad_()
-            ends.append(slope(moved, k))
+            ends.append(derivative(moved, k))
         if got is None:  # linear, or no output depends on both
             assert torch.equal(*ends), (k, other)
             continue
         got, want = (got * moves[other]).double(), float((ends[0] - ends[1]).sum()) / (2.0 * STEP)
         assert k in case.second, (k, other)
-        # float32 slopes over the step
+        # float32 differences over the step
         assert abs(float(got.sum()) - want) < 2e-2 * float(got.abs().sum()) + 1e-3, (k, other)
 
 
@@ -255,7 +255,7 @@ def fractions_within(case: Case, first, second, spoil=lambda tensor: tensor) -> 
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_one_two_and_five_threads_give_the_same_bits(threads, name):
+def test_one_two_and_five_threads_are_bitwise_identical(threads, name):
     case, results = CASES[name], []
     for count in (1, 2, 5):
         threads(count)

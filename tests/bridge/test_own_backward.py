@@ -1,5 +1,5 @@
 """What backward passes written by hand owe torch beyond the table of operations: inputs without a gradient, and
-gradients that nobody asked for."""
+gradients that are not required."""
 
 import pytest
 import torch
@@ -32,11 +32,11 @@ def lit(leaves, pixels=None):
     )
 
 
-def hits(device, asked=NAMES):
+def hits(device, required=NAMES):
     values = {k: v.to(device) for k, v in shaded(40).items()}
     values = {"ng": values["normal"].clone(), **values}
     values["wo"] = torch.nn.functional.normalize(values["normal"] + 0.3, dim=-1)
-    return {k: v.clone().requires_grad_(k in asked) for k, v in values.items()}
+    return {k: v.clone().requires_grad_(k in required) for k, v in values.items()}
 
 
 @pytest.mark.parametrize("name", ["ng", "wo", "pixels"])
@@ -70,26 +70,28 @@ def watched(monkeypatch, module, kernel):
     return rows
 
 
-@pytest.mark.parametrize("asked", [*((name,) for name in NAMES), ("base_color", "radiance")])
-def test_shade_computes_no_gradient_that_nobody_asks_for(device, monkeypatch, asked):
+@pytest.mark.parametrize("required", [*((name,) for name in NAMES), ("base_color", "radiance")])
+def test_shade_computes_only_required_gradients(device, monkeypatch, required):
     every = hits(device)
     truth = dict(zip(NAMES, torch.autograd.grad(lit(every).square().sum(), [every[k] for k in NAMES]), strict=True))
     rows = watched(monkeypatch, shading, "shade_adjoint_kernel")
-    leaves = hits(device, asked)
+    leaves = hits(device, required)
     lit(leaves).square().sum().backward()
-    assert rows and all([k for k, count in zip(NAMES, row[-5:], strict=True) if count] == list(asked) for row in rows)
-    for k in asked:
+    assert rows and all(
+        [k for k, count in zip(NAMES, row[-5:], strict=True) if count] == list(required) for row in rows
+    )
+    for k in required:
         torch.testing.assert_close(leaves[k].grad, truth[k], rtol=1e-5, atol=1e-6 * float(truth[k].abs().max()))
 
 
-@pytest.mark.parametrize("asked", [(True, False), (False, True)])
-def test_composite_computes_no_gradient_that_nobody_asks_for(device, monkeypatch, asked):
+@pytest.mark.parametrize("required", [(True, False), (False, True)])
+def test_composite_computes_only_required_gradients(device, monkeypatch, required):
     samples, density, color = packed([3, 0, 40], device)
     both = [v.clone().requires_grad_() for v in (density, color)]
     truth = torch.autograd.grad(composite(*both, samples).color.square().sum(), both)
     rows = watched(monkeypatch, volume, "composite_adjoint_kernel")
-    leaves = [v.requires_grad_(a) for v, a in zip((density, color), asked, strict=True)]
+    leaves = [v.requires_grad_(a) for v, a in zip((density, color), required, strict=True)]
     composite(*leaves, samples).color.square().sum().backward()
-    assert rows and all([bool(count) for count in row[-2:]] == list(asked) for row in rows)
-    for leaf, a, want in zip(leaves, asked, truth, strict=True):
+    assert rows and all([bool(count) for count in row[-2:]] == list(required) for row in rows)
+    for leaf, a, want in zip(leaves, required, truth, strict=True):
         assert torch.equal(leaf.grad, want) if a else leaf.grad is None

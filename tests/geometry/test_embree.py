@@ -1,4 +1,4 @@
-"""Embree by its C interface: packets of shadow rays beside single rays, trees that come and go, a wheel without it."""
+"""Embree by its C interface: packets of shadow rays against single rays, lifetime of trees, a wheel without Embree."""
 
 import sys
 import threading
@@ -39,7 +39,7 @@ def test_packets_leave_no_closed_mesh(device):
 
 @pytest.mark.parametrize("odd", [None, float("nan"), float("inf"), 0.0])
 def test_the_order_brings_like_rays_together_and_loses_none(device, odd):
-    """Cells of 32 x 32 directions are some 5 degrees wide; among rays as they come neighbours are 90 degrees apart."""
+    """Cells of 32 x 32 directions are some 5 degrees wide; in unsorted rays neighbors differ by 90 degrees."""
     scene = make(*bumpy(1), "embree", device)
     o, d = rays(300_000, 7, 1.0)
     if odd is not None:
@@ -80,8 +80,8 @@ def test_scenes_in_many_threads_answer_as_alone_and_are_given_back(device):
     assert held() is None and len(given_back) == 1
 
 
-def test_embree_is_found_beside_the_wheel_and_a_wheel_without_it_is_named(monkeypatch, tmp_path):
-    """Where the loader tells no names of what a library needs, as on Windows, the library itself is looked for."""
+def test_embree_is_found_in_the_wheel_and_its_absence_is_reported(monkeypatch, tmp_path):
+    """Where the extension does not export Embree's symbols, as on Windows, the bundled library is loaded."""
     import embreex
     from embreex import rtcore_scene
 

@@ -140,10 +140,10 @@ def test_gradients_of_the_triplane(device, dtype, channels, height, width):
     for k, axes in enumerate(([0, 1], [0, 2], [1, 2])):
         got = torch.nn.functional.grid_sample(p[:, k], q[None, None, :, axes], align_corners=False)
         parts.append(got[0, :, 0].T)
-        # at a texel's centre the slope jumps, and float32 decides on which side a point is
+        # at a texel's centre the gradient jumps, and float32 decides on which side a point is
         coordinate = (q.detach()[:, axes] + 1) * torch.tensor([width, height]) / 2 - 0.5
-        apart = (coordinate - coordinate.round()).abs()
-        smooth[:, axes] &= (apart > 1e-4) | (apart.isnan())
+        distance = (coordinate - coordinate.round()).abs()
+        smooth[:, axes] &= (distance > 1e-4) | (distance.isnan())
     want = torch.cat(parts, 1)
     # a coordinate of up to 64 texels rounds by 4e-6 of one; values differ by up to 8 from texel to texel
     torch.testing.assert_close(out.detach().cpu()[0].double(), want.detach(), rtol=0, atol=8 * 4e-6)

@@ -26,12 +26,12 @@ def test_values_and_gradients(device):
     got, want = sample_grid(grid, points), twin(grid, points)
     # float32 place between points: 2^-24 of a coordinate of up to 8 cells, times differences of up to 6
     torch.testing.assert_close(got, want.float(), rtol=0, atol=1e-5)
-    slopes = torch.autograd.grad((got * weight).sum(), (grid, points))
+    gradients = torch.autograd.grad((got * weight).sum(), (grid, points))
     wanted = torch.autograd.grad((want * weight.double()).sum(), (grid, points))
-    torch.testing.assert_close(slopes[0], wanted[0].float(), rtol=1e-4, atol=1e-3)  # sums of a hundred products
+    torch.testing.assert_close(gradients[0], wanted[0].float(), rtol=1e-4, atol=1e-3)  # sums of a hundred products
     inside = points.detach().abs().amax(-1) < 1
-    # slopes jump where a coordinate is a grid point's: a few in 5000 are nearer to one than float32 can tell
-    close = ((slopes[1] - wanted[1]).abs().amax(-1) < 1e-3)[inside]
+    # gradients jump where a coordinate is a grid point's: a few in 5000 are nearer to one than float32 can tell
+    close = ((gradients[1] - wanted[1]).abs().amax(-1) < 1e-3)[inside]
     assert float(close.double().mean()) > 0.999
 
 
@@ -72,8 +72,8 @@ def test_the_squared_laplacian_is_that_of_a_convolution(device, shape):
     weight = (weight * (torch.rand(shape, generator=generator) < 0.5)).to(device)  # borders are not 0
     got, want = squared_laplacian(field, weight), laplacian_twin(field, weight)
     torch.testing.assert_close(got.double(), want, rtol=1e-5, atol=1e-6)  # sums of 1e4 squares in float32
-    slopes = [torch.autograd.grad(3.0 * value, field)[0] for value in (got, want)]
-    torch.testing.assert_close(*slopes, rtol=1e-5, atol=1e-3)  # of 7 products of up to 100
+    gradients = [torch.autograd.grad(3.0 * value, field)[0] for value in (got, want)]
+    torch.testing.assert_close(*gradients, rtol=1e-5, atol=1e-3)  # of 7 products of up to 100
 
 
 def test_a_plane_has_no_squared_laplacian(device):
@@ -85,8 +85,8 @@ def test_a_plane_has_no_squared_laplacian(device):
 def test_a_grid_without_inner_points_has_none(device):
     field = torch.randn(2, 5, 5, generator=torch.Generator().manual_seed(0)).to(device).requires_grad_()
     total = squared_laplacian(field, torch.ones_like(field))
-    (slope,) = torch.autograd.grad(total, field)
-    assert float(total.detach()) == 0.0 and not slope.any()
+    (gradient,) = torch.autograd.grad(total, field)
+    assert float(total.detach()) == 0.0 and not gradient.any()
 
 
 def test_bad_fields_are_named():

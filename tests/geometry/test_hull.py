@@ -36,7 +36,7 @@ def test_half_plane_is_exact_for_an_unsaturated_ramp(device):
     got = mask_distance(mask[None].to(device))[0].cpu()
     foot_x, foot_y = x - a * true, y - b * true
     inner = (foot_x > 1) & (foot_x < 49) & (foot_y > 1) & (foot_y < 39)  # the others' foot has no contour
-    # beyond 4 px only the segments beside the nearest crossing are measured, whose ends are at most sqrt(1/2) off
+    # beyond 4 px only the segments at the nearest crossing are evaluated, whose ends are at most sqrt(1/2) off
     torch.testing.assert_close(got[inner], true[inner], rtol=0, atol=math.sqrt(16.5) - 4)
     near = inner & (true.abs() < 3)
     torch.testing.assert_close(got[near], true[near], rtol=0, atol=2e-5)  # float32 of coordinates up to 50
@@ -137,7 +137,7 @@ def test_only_what_is_far_outside_may_differ_where_far_is_given(device):
 @pytest.mark.parametrize("views, eyes, focal", [(8, 3.0, 300.0), (40, 1.2, 120.0), (3, 0.6, 60.0), (1, 3.0, 300.0)])
 @pytest.mark.parametrize("far", [math.inf, 0.2, 0.0])
 def test_a_grid_has_the_values_of_its_points(device, views, eyes, focal, far):
-    """Of ragged masks, of wide angles, of more views than a block tells apart, and of points behind cameras."""
+    """Ragged masks, wide angles, more views than a block culls, and points behind cameras."""
     _, camera = sphere_views(device, n=views, distance=eyes, size=128, focal=focal)
     noise = torch.rand(views, 1, 16, 16, generator=torch.Generator().manual_seed(views))
     masks = torch.nn.functional.interpolate(noise, size=(128, 128), mode="bilinear")[:, 0]

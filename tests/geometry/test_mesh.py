@@ -22,7 +22,7 @@ from tests.support.meshes import mesh_from
 
 def report(mesh):
     found = module.report(mesh)
-    assert watertight(mesh) is found.watertight  # the short way says the same
+    assert watertight(mesh) is found.watertight  # the direct test agrees
     return found
 
 
@@ -113,7 +113,7 @@ def test_defects_are_counted():
     two = [trimesh.creation.box(), trimesh.creation.box().apply_translation([1, 1, 1])]  # meet in a corner
     got = report(joined(*two))
     assert (got.nonmanifold_vertices, got.nonmanifold_edges, got.components) == (1, 0, 1)
-    # two tetrahedra that share an edge
+    # two tetrahedra with a common edge
     v = torch.tensor([[0.0, 0, 0], [0, 0, 1], [1, 0, 0], [1, 1, 0], [-1, 0, 0], [-1, -1, 0]])
     tetra = [[0, 2, 1], [0, 3, 2], [0, 1, 3], [1, 2, 3], [0, 4, 1], [0, 5, 4], [0, 1, 5], [1, 4, 5]]
     got = report(Mesh(v, torch.tensor(tetra, dtype=torch.int32)))

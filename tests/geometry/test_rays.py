@@ -56,7 +56,7 @@ def test_hits_are_those_of_float64_brute_force(device, backend, stretch, shift):
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_rays_at_edges_and_vertices_of_a_closed_mesh_do_not_leak(device, backend):
     """Aimed in float64 at the float32 mesh.  At most 0.5 % of the rays at vertices and 0.02 % of those at edges miss
-    (the exact ray, rounded, passes beside one face and may pass beside its neighbour too); every hit is where it was
+    (the exact ray, rounded, may miss one face and its neighbor too); every hit is where it was
     aimed at, on a face that the float64 oracle hits there."""
     mesh, n = trimesh.creation.icosphere(subdivisions=4), 200_000
     scene, rng = make(mesh.vertices, mesh.faces, backend, device), np.random.default_rng(1)
@@ -222,7 +222,7 @@ def test_reevaluated_hits_and_their_gradients_equal_float64(device):
         torch.linalg.det(torch.stack([b - a, c - a, twin[2]], -1)).abs()
         / ((b - a).norm(dim=-1) * (c - a).norm(dim=-1) * twin[2].norm(dim=-1))
     ).detach()
-    steep = sine > 0.01  # what the ray query itself says of t and bary errs by 1e-7 over that
+    steep = sine > 0.01  # t and bary of the ray query have an error of 1e-7 over that
     torch.testing.assert_close(got.t.cpu()[steep], hits.t.cpu()[steep], rtol=1e-4, atol=1e-5)
     torch.testing.assert_close(got.bary.cpu()[steep], hits.bary.cpu()[steep], rtol=0, atol=2e-4)
     assert len(sine) > 10_000 and float(sine.min()) < 2e-3

@@ -40,9 +40,9 @@ def oracle(vertices, faces, o, d):
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("stretch, shift", PLACES)
 def test_twenty_meshes_and_twenty_thousand_rays_against_every_face(device, backend, stretch, shift):
-    """The same face, or a distance within 1e-5 of the mesh's size; a ray that tells otherwise passes an edge within
+    """The same face, or a distance within 1e-5 of the mesh's size; any other ray passes an edge within
     rounding.  Five meshes where they are stretched or far."""
-    apart, meshes = 0, 20 if (stretch, shift) == PLACES[0] else 5
+    different, meshes = 0, 20 if (stretch, shift) == PLACES[0] else 5
     for seed in range(meshes):
         mesh, faces = bumpy(seed) if seed % 2 else soup(seed, 40 + 10 * seed)
         vertices = placed(mesh, *rays(1), stretch, shift)[0]
@@ -58,11 +58,11 @@ def test_twenty_meshes_and_twenty_thousand_rays_against_every_face(device, backe
             # t counts in lengths of d, which is stretched as the mesh is; the mesh was 3 across
             near = (got - best).abs() <= 1e-5 * 3.0 / plain[1].norm(dim=-1)
             odd = torch.nonzero(~(same | near))[:, 0]
-            apart += len(odd)
+            different += len(odd)
             for i in odd.tolist():  # both faces in question: an edge of either is within 1e-5 of its size
                 margins = [float(inside[i, f]) for f in (int(face[i]), int(first[i])) if f >= 0 and not best[i].isinf()]
                 assert min(abs(m) for m in margins) < 1e-5, (seed, k, i)
-    assert apart <= 1e-5 * meshes * 20_000
+    assert different <= 1e-5 * meshes * 20_000
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -224,8 +224,8 @@ def test_wrong_indices_and_odd_meshes_end_in_an_error_and_never_in_a_crash():
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_no_light_comes_into_a_closed_box_nor_through_a_gap_of_1e_5(device, backend):
-    """Shadow leaks.  A room: what starts on a wall, also at its edges and corners, is blocked.  Two walls 1e-5 apart:
-    what starts between them on the one is blocked by the other, so the offset is small enough."""
+    """Shadow leaks.  A closed box: rays from a wall, also from its edges and corners, are blocked.  Two walls at
+    distance 1e-5: rays from one into the gap are blocked by the other, so the offset is small enough."""
     rng, n = np.random.default_rng(1), 250_000
     box = trimesh.creation.box((2.0, 2.0, 2.0))
     box = box.subdivide().subdivide()

@@ -20,23 +20,23 @@ def lumps(points):
 
 
 def sparse(sdf, near, known=None):
-    asked = []
+    evaluated = []
 
     def evaluate(index):
-        asked.append(index)
+        evaluated.append(index)
         return sdf.view(-1)[index]
 
     got = sparse_sdf(torch.full_like(sdf, 9.0) if known is None else known, near, evaluate)
-    return got, torch.cat(asked)
+    return got, torch.cat(evaluated)
 
 
 @pytest.mark.parametrize("count", [49, 56])  # with and without a last point outside all coarse cells
 def test_same_surface_to_the_bit_from_fewer_points(count):
     sdf = lumps(grid(count))
     near = sdf < 2.0
-    got, asked = sparse(sdf, near)
-    assert len(asked) == len(asked.unique()), "a point is evaluated once"
-    assert len(asked) < 0.75 * int(near.sum())
+    got, evaluated = sparse(sdf, near)
+    assert len(evaluated) == len(evaluated.unique()), "a point is evaluated once"
+    assert len(evaluated) < 0.75 * int(near.sum())
     want = extract_surface(torch.where(near, sdf, 9.0), radius=1.0)
     mesh = extract_surface(got, radius=1.0)
     assert torch.equal(mesh.vertices, want.vertices) and torch.equal(mesh.faces, want.faces)
@@ -65,14 +65,14 @@ def test_a_surface_that_leaves_the_region_is_followed():
 
 def test_nothing_near_asks_for_nothing():
     sdf = torch.ones(8, 8, 8)
-    got, asked = sparse(sdf, torch.zeros(8, 8, 8, dtype=torch.bool), known=sdf)
-    assert len(asked) == 0 and torch.equal(got, sdf)
+    got, evaluated = sparse(sdf, torch.zeros(8, 8, 8, dtype=torch.bool), known=sdf)
+    assert len(evaluated) == 0 and torch.equal(got, sdf)
 
 
 def test_known_values_outside_the_region_are_kept():
     known = torch.full((9, 9, 9), -5.0)
-    got, asked = sparse(known, torch.zeros(9, 9, 9, dtype=torch.bool), known=known)
-    assert len(asked) == 0 and torch.equal(got, known)
+    got, evaluated = sparse(known, torch.zeros(9, 9, 9, dtype=torch.bool), known=known)
+    assert len(evaluated) == 0 and torch.equal(got, known)
 
 
 def test_wrong_grids_are_named():

@@ -91,7 +91,7 @@ def test_every_sign_pattern_is_a_closed_outward_manifold(device):
 
 
 def test_every_sign_pattern_has_a_ball_for_every_connected_part(device):
-    """Corners inside that no edge of the cube joins are apart; nothing has a hole or a bridge: Euler number 2 each."""
+    """Inside corners not connected by cube edges are separate components without handles: Euler number 2 each."""
     blocks = [F.pad(sign_pattern(case), (1,) * 6, value=0.5) for case in range(256)]
     parts = sum(ndimage.label(block.numpy() < 0)[1] for block in blocks)
     sdf = torch.cat([torch.cat(blocks[16 * k : 16 * k + 16], 0) for k in range(16)], 1).to(device)

@@ -118,8 +118,10 @@ def test_gradients_match_finite_differences_of_the_kernel(device):
             cotangent = torch.randn(mesh.vertices.shape, generator=rng).to(device)
         values.append((mesh.vertices * cotangent).sum())
     (got,) = torch.autograd.grad(values[2], leaf)
-    slope = float(((values[1] - values[0]) / 2e-2).detach())  # steps that scale with the sdf keep its signs
-    assert abs(float((got * direction * sdf.abs()).sum()) - slope) < 2e-3 * max(1.0, abs(slope))  # float32, step**2
+    derivative = float(((values[1] - values[0]) / 2e-2).detach())  # steps that scale with the sdf keep its signs
+    assert abs(float((got * direction * sdf.abs()).sum()) - derivative) < 2e-3 * max(
+        1.0, abs(derivative)
+    )  # float32, step**2
 
 
 def test_gradients_in_the_padding_reach_what_they_stand_at(device):
@@ -154,5 +156,7 @@ def test_centre_vertices_split_quads_in_four_with_gradient_to_gamma(device):
         weights["gamma"] = gamma.detach() + step * direction
         moved = extract_surface(sdf, radius=1.0, centre=True, **weights).vertices
         ends.append((moved.double() * cotangent.double()).sum())
-    slope = float((ends[1] - ends[0]) / 2e-3)
-    assert abs(float((got * direction).sum()) - slope) < 2e-2 * max(1.0, abs(slope))  # float32 over a step of 1e-3
+    derivative = float((ends[1] - ends[0]) / 2e-3)
+    assert abs(float((got * direction).sum()) - derivative) < 2e-2 * max(
+        1.0, abs(derivative)
+    )  # float32 over a step of 1e-3

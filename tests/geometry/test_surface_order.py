@@ -117,12 +117,14 @@ def test_gyroid_is_within_a_cube_both_ways_and_of_one_genus_at_any_resolution(de
         euler.append(found.euler)
         cube = 2 / n
         inner = mesh.vertices[mesh.vertices.abs().amax(-1) < 1 - cube].cpu().double()  # not the caps at the box
-        sdf, slope = gyroid(scale * inner)
-        assert float((sdf.abs() / (scale * slope.norm(dim=-1))).max()) < cube  # to first order, and 0.1 cubes in fact
+        sdf, gradient = gyroid(scale * inner)
+        assert (
+            float((sdf.abs() / (scale * gradient.norm(dim=-1))).max()) < cube
+        )  # to first order, and 0.1 cubes in fact
         points = torch.rand(4000, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 1.6 - 0.8
         for _ in range(20):  # Newton: onto the surface
-            sdf, slope = gyroid(scale * points)
-            points = points - slope * (sdf / (scale * slope.square().sum(-1).clamp(min=0.1)))[:, None]
+            sdf, gradient = gyroid(scale * points)
+            points = points - gradient * (sdf / (scale * gradient.square().sum(-1).clamp(min=0.1)))[:, None]
         points = points[(points.abs().amax(-1) < 0.9) & (gyroid(scale * points)[0].abs() < 1e-9)]
         assert len(points) > 3000
         assert cKDTree(samples_of(mesh)).query(points.numpy())[0].max() < cube

@@ -27,7 +27,7 @@ def test_values_and_gradients_match_grid_sample_in_float64(device, channels, hei
     g_got = torch.autograd.grad((got * weights).sum(), (planes, points))
     g_want = torch.autograd.grad((want * weights.double()).sum(), reference)
     torch.testing.assert_close(g_got[0].double(), g_want[0], rtol=0, atol=4e-5)  # of 600 points where there is 1 texel
-    # the slope jumps at a texel centre, which rounding may move a point across: none of these 600 points lies there
+    # the gradient jumps at a texel centre, which rounding may move a point across: none of these 600 points lies there
     for a, b in zip((got, *g_got), (want, *g_want), strict=True):
         assert share_within(a, b) >= 0.999
 

@@ -117,7 +117,7 @@ def test_any_number_of_views_in_any_order(model, views):
 def test_mirror_images_have_the_mirrored_maps(model):
     """The 2D U-Net does not read them; normals and points that they show are the photographs' ones, mirrored."""
     images, masks, c2w, intrinsics = sphere(3)
-    intrinsics = intrinsics + torch.tensor([0.0, 0.0, 1.5, -0.5])  # a picture that is not symmetric about its middle
+    intrinsics = intrinsics + torch.tensor([0.0, 0.0, 1.5, -0.5])  # principal point off the image centre
     plane = MirrorPlane(normalize(torch.tensor([2.0, 0.3, 1.0]), dim=0), 0.07)
     other = plane.mirrored(Camera(c2w, intrinsics, SIZE, SIZE))
     views = [torch.cat([t, t.flip(2)]) for t in (images, masks)]
@@ -155,7 +155,7 @@ def test_a_turn_of_the_world_turns_the_light(model):
         other = encoded(model, images, masks, turned(c2w, yaw), intrinsics).log_light
         expected = torch.roll(field.log_light, -4, 2)  # from +X, the centre, towards -Z, which lies to the left
         wrong = torch.roll(field.log_light, 4, 2)
-        # pixels beside the border of a texel may fall to its other side: 2 to 4 % with four seeds of the weights
+        # pixels at the border of a texel may fall on the other side: 2 to 4 % with four seeds of the weights
         assert float((other - expected).abs().mean()) < 0.06 * float((wrong - expected).abs().mean())
 
 

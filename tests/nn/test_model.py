@@ -44,7 +44,7 @@ def test_tiny_system_matches_published_end_to_end(tiny):
     model.upsampler.register_forward_pre_hook(lambda module, inputs: raw.append(inputs[0]))
     code = model.encode(g["image"], g["mask"].squeeze(-1), g["c2w"], torch.ones(1, 2, 4))
 
-    def close(got, expected):  # float32 through all blocks; the bound is the one asked for, measured about 1e-6
+    def close(got, expected):  # float32 through all blocks; the bound is the required one, measured about 1e-6
         assert (got - expected).abs().max() < 1e-4 * expected.abs().max()
 
     close(model.camera(numbers), g["camera_embedding"])
@@ -145,8 +145,8 @@ def test_truncated_exp_bounds_its_slope_only():
     x = torch.tensor([0.0, 14.0, 20.0], requires_grad=True)
     y = truncated_exp(x)
     torch.testing.assert_close(y, x.exp())
-    (slope,) = torch.autograd.grad(y.sum(), x)
-    torch.testing.assert_close(slope, torch.tensor([0.0, 14.0, 15.0]).exp())
+    (derivative,) = torch.autograd.grad(y.sum(), x)
+    torch.testing.assert_close(derivative, torch.tensor([0.0, 14.0, 15.0]).exp())
 
 
 def test_deformation_stays_below_half_a_cell():

@@ -227,5 +227,5 @@ def test_gradients_of_a_shared_bank_are_those_of_its_copies_added_up(golden):
     bank, views = g["input"][:1].squeeze(1).requires_grad_(), g["cross"]
     (shared,) = torch.autograd.grad(module(bank, views).square().sum(), bank)
     copies = bank.detach().double().repeat(2, 1, 1).requires_grad_()
-    (apart,) = torch.autograd.grad(module.double()(copies, views.double()).square().sum(), copies)
-    assert_relative(shared.double(), apart.sum(0, keepdim=True), 1e-4)  # float32 backward through three blocks
+    (separate,) = torch.autograd.grad(module.double()(copies, views.double()).square().sum(), copies)
+    assert_relative(shared.double(), separate.sum(0, keepdim=True), 1e-4)  # float32 backward through three blocks

@@ -11,7 +11,7 @@ from reli3d.nn.reni import EnvironmentDecoder, from_published, reni_frame, to_pu
 from reli3d.nn.weights import WeightsError, read_manifest, read_tensors
 from reli3d.render.latlong import lat_long_directions
 
-# Float32 through six norms, then exp; measured 6e-6 of the value.  The bound is the one asked for.
+# Float32 through six norms, then exp; measured 6e-6 of the value.  The bound is the required one.
 MAP = dict(rtol=1e-4, atol=1e-6)
 
 

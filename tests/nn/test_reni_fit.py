@@ -45,7 +45,7 @@ def test_a_decoded_map_is_found_again(decoder, height):
         again = decoder(fit.latent[None], fit.rotation[None], fit.strength[None], height)
     rows = torch.sin((torch.arange(height, device=device) + 0.5) * math.pi / height)[:, None, None]
     measured = float(((again.log() - radiance.log()).abs() * rows).mean() / rows.mean())
-    assert measured < 1.3 * fit.error  # what it says, but for the floor of the logarithm
+    assert measured < 1.3 * fit.error  # the reported error, up to the floor of the logarithm
     twice = fit_latent(decoder, 2.0 * radiance[0], steps=120)
     torch.testing.assert_close(
         twice.strength - fit.strength, torch.tensor(math.log(2.0), device=device), rtol=0, atol=1e-3

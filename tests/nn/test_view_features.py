@@ -85,7 +85,7 @@ def test_the_kernel_matches_plain_torch(device, views, on_surface):
 
 
 def test_gathered_values_and_gradients_equal_their_float64_twin(device):
-    """Border values outside, any channels; the slope of a point by its length, because image and pixels pull apart."""
+    """Clamped at the border, any channels; gradients of points compared by row, as those of image and pixels cancel."""
     g, n = torch.Generator().manual_seed(3), 20_000
     maps, points = torch.rand(3, 24, 20, 5, generator=g), torch.rand(n, 3, generator=g) * 1.6 - 0.8
     poses = rig(3, device).camera
@@ -132,8 +132,10 @@ def test_gradients_reach_the_tokens_and_match_finite_differences(device):
     loss = lambda t: module(ViewMaps(t, maps.images, maps.camera), points, visible, normal)[0].sum()  # noqa: E731
     (grad,) = torch.autograd.grad(loss(tokens), tokens)
     step = torch.randn(tokens.shape, generator=torch.Generator().manual_seed(1)).to(device)
-    slope = (loss(tokens + 1e-2 * step) - loss(tokens - 1e-2 * step)) / 2e-2
-    assert float((grad * step).sum()) == pytest.approx(float(slope.detach()), rel=1e-2)  # float32 sums of 64 x 48 terms
+    derivative = (loss(tokens + 1e-2 * step) - loss(tokens - 1e-2 * step)) / 2e-2
+    assert float((grad * step).sum()) == pytest.approx(
+        float(derivative.detach()), rel=1e-2
+    )  # float32 sums of 64 x 48 terms
 
 
 def test_half_of_the_arguments_of_a_surface_is_an_error(device):

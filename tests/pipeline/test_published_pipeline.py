@@ -33,7 +33,7 @@ def tiny():
     """The network of the golden ``tiny_system``: its field crosses the threshold all over the cube."""
     goldens = SHARED / "reference" / "goldens"
     if not goldens.is_dir():
-        pytest.skip("needs the folder ../shared/reference/goldens beside the checkout")
+        pytest.skip("needs the folder ../shared/reference/goldens next to the checkout")
     model = Reconstructor(TINY).eval()
     with np.load(goldens / "tiny_system.npz") as file:
         stored = {k[6:]: torch.from_numpy(file[k]) for k in file.files if k.startswith("param.")}

@@ -100,13 +100,13 @@ def test_every_form_gives_the_same_cameras_and_pictures(tmp_path):
         assert all(torch.equal(a, b) for a, b in zip(views.masks, first.masks))
 
 
-def apart(a: torch.Tensor, b: torch.Tensor) -> float:
+def distance(a: torch.Tensor, b: torch.Tensor) -> float:
     """Mean distance of points to the nearest of the others, both ways."""
     ways = cKDTree(b.numpy()).query(a.numpy())[0].mean(), cKDTree(a.numpy()).query(b.numpy())[0].mean()
     return float(np.mean(ways))
 
 
-def paint(asset) -> torch.Tensor:
+def mean_base_color(asset) -> torch.Tensor:
     """Mean base colour at the vertices."""
     at = (asset.mesh.uv * asset.textures.size).long().clamp(0, asset.textures.size - 1)
     return asset.textures.base_color[at[:, 1], at[:, 0]].mean()
@@ -118,9 +118,9 @@ def test_every_form_gives_the_same_asset(tmp_path):
     first, *others = (reconstruct(load_views(write_form(tmp_path / form, form)), options=options) for form in FORMS)
     for asset in others:
         # cameras differ in the last bit of float32, which a network and a surface carry on
-        assert apart(asset.mesh.vertices, first.mesh.vertices) < 1e-4
+        assert distance(asset.mesh.vertices, first.mesh.vertices) < 1e-4
         # the mean over the vertices: where charts end, the next texel may be another
-        assert float(paint(asset)) == pytest.approx(float(paint(first)), rel=1e-2)
+        assert float(mean_base_color(asset)) == pytest.approx(float(mean_base_color(first)), rel=1e-2)
         light = float(first.environment.radiance.mean())
         assert float(asset.environment.radiance.mean()) == pytest.approx(light, rel=1e-2)
 
@@ -157,4 +157,4 @@ def test_many_photographs_from_one_place_do_not_hide_the_others(tmp_path):
         mesh = reconstruct(loaded, options=ReconstructOptions(texture_size=256, resolution=48)).mesh
         solid = trimesh.Trimesh(mesh.vertices.numpy(), mesh.faces.numpy(), process=False)
         meshes[name] = torch.from_numpy(trimesh.sample.sample_surface(solid, 20000, seed=0)[0])
-    assert apart(meshes["four"], meshes["sixty"]) < 0.01  # the sampling alone gives 0.004
+    assert distance(meshes["four"], meshes["sixty"]) < 0.01  # the sampling alone gives 0.004
