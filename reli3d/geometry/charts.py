@@ -23,10 +23,10 @@ CPU = torch.device("cpu")
 COS_LABEL = 0.4  # a face keeps an axis only up to 66 degrees from its normal: at most 2.5 times stretched
 COS_MERGE = 0.25  # for charts of a few texels, where a border costs more than stretch
 COS_TILT = 0.3  # a chart is projected along its mean normal if no face is seen more obliquely
-SMOOTHING = 2  # rounds in which the normal takes up those of the neighbours
-MAJORITY = 4  # rounds of the majority vote along label borders
-MERGING = 4  # rounds in which small charts join their neighbours
-CUTTING = 4  # rounds in which charts that fill their box badly are cut in two
+NORMAL_ROUNDS = 2  # in which normals are averaged with those of neighbors
+MAJORITY_ROUNDS = 4  # of the majority vote along label borders
+MERGE_ROUNDS = 4  # in which small charts join their neighbors
+CUT_ROUNDS = 4  # in which charts that fill their box poorly are cut in two
 CUT_WASTE = 0.002  # of the atlas: empty area of a chart's box from which a cut is tried
 CUT_FILL = 0.6  # of its box: a chart that covers more is left whole
 CUT_GAIN = 0.85  # boxes of the two pieces over the box of the chart, at most ...
@@ -80,7 +80,7 @@ def axis_labels(normal: torch.Tensor, neighbours: np.ndarray) -> np.ndarray:
     """Axis 0..5 (as AXES) of every face, with smooth borders.  ``normal``: (F, 3), length twice the area."""
     n, links = len(normal), _ints(neighbours)
     smoothed = normal
-    for _ in range(SMOOTHING):
+    for _ in range(NORMAL_ROUNDS):
         rough, smoothed = smoothed, torch.empty_like(normal)
         _bridge.launch(kernels.smooth_kernel, n, [links, (rough, wp.vec3), (smoothed, wp.vec3)], CPU, slice_min=LIGHT)
     label = torch.empty(n, dtype=torch.int32, device="cpu")
@@ -91,7 +91,7 @@ def axis_labels(normal: torch.Tensor, neighbours: np.ndarray) -> np.ndarray:
         CPU,
         slice_min=LIGHT,
     )
-    for _ in range(MAJORITY):
+    for _ in range(MAJORITY_ROUNDS):
         voted = torch.empty_like(label)
         _bridge.launch(
             kernels.majority_kernel,
@@ -110,7 +110,7 @@ def merge_small(label: np.ndarray, normal: np.ndarray, neighbours: np.ndarray, l
     Of several such labels the one with the most common edges; several rounds, each from larger neighbours.
     """
     area = np.sqrt(np.einsum("fk,fk->f", normal, normal)) * 0.5
-    for _ in range(MERGING):
+    for _ in range(MERGE_ROUNDS):
         chart, count = components(neighbours, label)
         total = np.bincount(chart, area, count)
         faces = np.flatnonzero((total < least)[chart])
@@ -246,11 +246,11 @@ def _cut_bulky(
     cut = np.flatnonzero(bulky)[best_angle >= 0]
     if not len(cut):
         return None
-    direction, level = np.zeros((len(area), 3)), np.full(len(area), np.inf)
+    direction, threshold = np.zeros((len(area), 3)), np.full(len(area), np.inf)
     turn = angles[best_angle[best_angle >= 0]][:, None]
     direction[cut] = right[cut] * np.cos(turn) + up[cut] * np.sin(turn)
-    level[cut] = best_at[best_angle >= 0]
-    upper = np.einsum("fk,fk->f", points, direction[chart]) > level[chart]
+    threshold[cut] = best_at[best_angle >= 0]
+    upper = np.einsum("fk,fk->f", points, direction[chart]) > threshold[chart]
     pieces, number = components(neighbours, 2 * chart + upper)
     parent = np.zeros(number, np.int64)
     parent[pieces] = chart
@@ -355,7 +355,7 @@ def make_charts(
     chart, count = components(neighbours, label)
     right, up = _frames(normal, label, chart, count)
     centres = local[faces].mean(1).astype(np.float64)
-    for _ in range(CUTTING):
+    for _ in range(CUT_ROUNDS):
         cut = _cut_bulky(
             centres, chart, right, up, np.bincount(chart, size, count), CUT_WASTE * texels, longest, neighbours
         )

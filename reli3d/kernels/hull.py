@@ -436,13 +436,13 @@ def mask_distance_kernel(
             cell_x = int(at[0])
             cell_y = near_y
             best = wp.length_sq(at - p)
-    reach = wp.int32(1)  # the cell's lower neighbours, which share the crossing
+    neighbors = wp.int32(1)  # the cell's lower neighbours, which have the same crossing
     if best < EXACT_PIXELS * EXACT_PIXELS:
-        reach = 2
+        neighbors = 2
     if best > SEGMENT_PIXELS * SEGMENT_PIXELS:
-        reach = -1  # no cell
-    for v in range(cell_y - 1, cell_y + reach):
-        for u in range(cell_x - 1, cell_x + reach):
+        neighbors = -1  # no cell
+    for v in range(cell_y - 1, cell_y + neighbors):
+        for u in range(cell_x - 1, cell_x + neighbors):
             inner = v >= 0 and v < height - 1 and u >= 0 and u < width - 1
             if inner and crosses(mask, view, v, u):
                 best = wp.min(best, squared_to_contour(mask, view, v, u, p))

@@ -20,7 +20,7 @@ from reli3d.kernels.view_features import (
     view_summary_kernel,
 )
 
-BLOCK = 8  # floats of a kernels.vec8
+BLOCK_CHANNELS = 8  # floats of a kernels.vec8
 NUMBERS = 9  # features of a view at a point; the summary over the views has the same width
 HIDDEN, SPREAD = 32, 24  # widths of the two layers of spread_views, fixed in its kernel
 
@@ -62,16 +62,16 @@ def pool_views(
     check("tokens", tokens, like=images)
     check("mix", mix, like=images)
     hidden = tokens.shape[-1]
-    if tokens.ndim != 4 or tokens.shape[0] != len(images) or min(tokens.shape[1:3]) < 2 or hidden % BLOCK:
+    if tokens.ndim != 4 or tokens.shape[0] != len(images) or min(tokens.shape[1:3]) < 2 or hidden % BLOCK_CHANNELS:
         raise ValueError(
-            f"tokens: expected ({len(images)}, P, P, H), P at least 2 and H a multiple of {BLOCK}, "
+            f"tokens: expected ({len(images)}, P, P, H), P at least 2 and H a multiple of {BLOCK_CHANNELS}, "
             f"got {tuple(tokens.shape)}"
         )
     if tuple(mix.shape) != (NUMBERS, hidden):
         raise ValueError(f"mix: expected shape {(NUMBERS, hidden)}, got {tuple(mix.shape)}")
     pooled = points.new_empty(n, hidden)
-    layer = [(t.detach().contiguous().unflatten(-1, (-1, BLOCK)), vec8) for t in (tokens, mix)]
-    outs = [(pooled.unflatten(-1, (-1, BLOCK)), vec8), (out, wp.float32)]
+    layer = [(t.detach().contiguous().unflatten(-1, (-1, BLOCK_CHANNELS)), vec8) for t in (tokens, mix)]
+    outs = [(pooled.unflatten(-1, (-1, BLOCK_CHANNELS)), vec8), (out, wp.float32)]
     launch(pool_views_kernel, n, [viewed, *layer, *outs], points.device)
     return pooled, out
 
@@ -97,9 +97,9 @@ def spread_views(
         check(name, value, like=images)
         if tuple(value.shape) != shape or (name == "tokens" and min(shape[1:3]) < 2):
             raise ValueError(f"{name}: expected shape {shape}, got {tuple(value.shape)}")
-    layers = [(value.detach().contiguous().unflatten(-1, (-1, BLOCK)), vec8) for value, _ in shapes.values()]
+    layers = [(value.detach().contiguous().unflatten(-1, (-1, BLOCK_CHANNELS)), vec8) for value, _ in shapes.values()]
     pooled = points.new_empty(n, 2 * SPREAD)
-    outs = [(pooled.unflatten(-1, (-1, BLOCK)), vec8), (out, wp.float32)]
+    outs = [(pooled.unflatten(-1, (-1, BLOCK_CHANNELS)), vec8), (out, wp.float32)]
     launch(spread_views_kernel, n, [viewed, *layers, *outs], points.device)
     return pooled, out
 

@@ -18,7 +18,9 @@ from reli3d.geometry.rays import RayScene
 from reli3d.render.environment import Environment
 from reli3d.render.latlong import lat_long_directions, texel_solid_angles
 
-HEIGHT = 0.05  # of a mean edge, from where rays start: above the facets of a smooth surface that is convex
+RAY_OFFSET_EDGES = (
+    0.05  # ray origins above the surface, in mean edge lengths: clears the facets of smooth convex surfaces
+)
 
 
 def spherical_harmonics(directions: Tensor) -> Tensor:
@@ -74,7 +76,7 @@ def blocked_transfer(mesh: Mesh, *, directions: int = 64, scene: RayScene | None
     first, label = weld_rows(torch.cat([mesh.vertices.detach(), normals], 1).cpu().numpy())  # seams have copies
     rows = torch.from_numpy(first).to(device)
     position, normal = mesh.vertices.detach()[rows], normals[rows]
-    start = position + HEIGHT * _mean_edge(mesh) * normal
+    start = position + RAY_OFFSET_EDGES * _mean_edge(mesh) * normal
     toward = sphere_spiral(directions).to(device)
     cosine = (normal @ toward.T).clamp(min=0.0)
     above = cosine > 0.0

@@ -15,11 +15,11 @@ from tests.support.op_cases import Case, N, rng
 
 CASES = {**op_cases.CASES, **op_cases_plain.CASES}
 DIFFERENTIABLE = [name for name, case in CASES.items() if case.grads]
-FEW = 40  # rows where their number does not matter
+ROWS = 40  # rows where their number does not matter
 STEP = 3e-5  # of finite differences of derivatives: longer steps cross kinks of the mean absolute deviation
 
 
-def leaves_of(case: Case, device, n: int = FEW, requires_grad=None) -> dict:
+def leaves_of(case: Case, device, n: int = ROWS, requires_grad=None) -> dict:
     requires_grad = case.grads if requires_grad is None else requires_grad
     return {k: v.to(device).requires_grad_(k in requires_grad) for k, v in case.inputs(n).items()}
 
@@ -69,9 +69,10 @@ def test_an_expanded_row_is_as_good_as_its_copies(device, name):
     case = CASES[name]
     rows = {k: v.detach()[:1] if k in case.rows else v.detach() for k, v in leaves_of(case, device).items()}
     one = {k: v.clone().requires_grad_(k in case.grads) for k, v in rows.items()}
-    wide = {k: v.expand(FEW, *v.shape[1:]) if k in case.rows else v for k, v in one.items()}
+    wide = {k: v.expand(ROWS, *v.shape[1:]) if k in case.rows else v for k, v in one.items()}
     copies = {
-        k: v.detach().repeat(FEW, *[1] * (v.ndim - 1)) if k in case.rows else v.detach().clone() for k, v in one.items()
+        k: v.detach().repeat(ROWS, *[1] * (v.ndim - 1)) if k in case.rows else v.detach().clone()
+        for k, v in one.items()
     }
     copies = {k: v.requires_grad_(k in case.grads) for k, v in copies.items()}
     outs, others = case.run(**wide), case.run(**copies)

@@ -1,6 +1,7 @@
 """The layout of the package: who imports whom, and that importing it is cheap and silent."""
 
 import ast
+import dataclasses
 import graphlib
 import importlib
 import re
@@ -11,6 +12,7 @@ from pathlib import Path
 import pytest
 
 import reli3d
+from reli3d.nn import presets
 from tests.support.checkout import ROOT
 from tests.support.layers import LAYERS
 
@@ -105,6 +107,58 @@ def test_the_import_check_allows_what_it_should():
     source = "import warp as wp\nfrom reli3d.kernels import math\nfrom .._bridge import call\nfrom . import mesh"
     assert violations(source, "reli3d.geometry.rays") == []
     assert violations("from reli3d import Mesh, sample_triplane", "reli3d.nn.model") == []
+
+
+PRESETS = (presets.OFFICIAL, presets.TINY, presets.SMALL)
+
+
+def fields_of(value) -> dict[str, set]:
+    """Values of all fields of a preset by name, those of nested dataclasses included."""
+    found: dict[str, set] = {}
+    for field in dataclasses.fields(value):
+        inner = getattr(value, field.name)
+        nested = fields_of(inner) if dataclasses.is_dataclass(inner) else {field.name: {inner}}
+        for name, values in nested.items():
+            found[name] = found.get(name, set()) | values
+    return found
+
+
+def constants_of_presets(source: str) -> list[str]:
+    """Constants in ``source`` that repeat a preset: the name of one of its fields, or the half side of its cubes."""
+    fields = [fields_of(preset) for preset in PRESETS]
+    names = {name.upper() for found in fields for name in found}
+    radii = {radius for found in fields for radius in found["radius"]}
+    tree, bad = ast.parse(source), []
+    for node in tree.body:
+        targets = (
+            node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AnnAssign) else []
+        )
+        inner = [part for target in targets for part in ast.walk(target) if isinstance(part, ast.Name)]
+        bad += [part.id for part in inner if part.id in names]
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, float) and node.value in radii:
+            bad.append(str(node.value))
+    return bad
+
+
+def test_kernels_geometry_and_render_contain_no_constant_of_a_preset():
+    below = [path for path in SOURCES if part_of(name_of(path)) in ("kernels", "geometry", "render")]
+    found = {name_of(path): constants_of_presets(path.read_text()) for path in below}
+    assert len(found) > 50 and {name: bad for name, bad in found.items() if bad} == {}
+
+
+@pytest.mark.parametrize(
+    "source, count",
+    [
+        ("SOFTNESS = 0.03", 1),
+        ("HEAD_WIDTH, OTHER = 64, 1", 1),
+        ("def f(radius=0.87): ...", 1),
+        ("SIDE: int = 40\nCLIP = 0.56", 2),
+        ("MARGIN = 0.5\nsoftness = 1.0", 0),
+    ],
+)
+def test_the_check_of_presets_sees_what_it_should(source, count):
+    assert len(constants_of_presets(source)) == count
 
 
 def of_other_tests(source: str, folder: str) -> list[str]:
