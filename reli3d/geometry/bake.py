@@ -30,7 +30,7 @@ TILES_MIN = 16  # tiles a CPU slice: each of them walks its list of faces for 25
 
 @dataclass(frozen=True)
 class Texels:
-    """What :func:`rasterize_texels` finds."""
+    """Result of :func:`rasterize_texels`."""
 
     face: Tensor  # (T, T) int32, -1 where no surface is near
     bary: Tensor  # (T, T, 2) weights of vertices 1 and 2
@@ -74,7 +74,7 @@ def _bins(lower: Tensor, upper: Tensor, size: int, tile: int) -> tuple[Tensor, T
 
 
 def _tiles(corners: Tensor, lower: Tensor, upper: Tensor, size: int, tile: int) -> kernels.Tiles:
-    """What the kernels read of faces ``corners (F, 3, 2)``, whose boxes are ``lower`` to ``upper``."""
+    """Kernel struct of faces ``corners (F, 3, 2)``, whose boxes are ``lower`` to ``upper``."""
     start, faces = ((t, wp.int32) for t in _bins(lower, upper, size, tile))
     corner = corners, wp.vec2
     return struct_of(kernels.Tiles, corners=corner, face_start=start, face_list=faces, size=size, tile=tile)

@@ -1,4 +1,4 @@
-"""What a ray hit, with gradients: the hit itself re-evaluated, vertex attributes and geometric normals at hits.
+"""Differentiable evaluation of hits: the hit itself re-evaluated, vertex attributes and geometric normals at hits.
 
 Which face is hit has no gradient; everything evaluated at the hit has one.
 """

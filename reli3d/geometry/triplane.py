@@ -98,7 +98,7 @@ class _SampleTriplane(torch.autograd.Function):
 
 
 def sizes_of(points: int, height: int, width: int, blocks: int) -> kernels.Sizes:
-    """What the kernels read of points of each triplane, texels of a plane and blocks of 8 channels."""
+    """Kernel struct of the numbers of points, texels of a plane and blocks of 8 channels."""
     return struct_of(kernels.Sizes, points=points, height=height, width=width, blocks=blocks)
 
 

@@ -47,7 +47,7 @@ numpy.savez(sys.argv[2], source=source, faces=faces, uv=uv)
 
 @dataclass(frozen=True)
 class AtlasReport:
-    """What :func:`atlas_report` measures; areas are of the unit square of UV."""
+    """Result of :func:`atlas_report`; areas are fractions of the UV unit square."""
 
     charts: int  # connected through equal UV vertices
     utilisation: float  # fraction of the square that faces cover, overlap counted once
@@ -315,7 +315,7 @@ def unwrap_xatlas(mesh: Mesh, *, texture_size: int = 1024, timeout_s: float = 12
 
 
 def source_vertices(whole: Mesh, mesh: Mesh) -> Tensor:
-    """Which vertex of ``whole`` each vertex of ``mesh``, the same after :func:`unwrap`, was split from: ``(V,)`` int32.
+    """Vertex of ``whole`` that each vertex of ``mesh``, its result of :func:`unwrap`, was split from: ``(V,)`` int32.
 
     Faces and their corners have the same order in both; a vertex without a face gets 0.  Raises ValueError where the
     numbers of faces differ.

@@ -176,7 +176,7 @@ def before(t_max: float) -> float:
 
 @wp.func
 def stretch_of(direction: wp.vec3) -> float:
-    """What a direction is multiplied by for Embree."""
+    """Factor on a direction before it is passed to Embree."""
     return wp.where(largest(direction) < SHORT, LENGTHEN, 1.0)
 
 

@@ -236,7 +236,7 @@ def draw_sample(surface: Surface, plan: Plan, light: Light, sample: int) -> Draw
 
 @wp.func
 def sample_value(surface: Surface, plan: Plan, draw: Draw, light: wp.vec3) -> wp.vec3:
-    """What a sample adds if nothing is in its way; at most the plan's clamp over its strategy's count."""
+    """Contribution of an unoccluded sample, clamped to the plan's clamp divided by the sample count of its strategy."""
     value = eval_bsdf(
         draw.facet, surface.wo, draw.wi, surface.base_color, surface.alpha, surface.metallic, plan.conserving
     )

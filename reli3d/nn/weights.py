@@ -166,7 +166,7 @@ def check_keys(where: object, got: Mapping[str, tuple[int, ...]], expected: Mapp
 
 
 def official_path() -> Path:
-    """Where the converted official weights lie: in the folder ``RELI3D_WEIGHTS``, default ``~/.cache/reli3d``."""
+    """Path of the converted official weights: in the folder ``RELI3D_WEIGHTS``, default ``~/.cache/reli3d``."""
     return Path(os.environ.get("RELI3D_WEIGHTS") or Path.home() / ".cache" / "reli3d") / "official.safetensors"
 
 
