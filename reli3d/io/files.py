@@ -39,14 +39,14 @@ def file_size(path: str | os.PathLike) -> int:
 
 
 def write_bytes(path: str | os.PathLike, data: bytes) -> None:
-    """Write a whole file or nothing: a temporary file beside it, then a rename.  Raises OSError."""
+    """Write a file atomically: a temporary file in the same folder, then a rename.  Raises OSError."""
     with replacing(path) as temporary:
         temporary.write_bytes(data)
 
 
 @contextlib.contextmanager
 def replacing(path: str | os.PathLike):
-    """Yield a temporary path beside ``path``; it takes the place of ``path`` when the block ends without an error."""
+    """Yield a temporary path in the folder of ``path``; it replaces ``path`` when the block ends without an error."""
     path = Path(path)
     temporary = path.with_name(
         f".{os.getpid()}.{os.urandom(4).hex()}{path.suffix[-8:]}"

@@ -20,7 +20,7 @@ from reli3d.render.color import srgb_to_linear
 from reli3d.render.gbuffer import sample_texture, wrap_uv
 
 FORMATS = ("PNG", "JPEG", "WEBP")
-MAX_SCALE = 1e6  # of a normal texture's slopes: beyond it float32 has only the plane
+MAX_SCALE = 1e6  # of a normal texture: beyond it, float32 loses the normal's z
 PLAIN = 4  # texels along a side of a texture without an image
 MAX_SIDE = 4096  # texels along a side of textures that are resampled to one layout
 WRAPS = {10497: "repeat", 33648: "mirror", 33071: "clamp"}

@@ -62,7 +62,7 @@ def read_parts(
 def has_material_maps(path: str | os.PathLike, *, max_bytes: int = 1 << 29, max_vertices: int = 20_000_000) -> bool:
     """Whether a material of the file has a metallic-roughness texture.
 
-    Without one its roughness and metallic are two numbers, which exporters fill in where nobody chose them.  Raises
+    Without one its roughness and metallic are two numbers, which exporters write as defaults.  Raises
     InputError as :func:`read_parts` does.
     """
     document = Document(path, max_bytes=max_bytes, max_vertices=max_vertices)

@@ -28,7 +28,8 @@ MAX_PIXELS = 1 << 25  # 8192 x 4096
 
 
 def read_environment(path: str | os.PathLike, *, notes: list[str] | None = None) -> Environment:
-    """Environment of a lat-long ``.hdr`` or ``.exr`` file, ``(H, 2H, 3)`` linear radiance; its content tells which.
+    """Environment of a lat-long ``.hdr`` or ``.exr`` file, ``(H, 2H, 3)`` linear radiance; the format is detected by
+    content.
 
     Row 0 is +Y, the center column +X, right of it +Z.  What was converted, clamped or not applied is appended to
     ``notes``, one line each.  Raises InputError on a broken file, NaN, a shape other than 2:1, or a map above

@@ -1,8 +1,8 @@
-"""Photographs and masks in, PNG out.
+"""Reads images and masks, writes PNG, OpenEXR and Radiance HDR images.
 
 Colour is sRGB in [0, 1] as stored; alpha is straight (not premultiplied), and the colour under alpha 0 is kept.  Pixels
 are used as stored: an EXIF orientation is noted and not applied, because calibrated cameras refer to the stored pixels,
-unless the size they were calibrated for says that they refer to the turned ones.
+unless the size in the camera file shows that they refer to the turned ones.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ MAX_SCANS = 100  # progressive files have about ten; a thousand in a small file 
 ORIENTATION = 0x0112  # of EXIF; 5 to 8 swap the sides
 ASPECT = 0.01  # relative difference up to which two sizes have the same aspect
 _TOP = {"L": 255, "RGB": 255, "RGBA": 255, "F": 65535}  # mode: the value that is 1
-_DECODING = BoundedSemaphore(2)  # pictures at a time: one of 24 MP takes 96 MB
+_DECODING = BoundedSemaphore(2)  # images at a time: one of 24 MP takes 96 MB
 _OPENING = Lock()  # Python's warning filters are global; decoding runs outside
 _GREY = ("1", "L", "LA", "I;16", "I;16B", "I;16L", "I")
 _COLOUR = ("RGB", "RGBA", "P", "PA", "CMYK", "YCbCr")
@@ -52,37 +52,37 @@ def read_image(path: str | os.PathLike, *, notes: list[str] | None = None) -> tu
 
     As :func:`read_picture` reads it.
     """
-    picture = read_picture(path, notes=notes)
-    alpha = torch.from_numpy(unit(picture.getchannel("A"))) if picture.mode == "RGBA" else None
-    return colour(picture), alpha
+    bitmap = decode_image(path, notes=notes)
+    alpha = torch.from_numpy(unit(bitmap.getchannel("A"))) if bitmap.mode == "RGBA" else None
+    return color_of(bitmap), alpha
 
 
-def colour(picture: Image.Image) -> Tensor:
+def color_of(bitmap: Image.Image) -> Tensor:
     """Colour ``(H, W, 3)`` in [0, 1] of what :func:`read_picture` gives."""
-    values = unit(picture)
+    values = unit(bitmap)
     return torch.from_numpy(np.repeat(values[..., None], 3, -1) if values.ndim == 2 else values)
 
 
-def unit(picture: Image.Image) -> np.ndarray:
-    """Values of a picture, or of a channel of it, over their highest, without alpha: float32 in [0, 1]."""
-    values = np.asarray(picture)
-    return np.divide(values[..., :3] if values.ndim == 3 else values, np.float32(_TOP[picture.mode]), dtype=np.float32)
+def unit(bitmap: Image.Image) -> np.ndarray:
+    """Values of an image or channel without alpha, normalized by the mode's maximum: float32 in [0, 1]."""
+    values = np.asarray(bitmap)
+    return np.divide(values[..., :3] if values.ndim == 3 else values, np.float32(_TOP[bitmap.mode]), dtype=np.float32)
 
 
 def above(channel: Image.Image, limit: float) -> np.ndarray:
     """``(H, W)`` bool: where a channel exceeds ``limit`` of its highest value."""
-    level = limit * _TOP[channel.mode]
-    return np.asarray(channel) > (level if channel.mode == "F" else np.uint8(level))  # no array of floats beside it
+    threshold = limit * _TOP[channel.mode]
+    return np.asarray(channel) > (threshold if channel.mode == "F" else np.uint8(threshold))  # without a float copy
 
 
-def read_picture(
+def decode_image(
     path: str | os.PathLike, *, notes: list[str] | None = None, calibrated: tuple[int, int] | None = None
 ) -> Image.Image:
-    """A decoded picture of mode RGB, RGBA, L, or F for grey of 16 bits in [0, 65535].
+    """Decodes an image to mode RGB, RGBA, L, or F for grey of 16 bits in [0, 65535].
 
     PNG, JPEG, WebP or TIFF; 8 bit, palette, grey, CMYK, 16-bit grey; 16-bit colour comes down to 8 bit.  The size is
     checked before a pixel is decoded.  What was done to the pixels is appended to ``notes``.  calibrated: width and
-    height that the camera file states; where only the picture turned by its EXIF orientation has that aspect, it is
+    height that the camera file states; where only the image turned by its EXIF orientation has that aspect, it is
     turned.  Raises InputError on anything else: another format, more than 64 MP, several frames, a truncated file.
     """
     size = file_size(path)
@@ -117,7 +117,7 @@ def _decoded(path, image: Image.Image, notes: list[str], calibrated: tuple[int, 
     if width < 1 or height < 1:
         raise InputError(path, f"expected at least one pixel, got {width} x {height}; save the image again")
     if image.format != "MPO" and _several(image):  # MPO: JPEG of many phones, the photo comes first
-        raise InputError(path, "expected one picture, got several frames; save a single frame")
+        raise InputError(path, "expected one image, got several frames; save a single frame")
     if image.format in ("JPEG", "MPO") and (scans := _scans(path)) > MAX_SCANS:
         raise InputError(path, f"expected at most {MAX_SCANS} scans, got {scans}; save the image again")
     if image.mode not in _GREY + _COLOUR:
@@ -126,7 +126,7 @@ def _decoded(path, image: Image.Image, notes: list[str], calibrated: tuple[int, 
     if orientation not in (0, 1):
         name = f"{os.path.basename(path)}: EXIF orientation {shown(orientation)}"
         if calibrated and _aspect(calibrated, (height, width)) and not _aspect(calibrated, image.size):
-            notes.append(f"{name} applied: the camera file says {calibrated[0]} x {calibrated[1]} pixels")
+            notes.append(f"{name} applied: the camera file has {calibrated[0]} x {calibrated[1]} pixels")
             image = ImageOps.exif_transpose(image)
         else:
             notes.append(f"{name} not applied, cameras refer to stored pixels")
@@ -156,7 +156,7 @@ def _several(image: Image.Image) -> bool:
 
 
 def _scans(path) -> int:
-    """Scans of a JPEG file; each passes over the whole image.  A few more where a picture is embedded."""
+    """Scans of a JPEG file; each passes over the whole image.  A few more where a thumbnail is embedded."""
     with open(path, "rb") as file:
         return file.read().count(b"\xff\xda")
 

@@ -1,7 +1,8 @@
 """Wavefront OBJ out, with the metallic-roughness words that Blender and others read from a material file.
 
-The words ``map_Pr``, ``map_Pm`` and ``norm`` are those of the PBR extension (http://exocortex.com/blog/extending_wavefront_mtl_to_support_pbr).
-``Ks 0.5`` is what Blender writes and reads for a dielectric of refractive index 1.5; without it nothing shines there.
+The words ``map_Pr``, ``map_Pm`` and ``norm`` are those of the PBR extension
+(http://exocortex.com/blog/extending_wavefront_mtl_to_support_pbr). ``Ks 0.5`` is what Blender writes and reads for a
+dielectric of refractive index 1.5; without it nothing shines there.
 """
 
 from __future__ import annotations

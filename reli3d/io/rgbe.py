@@ -1,6 +1,6 @@
-"""Radiance pictures (``.hdr``), RGBE, in and out.
+"""Reads and writes Radiance HDR images (``.hdr``, RGBE).
 
-A pixel is three mantissas and the exponent they share: value = mantissa / 256 * 2 ** (exponent - 128).  Sources: Ward,
+A pixel is three mantissas and a common exponent: value = mantissa / 256 * 2 ** (exponent - 128).  Sources: Ward,
 Real Pixels, Graphics Gems II (1991); Radiance's "File Formats" (https://radsite.lbl.gov/radiance/refer/filefmts.pdf).
 """
 
@@ -59,7 +59,7 @@ def _variables(path, data: bytes, notes: list[str]) -> tuple[np.ndarray, np.ndar
         line, at = data[at:end].rstrip(b"\r"), end + 1
         if not line:
             return factor, matrix, at
-        key, _, value = line.partition(b"=")  # an indented line is history: of a picture that this was made from
+        key, _, value = line.partition(b"=")  # an indented line is the header of an image that this was derived from
         if key == b"FORMAT" and value.strip() != b"32-bit_rle_rgbe":
             got = shown(value.decode("latin-1"))
             raise InputError(path, f"FORMAT: expected 32-bit_rle_rgbe, got {got}; convert it with ra_xyze -r")
@@ -89,7 +89,7 @@ def _positive(path, field: str, value: bytes, count: int) -> list[float]:
 
 
 def _scanlines(path, data: bytes, at: int, count: int, length: int) -> np.ndarray:
-    """``(count, length, 4)`` bytes.  Each scanline says by its first pixel how it is stored."""
+    """``(count, length, 4)`` bytes.  The first pixel of a scanline determines its encoding."""
     lines = np.empty((count, length, 4), np.uint8)
     for k in range(count):
         first, rest = data[at : at + 4], len(data) - at

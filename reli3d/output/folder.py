@@ -1,9 +1,9 @@
-"""A result folder changes at once: its files are written beside it, then exchanged with it.
+"""Atomic replacement of a result folder: files are written to a sibling folder, which is exchanged with it.
 
-While ``NAME`` is made, ``.NAME.partial`` lies beside it.  It holds ``lock`` (the process at work has it), ``new`` (the
-files) and, during the exchange, ``old``.  A process that is killed leaves it behind; the next one that claims ``NAME``
-ends the exchange or removes the files.  Linux exchanges two folders in one step (renameat2 with RENAME_EXCHANGE).
-Elsewhere two renames do it; between them ``NAME`` is missing, and ``new`` is whole.
+While ``NAME`` is made, its sibling ``.NAME.partial`` holds ``lock`` (held by the process at work), ``new`` (the
+files) and, during the exchange, ``old``.  A killed process leaves it behind; the next one that claims ``NAME``
+completes the exchange or removes the files.  Linux exchanges two folders in one step (renameat2 with RENAME_EXCHANGE).
+Elsewhere two renames are needed; between them ``NAME`` is missing and ``new`` is complete.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def check_folder(folder: Path) -> Path:
 
 
 def check_place(folder: Path) -> Path:
-    """:func:`check_folder` of a result folder, beside which others can be written."""
+    """:func:`check_folder` of a result folder and of its parent, in which siblings are created."""
     folder = check_folder(folder)
     check_folder(folder.parent)
     if os.path.ismount(folder):
@@ -61,11 +61,11 @@ def check_place(folder: Path) -> Path:
 
 @contextlib.contextmanager
 def claimed(folder: Path, ours: Collection[str]) -> Iterator[Callable]:
-    """Hold ``folder`` for this process alone; an exchange that was interrupted is ended first.
+    """Locks ``folder`` for this process; an interrupted exchange is completed first.
 
-    Yields ``replacing()``, a context that gives an empty folder: when it ends without an error, that one takes the
-    place of ``folder``.  ours: names of the files that belong to a result; others in ``folder`` are kept.
-    Raises InputError for a place where nothing can be written, OSError where another process holds it.
+    Yields ``replacing()``, a context manager of an empty folder that replaces ``folder`` on exit without an error.
+    ours: names of the files that belong to a result; others in ``folder`` are kept. Raises InputError for a place where
+    nothing can be written, OSError where another process holds it.
     """
     folder = check_place(folder)
     made = [p for p in folder.parents if not p.exists()]
@@ -98,7 +98,7 @@ def _replacing(work: Path, folder: Path, ours: Collection[str]) -> Iterator[Path
     yield new
     if folder.exists():
         shutil.copymode(folder, new)
-        os.rename(new, old)  # what has this name is kept until nothing foreign is in it
+        os.rename(new, old)  # kept until foreign files are moved out of it
         if not exchanged(old, folder):
             os.rename(old, new)
             os.rename(folder, old)
@@ -109,7 +109,7 @@ def _replacing(work: Path, folder: Path, ours: Collection[str]) -> Iterator[Path
 
 
 def _settle(work: Path, folder: Path, ours: Collection[str]) -> None:
-    """End an exchange that has begun, and remove what one that has not begun left."""
+    """Completes an interrupted exchange, or removes the files of one that has not begun."""
     new, old = work / "new", work / "old"
     if old.exists():
         if not folder.exists():

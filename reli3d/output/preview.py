@@ -1,4 +1,4 @@
-"""One picture of a reconstruction: what went in, and what comes out where nobody looked."""
+"""Contact sheet of a reconstruction: input images, novel views, maps and environment."""
 
 from __future__ import annotations
 
@@ -29,98 +29,97 @@ TILE = 256  # pixels
 COLUMNS = 4
 TITLE = 14  # pixels of a line of text
 SUBPIXELS = 2  # a side of a pixel
-SAMPLES = (2, 1, 1)  # light, GGX and cosine samples a subpixel
-WINDOW = 2  # pixels that noise is averaged over, to each side
-SAME_NORMAL = 0.2  # length of a difference of normals above which pixels are averaged little
-GLOSS = 0.1  # added to the base colour: highlights do not have it
-PAPER = 0.93  # background of the tiles, sRGB
-MEAN = 0.25  # of the environment as it is drawn, linear
+SUBPIXEL_SAMPLES = (2, 1, 1)  # of light, GGX and cosine
+FILTER_RADIUS = 2  # pixels
+NORMAL_SIGMA = 0.2  # of the range kernel: length of the difference of unit normals
+SPECULAR_ALBEDO = 0.1  # added to the base color: highlights are not multiplied by it
+BACKGROUND = 0.93  # of the tiles, sRGB
+ENVIRONMENT_MEAN = 0.25  # linear, as displayed
 FOV = math.radians(30.0)
-ELEVATIONS = (5.0, 30.0)  # degrees, of views that nobody took
-AZIMUTHS = 24  # places around the object to choose from
+ELEVATIONS = (5.0, 30.0)  # degrees, of the novel views
+AZIMUTHS = 24  # number of candidates
 
 
 def preview(asset: Asset, views: Views, scene: RayScene | None = None) -> Callable[[], np.ndarray]:
-    """Begin to render a picture beside the caller's work; the result gives it, ``(H, W, 3)`` uint8, when called.
+    """Starts rendering the contact sheet in the pool; calling the result returns it, ``(H, W, 3)`` uint8.
 
-    It shows up to four input views; four views that nobody photographed under the asset's own light, then under the
-    studio of :mod:`reli3d.render.lights`; the maps of the first of them; the own light, row 0 up, centre +X as in its
-    files, exposed so that its mean is ``MEAN``.
+    It shows up to four input views; four novel views under the estimated lighting, then under the
+    studio of :mod:`reli3d.render.lights`; the maps of the first of them; the environment, row 0 up, centre +X as in its
+    files, scaled to the mean ``ENVIRONMENT_MEAN``.
 
-    views: in the frame of ``asset``.  scene: rays against its mesh, made here if None.  An error is raised by the call,
-    or at once on CUDA and where the caller computes alone.
+    views: in the frame of ``asset``.  scene: rays against its mesh, made here if None.  Errors are raised by the call,
+    or at once on CUDA and where the bridge is serial.
     """
     mesh = asset.mesh
     rays = scene if scene is not None else RayScene(mesh.vertices, mesh.faces)
     lights = (asset.environment, Environment(studio().radiance.to(mesh.vertices.device)))
 
     def tiles(camera: Camera, with_maps: bool) -> list[Image.Image]:
-        shots = _rendered(asset, camera, rays, lights)
-        lit = [_lit(radiance, shots[0].alpha) for radiance in _smoothed(*shots)]
-        return [_image(tile) for tile in lit + (_maps(shots[0]) if with_maps else [])]
+        renderings = _rendered(asset, camera, rays, lights)
+        lit = [_lit(radiance, renderings[0].alpha) for radiance in _denoised(*renderings)]
+        return [_image(tile) for tile in lit + (_maps(renderings[0]) if with_maps else [])]
 
     cameras = unseen_cameras(mesh, views.c2w)
     begun = [submit(partial(tiles, camera, k == 0), mesh.vertices.device) for k, camera in enumerate(cameras)]
 
-    def picture() -> np.ndarray:
+    def sheet() -> np.ndarray:
         taken = views.select(choose_views(views.c2w, COLUMNS)).resampled(TILE, crop=True)
-        inputs = [_image(_on_paper(i, m)) for i, m in zip(taken.images, taken.masks, strict=True)]
+        inputs = [_image(_on_background(i, m)) for i, m in zip(taken.images, taken.masks, strict=True)]
         light = _image(_map(asset.light))
         found = [result() for result in begun]
         rows = [
             ("input", inputs),
-            ("views that nobody photographed, own light", [own for own, *_ in found]),
-            ("the same views in a studio", [lit for _, lit, *_ in found]),
+            ("novel views, estimated lighting", [own for own, *_ in found]),
+            ("the same views, studio lighting", [lit for _, lit, *_ in found]),
             ("base colour, roughness, metallic, normal", found[0][2:]),
-            ("own light, its mean at a quarter", [light]),
+            ("estimated environment, scaled to a mean of 0.25", [light]),
         ]
         return _sheet(rows, COLUMNS, last=TILE // 2)
 
-    return picture
+    return sheet
 
 
 def comparison(before: Asset, after: Asset, views: Views) -> np.ndarray:
-    """Picture ``(H, W, 3)`` uint8 of three views: photographs, ``before`` and ``after`` in their own light."""
+    """Contact sheet ``(H, W, 3)`` uint8 of three views: input images, ``before``, ``after``, in their lighting."""
     count = min(len(views), 3)
     batch = views.select([k * len(views) // count for k in range(count)]).resampled(TILE, crop=True)
-    rows = [("input", [_image(_on_paper(i, m)) for i, m in zip(batch.images, batch.masks, strict=True)])]
+    rows = [("input", [_image(_on_background(i, m)) for i, m in zip(batch.images, batch.masks, strict=True)])]
     for title, asset in (("before", before), ("after refinement", after)):
         scene = RayScene(asset.mesh.vertices, asset.mesh.faces)
-        shots = [_rendered(asset, batch.camera[i], scene, (None,))[0] for i in range(count)]
-        rows.append((title, [_image(_lit(_smoothed(s)[0], s.alpha)) for s in shots]))
+        renderings = [_rendered(asset, batch.camera[i], scene, (None,))[0] for i in range(count)]
+        rows.append((title, [_image(_lit(_denoised(s)[0], s.alpha)) for s in renderings]))
     return _sheet(rows, count)
 
 
 def _rendered(asset: Asset, camera: Camera, scene: RayScene, lights: Sequence[Environment | None]) -> list[Render]:
-    options = ShadeOptions(samples=SAMPLES)
+    options = ShadeOptions(samples=SUBPIXEL_SAMPLES)
     return render_lights(asset, camera, lights, options=options, supersampling=SUBPIXELS, scene=scene)
 
 
-def _smoothed(*shots: Render) -> list[Tensor]:
-    """The radiance of each shot with less noise: its ratio to the base colour, averaged over pixels of about the same
-    normal.
+def _denoised(*renderings: Render) -> list[Tensor]:
+    """Denoises renderings of one camera in several lights by a joint bilateral filter; returns their radiance.
 
-    shots: of one camera, in several lights.  A joint bilateral filter (Petschnigg and others 2004): Monte Carlo noise
-    is in the light, edges are in the maps, and so are the weights.
+    The filter (Petschnigg et al. 2004) runs on the ratio of radiance to base color, guided by normals and alpha, so
+    that edges of the maps are kept.
     """
-    shot, count = shots[0], 3 * len(shots)
-    paint = (shot.base_color + GLOSS) * shot.alpha[..., None]
-    ratios = [s.radiance / paint.clamp(min=1e-6) for s in shots]
+    rendering, count = renderings[0], 3 * len(renderings)
+    albedo = (rendering.base_color + SPECULAR_ALBEDO) * rendering.alpha[..., None]
+    ratios = [s.radiance / albedo.clamp(min=1e-6) for s in renderings]
     # channels first: the products with the weights then run along rows, in half the time
-    guides = torch.cat([*ratios, shot.normal, shot.alpha[..., None]], -1).permute(2, 0, 1).contiguous()
-    padded, normal = pad(guides, (WINDOW,) * 4), guides[count:-1]
-    height, width = shot.alpha.shape
-    total, weights = guides.new_zeros(count, height, width), torch.zeros_like(shot.alpha)
-    for row in range(2 * WINDOW + 1):
-        for column in range(2 * WINDOW + 1):
+    guides = torch.cat([*ratios, rendering.normal, rendering.alpha[..., None]], -1).permute(2, 0, 1).contiguous()
+    padded, normal = pad(guides, (FILTER_RADIUS,) * 4), guides[count:-1]
+    height, width = rendering.alpha.shape
+    total, weights = guides.new_zeros(count, height, width), torch.zeros_like(rendering.alpha)
+    for row in range(2 * FILTER_RADIUS + 1):
+        for column in range(2 * FILTER_RADIUS + 1):
             near = padded[:, row : row + height, column : column + width]
-            apart = ((row - WINDOW) ** 2 + (column - WINDOW) ** 2) / (2 * WINDOW)
-            bent = (near[count:-1] - normal).square().sum(0) / SAME_NORMAL**2
-            weight = torch.exp(-apart - bent) * near[-1]
+            distance = ((row - FILTER_RADIUS) ** 2 + (column - FILTER_RADIUS) ** 2) / (2 * FILTER_RADIUS)
+            bent = (near[count:-1] - normal).square().sum(0) / NORMAL_SIGMA**2
+            weight = torch.exp(-distance - bent) * near[-1]
             total += weight * near[:count]
             weights += weight
     means = (total / weights.clamp(min=1e-6)).permute(1, 2, 0).contiguous()
-    return [mean * paint for mean in means.split(3, -1)]
+    return [mean * albedo for mean in means.split(3, -1)]
 
 
 def _sheet(rows: list[tuple[str, list[Image.Image]]], columns: int, *, last: int = TILE) -> np.ndarray:
@@ -136,10 +135,10 @@ def _sheet(rows: list[tuple[str, list[Image.Image]]], columns: int, *, last: int
 
 
 def unseen_cameras(mesh: Mesh, c2w: Tensor) -> list[Camera]:
-    """``COLUMNS`` cameras of ``TILE`` pixels around ``mesh``, each as far as can be from the cameras ``c2w`` and from
-    the others, in the order of their azimuth.
+    """Selects ``COLUMNS`` cameras of ``TILE`` pixels around ``mesh``, each farthest in direction from the
+    cameras ``c2w`` and the selected ones; ordered by azimuth.
 
-    They stand at ``ELEVATIONS`` above the horizon (+Y is up), where a beholder would, and see all of the mesh.
+    Their elevations above the horizon are ``ELEVATIONS`` (+Y is up), and the whole mesh is in view.
     """
     low, high = mesh.vertices.aminmax(dim=0)
     centre = (low + high) / 2
@@ -147,8 +146,8 @@ def unseen_cameras(mesh: Mesh, c2w: Tensor) -> list[Camera]:
     azimuth = torch.arange(AZIMUTHS, dtype=torch.float32, device="cpu") * (2.0 * math.pi / AZIMUTHS)
     places = []
     for lift in map(math.radians, ELEVATIONS):
-        level = torch.full_like(azimuth, math.sin(lift))
-        places.append(torch.stack([azimuth.sin() * math.cos(lift), level, azimuth.cos() * math.cos(lift)], -1))
+        height_above = torch.full_like(azimuth, math.sin(lift))
+        places.append(torch.stack([azimuth.sin() * math.cos(lift), height_above, azimuth.cos() * math.cos(lift)], -1))
     offered = torch.cat(places).to(centre)
     nearest = (offered @ normalize(c2w[:, :3, 3] - centre, dim=-1).T).amax(1)  # cosine of the angle to what is taken
     chosen = []
@@ -162,24 +161,25 @@ def unseen_cameras(mesh: Mesh, c2w: Tensor) -> list[Camera]:
 
 def _lit(radiance: Tensor, alpha: Tensor) -> Tensor:
     """Tile of premultiplied linear radiance."""
-    return _on_paper(linear_to_srgb((radiance / alpha.clamp(min=1e-3)[..., None]).clamp(0, 1)), alpha)
+    return _on_background(linear_to_srgb((radiance / alpha.clamp(min=1e-3)[..., None]).clamp(0, 1)), alpha)
 
 
-def _on_paper(color: Tensor, alpha: Tensor) -> Tensor:
-    return torch.lerp(torch.full_like(color, PAPER), color, alpha[..., None])
+def _on_background(color: Tensor, alpha: Tensor) -> Tensor:
+    return torch.lerp(torch.full_like(color, BACKGROUND), color, alpha[..., None])
 
 
-def _maps(shot: Render) -> list[Tensor]:
-    """Tiles of what was rendered: base colour, roughness, metallic, normal."""
-    grey = (value[..., None].expand(-1, -1, 3) for value in (shot.roughness, shot.metallic))
-    shown = (linear_to_srgb(shot.base_color), *grey, shot.normal * 0.5 + 0.5)
-    return [_on_paper(tile, shot.alpha) for tile in shown]
+def _maps(rendering: Render) -> list[Tensor]:
+    """Tiles of the material layers: base color, roughness, metallic, normal."""
+    grey = (value[..., None].expand(-1, -1, 3) for value in (rendering.roughness, rendering.metallic))
+    shown = (linear_to_srgb(rendering.base_color), *grey, rendering.normal * 0.5 + 0.5)
+    return [_on_background(tile, rendering.alpha) for tile in shown]
 
 
 def _map(light: Environment) -> Tensor:
     """The light as a tile of half the height."""
     radiance = light.radiance
-    shown = linear_to_srgb((radiance * (MEAN / radiance.mean().clamp(min=1e-6))).clamp(0, 1)).permute(2, 0, 1)[None]
+    exposed = (radiance * (ENVIRONMENT_MEAN / radiance.mean().clamp(min=1e-6))).clamp(0, 1)
+    shown = linear_to_srgb(exposed).permute(2, 0, 1)[None]
     return interpolate(shown, (TILE // 2, TILE), mode="bilinear", align_corners=False)[0].permute(1, 2, 0)
 
 

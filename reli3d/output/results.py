@@ -1,4 +1,4 @@
-"""The files of one reconstruction, which change together: :mod:`reli3d.output.folder`."""
+"""Writes the files of one reconstruction atomically, by :mod:`reli3d.output.folder`."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ from reli3d.views.views import Views
 
 FILES = ("mesh.glb", "environment.exr", "environment.hdr", "preview.png", "viewer.html", "run_info.json")
 COMPARISON = "refine.png"  # of a refinement
-SILHOUETTE = 256  # pixels a side by which mesh and masks are compared
-OURS = (*FILES, COMPARISON, "illumination.hdr")  # what a new result never leaves of an old one
+SILHOUETTE_PIXELS = 256  # along a side of the masks of :func:`mask_iou`
+OURS = (*FILES, COMPARISON, "illumination.hdr")  # removed from the folder of an older result
 
 
 def complete(folder: Path, *, refined: bool = False) -> bool:
@@ -47,7 +47,7 @@ def claim(folder: Path) -> AbstractContextManager[Callable]:
 
 
 def measure(mesh: Mesh, scene: RayScene, views: Views) -> Callable[[], dict]:
-    """Begin to measure a result, beside the caller's work: ``mesh``, the report of the mesh welded across its UV seams,
+    """Starts the measurements of a result in the pool: ``mesh``, the report of the mesh welded across its UV seams,
     and ``mask_iou``, see :func:`mask_iou`, as plain values.
     """
     return submit(lambda: {"mesh": asdict(report(mesh)), "mask_iou": mask_iou(scene, views)}, mesh.vertices.device)
@@ -58,18 +58,18 @@ def mask_iou(scene: RayScene, views: Views) -> float:
 
     scene: rays against the mesh.
     """
-    batch = views.resampled(SILHOUETTE, crop=True)
+    batch = views.resampled(SILHOUETTE_PIXELS, crop=True)
     origins, directions = camera_rays(batch.camera)
     far = torch.full((directions[..., 0].numel(),), torch.inf, device=directions.device, dtype=torch.float32)
-    free = scene.unoccluded(origins.reshape(-1, 3), directions.reshape(-1, 3), far)  # the rays of a camera go together
-    seen = ~free.reshape(directions.shape[:-1])
+    free = scene.unoccluded(origins.reshape(-1, 3), directions.reshape(-1, 3), far)  # rays of one camera are contiguous
+    hit = ~free.reshape(directions.shape[:-1])
     masks = batch.masks > 0.5
-    both, either = ((a.sum((1, 2)).double()) for a in (masks & seen, masks | seen))
+    both, either = ((a.sum((1, 2)).double()) for a in (masks & hit, masks | hit))
     return round(float((both / either.clamp(min=1)).mean()), 4)
 
 
 def peak_memory_mib() -> float | None:
-    """Most memory that this process has held, MiB, to a tenth; None on Windows, where Python has no such count."""
+    """Peak resident memory of this process, MiB, to a tenth; None on Windows, where Python does not report it."""
     try:
         import resource
     except ImportError:
@@ -80,7 +80,7 @@ def peak_memory_mib() -> float | None:
 
 @dataclass(frozen=True)
 class Encoded:
-    """What the files of a result hold besides its preview.  A call waits until it is there.
+    """Contents of the files of a result without its preview.  Calls block until the content is ready.
 
     placed: ``mesh.glb``.  page: ``viewer.html``, which shows the asset where its mesh lies.
     """
@@ -100,11 +100,11 @@ def encode(
     translation: Sequence[float] = (0.0, 0.0, 0.0),
     scene: RayScene | None = None,
 ) -> Encoded:
-    """Begin to encode a result, beside the caller's work: encoders run without the interpreter lock.
+    """Starts encoding a result in the pool; the encoders release the interpreter lock.
 
-    views: the photographs, in the frame of ``asset``.  record: of ``run_info.json``, whose frames and weights
-    ``mesh.glb`` names too.  name: title of the page.  before: the asset without its refinement, shown there too.
-    translation: of the mesh in ``mesh.glb``, see :func:`~reli3d.io.glb.write_glb`; the page shows the mesh where it is.
+    views: the input views, in the frame of ``asset``.  record: of ``run_info.json``, whose frames and weights
+    ``mesh.glb`` names too.  name: title of the page.  before: the asset without its refinement, also on the page.
+    translation: of the mesh in ``mesh.glb``, see :func:`~reli3d.io.glb.write_glb`; the page shows the mesh without it.
     scene: rays against the mesh of ``asset``.
     """
     device = asset.mesh.vertices.device
@@ -116,7 +116,7 @@ def encode(
     started = None if before is None else submit(partial(_shown, before), device)
 
     def page() -> str:
-        # This is a thread of the pool: it may wait for tasks that were submitted before it and that wait for none.
+        # In a thread of the pool: may wait only for tasks that were submitted before it and that wait for no other.
         shown = {"mesh" if started is None else "after": Shown(glb(), kept())}
         if started is not None:
             shown["before"] = started()
@@ -135,21 +135,20 @@ def _shown(asset: Asset) -> Shown:
 def write_results(
     replacing: Callable,
     encoded: Encoded,
-    picture: np.ndarray,
+    sheet: np.ndarray,
     info: dict,
     *,
     comparison: np.ndarray | None = None,
 ) -> None:
-    """Write :data:`FILES`; an error leaves what was there before.  Raises OSError, ValueError.
+    """Writes :data:`FILES`; on an error the folder is unchanged.  Raises OSError, ValueError.
 
-    replacing: what :func:`claim` of the folder gives.  picture: of the asset, from
-    :func:`~reli3d.output.preview.preview`.  info: what ``run_info.json`` holds, the convention of the light apart.
-    comparison: the picture of a refinement.
+    replacing: of :func:`claim`.  sheet: of the asset, from :func:`~reli3d.output.preview.preview`.  info: content of
+    ``run_info.json``, to which the convention of the light is added. comparison: sheet of a refinement.
     """
     light = encoded.asset.light
     info = {**info, "environment_centre": "+X"}
     with replacing() as new:
-        (new / "preview.png").write_bytes(png_bytes(picture))
+        (new / "preview.png").write_bytes(png_bytes(sheet))
         (new / "mesh.glb").write_bytes(encoded.placed())
         for name in ("environment.exr", "environment.hdr"):
             write_environment(new / name, light)
@@ -166,9 +165,9 @@ def frame_record(
 
     origin: of the frame of the views, in that of the folder, which the matrices begin with.
     """
-    began = torch.tensor(origin, dtype=torch.float64, device="cpu")
-    read = Similarity(1.0, torch.eye(3, dtype=torch.float64, device="cpu"), -began)
-    back = output_from_views.rotation @ began
+    shift = torch.tensor(origin, dtype=torch.float64, device="cpu")
+    read = Similarity(1.0, torch.eye(3, dtype=torch.float64, device="cpu"), -shift)
+    back = output_from_views.rotation @ shift
     output = Similarity(output_from_views.scale, output_from_views.rotation, output_from_views.translation + back)
     return {
         "up": up,
@@ -183,6 +182,6 @@ def weights_record(manifest: Manifest, digest: str) -> dict:
 
 
 def versions() -> dict[str, str]:
-    """Versions of this package and of those that compute."""
+    """Versions of this package and of its numerical dependencies."""
     others = {name: version(name) for name in ("torch", "warp-lang", "embreex", "numpy")}
     return {"reli3d": reli3d.__version__, **others}  # also from a checkout that is not installed

@@ -1,4 +1,4 @@
-"""Moving pictures as MP4, by PyAV (``av``), an optional install with FFmpeg's libraries in its wheel."""
+"""Encodes MP4 video by PyAV (``av``), an optional dependency whose wheel has FFmpeg's libraries."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ def library() -> ModuleType:
         raise ImportError("av is not installed: pip install 'reli3d[video]'", name="av") from error
 
 
-def mp4_bytes(pictures: list[Image.Image], rate: int) -> bytes:
-    """An MP4 file, H.264 in 4:2:0, of ``pictures`` of one even size, in front of white where they have alpha."""
+def mp4_bytes(frames: list[Image.Image], rate: int) -> bytes:
+    """MP4 file, H.264 in 4:2:0, of ``frames`` of one even size, composited over white if they have alpha."""
     av = library()
     data = io.BytesIO()
     with av.open(data, "w", format="mp4") as file:
         stream = file.add_stream("libx264", rate=rate, options={"crf": QUALITY})
-        stream.width, stream.height = pictures[0].size
+        stream.width, stream.height = frames[0].size
         stream.pix_fmt = "yuv420p"
-        for picture in pictures:
-            if picture.mode == "RGBA":
-                picture = Image.alpha_composite(Image.new("RGBA", picture.size, "white"), picture)
-            frame = av.VideoFrame.from_image(picture.convert("RGB"))
+        for image in frames:
+            if image.mode == "RGBA":
+                image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image)
+            frame = av.VideoFrame.from_image(image.convert("RGB"))
             file.mux(stream.encode(frame))
         file.mux(stream.encode())
     return data.getvalue()

@@ -1,4 +1,4 @@
-"""One page that shows a reconstruction in any browser, from a file and without a network: it holds all it needs."""
+"""A self-contained HTML page that shows a reconstruction in a browser, from a file and without a network."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ from reli3d.render.transfer import blocked_transfer, light_harmonics
 from reli3d.views.views import Views
 
 PARTS = Path(reli3d.__file__).parent / "assets" / "viewer"
-PHOTOGRAPH = 640  # pixels of the longer side: 16 of them take less than a megabyte
+MAX_IMAGE_PIXELS = 640  # along the longer side of an input image: 16 take less than a megabyte
 QUALITY, METHOD = 80, 2  # of their WebP: method 4 takes twice as long for 7 % less
-LEVEL = 1  # of deflate: 2.3 times smaller; more effort gains a tenth
-TINY = 1e-20  # instead of a division by zero where nothing is blocked
+DEFLATE_LEVEL = 1  # 2.3 times smaller; higher levels gain about 10 %
+MIN_TRANSFER = 1e-20  # against division by zero if nothing is blocked
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ def viewer_page(
 
     middle ``(3,)``, radius: of the object, for the camera.  stops: of :func:`photograph_stops`.
     """
-    lights = {"own light": light, **{k: make().radiance for k, make in LIGHTS.items()}}
+    lights = {"estimated light": light, **{k: make().radiance for k, make in LIGHTS.items()}}
     data = {
         "name": name,
         "meshes": [{"name": k, "glb": _base64(v.glb), **v.shadow} for k, v in meshes.items()],
@@ -64,13 +64,13 @@ def viewer_page(
         "three": (PARTS / "three.min.js").read_text(encoding="utf-8"),
         "viewer": (PARTS / "viewer.js").read_text(encoding="utf-8"),
     }
-    head, *rest = page.split("{{")  # one pass: what is filled in is not looked through again
+    head, *rest = page.split("{{")  # one pass: inserted text is not searched
     return head + "".join(fillings[part.split("}}", 1)[0]] + part.split("}}", 1)[1] for part in rest)
 
 
 def photograph_stops(views: Views) -> list[dict]:
-    """Stops of the page's camera at the photographs ``views``, in the frame of its meshes: scaled down to
-    ``PHOTOGRAPH`` pixels and cut out by their masks.
+    """Camera stops of the page at the input views, in the frame of its meshes, with images scaled down to
+    ``MAX_IMAGE_PIXELS`` and with the masks as alpha.
     """
     return [_stop(views, i) for i in range(len(views))]
 
@@ -80,35 +80,35 @@ def _base64(data: bytes) -> str:
 
 
 def shadow(mesh: Mesh, scene: RayScene | None = None) -> dict[str, str | float]:
-    """The light that every vertex of ``mesh`` keeps from itself, 16 bytes each, deflated: harmonics in steps of
+    """Self-shadowing of every vertex of ``mesh`` as spherical harmonics, 16 bytes each, deflated, in steps of
     ``largest`` / 127.
 
     scene: rays against the mesh, made here if None.
     """
     blocked = blocked_transfer(mesh, scene=scene).cpu()
     largest = float(blocked.abs().amax()) if blocked.numel() else 0.0
-    steps = (blocked * (127.0 / max(largest, TINY))).round().to(torch.int8)
-    return {"blocked": _base64(zlib.compress(steps.numpy().tobytes(), LEVEL)), "largest": largest}
+    steps = (blocked * (127.0 / max(largest, MIN_TRANSFER))).round().to(torch.int8)
+    return {"blocked": _base64(zlib.compress(steps.numpy().tobytes(), DEFLATE_LEVEL)), "largest": largest}
 
 
 def _light(name: str, radiance: Tensor) -> dict:
-    """A map, and its harmonics by channel."""
+    """An environment map and its spherical harmonics for each channel."""
     harmonics = light_harmonics(Environment(radiance)).T.tolist()
     return {"name": name, "hdr": _base64(environment_bytes(radiance)), "harmonics": harmonics}
 
 
 def _stop(views: Views, i: int) -> dict:
-    """One photograph with its camera; the intrinsics are those of the scaled picture."""
+    """One input image with its camera; the intrinsics are those of the scaled image."""
     height, width = views.masks[i].shape
     rgba = np.concatenate([views.images[i].cpu().numpy(), views.masks[i].cpu().numpy()[..., None]], -1)
-    picture = Image.fromarray((rgba * 255 + 0.5).astype(np.uint8))
-    scale = min(1.0, PHOTOGRAPH / max(width, height))
+    bitmap = Image.fromarray((rgba * 255 + 0.5).astype(np.uint8))
+    scale = min(1.0, MAX_IMAGE_PIXELS / max(width, height))
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
-    if size != picture.size:
-        picture = picture.resize(size, Image.Resampling.BOX)
+    if size != bitmap.size:
+        bitmap = bitmap.resize(size, Image.Resampling.BOX)
     data = io.BytesIO()
-    # a name that Pillow does not know yet would have it import all its formats
-    picture.save(data, WebPImagePlugin.WebPImageFile.format, quality=QUALITY, method=METHOD)
+    # an unregistered name would make Pillow import all formats
+    bitmap.save(data, WebPImagePlugin.WebPImageFile.format, quality=QUALITY, method=METHOD)
     fx, fy, cx, cy = views.intrinsics[i].tolist()
     sx, sy = size[0] / width, size[1] / height
     return {

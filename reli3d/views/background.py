@@ -25,13 +25,13 @@ class Remover:
         self._lock = threading.Lock()
         self._cut_out: Callable[[Image.Image], Image.Image] | None = None
 
-    def mask(self, picture: Image.Image) -> Image.Image:
-        """Mask of mode L in the size of ``picture``, soft at the edge of what stands before the background."""
+    def mask(self, bitmap: Image.Image) -> Image.Image:
+        """Mask of mode L in the size of ``bitmap``, soft at the edge of the foreground."""
         with self._lock:
             if self._cut_out is None:
                 self._cut_out = _loaded(self.network)
             self.masks += 1
-            return self._cut_out(picture if picture.mode != "F" else picture.point(lambda v: v / 257.0).convert("L"))
+            return self._cut_out(bitmap if bitmap.mode != "F" else bitmap.point(lambda v: v / 257.0).convert("L"))
 
 
 def _loaded(network: str) -> Callable[[Image.Image], Image.Image]:
@@ -48,4 +48,4 @@ def _loaded(network: str) -> Callable[[Image.Image], Image.Image]:
             "remove-background",
             f"expected the network {network} of rembg, got {error}; it is fetched once, or give masks",
         ) from None
-    return lambda picture: rembg.remove(picture.convert("RGB"), session=session, only_mask=True).convert("L")
+    return lambda bitmap: rembg.remove(bitmap.convert("RGB"), session=session, only_mask=True).convert("L")

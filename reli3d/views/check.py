@@ -1,4 +1,4 @@
-"""Are these cameras right?  Lines that say so, the likely mistake where they are not, and a picture of the rig.
+"""Checks the cameras of views: a report with the likely mistake of wrong conventions, and a plot of the rig.
 
 The test is the visual hull: with right cameras its silhouettes fill the masks.  Where they do not, the usual
 mistakes are undone one after the other, and the one that makes the hull fill the masks is named.
@@ -140,9 +140,9 @@ def _alternatives(views: Views):
             "store their inverses with the second and third column negated",
             inverse @ flip,
         ),
-        ("the rotations look transposed (world-to-camera) beside camera positions", "transpose the 3x3 blocks", turned),
+        ("the rotations look transposed (world-to-camera) with camera positions", "transpose the 3x3 blocks", turned),
         (
-            "the rotations look transposed and in OpenCV axes beside camera positions",
+            "the rotations look transposed and in OpenCV axes with camera positions",
             "transpose the 3x3 blocks, then negate their second and third column",
             turned @ flip,
         ),
@@ -201,7 +201,7 @@ def _verdict(views: Views, hull: Hull, filled: list[float]) -> str:
         )
     return (
         f"suspect: the visual hull fills only {100 * min(filled):.0f} % of a mask: cameras or masks are inaccurate, or "
-        "the object moved; look at the picture of the rig"
+        "the object moved; look at the plot of the rig"
     )
 
 
@@ -280,8 +280,8 @@ def _cube(views: Views) -> np.ndarray:
 
 
 def _panel(views, hull, middle, reach, frustums, title, across, down, sign) -> Image.Image:
-    picture = Image.new("RGB", (PANEL, PANEL), "#f4f4f4")
-    draw = ImageDraw.Draw(picture)
+    bitmap = Image.new("RGB", (PANEL, PANEL), "#f4f4f4")
+    draw = ImageDraw.Draw(bitmap)
     zoom = 0.5 * PANEL / reach
 
     def at(points) -> list[tuple[float, float]]:
@@ -302,18 +302,18 @@ def _panel(views, hull, middle, reach, frustums, title, across, down, sign) -> I
     draw.line((origin[0] - 5, origin[1], origin[0] + 5, origin[1]), fill="black")
     draw.line((origin[0], origin[1] - 5, origin[0], origin[1] + 5), fill="black")
     for i, frustum in enumerate(frustums):
-        colour = _COLOURS[i % len(_COLOURS)]
+        color_of = _COLOURS[i % len(_COLOURS)]
         eye, *corners = at(frustum)
         for k in range(4):
-            draw.line((*eye, *corners[k]), fill=colour, width=2)
-            draw.line((*corners[k], *corners[(k + 1) % 4]), fill=colour, width=4 if k == 0 else 2)  # bold: the top
+            draw.line((*eye, *corners[k]), fill=color_of, width=2)
+            draw.line((*corners[k], *corners[(k + 1) % 4]), fill=color_of, width=4 if k == 0 else 2)  # bold: the top
         draw.line((*eye, *at(hull.points.mean(0).numpy() if len(hull.points) else hull.aim.numpy())[0]), fill="#c8c8c8")
-        draw.text((eye[0] + 4, eye[1] + 4), str(i), fill=colour)
+        draw.text((eye[0] + 4, eye[1] + 4), str(i), fill=color_of)
     draw.text((6, 4), f"{title}; square: the network's cube, cross: origin", fill="black")
     scale = 10 ** math.floor(math.log10(reach))
     draw.line((8, PANEL - 12, 8 + scale * zoom, PANEL - 12), fill="black", width=2)
     draw.text((10, PANEL - 26), f"{scale:g}", fill="black")
-    return picture
+    return bitmap
 
 
 def _thumbnail(views: Views, hull: Hull, i: int) -> Image.Image:

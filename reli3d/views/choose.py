@@ -1,4 +1,4 @@
-"""Which of many views to take: those that lie farthest apart, by their cameras alone."""
+"""Selection of views by farthest-point sampling of their cameras."""
 
 from __future__ import annotations
 
@@ -10,17 +10,18 @@ from torch import Tensor
 from reli3d._bridge import full_precision
 from reli3d.views.normalize import meeting_point
 
-NEAR = math.radians(3.0)  # views nearer than this show the same: a hand's breadth at two metres
-NARROW = math.radians(25.0)  # views all within this angle leave the depth of the object open
-CLOSER = 0.5  # radians that a factor e in distance counts for: half the distance is worth 20 degrees
+DUPLICATE_DISTANCE_RAD = math.radians(3.0)  # below it, views are near-duplicates
+NARROW_BASELINE_RAD = math.radians(25.0)  # views within this angle constrain depth poorly
+LOG_DISTANCE_WEIGHT_RAD = 0.5  # radians per factor e of distance: half the distance counts as 20 degrees
 
 
 @full_precision
 def view_distances(c2w: Tensor) -> tuple[Tensor, Tensor]:
     """Angles [rad] between the views ``(V, V)`` and their distances ``(V, V)``, float64.
 
-    The angle is that between the directions to the eyes from the point where the cameras look; the distance adds, at
-    a right angle, ``CLOSER`` times the logarithm of how much nearer one of the eyes is.  Roll and lens do not count.
+    angle: between the directions to the eyes from the point that the cameras look at.  distance: sqrt(angle^2 + (w log
+    r)^2), where r is the ratio of the distances of the eyes to that point and w is ``LOG_DISTANCE_WEIGHT_RAD``.  Roll
+    and lens have no effect.
     """
     poses = c2w.double().cpu()
     eyes, axes = poses[:, :3, 3], -poses[:, :3, 2]
@@ -29,14 +30,14 @@ def view_distances(c2w: Tensor) -> tuple[Tensor, Tensor]:
     to = away / length[:, None]
     across = torch.linalg.cross(to[:, None].expand(-1, len(to), -1), to[None].expand(len(to), -1, -1)).norm(dim=-1)
     angle = torch.atan2(across, to @ to.T)  # exact for small angles, where the arc cosine is not
-    closer = CLOSER * (length.log()[:, None] - length.log())
+    closer = LOG_DISTANCE_WEIGHT_RAD * (length.log()[:, None] - length.log())
     return angle, (angle.square() + closer.square()).sqrt()
 
 
 def _looked_at(eyes: Tensor, axes: Tensor) -> Tensor:
-    """The point nearest to all axes, also where they are too alike for :func:`meeting_point`, whose guess is the prior.
+    """The point nearest to all optical axes, regularized towards :func:`meeting_point` for near-parallel axes.
 
-    A weight of 1e-5 of an axis leaves the point to axes that differ by a degree.
+    The prior has 1e-5 of the weight of an axis: axes that differ by a degree determine the point.
     """
     one = torch.eye(3, dtype=axes.dtype, device=axes.device)
     across = one - axes[:, :, None] * axes[:, None]
@@ -45,20 +46,20 @@ def _looked_at(eyes: Tensor, axes: Tensor) -> Tensor:
 
 
 @full_precision
-def choose_views(c2w: Tensor, count: int, *, apart: float = 0.0) -> list[int]:
-    """Indices, ascending, of up to ``count`` views: view 0, then each time the one farthest from those taken.
+def choose_views(c2w: Tensor, count: int, *, min_distance: float = 0.0) -> list[int]:
+    """Selects up to ``count`` views by farthest-point sampling, starting with view 0; returns ascending indices.
 
-    c2w: ``(V, 4, 4)``.  apart: distance (:func:`view_distances`) from the taken views at which to stop before
-    ``count``.  Farthest-point choice covers within twice the best possible distance (Gonzalez 1985).
+    c2w: ``(V, 4, 4)``.  min_distance: distance (:func:`view_distances`) [rad] from the selected views below which no
+    further view is selected.  The covering radius is at most 2 times the optimum (Gonzalez 1985).
     """
     if not count >= 1:
         raise ValueError(f"count: expected at least 1, got {count}")
     distance = view_distances(c2w)[1]
     taken, nearest = [0], distance[0].clone()
     while len(taken) < min(count, len(c2w)):
-        nearest[taken[-1]] = -1.0  # not again, also where all views are the same
+        nearest[taken[-1]] = -1.0  # never selected twice, even if all views are equal
         farthest = int(nearest.argmax())
-        if float(nearest[farthest]) < apart:
+        if float(nearest[farthest]) < min_distance:
             break
         taken.append(farthest)
         nearest = torch.minimum(nearest, distance[farthest])
@@ -66,20 +67,21 @@ def choose_views(c2w: Tensor, count: int, *, apart: float = 0.0) -> list[int]:
 
 
 def spread_notes(c2w: Tensor) -> list[str]:
-    """A line on views that are nearly the same, a line on views that all look from one side; none where all is well."""
+    """Notes on near-duplicate views and on a narrow baseline, at most one line each."""
     angle, distance = view_distances(c2w)
     notes = []
-    again = (distance + torch.full_like(distance, torch.inf).triu()).amin(1) < NEAR  # near to an earlier view
+    # near an earlier view
+    again = (distance + torch.full_like(distance, torch.inf).triu()).amin(1) < DUPLICATE_DISTANCE_RAD
     if bool(again.any()):
         which = ", ".join(str(i) for i in again.nonzero()[:, 0].tolist()[:8]) + (", ..." if again.sum() > 8 else "")
         notes.append(
-            f"{int(again.sum())} of {len(c2w)} views lie within {math.degrees(NEAR):.0f} degrees of an "
-            f"earlier one and add little: {which}"
+            f"{int(again.sum())} of {len(c2w)} views lie within {math.degrees(DUPLICATE_DISTANCE_RAD):.0f} degrees of "
+            f"an earlier one and add little information: {which}"
         )
     widest = float(angle.max())
-    if len(c2w) > 1 and widest < NARROW:
+    if len(c2w) > 1 and widest < NARROW_BASELINE_RAD:
         notes.append(
-            f"narrow baseline: all views lie within {math.degrees(widest):.1f} degrees; depth and the other "
-            "sides are guessed, add views from all around"
+            f"narrow baseline: all views lie within {math.degrees(widest):.1f} degrees; depth and "
+            "unobserved sides are poorly constrained, add views from all around"
         )
     return notes

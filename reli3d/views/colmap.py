@@ -38,7 +38,7 @@ _MODELS = {
 
 
 def find_colmap(folder: Path) -> list[Path]:
-    """The ``images.txt`` and ``images.bin`` of the models in ``folder``, each beside its cameras.
+    """The ``images.txt`` and ``images.bin`` of the models in ``folder``, each with its cameras in the same folder.
 
     Of a model in both forms the text, which people edit, comes first.
     """

@@ -78,7 +78,7 @@ class _Entries:
         self.file.close()
 
     def each(self) -> Iterator[str]:
-        """Names of the entries for messages, as many as the file says."""
+        """Names of the entries for messages, as many as the file declares."""
         for k in range(self.take("<Q")[0]):
             self.where = f"{self.path}: entry {k}"
             yield self.where

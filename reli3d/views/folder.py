@@ -20,17 +20,17 @@ from torch import Tensor
 
 from reli3d._bridge import full_precision, present
 from reli3d.errors import InputError, printable, shown
-from reli3d.io.images import above, colour, read_picture, unit
+from reli3d.io.images import above, color_of, decode_image, unit
 from reli3d.views.array_cameras import NEUS, read_llff, read_neus
 from reli3d.views.background import Remover
-from reli3d.views.choose import NEAR, choose_views, spread_notes
+from reli3d.views.choose import DUPLICATE_DISTANCE_RAD, choose_views, spread_notes
 from reli3d.views.colmap import find_colmap, read_colmap
 from reli3d.views.file_names import ENDINGS, FolderIndex
 from reli3d.views.frames import Frame, Lens, check_distortion, file_within
 from reli3d.views.masks import MaskFiles, alpha_values, check_one_label, mask_values
 from reli3d.views.missing_cameras import no_cameras
 from reli3d.views.normalize import near_origin
-from reli3d.views.reduce import LARGE, OBJECT, cut
+from reli3d.views.reduce import MAX_FULL_PIXELS, MAX_OBJECT_PIXELS, cut
 from reli3d.views.transforms import read_transforms
 from reli3d.views.views import LEAST_WHOLE, MASK_EDGE, Views, touches_border
 
@@ -54,7 +54,7 @@ def load_views(
 ) -> Views:
     """Photographs of an object folder, with their cameras and masks, in the order of the folder.
 
-    views: how many, farthest apart, the first among them.  first_views: how many from the beginning.  Neither: all,
+    views: number of views, selected by farthest-point sampling.  first_views: number from the beginning.  Neither: all,
     at most 16.  every: all; :meth:`Views.taken` are those without it.  masks: folder of masks; else ``mask_path`` of
     a frame, alpha, or a folder ``masks`` or ``mask``, in this order.  whole: keep all of photographs of more than two
     megapixels, scaled to two, not the object alone at 768 pixels.  remove_background: masks by ``rembg`` (extra
@@ -106,8 +106,10 @@ def load_views(
     notes += [note for *_, found, _ in loaded for note in found]
     check_one_label(root, notes)
     if reduced := sum(smaller for *_, smaller in loaded):
-        part = f"scaled down to {LARGE} pixels" if whole else f"cut to the object, at most {OBJECT} pixels of it"
-        notes.append(f"{reduced} of {len(loaded)} photographs have more than {LARGE} pixels: {part}")
+        part = f"scaled down to {MAX_FULL_PIXELS} pixels"
+        if not whole:
+            part = f"cut to the object, at most {MAX_OBJECT_PIXELS} pixels of it"
+        notes.append(f"{reduced} of {len(loaded)} photographs have more than {MAX_FULL_PIXELS} pixels: {part}")
     if remover and remover.masks:
         notes.append(f"{remover.masks} of {len(loaded)} masks made by rembg ({remover.network})")
     return Views(
@@ -169,11 +171,11 @@ def _chosen(
     if first_views is not None:
         taken = list(range(min(first_views, count)))
     elif views is not None or count > MAX_VIEWS:
-        taken = choose_views(poses, views or MAX_VIEWS, apart=0.0 if views else NEAR)
+        taken = choose_views(poses, views or MAX_VIEWS, min_distance=0.0 if views else DUPLICATE_DISTANCE_RAD)
         if len(taken) < count:
             indices = ", ".join(str(usable[i]) for i in taken)
             notes.append(
-                f"{len(taken)} of {len(frames)} views taken, farthest apart in direction and distance: {indices}; "
+                f"{len(taken)} of {len(frames)} views taken by farthest-point sampling: {indices}; "
                 "load_views(first_views=N) takes the first N"
             )
     else:
@@ -195,7 +197,7 @@ def _cut_off(names: list[str], cut_off: list[int], usable: list[int]) -> list[st
 def _load(
     root: Path, frame: Frame, files: MaskFiles, whole: bool, remover: Remover | None
 ) -> tuple[Tensor, Tensor, list[float], list[str], bool]:
-    """Image, mask, intrinsics and notes of one frame, and whether less than the whole picture is kept."""
+    """Image, mask, intrinsics and notes of one frame, and whether less than the whole image is kept."""
     notes: list[str] = []
     path = frame.image
     if not os.path.exists(path):
@@ -205,13 +207,13 @@ def _load(
             "paths are relative to the camera file and use /",
         )
     _still_inside(root, path, frame)
-    picture = read_picture(path, notes=notes, calibrated=frame.lens.size)
-    width, height = picture.size
+    bitmap = decode_image(path, notes=notes, calibrated=frame.lens.size)
+    width, height = bitmap.size
     if min(height, width) < MIN_SIDE:
         raise InputError(
             path, f"expected at least {MIN_SIDE} pixels a side, got {width} x {height}; give a larger image"
         )
-    mask = _mask(root, frame, picture, files, notes, remover)
+    mask = _mask(root, frame, bitmap, files, notes, remover)
     if mask.size != (width, height):
         got = f"{mask.size[0]} x {mask.size[1]}"
         raise InputError(
@@ -224,10 +226,10 @@ def _load(
             "check that it is neither blank nor inverted",
         )
     camera = intrinsics_of(frame.lens, width, height, frame.where, notes)
-    part = cut(picture.size, above(mask, MASK_EDGE), whole=whole)
+    part = cut(bitmap.size, above(mask, MASK_EDGE), whole=whole)
     if part is not None:
-        picture, mask, camera = part.pixels(picture), part.pixels(mask), part.intrinsics(camera)
-    image, alpha = colour(picture), unit(mask)
+        bitmap, mask, camera = part.pixels(bitmap), part.pixels(mask), part.intrinsics(camera)
+    image, alpha = color_of(bitmap), unit(mask)
     if looks_premultiplied(image.numpy(), alpha):
         notes.append(f"{path.name}: the colour looks multiplied by alpha, edges will be dark; save straight alpha")
     return image, torch.from_numpy(alpha), camera, notes, part is not None
@@ -252,10 +254,10 @@ def looks_premultiplied(image: np.ndarray, mask: np.ndarray) -> bool:
 
 
 def _mask(
-    root: Path, frame: Frame, picture: Image.Image, files: MaskFiles, notes: list[str], remover: Remover | None
+    root: Path, frame: Frame, bitmap: Image.Image, files: MaskFiles, notes: list[str], remover: Remover | None
 ) -> Image.Image:
     """The mask of a frame in full size, of mode L or F."""
-    alpha = None if files.given or frame.mask is not None else alpha_values(picture, notes)
+    alpha = None if files.given or frame.mask is not None else alpha_values(bitmap, notes)
     if alpha is not None:
         return alpha
     found = files.of(frame)
@@ -267,14 +269,14 @@ def _mask(
             )
         if files.given is None:
             _still_inside(root, found, frame)
-        return mask_values(found, read_picture(found, notes=notes, calibrated=frame.lens.size), notes)
+        return mask_values(found, decode_image(found, notes=notes, calibrated=frame.lens.size), notes)
     if files.given is not None:
         raise InputError(
             files.given, f"masks: expected a file with the stem of {shown(frame.image.name)}, got none; add it"
         )
     if remover is not None:
-        return remover.mask(picture)
-    got = "alpha that is opaque everywhere" if picture.mode == "RGBA" else "no alpha"
+        return remover.mask(bitmap)
+    got = "alpha that is opaque everywhere" if bitmap.mode == "RGBA" else "no alpha"
     raise InputError(
         frame.image,
         f"expected alpha or a foreground mask, got {got}; save RGBA images, put white-on-black masks of the same names "

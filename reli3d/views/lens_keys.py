@@ -188,7 +188,7 @@ def _spellings(where: str, source: dict, data: dict, size) -> Iterator[tuple[str
         if sensor is None:
             raise InputError(
                 where,
-                f"focal_length: expected sensor_width beside it, got {shown(source['focal_length'])} of an unknown "
+                f"focal_length: expected sensor_width with it, got {shown(source['focal_length'])} of an unknown "
                 "unit; write fl_x in pixels",
             )
         ratio = number(where, "focal_length", source["focal_length"], 0, 1e9) / number(

@@ -25,38 +25,38 @@ LABEL = "masks: the object has "
 _TOP = {"L": 255.0, "F": 65535.0}
 
 
-def mask_values(path: os.PathLike, picture: Image.Image, notes: list[str]) -> Image.Image:
-    """The coverage of the object, mode L or F, that a mask file of ``read_picture`` holds.
+def mask_values(path: os.PathLike, bitmap: Image.Image, notes: list[str]) -> Image.Image:
+    """The coverage of the object, mode L or F, that a mask file of ``decode_image`` holds.
 
     Alpha where it is used, else grey, or one color on black.  Grey values between black and white are coverage
     (antialiasing).  Of a mask with two values, black and one below white, nonzero is the object, with a note.  Raises
     InputError with the values found for several labels and for what has no black.
     """
-    alpha = used_alpha(picture)
+    alpha = used_alpha(bitmap)
     if alpha is not None:
         return _coverage(path, alpha, notes)
-    if picture.mode in _TOP:
-        return _coverage(path, picture, notes)
-    return _color_coverage(path, picture.convert("RGB"), notes)
+    if bitmap.mode in _TOP:
+        return _coverage(path, bitmap, notes)
+    return _color_coverage(path, bitmap.convert("RGB"), notes)
 
 
-def alpha_values(picture: Image.Image, notes: list[str]) -> Image.Image | None:
+def alpha_values(bitmap: Image.Image, notes: list[str]) -> Image.Image | None:
     """The alpha of an image as coverage; None where it has none, or one that is opaque nearly everywhere.
 
     Of two values, 0 and one below white, nonzero is the object, with a note.
     """
-    alpha = used_alpha(picture)
+    alpha = used_alpha(bitmap)
     if alpha is None:
         return None
     levels = _levels(alpha)
     return _nonzero(alpha, levels[1], notes) if len(levels) == 2 and levels[0] == 0 else alpha
 
 
-def used_alpha(picture: Image.Image) -> Image.Image | None:
-    """The alpha channel of ``picture`` where it is below one half somewhere."""
-    if picture.mode != "RGBA":
+def used_alpha(bitmap: Image.Image) -> Image.Image | None:
+    """The alpha channel of ``bitmap`` where it is below one half somewhere."""
+    if bitmap.mode != "RGBA":
         return None
-    alpha = picture.getchannel("A")
+    alpha = bitmap.getchannel("A")
     return alpha if int(np.asarray(alpha).min()) < 128 else None
 
 
@@ -116,14 +116,14 @@ def _flat(values: np.ndarray) -> np.ndarray:
     return rows[1:-1] & rows[:-2] & rows[2:] & (middle[1:-1] == middle[:-2]) & (middle[1:-1] == middle[2:])
 
 
-def _color_coverage(path: os.PathLike, picture: Image.Image, notes: list[str]) -> Image.Image:
-    """Coverage of ``picture``, which is grey or has multiples of one color alone, from its brightest channel."""
-    red, green, blue = picture.split()
+def _color_coverage(path: os.PathLike, bitmap: Image.Image, notes: list[str]) -> Image.Image:
+    """Coverage of ``bitmap``, which is grey or has multiples of one color alone, from its brightest channel."""
+    red, green, blue = bitmap.split()
     high = ImageChops.lighter(ImageChops.lighter(red, green), blue)
     low = ImageChops.darker(ImageChops.darker(red, green), blue)
     if int(np.asarray(ImageChops.difference(high, low)).max()) <= GREY_SPREAD:
         return _coverage(path, high, notes)
-    colors = picture.getcolors(MAX_COLORS)
+    colors = bitmap.getcolors(MAX_COLORS)
     if colors is None:
         raise _not_a_mask(path, f"more than {MAX_COLORS} colors")
     found = np.array(sorted(color for _, color in colors), dtype=np.float64)

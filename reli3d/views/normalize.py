@@ -186,7 +186,7 @@ def _covered(points: Tensor, mask: Tensor, pose: Tensor, camera: Tensor, cell: f
     footprint = float((camera[:2] * cell / depth.median()).max()) if len(points) else 0.0
     height, width = mask.shape
     step = max(1, min(int(footprint // 3), max(height, width)))  # without end where most points are behind the camera
-    if footprint > 1:  # maximum over 3 x 3 blocks of a third of a footprint: the thin part that one sample would miss
+    if footprint > 1:  # maximum over 3 x 3 blocks of a third of a footprint: thin parts that one sample would skip
         mask = max_pool2d(pad(mask, (0, -width % step, 0, -height % step))[None], step)
         mask = max_pool2d(mask, 3, 1, 1)[0]
     scaled = torch.stack([camera[0] * local[:, 0], -camera[1] * local[:, 1]], -1) / depth[:, None] + camera[2:]

@@ -1,8 +1,8 @@
-"""Views as the published network was shown them, and what it lets a user choose beside.
+"""Views in the form of the published network's training data, and its further options.
 
 The release stores its training views as JPEG and sends every input the same way: a round trip through JPEG, a plain
-bilinear resize, a mask that is cut at one half after it.  A network that was trained on such pictures gets such
-pictures; every step stands in docs/model.md.
+bilinear resize, a mask that is cut at one half after it.  The network was trained on such images, so inference
+uses the same steps, which docs/model.md lists.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""How much of a large photograph is kept: what is read from it later, not what the camera's sensor has."""
+"""Reduction of large images to the resolution that later stages read."""
 
 from __future__ import annotations
 
@@ -8,23 +8,23 @@ from dataclasses import dataclass
 import numpy as np
 from PIL import Image
 
-LARGE = 1 << 21  # pixels up to which a photograph is kept as it is: 1920 x 1080
-OBJECT = 768  # pixels along the object that are kept: nothing reads more than 512
+MAX_FULL_PIXELS = 1 << 21  # up to which an image is kept as it is: 1920 x 1080
+MAX_OBJECT_PIXELS = 768  # along the object's longer side: later stages read at most 512
 MARGIN = 1.25  # side of the square that is kept, in sides of the object
 
 
 @dataclass(frozen=True)
 class Cut:
-    """A part ``(x0, y0, x1, y1)`` of a picture and the size ``(width, height)`` it is scaled to."""
+    """A part ``(x0, y0, x1, y1)`` of an image and the size ``(width, height)`` it is scaled to."""
 
     part: tuple[int, int, int, int]
     size: tuple[int, int]
 
-    def pixels(self, picture: Image.Image) -> Image.Image:
-        """The part of ``picture`` at the new size, filtered over their area; straight alpha stays straight."""
-        if picture.mode == "RGBA":  # Pillow would multiply the colour by alpha, and lose that under alpha 0
-            return Image.merge("RGBA", [self.pixels(band) for band in picture.split()])
-        return picture.resize(self.size, Image.Resampling.BILINEAR, box=self.part)
+    def pixels(self, bitmap: Image.Image) -> Image.Image:
+        """The part of ``bitmap`` at the new size, filtered over their area; straight alpha stays straight."""
+        if bitmap.mode == "RGBA":  # Pillow would multiply the colour by alpha, and lose that under alpha 0
+            return Image.merge("RGBA", [self.pixels(band) for band in bitmap.split()])
+        return bitmap.resize(self.size, Image.Resampling.BILINEAR, box=self.part)
 
     def intrinsics(self, camera: list[float]) -> list[float]:
         """``[fx, fy, cx, cy]`` of the new pixels."""
@@ -35,23 +35,23 @@ class Cut:
 
 
 def cut(size: tuple[int, int], inside: np.ndarray, *, whole: bool) -> Cut | None:
-    """What to keep of a picture of ``size`` (width, height); None where all of it is kept as it is.
+    """What to keep of an image of ``size`` (width, height); None where all of it is kept as it is.
 
     inside: ``(H, W)`` bool, the pixels of the object, one at least.  whole: keep the background as well, with fewer
     pixels on the object.
     """
     width, height = size
-    if width * height <= LARGE:
+    if width * height <= MAX_FULL_PIXELS:
         return None
     if whole:
-        scale, part = math.sqrt(LARGE / (width * height)), (0, 0, width, height)
+        scale, part = math.sqrt(MAX_FULL_PIXELS / (width * height)), (0, 0, width, height)
     else:
         columns, rows = (np.flatnonzero(inside.any(axis)) for axis in (0, 1))
         x0, y0, x1, y1 = int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
         side = max(x1 - x0, y1 - y0)
         reach = math.ceil(0.5 * MARGIN * side)
         x, y = (x0 + x1) // 2, (y0 + y1) // 2
-        scale = min(1.0, OBJECT / side)
+        scale = min(1.0, MAX_OBJECT_PIXELS / side)
         part = max(0, x - reach), max(0, y - reach), min(width, x + reach), min(height, y + reach)
     columns_kept, rows_kept = part[2] - part[0], part[3] - part[1]
     return Cut(part, (max(1, round(scale * columns_kept)), max(1, round(scale * rows_kept))))

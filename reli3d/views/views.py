@@ -1,4 +1,4 @@
-"""Posed photographs of one object: what every reader of a folder gives and every stage of the pipeline takes.
+"""Posed images of one object with masks, as readers of folders return them and the stages of the pipeline take them.
 
 Colour is sRGB in [0, 1] with straight alpha, the background kept under it.  Cameras are camera-to-world in OpenGL axes
 (+X right, +Y up, looking along -Z), intrinsics (fx, fy, cx, cy) in pixels with pixel centres at +0.5.
@@ -112,7 +112,7 @@ class Views:
         return self if self.chosen is None else self.select(self.chosen)
 
     def transformed(self, similarity: Similarity) -> Views:
-        """The same photographs with the cameras in another frame: eyes mapped, axes turned, intrinsics as they are."""
+        """The same images with the cameras in another frame: eyes mapped, axes turned, intrinsics as they are."""
         c2w = self.c2w.double()
         rotation = similarity.rotation.to(c2w) @ c2w[:, :3, :3]
         rows = torch.cat([rotation, similarity.apply(c2w[:, :3, 3])[..., None]], -1)

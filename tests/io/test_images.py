@@ -11,7 +11,7 @@ from PIL import Image
 from reli3d.errors import InputError, printable, shown
 from reli3d.io.files import read_bytes, write_bytes
 from reli3d.io.hdr import read_hdr_image
-from reli3d.io.images import colour, png_bytes, read_image, write_image, write_png
+from reli3d.io.images import color_of, png_bytes, read_image, write_image, write_png
 
 NOISE = np.random.default_rng(3).integers(0, 256, (9, 14, 4), np.uint8)
 
@@ -70,10 +70,10 @@ def test_the_size_limit_holds_before_decoding(tmp_path):
 
 def test_colour_takes_no_memory_for_alpha():
     """Found by the campaign: 33 MP with alpha took more than 1 GiB."""
-    picture = Image.fromarray(np.full((1000, 1000, 4), 255, np.uint8))
+    bitmap = Image.fromarray(np.full((1000, 1000, 4), 255, np.uint8))
     tracemalloc.start()
     try:
-        assert bool((colour(picture) == 1).all())
+        assert bool((color_of(bitmap) == 1).all())
         assert tracemalloc.get_traced_memory()[1] < 24e6  # 12 of the result, 4 or 8 of the pixels as stored
     finally:
         tracemalloc.stop()

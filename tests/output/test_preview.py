@@ -1,4 +1,4 @@
-"""The picture of a reconstruction: views that nobody took, whole, and what its tiles hold."""
+"""The contact sheet of a reconstruction: novel views show the whole object, tiles have the right content."""
 
 import math
 import threading
@@ -84,16 +84,16 @@ def test_the_filter_takes_noise_and_leaves_edges(asset):
     camera = preview.unseen_cameras(asset.mesh, rig((0, 15, 3), target=(2.0, 2.0, 2.0)))[0]
     few, many = (
         render_asset(checkered, camera, options=ShadeOptions(samples=samples), supersampling=2, scene=scene)
-        for samples in (preview.SAMPLES, (400, 80, 20))
+        for samples in (preview.SUBPIXEL_SAMPLES, (400, 80, 20))
     )
-    (smooth,) = preview._smoothed(few)
+    (smooth,) = preview._denoised(few)
     before, after = ((x - many.radiance).square().mean() for x in (few.radiance, smooth))
-    assert float(after) < 0.15 * float(before)  # 0.06; a box of the same size, blind to paint and normals, has 0.34
+    assert float(after) < 0.15 * float(before)  # 0.06; a box of the same size, unguided, has 0.34
     assert float((smooth.mean() / few.radiance.mean() - 1).abs()) < 0.01
     assert bool((smooth[few.alpha == 0] == 0).all())
 
 
-def test_the_rendering_begins_before_the_picture_is_asked_for(asset, threads, monkeypatch):
+def test_the_rendering_begins_before_the_sheet_is_requested(asset, threads, monkeypatch):
     threads(2)
     began = []
     rendered = preview._rendered
@@ -107,11 +107,11 @@ def test_the_rendering_begins_before_the_picture_is_asked_for(asset, threads, mo
     monkeypatch.setattr(preview, "_rendered", seen)
     cameras, intrinsics = rig((0, 15, 3), target=(2.0, 2.0, 2.0)), torch.tensor([[120.0, 120.0, 32.0, 32.0]])
     views = Views((torch.ones(64, 64, 3),), (torch.ones(64, 64),), cameras, intrinsics, ("a",))
-    picture = preview.preview(asset, views)
+    sheet = preview.preview(asset, views)
     for _ in range(600):
         if len(began) == 4:
             break
         time.sleep(0.1)
     assert began == [True] * 4
     with pytest.raises(ValueError, match="a tile"):
-        picture()
+        sheet()

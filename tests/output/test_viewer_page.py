@@ -168,7 +168,7 @@ def test_the_page_shows_what_a_surface_hides_from_itself(tmp_path, waisted, view
         tab.open((tmp_path / "viewer.html").as_uri(), size=(WIDE, SIZE)).wait("document.body.dataset.ready")
         for i in range(len(views)):
             tab.ask(f"take({i})")
-            for name, turn, stops, light in (("own light", 30, 0, studio()), ("sky", -60, -1, sky())):
+            for name, turn, stops, light in (("estimated light", 30, 0, studio()), ("sky", -60, -1, sky())):
                 picture = pixels(tab.ask(choose(light=name, turn=turn, stopsof=stops) + "picture()"))
                 turned = light.rotated(math.radians(turn))
                 for shadows in (True, False):
@@ -210,7 +210,7 @@ def test_a_half_hidden_everywhere_is_a_stop_less(tmp_path, asset, views, monkeyp
 
 
 def test_the_page_of_the_example_looks_as_its_picture_by_the_renderer(tmp_path):
-    """The own light from the first photograph, at the command's own sizes."""
+    """The estimated light from the first photograph, at the command's default sizes."""
     assert infer.main(["--output", str(tmp_path), "--device", "cpu"]) == 0
     (part,) = read_glb(tmp_path / "example" / "mesh.glb")
     light = read_environment(tmp_path / "example" / "environment.exr")
@@ -230,7 +230,7 @@ def test_the_page_of_a_reconstruction_holds_all_it_needs(asset, views):
     assert page.count("</script>") == 3  # a name cannot end the data
     data = json.loads(re.search(r'id="data">(.*?)</script>', page, re.DOTALL)[1])
     assert len(zlib.decompress(base64.b64decode(data["meshes"][0]["blocked"]))) == 16 * len(asset.mesh.vertices)
-    assert [light["name"] for light in data["lights"]] == ["own light", "studio", "sky"]
+    assert [light["name"] for light in data["lights"]] == ["estimated light", "studio", "sky"]
     assert [view["name"] for view in data["views"]] == list(views.names)
 
 

@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 
 from reli3d.errors import InputError
-from reli3d.views.choose import NEAR, choose_views, spread_notes, view_distances
+from reli3d.views.choose import DUPLICATE_DISTANCE_RAD, choose_views, spread_notes, view_distances
 from reli3d.views.folder import MAX_VIEWS, load_views
 from tests.support import evil
 from tests.support.rigs import rig
@@ -26,7 +26,7 @@ def crowd() -> torch.Tensor:
 
 def test_of_sixty_views_of_which_57_are_near_identical_the_four_distinct_are_taken():
     assert choose_views(crowd(), 4) == [0, 17, 33, 51]
-    assert choose_views(crowd(), 16, apart=NEAR) == [0, 17, 33, 51]
+    assert choose_views(crowd(), 16, min_distance=DUPLICATE_DISTANCE_RAD) == [0, 17, 33, 51]
     assert len(choose_views(crowd(), 16)) == 16  # as many as asked for
 
 
@@ -61,7 +61,7 @@ def test_a_move_of_the_world_changes_nothing():
 
 def test_all_views_the_same_or_one_view():
     same = crowd()[:1].expand(5, 4, 4)
-    assert choose_views(same, 3) == [0, 1, 2] and choose_views(same, 3, apart=NEAR) == [0]
+    assert choose_views(same, 3) == [0, 1, 2] and choose_views(same, 3, min_distance=DUPLICATE_DISTANCE_RAD) == [0]
     assert choose_views(same[:1], 16) == [0] and spread_notes(same[:1]) == []
     with pytest.raises(ValueError, match="count: expected"):
         choose_views(same, 0)
@@ -90,7 +90,7 @@ def test_a_folder_of_sixty_is_read_as_its_four_distinct_views(tmp_path):
         views = load_views(tmp_path, **asked)
         assert views.in_folder == 60 and torch.allclose(views.c2w, cameras[[0, 17, 33, 51]], atol=1e-5)
         (note,) = views.notes
-        assert note.startswith("4 of 60 views taken, farthest apart in direction and distance: 0, 17, 33, 51")
+        assert note.startswith("4 of 60 views taken by farthest-point sampling: 0, 17, 33, 51")
     whole = load_views(tmp_path, every=True)
     assert len(whole) == 60 and whole.notes == views.notes and torch.equal(whole.taken().c2w, views.c2w)
     assert whole.taken().taken() is not whole and len(whole.taken().taken()) == 4

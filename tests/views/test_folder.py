@@ -241,7 +241,7 @@ def test_premultiplied_alpha_is_noted(tmp_path):
     frame = {"file_path": "a.png", "transform_matrix": evil.pose(0), "camera_fov": 0.6}
     transforms(tmp_path, [frame])
     flat = np.full_like(alpha, 0.8)
-    for colour, noted in ((np.where(alpha > 0, flat, 0.0), False), (flat * alpha, True), (flat, False)):
-        pixels = np.stack([colour, colour * 0.7, colour * 0.5, alpha], -1)
+    for color_of, noted in ((np.where(alpha > 0, flat, 0.0), False), (flat * alpha, True), (flat, False)):
+        pixels = np.stack([color_of, color_of * 0.7, color_of * 0.5, alpha], -1)
         Image.fromarray(np.rint(pixels * 255).astype(np.uint8)).save(tmp_path / "a.png")
         assert bool(load_views(tmp_path).notes) == noted

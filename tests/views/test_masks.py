@@ -31,18 +31,18 @@ def folder(root, images, **top):
 
 
 def palette(labels, colors):
-    picture = Image.fromarray(labels.astype(np.uint8), "L").convert("P")
-    picture.putdata(labels.ravel().tolist())
-    picture.putpalette([v for color in colors for v in color] + [0] * (768 - 3 * len(colors)))
-    return picture
+    bitmap = Image.fromarray(labels.astype(np.uint8), "L").convert("P")
+    bitmap.putdata(labels.ravel().tolist())
+    bitmap.putpalette([v for color in colors for v in color] + [0] * (768 - 3 * len(colors)))
+    return bitmap
 
 
-def mask_of(tmp_path, picture, ending=".png", **options):
-    """The mask and notes of one view whose mask file is ``picture``."""
+def mask_of(tmp_path, bitmap, ending=".png", **options):
+    """The mask and notes of one view whose mask file is ``bitmap``."""
     folder(tmp_path, ["images/a.png"])
     (tmp_path / "masks").mkdir()
-    picture = Image.fromarray(picture) if isinstance(picture, np.ndarray) else picture
-    picture.save(tmp_path / f"masks/a{ending}", **options)
+    bitmap = Image.fromarray(bitmap) if isinstance(bitmap, np.ndarray) else bitmap
+    bitmap.save(tmp_path / f"masks/a{ending}", **options)
     views = load_views(tmp_path)
     return views.masks[0].numpy(), views.notes
 

@@ -15,7 +15,7 @@ from reli3d.errors import InputError
 from reli3d.geometry.camera import project
 from reli3d.io.images import read_image
 from reli3d.views.folder import load_views
-from reli3d.views.reduce import LARGE, OBJECT, cut
+from reli3d.views.reduce import MAX_FULL_PIXELS, MAX_OBJECT_PIXELS, cut
 from tests.support import evil
 from tests.support.evil import pose
 
@@ -84,9 +84,9 @@ def test_what_is_accepted_comes_out_as_stored(tmp_path, name):
     write, expected, levels = ACCEPTED[name]
     write(tmp_path / "a.png")
     (path,) = tmp_path.iterdir()
-    colour, alpha = read_image(path)
+    color_of, alpha = read_image(path)
     want = torch.from_numpy(np.ascontiguousarray(expected(SHADES))).float().expand(SIZE[1], SIZE[0], 3)
-    assert float((colour * 255 - want).abs().max()) <= levels + 1e-4  # a few ulp of float32 at 255
+    assert float((color_of * 255 - want).abs().max()) <= levels + 1e-4  # a few ulp of float32 at 255
     assert (alpha is not None) == ("alpha" in name)
     if alpha is not None:
         assert torch.equal((alpha * 255).round().byte(), torch.from_numpy(SHADES[..., 3].copy()))
@@ -125,21 +125,21 @@ def test_a_large_photograph_keeps_its_object_and_its_camera(tmp_path, whole):
     image, mask = views.images[0], views.masks[0]
     assert any("more than" in note for note in views.notes)
     if whole:
-        assert 0.99 * LARGE < mask.numel() < 1.01 * LARGE
+        assert 0.99 * MAX_FULL_PIXELS < mask.numel() < 1.01 * MAX_FULL_PIXELS
     else:
         columns, rows = (mask > 0.5).any(0).nonzero(), (mask > 0.5).any(1).nonzero()
         side = max(int(columns[-1] - columns[0]), int(rows[-1] - rows[0])) + 1
-        assert OBJECT - 2 <= side <= OBJECT
-        assert max(mask.shape) <= 1.3 * OBJECT
+        assert MAX_OBJECT_PIXELS - 2 <= side <= MAX_OBJECT_PIXELS
+        assert max(mask.shape) <= 1.3 * MAX_OBJECT_PIXELS
     points = torch.tensor([[0.15, 0.1, 0.0], [0.5, 0.2, 0.1], [0.3, -0.1, -0.2]])
     full = torch.tensor([1.2 * width, 1.2 * width, 1400.0, 1100.0])
     at, _ = project(points, views.c2w[0], full)
     now, _ = project(points, views.c2w[0], views.intrinsics[0])
     for (x, y), (u, v) in zip(at.tolist(), now.tolist()):
         assert box[0] < x < box[2] and box[1] < y < box[3]
-        colour = image[int(v), int(u)] * 255
+        color_of = image[int(v), int(u)] * 255
         # the gradient moves by a level in 8 rows; JPEG and rounding cost two
-        assert abs(float(colour[0]) - x * 255 / width) < 3 and abs(float(colour[1]) - y * 255 / height) < 3
+        assert abs(float(color_of[0]) - x * 255 / width) < 3 and abs(float(color_of[1]) - y * 255 / height) < 3
         assert float(mask[int(v), int(u)]) == 1.0
     assert views.masks[0].dtype == torch.float32
 
