@@ -1,4 +1,4 @@
-"""From posed photographs to a relightable asset: one function a stage, :func:`reconstruct` that runs them in order, and
+"""Pipeline from posed images to a relightable asset: one function per stage, :func:`reconstruct` that runs them, and
 :func:`reconstruct_folder` from the files of an object to those of its result.
 """
 
@@ -49,10 +49,10 @@ if TYPE_CHECKING:
 
 REFINED = 384  # pixels of the views that a refinement compares with
 INSIDE = 2.0  # pixels of such a view that a silhouette's edge may spill over
-SMALLEST_PART = 0.01  # share of the faces below which a separate piece is dropped
+MIN_PART_FRACTION = 0.01  # of the faces; smaller components are removed
 TEXELS = 1 << 19  # evaluated at once on a CPU, where no features are kept: 100 bytes each
 SHADING_POINTS = 4096  # vertices by which the light on the object is judged
-OUTSIDE = 1.0  # level given to grid points that the silhouettes exclude
+OUTSIDE = 1.0  # field value of grid points that the silhouettes exclude
 MARGIN_CELLS = 2.5  # cells around the silhouettes' hull in which the field is still evaluated
 
 
@@ -90,10 +90,10 @@ def extract(field: Field, resolution: int) -> Mesh:
     Raises NoSurface, an InputError, where the field has none.
     """
     if isinstance(field, LocalField):
-        mesh = largest_components(_bounded_surface(field, resolution), SMALLEST_PART)
-        mesh = taubin_smooth(mesh, iterations=field.model.preset.smoothing)  # ripples of a cell: each level is a guess
+        mesh = largest_components(_bounded_surface(field, resolution), MIN_PART_FRACTION)
+        mesh = taubin_smooth(mesh, iterations=field.model.preset.smoothing)  # predictions are noisy from cell to cell
     elif isinstance(field, TriplaneField):
-        mesh = largest_components(_free_surface(field, resolution), SMALLEST_PART)
+        mesh = largest_components(_free_surface(field, resolution), MIN_PART_FRACTION)
     else:
         raise TypeError(f"field: expected LocalField or TriplaneField, got {type(field).__name__}")
     return replace(mesh, normals=vertex_normals(mesh.vertices, mesh.faces))
@@ -102,18 +102,18 @@ def extract(field: Field, resolution: int) -> Mesh:
 def _free_surface(field: TriplaneField, resolution: int) -> Mesh:
     radius = field.model.preset.radius
     flat = _grid(resolution, radius, field.maps.images.device).reshape(-1, 3)
-    level = field.grid_sdf(flat[: resolution + 1, 2])
-    _check_signs(level)
-    found = field.cube_weights(flat, level)
+    sdf = field.grid_sdf(flat[: resolution + 1, 2])
+    _check_signs(sdf)
+    found = field.cube_weights(flat, sdf)
     names = ("deformation", "alpha", "beta", "gamma", "cubes")
     deformation, alpha, beta, gamma, cubes = (found[name] for name in names)
     return extract_surface(
-        level, radius=radius, deformation=deformation, alpha=alpha, beta=beta, gamma=gamma, cubes=cubes
+        sdf, radius=radius, deformation=deformation, alpha=alpha, beta=beta, gamma=gamma, cubes=cubes
     )
 
 
 def _bounded_surface(field: LocalField, resolution: int) -> Mesh:
-    """The silhouettes bound it: as many cubes on the space that matters."""
+    """Surface within the silhouettes' hull, with all cubes on its bounding box."""
     preset, maps = field.model.preset, field.maps
     radius = preset.radius
     radius = min(radius, _hull_reach(field, resolution) + 2 * MARGIN_CELLS * radius / resolution)
@@ -126,14 +126,14 @@ def _bounded_surface(field: LocalField, resolution: int) -> Mesh:
         parts = [(_grid_points(axis, k), bound.view(-1)[k]) for k in index.split(CHUNK)]
         return torch.cat([torch.maximum(field.sdf_within(*part), part[1]) for part in parts])
 
-    level = torch.maximum(sparse_sdf(bound.clamp(min=OUTSIDE), near, evaluate), bound)
-    level = cover_silhouettes(level, bound, maps.silhouette, maps.camera, radius=radius)
-    _check_signs(level)
-    return extract_surface(level, radius=radius)
+    sdf = torch.maximum(sparse_sdf(bound.clamp(min=OUTSIDE), near, evaluate), bound)
+    sdf = cover_silhouettes(sdf, bound, maps.silhouette, maps.camera, radius=radius)
+    _check_signs(sdf)
+    return extract_surface(sdf, radius=radius)
 
 
-def _check_signs(level: Tensor) -> None:
-    low, high = (float(v) for v in torch.aminmax(level))
+def _check_signs(sdf: Tensor) -> None:
+    low, high = (float(v) for v in torch.aminmax(sdf))
     if low >= 0.0 or high < 0.0:
         raise NoSurface("sdf", f"expected values on both sides of 0, got [{low:.4g}, {high:.4g}]: no surface")
 
@@ -211,9 +211,9 @@ def light(field: Field) -> Environment:
 
 
 def match_brightness(asset: Asset, maps: ViewMaps, scene: RayScene) -> Asset:
-    """``asset`` with the likeliest paint, and its light scaled to the colour of the views that ``maps`` hold.
+    """``asset`` with estimated base color and its light scaled to match the colors of the views of ``maps``.
 
-    Photographs determine only the product of paint and light; see :mod:`reli3d.render.exposure`.
+    Images determine only the product of albedo and light; see :mod:`reli3d.render.exposure`.
     """
     maps = maps.inputs
     return estimate_base_color_and_light(asset, maps.images[..., :3], maps.images[..., 3] > INSIDE, maps.camera, scene)
@@ -323,7 +323,8 @@ class Placed:
 def place(views: Views, preset: Preset | LocalPreset, options: ReconstructOptions = DEFAULT) -> Placed:
     """The views with the hero first, and the frames.
 
-    Where poses are left as stored though nobody asked for it, ``notes`` of the views say so if the object does not fit.
+    If poses are used as stored by default and the object does not fit the model's box, ``notes`` of the views report
+    it.
     """
     normalization = options.normalization
     if normalization is None:
@@ -393,7 +394,8 @@ def reconstruct_placed(placed: Placed, model: Network, options: ReconstructOptio
 
 @full_precision
 def refine(asset: Asset, views: Views, *, seconds: float | None = None, steps: int | None = None, **options) -> Asset:
-    """``asset`` fitted to its photographs; parts of the fit that make held-out views worse are not taken.
+    """Refines ``asset`` by inverse rendering of its input views; parts of the fit that degrade held-out views are
+    dropped.
 
     views: any number, in the frame of ``asset`` (that of :func:`reconstruct`, unless its options name another).
     seconds or steps: one of the two.  options: of :func:`reli3d.fit.refine.refine`.  Raises TypeError, ValueError.

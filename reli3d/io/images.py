@@ -50,7 +50,7 @@ class _Reader(io.BufferedReader):
 def read_image(path: str | os.PathLike, *, notes: list[str] | None = None) -> tuple[Tensor, Tensor | None]:
     """Colour ``(H, W, 3)`` in [0, 1], sRGB-encoded as stored, and straight alpha ``(H, W)`` in [0, 1] or None.
 
-    As :func:`read_picture` reads it.
+    Decoded by :func:`decode_image`.
     """
     bitmap = decode_image(path, notes=notes)
     alpha = torch.from_numpy(unit(bitmap.getchannel("A"))) if bitmap.mode == "RGBA" else None
@@ -58,7 +58,7 @@ def read_image(path: str | os.PathLike, *, notes: list[str] | None = None) -> tu
 
 
 def color_of(bitmap: Image.Image) -> Tensor:
-    """Colour ``(H, W, 3)`` in [0, 1] of what :func:`read_picture` gives."""
+    """Color ``(H, W, 3)`` in [0, 1] of an image of :func:`decode_image`."""
     values = unit(bitmap)
     return torch.from_numpy(np.repeat(values[..., None], 3, -1) if values.ndim == 2 else values)
 

@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from reli3d.io.files import InputError, file_size, shown
+from reli3d.errors import InputError, shown
+from reli3d.io.files import file_size
 from reli3d.render.latlong import lat_long_directions, quarter_turn, texel_solid_angles
 
 ROWS = 64

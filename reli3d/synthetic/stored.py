@@ -8,7 +8,8 @@ from pathlib import Path
 
 from safetensors import SafetensorError, safe_open
 
-from reli3d.io.files import InputError, file_size, shown
+from reli3d.errors import InputError, shown
+from reli3d.io.files import file_size
 
 # Axes and dtype of each tensor of :mod:`reli3d.synthetic.samples`; a letter stands for the same number everywhere.
 TENSORS = {
