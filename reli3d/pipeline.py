@@ -421,7 +421,7 @@ class Progress:
     def __call__(self, stage: str) -> None:
         """A stage begins."""
 
-    def tell(self, notes: Iterable[str]) -> None:
+    def report(self, notes: Iterable[str]) -> None:
         """Notes on the object, a line each."""
 
 
@@ -480,14 +480,14 @@ def reconstruct_folder(
     views = photographs.taken()
     if options.up == "y" and (axis := up_axis(views.c2w)) not in (None, "y"):
         views = replace(views, notes=(*views.notes, f"the cameras stand upright about {axis}: try --up {axis}"))
-    progress.tell(views.notes)
+    progress.report(views.notes)
     with _diagnosed(views):
         with watch.stage("normalize"):
             placed = place(views, model.preset, options)
-        progress.tell(placed.views.notes[len(views.notes) :])
+        progress.report(placed.views.notes[len(views.notes) :])
         views = placed.views
         asset = reconstruct_placed(placed, model, options, watch)
-    progress.tell(watch.notes)
+    progress.report(watch.notes)
     output = placed.output_from_input
     shown, compared, first, record = views.transformed(output), None, None, {}
     if reading.budget:
@@ -496,7 +496,7 @@ def reconstruct_folder(
             fit: dict[str, Any] = {"seed": options.seed, "cameras": reading.cameras, "interrupt": reading.interrupt}
             result = refined(asset, photographs, bar=True, **fit, **reading.budget)
             compared = comparison(asset, result.asset, shown.to(model.device))
-        progress.tell(result.notes)
+        progress.report(result.notes)
         first, asset = asset if result.changed else None, result.asset
         record = {"refinement": {"views": len(photographs), **reading.budget, **result.record()}}
     with watch.stage("preview"):

@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 from reli3d.cli import objects
-from reli3d.cli.exit_codes import Parser, check_ranges, command, tell
+from reli3d.cli.exit_codes import Parser, check_ranges, command, report
 from reli3d.cli.samples import SampleJob, Wanted
 from reli3d.errors import InputError
 
@@ -181,8 +181,8 @@ def pack(args: argparse.Namespace) -> int:
         raise InputError(args.input, "expected samples or captures, got tar files")
     if isinstance(found, Captures):
         for name, reason in found.refused.items():
-            tell(f"{name}: left out, {reason}")
-    shards.pack(found, args.output, each=args.each, progress=tell)
+            report(f"{name}: left out, {reason}")
+    shards.pack(found, args.output, each=args.each, progress=report)
     return 0
 
 

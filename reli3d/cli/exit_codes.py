@@ -181,7 +181,7 @@ def check_ranges(args: argparse.Namespace, **ranges: tuple[float, float]) -> Non
         check_range(name.replace("_", "-"), getattr(args, name, None), low, high)
 
 
-def tell(line: str) -> None:
+def report(line: str) -> None:
     """Write a line of progress to stderr, at once."""
     print(line, file=sys.stderr, flush=True)
 

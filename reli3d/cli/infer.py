@@ -11,7 +11,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from reli3d.cli import objects
-from reli3d.cli.exit_codes import check_range, check_ranges, command, show_traceback, tell
+from reli3d.cli.exit_codes import check_range, check_ranges, command, report, show_traceback
 from reli3d.cli.help_format import joined
 from reli3d.cli.options import AXES, parser
 from reli3d.errors import InputError, printable
@@ -40,7 +40,7 @@ def main(argv: list[str] | None = None) -> int:
 
     def done(row: objects.Row) -> None:
         if args.workers is not None or args.ray is not None:  # their processes show no bar
-            tell(f"{printable(row.object)}: {row.seconds:.1f} s")
+            report(f"{printable(row.object)}: {row.seconds:.1f} s")
         if not args.json:
             print(args.output / row.object / "mesh.glb", flush=True)
 

@@ -107,7 +107,7 @@ class Bar(Progress):
             self.bar.n = STAGES.index(stage)
             self.bar.refresh()
 
-    def tell(self, notes: Iterable[str]) -> None:
+    def report(self, notes: Iterable[str]) -> None:
         for note in notes:
             self.bar.write(f"{self.name}: {printable(note)}", file=sys.stderr)
 

@@ -28,7 +28,7 @@ from typing import Protocol
 
 from tqdm import tqdm
 
-from reli3d.cli.exit_codes import Stopped, log_of, reason, signals, tell, write_log
+from reli3d.cli.exit_codes import Stopped, log_of, reason, report, signals, write_log
 from reli3d.errors import InputError, printable
 from reli3d.io.files import read_bytes, write_bytes
 
@@ -102,9 +102,9 @@ def collect(
                 ended.append(row)
                 if row.result in ("refused", "failed"):
                     which = "" if row.result == "refused" and len(items) == 1 else f"{printable(row.object)}: "
-                    tell(f"{name}: {which}{'; '.join(row.notes)}")
+                    report(f"{name}: {which}{'; '.join(row.notes)}")
                 elif row.result == "skipped":
-                    tell(f"{printable(row.object)}: all files are there, skipped")
+                    report(f"{printable(row.object)}: all files are there, skipped")
                 else:
                     done(row)
     finally:
@@ -251,7 +251,7 @@ def _rows(
                 if retried:
                     yield Row(item.name, "failed", retried=True, notes=(CRASHED,))
                     continue
-                tell(f"{printable(item.name)}: its worker crashed; it is made once more")
+                report(f"{printable(item.name)}: its worker crashed; it is made once more")
                 again.append(item)
             except Exception as error:  # the job of the worker could not be made
                 yield Row(item.name, "failed", retried=retried, notes=(reason(error),))

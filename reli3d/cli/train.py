@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from reli3d.cli.exit_codes import Parser, check_ranges, command, tell
+from reli3d.cli.exit_codes import Parser, check_ranges, command, report
 from reli3d.errors import InputError
 
 if TYPE_CHECKING:
@@ -199,7 +199,7 @@ def paper_stage(args: argparse.Namespace) -> Stage:
         for folder, samples in zip(args.data, sources, strict=True):
             if isinstance(samples, Samples):
                 cache = args.output / f"{folder.name}.latents"
-                samples.latents = fitted(model.environment, samples.files, cache, progress=tell)
+                samples.latents = fitted(model.environment, samples.files, cache, progress=report)
     names = ("seed", "max_views", "bfloat16", "checkpointing")
     return PaperStage(
         model.to(device),
@@ -248,10 +248,10 @@ def export(args: argparse.Namespace, stage: Stage) -> LocalReconstructor | Recon
         raise no_surface(path)
     if isinstance(model, LocalReconstructor):
         samples = args.validation if "validation" in args else args.data[0]
-        for views, tried in calibrate(model, samples, progress=tell).items():
+        for views, tried in calibrate(model, samples, progress=report).items():
             row = ", ".join(f"{offset:g}: {iou:.4f}" for offset, iou in tried.items())
-            tell(f"silhouette IoU by surface offset, {views} views: {row}")
-        tell(f"chosen: {model.preset.offset_one_view:g}, of many views {model.preset.offset_many_views:g}")
+            report(f"silhouette IoU by surface offset, {views} views: {row}")
+        report(f"chosen: {model.preset.offset_one_view:g}, of many views {model.preset.offset_many_views:g}")
     return model
 
 
