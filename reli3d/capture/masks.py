@@ -8,7 +8,8 @@ import numpy as np
 from reli3d.capture.mapping import Map, View
 from reli3d.capture.scene import Scene
 
-SIDE = 1000  # pixels along the longer side of the image that is segmented
+COARSE_SIDE, SIDE = 400, 1000  # pixels along the longer side of the image that is segmented, first and last
+BAND = 0.01  # of the longer side: half the width of the band about the coarse outline
 OUTER_GROWTH = 0.18  # of the object's projected hull: beyond it nothing is the object
 GROWTH_STEPS = 4  # times the limit grows at most: parts without a point are missing in the hull
 MOST_REACHED = 0.02  # fraction of the limit's edge up to which the mask does not count as cut off by it
@@ -29,67 +30,88 @@ def grabcut_mask(view: View, found: Map, scene: Scene, support: np.ndarray | Non
     feet on the plane, grown by OUTER_GROWTH, and once more as long as the mask reaches it.  support: pixels ``(K, 2)``
     of background seeds, in the place of the map's.
     """
-    image, scale = _reduced(view.photo.pixels)
-    h, w = image.shape[:2]
     points = found.points[scene.object]
     feet = points - scene.plane.height(points)[:, None] * scene.plane.normal if scene.plane else points[:0]
-    pixels, depth = view.project(points)
-    pixels = pixels[depth > 0] * scale
-    foot_pixels, depth = view.project(feet)
-    seeds = view.pixels[scene.object[view.points]] * scale
+    (pixels, depth), (foot_pixels, foot_depth) = view.project(points), view.project(feet)
+    pixels, foot_pixels = pixels[depth > 0], foot_pixels[foot_depth > 0]
+    seeds = view.pixels[scene.object[view.points]]
     seeds = seeds if len(seeds) >= FEWEST_SEEDS else pixels
-    inside = ((seeds > 0) & (seeds < (w - 1, h - 1))).all(1)
-    if inside.sum() < FEWEST_SEEDS:
+    seeds = seeds[((seeds > 0) & (seeds < np.array(view.photo.size) - 1)).all(1)]
+    if len(seeds) < FEWEST_SEEDS:
         return None
-    outline = cv2.convexHull(np.concatenate([pixels, foot_pixels[depth > 0] * scale]).astype(np.float32))[:, 0]
+    outline = cv2.convexHull(np.concatenate([pixels, foot_pixels]).astype(np.float32))[:, 0]
     ground = view.pixels[scene.support[view.points]] if support is None else support
-    middle, masks = outline.mean(0), []
+    found_masks = []
     for step in range(1, GROWTH_STEPS + 1):
-        limit = np.zeros((h, w), np.uint8)
-        grown = middle + (outline - middle) * (1 + OUTER_GROWTH * step)
-        cv2.fillConvexPoly(limit, np.rint(grown).astype(np.int32), 1)
-        mask = _grabcut(image, limit, seeds[inside], ground * scale)
-        if mask is None:
-            return None
-        masks.append(mask)
+        mask, limit = _coarse_mask(view.photo.pixels, outline, OUTER_GROWTH * step, seeds, ground)
+        found_masks.append(mask)
         if _reached(limit, mask) <= MOST_REACHED:
             break
     else:  # it leaks into the background without end
-        mask = masks[0]
-    return _full_size(cleaned(mask, seeds), view.photo.pixels.shape)
+        mask = found_masks[0]
+    return _full_size(_refined(view.photo.pixels, mask), view.photo.pixels.shape)
 
 
-def _grabcut(image: np.ndarray, limit: np.ndarray, seeds: np.ndarray, ground: np.ndarray) -> np.ndarray | None:
-    """The segmentation ``(H, W)`` within ``limit``; None where no background is in sight."""
-    h, w = limit.shape
-    labels = np.where(limit > 0, cv2.GC_PR_FGD, cv2.GC_BGD).astype(np.uint8)
-    radius = max(2, round(SEED_RADIUS * max(h, w)))
+def _coarse_mask(
+    pixels: np.ndarray, outline: np.ndarray, growth: float, seeds: np.ndarray, ground: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The mask at COARSE_SIDE, and its outer limit: the convex ``outline (K, 2)`` grown by ``growth``."""
+    image, scale = _reduced(pixels, COARSE_SIDE)
+    limit = np.zeros(image.shape[:2], np.uint8)
+    middle = outline.mean(0)
+    grown = (middle + (outline - middle) * (1 + growth)) * scale
+    cv2.fillConvexPoly(limit, np.rint(grown).astype(np.int32), 1)
+    labels = np.where(limit > 0, cv2.GC_PR_BGD, cv2.GC_BGD).astype(np.uint8)
+    cv2.fillConvexPoly(labels, np.rint(outline * scale).astype(np.int32), cv2.GC_PR_FGD)
+    radius = max(1, round(SEED_RADIUS * max(limit.shape)))
     for points, label in ((ground, cv2.GC_BGD), (seeds, cv2.GC_FGD)):
-        for at in np.rint(points).astype(int):
+        for at in np.rint(points * scale).astype(int):
             cv2.circle(labels, at.tolist(), radius, label, -1)
+    return cleaned(_grabcut(image, labels, limit), seeds * scale), limit
+
+
+def _refined(pixels: np.ndarray, coarse: np.ndarray) -> np.ndarray:
+    """``coarse`` at SIDE: segmented anew within BAND of its outline (Lombaert and others 2005, banded graph cuts)."""
+    image, scale = _reduced(pixels, SIDE)
+    if image.shape[:2] == coarse.shape:
+        return coarse
+    mask = ((_full_size(coarse, image.shape) > 127) * 255).astype(np.uint8)
+    size = 2 * round(BAND * max(mask.shape)) + 1
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+    labels = np.where(mask > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
+    labels[cv2.erode(mask, kernel, borderValue=255) > 0] = cv2.GC_FGD
+    around = cv2.dilate(mask, kernel)
+    labels[around == 0] = cv2.GC_BGD
+    return cleaned(_grabcut(image, labels, around), None)
+
+
+def _grabcut(image: np.ndarray, labels: np.ndarray, limit: np.ndarray) -> np.ndarray:
+    """The mask ``(H, W)`` of OpenCV's ``labels``, with the background's colors from a margin around ``limit``."""
     ys, xs = limit.nonzero()
+    if len(ys) == 0:
+        return np.zeros(limit.shape, np.uint8)
     pad = round(CONTEXT * max(np.ptp(ys), np.ptp(xs)) + 8)
     box = slice(max(0, ys.min() - pad), ys.max() + pad), slice(max(0, xs.min() - pad), xs.max() + pad)
-    part = np.ascontiguousarray(labels[box])
-    if not (part == cv2.GC_BGD).any():
-        return None
-    cv2.setRNGSeed(0)
-    crop, colors = np.ascontiguousarray(image[box][..., ::-1]), (np.zeros((1, 65)), np.zeros((1, 65)))
-    cv2.grabCut(crop, part, (0, 0, 0, 0), *colors, ROUNDS, cv2.GC_INIT_WITH_MASK)
-    mask = np.zeros((h, w), np.uint8)
+    part, crop = np.ascontiguousarray(labels[box]), np.ascontiguousarray(image[box][..., ::-1])
+    known = {int(label) for label in np.unique(part)}
+    if known & {cv2.GC_BGD, cv2.GC_PR_BGD} and known & {cv2.GC_FGD, cv2.GC_PR_FGD}:
+        cv2.setRNGSeed(0)
+        colors = np.zeros((1, 65)), np.zeros((1, 65))
+        cv2.grabCut(crop, part, (0, 0, 0, 0), *colors, ROUNDS, cv2.GC_INIT_WITH_MASK)
+    mask = np.zeros(limit.shape, np.uint8)
     mask[box] = ((part == cv2.GC_FGD) | (part == cv2.GC_PR_FGD)) * 255
     return mask
 
 
 def _reached(limit: np.ndarray, mask: np.ndarray) -> float:
     """Fraction of the limit's edge, but for the image's border, at which the mask is inside."""
-    edge = (limit > 0) & (cv2.erode(limit, np.ones((5, 5), np.uint8), borderValue=1) == 0)
+    edge = (limit > 0) & (cv2.erode(limit, np.ones((3, 3), np.uint8), borderValue=1) == 0)
     return float((mask[edge] > 0).mean()) if edge.any() else 0.0
 
 
 def key_mask(pixels: np.ndarray) -> np.ndarray | None:
     """Mask of what differs from the color of the image's border; None where the border has no one color."""
-    image, _ = _reduced(pixels)
+    image, _ = _reduced(pixels, SIDE)
     lab = cv2.cvtColor(image, cv2.COLOR_RGB2LAB).astype(np.float32)
     border = np.concatenate([lab[0], lab[-1], lab[:, 0], lab[:, -1]])
     middle = np.median(border, 0)
@@ -146,8 +168,8 @@ def touches_border(mask: np.ndarray) -> bool:
     return int(edge.sum()) > 0.004 * max(mask.shape)
 
 
-def _reduced(pixels: np.ndarray) -> tuple[np.ndarray, float]:
-    scale = min(1.0, SIDE / max(pixels.shape[:2]))
+def _reduced(pixels: np.ndarray, side: int) -> tuple[np.ndarray, float]:
+    scale = min(1.0, side / max(pixels.shape[:2]))
     if scale == 1.0:
         return pixels, 1.0
     size = round(pixels.shape[1] * scale), round(pixels.shape[0] * scale)
