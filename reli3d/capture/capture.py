@@ -30,7 +30,9 @@ from reli3d.views.views import Views
 MASK_METHODS = ("grabcut", "key", "rembg")
 MOST_VIEWS = 60  # of the object folder; more are thinned by the distance between their cameras
 MASK_SIDE = 512  # pixels of masks by which the visual hull is judged
+SURE_AGREEMENT = 0.99  # mean fraction of the masks that the hull fills, above which the first map is right
 KEPT_FRACTION = 0.9  # of the first map's images that the second must register
+SAME_UP = math.cos(math.radians(15.0))  # between the upward directions of views that saw the object in one pose
 SAME_RIG = 0.02  # of the distance: residual of camera positions up to which two maps are the same but for a similarity
 OUTLIER_AGREEMENT = 0.8  # of the median: a view whose mask the hull fills less is left out
 LEAST_REGISTERED, MOST_ERROR, WIDEST_GAP = 0.8, 1.0, 60.0
@@ -223,11 +225,13 @@ def _refined(segmented: _Segmented, scene: Scene, known, report: CaptureReport, 
     up = scene.plane.normal if scene.plane else _mean_up(first)
     ground = -scene.plane.offset if scene.plane else None
     views = segmented.views
+    before = _agreement(views, segmented.masks)
+    if before > SURE_AGREEMENT:
+        return segmented, up, ground
     try:
         second = map_photos([v.photo for v in views], progress, [segmented.masks[v.photo.name] for v in views])
     except InputError:
         return segmented, up, ground
-    before = _agreement(views, segmented.masks)
     again = [v for v in second.views if v.photo.name in segmented.masks]
     if len(second.views) < KEPT_FRACTION * len(first.views) or _agreement(again, segmented.masks) <= before:
         return segmented, up, ground
@@ -235,20 +239,18 @@ def _refined(segmented: _Segmented, scene: Scene, known, report: CaptureReport, 
     by_name = {v.photo.name: v for v in first.views}
     pairs = [(by_name[v.photo.name], v) for v in second.views]
     directions = np.stack([b.rotation.T @ a.rotation @ up for a, b in pairs])
-    middle = directions.mean(0)
-    nearest = directions[np.argsort(-(directions @ middle))[: max(3, len(directions) // 2)]].mean(0)
+    alike = directions @ directions.T > SAME_UP  # an object that was turned over has two: that of most views is up
+    upward = directions[alike[alike.sum(1).argmax()]].mean(0)
     support = None
     if known is None:
         support = {v.photo.name: v.pixels[scene.support[v.points]] for v in first.views}
-    object_points = (second.error < 2.0) & (second.tracks >= 3)
-    scene_2 = Scene(scene.center, scene.distance, None, object_points, np.zeros(len(second.points), bool))
-    masks = _masks(second, scene_2, known, support, progress)
+    masks = _masks(second, find_scene(second, supported=False), known, support, progress)
     refined = _Segmented(second, masks)
     if len(masks) < KEPT_FRACTION * len(segmented.masks) or (
         known is None and _agreement(refined.views, masks) < _agreement(again, segmented.masks)
     ):
         refined = _Segmented(second, {v.photo.name: segmented.masks[v.photo.name] for v in again})
-    return refined, nearest / np.linalg.norm(nearest), _ground(pairs, scene.plane)
+    return refined, upward / np.linalg.norm(upward), _ground(pairs, scene.plane)
 
 
 def _ground(pairs: list[tuple[View, View]], plane: Plane | None) -> float | None:

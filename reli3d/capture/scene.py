@@ -50,9 +50,9 @@ class Scene:
     support: np.ndarray  # (P,) bool, points of the plane
 
 
-def find_scene(found: Map) -> Scene:
-    """The object of a map: what stands on the support plane where the cameras look.  Without a plane it is what lies
-    around that point.
+def find_scene(found: Map, *, supported: bool = True) -> Scene:
+    """The object of a map: the points above the support plane where the cameras look, in clusters.  Without a plane, or
+    where none is looked for (``supported`` False), it is the points around there.
     """
     eyes = np.stack([v.eye for v in found.views])
     axes = np.stack([v.rotation[2] for v in found.views])
@@ -60,13 +60,11 @@ def find_scene(found: Map) -> Scene:
     distance = float(np.median(np.linalg.norm(eyes - center, axis=1)))
     good = (found.error < MOST_ERROR) & (found.tracks >= FEWEST_TRACKS)
     near = good & (np.linalg.norm(found.points - center, axis=1) < REACH * distance)
-    plane = find_plane(found.points[near], eyes, distance)
+    plane = find_plane(found.points[near], eyes, distance) if supported else None
     height = plane.height(found.points) if plane else np.full(len(found.points), np.inf)
     tolerance = PLANE_TOLERANCE * distance
-    above = near & (height > 1.5 * tolerance)
-    return Scene(
-        center, distance, plane, _object(found.points, above, center, distance), near & (np.abs(height) < tolerance)
-    )
+    chosen = _object(found.points, near & (height > 1.5 * tolerance), center, distance)
+    return Scene(center, distance, plane, chosen, near & (np.abs(height) < tolerance))
 
 
 def find_plane(points: np.ndarray, eyes: np.ndarray, distance: float) -> Plane | None:

@@ -37,12 +37,18 @@ class TrueCapture:
         return folder
 
 
-def scene_surface(seed: int, moved: float = 0.0) -> tuple[ObjectSurface, int]:
-    """Object and table, and the number of the object's faces.  moved: shift of the object on the table."""
+def scene_surface(seed: int, table_yaw: float = 0.0, table: float = TABLE) -> tuple[ObjectSurface, int]:
+    """Object and table, and the number of the object's faces.
+
+    table_yaw: radians by which the table's pattern is turned about the vertical axis, as if the object had been moved
+    on it.  table: its half side.
+    """
     shape = make_object(seed)
-    mosaic = [Mosaic(np.eye(3) * f, 7 + k, share=0.5) for k, f in enumerate((9.0, 23.0, 51.0))]
+    c, s = np.cos(table_yaw), np.sin(table_yaw)
+    turn = np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+    mosaic = [Mosaic(turn * f, 7 + k, share=0.5) for k, f in enumerate((9.0, 23.0, 51.0))]
     dark, light, warm = Coat((0.05, 0.06, 0.08), 0.9), Coat((0.7, 0.68, 0.6), 0.9), Coat((0.5, 0.2, 0.1), 0.9)
-    table = Material(Coat((0.3, 0.3, 0.32), 0.9), ((dark, mosaic[0]), (light, mosaic[1]), (warm, mosaic[2])))
+    stone = Material(Coat((0.3, 0.3, 0.32), 0.9), ((dark, mosaic[0]), (light, mosaic[1]), (warm, mosaic[2])))
     skin = [
         Material(
             Coat(c, 0.7),
@@ -53,20 +59,17 @@ def scene_surface(seed: int, moved: float = 0.0) -> tuple[ObjectSurface, int]:
         )
         for k, (c, d, e) in enumerate((((0.6, 0.1, 0.1), (0.8, 0.7, 0.2), (0.1, 0.1, 0.3)),) * len(shape.materials))
     ]
-    vertices = shape.vertices + np.array([moved, 0, 0], np.float32)
-    low = float(vertices[:, 1].min())
-    corners = np.array(
-        [[-TABLE, low, -TABLE], [-TABLE, low, TABLE], [TABLE, low, TABLE], [TABLE, low, -TABLE]], np.float32
-    )
-    faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32) + len(vertices)
+    low = float(shape.vertices[:, 1].min())
+    corners = np.array([[-1, 0, -1], [-1, 0, 1], [1, 0, 1], [1, 0, -1]], np.float32) * table + (0, low, 0)
+    faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32) + len(shape.vertices)
     normals = np.zeros((2, 3, 3), np.float32)
     normals[..., 1] = 1.0
     whole = ProceduralObject(
-        np.concatenate([vertices, corners]),
+        np.concatenate([shape.vertices, corners]).astype(np.float32),
         np.concatenate([shape.faces, faces]),
         np.concatenate([shape.normals, normals]),
         np.concatenate([shape.part, np.full(2, len(shape.materials), np.int32)]),
-        (*skin, table),
+        (*skin, stone),
         "scene",
     )
     return ObjectSurface(whole), len(shape.faces)
@@ -78,35 +81,38 @@ def render_capture(
     size: tuple[int, int] = (400, 300),
     *,
     moved_after: int | None = None,
-    rng_seed: int = 0,
+    turntable: bool = False,
 ) -> TrueCapture:
-    """A ring of hand-held views at two heights under a sky.  moved_after: from this view on the object stands elsewhere
-    (cameras are then relative to the object).
+    """A ring of hand-held views at two heights under a sky; cameras are relative to the object.
+
+    moved_after: from this view on the object stands otherwise on the table.  turntable: the camera is fixed, the object
+    turns with a small table in front of a textured background.
     """
-    rng = np.random.default_rng(rng_seed)
+    rng = np.random.default_rng(0)
     width, height = size
     focal = 1.4 * width
-    azimuth = 2 * np.pi * (np.arange(views) + rng.uniform(-0.2, 0.2, views)) / views
-    elevation = np.radians(np.where(np.arange(views) % 2 == 0, 24, 46) + rng.uniform(-3, 3, views))
+    steps = np.arange(views)
+    azimuth = 2 * np.pi * (steps + (0 if turntable else 1) * rng.uniform(-0.2, 0.2, views)) / views
+    elevation = np.radians(np.where(steps % 2 == 0, 24, 46) + rng.uniform(-3, 3, views))
     distance = 2.9 * rng.uniform(0.92, 1.08, views)
+    target, roll = rng.normal(0, 0.03, (views, 3)), rng.normal(0, 0.04, (views, 3))
+    if turntable:
+        elevation[:], distance[:], target[:], roll[:] = np.radians(30), 2.9, 0.0, 0.0
     level = np.cos(elevation) * distance
     eye = np.stack([level * np.sin(azimuth), np.sin(elevation) * distance, level * np.cos(azimuth)], -1)
-    target = rng.normal(0, 0.03, (views, 3))
-    up = np.array([0.0, 1.0, 0.0]) + rng.normal(0, 0.04, (views, 3))
-    c2w = torch.stack(
-        [look_at(*(torch.tensor(v, dtype=torch.float32) for v in (eye[k], target[k], up[k]))) for k in range(views)]
-    )
     rows = torch.linspace(1.2, 0.5, 32)[:, None, None].expand(32, 64, 3)
-    light = rows.clone()
+    light = rows * torch.tensor(rng.uniform(0.5, 1.5, (32, 64, 1)), dtype=torch.float32) if turntable else rows.clone()
     light[4:8, 10:18] = 6.0
-    environment = Environment(light.contiguous())
+    sky = Environment(light.contiguous())
     samples = Samples(light=4, bsdf=2, cosine=2)
     images, masks, poses = [], [], []
+    pooled = torch.nn.functional.avg_pool2d
     for k in range(views):
-        shift = 0.35 if moved_after is not None and k >= moved_after else 0.0
-        surface, faces = scene_surface(seed, shift)
-        pose = c2w[k].clone()
-        pose[0, 3] += shift  # the photographer follows the object
+        yaw = 0.6 if moved_after is not None and k >= moved_after else 0.0
+        surface, faces = scene_surface(seed, yaw, 0.7 if turntable else TABLE)
+        environment = sky.rotated(float(azimuth[k])) if turntable else sky
+        at = (torch.tensor(v, dtype=torch.float32) for v in (eye[k], target[k], roll[k] + (0, 1, 0)))
+        pose = look_at(*at)
         camera = Camera(pose, torch.tensor([focal, focal, width / 2, height / 2]), width, height)
         origins, directions = (r.reshape(-1, 3) for r in camera_rays(camera.scaled(2)))
         hits = surface.scene.closest(origins, directions)
@@ -117,12 +123,9 @@ def render_capture(
             points, -directions[seen], environment, scene=surface.scene, options=ShadeOptions(samples=samples, seed=k)
         )
         on_object = (hits.face >= 0) & (hits.face < faces)
-        pooled = torch.nn.functional.avg_pool2d
         image = pooled(image.reshape(1, 2 * height, 2 * width, 3).permute(0, 3, 1, 2), 2)[0].permute(1, 2, 0)
         covered = pooled(on_object.float().reshape(1, 2 * height, 2 * width), 2)[0] > 0.5
         images.append((linear_to_srgb((0.6 * image).clamp(0, 1)) * 255 + 0.5).to(torch.uint8).numpy())
         masks.append(covered.numpy())
-        relative = pose.clone()
-        relative[0, 3] -= shift
-        poses.append(relative.numpy())
+        poses.append(pose.numpy())
     return TrueCapture(np.stack(images), np.stack(masks), np.stack(poses), focal)
