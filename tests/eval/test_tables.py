@@ -98,7 +98,7 @@ def test_the_command_writes_table_rows_and_pictures(place, monkeypatch, capsys):
     monkeypatch.setattr("reli3d.nn.weights.load_model", lambda name: None)
 
     def nothing(views, *, weights, options):
-        raise objects.NoSurface("none")
+        raise objects.NoSurface("sdf", "expected a surface, got none")
 
     monkeypatch.setattr(objects, "reconstruct", nothing)
     out = place / "out"

@@ -147,7 +147,7 @@ def test_hero_and_background_reach_the_network(tiny, monkeypatch):
 @pytest.fixture(scope="module")
 def asset(tiny):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pipeline.ViewMaps, "seen", None)  # nothing asks which view sees a point
+        patch.setattr(pipeline.ViewMaps, "visibility", None)  # nothing asks which view sees a point
         patch.setattr(pipeline, "RayScene", None)
         return reconstruct(EXAMPLE, weights=tiny, options=ReconstructOptions(256, 16))
 
