@@ -101,6 +101,7 @@ def test_what_makes_no_sense_ends_with_2(glb, tmp_path, capsys, words, text):
 def test_a_missing_extra_is_one_line(glb, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "pxr", None)
     assert main([str(glb), "--format", "usdz", "--output", str(tmp_path / "out")]) == 2
-    assert capsys.readouterr().err == "reli3d export: --format usdz: usd-core is not installed: pip install 'reli3d[usd]'\n"
+    message = "reli3d export: --format usdz: usd-core is not installed: pip install 'reli3d[usd]'\n"
+    assert capsys.readouterr().err == message
     assert not (tmp_path / "out").exists()
     assert np.isfinite(read_glb(glb)[0].mesh.vertices.numpy()).all()

@@ -46,7 +46,7 @@ def test_an_empty_field_counts_as_nothing_found_and_spoils_no_mean(monkeypatch):
     sample = synthesize(ObjectSurface(make_object(seed)), torch.ones(32, 64, 3), np.random.default_rng(seed), views=12)
 
     def none(*args, **kwargs):
-        raise NoSurface("sdf")
+        raise NoSurface("sdf", "expected a surface, got none")
 
     monkeypatch.setattr(heldout, "reconstruct", none)
     row = evaluate(None, sample, seed, 4, torch.ones(32, 64, 3))
