@@ -61,7 +61,7 @@ def waisted(tmp_path_factory) -> Asset:
     away = torch.linalg.cross(ball.vertices, torch.tensor([0.36, 0.8, 0.48]).expand_as(ball.vertices)).square().sum(-1)
     vertices = ball.vertices * (0.7 - 0.45 * torch.exp(-12.0 * (1.0 - away)))[:, None]
     mesh = with_tangents(Mesh(vertices, ball.faces, vertex_normals(vertices, ball.faces), ball.uv))
-    return stored(tmp_path_factory.mktemp("waisted"), Asset(mesh, textures(4, "cpu", (0.6, 0.6, 0.6), 0.5)))
+    return stored(tmp_path_factory.mktemp("waisted"), Asset(mesh, textures(4, "cpu", (0.32, 0.32, 0.32), 0.5)))
 
 
 @pytest.fixture(scope="module")

@@ -32,9 +32,9 @@ def ball(radius: float = 0.8, cells: int = 24, squeeze: float = 1.0) -> Asset:
 
 
 def sky() -> Environment:
-    """Bright from above and one side, dark from below; three colours."""
+    """Bright from above and from +Z, dark from below; three colors."""
     row = torch.linspace(1.6, 0.1, 16)[:, None, None]
-    column = 0.6 + 0.4 * torch.cos(torch.linspace(0.0, 2.0 * math.pi, 33)[:-1])[None, :, None]
+    column = 0.6 + 0.4 * torch.sin(torch.linspace(-math.pi, math.pi, 33)[:-1])[None, :, None]
     return Environment((row * column * torch.tensor([0.9, 1.0, 1.1])).contiguous())
 
 
