@@ -6,7 +6,7 @@ on first use: ``import reli3d`` alone loads neither torch nor Warp.
 
 from importlib import import_module
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 
 _MODULES = {
     "pipeline": ("reconstruct", "ReconstructOptions", "refine"),
