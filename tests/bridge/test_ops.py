@@ -8,7 +8,6 @@ import pytest
 import torch
 import warp as wp
 
-import reli3d
 from reli3d import kernels
 from tests.support import op_cases, op_cases_plain, reference
 from tests.support.op_cases import Case, N, rng
@@ -147,14 +146,6 @@ def test_nothing_given_is_written_to_and_nothing_of_it_is_given_back(device, nam
         assert torch.equal(given[k], bits) and given[k]._version == version, k
 
 
-def test_no_operator_of_torch_library_is_registered():
-    """The operations are autograd functions: no schema, no fake tensor, nothing that ``opcheck`` could take."""
-    for module in pkgutil.walk_packages(reli3d.__path__, "reli3d."):
-        if not module.name.endswith("__main__"):
-            importlib.import_module(module.name)
-    assert not [name for name in torch._C._dispatch_get_all_op_names() if name.startswith("reli3d")]
-
-
 @pytest.mark.slow  # 20 s of tracing
 @pytest.mark.parametrize("held_out", [True, False])
 def test_a_compiled_function_around_an_operation_gives_the_same_bits(device, held_out):
@@ -275,7 +266,7 @@ def test_cpu_and_cuda_agree(name):
         assert fraction >= 0.999, (key, fraction)
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", ["shade", "bake"])  # floating-point and integer outputs
 def test_what_compares_devices_is_still_on_one_and_sees_an_error(name):
     """The judge of the test above: nothing differs between two runs on the CPU, and 3e-4 in one entry of 50 does."""
     case = CASES[name]

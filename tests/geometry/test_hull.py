@@ -269,17 +269,6 @@ def test_wrong_mask_is_named(mask):
         mask_distance(mask)
 
 
-def test_result_does_not_depend_on_the_number_of_threads(threads):
-    masks, camera = sphere_views("cpu", size=64)
-    points = torch.rand(6000, 3, generator=torch.Generator().manual_seed(2)) - 0.5
-    results = []
-    for count in (1, 2, 5):
-        threads(count)
-        distance, axis = mask_distance(masks), torch.linspace(-0.5, 0.5, 40)
-        results.append(torch.cat([hull_distance(points, distance, camera), hull_grid(axis, distance, camera).view(-1)]))
-    assert all(torch.equal(results[0], other) for other in results[1:])
-
-
 @pytest.mark.parametrize("radius, views", [(0.5, 8), (0.06, 3), (0.3, 1)])
 def test_the_reach_is_that_of_the_points_inside(device, radius, views):
     """Also of a thin ball, and of one view's cone that runs to the end of the grid."""

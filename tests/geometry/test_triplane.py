@@ -110,42 +110,6 @@ def test_channel_first_planes_are_read_by_rows_with_the_same_bits(channels, heig
     assert torch.equal(sample_triplane(planes.detach(), points), want)
 
 
-def test_the_same_bits_for_any_number_of_threads(threads):
-    planes, points, weights = inputs(1, 40, 80, 80, 20000)
-    results = []
-    for count in (1, 2, 5):
-        threads(count)
-        p, q = planes.clone().requires_grad_(), points.clone().requires_grad_()
-        out = sample_triplane(p, q)
-        by_rows = sample_triplane(planes, points)
-        results.append((out.detach(), by_rows, *torch.autograd.grad(out, (p, q), weights)))
-    for other in results[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
-
-
-def test_gradient_only_where_asked_and_twice_is_refused(device):
-    planes, points, weights = inputs(device=device)
-    p = planes.clone().requires_grad_()
-    out = sample_triplane(p, points)
-    (g,) = torch.autograd.grad(out, p, weights, retain_graph=True)
-    assert torch.equal(g, torch.autograd.grad(out, p, weights, create_graph=True)[0])
-    q = points.clone().requires_grad_()
-    (g,) = torch.autograd.grad(sample_triplane(planes, q), q, weights)
-    assert g.shape == points.shape
-    (first,) = torch.autograd.grad(sample_triplane(p, points), p, weights.requires_grad_(), create_graph=True)
-    with pytest.raises(RuntimeError, match="twice|once_differentiable"):
-        first.sum().backward()
-
-
-def test_changing_an_input_in_place_before_backward_is_an_error():
-    planes, points, weights = inputs()
-    p, q = planes.requires_grad_(), points.clone()
-    out = sample_triplane(p, q)
-    q.add_(1.0)
-    with pytest.raises(RuntimeError, match="inplace|in-place"):
-        torch.autograd.grad(out, p, weights)
-
-
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -1e30, 3e38])
 def test_points_at_no_place_have_no_features_and_no_gradient(device, value):
     planes, points, weights = inputs(device=device)

@@ -168,17 +168,6 @@ def test_gradients_stay_finite_at_the_edges(device):
         assert float(grads[6].abs().max()) > 0.0
 
 
-def test_same_bits_for_any_number_of_threads(device, threads):
-    results = []
-    for count in (1, 2, 5):
-        threads(count)
-        asked = ask([*shading_inputs(device, 6000), *lobes(device, 6)])
-        out = shade_gaussians(*on_ball(*asked[:5]), SphericalGaussians(*asked[5:]))
-        results.append([out.detach(), *torch.autograd.grad(out.square().sum(), asked)])
-    for other in results[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
-
-
 def test_bad_input_and_empty_batches(device):
     axis, sharpness, amplitude = lobes(device)
     with pytest.raises(ValueError, match="expected \\(K, 3\\)"):

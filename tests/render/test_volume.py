@@ -217,21 +217,6 @@ def test_occupancy_of_a_field_covers_it_and_changes_no_image(device):
     torch.testing.assert_close(outs[0][1].color, outs[1][1].color, rtol=1e-5, atol=1e-6)
 
 
-def test_same_bits_for_any_number_of_threads(device, threads):
-    results = []
-    for count in (1, 2, 5):
-        threads(count)
-        origins, directions = rays(device, 6000, 7)
-        samples = march_rays(origins, directions, random_grid(device), 0.05)
-        p = samples.positions(origins, directions)
-        density, color = (p.norm(dim=-1) * 9).requires_grad_(), p.abs().requires_grad_()
-        out = composite(density, color, samples)
-        grads = torch.autograd.grad(out.color.square().sum() + out.depth.sum(), (density, color))
-        results.append([samples.t, samples.ray, out.color.detach(), out.opacity.detach(), *grads])
-    for other in results[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
-
-
 def test_bad_input_is_named(device):
     grid, (origins, directions) = OccupancyGrid.full(4, 1.0, device), rays(device, 4)
     for keywords, name in (
