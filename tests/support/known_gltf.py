@@ -92,13 +92,14 @@ def quad(rng: Random) -> tuple[bytes, Look]:
         return {"index": len(textures) - 1}
 
     base = texture(Image.fromarray(blocks.repeat(CELL, 0).repeat(CELL, 1)))
-    move, stretch = np.zeros(2), np.ones(2)
+    move, stretch, turn = np.zeros(2), np.ones(2), 0.0
     if rng.random() < 0.3:
-        move, stretch = (
-            np.array([rng.choice((0.0, 0.25, 0.5)) for _ in range(2)]),
-            np.array([rng.choice((0.5, 2.0))] * 2),
-        )
+        move = np.array([rng.choice((0.0, 0.25, 0.5)) for _ in range(2)])
+        stretch = np.array([rng.choice((0.5, -1.0, 2.0)) for _ in range(2)])
+        turn = rng.choice((0.0, rng.uniform(-4.0, 4.0)))
         base["extensions"] = {"KHR_texture_transform": {"offset": move.tolist(), "scale": stretch.tolist()}}
+        if turn:
+            base["extensions"]["KHR_texture_transform"]["rotation"] = turn
         used.append("KHR_texture_transform")
         required += used if rng.random() < 0.5 else []
     factor = np.array([rng.uniform(0.2, 1.0) for _ in range(3)])
@@ -173,12 +174,15 @@ def quad(rng: Random) -> tuple[bytes, Look]:
     chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
 
     def color(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        u, v = (((1 + t) / 2 * uv_scale + uv_offset) * s for t, s in ((x, stretch[0]), (-y, stretch[1])))
+        turned = (u - 1j * v) * np.exp(1j * turn)  # counter-clockwise as seen: v is down
         cells, clear = [], np.ones(x.shape, bool)
-        for k, (t, mode) in enumerate((((1 + x) / 2, modes[0]), ((1 - y) / 2, modes[1]))):
-            t = wrapped((t * uv_scale + uv_offset) * stretch[k] + move[k], mode) * CELLS
+        for t, mode in ((turned.real + move[0], modes[0]), (-turned.imag + move[1], modes[1])):
+            t = wrapped(t, mode) * CELLS
             cells.append(t.astype(int).clip(0, CELLS - 1))
-            off = np.abs(t - np.rint(t))
-            clear &= off > 2.5 / CELL  # bilinear, and texels of another size
+            border = np.rint(t)
+            joined = (mode != 10497) & ((border == 0) | (border == CELLS))  # the same texel on both sides
+            clear &= joined | (np.abs(t - border) > 2.5 / CELL)  # bilinear, and texels of another size
         return linear(blocks[cells[1], cells[0]] / 255.0) * factor * vertex, clear
 
     look = Look(
