@@ -27,6 +27,7 @@ from reli3d.synthetic.finishes import draw_materials
 from reli3d.synthetic.noise import fbm
 from reli3d.synthetic.samples import Surface, random_faces
 
+UNCHANGED_PROBABILITY = 0.4  # of an object that keeps its base color in all regions
 REGION_COUNTS = (0.3, 0.35, 0.2, 0.15)  # probability of 1, 2, 3, 4 regions
 BLEND_EXPONENT = 8.0  # of |n| in the blend of the three projections: 1 % of a neighbor's weight at 30 degrees
 ROLES = ("metal", "metal", "plastic", "paint", "ceramic", "leather", "fabric", "rubber", "stone", "wood", "any")
@@ -86,9 +87,11 @@ class DressedSurface:
 
     def __init__(self, base: Surface, sets: Sequence[Path], rng: np.random.Generator, *, measured: bool, texels: int):
         self.base, self.vertices, self.faces, self.scene = base, base.vertices, base.faces, base.scene
-        count = 1 + int(rng.choice(len(REGION_COUNTS), p=REGION_COUNTS))
+        kept = rng.random() < UNCHANGED_PROBABILITY
+        count = 1 if kept else 1 + int(rng.choice(len(REGION_COUNTS), p=REGION_COUNTS))
         self._region = _draw_region(base, rng, count) if count > 1 else None
-        self._finishes = [_draw_finish(sets, rng, measured=measured, texels=texels) for _ in range(count)]
+        kind = "keep" if kept else None
+        self._finishes = [_draw_finish(sets, rng, kind, measured=measured, texels=texels) for _ in range(count)]
 
     def distance(self, points: Tensor) -> Tensor:
         return self.base.distance(points)
@@ -157,8 +160,11 @@ def _draw_cut(base: Surface, rng: np.random.Generator) -> Callable[[Tensor], Ten
     return lambda x: fbm((x * frequency).contiguous(), octaves=2, seed=seed)[0] > threshold
 
 
-def _draw_finish(sets: Sequence[Path], rng: np.random.Generator, *, measured: bool, texels: int) -> Finish:
-    kind = rng.choice(["keep", "recoat", "set", "procedural"], p=[0.32, 0.26, 0.24, 0.18])
+def _draw_finish(
+    sets: Sequence[Path], rng: np.random.Generator, kind: str | None, *, measured: bool, texels: int
+) -> Finish:
+    """kind: ``keep``, ``recoat``, ``set`` or ``procedural``; drawn where it is None."""
+    kind = kind or str(rng.choice(["keep", "recoat", "set", "procedural"], p=[0.32, 0.26, 0.24, 0.18]))
     if kind == "set" and sets:
         return _set_finish(sets[int(rng.integers(len(sets)))], rng, texels)
     if kind == "procedural":

@@ -114,3 +114,9 @@ def test_a_folder_without_sets_or_with_a_missing_map_is_refused(tmp_path, sets):
     (sets[0] / "metallic.png").unlink()
     with pytest.raises(InputError, match="metallic"):
         material_sets(sets[0].parent)
+
+
+def test_two_objects_of_five_keep_their_base_color(sets):
+    base = Ball().points_at(*random_faces(Ball(), 400, np.random.default_rng(0))).base_color
+    kept = sum(torch.equal(dressed(sets, seed, measured=True).base_color, base) for seed in range(60))
+    assert 24 <= kept <= 48  # 0.4, and a quarter of the rest; three standard deviations are 11
