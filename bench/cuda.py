@@ -24,7 +24,7 @@ NEEDED = ("torch", "warp", "numpy", "scipy", "PIL", "safetensors", "trimesh", "e
 NEEDED = (*NEEDED, "xatlas", "tqdm", "pytest", "mitsuba", "networkx")
 TAIL = 4000  # characters of a piece's output that the report keeps
 LEAST = 5.0  # seconds below which no piece begins
-RISE = 4.0  # of the raw density from the surface to the centre of the ball that stands for a trained object
+RISE = 4.0  # of the raw density from the surface to the center of the ball that stands for a trained object
 
 
 @dataclass(frozen=True)
@@ -89,9 +89,9 @@ def compile(device) -> dict:
     import warp as wp
 
     from reli3d import kernels
-    from reli3d.kernels.cache import CPU_BLOCK, initialise
+    from reli3d.kernels.cache import CPU_BLOCK, initialize
 
-    initialise()
+    initialize()
     names = [f"{kernels.__name__}.{info.name}" for info in pkgutil.iter_modules(kernels.__path__)]
     names = names if device.type == "cuda" else [f"{kernels.__name__}.triplane"]
     for name in names:
@@ -181,7 +181,7 @@ def official(device) -> dict:
     import torch
 
     from bench.official import views
-    from bench.timing import synchronise
+    from bench.timing import synchronize
     from reli3d.nn.presets import OFFICIAL, TINY
     from reli3d.train.stages.surface import surface
 
@@ -194,7 +194,7 @@ def official(device) -> dict:
             code = model.encode(*inputs)
             model.decode_environment(code)
             mesh = surface(model, code, preset.resolution).mesh
-            synchronise(device)
+            synchronize(device)
             found[turn] = round(time.perf_counter() - begin, 3)
     return found | {"faces": len(mesh.faces)}
 

@@ -30,7 +30,7 @@ def lookup(device, n, height, backward):
 
 
 def torch_lookup(device, n, height, backward):
-    """The same from grid_sample on a map with its neighbouring columns appended on both sides."""
+    """The same from grid_sample on a map with its neighboring columns appended on both sides."""
     radiance, directions, weight = inputs(device, n, height)
 
     def function(r):

@@ -1,9 +1,9 @@
 """One step of a fit of surface, material and light to four images, by stage, compared with Mitsuba's llvm variant.
 
 Ours extracts the surface from a signed distance grid of 128 cells, traces and shades the pixels with shadows, compares
-colours and antialiased silhouettes, and updates distances, material grids, light maps and exposures by their gradients.
+colors and antialiased silhouettes, and updates distances, material grids, light maps and exposures by their gradients.
 Mitsuba's surface stands still, so it neither extracts nor antialiases: it traces the same rays, takes as many samples
-in two strategies (``direct``: emitter and BSDF, material ``principled``), compares the same colours by the same loss,
+in two strategies (``direct``: emitter and BSDF, material ``principled``), compares the same colors by the same loss,
 and updates the material at the same mesh's vertices and the texels of the light.
 """
 
@@ -130,7 +130,7 @@ def step_of_a_fit(device, size, resolution):
             value.grad = gradient
         moving.step()
         mover.step(blurred_grid(of_sdf, 4), LEARNING_RATE)
-        tick("optimiser")
+        tick("optimizer")
         return tick.seconds
 
     return run, {"steps": 1}

@@ -19,7 +19,7 @@ from pathlib import Path
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
-from bench.timing import _status, synchronise
+from bench.timing import _status, synchronize
 from reli3d.geometry.camera import Camera
 from reli3d.nn import weights
 from reli3d.nn.field import TriplaneField
@@ -163,10 +163,10 @@ def matrix_rate(device: torch.device, dtype: torch.dtype, seconds: float = 2.0) 
     a, b = torch.rand(3072, 1024, device=device, dtype=dtype), torch.rand(8192, 1024, device=device, dtype=dtype)
     times: list[float] = []
     while len(times) < 5 or sum(times) < seconds:
-        synchronise(device)
+        synchronize(device)
         began = time.perf_counter()
         torch.nn.functional.linear(a, b)
-        synchronise(device)
+        synchronize(device)
         times.append(time.perf_counter() - began)
     return 2.0 * 3072 * 1024 * 8192 / statistics.median(times[1:])
 
@@ -183,7 +183,7 @@ class Clock:
             module.register_forward_hook(lambda *_, name=name: self._add(name, device, 1.0))
 
     def _add(self, name: str, device: torch.device, sign: float) -> None:
-        synchronise(device)
+        synchronize(device)
         self.seconds[name] += sign * time.perf_counter()
 
 
@@ -202,7 +202,7 @@ def forward(path: Path, count: int, trunk: torch.dtype, device: torch.device, ru
         processor, began = time.process_time(), time.perf_counter()
         code = model.encode(*inputs)
         environment = model.decode_environment(code)
-        synchronise(device)
+        synchronize(device)
         whole, busy = time.perf_counter() - began, time.process_time() - processor
         finite = all(bool(t.isfinite().all()) for t in (code.triplane, code.latent, code.strength, environment))
         print(
@@ -224,7 +224,7 @@ def forward(path: Path, count: int, trunk: torch.dtype, device: torch.device, ru
         maps = ViewMaps(code.view_tokens[0].float(), torch.cat([images, masks[..., None]], -1), camera)
         began, side = time.perf_counter(), torch.linspace(-0.87, 0.87, model.preset.resolution + 1, device=device)
         TriplaneField(maps, model, code).free_sdf(torch.cartesian_prod(side, side, side))
-        synchronise(device)
+        synchronize(device)
         print(f"  {'level, grid':16s} {time.perf_counter() - began:8.3f} s")
         if device.type == "cuda":
             print(f"  peak {torch.cuda.max_memory_allocated(device) / 2**30:.2f} GiB of the device")

@@ -2,7 +2,7 @@
 
 Mitsuba renders its ``principled`` material with as many samples a pixel in two strategies (``direct``: emitter and
 BSDF): the same amount of work, not the same estimator.  Both sides trace primary rays, without a film.  Gradients: of
-the sum of the image with respect to one base colour and all texels of the map.
+the sum of the image with respect to one base color and all texels of the map.
 
 ``python -m bench.shading`` prints what the cases do not: variance of the image and its gradients at equal samples, of
 one formula on both sides, and the ratio of times at equal variance; memory a pixel; time over pixels, samples and
@@ -70,7 +70,7 @@ def direct(device, size, roughness, backward, samples=SAMPLES, subdivisions=6):
 
 
 def mitsuba_direct(device, size, roughness, backward, formula=None):
-    """The same image from Mitsuba; CPU only, None without LLVM 19 or newer.  formula: ``(mi, base colour)`` to a
+    """The same image from Mitsuba; CPU only, None without LLVM 19 or newer.  formula: ``(mi, base color)`` to a
     material's dictionary instead of ``principled``."""
     mi = mitsuba(device)
     if mi is None:
@@ -198,7 +198,7 @@ def equal_variance(say) -> None:
             mitsuba_direct(device, size, roughness, True, formula)[0],
         )
         a, b = ([step(k + 1) for k in range(runs)] for step in (ours, theirs))
-        pairs["base colour"] = _noise([g[0].numpy() for g in a]), _noise([np.array(g[0]).ravel() for g in b])
+        pairs["base color"] = _noise([g[0].numpy() for g in a]), _noise([np.array(g[0]).ravel() for g in b])
         pairs["texels"] = _noise([g[1].numpy() for g in a]), _noise([_folded(np.array(g[1])) for g in b])
         for what, (ours, theirs) in pairs.items():
             faster = time[roughness, what != "image"]

@@ -1,4 +1,4 @@
-"""Wall-clock time and memory of a step: a function without arguments, warmed up, synchronised, repeated.
+"""Wall-clock time and memory of a step: a function without arguments, warmed up, synchronized, repeated.
 
 Several steps are timed in turn (A B A B ...), so that whatever else the machine does falls on all of them alike and the
 ratio of their medians holds where a single time does not.
@@ -53,10 +53,10 @@ def time_steps(steps: Sequence[Callable], device: torch.device, *, seconds: floa
 
 
 def _clock(step: Callable, device: torch.device) -> tuple[float, object]:
-    synchronise(device)
+    synchronize(device)
     start = time.perf_counter()
     value = step()
-    synchronise(device)
+    synchronize(device)
     return time.perf_counter() - start, value
 
 
@@ -73,7 +73,7 @@ def _is_stages(value: object) -> bool:
     return isinstance(value, dict) and all(isinstance(v, float) for v in value.values())
 
 
-def synchronise(device: torch.device) -> None:
+def synchronize(device: torch.device) -> None:
     if device.type == "cuda":
         torch.cuda.synchronize(device)
 

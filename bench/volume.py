@@ -33,7 +33,7 @@ def fields(device, n, resolution, step):
 
 
 def blend(device, n, resolution, step):
-    """Colours of ``n`` rays and the gradient to densities and colours."""
+    """Colors of ``n`` rays and the gradient to densities and colors."""
     samples, density, color, weight = fields(device, n, resolution, step)
 
     def run():

@@ -2,7 +2,7 @@
 
 usage: python examples/fit_light.py OUTPUT_FOLDER [--steps 150] [--size 64]
 
-Writes ``found.png`` and ``true.png``, maps with +X in the centre, and prints the error of the log radiance.
+Writes ``found.png`` and ``true.png``, maps with +X in the center, and prints the error of the log radiance.
 """
 
 import argparse

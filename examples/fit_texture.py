@@ -2,7 +2,7 @@
 
 usage: python examples/fit_texture.py OUTPUT_FOLDER [--steps 150] [--size 96]
 
-Writes ``found.png`` and ``true.png``, the base colour maps, and prints the error of an image from a new side.
+Writes ``found.png`` and ``true.png``, the base color maps, and prints the error of an image from a new side.
 """
 
 import argparse

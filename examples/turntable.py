@@ -38,14 +38,14 @@ studio = reli3d.Environment(studio)
 own = next((part.environment for part in parts if part.environment is not None), studio)
 
 vertices = torch.cat([part.mesh.vertices for part in parts])
-centre, reach = (vertices.amax(0) + vertices.amin(0)) / 2, (vertices.amax(0) - vertices.amin(0)).norm() / 2
+center, reach = (vertices.amax(0) + vertices.amin(0)) / 2, (vertices.amax(0) - vertices.amin(0)).norm() / 2
 scene, frames = joined_scene(parts), []
 for name in ("turn", "light"):
     for i in range(args.frames):
         angle = math.tau * i / args.frames
         turn = angle if name == "turn" else 0.0
-        eye = centre + 3 * reach * torch.tensor([math.sin(turn), 0.35, math.cos(turn)])
-        camera = reli3d.Camera.from_fov(reli3d.look_at(eye, centre), 0.75, args.size, args.size)
+        eye = center + 3 * reach * torch.tensor([math.sin(turn), 0.35, math.cos(turn)])
+        camera = reli3d.Camera.from_fov(reli3d.look_at(eye, center), 0.75, args.size, args.size)
         light = own if name == "turn" else studio.rotated(angle)
         path = args.output / f"{name}_{i:02d}.png"
         options = reli3d.ShadeOptions(samples=reli3d.Samples(light=8, bsdf=12, cosine=2))  # for each of four subpixels

@@ -25,7 +25,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from reli3d.kernels.cache import CPU_BLOCK, LOADING, initialise, repaired
+from reli3d.kernels.cache import CPU_BLOCK, LOADING, initialize, repaired
 
 WORKER = "reli3d-slice"  # name prefix of the pool's threads
 SLICES = 16  # per launch: balances uneven work on 2 to 8 cores; each adds 20 us of launch overhead
@@ -138,7 +138,7 @@ def full_precision(function: F) -> F:
 @contextlib.contextmanager
 def stream(device: torch.device):
     """Context in which Warp launches on torch's current CUDA stream; yields the Warp device name."""
-    initialise()
+    initialize()
     if device.type == "cuda":
         with wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device))):
             yield str(wp.device_from_torch(device))
@@ -166,7 +166,7 @@ def struct_of(kind, **fields):
 
     Tensors must be contiguous and have no gradient: inputs that :func:`call` differentiates are separate arguments.
     """
-    initialise()
+    initialize()
     made = kind()
     native = made.__ctype__()  # Warp's own setters require arrays, which take twice as long to create
     for name, value in fields.items():

@@ -25,13 +25,13 @@ def flexicubes(level, deformation, alpha, beta, gamma, cubes, scale):
     case = (inside.long() << torch.arange(8)).sum(-1)
     surface = ((case > 0) & (case < 255)).nonzero()[:, 0]
     own = case[surface]
-    face = table["neighbour"][own]
+    face = table["neighbor"][own]
     stride = torch.stack([size[1] * size[2], size[2], torch.ones_like(size[0])])
     step = torch.where(face >= 0, stride[face // 2] * (face % 2 * 2 - 1), 0)
     place = torch.stack([surface // stride[0], surface // stride[1] % size[1], surface % size[2]], -1)
     ahead = place.gather(1, (face // 2).clamp(min=0)[:, None])[:, 0] + face % 2 * 2 - 1
     valid = (face >= 0) & (ahead >= 0) & (ahead < size[(face // 2).clamp(min=0)])
-    other = table["neighbour"][case[torch.where(valid, surface + step, 0)]]
+    other = table["neighbor"][case[torch.where(valid, surface + step, 0)]]
     resolved = torch.where(valid & (other == face ^ 1), 255 - own, own)
 
     vertex = cubes[surface]

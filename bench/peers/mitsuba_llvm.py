@@ -29,8 +29,8 @@ def mitsuba(device: torch.device):
 def fit_step(mi, mesh: Mesh, light: torch.Tensor, camera: Camera, material, target: float, samples: int, rate: float):
     """A step that moves the material at the vertices of ``mesh`` and the texels of ``light (H, W, 3)``.
 
-    camera: of several views.  material: base colour of all channels, roughness and metallic, before the first step.
-    target: linear colour of all photographs.  samples: of a pixel, in each of two strategies.
+    camera: of several views.  material: base color of all channels, roughness and metallic, before the first step.
+    target: linear color of all photographs.  samples: of a pixel, in each of two strategies.
     """
     import drjit as dr
 

@@ -22,7 +22,7 @@ def material(mi, base_color, alpha, metallic, diffuse_model="conserving", maps: 
         textures = [mi.load_dict({"type": "bitmap", "bitmap": b, "raw": True}) for b in bitmaps]
 
     def values(si, active):
-        """Base colour, GGX width and metallic."""
+        """Base color, GGX width and metallic."""
         if maps is None:
             return numbers
         return textures[0].eval(si, active), textures[1].eval_1(si, active) ** 2, textures[2].eval_1(si, active)

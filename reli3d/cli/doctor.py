@@ -68,7 +68,7 @@ def _devices() -> Iterator[tuple[str, str]]:
 
     from reli3d.kernels import cache
 
-    cache.initialise()
+    cache.initialize()
     yield "cpu", f"{os.cpu_count()} cores, {torch.get_num_threads()} threads of torch"
     if not wp.is_cuda_available():
         yield "driver", "no NVIDIA driver with a device found: all runs on the CPU, which is no error"
@@ -87,7 +87,7 @@ def _cache() -> Iterator[tuple[str, str]]:
 
     from reli3d.kernels import cache
 
-    cache.initialise()
+    cache.initialize()
     folder = Path(str(wp.config.kernel_cache_dir))
     try:
         with tempfile.TemporaryFile(dir=folder):

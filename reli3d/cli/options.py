@@ -32,7 +32,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--normalize",
         choices=("auto", "hull", "none"),
-        help="auto: centre and scale by the visual hull unless it sits in the model's cube; default auto, "
+        help="auto: center and scale by the visual hull unless it sits in the model's cube; default auto, "
         "with official weights none: poses as stored",
     )
     p.add_argument(

@@ -30,7 +30,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--light",
         type=Path,
-        help="lat-long .hdr or .exr, its centre column +X (as three.js, "
+        help="lat-long .hdr or .exr, its center column +X (as three.js, "
         "model-viewer and Blender have it); default uniform white",
     )
     p.add_argument(
@@ -44,7 +44,7 @@ def parser() -> argparse.ArgumentParser:
         "--format",
         choices=FORMATS,
         help="png (default), exr (linear radiance), or an animation: webp, gif "
-        "(256 colours), mp4 (on white; pip install 'reli3d[video]')",
+        "(256 colors), mp4 (on white; pip install 'reli3d[video]')",
     )
     p.add_argument(
         "--frames", type=int, help="views on a full turn around +Y (default 1, of an animation named by --output 72)"
@@ -54,7 +54,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--azimuth", type=float, default=30.0, help="of the first view, degrees from +Z towards +X")
     p.add_argument("--elevation", type=float, default=20.0, help="degrees above the horizon, within 89")
     p.add_argument("--fov", type=float, default=32.0, help="horizontal field of view in degrees")
-    p.add_argument("--distance", type=float, help="from the centre of the object (default: it fills the view)")
+    p.add_argument("--distance", type=float, help="from the center of the object (default: it fills the view)")
     p.add_argument("--size", type=int, default=512, help="pixels along a side (default 512)")
     p.add_argument(
         "--quality",
@@ -98,7 +98,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--aovs",
         action="store_true",
-        help="also EXR files of base colour, material (0, roughness, "
+        help="also EXR files of base color, material (0, roughness, "
         "metallic), normal (n / 2 + 1 / 2) and depth (depth, depth, alpha)",
     )
     p.add_argument("--no-shadows", action="store_true")
@@ -193,7 +193,7 @@ def render_files(args: argparse.Namespace) -> list[Path]:
     environment = light.to(device)
     scene = joined_scene(parts)
     low, high = scene.vertices.amin(0), scene.vertices.amax(0)
-    centre, radius = (low + high) / 2, float((high - low).norm()) / 2
+    center, radius = (low + high) / 2, float((high - low).norm()) / 2
     distance = args.distance or 1.02 * radius / math.sin(math.radians(args.fov) / 2)
     up = torch.tensor([0.0, 1.0, 0.0], device=device)
     args.output.mkdir(parents=True, exist_ok=True)
@@ -205,8 +205,8 @@ def render_files(args: argparse.Namespace) -> list[Path]:
         azimuth = math.radians(args.azimuth) + (turn if args.turn == "camera" else 0.0)
         lift = math.radians(args.elevation)
         offset = [math.cos(lift) * math.sin(azimuth), math.sin(lift), math.cos(lift) * math.cos(azimuth)]
-        eye = centre + distance * torch.tensor(offset, device=device)
-        camera = Camera.from_fov(look_at(eye, centre, up), math.radians(args.fov), args.size, args.size)
+        eye = center + distance * torch.tensor(offset, device=device)
+        camera = Camera.from_fov(look_at(eye, center, up), math.radians(args.fov), args.size, args.size)
         if args.plan is not None and frame == 0:
             plan = plan_render(
                 parts,

@@ -1,8 +1,8 @@
 """How well the network reconstructs procedural objects that no training has seen, under light that no training has
 seen.
 
-For every validation sample: silhouette IoU and base colour PSNR from cameras that were not input, beside what the
-best single colour scores there, and the error of the environment beside that of the mean environment of the training
+For every validation sample: silhouette IoU and base color PSNR from cameras that were not input, beside what the
+best single color scores there, and the error of the environment beside that of the mean environment of the training
 maps.
 """
 
@@ -33,7 +33,7 @@ BLACK = 0.01  # added to radiance before the logarithm
 
 
 def truth_colors(seed: int, cameras: list[Camera]) -> list[tuple[Tensor, Tensor]]:
-    """Coverage ``(H, W)`` bool and base colour ``(H, W, 3)``, sRGB-encoded, of the object of ``seed`` in each
+    """Coverage ``(H, W)`` bool and base color ``(H, W, 3)``, sRGB-encoded, of the object of ``seed`` in each
     camera.
     """
     surface = ObjectSurface(make_object(seed))
@@ -89,13 +89,13 @@ def light_error(predicted: Tensor, target: Tensor) -> float:
 def evaluate(
     model: Network, sample: dict[str, Tensor], seed: int, count: int, mean_light: Tensor, *, symmetry: str = "auto"
 ) -> dict[str, float]:
-    """Figures of one object reconstructed from the first ``count`` views, at most all but ``UNSEEN``; colours are
+    """Figures of one object reconstructed from the first ``count`` views, at most all but ``UNSEEN``; colors are
     compared where truth and result are seen.  symmetry: of :class:`~reli3d.pipeline.ReconstructOptions`.
     Raises ValueError for more views.
 
-    ``*_mse`` are square errors of the base colour, ``single_*`` those of the best single colour of this very object.
+    ``*_mse`` are square errors of the base color, ``single_*`` those of the best single color of this very object.
     ``empty`` is 1 where the field has no surface: IoU 0 and nothing else to compare.  Without a pixel that both cover
-    there are no colours.
+    there are no colors.
     """
     last = len(sample["c2w"])
     if not 1 <= count <= last - UNSEEN:
@@ -116,7 +116,7 @@ def evaluate(
         got_all.append(got[both])
         want_all.append(want[both])
     got, want = torch.cat(got_all), torch.cat(want_all)
-    target = quarter_turn(sample["environment"].float(), -1)  # stored with -Z in the centre column
+    target = quarter_turn(sample["environment"].float(), -1)  # stored with -Z in the center column
     predicted = asset.light.resized(len(target)).radiance
     exposure = target.mean() / mean_light.mean()
     found = {
@@ -137,8 +137,8 @@ def evaluate(
 
 def summary(rows: list[dict[str, float]]) -> dict[str, float]:
     """Means over the objects that have the figure.  A square error becomes two PSNRs [dB]: the mean over objects
-    (``_psnr``), which objects of nearly one colour rule, and that of the mean error (``_psnr_pooled``), which the
-    colourful ones rule.
+    (``_psnr``), which objects of nearly one color rule, and that of the mean error (``_psnr_pooled``), which the
+    colorful ones rule.
     """
     out: dict[str, float] = {"objects": len(rows)}
     for key in dict.fromkeys(key for row in rows for key in row):

@@ -1,6 +1,6 @@
 """The paper's tables on any folder of textured GLB files: each is rendered, reconstructed and compared with itself.
 
-An object is centred and its longest side made 1.  Input views lie about it under one map of light; held-out views show
+An object is centered and its longest side made 1.  Input views lie about it under one map of light; held-out views show
 the same light, another light and the materials.  The reconstruction sees the input views alone, masks and cameras.
 """
 
@@ -188,7 +188,7 @@ def as_csv(rows: Sequence[dict]) -> str:
 
 
 def sheet(rows: Sequence[Sequence[Tensor]]) -> Tensor:
-    """Pictures side by side: hero, then truth and result of image, relit and base colour; uint8."""
+    """Pictures side by side: hero, then truth and result of image, relit and base color; uint8."""
     return (torch.cat([torch.cat([t.clamp(0, 1).cpu() for t in row], 1) for row in rows]) * 255 + 0.5).to(torch.uint8)
 
 

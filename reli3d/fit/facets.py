@@ -7,7 +7,7 @@ from torch import Tensor
 
 from reli3d.fit.unknowns import unit
 from reli3d.geometry.mesh import Mesh
-from reli3d.geometry.topology import face_neighbours
+from reli3d.geometry.topology import face_neighbors
 
 NORMAL_SIGMA = 0.2  # standard deviation of the range kernel: distance of unit normals, 11 degrees
 NORMAL_ITERATIONS = 10  # of the filter of the normals; its support in faces
@@ -17,7 +17,7 @@ VERTEX_ITERATIONS = 20  # that move the vertices towards their faces' planes
 def neighbor_faces(faces: Tensor) -> Tensor:
     """``(F, 3)`` int64: the face across each edge ``(0, 1), (1, 2), (2, 0)`` of ``faces (F, 3)``, the face itself where
     there is not exactly one."""
-    across = torch.from_numpy(face_neighbours(faces.cpu().numpy())).to(faces.device).long()
+    across = torch.from_numpy(face_neighbors(faces.cpu().numpy())).to(faces.device).long()
     own = torch.arange(len(faces), device=faces.device, dtype=torch.int64)[:, None]
     return torch.where(across < 0, own, across)
 

@@ -1,6 +1,6 @@
 """Baking: a function of surface points, evaluated at the texels of an atlas; every texel is filled.
 
-Maps are ``(T, T, C)``; row 0 is v = 0 (glTF: v down).  Texel (row, column) is sampled at its centre ((column + 0.5) /
+Maps are ``(T, T, C)``; row 0 is v = 0 (glTF: v down).  Texel (row, column) is sampled at its center ((column + 0.5) /
 T, (row + 0.5) / T).  Nothing here has a gradient.
 """
 
@@ -21,7 +21,7 @@ from reli3d.geometry.mesh import Mesh, sorted_keys, vertex_normals
 from reli3d.geometry.topology import edges_of
 from reli3d.kernels import bake as kernels
 
-BORDER_TEXELS = 1.5  # texels: a bilinear tap of a point of the surface has its centre within sqrt(2)
+BORDER_TEXELS = 1.5  # texels: a bilinear tap of a point of the surface has its center within sqrt(2)
 TILE = {"cpu": 16, "cuda": 4}  # side of a thread's tile in texels: large amortizes setup, small fills a GPU
 STRIP = 64  # columns a thread sweeps in the column pass: one cache line of the mask
 ROWS_MIN = 16  # rows of texels a CPU slice of the row pass
@@ -34,7 +34,7 @@ class Texels:
 
     face: Tensor  # (T, T) int32, -1 where no surface is near
     bary: Tensor  # (T, T, 2) weights of vertices 1 and 2
-    inside: Tensor  # (T, T) bool: the centre lies in the face; other texels of a face hold its nearest border point
+    inside: Tensor  # (T, T) bool: the center lies in the face; other texels of a face hold its nearest border point
 
     @property
     def valid(self) -> Tensor:
@@ -89,7 +89,7 @@ def _border_segments(faces: Tensor) -> Tensor:
 def rasterize_texels(mesh: Mesh, size: int) -> Texels:
     """Face and barycentrics of every texel of a ``size`` x ``size`` map over the UV of ``mesh``.
 
-    A texel whose centre lies in a face takes that face, the first of several.  A texel whose centre is within 1.5
+    A texel whose center lies in a face takes that face, the first of several.  A texel whose center is within 1.5
     texels of a chart takes the nearest point of the chart's border, so that bilinear lookups on the surface read only
     texels of the surface.  Bitwise identical for any number of threads.  Peak memory: 24 bytes per texel.  Raises
     ValueError without UV.
@@ -120,7 +120,7 @@ def rasterize_texels(mesh: Mesh, size: int) -> Texels:
 
 
 def coverage(mesh: Mesh, size: int) -> Tensor:
-    """Number of faces whose interior holds each texel centre, ``(size, size)`` uint8, 255 at most."""
+    """Number of faces whose interior holds each texel center, ``(size, size)`` uint8, 255 at most."""
     corners = _corners(mesh, size)
     hits = torch.zeros(size, size, dtype=torch.uint8, device=corners.device)
     if len(mesh.faces):

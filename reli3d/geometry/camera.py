@@ -3,7 +3,7 @@
 ============  ==========================================================================================
 world         right-handed, +Y up; any length unit, the same for vertices and camera positions
 camera        camera-to-world 4 x 4, OpenGL axes: +X right, +Y up, looks along -Z
-intrinsics    ``fx, fy, cx, cy`` in pixels; x to the right, y DOWN, pixel centres at +0.5, (0, 0) the corner
+intrinsics    ``fx, fy, cx, cy`` in pixels; x to the right, y DOWN, pixel centers at +0.5, (0, 0) the corner
 depth         distance along the viewing axis (-Z of the camera), not along the ray
 ============  ==========================================================================================
 
@@ -59,7 +59,7 @@ class Camera:
 
     @classmethod
     def from_fov(cls, c2w: Tensor, fov_x: float, width: int, height: int) -> Camera:
-        """Camera with the horizontal field of view ``fov_x`` [rad], square pixels and the axis at the image centre."""
+        """Camera with the horizontal field of view ``fov_x`` [rad], square pixels and the axis at the image center."""
         c2w = tensor_of(c2w)
         check("c2w", c2w, last=4)
         if not 0.0 < fov_x < torch.pi:
@@ -113,7 +113,7 @@ def check_camera(camera: Camera, *, like: Tensor, views: int | None = None, size
 
 
 def image_plane(camera: Camera) -> tuple[Tensor, Tensor]:
-    """Right and up, both ``(..., H, W)``, of all pixel centres in the plane at distance 1 before the camera."""
+    """Right and up, both ``(..., H, W)``, of all pixel centers in the plane at distance 1 before the camera."""
     fx, fy, cx, cy = (v[..., None, None] for v in camera.intrinsics.unbind(-1))
     ys = torch.arange(camera.height, dtype=torch.float32, device=camera.c2w.device)[:, None] + 0.5
     xs = torch.arange(camera.width, dtype=torch.float32, device=camera.c2w.device)[None, :] + 0.5
@@ -123,7 +123,7 @@ def image_plane(camera: Camera) -> tuple[Tensor, Tensor]:
 
 @full_precision
 def camera_rays(camera: Camera) -> tuple[Tensor, Tensor]:
-    """Origins and unit directions through all pixel centres, both ``(..., H, W, 3)``, world frame.
+    """Origins and unit directions through all pixel centers, both ``(..., H, W, 3)``, world frame.
 
     The origins are an expanded view of the eye.  Gradients reach ``c2w`` and ``intrinsics``.
 

@@ -15,9 +15,9 @@ import torch
 import warp as wp
 
 from reli3d import _bridge
-from reli3d.geometry.topology import face_neighbours, graph_components, group
+from reli3d.geometry.topology import face_neighbors, graph_components, group
 from reli3d.kernels import charts as kernels
-from reli3d.kernels.cache import initialise
+from reli3d.kernels.cache import initialize
 
 CPU = torch.device("cpu")
 COS_LABEL = 0.4  # a face keeps an axis only up to 66 degrees from its normal: at most 2.5 times stretched
@@ -46,26 +46,26 @@ class Charts:
 
     chart: np.ndarray  # (F,) int32
     corners: np.ndarray  # (F, 3, 2) float32, expected texels, x right, y up; counter-clockwise
-    neighbours: np.ndarray  # (F, 3) int32, face across the edge from corner k to k + 1, -1 at a border
+    neighbors: np.ndarray  # (F, 3) int32, face across the edge from corner k to k + 1, -1 at a border
     count: int
 
 
-def components(neighbours: np.ndarray, labels: np.ndarray) -> tuple[np.ndarray, int]:
+def components(neighbors: np.ndarray, labels: np.ndarray) -> tuple[np.ndarray, int]:
     """Connected faces of equal label, ``(F,)`` int32 numbered by their first face, and their number."""
-    face, side = np.nonzero((neighbours >= 0) & (labels[neighbours] == labels[:, None]))
-    root = graph_components(face, neighbours[face, side], len(labels))
+    face, side = np.nonzero((neighbors >= 0) & (labels[neighbors] == labels[:, None]))
+    root = graph_components(face, neighbors[face, side], len(labels))
     number = np.cumsum(root == np.arange(len(root)), dtype=np.int32) - 1
     return number[root], int(number[-1]) + 1
 
 
-def outer_faces(chart: np.ndarray, neighbours: np.ndarray) -> np.ndarray:
+def outer_faces(chart: np.ndarray, neighbors: np.ndarray) -> np.ndarray:
     """Faces with an edge on the border of their chart, ascending."""
-    return np.flatnonzero(border_edges(chart, neighbours).any(1))
+    return np.flatnonzero(border_edges(chart, neighbors).any(1))
 
 
-def border_edges(chart: np.ndarray, neighbours: np.ndarray) -> np.ndarray:
+def border_edges(chart: np.ndarray, neighbors: np.ndarray) -> np.ndarray:
     """Edges, ``(F, 3)`` bool, that no other face of the same chart shares."""
-    return (neighbours < 0) | (chart[neighbours] != chart[:, None])
+    return (neighbors < 0) | (chart[neighbors] != chart[:, None])
 
 
 def _ints(values: np.ndarray):
@@ -76,9 +76,9 @@ def _floats(values: np.ndarray, kind):
     return torch.from_numpy(np.ascontiguousarray(values, np.float32)), kind
 
 
-def axis_labels(normal: torch.Tensor, neighbours: np.ndarray) -> np.ndarray:
+def axis_labels(normal: torch.Tensor, neighbors: np.ndarray) -> np.ndarray:
     """Axis 0..5 (as AXES) of every face, with smooth borders.  ``normal``: (F, 3), length twice the area."""
-    n, links = len(normal), _ints(neighbours)
+    n, links = len(normal), _ints(neighbors)
     smoothed = normal
     for _ in range(NORMAL_ROUNDS):
         rough, smoothed = smoothed, torch.empty_like(normal)
@@ -104,14 +104,14 @@ def axis_labels(normal: torch.Tensor, neighbours: np.ndarray) -> np.ndarray:
     return label.numpy()
 
 
-def merge_small(label: np.ndarray, normal: np.ndarray, neighbours: np.ndarray, least: float) -> np.ndarray:
-    """Labels in which charts with less area than ``least`` take the label of a neighbour that all their faces can bear.
+def merge_small(label: np.ndarray, normal: np.ndarray, neighbors: np.ndarray, least: float) -> np.ndarray:
+    """Labels in which charts with less area than ``least`` take the label of a neighbor that all their faces can bear.
 
-    Of several such labels the one with the most common edges; several rounds, each from larger neighbours.
+    Of several such labels the one with the most common edges; several rounds, each from larger neighbors.
     """
     area = np.sqrt(np.einsum("fk,fk->f", normal, normal)) * 0.5
     for _ in range(MERGE_ROUNDS):
-        chart, count = components(neighbours, label)
+        chart, count = components(neighbors, label)
         total = np.bincount(chart, area, count)
         faces = np.flatnonzero((total < least)[chart])
         if not len(faces):
@@ -119,7 +119,7 @@ def merge_small(label: np.ndarray, normal: np.ndarray, neighbours: np.ndarray, l
         cosine = normal[faces] * (0.5 / np.maximum(area[faces], 1e-30))[:, None]
         worst = np.full((count, 6), 1.0)
         np.minimum.at(worst, chart[faces], np.concatenate([cosine, -cosine], 1))
-        near = neighbours[faces]
+        near = neighbors[faces]
         border = (near >= 0) & (label[near] != label[faces, None]) & (total[chart[near]] > total[chart[faces]][:, None])
         votes = np.bincount(np.repeat(chart[faces], 3)[border.ravel()] * 6 + label[near][border], minlength=count * 6)
         votes = np.where(worst >= COS_MERGE, votes.reshape(count, 6), 0)
@@ -203,14 +203,14 @@ def _cut_bulky(
     area: np.ndarray,
     waste: float,
     longest: float,
-    neighbours: np.ndarray,
+    neighbors: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Charts whose boxes are mostly empty, cut in two where that saves room: ``(chart, parent of each chart)`` or None.
 
-    points: ``(F, 3)`` centres of the faces.  area: of each chart.  waste: empty area [texels] that is worth a cut.
+    points: ``(F, 3)`` centers of the faces.  area: of each chart.  waste: empty area [texels] that is worth a cut.
     longest: [texels] a longer chart is halved in any case, since it would set the scale of all the others.
     """
-    outer = outer_faces(chart, neighbours)
+    outer = outer_faces(chart, neighbors)
     order, start = group(chart[outer])
     outer = outer[order]
     x, y = (np.einsum("pk,pk->p", points[outer], v[chart[outer]]) for v in (right, up))
@@ -251,7 +251,7 @@ def _cut_bulky(
     direction[cut] = right[cut] * np.cos(turn) + up[cut] * np.sin(turn)
     threshold[cut] = best_at[best_angle >= 0]
     upper = np.einsum("fk,fk->f", points, direction[chart]) > threshold[chart]
-    pieces, number = components(neighbours, 2 * chart + upper)
+    pieces, number = components(neighbors, 2 * chart + upper)
     parent = np.zeros(number, np.int64)
     parent[pieces] = chart
     return pieces, parent
@@ -264,7 +264,7 @@ def _overlaps(charts: Charts, boxes: np.ndarray, query: np.ndarray):
     z = charts.chart[boxes].astype(np.float32)
     lower = torch.from_numpy(np.column_stack([np.minimum(np.minimum(a, b), c), z]))
     upper = torch.from_numpy(np.column_stack([np.maximum(np.maximum(a, b), c), z]))
-    initialise()
+    initialize()
     bvh = wp.Bvh(_bridge.array_of(lower, wp.vec3), _bridge.array_of(upper, wp.vec3))
     count = torch.zeros(len(query), dtype=torch.int32, device="cpu")
     none = torch.zeros(1, dtype=torch.int64, device="cpu"), torch.zeros(1, dtype=torch.int32, device="cpu")
@@ -284,7 +284,7 @@ def split_overlaps(charts: Charts) -> bool:
     All faces of a chart look towards its plane.  So where two sheets overlap, the border of one of them ends over the
     other: looking for faces that lie over the faces at a border finds every overlap.
     """
-    outer = outer_faces(charts.chart, charts.neighbours)
+    outer = outer_faces(charts.chart, charts.neighbors)
     outer = outer[charts.chart[outer] >= 0]
     everything = np.arange(len(charts.chart), dtype=np.int32)
     if not len(outer):
@@ -308,7 +308,7 @@ def split_overlaps(charts: Charts) -> bool:
     find(1, offset, partner)
     rank = np.full(len(everything), -1, np.int32)
     rank[members] = np.arange(len(members), dtype=np.int32)
-    near = charts.neighbours[members]
+    near = charts.neighbors[members]
     near = np.where(near >= 0, rank[near], -1)
     # faces without overlap first: they grow large charts
     seeds = np.lexsort((np.arange(len(members)), count.numpy() > 0))
@@ -334,9 +334,9 @@ def make_charts(
     ``corners``.  least_texels: smaller charts are merged where possible.  longest: longer charts are cut [texels].
     sliver: height [texels] of a face without a chart.
     """
-    centre = 0.5 * (points.min(0).astype(np.float64) + points.max(0))
-    reach = np.abs(points - centre).max() or 1.0
-    local = ((points - centre) / reach).astype(np.float32)  # at most 1: products cannot overflow
+    center = 0.5 * (points.min(0).astype(np.float64) + points.max(0))
+    reach = np.abs(points - center).max() or 1.0
+    local = ((points - center) / reach).astype(np.float32)  # at most 1: products cannot overflow
     normal = torch.empty(len(faces), 3, dtype=torch.float32, device="cpu")
     _bridge.launch(
         kernels.normals_kernel,
@@ -350,20 +350,20 @@ def make_charts(
     unit = np.sqrt(texels / area) if area > 1e-30 else 0.0
     local, size = local * np.float32(unit), size * unit**2
     normal = torch.from_numpy(normal.numpy() * np.float32(unit * unit))
-    neighbours = face_neighbours(faces)
-    label = merge_small(axis_labels(normal, neighbours), normal.numpy(), neighbours, least_texels)
-    chart, count = components(neighbours, label)
+    neighbors = face_neighbors(faces)
+    label = merge_small(axis_labels(normal, neighbors), normal.numpy(), neighbors, least_texels)
+    chart, count = components(neighbors, label)
     right, up = _frames(normal, label, chart, count)
-    centres = local[faces].mean(1).astype(np.float64)
+    centers = local[faces].mean(1).astype(np.float64)
     for _ in range(CUT_ROUNDS):
         cut = _cut_bulky(
-            centres, chart, right, up, np.bincount(chart, size, count), CUT_WASTE * texels, longest, neighbours
+            centers, chart, right, up, np.bincount(chart, size, count), CUT_WASTE * texels, longest, neighbors
         )
         if cut is None:
             break
         chart, parent = cut
         right, up, count = right[parent], up[parent], len(parent)
-    outer = outer_faces(chart, neighbours)
+    outer = outer_faces(chart, neighbors)
     tips = local[faces[outer]].reshape(-1, 3).astype(np.float64)
     right, up, low = _upright(right, up, tips, np.repeat(chart[outer], 3))
     corners, flat = (
@@ -373,6 +373,6 @@ def make_charts(
     _bridge.launch(kernels.project_kernel, len(faces), [
         _floats(local, wp.vec3), _ints(faces), _ints(chart), _floats(right, wp.vec3), _floats(up, wp.vec3),
         _floats(low, wp.vec2), sliver, (corners, wp.vec2), (flat, wp.uint8)], CPU, slice_min=LIGHT)  # fmt: skip
-    charts = Charts(np.where(flat.numpy() > 0, -1, chart).astype(np.int32), corners.numpy(), neighbours, count)
+    charts = Charts(np.where(flat.numpy() > 0, -1, chart).astype(np.int32), corners.numpy(), neighbors, count)
     split_overlaps(charts)
     return charts

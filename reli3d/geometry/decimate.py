@@ -64,7 +64,7 @@ def decimate(mesh: Mesh, faces: int) -> Mesh:
     positions, triangles = _arrays(mesh)
     if len(triangles) <= faces:
         return _mesh(positions, triangles, mesh)
-    centre, size = positions.mean(0, dtype=np.float64), float(np.ptp(positions, axis=0).max())
+    center, size = positions.mean(0, dtype=np.float64), float(np.ptp(positions, axis=0).max())
     with _ONE_AT_A_TIME:  # unit size: the library's error thresholds are absolute
-        points, triangles = simplify((positions - centre) / size, triangles, target_count=int(faces))
-    return _mesh(*_used(points * size + centre, triangles), mesh)
+        points, triangles = simplify((positions - center) / size, triangles, target_count=int(faces))
+    return _mesh(*_used(points * size + center, triangles), mesh)

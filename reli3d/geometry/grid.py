@@ -34,7 +34,7 @@ def sample_grid(grid: Tensor, points: Tensor) -> Tensor:
 def squared_laplacian(field: Tensor, weight: Tensor) -> Tensor:
     """Weighted sum ``()`` of the squared 7-point Laplacian over the inner points of a grid.
 
-    field, weight: ``(X, Y, Z)`` float32.  Border points, and points whose ``weight`` is 0, enter as neighbours only.
+    field, weight: ``(X, Y, Z)`` float32.  Border points, and points whose ``weight`` is 0, enter as neighbors only.
     First-order gradients reach ``field``; ``weight`` is a constant.  Raises TypeError or ValueError.
     """
     check("field", field)

@@ -16,9 +16,9 @@ BLOCKS_MIN = 64  # blocks of a grid in a CPU slice: each of them has 64 points
 
 
 def mask_distance(masks: Tensor) -> Tensor:
-    """Signed distance of every pixel centre to the mask's contour, ``(V, H, W)`` in pixels, positive inside.
+    """Signed distance of every pixel center to the mask's contour, ``(V, H, W)`` in pixels, positive inside.
 
-    masks: ``(V, H, W)`` float32 coverage in [0, 1].  The contour is where the mask, bilinear between pixel centres, is
+    masks: ``(V, H, W)`` float32 coverage in [0, 1].  The contour is where the mask, bilinear between pixel centers, is
     0.5, as straight segments (marching squares).  Near the contour the distance is exact; far from it, it can be a
     fraction of a pixel too long, because only segments around the nearest crossing are evaluated.  The image border is
     no contour: a mask that touches it continues outside.  A view without contour has the length of the image diagonal

@@ -21,7 +21,7 @@ from reli3d.kernels import rays as kernels
 
 BACKENDS = ("auto", "embree", "warp")
 SLICE_RAYS = 8192  # fewest of an Embree slice, and of one whose rays are ordered: below it costs more than it gains
-THREAD_SLICES = 2  # of a large call for each thread: the more rays are ordered together, the closer are neighbours
+THREAD_SLICES = 2  # of a large call for each thread: the more rays are ordered together, the closer are neighbors
 
 
 class RayScene:
@@ -144,7 +144,7 @@ class RayScene:
     def unoccluded(self, origins: Tensor, directions: Tensor, t_max: Tensor) -> Tensor:
         """Whether nothing lies on a ray before its ``t_max``, ``(N,)`` bool; False where ``t_max`` is below 0.
 
-        For rays that a kernel has made, ``(N, 3)``, ``(N, 3)`` and ``(N,)`` on the device, whose neighbours start at
+        For rays that a kernel has made, ``(N, 3)``, ``(N, 3)`` and ``(N,)`` on the device, whose neighbors start at
         about one place.  Values are not checked.
         """
         if self._embree is None:
@@ -242,7 +242,7 @@ class RayScene:
     def _order(self, o: Tensor, d: Tensor) -> np.ndarray | None:
         """Permutation that brings like rays together, None where they are few or come in such an order already.
 
-        Embree traces one ray after the other; neighbours that visit the same nodes find them in the cache.
+        Embree traces one ray after the other; neighbors that visit the same nodes find them in the cache.
         """
         n = o.shape[0]
         if n < SLICE_RAYS:

@@ -29,7 +29,7 @@ def vertex_deviation(
 
     L_dev is the mean absolute deviation of the distances between a dual vertex and the zero crossings that it averages.
     A small value keeps the vertex inside its polygon and the faces free of folds.  Arguments, checks and vertex order
-    (without centres) are those of :func:`reli3d.geometry.surface.extract_surface`.  Gradients reach sdf, deformation,
+    (without centers) are those of :func:`reli3d.geometry.surface.extract_surface`.  Gradients reach sdf, deformation,
     alpha and beta, except through distances of 0.  A field without surface gives an empty tensor, whose mean is NaN.
     """
     extent = surface.check_fields(sdf, radius, deformation, alpha, beta, None, cubes)

@@ -22,8 +22,8 @@ class _Umbrella:
 
     label: Tensor  # (V,) welded vertex of every vertex
     weight: Tensor  # (V, 1) 1 / copies of a vertex
-    neighbours: Tensor  # (E,) of every moving welded vertex, concatenated
-    start: Tensor  # (W,) first entry of a vertex in ``neighbours``
+    neighbors: Tensor  # (E,) of every moving welded vertex, concatenated
+    start: Tensor  # (W,) first entry of a vertex in ``neighbors``
     inverse: Tensor  # (W, 1) 1 / number of neighbors, 0 for fixed vertices
 
     def welded(self, values: Tensor) -> Tensor:
@@ -31,7 +31,7 @@ class _Umbrella:
         return out.index_add(0, self.label, values * self.weight)
 
     def __call__(self, positions: Tensor) -> Tensor:
-        total = torch.nn.functional.embedding_bag(self.neighbours, positions, self.start, mode="sum")
+        total = torch.nn.functional.embedding_bag(self.neighbors, positions, self.start, mode="sum")
         return total * self.inverse - positions * (self.inverse > 0)
 
 

@@ -90,7 +90,7 @@ def extract_surface(
     gamma: Tensor | None = None,
     cubes: Tensor | None = None,
     closed: bool = True,
-    centre: bool = False,
+    center: bool = False,
 ) -> Mesh:
     """Mesh of the isosurface ``sdf == 0`` inside the box, faces counter-clockwise seen from the positive side.
 
@@ -98,10 +98,10 @@ def extract_surface(
     extent of the box, one or three numbers.  deformation: ``(*sdf.shape, 3)`` offsets of the grid vertices in box
     extents.  Positive weights, 1 if None: alpha ``(cubes, 8)`` of cube corners, beta ``(cubes, 12)`` of cube edges,
     gamma ``(cubes,)`` for the split of quads.  cubes: :func:`surface_cubes`, if the weights have rows for these alone.
-    closed: cap the surface flat at the border.  centre: four triangles for each quad instead of two.
+    closed: cap the surface flat at the border.  center: four triangles for each quad instead of two.
 
     A field of one sign gives no faces (positive) or, if closed, the whole box (negative).  Gradients reach all but
-    ``radius``; gamma only with ``centre``.  Bitwise identical for any number of threads.  Raises TypeError or
+    ``radius``; gamma only with ``center``.  Bitwise identical for any number of threads.  Raises TypeError or
     ValueError.
 
     >>> x = torch.linspace(-1, 1, 17)
@@ -118,8 +118,8 @@ def extract_surface(
     if gamma is not None and not bool((gamma.detach() > 0).all()):
         raise ValueError("gamma: expected positive weights, got others")
     quads, split = _quads(topology, padded, crossed, gamma)
-    if centre:
-        return _with_centres(vertices, quads, split if gamma is None else _gamma_of(topology, quads, gamma))
+    if center:
+        return _with_centers(vertices, quads, split if gamma is None else _gamma_of(topology, quads, gamma))
     first = split[:, 0] * split[:, 2] > split[:, 1] * split[:, 3]
     faces = torch.where(first[:, None], quads[:, [0, 1, 2, 0, 2, 3]], quads[:, [0, 1, 3, 3, 1, 2]])
     return Mesh(vertices, faces.reshape(-1, 3))
@@ -212,7 +212,7 @@ def topology_of(sdf: Tensor, cubes: Tensor | None, closed: bool) -> tuple[_Topol
         [
             (cells, I32),
             (case.view(-1), wp.uint8),
-            (table["neighbour"], I32),
+            (table["neighbor"], I32),
             (table["count"], I32),
             *sdf.shape[1:],
             (resolved, I32),
@@ -355,7 +355,7 @@ def _gamma_of(t: _Topology, quads: Tensor, gamma: Tensor) -> Tensor:
     return torch.where(rows >= 0, gamma.index_select(0, rows.clamp(min=0).view(-1)).view_as(rows), 1.0)
 
 
-def _with_centres(vertices: Tensor, quads: Tensor, gamma: Tensor) -> Mesh:
+def _with_centers(vertices: Tensor, quads: Tensor, gamma: Tensor) -> Mesh:
     """Four triangles a quad around the mean of its diagonals' midpoints, each weighted by the gammas at its ends."""
     # the backward of index_select sums in index order, that of advanced indexing in any order
     corner = vertices.index_select(0, quads.view(-1).long()).view(-1, 4, 3)

@@ -22,7 +22,7 @@ from reli3d.geometry.hull import hull_distance, hull_span, mirror_residual
 # Lengths are fractions of the longest side of the hull's bounding box unless noted.
 RAYS, DEPTHS = 96, 16  # rays per view, and points along each, at which hulls are compared
 ANGLES, OFFSETS = 60, 7  # planes of the coarse search
-MAX_OFFSET = 0.06  # of the plane from the hull's centre
+MAX_OFFSET = 0.06  # of the plane from the hull's center
 FINE_STEPS = 9  # angles and offsets of the fine search, within one coarse step
 LOST_RESIDUAL = 0.01  # a pixel whose ray has a larger residual is lost
 MAX_LOST_FRACTION = 0.008  # of the pixels: one-sided parts would be cut off
@@ -87,8 +87,8 @@ def mirror_plane(distance: Tensor, camera: Camera) -> MirrorPlane | None:
         return None
     points, known = points[seen], known[seen]
     low, high = inside.aminmax(dim=0)
-    centre, size = (low + high) / 2, float((high - low).max())
-    views = functional.normalize(camera.position - centre, dim=1)
+    center, size = (low + high) / 2, float((high - low).max())
+    views = functional.normalize(camera.position - center, dim=1)
     if float(functional.normalize(views - (views @ up)[:, None] * up, dim=1).mean(0).norm()) > MAX_MEAN_DIRECTION:
         return None
     first = functional.normalize(
@@ -97,9 +97,9 @@ def mirror_plane(distance: Tensor, camera: Camera) -> MirrorPlane | None:
     second = torch.linalg.cross(up, first)
 
     def residuals(angle: Tensor, offset: Tensor, every: int = 1) -> tuple[Tensor, Tensor]:
-        """Mean residual and fraction of lost pixels of the planes at these angles [rad] and offsets from the centre."""
+        """Mean residual and fraction of lost pixels of the planes at these angles [rad] and offsets from the center."""
         normals = torch.outer(angle.cos(), first) + torch.outer(angle.sin(), second)
-        away = normals @ centre + size * offset
+        away = normals @ center + size * offset
         some, within = points[::every, ::every], known[::every, ::every]
         residual = mirror_residual(some, within, normals, away, MAX_RESIDUAL * size, distance, camera) / size
         return residual.mean(1), (residual > LOST_RESIDUAL).float().mean(1)
@@ -129,7 +129,7 @@ def mirror_plane(distance: Tensor, camera: Camera) -> MirrorPlane | None:
     if float(residuals(angle[None], offset[None])[1]) > MAX_LOST_FRACTION:
         return None
     normal = angle.cos() * first + angle.sin() * second
-    return MirrorPlane(normal, float(unit * (normal @ centre + size * offset) + normal @ shift))
+    return MirrorPlane(normal, float(unit * (normal @ center + size * offset) + normal @ shift))
 
 
 def _middles(good: list[bool]) -> list[int]:

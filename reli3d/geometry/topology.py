@@ -53,7 +53,7 @@ def edges_of(faces: np.ndarray) -> Edges:
     return Edges(tail, head, order, start, np.diff(start, append=len(order)))
 
 
-def face_neighbours(faces: np.ndarray) -> np.ndarray:
+def face_neighbors(faces: np.ndarray) -> np.ndarray:
     """Face across each edge, ``(F, 3)`` int32: -1 where the edge has not exactly two different faces."""
     one, other = edges_of(faces).of_valence(2)
     two = one // 3 != other // 3

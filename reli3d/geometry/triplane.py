@@ -68,7 +68,7 @@ class _SampleTriplane(torch.autograd.Function):
                 slice_min=1,
             )
         else:
-            split = blocks if planes.is_cuda else 1  # neighbouring GPU threads read neighbouring blocks
+            split = blocks if planes.is_cuda else 1  # neighboring GPU threads read neighboring blocks
             launch(
                 kernels.sample_kernel,
                 batch * n * 3 * split,
@@ -203,7 +203,7 @@ def sample_triplane(planes: Tensor, points: Tensor) -> Tensor:
     the border gets half.  Channel-last strides, float32, C a multiple of 8, are read in place; other planes are
     copied.  points: ``(B, N, 3)`` float32; NaN gives zeros.
 
-    Gradients reach ``planes`` (in their dtype) and ``points`` (one-sided at texel centres), bitwise identical for any
+    Gradients reach ``planes`` (in their dtype) and ``points`` (one-sided at texel centers), bitwise identical for any
     number of threads.  Raises TypeError or ValueError, also for sizes beyond 32-bit indices.
 
     >>> planes = torch.rand(1, 3, 8, 16, 16, requires_grad=True)

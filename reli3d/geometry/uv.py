@@ -22,7 +22,7 @@ from torch import Tensor
 from reli3d import _bridge
 from reli3d.geometry import charts as parts
 from reli3d.geometry.mesh import Mesh, vertex_normals, weld
-from reli3d.geometry.topology import face_neighbours, group
+from reli3d.geometry.topology import face_neighbors, group
 from reli3d.kernels import charts as kernels
 
 FILL = 0.62  # expected fraction of the atlas covered by charts; sets only the length unit of the chart step
@@ -50,7 +50,7 @@ class AtlasReport:
     """Result of :func:`atlas_report`; areas are fractions of the UV unit square."""
 
     charts: int  # connected through equal UV vertices
-    utilisation: float  # fraction of the square that faces cover, overlap counted once
+    utilization: float  # fraction of the square that faces cover, overlap counted once
     overlap: float  # fraction of the covered samples with more than one face
     stretch: float  # L2 of Sander et al. 2001 over the surface, 1 where lengths are kept; scale of the atlas removed
     # largest length on the surface per UV length of any face, relative to the mean; slivers left out
@@ -161,7 +161,7 @@ def _place(charts: parts.Charts, faces: np.ndarray, size: int, guard: float, res
     used = np.zeros(charts.count, bool)
     used[charts.chart[faces]] = True
     chart, count = (np.cumsum(used) - 1)[charts.chart[faces]], int(used.sum())
-    face, corner = np.nonzero(parts.border_edges(charts.chart, charts.neighbours)[faces])
+    face, corner = np.nonzero(parts.border_edges(charts.chart, charts.neighbors)[faces])
     order, start = group(chart[face])
     face, corner = face[order], corner[order]
     edges = np.stack([charts.corners[faces[face], corner], charts.corners[faces[face], (corner + 1) % 3]], 1)
@@ -238,7 +238,7 @@ def _place(charts: parts.Charts, faces: np.ndarray, size: int, guard: float, res
 
 
 def atlas_report(mesh: Mesh, *, texture_size: int = 1024) -> AtlasReport:
-    """Quality of the UV of a mesh.  Overlap and utilisation are sampled at 16 points a texel, 4096 x 4096 at most."""
+    """Quality of the UV of a mesh.  Overlap and utilization are sampled at 16 points a texel, 4096 x 4096 at most."""
     from reli3d.geometry.bake import coverage
 
     if mesh.uv is None:
@@ -258,11 +258,11 @@ def atlas_report(mesh: Mesh, *, texture_size: int = 1024) -> AtlasReport:
     longest = np.sqrt(0.5 * (a + c + np.sqrt((a - c) ** 2 + 4 * b * b)))
     mean = np.sqrt(area.sum() / max(0.5 * np.abs(twice).sum(), 1e-300))
     joined = weld(torch.nn.functional.pad(mesh.uv.detach(), (0, 1)))[1].cpu().numpy()[faces]  # equal UV, split or not
-    _, chart_count = parts.components(face_neighbours(joined), np.zeros(len(faces), np.int32))
+    _, chart_count = parts.components(face_neighbors(joined), np.zeros(len(faces), np.int32))
     covered = max(int((hits > 0).sum()), 1)
     return AtlasReport(
         charts=chart_count,
-        utilisation=float((hits > 0).float().mean()),
+        utilization=float((hits > 0).float().mean()),
         overlap=int((hits > 1).sum()) / covered,
         stretch=float(np.sqrt(square) / mean),
         stretch_max=float(longest.max() / mean) if len(longest) else 1.0,

@@ -1,6 +1,6 @@
 """OpenEXR images in, through the OpenEXR package.
 
-Read are one flat part of scanlines or one level of tiles, with channels R, G, B, or Y as grey.  Deep, multi-part,
+Read are one flat part of scanlines or one level of tiles, with channels R, G, B, or Y as gray.  Deep, multi-part,
 multi-level and luminance-chroma files are refused.  Source: https://openexr.com/en/latest/TechnicalIntroduction.html.
 """
 

@@ -1,6 +1,6 @@
 """GLB out: one mesh, one metallic-roughness material, three PNG or WebP textures (glTF 2.0, Khronos).
 
-Axes and units are glTF's own (+Y up, right-handed), so nothing is rotated.  Base colour is sRGB 8 bit.  Roughness is
+Axes and units are glTF's own (+Y up, right-handed), so nothing is rotated.  Base color is sRGB 8 bit.  Roughness is
 green and metallic is blue of one linear texture.  All factors are written as 1.  :func:`read_glb` reads it back.
 """
 

@@ -201,7 +201,7 @@ class Document:
         return memoryview(data)[offset : offset + length], stride
 
     def accessor(self, index: object, field: str, kinds: tuple[str, ...]) -> np.ndarray:
-        """``(N, C)`` values; normalised integers and floats as float32 (finite), indices as stored."""
+        """``(N, C)`` values; normalized integers and floats as float32 (finite), indices as stored."""
         entry = self.item("accessors", index, field)
         where = f"accessors[{index}]"
         kind = self.get(entry, "type", str, f"{where}.type")

@@ -273,9 +273,9 @@ class Materials:
                             "use smaller textures",
                         )
                     self.left -= math.prod(image.size)
-                    if image.mode.startswith("I"):  # 16 bit grey
-                        grey = np.asarray(image).astype(np.float32)[..., None] / 65535.0
-                        pixels = np.concatenate([np.repeat(grey, 3, -1), np.ones_like(grey)], -1)
+                    if image.mode.startswith("I"):  # 16 bit gray
+                        gray = np.asarray(image).astype(np.float32)[..., None] / 65535.0
+                        pixels = np.concatenate([np.repeat(gray, 3, -1), np.ones_like(gray)], -1)
                     else:
                         pixels = np.asarray(image.convert("RGBA")).astype(np.float32) / np.float32(255.0)
         except InputError:

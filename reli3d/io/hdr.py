@@ -1,6 +1,6 @@
 """Environment maps and other linear images, in OpenEXR (``exr.py``) or Radiance RGBE (``rgbe.py``).
 
-Pixels are linear Rec. 709 radiance, row 0 at the top, +Y of an environment.  The centre column of an environment looks
+Pixels are linear Rec. 709 radiance, row 0 at the top, +Y of an environment.  The center column of an environment looks
 to +X and right of it lies +Z, in files and in memory, as three.js, model-viewer and Blender read it.
 
 NaN and negative values are never written: they are refused.  Infinity and, in half precision, values above 65504 are

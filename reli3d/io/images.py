@@ -1,6 +1,6 @@
 """Reads images and masks, writes PNG, OpenEXR and Radiance HDR images.
 
-Colour is sRGB in [0, 1] as stored; alpha is straight (not premultiplied), and the colour under alpha 0 is kept.  Pixels
+Color is sRGB in [0, 1] as stored; alpha is straight (not premultiplied), and the color under alpha 0 is kept.  Pixels
 are used as stored: an EXIF orientation is noted and not applied, because calibrated cameras refer to the stored pixels,
 unless the size in the camera file shows that they refer to the turned ones.
 """
@@ -32,8 +32,8 @@ ASPECT = 0.01  # relative difference up to which two sizes have the same aspect
 _TOP = {"L": 255, "RGB": 255, "RGBA": 255, "F": 65535}  # mode: the value that is 1
 _DECODING = BoundedSemaphore(2)  # images at a time: one of 24 MP takes 96 MB
 _OPENING = Lock()  # Python's warning filters are global; decoding runs outside
-_GREY = ("1", "L", "LA", "I;16", "I;16B", "I;16L", "I")
-_COLOUR = ("RGB", "RGBA", "P", "PA", "CMYK", "YCbCr")
+_GRAY = ("1", "L", "LA", "I;16", "I;16B", "I;16L", "I")
+_COLOR = ("RGB", "RGBA", "P", "PA", "CMYK", "YCbCr")
 
 
 class _Reader(io.BufferedReader):
@@ -48,7 +48,7 @@ class _Reader(io.BufferedReader):
 
 
 def read_image(path: str | os.PathLike, *, notes: list[str] | None = None) -> tuple[Tensor, Tensor | None]:
-    """Colour ``(H, W, 3)`` in [0, 1], sRGB-encoded as stored, and straight alpha ``(H, W)`` in [0, 1] or None.
+    """Color ``(H, W, 3)`` in [0, 1], sRGB-encoded as stored, and straight alpha ``(H, W)`` in [0, 1] or None.
 
     Decoded by :func:`decode_image`.
     """
@@ -78,9 +78,9 @@ def above(channel: Image.Image, limit: float) -> np.ndarray:
 def decode_image(
     path: str | os.PathLike, *, notes: list[str] | None = None, calibrated: tuple[int, int] | None = None
 ) -> Image.Image:
-    """Decodes an image to mode RGB, RGBA, L, or F for grey of 16 bits in [0, 65535].
+    """Decodes an image to mode RGB, RGBA, L, or F for gray of 16 bits in [0, 65535].
 
-    PNG, JPEG, WebP or TIFF; 8 bit, palette, grey, CMYK, 16-bit grey; 16-bit colour comes down to 8 bit.  The size is
+    PNG, JPEG, WebP or TIFF; 8 bit, palette, gray, CMYK, 16-bit gray; 16-bit color comes down to 8 bit.  The size is
     checked before a pixel is decoded.  What was done to the pixels is appended to ``notes``.  calibrated: width and
     height that the camera file states; where only the image turned by its EXIF orientation has that aspect, it is
     turned.  Raises InputError on anything else: another format, more than 64 MP, several frames, a truncated file.
@@ -120,8 +120,8 @@ def _decoded(path, image: Image.Image, notes: list[str], calibrated: tuple[int, 
         raise InputError(path, "expected one image, got several frames; save a single frame")
     if image.format in ("JPEG", "MPO") and (scans := _scans(path)) > MAX_SCANS:
         raise InputError(path, f"expected at most {MAX_SCANS} scans, got {scans}; save the image again")
-    if image.mode not in _GREY + _COLOUR:
-        raise InputError(path, f"expected 8 or 16 bit grey or colour, got mode {image.mode}; save as 8 bit PNG")
+    if image.mode not in _GRAY + _COLOR:
+        raise InputError(path, f"expected 8 or 16 bit gray or color, got mode {image.mode}; save as 8 bit PNG")
     orientation = image.getexif().get(ORIENTATION, 1)
     if orientation not in (0, 1):
         name = f"{os.path.basename(path)}: EXIF orientation {shown(orientation)}"
@@ -131,10 +131,10 @@ def _decoded(path, image: Image.Image, notes: list[str], calibrated: tuple[int, 
         else:
             notes.append(f"{name} not applied, cameras refer to stored pixels")
     if image.mode.startswith("I"):
-        grey = np.asarray(image).astype(np.float32)
-        if image.mode == "I" and (grey.min() < 0 or grey.max() > 65535):
-            raise InputError(path, "expected 8 or 16 bit grey, got 32 bit; save as 8 bit PNG")
-        return Image.fromarray(grey)
+        gray = np.asarray(image).astype(np.float32)
+        if image.mode == "I" and (gray.min() < 0 or gray.max() > 65535):
+            raise InputError(path, "expected 8 or 16 bit gray, got 32 bit; save as 8 bit PNG")
+        return Image.fromarray(gray)
     transparent = image.mode in ("LA", "PA", "RGBA") or "transparency" in image.info
     wanted = "RGBA" if transparent else "L" if image.mode in ("1", "L") else "RGB"
     image.load()
@@ -188,9 +188,9 @@ def write_png(path: str | os.PathLike, pixels: Tensor | np.ndarray) -> None:
 def write_image(path: str | os.PathLike, image: Tensor) -> None:
     """Write a linear image as ``.png`` (sRGB, 8 bit), ``.exr`` (float) or ``.hdr``, by the suffix of ``path``.
 
-    image: float32, linear Rec. 709, ``(H, W)`` grey, ``(H, W, 3)``, or ``(H, W, 4)`` with color premultiplied by alpha.
+    image: float32, linear Rec. 709, ``(H, W)`` gray, ``(H, W, 3)``, or ``(H, W, 4)`` with color premultiplied by alpha.
     ``.png``: color is divided by alpha, encoded as sRGB and clamped to [0, 1]; alpha is straight, as PNG has it.
-    ``.exr``: values as given, premultiplied as OpenEXR has it.  ``.hdr``: has neither grey nor alpha; ``(H, W, 3)``
+    ``.exr``: values as given, premultiplied as OpenEXR has it.  ``.hdr``: has neither gray nor alpha; ``(H, W, 3)``
     alone.  Writes the whole file or nothing.  Raises TypeError for another dtype, ValueError for another suffix or
     shape, NaN, infinity or negative values, OSError where the file cannot be written.
 

@@ -44,8 +44,8 @@ def obj_files(asset: Asset, name: str) -> dict[str, bytes]:
     text.write("usemtl baked\n")
     corners = np.repeat(mesh.faces.cpu().numpy() + 1, 3, axis=1)
     np.savetxt(text, corners, fmt="f %d/%d/%d %d/%d/%d %d/%d/%d")
-    grey = {k: getattr(textures, k)[..., None].expand(-1, -1, 3) for k in ("roughness", "metallic")}
-    maps = {"base_color": linear_to_srgb(textures.base_color), **grey, "normal": textures.normal}
+    gray = {k: getattr(textures, k)[..., None].expand(-1, -1, 3) for k in ("roughness", "metallic")}
+    maps = {"base_color": linear_to_srgb(textures.base_color), **gray, "normal": textures.normal}
     return {
         f"{name}.obj": text.getvalue().encode(),
         f"{name}.mtl": MATERIAL.format(name=name).encode(),

@@ -14,7 +14,7 @@ from reli3d.render.asset import Asset
 
 
 def usdz_bytes(asset: Asset, name: str = "object") -> bytes:
-    """A USDZ package: +Y up, metres, textures as PNG.  Raises ImportError without ``usd-core``, else as glTF does.
+    """A USDZ package: +Y up, meters, textures as PNG.  Raises ImportError without ``usd-core``, else as glTF does.
 
     Roughness and metallic are channels of one texture, as in glTF; texture coordinates have v up, as USD has them.
     """

@@ -1,6 +1,6 @@
 """Texels of an atlas: which face covers each, attributes there, and the nearest covered texel of every other.
 
-Texel (row y, column x) has its centre at (x + 0.5, y + 0.5) in texel units, v down.  A thread owns a tile, a strip or a
+Texel (row y, column x) has its center at (x + 0.5, y + 0.5) in texel units, v down.  A thread owns a tile, a strip or a
 row of the output and gathers, so that the result does not depend on the number of threads or the size of the tiles.
 """
 
@@ -8,7 +8,7 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
 
-ROUNDING = wp.constant(4.0e-7)  # relative error of a float32 cross product, twice over: neighbours leave no crack
+ROUNDING = wp.constant(4.0e-7)  # relative error of a float32 cross product, twice over: neighbors leave no crack
 
 
 @wp.struct
@@ -67,7 +67,7 @@ def texels_kernel(
     face: wp.array2d[wp.int32],
     bary: wp.array2d[wp.vec2],
 ):
-    """Fill tile ``i``: the first face over a texel's centre; else the nearest border segment within ``reach`` texels.
+    """Fill tile ``i``: the first face over a texel's center; else the nearest border segment within ``reach`` texels.
 
     ``segments`` holds 3 * face + corner of each edge on a border.  ``bary`` weighs vertices 1 and 2.
     """
@@ -149,7 +149,7 @@ def coverage_kernel(
     # out
     hits: wp.array2d[wp.uint8],
 ):
-    """Number of faces, 255 at most, whose interior holds each centre of tile ``i``."""
+    """Number of faces, 255 at most, whose interior holds each center of tile ``i``."""
     i = start + wp.tid()
     tile = tiles.tile
     across = (tiles.size + tile - 1) // tile

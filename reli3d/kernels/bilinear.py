@@ -1,4 +1,4 @@
-"""Bilinear values of images: pixel centres lie at +0.5, beyond the outermost ones the border's value is taken."""
+"""Bilinear values of images: pixel centers lie at +0.5, beyond the outermost ones the border's value is taken."""
 
 from typing import Any
 

@@ -1,7 +1,7 @@
 """Metallic-roughness BSDF in the local frame: normal +z, ``wo`` towards the viewer, ``wi`` to the light, both unit.
 
 f = T (1 - metallic) base / pi + D G2 F / (4 cos_o cos_i) [1/sr], without the cosine; linear Rec. 709.
-F = F0 + (1 - F0)(1 - wo.wm)^5 (Schlick 1994), F0 = 0.04 for dielectrics, the base colour for metals.
+F = F0 + (1 - F0)(1 - wo.wm)^5 (Schlick 1994), F0 = 0.04 for dielectrics, the base color for metals.
 ``conserving`` (Shirley et al. 1997): T = (1 - F(c_o)) (1 - F(c_i)), 1 - c = (1 - cos) / (1 + alpha), dielectric F0.
 ``published`` (glTF 2.0, appendix B): T = 1 - F of the microfacet, which creates energy at grazing views.
 """

@@ -16,7 +16,7 @@ EMBREE = ("embree", "shade_rays")  # modules whose kernels call Embree, which ru
 LOADING = threading.Lock()  # Warp has none: it would be started, and a module compiled, by two threads at once
 
 
-def initialise() -> None:
+def initialize() -> None:
     """Start Warp once: quiet on stdout, and with a kernel cache that can be written."""
     with LOADING:
         _start()
@@ -46,7 +46,7 @@ def imported(kind: str) -> list[ModuleType]:
 
 def compiled(modules: Sequence[ModuleType], kind: str) -> bool:
     """Whether the kernel cache has all of these kernel modules for ``cpu`` or ``cuda``: loading them takes no time."""
-    initialise()
+    initialize()
     block = CPU_BLOCK if kind == "cpu" else None
     names = [wp.get_module(m.__name__).get_module_identifier(block_dim=block) for m in modules]
     return all(os.path.isdir(os.path.join(str(wp.config.kernel_cache_dir), name)) for name in names)

@@ -32,15 +32,15 @@ def normals_kernel(
 def smooth_kernel(
     start: int,
     # in
-    neighbours: wp.array2d[wp.int32], normal: wp.array[wp.vec3],
+    neighbors: wp.array2d[wp.int32], normal: wp.array[wp.vec3],
     # out
     smoothed: wp.array[wp.vec3],
 ):  # fmt: skip
-    """Sum of the normals of a face and its neighbours."""
+    """Sum of the normals of a face and its neighbors."""
     i = start + wp.tid()
     total = normal[i]
     for k in range(3):
-        j = neighbours[i, k]
+        j = neighbors[i, k]
         if j >= 0:
             total += normal[j]
     smoothed[i] = total
@@ -84,16 +84,16 @@ def labels_kernel(
 def majority_kernel(
     start: int,
     # in
-    neighbours: wp.array2d[wp.int32], normal: wp.array[wp.vec3], label: wp.array[wp.int32],
+    neighbors: wp.array2d[wp.int32], normal: wp.array[wp.vec3], label: wp.array[wp.int32],
     cosine: float,
     # out
     voted: wp.array[wp.int32],
 ):  # fmt: skip
-    """The label of two or three neighbours of a face, if the face is within ``cosine`` of that axis."""
+    """The label of two or three neighbors of a face, if the face is within ``cosine`` of that axis."""
     i = start + wp.tid()
     vote = wp.vec3i(-1, -1, -1)
     for k in range(3):
-        j = neighbours[i, k]
+        j = neighbors[i, k]
         if j >= 0:
             vote[k] = label[j]
     winner = vote[0]
@@ -218,7 +218,7 @@ def overlaps_kernel(
 def split_serial_kernel(
     start: int,
     # in
-    neighbours: wp.array2d[wp.int32], chart: wp.array[wp.int32], seeds: wp.array[wp.int32],
+    neighbors: wp.array2d[wp.int32], chart: wp.array[wp.int32], seeds: wp.array[wp.int32],
     offset: wp.array[wp.int64], count: wp.array[wp.int32], partner: wp.array[wp.int32], first: int,
     # scratch
     queue: wp.array[wp.int32],
@@ -247,7 +247,7 @@ def split_serial_kernel(
                     if free == 1:
                         owner[f] = current
                         for k in range(3):
-                            g = neighbours[f, k]
+                            g = neighbors[f, k]
                             if g >= 0 and owner[g] < 0 and chart[g] == chart[f]:
                                 queue[tail] = g
                                 tail += 1

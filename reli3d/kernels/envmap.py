@@ -1,8 +1,8 @@
 """Lat-long environment maps: lookup, importance table, sampling.
 
-Row 0 is +Y; the centre column looks to +X, right of it +Z: with phi = 2 pi u - pi and theta = pi v the direction is
-(cos phi sin theta, cos theta, sin phi sin theta).  A texel has its centre at ((column + .5) / W, (row + .5) / H).
-Radiance is bilinear between centres, periodic in u, constant beyond the first and last row.  Sampling is piecewise
+Row 0 is +Y; the center column looks to +X, right of it +Z: with phi = 2 pi u - pi and theta = pi v the direction is
+(cos phi sin theta, cos theta, sin phi sin theta).  A texel has its center at ((column + .5) / W, (row + .5) / H).
+Radiance is bilinear between centers, periodic in u, constant beyond the first and last row.  Sampling is piecewise
 constant over texels with respect to solid angle; densities are per steradian.
 """
 
@@ -42,7 +42,7 @@ class Texels:
 
 @wp.func
 def four_texels(height: int, width: int, uv: wp.vec2) -> Texels:
-    """Neighbours for bilinear lookup: periodic in u, the border's row beyond the first and the last."""
+    """Neighbors for bilinear lookup: periodic in u, the border's row beyond the first and the last."""
     x = uv[0] * float(width) - 0.5
     y = uv[1] * float(height) - 0.5
     column = int(wp.floor(x))

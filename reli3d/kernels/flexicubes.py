@@ -194,7 +194,7 @@ def resolve_kernel(
     # in
     cells: wp.array[wp.int32],
     codes: wp.array[wp.uint8],
-    neighbour: wp.array[wp.int32],
+    neighbor: wp.array[wp.int32],
     count: wp.array[wp.int32],
     ny: int,
     nz: int,
@@ -207,7 +207,7 @@ def resolve_kernel(
     s = start + wp.tid()
     cell = cells[s]
     code = int(codes[cell])
-    face = neighbour[code]
+    face = neighbor[code]
     if face >= 0:
         axis = face // 2
         at = split_index(cell, ny, nz)
@@ -217,9 +217,9 @@ def resolve_kernel(
         if axis == 0:
             step = ny * nz
         if face % 2 == 1:
-            if neighbour[int(codes[cell + step])] == face - 1:
+            if neighbor[int(codes[cell + step])] == face - 1:
                 code = 255 - code
-        elif at[axis] > 0 and neighbour[int(codes[cell - step])] == face + 1:
+        elif at[axis] > 0 and neighbor[int(codes[cell - step])] == face + 1:
             code = 255 - code
     resolved[s] = code
     counts[s] = count[code]

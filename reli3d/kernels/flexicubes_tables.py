@@ -23,7 +23,7 @@ class Tables(NamedTuple):
 
     count: np.ndarray  # (256,) dual vertices of a case
     group: np.ndarray  # (256, 12) dual vertex of an edge, -1 where the edge is not crossed
-    neighbour: np.ndarray  # (256,) face (axis * 2 + side) at which one loop has both pairs, or -1
+    neighbor: np.ndarray  # (256,) face (axis * 2 + side) at which one loop has both pairs, or -1
     ends: np.ndarray  # (12, 2) EDGES
     around: np.ndarray  # (3, 4) axis of a grid edge -> which edge it is of its four cubes, by rising cube index
 
@@ -78,10 +78,10 @@ def _around(axis: int) -> list[int]:
 def tables() -> Tables:
     """The tables of all 256 cases."""
     group = groups()
-    neighbour = np.full(256, -1, np.int32)
+    neighbor = np.full(256, -1, np.int32)
     for face, edges in faces():
         on = group[:, edges]
         same = (on[:, 0] >= 0) & (on == on[:, :1]).all(1)
-        neighbour[same] = face  # ambiguous, and the only ambiguous face of such a case
+        neighbor[same] = face  # ambiguous, and the only ambiguous face of such a case
     around = np.array([_around(axis) for axis in range(3)], np.int32)
-    return Tables(group.max(1) + 1, group, neighbour, np.array(EDGES, np.int32), around)
+    return Tables(group.max(1) + 1, group, neighbor, np.array(EDGES, np.int32), around)

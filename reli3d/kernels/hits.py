@@ -4,7 +4,7 @@ Normals and re-evaluated hits, and their adjoints, are computed in float64: diff
 gradients depend on the square of the result.
 
 ``bary`` are the weights of vertices 1 and 2 of a face.  Face -1 is a miss: value 0, no gradient.  Textures are bilinear
-between texel centres at ((column + .5) / T, (row + .5) / T) and repeat in both axes (glTF's default wrap).
+between texel centers at ((column + .5) / T, (row + .5) / T) and repeat in both axes (glTF's default wrap).
 """
 
 import warp as wp

@@ -1,7 +1,7 @@
 """Signed distance of pixels to a mask's contour, and of points to the visual hull of several masks.
 
-Pixel (row y, column x) has its centre at (x + 0.5, y + 0.5).  The contour is where the mask, bilinear between pixel
-centres, is 0.5: in a *cell* of four neighbouring centres one or two segments (marching squares).  Cell (y, x) has the
+Pixel (row y, column x) has its center at (x + 0.5, y + 0.5).  The contour is where the mask, bilinear between pixel
+centers, is 0.5: in a *cell* of four neighboring centers one or two segments (marching squares).  Cell (y, x) has the
 pixels (y, x), (y, x + 1), (y + 1, x), (y + 1, x + 1); there are (H - 1) * (W - 1).
 """
 
@@ -77,13 +77,13 @@ def hull_distance_kernel(
 
 
 @wp.func
-def change_in_view(centre: wp.vec3, radius: float, value: float, pose: wp.mat44, k: wp.vec4) -> float:
-    """Bound on the change of :func:`distance_in_view`, ``value`` at ``centre``, within ``radius``; -1 if points there
+def change_in_view(center: wp.vec3, radius: float, value: float, pose: wp.mat44, k: wp.vec4) -> float:
+    """Bound on the change of :func:`distance_in_view`, ``value`` at ``center``, within ``radius``; -1 if points there
     may lie behind the camera.
 
-    The map changes by at most sqrt(2) per pixel between pixel centres, and mask_distance_kernel errs by up to 1 pixel.
+    The map changes by at most sqrt(2) per pixel between pixel centers, and mask_distance_kernel errs by up to 1 pixel.
     """
-    away = centre - wp.vec3(pose[0, 3], pose[1, 3], pose[2, 3])
+    away = center - wp.vec3(pose[0, 3], pose[1, 3], pose[2, 3])
     depth = -(pose[0, 2] * away[0] + pose[1, 2] * away[1] + pose[2, 2] * away[2])
     if not (depth - radius > DEPTH_MIN):
         return -1.0
@@ -116,14 +116,14 @@ def hull_grid_kernel(
     z1 = wp.min(z0 + BLOCK_POINTS, n)
     low = wp.vec3(axis[x0], axis[y0], axis[z0])
     high = wp.vec3(axis[x1 - 1], axis[y1 - 1], axis[z1 - 1])
-    centre = 0.5 * (low + high)
+    center = 0.5 * (low + high)
     radius = 0.5 * wp.length(high - low)
     greatest = wp.float32(-BEHIND)  # no point of the block is farther inside
     least = few()  # of each view
     views = wp.min(c2w.shape[0], BLOCK_VIEWS_MAX)
     for v in range(views):
-        value = distance_in_view(centre, v, distance, c2w, intrinsics)
-        change = change_in_view(centre, radius, value, c2w[v], intrinsics[v])
+        value = distance_in_view(center, v, distance, c2w, intrinsics)
+        change = change_in_view(center, radius, value, c2w[v], intrinsics[v])
         least[v] = BEHIND
         if change >= 0.0:
             least[v] = value - change
@@ -262,7 +262,7 @@ def crossing(a: float, b: float) -> float:
 
 @wp.func
 def squared_to_contour(mask: wp.array3d[float], view: int, y: int, x: int, p: wp.vec2) -> float:
-    """Squared distance of ``p`` (column, row in pixel centres) to the contour inside cell (y, x), which it crosses."""
+    """Squared distance of ``p`` (column, row in pixel centers) to the contour inside cell (y, x), which it crosses."""
     m00 = mask[view, y, x]
     m01 = mask[view, y, x + 1]
     m10 = mask[view, y + 1, x]
@@ -285,7 +285,7 @@ def squared_to_contour(mask: wp.array3d[float], view: int, y: int, x: int, p: wp
     if right:
         r = wp.vec2(1.0, crossing(m01, m11))
     if top and bottom and left and right:
-        # saddle: the corners with the sign of the centre are joined, the other two are cut off
+        # saddle: the corners with the sign of the center are joined, the other two are cut off
         if (0.25 * (m00 + m01 + m10 + m11) >= 0.5) == (m00 >= 0.5):
             return wp.min(squared_to_segment(q, t, r), squared_to_segment(q, l, b))
         return wp.min(squared_to_segment(q, t, l), squared_to_segment(q, r, b))
@@ -436,7 +436,7 @@ def mask_distance_kernel(
             cell_x = int(at[0])
             cell_y = near_y
             best = wp.length_sq(at - p)
-    neighbors = wp.int32(1)  # the cell's lower neighbours, which have the same crossing
+    neighbors = wp.int32(1)  # the cell's lower neighbors, which have the same crossing
     if best < EXACT_PIXELS * EXACT_PIXELS:
         neighbors = 2
     if best > SEGMENT_PIXELS * SEGMENT_PIXELS:

@@ -123,8 +123,8 @@ def cells_kernel(
             for z in range(-1, 2):
                 hx = mix(wp.uint32(seed) ^ wp.uint32(int(base[0]) + x))
                 h = mix(mix(hx + wp.uint32(int(base[1]) + y)) + wp.uint32(int(base[2]) + z))
-                centre = base + wp.vec3(float(x) + 0.5, float(y) + 0.5, float(z) + 0.5) + 0.45 * unpack(h)
-                away = q - centre
+                center = base + wp.vec3(float(x) + 0.5, float(y) + 0.5, float(z) + 0.5) + 0.45 * unpack(h)
+                away = q - center
                 d = wp.length_sq(away)
                 if d < first:
                     second = first

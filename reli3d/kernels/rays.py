@@ -123,7 +123,7 @@ def sight_kernel(
 ):
     """Ray from a point of a surface to a camera; ``t_max`` is -1 where the point looks away or lies off the image.
 
-    pair: the ray is of camera ``pair // N`` and point ``pair % N``, so that neighbours go to one camera from about one
+    pair: the ray is of camera ``pair // N`` and point ``pair % N``, so that neighbors go to one camera from about one
     place; without any, the ray's own number.
     """
     i = start + wp.tid()

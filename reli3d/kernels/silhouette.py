@@ -30,7 +30,7 @@ def pixel_of(frame: wp.mat33, eye: wp.vec3, intrinsics: wp.vec4, p: wp.vec3) -> 
 
 @wp.func
 def line_range(from_: float, to: float, size: int) -> wp.vec2i:
-    """First pixel line whose centre lies in [low, high) of the two coordinates, and how many do."""
+    """First pixel line whose center lies in [low, high) of the two coordinates, and how many do."""
     low = wp.clamp(wp.min(from_, to) - 0.5, -1.0, float(size))
     high = wp.clamp(wp.max(from_, to) - 0.5, -1.0, float(size))
     first = wp.max(int(wp.ceil(low)), 0)

@@ -28,9 +28,9 @@ ONE, HALF, MINUS = (wp.constant(wp.float64(v)) for v in (1.0, 0.5, -1.0))
 
 @wp.func
 def texel_position(point: wp.vec3, plane: int, sizes: Sizes) -> wp.vec2d:
-    """Column and row of ``point`` in texel centres, as far outside as needed: -1 and below has no texel.
+    """Column and row of ``point`` in texel centers, as far outside as needed: -1 and below has no texel.
 
-    In float64: float32 would leave 1.5e-5 of a texel of 300, and a value of that part of what neighbours differ by.
+    In float64: float32 would leave 1.5e-5 of a texel of 300, and a value of that part of what neighbors differ by.
     """
     a = wp.float64(point[0])
     b = wp.float64(point[1])
@@ -46,7 +46,7 @@ def texel_position(point: wp.vec3, plane: int, sizes: Sizes) -> wp.vec2d:
 
 @wp.func
 def fraction(at: wp.float64, k: int) -> float:
-    """Place between texel centres ``k`` and ``k + 1``, in [0, 1]."""
+    """Place between texel centers ``k`` and ``k + 1``, in [0, 1]."""
     return wp.float32(at - wp.float64(k))
 
 
@@ -235,7 +235,7 @@ def points_adjoint_kernel(
     # out
     g_points: wp.array[wp.vec3],
 ):
-    """Gradient of the features with respect to a point; one-sided, towards +, at a texel centre."""
+    """Gradient of the features with respect to a point; one-sided, towards +, at a texel center."""
     point = start + wp.tid()
     height = sizes.height
     width = sizes.width

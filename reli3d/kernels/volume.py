@@ -161,7 +161,7 @@ def composite_kernel(
     opacity: wp.array[float],
     depth: wp.array[float],
 ):
-    """Emission and absorption, Max 1995: a sample counts ``T (1 - exp(-density step))`` of its colour and distance."""
+    """Emission and absorption, Max 1995: a sample counts ``T (1 - exp(-density step))`` of its color and distance."""
     i = start + wp.tid()
     thickness = wp.float32(0.0)
     total = wp.vec3(0.0, 0.0, 0.0)

@@ -1,7 +1,7 @@
 """Embedding of each view's camera matrices, an input of the network.
 
 Camera-to-world matrices are 4x4 in OpenGL axes (+X right, +Y up, looking along -Z); intrinsics are fx, fy, cx, cy in
-pixels of the square input, pixel centres at +0.5.
+pixels of the square input, pixel centers at +0.5.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ def camera_vector(c2w: Tensor, intrinsics: Tensor, size: int) -> Tensor:
     """
     fx, fy, cx, cy = (intrinsics / size).unbind(-1)
     zero, one = torch.zeros_like(fx), torch.ones_like(fx)
-    normalised = torch.stack([fx, zero, cx, zero, fy, cy, zero, zero, one], dim=-1)
-    return torch.cat([c2w.flatten(-2), normalised], dim=-1)
+    normalized = torch.stack([fx, zero, cx, zero, fy, cy, zero, zero, one], dim=-1)
+    return torch.cat([c2w.flatten(-2), normalized], dim=-1)
 
 
 class CameraEmbedder(nn.Module):

@@ -14,14 +14,14 @@ from reli3d.nn.blocks import linear_of
 from reli3d.nn.camera import CameraEmbedder, camera_vector
 from reli3d.nn.heads import HEADS, Heads, WeightMerger, truncated_exp
 from reli3d.nn.illumination import Illumination
-from reli3d.nn.initialise import initialise
+from reli3d.nn.initialize import initialize
 from reli3d.nn.presets import Preset
 from reli3d.nn.reni import EnvironmentDecoder, reni_frame
 from reli3d.nn.tokenizers import ImageTokenizer, TriplaneBank, patch_grid
 from reli3d.nn.transformer import TwoStreamTransformer
 from reli3d.nn.upsample import PixelShuffleUpsampler
 
-BACKGROUND = 0.5  # grey behind the object in the object encoder's images, sRGB
+BACKGROUND = 0.5  # gray behind the object in the object encoder's images, sRGB
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Reconstructor(nn.Module):
         self.heads = Heads(3 * preset.upsampler.channels, preset.head_width)
         self.merger = WeightMerger(preset.head_width)
         if self.device.type != "meta":  # there are no values there, and torch would import its compiler to say so
-            initialise(self)
+            initialize(self)
 
     @property
     def device(self) -> torch.device:
@@ -119,7 +119,7 @@ class Reconstructor(nn.Module):
         return Code(triplane, patch_grid(tokens), latent, rotation, strength)
 
     def decode_environment(self, code: Code, height: int | None = None) -> Tensor:
-        """Linear radiance ``(B, H, 2H, 3)``, row 0 is +Y, the centre column +X; default height the preset's."""
+        """Linear radiance ``(B, H, 2H, 3)``, row 0 is +Y, the center column +X; default height the preset's."""
         return self.environment(code.latent, code.rotation, code.strength, height)
 
     def radiance(self, code: Code, directions: Tensor) -> Tensor:

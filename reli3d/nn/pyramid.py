@@ -23,7 +23,7 @@ CLIP_RADIUS = 0.87  # of the sphere around the origin that clips the hull: circu
 
 
 def block(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
-    """3x3 convolution, group normalisation over groups of eight channels, SiLU."""
+    """3x3 convolution, group normalization over groups of eight channels, SiLU."""
     return nn.Sequential(
         nn.Conv2d(inputs, outputs, 3, stride=stride, padding=1), nn.GroupNorm(max(1, outputs // 8), outputs), nn.SiLU()
     )

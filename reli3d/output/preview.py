@@ -44,7 +44,7 @@ def preview(asset: Asset, views: Views, scene: RayScene | None = None) -> Callab
     """Starts rendering the contact sheet in the pool; calling the result returns it, ``(H, W, 3)`` uint8.
 
     It shows up to four input views; four novel views under the estimated lighting, then under the
-    studio of :mod:`reli3d.render.lights`; the maps of the first of them; the environment, row 0 up, centre +X as in its
+    studio of :mod:`reli3d.render.lights`; the maps of the first of them; the environment, row 0 up, center +X as in its
     files, scaled to the mean ``ENVIRONMENT_MEAN``.
 
     views: in the frame of ``asset``.  scene: rays against its mesh, made here if None.  Errors are raised by the call,
@@ -71,7 +71,7 @@ def preview(asset: Asset, views: Views, scene: RayScene | None = None) -> Callab
             ("input", inputs),
             ("novel views, estimated lighting", [own for own, *_ in found]),
             ("the same views, studio lighting", [lit for _, lit, *_ in found]),
-            ("base colour, roughness, metallic, normal", found[0][2:]),
+            ("base color, roughness, metallic, normal", found[0][2:]),
             ("estimated environment, scaled to a mean of 0.25", [light]),
         ]
         return _sheet(rows, COLUMNS, last=TILE // 2)
@@ -141,22 +141,22 @@ def unseen_cameras(mesh: Mesh, c2w: Tensor) -> list[Camera]:
     Their elevations above the horizon are ``ELEVATIONS`` (+Y is up), and the whole mesh is in view.
     """
     low, high = mesh.vertices.aminmax(dim=0)
-    centre = (low + high) / 2
-    radius = float((mesh.vertices - centre).norm(dim=-1).max())
+    center = (low + high) / 2
+    radius = float((mesh.vertices - center).norm(dim=-1).max())
     azimuth = torch.arange(AZIMUTHS, dtype=torch.float32, device="cpu") * (2.0 * math.pi / AZIMUTHS)
     places = []
     for lift in map(math.radians, ELEVATIONS):
         height_above = torch.full_like(azimuth, math.sin(lift))
         places.append(torch.stack([azimuth.sin() * math.cos(lift), height_above, azimuth.cos() * math.cos(lift)], -1))
-    offered = torch.cat(places).to(centre)
-    nearest = (offered @ normalize(c2w[:, :3, 3] - centre, dim=-1).T).amax(1)  # cosine of the angle to what is taken
+    offered = torch.cat(places).to(center)
+    nearest = (offered @ normalize(c2w[:, :3, 3] - center, dim=-1).T).amax(1)  # cosine of the angle to what is taken
     chosen = []
     for _ in range(COLUMNS):
         chosen.append(int(nearest.argmin()))
         nearest = torch.maximum(nearest, offered @ offered[chosen[-1]])
-    eyes = centre + offered[sorted(chosen, key=lambda k: k % AZIMUTHS)] * (radius / math.sin(FOV / 2))
-    up = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float32, device="cpu").to(centre)
-    return [Camera.from_fov(look_at(eye, centre, up), FOV, TILE, TILE) for eye in eyes]
+    eyes = center + offered[sorted(chosen, key=lambda k: k % AZIMUTHS)] * (radius / math.sin(FOV / 2))
+    up = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float32, device="cpu").to(center)
+    return [Camera.from_fov(look_at(eye, center, up), FOV, TILE, TILE) for eye in eyes]
 
 
 def _lit(radiance: Tensor, alpha: Tensor) -> Tensor:
@@ -170,8 +170,8 @@ def _on_background(color: Tensor, alpha: Tensor) -> Tensor:
 
 def _maps(rendering: Render) -> list[Tensor]:
     """Tiles of the material layers: base color, roughness, metallic, normal."""
-    grey = (value[..., None].expand(-1, -1, 3) for value in (rendering.roughness, rendering.metallic))
-    shown = (linear_to_srgb(rendering.base_color), *grey, rendering.normal * 0.5 + 0.5)
+    gray = (value[..., None].expand(-1, -1, 3) for value in (rendering.roughness, rendering.metallic))
+    shown = (linear_to_srgb(rendering.base_color), *gray, rendering.normal * 0.5 + 0.5)
     return [_on_background(tile, rendering.alpha) for tile in shown]
 
 

@@ -146,7 +146,7 @@ def write_results(
     ``run_info.json``, to which the convention of the light is added. comparison: sheet of a refinement.
     """
     light = encoded.asset.light
-    info = {**info, "environment_centre": "+X"}
+    info = {**info, "environment_center": "+X"}
     with replacing() as new:
         (new / "preview.png").write_bytes(png_bytes(sheet))
         (new / "mesh.glb").write_bytes(encoded.placed())

@@ -119,7 +119,7 @@ class Asset:
     """A relightable object: mesh, textures and the light it was captured under, where that is known.
 
     mesh: a :class:`~reli3d.geometry.mesh.Mesh`; renderers need its ``uv`` where there are textures
-    (:func:`~reli3d.geometry.uv.unwrap`).  textures: a :class:`TextureSet`; renderers take None as a grey dielectric.
+    (:func:`~reli3d.geometry.uv.unwrap`).  textures: a :class:`TextureSet`; renderers take None as a gray dielectric.
     environment: an :class:`~reli3d.render.environment.Environment` or None.  ``.to(device)`` and
     ``.detach()`` give copies; gradients pass through.  Raises TypeError for another kind.
 

@@ -9,7 +9,7 @@ from torch.nn.functional import normalize
 from reli3d._bridge import check, launch
 from reli3d.kernels import bump as kernels
 
-EPS = float(kernels.BUMP_EPS)  # of the published normalisation; on the vertical axis there is no frame and no bump
+EPS = float(kernels.BUMP_EPS)  # of the published normalization; on the vertical axis there is no frame and no bump
 
 
 def radial_bump(position: Tensor, normal: Tensor, bump: Tensor) -> Tensor:

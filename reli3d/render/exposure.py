@@ -99,7 +99,7 @@ def _seen(
     """Linear colors of the photographs ``(N, 3)`` on the grid, ``asset`` there and the directions."""
     first = STEP // 2
     seen, inside = srgb_to_linear(images[:, first::STEP, first::STEP]), inside[:, first::STEP, first::STEP]
-    corner = camera.intrinsics.new_tensor([0.0, 0.0, 0.5, 0.5])  # centres of coarse pixels on those read
+    corner = camera.intrinsics.new_tensor([0.0, 0.0, 0.5, 0.5])  # centers of coarse pixels on those read
     coarse = Camera(camera.c2w, (camera.intrinsics - corner) / STEP, seen.shape[2], seen.shape[1])
     hits, _, directions = primary_hits(scene, coarse)
     both = inside & (hits.face >= 0) & (seen.amax(-1) < WHITE)

@@ -78,7 +78,7 @@ def tangent_normals(mesh: Mesh, face: Tensor, bary: Tensor, normal: Tensor, mapp
 def surface_points(mesh: Mesh, textures: TextureSet | None, face: Tensor, bary: Tensor) -> SurfacePoints:
     """Geometry and material at hits of a mesh, as :func:`~reli3d.render.shading.shade` takes them.
 
-    mesh: with uv for textures.  textures: a :class:`~reli3d.render.asset.TextureSet` or None for a grey dielectric:
+    mesh: with uv for textures.  textures: a :class:`~reli3d.render.asset.TextureSet` or None for a gray dielectric:
     base color 0.5, roughness 0.5, metallic 0.  face: ``(N,)`` int32, no miss among them.  bary: ``(N, 2)``.  Without
     vertex normals the shading normal is the geometric one.  Gradients reach the mesh's arrays, the textures and
     ``bary``.  Raises TypeError, ValueError.
@@ -94,8 +94,8 @@ def surface_points(mesh: Mesh, textures: TextureSet | None, face: Tensor, bary: 
         square = (smooth * smooth).sum(-1, keepdim=True)
         normal = torch.where(square > 1e-8, smooth * torch.rsqrt(square.clamp(min=1e-8)), ng)  # opposed normals cancel
     if textures is None:
-        grey = position.new_full((len(position),), 0.5)
-        return SurfacePoints(position, ng, normal, grey[:, None].expand(-1, 3), grey, torch.zeros_like(grey))
+        gray = position.new_full((len(position),), 0.5)
+        return SurfacePoints(position, ng, normal, gray[:, None].expand(-1, 3), gray, torch.zeros_like(gray))
     if mesh.uv is None:
         raise ValueError("mesh.uv: expected texture coordinates for a textured asset, got None (see unwrap)")
     uv = wrap_uv(interpolate(mesh.uv, mesh.faces, face, bary), textures.wrap, (textures.size, textures.size))

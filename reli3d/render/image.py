@@ -91,7 +91,7 @@ def render_asset(
 ) -> Render:
     """Image of ``asset`` under ``environment`` (default: the asset's own) with direct light and shadows.
 
-    asset: one, or the parts of one that cast shadows on each other; without textures a grey dielectric.  camera: one
+    asset: one, or the parts of one that cast shadows on each other; without textures a gray dielectric.  camera: one
     camera, no batch.  options: of :func:`reli3d.render.shading.shade`.  supersampling: side of the subpixel grid;
     samples are per subpixel.  shadows: trace shadow rays.  background: ``transparent`` or ``environment``.  scene: rays
     against :func:`joined_scene`, built here if None.  progress: called with the fraction done.

@@ -32,7 +32,7 @@ def _vector(values: Sequence[float]) -> Tensor:
 
 @full_precision
 def studio(height: int = 64) -> Environment:
-    """A grey room with four softboxes: a key at the left, a strip at the right, one behind and one above."""
+    """A gray room with four softboxes: a key at the left, a strip at the right, one behind and one above."""
     d = lat_long_directions(height)
     y = d[..., 1:2]
     light = (0.22 + 0.12 * y).expand(-1, -1, 3)
@@ -62,8 +62,8 @@ def sky(height: int = 64) -> Environment:
     light = torch.lerp(ground.expand_as(up), up, torch.sigmoid(y * height))  # the horizon fades over a texel
     sun = normalize(_vector([0.5, math.sin(math.radians(40.0)), 0.58]), dim=0)
     away = torch.linalg.cross(d, sun.expand_as(d)).norm(dim=-1).atan2(d @ sun)
-    disc = torch.sigmoid((SUN_RADIUS - away) * (2.0 * height / math.pi))[..., None] * _vector([1.0, 0.9, 0.75])
-    return _of_mean_one(light / _mean(light) + disc / _mean(disc) * (SUN_FRACTION / (1.0 - SUN_FRACTION)))
+    disk = torch.sigmoid((SUN_RADIUS - away) * (2.0 * height / math.pi))[..., None] * _vector([1.0, 0.9, 0.75])
+    return _of_mean_one(light / _mean(light) + disk / _mean(disk) * (SUN_FRACTION / (1.0 - SUN_FRACTION)))
 
 
 LIGHTS = {"studio": studio, "sky": sky}

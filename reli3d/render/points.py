@@ -13,7 +13,7 @@ from torch import Tensor
 from reli3d._bridge import check, tensor_of
 
 UNIT = 1e-4  # of a length from 1: float32 interpolation and rotation err by 1e-6
-NUMBERS = ("base_color", "roughness", "metallic")  # may be a plain number: grey, or the same everywhere
+NUMBERS = ("base_color", "roughness", "metallic")  # may be a plain number: gray, or the same everywhere
 
 
 @dataclass(frozen=True)

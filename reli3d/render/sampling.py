@@ -83,7 +83,7 @@ def antithetic(u: Tensor) -> Tensor:
 
     Uniform if ``u`` is.  The partner lies across the lobe: the first number is half a turn on, the second counts from
     the other end, exactly if ``u`` are multiples of 2^-24.  The mean of both integrands has less variance than two
-    independent ones where the integrand is near to odd about the lobe's centre, as derivatives in ``alpha`` and the
+    independent ones where the integrand is near to odd about the lobe's center, as derivatives in ``alpha`` and the
     normal are.  Its own inverse.  No gradient.  Raises TypeError unless float32, ValueError for a shape.
 
     >>> partners = reli3d.antithetic(u)

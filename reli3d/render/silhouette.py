@@ -1,7 +1,7 @@
 """Antialiased outlines whose gradient reaches the vertices, for any image that was made through the pixel centers.
 
 After Laine et al. 2020, Modular Primitives for High-Performance Differentiable Rendering, section 3.4: two neighboring
-pixels are blended where an outline crosses the line between their centres.  There the edge belongs to the triangle that
+pixels are blended where an outline crosses the line between their centers.  There the edge belongs to the triangle that
 a pixel shows, which fails for small triangles.  Here every edge's crossings with the rows or columns of pixel centers
 are listed, and a ray decides whether one is seen.
 
@@ -34,7 +34,7 @@ class Crossings:
     """Where visible silhouettes pass between pixel centers; M pairs of neighbors, each at most once a direction.
 
     inner, outer: ``(M,)`` int64 pixel (row * W + column) on the surface's side and beyond.  place: ``(M,)`` in [0, 1],
-    distance of the crossing from the inner centre in pixels.  Gradients reach the vertices and the camera.
+    distance of the crossing from the inner center in pixels.  Gradients reach the vertices and the camera.
     """
 
     inner: Tensor
@@ -92,8 +92,8 @@ def outline_crossings(vertices: Tensor, edges: Tensor, camera: Camera, scene: Ra
     ends = [vertices.index_select(0, k) for k in edges.long()[edge, :2].unbind(1)]
     (a, za), (b, zb) = (project(p, camera.c2w, camera.intrinsics) for p in ends)
     a, b = (torch.where(steep[:, None], p.flip(1), p) for p in (a, b))  # the coordinate that runs over lines first
-    centre = line.to(vertices.dtype) + 0.5
-    part = (centre - a[:, 0]) / (b[:, 0] - a[:, 0])
+    center = line.to(vertices.dtype) + 0.5
+    part = (center - a[:, 0]) / (b[:, 0] - a[:, 0])
     across = a[:, 1] + part * (b[:, 1] - a[:, 1])
     low = torch.floor(across.detach() - 0.5)
     size = torch.where(steep, camera.width, camera.height)
@@ -101,7 +101,7 @@ def outline_crossings(vertices: Tensor, edges: Tensor, camera: Camera, scene: Ra
     place = (across - inner_at - 0.5) * outward
     keep = (low >= 0.0) & (low < size - 1)
     depth = 1.0 / ((1.0 - part) / za + part / zb)
-    offset = torch.stack([centre, across + OUTSIDE * outward], 1).detach()
+    offset = torch.stack([center, across + OUTSIDE * outward], 1).detach()
     keep &= _seen(torch.where(steep[:, None], offset.flip(1), offset), depth.detach(), camera, scene)
     stride = torch.where(steep, 1, camera.width)
     inner = torch.where(steep, line * camera.width + inner_at.long(), inner_at.long() * camera.width + line)

@@ -49,7 +49,7 @@ class OccupancyGrid:
         threshold: float,
         device: torch.device | None = None,
     ) -> OccupancyGrid:
-        """Cells where ``field`` exceeds ``threshold`` at the centre or a corner, grown by one cell on every side.
+        """Cells where ``field`` exceeds ``threshold`` at the center or a corner, grown by one cell on every side.
 
         field: densities ``(N,)`` of points ``(N, 3)``; evaluated without gradient, in chunks.  Detail of less than half
         a cell between those points may be missed.

@@ -32,7 +32,7 @@ class Assembly:
         """Join ``solid``, moved by ``at``."""
         self._solids.append(self._tagged(solid, part, at))
 
-    def add_labelled(self, vertices: np.ndarray, faces: np.ndarray, part: np.ndarray) -> None:
+    def add_labeled(self, vertices: np.ndarray, faces: np.ndarray, part: np.ndarray) -> None:
         """Join a closed mesh ``(V, 3)``, ``(F, 3)`` whose faces belong to several parts ``(F,)``."""
         order = np.argsort(part, kind="stable")
         numbers, starts = np.unique(part[order], return_index=True)

@@ -1,4 +1,4 @@
-"""The example object of the package: an enamelled kettle with a wooden grip and brass fittings on a wooden board.
+"""The example object of the package: an enameled kettle with a wooden grip and brass fittings on a wooden board.
 
 It is put together by hand; no family of ``procedural.py`` can make it, so a network has never seen it in training.
 """
@@ -86,11 +86,11 @@ def finish() -> tuple[Material, ...]:
         seed=5,
     )
     plain = Material(enamel, ((Coat(CHARCOAL, 0.75), chips),), drift=0.03, drift_roughness=0.03, seed=6)
-    fibre = np.diag([0.8, 60.0, 60.0])
+    fiber = np.diag([0.8, 60.0, 60.0])
     steel = Material(
         Coat(STEEL, 0.32, 1.0),
         ((Coat((0.2, 0.08, 0.035), 0.9, 0.0), pt.Blotches(9.0 * np.eye(3), 3, 0.75, 0.15, octaves=5, gain=0.6)),),
-        (pt.Emboss(fibre, 2, 0.0006, octaves=1),),
+        (pt.Emboss(fiber, 2, 0.0006, octaves=1),),
         drift_roughness=0.05,
         seed=7,
     )
@@ -102,7 +102,7 @@ def finish() -> tuple[Material, ...]:
     )
 
     def wood(light, dark, rough: float, seed: int) -> Material:
-        axes = np.eye(3)[[1, 2, 0]]  # the fibres run along x
+        axes = np.eye(3)[[1, 2, 0]]  # the fibers run along x
         grain = pt.Grain(2.6 * axes, seed, 5.0, (1.7, 0.9))
         bump = pt.Emboss(np.diag([30.0, 30.0, 1.2]) @ axes, seed + 1, 0.003, octaves=1)
         return Material(

@@ -1,6 +1,6 @@
 """Finishes: how the parts of a procedural object are dressed by their roles.
 
-Palettes follow everyday things: greys, browns, whites and dark plastics first, saturated paint less often.  Colours are
+Palettes follow everyday things: grays, browns, whites and dark plastics first, saturated paint less often.  Colors are
 linear Rec. 709.
 """
 
@@ -14,7 +14,7 @@ from reli3d.synthetic import patterns as pt
 from reli3d.synthetic.materials import Bump, Coat, Layer, Material
 
 METAL_SHARE = 0.36  # of the objects may have metal; some of these have no part that takes it
-# F0 of steel, aluminium, gold, brass, copper, bronze, iron, gunmetal, as published tables give them
+# F0 of steel, aluminum, gold, brass, copper, bronze, iron, gunmetal, as published tables give them
 METALS = (
     (0.56, 0.57, 0.58), (0.88, 0.88, 0.89), (0.9, 0.72, 0.32), (0.86, 0.72, 0.42),
     (0.88, 0.6, 0.48), (0.6, 0.45, 0.26), (0.5, 0.49, 0.47), (0.2, 0.2, 0.21),
@@ -48,17 +48,17 @@ def draw_materials(rng: np.random.Generator, roles: Sequence[str], bounds: np.nd
 
 
 def color(rng: np.random.Generator, kind: str) -> tuple[float, float, float]:
-    """Linear base colour: ``grey white dark wood muted vivid earth any``."""
+    """Linear base color: ``gray white dark wood muted vivid earth any``."""
     u = rng.uniform
     if kind == "any":
         kind = str(
             rng.choice(
-                ["grey", "white", "dark", "wood", "muted", "vivid", "earth"],
+                ["gray", "white", "dark", "wood", "muted", "vivid", "earth"],
                 p=[0.17, 0.17, 0.15, 0.1, 0.2, 0.1, 0.11],
             )
         )
     match kind:
-        case "grey":
+        case "gray":
             rgb = np.exp(u(np.log(0.04), np.log(0.6))) * np.exp(rng.normal(0, 0.05, 3))
         case "white":
             rgb = u(0.55, 0.88) * np.array([1.0, 1.0 - u(0, 0.06), 1.0 - u(0, 0.2)])
@@ -86,7 +86,7 @@ def _rgb(values: np.ndarray) -> tuple[float, float, float]:
 
 def _linear_of_hsv(hue: float, saturation: float, value: float) -> np.ndarray:
     ramp = np.clip(np.abs((hue * 6 + np.array([0.0, 4.0, 2.0])) % 6 - 3) - 1, 0, 1)
-    return (value * (1 - saturation + saturation * ramp)) ** 2.2  # the display curve, near enough for a random colour
+    return (value * (1 - saturation + saturation * ramp)) ** 2.2  # the display curve, near enough for a random color
 
 
 def _frame(
@@ -146,7 +146,7 @@ def _draw(rng: np.random.Generator, role: str, box: np.ndarray) -> Material:
         case "stone":
             return _stone(rng)
         case "skin":
-            base = Coat(color(rng, str(rng.choice(["earth", "wood", "grey", "white", "muted", "vivid"]))), u(0.45, 0.9))
+            base = Coat(color(rng, str(rng.choice(["earth", "wood", "gray", "white", "muted", "vivid"]))), u(0.45, 0.9))
             if rng.random() < 0.5:
                 frame = _frame(rng, 3, 12)
                 spots = (
@@ -183,13 +183,13 @@ def _draw(rng: np.random.Generator, role: str, box: np.ndarray) -> Material:
 
 
 def _decor(rng: np.random.Generator, base: Coat, box: np.ndarray, chance: float) -> list:
-    """Painted decoration: bands, checks, dots, blotches, a second colour from some height on, labels."""
+    """Painted decoration: bands, checks, dots, blotches, a second color from some height on, labels."""
     u = rng.uniform
     layers: list[Layer] = []
     second = Coat(color(rng, "any"), float(np.clip(base.roughness + rng.normal(0, 0.1), 0.1, 1)))
     size = float(np.max(box[1] - box[0]))
     if rng.random() < chance:
-        centre = box.mean(0)
+        center = box.mean(0)
         match int(rng.choice(7, p=[0.25, 0.08, 0.1, 0.17, 0.2, 0.1, 0.1])):
             case 0:
                 frame = _frame(rng, min(1.5 / size, 10), 14, turned=0.15)
@@ -208,7 +208,7 @@ def _decor(rng: np.random.Generator, base: Coat, box: np.ndarray, chance: float)
                 )
             case 4:
                 axis = np.eye(3)[1 if rng.random() < 0.7 else int(rng.choice([0, 2]))] * rng.choice([-1, 1])
-                at = float(centre @ axis) + u(-0.3, 0.3) * size
+                at = float(center @ axis) + u(-0.3, 0.3) * size
                 soft = u(0.002, 0.01) if rng.random() < 0.5 else u(0.05, 0.4)
                 layers.append((second, pt.Ramp(tuple(axis.tolist()), at - soft, at + soft, 0.0, 0)))
             case 5:
@@ -228,12 +228,12 @@ def label(rng: np.random.Generator, box: np.ndarray) -> list:
     up = np.eye(3)[1] if axis != 1 else np.eye(3)[2]
     right = np.cross(up, normal)
     half = 0.5 * np.abs([extent @ right, extent @ up]) * u(0.25, 0.85, 2)
-    centre = (
+    center = (
         box.mean(0)
         + right * u(-0.3, 0.3) * (np.abs(extent @ right) / 2 - half[0])
         + up * u(-0.6, 0.6) * (np.abs(extent @ up) / 2 - half[1])
     )
-    place = [(float(x), float(y), float(z)) for x, y, z in (centre, right, up)]
+    place = [(float(x), float(y), float(z)) for x, y, z in (center, right, up)]
     paper = Coat(color(rng, str(rng.choice(["white", "vivid", "any"]))), u(0.3, 0.8))
     ink = Coat(
         color(rng, "dark" if sum(paper.color) > 1.0 else "white") if rng.random() < 0.6 else color(rng, "vivid"),
@@ -254,8 +254,8 @@ def label(rng: np.random.Generator, box: np.ndarray) -> list:
 
 
 def _decal(place: list[tuple[float, float, float]], half: np.ndarray, picture: np.ndarray, oval=False) -> pt.Decal:
-    centre, right, up = place
-    return pt.Decal(centre, right, up, (float(half[0]), float(half[1])), picture.astype(np.float32), oval)
+    center, right, up = place
+    return pt.Decal(center, right, up, (float(half[0]), float(half[1])), picture.astype(np.float32), oval)
 
 
 def _text(rng: np.random.Generator, rows: int, columns: int) -> np.ndarray:
@@ -281,7 +281,7 @@ def _dirt(rng: np.random.Generator, base: Coat) -> tuple:
 
 def _wear(rng: np.random.Generator, base: Coat) -> list:
     """Paint worn off to what lies below, scratched or flaking."""
-    below = Coat(color(rng, str(rng.choice(["wood", "grey", "earth"]))), rng.uniform(0.5, 0.95))
+    below = Coat(color(rng, str(rng.choice(["wood", "gray", "earth"]))), rng.uniform(0.5, 0.95))
     if rng.random() < 0.35:
         scratch = _frame(rng, 4, 10, stretch=6.0, turned=0.7)
         return [(below, pt.Blotches(scratch, _seed(rng), rng.uniform(0.4, 0.48), 0.03, octaves=2, ridged=True))]
@@ -314,9 +314,9 @@ def _wood(rng: np.random.Generator, box: np.ndarray) -> Material:
         layers += _decor(rng, base, box, 0.4)
     if rng.random() < 0.3:
         layers.append(_dirt(rng, base))
-    fibre = frame * np.array([12.0, 12.0, 0.7])[:, None]
+    fiber = frame * np.array([12.0, 12.0, 0.7])[:, None]
     bumps = (
-        (pt.Emboss(fibre, _seed(rng), u(0.02, 0.15) / float(np.linalg.norm(fibre[0])), octaves=1),)
+        (pt.Emboss(fiber, _seed(rng), u(0.02, 0.15) / float(np.linalg.norm(fiber[0])), octaves=1),)
         if rng.random() < 0.6
         else ()
     )
@@ -363,7 +363,7 @@ def _metal(rng: np.random.Generator, box: np.ndarray) -> Material:
 
 def _stone(rng: np.random.Generator) -> Material:
     u = rng.uniform
-    base = Coat(color(rng, str(rng.choice(["grey", "white", "earth", "dark", "muted"]))), _roughness(rng, 0.3, 0.95))
+    base = Coat(color(rng, str(rng.choice(["gray", "white", "earth", "dark", "muted"]))), _roughness(rng, 0.3, 0.95))
     layers: list[Layer] = []
     bumps: list[Bump] = []
     other = Coat(_near(rng, base.color, 0.7) if rng.random() < 0.7 else color(rng, "any"), base.roughness)

@@ -1,6 +1,6 @@
 """Families of furniture and vehicles: tables, stools, chairs, benches, sofas, shelves, cabinets, toy cars.
 
-Units are about metres, the floor is at y = 0 and the front looks to +z.  See ``manmade.py`` for what a family is.
+Units are about meters, the floor is at y = 0 and the front looks to +z.  See ``manmade.py`` for what a family is.
 """
 
 from __future__ import annotations
@@ -255,7 +255,7 @@ def vehicle(a: Assembly) -> None:
     lamps.
     """
     rng, u = a.rng, a.rng.uniform
-    paint, tyre = a.part("paint"), a.part("rubber")
+    paint, tire = a.part("paint"), a.part("rubber")
     hub, dark = a.part("metal"), a.part("accent")
     long, w, h, r = u(0.9, 1.6), u(0.4, 0.65), u(0.14, 0.34), u(0.1, 0.2)
     a.add(p.box((long, h, w), float(rng.choice([0.01, 0.04, 0.1]))), paint, (0, r + h / 2, 0))
@@ -273,7 +273,7 @@ def vehicle(a: Assembly) -> None:
     wide = u(0.08, 0.16)
     for at in axles:
         for s in (-1, 1):
-            a.add(p.cylinder(r, wide, bevel=0.025).rotate((90, 0, 0)), tyre, (at, r, s * w / 2))
+            a.add(p.cylinder(r, wide, bevel=0.025).rotate((90, 0, 0)), tire, (at, r, s * w / 2))
             a.add(p.cylinder(r * 0.55, wide * 1.1, bevel=0.01, segments=20).rotate((90, 0, 0)), hub, (at, r, s * w / 2))
     for s in (-1, 1):
         a.add(p.box((0.05, 0.06, w * 1.02), 0.02), hub, (s * long / 2, r + 0.06, 0))

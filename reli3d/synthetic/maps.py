@@ -17,9 +17,9 @@ HELD_BACK = 6  # every sixth map is left out of the fit and of all training
 
 
 def load_maps(path: Path) -> tuple[Tensor, list[str]]:
-    """Maps ``(n, 64, 128, 3)``, linear, area-averaged, the centre column +X, and their names, of an ``.npz``.
+    """Maps ``(n, 64, 128, 3)``, linear, area-averaged, the center column +X, and their names, of an ``.npz``.
 
-    The file has ``env (n, H, 2H, 3)``, linear, row 0 +Y, the centre column -Z and right of it +X, and ``names``.
+    The file has ``env (n, H, 2H, 3)``, linear, row 0 +Y, the center column -Z and right of it +X, and ``names``.
     Raises InputError for anything else.
     """
     file_size(path)
@@ -36,7 +36,7 @@ def load_maps(path: Path) -> tuple[Tensor, list[str]]:
         raise InputError(path, f"names: expected {len(env)}, one a map, got {len(names)}")
     maps = torch.as_tensor(env.astype(np.float32)).permute(0, 3, 1, 2)
     maps = torch.nn.functional.interpolate(maps, (ROWS, 2 * ROWS), mode="area").permute(0, 2, 3, 1)
-    return quarter_turn(maps, -1).contiguous(), names  # the file has -Z in the centre column
+    return quarter_turn(maps, -1).contiguous(), names  # the file has -Z in the center column
 
 
 def held_back(names: list[str]) -> list[bool]:
@@ -52,7 +52,7 @@ def training_maps(path: Path) -> Tensor:
 
 
 def with_lamps(light: Tensor, rng: np.random.Generator) -> Tensor:
-    """The lat-long map ``(H, 2H, 3)`` with one to three lamps: soft discs that bring a good part of its light."""
+    """The lat-long map ``(H, 2H, 3)`` with one to three lamps: soft disks that bring a good part of its light."""
     rows = light.shape[0]
     directions = lat_long_directions(rows)
     area = texel_solid_angles(rows, 2 * rows).float()[:, None, None]
@@ -65,9 +65,9 @@ def with_lamps(light: Tensor, rng: np.random.Generator) -> Tensor:
         to = torch.tensor([level * np.cos(angle), y, level * np.sin(angle)], dtype=torch.float32)
         radius = np.radians(np.exp(rng.uniform(np.log(2.0), np.log(18.0))))
         away = (directions @ to).clamp(-1, 1).acos()
-        disc = torch.sigmoid((radius - away) / (0.15 * radius + np.pi / rows / 2))[..., None]
+        disk = torch.sigmoid((radius - away) / (0.15 * radius + np.pi / rows / 2))[..., None]
         warmth = rng.normal(0, 0.25)
         tint = torch.tensor([np.exp(warmth), 1.0, np.exp(-warmth)], dtype=torch.float32)
         share = np.exp(rng.uniform(np.log(0.15), np.log(1.5)))
-        out += disc * tint * (share * total / float((disc * area).sum()))
+        out += disk * tint * (share * total / float((disk * area).sum()))
     return out

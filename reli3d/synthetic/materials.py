@@ -1,6 +1,6 @@
-"""Materials that vary over a surface: coats of colour, roughness and metal laid over each other by solid patterns.
+"""Materials that vary over a surface: coats of color, roughness and metal laid over each other by solid patterns.
 
-Base colours are linear Rec. 709, 0.02 to 0.9; roughness is perceptual.
+Base colors are linear Rec. 709, 0.02 to 0.9; roughness is perceptual.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ STEEPEST = 0.6  # largest slope of a bump, 31 degrees: steeper ones shade below 
 class Coat:
     """One uniform layer of material."""
 
-    color: tuple[float, float, float]  # linear base colour
+    color: tuple[float, float, float]  # linear base color
     roughness: float
     metallic: float = 0.0
 
@@ -50,18 +50,18 @@ Layer = tuple[Coat, Pattern]
 
 @dataclass(frozen=True)
 class Material:
-    """A coat, further coats where their patterns say, a slow drift of colour and roughness, and bumps."""
+    """A coat, further coats where their patterns say, a slow drift of color and roughness, and bumps."""
 
     base: Coat
     layers: tuple[Layer, ...] = ()
     bumps: tuple[Bump, ...] = ()
-    drift: float = 0.0  # relative standard deviation of the colour, by noise
+    drift: float = 0.0  # relative standard deviation of the color, by noise
     drift_roughness: float = 0.0
     drift_scale: float = 3.0  # cycles a unit
     seed: int = 0
 
     def at(self, points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Base colour ``(N, 3)``, roughness ``(N,)``, metallic ``(N,)``, bumped normal ``(N, 3)``."""
+        """Base color ``(N, 3)``, roughness ``(N,)``, metallic ``(N,)``, bumped normal ``(N, 3)``."""
         coat = points.new_tensor([*self.base.color, self.base.roughness, self.base.metallic])
         value = coat.expand(len(points), 5)
         for layer, pattern in self.layers:
@@ -85,7 +85,7 @@ class Material:
 def evaluate(materials: Sequence[Material], points, normals, part):
     """Materials of the parts ``(N,)`` at ``points`` ``(N, 3)`` with unit ``normals`` ``(N, 3)``.
 
-    Gives base colour ``(N, 3)``, roughness ``(N,)``, metallic ``(N,)``, bumped normal ``(N, 3)``, float32.
+    Gives base color ``(N, 3)``, roughness ``(N,)``, metallic ``(N,)``, bumped normal ``(N, 3)``, float32.
     Arguments are all tensors on one device or all numpy arrays, and the results are of the same kind.  Raises
     TypeError, ValueError on others.
     """

@@ -44,13 +44,13 @@ class Field:
         d = (x - start[0] - t * line[0]) ** 2 + (y - start[1] - t * line[1]) ** 2 + (z - start[2] - t * line[2]) ** 2
         self._join(window, np.sqrt(d) - (radius + t * (tip - radius)), blend, label)
 
-    def ball(self, centre, radii, *, blend: float = 0.05, label: int = 0) -> None:
+    def ball(self, center, radii, *, blend: float = 0.05, label: int = 0) -> None:
         """Smooth union with an ellipsoid of half axes ``radii``."""
-        centre, radii = np.asarray(centre, dtype=np.float32), np.broadcast_to(np.asarray(radii, dtype=np.float32), 3)
-        window = self._window(centre - radii, centre + radii, blend * 2 + 2 * self.step)
+        center, radii = np.asarray(center, dtype=np.float32), np.broadcast_to(np.asarray(radii, dtype=np.float32), 3)
+        window = self._window(center - radii, center + radii, blend * 2 + 2 * self.step)
         x, y, z = np.meshgrid(*[axis[s] for axis, s in zip(self.axes, window)], indexing="ij", sparse=True)
         q = np.sqrt(
-            ((x - centre[0]) / radii[0]) ** 2 + ((y - centre[1]) / radii[1]) ** 2 + ((z - centre[2]) / radii[2]) ** 2
+            ((x - center[0]) / radii[0]) ** 2 + ((y - center[1]) / radii[1]) ** 2 + ((z - center[2]) / radii[2]) ** 2
         )
         self._join(window, (q - 1) * float(radii.min()), blend, label)
 
@@ -75,7 +75,7 @@ class Field:
         points, faces = np.asarray(mesh.vert_properties)[:, :3], np.asarray(mesh.tri_verts)
         index = np.rint((points[faces].mean(1) - self.low) / self.step).astype(int)
         label = self.label[tuple(np.clip(index, 0, np.array(self.value.shape) - 1).T)]
-        a.add_labelled(points, faces, np.array(parts)[label])
+        a.add_labeled(points, faces, np.array(parts)[label])
 
     def _window(self, low, high, margin):
         a = np.floor((low - margin - self.low) / self.step).astype(int).clip(0)
@@ -308,9 +308,9 @@ def stone(a: Assembly) -> None:
     f = Field((-0.6, -0.6, -0.6), (0.6, 0.6, 0.6))
     stretch = u(0.4, 1.0, 3)
     for k in range(int(rng.integers(1, 8))):
-        centre = u(-0.32, 0.32, 3) * stretch if k else np.zeros(3)
+        center = u(-0.32, 0.32, 3) * stretch if k else np.zeros(3)
         f.ball(
-            centre,
+            center,
             u(0.1, 0.28) * np.exp(rng.normal(0, 0.25, 3)).clip(0.6, 1.6) if k else 0.42 * stretch,
             blend=u(0.02, 0.15),
             label=int(k > 2),

@@ -78,7 +78,7 @@ class Bands:
 
 @dataclass(frozen=True)
 class Grain:
-    """Wood: year rings about the third pattern axis, bent by noise, and fine fibres along it."""
+    """Wood: year rings about the third pattern axis, bent by noise, and fine fibers along it."""
 
     frame: np.ndarray
     seed: int
@@ -88,12 +88,12 @@ class Grain:
     def weight(self, points: Tensor, normals: Tensor) -> Tensor:
         q = _in(self.frame, points)
         bend = fbm(q * q.new_tensor([1.0, 1.0, 0.25]), octaves=2, seed=self.seed)[0]
-        fibre = fbm(q * q.new_tensor([22.0, 22.0, 0.9]), octaves=2, seed=self.seed + 1)[0]
+        fiber = fbm(q * q.new_tensor([22.0, 22.0, 0.9]), octaves=2, seed=self.seed + 1)[0]
         radius = torch.hypot(q[:, 0] - self.offset[0], q[:, 1] - self.offset[1]) + 0.22 * bend
         ring = radius * self.rings
         ring = ring - torch.floor(ring)
         late = smoothstep(0.15, 0.9, ring) * (1 - smoothstep(0.93, 1.0, ring))
-        return (0.75 * late + 0.35 * fibre + 0.08).clamp(0, 1)
+        return (0.75 * late + 0.35 * fiber + 0.08).clamp(0, 1)
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ class Checker:
 
 @dataclass(frozen=True)
 class Dots:
-    """Discs of ``radius`` on a unit grid, every other row shifted, in the plane the normal faces."""
+    """Disks of ``radius`` on a unit grid, every other row shifted, in the plane the normal faces."""
 
     frame: np.ndarray
     radius: float
@@ -159,7 +159,7 @@ class Decal:
     window.
     """
 
-    centre: tuple[float, float, float]
+    center: tuple[float, float, float]
     right: tuple[float, float, float]
     up: tuple[float, float, float]
     half: tuple[float, float]
@@ -168,7 +168,7 @@ class Decal:
 
     def weight(self, points: Tensor, normals: Tensor) -> Tensor:
         right, up = points.new_tensor(self.right), points.new_tensor(self.up)
-        local = points - points.new_tensor(self.centre)
+        local = points - points.new_tensor(self.center)
         u, v = local @ right / self.half[0], local @ up / self.half[1]
         facing = normals @ torch.linalg.cross(right, up) > 0.35
         inside = (u * u + v * v < 1) if self.oval else (u.abs() < 1) & (v.abs() < 1)

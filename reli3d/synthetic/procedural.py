@@ -2,7 +2,7 @@
 
 Seeds are disjoint by use: training takes ``TRAINING_SEEDS``, choices are made on ``VALIDATION_SEEDS``, figures are
 reported on ``TEST_SEEDS``.  :func:`example_object` is one fixed object that no family can make.  The same seed gives
-the same object.  Frame: right-handed, +Y up, resting, centred, longest side 1 (so inside the radius 0.87 of the
+the same object.  Frame: right-handed, +Y up, resting, centered, longest side 1 (so inside the radius 0.87 of the
 network's frame).
 """
 
@@ -64,7 +64,7 @@ class ProceduralObject:
     name: str  # the family it is drawn from
 
     def material(self, points: np.ndarray, normals: np.ndarray, part: np.ndarray):
-        """Base colour ``(N, 3)`` linear, roughness ``(N,)``, metallic ``(N,)``, bumped normal ``(N, 3)`` at surface
+        """Base color ``(N, 3)`` linear, roughness ``(N,)``, metallic ``(N,)``, bumped normal ``(N, 3)`` at surface
         points.
 
         points ``(N, 3)``, normals ``(N, 3)`` unit, part ``(N,)``: numpy arrays, or tensors on any one device; the
@@ -92,14 +92,14 @@ def make_object(seed: int) -> ProceduralObject:
 
 
 def example_object() -> ProceduralObject:
-    """The fixed example of the package, see ``example.py``: an enamelled kettle on a board."""
+    """The fixed example of the package, see ``example.py``: an enameled kettle on a board."""
     assembly = Assembly(np.random.default_rng(0))
     example.kettle(assembly)
     return assemble(assembly, "kettle", example.finish())
 
 
 def assemble(assembly: Assembly, name: str, materials: tuple[Material, ...] | None = None) -> ProceduralObject:
-    """Close ``assembly``: union, at most ``MAX_FACES`` faces, centre, scale, normals, materials (drawn if not
+    """Close ``assembly``: union, at most ``MAX_FACES`` faces, center, scale, normals, materials (drawn if not
     given).
     """
     vertices, faces, part = assembly.finish(MAX_FACES)
@@ -161,12 +161,12 @@ def _deform(a: Assembly) -> None:
     if rng.random() > 0.16:
         return
     box = np.array(a.joined().bounding_box()).reshape(2, 3)
-    centre, size = box.mean(0), float((box[1] - box[0]).max())
+    center, size = box.mean(0), float((box[1] - box[0]).max())
     kind, k, wave = int(rng.integers(4)), u(-1, 1), rng.normal(0, 1, (4, 3)) * 4
     phase = u(0, 6.28, (4, 3))
 
     def move(q: np.ndarray) -> np.ndarray:
-        r = (q - centre) / size
+        r = (q - center) / size
         if kind == 0:
             r = r * np.stack([1 + 0.7 * k * r[:, 1], np.ones(len(r)), 1 + 0.7 * k * r[:, 1]], -1)
         elif kind == 1:
@@ -176,7 +176,7 @@ def _deform(a: Assembly) -> None:
             r = r + np.stack([0.35 * k * r[:, 1] ** 2, np.zeros(len(r)), np.zeros(len(r))], -1)
         else:
             r = r + 0.025 * abs(k) * sum(np.sin(r @ w[:, None] + f) for w, f in zip(wave, phase))
-        return r * size + centre
+        return r * size + center
 
     a.warp(move, size / 18)
 

@@ -1,7 +1,7 @@
 """Samples by the paper's rendering protocol: three lights an object, turned about the vertical, and framed cameras.
 
 Section B.1 of the paper gives: three environments an object, each turned at random about the vertical axis; a field of
-view from a scaled normal distribution between 22 and 37 degrees; objects of unit scale in the centre; cameras that fill
+view from a scaled normal distribution between 22 and 37 degrees; objects of unit scale in the center; cameras that fill
 the frame with padding and a small shift; 100 images of objects with PBR truth, 30 of others.
 
 The paper leaves three things open.  Here the views of an object are shared among its lights, the normal distribution

@@ -2,7 +2,7 @@
 
 A sample is a dictionary of tensors, one safetensors file on disk.  ``docs/model.md``, "A sample", lists its entries
 with shapes and units.  There are ``V`` views of ``S`` by ``S`` pixels, cropped to the object as the network's input
-is.  World +Y up, object centred, longest side 1.  Radiance is scaled so that the first view is well exposed.
+is.  World +Y up, object centered, longest side 1.  Radiance is scaled so that the first view is well exposed.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ def crop_camera(vertices: Tensor, c2w: Tensor, size: int, padding: float) -> Ten
     xy, _ = project(vertices, c2w, unit)
     low, high = xy.amin(0), xy.amax(0)
     focal = size * (1 - 2 * padding) / (high - low).max()
-    centre = size / 2 - focal * (low + high) / 2
-    return torch.stack([focal, focal, centre[0], centre[1]])
+    center = size / 2 - focal * (low + high) / 2
+    return torch.stack([focal, focal, center[0], center[1]])
 
 
 class Surface(Protocol):
@@ -148,7 +148,7 @@ def render_sample(
     pooled = torch.nn.functional.interpolate(
         (environment.radiance * exposure).permute(2, 0, 1)[None], (32, 64), mode="area"
     )
-    # stored with -Z in the centre column, as samples always were
+    # stored with -Z in the center column, as samples always were
     sample["environment"] = quarter_turn(pooled[0].permute(1, 2, 0), 1).clamp(max=6e4).half()
     if not views_only:
         sample.update(pixels=torch.stack(pixels).half(), pixel_radiance=torch.stack(pixel_radiance).half())

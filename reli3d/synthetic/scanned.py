@@ -20,7 +20,7 @@ from reli3d.render.points import SurfacePoints
 
 ESCAPES = 48  # directions in which a point may see the sky: enough for an opening of a tenth of the sphere
 STRETCH = 0.18  # standard deviation of the logarithm of the scale along each axis
-GAIN = 0.2  # the same of the base colour's factor
+GAIN = 0.2  # the same of the base color's factor
 
 
 @lru_cache(16)  # decoding a texture takes as long as rendering a view
@@ -46,7 +46,7 @@ def outside_distance(vertices: Tensor, faces: Tensor, points: Tensor, scene: Ray
 
 
 class ScannedSurface:
-    """One GLB, centred, longest side 1, stretched and tinted at random: a ``Surface`` of :mod:`.samples`.
+    """One GLB, centered, longest side 1, stretched and tinted at random: a ``Surface`` of :mod:`.samples`.
 
     rng: None leaves its proportions and its paint as they are.
     """
@@ -87,12 +87,12 @@ def _factors(logarithms: np.ndarray) -> Tensor:
     return torch.as_tensor(np.exp(logarithms), dtype=torch.float32)
 
 
-def _moved(mesh: Mesh, centre: Tensor, stretch: Tensor, size: float) -> Mesh:
+def _moved(mesh: Mesh, center: Tensor, stretch: Tensor, size: float) -> Mesh:
     normals = torch.nn.functional.normalize(present("mesh.normals", mesh.normals) / stretch, dim=-1)
     tangents = mesh.tangents
     if tangents is not None:
         turned = tangents[:, :3] * stretch
         turned = torch.nn.functional.normalize(turned - (turned * normals).sum(-1, keepdim=True) * normals, dim=-1)
         tangents = torch.cat([turned, tangents[:, 3:]], -1)
-    vertices = (mesh.vertices * stretch - centre) / size
+    vertices = (mesh.vertices * stretch - center) / size
     return replace(mesh, vertices=vertices.contiguous(), normals=normals.contiguous(), tangents=tangents)

@@ -41,7 +41,7 @@ def _count(rng: np.random.Generator) -> int:
 
 @lru_cache(64)
 def _read(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Welded vertices, faces and the primitive of each face; longest side 1, centred."""
+    """Welded vertices, faces and the primitive of each face; longest side 1, centered."""
     vertices, faces, owners, start = [], [], [], 0
     for k, asset in enumerate(read_glb(path)):
         vertices.append(asset.mesh.vertices.numpy())
@@ -100,7 +100,7 @@ def combine(paths: Sequence[Path], rng: np.random.Generator) -> ProceduralObject
 
 
 def rounded(v: np.ndarray, f: np.ndarray, part: np.ndarray, times: int, strength: float):
-    """Each face in four, ``times``; after each the vertices move towards their neighbours' mean."""
+    """Each face in four, ``times``; after each the vertices move towards their neighbors' mean."""
     for _ in range(times):
         if len(f) * 4 > COARSE_FACES * 8:
             break

@@ -46,7 +46,7 @@ class Pictures:
     silhouette: Tensor  # (V, S, S) pixels
     c2w: Tensor  # (V, 4, 4)
     intrinsics: Tensor  # (V, 4)
-    view_material: Tensor  # (V, P, P, 5) base colour (sRGB), roughness, metallic
+    view_material: Tensor  # (V, P, P, 5) base color (sRGB), roughness, metallic
     view_normal: Tensor  # (V, P, P, 3) world, unit
     view_depth: Tensor  # (V, P, P) from the world's origin along the camera's axis
     view_valid: Tensor  # (V, P, P) bool: the pixel shows the surface alone
@@ -99,7 +99,7 @@ def load_sample(
         images, c2w, intrinsics = of_views("images").float() / 255, of_views("c2w"), of_views("intrinsics")
         of_pixels = of_views("view_material").float() / 255
         normal, depth = of_views("view_normal").float() / 127, of_views("view_depth").float()
-        light = quarter_turn(file.get_tensor("environment").float(), -1)  # stored with -Z in the centre column
+        light = quarter_turn(file.get_tensor("environment").float(), -1)  # stored with -Z in the center column
     valid = depth > 0
     if augment and lights is not None and rng.random() < RELIT:
         finish = Finish.draw(rng)

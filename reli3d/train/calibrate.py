@@ -105,7 +105,7 @@ def agreement(mesh: Mesh, sample: dict[str, Tensor], views: range) -> tuple[floa
 def mismatch(both: int, got: int, want: int) -> float:
     """Logarithm of ``1 / recall - precision`` of ``both`` pixels in common of ``got`` and ``want``, at most ``LOST``.
 
-    The square error of a picture in one colour at its best brightness, for each pixel in common.  Unlike IoU it weighs
+    The square error of a picture in one color at its best brightness, for each pixel in common.  Unlike IoU it weighs
     how much of the object is missing more than what is too much, the more so the less is right: a shape that is guessed
     from one view had better be full.
     """

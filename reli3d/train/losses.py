@@ -121,7 +121,7 @@ def astray(position: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
 def excess_entropy(value: Tensor, target: Tensor) -> Tensor:
     """Cross-entropy of values in [0, 1] over its least value: 0 where they are equal.
 
-    The mean square has hardly a slope where a sigmoid is near 0 or 1: black colours would stay black, and a metallic
+    The mean square has hardly a slope where a sigmoid is near 0 or 1: black colors would stay black, and a metallic
     of 0.1 everywhere would stay so.
     """
     least = functional.binary_cross_entropy(target, target)
@@ -129,11 +129,11 @@ def excess_entropy(value: Tensor, target: Tensor) -> Tensor:
 
 
 def pattern_loss(color: Tensor, target: Tensor) -> Tensor:
-    """Logarithm of the mean square difference of base colours ``(N, 3)``, sRGB, after each channel's best factor in
+    """Logarithm of the mean square difference of base colors ``(N, 3)``, sRGB, after each channel's best factor in
     linear light; PLAIN is added, and 0 is no difference.
 
     How bright an albedo is no image tells: a longer exposure looks the same.  How it varies over the surface, they do.
-    The factor has its gradient, else the colours would drift: the mean square is that of encoded colours.  By the
+    The factor has its gradient, else the colors would drift: the mean square is that of encoded colors.  By the
     logarithm a stain on a plain object counts as much as a lost pattern.
     """
     p, t = srgb_to_linear(color), srgb_to_linear(target)
@@ -144,7 +144,7 @@ def pattern_loss(color: Tensor, target: Tensor) -> Tensor:
 def _pixels(pixels: PixelMaps, shown: Tensor, views: Pictures, counts: tuple[int, ...]) -> dict[str, Tensor]:
     """The pyramid's predictions against the maps of the views, at pixels that show the surface alone.
 
-    shown: ``(V, P, P, 3)`` sRGB, the colours of these pixels.  counts: views of each object, side by side.
+    shown: ``(V, P, P, 3)`` sRGB, the colors of these pixels.  counts: views of each object, side by side.
     """
     valid = views.view_valid
     want = views.view_material[valid]

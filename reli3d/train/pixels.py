@@ -76,7 +76,7 @@ def predicts(name: str) -> bool:
 
 
 def predicted(model: LocalReconstructor, group: Group) -> tuple[PixelMaps, Tensor]:
-    """What the 2D U-Net says of the pixels of all views, and the colours ``(V, P, P, 3)`` that they show."""
+    """What the 2D U-Net says of the pixels of all views, and the colors ``(V, P, P, 3)`` that they show."""
     views = group.views
     size = views.masks.shape[1]
     camera = Camera(views.c2w, views.intrinsics, size, size)
@@ -134,7 +134,7 @@ def read_pictures(path: Path, factor: int) -> Pictures:
 
 
 def augmented(views: Pictures, rng: np.random.Generator) -> Pictures:
-    """``views`` in any order, some mirrored, some with their colour channels exchanged, with noise."""
+    """``views`` in any order, some mirrored, some with their color channels exchanged, with noise."""
     views = views.of_views(torch.as_tensor(rng.permutation(len(views.masks))))
     changed = {}
     if rng.random() > KEPT:

@@ -20,7 +20,7 @@ from reli3d.synthetic.samples import DIFFUSE_MODEL, EXPOSED
 SAMPLES = (12, 5, 5)  # light, GGX and cosine samples a pixel: what noise is left, a photograph in poor light has
 LAMPS = 0.6  # share of the lights that get lamps
 SATURATES = 4.0  # a pixel's radiance, as in reli3d.synthetic.samples
-TINT = 0.1  # standard deviation of the logarithm of the light's colour
+TINT = 0.1  # standard deviation of the logarithm of the light's color
 EXPOSURE = 0.35  # the same of the exposure
 METAL, PLAIN = 0.08, 0.05  # shares of the objects made all of metal, and without any
 
@@ -29,7 +29,7 @@ METAL, PLAIN = 0.08, 0.05  # shares of the objects made all of metal, and withou
 class Finish:
     """One change of all materials of an object, the same in its pixels and at its points."""
 
-    gamma: float  # of the base colour, sRGB
+    gamma: float  # of the base color, sRGB
     gain: float  # of the roughness
     shift: float
     metallic: float | None  # everywhere, or as it is
@@ -46,7 +46,7 @@ class Finish:
         )
 
     def apply(self, material: Tensor) -> Tensor:
-        """Of ``material (..., 5)``: base colour (sRGB), roughness, metallic."""
+        """Of ``material (..., 5)``: base color (sRGB), roughness, metallic."""
         base, rough, metal = material.split([3, 1, 1], -1)
         base = base.clamp(min=1e-6) ** self.gamma
         rough = (rough * self.gain + self.shift).clamp(0.03, 1.0)

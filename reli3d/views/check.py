@@ -20,7 +20,7 @@ from reli3d._bridge import full_precision
 from reli3d.errors import printable
 from reli3d.geometry.camera import project
 from reli3d.io.images import write_png
-from reli3d.views.normalize import AT_EYE, RADIUS, Hull, centre_rays, meeting_point, normalize, visual_hull
+from reli3d.views.normalize import AT_EYE, RADIUS, Hull, center_rays, meeting_point, normalize, visual_hull
 from reli3d.views.views import Views
 
 MIN_FILLED = 0.8  # fraction of every mask that the hull of right cameras fills; masks a few pixels off still reach 0.9
@@ -41,7 +41,7 @@ def explain_cameras(views: Views) -> list[str]:
     """One line per view, one on the up axis where it is not +Y, and last the :func:`verdict` on the cameras."""
     hull, filled = agreement(views)
     c2w, intrinsics = views.c2w.double().cpu(), views.intrinsics.double().cpu()
-    rays = centre_rays([m.cpu() for m in views.masks], c2w, intrinsics)
+    rays = center_rays([m.cpu() for m in views.masks], c2w, intrinsics)
     target = hull.points.mean(0) if len(hull.points) else meeting_point(c2w[:, :3, 3], rays)[0]
     lines = []
     for i, name in enumerate(views.names):
@@ -221,11 +221,11 @@ def _scaling(views: Views) -> str:
     similarity = normalize(views)
     if similarity.is_identity():
         return "left as it is for the network"
-    return f"scaled by {similarity.scale:.4g} and centred for the network"
+    return f"scaled by {similarity.scale:.4g} and centered for the network"
 
 
 PANEL, THUMB, MARGIN = 560, 184, 12
-_COLOURS = ("#d62728", "#1f77b4", "#2ca02c", "#ff7f0e", "#9467bd", "#17becf", "#e377c2", "#8c564b")
+_COLORS = ("#d62728", "#1f77b4", "#2ca02c", "#ff7f0e", "#9467bd", "#17becf", "#e377c2", "#8c564b")
 
 
 def rig_picture(views: Views, path: str | os.PathLike) -> None:
@@ -255,7 +255,7 @@ def rig_picture(views: Views, path: str | os.PathLike) -> None:
         at = (MARGIN + i % columns * (THUMB + MARGIN), PANEL + 2 * MARGIN + i // columns * (THUMB + 18 + MARGIN))
         canvas.paste(_thumbnail(views, hull, i), at)
         label = f"{i} {os.path.basename(views.names[i])[:18]}  {100 * filled[i]:.0f} %"
-        ImageDraw.Draw(canvas).text((at[0], at[1] + THUMB + 2), _latin(label), fill=_COLOURS[i % len(_COLOURS)])
+        ImageDraw.Draw(canvas).text((at[0], at[1] + THUMB + 2), _latin(label), fill=_COLORS[i % len(_COLORS)])
     write_png(path, np.asarray(canvas))
 
 
@@ -293,8 +293,8 @@ def _panel(views, hull, middle, reach, frustums, title, across, down, sign) -> I
         order = np.argsort(points[:, 3 - across - down])  # the beholder sits on the positive side of the third axis
         shade = np.linspace(90, 190, len(order)).astype(int)[::-1]
         half = max(1.0, 0.5 * hull.cell * zoom)
-        for (x, y), grey in zip(at(points[order]), shade):
-            draw.rectangle((x - half, y - half, x + half, y + half), fill=(int(grey),) * 2 + (int(grey) + 30,))
+        for (x, y), gray in zip(at(points[order]), shade):
+            draw.rectangle((x - half, y - half, x + half, y + half), fill=(int(gray),) * 2 + (int(gray) + 30,))
         flat = at(_cube(views))
         xs, ys = [p[0] for p in flat], [p[1] for p in flat]
         draw.rectangle((min(xs), min(ys), max(xs), max(ys)), outline="#606060")
@@ -302,7 +302,7 @@ def _panel(views, hull, middle, reach, frustums, title, across, down, sign) -> I
     draw.line((origin[0] - 5, origin[1], origin[0] + 5, origin[1]), fill="black")
     draw.line((origin[0], origin[1] - 5, origin[0], origin[1] + 5), fill="black")
     for i, frustum in enumerate(frustums):
-        color_of = _COLOURS[i % len(_COLOURS)]
+        color_of = _COLORS[i % len(_COLORS)]
         eye, *corners = at(frustum)
         for k in range(4):
             draw.line((*eye, *corners[k]), fill=color_of, width=2)

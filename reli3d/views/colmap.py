@@ -1,7 +1,7 @@
 """Cameras of a COLMAP model, as text (``cameras.txt`` and ``images.txt``) or binary (``cameras.bin``, ``images.bin``).
 
 COLMAP stores world-to-camera rotations (w, x, y, z) and translations in OpenCV axes (+Y down, looking along +Z); they
-become camera-to-world in OpenGL axes here.  Pixel centres lie at +0.5 there as well.
+become camera-to-world in OpenGL axes here.  Pixel centers lie at +0.5 there as well.
 Source: https://colmap.github.io/format.html and the list of camera models there.
 """
 
@@ -27,7 +27,7 @@ MAX_LINE = 1 << 24  # an image's points: 30 characters each
 MAX_IMAGES = 100_000
 PLACES = ("sparse/0", "sparse", "sparse/*", "colmap/sparse/0", "colmap/sparse", "colmap/sparse/*", "")
 _POINTS = re.compile(r"(?:[-+.0-9eE]+\s+[-+.0-9eE]+\s+-?\d+(?:\s+|$))+")  # x, y, number of the 3D point or -1
-# model: numbers of focal lengths, radial and tangential parameters; the centre stands after the focal lengths
+# model: numbers of focal lengths, radial and tangential parameters; the center stands after the focal lengths
 _MODELS = {
     "SIMPLE_PINHOLE": (1, 0, 0),
     "PINHOLE": (2, 0, 0),
@@ -199,7 +199,7 @@ def _lenses(cameras: Iterator) -> dict[object, Lens]:
             )
         lenses[key] = Lens(
             focal=(values[0], values[focals - 1]),
-            centre=(values[focals], values[focals + 1]),
+            center=(values[focals], values[focals + 1]),
             size=(int(size[0]), int(size[1])),
             radial=tuple(values[focals + 2 : focals + 2 + radial]),
             tangential=tuple(values[focals + 2 + radial :]),

@@ -231,7 +231,7 @@ def _load(
         bitmap, mask, camera = part.pixels(bitmap), part.pixels(mask), part.intrinsics(camera)
     image, alpha = color_of(bitmap), unit(mask)
     if looks_premultiplied(image.numpy(), alpha):
-        notes.append(f"{path.name}: the colour looks multiplied by alpha, edges will be dark; save straight alpha")
+        notes.append(f"{path.name}: the color looks multiplied by alpha, edges will be dark; save straight alpha")
     return image, torch.from_numpy(alpha), camera, notes, part is not None
 
 
@@ -334,7 +334,7 @@ def intrinsics_of(lens: Lens, width: int, height: int, where: str, notes: list[s
         fy = fx if math.isnan(upright) else 0.5 * height / math.tan(0.5 * upright)
     note = check_distortion(where, lens, fx, width, height)
     notes.extend([note] if note else [])
-    given = (math.nan, math.nan) if lens.centre is None else lens.centre
+    given = (math.nan, math.nan) if lens.center is None else lens.center
     cx = 0.5 * width if math.isnan(given[0]) else given[0] * sx
     cy = 0.5 * height if math.isnan(given[1]) else given[1] * sy
     if 0 < given[0] <= 1 and 0 < given[1] <= 1:

@@ -24,7 +24,7 @@ class Lens:
 
     fov: tuple[float, float] | None = None  # (x, y); y is NaN where the focal length is that of x
     focal: tuple[float, float] | None = None
-    centre: tuple[float, float] | None = None  # None or NaN: the middle
+    center: tuple[float, float] | None = None  # None or NaN: the middle
     size: tuple[int, int] | None = None
     radial: tuple[float, ...] = ()  # k1, k2, ... of OpenCV's polynomial; accepted where it does not matter
     tangential: tuple[float, ...] = ()  # p1, p2

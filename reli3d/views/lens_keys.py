@@ -130,7 +130,7 @@ def lens_of(where: str, frame: dict, data: dict, notes: list[str]) -> Lens:
         value = frame.get(key, data.get(key))
         return None if value is None else number(where, key, value, low, high)
 
-    size, centre = _size(where, found), _centre(where, frame, data, found)
+    size, center = _size(where, found), _center(where, frame, data, found)
     lens = None
     for source in (frame, data):
         spellings = list(_spellings(where, source, data, size))
@@ -143,14 +143,14 @@ def lens_of(where: str, frame: dict, data: dict, notes: list[str]) -> Lens:
                         f"{other}: expected the focal length of {name}, {ratio:.4g} image widths, got {value:.4g}; "
                         "remove the wrong one",
                     )
-            if lens.centre is None:
-                lens = replace(lens, centre=centre)
-            if name not in _FOVS or lens.centre is not None:
+            if lens.center is None:
+                lens = replace(lens, center=center)
+            if name not in _FOVS or lens.center is not None:
                 lens = replace(lens, size=size)
             break
     if lens is None:
         notes.append(f"{where}: no field of view given, {DEFAULT_FOV} radians assumed as in the published release")
-        lens = Lens(fov=(DEFAULT_FOV, DEFAULT_FOV), centre=centre)
+        lens = Lens(fov=(DEFAULT_FOV, DEFAULT_FOV), center=center)
     radial, tangential = (tuple(found(k) or 0.0 for k in keys) for keys in (_RADIAL, _TANGENTIAL))
     model = frame.get("camera_model", data.get("camera_model"))
     if radial[3] and isinstance(model, str) and model.upper() == "FULL_OPENCV":  # of a denominator there
@@ -167,7 +167,7 @@ def _spellings(where: str, source: dict, data: dict, size) -> Iterator[tuple[str
     for key in _MATRICES:
         if source.get(key) is not None:
             fx, fy, cx, cy = _matrix(where, key, source[key])
-            yield key, Lens(focal=(fx, fy), centre=(cx, cy)), fx / width
+            yield key, Lens(focal=(fx, fy), center=(cx, cy)), fx / width
     for x_key, y_key in _FOCALS:
         if source.get(x_key) is not None or source.get(y_key) is not None:
             fx = number(where, x_key, source.get(x_key, data.get(x_key)), 0, 1e9)
@@ -213,7 +213,7 @@ def _size(where: str, found) -> tuple[int, int] | None:
     return None if w is None or h is None else (int(w), int(h))
 
 
-def _centre(where: str, frame: dict, data: dict, found) -> tuple[float, float] | None:
+def _center(where: str, frame: dict, data: dict, found) -> tuple[float, float] | None:
     for source in (frame, data):
         if source.get("camera_principal_point") is not None:
             return _pair(where, "camera_principal_point", source["camera_principal_point"], -1e6, 1e6)
@@ -224,7 +224,7 @@ def _centre(where: str, frame: dict, data: dict, found) -> tuple[float, float] |
 
 
 def _matrix(where: str, key: str, value: object) -> tuple[float, float, float, float]:
-    """Focal lengths and centre of a 3x3 matrix, its 9 numbers by rows, or a 4x4 matrix that holds it."""
+    """Focal lengths and center of a 3x3 matrix, its 9 numbers by rows, or a 4x4 matrix that holds it."""
     rows = value if isinstance(value, list) else []
     if len(rows) == 9:
         rows = [rows[0:3], rows[3:6], rows[6:9]]

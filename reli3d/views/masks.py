@@ -19,7 +19,7 @@ FEW_VALUES = 16  # up to which a mask has no noise of a codec, so that every val
 NOISE = 16 / 255  # of values near black and white where there are more
 PLATEAU = 0.2  # fraction of the pixels between black and white in flat 3x3 blocks, above which these are labels
 SOLID = 0.3  # fraction of the object at the highest value, from which that value is its opaque part
-GREY_SPREAD = 16  # of 255: difference of channels up to which a pixel is grey; JPEG's chroma
+GRAY_SPREAD = 16  # of 255: difference of channels up to which a pixel is gray; JPEG's chroma
 MAX_COLORS = 4096
 LABEL = "masks: the object has "
 _TOP = {"L": 255.0, "F": 65535.0}
@@ -28,7 +28,7 @@ _TOP = {"L": 255.0, "F": 65535.0}
 def mask_values(path: os.PathLike, bitmap: Image.Image, notes: list[str]) -> Image.Image:
     """The coverage of the object, mode L or F, that a mask file of ``decode_image`` holds.
 
-    Alpha where it is used, else grey, or one color on black.  Grey values between black and white are coverage
+    Alpha where it is used, else gray, or one color on black.  Gray values between black and white are coverage
     (antialiasing).  Of a mask with two values, black and one below white, nonzero is the object, with a note.  Raises
     InputError with the values found for several labels and for what has no black.
     """
@@ -71,10 +71,10 @@ def _nonzero(channel: Image.Image, value: int, notes: list[str]) -> Image.Image:
     """``channel``, of which ``value`` is the only value above 0, as 0 and 255."""
     if value >= OPAQUE * _TOP[channel.mode]:
         return channel
-    return _labelled(channel, f"the value {value}", notes)
+    return _labeled(channel, f"the value {value}", notes)
 
 
-def _labelled(channel: Image.Image, label: str, notes: list[str]) -> Image.Image:
+def _labeled(channel: Image.Image, label: str, notes: list[str]) -> Image.Image:
     notes.append(f"{LABEL}{label} instead of white; nonzero pixels are taken as the object")
     return Image.fromarray(np.where(np.asarray(channel) > 0, np.uint8(255), np.uint8(0)))
 
@@ -117,11 +117,11 @@ def _flat(values: np.ndarray) -> np.ndarray:
 
 
 def _color_coverage(path: os.PathLike, bitmap: Image.Image, notes: list[str]) -> Image.Image:
-    """Coverage of ``bitmap``, which is grey or has multiples of one color alone, from its brightest channel."""
+    """Coverage of ``bitmap``, which is gray or has multiples of one color alone, from its brightest channel."""
     red, green, blue = bitmap.split()
     high = ImageChops.lighter(ImageChops.lighter(red, green), blue)
     low = ImageChops.darker(ImageChops.darker(red, green), blue)
-    if int(np.asarray(ImageChops.difference(high, low)).max()) <= GREY_SPREAD:
+    if int(np.asarray(ImageChops.difference(high, low)).max()) <= GRAY_SPREAD:
         return _coverage(path, high, notes)
     colors = bitmap.getcolors(MAX_COLORS)
     if colors is None:
@@ -129,11 +129,11 @@ def _color_coverage(path: os.PathLike, bitmap: Image.Image, notes: list[str]) ->
     found = np.array(sorted(color for _, color in colors), dtype=np.float64)
     brightest = found[found.sum(1).argmax()]
     along = np.outer(found @ brightest / (brightest @ brightest), brightest)
-    if np.abs(found - along).max() > GREY_SPREAD:
+    if np.abs(found - along).max() > GRAY_SPREAD:
         some = ", ".join(str(tuple(int(v) for v in color)) for color in found[:4])
         raise _not_a_mask(path, f"{len(found)} colors ({some}{', ...' if len(found) > 4 else ''})")
     if len(found) == 2 and not found[0].any():
-        return _labelled(high, f"the color {tuple(int(v) for v in brightest)}", notes)
+        return _labeled(high, f"the color {tuple(int(v) for v in brightest)}", notes)
     return _coverage(path, high, notes)
 
 

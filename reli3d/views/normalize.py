@@ -17,7 +17,7 @@ from reli3d.views.views import LEAST_WHOLE, Views, mask_box, touches_border
 RADIUS = 0.87  # half side of the network's cube
 SLACK = 1.1  # a hull of few views exceeds its object by about a tenth, so it may exceed the cube by as much
 LONGEST = 0.55  # longest side from which an object in the cube needs no rescaling; in training it is 1
-OFF_CENTRE = 0.3  # as far as the hull's centre of such an object may lie from the origin
+OFF_CENTER = 0.3  # as far as the hull's center of such an object may lie from the origin
 GRIDS = (24, 44)  # cells a side, coarse and refined: the last is 2 to 3 % of the object
 BALL = 1.3  # diameter of the ball that limits the hull, in mask widths: a generic view shows 0.8 of the longest side
 ONE_SIDED = math.radians(90.0)  # between eyes: beyond it the views bound each other's depth
@@ -33,7 +33,7 @@ AT_EYE = 1e-6  # of an eye's distance from the origin: what is nearer to the eye
 class Hull:
     """Cells of a grid that project into every mask; empty where the cameras and masks agree on nothing."""
 
-    points: Tensor  # (N, 3) float64 cell centres
+    points: Tensor  # (N, 3) float64 cell centers
     cell: float  # side of a cell
     aim: Tensor  # (3,) where the views look
     extent: float  # longest lateral side of the masks at ``aim``
@@ -49,7 +49,7 @@ class Hull:
 def normalize(views: Views, mode: str = "auto") -> Similarity:
     """The map from the frame of the input cameras to the network's frame (no rotation).
 
-    mode ``none``: identity.  ``hull``: the box of the visual hull is centred and its longest side becomes 1, as in
+    mode ``none``: identity.  ``hull``: the box of the visual hull is centered and its longest side becomes 1, as in
     training.  ``auto``: identity where the hull already sits well in the network's cube of half side 0.87, else
     ``hull``.
 
@@ -69,10 +69,10 @@ def normalize(views: Views, mode: str = "auto") -> Similarity:
     basis = _one_sided_basis(views, hull)
     points = hull.points @ basis
     low, high = points.amin(0), points.amax(0)
-    longest, centre = float((high - low).max()), basis @ ((low + high) / 2)
-    if mode == "auto" and inside and longest >= LONGEST and float(centre.norm()) <= OFF_CENTRE:
+    longest, center = float((high - low).max()), basis @ ((low + high) / 2)
+    if mode == "auto" and inside and longest >= LONGEST and float(center.norm()) <= OFF_CENTER:
         return Similarity.identity()
-    return Similarity(1.0 / longest, torch.eye(3, dtype=torch.float64, device="cpu"), -centre / longest)
+    return Similarity(1.0 / longest, torch.eye(3, dtype=torch.float64, device="cpu"), -center / longest)
 
 
 def _one_sided_basis(views: Views, hull: Hull) -> Tensor:
@@ -107,7 +107,7 @@ def visual_hull(views: Views) -> Hull:
         views = views.select(whole)
     c2w, intrinsics = views.c2w.double().cpu(), views.intrinsics.double().cpu()
     masks = [m.cpu() for m in views.masks]
-    origins, rays = c2w[:, :3, 3], centre_rays(masks, c2w, intrinsics)
+    origins, rays = c2w[:, :3, 3], center_rays(masks, c2w, intrinsics)
     aim, spread = meeting_point(origins, rays)
     depth = ((aim - origins)[:, None] @ -c2w[:, :3, 2:3])[:, 0, 0]  # along the viewing axes
     if not bool((depth > AT_EYE * origins.norm(dim=-1).max()).all()):
@@ -133,7 +133,7 @@ def visual_hull(views: Views) -> Hull:
 
 
 @full_precision
-def centre_rays(masks: list[Tensor], c2w: Tensor, intrinsics: Tensor) -> Tensor:
+def center_rays(masks: list[Tensor], c2w: Tensor, intrinsics: Tensor) -> Tensor:
     """Unit rays ``(V, 3)`` through the middle of each mask's box, world frame."""
     boxes = torch.tensor([mask_box(m) for m in masks], dtype=c2w.dtype, device="cpu")
     middle = (boxes[:, :2] + boxes[:, 2:]) / 2

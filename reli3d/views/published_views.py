@@ -30,8 +30,8 @@ BACKGROUND_RANGE = 4 / 255  # between the 10th and the 90th percentile; a cut-ou
 def published_views(views: Views, size: int) -> ViewBatch:
     """All views at ``size`` x ``size`` pixels as the release prepares them; cameras stay as they are.
 
-    The whole image is stretched to the square; colours keep the background; masks are 0 or 1.  The 8-bit pixels of the
-    files are what is encoded, so colours of 16 bits are rounded first.  Agrees with the published tensors to float32
+    The whole image is stretched to the square; colors keep the background; masks are 0 or 1.  The 8-bit pixels of the
+    files are what is encoded, so colors of 16 bits are rounded first.  Agrees with the published tensors to float32
     rounding (2e-7), masks exactly.  Raises ValueError on a size below 1 and for views that are not on the CPU, where
     the codec runs.
     """
@@ -60,7 +60,7 @@ def jpeg_round_trip(pixels: Tensor) -> Tensor:
 
 
 def _resized(pixels: Tensor, size: int) -> Tensor:
-    """Bilinear between pixel centres, without filtering: what OpenCV's resize does by default."""
+    """Bilinear between pixel centers, without filtering: what OpenCV's resize does by default."""
     moved = interpolate(pixels.permute(2, 0, 1)[None], (size, size), mode="bilinear", align_corners=False)
     return moved[0].permute(1, 2, 0)
 
@@ -87,7 +87,7 @@ def background_shown(views: Views, background: str, *, readable: bool) -> bool:
 
 
 def has_background(image: Tensor, mask: Tensor) -> bool:
-    """Whether ``image (H, W, 3)`` shows something outside ``mask (H, W)``: a cut-out has one flat colour there."""
+    """Whether ``image (H, W, 3)`` shows something outside ``mask (H, W)``: a cut-out has one flat color there."""
     outside = image[mask < CLEAR]
     if len(outside) == 0:
         return False

@@ -22,7 +22,7 @@ class Cut:
 
     def pixels(self, bitmap: Image.Image) -> Image.Image:
         """The part of ``bitmap`` at the new size, filtered over their area; straight alpha stays straight."""
-        if bitmap.mode == "RGBA":  # Pillow would multiply the colour by alpha, and lose that under alpha 0
+        if bitmap.mode == "RGBA":  # Pillow would multiply the color by alpha, and lose that under alpha 0
             return Image.merge("RGBA", [self.pixels(band) for band in bitmap.split()])
         return bitmap.resize(self.size, Image.Resampling.BILINEAR, box=self.part)
 

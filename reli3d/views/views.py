@@ -1,7 +1,7 @@
 """Posed images of one object with masks, as readers of folders return them and the stages of the pipeline take them.
 
-Colour is sRGB in [0, 1] with straight alpha, the background kept under it.  Cameras are camera-to-world in OpenGL axes
-(+X right, +Y up, looking along -Z), intrinsics (fx, fy, cx, cy) in pixels with pixel centres at +0.5.
+Color is sRGB in [0, 1] with straight alpha, the background kept under it.  Cameras are camera-to-world in OpenGL axes
+(+X right, +Y up, looking along -Z), intrinsics (fx, fy, cx, cy) in pixels with pixel centers at +0.5.
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ class Views:
         """All views at ``size`` x ``size`` pixels, with the intrinsics of the new pixels.
 
         crop: cut a square around the mask, ``padding`` of its side left free on each side; it may reach over the
-        border, where the mask is 0 and the colour that of the nearest edge.  Otherwise the whole image is stretched to
+        border, where the mask is 0 and the color that of the nearest edge.  Otherwise the whole image is stretched to
         the square.  Pixels are filtered over the area they cover (triangle filter of its width); where the new pixels
         are smaller, bilinear.  Raises ValueError on a size below 1 or, with ``crop``, an empty mask.
         """
@@ -168,7 +168,7 @@ def _window(mask: Tensor, padding: float) -> tuple[int, int, int, int]:
 
 
 def _cut(image: Tensor, mask: Tensor, x: int, y: int, width: int, height: int) -> Tensor:
-    """``(4, height, width)`` colour and mask of a window that may reach over the border."""
+    """``(4, height, width)`` color and mask of a window that may reach over the border."""
     rows, columns = mask.shape
     left, top = max(0, -x), max(0, -y)
     right, bottom = max(0, x + width - columns), max(0, y + height - rows)

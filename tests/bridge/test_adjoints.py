@@ -85,7 +85,7 @@ def flexicubes(g, small) -> Op:
     return Op(leaves, ours, twin)
 
 
-def centres(g, small) -> Op:
+def centers(g, small) -> Op:
     """The vertices that split the quads, of dual vertices that stay."""
     leaves = surface_leaves(g, small)
     gamma = leaves.pop("gamma")
@@ -94,11 +94,11 @@ def centres(g, small) -> Op:
 
     def ours(gamma):
         fields = {k: v.to(gamma) for k, v in leaves.items()}
-        return extract_surface(fields.pop("sdf"), radius=0.8, gamma=gamma, centre=True, **fields).vertices[count:]
+        return extract_surface(fields.pop("sdf"), radius=0.8, gamma=gamma, center=True, **fields).vertices[count:]
 
     def twin(gamma):
         fields = {k: v for k, v in leaves.items() if k != "sdf"}
-        mesh = extract_surface(leaves["sdf"], radius=0.8, centre=True, **fields)
+        mesh = extract_surface(leaves["sdf"], radius=0.8, center=True, **fields)
         quads = mesh.faces.long().view(-1, 4, 3)[:, :, 0]
         cube = reference_surface.flexicubes_vertices(*(leaves[k] for k in ORDER), 1.6)[1]
         corner, weight = mesh.vertices[:count].double()[quads], gamma[cube[quads]]
@@ -334,7 +334,7 @@ OPS = {
         for f in (
             triplane,
             flexicubes,
-            centres,
+            centers,
             deviation,
             texture,
             normals,

@@ -265,5 +265,5 @@ def test_threads_start_warp_once(monkeypatch):
     monkeypatch.setattr(wp, "init", lambda: (time.sleep(0.05), started.append(1)))
     cache._start.cache_clear()
     with ThreadPoolExecutor(4) as pool:
-        list(pool.map(lambda _: (cache.initialise(), started.append(0)), range(4)))
+        list(pool.map(lambda _: (cache.initialize(), started.append(0)), range(4)))
     assert started == [1, 0, 0, 0, 0]

@@ -34,7 +34,7 @@ def far_camera(size=128, height=0.9):
     return Camera(c2w[None], torch.tensor([[focal, focal, size / 2, size / 2]]), size, size)
 
 
-def disc(size, radius):
+def disk(size, radius):
     """Signed distance in pixels to a centred disc, positive inside."""
     y, x = torch.meshgrid(torch.arange(size) + 0.5, torch.arange(size) + 0.5, indexing="ij")
     return (radius - torch.hypot(x - size / 2, y - size / 2))[None]
@@ -44,7 +44,7 @@ def test_an_unsure_sheet_becomes_a_surface_as_thick_as_it_is_unsure(device):
     """0.5 + (z / s)^2 has no inside; lowered to (z / s)^2 - DEPTH it is negative for |z| < s sqrt(DEPTH)."""
     points, s = grid((41, 41, 41)), 0.4
     sdf = 0.5 + (points[..., 2] / s).square()
-    args = [v.to(device) for v in (sdf, torch.full_like(sdf, FREE), disc(128, 40.0), far_camera())]
+    args = [v.to(device) for v in (sdf, torch.full_like(sdf, FREE), disk(128, 40.0), far_camera())]
     got = cover_silhouettes(*args, radius=RADIUS).cpu()
     radius = points[..., :2].norm(dim=-1)
     inner, outer = radius < (40 - STRIDE) * 0.9 / 128, radius > (40 + 2 * STRIDE) * 0.9 / 128
@@ -63,7 +63,7 @@ def test_blocks_that_are_left_out_change_nothing(device, monkeypatch):
     points = grid((37, 42, 30))
     wave = (9.0 * points).sin().sum(-1)
     sdf = torch.where(wave > 0.8, 3.0 + wave, wave - 0.3).to(device)
-    args = sdf, torch.full_like(sdf, FREE), disc(128, 55.0).to(device), far_camera().to(device)
+    args = sdf, torch.full_like(sdf, FREE), disk(128, 55.0).to(device), far_camera().to(device)
     got = cover_silhouettes(*args, radius=RADIUS)
     lowest = cover._lowest(sdf)
     assert tuple(lowest.shape) == (9, 11, 8) and float(lowest.min()) == float(sdf.min())
@@ -76,14 +76,14 @@ def test_blocks_that_are_left_out_change_nothing(device, monkeypatch):
 def test_a_surface_that_covers_its_silhouettes_stays_as_it_is(device):
     points = grid((31, 33, 35))
     sdf = (points.norm(dim=-1) - 0.4) / 0.02
-    args = [v.to(device) for v in (sdf, torch.full_like(sdf, FREE), disc(128, 0.385 * 128 / 0.9), far_camera())]
+    args = [v.to(device) for v in (sdf, torch.full_like(sdf, FREE), disk(128, 0.385 * 128 / 0.9), far_camera())]
     assert torch.equal(cover_silhouettes(*args, radius=RADIUS).cpu(), sdf)
 
 
 def test_the_bound_holds_and_hopeless_rays_are_left(device):
     points = grid((31, 31, 31))
     camera = far_camera().to(device)
-    mask = disc(128, 40.0).to(device)
+    mask = disk(128, 40.0).to(device)
     sdf = torch.full(points.shape[:3], 0.4).to(device)
     bound = -hull_distance(points.reshape(-1, 3).to(device), mask, camera).view_as(sdf) / 0.02
     start = torch.maximum(sdf, bound)
@@ -111,8 +111,8 @@ def twin(sdf, bound, distance, cameras):
         ]
         least = torch.where(t < far[:, None], value, torch.inf).amin(1)
         x, y = torch.meshgrid(torch.arange(columns), torch.arange(rows), indexing="xy")
-        centre = (torch.stack([x, y], -1) + 0.5) * STRIDE * 2 / torch.tensor([distance.shape[2], distance.shape[1]]) - 1
-        inside = grid_sample(distance[None, v : v + 1], centre[None].double(), align_corners=False)[0, 0].reshape(-1)
+        center = (torch.stack([x, y], -1) + 0.5) * STRIDE * 2 / torch.tensor([distance.shape[2], distance.shape[1]]) - 1
+        inside = grid_sample(distance[None, v : v + 1], center[None].double(), align_corners=False)[0, 0].reshape(-1)
         lacks = torch.where((inside > 1.0) & (least < FIELD_MAX), (least + DEPTH).clamp(min=0.0), 0.0).view(
             1, 1, rows, columns
         )
@@ -174,7 +174,7 @@ def test_without_views_the_field_is_returned_unchanged(device):
 
 def test_bad_input_is_named():
     sdf, camera = torch.zeros(4, 4, 4), far_camera(32)
-    good = {"sdf": sdf, "bound": sdf, "distance": disc(32, 9.0), "camera": camera}
+    good = {"sdf": sdf, "bound": sdf, "distance": disk(32, 9.0), "camera": camera}
     for change, message in (
         ({"sdf": torch.zeros(4, 4)}, r"sdf: expected shape \(X, Y, Z\)"),
         ({"bound": torch.zeros(4, 4, 5)}, r"bound: expected shape \(4, 4, 4\)"),

@@ -23,12 +23,12 @@ SHAPE = (5, 6, 7)
 NOTHING = Mesh(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.int32))
 
 
-@pytest.mark.parametrize("centre", [False, True])
+@pytest.mark.parametrize("center", [False, True])
 @pytest.mark.parametrize("value, closed", [(1.0, True), (0.0, True), (-0.0, True), (1.0, False), (-1.0, False)])
-def test_a_field_without_a_change_of_sign_has_no_faces_and_gradients_of_zero(device, value, closed, centre):
+def test_a_field_without_a_change_of_sign_has_no_faces_and_gradients_of_zero(device, value, closed, center):
     sdf = torch.full(SHAPE, value, device=device).requires_grad_()
     weights = {k: v.requires_grad_() for k, v in random_weights(SHAPE, 0, device).items()}
-    mesh = extract_surface(sdf, radius=1.0, closed=closed, centre=centre, **weights)
+    mesh = extract_surface(sdf, radius=1.0, closed=closed, center=center, **weights)
     assert mesh.vertices.shape == (0, 3) and mesh.faces.shape == (0, 3) and mesh.vertices.device == sdf.device
     assert len(surface_cubes(sdf)) == 0
     leaves = [sdf, *(weights[k] for k in ("deformation", "alpha", "beta"))]
@@ -36,7 +36,7 @@ def test_a_field_without_a_change_of_sign_has_no_faces_and_gradients_of_zero(dev
         assert g.shape == leaf.shape and float(g.abs().max()) == 0.0
     rows = {k: v.detach() if k == "deformation" else v.detach()[:0] for k, v in weights.items()}
     cubes = torch.zeros(0, dtype=torch.int64, device=device)
-    assert len(extract_surface(sdf, radius=1.0, closed=closed, centre=centre, cubes=cubes, **rows).faces) == 0
+    assert len(extract_surface(sdf, radius=1.0, closed=closed, center=center, cubes=cubes, **rows).faces) == 0
     weights.pop("gamma")
     spread = vertex_deviation(sdf, radius=1.0, closed=closed, **weights)
     assert spread.shape == (0,)
@@ -54,8 +54,8 @@ def test_a_full_field_is_the_box_with_its_edges_cut_off(device):
     assert float(volume(mesh)) == pytest.approx(hull.volume, rel=1e-5)
     assert mesh.vertices.abs().amax(0).tolist() == [1.0, 1.5, 2.0]
     leaf = sdf.requires_grad_()
-    for centre in (False, True):  # a crossing between a vertex and its copy in the padding does not move
-        moved = extract_surface(leaf, radius=1.0, centre=centre)
+    for center in (False, True):  # a crossing between a vertex and its copy in the padding does not move
+        moved = extract_surface(leaf, radius=1.0, center=center)
         assert float(torch.autograd.grad(moved.vertices.square().sum(), leaf)[0].abs().max()) == 0.0
 
 

@@ -69,7 +69,7 @@ def test_gradients_of_flexicubes(device, reach):
         "gamma": wild_weights((n,), g, reach),
     }
     ours = {k: v.to(device).requires_grad_() for k, v in leaves.items()}
-    mesh = extract_surface(ours["sdf"], radius=0.5, centre=True, **{k: ours[k] for k in leaves if k != "sdf"})
+    mesh = extract_surface(ours["sdf"], radius=0.5, center=True, **{k: ours[k] for k in leaves if k != "sdf"})
     cotangent = torch.randn(mesh.vertices.shape, generator=g)
     got = torch.autograd.grad((mesh.vertices * cotangent.to(device)).sum(), list(ours.values()))
     assert finite(mesh.vertices, *got)

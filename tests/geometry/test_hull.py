@@ -22,9 +22,9 @@ def pixel_grid(height, width, device="cpu"):
     return x.to(device), y.to(device)
 
 
-def disc(size, centre, radius):
+def disk(size, center, radius):
     x, y = pixel_grid(size, size)
-    true = radius - torch.hypot(x - centre[0], y - centre[1])
+    true = radius - torch.hypot(x - center[0], y - center[1])
     return (true + 0.5).clamp(0, 1), true
 
 
@@ -43,7 +43,7 @@ def test_half_plane_is_exact_for_an_unsaturated_ramp(device):
 
 
 def test_disc_is_sub_pixel(device):
-    mask, true = disc(128, (63.3, 66.8), 37.2)
+    mask, true = disk(128, (63.3, 66.8), 37.2)
     got = mask_distance(mask[None].to(device))[0].cpu()
     # a coverage that saturates one pixel from the contour moves the linear crossing by at most 0.09 pixels
     assert (got - true).abs().max() < 0.1
@@ -51,15 +51,15 @@ def test_disc_is_sub_pixel(device):
 
 
 def test_hard_mask_is_within_half_a_pixel():
-    _, true = disc(128, (63.3, 66.8), 37.2)
+    _, true = disk(128, (63.3, 66.8), 37.2)
     got = mask_distance((true > 0).float()[None])[0]
     assert (got - true).abs().max() < 0.75  # the staircase's corners stand half a pixel diagonal off at most
 
 
 def test_two_blobs_and_a_hole_against_brute_force(device):
-    one, _ = disc(64, (18.2, 20.4), 10.3)
-    two, _ = disc(64, (44.6, 40.1), 14.7)
-    hole, _ = disc(64, (46.0, 41.0), 5.5)
+    one, _ = disk(64, (18.2, 20.4), 10.3)
+    two, _ = disk(64, (44.6, 40.1), 14.7)
+    hole, _ = disk(64, (46.0, 41.0), 5.5)
     mask = torch.maximum(one, two) - hole
     got = mask_distance(mask[None].to(device))[0].cpu()
     fine = torch.nn.functional.interpolate(mask[None, None].double(), scale_factor=32, mode="bilinear")[0, 0] >= 0.5
@@ -95,7 +95,7 @@ def sphere_views(device, n=8, distance=3.0, radius=0.5, size=256, focal=300.0):
         c2w.append(pose)
     # on the axis a sphere projects to a disc of radius f tan(asin(r / d))
     outline = focal * math.tan(math.asin(radius / distance))
-    mask, _ = disc(size, (size / 2, size / 2), outline)
+    mask, _ = disk(size, (size / 2, size / 2), outline)
     intrinsics = torch.tensor([focal, focal, size / 2, size / 2]).expand(n, 4)
     return mask.expand(n, size, size).to(device), Camera(torch.stack(c2w).float(), intrinsics, size, size).to(device)
 
@@ -286,6 +286,6 @@ def test_the_reach_is_that_of_the_points_inside(device, radius, views):
 
 def test_far_from_the_contour_the_ends_of_segments_will_do(device):
     """Beyond 16 pixels 0.25 / 16 too far at most; the disc itself is known to 0.1 pixels (above)."""
-    mask, true = disc(256, (127.3, 130.8), 60.2)
+    mask, true = disk(256, (127.3, 130.8), 60.2)
     got = mask_distance(mask[None].to(device))[0].cpu()
     assert (got - true).abs().max() < 0.1 + 0.25 / 16

@@ -241,10 +241,10 @@ def test_reevaluated_hits_and_their_gradients_equal_float64(device):
 def test_a_far_closed_mesh_is_watertight(device, backend):
     """After Embree's verification: a sphere at (148376, 1234, -223423), rays from near its centre, 2e-5 may leak."""
     mesh = trimesh.creation.icosphere(subdivisions=4, radius=100.0)
-    centre = np.array([148376.0, 1234.0, -223423.0])
-    scene = make(mesh.vertices + centre, mesh.faces, backend, device)
+    center = np.array([148376.0, 1234.0, -223423.0])
+    scene = make(mesh.vertices + center, mesh.faces, backend, device)
     rng = np.random.default_rng(3)
-    o = torch.tensor(centre + rng.uniform(-1, 1, (200_000, 3)), dtype=torch.float32, device=device)
+    o = torch.tensor(center + rng.uniform(-1, 1, (200_000, 3)), dtype=torch.float32, device=device)
     d = torch.tensor(rng.normal(size=(200_000, 3)), dtype=torch.float32, device=device)
     assert float((scene.closest(o, d).face < 0).float().mean()) <= 2e-5
 

@@ -93,7 +93,7 @@ def test_gradients_behind_the_mesh_are_the_same_bits_for_any_number_of_threads(t
         threads(count)
         leaves = {k: v.clone().requires_grad_() for k, v in weights.items()}
         given = {k: v for k, v in leaves.items() if k not in ("sdf", "gamma")}
-        mesh = extract_surface(leaves["sdf"], radius=1.0, centre=True, gamma=leaves["gamma"], **given)
+        mesh = extract_surface(leaves["sdf"], radius=1.0, center=True, gamma=leaves["gamma"], **given)
         shown = unwrap(taubin_smooth(mesh.with_normals(), iterations=2), texture_size=64)
         spread = vertex_deviation(leaves["sdf"], radius=1.0, **given)
         seen = [mesh.vertices, shown.vertices, shown.normals, spread]
@@ -113,7 +113,7 @@ def test_gradients_match_finite_differences_of_the_kernel(device):
     values = []
     leaf = sdf.clone().requires_grad_()
     for step in (-1e-2, 1e-2, 0.0):
-        mesh = extract_surface(leaf + step * direction * sdf.abs(), radius=1.0, centre=True, **weights)
+        mesh = extract_surface(leaf + step * direction * sdf.abs(), radius=1.0, center=True, **weights)
         if cotangent is None:
             cotangent = torch.randn(mesh.vertices.shape, generator=rng).to(device)
         values.append((mesh.vertices * cotangent).sum())
@@ -141,7 +141,7 @@ def test_centre_vertices_split_quads_in_four_with_gradient_to_gamma(device):
     weights = random_weights(sdf.shape, 2, device)
     gamma = weights["gamma"].requires_grad_()
     two = extract_surface(sdf, radius=1.0, **weights)
-    four = extract_surface(sdf, radius=1.0, centre=True, **weights)
+    four = extract_surface(sdf, radius=1.0, center=True, **weights)
     quads = len(two.faces) // 2
     assert len(four.faces) == 4 * quads and len(four.vertices) == len(two.vertices) + quads
     found = report(four.detach())
@@ -154,7 +154,7 @@ def test_centre_vertices_split_quads_in_four_with_gradient_to_gamma(device):
     ends = []
     for step in (-1e-3, 1e-3):
         weights["gamma"] = gamma.detach() + step * direction
-        moved = extract_surface(sdf, radius=1.0, centre=True, **weights).vertices
+        moved = extract_surface(sdf, radius=1.0, center=True, **weights).vertices
         ends.append((moved.double() * cotangent.double()).sum())
     derivative = float((ends[1] - ends[0]) / 2e-3)
     assert abs(float((got * direction).sum()) - derivative) < 2e-2 * max(

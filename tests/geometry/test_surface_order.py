@@ -11,14 +11,14 @@ from tests.support.reference_surface import grid, sphere, torus
 
 F = torch.nn.functional
 RESOLUTIONS = (16, 32, 64)
-CENTRE = torch.tensor([0.5, 0.0, 0.0])
+CENTER = torch.tensor([0.5, 0.0, 0.0])
 EULER = {"sphere": 2, "torus": 0, "two spheres": 4}
 VOLUME = {"sphere": 4 / 3 * 0.6**3, "torus": 2 * np.pi * 0.6 * 0.22**2, "two spheres": 8 / 3 * 0.35**3}  # over pi
 
 
 def two_spheres(n, device="cpu"):
-    p, centre = grid(n, device=device), CENTRE.to(device)
-    return torch.minimum((p - centre).norm(dim=-1), (p + centre).norm(dim=-1)) - 0.35
+    p, center = grid(n, device=device), CENTER.to(device)
+    return torch.minimum((p - center).norm(dim=-1), (p + center).norm(dim=-1)) - 0.35
 
 
 FIELDS = {"sphere": lambda n, device: sphere(n, device=device), "torus": torus, "two spheres": two_spheres}
@@ -144,7 +144,7 @@ def test_the_distance_to_the_analytic_surface_is_below_a_cube_both_ways(device, 
     elif shape == "sphere":
         points, away = 0.6 * direction, at.norm(dim=-1) - 0.6
     else:
-        points = 0.35 * direction + torch.where(u[:, None] > 3, CENTRE, -CENTRE)
-        away = torch.minimum((at - CENTRE).norm(dim=-1), (at + CENTRE).norm(dim=-1)) - 0.35
+        points = 0.35 * direction + torch.where(u[:, None] > 3, CENTER, -CENTER)
+        away = torch.minimum((at - CENTER).norm(dim=-1), (at + CENTER).norm(dim=-1)) - 0.35
     assert float(away.abs().max()) < cube
     assert cKDTree(samples).query(points.numpy())[0].max() < cube

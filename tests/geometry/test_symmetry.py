@@ -16,11 +16,11 @@ ODD = [((0.0, 0.0, 0.0), 0.25), ((0.4, 0.1, 0.1), 0.14), ((-0.1, 0.35, 0.3), 0.1
 EYES = [(0.3, 0.9, 2.4), (2.3, 0.4, -0.8), (-1.4, 1.2, -1.7), (-2.1, 0.2, 1.2)]
 
 
-def cameras(eyes=EYES, up=(0.0, 1.0, 0.0), centre=(0.0, 0.0, 0.0), unit=1.0):
+def cameras(eyes=EYES, up=(0.0, 1.0, 0.0), center=(0.0, 0.0, 0.0), unit=1.0):
     """Cameras about ``centre``; the world's up and unit are free."""
-    up, centre = torch.tensor(up), torch.tensor(centre)
+    up, center = torch.tensor(up), torch.tensor(center)
     turn = turned(up)
-    c2w = [look_at(centre + unit * turn @ torch.tensor(eye), centre, up) for eye in eyes]
+    c2w = [look_at(center + unit * turn @ torch.tensor(eye), center, up) for eye in eyes]
     return Camera.from_fov(torch.stack(c2w), 0.7, SIZE, SIZE)
 
 
@@ -31,13 +31,13 @@ def turned(up):
     return torch.stack([side, up, torch.linalg.cross(side, up)], 1)
 
 
-def distances(balls, camera, turn=None, centre=(0.0, 0.0, 0.0), unit=1.0):
+def distances(balls, camera, turn=None, center=(0.0, 0.0, 0.0), unit=1.0):
     """Silhouettes of balls: a ray hits one where its distance to the centre is below the radius, in float64."""
     origin, direction = (t.double() for t in camera_rays(camera))
     turn = torch.eye(3) if turn is None else turn
     clear = torch.full(origin.shape[:-1], -1e9, dtype=torch.float64)
     for place, radius in balls:
-        at = torch.tensor(centre).double() + unit * turn.double() @ torch.tensor(place).double()
+        at = torch.tensor(center).double() + unit * turn.double() @ torch.tensor(place).double()
         along = ((at - origin) * direction).sum(-1, keepdim=True)
         away = (at - origin - along * direction).norm(dim=-1)
         pixel = along[..., 0] / camera.intrinsics[0, 0].double()
@@ -61,23 +61,23 @@ def test_a_mirrored_camera_sees_the_reflected_point_at_the_mirrored_pixel():
     torch.testing.assert_close(torch.linalg.det(other.c2w[:, :3, :3]), torch.ones(4))  # still rotations
 
 
-@pytest.mark.parametrize("up, centre, unit", [
+@pytest.mark.parametrize("up, center, unit", [
     ((0.0, 1.0, 0.0), (0.0, 0.0, 0.0), 1.0),
     ((0.0, 0.0, 1.0), (0.3, -0.2, 0.1), 1.0),
     ((0.48, 0.6, -0.64), (300.0, 100.0, -200.0), 1000.0),
     ((0.0, 1.0, 0.0), (0.001, 0.0, 0.002), 0.01),
 ])  # fmt: skip
-def test_the_plane_of_twin_balls_is_found_in_any_frame(up, centre, unit, device):
-    camera = cameras(up=up, centre=centre, unit=unit)
+def test_the_plane_of_twin_balls_is_found_in_any_frame(up, center, unit, device):
+    camera = cameras(up=up, center=center, unit=unit)
     turn = turned(torch.tensor(up))
-    distance = distances(TWIN, camera, turn, centre, unit)
+    distance = distances(TWIN, camera, turn, center, unit)
     plane = mirror_plane(distance.to(device), camera.to(device))
     normal = plane.normal.cpu()
     want = turn[:, 0]
     cosine = float((normal @ want).abs())
     # a pixel of the silhouettes is 0.015 units, over the object's 0.9 units: 1 degree
     assert math.degrees(math.acos(min(cosine, 1.0))) < 1.0
-    assert abs(plane.offset - float(torch.tensor(centre) @ normal)) < 0.008 * unit
+    assert abs(plane.offset - float(torch.tensor(center) @ normal)) < 0.008 * unit
 
 
 def test_an_object_without_a_mirror_plane_has_none(device):

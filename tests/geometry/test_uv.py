@@ -10,7 +10,7 @@ from reli3d.geometry import charts, uv
 from reli3d.geometry.bake import coverage, nearest_valid
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.surface import extract_surface
-from reli3d.geometry.topology import face_neighbours
+from reli3d.geometry.topology import face_neighbors
 from reli3d.geometry.uv import atlas_report, guard_band, source_vertices, unwrap, unwrap_xatlas
 from tests.support.meshes import QUICK, SLOW, loaded, mesh_of
 
@@ -87,7 +87,7 @@ def test_sphere_fills_the_atlas_with_little_stretch():
     check_atlas(mesh, result)
     found = atlas_report(result, texture_size=512)
     assert found.charts == 6
-    assert found.utilisation > 0.55
+    assert found.utilization > 0.55
     # a cap of 54.7 degrees seen along its axis: stretch at the tip 1 / cos = 1.73, less the common scale
     assert found.stretch < 1.05 and found.stretch_max < 1.74
 
@@ -105,7 +105,7 @@ def test_a_long_part_does_not_hold_down_the_scale():
     result = unwrap(mesh, texture_size=512)
     check_atlas(mesh, result)
     # 122 units of area; uncut, the longest chart's 30 units would span the side and use 122 / 900 of it
-    assert atlas_report(result, texture_size=512).utilisation > 0.5
+    assert atlas_report(result, texture_size=512).utilization > 0.5
 
 
 def test_charts_are_counted_by_their_uv_whether_vertices_are_split_or_not():
@@ -128,8 +128,8 @@ def test_stretch_of_a_plane_is_one_and_of_a_squeezed_one_is_known():
 @pytest.mark.parametrize("size", [256, 512])
 def test_charts_keep_the_guard_band(size):
     result = unwrap(icosphere(3), texture_size=size)
-    neighbours = face_neighbours(result.faces.numpy())
-    chart, count = charts.components(neighbours, np.zeros(len(neighbours), np.int32))
+    neighbors = face_neighbors(result.faces.numpy())
+    chart, count = charts.components(neighbors, np.zeros(len(neighbors), np.int32))
     fine = 2  # samples along a texel
     for c in range(count):
         own, others = (
@@ -196,8 +196,8 @@ def test_size_and_place_of_the_mesh_do_not_matter(scale, offset):
 
 def test_a_soup_of_triangles_fits():
     rng = np.random.default_rng(0)
-    centre = rng.uniform(-1, 1, (3000, 1, 3))
-    corners = centre + rng.normal(0, 0.05, (3000, 3, 3))
+    center = rng.uniform(-1, 1, (3000, 1, 3))
+    corners = center + rng.normal(0, 0.05, (3000, 3, 3))
     mesh = mesh_of(corners.reshape(-1, 3), np.arange(9000).reshape(-1, 3))
     check_atlas(mesh, unwrap(mesh, texture_size=512), rel=2e-2)  # all border: 3,000 triangles of about 150 samples
 
@@ -235,7 +235,7 @@ def test_split_vertices_know_what_they_were(atlas):
 
 def test_neighbours_skip_borders_and_crowded_edges():
     faces = np.array([[0, 1, 2], [2, 1, 3], [4, 5, 6], [5, 4, 7], [4, 5, 8]])
-    assert face_neighbours(faces).tolist() == [[-1, 1, -1], [0, -1, -1], [-1] * 3, [-1] * 3, [-1] * 3]
+    assert face_neighbors(faces).tolist() == [[-1, 1, -1], [0, -1, -1], [-1] * 3, [-1] * 3, [-1] * 3]
 
 
 def test_faults_are_named():
@@ -272,7 +272,7 @@ def test_xatlas_takes_meshes_of_any_size(radius, center):
     result = unwrap_xatlas(mesh_of(ball.vertices * radius + center, ball.faces), texture_size=256)
     assert bool(torch.isfinite(result.uv).all())
     report = atlas_report(result, texture_size=256)
-    assert report.utilisation > 0.4 and report.overlap < 0.01
+    assert report.utilization > 0.4 and report.overlap < 0.01
 
 
 def test_an_atlas_of_xatlas_with_nan_is_refused(monkeypatch):

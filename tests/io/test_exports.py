@@ -53,8 +53,8 @@ def test_trimesh_reads_the_obj_back(asset, tmp_path):
     words = dict(line.split(" ", 1) for line in files["ball.mtl"].decode().splitlines())
     for word, map_of in (("map_Kd", "base_color"), ("map_Pr", "roughness"), ("map_Pm", "metallic"), ("norm", "normal")):
         assert words[word] in files and map_of in words[word]
-    grey = np.asarray(Image.open(io.BytesIO(files["ball_roughness.png"])))
-    assert np.array_equal(grey[..., 0], np.rint(asset.textures.roughness.numpy() * 255).astype(np.uint8))
+    gray = np.asarray(Image.open(io.BytesIO(files["ball_roughness.png"])))
+    assert np.array_equal(gray[..., 0], np.rint(asset.textures.roughness.numpy() * 255).astype(np.uint8))
 
 
 def test_pixars_library_reads_the_usdz_and_finds_it_compliant(asset, tmp_path):

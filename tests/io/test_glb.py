@@ -211,8 +211,8 @@ def test_node_transforms_reach_positions_normals_and_mirrors(asset, tmp_path):
     torch.testing.assert_close(part.mesh.vertices, want, rtol=0, atol=1e-5)
     a, b, c = (part.mesh.vertices[part.mesh.faces[:, k].long()] for k in range(3))
     outward = torch.linalg.cross(b - a, c - a)
-    centre = (a + b + c) / 3 - torch.tensor([1.0, 2, 3])
-    assert bool(((outward * centre).sum(1) > 0).all())
+    center = (a + b + c) / 3 - torch.tensor([1.0, 2, 3])
+    assert bool(((outward * center).sum(1) > 0).all())
     assert bool((part.mesh.tangents[:, 3] == -1).all())
     face_normal = outward / outward.norm(dim=1, keepdim=True)
     assert float((part.mesh.normals[part.mesh.faces[:, 0].long()] * face_normal).sum(1).min()) > 0.9

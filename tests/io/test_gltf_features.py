@@ -111,11 +111,11 @@ def near(got: torch.Tensor, want, atol: float = 1e-5) -> None:
 
 
 def test_16_bit_grey_textures(tmp_path):
-    quad, grey = Quad(pbrMetallicRoughness={}), noise(4, 4, dtype=np.uint16)
-    quad.material()["pbrMetallicRoughness"]["metallicRoughnessTexture"] = quad.texture(grey)
+    quad, gray = Quad(pbrMetallicRoughness={}), noise(4, 4, dtype=np.uint16)
+    quad.material()["pbrMetallicRoughness"]["metallicRoughnessTexture"] = quad.texture(gray)
     asset, notes = quad.read(tmp_path)
-    near(asset.textures.roughness, grey / np.float32(65535), 1e-6)
-    near(asset.textures.metallic, grey / np.float32(65535), 1e-6)
+    near(asset.textures.roughness, gray / np.float32(65535), 1e-6)
+    near(asset.textures.metallic, gray / np.float32(65535), 1e-6)
     assert not notes
 
 

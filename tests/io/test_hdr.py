@@ -199,16 +199,16 @@ def test_exr_of_other_writers_reads(tmp_path, options, dtype):
 
 
 def test_grey_and_cleaned_pixels(tmp_path):
-    grey = np.ones((8, 16), np.float32)
-    grey[0, :3] = (np.inf, -2.0, 5e5)
-    with OpenEXR.File({"type": OpenEXR.scanlineimage}, {"Y": grey}) as file:
+    gray = np.ones((8, 16), np.float32)
+    gray[0, :3] = (np.inf, -2.0, 5e5)
+    with OpenEXR.File({"type": OpenEXR.scanlineimage}, {"Y": gray}) as file:
         file.write(str(tmp_path / "a.exr"))
     notes: list[str] = []
     image = read_hdr_image(tmp_path / "a.exr", notes=notes)
     assert image[0, :3, 2].tolist() == [HALF_MAX, 0.0, 5e5]
     assert notes == ["a.exr: 3 infinite values set to 65504, 3 negative to 0"]
-    grey[0, 0] = np.nan
-    with OpenEXR.File({"type": OpenEXR.scanlineimage}, {"Y": grey}) as file:
+    gray[0, 0] = np.nan
+    with OpenEXR.File({"type": OpenEXR.scanlineimage}, {"Y": gray}) as file:
         file.write(str(tmp_path / "a.exr"))
     with pytest.raises(InputError, match="NaN at 1 pixels"):
         read_hdr_image(tmp_path / "a.exr")

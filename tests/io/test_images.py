@@ -30,9 +30,9 @@ def test_straight_alpha_and_the_colour_under_it_are_kept(tmp_path, name, options
 
 
 def test_grey_palette_and_cmyk_come_out_as_colour(tmp_path):
-    grey, alpha = read_image(saved(tmp_path, Image.fromarray(NOISE[..., 0]), "grey.png"))
+    gray, alpha = read_image(saved(tmp_path, Image.fromarray(NOISE[..., 0]), "grey.png"))
     assert alpha is None
-    assert torch.equal((grey * 255).round().byte(), torch.from_numpy(NOISE[..., :1]).expand(-1, -1, 3))
+    assert torch.equal((gray * 255).round().byte(), torch.from_numpy(NOISE[..., :1]).expand(-1, -1, 3))
     flat = Image.fromarray(np.repeat(NOISE[:1, :5, :3], 7, 0))
     palette, alpha = read_image(saved(tmp_path, flat.quantize(8), "palette.png"))
     assert alpha is None

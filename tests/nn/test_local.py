@@ -187,8 +187,8 @@ def test_pixels_start_as_what_they_show(model):
     _, _, c2w, intrinsics = sphere(4)
     camera = Camera(c2w, intrinsics / 2, 32, 32)
     maps = PixelMaps.of(torch.zeros(4, 32, 32, 12), torch.zeros(4, 16, 16, 2), camera, torch.tensor(0.0))
-    centre = maps.normal[:, 15:17, 15:17].mean((1, 2))
-    torch.testing.assert_close(normalize(centre, dim=-1), c2w[:, :3, 2], rtol=0, atol=1e-3)  # +Z of a camera looks back
+    center = maps.normal[:, 15:17, 15:17].mean((1, 2))
+    torch.testing.assert_close(normalize(center, dim=-1), c2w[:, :3, 2], rtol=0, atol=1e-3)  # +Z of a camera looks back
     assert float(maps.shift.abs().max()) == 0.0 and float(maps.gain.min()) == pytest.approx(0.8808, abs=1e-4)
     assert float(maps.chroma.min()) == float(maps.chroma.max()) == 1.0
 
@@ -205,9 +205,9 @@ def test_base_color_does_not_follow_the_exposure():
     one, two = (PixelMaps.of(raw, span, camera, mean_logit(c, mask)).base_logit(c) for c in (color, brighter))
     torch.testing.assert_close(one, two, rtol=0, atol=1e-4)  # float32 logits
     maps = PixelMaps.of(0 * raw, span, camera, mean_logit(color, mask))
-    grey = color.logit().mean(-1, keepdim=True)
+    gray = color.logit().mean(-1, keepdim=True)
     torch.testing.assert_close(
-        maps.base_logit(color), color.logit() - grey + 0.8808 * (grey - mean_logit(color, mask)), rtol=0, atol=1e-3
+        maps.base_logit(color), color.logit() - gray + 0.8808 * (gray - mean_logit(color, mask)), rtol=0, atol=1e-3
     )  # the gain has four digits here
 
 

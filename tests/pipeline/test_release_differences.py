@@ -125,11 +125,11 @@ def test_environment_lookups_meet_texel_centres_and_wrap(goldens):
     twin = release_lookup(radiance, torch.from_numpy(data["direction"]))
     torch.testing.assert_close(twin, stored, rtol=1e-4, atol=1e-5)  # this is what the release does
     ours = from_published(radiance)
-    environment, centres = Environment(ours), lat_long_directions(64).reshape(-1, 3).contiguous()
+    environment, centers = Environment(ours), lat_long_directions(64).reshape(-1, 3).contiguous()
     texels = ours.reshape(-1, 3)
     scale = float(texels.std())
-    assert (environment.lookup(centres) - texels).abs().max() < 1e-3 * scale  # 1e-7 of u times 128 texels
-    assert (release_lookup(radiance, centres) - texels).abs().mean() > 1e-2 * scale
+    assert (environment.lookup(centers) - texels).abs().max() < 1e-3 * scale  # 1e-7 of u times 128 texels
+    assert (release_lookup(radiance, centers) - texels).abs().mean() > 1e-2 * scale
     seam = torch.tensor([[1e-5, 0.2, 1.0], [-1e-5, 0.2, 1.0]])  # both sides of +Z
     seam = normalize(seam, dim=-1)
     ramp = torch.arange(128.0).cos()[None, :, None].expand(64, 128, 3).contiguous()

@@ -25,9 +25,9 @@ EYES = [(0.3, 0.9, 2.4), (2.3, 0.4, -0.8), (1.9, 1.2, 1.4), (0.2, -0.3, -2.2)]  
 
 def depth_in_balls(points):
     """Positive inside the union, negative outside, ``(N,)``."""
-    centres = torch.tensor([c for c, _ in BALLS])
+    centers = torch.tensor([c for c, _ in BALLS])
     radii = torch.tensor([r for _, r in BALLS])
-    return (radii - (points[:, None] - centres).norm(dim=-1)).amax(1)
+    return (radii - (points[:, None] - centers).norm(dim=-1)).amax(1)
 
 
 @pytest.fixture(scope="module")
@@ -38,9 +38,9 @@ def views():
     masks, images = [], []
     for o, d in zip(origin, direction):
         nearest, shade = torch.full((SIZE, SIZE), -1.0), torch.full((SIZE, SIZE), 0.5)
-        for centre, radius in BALLS:
-            along = ((torch.tensor(centre) - o) * d).sum(-1)
-            away = (torch.tensor(centre) - o - along[..., None] * d).norm(dim=-1)
+        for center, radius in BALLS:
+            along = ((torch.tensor(center) - o) * d).sum(-1)
+            away = (torch.tensor(center) - o - along[..., None] * d).norm(dim=-1)
             clear = (radius - away) * camera.intrinsics[0, 0] / along
             shade = torch.where(clear > nearest, 0.4 + 0.5 * (1 - away / radius).clamp(0, 1), shade)
             nearest = torch.maximum(nearest, clear)

@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 
 from reli3d import kernels
-from reli3d.kernels.cache import initialise
+from reli3d.kernels.cache import initialize
 
 FOUND = [importlib.import_module(f"{kernels.__name__}.{info.name}") for info in pkgutil.iter_modules(kernels.__path__)]
 MODULES = {module.__name__.rpartition(".")[2]: module for module in FOUND if wp.get_module(module.__name__).kernels}
@@ -16,7 +16,7 @@ MODULES = {module.__name__.rpartition(".")[2]: module for module in FOUND if wp.
 @pytest.mark.slow
 @pytest.mark.parametrize("name", MODULES)
 def test_kernels_compile_for_cuda(tmp_path, name):
-    initialise()
+    initialize()
     module = wp.get_module(MODULES[name].__name__)
     wp.compile_aot_module(module, arch=90, module_dir=tmp_path, use_ptx=True)
     (text,) = (path.read_text() for path in tmp_path.glob("*.ptx"))

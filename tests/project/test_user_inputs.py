@@ -128,8 +128,8 @@ def test_points_take_numbers_of_any_kind_and_numpy_arrays():
     position = np.random.default_rng(0).random((5, 3), dtype=np.float32)
     normal = np.array([0.0, 0.0, 1.0], np.float32)
     want = SurfacePoints(*map(torch.from_numpy, (position, normal, normal)), torch.full((5, 3), 0.5), 0.25, 0.0)
-    for grey in (0.5, np.float32(0.5), torch.tensor(0.5), torch.tensor([0.5]), np.array([[0.5]], np.float32)):
-        got = SurfacePoints(position, normal, normal, grey, np.float32(0.25), torch.tensor([0.0]))
+    for gray in (0.5, np.float32(0.5), torch.tensor(0.5), torch.tensor([0.5]), np.array([[0.5]], np.float32)):
+        got = SurfacePoints(position, normal, normal, gray, np.float32(0.25), torch.tensor([0.0]))
         assert all(torch.equal(getattr(got, f), getattr(want, f)) for f in vars(want))
     light = Environment(torch.ones(4, 8, 3))
     assert torch.equal(shade(want, normal, light), shade(want, torch.from_numpy(normal), light))

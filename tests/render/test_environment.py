@@ -110,8 +110,8 @@ def test_samples_fall_on_texels_as_their_density_says(device, name):
         (torch.arange(width, device=device) + 0.5) / width,
         indexing="ij",
     )
-    centres = grid.at(y.reshape(-1).double(), x.reshape(-1).double())[0].float()
-    assert torch.equal(env.pdf(centres).reshape(height, width), env.table.density)  # exactly 0 where nothing is lit
+    centers = grid.at(y.reshape(-1).double(), x.reshape(-1).double())[0].float()
+    assert torch.equal(env.pdf(centers).reshape(height, width), env.table.density)  # exactly 0 where nothing is lit
 
 
 @pytest.mark.parametrize("name", maps())

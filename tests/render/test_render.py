@@ -39,8 +39,8 @@ def test_rays_and_projection_are_inverse(device):
     torch.testing.assert_close(pixels.cpu(), torch.stack([xs, ys], -1), rtol=0, atol=2e-4)
     cos = (directions * -camera.c2w[:3, 2]).sum(-1)
     torch.testing.assert_close(depth, 3.0 * cos, rtol=1e-5, atol=0)
-    centre, _ = project(torch.zeros(3, device=device), camera.c2w, camera.intrinsics)
-    torch.testing.assert_close(centre.cpu(), torch.tensor([17.0, 21.0]), rtol=0, atol=1e-4)  # looks at the origin
+    center, _ = project(torch.zeros(3, device=device), camera.c2w, camera.intrinsics)
+    torch.testing.assert_close(center.cpu(), torch.tensor([17.0, 21.0]), rtol=0, atol=1e-4)  # looks at the origin
     with pytest.raises(ValueError, match=r"intrinsics: expected shape \(..., 4\)"):
         Camera(torch.zeros(8, 4, 4), torch.zeros(8, 3), 4, 4)
     with pytest.raises(ValueError, match="c2w: expected"):

@@ -182,7 +182,7 @@ def test_render_equals_mitsubas_sensor_textures_and_light(device):
     mesh = mitsuba_scene.smooth_mesh(mi, m.vertices, m.faces, m.normals, bsdf, m.uv)
     world = mi.load_dict({"type": "scene", "light": mitsuba_scene.environment(mi, environment.radiance), "mesh": mesh})
     sensor = mitsuba_scene.sensor(mi, eye, target, fov, fine * width, fine * height)
-    origins, directions = mitsuba_scene.rays_through_pixel_centres(mi, sensor)
+    origins, directions = mitsuba_scene.rays_through_pixel_centers(mi, sensor)
     si = world.ray_intersect(mi.Ray3f(*(mi.Vector3f(v.numpy().T) for v in (origins, directions))))
     hit, cos = np.array(si.is_valid()), np.array(si.wi.z)
     count = runs_for(hit.sum())

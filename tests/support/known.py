@@ -33,7 +33,7 @@ from tests.support.misread import Case, check
 SIDE = 48
 
 
-def disc(rng: Random, side: int = SIDE, scale: int = 8) -> np.ndarray:
+def disk(rng: Random, side: int = SIDE, scale: int = 8) -> np.ndarray:
     """Coverage ``(side, side)`` in [0, 1] of a random disc, antialiased."""
     n = side * scale
     y, x = np.mgrid[:n, :n] + 0.5
@@ -95,11 +95,11 @@ def masks(rng: Random) -> Case:
     suffix = rng.choice([".png", ".png.png"])
     files, truth, frames = {}, {}, []
     for k, pose in enumerate(rotations(rng, 3)):
-        soft = disc(rng)
+        soft = disk(rng)
         hard = soft > 0.5
         name, image = f"images/{k:03d}.png", picture(rng)
-        grey = {"white": 255 * hard, "soft": np.rint(255 * soft), "two labels": np.where(hard, label, 0)}
-        mask: np.ndarray | Image.Image = grey.get(kind, label * hard).astype(np.uint8)
+        gray = {"white": 255 * hard, "soft": np.rint(255 * soft), "two labels": np.where(hard, label, 0)}
+        mask: np.ndarray | Image.Image = gray.get(kind, label * hard).astype(np.uint8)
         if kind == "two labels":
             mask[:, SIDE // 2 :] = np.where(hard, (label + 97) % 200 + 20, 0)[:, SIDE // 2 :]
         if kind == "palette":
@@ -130,7 +130,7 @@ def names(rng: Random) -> Case:
     for k, pose in enumerate(rotations(rng, 2 * len(folders))):
         stem = f"{k:06d}" if layout == "flat and unique" else f"{k // len(folders):06d}"
         part = f"{folders[k % len(folders)]}/{stem}"
-        mask = disc(rng) > 0.5
+        mask = disk(rng) > 0.5
         name = f"images/{part}.jpg" if layout == "below images" else f"{part}.png"
         image = Image.open(io.BytesIO(picture(rng)))
         data = io.BytesIO()
@@ -170,12 +170,12 @@ def spelled(rng: Random, width: int, height: int) -> tuple[dict, list[float]]:
     size = {"w": width, "h": height}
     angle = [2 * math.atan(0.5 * side / f) for side, f in ((width, fx), (height, fy))]
     matrix = [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]
-    centre = {"cx": cx, "cy": cy}
+    center = {"cx": cx, "cy": cy}
     lenses = [
-        {"fl_x": fx, "fl_y": fy, **centre, **size},
-        {"fx": fx, "fy": fy, **centre, **size},
-        {"camera_angle_x": angle[0], "camera_angle_y": angle[1], **centre, **size},
-        {"x_fov": math.degrees(angle[0]), "y_fov": math.degrees(angle[1]), **centre, **size},
+        {"fl_x": fx, "fl_y": fy, **center, **size},
+        {"fx": fx, "fy": fy, **center, **size},
+        {"camera_angle_x": angle[0], "camera_angle_y": angle[1], **center, **size},
+        {"x_fov": math.degrees(angle[0]), "y_fov": math.degrees(angle[1]), **center, **size},
         {"camera_fov": angle, "camera_principal_point": [cx, cy]},
         {"intrinsics": matrix, **size},
         {"K": matrix, **size},

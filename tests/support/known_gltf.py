@@ -113,9 +113,9 @@ def quad(rng: Random) -> tuple[bytes, Look]:
         pbr["metallicRoughnessTexture"] = texture(Image.new("RGB", (4, 4), (rng.randrange(256), rough, metal)))
         roughness, metallic = rough / 255, metal / 255
     else:
-        grey = rng.randrange(8000, 65536)
-        pbr["metallicRoughnessTexture"] = texture(Image.fromarray(np.full((4, 4), grey, np.uint16)))
-        roughness = metallic = grey / 65535
+        gray = rng.randrange(8000, 65536)
+        pbr["metallicRoughnessTexture"] = texture(Image.fromarray(np.full((4, 4), gray, np.uint16)))
+        roughness = metallic = gray / 65535
     vertex = np.ones(3)
     if rng.random() < 0.4:
         vertex = np.array([rng.choice((0.2, 0.4, 0.6, 0.8, 1.0)) for _ in range(3)])

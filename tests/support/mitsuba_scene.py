@@ -66,7 +66,7 @@ def sensor(mi, eye, target, fov_x: float, width: int, height: int):
     return mi.load_dict({"type": "perspective", "fov": math.degrees(fov_x), "to_world": pose, "film": film})
 
 
-def rays_through_pixel_centres(mi, sensor):
+def rays_through_pixel_centers(mi, sensor):
     """The sensor's own rays, row by row from the top: origins and directions ``(H W, 3)``."""
     width, height = (int(v) for v in sensor.film().size())
     y, x = np.meshgrid((np.arange(height) + 0.5) / height, (np.arange(width) + 0.5) / width, indexing="ij")

@@ -92,8 +92,8 @@ def ball(device, subdivisions: int = 2, radius: float = 0.5) -> tuple[Tensor, Te
 
 
 def corners(count: int) -> Tensor:
-    centre = uniform(count, 1, 3, seed=1, low=-1.0)
-    return (centre + 0.3 * torch.randn(count, 3, 3, generator=rng(2), **HOST)).reshape(-1, 3)
+    center = uniform(count, 1, 3, seed=1, low=-1.0)
+    return (center + 0.3 * torch.randn(count, 3, 3, generator=rng(2), **HOST)).reshape(-1, 3)
 
 
 def soup(vertices: Tensor, n: int) -> tuple[Tensor, Tensor]:
@@ -203,7 +203,7 @@ def grid_inputs(_, shape=(7, 6, 8), seed: int = 3) -> dict[str, Tensor]:
 
 
 def surface(sdf, deformation, alpha, beta, gamma):
-    mesh = extract_surface(sdf, radius=0.8, deformation=deformation, alpha=alpha, beta=beta, gamma=gamma, centre=True)
+    mesh = extract_surface(sdf, radius=0.8, deformation=deformation, alpha=alpha, beta=beta, gamma=gamma, center=True)
     return mesh.vertices, mesh.faces
 
 

@@ -31,8 +31,8 @@ def make(vertices, faces, backend, device):
 def soup(seed, count=60):
     """Vertices and faces of triangles at random places, none joined."""
     rng = np.random.default_rng(seed)
-    centre = rng.uniform(-1, 1, (count, 1, 3))
-    vertices = (centre + rng.normal(0, 0.3, (count, 3, 3))).reshape(-1, 3).astype(np.float32)
+    center = rng.uniform(-1, 1, (count, 1, 3))
+    vertices = (center + rng.normal(0, 0.3, (count, 3, 3))).reshape(-1, 3).astype(np.float32)
     return vertices, np.arange(3 * count, dtype=np.int32).reshape(-1, 3)
 
 

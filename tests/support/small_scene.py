@@ -27,8 +27,8 @@ def ball(radius: float = 0.8, cells: int = 24, squeeze: float = 1.0) -> Asset:
     sdf = (points / torch.tensor([1.0, squeeze, 1.0])).norm(dim=-1) - radius
     mesh = unwrap(extract_surface(sdf, radius=1.0).with_normals(), texture_size=TEXELS)
     mesh = replace(mesh, tangents=vertex_tangents(mesh))
-    grey = srgb_to_linear(torch.full((TEXELS, TEXELS, 3), 0.6))
-    return Asset(mesh, TextureSet(grey, 0.6, 0.1), Environment(torch.full((16, 32, 3), 0.5)))
+    gray = srgb_to_linear(torch.full((TEXELS, TEXELS, 3), 0.6))
+    return Asset(mesh, TextureSet(gray, 0.6, 0.1), Environment(torch.full((16, 32, 3), 0.5)))
 
 
 def sky() -> Environment:

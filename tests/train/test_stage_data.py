@@ -81,8 +81,8 @@ def test_a_capture_is_cropped_centred_and_scaled_and_knows_where_its_photograph_
         for v in range(3):
             rows, columns = (views.masks[v] > 0.5).nonzero().unbind(1)
             assert abs(float(rows.float().mean()) + 0.5 - 16) < 1.5 and abs(float(columns.float().mean()) - 15.5) < 1.5
-            centre, depth = project(torch.zeros(1, 3), views.c2w[v], views.intrinsics[v])
-            assert float((centre - 16).abs().max()) < 2.5  # the hull of three views lies about the object
+            center, depth = project(torch.zeros(1, 3), views.c2w[v], views.intrinsics[v])
+            assert float((center - 16).abs().max()) < 2.5  # the hull of three views lies about the object
             width = float((views.masks[v] > 0.5).any(0).sum()) / float(views.intrinsics[v, 0]) * float(depth)
             assert 0.7 < width < 1.1  # longest side of the hull 1, the ball in it a little less
     valid = views.valid

@@ -110,16 +110,16 @@ def test_the_weight_of_quads_moves_their_centres(one, monkeypatch):
     last = model.merger.mlp[-1]
     weight = last.weight.detach().clone()
 
-    def centres(row: torch.Tensor) -> torch.Tensor:
+    def centers(row: torch.Tensor) -> torch.Tensor:
         values = torch.cat([weight[:20], row[None]])
         monkeypatch.setattr(last, "forward", lambda x: torch.nn.functional.linear(x, values, last.bias))
         vertices = surface(model, code, 16).mesh.vertices
         return (vertices * torch.randn(vertices.shape, generator=torch.Generator().manual_seed(1))).sum()
 
     row, direction = weight[20].clone().requires_grad_(), torch.ones(weight.shape[1])
-    (slope,) = torch.autograd.grad(centres(row), row)
+    (slope,) = torch.autograd.grad(centers(row), row)
     # float32 positions summed: 1e-6, of a difference of 2e-3; gamma is far from where its sigmoid bends
-    assert float(slope @ direction) == pytest.approx(difference(centres, row.detach(), direction, 100.0), rel=0.02)
+    assert float(slope @ direction) == pytest.approx(difference(centers, row.detach(), direction, 100.0), rel=0.02)
     assert float(slope @ direction) != 0.0
 
 

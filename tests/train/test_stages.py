@@ -231,9 +231,9 @@ def test_latents_are_compared_as_the_decoder_gets_them(one):
 
 def test_light_without_colour_is_neutral(one):
     bare = replace(one.inputs, latent=None)
-    grey = torch.rand(50, 1, generator=torch.Generator().manual_seed(0)).expand(50, 3)
+    gray = torch.rand(50, 1, generator=torch.Generator().manual_seed(0)).expand(50, 3)
     eye, none = torch.eye(3), torch.zeros(())
-    assert float(light_terms(torch.zeros(9, 3), eye, none, grey, bare)["neutral"]) < 1e-6
+    assert float(light_terms(torch.zeros(9, 3), eye, none, gray, bare)["neutral"]) < 1e-6
     red = torch.tensor([[1.5, 0.75, 0.75]])  # mean 1; off by 0.5, 0.25, 0.25
     assert float(light_terms(torch.zeros(9, 3), eye, none, red, bare)["neutral"]) == pytest.approx(1 / 3, rel=1e-5)
 

@@ -108,8 +108,8 @@ def test_the_pattern_loss_forgives_exposure_and_nothing_else():
 def test_half_an_error_counts_as_much_on_a_plain_object_as_on_a_patterned_one():
     for amount in (0.1, 0.2):  # of stripes without a factor, on grey
         stripes = amount * torch.tensor([1.0, -1.0]).repeat(250)[:, None].expand(-1, 3)
-        grey = torch.full((500, 3), 0.5)
-        whole, half = (float(pattern_loss(grey + k * stripes, grey)) for k in (1.0, 0.5))
+        gray = torch.full((500, 3), 0.5)
+        whole, half = (float(pattern_loss(gray + k * stripes, gray)) for k in (1.0, 0.5))
         assert 0.7 * math.log(4.0) < whole - half < 1.1 * math.log(4.0), amount  # PLAIN takes a quarter at 0.1
 
 

@@ -95,8 +95,8 @@ def test_the_picture_is_drawn_for_right_and_wrong_cameras(tmp_path, change):
     rig_picture(replace(views, c2w=change(views.c2w)), tmp_path / "rig.png")
     bitmap = Image.open(tmp_path / "rig.png")
     assert bitmap.width > 1000
-    colours = {c for _, c in bitmap.getcolors(1 << 20)}
-    assert {(214, 39, 40), (0, 200, 0)} <= colours  # the last frustum and the outline of a mask
+    colors = {c for _, c in bitmap.getcolors(1 << 20)}
+    assert {(214, 39, 40), (0, 200, 0)} <= colors  # the last frustum and the outline of a mask
     assert [p.name for p in tmp_path.iterdir()] == ["rig.png"]
 
 

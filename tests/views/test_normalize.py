@@ -84,7 +84,7 @@ def test_the_hull_of_many_views_is_the_object(spheres, low, high):
 
 
 @pytest.mark.parametrize(
-    "count, scale, centre",
+    "count, scale, center",
     [
         (1, 1.0, (0, 0, 0)),
         (1, 40.0, (0, 0, 0)),
@@ -95,12 +95,12 @@ def test_the_hull_of_many_views_is_the_object(spheres, low, high):
         (8, 0.01, (0.02, 0.1, 0)),
     ],
 )
-def test_an_object_anywhere_is_centred_and_scaled(count, scale, centre):
+def test_an_object_anywhere_is_centred_and_scaled(count, scale, center):
     """A ball of diameter 1.  One view finds its middle if it is the point of the ray nearest to the origin."""
-    centre = torch.tensor(centre, dtype=torch.float64)
-    views = sphere_views(BALL, count).transformed(Similarity(scale, torch.eye(3, dtype=torch.float64), centre))
+    center = torch.tensor(center, dtype=torch.float64)
+    views = sphere_views(BALL, count).transformed(Similarity(scale, torch.eye(3, dtype=torch.float64), center))
     similarity = normalize(views, "hull")
-    middle = similarity.apply(centre)
+    middle = similarity.apply(center)
     radius = similarity.scale * 0.5 * scale
     # the hull of a few views of a ball exceeds it by up to 30 % (the limiting ball), mostly by its grid
     assert 0.5 / 1.35 < radius < 0.53

@@ -46,7 +46,7 @@ def saver(mode, ending, **options):
     return lambda path: Image.fromarray(SHADES).convert(mode).save(path.with_suffix(ending), **options)
 
 
-def grey(k):
+def gray(k):
     return lambda v: np.repeat(v[..., k : k + 1], 3, -1)
 
 
@@ -56,8 +56,8 @@ ACCEPTED = {
     "8-bit colour, TIFF": (saver("RGB", ".tif"), lambda v: v[..., :3], 0),
     "8-bit colour with alpha": (saver("RGBA", ".png"), lambda v: v[..., :3], 0),
     "8-bit colour with alpha, WebP": (saver("RGBA", ".webp", lossless=True, exact=True), lambda v: v[..., :3], 0),
-    "8-bit grey": (lambda p: Image.fromarray(SHADES[..., 0]).save(p), grey(0), 0),
-    "1-bit": (lambda p: Image.fromarray(SHADES[..., 0] > 99).save(p), lambda v: (grey(0)(v) > 99) * 255, 0),
+    "8-bit grey": (lambda p: Image.fromarray(SHADES[..., 0]).save(p), gray(0), 0),
+    "1-bit": (lambda p: Image.fromarray(SHADES[..., 0] > 99).save(p), lambda v: (gray(0)(v) > 99) * 255, 0),
     "16-bit grey": (lambda p: Image.fromarray(DEEP[..., 0]).save(p), lambda v: DEEP[..., :1] / 257.0, 0),
     "16-bit colour": (lambda p: deep_png(p, DEEP[..., :3]), lambda v: v[..., :3], 1),  # the low byte is dropped
     "16-bit colour with alpha": (lambda p: deep_png(p, DEEP), lambda v: v[..., :3], 1),

@@ -44,8 +44,8 @@ def test_a_render_is_prepared_as_published(goldens, shared_data):
     assert np.abs(images[:, ::16, ::16] - golden["image_stride16"][0]).max() < ROUNDING
     assert np.abs(images[0, 256] - golden["image_view0_row256"]).max() < ROUNDING
     assert np.abs(images.mean((1, 2), dtype=np.float64) - golden["image_mean"][0]).max() < 1e-6  # a float32 mean
-    grey = torch.lerp(torch.full_like(batch.images, 0.5), batch.images, batch.masks[..., None]).numpy()
-    assert np.abs(grey[:, ::16, ::16] - golden["image_bg_stride16"][0]).max() < ROUNDING
+    gray = torch.lerp(torch.full_like(batch.images, 0.5), batch.images, batch.masks[..., None]).numpy()
+    assert np.abs(gray[:, ::16, ::16] - golden["image_bg_stride16"][0]).max() < ROUNDING
     assert np.abs(batch.c2w.numpy() - golden["c2w"][0]).max() < 1e-6  # reading makes rotations orthonormal again
     matrix = golden["intrinsics"][0]
     np.testing.assert_allclose(batch.intrinsics.numpy(), matrix[:, [0, 1, 0, 1], [0, 1, 2, 2]], rtol=1e-6)

@@ -19,7 +19,7 @@ let stop = null // the photograph whose camera is taken, or null
 let waiting = false
 
 // Layers that are no light: values of the maps as they are, normals in the world's axes.
-const layers = { 'base colour': 0, roughness: 1, metallic: 2, normal: 3 }
+const layers = { 'base color': 0, roughness: 1, metallic: 2, normal: 3 }
 const VERTEX = `
 attribute vec4 tangent;
 varying vec2 at;
@@ -119,7 +119,7 @@ function later() {
   requestAnimationFrame(() => { waiting = false; draw() })
 }
 
-// A map of more columns, bilinear between texel centres as our renderer has it; half floats in and out.
+// A map of more columns, bilinear between texel centers as our renderer has it; half floats in and out.
 function finer({ width, height, data: half }) {
   const scale = Math.max(1, Math.round(FINE / width)), w = width * scale, h = height * scale
   const linear = Float32Array.from(half, T.DataUtils.fromHalfFloat), out = new Uint16Array(4 * w * h)

@@ -21,11 +21,11 @@ class Weights:
     image: float = 10.0  # mean square difference of display values
     perceptual: float = 2.0  # LPIPS, or what stands in for it
     mask: float = 10.0  # cross-entropy of the volume's opacity; of a surface: mean square difference, not in the paper
-    material: float = 10.0  # mean square difference of base colour, roughness, metallic
+    material: float = 10.0  # mean square difference of base color, roughness, metallic
     normal: float = 4.0  # one minus the cosine
     flat: float = 0.05  # bump normals off the surface's own
     latent: float = 0.1  # mean square difference of RENI++ latents
-    neutral: float = 0.02  # colour of the light, where its latents are not known
+    neutral: float = 0.02  # color of the light, where its latents are not known
     deviation: float = 0.5  # FlexiCubes' own example: distances of a dual vertex from its crossings
     sign: float = 0.2  # the same: sign changes that nothing asks for
     spread: float = 0.1  # the same: weights away from 1

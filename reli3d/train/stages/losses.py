@@ -34,7 +34,7 @@ def shown_colors(picture: Picture, target: ObjectViews, view: int) -> tuple[Tens
 
 
 def gradients(got: Tensor, want: Tensor) -> Tensor:
-    """Mean absolute difference of neighbours' differences of ``(H, W, 3)`` at several scales.
+    """Mean absolute difference of neighbors' differences of ``(H, W, 3)`` at several scales.
 
     It stands in for LPIPS where that has no weights: like it, it asks for edges in their place and forgives what is
     even; it knows nothing of what pictures mean.
@@ -124,7 +124,7 @@ def map_terms(picture: Picture, target: ObjectViews, view: int) -> dict[str, Ten
 
 def light_terms(latent: Tensor, rotation: Tensor, strength: Tensor, radiance: Tensor, target: ObjectViews) -> dict:
     """Of the light: latents as they are decoded, turned by the predicted rotation, and the strength; without their
-    truth the colour of the light.
+    truth the color of the light.
 
     latent: ``(L, 3)``.  rotation: ``(3, 3)``.  strength: ``()``.  radiance: ``(K, 3)`` spread evenly over the sphere.
     The prior is equivariant to turns, so latents and a rotation are one and the same light as the turned latents.

@@ -20,7 +20,7 @@ class Picture:
     """One view of ``H`` by ``W`` pixels.
 
     color: ``(H, W, 3)`` display values times coverage, above 1 where the surface is brighter than white.  cover:
-    ``(H, W)``.  known: ``(H, W)`` 1 where the maps have values, else 0.  material: ``(H, W, 5)`` base colour (sRGB),
+    ``(H, W)``.  known: ``(H, W)`` 1 where the maps have values, else 0.  material: ``(H, W, 5)`` base color (sRGB),
     roughness, metallic.  normal: ``(H, W, 3)`` of shading, world, unit.
     bump: ``(N, 3)`` tangent-space normals that were asked for, of the pixels that show something.
     """

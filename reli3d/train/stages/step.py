@@ -93,7 +93,7 @@ def object_losses(
         for name, value in found.items():
             of_views.setdefault(name, []).append(value)
     terms = {**terms, **{name: torch.stack(values).mean() for name, values in of_views.items()}}
-    light = lobes(model, code, 64).amplitude  # 64 directions tell the colour of a light
+    light = lobes(model, code, 64).amplitude  # 64 directions tell the color of a light
     return {**terms, **losses.light_terms(code.latent[0], code.rotation[0], code.strength[0], light, drawn.inputs)}
 
 

@@ -36,7 +36,7 @@ CHUNK = 1 << 16  # grid points whose features are held at once; those of a chunk
 class Surface:
     """The surface of one object and what rays need to see it.
 
-    terms: FlexiCubes' regularisers, by name.
+    terms: FlexiCubes' regularizers, by name.
     """
 
     mesh: Mesh
@@ -99,7 +99,7 @@ def surface(model: Reconstructor, code: Code, resolution: int) -> Surface | None
     offset = torch.zeros_like(points).index_copy(0, at, deformation(raw["deformation"], resolution))
     merged = model.merger(raw["flexicubes"].index_select(0, row[corners].reshape(-1)).view(len(cubes), 8, -1))
     weights = {"deformation": offset.view(*level.shape, 3), "alpha": merged.alpha, "beta": merged.beta}
-    made = extract_surface(level, radius=radius, gamma=merged.gamma, cubes=cubes, centre=True, **weights)
+    made = extract_surface(level, radius=radius, gamma=merged.gamma, cubes=cubes, center=True, **weights)
     mesh = Mesh(made.vertices, made.faces, vertex_normals(made.vertices, made.faces))
     terms = {
         "deviation": vertex_deviation(level, radius=radius, cubes=cubes, **weights).mean(),

@@ -32,7 +32,7 @@ class ObjectViews:
     intrinsics: Tensor  # (V, 4) pixels
     background: bool  # whether there is a photograph outside the masks
     valid: Tensor | None = None  # (V, S, S) 1 where the pixel lies in the photograph; None: everywhere
-    material: Tensor | None = None  # (V, S, S, 5) base colour (sRGB), roughness, metallic
+    material: Tensor | None = None  # (V, S, S, 5) base color (sRGB), roughness, metallic
     normal: Tensor | None = None  # (V, S, S, 3) world, unit
     shown: Tensor | None = None  # (V, S, S) 1 where material and normal are known
     latent: Tensor | None = None  # (L, 3) RENI++ latents of the light

@@ -16,7 +16,7 @@ STD = 0.02  # truncated normal of transformer weights
 OUTSIDE = 2.0  # raw density below the surface's at the start: every point outside, probability about 0.12
 
 
-def initialise(model: nn.Module) -> None:
+def initialize(model: nn.Module) -> None:
     """Fill the parameters of a :class:`reli3d.nn.model.Reconstructor` in place, from torch's global generator.
 
     Linear weights are truncated normal; modulations start as the identity, outputs of residual branches are scaled
@@ -44,13 +44,13 @@ def initialise(model: nn.Module) -> None:
         elif isinstance(module, TwoStreamTransformer):
             nn.init.trunc_normal_(module.latent_init, std=STD)
         elif isinstance(module, Heads):
-            _initialise_heads(module, model.surface_density - OUTSIDE)
+            _initialize_heads(module, model.surface_density - OUTSIDE)
         elif isinstance(module, WeightMerger):
             _normal(module.mlp, 0.05)
         elif isinstance(module, PixelShuffleUpsampler):
             nn.init.normal_(module.upsample[-2].weight, std=1.0 / math.sqrt(module.upsample[-2].weight[0].numel()))
         elif isinstance(module, EnvironmentDecoder):
-            _initialise_reni(module)
+            _initialize_reni(module)
     for stream in (model.backbone, model.illumination.transformer):
         _shrink(
             [m.proj for m in stream.modules() if hasattr(m, "wq")]
@@ -73,7 +73,7 @@ def _normal(layers: nn.Sequential, std: float) -> None:
             nn.init.zeros_(layer.bias)
 
 
-def _initialise_heads(heads: Heads, density: float) -> None:
+def _initialize_heads(heads: Heads, density: float) -> None:
     for name, layers in heads.items():
         for layer in layers:
             if isinstance(layer, nn.Linear):
@@ -85,7 +85,7 @@ def _initialise_heads(heads: Heads, density: float) -> None:
     nn.init.constant_(heads["density"][-1].bias, density)
 
 
-def _initialise_reni(decoder: EnvironmentDecoder) -> None:
+def _initialize_reni(decoder: EnvironmentDecoder) -> None:
     """Torch's default for linear layers: the decoder's inputs are of order one and it has norms of its own."""
     for module in decoder.modules():
         if isinstance(module, nn.Linear):
