@@ -104,7 +104,10 @@ class SampleJob:
         if not self.wanted.held and rng.random() < LAMPS:
             light = with_lamps(light, rng)
         wanted = self.wanted
-        return synthesize(surface, light, rng, size=wanted.size, views=wanted.views, views_only=wanted.views_only)
+        known = bool(wanted.materials) or self._measured(seed)
+        return synthesize(
+            surface, light, rng, size=wanted.size, views=wanted.views, views_only=wanted.views_only, finish_known=known
+        )
 
     def _paper(self, seed: int, light: int) -> dict[str, Tensor]:
         import numpy as np

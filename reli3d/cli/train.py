@@ -22,7 +22,7 @@ SIDES = 64, 128, 256  # of the images of stage pixels
 CALIBRATED = 5  # views of a sample: four are input, one is compared
 OF_LOOP = ("steps", "minutes", "batch", "rate", "seed", "save_every", "tensorboard")
 OF_ALL = (*OF_LOOP, "weights", "validation", "export", "licence", "max_views", "bfloat16")
-OF_SMALL = ("points", "pyramid_rate", "maps")
+OF_SMALL = ("points", "pyramid_rate", "maps", "material_bins")
 OF_CONFIG = ("image_size", "patch", "targets", "lobes", "resolution", "samples", "shadows")  # of a StageConfig
 OF_PAPER = (*OF_CONFIG, "preset", "prior", "perceptual", "checkpointing", "shard", "device")
 
@@ -72,6 +72,12 @@ def parser() -> argparse.ArgumentParser:
         metavar="TIMES",
         help="of the 2D U-Net over --rate: 0.1 keeps what pixels taught",
     )
+    small.add_argument(
+        "--material-bins",
+        type=int,
+        metavar="N",
+        help="roughness and metallic of pixels are distributions over N values (8); default as in the weights",
+    )
     small.add_argument("--maps", type=Path, help="environment maps, .npz: half of the draws are relit under them")
     paper = p.add_argument_group("stages of the paper's network, and --image-size of pixels")
     paper.add_argument("--image-size", type=int, help="pixels of a side; of stage pixels 64 (default), 128 or 256")
@@ -101,6 +107,7 @@ def parsed(argv: list[str] | None) -> argparse.Namespace:
             raise InputError(f"--{name.replace('_', '-')}", f"expected none for stage {args.stage}; leave it out")
     check_ranges(args, steps=(0, 10**9), minutes=(1e-3, math.inf), batch=(1, 4096), rate=(1e-9, 10.0), seed=(0, 10**9))
     check_ranges(args, save_every=(1, 10**9), max_views=(1, 16), points=(2, 16384), pyramid_rate=(1e-6, 10.0))
+    check_ranges(args, material_bins=(2, 64))
     check_ranges(args, image_size=(8, 2048), patch=(0, 2048), targets=(1, 16), lobes=(1, 4096), resolution=(4, 256))
     check_folder(args.output)
     if "export" in args:
@@ -118,6 +125,7 @@ def given(args: argparse.Namespace, *names: str) -> dict[str, Any]:
 
 def small_stage(args: argparse.Namespace) -> Stage:
     """The stages pixels and small."""
+    from reli3d.nn.value_bins import with_bins
     from reli3d.synthetic.stored import check_samples
     from reli3d.train.pixels import for_small_pictures
     from reli3d.train.small import PixelStage, SmallStage
@@ -136,25 +144,31 @@ def small_stage(args: argparse.Namespace) -> Stage:
     side = getattr(args, "image_size", SIDES[0])
     if pixels and side not in SIDES:
         raise InputError("--image-size", f"expected {', '.join(map(str, SIDES))} for stage pixels, got {side}")
-    model = small_network(getattr(args, "weights", None))
+    model = small_network(getattr(args, "weights", None), args.output / "state.pt")
+    if "material_bins" in args:
+        model = with_bins(model, args.material_bins)
     finest = SIDES[::-1].index(side) if pixels else 0
     model = for_small_pictures(model, finest).train() if finest else model
     names = ("seed", "max_views", "points", "pyramid_rate", "bfloat16", "maps", "validation")
     return (PixelStage if pixels else SmallStage)(model, args.data, **given(args, *names))
 
 
-def small_network(start: str | None) -> LocalReconstructor:
-    """The small network with the weights of ``start``, or with random ones.  A checkpoint may lack the finer levels."""
+def small_network(start: str | None, resumed: Path) -> LocalReconstructor:
+    """The small network with the weights of ``start``, or with random ones.  A checkpoint may lack the finer levels.
+
+    resumed: the checkpoint that the run continues from if it exists; without ``start`` its preset is used.
+    """
     from reli3d.nn import weights
     from reli3d.nn.local import LocalReconstructor
-    from reli3d.nn.presets import SMALL
     from reli3d.train import checkpoint
     from reli3d.train.pixels import lacking, take_levels
 
     if start is None or start.endswith(".pt"):
-        model = LocalReconstructor(SMALL)
+        known = Path(start) if start else resumed
+        state = checkpoint.load(known) if known.exists() or start else {}
+        model = LocalReconstructor(checkpoint.small_preset(state))
         if start:
-            average = checkpoint.load(Path(start))["average"]
+            average = state["average"]
             checkpoint.check_shapes(Path(start), average, model, lacking(model.preset, average))
             take_levels(model, average)
         return model.train()

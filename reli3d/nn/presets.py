@@ -22,6 +22,7 @@ LIMITS = {  # inclusive; all other integers lie in 1 to MAX_SIZE
     "tokens": (2, MAX_SIZE),
     "view_width": (10, MAX_SIZE),  # nine of them are the numbers of summarize_views
     "side": (4, 256),
+    "material_bins": (1, 64),
     "height": (4, 512),
     "resolution": (4, 512),
     "image_size": (8, 4096),
@@ -144,6 +145,7 @@ class PyramidSizes(_Checked):
     widths: tuple[int, ...]  # channels at 1/2, 1/4, ... of the image
     features: int  # that leave it
     reading: int  # the finest levels, which read the image at their own resolution and predict
+    material_bins: int = 1  # values over which roughness and metallic are distributions; 1: single logits
 
     def __post_init__(self):
         super().__post_init__()

@@ -17,9 +17,14 @@ from reli3d.geometry.hull import hull_span
 from reli3d.nn.presets import PyramidSizes
 
 INPUTS = 9  # color times mask (3), mask, position in the world (2), depths of the hull along the ray (2), 1 / views
-PREDICTED = 12  # see PixelMaps
+OTHERS_BEFORE, BINNED, OTHERS_AFTER = 5, 2, 5  # predictions of a pixel, see PixelMaps: roughness, metallic have bins
 MIN_COVERAGE = 0.1  # of a pixel whose ray is intersected with the hull
 CLIP_RADIUS = 0.87  # of the sphere around the origin that clips the hull: circumscribes a cube of side 1
+
+
+def predicted_width(sizes: PyramidSizes) -> int:
+    """Number of predictions of a pixel."""
+    return OTHERS_BEFORE + BINNED * sizes.material_bins + OTHERS_AFTER
 
 
 def block(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
@@ -105,7 +110,8 @@ class ImagePyramid(nn.Module):
         self.across = nn.ModuleDict({k: nn.Conv2d(coarse, fine, 1) for k, (fine, coarse) in pairs.items()})
         self.up = nn.ModuleDict({k: block(fine, fine) for k, (fine, _) in pairs.items()})
         predicted = {
-            str(k): nn.Sequential(block(widths[k], widths[k]), nn.Conv2d(widths[k], PREDICTED, 1)) for k in reading
+            str(k): nn.Sequential(block(widths[k], widths[k]), nn.Conv2d(widths[k], predicted_width(sizes), 1))
+            for k in reading
         }
         self.says = nn.ModuleDict(predicted)
         if finest == 0:
@@ -120,7 +126,7 @@ class ImagePyramid(nn.Module):
     def forward(
         self, images: Tensor, masks: Tensor, place: Tensor, span: Tensor, counts: Sequence[int] | None = None
     ) -> tuple[Tensor | None, Tensor]:
-        """Features ``(V, S/4, S/4, F)``, None if ``finest`` > 0, and raw predictions ``(V, S/2, S/2, 12)`` of views.
+        """Features ``(V, S/4, S/4, F)``, None if ``finest`` > 0, and raw predictions ``(V, S/2, S/2, C)`` of views.
         Gradients reach every parameter.
 
         images: ``(V, S, S, 3)`` sRGB.  masks: ``(V, S, S)``.  place: ``(V, S, S, 2)`` from :func:`place_of_pixels`.

@@ -106,14 +106,18 @@ def synthesize(
     size: int = 192,
     views: int = 6,
     views_only: bool = False,
+    finish_known: bool = True,
 ) -> dict[str, Tensor]:
-    """One sample of an object under the lat-long map ``light`` ``(H, 2H, 3)``, turned by a random yaw.  views_only: as
-    in :func:`render_sample`.
+    """One sample of an object under the lat-long map ``light`` ``(H, 2H, 3)``, turned by a random yaw.
+
+    views_only: as in :func:`render_sample`.  finish_known: stored for each view, False if roughness and metallic of the
+    object are placeholders, as those of a scan are; training then leaves them out.
     """
     environment = Environment(torch.roll(light, int(rng.integers(light.shape[1])), 1).contiguous())
     c2w = torch.as_tensor(np.asarray(sample_cameras(rng, views)[0]), dtype=torch.float32)
     intrinsics = torch.stack([crop_camera(surface.vertices, m, size, rng.uniform(0.04, 0.12)) for m in c2w])
-    return render_sample(surface, environment, Camera(c2w, intrinsics, size, size), rng, views_only=views_only)
+    sample = render_sample(surface, environment, Camera(c2w, intrinsics, size, size), rng, views_only=views_only)
+    return {**sample, "finish_known": torch.full((views,), finish_known, dtype=torch.uint8)}
 
 
 def render_sample(

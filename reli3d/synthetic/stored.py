@@ -25,8 +25,10 @@ TENSORS = {
     "view_material": ("V S S 5", "U8"),
     "view_normal": ("V S S 3", "I8"),
     "view_depth": ("V S S", "F16"),
+    "finish_known": ("V", "U8"),
 }
 OF_POINTS = ("points", "distance", "surface", "material", "visible")  # not in samples of views alone
+OPTIONAL = ("finish_known",)  # not in samples of version 0.3, whose finish is taken as known
 
 
 def check_sample(path: str | os.PathLike, *, views: int = 1, points: bool = True) -> None:
@@ -45,7 +47,7 @@ def check_sample(path: str | os.PathLike, *, views: int = 1, points: bool = True
         ) from None
     sizes: dict[str, int] = {}
     for name, (axes, dtype) in TENSORS.items():
-        if name in OF_POINTS and not points:
+        if (name in OF_POINTS and not points) or (name in OPTIONAL and name not in found):
             continue
         shape, got = found.get(name, ((), None))
         wanted = axes.split()

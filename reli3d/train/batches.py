@@ -37,6 +37,13 @@ def random_turn(rng: np.random.Generator) -> Tensor:
     return torch.as_tensor(yaw, dtype=torch.float32)
 
 
+def finish_known(file: safe_open) -> Tensor:
+    """``(V,)`` bool of an open sample; of one that does not store it, all true."""
+    if "finish_known" in file.keys():  # noqa: SIM118 - no iterable
+        return file.get_tensor("finish_known").bool()
+    return torch.ones(file.get_slice("c2w").get_shape()[0], dtype=torch.bool)
+
+
 @dataclass(frozen=True)
 class Pictures:
     """``V`` views of ``S`` by ``S`` pixels, the truth for ``P = S/2``; float32."""
@@ -50,6 +57,7 @@ class Pictures:
     view_normal: Tensor  # (V, P, P, 3) world, unit
     view_depth: Tensor  # (V, P, P) from the world's origin along the camera's axis
     view_valid: Tensor  # (V, P, P) bool: the pixel shows the surface alone
+    finish_known: Tensor  # (V,) bool: roughness and metallic are the truth, not placeholders
 
     def of_views(self, chosen: slice | Tensor) -> Pictures:
         """The ``chosen`` views alone."""
@@ -97,6 +105,7 @@ def load_sample(
         surface, material = file.get_slice("surface")[s].float(), file.get_slice("material")[s].float() / 255
         visible = file.get_slice("visible")[s][:, chosen].float()
         images, c2w, intrinsics = of_views("images").float() / 255, of_views("c2w"), of_views("intrinsics")
+        known = finish_known(file)[chosen]
         of_pixels = of_views("view_material").float() / 255
         normal, depth = of_views("view_normal").float() / 127, of_views("view_depth").float()
         light = quarter_turn(file.get_tensor("environment").float(), -1)  # stored with -Z in the center column
@@ -144,6 +153,7 @@ def load_sample(
         view_normal=functional.normalize(half(normal) @ turn.T, dim=-1),
         view_depth=half(depth[..., None])[..., 0] - origin,
         view_valid=whole > 0.99,
+        finish_known=known,
         points=volume @ turn.T,
         distance=distance,
         surface=surface @ turn.T,

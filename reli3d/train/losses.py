@@ -7,6 +7,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from reli3d.nn.local import LocalField, LocalReconstructor, PixelMaps
+from reli3d.nn.value_bins import bin_loss
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.render.environment import Environment
 from reli3d.train.batches import Pictures, Sample
@@ -98,13 +99,14 @@ def _paint(field: LocalField, sample: Sample, position: Tensor, normal: Tensor, 
     got = field.material(*astray(position, normal), sample.visible)
     base, rough, metal = sample.material[:, :3], sample.material[:, 3], sample.material[:, 4]
     color = linear_to_srgb(got.base_color)  # as samples store it
-    return {
+    found = {
         "base_color": excess_entropy(color, base),
         "pattern": pattern_loss(color, base),
-        "roughness": excess_entropy(got.roughness, rough),
-        "metallic": excess_entropy(got.metallic, metal),
         "normal": (1 - functional.cosine_similarity(got.normal, bumped, dim=-1)).mean(),
     }
+    if bool(sample.finish_known.all()):
+        found |= {"roughness": excess_entropy(got.roughness, rough), "metallic": excess_entropy(got.metallic, metal)}
+    return found
 
 
 def astray(position: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
@@ -153,16 +155,32 @@ def _pixels(pixels: PixelMaps, shown: Tensor, views: Pictures, counts: tuple[int
     pairs = zip(color.split(of_objects), want[:, :3].split(of_objects), strict=True)
     patterns = [pattern_loss(c, w) if len(w) else w.sum() for c, w in pairs]
     share = color.new_tensor([count if n else 0 for count, n in zip(counts, of_objects, strict=True)])
-    return {
+    found = {
         "pixel_color": excess_entropy(color, want[:, :3]),
         "pixel_pattern": (torch.stack(patterns) * share).sum() / share.sum(),
-        "pixel_roughness": excess_entropy(pixels.roughness[valid][:, 0].sigmoid(), want[:, 3]),
-        "pixel_metallic": excess_entropy(pixels.metallic[valid][:, 0].sigmoid(), want[:, 4]),
         "pixel_normal": (1 - (pixels.normal[valid] * views.view_normal[valid]).sum(-1)).mean(),
         "pixel_depth": functional.smooth_l1_loss(
             pixels.depth[valid][:, 0] / DEPTH_UNIT, views.view_depth[valid] / DEPTH_UNIT, beta=0.2
         ),
     }
+    return found | _finish(pixels, views)
+
+
+def _finish(pixels: PixelMaps, views: Pictures) -> dict[str, Tensor]:
+    """Roughness and metallic of the pixels, by cross-entropy over bins where the network has them; nothing where no
+    view has a known finish.
+    """
+    valid = views.view_valid & views.finish_known[:, None, None]
+    if not bool(valid.any()):
+        return {}
+    want, found = views.view_material[valid][:, 3:], {}
+    for k, name in enumerate(("roughness", "metallic")):
+        if pixels.bins.shape[-1] > 1:
+            loss = bin_loss(pixels.bins[..., k, :][valid], want[:, k])
+        else:
+            loss = excess_entropy(getattr(pixels, name)[valid][:, 0].sigmoid(), want[:, k])
+        found[f"pixel_{name}"] = loss
+    return found
 
 
 def _light(field: LocalField, sample: Sample) -> dict[str, Tensor]:

@@ -22,7 +22,7 @@ from reli3d.geometry.hull import mask_distance
 from reli3d.nn.local import QUARTER, LocalReconstructor, PixelMaps, mean_logit, shown_pixels
 from reli3d.nn.presets import LocalPreset
 from reli3d.nn.pyramid import ImagePyramid, place_of_pixels, span_of_pixels
-from reli3d.train.batches import KEPT, NOISE, Pictures
+from reli3d.train.batches import KEPT, NOISE, Pictures, finish_known
 
 FULL_SIDE = 256  # pixels of an image at the finest level
 CACHE_BYTES = 1 << 31  # of small images in the memory of a process
@@ -110,6 +110,7 @@ def read_pictures(path: Path, factor: int) -> Pictures:
             file.get_tensor(name).float()
             for name in ("images", "view_material", "view_normal", "view_depth", "c2w", "intrinsics")
         )
+        known = finish_known(file)
     images = functional.avg_pool2d(images.permute(0, 3, 1, 2) / 255, factor).permute(0, 2, 3, 1).contiguous()
     valid = (depth > 0).float()[:, None]
     share = functional.avg_pool2d(valid, 2 * factor)
@@ -130,6 +131,7 @@ def read_pictures(path: Path, factor: int) -> Pictures:
         view_normal=functional.normalize(pooled(normal), dim=-1),
         view_depth=pooled(depth[..., None])[..., 0] - origin,
         view_valid=share[:, 0] > 0.99,
+        finish_known=known,
     )
 
 

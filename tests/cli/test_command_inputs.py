@@ -8,7 +8,7 @@ from safetensors.torch import save_file
 from reli3d.cli import data, render, train
 from reli3d.cli import eval as evaluation
 from reli3d.errors import InputError
-from reli3d.synthetic.stored import TENSORS, check_sample
+from reli3d.synthetic.stored import OPTIONAL, TENSORS, check_sample
 
 TYPES = {"U8": torch.uint8, "I8": torch.int8, "F16": torch.float16, "F32": torch.float32}
 
@@ -198,7 +198,8 @@ def test_a_good_sample_passes_and_each_other_dtype_or_shape_does_not(tmp_path):
     with pytest.raises(InputError, match="at least 13"):
         check_sample(path, views=13)
     for name, (_, dtype) in TENSORS.items():
-        for tensor in (torch.zeros(2, 5, 7, 11, 13, dtype=TYPES[dtype]), torch.zeros(1, dtype=torch.int64), None):
+        wrong = [torch.zeros(2, 5, 7, 11, 13, dtype=TYPES[dtype]), torch.zeros(1, dtype=torch.int64)]
+        for tensor in wrong if name in OPTIONAL else [*wrong, None]:
             sample(path, **{name: tensor})
             with pytest.raises(InputError, match=name):
                 check_sample(path)

@@ -17,7 +17,7 @@ from reli3d.io.files import replacing
 from reli3d.train.stages.captures import Captures
 from reli3d.train.stages.views import Chooser, ObjectViews, Samples, sample_views
 
-OF_SAMPLE = ("images", "c2w", "intrinsics", "view_material", "view_normal", "view_depth", "environment")
+OF_SAMPLE = ("images", "c2w", "intrinsics", "view_material", "view_normal", "view_depth", "environment", "finish_known")
 
 
 def to_tensors(views: ObjectViews) -> dict[str, Tensor]:

@@ -118,7 +118,9 @@ def sample_views(read: Callable[[str], Any], choose: Chooser) -> ObjectViews:
     images = present("images", of_views("images")) / 255
     c2w, intrinsics = present("c2w", of_views("c2w")), present("intrinsics", of_views("intrinsics"))
     valid, depth = of_views("view_valid"), of_views("view_depth")
-    material, normal = of_views("view_material"), of_views("view_normal")
+    material, normal, known = of_views("view_material"), of_views("view_normal"), of_views("finish_known")
+    if known is not None and not known.all():  # nothing stands for what is not known
+        material = None
     return ObjectViews(
         images[..., :3].contiguous(),
         images[..., 3].contiguous(),

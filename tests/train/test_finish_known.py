@@ -1,0 +1,97 @@
+"""A scan without a metallic-roughness texture has placeholders: its shape and base color train, its finish does not."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from PIL import Image
+from safetensors.torch import load_file, save_file
+
+from reli3d.cli.data import main as data
+from reli3d.cli.train import main, small_network
+from reli3d.nn.local import LocalReconstructor
+from reli3d.nn.presets import SMALL
+from reli3d.nn.value_bins import with_bins
+from reli3d.train.batches import load_sample
+from reli3d.train.losses import losses, pixel_losses
+from reli3d.train.pixels import Group, read_pictures
+from reli3d.train.stages.views import Samples
+
+FINISH = {"roughness", "metallic"}
+
+
+@pytest.fixture(scope="module")
+def scans(tmp_path_factory):
+    """Samples of one box without material maps: as it is, and with exchanged materials."""
+    root = tmp_path_factory.mktemp("scans")
+    np.savez(root / "maps.npz", env=np.ones((6, 8, 16, 3), np.float32), names=[f"m{k}" for k in range(6)])
+    trimesh.creation.box().export(root / "box.glb")
+    (root / "sets" / "one").mkdir(parents=True)
+    for name in ("basecolor", "roughness", "metallic"):
+        Image.new("RGB", (32, 32), (128, 128, 128)).save(root / "sets" / "one" / f"{name}.png")
+    call = ["--maps", str(root / "maps.npz"), "--meshes", str(root / "box.glb"), "--count", "1", "--views", "2"]
+    call += ["--size", "32", "--workers", "1"]
+    assert data(["render", str(root / "plain"), *call]) == 0
+    assert data(["render", str(root / "dressed"), *call, "--materials", str(root / "sets")]) == 0
+    return root
+
+
+def path_of(scans, name):
+    return scans / name / "0000000000.safetensors"
+
+
+def test_a_sample_stores_whether_its_finish_is_the_truth(scans, folder):
+    for name, known in (("plain", 0), ("dressed", 1)):
+        assert load_file(path_of(scans, name))["finish_known"].tolist() == [known, known]
+        assert read_pictures(path_of(scans, name), 1).finish_known.tolist() == [bool(known)] * 2
+    procedural = next(folder.glob("*.safetensors"))
+    assert bool(read_pictures(procedural, 1).finish_known.all())
+
+
+def test_a_sample_of_version_0_3_does_not_store_it_and_is_known(scans, tmp_path):
+    tensors = load_file(path_of(scans, "plain"))
+    del tensors["finish_known"]
+    save_file(tensors, tmp_path / "old.safetensors")
+    assert read_pictures(tmp_path / "old.safetensors", 1).finish_known.tolist() == [True, True]
+
+
+@pytest.mark.parametrize("bins", [1, 8])
+def test_an_unknown_finish_takes_part_in_no_loss(scans, bins):
+    torch.manual_seed(0)
+    model = LocalReconstructor(SMALL)
+    for head in model.pyramid.says.values():
+        torch.nn.init.normal_(head[1].weight, std=0.3)
+    model = with_bins(model, bins)
+    plain, dressed = (read_pictures(path_of(scans, name), 1) for name in ("plain", "dressed"))
+    alone = pixel_losses(model, Group.of([plain]))
+    assert set(alone) == {"pixel_color", "pixel_pattern", "pixel_normal", "pixel_depth"}
+    both, known = (pixel_losses(model, Group.of(parts)) for parts in ([plain, dressed], [dressed]))
+    for name in FINISH:
+        torch.testing.assert_close(both[f"pixel_{name}"], known[f"pixel_{name}"], rtol=1e-3, atol=1e-5)
+    for name, parts in (("plain", set()), ("dressed", FINISH)):
+        sample = load_sample(path_of(scans, name), 2, 256, np.random.default_rng(0), augment=False)
+        assert set(losses(model, sample)) & {*FINISH, "pixel_roughness", "pixel_metallic"} == {
+            *parts,
+            *(f"pixel_{part}" for part in parts),
+        }
+
+
+def test_the_papers_stages_have_no_material_of_an_unknown_finish(scans):
+    for name, known in (("plain", False), ("dressed", True)):
+        views = Samples(scans / name).load(0, range)
+        assert (views.material is not None) == known and views.normal is not None
+
+
+def test_a_run_over_bins_resumes_and_starts_the_next_one(scans, tmp_path, capsys):
+    call = [str(scans / "dressed"), str(tmp_path / "run"), "--batch", "1"]
+    pixels = ["--stage", "pixels", "--image-size", "64"]
+    assert main([*call, *pixels, "--steps", "1", "--material-bins", "8"]) == 0
+    assert main([*call, *pixels, "--steps", "2"]) == 0  # without the option the checkpoint's preset is used
+    state = torch.load(tmp_path / "run" / "state.pt", weights_only=True)
+    assert state["step"] == 2 and state["average"]["pyramid.says.2.1.bias"].shape == (26,)
+    started = small_network(str(tmp_path / "run" / "state.pt"), tmp_path / "none")
+    assert started.preset == dataclasses.replace(SMALL, pyramid=dataclasses.replace(SMALL.pyramid, material_bins=8))
+    assert main([*call, *pixels, "--steps", "3", "--material-bins", "4"]) == 2
+    assert "material_bins: expected 8, as the weights have, got 4" in capsys.readouterr().err
