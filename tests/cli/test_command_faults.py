@@ -159,6 +159,16 @@ def test_a_signal_while_the_interpreter_ends_is_one_line_too(tmp_path, number, c
     assert (tmp_path / "out/example/mesh.glb").read_text() == "mesh"
 
 
+@pytest.mark.parametrize("fails, code", [("", 0), ("; 1 / 0", 1)])
+def test_the_process_ends_before_python_frees_objects_and_ignores_signals(tmp_path, fails, code):
+    """Objects of torch take 1.6 s, in which no handler runs; one that takes a minute stands for them."""
+    kept = f"""atexit.register(print, "at exit")
+            sys.kept = type("Kept", (), {{"__del__": lambda self, sleep=time.sleep: sleep(60)}})(){fails}"""
+    process = start(["--output", tmp_path / "out"], body=f"{WRITES}\n            {kept}")
+    out, err = process.communicate(timeout=40)
+    assert process.returncode == code and out.endswith("at exit\n") and len(lines_of(err)) == code
+
+
 @pytest.mark.parametrize("error", ["TypeError", "ValueError", "ImportError", "KeyError", "OSError"])
 def test_what_no_input_explains_is_one_line_exit_code_1_and_a_log(tmp_path, error):
     body = f"raise {error}('spoon')"
