@@ -1,4 +1,4 @@
-"""``reli3d check``: what the cameras of a folder look like, without a reconstruction."""
+"""``reli3d check``: checks the cameras and masks of object folders, without a reconstruction."""
 
 from __future__ import annotations
 
@@ -16,14 +16,15 @@ from reli3d.cli.options import add_reading
 if TYPE_CHECKING:
     from reli3d.pipeline import FolderOptions
 
-SUSPECT = 3  # exit code where the cameras are not trusted
+SUSPECT = 3  # exit code for implausible cameras or masks
 
 
 def parser() -> Parser:
     p = Parser(
         prog="reli3d check",
-        description="Explain the cameras of object folders, one line a view, and draw the rig with the visual hull.",
-        epilog="Exit code: 0 plausible, 1 some folders failed, 2 wrong input, 3 cameras or masks are suspect.",
+        description="Check the cameras and masks of object folders: print one line per view and a verdict, and draw "
+        "the rig with the visual hull.",
+        epilog="Exit code: 0 plausible, 1 some folders failed, 2 wrong input, 3 cameras or masks are implausible.",
     )
     add_reading(p)
     return p
@@ -31,20 +32,20 @@ def parser() -> Parser:
 
 @dataclass
 class Check:
-    """Explains the cameras of objects: a :class:`~reli3d.cli.objects.Job`.  found: by the names of the objects."""
+    """Checks the cameras of objects: a :class:`~reli3d.cli.objects.Job`.  found: results by the name of the object."""
 
     reading: FolderOptions
     silent: bool
     found: dict[str, dict] = field(default_factory=dict)
 
     def run(self, folder: Path, name: str, target: Path) -> str:
-        """Print what the cameras look like, one line a view, and draw the rig."""
-        from reli3d.views.check import explain_cameras, rig_picture
+        """Prints one line per view and the verdict, and draws the rig."""
+        from reli3d.views.check import draw_rig, explain_cameras
 
         views = self.reading.read(folder, whole=True)
         lines = explain_cameras(views)
         target.mkdir(parents=True, exist_ok=True)
-        rig_picture(views, target / "rig.png")
+        draw_rig(views, target / "rig.png")
         if not self.silent:
             print(*views.notes, *lines, target / "rig.png", sep="\n")
         self.found[name] = {
@@ -52,7 +53,7 @@ class Check:
             "verdict": lines[-1],
             "lines": lines[:-1],
             "notes": list(views.notes),
-            "picture": str(target / "rig.png"),
+            "image": str(target / "rig.png"),
         }
         return "done"
 

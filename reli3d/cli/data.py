@@ -1,4 +1,4 @@
-"""``reli3d-data``: make training samples of procedural objects, or of textured meshes; put objects into shards."""
+"""``reli3d-data``: renders training samples of procedural objects or meshes, and packs objects into shards."""
 
 from __future__ import annotations
 
@@ -11,80 +11,76 @@ from pathlib import Path
 
 from reli3d.cli import objects
 from reli3d.cli.exit_codes import Parser, check_ranges, command, report
-from reli3d.cli.samples import SampleJob, Wanted
+from reli3d.cli.samples import SampleJob, SampleSpec
 from reli3d.errors import InputError
 
-COUNT, VIEWS = 1000, 6  # seeds and views where nothing else is asked for
+COUNT, VIEWS = 1000, 6  # default numbers of seeds and views
 
 
 def parser() -> argparse.ArgumentParser:
     whole = Parser(
         prog="reli3d-data",
-        description="Make training samples, and put objects into shards.",
+        description="Render training samples, and pack objects into shards.",
     )
     actions = whole.add_subparsers(dest="action", required=True, metavar="ACTION")
-    about = "make training samples of procedural objects, or of textured meshes"
+    about = "render training samples of procedural objects or textured meshes"
     p = actions.add_parser("render", help=about, description=f"{about.capitalize()}.")
-    p.add_argument("output", type=Path, help="folder for NNNNNNNNNN.safetensors; those that exist are kept")
+    p.add_argument("output", type=Path, help="folder for NNNNNNNNNN.safetensors; existing files are kept")
     p.add_argument("--maps", type=Path, required=True, help=".npz of environment maps: env (n, H, 2H, 3) linear, names")
     p.add_argument("--first", type=int, default=0, help="first seed")
     p.add_argument(
         "--count",
         type=int,
-        help=f"seeds, without --held-back; default {COUNT}, by --protocol paper one for each of --meshes",
+        help=f"number of seeds, ignored with --held-out; default {COUNT}, with --protocol paper one per --meshes file",
     )
-    p.add_argument("--views", type=int, help=f"default {VIEWS}; --protocol paper has its own numbers")
-    p.add_argument("--size", type=int, default=192, help="pixels")
+    p.add_argument("--views", type=int, help=f"views per object; default {VIEWS}, fixed by --protocol paper")
+    p.add_argument("--size", type=int, default=192, help="pixels per side of a view")
     p.add_argument(
         "--protocol",
         choices=("own", "paper"),
         default="own",
-        help="paper: three lights an object in files of their own, 100 views, 30 of meshes without a "
-        "metallic-roughness texture, of which there are images, cameras and light alone",
+        help="paper: three environments per object, one file each; 100 views in total; for meshes without a "
+        "metallic-roughness texture 30 views, with images, cameras and environment only",
     )
     p.add_argument(
-        "--held-back",
+        "--held-out",
         choices=("validation", "test"),
-        help="objects to choose by or to report on, under maps that no training sees",
+        help="objects of the validation or test set, under held-out maps",
     )
-    p.add_argument(
-        "--meshes", type=Path, nargs="+", help="GLB files, or folders of them, in the place of procedural objects"
-    )
+    p.add_argument("--meshes", type=Path, nargs="+", help="GLB files or folders of them, instead of procedural objects")
     p.add_argument(
         "--shapes",
         type=Path,
         nargs="+",
-        help="GLB files whose shapes are put together and dressed by finishes of their own",
+        help="GLB files or folders of them, whose shapes are combined and get procedural materials",
     )
     p.add_argument(
         "--materials",
         type=Path,
         help="folder of material sets (basecolor, roughness, metallic, normal): surfaces are divided into regions with "
-        "finishes of their own",
+        "different materials",
     )
     p.add_argument(
         "--views-only",
         action="store_true",
-        help="photographs and maps of the views alone, one ray a pixel: for reli3d-train --pixels, in less than "
-        "half of the time",
+        help="only images and maps of the views, one ray per pixel, for reli3d-train --stage pixels; more than 2 times "
+        "faster",
     )
     where = p.add_mutually_exclusive_group()
-    where.add_argument("--workers", type=int, help="processes of this machine; default one a core")
+    where.add_argument("--workers", type=int, help="number of processes; default one per core")
     where.add_argument("--ray", metavar="ADDRESS", help="render on a Ray cluster: auto, local, or its address")
     p.set_defaults(run=render)
-    about = "write samples or captures as tar files (WebDataset)"
-    p = actions.add_parser("pack", help=about, description=f"{about}; keeps existing ones.")
+    about = "write samples or captures as WebDataset tar files"
+    p = actions.add_parser("pack", help=about, description=f"{about.capitalize()}; existing files are kept.")
     p.add_argument("input", type=Path, help="folder of samples, or of captures with transforms.json each")
     p.add_argument("output", type=Path, help="folder for NNNNNN.tar")
-    p.add_argument("--each", type=int, default=64, help="objects of a tar file")
+    p.add_argument("--each", type=int, default=64, help="objects per tar file")
     p.set_defaults(run=pack)
     return whole
 
 
 def glb_files(paths: list[Path] | None) -> tuple[Path, ...]:
-    """The files among ``paths``, and in the place of a folder all GLB files in it.  Raises InputError where there is
-    none.
-    """
+    """The files among ``paths`` and all GLB files in the folders among them.  Raises InputError for an empty folder."""
     from reli3d.io.files import file_size
 
     found: list[Path] = []
@@ -98,32 +94,32 @@ def glb_files(paths: list[Path] | None) -> tuple[Path, ...]:
     return tuple(path.absolute() for path in found)
 
 
-def _wanted(args: argparse.Namespace) -> Wanted:
-    """What the arguments ask for, checked."""
+def _sample_spec(args: argparse.Namespace) -> SampleSpec:
+    """The validated arguments."""
     from reli3d.output.folder import check_folder
-    from reli3d.synthetic.dressed import material_sets
-    from reli3d.synthetic.maps import held_back, load_maps
+    from reli3d.synthetic.maps import held_out, load_maps
     from reli3d.synthetic.protocol import LIGHTS
+    from reli3d.synthetic.refinished import material_sets
 
     check_ranges(args, first=(0, 10**9), count=(1, 10**9), views=(1, 64), size=(16, 2048), workers=(1, 1024))
     paper = args.protocol == "paper"
     if paper and args.views is not None:
-        raise InputError("--views", f"expected none with --protocol paper, got {args.views}; it has its own numbers")
+        raise InputError("--views", f"expected none with --protocol paper, got {args.views}; leave it out")
     check_folder(args.output)
     meshes, shapes = glb_files(args.meshes), glb_files(args.shapes)
-    fit = held_back(load_maps(args.maps)[1]).count(bool(args.held_back))
+    fit = held_out(load_maps(args.maps)[1]).count(bool(args.held_out))
     if not fit:
-        raise InputError("--maps", "expected at least six maps for --held-back, got fewer")
+        raise InputError("--maps", "expected at least six maps for --held-out, got fewer")
     if paper and fit < LIGHTS:
-        raise InputError("--maps", f"expected at least {LIGHTS} for --protocol paper, got {fit} that may be taken")
+        raise InputError("--maps", f"expected at least {LIGHTS} for --protocol paper, got {fit} usable maps")
     maps = args.maps.absolute()
     if paper and args.views_only:
-        raise InputError("--views-only", "expected --protocol own with it, got paper")
+        raise InputError("--views-only", "expected --protocol own, got paper")
     if paper and args.materials:
-        raise InputError("--materials", "expected --protocol own with it, got paper")
+        raise InputError("--materials", "expected --protocol own, got paper")
     views = args.views or VIEWS
     sets = material_sets(args.materials) if args.materials else ()
-    return Wanted(maps, bool(args.held_back), paper, views, args.size, meshes, shapes, args.views_only, sets)
+    return SampleSpec(maps, bool(args.held_out), paper, views, args.size, meshes, shapes, args.views_only, sets)
 
 
 @command("reli3d-data")
@@ -133,23 +129,23 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def render(args: argparse.Namespace) -> int:
-    """Write the samples; 1 where some object could not be made."""
-    wanted = _wanted(args)
+    """Writes the samples; returns 1 if some objects failed."""
+    spec = _sample_spec(args)
     from tqdm import tqdm
 
     from reli3d.synthetic.procedural import TEST_SEEDS, VALIDATION_SEEDS
     from reli3d.synthetic.protocol import LIGHTS
 
-    count = args.count or (len(wanted.meshes) if wanted.paper else 0) or COUNT
+    count = args.count or (len(spec.meshes) if spec.paper else 0) or COUNT
     seeds = range(args.first, args.first + count)
-    if args.held_back:
-        seeds = {"validation": VALIDATION_SEEDS, "test": TEST_SEEDS}[args.held_back]
+    if args.held_out:
+        seeds = {"validation": VALIDATION_SEEDS, "test": TEST_SEEDS}[args.held_out]
     args.output.mkdir(parents=True, exist_ok=True)
-    ends = [f"_{k}" for k in range(LIGHTS)] if wanted.paper else [""]
+    ends = [f"_{k}" for k in range(LIGHTS)] if spec.paper else [""]
     names = [f"{seed:010d}{end}" for seed in seeds for end in ends]
     items = [objects.Item(Path(), n, args.output.absolute() / f"{n}.safetensors") for n in names]
     items = [item for item in items if not item.target.exists()]
-    start = functools.partial(SampleJob, wanted)
+    start = functools.partial(SampleJob, spec)
     workers = args.workers or os.cpu_count() or 1
     rows = objects.on_ray(start, items, args.ray) if args.ray else objects.in_processes(start, items, workers)
     lost = 0
@@ -159,7 +155,7 @@ def render(args: argparse.Namespace) -> int:
             if row.result in ("done", "skipped"):
                 continue
             notes = "; ".join(row.notes)
-            if row.result == "failed" and objects.CRASHED not in row.notes:  # a full disk: the others would fail too
+            if row.result == "failed" and objects.CRASHED not in row.notes:  # such as a full disk
                 raise OSError(f"{row.object}: {notes}")
             lost += 1
             tqdm.write(f"{row.object}: {notes}", file=sys.stderr)
@@ -167,7 +163,7 @@ def render(args: argparse.Namespace) -> int:
 
 
 def pack(args: argparse.Namespace) -> int:
-    """Write the tar files; captures that are left out are reported."""
+    """Writes the tar files and reports captures that are left out."""
     from reli3d.output.folder import check_folder
     from reli3d.train.stages import shards
     from reli3d.train.stages.captures import Captures

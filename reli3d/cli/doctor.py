@@ -1,4 +1,4 @@
-"""``reli3d doctor``: what is installed, where it runs, and whether it can."""
+"""``reli3d doctor``: reports versions, devices, kernel cache and weights, and whether the package is usable."""
 
 from __future__ import annotations
 
@@ -33,19 +33,19 @@ REQUIRED = (
     "tqdm",
 )
 ASSETS = Path(reli3d.__file__).parent / "assets"
-PROBLEM = "PROBLEM: "  # starts the value of a line that keeps the package from working
+PROBLEM = "PROBLEM: "  # prefix of a value that makes the package unusable
 
 
 def examine() -> tuple[list[tuple[str, str]], bool]:
-    """Rows ``(name, value)``, and whether the package is usable: no value begins with ``PROBLEM``.
+    """Rows ``(name, value)``, and whether the package is usable, that is, no value begins with PROBLEM.
 
-    Compiles one kernel where the cache has none, which takes some seconds the first time.
+    Compiles one kernel unless it is cached, which takes some seconds.
     """
     rows = []
     for part in (_versions, _devices, _cache, _kernels, _files, _tools):
         try:
             rows += list(part())
-        except Exception as error:  # whatever fails is reported, and the rest goes on
+        except Exception as error:  # reported as a row; the other parts still run
             rows.append((part.__name__[1:], f"{PROBLEM}{type(error).__name__}: {error}"))
     problems = sum(value.startswith(PROBLEM) for _, value in rows)
     verdict = "usable" if problems == 0 else f"not usable: {problems} problem{'s' if problems > 1 else ''}"
@@ -71,7 +71,7 @@ def _devices() -> Iterator[tuple[str, str]]:
     cache.initialize()
     yield "cpu", f"{os.cpu_count()} cores, {torch.get_num_threads()} threads of torch"
     if not wp.is_cuda_available():
-        yield "driver", "no NVIDIA driver with a device found: all runs on the CPU, which is no error"
+        yield "driver", "no NVIDIA driver or device found: runs on the CPU, which is not an error"
     if torch.version.cuda is None:
         yield "cuda", "none: this torch is built without CUDA"
     elif not torch.cuda.is_available():
@@ -136,11 +136,12 @@ def _tools() -> Iterator[tuple[str, str]]:
 
 @command("reli3d doctor")
 def main(argv: list[str] | None = None) -> int:
-    """The command ``reli3d doctor``; 0 when usable, 1 when something must be mended, 2 for a wrong call."""
+    """The command ``reli3d doctor``.  Exit code: 0 usable, 1 not usable, 2 wrong arguments."""
     parser = Parser(
-        prog="reli3d doctor", description="Print versions, devices, kernel cache and weights, and the verdict."
+        prog="reli3d doctor",
+        description="Print versions, devices, kernel cache and weights, and whether the package works.",
     )
-    parser.add_argument("--json", action="store_true", help="print one JSON object: the rows by name, and usable")
+    parser.add_argument("--json", action="store_true", help="print one JSON object with the rows by name and usable")
     args = parser.parse_args(argv)
     rows, usable = examine()
     print(json.dumps({**dict(rows), "usable": usable}) if args.json else aligned(rows))

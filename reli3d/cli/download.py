@@ -1,4 +1,4 @@
-"""``reli3d download``: the official weights, fetched and converted once."""
+"""``reli3d download``: fetches and converts the official weights."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from reli3d.cli.exit_codes import Parser, command
 def parser() -> Parser:
     return Parser(
         prog="reli3d download",
-        description="Fetch the published checkpoint and convert it for --weights official, unless that is done.  "
-        "The file's path goes to stdout.",
+        description="Fetch the published checkpoint and convert it for --weights official; does nothing if the "
+        "converted file exists.  Prints the path of the file.",
     )
 
 

@@ -1,8 +1,8 @@
-"""How every command ends: an exit code and at most one line, whatever comes from outside.
+"""Exit codes and error messages of all commands: at most one line on stderr.
 
-2 is input that the user can correct (:class:`~reli3d.errors.InputError`, also a wrong option), 1 every other exception,
-whose traceback goes to a log file and, with ``--traceback``, to stderr.  Ctrl-C is 130, SIGTERM 143 and SIGHUP 129,
-after half-written files are removed.  A stream that is closed or full, or that cannot encode a letter, changes no code.
+2: input that the user can correct (:class:`~reli3d.errors.InputError`, also wrong options).  1: any other exception,
+whose traceback goes to a log file and, with ``--traceback``, to stderr.  130, 143, 129: Ctrl-C, SIGTERM, SIGHUP, after
+removing partially written files.  Closed or full output streams and unencodable characters do not change the code.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _parsed: ContextVar[argparse.Namespace | None] = ContextVar("parsed", default=No
 
 
 class Stopped(BaseException):
-    """A signal that ends the process."""
+    """Raised by a signal that terminates the process."""
 
     def __init__(self, number: int):
         super().__init__(number)
@@ -60,7 +60,7 @@ class Parser(argparse.ArgumentParser):
 
 
 class _Stream:
-    """A text stream that never raises for what is outside the program."""
+    """A text stream that ignores write errors and escapes unencodable characters."""
 
     def __init__(self, stream):
         self._stream = stream
@@ -83,15 +83,15 @@ class _Stream:
 
 
 def command(name: str) -> Callable:
-    """Decorator of a command's ``main``: its exit code for everything that may happen.  name: of the command.
+    """Decorator of a command's ``main`` that turns exceptions and signals into exit codes.  name: of the command.
 
-    Without arguments of its own ``main`` is the program: its signals are handled until the interpreter has ended.
+    Called without arguments, ``main`` is the whole program, and signals stay handled until the interpreter exits.
     """
 
     def decorate(main: Callable[[list[str] | None], int]) -> Callable[..., int]:
         @functools.wraps(main)
         def run(argv: list[str] | None = None) -> int:
-            ended: list[int] = []  # its exit code: from then on a signal finds nothing to clean up
+            ended: list[int] = []  # the exit code once known: from then on a signal has nothing to clean up
             with _streams(), signals(name if argv is None else None, ended):
                 try:
                     _parsed.set(None)
@@ -114,7 +114,7 @@ def command(name: str) -> Callable:
 
 
 def reason(error: BaseException) -> str:
-    """What an error says, as one line; the class too where no message was written for a user."""
+    """The message of an error on one line, with the class name unless it is an InputError or an OSError."""
     if isinstance(error, InputError):
         return str(error)
     if isinstance(error, OSError) and error.strerror:
@@ -125,7 +125,7 @@ def reason(error: BaseException) -> str:
 
 
 def _failed(name: str, error: Exception) -> int:
-    """One line for an exception that no input explains, and its traceback where it belongs; the exit code."""
+    """Reports an unexpected exception in one line, writes its traceback, and returns the exit code."""
     args = _parsed.get()
     show_traceback(error, args)
     output = getattr(args, "output", None)
@@ -135,13 +135,13 @@ def _failed(name: str, error: Exception) -> int:
 
 
 def show_traceback(error: BaseException, args: argparse.Namespace | None) -> None:
-    """Print the traceback of ``error`` on stderr where ``--traceback`` was given."""
+    """Prints the traceback of ``error`` on stderr if ``--traceback`` is given."""
     if getattr(args, "traceback", False):
         sys.stderr.write("".join(traceback.format_exception(error)))
 
 
 def write_log(target: Path, error: BaseException) -> Path | None:
-    """Write the traceback of ``error`` to :func:`log_of` the target; its path, None where it cannot be written."""
+    """Writes the traceback of ``error`` to :func:`log_of` the target; returns its path, None if that fails."""
     from reli3d.io.files import write_bytes
 
     path = log_of(target)
@@ -154,7 +154,7 @@ def write_log(target: Path, error: BaseException) -> Path | None:
 
 
 def log_of(target: Path) -> Path:
-    """The file beside the output ``target`` that has the traceback of its failure."""
+    """The path of the log file of ``target``, in the same folder."""
     from reli3d.output.folder import sibling
 
     return sibling(Path(os.path.abspath(target)), "", ".reli3d.log")
@@ -162,7 +162,7 @@ def log_of(target: Path) -> Path:
 
 @contextlib.contextmanager
 def extra(option: str) -> Iterator[None]:
-    """In this block a package that an option needs and that is not installed is an InputError of the option."""
+    """Turns an ImportError in the block into an InputError of ``option``."""
     try:
         yield
     except ImportError as error:
@@ -170,19 +170,19 @@ def extra(option: str) -> Iterator[None]:
 
 
 def check_range(name: str, value: float | None, low: float, high: float) -> None:
-    """Raise InputError where the option ``--name`` is given and not within ``low`` and ``high``."""
+    """Raises InputError if the option ``--name`` is given and not within ``low`` and ``high``."""
     if value is not None and not low <= value <= high:
         raise InputError(f"--{name}", f"expected {low:g} to {high:g}, got {value}")
 
 
 def check_ranges(args: argparse.Namespace, **ranges: tuple[float, float]) -> None:
-    """:func:`check_range` of options by name, each with its ``(low, high)``; what ``args`` have not is not given."""
+    """:func:`check_range` of several options, each with its ``(low, high)``; missing attributes count as not given."""
     for name, (low, high) in ranges.items():
         check_range(name.replace("_", "-"), getattr(args, name, None), low, high)
 
 
 def report(line: str) -> None:
-    """Write a line of progress to stderr, at once."""
+    """Writes a line of progress to stderr, unbuffered."""
     print(line, file=sys.stderr, flush=True)
 
 
@@ -193,11 +193,12 @@ def _report(name: str, text: str, code: int) -> int:
 
 @contextlib.contextmanager
 def signals(program: str | None = None, ended: list[int] | None = None) -> Iterator[None]:
-    """SIGTERM and SIGHUP raise :class:`Stopped`; after the first signal the next ones are ignored.
+    """In the block SIGTERM and SIGHUP raise :class:`Stopped`; signals after the first one are ignored.
 
-    program: name of the command that this process is, or None to restore the handlers at the end.  Its signals stay
-    handled, SIGINT too: once ``ended`` has its exit code, one prints its line and ends the process at once.  Without
-    one the process ends with that code after its threads and what is registered at exit, and frees no object.
+    program: name of the command if it is the whole process; its handlers, also that of SIGINT, then stay installed.
+    Once ``ended`` has the exit code, a signal prints its line and exits immediately; without a signal the process exits
+    with that code after its threads and exit handlers, without freeing its objects.  None: the previous handlers are
+    restored after the block.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -1,4 +1,4 @@
-"""``reli3d export``: a reconstruction in another format, with fewer triangles or smaller textures."""
+"""``reli3d export``: converts a GLB to another format, with fewer triangles or smaller textures."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FORMATS = ("glb", "obj", "usdz")
 def parser() -> argparse.ArgumentParser:
     p = Parser(
         prog="reli3d export",
-        description="Write a GLB of one surface in another format.  The files' names go to stdout.",
+        description="Convert a GLB with one surface to another format.  Prints the names of the written files.",
         epilog="Exit code: 0 done, 2 wrong input.",
     )
     p.add_argument("glb", type=Path, help="a GLB with one surface, such as mesh.glb of a result")
@@ -25,23 +25,23 @@ def parser() -> argparse.ArgumentParser:
         "--format",
         choices=FORMATS,
         default="glb",
-        help="obj has a material file and four PNG textures beside it; usdz needs pip install 'reli3d[usd]'",
+        help="obj: with a material file and four PNG textures; usdz: needs pip install 'reli3d[usd]'",
     )
     p.add_argument(
-        "--output", type=Path, default=Path("exports"), help="folder; a file in it with the same name is replaced"
+        "--output", type=Path, default=Path("exports"), help="folder; files of the same name in it are replaced"
     )
     p.add_argument(
         "--decimate",
         type=int,
         metavar="N",
-        help="at most N triangles, 16 to 10^7, with a new atlas (pip install 'reli3d[mesh]')",
+        help="reduce to at most N triangles, 16 to 10^7, with a new texture atlas (pip install 'reli3d[mesh]')",
     )
-    p.add_argument("--texture-size", type=int, help="texels along a side, 64 to 4096 (default those of the GLB)")
+    p.add_argument("--texture-size", type=int, help="texels per side, 64 to 4096 (default: of the GLB)")
     p.add_argument(
         "--textures",
         choices=("png", "webp"),
         default="png",
-        help="of glb: webp, without loss as png, is smaller, and needs a viewer that knows EXT_texture_webp",
+        help="image format in glb: png, or webp, also lossless and smaller, for viewers that support EXT_texture_webp",
     )
     p.add_argument("--json", action="store_true", help="print one JSON object instead of the names")
     return p
@@ -67,7 +67,7 @@ def _check(args: argparse.Namespace) -> None:
 
 
 def export(args: argparse.Namespace) -> tuple[list[Path], dict]:
-    """Write the files; their paths, and what was written in numbers."""
+    """Writes the files; returns their paths and a record of triangles and texture size."""
     from reli3d.fit.transfer import dressed
     from reli3d.geometry.decimate import decimate
     from reli3d.geometry.mesh import vertex_normals

@@ -1,4 +1,4 @@
-"""How the commands print their options."""
+"""Formatting of ``--help`` and preprocessing of arguments."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 
 class Defaults(argparse.HelpFormatter):
-    """Adds the default of an option to its help where it has one and the help does not say it."""
+    """Appends the default of an option to its help unless the help mentions it."""
 
     def _get_help_string(self, action: argparse.Action) -> str | None:
         silent = action.default is None or action.default is False or not action.option_strings
@@ -18,9 +18,7 @@ class Defaults(argparse.HelpFormatter):
 
 
 def joined(argv: Sequence[str] | None, option: str, values: Sequence[str]) -> list[str]:
-    """The arguments with ``option value`` as one word where ``value`` begins with a dash: argparse would take it for
-    an option.
-    """
+    """The arguments with ``option value`` joined by ``=`` for ``values``, which may begin with a dash."""
     words = list(sys.argv[1:] if argv is None else argv)
     for k in range(len(words) - 2, -1, -1):
         if words[k] == option and words[k + 1] in values:

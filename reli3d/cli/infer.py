@@ -29,7 +29,7 @@ def main(argv: list[str] | None = None) -> int:
     budget = refinement_budget(args, device)
     from reli3d.cli import job
 
-    made = job.FolderJob(args, device, budget)  # the weights are good, the kernels compiled
+    made = job.FolderJob(args, device, budget)  # checks the weights and compiles the kernels
     start = functools.partial(job.worker, args, device, budget)
     if args.workers is not None:
         rows = objects.in_processes(start, items, min(args.workers, len(items)))
@@ -39,7 +39,7 @@ def main(argv: list[str] | None = None) -> int:
         rows = (objects.make(made, item, lambda error: show_traceback(error, args)) for item in items)
 
     def done(row: objects.Row) -> None:
-        if args.workers is not None or args.ray is not None:  # their processes show no bar
+        if args.workers is not None or args.ray is not None:  # without progress bars
             report(f"{printable(row.object)}: {row.seconds:.1f} s")
         if not args.json:
             print(args.output / row.object / "mesh.glb", flush=True)
@@ -53,7 +53,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def checked_items(args: argparse.Namespace) -> list[objects.Item]:
-    """The objects of the command line.  Raises InputError where one of their results cannot be written."""
+    """The objects of the command line.  Raises InputError if a result cannot be written."""
     from reli3d.output.folder import check_place
 
     items = objects.items_of(args.folder or [EXAMPLE], args.output)
@@ -64,20 +64,20 @@ def checked_items(args: argparse.Namespace) -> list[objects.Item]:
     return items
 
 
-def choose_device(wanted: str) -> str:
-    """``cpu`` or ``cuda``.  Raises InputError where cuda is given and missing: nothing falls back silently."""
+def choose_device(requested: str) -> str:
+    """``cpu`` or ``cuda`` for ``auto``, ``cpu`` or ``cuda``.  Raises InputError if cuda is requested and missing."""
     import torch
 
-    if wanted == "cuda" and not torch.cuda.is_available():
+    if requested == "cuda" and not torch.cuda.is_available():
         raise InputError("--device", "expected a CUDA device for cuda, got none; use --device cpu")
-    return "cuda" if wanted != "cpu" and torch.cuda.is_available() else "cpu"
+    return "cuda" if requested != "cpu" and torch.cuda.is_available() else "cpu"
 
 
 def refinement_budget(args: argparse.Namespace, device: str) -> dict[str, float | int]:
-    """``seconds`` or ``steps`` of a refinement, empty for none.  Raises InputError for what makes no sense."""
+    """``seconds`` or ``steps`` of the refinement, empty without --refine.  Raises InputError for an invalid value."""
     if args.refine is None:
         if args.refine_cameras:
-            raise InputError("--refine-cameras", "expected --refine with it, got none")
+            raise InputError("--refine-cameras", "expected it together with --refine; add --refine")
         return {}
     if not args.refine:
         return {"seconds": REFINE_SECONDS[device]}
@@ -89,7 +89,7 @@ def refinement_budget(args: argparse.Namespace, device: str) -> dict[str, float 
     except ValueError:
         seconds = 0.0
     if not 0.0 < seconds < 1e6:
-        raise InputError("--refine", f"expected seconds, 60, or steps, 300steps, got {args.refine}")
+        raise InputError("--refine", f"expected seconds such as 60 or steps such as 300steps, got {args.refine}")
     return {"seconds": seconds}
 
 

@@ -1,4 +1,4 @@
-"""What ``reli3d-infer`` does with each object: the loaded network, and a bar on stderr."""
+"""The job of ``reli3d-infer`` for each object, with a progress bar on stderr."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ STAGES = (
 
 
 class FolderJob:
-    """What all objects of one command share: options and the loaded network."""
+    """The options and the loaded network, common to all objects of one command."""
 
     def __init__(self, args: argparse.Namespace, device: str, budget: dict[str, float | int]):
         self.options = ReconstructOptions(
@@ -49,7 +49,7 @@ class FolderJob:
             background=args.background,
         )
         self.reading = FolderOptions(
-            args.views, args.masks, args.remove_background, budget, args.refine_cameras, pressed
+            args.views, args.masks, args.remove_background, budget, args.refine_cameras, interrupt_flag
         )
         path = weights.locate(args.weights)
         trunk = args.precision if args.precision in (None, "auto") else getattr(torch, args.precision)
@@ -58,11 +58,11 @@ class FolderJob:
         self.skip = args.skip_existing
         if budget:
             import reli3d.fit.refine  # noqa: F401 # its kernels are compiled with the others
-        ready_kernels(device)  # takes half a minute the first time: not before the weights are known to be good
+        compile_kernels(device)  # takes half a minute the first time, so after the weights are checked
 
     def run(self, folder: Path, name: str, target: Path) -> str:
-        """Reconstruct one object and write its files, unless they are there; the bar ends before an error is raised."""
-        pressed.clear()
+        """Reconstructs one object and writes its files; with --skip-existing only if they are missing."""
+        interrupt_flag.clear()
         with results.claim(target) as replacing:
             if self.skip and results.complete(target, refined=bool(self.reading.budget)):
                 return "skipped"
@@ -81,27 +81,27 @@ class FolderJob:
 
 
 def worker(args: argparse.Namespace, device: str, budget: dict[str, float | int]) -> FolderJob:
-    """The job of a process that runs beside others."""
+    """The job of a worker process, with one thread."""
     torch.set_num_threads(1)
     return FolderJob(args, device, budget)
 
 
 class Bar(Progress):
-    """A bar over the stages of one object, on stderr where that is a terminal; elsewhere lines alone are written.
+    """Progress bar over the stages of one object, on stderr; without a terminal only notes are written.
 
-    While a refinement runs the first Ctrl-C ends it, with the best so far; the second one ends the command.
+    During refinement the first Ctrl-C ends the refinement with the best result so far, the second ends the command.
     """
 
     def __init__(self, name: str):
         self.name = printable(name)
         layout = "{desc}: {bar:20} {postfix} {elapsed}"
         self.bar = tqdm(total=len(STAGES), desc=self.name, file=sys.stderr, bar_format=layout, disable=None)
-        self.heeded = contextlib.ExitStack()
+        self.catching = contextlib.ExitStack()
 
     def __call__(self, stage: str) -> None:
-        self.heeded.close()
+        self.catching.close()
         if stage == "refine":
-            self.heeded.enter_context(pressed.heeded())
+            self.catching.enter_context(interrupt_flag.catching())
         if not self.bar.disable:
             self.bar.set_postfix_str(stage, refresh=False)
             self.bar.n = STAGES.index(stage)
@@ -115,7 +115,7 @@ class Bar(Progress):
         return self
 
     def __exit__(self, kind, error, trace) -> None:
-        self.heeded.close()
+        self.catching.close()
         self.bar.leave = error is None
         if error is None and not self.bar.disable:
             self.bar.n = len(STAGES)
@@ -123,8 +123,8 @@ class Bar(Progress):
         self.bar.close()
 
 
-class Pressed:
-    """Whether Ctrl-C was pressed while it is :meth:`heeded`; called, it says so."""
+class InterruptFlag:
+    """Whether Ctrl-C was pressed inside :meth:`catching`; call it for the value."""
 
     def __init__(self) -> None:
         self._flag = False
@@ -136,8 +136,8 @@ class Pressed:
         self._flag = False
 
     @contextlib.contextmanager
-    def heeded(self) -> Iterator[None]:
-        """In this block the first Ctrl-C is noted; the second one does what it did before."""
+    def catching(self) -> Iterator[None]:
+        """In the block the first Ctrl-C sets the flag; the second one has its usual effect."""
         before = signal.getsignal(signal.SIGINT)
         if threading.current_thread() is not threading.main_thread() or before == signal.SIG_IGN:
             yield
@@ -154,11 +154,11 @@ class Pressed:
             signal.signal(signal.SIGINT, before)
 
 
-pressed = Pressed()
+interrupt_flag = InterruptFlag()
 
 
-def ready_kernels(device: str) -> None:
-    """Compile several kernel modules at once that a first run would compile one by one; says so on stderr."""
+def compile_kernels(device: str) -> None:
+    """Compiles the kernel modules in parallel unless they are cached; reports it on stderr."""
     modules = cache.imported(device)
     if not cache.compiled(modules, device):
         print("compiling kernels (first run only)", file=sys.stderr)

@@ -1,4 +1,4 @@
-"""``reli3d``: one name for all commands."""
+"""``reli3d``: the entry point of all commands."""
 
 from __future__ import annotations
 
@@ -13,31 +13,31 @@ COMMANDS = {  # module of reli3d.cli, what it does
     "infer": ("infer", "photographs with cameras to a relightable asset (also reli3d-infer)"),
     "capture": ("capture", "photographs or a video without cameras to an object folder"),
     "view": ("view", "show a reconstruction in the browser"),
-    "check": ("checking", "explain the cameras of a folder, reconstruct nothing"),
+    "check": ("checking", "check the cameras and masks of a folder without reconstruction"),
     "render": ("render", "views and turntables of a GLB under any light (also reli3d-render)"),
-    "export": ("export", "write a GLB as OBJ, USDZ or GLB, with fewer triangles or smaller textures"),
+    "export": ("export", "convert a GLB to OBJ, USDZ or GLB, with fewer triangles or smaller textures"),
     "download": ("download", "fetch and convert the official weights"),
-    "data": ("data", "make training samples (also reli3d-data)"),
+    "data": ("data", "render training samples (also reli3d-data)"),
     "train": ("train", "train the network (also reli3d-train)"),
-    "eval": ("eval", "measure the network on held-out objects (also reli3d-eval)"),
+    "eval": ("eval", "evaluate the network on held-out objects (also reli3d-eval)"),
     "tables": ("tables", "the paper's tables on a folder of GLB files (also reli3d-tables)"),
-    "doctor": ("doctor", "print what is installed, where it runs and whether it can"),
+    "doctor": ("doctor", "print versions and devices, and whether the package is usable"),
 }
 
 
 @command("reli3d")
 def main(argv: list[str] | None = None) -> int:
-    """Run the named command; its exit code.  2 for a name that is none."""
+    """Runs the named command and returns its exit code; 2 for an unknown name."""
     rows = "\n".join(f"  {name:8s} {what}" for name, (_, what) in COMMANDS.items())
     parser = Parser(
         prog="reli3d",
         description="Relightable 3D assets from a few posed photographs.",
         usage="reli3d COMMAND [OPTION ...]",
-        epilog=f"commands:\n{rows}\n\n'reli3d COMMAND --help' has the options of each.",
+        epilog=f"commands:\n{rows}\n\n'reli3d COMMAND --help' prints its options.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"reli3d {reli3d.__version__}")
-    parser.add_argument("command", choices=COMMANDS, metavar="COMMAND", help="one of those below")
+    parser.add_argument("command", choices=COMMANDS, metavar="COMMAND", help="one of the commands below")
     parser.add_argument("options", nargs=argparse.REMAINDER, help=argparse.SUPPRESS)
     if not (sys.argv[1:] if argv is None else argv):
         parser.print_help()

@@ -1,7 +1,7 @@
-"""Many objects: the function that makes the result of one, here, in processes of this machine or on a Ray cluster.
+"""Runs a job over many objects: in this process, in worker processes or on a Ray cluster.
 
-An object whose worker crashed is made once more, in processes while nothing else runs.  A worker has one thread:
-results are equal bit for bit for any number of workers.
+An object whose worker crashed is retried once, in worker processes while nothing else runs.  Workers are
+single-threaded; results are bitwise identical for any number of workers.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ COLUMNS = ("object", "result", "seconds", "mask_iou", "faces", "retried", "notes
 
 class Job(Protocol):
     def run(self, folder: Path, name: str, target: Path) -> str:
-        """Make ``target`` from ``folder``; the result of its row."""
+        """Makes ``target`` from ``folder``; returns the ``result`` of its :class:`Row`."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Item:
 
 @dataclass(frozen=True)
 class Row:
-    """What became of one object.  result: ``done``, ``skipped``, ``refused`` (wrong input) or ``failed``."""
+    """The outcome of one object.  result: ``done``, ``skipped``, ``refused`` (wrong input) or ``failed``."""
 
     object: str
     result: str
@@ -68,9 +68,9 @@ Rows = Generator[Row, None, None]
 
 
 def make(job: Job, item: Item, failed: Callable[[Exception], None] = lambda error: None) -> Row:
-    """Make one object; an error becomes its row, and its traceback a log file beside the target.
+    """Makes one object; an error is returned as a row, and its traceback is written to a log file next to the target.
 
-    failed: called with an error that no input explains.
+    failed: called with an error other than InputError.
     """
     began = time.monotonic()
     try:
@@ -90,10 +90,10 @@ def make(job: Job, item: Item, failed: Callable[[Exception], None] = lambda erro
 def collect(
     name: str, rows: Rows, items: Sequence[Item], done: Callable[[Row], None], summary: Path | None = None
 ) -> tuple[list[Row], int]:
-    """All rows, and the exit code that they give.
+    """Collects all rows; returns them and the exit code.
 
-    An object that is not done is reported on stderr as it ends; ``done`` is called with each that is.  summary: file of
-    the table, in the order of ``items``, which an interrupted command writes too.
+    Objects that are not done are reported on stderr.  done: called with the row of each object that is done.  summary:
+    CSV file of the rows in the order of ``items``, also written by an interrupted command.
     """
     ended: list[Row] = []
     try:
@@ -118,7 +118,7 @@ def collect(
 
 
 def _recorded(target: Path) -> dict:
-    """What ``run_info.json`` says that a summary holds; nothing where it is missing or broken."""
+    """The fields of ``run_info.json`` that a summary contains; empty if it is missing or broken."""
     try:
         info = json.loads((target / "run_info.json").read_bytes())
         return {"mask_iou": info["mask_iou"], "faces": info["mesh"]["faces"], "notes": tuple(info["notes"])}
@@ -127,8 +127,9 @@ def _recorded(target: Path) -> dict:
 
 
 def items_of(paths: Sequence[Path], output: Path) -> list[Item]:
-    """The folders among ``paths`` and those that list files among them name, each with a name of its own in ``output``:
-    that of the folder, with a number where two are alike.  Raises InputError.
+    """The folders among ``paths`` and those named in list files among them, with targets in ``output``.
+
+    A target has the name of its folder, with a number appended to duplicates.  Raises InputError.
     """
     folders = [folder for path in paths for folder in (listed(path) if path.is_file() else [path])]
     taken = {SUMMARY}
@@ -145,7 +146,7 @@ def items_of(paths: Sequence[Path], output: Path) -> list[Item]:
 
 
 def listed(path: Path) -> list[Path]:
-    """The folders that a text file names, one a line, relative to where the command runs.  Raises InputError."""
+    """The folders named in a text file, one per line, relative to the working directory.  Raises InputError."""
     try:
         lines = read_bytes(path, MAX_LIST).decode("utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
@@ -160,7 +161,7 @@ def listed(path: Path) -> list[Path]:
 
 
 def in_processes(start: Callable[[], Job], items: Sequence[Item], count: int) -> Rows:
-    """Rows in the order in which they end.  start: makes the job of a process; it is pickled."""
+    """Runs objects in ``count`` processes; rows in order of completion.  start: creates the job, is pickled."""
     job, pool = pickle.dumps((os.getcwd(), start)), _pool(count)
 
     def submit(item: Item) -> Future:
@@ -175,11 +176,11 @@ def in_processes(start: Callable[[], Job], items: Sequence[Item], count: int) ->
     try:
         yield from _rows(submit, items, lambda: count, BrokenProcessPool, alone=True)
         pool.shutdown()
-    except BaseException:  # also where the caller wants no more rows
+    except BaseException:  # also if the caller closes the generator
         pool.shutdown(wait=False, cancel_futures=True)
         children = active_children()
         for process in children:
-            process.terminate()  # it removes what is half written
+            process.terminate()  # removes partially written files
         for process in children:
             process.join(PATIENCE)
             process.kill()
@@ -187,10 +188,10 @@ def in_processes(start: Callable[[], Job], items: Sequence[Item], count: int) ->
 
 
 def on_ray(start: Callable[[], Job], items: Sequence[Item], address: str, *, gpu: bool = False) -> Rows:
-    """As :func:`in_processes` on a Ray cluster.  address: of it, ``auto`` for the one of this machine, ``local`` to
-    start one.  All its machines must see the folders by the same paths, and have this package.
+    """As :func:`in_processes`, on a Ray cluster.
 
-    The connection is made at once.  Raises InputError where there is none.
+    address: of the cluster, ``auto`` for the one of this machine, ``local`` to start one.  All its machines must have
+    this package and see the folders at the same paths.  Raises InputError if the connection fails, before any row.
     """
     try:
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is sent anywhere
@@ -211,7 +212,7 @@ def _on_ray(ray, start: Callable[[], Job], items: Sequence[Item], gpu: bool) -> 
     task = ray.remote(num_cpus=1, num_gpus=int(gpu), max_retries=0)(_made)
     job = pickle.dumps((os.getcwd(), start))
 
-    def ahead() -> int:  # enough that no worker waits, and few to keep
+    def ahead() -> int:  # submitted objects: keeps all workers busy
         return 2 * int(ray.cluster_resources().get("CPU", 1)) + 2
 
     try:
@@ -229,9 +230,9 @@ def _rows(
     *,
     alone: bool,
 ) -> Rows:
-    """Keep up to ``limit()`` objects submitted; one whose future raises ``crash`` is submitted once more.
+    """Keeps up to ``limit()`` objects submitted; one whose future raises ``crash`` is submitted once more.
 
-    alone: a crash ends all futures, so an object is retried while no other one is submitted.
+    alone: a crash breaks all futures, so an object is retried only while no other one is submitted.
     """
     left, again, running = deque(items), deque[Item](), dict[Future, tuple[Item, bool]]()
     while left or again or running:
@@ -251,7 +252,7 @@ def _rows(
                 if retried:
                     yield Row(item.name, "failed", retried=True, notes=(CRASHED,))
                     continue
-                report(f"{printable(item.name)}: its worker crashed; it is made once more")
+                report(f"{printable(item.name)}: its worker crashed; retrying")
                 again.append(item)
             except Exception as error:  # the job of the worker could not be made
                 yield Row(item.name, "failed", retried=retried, notes=(reason(error),))
@@ -262,9 +263,9 @@ def _pool(count: int) -> ProcessPoolExecutor:
 
 
 def _begin() -> None:
-    """In a worker: no bars, as several would share one terminal, and an end with the command, however that ends."""
+    """Initializes a worker: no progress bars, and termination when the parent process ends."""
     os.environ["TQDM_DISABLE"] = "1"
-    tqdm.set_lock(threading.RLock())  # its own one is a semaphore that a process which is killed would leave behind
+    tqdm.set_lock(threading.RLock())  # the default is a semaphore, which a killed process would leak
     parent = parent_process()
 
     def watch() -> None:
@@ -277,7 +278,7 @@ def _begin() -> None:
 
 @contextlib.contextmanager
 def _blocked_interrupts():
-    """Processes that start in this block inherit that Ctrl-C does not reach them: the command ends them itself."""
+    """Processes started in the block ignore Ctrl-C; the command terminates them itself."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
@@ -289,7 +290,7 @@ def _blocked_interrupts():
 
 
 def _made(job: bytes, item: Item) -> Row:
-    """In a worker: make one object; SIGTERM ends the process after what is half written is removed."""
+    """Makes one object in a worker; SIGTERM ends the process after partially written files are removed."""
     try:
         with signals():
             return make(_kept(job), item)
@@ -301,14 +302,14 @@ def _made(job: bytes, item: Item) -> Row:
 
 @functools.lru_cache(1)
 def _kept(job: bytes) -> Job:
-    """The job of this worker, made once for all its objects."""
+    """The job of this worker, created once for all its objects."""
     folder, start = pickle.loads(job)
     os.chdir(folder)
     return start()
 
 
 def write_summary(path: Path, rows: Sequence[Row]) -> None:
-    """Write a CSV table, a line an object; its folder is made.  Raises OSError."""
+    """Writes a CSV table with one line per object and creates its folder.  Raises OSError."""
     path.parent.mkdir(parents=True, exist_ok=True)
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")

@@ -1,4 +1,4 @@
-"""``reli3d-render``: views and turntables of any GLB under any lat-long light."""
+"""``reli3d-render``: still images and turntables of a GLB under an environment map."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from reli3d.cli.exit_codes import Parser, check_ranges, command, extra
 from reli3d.errors import InputError
 
 FORMATS = ("png", "exr", "webp", "gif", "mp4")
-OTHER_FILMS = (".mov", ".avi", ".mkv", ".webm", ".m4v", ".apng")  # not written
+UNSUPPORTED_VIDEO = (".mov", ".avi", ".mkv", ".webm", ".m4v", ".apng")
 MOVING = ("webp", "gif", "mp4")  # one file of all frames
 STILL = ("png", "exr")  # one file a frame
 RATE = 24  # frames a second
@@ -23,8 +23,8 @@ QUALITIES = {"draft": ((6, 12, 2), 1), "good": ((20, 40, 4), 2), "best": ((64, 1
 def parser() -> argparse.ArgumentParser:
     p = Parser(
         prog="reli3d-render",
-        description="Render a GLB with direct light and shadows under an HDR environment.",
-        epilog="Exit code: 0 done, 2 wrong input.  The files' names go to stdout, progress to stderr.",
+        description="Render a GLB with direct lighting and shadows under an HDR environment.",
+        epilog="Exit code: 0 done, 2 wrong input.  Prints the names of the files; progress goes to stderr.",
     )
     p.add_argument("glb", type=Path)
     p.add_argument(
@@ -37,8 +37,7 @@ def parser() -> argparse.ArgumentParser:
         "--output",
         type=Path,
         default=Path("renders"),
-        help="folder, or the name of one view that ends in .png or .exr, or of an animation that ends in .webp, .gif "
-        "or .mp4 (default renders)",
+        help="folder, or a file: one view as .png or .exr, or an animation as .webp, .gif or .mp4 (default renders)",
     )
     p.add_argument(
         "--format",
@@ -47,21 +46,22 @@ def parser() -> argparse.ArgumentParser:
         "(256 colors), mp4 (on white; pip install 'reli3d[video]')",
     )
     p.add_argument(
-        "--frames", type=int, help="views on a full turn around +Y (default 1, of an animation named by --output 72)"
+        "--frames",
+        type=int,
+        help="number of frames of a full turn about +Y (default 1; 72 if --output is an animation)",
     )
-    p.add_argument("--turn", choices=("camera", "light"), default="camera", help="what turns between frames")
-    p.add_argument("--rotate-light", dest="turn", action="store_const", const="light", help="the same as --turn light")
+    p.add_argument("--turn", choices=("camera", "light"), default="camera", help="rotate the camera or the environment")
+    p.add_argument("--rotate-light", dest="turn", action="store_const", const="light", help="same as --turn light")
     p.add_argument("--azimuth", type=float, default=30.0, help="of the first view, degrees from +Z towards +X")
-    p.add_argument("--elevation", type=float, default=20.0, help="degrees above the horizon, within 89")
+    p.add_argument("--elevation", type=float, default=20.0, help="degrees above the horizon, -89 to 89")
     p.add_argument("--fov", type=float, default=32.0, help="horizontal field of view in degrees")
-    p.add_argument("--distance", type=float, help="from the center of the object (default: it fills the view)")
-    p.add_argument("--size", type=int, default=512, help="pixels along a side (default 512)")
+    p.add_argument("--distance", type=float, help="from the center of the object (default: the object fills the view)")
+    p.add_argument("--size", type=int, default=512, help="pixels per side (default 512)")
     p.add_argument(
         "--quality",
         choices=tuple(QUALITIES),
         default="good",
-        help="samples, supersampling: draft 6 12 2 "
-        "and 1, good 20 40 4 and 2, best 64 128 16 and 4; what is given beside it counts",
+        help="preset of --samples and --supersampling: draft 6 12 2 and 1, good 20 40 4 and 2, best 64 128 16 and 4",
     )
     counts = p.add_mutually_exclusive_group()
     counts.add_argument(
@@ -69,42 +69,41 @@ def parser() -> argparse.ArgumentParser:
         type=int,
         nargs=3,
         metavar=("ENV", "GGX", "COS"),
-        help="per subpixel, by strategy (default that of --quality)",
+        help="samples per subpixel of the environment, GGX and cosine strategies (default: of --quality)",
     )
     counts.add_argument(
         "--plan",
         type=int,
         metavar="TOTAL",
-        help="so many per subpixel, shared among the strategies "
-        "for the least noise of the first view (relative noise; with exr absolute); the counts go to "
-        "stderr",
+        help="TOTAL samples per subpixel, divided among the strategies to minimize the noise of the first view "
+        "(relative noise; with exr absolute); prints the counts to stderr",
     )
-    p.add_argument("--supersampling", type=int, help="subpixels along a side of a pixel (default that of --quality)")
+    p.add_argument("--supersampling", type=int, help="subpixels per side of a pixel (default: of --quality)")
     p.add_argument(
         "--diffuse-model",
         choices=("conserving", "published"),
         default="conserving",
-        help="energy transmitted to the diffuse layer: conserving (default; no surface reflects more than it "
-        "receives) or published (glTF viewers' formula; a white diffuse base gains energy at grazing angles)",
+        help="energy transmitted to the diffuse layer: conserving (default; conserves energy) or published (formula of "
+        "glTF viewers; a white diffuse base gains energy at grazing angles)",
     )
     p.add_argument("--background", choices=("transparent", "environment"), default="transparent")
     p.add_argument(
         "--tone",
         choices=("srgb", "agx", "none"),
         default="srgb",
-        help="display transform of png and webp; none writes linear values",
+        help="display transform of all formats but exr; none: linear values",
     )
-    p.add_argument("--exposure", type=float, default=0.0, help="stops, of every format (not of AOVs), within 32")
+    p.add_argument("--exposure", type=float, default=0.0, help="in stops, -32 to 32; of all files but AOVs")
     p.add_argument(
         "--aovs",
         action="store_true",
-        help="also EXR files of base color, material (0, roughness, "
-        "metallic), normal (n / 2 + 1 / 2) and depth (depth, depth, alpha)",
+        help="also write EXR files of base color, material (0, roughness, metallic), normal (n / 2 + 1 / 2) and depth "
+        "(depth, depth, alpha)",
     )
-    p.add_argument("--no-shadows", action="store_true")
-    p.add_argument("--seed", type=int, default=0, help="of what is drawn by chance")
+    p.add_argument("--no-shadows", action="store_true", help="without visibility of the environment")
+    p.add_argument("--seed", type=int, default=0, help="of the Monte Carlo samples")
     p.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
-    p.add_argument("--json", action="store_true", help="print one JSON object instead of the files' names")
+    p.add_argument("--json", action="store_true", help="print one JSON object instead of the file names")
     return p
 
 
@@ -125,7 +124,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _completed(args: argparse.Namespace) -> argparse.Namespace:
-    """The arguments with what others of them say; ``args.file`` is the file that ``--output`` names, or None."""
+    """The arguments with defaults that depend on others; ``args.file``: the file named by ``--output``, or None."""
     ending = args.output.suffix.lower().removeprefix(".")
     args.file = args.output if ending in FORMATS and not args.output.is_dir() else None
     if args.file is not None:
@@ -150,9 +149,9 @@ def _check(args: argparse.Namespace) -> None:
     check_ranges(args, frames=(1, 3600), size=(1, 8192), supersampling=(1, 16), plan=(1, 65536), seed=(0, 10**9))
     if not all(0 <= k <= 65536 for k in args.samples) or sum(args.samples) == 0:
         raise InputError("--samples", f"expected three counts of 0 to 65536, one above 0, got {tuple(args.samples)}")
-    if args.output.suffix.lower() in OTHER_FILMS:
+    if args.output.suffix.lower() in UNSUPPORTED_VIDEO:
         raise InputError(
-            "--output", f"expected a folder, or a name that ends in .png, .exr, .webp, .gif or .mp4, got {args.output}"
+            "--output", f"expected a folder or a file of type .png, .exr, .webp, .gif or .mp4, got {args.output}"
         )
     if args.format == "mp4":
         if args.size % 2:
@@ -173,7 +172,7 @@ def _check(args: argparse.Namespace) -> None:
 
 
 def render_files(args: argparse.Namespace) -> list[Path]:
-    """Render all frames and write them; returns what was written."""
+    """Renders and writes all frames; returns the paths of the files."""
     import torch
     from tqdm import tqdm
 
@@ -237,7 +236,7 @@ def render_files(args: argparse.Namespace) -> list[Path]:
             written.append(still or stem.with_name(stem.name + ".exr"))
             write_exr(written[-1], (image.radiance * 2.0**args.exposure).cpu())
         else:
-            animation.append(_picture(image, args))
+            animation.append(_display_image(image, args))
             if args.format == "png":
                 written.append(still or stem.with_name(stem.name + ".png"))
                 _save(written[-1], animation.pop(), format="PNG")
@@ -251,8 +250,8 @@ def render_files(args: argparse.Namespace) -> list[Path]:
     return written
 
 
-def _picture(image, args):
-    """Display image: RGBA with straight alpha, or RGB in front of the environment."""
+def _display_image(image, args):
+    """Display image of Pillow: RGBA with straight alpha, or RGB over the environment."""
     import torch
     from PIL import Image
 
@@ -263,33 +262,35 @@ def _picture(image, args):
     return Image.fromarray((shown * 255.0 + 0.5).to(torch.uint8).cpu().numpy())
 
 
-def _animate(path: Path, pictures: list, kind: str) -> None:
-    """One file of all ``pictures``, RATE a second, that begins again."""
+def _animate(path: Path, images: list, kind: str) -> None:
+    """Writes a looping animation of ``images`` at RATE frames per second."""
     if kind == "mp4":
         from reli3d.io.files import write_bytes
         from reli3d.output.video import mp4_bytes
 
-        return write_bytes(path, mp4_bytes(pictures, RATE))
-    options = {"lossless": False} if kind == "webp" else {"disposal": 2}  # gif: what is transparent shows no old frame
+        return write_bytes(path, mp4_bytes(images, RATE))
+    options = (
+        {"lossless": False} if kind == "webp" else {"disposal": 2}
+    )  # disposal: clear to transparent before each frame
     return _save(
         path,
-        pictures[0],
+        images[0],
         format=kind.upper(),
         save_all=True,
-        append_images=pictures[1:],
+        append_images=images[1:],
         duration=round(1000 / RATE),
         loop=0,
         **options,
     )
 
 
-def _save(path: Path, picture, **options) -> None:
+def _save(path: Path, image_file, **options) -> None:
     from io import BytesIO
 
     from reli3d.io.files import write_bytes
 
     data = BytesIO()
-    picture.save(data, **options)
+    image_file.save(data, **options)
     write_bytes(path, data.getvalue())
 
 

@@ -9,21 +9,23 @@ from pathlib import Path
 from reli3d.cli.exit_codes import Parser, check_range, command
 from reli3d.errors import InputError
 
-MOST = 16  # input views
+MAX_VIEWS = 16  # input views
 
 
 def parser() -> argparse.ArgumentParser:
     p = Parser(
         prog="reli3d-tables",
-        description="Render objects, reconstruct them from some of the views, and compare in the others.",
+        description="Render objects, reconstruct them from some views, and compare in held-out views.",
     )
     p.add_argument("objects", type=Path, nargs="+", help="GLB files with textures")
-    p.add_argument("--maps", type=Path, required=True, help=".npz of environment maps, of which the held-back light")
+    p.add_argument("--maps", type=Path, required=True, help=".npz of environment maps; the held-out ones are used")
     p.add_argument("--weights", default="small", help="small, or a safetensors file")
     p.add_argument("--views", type=int, nargs="+", default=(1, 2, 4, 8, 16), help="numbers of input views")
     p.add_argument("--size", type=int, default=128, help="pixels")
-    p.add_argument("--hero", choices=("random", "first"), default="random", help="which view goes first")
-    p.add_argument("--icp", action="store_true", help="move the result onto the truth before geometry is compared")
+    p.add_argument("--hero", choices=("random", "first"), default="random", help="which view is the reference view")
+    p.add_argument(
+        "--icp", action="store_true", help="align the result to the reference by ICP before comparing geometry"
+    )
     p.add_argument("--seed", type=int, default=0)
     p.add_argument("--output", type=Path, default=Path("tables"), help="folder of table.md, objects.csv and sheet.png")
     return p
@@ -38,19 +40,19 @@ def main(argv: list[str] | None = None) -> int:
     from reli3d.nn.weights import load_model
     from reli3d.output.folder import check_folder
     from reli3d.render.environment import Environment
-    from reli3d.synthetic.maps import held_back, load_maps
+    from reli3d.synthetic.maps import held_out, load_maps
 
     check_range("size", args.size, 16, 2048)
     check_range("seed", args.seed, 0, 10**9)
     for count in args.views:
-        check_range("views", count, 1, MOST)
+        check_range("views", count, 1, MAX_VIEWS)
     check_folder(args.output)
     for path in args.objects:
         file_size(path)
     maps, names = load_maps(args.maps)
-    lights = [Environment(m) for m, held in zip(maps, held_back(names), strict=True) if held]
+    lights = [Environment(m) for m, held in zip(maps, held_out(names), strict=True) if held]
     if len(lights) < 2:
-        raise InputError("--maps", "expected two held-back maps, so twelve maps, got fewer")
+        raise InputError("--maps", "expected at least two held-out maps, got fewer; give twelve maps or more")
     model = load_model(args.weights)
     tables, rows, sheet = table(
         model,

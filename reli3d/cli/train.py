@@ -1,4 +1,4 @@
-"""``reli3d-train``: train a network, one stage a call."""
+"""``reli3d-train``: trains one stage of a network."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 SMALL_STAGES = ("pixels", "small")
 SIDES = 64, 128, 256  # of the images of stage pixels
-CALIBRATED = 5  # views of a sample: four are input, one is compared
+CALIBRATED = 5  # least views of a sample for calibration: four are input, one is compared
 OF_LOOP = ("steps", "minutes", "batch", "rate", "seed", "save_every", "tensorboard")
 OF_ALL = (*OF_LOOP, "weights", "validation", "export", "licence", "max_views", "bfloat16")
 OF_SMALL = ("points", "pyramid_rate", "maps", "material_bins")
@@ -30,13 +30,16 @@ OF_PAPER = (*OF_CONFIG, "preset", "prior", "perceptual", "checkpointing", "shard
 def parser() -> argparse.ArgumentParser:
     p = Parser(
         prog="reli3d-train",
-        description="Train a network, one stage a call; continues where it stopped.  Under torchrun the processes "
-        "share each batch.",
+        description="Train one stage of a network, or resume it.  Under torchrun the processes divide each batch.",
         argument_default=argparse.SUPPRESS,
     )
     # torchrun reads the whole line first: an option that is the beginning of one of its own would be ambiguous
     p.add_argument(
-        "data", type=Path, nargs="*", default=[], help="folders of samples; of the paper's stages also captures, shards"
+        "data",
+        type=Path,
+        nargs="*",
+        default=[],
+        help="folders of samples; for the paper's stages also captures, shards",
     )
     p.add_argument("output", type=Path, help="folder of the checkpoint, the log, the curves and validation images")
     p.add_argument(
@@ -48,29 +51,29 @@ def parser() -> argparse.ArgumentParser:
     )
     p.add_argument(
         "--weights",
-        help="initial weights: the averaged ones of a checkpoint (state.pt of this or the stage before), a safetensors "
-        "file, or small; random without it",
+        help="initial weights: the averaged weights of a checkpoint (state.pt of this or the previous stage), a "
+        "safetensors file, or small (default: random)",
     )
-    p.add_argument("--validation", type=Path, help="folder of held-out objects: shown at every checkpoint")
-    p.add_argument("--export", type=Path, help="write the averaged weights of the checkpoint to this file and stop")
-    p.add_argument("--licence", help="of the exported weights")
-    loop = p.add_argument_group("schedule (defaults of the stage)")
+    p.add_argument("--validation", type=Path, help="folder of held-out objects, reconstructed at every checkpoint")
+    p.add_argument("--export", type=Path, help="write the averaged weights of the checkpoint to this file and exit")
+    p.add_argument("--licence", help="license of the exported weights, stored in the file")
+    loop = p.add_argument_group("schedule (default: of the stage)")
     loop.add_argument("--steps", type=int)
-    loop.add_argument("--minutes", type=float, help="of training, if the steps take longer")
-    loop.add_argument("--batch", type=int, help="objects a step, over all processes")
+    loop.add_argument("--minutes", type=float, help="end training after this time, if before --steps")
+    loop.add_argument("--batch", type=int, help="objects per step, over all processes")
     loop.add_argument("--rate", type=float, help="peak learning rate")
-    loop.add_argument("--max-views", type=int, help="an object is read from 1 to this many views")
+    loop.add_argument("--max-views", type=int, help="upper limit of the random number of input views")
     loop.add_argument("--seed", type=int)
     loop.add_argument("--save-every", type=int, metavar="STEPS")
-    loop.add_argument("--bfloat16", action="store_true", help="convolutions, or the trunk, in bfloat16")
+    loop.add_argument("--bfloat16", action="store_true", help="compute the convolutions or the trunk in bfloat16")
     loop.add_argument("--tensorboard", type=Path, metavar="DIR", help="also write event files to this folder")
     small = p.add_argument_group("stages pixels and small")
-    small.add_argument("--points", type=int, help="volume points an object")
+    small.add_argument("--points", type=int, help="volume points per object")
     small.add_argument(
         "--pyramid-rate",
         type=float,
         metavar="TIMES",
-        help="of the 2D U-Net over --rate: 0.1 keeps what pixels taught",
+        help="multiplier of the learning rate of the 2D U-Net; 0.1 after stage pixels",
     )
     small.add_argument(
         "--material-bins",
@@ -80,9 +83,11 @@ def parser() -> argparse.ArgumentParser:
     )
     small.add_argument("--maps", type=Path, help="environment maps, .npz: half of the draws are relit under them")
     paper = p.add_argument_group("stages of the paper's network, and --image-size of pixels")
-    paper.add_argument("--image-size", type=int, help="pixels of a side; of stage pixels 64 (default), 128 or 256")
+    paper.add_argument("--image-size", type=int, help="pixels per side; for stage pixels 64 (default), 128 or 256")
     paper.add_argument("--preset", choices=("tiny", "official"))
-    paper.add_argument("--prior", type=Path, help="light prior of reli3d.train.light_prior, fixed; adds a loss")
+    paper.add_argument(
+        "--prior", type=Path, help="environment decoder from reli3d.train.light_prior, frozen; adds a loss"
+    )
     paper.add_argument("--perceptual", choices=("gradients", "lpips"))
     paper.add_argument("--checkpointing", action="store_true", help="recompute the trunk's layers in the backward pass")
     paper.add_argument("--shard", action="store_true", help="divide the trunk among the processes of torchrun (FSDP)")
@@ -95,7 +100,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def parsed(argv: list[str] | None) -> argparse.Namespace:
-    """The arguments, checked as far as possible without reading data.  Raises InputError."""
+    """The arguments, validated without reading data.  Raises InputError."""
     from reli3d.output.folder import check_folder
     from reli3d.train.log import summary_writer
 
@@ -119,15 +124,15 @@ def parsed(argv: list[str] | None) -> argparse.Namespace:
 
 
 def given(args: argparse.Namespace, *names: str) -> dict[str, Any]:
-    """Those of the options that are given."""
+    """The options ``names`` that are given, by name."""
     return {name: getattr(args, name) for name in names if name in args}
 
 
 def small_stage(args: argparse.Namespace) -> Stage:
-    """The stages pixels and small."""
+    """A stage of the small network."""
     from reli3d.nn.value_bins import with_bins
     from reli3d.synthetic.stored import check_samples
-    from reli3d.train.pixels import for_small_pictures
+    from reli3d.train.pixels import reduced_model
     from reli3d.train.small import PixelStage, SmallStage
 
     pixels = args.stage == "pixels"
@@ -148,7 +153,7 @@ def small_stage(args: argparse.Namespace) -> Stage:
     if "material_bins" in args:
         model = with_bins(model, args.material_bins)
     finest = SIDES[::-1].index(side) if pixels else 0
-    model = for_small_pictures(model, finest).train() if finest else model
+    model = reduced_model(model, finest).train() if finest else model
     names = ("seed", "max_views", "points", "pyramid_rate", "bfloat16", "maps", "validation")
     return (PixelStage if pixels else SmallStage)(model, args.data, **given(args, *names))
 
@@ -161,7 +166,7 @@ def small_network(start: str | None, resumed: Path) -> LocalReconstructor:
     from reli3d.nn import weights
     from reli3d.nn.local import LocalReconstructor
     from reli3d.train import checkpoint
-    from reli3d.train.pixels import lacking, take_levels
+    from reli3d.train.pixels import load_levels, missing_parameters
 
     if start is None or start.endswith(".pt"):
         known = Path(start) if start else resumed
@@ -169,8 +174,8 @@ def small_network(start: str | None, resumed: Path) -> LocalReconstructor:
         model = LocalReconstructor(checkpoint.small_preset(state))
         if start:
             average = state["average"]
-            checkpoint.check_shapes(Path(start), average, model, lacking(model.preset, average))
-            take_levels(model, average)
+            checkpoint.check_shapes(Path(start), average, model, missing_parameters(model.preset, average))
+            load_levels(model, average)
         return model.train()
     found = weights.load_model(start, "cpu")
     if not isinstance(found, LocalReconstructor):
@@ -179,7 +184,7 @@ def small_network(start: str | None, resumed: Path) -> LocalReconstructor:
 
 
 def paper_stage(args: argparse.Namespace) -> Stage:
-    """The stages of the paper's network."""
+    """A stage of the paper's network."""
     import torch
 
     from reli3d.nn.model import Reconstructor
@@ -227,7 +232,7 @@ def paper_stage(args: argparse.Namespace) -> Stage:
 
 
 def start_from(start: str, model: Reconstructor) -> None:
-    """Load the averaged weights of a checkpoint, or a file of weights, into ``model``.  Raises InputError."""
+    """Loads the averaged weights of a checkpoint or a weights file into ``model``.  Raises InputError."""
     from reli3d.nn import weights
     from reli3d.train import checkpoint
 
@@ -243,8 +248,9 @@ def start_from(start: str, model: Reconstructor) -> None:
 
 
 def export(args: argparse.Namespace, stage: Stage) -> LocalReconstructor | Reconstructor:
-    """The averaged network of the checkpoint, calibrated if it is the small one.  Raises InputError for one that has
-    no surface.
+    """The network with the averaged weights of the checkpoint, the small network calibrated.
+
+    Raises InputError if it predicts no surface.
     """
     from reli3d.nn.local import LocalReconstructor
     from reli3d.train import checkpoint

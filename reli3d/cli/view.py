@@ -1,4 +1,4 @@
-"""``reli3d view``: the page of a reconstruction, served on this machine alone and opened in the browser."""
+"""``reli3d view``: serves the viewer page of a reconstruction on this machine and opens it in the browser."""
 
 from __future__ import annotations
 
@@ -21,20 +21,19 @@ HOSTS = ("localhost", "127.0.0.1", "[::1]")
 def parser() -> argparse.ArgumentParser:
     p = Parser(
         prog="reli3d view",
-        description="Show a reconstruction in the browser: orbit, relight, its maps, the photographs over it.",
-        epilog="The page also opens by itself, as a file.  Its address goes to stdout; Ctrl-C ends.",
+        description="View a reconstruction in the browser: orbit, relight, show its maps, overlay the input images.",
+        epilog="Prints the address; Ctrl-C ends.  The page can also be opened as a file.",
     )
-    p.add_argument("folder", type=Path, help=f"what reli3d-infer wrote: the folder of {PAGE}")
-    p.add_argument("--port", type=int, default=0, help="of 127.0.0.1 (default: a free one)")
+    p.add_argument("folder", type=Path, help=f"folder written by reli3d-infer, with {PAGE}")
+    p.add_argument("--port", type=int, default=0, help="port on 127.0.0.1 (default: a free one)")
     p.add_argument("--no-browser", action="store_true", help="print the address only")
     return p
 
 
 class Handler(http.server.SimpleHTTPRequestHandler):
-    """Files of one folder, for pages of this machine alone.
+    """Serves the files of one folder to this machine only.
 
-    A request whose ``Host`` is not the server's own address is refused: a web page of another site, whose name has been
-    made to lead to 127.0.0.1 (DNS rebinding), would otherwise read the files.
+    Refuses requests whose ``Host`` is not the server's own address, against DNS rebinding.
     """
 
     def parse_request(self) -> bool:

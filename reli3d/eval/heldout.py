@@ -1,9 +1,7 @@
-"""How well the network reconstructs procedural objects that no training has seen, under light that no training has
-seen.
+"""Metrics on held-out procedural objects under held-out environments.
 
-For every validation sample: silhouette IoU and base color PSNR from cameras that were not input, beside what the
-best single color scores there, and the error of the environment beside that of the mean environment of the training
-maps.
+For every sample: silhouette IoU and base color PSNR in held-out views, with the PSNR of the best constant color as a
+baseline; and the error of the environment, with that of the mean training environment as a baseline.
 """
 
 from __future__ import annotations
@@ -16,6 +14,7 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
+from reli3d.errors import InputError
 from reli3d.geometry.camera import Camera, camera_rays
 from reli3d.geometry.rays import RayScene
 from reli3d.pipeline import Network, NoSurface, ReconstructOptions, reconstruct
@@ -28,11 +27,11 @@ from reli3d.synthetic.samples import ObjectSurface
 from reli3d.train.batches import stored_views
 from reli3d.train.light_prior import scale_free
 
-UNSEEN = 8  # the last views are looked at, the first are input
+HELD_OUT_VIEWS = 8  # the last views of a sample, which are compared; the first are input
 BLACK = 0.01  # added to radiance before the logarithm
 
 
-def truth_colors(seed: int, cameras: list[Camera]) -> list[tuple[Tensor, Tensor]]:
+def reference_colors(seed: int, cameras: list[Camera]) -> list[tuple[Tensor, Tensor]]:
     """Coverage ``(H, W)`` bool and base color ``(H, W, 3)``, sRGB-encoded, of the object of ``seed`` in each
     camera.
     """
@@ -50,7 +49,7 @@ def truth_colors(seed: int, cameras: list[Camera]) -> list[tuple[Tensor, Tensor]
 
 
 def asset_colors(asset, scene: RayScene, camera: Camera) -> tuple[Tensor, Tensor]:
-    """The same of a reconstruction."""
+    """As :func:`reference_colors`, of a reconstruction in one camera."""
     origins, directions = (r.reshape(-1, 3) for r in camera_rays(camera))
     hits = scene.closest(origins, directions)
     seen = (hits.face >= 0).nonzero()[:, 0]
@@ -62,18 +61,16 @@ def asset_colors(asset, scene: RayScene, camera: Camera) -> tuple[Tensor, Tensor
     return (hits.face >= 0).reshape(shape), color.reshape(*shape, 3)
 
 
-def square_error(color: Tensor, truth: Tensor) -> float:
-    """Mean square difference of sRGB values ``(N, 3)`` in [0, 1]."""
-    return float((color - truth).square().mean().clamp(min=1e-10))
+def square_error(color: Tensor, reference: Tensor) -> float:
+    """Mean square error of sRGB values ``(N, 3)`` in [0, 1], at least 1e-10."""
+    return float((color - reference).square().mean().clamp(min=1e-10))
 
 
-def scaled_square_error(color: Tensor, truth: Tensor) -> float:
-    """The same after the best factor for each channel in linear light: no image determines how bright an albedo is,
-    since a longer exposure looks the same.
-    """
-    p, t = srgb_to_linear(color), srgb_to_linear(truth)
+def scaled_square_error(color: Tensor, reference: Tensor) -> float:
+    """:func:`square_error` after the best factor per channel in linear light: exposure makes the albedo ambiguous."""
+    p, t = srgb_to_linear(color), srgb_to_linear(reference)
     factor = (p * t).sum(0) / (p * p).sum(0).clamp(min=1e-9)
-    return square_error(linear_to_srgb((p * factor).clamp(0, 1)), truth)
+    return square_error(linear_to_srgb((p * factor).clamp(0, 1)), reference)
 
 
 def light_error(predicted: Tensor, target: Tensor) -> float:
@@ -89,33 +86,32 @@ def light_error(predicted: Tensor, target: Tensor) -> float:
 def evaluate(
     model: Network, sample: dict[str, Tensor], seed: int, count: int, mean_light: Tensor, *, symmetry: str = "auto"
 ) -> dict[str, float]:
-    """Figures of one object reconstructed from the first ``count`` views, at most all but ``UNSEEN``; colors are
-    compared where truth and result are seen.  symmetry: of :class:`~reli3d.pipeline.ReconstructOptions`.
-    Raises ValueError for more views.
+    """Metrics of one object reconstructed from the first ``count`` views, compared in the last HELD_OUT_VIEWS.
 
-    ``*_mse`` are square errors of the base color, ``single_*`` those of the best single color of this very object.
-    ``empty`` is 1 where the field has no surface: IoU 0 and nothing else to compare.  Without a pixel that both cover
-    there are no colors.
+    ``*_mse``: mean square errors of the base color over the pixels that both silhouettes cover, absent if there are
+    none; ``single_*``: of the best constant color of the object.  ``empty``: 1 if the field has no surface; the IoU is
+    then 0 and the other metrics are absent.  symmetry: as in :class:`~reli3d.pipeline.ReconstructOptions`.  Raises
+    ValueError if the sample has too few views.
     """
     last = len(sample["c2w"])
-    if not 1 <= count <= last - UNSEEN:
-        raise ValueError(f"count: expected 1 to {last - UNSEEN} of {last} views, got {count}")
+    if not 1 <= count <= last - HELD_OUT_VIEWS:
+        raise ValueError(f"count: expected 1 to {last - HELD_OUT_VIEWS} of {last} views, got {count}")
     try:
         options = ReconstructOptions(texture_size=512, symmetry=symmetry)
         asset = reconstruct(stored_views(sample, count), weights=model, options=options)
     except NoSurface:
         return {"empty": 1.0, "iou": 0.0}
     scene, size = RayScene(asset.mesh.vertices, asset.mesh.faces), sample["images"].shape[1]
-    chosen = range(last - UNSEEN, last)
+    chosen = range(last - HELD_OUT_VIEWS, last)
     cameras = [Camera(sample["c2w"][i], sample["intrinsics"][i], size, size) for i in chosen]
-    ious, got_all, want_all = [], [], []
-    for camera, (mask, want) in zip(cameras, truth_colors(seed, cameras), strict=True):
-        got_mask, got = asset_colors(asset, scene, camera)
-        ious.append(float((mask & got_mask).sum() / (mask | got_mask).sum().clamp(min=1)))
-        both = mask & got_mask
-        got_all.append(got[both])
-        want_all.append(want[both])
-    got, want = torch.cat(got_all), torch.cat(want_all)
+    ious, result_all, reference_all = [], [], []
+    for camera, (mask, reference) in zip(cameras, reference_colors(seed, cameras), strict=True):
+        result_mask, result = asset_colors(asset, scene, camera)
+        ious.append(float((mask & result_mask).sum() / (mask | result_mask).sum().clamp(min=1)))
+        both = mask & result_mask
+        result_all.append(result[both])
+        reference_all.append(reference[both])
+    result, reference = torch.cat(result_all), torch.cat(reference_all)
     target = quarter_turn(sample["environment"].float(), -1)  # stored with -Z in the center column
     predicted = asset.light.resized(len(target)).radiance
     exposure = target.mean() / mean_light.mean()
@@ -125,20 +121,21 @@ def evaluate(
         "light_error": light_error(predicted, target),
         "mean_light_error": light_error(mean_light * exposure, target),
     }
-    if len(got):
+    if len(result):
         found |= {
-            "base_color_mse": square_error(got, want),
-            "base_color_scaled_mse": scaled_square_error(got, want),
-            "single_color_mse": square_error(want.mean(0), want),
-            "single_color_scaled_mse": scaled_square_error(torch.ones_like(want), want),
+            "base_color_mse": square_error(result, reference),
+            "base_color_scaled_mse": scaled_square_error(result, reference),
+            "single_color_mse": square_error(reference.mean(0), reference),
+            "single_color_scaled_mse": scaled_square_error(torch.ones_like(reference), reference),
         }
     return found
 
 
 def summary(rows: list[dict[str, float]]) -> dict[str, float]:
-    """Means over the objects that have the figure.  A square error becomes two PSNRs [dB]: the mean over objects
-    (``_psnr``), which objects of nearly one color rule, and that of the mean error (``_psnr_pooled``), which the
-    colorful ones rule.
+    """Means over the objects that have the metric.
+
+    A mean square error gives two PSNRs [dB]: ``_psnr``, the mean over objects, which nearly uniform objects dominate;
+    and ``_psnr_pooled``, that of the mean error, which colorful objects dominate.
     """
     out: dict[str, float] = {"objects": len(rows)}
     for key in dict.fromkeys(key for row in rows for key in row):
@@ -153,9 +150,7 @@ def summary(rows: list[dict[str, float]]) -> dict[str, float]:
 
 
 def mean_environment(maps: Tensor) -> Tensor:
-    """The geometric mean ``(32, 64, 3)`` of maps ``(n, H, 2H, 3)`` over all turns about the vertical: what a guess
-    can know.
-    """
+    """Geometric mean ``(32, 64, 3)`` of maps ``(n, H, 2H, 3)`` over all rotations about the vertical axis."""
     rows = scale_free(maps).log().mean((0, 2))
     wide = rows.exp()[:, None].expand(-1, 2 * len(rows), -1)
     return Environment(wide.contiguous()).resized(32).radiance
@@ -170,12 +165,13 @@ def table(
     *,
     symmetry: str = "auto",
 ) -> dict[int, dict]:
-    """:func:`summary` of the samples in ``folder`` for each number of views; ``progress`` gets a line an object.  The
-    rest as in :func:`evaluate`.  Raises ValueError where the folder holds no samples.
+    """:func:`summary` of the samples in ``folder`` for each number of input views.
+
+    progress: called with one line per object.  Raises InputError if the folder has no samples.
     """
     files = sorted(folder.glob("*.safetensors"))
     if not files:
-        raise ValueError(f"samples: expected *.safetensors files, got none in {folder}")
+        raise InputError(folder, "expected *.safetensors files, got none; make samples with reli3d-data render")
     out = {}
     for count in counts:
         rows = []

@@ -1,7 +1,7 @@
-"""The paper's figures, each with its definition (papers name them and seldom define them).
+"""The paper's metrics with their definitions.
 
-Geometry is compared in the frame of the truth, scaled so that the truth's longest side is 2, as a box from -1 to 1.
-Pictures are compared in display values (sRGB in [0, 1]) over black, the whole picture.
+Geometry is compared in the frame of the reference, scaled so that its longest side is 2.  Images are compared as
+display values (sRGB in [0, 1]) over black, including the background.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from torch.nn.functional import conv2d
 
 from reli3d.geometry.mesh import Mesh
 
-POINTS = 30_000  # of each surface, drawn evenly by area
+POINTS = 30_000  # of each surface, uniform by area
 THRESHOLDS = (0.1, 0.2, 0.5)  # of the F-score
-WINDOW, SIGMA = 11, 1.5  # of SSIM's Gaussian (Wang and others 2004)
+WINDOW, SIGMA = 11, 1.5  # of SSIM's Gaussian (Wang et al. 2004)
 K1, K2 = 0.01, 0.03
-BEST = 100.0  # dB, of equal pictures
+MAX_PSNR = 100.0  # dB, of equal images
 
 
 def surface_samples(mesh: Mesh, count: int = POINTS, seed: int = 0) -> np.ndarray:
-    """Points ``(count, 3)`` on the faces, evenly by area."""
+    """Points ``(count, 3)`` on the surface, uniform by area."""
     corners = mesh.vertices.detach().cpu().double().numpy()[mesh.faces.cpu().numpy()]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1)
     rng = np.random.default_rng(seed)
@@ -33,37 +33,37 @@ def surface_samples(mesh: Mesh, count: int = POINTS, seed: int = 0) -> np.ndarra
     return (1 - u) * a + u * (1 - v) * b + u * v * c
 
 
-def geometry(got: np.ndarray, want: np.ndarray, *, icp: bool = False) -> dict[str, float]:
-    """Chamfer distance and F-scores of points ``(N, 3)`` of the result and of the truth.
+def geometry(result: np.ndarray, reference: np.ndarray, *, icp: bool = False) -> dict[str, float]:
+    """Chamfer distance and F-scores of points ``(N, 3)`` of a result and of the reference.
 
-    cd: mean of the two mean distances (not squared) to the nearest point of the other.  fs@t: harmonic mean of the
-    shares of each that lie within t of the other.  Both are divided by half the truth's longest side first.  icp: move
-    the result by a rotation and a shift that bring it nearer first (Besl and McKay 1992, from where it is).
+    cd: mean of the two mean distances (not squared) to the nearest point of the other set.  fs@t: harmonic mean of
+    precision and recall, the fractions of points within t of the other set.  Lengths are in units of half the longest
+    side of the reference.  icp: first align the result by a rigid motion (Besl and McKay 1992, from the identity).
     """
-    half = float(np.ptp(want, axis=0).max()) / 2.0
-    got, want = got / half, want / half
+    half = float(np.ptp(reference, axis=0).max()) / 2.0
+    result, reference = result / half, reference / half
     if icp:
-        _, got, _ = trimesh.registration.icp(got, want, max_iterations=50, reflection=False, scale=False)
-    to_want, to_got = cKDTree(want).query(got)[0], cKDTree(got).query(want)[0]
-    found = {"cd": float(to_want.mean() + to_got.mean()) / 2.0}
+        _, result, _ = trimesh.registration.icp(result, reference, max_iterations=50, reflection=False, scale=False)
+    to_reference, to_result = cKDTree(reference).query(result)[0], cKDTree(result).query(reference)[0]
+    found = {"cd": float(to_reference.mean() + to_result.mean()) / 2.0}
     for t in THRESHOLDS:
-        precision, recall = float((to_want <= t).mean()), float((to_got <= t).mean())
+        precision, recall = float((to_reference <= t).mean()), float((to_result <= t).mean())
         found[f"fs@{t:g}"] = 2.0 * precision * recall / max(precision + recall, 1e-12)
     return found
 
 
-def psnr(got: Tensor, want: Tensor) -> float:
-    """Of pictures in [0, 1], dB, at most :data:`BEST`."""
-    return min(BEST, -10.0 * float(torch.log10((got - want).square().mean().clamp(min=1e-12))))
+def psnr(result: Tensor, reference: Tensor) -> float:
+    """Peak signal-to-noise ratio of images in [0, 1], dB, at most MAX_PSNR."""
+    return min(MAX_PSNR, -10.0 * float(torch.log10((result - reference).square().mean().clamp(min=1e-12))))
 
 
-def ssim(got: Tensor, want: Tensor) -> float:
-    """Structural similarity of ``(H, W, C)`` in [0, 1], mean over channels and pixels whose window is whole.
+def ssim(result: Tensor, reference: Tensor) -> float:
+    """Structural similarity of ``(H, W, C)`` in [0, 1], mean over channels and over windows inside the image.
 
-    Wang and others 2004: a Gaussian window of 11 pixels, K1 0.01, K2 0.03.  Raises ValueError below 11 pixels.
+    Wang et al. 2004: Gaussian window of 11 pixels, K1 = 0.01, K2 = 0.03.  Raises ValueError below 11 pixels per side.
     """
-    if min(got.shape[:2]) < WINDOW:
-        raise ValueError(f"got: expected at least {WINDOW} pixels a side, got {tuple(got.shape)}")
+    if min(result.shape[:2]) < WINDOW:
+        raise ValueError(f"result: expected at least {WINDOW} pixels per side, got {tuple(result.shape)}")
     at = torch.arange(WINDOW, dtype=torch.float64, device="cpu") - WINDOW // 2
     line = torch.exp(-at.square() / (2.0 * SIGMA**2))
     kernel = (line[:, None] * line)[None, None] / line.sum() ** 2
@@ -71,7 +71,7 @@ def ssim(got: Tensor, want: Tensor) -> float:
     def mean(x: Tensor) -> Tensor:
         return conv2d(x, kernel)
 
-    a, b = (x.double().movedim(-1, 0)[:, None] for x in (got.cpu(), want.cpu()))
+    a, b = (x.double().movedim(-1, 0)[:, None] for x in (result.cpu(), reference.cpu()))
     ma, mb = mean(a), mean(b)
     va, vb, both = mean(a * a) - ma * ma, mean(b * b) - mb * mb, mean(a * b) - ma * mb
     c1, c2 = K1**2, K2**2

@@ -1,7 +1,7 @@
-"""The paper's tables on any folder of textured GLB files: each is rendered, reconstructed and compared with itself.
+"""The paper's tables for textured GLB files: each object is rendered, reconstructed and compared with the original.
 
-An object is centered and its longest side made 1.  Input views lie about it under one map of light; held-out views show
-the same light, another light and the materials.  The reconstruction sees the input views alone, masks and cameras.
+An object is centered and scaled to a longest side of 1.  The input views are lit by one environment.  Held-out views
+compare renderings under the input lighting, relighting by another environment, and the material maps.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from reli3d.render.shading import ShadeOptions
 from reli3d.synthetic.procedural import sample_cameras
 from reli3d.views.views import Views
 
-UNSEEN = 4  # views that are compared
+HELD_OUT_VIEWS = 4  # views that are compared
 SAMPLES = (16, 16, 4)
-EXPOSED = 0.6  # linear value of the 90th percentile of the object in the first view
+EXPOSURE_TARGET = 0.6  # linear value of the 90th percentile of the object in the first view
 MAPS = ("base_color", "roughness", "metallic")
 COLUMNS = {  # the paper's groups
     "3D": ("cd", "fs@0.1", "fs@0.2", "fs@0.5"),
@@ -43,18 +43,20 @@ COLUMNS = {  # the paper's groups
 
 
 @dataclass(frozen=True)
-class Truth:
-    """An object as it is, and how it is looked at."""
+class ReferenceObject:
+    """The original object with its lighting and cameras."""
 
     name: str
     parts: list[Asset]
-    light: Environment
-    other: Environment
-    cameras: list[Camera]  # the inputs, then ``UNSEEN`` others
+    light: Environment  # of the input views
+    other: Environment  # for relighting
+    cameras: list[Camera]  # the inputs, then ``HELD_OUT_VIEWS`` others
 
 
-def load_truth(path: Path, light: Environment, other: Environment, *, inputs: int, size: int, seed: int) -> Truth:
-    """The object of a file among cameras of the paper's protocol."""
+def load_reference(
+    path: Path, light: Environment, other: Environment, *, inputs: int, size: int, seed: int
+) -> ReferenceObject:
+    """Reads a GLB, normalizes it and places cameras by the paper's protocol."""
     parts = read_glb(path)
     points = torch.cat([p.mesh.vertices for p in parts])
     low, high = points.amin(0), points.amax(0)
@@ -63,11 +65,11 @@ def load_truth(path: Path, light: Environment, other: Environment, *, inputs: in
         replace(p, mesh=replace(p.mesh, vertices=((p.mesh.vertices - (low + high) / 2) * scale).contiguous()))
         for p in parts
     ]
-    c2w, fov = sample_cameras(np.random.default_rng((seed, 5)), inputs + UNSEEN)
+    c2w, fov = sample_cameras(np.random.default_rng((seed, 5)), inputs + HELD_OUT_VIEWS)
     cameras = [
         Camera.from_fov(torch.as_tensor(m, device="cpu"), float(f), size, size) for m, f in zip(c2w, fov, strict=True)
     ]
-    return Truth(path.stem, moved, light, other, cameras)
+    return ReferenceObject(path.stem, moved, light, other, cameras)
 
 
 def layers(
@@ -77,12 +79,12 @@ def layers(
     other: Environment,
     exposures: tuple[float, float],
 ) -> dict[str, Tensor]:
-    """Pictures ``(H, W, 3)`` in [0, 1] over black: in both lights, and the maps; and ``alpha (H, W)``."""
+    """Images ``(H, W, 3)`` in [0, 1] over black: under both environments, and the maps; and ``alpha (H, W)``."""
     first = render_asset(asset, camera, light, options=ShadeOptions(samples=SAMPLES, seed=1))
     lit = render_asset(asset, camera, other, options=ShadeOptions(samples=SAMPLES, seed=2))
     shown = {"alpha": first.alpha}
-    for name, picture, exposure in (("image", first, exposures[0]), ("relit", lit, exposures[1])):
-        shown[name] = linear_to_srgb((picture.radiance * exposure).clamp(0.0, 1.0))
+    for name, rendering, exposure in (("image", first, exposures[0]), ("relit", lit, exposures[1])):
+        shown[name] = linear_to_srgb((rendering.radiance * exposure).clamp(0.0, 1.0))
     cover = first.alpha[..., None]
     shown["base_color"] = linear_to_srgb(first.base_color.clamp(0.0, 1.0)) * cover
     for name in ("roughness", "metallic"):
@@ -90,29 +92,29 @@ def layers(
     return shown
 
 
-def exposure_of(truth: Truth, light: Environment) -> float:
-    """What brings the first view's 90th percentile to :data:`EXPOSED`."""
-    picture = render_asset(truth.parts, truth.cameras[0], light, options=ShadeOptions(samples=SAMPLES, seed=0))
-    shown = picture.radiance[picture.alpha > 0.99].mean(-1)
-    return EXPOSED / max(float(shown.quantile(0.9)) if len(shown) else 1.0, 1e-3)
+def exposure_of(target: ReferenceObject, light: Environment) -> float:
+    """Factor that scales the 90th percentile of the object's radiance in the first view to EXPOSURE_TARGET."""
+    rendering = render_asset(target.parts, target.cameras[0], light, options=ShadeOptions(samples=SAMPLES, seed=0))
+    shown = rendering.radiance[rendering.alpha > 0.99].mean(-1)
+    return EXPOSURE_TARGET / max(float(shown.quantile(0.9)) if len(shown) else 1.0, 1e-3)
 
 
-def input_views(truth: Truth, count: int, hero: int, exposure: float) -> Views:
-    """The first ``count`` views as photographs, the one of index ``hero`` in front."""
+def input_views(target: ReferenceObject, count: int, hero: int, exposure: float) -> Views:
+    """Rendered input views: the first ``count`` cameras, the reference view ``hero`` first."""
     order = [hero, *(k for k in range(count) if k != hero)]
     images, masks = [], []
     for k in order:
-        picture = render_asset(
-            truth.parts,
-            truth.cameras[k],
-            truth.light,
+        rendering = render_asset(
+            target.parts,
+            target.cameras[k],
+            target.light,
             options=ShadeOptions(samples=SAMPLES, seed=3),
             background="environment",
             supersampling=2,
         )
-        images.append(linear_to_srgb((picture.radiance * exposure).clamp(0.0, 1.0)))
-        masks.append(picture.alpha)
-    cameras = [truth.cameras[k] for k in order]
+        images.append(linear_to_srgb((rendering.radiance * exposure).clamp(0.0, 1.0)))
+        masks.append(rendering.alpha)
+    cameras = [target.cameras[k] for k in order]
     return Views(
         tuple(images),
         tuple(masks),
@@ -124,51 +126,52 @@ def input_views(truth: Truth, count: int, hero: int, exposure: float) -> Views:
 
 @torch.no_grad()
 def evaluate(
-    model: Network, truth: Truth, count: int, *, hero: str = "random", icp: bool = False, seed: int = 0
+    model: Network, target: ReferenceObject, count: int, *, hero: str = "random", icp: bool = False, seed: int = 0
 ) -> tuple[dict[str, float], list[Tensor]]:
-    """Figures of one object from ``count`` views, and a row of pictures; ``empty`` 1 where nothing was found.
+    """Metrics of one object reconstructed from ``count`` views, and a row of images for :func:`sheet`.
 
-    hero: ``random``, or ``first``.  Without a surface the pictures are black and there is no geometry to compare.
+    hero: how the reference view is chosen, ``random`` or ``first``.  ``empty``: 1 if the network predicts no surface;
+    the images are then black and the geometry metrics absent.
     """
-    exposures = exposure_of(truth, truth.light), exposure_of(truth, truth.other)
+    exposures = exposure_of(target, target.light), exposure_of(target, target.other)
     front = int(np.random.default_rng((seed, count)).integers(count)) if hero == "random" else 0
-    views = input_views(truth, count, front, exposures[0])
-    unseen = truth.cameras[-UNSEEN:]
-    want = [layers(truth.parts, c, truth.light, truth.other, exposures) for c in unseen]
+    views = input_views(target, count, front, exposures[0])
+    unseen = target.cameras[-HELD_OUT_VIEWS:]
+    reference = [layers(target.parts, c, target.light, target.other, exposures) for c in unseen]
     found = {"empty": 0.0}
     try:
         options = ReconstructOptions(texture_size=512, normalization="none")
         asset = reconstruct(views, weights=model, options=options)
     except NoSurface:
-        found, got = {"empty": 1.0}, [{k: torch.zeros_like(v) for k, v in w.items()} for w in want]
+        found, result = {"empty": 1.0}, [{k: torch.zeros_like(v) for k, v in w.items()} for w in reference]
     else:
         light = present("environment", asset.environment)
-        got = [layers(asset, c, light, truth.other, (1.0, exposures[1])) for c in unseen]
-        mesh = joined([p.mesh for p in truth.parts])
+        result = [layers(asset, c, light, target.other, (1.0, exposures[1])) for c in unseen]
+        mesh = joined([p.mesh for p in target.parts])
         found |= geometry(surface_samples(asset.mesh), surface_samples(mesh, seed=1), icp=icp)
     for name in ("image", "relit", *MAPS):
-        found[f"{name}_psnr"] = float(np.mean([psnr(g[name], w[name]) for g, w in zip(got, want, strict=True)]))
-        found[f"{name}_ssim"] = float(np.mean([ssim(g[name], w[name]) for g, w in zip(got, want, strict=True)]))
+        found[f"{name}_psnr"] = float(np.mean([psnr(g[name], w[name]) for g, w in zip(result, reference, strict=True)]))
+        found[f"{name}_ssim"] = float(np.mean([ssim(g[name], w[name]) for g, w in zip(result, reference, strict=True)]))
     names = ("image", "relit", "base_color")
-    return found, [views.images[0], *(x[n] for n in names for x in (want[0], got[0]))]
+    return found, [views.images[0], *(x[n] for n in names for x in (reference[0], result[0]))]
 
 
 def joined(meshes: Sequence[Mesh]) -> Mesh:
-    """One mesh of several, positions and faces."""
+    """The concatenation of meshes, with positions and faces only."""
     starts = np.cumsum([0] + [len(m.vertices) for m in meshes])
     faces = [m.faces + int(s) for m, s in zip(meshes, starts)]
     return Mesh(torch.cat([m.vertices for m in meshes]), torch.cat(faces))
 
 
 def summary(rows: Sequence[dict[str, float]]) -> dict[str, float]:
-    """Means over the objects that have the figure, and how many objects there were."""
+    """Means over the objects that have the metric, and the number of objects."""
     names = dict.fromkeys(name for row in rows for name in row)
     means = {name: float(np.mean([row[name] for row in rows if name in row])) for name in names}
     return {"objects": float(len(rows)), **means}
 
 
 def markdown(tables: dict[str, dict[str, float]]) -> str:
-    """The paper's layout: a row for each number of views, groups of columns; a dash where there is no figure."""
+    """Markdown table in the paper's layout: a row per number of views, ``-`` for missing values."""
     names = [c for columns in COLUMNS.values() for c in columns]
     lines = ["| views | objects | " + " | ".join(names) + " |", "|---" * (len(names) + 2) + "|"]
     for label, row in tables.items():
@@ -178,7 +181,7 @@ def markdown(tables: dict[str, dict[str, float]]) -> str:
 
 
 def as_csv(rows: Sequence[dict]) -> str:
-    """All objects, one a line."""
+    """CSV table with one object and number of views per line."""
     names = list(dict.fromkeys(name for row in rows for name in row))
     out = io.StringIO()
     writer = csv.DictWriter(out, names, restval="", lineterminator="\n")
@@ -188,7 +191,7 @@ def as_csv(rows: Sequence[dict]) -> str:
 
 
 def sheet(rows: Sequence[Sequence[Tensor]]) -> Tensor:
-    """Pictures side by side: hero, then truth and result of image, relit and base color; uint8."""
+    """Image sheet, uint8.  Columns: reference view, then reference and result of image, relit and base color."""
     return (torch.cat([torch.cat([t.clamp(0, 1).cpu() for t in row], 1) for row in rows]) * 255 + 0.5).to(torch.uint8)
 
 
@@ -204,19 +207,22 @@ def table(
     seed: int = 0,
     progress: Callable[[str], None] = lambda line: None,
 ) -> tuple[dict, list[dict], Tensor]:
-    """Means for each number of views, all rows, and the sheet of the largest number; lights go round the objects."""
+    """Means for each number of views, the metrics of every object, and the image sheet of the last number of views.
+
+    lights: assigned to the objects in turn; the next one is used for relighting.
+    """
     rows: list[dict] = []
-    pictures = []
+    rows_of_images = []
     for k, path in enumerate(files):
         light, other = lights[k % len(lights)], lights[(k + 1) % len(lights)]
-        truth = load_truth(path, light, other, inputs=max(counts), size=size, seed=seed + k)
+        target = load_reference(path, light, other, inputs=max(counts), size=size, seed=seed + k)
         for count in counts:
-            found, shown = evaluate(model, truth, count, hero=hero, icp=icp, seed=seed + k)
-            rows.append({"object": truth.name, "views": count, **found})
-            progress(f"{truth.name}, {count} views: " + ", ".join(f"{n} {v:.3f}" for n, v in found.items()))
-        pictures.append(shown)
+            found, shown = evaluate(model, target, count, hero=hero, icp=icp, seed=seed + k)
+            rows.append({"object": target.name, "views": count, **found})
+            progress(f"{target.name}, {count} views: " + ", ".join(f"{n} {v:.3f}" for n, v in found.items()))
+        rows_of_images.append(shown)
     of = {
         str(c): [{n: v for n, v in r.items() if n not in ("object", "views")} for r in rows if r["views"] == c]
         for c in counts
     }
-    return {label: summary(scores) for label, scores in of.items()}, rows, sheet(pictures)
+    return {label: summary(scores) for label, scores in of.items()}, rows, sheet(rows_of_images)

@@ -33,8 +33,8 @@ from reli3d.nn.pyramid import (
     OTHERS_BEFORE,
     ImagePyramid,
     depth_of_origin,
-    place_of_pixels,
-    span_of_pixels,
+    pixel_hull_depths,
+    pixel_positions,
 )
 from reli3d.nn.view_features import AHEAD, ViewFeatures, ViewMaps, ahead_of_surface
 from reli3d.nn.view_lookup import fuse_views, summarize_views
@@ -226,7 +226,7 @@ class LocalReconstructor(nn.Module):
     def _encoded(self, views: tuple[Tensor, ...], mirrored: int, *, inference: bool) -> LocalField:
         images, masks, c2w, intrinsics, detail, detail_intrinsics = views
         features, pixels, camera = self.read_pixels(images, masks, c2w, intrinsics, detail, detail_intrinsics, mirrored)
-        color, mask = shown_pixels(images, masks, camera)
+        color, mask = pixel_colors(images, masks, camera)
         shape = torch.cat([pixels.depth, pixels.normal], -1).permute(0, 3, 1, 2)
         shape = functional.avg_pool2d(shape, camera.height // features.shape[1]).permute(0, 2, 3, 1)
         tokens = torch.cat([features, shape], -1).contiguous()
@@ -258,10 +258,10 @@ class LocalReconstructor(nn.Module):
         read = camera[:taken]
         quarter = functional.avg_pool2d(masks[:taken, None], QUARTER)[:, 0]
         outlined = Camera(c2w, detail_intrinsics, *detail.shape[2:0:-1])
-        span = span_of_pixels(detail[..., 3], outlined, quarter, read.resized(*quarter.shape[:0:-1]))
-        features, raw = self.pyramid(images[:taken], masks[:taken], place_of_pixels(read), span)
+        span = pixel_hull_depths(detail[..., 3], outlined, quarter, read.resized(*quarter.shape[:0:-1]))
+        features, raw = self.pyramid(images[:taken], masks[:taken], pixel_positions(read), span)
         coarse = camera.resized(*raw.shape[2:0:-1])
-        mean = mean_logit(*shown_pixels(images[:taken], masks[:taken], coarse[:taken]))
+        mean = mean_logit(*pixel_colors(images[:taken], masks[:taken], coarse[:taken]))
         if mirrored:
             nearer = depth_of_origin(c2w[:mirrored]) - depth_of_origin(c2w[taken:])
             turned = raw[:mirrored].flip(2)
@@ -282,7 +282,7 @@ class LocalReconstructor(nn.Module):
         return self.light(srgb_to_linear(observed), albedo, gloss, pixels.normal[v, y, x], wo)
 
 
-def shown_pixels(images: Tensor, masks: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+def pixel_colors(images: Tensor, masks: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
     """Colors ``(V, P, P, 3)`` and coverage ``(V, P, P, 1)`` of the views, downsampled to the size of ``camera``."""
     shown = torch.cat([images, masks[..., None]], -1).permute(0, 3, 1, 2)
     shown = functional.avg_pool2d(shown, images.shape[1] // camera.height)

@@ -43,7 +43,7 @@ def depth_of_origin(c2w: Tensor) -> Tensor:
     return (c2w[:, :3, 3] * c2w[:, :3, 2]).sum(-1)
 
 
-def place_of_pixels(camera: Camera) -> Tensor:
+def pixel_positions(camera: Camera) -> Tensor:
     """Coordinates ``(V, S, S, 2)`` [world units, right and up] where pixel rays hit the plane through the world origin
     parallel to the image plane.  They encode the scale and the position of a crop.
 
@@ -56,7 +56,7 @@ def place_of_pixels(camera: Camera) -> Tensor:
     return torch.stack([x * depth, y * depth], -1) - origin
 
 
-def span_of_pixels(silhouette: Tensor, outlined: Camera, coverage: Tensor, camera: Camera) -> Tensor:
+def pixel_hull_depths(silhouette: Tensor, outlined: Camera, coverage: Tensor, camera: Camera) -> Tensor:
     """Depths ``(V, Q, Q, 2)``, relative to the world origin's, at which pixel rays enter and leave the visual hull.
 
     silhouette: ``(V, D, D)`` signed distance in pixels of the cameras ``outlined``.  coverage: ``(V, Q, Q)`` of the

@@ -1,4 +1,4 @@
-"""The bench on which a procedural object is put together: solids with part numbers, deformed and joined at the end."""
+"""Constructive solid geometry of procedural objects: solids with part numbers, their union, cuts and deformations."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from manifold3d import Manifold, Mesh, OpType
 
-SCRAP = 2e-3  # share of the volume below which a loose piece left by a cut is dropped
+MIN_PIECE_FRACTION = 2e-3  # of the volume; smaller disconnected pieces are removed
 
 
 class Assembly:
-    """Solids that are joined, cutters that are taken away, and the role (a hint for the material) of every part.
+    """The union of added solids minus the cuts; every part has a role, from which its material is drawn.
 
     Roles: ``wood metal plastic paint fabric leather ceramic stone skin rubber accent any``.
     """
@@ -29,11 +29,11 @@ class Assembly:
         return len(self.roles) - 1
 
     def add(self, solid: Manifold, part: int, at: Sequence[float] | np.ndarray | None = None) -> None:
-        """Join ``solid``, moved by ``at``."""
+        """Adds ``solid``, translated by ``at``."""
         self._solids.append(self._tagged(solid, part, at))
 
     def add_labeled(self, vertices: np.ndarray, faces: np.ndarray, part: np.ndarray) -> None:
-        """Join a closed mesh ``(V, 3)``, ``(F, 3)`` whose faces belong to several parts ``(F,)``."""
+        """Adds a closed mesh ``(V, 3)``, ``(F, 3)`` with the part ``(F,)`` of each face."""
         order = np.argsort(part, kind="stable")
         numbers, starts = np.unique(part[order], return_index=True)
         first = Manifold.reserve_ids(len(numbers))
@@ -47,24 +47,24 @@ class Assembly:
         self._solids.append(Manifold(mesh))
 
     def cut(self, solid: Manifold, part: int, at: Sequence[float] | np.ndarray | None = None) -> None:
-        """Take ``solid`` away from all that has been added so far; the cut faces belong to ``part``."""
+        """Subtracts ``solid`` from all that has been added so far; the cut faces belong to ``part``."""
         self._solids = [self.joined() - self._tagged(solid, part, at)]
 
     def keep_inside(self, solid: Manifold, part: int) -> None:
-        """Keep only what lies inside ``solid``."""
+        """Intersects all that has been added so far with ``solid``; the cut faces belong to ``part``."""
         self._solids = [self.joined() ^ self._tagged(solid, part, None)]
 
     def transform(self, matrix: np.ndarray) -> None:
-        """Apply the linear map ``(3, 3)`` to all that has been added so far."""
+        """Applies the linear map ``(3, 3)`` to all that has been added so far."""
         affine = np.concatenate([np.asarray(matrix, dtype=float), np.zeros((3, 1))], 1)
         self._solids = [s.transform(affine) for s in self._solids]
 
     def warp(self, move: Callable[[np.ndarray], np.ndarray], edge: float) -> None:
-        """Move the points ``(N, 3)`` of the joined solid by ``move`` after splitting edges longer than ``edge``."""
+        """Maps the vertices ``(N, 3)`` of the union by ``move`` after splitting edges longer than ``edge``."""
         self._solids = [self.joined().refine_to_length(edge).warp_batch(move)]
 
     def copy_turned(self, solid: Manifold, part: int, count: int, *, about: str = "y") -> None:
-        """Join ``count`` copies of ``solid``, turned evenly about an axis through the origin."""
+        """Adds ``count`` copies of ``solid``, rotated by multiples of ``360 / count`` degrees about an axis."""
         axis = "xyz".index(about)
         for k in range(count):
             angles = [0.0, 0.0, 0.0]
@@ -79,8 +79,8 @@ class Assembly:
         self._solids = [solid]
         return solid
 
-    def solid_share(self) -> float:
-        """Volume over the cube of the longest side, 0 if nothing is left."""
+    def solid_fraction(self) -> float:
+        """Volume divided by the cube of the longest side; 0 for an empty solid."""
         solid = self.joined()
         if solid.num_tri() == 0:
             return 0.0
@@ -88,15 +88,16 @@ class Assembly:
         return solid.volume() / float((box[1] - box[0]).max()) ** 3
 
     def finish(self, max_faces: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Vertices ``(V, 3)`` float64, faces ``(F, 3)`` and part of each face ``(F,)`` of the union without scraps.
+        """Vertices ``(V, 3)`` float64, faces ``(F, 3)`` and part ``(F,)`` of each face of the union.
 
-        Raises ValueError if nothing is left.
+        Small disconnected pieces are removed, and the mesh is simplified to at most ``max_faces``.  Raises ValueError
+        if nothing remains.
         """
         solid = self.joined()
         pieces = solid.decompose()
         if len(pieces) > 1:
             volume = np.array([p.volume() for p in pieces])
-            solid = Manifold.compose([p for p, v in zip(pieces, volume) if v > SCRAP * volume.sum()])
+            solid = Manifold.compose([p for p, v in zip(pieces, volume) if v > MIN_PIECE_FRACTION * volume.sum()])
         if solid.num_tri() == 0 or solid.volume() <= 0:
             raise ValueError("assembly: expected a solid, got nothing after the cuts")
         box = np.array(solid.bounding_box()).reshape(2, 3)

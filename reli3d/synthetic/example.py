@@ -1,6 +1,6 @@
 """The example object of the package: an enameled kettle with a wooden grip and brass fittings on a wooden board.
 
-It is put together by hand; no family of ``procedural.py`` can make it, so a network has never seen it in training.
+No family of ``procedural.py`` generates it, so it is not in the training set.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ OAK, DARK_OAK, WALNUT, DARK_WALNUT = (0.42, 0.26, 0.12), (0.22, 0.12, 0.05), (0.
 
 
 def kettle(a: Assembly) -> None:
-    """Add the solids; the parts are numbered as :func:`finish` dresses them."""
+    """Adds the solids; the parts are in the order of the materials of :func:`finish`."""
     body, lid, knob, arms, grip, spout, trim, board = (a.part("any") for _ in range(8))
     height = np.linspace(0, 0.62, 32)
     belly = p.curve(np.array([[0.44, 0], [0.5, 0.08], [0.47, 0.26], [0.37, 0.44], [0.27, 0.55], [0.235, 0.62]]), 32)[
@@ -68,14 +68,14 @@ def kettle(a: Assembly) -> None:
 
 def finish() -> tuple[Material, ...]:
     """Materials of the parts: body, lid, knob, arms, grip, spout, trim, board."""
-    level = np.diag([1.0, 1.0, 1.0])[[1, 0, 2]]
+    horizontal = np.diag([1.0, 1.0, 1.0])[[1, 0, 2]]
     enamel, cream = Coat(TEAL, 0.2), Coat(CREAM, 0.24)
     chips = pt.Blotches(5.0 * np.eye(3), 11, 0.95, 0.04, octaves=5, gain=0.6)
     body = Material(
         enamel,
         (
             (cream, pt.Ramp((0.0, 1.0, 0.0), -0.012, -0.008, 0.0, 0)),
-            (enamel, pt.Bands(9.5 * level, 0.16, 0.38, softness=0.02)),
+            (enamel, pt.Bands(9.5 * horizontal, 0.16, 0.38, softness=0.02)),
             (Coat((0.55, 0.06, 0.03), 0.25), pt.Dots(11.0 * np.eye(3), 0.22)),
             (enamel, pt.Ramp((0.0, -1.0, 0.0), 0.03, 0.034, 0.0, 0)),
             (Coat(CHARCOAL, 0.75), chips),

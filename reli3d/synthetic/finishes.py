@@ -1,6 +1,6 @@
-"""Finishes: how the parts of a procedural object are dressed by their roles.
+"""Random materials for the parts of a procedural object, by their roles.
 
-Palettes follow everyday things: grays, browns, whites and dark plastics first, saturated paint less often.  Colors are
+Palettes follow everyday objects: mostly grays, browns, whites and dark plastics, few saturated colors.  Colors are
 linear Rec. 709.
 """
 
@@ -13,7 +13,7 @@ import numpy as np
 from reli3d.synthetic import patterns as pt
 from reli3d.synthetic.materials import Bump, Coat, Layer, Material
 
-METAL_SHARE = 0.36  # of the objects may have metal; some of these have no part that takes it
+METAL_PROBABILITY = 0.36  # that an object may have metal parts; not all of these have a suitable part
 # F0 of steel, aluminum, gold, brass, copper, bronze, iron, gunmetal, as published tables give them
 METALS = (
     (0.56, 0.57, 0.58), (0.88, 0.88, 0.89), (0.9, 0.72, 0.32), (0.86, 0.72, 0.42),
@@ -28,10 +28,8 @@ WOODS = (
 
 
 def draw_materials(rng: np.random.Generator, roles: Sequence[str], bounds: np.ndarray) -> tuple[Material, ...]:
-    """One material for each part: ``roles`` as in ``Assembly``, ``bounds`` ``(P, 2, 3)`` its lowest and highest
-    corner.
-    """
-    metal = rng.random() < METAL_SHARE
+    """One material per part.  roles: as in ``Assembly``.  bounds: ``(P, 2, 3)`` lowest and highest corner of a part."""
+    metal = rng.random() < METAL_PROBABILITY
     takes = [metal and role == "metal" for role in roles]
     if metal and not any(takes):
         takes[int(rng.integers(len(roles)))] = rng.random() < 0.7
@@ -48,7 +46,7 @@ def draw_materials(rng: np.random.Generator, roles: Sequence[str], bounds: np.nd
 
 
 def color(rng: np.random.Generator, kind: str) -> tuple[float, float, float]:
-    """Linear base color: ``gray white dark wood muted vivid earth any``."""
+    """Random linear base color of a palette: ``gray white dark wood muted vivid earth any``."""
     u = rng.uniform
     if kind == "any":
         kind = str(
@@ -92,8 +90,8 @@ def _linear_of_hsv(hue: float, saturation: float, value: float) -> np.ndarray:
 def _frame(
     rng: np.random.Generator, low: float, high: float, *, stretch: float = 1.0, turned: float = 0.2
 ) -> np.ndarray:
-    """Random frame with ``low`` to ``high`` cycles a unit, axes swapped at random, turned freely with chance
-    ``turned``.
+    """Random pattern frame of ``low`` to ``high`` cycles per unit with permuted axes; with probability ``turned`` a
+    random rotation.
     """
     axes = np.eye(3)[rng.permutation(3)]
     if rng.random() < turned:
@@ -150,7 +148,7 @@ def _draw(rng: np.random.Generator, role: str, box: np.ndarray) -> Material:
             if rng.random() < 0.5:
                 frame = _frame(rng, 3, 12)
                 spots = (
-                    pt.Mosaic(frame, _seed(rng), share=u(0.2, 0.6))
+                    pt.Mosaic(frame, _seed(rng), fraction=u(0.2, 0.6))
                     if rng.random() < 0.4
                     else pt.Blotches(frame, _seed(rng), u(-0.2, 0.4), u(0.03, 0.2))
                 )
@@ -183,7 +181,7 @@ def _draw(rng: np.random.Generator, role: str, box: np.ndarray) -> Material:
 
 
 def _decor(rng: np.random.Generator, base: Coat, box: np.ndarray, chance: float) -> list:
-    """Painted decoration: bands, checks, dots, blotches, a second color from some height on, labels."""
+    """Decoration in a second color: bands, checks, dots, blotches, a gradient along an axis, cells, labels."""
     u = rng.uniform
     layers: list[Layer] = []
     second = Coat(color(rng, "any"), float(np.clip(base.roughness + rng.normal(0, 0.1), 0.1, 1)))
@@ -194,7 +192,7 @@ def _decor(rng: np.random.Generator, base: Coat, box: np.ndarray, chance: float)
             case 0:
                 frame = _frame(rng, min(1.5 / size, 10), 14, turned=0.15)
                 if rng.random() < 0.5:
-                    frame = frame[[int(np.argmax(np.abs(frame[:, 1]))), 0, 1]]  # level bands
+                    frame = frame[[int(np.argmax(np.abs(frame[:, 1]))), 0, 1]]  # horizontal bands
                 layers.append(
                     (second, pt.Bands(frame, u(0.15, 0.7), u(), u(0, 0.5) * (rng.random() < 0.25), _seed(rng)))
                 )
@@ -214,14 +212,14 @@ def _decor(rng: np.random.Generator, base: Coat, box: np.ndarray, chance: float)
             case 5:
                 layers.append((second, pt.Mosaic(_frame(rng, 4, 14), _seed(rng), border=u(0.05, 0.2))))
             case _:
-                layers.append((second, pt.Mosaic(_frame(rng, 4, 16), _seed(rng), share=u(0.1, 0.6))))
+                layers.append((second, pt.Mosaic(_frame(rng, 4, 16), _seed(rng), fraction=u(0.1, 0.6))))
     if rng.random() < 0.8 * chance:
         layers += label(rng, box)
     return layers
 
 
 def label(rng: np.random.Generator, box: np.ndarray) -> list:
-    """Sticker with rows of letter-like blocks or a symmetric sign, or letters straight on the surface."""
+    """Label with rows of glyph-like blocks or a symmetric sign, with or without a background."""
     u = rng.uniform
     extent, axis = box[1] - box[0], int(rng.choice([2, 0, 1], p=[0.6, 0.25, 0.15]))
     normal = np.eye(3)[axis] * rng.choice([1, 1, -1])
@@ -245,21 +243,21 @@ def label(rng: np.random.Generator, box: np.ndarray) -> list:
         layers.append((paper, _decal(place, half, np.ones((1, 1)), oval)))
     if rng.random() < 0.3:
         side = rng.random((9, 5)) < 0.55
-        picture = np.concatenate([side, side[:, -2::-1]], 1)
+        bitmap = np.concatenate([side, side[:, -2::-1]], 1)
         inner = np.full(2, 0.7 * half.min())
     else:
-        picture, inner = _text(rng, int(rng.integers(1, 6)), int(rng.integers(3, 10))), half * 0.85
-    layers.append((ink, _decal(place, inner, picture)))
+        bitmap, inner = _text(rng, int(rng.integers(1, 6)), int(rng.integers(3, 10))), half * 0.85
+    layers.append((ink, _decal(place, inner, bitmap)))
     return layers
 
 
-def _decal(place: list[tuple[float, float, float]], half: np.ndarray, picture: np.ndarray, oval=False) -> pt.Decal:
+def _decal(place: list[tuple[float, float, float]], half: np.ndarray, bitmap: np.ndarray, oval=False) -> pt.Decal:
     center, right, up = place
-    return pt.Decal(center, right, up, (float(half[0]), float(half[1])), picture.astype(np.float32), oval)
+    return pt.Decal(center, right, up, (float(half[0]), float(half[1])), bitmap.astype(np.float32), oval)
 
 
 def _text(rng: np.random.Generator, rows: int, columns: int) -> np.ndarray:
-    """Rows of glyphs of 5 by 3 blocks, each with a stem, so that they read as print from afar."""
+    """Bitmap of rows of random glyphs of 5 by 3 blocks, each with a stem, which resemble print."""
     page = np.zeros((6 * rows + 1, 4 * columns + 1), dtype=bool)
     for i in range(rows):
         for j in range(columns if rng.random() < 0.5 else int(rng.integers(1, columns + 1))):
@@ -280,7 +278,7 @@ def _dirt(rng: np.random.Generator, base: Coat) -> tuple:
 
 
 def _wear(rng: np.random.Generator, base: Coat) -> list:
-    """Paint worn off to what lies below, scratched or flaking."""
+    """Scratched or flaking paint that exposes the material below."""
     below = Coat(color(rng, str(rng.choice(["wood", "gray", "earth"]))), rng.uniform(0.5, 0.95))
     if rng.random() < 0.35:
         scratch = _frame(rng, 4, 10, stretch=6.0, turned=0.7)
@@ -295,9 +293,9 @@ def _wear(rng: np.random.Generator, base: Coat) -> list:
     ]
 
 
-def _noise_bump(rng: np.random.Generator, low: float, high: float, slope: float) -> pt.Emboss:
+def _noise_bump(rng: np.random.Generator, low: float, high: float, steepness: float) -> pt.Emboss:
     frame = _frame(rng, low, high)
-    return pt.Emboss(frame, _seed(rng), slope / float(np.linalg.norm(frame[0])), octaves=2)
+    return pt.Emboss(frame, _seed(rng), steepness / float(np.linalg.norm(frame[0])), octaves=2)
 
 
 def _wood(rng: np.random.Generator, box: np.ndarray) -> Material:
@@ -387,7 +385,7 @@ def _stone(rng: np.random.Generator) -> Material:
             (other, pt.Blotches(_frame(rng, 4, 20), _seed(rng), u(-0.2, 0.4), u(0.1, 0.5), octaves=5, gain=0.65))
         )
     else:
-        layers.append((other, pt.Mosaic(_frame(rng, 10, 30), _seed(rng), share=u(0.2, 0.5))))
+        layers.append((other, pt.Mosaic(_frame(rng, 10, 30), _seed(rng), fraction=u(0.2, 0.5))))
     if rng.random() < 0.6:
         bumps.append(_noise_bump(rng, 8, 30, u(0.02, 0.16)))
     if rng.random() < 0.3:

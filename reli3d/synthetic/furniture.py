@@ -1,6 +1,6 @@
 """Families of furniture and vehicles: tables, stools, chairs, benches, sofas, shelves, cabinets, toy cars.
 
-Units are about meters, the floor is at y = 0 and the front looks to +z.  See ``manmade.py`` for what a family is.
+Lengths are in meters, approximately; the floor is at y = 0 and the front faces +z.  ``manmade.py`` defines a family.
 """
 
 from __future__ import annotations
@@ -30,9 +30,7 @@ def _leg(a: Assembly, part: int, foot: np.ndarray, top: np.ndarray, thick: float
 
 
 def _legs(a: Assembly, part: int, w: float, d: float, h: float, *, thick: float, bars: bool = True) -> None:
-    """Four legs below a seat or a top of ``w`` by ``d`` at height ``h``, splayed or straight, with stretchers or
-    not.
-    """
+    """Four legs below a seat or a top of ``w`` by ``d`` at height ``h``, optionally splayed, with stretchers."""
     rng = a.rng
     style, splay = int(rng.choice(4, p=[0.5, 0.2, 0.2, 0.1])), rng.uniform(0, 0.18) * (rng.random() < 0.4)
     x, z = w / 2 - thick * 0.7, d / 2 - thick * 0.7
@@ -51,7 +49,7 @@ def _legs(a: Assembly, part: int, w: float, d: float, h: float, *, thick: float,
 
 
 def table(a: Assembly) -> None:
-    """Table, desk, bench or stool: rectangular or round top, four legs, a pedestal or plank sides, apron, drawers."""
+    """Table, desk, bench or stool: rectangular or round top, four legs, a pedestal or panel sides, apron, drawers."""
     rng, u = a.rng, a.rng.uniform
     wood = a.part("wood" if rng.random() < 0.7 else "paint")
     top = wood if rng.random() < 0.6 else a.part(str(rng.choice(["wood", "stone", "plastic", "leather", "fabric"])))
@@ -90,7 +88,7 @@ def table(a: Assembly) -> None:
             a.add(p.box((w - t, u(0.04, 0.3), t)), wood, (0, h * u(0.4, 0.8), -0.3 * d))
     if rng.random() < 0.2 and not rounded:
         _drawers(a, w * 0.35, 0.4 * h, d * 0.9, np.array([w * 0.28, h - 0.2 * h, 0]), wood)
-    if rng.random() < 0.15:  # something on it
+    if rng.random() < 0.15:  # a vessel on top
         a.add(
             p.cylinder(u(0.04, 0.09), u(0.08, 0.2), top=u(0.05, 0.12)),
             a.part("ceramic"),
@@ -134,7 +132,7 @@ def chair(a: Assembly) -> None:
             rest = np.stack([at(s, y - h), np.array([s * w / 2, y, front])])
             a.add(p.tube(p.curve(rest, 4), 0.022, segments=8), wood)
             a.add(p.cylinder(0.018, y - h, segments=8), wood, (s * w / 2, (y + h) / 2, front))
-    if rng.random() < 0.25:  # bent in one piece, as shells are
+    if rng.random() < 0.25:  # bent, as a molded shell
         k = u(0.2, 0.7)
         a.warp(
             lambda q: (
@@ -192,7 +190,7 @@ def sofa(a: Assembly) -> None:
 
 
 def _drawers(a: Assembly, w: float, h: float, d: float, at: np.ndarray, part: int) -> None:
-    """Block with fronts that stand out, gaps between them and knobs or bars."""
+    """Block with protruding drawer fronts, gaps between them, and knobs or bars."""
     rng = a.rng
     a.add(p.box((w, h, d), 0.005), part, at)
     rows, columns = int(rng.integers(1, 5)), int(rng.integers(1, 3))

@@ -1,7 +1,7 @@
-"""Families of made things: primitives and booleans, devices, tools, raised outlines.
+"""Families of man-made objects: primitives with booleans, devices, tools, extruded outlines.
 
-A family is ``family(assembly)``: it draws from ``assembly.rng`` and adds solids, +Y up, sizes of the order of 1.
-Proportions are those of everyday things: legs a few per cent of the height, walls 2 to 6 %, edges rounded by 0 to 10 %.
+A family is a function ``family(assembly)`` that draws from ``assembly.rng`` and adds solids, +Y up, of sizes of the
+order of 1.  Proportions are typical: legs a few percent of the height, walls 2 to 6 %, edges rounded by 0 to 10 %.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from reli3d.synthetic.assembly import Assembly
 
 
 def csg(a: Assembly) -> None:
-    """Two to eight primitives, mostly aligned with the axes and touching, joined, cut and mirrored."""
+    """Two to eight primitives, mostly axis-aligned and touching, with unions, cuts and mirrored copies."""
     rng, u = a.rng, a.rng.uniform
     roles = [
         a.part(str(rng.choice(["plastic", "metal", "wood", "paint", "stone", "accent", "ceramic"])))
@@ -49,7 +49,7 @@ def csg(a: Assembly) -> None:
 
 
 def primitive(rng: np.random.Generator, size: np.ndarray, *, free: bool = False) -> Manifold:
-    """One primitive of bounding size about ``size``, turned by quarter turns or freely."""
+    """A random primitive with a bounding box of about ``size``, rotated by multiples of 90 degrees or freely."""
     u = rng.uniform
     kind = int(rng.choice(10, p=[0.3, 0.2, 0.05, 0.07, 0.06, 0.08, 0.07, 0.09, 0.05, 0.03]))
     segments = int(rng.choice([6, 8, 24, 32, 40], p=[0.06, 0.06, 0.28, 0.4, 0.2]))
@@ -99,9 +99,7 @@ def star(rng: np.random.Generator) -> np.ndarray:
 
 
 def device(a: Assembly) -> None:
-    """Rounded body with a lens or dials, knobs, buttons, a screen, keys, feet and an aerial: camera, radio, toy,
-    appliance.
-    """
+    """Rounded body with a lens or dials, knobs, keys, a screen, feet and an antenna: camera, radio, toy, appliance."""
     rng, u = a.rng, a.rng.uniform
     w, h, d = u(0.6, 1.3), u(0.35, 1.1), u(0.15, 0.8)
     body = a.part(str(rng.choice(["plastic", "paint", "metal", "wood"], p=[0.5, 0.2, 0.15, 0.15])))
@@ -120,9 +118,9 @@ def device(a: Assembly) -> None:
     front, kind = d / 2, rng.random()
     if kind < 0.4:  # lens
         r, x, y, out = u(0.2, 0.42) * min(w, h), u(-0.2, 0.2) * w, u(-0.12, 0.1) * h, u(0.08, 0.5)
-        for k, share in enumerate(np.sort(u(0.7, 1.05, int(rng.integers(1, 4))))[::-1]):
+        for k, scale in enumerate(np.sort(u(0.7, 1.05, int(rng.integers(1, 4))))[::-1]):
             part, length = (dark, trim, body)[int(rng.integers(3))], out * (0.5 + 0.4 * k)
-            a.add(p.cylinder(r * share, length, bevel=0.02).rotate((90, 0, 0)), part, (x, y, front + length / 2 - 0.02))
+            a.add(p.cylinder(r * scale, length, bevel=0.02).rotate((90, 0, 0)), part, (x, y, front + length / 2 - 0.02))
             end = front + length - 0.02
         a.cut(p.cylinder(r * 0.55, 0.1, top=r * 0.6).rotate((90, 0, 0)), dark, (x, y, end))
         a.add(p.ellipsoid((r * 0.56, r * 0.56, 0.05)), a.part("accent"), (x, y, end - 0.05))
@@ -234,7 +232,7 @@ def tool(a: Assembly) -> None:
 
 
 def profile(a: Assembly) -> None:
-    """Raised outlines: letters made of bars, gears, brackets, signs with rims, rings, horns and knots."""
+    """Extruded outlines and tubes: letters made of bars, gears, brackets, signs with rims, horns and knots."""
     rng, u = a.rng, a.rng.uniform
     part = a.part(str(rng.choice(["metal", "plastic", "wood", "paint", "stone"])))
     kind = int(rng.integers(5))

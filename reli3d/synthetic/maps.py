@@ -1,4 +1,4 @@
-"""Environment maps: which ones training may see, and lamps that are added to them."""
+"""Environment maps: the split into training and held-out maps, and added lamps."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from reli3d.io.files import file_size
 from reli3d.render.latlong import lat_long_directions, quarter_turn, texel_solid_angles
 
 ROWS = 64
-HELD_BACK = 6  # every sixth map is left out of the fit and of all training
+HELD_OUT_EVERY = 6  # every sixth map is held out of all training
 
 
 def load_maps(path: Path) -> tuple[Tensor, list[str]]:
-    """Maps ``(n, 64, 128, 3)``, linear, area-averaged, the center column +X, and their names, of an ``.npz``.
+    """Reads maps ``(n, 64, 128, 3)``, linear radiance, and their names from an ``.npz``.
 
-    The file has ``env (n, H, 2H, 3)``, linear, row 0 +Y, the center column -Z and right of it +X, and ``names``.
-    Raises InputError for anything else.
+    The file has ``names`` and ``env (n, H, 2H, 3)``, linear, row 0 +Y, center column -Z, +X right of it.  The result is
+    area-averaged, in the layout of :mod:`reli3d.render.latlong`.  Raises InputError for any other file.
     """
     file_size(path)
     try:
@@ -39,20 +39,20 @@ def load_maps(path: Path) -> tuple[Tensor, list[str]]:
     return quarter_turn(maps, -1).contiguous(), names  # the file has -Z in the center column
 
 
-def held_back(names: list[str]) -> list[bool]:
-    """Which maps no training may see: every sixth by alphabetical order."""
+def held_out(names: list[str]) -> list[bool]:
+    """Whether each map is held out: every sixth in alphabetical order."""
     rank = {n: i for i, n in enumerate(sorted(names))}
-    return [rank[n] % HELD_BACK == HELD_BACK - 1 for n in names]
+    return [rank[n] % HELD_OUT_EVERY == HELD_OUT_EVERY - 1 for n in names]
 
 
 def training_maps(path: Path) -> Tensor:
-    """The maps of :func:`load_maps` that training may see, ``(n, 64, 128, 3)``."""
+    """The maps of :func:`load_maps` that are not held out, ``(n, 64, 128, 3)``."""
     maps, names = load_maps(path)
-    return maps[torch.tensor([not held for held in held_back(names)])].contiguous()
+    return maps[torch.tensor([not h for h in held_out(names)])].contiguous()
 
 
 def with_lamps(light: Tensor, rng: np.random.Generator) -> Tensor:
-    """The lat-long map ``(H, 2H, 3)`` with one to three lamps: soft disks that bring a good part of its light."""
+    """The lat-long map ``(H, 2H, 3)`` with one to three added lamps: soft disks of 0.15 to 1.5 times its total flux."""
     rows = light.shape[0]
     directions = lat_long_directions(rows)
     area = texel_solid_angles(rows, 2 * rows).float()[:, None, None]
@@ -61,13 +61,13 @@ def with_lamps(light: Tensor, rng: np.random.Generator) -> Tensor:
     for _ in range(int(rng.integers(1, 4))):
         y = rng.uniform(-0.15, 0.98)
         angle = rng.uniform(0, 2 * np.pi)
-        level = np.sqrt(1 - y * y)
-        to = torch.tensor([level * np.cos(angle), y, level * np.sin(angle)], dtype=torch.float32)
+        horizontal = np.sqrt(1 - y * y)
+        to = torch.tensor([horizontal * np.cos(angle), y, horizontal * np.sin(angle)], dtype=torch.float32)
         radius = np.radians(np.exp(rng.uniform(np.log(2.0), np.log(18.0))))
         away = (directions @ to).clamp(-1, 1).acos()
         disk = torch.sigmoid((radius - away) / (0.15 * radius + np.pi / rows / 2))[..., None]
         warmth = rng.normal(0, 0.25)
         tint = torch.tensor([np.exp(warmth), 1.0, np.exp(-warmth)], dtype=torch.float32)
-        share = np.exp(rng.uniform(np.log(0.15), np.log(1.5)))
-        out += disk * tint * (share * total / float((disk * area).sum()))
+        flux = total * np.exp(rng.uniform(np.log(0.15), np.log(1.5)))
+        out += disk * tint * (flux / float((disk * area).sum()))
     return out

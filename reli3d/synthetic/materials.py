@@ -1,4 +1,4 @@
-"""Materials that vary over a surface: coats of color, roughness and metal laid over each other by solid patterns.
+"""Spatially varying materials: layers of uniform material, blended by solid patterns, with bumps.
 
 Base colors are linear Rec. 709, 0.02 to 0.9; roughness is perceptual.
 """
@@ -17,7 +17,7 @@ from reli3d.synthetic.noise import fbm
 
 ALBEDO_RANGE = (0.02, 0.9)  # coal to fresh snow
 ROUGHNESS_RANGE = (0.08, 1.0)
-STEEPEST = 0.6  # largest slope of a bump, 31 degrees: steeper ones shade below the horizon
+MAX_HEIGHT_GRADIENT = 0.6  # of a bump, 31 degrees: steeper ones shade below the horizon
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Coat:
 
 
 class Pattern(Protocol):
-    """Where a coat lies."""
+    """Blend weight of a layer over the surface."""
 
     def weight(self, points: Tensor, normals: Tensor) -> Tensor:
         """``(N,)`` in [0, 1] at surface points and normals ``(N, 3)``."""
@@ -38,9 +38,9 @@ class Pattern(Protocol):
 
 
 class Bump(Protocol):
-    """How the surface is embossed."""
+    """Height field over the surface."""
 
-    def slope(self, points: Tensor, normals: Tensor) -> Tensor:
+    def height_gradient(self, points: Tensor, normals: Tensor) -> Tensor:
         """Gradient ``(N, 3)`` of the height at surface points and normals ``(N, 3)``."""
         ...
 
@@ -50,18 +50,18 @@ Layer = tuple[Coat, Pattern]
 
 @dataclass(frozen=True)
 class Material:
-    """A coat, further coats where their patterns say, a slow drift of color and roughness, and bumps."""
+    """A base layer, further layers blended over it by their patterns, low-frequency variation, and bumps."""
 
     base: Coat
     layers: tuple[Layer, ...] = ()
     bumps: tuple[Bump, ...] = ()
-    drift: float = 0.0  # relative standard deviation of the color, by noise
-    drift_roughness: float = 0.0
-    drift_scale: float = 3.0  # cycles a unit
+    drift: float = 0.0  # relative standard deviation of the color, by low-frequency noise
+    drift_roughness: float = 0.0  # standard deviation of the roughness
+    drift_scale: float = 3.0  # cycles per unit
     seed: int = 0
 
     def at(self, points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Base color ``(N, 3)``, roughness ``(N,)``, metallic ``(N,)``, bumped normal ``(N, 3)``."""
+        """Base color ``(N, 3)``, roughness ``(N,)``, metallic ``(N,)`` and bump-mapped normal ``(N, 3)``."""
         coat = points.new_tensor([*self.base.color, self.base.roughness, self.base.metallic])
         value = coat.expand(len(points), 5)
         for layer, pattern in self.layers:
@@ -74,20 +74,22 @@ class Material:
             roughness = roughness + self.drift_roughness * noise
         bumped = normals
         if self.bumps:
-            slope = torch.stack([bump.slope(points, normals) for bump in self.bumps]).sum(0)
-            slope = slope - normals * (slope * normals).sum(-1, keepdim=True)
-            size = slope.norm(dim=-1, keepdim=True)
-            slope = slope * (STEEPEST * torch.tanh(size / STEEPEST) / size.clamp(min=1e-8))
-            bumped = torch.nn.functional.normalize(normals - slope, dim=-1)
+            height_gradient = torch.stack([bump.height_gradient(points, normals) for bump in self.bumps]).sum(0)
+            height_gradient = height_gradient - normals * (height_gradient * normals).sum(-1, keepdim=True)
+            size = height_gradient.norm(dim=-1, keepdim=True)
+            height_gradient = height_gradient * (
+                MAX_HEIGHT_GRADIENT * torch.tanh(size / MAX_HEIGHT_GRADIENT) / size.clamp(min=1e-8)
+            )
+            bumped = torch.nn.functional.normalize(normals - height_gradient, dim=-1)
         return color.clamp(*ALBEDO_RANGE), roughness.clamp(*ROUGHNESS_RANGE), value[:, 4].clamp(0, 1), bumped
 
 
 def evaluate(materials: Sequence[Material], points, normals, part):
-    """Materials of the parts ``(N,)`` at ``points`` ``(N, 3)`` with unit ``normals`` ``(N, 3)``.
+    """Evaluates the materials at ``points (N, 3)`` with unit ``normals (N, 3)`` and material indices ``part (N,)``.
 
-    Gives base color ``(N, 3)``, roughness ``(N,)``, metallic ``(N,)``, bumped normal ``(N, 3)``, float32.
-    Arguments are all tensors on one device or all numpy arrays, and the results are of the same kind.  Raises
-    TypeError, ValueError on others.
+    Returns base color ``(N, 3)``, roughness ``(N,)``, metallic ``(N,)`` and bump-mapped normal ``(N, 3)``, float32.
+    Arguments are all tensors on one device or all numpy arrays; the results are of the same type.  Raises TypeError
+    unless float32, ValueError for a wrong shape or index.
     """
     as_array = isinstance(points, np.ndarray)
     if as_array:

@@ -1,4 +1,4 @@
-"""Solid noise at points, on the device of the points: summed gradient noise and cellular noise, with gradients."""
+"""Solid noise with gradients: fractal sums of gradient noise, and cellular noise."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from reli3d.kernels import noise as kernels
 def fbm(
     points: Tensor, *, octaves: int = 4, gain: float = 0.5, ridged: bool = False, seed: int = 0
 ) -> tuple[Tensor, Tensor]:
-    """Fractal sum of gradient noise at ``points (N, 3)``: value ``(N,)``, and its gradient in the points ``(N, 3)``.
+    """Fractal sum of gradient noise at ``points (N, 3)``: value ``(N,)`` and its gradient ``(N, 3)`` in the points.
 
-    One octave has mean 0 and standard deviation 0.5.  ``ridged`` sums absolute values (turbulence, Perlin 1985).  No
-    autograd.  Raises TypeError unless float32, ValueError on a wrong shape or ``octaves`` outside 1 to 16.
+    One octave has mean 0 and standard deviation 0.5.  gain: amplitude ratio of successive octaves.  ridged: sums
+    absolute values (turbulence, Perlin 1985).  Not differentiable by autograd.  Raises TypeError unless float32,
+    ValueError for a wrong shape or ``octaves`` outside 1 to 16.
     """
     points = _points(points)
     if not 1 <= octaves <= 16:
@@ -37,10 +38,10 @@ def fbm(
 
 
 def cells(points: Tensor, *, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
-    """Cellular noise (Worley 1996) at ``points (N, 3)``, with one jittered point in each lattice cell.
+    """Cellular noise (Worley 1996) at ``points (N, 3)``, with one jittered feature point per lattice cell.
 
-    Gives the distances to the nearest two ``(N, 2)``, a number in [0, 1) of the nearest ``(N,)``, and the gradient of
-    the second minus the first distance ``(N, 3)``.  No autograd.
+    Returns the distances to the nearest two feature points ``(N, 2)``, a random number in [0, 1) of the nearest one
+    ``(N,)``, and the gradient of the second minus the first distance ``(N, 3)``.  Not differentiable by autograd.
     """
     points = _points(points)
     distance = points.new_empty((len(points), 2))

@@ -1,8 +1,7 @@
-"""Families of grown and sculpted things: animals, figures, busts, fruits, shoes, stones, cushions.
+"""Families of organic shapes: animals, figures, busts, fruits, shoes, stones.
 
-Each is a signed field, negative inside, sampled on a grid.  Its zero level is taken by surface nets (Gibson 1998): one
-vertex for each cell that the surface crosses, at the mean of its edge crossings, and one quad for each crossed grid
-edge.
+Each is a signed field on a grid, negative inside, whose zero iso-surface is extracted by surface nets (Gibson 1998):
+one vertex per cell that the surface crosses, at the mean of its edge crossings, and one quad per crossed grid edge.
 """
 
 from __future__ import annotations
@@ -14,11 +13,11 @@ import numpy as np
 from reli3d.synthetic import primitives as p
 from reli3d.synthetic.assembly import Assembly
 
-CELLS = 52  # along the longest side: limbs of 4 % are still two cells thick
+CELLS = 52  # along the longest side: limbs of 4 % are two cells thick
 
 
 class Field:
-    """Signed distance-like values on a grid about a box, joined smoothly piece by piece."""
+    """Approximate signed distances on a grid around a box, built by smooth unions."""
 
     def __init__(self, lowest: Sequence[float], highest: Sequence[float]):
         low, high = np.asarray(lowest, dtype=np.float32), np.asarray(highest, dtype=np.float32)
@@ -55,7 +54,7 @@ class Field:
         self._join(window, (q - 1) * float(radii.min()), blend, label)
 
     def ripple(self, rng: np.random.Generator, amplitude: float, wave: float) -> None:
-        """Add a sum of six plane waves of length about ``wave``."""
+        """Adds six plane waves of wavelength about ``wave`` to the field."""
         x, y, z = np.meshgrid(*self.axes, indexing="ij", sparse=True)
         for _ in range(6):
             k = rng.normal(size=3).astype(np.float32)
@@ -65,7 +64,7 @@ class Field:
             )
 
     def add_to(self, a: Assembly, parts: list[int]) -> None:
-        """Join the closed surface to ``a``; a face belongs to ``parts[label]`` of the piece nearest to it."""
+        """Adds the closed surface to ``a``; a face belongs to ``parts[label]`` of the primitive nearest to it."""
         self.value[[0, 1, -2, -1]] = 1.0
         self.value[:, [0, 1, -2, -1]] = 1.0
         self.value[:, :, [0, 1, -2, -1]] = 1.0
@@ -90,8 +89,8 @@ class Field:
 
 
 def surface_nets(value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices ``(V, 3)`` in grid units and outward triangles ``(F, 3)`` of the zero level of ``value`` (negative
-    inside).
+    """Vertices ``(V, 3)`` in grid units and outward triangles ``(F, 3)`` of the zero iso-surface of ``value``, negative
+    inside.
     """
     inside = value < 0
     shape = np.array(value.shape) - 1
@@ -119,7 +118,7 @@ def surface_nets(value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def creature(a: Assembly) -> None:
-    """Animal on four legs or bird: body, neck, head with snout, ears or horns, eyes, tail; sometimes on a plinth."""
+    """Quadruped or bird: body, neck, head with snout, ears or horns, eyes, tail; sometimes on a plinth."""
     rng, u = a.rng, a.rng.uniform
     statue = rng.random() < 0.35
     skin = a.part(
@@ -184,7 +183,7 @@ def creature(a: Assembly) -> None:
 
 
 def figure(a: Assembly) -> None:
-    """Standing or sitting figure, doll, bear or bust, clothed by part, on a base or not."""
+    """Standing or sitting figure, doll, bear or bust, with clothes as parts, optionally on a base."""
     rng, u = a.rng, a.rng.uniform
     kind = str(rng.choice(["stone", "metal", "skin", "plastic", "fabric", "wood"]))
     skin = a.part(kind)
@@ -259,7 +258,7 @@ def shoe(a: Assembly) -> None:
 
 
 def fruit(a: Assembly) -> None:
-    """Fruit, vegetable, gourd, egg, mushroom or pot plant: lobed bodies of revolution with stalk, bend and dents."""
+    """Fruit, vegetable, gourd, egg or mushroom: lobed bodies of revolution with stalk, bend and dents."""
     rng, u = a.rng, a.rng.uniform
     skin = a.part(str(rng.choice(["skin", "accent", "plastic", "ceramic"])))
     stalk = a.part("wood")
@@ -301,7 +300,7 @@ def fruit(a: Assembly) -> None:
 
 
 def stone(a: Assembly) -> None:
-    """Stone, shell, loaf, crumpled bag or abstract sculpture: merged balls with low waves, sometimes pierced."""
+    """Stone, shell, loaf or abstract sculpture: smooth unions of ellipsoids with waves, sometimes pierced."""
     rng, u = a.rng, a.rng.uniform
     body = a.part(str(rng.choice(["stone", "skin", "ceramic", "fabric", "metal"])))
     other = body if rng.random() < 0.6 else a.part("accent")
@@ -321,7 +320,7 @@ def stone(a: Assembly) -> None:
     f.add_to(a, [body, other])
     if rng.random() < 0.2:
         a.cut(p.cylinder(u(0.06, 0.2), 3).rotate(tuple(u(-90, 90, 3))), other)
-    if rng.random() < 0.4:  # cut flat where it stands
+    if rng.random() < 0.4:  # flat underside
         a.keep_inside(p.box((4, 4, 4)).translate((0, 2 - u(0.15, 0.3), 0)), body)
     if rng.random() < 0.25:
         a.add(p.cylinder(0.3, 0.12, bevel=0.02), a.part("wood"), (0, -0.36, 0))

@@ -1,8 +1,8 @@
-"""Solid patterns: where on an object a coat of paint, a vein or a scratch lies, and how the surface is embossed.
+"""Solid patterns: blend weights of material layers, and height fields.
 
-``weight(points, normals)`` gives ``(N,)`` in [0, 1] at surface points ``(N, 3)`` with unit normals ``(N, 3)``;
-``slope(points, normals)`` the gradient ``(N, 3)`` of a height in object units.  ``frame`` ``(3, 3)`` maps points to
-pattern units and so holds rotation, stretch and frequency.
+``weight(points, normals)``: ``(N,)`` in [0, 1] at surface points ``(N, 3)`` with unit normals ``(N, 3)``.
+``height_gradient(points, normals)``: gradient ``(N, 3)`` of a height in object units.  ``frame (3, 3)`` maps points to
+pattern units: rotation, stretch and frequency.
 """
 
 from __future__ import annotations
@@ -35,9 +35,7 @@ def _plane(q: Tensor, normals: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Blotches:
-    """Fractal noise above a threshold: stains, rust, camouflage, speckles; ``ridged`` makes veins of marble and
-    scratches.
-    """
+    """Thresholded fractal noise: stains, rust, camouflage, speckles; with ``ridged`` marble veins and scratches."""
 
     frame: np.ndarray
     seed: int
@@ -58,7 +56,7 @@ class Blotches:
 
 @dataclass(frozen=True)
 class Bands:
-    """Bands across the first pattern axis, one a unit, covering ``duty`` of it; ``wobble`` bends them by noise."""
+    """Bands across the first pattern axis, one per unit, of width ``duty``; ``wobble``: amplitude of a distortion."""
 
     frame: np.ndarray
     duty: float
@@ -78,7 +76,7 @@ class Bands:
 
 @dataclass(frozen=True)
 class Grain:
-    """Wood: year rings about the third pattern axis, bent by noise, and fine fibers along it."""
+    """Wood: growth rings around the third pattern axis, distorted by noise, and fine fibers along it."""
 
     frame: np.ndarray
     seed: int
@@ -98,7 +96,7 @@ class Grain:
 
 @dataclass(frozen=True)
 class Checker:
-    """Squares of one unit in the plane the normal faces, or solid cubes."""
+    """Solid checkerboard of unit cubes."""
 
     frame: np.ndarray
 
@@ -109,7 +107,7 @@ class Checker:
 
 @dataclass(frozen=True)
 class Dots:
-    """Disks of ``radius`` on a unit grid, every other row shifted, in the plane the normal faces."""
+    """Disks of ``radius`` on a unit grid, alternate rows shifted, in the coordinate plane nearest to the surface."""
 
     frame: np.ndarray
     radius: float
@@ -124,7 +122,7 @@ class Dots:
 
 @dataclass(frozen=True)
 class Ramp:
-    """From 0 to 1 along ``axis`` between two heights, frayed by noise: dirt at the foot, dust or fading at the top."""
+    """Smooth step from ``low`` to ``high`` along ``axis``, distorted by noise: dirt at the base, fading at the top."""
 
     axis: tuple[float, float, float]
     low: float
@@ -141,7 +139,7 @@ class Ramp:
 
 @dataclass(frozen=True)
 class Facing:
-    """Where the surface faces ``axis``, frayed by noise: dust, snow, worn upper faces."""
+    """Smooth step of the cosine between normal and ``axis``, distorted by noise: dust, snow, worn upper faces."""
 
     axis: tuple[float, float, float]
     low: float
@@ -155,15 +153,13 @@ class Facing:
 
 @dataclass(frozen=True)
 class Decal:
-    """Black and white picture ``(h, w)`` in a rectangle projected along ``normal``: label, logo, letters, badge,
-    window.
-    """
+    """Bitmap ``(h, w)`` of 0 and 1 projected onto a rectangle, or its inscribed ellipse: label, logo, letters."""
 
     center: tuple[float, float, float]
     right: tuple[float, float, float]
     up: tuple[float, float, float]
     half: tuple[float, float]
-    picture: np.ndarray
+    bitmap: np.ndarray
     oval: bool = False
 
     def weight(self, points: Tensor, normals: Tensor) -> Tensor:
@@ -172,35 +168,33 @@ class Decal:
         u, v = local @ right / self.half[0], local @ up / self.half[1]
         facing = normals @ torch.linalg.cross(right, up) > 0.35
         inside = (u * u + v * v < 1) if self.oval else (u.abs() < 1) & (v.abs() < 1)
-        rows, columns = self.picture.shape
+        rows, columns = self.bitmap.shape
         j = ((u * 0.5 + 0.5) * columns).long().clamp(0, columns - 1)
         i = ((0.5 - v * 0.5) * rows).long().clamp(0, rows - 1)
-        picture = torch.as_tensor(self.picture, dtype=torch.float32, device=points.device)
-        return picture[i, j] * (inside & facing)
+        bitmap = torch.as_tensor(self.bitmap, dtype=torch.float32, device=points.device)
+        return bitmap[i, j] * (inside & facing)
 
 
 @dataclass(frozen=True)
 class Mosaic:
-    """Cells: their borders of width ``border`` (cracks, scales, tiles), or a ``share`` of them at random (terrazzo,
-    spots).
-    """
+    """Cellular noise: borders of width ``border`` (cracks, scales), or a random ``fraction`` of the cells (spots)."""
 
     frame: np.ndarray
     seed: int
     border: float = 0.0
-    share: float = 0.0
+    fraction: float = 0.0
 
     def weight(self, points: Tensor, normals: Tensor) -> Tensor:
         distance, cell, _ = cells(_in(self.frame, points), seed=self.seed)
         gap = distance[:, 1] - distance[:, 0]
         if self.border > 0:
             return 1 - smoothstep(self.border * 0.5, self.border, gap)
-        return (cell < self.share) * smoothstep(0.02, 0.08, gap)
+        return (cell < self.fraction) * smoothstep(0.02, 0.08, gap)
 
 
 @dataclass(frozen=True)
 class Weave:
-    """Threads over and under each other, two a unit, in the plane the normal faces; weight of the crossing threads."""
+    """Woven threads, two per unit, in the coordinate plane nearest to the surface."""
 
     frame: np.ndarray
     depth: float = 0.0
@@ -209,7 +203,7 @@ class Weave:
         uv = _plane(_in(self.frame, points), normals) * np.pi
         return (0.5 + 0.5 * torch.sin(uv[:, 0]) * torch.sin(uv[:, 1])).clamp(0, 1)
 
-    def slope(self, points: Tensor, normals: Tensor) -> Tensor:
+    def height_gradient(self, points: Tensor, normals: Tensor) -> Tensor:
         q = _in(self.frame, points) * np.pi
         a, b, c = torch.sin(q).unbind(-1)
         x, y, z = torch.cos(q).unbind(-1)
@@ -219,7 +213,7 @@ class Weave:
 
 @dataclass(frozen=True)
 class Emboss:
-    """Height of fractal noise (hammered, cast, brushed along a stretched axis) or of cell borders (leather, scales)."""
+    """Height field of fractal noise (hammered, cast, brushed) or of cellular borders (leather, scales)."""
 
     frame: np.ndarray
     seed: int
@@ -227,7 +221,7 @@ class Emboss:
     octaves: int = 3
     cellular: bool = False
 
-    def slope(self, points: Tensor, normals: Tensor) -> Tensor:
+    def height_gradient(self, points: Tensor, normals: Tensor) -> Tensor:
         q = _in(self.frame, points)
         if self.cellular:
             distance, _, gradient = cells(q, seed=self.seed)

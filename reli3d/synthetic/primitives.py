@@ -1,8 +1,7 @@
-"""Solids of which the procedural objects are put together: all +Y up, closed, in the units of the caller.
+"""Primitive solids of procedural objects, +Y up.
 
-Every function gives a manifold3d solid.  Rounded convex bodies are hulls of swept points, round bodies are profiles
-turned about +Y, tubes follow a curve with frames that do not twist.  ``segments`` is the number of sides of a full
-circle.
+Every function returns a closed manifold3d solid.  Rounded boxes are convex hulls, bodies of revolution turn about +Y,
+tubes are swept with rotation-minimizing frames.  ``segments``: number of sides of a full circle.
 """
 
 from __future__ import annotations
@@ -13,11 +12,11 @@ import numpy as np
 from manifold3d import CrossSection, Manifold, Mesh
 
 Y_UP = (-90.0, 0.0, 0.0)  # manifold3d extrudes and revolves along +Z: (x, y, z) -> (x, z, -y)
-BEVEL_STEPS = 2  # facets of a rounded edge: with smoothed normals two look round at 512 pixels
+BEVEL_STEPS = 2  # facets of a rounded edge: enough for smooth normals at 512 pixels
 
 
 def box(size: Sequence[float] | np.ndarray, bevel: float = 0.0) -> Manifold:
-    """Box of full ``size`` about the origin; edges rounded with radius ``bevel``, at most half the shortest side."""
+    """Box of full ``size`` at the origin; edges rounded with radius ``bevel``, clamped to half the shortest side."""
     half = np.asarray(size, dtype=float) / 2
     bevel = min(bevel, 0.98 * float(half.min()))
     signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
@@ -31,9 +30,7 @@ def box(size: Sequence[float] | np.ndarray, bevel: float = 0.0) -> Manifold:
 
 
 def lathe(profile: np.ndarray, segments: int = 32, degrees: float = 360.0) -> Manifold:
-    """Closed polygon ``(K, 2)`` of radius and height, turned about +Y; the orientation of the polygon does not
-    matter.
-    """
+    """Body of revolution about +Y of a closed polygon ``(K, 2)`` of radius and height, in either orientation."""
     x, y = np.asarray(profile, dtype=float).T
     ring = np.asarray(profile, dtype=float)
     if np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)) < 0:
@@ -43,7 +40,7 @@ def lathe(profile: np.ndarray, segments: int = 32, degrees: float = 360.0) -> Ma
 
 
 def solid_of_profile(radius: np.ndarray, height: np.ndarray, segments: int = 32) -> Manifold:
-    """Solid body of revolution with ``radius`` at each ``height`` (bottom to top), closed along the axis."""
+    """Body of revolution with ``radius`` at each ``height``, bottom to top, closed along the axis."""
     ring = np.stack([np.maximum(radius, 0.0), height], -1)
     return lathe(np.concatenate([[[0.0, height[0]]], ring, [[0.0, height[-1]]]]), segments)
 
@@ -51,7 +48,7 @@ def solid_of_profile(radius: np.ndarray, height: np.ndarray, segments: int = 32)
 def cylinder(
     radius: float, height: float, *, top: float | None = None, bevel: float = 0.0, segments: int = 32
 ) -> Manifold:
-    """Cylinder, or cone frustum where ``top`` differs, about the origin; both rims rounded with radius ``bevel``."""
+    """Cylinder, or frustum with the radius ``top``, centered at the origin; rims rounded with radius ``bevel``."""
     top = radius if top is None else top
     bevel = min(bevel, 0.45 * height, 0.9 * max(min(radius, top), 1e-3))
     turn = np.linspace(0, np.pi / 2, BEVEL_STEPS + 1) if bevel > 0 else np.zeros(1)
@@ -62,7 +59,7 @@ def cylinder(
 
 
 def ellipsoid(radii: Sequence[float] | np.ndarray, segments: int = 32) -> Manifold:
-    """Ellipsoid of the given half axes about the origin."""
+    """Ellipsoid with semi-axes ``radii`` centered at the origin."""
     return Manifold.sphere(1.0, segments).scale(tuple(float(r) for r in radii))
 
 
@@ -78,7 +75,7 @@ def capsule(
 
 
 def torus(ring: float, tube: float, *, segments: int = 40, degrees: float = 360.0) -> Manifold:
-    """Torus about +Y of radii ``ring`` and ``tube``, or the part of it over ``degrees``."""
+    """Torus about +Y with major radius ``ring`` and minor radius ``tube``, or a sector of ``degrees``."""
     turn = np.linspace(0, 2 * np.pi, 17)[:-1]
     return lathe(np.stack([ring + tube * np.cos(turn), tube * np.sin(turn)], -1), segments, degrees)
 
@@ -91,9 +88,9 @@ def prism(
     taper: float = 1.0,
     twist: float = 0.0,
 ) -> Manifold:
-    """Polygon ``(K, 2)`` (or a list of contours) in x, z raised by ``height`` about the origin.
+    """Extrudes a polygon ``(K, 2)`` in x, z, or a list of contours, by ``height``, centered at the origin.
 
-    ``bevel`` narrows a band below the top and above the bottom; ``taper`` scales the top; ``twist`` turns it, degrees.
+    bevel: inset of the top and bottom rims.  taper: scale of the top.  twist: rotation of the top, degrees.
     """
     contours = [outline] if isinstance(outline, np.ndarray) else list(outline)
     section = CrossSection([np.ascontiguousarray(c, dtype=float) for c in contours])
@@ -107,9 +104,7 @@ def prism(
 
 
 def wedge(size: Sequence[float], ridge: float, shift: float = 0.0) -> Manifold:
-    """Roof-like hull: a box base of full ``size`` whose top face is narrowed along x to ``ridge`` and moved by
-    ``shift``.
-    """
+    """Box of full ``size`` whose top face is scaled along x by ``ridge`` and moved by ``shift`` half sides."""
     x, y, z = (s / 2 for s in size)
     top = np.array([[s * x * ridge + shift * x, y, t * z] for s in (-1, 1) for t in (-1, 1)])
     low = np.array([[s * x, -y, t * z] for s in (-1, 1) for t in (-1, 1)])
@@ -124,11 +119,10 @@ def tube(
     outline: np.ndarray | None = None,
     segments: int = 12,
 ) -> Manifold:
-    """Solid swept along ``path`` ``(K, 3)`` with ``radius`` at each point; ``outline`` ``(M, 2)`` replaces the unit
-    circle.
+    """Sweeps a circle along ``path (K, 3)`` with ``radius`` at each point.
 
-    Frames are carried by the smallest rotation from point to point (Hanson and Ma 1995); a closed path spreads the
-    turn left over evenly.
+    outline: ``(M, 2)``, replaces the unit circle.  Frames are rotation minimizing (parallel transport, Hanson and Ma
+    1995); along a closed path the residual rotation is distributed evenly.
     """
     path = np.asarray(path, dtype=float)
     count = len(path)
@@ -165,7 +159,7 @@ def tube(
 
 
 def _carry(vector: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """``vector`` normal to ``before`` turned by the smallest rotation that takes ``before`` to ``after``, both unit."""
+    """Parallel transport: rotates ``vector`` by the smallest rotation from ``before`` to ``after``, both unit."""
     axis = np.cross(before, after)
     cosine = float(np.dot(before, after))
     turned = vector * cosine + np.cross(axis, vector) + axis * (np.dot(axis, vector) / (1.0 + max(cosine, -0.99)))

@@ -1,9 +1,7 @@
 """Procedural objects for training: a closed mesh, its parts and their materials from one seed.
 
-Seeds are disjoint by use: training takes ``TRAINING_SEEDS``, choices are made on ``VALIDATION_SEEDS``, figures are
-reported on ``TEST_SEEDS``.  :func:`example_object` is one fixed object that no family can make.  The same seed gives
-the same object.  Frame: right-handed, +Y up, resting, centered, longest side 1 (so inside the radius 0.87 of the
-network's frame).
+The same seed gives the same object.  ``TRAINING_SEEDS``, ``VALIDATION_SEEDS`` and ``TEST_SEEDS`` are disjoint.  Frame:
+right-handed, +Y up, centered, longest side 1, which lies inside the sphere of radius 0.87 of the network's frame.
 """
 
 from __future__ import annotations
@@ -25,9 +23,9 @@ TRAINING_SEEDS = range(0, 1_000_000_000)
 VALIDATION_SEEDS = range(1_000_000_000, 1_000_000_032)
 TEST_SEEDS = range(1_000_000_032, 1_000_000_064)
 MAX_FACES = 30_000
-CREASE_DEG = 38.0  # rounded edges turn at most 30 degrees a facet and must look smooth, edges of boxes turn 90
-THINNEST = 2e-4  # volume over cubed longest side: a sword has 1e-3, less is a sheet that no view shows
-FRAME_RADIUS = 0.87  # half diagonal of the unit cube: objects of longest side 1 lie inside
+CREASE_DEG = 38.0  # facets of rounded edges meet at 30 degrees at most, faces of boxes at 90
+MIN_VOLUME_FRACTION = 2e-4  # volume over cubed longest side: a sword has 1e-3, a sheet seen edge-on less
+FRAME_RADIUS = 0.87  # half diagonal of the unit cube: contains objects of longest side 1
 
 FAMILIES = (
     (manmade.csg, 0.2),
@@ -52,39 +50,32 @@ FAMILIES = (
 
 @dataclass(frozen=True)
 class ProceduralObject:
-    """Closed surface with materials.  Arrays are numpy; ``normals`` are those of shading, one for each corner of a
-    face.
-    """
+    """Closed surface with materials, as numpy arrays.  ``normals`` are shading normals of the face corners."""
 
     vertices: np.ndarray  # (V, 3) float32
     faces: np.ndarray  # (F, 3) int32, counter-clockwise seen from outside
     normals: np.ndarray  # (F, 3, 3) float32 unit
     part: np.ndarray  # (F,) int32 index into materials
     materials: tuple[Material, ...]
-    name: str  # the family it is drawn from
+    name: str  # of the family
 
     def material(self, points: np.ndarray, normals: np.ndarray, part: np.ndarray):
-        """Base color ``(N, 3)`` linear, roughness ``(N,)``, metallic ``(N,)``, bumped normal ``(N, 3)`` at surface
-        points.
-
-        points ``(N, 3)``, normals ``(N, 3)`` unit, part ``(N,)``: numpy arrays, or tensors on any one device; the
-        same kind comes back, float32.
-        """
+        """:func:`~reli3d.synthetic.materials.evaluate` of the object's materials at surface points."""
         return evaluate(self.materials, points, normals, part)
 
 
 def make_object(seed: int) -> ProceduralObject:
-    """The object of ``seed``: a family, a deformation, a pose at rest and materials, all drawn from it."""
+    """The object of ``seed``: a random family, deformation, pose and materials.  Raises ValueError below 0."""
     if seed < 0:
         raise ValueError(f"seed: expected at least 0, got {seed}")
     weights = np.array([w for _, w in FAMILIES])
     attempt = 0
-    while True:  # a cut may leave nothing, or a sheet: then the object is drawn anew from the next stream of the seed
+    while True:  # a cut may leave nothing or a thin sheet: draw again from the next stream of the seed
         rng = np.random.default_rng((seed, attempt))
         family = FAMILIES[int(rng.choice(len(FAMILIES), p=weights / weights.sum()))][0]
         assembly = Assembly(rng)
         family(assembly)
-        if assembly.solid_share() > THINNEST:
+        if assembly.solid_fraction() > MIN_VOLUME_FRACTION:
             _deform(assembly)
             _pose(assembly)
             return assemble(assembly, family.__name__)
@@ -92,15 +83,16 @@ def make_object(seed: int) -> ProceduralObject:
 
 
 def example_object() -> ProceduralObject:
-    """The fixed example of the package, see ``example.py``: an enameled kettle on a board."""
+    """The example object of the package, see ``example.py``."""
     assembly = Assembly(np.random.default_rng(0))
     example.kettle(assembly)
     return assemble(assembly, "kettle", example.finish())
 
 
 def assemble(assembly: Assembly, name: str, materials: tuple[Material, ...] | None = None) -> ProceduralObject:
-    """Close ``assembly``: union, at most ``MAX_FACES`` faces, center, scale, normals, materials (drawn if not
-    given).
+    """Builds the object of ``assembly``: union of at most MAX_FACES faces, normalization, normals, materials.
+
+    materials: of the parts; None draws them.
     """
     vertices, faces, part = assembly.finish(MAX_FACES)
     low, high = vertices.min(0), vertices.max(0)
@@ -117,11 +109,10 @@ def assemble(assembly: Assembly, name: str, materials: tuple[Material, ...] | No
 
 
 def corner_normals(vertices: np.ndarray, faces: np.ndarray, crease_deg: float = CREASE_DEG) -> np.ndarray:
-    """Shading normals ``(F, 3, 3)`` float32 of the corners: smooth across edges that turn by less than ``crease_deg``.
+    """Shading normals ``(F, 3, 3)`` float32 of the corners, smooth across dihedral angles below ``crease_deg``.
 
-    Corners of a vertex that smooth edges connect share the mean of their faces' normals, weighted by area and angle.
-    The area keeps flat sides flat beside narrow bevels.  The angle makes the mean independent of how a flat side is cut
-    into triangles.
+    Corners of a vertex that are connected by smooth edges get the mean of their faces' normals, weighted by area, which
+    keeps flat faces next to narrow bevels flat, and by angle, which makes it independent of the triangulation.
     """
     p = vertices[faces].astype(np.float64)
     edge = np.roll(p, -1, 1) - p
@@ -134,15 +125,14 @@ def corner_normals(vertices: np.ndarray, faces: np.ndarray, crease_deg: float = 
     start, end = faces.reshape(-1).astype(np.int64), np.roll(faces, -1, 1).reshape(-1).astype(np.int64)
     key, mirrored = start * last + end, end * last + start
     order = np.argsort(key)
-    twin = order[np.minimum(np.searchsorted(key[order], mirrored), len(order) - 1)]  # half-edge on the other side
+    opposite = order[np.minimum(np.searchsorted(key[order], mirrored), len(order) - 1)]  # half-edge on the other side
     half = np.arange(3 * count)
     found = key[order[np.minimum(np.searchsorted(key[order], mirrored), len(order) - 1)]] == mirrored
-    smooth = (normal[half // 3] * normal[twin // 3]).sum(-1) > np.cos(np.radians(crease_deg))
-    # an edge joins the corner at its start with the corner at its end across the edge; a sliver has no normal of its
-    # own
-    smooth |= (area[half // 3] < 1e-12) | (area[twin // 3] < 1e-12)
+    smooth = (normal[half // 3] * normal[opposite // 3]).sum(-1) > np.cos(np.radians(crease_deg))
+    # a half-edge connects the corner at its start with the adjacent corner of the opposite face; slivers are smooth
+    smooth |= (area[half // 3] < 1e-12) | (area[opposite // 3] < 1e-12)
     smooth &= found  # an open border has no other side
-    here, there = half[smooth], (twin - twin % 3 + (twin + 1) % 3)[smooth]
+    here, there = half[smooth], (opposite - opposite % 3 + (opposite + 1) % 3)[smooth]
     graph = coo_matrix((np.ones(len(here), dtype=np.int8), (here, there)), shape=(3 * count, 3 * count))
     groups, label = connected_components(graph, directed=False)
     weight = np.repeat(normal * area[:, None], 3, axis=0) * angle.reshape(-1, 1)
@@ -150,12 +140,12 @@ def corner_normals(vertices: np.ndarray, faces: np.ndarray, crease_deg: float = 
     size = np.linalg.norm(total, axis=1, keepdims=True)
     flat = np.repeat(normal, 3, axis=0)
     result = np.where(size[label] > 1e-20, total[label] / np.maximum(size[label], 1e-20), flat)
-    result[np.linalg.norm(result, axis=1) < 0.5] = (0.0, 1.0, 0.0)  # a sliver by itself: any unit vector
+    result[np.linalg.norm(result, axis=1) < 0.5] = (0.0, 1.0, 0.0)  # an isolated sliver: any unit vector
     return result.reshape(count, 3, 3).astype(np.float32)
 
 
 def _deform(a: Assembly) -> None:
-    """Stretch along the axes, and with chance one of: taper, twist, bend, low waves."""
+    """Random scale per axis, and with probability 0.16 a taper, twist, bend or low-frequency waves."""
     rng, u = a.rng, a.rng.uniform
     a.transform(np.diag(np.exp(rng.normal(0, 0.12, 3))))
     if rng.random() > 0.16:
@@ -182,7 +172,7 @@ def _deform(a: Assembly) -> None:
 
 
 def _pose(a: Assembly) -> None:
-    """Half of the objects face an axis, the others any way about +Y; some lie on a side."""
+    """Random yaw, a multiple of 90 degrees with probability 1/2; with probability 0.06 also lying on a side."""
     rng = a.rng
     if rng.random() < 0.06:
         a.transform(
@@ -198,10 +188,9 @@ def _pose(a: Assembly) -> None:
 def sample_cameras(rng: np.random.Generator, n: int) -> tuple[np.ndarray, np.ndarray]:
     """Camera-to-world matrices ``(n, 4, 4)`` (OpenGL) and full fields of view ``(n,)`` in radians, float32.
 
-    The rendering protocol of the paper.  Field of view: normal about 29.5 degrees (deviation 3.5), clipped to 22 to
-    37.  Distance: 0.87 / sin(fov / 2) times 0.8 to 1.05, so that the object fills the frame.  Azimuths are spread
-    evenly with jitter and come in random order, so the first k views are random but apart.  One set in six covers only
-    an arc.
+    Follows the rendering protocol of the paper.  Field of view: normal distribution of mean 29.5 and deviation 3.5
+    degrees, clipped to [22, 37].  Distance: 0.87 / sin(fov / 2) times 0.8 to 1.05.  Azimuths are stratified with jitter
+    and in random order.  One set in six covers only an arc.
     """
     if n < 1:
         raise ValueError(f"n: expected at least 1, got {n}")
@@ -211,8 +200,8 @@ def sample_cameras(rng: np.random.Generator, n: int) -> tuple[np.ndarray, np.nda
     elevation = np.radians(np.where(rng.random(n) < 0.9, rng.uniform(-20, 55, n), rng.uniform(-35, 75, n)))
     distance = FRAME_RADIUS / np.sin(fov / 2) * rng.uniform(0.8, 1.05, n)
     target = rng.normal(0, 0.02, (n, 3))
-    level = np.cos(elevation)
-    direction = np.stack([level * np.sin(azimuth), np.sin(elevation), level * np.cos(azimuth)], -1)
+    horizontal = np.cos(elevation)
+    direction = np.stack([horizontal * np.sin(azimuth), np.sin(elevation), horizontal * np.cos(azimuth)], -1)
     eye = torch.from_numpy((target + distance[:, None] * direction).astype(np.float32))
     c2w = look_at(eye, torch.from_numpy(target.astype(np.float32)), torch.tensor([0.0, 1.0, 0.0]))
     return c2w.numpy(), fov.astype(np.float32)

@@ -1,8 +1,8 @@
-"""Training samples: one object under one light, seen by a few cameras, with the truth at points in and on it.
+"""Training samples: an object under one environment, rendered in several views, with ground truth at points.
 
-A sample is a dictionary of tensors, one safetensors file on disk.  ``docs/model.md``, "A sample", lists its entries
-with shapes and units.  There are ``V`` views of ``S`` by ``S`` pixels, cropped to the object as the network's input
-is.  World +Y up, object centered, longest side 1.  Radiance is scaled so that the first view is well exposed.
+A sample is a dictionary of tensors, stored as one safetensors file.  ``docs/model.md``, "A sample", lists its entries
+with shapes and units.  It has ``V`` views of ``S`` by ``S`` pixels, cropped to the object.  World +Y up, object
+centered, longest side 1.  Radiance is scaled by the exposure of the first view.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from reli3d.render.points import SurfacePoints
 from reli3d.render.shading import ShadeOptions, shade
 from reli3d.synthetic.procedural import ProceduralObject, sample_cameras
 
-SAMPLES = (4, 3, 1)  # light, GGX and cosine samples a ray: with FINE**2 rays a pixel the noise left is a photograph's
+SAMPLES = (4, 3, 1)  # light, GGX and cosine samples per ray; with FINE**2 rays per pixel the noise is a photograph's
 FINE = 2  # rays along each side of a pixel
-DIFFUSE_MODEL = "published"  # what the shipped weights learned from, and what viewers show of an asset
-EXPOSED = 0.6  # linear value of the 90th percentile of the object in the first view
+DIFFUSE_MODEL = "published"  # the training data of the bundled weights, and the formula of glTF viewers
+EXPOSURE_TARGET = 0.6  # linear value of the 90th percentile of the object in the first view
 VOLUME_POINTS, SURFACE_POINTS, PIXELS = 16384, 8192, 1024
 
 
@@ -44,7 +44,7 @@ def crop_camera(vertices: Tensor, c2w: Tensor, size: int, padding: float) -> Ten
 
 
 class Surface(Protocol):
-    """An object as the renderer sees it: rays in, geometry and material at the hits out."""
+    """Interface of an object: its mesh, and geometry and material at ray hits."""
 
     vertices: Tensor  # (V, 3)
     faces: Tensor  # (F, 3) int32
@@ -54,11 +54,11 @@ class Surface(Protocol):
         """Signed distance ``(N,)`` of points ``(N, 3)``, positive outside."""
 
     def points_at(self, face: Tensor, bary: Tensor) -> SurfacePoints:
-        """Geometry and material of hits: ``face (N,)``, ``bary (N, 2)``; the shading normal is the bumped one."""
+        """Geometry and material at hits ``face (N,)``, ``bary (N, 2)``; the shading normal is bump mapped."""
 
 
 class ObjectSurface:
-    """A procedural object."""
+    """:class:`Surface` of a procedural object."""
 
     def __init__(self, shape: ProceduralObject):
         self.shape = shape
@@ -85,7 +85,7 @@ class ObjectSurface:
 
 
 def _render(surface: Surface, camera: Camera, light: Environment, seed: int):
-    """Linear radiance ``(H * W, 3)`` of every ray, the rays that hit, and the points at the hits."""
+    """Radiance ``(H * W, 3)`` of all rays; of the rays that hit: indices, points, view directions and radiance."""
     origins, directions = (r.reshape(-1, 3) for r in camera_rays(camera))
     hits = surface.scene.closest(origins, directions)
     seen = (hits.face >= 0).nonzero()[:, 0]
@@ -123,9 +123,9 @@ def synthesize(
 def render_sample(
     surface: Surface, environment: Environment, cameras: Camera, rng: np.random.Generator, *, views_only: bool = False
 ) -> dict[str, Tensor]:
-    """The sample of an object under ``environment``, seen by ``V`` square ``cameras``.
+    """The sample of an object under ``environment`` with ``V`` square ``cameras``.
 
-    views_only: one ray a pixel, and no points of the volume and the surface: what training of the 2D U-Net alone needs.
+    views_only: one ray per pixel, and no points of the volume and the surface; enough for training the 2D U-Net alone.
     """
     c2w, views, size = cameras.c2w, len(cameras.c2w), cameras.width
     fine = 1 if views_only else FINE
@@ -137,9 +137,11 @@ def render_sample(
             surface, cameras[k].scaled(fine), environment, int(rng.integers(1 << 30))
         )
         if k == 0:
-            exposure = EXPOSED / max(float(radiance.mean(-1).quantile(0.9)), 1e-3) * float(np.exp(rng.normal(0, 0.25)))
+            exposure = (
+                EXPOSURE_TARGET / max(float(radiance.mean(-1).quantile(0.9)), 1e-3) * float(np.exp(rng.normal(0, 0.25)))
+            )
         alpha = _coverage(surface.scene, cameras[k], fine + 1)
-        image = pooled_pixels((image * exposure).clamp(0, 4), size, fine).clamp(0, 1)  # a sensor saturates, late
+        image = pooled_pixels((image * exposure).clamp(0, 4), size, fine).clamp(0, 1)  # sensor saturation
         encoded = torch.cat([linear_to_srgb(image), alpha[..., None]], -1)
         images.append((encoded * 255 + 0.5).to(torch.uint8))
         for name, value in _view_maps(points, seen, c2w[k], size, fine).items():
@@ -152,7 +154,7 @@ def render_sample(
     pooled = torch.nn.functional.interpolate(
         (environment.radiance * exposure).permute(2, 0, 1)[None], (32, 64), mode="area"
     )
-    # stored with -Z in the center column, as samples always were
+    # stored with -Z in the center column, the format of samples since version 0.1
     sample["environment"] = quarter_turn(pooled[0].permute(1, 2, 0), 1).clamp(max=6e4).half()
     if not views_only:
         sample.update(pixels=torch.stack(pixels).half(), pixel_radiance=torch.stack(pixel_radiance).half())
@@ -161,7 +163,7 @@ def render_sample(
 
 
 def _view_maps(points: SurfacePoints, seen: Tensor, c2w: Tensor, size: int, fine: int) -> dict[str, Tensor]:
-    """True maps of one view from the ``points`` that the rays ``seen (N,)`` hit."""
+    """Ground-truth maps of one view from the ``points`` at the hits of the rays ``seen (N,)``."""
     rays = (size * fine) ** 2
     depth = -((points.position - c2w[:3, 3]) @ c2w[:3, 2])
     values = [
@@ -174,14 +176,14 @@ def _view_maps(points: SurfacePoints, seen: Tensor, c2w: Tensor, size: int, fine
     ]
     dense = torch.zeros(rays, 10).index_copy_(0, seen, torch.cat(values, -1))
     base, rest, normal, depth, hit = pooled_pixels(dense, size, fine).split([3, 2, 3, 1, 1], -1)
-    share = hit.clamp(min=0.5 / fine**2)
-    material = torch.cat([linear_to_srgb((base / share).clamp(0, 1)), rest / share], -1)
+    fraction = hit.clamp(min=0.5 / fine**2)
+    material = torch.cat([linear_to_srgb((base / fraction).clamp(0, 1)), rest / fraction], -1)
     normal = torch.nn.functional.normalize(normal, dim=-1)
     whole = hit > 0.5
     return {
         "view_material": (material * whole * 255 + 0.5).to(torch.uint8),
         "view_normal": (normal * whole * 127).round().to(torch.int8),
-        "view_depth": (depth / share * whole)[..., 0].half(),
+        "view_depth": (depth / fraction * whole)[..., 0].half(),
     }
 
 
@@ -192,14 +194,14 @@ def pooled_pixels(rays: Tensor, size: int, fine: int = FINE) -> Tensor:
 
 
 def _coverage(scene: RayScene, camera: Camera, grid: int) -> Tensor:
-    """Antialiased alpha ``(S, S)``: share of ``grid**2`` sub-pixel rays that hit."""
+    """Antialiased alpha ``(S, S)``: fraction of ``grid**2`` subpixel rays that hit."""
     origins, directions = camera_rays(camera.scaled(grid))
     hit = scene.occluded(origins, directions).float()
     return torch.nn.functional.avg_pool2d(hit[None, None], grid)[0, 0]
 
 
 def random_faces(surface: Surface, count: int, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
-    """Faces ``(N,)`` and barycentrics ``(N, 2)`` of points that are uniform over the area."""
+    """Faces ``(N,)`` and barycentrics ``(N, 2)`` of random points, uniform by area."""
     corners = surface.vertices[surface.faces.long()].numpy()
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1)
     face = rng.choice(len(area), count, p=area / area.sum())
@@ -209,8 +211,8 @@ def random_faces(surface: Surface, count: int, rng: np.random.Generator) -> tupl
 
 
 def _volume(surface: Surface, rng: np.random.Generator) -> dict[str, Tensor]:
-    """Half the points beside the surface (normal offsets of 0.01 and 0.05), half uniform in a box slightly larger
-    than the object.
+    """Points of the volume with signed distances: half near the surface, with normally distributed offsets of standard
+    deviation 0.01 or 0.05, half uniform in a box slightly larger than the object.
     """
     near = surface.points_at(*random_faces(surface, VOLUME_POINTS // 2, rng)).position.numpy()
     near = near + rng.normal(size=near.shape) * rng.choice([0.01, 0.05], (len(near), 1))
@@ -218,7 +220,7 @@ def _volume(surface: Surface, rng: np.random.Generator) -> dict[str, Tensor]:
     points = torch.as_tensor(
         np.concatenate([near, rng.uniform(-box, box, (VOLUME_POINTS // 2, 3))]), dtype=torch.float32
     )
-    points = points.half().float()  # the distance must belong to the point as it is stored
+    points = points.half().float()  # distances of the points as stored, in half precision
     return {"points": points.half(), "distance": surface.distance(points).half()}
 
 

@@ -1,4 +1,4 @@
-"""Textured meshes of the real world as training objects, beside the procedural ones."""
+"""Textured meshes, such as scans, as training objects."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from reli3d.io.glb import read_glb
 from reli3d.render.gbuffer import surface_points
 from reli3d.render.points import SurfacePoints
 
-ESCAPES = 48  # directions in which a point may see the sky: enough for an opening of a tenth of the sphere
+SKY_DIRECTIONS = 48  # tested rays to the outside: they find an opening of a tenth of the sphere
 STRETCH = 0.18  # standard deviation of the logarithm of the scale along each axis
-GAIN = 0.2  # the same of the base color's factor
+GAIN = 0.2  # standard deviation of the logarithm of the factor of the base color
 
 
 @lru_cache(16)  # decoding a texture takes as long as rendering a view
@@ -29,12 +29,12 @@ def _read(path: Path):
 
 
 def outside_distance(vertices: Tensor, faces: Tensor, points: Tensor, scene: RayScene) -> Tensor:
-    """Distance ``(N,)`` to a mesh with holes and inner walls: positive where a point sees the sky in some direction.
+    """Signed distance ``(N,)`` to a mesh with holes and internal faces: negative where all of SKY_DIRECTIONS rays hit.
 
-    The inside of a scan is what no light reaches.  Parity and winding of its faces do not show it.
+    Ray parity and winding numbers are unreliable for such meshes.
     """
-    z = 1 - (2 * torch.arange(ESCAPES) + 1) / ESCAPES
-    phi = torch.arange(ESCAPES) * (np.pi * (3 - 5**0.5))
+    z = 1 - (2 * torch.arange(SKY_DIRECTIONS) + 1) / SKY_DIRECTIONS
+    phi = torch.arange(SKY_DIRECTIONS) * (np.pi * (3 - 5**0.5))
     radius = (1 - z * z).sqrt()
     sphere = torch.stack([radius * phi.cos(), z, radius * phi.sin()], -1).float()
     hidden = torch.ones(len(points), dtype=torch.bool)
@@ -46,9 +46,9 @@ def outside_distance(vertices: Tensor, faces: Tensor, points: Tensor, scene: Ray
 
 
 class ScannedSurface:
-    """One GLB, centered, longest side 1, stretched and tinted at random: a ``Surface`` of :mod:`.samples`.
+    """A GLB, centered, longest side 1, randomly stretched and tinted: a ``Surface`` of :mod:`.samples`.
 
-    rng: None leaves its proportions and its paint as they are.
+    rng: None keeps proportions and colors.
     """
 
     def __init__(self, path: Path, rng: np.random.Generator | None):

@@ -1,4 +1,4 @@
-"""Shapes of untextured GLB files as training objects: rounded, stretched, put together, with finishes of their own."""
+"""Untextured GLB files as training objects: smoothed, stretched and combined, with procedural materials."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import trimesh
 from scipy.sparse import coo_matrix
 from torch import Tensor
 
+from reli3d.errors import InputError
 from reli3d.io.glb import read_glb
 from reli3d.synthetic.finishes import draw_materials
 from reli3d.synthetic.procedural import CREASE_DEG, ProceduralObject, corner_normals
@@ -19,14 +20,14 @@ from reli3d.synthetic.scanned import outside_distance
 
 ROLES = ("any", "any", "any", "wood", "metal", "plastic", "paint", "fabric", "leather", "ceramic", "stone", "accent")
 STRETCH = 0.22  # standard deviation of the logarithm of the scale along each axis
-COMBINED = 0.3  # share of the objects that are put together from two or three shapes
-ROUNDED = 0.65  # share of the coarse shapes that are subdivided and smoothed
-COARSE_FACES = 3000  # above: scanned, and smooth already
+COMBINED_PROBABILITY = 0.3  # of combining two or three shapes
+ROUNDED_PROBABILITY = 0.65  # of subdividing and smoothing a coarse shape
+COARSE_FACES = 3000  # meshes with more faces are scans and not smoothed
 MAX_FACES = 60_000
 
 
 class ShapeSurface(ObjectSurface):
-    """One or more shapes, dressed; open undersides are closed by what no light reaches."""
+    """One or more shapes with procedural materials; distances treat open undersides as closed."""
 
     def __init__(self, paths: Sequence[Path], rng: np.random.Generator):
         super().__init__(combine([paths[int(rng.integers(len(paths)))] for _ in range(_count(rng))], rng))
@@ -36,7 +37,7 @@ class ShapeSurface(ObjectSurface):
 
 
 def _count(rng: np.random.Generator) -> int:
-    return int(rng.integers(2, 4)) if rng.random() < COMBINED else 1
+    return int(rng.integers(2, 4)) if rng.random() < COMBINED_PROBABILITY else 1
 
 
 @lru_cache(64)
@@ -57,12 +58,15 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def combine(paths: Sequence[Path], rng: np.random.Generator) -> ProceduralObject:
-    """The shapes of ``paths`` as one object: the first as it rests, the others beside, on or in it."""
+    """Combines the meshes of ``paths`` into one object: the others are placed next to, on or in the first.
+
+    Raises InputError above MAX_FACES faces.
+    """
     vertices: list[np.ndarray] = []
     faces, owners, start, parts = [], [], 0, 0
     for k, path in enumerate(paths):
         v, f, p = _read(path)
-        if len(f) < COARSE_FACES and rng.random() < ROUNDED:
+        if len(f) < COARSE_FACES and rng.random() < ROUNDED_PROBABILITY:
             v, f, p = rounded(v, f, p, int(rng.integers(1, 3)), float(rng.uniform(0.2, 1.0)))
         v = v * np.exp(rng.normal(0, STRETCH, 3))
         yaw = rng.uniform(0, 2 * np.pi) if rng.random() < 0.5 else np.pi / 2 * rng.integers(4)
@@ -79,14 +83,15 @@ def combine(paths: Sequence[Path], rng: np.random.Generator) -> ProceduralObject
             at[side] = (high if rng.random() < 0.7 else low)[side]
             v = v - (v.min(0) + v.max(0)) / 2 + at
             if rng.random() < 0.5:
-                v[:, 1] += low[1] - v[:, 1].min()  # both stand on the ground
+                v[:, 1] += low[1] - v[:, 1].min()  # on the same ground plane
         vertices.append(v)
         faces.append(f + start)
         owners.append(p + parts)
         start, parts = start + len(v), parts + int(p.max()) + 1
     v, f, part = np.concatenate(vertices), np.concatenate(faces), np.concatenate(owners)
     if len(f) > MAX_FACES:
-        raise ValueError(f"shape: expected at most {MAX_FACES} faces, got {len(f)}")
+        names = ", ".join(str(path) for path in paths)
+        raise InputError("--shapes", f"expected at most {MAX_FACES} faces of {names}, got {len(f)}; decimate them")
     v = ((v - (v.min(0) + v.max(0)) / 2) / np.ptp(v, axis=0).max()).astype(np.float32)
     used, part = np.unique(part, return_inverse=True)
     part = part.reshape(-1).astype(np.int32)
@@ -100,7 +105,7 @@ def combine(paths: Sequence[Path], rng: np.random.Generator) -> ProceduralObject
 
 
 def rounded(v: np.ndarray, f: np.ndarray, part: np.ndarray, times: int, strength: float):
-    """Each face in four, ``times``; after each the vertices move towards their neighbors' mean."""
+    """Subdivides ``times``, each followed by Laplacian smoothing of weight ``strength``."""
     for _ in range(times):
         if len(f) * 4 > COARSE_FACES * 8:
             break

@@ -1,4 +1,4 @@
-"""What a file of a training sample must hold, checked by its header before any work."""
+"""Validation of training samples by their file headers."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from safetensors import SafetensorError, safe_open
 from reli3d.errors import InputError, shown
 from reli3d.io.files import file_size
 
-# Axes and dtype of each tensor of :mod:`reli3d.synthetic.samples`; a letter stands for the same number everywhere.
+# Axes and dtype of each tensor of :mod:`reli3d.synthetic.samples`; equal letters must have equal sizes.
 TENSORS = {
     "images": ("V S S 4", "U8"),
     "c2w": ("V 4 4", "F32"),
@@ -27,14 +27,14 @@ TENSORS = {
     "view_depth": ("V S S", "F16"),
     "finish_known": ("V", "U8"),
 }
-OF_POINTS = ("points", "distance", "surface", "material", "visible")  # not in samples of views alone
+POINT_TENSORS = ("points", "distance", "surface", "material", "visible")  # absent from samples with views only
 OPTIONAL = ("finish_known",)  # not in samples of version 0.3, whose finish is taken as known
 
 
 def check_sample(path: str | os.PathLike, *, views: int = 1, points: bool = True) -> None:
-    """Raise InputError where ``path`` is no whole sample of at least ``views`` views.  Values are not read.
+    """Raises InputError unless ``path`` is a complete sample with at least ``views`` views.  Reads the header only.
 
-    points: whether it must hold those of the volume and the surface.
+    points: whether it must have points of the volume and the surface.
     """
     file_size(path)
     try:
@@ -47,18 +47,18 @@ def check_sample(path: str | os.PathLike, *, views: int = 1, points: bool = True
         ) from None
     sizes: dict[str, int] = {}
     for name, (axes, dtype) in TENSORS.items():
-        if (name in OF_POINTS and not points) or (name in OPTIONAL and name not in found):
+        if (name in POINT_TENSORS and not points) or (name in OPTIONAL and name not in found):
             continue
         shape, got = found.get(name, ((), None))
-        wanted = axes.split()
-        if got != dtype or len(shape) != len(wanted):
+        expected = axes.split()
+        if got != dtype or len(shape) != len(expected):
             found_text = "none" if got is None else f"{got} {shape}"
-            raise InputError(path, f"{name}: expected {dtype} ({', '.join(wanted)}), got {found_text}; make it again")
-        for letter, size in zip(wanted, shape, strict=True):
+            raise InputError(path, f"{name}: expected {dtype} ({', '.join(expected)}), got {found_text}; make it again")
+        for letter, size in zip(expected, shape, strict=True):
             if size < 1 or size != (int(letter) if letter.isdigit() else sizes.setdefault(letter, size)):
                 raise InputError(
                     path,
-                    f"{name}: expected ({', '.join(wanted)}) as its other tensors have it, got {shape}; make it again",
+                    f"{name}: expected ({', '.join(expected)}) as in its other tensors, got {shape}; make it again",
                 )
     if sizes["V"] < views:
         raise InputError(path, f"views: expected at least {views}, got {sizes['V']}; make samples of more views")
@@ -72,10 +72,10 @@ def check_samples(
     points: bool = True,
     also: Callable[[Path], None] = lambda path: None,
 ) -> list[Path]:
-    """Files of all samples in ``folder``, checked.  Raises InputError where one is broken or there is none.
+    """All sample files of ``folder``, checked.  Raises InputError if one is invalid or there is none.
 
-    name: of the option or argument that gave the folder.  points: as in :func:`check_sample`.  also: what else must
-    hold of each file.
+    name: of the option or argument for error messages.  views, points: as in :func:`check_sample`.  also: additional
+    check of each file.
     """
     if not folder.is_dir():
         raise InputError(name, f"expected a folder of samples, got {shown(str(folder))}; make them with reli3d-data")

@@ -1,7 +1,4 @@
-"""Families of things that hold something: vessels turned about an axis, lamps and lanterns, crates, barrels and chests.
-
-See ``manmade.py`` for what a family is.
-"""
+"""Families of vessels, lamps and containers.  ``manmade.py`` defines a family."""
 
 from __future__ import annotations
 
@@ -97,7 +94,7 @@ def _lid(a: Assembly, radius: float, height: float, segments: int) -> None:
 
 
 def lamp(a: Assembly) -> None:
-    """Table lamp, lantern or candlestick: foot, stem, shade or cage with a ring to carry it."""
+    """Table lamp, lantern or candlestick: foot, stem, shade, or a cage with a carrying ring."""
     rng, u = a.rng, a.rng.uniform
     frame = a.part("metal" if rng.random() < 0.6 else "paint")
     if rng.random() < 0.5:

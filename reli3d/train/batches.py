@@ -1,4 +1,4 @@
-"""One object of a training step from a file of :mod:`reli3d.synthetic.samples`: views, points and maps, augmented."""
+"""Training examples of the small network: views, points and maps from :mod:`reli3d.synthetic.samples`, augmented."""
 
 from __future__ import annotations
 
@@ -14,20 +14,22 @@ from torch.nn import functional
 
 from reli3d.geometry.hull import mask_distance
 from reli3d.render.latlong import lat_long_directions, quarter_turn
-from reli3d.train.relight import Finish, draw_light, relit
+from reli3d.train.relight import Finish, draw_light, relight_views
 from reli3d.views.views import Views
 
-TURNED_UP = 0.12  # share of objects whose world is not +Y up: captures come in any frame
-NOISE = 0.012  # greatest standard deviation of a photograph's noise, sRGB
-RELIT = 0.5  # share of the objects whose photographs are made anew under another light
-KEPT = 0.75  # share of the augmented objects that stay the right way round in a mirror, and keep their channels
+OTHER_UP_PROBABILITY = 0.12  # of a world that is not +Y up: captures come in any frame
+MAX_NOISE = 0.012  # largest standard deviation of the image noise, sRGB
+RELIGHT_PROBABILITY = 0.5  # of views that are rendered again under another environment
+UNCHANGED_PROBABILITY = (
+    0.75  # share of the augmented objects that stay the right way round in a mirror, and keep their channels
+)
 
 
 def random_turn(rng: np.random.Generator) -> Tensor:
-    """A yaw about +Y; now and then followed by a turn that makes another axis the vertical one."""
+    """Random rotation ``(3, 3)``: a yaw about +Y, with OTHER_UP_PROBABILITY followed by a change of the up axis."""
     a = rng.uniform(0, 2 * np.pi)
     yaw = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
-    if rng.random() < TURNED_UP:
+    if rng.random() < OTHER_UP_PROBABILITY:
         up = [
             np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]),
             np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]]),
@@ -45,8 +47,8 @@ def finish_known(file: safe_open) -> Tensor:
 
 
 @dataclass(frozen=True)
-class Pictures:
-    """``V`` views of ``S`` by ``S`` pixels, the truth for ``P = S/2``; float32."""
+class TrainingViews:
+    """``V`` views of ``S`` by ``S`` pixels with ground-truth maps of ``P = S/2`` pixels; float32."""
 
     images: Tensor  # (V, S, S, 3) sRGB
     masks: Tensor  # (V, S, S)
@@ -56,21 +58,21 @@ class Pictures:
     view_material: Tensor  # (V, P, P, 5) base color (sRGB), roughness, metallic
     view_normal: Tensor  # (V, P, P, 3) world, unit
     view_depth: Tensor  # (V, P, P) from the world's origin along the camera's axis
-    view_valid: Tensor  # (V, P, P) bool: the pixel shows the surface alone
+    view_valid: Tensor  # (V, P, P) bool: the surface covers the whole pixel
     finish_known: Tensor  # (V,) bool: roughness and metallic are the truth, not placeholders
 
-    def of_views(self, chosen: slice | Tensor) -> Pictures:
-        """The ``chosen`` views alone."""
-        return Pictures(**{f.name: getattr(self, f.name)[chosen] for f in fields(self)})
+    def of_views(self, chosen: slice | Tensor) -> TrainingViews:
+        """The views of the indices ``chosen``."""
+        return TrainingViews(**{f.name: getattr(self, f.name)[chosen] for f in fields(self)})
 
 
 @dataclass(frozen=True)
-class Sample(Pictures):
-    """One object, with points in and on it and its light; the world turned at random."""
+class Sample(TrainingViews):
+    """One object: views, points of the volume and of the surface, and lighting, in a randomly rotated world."""
 
     points: Tensor  # (M, 3)
     distance: Tensor  # (M,)
-    surface: Tensor  # (N, 3, 3) position, normal, bumped normal
+    surface: Tensor  # (N, 3, 3) position, normal, bump-mapped normal
     material: Tensor  # (N, 5)
     visible: Tensor  # (N, V)
     light_directions: Tensor  # (2048, 3)
@@ -80,9 +82,9 @@ class Sample(Pictures):
 def load_sample(
     path: Path, views: int, points: int, rng: np.random.Generator, *, augment: bool = True, lights: Tensor | None = None
 ) -> Sample:
-    """``views`` random views of a file, at most what it has; ``points`` of the volume, half as many of the surface.
+    """Reads up to ``views`` random views of a file, ``points`` volume points and half as many surface points.
 
-    lights: ``(n, H, 2H, 3)`` under which some samples are relit.  Without ``augment`` the first views, as they are.
+    augment: False takes the first views unchanged.  lights: ``(n, H, 2H, 3)``, for relighting some of the samples.
     """
     with safe_open(path, "pt") as file:
         total = file.get_slice("c2w").get_shape()[0]
@@ -110,12 +112,12 @@ def load_sample(
         normal, depth = of_views("view_normal").float() / 127, of_views("view_depth").float()
         light = quarter_turn(file.get_tensor("environment").float(), -1)  # stored with -Z in the center column
     valid = depth > 0
-    if augment and lights is not None and rng.random() < RELIT:
+    if augment and lights is not None and rng.random() < RELIGHT_PROBABILITY:
         finish = Finish.draw(rng)
         material, of_pixels = finish.apply(material), finish.apply(of_pixels)
-        images, light = relit(images, of_pixels, normal, valid, c2w, intrinsics, draw_light(lights, rng), rng)
+        images, light = relight_views(images, of_pixels, normal, valid, c2w, intrinsics, draw_light(lights, rng), rng)
     turn = random_turn(rng) if augment else torch.eye(3)
-    flip = torch.tensor([-1.0 if augment and rng.random() > KEPT else 1.0, 1.0, 1.0])
+    flip = torch.tensor([-1.0 if augment and rng.random() > UNCHANGED_PROBABILITY else 1.0, 1.0, 1.0])
     turn = turn * flip  # a mirror at the plane x = 0, then the turn
     mirrored = bool(flip[0] < 0)
     if mirrored:
@@ -125,8 +127,8 @@ def load_sample(
     c2w = c2w.clone()
     c2w[:, :3] = turn @ c2w[:, :3]
     if mirrored:
-        c2w[:, :, 0] *= -1  # the camera stays right-handed, its picture is flipped
-    if augment and rng.random() > KEPT:
+        c2w[:, :, 0] *= -1  # the camera stays right-handed, its image is flipped
+    if augment and rng.random() > UNCHANGED_PROBABILITY:
         channels = torch.as_tensor(rng.permutation(3))
         images = torch.cat([images[..., channels], images[..., 3:]], -1)
         light, material = light[..., channels], torch.cat([material[:, channels], material[:, 3:]], -1)
@@ -134,13 +136,13 @@ def load_sample(
     color, masks = images[..., :3], images[..., 3]
     if augment:
         noise = torch.from_numpy(rng.standard_normal(color.shape, dtype=np.float32))
-        color = (color + float(rng.random()) * NOISE * noise).clamp(0, 1)
+        color = (color + float(rng.random()) * MAX_NOISE * noise).clamp(0, 1)
     whole = functional.avg_pool2d(valid.float()[:, None], 2)[:, 0]
-    share = whole.clamp(min=0.25)[..., None]
+    fraction = whole.clamp(min=0.25)[..., None]
 
     def half(values: Tensor) -> Tensor:
         pooled = functional.avg_pool2d((values * valid[..., None]).permute(0, 3, 1, 2), 2).permute(0, 2, 3, 1)
-        return pooled / share
+        return pooled / fraction
 
     origin = (c2w[:, :3, 3] * c2w[:, :3, 2]).sum(-1)[:, None, None]  # depth of the world's origin
     return Sample(
@@ -172,7 +174,7 @@ def draw_samples(
     max_views: int,
     lights: Tensor | None = None,
 ) -> list[Sample]:
-    """A random object of ``files`` for each of ``seeds``, read from 1 to ``max_views`` views."""
+    """For each of ``seeds`` a random object of ``files`` with 1 to ``max_views`` random views."""
     drawn = []
     for seed in seeds:
         rng = np.random.default_rng(seed)
@@ -182,7 +184,7 @@ def draw_samples(
 
 
 def stored_views(sample: dict[str, Tensor], count: int) -> Views:
-    """The first ``count`` views of a stored sample, as the pipeline takes them."""
+    """The first ``count`` views of a stored sample, as input of the pipeline."""
     images = sample["images"][:count].float() / 255
     return Views(
         tuple(images[..., :3].contiguous()),

@@ -1,7 +1,7 @@
-"""An uncertain network predicts occupancy below 0.5 at the surface.  A constant added to the logit corrects it.
+"""Calibration of the occupancy logit, by silhouettes in held-out views.
 
-Without it shapes come out thin.  The constant is chosen by the silhouettes of whole objects in views that were not
-input.  The uncertainty depends on the number of views, so one view and four have their own constant.
+An uncertain network predicts occupancies below 0.5 at the true surface, which makes shapes too thin.  A constant added
+to the logit compensates.  Uncertainty depends on the number of views, so one and four views have separate constants.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
+from reli3d.errors import InputError
 from reli3d.geometry.camera import Camera, camera_rays
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene
@@ -24,11 +25,11 @@ from reli3d.pipeline import Network, NoSurface, encode, extract, prepare
 from reli3d.train.batches import stored_views
 from reli3d.views.similarity import Similarity
 
-OFFSETS = (0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 3.0, 5.0)  # of the logit; the last: the hull
-FEW, MANY = 1, 4  # numbers of views that are tried
-SIDE = 96  # pixels of the silhouettes that are compared
-ALIKE = 1e-3  # of 1 / recall - precision: a few pixels of a silhouette of some thousand; less is chance
-LOST = math.log(20.0)  # a twentieth of the object is all that is found
+OFFSETS = (0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 3.0, 5.0)  # candidates; the last gives about the visual hull
+FEW_VIEWS, MANY_VIEWS = 1, 4  # numbers of views that are tried
+SILHOUETTE_SIZE = 96  # pixels of the silhouettes that are compared
+MIN_RATIO_DIFFERENCE = 1e-3  # of 1 / recall - precision: a few pixels in a silhouette of several thousand
+MAX_MISMATCH = math.log(20.0)  # that of a recall of 1/20
 
 
 @torch.no_grad()
@@ -40,20 +41,23 @@ def calibrate(
     seed: int = 1,
     progress: Callable[[str], None] = lambda line: None,
 ) -> dict[int, dict[float, float]]:
-    """Set the preset's surface offsets to the least that do as well as any by :func:`mismatch` over random ``samples``.
+    """Sets the surface offsets of the preset by :func:`mismatch` over random ``samples``.
 
-    samples: a folder of samples with more than ``MANY`` views, best of objects that no training saw: of those it knows
-    a network is surer.  Gives the mean IoU of every offset for each number of views; ``progress`` gets a line an
-    object.  Raises ValueError where the folder holds no samples.
+    Of the candidates OFFSETS it takes the smallest that :func:`one_standard_error_choice` cannot distinguish from the
+    best.  Returns the mean silhouette IoU of every offset, for each number of views.
+
+    samples: folder of samples with more than MANY_VIEWS views, of held-out objects: on objects of its training set the
+    network is too certain.  objects: how many are used.  progress: called with one line per object.  Raises InputError
+    if the folder has no samples.
     """
     files = sorted(samples.glob("*.safetensors"))
     if not files:
-        raise ValueError(f"samples: expected *.safetensors files, got none in {samples}")
+        raise InputError(samples, "expected *.safetensors files, got none; make samples with reli3d-data render")
     chosen = np.random.default_rng(seed).permutation(len(files))[:objects]
     plain = model.preset
     if not isinstance(plain, LocalPreset):
         raise ValueError(f"model: expected a network of convolutions, got the preset {plain.name}")
-    scores: dict[int, list[list[tuple[float, float]]]] = {FEW: [], MANY: []}
+    scores: dict[int, list[list[tuple[float, float]]]] = {FEW_VIEWS: [], MANY_VIEWS: []}
     for k in chosen:
         sample = load_file(files[k])
         for count, rows in scores.items():
@@ -63,33 +67,30 @@ def calibrate(
                 model.preset = replace(plain, offset_one_view=offset, offset_many_views=offset)
                 try:
                     mesh = extract(field, plain.resolution)
-                    rows[-1].append(agreement(mesh, sample, range(count, len(sample["images"]))))
-                except NoSurface:  # nothing is left of the object
-                    rows[-1].append((0.0, LOST))
-        progress(f"{files[k].stem}: IoU {max(scores[FEW][-1])[0]:.3f}, {max(scores[MANY][-1])[0]:.3f}")
+                    rows[-1].append(silhouette_scores(mesh, sample, range(count, len(sample["images"]))))
+                except NoSurface:
+                    rows[-1].append((0.0, MAX_MISMATCH))
+        progress(f"{files[k].stem}: IoU {max(scores[FEW_VIEWS][-1])[0]:.3f}, {max(scores[MANY_VIEWS][-1])[0]:.3f}")
     found = {count: np.array(rows) for count, rows in scores.items()}  # (objects, offsets, 2)
     tried = {count: dict(zip(OFFSETS, rows[..., 0].mean(0).tolist(), strict=True)) for count, rows in found.items()}
-    one, many = (OFFSETS[first_of_the_best(found[count][..., 1])] for count in (FEW, MANY))
-    model.preset = replace(plain, offset_one_view=one, offset_many_views=many + (many - one) / (MANY - 1))
+    one, many = (OFFSETS[one_standard_error_choice(found[count][..., 1])] for count in (FEW_VIEWS, MANY_VIEWS))
+    model.preset = replace(plain, offset_one_view=one, offset_many_views=many + (many - one) / (MANY_VIEWS - 1))
     return tried
 
 
-def first_of_the_best(errors: np.ndarray) -> int:
-    """First column of ``errors (objects, choices)`` whose mean is above the least by no more than the standard error of
-    that difference (the rule of one standard error, Breiman et al. 1984): what objects do not tell apart stays as the
-    network has it.
+def one_standard_error_choice(errors: np.ndarray) -> int:
+    """First column of ``errors (objects, choices)`` whose mean exceeds the minimum by at most one standard error of the
+    difference (the one-standard-error rule, Breiman et al. 1984).
     """
     more = errors - errors[:, [errors.mean(0).argmin()]]
     noise = more.std(0, ddof=1) / len(more) ** 0.5 if len(more) > 1 else 0.0
     return int(np.flatnonzero(more.mean(0) <= noise)[0])
 
 
-def agreement(mesh: Mesh, sample: dict[str, Tensor], views: range) -> tuple[float, float]:
-    """Mean IoU and :func:`mismatch` of silhouettes of ``mesh`` and masks of ``sample`` in ``views``, ``SIDE`` pixels
-    wide.
-    """
+def silhouette_scores(mesh: Mesh, sample: dict[str, Tensor], views: range) -> tuple[float, float]:
+    """Mean IoU and mean :func:`mismatch` between silhouettes of ``mesh`` and the masks of ``sample`` in ``views``."""
     scene, size = RayScene(mesh.vertices, mesh.faces), sample["images"].shape[1]
-    step = size // SIDE
+    step = size // SILHOUETTE_SIZE
     rows = []
     for v in views:
         intrinsics = sample["intrinsics"][v] / step
@@ -103,12 +104,11 @@ def agreement(mesh: Mesh, sample: dict[str, Tensor], views: range) -> tuple[floa
 
 
 def mismatch(both: int, got: int, want: int) -> float:
-    """Logarithm of ``1 / recall - precision`` of ``both`` pixels in common of ``got`` and ``want``, at most ``LOST``.
+    """``log(1 / recall - precision)`` of silhouettes of ``got`` and ``want`` pixels with ``both`` in common.
 
-    The square error of a picture in one color at its best brightness, for each pixel in common.  Unlike IoU it weighs
-    how much of the object is missing more than what is too much, the more so the less is right: a shape that is guessed
-    from one view had better be full.
+    Equals the logarithm of the square error per common pixel of an image of constant color at its optimal brightness.
+    Unlike IoU it penalizes missing area more than excess area.  At most MAX_MISMATCH.
     """
     if both == 0:
-        return LOST
-    return min(LOST, math.log(max(want / both - both / got, ALIKE)))
+        return MAX_MISMATCH
+    return min(MAX_MISMATCH, math.log(max(want / both - both / got, MIN_RATIO_DIFFERENCE)))

@@ -1,4 +1,4 @@
-"""Checkpoints of a run: one file that holds all that it needs to go on, for every stage."""
+"""Checkpoints of a training run: one file with all that is needed to resume, the same for every stage."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ REMEDY = "name another output folder, and this file by --weights"
 
 
 def update_average(average: dict[str, Tensor], model: nn.Module, decay: float) -> None:
-    """Move ``average`` towards the parameters of ``model`` by ``1 - decay``, in place."""
+    """Exponential moving average: ``average = decay * average + (1 - decay) * parameters``, in place."""
     with torch.no_grad():
         for key, value in model.state_dict().items():
             if value.is_floating_point():
@@ -40,7 +40,10 @@ def save(
     measures: dict[str, float],
     workers: Workers,
 ) -> dict[str, Tensor]:
-    """Replace ``folder/state.pt`` whole; the averaged weights.  All processes must call it, the first one writes."""
+    """Writes ``folder/state.pt`` atomically and returns the averaged weights.
+
+    All processes must call it; the first one writes.
+    """
     first = workers.rank == 0
     state = {
         "model": gathered(stage.model.state_dict(), first),
@@ -63,9 +66,9 @@ def save(
 
 
 def load(path: Path, **options: Any) -> dict[str, Any]:
-    """What :func:`save` wrote; of a file of version 0.2 ``stage`` and ``measures`` are empty.
+    """The dictionary that :func:`save` wrote.  In files of version 0.2 ``stage`` and ``measures`` are empty.
 
-    options: of ``torch.load``.  Raises InputError for a missing, broken or foreign file.
+    options: passed to ``torch.load``.  Raises InputError for a missing or broken file, or one of another kind.
     """
     file_size(path)
     try:
@@ -87,9 +90,9 @@ def small_preset(state: dict[str, Any]) -> LocalPreset:
 
 
 def to_resume(path: Path, stage: Stage, groups: list[dict]) -> dict[str, Any]:
-    """The checkpoint that ``stage`` goes on from.  Raises InputError for one of another stage or network.
+    """The checkpoint from which ``stage`` resumes.  Raises InputError if it is of another stage or network.
 
-    groups: of the optimizer that goes on.
+    groups: parameter groups of the optimizer that resumes.
     """
 
     def sizes(groups: list[dict]) -> list[tuple]:
@@ -105,14 +108,16 @@ def to_resume(path: Path, stage: Stage, groups: list[dict]) -> dict[str, Any]:
     return state
 
 
-def check_shapes(path: Path, state: dict[str, Tensor], model: nn.Module, lacking: set[str] | None = None) -> None:
-    """Raise InputError unless ``state`` has the tensors of ``model`` but for those ``lacking``."""
-    wanted = {k: tuple(v.shape) for k, v in model.state_dict().items() if k not in (lacking or ())}
+def check_shapes(
+    path: Path, state: dict[str, Tensor], model: nn.Module, missing_parameters: set[str] | None = None
+) -> None:
+    """Raise InputError unless ``state`` has the tensors of ``model`` but for those ``missing_parameters``."""
+    wanted = {k: tuple(v.shape) for k, v in model.state_dict().items() if k not in (missing_parameters or ())}
     check_keys(path, {k: tuple(v.shape) for k, v in state.items()}, wanted)
 
 
 def restore(optimizer: torch.optim.Optimizer, state: dict) -> None:
-    """Give ``optimizer`` the whole moments of a checkpoint, sharded where its parameters are."""
+    """Loads the optimizer state of a checkpoint, sharded where the parameters are."""
     parameters = [p for group in optimizer.param_groups for p in group["params"]]
     for k, values in state["state"].items():
         state["state"][k] = {name: scattered(value, parameters[k]) for name, value in values.items()}

@@ -1,9 +1,8 @@
-"""Training of the environment prior: a RENI++ decoder and one latent code for each map, fitted together.
+"""Training of the environment prior: a RENI++ decoder, jointly with one latent code per map (an auto-decoder).
 
-The decoder is equivariant to turns about the vertical, so maps need no augmentation by yaw; blends of two maps under
-a relative turn and a tint stand in for the many environments that a small collection lacks.  Maps are scaled to a
-geometric mean of 1: the network's strength carries the exposure.  Source: Gardner et al. 2023, RENI++, arXiv
-2311.09361, section 4.
+The decoder is equivariant to rotation about the vertical axis, so maps need no augmentation by yaw.  Blends of two
+maps with a relative rotation and a tint augment a small collection.  Maps are scaled to a geometric mean of 1; the
+exposure is a separate output of the network.  Source: Gardner et al. 2023, RENI++, arXiv 2311.09361, section 4.
 """
 
 from __future__ import annotations
@@ -22,10 +21,10 @@ from reli3d.nn.presets import OFFICIAL, TINY
 from reli3d.nn.reni import EnvironmentDecoder, reni_frame
 from reli3d.nn.reni_fit import fit_latent
 from reli3d.render.latlong import lat_long_directions
-from reli3d.synthetic.maps import ROWS, held_back, load_maps
+from reli3d.synthetic.maps import ROWS, held_out, load_maps
 
-FLOOR = 1e-2  # of the geometric mean: darker is black
-PEAK = 2e3  # of the geometric mean: the sun of a clear sky is 1e4 to 1e5, out of reach of a smooth decoder
+FLOOR = 1e-2  # of the geometric mean, added before the logarithm
+PEAK = 2e3  # of the geometric mean, clipped above: a smooth decoder cannot represent the sun, 1e4 to 1e5
 
 
 def scale_free(maps: Tensor) -> Tensor:
@@ -37,7 +36,7 @@ def scale_free(maps: Tensor) -> Tensor:
 
 
 def blends(maps: Tensor, count: int, rng: np.random.Generator) -> Tensor:
-    """``count`` mixtures of two maps, one mirrored or turned, with a tint."""
+    """``count`` blends of two maps, linear or geometric, one of them mirrored or rotated, tinted."""
     out = []
     for _ in range(count):
         a, b = (maps[int(rng.integers(len(maps)))] for _ in range(2))
@@ -59,7 +58,7 @@ def fit(
     seed: int = 0,
     log=sys.stderr,
 ) -> Tensor:
-    """Latents ``(n, L, 3)`` that decode to ``maps``; the decoder is fitted with them in place."""
+    """Fits ``decoder`` in place and returns the latents ``(n, L, 3)`` of ``maps (n, H, 2H, 3)``."""
     generator = torch.Generator().manual_seed(seed)
     latents = torch.nn.Parameter(
         0.1 * torch.randn(len(maps), decoder.field.network.layers[0].mha.key.in_features // 3, 3, generator=generator)
@@ -101,7 +100,7 @@ def fit(
 
 
 def main() -> None:
-    """Fit the prior and write the decoder, the latents of the real maps and their names."""
+    """Fits the prior and writes the decoder and the latents; prints the error on held-out maps."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("maps", type=Path, help=".npz with env (n, H, 2H, 3) and names")
     parser.add_argument("output", type=Path, help="safetensors file to write")
@@ -112,20 +111,20 @@ def main() -> None:
     args = parser.parse_args()
     torch.manual_seed(0)
     maps, names = load_maps(args.maps)
-    kept = scale_free(maps[[not h for h in held_back(names)]])
+    kept = scale_free(maps[[not h for h in held_out(names)]])
     decoder = EnvironmentDecoder((TINY if args.preset == "tiny" else OFFICIAL).reni)
     every = torch.cat([kept, scale_free(blends(kept, args.blends, np.random.default_rng(0)))])
     latents = fit(decoder, every, steps=args.steps, minutes=args.minutes)
     state = {k: v.contiguous() for k, v in decoder.state_dict().items()}
     save_file({**state, "latents": latents}, args.output)
-    test = scale_free(maps[held_back(names)])
+    test = scale_free(maps[held_out(names)])
     fitted = [fit_latent(decoder, radiance) for radiance in test]
     with torch.no_grad():
         radiance = torch.cat([decoder(f.latent[None], f.rotation[None], f.strength[None], ROWS) for f in fitted])
     error = ((radiance + FLOOR).log() - (test + FLOOR).log()).abs().mean((1, 2, 3))
     mean_map = every[: len(kept)].log1p().mean(0).expm1()
     base = ((mean_map + FLOOR).log() - (test + FLOOR).log()).abs().mean((1, 2, 3))
-    print(f"held-back maps: log error {error.mean():.3f}, of the mean map {base.mean():.3f}", file=sys.stderr)
+    print(f"held-out maps: log error {error.mean():.3f}, of the mean map {base.mean():.3f}", file=sys.stderr)
 
 
 if __name__ == "__main__":

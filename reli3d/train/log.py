@@ -1,4 +1,4 @@
-"""The log of a run, its curves (drawn with Pillow), and TensorBoard's event files."""
+"""The log of a training run, plots of it (drawn with Pillow), and TensorBoard event files."""
 
 from __future__ import annotations
 
@@ -18,8 +18,9 @@ NO_CURVE = ("step", "seconds", "bad")  # columns of the log
 
 
 def write_curves(log: Path, target: Path) -> None:
-    """One panel for each logged quantity over the steps, logarithmic where it is positive; none for a quantity that is
-    nowhere finite.  Nothing is written for fewer than two rows.
+    """Plots every logged quantity over the steps, on a logarithmic axis if all its values are positive.
+
+    Quantities without finite values are left out.  Nothing is written for fewer than two rows.
     """
     rows = [r for r in map(json.loads, log.read_text().splitlines()) if "config" not in r]
     if len(rows) < 2:
@@ -50,9 +51,9 @@ def write_curves(log: Path, target: Path) -> None:
 
 
 class Log:
-    """``log.jsonl``: one JSON object a line; a run begins with its configuration.
+    """``log.jsonl``: one JSON object per line; a run begins with its configuration.
 
-    Rows after ``step``, whose steps are taken again, and a half-written one are removed.
+    On resuming, rows after ``step`` and a half-written last row are removed.
     """
 
     def __init__(self, path: Path, step: int, configuration: Mapping[str, Any]):
@@ -88,7 +89,7 @@ def summary_writer() -> type:
 
 
 class Board:
-    """An event file in ``folder``.  step: where the run goes on; events of later steps are replaced."""
+    """A TensorBoard event file in ``folder``.  step: at which the run resumes; events of later steps are purged."""
 
     def __init__(self, folder: str, step: int):
         self._writer = summary_writer()(folder, purge_step=step + 1)

@@ -1,8 +1,8 @@
 """The training loop of all stages: schedule, optimizer, averaged weights, checkpoints and log.
 
-A :class:`~reli3d.train.stage.Stage` supplies what is trained: parameters with multipliers of the rate, batches, losses,
-validation images.
-A run resumes at its last checkpoint; on a CPU the result is bitwise equal to that of a run that was not stopped.
+A :class:`~reli3d.train.stage.Stage` supplies the model, multipliers of the learning rate, batches, losses and
+validation images.  A run resumes from its last checkpoint; on a CPU the result is bitwise identical to that of an
+uninterrupted run.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from reli3d.train.workers import Workers
 
 
 def progress(options: Options, step: int, seconds: float) -> float:
-    """Fraction of the schedule that is done, by steps or by time, whichever is further."""
+    """Completed fraction of the schedule, in [0, 1]: by steps or by time, whichever is larger."""
     return min(1.0, max(step / max(options.steps, 1), seconds / (60 * options.minutes)) if options.steps else 1.0)
 
 
 def rate_at(options: Options, step: int, done: float) -> float:
-    """Linear warm-up, then a cosine from ``rate`` to ``final_rate`` of it."""
+    """Learning rate: linear warm-up times a cosine from ``rate`` to ``rate * final_rate``."""
     cosine = 0.5 * (1 + math.cos(math.pi * done))
     return (
         options.rate * min(1.0, (step + 1) / options.warmup) * (options.final_rate + (1 - options.final_rate) * cosine)
@@ -43,7 +43,7 @@ def rate_at(options: Options, step: int, done: float) -> float:
 
 
 def parameter_groups(stage: Stage, weight_decay: float) -> list[dict]:
-    """Groups of the optimizer: by weight decay, which vectors do not have, and by ``times`` the rate."""
+    """Parameter groups by weight decay (none for vectors) and by ``times``, the multiplier of the learning rate."""
     groups: dict[tuple[float, float], list[nn.Parameter]] = {}
     for name, parameter in stage.model.named_parameters():
         times = stage.rate_factor(name) if parameter.requires_grad else 0.0
@@ -53,10 +53,10 @@ def parameter_groups(stage: Stage, weight_decay: float) -> list[dict]:
 
 
 def accumulate(stage: Stage, items: Sequence[Any]) -> Tensor:
-    """Add the gradients of the mean loss of ``items``, one after the other; sums of their terms.
+    """Accumulates the gradients of the mean loss over ``items``, one item at a time; returns sums for the log.
 
-    ``(2 T + 2,)``: for each of the T names of ``stage.weights`` the sum of its values, then the number of items that
-    have it, then the sum of the weighted losses and the number of items.
+    ``(2 T + 2,)``: for each of the T terms of ``stage.weights`` the sum of its values; for each term the number of
+    items that have it; the sum of the weighted losses; the number of items.
     """
     names = list(stage.weights)
     values = torch.zeros(2 * len(names) + 2, dtype=torch.float64)
@@ -73,7 +73,7 @@ def accumulate(stage: Stage, items: Sequence[Any]) -> Tensor:
 
 
 def row_of(stage: Stage, sums: Tensor) -> dict[str, float]:
-    """The mean loss, and each term's mean over the items that have it."""
+    """Row of the log: the mean loss, and the mean of each term over the items that have it."""
     names = list(stage.weights)
     counts = sums[len(names) : 2 * len(names)]
     means = {n: round(float(s / c), 6) for n, s, c in zip(names, sums, counts, strict=False) if c > 0}
@@ -81,10 +81,11 @@ def row_of(stage: Stage, sums: Tensor) -> dict[str, float]:
 
 
 def train(stage: Stage, options: Options, workers: Workers | None = None) -> None:
-    """Train ``stage.model`` in place to the end of the schedule; resume from ``output/state.pt`` where there is one.
+    """Trains ``stage.model`` in place to the end of the schedule; resumes from ``output/state.pt`` if it exists.
 
-    workers: processes that share the batch; all start from the same parameters, the first one writes.  A step without
-    finite gradients is skipped and counted; RuntimeError after ``options.bad_steps`` in a row.
+    workers: processes that divide each batch; all start from the same parameters, the first one writes files.  A step
+    whose gradients are not finite is skipped; ``options.bad_steps`` such steps in a row raise RuntimeError.  Raises
+    InputError for a batch size that the processes do not divide and for a checkpoint of another stage.
     """
     workers = workers or Workers()
     model, folder, first = stage.model, Path(options.output), workers is None or workers.rank == 0
@@ -124,7 +125,7 @@ def train(stage: Stage, options: Options, workers: Workers | None = None) -> Non
         for group in optimizer.param_groups:
             group["lr"] = group["times"] * rate
         optimizer.zero_grad(set_to_none=True)
-        torch.manual_seed((options.seed << 32) + step)  # for losses that draw at random: resumed, they draw the same
+        torch.manual_seed((options.seed << 32) + step)  # random losses draw the same numbers after resuming
         values = accumulate(stage, stage.batch(step, range(workers.rank, options.batch, workers.count)))
         clock = torch.tensor([time.monotonic() - began], dtype=torch.float64)
         values = workers.average(plain(trained), torch.cat([values, clock]).float()).double()

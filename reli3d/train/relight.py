@@ -1,4 +1,4 @@
-"""Photographs of a sample made anew under another light and with another finish, from the maps of its views."""
+"""Renders the views of a sample again under another environment and with changed materials, from its G-buffers."""
 
 from __future__ import annotations
 
@@ -15,38 +15,38 @@ from reli3d.render.environment import Environment
 from reli3d.render.points import SurfacePoints
 from reli3d.render.shading import ShadeOptions, shade
 from reli3d.synthetic.maps import with_lamps
-from reli3d.synthetic.samples import DIFFUSE_MODEL, EXPOSED
+from reli3d.synthetic.samples import DIFFUSE_MODEL, EXPOSURE_TARGET
 
-SAMPLES = (12, 5, 5)  # light, GGX and cosine samples a pixel: what noise is left, a photograph in poor light has
-LAMPS = 0.6  # share of the lights that get lamps
+SAMPLES = (12, 5, 5)  # light, GGX and cosine samples per pixel: the remaining noise is that of a photograph
+LAMP_PROBABILITY = 0.6  # of lamps added to an environment
 SATURATES = 4.0  # a pixel's radiance, as in reli3d.synthetic.samples
-TINT = 0.1  # standard deviation of the logarithm of the light's color
-EXPOSURE = 0.35  # the same of the exposure
-METAL, PLAIN = 0.08, 0.05  # shares of the objects made all of metal, and without any
+TINT = 0.1  # standard deviation of the logarithm of the color of the lighting
+EXPOSURE = 0.35  # standard deviation of the logarithm of the exposure
+METAL_PROBABILITY, NONMETAL_PROBABILITY = 0.08, 0.05  # of metallic set to 1, and to 0, everywhere
 
 
 @dataclass(frozen=True)
 class Finish:
-    """One change of all materials of an object, the same in its pixels and at its points."""
+    """A change of all materials of an object, applied alike to its pixels and points."""
 
-    gamma: float  # of the base color, sRGB
+    gamma: float  # exponent of the base color, sRGB
     gain: float  # of the roughness
-    shift: float
-    metallic: float | None  # everywhere, or as it is
+    shift: float  # of the roughness
+    metallic: float | None  # value everywhere; None: unchanged
 
     @staticmethod
     def draw(rng: np.random.Generator) -> Finish:
-        """Half of the objects stay as they are."""
+        """A random change; the identity with probability 1/2."""
         if rng.random() < 0.5:
             return Finish(1.0, 1.0, 0.0, None)
         kind = rng.random()
-        metallic = 1.0 if kind < METAL else 0.0 if kind < METAL + PLAIN else None
+        metallic = 1.0 if kind < METAL_PROBABILITY else 0.0 if kind < METAL_PROBABILITY + NONMETAL_PROBABILITY else None
         return Finish(
             float(np.exp(rng.normal(0, 0.35))), float(np.exp(rng.normal(0, 0.25))), float(rng.normal(0, 0.08)), metallic
         )
 
     def apply(self, material: Tensor) -> Tensor:
-        """Of ``material (..., 5)``: base color (sRGB), roughness, metallic."""
+        """Changed ``material (..., 5)``: base color (sRGB), roughness, metallic."""
         base, rough, metal = material.split([3, 1, 1], -1)
         base = base.clamp(min=1e-6) ** self.gamma
         rough = (rough * self.gain + self.shift).clamp(0.03, 1.0)
@@ -54,16 +54,16 @@ class Finish:
 
 
 def draw_light(lights: Tensor, rng: np.random.Generator) -> Tensor:
-    """One of ``lights (n, H, 2H, 3)``, turned, mirrored, tinted, most often with lamps: ``(H, 2H, 3)``."""
+    """A random map ``(H, 2H, 3)`` of ``lights (n, H, 2H, 3)``, rotated, mirrored, tinted, often with added lamps."""
     light = lights[int(rng.integers(len(lights)))]
     light = torch.roll(light, int(rng.integers(light.shape[1])), 1)
     if rng.random() < 0.5:
         light = light.flip(1)
     light = light * torch.as_tensor(np.exp(rng.normal(0, TINT, 3)), dtype=torch.float32)
-    return with_lamps(light, rng) if rng.random() < LAMPS else light
+    return with_lamps(light, rng) if rng.random() < LAMP_PROBABILITY else light
 
 
-def relit(
+def relight_views(
     images: Tensor,
     material: Tensor,
     normal: Tensor,
@@ -75,8 +75,8 @@ def relit(
 ) -> tuple[Tensor, Tensor]:
     """Views ``(V, S, S, 4)`` under ``light (H, 2H, 3)``, and that light as ``(32, 64, 3)`` at the views' exposure.
 
-    images: ``(V, S, S, 4)``, of which the alpha is kept.  material, normal: of the pixels ``valid (V, S, S)``, as in
-    :mod:`reli3d.synthetic.samples`.  Objects cast no shadow on themselves here; the stored images have shadows.
+    images: ``(V, S, S, 4)``, of which only alpha is used.  material, normal: of the pixels ``valid (V, S, S)``, as in
+    :mod:`reli3d.synthetic.samples`.  Without shadows: the G-buffers have no geometry behind other surfaces.
     """
     views, size = images.shape[:2]
     environment = Environment(light.contiguous())
@@ -85,14 +85,14 @@ def relit(
     wo = -directions[valid]
     n = functional.normalize(normal[valid], dim=-1)
     behind = (n * wo).sum(-1, keepdim=True)
-    n = functional.normalize(n + (0.02 - behind).clamp(min=0.0) * wo, dim=-1)  # a mean of normals may face away
-    paint = material[valid]
-    points = SurfacePoints(torch.zeros_like(n), n, n, srgb_to_linear(paint[:, :3]), paint[:, 3], paint[:, 4])
+    n = functional.normalize(n + (0.02 - behind).clamp(min=0.0) * wo, dim=-1)  # an average of normals may face away
+    base, rough, metal = material[valid].split([3, 1, 1], -1)
+    points = SurfacePoints(torch.zeros_like(n), n, n, srgb_to_linear(base), rough[:, 0], metal[:, 0])
     options = ShadeOptions(samples=SAMPLES, seed=int(rng.integers(1 << 30)), diffuse_model=DIFFUSE_MODEL)
     radiance = shade(points, wo, environment, options=options)
     first_view = int(valid[0].sum()) or len(radiance)
     bright = float(radiance[:first_view].mean(-1).quantile(0.9))
-    exposure = EXPOSED / max(bright, 1e-3) * float(np.exp(rng.normal(0, EXPOSURE)))
+    exposure = EXPOSURE_TARGET / max(bright, 1e-3) * float(np.exp(rng.normal(0, EXPOSURE)))
     surface = torch.zeros(views, size, size, 4)
     surface[valid] = functional.pad(radiance, (0, 1), value=1.0)
     around = functional.avg_pool2d(surface.permute(0, 3, 1, 2), 3, 1, 1).permute(0, 2, 3, 1)  # for pixels of the edge

@@ -1,8 +1,8 @@
-"""Layers whose parameters, gradients and optimizer moments lie in parts on several processes: torch's ``fully_shard``.
+"""Fully sharded data parallelism of the trunk's layers, by torch's ``fully_shard``.
 
-The layers of the trunk hold nearly all numbers of ``official``.  Each is gathered when it computes and given up after
-it.  What is left is whole on every process, and its gradients are averaged by :mod:`reli3d.train.workers`.  Outside
-this module a sharded tensor is a tensor; checkpoints hold whole ones.
+Parameters, gradients and optimizer moments of these layers, nearly all of preset ``official``, are divided among the
+processes; a layer is gathered while it computes.  All other parameters are replicated, and
+:mod:`reli3d.train.workers` averages their gradients.  Checkpoints hold full tensors.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ EPSILON = 1e-6  # added to a norm that is divided by, as in torch's clip_grad_no
 
 
 def shard(layers: Iterable[nn.Module], device: torch.device) -> None:
-    """Cut the parameters of ``layers`` among all processes, in place.  All processes must hold the same values."""
+    """Divides the parameters of ``layers`` among all processes, in place.  They must be equal on all processes."""
     mesh = init_device_mesh(device.type, (distributed.get_world_size(),))
     for layer in layers:
         fully_shard(layer, mesh=mesh)
 
 
 def gathered(tree: Any, keep: bool) -> Any:
-    """``tree`` of dictionaries, lists and tensors, with whole tensors on the CPU in the place of sharded ones.
+    """``tree`` of dictionaries, lists and tensors with its sharded tensors replaced by full ones on the CPU.
 
-    All processes must call it.  Where ``keep`` is false nothing is kept but the structure.
+    All processes must call it.  keep: False replaces them by None, which frees the memory on all but one process.
     """
     if isinstance(tree, DTensor):
         whole = tree.full_tensor()
@@ -42,7 +42,7 @@ def gathered(tree: Any, keep: bool) -> Any:
 
 
 def scattered(whole: Tensor, like: Tensor) -> Tensor:
-    """``whole`` where ``like`` lies, in parts if ``like`` is; unchanged where it has another shape."""
+    """``whole`` on the device and with the sharding of ``like``; unchanged if the shapes differ."""
     if whole.shape != like.shape:
         return whole
     whole = whole.to(like.device)
@@ -52,14 +52,14 @@ def scattered(whole: Tensor, like: Tensor) -> Tensor:
 
 
 def plain(parameters: Iterable[Tensor]) -> list[Tensor]:
-    """Those that every process has whole."""
+    """The ``parameters`` that are not sharded."""
     return [p for p in parameters if not isinstance(p, DTensor)]
 
 
 def clip_gradients(parameters: Sequence[Tensor], limit: float) -> Tensor:
-    """Norm ``()`` of all gradients; where it is above ``limit`` they are scaled to that norm, in place.
+    """Global norm ``()`` of the gradients, which are scaled in place to a norm of at most ``limit``.
 
-    Whole gradients must be the same on all processes.
+    Gradients that are not sharded must be equal on all processes.
     """
     grads = [p.grad for p in parameters if p.grad is not None]
     cut = [g.to_local() for g in grads if isinstance(g, DTensor)]

@@ -1,7 +1,4 @@
-"""The stages of the small network: ``pixels``, the 2D U-Net alone, and ``small``, all of it.
-
-A further stage is a subclass: its ``weights`` name the terms, its ``losses`` computes them.
-"""
+"""The training stages of the small network: ``pixels`` trains the 2D U-Net alone, ``small`` the whole network."""
 
 from __future__ import annotations
 
@@ -22,14 +19,14 @@ from reli3d.pipeline import NoSurface, ReconstructOptions, reconstruct
 from reli3d.synthetic.maps import training_maps
 from reli3d.train.batches import draw_samples, stored_views
 from reli3d.train.losses import PIXEL_TERMS, WEIGHTS, losses, pixel_losses
-from reli3d.train.pixels import ViewCache, draw_group, predicts
+from reli3d.train.pixels import ViewCache, draw_group, is_pixel_parameter
 from reli3d.train.stage import Stage
 
-# Last layers begin near zero, and Adam moves a number by hardly more than the rate: they take a multiple of it
+# Last layers start near zero and Adam's step is about the learning rate, so they train at a multiple of it
 LAST_LAYERS = (*(f"pyramid.says.{k}.1." for k in range(SMALL.pyramid.reading)), "color.4.", "surface.4.", "light.out.")
 LAST_RATE = 10.0
-SHOWN = 3  # validation objects in the image, from one and from four views
-LIST_EVERY = 50  # steps after which the folders are listed again: samples may still arrive
+SHOWN = 3  # validation objects in the image, reconstructed from one and from four views
+LIST_EVERY = 50  # steps after which the folders are listed again: samples may be added during training
 
 
 class SmallStage(Stage):
@@ -53,10 +50,10 @@ class SmallStage(Stage):
         maps: Path | None = None,
         validation: Path | None = None,
     ):
-        """folders: of ``*.safetensors`` that ``reli3d-data`` made.  max_views: an object is read from 1 to this many.
-        points: of the volume, an object; half as many of the surface.  pyramid_rate: multiplier of the 2D U-Net's
-        rate; with few objects a step it forgets at the full rate.  bfloat16: of the convolutions.  maps: environment
-        maps, .npz, under which some samples are relit.  validation: folder of held-out samples.
+        """folders: of ``*.safetensors`` from ``reli3d-data``.  max_views: upper limit of the random number of input
+        views.  points: volume points per object; half as many surface points.  pyramid_rate: multiplier of the
+        learning rate of the 2D U-Net, which small batches degrade at the full rate.  bfloat16: compute dtype of the
+        convolutions.  maps: environment maps, .npz, for relighting samples.  validation: folder of held-out samples.
         """
         self.model, self.folders, self.seed = model, tuple(folders), seed
         self.max_views, self.points, self.pyramid_rate = max_views, points, pyramid_rate
@@ -75,7 +72,7 @@ class SmallStage(Stage):
         model.to_compute(torch.bfloat16 if bfloat16 else torch.float32)
 
     def files(self, step: int) -> list[Path]:
-        """The samples that the ``step`` draws from.  Raises ValueError where there is none."""
+        """Files that ``step`` draws from.  Raises InputError if there are none."""
         if step % LIST_EVERY == 0 or not self._files:
             self._files = sorted(path for folder in self.folders for path in folder.glob("*.safetensors"))
         if not self._files:
@@ -91,13 +88,13 @@ class SmallStage(Stage):
 
     def rate_factor(self, parameter: str) -> float:
         last = LAST_RATE if parameter.startswith(LAST_LAYERS) else 1.0
-        return last * (self.pyramid_rate if predicts(parameter) else 1.0)
+        return last * (self.pyramid_rate if is_pixel_parameter(parameter) else 1.0)
 
     def configuration(self) -> dict[str, Any]:
         return self._numbers
 
     def validation(self, average: dict[str, Tensor]) -> np.ndarray | None:
-        """Previews of held-out samples reconstructed from one and from four views; None where nothing has a surface."""
+        """Previews of held-out samples, reconstructed from one and four views; None if none has a surface."""
         if not self.held_out:
             return None
         model = LocalReconstructor(self.model.preset)
@@ -120,7 +117,7 @@ class SmallStage(Stage):
 
 
 class PixelStage(SmallStage):
-    """The 2D U-Net alone, on the maps of all views; images may be 2 or 4 times smaller (``model.pyramid.finest``)."""
+    """The 2D U-Net alone, on the ground-truth maps; images may be 2 or 4 times smaller (``model.pyramid.finest``)."""
 
     name = "pixels"
     weights = {term: WEIGHTS[term] for term in PIXEL_TERMS}
@@ -130,7 +127,7 @@ class PixelStage(SmallStage):
         self._cache = ViewCache(model.pyramid.finest)
 
     def batch(self, step: int, objects: range) -> Sequence[Any]:
-        """One item: convolutions of small images are faster for many views at once."""
+        """A single item with all objects: convolutions of small images are faster in large batches."""
         seeds = [(self.seed, step, k) for k in objects]
         return [draw_group(self.files(step), seeds, self._cache, max_views=self.max_views)]
 
@@ -138,7 +135,7 @@ class PixelStage(SmallStage):
         return pixel_losses(self.model, item)
 
     def rate_factor(self, parameter: str) -> float:
-        return super().rate_factor(parameter) if predicts(parameter) else 0.0
+        return super().rate_factor(parameter) if is_pixel_parameter(parameter) else 0.0
 
     def validation(self, average: dict[str, Tensor]) -> np.ndarray | None:
         return super().validation(average) if self.model.pyramid.finest == 0 else None

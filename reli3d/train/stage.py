@@ -1,8 +1,9 @@
-"""What a training is made of: the options of the loop and the interface of a stage."""
+"""Options of the training loop, and the interface of a training stage."""
 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -13,30 +14,30 @@ from torch import Tensor, nn
 
 @dataclass(frozen=True)
 class Options:
-    """Of the loop, whatever the stage."""
+    """Options of the training loop, for every stage."""
 
     output: str  # folder of state.pt, log.jsonl, curves.png and validation.png
     steps: int = 20_000
-    minutes: float = math.inf  # of training; the schedule follows whichever of steps and minutes runs out first
-    batch: int = 4  # objects a step, over all processes
+    minutes: float = math.inf  # of training; the schedule ends at ``steps`` or ``minutes``, whichever is first
+    batch: int = 4  # objects per step, over all processes
     rate: float = 1.5e-3  # peak learning rate
     final_rate: float = 0.02  # at the end of the schedule, as a fraction of the peak
     warmup: int = 100  # steps
     weight_decay: float = 0.02
-    clip: float = 5.0  # largest norm of the gradient
+    clip: float = 5.0  # maximum norm of the gradient
     average: float = 0.999  # decay of the averaged weights
     seed: int = 0
     save_every: int = 200  # steps
     log_every: int = 10  # steps
-    bad_steps: int = 20  # steps in a row without finite gradients after which a run ends with an error
-    shard: bool = False  # divide parameters, gradients and moments of ``Stage.layers`` among the processes
+    bad_steps: int = 20  # consecutive steps with non-finite gradients that end the run with an error
+    shard: bool = False  # divide parameters, gradients and optimizer moments of ``Stage.layers`` among the processes
     tensorboard: str = ""  # folder of event files; "": none
 
 
-class Stage:
-    """What :func:`reli3d.train.loop.train` trains.
+class Stage(ABC):
+    """A model with its batches and losses, trained by :func:`reli3d.train.loop.train`.
 
-    A new stage sets the four attributes and overrides ``batch`` and ``losses``.
+    A subclass sets the four attributes and implements ``batch`` and ``losses``.
     """
 
     name: str
@@ -44,29 +45,30 @@ class Stage:
     weights: Mapping[str, float]  # of the terms of ``losses``
     settings: Mapping[str, Any]  # defaults of :class:`Options` for this stage
 
+    @abstractmethod
     def batch(self, step: int, objects: range) -> Sequence[Any]:
-        """Items for the ``objects`` of a step, by their places in the batch: a function of the seed, the step and the
-        places alone, so that several processes train as one does.
-        """
-        raise NotImplementedError
+        """Items at the positions ``objects`` of the batch of ``step``.
 
+        A function of the seed, the step and the positions alone, so that the number of processes does not matter.
+        """
+
+    @abstractmethod
     def losses(self, item: Any) -> dict[str, Tensor]:
-        """Unweighted scalar terms of an item, by the names of ``weights``; a term without ground truth is left out."""
-        raise NotImplementedError
+        """Unweighted scalar terms of an item, by the names of ``weights``; terms without ground truth are left out."""
 
     def rate_factor(self, parameter: str) -> float:
         """Multiplier of the learning rate for the parameter of this name; 0: not trained."""
         return 1.0
 
     def measures(self) -> dict[str, float]:
-        """Numbers that are logged and stored with every checkpoint; raises where training cannot go on from here.
+        """Metrics that are logged and stored with every checkpoint; raises InputError if training cannot continue.
 
         Called before the first step and at every checkpoint, by all processes.
         """
         return {}
 
     def validation(self, average: dict[str, Tensor]) -> np.ndarray | None:
-        """Image ``(H, W, 3)`` uint8 of what the averaged weights reconstruct; None: there is none."""
+        """Image ``(H, W, 3)`` uint8 of reconstructions by the averaged weights, or None."""
         return None
 
     def layers(self) -> list[nn.Module]:
@@ -74,9 +76,9 @@ class Stage:
         return []
 
     def configuration(self) -> dict[str, Any]:
-        """What is stored with a run besides :class:`Options`."""
+        """Values that are logged with a run in addition to :class:`Options`."""
         return {}
 
     def options(self, output: str, **given: Any) -> Options:
-        """The stage's settings with those ``given`` in their place."""
+        """Options with the defaults of the stage, overridden by ``given``."""
         return Options(output, **{**self.settings, **given})

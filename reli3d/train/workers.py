@@ -1,7 +1,7 @@
-"""Several processes that train one network together: each sees its share of a batch, gradients are averaged.
+"""Data parallelism: each process computes a part of the batch, gradients are averaged.
 
-Start them with ``torchrun --nproc-per-node N``.  On a CPU one process a core, each with one thread, does twice the
-steps of one process with all threads: the operations of a small network are too short to be split.
+Start with ``torchrun --nproc-per-node N``.  On a CPU one single-threaded process per core does about 2 times the steps
+of one process with all threads: the operations of a small network are too short for intra-operation parallelism.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ class Workers:
 
     @staticmethod
     def join() -> Workers:
-        """The group that torchrun started this process in; alone where it did not."""
+        """Joins the process group of torchrun; a group of one process without torchrun."""
         if "RANK" not in os.environ:
             return Workers()
         distributed.init_process_group("nccl" if torch.cuda.is_available() else "gloo")
         return Workers(distributed.get_rank(), distributed.get_world_size())
 
     def average(self, parameters: Sequence[Tensor], values: Tensor) -> Tensor:
-        """Mean of ``values (k,)`` over the processes; the gradients of ``parameters`` become their means in place.
+        """Mean of ``values (k,)`` over the processes; also averages the gradients of ``parameters`` in place.
 
-        A parameter without a gradient counts as zero, so that all processes send the same bytes.
+        A missing gradient counts as zero, so that all processes reduce buffers of the same size.
         """
         if self.count == 1:
             return values
@@ -43,11 +43,10 @@ class Workers:
         return flat[-len(values) :].clone()
 
     def leave(self) -> None:
-        """End the group, and this process with exit code 0 where there are several.
+        """Destroys the group; with several processes also exits this one, with code 0.
 
-        Gloo's threads give up the tensors of an operation some time after it has ended, and need the interpreter for
-        it.  One that comes while the interpreter ends aborts the process, so the process ends without that: what the
-        program has printed must be flushed before.
+        Threads of Gloo release tensors some time after an operation, which needs the interpreter and aborts the process
+        if that is shutting down.  Therefore the process exits without interpreter shutdown; flush output before.
         """
         if self.count == 1:
             return

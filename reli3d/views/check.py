@@ -228,7 +228,7 @@ PANEL, THUMB, MARGIN = 560, 184, 12
 _COLORS = ("#d62728", "#1f77b4", "#2ca02c", "#ff7f0e", "#9467bd", "#17becf", "#e377c2", "#8c564b")
 
 
-def rig_picture(views: Views, path: str | os.PathLike) -> None:
+def draw_rig(views: Views, path: str | os.PathLike) -> None:
     """Write a PNG of the rig: frustums, visual hull and the network's cube from two sides, and thumbnails.
 
     On the thumbnails the mask's outline is green and the hull's cells are red dots.  Raises OSError where ``path``

@@ -75,7 +75,7 @@ CASES = [
             (["--seed", "-1"], "--seed"),
             (["--seed", "99999999999999999999"], "--seed"),
             (["--output", "file"], "a file"),
-            (["--output", "turn.mov"], "ends in .png, .exr, .webp, .gif or .mp4"),
+            (["--output", "turn.mov"], "expected a folder or a file of type .png"),
             (["--output", "turn.png", "--frames", "4"], "--frames: expected 1 where --output names one png, got 4"),
             ([], "not found"),
         ]
@@ -91,7 +91,7 @@ CASES = [
             (["shape.npz"], "env"),
             (["long.npz"], "names"),
             (["/dev/zero"], "regular"),
-            (["few.npz", "--held-back", "test"], "--maps"),
+            (["few.npz", "--held-out", "test"], "--maps"),
             (["maps.npz", "--workers", "0"], "--workers"),
             (["maps.npz", "--first", "-5"], "--first"),
             (["maps.npz", "--count", "0"], "--count"),

@@ -166,7 +166,7 @@ def test_json_is_one_object_on_stdout(tmp_path, capsys):
     assert seen["exit_code"] == 1 and [o["object"] for o in seen["objects"]] == ["example", "empty"]
     example, empty = seen["objects"]
     assert example["result"] == "done" and not example["suspect"] and example["verdict"].startswith("cameras agree")
-    assert len(example["lines"]) == 12 and Path(example["picture"]).is_file()
+    assert len(example["lines"]) == 12 and Path(example["image"]).is_file()
     assert empty["result"] == "refused" and "expected transforms.json" in empty["notes"][0]
     assert command(tmp_path, *folders, "--json") == 1
     made = json.loads(capsys.readouterr().out)["objects"]

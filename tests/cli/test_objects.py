@@ -74,7 +74,7 @@ def test_a_worker_that_crashes_loses_nothing_and_its_object_is_made_once_more(tm
     retried = {row.object for row in found if row.retried}
     assert retried >= {item.name for item, word in zip(items, WORDS, strict=True) if "die" in word}
     said = capsys.readouterr().err.splitlines()
-    assert sorted(said) == sorted(f"{name}: its worker crashed; it is made once more" for name in retried)
+    assert sorted(said) == sorted(f"{name}: its worker crashed; retrying" for name in retried)
     result = {row.object: row.result for row in found}
     finished = sorted((tmp_path / "log").read_text().split())
     for item, word in zip(items, WORDS, strict=True):

@@ -14,7 +14,7 @@ from reli3d.geometry.symmetry import MirrorPlane
 from reli3d.nn.light_map import LightMap, gathered, trained_texels
 from reli3d.nn.local import LocalReconstructor, PixelMaps, mean_logit
 from reli3d.nn.presets import SMALL, LightMapSizes, PyramidSizes, VolumeSizes
-from reli3d.nn.pyramid import place_of_pixels, span_of_pixels
+from reli3d.nn.pyramid import pixel_hull_depths, pixel_positions
 from reli3d.nn.view_features import ViewMaps, ahead_of_surface
 from reli3d.nn.view_lookup import spread_views
 from reli3d.nn.volume import FeatureVolume
@@ -216,7 +216,7 @@ def test_pixels_know_their_place():
     eye, target = torch.tensor([[0.7, 1.1, 2.0]]), torch.tensor([[0.1, -0.2, 0.3]])
     c2w = look_at(eye, target, torch.tensor([0.0, 1.0, 0.0]))
     intrinsics = torch.tensor([[SIZE * 1.7, SIZE * 1.9, SIZE / 2 + 3, SIZE / 2 - 5]])
-    place = place_of_pixels(Camera(c2w, intrinsics, SIZE, SIZE))
+    place = pixel_positions(Camera(c2w, intrinsics, SIZE, SIZE))
     want = place[0, 10, 40]
     point = want[0] * c2w[0, :3, 0] + want[1] * c2w[0, :3, 1]
     xy, _ = project(point[None], c2w[0], intrinsics[0])
@@ -228,7 +228,7 @@ def test_pixels_know_where_their_rays_meet_the_hull():
     _, masks, c2w, intrinsics = sphere(16)
     camera = Camera(c2w, intrinsics, *masks.shape[:0:-1])
     seen = avg_pool2d(masks[:, None], 4)[:, 0]
-    span = span_of_pixels(mask_distance(masks), camera, seen, camera.resized(*seen.shape[:0:-1]))
+    span = pixel_hull_depths(mask_distance(masks), camera, seen, camera.resized(*seen.shape[:0:-1]))
     middle = slice(seen.shape[1] // 2 - 1, seen.shape[1] // 2 + 1)
     enter, leave = span[:, middle, middle].mean((1, 2)).unbind(-1)
     assert float(enter.max()) < -0.38 and float(enter.median()) > -0.5  # before the ball, not far

@@ -9,7 +9,7 @@ import trimesh
 from reli3d.geometry.camera import Camera, camera_rays, look_at
 from reli3d.geometry.rays import RayScene
 from reli3d.geometry.visibility import MIN_COSINE
-from reli3d.nn.local import PixelMaps, shown_pixels
+from reli3d.nn.local import PixelMaps, pixel_colors
 from reli3d.nn.view_features import ViewMaps
 from reli3d.nn.weights import load_model
 from reli3d.pipeline import ReconstructOptions, Stopwatch, encode, reconstruct
@@ -82,7 +82,7 @@ def test_mirror_images_tell_shape_and_paint_but_not_the_light(views):
     with torch.no_grad():
         one, two = encode(model, plain), encode(model, both)
         taken = PixelMaps(*(getattr(two.pixels, f.name)[:4] for f in fields(PixelMaps)))
-        _, mask = shown_pixels(both.batch.images, both.batch.masks, both.batch.camera.resized(128, 128))
+        _, mask = pixel_colors(both.batch.images, both.batch.masks, both.batch.camera.resized(128, 128))
         light = model._light(taken, two.color[:4], mask[:4, ..., 0], both.batch.camera[:4].resized(128, 128))
     torch.testing.assert_close(two.log_light, light)
     assert two.maps.input_count == len(two.maps.inputs.images) == 4

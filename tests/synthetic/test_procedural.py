@@ -98,7 +98,7 @@ def test_every_family_makes_solids(family):
     for seed in range(4):
         assembly = Assembly(np.random.default_rng((77, seed)))
         family(assembly)
-        if assembly.solid_share() > 0:
+        if assembly.solid_fraction() > 0:
             mesh = assemble(assembly, family.__name__)
             assert trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).is_watertight
             made += 1

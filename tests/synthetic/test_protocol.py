@@ -131,7 +131,7 @@ def test_the_command_writes_a_file_for_each_light(rendered):
         files = sorted((rendered / name).iterdir())
         assert [f.name for f in files] == [f"0000000000_{k}.safetensors" for k in range(3)]
         assert [len(load_file(f)["images"]) for f in files] == views
-    assert set(load_file(rendered / "rgb" / "0000000000_0.safetensors")) == set(protocol.OF_RGB)
+    assert set(load_file(rendered / "rgb" / "0000000000_0.safetensors")) == set(protocol.RGB_TENSORS)
 
 
 def test_what_is_not_known_is_none_and_takes_part_in_no_loss(rendered):
@@ -151,7 +151,7 @@ def test_what_is_not_known_is_none_and_takes_part_in_no_loss(rendered):
         (["--protocol", "paper", "--views", "8"], "--views: expected none"),
         (["--meshes", "empty"], "expected GLB files"),
         (["--workers", "2", "--ray", "auto"], "not allowed with"),
-        (["--protocol", "paper", "--held-back", "test"], "expected at least 3 for --protocol paper"),
+        (["--protocol", "paper", "--held-out", "test"], "expected at least 3 for --protocol paper"),
     ],
 )
 def test_wrong_options_end_with_2_and_one_line(rendered, options, word, capsys, tmp_path, monkeypatch):

@@ -16,7 +16,7 @@ from reli3d.nn.presets import SMALL
 from reli3d.nn.value_bins import with_bins
 from reli3d.train.batches import load_sample
 from reli3d.train.losses import losses, pixel_losses
-from reli3d.train.pixels import Group, read_pictures
+from reli3d.train.pixels import Group, read_views_reduced
 from reli3d.train.stages.views import Samples
 
 FINISH = {"roughness", "metallic"}
@@ -45,16 +45,16 @@ def path_of(scans, name):
 def test_a_sample_stores_whether_its_finish_is_the_truth(scans, folder):
     for name, known in (("plain", 0), ("dressed", 1)):
         assert load_file(path_of(scans, name))["finish_known"].tolist() == [known, known]
-        assert read_pictures(path_of(scans, name), 1).finish_known.tolist() == [bool(known)] * 2
+        assert read_views_reduced(path_of(scans, name), 1).finish_known.tolist() == [bool(known)] * 2
     procedural = next(folder.glob("*.safetensors"))
-    assert bool(read_pictures(procedural, 1).finish_known.all())
+    assert bool(read_views_reduced(procedural, 1).finish_known.all())
 
 
 def test_a_sample_of_version_0_3_does_not_store_it_and_is_known(scans, tmp_path):
     tensors = load_file(path_of(scans, "plain"))
     del tensors["finish_known"]
     save_file(tensors, tmp_path / "old.safetensors")
-    assert read_pictures(tmp_path / "old.safetensors", 1).finish_known.tolist() == [True, True]
+    assert read_views_reduced(tmp_path / "old.safetensors", 1).finish_known.tolist() == [True, True]
 
 
 @pytest.mark.parametrize("bins", [1, 8])
@@ -64,7 +64,7 @@ def test_an_unknown_finish_takes_part_in_no_loss(scans, bins):
     for head in model.pyramid.says.values():
         torch.nn.init.normal_(head[1].weight, std=0.3)
     model = with_bins(model, bins)
-    plain, dressed = (read_pictures(path_of(scans, name), 1) for name in ("plain", "dressed"))
+    plain, dressed = (read_views_reduced(path_of(scans, name), 1) for name in ("plain", "dressed"))
     alone = pixel_losses(model, Group.of([plain]))
     assert set(alone) == {"pixel_color", "pixel_pattern", "pixel_normal", "pixel_depth"}
     both, known = (pixel_losses(model, Group.of(parts)) for parts in ([plain, dressed], [dressed]))

@@ -14,7 +14,7 @@ from reli3d.geometry.hull import hull_distance
 from reli3d.nn.local import LocalReconstructor
 from reli3d.nn.presets import SMALL
 from reli3d.nn.pyramid import ImagePyramid
-from reli3d.train.batches import Pictures, load_sample
+from reli3d.train.batches import TrainingViews, load_sample
 from reli3d.train.loop import train
 from reli3d.train.losses import PIXEL_TERMS, losses, pixel_losses
 from reli3d.train.pixels import (
@@ -22,11 +22,11 @@ from reli3d.train.pixels import (
     ViewCache,
     augmented,
     draw_group,
-    for_small_pictures,
-    predicted,
-    predicts,
-    read_pictures,
-    take_levels,
+    is_pixel_parameter,
+    load_levels,
+    predict_pixels,
+    read_views_reduced,
+    reduced_model,
 )
 from reli3d.train.small import PixelStage
 
@@ -42,12 +42,12 @@ def learned(finest: int = 0) -> LocalReconstructor:
     model = LocalReconstructor(SMALL)
     for head in model.pyramid.says.values():
         torch.nn.init.normal_(head[1].weight, std=0.3)
-    return for_small_pictures(model, finest) if finest else model
+    return reduced_model(model, finest) if finest else model
 
 
 def test_pictures_of_the_full_size_are_those_of_a_sample(files):
-    got, want = read_pictures(files[0], 1), load_sample(files[0], 6, 64, np.random.default_rng(0), augment=False)
-    for field in dataclasses.fields(Pictures):
+    got, want = read_views_reduced(files[0], 1), load_sample(files[0], 6, 64, np.random.default_rng(0), augment=False)
+    for field in dataclasses.fields(TrainingViews):
         a, b = getattr(got, field.name), getattr(want, field.name)
         torch.testing.assert_close(a, b, rtol=0, atol=1e-5, msg=field.name)
 
@@ -55,7 +55,7 @@ def test_pictures_of_the_full_size_are_those_of_a_sample(files):
 @pytest.mark.parametrize("factor", [2, 4])
 def test_small_pictures_show_the_same_object(files, factor):
     """Points of the true surface lie in all silhouettes, and the pixels' truth is the mean of the finer ones."""
-    small, fine = read_pictures(files[0], factor), read_pictures(files[0], 1)
+    small, fine = read_views_reduced(files[0], factor), read_views_reduced(files[0], 1)
     size = fine.masks.shape[1] // factor
     assert small.images.shape[1:] == (size, size, 3) and small.view_normal.shape[1:] == (size // 2, size // 2, 3)
     sample = load_sample(files[0], 1, 2048, np.random.default_rng(0), augment=False)
@@ -69,7 +69,7 @@ def test_small_pictures_show_the_same_object(files, factor):
 
 
 def test_mirrored_pictures_are_those_of_the_mirrored_object(files):
-    views = read_pictures(files[0], 2)
+    views = read_views_reduced(files[0], 2)
     sample = load_sample(files[0], 1, 2048, np.random.default_rng(0), augment=False)
     for seed in range(20):
         got = augmented(views, np.random.default_rng(seed))
@@ -89,12 +89,12 @@ def test_mirrored_pictures_are_those_of_the_mirrored_object(files):
 @pytest.mark.parametrize("finest", [0, 1, 2])
 def test_objects_side_by_side_are_read_as_each_alone(files, finest):
     model = learned(finest)
-    objects = [read_pictures(f, 1 << finest).of_views(slice(0, n)) for f, n in zip(files, (3, 2), strict=True)]
+    objects = [read_views_reduced(f, 1 << finest).of_views(slice(0, n)) for f, n in zip(files, (3, 2), strict=True)]
     with torch.no_grad():
-        both, _ = predicted(model, Group.of(objects))
+        both, _ = predict_pixels(model, Group.of(objects))
         first = 0
         for one in objects:
-            alone, _ = predicted(model, Group.of([one]))
+            alone, _ = predict_pixels(model, Group.of([one]))
             for field in dataclasses.fields(alone):
                 part = getattr(both, field.name)[first : first + len(one.masks)]
                 # float32 convolutions of another batch
@@ -123,7 +123,7 @@ def test_the_pixels_alone_are_asked_as_with_all_else(files):
     model = learned()
     sample = load_sample(files[0], 3, 512, np.random.default_rng(0), augment=False)
     whole = losses(model, sample)
-    alone = pixel_losses(model, Group.of([read_pictures(files[0], 1).of_views(slice(0, 3))]))
+    alone = pixel_losses(model, Group.of([read_views_reduced(files[0], 1).of_views(slice(0, 3))]))
     assert set(alone) == set(PIXEL_TERMS) < set(whole)
     for name, value in alone.items():
         torch.testing.assert_close(value, whole[name], rtol=1e-4, atol=1e-6, msg=name)
@@ -132,7 +132,7 @@ def test_the_pixels_alone_are_asked_as_with_all_else(files):
 def test_an_object_without_a_whole_pixel_says_nothing(files):
     """A thin object in a small picture: the others are asked as they are without it."""
     model = learned(2)
-    objects = [read_pictures(f, 4).of_views(slice(0, 2)) for f in files]
+    objects = [read_views_reduced(f, 4).of_views(slice(0, 2)) for f in files]
     empty = dataclasses.replace(objects[1], view_valid=torch.zeros_like(objects[1].view_valid))
     both, alone = (pixel_losses(model, Group.of(parts)) for parts in ([objects[0], empty], objects[:1]))
     for name, value in alone.items():
@@ -149,7 +149,7 @@ def test_a_checkpoint_of_small_pictures_is_no_whole_network(folder, tmp_path, ca
     state = torch.load(tmp_path / "64" / "state.pt", weights_only=True)
     del state["average"]["pyramid.shared.weight"]
     with pytest.raises(ValueError, match="pyramid.shared.weight"):
-        take_levels(LocalReconstructor(SMALL), state["average"])
+        load_levels(LocalReconstructor(SMALL), state["average"])
 
 
 def test_every_view_of_a_drawn_object_is_read_once(folder):
@@ -185,7 +185,7 @@ def test_training_of_pixels_teaches_the_2d_u_net_alone(folder, tmp_path):
         stage = PixelStage(model, [folder])
         train(stage, stage.options(str(tmp_path / str(side)), steps=3, batch=1, warmup=1))
         changed = {k for k, v in model.state_dict().items() if not torch.equal(v, before[k])}
-        assert changed == {k for k in before if predicts(k)} and len(changed) > 20
+        assert changed == {k for k in before if is_pixel_parameter(k)} and len(changed) > 20
 
 
 def test_samples_of_views_alone_teach_the_2d_u_net_and_nothing_else(tmp_path, capsys):
@@ -195,7 +195,7 @@ def test_samples_of_views_alone_teach_the_2d_u_net_and_nothing_else(tmp_path, ca
     assert data(["render", str(tmp_path / "views"), "--views-only", *wanted]) == 0
     assert data(["render", str(tmp_path / "whole"), *wanted]) == 0
     for path in (tmp_path / "views").glob("*"):
-        views, whole = read_pictures(path, 1), read_pictures(tmp_path / "whole" / path.name, 1)
+        views, whole = read_views_reduced(path, 1), read_views_reduced(tmp_path / "whole" / path.name, 1)
         assert torch.equal(views.c2w, whole.c2w)
         both = views.view_valid & whole.view_valid
         assert float(both.sum() / whole.view_valid.sum()) > 0.9

@@ -13,7 +13,7 @@ from reli3d.render.points import SurfacePoints
 from reli3d.synthetic.maps import training_maps
 from reli3d.synthetic.samples import synthesize
 from reli3d.train import batches
-from reli3d.train.relight import Finish, draw_light, relit
+from reli3d.train.relight import Finish, draw_light, relight_views
 
 
 class Ball:
@@ -66,7 +66,7 @@ def maps_of(sample):
 def test_the_same_light_gives_the_same_photographs(sample, sky):
     """Nothing on a ball hides the light, so the path traced images, with shadow rays, are the truth."""
     images, *maps = maps_of(sample)
-    got, light = relit(images, *maps, sky, np.random.default_rng(3))
+    got, light = relight_views(images, *maps, sky, np.random.default_rng(3))
     ratio = float(sample["environment"].float().mean() / light.mean())  # the exposures differ
     linear = lambda x: torch.where(x < 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)  # noqa: E731  IEC 61966-2-1
     want, got_linear = linear(images[..., :3]), linear(got[..., :3]) * ratio
@@ -88,7 +88,7 @@ def test_the_same_light_gives_the_same_photographs(sample, sky):
 def test_another_light_gives_other_photographs(sample, sky):
     images, *maps = maps_of(sample)
     turned = sky.flip(0).contiguous()
-    got, _ = relit(images, *maps, turned, np.random.default_rng(3))
+    got, _ = relight_views(images, *maps, turned, np.random.default_rng(3))
     assert float((got[..., :3] - images[..., :3])[maps[2]].abs().mean()) > 0.05
 
 
@@ -107,7 +107,7 @@ def test_a_finish_is_the_same_for_pixels_and_points():
 def test_samples_are_relit_where_lights_are_given(sample, sky, tmp_path, monkeypatch):
     save_file(sample, tmp_path / "0.safetensors")
     draw = lambda share, lights: (  # noqa: E731
-        monkeypatch.setattr(batches, "RELIT", share),
+        monkeypatch.setattr(batches, "RELIGHT_PROBABILITY", share),
         batches.load_sample(tmp_path / "0.safetensors", 2, 64, np.random.default_rng(5), lights=lights),
     )[1]
     lights = sky[None]

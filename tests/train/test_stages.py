@@ -14,9 +14,9 @@ from reli3d.render.gaussians import shade_gaussians
 from reli3d.render.points import SurfacePoints
 from reli3d.train.stages.config import PAPER, StageConfig, Weights
 from reli3d.train.stages.config import TINY as TINY_STAGES
-from reli3d.train.stages.losses import gradients, light_terms, lpips_distance, shown_colors
-from reli3d.train.stages.picture import Picture, display, lobes
-from reli3d.train.stages.step import encode, object_losses, pictures, shader_of, total
+from reli3d.train.stages.losses import compared_colors, gradients, light_terms, lpips_distance
+from reli3d.train.stages.rendering import Rendering, display, lobes
+from reli3d.train.stages.step import encode, object_losses, renderings, shader_of, total
 from reli3d.train.stages.surface import render_surface, surface
 from reli3d.train.stages.views import ObjectViews, Samples, draw
 from reli3d.train.stages.volume import occupied, render_volume
@@ -131,19 +131,19 @@ def test_a_ball_is_shown_as_a_ball(stage, one):
         far = (miss[..., None] + t * t).sqrt()
         depth = 10.0 * (model.steep * (RADIUS - far)).exp().sum(-1) * (t[1] - t[0])
         # a step of 0.036 and a slope of 30: single rays err by the share of a step, their mean does not
-        assert float((picture.cover - (1.0 - (-depth).exp())).abs().mean()) < 0.02
-        assert float((picture.cover - (1.0 - (-depth).exp())).mean()) == pytest.approx(0.0, abs=0.005)
+        assert float((picture.coverage - (1.0 - (-depth).exp())).abs().mean()) < 0.02
+        assert float((picture.coverage - (1.0 - (-depth).exp())).mean()) == pytest.approx(0.0, abs=0.005)
     else:
         found = surface(model, code, 24)
         light = lobes(model, code, 16)
         picture = render_surface(model, code, found, view, lambda p, wo, scene: shade_gaussians(p, wo, light))
-        area = float(picture.cover.sum() / (miss < RADIUS**2).sum())
+        area = float(picture.coverage.sum() / (miss < RADIUS**2).sum())
         assert area == pytest.approx(1.0, abs=0.05)  # the level is curved, so a crossing on a cube of 0.07 lies inside
     nearest = (along + (RADIUS**2 - miss).clamp(min=0).sqrt())[..., None]
     true = torch.nn.functional.normalize(origins - nearest * directions, dim=-1)
     cosine = (picture.normal * true).sum(-1)[core]
     assert float(cosine.mean()) > (0.97 if stage is VOLUME else 0.995)
-    assert float(picture.cover[core].min()) > 0.95
+    assert float(picture.coverage[core].min()) > 0.95
     base = picture.material[core][:, :3]
     assert 0.2 < float(base.mean()) < 0.8  # the head starts near one half
 
@@ -202,7 +202,7 @@ def test_pixels_outside_the_photograph_say_nothing(one):
 def test_what_is_cut_off_at_white_may_be_brighter(one):
     views = replace(one.targets, images=torch.ones_like(one.targets.images), masks=torch.ones_like(one.targets.masks))
     color = torch.full((24, 24, 3), 1.7)
-    got, want = shown_colors(Picture(color, color[..., 0], color[..., 0], color, color, color[0]), views, 0)
+    got, want = compared_colors(Rendering(color, color[..., 0], color[..., 0], color, color, color[0]), views, 0)
     assert torch.equal(got, want)
 
 
@@ -271,7 +271,7 @@ def test_a_field_of_one_sign_is_pulled_across_zero(one):
     with torch.no_grad():
         model.heads["density"][-1].bias -= 4.0
     code = encode(model, one)
-    shown, terms = pictures(model, code, one, GAUSSIANS)
+    shown, terms = renderings(model, code, one, GAUSSIANS)
     assert shown == [] and float(terms["sign"]) > 0.5
     (slope,) = torch.autograd.grad(terms["sign"], model.heads["density"][-1].bias, retain_graph=True)
     assert bool(torch.isfinite(slope).all())

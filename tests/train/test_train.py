@@ -21,14 +21,14 @@ from reli3d.train.batches import draw_samples, random_turn
 from reli3d.train.light_prior import fit, scale_free
 from reli3d.train.loop import parameter_groups, progress, rate_at, train
 from reli3d.train.losses import (
-    ASTRAY,
-    PLAIN,
+    MAX_PERTURBATION,
+    PATTERN_FLOOR,
     WEIGHTS,
-    astray,
     encode_sample,
     excess_entropy,
     losses,
     pattern_loss,
+    perturbed,
 )
 from reli3d.train.small import LAST_RATE, PixelStage, SmallStage
 from reli3d.train.stage import Options
@@ -102,7 +102,9 @@ def test_the_pattern_loss_forgives_exposure_and_nothing_else():
     darker = linear_to_srgb(srgb_to_linear(target) * torch.tensor([0.3, 0.7, 0.5]))
     assert float(pattern_loss(darker, target)) < 1e-9
     unrelated = (target.flip(0) - target).square().mean()  # about twice the variance, 0.06; the best factors are near 1
-    torch.testing.assert_close(pattern_loss(target.flip(0), target).expm1() * PLAIN, unrelated, rtol=0.5, atol=0)
+    torch.testing.assert_close(
+        pattern_loss(target.flip(0), target).expm1() * PATTERN_FLOOR, unrelated, rtol=0.5, atol=0
+    )
 
 
 def test_half_an_error_counts_as_much_on_a_plain_object_as_on_a_patterned_one():
@@ -234,8 +236,8 @@ def test_convolutions_in_bfloat16_change_the_losses_by_their_rounding(samples):
         found.append((terms, torch.cat([p.grad.flatten() for p in model.parameters()])))
     assert all(p.dtype == torch.float32 for p in model.parameters())
     for name, value in found[0][0].items():
-        # light_level is the mean of differences of logarithms, which may lie near zero
-        near = 0.01 if name == "light_level" else 0.0
+        # light_scale is the mean of differences of logarithms, which may lie near zero
+        near = 0.01 if name == "light_scale" else 0.0
         assert float(found[1][0][name]) == pytest.approx(float(value), rel=0.01, abs=near), name
         assert not torch.equal(found[1][0][name], value), name
     assert float(torch.nn.functional.cosine_similarity(found[0][1], found[1][1], 0)) > 0.999
@@ -295,12 +297,12 @@ def test_points_go_astray_along_their_normals_as_far_as_stated():
     position = torch.rand(256, 3) - 0.5
     moved, angle = [], []
     for _ in range(400):
-        p, n = astray(position, normal)
+        p, n = perturbed(position, normal)
         away = p - position
         assert float((away - (away * normal).sum(-1, keepdim=True) * normal).abs().max()) < 1e-6  # float32 of unit size
         assert float((n.norm(dim=-1) - 1).abs().max()) < 1e-6
         moved.append(away.square().sum(-1).mean())
         angle.append((n - normal).square().sum(-1).mean())
     # the mean of 400 squares of uniform numbers is known to 4.5 % (standard error 0.30 / sqrt(400) of 1/3): four of it
-    assert abs(float(torch.stack(moved).mean()) / (ASTRAY[0] ** 2 / 3) - 1) < 0.18
-    assert abs(float(torch.stack(angle).mean()) / (ASTRAY[1] ** 2 / 3) - 1) < 0.18  # chords of small angles
+    assert abs(float(torch.stack(moved).mean()) / (MAX_PERTURBATION[0] ** 2 / 3) - 1) < 0.18
+    assert abs(float(torch.stack(angle).mean()) / (MAX_PERTURBATION[1] ** 2 / 3) - 1) < 0.18  # chords of small angles

@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 
 import reli3d
-from reli3d.views.check import explain_cameras, rig_picture, up_axis, verdict
+from reli3d.views.check import draw_rig, explain_cameras, up_axis, verdict
 from reli3d.views.folder import load_views
 from tests.support.rigs import rig as cameras
 from tests.support.rigs import sphere_views
@@ -92,7 +92,7 @@ def test_lines_are_single_and_printable():
 @pytest.mark.parametrize("change", [lambda c: c, lambda c: c @ FLIP, lambda c: torch.linalg.inv(c)])
 def test_the_picture_is_drawn_for_right_and_wrong_cameras(tmp_path, change):
     views = sphere_views(count=9)
-    rig_picture(replace(views, c2w=change(views.c2w)), tmp_path / "rig.png")
+    draw_rig(replace(views, c2w=change(views.c2w)), tmp_path / "rig.png")
     bitmap = Image.open(tmp_path / "rig.png")
     assert bitmap.width > 1000
     colors = {c for _, c in bitmap.getcolors(1 << 20)}
@@ -101,8 +101,8 @@ def test_the_picture_is_drawn_for_right_and_wrong_cameras(tmp_path, change):
 
 
 def test_the_picture_takes_one_view_of_any_shape(tmp_path):
-    rig_picture(sphere_views(count=1, size=(300, 40), fov=1.5), tmp_path / "wide.png")
-    rig_picture(sphere_views(count=1, size=(24, 200), fov=0.2), tmp_path / "high.png")
+    draw_rig(sphere_views(count=1, size=(300, 40), fov=1.5), tmp_path / "wide.png")
+    draw_rig(sphere_views(count=1, size=(24, 200), fov=0.2), tmp_path / "high.png")
 
 
 @pytest.mark.parametrize("name", ["Camera_01", "Lantern_01", "UCO3D_217-72983-41010", "UCO3D_639-13622-90739"])

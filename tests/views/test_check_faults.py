@@ -7,7 +7,7 @@ import pytest
 import torch
 from PIL import Image
 
-from reli3d.views.check import explain_cameras, rig_picture
+from reli3d.views.check import draw_rig, explain_cameras
 from reli3d.views.folder import load_views
 from tests.support import evil
 from tests.support.rigs import sphere_views
@@ -32,7 +32,7 @@ def test_eyes_in_one_point_are_told(tmp_path, place, spread, parallel):
     assert len(lines) == 5 and not any("nan" in line for line in lines)
     if not parallel and max(map(abs, place)) > 0.1:  # the same way from one point: the views are one, and agree
         assert lines[-1].startswith("suspect: all cameras stand in one point")
-    rig_picture(views, tmp_path / "rig.png")
+    draw_rig(views, tmp_path / "rig.png")
     assert Image.open(tmp_path / "rig.png").size[0] > 1000
 
 
@@ -41,7 +41,7 @@ def test_eyes_in_one_point_are_told(tmp_path, place, spread, parallel):
 def test_one_or_two_eyes(tmp_path, place, count):
     views = at(place, count=count)
     assert len(explain_cameras(views)) == count + 1
-    rig_picture(views, tmp_path / "rig.png")
+    draw_rig(views, tmp_path / "rig.png")
 
 
 @pytest.mark.parametrize("scale", [1e-30, 1e-18, 1e-6, 1e5])
@@ -50,7 +50,7 @@ def test_rigs_of_any_size(tmp_path, scale):
     c2w = views.c2w.clone()
     c2w[:, :3, 3] *= scale
     explain_cameras(replace(views, c2w=c2w))
-    rig_picture(replace(views, c2w=c2w), tmp_path / "rig.png")
+    draw_rig(replace(views, c2w=c2w), tmp_path / "rig.png")
 
 
 def test_lenses_of_all_widths_have_a_verdict(tmp_path):

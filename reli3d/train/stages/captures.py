@@ -1,4 +1,4 @@
-"""Real captures as training objects: photographs with masks and cameras, and no truth of material or light."""
+"""Real captures as training objects: images with masks and cameras, without ground-truth materials or lighting."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from reli3d.views.views import Views
 
 SIZE = 256  # pixels of the square crops; the stages scale them further
 SCORES = ("camera_quality_score", "gaussian_splats_quality_score")  # of UCO3D's metadata.json
-LEAST = 1.0  # of both, as the paper filters
+MIN_SCORE = 1.0  # of both, as in the paper
 METADATA_LIMIT = 1 << 20  # bytes
-KEPT = 64  # prepared captures in memory: 50 MB at 4 views
+CACHED_CAPTURES = 64  # preprocessed captures in memory: 50 MB at 4 views
 
 
 class Captures:
-    """Object folders below one folder; those of UCO3D must have both scores of at least 1.
+    """The object folders in a folder; those of UCO3D must have both quality scores of at least MIN_SCORE.
 
-    ``refused`` has the name of each folder that is left out, and the reason.  Raises InputError where none is left.
+    ``refused``: reason by the name of each folder that is left out.  Raises InputError if no folder remains.
     """
 
     def __init__(self, folder: Path, size: int = SIZE):
@@ -42,7 +42,7 @@ class Captures:
         if not self.folders:
             reasons = "; ".join(f"{k}: {v}" for k, v in list(self.refused.items())[:3]) or "no */transforms.json"
             raise InputError(folder, f"expected captures of good quality, got none ({reasons})")
-        self._prepared = lru_cache(KEPT)(self._prepare)
+        self._prepared = lru_cache(CACHED_CAPTURES)(self._prepare)
 
     def __len__(self) -> int:
         return len(self.folders)
@@ -56,7 +56,7 @@ class Captures:
 
 
 def unfit(folder: Path) -> str | None:
-    """Why a capture is left out by UCO3D's own scores; None where it is not, or where it has none."""
+    """The reason to exclude a capture by UCO3D's quality scores; None if there is none or it has no scores."""
     path = folder / "metadata.json"
     if not path.exists():
         return None
@@ -65,12 +65,12 @@ def unfit(folder: Path) -> str | None:
         values = [float(scores[name]) for name in SCORES]
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         return f"metadata.json: expected {' and '.join(SCORES)}, got a broken file ({shown(str(error))})"
-    low = [f"{n} {v:.2f}" for n, v in zip(SCORES, values, strict=True) if not v >= LEAST]
-    return f"expected scores of at least {LEAST:g}, got {', '.join(low)}" if low else None
+    low = [f"{n} {v:.2f}" for n, v in zip(SCORES, values, strict=True) if not v >= MIN_SCORE]
+    return f"expected scores of at least {MIN_SCORE:g}, got {', '.join(low)}" if low else None
 
 
 def capture_views(views: Views, size: int) -> ObjectViews:
-    """Square crops around the object, scaled so that the longest side of its hull is 1, as the samples' objects are."""
+    """Square crops around the object, in a frame in which the longest side of its visual hull is 1, as in samples."""
     moved = views.transformed(normalize(views, "hull"))
     cut = moved.resampled(size)
     valid = torch.stack(
@@ -81,7 +81,7 @@ def capture_views(views: Views, size: int) -> ObjectViews:
 
 
 def _inside(new: Tensor, old: Tensor, shape: torch.Size, size: int) -> Tensor:
-    """``(S, S)`` 1 where the crop's pixel lies in the photograph of ``shape`` (rows, columns)."""
+    """``(S, S)`` 1 where the crop's pixel lies in the input image of ``shape`` (rows, columns)."""
     at = torch.arange(size, dtype=torch.float32) + 0.5
     x = (at - new[2]) * (old[0] / new[0]) + old[2]
     y = (at - new[3]) * (old[1] / new[1]) + old[3]

@@ -1,4 +1,4 @@
-"""RENI++ latents of the lights of training samples: what the light of a prediction is compared with."""
+"""RENI++ latents of the lighting of training samples, the ground truth of the latent loss."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ Latents = dict[str, tuple[Tensor, Tensor]]  # of a file's stem: (L, 3) and ()
 
 
 def load_prior(model: Reconstructor, path: Path) -> None:
-    """Give ``model`` the decoder that :mod:`reli3d.train.light_prior` fitted, and keep it as it is from now on.
+    """Loads the environment decoder from :mod:`reli3d.train.light_prior` into ``model`` and freezes it.
 
-    Raises InputError where the file holds no decoder of the preset's sizes.
+    Raises InputError if the file has no decoder of the preset's sizes.
     """
     try:
         stored = {k: v for k, v in load_file(path).items() if k != "latents"}
@@ -44,9 +44,9 @@ def fitted(
     steps: int = 200,
     progress: Callable[[str], None] = lambda line: None,
 ) -> Latents:
-    """Latents and strength of each sample's light, by the stem of its file; kept in ``cache`` for the next time.
+    """Fits latents and strength to the lighting of each sample; returns them by the stem of its file.
 
-    What the cache holds counts while decoder and number of steps are the same.
+    cache: safetensors file of earlier results, valid for the same decoder and number of steps; updated.
     """
     digest = hashlib.sha256(str(steps).encode())
     for name, value in decoder.state_dict().items():

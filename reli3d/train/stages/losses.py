@@ -1,6 +1,6 @@
-"""What a stage makes small.  One function a term; :class:`~reli3d.train.stages.config.Weights` has their weights.
+"""Loss terms of the paper's stages, weighted by :class:`~reli3d.train.stages.config.Weights`.
 
-A term whose truth a sample does not have is left out of the result: it is not zero, it is not asked.
+A term whose ground truth a sample lacks is absent from the result instead of zero.
 """
 
 from __future__ import annotations
@@ -13,18 +13,18 @@ from torch.nn.functional import avg_pool2d, binary_cross_entropy
 
 from reli3d._bridge import present
 from reli3d.errors import InputError
-from reli3d.train.stages.picture import Picture
+from reli3d.train.stages.rendering import Rendering
 from reli3d.train.stages.views import ObjectViews
 
-WHITE = 0.99  # sRGB; a brighter photograph may be cut off, so a brighter render is no error
+WHITE = 0.99  # sRGB; above it an input image may be clipped, so a brighter rendering is no error
 SCALES = 4  # of the multi-scale gradients: 1, 2, 4, 8 pixels
-SURE = 1e-4  # opacities are kept this far from 0 and 1: the cross-entropy of a wrong pixel is 9 at most
+MIN_OPACITY = 1e-4  # opacities are kept this far from 0 and 1: the cross-entropy of a wrong pixel is 9 at most
 
 Perceptual = Callable[[Tensor, Tensor], Tensor]
 
 
-def shown_colors(picture: Picture, target: ObjectViews, view: int) -> tuple[Tensor, Tensor]:
-    """Render and photograph ``(H, W, 3)`` over black, display values, where the photograph has pixels."""
+def compared_colors(picture: Rendering, target: ObjectViews, view: int) -> tuple[Tensor, Tensor]:
+    """Rendering and target ``(H, W, 3)`` over black, display values, zero where the target is not valid."""
     want = target.images[view] * target.masks[view][..., None]
     got = picture.color
     got = torch.where(target.images[view] > WHITE, torch.minimum(got, want), got)
@@ -34,10 +34,9 @@ def shown_colors(picture: Picture, target: ObjectViews, view: int) -> tuple[Tens
 
 
 def gradients(got: Tensor, want: Tensor) -> Tensor:
-    """Mean absolute difference of neighbors' differences of ``(H, W, 3)`` at several scales.
+    """Mean absolute error of image gradients of ``(H, W, 3)`` at several scales.
 
-    It stands in for LPIPS where that has no weights: like it, it asks for edges in their place and forgives what is
-    even; it knows nothing of what pictures mean.
+    A substitute for LPIPS without network weights: sensitive to the position of edges, insensitive to constant offsets.
     """
     error = (got - want).movedim(-1, 0)[None]
     total = error.new_zeros(())
@@ -51,15 +50,15 @@ def gradients(got: Tensor, want: Tensor) -> Tensor:
 
 
 def lpips_distance() -> Perceptual:
-    """LPIPS (Zhang and others 2018) with VGG features, from the package ``lpips``.
+    """LPIPS (Zhang et al. 2018) with VGG features, from the package ``lpips``.
 
-    Raises ValueError where the package or the weights of VGG are not on this machine: nothing is downloaded.
+    Raises InputError if the package or the weights of VGG are missing; nothing is downloaded.
     """
     try:
         import lpips
     except ImportError:
         raise InputError(
-            "--perceptual", "expected the package lpips for lpips, got none; pip install lpips, or take gradients"
+            "--perceptual", "expected the package lpips, got none; pip install lpips, or use --perceptual gradients"
         ) from None
     weights = torch.hub.get_dir() + "/checkpoints/vgg16-397923af.pth"
     try:
@@ -67,7 +66,7 @@ def lpips_distance() -> Perceptual:
             pass
     except OSError:
         raise InputError(
-            "--perceptual", f"expected the weights of VGG16 at {weights} for lpips, got none; take gradients"
+            "--perceptual", f"expected the weights of VGG16 at {weights}, got none; use --perceptual gradients"
         ) from None
     network = lpips.LPIPS(net="vgg", verbose=False).requires_grad_(False)
 
@@ -79,20 +78,20 @@ def lpips_distance() -> Perceptual:
 
 
 def perceptual(name: str) -> Perceptual:
-    """The distance of pictures that a run names."""
+    """The image distance ``lpips`` or ``gradients``."""
     return lpips_distance() if name == "lpips" else gradients
 
 
-def opacity_entropy(picture: Picture, target: ObjectViews, view: int) -> Tensor:
-    """Cross-entropy of opacity and mask, mean over the photograph's pixels."""
-    cover = picture.cover.clamp(SURE, 1.0 - SURE)
-    entropy = binary_cross_entropy(cover, target.masks[view], reduction="none")
+def opacity_entropy(picture: Rendering, target: ObjectViews, view: int) -> Tensor:
+    """Binary cross-entropy of opacity and mask, mean over the valid pixels."""
+    coverage = picture.coverage.clamp(MIN_OPACITY, 1.0 - MIN_OPACITY)
+    entropy = binary_cross_entropy(coverage, target.masks[view], reduction="none")
     return _mean(entropy, target, view)
 
 
-def cover_error(picture: Picture, target: ObjectViews, view: int) -> Tensor:
-    """Mean square difference of antialiased coverage and mask."""
-    return _mean((picture.cover - target.masks[view]).square(), target, view)
+def coverage_error(picture: Rendering, target: ObjectViews, view: int) -> Tensor:
+    """Mean square error of antialiased coverage against the mask, over the valid pixels."""
+    return _mean((picture.coverage - target.masks[view]).square(), target, view)
 
 
 def _mean(values: Tensor, target: ObjectViews, view: int) -> Tensor:
@@ -101,15 +100,15 @@ def _mean(values: Tensor, target: ObjectViews, view: int) -> Tensor:
     return (values * target.valid[view]).sum() / target.valid[view].sum().clamp(min=1.0)
 
 
-def map_terms(picture: Picture, target: ObjectViews, view: int) -> dict[str, Tensor]:
-    """Errors of the maps where both the truth and the object's own are known, weighed by its coverage.
+def map_terms(picture: Rendering, target: ObjectViews, view: int) -> dict[str, Tensor]:
+    """Errors of material and normal where both maps have values, weighted by the coverage of the prediction.
 
-    The weight has no gradient: a wrong material is no reason to become transparent.
+    The weight is detached: a wrong material must not reduce the opacity.
     """
     terms = {"flat": (1.0 - picture.bump[:, 2]).mean()} if len(picture.bump) else {}
     if target.shown is None:
         return terms
-    weight = target.shown[view] * picture.known * picture.cover.detach()
+    weight = target.shown[view] * picture.known * picture.coverage.detach()
     total = weight.sum()
     if float(total.detach()) < 1.0:  # nothing in common yet
         return terms
@@ -123,11 +122,11 @@ def map_terms(picture: Picture, target: ObjectViews, view: int) -> dict[str, Ten
 
 
 def light_terms(latent: Tensor, rotation: Tensor, strength: Tensor, radiance: Tensor, target: ObjectViews) -> dict:
-    """Of the light: latents as they are decoded, turned by the predicted rotation, and the strength; without their
-    truth the color of the light.
+    """``latent``: mean square error of the rotated latents and the strength; without ground truth ``neutral``, the mean
+    relative saturation of the lighting.
 
-    latent: ``(L, 3)``.  rotation: ``(3, 3)``.  strength: ``()``.  radiance: ``(K, 3)`` spread evenly over the sphere.
-    The prior is equivariant to turns, so latents and a rotation are one and the same light as the turned latents.
+    latent: ``(L, 3)``.  rotation: ``(3, 3)``.  strength: ``()``.  radiance: ``(K, 3)`` in directions uniform over the
+    sphere.  The prior is equivariant to rotation, so latents with a rotation equal the rotated latents.
     """
     if target.latent is None or target.strength is None:
         mean = radiance.mean(-1, keepdim=True)

@@ -1,4 +1,4 @@
-"""Training objects in tar files of the WebDataset form: one ``<object>.safetensors`` for each object."""
+"""Training objects in WebDataset tar files: one ``<object>.safetensors`` per object."""
 
 from __future__ import annotations
 
@@ -17,11 +17,20 @@ from reli3d.io.files import replacing
 from reli3d.train.stages.captures import Captures
 from reli3d.train.stages.views import Chooser, ObjectViews, Samples, sample_views
 
-OF_SAMPLE = ("images", "c2w", "intrinsics", "view_material", "view_normal", "view_depth", "environment", "finish_known")
+STORED_TENSORS = (
+    "images",
+    "c2w",
+    "intrinsics",
+    "view_material",
+    "view_normal",
+    "view_depth",
+    "environment",
+    "finish_known",
+)
 
 
 def to_tensors(views: ObjectViews) -> dict[str, Tensor]:
-    """What is stored of captures; the layout of :mod:`reli3d.synthetic.samples`, without what captures lack."""
+    """Tensors stored for a capture, in the layout of :mod:`reli3d.synthetic.samples`."""
     images = torch.cat([views.images, views.masks[..., None]], -1)
     stored = {
         "images": (images * 255 + 0.5).to(torch.uint8),
@@ -38,7 +47,7 @@ def _objects(source: Samples | Captures, numbers: Iterable[int]) -> Iterator[tup
     for k in numbers:
         if isinstance(source, Samples):
             tensors = load(source.files[k].read_bytes())
-            yield source.files[k].stem, save({n: tensors[n] for n in OF_SAMPLE if n in tensors})
+            yield source.files[k].stem, save({n: tensors[n] for n in STORED_TENSORS if n in tensors})
         else:
             yield source.folders[k].name, save(to_tensors(source.load(k, range)))
 
@@ -46,9 +55,9 @@ def _objects(source: Samples | Captures, numbers: Iterable[int]) -> Iterator[tup
 def pack(
     source: Samples | Captures, folder: Path, *, each: int = 64, progress: Callable[[str], None] = lambda line: None
 ) -> None:
-    """Write the objects of ``source`` as ``NNNNNN.tar`` of ``each`` objects; shards that exist are kept.
+    """Writes the objects of ``source`` to ``NNNNNN.tar``, ``each`` per file; existing files are kept.
 
-    Raises InputError where the package ``webdataset`` is missing.
+    Raises InputError if the package ``webdataset`` is missing.
     """
     try:
         from webdataset import TarWriter
@@ -67,7 +76,7 @@ def pack(
 
 
 class Shards:
-    """Objects of a folder of shards, by number.  Raises InputError where a shard is broken or there is none."""
+    """The objects of a folder of shards, by index.  Raises InputError if a shard is broken or there is none."""
 
     def __init__(self, folder: Path):
         self.places: list[tuple[Path, int, int]] = []  # shard, offset and length of the object's bytes

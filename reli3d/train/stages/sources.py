@@ -1,4 +1,4 @@
-"""Where objects come from: the reader of a folder."""
+"""Opens a folder of training objects."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from reli3d.train.stages.views import Samples, Source
 
 
 def source(folder: Path) -> Source:
-    """The objects of a folder: of shards, of samples, or of captures.  Raises InputError where it holds none."""
+    """The objects of a folder of shards, samples or captures.  Raises InputError if it has none."""
     if not folder.is_dir():
         raise InputError(folder, "expected a folder of samples, captures or shards, got none")
     if any(folder.glob("*.tar")):

@@ -1,4 +1,4 @@
-"""The stages of the paper's network as the training loop takes them."""
+"""The training stages of the paper's network."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from reli3d.nn.model import Reconstructor
 from reli3d.train.stage import Stage
 from reli3d.train.stages.config import TINY, StageConfig
 from reli3d.train.stages.losses import perceptual
-from reli3d.train.stages.step import checkpointed, encode, object_losses, pictures, trunk_layers
+from reli3d.train.stages.step import checkpointed, encode, object_losses, renderings, trunk_layers
 from reli3d.train.stages.surface import surface
 from reli3d.train.stages.views import Draw, Source, draw
 
-CHECKED = 4  # objects whose surface is looked for at every checkpoint
+CHECKED = 4  # objects whose surface is extracted at every checkpoint
 SHOWN = 3  # validation objects in the image
 TILE = 96  # pixels of a side of a tile of the image
 
 
 class PaperStage(Stage):
-    """Images of views that were not input, compared with renderings of the predicted object."""
+    """Compares held-out views with renderings of the predicted object."""
 
     model: Reconstructor
 
@@ -44,10 +44,10 @@ class PaperStage(Stage):
         validation: Source | None = None,
         folders: Sequence[str] = (),
     ):
-        """max_views: an object is read from 1 to this many; the first is the hero.  background: fraction of the
-        objects whose light may be read from the background.  distance: ``gradients`` or ``lpips``, the perceptual
-        term.  bfloat16: autocast of the trunk.  checkpointing: recompute the trunk's layers in the backward pass.
-        validation: held-out objects.  folders: of the sources, for the log.
+        """max_views: upper limit of the random number of input views; the first is the reference view.  background:
+        fraction of the objects whose input includes the background.  distance: ``gradients`` or ``lpips``, the
+        perceptual term.  bfloat16: autocast of the trunk.  checkpointing: recompute the trunk's layers in the backward
+        pass.  validation: held-out objects.  folders: names of the sources for the log.
         """
         if not 1 <= max_views <= 16:
             raise ValueError(f"max_views: expected 1 to 16, got {max_views}")
@@ -73,7 +73,7 @@ class PaperStage(Stage):
         self.held_out = [self.drawn(0, k, [validation], patch=0) for k in range(SHOWN)] if validation else []
 
     def drawn(self, step: int, place: int, sources: Sequence[Source] | None = None, patch: int | None = None) -> Draw:
-        """The object at ``place`` of a step: a function of the seed, the step and the place."""
+        """The object at position ``place`` of the batch of ``step``; a function of the seed, the step and ``place``."""
         return draw(
             sources or self.sources,
             (self.seed, step, place),
@@ -86,7 +86,7 @@ class PaperStage(Stage):
         ).to(self.model.device)
 
     def batch(self, step: int, objects: range) -> Sequence[Any]:
-        return [(step, place) for place in objects]  # read one after the other: a batch of images may not fit
+        return [(step, place) for place in objects]  # loaded one at a time: a batch of images may not fit in memory
 
     def losses(self, item: tuple[int, int]) -> dict[str, Tensor]:
         return object_losses(self.model, self.drawn(*item), self.config, self.distance, bfloat16=self.bfloat16)
@@ -99,9 +99,9 @@ class PaperStage(Stage):
 
     @torch.no_grad()
     def measures(self) -> dict[str, float]:
-        """``surface``: the fraction of a few training objects for which the network has a surface.
+        """``surface``: fraction of CHECKED training objects for which the network predicts a surface.
 
-        Raises InputError where a stage that renders the surface has none: its losses could not train the materials.
+        Raises InputError if the stage renders the surface and there is none: no loss could reach the materials.
         """
         resolution = self.config.resolution or self.model.preset.resolution
         draws = (self.drawn(0, place) for place in range(CHECKED))
@@ -112,12 +112,12 @@ class PaperStage(Stage):
 
     @torch.no_grad()
     def validation(self, average: dict[str, Tensor]) -> np.ndarray | None:
-        """A row for each object: hero, target, rendering, base color, roughness and metallic, normal, light."""
+        """One row per object: reference view, target, rendering, base color, roughness, metallic, normal, lighting."""
         model = averaged(self.model, average)
         rows = []
         for one in self.held_out:
             code = encode(model, one)
-            shown, _ = pictures(model, code, one, self.config)
+            shown, _ = renderings(model, code, one, self.config)
             target = one.targets
             tiles = [
                 one.inputs.images[0] * one.inputs.masks[0][..., None],
@@ -125,10 +125,10 @@ class PaperStage(Stage):
             ]
             if shown:
                 picture = shown[0]
-                cover = (picture.cover * picture.known)[..., None]
-                finish = torch.cat([picture.material[..., 3:], torch.zeros_like(cover)], -1) * cover
-                normal = 0.5 * (picture.normal + 1.0) * cover
-                tiles += [picture.color, picture.material[..., :3] * cover, finish, normal]
+                coverage = (picture.coverage * picture.known)[..., None]
+                finish = torch.cat([picture.material[..., 3:], torch.zeros_like(coverage)], -1) * coverage
+                normal = 0.5 * (picture.normal + 1.0) * coverage
+                tiles += [picture.color, picture.material[..., :3] * coverage, finish, normal]
             else:
                 tiles += [torch.zeros_like(tiles[1])] * 4
             light = model.decode_environment(code)[0]
@@ -138,23 +138,23 @@ class PaperStage(Stage):
 
 
 def no_surface(where: object) -> InputError:
-    """The error for a network that has no surface."""
+    """The error for a network that predicts no surface."""
     return InputError(
         where,
-        f"expected a network that has a surface, got none for {CHECKED} training objects; start from a longer "
+        f"expected a network that predicts a surface, got none for {CHECKED} training objects; start from a longer "
         f"--stage volume ({TINY['volume'].steps} steps by default), whose log has the fraction with a surface",
     )
 
 
 def averaged(model: Reconstructor, average: dict[str, Tensor]) -> Reconstructor:
-    """A network of its own with the averaged parameters."""
+    """A copy of ``model`` with the averaged parameters, in evaluation mode."""
     other = Reconstructor(model.preset).to(model.device)
     other.load_state_dict(average)
     return other.eval()
 
 
 def _tile(values: np.ndarray) -> np.ndarray:
-    """Repeated pixels, ``TILE`` high."""
+    """``values`` resized to TILE by TILE pixels, nearest neighbor, uint8."""
     at = (np.arange(TILE) * values.shape[0]) // TILE
     across = (np.arange(TILE) * values.shape[1]) // TILE
     return (values[at][:, across] * 255 + 0.5).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""The whole loss of one object in one stage."""
+"""The losses of one object in one stage."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from reli3d.render.points import SurfacePoints
 from reli3d.render.shading import ShadeOptions, shade
 from reli3d.train.stages import losses
 from reli3d.train.stages.config import StageConfig
-from reli3d.train.stages.picture import Picture, lobes
+from reli3d.train.stages.rendering import Rendering, lobes
 from reli3d.train.stages.surface import Shader, render_surface, seed_surface, surface
 from reli3d.train.stages.views import Draw
 from reli3d.train.stages.volume import occupied, render_volume
@@ -26,7 +26,7 @@ DIFFUSE_MODEL = "published"  # the formula of the images of reli3d.synthetic.sam
 
 
 def encode(model: Reconstructor, drawn: Draw, *, bfloat16: bool = False) -> Code:
-    """What the network makes of the views that are read."""
+    """The network's encoding of the input views."""
     views = drawn.inputs
     shown = torch.tensor([drawn.background_visible], device=views.images.device)
     with torch.autocast(views.images.device.type, torch.bfloat16, enabled=bfloat16):
@@ -36,7 +36,7 @@ def encode(model: Reconstructor, drawn: Draw, *, bfloat16: bool = False) -> Code
 
 
 def shader_of(model: Reconstructor, code: Code, stage: StageConfig, seed: int) -> Shader:
-    """The light of a stage on points of a surface."""
+    """The function that shades surface points under the predicted lighting, by the renderer of ``stage``."""
     if stage.renderer == "gaussians":
         light = lobes(model, code, stage.lobes)
         return lambda points, wo, scene: shade_gaussians(points, wo, light)
@@ -49,12 +49,12 @@ def shader_of(model: Reconstructor, code: Code, stage: StageConfig, seed: int) -
     return lit
 
 
-def pictures(
+def renderings(
     model: Reconstructor, code: Code, drawn: Draw, stage: StageConfig
-) -> tuple[list[Picture], dict[str, Tensor]]:
-    """The renders of the views to compare, and what the geometry itself asks for.
+) -> tuple[list[Rendering], dict[str, Tensor]]:
+    """Renderings of the target views, and the regularization terms of the geometry.
 
-    No pictures where the field has no surface yet: then the terms say where one shall be.
+    If the field has no surface yet there are no renderings, and the term ``sign`` creates one.
     """
     target, size = drawn.targets, drawn.targets.images.shape[1]
     cameras = [Camera(target.c2w[v], target.intrinsics[v], size, size) for v in range(len(target))]
@@ -73,17 +73,17 @@ def pictures(
 def object_losses(
     model: Reconstructor, drawn: Draw, stage: StageConfig, distance: losses.Perceptual, *, bfloat16: bool = False
 ) -> dict[str, Tensor]:
-    """Unweighted terms of one object, each a scalar, by the names of ``stage.weights``; what is not known is not in it.
+    """Unweighted scalar terms of one object, by the names of ``stage.weights``; terms without ground truth are absent.
 
-    Terms of several target views are their means over the views that have them.
+    Terms of several target views are averaged over the views that have them.
     """
     code = encode(model, drawn, bfloat16=bfloat16)
-    shown, terms = pictures(model, code, drawn, stage)
+    shown, terms = renderings(model, code, drawn, stage)
     target = drawn.targets
     of_views: dict[str, list[Tensor]] = {}
     for view, picture in enumerate(shown):
-        got, want = losses.shown_colors(picture, target, view)
-        mask = losses.opacity_entropy if stage.renderer == "volume" else losses.cover_error
+        got, want = losses.compared_colors(picture, target, view)
+        mask = losses.opacity_entropy if stage.renderer == "volume" else losses.coverage_error
         found = {
             "image": (got - want).square().mean(),
             "perceptual": distance(got, want),
@@ -93,18 +93,18 @@ def object_losses(
         for name, value in found.items():
             of_views.setdefault(name, []).append(value)
     terms = {**terms, **{name: torch.stack(values).mean() for name, values in of_views.items()}}
-    light = lobes(model, code, 64).amplitude  # 64 directions tell the color of a light
+    light = lobes(model, code, 64).amplitude  # 64 directions determine the color of the lighting
     return {**terms, **losses.light_terms(code.latent[0], code.rotation[0], code.strength[0], light, drawn.inputs)}
 
 
 def total(terms: dict[str, Tensor], stage: StageConfig) -> Tensor:
-    """The weighted sum."""
+    """Weighted sum of ``terms``."""
     weights = vars(stage.weights)
     return sum((weights[name] * value for name, value in terms.items()), start=torch.zeros(()))
 
 
 def trunk_layers(model: Reconstructor) -> list[Any]:
-    """The layers of encoders and transformers: a few large modules of which one is needed at a time."""
+    """The layers of the encoders and transformers: the units of sharding and of gradient checkpointing."""
     layers: list[Any] = [
         *model.encoder.model.encoder.layer,
         *model.illumination.encoder.model.encoder.layer,
@@ -117,7 +117,7 @@ def trunk_layers(model: Reconstructor) -> list[Any]:
 
 
 def checkpointed(model: Reconstructor) -> None:
-    """Let the trunk's layers be computed again in the backward pass instead of kept, in place."""
+    """Enables gradient checkpointing of the trunk's layers, in place."""
     from torch.utils.checkpoint import checkpoint
 
     for layer in trunk_layers(model):

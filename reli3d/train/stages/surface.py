@@ -1,4 +1,4 @@
-"""Stages two to four: the predicted surface, extracted at every step with gradients, and its pictures."""
+"""Differentiable extraction and rendering of the predicted surface, for all stages but ``volume``."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ from reli3d.render.color import srgb_to_linear
 from reli3d.render.gbuffer import primary_hits
 from reli3d.render.points import SurfacePoints
 from reli3d.render.silhouette import antialias, mesh_edges
-from reli3d.train.stages.picture import Picture, display
+from reli3d.train.stages.rendering import Rendering, display
 
-Shader = Callable[[SurfacePoints, Tensor, RayScene], Tensor]  # points, directions to the eye, what casts shadows
-CORE = 0.3  # of the cube's half side: what is made inside where nothing is
-CHUNK = 1 << 16  # grid points whose features are held at once; those of a chunk are computed again backwards
+Shader = Callable[[SurfacePoints, Tensor, RayScene], Tensor]  # points, directions to the camera, occluders
+CORE = 0.3  # of the cube's half side: the region that :func:`seed_surface` pulls inside
+CHUNK = 1 << 16  # grid points per chunk, whose features are recomputed in the backward pass
 
 
 @dataclass(frozen=True)
 class Surface:
-    """The surface of one object and what rays need to see it.
+    """The surface of one object with its ray tracing structure and edges.
 
     terms: FlexiCubes' regularizers, by name.
     """
@@ -45,8 +45,8 @@ class Surface:
     terms: dict[str, Tensor]
 
 
-def ask(model: Reconstructor, code: Code, points: Tensor, heads: tuple[str, ...]) -> dict[str, Tensor]:
-    """Values ``(N, outputs)`` of the heads at ``points (N, 3)``; of many points the features are not kept."""
+def query_heads(model: Reconstructor, code: Code, points: Tensor, heads: tuple[str, ...]) -> dict[str, Tensor]:
+    """Values ``(N, outputs)`` of the heads at ``points (N, 3)``; above CHUNK points with gradient checkpointing."""
     if len(points) <= CHUNK or not torch.is_grad_enabled():
         return {k: v[0] for k, v in model.query(code, points[None], heads).items()}
     parts = []
@@ -59,9 +59,9 @@ def ask(model: Reconstructor, code: Code, points: Tensor, heads: tuple[str, ...]
     return dict(zip(heads, (torch.cat(columns) for columns in zip(*parts)), strict=True))
 
 
-def corner_points(level: Tensor, cubes: Tensor) -> Tensor:
+def corner_points(sdf: Tensor, cubes: Tensor) -> Tensor:
     """Grid points ``(C, 8)`` of the corners of ``cubes``; corner k lies at x = k & 1, y = k >> 1 & 1, z = k >> 2."""
-    _, y, z = level.shape
+    _, y, z = sdf.shape
     i, rest = cubes // ((y - 1) * (z - 1)), cubes % ((y - 1) * (z - 1))
     lowest = (i * y + rest // (z - 1)) * z + rest % (z - 1)
     k = torch.arange(8, device=cubes.device)
@@ -69,11 +69,11 @@ def corner_points(level: Tensor, cubes: Tensor) -> Tensor:
 
 
 def surface(model: Reconstructor, code: Code, resolution: int) -> Surface | None:
-    """The surface on ``resolution`` cubes a side with gradients to the network; None where the level has one sign.
+    """The surface on a grid of ``resolution`` cubes per side; None if the field has only one sign.
 
-    Levels of all points are found without gradient; those at cubes that the surface crosses are asked again with it.
-    The others have none, as nothing that is extracted depends on them.  Levels are over the threshold: -1 is a sure
-    outside of the density, so to speak its complement.
+    Gradients reach the network.  The field is first evaluated at all grid points without gradient, then again with
+    gradient at the corners of cubes that the surface crosses: the surface depends on no other points.  Field values are
+    divided by the density threshold.
     """
     radius, threshold = model.preset.radius, model.preset.density_threshold
     axis = torch.linspace(-radius, radius, resolution + 1, device=code.latent.device)
@@ -85,25 +85,25 @@ def surface(model: Reconstructor, code: Code, resolution: int) -> Surface | None
             return None
         corners = corner_points(free, cubes)
         needed = torch.zeros_like(free, dtype=torch.bool)
-        for side in range(3):  # where the inside reaches the box, the cap stands on the border's vertices
+        for side in range(3):  # where the inside reaches the box, the cap uses the grid points of the boundary
             for end in (0, -1):
                 needed.select(side, end)[free.select(side, end) < 0] = True
         needed.view(-1)[corners] = True
         at = needed.view(-1).nonzero()[:, 0]
         row = torch.cumsum(needed.view(-1), 0) - 1
-    raw = ask(model, code, points[at], ("density", "deformation", "flexicubes"))
+    raw = query_heads(model, code, points[at], ("density", "deformation", "flexicubes"))
     known = model.sdf(raw["density"][:, 0]) / threshold
     # the two passes round differently, and a sign that flips would not fit the cubes
     known = torch.where((known < 0) == (free.view(-1)[at] < 0), known, free.view(-1)[at])
-    level = free.reshape(-1).index_copy(0, at, known).view_as(free)
+    sdf = free.reshape(-1).index_copy(0, at, known).view_as(free)
     offset = torch.zeros_like(points).index_copy(0, at, deformation(raw["deformation"], resolution))
     merged = model.merger(raw["flexicubes"].index_select(0, row[corners].reshape(-1)).view(len(cubes), 8, -1))
-    weights = {"deformation": offset.view(*level.shape, 3), "alpha": merged.alpha, "beta": merged.beta}
-    made = extract_surface(level, radius=radius, gamma=merged.gamma, cubes=cubes, center=True, **weights)
+    weights = {"deformation": offset.view(*sdf.shape, 3), "alpha": merged.alpha, "beta": merged.beta}
+    made = extract_surface(sdf, radius=radius, gamma=merged.gamma, cubes=cubes, center=True, **weights)
     mesh = Mesh(made.vertices, made.faces, vertex_normals(made.vertices, made.faces))
     terms = {
-        "deviation": vertex_deviation(level, radius=radius, cubes=cubes, **weights).mean(),
-        "sign": sign_entropy(level),
+        "deviation": vertex_deviation(sdf, radius=radius, cubes=cubes, **weights).mean(),
+        "sign": sign_entropy(sdf),
         "spread": torch.cat([merged.alpha, merged.beta], -1).sub(1.0).abs().mean(),
     }
     scene = RayScene(mesh.vertices.detach(), mesh.faces)
@@ -116,23 +116,23 @@ def _densities(model: Reconstructor, code: Code, points: Tensor) -> Tensor:
 
 
 def seed_surface(model: Reconstructor, code: Code) -> Tensor:
-    """What pulls a field of one sign across zero: inside at the core of the cube, outside at its border.
+    """Hinge loss that creates a surface in a field of one sign: inside at the core of the cube, outside at its border.
 
-    As in nvdiffrec an object without surface would otherwise have no gradient for ever.
+    As in nvdiffrec: an object without a surface would otherwise have no gradient.
     """
     axis = torch.linspace(-1.0, 1.0, 8, device=code.latent.device)
     points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
     far = points.abs().amax(-1)
-    raw = ask(model, code, points * model.preset.radius, ("density",))["density"][:, 0] - model.surface_density
+    raw = query_heads(model, code, points * model.preset.radius, ("density",))["density"][:, 0] - model.surface_density
     return relu(1.0 - raw[far < CORE]).mean() + relu(1.0 + raw[far > 0.99]).mean()
 
 
-def render_surface(model: Reconstructor, code: Code, found: Surface, camera: Camera, shader: Shader) -> Picture:
-    """The view of one object from ``camera``, one ray a pixel, outlines antialiased.
+def render_surface(model: Reconstructor, code: Code, found: Surface, camera: Camera, shader: Shader) -> Rendering:
+    """Rendering of one object from ``camera``: one ray per pixel, antialiased silhouettes.
 
-    Materials and normals are asked at the hits as they are: gradients reach the network through the values there,
-    through the normals of the mesh, and through the outlines.  That a moving surface passes a pixel's ray at another
-    place is left out: towards the outline that slope grows without bound, and a few grazing pixels outweigh all others.
+    Gradients reach the network through the head outputs at the hits, through the normals of the mesh and through the
+    silhouettes.  The hit positions are detached: their derivative grows without bound towards the silhouette, and a few
+    grazing pixels would dominate.
     """
     mesh = found.mesh
     hits, _, directions = primary_hits(found.scene, camera)
@@ -140,9 +140,9 @@ def render_surface(model: Reconstructor, code: Code, found: Surface, camera: Cam
     face, bary = hits.face.reshape(-1)[seen], hits.bary.reshape(-1, 2)[seen]
     position = interpolate(mesh.vertices.detach(), mesh.faces, face, bary)
     normal = normalize(interpolate(present("normals", mesh.normals), mesh.faces, face, bary), dim=-1)
-    values = ask(model, code, position, MATERIAL)
+    values = query_heads(model, code, position, MATERIAL)
     bent = radial_bump(position, normal, values["normal"])
-    bent = normalize(bent + normal - normal.detach(), dim=-1)  # its slope in the normal: the frame has none
+    bent = normalize(bent + normal - normal.detach(), dim=-1)  # gradient to the normal: the frame has none
     wo = -directions.reshape(-1, 3)[seen]
     material = torch.cat([values["base_color"], values["roughness"], values["metallic"]], -1)
     points = SurfacePoints(
@@ -158,4 +158,4 @@ def render_surface(model: Reconstructor, code: Code, found: Surface, camera: Cam
     full = layers.new_zeros(camera.height * camera.width, layers.shape[1]).index_copy(0, seen, layers)
     full = full.reshape(camera.height, camera.width, -1)
     shown = antialias(full[..., :4].contiguous(), mesh.vertices, mesh.faces, camera, found.scene, edges=found.edges)
-    return Picture(shown[..., :3], shown[..., 3], full[..., 3], full[..., 4:9], full[..., 9:], values["normal"])
+    return Rendering(shown[..., :3], shown[..., 3], full[..., 3], full[..., 4:9], full[..., 9:], values["normal"])

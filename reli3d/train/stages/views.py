@@ -1,6 +1,6 @@
-"""One object of a training step, whatever its source: posed views, and the truth that its source has.
+"""Training objects: posed views, with the ground truth that their source has.
 
-What a source does not have is None and takes part in no loss; nothing stands for it.
+Missing ground truth is None and takes part in no loss.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from torch.nn.functional import interpolate, normalize
 from reli3d._bridge import present
 from reli3d.errors import InputError
 
-Chooser = Callable[[int], Sequence[int]]  # from the number of views that there are to the indices wanted
+Chooser = Callable[[int], Sequence[int]]  # maps the number of available views to the indices to load
 
 
 @dataclass(frozen=True)
 class ObjectViews:
     """``V`` views of ``S`` by ``S`` pixels in the model's frame, float32."""
 
-    images: Tensor  # (V, S, S, 3) sRGB, straight
+    images: Tensor  # (V, S, S, 3) sRGB, straight alpha alpha
     masks: Tensor  # (V, S, S) coverage
     c2w: Tensor  # (V, 4, 4)
     intrinsics: Tensor  # (V, 4) pixels
-    background: bool  # whether there is a photograph outside the masks
-    valid: Tensor | None = None  # (V, S, S) 1 where the pixel lies in the photograph; None: everywhere
+    background: bool  # whether the images have content outside the masks
+    valid: Tensor | None = None  # (V, S, S) 1 where the pixel lies in the input image; None: everywhere
     material: Tensor | None = None  # (V, S, S, 5) base color (sRGB), roughness, metallic
     normal: Tensor | None = None  # (V, S, S, 3) world, unit
     shown: Tensor | None = None  # (V, S, S) 1 where material and normal are known
@@ -55,7 +55,7 @@ class ObjectViews:
         return replace(self, **moved)
 
     def resized(self, size: int) -> ObjectViews:
-        """``size`` pixels a side, filtered over the area that they cover; maps are means over where they are known."""
+        """The views at ``size`` pixels per side, antialiased; maps are averaged over the pixels that have values."""
         if size == self.images.shape[1]:
             return self
 
@@ -72,18 +72,18 @@ class ObjectViews:
             changed["valid"] = (planes(self.valid[..., None])[..., 0] > 0.99).float()
         if self.shown is not None:
             known = self.shown[..., None]
-            share = planes(known)
+            fraction = planes(known)
             for name in ("material", "normal"):
                 value = getattr(self, name)
                 if value is not None:
-                    changed[name] = planes(value * known) / share.clamp(min=1e-3)
+                    changed[name] = planes(value * known) / fraction.clamp(min=1e-3)
             if "normal" in changed:
                 changed["normal"] = normalize(changed["normal"], dim=-1)
-            changed["shown"] = (share[..., 0] > 0.99).float()
+            changed["shown"] = (fraction[..., 0] > 0.99).float()
         return replace(self, **changed)
 
     def window(self, x: int, y: int, side: int) -> ObjectViews:
-        """The square of ``side`` pixels whose corner is ``(x, y)``, of every view."""
+        """Crops of all views: a square of ``side`` pixels with its upper left corner at pixel ``(x, y)``."""
         cut: dict[str, Any] = {}
         for f in fields(self):
             value = getattr(self, f.name)
@@ -94,7 +94,7 @@ class ObjectViews:
 
 
 class Source(Protocol):
-    """Objects by number."""
+    """Training objects by index."""
 
     def __len__(self) -> int: ...
 
@@ -102,10 +102,9 @@ class Source(Protocol):
 
 
 def sample_views(read: Callable[[str], Any], choose: Chooser) -> ObjectViews:
-    """Views of a sample of :mod:`reli3d.synthetic.samples`, or of what a shard holds of a capture.
+    """Views of a sample of :mod:`reli3d.synthetic.samples` or of a capture in a shard.
 
-    read: gives for the name of a tensor what is indexed by the view, a slice of a file or the tensor itself; None
-    where there is none.
+    read: maps the name of a tensor to the tensor or a safetensors slice of it, indexed by view; None if missing.
     """
     poses = read("c2w")
     total = len(poses) if isinstance(poses, Tensor) else poses.get_shape()[0]
@@ -135,9 +134,9 @@ def sample_views(read: Callable[[str], Any], choose: Chooser) -> ObjectViews:
 
 
 class Samples:
-    """A folder of ``*.safetensors`` that ``reli3d-data`` made.
+    """A folder of ``*.safetensors`` from ``reli3d-data``.
 
-    latents: of :func:`reli3d.train.stages.latents.fitted`, by the stem of a file; None: not known.
+    latents: from :func:`reli3d.train.stages.latents.fitted`, by the stem of a file; None: not known.
     """
 
     def __init__(self, folder: Path, latents: dict[str, tuple[Tensor, Tensor]] | None = None):
@@ -158,12 +157,12 @@ class Samples:
 
 @dataclass(frozen=True)
 class Draw:
-    """What one object of a step is: the views that are read, hero first, and those that are compared."""
+    """One object of a training step: input views, the reference view first, and target views."""
 
     inputs: ObjectViews
     targets: ObjectViews
     background_visible: bool
-    seed: int  # of everything random in the rendering
+    seed: int  # of the rendering
 
     def to(self, device: torch.device | str) -> Draw:
         """The same on ``device``."""
@@ -181,10 +180,11 @@ def draw(
     target_size: int,
     patch: int,
 ) -> Draw:
-    """A random object: 1 to ``inputs`` random views are read, ``targets`` others are compared.
+    """A random object with 1 to ``inputs`` random input views and ``targets`` other views as targets.
 
-    A function of ``seed`` and the sources alone.  Of an object with fewer views fewer are read; the only view of an
-    object is read and compared.  patch: side of a random square of the targets, 0 for all of them.
+    A function of ``seed`` and the sources alone.  Objects with few views have fewer inputs; a single view is both input
+    and target.  background: probability that the background is visible.  input_size, target_size: pixels per side.
+    patch: side of a random crop of the targets; 0: no crop.
     """
     rng = np.random.default_rng(seed)
     sizes = [len(s) for s in sources]

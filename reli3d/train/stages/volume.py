@@ -1,4 +1,4 @@
-"""Stage one: the predicted density as a volume, its materials collected along rays and lit where the ray ends."""
+"""Volume rendering of the predicted density, with deferred shading of the material composited along each ray."""
 
 from __future__ import annotations
 
@@ -15,36 +15,38 @@ from reli3d.render.gaussians import SphericalGaussians, shade_gaussians
 from reli3d.render.points import SurfacePoints
 from reli3d.render.volume import OccupancyGrid, composite, march_rays
 from reli3d.train.stages.config import StageConfig
-from reli3d.train.stages.picture import Picture, display
+from reli3d.train.stages.rendering import Rendering, display
 
-EMPTY = 1e-3  # opacity of a step below which a cell is not asked
-FAINT = 1e-2  # opacity of a ray below which it is not lit: it shows a hundredth of what it hits
-APART = 0.02  # of the cube's half side: where the density is asked for its slope
+MIN_STEP_OPACITY = 1e-3  # of a step; cells below it are skipped
+MIN_RAY_OPACITY = 1e-2  # of a ray; rays below it are not shaded
+GRADIENT_STEP = 0.02  # of the cube's half side: finite-difference step of the density gradient
 
 
 def density(model: Reconstructor, raw: Tensor) -> Tensor:
-    """Density per model unit of the ``density`` head's raw values."""
+    """Density per model unit from the raw outputs of the ``density`` head."""
     return truncated_exp(raw + model.preset.density_bias)
 
 
 def occupied(model: Reconstructor, code: Code, stage: StageConfig) -> OccupancyGrid:
-    """Cells that a ray may not skip; no gradient."""
+    """Occupancy grid of the cells that rays must sample; without gradient."""
     radius = model.preset.radius
     step = 2.0 * radius / stage.samples_along
 
     def field(points: Tensor) -> Tensor:
         return density(model, model.query(code, points[None], ("density",))["density"][0, :, 0])
 
-    return OccupancyGrid.of_density(field, stage.grid, radius, threshold=EMPTY / step, device=code.latent.device)
+    return OccupancyGrid.of_density(
+        field, stage.grid, radius, threshold=MIN_STEP_OPACITY / step, device=code.latent.device
+    )
 
 
-def slope_normals(model: Reconstructor, code: Code, points: Tensor) -> Tensor:
-    """Unit normals ``(N, 3)`` against the slope of the raw density, by differences over a tetrahedron.
+def density_normals(model: Reconstructor, code: Code, points: Tensor) -> Tensor:
+    """Unit normals ``(N, 3)``: the negative gradient of the raw density, by finite differences over a tetrahedron.
 
-    Raw values, not densities: these differ by powers of ten.  No second derivative of the network is needed.
+    Raw outputs are used because densities vary by orders of magnitude.  No second derivative of the network is needed.
     """
     corners = points.new_tensor([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
-    around = (points[:, None] + APART * model.preset.radius * corners).reshape(1, -1, 3)
+    around = (points[:, None] + GRADIENT_STEP * model.preset.radius * corners).reshape(1, -1, 3)
     raw = model.query(code, around, ("density",))["density"].reshape(-1, 4, 1)
     return normalize(-(raw * corners).sum(1), dim=-1, eps=1e-6)
 
@@ -57,11 +59,11 @@ def render_volume(
     grid: OccupancyGrid,
     stage: StageConfig,
     seed: int,
-) -> Picture:
-    """The view of one object from ``camera``; samples lie at random places of their steps, drawn from ``seed``.
+) -> Rendering:
+    """Rendering of one object from ``camera``, with sample positions jittered along each ray by ``seed``.
 
-    Material is the mean along the ray; light falls on the mean depth, on the normal of the density's slope there, bent
-    by the bump that is predicted there.  Gradients reach the network.
+    The composited material is shaded at the expected depth, with the normal of :func:`density_normals` perturbed by the
+    predicted bump normal.  Gradients reach the network.
     """
     origins, directions = (r.reshape(-1, 3).contiguous() for r in camera_rays(camera))
     step = 2.0 * model.preset.radius / stage.samples_along
@@ -76,15 +78,15 @@ def render_volume(
     rest = torch.cat([raw["roughness"], raw["metallic"], torch.zeros_like(raw["metallic"])], -1)
     material = torch.cat([first.color, composite(sigma, rest, samples).color[:, :2]], -1)
     opacity = first.opacity
-    at = torch.nonzero(opacity.detach() > FAINT)[:, 0]
+    at = torch.nonzero(opacity.detach() > MIN_RAY_OPACITY)[:, 0]
     whole = opacity.index_select(0, at)[:, None]
     depth = first.depth.index_select(0, at)[:, None] / whole
     position = origins[at] + directions[at] * depth
-    normal = slope_normals(model, code, position)
+    normal = density_normals(model, code, position)
     bump = model.query(code, position[None], ("normal",))["normal"][0]
     bent = radial_bump(position, normal, bump)
-    bent = normalize(bent + normal - normal.detach(), dim=-1)  # its slope in the normal: the frame has none
-    of_ray = (material.index_select(0, at) / whole).clamp(0.0, 1.0)  # rounding of the sum
+    bent = normalize(bent + normal - normal.detach(), dim=-1)  # gradient to the normal: the frame has none
+    of_ray = (material.index_select(0, at) / whole).clamp(0.0, 1.0)  # clamps rounding errors
     points = SurfacePoints(
         position.detach(), normal.detach(), bent, srgb_to_linear(of_ray[:, :3]), of_ray[:, 3], of_ray[:, 4]
     )
@@ -92,4 +94,4 @@ def render_volume(
     shape = (camera.height, camera.width)
     values = torch.cat([lit * whole, torch.ones_like(whole), of_ray, bent], -1)
     full = values.new_zeros(len(origins), values.shape[1]).index_copy(0, at, values).reshape(*shape, -1)
-    return Picture(full[..., :3], opacity.reshape(shape), full[..., 3], full[..., 4:9], full[..., 9:], bump)
+    return Rendering(full[..., :3], opacity.reshape(shape), full[..., 3], full[..., 4:9], full[..., 9:], bump)

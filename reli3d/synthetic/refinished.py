@@ -1,8 +1,7 @@
-"""Surfaces with exchanged materials: any shape under any finish, several on one object, with sharp borders.
+"""Surfaces with randomly exchanged materials, so that a network cannot infer the material from the shape.
 
-A network that sees each object under one finish learns which object has which roughness.  Here the surface of an
-object is divided into one to four regions, and each region gets a finish of its own: the material of the file, its
-base color with another roughness and metallic value, a scanned material set mapped from three sides, or a procedural
+The surface is divided into one to four regions with sharp borders.  Each region gets one of: its original material, its
+base color with another roughness and metallic value, a scanned material set by triplanar projection, or a procedural
 material.
 """
 
@@ -38,8 +37,9 @@ Region = Callable[[SurfacePoints], Tensor]
 
 
 def material_sets(folder: Path) -> tuple[Path, ...]:
-    """Folders of material sets inside ``folder``: each holds basecolor, roughness and metallic, and may hold normal, as
-    JPEG or PNG.  Raises InputError where there is none, or where a map is missing.
+    """Folders of material sets inside ``folder``: basecolor, roughness, metallic and optionally normal, JPEG or PNG.
+
+    Raises InputError if there is none or if a map is missing.
     """
     found = sorted({path.parent for path in folder.glob("*/basecolor.*")})
     if not found:
@@ -78,11 +78,11 @@ def _read_set(folder: Path, side: int) -> tuple[Tensor, Tensor, Tensor]:
     return base, torch.cat([rough, metal, torch.zeros_like(rough)], -1), functional.normalize(normal, dim=-1)
 
 
-class DressedSurface:
-    """``base`` with finishes drawn from ``rng``: a ``Surface`` of :mod:`reli3d.synthetic.samples`.
+class RefinishedSurface:
+    """``base`` with random materials: a ``Surface`` of :mod:`reli3d.synthetic.samples`.
 
-    sets: of :func:`material_sets`.  measured: whether the roughness and metallic values of ``base`` are a truth, or
-    placeholders of a scan.  texels: of a material set for one unit of length; about two for each pixel of a view.
+    sets: from :func:`material_sets`.  measured: whether roughness and metallic of ``base`` are ground truth rather than
+    placeholders.  texels: resolution of a material set per unit of length, about two per pixel of a view.
     """
 
     def __init__(self, base: Surface, sets: Sequence[Path], rng: np.random.Generator, *, measured: bool, texels: int):
@@ -106,14 +106,14 @@ class DressedSurface:
         for k, finish in enumerate(self._finishes):
             rows = (region == k).nonzero()[:, 0]
             if len(rows):
-                dressed = finish(points[rows])
+                changed = finish(points[rows])
                 for value, name in zip(values, fields, strict=True):
-                    value[rows] = getattr(dressed, name)
+                    value[rows] = getattr(changed, name)
         return SurfacePoints(*values)
 
 
 def _draw_region(base: Surface, rng: np.random.Generator, count: int) -> Region:
-    """Index ``(N,)`` in [0, count) of points: by clusters of the base color, or by cuts in space."""
+    """A function from points to region indices ``(N,)`` in [0, count): clusters of the base color, or cuts in space."""
     if rng.random() < 0.45:
         samples = base.points_at(*random_faces(base, CLUSTER_POINTS, rng))
         centers = _cluster(linear_to_srgb(samples.base_color.clamp(0, 1)), count, rng)
@@ -132,7 +132,7 @@ def _draw_region(base: Surface, rng: np.random.Generator, count: int) -> Region:
 
 
 def _cluster(colors: Tensor, count: int, rng: np.random.Generator, steps: int = 12) -> Tensor:
-    """Centers ``(K, 3)`` of k-means, K at most ``count``: clusters of less than 3 % of the points are dropped."""
+    """Centers ``(K, 3)`` of k-means, K at most ``count``; clusters of less than 3 % of the points are removed."""
     centers = colors[torch.as_tensor(rng.choice(len(colors), count, replace=False))]
     for _ in range(steps):
         nearest = torch.cdist(colors, centers).argmin(1)
@@ -144,7 +144,7 @@ def _cluster(colors: Tensor, count: int, rng: np.random.Generator, steps: int = 
 
 
 def _draw_cut(base: Surface, rng: np.random.Generator) -> Callable[[Tensor], Tensor]:
-    """Mask ``(N,)`` of positions ``(N, 3)``: a half-space, a slab, a ball or the inside of a noise contour."""
+    """A function from positions ``(N, 3)`` to a mask ``(N,)``: a half-space, slab, ball or thresholded noise."""
     low, high = base.vertices.amin(0), base.vertices.amax(0)
     at = low + torch.as_tensor(rng.uniform(0.2, 0.8, 3), dtype=torch.float32) * (high - low)
     axis = np.eye(3)[rng.integers(3)] if rng.random() < 0.6 else rng.normal(size=3)
@@ -194,7 +194,7 @@ def _with_material(p: SurfacePoints, color: Tensor, rough: Tensor, metal: Tensor
 
 
 def _set_finish(folder: Path, rng: np.random.Generator, texels: int) -> Finish:
-    """A material set projected along the three axes, blended by the normal; one to four repeats a unit."""
+    """A material set by triplanar projection, blended by the normal, with 0.8 to 4 repeats per unit."""
     repeats = float(np.exp(rng.uniform(np.log(0.8), np.log(4.0))))
     side = int(np.clip(2 ** np.round(np.log2(texels / repeats)), 32, 512))
     offset = torch.as_tensor(rng.random((3, 2)), dtype=torch.float32)

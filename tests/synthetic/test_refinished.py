@@ -12,7 +12,7 @@ from reli3d.errors import InputError
 from reli3d.geometry.rays import RayScene
 from reli3d.render.color import srgb_to_linear
 from reli3d.render.points import SurfacePoints
-from reli3d.synthetic.dressed import DressedSurface, material_sets
+from reli3d.synthetic.refinished import RefinishedSurface, material_sets
 from reli3d.synthetic.samples import random_faces
 
 PLACEHOLDER = 0.8
@@ -53,7 +53,7 @@ def sets(tmp_path):
 
 def dressed(sets, seed, *, measured):
     rng = np.random.default_rng(seed)
-    surface = DressedSurface(Ball(), sets, rng, measured=measured, texels=256)
+    surface = RefinishedSurface(Ball(), sets, rng, measured=measured, texels=256)
     return surface.points_at(*random_faces(surface, 400, np.random.default_rng(0)))
 
 
