@@ -77,4 +77,4 @@ CASES = {
     "tangents": (tangents, dict(subdivisions=5, size=1024)),
     "glb": (glb, dict(subdivisions=5, size=1024)),
 }
-PEERS = {"dilate": scipy_filling}
+PEERS = {"dilate": ("scipy", scipy_filling)}

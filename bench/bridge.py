@@ -47,4 +47,4 @@ CASES = {
     "stream": (square, dict(n=1 << 22, backward=False)),
     "stream_grad": (square, dict(n=1 << 22, backward=True)),
 }
-PEERS = dict.fromkeys(CASES, torch_square)
+PEERS = dict.fromkeys(CASES, ("torch", torch_square))

@@ -85,4 +85,8 @@ CASES = {
     "sample": (sample, _SIZE),
     "gaussians": (gaussians, dict(n=8192, count=128)),
 }
-PEERS = {"lookup": torch_lookup, "lookup_grad": torch_lookup, "gaussians": torch_gaussians}
+PEERS = {
+    "lookup": ("torch", torch_lookup),
+    "lookup_grad": ("torch", torch_lookup),
+    "gaussians": ("torch", torch_gaussians),
+}

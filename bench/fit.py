@@ -150,4 +150,4 @@ def mitsuba_step(device, size, resolution):
 
 
 CASES = {"step": (step_of_a_fit, dict(size=256, resolution=128))}
-PEERS = {"step": mitsuba_step}
+PEERS = {"step": ("mitsuba", mitsuba_step)}

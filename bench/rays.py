@@ -92,7 +92,13 @@ CASES = {
     "nan": (invalid, dict(n=_N, value=float("nan"))),
     "infinity": (invalid, dict(n=_N, value=float("inf"))),
 }
-PEERS = {"closest": embree_cast, "occluded": embree_cast, "primary": embree_primary, "nan": valid, "infinity": valid}
+PEERS = {
+    "closest": ("embreex", embree_cast),
+    "occluded": ("embreex", embree_cast),
+    "primary": ("embreex", embree_primary),
+    "nan": ("reli3d", valid),
+    "infinity": ("reli3d", valid),
+}
 
 
 def study() -> None:

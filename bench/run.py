@@ -2,8 +2,9 @@
 
 A module holds ``CASES = {"name": (builder, arguments)}``; ``builder(device, **arguments)`` builds the inputs and
 returns ``(step, work)``: the function to time, and how much one call of it does, e.g. ``{"rays": 1 << 20}``.  It may
-hold ``PEERS = {"name": peer_builder}`` with the same arguments, for a named other implementation of the same work that
-is timed in turn with ours.  A builder returns None on a device that its case does not run on.
+hold ``PEERS = {"name": (package, peer_builder)}`` with the same arguments, for another implementation of the same work,
+of a package whose version is printed, that is timed in turn with ours.  A builder returns None on a device that its
+case does not run on.
 
 Each result is one line of JSON in ``bench/results/<machine>.jsonl``.  ``--record`` writes the ratios, our time by the
 peer's, to ``bench/baseline.json`` under this kind of machine (:func:`kind`), which ``pytest bench/`` compares with.
@@ -40,6 +41,7 @@ class Case:
     builder: Callable
     arguments: dict
     peer: Callable | None
+    package: str | None  # of the peer
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,7 @@ class Result:
     work: dict
     ours: Timing
     peer: Timing | None
+    peer_name: str | None  # package and version
 
     @property
     def ratio(self) -> float | None:
@@ -63,7 +66,8 @@ def collect() -> dict[str, Case]:
         module = importlib.import_module(f"bench.{path.stem}")
         peers = getattr(module, "PEERS", {})
         for name, (builder, arguments) in getattr(module, "CASES", {}).items():
-            found[f"{path.stem}.{name}"] = Case(builder, arguments, peers.get(name))
+            package, peer = peers.get(name, (None, None))
+            found[f"{path.stem}.{name}"] = Case(builder, arguments, peer, package)
     return found
 
 
@@ -74,7 +78,8 @@ def measure(case: Case, device: torch.device, *, seconds: float) -> Result | Non
         return None
     peer = case.peer(device, **case.arguments) if case.peer else None
     timings = time_steps([ours[0]] + ([peer[0]] if peer else []), device, seconds=seconds)
-    return Result(ours[1], timings[0], timings[1] if peer else None)
+    name = f"{case.package} {metadata.version(case.package)}" if peer else None
+    return Result(ours[1], timings[0], timings[1] if peer else None, name)
 
 
 def line(name: str, result: Result) -> str:
@@ -83,7 +88,8 @@ def line(name: str, result: Result) -> str:
     text = f"{name:32s} {1e3 * t.median:10.3f} ms [{1e3 * t.p10:.3f}, {1e3 * t.p90:.3f}]"
     text += "".join(f"  {_short(n / t.median)} {unit}/s" for unit, n in result.work.items())
     text += "" if t.peak_bytes is None else f"  +{t.peak_bytes / 2**20:.0f} MiB"
-    text += "" if result.ratio is None else f"  {result.ratio:.3f} x peer ({1e3 * result.peer.median:.3f} ms)"
+    if result.peer:
+        text += f"  {result.ratio:.3f} x {result.peer_name} ({1e3 * result.peer.median:.3f} ms)"
     return text + "".join(f"\n    {stage:28s} {1e3 * s:10.3f} ms" for stage, s in t.stages.items())
 
 
@@ -172,7 +178,7 @@ def main(argv: list[str] | None = None) -> int:
                 "work": result.work,
                 **asdict(result.ours),
                 "ratio": result.ratio,
-                "peer": None if result.peer is None else asdict(result.peer),
+                "peer": None if result.peer is None else {"name": result.peer_name, **asdict(result.peer)},
                 "arguments": case.arguments,
                 **about,
             }

@@ -156,7 +156,7 @@ CASES = {
     "direct_grad": (direct, dict(size=128, roughness=0.4, backward=True)),
     "outline_grad": (outline, dict(size=512)),
 }
-PEERS = {"direct": mitsuba_direct, "direct_grad": mitsuba_direct}
+PEERS = {"direct": ("mitsuba", mitsuba_direct), "direct_grad": ("mitsuba", mitsuba_direct)}
 
 
 def _own_formula(roughness, mi, base):

@@ -86,4 +86,4 @@ def hull(device, size, n):
 CASES = {f"extract_{n}": (extraction, dict(n=n, backward=False)) for n in (32, 80, 128, 256)}
 CASES |= {f"extract_grad_{n}": (extraction, dict(n=n, backward=True)) for n in (32, 80, 128, 256)}
 CASES |= {"components_80": (components, dict(n=80)), "hull_80": (hull, dict(size=512, n=80))}
-PEERS = {"extract_80": torch_extraction, "extract_grad_80": torch_extraction}
+PEERS = {"extract_80": ("torch", torch_extraction), "extract_grad_80": ("torch", torch_extraction)}

@@ -45,7 +45,9 @@ def test_case_keeps_its_ratio_to_the_peer(device, name, rows):
     if result.ratio > limit:
         result = measure(CASES[name], device, seconds=AGAIN)
     rows.append(line(name, result) + f"  at most {limit:.3f}")
-    assert result.ratio <= limit, f"{name}: {result.ratio:.3f} x peer, at most {limit:.3f} on {kind(device)}"
+    assert result.ratio <= limit, (
+        f"{name}: {result.ratio:.3f} x {result.peer_name}, at most {limit:.3f} on {kind(device)}"
+    )
 
 
 def test_a_kind_without_a_ratio_is_held_to_the_looser_bound_by_the_worst_of_the_others():

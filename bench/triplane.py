@@ -67,4 +67,4 @@ CASES = {
     }.items()
     if threads == 2 or not variant or variant == "_channel_last"
 }
-PEERS = dict.fromkeys(CASES, torch_triplane)
+PEERS = dict.fromkeys(CASES, ("torch", torch_triplane))

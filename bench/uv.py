@@ -29,4 +29,4 @@ def xatlas_atlas(device, subdivisions, texture_size):
 
 
 CASES = {"atlas": (atlas, dict(subdivisions=5, texture_size=1024))}
-PEERS = {"atlas": xatlas_atlas}
+PEERS = {"atlas": ("xatlas", xatlas_atlas)}

@@ -60,4 +60,4 @@ def torch_blend(device, n, resolution, step):
 
 _SIZE = dict(n=16384, resolution=128, step=0.01)
 CASES = {"march": (march, _SIZE), "composite_grad": (blend, _SIZE)}
-PEERS = {"composite_grad": torch_blend}
+PEERS = {"composite_grad": ("torch", torch_blend)}
