@@ -1,5 +1,7 @@
-"""Pipeline from posed images to a relightable asset: one function per stage, :func:`reconstruct` that runs them, and
-:func:`reconstruct_folder` from the files of an object to those of its result.
+"""Pipeline from posed images to a relightable asset.
+
+One function per stage, :func:`reconstruct`, which runs them, and :func:`reconstruct_folder`, which reads an object
+folder and writes the result.
 """
 
 from __future__ import annotations
@@ -47,23 +49,23 @@ from reli3d.views.views import Views
 if TYPE_CHECKING:
     from reli3d.fit.refine import Refinement
 
-REFINED = 384  # pixels of the views that a refinement compares with
-INSIDE = 2.0  # pixels of such a view that a silhouette's edge may spill over
+REFINED = 384  # pixels per side of the views that a refinement compares with
+INSIDE = 2.0  # pixels from the silhouette within which colors may be mixed with the background
 MIN_PART_FRACTION = 0.01  # of the faces; smaller components are removed
-TEXELS = 1 << 19  # evaluated at once on a CPU, where no features are kept: 100 bytes each
-SHADING_POINTS = 4096  # vertices by which the light on the object is judged
-OUTSIDE = 1.0  # field value of grid points that the silhouettes exclude
+TEXELS = 1 << 19  # evaluated at once on a CPU: 100 bytes each
+SHADING_POINTS = 4096  # vertices from which the lighting on the object is estimated
+OUTSIDE = 1.0  # field value of grid points outside the visual hull
 MARGIN_CELLS = 2.5  # cells around the silhouettes' hull in which the field is still evaluated
 
 
 class NoSurface(InputError):
-    """The field of an object has one sign in its whole box."""
+    """The field of an object has one sign in the whole box, so there is no surface."""
 
 
 def encode(model: Network, prepared: Prepared, *, background: bool = False) -> Field:
-    """Run the network on the views of one object.
+    """Runs the network on the views of one object.
 
-    background: whether the illumination path of a :class:`Reconstructor` may look past the masks.
+    background: whether the illumination branch of a :class:`~reli3d.nn.model.Reconstructor` sees the background.
     """
     batch = prepared.batch
     if isinstance(model, LocalReconstructor):
@@ -85,13 +87,13 @@ def encode(model: Network, prepared: Prepared, *, background: bool = False) -> F
 
 
 def extract(field: Field, resolution: int) -> Mesh:
-    """Closed surface of the field on ``resolution`` cubes a side, without small loose pieces; model frame.
+    """Closed surface of the field on a grid of ``resolution`` cubes per side, in the model frame.
 
-    Raises NoSurface, an InputError, where the field has none.
+    Components below MIN_PART_FRACTION of the faces are removed.  Raises NoSurface, an InputError, if there is none.
     """
     if isinstance(field, LocalField):
         mesh = largest_components(_bounded_surface(field, resolution), MIN_PART_FRACTION)
-        mesh = taubin_smooth(mesh, iterations=field.model.preset.smoothing)  # predictions are noisy from cell to cell
+        mesh = taubin_smooth(mesh, iterations=field.model.preset.smoothing)  # predictions are noisy between cells
     elif isinstance(field, TriplaneField):
         mesh = largest_components(_free_surface(field, resolution), MIN_PART_FRACTION)
     else:
@@ -113,13 +115,13 @@ def _free_surface(field: TriplaneField, resolution: int) -> Mesh:
 
 
 def _bounded_surface(field: LocalField, resolution: int) -> Mesh:
-    """Surface within the silhouettes' hull, with all cubes on its bounding box."""
+    """Surface inside the visual hull, on a grid that covers the hull's bounding box."""
     preset, maps = field.model.preset, field.maps
     radius = preset.radius
     radius = min(radius, _hull_reach(field, resolution) + 2 * MARGIN_CELLS * radius / resolution)
     axis = torch.linspace(-radius, radius, resolution + 1, device=maps.images.device, dtype=torch.float32)
     cell = 2 * radius / resolution / preset.softness
-    bound = field.grid_bound(axis, FIELD_MAX + 4 * cell)  # what is farther outside than FIELD_MAX changes nothing
+    bound = field.grid_bound(axis, FIELD_MAX + 4 * cell)  # values above FIELD_MAX do not affect the result
     near = bound < MARGIN_CELLS * cell
 
     def evaluate(index: Tensor) -> Tensor:
@@ -163,16 +165,17 @@ def _grid(resolution: int, radius: float, device: torch.device) -> Tensor:
 def texture(
     field: Field, mesh: Mesh, size: int, scene: RayScene | None, *, uv: str = "project"
 ) -> tuple[Mesh, TextureSet]:
-    """The mesh with an atlas, normals and tangents, and its maps of ``size`` texels; the faces keep their order.
+    """``mesh`` with UV, normals and tangents, and its textures of ``size`` texels per side; the faces keep their order.
 
-    scene: rays against ``mesh``, for a network that uses which view sees a point, else None.
+    scene: rays against ``mesh``, for a network that uses the visibility of points in the views; otherwise None.  uv:
+    ``project`` or ``xatlas``.
     """
     if uv not in ("project", "xatlas"):
         raise InputError("uv", f"expected project or xatlas, got {uv}")
     maps = field.maps
 
     def at_vertices(field: LocalField, mesh: Mesh) -> tuple[LocalField, Tensor]:
-        """The field with its light, and, at vertices, which lie as close as the network's cells, heads and who sees."""
+        """The field with its lighting; head outputs and visibility at the vertices, which are as dense as the grid."""
         every = slice(None, None, max(1, len(mesh.vertices) // SHADING_POINTS))
         position, normal = mesh.vertices, present("mesh.normals", mesh.normals)
         visible = maps.visibility(present("scene", scene), position, normal)
@@ -199,21 +202,20 @@ def texture(
         found = {"base_color": got.base_color, "roughness": got.roughness[:, None], "metallic": got.metallic[:, None]}
         return {**found, "normal": encode_normals(got.normal, normal, tangent)}
 
-    ask = partial(in_rows, surface)
     chunk = CHUNK if mesh.vertices.is_cuda else TEXELS
-    baked = bake(mesh, size, ask, chunk=chunk, tangents=True, values=known)
+    baked = bake(mesh, size, partial(in_rows, surface), chunk=chunk, tangents=True, values=known)
     return mesh, TextureSet(**{k: v.clamp_(0, 1) for k, v in baked.items()})
 
 
 def light(field: Field) -> Environment:
-    """The environment of the field, in the world's axes."""
+    """The predicted environment, in the axes of the model frame."""
     return Environment(field.radiance_map().contiguous())
 
 
 def match_brightness(asset: Asset, maps: ViewMaps, scene: RayScene) -> Asset:
-    """``asset`` with estimated base color and its light scaled to match the colors of the views of ``maps``.
+    """``asset`` with base color and lighting rescaled to reproduce the colors of the views of ``maps``.
 
-    Images determine only the product of albedo and light; see :mod:`reli3d.render.exposure`.
+    Images determine only the product of albedo and lighting; see :mod:`reli3d.render.exposure`.
     """
     maps = maps.inputs
     return estimate_base_color_and_light(asset, maps.images[..., :3], maps.images[..., 3] > INSIDE, maps.camera, scene)
@@ -221,7 +223,7 @@ def match_brightness(asset: Asset, maps: ViewMaps, scene: RayScene) -> Asset:
 
 @full_precision
 def transform_asset(asset: Asset, similarity: Similarity) -> Asset:
-    """``asset`` moved by ``similarity``; normals, tangents and the light turn with it."""
+    """``asset`` transformed by ``similarity``: positions, normals, tangents and environment."""
     mesh, rotation = asset.mesh, similarity.rotation.to(asset.mesh.vertices)
     normals, tangents = present("mesh.normals", mesh.normals), present("mesh.tangents", mesh.tangents)
     tangents = torch.cat([tangents[:, :3] @ rotation.T, tangents[:, 3:]], -1)
@@ -236,8 +238,8 @@ def transform_asset(asset: Asset, similarity: Similarity) -> Asset:
 
 
 def _check_place(near: Mesh, mesh: Mesh) -> None:
-    """Raise InputError where vertices that differ in ``near`` meet in ``mesh``, the same elsewhere: float32 is coarse
-    far from the origin.
+    """Raises InputError if vertices of ``near`` coincide in ``mesh``, its transform: float32 is coarse far from the
+    origin.
     """
     low, high = mesh.vertices.aminmax(dim=0)
     far, size = float(torch.maximum(-low, high).max()), float((high - low).max())
@@ -245,12 +247,12 @@ def _check_place(near: Mesh, mesh: Mesh) -> None:
         raise InputError(
             "views",
             f"expected an object near the origin, got one of size {size:.3g} at {far:.3g}; "
-            "subtract its place from the positions of the cameras",
+            "subtract its position from those of the cameras",
         )
 
 
 class Stopwatch:
-    """Seconds of each stage, in the order they ran, and notes; waits for the device before it reads the clock."""
+    """Seconds of each stage in the order of execution, and notes; synchronizes the device before reading the clock."""
 
     def __init__(self, device: torch.device, report=None):
         self.seconds: dict[str, float] = {}
@@ -269,20 +271,24 @@ class Stopwatch:
 
 
 def default_normalization(preset: Preset | LocalPreset) -> str:
-    """``none`` where views go in as the release prepares them, poses as stored; else ``auto``."""
+    """``none`` for presets with the published preprocessing, which uses poses as stored; otherwise ``auto``."""
     return "none" if published_input(preset) else "auto"
 
 
 @dataclass(frozen=True)
 class ReconstructOptions:
-    """How :func:`reconstruct` works.  Raises InputError on a value out of range.
+    """Options of :func:`reconstruct`.
 
-    texture_size: 256 to 4096 texels.  resolution: cubes a side of the surface grid, 16 to 256; None is the preset's.
-    normalization: ``auto``, ``hull``, ``none``, or the map from the input frame to the model's; None is
-    :func:`default_normalization`.  up: the axis of the cameras' frame that becomes +Y in the asset.  uv: ``project`` or
-    ``xatlas``.  hero: index of the reference view.
-    background: ``masked``, ``visible`` or ``auto``, see :func:`~reli3d.views.published_views.background_shown`.
-    symmetry: ``auto`` or ``off``, see :func:`~reli3d.prepare.completed`; for the network of convolutions.
+    texture_size: texels per side, 256 to 4096.  resolution: cubes per side of the surface grid, 16 to 256; None: of the
+    preset.  normalization: how the object is placed in the model's cube: ``hull`` (centered and scaled by the visual
+    hull), ``none`` (poses as stored), ``auto`` (hull unless the object already fits), or a
+    :class:`~reli3d.views.similarity.Similarity` from the input to the model frame; None: ``auto``, for official weights
+    ``none``.  up: axis of the cameras' world frame that becomes +Y, ``x``, ``y``, ``z`` or one with a minus sign.  uv:
+    ``project`` or ``xatlas``.  hero: index of the reference view.  background: input of the lighting estimate:
+    ``masked`` (object only), ``visible`` or ``auto``.  seed: of torch's generator, and of the refinement of
+    ``reli3d-infer --refine``; the networks draw no random numbers, so it does not change a reconstruction.  symmetry:
+    ``auto`` completes objects with a detected mirror plane (small network only), or ``off``.  Raises InputError for a
+    value out of range.
 
     >>> options = reli3d.ReconstructOptions(texture_size=512, symmetry="off")
     >>> asset = reli3d.reconstruct(reli3d.load_views("photos/shoe"), options=options)
@@ -312,7 +318,7 @@ DEFAULT = ReconstructOptions()
 
 @dataclass(frozen=True)
 class Placed:
-    """Views in the order in which a network takes them, and the frames that it and the asset have."""
+    """Views in the order of the network's input, and the transforms to the model frame and to that of the asset."""
 
     views: Views
     model_from_input: Similarity
@@ -321,10 +327,9 @@ class Placed:
 
 @full_precision
 def place(views: Views, preset: Preset | LocalPreset, options: ReconstructOptions = DEFAULT) -> Placed:
-    """The views with the hero first, and the frames.
+    """The views with the reference view first, and the transforms to the frames of model and asset.
 
-    If poses are used as stored by default and the object does not fit the model's box, ``notes`` of the views report
-    it.
+    If poses are used as stored by default and the object does not fit the model's cube, ``notes`` of the views say so.
     """
     normalization = options.normalization
     if normalization is None:
@@ -340,11 +345,17 @@ def place(views: Views, preset: Preset | LocalPreset, options: ReconstructOption
 @full_precision
 def reconstruct(views: Views, *, weights: str | Network = "small", device: str = "cpu",
                 options: ReconstructOptions = DEFAULT, watch: Stopwatch | None = None) -> Asset:  # fmt: skip
-    """A relightable asset from posed photographs of one object.
+    """Reconstructs a relightable asset from posed images of one object.
 
-    views: 1 to 16, see :func:`reli3d.views.folder.load_views`.  weights: ``small`` (in the package), a safetensors
-    file, or a loaded network.  watch: filled with the seconds of each stage.  The same input and options give the same
-    asset.  Raises InputError where the masks hold no object, NoSurface where the field holds none.
+    views: 1 to 16, see :func:`reli3d.load_views`.  weights: ``small`` (bundled), ``official`` (after ``reli3d
+    download``), the path of a safetensors file, or a loaded network.  device: ``cpu`` or ``cuda``, ignored for a loaded
+    network; the asset is on the device of the network.  options: see :class:`ReconstructOptions`.  watch: receives the
+    seconds of each stage.
+
+    The asset is in the frame of the cameras, in their units, with ``options.up`` as +Y.  Deterministic.  Runs under
+    ``torch.no_grad``, so nothing has gradients; :func:`refine` optimizes the result.  Raises TypeError unless ``views``
+    are Views; InputError if the masks have no common object, or for weights that cannot be read; NoSurface, an
+    InputError, if the network predicts no surface.  Source: the ReLi3D paper, ICLR 2026.
 
     >>> asset = reli3d.reconstruct(reli3d.load_views("photos/shoe", views=4))
     >>> reli3d.write_glb("shoe.glb", asset)
@@ -372,7 +383,7 @@ def reconstruct_placed(placed: Placed, model: Network, options: ReconstructOptio
             prepared = completed(prepared)
         if prepared.mirrored:
             watch.notes.append(
-                "symmetry: the silhouettes fit a mirror plane; photographs are also read as views of the other half"
+                "symmetry: the silhouettes have a mirror plane; mirrored views complete unobserved surfaces"
             )
     with watch.stage("network"):
         field = encode(model, prepared, background=shown)
@@ -394,11 +405,14 @@ def reconstruct_placed(placed: Placed, model: Network, options: ReconstructOptio
 
 @full_precision
 def refine(asset: Asset, views: Views, *, seconds: float | None = None, steps: int | None = None, **options) -> Asset:
-    """Refines ``asset`` by inverse rendering of its input views; parts of the fit that degrade held-out views are
-    dropped.
+    """Refines mesh, maps and lighting of ``asset`` by inverse rendering of ``views``.
 
-    views: any number, in the frame of ``asset`` (that of :func:`reconstruct`, unless its options name another).
-    seconds or steps: one of the two.  options: of :func:`reli3d.fit.refine.refine`.  Raises TypeError, ValueError.
+    Some views are held out; parts of the fit that increase their error are discarded.
+
+    views: any number, in the frame of ``asset``: that of the cameras unless ``ReconstructOptions.up`` changed it.
+    seconds, steps: duration of the optimization, one of the two; ``steps`` is reproducible.  options: of
+    :func:`reli3d.fit.refine.refine`.  Returns a new asset without gradients.  Raises TypeError for a wrong type,
+    ValueError unless exactly one of ``seconds`` and ``steps`` is given.
 
     >>> views = reli3d.load_views("photos/shoe")
     >>> asset = reli3d.refine(reli3d.reconstruct(views), views, seconds=60)
@@ -408,7 +422,7 @@ def refine(asset: Asset, views: Views, *, seconds: float | None = None, steps: i
 
 @full_precision
 def refined(asset: Asset, views: Views, **options) -> Refinement:
-    """:func:`refine` with its record."""
+    """As :func:`refine`; returns the asset with the record of the fit."""
     from reli3d.fit import refine as fit  # imported where it is used: it loads kernels of its own
 
     device = asset.mesh.vertices.device
@@ -416,21 +430,21 @@ def refined(asset: Asset, views: Views, **options) -> Refinement:
 
 
 class Progress:
-    """What :func:`reconstruct_folder` reports to: nothing here; commands show a bar."""
+    """Progress callbacks of :func:`reconstruct_folder`, without effect; commands override them."""
 
     def __call__(self, stage: str) -> None:
-        """A stage begins."""
+        """Called at the start of each stage."""
 
     def report(self, notes: Iterable[str]) -> None:
-        """Notes on the object, a line each."""
+        """Called with notes on the object, one line each."""
 
 
 @dataclass(frozen=True)
 class FolderOptions:
-    """Which photographs of a folder :func:`reconstruct_folder` reads, and whether it refines the result.
+    """Which images of a folder :func:`reconstruct_folder` reads, and whether it refines the result.
 
-    views, masks, remove_background: of :func:`~reli3d.views.folder.load_views`.  budget: ``seconds`` or ``steps`` of a
-    refinement to all photographs, empty for none.  cameras: it corrects the cameras as well.  interrupt: as of
+    views, masks, remove_background: as in :func:`~reli3d.views.folder.load_views`.  budget: ``seconds`` or ``steps`` of
+    a refinement with all images; empty: none.  cameras: also optimize the cameras.  interrupt: as in
     :func:`reli3d.fit.refine.refine`.
     """
 
@@ -464,10 +478,11 @@ def reconstruct_folder(
     options: ReconstructOptions = DEFAULT,
     progress: Progress | None = None,
 ) -> None:
-    """Reconstruct the object of ``folder``, refine it where ``reading`` has a budget, and write its result.
+    """Reconstructs the object of ``folder``, refines it if ``reading`` has a budget, and writes the result.
 
-    name: title of the viewer page.  replacing: of :func:`reli3d.output.results.claim`.  weights: their record.
-    Raises InputError, with the likely cause where the cameras are suspect, and OSError; the old result then stays.
+    name: title of the viewer page.  replacing: from :func:`reli3d.output.results.claim`.  weights: record of the
+    weights for ``run_info.json``.  Raises InputError, with the likely cause if the cameras are implausible, and
+    OSError; an earlier result is then kept.
     """
     from reli3d.output import results
     from reli3d.output.preview import comparison, preview
@@ -479,7 +494,7 @@ def reconstruct_folder(
         photographs = reading.read(folder, whole=whole)
     views = photographs.taken()
     if options.up == "y" and (axis := up_axis(views.c2w)) not in (None, "y"):
-        views = replace(views, notes=(*views.notes, f"the cameras stand upright about {axis}: try --up {axis}"))
+        views = replace(views, notes=(*views.notes, f"the cameras suggest {axis} as the up axis: try --up {axis}"))
     progress.report(views.notes)
     with _diagnosed(views):
         with watch.stage("normalize"):
@@ -504,10 +519,10 @@ def reconstruct_folder(
         frames, moved = results.frame_record(placed.model_from_input, output, views.origin, options.up)
         frames["weights"] = dict(weights)
         on_device = shown.to(model.device)
-        picture = preview(asset, on_device, scene)  # the longest tasks first, so that the threads end at about one time
+        sheet = preview(asset, on_device, scene)  # the longest tasks first, to balance the threads
         measured = results.measure(asset.mesh, scene, on_device)
         encoded = results.encode(asset, shown, frames, name=name, before=first, translation=moved, scene=scene)
-        drawn, measures = picture(), measured()
+        drawn, measures = sheet(), measured()
     info = {
         "object": name,
         "views": list(views.names),
@@ -534,7 +549,7 @@ def reconstruct_folder(
 
 @contextmanager
 def _diagnosed(views: Views) -> Iterator[None]:
-    """Adds what :mod:`reli3d.views.check` suspects to an InputError of the block, where it suspects something."""
+    """Appends the verdict of :mod:`reli3d.views.check` to an InputError of the block if the cameras are implausible."""
     try:
         yield
     except InputError as error:

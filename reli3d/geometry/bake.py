@@ -200,14 +200,18 @@ def bake(
     values: Tensor | None = None,
     fill: bool = True,
 ) -> dict[str, Tensor]:
-    """Maps ``{name: (size, size, C)}`` of ``fn(position (N, 3), normal (N, 3))`` over the surface.
+    """Evaluates ``fn`` at the texels of an atlas; returns maps ``{name: (size, size, C)}`` float32.
 
-    fn: returns ``{name: (N, C)}``, or one tensor (named "value"), float32.  It is called at the valid texels, at most
-    ``chunk`` at a time, without gradient.  If it works point by point, the result does not depend on ``chunk``.
-    texels: of :func:`rasterize_texels`, to use them again.  tangents: ``fn`` takes the tangents ``(N, 4)`` as third
-    argument.  values: numbers of the vertices, ``(V, C)``, which ``fn`` takes, interpolated, as last argument.  fill:
-    every other texel takes the value of the nearest valid one (:func:`dilate`); otherwise it is 0.  Raises ValueError
-    if the surface covers no texel, or ``fn`` changes its outputs from chunk to chunk.
+    mesh: with ``uv``, of which the part in [0, 1] is baked.  size: texels per side, 1 to 16384; row 0 is v = 0.  fn:
+    called as ``fn(position (N, 3), normal (N, 3))`` with at most ``chunk`` surface points at a time, under
+    ``torch.no_grad``; returns ``{name: (N, C)}``, or one tensor, which is named "value".  Values are stored unchanged,
+    in any range; :class:`~reli3d.render.asset.TextureSet` expects [0, 1].  texels: from
+    :func:`~reli3d.geometry.bake.rasterize_texels`, for reuse.  tangents: pass the tangents ``(N, 4)`` as third
+    argument.  values: vertex attributes ``(V, C)``, interpolated and passed as last argument.  fill: extend the values
+    to all other texels from the nearest valid one; otherwise they are 0.
+
+    No gradient.  Raises TypeError for a wrong type or dtype; ValueError without ``uv``, if the surface covers no texel,
+    or if ``fn`` returns other shapes or names for different chunks.
 
     >>> maps = reli3d.bake(mesh, 64, lambda position, normal: 0.5 + 0.5 * normal)
     >>> textures = reli3d.TextureSet(maps["value"], roughness=0.5, metallic=0.0)

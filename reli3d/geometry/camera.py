@@ -29,11 +29,12 @@ DEPTH_RATIO_MIN = (
 
 @dataclass(frozen=True)
 class Camera:
-    """One pinhole camera, or a batch of cameras of one image size.
+    """One pinhole camera, or a batch of cameras with the same image size.
 
-    c2w: ``(..., 4, 4)`` camera-to-world, OpenGL axes: +X right, +Y up, looks along -Z.  intrinsics: ``(..., 4)`` as
-    ``fx, fy, cx, cy`` in pixels, y down, pixel centers at +0.5.  width, height: pixels.  Leading axes are equal.
-    Gradients pass through.  Raises TypeError or ValueError for a dtype, shape or device.
+    c2w: ``(..., 4, 4)`` float32 camera-to-world, OpenGL axes: +X right, +Y up, looks along -Z.  intrinsics:
+    ``(..., 4)`` float32 as ``fx, fy, cx, cy`` in pixels, y down, pixel centers at +0.5.  width, height: pixels, at
+    least 1.  The batch axes are equal.  Gradients pass through.  Raises TypeError for a dtype, ValueError for a shape,
+    size or device.
 
     >>> camera = reli3d.Camera.from_fov(reli3d.look_at([0.0, 0.5, 3.0]), 0.7, 64, 48)  # fov_x in radians
     >>> origins, directions = reli3d.camera_rays(camera)
@@ -59,7 +60,12 @@ class Camera:
 
     @classmethod
     def from_fov(cls, c2w: Tensor, fov_x: float, width: int, height: int) -> Camera:
-        """Camera with the horizontal field of view ``fov_x`` [rad], square pixels and the axis at the image center."""
+        """Camera with square pixels and the principal point at the image center.
+
+        c2w: ``(..., 4, 4)`` float32 camera-to-world, such as from :func:`look_at`.  fov_x: full horizontal field of
+        view in radians, in (0, pi); ``fx = fy = width / (2 tan(fov_x / 2))``.  width, height: pixels.  Gradients reach
+        ``c2w``.  Raises TypeError for a dtype, ValueError for a shape, size or field of view out of range.
+        """
         c2w = tensor_of(c2w)
         check("c2w", c2w, last=4)
         if not 0.0 < fov_x < torch.pi:
@@ -82,7 +88,7 @@ class Camera:
 
     @property
     def position(self) -> Tensor:
-        """Eye position, ``(..., 3)``."""
+        """Camera position, ``(..., 3)``."""
         return self.c2w[..., :3, 3]
 
     def resized(self, width: int, height: int) -> Camera:
@@ -123,9 +129,11 @@ def image_plane(camera: Camera) -> tuple[Tensor, Tensor]:
 
 @full_precision
 def camera_rays(camera: Camera) -> tuple[Tensor, Tensor]:
-    """Origins and unit directions through all pixel centers, both ``(..., H, W, 3)``, world frame.
+    """Rays through all pixel centers: origins and unit directions, both ``(..., H, W, 3)`` float32, world frame.
 
-    The origins are an expanded view of the eye.  Gradients reach ``c2w`` and ``intrinsics``.
+    Row 0 is the top row of the image.  Origins are the camera position, expanded without a copy.  Hits of unit
+    directions have ``t`` as Euclidean distance, not depth along the viewing axis.  Gradients reach ``c2w`` and
+    ``intrinsics``.
 
     >>> origins, directions = reli3d.camera_rays(camera)  # (H, W, 3) each
     >>> hits = reli3d.RayScene(mesh).intersect(origins, directions)
@@ -182,10 +190,11 @@ def look_at(
     target: Tensor | Sequence[float] = (0.0, 0.0, 0.0),
     up: Tensor | Sequence[float] = (0.0, 1.0, 0.0),
 ) -> Tensor:
-    """Camera-to-world ``(..., 4, 4)`` at ``eye`` looking to ``target``, image up towards ``up``; all ``(..., 3)``.
+    """Camera-to-world matrix ``(..., 4, 4)`` of a camera at ``eye`` that looks at ``target``, with ``up`` upwards.
 
-    Lists of numbers are taken too, on the device of the first tensor among the three.  Batch axes broadcast.  ``up``
-    parallel to the view raises ValueError.
+    eye, target, up: ``(..., 3)`` float32 tensors or lists of numbers; batch axes broadcast.  Lists go to the device of
+    the first tensor.  Gradients reach all three.  Raises TypeError for a dtype, ValueError for a shape or if ``up`` is
+    parallel to the viewing direction.
 
     >>> pose = reli3d.look_at([0.0, 0.5, 3.0], [0.0, 0.0, 0.0])
     >>> camera = reli3d.Camera.from_fov(pose, 0.7, 64, 48)

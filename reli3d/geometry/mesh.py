@@ -21,12 +21,13 @@ NORMAL_MIN = 1.0e-20  # squared length of an area-weighted normal sum below whic
 
 @dataclass(frozen=True)
 class Mesh:
-    """Triangle mesh on one device, without textures.
+    """Triangle mesh on one device, with optional vertex attributes.
 
     vertices: ``(V, 3)`` float32.  faces: ``(F, 3)`` int32, counter-clockwise seen from outside.  normals: ``(V, 3)``
     unit.  uv: ``(V, 2)``, u right, v down, as glTF.  tangents: ``(V, 4)`` unit, w = +-1, bitangent = w cross(normal,
-    tangent).  The last three may be None.  Numpy arrays and other integers are taken if the conversion is exact.
-    Gradients pass through.  Raises TypeError or ValueError for a dtype, shape, device or a face index out of range.
+    tangent).  colors: ``(V, 3)`` linear factors of the base color.  Numpy arrays and other integer types are converted
+    if the conversion is exact.  Gradients pass through.  Raises TypeError for a dtype, ValueError for a shape, device
+    or a face index out of range.
 
     >>> triangle = reli3d.Mesh(torch.eye(3), torch.tensor([[0, 1, 2]]))
     >>> scene = reli3d.RayScene(triangle)

@@ -25,15 +25,14 @@ THREAD_SLICES = 2  # of a large call for each thread: the more rays are ordered 
 
 
 class RayScene:
-    """Acceleration structure for rays against one triangle mesh; keeps its own copy of the geometry, without gradient.
+    """Acceleration structure (BVH) for rays against one triangle mesh; holds a copy of the geometry, without gradient.
 
-    mesh: a :class:`~reli3d.geometry.mesh.Mesh`, or its vertices ``(V, 3)`` float32 with ``faces (F, 3)`` int32.  Numpy
-    arrays and other integers are taken if the conversion is exact.  Faces without area are never hit; without faces
-    every ray misses.  backend: ``embree`` (CPU, robust mode), ``warp`` (CPU and CUDA), or ``auto``: Embree on the CPU,
-    where it is about 3 times faster on incoherent rays, Warp on CUDA.  Warp's tree is split by surface area, since its
-    other trees lose more rays at vertices; on CUDA it is built on the host, and :meth:`refit` is the fast way to move
-    vertices.  For gradients of the vertices pass them to :meth:`intersect` again.  Raises TypeError or ValueError for a
-    wrong kind, dtype or shape, an index out of range or a vertex that is not finite.
+    mesh: a :class:`~reli3d.geometry.mesh.Mesh`, or its vertices ``(V, 3)`` float32 with ``faces (F, 3)`` int32.
+    Degenerate faces are never hit; without faces every ray misses.  backend: ``embree`` (CPU, robust mode), ``warp``
+    (CPU and CUDA), or ``auto``: Embree on the CPU, where it is about 3 times faster than Warp on incoherent rays, and
+    Warp on CUDA, where the BVH is built on the host.  :meth:`refit` updates moved vertices.  For gradients to the
+    vertices pass them to :meth:`intersect`.  Raises TypeError for a wrong type or dtype; ValueError for a shape, an
+    index out of range, vertices that are not finite, or ``embree`` on CUDA.
 
     >>> scene = reli3d.RayScene(mesh)
     >>> hits = scene.intersect(origins, directions, vertices=mesh.vertices)
@@ -66,10 +65,10 @@ class RayScene:
         self._build()
 
     def refit(self, vertices: Tensor) -> None:
-        """Move the vertices, ``(V, 3)``, keeping the faces.
+        """Replaces the vertex positions ``(V, 3)``; the faces stay.
 
-        Warp refits its boxes, which traverse slower after large motion; Embree builds anew.  Raises as the constructor
-        does, and then leaves the scene as it was.
+        Warp refits the bounding boxes, which slows down traversal after large motion; Embree rebuilds.  Raises the
+        errors of the constructor, and then leaves the scene unchanged.
         """
         if vertices.shape != self.vertices.shape:
             raise ValueError(f"vertices: expected shape {tuple(self.vertices.shape)}, got {tuple(vertices.shape)}")
@@ -94,15 +93,15 @@ class RayScene:
     ) -> Hits:
         """First hit of every ray, differentiable in the rays and in ``vertices``.
 
-        origins, directions: ``(..., 3)``, broadcast; ``t`` counts in lengths of ``directions``.  vertices: ``(V, 3)``,
-        the tensor that gradients go to, equal to the positions of the scene; without it the vertices have no gradient.
-        When it has changed, call :meth:`refit` with it first.  t_max: a number or ``(...)``, exclusive.  A miss has
-        ``face = -1``, ``t = inf``, ``bary = 0`` and gradient 0.
+        origins, directions: ``(..., 3)`` float32, broadcast; directions need not be unit, ``t`` is in their lengths.
+        vertices: ``(V, 3)``, the tensor that receives gradients, equal to the positions of the scene (call
+        :meth:`refit` after a change); None: no gradient to the vertices.  t_max: a number or ``(...)``, exclusive.  A
+        miss has ``face = -1``, ``t = inf``, ``bary = 0`` and gradient 0.
 
-        Gradients of ``t`` and ``bary`` reach origins, directions and vertices; which face is hit has none, so
-        silhouettes need :func:`~reli3d.render.silhouette.antialias`.  ``origins + t directions`` is the point with the
-        most digits.  Raises TypeError for a dtype, ValueError for a shape, a device, or positions that are not the
-        scene's.  Source: Moller and Trumbore 1997, in float64.
+        Gradients of ``t`` and ``bary`` reach origins, directions and vertices.  The choice of the face has none, so
+        silhouettes need :func:`reli3d.antialias`.  ``origins + t * directions`` is the most accurate hit position.
+        Raises TypeError for a dtype; ValueError for a shape or device, or if ``vertices`` differ from the scene's.
+        Source: Moller and Trumbore 1997, in float64.
 
         >>> hits = scene.intersect(origins, directions, vertices=v)
         >>> points = origins[hits.valid] + hits.t[hits.valid][:, None] * directions[hits.valid]

@@ -92,17 +92,22 @@ def extract_surface(
     closed: bool = True,
     center: bool = False,
 ) -> Mesh:
-    """Mesh of the isosurface ``sdf == 0`` inside the box, faces counter-clockwise seen from the positive side.
+    """Extracts the isosurface ``sdf == 0`` in the box ``[-radius, radius]^3`` by FlexiCubes.
 
-    sdf: ``(X + 1, Y + 1, Z + 1)`` float32, a signed distance or any other field that is negative inside.  radius: half
-    extent of the box, one or three numbers.  deformation: ``(*sdf.shape, 3)`` offsets of the grid vertices in box
-    extents.  Positive weights, 1 if None: alpha ``(cubes, 8)`` of cube corners, beta ``(cubes, 12)`` of cube edges,
-    gamma ``(cubes,)`` for the split of quads.  cubes: :func:`surface_cubes`, if the weights have rows for these alone.
-    closed: cap the surface flat at the border.  center: four triangles for each quad instead of two.
+    sdf: ``(X + 1, Y + 1, Z + 1)`` float32 at the grid vertices, x first, finite: a signed distance or any other field
+    that is negative inside.  radius: half extent of the box, one or three numbers.  deformation: ``(*sdf.shape, 3)``
+    offsets of the grid vertices as fractions of the box.  alpha ``(cubes, 8)``, beta ``(cubes, 12)``, gamma
+    ``(cubes,)``: positive weights of cube corners, cube edges and the splitting of quads; None: 1.  cubes: from
+    :func:`~reli3d.geometry.surface.surface_cubes` if the weights have rows only for these cubes.  closed: cap the
+    surface at the box.  center: split quads into four triangles around a center vertex instead of two.
 
-    A field of one sign gives no faces (positive) or, if closed, the whole box (negative).  Gradients reach all but
-    ``radius``; gamma only with ``center``.  Bitwise identical for any number of threads.  Raises TypeError or
-    ValueError.
+    Faces are counter-clockwise seen from the positive side.  A field of one sign is valid: a positive one gives an
+    empty mesh, a negative one the box if ``closed``.  Gradients reach sdf, deformation, alpha, beta and, with
+    ``center``, gamma.  Bitwise identical for any number of threads.
+
+    Raises TypeError for a dtype; ValueError for a wrong shape, NaN or infinity in ``sdf``, a radius or ``gamma`` that is
+    not positive, alpha, beta or deformation that give vertices that are not finite, ``cubes`` that are not those of
+    ``sdf``, and 2^31 grid vertices or more.  Source: Shen et al. 2023.
 
     >>> x = torch.linspace(-1, 1, 17)
     >>> ball = reli3d.extract_surface((x**2 + x[:, None] ** 2 + x[:, None, None] ** 2).sqrt() - 0.5, radius=1.0)

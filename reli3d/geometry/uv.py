@@ -75,12 +75,15 @@ def _check(mesh: Mesh, texture_size: int) -> None:
 
 
 def unwrap(mesh: Mesh, *, texture_size: int = 1024) -> Mesh:
-    """The mesh with ``uv``; vertices are split at the borders of charts, the faces keep their order.
+    """Adds a texture atlas to a mesh: ``uv (V', 2)`` in [0, 1], u right, v down, without overlap.
 
-    Every face has positive UV area.  Charts are separated by a guard band (:func:`guard_band`), which is smaller only
-    if there are too many charts for the texture.  Normals are kept, or computed before the split, so that shading is
-    smooth across charts.  Any triangle mesh is accepted: open, non-manifold, disconnected, with degenerate faces.  The
-    result is deterministic.  Raises TypeError or ValueError for an invalid mesh, no faces, or NaN.
+    texture_size: texels per side, 16 to 16384, for which the gaps between charts are sized, see
+    :func:`~reli3d.geometry.uv.guard_band`.  Vertices are split at chart borders; faces keep their order, and each has
+    positive UV area.  Normals are kept, or computed before the split, so that shading stays smooth across charts.
+    Accepts any triangle mesh: open, non-manifold, disconnected, with degenerate faces.  Deterministic.
+
+    Gradients pass through vertices and normals; ``uv`` has none.  Raises TypeError for a wrong type; ValueError for a
+    mesh without faces, vertices that are not finite, or a texture size out of range.
 
     >>> charted = reli3d.unwrap(mesh, texture_size=64)
     >>> maps = reli3d.bake(charted, 64, lambda position, normal: position.abs())

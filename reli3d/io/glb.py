@@ -1,7 +1,7 @@
-"""GLB out: one mesh, one metallic-roughness material, three PNG or WebP textures (glTF 2.0, Khronos).
+"""Writes GLB files: one mesh, one metallic-roughness material, three PNG or WebP textures (glTF 2.0, Khronos).
 
-Axes and units are glTF's own (+Y up, right-handed), so nothing is rotated.  Base color is sRGB 8 bit.  Roughness is
-green and metallic is blue of one linear texture.  All factors are written as 1.  :func:`read_glb` reads it back.
+Axes and units are those of glTF (+Y up, right-handed), so nothing is rotated.  Base color is 8-bit sRGB; roughness and
+metallic are the green and blue channel of a linear texture.  All factors are 1.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def portable(asset: Asset) -> bool:
 
 
 def check_asset(asset: Asset) -> None:
-    """Raise TypeError or ValueError for an asset that lacks what a file needs, or is not finite."""
+    """Raises TypeError or ValueError for an asset with missing attributes, values out of range or not finite."""
     expect("asset", asset, Asset)
     mesh = asset.mesh
     if len(mesh.faces) == 0:
@@ -209,13 +209,14 @@ def write_glb(
     translation: Sequence[float] = (0.0, 0.0, 0.0),
     textures: str = "png",
 ) -> None:
-    """Write ``asset`` (its mesh with normals, UV and tangents, and its textures) as a GLB: the whole file or nothing.
+    """Writes mesh and textures of ``asset`` as a GLB file, completely or not at all; the environment is not written.
 
-    extras: JSON values kept in ``asset.extras``, such as the recorded transform and the licence.  double_sided: None
-    writes false for a watertight mesh, true otherwise.  translation: of the node that holds the mesh, for places where
-    float32 vertices would lose their shape.  textures: ``png``, or ``webp``, lossless too, smaller, and required from a
-    viewer by ``EXT_texture_webp``.  Raises TypeError, ValueError for an asset that lacks something or is not finite,
-    OSError where the file cannot be written.
+    asset: its mesh needs normals, UV and tangents, as :func:`reconstruct` and :func:`read_glb` return them.  extras:
+    JSON values for glTF's ``asset.extras``.  double_sided: None: false for a watertight mesh, otherwise true.
+    translation: of the node, for objects so far from the origin that float32 vertices would lose precision.  textures:
+    ``png``, or ``webp`` (lossless, smaller, needs a viewer with ``EXT_texture_webp``).  Raises TypeError for a wrong
+    type; ValueError for missing attributes, values that are not finite or not in [0, 1], normals that are not unit, or
+    4 GiB or more; OSError if writing fails.
 
     >>> reli3d.write_glb("object.glb", asset, extras={"license": "CC0-1.0"})
     >>> parts = reli3d.read_glb("object.glb")
@@ -226,17 +227,16 @@ def write_glb(
 
 @full_precision
 def read_glb(path: str | os.PathLike, *, notes: list[str] | None = None, **limits: int) -> list[Asset]:
-    """The surfaces of a GLB file, one :class:`Asset` for each primitive, in the axes of its scene; no environment.
+    """Reads a GLB file: one :class:`Asset` per primitive, in the axes of its scene, without environment.
 
-    Meshes are at rest: node transforms or skins, and morph targets by their default weights, are applied.  Vertex
-    colors are ``Mesh.colors``, or part of the textures where all are equal.  Textures come out square and of one size,
-    with all factors, and transforms of texture coordinates, applied; faces are seen from both sides.  Missing normals
-    are those of the faces, missing tangents MikkTSpace's.
+    Node transforms, skins in the rest pose and morph targets by their default weights are applied.  Vertex colors
+    become ``Mesh.colors``, or are multiplied into the textures if uniform.  Textures are resampled to squares of one
+    size, with all factors and texture transforms applied.  Missing normals are face normals, missing tangents follow
+    MikkTSpace.  Specular-glossiness materials are converted.
 
-    Specular-glossiness materials are converted.  What is left out (animation, emission, occlusion, alpha, points,
-    lines, extensions that core glTF approximates, such as clearcoat) is appended to ``notes``, one line each.  What
-    must be decoded (Draco, meshopt, KTX2) is refused.  limits: see :func:`reli3d.io.gltf_parts.read_parts`.  Raises
-    InputError, a ValueError that names field, value and fix.
+    notes: receives one line for every feature that is ignored (animation, emission, occlusion, alpha, points, lines,
+    extensions such as clearcoat).  Compressed data (Draco, meshopt, KTX2) is refused.  limits: see
+    :func:`reli3d.io.gltf_parts.read_parts`.  Raises InputError, a ValueError, naming field, value and fix.
 
     >>> reli3d.write_glb("object.glb", asset)
     >>> parts = reli3d.read_glb("object.glb")

@@ -1,10 +1,10 @@
 """Environment maps and other linear images, in OpenEXR (``exr.py``) or Radiance RGBE (``rgbe.py``).
 
-Pixels are linear Rec. 709 radiance, row 0 at the top, +Y of an environment.  The center column of an environment looks
-to +X and right of it lies +Z, in files and in memory, as three.js, model-viewer and Blender read it.
+Pixels are linear Rec. 709 radiance.  Row 0 of an environment is +Y, its center column +X with +Z right of it, in files
+and in memory, the convention of three.js, model-viewer and Blender.
 
-NaN and negative values are never written: they are refused.  Infinity and, in half precision, values above 65504 are
-clamped to 65504 and counted.  On reading, NaN is refused, negative values become 0 and infinity 65504.
+Writing refuses NaN and negative values; infinity and, in half precision, values above 65504 are clamped to 65504.
+Reading refuses NaN, sets negative values to 0 and infinity to 65504.
 """
 
 from __future__ import annotations
@@ -28,12 +28,11 @@ MAX_PIXELS = 1 << 25  # 8192 x 4096
 
 
 def read_environment(path: str | os.PathLike, *, notes: list[str] | None = None) -> Environment:
-    """Environment of a lat-long ``.hdr`` or ``.exr`` file, ``(H, 2H, 3)`` linear radiance; the format is detected by
-    content.
+    """Reads a lat-long environment ``(H, 2H, 3)``, linear radiance, from an ``.hdr`` or ``.exr`` file.
 
-    Row 0 is +Y, the center column +X, right of it +Z.  What was converted, clamped or not applied is appended to
-    ``notes``, one line each.  Raises InputError on a broken file, NaN, a shape other than 2:1, or a map above
-    8192 x 4096.
+    The format is detected by content.  Row 0 is +Y, the center column +X, +Z right of it.  notes: receives one line for
+    every conversion, clamping or ignored header field.  Raises InputError for a broken file, NaN, a shape other than
+    2:1, or more than 8192 x 4096 pixels.
 
     >>> light = reli3d.read_environment("studio.hdr").rotated(math.pi / 2)
     >>> image = reli3d.render_asset(asset, camera, light)
@@ -46,10 +45,10 @@ def read_environment(path: str | os.PathLike, *, notes: list[str] | None = None)
 
 
 def write_environment(path: str | os.PathLike, environment: Environment) -> int:
-    """Write ``environment``, ``(H, 2H, 3)``, as ``.exr`` (half floats) or ``.hdr``, by the suffix of ``path``.
+    """Writes ``environment (H, 2H, 3)`` as ``.exr`` (half precision) or ``.hdr`` (RGBE), by the suffix of ``path``.
 
-    Returns the number of values clamped.  Raises TypeError for another kind, ValueError on NaN, negative values or
-    another shape, OSError where it cannot be written; then nothing is written.
+    Returns the number of clamped values.  The file is written completely or not at all.  Raises TypeError for a wrong
+    type; ValueError for NaN, negative values, another shape or suffix; OSError if writing fails.
 
     >>> reli3d.write_environment("light.exr", asset.environment)
     >>> again = reli3d.read_environment("light.exr")
@@ -65,7 +64,7 @@ def write_environment(path: str | os.PathLike, environment: Environment) -> int:
 
 
 def environment_bytes(radiance: Tensor) -> bytes:
-    """What :func:`write_environment` writes into a ``.hdr`` file, of ``radiance (H, 2H, 3)``.  Raises as it does."""
+    """The ``.hdr`` file of ``radiance (H, 2H, 3)`` as bytes; errors as in :func:`write_environment`."""
     pixels, _ = _writable(radiance, float(np.finfo(np.float32).max) / 2)
     return rgbe_bytes(pixels)
 

@@ -186,13 +186,13 @@ def write_png(path: str | os.PathLike, pixels: Tensor | np.ndarray) -> None:
 
 
 def write_image(path: str | os.PathLike, image: Tensor) -> None:
-    """Write a linear image as ``.png`` (sRGB, 8 bit), ``.exr`` (float) or ``.hdr``, by the suffix of ``path``.
+    """Writes a linear image as ``.png`` (sRGB, 8 bit), ``.exr`` (float) or ``.hdr`` (RGBE), by the suffix of ``path``.
 
     image: float32, linear Rec. 709, ``(H, W)`` gray, ``(H, W, 3)``, or ``(H, W, 4)`` with color premultiplied by alpha.
-    ``.png``: color is divided by alpha, encoded as sRGB and clamped to [0, 1]; alpha is straight, as PNG has it.
-    ``.exr``: values as given, premultiplied as OpenEXR has it.  ``.hdr``: has neither gray nor alpha; ``(H, W, 3)``
-    alone.  Writes the whole file or nothing.  Raises TypeError for another dtype, ValueError for another suffix or
-    shape, NaN, infinity or negative values, OSError where the file cannot be written.
+    ``.png``: color is divided by alpha, encoded as sRGB and clamped to [0, 1]; alpha is straight.  ``.exr``: values
+    unchanged, premultiplied.  ``.hdr``: ``(H, W, 3)`` only.  A rendering with ``background="environment"`` is written
+    by its ``radiance``, not ``rgba``.  The file is written completely or not at all.  Raises TypeError for another
+    dtype; ValueError for another suffix or shape, NaN, infinity or negative values; OSError if writing fails.
 
     >>> image = reli3d.render_asset(asset, camera, light)
     >>> reli3d.write_image("image.png", image.rgba)

@@ -1,4 +1,4 @@
-"""Asset: a mesh, its textures and a light."""
+"""Asset: a mesh with textures and an environment."""
 
 from __future__ import annotations
 
@@ -23,13 +23,14 @@ KEPT = 2048  # texels a side up to which lookups are kept: 50 MB
 
 @dataclass(frozen=True, repr=False)
 class TextureSet:
-    """Square maps of one size, values in [0, 1]; row 0 is v = 0 (glTF: v down), texel centers at +0.5.
+    """Metallic-roughness textures of one mesh: square float32 maps of one size, values in [0, 1].
 
-    base_color: ``(T, T, 3)``, linear; files hold sRGB.  roughness: ``(T, T)`` or ``(T, T, 1)``, perceptual.  metallic:
-    the same.  Either may be a number.  normal: ``(T, T, 3)``, tangent-space unit normal as ``n * 0.5 + 0.5``, green
-    along the bitangent; None is flat.  wrap: addressing of uv outside [0, 1] along u and v, each of ``WRAPS``.  Fields
-    are ``(T, T, 3)`` and ``(T, T)`` tensors after construction.  Gradients pass through.  Raises TypeError for a wrong
-    kind or dtype, ValueError for a shape, device or mode.
+    Row 0 is v = 0 (glTF: v down), texel centers at +0.5.  base_color: ``(T, T, 3)``, linear; files hold sRGB.
+    roughness, metallic: ``(T, T)``, ``(T, T, 1)`` or a number; roughness is perceptual.  normal: ``(T, T, 3)``,
+    tangent-space unit normal as ``n * 0.5 + 0.5``, green along the bitangent; None: flat.  wrap: addressing of UV
+    outside [0, 1] along u and v, each ``repeat``, ``mirror`` or ``clamp``.  Fields are tensors after construction.
+    Gradients pass through.  Raises TypeError for a wrong type or dtype, ValueError for a shape, device or mode; the
+    range is checked only when a file is written.
 
     >>> textures = reli3d.TextureSet(torch.full((64, 64, 3), 0.5), roughness=0.4, metallic=0.0)
     >>> asset = reli3d.Asset(mesh, textures)
@@ -116,12 +117,12 @@ class TextureSet:
 
 @dataclass(frozen=True, repr=False)
 class Asset:
-    """A relightable object: mesh, textures and the light it was captured under, where that is known.
+    """A relightable object: mesh, textures and the estimated input lighting, if known.
 
-    mesh: a :class:`~reli3d.geometry.mesh.Mesh`; renderers need its ``uv`` where there are textures
-    (:func:`~reli3d.geometry.uv.unwrap`).  textures: a :class:`TextureSet`; renderers take None as a gray dielectric.
-    environment: an :class:`~reli3d.render.environment.Environment` or None.  ``.to(device)`` and
-    ``.detach()`` give copies; gradients pass through.  Raises TypeError for another kind.
+    mesh: a :class:`~reli3d.geometry.mesh.Mesh`, with ``uv`` if there are textures (:func:`reli3d.unwrap`).  textures: a
+    :class:`TextureSet`; None renders as a gray dielectric.  environment: an
+    :class:`~reli3d.render.environment.Environment` or None.  ``.to(device)`` and ``.detach()`` return copies.
+    Gradients pass through.  Raises TypeError for a wrong type.
 
     >>> asset = reli3d.Asset(mesh, reli3d.TextureSet(torch.full((64, 64, 3), 0.5), roughness=0.4, metallic=0.0))
     >>> image = reli3d.render_asset(asset, camera, light)
@@ -150,7 +151,7 @@ class Asset:
 
     @property
     def light(self) -> Environment:
-        """``environment``; raises ValueError where there is none."""
+        """``environment``; raises ValueError if it is None."""
         return present("asset.environment", self.environment)
 
     def __repr__(self) -> str:

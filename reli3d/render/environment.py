@@ -57,12 +57,12 @@ class EnvironmentTable:
 
 @dataclass(frozen=True)
 class Environment:
-    """Distant light as a lat-long map: ``radiance (H, W, 3)``, normally W = 2 H, linear Rec. 709.
+    """Distant lighting as a lat-long map ``radiance (H, W, 3)``, normally W = 2 H, linear Rec. 709 radiance.
 
-    Row 0 is +Y, the center column +X, right of it +Z.  ``.lookup(directions)``, ``.rotated(yaw)`` [rad],
+    Row 0 is +Y, the center column +X, +Z right of it.  Methods: ``.lookup(directions)``, ``.rotated(yaw)`` [rad],
     ``.resized(height)``, ``.sample(u)``, ``.pdf(directions)``, ``.irradiance()``.  Gradients reach the texels.  The
-    sampling table is made once, on first use: do not edit ``radiance`` in place afterwards.  Raises TypeError for a
-    dtype, ValueError for a shape.
+    importance sampling table is built on first use, so ``radiance`` must not be modified in place afterwards.  Raises
+    TypeError for a dtype, ValueError for a shape.
 
     >>> light = reli3d.Environment(torch.rand(16, 32, 3))
     >>> radiance = light.rotated(0.5).lookup(torch.tensor([0.0, 1.0, 0.0]))
@@ -78,16 +78,16 @@ class Environment:
 
     @classmethod
     def constant(cls, rgb: Tensor, height: int = 16) -> Environment:
-        """The same radiance ``rgb (3,)`` from everywhere."""
+        """Uniform lighting of radiance ``rgb (3,)``."""
         check("rgb", rgb, last=3)
         return cls(rgb.expand(height, 2 * height, 3).contiguous())
 
     def to(self, device: torch.device | str) -> Environment:
-        """The same light on ``device``; ``self``, with its table, if it is there already."""
+        """The environment on ``device``; ``self``, with its table, if it is already there."""
         return self if torch.device(device) == self.radiance.device else Environment(self.radiance.to(device))
 
     def detach(self) -> Environment:
-        """The same light without gradient."""
+        """The environment without gradient."""
         return Environment(self.radiance.detach())
 
     def lookup(self, directions: Tensor) -> Tensor:
@@ -101,10 +101,10 @@ class Environment:
 
     @full_precision
     def irradiance(self) -> Environment:
-        """Irradiance [radiance times sr] on a surface of each normal, as a map of the same size: pi times a constant.
+        """Irradiance [radiance times sr] for every surface normal, as a lat-long map of the same size.
 
-        The sum over the texels by their solid angles: n^2 terms for n texels, meant for maps of at most 32 rows.
-        Gradients reach the texels.
+        A sum over all texels by solid angle: n^2 terms for n texels, intended for maps of at most 32 rows.  Uniform
+        radiance L gives pi L.  Gradients reach the texels.
         """
         height, width = self.radiance.shape[:2]
         directions = lat_long_directions(height, width, dtype=torch.float64).reshape(-1, 3)
@@ -113,9 +113,9 @@ class Environment:
         return Environment((weight @ self.radiance.reshape(-1, 3)).reshape(self.radiance.shape))
 
     def rotated(self, yaw: float) -> Environment:
-        """The light turned by ``yaw`` [rad] about +Y, counter-clockwise seen from above: -Z light moves towards -X.
+        """The environment rotated by ``yaw`` [rad] about +Y, counter-clockwise seen from above: -Z moves towards -X.
 
-        A multiple of 2 pi / W moves whole texels; in between, columns are blended linearly.
+        Columns are interpolated linearly; a multiple of 2 pi / W is an exact shift.
         """
         width = self.radiance.shape[1]
         shift = yaw * width / (2.0 * torch.pi)
@@ -127,7 +127,7 @@ class Environment:
         return Environment(radiance)
 
     def resized(self, height: int) -> Environment:
-        """Map of ``height`` x 2 ``height`` texels by area averaging (bilinear where it grows)."""
+        """The environment at ``height`` x 2 ``height`` texels, by area averaging, or bilinear when enlarging."""
         planes = self.radiance.permute(2, 0, 1)[None]
         mode = "area" if height <= self.radiance.shape[0] else "bilinear"
         out = torch.nn.functional.interpolate(planes, size=(height, 2 * height), mode=mode)

@@ -76,12 +76,15 @@ def tangent_normals(mesh: Mesh, face: Tensor, bary: Tensor, normal: Tensor, mapp
 
 
 def surface_points(mesh: Mesh, textures: TextureSet | None, face: Tensor, bary: Tensor) -> SurfacePoints:
-    """Geometry and material at hits of a mesh, as :func:`~reli3d.render.shading.shade` takes them.
+    """Geometry and material at hits of a mesh, the input of :func:`reli3d.shade`.
 
-    mesh: with uv for textures.  textures: a :class:`~reli3d.render.asset.TextureSet` or None for a gray dielectric:
-    base color 0.5, roughness 0.5, metallic 0.  face: ``(N,)`` int32, no miss among them.  bary: ``(N, 2)``.  Without
-    vertex normals the shading normal is the geometric one.  Gradients reach the mesh's arrays, the textures and
-    ``bary``.  Raises TypeError, ValueError.
+    mesh: with ``uv`` if textured.  textures: None gives a gray dielectric of base color 0.5, roughness 0.5, metallic 0.
+    face: ``(N,)`` int32, without misses.  bary: ``(N, 2)`` weights of vertices 1 and 2.  The shading normal is the
+    interpolated vertex normal, or the geometric one if ``mesh.normals`` is None, perturbed by the normal map in the
+    frame of ``mesh.tangents``, or of the UV gradients if these are None.
+
+    Gradients reach the arrays of the mesh, the textures and ``bary``.  Raises TypeError for a wrong type or dtype;
+    ValueError for textures without ``mesh.uv``, a face index out of range, a wrong shape or another device.
 
     >>> hits = reli3d.RayScene(mesh).intersect(*reli3d.camera_rays(camera))
     >>> points = reli3d.surface_points(mesh, asset.textures, hits.face[hits.valid], hits.bary[hits.valid])

@@ -1,4 +1,4 @@
-"""Images of an asset: primary visibility, materials, direct light with shadows, background, resolve."""
+"""Rendering of an asset: primary visibility, materials, direct lighting with shadows, background, resolve."""
 
 from __future__ import annotations
 
@@ -23,18 +23,19 @@ from reli3d.render.shading import DEFAULT, ShadeOptions, shade_lights
 if TYPE_CHECKING:
     from reli3d.render.allocation import SamplePlan
 
-PLAN_RAYS = 32768  # of a view, to find the points of a plan's pilot among
+PLAN_RAYS = 32768  # of a view, whose hits are candidates for the points of the pilot
 BAND_RAYS = 1 << 18  # rays of one band of rows: bounds memory at about 40 MB whatever the image size
 
 
 @dataclass(frozen=True)
 class Render:
-    """One image of an asset.  Values are means over the covered subpixels; ``radiance`` is the mean over all of them.
+    """Result of :func:`render_asset`: radiance, coverage and G-buffers of one image.
 
-    radiance: ``(H, W, 3)`` linear Rec. 709, premultiplied by alpha unless the background was rendered.  alpha:
-    ``(H, W)``, of the object even with a background: write ``radiance``, not ``rgba``, then.  base_color:
-    ``(H, W, 3)`` linear.  roughness, metallic: ``(H, W)``.  normal: ``(H, W, 3)`` unit, world.  position:
-    ``(H, W, 3)`` world.  depth: ``(H, W)`` along the viewing axis, inf where nothing is.  The others are 0 there.
+    radiance: ``(H, W, 3)`` linear Rec. 709, mean over all subpixels: premultiplied by alpha with a transparent
+    background, composited with ``background="environment"``.  alpha: ``(H, W)`` coverage of the object in [0, 1], with
+    either background.  The G-buffers are means over the covered subpixels: base_color ``(H, W, 3)`` linear; roughness,
+    metallic ``(H, W)``; normal ``(H, W, 3)`` shading normal, unit, world; position ``(H, W, 3)`` world; depth
+    ``(H, W)`` along the viewing axis.  Where alpha is 0, depth is inf and the others 0.
 
     >>> image = reli3d.render_asset(asset, camera, light)
     >>> reli3d.write_image("image.png", image.rgba)
@@ -51,9 +52,10 @@ class Render:
 
     @property
     def rgba(self) -> Tensor:
-        """``(H, W, 4)``: radiance, premultiplied, and alpha, as :func:`reli3d.io.images.write_image` takes it.
+        """``(H, W, 4)``: premultiplied radiance and alpha, for :func:`reli3d.write_image`.
 
-        For a transparent background only: write ``radiance`` where the environment was rendered behind the object.
+        Only valid with ``background="transparent"``.  With ``background="environment"`` radiance is already composited,
+        and dividing it by alpha would brighten the background: use ``radiance`` instead.
         """
         return torch.cat([self.radiance, self.alpha[..., None]], -1)
 
@@ -64,13 +66,13 @@ class Render:
         tone: Callable[[Tensor], Tensor] = linear_to_srgb,
         transparent: bool = True,
     ) -> Tensor:
-        """Display values of ``radiance`` in [0, 1]: ``(H, W, 4)`` with straight alpha, else ``(H, W, 3)``.
+        """Display values in [0, 1]: ``(H, W, 4)`` with straight alpha, or ``(H, W, 3)`` if not ``transparent``.
 
-        exposure: in stops.  tone: from linear radiance to display values.  transparent: False where the background was
-        rendered.
+        exposure: in stops.  tone: transform of linear radiance to display values.  transparent: False for an image with
+        ``background="environment"``.
         """
         radiance = self.radiance * 2.0**exposure
-        if transparent:  # the transform is not linear: it takes the color, not the premultiplied one
+        if transparent:  # tone mapping is nonlinear and needs straight color
             radiance = radiance / self.alpha[..., None].clamp(min=1e-6)
         shown = tone(radiance).clamp(0.0, 1.0)
         return torch.cat([shown, self.alpha[..., None]], -1) if transparent else shown
@@ -89,15 +91,18 @@ def render_asset(
     scene: RayScene | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Render:
-    """Image of ``asset`` under ``environment`` (default: the asset's own) with direct light and shadows.
+    """Renders ``asset`` under an environment with direct lighting and shadows.
 
-    asset: one, or the parts of one that cast shadows on each other; without textures a gray dielectric.  camera: one
-    camera, no batch.  options: of :func:`reli3d.render.shading.shade`.  supersampling: side of the subpixel grid;
-    samples are per subpixel.  shadows: trace shadow rays.  background: ``transparent`` or ``environment``.  scene: rays
-    against :func:`joined_scene`, built here if None.  progress: called with the fraction done.
+    asset: an :class:`Asset`, or a list of assets that shadow each other; without textures a gray dielectric.  camera: a
+    single camera.  environment: None uses that of the asset.  options: sample counts, seed and material model.
+    supersampling: subpixels per side of a pixel; sample counts are per subpixel.  shadows: whether occlusion of the
+    environment is traced.  background: ``transparent``, or ``environment``, which composites the environment behind the
+    object; then write ``image.radiance``, not ``image.rgba``.  scene: ray tracing structure of the assets (a
+    :class:`RayScene` of the mesh), built if None.  progress: called with the completed fraction.
 
-    Gradients reach textures, mesh attributes and environment as in ``shade``; silhouettes have none.  Raises TypeError
-    for a wrong kind, ValueError without any environment.
+    Gradients reach textures, normals, UV and environment as in :func:`shade`; silhouettes and shadows have none (see
+    :func:`antialias`).  Raises TypeError for a wrong type; ValueError if neither argument nor asset has an environment,
+    for another ``background``, a batch of cameras, or textures without ``mesh.uv``.
 
     >>> camera = reli3d.Camera.from_fov(reli3d.look_at([0.0, 0.5, 3.0]), 0.7, 512, 512)
     >>> image = reli3d.render_asset(asset, camera, reli3d.Environment.constant(torch.ones(3)), supersampling=2)
@@ -129,10 +134,10 @@ def render_lights(
     scene: RayScene | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> list[Render]:
-    """:func:`render_asset` under each of ``environments``, bitwise identical.
+    """:func:`render_asset` under each of ``environments``, with bitwise identical results.
 
-    Primary hits and materials are evaluated once.  The images share all layers but ``radiance``.  The other arguments
-    are those of :func:`render_asset`.
+    Primary hits and materials are evaluated once; the images have all layers but ``radiance`` in common.  The other
+    arguments are those of :func:`render_asset`.
     """
     parts, lights = _checked(asset, camera, environments)
     if background not in ("transparent", "environment"):
@@ -177,11 +182,11 @@ def plan_render(
     scene: RayScene | None = None,
     relative: bool = False,
 ) -> SamplePlan:
-    """Counts of ``total`` samples for :func:`render_asset` of this view, to be given to it with ``antithetic="none"``.
+    """Divides ``total`` samples among the strategies to minimize the noise of :func:`render_asset` for this view.
 
-    Arguments as for :func:`render_asset`; total, relative: as for :func:`reli3d.render.allocation.plan_samples`, which
-    plans for points among those that 32768 rays of the camera hit.  No gradient.  Raises ValueError without any
-    environment and where the camera sees nothing.
+    Pass the counts with ``antithetic="none"``.  Arguments as for :func:`render_asset`; total, relative: as for
+    :func:`reli3d.render.allocation.plan_samples`, which is applied to hits of 32768 camera rays.  No gradient.  Raises
+    ValueError without an environment or if no ray hits the asset.
     """
     from reli3d.render.allocation import plan_samples, spread_rows  # lazily: few images have a plan
 
@@ -193,7 +198,7 @@ def plan_render(
     hits = scene.closest(origins[rays], directions)
     seen = hits.face >= 0
     if not bool(seen.any()):
-        raise ValueError(f"camera: expected one that sees the asset, got none of {len(rays)} rays that hits it")
+        raise ValueError(f"camera: expected the asset in view, got {len(rays)} rays without a hit")
     points = _points(parts, hits.face[seen], hits.bary[seen])
     return plan_samples(
         points,
@@ -209,7 +214,7 @@ def plan_render(
 def _checked(
     asset: Asset | Sequence[Asset], camera: Camera, environments: Sequence[Environment | None]
 ) -> tuple[list[Asset], list[Environment]]:
-    """The parts, and the lights: those given, or the first part's own for None."""
+    """The parts, and the environments, with None replaced by that of the first part that has one."""
     parts: list[Asset] = list(asset) if isinstance(asset, (list, tuple)) else [asset]  # type: ignore[list-item]
     for part in parts:
         expect("asset", part, Asset)
@@ -225,7 +230,7 @@ def _checked(
 
 
 def joined_scene(parts: Sequence[Asset]) -> RayScene:
-    """Rays against all ``parts`` together; their faces count on from one part to the next."""
+    """Ray tracing structure of all ``parts``; face indices continue from one part to the next."""
     if not parts:
         raise ValueError("parts: expected at least one asset, got none")
     first = [0]
@@ -251,12 +256,13 @@ def _points(parts: Sequence[Asset], face: Tensor, bary: Tensor) -> SurfacePoints
 
 
 def _band(parts, camera, lights, scene, first, shadows, background, options) -> Iterator[Tensor]:
-    """Premultiplied layers ``(rows, W, C)`` of one band of subpixels: the radiance of each light, then the others, in
-    the order that :func:`render_lights` takes apart.  Where no background is seen only the asset's box has rays.
+    """Premultiplied layers ``(rows, W, C)`` of one band of subpixels: radiance under each environment, then G-buffers.
+
+    With a transparent background rays are traced only in the bounding box of the asset.
     """
     whole = (0, 0, camera.width, camera.height)
     left, top, right, bottom = box_of(scene.vertices, camera) if background == "transparent" else whole
-    corner = camera.intrinsics.new_tensor([0.0, 0.0, left, top])  # whole numbers: the rays keep their bits
+    corner = camera.intrinsics.new_tensor([0.0, 0.0, left, top])  # integers: rays are bitwise unchanged
     inner = Camera(camera.c2w, camera.intrinsics - corner, right - left, bottom - top)
     origins, directions = (v.reshape(-1, 3) for v in camera_rays(inner))
     hits = scene.closest(origins, directions)

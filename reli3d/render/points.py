@@ -18,13 +18,12 @@ NUMBERS = ("base_color", "roughness", "metallic")  # may be a plain number: gray
 
 @dataclass(frozen=True)
 class SurfacePoints:
-    """Geometry and material of N points to be shaded; directions unit, world frame.
+    """Geometry and material of N surface points, float32, world frame.
 
-    position: ``(N, 3)``.  ng: ``(N, 3)`` geometric normal, outward.  normal: ``(N, 3)`` shading normal.  base_color:
-    ``(N, 3)`` linear.  roughness: ``(N,)`` perceptual.  metallic: ``(N,)``.  All but ``position`` may be one row for
-    all points, and the material may be single numbers.  Numpy arrays are taken if the conversion is exact.  Fields have
-    N rows after construction.  Gradients pass through.  Raises TypeError for a wrong kind or dtype, ValueError for a
-    shape or device.
+    position: ``(N, 3)``.  ng: ``(N, 3)`` geometric normal, unit, outward.  normal: ``(N, 3)`` shading normal, unit.
+    base_color: ``(N, 3)`` linear, in [0, 1].  roughness: ``(N,)`` perceptual, in [0, 1].  metallic: ``(N,)`` in [0, 1].
+    All but ``position`` may be a single row for all points, and the material a single number; fields have N rows after
+    construction.  Gradients pass through.  Raises TypeError for a type or dtype, ValueError for a shape or device.
 
     >>> points = reli3d.SurfacePoints(position, normal, normal, base_color=0.8, roughness=0.4, metallic=0.0)
     >>> radiance = reli3d.shade(points, wo, light)

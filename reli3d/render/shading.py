@@ -1,4 +1,4 @@
-"""Direct light of surface points by multiple importance sampling, with optional shadow rays."""
+"""Direct lighting of surface points by multiple importance sampling, with optional shadow rays."""
 
 from __future__ import annotations
 
@@ -45,9 +45,9 @@ GROUP_RAYS = 64  # of neighboring hits, traced together: so packets of 16 are fu
 
 
 class Samples(NamedTuple):
-    """Numbers of samples of each point by strategy; the defaults are the published counts.
+    """Sample counts per point and strategy; the defaults are those of the paper.
 
-    light: from the environment's importance table.  bsdf: from visible normals.  cosine: from the cosine.
+    light: importance sampling of the environment.  bsdf: GGX visible normals.  cosine: cosine-weighted hemisphere.
 
     >>> options = reli3d.ShadeOptions(samples=reli3d.Samples(light=8, bsdf=16, cosine=2))
     >>> image = reli3d.render_asset(asset, camera, light, options=options)
@@ -60,16 +60,16 @@ class Samples(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class ShadeOptions:
-    """How :func:`shade` draws and weights its samples, and which formulas the material has.
+    """Options of :func:`shade`: sampling and material model.
 
-    samples: :class:`Samples`, or three counts in its order.  seed: of the random numbers; another seed gives
-    independent noise.  antithetic: partners of visible normals, ``opposite`` (across the lobe,
-    :func:`reli3d.render.sampling.antithetic`), ``mirrored`` (about the normal, as published) or ``none``.  heuristic:
-    ``balance`` or ``power``.  sequence: ``halton`` (rotated per point and strategy) or ``random``.  alpha: GGX width,
-    ``squared`` roughness or, as published, ``linear``.  diffuse_model: ``conserving`` or ``published``, see
-    :func:`reli3d.render.material.eval_bsdf`.  clamp: largest value of one sample times its strategy's count, per
-    channel.  check_inputs: raise ValueError for directions that are not unit and materials beyond [0, 1].  Raises
-    ValueError for a count or choice.
+    samples: :class:`Samples`, or three counts in its order, each at least 0.  seed: of the random numbers; another seed
+    gives independent noise.  antithetic: pairing of visible-normal samples: ``opposite`` (across the lobe, see
+    :func:`reli3d.antithetic`), ``mirrored`` (about the surface normal, as published) or ``none``.  heuristic: MIS
+    weights, ``balance`` or ``power``.  sequence: ``halton`` (rotated per point and strategy) or ``random``.  alpha: GGX
+    width from roughness, ``squared`` or, as published, ``linear``.  diffuse_model: ``conserving`` or ``published``, see
+    :func:`reli3d.eval_bsdf`.  clamp: upper limit of one sample times the count of its strategy, per channel; None: no
+    limit.  check_inputs: raise ValueError for directions that are not unit and materials outside [0, 1].  Raises
+    ValueError for an invalid count or choice.
 
     >>> fast = reli3d.ShadeOptions(samples=reli3d.Samples(light=4, bsdf=4, cosine=2), seed=1)
     >>> image = reli3d.render_asset(asset, camera, light, options=fast)
@@ -111,18 +111,18 @@ def shade(
     options: ShadeOptions = DEFAULT,
     pixels: Tensor | None = None,
 ) -> Tensor:
-    """Radiance ``(N, 3)`` that leaves surface ``points`` towards ``wo``, lit by ``environment``; linear Rec. 709.
+    """Reflected radiance ``(N, 3)`` of surface points towards ``wo`` under ``environment``; linear Rec. 709.
 
-    points: N points with their material.  wo: ``(N, 3)`` unit, world, to the viewer, or one row for all.  A face seen
-    from behind is shaded as its other side.  scene: mesh that casts shadows, None for none.  options: sample counts,
-    seed and formulas.  pixels: ``(N,)`` int32 counters of the random numbers, by default the row.  A point with a value
-    that is not finite is NaN.
+    points: N points with their material.  wo: ``(N, 3)`` unit, world frame, to the viewer, or one row for all points.
+    Faces seen from behind are shaded two-sided.  scene: occluders for shadow rays; None: no shadows.  options: sample
+    counts, seed and material model.  pixels: ``(N,)`` int32 counters of the random numbers; None: the row index.
+    Non-finite inputs of a point give NaN.
 
-    Gradients reach normal, base_color, roughness, metallic and the texels of ``environment``; sampling is detached, and
-    positions and shadows have no gradient.  The part of the normal's gradient along the normal has no meaning.  Once
-    differentiable.  Bitwise identical for any number of threads.  Raises TypeError for a kind or dtype, ValueError for
-    a shape or device.  Estimator: multiple importance sampling (Veach and Guibas 1995) over the material of
-    :func:`reli3d.render.material.eval_bsdf`.
+    Gradients reach normal, base_color, roughness, metallic and the texels of ``environment``; the samples are detached,
+    and positions and shadows have no gradient.  Only the component of the normal's gradient orthogonal to the normal is
+    meaningful.  Once differentiable.  Bitwise identical for any number of threads.  Raises TypeError for a wrong type
+    or dtype, ValueError for a shape or device.  Estimator: multiple importance sampling (Veach and Guibas 1995) of
+    :func:`reli3d.eval_bsdf`.
 
     >>> points = reli3d.SurfacePoints(position, normal, normal, base_color=0.8, roughness=0.4, metallic=0.0)
     >>> radiance = reli3d.shade(points, wo, reli3d.Environment.constant(torch.ones(3)))
@@ -139,9 +139,9 @@ def shade_lights(
     options: ShadeOptions = DEFAULT,
     pixels: Tensor | None = None,
 ) -> list[Tensor]:
-    """:func:`shade` under each of ``environments``, bitwise identical; the other arguments are the same.
+    """:func:`shade` under each of ``environments``, with bitwise identical results.
 
-    Of several lights without a gradient Embree tests the samples that do not depend on the light once.
+    Without gradients, shadow rays that do not depend on the environment are traced once.
     """
     tasks = [_task(points, wo, light, scene, options, pixels) for light in environments]
     recorded = torch.is_grad_enabled() and any(v.requires_grad for _, *tensors in tasks for v in tensors)
@@ -169,7 +169,7 @@ def _task(points, wo, environment, scene, options, pixels) -> tuple:
 
 @dataclass(frozen=True)
 class _Job:
-    """What a call has besides its differentiable inputs."""
+    """Arguments of a call that are not differentiable."""
 
     plan: kernels.Plan
     count: int

@@ -141,15 +141,17 @@ def antialias(
     *,
     edges: Tensor | None = None,
 ) -> Tensor:
-    """``image (H, W, C)`` with antialiased silhouettes of the mesh, differentiable in the vertices.
+    """Antialiases the silhouettes of a mesh in ``image (H, W, C)``, differentiably in the vertices.
 
-    image: float32, any number of layers, values at the first hits of the camera's rays through the pixel centers.
-    vertices: ``(V, 3)``.  faces: ``(F, 3)`` int32.  camera: one of the image's size.  scene: what hides edges, built of
-    the mesh here if None.  edges: of :func:`mesh_edges`, built here if None; they hold as long as the faces do.
+    image: float32, any number of channels, sampled at the pixel centers, for instance shaded first hits or a mask.
+    vertices: ``(V, 3)`` float32.  faces: ``(F, 3)`` int32.  camera: a single camera of the image's size.  scene:
+    occluders of the edges, built from the mesh if None.  edges: from :func:`reli3d.render.silhouette.mesh_edges`, for
+    reuse while the faces do not change; built if None.
 
-    Gradients reach the image, the vertices and the camera; bitwise identical for any number of CPU threads.  Values
-    inside faces are the caller's: only silhouettes move with the vertices here, not seams of color or lines where faces
-    cut through each other.  Raises TypeError or ValueError.  Source: Laine et al. 2020, section 3.4.
+    Gradients reach image, vertices and camera, and are bitwise identical for any number of CPU threads.  Only
+    visibility silhouettes are handled, not texture edges or intersections of faces.  Raises TypeError for a wrong
+    dtype, ValueError for a wrong shape, an image that does not have the camera's size, or a face index out of range.
+    Source: Laine et al. 2020, section 3.4.
 
     >>> mask = reli3d.RayScene(mesh).intersect(*reli3d.camera_rays(camera)).valid[..., None].float()
     >>> smooth = reli3d.antialias(mask, mesh.vertices, mesh.faces, camera)

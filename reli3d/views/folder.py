@@ -52,15 +52,18 @@ def load_views(
     whole: bool = False,
     remove_background: bool = False,
 ) -> Views:
-    """Photographs of an object folder, with their cameras and masks, in the order of the folder.
+    """Reads the images of an object folder with their cameras and masks, in the order of the folder.
 
-    views: number of views, selected by farthest-point sampling.  first_views: number from the beginning.  Neither: all,
-    at most 16.  every: all; :meth:`Views.taken` are those without it.  masks: folder of masks; else ``mask_path`` of
-    a frame, alpha, or a folder ``masks`` or ``mask``, in this order.  whole: keep all of photographs of more than two
-    megapixels, scaled to two, not the object alone at 768 pixels.  remove_background: masks by ``rembg`` (extra
-    ``masks``) where there are none; may download.
+    folder: with cameras in ``transforms.json`` (also ``transforms_train.json`` and the other splits), a COLMAP model,
+    ``cameras_sphere.npz`` or ``poses_bounds.npy``; :mod:`reli3d.capture` finds missing cameras.  views: number of
+    views, 1 to 16, selected by farthest-point sampling.  first_views: number of views from the beginning.  Neither: all
+    views, at most 16.  every: all views without limit; :meth:`Views.taken` selects 16.  masks: folder of masks;
+    otherwise ``mask_path`` of a frame, alpha, or a folder ``masks`` or ``mask``, in this order.  whole: images of more
+    than two megapixels are scaled to two instead of cropped to the object.  remove_background: segment images without a
+    mask by ``rembg`` (extra ``masks``), which may download its network.
 
-    Cameras far from their origin are moved by ``-origin``.  Raises InputError, one line.
+    Cameras far from the world origin are translated by ``-Views.origin``.  Raises InputError with one line that names
+    file, field, value and fix.
 
     >>> views = reli3d.load_views("photos/shoe", views=4)
     >>> notes = views.notes

@@ -1,6 +1,6 @@
-"""Posed images of one object with masks, as readers of folders return them and the stages of the pipeline take them.
+"""Posed images of one object with masks: the result of the readers and the input of the pipeline.
 
-Color is sRGB in [0, 1] with straight alpha, the background kept under it.  Cameras are camera-to-world in OpenGL axes
+Color is sRGB in [0, 1] with straight alpha, including the background.  Cameras are camera-to-world in OpenGL axes
 (+X right, +Y up, looking along -Z), intrinsics (fx, fy, cx, cy) in pixels with pixel centers at +0.5.
 """
 
@@ -47,11 +47,12 @@ class ViewBatch:
 
 @dataclass(frozen=True)
 class Views:
-    """``V`` posed images of any sizes; view 0 is the hero view of the network.
+    """``V`` posed images, which may have different sizes; view 0 is the reference view of the official network.
 
-    images: ``(H, W, 3)`` each, float32 sRGB in [0, 1].  masks: ``(H, W)`` each, float32 alpha in [0, 1].
-    c2w: ``(V, 4, 4)`` rotations and translations.  intrinsics: ``(V, 4)``.  All on one device, without gradient.
-    Raises TypeError or ValueError where shapes, kinds or devices disagree.
+    images: V tensors ``(H, W, 3)``, float32 sRGB in [0, 1].  masks: V tensors ``(H, W)``, float32 alpha in [0, 1].
+    c2w: ``(V, 4, 4)`` float32 rigid camera-to-world matrices, OpenGL axes.  intrinsics: ``(V, 4)`` as ``fx, fy, cx,
+    cy`` in pixels.  names: V file stems.  All on one device, without gradient.  Raises TypeError for a dtype,
+    ValueError for shapes or devices that do not match.
 
     >>> views = reli3d.load_views("photos/shoe")
     >>> size = [image.shape for image in views.images]
@@ -62,10 +63,10 @@ class Views:
     c2w: Tensor
     intrinsics: Tensor
     names: tuple[str, ...]
-    notes: tuple[str, ...] = ()  # what reading changed or guessed, one line each
-    in_folder: int | None = None  # views that the folder offered
-    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the frame as read, in that of the folder
-    chosen: tuple[int, ...] | None = None  # of all of a folder: those for a network, which reads 16 at most
+    notes: tuple[str, ...] = ()  # changes and assumptions of the reader, one line each
+    in_folder: int | None = None  # number of views in the folder
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the world frame here, in that of the folder
+    chosen: tuple[int, ...] | None = None  # indices of the views for the network, at most 16, if all were read
 
     def __post_init__(self):
         count = len(self.images)
@@ -91,7 +92,9 @@ class Views:
         return len(self.images)
 
     def select(self, which: int | Sequence[int]) -> Views:
-        """The first ``which`` views, or the views of these indices in this order.  ValueError where there are none."""
+        """The first ``which`` views, or those of the indices ``which`` in that order.  Raises ValueError if out of
+        range.
+        """
         indices = list(range(which)) if isinstance(which, int) else list(which)
         if not indices or min(indices) < 0 or max(indices) >= len(self):
             raise ValueError(f"which: expected 1 to {len(self)} views of {len(self)}, got {which}")
@@ -108,11 +111,11 @@ class Views:
         )
 
     def taken(self) -> Views:
-        """The views for a network: those ``chosen``, all where nothing was."""
+        """The views for the network: those in ``chosen``, or all if it is None."""
         return self if self.chosen is None else self.select(self.chosen)
 
     def transformed(self, similarity: Similarity) -> Views:
-        """The same images with the cameras in another frame: eyes mapped, axes turned, intrinsics as they are."""
+        """The same images with the cameras transformed by ``similarity``; intrinsics are unchanged."""
         c2w = self.c2w.double()
         rotation = similarity.rotation.to(c2w) @ c2w[:, :3, :3]
         rows = torch.cat([rotation, similarity.apply(c2w[:, :3, 3])[..., None]], -1)
