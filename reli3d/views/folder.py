@@ -340,7 +340,7 @@ def intrinsics_of(lens: Lens, width: int, height: int, where: str, notes: list[s
     given = (math.nan, math.nan) if lens.center is None else lens.center
     cx = 0.5 * width if math.isnan(given[0]) else given[0] * sx
     cy = 0.5 * height if math.isnan(given[1]) else given[1] * sy
-    if 0 < given[0] <= 1 and 0 < given[1] <= 1:
+    if max(map(abs, given)) <= 1:
         raise InputError(
             where,
             f"cx, cy: expected pixels, got {given[0]:.6g} and {given[1]:.6g}, fractions of the image; multiply them by "

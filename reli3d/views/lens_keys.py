@@ -44,6 +44,7 @@ _FOCALS = (("fl_x", "fl_y"), ("fx", "fy"))
 _ANGLES = (("x_fov", "y_fov", math.pi / 180), ("camera_angle_x", "camera_angle_y", 1.0))
 _FOVS = ("camera_fov", "fov_rad")
 _SIDES = (("w", "width", "image_width"), ("h", "height", "image_height"))
+_SIZES = ("resolution", "img_wh", "image_size", "img_size")  # width and height in a list
 _RADIAL, _TANGENTIAL = ("k1", "k2", "k3", "k4"), ("p1", "p2")
 _READ = {
     *_MATRICES,
@@ -57,15 +58,18 @@ _READ = {
 _MODEL = re.compile(r"(camera|lens|distortion|projection)(model|mode|type)|projection")
 _KIND = re.compile(r"(camera|cam|lens|sensor)?(model|mode|type|kind|name)?")
 _NO_PINHOLE = re.compile(
-    r"fisheye|ftheta|latlong|equirect|equidist|kannala|thinprism|panoram|spherical|omnidir|orthograph|isortho|vr180"
+    r"fisheye|ftheta|latlong|equirect|equidist|kannala|thinprism|^pano(ram|$)|spherical|omnidir|doublesphere"
+    r"|^(is)?ortho(?!n|go)|vr180"
 )
 _BENT = re.compile(
-    r"[kps]\d+|.*(distort|distcoef|skew|rollingshutter|pixelaspect|lensshift|camerashift).*|(shift|tau)[xy]"
+    r"xi|[kps]\d+|.*(distort|distcoef|skew|rollingshutter|pixelaspect|lensshift|camerashift).*|(shift|tau)[xy]"
 )
 _LENS = re.compile(
     r".*(focal|fov|fieldofview|angleofview|cameraangle|intrinsic|principal|sensor|calib|cameramatrix).*"
-    r"|(camera|cam)(param(eter)?s?|info|data)?|fl[xy]?|f[xy]?|c[xy]|k|kmatrix|camk|hwf|lens"
+    r"|(camera|cam)(param(eter)?s?|info|data)?|(cam|view)?angle[xy]|fl[xy]?|f[xy]?|c[xy]|k|kmatrix|camk|hwf|lens"
+    r"|p|(camera|cam)?proj(ection)?(mat(rix)?)?"
 )
+_COEFFICIENTS = ("d", "dist", "coeffs", "coefficients")  # where these are lists
 _AXES = re.compile(r"(coordinate|coord|axis|axes|pose|camera)*(system|convention|coordinates?|axes)")
 _OPENCV = re.compile(r".*(opencv|colmap|rdf).*|cv")
 
@@ -87,11 +91,11 @@ def check_keys(where: str, values: dict) -> None:
                 raise InputError(
                     where, f"{key}: expected a pinhole camera, got {shown(value)}; undistort the images first"
                 )
-        elif _NO_PINHOLE.search(word) or (
-            isinstance(value, str) and _KIND.fullmatch(word) and _NO_PINHOLE.search(_word(value))
-        ):
+        elif _no_pinhole(key, value):
             raise InputError(where, f"{key}: expected a pinhole camera, got {shown(value)}; undistort the images first")
-        elif _BENT.fullmatch(word) and not (word.startswith("s") and isinstance(value, str)):
+        elif (_BENT.fullmatch(word) and not (word.startswith("s") and isinstance(value, str))) or (
+            word in _COEFFICIENTS and isinstance(value, list)
+        ):
             raise InputError(
                 where,
                 f"{key}: expected 0 or none, as it is not read, got {shown(value)}; undistort the images first",
@@ -102,6 +106,41 @@ def check_keys(where: str, values: dict) -> None:
                 f"{key}: expected fl_x in pixels, camera_angle_x in radians or a 3x3 matrix intrinsics, got a key of "
                 f"the lens that is not read, {shown(value)}; write one of these and remove it",
             )
+
+    for key, entry in _inner(values):
+        for name, value in entry.items():
+            if _no_pinhole(name, value):
+                got = f"{name}: {shown(value)}"
+                raise InputError(where, f"{key}: expected a pinhole camera, got {got}; undistort the images first")
+
+
+def _no_pinhole(key: str, value: object) -> bool:
+    """Whether a key, or a model that it names, is a lens that is none."""
+    word = _word(key)
+    if isinstance(value, str) and (_KIND.fullmatch(word) or _MODEL.fullmatch(word)):
+        word += " " + _word(value)
+    return not _nothing(value) and any(map(_NO_PINHOLE.search, word.split()))
+
+
+def _inner(values: dict) -> Iterator[tuple[str, dict[str, object]]]:
+    """``(key, object)`` of the objects that are values of ``values``, alone, in a list or by name, frames left out."""
+    for key, value in values.items():
+        if key != "frames":
+            found = value if isinstance(value, list) else [value]
+            for entry in (e for e in found if isinstance(e, dict)):
+                yield from ((key, e) for e in (entry, *entry.values()) if isinstance(e, dict))
+
+
+def _check_inner(where: str, values: dict) -> None:
+    """Raises InputError for an object in ``values`` that holds a lens, where no other lens is known."""
+    for key, entry in _inner(values):
+        for name in map(str, entry):
+            if name in _READ or _LENS.fullmatch(_word(name)):
+                raise InputError(
+                    where,
+                    f"{key}: expected the lens in the frame or the file, got {shown(name)} within {key}, which is not "
+                    "read; write it beside transform_matrix",
+                )
 
 
 def _word(text: str) -> str:
@@ -130,7 +169,7 @@ def lens_of(where: str, frame: dict, data: dict, notes: list[str]) -> Lens:
         value = frame.get(key, data.get(key))
         return None if value is None else number(where, key, value, low, high)
 
-    size, center = _size(where, found), _center(where, frame, data, found)
+    size, center = _size(where, frame, data, found), _center(where, frame, data, found)
     lens = None
     for source in (frame, data):
         spellings = list(_spellings(where, source, data, size))
@@ -149,6 +188,8 @@ def lens_of(where: str, frame: dict, data: dict, notes: list[str]) -> Lens:
                 lens = replace(lens, size=size)
             break
     if lens is None:
+        _check_inner(where, frame)
+        _check_inner(where, data)
         notes.append(f"{where}: no field of view given, {DEFAULT_FOV} radians assumed as in the published release")
         lens = Lens(fov=(DEFAULT_FOV, DEFAULT_FOV), center=center)
     radial, tangential = (tuple(found(k) or 0.0 for k in keys) for keys in (_RADIAL, _TANGENTIAL))
@@ -171,13 +212,15 @@ def _spellings(where: str, source: dict, data: dict, size) -> Iterator[tuple[str
     for x_key, y_key in _FOCALS:
         if source.get(x_key) is not None or source.get(y_key) is not None:
             fx = number(where, x_key, source.get(x_key, data.get(x_key)), 0, 1e9)
-            fy = fx if source.get(y_key) is None else number(where, y_key, source[y_key], 0, 1e9)
+            y = _upright(source, data, x_key, y_key)
+            fy = fx if y is None else number(where, y_key, y, 0, 1e9)
             yield x_key, Lens(focal=(fx, fy)), fx / width
     for x_key, y_key, unit in _ANGLES:
         if source.get(x_key) is not None or source.get(y_key) is not None:
             low, high = MIN_FOV / unit, math.pi / unit
             x = unit * number(where, x_key, source.get(x_key, data.get(x_key)), low, high)
-            y = math.nan if source.get(y_key) is None else unit * number(where, y_key, source[y_key], low, high)
+            upright = _upright(source, data, x_key, y_key)
+            y = math.nan if upright is None else unit * number(where, y_key, upright, low, high)
             yield x_key, Lens(fov=(x, y)), _widths(x)
     for key in _FOVS:
         if source.get(key) is not None:
@@ -197,11 +240,16 @@ def _spellings(where: str, source: dict, data: dict, size) -> Iterator[tuple[str
         yield "focal_length", Lens(fov=(2 * math.atan(0.5 / ratio), math.nan)), ratio
 
 
+def _upright(source: dict, data: dict, x_key: str, y_key: str) -> object:
+    """The value of ``y_key``; that of the file for a frame only where the file has none across as well."""
+    return source.get(y_key, None if data.get(x_key) is not None else data.get(y_key))
+
+
 def _widths(fov: float) -> float:
     return 0.5 / math.tan(0.5 * fov)
 
 
-def _size(where: str, found) -> tuple[int, int] | None:
+def _size(where: str, frame: dict, data: dict, found) -> tuple[int, int] | None:
     sides = []
     for keys in _SIDES:
         sides.append(next((v for v in (found(key, 0) for key in keys) if v is not None), None))
@@ -210,7 +258,13 @@ def _size(where: str, found) -> tuple[int, int] | None:
         raise InputError(where, f"w, h: expected at least 1 pixel, got {w} x {h}; correct the camera file")
     if (w is None) != (h is None):
         raise InputError(where, f"w, h: expected both or none, got {w} x {h}; write the size of the images")
-    return None if w is None or h is None else (int(w), int(h))
+    if w is None or h is None:
+        pairs = (source[key] for source in (frame, data) for key in _SIZES if key in source)
+        pair = next((p for p in pairs if isinstance(p, list) and len(p) == 2), None)
+        if pair is None:
+            return None
+        w, h = (number(where, "image size", side, 1, 1e6) for side in pair)
+    return int(w), int(h)
 
 
 def _center(where: str, frame: dict, data: dict, found) -> tuple[float, float] | None:

@@ -104,9 +104,16 @@ def _coverage(path: os.PathLike, channel: Image.Image, notes: list[str]) -> Imag
         some = ", ".join(map(str, levels[:8])) + (", ..." if len(levels) > 8 else "")
         raise _not_a_mask(path, f"{len(levels)} values in flat areas ({some}), as of several labels")
     if peak < OPAQUE * top and int(((values == peak)[1:-1, 1:-1] & flat).sum()) > SOLID * int((values > 0).sum()):
-        notes.append(f"masks: the highest value, {peak}, is taken as opaque instead of white")
-        return Image.fromarray(np.rint(values * np.float32(255 / peak)).astype(np.uint8))
+        return _scaled(values, peak, f"the highest value, {peak}, is", notes)
+    if not few and peak < OPAQUE * top:  # of a codec: the object's value is not one but a few about it
+        level = int(np.median(values[values > 0.5 * peak]))
+        return _scaled(values, level, f"values about {level} are", notes)
     return channel
+
+
+def _scaled(values: np.ndarray, level: int, which: str, notes: list[str]) -> Image.Image:
+    notes.append(f"masks: {which} taken as opaque instead of white")
+    return Image.fromarray(np.rint(np.minimum(values * np.float32(255 / level), 255)).astype(np.uint8))
 
 
 def _flat(values: np.ndarray) -> np.ndarray:

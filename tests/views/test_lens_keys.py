@@ -41,6 +41,8 @@ READ = {
     "intrinsic_matrix of 9 numbers": ({"intrinsic_matrix": sum(K, [])}, [F, F, CX, CY]),
     "intrinsics 4x4": ({"intrinsics": [[*row, 0] for row in K] + [[0, 0, 0, 1]]}, [F, F, CX, CY]),
     "width and height": ({"fl_x": 2 * F, "cx": 2 * CX, "cy": 2 * CY, "width": 2 * S, "height": 2 * S}, [F, F, CX, CY]),
+    "resolution": ({"fl_x": 2 * F, "resolution": [2 * S, 2 * S]}, MIDDLE),
+    "img_wh": ({"fl_x": 2 * F, "img_wh": [2 * S, 2 * S]}, MIDDLE),
     "two that agree": ({"fl_x": F, "camera_angle_x": FOV, "w": S, "h": S}, MIDDLE),
 }
 
@@ -57,6 +59,16 @@ def test_spellings_that_are_read(tmp_path, name, per_frame):
 def test_the_frame_goes_before_the_file(tmp_path):
     views = load(tmp_path, {"K": K}, camera_angle_x=1.2, fl_x=9.0)
     np.testing.assert_allclose(views.intrinsics, [[F, F, CX, CY]] * 3, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "x, y, low", [("fl_x", "fl_y", F), ("x_fov", "y_fov", 60.0), ("camera_angle_x", "camera_angle_y", 0.9)]
+)
+def test_one_axis_in_the_frame_and_the_other_in_the_file(tmp_path, x, y, low):
+    together = load(tmp_path / "a", **{x: low, y: 1.3 * low})
+    apart = load(tmp_path / "b", {x: low}, **{y: 1.3 * low})
+    assert together.intrinsics.tolist() == apart.intrinsics.tolist()
+    assert together.intrinsics[0, 0] != together.intrinsics[0, 1]
 
 
 HARMLESS = {
@@ -137,6 +149,24 @@ REFUSED = [
     {"fl_x": F, "w": S},
     {"fl_x": F, "camera_angle_x": 1.2, "w": S, "h": S},
     {"K": K, "fl_x": 80.0, "w": S, "h": S},
+    {"projection_matrix": [[1.2, 0, 0, 0], [0, 1.2, 0, 0], [0, 0, -1, -0.2], [0, 0, -1, 0]]},
+    {"P": [[F, 0, CX, 0], [0, F, CY, 0], [0, 0, 1, 0]]},
+    {"angle_x": 0.6},
+    {"cam_angle_x": 0.6},
+    {"cameras": {"0": {"fl_x": F}}},
+    {"cameras": [{"model": "PINHOLE", "params": 4, "fx": F}]},
+    {"metadata": {"camera_angle_x": 0.6}},
+    {"perspective": {"yfov": 0.6}},
+    {"cameras": [{"model": "OPENCV_FISHEYE"}], "fl_x": F},
+    {"K": [[1.6, 0, 0], [0, 1.6, 0], [0, 0, 1]]},
+    {"ortho": True, "fl_x": F},
+    {"ortho_scale": 2.5, "fl_x": F},
+    {"type": "ORTHO", "fl_x": F},
+    {"type": "PANO", "fl_x": F},
+    {"model": "double_sphere", "fl_x": F},
+    {"xi": 1.2, "fl_x": F},
+    {"D": [-0.3, 0.1, 0, 0, 0], "fl_x": F},
+    {"dist": [-0.3, 0.1, 0, 0], "fl_x": F},
     {"coordinate_system": "opencv"},
     {"camera_convention": "COLMAP"},
 ]

@@ -95,6 +95,14 @@ def test_grey_edges_of_a_label_are_scaled(tmp_path):
         assert any(f"the highest value, {top}, is taken as opaque" in n for n in notes)
 
 
+@pytest.mark.parametrize("ending, color", [(".jpg", (128, 0, 0)), (".webp", (128, 128, 128))])
+def test_labels_of_a_lossy_codec_are_opaque(tmp_path, ending, color):
+    mask, notes = mask_of(tmp_path, np.where(DISK[..., None], color, 0).astype(np.uint8), ending)
+    assert ((mask > 0.5) != DISK).mean() < 0.01  # blocks of color at the edge
+    inner = np.hypot(*(np.mgrid[:SIDE, :SIDE] - 23.5)) < 9  # clear of the blocks at the edge
+    assert mask[inner].min() > 0.9 and any("taken as opaque" in n for n in notes)
+
+
 def test_masks_of_jpeg_are_coverage(tmp_path):
     for quality in (95, 60, 20):
         stored = Image.fromarray(np.rint(antialiased() * 255).astype(np.uint8))
