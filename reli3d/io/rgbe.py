@@ -65,8 +65,8 @@ def _variables(path, data: bytes, notes: list[str]) -> tuple[np.ndarray, np.ndar
             raise InputError(path, f"FORMAT: expected 32-bit_rle_rgbe, got {got}; convert it with ra_xyze -r")
         if key in (b"EXPOSURE", b"COLORCORR"):
             factor = factor * _positive(path, key.decode(), value, 1 if key == b"EXPOSURE" else 3)
-        elif key == b"PIXASPECT" and _positive(path, "PIXASPECT", value, 1) != [1.0]:
-            notes.append(f"{os.path.basename(path)}: PIXASPECT {shown(value.decode('latin-1'))} is not applied")
+        elif key in (b"PIXASPECT", b"GAMMA") and _positive(path, key.decode(), value, 1) != [1.0]:
+            notes.append(f"{os.path.basename(path)}: {key.decode()} {shown(value.decode('latin-1'))} is not applied")
         elif key == b"PRIMARIES":
             try:
                 matrix = rec709_from_primaries([float(word) for word in value.split()])

@@ -290,6 +290,7 @@ PLANE = np.ones((4, 8), np.float32)
     "planes, header, said",
     [
         ({"Y": PLANE, "RY": PLANE, "BY": PLANE}, {}, "channels: expected R, G, B or Y, got"),
+        ({"X": PLANE, "Y": PLANE, "Z": PLANE}, {}, "channels: expected R, G, B or Y, got"),
         ({"R": PLANE, "G": PLANE}, {}, "channels: expected R, G, B or Y, got"),
         ({"left.R": PLANE, "left.G": PLANE, "left.B": PLANE}, {}, "channels: expected R, G, B or Y, got"),
         ({"Y": PLANE}, {"type": OpenEXR.tiledimage, "tiles": tiles(OpenEXR.MIPMAP_LEVELS)}, "EXR tiles: expected one"),
@@ -323,12 +324,12 @@ def test_several_parts_are_refused(tmp_path):
 def test_what_is_not_applied_is_noted(tmp_path):
     exr(tmp_path / "a.exr", {"Y": PLANE}, envmap=OpenEXR.ENVMAP_LATLONG, pixelAspectRatio=2.0)
     write_hdr(tmp_path / "b.hdr", torch.ones(4, 8, 3))
-    data = (tmp_path / "b.hdr").read_bytes().replace(b"\n\n", b"\nPIXASPECT=0.5\n\n", 1)
+    data = (tmp_path / "b.hdr").read_bytes().replace(b"\n\n", b"\nPIXASPECT=0.5\nGAMMA=2.2\n\n", 1)
     (tmp_path / "b.hdr").write_bytes(data)
     notes: list[str] = []
     for name in ("a.exr", "b.hdr"):
         read_environment(tmp_path / name, notes=notes)
-    assert [note.split(":")[1].split()[0] for note in notes] == ["envmap", "pixelAspectRatio", "PIXASPECT"]
+    assert [note.split(":")[1].split()[0] for note in notes] == ["envmap", "pixelAspectRatio", "PIXASPECT", "GAMMA"]
 
 
 QUADS = np.random.default_rng(5).integers(0, 256, (6, 12, 4), dtype=np.uint8)
