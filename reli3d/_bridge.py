@@ -152,7 +152,7 @@ def view(tensor: Tensor, dtype):
 
 
 def array_of(tensor: Tensor, dtype) -> wp.array:
-    """Warp array that shares the memory of a contiguous tensor, without gradient, for objects that Warp keeps."""
+    """Warp array on the memory of a contiguous tensor, without gradient, for objects that Warp keeps."""
     return cast(wp.array, wp.from_torch(tensor, dtype=dtype, requires_grad=False))
 
 

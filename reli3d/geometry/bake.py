@@ -34,7 +34,7 @@ class Texels:
 
     face: Tensor  # (T, T) int32, -1 where no surface is near
     bary: Tensor  # (T, T, 2) weights of vertices 1 and 2
-    inside: Tensor  # (T, T) bool: the center lies in the face; other texels of a face hold its nearest border point
+    inside: Tensor  # (T, T) bool: the center is in the face; other texels of a face have its nearest border point
 
     @property
     def valid(self) -> Tensor:

@@ -64,7 +64,7 @@ def outer_faces(chart: np.ndarray, neighbors: np.ndarray) -> np.ndarray:
 
 
 def border_edges(chart: np.ndarray, neighbors: np.ndarray) -> np.ndarray:
-    """Edges, ``(F, 3)`` bool, that no other face of the same chart shares."""
+    """Boundary edges of the charts, ``(F, 3)`` bool."""
     return (neighbors < 0) | (chart[neighbors] != chart[:, None])
 
 
@@ -205,7 +205,7 @@ def _cut_bulky(
     longest: float,
     neighbors: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Charts whose boxes are mostly empty, cut in two where that saves room: ``(chart, parent of each chart)`` or None.
+    """Charts with mostly empty boxes, cut in two if that saves area: ``(chart, parent of each chart)`` or None.
 
     points: ``(F, 3)`` centers of the faces.  area: of each chart.  waste: empty area [texels] that is worth a cut.
     longest: [texels] a longer chart is halved in any case, since it would set the scale of all the others.
@@ -279,10 +279,10 @@ def _overlaps(charts: Charts, boxes: np.ndarray, query: np.ndarray):
 
 
 def split_overlaps(charts: Charts) -> bool:
-    """Move faces of charts that overlap themselves to new charts that do not, in place; True if there were any.
+    """Moves faces of self-overlapping charts to new charts without overlap, in place; True if there were any.
 
-    All faces of a chart look towards its plane.  So where two sheets overlap, the border of one of them ends over the
-    other: looking for faces that lie over the faces at a border finds every overlap.
+    All faces of a chart face its plane.  So where two sheets overlap, the border of one of them lies on the other: it
+    suffices to test the faces at a border against all faces.
     """
     outer = outer_faces(charts.chart, charts.neighbors)
     outer = outer[charts.chart[outer] >= 0]

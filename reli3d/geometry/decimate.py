@@ -49,7 +49,7 @@ def decimate(mesh: Mesh, faces: int) -> Mesh:
     Garland and Heckbert 1997, Surface simplification using quadric error metrics, through ``fast-simplification``
     (``pip install 'reli3d[mesh]'``).  The result has at most ``faces`` faces unless no collapse is left that turns no
     face over, and it may have a few non-manifold edges (:func:`reli3d.geometry.mesh.report` counts them).
-    Deterministic.  A surface that has no more than ``faces`` comes back welded.
+    Deterministic.  A surface with at most ``faces`` faces is only welded.
 
     Raises ValueError unless ``faces`` is at least 4 and positions are finite, ImportError without the library.
     """

@@ -1,4 +1,4 @@
-"""Signed distance to closed meshes, as the truth of volume points in training."""
+"""Signed distance to closed meshes, the ground truth of volume points in training."""
 
 from __future__ import annotations
 

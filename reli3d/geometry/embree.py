@@ -66,7 +66,7 @@ def query(name: str) -> int:
 
 
 class Tree:
-    """Triangles in robust mode; ``scene`` is what queries take, valid while the tree lives.
+    """Embree scene of triangles in robust mode; ``scene``: its handle, valid during the lifetime of the object.
 
     vertices: ``(V, 3)`` float32.  faces: ``(F, 3)`` int32 in [0, V).  Raises RuntimeError if Embree cannot build it.
     """

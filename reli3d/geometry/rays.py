@@ -130,7 +130,7 @@ class RayScene:
         return Hits(face.reshape(shape), t.reshape(shape), bary.reshape(*shape, 2))
 
     def occluded(self, origins: Tensor, directions: Tensor, *, t_max: Tensor | float = float("inf")) -> Tensor:
-        """Whether anything lies on each ray before ``t_max``, ``(...)`` bool; arguments as in :meth:`closest`."""
+        """Whether each ray hits anything before ``t_max``, ``(...)`` bool; arguments as in :meth:`closest`."""
         shape, o, d, far = self._rays(origins, directions, t_max)
         out = torch.zeros(o.shape[0], dtype=torch.bool, device=self.device)
         if self._embree is not None:
@@ -141,7 +141,7 @@ class RayScene:
         return out.reshape(shape)
 
     def unoccluded(self, origins: Tensor, directions: Tensor, t_max: Tensor) -> Tensor:
-        """Whether nothing lies on a ray before its ``t_max``, ``(N,)`` bool; False where ``t_max`` is below 0.
+        """Whether a ray hits nothing before its ``t_max``, ``(N,)`` bool; False for ``t_max`` below 0.
 
         For rays that a kernel has made, ``(N, 3)``, ``(N, 3)`` and ``(N,)`` on the device, whose neighbors start at
         about one place.  Values are not checked.
@@ -256,7 +256,7 @@ class RayScene:
 
 
 def _items(values: Tensor) -> np.ndarray:
-    """``(N,)`` as it is, ``(N, 2)`` float32 as ``(N,)`` of eight bytes each, which numpy moves four times as fast."""
+    """``(N,)`` unchanged, ``(N, 2)`` float32 as ``(N,)`` of eight bytes, which numpy copies about 4 times faster."""
     return values.numpy() if values.ndim == 1 else values.view(torch.float64)[:, 0].numpy()
 
 

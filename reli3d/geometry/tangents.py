@@ -59,9 +59,9 @@ def vertex_tangents(mesh: Mesh) -> Tensor:
     # unmirrored, then mirrored; index_add_ is about 10 times slower
     total = torch.stack([torch.bincount(side, part, 2 * count) for part in weighted])
     n = _unit(normals.double().T.contiguous())[0]  # vectors are columns: torch sums a short last axis slowly
-    plain, mirrored = total[:, :count][:, same], total[:, count:][:, same]
-    flip = mirrored[3] > plain[3]
-    tangent, length = _unit(torch.where(flip, mirrored, plain)[:3])
+    upright, mirrored = total[:, :count][:, same], total[:, count:][:, same]
+    flip = mirrored[3] > upright[3]
+    tangent, length = _unit(torch.where(flip, mirrored, upright)[:3])
     tangent = torch.where(length > PARALLEL, _unit(_flat(tangent, n))[0], _any_orthogonal(n))
     return torch.cat([tangent, torch.where(flip, -1.0, 1.0).to(tangent)[None]]).T.to(torch.float32).contiguous()
 

@@ -141,7 +141,7 @@ def _by_cell_row(points: Tensor, height: int, width: int) -> tuple[Tensor, Tenso
         return order, edges
     order = torch.empty_like(keys)
 
-    def sort(slab: int, _stop: int) -> None:  # numpy sorts 16-bit keys by radix, ten times faster than torch.sort
+    def sort(slab: int, _stop: int) -> None:  # numpy sorts 16-bit keys by radix, about 10 times faster than torch.sort
         key = keys[slab].numpy().astype(np.uint16)
         order[slab] = torch.from_numpy(np.argsort(key, kind="stable"))
         edges[slab, 1:] = torch.from_numpy(np.bincount(key // bins, minlength=height + 2)[:-1].cumsum())

@@ -1,6 +1,6 @@
 """OpenEXR images in, through the OpenEXR package.
 
-Read are one flat part of scanlines or one level of tiles, with channels R, G, B, or Y as gray.  Deep, multi-part,
+Reads one flat part of scanlines or of single-level tiles, with channels R, G, B, or Y as gray.  Deep, multi-part,
 multi-level and luminance-chroma files are refused.  Source: https://openexr.com/en/latest/TechnicalIntroduction.html.
 """
 
@@ -96,8 +96,8 @@ def _header(path, notes: list[str], max_pixels: int) -> tuple[dict, list[str]]:
         samples = width * height * (len(channels) if name == "dataWindow" else 3)
         if width < 1 or height < 1 or width * height > max_pixels or samples > MAX_SAMPLES:
             got = f"{width} x {height} x {len(channels)}"
-            wanted = f"expected at most {max_pixels} pixels and {MAX_SAMPLES} samples"
-            raise InputError(path, f"EXR {name}: {wanted}, got {got}; scale the map down")
+            expected = f"expected at most {max_pixels} pixels and {MAX_SAMPLES} samples"
+            raise InputError(path, f"EXR {name}: {expected}, got {got}; scale the map down")
     _check_chunks(path, data, table, header)
     if header.get("envmap") == OpenEXR.ENVMAP_CUBE:
         raise InputError(path, "envmap: expected a lat-long map, got cube faces; convert it with exrenvmap")
@@ -109,7 +109,7 @@ def _header(path, notes: list[str], max_pixels: int) -> tuple[dict, list[str]]:
 
 
 def _header_end(path, data: bytes) -> int:
-    """Offset behind the header.  Its counts are bounded before OpenEXR, which takes quadratic time, sees them."""
+    """Offset of the end of the header.  Bounds its counts before OpenEXR parses them in quadratic time."""
     try:
         magic, version = struct.unpack_from("<II", data)
         if magic != 20000630:
@@ -156,7 +156,7 @@ def _check_chunks(path, data: bytes, table: int, header: dict) -> None:
 
 
 def _matrix(path, header: dict, notes: list[str]) -> np.ndarray | None:
-    """From the file's primaries (``chromaticities``, or what stands in for them) to Rec. 709."""
+    """Matrix from the file's primaries (``chromaticities`` or a substitute) to Rec. 709."""
     primaries, field = header.get("chromaticities"), "chromaticities"
     if primaries is None and header.get("acesImageContainerFlag") == 1:
         primaries, field = _PRIMARIES["lin_ap0_scene"], "acesImageContainerFlag"

@@ -25,7 +25,7 @@ def read_bytes(path: str | os.PathLike, limit: int) -> bytes:
 
 
 def file_size(path: str | os.PathLike) -> int:
-    """Bytes of a regular file.  Raises InputError where there is none, TypeError for what is no path."""
+    """Size of a regular file in bytes.  Raises InputError if there is none, TypeError unless ``path`` is a path."""
     try:
         info = os.stat(os.fspath(path))
     except FileNotFoundError:

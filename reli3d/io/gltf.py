@@ -121,7 +121,7 @@ class Document:
         return value
 
     def item(self, kind: str, index: object, field: str) -> dict:
-        """Element ``index`` of the top-level list ``kind``; ``field`` is what refers to it."""
+        """Element ``index`` of the top-level list ``kind``; ``field``: the reference to it, for error messages."""
         items = self.get(self.json, kind, list, kind, [])
         if not isinstance(index, int) or isinstance(index, bool) or not 0 <= index < len(items):
             self.fail(field, f"expected an index into {len(items)} {kind}", index)

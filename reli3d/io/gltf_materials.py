@@ -21,7 +21,7 @@ from reli3d.render.gbuffer import sample_texture, wrap_uv
 
 FORMATS = ("PNG", "JPEG", "WEBP")
 MAX_SCALE = 1e6  # of a normal texture: beyond it, float32 loses the normal's z
-PLAIN = 4  # texels along a side of a texture without an image
+UNIFORM_SIZE = 4  # texels per side of a texture without an image
 MAX_SIDE = 4096  # texels along a side of textures that are resampled to one layout
 WRAPS = {10497: "repeat", 33648: "mirror", 33071: "clamp"}
 NEAREST = (9728, 9984, 9986)  # filters that take the nearest texel
@@ -110,7 +110,7 @@ class Materials:
     def _kept(self, index: object, material: _Material) -> TextureSet:
         if index not in self.made:
             slots = material.slots
-            size = max((max(s.image.shape[:2]) for s in slots if s is not None), default=PLAIN)
+            size = max((max(s.image.shape[:2]) for s in slots if s is not None), default=UNIFORM_SIZE)
             self._count(size, f"materials[{index}]")
             maps = [None if s is None else _square(s.image, size) for s in slots]
             wrap = next((s.layout.wrap for s in slots if s is not None), ("repeat", "repeat"))
@@ -119,7 +119,7 @@ class Materials:
 
     def _resampled(self, material: _Material, low: np.ndarray, span: np.ndarray, field: str) -> TextureSet:
         """Textures of different layouts, looked up at the texel centers of the box ``low``, ``span`` of the uv."""
-        with np.errstate(all="ignore"):  # what overflows is refused below
+        with np.errstate(all="ignore"):  # overflow is refused below
             sides = [
                 np.abs(np.array(s.layout.transform).reshape(2, 3)[:, :2] * span).sum(1) * s.image.shape[1::-1]
                 for s in material.slots
@@ -127,9 +127,9 @@ class Materials:
             ]
         largest = float(np.max(sides))
         if not largest <= MAX_SIDE:
-            wanted = f"expected transforms and wrap modes of its textures that fit one of {MAX_SIDE} texels"
-            self.document.fail(field, wanted, largest, "bake to one UV channel")
-        size = max(PLAIN, math.ceil(largest))
+            expected = f"expected transforms and wrap modes of its textures that fit one of {MAX_SIDE} texels"
+            self.document.fail(field, expected, largest, "bake to one UV channel")
+        size = max(UNIFORM_SIZE, math.ceil(largest))
         self._count(size, field)
         self.document.note(f"{field}: textures of different transforms or wrap modes are resampled to one layout")
         center = (np.arange(size) + 0.5) / size
@@ -150,11 +150,11 @@ class Materials:
         return self._make(material, maps, size, ("clamp", "clamp"))
 
     def _count(self, size: int, field: str) -> None:
-        if size > PLAIN:
+        if size > UNIFORM_SIZE:
             self.squares -= size * size
             if self.squares < 0:
-                wanted = "expected smaller textures: images are made square, for each material"
-                self.document.fail(field, wanted, size, "use smaller textures or fewer materials")
+                expected = "expected smaller textures: images are made square, for each material"
+                self.document.fail(field, expected, size, "use smaller textures or fewer materials")
 
     def _make(self, material: _Material, maps: list[Tensor | None], size: int, wrap: tuple[str, str]) -> TextureSet:
         white = torch.ones(size, size, 4, dtype=torch.float32, device="cpu")
@@ -296,7 +296,7 @@ def metallic_from_specular(diffuse: Tensor, specular: Tensor) -> tuple[Tensor, T
     """
     weights = diffuse.new_tensor([0.299, 0.587, 0.114])
     d, s = ((v * v * weights).sum(-1).sqrt() for v in (diffuse, specular))  # perceived brightness
-    left = 1.0 - specular.amax(-1)  # what the specular lobe leaves to the diffuse one
+    left = 1.0 - specular.amax(-1)  # energy transmitted to the diffuse layer
     b = d * left / (1.0 - DIELECTRIC) + s - 2.0 * DIELECTRIC
     root = (b * b - 4.0 * DIELECTRIC * (DIELECTRIC - s)).clamp(min=0.0).sqrt()
     metallic = torch.where(s < DIELECTRIC, torch.zeros_like(s), ((root - b) / (2.0 * DIELECTRIC)).clamp(0.0, 1.0))

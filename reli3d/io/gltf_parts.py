@@ -184,8 +184,8 @@ class _Primitive:
                     self.document.fail(f"{self.field}.attributes", "expected JOINTS_0, WEIGHTS_0", [*self.attributes])
                 break
             if len(joints) and joints.max() >= len(placed.joints):
-                wanted = f"expected joints below {len(placed.joints)}"
-                self.document.fail(f"{self.field}.attributes.JOINTS_{k}", wanted, int(joints.max()))
+                expected = f"expected joints below {len(placed.joints)}"
+                self.document.fail(f"{self.field}.attributes.JOINTS_{k}", expected, int(joints.max()))
             for joint, weight in zip(joints.T.astype(np.int64), weights.T, strict=True):
                 total += weight[:, None, None] * placed.joints[joint]
                 sums += weight

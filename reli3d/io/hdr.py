@@ -133,8 +133,8 @@ def _writable(image: Tensor, limit: float, layouts: tuple[tuple[int, ...], ...] 
     if not isinstance(image, Tensor) or image.dtype != torch.float32:
         raise TypeError(f"image: expected a float32 tensor, got {getattr(image, 'dtype', type(image).__name__)}")
     if image.ndim < 2 or image.shape[2:] not in layouts or image.numel() == 0:
-        wanted = " or ".join(f"(H, W{''.join(f', {n}' for n in layout)})" for layout in layouts)
-        raise ValueError(f"image: expected shape {wanted}, got {tuple(image.shape)}")
+        expected = " or ".join(f"(H, W{''.join(f', {n}' for n in layout)})" for layout in layouts)
+        raise ValueError(f"image: expected shape {expected}, got {tuple(image.shape)}")
     pixels = image.detach().cpu().numpy()
     if np.isnan(pixels).any() or (pixels < 0).any():
         raise ValueError(f"image: expected values >= 0, got NaN or negative at {int((~(pixels >= 0)).sum())} places")

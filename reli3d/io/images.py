@@ -37,7 +37,7 @@ _COLOR = ("RGB", "RGBA", "P", "PA", "CMYK", "YCbCr")
 
 
 class _Reader(io.BufferedReader):
-    """A file of which no more is read than it holds: Python takes memory at once for what a broken chunk claims."""
+    """A file whose reads are limited to its size: a broken chunk may claim any length, which Python would allocate."""
 
     def __init__(self, path: str | os.PathLike, size: int):
         super().__init__(io.FileIO(path))
@@ -78,12 +78,12 @@ def above(channel: Image.Image, limit: float) -> np.ndarray:
 def decode_image(
     path: str | os.PathLike, *, notes: list[str] | None = None, calibrated: tuple[int, int] | None = None
 ) -> Image.Image:
-    """Decodes an image to mode RGB, RGBA, L, or F for gray of 16 bits in [0, 65535].
+    """Decodes an image to mode RGB, RGBA, L, or F for 16-bit gray in [0, 65535].
 
-    PNG, JPEG, WebP or TIFF; 8 bit, palette, gray, CMYK, 16-bit gray; 16-bit color comes down to 8 bit.  The size is
-    checked before a pixel is decoded.  What was done to the pixels is appended to ``notes``.  calibrated: width and
-    height that the camera file states; where only the image turned by its EXIF orientation has that aspect, it is
-    turned.  Raises InputError on anything else: another format, more than 64 MP, several frames, a truncated file.
+    Reads PNG, JPEG, WebP or TIFF: 8-bit color, palette, gray, CMYK, 16-bit gray; 16-bit color is reduced to 8 bit.  The
+    size is checked before decoding.  notes: receives changes of the pixels.  calibrated: width and height in the camera
+    file; the EXIF orientation is applied if only the rotated image has that aspect.  Raises InputError for other
+    formats, more than 64 MP, several frames, or a broken file.
     """
     size = file_size(path)
     if size > MAX_BYTES:
@@ -136,9 +136,9 @@ def _decoded(path, image: Image.Image, notes: list[str], calibrated: tuple[int, 
             raise InputError(path, "expected 8 or 16 bit gray, got 32 bit; save as 8 bit PNG")
         return Image.fromarray(gray)
     transparent = image.mode in ("LA", "PA", "RGBA") or "transparency" in image.info
-    wanted = "RGBA" if transparent else "L" if image.mode in ("1", "L") else "RGB"
+    mode = "RGBA" if transparent else "L" if image.mode in ("1", "L") else "RGB"
     image.load()
-    return image if image.mode == wanted else image.convert(wanted)
+    return image if image.mode == mode else image.convert(mode)
 
 
 def _aspect(a: tuple[int, int], b: tuple[int, int]) -> bool:
@@ -204,8 +204,8 @@ def write_image(path: str | os.PathLike, image: Tensor) -> None:
         raise TypeError(f"image: expected a float32 tensor, got {getattr(image, 'dtype', type(image).__name__)}")
     layouts = [(3,)] if suffix == ".hdr" else [(), (3,), (4,)]
     if image.ndim < 2 or image.shape[2:] not in layouts or image.numel() == 0:
-        wanted = "(H, W, 3)" if suffix == ".hdr" else "(H, W), (H, W, 3) or (H, W, 4)"
-        raise ValueError(f"image: expected shape {wanted}, got {tuple(image.shape)}")
+        expected = "(H, W, 3)" if suffix == ".hdr" else "(H, W), (H, W, 3) or (H, W, 4)"
+        raise ValueError(f"image: expected shape {expected}, got {tuple(image.shape)}")
     image = image.detach()
     if not bool((torch.isfinite(image) & (image >= 0.0)).all()):
         raise ValueError("image: expected finite values >= 0, got NaN, infinity or negative values")

@@ -29,7 +29,7 @@ norm {name}_normal.png
 def obj_files(asset: Asset, name: str) -> dict[str, bytes]:
     """Files by name: ``NAME.obj``, ``NAME.mtl`` and four PNG textures.  Raises TypeError, ValueError as glTF does.
 
-    Corners share positions, normals and texture coordinates by the same index.  v goes up in OBJ, so it is turned.
+    A corner uses one index for position, normal and texture coordinate.  v is flipped, since it points up in OBJ.
     """
     check_asset(asset)
     if not portable(asset):

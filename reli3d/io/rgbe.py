@@ -50,7 +50,7 @@ def read_rgbe(path: str | os.PathLike, max_pixels: int, notes: list[str]) -> tup
 
 
 def _variables(path, data: bytes, notes: list[str]) -> tuple[np.ndarray, np.ndarray | None, int]:
-    """What the pixels were multiplied by, the matrix of PRIMARIES, and the offset of the resolution line."""
+    """The factors of EXPOSURE and COLORCORR, the matrix of PRIMARIES, and the offset of the resolution line."""
     factor, matrix, at = np.ones(3), None, 0
     while True:
         end = data.find(b"\n", at, MAX_HEADER)
@@ -83,8 +83,8 @@ def _positive(path, field: str, value: bytes, count: int) -> list[float]:
     except ValueError:
         numbers = []
     if len(numbers) != count or not all(1e-12 < number < 1e12 for number in numbers):
-        wanted = "a positive number" if count == 1 else f"{count} positive numbers"
-        raise InputError(path, f"{field}: expected {wanted}, got {shown(value.decode('latin-1'))}; correct the header")
+        numbers = "a positive number" if count == 1 else f"{count} positive numbers"
+        raise InputError(path, f"{field}: expected {numbers}, got {shown(value.decode('latin-1'))}; correct the header")
     return numbers
 
 
@@ -138,16 +138,16 @@ def _pixels(path, data: bytes, at: int, line: np.ndarray) -> int:
     while done < length:
         quads = np.frombuffer(data, np.uint8, min(length - done, (len(data) - at) // 4) * 4, at).reshape(-1, 4)
         repeats = np.flatnonzero((quads[:, :3] == 1).all(1)[done == 0 :]) + (done == 0)
-        plain = int(repeats[0]) if len(repeats) else len(quads)
-        line[done : done + plain] = quads[:plain]
-        done, at = done + plain, at + 4 * plain
-        if plain:
+        literals = int(repeats[0]) if len(repeats) else len(quads)
+        line[done : done + literals] = quads[:literals]
+        done, at = done + literals, at + 4 * literals
+        if literals:
             shift = 0
         if done == length:
             break
         if not len(repeats):  # the end of the file
             raise _truncated(path)
-        count = min(int(quads[plain, 3]) << min(shift, 24), length - done)
+        count = min(int(quads[literals, 3]) << min(shift, 24), length - done)
         line[done : done + count] = line[done - 1]
         done, at, shift = done + count, at + 4, shift + 8
     return at

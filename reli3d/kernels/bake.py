@@ -26,7 +26,7 @@ class Tiles:
 
 @wp.struct
 class Places:
-    """Flat indices of the wanted texels; face and weights of every texel of the map; vertices of the faces."""
+    """Flat indices of the texels to evaluate; face and weights of every texel of the map; vertices of the faces."""
 
     texel: wp.array[wp.int64]
     face: wp.array[wp.int32]

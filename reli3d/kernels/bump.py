@@ -1,4 +1,4 @@
-"""Normals that bend in a frame, and what a normal map holds of them, without gradient.
+"""Bump-mapped normals in a tangent frame, and their encoding in a normal map, without gradient.
 
 The formulas are those of :mod:`reli3d.render.bump` and :mod:`reli3d.geometry.tangents`, which have gradients.
 """

@@ -153,7 +153,7 @@ def side(a: wp.vec2, b: wp.vec2, p: wp.vec2) -> float:
 
 @wp.func
 def separates(a: wp.vec2, b: wp.vec2, p: wp.vec2, q: wp.vec2, r: wp.vec2, slack: float) -> bool:
-    """True if the triangle ``p q r`` lies right of the line ``a b``, up to ``slack``."""
+    """True if the triangle ``p q r`` is right of the line ``a b``, up to ``slack``."""
     return wp.min(side(a, b, p), wp.min(side(a, b, q), side(a, b, r))) >= -slack
 
 
@@ -281,15 +281,15 @@ def outline_kernel(
             t = p
             p = q
             q = t
-        slope = (q[1] - p[1]) / wp.max(q[0] - p[0], 1.0e-6)
+        gradient = (q[1] - p[1]) / wp.max(q[0] - p[0], 1.0e-6)
         first = wp.max(int(wp.floor(p[0] - margin)), 0)
         last = wp.min(int(wp.floor(q[0] + margin)), width - 1)
         for c in range(first, last + 1):
             # part of the segment within the margin of this column
             x0 = wp.clamp(float(c) - margin, p[0], q[0])
             x1 = wp.clamp(float(c + 1) + margin, p[0], q[0])
-            y0 = p[1] + slope * (x0 - p[0])
-            y1 = p[1] + slope * (x1 - p[0])
+            y0 = p[1] + gradient * (x0 - p[0])
+            y1 = p[1] + gradient * (x1 - p[0])
             if q[0] - p[0] < 1.0e-6:
                 y0 = p[1]
                 y1 = q[1]

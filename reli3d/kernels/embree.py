@@ -70,7 +70,7 @@ return false;
 """
 )
 def any_hit(occluded1: wp.uint64, scene: wp.uint64, o: wp.vec3, d: wp.vec3, limit: float) -> bool:
-    """Whether anything lies at t in [0, limit]."""
+    """Whether there is a hit at t in [0, limit]."""
     ...
 
 

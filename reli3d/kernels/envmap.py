@@ -1,6 +1,6 @@
 """Lat-long environment maps: lookup, importance table, sampling.
 
-Row 0 is +Y; the center column looks to +X, right of it +Z: with phi = 2 pi u - pi and theta = pi v the direction is
+Row 0 is +Y, the center column +X, +Z right of it: with phi = 2 pi u - pi and theta = pi v the direction is
 (cos phi sin theta, cos theta, sin phi sin theta).  A texel has its center at ((column + .5) / W, (row + .5) / H).
 Radiance is bilinear between centers, periodic in u, constant beyond the first and last row.  Sampling is piecewise
 constant over texels with respect to solid angle; densities are per steradian.
@@ -89,7 +89,7 @@ def upper_cell(cdf: wp.array2d[float], guide: wp.array2d[wp.int32], row: int, u:
     """Index k with ``cdf[row, k] <= u < cdf[row, k + 1]``; such a cell has positive probability.
 
     Chen and Asau 1974: ``guide[row, j]`` is the cell of u = j / n, from which one step is expected for any CDF.  The
-    first two are looked at without a branch, which a processor could not foresee, and side by side.
+    first two are tested without a branch, which a processor could not predict, and in parallel.
     """
     n = guide.shape[1]
     k = guide[row, wp.min(int(u * float(n)), n - 1)]

@@ -1,6 +1,6 @@
 """Tables of dual marching cubes, generated from the topology of the cube.
 
-Corner k stands at (k & 1, k >> 1 & 1, k >> 2 & 1) in (x, y, z).  A case is the sum of ``1 << k`` over the inside
+Corner k is at (k & 1, k >> 1 & 1, k >> 2 & 1) in (x, y, z).  A case is the sum of ``1 << k`` over the inside
 corners.  A face joins its crossed edges in pairs; they form closed loops, and each loop is one dual vertex (Nielson
 2004, Dual Marching Cubes).
 
@@ -19,7 +19,7 @@ EDGES = ((0, 1), (1, 5), (4, 5), (0, 4), (2, 3), (3, 7), (6, 7), (2, 6), (2, 0),
 
 
 class Tables(NamedTuple):
-    """Everything the kernels look up, int32."""
+    """Lookup tables of the kernels, int32."""
 
     count: np.ndarray  # (256,) dual vertices of a case
     group: np.ndarray  # (256, 12) dual vertex of an edge, -1 where the edge is not crossed
@@ -64,7 +64,7 @@ def groups() -> np.ndarray:
 
 
 def _around(axis: int) -> list[int]:
-    """Edge of its four cubes that an edge along ``axis`` is: the first cube lies below it in both other axes."""
+    """Index of a grid edge along ``axis`` in each of its four cubes; the first cube is below it in both other axes."""
     first, second = (a for a in range(3) if a != axis)
     found = []
     for below_first in (1, 0):

@@ -125,7 +125,7 @@ def reevaluate_kernel(
 ):
     """Ray against the plane of a known face.  Moller and Trumbore 1997, without their early exits.
 
-    A miss, and a face that the ray query takes for one seen edge on, keep what the hit has, without gradient."""
+    A miss, and a face seen edge-on, keep the values of the ray query, without gradient."""
     i = start + wp.tid()
     f = face[i]
     t[i] = hit_t[i]

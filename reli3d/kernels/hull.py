@@ -160,7 +160,7 @@ def mirror_residual_kernel(
     start: int,
     # in
     points: wp.array2d[wp.vec3],  # (R, D) along rays
-    known: wp.array2d[bool],  # (R, D) whether the point lies in the hull
+    known: wp.array2d[bool],  # (R, D) whether the point is in the hull
     normal: wp.array[wp.vec3],  # (P,) of planes, unit
     offset: wp.array[float],  # (P,)
     most: float,

@@ -1,6 +1,6 @@
 """Look-up of points in posed feature maps: pinhole projection and a bilinear gather, one thread a point and view.
 
-Cameras are OpenGL (look along -Z, +Y up); pixel centers lie at +0.5; outside the image the border value is taken.
+Cameras are OpenGL (look along -Z, +Y up); pixel centers at +0.5; outside the image lookups clamp to the border.
 """
 
 import warp as wp

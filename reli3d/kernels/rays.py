@@ -38,7 +38,7 @@ def offset_origin(position: wp.vec3, ng: wp.vec3, direction: wp.vec3, scale: flo
 
 @wp.func
 def hit_occluded(mesh: wp.uint64, origin: wp.vec3, direction: wp.vec3, t_max: float) -> bool:
-    """Whether anything lies at t in [0, t_max)."""
+    """Whether there is a hit at t in [0, t_max)."""
     return wp.mesh_query_ray_anyhit(mesh, origin, direction, wp.min(t_max, T_FAR))
 
 
@@ -121,7 +121,7 @@ def sight_kernel(
     direction: wp.array[wp.vec3],
     t_max: wp.array[float],
 ):
-    """Ray from a point of a surface to a camera; ``t_max`` is -1 where the point looks away or lies off the image.
+    """Ray from a surface point to a camera; ``t_max`` is -1 if the point faces away or projects outside the image.
 
     pair: the ray is of camera ``pair // N`` and point ``pair % N``, so that neighbors go to one camera from about one
     place; without any, the ray's own number.

@@ -36,7 +36,7 @@ def opposite(u: wp.vec2) -> wp.vec2:
     """Numbers of the antithetic partner of the visible normal drawn with ``u``: its point of the cap is across the
     normal, and as many points of the cap are lower as are higher than the original's.
 
-    Exact on the grid of the random numbers: what is uniform stays so.
+    Exact for multiples of 2^-24, the grid of the random numbers, so the result is uniform too.
     """
     turned = u[0] + 0.5
     if u[0] >= 0.5:

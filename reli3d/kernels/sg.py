@@ -16,7 +16,7 @@ SHARPNESS_MIN = wp.constant(0.01)  # a lobe within 2 % of constant; keeps 1 / sh
 SERIES = wp.constant(0.5)  # where derivatives of the closed forms, which cancel, and of the series both err by 1e-5
 COSINE_SHARPNESS = wp.constant(2.133)  # of the Gaussian nearest to a clamped cosine, Wang et al. 2009
 
-# (1 + x)^-2 = sum of weight exp(-rate x), fitted here over x in [0, 300] to 6e-4: GGX's slopes as a mixture of normals
+# (1 + x)^-2 = sum of weight exp(-rate x), fitted over x in [0, 300] to 6e-4: GGX's slope distribution as normals
 GGX_WEIGHT = wp.constant(wp.vec4(0.01271983, 0.15480422, 0.51788954, 0.31433217))
 GGX_RATE = wp.constant(wp.vec4(0.08227587, 0.41751521, 1.38313102, 3.80806021))
 

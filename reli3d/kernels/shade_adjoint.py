@@ -1,4 +1,4 @@
-"""Gradient of the estimator of ``reli3d.kernels.shade``, written out by hand.
+"""Explicit adjoint of the estimator of ``reli3d.kernels.shade``.
 
 Detached sampling: directions, densities, weights and visibility are those of the forward pass and constants, which
 leaves the gradient unbiased because the integrand's domain, the sphere, does not depend on the parameters (Zeltner et

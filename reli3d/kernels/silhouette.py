@@ -16,7 +16,7 @@ DEPTH_MIN = wp.constant(
 
 @wp.func
 def side_of_edge(eye: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3) -> float:
-    """Signed volume; its sign is the side of the plane through the eye and the edge on which ``c`` lies."""
+    """Signed volume, whose sign is the side of ``c`` relative to the plane through the camera and the edge."""
     return wp.dot(wp.cross(a - eye, b - eye), c - a)
 
 
@@ -30,7 +30,7 @@ def pixel_of(frame: wp.mat33, eye: wp.vec3, intrinsics: wp.vec4, p: wp.vec3) -> 
 
 @wp.func
 def line_range(from_: float, to: float, size: int) -> wp.vec2i:
-    """First pixel line whose center lies in [low, high) of the two coordinates, and how many do."""
+    """First pixel line with a center in [low, high) of the two coordinates, and the number of such lines."""
     low = wp.clamp(wp.min(from_, to) - 0.5, -1.0, float(size))
     high = wp.clamp(wp.max(from_, to) - 0.5, -1.0, float(size))
     first = wp.max(int(wp.ceil(low)), 0)

@@ -1,7 +1,7 @@
 """Bilinear gather from three axis-aligned feature planes, and its two adjoints.
 
 Planes are channel-last, ``(P = 3 * batch, H, W, Q)`` of :data:`vec8` blocks, flattened: texel (y, x), block q of
-plane ``p`` stands at ``((p * H + y) * W + x) * Q + q``.  Plane 0 takes (x, y) of a point, plane 1 (x, z), plane 2 (y,
+plane ``p`` is at ``((p * H + y) * W + x) * Q + q``.  Plane 0 takes (x, y) of a point, plane 1 (x, z), plane 2 (y,
 z), the first along W.  A coordinate in [-1, 1] spans the texel borders (align_corners False); texels outside the
 plane are zero.
 """
@@ -301,7 +301,7 @@ def cell_key_kernel(
 
 @wp.func
 def add_texel(g_planes: wp.array[vec8], base: int, x: int, y: int, sizes: Sizes, value: vec8):
-    """Plain addition: the caller owns the rows of the texel."""
+    """Addition without atomics: the caller owns the rows of the texel."""
     if x >= 0 and x < sizes.width and y >= 0 and y < sizes.height:
         at = base + (y * sizes.width + x) * sizes.blocks
         g_planes[at] = g_planes[at] + value

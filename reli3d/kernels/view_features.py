@@ -1,4 +1,4 @@
-"""Per-view features of points looked up in posed images, blend weights of the views, and weighted means over them."""
+"""Per-view features of points by lookup in posed images, blend weights of the views, and weighted means over them."""
 
 import warp as wp
 
@@ -23,7 +23,7 @@ TANH_SATURATION = wp.constant(8.3)  # tanh is 1 to within 1.2e-7, a float32 roun
 
 @wp.struct
 class Viewed:
-    """Posed images, and N points that are looked up in them; points in space have no normals and no visibility."""
+    """Posed images and N query points; points of the volume have no normals and no visibility."""
 
     image: wp.array3d[wp.vec4]  # (V, S, S) sRGB and silhouette distance in pixels
     c2w: wp.array[wp.mat44]  # (V,)

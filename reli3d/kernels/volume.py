@@ -49,7 +49,7 @@ def next_sample(
     shift: float,
     index: int,
 ) -> int:
-    """First step from ``index`` on whose sample lies in an occupied cell, or -1; empty cells are stepped over whole."""
+    """First step from ``index`` on with its sample in an occupied cell, or -1; empty cells are skipped entirely."""
     size = occupied.shape[0]
     k = index
     found = wp.int32(-1)

@@ -53,7 +53,7 @@ def grid_bound_sdf(maps: ViewMaps, axis: Tensor, softness: float, far: float = m
 class Field(ABC):
     """Network output for one object, and its input views, in the model's frame."""
 
-    reads_views: ClassVar[bool]  # whether the material depends on which view sees a point
+    reads_views: ClassVar[bool]  # whether the material depends on the visibility of a point in the views
 
     maps: ViewMaps
 

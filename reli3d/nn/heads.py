@@ -132,7 +132,7 @@ class WeightMerger(nn.Module):
     def merged(self, corners: Tensor) -> Tensor:
         """Raw weights ``(..., 21)`` of cubes from their corners ``(..., 8, 16)``.
 
-        Corner k lies at x = k & 1, y = k >> 1 & 1, z = k >> 2 of the cube.
+        Corner k is at x = k & 1, y = k >> 1 & 1, z = k >> 2 of the cube.
         """
         return MERGED_MULTIPLIER * self.mlp(corners.flatten(-2))
 

@@ -38,8 +38,8 @@ class Shading:
         """
         predicted = torch.log(self.irradiance.lookup(normal.contiguous()) / torch.pi + LOG_OFFSET)
         brightness = brightness_at(normal, self.observed)
-        plain = color_logit(unshaded(color, brightness))
-        return torch.cat([normal, predicted, brightness.log(), plain, self.palette.expand(len(normal), -1)], -1)
+        unlit = color_logit(unshaded(color, brightness))
+        return torch.cat([normal, predicted, brightness.log(), unlit, self.palette.expand(len(normal), -1)], -1)
 
 
 def unshaded(color: Tensor, brightness: Tensor) -> Tensor:
@@ -47,13 +47,13 @@ def unshaded(color: Tensor, brightness: Tensor) -> Tensor:
     return linear_to_srgb((srgb_to_linear(color) / brightness).clamp(0.0, 1.0))
 
 
-def palette_of(color: Tensor, plain: Tensor, visible: Tensor) -> Tensor:
-    """Mean and standard deviation ``(12,)`` of the logits of ``color`` and ``plain``, both ``(N, 3)`` sRGB.
+def palette_of(color: Tensor, unlit: Tensor, visible: Tensor) -> Tensor:
+    """Mean and standard deviation ``(12,)`` of the logits of ``color`` and ``unlit``, both ``(N, 3)`` sRGB.
 
     color: observed.  plain: divided by the brightness, see :func:`unshaded`.  visible: ``(N,)``, weight of each point.
     """
     weight = ((visible + 1e-6) / (visible + 1e-6).sum())[:, None]
-    values = torch.cat([color_logit(color), color_logit(plain)], -1)
+    values = torch.cat([color_logit(color), color_logit(unlit)], -1)
     mean = (values * weight).sum(0)
     return torch.cat([mean, ((values - mean).square() * weight).sum(0).sqrt()])
 

@@ -386,9 +386,9 @@ class LocalField(Field):
             _, _, summary = summarize_views(self.maps.images, self.maps.camera, position, visible, normal)
             shown, visible_in_any = summary[:, :3], visible.amax(1)
             observed = brightness_over_normal(srgb_to_linear(shown), visible_in_any, normal)
-            plain = unshaded(shown, brightness_at(normal, observed))
+            unlit = unshaded(shown, brightness_at(normal, observed))
             irradiance = Environment(self.radiance_map(LIGHT_ROWS).detach().contiguous()).irradiance()
-            return replace(self, shading=Shading(irradiance, observed, palette_of(color, plain, visible_in_any)))
+            return replace(self, shading=Shading(irradiance, observed, palette_of(color, unlit, visible_in_any)))
 
     def material(self, position: Tensor, normal: Tensor, visible: Tensor) -> PointMaterial:
         def evaluate(position: Tensor, normal: Tensor, visible: Tensor) -> dict[str, Tensor]:

@@ -59,7 +59,7 @@ class Reconstructor(nn.Module):
         self.environment = EnvironmentDecoder(preset.reni)
         self.heads = Heads(3 * preset.upsampler.channels, preset.head_width)
         self.merger = WeightMerger(preset.head_width)
-        if self.device.type != "meta":  # there are no values there, and torch would import its compiler to say so
+        if self.device.type != "meta":  # no values to initialize, and torch would import its compiler
             initialize(self)
 
     @property
@@ -89,7 +89,7 @@ class Reconstructor(nn.Module):
         *,
         background_visible: Tensor | None = None,
     ) -> Code:
-        """Read posed views of B objects, each in the model's frame; the first view is the hero.
+        """Encodes posed views of B objects, each in the model's frame; the first view is the reference view.
 
         images: ``(B, V, S, S, 3)`` sRGB in [0, 1], straight (not multiplied by the mask), S the preset's image size.
         masks: ``(B, V, S, S)`` in [0, 1].  c2w: ``(B, V, 4, 4)`` OpenGL axes.  intrinsics: ``(B, V, 4)`` fx, fy, cx, cy

@@ -14,7 +14,7 @@ import math
 import typing
 from dataclasses import dataclass
 
-MAX_SIZE, MAX_LAYERS, MAX_LEVELS = 8192, 64, 8  # several times what a network of this kind has
+MAX_SIZE, MAX_LAYERS, MAX_LEVELS = 8192, 64, 8  # several times the values of the presets
 LAYERS = ("layers", "blocks", "basic_blocks", "convolutions")
 LIMITS = {  # inclusive; all other integers lie in 1 to MAX_SIZE
     **dict.fromkeys(LAYERS, (1, MAX_LAYERS)),
@@ -92,7 +92,7 @@ class BackboneSizes(_Checked):
     """The two-stream transformer; its width is also the width of encoder and triplane bank."""
 
     heads: int
-    latents: int  # learned latent tokens, in addition to the hero view's tokens
+    latents: int  # learned latent tokens, in addition to the tokens of the reference view
     blocks: int
     basic_blocks: int  # in each block
     experts: int  # 0: none
@@ -110,7 +110,7 @@ class UpsamplerSizes(_Checked):
 @dataclass(frozen=True)
 class IlluminationSizes(_Checked):
     encoder: EncoderSizes
-    tokens: int  # tokens * token_width numbers come out, of which latents*3 + 1 + 6 are read
+    tokens: int  # output tokens; of tokens * token_width values latents * 3 + 1 + 6 are used
     token_width: int
     width: int
     heads: int

@@ -1,7 +1,7 @@
 """Two-stream transformer: triplane tokens and latents, which attend to each other alternately.
 
-Source: section 3 of the paper, in the form of its release (the hero view's tokens join the latents, all views' tokens
-are read by cross attention, the last blocks mix experts).  Parameter names are the published checkpoint's.
+Source: section 3 of the paper, in the form of its release: the tokens of the reference view join the latents, tokens of
+all views enter by cross-attention, and the last blocks mix experts.  Parameter names are those of the checkpoint.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class FeedForward(nn.Module):
 
 
 class Experts(nn.Module):
-    """Half the sum of a shared feed-forward and of the softly weighted experts; every expert sees every token."""
+    """Half the sum of a shared feed-forward layer and of softly weighted experts; all experts process all tokens."""
 
     def __init__(self, width: int, count: int):
         super().__init__()

@@ -1,6 +1,6 @@
 """Pixel-aligned features of points from the input views, which keep the detail of the images in a small network.
 
-A point is looked up in every view.  Patch tokens, color, silhouette distance and depth pass through a small MLP per
+A point is projected into every view.  Patch tokens, color, silhouette distance and depth pass through a small MLP per
 view and are pooled over the views, so the features are order-invariant and of one width for any number of views (Yu et
 al. 2021, pixelNeRF, with pooling as in Wang et al. 2021, IBRNet).
 """

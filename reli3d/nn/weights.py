@@ -46,7 +46,7 @@ def network(preset: AnyPreset) -> Network:
 
 
 class WeightsError(InputError):
-    """A file of weights cannot be used; one line that names the file and what is wrong with it."""
+    """A weights file cannot be used; the message is one line with the file and the reason."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Manifest:
 
     path: str
     tensors: dict[str, Stored]
-    metadata: dict[str, str]  # of our files: format, preset, licence, and what the writer added
+    metadata: dict[str, str]  # of files in our format: format, preset, licence and additional entries
 
     @property
     def licence(self) -> str:
@@ -240,20 +240,20 @@ def load(
     if isinstance(preset, LocalPreset) and trunk not in (None, torch.float32, torch.bfloat16):
         raise WeightsError(path, f"expected float32 or bfloat16 for the network of convolutions, got {trunk}")
     model.to_compute(trunk or default_trunk(preset, device))
-    wanted = {name: value.dtype for name, value in model.state_dict().items()}
-    model.load_state_dict(read_tensors(manifest, wanted, device), strict=True, assign=True)
+    dtypes = {name: value.dtype for name, value in model.state_dict().items()}
+    model.load_state_dict(read_tensors(manifest, dtypes, device), strict=True, assign=True)
     return model.eval(), manifest
 
 
 def read_tensors(
-    manifest: Manifest, wanted: Mapping[str, torch.dtype], device: torch.device | str = "cpu"
+    manifest: Manifest, dtypes: Mapping[str, torch.dtype], device: torch.device | str = "cpu"
 ) -> dict[str, Tensor]:
-    """The tensors named in ``wanted`` as the dtypes it gives.
+    """The tensors named in ``dtypes``, converted to these dtypes.
 
-    On a CPU a tensor of the dtype in the file is a part of the file's mapping: read when used, never written back.
+    On a CPU a tensor that needs no conversion is memory-mapped: read on use, never written back.
     """
     with safe_open(manifest.path, "pt") as opened:
-        return {name: opened.get_tensor(name).to(device, dtype) for name, dtype in wanted.items()}
+        return {name: opened.get_tensor(name).to(device, dtype) for name, dtype in dtypes.items()}
 
 
 def save(

@@ -69,7 +69,7 @@ def preview(asset: Asset, views: Views, scene: RayScene | None = None) -> Callab
         found = [result() for result in begun]
         rows = [
             ("input", inputs),
-            ("novel views, estimated lighting", [own for own, *_ in found]),
+            ("novel views, estimated lighting", [estimated for estimated, *_ in found]),
             ("the same views, studio lighting", [lit for _, lit, *_ in found]),
             ("base color, roughness, metallic, normal", found[0][2:]),
             ("estimated environment, scaled to a mean of 0.25", [light]),
@@ -80,7 +80,7 @@ def preview(asset: Asset, views: Views, scene: RayScene | None = None) -> Callab
 
 
 def comparison(before: Asset, after: Asset, views: Views) -> np.ndarray:
-    """Contact sheet ``(H, W, 3)`` uint8 of three views: input images, ``before``, ``after``, in their lighting."""
+    """Contact sheet ``(H, W, 3)`` uint8 of three views: input images, ``before``, ``after``, in their own lighting."""
     count = min(len(views), 3)
     batch = views.select([k * len(views) // count for k in range(count)]).resampled(TILE, crop=True)
     rows = [("input", [_image(_on_background(i, m)) for i, m in zip(batch.images, batch.masks, strict=True)])]
@@ -97,7 +97,7 @@ def _rendered(asset: Asset, camera: Camera, scene: RayScene, lights: Sequence[En
 
 
 def _denoised(*renderings: Render) -> list[Tensor]:
-    """Denoises renderings of one camera in several lights by a joint bilateral filter; returns their radiance.
+    """Denoises renderings of one camera under several environments by a joint bilateral filter; returns radiances.
 
     The filter (Petschnigg et al. 2004) runs on the ratio of radiance to base color, guided by normals and alpha, so
     that edges of the maps are kept.

@@ -42,7 +42,7 @@ def complete(folder: Path, *, refined: bool = False) -> bool:
 
 
 def claim(folder: Path) -> AbstractContextManager[Callable]:
-    """Hold ``folder`` for one result: :func:`~reli3d.output.folder.claimed`.  Raises OSError, InputError."""
+    """Reserves ``folder`` for one result: :func:`~reli3d.output.folder.claimed`.  Raises OSError, InputError."""
     return claimed(folder, OURS)
 
 
@@ -82,7 +82,7 @@ def peak_memory_mib() -> float | None:
 class Encoded:
     """Contents of the files of a result without its preview.  Calls block until the content is ready.
 
-    placed: ``mesh.glb``.  page: ``viewer.html``, which shows the asset where its mesh lies.
+    placed: ``mesh.glb``.  page: ``viewer.html``, in the frame of the mesh.
     """
 
     asset: Asset

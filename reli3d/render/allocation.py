@@ -1,4 +1,4 @@
-"""How many samples each strategy of direct light should get: counts chosen for the scene from a pilot's variances."""
+"""Allocation of samples to the strategies of direct lighting by the variances of a pilot."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ from reli3d.render.shading import (
     struct_of_points,
 )
 
-SCOUTED = 16384  # points of a first pass with one sample of each strategy, among which the pilot's are drawn
-PILOT_SAMPLES = 24576  # then, in all; an image of 512 x 512, half of it covered, takes 8.4 million
-PILOT_POINTS = 256  # so at least 32 samples of each strategy for each of them
-TRIED = 1024  # points, some of them more than once, that a mixture and its rival are tried at
-RIVAL = 2.0  # times the mixture's variance, at most, of a rival: rare events that a trial misses then cost that much
-PREFER_ONE = 0.9  # of the rival's variance, tried, is what a mixture must stay below: the trial's noise is 7 %
-DARK = 0.1  # of the mean radiance: below it relative variances count as if there, or black points would decide alone
-BLOCK = 1 << 17  # samples times candidates evaluated at once: arrays of 1 MB
+FIRST_PASS_POINTS = 16384  # with one sample of each strategy; the points of the pilot are drawn from these
+PILOT_SAMPLES = 24576  # in total; an image of 512 x 512, half of it covered, takes 8.4 million
+PILOT_POINTS = 256  # so at least 32 samples of each strategy per point
+TRIAL_POINTS = 1024  # with repetition, at which a mixture is compared with a single strategy
+MAX_SINGLE_RATIO = 2.0  # of the variance of a single strategy to that of the mixture, above which it is not compared
+MIXTURE_RATIO = 0.9  # of the variances in the trial, whose noise is 7 %, below which the mixture is preferred
+MIN_RELATIVE_RADIANCE = 0.1  # of the mean radiance: floor of the denominator of relative variances
+BLOCK_VALUES = 1 << 17  # samples times candidates evaluated at once: arrays of 1 MB
 
 
 @dataclass(frozen=True)
 class SamplePlan:
-    """Counts ``samples`` for :func:`reli3d.render.shading.shade` with ``antithetic="none"``, and what they should give.
+    """Sample counts for :func:`reli3d.render.shading.shade` with ``antithetic="none"``, and the expected variance.
 
-    variance: of a point's radiance with independent samples, summed over the channels, mean over the points; over its
-    squared radiance where the plan is ``relative``.
+    variance: of the radiance with independent samples, summed over the channels, mean over the points; relative to the
+    squared radiance if the plan is ``relative``.
     """
 
     samples: tuple[int, int, int]
@@ -57,16 +57,15 @@ def plan_samples(
     options: ShadeOptions = DEFAULT,
     relative: bool = False,
 ) -> SamplePlan:
-    """Counts of the three strategies, ``total`` together, with the least variance for these points under this light.
+    """Divides ``total`` samples among the three strategies to minimize the variance at ``points``.
 
-    Arguments are those of :func:`reli3d.render.shading.shade`; N is at least 1.  Of ``options`` the seed, ``sequence``,
-    ``alpha`` and ``diffuse_model`` count.  One plan holds for all points: the sum of their variances is least, with
-    ``relative`` of the variances over the squared radiance.
+    Arguments are those of :func:`reli3d.render.shading.shade`, with at least one point; of ``options`` only ``seed``,
+    ``sequence``, ``alpha`` and ``diffuse_model`` are used.  One plan minimizes the sum of the variances of all points;
+    relative: of the variances divided by the squared radiance.  The variance of any split is estimated from a pilot of
+    PILOT_SAMPLES samples.  For images, not for optimization: a plan may omit a strategy that gradients need.
 
-    A pilot's samples estimate the variance of any split, see docs/library.md.  A plan is for images, not for fits.
-
-    No gradient.  The result depends on the inputs and the seed alone.  Raises TypeError for a wrong dtype, ValueError
-    for a shape, device, count, choice or a value that is not finite.
+    No gradient.  Deterministic for a given seed.  Raises TypeError for a dtype, ValueError for a shape, device, count,
+    choice or values that are not finite.
     """
     values = [v.detach() for v in shaded_arrays(points, wo, environment, scene, options)]
     if len(points) == 0:
@@ -78,7 +77,7 @@ def plan_samples(
     drawn = _draw(values, environment, PILOT_SAMPLES // (3 * len(rows)), scene, options)
     if relative:
         radiance = drawn[0].sum(1).mean(1)
-        weights = weights / (radiance.square() + (DARK * (weights @ radiance)) ** 2).clamp(min=1e-30)
+        weights = weights / (radiance.square() + (MIN_RELATIVE_RADIANCE * (weights @ radiance)) ** 2).clamp(min=1e-30)
     counts = _splits(int(total)).to(weights.device)
     variance = _variances(*drawn, weights, counts)
     finer = counts[variance.argmin()] + _MOVES.to(counts) * max(1, int(total) // 16)
@@ -86,31 +85,33 @@ def plan_samples(
     counts, variance = torch.cat([counts, finer]), torch.cat([variance, _variances(*drawn, weights, finer)])
     alone = (counts > 0.0).sum(1) == 1
     best, single = int(variance.argmin()), int(torch.where(alone, variance, torch.inf).argmin())
-    if best != single and float(variance[single]) < RIVAL * float(variance[best]):
-        mixture, one = (_tried(values, weights, environment, counts[k], scene, options) for k in (best, single))
-        best = best if mixture < PREFER_ONE * one else single
+    if best != single and float(variance[single]) < MAX_SINGLE_RATIO * float(variance[best]):
+        mixture, one = (
+            _measured_variance(values, weights, environment, counts[k], scene, options) for k in (best, single)
+        )
+        best = best if mixture < MIXTURE_RATIO * one else single
     return SamplePlan(_whole(counts[best]), float(variance[best]))
 
 
 def spread_rows(n: int, count: int, seed: int) -> Tensor:
-    """One row of each of ``count`` equal stretches of ``n`` rows, at random within it; int64."""
+    """Stratified row indices: one random row in each of ``count`` equal intervals of ``n`` rows; int64."""
     return (_spread(count, seed) * n).long().clamp(max=n - 1)
 
 
 def _spread(count: int, seed: int) -> Tensor:
-    """A number at random in each of ``count`` equal parts of [0, 1), float64."""
+    """Stratified numbers: one in each of ``count`` equal parts of [0, 1), float64."""
     jitter = torch.rand(count, dtype=torch.float64, generator=torch.Generator().manual_seed(int(seed)), device="cpu")
     return (torch.arange(count, dtype=torch.float32, device="cpu") + jitter) / count
 
 
 def _pilot_points(values: list[Tensor], environment, scene, options: ShadeOptions) -> tuple[Tensor, Tensor]:
-    """Rows of the pilot's points and what each counts in the mean over all points, both ``(P,)``."""
+    """Rows of the pilot's points and their weights in the mean over all points, both ``(P,)``."""
     n, device, seed = len(values[0]), values[0].device, options.seed
     if n <= PILOT_POINTS:
         return torch.arange(n, device=device, dtype=torch.int64), torch.full(
             (n,), 1.0 / n, dtype=torch.float64, device=device
         )
-    rows = spread_rows(n, min(n, SCOUTED), seed).to(device)
+    rows = spread_rows(n, min(n, FIRST_PASS_POINTS), seed).to(device)
     first = _draw([v[rows] for v in values], environment, 1, scene, replace(options, seed=seed + 1))
     square = first[0].square().sum((1, 2))
     chance = 0.5 / len(rows) + 0.5 * square / square.sum().clamp(min=1e-30)
@@ -122,11 +123,11 @@ def _pilot_points(values: list[Tensor], environment, scene, options: ShadeOption
 def _draw(
     values: list[Tensor], environment: Environment, each: int, scene: RayScene | None, options: ShadeOptions
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """``each`` samples of every strategy for P points, S for each point, float64.
+    """``each`` samples of every strategy at P points, S per point, float64.
 
-    Values over q ``(P, S, 3)``; densities over q ``(P, S, 3)``; these scaled to weights with which each strategy's
-    samples, and those of its own that are lost below the horizon, have mass 1: so an integrand without variance shows
-    none.
+    Returns values over q ``(P, S, 3)``, densities over q ``(P, S, 3)``, and the densities normalized so that the
+    samples of a strategy, with its own samples below the horizon, have weight 1; then a constant integrand has
+    variance 0.
     """
     n, count, device = len(values[0]), 3 * each, values[0].device
     options = replace(
@@ -150,9 +151,11 @@ def _draw(
     return value.double(), density, density / (density.sum(1) + lost)[:, None]
 
 
-def _tried(values: list[Tensor], weights: Tensor, environment, counts: Tensor, scene, options: ShadeOptions) -> float:
-    """Variance of a point, mean by ``weights (P,)``, that :func:`reli3d.render.shading.shade` has with ``counts``."""
-    runs = TRIED // len(weights)
+def _measured_variance(
+    values: list[Tensor], weights: Tensor, environment, counts: Tensor, scene, options: ShadeOptions
+) -> float:
+    """Measured variance of :func:`reli3d.render.shading.shade` with ``counts``, weighted mean over the points."""
+    runs = TRIAL_POINTS // len(weights)
     position, normal, ng, wo, *material = (v.repeat(runs, *[1] * (v.ndim - 1)) for v in values)
     options = replace(
         options, samples=_whole(counts), antithetic="none", alpha="linear", heuristic="balance", clamp=None
@@ -179,10 +182,10 @@ _MOVES = torch.tensor(
 
 
 def _variances(value: Tensor, density: Tensor, weight: Tensor, weights: Tensor, counts: Tensor) -> Tensor:
-    """Variance of a point, mean by ``weights (P,)``, for each of ``counts (C, 3)``; the others from :func:`_draw`."""
+    """Predicted variance for each of ``counts (C, 3)``, mean over points by ``weights (P,)``, from :func:`_draw`."""
     points, samples = value.shape[:2]
     total = torch.zeros(len(counts), dtype=torch.float64, device=counts.device)
-    size = max(1, BLOCK // (samples * len(counts)))
+    size = max(1, BLOCK_VALUES // (samples * len(counts)))
     for first in range(0, points, size):
         v, p, w = (a[first : first + size] for a in (value, density, weight))
         inverse = 1.0 / (counts @ p.mT).clamp(min=1e-30)  # (P, C, S): the pilot's q over the candidate's

@@ -1,4 +1,4 @@
-"""From a bump normal in a tangent frame to a world-space shading normal."""
+"""Shading normals from tangent-space bump normals, in the frame of the published model."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ EPS = float(kernels.BUMP_EPS)  # of the published normalization; on the vertical
 
 
 def radial_bump(position: Tensor, normal: Tensor, bump: Tensor) -> Tensor:
-    """Unit shading normal ``(..., 3)`` of a tangent-space ``bump (..., 3)`` in the frame that circles the +Y axis.
+    """Unit shading normal ``(..., 3)`` of a tangent-space ``bump (..., 3)``, with tangents around the +Y axis.
 
-    position: ``(..., 3)`` model frame.  normal: ``(..., 3)`` unit, geometric.  The tangent is ``y x position`` made
-    orthogonal to the normal, the bitangent ``normal x tangent``.  Gradients reach ``bump`` only, as published: the
-    frame is data.  Raises ValueError for another last axis, or another device than that of ``bump``.
+    position: ``(..., 3)`` model frame.  normal: ``(..., 3)`` unit, geometric.  The tangent is ``y x position``,
+    orthogonalized to the normal, the bitangent ``normal x tangent``.  Gradients reach ``bump`` only, as published.
+    Raises ValueError for a shape or device.
     """
     position, normal = position.detach(), normal.detach()
     values = (position, normal, bump)

@@ -1,8 +1,8 @@
-"""Base color and light of an asset estimated from its photographs, which determine only their product.
+"""Scale of base color and lighting of an asset, of which images determine only the product.
 
-A darker albedo under brighter light looks the same, in each channel.  The brightness of the base color is the mean of
-three normal distributions: a prior of albedo, the photographs under a prior of light, and the network's prediction.
-The light is then scaled until the rendering has the photographs' color.
+The log brightness of the base color is the precision-weighted mean of three normal distributions: a prior of albedo,
+the observed colors under a prior of lighting, and the prediction of the network.  The lighting is then scaled so that
+the rendering has the mean color of the images.
 """
 
 from __future__ import annotations
@@ -22,22 +22,21 @@ from reli3d.render.gbuffer import primary_hits, surface_points
 from reli3d.render.points import SurfacePoints
 from reli3d.render.shading import ShadeOptions, shade
 
-STEP = 16  # of the photographs' pixels one in STEP^2 is read: some thousand in four photographs of 512 pixels
-SAMPLES = (8, 8, 2)  # a pixel; the noise of the mean over some hundred pixels is below a percent
-WHITE = 0.97  # linear; brighter pixels may be cut off
+STEP = 16  # pixel stride: about a thousand pixels in four images of 512 pixels per side
+SAMPLES = (8, 8, 2)  # per pixel; the noise of the mean over several hundred pixels is below a percent
+WHITE = 0.97  # linear; brighter pixels may be clipped
 BLACK = 1e-3  # added to both means: without a visible pixel the ratio is 1
-TINT = 1.5  # largest change of the light's color, as a factor of a channel
+TINT = 1.5  # largest change of the color of the lighting, as a factor of a channel
 
-# Prior mean and standard deviation of the logarithms of mean linear base color and of the light on it (photograph over
-# base color); last the standard deviation of a prediction.  Chosen on 20 meshes, as they are and dark:
-# docs/results.md.
+# Prior mean and standard deviation of the logarithms of mean linear base color and of the lighting (observed color over
+# base color); last the standard deviation of a prediction.  Chosen on 20 meshes, original and darkened.
 ALBEDO, ALBEDO_SPREAD = -2.1, 1.2
 LIGHT, LIGHT_SPREAD = -0.3, 0.9
 PREDICTION_SPREAD = 0.7
-# Color, as the logarithm of a channel over the mean of the channels: weights of photographs and prediction.  Lights are
-# less colored than base colors.
+# Weights of observation and prediction in the chromaticity (logarithms relative to their mean over the channels):
+# lighting is less saturated than base colors.
 PHOTOGRAPH_COLOR, PREDICTED_COLOR = 0.8, 0.2
-DARKEST = 1e-3  # linear; below it a logarithm is noise
+DARKEST = 1e-3  # linear, floor of logarithms
 FARTHEST = 4.0  # largest factor on a prediction
 
 
@@ -45,7 +44,7 @@ FARTHEST = 4.0  # largest factor on a prediction
 def estimate_base_color_and_light(
     asset: Asset, images: Tensor, inside: Tensor, camera: Camera, scene: RayScene
 ) -> Asset:
-    """``asset`` with its base color times :func:`base_color_factor`, then its light times :func:`photograph_ratio`."""
+    """``asset`` with base color scaled by :func:`base_color_factor`, then lighting by :func:`photograph_ratio`."""
     views = images, inside, camera, scene
     base_color = (asset.textures.base_color * base_color_factor(asset, *views)).clamp(max=1.0)
     asset = replace(asset, textures=replace(asset.textures, base_color=base_color))
@@ -55,11 +54,11 @@ def estimate_base_color_and_light(
 @torch.no_grad()
 @full_precision
 def photograph_ratio(asset: Asset, images: Tensor, inside: Tensor, camera: Camera, scene: RayScene) -> Tensor:
-    """Mean linear color of photographs over that of ``asset`` under its own light with shadows, ``(3,)``.
+    """Mean linear color of the images over that of ``asset`` under its environment with shadows, ``(3,)``.
 
     images: ``(V, H, W, 3)`` sRGB, at least ``STEP`` pixels a side.  inside: ``(V, H, W)`` bool, pixels inside the
-    silhouette.  camera: of all V.  scene: rays against the asset's faces.  Over a regular grid of pixels
-    at which the asset is hit and the photograph is not overexposed.  No gradient.  Raises ValueError for fewer pixels.
+    silhouette.  camera: of all V.  scene: ray tracing structure of the mesh.  Means over a regular grid of pixels at
+    which the asset is hit and the image is not overexposed.  No gradient.  Raises ValueError for fewer pixels.
     """
     seen, at, directions = _seen(asset, images, inside, camera, scene)
     shown = shade(at, -directions, asset.light, scene=scene, options=ShadeOptions(samples=SAMPLES))
@@ -71,12 +70,11 @@ def photograph_ratio(asset: Asset, images: Tensor, inside: Tensor, camera: Camer
 
 @torch.no_grad()
 def base_color_factor(asset: Asset, images: Tensor, inside: Tensor, camera: Camera, scene: RayScene) -> Tensor:
-    """Maximum-likelihood factor ``(3,)`` on the linear base color of ``asset``.
+    """Maximum a posteriori factor ``(3,)`` on the linear base color of ``asset``; 1 without a visible pixel.
 
-    The mean of three normal distributions of the logarithm of its brightness: the prior of albedo, the photographs
-    under the prior of light, and the prediction that ``asset`` has.  The color is a weighted mean of photographs and
-    prediction.  Arguments as of :func:`photograph_ratio`; the light of ``asset`` is not used.  1 without a visible
-    pixel.
+    The log brightness combines the prior of albedo, the observed colors under the prior of lighting, and the base color
+    of ``asset`` as three normal distributions.  The chromaticity is a weighted mean of observation and prediction.
+    Arguments as in :func:`photograph_ratio`; the environment of ``asset`` is not used.
     """
     seen, at, _ = _seen(asset, images, inside, camera, scene)
     if len(seen) == 0:
@@ -96,7 +94,7 @@ def _color(value: Tensor) -> Tensor:
 def _seen(
     asset: Asset, images: Tensor, inside: Tensor, camera: Camera, scene: RayScene
 ) -> tuple[Tensor, SurfacePoints, Tensor]:
-    """Linear colors of the photographs ``(N, 3)`` on the grid, ``asset`` there and the directions."""
+    """Linear colors ``(N, 3)`` of the images on the grid, the points of ``asset`` there, and the ray directions."""
     first = STEP // 2
     seen, inside = srgb_to_linear(images[:, first::STEP, first::STEP]), inside[:, first::STEP, first::STEP]
     corner = camera.intrinsics.new_tensor([0.0, 0.0, 0.5, 0.5])  # centers of coarse pixels on those read

@@ -1,8 +1,7 @@
-"""Light as a mixture of spherical Gaussians: value, irradiance and shading in closed form.
+"""Lighting as a mixture of spherical Gaussians: value, irradiance and shading in closed form.
 
-A lobe is ``amplitude exp(sharpness (axis . w - 1))``.  The formulas stand in ``reli3d.kernels.sg``.  There are no
-shadows and no samples here: shading is a smooth function of light, normal and material, made for the early stages of a
-fit, and replaced by ``reli3d.render.shading.shade`` once visibility matters.
+A lobe is ``amplitude exp(sharpness (axis . w - 1))``; formulas in ``reli3d.kernels.sg``.  Shading has no shadows and no
+Monte Carlo noise: it is a smooth function of lighting, normal and material for the early stages of an optimization.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from reli3d.kernels import sg as kernels
 from reli3d.render.points import SurfacePoints, nan_where_not_finite, of_rows
 
 GOLDEN = 0.6180339887498949  # turns between neighbors of a spiral, the golden ratio
-OVERLAP = 3.5  # sharpness of a lobe times the solid angle [sr] it covers, for even lobes of least residual
+OVERLAP = 3.5  # sharpness times the solid angle [sr] per lobe, which minimizes the ripple of equal lobes
 
 
 @dataclass(frozen=True)
@@ -63,15 +62,15 @@ class SphericalGaussians:
 
 
 def shade_gaussians(points: SurfacePoints, wo: Tensor, light: SphericalGaussians) -> Tensor:
-    """Radiance ``(N, 3)`` towards ``wo`` of ``points`` lit by ``light`` without shadows; linear Rec. 709.
+    """Reflected radiance ``(N, 3)`` of ``points`` towards ``wo`` under ``light``, without shadows; linear Rec. 709.
 
-    wo: ``(N, 3)`` unit, or one row for all.  A value that is not finite gives NaN.  Position and geometric
-    normal play no part.  The material is that of ``reli3d.kernels.bsdf``.  Diffuse: the closed cosine integral.
-    Specular: Wang et al. 2009 with GGX as four Gaussians.
+    wo: ``(N, 3)`` unit, or one row for all points.  Non-finite inputs of a point give NaN.  Position and geometric
+    normal are not used.  Material of ``reli3d.kernels.bsdf``.  Diffuse: closed-form cosine integral.  Specular: Wang et
+    al. 2009 with GGX as four Gaussians.
 
-    Against quadrature it errs by 6 % at roughness 0.3 and 12 % at 0.5 for light about the mirror direction and views
-    within 45 degrees; at roughness 1 or at 70 degrees by 20 to 35 % for light at the peak, and up to a factor of two
-    beside it.  Gradients reach every argument that is used.
+    Error against quadrature for lighting around the mirror direction and viewing angles up to 45 degrees: 6 % at
+    roughness 0.3, 12 % at 0.5; at roughness 1 or 70 degrees 20 to 35 % at the peak and up to a factor of 2 off the
+    peak.  Gradients reach all arguments that are used.
     """
     expect("points", points, SurfacePoints)
     normal, n = points.normal, len(points)

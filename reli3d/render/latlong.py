@@ -1,6 +1,6 @@
 """Lat-long maps: directions of texels, texels of directions, solid angles.
 
-A map has H rows and W columns, normally W = 2 H.  Row 0 is +Y; the center column looks to +X and right of it lies +Z:
+A map has H rows and W columns, normally W = 2 H.  Row 0 is +Y, the center column +X, +Z right of it:
 with phi = 2 pi (u - 1/2) and theta = pi v the direction is (cos phi sin theta, cos theta, sin phi sin theta).  Texel
 centers are at u = (column + 1/2) / W, v = (row + 1/2) / H.  ``reli3d.kernels.envmap`` has the same mapping for kernels.
 """
@@ -29,9 +29,7 @@ def lat_long_directions(
 
 
 def lat_long_texels(directions: Tensor, height: int) -> Tensor:
-    """Index ``(...)``, int64, of the texel of a flattened ``(height, 2 height)`` map that holds unit ``directions (...,
-    3)``.
-    """
+    """Texel indices ``(...)``, int64, of unit ``directions (..., 3)`` in a flattened ``(height, 2 height)`` map."""
     x, y, z = directions.unbind(-1)
     row = (y.clamp(-1.0, 1.0).acos() * (height / math.pi)).long().clamp(0, height - 1)
     column = ((torch.atan2(z, x) + math.pi) * (height / math.pi)).long() % (2 * height)
@@ -47,8 +45,8 @@ def texel_solid_angles(height: int, width: int, device: torch.device | str = "cp
 def quarter_turn(maps: Tensor, quarters: int) -> Tensor:
     """``maps (..., H, W, C)`` with columns moved right by ``quarters`` quarters of the width.
 
-    By -1 a map whose center column looks to -Z, as published, gets +X there.  Raises ValueError unless W is a multiple
-    of 4.
+    -1 converts a map with center column -Z, as published, to center column +X.  Raises ValueError unless W is a
+    multiple of 4.
     """
     width = maps.shape[-2]
     if width % 4:

@@ -1,6 +1,6 @@
-"""Two lights of the package's own: a studio and an open sky, by formulas.
+"""Two procedural environments: a studio and a clear sky.
 
-Both have a mean radiance of 1 over the sphere, so that a matte surface has about the radiance of its albedo.
+Both have a mean radiance of 1 over the sphere, so that the radiance of a diffuse surface is about its albedo.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from reli3d._bridge import full_precision
 from reli3d.render.environment import Environment
 from reli3d.render.latlong import lat_long_directions, texel_solid_angles
 
-SUN_RADIUS = 0.055  # rad, twelve times the real one: a texel of a small map is 0.05 wide
+SUN_RADIUS = 0.055  # rad, about 12 times that of the sun: a texel of a small map is 0.05 wide
 SUN_FRACTION = 0.45  # of the total radiance
 SOFTBOXES = (  # direction of the middle, half width and half height [tangents of angles], radiance
     ((-0.75, 0.5, 0.6), 0.45, 0.6, (9.0, 8.8, 8.4)),  # key
@@ -32,7 +32,7 @@ def _vector(values: Sequence[float]) -> Tensor:
 
 @full_precision
 def studio(height: int = 64) -> Environment:
-    """A gray room with four softboxes: a key at the left, a strip at the right, one behind and one above."""
+    """Gray surroundings with four softboxes: key light at the left, strip at the right, one behind and one above."""
     d = lat_long_directions(height)
     y = d[..., 1:2]
     light = (0.22 + 0.12 * y).expand(-1, -1, 3)
@@ -50,7 +50,7 @@ def studio(height: int = 64) -> Environment:
 
 @full_precision
 def sky(height: int = 64) -> Environment:
-    """A clear sky over brown ground, the sun 40 degrees high in front at the right."""
+    """Clear sky over brown ground, with the sun at an elevation of 40 degrees, in front at the right."""
     d = lat_long_directions(height)
     y = d[..., 1:2]
     up = torch.lerp(

@@ -1,7 +1,7 @@
 """Metallic-roughness material in the local frame: normal +z, ``wo`` to the viewer, ``wi`` to the light, both unit.
 
-Arguments come in one order: ``wo``, the material, then what is evaluated (``wi``) or drawn with (``u``).  ``alpha`` is
-the GGX width, ``roughness**2``.  The formulas stand in ``reli3d.kernels.bsdf``.
+Order of arguments: ``wo``, the material, then ``wi`` to evaluate or ``u`` to sample.  ``alpha`` is the GGX width,
+``roughness**2``.  Formulas in ``reli3d.kernels.bsdf``.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def _flat(items: list[tuple[str, Tensor, int]]) -> tuple[torch.Size, list[Tensor
 
 
 def choice(name: str, value: str, allowed: tuple[str, ...]) -> int:
-    """Place of ``value`` in ``allowed``; ValueError where it is none of them."""
+    """Index of ``value`` in ``allowed``; raises ValueError if it is not in it."""
     if value not in allowed:
         raise ValueError(f"{name}: expected one of {', '.join(allowed)}, got {value}")
     return allowed.index(value)
@@ -38,7 +38,7 @@ def choice(name: str, value: str, allowed: tuple[str, ...]) -> int:
 def eval_bsdf(
     wo: Tensor, base_color: Tensor, alpha: Tensor, metallic: Tensor, wi: Tensor, *, diffuse_model: str = "conserving"
 ) -> Tensor:
-    """BSDF value ``(..., 3)`` [1/sr] without the cosine; 0 below the horizon on either side.
+    """Value of the metallic-roughness BSDF ``(..., 3)`` [1/sr], without the cosine; 0 below the horizon on either side.
 
     wo, wi: ``(..., 3)`` unit, local frame.  base_color: ``(..., 3)`` linear in [0, 1].  alpha: ``(...)`` GGX width,
     ``roughness**2``.  metallic: ``(...)``.  All are tensors; leading axes broadcast.  diffuse_model: energy transmitted
@@ -62,16 +62,15 @@ def eval_bsdf(
 
 
 def sample_bsdf(wo: Tensor, alpha: Tensor, u: Tensor, *, lobe: str = "visible") -> Tensor:
-    """Directions to the light ``(..., 3)``, unit, drawn from one lobe; density :func:`pdf_bsdf` of the same ``lobe``.
+    """Samples directions to the light ``(..., 3)``, unit, from one lobe; density :func:`pdf_bsdf` of the same ``lobe``.
 
     wo: ``(..., 3)`` unit, local frame.  alpha: ``(...)`` GGX width.  u: ``(..., 2)`` uniform in [0, 1).  Leading axes
-    broadcast.  lobe: ``visible`` (reflection at a visible normal), ``mirrored`` (at that normal turned by pi about the
-    surface normal) or ``cosine``.  A direction below the horizon, and one of a mirrored normal that faces away from
-    ``wo``, has value and density 0.  The antithetic partner of ``u`` is ``visible`` with
-    :func:`~reli3d.render.sampling.antithetic` of ``u`` or, as published, ``mirrored`` with ``u``.  Gradients reach
-    ``wo`` and ``alpha``, but :func:`pdf_bsdf` has none: detach the directions for the derivative of an estimate, which
-    is wrong otherwise.  Raises TypeError unless float32, ValueError for a shape, a device or another lobe.  Source:
-    Dupuy and Benyoub 2023.
+    broadcast.  lobe: ``visible`` (reflection at a visible normal), ``mirrored`` (at that normal rotated by pi about the
+    surface normal) or ``cosine``.  Directions below the horizon, and those of a mirrored normal that faces away from
+    ``wo``, have value and density 0.  Antithetic pairs: ``visible`` with ``u`` and :func:`reli3d.antithetic` of ``u``,
+    or, as published, ``visible`` and ``mirrored`` with the same ``u``.  Gradients reach ``wo`` and ``alpha``, but
+    :func:`pdf_bsdf` has none: detach the directions to differentiate a Monte Carlo estimate.  Raises TypeError unless
+    float32, ValueError for a shape, a device or another lobe.  Source: Dupuy and Benyoub 2023.
 
     >>> wi = reli3d.sample_bsdf(wo, alpha, u).detach()
     >>> density = reli3d.pdf_bsdf(wo, alpha, wi).clamp(min=1e-12)  # 0 below the horizon, where the value is 0 too
@@ -91,10 +90,10 @@ def sample_bsdf(wo: Tensor, alpha: Tensor, u: Tensor, *, lobe: str = "visible") 
 def pdf_bsdf(wo: Tensor, alpha: Tensor, wi: Tensor, *, lobe: str = "visible") -> Tensor:
     """Density ``(...)`` [1/sr] of :func:`sample_bsdf` at ``wi``; 0 below the horizon.
 
-    wo, wi: ``(..., 3)`` unit, local frame.  alpha: ``(...)`` GGX width.  Leading axes broadcast.  lobe: as there.  No
-    gradient, so ``wi`` must be detached where an estimate is differentiated; :func:`pdf_ggx_vndf` has gradients.  0
-    also where the value is 0: clamp it before dividing.  Raises TypeError unless float32, ValueError for a shape,
-    a device or another lobe.
+    wo, wi: ``(..., 3)`` unit, local frame.  alpha: ``(...)`` GGX width.  Leading axes broadcast.  lobe: as in
+    :func:`sample_bsdf`.  No gradient, so detach ``wi`` to differentiate an estimate; :func:`pdf_ggx_vndf` has
+    gradients.  The density is 0 where the value is 0: clamp it before dividing.  Raises TypeError unless float32,
+    ValueError for a shape, a device or another lobe.
 
     >>> wi = reli3d.sample_bsdf(wo, alpha, u)
     >>> density = reli3d.pdf_bsdf(wo, alpha, wi)

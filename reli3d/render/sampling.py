@@ -1,6 +1,6 @@
-"""Samplers of directions in the local frame (normal +z) and their densities, and the random numbers they take.
+"""Sampling of directions in the local frame (normal +z), their densities, and random numbers.
 
-``u`` is uniform in [0, 1)^2 and belongs to the caller.  Leading axes broadcast; tensors are float32 on one device.
+``u`` is uniform in [0, 1)^2, an argument.  Leading axes broadcast; tensors are float32 on one device.
 """
 
 from __future__ import annotations
@@ -79,12 +79,13 @@ def pdf_ggx_vndf(wo: Tensor, alpha: Tensor, wm: Tensor) -> Tensor:
 
 
 def antithetic(u: Tensor) -> Tensor:
-    """Numbers ``(..., 2)`` of the antithetic partners of visible normals drawn with ``u (..., 2)``.
+    """Random numbers ``(..., 2)`` of the antithetic partners of visible-normal samples with ``u (..., 2)``.
 
-    Uniform if ``u`` is.  The partner lies across the lobe: the first number is half a turn on, the second counts from
-    the other end, exactly if ``u`` are multiples of 2^-24.  The mean of both integrands has less variance than two
-    independent ones where the integrand is near to odd about the lobe's center, as derivatives in ``alpha`` and the
-    normal are.  Its own inverse.  No gradient.  Raises TypeError unless float32, ValueError for a shape.
+    ``(u1 + 1/2 mod 1, 1 - u2)``, exact for multiples of 2^-24: the partner is on the opposite side of the lobe.
+    Uniform if ``u`` is; its own inverse.  The mean of both samples has less variance than that of two independent ones
+    if the integrand is nearly odd about the center of the lobe, as are derivatives in ``alpha`` and the normal.
+    Samplers treat ``u`` as a constant, so gradients are not needed.  Raises TypeError unless float32, ValueError for a
+    shape.
 
     >>> partners = reli3d.antithetic(u)
     >>> first, second = (reli3d.sample_ggx_vndf(wo, alpha, v) for v in (u, partners))
@@ -95,7 +96,7 @@ def antithetic(u: Tensor) -> Tensor:
 
 
 def tangent_frame(normal: Tensor) -> Tensor:
-    """Rotations ``(..., 3, 3)`` to the local frame: rows tangent, bitangent, ``normal``; ``local = frame @ world``.
+    """Rotations ``(..., 3, 3)`` to the local frame: rows tangent, bitangent, normal; ``local = frame @ world``.
 
     normal: ``(..., 3)`` unit.  Right-handed.  Continuous except at z = 0 from below.  Gradients reach ``normal``.
     Raises TypeError unless float32, ValueError for a shape.  Source: Duff et al. 2017, Building an Orthonormal Basis,
@@ -114,13 +115,13 @@ def tangent_frame(normal: Tensor) -> Tensor:
 
 
 def mirror(wm: Tensor) -> Tensor:
-    """Microfacet normals ``(..., 3)`` turned by pi about the surface normal."""
+    """Microfacet normals ``(..., 3)`` rotated by pi about the surface normal."""
     check("wm", wm, last=3)
     return wm * wm.new_tensor([-1.0, -1.0, 1.0])
 
 
 def reflect(wo: Tensor, wm: Tensor) -> Tensor:
-    """``wo`` mirrored at the microfacet normal ``wm``: ``2 (wo.wm) wm - wo``, ``(..., 3)``.
+    """Mirror reflection of ``wo`` about the microfacet normal ``wm``: ``2 (wo.wm) wm - wo``, ``(..., 3)``.
 
     wo, wm: ``(..., 3)`` unit, any common frame.  Gradients reach both.  Raises TypeError unless float32, ValueError for
     a shape or device.

@@ -276,7 +276,7 @@ def struct_of_light(radiance: Tensor, table: EnvironmentTable, offsets: Tensor) 
 
 
 def _shade_embree(n: int, ins: list, job: _Job, outs: list) -> None:
-    """Chunks of hits: one kernel makes the rays and values, another has Embree test the rays and sums what is lit."""
+    """Shades chunks of hits: one kernel generates shadow rays and values, another traces them by Embree and sums."""
     out, count, tracer = (
         outs[0][0],
         job.count,

@@ -1,12 +1,12 @@
-"""Antialiased outlines whose gradient reaches the vertices, for any image that was made through the pixel centers.
+"""Antialiasing of silhouettes, differentiable in the vertices, for images sampled at the pixel centers.
 
 After Laine et al. 2020, Modular Primitives for High-Performance Differentiable Rendering, section 3.4: two neighboring
-pixels are blended where an outline crosses the line between their centers.  There the edge belongs to the triangle that
-a pixel shows, which fails for small triangles.  Here every edge's crossings with the rows or columns of pixel centers
-are listed, and a ray decides whether one is seen.
+pixels are blended where a silhouette crosses the line between their centers.  They find the edge by the triangle of a
+pixel, which fails for small triangles; here all crossings of edges with rows or columns of pixel centers are listed,
+and a ray tests whether each is visible.
 
-Sums over an image have the derivative of the area.  Single pixels err by 0.02 on average, gradients of squared
-differences by some 10 %.
+Sums over an image have the exact derivative of the area.  The error of single pixels is 0.02 on average, that of
+gradients of square differences about 10 %.
 """
 
 from __future__ import annotations
@@ -45,9 +45,8 @@ class Crossings:
 def mesh_edges(vertices: Tensor, faces: Tensor) -> Tensor:
     """Edges ``(E, 4)`` int32: two ends and the opposite vertices of the two faces, -1 where there is only one.
 
-    vertices: ``(V, 3)`` float32.  faces: ``(F, 3)`` int32.  Vertices at exactly the same place count as one (an atlas
-    splits them), of which the first stands in the table and gets the gradient.  An edge of three or more faces is
-    listed once a face.
+    vertices: ``(V, 3)`` float32.  faces: ``(F, 3)`` int32.  Vertices at identical positions (split by an atlas) are
+    merged: the first is listed and receives the gradient.  An edge of three or more faces is listed once per face.
     """
     check("vertices", vertices, last=3)
     check("faces", faces, last=3, like=vertices, dtype=torch.int32)
@@ -196,7 +195,7 @@ def _lines(vertices: Tensor, edges: Tensor, camera: Camera) -> tuple[Tensor, Ten
 
 
 def _seen(pixels: Tensor, depth: Tensor, camera: Camera, scene: RayScene) -> Tensor:
-    """Whether nothing lies before ``depth (M,)`` at ``pixels (M, 2)``."""
+    """Whether nothing occludes ``depth (M,)`` at ``pixels (M, 2)``."""
     fx, fy, cx, cy = camera.intrinsics.detach().unbind(-1)
     local = torch.stack([(pixels[:, 0] - cx) / fx, (cy - pixels[:, 1]) / fy, -torch.ones_like(depth)], -1)
     directions = local @ camera.c2w.detach()[:3, :3].T  # of depth 1: the ray's t is the depth

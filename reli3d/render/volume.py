@@ -1,7 +1,7 @@
 """Volume rendering for the first training stage: samples along rays through an occupancy grid, and their compositing.
 
 Density is per world unit, so a sample of a step ``s`` lets ``exp(-density s)`` of the light through.  The grid does
-what that of Li et al. 2023, NerfAcc, does: cells known to be empty cost no query of the field.  The field is the
+the purpose of that of Li et al. 2023, NerfAcc: empty cells cost no query of the field.  The field is the
 caller's: march, query at ``positions``, composite.
 """
 
@@ -103,7 +103,7 @@ def march_rays(
     far: float = float("inf"),
     shift: Tensor | None = None,
 ) -> RaySamples:
-    """Samples in the occupied cells along N rays, ``step`` lengths of the direction apart.
+    """Samples in the occupied cells along N rays, at a spacing of ``step`` lengths of the direction.
 
     origins, directions: ``(N, 3)``, directions normally unit.  near, far: limits of t.  shift: ``(N,)`` in [0, 1),
     place of the samples within their steps, 0.5 if None; random for an unbiased integral.  A ray that is not finite or

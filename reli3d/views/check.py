@@ -1,7 +1,7 @@
 """Checks the cameras of views: a report with the likely mistake of wrong conventions, and a plot of the rig.
 
-The test is the visual hull: with right cameras its silhouettes fill the masks.  Where they do not, the usual
-mistakes are undone one after the other, and the one that makes the hull fill the masks is named.
+With correct cameras the silhouettes of the visual hull fill the masks.  Otherwise the common mistakes are inverted one
+at a time, and the one whose inverse makes the hull fill the masks is named.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from reli3d.views.normalize import AT_EYE, RADIUS, Hull, center_rays, meeting_po
 from reli3d.views.views import Views
 
 MIN_FILLED = 0.8  # fraction of every mask that the hull of right cameras fills; masks a few pixels off still reach 0.9
-SURELY_FILLED = 0.97  # mean fraction from which no mistake is looked for
+SURELY_FILLED = 0.97  # mean fraction above which the cameras are accepted
 BETTER = 3.0  # an alternative is named where it leaves that many times less of the masks unfilled
 UP_MARGIN = (
     0.1  # mean squared sine by which the up axis must be nearer to the horizon's than another: 18 degrees about it
 )
-NEAR_AXIS = 0.94  # cosine, 20 degrees: what is farther from every axis no --up puts right
+NEAR_AXIS = 0.94  # cosine, 20 degrees: an up direction farther from every axis cannot be corrected by --up
 INVERTED_BORDER = 0.6  # fraction of the image border inside the mask from which the mask looks inverted
 
 _FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float32, device="cpu"))
@@ -70,10 +70,10 @@ def verdict(views: Views) -> str:
 
 @full_precision
 def up_axis(c2w: Tensor) -> str | None:
-    """The axis (``y``, ``-z``, ...) that is up for cameras held upright; None where they leave it open.
+    """The up axis (``y``, ``-z``, ...) under the assumption of upright cameras; None if it is ambiguous.
 
-    c2w: ``(V, 4, 4)``.  A camera held upright has its right axis on the horizon: up is the direction most nearly at
-    right angles to all of them, on the side of the cameras' own up axes.
+    c2w: ``(V, 4, 4)``.  The right axis of an upright camera is horizontal: up is the direction most nearly orthogonal
+    to all right axes, with the sign of the mean up axis.
     """
     right, above = c2w[:, :3, 0].double().cpu(), c2w[:, :3, 1].double().cpu().mean(0)
     spread, directions = torch.linalg.eigh(right.T @ right / len(right))
@@ -90,7 +90,7 @@ def _triple(values: Tensor) -> str:
 
 @full_precision
 def agreement(views: Views) -> tuple[Hull, list[float]]:
-    """The visual hull and the fraction of each mask that its silhouette fills, all 0 where the hull is empty."""
+    """The visual hull and the fraction of each mask that its silhouette fills, all 0 for an empty hull."""
     hull = visual_hull(views)
     if len(hull.points) == 0:
         return hull, [0.0] * len(views)
@@ -111,7 +111,7 @@ def _filled(hull: Hull, mask: Tensor, pose: Tensor, camera: Tensor) -> float:
 
 
 def _quarter_turn(views: Views, sign: float) -> Views:
-    """The views as if every image had been turned by 90 degrees without its camera."""
+    """The views with every image rotated by 90 degrees relative to its camera."""
     turn = torch.tensor(
         [[0.0, sign, 0.0, 0.0], [-sign, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]],
         dtype=torch.float32,
@@ -121,7 +121,7 @@ def _quarter_turn(views: Views, sign: float) -> Views:
 
 
 def _alternatives(views: Views):
-    """``(what is wrong, what to do, views with it undone)`` for the usual mistakes."""
+    """``(mistake, remedy, corrected views)`` of the common mistakes."""
     c2w, flip, half = views.c2w, _FLIP.to(views.c2w), _HALF_TURN.to(views.c2w)
     given = c2w.double()
     given[:, :3, 3] += given.new_tensor(views.origin)  # as in the folder

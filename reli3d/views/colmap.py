@@ -27,7 +27,7 @@ MAX_LINE = 1 << 24  # an image's points: 30 characters each
 MAX_IMAGES = 100_000
 PLACES = ("sparse/0", "sparse", "sparse/*", "colmap/sparse/0", "colmap/sparse", "colmap/sparse/*", "")
 _POINTS = re.compile(r"(?:[-+.0-9eE]+\s+[-+.0-9eE]+\s+-?\d+(?:\s+|$))+")  # x, y, number of the 3D point or -1
-# model: numbers of focal lengths, radial and tangential parameters; the center stands after the focal lengths
+# model: numbers of focal lengths, radial and tangential parameters; the principal point follows the focal lengths
 _MODELS = {
     "SIMPLE_PINHOLE": (1, 0, 0),
     "PINHOLE": (2, 0, 0),
@@ -58,7 +58,7 @@ def read_colmap(folder: Path, models: Sequence[Path]) -> tuple[list[Frame], list
     models: as :func:`find_colmap` gives them; the first of the largest is read.  Images that are missing in the folder
     are left out with a note.  Raises InputError naming the line, or the entry of a binary file, and the field.
     """
-    notes = ["COLMAP models have no up direction and no scale: the mesh comes out as the cameras stand"]
+    notes = ["COLMAP models have no up direction and no scale: the mesh is in the frame of the cameras"]
     entries = [_entries(path) for path in models]
     best = max(range(len(models)), key=lambda k: len(entries[k]))
     path = models[best]

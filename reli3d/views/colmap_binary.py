@@ -1,6 +1,6 @@
 """The entries of COLMAP's binary files ``cameras.bin`` and ``images.bin``: little-endian, without alignment.
 
-Source: https://colmap.github.io/format.html#binary-file-format.  Only what is used is read: the points of an image are
+Source: https://colmap.github.io/format.html#binary-file-format.  Unused data is skipped: the points of an image are
 stepped over.
 """
 

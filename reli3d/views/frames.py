@@ -40,7 +40,7 @@ class Frame:
     mask: Path | None
     c2w: np.ndarray  # (4, 4) float64, OpenGL axes
     lens: Lens
-    notes: tuple[str, ...] = ()  # what was assumed of it
+    notes: tuple[str, ...] = ()  # assumptions about it
 
 
 def number(where: str, field: str, value: object, low: float = -math.inf, high: float = math.inf) -> float:
@@ -111,7 +111,7 @@ def nearest_rigid(where: str, field: str, matrix: np.ndarray) -> np.ndarray:
 
 
 def shape_of(value: object) -> str:
-    """What a value that should be a matrix is, in a few words."""
+    """Short description of a value that should be a matrix, for an error message."""
     if not isinstance(value, list):
         return shown(value)
     return f"{len(value)} rows of {sorted({len(r) if isinstance(r, list) else 'no list' for r in value}, key=str)[:4]}"

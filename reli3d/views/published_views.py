@@ -66,7 +66,7 @@ def _resized(pixels: Tensor, size: int) -> Tensor:
 
 
 def hero_first(views: Views, hero: int) -> Views:
-    """``views`` with the one of index ``hero`` first and the rest in their order.  Raises InputError on an index that
+    """``views`` with the one of index ``hero`` first and the rest in their order.  Raises InputError for an index that
     is none.
     """
     count = len(views)
@@ -76,7 +76,7 @@ def hero_first(views: Views, hero: int) -> Views:
 
 
 def background_shown(views: Views, background: str, *, readable: bool) -> bool:
-    """Whether the illumination path may look at the background: never if ``masked``, always if ``visible``, and if
+    """Whether the illumination branch sees the background: never if ``masked``, always if ``visible``, and if
     ``auto`` where the weights were trained to (``readable``) and every view has one.  InputError on another word.
     """
     if background not in BACKGROUNDS:

@@ -17,7 +17,7 @@ from reli3d._bridge import check
 from reli3d.geometry.camera import Camera
 from reli3d.views.similarity import Similarity
 
-LEAST_WHOLE = 8  # views with the whole object, from which on those that cut it off are left out
+LEAST_WHOLE = 8  # views with the complete object; if there are as many, cropped views are left out
 MASK_EDGE = 0.1  # alpha from which a pixel counts into the bounding box: keeps hair and thin wires, drops codec noise
 
 

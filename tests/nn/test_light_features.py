@@ -104,6 +104,6 @@ def test_features_in_their_order():
     torch.testing.assert_close(got[:, 3:6], expected.expand(50, 3), rtol=0, atol=5e-3)  # the map's 16 rows
     brightness = (1 + 2 * n[:, 1]).clamp(min=MIN_BRIGHTNESS)
     torch.testing.assert_close(got[:, 6], torch.log(brightness), rtol=1e-4, atol=1e-5)
-    plain = unshaded(color, brightness[:, None].expand(-1, 3)).clamp(COLOR_MARGIN, 1 - COLOR_MARGIN)
-    torch.testing.assert_close(got[:, 9:12], plain.logit(), rtol=1e-3, atol=1e-3)
+    unlit = unshaded(color, brightness[:, None].expand(-1, 3)).clamp(COLOR_MARGIN, 1 - COLOR_MARGIN)
+    torch.testing.assert_close(got[:, 9:12], unlit.logit(), rtol=1e-3, atol=1e-3)
     assert torch.equal(got[:, 12:], torch.arange(12.0).expand(50, 12))

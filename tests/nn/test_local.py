@@ -241,10 +241,10 @@ def test_the_view_that_sees_a_point_has_the_weight(model):
     images, masks, c2w, intrinsics = sphere(2, seed=3)
     images[0], images[1] = 0.8, 0.2
     field = encoded(model, images, masks, c2w, intrinsics)
-    plain = torch.zeros(2, 32, 32, 12)
+    unlit = torch.zeros(2, 32, 32, 12)
     camera = Camera(c2w, intrinsics / 2, 32, 32)
     mean = torch.tensor(0.0)
-    field = dataclasses.replace(field, pixels=PixelMaps.of(plain, torch.zeros(2, 16, 16, 2), camera, mean))
+    field = dataclasses.replace(field, pixels=PixelMaps.of(unlit, torch.zeros(2, 16, 16, 2), camera, mean))
     position = 0.4 * normalize(c2w[:, :3, 3], dim=-1)  # the nearest point to each camera
     visible = torch.eye(2)
     with torch.no_grad():
@@ -261,8 +261,8 @@ def outputs(field, inputs):
     field = field.with_shading(position, normal, visible)
     fused, material = field.fused(position, normal, visible), field.material(position, normal, visible)
     heads = field.heads(position, normal, visible)
-    plain = [field.free_sdf(position), field.sdf(1.2 * position), heads, field.radiance_map(), field.volume]
-    return [*vars(fused).values(), *vars(material).values(), *plain]
+    unlit = [field.free_sdf(position), field.sdf(1.2 * position), heads, field.radiance_map(), field.volume]
+    return [*vars(fused).values(), *vars(material).values(), *unlit]
 
 
 @pytest.mark.parametrize("views", [1, 5])
@@ -270,9 +270,9 @@ def test_a_forward_pass_gives_the_same_numbers_with_and_without_gradient(model, 
     inputs = sphere(views)
     recorded = outputs(encoded(model, *inputs), inputs)
     with torch.no_grad():
-        plain = outputs(encoded(model, *inputs), inputs)
+        unlit = outputs(encoded(model, *inputs), inputs)
     assert any(value.requires_grad for value in recorded)
-    for a, b in zip(plain, recorded, strict=True):
+    for a, b in zip(unlit, recorded, strict=True):
         assert torch.equal(a, b)
 
 

@@ -67,13 +67,13 @@ def test_background_is_hidden_unless_asked_for():
     model = Reconstructor(NANO).eval()
     images, masks, c2w, intrinsics = views(2, 2, 32)
     repainted = torch.where(masks[..., None] > 0, images, torch.rand_like(images))
-    plain = model.encode(images, masks, c2w, intrinsics)
+    unlit = model.encode(images, masks, c2w, intrinsics)
     hidden = model.encode(repainted, masks, c2w, intrinsics)
-    torch.testing.assert_close(plain.latent, hidden.latent, rtol=0, atol=0)
-    torch.testing.assert_close(plain.triplane, hidden.triplane, rtol=0, atol=0)
+    torch.testing.assert_close(unlit.latent, hidden.latent, rtol=0, atol=0)
+    torch.testing.assert_close(unlit.triplane, hidden.triplane, rtol=0, atol=0)
     shown = model.encode(repainted, masks, c2w, intrinsics, background_visible=torch.tensor([True, False]))
-    assert (shown.latent[0] - plain.latent[0]).abs().max() > 1e-4
-    torch.testing.assert_close(shown.latent[1], plain.latent[1])
+    assert (shown.latent[0] - unlit.latent[0]).abs().max() > 1e-4
+    torch.testing.assert_close(shown.latent[1], unlit.latent[1])
 
 
 @torch.no_grad()
@@ -81,9 +81,9 @@ def test_order_of_further_views_does_not_matter_and_the_hero_does():
     torch.manual_seed(0)
     model = Reconstructor(NANO).eval()
     inputs = views(1, 3, 32)
-    plain = model.encode(*inputs).triplane
-    torch.testing.assert_close(model.encode(*(t[:, [0, 2, 1]] for t in inputs)).triplane, plain, rtol=1e-4, atol=1e-6)
-    assert (model.encode(*(t[:, [1, 0, 2]] for t in inputs)).triplane - plain).abs().max() > 1e-5
+    unlit = model.encode(*inputs).triplane
+    torch.testing.assert_close(model.encode(*(t[:, [0, 2, 1]] for t in inputs)).triplane, unlit, rtol=1e-4, atol=1e-6)
+    assert (model.encode(*(t[:, [1, 0, 2]] for t in inputs)).triplane - unlit).abs().max() > 1e-5
 
 
 @torch.no_grad()

@@ -64,11 +64,11 @@ def test_turning_the_latents_turns_the_map(decoder):
     latent = torch.randn(1, 49, 3, generator=generator)
     quarter = torch.tensor([[[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]])
     zero = torch.zeros(1)
-    plain = decoder(latent, torch.eye(3)[None], zero, 16)
+    unlit = decoder(latent, torch.eye(3)[None], zero, 16)
     turned = decoder(latent, quarter, zero, 16)
     # z up: counter-clockwise from above.  In the map the right is clockwise seen from above, so columns move left.
-    torch.testing.assert_close(turned, plain.roll(-8, dims=2), **MAP)
-    assert (turned - plain).abs().max() > 0.1 * plain.mean()
+    torch.testing.assert_close(turned, unlit.roll(-8, dims=2), **MAP)
+    assert (turned - unlit).abs().max() > 0.1 * unlit.mean()
 
 
 @torch.no_grad()
@@ -81,8 +81,8 @@ def test_zero_latent_is_a_sky(decoder):
 @torch.no_grad()
 def test_strength_is_the_logarithm_of_a_factor(decoder):
     latent, eye = torch.randn(1, 49, 3, generator=torch.Generator().manual_seed(1)), torch.eye(3)[None]
-    plain, doubled = (decoder(latent, eye, torch.tensor([s]), 8) for s in (0.0, math.log(2.0)))
-    torch.testing.assert_close(doubled, 2.0 * plain)
+    unlit, doubled = (decoder(latent, eye, torch.tensor([s]), 8) for s in (0.0, math.log(2.0)))
+    torch.testing.assert_close(doubled, 2.0 * unlit)
 
 
 @torch.no_grad()

@@ -45,8 +45,8 @@ def test_the_loss_is_the_excess_cross_entropy_and_zero_at_the_value():
 
 def test_a_converted_network_predicts_the_same(tmp_path):
     """Also from its file, and for mirror images; a network is not converted twice."""
-    plain = load_model("small", "cpu")
-    made = with_bins(plain, 8)
+    unlit = load_model("small", "cpu")
+    made = with_bins(unlit, 8)
     made, _ = load(save(tmp_path / "bins.safetensors", made, licence="test", dtype=torch.float32).path)
     assert made.preset.pyramid.material_bins == 8
     eyes = [look_at((0.0, 0.0, 2.4)), look_at((2.0, 0.4, 1.2))]
@@ -58,7 +58,7 @@ def test_a_converted_network_predicts_the_same(tmp_path):
     detail = torch.cat([images, 20.0 * (0.7 - (x.square() + y.square()).sqrt())[..., None].expand(4, -1, -1, 1)], -1)
     with torch.no_grad():
         views = images, masks, c2w, camera.intrinsics, detail.contiguous(), camera.intrinsics
-        (_, want, _), (_, got, _) = (m.read_pixels(*views, mirrored=2) for m in (plain, made))
+        (_, want, _), (_, got, _) = (m.read_pixels(*views, mirrored=2) for m in (unlit, made))
     assert got.bins.shape == (4, 32, 32, 2, 8)
     assert float(want.roughness.std()) > 0.1 and float(want.normal[2:].std()) > 0.1
     for name in ("gain", "shift", "confidence", "roughness", "metallic", "chroma", "normal", "depth"):

@@ -32,7 +32,7 @@ def surface(n: int, views: int, device: torch.device):
     return (t.to(device) for t in (points, visible, normalize(torch.randn(n, 3, generator=g), dim=-1)))
 
 
-def plain(maps: ViewMaps, points, visible, normal):
+def unlit(maps: ViewMaps, points, visible, normal):
     """Reference in float64 torch, view by view."""
     rows = []
     for v in range(len(maps.images)):
@@ -76,7 +76,7 @@ def test_the_kernel_matches_plain_torch(device, views, on_surface):
         visible = normal = None
     got, want = (
         summarize_views(maps.images, maps.camera, points, visible, normal),
-        plain(maps, points, visible, normal),
+        unlit(maps, points, visible, normal),
     )
     for g, w in zip(got, want, strict=True):
         # projection in float32: errors of 1e-5 pixel on values that change by up to 12 per pixel; 0.2 % of them are

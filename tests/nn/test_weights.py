@@ -128,11 +128,11 @@ def refused(path, folder, message):
 def test_a_pickle_that_runs_code_is_refused_and_does_not_run(tmp_path):
     (tmp_path / "files").mkdir()
     crater = tmp_path / "crater"
-    zipped, plain = tmp_path / "files" / "bomb.ckpt", tmp_path / "files" / "plain.ckpt"
+    zipped, unlit = tmp_path / "files" / "bomb.ckpt", tmp_path / "files" / "plain.ckpt"
     torch.save({"state_dict": {"system.x": torch.ones(1)}, "hook": Bomb(crater)}, zipped)
-    plain.write_bytes(pickle.dumps(Bomb(crater)))
+    unlit.write_bytes(pickle.dumps(Bomb(crater)))
     refused(zipped, tmp_path / "files", "refused, nothing was run")
-    refused(plain, tmp_path / "files", "is not a torch checkpoint|refused, nothing was run")
+    refused(unlit, tmp_path / "files", "is not a torch checkpoint|refused, nothing was run")
     assert not crater.exists()
 
 
