@@ -105,9 +105,9 @@ def axis_labels(normal: torch.Tensor, neighbors: np.ndarray) -> np.ndarray:
 
 
 def merge_small(label: np.ndarray, normal: np.ndarray, neighbors: np.ndarray, least: float) -> np.ndarray:
-    """Labels in which charts with less area than ``least`` take the label of a neighbor that all their faces can bear.
+    """Merges charts with less area than ``least`` into a neighbor into whose projection all their faces fit.
 
-    Of several such labels the one with the most common edges; several rounds, each from larger neighbors.
+    Of several such neighbors the one with the most common edges is chosen; repeats while charts merge.
     """
     area = np.sqrt(np.einsum("fk,fk->f", normal, normal)) * 0.5
     for _ in range(MERGE_ROUNDS):

@@ -83,8 +83,8 @@ def _positive(path, field: str, value: bytes, count: int) -> list[float]:
     except ValueError:
         numbers = []
     if len(numbers) != count or not all(1e-12 < number < 1e12 for number in numbers):
-        numbers = "a positive number" if count == 1 else f"{count} positive numbers"
-        raise InputError(path, f"{field}: expected {numbers}, got {shown(value.decode('latin-1'))}; correct the header")
+        amount = "a positive number" if count == 1 else f"{count} positive numbers"
+        raise InputError(path, f"{field}: expected {amount}, got {shown(value.decode('latin-1'))}; correct the header")
     return numbers
 
 

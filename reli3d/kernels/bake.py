@@ -13,8 +13,8 @@ ROUNDING = wp.constant(4.0e-7)  # relative error of a float32 cross product, twi
 
 @wp.struct
 class Tiles:
-    """Corners of the faces in texels, and the faces whose boxes touch each tile of the map: ``face_list`` from
-    ``face_start[i]`` to ``face_start[i + 1]``.
+    """Face corners in texel units, and for each tile ``i`` of the map the faces whose bounding boxes overlap it:
+    ``face_list[face_start[i]:face_start[i + 1]]``.
     """
 
     corners: wp.array2d[wp.vec2]

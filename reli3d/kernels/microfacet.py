@@ -42,7 +42,7 @@ class Facet:
 
 @wp.func
 def facet_between(wo: wp.vec3, wi: wp.vec3, alpha: float, root_o: float) -> Facet:
-    """Facet of two directions above the horizon, whose cosines with the half vector are then positive.
+    """Half vector and its terms for two directions above the horizon, whose cosines with it are positive.
 
     root_o: ``ggx_root(wo, alpha)``, independent of ``wi``.
     """

@@ -321,10 +321,11 @@ def planes_adjoint_kernel(
     # out
     g_planes: wp.array[vec8],
 ):
-    """A thread is a row of cells of a plane and every ``split``-th block; it adds that row's points to two texel rows.
+    """Gradient of the planes: a thread adds the points of one row of cells, for every ``split``-th channel block, to
+    the two adjacent rows of texels.
 
-    Only rows of one ``parity`` run in a launch, so no two threads share a row of texels.  ``order`` lists the points
-    of every plane by row of cells, ``edges (P, height + 2)`` where each begins.
+    A launch covers the rows of one ``parity``, so that no two threads write the same row of texels.  ``order``: points
+    of every plane sorted by row of cells; ``edges (P, height + 2)``: start of each row.
     """
     i = start + wp.tid()
     height = sizes.height

@@ -67,9 +67,10 @@ class OccupancyGrid:
 
 @dataclass(frozen=True)
 class RaySamples:
-    """Samples of N rays, side by side: those of ray ``i`` are ``first[i]`` to ``first[i + 1]``, by rising ``t``.
+    """Concatenated samples of N rays; ``first[i]`` to ``first[i + 1]`` are those of ray ``i``, in ascending ``t``.
 
-    ray: ``(S,)`` int32.  t: ``(S,)`` in lengths of the direction.  first: ``(N + 1,)`` int32.  step: their distance.
+    ray: ``(S,)`` int32 index.  t: ``(S,)`` in lengths of the direction.  first: ``(N + 1,)`` int32.  step: spacing of
+    the samples.
     """
 
     ray: Tensor
@@ -105,9 +106,9 @@ def march_rays(
 ) -> RaySamples:
     """Samples in the occupied cells along N rays, at a spacing of ``step`` lengths of the direction.
 
-    origins, directions: ``(N, 3)``, directions normally unit.  near, far: limits of t.  shift: ``(N,)`` in [0, 1),
-    place of the samples within their steps, 0.5 if None; random for an unbiased integral.  A ray that is not finite or
-    misses the cube has no samples.  No gradient.  Raises ValueError beyond 2^31 samples.
+    origins, directions: ``(N, 3)``, directions usually unit.  near, far: limits of t.  shift: ``(N,)`` in [0, 1),
+    position of the samples within their steps; None: 0.5; random numbers give an unbiased integral.  Rays that are not
+    finite or miss the cube have no samples.  No gradient.  Raises ValueError above 2^31 samples.
     """
     check("origins", origins, last=3)
     check("directions", directions, last=3, like=origins)

@@ -180,7 +180,7 @@ def device(a: Assembly) -> None:
                 a.add(
                     p.cylinder(0.045, 0.1, top=0.05, segments=16), dark, (sx * 0.38 * w, -h / 2 - 0.03, sz * 0.35 * d)
                 )
-    if rng.random() < 0.12:  # lies on its back: keypad, telephone
+    if rng.random() < 0.12:  # on its back: keypad, telephone
         a.transform(np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0.0]]))
 
 

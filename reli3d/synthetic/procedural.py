@@ -1,7 +1,7 @@
 """Procedural objects for training: a closed mesh, its parts and their materials from one seed.
 
 The same seed gives the same object.  ``TRAINING_SEEDS``, ``VALIDATION_SEEDS`` and ``TEST_SEEDS`` are disjoint.  Frame:
-right-handed, +Y up, centered, longest side 1, which lies inside the sphere of radius 0.87 of the network's frame.
+right-handed, +Y up, centered, longest side 1, inside the sphere of radius 0.87 of the network's frame.
 """
 
 from __future__ import annotations

@@ -20,9 +20,7 @@ from reli3d.views.views import Views
 OTHER_UP_PROBABILITY = 0.12  # of a world that is not +Y up: captures come in any frame
 MAX_NOISE = 0.012  # largest standard deviation of the image noise, sRGB
 RELIGHT_PROBABILITY = 0.5  # of views that are rendered again under another environment
-UNCHANGED_PROBABILITY = (
-    0.75  # share of the augmented objects that stay the right way round in a mirror, and keep their channels
-)
+UNCHANGED_PROBABILITY = 0.75  # of not mirroring, and of not permuting the color channels
 
 
 def random_turn(rng: np.random.Generator) -> Tensor:

@@ -54,9 +54,9 @@ def calibrate(
     if not files:
         raise InputError(samples, "expected *.safetensors files, got none; make samples with reli3d-data render")
     chosen = np.random.default_rng(seed).permutation(len(files))[:objects]
-    plain = model.preset
-    if not isinstance(plain, LocalPreset):
-        raise ValueError(f"model: expected a network of convolutions, got the preset {plain.name}")
+    preset = model.preset
+    if not isinstance(preset, LocalPreset):
+        raise ValueError(f"model: expected a network of convolutions, got the preset {preset.name}")
     scores: dict[int, list[list[tuple[float, float]]]] = {FEW_VIEWS: [], MANY_VIEWS: []}
     for k in chosen:
         sample = load_file(files[k])
@@ -64,9 +64,9 @@ def calibrate(
             field = encode(model, prepare(model, stored_views(sample, count), Similarity.identity()))
             rows.append([])
             for offset in OFFSETS:
-                model.preset = replace(plain, offset_one_view=offset, offset_many_views=offset)
+                model.preset = replace(preset, offset_one_view=offset, offset_many_views=offset)
                 try:
-                    mesh = extract(field, plain.resolution)
+                    mesh = extract(field, preset.resolution)
                     rows[-1].append(silhouette_scores(mesh, sample, range(count, len(sample["images"]))))
                 except NoSurface:
                     rows[-1].append((0.0, MAX_MISMATCH))
@@ -74,7 +74,7 @@ def calibrate(
     found = {count: np.array(rows) for count, rows in scores.items()}  # (objects, offsets, 2)
     tried = {count: dict(zip(OFFSETS, rows[..., 0].mean(0).tolist(), strict=True)) for count, rows in found.items()}
     one, many = (OFFSETS[one_standard_error_choice(found[count][..., 1])] for count in (FEW_VIEWS, MANY_VIEWS))
-    model.preset = replace(plain, offset_one_view=one, offset_many_views=many + (many - one) / (MANY_VIEWS - 1))
+    model.preset = replace(preset, offset_one_view=one, offset_many_views=many + (many - one) / (MANY_VIEWS - 1))
     return tried
 
 
@@ -95,20 +95,20 @@ def silhouette_scores(mesh: Mesh, sample: dict[str, Tensor], views: range) -> tu
     for v in views:
         intrinsics = sample["intrinsics"][v] / step
         origins, directions = camera_rays(Camera(sample["c2w"][v], intrinsics, size // step, size // step))
-        got = scene.closest(origins, directions).face >= 0
+        filled = scene.closest(origins, directions).face >= 0
         alpha = sample["images"][v, ..., 3].float()[None, None]
-        want = torch.nn.functional.avg_pool2d(alpha, step)[0, 0] > 127.5
-        both = int((got & want).sum())
-        rows.append((both / max(int((got | want).sum()), 1), mismatch(both, int(got.sum()), int(want.sum()))))
+        masked = torch.nn.functional.avg_pool2d(alpha, step)[0, 0] > 127.5
+        both = int((filled & masked).sum())
+        rows.append((both / max(int((filled | masked).sum()), 1), mismatch(both, int(filled.sum()), int(masked.sum()))))
     return tuple(np.mean(rows, 0).tolist())
 
 
-def mismatch(both: int, got: int, want: int) -> float:
-    """``log(1 / recall - precision)`` of silhouettes of ``got`` and ``want`` pixels with ``both`` in common.
+def mismatch(both: int, filled: int, masked: int) -> float:
+    """``log(1 / recall - precision)`` of silhouettes of ``filled`` and ``masked`` pixels with ``both`` in common.
 
     Equals the logarithm of the square error per common pixel of an image of constant color at its optimal brightness.
     Unlike IoU it penalizes missing area more than excess area.  At most MAX_MISMATCH.
     """
     if both == 0:
         return MAX_MISMATCH
-    return min(MAX_MISMATCH, math.log(max(want / both - both / got, MIN_RATIO_DIFFERENCE)))
+    return min(MAX_MISMATCH, math.log(max(masked / both - both / filled, MIN_RATIO_DIFFERENCE)))

@@ -112,8 +112,8 @@ def check_shapes(
     path: Path, state: dict[str, Tensor], model: nn.Module, missing_parameters: set[str] | None = None
 ) -> None:
     """Raise InputError unless ``state`` has the tensors of ``model`` but for those ``missing_parameters``."""
-    wanted = {k: tuple(v.shape) for k, v in model.state_dict().items() if k not in (missing_parameters or ())}
-    check_keys(path, {k: tuple(v.shape) for k, v in state.items()}, wanted)
+    shapes = {k: tuple(v.shape) for k, v in model.state_dict().items() if k not in (missing_parameters or ())}
+    check_keys(path, {k: tuple(v.shape) for k, v in state.items()}, shapes)
 
 
 def restore(optimizer: torch.optim.Optimizer, state: dict) -> None:

@@ -24,7 +24,7 @@ from reli3d.errors import InputError
 from reli3d.io.images import write_png
 from reli3d.train import checkpoint
 from reli3d.train.log import Board, Log, write_curves
-from reli3d.train.sharded import clip_gradients, plain, scattered, shard
+from reli3d.train.sharded import clip_gradients, replicated, scattered, shard
 from reli3d.train.stage import Options, Stage
 from reli3d.train.workers import Workers
 
@@ -128,7 +128,7 @@ def train(stage: Stage, options: Options, workers: Workers | None = None) -> Non
         torch.manual_seed((options.seed << 32) + step)  # random losses draw the same numbers after resuming
         values = accumulate(stage, stage.batch(step, range(workers.rank, options.batch, workers.count)))
         clock = torch.tensor([time.monotonic() - began], dtype=torch.float64)
-        values = workers.average(plain(trained), torch.cat([values, clock]).float()).double()
+        values = workers.average(replicated(trained), torch.cat([values, clock]).float()).double()
         norm = clip_gradients(trained, options.clip)
         bad = 0 if torch.isfinite(norm) else bad + 1
         if not bad:

@@ -41,7 +41,7 @@ class Group:
 
 
 def reduced_model(model: LocalReconstructor, finest: int) -> LocalReconstructor:
-    """A network whose 2D U-Net reads images ``2**finest`` times smaller, with the parameters of ``model`` it shares."""
+    """A network whose 2D U-Net reads images ``2**finest`` times smaller, with the common parameters of ``model``."""
     small = LocalReconstructor(model.preset)
     small.pyramid = ImagePyramid(model.preset.pyramid, finest)
     have = small.state_dict()

@@ -51,7 +51,7 @@ def scattered(whole: Tensor, like: Tensor) -> Tensor:
     return distribute_tensor(whole, like.device_mesh, like.placements, src_data_rank=None)
 
 
-def plain(parameters: Iterable[Tensor]) -> list[Tensor]:
+def replicated(parameters: Iterable[Tensor]) -> list[Tensor]:
     """The ``parameters`` that are not sharded."""
     return [p for p in parameters if not isinstance(p, DTensor)]
 

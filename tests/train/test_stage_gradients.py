@@ -139,8 +139,8 @@ def test_the_normals_of_the_mesh_have_a_slope_in_the_picture(one):
 
     def shown(normals: torch.Tensor) -> torch.Tensor:
         bent = replace(found, mesh=replace(found.mesh, normals=normals))
-        picture = render_surface(model, code, bent, camera(24), lit)
-        return (picture.color * noise).sum() + (picture.normal * noise.flip(0)).sum()
+        rendering = render_surface(model, code, bent, camera(24), lit)
+        return (rendering.color * noise).sum() + (rendering.normal * noise.flip(0)).sum()
 
     noise = torch.randn(24, 24, 3, generator=generator)
     leaf = normals.clone().requires_grad_()

@@ -126,25 +126,25 @@ def test_a_ball_is_shown_as_a_ball(stage, one):
     miss = origins.square().sum(-1) - along**2  # squared distance of a ray from the centre
     core = miss < RADIUS**2 - 0.1
     if stage is VOLUME:
-        picture = render_volume(model, code, view, lobes(model, code, 16), occupied(model, code, stage), stage, 0)
+        rendering = render_volume(model, code, view, lobes(model, code, 16), occupied(model, code, stage), stage, 0)
         t = torch.linspace(-0.87, 0.87, 1001)
         far = (miss[..., None] + t * t).sqrt()
         depth = 10.0 * (model.steep * (RADIUS - far)).exp().sum(-1) * (t[1] - t[0])
         # a step of 0.036 and a slope of 30: single rays err by the share of a step, their mean does not
-        assert float((picture.coverage - (1.0 - (-depth).exp())).abs().mean()) < 0.02
-        assert float((picture.coverage - (1.0 - (-depth).exp())).mean()) == pytest.approx(0.0, abs=0.005)
+        assert float((rendering.coverage - (1.0 - (-depth).exp())).abs().mean()) < 0.02
+        assert float((rendering.coverage - (1.0 - (-depth).exp())).mean()) == pytest.approx(0.0, abs=0.005)
     else:
         found = surface(model, code, 24)
         light = lobes(model, code, 16)
-        picture = render_surface(model, code, found, view, lambda p, wo, scene: shade_gaussians(p, wo, light))
-        area = float(picture.coverage.sum() / (miss < RADIUS**2).sum())
+        rendering = render_surface(model, code, found, view, lambda p, wo, scene: shade_gaussians(p, wo, light))
+        area = float(rendering.coverage.sum() / (miss < RADIUS**2).sum())
         assert area == pytest.approx(1.0, abs=0.05)  # the level is curved, so a crossing on a cube of 0.07 lies inside
     nearest = (along + (RADIUS**2 - miss).clamp(min=0).sqrt())[..., None]
     true = torch.nn.functional.normalize(origins - nearest * directions, dim=-1)
-    cosine = (picture.normal * true).sum(-1)[core]
+    cosine = (rendering.normal * true).sum(-1)[core]
     assert float(cosine.mean()) > (0.97 if stage is VOLUME else 0.995)
-    assert float(picture.coverage[core].min()) > 0.95
-    base = picture.material[core][:, :3]
+    assert float(rendering.coverage[core].min()) > 0.95
+    base = rendering.material[core][:, :3]
     assert 0.2 < float(base.mean()) < 0.8  # the head starts near one half
 
 
@@ -207,9 +207,9 @@ def test_what_is_cut_off_at_white_may_be_brighter(one):
 
 
 def test_the_multi_scale_gradients_forgive_what_is_even_and_see_edges():
-    picture = torch.rand(32, 32, 3, generator=torch.Generator().manual_seed(0))
-    assert float(gradients(picture + 0.2, picture)) < 1e-6
-    assert float(gradients(picture.roll(3, 1), picture)) > 0.1
+    rendering = torch.rand(32, 32, 3, generator=torch.Generator().manual_seed(0))
+    assert float(gradients(rendering + 0.2, rendering)) < 1e-6
+    assert float(gradients(rendering.roll(3, 1), rendering)) > 0.1
 
 
 def test_latents_are_compared_as_the_decoder_gets_them(one):

@@ -81,7 +81,7 @@ def capture_views(views: Views, size: int) -> ObjectViews:
 
 
 def _inside(new: Tensor, old: Tensor, shape: torch.Size, size: int) -> Tensor:
-    """``(S, S)`` 1 where the crop's pixel lies in the input image of ``shape`` (rows, columns)."""
+    """``(S, S)`` 1 where the crop's pixel is inside the input image of ``shape`` (rows, columns)."""
     at = torch.arange(size, dtype=torch.float32) + 0.5
     x = (at - new[2]) * (old[0] / new[0]) + old[2]
     y = (at - new[3]) * (old[1] / new[1]) + old[3]

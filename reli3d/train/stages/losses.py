@@ -23,22 +23,22 @@ MIN_OPACITY = 1e-4  # opacities are kept this far from 0 and 1: the cross-entrop
 Perceptual = Callable[[Tensor, Tensor], Tensor]
 
 
-def compared_colors(picture: Rendering, target: ObjectViews, view: int) -> tuple[Tensor, Tensor]:
+def compared_colors(rendering: Rendering, target: ObjectViews, view: int) -> tuple[Tensor, Tensor]:
     """Rendering and target ``(H, W, 3)`` over black, display values, zero where the target is not valid."""
-    want = target.images[view] * target.masks[view][..., None]
-    got = picture.color
-    got = torch.where(target.images[view] > WHITE, torch.minimum(got, want), got)
+    observed = target.images[view] * target.masks[view][..., None]
+    rendered = rendering.color
+    rendered = torch.where(target.images[view] > WHITE, torch.minimum(rendered, observed), rendered)
     if target.valid is not None:
-        got, want = (x * target.valid[view][..., None] for x in (got, want))
-    return got, want
+        rendered, observed = (x * target.valid[view][..., None] for x in (rendered, observed))
+    return rendered, observed
 
 
-def gradients(got: Tensor, want: Tensor) -> Tensor:
+def gradients(rendered: Tensor, observed: Tensor) -> Tensor:
     """Mean absolute error of image gradients of ``(H, W, 3)`` at several scales.
 
     A substitute for LPIPS without network weights: sensitive to the position of edges, insensitive to constant offsets.
     """
-    error = (got - want).movedim(-1, 0)[None]
+    error = (rendered - observed).movedim(-1, 0)[None]
     total = error.new_zeros(())
     for scale in range(SCALES):
         if scale:
@@ -70,9 +70,9 @@ def lpips_distance() -> Perceptual:
         ) from None
     network = lpips.LPIPS(net="vgg", verbose=False).requires_grad_(False)
 
-    def distance(got: Tensor, want: Tensor) -> Tensor:
-        a, b = (2.0 * x.clamp(0.0, 1.0).movedim(-1, 0)[None] - 1.0 for x in (got, want))
-        return network.to(got.device)(a, b).mean()
+    def distance(rendered: Tensor, observed: Tensor) -> Tensor:
+        a, b = (2.0 * x.clamp(0.0, 1.0).movedim(-1, 0)[None] - 1.0 for x in (rendered, observed))
+        return network.to(rendered.device)(a, b).mean()
 
     return distance
 
@@ -82,16 +82,16 @@ def perceptual(name: str) -> Perceptual:
     return lpips_distance() if name == "lpips" else gradients
 
 
-def opacity_entropy(picture: Rendering, target: ObjectViews, view: int) -> Tensor:
+def opacity_entropy(rendering: Rendering, target: ObjectViews, view: int) -> Tensor:
     """Binary cross-entropy of opacity and mask, mean over the valid pixels."""
-    coverage = picture.coverage.clamp(MIN_OPACITY, 1.0 - MIN_OPACITY)
+    coverage = rendering.coverage.clamp(MIN_OPACITY, 1.0 - MIN_OPACITY)
     entropy = binary_cross_entropy(coverage, target.masks[view], reduction="none")
     return _mean(entropy, target, view)
 
 
-def coverage_error(picture: Rendering, target: ObjectViews, view: int) -> Tensor:
+def coverage_error(rendering: Rendering, target: ObjectViews, view: int) -> Tensor:
     """Mean square error of antialiased coverage against the mask, over the valid pixels."""
-    return _mean((picture.coverage - target.masks[view]).square(), target, view)
+    return _mean((rendering.coverage - target.masks[view]).square(), target, view)
 
 
 def _mean(values: Tensor, target: ObjectViews, view: int) -> Tensor:
@@ -100,23 +100,23 @@ def _mean(values: Tensor, target: ObjectViews, view: int) -> Tensor:
     return (values * target.valid[view]).sum() / target.valid[view].sum().clamp(min=1.0)
 
 
-def map_terms(picture: Rendering, target: ObjectViews, view: int) -> dict[str, Tensor]:
+def map_terms(rendering: Rendering, target: ObjectViews, view: int) -> dict[str, Tensor]:
     """Errors of material and normal where both maps have values, weighted by the coverage of the prediction.
 
     The weight is detached: a wrong material must not reduce the opacity.
     """
-    terms = {"flat": (1.0 - picture.bump[:, 2]).mean()} if len(picture.bump) else {}
+    terms = {"flat": (1.0 - rendering.bump[:, 2]).mean()} if len(rendering.bump) else {}
     if target.shown is None:
         return terms
-    weight = target.shown[view] * picture.known * picture.coverage.detach()
+    weight = target.shown[view] * rendering.known * rendering.coverage.detach()
     total = weight.sum()
     if float(total.detach()) < 1.0:  # nothing in common yet
         return terms
     if target.material is not None:
-        error = (picture.material - target.material[view]).square().mean(-1)
+        error = (rendering.material - target.material[view]).square().mean(-1)
         terms["material"] = (error * weight).sum() / total
     if target.normal is not None:
-        cosine = (picture.normal * target.normal[view]).sum(-1)
+        cosine = (rendering.normal * target.normal[view]).sum(-1)
         terms["normal"] = ((1.0 - cosine) * weight).sum() / total
     return terms
 

@@ -124,11 +124,11 @@ class PaperStage(Stage):
                 target.images[0] * target.masks[0][..., None],
             ]
             if shown:
-                picture = shown[0]
-                coverage = (picture.coverage * picture.known)[..., None]
-                finish = torch.cat([picture.material[..., 3:], torch.zeros_like(coverage)], -1) * coverage
-                normal = 0.5 * (picture.normal + 1.0) * coverage
-                tiles += [picture.color, picture.material[..., :3] * coverage, finish, normal]
+                rendering = shown[0]
+                coverage = (rendering.coverage * rendering.known)[..., None]
+                finish = torch.cat([rendering.material[..., 3:], torch.zeros_like(coverage)], -1) * coverage
+                normal = 0.5 * (rendering.normal + 1.0) * coverage
+                tiles += [rendering.color, rendering.material[..., :3] * coverage, finish, normal]
             else:
                 tiles += [torch.zeros_like(tiles[1])] * 4
             light = model.decode_environment(code)[0]

@@ -81,14 +81,14 @@ def object_losses(
     shown, terms = renderings(model, code, drawn, stage)
     target = drawn.targets
     of_views: dict[str, list[Tensor]] = {}
-    for view, picture in enumerate(shown):
-        got, want = losses.compared_colors(picture, target, view)
+    for view, rendering in enumerate(shown):
+        rendered, observed = losses.compared_colors(rendering, target, view)
         mask = losses.opacity_entropy if stage.renderer == "volume" else losses.coverage_error
         found = {
-            "image": (got - want).square().mean(),
-            "perceptual": distance(got, want),
-            "mask": mask(picture, target, view),
-            **losses.map_terms(picture, target, view),
+            "image": (rendered - observed).square().mean(),
+            "perceptual": distance(rendered, observed),
+            "mask": mask(rendering, target, view),
+            **losses.map_terms(rendering, target, view),
         }
         for name, value in found.items():
             of_views.setdefault(name, []).append(value)

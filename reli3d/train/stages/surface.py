@@ -60,7 +60,7 @@ def query_heads(model: Reconstructor, code: Code, points: Tensor, heads: tuple[s
 
 
 def corner_points(sdf: Tensor, cubes: Tensor) -> Tensor:
-    """Grid points ``(C, 8)`` of the corners of ``cubes``; corner k lies at x = k & 1, y = k >> 1 & 1, z = k >> 2."""
+    """Grid points ``(C, 8)`` of the corners of ``cubes``; corner k is at x = k & 1, y = k >> 1 & 1, z = k >> 2."""
     _, y, z = sdf.shape
     i, rest = cubes // ((y - 1) * (z - 1)), cubes % ((y - 1) * (z - 1))
     lowest = (i * y + rest // (z - 1)) * z + rest % (z - 1)

@@ -26,12 +26,12 @@ Chooser = Callable[[int], Sequence[int]]  # maps the number of available views t
 class ObjectViews:
     """``V`` views of ``S`` by ``S`` pixels in the model's frame, float32."""
 
-    images: Tensor  # (V, S, S, 3) sRGB, straight alpha alpha
+    images: Tensor  # (V, S, S, 3) sRGB, straight alpha
     masks: Tensor  # (V, S, S) coverage
     c2w: Tensor  # (V, 4, 4)
     intrinsics: Tensor  # (V, 4) pixels
     background: bool  # whether the images have content outside the masks
-    valid: Tensor | None = None  # (V, S, S) 1 where the pixel lies in the input image; None: everywhere
+    valid: Tensor | None = None  # (V, S, S) 1 where the pixel is inside the input image; None: everywhere
     material: Tensor | None = None  # (V, S, S, 5) base color (sRGB), roughness, metallic
     normal: Tensor | None = None  # (V, S, S, 3) world, unit
     shown: Tensor | None = None  # (V, S, S) 1 where material and normal are known
@@ -118,7 +118,7 @@ def sample_views(read: Callable[[str], Any], choose: Chooser) -> ObjectViews:
     c2w, intrinsics = present("c2w", of_views("c2w")), present("intrinsics", of_views("intrinsics"))
     valid, depth = of_views("view_valid"), of_views("view_depth")
     material, normal, known = of_views("view_material"), of_views("view_normal"), of_views("finish_known")
-    if known is not None and not known.all():  # nothing stands for what is not known
+    if known is not None and not known.all():  # missing ground truth stays None
         material = None
     return ObjectViews(
         images[..., :3].contiguous(),
