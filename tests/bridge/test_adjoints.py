@@ -352,7 +352,7 @@ OPS = {
 
 
 @pytest.mark.parametrize("name", OPS)
-def test_the_adjoint_is_that_of_the_float64_twin(device, name):
+def test_the_adjoint_is_that_of_the_float64_reference(device, name):
     """Of the entries that are not 0; those below a hundredth of their median are judged as if they were as large.  No
     kink is left out but the deviation's absolute values, which it takes in float64.
     """
@@ -382,6 +382,6 @@ SLOW = pytest.param("deviation", marks=pytest.mark.slow)  # 6 s
 
 
 @pytest.mark.parametrize("name", [SLOW if name == "deviation" else name for name in OPS])
-def test_the_twin_has_the_gradients_of_finite_differences(name):
+def test_the_reference_has_the_gradients_of_finite_differences(name):
     op = OPS[name](torch.Generator().manual_seed(7), True)
     assert torch.autograd.gradcheck(op.twin, op.double(), eps=1e-6, atol=1e-5, rtol=1e-3)

@@ -43,7 +43,7 @@ def test_options_reach_the_command_and_so_does_its_exit_code(monkeypatch, tmp_pa
     assert "invalid choice: 'infr'" in capsys.readouterr().err
 
 
-def test_view_serves_the_folder_on_this_machine_until_it_is_told_to_stop(tmp_path):
+def test_view_serves_the_folder_on_this_machine_until_it_is_stopped(tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / view.PAGE).write_text("the page")
     (tmp_path / "secret").write_text("not served")
@@ -113,7 +113,7 @@ def test_view_of_the_folder_above_names_the_one_below(tmp_path, capsys):
     assert capsys.readouterr().err.rstrip().endswith(f"give {tmp_path / 'shoe'}")
 
 
-def test_help_tells_defaults(capsys):
+def test_help_lists_defaults(capsys):
     for name in ("infer", "render", "data render", "data pack", "eval"):
         with pytest.raises(SystemExit):
             main.main([*name.split(), "--help"])

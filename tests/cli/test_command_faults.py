@@ -184,7 +184,7 @@ def test_what_no_input_explains_is_one_line_exit_code_1_and_a_log(tmp_path, erro
     process.communicate()
 
 
-def test_a_bug_outside_of_the_objects_is_logged_beside_the_output(tmp_path, monkeypatch, capsys):
+def test_a_bug_outside_of_the_objects_is_logged_next_to_the_output(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(infer, "refinement_budget", lambda *_: 1 + "a")
     assert infer.main(["--output", str(tmp_path / "out"), "--device", "cpu"]) == 1
     out, err = capsys.readouterr()

@@ -186,7 +186,7 @@ def test_a_device_is_cpu_or_cuda(device, capsys):
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
-def test_cuda_that_is_missing_is_told(capsys):
+def test_cuda_that_is_missing_is_reported(capsys):
     assert render.main(["x.glb", "--device", "cuda"]) == 2
     assert "expected a CUDA device" in capsys.readouterr().err
 

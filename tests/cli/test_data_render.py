@@ -87,7 +87,7 @@ def test_the_work_of_a_killed_process_is_done_again(where, maps, alone, tmp_path
     assert {p.name: p.read_bytes() for p in out.glob("*.safetensors")} == alone
 
 
-def test_what_cannot_be_made_is_told_and_the_rest_is_made(maps, tmp_path, monkeypatch, capsys):
+def test_what_cannot_be_made_is_reported_and_the_rest_is_made(maps, tmp_path, monkeypatch, capsys):
     """A refused object and a process that died twice cost their own sample; a full disk ends the command."""
     ends = [
         objects.Row("0000000000", "refused", notes=("mesh: expected a surface, got none",)),
@@ -103,7 +103,7 @@ def test_what_cannot_be_made_is_told_and_the_rest_is_made(maps, tmp_path, monkey
     assert "0000000003: no space left" in capsys.readouterr().err
 
 
-def test_ray_that_is_missing_is_told_in_one_line(maps, tmp_path, monkeypatch, capsys):
+def test_ray_that_is_missing_is_reported_in_one_line(maps, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "ray", None)  # its import raises
     assert data.main(call(maps, tmp_path / "out", "--ray", "local")) == 2
     assert "pip install reli3d[ray]" in capsys.readouterr().err

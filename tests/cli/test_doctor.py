@@ -37,7 +37,7 @@ def test_report_names_versions_devices_cache_and_weights(assets):
     assert usable and not any(doctor.PROBLEM in value for value in rows.values())
 
 
-def test_command_says_usable_on_stdout(assets, capsys):
+def test_command_reports_usable_on_stdout(assets, capsys):
     assert doctor.main([]) == 0
     assert capsys.readouterr().out.splitlines()[-1].endswith(" usable")
 
@@ -59,7 +59,7 @@ def test_missing_weights_are_a_problem(assets, capsys):
     assert out.count(doctor.PROBLEM) == 1 and out.splitlines()[-1].endswith("not usable: 1 problem")
 
 
-def test_a_part_that_fails_is_reported_and_the_rest_goes_on(assets, monkeypatch):
+def test_a_part_that_fails_is_reported_and_the_rest_continues(assets, monkeypatch):
     def broken():
         raise RuntimeError("the driver is gone")
 

@@ -51,7 +51,7 @@ def test_every_format_is_written_and_named(glb, tmp_path, capsys):
         assert {p.name for p in (tmp_path / kind).iterdir()} == expected == {f.split("/")[-1] for f in record["files"]}
 
 
-def test_fewer_triangles_keep_the_shape_and_the_paint(glb, tmp_path, capsys):
+def test_fewer_triangles_keep_the_shape_and_the_base_color(glb, tmp_path, capsys):
     pytest.importorskip("fast_simplification")
     assert main([str(glb), "--decimate", "400", "--textures", "webp", "--output", str(tmp_path)]) == 0
     assert capsys.readouterr().out.strip() == str(tmp_path / "mesh.glb")

@@ -206,14 +206,14 @@ def test_wrong_options_end_with_2_before_the_work(tmp_path, capsys, monkeypatch,
     assert out == "" and err.count("\n") == 1 and word in err and not (tmp_path / "out").exists()
 
 
-def test_a_folder_in_the_place_of_the_summary_is_told_at_once(tmp_path, capsys, monkeypatch):
+def test_a_folder_in_the_place_of_the_summary_is_reported_at_once(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(job, "FolderJob", None)
     (tmp_path / "summary.csv").mkdir()
     assert infer.main(["a", "b", "--output", str(tmp_path)]) == 2
     assert "expected a file or none" in capsys.readouterr().err
 
 
-def test_ray_that_is_missing_is_told(monkeypatch):
+def test_ray_that_is_missing_is_reported(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)  # its import raises
     with pytest.raises(ValueError, match=r"pip install reli3d\[ray\]"):
         objects.on_ray(WordJob, [], "auto")
@@ -221,7 +221,7 @@ def test_ray_that_is_missing_is_told(monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("options", [["--workers", "1"], ["--workers", "2"], ["--ray", "local"]])
-def test_the_same_bits_wherever_an_object_is_made(tmp_path, options):
+def test_results_are_bitwise_identical_wherever_an_object_is_made(tmp_path, options):
     if "--ray" in options:
         pytest.importorskip("ray")
     for name in ("first", "second", "third"):

@@ -115,7 +115,7 @@ def test_linear_files_and_layers_are_those_of_render(scene):
 
 
 @pytest.mark.parametrize("tone, transform", [("srgb", linear_to_srgb), ("agx", agx), ("none", lambda v: v)])
-def test_pictures_are_the_display_transform_of_the_exposed_radiance(scene, tone, transform):
+def test_images_are_the_display_transform_of_the_exposed_radiance(scene, tone, transform):
     image = expected(scene)[0]
     for stops in (0, 1):
         picture = pixels(run(scene, "--tone", tone, "--exposure", str(stops))["ball.png"])
@@ -163,7 +163,7 @@ def test_turntables_are_their_frames(scene, turn, monkeypatch):
             assert errors[k] < 0.03 and errors[k] == min(errors), errors  # WebP loses detail
 
 
-def test_paint_and_wrong_options(scene, capsys):
+def test_diffuse_model_and_wrong_options(scene, capsys):
     picture = pixels(run(scene, light=None)["ball.png"])
     changed = (
         pixels(run(scene, "--diffuse-model", "published", light=None)["ball.png"])[..., :3].int()
@@ -241,7 +241,7 @@ def test_the_name_of_the_output_makes_an_animation(scene, tmp_path, ending):
 
 
 @pytest.mark.parametrize("name", ["seen.png", "seen.PNG", "linear.light.exr"])
-def test_the_name_of_the_output_makes_one_picture(scene, tmp_path, name):
+def test_the_name_of_the_output_makes_one_image(scene, tmp_path, name):
     in_folder = run(scene, "--format", name[-3:].lower())
     (found,) = run(scene, "--output", str(tmp_path / name)).values()
     assert found == tmp_path / name

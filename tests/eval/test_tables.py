@@ -46,7 +46,7 @@ def test_surface_samples_lie_on_the_surface_evenly():
     assert np.ptp(radius) < 0.03 and float(np.abs(points.mean(0)).max()) < 0.03 * radius.mean() * 2
 
 
-def test_psnr_and_ssim_of_known_pictures():
+def test_psnr_and_ssim_of_known_images():
     picture = torch.rand(40, 40, 3, generator=torch.Generator().manual_seed(0)) * 0.5
     assert psnr(picture + 0.1, picture) == pytest.approx(20.0, abs=1e-4) and psnr(picture, picture) == 100.0
     assert ssim(picture, picture) == pytest.approx(1.0, abs=1e-12)
@@ -73,7 +73,7 @@ def test_the_pipeline_takes_what_it_is_given():
     assert asked <= set(inspect.signature(objects.reconstruct).parameters)
 
 
-def test_the_truth_reconstructed_perfectly_has_perfect_figures(place, monkeypatch):
+def test_the_reference_reconstructed_perfectly_has_perfect_figures(place, monkeypatch):
     """The pipeline replaced by one that gives the object itself, in its own light at the photographs' exposure."""
     light = Environment(torch.rand(16, 32, 3, generator=torch.Generator().manual_seed(0)) + 0.2)
     truth = objects.load_reference(place / "ball.glb", light, light, inputs=2, size=32, seed=0)
@@ -94,7 +94,7 @@ def test_the_truth_reconstructed_perfectly_has_perfect_figures(place, monkeypatc
     assert found["empty"] == 0.0
 
 
-def test_the_command_writes_table_rows_and_pictures(place, monkeypatch, capsys):
+def test_the_command_writes_table_rows_and_images(place, monkeypatch, capsys):
     monkeypatch.setattr("reli3d.nn.weights.load_model", lambda name: None)
 
     def nothing(views, *, weights, options):

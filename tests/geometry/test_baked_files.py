@@ -103,7 +103,7 @@ def check_file(path, source: Mesh) -> float:
 
 
 @pytest.mark.parametrize("name", QUICK + [pytest.param(n, marks=pytest.mark.slow) for n in SLOW])
-def test_known_colour_reads_back_from_the_file_of_a_real_mesh(shared_data, tmp_path, name):
+def test_known_color_reads_back_from_the_file_of_a_real_mesh(shared_data, tmp_path, name):
     mesh = unit_size(loaded(shared_data / "meshes" / f"{name}.glb"))
     write_glb(tmp_path / "a.glb", baked(mesh, 1024))
     error = check_file(tmp_path / "a.glb", mesh)
@@ -111,7 +111,7 @@ def test_known_colour_reads_back_from_the_file_of_a_real_mesh(shared_data, tmp_p
 
 
 @pytest.mark.parametrize("n", [24, pytest.param(80, marks=pytest.mark.slow), pytest.param(160, marks=pytest.mark.slow)])
-def test_known_colour_reads_back_from_the_file_of_an_extracted_surface(tmp_path, n):
+def test_known_color_reads_back_from_the_file_of_an_extracted_surface(tmp_path, n):
     mesh = extract_surface(field(n, "cpu"), radius=0.87)
     size = 1024 if n > 24 else 512
     write_glb(tmp_path / "a.glb", baked(mesh, size))

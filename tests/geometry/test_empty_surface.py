@@ -90,7 +90,7 @@ def test_what_can_be_said_of_no_faces_is_said():
         (lambda m: glb_bytes(Asset(m, TextureSet(torch.zeros(4, 4, 3), 0.0, 0.0))), "numpy"),
     ],
 )
-def test_what_needs_a_face_says_so_in_one_line(call, module):
+def test_what_needs_a_face_reports_it_in_one_line(call, module):
     pytest.importorskip(module)
     mesh = Mesh(NOTHING.vertices, NOTHING.faces, torch.zeros(0, 3), torch.zeros(0, 2), torch.zeros(0, 4))
     with pytest.raises(ValueError, match=r"^[\w.]*mesh[\w.]*: expected .*, got .*$"):

@@ -183,7 +183,7 @@ def solved(a, b, c, o, d):
     return torch.linalg.solve(torch.stack([b - a, c - a, -d], -1), o - a)
 
 
-def test_the_twin_of_hits_has_the_gradients_of_finite_differences():
+def test_the_reference_of_hits_has_the_gradients_of_finite_differences():
     rng = torch.Generator().manual_seed(3)
     leaves = [torch.randn(6, 3, generator=rng, dtype=torch.float64).requires_grad_() for _ in range(5)]
     assert torch.autograd.gradcheck(solved, leaves, eps=1e-6, atol=1e-5, rtol=1e-3)

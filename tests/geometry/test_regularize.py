@@ -15,7 +15,7 @@ from tests.support.reference_surface import random_weights, sphere
 F = torch.nn.functional
 
 
-def test_deviation_and_gradients_match_the_plain_float64_formulation(device):
+def test_deviation_and_gradients_match_the_float64_formulation(device):
     rng = torch.Generator().manual_seed(3)
     sdf = F.pad(torch.randn(6, 5, 7, generator=rng), (1,) * 6, value=0.7)  # no cube of the padding is needed
     weights = random_weights(sdf.shape, 5, spread=0.5)

@@ -15,7 +15,7 @@ from tests.support.reference_surface import grid, random_weights, sphere, torus
 F = torch.nn.functional
 
 
-def test_gradients_match_the_plain_float64_formulation(device):
+def test_gradients_match_the_float64_formulation(device):
     rng = torch.Generator().manual_seed(3)
     sdf = torch.randn(7, 6, 8, generator=rng)
     sdf = F.pad(sdf, (1,) * 6, value=0.7)  # the plain formulation has no padding; away from the box both agree
@@ -84,7 +84,7 @@ def test_fields_and_weights_of_any_size_give_finite_vertices_and_gradients(devic
     assert all(bool(torch.isfinite(g).all()) for g in grads) and all(float(g.abs().max()) > 0 for g in grads)
 
 
-def test_gradients_behind_the_mesh_are_the_same_bits_for_any_number_of_threads(threads):
+def test_gradients_behind_the_mesh_are_bitwise_identical_for_any_number_of_threads(threads):
     """Centre vertices, deviation, normals, smoothing, atlas: torch's own scatters add up in any order."""
     sdf = torus(40) + 0.01 * torch.randn(41, 41, 41, generator=torch.Generator().manual_seed(0))
     weights = {"sdf": sdf, **random_weights(sdf.shape, 0, spread=0.5)}
@@ -136,7 +136,7 @@ def test_gradients_in_the_padding_reach_what_they_stand_at(device):
     torch.testing.assert_close(whole.sum((0, 1, 2)), torch.full((3,), 2.0 * len(mesh.vertices), device=device))
 
 
-def test_centre_vertices_split_quads_in_four_with_gradient_to_gamma(device):
+def test_center_vertices_split_quads_in_four_with_gradient_to_gamma(device):
     sdf = torus(12, device)
     weights = random_weights(sdf.shape, 2, device)
     gamma = weights["gamma"].requires_grad_()

@@ -67,7 +67,7 @@ def test_a_mirrored_camera_sees_the_reflected_point_at_the_mirrored_pixel():
     ((0.48, 0.6, -0.64), (300.0, 100.0, -200.0), 1000.0),
     ((0.0, 1.0, 0.0), (0.001, 0.0, 0.002), 0.01),
 ])  # fmt: skip
-def test_the_plane_of_twin_balls_is_found_in_any_frame(up, center, unit, device):
+def test_the_plane_of_two_equal_balls_is_found_in_any_frame(up, center, unit, device):
     camera = cameras(up=up, center=center, unit=unit)
     turn = turned(torch.tensor(up))
     distance = distances(TWIN, camera, turn, center, unit)
@@ -85,7 +85,7 @@ def test_an_object_without_a_mirror_plane_has_none(device):
     assert mirror_plane(distances(ODD, camera).to(device), camera.to(device)) is None
 
 
-def test_one_ball_has_a_plane_through_its_centre():
+def test_one_ball_has_a_plane_through_its_center():
     camera = cameras()
     plane = mirror_plane(distances([((0.1, 0.0, 0.05), 0.4)], camera), camera)
     # the centre of the visual hull is that of the ball within some pixels
@@ -99,7 +99,7 @@ def around(count, arc):
 
 
 @pytest.mark.parametrize("count, arc", [(3, 40), (4, 60), (6, 45), (8, 60)])
-def test_from_one_side_nothing_is_told(count, arc):
+def test_from_one_side_the_plane_is_ambiguous(count, arc):
     camera = around(count, arc)
     assert mirror_plane(distances(ODD, camera), camera) is None
     assert mirror_plane(distances(TWIN, camera), camera) is None
@@ -129,7 +129,7 @@ def test_a_plane_cuts_little_of_an_object_that_has_none(count, arc):
     assert planes <= 3
 
 
-def test_few_views_and_rolled_cameras_tell_nothing():
+def test_few_views_and_rolled_cameras_are_ambiguous():
     camera = cameras()
     distance = distances(TWIN, camera)
     for count in (1, 2):
@@ -150,7 +150,7 @@ def test_upright_is_a_right_angle_to_what_is_level():
     torch.testing.assert_close(upright(low), torch.tensor([0.0, 1.0, 0.0]), rtol=0, atol=1e-5)
 
 
-def test_cameras_in_one_place_tell_nothing():
+def test_cameras_in_one_place_are_ambiguous():
     eye = look_at((0.3, 0.9, 2.4))
     turned_on_the_spot = torch.stack([eye @ yawed(angle) for angle in (-0.6, 0.0, 0.6)])
     camera = Camera.from_fov(turned_on_the_spot, 2.2, SIZE, SIZE)

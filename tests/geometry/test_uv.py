@@ -143,14 +143,14 @@ def test_charts_keep_the_guard_band(size):
         assert float(torch.minimum(corner, 1 - corner).min()) * size >= 0.5 * guard_band(size) - 1e-3  # float32 uv
 
 
-def test_stacked_sheets_are_told_apart():
+def test_stacked_sheets_are_distinguished():
     mesh = ramp(5)
     result = unwrap(mesh, texture_size=512)
     check_atlas(mesh, result)
     assert atlas_report(result, texture_size=512).charts <= 10  # five turns: each one chart, or cut once
 
 
-def test_a_slab_folded_over_itself_is_told_apart():
+def test_a_slab_folded_over_itself_is_distinguished():
     # an S of gentle slope: every face looks up, the sheets lie over each other and cross in projection
     t = np.linspace(0, 1, 60)
     path = np.stack([np.cos(4 * np.pi * t) * (1 + t), 0.5 * t, np.sin(4 * np.pi * t) * (1 + t)], 1)
@@ -202,7 +202,7 @@ def test_a_soup_of_triangles_fits():
     check_atlas(mesh, unwrap(mesh, texture_size=512), rel=2e-2)  # all border: 3,000 triangles of about 150 samples
 
 
-def test_same_bits_again_and_for_any_number_of_threads(threads):
+def test_the_atlas_is_bitwise_identical_again_and_for_any_number_of_threads(threads):
     mesh, results = icosphere(5), []
     for n in (1, 2, 5, 1):
         threads(n)
@@ -233,7 +233,7 @@ def test_split_vertices_know_what_they_were(atlas):
         source_vertices(Mesh(whole.vertices, whole.faces[:1]), mesh)
 
 
-def test_neighbours_skip_borders_and_crowded_edges():
+def test_neighbors_skip_borders_and_crowded_edges():
     faces = np.array([[0, 1, 2], [2, 1, 3], [4, 5, 6], [5, 4, 7], [4, 5, 8]])
     assert face_neighbors(faces).tolist() == [[-1, 1, -1], [0, -1, -1], [-1] * 3, [-1] * 3, [-1] * 3]
 

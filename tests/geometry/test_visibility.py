@@ -81,7 +81,7 @@ def test_inactive_pairs_are_false_and_the_others_unchanged(device, fraction):
     assert not fraction or 0.1 < got[active].float().mean() < 0.9
 
 
-def test_wrong_inputs_are_told(device):
+def test_wrong_inputs_are_reported(device):
     camera = rig(device)
     scene = RayScene(torch.zeros(0, 3, device=device), torch.zeros(0, 3, dtype=torch.int32, device=device))
     p = points(device, 4)

@@ -138,7 +138,7 @@ def test_an_open_mesh_is_double_sided(asset):
     assert parsed(glb_bytes(Asset(half, asset.textures), double_sided=False))[0]["materials"][0]["doubleSided"] is False
 
 
-def test_trimesh_reads_the_same_surface_and_colours(asset, tmp_path):
+def test_trimesh_reads_the_same_surface_and_colors(asset, tmp_path):
     write_glb(tmp_path / "a.glb", asset)
     shape = trimesh.load(tmp_path / "a.glb", force="mesh", process=False)
     assert np.array_equal(shape.vertices.astype(np.float32), asset.mesh.vertices.numpy())

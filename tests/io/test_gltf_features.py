@@ -110,7 +110,7 @@ def near(got: torch.Tensor, want, atol: float = 1e-5) -> None:
     torch.testing.assert_close(got, torch.as_tensor(want).to(got), rtol=0, atol=atol)
 
 
-def test_16_bit_grey_textures(tmp_path):
+def test_16_bit_gray_textures(tmp_path):
     quad, gray = Quad(pbrMetallicRoughness={}), noise(4, 4, dtype=np.uint16)
     quad.material()["pbrMetallicRoughness"]["metallicRoughnessTexture"] = quad.texture(gray)
     asset, notes = quad.read(tmp_path)

@@ -139,7 +139,7 @@ def test_mitsuba_sees_the_sun_where_we_put_it(tmp_path, suffix):
         assert float(light.eval(it)[0]) < 0.1
 
 
-def test_an_environment_comes_back(tmp_path):
+def test_an_environment_is_read_back(tmp_path):
     image = sky(8)
     assert write_environment(tmp_path / "a.exr", Environment(image)) == 0
     torch.testing.assert_close(
@@ -198,7 +198,7 @@ def test_exr_of_other_writers_reads(tmp_path, options, dtype):
     assert np.array_equal(got.numpy(), np.stack([planes[c] for c in "RGB"], -1).astype(np.float32)) and not notes
 
 
-def test_grey_and_cleaned_pixels(tmp_path):
+def test_gray_and_cleaned_pixels(tmp_path):
     gray = np.ones((8, 16), np.float32)
     gray[0, :3] = (np.inf, -2.0, 5e5)
     with OpenEXR.File({"type": OpenEXR.scanlineimage}, {"Y": gray}) as file:
@@ -266,7 +266,7 @@ def test_primaries_of_an_exr_are_converted(tmp_path, header, primaries):
     assert len(notes) == bool(primaries) and all("Rec. 709" in note for note in notes)
 
 
-def test_primaries_of_a_radiance_picture_are_converted(tmp_path):
+def test_primaries_of_a_radiance_image_are_converted(tmp_path):
     image = np.tile(INSIDE, (4, 2, 1))
     write_hdr(tmp_path / "a.hdr", torch.from_numpy(image))
     stored = read_hdr_image(tmp_path / "a.hdr").numpy()
@@ -356,7 +356,7 @@ def picture(path, resolution: str, pixels: bytes, head: bytes = HEAD) -> np.ndar
         ("+X 12 +Y 6", lambda q: q[::-1].transpose(1, 0, 2)),
     ],
 )
-def test_pictures_of_all_orientations(tmp_path, resolution, placed):
+def test_images_of_all_orientations(tmp_path, resolution, placed):
     got = picture(tmp_path / "a.hdr", resolution, placed(QUADS).tobytes())
     assert np.array_equal(got, QUADS[..., :3])
 
@@ -388,7 +388,7 @@ def test_run_lengths_of_before_1991(tmp_path):
             picture(tmp_path / "b.hdr", "-Y 1 +X 301", broken)
 
 
-def test_scanlines_of_several_kinds_in_one_picture(tmp_path):
+def test_scanlines_of_several_kinds_in_one_image(tmp_path):
     rle = bytes((2, 2, 0, 12)) + b"".join(b"\x0c" + QUADS[1, :, k].tobytes() for k in range(4))
     old = QUADS[2].copy()
     old[5:] = old[4]

@@ -22,14 +22,14 @@ def saved(tmp_path, image: Image.Image, name: str, **options):
 
 
 @pytest.mark.parametrize("name, options", [("a.png", {}), ("a.webp", {"lossless": True, "exact": True}), ("a.tif", {})])
-def test_straight_alpha_and_the_colour_under_it_are_kept(tmp_path, name, options):
+def test_straight_alpha_and_the_color_under_it_are_kept(tmp_path, name, options):
     rgb, alpha = read_image(saved(tmp_path, Image.fromarray(NOISE), name, **options))
     # 8-bit values over 255 in float32: exact to one rounding
     torch.testing.assert_close(rgb, torch.from_numpy(NOISE[..., :3] / 255).float(), rtol=0, atol=6e-8)
     torch.testing.assert_close(alpha, torch.from_numpy(NOISE[..., 3] / 255).float(), rtol=0, atol=6e-8)
 
 
-def test_grey_palette_and_cmyk_come_out_as_colour(tmp_path):
+def test_gray_palette_and_cmyk_come_out_as_color(tmp_path):
     gray, alpha = read_image(saved(tmp_path, Image.fromarray(NOISE[..., 0]), "grey.png"))
     assert alpha is None
     assert torch.equal((gray * 255).round().byte(), torch.from_numpy(NOISE[..., :1]).expand(-1, -1, 3))
@@ -46,7 +46,7 @@ def test_grey_palette_and_cmyk_come_out_as_colour(tmp_path):
     assert (cmyk[8, 8] - torch.tensor([1.0, 0.0, 0.0])).abs().max() < 0.03  # JPEG of a flat colour: a few levels
 
 
-def test_16_bit_grey_keeps_its_precision(tmp_path):
+def test_16_bit_gray_keeps_its_precision(tmp_path):
     ramp = np.arange(0, 65536, 257, dtype=np.uint16).reshape(16, 16) + 5
     rgb, _ = read_image(saved(tmp_path, Image.fromarray(ramp), "deep.png"))
     torch.testing.assert_close(rgb[..., 1], torch.from_numpy(ramp.astype(np.float32) / 65535), rtol=0, atol=6e-8)
@@ -68,7 +68,7 @@ def test_the_size_limit_holds_before_decoding(tmp_path):
         read_image(path)
 
 
-def test_colour_takes_no_memory_for_alpha():
+def test_color_takes_no_memory_for_alpha():
     """Found by the campaign: 33 MP with alpha took more than 1 GiB."""
     bitmap = Image.fromarray(np.full((1000, 1000, 4), 255, np.uint8))
     tracemalloc.start()

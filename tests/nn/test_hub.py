@@ -112,7 +112,7 @@ def fails(message: str) -> None:
     assert "\n" not in str(caught.value) and "secret" not in str(caught.value)
 
 
-def test_the_checkpoint_arrives_converted_with_its_licence_and_nothing_beside(server, checkpoint, capsys, monkeypatch):
+def test_the_checkpoint_arrives_converted_with_its_licence_and_nothing_else(server, checkpoint, capsys, monkeypatch):
     server.content, state = checkpoint
     monkeypatch.setenv("HF_TOKEN", "hf_secret")
     path = hub.fetch_official(preset=TINY)

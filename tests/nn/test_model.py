@@ -77,7 +77,7 @@ def test_background_is_hidden_unless_asked_for():
 
 
 @torch.no_grad()
-def test_order_of_further_views_does_not_matter_and_the_hero_does():
+def test_order_of_further_views_does_not_matter_and_the_reference_view_does():
     torch.manual_seed(0)
     model = Reconstructor(NANO).eval()
     inputs = views(1, 3, 32)
@@ -141,7 +141,7 @@ def test_official_roughness_is_the_root_of_its_alpha(tiny):
     torch.testing.assert_close(roughness.square(), model.query(code, points, ["roughness"])["roughness"])
 
 
-def test_truncated_exp_bounds_its_slope_only():
+def test_truncated_exp_bounds_its_gradient_only():
     x = torch.tensor([0.0, 14.0, 20.0], requires_grad=True)
     y = truncated_exp(x)
     torch.testing.assert_close(y, x.exp())

@@ -69,7 +69,7 @@ def unlit(maps: ViewMaps, points, visible, normal):
 
 @pytest.mark.parametrize("views", [1, 3, 16])
 @pytest.mark.parametrize("on_surface", [False, True])
-def test_the_kernel_matches_plain_torch(device, views, on_surface):
+def test_the_kernel_matches_torch(device, views, on_surface):
     maps = rig(views, device)
     points, visible, normal = surface(700, views, device)
     if not on_surface:
@@ -84,7 +84,7 @@ def test_the_kernel_matches_plain_torch(device, views, on_surface):
         torch.testing.assert_close(g.double(), w, rtol=1e-4, atol=5e-4)
 
 
-def test_gathered_values_and_gradients_equal_their_float64_twin(device):
+def test_gathered_values_and_gradients_equal_their_float64_reference(device):
     """Clamped at the border, any channels; gradients of points compared by row, as those of image and pixels cancel."""
     g, n = torch.Generator().manual_seed(3), 20_000
     maps, points = torch.rand(3, 24, 20, 5, generator=g), torch.rand(n, 3, generator=g) * 1.6 - 0.8

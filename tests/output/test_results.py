@@ -145,7 +145,7 @@ def test_a_link_to_a_folder_stays_one(tmp_path):
 
 
 @pytest.mark.skipif(os.name == "nt", reason="needs locks of files")
-def test_of_two_processes_one_says_so_at_its_start(tmp_path):
+def test_of_two_processes_one_reports_it_at_its_start(tmp_path):
     folder = tmp_path / "name"
     with claimed(folder, OURS) as replacing:
         began = time.monotonic()

@@ -209,7 +209,7 @@ def test_a_half_hidden_everywhere_is_a_stop_less(tmp_path, asset, views, monkeyp
     assert np.abs(pictures[0] - pictures[1]).max() <= 4  # of 255: coefficients have 8 bits
 
 
-def test_the_page_of_the_example_looks_as_its_picture_by_the_renderer(tmp_path):
+def test_the_page_of_the_example_looks_as_its_image_by_the_renderer(tmp_path):
     """The estimated light from the first photograph, at the command's default sizes."""
     assert infer.main(["--output", str(tmp_path), "--device", "cpu"]) == 0
     (part,) = read_glb(tmp_path / "example" / "mesh.glb")

@@ -118,7 +118,7 @@ def test_the_release_s_preparation_is_a_switch_of_the_preset(tiny):
     assert default_normalization(TINY) == "none" and default_normalization(NANO) == "auto"
 
 
-def test_hero_and_background_reach_the_network(tiny, monkeypatch):
+def test_reference_view_and_background_reach_the_network(tiny, monkeypatch):
     seen = {}
 
     def encode(images, masks, c2w, intrinsics, *, background_visible):

@@ -41,7 +41,7 @@ def degrees(a, b):
     return torch.rad2deg(cosine.clamp(-1, 1).acos())
 
 
-def test_texels_are_baked_at_their_centres(goldens):
+def test_texels_are_baked_at_their_centers(goldens):
     """The release's own bake is ours of a chart half a texel further right and down."""
     bar, unwrapped = np.load(goldens / "texture_bake_96.npz"), np.load(goldens / "uv_unwrap.npz")
     corners = torch.from_numpy(unwrapped["v"])[torch.from_numpy(unwrapped["f"]).long()].reshape(-1, 3)
@@ -118,7 +118,7 @@ def release_lookup(radiance: torch.Tensor, directions: torch.Tensor) -> torch.Te
     )[0, :, 0].T
 
 
-def test_environment_lookups_meet_texel_centres_and_wrap(goldens):
+def test_environment_lookups_meet_texel_centers_and_wrap(goldens):
     data = np.load(goldens / "env_parametrisation.npz")
     radiance = torch.from_numpy(np.load(goldens / "reni_decoder.npz")["env_map"][1])
     stored = torch.from_numpy(data["sampled"])

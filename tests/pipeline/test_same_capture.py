@@ -90,7 +90,7 @@ def write_colmap(model: Path, form: str, names, poses, size, camera) -> None:
     (model / "images.bin").write_bytes(data)
 
 
-def test_every_form_gives_the_same_cameras_and_pictures(tmp_path):
+def test_every_form_gives_the_same_cameras_and_images(tmp_path):
     first, *others = (load_views(write_form(tmp_path / form, form)) for form in FORMS)
     for views in others:
         # the tangent of an angle and a quaternion in float64, then float32

@@ -63,7 +63,7 @@ def overlap(asset):
     return float((inside & true).sum() / (inside | true).sum())
 
 
-def test_the_other_half_comes_nearer_to_the_truth(views):
+def test_the_other_half_comes_nearer_to_the_reference(views):
     found = {}
     for symmetry in ("off", "auto"):
         watch = Stopwatch(torch.device("cpu"))
@@ -73,7 +73,7 @@ def test_the_other_half_comes_nearer_to_the_truth(views):
     assert found["auto"] > found["off"] + 0.05
 
 
-def test_mirror_images_tell_shape_and_paint_but_not_the_light(views):
+def test_mirror_images_determine_shape_and_base_color_but_not_the_lighting(views):
     model = load_model("small", "cpu")
     plain = prepare(model, views, normalize(views, "auto"))
     both = completed(plain)

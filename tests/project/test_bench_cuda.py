@@ -10,7 +10,7 @@ from bench.cuda import Piece, limits, main, pieces, report, run, run_piece
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
-def test_without_cuda_it_says_so_in_one_line(capsys, tmp_path):
+def test_without_cuda_it_reports_it_in_one_line(capsys, tmp_path):
     assert main(["--output", str(tmp_path / "none")]) == 2
     found = capsys.readouterr().err
     assert found.count("\n") == 1 and "expected a CUDA device" in found and not (tmp_path / "none").exists()

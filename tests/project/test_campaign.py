@@ -37,7 +37,7 @@ def outcomes(read, count: int = 3):
     return list(campaign.in_fork([(k, target, []) for k in range(count)]))
 
 
-def test_every_kind_of_fault_is_told_apart_and_none_leaves_files(small_threads, monkeypatch, tmp_path):
+def test_every_kind_of_fault_is_distinguished_and_none_leaves_files(small_threads, monkeypatch, tmp_path):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.setattr(campaign, "SECONDS", 0.2)
     monkeypatch.setattr(campaign, "MEMORY", 1 << 26)
@@ -172,7 +172,7 @@ def test_kills_at_random_moments_leave_one_whole_result(tmp_path, kills):
     assert len(seen) > kills / 4  # most lived long enough to write
 
 
-def test_the_command_says_what_it_did(tmp_path, capsys):
+def test_the_command_reports_what_it_did(tmp_path, capsys):
     before = torch.get_num_threads()
     try:
         count = len(targets(tmp_path / "good"))

@@ -86,7 +86,7 @@ def test_a_texture_set_has_named_maps(device):
             TextureSet(**{"base_color": base, "roughness": 0.5, "metallic": 0.5, **change})
 
 
-def test_an_asset_moves_detaches_and_says_what_it_is(device):
+def test_an_asset_moves_detaches_and_reports_what_it_is(device):
     asset = ball(torch.device("cpu"))
     maps = asset.textures
     leaf = maps.base_color.clone().requires_grad_()

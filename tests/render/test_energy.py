@@ -84,7 +84,7 @@ def view(cos_o, device):
 
 
 @pytest.mark.parametrize("alpha", [1e-3, 0.01, 0.1, 0.5, 1.0])
-def test_neither_coat_nor_paint_nor_metal_gains_energy(device, alpha):
+def test_neither_specular_nor_diffuse_nor_metal_gains_energy(device, alpha):
     """Each alone, the published paint too.  Coat and published paint of a white dielectric together may: the paint
     loses what the microfacets reflect, not what the coat does (docs/results.md)."""
     u = halton(1 << 16, device=device)

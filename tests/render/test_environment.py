@@ -57,7 +57,7 @@ def test_texels_are_found_from_their_directions_and_looked_up_there(device):
         quarter_turn(torch.ones(3, 6, 3), 1)
 
 
-def test_directions_of_the_published_parametrisation(goldens):
+def test_directions_of_the_published_parametrization(goldens):
     data = np.load(goldens / "env_parametrisation.npz")
     uv, want = data["uv"].reshape(-1, 2), torch.from_numpy(data["uv_direction"].reshape(-1, 3))
     ramp = torch.zeros(64, 128, 3)
@@ -68,7 +68,7 @@ def test_directions_of_the_published_parametrisation(goldens):
     assert np.abs(got - uv)[inside].max() < 1e-5
 
 
-def test_lookup_and_its_gradient_equal_the_float64_twin(device):
+def test_lookup_and_its_gradient_equal_the_float64_reference(device):
     g = torch.Generator().manual_seed(1)
     radiance, d = torch.rand(9, 18, 3, generator=g), directions(20_000)
     weight = torch.rand(20_000, 3, generator=g)  # of one sign: sums that cancel have no digits left

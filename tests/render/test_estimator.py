@@ -216,7 +216,7 @@ def test_variance_is_that_of_the_closed_form(device, counts):
 
 
 @pytest.mark.parametrize("name", SKIES[:2])
-def test_pairs_cancel_the_slopes_of_the_lobe(device, name):
+def test_pairs_cancel_the_gradients_of_the_lobe(device, name):
     """A lobe seen from above has d log D = (4 u - 2) / alpha d alpha for the second of its numbers, and 4 sqrt(u (1 -
     u)) cos(2 pi phi) / alpha where the normal turns: half a turn and 1 - u change the sign of both.  Mirrored alone
     (Zhang et al. 2021) keeps u and tells the slope in roughness twice: 20 draws instead of 40."""

@@ -96,7 +96,7 @@ def test_the_tint_of_photographs_goes_to_the_light(device, scene):
     assert float(strong.mean()) == pytest.approx(0.75, rel=0.03)
 
 
-def test_the_likeliest_paint_is_the_mean_of_three_normal_distributions(device, scene):
+def test_the_most_likely_base_color_is_the_mean_of_three_normal_distributions(device, scene):
     """Where paint, light and guess are at the prior means nothing changes; else each pulls by its weight."""
     prior = float(torch.tensor(exposure.ALBEDO).exp())
     lit = prior * float(torch.tensor(exposure.LIGHT).exp())
@@ -115,7 +115,7 @@ def test_the_likeliest_paint_is_the_mean_of_three_normal_distributions(device, s
     torch.testing.assert_close(again, torch.full((3,), float(2.0 ** (shares[2] - 1))), rtol=1e-4, atol=0)
 
 
-def test_a_paint_more_colourful_than_the_photographs_is_calmed(device, scene):
+def test_a_base_color_more_saturated_than_the_images_is_reduced(device, scene):
     """A dark grey thing, guessed blue: the photographs are nearly grey."""
     asset, camera, inside = painted(device, scene, 0.03, 0.1, 0.15)
     images = photographs(device, 0.010, 0.013, 0.018)
@@ -124,7 +124,7 @@ def test_a_paint_more_colourful_than_the_photographs_is_calmed(device, scene):
     assert torch.equal(factor(asset, images, torch.zeros_like(inside), camera), torch.ones(3))
 
 
-def test_the_estimated_asset_shows_the_photographs_colour(device, scene):
+def test_the_estimated_asset_shows_the_photographs_color(device, scene):
     asset, camera, inside = painted(device, scene, 0.03, 0.1, 0.15)
     images = photographs(device, 0.010, 0.013, 0.018)
     rays = RayScene(asset.mesh.vertices, asset.mesh.faces)

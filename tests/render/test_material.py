@@ -27,7 +27,7 @@ def pairs(n, seed=0, low=0.02, alpha=None):
 
 
 @pytest.mark.parametrize("diffuse_model", DIFFUSE_MODELS)
-def test_value_and_gradients_equal_the_float64_twin(device, diffuse_model):
+def test_value_and_gradients_equal_the_float64_reference(device, diffuse_model):
     ins = pairs(4000)
     leaf = [v.to(device).requires_grad_() for v in ins]
     twin = [v.double().requires_grad_() for v in ins]
@@ -114,7 +114,7 @@ def test_directions_in_and_below_the_horizon_and_extreme_parameters(device, diff
         assert bool(torch.isfinite(pdf_lobes(wo, alpha, drawn)).all())
 
 
-def test_bad_paint_is_named(device):
+def test_bad_diffuse_model_is_named(device):
     with pytest.raises(ValueError, match="diffuse_model: expected one of conserving, published, got white"):
         eval_bsdf(*(v.to(device) for v in pairs(4)), diffuse_model="white")
 

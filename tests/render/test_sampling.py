@@ -206,7 +206,7 @@ def test_directions_return_to_the_numbers_they_came_from(device):
         assert float(off.abs().max()) < 1e-4 and float(sure.double().mean()) > 0.95, (alpha, deg)
 
 
-def test_visible_normals_equal_their_float64_twin(device):
+def test_visible_normals_equal_their_float64_reference(device):
     g = torch.Generator().manual_seed(1)
     n = 4000
     wo = torch.nn.functional.normalize(torch.rand(n, 3, generator=g) + torch.tensor([-0.5, -0.5, 0.02]), dim=-1)
@@ -226,7 +226,7 @@ def test_visible_normals_equal_their_float64_twin(device):
     assert all(reference.share_within(a, b) >= 0.999 for a, b in zip(grads, truth, strict=True))
 
 
-def test_density_equals_its_float64_twin(device):
+def test_density_equals_its_float64_reference(device):
     g = torch.Generator().manual_seed(2)
     n = 4000
     wo, wm = (torch.nn.functional.normalize(torch.rand(n, 3, generator=g) + 0.02, dim=-1) for _ in range(2))

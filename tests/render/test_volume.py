@@ -99,7 +99,7 @@ def test_uniform_fog_follows_beer_and_lambert(device):
 COUNTS = [0, 1, 7, 200, 0, 33, 64, 5]
 
 
-def test_composite_and_gradients_match_the_float64_twin(device):
+def test_composite_and_gradients_match_the_float64_reference(device):
     samples, density, color = packed(COUNTS, device)
     own = [v.clone().requires_grad_() for v in (density, color)]
     far = [v.detach().cpu().double().requires_grad_() for v in (density, color)]
@@ -157,7 +157,7 @@ def test_a_triplane_is_marched_and_composited_as_in_float64(device):
         assert share_within(g, t) >= 0.999
 
 
-def test_the_twin_has_the_gradients_of_finite_differences():
+def test_the_reference_has_the_gradients_of_finite_differences():
     samples, density, color = packed([0, 3, 5], torch.device("cpu"))
     leaves = [v.double().requires_grad_() for v in (density, color)]
     assert torch.autograd.gradcheck(lambda *v: twin(samples, *v), leaves, eps=1e-6, atol=1e-5, rtol=1e-3)

@@ -166,7 +166,7 @@ def test_surface_nets_follow_a_ball():
     assert abs(mesh.volume / (4 / 3 * np.pi * 12**3) - 1) < 0.01
 
 
-def test_noise_gradient_is_the_slope_of_its_value(device):
+def test_noise_gradient_is_the_gradient_of_its_value(device):
     rng = torch.Generator().manual_seed(0)
     points = ((torch.rand(20_000, 3, generator=rng) - 0.5) * 20).to(device)
     value, gradient = fbm(points, octaves=1, seed=4)

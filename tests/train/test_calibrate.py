@@ -47,7 +47,7 @@ def test_calibration_gives_back_what_is_missing(folder, tmp_path):
         calibrate(model, tmp_path / "none")
 
 
-def test_mismatch_is_the_error_of_a_picture_in_one_colour_at_its_best_brightness():
+def test_mismatch_is_the_error_of_an_image_in_one_color_at_its_best_brightness():
     rng = np.random.default_rng(0)
     for share in (0.1, 0.5, 0.9):
         want = rng.random(5000) < 0.4

@@ -42,7 +42,7 @@ def path_of(scans, name):
     return scans / name / "0000000000.safetensors"
 
 
-def test_a_sample_stores_whether_its_finish_is_the_truth(scans, folder):
+def test_a_sample_stores_whether_its_finish_is_ground_truth(scans, folder):
     for name, known in (("plain", 0), ("dressed", 1)):
         assert load_file(path_of(scans, name))["finish_known"].tolist() == [known, known]
         assert read_views_reduced(path_of(scans, name), 1).finish_known.tolist() == [bool(known)] * 2

@@ -45,7 +45,7 @@ def learned(finest: int = 0) -> LocalReconstructor:
     return reduced_model(model, finest) if finest else model
 
 
-def test_pictures_of_the_full_size_are_those_of_a_sample(files):
+def test_images_of_the_full_size_are_those_of_a_sample(files):
     got, want = read_views_reduced(files[0], 1), load_sample(files[0], 6, 64, np.random.default_rng(0), augment=False)
     for field in dataclasses.fields(TrainingViews):
         a, b = getattr(got, field.name), getattr(want, field.name)
@@ -53,7 +53,7 @@ def test_pictures_of_the_full_size_are_those_of_a_sample(files):
 
 
 @pytest.mark.parametrize("factor", [2, 4])
-def test_small_pictures_show_the_same_object(files, factor):
+def test_small_images_show_the_same_object(files, factor):
     """Points of the true surface lie in all silhouettes, and the pixels' truth is the mean of the finer ones."""
     small, fine = read_views_reduced(files[0], factor), read_views_reduced(files[0], 1)
     size = fine.masks.shape[1] // factor
@@ -68,7 +68,7 @@ def test_small_pictures_show_the_same_object(files, factor):
     torch.testing.assert_close(small.view_depth[valid], mean[valid], rtol=0, atol=1e-5)
 
 
-def test_mirrored_pictures_are_those_of_the_mirrored_object(files):
+def test_mirrored_images_are_those_of_the_mirrored_object(files):
     views = read_views_reduced(files[0], 2)
     sample = load_sample(files[0], 1, 2048, np.random.default_rng(0), augment=False)
     for seed in range(20):
@@ -129,7 +129,7 @@ def test_the_pixels_alone_are_asked_as_with_all_else(files):
         torch.testing.assert_close(value, whole[name], rtol=1e-4, atol=1e-6, msg=name)
 
 
-def test_an_object_without_a_whole_pixel_says_nothing(files):
+def test_an_object_without_a_whole_pixel_has_no_terms(files):
     """A thin object in a small picture: the others are asked as they are without it."""
     model = learned(2)
     objects = [read_views_reduced(f, 4).of_views(slice(0, 2)) for f in files]
@@ -139,7 +139,7 @@ def test_an_object_without_a_whole_pixel_says_nothing(files):
         torch.testing.assert_close(both[name], value, rtol=1e-3, atol=1e-5, msg=name)
 
 
-def test_a_checkpoint_of_small_pictures_is_no_whole_network(folder, tmp_path, capsys):
+def test_a_checkpoint_of_small_images_is_no_whole_network(folder, tmp_path, capsys):
     few = ["--steps", "1", "--batch", "1"]
     assert main([str(folder), str(tmp_path / "64"), "--stage", "pixels", "--image-size", "64", *few]) == 0
     assert main([str(folder), str(tmp_path / "64"), "--export", str(tmp_path / "net.safetensors")]) == 2

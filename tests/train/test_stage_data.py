@@ -73,7 +73,7 @@ def test_captures_are_filtered_by_both_scores(captures):
     assert "gaussian_splats_quality_score 0.99" in found.refused["blurred"] and "broken" in found.refused["broken"]
 
 
-def test_a_capture_is_cropped_centred_and_scaled_and_knows_where_its_photograph_ends(captures):
+def test_a_capture_is_cropped_centered_and_scaled_and_knows_where_its_photograph_ends(captures):
     found = Captures(captures, 32)
     for index in range(2):  # the second is as the first, seen from twice as far: the same size after scaling
         views = found.load(index, range)
@@ -91,7 +91,7 @@ def test_a_capture_is_cropped_centred_and_scaled_and_knows_where_its_photograph_
     assert float(whole.max()) == 0.0  # the object is never shown where there is no photograph
 
 
-def test_a_capture_takes_part_without_truth(captures):
+def test_a_capture_takes_part_without_ground_truth(captures):
     one = draw(
         [Captures(captures, 32)], (0, 2), inputs=2, targets=1, background=1.0, input_size=32, target_size=16, patch=0
     )
@@ -123,7 +123,7 @@ def test_shards_hold_what_the_samples_held_and_any_reader_reads_them(samples, tm
     assert streamed == [p.stem for p in plain.files] and len(urls) == 2
 
 
-def test_packing_goes_on_where_it_stopped(samples, tmp_path):
+def test_packing_continues_where_it_stopped(samples, tmp_path):
     pack(Samples(samples), tmp_path, each=1)
     (tmp_path / "000001.tar").unlink()
     times = {p: p.stat().st_mtime_ns for p in tmp_path.glob("*.tar")}

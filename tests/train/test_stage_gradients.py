@@ -55,7 +55,7 @@ def one(tmp_path_factory):
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_the_whole_loss_has_the_slope_of_central_differences(case, one, monkeypatch):
+def test_the_whole_loss_has_the_gradient_of_central_differences(case, one, monkeypatch):
     stage, names, size, tolerance = CASES[case]
     model = ball_model()
     for head in ("normal", *(MATERIAL_HEADS if names is SHAPE else ())):
@@ -87,7 +87,7 @@ def test_the_whole_loss_has_the_slope_of_central_differences(case, one, monkeypa
 MATERIAL_HEADS = ("base_color", "roughness", "metallic")
 
 
-def test_all_terms_are_in_the_slope(one):
+def test_all_terms_are_in_the_gradient(one):
     """Every weight of the paper changes the total of some stage: no term is computed and forgotten."""
     model = ball_model()
     asked = set()
@@ -103,7 +103,7 @@ def difference(f, value: torch.Tensor, direction: torch.Tensor, size: float) -> 
     return (ends[0] - ends[1]) / (2.0 * size)
 
 
-def test_the_weight_of_quads_moves_their_centres(one, monkeypatch):
+def test_the_weight_of_quads_moves_their_centers(one, monkeypatch):
     """gamma decides where a quad's centre lies.  Its last layer alone moves, by which no other weight changes."""
     model = ball_model()
     code = stage_step.encode(model, one)
@@ -123,7 +123,7 @@ def test_the_weight_of_quads_moves_their_centres(one, monkeypatch):
     assert float(slope @ direction) != 0.0
 
 
-def test_the_normals_of_the_mesh_have_a_slope_in_the_picture(one):
+def test_the_normals_of_the_mesh_have_a_gradient_in_the_image(one):
     """The shading normal of a flat bump is that of the mesh; what a light shows of it follows."""
     model = ball_model()
     model.heads["normal"][-1].weight.data.zero_()

@@ -229,7 +229,7 @@ def test_latents_are_compared_as_the_decoder_gets_them(one):
     assert float(off) == pytest.approx(0.49 / 28, rel=1e-4)  # 27 numbers and the strength
 
 
-def test_light_without_colour_is_neutral(one):
+def test_light_without_color_is_neutral(one):
     bare = replace(one.inputs, latent=None)
     gray = torch.rand(50, 1, generator=torch.Generator().manual_seed(0)).expand(50, 3)
     eye, none = torch.eye(3), torch.zeros(())

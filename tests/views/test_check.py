@@ -78,7 +78,7 @@ def test_unrelated_cameras_are_suspect():
     assert explain_cameras(replace(views, c2w=c2w))[-1].startswith("suspect: ")
 
 
-def test_one_view_says_what_it_cannot_know():
+def test_one_view_reports_what_is_ambiguous():
     views = rig(1)
     assert explain_cameras(views)[-1].startswith("one view: nothing to compare")
     assert "looks away from the origin" in explain_cameras(replace(views, c2w=views.c2w @ FLIP))[-1]
@@ -90,7 +90,7 @@ def test_lines_are_single_and_printable():
 
 
 @pytest.mark.parametrize("change", [lambda c: c, lambda c: c @ FLIP, lambda c: torch.linalg.inv(c)])
-def test_the_picture_is_drawn_for_right_and_wrong_cameras(tmp_path, change):
+def test_the_image_is_drawn_for_right_and_wrong_cameras(tmp_path, change):
     views = sphere_views(count=9)
     draw_rig(replace(views, c2w=change(views.c2w)), tmp_path / "rig.png")
     bitmap = Image.open(tmp_path / "rig.png")
@@ -100,7 +100,7 @@ def test_the_picture_is_drawn_for_right_and_wrong_cameras(tmp_path, change):
     assert [p.name for p in tmp_path.iterdir()] == ["rig.png"]
 
 
-def test_the_picture_takes_one_view_of_any_shape(tmp_path):
+def test_the_image_takes_one_view_of_any_shape(tmp_path):
     draw_rig(sphere_views(count=1, size=(300, 40), fov=1.5), tmp_path / "wide.png")
     draw_rig(sphere_views(count=1, size=(24, 200), fov=0.2), tmp_path / "high.png")
 
@@ -132,7 +132,7 @@ def turned(c2w, rotation):
 
 
 @pytest.mark.parametrize("axis", TURNS)
-def test_the_up_axis_is_told_from_upright_cameras(axis):
+def test_the_up_axis_is_estimated_from_upright_cameras(axis):
     """Around at many heights, one of them nearly from above, all held upright but for a few degrees."""
     c2w = cameras((0, 20, 2), (80, 70, 2), (170, -10, 2.5), (260, 35, 2), (310, 50, 3))
     lean = torch.tensor(0.06)

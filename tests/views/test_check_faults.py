@@ -26,7 +26,7 @@ def at(place, *, spread=0.0, count=4, parallel=False):
 @pytest.mark.parametrize("parallel", [False, True])
 @pytest.mark.parametrize("place", [(0.0, 0.0, 0.0), (0.3, -0.7, 1.9), (1e5, 3e5, -2e5), (1e-30, 0.0, 2e-30)])
 @pytest.mark.parametrize("spread", [0.0, 1e-12])
-def test_eyes_in_one_point_are_told(tmp_path, place, spread, parallel):
+def test_eyes_in_one_point_are_reported(tmp_path, place, spread, parallel):
     views = at(place, spread=spread, parallel=parallel)
     lines = explain_cameras(views)
     assert len(lines) == 5 and not any("nan" in line for line in lines)

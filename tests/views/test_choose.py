@@ -40,7 +40,7 @@ def test_the_choice_covers_within_twice_the_best():
     assert radius(choose_views(cameras, 3)) <= 2 * best
 
 
-def test_distance_counts_beside_direction():
+def test_distance_counts_in_addition_to_direction():
     cameras = rig((0, 0, 2), (4, 0, 2), (0, 0, 0.5), (0, 5, 2))
     assert choose_views(cameras, 2) == [0, 2]  # a close-up tells more than four degrees
     angle, distance = view_distances(cameras)
@@ -67,7 +67,7 @@ def test_all_views_the_same_or_one_view():
         choose_views(same, 0)
 
 
-def test_near_duplicates_and_a_narrow_baseline_are_told():
+def test_near_duplicates_and_a_narrow_baseline_are_reported():
     assert spread_notes(rig((0, 0, 2), (90, 0, 2), (180, 0, 2))) == []
     (near,) = spread_notes(rig((0, 0, 2), (90, 0, 2), (91, 0, 2), (180, 0, 2)))
     assert near.startswith("1 of 4 views lie within 3 degrees") and near.endswith(": 2")

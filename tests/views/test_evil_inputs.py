@@ -39,7 +39,7 @@ def test_the_untouched_folders_load(tmp_path):
 
 
 @pytest.mark.parametrize("name, make", evil.cases(), ids=[name for name, _ in evil.cases()])
-def test_an_evil_folder_gives_one_line(tmp_path, capfd, name, make):
+def test_a_malformed_folder_gives_one_line(tmp_path, capfd, name, make):
     make(tmp_path / "object")
     before = listing(tmp_path)
     with pytest.raises(InputError) as caught:
@@ -50,7 +50,7 @@ def test_an_evil_folder_gives_one_line(tmp_path, capfd, name, make):
 
 
 @pytest.mark.parametrize("name, content", evil_maps.cases(), ids=[name for name, _ in evil_maps.cases()])
-def test_an_evil_map_gives_one_line(tmp_path, capfd, name, content):
+def test_a_malformed_map_gives_one_line(tmp_path, capfd, name, content):
     path = tmp_path / "map.hdr"
     path.write_bytes(content)
     with pytest.raises(InputError) as caught:

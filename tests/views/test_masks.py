@@ -78,7 +78,7 @@ def test_of_two_values_nonzero_is_the_object(tmp_path, name):
 
 
 @pytest.mark.parametrize("levels", [255, 16, 4])
-def test_grey_edges_are_coverage(tmp_path, levels):
+def test_gray_edges_are_coverage(tmp_path, levels):
     """Antialiased in many or in few steps."""
     stored = np.rint(np.rint(antialiased() * levels) / levels * 255).astype(np.uint8)
     mask, notes = mask_of(tmp_path, stored)
@@ -86,7 +86,7 @@ def test_grey_edges_are_coverage(tmp_path, levels):
     assert not any("mask" in n for n in notes)
 
 
-def test_grey_edges_of_a_label_are_scaled(tmp_path):
+def test_gray_edges_of_a_label_are_scaled(tmp_path):
     """An antialiased label 38; 16 bits with the values of 8."""
     for k, (top, kind) in enumerate(((38, np.uint8), (255, np.uint16))):
         stored = np.rint(antialiased() * top)

@@ -95,7 +95,7 @@ def test_the_hull_of_many_views_is_the_object(spheres, low, high):
         (8, 0.01, (0.02, 0.1, 0)),
     ],
 )
-def test_an_object_anywhere_is_centred_and_scaled(count, scale, center):
+def test_an_object_anywhere_is_centered_and_scaled(count, scale, center):
     """A ball of diameter 1.  One view finds its middle if it is the point of the ray nearest to the origin."""
     center = torch.tensor(center, dtype=torch.float64)
     views = sphere_views(BALL, count).transformed(Similarity(scale, torch.eye(3, dtype=torch.float64), center))
@@ -108,7 +108,7 @@ def test_an_object_anywhere_is_centred_and_scaled(count, scale, center):
     assert torch.equal(similarity.rotation, torch.eye(3, dtype=torch.float64))
 
 
-def test_normalisation_does_not_depend_on_the_frame():
+def test_normalization_does_not_depend_on_the_frame():
     """Scaling and shifting the rig changes the answer by that much and nothing else."""
     views = sphere_views(count=5)
     move = Similarity(7.0, torch.eye(3, dtype=torch.float64), torch.tensor([3.0, 1.0, -2.0], dtype=torch.float64))

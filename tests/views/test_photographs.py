@@ -151,7 +151,7 @@ def test_photographs_up_to_two_megapixels_stay_as_they_are():
     assert small.size == (small.part[2] - small.part[0], small.part[3] - small.part[1])  # nothing is made larger
 
 
-def test_colour_under_alpha_survives_the_reduction(tmp_path):
+def test_color_under_alpha_survives_the_reduction(tmp_path):
     pixels = np.full((1600, 1600, 4), (200, 100, 50, 0), np.uint8)
     pixels[200:1400, 200:1400, 3] = 255
     (tmp_path / "rgba").mkdir()
@@ -164,7 +164,7 @@ def test_colour_under_alpha_survives_the_reduction(tmp_path):
 
 
 @pytest.mark.parametrize("w, h, turned", [(300, 400, True), (600, 800, True), (400, 300, False), (None, None, False)])
-def test_exif_orientation_counts_where_the_cameras_were_calibrated_on_turned_pictures(tmp_path, w, h, turned):
+def test_exif_orientation_counts_where_the_cameras_were_calibrated_on_turned_images(tmp_path, w, h, turned):
     exif = Image.Exif()
     exif[0x0112] = 6  # the camera was turned: the first row of the file is the right side of what is shown
     lens = {} if w is None else {"w": w, "h": h, "cx": 140.0 * w / 300, "cy": 0.5 * h}

@@ -35,7 +35,7 @@ def test_intrinsics_follow_the_pixels(crop, size):
     torch.testing.assert_close(found, before[inside], rtol=0, atol=0.05)
 
 
-def test_a_crop_is_square_centred_on_the_mask_and_padded():
+def test_a_crop_is_square_centered_on_the_mask_and_padded():
     batch = ramp_views().resampled(64, crop=True, padding=0.08)
     x0, y0, x1, y1 = mask_box(batch.masks[0])
     assert abs((x0 + x1) / 2 - 32) <= 1
@@ -44,7 +44,7 @@ def test_a_crop_is_square_centred_on_the_mask_and_padded():
     assert float(batch.intrinsics[0, 0] / batch.intrinsics[0, 1]) == pytest.approx(100 / 110, rel=1e-6)
 
 
-def test_a_crop_over_the_border_has_no_mask_and_the_edge_colour():
+def test_a_crop_over_the_border_has_no_mask_and_the_edge_color():
     batch = ramp_views(box=(0, 5, 20, 65)).resampled(70, crop=True)  # 60 high: reaches 20 pixels over the left border
     left = batch.masks[0][:, :20]
     assert float(left.max()) == 0.0
