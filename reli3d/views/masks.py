@@ -43,13 +43,13 @@ def mask_values(path: os.PathLike, bitmap: Image.Image, notes: list[str]) -> Ima
 def alpha_values(bitmap: Image.Image, notes: list[str]) -> Image.Image | None:
     """The alpha of an image as coverage; None where it has none, or one that is opaque nearly everywhere.
 
-    Of two values, 0 and one below white, nonzero is the object, with a note.
+    Of two values, 0 and one below white, nonzero is the object, with a note; so are many values about one.
     """
     alpha = used_alpha(bitmap)
     if alpha is None:
         return None
     levels = _levels(alpha)
-    return _nonzero(alpha, levels[1], notes) if len(levels) == 2 and levels[0] == 0 else alpha
+    return _nonzero(alpha, levels[1], notes) if len(levels) == 2 and levels[0] == 0 else _scaled(alpha, levels, notes)
 
 
 def used_alpha(bitmap: Image.Image) -> Image.Image | None:
@@ -103,15 +103,25 @@ def _coverage(path: os.PathLike, channel: Image.Image, notes: list[str]) -> Imag
     if int((between[1:-1, 1:-1] & flat).sum()) > PLATEAU * int(between.sum()):
         some = ", ".join(map(str, levels[:8])) + (", ..." if len(levels) > 8 else "")
         raise _not_a_mask(path, f"{len(levels)} values in flat areas ({some}), as of several labels")
-    if peak < OPAQUE * top and int(((values == peak)[1:-1, 1:-1] & flat).sum()) > SOLID * int((values > 0).sum()):
-        return _scaled(values, peak, f"the highest value, {peak}, is", notes)
-    if not few and peak < OPAQUE * top:  # of a codec: the object's value is not one but a few about it
+    return _scaled(channel, levels, notes)
+
+
+def _scaled(channel: Image.Image, levels: list[int], notes: list[str]) -> Image.Image:
+    """``channel`` such that the object is opaque, with a note: where its highest value is below white and frequent, or
+    most of its values lie near it, as those of a codec about a label do.
+    """
+    peak, top = levels[-1], _TOP[channel.mode]
+    if peak >= OPAQUE * top:
+        return channel
+    values = np.asarray(channel)
+    upper, between = (int((values > part * peak).sum()) for part in (0.75, 0.25))
+    if int(((values == peak)[1:-1, 1:-1] & _flat(values)).sum()) > SOLID * int((values > 0).sum()):
+        level, which = peak, f"the highest value, {peak}, is"
+    elif between - upper < 0.5 * upper:
         level = int(np.median(values[values > 0.5 * peak]))
-        return _scaled(values, level, f"values about {level} are", notes)
-    return channel
-
-
-def _scaled(values: np.ndarray, level: int, which: str, notes: list[str]) -> Image.Image:
+        which = f"values about {level} are"
+    else:
+        return channel
     notes.append(f"masks: {which} taken as opaque instead of white")
     return Image.fromarray(np.rint(np.minimum(values * np.float32(255 / level), 255)).astype(np.uint8))
 

@@ -156,6 +156,36 @@ def test_labels_in_the_alpha_of_an_image(tmp_path):
     assert any("the value 1 instead of white" in n for n in views.notes)
 
 
+@pytest.mark.parametrize("where", ["alpha", "mask", "grey alpha of a mask"])
+@pytest.mark.parametrize("spread", [2, 4, 9])
+def test_values_about_one_level_are_opaque(tmp_path, where, spread):
+    """Few or many values about 200, as of a lossy codec."""
+    noise = np.random.default_rng(0).integers(200 - spread, 201 + spread, (SIDE, SIDE))
+    level = np.where(DISK, noise, 0).astype(np.uint8)
+    if where == "mask":
+        mask, notes = mask_of(tmp_path, level)
+    else:
+        pixels = np.dstack([np.full((SIDE, SIDE, 3), 90, np.uint8), level])
+        if where == "alpha":
+            folder(tmp_path, ["a.png"])
+            Image.fromarray(pixels).save(tmp_path / "a.png")
+            views = load_views(tmp_path)
+            mask, notes = views.masks[0].numpy(), views.notes
+        else:
+            mask, notes = mask_of(tmp_path, Image.fromarray(pixels).convert("LA"))
+    np.testing.assert_allclose(mask, DISK, rtol=0, atol=0.05)  # 191 of 200
+    assert any("masks: values about 200 are taken as opaque instead of white" in n for n in notes)
+
+
+def test_soft_alpha_is_coverage(tmp_path):
+    """A fading edge that nowhere is quite opaque."""
+    folder(tmp_path, ["a.png"])
+    soft = np.rint(240 * np.clip(1.5 - np.hypot(*(np.mgrid[:SIDE, :SIDE] - 23.5)) / 15, 0, 1)).astype(np.uint8)
+    soft = np.minimum(soft, 240 - (np.indices(soft.shape).sum(0) % 40).astype(np.uint8))
+    Image.fromarray(np.dstack([np.full((SIDE, SIDE, 3), 90, np.uint8), soft])).save(tmp_path / "a.png")
+    np.testing.assert_array_equal(load_views(tmp_path).masks[0], soft / np.float32(255))
+
+
 def disk(k):
     """Disks that tell masks from each other by their areas."""
     return np.where(np.hypot(*(np.mgrid[:SIDE, :SIDE] - 23.5)) < 8 + k, 255, 0).astype(np.uint8)
