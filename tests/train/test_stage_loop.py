@@ -215,7 +215,7 @@ def test_a_stage_of_the_surface_ends_at_once_without_one(folder, tmp_path, capsy
     few = ["--steps", "1", "--batch", "1", "--image-size", "16", "--lobes", "8"]
     assert main([str(folder), str(tmp_path / "direct"), "--stage", "gaussians", *few]) == 2
     found = capsys.readouterr().err
-    assert "expected a network that has a surface, got none for 4 training objects" in found
+    assert "expected a network that predicts a surface, got none for 4 training objects" in found
     assert "--stage volume (1500 steps by default)" in found and not (tmp_path / "direct" / "state.pt").exists()
     volume = tmp_path / "volume"
     assert main([str(folder), str(volume), "--stage", "volume", "--patch", "8", *few]) == 0
