@@ -20,14 +20,6 @@ def direction_to_uv(d: wp.vec3) -> wp.vec2:
     return wp.vec2(0.5 + turn_atan2(d[2], d[0]), 2.0 * turn_atan2(s, d[1]))
 
 
-@wp.func
-def uv_to_direction(uv: wp.vec2) -> wp.vec3:
-    """Unit direction of map coordinates."""
-    a = turn_cos_sin(uv[0])
-    p = turn_cos_sin(0.5 * uv[1])
-    return wp.vec3(-a[0] * p[1], p[0], -a[1] * p[1])
-
-
 @wp.struct
 class Texels:
     """The four texels about a point of the map: rows, columns, and the point's place between them in [0, 1]."""

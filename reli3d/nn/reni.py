@@ -216,8 +216,3 @@ def rotation_from_6d(d: Tensor) -> Tensor:
     x = functional.normalize(a, dim=-1, eps=eps)
     y = functional.normalize(b - (x * b).sum(-1, keepdim=True) * x, dim=-1, eps=eps)
     return torch.stack([x, y, torch.linalg.cross(x, y)], dim=-1)
-
-
-def rotation_to_6d(matrix: Tensor) -> Tensor:
-    """The first two columns, ``(..., 6)``, of rotation matrices ``(..., 3, 3)``."""
-    return torch.cat([matrix[..., 0], matrix[..., 1]], dim=-1)

@@ -332,14 +332,3 @@ def published_state(published: Mapping[str, Tensor], where: object) -> dict[str,
         if other is not value and not (other.data_ptr() == value.data_ptr() or torch.equal(other, value)):
             raise WeightsError(where, f"{name}: expected the values of the same parameter's other name")
     return state
-
-
-def load_environment(path: str | os.PathLike, model: Reconstructor) -> Manifest:
-    """Fill the environment decoder in place from the published RENI++ file.  Raises WeightsError."""
-    manifest = read_manifest(path)
-    field = model.environment.field
-    expected = {name: tuple(value.shape) for name, value in field.state_dict().items()}
-    check_keys(path, {name: entry.shape for name, entry in manifest.tensors.items()}, expected)
-    device = model.environment.sample_directions.device
-    field.load_state_dict(read_tensors(manifest, {name: torch.float32 for name in expected}, device), strict=True)
-    return manifest

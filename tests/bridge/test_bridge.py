@@ -223,17 +223,6 @@ def test_blocks_of_rows_come_in_order_without_gradient_and_with_one_torch_thread
     assert _bridge.over_rows(0, 4, lambda a, b: (a, b)) == []
 
 
-def test_bits_of_a_block_of_torch_do_not_depend_on_the_threads(threads):
-    g = torch.Generator().manual_seed(0)
-    x, w = torch.randn(3000, 120, generator=g), torch.randn(120, 64, generator=g)
-    results = []
-    for count in (1, 2, 5):
-        threads(count)
-        parts = _bridge.over_rows(len(x), 700, lambda a, b: torch.nn.functional.silu(x[a:b] @ w))
-        results.append(torch.cat(parts))
-    assert all(torch.equal(results[0], other) for other in results[1:])
-
-
 def test_threads_load_a_kernel_one_after_the_other(threads, monkeypatch):
     """Slices that launch kernels of their own, as the ray caster's do: Warp would compile a module in each thread."""
     threads(4)

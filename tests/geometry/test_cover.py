@@ -9,7 +9,6 @@ from torch.nn.functional import grid_sample, max_pool2d
 
 import reli3d
 from reli3d import pipeline
-from reli3d.geometry import cover
 from reli3d.geometry.camera import Camera, camera_rays, look_at, project
 from reli3d.geometry.cover import DEPTH, FIELD_MAX, STRIDE, cover_silhouettes
 from reli3d.geometry.hull import hull_distance, mask_distance
@@ -56,21 +55,6 @@ def test_an_unsure_sheet_becomes_a_surface_as_thick_as_it_is_unsure(device):
     assert abs(float(mesh.vertices[:, 2].max()) - s * math.sqrt(DEPTH)) < 0.003  # a tenth of a cell
     beyond = float(mesh.vertices[:, :2].norm(dim=-1).max()) - 40 * 0.9 / 128
     assert 0.0 < beyond < 2 * STRIDE * 0.9 / 128  # nothing bounds it here but the next ray without a surface
-
-
-def test_blocks_that_are_left_out_change_nothing(device, monkeypatch):
-    """Skipping blocks whose minimum cannot lower the ray's changes nothing: bitwise identical."""
-    points = grid((37, 42, 30))
-    wave = (9.0 * points).sin().sum(-1)
-    sdf = torch.where(wave > 0.8, 3.0 + wave, wave - 0.3).to(device)
-    args = sdf, torch.full_like(sdf, FREE), disk(128, 55.0).to(device), far_camera().to(device)
-    got = cover_silhouettes(*args, radius=RADIUS)
-    lowest = cover._lowest(sdf)
-    assert tuple(lowest.shape) == (9, 11, 8) and float(lowest.min()) == float(sdf.min())
-    assert 0.02 < float((lowest >= FIELD_MAX).float().mean()) < 0.9, "some blocks are left out"
-    monkeypatch.setattr(cover, "_lowest", lambda sdf: torch.full_like(lowest, -1e30))
-    assert torch.equal(got, cover_silhouettes(*args, radius=RADIUS))
-    assert int((got != sdf).sum()) > 500
 
 
 def test_a_surface_that_covers_its_silhouettes_stays_as_it_is(device):

@@ -10,7 +10,7 @@ from bench.peers.flexicubes_torch import cube_list, flexicubes
 from reli3d.geometry.mesh import face_components, report, vertex_normals, volume
 from reli3d.geometry.surface import extract_surface, surface_cubes
 from reli3d.geometry.triplane import sample_triplane
-from tests.support.reference_surface import grid, random_weights, sphere, torus
+from tests.support.reference_surface import grid, random_weights, sphere
 
 F = torch.nn.functional
 
@@ -187,20 +187,6 @@ def test_weights_of_surface_cubes_only(device):
         assert torch.equal(g_alpha, f_alpha[cubes]) and torch.equal(g_beta, f_beta[cubes])
         with pytest.raises(ValueError, match="cubes"):
             extract_surface(sdf, radius=1.0, cubes=cubes.flip(0), **rows)
-
-
-def test_the_same_bits_for_any_number_of_threads(threads):
-    sdf = torus(40) + 0.01 * torch.randn(41, 41, 41, generator=torch.Generator().manual_seed(0))
-    weights = random_weights(sdf.shape, 0)
-    results = []
-    for count in (1, 2, 5):
-        threads(count)
-        leaves = [sdf.clone().requires_grad_(), weights["deformation"].clone().requires_grad_()]
-        mesh = extract_surface(leaves[0], radius=1.0, **{**weights, "deformation": leaves[1]})
-        grads = torch.autograd.grad(mesh.vertices.square().sum(), leaves)
-        results.append((mesh.vertices.detach(), mesh.faces, *grads))
-    for other in results[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from reli3d.geometry.triplane import CACHED, _is_walk, sample_triplane
+from reli3d.geometry.triplane import CACHED, sample_triplane
 from tests.support.reference import grid_samples, share_within
 
 
@@ -90,8 +90,6 @@ def test_a_walk_is_read_as_it_comes_and_shuffled_points_by_row_with_the_same_bit
     t = torch.linspace(0, 300, 6000)
     walk = torch.stack([0.9 * (0.11 * t).sin(), t / 160 - 0.9, 0.9 * (0.13 * t).cos()], -1)[None]
     shuffled = torch.randperm(6000, generator=torch.Generator().manual_seed(0))
-    assert _is_walk(walk, 100) and not _is_walk(walk[:, shuffled], 100)
-    assert not _is_walk(torch.full((1, 100, 3), float("nan")), 100) and not _is_walk(walk[:, :0], 100)
     assert torch.equal(sample_triplane(planes, walk[:, shuffled]), sample_triplane(planes, walk)[:, shuffled])
 
 
@@ -101,7 +99,7 @@ def test_channel_first_planes_are_read_by_rows_with_the_same_bits(channels, heig
     planes, points, weights = inputs(2, channels, height, width, 3000)
     points[1, :, 1] = points[1, :, 1].abs() * 0.3 + 0.4
     points[0, 5] = float("nan")
-    assert planes[0, 0].numel() > CACHED and not _is_walk(points, max(height, width))
+    assert planes[0, 0].numel() > CACHED
     channel_last = planes.movedim(2, -1).contiguous().movedim(-1, 2)
     p, q = planes.requires_grad_(), channel_last.requires_grad_()
     got, want = sample_triplane(p, points), sample_triplane(q, points)

@@ -20,7 +20,6 @@ from reli3d.nn.weights import (
     default_trunk,
     known_sha256,
     load,
-    load_environment,
     load_model,
     read_manifest,
     save,
@@ -296,15 +295,6 @@ def test_bfloat16_is_the_default_for_the_published_sizes_on_cuda_alone(saved):
     ]
     path, _ = saved
     assert load_model(path).dtype == torch.float32 and load_model(path, trunk=torch.bfloat16).dtype == torch.bfloat16
-
-
-def test_published_environment_weights_load(goldens, saved):
-    _, model = saved
-    path = goldens.parent / "reni++L49.safetensors"
-    manifest = load_environment(path, model)
-    assert len(manifest.tensors) == 104
-    with safe_open(path, "pt") as file:
-        torch.testing.assert_close(model.environment.field.network.fc.weight, file.get_tensor("network.fc.weight"))
 
 
 def test_written_files_hold_bfloat16_and_scalars(tmp_path):

@@ -1,21 +1,16 @@
 """The contact sheet of a reconstruction: novel views show the whole object, tiles have the right content."""
 
 import math
-import threading
-import time
 from dataclasses import replace
 
 import pytest
 import torch
 
-from reli3d._bridge import WORKER
 from reli3d.geometry.camera import project
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene
-from reli3d.io.hdr import read_hdr_image, write_environment
 from reli3d.output import preview
 from reli3d.render.asset import Asset
-from reli3d.render.environment import Environment
 from reli3d.render.image import render_asset
 from reli3d.render.lights import sky
 from reli3d.render.shading import ShadeOptions
@@ -65,16 +60,6 @@ def test_the_sheet_holds_the_inputs_unseen_views_maps_and_a_small_light(asset):
     assert float(blue) > 1.3 * float(red)  # a sky above
 
 
-def test_the_light_is_drawn_as_its_file_holds_it(asset, tmp_path):
-    radiance = torch.full((32, 64, 3), 0.1)
-    radiance[8:12, 5:9] = 5.0
-    write_environment(tmp_path / "light.hdr", Environment(radiance))
-    stored = read_hdr_image(tmp_path / "light.hdr")
-    drawn = preview._map(Environment(radiance))
-    peak = [int(m.mean(-1).amax(0).argmax()) / m.shape[1] for m in (stored, drawn)]
-    assert abs(peak[0] - peak[1]) < 4 / 64
-
-
 def test_the_filter_takes_noise_and_leaves_edges(asset):
     """Against 500 samples a subpixel; a checkered ball, so that what blurs the paint shows."""
     checks = torch.where(((torch.arange(32)[:, None] // 4 + torch.arange(32) // 4) % 2 == 0)[..., None], 0.8, 0.1)
@@ -91,27 +76,3 @@ def test_the_filter_takes_noise_and_leaves_edges(asset):
     assert float(after) < 0.15 * float(before)  # 0.06; a box of the same size, unguided, has 0.34
     assert float((smooth.mean() / few.radiance.mean() - 1).abs()) < 0.01
     assert bool((smooth[few.alpha == 0] == 0).all())
-
-
-def test_the_rendering_begins_before_the_sheet_is_requested(asset, threads, monkeypatch):
-    threads(2)
-    began = []
-    rendered = preview._rendered
-
-    def seen(*args):
-        began.append(threading.current_thread().name.startswith(WORKER))
-        if len(began) == 4:
-            raise ValueError("a tile")
-        return rendered(*args)
-
-    monkeypatch.setattr(preview, "_rendered", seen)
-    cameras, intrinsics = rig((0, 15, 3), target=(2.0, 2.0, 2.0)), torch.tensor([[120.0, 120.0, 32.0, 32.0]])
-    views = Views((torch.ones(64, 64, 3),), (torch.ones(64, 64),), cameras, intrinsics, ("a",))
-    sheet = preview.preview(asset, views)
-    for _ in range(600):
-        if len(began) == 4:
-            break
-        time.sleep(0.1)
-    assert began == [True] * 4
-    with pytest.raises(ValueError, match="a tile"):
-        sheet()

@@ -82,33 +82,6 @@ def test_imports_point_down(path):
     assert violations(path.read_text(), module, path.name == "__init__.py") == []
 
 
-@pytest.mark.parametrize(
-    "source, module, is_package",
-    [
-        ("import torch", "reli3d.kernels.math", False),
-        ("from .. import _bridge", "reli3d.kernels.math", False),
-        ("from .._bridge import call", "reli3d.kernels.math", False),
-        ("def f():\n    from reli3d.nn.model import Reconstructor", "reli3d.render.image", False),
-        ("from reli3d import reconstruct", "reli3d.nn.model", False),
-        ("from ..pipeline import reconstruct", "reli3d.nn", True),
-        ("import reli3d.cli.infer", "reli3d.pipeline", False),
-        ("import warp as wp", "reli3d.views.views", False),
-        ("from tests.support import reference", "reli3d.geometry.uv", False),
-        ("from reli3d.synthetic.samples import synthesize", "reli3d.views.folder", False),
-        ("from reli3d.eval.heldout import evaluate", "reli3d.train.loop", False),
-        ("from reli3d.render.environment import Environment", "reli3d.geometry.rays", False),
-    ],
-)
-def test_the_import_check_sees_what_it_should(source, module, is_package):
-    assert len(violations(source, module, is_package)) == 1
-
-
-def test_the_import_check_allows_what_it_should():
-    source = "import warp as wp\nfrom reli3d.kernels import math\nfrom .._bridge import call\nfrom . import mesh"
-    assert violations(source, "reli3d.geometry.rays") == []
-    assert violations("from reli3d import Mesh, sample_triplane", "reli3d.nn.model") == []
-
-
 PRESETS = (presets.OFFICIAL, presets.TINY, presets.SMALL)
 
 
@@ -147,20 +120,6 @@ def test_kernels_geometry_and_render_contain_no_constant_of_a_preset():
     assert len(found) > 50 and {name: bad for name, bad in found.items() if bad} == {}
 
 
-@pytest.mark.parametrize(
-    "source, count",
-    [
-        ("SOFTNESS = 0.03", 1),
-        ("HEAD_WIDTH, OTHER = 64, 1", 1),
-        ("def f(radius=0.87): ...", 1),
-        ("SIDE: int = 40\nCLIP = 0.56", 2),
-        ("MARGIN = 0.5\nsoftness = 1.0", 0),
-    ],
-)
-def test_the_check_of_presets_sees_what_it_should(source, count):
-    assert len(constants_of_presets(source)) == count
-
-
 def of_other_tests(source: str, folder: str) -> list[str]:
     """What a file of ``tests`` imports from test modules, or one of ``bench`` from ``tests``."""
     found = []
@@ -178,23 +137,6 @@ def test_no_test_imports_another_and_bench_imports_no_test(folder):
     files = sorted((ROOT / folder).rglob("*.py"))
     found = {name_of(path): of_other_tests(path.read_text(), folder) for path in files}
     assert len(found) > 20 and {name: bad for name, bad in found.items() if bad} == {}
-
-
-@pytest.mark.parametrize(
-    "source, folder, count",
-    [
-        ("from tests.geometry.test_rays import soup", "tests", 1),
-        ("from tests.geometry import test_rays", "tests", 1),
-        ("def f():\n    import tests.geometry.test_rays as other", "tests", 1),
-        ("from . import test_rays", "tests", 1),
-        ("from tests.conftest import DEVICES", "tests", 1),
-        ("from tests.support.rays import soup", "bench", 1),
-        ("from tests.support.rays import soup", "tests", 0),
-        ("from bench.surface import field", "tests", 0),
-    ],
-)
-def test_the_check_of_tests_sees_what_it_should(source, folder, count):
-    assert len(of_other_tests(source, folder)) == count
 
 
 def circle(sources: dict[str, str]) -> list[str]:

@@ -14,7 +14,7 @@ from reli3d.geometry.rays import RayScene
 from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.environment import Environment
 from reli3d.render.gbuffer import sample_texture, surface_points
-from reli3d.render.image import _resolve, render_asset, render_lights
+from reli3d.render.image import render_asset, render_lights
 from reli3d.render.material import DIFFUSE_MODELS
 from reli3d.render.shading import ShadeOptions, shade, shade_lights
 from tests.support import reference
@@ -199,13 +199,6 @@ def test_shadows_found_for_one_light_are_those_of_the_others(device, counts, seq
             assert got.requires_grad == base.requires_grad
         free = shade(*args, lights[2], options=options)
         assert bool((together[2] < 0.9 * free).any())  # the ball is in the way of something
-
-
-@pytest.mark.parametrize("factor", [1, 2, 3])
-def test_subpixels_are_resolved_to_their_mean(device, factor):
-    layer = torch.rand(6 * factor, 5 * factor, 2, generator=torch.Generator().manual_seed(4)).to(device)
-    want = layer.double().reshape(6, factor, 5, factor, 2).mean((1, 3))
-    torch.testing.assert_close(_resolve(layer, factor).double(), want, rtol=0, atol=2e-7)  # three roundings below 1
 
 
 def test_image_gradient_reaches_textures_and_light(device):

@@ -211,19 +211,6 @@ def test_edges_of_split_vertices_and_open_borders(device):
         mesh_edges(v, faces)
 
 
-def test_same_bits_for_any_number_of_threads(device, threads):
-    vertices, faces = shape("fine sphere", device)
-    camera = camera_of(device)
-    results = []
-    for count in (1, 2, 5):
-        threads(count)
-        v = vertices.clone().requires_grad_()
-        mask = mask_of(v, faces, camera)
-        results.append((mask.detach(), torch.autograd.grad(mask.square().sum(), v)[0]))
-    for other in results[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
-
-
 def test_odd_scenes_give_finite_gradients(device):
     """Faces without area, slivers, vertices behind the eye or on it, an eye within the plane of a face; 256 pixels a
     scene, a hundred thousand in all."""

@@ -2,9 +2,6 @@
 
 import contextlib
 import json
-import os
-import subprocess
-import sys
 
 import pytest
 import torch
@@ -15,6 +12,7 @@ from reli3d.train.stages.config import StageConfig
 from reli3d.train.stages.stage import PaperStage
 from reli3d.train.stages.step import trunk_layers
 from reli3d.train.stages.views import Samples
+from tests.support.processes import on_two
 from tests.support.stages import ball_model, write_samples
 
 CONFIG = StageConfig("gaussians", "gaussians", 16, lobes=16, batch=2, steps=4, rate=1e-3)
@@ -98,20 +96,6 @@ def alone(folder, out, stop=None):
         train(stage, stage.options(str(out), **STEPS))
 
 
-def on_two(script, text, *arguments):
-    """Run ``text`` on two processes."""
-    script.write_text(text)
-    env = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
-    group = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", script]
-    done = subprocess.run([*group, *arguments], env=env, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr[-2000:]
-
-
-def together(folder, out, stop, script):
-    """The run of two processes, in parts, ended after the checkpoint of step ``stop``."""
-    on_two(script, WORKER, folder, out, str(stop))
-
-
 def rows(out):
     found = [r for r in map(json.loads, (out / "log.jsonl").read_text().splitlines()) if "config" not in r]
     return [{k: v for k, v in row.items() if k != "seconds"} for row in found]
@@ -121,12 +105,14 @@ def rows(out):
 def runs(folder, tmp_path_factory):
     """``one`` by one process; ``first`` begun in parts and ended by one process; ``last`` the other way."""
     root = tmp_path_factory.mktemp("runs")
+    script = root / "worker.py"
+    script.write_text(WORKER)
     alone(folder, root / "one")
-    together(folder, root / "first", 2, root / "worker.py")
+    on_two(script, folder, root / "first", 2)
     state = torch.load(root / "first" / "state.pt", weights_only=True)
     alone(folder, root / "first")
     alone(folder, root / "last", 2)
-    together(folder, root / "last", 4, root / "worker.py")
+    on_two(script, folder, root / "last", 4)
     return root, state
 
 
@@ -176,4 +162,5 @@ def test_one_process_alone_is_refused(folder, tmp_path, capsys):
 
 def test_norms_and_parts_are_those_of_whole_gradients(tmp_path):
     """Beside torch's own clipping of a module that is whole, on the same input on both processes."""
-    on_two(tmp_path / "clip.py", CLIP)
+    (tmp_path / "clip.py").write_text(CLIP)
+    on_two(tmp_path / "clip.py")
