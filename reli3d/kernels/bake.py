@@ -6,6 +6,8 @@ row of the output and gathers, so that the result does not depend on the number 
 
 import warp as wp
 
+from reli3d.kernels.envelope import NO_SITE_ROWS, lower_envelope
+
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
 
 ROUNDING = wp.constant(4.0e-7)  # relative error of a float32 cross product, twice over: neighbors leave no crack
@@ -260,7 +262,7 @@ def nearest_row_kernel(
     # out
     row: wp.array2d[wp.int32],
 ):
-    """Row of the nearest valid texel of the same column, the upper of two; -1 without one.
+    """Row of the nearest valid texel of the same column, the upper of two; ``-NO_SITE_ROWS`` without one.
 
     A thread works on ``strip`` columns: contiguous reads.
     """
@@ -269,7 +271,7 @@ def nearest_row_kernel(
     x0 = i * strip
     x1 = wp.min(x0 + strip, valid.shape[1])
     for x in range(x0, x1):
-        row[0, x] = -1
+        row[0, x] = wp.int32(-NO_SITE_ROWS)
         if valid[0, x] != wp.uint8(0):
             row[0, x] = 0
     for y in range(1, height):
@@ -301,31 +303,11 @@ def nearest_texel_kernel(
 ):
     """Flat index and squared distance of the nearest valid texel for every texel of row ``i``; -1 and inf without one.
 
-    Lower envelope of parabolas, Felzenszwalb and Huttenlocher 2012 (Distance transforms of sampled functions).
     A thread works on one row.
     """
     i = start + wp.tid()
     width = row.shape[1]
-    top = wp.int32(-1)
-    for q in range(width):
-        r = row[i, q]
-        if r >= 0:
-            h = float(r - i) * float(r - i)
-            s = wp.float32(0.0)
-            keep = wp.int32(1)
-            while top >= 0 and keep == 1:
-                v = site[i, top]
-                g = float(row[i, v] - i)
-                s = ((h - g * g) / float(q - v) + float(q + v)) * 0.5
-                if s <= border[i, top]:
-                    top -= 1
-                else:
-                    keep = 0
-            top += 1
-            site[i, top] = q
-            border[i, top] = s
-            if top == 0:
-                border[i, 0] = -1.0e30
+    top = lower_envelope(row[i], i, site[i], border[i])
     k = wp.int32(0)
     for x in range(width):
         if top < 0:

@@ -8,6 +8,7 @@ pixels (y, x), (y, x + 1), (y + 1, x), (y + 1, x + 1); there are (H - 1) * (W - 
 import warp as wp
 
 from reli3d.kernels.bilinear import look_up
+from reli3d.kernels.envelope import NO_SITE_ROWS, lower_envelope
 
 wp.set_module_options(
     # functions that several kernels call: a call copies the arrays' shapes and strides
@@ -22,7 +23,6 @@ STEP_MAX = wp.constant(0.25)
 DEPTH_MIN = wp.constant(1.0e-4)  # world units: points closer to a camera's plane count as behind it
 BLOCK_POINTS = wp.constant(4)  # side of a block of grid points
 BLOCK_VIEWS_MAX = wp.constant(32)  # views that are culled per block; further ones are evaluated at every point
-NO_CROSSING_ROWS = wp.constant(65536.0)  # distance in a column without a crossing: beyond any image
 EXACT_PIXELS = wp.constant(4.0)  # beyond, other segments are at most sqrt(16.5) - 4 = 0.06 pixels nearer
 SEGMENT_PIXELS = wp.constant(16.0)  # beyond, the end of a segment is at most 0.25 / 16 pixels farther than the segment
 
@@ -313,7 +313,7 @@ def column_kernel(
     # out
     row: wp.array3d[float],
 ):
-    """Row of the nearest contour crossing in a pixel's column; ``NO_CROSSING_ROWS`` away if there is none.
+    """Row of the nearest contour crossing in a pixel's column; ``NO_SITE_ROWS`` away if there is none.
 
     One thread per column.
     """
@@ -322,7 +322,7 @@ def column_kernel(
     width = mask.shape[2]
     view = i // width
     x = i % width
-    last = wp.float32(-NO_CROSSING_ROWS)
+    last = wp.float32(-NO_SITE_ROWS)
     for y in range(height):
         row[view, y, x] = last
         if y + 1 < height:
@@ -330,7 +330,7 @@ def column_kernel(
             b = mask[view, y + 1, x]
             if (a >= 0.5) != (b >= 0.5):
                 last = float(y) + crossing(a, b)
-    last = wp.float32(2.0 * NO_CROSSING_ROWS)
+    last = wp.float32(2.0 * NO_SITE_ROWS)
     for k in range(height):
         y = height - 1 - k
         if y + 1 < height:
@@ -355,37 +355,13 @@ def row_kernel(
 ):
     """Column of the nearest crossing, given the nearest one of each column in ``row``; -1 without any.  One thread per
     row.
-
-    Lower envelope of parabolas, Felzenszwalb and Huttenlocher 2012, Distance Transforms of Sampled Functions.
     """
     i = start + wp.tid()
-    height = row.shape[1]
-    width = row.shape[2]
-    view = i // height
-    y = i % height
-    top = wp.int32(-1)
-    for x in range(width):
-        dy = row[view, y, x] - float(y)
-        if wp.abs(dy) < 0.5 * NO_CROSSING_ROWS:
-            height_x = dy * dy + float(x * x)
-            at = wp.float32(-1.0e9)
-            search = top >= 0
-            while search:
-                other = apex[view, y, top]
-                dy = row[view, y, other] - float(y)
-                at = (height_x - (dy * dy + float(other * other))) / float(2 * (x - other))
-                if at > begin[view, y, top]:
-                    search = False
-                else:
-                    top -= 1
-                    if top < 0:
-                        at = -1.0e9
-                        search = False
-            top += 1
-            apex[view, y, top] = x
-            begin[view, y, top] = at
+    view = i // row.shape[1]
+    y = i % row.shape[1]
+    top = lower_envelope(row[view, y], y, apex[view, y], begin[view, y])
     k = wp.int32(0)
-    for x in range(width):
+    for x in range(row.shape[2]):
         while k < top and begin[view, y, k + 1] < float(x):
             k += 1
         if top < 0:
