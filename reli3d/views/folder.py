@@ -85,6 +85,7 @@ def load_views(
     frames, notes = _read_cameras(root)
     index = FolderIndex()
     frames = [replace(f, image=_existing(root, f.image, index) or f.image) for f in frames]
+    _check_poses(frames)
     files = MaskFiles(root, frames, None if masks is None else Path(masks))
     offered, names = len(frames), [frame.name for frame in frames]
     origin, moved = _origin(frames, folder)
@@ -148,6 +149,19 @@ def _read_cameras(root: Path) -> tuple[list[Frame], list[str]]:
         others = f"; not read: {', '.join(forms[1:])}" if len(forms) > 1 else ""
         notes.insert(0, f"cameras of {len(frames)} images from {used}{others}")
     return frames, notes
+
+
+def _check_poses(frames: list[Frame]) -> None:
+    """Raises InputError where two frames have the same image with different poses."""
+    first: dict[str, Frame] = {}
+    for frame in frames:
+        other = first.setdefault(os.path.realpath(frame.image), frame)
+        if not np.allclose(other.c2w, frame.c2w):
+            raise InputError(
+                frame.where,
+                f"pose: expected one for each image, got another for {shown(frame.name)} than {other.where} has "
+                "for the same file; remove one of them",
+            )
 
 
 def _origin(frames: list[Frame], folder) -> tuple[tuple[float, float, float], list[str]]:

@@ -111,7 +111,7 @@ def _scaled(channel: Image.Image, levels: list[int], notes: list[str]) -> Image.
     most of its values lie near it, as those of a codec about a label do.
     """
     peak, top = levels[-1], _TOP[channel.mode]
-    if peak >= OPAQUE * top:
+    if not 0 < peak < OPAQUE * top:
         return channel
     values = np.asarray(channel)
     upper, between = (int((values > part * peak).sum()) for part in (0.75, 0.25))

@@ -124,3 +124,11 @@ def test_an_image_that_is_listed_twice_is_refused(model):
     write(folder, [*lines, *lines[:2]])
     with pytest.raises(InputError, match=r"NAME: expected each image once, got '0.png' 2 times"):
         load_views(folder)
+
+
+@pytest.mark.parametrize("name", ["./1.png", "1.PNG"])
+def test_another_name_of_a_listed_image_is_refused(model, name):
+    folder, lines = model
+    write(folder, [line.replace(" 0.png", f" {name}") for line in lines])
+    with pytest.raises(InputError, match="pose: expected one for each image, got another for '1.png'"):
+        load_views(folder)

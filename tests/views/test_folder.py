@@ -188,6 +188,18 @@ def test_files_outside_are_refused(tmp_path):
     assert len(load_views(tmp_path / "object")) == 1
 
 
+@pytest.mark.parametrize("name", ["rgba/0.png", "./rgba/0.png", "RGBA/0.PNG", "rgba/0"])
+def test_an_image_with_two_poses_is_refused(tmp_path, name):
+    data = evil.good(tmp_path)
+    data["frames"].append(data["frames"][0] | {"file_path": name, "view_index": 3})
+    (tmp_path / "transforms.json").write_text(json.dumps(data))
+    assert len(load_views(tmp_path)) == 4  # the same pose again
+    data["frames"][3]["transform_matrix"] = evil.pose(1.0)
+    (tmp_path / "transforms.json").write_text(json.dumps(data))
+    with pytest.raises(InputError, match=r"frames\[3\]: pose: expected one for each image, got another .*frames\[0\]"):
+        load_views(tmp_path)
+
+
 def test_number_of_views(tmp_path):
     frames = evil.good(tmp_path)["frames"] * 7
     transforms(tmp_path, frames)
