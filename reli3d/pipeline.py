@@ -426,7 +426,7 @@ def refined(asset: Asset, views: Views, **options) -> Refinement:
     from reli3d.fit import refine as fit  # imported where it is used: it loads kernels of its own
 
     device = asset.mesh.vertices.device
-    return fit.refine(asset, views.to(device).resampled(REFINED), **options)
+    return fit.refine(asset, views.to(device).resampled(REFINED), **{"light": views.lighting, **options})
 
 
 class Progress:
@@ -445,7 +445,8 @@ class FolderOptions:
 
     views, masks, remove_background: as in :func:`~reli3d.views.folder.load_views`.  budget: ``seconds`` or ``steps`` of
     a refinement with all images; empty: none.  cameras: also optimize the cameras.  interrupt: as in
-    :func:`reli3d.fit.refine.refine`.
+    :func:`reli3d.fit.refine.refine`.  light: ``object``, ``camera`` or ``per-group``, a lighting for each sub-folder of
+    images; None: as the folder says.
     """
 
     views: int | None = None
@@ -454,6 +455,7 @@ class FolderOptions:
     budget: Mapping[str, float | int] | None = None
     cameras: bool = False
     interrupt: Callable[[], bool] | None = None
+    light: str | None = None
 
     def read(self, folder: Path, *, whole: bool) -> Views:
         """The views of ``folder``; whole: see :func:`~reli3d.views.folder.load_views`."""
@@ -465,6 +467,15 @@ class FolderOptions:
             every=bool(self.budget) and self.views is None,
             whole=whole,
         )
+
+    def lighting(self, views: Views) -> str | list[str]:
+        """``light`` of a refinement.  Raises InputError for ``per-group`` without two sub-folders."""
+        if self.light != "per-group":
+            return self.light or views.lighting
+        groups = [name.rpartition("/")[0] for name in views.names]
+        if len(set(groups)) < 2:
+            raise InputError("--light", "per-group: expected images in at least two sub-folders, got one folder")
+        return groups
 
 
 def reconstruct_folder(
@@ -509,6 +520,7 @@ def reconstruct_folder(
         with watch.stage("refine"):
             photographs = photographs.transformed(output)
             fit: dict[str, Any] = {"seed": options.seed, "cameras": reading.cameras, "interrupt": reading.interrupt}
+            fit["light"] = reading.lighting(photographs)
             result = refined(asset, photographs, bar=True, **fit, **reading.budget)
             compared = comparison(asset, result.asset, shown.to(model.device))
         progress.report(result.notes)

@@ -78,6 +78,8 @@ def refinement_budget(args: argparse.Namespace, device: str) -> dict[str, float 
     if args.refine is None:
         if args.refine_cameras:
             raise InputError("--refine-cameras", "expected it together with --refine; add --refine")
+        if args.light:
+            raise InputError("--light", "expected it together with --refine; add --refine")
         return {}
     if not args.refine:
         return {"seconds": REFINE_SECONDS[device]}

@@ -49,7 +49,7 @@ class FolderJob:
             background=args.background,
         )
         self.reading = FolderOptions(
-            args.views, args.masks, args.remove_background, budget, args.refine_cameras, interrupt_flag
+            args.views, args.masks, args.remove_background, budget, args.refine_cameras, interrupt_flag, args.light
         )
         path = weights.locate(args.weights)
         trunk = args.precision if args.precision in (None, "auto") else getattr(torch, args.precision)

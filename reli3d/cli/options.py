@@ -58,6 +58,12 @@ def parser() -> argparse.ArgumentParser:
         help="fit the result to all images of the folder for SECONDS (default 60, on CUDA 20) or, as 300steps, for a "
         "number of steps, which is reproducible on one machine; place it after the folders",
     )
+    p.add_argument(
+        "--light",
+        choices=("object", "camera", "per-group"),
+        help="with --refine: the lighting is fixed to the object, moves with the camera (turntable, flash), or differs "
+        "between sub-folders of images; default: lighting in transforms.json, else object",
+    )
     p.add_argument("--refine-cameras", action="store_true", help="with --refine: optimize the cameras as well")
     where = p.add_mutually_exclusive_group()
     where.add_argument(

@@ -24,10 +24,10 @@ def gathered(mesh: Mesh, images: InputImages, *, seed: int) -> Tensor:
     """Cosine-weighted mean ``(V, 3)`` of the radiance that each vertex receives from the mesh itself.
 
     Final gathering with one bounce: a surface point is taken as Lambertian, and its outgoing radiance, which includes
-    all bounces, is the mean colour of the images in which it is visible.  Points that no camera sees have the mean of
+    all bounces, is the mean color of the images in which it is visible.  Points that no camera sees have the mean of
     the others.  Faces emit on both sides.
 
-    mesh: with normals, in the fit's box [-1, 1]^3.  images: those whose colours may be used; exposures count as 1.
+    mesh: with normals, in the fit's box [-1, 1]^3.  images: those whose colors may be used; exposures count as 1.
     seed: of the ray directions.  No gradient.  Raises ValueError without normals.
     """
     position, normal = mesh.vertices, present("mesh.normals", mesh.normals)
@@ -50,7 +50,7 @@ def gathered(mesh: Mesh, images: InputImages, *, seed: int) -> Tensor:
 
 
 def _leaving(position: Tensor, normal: Tensor, scene: RayScene, images: InputImages) -> tuple[Tensor, Tensor]:
-    """Mean linear colour ``(V, 3)`` of each point over the images that see it, and whether any does ``(V,)``."""
+    """Mean linear color ``(V, 3)`` of each point over the images that see it, and whether any does ``(V,)``."""
     planes, parts, visible = display_planes(images), [], []
     for at, n in zip(position.split(VERTICES_PER_BATCH), normal.split(VERTICES_PER_BATCH), strict=True):
         color, cover = view_colors(planes, at, images.camera)

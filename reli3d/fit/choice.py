@@ -10,9 +10,10 @@ from torch import Tensor
 
 from reli3d.fit.bounce import reflected
 from reli3d.fit.input_images import InputImages
+from reli3d.fit.lighting import Lights
 from reli3d.fit.shading import radiance
 from reli3d.fit.transfer import changed
-from reli3d.fit.unknowns import Start, Unknowns, environment
+from reli3d.fit.unknowns import Start, Unknowns
 from reli3d.geometry.hits import interpolate
 from reli3d.geometry.rays import RayScene
 from reli3d.render.asset import Asset
@@ -77,11 +78,15 @@ class Fitted:
         asset, unknowns = self.surface, self.unknowns
         if material:
             grids, bend = ([material * grid for grid in grids] for grids in (unknowns.material, unknowns.bend))
-            asset = changed(asset, replace(unknowns, material=grids, bend=bend, detail=material * unknowns.detail))
-        if light:
-            maps = [light * values for values in unknowns.light]
-            asset = replace(asset, environment=environment(replace(unknowns, light=maps), self.start))
-        return asset
+            detail, membership = material * unknowns.detail, material * unknowns.membership
+            change = replace(unknowns, material=grids, bend=bend, detail=detail, membership=membership)
+            asset = changed(asset, change)
+        return replace(asset, environment=self.lights(light).of_view(0)) if light else asset
+
+    def lights(self, weight: float) -> Lights:
+        """Lights of all views with the changes scaled by ``weight``."""
+        maps = [weight * values for values in self.unknowns.light]
+        return Lights.of(replace(self.unknowns, light=maps), self.start, self.images)
 
 
 class ViewRenderer:
@@ -107,15 +112,16 @@ class ViewRenderer:
             self.inside.append(inside[view][hit])
 
     @torch.no_grad()
-    def lit(self, asset: Asset) -> list[tuple[Tensor, Tensor]]:
-        """For each view, linear radiance ``(N, 3)`` by the light of ``asset``, which has this surface, and by
-        one-bounce interreflection ``(N, 3)``.  The random numbers depend on the view alone.
+    def lit(self, asset: Asset, lights: Lights | None = None) -> list[tuple[Tensor, Tensor]]:
+        """For each view, linear radiance ``(N, 3)`` by ``lights``, by default that of ``asset``, which has this
+        surface, and by one-bounce interreflection ``(N, 3)``.  The random numbers depend on the view alone.
         """
         lit = []
         for view, (_, face, bary, wo) in enumerate(self.rays):
             at = surface_points(self.mesh, asset.textures, face, bary)
             bounced = reflected(at, interpolate(self.received, self.mesh.faces, face, bary))
-            lit.append((radiance(at, wo, asset.light, samples=CHECK_SAMPLES, scene=self.scene, seed=view), bounced))
+            light = asset.light if lights is None else lights.of_view(view)
+            lit.append((radiance(at, wo, light, samples=CHECK_SAMPLES, scene=self.scene, seed=view), bounced))
         return lit
 
     @torch.no_grad()
@@ -144,7 +150,7 @@ class ViewRenderer:
 
 
 def view_errors(asset: Asset, received: Tensor, images: InputImages) -> Tensor:
-    """Mean squared display error ``(V,)`` of renderings on white, at pixel centres, with the asset's environment
+    """Mean squared display error ``(V,)`` of renderings on white, at pixel centers, with the asset's environment
     and one-bounce interreflection: ``received``, of :func:`~reli3d.fit.bounce.gathered` at its vertices."""
     renderer = ViewRenderer(asset, received, images)
     return renderer.errors(renderer.lit(asset))
@@ -175,7 +181,7 @@ def chosen(fitted: Fitted, used: list[int], held: list[int], before: Tensor) -> 
         if few and (material > 0.5 or (held and light > 0.5)):
             continue
         asset = fitted.blended(material, light)
-        lit = renderer.lit(asset)
+        lit = renderer.lit(asset, fitted.lights(light) if light else None)
         light_scale = renderer.light_scale(lit, used) if light else 1.0
         errors = renderer.errors(lit, light_scale)
         tolerances = (PSNR_TOLERANCE_DB,) * 3 if material or light else SURFACE_TOLERANCES_DB

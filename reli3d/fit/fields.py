@@ -36,7 +36,7 @@ def light_field(maps: Sequence[Tensor], height: int) -> Tensor:
 
 
 def blurred_grid(grid: Tensor, cells: int) -> Tensor:
-    """``grid (X, Y, Z)`` averaged over blocks of ``cells`` a side and blended between their centres."""
+    """``grid (X, Y, Z)`` averaged over blocks of ``cells`` a side and blended between their centers."""
     if cells <= 1:
         return grid
     shape = grid.shape

@@ -1,7 +1,8 @@
-"""Posed input images of a fit: linear colours, masks and cameras."""
+"""Posed input images of a fit: linear colors, masks and cameras."""
 
 from __future__ import annotations
 
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -45,16 +46,27 @@ class PosedImages(Protocol):
 class InputImages:
     """``V`` input images of one size on one device.
 
-    color: ``(V, S, S, 3)`` linear.  mask: ``(V, S, S)`` coverage in [0, 1].  camera: batch of V cameras.
+    color: ``(V, S, S, 3)`` linear.  mask: ``(V, S, S)`` coverage in [0, 1].  camera: batch of V cameras.  light_group:
+    for each view the index of its lighting, by default 0.  light_moves: the lighting is fixed to the camera.
     """
 
     color: Tensor
     mask: Tensor
     camera: Camera
+    light_group: tuple[int, ...] = ()
+    light_moves: bool = False
+
+    def __post_init__(self):
+        if not self.light_group:
+            object.__setattr__(self, "light_group", (0,) * len(self.color))
 
     @classmethod
-    def of(cls, views: PosedImages) -> InputImages:
-        """Converts sRGB images to linear.  Raises TypeError or ValueError if shapes or devices do not match."""
+    def of(cls, views: PosedImages, light: str | Sequence[Hashable] = "object") -> InputImages:
+        """Converts sRGB images to linear.
+
+        light: ``object``, a lighting fixed to the object; ``camera``, one fixed to the camera; or for each view the
+        name of its lighting.  Raises TypeError or ValueError if shapes or devices do not match, or for another light.
+        """
         images, masks = views.images, views.masks
         check("images", images, last=3)
         check("masks", masks, like=images)
@@ -69,7 +81,15 @@ class InputImages:
             got = f"{tuple(views.c2w.shape)} and {tuple(views.intrinsics.shape)}"
             raise ValueError(f"c2w, intrinsics: expected {count} cameras, got {got}")
         camera = Camera(views.c2w, views.intrinsics, *images.shape[2:0:-1]).detach()
-        return cls(srgb_to_linear(images.detach()), masks.detach(), camera)
+        group: tuple[int, ...] = ()
+        if not isinstance(light, str):
+            numbers = {g: k for k, g in enumerate(dict.fromkeys(light))}
+            group = tuple(numbers[g] for g in light)
+            if len(group) != count:
+                raise ValueError(f"light: expected the lighting of {count} views, got {len(group)}")
+        elif light not in ("object", "camera"):
+            raise ValueError(f"light: expected object, camera or a name for each view, got {light!r}")
+        return cls(srgb_to_linear(images.detach()), masks.detach(), camera, group, light == "camera")
 
     def __len__(self) -> int:
         return len(self.color)
@@ -81,17 +101,19 @@ class InputImages:
 
     def select(self, views: list[int]) -> InputImages:
         """The images of these indices, in this order."""
-        return InputImages(self.color[views], self.mask[views], self.camera[views])
+        group = tuple(self.light_group[v] for v in views)
+        return InputImages(self.color[views], self.mask[views], self.camera[views], group, self.light_moves)
 
     def resized(self, size: int) -> InputImages:
-        """The images resampled to ``size`` pixels a side; colours are averaged with the masks as weights."""
+        """The images resampled to ``size`` pixels a side; colors are averaged with the masks as weights."""
         if size == self.size:
             return self
         planes = torch.cat([self.color * self.mask[..., None], self.mask[..., None]], -1).permute(0, 3, 1, 2)
         planes = interpolate(planes, (size, size), mode="bilinear", align_corners=False, antialias=True)
         cover = planes[:, 3]
         color = planes[:, :3].permute(0, 2, 3, 1) / cover.clamp(min=1e-4)[..., None]
-        return InputImages(color.contiguous(), cover.clamp(0.0, 1.0), self.camera.resized(size, size))
+        camera = self.camera.resized(size, size)
+        return replace(self, color=color.contiguous(), mask=cover.clamp(0.0, 1.0), camera=camera)
 
     def moved(self, shift: Tensor, scale: float) -> InputImages:
         """The images with cameras in the frame ``scale * (x - shift)``."""

@@ -8,21 +8,20 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from reli3d.fit.fields import light_field
-from reli3d.fit.unknowns import LIGHT_ROWS, Unknowns
+from reli3d.fit.unknowns import Unknowns, light_maps
 from reli3d.geometry.grid import squared_laplacian
 
 MIN_LINEAR = 0.02  # linear radiance below which the display's derivative is constant: there images contain mostly noise
 HUBER_DELTA = 0.25  # display values; larger residuals count linearly: reflected surroundings, glare, wrong masks
 AGREEMENT_SIGMA = 0.1  # display values; larger differences at one point come from other surfaces or highlights
-BASE_COLOR_SCALE = 0.25  # logits; a larger change of base colour corrects a wrong start, a smaller one may be shading
-PALETTE_SCALE = 0.5  # log base colour; points that differ by more have different materials, not different shading
-CHROMATICITY_SIGMA = 0.25  # log colour without brightness: variation that coloured light causes on one material
+BASE_COLOR_SCALE = 0.25  # logits; a larger change of base color corrects a wrong start, a smaller one may be shading
+PALETTE_SCALE = 0.5  # log base color; points that differ by more have different materials, not different shading
+CHROMATICITY_SIGMA = 0.25  # log color without brightness: variation that colored light causes on one material
 
 
 @dataclass(frozen=True)
 class Weights:
-    """Weights of all terms; lengths in cells of the grid, colours in display values."""
+    """Weights of all terms; lengths in cells of the grid, colors in display values."""
 
     outline: float = 30.0  # of :func:`outline`
     agreement: float = 0.3  # of :func:`agreement`
@@ -32,9 +31,8 @@ class Weights:
     image: float = 1.0  # of :func:`display_error` in the fit of the maps and the light
     palette: float = 0.01  # of :func:`palette`
     hue: float = 0.1  # of :func:`hue_drift`
-    base_coarse: float = 0.02  # prior of the base colour's coarse field towards the start, over the number of views
-    base_color: float = 20.0  # of :func:`near_base_color`, over the 4th power of the number of views with used colours
-    finish: float = 0.05  # prior of roughness and metallic towards the start, over the number of views
+    base_coarse: float = 0.02  # prior of the base color's coarse field towards the start, over the number of views
+    base_color: float = 20.0  # of :func:`near_base_color`, over the 4th power of the number of views with used colors
     light: float = 2e-3  # prior of the light's maps towards the start
     light_variation: float = 2e-3  # of :func:`total_variation` of the light
     exposure: float = 0.1  # of squared log exposures; their mean is ambiguous with the light's scale
@@ -71,10 +69,10 @@ def display_error(image: Tensor, other: Tensor, target: Tensor, bright: Tensor) 
 
 
 def agreement(color: Tensor, weight: Tensor) -> Tensor:
-    """Photo-consistency: weighted variance of a point's colour over the views, robust, mean over points.
+    """Photo-consistency: weighted variance of a point's color over the views, robust, mean over points.
 
     color: ``(N, V, 3)`` display values where the point projects.  weight: ``(N, V)``, 0 where it is occluded.  Apart
-    from highlights, a point on the true surface has the same colour in all views.  The term needs neither light nor
+    from highlights, a point on the true surface has the same color in all views.  The term needs neither light nor
     material, so it is used before they are fitted.  Points that fewer than two views see do not count.
     """
     total = weight.sum(1)
@@ -95,7 +93,7 @@ def outline(cover: Tensor, mask: Tensor) -> Tensor:
 def curvature(sdf: Tensor, cell: float, weight: Tensor) -> Tensor:
     """Weighted sum of the squared Laplacian of the signed distance, in cells.
 
-    sdf, weight: ``(X, Y, Z)``.  cell: side of a cell.  The term regularizes the surface where silhouettes and colours
+    sdf, weight: ``(X, Y, Z)``.  cell: side of a cell.  The term regularizes the surface where silhouettes and colors
     do not constrain it.
     """
     return squared_laplacian(sdf, weight) / (cell * cell)
@@ -112,10 +110,10 @@ def near_start(grids: Sequence[Tensor]) -> Tensor:
 
 
 def near_base_color(change: Tensor, weights: Weights, views: int) -> Tensor:
-    """Robust prior of the base colour towards the start, mean over points; change: ``(N, 3)``, of its logits.
+    """Robust prior of the base color towards the start, mean over points; change: ``(N, 3)``, of its logits.
 
-    Few views constrain normals and light poorly, and the residual shading would be baked into the base colour as a
-    small change of most points.  A wrong base colour of the start needs a large change; above ``BASE_COLOR_SCALE`` the
+    Few views constrain normals and light poorly, and the residual shading would be baked into the base color as a
+    small change of most points.  A wrong base color of the start needs a large change; above ``BASE_COLOR_SCALE`` the
     gradient decreases.  The weight is divided by ``views**4``: 0.25 at 3 views and 5e-4 at 14.
     """
     square = change.square().mean(1)
@@ -123,10 +121,10 @@ def near_base_color(change: Tensor, weights: Weights, views: int) -> Tensor:
 
 
 def palette(color: Tensor, tint: Tensor) -> Tensor:
-    """Sparsity of base colours: mean over random pairs of points of a robust distance of their colours.
+    """Sparsity of base colors: mean over random pairs of points of a robust distance of their colors.
 
-    color: ``(N, 3)`` logarithms of base colour at points in random order, each paired with the next.  tint: ``(N, 3)``
-    linear colour in the input images, of any scale; pairs of different chromaticity count less.  Variation within one
+    color: ``(N, 3)`` logarithms of base color at points in random order, each paired with the next.  tint: ``(N, 3)``
+    linear color in the input images, of any scale; pairs of different chromaticity count less.  Variation within one
     material is reduced, so that the light explains it; pairs that differ by much more than ``PALETTE_SCALE`` have
     almost no gradient (the global sparsity of reflectances of Barron and Malik 2015, Shape, Illumination, and
     Reflectance from Shading, section 4.1.2, on pairs).
@@ -139,10 +137,10 @@ def palette(color: Tensor, tint: Tensor) -> Tensor:
 
 
 def hue_drift(color: Tensor, start: Tensor) -> Tensor:
-    """Squared change of the object's mean chromaticity, in log base colour.
+    """Squared change of the object's mean chromaticity, in log base color.
 
-    color, start: ``(N, 3)`` logarithms of base colour at the same points.  A factor per channel is ambiguous between
-    base colour and light: a red object under white light looks like a white one under red light.  The start, a
+    color, start: ``(N, 3)`` logarithms of base color at the same points.  A factor per channel is ambiguous between
+    base color and light: a red object under white light looks like a white one under red light.  The start, a
     prediction from learned priors, resolves it.  The brightness is not constrained, as that of a start is often wrong.
     """
     drift = (color - start).mean(0)
@@ -151,17 +149,16 @@ def hue_drift(color: Tensor, start: Tensor) -> Tensor:
 
 def priors(unknowns: Unknowns, weights: Weights, views: int) -> Tensor:
     """Priors of material, light and exposures towards the start; those of the material are divided by ``views``."""
-    base, finish = ([grid[..., part] for grid in unknowns.material] for part in (slice(0, 3), slice(3, 5)))
-    loss = weights.base_coarse / views * near_start(base) + weights.finish / views * near_start(finish)
+    loss = weights.base_coarse / views * near_start(unknowns.material)
     loss = loss + weights.light * near_start(unknowns.light)
-    loss = loss + weights.light_variation * total_variation(light_field(unknowns.light, LIGHT_ROWS))
+    loss = loss + weights.light_variation * torch.stack([total_variation(m) for m in light_maps(unknowns.light)]).sum()
     return loss + weights.exposure * unknowns.exposure.square().mean()
 
 
 def shared_pattern(change: Tensor, shading: Tensor) -> Tensor:
-    """Squared correlation, over points, of the change of log base colour ``(N,)`` and log shading ``(N,)``.
+    """Squared correlation, over points, of the change of log base color ``(N,)`` and log shading ``(N,)``.
 
-    Base colour and shading are independent.  A change of the base colour that correlates with the shading, positively
+    Base color and shading are independent.  A change of the base color that correlates with the shading, positively
     or negatively, bakes an error of the light into it (after Hasselgren, Hofmann and Munkberg 2022, Shape, Light, and
     Material Decomposition, section 3: demodulation).
     """

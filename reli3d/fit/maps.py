@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -11,29 +12,30 @@ from reli3d._bridge import present
 from reli3d.fit import losses
 from reli3d.fit.bounce import reflected
 from reli3d.fit.budget import Budget
-from reli3d.fit.input_images import SATURATED_LINEAR, InputImages
+from reli3d.fit.input_images import SATURATED_LINEAR
+from reli3d.fit.lighting import Lights
+from reli3d.fit.materials import FixedSurface, Observed, searched, segmented
 from reli3d.fit.shading import radiance
 from reli3d.fit.unknowns import (
-    Start,
     Unknowns,
     bent,
-    environment,
-    material_change,
     material_logits,
     material_of,
+    surface_change,
 )
 from reli3d.geometry.hits import interpolate
 from reli3d.geometry.rays import RayScene
-from reli3d.render.asset import Asset
-from reli3d.render.gbuffer import primary_hits, sample_texture, surface_points
+from reli3d.render.gbuffer import primary_hits, surface_points
 from reli3d.render.points import SurfacePoints
 
 PIXELS_PER_STEP = 6144
 SHADING_SAMPLES = ((6, 6, 2), (12, 12, 4))  # of light, BSDF and cosine, in the first and the second half of a stage
 MAX_PIXELS = 400_000  # of all images: 46 MB; of more, a random subset
-LEARNING_RATES = {"material": 0.04, "detail": 0.03, "bend": 0.02, "light": 0.04, "exposure": 0.01}
+LEARNING_RATES = {"material": 0.04, "materials": 0.03, "detail": 0.03, "bend": 0.02, "light": 0.04, "exposure": 0.01}
 GRID_INTERVAL = 0.1  # of a stage's progress, after which the next finer map or grid is optimized as well
 DETAIL_FROM = 0.35  # progress from which the texture detail is optimized
+SEARCHES_AT = ((0.0, 0.3), (0.25, 1.0), (0.5, 1.0))  # progress at which materials are searched, largest roughness
+MIN_SEARCH_VIEWS = 4
 MATERIAL_UNTIL = 0.7  # progress at which the material is frozen, and the bend is reset and fitted with a stronger prior
 
 
@@ -63,13 +65,14 @@ class Pixels:
 
 
 @torch.no_grad()
-def traced(asset: Asset, received: Tensor, scene: RayScene, images: InputImages, views: list[int], seed: int) -> Pixels:
-    """The pixels of ``views`` that lie inside the masks by a pixel and whose rays hit ``asset``.
+def traced(data: FixedSurface, scene: RayScene, seed: int) -> Pixels:
+    """The pixels of the used views that lie inside the masks by a pixel and whose rays hit the surface.
 
-    received: ``(vertices, 3)``, of :func:`~reli3d.fit.bounce.gathered`.  seed: of the order.
+    scene: of the surface.  seed: of the order.
     """
+    asset, images = data.asset, data.images
     inside, mesh, parts = images.inside(), asset.mesh, []
-    for view in views:
+    for view in data.used:
         hits, _, directions = primary_hits(scene, images.camera[view])
         both = inside[view] & (hits.face >= 0)
         face, bary = hits.face[both], hits.bary[both]
@@ -86,7 +89,7 @@ def traced(asset: Asset, received: Tensor, scene: RayScene, images: InputImages,
                 uv,
                 material_logits(at),
                 images.color[view][both],
-                interpolate(received, mesh.faces, face, bary),
+                interpolate(data.received, mesh.faces, face, bary),
             )
         )
     columns = [torch.cat(column) for column in zip(*parts)]
@@ -104,38 +107,44 @@ def traced(asset: Asset, received: Tensor, scene: RayScene, images: InputImages,
 
 def maps_loss(
     unknowns: Unknowns,
-    start: Start,
+    data: FixedSurface,
     pixels: Pixels,
     rows: Tensor,
-    scene: RayScene | None,
     weights: losses.Weights,
     *,
+    scene: RayScene | None,
     samples: tuple[int, int, int],
-    views: int,
     seed: int,
     independent: bool = True,
 ) -> Tensor:
-    """Loss of one step over ``rows`` of the pixels, with gradients to material, detail, bend, light and exposure."""
+    """Loss of one step over ``rows`` of the pixels, with gradients to base color, materials, bend, light and exposure.
+
+    scene: casts shadows, None for none.  samples: of light, BSDF and cosine.  independent: use two independent
+    estimates of the shading; with False the gradient is that of the returned value, for tests.
+    """
     position, view, target = pixels.position[rows], pixels.view[rows], pixels.target[rows]
-    change = material_change(unknowns, position)
-    fine = sample_texture(unknowns.detail, pixels.uv[rows])
-    change = torch.cat([change[:, :3] + fine, change[:, 3:]], 1)
+    change = surface_change(unknowns, pixels.logits[rows], position, pixels.uv[rows])
     normal, turned = bent(unknowns, position, pixels.normal[rows])
     points = SurfacePoints(position, pixels.ng[rows], normal, *material_of(pixels.logits[rows] + change))
-    light, exposure = environment(unknowns, start), unknowns.exposure.exp()[view, None]
+    lights, exposure = Lights.of(unknowns, data.start, data.images), unknowns.exposure.exp()[view, None]
+
+    def lit(seed: int) -> Tensor:
+        shading = partial(radiance, samples=samples, scene=scene, seed=seed)
+        return lights.evaluate(points, pixels.wo[rows], view, shading)
+
     bounced = reflected(points, pixels.received[rows])
-    image = (bounced + radiance(points, pixels.wo[rows], light, samples=samples, scene=scene, seed=2 * seed)) * exposure
+    image = (bounced + lit(2 * seed)) * exposure
     other = image
     if independent:
         with torch.no_grad():
-            other = radiance(points, pixels.wo[rows], light, samples=samples, scene=scene, seed=2 * seed + 1)
-            other = (bounced + other) * exposure
+            other = (bounced + lit(2 * seed + 1)) * exposure
     loss = weights.image * losses.display_error(image, other, target, target > SATURATED_LINEAR)
     color, was = (
         c.clamp(min=losses.MIN_LINEAR).log() for c in (points.base_color, material_of(pixels.logits[rows])[0])
     )
     loss = loss + weights.palette * losses.palette(color, target) + weights.hue * losses.hue_drift(color, was)
-    loss = loss + losses.priors(unknowns, weights, views) + losses.near_base_color(change[:, :3], weights, views)
+    loss = loss + losses.priors(unknowns, weights, len(data.used))
+    loss = loss + losses.near_base_color(change[:, :3], weights, len(data.used))
     loss = loss + weights.bend * turned.square().sum(1).mean()
     if weights.demodulation:
         bright = other.detach().mean(1) / points.base_color.detach().mean(1).clamp(min=0.02)
@@ -152,32 +161,20 @@ def fading(progress: float, settled: bool) -> float:
 
 
 def fit_maps(
-    unknowns: Unknowns,
-    start: Start,
-    asset: Asset,
-    received: Tensor,
-    images: InputImages,
-    views: list[int],
-    weights: losses.Weights,
-    budget: Budget,
-    stage: MapsStage,
-    *,
-    seed: int,
+    unknowns: Unknowns, data: FixedSurface, weights: losses.Weights, budget: Budget, stage: MapsStage, *, seed: int
 ) -> None:
-    """Fit light, exposures and material on the surface of ``asset``, coarse to fine.
+    """Fit light, exposures and material on a fixed surface, coarse to fine.
 
-    received: ``(vertices, 3)``, of :func:`~reli3d.fit.bounce.gathered`.
-
-    Errors of normals, shadows and interreflection would be baked into the base colour.  While the material is fitted,
+    Errors of normals, shadows and interreflection would be baked into the base color.  While the material is fitted,
     a weakly regularized bend of the shading normals absorbs them.  Then the material is frozen and the bend is reset
     and fitted again with a stronger prior; only this bend is kept.
     """
-    scene = RayScene(asset.mesh.vertices, asset.mesh.faces)
-    pixels = traced(asset, received, scene, images, views, seed)
+    scene = RayScene(data.asset.mesh.vertices, data.asset.mesh.faces)
+    pixels = traced(data, scene, seed)
     count = len(pixels.order)
     if count == 0:
         return
-    names = ("light", "exposure", "material", *(("detail", "bend") if stage.detail else ()))
+    names = ("light", "exposure", "material", *(("materials", "detail", "bend") if stage.detail else ()))
     groups, opens = [], []
     for which in names:
         for k, value in enumerate(unknowns.groups()[which]):
@@ -186,13 +183,20 @@ def fit_maps(
             value.requires_grad_(True)
     optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99))
     first, settled = 0, False
-    free, kept = weights.free_bend * len(views), weights.bend / len(views) ** 2
+    searches = list(SEARCHES_AT) if stage.detail and len(data.used) >= MIN_SEARCH_VIEWS else []
+    seen: Observed | None = None
+    free, kept = weights.free_bend * len(data.used), weights.bend / len(data.used) ** 2
     for step, progress in budget.part(stage.name, stage.until):
         if stage.detail and progress >= MATERIAL_UNTIL and not settled:
             settled = True
-            for value in (*unknowns.material, unknowns.detail):
+            for value in (*unknowns.material, unknowns.materials, unknowns.detail):
                 value.requires_grad_(False)
             unknowns.reset_bend()
+        if searches and progress >= searches[0][0]:
+            _, limit = searches.pop(0)
+            if seen is None:
+                seen = segmented(unknowns, data, scene, seed)
+            searched(unknowns, data, seen, scene, seed, limit)
         fade = fading(progress, settled)
         for group, opening in zip(optimizer.param_groups, opens, strict=True):
             group["lr"] = group["full"] * fade if progress >= opening else 0.0
@@ -204,13 +208,12 @@ def fit_maps(
         samples = SHADING_SAMPLES[0] if progress < 0.5 else SHADING_SAMPLES[1]
         loss = maps_loss(
             unknowns,
-            start,
+            data,
             pixels,
             rows,
-            scene,
             replace(weights, bend=kept if settled else free),
+            scene=scene,
             samples=samples,
-            views=len(views),
             seed=seed * 1_000_003 + step,
         )
         optimizer.zero_grad()  # to None: Adam skips frozen tensors

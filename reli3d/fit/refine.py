@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 
 import torch
@@ -16,6 +16,7 @@ from reli3d.fit.budget import Budget, progress_bar
 from reli3d.fit.choice import UNCHANGED, Fitted, Parts, chosen, mean_psnr, view_errors
 from reli3d.fit.input_images import InputImages, PosedImages
 from reli3d.fit.maps import MapsStage, fit_maps
+from reli3d.fit.materials import FixedSurface
 from reli3d.fit.shape import ShapeData, finished, fit_shape, start_grid
 from reli3d.fit.transfer import dressed
 from reli3d.fit.unknowns import START_GRID, Start, Unknowns, corrected, filled_grid
@@ -26,7 +27,7 @@ RESOLUTION = 128  # cells along the longest side
 LIGHT = MapsStage("light", until=0.12, detail=False)  # first the light, then the surface, then all maps
 SHAPE_UNTIL = 0.5  # fraction of the budget
 MAPS = MapsStage("maps", until=1.0)
-MAX_DETAIL_TEXELS = 512  # along a side of the base colour's detail map
+MAX_DETAIL_TEXELS = 512  # along a side of the base color's detail map
 
 
 @dataclass(frozen=True)
@@ -87,6 +88,7 @@ def refine(
     resolution: int = RESOLUTION,
     weights: losses.Weights | None = None,
     cameras: bool = False,
+    light: str | Sequence[Hashable] = "object",
     seed: int = 0,
     bar: bool = False,
     interrupt: Callable[[], bool] | None = None,
@@ -96,14 +98,18 @@ def refine(
     views: images, masks and cameras in the frame of ``asset``.  seconds, steps: the budget, one of the two; with
     ``steps`` the result is deterministic on one machine.  resolution: cells of the surface's grid along the longest
     side, more for thin objects (:func:`~reli3d.fit.shape.start_grid`).  weights: of the loss terms.  cameras: optimize
-    the camera poses as well.  seed: of all random numbers.  bar: show progress on stderr.  interrupt: called before
-    every step; once it returns True the fit ends with the best result so far.
+    the camera poses as well.  light: ``object``, lighting fixed to the object; ``camera``, lighting that moves with the
+    camera, as that of a turntable or a flash; or for each view the name of its lighting.  The environment of the
+    result is then the lighting of view 0.  seed: of all random numbers.  bar: show progress on stderr.  interrupt:
+    called before every step; once it returns True the fit ends with the best result so far.
 
-    With three or more views some are held out (:func:`held_out`): their masks are used, their colours only to select
-    which parts of the fit are kept (:func:`~reli3d.fit.choice.chosen`).  Raises TypeError or ValueError if asset and
-    views have different devices, if shapes do not match, or if the asset lacks an environment, an atlas or faces.
+    With three or more views some are held out (:func:`held_out`): their masks are used, their colors only to select
+    which parts of the fit are kept (:func:`~reli3d.fit.choice.chosen`).  The inputs are detached: no gradient reaches
+    them, and the result has none.  Raises TypeError or ValueError if asset and views have different devices, if shapes
+    do not match, for another ``light``, for a budget that is not one positive number, or if the asset lacks an
+    environment, an atlas or faces.
     """
-    images, weights = InputImages.of(views), weights or losses.Weights()
+    images, weights = InputImages.of(views, light), weights or losses.Weights()
     _check_asset(asset, images)
     budget = Budget(seconds, steps, interrupt=interrupt)
     if bar:
@@ -116,8 +122,13 @@ def refine(
     received = gathered(first.mesh, near.select(used), seed=seed)
     before = view_errors(first, received, near)
     notes: list[str] = []
+    if images.light_moves:
+        notes.append("refinement: the lighting moves with the camera; the environment is that of view 0")
+    elif len(set(images.light_group)) > 1:
+        notes.append(f"refinement: {len(set(images.light_group))} lightings; the environment is that of view 0")
     with torch.random.fork_rng(devices=[]):
-        fitted = _fitted(first, received, near, used, resolution, weights, budget, notes, seed=seed, cameras=cameras)
+        data = FixedSurface(Start.of(first), first, received, near, used)
+        fitted = _fitted(data, _Options(resolution, weights, cameras, seed), budget, notes)
         kept, parts, after = chosen(fitted, used, list(held), before)
     if budget.bar is not None:
         budget.bar.close()
@@ -131,39 +142,38 @@ def refine(
     return Refinement(kept, parts, was, now, held, near.camera.c2w, tuple(notes), budget.curve, budget.counts)
 
 
-def _fitted(
-    first: Asset,
-    received: Tensor,
-    images: InputImages,
-    used: list[int],
-    resolution: int,
-    weights: losses.Weights,
-    budget: Budget,
-    notes: list[str],
-    *,
-    seed: int,
-    cameras: bool,
-) -> Fitted:
-    start, texels = Start.of(first), min(MAX_DETAIL_TEXELS, first.textures.size)
+@dataclass(frozen=True)
+class _Options:
+    """Those arguments of :func:`refine` that the stages read."""
+
+    resolution: int
+    weights: losses.Weights
+    cameras: bool
+    seed: int
+
+
+def _fitted(data: FixedSurface, options: _Options, budget: Budget, notes: list[str]) -> Fitted:
+    first, images, used, seed = data.asset, data.images, data.used, options.seed
+    start, weights, texels = data.start, options.weights, min(MAX_DETAIL_TEXELS, first.textures.size)
     closed = watertight(first.mesh)
     sdf = first.mesh.vertices.new_ones(2, 2, 2)  # unused placeholder: an open surface has no signed distance
     if closed:
-        grid, sdf, bound = start_grid(first.mesh, images, resolution)
-    unknowns = Unknowns.zero(sdf, len(images), texels)
-    fit_maps(unknowns, start, first, received, images, used, weights, budget, LIGHT, seed=seed)
-    surface = first
+        grid, sdf, bound = start_grid(first.mesh, images, options.resolution)
+    unknowns = Unknowns.zero(sdf, len(images), texels, max(images.light_group) + 1)
+    fit_maps(unknowns, data, weights, budget, LIGHT, seed=seed)
     if closed:
-        around = filled_grid(first.mesh.vertices, received, START_GRID)
-        data = ShapeData.of(start, sdf, bound, grid, around, images, used)
-        fit_shape(unknowns, data, weights, budget, SHAPE_UNTIL, seed=seed, cameras=cameras)
+        around = filled_grid(first.mesh.vertices, data.received, START_GRID)
+        shape = ShapeData.of(start, sdf, bound, grid, around, images, used)
+        fit_shape(unknowns, shape, weights, budget, SHAPE_UNTIL, seed=seed, cameras=options.cameras)
         mesh = finished(unknowns.sdf, bound, grid)
         surface = dressed(mesh, first, first.textures.size)
         images = replace(images, camera=corrected(images.camera, unknowns.pose))
         received = gathered(surface.mesh, images.select(used), seed=seed)
+        data = FixedSurface(start, surface, received, images, used)
     else:
         notes.append("refinement: the surface is not closed, so only maps and light are fitted")
-    fit_maps(unknowns, start, surface, received, images, used, weights, budget, MAPS, seed=seed)
-    return Fitted(first, surface, received, start, unknowns, images)
+    fit_maps(unknowns, data, weights, budget, MAPS, seed=seed)
+    return Fitted(first, data.asset, data.received, start, unknowns, images)
 
 
 def _check_asset(asset: Asset, images: InputImages) -> None:

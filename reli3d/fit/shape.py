@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -15,8 +16,9 @@ from reli3d.fit.budget import Budget
 from reli3d.fit.facets import flattened
 from reli3d.fit.fields import EvenAdam, blurred_grid
 from reli3d.fit.input_images import SATURATED_LINEAR, InputImages
+from reli3d.fit.lighting import Lights
 from reli3d.fit.shading import radiance
-from reli3d.fit.unknowns import Start, Unknowns, corrected, environment, material_change, material_of, unit
+from reli3d.fit.unknowns import Start, Unknowns, base_color_change, corrected, material_of, unit, with_base_color
 from reli3d.fit.view_colors import MIN_COVERAGE, display_planes, view_colors, view_weights
 from reli3d.geometry.distance import signed_distance
 from reli3d.geometry.grid import sample_grid
@@ -42,20 +44,20 @@ OUTLINE_VIEWS, OUTLINE_PIXELS = 2, 160  # views a step whose silhouettes are com
 SHADING_SAMPLES = (8, 8, 2)  # of light, BSDF and cosine
 STEP_CELLS = (0.6, 0.08)  # largest change of the signed distance in a step, at the start and the end
 BLUR_CELLS = (8, 2)  # width of the filter of the gradient, at the start and the end
-IMAGE_SCALES = (0.25, 1.0)  # of the images in which colours are compared, at the start and the end
+IMAGE_SCALES = (0.25, 1.0)  # of the images in which colors are compared, at the start and the end
 MIN_PART_FRACTION = 0.01  # of the faces; smaller components are removed
 
 
 @dataclass(frozen=True)
 class Grid:
-    """A grid of ``shape`` points with spacing ``cell``, centred at the origin."""
+    """A grid of ``shape`` points with spacing ``cell``, centerd at the origin."""
 
     shape: tuple[int, int, int]
     cell: float
 
     @classmethod
     def around(cls, vertices: Tensor, resolution: int) -> Grid:
-        """About ``resolution`` cells along the longest side of the origin-centred bounding box of ``vertices``."""
+        """About ``resolution`` cells along the longest side of the origin-centerd bounding box of ``vertices``."""
         reach = vertices.abs().amax(0)
         cell = 2.0 * float(reach.max()) / resolution
         return cls(tuple(2 * (math.ceil(r / cell) + MARGIN_CELLS) + 1 for r in reach.tolist()), cell)
@@ -155,7 +157,7 @@ class ShapeData:
     received: Tensor  # (n, n, n, 3) grid of :func:`~reli3d.fit.bounce.gathered`, equal on both sides of a thin wall
     images: InputImages  # for silhouettes
     planes: list[Tensor]  # of :func:`display_planes`, small to large
-    colored: list[int]  # views whose colours may be used
+    colored: list[int]  # views whose colors may be used
 
     @classmethod
     def of(
@@ -239,25 +241,27 @@ def _colors(unknowns, data, mesh, scene, weights, progress, rng, seed, independe
     view = torch.multinomial(weight[row].cpu(), 1, generator=rng)[:, 0].to(row.device)
     target = srgb_to_linear(color[row, view].detach())
     position, normal = position[row], normal[row]
-    change = material_change(unknowns, position)
-    logits = sample_grid(data.start.material, position) + change
+    change = base_color_change(unknowns, position)
+    logits = with_base_color(sample_grid(data.start.material, position), change)
     points = SurfacePoints(position, normal.detach(), normal, *material_of(logits))
-    light = environment(unknowns, data.start)
+    lights = Lights.of(unknowns, data.start, images)
     wo = unit(camera.c2w[view, :3, 3] - position).detach()
     bounced, exposure = reflected(points, sample_grid(data.received, position)), exposure[view, None]
-    image = (bounced + radiance(points, wo, light, samples=SHADING_SAMPLES, scene=scene, seed=2 * seed)) * exposure
-    other = image
+
+    def lit(seed: int) -> Tensor:
+        shading = partial(radiance, samples=SHADING_SAMPLES, scene=scene, seed=seed)
+        return (bounced + lights.evaluate(points, wo, view, shading)) * exposure
+
+    other = image = lit(2 * seed)
     if independent:
         with torch.no_grad():
-            other = (
-                bounced + radiance(points, wo, light, samples=SHADING_SAMPLES, scene=scene, seed=2 * seed + 1)
-            ) * exposure
+            other = lit(2 * seed + 1)
     loss = loss + weights.shading * losses.display_error(image, other, target, target > SATURATED_LINEAR)
     # the same ratio of the terms as in the fit of the maps
     loss = loss + weights.shading * weights.palette * losses.palette(
         points.base_color.clamp(min=losses.MIN_LINEAR).log(), target
     )
-    loss = loss + weights.shading * losses.near_base_color(change[:, :3], weights, len(data.colored))
+    loss = loss + weights.shading * losses.near_base_color(change, weights, len(data.colored))
     return loss + weights.shading * losses.priors(unknowns, weights, len(data.images))
 
 

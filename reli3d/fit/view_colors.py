@@ -1,4 +1,4 @@
-"""Colours of the input images at surface points, and the weights of the views there."""
+"""Colors of the input images at surface points, and the weights of the views there."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from reli3d.geometry.rays import RayScene
 from reli3d.geometry.visibility import visible_from
 from reli3d.render.color import linear_to_srgb
 
-MIN_COVERAGE = 0.9  # of the mask, from which a colour is used: pixels at the rim contain background
+MIN_COVERAGE = 0.9  # of the mask, from which a color is used: pixels at the rim contain background
 FULL_WEIGHT_COSINE = 0.2  # between normal and direction to the eye, from which a view has its full weight
 
 
 def view_colors(display: Tensor, position: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Samples colours ``(N, V, 3)`` and coverage ``(N, V)`` of the images at the projections of ``position (N, 3)``.
+    """Samples colors ``(N, V, 3)`` and coverage ``(N, V)`` of the images at the projections of ``position (N, 3)``.
 
     display: ``(V, 4, S, S)``, of :func:`display_planes`.  camera: batch of V.  Bilinear.  Gradients with respect to
     ``position`` and the cameras.

@@ -126,6 +126,7 @@ def load_views(
         in_folder=offered,
         chosen=tuple(taken) if every else None,
         origin=origin,
+        lighting=frames[0].lighting,
     )
 
 

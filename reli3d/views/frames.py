@@ -41,6 +41,7 @@ class Frame:
     c2w: np.ndarray  # (4, 4) float64, OpenGL axes
     lens: Lens
     notes: tuple[str, ...] = ()  # assumptions about it
+    lighting: str = "object"  # frame in which the lighting is fixed: object or camera
 
 
 def number(where: str, field: str, value: object, low: float = -math.inf, high: float = math.inf) -> float:

@@ -73,6 +73,9 @@ def read_transforms(path: Path) -> tuple[list[Frame], list[str]]:
     if len(frames) > MAX_FRAMES:
         raise InputError(path, f"frames: expected at most {MAX_FRAMES}, got {len(frames)}; keep the views to be used")
     check_keys(str(path), data)
+    lighting = data.get("lighting", "object")
+    if lighting not in ("object", "camera"):
+        raise InputError(path, f"lighting: expected object or camera, got {shown(lighting)}; correct the camera file")
     for i, frame in enumerate(frames):
         if not isinstance(frame, dict):
             raise InputError(path, f"frames[{i}]: expected an object, got {shown(frame)}; export the cameras again")
@@ -100,4 +103,5 @@ def _frame(path: Path, index: int, frame: dict, data: dict) -> Frame:
     check_keys(where, frame)
     notes: list[str] = []
     lens = lens_of(where, frame, data, notes)
-    return Frame(where, str(frame["file_path"]), image, mask, rigid(where, key, frame[key]), lens, tuple(notes))
+    pose, lighting = rigid(where, key, frame[key]), data.get("lighting", "object")
+    return Frame(where, str(frame["file_path"]), image, mask, pose, lens, tuple(notes), lighting)

@@ -66,6 +66,7 @@ class Views:
     notes: tuple[str, ...] = ()  # changes and assumptions of the reader, one line each
     in_folder: int | None = None  # number of views in the folder
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the world frame here, in that of the folder
+    lighting: str = "object"  # frame in which the lighting is fixed: object or camera
     chosen: tuple[int, ...] | None = None  # indices of the views for the network, at most 16, if all were read
 
     def __post_init__(self):

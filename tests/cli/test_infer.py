@@ -190,6 +190,12 @@ def test_a_refinement_writes_its_picture_and_its_curve(tmp_path):
 
 
 def test_a_refinement_of_no_time_is_refused(tmp_path, capsys):
-    for options in (["--refine", "-1"], ["--refine", "0steps"], ["--refine", "soon"], ["--refine-cameras"]):
+    for options in (
+        ["--refine", "-1"],
+        ["--refine", "0steps"],
+        ["--refine", "soon"],
+        ["--refine-cameras"],
+        ["--light", "camera"],
+    ):
         assert command(tmp_path, *options) == 2
         assert "refine" in capsys.readouterr().err and not (tmp_path / "out").exists()

@@ -10,6 +10,7 @@ from reli3d.fit import maps
 from reli3d.fit.budget import Budget
 from reli3d.fit.input_images import InputImages
 from reli3d.fit.losses import Weights
+from reli3d.fit.materials import FixedSurface
 from reli3d.fit.transfer import changed
 from reli3d.fit.unknowns import MAX_BEND, Start, Unknowns, bent
 from reli3d.geometry.bake import interpolate, rasterize_texels
@@ -42,12 +43,13 @@ def fitted(start, images, weights: Weights, steps: int = 40) -> Unknowns:
     unknowns = Unknowns.zero(torch.ones(2, 2, 2), VIEWS, small_scene.TEXELS)
     views, budget = list(range(VIEWS)), Budget(steps=steps)
     none = torch.zeros_like(start.mesh.vertices)
-    maps.fit_maps(unknowns, Start.of(start), start, none, images, views, weights, budget, STAGE, seed=0)
+    data = FixedSurface(Start.of(start), start, none, images, views)
+    maps.fit_maps(unknowns, data, weights, budget, STAGE, seed=0)
     return unknowns
 
 
 def patches(asset) -> float:
-    """Standard deviation of the logarithm of the base colour over the faces."""
+    """Standard deviation of the logarithm of the base color over the faces."""
     face = torch.arange(len(asset.mesh.faces), dtype=torch.int32)
     at = surface_points(asset.mesh, asset.textures, face, torch.full((len(face), 2), 1 / 3))
     return float(at.base_color.log().std(0).mean())
@@ -63,7 +65,7 @@ def test_waves_of_the_normals_are_baked_into_the_base_color_less(start, images):
 
 
 def hue(asset) -> torch.Tensor:
-    """Mean logarithm of the base colour ``(3,)`` without its brightness."""
+    """Mean logarithm of the base color ``(3,)`` without its brightness."""
     face = torch.arange(len(asset.mesh.faces), dtype=torch.int32)
     color = surface_points(asset.mesh, asset.textures, face, torch.full((len(face), 2), 1 / 3)).base_color.log().mean(0)
     return color - color.mean()
@@ -127,7 +129,8 @@ def test_the_material_is_frozen_while_the_kept_bend_is_fitted(start, images, mon
     monkeypatch.setattr(Budget, "record", looking)
     unknowns = Unknowns.zero(torch.ones(2, 2, 2), VIEWS, small_scene.TEXELS)
     budget, views, none = Budget(steps=20), list(range(VIEWS)), torch.zeros_like(start.mesh.vertices)
-    maps.fit_maps(unknowns, Start.of(start), start, none, images, views, Weights(), budget, STAGE, seed=0)
+    data = FixedSurface(Start.of(start), start, none, images, views)
+    maps.fit_maps(unknowns, data, Weights(), budget, STAGE, seed=0)
     first = int(maps.MATERIAL_UNTIL * 20)
     assert not torch.equal(seen[first - 2][0], seen[first - 1][0])
     assert torch.equal(seen[first][0], seen[-1][0]) and not torch.equal(seen[first][1], seen[-1][1])

@@ -11,6 +11,7 @@ from reli3d.fit import maps, shape
 from reli3d.fit.bounce import RAYS_PER_VERTEX, gathered, reflected
 from reli3d.fit.input_images import InputImages
 from reli3d.fit.losses import Weights
+from reli3d.fit.materials import FixedSurface
 from reli3d.fit.unknowns import Start, Unknowns, material_of
 from reli3d.geometry.camera import Camera, look_at
 from reli3d.geometry.mesh import Mesh
@@ -100,21 +101,19 @@ def test_a_fit_of_maps_includes_interreflection(monkeypatch):
     asset, images = small_scene.ball(), small_scene.input_views(small_scene.ball(), 3, 32)
     images, mesh = InputImages.of(images), asset.mesh
     received = torch.linspace(0.1, 0.5, len(mesh.vertices))[:, None].expand(-1, 3).contiguous()
-    pixels = maps.traced(asset, received, RayScene(mesh.vertices, mesh.faces), images, [0, 1, 2], seed=0)
+    data = FixedSurface(Start.of(asset), asset, received, images, [0, 1, 2])
+    pixels = maps.traced(data, RayScene(mesh.vertices, mesh.faces), seed=0)
     base_color, _, metallic = material_of(pixels.logits)
     shown = replace(pixels, target=1.5 * base_color * (1.0 - metallic[:, None]) * pixels.received)
     monkeypatch.setattr(maps, "radiance", lambda points, *args, **options: torch.zeros_like(points.base_color))
     weights = Weights(**{**dict.fromkeys(vars(Weights()), 0.0), "image": 1.0})
     unknowns = Unknowns.zero(torch.ones(2, 2, 2), 3, 8)
     unknowns.exposure += math.log(1.5)
-    options = {"samples": (1, 0, 0), "views": 3, "seed": 0}
+    options = {"scene": None, "samples": (1, 0, 0), "seed": 0}
 
     def loss(weight: float, independent: bool) -> float:
         rows = replace(shown, received=weight * pixels.received)
-        result = maps.maps_loss(
-            unknowns, Start.of(asset), rows, pixels.order, None, weights, independent=independent, **options
-        )
-        return float(result)
+        return float(maps.maps_loss(unknowns, data, rows, pixels.order, weights, independent=independent, **options))
 
     assert loss(1.0, False) < 1e-10 < 1e-4 < loss(0.5, False)
     assert loss(0.5, True) == loss(0.5, False)  # both estimates include it, and there is no noise

@@ -31,7 +31,7 @@ def fitted(first, images, *, light=None, base_color=0.0, surface=None) -> Fitted
     """A fit with this light, this change of the base color's logits, and this surface."""
     start, unknowns = Start.of(first), Unknowns.zero(torch.ones(2, 2, 2), VIEWS, small_scene.TEXELS)
     if light is not None:
-        unknowns.light[-1] = light.resized(LIGHT_ROWS).radiance.log() - start.light
+        unknowns.light[-1][0] = light.resized(LIGHT_ROWS).radiance.log() - start.light
     unknowns.material[0][..., :3] = base_color
     moved = first if surface is None else replace(surface, environment=first.environment)
     return Fitted(first, moved, torch.zeros_like(moved.mesh.vertices), start, unknowns, images)

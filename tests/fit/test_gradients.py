@@ -14,6 +14,7 @@ from torch import Tensor
 from reli3d.fit import maps, shape
 from reli3d.fit.input_images import InputImages
 from reli3d.fit.losses import Weights
+from reli3d.fit.materials import FixedSurface
 from reli3d.fit.unknowns import Start, Unknowns
 from reli3d.geometry.rays import RayScene
 from tests.support import small_scene
@@ -108,16 +109,17 @@ def test_the_gradient_of_the_bend_matches_central_differences(terms, monkeypatch
     unknowns, data = scene(plain=False)
     asset, images = replace(small_scene.ball(), environment=small_scene.sky()), data.images
     scene_of_rays, none = RayScene(asset.mesh.vertices, asset.mesh.faces), torch.zeros_like(asset.mesh.vertices)
-    pixels = maps.traced(asset, none, scene_of_rays, images, [0, 1, 2], seed=0)
+    surface = FixedSurface(data.start, asset, none, images, [0, 1, 2])
+    pixels = maps.traced(surface, scene_of_rays, seed=0)
     rng = torch.Generator().manual_seed(3)
     for grid in unknowns.bend:
         grid += 0.1 * torch.randn(grid.shape, generator=rng)
     directions = towards("all", unknowns.bend)
-    options = {"samples": LIGHT, "views": 3, "seed": 1, "independent": False}
+    options = {"scene": None, "samples": LIGHT, "seed": 1, "independent": False}
 
     def loss() -> Tensor:
         weights = Weights(**{**NONE, **terms})
-        return maps.maps_loss(unknowns, data.start, pixels, pixels.order[:400], None, weights, **options)
+        return maps.maps_loss(unknowns, surface, pixels, pixels.order[:400], weights, **options)
 
     for grid in unknowns.bend:
         grid.requires_grad_(True)

@@ -37,7 +37,7 @@ def refined(start, views):
 
 
 def half_colors(asset) -> torch.Tensor:
-    """Mean linear base colour of the faces of either half, ``(2, 3)``."""
+    """Mean linear base color of the faces of either half, ``(2, 3)``."""
     from reli3d.render.gbuffer import surface_points
 
     face = torch.arange(len(asset.mesh.faces), dtype=torch.int32)
@@ -54,7 +54,7 @@ def test_a_small_scene_is_recovered(refined, start):
     want = srgb_to_linear(torch.tensor([[0.8, 0.25, 0.2], [0.25, 0.6, 0.3]]))
     # a factor per channel is ambiguous between base color and light; the ratio of the halves is not
     error = ((got[0] / got[1]).log() - (want[0] / want[1]).log()).abs()
-    # measured 0.63 of what grey is off: 60 steps are few, and the palette draws colours together at first
+    # measured 0.63 of what grey is off: 60 steps are few, and the palette draws colors together at first
     assert float(error.max()) < 0.65 * float((want[0] / want[1]).log().abs().max())
 
 
@@ -85,12 +85,13 @@ def test_the_same_steps_and_seed_give_bitwise_identical_results(refined, start, 
 
 
 def test_a_worse_result_gives_the_start_and_is_reported(start, views, monkeypatch):
-    def spoiled(first, received, images, *args, **options):
+    def spoiled(data, *args):
+        first, images = data.asset, data.images
         unknowns = Unknowns.zero(torch.ones(2, 2, 2), VIEWS, 8)
         unknowns.material[0][..., :3] = torch.tensor([-8.0, 8.0, -8.0])
         unknowns.light[0][:] = torch.tensor([4.0, -4.0, 4.0])
         small = replace(first, mesh=replace(first.mesh, vertices=0.5 * first.mesh.vertices))
-        return Fitted(first, small, received, Start.of(first), unknowns, images)
+        return Fitted(first, small, data.received, Start.of(first), unknowns, images)
 
     monkeypatch.setattr(fit, "_fitted", spoiled)
     result = fit.refine(start, views, steps=1)

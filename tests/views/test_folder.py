@@ -257,3 +257,13 @@ def test_premultiplied_alpha_is_noted(tmp_path):
         pixels = np.stack([color_of, color_of * 0.7, color_of * 0.5, alpha], -1)
         Image.fromarray(np.rint(pixels * 255).astype(np.uint8)).save(tmp_path / "a.png")
         assert bool(load_views(tmp_path).notes) == noted
+
+
+def test_the_lighting_of_a_capture_is_read(tmp_path):
+    frames = evil.good(tmp_path)["frames"]
+    assert load_views(tmp_path).lighting == "object"
+    transforms(tmp_path, frames, lighting="camera")
+    assert load_views(tmp_path).lighting == "camera"
+    transforms(tmp_path, frames, lighting="turntable")
+    with pytest.raises(InputError, match="lighting: expected object or camera"):
+        load_views(tmp_path)

@@ -1,0 +1,75 @@
+"""Lighting of the input images: a map fixed to the object, one fixed to the camera, or one for each group of views."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from reli3d.fit.input_images import InputImages
+from reli3d.fit.unknowns import Start, Unknowns, light_maps
+from reli3d.render.environment import Environment
+from reli3d.render.latlong import lat_long_directions
+from reli3d.render.points import SurfacePoints
+
+
+@dataclass(frozen=True)
+class Lights:
+    """Environments of V views.
+
+    maps: ``(G, H, 2H, 3)`` radiance of G groups.  group: V indices of maps.  c2w: ``(V, 4, 4)`` if the maps are in the
+    axes of the cameras (+Y is the top of the image), None if they are in the object's frame.
+    """
+
+    maps: Tensor
+    group: Sequence[int]
+    c2w: Tensor | None = None
+
+    @classmethod
+    def of(cls, unknowns: Unknowns, start: Start, images: InputImages) -> Lights:
+        """The fitted lights of ``images``; gradients reach ``unknowns.light``."""
+        maps = (start.light + light_maps(unknowns.light)).exp()
+        return cls(maps, images.light_group, images.camera.c2w if images.light_moves else None)
+
+    def of_view(self, view: int) -> Environment:
+        """The environment of a view in the object's frame.  Gradients reach ``maps``."""
+        light = Environment(self.maps[self.group[view]].contiguous())
+        if self.c2w is None:
+            return light
+        height, width = self.maps.shape[1:3]
+        world = lat_long_directions(height, width).to(self.maps)
+        return Environment(light.lookup((world @ self.c2w[view, :3, :3]).contiguous()))
+
+    def distinct(self) -> list[list[int]]:
+        """Views of equal lighting."""
+        if self.c2w is not None:
+            return [[view] for view in range(len(self.group))]
+        return [[v for v, g in enumerate(self.group) if g == k] for k in dict.fromkeys(self.group)]
+
+    def scaled(self, factor: float) -> Lights:
+        """The same lights times ``factor``."""
+        return Lights(factor * self.maps, self.group, self.c2w)
+
+    def evaluate(
+        self,
+        points: SurfacePoints,
+        wo: Tensor,
+        view: Tensor,
+        radiance: Callable[[SurfacePoints, Tensor, Environment], Tensor],
+    ) -> Tensor:
+        """``radiance(points, wo, environment)`` of each row under the light of its ``view (N,)``, ``(N, 3)``."""
+        views = self.distinct()
+        if len(views) == 1:
+            return radiance(points, wo, self.of_view(views[0][0]))
+        kind = torch.zeros(len(self.group), dtype=torch.long, device=view.device)
+        for k, members in enumerate(views):
+            kind[members] = k
+        kind = kind[view]
+        out = wo.new_zeros(wo.shape)
+        for k in torch.unique(kind).tolist():
+            rows = torch.nonzero(kind == k)[:, 0]
+            shaded = radiance(points[rows], wo[rows], self.of_view(views[k][0]))
+            out = out.index_copy(0, rows, shaded)
+        return out

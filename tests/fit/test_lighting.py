@@ -1,0 +1,125 @@
+"""Lighting that moves with the camera or differs between groups of views is recovered, and relights as a fixed one."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from reli3d.fit import maps
+from reli3d.fit.bounce import gathered
+from reli3d.fit.budget import Budget
+from reli3d.fit.input_images import InputImages
+from reli3d.fit.lighting import Lights
+from reli3d.fit.losses import Weights
+from reli3d.fit.materials import FixedSurface
+from reli3d.fit.transfer import changed
+from reli3d.fit.unknowns import Start, Unknowns
+from reli3d.geometry.camera import Camera
+from reli3d.render.color import linear_to_srgb
+from reli3d.render.environment import Environment
+from reli3d.render.image import render_asset
+from reli3d.render.shading import ShadeOptions
+from tests.support import small_scene
+
+VIEWS, SIZE, STEPS = 6, 28, 30
+STAGE = maps.MapsStage("light", until=1.0, detail=False)  # light, exposures and the base color's grids
+OPTIONS = ShadeOptions(samples=(24, 8, 8), diffuse_model="published")
+
+
+def input_views(lights):
+    """The two-colored ball from all around, each view under its own light of ``lights(rotation of the camera)``."""
+    true, views = small_scene.two_colored(small_scene.ball()), []
+    batch = small_scene.input_views(small_scene.ball(), VIEWS, SIZE)
+    for k in range(VIEWS):
+        camera = Camera(batch.c2w[k], batch.intrinsics[k], SIZE, SIZE)
+        image = render_asset(true, camera, lights(k, batch.c2w[k, :3, :3]), options=OPTIONS, supersampling=2)
+        views.append(linear_to_srgb((image.radiance / image.alpha.clamp(min=1e-3)[..., None]).clamp(0, 1)))
+    return replace(batch, images=torch.stack(views))
+
+
+def camera_light(_, rotation) -> Environment:
+    """The sky in the axes of a camera, evaluated by the definition: radiance from d is that of the sky from R^T d."""
+    from reli3d.render.latlong import lat_long_directions
+
+    directions = lat_long_directions(32, 64).float().reshape(-1, 3)
+    return Environment(small_scene.sky().lookup((rotation.T @ directions.T).T.contiguous()).reshape(32, 64, 3))
+
+
+def fitted(views, light, steps: int = STEPS) -> tuple:
+    """Base color after a fit on the true surface from a gray ball under even light, and the lights."""
+    images = InputImages.of(views, light)
+    first = replace(small_scene.ball(), environment=Environment(torch.full((16, 32, 3), 0.5)))
+    unknowns = Unknowns.zero(torch.ones(2, 2, 2), VIEWS, small_scene.TEXELS, max(images.light_group) + 1)
+    data = FixedSurface(Start.of(first), first, gathered(first.mesh, images, seed=0), images, list(range(VIEWS)))
+    maps.fit_maps(unknowns, data, Weights(), Budget(steps=steps), STAGE, seed=0)
+    return changed(first, unknowns), Lights.of(unknowns, data.start, images)
+
+
+def relighting_error(asset) -> float:
+    """Mean square display error under another light, after the best factor, over four views."""
+    true, light = small_scene.two_colored(small_scene.ball()), small_scene.sky().rotated(2.0)
+    batch, errors = small_scene.input_views(small_scene.ball(), 4, 24), []
+    for k in range(4):
+        camera = Camera(batch.c2w[k], batch.intrinsics[k], 24, 24)
+        got, want = (render_asset(a, camera, light, options=OPTIONS) for a in (asset, true))
+        hit = want.alpha > 0.5
+        a, b = got.radiance[hit], want.radiance[hit]
+        a = a * (a * b).sum() / (a * a).sum()
+        errors.append((linear_to_srgb(a.clamp(0, 1)) - linear_to_srgb(b.clamp(0, 1))).square().mean())
+    return float(torch.stack(errors).mean())
+
+
+@pytest.fixture(scope="module")
+def fixed():
+    return fitted(input_views(lambda *_: small_scene.sky()), "object")[0]
+
+
+@pytest.fixture(scope="module")
+def moving_views():
+    return input_views(camera_light)
+
+
+def test_a_light_that_moves_with_the_camera_relights_as_a_fixed_one(fixed, moving_views):
+    moving, lights = fitted(moving_views, "camera")
+    assert relighting_error(moving) < 10**0.1 * relighting_error(fixed)  # within 1 dB
+    # the fitted map is in the camera's axes: bright above the camera, dark below, as the sky
+    rows = lights.maps[0].mean((1, 2))
+    assert float(rows[4:12].mean()) > 1.5 * float(rows[20:28].mean())
+
+
+def test_groups_of_views_have_lights_of_their_own():
+    dark = 0.4 * torch.tensor([0.6, 1.0, 1.4])
+    groups = ["day", "night"] * (VIEWS // 2)
+
+    def light(k, _):
+        return small_scene.sky() if groups[k] == "day" else Environment(small_scene.sky().radiance * dark)
+
+    _, lights = fitted(input_views(light), groups, steps=90)
+    means = lights.maps.mean((1, 2))
+    # measured 0.31; without a map for each group it is the log factors themselves, 1.4, 0.9 and 0.6
+    assert float((means[1] / means[0] / dark).log().abs().max()) < 0.45
+
+
+def test_a_camera_light_is_turned_into_the_frame_of_the_object(moving_views):
+    images = InputImages.of(moving_views, "camera")
+    lights = Lights(small_scene.sky().resized(64).radiance[None], images.light_group, images.camera.c2w)
+    for k in (0, 3):
+        want = camera_light(k, images.camera.c2w[k, :3, :3]).resized(64).radiance
+        assert float((lights.of_view(k).radiance - want).abs().mean()) < 0.02  # two bilinear lookups
+
+
+def test_lights_are_evaluated_for_their_own_rows():
+    lights = Lights(torch.tensor([1.0, 2.0])[:, None, None, None].expand(-1, 4, 8, 3), (0, 1, 0))
+    from reli3d.render.points import SurfacePoints
+
+    up = torch.tensor([[0.0, 0.0, 1.0]]).expand(5, -1).contiguous()
+    points = SurfacePoints(0.0 * up, up, up, torch.full((5, 3), 0.5), torch.full((5,), 0.5), torch.zeros(5))
+    got = lights.evaluate(points, up, torch.tensor([0, 1, 2, 1, 0]), lambda p, wo, light: light.lookup(wo))
+    assert got[:, 0].tolist() == [1.0, 2.0, 1.0, 2.0, 1.0]
+
+
+def test_another_light_is_refused(moving_views):
+    with pytest.raises(ValueError, match="light: expected object, camera or a name for each view, got 'sun'"):
+        InputImages.of(moving_views, "sun")
+    with pytest.raises(ValueError, match="light: expected the lighting of 6 views, got 2"):
+        InputImages.of(moving_views, [0, 1])
