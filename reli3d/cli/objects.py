@@ -14,6 +14,7 @@ import json
 import logging
 import os
 import pickle
+import re
 import signal
 import threading
 import time
@@ -148,7 +149,7 @@ def items_of(paths: Sequence[Path], output: Path) -> list[Item]:
 def listed(path: Path) -> list[Path]:
     """The folders named in a text file, one per line, relative to the working directory.  Raises InputError."""
     try:
-        lines = read_bytes(path, MAX_LIST).decode("utf-8-sig").splitlines()
+        lines = re.split(r"[\r\n]+", read_bytes(path, MAX_LIST).decode("utf-8-sig"))  # names may have other separators
     except UnicodeDecodeError as error:
         raise InputError(path, f"expected UTF-8 text, got other bytes at {error.start}; save it as UTF-8") from None
     folders = [Path(line.strip()) for line in lines if line.strip()]

@@ -246,3 +246,10 @@ def test_results_are_bitwise_identical_wherever_an_object_is_made(tmp_path, opti
     info = json.loads((tmp_path / "out/third/run_info.json").read_text())
     assert [r["object"] for r in table] == ["first", "second", "third"]
     assert float(table[2]["mask_iou"]) == info["mask_iou"] > 0.8 and int(table[2]["faces"]) == info["mesh"]["faces"]
+
+
+def test_only_line_ends_separate_the_folders_of_a_list(tmp_path):
+    """U+2028, U+0085 and the form feed, at which ``str.splitlines`` splits, are legal in names."""
+    names = ["a\u2028b", "c\x85d", "e\x0cf", "g h"]
+    (tmp_path / "list.txt").write_bytes("\r\n".join([*names, "", "i\nj\r"]).encode())
+    assert [i.name for i in objects.items_of([tmp_path / "list.txt"], tmp_path)] == [*names, "i", "j"]

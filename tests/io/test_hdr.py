@@ -106,7 +106,9 @@ def assert_mitsuba_reads_the_same(data: bytes, pixels: np.ndarray) -> None:
 def test_real_maps_read_as_mitsuba_reads_them(shared_data):
     mi = pytest.importorskip("mitsuba")
     mi.set_variant("scalar_rgb")
-    for path in sorted((shared_data / "hdri").glob("*.hdr"))[:3]:
+    paths = sorted((shared_data / "hdri").glob("*.hdr"))[:3]
+    assert len(paths) == 3
+    for path in paths:
         image = read_hdr_image(path)
         theirs = np.array(mi.Bitmap(str(path)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False))
         np.testing.assert_allclose(image.numpy(), theirs, rtol=1e-6)  # the same integers times powers of two
