@@ -17,7 +17,7 @@ from PIL import Image
 
 from reli3d.capture.mapping import Map, View, map_photos
 from reli3d.capture.masks import grabcut_mask, key_mask, moving_region, touches_border
-from reli3d.capture.photos import FEWEST, Photo, Progress, read_photos
+from reli3d.capture.photos import FEWEST, PHOTO_SUFFIXES, Photo, Progress, read_photos
 from reli3d.capture.scene import Plane, Scene, find_scene
 from reli3d.capture.sheet import contact_sheet
 from reli3d.errors import InputError, printable
@@ -35,6 +35,7 @@ KEPT_FRACTION = 0.9  # of the first map's images that the second must register
 SAME_UP = math.cos(math.radians(15.0))  # between the upward directions of views that saw the object in one pose
 SAME_RIG = 0.02  # of the distance: residual of camera positions up to which two maps are the same but for a similarity
 OUTLIER_AGREEMENT = 0.8  # of the median: a view whose mask the hull fills less is left out
+SIDE_ELEVATION = 45.0  # degrees up to which a direction looks at a side of the object
 LEAST_REGISTERED, MOST_ERROR, WIDEST_GAP = 0.8, 1.0, 60.0
 LEAST_POINTS, LEAST_AGREEMENT, LEAST_MASK = 200, 0.85, 0.03
 
@@ -62,7 +63,7 @@ class CaptureReport:
     views: list[str] = field(default_factory=list)
     reprojection_error: float = 0.0  # pixels, mean
     object_points: int = 0
-    gap: float = 0.0  # degrees, the widest between neighboring cameras around the object
+    gap: float = 0.0  # degrees, the widest between cameras around the object
     agreement: float = 0.0  # median fraction of a mask that the visual hull fills
     mask_fraction: float = 0.0  # median fraction of an image that the mask covers
     mask_method: str = ""
@@ -110,7 +111,7 @@ def capture(
         raise InputError("turntable", "expected images of a fixed camera in which the object turns, got others")
     if region is not None:
         notes.append("turntable: the camera is fixed and the object turns; the lighting is fixed to the camera")
-    if region is not None or any(p.flash for p in photos):
+    if region is not None or 2 * sum(p.flash for p in photos) > len(photos):
         report.lighting = "camera"
     known = _known_masks(photos, options, progress)
     first = map_photos(photos, progress, None if region is None else [region] * len(photos))
@@ -136,16 +137,17 @@ def capture(
     hull, filled = agreement(_as_views(views, final.masks))
     if len(hull.points) == 0:
         raise InputError(source, "expected masks of one object, got masks that no point lies inside of; give --masks")
-    frame = _frame(hull.points.numpy(), up, ground, options.size)
+    frame, box = _frame(hull.points.numpy(), up, ground, options.size)
     report.agreement = round(float(np.median(filled)), 3)
     report.mask_fraction = round(float(np.median([(final.masks[v.photo.name] > 127).mean() for v in views])), 4)
     report.views = [v.photo.name for v in views]
     report.unit = "meter" if options.size else "longest side"
     inside = _object_points(final, views)
     report.object_points = len(inside)
-    report.gap = round(_widest_gap(np.stack([frame.apply(v.eye) for v in views])), 1)
+    middle = (box[0] + box[1]) / 2
+    report.gap = round(widest_gap(np.stack([frame.apply(v.eye) for v in views]) - middle), 1)
     _check(report)
-    _write(output, views, final.masks, frame, report, frame.apply(inside), progress)
+    _write(output, views, final.masks, frame, box, report, frame.apply(inside), progress)
     return report
 
 
@@ -181,18 +183,31 @@ def _known_masks(photos: Sequence[Photo], options: CaptureOptions, progress: Pro
             mask = key_mask(photo.pixels)
         if mask is not None:
             found[photo.name] = mask
+    if len(found) < FEWEST:
+        where, what = "mask-method", "images of one object before a uniform background"
+        if options.masks:
+            where, what = str(options.masks), "masks with the names of the photographs, such as IMG_1.png of IMG_1.jpg,"
+        raise InputError(where, f"expected {what} for at least {FEWEST} of {len(photos)}, got {len(found)}")
     return found
 
 
 def _given_mask(folder: Path, photo: Photo) -> np.ndarray | None:
-    stem = Path(photo.name).stem
-    files = sorted(p for p in folder.iterdir() if p.is_file() and photo.name in (p.stem, p.name) or p.stem == stem)
+    """The mask in ``folder`` by the photograph's name, with or without that one's suffix before its own."""
+    files = []
+    for path in sorted(p for p in folder.iterdir() if p.is_file()):
+        before = Path(path.stem)
+        if photo.name in (path.name, path.stem) or (
+            before.suffix.lower() in PHOTO_SUFFIXES and photo.name == before.stem
+        ):
+            files.append(path)
     if not files:
         return None
     if len(files) > 1:
         raise InputError(folder, f"expected one mask of {printable(photo.name)}, got {files[0].name}, {files[1].name}")
     color, alpha = read_image(files[0])
-    mask = np.rint((color.mean(-1) if alpha is None else alpha).numpy() * 255).astype(np.uint8)
+    mask = np.rint((color.mean(-1) if alpha is None or bool((alpha == 1).all()) else alpha).numpy() * 255).astype(
+        np.uint8
+    )
     if abs(mask.shape[1] * photo.size[1] / (mask.shape[0] * photo.size[0]) - 1) > 0.01:
         raise InputError(files[0], f"expected the aspect of {photo.size[0]} x {photo.size[1]}, got {mask.shape[::-1]}")
     return cv2.resize(mask, photo.size, interpolation=cv2.INTER_AREA)
@@ -355,9 +370,9 @@ class _Frame:
         return self.scale * points @ self.turn.T + self.shift
 
 
-def _frame(hull: np.ndarray, up: np.ndarray, ground: float | None, size: float | None) -> _Frame:
+def _frame(hull: np.ndarray, up: np.ndarray, ground: float | None, size: float | None) -> tuple[_Frame, np.ndarray]:
     """``up`` to +Y, the ground at 0, the middle of the ``hull (N, 3)`` above the origin, its longest side 1 or
-    ``size`` millimeters.
+    ``size`` millimeters; and the box ``(2, 3)`` of the hull in it.
     """
     y = up / np.linalg.norm(up)
     x = np.cross(y, np.eye(3)[np.abs(y).argmin()])
@@ -372,7 +387,7 @@ def _frame(hull: np.ndarray, up: np.ndarray, ground: float | None, size: float |
     scale = (1.0 if size is None else size / 1000.0) / float((high - low).max())
     middle = (low + high) / 2
     middle[1] = bottom
-    return _Frame(scale, turn, -scale * middle)
+    return _Frame(scale, turn, -scale * middle), scale * (np.stack([low, high]) - middle)
 
 
 def _object_points(final: _Segmented, views: Sequence[View]) -> np.ndarray:
@@ -386,10 +401,18 @@ def _object_points(final: _Segmented, views: Sequence[View]) -> np.ndarray:
     return final.found.points[(count >= 2) & (hits > 0.7 * count)]
 
 
-def _widest_gap(eyes: np.ndarray) -> float:
-    """Degrees of the widest gap between neighboring cameras about the vertical axis."""
-    azimuth = np.sort(np.degrees(np.arctan2(eyes[:, 0], eyes[:, 2])))
-    return float(np.max(np.diff(azimuth, append=azimuth[0] + 360.0)))
+def widest_gap(eyes: np.ndarray) -> float:
+    """Degrees of the widest gap between the cameras ``eyes (V, 3)`` around an object at the origin, +Y up.
+
+    Twice the largest angle, over all azimuths, between a camera and the nearest direction of that azimuth at most
+    SIDE_ELEVATION up or down: for a level ring the angle between neighbors, up to 180; cameras that look down from
+    higher up see more of the sides, and from straight above none.
+    """
+    azimuth, elevation = np.radians(np.arange(360.0)), np.radians(np.linspace(-SIDE_ELEVATION, SIDE_ELEVATION, 31))
+    level, height = np.cos(elevation), np.broadcast_to(np.sin(elevation), (360, 31))
+    sides = np.stack([np.sin(azimuth)[:, None] * level, height, np.cos(azimuth)[:, None] * level], -1)
+    cosine = (sides @ (eyes / np.linalg.norm(eyes, axis=1, keepdims=True)).T).max((1, 2))
+    return float(2 * np.degrees(np.arccos(np.clip(cosine.min(), -1, 1))))
 
 
 def _check(report: CaptureReport) -> None:
@@ -415,7 +438,7 @@ def _check(report: CaptureReport) -> None:
     report.failed = [text for passed, text in checks if not passed]
 
 
-def _write(output, views, masks, frame: _Frame, report: CaptureReport, points: np.ndarray, progress: Progress) -> None:
+def _write(output, views, masks, frame: _Frame, box: np.ndarray, report: CaptureReport, points, progress) -> None:
     output.parent.mkdir(parents=True, exist_ok=True)
     work = output.with_name(f".{os.getpid()}.{os.urandom(4).hex()}.capture")
     try:
@@ -447,7 +470,13 @@ def _write(output, views, masks, frame: _Frame, report: CaptureReport, points: n
             )
             thumbnails.append((view.photo.name, image, mask, replace(view, radial=0.0)))
         turn, back = frame, lambda p: (p - frame.shift) @ frame.turn / frame.scale
-        content = {"camera_model": "PINHOLE", "lighting": report.lighting, "unit": report.unit, "frames": frames}
+        content = {
+            "camera_model": "PINHOLE",
+            "lighting": report.lighting,
+            "unit": report.unit,
+            "object_box": box.tolist(),
+            "frames": frames,
+        }
         (work / "transforms.json").write_text(json.dumps(content, indent=1))
         (work / "capture.json").write_text(json.dumps(asdict(report), indent=1))
         eyes = np.stack([turn.apply(v.eye) for v in views])

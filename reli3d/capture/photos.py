@@ -67,7 +67,8 @@ def read_photos(source: Path, progress: Progress) -> tuple[list[Photo], list[str
     flashes = sum(p.flash for p in photos)
     if flashes:
         notes.append(
-            f"{flashes} of {len(photos)} photographs were taken with flash: the lighting moves with the camera"
+            f"{flashes} of {len(photos)} photographs were taken with flash: "
+            f"the lighting {'moves with the camera' if 2 * flashes > len(photos) else 'differs'}"
         )
     return photos, notes
 

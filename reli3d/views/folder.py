@@ -127,6 +127,7 @@ def load_views(
         chosen=tuple(taken) if every else None,
         origin=origin,
         lighting=frames[0].lighting,
+        object_box=_moved_box(frames[0].object_box, origin),
     )
 
 
@@ -173,6 +174,10 @@ def _origin(frames: list[Frame], folder) -> tuple[tuple[float, float, float], li
         raise InputError(folder, str(error)) from None
     place = ", ".join(f"{v:.6g}" for v in at)
     return at, [f"the cameras are far from their origin: work is done about ({place})"] if any(at) else []
+
+
+def _moved_box(box: tuple | None, origin: tuple[float, float, float]) -> tuple[tuple[float, ...], ...] | None:
+    return box and tuple(tuple(a - b for a, b in zip(corner, origin)) for corner in box)
 
 
 def _poses(frames: list[Frame], origin: tuple[float, float, float]) -> Tensor:

@@ -42,6 +42,7 @@ class Frame:
     lens: Lens
     notes: tuple[str, ...] = ()  # assumptions about it
     lighting: str = "object"  # frame in which the lighting is fixed: object or camera
+    object_box: tuple[tuple[float, ...], ...] | None = None  # lower and upper corner, of all frames of the file
 
 
 def number(where: str, field: str, value: object, low: float = -math.inf, high: float = math.inf) -> float:

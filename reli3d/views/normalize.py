@@ -50,8 +50,8 @@ def normalize(views: Views, mode: str = "auto") -> Similarity:
     """The map from the frame of the input cameras to the network's frame (no rotation).
 
     mode ``none``: identity.  ``hull``: the box of the visual hull is centered and its longest side becomes 1, as in
-    training.  ``auto``: identity where the hull already sits well in the network's cube of half side 0.87, else
-    ``hull``.
+    training.  ``auto``: so the ``object_box`` of the views, where they have one; else identity where the hull already
+    sits well in the network's cube of half side 0.87, else ``hull``.
 
     Captures from one side, all eyes within 90 degrees seen from the object, leave its depth open: it is at most 1.3
     widths of the masks, where the hull is cut, and the box is aligned with the mean viewing direction, so that the
@@ -63,6 +63,10 @@ def normalize(views: Views, mode: str = "auto") -> Similarity:
         raise ValueError(f"mode: expected auto, none or hull, got {mode!r}")
     if mode == "none":
         return Similarity.identity()
+    if mode == "auto" and views.object_box is not None:
+        low, high = torch.tensor(views.object_box, dtype=torch.float64, device="cpu")
+        longest = float((high - low).max())
+        return Similarity(1.0 / longest, torch.eye(3, dtype=torch.float64, device="cpu"), -(low + high) / (2 * longest))
     hull = visual_hull(views)
     low, high = hull.box()
     inside = float(torch.maximum(-low, high).max()) <= SLACK * RADIUS

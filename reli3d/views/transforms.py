@@ -104,4 +104,19 @@ def _frame(path: Path, index: int, frame: dict, data: dict) -> Frame:
     notes: list[str] = []
     lens = lens_of(where, frame, data, notes)
     pose, lighting = rigid(where, key, frame[key]), data.get("lighting", "object")
-    return Frame(where, str(frame["file_path"]), image, mask, pose, lens, tuple(notes), lighting)
+    return Frame(
+        where, str(frame["file_path"]), image, mask, pose, lens, tuple(notes), lighting, _object_box(path, data)
+    )
+
+
+def _object_box(path: Path, data: dict) -> tuple[tuple[float, ...], ...] | None:
+    """``object_box`` of the file: lower and upper corner in the frame of the cameras."""
+    box = data.get("object_box")
+    if box is None:
+        return None
+    if not isinstance(box, list) or len(box) != 2 or any(not isinstance(c, list) or len(c) != 3 for c in box):
+        raise InputError(path, f"object_box: expected two corners of three numbers, got {shown(box)}; remove it")
+    low, high = (tuple(number(str(path), "object_box", value) for value in corner) for corner in box)
+    if not all(b > a for a, b in zip(low, high)):
+        raise InputError(path, f"object_box: expected the lower corner first, got {shown(box)}; remove it")
+    return low, high

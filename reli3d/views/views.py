@@ -68,6 +68,7 @@ class Views:
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the world frame here, in that of the folder
     lighting: str = "object"  # frame in which the lighting is fixed: object or camera
     chosen: tuple[int, ...] | None = None  # indices of the views for the network, at most 16, if all were read
+    object_box: tuple[tuple[float, ...], ...] | None = None  # lower and upper corner, where the folder has it
 
     def __post_init__(self):
         count = len(self.images)
@@ -116,11 +117,14 @@ class Views:
         return self if self.chosen is None else self.select(self.chosen)
 
     def transformed(self, similarity: Similarity) -> Views:
-        """The same images with the cameras transformed by ``similarity``; intrinsics are unchanged."""
+        """The same images with the cameras transformed by ``similarity``; intrinsics are unchanged.
+
+        The ``object_box``, which has the axes of the old frame, is dropped.
+        """
         c2w = self.c2w.double()
         rotation = similarity.rotation.to(c2w) @ c2w[:, :3, :3]
         rows = torch.cat([rotation, similarity.apply(c2w[:, :3, 3])[..., None]], -1)
-        return replace(self, c2w=torch.cat([rows, c2w[:, 3:]], -2).to(self.c2w.dtype))
+        return replace(self, c2w=torch.cat([rows, c2w[:, 3:]], -2).to(self.c2w.dtype), object_box=None)
 
     def to(self, device: torch.device | str) -> Views:
         """The same views with their tensors on ``device``."""

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from reli3d.capture.capture import capture
 from reli3d.errors import InputError
+from reli3d.synthetic.procedural import make_object
 from reli3d.views.folder import load_views
+from reli3d.views.normalize import normalize
+from reli3d.views.transforms import read_transforms
 from tests.support.capture_scene import render_capture
+from tests.support.rigs import eyes_around, sphere_views
 
 
 @pytest.fixture(scope="module")
@@ -83,6 +88,38 @@ def test_the_frame_is_upright_with_the_ground_at_zero(truth, captured):
     scale, turn, shift = similarity(want, got)
     assert (turn @ [0, 1, 0])[1] > np.cos(np.radians(1.0))
     assert abs(scale - 1.0) < 0.1  # the object's longest side is 1; a hull is larger than its object
+
+
+def test_a_capture_is_placed_by_the_box_of_its_object(truth, captured):
+    """The network's frame has the object's center at the origin although the capture's has the ground there."""
+    _, folder = captured
+    frames = json.loads((folder / "transforms.json").read_text())["frames"]
+    index = [int(f["file_path"][7:10]) for f in frames]
+    views = load_views(folder, every=True)
+    placed = normalize(views)
+    got = placed.apply(views.c2w[:, :3, 3].double()).numpy()
+    scale, turn, shift = similarity(truth.c2w[index, :3, 3], got)
+    vertices = make_object(3).vertices
+    center = (vertices.min(0) + vertices.max(0)) / 2
+    assert np.abs(scale * turn @ center + shift).max() < 0.06  # a hull of views from above reaches beyond its object
+    assert abs(scale * np.ptp(vertices, axis=0).max() - 1.0) < 0.1
+
+
+def test_a_low_object_that_stands_on_the_ground_is_not_taken_for_normalized():
+    flat = tuple((0.1 * x, 0.1, 0.1 * z, 0.1) for x in range(-4, 5) for z in (-1, 0, 1))
+    views = sphere_views(flat, eyes=eyes_around(8, 2.2))
+    assert normalize(views).is_identity()  # within what a hull of few views leaves open
+    placed = normalize(replace(views, object_box=((-0.5, 0.0, -0.2), (0.5, 0.2, 0.2))))
+    assert placed.scale == 1.0 and placed.translation.tolist() == [0.0, -0.1, 0.0]
+
+
+@pytest.mark.parametrize("box", [5, [[0, 0, 0]], [[0, 0, 0], [1, 1]], [[0, 0, 0], [1, "1", 1]], [[0, 1, 0], [1, 0, 1]]])
+def test_an_object_box_that_is_none_is_refused(captured, tmp_path, box):
+    _, folder = captured
+    data = json.loads((folder / "transforms.json").read_text()) | {"object_box": box}
+    (tmp_path / "transforms.json").write_text(json.dumps(data))
+    with pytest.raises(InputError, match="object_box"):
+        read_transforms(tmp_path / "transforms.json")
 
 
 def test_the_folder_is_whole_and_is_replaced_only_if_it_is_a_capture(truth, captured, tmp_path):

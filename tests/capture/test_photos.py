@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import av
 import numpy as np
+import pillow_heif
 import pytest
 from PIL import ExifTags, Image
 
+from reli3d.capture.capture import CaptureOptions, capture
 from reli3d.capture.photos import FRAME_COUNT, focal_from_exif, read_photos, sharpness
 from reli3d.errors import InputError
 
@@ -56,6 +58,38 @@ def test_photographs_are_upright_reduced_and_in_order(tmp_path):
     assert difference.mean() < 25  # JPEG of noise; a wrong turn differs by 85
 
 
+def test_heic_photographs_are_upright(tmp_path):
+    exif = Image.Exif()
+    exif[BASE.Orientation] = 6
+    exif.get_ifd(ExifTags.IFD.Exif)[BASE.FocalLengthIn35mmFilm] = 26
+    file = pillow_heif.from_pillow(Image.fromarray(textured(0, 80, 60)))
+    for k in range(8):
+        file.save(tmp_path / f"{k}.HEIC", exif=exif.tobytes())
+    photos, _ = read_photos(tmp_path, quiet)
+    assert photos[0].size == (60, 80) and photos[0].focal == pytest.approx(80 * 26 / 36)
+    difference = np.abs(photos[0].pixels.astype(int) - np.rot90(textured(0, 80, 60), -1).astype(int))
+    assert difference.mean() < 25  # HEVC of noise; a wrong turn differs by 85
+
+
+def test_masks_are_found_by_name_before_the_mapping(tmp_path):
+    photographs, masks = tmp_path / "photographs", tmp_path / "masks"
+    for folder in (photographs, masks):
+        folder.mkdir()
+    for k in range(8):
+        Image.fromarray(textured(k)).save(photographs / f"{k}.jpg")
+        Image.new("L", (100, 100)).save(masks / f"other{k}.png")
+    options = CaptureOptions(masks=masks)
+    with pytest.raises(InputError, match="masks with the names of the photographs.* at least 8 of 8, got 0"):
+        capture(photographs, tmp_path / "object", options)
+    Image.new("L", (100, 100)).save(masks / "0.jpg.png")  # as COLMAP names it
+    with pytest.raises(InputError, match=r"0\.jpg\.png.*aspect of 320 x 240"):
+        capture(photographs, tmp_path / "object", options)
+    Image.new("L", (320, 240)).save(masks / "0.png")
+    with pytest.raises(InputError, match=r"one mask of 0, got 0\.jpg\.png, 0\.png"):
+        capture(photographs, tmp_path / "object", options)
+    assert not (tmp_path / "object").exists()
+
+
 def test_flash_and_mixed_sizes_are_reported(tmp_path):
     exif = Image.Exif()
     exif.get_ifd(ExifTags.IFD.Exif)[BASE.Flash] = 0x19  # fired, auto
@@ -63,7 +97,7 @@ def test_flash_and_mixed_sizes_are_reported(tmp_path):
         pixels = textured(k) if k else textured(k, 200, 200)
         Image.fromarray(pixels).save(tmp_path / f"{k}.jpg", **({"exif": exif} if k < 3 else {}))
     _, notes = read_photos(tmp_path, quiet)
-    assert any("3 of 8" in n and "flash" in n for n in notes)
+    assert any("3 of 8" in n and "flash: the lighting differs" in n for n in notes)
     assert any("2 image sizes" in n for n in notes)
 
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+import pytest
 
+from reli3d.capture.capture import widest_gap
 from reli3d.capture.masks import cleaned, key_mask, moving_region, touches_border
 from reli3d.capture.scene import find_plane
 
@@ -79,3 +81,18 @@ def test_a_mask_that_is_cut_off_touches_the_border():
     assert not touches_border(mask)
     mask[20:80, 80:] = 255
     assert touches_border(mask)
+
+
+def ring(count: int, elevation: float, end: float = 360.0) -> np.ndarray:
+    azimuth, e = np.radians(np.arange(count) * end / count), np.radians(elevation)
+    return 3.0 * np.stack([np.cos(e) * np.sin(azimuth), np.full(count, np.sin(e)), np.cos(e) * np.cos(azimuth)], -1)
+
+
+def test_the_widest_gap_of_rings_of_cameras():
+    """Closed forms; directions are sampled every degree."""
+    assert widest_gap(ring(12, 0.0)) == pytest.approx(30.0, abs=1.0)
+    slant = 2 * np.degrees(np.arcsin(np.cos(np.radians(30)) * np.sin(np.radians(15))))
+    assert widest_gap(ring(12, 30.0)) == pytest.approx(slant, abs=1.0)
+    assert widest_gap(ring(8, 0.0, 240.0)) == pytest.approx(360 - 210, abs=1.0)  # the last stands at 210 degrees
+    assert widest_gap(ring(60, 85.0)) == pytest.approx(2 * (85 - 45), abs=1.0)  # from above no side is seen
+    assert widest_gap(np.concatenate([ring(12, 30.0), ring(12, -40.0)])) < 30
