@@ -25,11 +25,10 @@ from reli3d.fit.unknowns import (
     START_GRID,
     Start,
     Unknowns,
-    base_color_change,
     light_maps,
+    material_change,
     material_of,
     unit,
-    with_base_color,
 )
 from reli3d.geometry.camera import Camera, look_at
 from reli3d.geometry.grid import sample_grid
@@ -113,9 +112,7 @@ def step_of_a_fit(device, size, resolution):
         found = evaluate_hits(vertices, mesh.faces, found, eye, -wo)
         position = eye - found.t[:, None] * wo
         normal = unit(interpolate(normals, mesh.faces, found.face, found.bary))
-        material = material_of(
-            with_base_color(sample_grid(start.material, position), base_color_change(unknowns, position))
-        )
+        material = material_of(sample_grid(start.material, position) + material_change(unknowns, position))
         light = (start.light + light_maps(unknowns.light)[0]).exp()
         given = [normal, *material, light, unknowns.exposure.exp()[view, None]]
         tick("points")

@@ -78,9 +78,7 @@ class Fitted:
         asset, unknowns = self.surface, self.unknowns
         if material:
             grids, bend = ([material * grid for grid in grids] for grids in (unknowns.material, unknowns.bend))
-            detail, membership = material * unknowns.detail, material * unknowns.membership
-            change = replace(unknowns, material=grids, bend=bend, detail=detail, membership=membership)
-            asset = changed(asset, change)
+            asset = changed(asset, replace(unknowns, material=grids, bend=bend, detail=material * unknowns.detail))
         return replace(asset, environment=self.lights(light).of_view(0)) if light else asset
 
     def lights(self, weight: float) -> Lights:

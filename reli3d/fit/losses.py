@@ -33,6 +33,7 @@ class Weights:
     hue: float = 0.1  # of :func:`hue_drift`
     base_coarse: float = 0.02  # prior of the base color's coarse field towards the start, over the number of views
     base_color: float = 20.0  # of :func:`near_base_color`, over the 4th power of the number of views with used colors
+    finish: float = 0.05  # prior of roughness and metallic towards the start, over the number of views
     light: float = 2e-3  # prior of the light's maps towards the start
     light_variation: float = 2e-3  # of :func:`total_variation` of the light
     exposure: float = 0.1  # of squared log exposures; their mean is ambiguous with the light's scale
@@ -149,7 +150,8 @@ def hue_drift(color: Tensor, start: Tensor) -> Tensor:
 
 def priors(unknowns: Unknowns, weights: Weights, views: int) -> Tensor:
     """Priors of material, light and exposures towards the start; those of the material are divided by ``views``."""
-    loss = weights.base_coarse / views * near_start(unknowns.material)
+    base, finish = ([grid[..., part] for grid in unknowns.material] for part in (slice(0, 3), slice(3, 5)))
+    loss = weights.base_coarse / views * near_start(base) + weights.finish / views * near_start(finish)
     loss = loss + weights.light * near_start(unknowns.light)
     loss = loss + weights.light_variation * torch.stack([total_variation(m) for m in light_maps(unknowns.light)]).sum()
     return loss + weights.exposure * unknowns.exposure.square().mean()

@@ -12,31 +12,38 @@ from reli3d._bridge import present
 from reli3d.fit import losses
 from reli3d.fit.bounce import reflected
 from reli3d.fit.budget import Budget
-from reli3d.fit.input_images import SATURATED_LINEAR
+from reli3d.fit.input_images import SATURATED_LINEAR, InputImages
 from reli3d.fit.lighting import Lights
-from reli3d.fit.materials import FixedSurface, Observed, searched, segmented
 from reli3d.fit.shading import radiance
-from reli3d.fit.unknowns import (
-    Unknowns,
-    bent,
-    material_logits,
-    material_of,
-    surface_change,
-)
+from reli3d.fit.unknowns import Start, Unknowns, bent, material_change, material_logits, material_of
 from reli3d.geometry.hits import interpolate
 from reli3d.geometry.rays import RayScene
-from reli3d.render.gbuffer import primary_hits, surface_points
+from reli3d.render.asset import Asset
+from reli3d.render.gbuffer import primary_hits, sample_texture, surface_points
 from reli3d.render.points import SurfacePoints
 
 PIXELS_PER_STEP = 6144
 SHADING_SAMPLES = ((6, 6, 2), (12, 12, 4))  # of light, BSDF and cosine, in the first and the second half of a stage
 MAX_PIXELS = 400_000  # of all images: 46 MB; of more, a random subset
-LEARNING_RATES = {"material": 0.04, "materials": 0.03, "detail": 0.03, "bend": 0.02, "light": 0.04, "exposure": 0.01}
+LEARNING_RATES = {"material": 0.04, "detail": 0.03, "bend": 0.02, "light": 0.04, "exposure": 0.01}
 GRID_INTERVAL = 0.1  # of a stage's progress, after which the next finer map or grid is optimized as well
 DETAIL_FROM = 0.35  # progress from which the texture detail is optimized
-SEARCHES_AT = ((0.0, 0.3), (0.25, 1.0), (0.5, 1.0))  # progress at which materials are searched, largest roughness
-MIN_SEARCH_VIEWS = 4
 MATERIAL_UNTIL = 0.7  # progress at which the material is frozen, and the bend is reset and fitted with a stronger prior
+
+
+@dataclass(frozen=True)
+class FixedSurface:
+    """Constants of a fit of maps and light.
+
+    asset: the surface with the start's maps.  received: ``(vertices, 3)``, of :func:`~reli3d.fit.bounce.gathered`.
+    used: indices of the views whose colors are used.
+    """
+
+    start: Start
+    asset: Asset
+    received: Tensor
+    images: InputImages
+    used: list[int]
 
 
 @dataclass(frozen=True)
@@ -117,13 +124,15 @@ def maps_loss(
     seed: int,
     independent: bool = True,
 ) -> Tensor:
-    """Loss of one step over ``rows`` of the pixels, with gradients to base color, materials, bend, light and exposure.
+    """Loss of one step over ``rows`` of the pixels, with gradients to material, detail, bend, light and exposure.
 
     scene: casts shadows, None for none.  samples: of light, BSDF and cosine.  independent: use two independent
     estimates of the shading; with False the gradient is that of the returned value, for tests.
     """
     position, view, target = pixels.position[rows], pixels.view[rows], pixels.target[rows]
-    change = surface_change(unknowns, pixels.logits[rows], position, pixels.uv[rows])
+    detail = sample_texture(unknowns.detail, pixels.uv[rows])
+    change = material_change(unknowns, position)
+    change = torch.cat([change[:, :3] + detail, change[:, 3:]], 1)
     normal, turned = bent(unknowns, position, pixels.normal[rows])
     points = SurfacePoints(position, pixels.ng[rows], normal, *material_of(pixels.logits[rows] + change))
     lights, exposure = Lights.of(unknowns, data.start, data.images), unknowns.exposure.exp()[view, None]
@@ -174,7 +183,7 @@ def fit_maps(
     count = len(pixels.order)
     if count == 0:
         return
-    names = ("light", "exposure", "material", *(("materials", "detail", "bend") if stage.detail else ()))
+    names = ("light", "exposure", "material", *(("detail", "bend") if stage.detail else ()))
     groups, opens = [], []
     for which in names:
         for k, value in enumerate(unknowns.groups()[which]):
@@ -183,20 +192,13 @@ def fit_maps(
             value.requires_grad_(True)
     optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99))
     first, settled = 0, False
-    searches = list(SEARCHES_AT) if stage.detail and len(data.used) >= MIN_SEARCH_VIEWS else []
-    seen: Observed | None = None
     free, kept = weights.free_bend * len(data.used), weights.bend / len(data.used) ** 2
     for step, progress in budget.part(stage.name, stage.until):
         if stage.detail and progress >= MATERIAL_UNTIL and not settled:
             settled = True
-            for value in (*unknowns.material, unknowns.materials, unknowns.detail):
+            for value in (*unknowns.material, unknowns.detail):
                 value.requires_grad_(False)
             unknowns.reset_bend()
-        if searches and progress >= searches[0][0]:
-            _, limit = searches.pop(0)
-            if seen is None:
-                seen = segmented(unknowns, data, scene, seed)
-            searched(unknowns, data, seen, scene, seed, limit)
         fade = fading(progress, settled)
         for group, opening in zip(optimizer.param_groups, opens, strict=True):
             group["lr"] = group["full"] * fade if progress >= opening else 0.0

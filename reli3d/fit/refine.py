@@ -15,8 +15,7 @@ from reli3d.fit.bounce import gathered
 from reli3d.fit.budget import Budget, progress_bar
 from reli3d.fit.choice import UNCHANGED, Fitted, Parts, chosen, mean_psnr, view_errors
 from reli3d.fit.input_images import InputImages, PosedImages
-from reli3d.fit.maps import MapsStage, fit_maps
-from reli3d.fit.materials import FixedSurface
+from reli3d.fit.maps import FixedSurface, MapsStage, fit_maps
 from reli3d.fit.shape import ShapeData, finished, fit_shape, start_grid
 from reli3d.fit.transfer import dressed
 from reli3d.fit.unknowns import START_GRID, Start, Unknowns, corrected, filled_grid

@@ -18,7 +18,7 @@ from reli3d.fit.fields import EvenAdam, blurred_grid
 from reli3d.fit.input_images import SATURATED_LINEAR, InputImages
 from reli3d.fit.lighting import Lights
 from reli3d.fit.shading import radiance
-from reli3d.fit.unknowns import Start, Unknowns, base_color_change, corrected, material_of, unit, with_base_color
+from reli3d.fit.unknowns import Start, Unknowns, corrected, material_change, material_of, unit
 from reli3d.fit.view_colors import MIN_COVERAGE, display_planes, view_colors, view_weights
 from reli3d.geometry.distance import signed_distance
 from reli3d.geometry.grid import sample_grid
@@ -50,14 +50,14 @@ MIN_PART_FRACTION = 0.01  # of the faces; smaller components are removed
 
 @dataclass(frozen=True)
 class Grid:
-    """A grid of ``shape`` points with spacing ``cell``, centerd at the origin."""
+    """A grid of ``shape`` points with spacing ``cell``, centered at the origin."""
 
     shape: tuple[int, int, int]
     cell: float
 
     @classmethod
     def around(cls, vertices: Tensor, resolution: int) -> Grid:
-        """About ``resolution`` cells along the longest side of the origin-centerd bounding box of ``vertices``."""
+        """About ``resolution`` cells along the longest side of the origin-centered bounding box of ``vertices``."""
         reach = vertices.abs().amax(0)
         cell = 2.0 * float(reach.max()) / resolution
         return cls(tuple(2 * (math.ceil(r / cell) + MARGIN_CELLS) + 1 for r in reach.tolist()), cell)
@@ -241,8 +241,8 @@ def _colors(unknowns, data, mesh, scene, weights, progress, rng, seed, independe
     view = torch.multinomial(weight[row].cpu(), 1, generator=rng)[:, 0].to(row.device)
     target = srgb_to_linear(color[row, view].detach())
     position, normal = position[row], normal[row]
-    change = base_color_change(unknowns, position)
-    logits = with_base_color(sample_grid(data.start.material, position), change)
+    change = material_change(unknowns, position)
+    logits = sample_grid(data.start.material, position) + change
     points = SurfacePoints(position, normal.detach(), normal, *material_of(logits))
     lights = Lights.of(unknowns, data.start, images)
     wo = unit(camera.c2w[view, :3, 3] - position).detach()
@@ -261,7 +261,7 @@ def _colors(unknowns, data, mesh, scene, weights, progress, rng, seed, independe
     loss = loss + weights.shading * weights.palette * losses.palette(
         points.base_color.clamp(min=losses.MIN_LINEAR).log(), target
     )
-    loss = loss + weights.shading * losses.near_base_color(change, weights, len(data.colored))
+    loss = loss + weights.shading * losses.near_base_color(change[:, :3], weights, len(data.colored))
     return loss + weights.shading * losses.priors(unknowns, weights, len(data.images))
 
 

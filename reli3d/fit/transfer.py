@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from reli3d._bridge import present
-from reli3d.fit.unknowns import Unknowns, bent, material_logits, material_of, surface_change, unit
+from reli3d.fit.unknowns import Unknowns, bent, material_change, material_logits, material_of, unit
 from reli3d.geometry.bake import Texels, dilate, interpolate, interpolate_tangents, rasterize_texels
 from reli3d.geometry.hits import interpolate as at_hits
 from reli3d.geometry.mesh import Mesh
@@ -17,7 +17,7 @@ from reli3d.geometry.rays import RayScene
 from reli3d.geometry.tangents import encode_normals, vertex_tangents
 from reli3d.geometry.uv import unwrap
 from reli3d.render.asset import Asset, TextureSet
-from reli3d.render.gbuffer import surface_points
+from reli3d.render.gbuffer import sample_texture, surface_points
 from reli3d.render.points import SurfacePoints
 
 MAX_DISTANCE = 0.08  # of the surfaces along the new one's normal, in the box [-1, 1]^3
@@ -65,8 +65,8 @@ def changed(asset: Asset, unknowns: Unknowns) -> Asset:
     old = surface_points(asset.mesh, asset.textures, *found)
     row, column = torch.div(index, size, rounding_mode="floor"), index % size
     uv = (torch.stack([column, row], -1).float() + 0.5) / size
-    logits = material_logits(old)
-    logits = logits + surface_change(unknowns, logits, position, uv)
+    logits = material_logits(old) + material_change(unknowns, position)
+    logits[:, :3] += sample_texture(unknowns.detail, uv)
     color, roughness, metallic = material_of(logits)
     world, _ = bent(unknowns, position, old.normal)
     new = SurfacePoints(position, old.ng, world, color, roughness, metallic)

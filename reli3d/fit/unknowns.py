@@ -17,13 +17,13 @@ from reli3d.fit.fields import light_field, space_field
 from reli3d.geometry.bake import rasterize_texels
 from reli3d.geometry.camera import Camera
 from reli3d.render.asset import Asset
-from reli3d.render.gbuffer import sample_texture, surface_points
+from reli3d.render.gbuffer import surface_points
 from reli3d.render.points import SurfacePoints
 
 LOGIT_MARGIN = 0.005  # from 0 and 1 at which values are clamped before the logit
 MAX_ROUGHNESS, MIN_ROUGHNESS = 1.0, 0.05  # below, a lobe is narrower than the light's texels
 MATERIAL_GRIDS = (4, 8, 16, 32)  # points along a side of the box
-MATERIALS = 6  # into which the surface is segmented
+FINISH_GRIDS = 2  # number of them that roughness and metallic have: images constrain these poorly
 START_GRID = 32  # points along a side of the box
 MAX_BEND = 0.3  # length of the vector added to a unit normal: 17 degrees
 BEND_GRIDS = (8, 16, 32, 64)  # finer than the material's, which must not explain errors of the normals
@@ -36,19 +36,15 @@ MIN_RELATIVE_RADIANCE = 1e-4  # of the start's mean; its logarithm must be finit
 class Unknowns:
     """Variables of the optimization, in a frame in which the object fills the box [-1, 1]^3.
 
-    sdf: ``(X, Y, Z)`` signed distance, negative inside.  material: grids ``(n, n, n, 3)`` over the box, changes of the
-    base color's logits.  materials: ``(K, 5)``, for each of K materials the change of the base color's logits, and the
-    logits of roughness and metallic themselves.  membership: ``(H, W, K)`` over the atlas, weights of the materials,
-    not optimized; where their sum is 0, roughness and metallic are the start's.  detail: ``(T, T, 3)`` over the atlas,
-    changes of the base color's logits.  bend: grids ``(n, n, n, 3)`` over the box, added to the unit shading normal.
-    light: maps ``(G, h, 2h, 3)`` of G lightings, changes of log radiance.  exposure: ``(V,)`` logarithms.  pose:
-    ``(V, 6)``, a rotation vector [rad] and a translation in the camera's axes.
+    sdf: ``(X, Y, Z)`` signed distance, negative inside.  material: grids ``(n, n, n, 5)`` over the box, changes of
+    logits.  detail: ``(T, T, 3)`` over the atlas, changes of the base color's logits.  bend: grids ``(n, n, n, 3)``
+    over the box, added to the unit shading normal.  light: maps ``(G, h, 2h, 3)`` of G lightings, changes of log
+    radiance.  exposure: ``(V,)`` logarithms.  pose: ``(V, 6)``, a rotation vector [rad] and a translation in the
+    camera's axes.
     """
 
     sdf: Tensor
     material: list[Tensor]
-    materials: Tensor
-    membership: Tensor
     detail: Tensor
     bend: list[Tensor]
     light: list[Tensor]
@@ -61,9 +57,7 @@ class Unknowns:
         device = sdf.device
         return cls(
             sdf.clone(),
-            [torch.zeros(n, n, n, 3, device=device, dtype=torch.float32) for n in MATERIAL_GRIDS],
-            torch.zeros(MATERIALS, 5, device=device, dtype=torch.float32),
-            torch.zeros(1, 1, MATERIALS, device=device, dtype=torch.float32),
+            [torch.zeros(n, n, n, 5, device=device, dtype=torch.float32) for n in MATERIAL_GRIDS],
             torch.zeros(texels, texels, 3, device=device, dtype=torch.float32),
             [torch.zeros(n, n, n, 3, device=device, dtype=torch.float32) for n in BEND_GRIDS],
             [torch.zeros(lights, n, 2 * n, 3, device=device, dtype=torch.float32) for n in LIGHT_MAPS],
@@ -111,14 +105,9 @@ class Start:
 
 
 def material_logits(points: SurfacePoints) -> Tensor:
-    """:func:`logits_of` the material of ``points``."""
-    return logits_of(points.base_color, points.roughness, points.metallic)
-
-
-def logits_of(base_color: Tensor, roughness: Tensor, metallic: Tensor) -> Tensor:
     """``(N, 5)``: logits of linear base color, of roughness mapped from its range to [0, 1], and of metallic."""
-    rough = (roughness - MIN_ROUGHNESS) / (MAX_ROUGHNESS - MIN_ROUGHNESS)
-    values = torch.cat([base_color, rough[:, None], metallic[:, None]], 1)
+    rough = (points.roughness - MIN_ROUGHNESS) / (MAX_ROUGHNESS - MIN_ROUGHNESS)
+    values = torch.cat([points.base_color, rough[:, None], points.metallic[:, None]], 1)
     return torch.logit(values.clamp(LOGIT_MARGIN, 1.0 - LOGIT_MARGIN))
 
 
@@ -128,29 +117,11 @@ def material_of(logits: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return values[:, :3], MIN_ROUGHNESS + (MAX_ROUGHNESS - MIN_ROUGHNESS) * values[:, 3], values[:, 4]
 
 
-def base_color_change(unknowns: Unknowns, position: Tensor) -> Tensor:
-    """Change of the base color's logits ``(N, 3)`` at ``position (N, 3)`` by the grids."""
-    return space_field(unknowns.material, position)
-
-
-def with_base_color(logits: Tensor, change: Tensor) -> Tensor:
-    """``logits (N, 5)`` with ``change (N, 3)`` added to those of the base color."""
-    return torch.cat([logits[:, :3] + change, logits[:, 3:]], 1)
-
-
-def surface_change(
-    unknowns: Unknowns, logits: Tensor, position: Tensor, uv: Tensor, *, materials: bool = True
-) -> Tensor:
-    """Change of the start's ``logits (N, 5)`` at ``position (N, 3)`` and ``uv (N, 2)`` by grids, detail and, if
-    ``materials``, the segmented materials."""
-    base = base_color_change(unknowns, position) + sample_texture(unknowns.detail, uv)
-    change = torch.cat([base, torch.zeros_like(logits[:, 3:])], 1)
-    if not materials:
-        return change
-    planes = unknowns.membership.split(3, -1)
-    member = torch.cat([sample_texture(plane.contiguous(), uv) for plane in planes], 1)
-    start = torch.cat([torch.zeros_like(base), logits[:, 3:]], 1)
-    return change + member @ unknowns.materials - member.sum(1, keepdim=True) * start
+def material_change(unknowns: Unknowns, position: Tensor) -> Tensor:
+    """Change of the logits ``(N, 5)`` at ``position (N, 3)``; roughness and metallic from the coarse grids only."""
+    both = space_field(unknowns.material[:FINISH_GRIDS], position)
+    fine = space_field([grid[..., :3] for grid in unknowns.material[FINISH_GRIDS:]], position)
+    return both + torch.cat([fine, torch.zeros_like(both[:, 3:])], 1)
 
 
 def bent(unknowns: Unknowns, position: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:

@@ -11,7 +11,7 @@ from reli3d.fit import maps, shape
 from reli3d.fit.bounce import RAYS_PER_VERTEX, gathered, reflected
 from reli3d.fit.input_images import InputImages
 from reli3d.fit.losses import Weights
-from reli3d.fit.materials import FixedSurface
+from reli3d.fit.maps import FixedSurface
 from reli3d.fit.unknowns import Start, Unknowns, material_of
 from reli3d.geometry.camera import Camera, look_at
 from reli3d.geometry.mesh import Mesh

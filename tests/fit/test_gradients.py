@@ -14,7 +14,7 @@ from torch import Tensor
 from reli3d.fit import maps, shape
 from reli3d.fit.input_images import InputImages
 from reli3d.fit.losses import Weights
-from reli3d.fit.materials import FixedSurface
+from reli3d.fit.maps import FixedSurface
 from reli3d.fit.unknowns import Start, Unknowns
 from reli3d.geometry.rays import RayScene
 from tests.support import small_scene

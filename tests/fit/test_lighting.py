@@ -11,7 +11,7 @@ from reli3d.fit.budget import Budget
 from reli3d.fit.input_images import InputImages
 from reli3d.fit.lighting import Lights
 from reli3d.fit.losses import Weights
-from reli3d.fit.materials import FixedSurface
+from reli3d.fit.maps import FixedSurface
 from reli3d.fit.transfer import changed
 from reli3d.fit.unknowns import Start, Unknowns
 from reli3d.geometry.camera import Camera
