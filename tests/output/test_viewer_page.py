@@ -130,7 +130,7 @@ def test_the_page_shows_the_asset_as_the_renderer_does(tmp_path, asset, views):
         first = ours(asset, views, 0, asset.environment)
         own = psnr(picture(), shown(first), first.alpha)
         layers = {
-            "base colour": linear_to_srgb(first.base_color / first.alpha[..., None].clamp(min=1e-6)),
+            "base color": linear_to_srgb(first.base_color / first.alpha[..., None].clamp(min=1e-6)),
             "roughness": (first.roughness / first.alpha.clamp(min=1e-6))[..., None].expand(-1, -1, 3),
             "metallic": (first.metallic / first.alpha.clamp(min=1e-6))[..., None].expand(-1, -1, 3),
             "normal": torch.nn.functional.normalize(first.normal, dim=-1) / 2 + 0.5,

@@ -252,7 +252,7 @@ def test_bad_input_is_named(device):
         plan_samples(*at(*arguments[:4], arguments[4] * torch.nan, *arguments[5:]), env)
     camera = Camera.from_fov(eye(device, 0.0, 0.0, 2.0), 0.8, 8, 8)
     away = Camera(eye(device, 0.0, 0.0, 2.0), camera.intrinsics.new_tensor([9.0, 9.0, 900.0, 4.0]), 8, 8)
-    with pytest.raises(ValueError, match="camera: expected one that sees"):
+    with pytest.raises(ValueError, match="camera: expected the asset in view"):
         plan_render(ball(device), away, env)
     with pytest.raises(ValueError, match="environment: expected one"):
         plan_render(ball(device), camera)

@@ -76,10 +76,8 @@ def test_near_duplicates_and_a_narrow_baseline_are_reported():
 
 
 def folder(path, cameras) -> None:
-    data = evil.good(path)
-    frames = [
-        data["frames"][0] | {"transform_matrix": pose.tolist(), "view_index": i} for i, pose in enumerate(cameras)
-    ]
+    data = evil.good(path, len(cameras))
+    frames = [frame | {"transform_matrix": c.tolist()} for frame, c in zip(data["frames"], cameras, strict=True)]
     (path / "transforms.json").write_text(json.dumps({**data, "frames": frames}))
 
 

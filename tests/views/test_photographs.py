@@ -183,7 +183,10 @@ def test_16_large_photographs_take_less_than_a_gibibyte(tmp_path):
     """Peak of a process that reads 16 photographs of 24 megapixels, their masks beside them."""
     folder = capture(tmp_path / "large", 6000, 4000, (1500, 800, 4500, 3200))
     data = json.loads((folder / "transforms.json").read_text())
-    data["frames"] = [data["frames"][0] | {"transform_matrix": pose(0.39 * i)} for i in range(16)]
+    for i in range(16):
+        (folder / f"{i}.jpg").hardlink_to(folder / "a.jpg")
+        (folder / f"masks/{i}.png").hardlink_to(folder / "masks/a.png")
+    data["frames"] = [{"file_path": f"{i}.jpg", "transform_matrix": pose(0.39 * i)} for i in range(16)]
     (folder / "transforms.json").write_text(json.dumps(data))
     peak = r"re.search(r'VmHWM:\s+(\d+)', open('/proc/self/status').read())[1]"
     code = (
