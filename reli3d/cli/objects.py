@@ -37,6 +37,7 @@ MAX_LIST = 1 << 28  # bytes of a list of folders: a million names of 250 letters
 SUMMARY = "summary.csv"
 CRASHED = "its worker crashed twice; is there too little memory?"
 PATIENCE = 10.0  # seconds for a process to end before it is killed
+POLL = 0.2  # seconds: Python handles a signal that another thread received only after a blocking wait
 COLUMNS = ("object", "result", "seconds", "mask_iou", "faces", "retried", "notes")
 
 
@@ -243,7 +244,7 @@ def _rows(
         while left and len(running) < limit() and not (alone and (again or any(r for _, r in running.values()))):
             item = left.popleft()
             running[submit(item)] = item, False
-        for future in wait(running, return_when=FIRST_COMPLETED).done:
+        for future in wait(running, POLL, FIRST_COMPLETED).done:
             item, retried = running.pop(future)
             try:
                 row = future.result()

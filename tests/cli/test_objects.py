@@ -100,13 +100,24 @@ def made(args, device, budget):
 sys.modules["reli3d.cli.job"] = SimpleNamespace(FolderJob=made, worker=None)
 infer.choose_device = lambda wanted: "cpu"
 infer.functools = SimpleNamespace(partial=lambda *_: made(None, None, None).start())
+{}
 sys.exit(infer.main())
+"""
+# Delivers SIGINT to a thread other than the main one, which then waits undisturbed.
+INTERRUPT = """
+import signal, threading, time
+def interrupt(waits=[Path(a) / "waits" for a in sys.argv[3:5]]):
+    while not all(w.exists() for w in waits):
+        time.sleep(0.05)
+    time.sleep(0.5)
+    signal.pthread_kill(threading.get_ident(), signal.SIGINT)
+threading.Thread(target=interrupt, daemon=True).start()
 """
 
 
-def command(tmp_path, *arguments) -> subprocess.Popen:
+def command(tmp_path, *arguments, code: str = "") -> subprocess.Popen:
     return subprocess.Popen(
-        [sys.executable, "-c", COMMAND, tmp_path / "log", *map(str, arguments)],
+        [sys.executable, "-c", COMMAND.format(code), tmp_path / "log", *map(str, arguments)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -135,6 +146,15 @@ def test_a_signal_ends_all_processes_and_leaves_whole_results(tmp_path, number, 
     assert out.count("mesh.glb") == 2
     table = read_table(tmp_path / "out" / "summary.csv")
     assert [(r["object"], r["result"]) for r in table] == [("object0", "done"), ("object1", "done")]
+
+
+@pytest.mark.skipif(os.name == "nt", reason="needs signals")
+def test_a_signal_that_another_thread_receives_ends_the_command(tmp_path):
+    items = folders(tmp_path, ["one", "two", "wait", "wait", "five"])
+    process = command(tmp_path, *(i.folder for i in items), "--output", tmp_path / "out", "--workers", 2, code=INTERRUPT)
+    err = process.communicate(timeout=30)[1]  # the objects wait for a minute
+    assert process.returncode == 130 and err.count("reli3d-infer: ") == 1 and "Traceback" not in err
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["object0", "object1", "summary.csv"]
 
 
 @pytest.mark.skipif(os.name == "nt", reason="needs SIGKILL")
