@@ -76,6 +76,7 @@ def held_out(count: int) -> tuple[int, ...]:
     return () if count < 3 else (count // 2,) if count < 12 else (count // 3, 2 * count // 3)
 
 
+@torch.inference_mode(False)
 @torch.enable_grad()
 @full_precision
 def refine(

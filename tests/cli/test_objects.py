@@ -151,7 +151,9 @@ def test_a_signal_ends_all_processes_and_leaves_whole_results(tmp_path, number, 
 @pytest.mark.skipif(os.name == "nt", reason="needs signals")
 def test_a_signal_that_another_thread_receives_ends_the_command(tmp_path):
     items = folders(tmp_path, ["one", "two", "wait", "wait", "five"])
-    process = command(tmp_path, *(i.folder for i in items), "--output", tmp_path / "out", "--workers", 2, code=INTERRUPT)
+    process = command(
+        tmp_path, *(i.folder for i in items), "--output", tmp_path / "out", "--workers", 2, code=INTERRUPT
+    )
     err = process.communicate(timeout=30)[1]  # the objects wait for a minute
     assert process.returncode == 130 and err.count("reli3d-infer: ") == 1 and "Traceback" not in err
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["object0", "object1", "summary.csv"]

@@ -35,13 +35,13 @@ def samples(tmp_path_factory):
     return write_samples(tmp_path_factory.mktemp("packed"), seeds=(1, 2, 3), views=3)
 
 
-def write_capture(folder: Path, scores: dict | None, radius: float = 3.0) -> None:
-    """Three photographs of a disc of radius 0.6 about the origin, off the centre of frames of 60 by 40 pixels."""
+def write_capture(folder: Path, scores: dict | None, radius: float = 3.0, target: float = 0.45) -> None:
+    """Three photographs of a disc of radius 0.6 about the origin, off the center of frames of 60 by 40 pixels."""
     (folder / "images").mkdir(parents=True)
     frames = []
     for k, eye in enumerate(([0.3, 0.2, 3.0], [2.5, 0.5, 1.5], [-2.0, 1.0, 2.0])):
         eye = radius * np.array(eye) / np.linalg.norm(eye)
-        c2w = look_at(torch.tensor(eye, dtype=torch.float32), [0.45, 0.0, 0.0])  # the object is not in the middle
+        c2w = look_at(torch.tensor(eye, dtype=torch.float32), [target, 0.0, 0.0])
         camera = torch.tensor([50.0, 50.0, 30.0, 20.0])
         middle, depth = project(torch.zeros(1, 3), c2w, camera)
         y, x = np.mgrid[:40, :60] + 0.5
@@ -64,16 +64,17 @@ def captures(tmp_path_factory):
     write_capture(folder / "blurred", dict(zip(names, (2.0, 0.99), strict=True)))
     write_capture(folder / "broken", {"camera_quality_score": 2.0})
     write_capture(folder / "own", None, radius=6.0)
+    write_capture(folder / "side", None, target=1.15)
     return folder
 
 
 def test_captures_are_filtered_by_both_scores(captures):
     found = Captures(captures, 32)
-    assert [f.name for f in found.folders] == ["good", "own"]
+    assert [f.name for f in found.folders] == ["good", "own", "side"]
     assert "gaussian_splats_quality_score 0.99" in found.refused["blurred"] and "broken" in found.refused["broken"]
 
 
-def test_a_capture_is_cropped_centered_and_scaled_and_knows_where_its_photograph_ends(captures):
+def test_a_capture_is_cropped_centered_and_scaled(captures):
     found = Captures(captures, 32)
     for index in range(2):  # the second is as the first, seen from twice as far: the same size after scaling
         views = found.load(index, range)
@@ -85,10 +86,19 @@ def test_a_capture_is_cropped_centered_and_scaled_and_knows_where_its_photograph
             assert float((center - 16).abs().max()) < 2.5  # the hull of three views lies about the object
             width = float((views.masks[v] > 0.5).any(0).sum()) / float(views.intrinsics[v, 0]) * float(depth)
             assert 0.7 < width < 1.1  # longest side of the hull 1, the ball in it a little less
-    valid = views.valid
-    assert 0.0 < float(valid.min(0).values.mean()) < 1.0 or float(valid.mean()) == 1.0
-    whole = torch.where(valid > 0, 0.0, 1.0) * views.masks
-    assert float(whole.max()) == 0.0  # the object is never shown where there is no photograph
+
+
+def test_pixels_outside_a_photograph_are_not_valid(captures):
+    views = Captures(captures, 32).load(2, range)
+    y, x = torch.meshgrid(torch.arange(32) + 0.5, torch.arange(32) + 0.5, indexing="ij")
+    for v in range(3):
+        fx, fy, cx, cy = views.intrinsics[v]
+        column, row = 50 * (x - cx) / fx + 30, 50 * (y - cy) / fy + 20  # of the photograph
+        inside = torch.minimum(torch.minimum(column, 60 - column), torch.minimum(row, 40 - row))
+        certain = inside.abs() > 1.0  # resampling blends a pixel across the border
+        assert bool((inside < -1).any()) or v > 0
+        assert torch.equal((views.valid[v] > 0.5)[certain], (inside > 0)[certain])
+        assert float(views.masks[v][inside < -1].sum()) == 0.0
 
 
 def test_a_capture_takes_part_without_ground_truth(captures):
