@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -22,11 +21,13 @@ from reli3d.capture.scene import Plane, Scene, find_scene
 from reli3d.capture.sheet import contact_sheet
 from reli3d.errors import InputError, printable
 from reli3d.io.images import read_image
+from reli3d.output.folder import check_place, claimed
 from reli3d.views.background import Remover
 from reli3d.views.check import agreement
 from reli3d.views.choose import choose_views
 from reli3d.views.views import Views
 
+RESULT_FILES = ("images", "masks", "transforms.json", "capture.json", "capture.png")
 MASK_METHODS = ("grabcut", "key", "rembg")
 MOST_VIEWS = 60  # of the object folder; more are thinned by the distance between their cameras
 MASK_SIDE = 512  # pixels of masks by which the visual hull is judged
@@ -103,7 +104,7 @@ def capture(
     options = options or CaptureOptions()
     source, output = Path(source), Path(output)
     _check_options(options)
-    _check_output(output)
+    _check_output(source, output)
     photos, notes = read_photos(source, progress)
     report = CaptureReport(len(photos), notes=notes, mask_method="given" if options.masks else options.mask_method)
     region = None if options.turntable is False else moving_region([p.pixels for p in photos])
@@ -160,9 +161,10 @@ def _check_options(options: CaptureOptions) -> None:
         raise InputError("size", f"expected 0.1 to 1000000 millimeters, got {options.size}")
 
 
-def _check_output(output: Path) -> None:
-    if output.exists() and not output.is_dir():
-        raise InputError(output, "expected a folder for the result, got a file; give another")
+def _check_output(source: Path, output: Path) -> None:
+    check_place(output)
+    if output.resolve() in (source.resolve(), *source.resolve().parents) and (output / "capture.json").exists():
+        raise InputError(output, "expected a folder without the images that are read, got theirs; give another")
     if output.is_dir() and any(output.iterdir()) and not (output / "capture.json").exists():
         raise InputError(output, "expected an empty folder or an earlier capture, got other files; give another")
 
@@ -172,7 +174,7 @@ def _known_masks(photos: Sequence[Photo], options: CaptureOptions, progress: Pro
     if options.masks is None and options.mask_method == "grabcut":
         return None
     found: dict[str, np.ndarray] = {}
-    remover = Remover() if options.masks is None and options.mask_method == "rembg" else None
+    remover = Remover("mask-method") if options.masks is None and options.mask_method == "rembg" else None
     for k, photo in enumerate(photos):
         progress("masks", k, len(photos))
         if options.masks:
@@ -438,16 +440,16 @@ def _check(report: CaptureReport) -> None:
     report.failed = [text for passed, text in checks if not passed]
 
 
-def _write(output, views, masks, frame: _Frame, box: np.ndarray, report: CaptureReport, points, progress) -> None:
-    output.parent.mkdir(parents=True, exist_ok=True)
-    work = output.with_name(f".{os.getpid()}.{os.urandom(4).hex()}.capture")
-    try:
+def _write(output: Path, views, masks, frame: _Frame, box: np.ndarray, report: CaptureReport, points, progress) -> None:
+    stems = [Path(v.photo.name).stem for v in views]
+    if len(set(stems)) < len(stems):
+        stems = [f"{k:04d}" for k in range(len(views))]
+    with claimed(output, RESULT_FILES) as replacing, replacing() as work:
         frames, thumbnails = [], []
         for name in ("images", "masks"):
-            (work / name).mkdir(parents=True)
-        for k, view in enumerate(views):
+            (work / name).mkdir()
+        for k, (stem, view) in enumerate(zip(stems, views, strict=True)):
             progress("writing", k, len(views))
-            stem = Path(view.photo.name).stem if views_are_unique(views) else f"{k:04d}"
             image = view.undistorted(view.photo.pixels)
             mask = view.undistorted(masks[view.photo.name])
             Image.fromarray(image).save(work / "images" / f"{stem}.jpg", quality=95, subsampling=0)
@@ -469,7 +471,6 @@ def _write(output, views, masks, frame: _Frame, box: np.ndarray, report: Capture
                 }
             )
             thumbnails.append((view.photo.name, image, mask, replace(view, radial=0.0)))
-        turn, back = frame, lambda p: (p - frame.shift) @ frame.turn / frame.scale
         content = {
             "camera_model": "PINHOLE",
             "lighting": report.lighting,
@@ -479,22 +480,11 @@ def _write(output, views, masks, frame: _Frame, box: np.ndarray, report: Capture
         }
         (work / "transforms.json").write_text(json.dumps(content, indent=1))
         (work / "capture.json").write_text(json.dumps(asdict(report), indent=1))
-        eyes = np.stack([turn.apply(v.eye) for v in views])
+        eyes = np.stack([frame.apply(v.eye) for v in views])
         lines = [summary(report), *(f"check failed: {text}" for text in report.failed[:1])]
+        back = lambda p: (p - frame.shift) @ frame.turn / frame.scale  # noqa: E731
         contact_sheet(thumbnails, points, eyes, back, lines).save(work / "capture.png")
-        old = output.with_name(f".{os.getpid()}.{os.urandom(4).hex()}.old")
-        if output.exists():
-            os.replace(output, old)
-        os.replace(work, output)
-        shutil.rmtree(old, ignore_errors=True)
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
     progress("writing", len(views), len(views))
-
-
-def views_are_unique(views: Sequence[View]) -> bool:
-    """Whether the names of the photos differ without their suffixes."""
-    return len({Path(v.photo.name).stem for v in views}) == len(views)
 
 
 def summary(report: CaptureReport) -> str:

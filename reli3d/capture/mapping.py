@@ -5,17 +5,19 @@ Cameras are world-to-camera in OpenCV axes here (+X right, +Y down, looking alon
 
 from __future__ import annotations
 
-import importlib
 import math
+import signal
 import tempfile
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 
 import cv2
 import numpy as np
 
-from reli3d.capture.photos import Photo, Progress
+from reli3d.capture.photos import Photo, Progress, optional_module
 from reli3d.errors import InputError
 
 FEATURES = 4096  # SIFT features of an image
@@ -105,18 +107,23 @@ def map_photos(photos: Sequence[Photo], progress: Progress, masks: Sequence[np.n
     if best is None:
         raise InputError(
             "photographs",
-            "expected images that overlap, got none that match; take sharp ones with small steps around an object "
-            "with texture, or on a printed sheet of newspaper",
+            "expected images that overlap, from different places, got none that match; take sharp ones, walk around "
+            "the object in small steps, and put one without texture on a sheet of newspaper",
         )
     return best
 
 
+def _pycolmap() -> ModuleType:
+    handler = signal.getsignal(signal.SIGTERM)
+    module = optional_module("pycolmap")
+    if threading.current_thread() is threading.main_thread() and handler is not None:
+        signal.signal(signal.SIGTERM, handler)  # the import replaced it by one that prints a stack trace
+    module.logging.minloglevel = 3
+    return module
+
+
 def _mapped(photos, masks, work: Path, side: int, relaxed: bool, progress: Progress) -> Map | None:
-    try:
-        pycolmap = importlib.import_module("pycolmap")
-    except ModuleNotFoundError:
-        raise InputError("pycolmap", "is not installed: pip install 'reli3d[capture]'") from None
-    pycolmap.logging.minloglevel = 3
+    pycolmap = _pycolmap()
     pycolmap.set_random_seed(SEED)
     lenses = sorted({p.lens for p in photos}, key=str)
     images, database, scales, by_path = work / "images", work / "database.db", {}, {}

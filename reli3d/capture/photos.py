@@ -65,6 +65,8 @@ def read_photos(source: Path, progress: Progress) -> tuple[list[Photo], list[str
     if len(sizes) > 1:
         notes.append(f"{len(sizes)} image sizes: each is calibrated as a camera of its own")
     flashes = sum(p.flash for p in photos)
+    if not any(p.focal for p in photos):
+        notes.append("no focal length in the files: it is estimated from the images alone")
     if flashes:
         notes.append(
             f"{flashes} of {len(photos)} photographs were taken with flash: "
@@ -78,7 +80,7 @@ def _read_folder(folder: Path, progress: Progress) -> tuple[list[Photo], list[st
     if not files and (folder / "images").is_dir():
         return _read_folder(folder / "images", progress)
     if any(p.suffix.lower() in (".heic", ".heif") for p in files):
-        _extra("pillow_heif").register_heif_opener()
+        optional_module("pillow_heif").register_heif_opener()
     notes, step = [], -(-len(files) // MOST_PHOTOS)
     if step > 1:
         notes.append(f"one of {step} photographs is read: {len(files[::step])} of {len(files)}")
@@ -93,7 +95,8 @@ def _read_folder(folder: Path, progress: Progress) -> tuple[list[Photo], list[st
     return photos, notes
 
 
-def _extra(module: str) -> ModuleType:
+def optional_module(module: str) -> ModuleType:
+    """A module of the extra ``capture``; raises InputError with the command that installs it."""
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError:
@@ -159,10 +162,10 @@ def sharpness(pixels: np.ndarray) -> float:
 
 def _read_video(path: Path, progress: Progress) -> tuple[list[Photo], list[str]]:
     """The sharpest frame of each of FRAME_COUNT windows of equal length."""
-    av = _extra("av")
+    av = optional_module("av")
     file_size(path)
     best: dict[int, tuple[float, np.ndarray]] = {}
-    count = 0
+    count, notes = 0, []
     try:
         with av.open(str(path)) as file:
             if not file.streams.video:
@@ -183,8 +186,9 @@ def _read_video(path: Path, progress: Progress) -> tuple[list[Photo], list[str]]
     except Exception as error:  # FFmpeg's errors have many classes
         if len(best) < FEWEST:
             raise InputError(path, f"cannot be decoded ({shown(str(error))}); record it again") from None
+        notes.append(f"the video cannot be decoded from frame {count} of {total} on")
     photos = [Photo(f"frame_{k:04d}", best[k][1], None, (best[k][1].shape,)) for k in sorted(best)]
-    return photos, [f"{len(photos)} sharp frames taken of {count} of the video"]
+    return photos, [f"{len(photos)} sharp frames taken of {count} of the video", *notes]
 
 
 def _frame_pixels(frame) -> np.ndarray:

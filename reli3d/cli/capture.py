@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 from reli3d.cli.exit_codes import Parser, command
+from reli3d.errors import printable
 
 FAILED_CHECKS = 3  # exit code
 LEAST_IOU = 0.9  # of the asset's silhouettes with the masks
@@ -72,25 +73,25 @@ def main(argv: list[str] | None = None) -> int:
     if report.lost:
         lines.append(f"not registered: {', '.join(report.lost)}")
     for line in [*lines, summary(report), *(f"check failed: {text}" for text in report.failed)]:
-        print(f"reli3d capture: {line}", file=sys.stderr)
+        print(f"reli3d capture: {printable(line)}", file=sys.stderr)
     print(args.output)
-    if args.infer and _infer(args.output):
-        return FAILED_CHECKS
-    return FAILED_CHECKS if report.failed else 0
+    code = FAILED_CHECKS if report.failed else 0
+    return _infer(args.output) or code if args.infer else code
 
 
-def _infer(folder: Path) -> bool:
-    """Reconstruct ``folder``; whether the asset's silhouettes do not fill the masks."""
+def _infer(folder: Path) -> int:
+    """Reconstructs ``folder`` and returns the exit code: 3 where the asset's silhouettes differ from the masks."""
     from reli3d.cli import infer
 
-    code = infer.main([str(folder), "--output", str(folder / "asset")])
-    if code:
-        return True
+    if code := infer.main([str(folder), "--output", str(folder / "asset")]):
+        return code
     info = next((folder / "asset").glob("*/run_info.json"))
     iou = json.loads(info.read_text())["mask_iou"]
-    if iou < LEAST_IOU:
-        print(f"reli3d capture: check failed: mask IoU of the asset {iou:.3f}, at least 0.9 expected", file=sys.stderr)
-    return iou < LEAST_IOU
+    if iou >= LEAST_IOU:
+        return 0
+    text = f"mask IoU of the asset {iou:.3f}, at least {LEAST_IOU} expected"
+    print(f"reli3d capture: check failed: {text}", file=sys.stderr)
+    return FAILED_CHECKS
 
 
 if __name__ == "__main__":

@@ -18,10 +18,13 @@ NETWORK = "isnet-general-use"  # Qin and others 2022, Highly accurate dichotomou
 
 
 class Remover:
-    """Makes masks, one at a time; the network is loaded with the first.  Raises InputError where it cannot be."""
+    """Makes masks, one at a time; the network is loaded with the first.
 
-    def __init__(self, network: str = NETWORK):
-        self.network, self.masks = network, 0
+    Raises InputError of ``option`` where it cannot be loaded.
+    """
+
+    def __init__(self, option: str = "remove-background"):
+        self.option, self.network, self.masks = option, NETWORK, 0
         self._lock = threading.Lock()
         self._cut_out: Callable[[Image.Image], Image.Image] | None = None
 
@@ -29,23 +32,21 @@ class Remover:
         """Mask of mode L in the size of ``bitmap``, soft at the edge of the foreground."""
         with self._lock:
             if self._cut_out is None:
-                self._cut_out = _loaded(self.network)
+                self._cut_out = _loaded(self.network, self.option)
             self.masks += 1
             return self._cut_out(bitmap if bitmap.mode != "F" else bitmap.point(lambda v: v / 257.0).convert("L"))
 
 
-def _loaded(network: str) -> Callable[[Image.Image], Image.Image]:
+def _loaded(network: str, option: str) -> Callable[[Image.Image], Image.Image]:
     try:
         rembg = importlib.import_module("rembg")
     except (ImportError, SystemExit) as error:  # without onnxruntime rembg ends the process
-        raise InputError(
-            "remove-background", f"expected rembg installed, got none ({error}); pip install 'reli3d[masks]'"
-        ) from None
+        raise InputError(option, f"expected rembg installed, got none ({error}); pip install 'reli3d[masks]'") from None
     try:
         session = rembg.new_session(network)
     except Exception as error:  # downloads raise almost anything
         raise InputError(
-            "remove-background",
+            option,
             f"expected the network {network} of rembg, got {error}; it is fetched once, or give masks",
         ) from None
     return lambda bitmap: rembg.remove(bitmap.convert("RGB"), session=session, only_mask=True).convert("L")

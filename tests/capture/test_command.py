@@ -1,0 +1,89 @@
+"""``reli3d capture``: exit codes, lines on stderr and what is left on the disk."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from reli3d.capture import capture as function
+from reli3d.cli import infer
+from reli3d.cli.capture import main
+from tests.support.signals import heed_signals
+
+
+def write_noise(folder, count: int):
+    """Images of ``count`` different patterns: none matches another."""
+    folder.mkdir()
+    for k in range(count):
+        coarse = np.random.default_rng(k).integers(0, 255, (60, 80, 3), dtype=np.uint8)
+        Image.fromarray(coarse).resize((320, 240), Image.Resampling.NEAREST).save(folder / f"{k}.png")
+    return folder
+
+
+def test_photographs_without_overlap_are_refused_in_one_line(tmp_path, capsys):
+    assert main([str(write_noise(tmp_path / "photos", 8)), str(tmp_path / "out")]) == 2
+    err = capsys.readouterr().err.strip()
+    assert "\n" not in err and "expected images that overlap" in err and "walk around the object" in err
+    assert {p.name for p in tmp_path.iterdir()} == {"photos"}
+
+
+def test_a_segmentation_network_that_is_not_installed_is_refused(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rembg", None)
+    photos = str(write_noise(tmp_path / "photos", 8))
+    assert main([photos, str(tmp_path / "out"), "--mask-method", "rembg"]) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("reli3d capture: mask-method: ") and "pip install 'reli3d[masks]'" in err
+
+
+@pytest.mark.parametrize("code", [0, 1, 2])
+def test_the_exit_code_of_the_reconstruction_is_that_of_the_command(tmp_path, monkeypatch, capsys, code):
+    report = function.CaptureReport(20, registered=20)
+
+    def reconstruct(argv):
+        target = tmp_path / "out" / "asset" / "out"
+        assert argv == [str(tmp_path / "out"), "--output", str(target.parent)]
+        target.mkdir(parents=True)
+        (target / "run_info.json").write_text(json.dumps({"mask_iou": 0.95}))
+        return code
+
+    monkeypatch.setattr(function, "capture", lambda *_: report)
+    monkeypatch.setattr(infer, "main", reconstruct)
+    assert main([str(tmp_path), str(tmp_path / "out"), "--infer"]) == code
+
+
+def test_an_asset_that_differs_from_its_masks_fails_the_check(tmp_path, monkeypatch, capsys):
+    def reconstruct(argv):
+        (tmp_path / "out" / "asset" / "out").mkdir(parents=True)
+        (tmp_path / "out" / "asset" / "out" / "run_info.json").write_text(json.dumps({"mask_iou": 0.85}))
+        return 0
+
+    monkeypatch.setattr(function, "capture", lambda *_: function.CaptureReport(20))
+    monkeypatch.setattr(infer, "main", reconstruct)
+    assert main([str(tmp_path), str(tmp_path / "out"), "--infer"]) == 3
+    assert "mask IoU of the asset 0.850" in capsys.readouterr().err
+
+
+def test_a_termination_while_features_are_extracted_removes_all_files(tmp_path):
+    """COLMAP's library installs a handler of SIGTERM that ends the process with a stack trace."""
+    photos = write_noise(tmp_path / "photos", 40)
+    (tmp_path / "temporary").mkdir()
+    command = [sys.executable, "-m", "reli3d.cli.capture", str(photos), str(tmp_path / "out")]
+    environment = os.environ | {"TMPDIR": str(tmp_path / "temporary")}
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment, preexec_fn=heed_signals)
+    with process:
+        deadline = time.monotonic() + 120
+        while not list((tmp_path / "temporary").glob("*/database.db")) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        process.send_signal(signal.SIGTERM)
+        err = process.stderr.read().strip()
+    assert process.returncode == 128 + signal.SIGTERM and err.splitlines()[-1] == "reli3d capture: ended by SIGTERM"
+    assert "stack trace" not in err
+    assert not list((tmp_path / "temporary").iterdir()) and not (tmp_path / "out").exists()
