@@ -6,7 +6,7 @@ from scipy import ndimage
 
 from reli3d.geometry.bake import bake, dilate, rasterize_texels
 from reli3d.geometry.mesh import Mesh
-from reli3d.geometry.tangents import encode_normals, vertex_tangents, with_tangents
+from reli3d.geometry.tangents import encode_normals, vertex_tangents
 from reli3d.geometry.uv import unwrap
 from reli3d.io.glb import glb_bytes
 from reli3d.render.asset import Asset, TextureSet
@@ -15,7 +15,7 @@ from reli3d.render.asset import Asset, TextureSet
 def sphere(device, subdivisions, size) -> Mesh:
     ball = trimesh.creation.icosphere(subdivisions)
     mesh = Mesh(torch.tensor(ball.vertices, dtype=torch.float32), torch.tensor(ball.faces, dtype=torch.int32))
-    return with_tangents(unwrap(mesh, texture_size=size)).to(device)
+    return unwrap(mesh, texture_size=size).with_tangents().to(device)
 
 
 def colors(p, n, t):

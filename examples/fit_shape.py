@@ -14,7 +14,6 @@ import torch
 import reli3d
 from reli3d.geometry.hits import evaluate_hits
 from reli3d.geometry.hull import hull_distance, mask_distance
-from reli3d.geometry.tangents import with_tangents
 from reli3d.render.gbuffer import primary_hits
 from reli3d.render.silhouette import antialias
 
@@ -56,5 +55,5 @@ for step in range(args.steps):
     optimizer.step()
 found = reli3d.extract_surface(level.detach(), radius=1.0)
 print(f"found: {distance(found.vertices).abs().mean():.4f}")
-found, clay = with_tangents(reli3d.unwrap(found)), reli3d.TextureSet(torch.full((8, 8, 3), 0.7), 0.8, 0.0)
+found, clay = reli3d.unwrap(found).with_tangents(), reli3d.TextureSet(torch.full((8, 8, 3), 0.7), 0.8, 0.0)
 reli3d.write_glb(args.output / "shape.glb", reli3d.Asset(found, clay))

@@ -26,8 +26,8 @@ class Mesh:
     vertices: ``(V, 3)`` float32.  faces: ``(F, 3)`` int32, counter-clockwise seen from outside.  normals: ``(V, 3)``
     unit.  uv: ``(V, 2)``, u right, v down, as glTF.  tangents: ``(V, 4)`` unit, w = +-1, bitangent = w cross(normal,
     tangent).  colors: ``(V, 3)`` linear factors of the base color.  Numpy arrays and other integer types are converted
-    if the conversion is exact.  Gradients pass through.  Raises TypeError for a dtype, ValueError for a shape, device
-    or a face index out of range.
+    if the conversion is exact.  Methods: ``.with_normals()``, ``.with_tangents()``.  Gradients pass through.
+    Raises TypeError for a dtype, ValueError for a shape, device or a face index out of range.
 
     >>> triangle = reli3d.Mesh(torch.eye(3), torch.tensor([[0, 1, 2]]))
     >>> scene = reli3d.RayScene(triangle)
@@ -67,6 +67,12 @@ class Mesh:
     def with_normals(self) -> Mesh:
         """The same mesh with :func:`vertex_normals`."""
         return replace(self, normals=vertex_normals(self.vertices, self.faces))
+
+    def with_tangents(self) -> Mesh:
+        """The same mesh with :func:`~reli3d.geometry.tangents.vertex_tangents`; needs normals and UV."""
+        from reli3d.geometry.tangents import vertex_tangents  # imports this module
+
+        return replace(self, tangents=vertex_tangents(self))
 
 
 @dataclass(frozen=True)

@@ -45,6 +45,8 @@ class RayScene:
             raise ValueError(f"backend: expected one of {', '.join(BACKENDS)}, got {backend}")
         if isinstance(mesh, Mesh) and faces is not None:
             raise TypeError("faces: expected None with a mesh, got faces")
+        if isinstance(mesh, Tensor) and faces is None:
+            raise TypeError("faces: expected a tensor with vertices, got None")
         if faces is None:
             expect("mesh", mesh, Mesh)
         vertices, faces = (mesh.vertices, mesh.faces) if isinstance(mesh, Mesh) else (mesh, faces)
@@ -95,8 +97,8 @@ class RayScene:
 
         origins, directions: ``(..., 3)`` float32, broadcast; directions need not be unit, ``t`` is in their lengths.
         vertices: ``(V, 3)``, the tensor that receives gradients, equal to the positions of the scene (call
-        :meth:`refit` after a change); None: no gradient to the vertices.  t_max: a number or ``(...)``, exclusive.  A
-        miss has ``face = -1``, ``t = inf``, ``bary = 0`` and gradient 0.
+        :meth:`refit` after a change); None: no gradient to the vertices, even if those of the mesh require it.  t_max:
+        a number or ``(...)``, exclusive.  A miss has ``face = -1``, ``t = inf``, ``bary = 0`` and gradient 0.
 
         Gradients of ``t`` and ``bary`` reach origins, directions and vertices.  The choice of the face has none, so
         silhouettes need :func:`reli3d.antialias`.  ``origins + t * directions`` is the most accurate hit position.
@@ -115,7 +117,7 @@ class RayScene:
         return evaluate_hits(vertices, self.faces, hits, origins, directions)
 
     def closest(self, origins: Tensor, directions: Tensor, *, t_max: Tensor | float = float("inf")) -> Hits:
-        """First hit of every ray: origins and directions ``(..., 3)`` broadcast; ``t_max`` a number or ``(...)``."""
+        """First hit of every ray ``(..., 3)``, without gradient; ``t_max`` a number or ``(...)``."""
         shape, o, d, far = self._rays(origins, directions, t_max)
         n = o.shape[0]
         face, t, bary = (empty((n,), kind, self.device) for kind in (wp.int32, wp.float32, wp.vec2))

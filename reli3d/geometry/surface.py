@@ -92,7 +92,7 @@ def extract_surface(
     closed: bool = True,
     center: bool = False,
 ) -> Mesh:
-    """Extracts the isosurface ``sdf == 0`` in the box ``[-radius, radius]^3`` by FlexiCubes.
+    """Extracts the isosurface ``sdf == 0`` in the box ``[-radius, radius]^3`` by FlexiCubes; the mesh has no normals.
 
     sdf: ``(X + 1, Y + 1, Z + 1)`` float32 at the grid vertices, x first, finite: a signed distance or any other field
     that is negative inside.  radius: half extent of the box, one or three numbers.  deformation: ``(*sdf.shape, 3)``

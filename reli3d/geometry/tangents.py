@@ -7,8 +7,6 @@ along the tangent and green along the bitangent.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import torch
 import warp as wp
 from torch import Tensor
@@ -80,11 +78,6 @@ def _merged(mesh: Mesh) -> Tensor:
 def _any_orthogonal(n: Tensor) -> Tensor:
     axis = torch.zeros_like(n).scatter_(0, n.abs().argmin(0, keepdim=True), 1.0)
     return _unit(_flat(axis, n))[0]
-
-
-def with_tangents(mesh: Mesh) -> Mesh:
-    """The same mesh with :func:`vertex_tangents`."""
-    return replace(mesh, tangents=vertex_tangents(mesh))
 
 
 def _dot(a: Tensor, b: Tensor) -> Tensor:

@@ -75,7 +75,7 @@ def check_asset(asset: Asset) -> None:
     mesh = asset.mesh
     if len(mesh.faces) == 0:
         raise ValueError("asset.mesh.faces: expected at least one face, got 0")
-    for name, fix in (("normals", "Mesh.with_normals"), ("uv", "unwrap"), ("tangents", "with_tangents")):
+    for name, fix in (("normals", "Mesh.with_normals"), ("uv", "unwrap"), ("tangents", "Mesh.with_tangents")):
         if getattr(mesh, name) is None:
             raise ValueError(f"asset.mesh.{name}: expected a tensor, got None (see {fix})")
     for name in ("vertices", "normals", "uv", "tangents"):
@@ -211,7 +211,8 @@ def write_glb(
 ) -> None:
     """Writes mesh and textures of ``asset`` as a GLB file, completely or not at all; the environment is not written.
 
-    asset: its mesh needs normals, UV and tangents, as :func:`reconstruct` and :func:`read_glb` return them.  extras:
+    asset: its mesh needs normals, UV and tangents, as :func:`reconstruct` and :func:`read_glb` return them;
+    :func:`unwrap` adds UV and normals to other meshes, :meth:`Mesh.with_tangents` tangents.  extras:
     JSON values for glTF's ``asset.extras``.  double_sided: None: false for a watertight mesh, otherwise true.
     translation: of the node, for objects so far from the origin that float32 vertices would lose precision.  textures:
     ``png``, or ``webp`` (lossless, smaller, needs a viewer with ``EXT_texture_webp``).  Raises TypeError for a wrong

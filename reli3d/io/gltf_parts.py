@@ -11,7 +11,6 @@ from torch import Tensor
 
 from reli3d.errors import InputError
 from reli3d.geometry.mesh import Mesh
-from reli3d.geometry.tangents import with_tangents
 from reli3d.io.gltf import Document, Placed
 from reli3d.io.gltf_materials import Materials
 from reli3d.render.asset import Asset
@@ -147,12 +146,12 @@ class _Primitive:
             else:
                 mesh = replace(mesh, colors=factors)
         if tangent is None or not (np.linalg.norm(tangent[:, :3], axis=1) > 1e-6).all():
-            return Asset(with_tangents(mesh), textures)
+            return Asset(mesh.with_tangents(), textures)
         direction = (linear @ tangent[:, :3, None])[..., 0]
         n = normals.double().numpy()
         direction -= n * (n * direction).sum(1, keepdims=True)
         if not (np.linalg.norm(direction, axis=1) > 1e-9 * max(float(np.abs(linear).max()), 1e-300)).all():
-            return Asset(with_tangents(mesh), textures)
+            return Asset(mesh.with_tangents(), textures)
         sign = np.where((tangent[:, 3:] < 0) != mirrored, -1.0, 1.0)
         return Asset(replace(mesh, tangents=_tensor(np.concatenate([_unit(direction), sign], 1))), textures)
 

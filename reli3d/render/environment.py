@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from numbers import Real
 
 import torch
 import warp as wp
@@ -61,7 +62,9 @@ class Environment:
 
     Row 0 is +Y, the center column +X, +Z right of it.  Methods: ``.lookup(directions)``, ``.rotated(yaw)`` [rad],
     ``.resized(height)``, ``.sample(u)``, ``.pdf(directions)``, ``.irradiance()``.  Gradients reach the texels.  The
-    importance sampling table is built on first use, so ``radiance`` must not be modified in place afterwards.  Raises
+    importance sampling table is built on first use, so ``radiance`` must not be modified in place afterwards: in
+    optimization construct a new Environment in every step.  Negative values are rejected only when a file is written:
+    optimize the logarithm, or clamp.  Raises
     TypeError for a dtype, ValueError for a shape.
 
     >>> light = reli3d.Environment(torch.rand(16, 32, 3))
@@ -115,8 +118,11 @@ class Environment:
     def rotated(self, yaw: float) -> Environment:
         """The environment rotated by ``yaw`` [rad] about +Y, counter-clockwise seen from above: -Z moves towards -X.
 
+        yaw: a Python number, no gradient.  Raises TypeError for another type.
         Columns are interpolated linearly; a multiple of 2 pi / W is an exact shift.
         """
+        if not isinstance(yaw, Real):
+            raise TypeError(f"yaw: expected a number, got {type(yaw).__name__}")
         width = self.radiance.shape[1]
         shift = yaw * width / (2.0 * torch.pi)
         whole = round(shift) if abs(shift - round(shift)) < 1e-6 * width else int(shift // 1)  # rounding of yaw itself

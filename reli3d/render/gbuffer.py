@@ -89,6 +89,8 @@ def surface_points(mesh: Mesh, textures: TextureSet | None, face: Tensor, bary: 
     >>> hits = reli3d.RayScene(mesh).intersect(*reli3d.camera_rays(camera))
     >>> points = reli3d.surface_points(mesh, asset.textures, hits.face[hits.valid], hits.bary[hits.valid])
     """
+    if face.ndim != 1:
+        raise ValueError(f"face: expected shape (N,), as hits.face[hits.valid], got {tuple(face.shape)}")
     position = interpolate(mesh.vertices, mesh.faces, face, bary)
     ng = hit_normals(mesh.vertices, mesh.faces, face)
     normal = ng

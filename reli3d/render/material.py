@@ -41,10 +41,10 @@ def eval_bsdf(
     """Value of the metallic-roughness BSDF ``(..., 3)`` [1/sr], without the cosine; 0 below the horizon on either side.
 
     wo, wi: ``(..., 3)`` unit, local frame.  base_color: ``(..., 3)`` linear in [0, 1].  alpha: ``(...)`` GGX width,
-    ``roughness**2``.  metallic: ``(...)``.  All are tensors; leading axes broadcast.  diffuse_model: energy transmitted
-    to the diffuse layer, ``conserving`` (1 - F of the surface on the way in and out; the albedo is at most 1) or
-    ``published`` (1 - F of the microfacet, the formula of the published model's shader and of glTF 2.0's appendix B).
-    Gradients reach all five tensors; that of ``alpha`` is 0 below ``ALPHA_MIN`` = 1e-3.  Raises TypeError unless
+    ``roughness**2``.  metallic: ``(...)`` in [0, 1].  All are tensors; leading axes broadcast.  diffuse_model: energy
+    transmitted to the diffuse layer, ``conserving`` (1 - F of the surface on the way in and out; the albedo is at most
+    1) or ``published`` (1 - F of the microfacet, the formula of the published model's shader and of glTF 2.0's appendix
+    B).  Gradients reach all five tensors; that of ``alpha`` is 0 below ``ALPHA_MIN`` = 1e-3.  Raises TypeError unless
     float32, ValueError for a shape, a device or another model.  Source: glTF 2.0, appendix B; GGX of Walter et al. 2007
     with Smith's height-correlated masking.
 
@@ -64,11 +64,13 @@ def eval_bsdf(
 def sample_bsdf(wo: Tensor, alpha: Tensor, u: Tensor, *, lobe: str = "visible") -> Tensor:
     """Samples directions to the light ``(..., 3)``, unit, from one lobe; density :func:`pdf_bsdf` of the same ``lobe``.
 
-    wo: ``(..., 3)`` unit, local frame.  alpha: ``(...)`` GGX width.  u: ``(..., 2)`` uniform in [0, 1).  Leading axes
-    broadcast.  lobe: ``visible`` (reflection at a visible normal), ``mirrored`` (at that normal rotated by pi about the
-    surface normal) or ``cosine``.  Directions below the horizon, and those of a mirrored normal that faces away from
-    ``wo``, have value and density 0.  Antithetic pairs: ``visible`` with ``u`` and :func:`reli3d.antithetic` of ``u``,
-    or, as published, ``visible`` and ``mirrored`` with the same ``u``.  Gradients reach ``wo`` and ``alpha``, but
+    wo: ``(..., 3)`` unit, local frame, z > 0; otherwise all directions have density 0.  alpha: tensor ``(...)``, GGX
+    width ``roughness**2``.  u: ``(..., 2)`` uniform in [0, 1).  Leading axes broadcast.  lobe: ``visible`` (reflection
+    at a visible normal), ``mirrored`` (at that normal rotated by pi about the surface normal) or ``cosine``.
+    Directions below the horizon, and those of a mirrored normal that faces away from ``wo``, have value and density 0.
+    Antithetic pairs: ``visible`` with ``u`` and :func:`reli3d.antithetic` of ``u``, averaged; or, as in ReLi3D,
+    ``visible`` and ``mirrored`` with the same ``u``, each sample weighted by the sum of both densities and the results
+    added, because ``mirrored`` alone does not reach all directions.  Gradients reach ``wo`` and ``alpha``, but
     :func:`pdf_bsdf` has none: detach the directions to differentiate a Monte Carlo estimate.  Raises TypeError unless
     float32, ValueError for a shape, a device or another lobe.  Source: Dupuy and Benyoub 2023.
 
@@ -90,7 +92,7 @@ def sample_bsdf(wo: Tensor, alpha: Tensor, u: Tensor, *, lobe: str = "visible") 
 def pdf_bsdf(wo: Tensor, alpha: Tensor, wi: Tensor, *, lobe: str = "visible") -> Tensor:
     """Density ``(...)`` [1/sr] of :func:`sample_bsdf` at ``wi``; 0 below the horizon.
 
-    wo, wi: ``(..., 3)`` unit, local frame.  alpha: ``(...)`` GGX width.  Leading axes broadcast.  lobe: as in
+    wo, wi: ``(..., 3)`` unit, local frame.  alpha: tensor ``(...)``, GGX width.  Leading axes broadcast.  lobe: as in
     :func:`sample_bsdf`.  No gradient, so detach ``wi`` to differentiate an estimate; :func:`pdf_ggx_vndf` has
     gradients.  The density is 0 where the value is 0: clamp it before dividing.  Raises TypeError unless float32,
     ValueError for a shape, a device or another lobe.

@@ -32,10 +32,10 @@ def pdf_cosine(wi: Tensor) -> Tensor:
 def sample_ggx_vndf(wo: Tensor, alpha: Tensor, u: Tensor) -> Tensor:
     """GGX microfacet normals visible from ``wo``, ``(..., 3)`` unit, local frame (+z the surface normal).
 
-    wo: ``(..., 3)`` unit, z > 0.  alpha: ``(...)`` GGX width ``roughness**2`` in (0, 1], floored at 1e-3.  u: ``(...,
-    2)`` uniform in [0, 1).  Leading axes broadcast.  Gradients reach ``wo`` and ``alpha``; ``u`` is a constant.  Raises
-    TypeError unless float32, ValueError for a shape or device.  Source: Dupuy and Benyoub 2023, spherical caps.
-    Density: :func:`pdf_ggx_vndf`.
+    wo: ``(..., 3)`` unit, z > 0; otherwise the samples are undefined, with density 0.  alpha: tensor ``(...)``, GGX
+    width ``roughness**2`` in (0, 1], floored at 1e-3.  u: ``(..., 2)`` uniform in [0, 1).  Leading axes broadcast.
+    Gradients reach ``wo`` and ``alpha``; ``u`` is a constant.  Raises TypeError unless float32, ValueError for a shape
+    or device.  Source: Dupuy and Benyoub 2023, spherical caps.  Density: :func:`pdf_ggx_vndf`.
 
     >>> wo, alpha = torch.tensor([0.6, 0.0, 0.8]), torch.tensor(0.25)
     >>> wm = reli3d.sample_ggx_vndf(wo, alpha, torch.rand(4096, 2))
@@ -55,9 +55,10 @@ def sample_ggx_vndf(wo: Tensor, alpha: Tensor, u: Tensor) -> Tensor:
 
 
 def pdf_ggx_vndf(wo: Tensor, alpha: Tensor, wm: Tensor) -> Tensor:
-    """Density ``(...)`` [1/sr of ``wm``] of :func:`sample_ggx_vndf`; 0 where ``wm`` faces away from ``wo``.
+    """Density ``(...)`` [1/sr of ``wm``] of :func:`sample_ggx_vndf`.
 
-    wo, wm: ``(..., 3)`` unit, local frame.  alpha: ``(...)`` GGX width.  Leading axes broadcast.  Gradients reach
+    0 where ``wm`` faces away from ``wo``, and where either is below the surface.  wo, wm: ``(..., 3)`` unit, local
+    frame.  alpha: tensor ``(...)``, GGX width ``roughness**2``.  Leading axes broadcast.  Gradients reach
     ``wo``, ``alpha`` and ``wm``.  Divide by ``4 wo.wm`` for the density of the reflected direction.  Raises TypeError
     unless float32, ValueError for a shape or device.
 
@@ -81,14 +82,14 @@ def pdf_ggx_vndf(wo: Tensor, alpha: Tensor, wm: Tensor) -> Tensor:
 def antithetic(u: Tensor) -> Tensor:
     """Random numbers ``(..., 2)`` of the antithetic partners of visible-normal samples with ``u (..., 2)``.
 
-    ``(u1 + 1/2 mod 1, 1 - u2)``, exact for multiples of 2^-24: the partner is on the opposite side of the lobe.
-    Uniform if ``u`` is; its own inverse.  The mean of both samples has less variance than that of two independent ones
-    if the integrand is nearly odd about the center of the lobe, as are derivatives in ``alpha`` and the normal.
-    Samplers treat ``u`` as a constant, so gradients are not needed.  Raises TypeError unless float32, ValueError for a
-    shape.
+    ``((u1 + 1/2) mod 1, 1 - 2^-24 - u2)``: the partner is on the opposite side of the lobe.  Uniform if ``u`` is.  For
+    multiples of 2^-24 the map is exact and its own inverse.  The mean of both samples has less variance than that of
+    two independent ones if the integrand is nearly odd about the center of the lobe, as are derivatives in ``alpha``
+    and the normal. Samplers treat ``u`` as a constant, so gradients are not needed.  Raises TypeError unless float32,
+    ValueError for a shape.
 
     >>> partners = reli3d.antithetic(u)
-    >>> first, second = (reli3d.sample_ggx_vndf(wo, alpha, v) for v in (u, partners))
+    >>> first, second = (reli3d.sample_bsdf(wo, alpha, v) for v in (u, partners))
     """
     check("u", u, last=2)
     turn, height = u.unbind(-1)

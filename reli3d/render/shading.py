@@ -63,13 +63,15 @@ class ShadeOptions:
     """Options of :func:`shade`: sampling and material model.
 
     samples: :class:`Samples`, or three counts in its order, each at least 0.  seed: of the random numbers; another seed
-    gives independent noise.  antithetic: pairing of visible-normal samples: ``opposite`` (across the lobe, see
-    :func:`reli3d.antithetic`), ``mirrored`` (about the surface normal, as published) or ``none``.  heuristic: MIS
-    weights, ``balance`` or ``power``.  sequence: ``halton`` (rotated per point and strategy) or ``random``.  alpha: GGX
-    width from roughness, ``squared`` or, as published, ``linear``.  diffuse_model: ``conserving`` or ``published``, see
-    :func:`reli3d.eval_bsdf`.  clamp: upper limit of one sample times the count of its strategy, per channel; None: no
-    limit.  check_inputs: raise ValueError for directions that are not unit and materials outside [0, 1].  Raises
-    ValueError for an invalid count or choice.
+    gives independent noise.  In optimization use another seed in every step; the gradient of a squared residual of one
+    rendering is biased, because its value and its derivative share the noise: for an unbiased gradient multiply the
+    residuals of two renderings with different seeds.  antithetic: pairing of visible-normal samples: ``opposite``
+    (across the lobe, see :func:`reli3d.antithetic`), ``mirrored`` (about the surface normal, as published) or
+    ``none``.  heuristic: MIS weights, ``balance`` or ``power``.  sequence: ``halton`` (rotated per point and strategy)
+    or ``random``.  alpha: GGX width from roughness, ``squared`` or, as published, ``linear``.  diffuse_model:
+    ``conserving`` or ``published``, see :func:`reli3d.eval_bsdf`.  clamp: upper limit of one sample times the count of
+    its strategy, per channel; None: no limit.  check_inputs: raise ValueError for directions that are not unit and
+    materials outside [0, 1].  Raises ValueError for an invalid count or choice.
 
     >>> fast = reli3d.ShadeOptions(samples=reli3d.Samples(light=4, bsdf=4, cosine=2), seed=1)
     >>> image = reli3d.render_asset(asset, camera, light, options=fast)

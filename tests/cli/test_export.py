@@ -11,7 +11,6 @@ import trimesh
 
 from reli3d.cli.export import main
 from reli3d.geometry.mesh import Mesh
-from reli3d.geometry.tangents import with_tangents
 from reli3d.geometry.uv import unwrap
 from reli3d.io.glb import read_glb, write_glb
 from reli3d.render.asset import Asset, TextureSet
@@ -24,7 +23,7 @@ def glb(tmp_path_factory):
 
     ball = trimesh.creation.icosphere(3)
     mesh = Mesh(torch.tensor(ball.vertices, dtype=torch.float32), torch.tensor(ball.faces, dtype=torch.int32))
-    mesh = with_tangents(unwrap(mesh, texture_size=128))
+    mesh = unwrap(mesh, texture_size=128).with_tangents()
 
     def at(position, normal, tangent):
         flat = torch.tensor([0.5, 0.5, 1.0]).expand_as(position)

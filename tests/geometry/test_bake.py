@@ -12,7 +12,7 @@ from scipy import ndimage
 
 from reli3d.geometry.bake import bake, coverage, dilate, interpolate, nearest_valid, rasterize_texels
 from reli3d.geometry.mesh import Mesh
-from reli3d.geometry.tangents import decode_normals, encode_normals, vertex_tangents, with_tangents
+from reli3d.geometry.tangents import decode_normals, encode_normals, vertex_tangents
 from reli3d.geometry.uv import unwrap
 from reli3d.io.glb import write_glb
 from reli3d.render.asset import Asset, TextureSet
@@ -32,7 +32,7 @@ def icosphere(subdivisions: int, device="cpu") -> Mesh:
 
 @pytest.fixture(scope="module")
 def sphere() -> Mesh:
-    return with_tangents(unwrap(icosphere(4), texture_size=SIZE))
+    return unwrap(icosphere(4), texture_size=SIZE).with_tangents()
 
 
 def surface_samples(mesh: Mesh, n: int, seed: int = 0):

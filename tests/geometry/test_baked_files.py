@@ -13,7 +13,7 @@ from bench.surface import field
 from reli3d.geometry.bake import bake
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.surface import extract_surface
-from reli3d.geometry.tangents import encode_normals, with_tangents
+from reli3d.geometry.tangents import encode_normals
 from reli3d.geometry.uv import unwrap
 from reli3d.io.glb import encode_image, write_glb
 from reli3d.render.asset import Asset, TextureSet
@@ -33,7 +33,7 @@ def unit_size(mesh: Mesh) -> Mesh:
 
 
 def baked(mesh: Mesh, size: int) -> Asset:
-    mesh = with_tangents(unwrap(mesh, texture_size=size))
+    mesh = unwrap(mesh, texture_size=size).with_tangents()
 
     def material(p, n, t):
         rough, metal = ((0.5 + 0.4 * p[:, k : k + 1]).clamp(0, 1) for k in (1, 2))

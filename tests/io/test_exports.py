@@ -10,7 +10,6 @@ import trimesh
 from PIL import Image
 
 from reli3d.geometry.mesh import Mesh
-from reli3d.geometry.tangents import with_tangents
 from reli3d.geometry.uv import unwrap
 from reli3d.io.obj import obj_files
 from reli3d.io.usd import usdz_bytes
@@ -27,7 +26,7 @@ def asset() -> Asset:
     row, column = torch.meshgrid(torch.linspace(0, 1, SIZE), torch.linspace(0, 1, SIZE), indexing="ij")
     color = torch.stack([row, column, torch.full_like(row, 0.2)], -1)  # tells up from down
     flat = torch.tensor([0.5, 0.5, 1.0]).expand(SIZE, SIZE, 3).contiguous()
-    return Asset(with_tangents(unwrap(mesh, texture_size=SIZE)), TextureSet(color, row, column, flat))
+    return Asset(unwrap(mesh, texture_size=SIZE).with_tangents(), TextureSet(color, row, column, flat))
 
 
 def test_trimesh_reads_the_obj_back(asset, tmp_path):

@@ -20,7 +20,7 @@ from PIL import Image
 
 from reli3d.geometry.bake import bake
 from reli3d.geometry.mesh import Mesh
-from reli3d.geometry.tangents import encode_normals, with_tangents
+from reli3d.geometry.tangents import encode_normals
 from reli3d.geometry.uv import unwrap
 from reli3d.io.glb import glb_bytes, read_glb, write_glb
 from reli3d.render.asset import Asset, TextureSet
@@ -44,7 +44,7 @@ def color(p):
 def asset() -> Asset:
     ball = trimesh.creation.icosphere(3)
     mesh = Mesh(torch.tensor(ball.vertices, dtype=torch.float32), torch.tensor(ball.faces, dtype=torch.int32))
-    mesh = with_tangents(unwrap(mesh, texture_size=SIZE))
+    mesh = unwrap(mesh, texture_size=SIZE).with_tangents()
 
     def fn(p, n, t):
         bumped = torch.nn.functional.normalize(n + 0.2 * torch.sin(6 * p), dim=1)
@@ -105,7 +105,7 @@ def test_webp_textures_are_smaller_exact_and_valid(asset, tmp_path):
 def test_khronos_validator_on_a_real_mesh(shared_data, tmp_path):
     shape = trimesh.load(shared_data / "meshes" / "scifi_crate.glb", force="mesh", process=False)
     mesh = Mesh(torch.tensor(shape.vertices, dtype=torch.float32), torch.tensor(shape.faces, dtype=torch.int32))
-    mesh = with_tangents(unwrap(mesh, texture_size=64))
+    mesh = unwrap(mesh, texture_size=64).with_tangents()
     plain = torch.full((64, 64, 3), 0.5)
     write_glb(tmp_path / "a.glb", Asset(mesh, TextureSet(plain, 0.5, 0.5, plain)))
     issues = judged(tmp_path / "a.glb")
@@ -193,7 +193,7 @@ def test_an_unsymmetric_arrow_keeps_its_axes(tmp_path, asset):
         torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]]),
         torch.tensor([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]).int(),
     )
-    write_glb(tmp_path / "a.glb", Asset(with_tangents(unwrap(arrow, texture_size=64)), asset.textures))
+    write_glb(tmp_path / "a.glb", Asset(unwrap(arrow, texture_size=64).with_tangents(), asset.textures))
     shape = trimesh.load(tmp_path / "a.glb", force="mesh")
     assert np.allclose(shape.bounds, [[0, 0, 0], [1, 2, 3]]) and shape.volume == pytest.approx(1.0, rel=1e-6)
 

@@ -14,7 +14,6 @@ import torch
 from reli3d.cli import infer
 from reli3d.geometry.camera import Camera, look_at
 from reli3d.geometry.mesh import Mesh, vertex_normals
-from reli3d.geometry.tangents import with_tangents
 from reli3d.io.glb import glb_bytes, read_glb, write_glb
 from reli3d.io.hdr import read_environment
 from reli3d.output import viewer
@@ -60,7 +59,7 @@ def waisted(tmp_path_factory) -> Asset:
     ball = ball_mesh(5, 1.0)
     away = torch.linalg.cross(ball.vertices, torch.tensor([0.36, 0.8, 0.48]).expand_as(ball.vertices)).square().sum(-1)
     vertices = ball.vertices * (0.7 - 0.45 * torch.exp(-12.0 * (1.0 - away)))[:, None]
-    mesh = with_tangents(Mesh(vertices, ball.faces, vertex_normals(vertices, ball.faces), ball.uv))
+    mesh = Mesh(vertices, ball.faces, vertex_normals(vertices, ball.faces), ball.uv).with_tangents()
     return stored(tmp_path_factory.mktemp("waisted"), Asset(mesh, textures(4, "cpu", (0.32, 0.32, 0.32), 0.5)))
 
 

@@ -17,7 +17,7 @@ from torch.nn.functional import grid_sample, normalize
 from reli3d.geometry.bake import bake, rasterize_texels
 from reli3d.geometry.mesh import Mesh, volume
 from reli3d.geometry.surface import extract_surface
-from reli3d.geometry.tangents import decode_normals, encode_normals, with_tangents
+from reli3d.geometry.tangents import decode_normals, encode_normals
 from reli3d.geometry.triplane import sample_triplane
 from reli3d.geometry.uv import unwrap
 from reli3d.io.glb import read_glb, write_glb
@@ -33,7 +33,7 @@ SIZE = 128
 def ball() -> Mesh:
     shape = trimesh.creation.icosphere(2)
     mesh = Mesh(torch.tensor(shape.vertices, dtype=torch.float32), torch.tensor(shape.faces, dtype=torch.int32))
-    return with_tangents(unwrap(mesh.with_normals(), texture_size=SIZE))
+    return unwrap(mesh.with_normals(), texture_size=SIZE).with_tangents()
 
 
 def degrees(a, b):

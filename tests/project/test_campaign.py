@@ -149,7 +149,7 @@ def faded(views: Views) -> Views:
 def test_kills_at_random_moments_leave_one_whole_result(tmp_path, kills):
     """A process that exchanges results as fast as it can; what it is killed in, nobody chooses."""
     folder, rng, seen = tmp_path / "out" / "name", Random(7), set()
-    for _ in range(kills):
+    for k in range(kills):
         pid = os.fork()
         if pid == 0:
             try:
@@ -159,6 +159,8 @@ def test_kills_at_random_moments_leave_one_whole_result(tmp_path, kills):
                             (new / name).write_text(f"{os.getpid()} {word}")
             finally:
                 os._exit(1)
+        while k % 2 and not (folder.exists() and (folder / NAMES[0]).read_text().startswith(f"{pid} ")):
+            time.sleep(0.001)  # until it wrote a result
         time.sleep(rng.uniform(0.0, 0.05))
         os.kill(pid, signal.SIGKILL)
         os.waitpid(pid, 0)
@@ -169,7 +171,7 @@ def test_kills_at_random_moments_leave_one_whole_result(tmp_path, kills):
         assert len(words) == 1
         seen |= words
         assert not folder.parent.exists() or {p.name for p in folder.parent.iterdir()} <= {"name"}
-    assert len(seen) > kills / 4  # most lived long enough to write
+    assert len(seen) >= kills // 2
 
 
 def test_the_command_reports_what_it_did(tmp_path, capsys):

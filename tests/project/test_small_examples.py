@@ -11,7 +11,6 @@ import pytest
 import torch
 
 import reli3d
-from reli3d.geometry.tangents import with_tangents
 from reli3d.io.glb import read_glb
 from reli3d.io.images import read_image
 from tests.support import reference
@@ -137,7 +136,7 @@ def test_the_examples_of_the_public_names_run(tmp_path, monkeypatch):
         names |= dict(zip(("origins", "directions"), reli3d.camera_rays(names["camera"]), strict=True))
         names |= {"v": scene.vertices.clone().requires_grad_(), "scene": reli3d.RayScene(scene)}
         maps = reli3d.TextureSet(torch.full((64, 64, 3), 0.5), 0.5, 0.0)
-        names["asset"] = reli3d.Asset(with_tangents(scene), maps, light)
+        names["asset"] = reli3d.Asset(scene.with_tangents(), maps, light)
         reli3d.write_environment("studio.hdr", light)
         for name in reli3d.__all__[1:]:
             code = "\n".join(re.findall(r"^ *>>> (.*)$", getattr(reli3d, name).__doc__, re.MULTILINE))

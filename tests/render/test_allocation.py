@@ -7,7 +7,6 @@ import trimesh
 from reli3d.cli.render import main
 from reli3d.geometry.camera import Camera
 from reli3d.geometry.rays import RayScene
-from reli3d.geometry.tangents import with_tangents
 from reli3d.io.glb import write_glb
 from reli3d.render.allocation import plan_samples
 from reli3d.render.asset import Asset
@@ -280,7 +279,7 @@ def test_an_image_has_less_noise_by_its_plan(device):
 
 def test_the_command_plans_its_first_view(tmp_path, capsys):
     asset = ball(torch.device("cpu"))
-    write_glb(tmp_path / "ball.glb", Asset(with_tangents(asset.mesh), asset.textures))
+    write_glb(tmp_path / "ball.glb", Asset(asset.mesh.with_tangents(), asset.textures))
     common = [str(tmp_path / "ball.glb"), "--output", str(tmp_path), "--size", "16", "--supersampling", "1"]
     assert main([*common, "--plan", "16", "--frames", "2", "--format", "webp"]) == 0
     said = capsys.readouterr().err.strip().splitlines()

@@ -23,7 +23,6 @@ from PIL import Image
 import reli3d
 from reli3d.geometry.camera import project
 from reli3d.geometry.mesh import vertex_normals
-from reli3d.geometry.tangents import with_tangents
 from reli3d.io.glb import read_glb
 from reli3d.io.hdr import read_hdr_image
 from reli3d.views.folder import load_views
@@ -472,7 +471,7 @@ def operation(name: str, seed: int) -> list[torch.Tensor]:
     if name == "rays":
         hits = reli3d.RayScene(mesh.vertices, mesh.faces).closest(random(9, 3) + 2.0, -random(9, 3) - 2.0)
         return [hits.face, hits.t, hits.bary]
-    textured = with_tangents(reli3d.unwrap(mesh, texture_size=64))
+    textured = reli3d.unwrap(mesh, texture_size=64).with_tangents()
     if name == "atlas":
         return [textured.vertices, textured.uv]
     light = reli3d.Environment(random(8, 16, 3) + 0.1)
