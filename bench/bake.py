@@ -1,4 +1,4 @@
-"""Texels of an atlas, dilation beside scipy's distance transform, a bake with its normal map, and the GLB."""
+"""Texels of an atlas, dilation against scipy's distance transform, a bake with its normal map, and the GLB."""
 
 import torch
 import trimesh

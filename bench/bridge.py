@@ -1,4 +1,4 @@
-"""What the crossing itself costs: a launch of one thread, its gradient, and a stream through memory."""
+"""Cost of a call from torch to Warp: a launch of one thread, its gradient, and a stream through memory."""
 
 import torch
 import warp as wp

@@ -1,6 +1,6 @@
 """Tests and timings of a GPU in a fixed time: ``python -m bench.cuda --minutes 8``.
 
-Needs the package with its extras ``test`` and ``bench``, and this checkout; what is missing is printed before anything
+Needs the package with its extras ``test`` and ``bench``, and this checkout; missing parts are printed before anything
 runs.  Pieces run in this order: kernels are compiled once, CPU and CUDA are compared, then speed is measured.  Each
 piece is a process with a limit of its own; the limits add up to ``--minutes``.  ``cuda.json`` and ``cuda.md`` in
 ``--output`` are written after every piece, and the same call again repeats only pieces that did not end well.
@@ -24,7 +24,7 @@ NEEDED = ("torch", "warp", "numpy", "scipy", "PIL", "safetensors", "trimesh", "e
 NEEDED = (*NEEDED, "xatlas", "tqdm", "pytest", "mitsuba", "networkx")
 TAIL = 4000  # characters of a piece's output that the report keeps
 LEAST = 5.0  # seconds below which no piece begins
-RISE = 4.0  # of the raw density from the surface to the center of the ball that stands for a trained object
+RISE = 4.0  # of the raw density from the surface to the center of the ball that replaces a trained object
 
 
 @dataclass(frozen=True)
@@ -218,7 +218,7 @@ def run_piece(piece: Piece, cache: Path, limit: float) -> dict:
 
 
 def report(rows: list[dict], device: str) -> str:
-    """Markdown of what has run so far."""
+    """Markdown of the pieces that have run so far."""
     text = [f"# bench.cuda on {device}", "", "| piece | end | seconds |", "|---|---|---|"]
     text += [f"| {r['name']} | {r['end']} | {r['seconds']} |" for r in rows]
     for r in rows:

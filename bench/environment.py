@@ -1,4 +1,4 @@
-"""Lookup of a lat-long map beside torch's grid_sample; sampling its table; spherical Gaussians beside plain torch."""
+"""Lookup of a lat-long map against torch's grid_sample; sampling its table; spherical Gaussians against plain torch."""
 
 import torch
 

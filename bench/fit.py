@@ -2,7 +2,7 @@
 
 Ours extracts the surface from a signed distance grid of 128 cells, traces and shades the pixels with shadows, compares
 colors and antialiased silhouettes, and updates distances, material grids, light maps and exposures by their gradients.
-Mitsuba's surface stands still, so it neither extracts nor antialiases: it traces the same rays, takes as many samples
+Mitsuba's surface is fixed, so it neither extracts nor antialiases: it traces the same rays, takes as many samples
 in two strategies (``direct``: emitter and BSDF, material ``principled``), compares the same colors by the same loss,
 and updates the material at the same mesh's vertices and the texels of the light.
 """

@@ -34,8 +34,8 @@ class KnownSurface(Reconstructor):
     """The published heads; the grid's query evaluates them and then gives the bench's field as density."""
 
     def grid_density(self, code, axis):
-        level = _field(len(axis) - 1, axis.device)
-        return self.surface_density - 20.0 * level + 0.0 * super().grid_density(code, axis)
+        sdf = _field(len(axis) - 1, axis.device)
+        return self.surface_density - 20.0 * sdf + 0.0 * super().grid_density(code, axis)
 
 
 @lru_cache(1)

@@ -1,8 +1,8 @@
 """A whole forward of a preset at its published size, part by part: ``python -m bench.official --views 4``.
 
-It takes minutes and gigabytes, so it has no CASES and runs only when asked.  Random weights (those that training starts
+It takes minutes and gigabytes, so it has no CASES and runs only when named.  Random weights (those that training starts
 from) are written to a file by a process of their own and then mapped, as published ones would be.  FLOPs are counted
-on the meta device, two a multiply-add, and set beside closed forms of the specification's sizes.
+on the meta device, two a multiply-add, and compared with closed forms of the specification's sizes.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ SPECIFIED = {
 
 
 def views(preset: Preset, count: int, device: torch.device) -> tuple[torch.Tensor, ...]:
-    """Random pictures of one object from cameras on a circle about the vertical."""
+    """Random images of one object from cameras on a circle about the vertical."""
     size, generator = preset.image_size, torch.Generator().manual_seed(0)
     angle = torch.arange(count) * 6.283 / count
     zero, one, c, s = torch.zeros(count), torch.ones(count), angle.cos(), angle.sin()
@@ -136,7 +136,7 @@ def parameters(preset: Preset) -> dict[str, int]:
 
 
 def table(preset: Preset, count: int) -> str:
-    """Parameters and operations of each part beside the specification's, as rows of Markdown."""
+    """Parameters and operations of each part and those of the specification, as rows of Markdown."""
     flops, formula = counted(preset, count), specified_flops(preset, count)
     own, stated = parameters(preset), SPECIFIED if preset.name == "official" else {}
     rows = [f"| part | parameters | specification | GFLOP, {count} views | closed form |", "|---|---|---|---|---|"]
@@ -225,7 +225,7 @@ def forward(path: Path, count: int, trunk: torch.dtype, device: torch.device, ru
         began, side = time.perf_counter(), torch.linspace(-0.87, 0.87, model.preset.resolution + 1, device=device)
         TriplaneField(maps, model, code).free_sdf(torch.cartesian_prod(side, side, side))
         synchronize(device)
-        print(f"  {'level, grid':16s} {time.perf_counter() - began:8.3f} s")
+        print(f"  {'SDF on grid':16s} {time.perf_counter() - began:8.3f} s")
         if device.type == "cuda":
             print(f"  peak {torch.cuda.max_memory_allocated(device) / 2**30:.2f} GiB of the device")
         elif peak := _status("VmHWM"):
@@ -252,14 +252,14 @@ def main(argv: list[str] | None = None) -> int:
     if options.table:
         print(table(preset, max(options.views)))
         return 0
-    apart = multiprocessing.get_context("spawn")  # a process of its own: the peak is the forward's alone
+    spawn = multiprocessing.get_context("spawn")  # a process of its own: the peak is the forward's alone
     with tempfile.TemporaryDirectory() as folder:
         path = options.weights or Path(folder) / "random.safetensors"
         jobs = [] if path.is_file() else [(write_random, (path, preset))]
         trunk = getattr(torch, options.precision)
         jobs += [(forward, (path, n, trunk, torch.device(options.device), options.runs)) for n in options.views]
         for target, arguments in jobs:
-            process = apart.Process(target=target, args=arguments)
+            process = spawn.Process(target=target, args=arguments)
             process.start()
             process.join()
             if process.exitcode:

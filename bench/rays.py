@@ -1,4 +1,4 @@
-"""Incoherent rays from within a closed mesh of 82 thousand triangles, and a camera's, beside one call of embreex.
+"""Incoherent rays from within a closed mesh of 82 thousand triangles, and a camera's, against one call of embreex.
 
 ``python -m bench.rays`` prints how the time of a ray grows with rays and triangles, and where it goes.
 """
@@ -47,7 +47,7 @@ def embree_cast(device, n, query, subdivisions=6):
 
 
 def camera_inputs(size, subdivisions=6):
-    """``size^2`` rays of a camera in order of its rows, before the same mesh, which covers half of the picture."""
+    """``size^2`` rays of a camera in order of its rows, before the same mesh, which covers half of the image."""
     mesh = trimesh.creation.icosphere(subdivisions=subdivisions)
     pose = look_at(torch.tensor([0.0, 0.5, 2.2]), torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))
     origins, directions = (v.reshape(-1, 3).numpy() for v in camera_rays(Camera.from_fov(pose, 1.1, size, size)))
@@ -102,13 +102,13 @@ PEERS = {
 
 
 def study() -> None:
-    """Print growth with rays and triangles beside embreex, and the parts of a ray's time; CPU."""
-    device, say = torch.device("cpu"), sys.stdout.write
+    """Print growth with rays and triangles against embreex, and the parts of a ray's time; CPU."""
+    device, write = torch.device("cpu"), sys.stdout.write
     for query in ("closest", "occluded"):
         for n, subdivisions in [(1 << k, 6) for k in (10, 14, 17, 20, 22)] + [(1 << 18, k) for k in (2, 4, 6, 8)]:
             steps = [f(device, n, query, subdivisions)[0] for f in (cast, embree_cast)]
             ours, theirs = time_steps(steps, device, seconds=0.7)
-            say(
+            write(
                 f"{query}, {n} rays, {20 * 4**subdivisions} triangles: {1e9 * ours.median / n:.0f} ns a ray, embreex "
                 f"{1e9 * theirs.median / n:.0f}, {theirs.median / ours.median:.2f} times\n"
             )
@@ -129,7 +129,7 @@ def study() -> None:
     }
     for name, step in parts.items():
         best = min(_cpu_seconds(step) for _ in range(6))
-        say(f"{name}: {1e9 * best / n:.0f} ns a ray\n")
+        write(f"{name}: {1e9 * best / n:.0f} ns a ray\n")
     torch.set_num_threads(torch_threads)
 
 

@@ -1,4 +1,4 @@
-"""Run the cases of the modules beside this one: ``python -m bench.run [NAME ...]``.
+"""Run the cases of the modules of this folder: ``python -m bench.run [NAME ...]``.
 
 A module holds ``CASES = {"name": (builder, arguments)}``; ``builder(device, **arguments)`` builds the inputs and
 returns ``(step, work)``: the function to time, and how much one call of it does, e.g. ``{"rays": 1 << 20}``.  It may
@@ -72,7 +72,7 @@ def collect() -> dict[str, Case]:
 
 
 def measure(case: Case, device: torch.device, *, seconds: float) -> Result | None:
-    """Build and time a case beside its peer; None where it does not run on ``device``."""
+    """Build and time a case and its peer; None where it does not run on ``device``."""
     ours = case.builder(device, **case.arguments)
     if ours is None:
         return None
@@ -114,12 +114,12 @@ def machine(device: torch.device) -> str:
 
 
 def kind(device: torch.device) -> str:
-    """The machine and the vectors that its processor has and the system lets it use: what a ratio may depend on."""
+    """The machine and the vectors that its processor has and the system lets it use: a ratio may depend on them."""
     return f"{machine(device)} {torch.backends.cpu.get_cpu_capability().lower()}"
 
 
 def context(device: torch.device) -> dict:
-    """What a number depends on besides the code: versions, commit, machine, threads."""
+    """The conditions of a measurement: versions, commit, machine, threads."""
     versions = {"python": platform.python_version()}
     for package in PACKAGES:
         try:

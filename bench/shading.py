@@ -1,10 +1,10 @@
-"""Direct light of a sphere of 82 thousand triangles with shadows, and its outline, beside Mitsuba's llvm variant.
+"""Direct light of a sphere of 82 thousand triangles with shadows, and its outline, against Mitsuba's llvm variant.
 
 Mitsuba renders its ``principled`` material with as many samples a pixel in two strategies (``direct``: emitter and
 BSDF): the same amount of work, not the same estimator.  Both sides trace primary rays, without a film.  Gradients: of
 the sum of the image with respect to one base color and all texels of the map.
 
-``python -m bench.shading`` prints what the cases do not: variance of the image and its gradients at equal samples, of
+``python -m bench.shading`` also prints, beyond the cases: variance of the image and its gradients at equal samples, of
 one formula on both sides, and the ratio of times at equal variance; memory a pixel; time over pixels, samples and
 triangles; how near the device's peak is.
 """
@@ -171,14 +171,14 @@ def _noise(runs) -> float:
 
 
 def _folded(texels: np.ndarray) -> np.ndarray:
-    """Mitsuba keeps a column of the other end on either side of its map; their slopes belong to one texel."""
+    """Mitsuba keeps a column of the other end on either side of its map; their gradients belong to one texel."""
     out = texels[:, 1:-1].copy()
     out[:, -1] += texels[:, 0]
     out[:, 0] += texels[:, -1]
     return out
 
 
-def equal_variance(say) -> None:
+def equal_variance(write) -> None:
     """Print variances of 64 runs at 64 samples on either side, and times, ours by Mitsuba's, equal in either."""
     device, size, runs, time = torch.device("cpu"), 64, 64, {}
     for case in product((0.1, 0.4, 0.9), (False, True)):
@@ -202,7 +202,7 @@ def equal_variance(say) -> None:
         pairs["texels"] = _noise([g[1].numpy() for g in a]), _noise([_folded(np.array(g[1])) for g in b])
         for what, (ours, theirs) in pairs.items():
             faster = time[roughness, what != "image"]
-            say(
+            write(
                 f"roughness {roughness}, {what}: variance over squared mean, 64 samples: ours {ours:.3e}, Mitsuba "
                 f"{theirs:.3e}, {theirs / ours:.2f} times; time {faster:.2f} times less at equal samples, "
                 f"{faster * theirs / ours:.2f} at equal variance\n"
@@ -222,8 +222,8 @@ OPERATIONS = {
 HIT_BYTES = 84  # seven inputs and a counter read, radiance written, once; tables and a small map stay in caches
 
 
-def floor(device, say) -> None:
-    """Print the fused kernel's share of what the device can do: its peaks are measured by torch in the same run.
+def floor(device, write) -> None:
+    """Print the fused kernel's fraction of the device's peaks, which torch measures in the same run.
 
     Without shadow rays, whose traversal is not counted.  A sample below the horizon does less than is counted for it.
     """
@@ -238,7 +238,7 @@ def floor(device, say) -> None:
     rate, width = 2 * 2048**3 / product, 2 * 4 * block.numel() / copy
     count = sum(OPERATIONS.values())
     took, least, read = (1e9 * v for v in (kernel / (n * 64), count / rate, HIT_BYTES / 64 / width))
-    say(
+    write(
         f"fused kernel on {device.type}, 64 samples, no shadows: {took:.3g} ns a sample, {count / took:.3g} GFLOP/s; "
         f"floor {least:.3g} ns by {count} operations at {rate / 1e9:.0f} GFLOP/s (float32 matrix product), "
         f"{read:.3g} ns by {HIT_BYTES / 64:.1f} bytes at {width / 1e9:.0f} GB/s (copy): "
@@ -248,10 +248,10 @@ def floor(device, say) -> None:
 
 def study() -> None:
     """Print the floor, variance, memory and growth; all but the floor on CPU."""
-    device, say = torch.device("cpu"), sys.stdout.write
+    device, write = torch.device("cpu"), sys.stdout.write
     for kind in ["cpu"] + ["cuda"] * torch.cuda.is_available():
-        floor(torch.device(kind), say)
-    equal_variance(say)
+        floor(torch.device(kind), write)
+    equal_variance(write)
     base = dict(size=128, roughness=0.4, backward=False)
     changes = [{}, {"size": 256}, {"size": 512}, {"samples": (5, 10, 1)}, {"samples": (80, 160, 16)}]
     changes += [{"subdivisions": 4}, {"subdivisions": 7}, {"backward": True}, {"backward": True, "size": 256}]
@@ -259,7 +259,7 @@ def study() -> None:
         step, work = direct(device, **{**base, **change})
         timing = time_steps([step], device, seconds=1.0)[0]
         rate, pixels = work["samples"] / timing.median / 1e6, change.get("size", base["size"]) ** 2
-        say(
+        write(
             f"{change or 'the case'}: {1e3 * timing.median:.1f} ms, {rate:.2f} M samples/s, "
             f"{timing.peak_bytes / pixels:.0f} bytes a pixel\n"
         )

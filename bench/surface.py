@@ -1,4 +1,4 @@
-"""FlexiCubes of a bumpy sphere with all weights beside plain torch, and what it feeds: components, the visual hull."""
+"""FlexiCubes of a bumpy sphere with all weights against plain torch; components, the visual hull."""
 
 import math
 
@@ -12,50 +12,50 @@ from reli3d.geometry.surface import extract_surface
 
 
 def offset(p):
-    """Level ``(...)`` of a bumpy sphere at ``(..., 3)`` in the cube [-1, 1]."""
+    """SDF ``(...)`` of a bumpy sphere at ``(..., 3)`` in the cube [-1, 1]."""
     return p.norm(dim=-1) - 0.62 + 0.05 * torch.sin(9 * p).sum(-1)
 
 
 def field(n, device):
-    """Level on ``(n + 1)^3`` vertices; at n = 80 its surface has about 25,000 faces."""
+    """SDF on ``(n + 1)^3`` vertices; at n = 80 its surface has about 25,000 faces."""
     axis = torch.linspace(-1, 1, n + 1, device=device)
     return offset(torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1))
 
 
 def fields(device, n, backward):
-    """Level, the weights that gradients reach, and gamma."""
+    """SDF, the weights that gradients reach, and gamma."""
     rng = torch.Generator(device).manual_seed(0)
-    level = field(n, device).requires_grad_(backward)
+    sdf = field(n, device).requires_grad_(backward)
     weights = dict(
-        deformation=(torch.rand(*level.shape, 3, generator=rng, device=device) - 0.5) * 0.9 / n,
+        deformation=(torch.rand(*sdf.shape, 3, generator=rng, device=device) - 0.5) * 0.9 / n,
         alpha=torch.rand(n**3, 8, generator=rng, device=device) + 0.5,
         beta=torch.rand(n**3, 12, generator=rng, device=device) + 0.5,
     )
     gamma = torch.rand(n**3, generator=rng, device=device) * 0.5 + 0.25
-    return level, {name: v.requires_grad_(backward) for name, v in weights.items()}, gamma
+    return sdf, {name: v.requires_grad_(backward) for name, v in weights.items()}, gamma
 
 
 def extraction(device, n, backward):
-    """Mesh of a field at resolution ``n``, with gradients to level, deformation, alpha and beta if ``backward``."""
-    level, weights, gamma = fields(device, n, backward)
-    leaves = [level, *weights.values()]
+    """Mesh of a field at resolution ``n``, with gradients to sdf, deformation, alpha and beta if ``backward``."""
+    sdf, weights, gamma = fields(device, n, backward)
+    leaves = [sdf, *weights.values()]
 
     def step():
-        mesh = extract_surface(level, radius=0.87, gamma=gamma, **weights)
+        mesh = extract_surface(sdf, radius=0.87, gamma=gamma, **weights)
         return torch.autograd.grad(mesh.vertices.square().sum(), leaves) if backward else mesh
 
-    return step, {"faces": len(extract_surface(level.detach(), radius=0.87).faces)}
+    return step, {"faces": len(extract_surface(sdf.detach(), radius=0.87).faces)}
 
 
 def torch_extraction(device, n, backward):
     """The same from plain torch, its list of cubes made before."""
     if device.type != "cpu":
         return None
-    level, weights, gamma = fields(device, n, backward)
-    cubes, leaves = cube_list(level.shape), [level, *weights.values()]
+    sdf, weights, gamma = fields(device, n, backward)
+    cubes, leaves = cube_list(sdf.shape), [sdf, *weights.values()]
 
     def step():
-        vertices, faces = flexicubes(level, *weights.values(), gamma, cubes, 1.74)
+        vertices, faces = flexicubes(sdf, *weights.values(), gamma, cubes, 1.74)
         return torch.autograd.grad(vertices.square().sum(), leaves) if backward else faces
 
     return step, {}

@@ -15,9 +15,9 @@ from reli3d.nn.presets import OFFICIAL
 
 TOLERANCE = 1.5  # other work on the machine moved a ratio of medians by up to 1.25 between runs; a lost factor is 2
 ELSEWHERE = 3.0  # of the worst recorded: an AMD with AVX2 took 1.5 times the ratio of an Intel with AVX-512; twice that
-CALL = 5e-4  # seconds of a peer; a call of ours costs some 70 us, which is more than what a shorter peer does
+CALL = 5e-4  # seconds of a peer; a call of ours costs some 70 us, more than the work of a shorter peer
 QUICK = 0.1  # seconds a step, or as many as its fewest runs take
-AGAIN = 3.0  # seconds a step when the quick look says slower
+AGAIN = 3.0  # seconds a step if the quick measurement is slower
 
 CASES = collect()
 

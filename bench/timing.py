@@ -17,7 +17,7 @@ from statistics import median
 import torch
 
 MIN_RUNS = 5  # below that a decile is a guess
-MIN_SLOW = 3  # of steps above a second, which vary little and would make a full run last for ever
+MIN_SLOW = 3  # of steps above a second, which vary little and would make a full run very long
 MAX_RUNS = 200
 
 
@@ -29,7 +29,7 @@ class Timing:
     p10: float
     p90: float
     runs: int
-    peak_bytes: int | None  # None where the system does not tell
+    peak_bytes: int | None  # None where the system does not report it
     stages: dict[str, float]  # medians, for a step that returns ``{stage: seconds}``
 
 
@@ -79,10 +79,10 @@ def synchronize(device: torch.device) -> None:
 
 
 def peak_bytes(step: Callable, device: torch.device) -> int | None:
-    """Memory that one call of ``step`` needs beyond what is held before it; None where the system does not tell.
+    """Memory that one call of ``step`` needs beyond what is held before it; None where the system does not report it.
 
-    On CUDA the allocator of torch counts it.  On Linux the kernel does, in pages of the process, once what is free has
-    been given back and the mark is reset.
+    On CUDA the allocator of torch counts it.  On Linux the kernel does, in pages of the process, after free memory is
+    returned and the mark is reset.
     """
     if device.type == "cuda":
         torch.cuda.synchronize(device)

@@ -1,4 +1,4 @@
-"""Triplane sampling at the published size, 3 x 40 x 384^2 and 200,000 points, beside torch's float32 grid_sample.
+"""Triplane sampling at the published size, 3 x 40 x 384^2 and 200,000 points, against torch's float32 grid_sample.
 
 Both run with the number of threads that a case names.  ``channel_last`` planes are read in place, others are copied by
 every call; ``half`` and ``bfloat16`` are the storage of our planes, sums are float32.

@@ -1,4 +1,4 @@
-"""UV atlas of a bumpy closed mesh of 20 thousand faces, beside xatlas with its defaults."""
+"""UV atlas of a bumpy closed mesh of 20 thousand faces, against xatlas with its defaults."""
 
 import numpy as np
 import torch

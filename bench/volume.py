@@ -1,4 +1,4 @@
-"""Ray marching of a ball in a cube, and compositing with gradients beside a padded product in torch."""
+"""Ray marching of a ball in a cube, and compositing with gradients against a padded product in torch."""
 
 import torch
 

@@ -19,9 +19,9 @@ parser.add_argument("--size", type=int, default=64, help="pixels along a side of
 args = parser.parse_args()
 args.output.mkdir(parents=True, exist_ok=True)
 
-truth = torch.full((16, 32, 3), 0.3)
-truth[:6] = torch.tensor([0.5, 0.8, 1.2])  # sky
-truth[4:8, 20:24] = torch.tensor([8.0, 6.0, 3.0])  # a lamp
+reference = torch.full((16, 32, 3), 0.3)
+reference[:6] = torch.tensor([0.5, 0.8, 1.2])  # sky
+reference[4:8, 20:24] = torch.tensor([8.0, 6.0, 3.0])  # a lamp
 x, y, z = torch.meshgrid(*[torch.linspace(-1, 1, 41)] * 3, indexing="ij")
 ball = reli3d.extract_surface((x**2 + y**2 + z**2).sqrt() - 0.8, radius=1.0)
 camera = reli3d.Camera.from_fov(reli3d.look_at([0.0, 0.4, 3.0]), 0.6, args.size, args.size)
@@ -38,17 +38,18 @@ def image(radiance: torch.Tensor, seed: int, samples: tuple = (8, 8, 2)) -> torc
     return reli3d.shade(points, -directions[seen], reli3d.Environment(radiance), options=options)
 
 
-photograph = image(truth, seed=1, samples=(64, 64, 16))
+photograph = image(reference, seed=1, samples=(64, 64, 16))
 log = torch.zeros(16, 32, 3, requires_grad=True)
 optimizer = torch.optim.Adam([log], lr=0.1)
 for step in range(args.steps):
     first, second = (image(log.exp(), 2 * step + k) for k in (2, 3))  # independent noise: the square has no bias
     loss = ((first - photograph) * (second - photograph)).mean()
-    loss = loss + 1e-3 * (log.diff(dim=0).square().mean() + log.diff(dim=1).square().mean())  # what no pixel shows
+    # smoothness, for texels that no pixel constrains
+    loss = loss + 1e-3 * (log.diff(dim=0).square().mean() + log.diff(dim=1).square().mean())
     optimizer.zero_grad()
     loss.backward()
     optimizer.step()
 
-print(f"mean error of the log radiance: {(log.detach() - truth.log()).abs().mean():.3f}")
-for name, radiance in (("found", log.detach().exp()), ("true", truth)):
+print(f"mean error of the log radiance: {(log.detach() - reference.log()).abs().mean():.3f}")
+for name, radiance in (("found", log.detach().exp()), ("true", reference)):
     reli3d.write_image(args.output / f"{name}.png", 0.5 * radiance)

@@ -25,7 +25,7 @@ args = parser.parse_args()
 args.output.mkdir(parents=True, exist_ok=True)
 
 
-def distance(p: torch.Tensor) -> torch.Tensor:  # the truth: two balls
+def distance(p: torch.Tensor) -> torch.Tensor:  # of the reference: two balls
     return torch.minimum((p - 0.25).norm(dim=-1) - 0.35, (p + 0.2).norm(dim=-1) - 0.5)
 
 
@@ -40,12 +40,12 @@ eyes = [[0, 0.5, 3], [3, 0.5, 0], [0, 0.5, -3], [-3, 0.5, 0], [0.1, 3, 0], [0.1,
 cameras = reli3d.Camera.from_fov(reli3d.look_at(eyes, [0, 0, 0]), 0.6, args.size, args.size)
 targets = [layers(reli3d.extract_surface(distance(grid), radius=1.0), camera) for camera in cameras]
 masks = mask_distance(torch.stack([t[..., 0] for t in targets]))
-level = -hull_distance(grid.reshape(-1, 3), masks, cameras).reshape(33, 33, 33)
-print(f"hull:  {distance(reli3d.extract_surface(level, radius=1.0).vertices).abs().mean():.4f}")
-optimizer = torch.optim.Adam([level.requires_grad_()], lr=0.01)
+sdf = -hull_distance(grid.reshape(-1, 3), masks, cameras).reshape(33, 33, 33)
+print(f"hull:  {distance(reli3d.extract_surface(sdf, radius=1.0).vertices).abs().mean():.4f}")
+optimizer = torch.optim.Adam([sdf.requires_grad_()], lr=0.01)
 for step in range(args.steps):
     optimizer.param_groups[0]["lr"] = 0.01 * (1 - step / args.steps)
-    mesh, loss = reli3d.extract_surface(level, radius=1.0), 0.0
+    mesh, loss = reli3d.extract_surface(sdf, radius=1.0), 0.0
     for camera, target in zip(cameras, targets, strict=True):
         image = layers(mesh, camera)
         both, off = (image[..., 0] == 1) & (target[..., 0] == 1), (image - target).abs()
@@ -53,7 +53,7 @@ for step in range(args.steps):
     optimizer.zero_grad()
     loss.backward()
     optimizer.step()
-found = reli3d.extract_surface(level.detach(), radius=1.0)
+found = reli3d.extract_surface(sdf.detach(), radius=1.0)
 print(f"found: {distance(found.vertices).abs().mean():.4f}")
 found, clay = reli3d.unwrap(found).with_tangents(), reli3d.TextureSet(torch.full((8, 8, 3), 0.7), 0.8, 0.0)
 reli3d.write_glb(args.output / "shape.glb", reli3d.Asset(found, clay))

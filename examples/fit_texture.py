@@ -26,7 +26,7 @@ x, y, z = torch.meshgrid(*[torch.linspace(-1, 1, 25)] * 3, indexing="ij")
 torus = reli3d.extract_surface((((x**2 + z**2).sqrt() - 0.6) ** 2 + y**2).sqrt() - 0.25, radius=1.0)
 mesh = reli3d.unwrap(torus, texture_size=TEXELS)
 checker = reli3d.bake(mesh, TEXELS, lambda position, _: 0.2 + 0.6 * ((6 * position).floor() % 2))["value"]
-truth = reli3d.Asset(mesh, reli3d.TextureSet(checker, roughness=0.4, metallic=0.0))
+reference = reli3d.Asset(mesh, reli3d.TextureSet(checker, roughness=0.4, metallic=0.0))
 
 light = reli3d.Environment(torch.linspace(2.0, 0.2, 16)[:, None, None].expand(16, 32, 3).contiguous())  # bright above
 poses = [reli3d.look_at([2.5 * math.cos(k), 1.5 * (-1) ** k, 2.5 * math.sin(k)]) for k in range(8)]
@@ -38,7 +38,7 @@ def image(asset: reli3d.Asset, camera: reli3d.Camera, seed: int) -> torch.Tensor
 
 
 with torch.no_grad():
-    photographs = [sum(image(truth, c, 1000 + i) for i in range(8)) / 8 for c in cameras]
+    photographs = [sum(image(reference, c, 1000 + i) for i in range(8)) / 8 for c in cameras]
 color, rough = torch.zeros(TEXELS, TEXELS, 3, requires_grad=True), torch.zeros(TEXELS, TEXELS, requires_grad=True)
 optimizer = torch.optim.Adam([color, rough], lr=0.1)
 for step in range(args.steps):
@@ -51,7 +51,7 @@ for step in range(args.steps):
     optimizer.step()
 
 side = reli3d.Camera.from_fov(reli3d.look_at([0.0, 3.0, 0.5]), 0.9, args.size, args.size)
-error = (image(asset.detach(), side, 1) - image(truth, side, 1)).square().mean().sqrt()
+error = (image(asset.detach(), side, 1) - image(reference, side, 1)).square().mean().sqrt()
 print(f"root mean square error from a new side: {error:.4f}")
 reli3d.write_image(args.output / "found.png", color.detach().sigmoid())
 reli3d.write_image(args.output / "true.png", checker)

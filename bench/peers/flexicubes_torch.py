@@ -16,11 +16,11 @@ def cube_list(shape):
     return torch.stack([index[tuple(slice(o, n - 1 + o) for o, n in zip(c, shape))].reshape(-1) for c in corners], -1)
 
 
-def flexicubes(level, deformation, alpha, beta, gamma, cubes, scale):
+def flexicubes(sdf, deformation, alpha, beta, gamma, cubes, scale):
     """Vertices ``(V, 3)`` and faces ``(F, 3)`` of a field that is positive at the border of its box."""
     table = {name: torch.from_numpy(value).long() for name, value in tables()._asdict().items()}
-    size = torch.tensor(level.shape) - 1
-    values = level.reshape(-1)
+    size = torch.tensor(sdf.shape) - 1
+    values = sdf.reshape(-1)
     inside = (values < 0)[cubes]
     case = (inside.long() << torch.arange(8)).sum(-1)
     surface = ((case > 0) & (case < 255)).nonzero()[:, 0]
@@ -35,7 +35,7 @@ def flexicubes(level, deformation, alpha, beta, gamma, cubes, scale):
     resolved = torch.where(valid & (other == face ^ 1), 255 - own, own)
 
     vertex = cubes[surface]
-    axes = [torch.arange(n) / (n - 1) - 0.5 for n in level.shape]
+    axes = [torch.arange(n) / (n - 1) - 0.5 for n in sdf.shape]
     position = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).view(-1, 3) + deformation.view(-1, 3)
     ends = table["ends"]
     pairs = vertex[:, ends]  # (S, 12, 2)
@@ -49,10 +49,10 @@ def flexicubes(level, deformation, alpha, beta, gamma, cubes, scale):
     count = table["count"][resolved]
     base = count.cumsum(0) - count
     owner = base[row] + table["group"][resolved[row], edge]
-    share = beta[surface][row, edge]
+    weight = beta[surface][row, edge]
     total = int(count.sum())
-    mass = torch.zeros(total).index_add(0, owner, share)
-    vertices = torch.zeros(total, 3).index_add(0, owner, crossing * share[:, None]) / mass[:, None] * scale
+    mass = torch.zeros(total).index_add(0, owner, weight)
+    vertices = torch.zeros(total, 3).index_add(0, owner, crossing * weight[:, None]) / mass[:, None] * scale
 
     unique, inverse, times = torch.unique(at.sort(-1).values, dim=0, return_inverse=True, return_counts=True)
     whole = (times == 4)[inverse].nonzero()[:, 0]  # an edge at the box's border has fewer cubes
@@ -60,7 +60,7 @@ def flexicubes(level, deformation, alpha, beta, gamma, cubes, scale):
     ring = order[:, [0, 1, 3, 2]]
     quads = owner[ring]
     low, high = unique[inverse[order[:, 0]]].unbind(-1)
-    axis = (high - low == 1) * 2 + (high - low == level.shape[2])
+    axis = (high - low == 1) * 2 + (high - low == sdf.shape[2])
     flip = ((values[low] < 0) == (axis == 1)).logical_not()
     quads = torch.where(flip[:, None], quads.flip(1), quads)
     g = gamma[surface][row[torch.where(flip[:, None], ring.flip(1), ring)]]

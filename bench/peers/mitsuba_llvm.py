@@ -60,15 +60,15 @@ def fit_step(mi, mesh: Mesh, light: torch.Tensor, camera: Camera, material, targ
     for key in keys:
         optimizer[key] = params[key]
     params.update(optimizer)
-    slope = float(np.float32(1 / 2.2) * np.float32(target) ** np.float32(1 / 2.2 - 1))
+    derivative = float(np.float32(1 / 2.2) * np.float32(target) ** np.float32(1 / 2.2 - 1))
     pixels = directions[..., 0].numel()
 
     def step():
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(0, pixels)
         image, hit, _ = scene.integrator().sample(scene, sampler, ray)
-        miss = dr.select(hit, (image - target) * slope, 0.0)
-        dr.backward(dr.sum(dr.squared_norm(miss)))
+        residual = dr.select(hit, (image - target) * derivative, 0.0)
+        dr.backward(dr.sum(dr.squared_norm(residual)))
         optimizer.step()
         params.update(optimizer)
         dr.eval(*(optimizer[key] for key in keys))

@@ -15,7 +15,7 @@ def material(mi, base_color, alpha, metallic, diffuse_model="conserving", maps: 
     import drjit as dr
 
     numbers = mi.Color3f(*base_color), mi.Float(alpha), mi.Float(metallic)
-    dr.make_opaque(*numbers)  # not literals: materials share a compiled kernel
+    dr.make_opaque(*numbers)  # not literals: one compiled kernel for all materials
     if maps is not None:
         planes = maps.base_color, maps.roughness[..., None], maps.metallic[..., None]
         bitmaps = [mi.Bitmap(np.ascontiguousarray(v.cpu().numpy(), np.float32)) for v in planes]

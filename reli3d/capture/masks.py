@@ -26,9 +26,9 @@ def grabcut_mask(view: View, found: Map, scene: Scene, support: np.ndarray | Non
 
     GrabCut (Rother and others 2004) with the map's points as seeds.  Foreground are the keypoints of the object's
     points, or all of its points, projected, where the view observes less than FEWEST_SEEDS of them.  Background are the
-    keypoints of the support plane and what lies beyond an outer limit: the hull of the object's points and of their
+    keypoints of the support plane and everything beyond an outer limit: the hull of the object's points and of their
     feet on the plane, grown by OUTER_GROWTH, and once more as long as the mask reaches it.  support: pixels ``(K, 2)``
-    of background seeds, in the place of the map's.
+    of background seeds, instead of the map's.
     """
     points = found.points[scene.object]
     feet = points - scene.plane.height(points)[:, None] * scene.plane.normal if scene.plane else points[:0]
@@ -110,7 +110,7 @@ def _reached(limit: np.ndarray, mask: np.ndarray) -> float:
 
 
 def key_mask(pixels: np.ndarray) -> np.ndarray | None:
-    """Mask of what differs from the color of the image's border; None where the border has no one color."""
+    """Mask of the pixels that differ from the color of the image's border; None unless the border has one color."""
     image, _ = _reduced(pixels, SIDE)
     lab = cv2.cvtColor(image, cv2.COLOR_RGB2LAB).astype(np.float32)
     border = np.concatenate([lab[0], lab[-1], lab[:, 0], lab[:, -1]])

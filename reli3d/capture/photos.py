@@ -1,4 +1,4 @@
-"""Photographs of a folder, or sharp frames of a video, with what their files say about the lens."""
+"""Photographs of a folder, or sharp frames of a video, with the lens data of their files."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ class Photo:
 
     name: str  # unique; without suffix
     pixels: np.ndarray  # (H, W, 3) uint8, sRGB, upright
-    focal: float | None  # pixels, from EXIF; None where it says nothing
-    lens: tuple  # equal for photographs that share a lens and a size
+    focal: float | None  # pixels, from EXIF; None if it is missing
+    lens: tuple  # equal for photographs of one lens and size
     flash: bool = False
 
     @property
@@ -169,7 +169,7 @@ def _read_video(path: Path, progress: Progress) -> tuple[list[Photo], list[str]]
     try:
         with av.open(str(path)) as file:
             if not file.streams.video:
-                raise InputError(path, "expected a video, got a file without a picture stream; check the path")
+                raise InputError(path, "expected a video, got a file without a video stream; check the path")
             stream = file.streams.video[0]
             stream.thread_type = "AUTO"
             total = stream.frames or round(float((file.duration or 0) / 1e6 * float(stream.average_rate or 30)))

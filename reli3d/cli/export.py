@@ -68,7 +68,7 @@ def _check(args: argparse.Namespace) -> None:
 
 def export(args: argparse.Namespace) -> tuple[list[Path], dict]:
     """Writes the files; returns their paths and a record of triangles and texture size."""
-    from reli3d.fit.transfer import dressed
+    from reli3d.fit.transfer import transfer_textures
     from reli3d.geometry.decimate import decimate
     from reli3d.geometry.mesh import vertex_normals
     from reli3d.io.files import write_bytes
@@ -86,9 +86,9 @@ def export(args: argparse.Namespace) -> tuple[list[Path], dict]:
     if args.decimate is not None and len(asset.mesh.faces) > args.decimate:
         with extra("--decimate"):
             mesh = decimate(asset.mesh, args.decimate)
-        asset = dressed(replace(mesh, normals=vertex_normals(mesh.vertices, mesh.faces)), asset, size)
+        asset = transfer_textures(replace(mesh, normals=vertex_normals(mesh.vertices, mesh.faces)), asset, size)
     elif size != asset.textures.size or (args.format != "glb" and not portable(asset)):
-        asset = dressed(asset.mesh, asset, size)
+        asset = transfer_textures(asset.mesh, asset, size)
     name = args.glb.stem
     if args.format == "glb":
         files = {f"{name}.glb": glb_bytes(asset, textures=args.textures)}

@@ -9,7 +9,7 @@ import sys
 import reli3d
 from reli3d.cli.exit_codes import Parser, command
 
-COMMANDS = {  # module of reli3d.cli, what it does
+COMMANDS = {  # module of reli3d.cli, purpose
     "infer": ("infer", "photographs with cameras to a relightable asset (also reli3d-infer)"),
     "capture": ("capture", "photographs or a video without cameras to an object folder"),
     "view": ("view", "show a reconstruction in the browser"),

@@ -28,7 +28,7 @@ def flattened(
 ) -> Mesh:
     """``mesh`` denoised by bilateral filtering of its face normals; vertices and faces only.
 
-    The normals are averaged over neighbours with weights of area and of the distance of normals (Zheng, Fu, Au and Tai
+    The normals are averaged over neighbors with weights of area and of the distance of normals (Zheng, Fu, Au and Tai
     2011, Bilateral normal filtering for mesh denoising); then the vertices are moved to match the filtered normals
     (Sun, Rosin, Martin and Langbein 2007, Fast and effective feature-preserving mesh denoising, section 4).  Unlike
     smoothing of positions this keeps sharp edges and the thickness of thin parts.

@@ -15,7 +15,7 @@ from reli3d.geometry.camera import Camera
 from reli3d.render.color import srgb_to_linear
 
 SATURATED_LINEAR = 0.97  # a brighter pixel may be clipped: its value is a lower bound
-INSIDE_COVERAGE = 0.99  # minimum of a pixel and its neighbours that contain only the object
+INSIDE_COVERAGE = 0.99  # minimum of a pixel and its neighbors that contain only the object
 
 
 class PosedImages(Protocol):
@@ -122,5 +122,5 @@ class InputImages:
         return replace(self, camera=replace(self.camera, c2w=c2w))
 
     def inside(self) -> Tensor:
-        """``(V, S, S)`` bool: pixels that, with their 8 neighbours, contain only the object."""
+        """``(V, S, S)`` bool: pixels that, with their 8 neighbors, contain only the object."""
         return max_pool2d(1.0 - self.mask[:, None], 3, 1, 1)[:, 0] < 1.0 - INSIDE_COVERAGE

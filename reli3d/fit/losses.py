@@ -101,7 +101,7 @@ def curvature(sdf: Tensor, cell: float, weight: Tensor) -> Tensor:
 
 
 def total_variation(values: Tensor) -> Tensor:
-    """Total variation: mean absolute difference of neighbours of a map ``(H, W, C)`` that is periodic along W."""
+    """Total variation: mean absolute difference of neighbors of a map ``(H, W, C)`` that is periodic along W."""
     return values.diff(dim=0).abs().mean() + (values - values.roll(1, 1)).abs().mean()
 
 

@@ -17,7 +17,7 @@ from reli3d.fit.choice import UNCHANGED, Fitted, Parts, chosen, mean_psnr, view_
 from reli3d.fit.input_images import InputImages, PosedImages
 from reli3d.fit.maps import FixedSurface, MapsStage, fit_maps
 from reli3d.fit.shape import ShapeData, finished, fit_shape, start_grid
-from reli3d.fit.transfer import dressed
+from reli3d.fit.transfer import transfer_textures
 from reli3d.fit.unknowns import START_GRID, Start, Unknowns, corrected, filled_grid
 from reli3d.geometry.mesh import watertight
 from reli3d.render.asset import Asset
@@ -166,7 +166,7 @@ def _fitted(data: FixedSurface, options: _Options, budget: Budget, notes: list[s
         shape = ShapeData.of(start, sdf, bound, grid, around, images, used)
         fit_shape(unknowns, shape, weights, budget, SHAPE_UNTIL, seed=seed, cameras=options.cameras)
         mesh = finished(unknowns.sdf, bound, grid)
-        surface = dressed(mesh, first, first.textures.size)
+        surface = transfer_textures(mesh, first, first.textures.size)
         images = replace(images, camera=corrected(images.camera, unknowns.pose))
         received = gathered(surface.mesh, images.select(used), seed=seed)
         data = FixedSurface(start, surface, received, images, used)

@@ -41,8 +41,8 @@ def nearest_hits(mesh: Mesh, position: Tensor, normal: Tensor) -> tuple[Tensor, 
     return face, bary
 
 
-def dressed(mesh: Mesh, source: Asset, size: int) -> Asset:
-    """``mesh`` with a new atlas of ``size`` texels, the maps of ``source`` at corresponding points, and its light."""
+def transfer_textures(mesh: Mesh, source: Asset, size: int) -> Asset:
+    """``mesh`` with a new atlas of ``size`` texels, and the lighting and maps of ``source`` at corresponding points."""
     mesh = unwrap(mesh, texture_size=size)
     mesh = replace(mesh, tangents=vertex_tangents(mesh), colors=None)  # vertex colors are baked into the maps below
     texels = rasterize_texels(mesh, size)

@@ -281,7 +281,7 @@ def _overlaps(charts: Charts, boxes: np.ndarray, query: np.ndarray):
 def split_overlaps(charts: Charts) -> bool:
     """Moves faces of self-overlapping charts to new charts without overlap, in place; True if there were any.
 
-    All faces of a chart face its plane.  So where two sheets overlap, the border of one of them lies on the other: it
+    All faces of a chart face its plane.  So where two sheets overlap, the border of one of them is within the other: it
     suffices to test the faces at a border against all faces.
     """
     outer = outer_faces(charts.chart, charts.neighbors)

@@ -44,7 +44,7 @@ _PRIMARIES = {  # of colorInteropID (Color Interop Forum) without chromaticities
 def read_exr(path: str | os.PathLike, max_pixels: int, notes: list[str]) -> tuple[np.ndarray, np.ndarray | None]:
     """Pixels ``(H, W, 3)`` float32 of the display window, and the 3x3 matrix that takes them to Rec. 709 (None: none).
 
-    Outside the data window the image is black; what lies outside the display window is cropped.  Both are appended to
+    Outside the data window the image is black; pixels outside the display window are cropped.  Both are appended to
     ``notes``.  Raises InputError.
     """
     header, names = _header(path, notes, max_pixels)

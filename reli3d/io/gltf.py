@@ -1,7 +1,7 @@
 """GLB in: the container, accessors, nodes and skins of any glTF 2.0 file, checked before use.
 
 Nothing outside the file is opened (data URIs only).  Sizes are limited before memory is taken.  Every fault is an
-InputError that names the field; what is left out is a note.  Primitives are read in ``gltf_parts.py``, materials in
+InputError that names the field; an omission is a note.  Primitives are read in ``gltf_parts.py``, materials in
 ``gltf_materials.py``.  Source: https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html.
 """
 
@@ -57,7 +57,7 @@ class Placed:
 class Document:
     """A parsed GLB: typed access to its JSON and its accessors.
 
-    Every getter raises InputError with the place in the file for a wrong type, index or range.  What is left out is
+    Every getter raises InputError with the place in the file for a wrong type, index or range.  Omissions are
     appended to ``notes``, one line each.
     """
 

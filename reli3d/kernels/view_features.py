@@ -6,7 +6,7 @@ from reli3d.kernels.bilinear import between_pixels, look_up
 from reli3d.kernels.projection import project_point
 
 wp.set_module_options(
-    # inlines functions that several kernels share: calls take a third of the time
+    # inlines functions of several kernels: calls take a third of the time
     {"enable_backward": False, "cpu_compiler_flags": "-march=native -mllvm=-inline-threshold=5000"}
 )
 
@@ -361,9 +361,9 @@ def fuse_views_kernel(
     direction = wp.vec4()
     for k in range(2 * views):
         v = k % views
-        sees = viewed.visible[n, v] > 0.0
+        visible = viewed.visible[n, v] > 0.0
         # views that see the point come first; the others are used only if none of those is confident
-        if (k < views and sees) or (k >= views and not sees and greatest < CONFIDENT_WEIGHT):
+        if (k < views and visible) or (k >= views and not visible and greatest < CONFIDENT_WEIGHT):
             pose = viewed.c2w[v]
             q = project_point(p, pose, viewed.intrinsics[v])
             seen, view_weight = view_numbers(viewed.image, v, p, q, pose, 1, viewed.visible[n, v], normal)

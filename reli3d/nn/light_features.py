@@ -50,7 +50,7 @@ def unshaded(color: Tensor, brightness: Tensor) -> Tensor:
 def palette_of(color: Tensor, unlit: Tensor, visible: Tensor) -> Tensor:
     """Mean and standard deviation ``(12,)`` of the logits of ``color`` and ``unlit``, both ``(N, 3)`` sRGB.
 
-    color: observed.  plain: divided by the brightness, see :func:`unshaded`.  visible: ``(N,)``, weight of each point.
+    color: observed.  unlit: divided by the brightness, see :func:`unshaded`.  visible: ``(N,)``, weight of each point.
     """
     weight = ((visible + 1e-6) / (visible + 1e-6).sum())[:, None]
     values = torch.cat([color_logit(color), color_logit(unlit)], -1)

@@ -91,7 +91,7 @@ class Reconstructor(nn.Module):
     ) -> Code:
         """Encodes posed views of B objects, each in the model's frame; the first view is the reference view.
 
-        images: ``(B, V, S, S, 3)`` sRGB in [0, 1], straight (not multiplied by the mask), S the preset's image size.
+        images: ``(B, V, S, S, 3)`` sRGB in [0, 1], not multiplied by the mask, S the preset's image size.
         masks: ``(B, V, S, S)`` in [0, 1].  c2w: ``(B, V, 4, 4)`` OpenGL axes.  intrinsics: ``(B, V, 4)`` fx, fy, cx, cy
         in pixels of the S by S image.  background_visible: ``(B,)`` bool, whether the illumination path may look at the
         background of an object's views; default none may, as published.

@@ -85,7 +85,7 @@ class ImagePyramid(nn.Module):
 
     Level ``k`` has ``S / 2**(k + 1)`` pixels a side.  Each of the ``sizes.reading`` finest levels also reads the image
     at its own resolution and adds a residual to the prediction of the coarser levels.  Coarse levels can therefore be
-    trained first, on small images; finer ones are initialized to add zero.  The coarsest level shares one mean vector
+    trained first, on small images; finer ones are initialized to add zero.  The coarsest level has one mean vector
     between the views, which have common lighting.  ``in_bfloat16``: compute dtype of the convolutions; parameters and
     results are float32.
     """
@@ -129,9 +129,9 @@ class ImagePyramid(nn.Module):
         """Features ``(V, S/4, S/4, F)``, None if ``finest`` > 0, and raw predictions ``(V, S/2, S/2, C)`` of views.
         Gradients reach every parameter.
 
-        images: ``(V, S, S, 3)`` sRGB.  masks: ``(V, S, S)``.  place: ``(V, S, S, 2)`` from :func:`place_of_pixels`.
-        span: ``(V, S / k, S / k, 2)`` from :func:`span_of_pixels`.  S is a multiple of ``2**levels``.  counts: number
-        of views of each object, in order; None if all are of one object.
+        images: ``(V, S, S, 3)`` sRGB.  masks: ``(V, S, S)``.  place: ``(V, S, S, 2)`` from :func:`pixel_positions`.
+        span: ``(V, S / k, S / k, 2)`` from :func:`pixel_hull_depths`.  S is a multiple of ``2**levels``.  counts:
+        number of views of each object, in order; None if all are of one object.
         """
         counts = [len(masks)] if counts is None else counts
         x = pyramid_input(images, masks, place, span, counts)

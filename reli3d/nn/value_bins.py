@@ -20,7 +20,7 @@ from reli3d.errors import InputError
 from reli3d.nn.local import LocalReconstructor
 from reli3d.nn.pyramid import BINNED, OTHERS_BEFORE
 
-L1_WEIGHT = 0.2  # of the expectation's absolute error beside the cross-entropy
+L1_WEIGHT = 0.2  # of the expectation's absolute error, added to the cross-entropy
 
 
 def two_bins(value: Tensor, bins: int) -> Tensor:

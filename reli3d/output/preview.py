@@ -149,7 +149,7 @@ def unseen_cameras(mesh: Mesh, c2w: Tensor) -> list[Camera]:
         height_above = torch.full_like(azimuth, math.sin(lift))
         places.append(torch.stack([azimuth.sin() * math.cos(lift), height_above, azimuth.cos() * math.cos(lift)], -1))
     offered = torch.cat(places).to(center)
-    nearest = (offered @ normalize(c2w[:, :3, 3] - center, dim=-1).T).amax(1)  # cosine of the angle to what is taken
+    nearest = (offered @ normalize(c2w[:, :3, 3] - center, dim=-1).T).amax(1)  # cosine of the angle to the nearest view
     chosen = []
     for _ in range(COLUMNS):
         chosen.append(int(nearest.argmin()))

@@ -75,8 +75,8 @@ class TextureSet:
         check(name, value, like=first)
         size = (first.shape[0] if first.ndim else 0,) * 2
         if value.shape != (size if channels == 1 else (*size, channels)) or size[0] == 0:
-            wanted = "(T, T, 3)" if name == "base_color" else f"{size if channels == 1 else (*size, channels)}"
-            raise ValueError(f"{name}: expected shape {wanted}, got {tuple(value.shape)}")
+            expected = "(T, T, 3)" if name == "base_color" else f"{size if channels == 1 else (*size, channels)}"
+            raise ValueError(f"{name}: expected shape {expected}, got {tuple(value.shape)}")
         object.__setattr__(self, name, value)
 
     @property

@@ -76,7 +76,7 @@ class SurfacePoints:
 def nan_where_not_finite(values: Sequence[Tensor]) -> Tensor:
     """``(N, 1)``: 0, or NaN where one of ``values (N, 3)`` or ``(N,)`` is not finite, which a minimum would hide."""
     rows = torch.zeros_like(values[0])
-    for value in values:  # a sum over columns would take five times as long
+    for value in values:  # a sum over columns would take 5 times as long
         if value.ndim == 2:
             rows += value * 0.0
     total = rows[:, 0] + rows[:, 1] + rows[:, 2]
@@ -87,7 +87,7 @@ def nan_where_not_finite(values: Sequence[Tensor]) -> Tensor:
 
 
 def check_values(points: SurfacePoints, wo: Tensor) -> None:
-    """Raise ValueError for directions that are not unit, materials beyond [0, 1] and what is not finite."""
+    """Raise ValueError for directions that are not unit, materials outside [0, 1] and values that are not finite."""
     given = {f.name: getattr(points, f.name).detach() for f in fields(points)} | {"wo": wo.detach()}
     for name, value in given.items():
         if name in NUMBERS:

@@ -289,7 +289,7 @@ def _shade_embree(n: int, ins: list, job: _Job, outs: list) -> None:
         return
     size = max(1, CHUNK_RAYS // count)
     group = max(1, GROUP_RAYS // count)
-    outs = views(outs)  # once: a third of what a chunk costs besides its rays
+    outs = views(outs)  # once: a third of the cost of a chunk without its rays
     (known,) = views([(job.known, wp.int32)])
 
     def work(_, start, length):

@@ -75,8 +75,8 @@ def mesh_edges(vertices: Tensor, faces: Tensor) -> Tensor:
 def outline_crossings(vertices: Tensor, edges: Tensor, camera: Camera, scene: RayScene) -> Crossings:
     """Crossings of visible silhouettes with the lines between pixel centers.
 
-    vertices: ``(V, 3)``.  edges: of :func:`mesh_edges`.  camera: one, no batch.  scene: what may hide an edge, normally
-    the mesh itself and everything else in the scene.  An edge with an end behind the eye is left out.  Of several
+    vertices: ``(V, 3)``.  edges: of :func:`mesh_edges`.  camera: one, no batch.  scene: the occluders, normally the
+    mesh itself and the rest of the scene.  An edge with an end behind the eye is left out.  Of several
     crossings of one pair in one direction the outermost stays.
     """
     check("vertices", vertices, last=3)

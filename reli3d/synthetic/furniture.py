@@ -220,13 +220,13 @@ def shelf(a: Assembly) -> None:
             _drawers(a, w * 1.02, low, d * 1.05, np.array([0, low / 2, 0.02]), wood)
         for s in (-1, 1):
             a.add(p.box((t, h, d)), wood, (s * (w - t) / 2, h / 2, 0))
-        levels = np.linspace(low, h - t, int(rng.integers(2, 6)) + (low == 0))
-        for y in levels:
+        heights = np.linspace(low, h - t, int(rng.integers(2, 6)) + (low == 0))
+        for y in heights:
             a.add(p.box((w, t, d)), wood, (0, y + t / 2, 0))
         if rng.random() < 0.75:
             a.add(p.box((w, h, 0.015)), wood, (0, h / 2, -d / 2 + 0.008))
         books = [a.part("accent") for _ in range(3)] if rng.random() < 0.4 else []
-        for y, top in zip(levels[:-1], levels[1:]) if books else ():
+        for y, top in zip(heights[:-1], heights[1:]) if books else ():
             x = -w / 2 + t
             while x < w / 2 - t - 0.12 and rng.random() < 0.92:
                 wide, tall = u(0.03, 0.09), (top - y - t) * u(0.6, 0.92)

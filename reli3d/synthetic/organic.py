@@ -199,7 +199,7 @@ def figure(a: Assembly) -> None:
     f.ball(top + (0, 0.4 * head, 0), head * np.array([0.85, 1.1, 0.95]), blend=0.03)
     f.ball(top + (0, 0.75 * head, -0.3 * head), head * np.array([0.9, 0.85, 0.85]), blend=0.01, label=2)
     f.ball(top + (0, 0.2 * head, 0.9 * head), head * 0.2, blend=0.03)
-    sits = rng.random() < 0.25
+    seated = rng.random() < 0.25
     for s in (-1, 1):
         shoulder = np.array([s * 1.2 * wide, chest + 0.03, 0])
         elbow = shoulder + np.array([s * u(0.05, 0.2), u(-0.2, 0.08), u(-0.05, 0.1)])
@@ -209,8 +209,8 @@ def figure(a: Assembly) -> None:
         f.limb(elbow, hand, arm * 1.1, arm * 0.9, blend=0.02)
         f.ball(hand, arm * 1.2, blend=0.02)
         top_leg = np.array([s * 0.6 * wide, hip, 0])
-        knee = np.array([s * u(0.5, 1.0) * wide, hip * (0.95 if sits else 0.55), 0.24 if sits else u(-0.03, 0.06)])
-        foot = np.array([knee[0] + s * 0.02, hip * 0.5 if sits else 0.03, knee[2] + u(-0.06, 0.02)])
+        knee = np.array([s * u(0.5, 1.0) * wide, hip * (0.95 if seated else 0.55), 0.24 if seated else u(-0.03, 0.06)])
+        foot = np.array([knee[0] + s * 0.02, hip * 0.5 if seated else 0.03, knee[2] + u(-0.06, 0.02)])
         f.limb(top_leg, knee, 0.06 * plump, 0.05 * np.sqrt(plump), blend=blend, label=1)
         f.limb(knee, foot, 0.047 * np.sqrt(plump), 0.035 * np.sqrt(plump), blend=0.02, label=1)
         f.limb(foot, foot + (0, 0, 0.09), 0.036 * np.sqrt(plump), 0.033, blend=0.02, label=2)
@@ -228,7 +228,7 @@ def figure(a: Assembly) -> None:
         a.add(
             p.box((0.5, u(0.04, 0.3), 0.45), 0.02), a.part("stone" if rng.random() < 0.5 else "wood"), (0, -0.03, 0.03)
         )
-    elif sits:
+    elif seated:
         a.add(p.box((0.36, hip * 0.85, 0.34), 0.02), a.part("wood"), (0, hip * 0.42, -0.02))
 
 

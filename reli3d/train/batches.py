@@ -57,7 +57,7 @@ class TrainingViews:
     view_normal: Tensor  # (V, P, P, 3) world, unit
     view_depth: Tensor  # (V, P, P) from the world's origin along the camera's axis
     view_valid: Tensor  # (V, P, P) bool: the surface covers the whole pixel
-    finish_known: Tensor  # (V,) bool: roughness and metallic are the truth, not placeholders
+    finish_known: Tensor  # (V,) bool: roughness and metallic are ground truth, not placeholders
 
     def of_views(self, chosen: slice | Tensor) -> TrainingViews:
         """The views of the indices ``chosen``."""

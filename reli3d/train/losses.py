@@ -171,9 +171,7 @@ def _pixel_terms(pixels: PixelMaps, shown: Tensor, views: TrainingViews, counts:
 
 
 def _finish(pixels: PixelMaps, views: TrainingViews) -> dict[str, Tensor]:
-    """Cross-entropy of roughness and metallic per pixel, over bins if the network has them; empty if no view has ground
-    truth of them.
-    """
+    """Cross-entropy of roughness and metallic per pixel, over bins if the model has them; empty without targets."""
     valid = views.view_valid & views.finish_known[:, None, None]
     if not bool(valid.any()):
         return {}

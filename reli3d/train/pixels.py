@@ -83,15 +83,15 @@ def predict_pixels(model: LocalReconstructor, group: Group) -> tuple[PixelMaps, 
     seen = functional.avg_pool2d(views.masks[:, None], QUARTER)[:, 0]
     quarter, half = camera.resized(*seen.shape[:0:-1]), camera.resized(size // 2, size // 2)
     color, mask = pixel_colors(views.images, views.masks, half)
-    spans, levels, first = [], [], 0
+    spans, means, first = [], [], 0
     for count in group.counts:  # the hull and the exposure are those of one object
         of = slice(first, first + count)
         spans.append(pixel_hull_depths(views.silhouette[of], camera[of], seen[of], quarter[of]))
-        levels.append(mean_logit(color[of], mask[of]).expand(count))
+        means.append(mean_logit(color[of], mask[of]).expand(count))
         first += count
-    span, level = torch.cat(spans), torch.cat(levels)[:, None, None, None]
+    span, mean = torch.cat(spans), torch.cat(means)[:, None, None, None]
     _, raw = model.pyramid(views.images, views.masks, pixel_positions(camera), span, group.counts)
-    return PixelMaps.of(raw, span, half, level), color
+    return PixelMaps.of(raw, span, half, mean), color
 
 
 def reduction(path: Path, finest: int) -> int:

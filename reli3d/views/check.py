@@ -290,7 +290,7 @@ def _panel(views, hull, middle, reach, frustums, title, across, down, sign) -> I
 
     if len(hull.points):
         points = hull.points.numpy()
-        order = np.argsort(points[:, 3 - across - down])  # the beholder sits on the positive side of the third axis
+        order = np.argsort(points[:, 3 - across - down])  # seen from the positive end of the third axis
         shade = np.linspace(90, 190, len(order)).astype(int)[::-1]
         half = max(1.0, 0.5 * hull.cell * zoom)
         for (x, y), gray in zip(at(points[order]), shade):

@@ -139,7 +139,7 @@ def _check_inner(where: str, values: dict) -> None:
                 raise InputError(
                     where,
                     f"{key}: expected the lens in the frame or the file, got {shown(name)} within {key}, which is not "
-                    "read; write it beside transform_matrix",
+                    "read; write it into the object that has transform_matrix",
                 )
 
 

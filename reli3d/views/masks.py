@@ -30,7 +30,7 @@ def mask_values(path: os.PathLike, bitmap: Image.Image, notes: list[str]) -> Ima
 
     Alpha where it is used, else gray, or one color on black.  Gray values between black and white are coverage
     (antialiasing).  Of a mask with two values, black and one below white, nonzero is the object, with a note.  Raises
-    InputError with the values found for several labels and for what has no black.
+    InputError, with the values found, for several labels and for masks without black.
     """
     alpha = used_alpha(bitmap)
     if alpha is not None:
@@ -48,8 +48,8 @@ def alpha_values(bitmap: Image.Image, notes: list[str]) -> Image.Image | None:
     alpha = used_alpha(bitmap)
     if alpha is None:
         return None
-    levels = _levels(alpha)
-    return _nonzero(alpha, levels[1], notes) if len(levels) == 2 and levels[0] == 0 else _scaled(alpha, levels, notes)
+    grays = _gray_values(alpha)
+    return _nonzero(alpha, grays[1], notes) if len(grays) == 2 and grays[0] == 0 else _scaled(alpha, grays, notes)
 
 
 def used_alpha(bitmap: Image.Image) -> Image.Image | None:
@@ -60,7 +60,7 @@ def used_alpha(bitmap: Image.Image) -> Image.Image | None:
     return alpha if int(np.asarray(alpha).min()) < 128 else None
 
 
-def _levels(channel: Image.Image) -> list[int]:
+def _gray_values(channel: Image.Image) -> list[int]:
     """The values that occur, ascending."""
     if channel.mode == "L":
         return [value for value, count in enumerate(channel.histogram()) if count]
@@ -89,41 +89,41 @@ def check_one_label(folder: os.PathLike, notes: Sequence[str]) -> None:
 
 
 def _coverage(path: os.PathLike, channel: Image.Image, notes: list[str]) -> Image.Image:
-    levels, top = _levels(channel), _TOP[channel.mode]
-    if len(levels) == 1 and 0 < levels[0] < OPAQUE * top or len(levels) == 2 and levels[0] > 0:
-        raise _not_a_mask(path, f"the values {', '.join(map(str, levels))} without 0")
-    if len(levels) == 2:
-        return _nonzero(channel, levels[1], notes)
-    if len(levels) == 1:
+    grays, top = _gray_values(channel), _TOP[channel.mode]
+    if len(grays) == 1 and 0 < grays[0] < OPAQUE * top or len(grays) == 2 and grays[0] > 0:
+        raise _not_a_mask(path, f"the values {', '.join(map(str, grays))} without 0")
+    if len(grays) == 2:
+        return _nonzero(channel, grays[1], notes)
+    if len(grays) == 1:
         return channel
-    values, peak, few = np.asarray(channel), levels[-1], len(levels) <= FEW_VALUES
+    values, peak, few = np.asarray(channel), grays[-1], len(grays) <= FEW_VALUES
     high = min(peak, OPAQUE * top) if few else (1 - NOISE) * min(peak, top)
     between = (values > (0 if few else NOISE * top)) & (values < high)
     flat = _flat(values)
     if int((between[1:-1, 1:-1] & flat).sum()) > PLATEAU * int(between.sum()):
-        some = ", ".join(map(str, levels[:8])) + (", ..." if len(levels) > 8 else "")
-        raise _not_a_mask(path, f"{len(levels)} values in flat areas ({some}), as of several labels")
-    return _scaled(channel, levels, notes)
+        some = ", ".join(map(str, grays[:8])) + (", ..." if len(grays) > 8 else "")
+        raise _not_a_mask(path, f"{len(grays)} values in flat areas ({some}), as of several labels")
+    return _scaled(channel, grays, notes)
 
 
-def _scaled(channel: Image.Image, levels: list[int], notes: list[str]) -> Image.Image:
+def _scaled(channel: Image.Image, grays: list[int], notes: list[str]) -> Image.Image:
     """``channel`` such that the object is opaque, with a note: where its highest value is below white and frequent, or
     most of its values lie near it, as those of a codec about a label do.
     """
-    peak, top = levels[-1], _TOP[channel.mode]
+    peak, top = grays[-1], _TOP[channel.mode]
     if not 0 < peak < OPAQUE * top:
         return channel
     values = np.asarray(channel)
     upper, between = (int((values > part * peak).sum()) for part in (0.75, 0.25))
     if int(((values == peak)[1:-1, 1:-1] & _flat(values)).sum()) > SOLID * int((values > 0).sum()):
-        level, which = peak, f"the highest value, {peak}, is"
+        white, which = peak, f"the highest value, {peak}, is"
     elif between - upper < 0.5 * upper:
-        level = int(np.median(values[values > 0.5 * peak]))
-        which = f"values about {level} are"
+        white = int(np.median(values[values > 0.5 * peak]))
+        which = f"values about {white} are"
     else:
         return channel
     notes.append(f"masks: {which} taken as opaque instead of white")
-    return Image.fromarray(np.rint(np.minimum(values * np.float32(255 / level), 255)).astype(np.uint8))
+    return Image.fromarray(np.rint(np.minimum(values * np.float32(255 / white), 255)).astype(np.uint8))
 
 
 def _flat(values: np.ndarray) -> np.ndarray:
@@ -161,9 +161,9 @@ def _not_a_mask(path: os.PathLike, got: str) -> InputError:
 class MaskFiles:
     """Finds the mask file of each of ``frames``, and never one file for two images.
 
-    Looked for are, below ``folder`` (else ``masks`` and ``mask`` in ``root``): the image's path relative to ``root``,
-    then without its first folder, without its first two, and so on to the bare name; with the image's own ending,
-    with another in its place, or with another after it (COLMAP's ``a.jpg.png``).
+    Below ``folder`` (else ``masks`` and ``mask`` in ``root``) a mask has the image's path relative to ``root``, or that
+    path without its first one, two, ... folders, down to the bare file name.  It has the image's own ending, another
+    one instead, or another one after it (COLMAP's ``a.jpg.png``).
     """
 
     def __init__(self, root: Path, frames: Sequence[Frame], folder: Path | None):
@@ -171,7 +171,7 @@ class MaskFiles:
         self._folders = [folder] if folder is not None else [root / name for name in named(root, FOLDERS)]
         self._images: dict[str, list[Path]] = {}  # of each mask file
         images = {os.path.realpath(frame.image): frame.image for frame in frames}
-        for image in (*images.values(), *self._beside(images)):
+        for image in (*images.values(), *self._other_images(images)):
             if (found := self._find(image)) is not None:
                 self._images.setdefault(os.path.realpath(found), []).append(image)
         for frame in frames:
@@ -183,7 +183,7 @@ class MaskFiles:
         if os.path.realpath(image) not in map(os.path.realpath, others):
             others.append(image)
 
-    def _beside(self, images: dict[str, Path]) -> Iterator[Path]:
+    def _other_images(self, images: dict[str, Path]) -> Iterator[Path]:
         """Images in nested folders that are no frames: a mask named after one of these may be another's."""
         frames = {(image.parent, image.stem) for image in images.values()}  # the same photograph in another format
         tops = {part.parts[0] for part in map(self._relative, images.values()) if len(part.parts) > 2}

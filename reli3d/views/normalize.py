@@ -26,7 +26,7 @@ FAR = 10.0  # distances to the object from which the origin is moved to it: floa
 SMALLEST = 1e-6  # distance to the object below which squares of areas of a mesh's faces leave float32
 WRITTEN = 1e-6  # of a position: matrices are often written with seven digits
 ONE_POINT = 1e-12  # of the eyes' distance from the origin: nearer together, they differ by float64's rounding alone
-AT_EYE = 1e-6  # of an eye's distance from the origin: what is nearer to the eye than float32 resolves
+AT_EYE = 1e-6  # of an eye's distance from the origin: float32 does not resolve a smaller distance to the eye
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ def visual_hull(views: Views) -> Hull:
     """Coarse visual hull of ``views``, on the CPU: a grid where the views meet, refined once to the box of its cells.
 
     A cell counts where the masks' maximum over its footprint exceeds one half, so that thin parts are not lost; beyond
-    the border of an image the mask goes on as at the border.  The hull is limited to the ball that the masks' width
+    the border of an image the mask has its values at the border.  The hull is limited to the ball that the masks' width
     suggests, which bounds it along rays that no other view crosses.  Views whose mask touches the border do not count
     where at least LEAST_WHOLE others are there.
     """

@@ -30,8 +30,8 @@ BACKGROUND_RANGE = 4 / 255  # between the 10th and the 90th percentile; a cut-ou
 def published_views(views: Views, size: int) -> ViewBatch:
     """All views at ``size`` x ``size`` pixels as the release prepares them; cameras stay as they are.
 
-    The whole image is stretched to the square; colors keep the background; masks are 0 or 1.  The 8-bit pixels of the
-    files are what is encoded, so colors of 16 bits are rounded first.  Agrees with the published tensors to float32
+    The whole image is stretched to the square; colors keep the background; masks are 0 or 1.  8-bit pixels
+    are encoded, so colors of 16 bits are rounded first.  Agrees with the published tensors to float32
     rounding (2e-7), masks exactly.  Raises ValueError on a size below 1 and for views that are not on the CPU, where
     the codec runs.
     """

@@ -84,7 +84,7 @@ def read_transforms(path: Path) -> tuple[list[Frame], list[str]]:
     found = [_frame(path, i, frames[i], data) for i in ranked]
     if data.get("applied_transform") is not None:
         notes.append(
-            f"{path.name}: applied_transform recorded by nerfstudio is not undone; the mesh comes out in the "
+            f"{path.name}: applied_transform recorded by nerfstudio is not undone; the mesh is in the "
             "frame of transform_matrix"
         )
     return found, notes

@@ -11,7 +11,7 @@ from reli3d.fit.budget import Budget
 from reli3d.fit.choice import PSNR_TOLERANCE_DB, Fitted, Parts
 from reli3d.fit.input_images import InputImages
 from reli3d.fit.losses import Weights, agreement, display_error, hue_drift, palette, shared_pattern
-from reli3d.fit.transfer import dressed
+from reli3d.fit.transfer import transfer_textures
 from reli3d.fit.unknowns import Start, Unknowns
 from reli3d.render.color import srgb_to_linear
 from reli3d.render.environment import Environment
@@ -201,7 +201,7 @@ def test_the_shared_pattern_sees_baked_shading():
 
 def test_maps_move_to_another_surface():
     painted = small_scene.two_colored(small_scene.ball())
-    moved = dressed(small_scene.ball(squeeze=0.96).mesh, painted, small_scene.TEXELS)
+    moved = transfer_textures(small_scene.ball(squeeze=0.96).mesh, painted, small_scene.TEXELS)
     # texels blend over the seam of the two colors, a small part of each half
     assert torch.allclose(half_colors(moved), half_colors(painted), atol=0.02)
 
