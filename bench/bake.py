@@ -6,7 +6,7 @@ from scipy import ndimage
 
 from reli3d.geometry.bake import bake, dilate, rasterize_texels
 from reli3d.geometry.mesh import Mesh
-from reli3d.geometry.tangents import encode_normals, vertex_tangents
+from reli3d.geometry.tangents import encode_normals
 from reli3d.geometry.uv import unwrap
 from reli3d.io.glb import glb_bytes
 from reli3d.render.asset import Asset, TextureSet
@@ -60,7 +60,7 @@ def whole(device, subdivisions, size):
 
 def tangents(device, subdivisions, size):
     mesh = sphere(device, subdivisions, size)
-    return lambda: vertex_tangents(mesh), {"faces": len(mesh.faces)}
+    return lambda: mesh.with_tangents().tangents, {"faces": len(mesh.faces)}
 
 
 def glb(device, subdivisions, size):

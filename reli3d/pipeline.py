@@ -26,7 +26,7 @@ from reli3d.geometry.rays import RayScene
 from reli3d.geometry.smooth import taubin_smooth
 from reli3d.geometry.sparse_sdf import sparse_sdf
 from reli3d.geometry.surface import extract_surface
-from reli3d.geometry.tangents import encode_normals, vertex_tangents
+from reli3d.geometry.tangents import encode_normals
 from reli3d.geometry.uv import source_vertices, unwrap, unwrap_xatlas
 from reli3d.nn.blocks import in_rows, submit
 from reli3d.nn.field import CHUNK, Field, TriplaneField
@@ -186,7 +186,7 @@ def texture(
     whole = mesh
     try:
         mesh = unwrap(mesh, texture_size=size) if uv == "project" else unwrap_xatlas(mesh, texture_size=size)
-        mesh = replace(mesh, tangents=vertex_tangents(mesh))
+        mesh = mesh.with_tangents()
     finally:
         local, known = pending() if pending else (None, None)
     if known is not None:

@@ -14,7 +14,7 @@ from reli3d.geometry.bake import Texels, dilate, interpolate, interpolate_tangen
 from reli3d.geometry.hits import interpolate as at_hits
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene
-from reli3d.geometry.tangents import encode_normals, vertex_tangents
+from reli3d.geometry.tangents import encode_normals
 from reli3d.geometry.uv import unwrap
 from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.gbuffer import sample_texture, surface_points
@@ -44,7 +44,7 @@ def nearest_hits(mesh: Mesh, position: Tensor, normal: Tensor) -> tuple[Tensor, 
 def transfer_textures(mesh: Mesh, source: Asset, size: int) -> Asset:
     """``mesh`` with a new atlas of ``size`` texels, and the lighting and maps of ``source`` at corresponding points."""
     mesh = unwrap(mesh, texture_size=size)
-    mesh = replace(mesh, tangents=vertex_tangents(mesh), colors=None)  # vertex colors are baked into the maps below
+    mesh = replace(mesh.with_tangents(), colors=None)  # vertex colors are baked into the maps below
     texels = rasterize_texels(mesh, size)
     index = torch.nonzero(texels.valid.reshape(-1))[:, 0]
     position, normal = interpolate(mesh, texels, index)

@@ -172,7 +172,7 @@ def _positions_normals(mesh: Mesh, places: kernels.Places, index: Tensor) -> tup
 
 def _tangents(mesh: Mesh, places: kernels.Places, index: Tensor) -> Tensor:
     if mesh.tangents is None:
-        raise ValueError("mesh.tangents: expected tangents, got None (see vertex_tangents)")
+        raise ValueError("mesh.tangents: expected tangents, got None (see Mesh.with_tangents)")
     tangent = torch.empty(len(index), 4, device=index.device, dtype=torch.float32)
     inputs = [places, (mesh.tangents.detach().contiguous(), wp.vec4), (tangent, wp.vec4)]
     _bridge.launch(kernels.tangents_kernel, len(index), inputs, index.device)

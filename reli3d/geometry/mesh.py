@@ -14,7 +14,8 @@ import torch
 from torch import Tensor
 
 from reli3d._bridge import check, tensor_of
-from reli3d.geometry.topology import edges_of, graph_components, group
+from reli3d.geometry.tangents import vertex_tangents
+from reli3d.geometry.topology import edges_of, graph_components, weld_rows
 
 NORMAL_MIN = 1.0e-20  # squared length of an area-weighted normal sum below which it counts as zero (published release)
 
@@ -69,10 +70,12 @@ class Mesh:
         return replace(self, normals=vertex_normals(self.vertices, self.faces))
 
     def with_tangents(self) -> Mesh:
-        """The same mesh with :func:`~reli3d.geometry.tangents.vertex_tangents`; needs normals and UV."""
-        from reli3d.geometry.tangents import vertex_tangents  # imports this module
-
-        return replace(self, tangents=vertex_tangents(self))
+        """The same mesh with :func:`~reli3d.geometry.tangents.vertex_tangents`.  ValueError without normals or UV."""
+        if self.normals is None:
+            raise ValueError("mesh.normals: expected a tensor, got None (see Mesh.with_normals)")
+        if self.uv is None:
+            raise ValueError("mesh.uv: expected a tensor, got None (see unwrap)")
+        return replace(self, tangents=vertex_tangents(self.vertices, self.faces, self.normals, self.uv))
 
 
 @dataclass(frozen=True)
@@ -136,26 +139,6 @@ def weld(vertices: Tensor) -> tuple[Tensor, Tensor]:
     check("vertices", vertices, last=3)
     first, label = weld_rows(vertices.detach().cpu().numpy())
     return torch.from_numpy(first).to(vertices.device), torch.from_numpy(label).to(vertices.device)
-
-
-def weld_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """As :func:`weld` for rows ``(N, K)`` of float32."""
-    bits = np.ascontiguousarray(rows + np.float32(0.0)).view(np.uint32).astype(np.uint64)
-    key = np.zeros(len(bits), np.uint64)
-    for k in range(bits.shape[1]):  # 64-bit mix (splitmix64): one integer to sort instead of the columns
-        key = (key ^ bits[:, k]) + np.uint64(0x9E3779B97F4A7C15)
-        key = (key ^ (key >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-        key = (key ^ (key >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-        key ^= key >> np.uint64(31)
-    spare = np.uint64(1 + max(1, len(bits).bit_length()))  # bits left for the index
-    order, start = group((key >> spare).astype(np.int64))
-    lowest = np.empty(len(bits), np.int64)
-    lowest[order] = np.repeat(order[start], np.diff(start, append=len(order)))
-    if not np.array_equal(bits[lowest], bits):  # hash collision
-        _, first, label = np.unique(bits, axis=0, return_index=True, return_inverse=True)
-        lowest = first[label.reshape(-1)]
-    leads = lowest == np.arange(len(bits))
-    return np.flatnonzero(leads), (np.cumsum(leads) - 1)[lowest]
 
 
 def sorted_keys(keys: Tensor) -> Tensor:

@@ -11,8 +11,8 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from reli3d._bridge import check, expect, launch, present
-from reli3d.geometry.mesh import Mesh, weld_rows
+from reli3d._bridge import check, launch
+from reli3d.geometry.topology import weld_rows
 from reli3d.kernels.bump import ENCODE_EPS, encode_normals_kernel
 from reli3d.kernels.tangents import corner_tangents_kernel
 
@@ -31,28 +31,24 @@ def _flat(v: Tensor, n: Tensor) -> Tensor:
     return v - n * (n * v).sum(0)
 
 
-def vertex_tangents(mesh: Mesh) -> Tensor:
+def vertex_tangents(vertices: Tensor, faces: Tensor, normals: Tensor, uv: Tensor) -> Tensor:
     """Tangents ``(V, 4)`` float32: unit, orthogonal to the normal, w = +-1.
 
     The tangent of a vertex is the sum over its corners of the face's +u direction, projected onto the plane of the
     vertex normal and normalized, times the angle of the corner.  Vertices with equal position, normal and UV are
     merged.  A vertex between mirrored and unmirrored faces, which MikkTSpace splits, takes the side with the larger
     angle; :func:`unwrap` produces none.  Where all faces have zero UV area the tangent is an arbitrary vector
-    orthogonal to the normal.  No gradient.  Raises ValueError without normals or UV.  Source: Mikkelsen 2008,
+    orthogonal to the normal.  No gradient.  Source: Mikkelsen 2008,
     Simulation of wrinkled surfaces revisited; mikktspace.c.
     """
-    expect("mesh", mesh, Mesh)
-    if mesh.normals is None:
-        raise ValueError("mesh.normals: expected a tensor, got None (see Mesh.with_normals)")
-    if mesh.uv is None:
-        raise ValueError("mesh.uv: expected a tensor, got None (see unwrap)")
-    vertices, uv, normals = (x.detach().contiguous() for x in (mesh.vertices, mesh.uv, mesh.normals))
-    same, count = _merged(mesh), len(mesh.vertices)
-    corner = torch.empty(3, len(mesh.faces), 4, dtype=torch.float64, device=vertices.device)
-    side = torch.empty(3, len(mesh.faces), dtype=torch.int32, device=vertices.device)
-    ins = [(vertices, wp.vec3), (normals, wp.vec3), (uv, wp.vec2), (mesh.faces.contiguous(), wp.int32)]
+    vertices, normals, uv = (x.detach().contiguous() for x in (vertices, normals, uv))
+    first, label = weld_rows(torch.cat([vertices, normals, uv], 1).cpu().numpy())
+    same, count = torch.from_numpy(first[label]).to(vertices.device), len(vertices)
+    corner = torch.empty(3, len(faces), 4, dtype=torch.float64, device=vertices.device)
+    side = torch.empty(3, len(faces), dtype=torch.int32, device=vertices.device)
+    ins = [(vertices, wp.vec3), (normals, wp.vec3), (uv, wp.vec2), (faces.contiguous(), wp.int32)]
     outs = [(same.int(), wp.int32), (corner, wp.vec4d), (side, wp.int32)]
-    launch(corner_tangents_kernel, len(mesh.faces), [*ins, *outs], vertices.device)
+    launch(corner_tangents_kernel, len(faces), [*ins, *outs], vertices.device)
     side, weighted = side.flatten(), corner.flatten(0, 1).T.contiguous()
     # unmirrored, then mirrored; index_add_ is about 10 times slower
     total = torch.stack([torch.bincount(side, part, 2 * count) for part in weighted])
@@ -62,17 +58,6 @@ def vertex_tangents(mesh: Mesh) -> Tensor:
     tangent, length = _unit(torch.where(flip, mirrored, upright)[:3])
     tangent = torch.where(length > PARALLEL, _unit(_flat(tangent, n))[0], _any_orthogonal(n))
     return torch.cat([tangent, torch.where(flip, -1.0, 1.0).to(tangent)[None]]).T.to(torch.float32).contiguous()
-
-
-def _merged(mesh: Mesh) -> Tensor:
-    """First vertex with the same position, normal and UV, for every vertex, ``(V,)``."""
-    first, label = weld_rows(
-        torch.cat([mesh.vertices, present("mesh.normals", mesh.normals), present("mesh.uv", mesh.uv)], 1)
-        .detach()
-        .cpu()
-        .numpy()
-    )
-    return torch.from_numpy(first[label]).to(mesh.vertices.device)
 
 
 def _any_orthogonal(n: Tensor) -> Tensor:

@@ -75,3 +75,23 @@ def graph_components(a: np.ndarray, b: np.ndarray, count: int) -> np.ndarray:
     ends = [(torch.from_numpy(np.ascontiguousarray(v, dtype=np.int32)), wp.int32) for v in (a, b)]
     launch(kernels.components_kernel, 1, [*ends, (parent, wp.int32)], parent.device)
     return parent.numpy()
+
+
+def weld_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Index of the first of each set of equal rows of ``rows (N, K)`` float32 and the set ``(N,)`` of every row."""
+    bits = np.ascontiguousarray(rows + np.float32(0.0)).view(np.uint32).astype(np.uint64)
+    key = np.zeros(len(bits), np.uint64)
+    for k in range(bits.shape[1]):  # 64-bit mix (splitmix64): one integer to sort instead of the columns
+        key = (key ^ bits[:, k]) + np.uint64(0x9E3779B97F4A7C15)
+        key = (key ^ (key >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        key = (key ^ (key >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        key ^= key >> np.uint64(31)
+    spare = np.uint64(1 + max(1, len(bits).bit_length()))  # bits left for the index
+    order, start = group((key >> spare).astype(np.int64))
+    lowest = np.empty(len(bits), np.int64)
+    lowest[order] = np.repeat(order[start], np.diff(start, append=len(order)))
+    if not np.array_equal(bits[lowest], bits):  # hash collision
+        _, first, label = np.unique(bits, axis=0, return_index=True, return_inverse=True)
+        lowest = first[label.reshape(-1)]
+    leads = lowest == np.arange(len(bits))
+    return np.flatnonzero(leads), (np.cumsum(leads) - 1)[lowest]

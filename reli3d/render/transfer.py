@@ -13,8 +13,9 @@ import torch
 from torch import Tensor
 
 from reli3d._bridge import check, full_precision, present
-from reli3d.geometry.mesh import Mesh, weld_rows
+from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene
+from reli3d.geometry.topology import weld_rows
 from reli3d.render.environment import Environment
 from reli3d.render.latlong import lat_long_directions, texel_solid_angles
 

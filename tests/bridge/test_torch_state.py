@@ -11,7 +11,6 @@ import reli3d
 from reli3d.cli.infer import EXAMPLE
 from reli3d.geometry import distance, hull, mesh, symmetry, uv, visibility
 from reli3d.geometry.camera import Camera, camera_rays, look_at
-from reli3d.geometry.tangents import vertex_tangents
 from reli3d.io.hdr import write_environment
 from reli3d.io.images import read_image
 from reli3d.io.obj import obj_files
@@ -117,7 +116,7 @@ def camera(count: int | None = None) -> Camera:
 def asset() -> reli3d.Asset:
     unwrapped = reli3d.unwrap(ball(), texture_size=64)
     unwrapped = reli3d.Mesh(
-        unwrapped.vertices, unwrapped.faces, unwrapped.normals, unwrapped.uv, vertex_tangents(unwrapped)
+        unwrapped.vertices, unwrapped.faces, unwrapped.normals, unwrapped.uv, unwrapped.with_tangents().tangents
     )
     maps = reli3d.bake(unwrapped, 64, lambda position, normal: 0.5 + 0.4 * normal)
     return reli3d.Asset(unwrapped, reli3d.TextureSet(maps["value"], 0.5, 0.1), lights.LIGHTS["sky"](16))
@@ -171,7 +170,7 @@ def meshes():
         mesh.largest_components(shape),
         mesh.volume(shape),
         mesh.watertight(shape),
-        vertex_tangents(reli3d.unwrap(shape, texture_size=64)),
+        reli3d.unwrap(shape, texture_size=64).with_tangents().tangents,
     )
 
 

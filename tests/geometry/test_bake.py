@@ -12,7 +12,7 @@ from scipy import ndimage
 
 from reli3d.geometry.bake import bake, coverage, dilate, interpolate, nearest_valid, rasterize_texels
 from reli3d.geometry.mesh import Mesh
-from reli3d.geometry.tangents import decode_normals, encode_normals, vertex_tangents
+from reli3d.geometry.tangents import decode_normals, encode_normals
 from reli3d.geometry.uv import unwrap
 from reli3d.io.glb import write_glb
 from reli3d.render.asset import Asset, TextureSet
@@ -213,7 +213,7 @@ def test_faults_are_named(sphere):
     with pytest.raises(ValueError, match=r"maps: expected shape \(4, 4, 'C'\)"):
         dilate(torch.zeros(5, 4, 1), torch.zeros(4, 4, dtype=torch.bool))
     with pytest.raises(ValueError, match="mesh.normals"):
-        vertex_tangents(Mesh(sphere.vertices, sphere.faces, uv=sphere.uv))
+        Mesh(sphere.vertices, sphere.faces, uv=sphere.uv).with_tangents()
 
 
 def test_tangents_of_a_cylinder_follow_u(device):
@@ -229,7 +229,7 @@ def test_tangents_of_a_cylinder_follow_u(device):
     want = torch.stack([-angle.sin(), torch.zeros(k + 1), -angle.cos()], 1).repeat(2, 1)
     for flip, w in ((1.0, 1.0), (-1.0, -1.0)):
         turned = mesh.uv * mesh.uv.new_tensor([flip, 1.0])
-        t = vertex_tangents(Mesh(mesh.vertices, mesh.faces, mesh.normals, turned)).cpu()
+        t = Mesh(mesh.vertices, mesh.faces, mesh.normals, turned).with_tangents().tangents.cpu()
         assert torch.equal(t[:, 3], torch.full((2 * k + 2,), w))
         cosine = (t[:, :3] * want).sum(1) * flip
         inner = torch.arange(2 * k + 2) % (k + 1) % k > 0
@@ -243,7 +243,7 @@ def test_tangents_weigh_faces_by_their_angle(device):
     p = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [-1, 1, 0]], device=device)
     uv = torch.tensor([[0.0, 0], [1, 0], [0, -1], [-1, -2]], device=device)
     faces = torch.tensor([[0, 1, 2], [0, 2, 3]], device=device).int()
-    got = vertex_tangents(Mesh(p, faces, torch.tensor([0.0, 0, 1], device=device).repeat(4, 1), uv))[0].cpu()
+    got = Mesh(p, faces, torch.tensor([0.0, 0, 1], device=device).repeat(4, 1), uv).with_tangents().tangents[0].cpu()
     want = math.pi / 2 * torch.tensor([1.0, 0, 0]) + math.pi / 4 * torch.tensor([0.5, 0.5, 0]) * 2**0.5
     torch.testing.assert_close(got, torch.cat([want / want.norm(), torch.ones(1)]), rtol=0, atol=1e-6)
 
@@ -265,7 +265,7 @@ def test_tangents_agree_with_an_exporter(shared_data):
     primitive = document["meshes"][0]["primitives"][0]
     p, n, t, uv = (array(primitive["attributes"][k]) for k in ("POSITION", "NORMAL", "TANGENT", "TEXCOORD_0"))
     faces = array(primitive["indices"]).reshape(-1, 3).astype(np.int32)
-    got = vertex_tangents(Mesh(*(torch.from_numpy(v.copy()) for v in (p, faces, n, uv)))).numpy()
+    got = Mesh(*(torch.from_numpy(v.copy()) for v in (p, faces, n, uv))).with_tangents().tangents.numpy()
     assert (np.sign(got[:, 3]) == np.sign(t[:, 3])).mean() > 0.999 and (t[:, 3] < 0).any() and (t[:, 3] > 0).any()
     cosine = (got[:, :3] * t[:, :3]).sum(1)
     assert np.median(cosine) > 0.99999 and (cosine > 0.999).mean() > 0.98  # vertices were welded after its export

@@ -12,7 +12,6 @@ from reli3d.geometry.mesh import Mesh, report, vertex_normals, volume
 from reli3d.geometry.regularize import sign_entropy, vertex_deviation
 from reli3d.geometry.smooth import taubin_smooth
 from reli3d.geometry.surface import extract_surface, surface_cubes
-from reli3d.geometry.tangents import vertex_tangents
 from reli3d.geometry.uv import atlas_report, unwrap, unwrap_xatlas
 from reli3d.io.glb import glb_bytes
 from reli3d.nn.weights import load, locate, save
@@ -75,7 +74,7 @@ def test_what_can_be_said_of_no_faces_is_said():
         assert len(meshes.select_faces(mesh, torch.zeros(0, dtype=torch.bool)).vertices) == 0
         assert [len(part) for part in meshes.weld(mesh.vertices)] == [n, n]
         assert torch.equal(taubin_smooth(mesh).vertices, mesh.vertices)
-    assert vertex_tangents(with_all).shape == (0, 4)
+    assert with_all.with_tangents().tangents.shape == (0, 4)
     assert not bool(rasterize_texels(with_all, 8).valid.any()) and int(coverage(with_all, 8).max()) == 0
 
 

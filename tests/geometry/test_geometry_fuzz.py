@@ -14,7 +14,7 @@ from reli3d.geometry.mesh import Mesh, vertex_normals
 from reli3d.geometry.regularize import vertex_deviation
 from reli3d.geometry.smooth import taubin_smooth
 from reli3d.geometry.surface import extract_surface
-from reli3d.geometry.tangents import decode_normals, encode_normals, vertex_tangents
+from reli3d.geometry.tangents import decode_normals, encode_normals
 from reli3d.geometry.triplane import sample_triplane
 from reli3d.kernels.flexicubes import SDF_MIN
 from tests.support import reference_surface
@@ -206,7 +206,7 @@ def test_tangents_and_normal_maps(device):
     uv = torch.where((kind == 2)[..., None], uv * 1e-30, uv)
     faces = torch.arange(3 * N, dtype=torch.int32).view(-1, 3)
     mesh = Mesh(corners.view(-1, 3), faces, uv=uv.view(-1, 2)).to(device).with_normals()
-    tangent = vertex_tangents(mesh)
+    tangent = mesh.with_tangents().tangents
     assert finite(tangent) and bool((tangent[:, 3].abs() == 1).all())
     assert float((tangent[:, :3].norm(dim=1) - 1).abs().max()) < 1e-6
     assert float((tangent[:, :3] * mesh.normals).sum(1).abs().max()) < 2e-6  # of a float32 normal

@@ -6,6 +6,7 @@ import torch
 import trimesh
 
 from reli3d.geometry import mesh as module
+from reli3d.geometry import topology
 from reli3d.geometry.mesh import (
     Mesh,
     face_components,
@@ -15,7 +16,6 @@ from reli3d.geometry.mesh import (
     volume,
     watertight,
     weld,
-    weld_rows,
 )
 from tests.support.meshes import mesh_from
 
@@ -79,11 +79,11 @@ def test_rows_are_welded_as_numpy_does_even_where_all_hashes_collide(monkeypatch
     rows = np.random.default_rng(0).integers(0, 2 if columns == 8 else 4, (500, columns)).astype(np.float32)
     _, index, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
     lowest = index[inverse.reshape(-1)]
-    assert all(len(part) == 0 for part in weld_rows(rows[:0]))
+    assert all(len(part) == 0 for part in topology.weld_rows(rows[:0]))
     for _ in range(2):
-        first, label = weld_rows(rows)
+        first, label = topology.weld_rows(rows)
         assert np.array_equal(first, np.unique(lowest)) and np.array_equal(first[label], lowest)
-        monkeypatch.setattr(module, "group", lambda keys: (np.arange(len(keys)), np.zeros(1, np.int64)))
+        monkeypatch.setattr(topology, "group", lambda keys: (np.arange(len(keys)), np.zeros(1, np.int64)))
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from reli3d.geometry.cover import cover_silhouettes
 from reli3d.geometry.hits import interpolate
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene, offset_origin
-from reli3d.geometry.tangents import encode_normals, vertex_tangents
+from reli3d.geometry.tangents import encode_normals
 from reli3d.geometry.visibility import visible_from
 from reli3d.nn import view_lookup
 from reli3d.render import material, sampling
@@ -67,7 +67,7 @@ def texels(vertices):
     found = bake.rasterize_texels(mesh, 64)
     maps = bake.bake(mesh, 64, lambda position, normal: torch.cat([position, normal], 1), texels=found)
     near, square = bake.nearest_valid(found.valid)
-    tangents = vertex_tangents(mesh)
+    tangents = mesh.with_tangents().tangents
     mesh = Mesh(vertices, faces, mesh.normals, uv, tangents)
     along = bake.bake(mesh, 64, lambda position, normal, tangent: tangent, texels=found, tangents=True)
     colors = uniform(n, 5, seed=7).to(vertices)

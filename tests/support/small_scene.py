@@ -7,7 +7,6 @@ import torch
 
 from reli3d.geometry.camera import Camera, look_at
 from reli3d.geometry.surface import extract_surface
-from reli3d.geometry.tangents import vertex_tangents
 from reli3d.geometry.uv import unwrap
 from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
@@ -26,7 +25,7 @@ def ball(radius: float = 0.8, cells: int = 24, squeeze: float = 1.0) -> Asset:
     points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
     sdf = (points / torch.tensor([1.0, squeeze, 1.0])).norm(dim=-1) - radius
     mesh = unwrap(extract_surface(sdf, radius=1.0).with_normals(), texture_size=TEXELS)
-    mesh = replace(mesh, tangents=vertex_tangents(mesh))
+    mesh = mesh.with_tangents()
     gray = srgb_to_linear(torch.full((TEXELS, TEXELS, 3), 0.6))
     return Asset(mesh, TextureSet(gray, 0.6, 0.1), Environment(torch.full((16, 32, 3), 0.5)))
 
