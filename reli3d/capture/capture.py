@@ -107,9 +107,11 @@ def capture(
     _check_output(source, output)
     photos, notes = read_photos(source, progress)
     report = CaptureReport(len(photos), notes=notes, mask_method="given" if options.masks else options.mask_method)
-    region = None if options.turntable is False else moving_region([p.pixels for p in photos])
+    region = None
+    if options.turntable is not False:
+        region = moving_region([p.pixels for p in photos], fixed=bool(options.turntable))
     if options.turntable and region is None:
-        raise InputError("turntable", "expected images of a fixed camera in which the object turns, got others")
+        raise InputError("turntable", "expected images of one size in which the object turns, got others")
     if region is not None:
         notes.append("turntable: the camera is fixed and the object turns; the lighting is fixed to the camera")
     if region is not None or 2 * sum(p.flash for p in photos) > len(photos):

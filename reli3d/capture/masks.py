@@ -18,6 +18,10 @@ CONTEXT = 0.25  # of the outer limit's size: background around it that the color
 ROUNDS = 5  # of GrabCut
 FEWEST_SEEDS = 6  # keypoints of the object: fewer do not show its colors
 HOLE = 0.002  # of the mask's area: smaller holes and islands are noise
+REGION_SIDE = 160  # pixels along the width at which images of a turntable are compared
+STILL = 3.0  # gray levels of standard deviation between images up to which a pixel does not change: noise and JPEG
+LEAST_STILL = 0.1  # fraction of such pixels from which the camera is fixed; hand-held images have none
+CLIPPED = 8  # gray levels from black and white
 KEY_SIGMAS = 4.0  # standard deviations of the border's color beyond which a pixel is the object
 
 
@@ -144,19 +148,27 @@ def cleaned(mask: np.ndarray, seeds: np.ndarray | None) -> np.ndarray:
     return mask
 
 
-def moving_region(pixels: list[np.ndarray]) -> np.ndarray | None:
+def moving_region(pixels: list[np.ndarray], *, fixed: bool = False) -> np.ndarray | None:
     """Mask of where images of a fixed camera differ from each other: the turntable and what stands on it; None where
     the cameras move, or nothing does.
+
+    A camera is fixed where LEAST_STILL of the pixels do not change, or nearly all of the image's border does not.
+    fixed: True where that is known.
     """
     if len({p.shape for p in pixels}) != 1:
         return None
-    small = np.stack([cv2.resize(p, (160, max(1, round(160 * p.shape[0] / p.shape[1])))) for p in pixels])
-    spread = cv2.blur(small.astype(np.float32).std(0).max(-1), (3, 3))
-    ring = np.concatenate([spread[:4].ravel(), spread[-4:].ravel(), spread[:, :4].ravel(), spread[:, -4:].ravel()])
-    still = float(np.quantile(ring, 0.8))
-    if still > 5.0 or float(np.quantile(spread, 0.97)) < max(12.0, 4.0 * still):
+    size = REGION_SIDE, max(1, round(REGION_SIDE * pixels[0].shape[0] / pixels[0].shape[1]))
+    small = np.stack([cv2.resize(p, size, interpolation=cv2.INTER_AREA) for p in pixels]).astype(np.float32)
+    spread = cv2.blur(small.std(0).max(-1), (3, 3))
+    noise = float(np.quantile(spread, 0.05))
+    if float(np.quantile(spread, 0.97)) < max(12.0, 4.0 * noise):
         return None
-    moving = (spread > max(6.0, 3.0 * still)).astype(np.uint8) * 255
+    level = small.mean((0, 3))
+    still = (spread < STILL) & (level > CLIPPED) & (level < 255 - CLIPPED)  # an overexposed sky does not change either
+    ring = np.concatenate([spread[:4].ravel(), spread[-4:].ravel(), spread[:, :4].ravel(), spread[:, -4:].ravel()])
+    if not fixed and still.mean() < LEAST_STILL and float(np.quantile(ring, 0.8)) > 5.0:
+        return None
+    moving = (spread > max(6.0, 3.0 * noise)).astype(np.uint8) * 255
     moving = cleaned(cv2.morphologyEx(moving, cv2.MORPH_CLOSE, np.ones((9, 9), np.uint8)), None)
     return cv2.resize(moving, pixels[0].shape[1::-1], interpolation=cv2.INTER_NEAREST)
 

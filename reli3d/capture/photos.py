@@ -22,6 +22,7 @@ FEWEST = 8  # photographs, below which no closed shape can be expected
 MAX_PIXELS = 1 << 27
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".heic", ".heif", ".webp", ".tif", ".tiff")
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
+WHOLE_VIDEO = 0.9  # fraction of the frames that a file announces, below which it is cut off
 SHARPNESS_SIDE = 640  # pixels at which sharpness is compared
 MILLIMETERS = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # EXIF FocalPlaneResolutionUnit
 
@@ -165,7 +166,7 @@ def _read_video(path: Path, progress: Progress) -> tuple[list[Photo], list[str]]
     av = optional_module("av")
     file_size(path)
     best: dict[int, tuple[float, np.ndarray]] = {}
-    count, notes = 0, []
+    count, total, reason = 0, 0, ""
     try:
         with av.open(str(path)) as file:
             if not file.streams.video:
@@ -184,11 +185,13 @@ def _read_video(path: Path, progress: Progress) -> tuple[list[Photo], list[str]]
     except InputError:
         raise
     except Exception as error:  # FFmpeg's errors have many classes
-        if len(best) < FEWEST:
-            raise InputError(path, f"cannot be decoded ({shown(str(error))}); record it again") from None
-        notes.append(f"the video cannot be decoded from frame {count} of {total} on")
-    photos = [Photo(f"frame_{k:04d}", best[k][1], None, (best[k][1].shape,)) for k in sorted(best)]
-    return photos, [f"{len(photos)} sharp frames taken of {count} of the video", *notes]
+        reason = shown(str(error))
+    if len(best) < FEWEST and reason:
+        raise InputError(path, f"cannot be decoded ({reason}); record it again")
+    notes = [f"{len(best)} sharp frames taken of {count} of the video"]
+    if count < WHOLE_VIDEO * total:  # FFmpeg ends without an error where a file is cut off
+        notes.append(f"only {count} of the {total} frames of the video can be decoded: the file is cut off or broken")
+    return [Photo(f"frame_{k:04d}", best[k][1], None, (best[k][1].shape,)) for k in sorted(best)], notes
 
 
 def _frame_pixels(frame) -> np.ndarray:

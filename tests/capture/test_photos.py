@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import av
 import numpy as np
 import pillow_heif
@@ -98,13 +100,13 @@ def test_flash_and_mixed_sizes_are_reported(tmp_path):
         Image.fromarray(pixels).save(tmp_path / f"{k}.jpg", **({"exif": exif} if k < 3 else {}))
     _, notes = read_photos(tmp_path, quiet)
     assert any("3 of 8" in n and "flash: the lighting differs" in n for n in notes)
-    assert any("2 image sizes" in n for n in notes)
+    assert any("2 image sizes" in n for n in notes) and any("no focal length" in n for n in notes)
 
 
 def test_the_sharpest_frame_of_each_window_of_a_video_is_taken(tmp_path):
     """Every third frame is sharp, the others are blurred; there are three frames a window."""
     path = tmp_path / "clip.mp4"
-    with av.open(str(path), "w") as file:
+    with av.open(str(path), "w", options={"movflags": "faststart"}) as file:
         stream = file.add_stream("libx264", rate=30, options={"crf": "12"})
         stream.width, stream.height, stream.pix_fmt = 320, 240, "yuv420p"
         for k in range(3 * FRAME_COUNT):
@@ -116,7 +118,14 @@ def test_the_sharpest_frame_of_each_window_of_a_video_is_taken(tmp_path):
     photos, notes = read_photos(path, quiet)
     assert len(photos) == FRAME_COUNT
     assert min(sharpness(p.pixels) for p in photos) > 0.5 * sharpness(textured(0))  # blurred ones have a tenth
-    assert "60 sharp frames taken of 180" in notes[0]
+    assert "60 sharp frames taken of 180" in notes[0] and "no focal length" in notes[-1]
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])  # the index comes first: half of the frames are there
+    photos, notes = read_photos(path, quiet)
+    assert 20 < len(photos) < 40 and re.match(r"only \d+ of the 180 frames", notes[1])
+    path.write_bytes(data[: len(data) // 20])
+    with pytest.raises(InputError, match=r"cannot be decoded|at least 8 photographs, got [0-7]\b"):
+        read_photos(path, quiet)
 
 
 def test_what_is_no_capture_is_refused_in_one_line(tmp_path):
