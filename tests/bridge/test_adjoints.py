@@ -358,15 +358,15 @@ def test_the_adjoint_is_that_of_the_float64_reference(device, name):
     """
     op = OPS[name](torch.Generator().manual_seed(7), False)
     double = op.double()
-    want = op.twin(*double)
+    expected = op.twin(*double)
     ours = [v.to(device).requires_grad_() for v in op.leaves.values()]
     got = op.ours(*ours)
-    most = max(1.0, 0.1 * float(want.detach().abs().max()))  # densities go up to hundreds
-    torch.testing.assert_close(got.detach().cpu().double(), want.detach(), rtol=1e-5, atol=2e-6 * most)
+    most = max(1.0, 0.1 * float(expected.detach().abs().max()))  # densities go up to hundreds
+    torch.testing.assert_close(got.detach().cpu().double(), expected.detach(), rtol=1e-5, atol=2e-6 * most)
     draw = torch.rand if op.one_sign else torch.randn
-    cotangent = draw(want.shape, generator=torch.Generator().manual_seed(8))
+    cotangent = draw(expected.shape, generator=torch.Generator().manual_seed(8))
     grads = torch.autograd.grad((got * cotangent.to(device)).sum(), ours)
-    truth = torch.autograd.grad((want * cotangent.double()).sum(), double)
+    truth = torch.autograd.grad((expected * cotangent.double()).sum(), double)
     for leaf, a, b in zip(op.leaves, grads, truth, strict=True):
         if leaf in op.unit:
             a, b = (reference.across(v, op.leaves[leaf]) for v in (a, b))

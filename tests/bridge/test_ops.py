@@ -79,8 +79,10 @@ def test_an_expanded_row_is_as_good_as_its_copies(device, name):
     if case.grads:
         first, second = gradients(case, one, outs), gradients(case, copies, others)
         for k, g in first.items():
-            want = second[k].sum(0, keepdim=True) if k in case.rows else second[k]
-            torch.testing.assert_close(g, want, rtol=1e-4, atol=1e-5 * float(want.abs().max()))  # 40 float32 terms
+            expected = second[k].sum(0, keepdim=True) if k in case.rows else second[k]
+            torch.testing.assert_close(
+                g, expected, rtol=1e-4, atol=1e-5 * float(expected.abs().max())
+            )  # 40 float32 terms
 
 
 @pytest.mark.parametrize("name", DIFFERENTIABLE)
@@ -127,7 +129,7 @@ def test_an_edit_in_place_is_an_error_or_harmless(device, name):
 
 @pytest.mark.parametrize("name", CASES)
 def test_nothing_given_is_written_to_and_nothing_of_it_is_given_back(device, name):
-    """What ``torch.library.opcheck`` asks of a schema: no input and no incoming gradient has other bits or another
+    """What ``torch.library.opcheck`` requires of a schema: no input and no incoming gradient has other bits or another
     version afterwards, and no output lies in the memory of an input."""
     case = CASES[name]
     given = leaves_of(case, device)
@@ -221,10 +223,10 @@ def test_second_derivatives_are_right_or_refused(device, name, of):
         if got is None:  # linear, or no output depends on both
             assert torch.equal(*ends), (k, other)
             continue
-        got, want = (got * moves[other]).double(), float((ends[0] - ends[1]).sum()) / (2.0 * STEP)
+        got, expected = (got * moves[other]).double(), float((ends[0] - ends[1]).sum()) / (2.0 * STEP)
         assert k in case.second, (k, other)
         # float32 differences over the step
-        assert abs(float(got.sum()) - want) < 2e-2 * float(got.abs().sum()) + 1e-3, (k, other)
+        assert abs(float(got.sum()) - expected) < 2e-2 * float(got.abs().sum()) + 1e-3, (k, other)
 
 
 def fractions_within(case: Case, first, second) -> dict[str, float]:
@@ -235,14 +237,14 @@ def fractions_within(case: Case, first, second) -> dict[str, float]:
         outs = case.run(**leaves)
         grads = gradients(case, leaves, outs) if case.grads else {}
         results.append({**{f"output {k}": out.detach() for k, out in enumerate(outs)}, **grads})
-    for key, want in results[0].items():
+    for key, expected in results[0].items():
         got = results[1][key].cpu()
-        if got.shape != want.shape:
+        if got.shape != expected.shape:
             found[key] = 0.0
-        elif want.is_floating_point():
-            found[key] = reference.share_within(got, want)
+        elif expected.is_floating_point():
+            found[key] = reference.share_within(got, expected)
         else:
-            found[key] = float((got == want.cpu()).double().mean())
+            found[key] = float((got == expected.cpu()).double().mean())
     return found
 
 

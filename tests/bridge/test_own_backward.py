@@ -93,5 +93,5 @@ def test_composite_computes_only_required_gradients(device, monkeypatch, require
     leaves = [v.requires_grad_(a) for v, a in zip((density, color), required, strict=True)]
     composite(*leaves, samples).color.square().sum().backward()
     assert rows and all([bool(count) for count in row[-2:]] == list(required) for row in rows)
-    for leaf, a, want in zip(leaves, required, truth, strict=True):
-        assert torch.equal(leaf.grad, want) if a else leaf.grad is None
+    for leaf, a, expected in zip(leaves, required, truth, strict=True):
+        assert torch.equal(leaf.grad, expected) if a else leaf.grad is None

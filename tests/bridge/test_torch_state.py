@@ -86,7 +86,7 @@ def test_the_table_of_operations(name, state):
         return torch.autograd.grad(outs, [leaves[k] for k in case.grads], ones) if outs else ()
 
     leaves, plain = run()
-    want = [g.detach() for g in gradients(leaves, plain)]
+    expected = [g.detach() for g in gradients(leaves, plain)]
     with state():
         leaves, got = run()
         if state is not autocast:  # a backward pass belongs outside, as torch's documentation says
@@ -94,7 +94,7 @@ def test_the_table_of_operations(name, state):
     if state is autocast:
         found = gradients(leaves, got)
     assert same(list(plain), list(got))
-    assert same(want, [g.detach() for g in found])
+    assert same(expected, [g.detach() for g in found])
 
 
 def floats(*values) -> Tensor:
@@ -220,7 +220,7 @@ OPERATIONS = {
 @pytest.mark.parametrize("state", [*STATES, torch.inference_mode])
 @pytest.mark.parametrize("name", OPERATIONS)
 def test_what_is_made_of_them(name, state, tmp_path):
-    want = OPERATIONS[name](tmp_path)
+    expected = OPERATIONS[name](tmp_path)
     with state():
         got = OPERATIONS[name](tmp_path)
-    assert same(want, got)
+    assert same(expected, got)

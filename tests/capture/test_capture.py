@@ -44,12 +44,12 @@ def camera_errors(truth, folder) -> tuple[float, float, float]:
     """Largest position error over the distance, largest rotation error in degrees, relative focal length error."""
     frames = json.loads((folder / "transforms.json").read_text())["frames"]
     index = [int(f["file_path"][7:10]) for f in frames]
-    got, want = np.array([f["transform_matrix"] for f in frames]), truth.c2w[index]
-    scale, turn, shift = similarity(got[:, :3, 3], want[:, :3, 3])
-    away = np.linalg.norm(scale * got[:, :3, 3] @ turn.T + shift - want[:, :3, 3], axis=1)
-    relative = turn @ got[:, :3, :3] @ want[:, :3, :3].transpose(0, 2, 1)
+    got, expected = np.array([f["transform_matrix"] for f in frames]), truth.c2w[index]
+    scale, turn, shift = similarity(got[:, :3, 3], expected[:, :3, 3])
+    away = np.linalg.norm(scale * got[:, :3, 3] @ turn.T + shift - expected[:, :3, 3], axis=1)
+    relative = turn @ got[:, :3, :3] @ expected[:, :3, :3].transpose(0, 2, 1)
     angle = np.degrees(np.arccos(np.clip((np.trace(relative, axis1=1, axis2=2) - 1) / 2, -1, 1)))
-    distance = np.linalg.norm(want[:, :3, 3], axis=1).mean()
+    distance = np.linalg.norm(expected[:, :3, 3], axis=1).mean()
     return away.max() / distance, angle.max(), abs(frames[0]["fl_x"] / truth.focal - 1)
 
 
@@ -73,10 +73,10 @@ def test_masks_are_those_of_the_scene_and_views_agree(truth, captured):
     report, folder = captured
     views = load_views(folder, every=True)
     for name, mask in zip(views.names, views.masks, strict=True):
-        want = truth.masks[int(name.split("/")[-1][:3])]
+        expected = truth.masks[int(name.split("/")[-1][:3])]
         got = mask.numpy() > 0.5
-        if got.shape == want.shape:  # views of more than two megapixels are cut
-            assert (got & want).sum() / (got | want).sum() > 0.93
+        if got.shape == expected.shape:  # views of more than two megapixels are cut
+            assert (got & expected).sum() / (got | expected).sum() > 0.93
     assert report.agreement > 0.9 and not report.failed
 
 
@@ -84,8 +84,8 @@ def test_the_frame_is_upright_with_the_ground_at_zero(truth, captured):
     _, folder = captured
     frames = json.loads((folder / "transforms.json").read_text())["frames"]
     index = [int(f["file_path"][7:10]) for f in frames]
-    got, want = np.array([f["transform_matrix"] for f in frames])[:, :3, 3], truth.c2w[index, :3, 3]
-    scale, turn, shift = similarity(want, got)
+    got, expected = np.array([f["transform_matrix"] for f in frames])[:, :3, 3], truth.c2w[index, :3, 3]
+    scale, turn, shift = similarity(expected, got)
     assert (turn @ [0, 1, 0])[1] > np.cos(np.radians(1.0))
     assert abs(scale - 1.0) < 0.1  # the object's longest side is 1; a hull is larger than its object
 

@@ -55,8 +55,8 @@ def test_photographs_are_upright_reduced_and_in_order(tmp_path):
     photos, _ = read_photos(tmp_path, quiet)
     assert [p.name for p in photos] == [str(k) for k in range(2, 10)]
     assert photos[0].size == (1000, 2000)
-    want = Image.fromarray(np.rot90(textured(7, 2400, 1200), -1)).resize((1000, 2000), Image.Resampling.BOX)
-    difference = np.abs(photos[0].pixels.astype(int) - np.asarray(want).astype(int))
+    expected = Image.fromarray(np.rot90(textured(7, 2400, 1200), -1)).resize((1000, 2000), Image.Resampling.BOX)
+    difference = np.abs(photos[0].pixels.astype(int) - np.asarray(expected).astype(int))
     assert difference.mean() < 25  # JPEG of noise; a wrong turn differs by 85
 
 

@@ -25,7 +25,7 @@ class Job:
             {body}
         return "done"
 sys.modules["reli3d.cli.job"] = types.SimpleNamespace(FolderJob=Job, worker=Job)
-infer.choose_device = lambda wanted: wanted
+infer.choose_device = lambda device: device
 sys.exit(infer.main())
 """
 WRITES = """with replacing() as new:

@@ -90,5 +90,5 @@ def test_the_constraints_name_every_dependency_and_reference():
     pins = re.findall(r"^([\w-]+)==", (folder / "constraints.txt").read_text(), re.MULTILINE)
     text = (folder / "pyproject.toml").read_text()
     extras = re.search(r"^test = \[(.*?)\]", text, re.MULTILINE).group(1)
-    wanted = (*doctor.REQUIRED, *re.findall(r'"([\w-]+)', extras))
-    assert {name.lower() for name in wanted} <= {name.lower() for name in pins}
+    expected = (*doctor.REQUIRED, *re.findall(r'"([\w-]+)', extras))
+    assert {name.lower() for name in expected} <= {name.lower() for name in pins}

@@ -79,8 +79,8 @@ def test_vertex_colors_are_baked_where_the_format_has_none_and_notes_are_printed
     row, column = ((1 - shape.visual.uv[:, 1]) * 128).astype(int), (shape.visual.uv[:, 0] * 128).astype(int)
     got = torch.from_numpy(image[row.clip(0, 127), column.clip(0, 127)])
     got = torch.where(got <= 0.04045, got / 12.92, ((got + 0.055) / 1.055) ** 2.4)
-    want = 0.5 + 0.5 * torch.from_numpy(np.array(shape.vertices)).clamp(-1, 1)
-    assert float((got - want).abs().mean()) < 0.03  # as above
+    expected = 0.5 + 0.5 * torch.from_numpy(np.array(shape.vertices)).clamp(-1, 1)
+    assert float((got - expected).abs().mean()) < 0.03  # as above
 
 
 @pytest.mark.parametrize(

@@ -78,10 +78,10 @@ def test_a_worker_that_crashes_loses_nothing_and_its_object_is_made_once_more(tm
     result = {row.object: row.result for row in found}
     finished = sorted((tmp_path / "log").read_text().split())
     for item, word in zip(items, WORDS, strict=True):
-        wanted = {"refuse": "refused", "fail": "failed", "die": "failed"}.get(word, "done")
-        assert result[item.name] == wanted, (word, found)
-        assert (wanted == "done") == item.target.exists()
-        assert (item.name in finished) == (wanted == "done") or item.name in retried  # its last line may be missing
+        expected = {"refuse": "refused", "fail": "failed", "die": "failed"}.get(word, "done")
+        assert result[item.name] == expected, (word, found)
+        assert (expected == "done") == item.target.exists()
+        assert (item.name in finished) == (expected == "done") or item.name in retried  # its last line may be missing
     assert "crashed twice" in " ".join(next(r.notes for r in found if r.object == "object4"))
     # the dead left their half-written folders, which the next claim of the same object removes; nothing else is there
     left = {p.name for p in (tmp_path / "out").iterdir()} - {i.name for i in items}
@@ -98,7 +98,7 @@ log = Path(sys.argv.pop(1))
 def made(args, device, budget):
     return WordJob(log)
 sys.modules["reli3d.cli.job"] = SimpleNamespace(FolderJob=made, worker=None)
-infer.choose_device = lambda wanted: "cpu"
+infer.choose_device = lambda device: "cpu"
 infer.functools = SimpleNamespace(partial=lambda *_: made(None, None, None).start())
 {}
 sys.exit(infer.main())
@@ -262,8 +262,8 @@ def test_results_are_bitwise_identical_wherever_an_object_is_made(tmp_path, opti
     assert done.stdout.count("mesh.glb") == 3
     for name in ("mesh.glb", "environment.exr", "environment.hdr", "preview.png"):
         for folder in ("first", "second", "third"):
-            wanted = (tmp_path / "alone" / "first" / name).read_bytes()
-            assert (tmp_path / "out" / folder / name).read_bytes() == wanted
+            expected = (tmp_path / "alone" / "first" / name).read_bytes()
+            assert (tmp_path / "out" / folder / name).read_bytes() == expected
     table = read_table(tmp_path / "out" / "summary.csv")
     info = json.loads((tmp_path / "out/third/run_info.json").read_text())
     assert [r["object"] for r in table] == ["first", "second", "third"]

@@ -78,10 +78,10 @@ def bytes_of(display):
     return (display.clamp(0.0, 1.0) * 255.0 + 0.5).to(torch.uint8)
 
 
-def same_picture(got, want):
+def same_picture(got, expected):
     """8 bits; a value beside a rounding step may fall on its other side."""
-    off = (got.int() - want.int()).abs()
-    return got.shape == want.shape and int(off.max()) <= 1 and float((off > 0).float().mean()) < 0.01
+    off = (got.int() - expected.int()).abs()
+    return got.shape == expected.shape and int(off.max()) <= 1 and float((off > 0).float().mean()) < 0.01
 
 
 def straight(image):
@@ -110,8 +110,8 @@ def test_linear_files_and_layers_are_those_of_render(scene):
     brighter = read_hdr_image(run(scene, "--format", "exr", "--exposure", "1")["ball.exr"])
     torch.testing.assert_close(brighter, 2.0 * radiance, rtol=2**-10, atol=0)
     clear = read_hdr_image(run(scene, "--format", "exr", "--no-shadows", "--seed", "5")["ball.exr"])
-    want = expected(scene, seed=5, shadows=False)[0].radiance
-    torch.testing.assert_close(clear, want, rtol=2**-10, atol=1e-6)
+    unshadowed = expected(scene, seed=5, shadows=False)[0].radiance
+    torch.testing.assert_close(clear, unshadowed, rtol=2**-10, atol=1e-6)
 
 
 @pytest.mark.parametrize("tone, transform", [("srgb", linear_to_srgb), ("agx", agx), ("none", lambda v: v)])
@@ -124,7 +124,7 @@ def test_images_are_the_display_transform_of_the_exposed_radiance(scene, tone, t
     assert int(picture[SIZE // 2, SIZE // 2, 0]) > int(picture[SIZE // 2, SIZE // 2, 1])  # the red ball
 
 
-def test_the_light_stands_behind_where_it_is_asked_for(scene):
+def test_environment_is_the_background_if_requested(scene):
     image, camera, light = expected(scene, azimuth=5.0, background="environment")  # the centre of the map is in view
     picture = pixels(run(scene, "--background", "environment", "--azimuth", "5")["ball.png"])
     assert same_picture(picture, bytes_of(linear_to_srgb(image.radiance)))
@@ -137,10 +137,10 @@ def test_the_light_stands_behind_where_it_is_asked_for(scene):
 @pytest.mark.parametrize("turn", ["camera", "light"])
 def test_turntables_are_their_frames(scene, turn, monkeypatch):
     """As numbered PNG and EXR files and as one animation; the progress goes to the error stream of a terminal."""
-    wanted = []
+    frames = []
     for k in range(3):
         view = {"azimuth": 30.0 + 120.0 * k} if turn == "camera" else {"yaw": 2.0 * math.pi * k / 3}
-        wanted.append(expected(scene, seed=k, **view)[0])
+        frames.append(expected(scene, seed=k, **view)[0])
     terminal = io.StringIO()
     terminal.isatty = lambda: True
     monkeypatch.setattr(sys, "stderr", terminal)
@@ -148,17 +148,17 @@ def test_turntables_are_their_frames(scene, turn, monkeypatch):
     files = run(scene, *options)
     assert list(files) == [f"ball_{k:04d}.png" for k in range(3)]
     assert "3/3" in terminal.getvalue() and "frame" in terminal.getvalue()
-    shown = [torch.cat([linear_to_srgb(straight(image)), image.alpha[..., None]], -1) for image in wanted]
-    assert all(same_picture(pixels(path), bytes_of(want)) for path, want in zip(files.values(), shown, strict=True))
-    for path, image in zip(run(scene, *options, "--format", "exr").values(), wanted, strict=True):
+    shown = [torch.cat([linear_to_srgb(straight(image)), image.alpha[..., None]], -1) for image in frames]
+    assert all(same_picture(pixels(path), bytes_of(image)) for path, image in zip(files.values(), shown, strict=True))
+    for path, image in zip(run(scene, *options, "--format", "exr").values(), frames, strict=True):
         torch.testing.assert_close(read_hdr_image(path), image.radiance, rtol=2**-10, atol=1e-6)
     (path,) = run(scene, *options, "--format", "webp").values()
     with Image.open(path) as animation:
         assert animation.n_frames == 3
-        for k, want in enumerate(shown):
+        for k, image in enumerate(shown):
             animation.seek(k)
             got = torch.from_numpy(np.asarray(animation.convert("RGBA")).astype(np.float32) / 255)
-            cover = want[..., 3:]
+            cover = image[..., 3:]
             errors = [float(((got - other)[..., :3] * cover).abs().mean()) for other in shown]
             assert errors[k] < 0.03 and errors[k] == min(errors), errors  # WebP loses detail
 

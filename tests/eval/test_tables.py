@@ -34,10 +34,10 @@ def test_chamfer_and_f_score_of_two_spheres():
 
 
 def test_icp_takes_a_small_turn_and_shift_back():
-    want = sphere(1.0, 4000) * np.array([1.0, 0.5, 0.3])
+    expected = sphere(1.0, 4000) * np.array([1.0, 0.5, 0.3])
     c, s = math.cos(0.1), math.sin(0.1)
-    got = want @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T + 0.05
-    assert geometry(got, want)["cd"] > 0.02 and geometry(got, want, icp=True)["cd"] < 2e-3
+    got = expected @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T + 0.05
+    assert geometry(got, expected)["cd"] > 0.02 and geometry(got, expected, icp=True)["cd"] < 2e-3
 
 
 def test_surface_samples_lie_on_the_surface_evenly():
@@ -69,8 +69,8 @@ def place(tmp_path_factory):
 
 
 def test_the_pipeline_takes_what_it_is_given():
-    asked = {"weights", "options"}
-    assert asked <= set(inspect.signature(objects.reconstruct).parameters)
+    requested = {"weights", "options"}
+    assert requested <= set(inspect.signature(objects.reconstruct).parameters)
 
 
 def test_the_reference_reconstructed_perfectly_has_perfect_figures(place, monkeypatch):

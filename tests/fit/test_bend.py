@@ -92,9 +92,9 @@ def test_the_bend_is_written_into_the_normal_map(start):
         asset.mesh, asset.textures, found.face.reshape(-1)[index], found.bary.reshape(-1, 2)[index]
     ).normal
     length = 0.3 / math.sqrt(1.0 + (0.3 / MAX_BEND) ** 2)
-    want = torch.nn.functional.normalize(plain + torch.tensor([length, 0.0, 0.0]), dim=-1)
-    assert torch.allclose(bent(unknowns, position, plain)[0], want, atol=1e-6)
-    assert float((got - want).norm(dim=1).median()) < 0.01  # 8 bits hold a direction to 0.004
+    expected = torch.nn.functional.normalize(plain + torch.tensor([length, 0.0, 0.0]), dim=-1)
+    assert torch.allclose(bent(unknowns, position, plain)[0], expected, atol=1e-6)
+    assert float((got - expected).norm(dim=1).median()) < 0.01  # 8 bits hold a direction to 0.004
 
 
 def test_no_bend_turns_a_normal_away():

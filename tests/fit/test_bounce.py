@@ -54,9 +54,9 @@ def test_a_floor_receives_the_view_factor_of_its_wall(device):
     for d in distance.unique():
         row = distance == d
         weight, count = factor[row][0], int(row.sum()) * RAYS_PER_VERTEX
-        mean, want = got[row].mean(0), weight * COLOR.to(device)
+        mean, expected = got[row].mean(0), weight * COLOR.to(device)
         error = COLOR.to(device) * math.sqrt(float(weight * (1 - weight)) / count)
-        assert bool(((mean - want).abs() < 4.0 * error + 1e-3).all())  # four standard deviations; starts are lifted
+        assert bool(((mean - expected).abs() < 4.0 * error + 1e-3).all())  # four standard deviations; starts are lifted
 
 
 def test_a_convex_body_receives_nothing_and_a_closed_box_one_color(device):

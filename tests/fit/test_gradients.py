@@ -100,8 +100,8 @@ def test_the_gradient_of_a_step_matches_central_differences(case, monkeypatch):
         for value, direction in zip(values, directions, strict=True):
             value += sign * step * direction
         ends.append(float(loss().double()))
-    want = (ends[0] - ends[1]) / (2.0 * step)
-    assert got == pytest.approx(want, rel=tolerance)
+    expected = (ends[0] - ends[1]) / (2.0 * step)
+    assert got == pytest.approx(expected, rel=tolerance)
 
 
 @pytest.mark.parametrize("terms", [{"image": 1.0}, {"bend": 1.0}], ids=["image", "prior"])

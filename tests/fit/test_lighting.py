@@ -61,9 +61,9 @@ def relighting_error(asset) -> float:
     batch, errors = small_scene.input_views(small_scene.ball(), 4, 24), []
     for k in range(4):
         camera = Camera(batch.c2w[k], batch.intrinsics[k], 24, 24)
-        got, want = (render_asset(a, camera, light, options=OPTIONS) for a in (asset, true))
-        hit = want.alpha > 0.5
-        a, b = got.radiance[hit], want.radiance[hit]
+        got, expected = (render_asset(a, camera, light, options=OPTIONS) for a in (asset, true))
+        hit = expected.alpha > 0.5
+        a, b = got.radiance[hit], expected.radiance[hit]
         a = a * (a * b).sum() / (a * a).sum()
         errors.append((linear_to_srgb(a.clamp(0, 1)) - linear_to_srgb(b.clamp(0, 1))).square().mean())
     return float(torch.stack(errors).mean())
@@ -104,8 +104,8 @@ def test_a_camera_light_is_turned_into_the_frame_of_the_object(moving_views):
     images = InputImages.of(moving_views, "camera")
     lights = Lights(small_scene.sky().resized(64).radiance[None], images.light_group, images.camera.c2w)
     for k in (0, 3):
-        want = camera_light(k, images.camera.c2w[k, :3, :3]).resized(64).radiance
-        assert float((lights.of_view(k).radiance - want).abs().mean()) < 0.02  # two bilinear lookups
+        expected = camera_light(k, images.camera.c2w[k, :3, :3]).resized(64).radiance
+        assert float((lights.of_view(k).radiance - expected).abs().mean()) < 0.02  # two bilinear lookups
 
 
 def test_lights_are_evaluated_for_their_own_rows():

@@ -110,8 +110,8 @@ def test_positions_and_normals_interpolate_linearly(sphere, device):
     face = mesh.faces.long()[texels.face.reshape(-1)[index].long()]
     b = texels.bary.reshape(-1, 2)[index].double()
     w = torch.stack([1 - b.sum(1), b[:, 0], b[:, 1]], 1)[..., None]
-    want = (mesh.vertices.double()[face] * w).sum(1)
-    torch.testing.assert_close(position.double(), want, rtol=0, atol=3e-7)  # float32 sums of values up to 1
+    expected = (mesh.vertices.double()[face] * w).sum(1)
+    torch.testing.assert_close(position.double(), expected, rtol=0, atol=3e-7)  # float32 sums of values up to 1
     n = torch.nn.functional.normalize((mesh.normals.double()[face] * w).sum(1), dim=1)
     torch.testing.assert_close(normal.double(), n, rtol=0, atol=1e-6)
 
@@ -119,8 +119,8 @@ def test_positions_and_normals_interpolate_linearly(sphere, device):
 def test_known_colour_reads_back(sphere):
     image = bake(sphere, SIZE, lambda p, n: color(p))["value"].numpy()
     position, uv = surface_samples(sphere, 50_000)
-    want = color(torch.from_numpy(position)).numpy()
-    error = np.abs(bilinear(image, uv) - want)
+    expected = color(torch.from_numpy(position)).numpy()
+    error = np.abs(bilinear(image, uv) - expected)
     # a texel is 0.022 long here: bilinear errs by 3.6 * h^2 / 8 = 2e-4 inside, border texels hold a point up to h away
     assert error.mean() < 0.2 / 255
     assert error.max() < 1.2 * 1.5 * 0.022 * 1.8
@@ -142,9 +142,9 @@ def test_known_colour_reads_back_through_the_file_at_every_mip(sphere, tmp_path)
     rng = np.random.default_rng(2)
     w, face = rng.dirichlet((1, 1, 1), 50_000)[:, :, None], read.faces[rng.integers(0, len(read.faces), 50_000)]
     uv = (read.visual.uv[face] * w).sum(1) * [1, -1] + [0, 1]  # trimesh turns v up
-    want = color(torch.from_numpy((np.asarray(read.vertices)[face] * w).sum(1))).numpy()
+    expected = color(torch.from_numpy((np.asarray(read.vertices)[face] * w).sum(1))).numpy()
     # 8 bit: a quarter of a step on average; the bake itself stays under a fifth (see above)
-    assert np.abs(bilinear(image, uv) - want).mean() < 0.5 / 255
+    assert np.abs(bilinear(image, uv) - expected).mean() < 0.5 / 255
     while image.shape[0] >= 64:  # colours are at least 0.1: whatever is darker was never written
         assert image.min() > 0.1 - 0.6 / 255
         image = 0.25 * (image[::2, ::2] + image[1::2, ::2] + image[::2, 1::2] + image[1::2, 1::2])
@@ -226,12 +226,12 @@ def test_tangents_of_a_cylinder_follow_u(device):
     faces = torch.cat([torch.stack([i, i + 1, k + 2 + i], 1), torch.stack([i, k + 2 + i, k + 1 + i], 1)]).int()
     uv = torch.stack([angle.repeat(2) / (2 * math.pi), torch.cat([torch.ones(k + 1), torch.zeros(k + 1)])], 1)
     mesh = Mesh(vertices, faces, normals, uv).to(device)
-    want = torch.stack([-angle.sin(), torch.zeros(k + 1), -angle.cos()], 1).repeat(2, 1)
+    expected = torch.stack([-angle.sin(), torch.zeros(k + 1), -angle.cos()], 1).repeat(2, 1)
     for flip, w in ((1.0, 1.0), (-1.0, -1.0)):
         turned = mesh.uv * mesh.uv.new_tensor([flip, 1.0])
         t = Mesh(mesh.vertices, mesh.faces, mesh.normals, turned).with_tangents().tangents.cpu()
         assert torch.equal(t[:, 3], torch.full((2 * k + 2,), w))
-        cosine = (t[:, :3] * want).sum(1) * flip
+        cosine = (t[:, :3] * expected).sum(1) * flip
         inner = torch.arange(2 * k + 2) % (k + 1) % k > 0
         # float32; the rim sees one side only: half a facet, projected flat
         assert float(cosine[inner].min()) > 1 - 1e-6
@@ -244,8 +244,8 @@ def test_tangents_weigh_faces_by_their_angle(device):
     uv = torch.tensor([[0.0, 0], [1, 0], [0, -1], [-1, -2]], device=device)
     faces = torch.tensor([[0, 1, 2], [0, 2, 3]], device=device).int()
     got = Mesh(p, faces, torch.tensor([0.0, 0, 1], device=device).repeat(4, 1), uv).with_tangents().tangents[0].cpu()
-    want = math.pi / 2 * torch.tensor([1.0, 0, 0]) + math.pi / 4 * torch.tensor([0.5, 0.5, 0]) * 2**0.5
-    torch.testing.assert_close(got, torch.cat([want / want.norm(), torch.ones(1)]), rtol=0, atol=1e-6)
+    expected = math.pi / 2 * torch.tensor([1.0, 0, 0]) + math.pi / 4 * torch.tensor([0.5, 0.5, 0]) * 2**0.5
+    torch.testing.assert_close(got, torch.cat([expected / expected.norm(), torch.ones(1)]), rtol=0, atol=1e-6)
 
 
 def test_tangents_agree_with_an_exporter(shared_data):
@@ -290,13 +290,13 @@ def test_normal_map_decodes_to_the_world_normal_within_a_degree(sphere):
 
     texels = rasterize_texels(sphere, SIZE)
     image = bake(sphere, SIZE, fn, texels=texels, tangents=True)["value"]
-    want, n, t = (torch.cat(v) for v in zip(*kept["parts"]))
+    expected, n, t = (torch.cat(v) for v in zip(*kept["parts"]))
     stored = (image.reshape(-1, 3)[texels.valid.reshape(-1)] * 255).round() / 255
     # the shader of glTF 2.0, section 3.9.3, in float64: bitangent from the exported w, green up
     s = stored.double() * 2 - 1
     b = torch.linalg.cross(n.double(), t[:, :3].double()) * t[:, 3:].double()
     shaded = torch.nn.functional.normalize(s[:, :1] * t[:, :3] + s[:, 1:2] * b + s[:, 2:] * n, dim=1)
-    angle = torch.rad2deg(torch.acos((shaded * want.double()).sum(1).clamp(-1, 1)))
+    angle = torch.rad2deg(torch.acos((shaded * expected.double()).sum(1).clamp(-1, 1)))
     # 8 bit: half a step of 2 / 255 in each of three channels is at most 0.39 degrees
     assert float(angle.max()) < 0.45
     torch.testing.assert_close(decode_normals(stored, n, t).double(), shaded, rtol=0, atol=1e-5)
@@ -307,8 +307,8 @@ def test_encoding_bends_normals_up_and_gives_exact_ones_back():
     t = torch.tensor([[1.0, 0, 0, 1], [1, 0, 0, -1], [1, 0, 0, 1]])
     world = torch.tensor([[0.6, 0, 0.8], [0, 0.6, 0.8], [0.6, 0.0, -0.8]])
     # w = -1 turns green; below: on the horizon
-    want = torch.tensor([[0.8, 0.5, 0.9], [0.5, 0.2, 0.9], [1.0, 0.5, 0.5]])
-    torch.testing.assert_close(encode_normals(world, n, t), want)
+    expected = torch.tensor([[0.8, 0.5, 0.9], [0.5, 0.2, 0.9], [1.0, 0.5, 0.5]])
+    torch.testing.assert_close(encode_normals(world, n, t), expected)
 
 
 def test_the_kernel_that_encodes_normals_is_the_formula_that_has_gradients(device):

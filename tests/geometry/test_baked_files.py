@@ -91,9 +91,9 @@ def check_file(path, source: Mesh) -> float:
     assert np.abs(bilinear(orm, at)[:, 1:] - ramps).mean() < STEP
     flat = bilinear(normal_map, at) * 2 - 1  # the baked normal is the mesh's own: straight up in its frame
     assert np.median(flat[:, 2]) > 0.9999 and np.abs(flat[:, :2]).mean() < 1.5 * STEP
-    want, half = color(torch.from_numpy(position)).numpy(), 0.5 / len(image)
+    expected, half = color(torch.from_numpy(position)).numpy(), 0.5 / len(image)
     shifts = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]]) * half
-    error = [np.abs(bilinear(image, at + shift) - want).mean() for shift in shifts]
+    error = [np.abs(bilinear(image, at + shift) - expected).mean() for shift in shifts]
     assert min(error[1:]) > error[0]  # half a texel to any side fits worse
     level = image
     while len(level) >= 64:  # no texel at all is black, at any mip level, so no lookup can reach one

@@ -47,9 +47,9 @@ def test_an_unsure_sheet_becomes_a_surface_as_thick_as_it_is_unsure(device):
     got = cover_silhouettes(*args, radius=RADIUS).cpu()
     radius = points[..., :2].norm(dim=-1)
     inner, outer = radius < (40 - STRIDE) * 0.9 / 128, radius > (40 + 2 * STRIDE) * 0.9 / 128
-    want = torch.where(sdf < FIELD_MAX, sdf - 0.5 - DEPTH, sdf)
+    expected = torch.where(sdf < FIELD_MAX, sdf - 0.5 - DEPTH, sdf)
     # a ray looks every half cell, so it may miss the lowest point by a quarter of a cell of 0.03
-    torch.testing.assert_close(got[inner], want[inner], rtol=0, atol=(0.0075 / s) ** 2 + 1e-4)
+    torch.testing.assert_close(got[inner], expected[inner], rtol=0, atol=(0.0075 / s) ** 2 + 1e-4)
     assert torch.equal(got[outer], sdf[outer])
     mesh = extract_surface(got, radius=RADIUS)
     assert abs(float(mesh.vertices[:, 2].max()) - s * math.sqrt(DEPTH)) < 0.003  # a tenth of a cell
@@ -122,10 +122,10 @@ def test_equals_its_twin_on_a_rough_field(device):
     distance = mask_distance(masks)
     args = [v.to(device) for v in (sdf, bound, distance, camera)]
     got = cover_silhouettes(*args, radius=RADIUS).cpu()
-    want = twin(sdf.double(), bound.double(), distance.double(), camera)
-    assert float((want != sdf).double().mean()) > 0.2
+    expected = twin(sdf.double(), bound.double(), distance.double(), camera)
+    assert float((expected != sdf).double().mean()) > 0.2
     # float32 has rays enter the cube 1e-5 of a step aside; one whose least sdf is FIELD_MAX falls to either side
-    assert float(((got - want).abs() < 2e-4).double().mean()) > 0.999
+    assert float(((got - expected).abs() < 2e-4).double().mean()) > 0.999
 
 
 def covered_fractions(model, views):

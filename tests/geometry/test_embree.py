@@ -58,13 +58,13 @@ def test_scenes_in_many_threads_answer_as_alone_and_are_given_back(device):
         pytest.skip("Embree runs on CPU only")
     o, d = rays(3000, 6, 1.5)
     meshes = [bumpy(seed) for seed in range(8)]
-    want = [make(*mesh, "embree", device).closest(o, d).face for mesh in meshes]
+    expected = [make(*mesh, "embree", device).closest(o, d).face for mesh in meshes]
     failed = []
 
     def work(k):
         for _ in range(10):
             scene = RayScene(*(torch.from_numpy(a) for a in meshes[k]), backend="embree")
-            if not torch.equal(scene.closest(o, d).face, want[k]):
+            if not torch.equal(scene.closest(o, d).face, expected[k]):
                 failed.append(k)
 
     threads = [threading.Thread(target=work, args=(k,)) for k in range(8)]

@@ -27,9 +27,9 @@ CUBES = 47  # a side: 103,823 cubes
 FLOOR = {"sdf": 3e-9, "deformation": 1e-9, "alpha": 3e-9, "beta": 3e-9, "gamma": 1e-7}
 
 
-def agree(got, want, floor=0.0, fraction=0.999, within=1e-4):
+def agree(got, expected, floor=0.0, fraction=0.999, within=1e-4):
     """Whether a ``fraction`` of ``got`` has a relative error of at most ``within``, or an absolute one of ``floor``."""
-    off = (got.detach().cpu().double() - want.detach()).abs() - within * want.detach().abs()
+    off = (got.detach().cpu().double() - expected.detach()).abs() - within * expected.detach().abs()
     return float((off <= floor).double().mean()) >= fraction
 
 
@@ -81,11 +81,11 @@ def test_gradients_of_flexicubes(device, reach):
     corner, weight = dual[quads], double["gamma"][cube_of[quads]]
     one, other = weight[:, 0] * weight[:, 2], weight[:, 1] * weight[:, 3]
     middle = (corner[:, 0] + corner[:, 2]) * one[:, None] + (corner[:, 1] + corner[:, 3]) * other[:, None]
-    want = torch.cat([dual, middle * (0.5 / (one + other))[:, None]])
-    assert len(dual) > N and len(want) == len(mesh.vertices)
+    expected = torch.cat([dual, middle * (0.5 / (one + other))[:, None]])
+    assert len(dual) > N and len(expected) == len(mesh.vertices)
     # a sum of twelve points of size 0.5; with weights of any size it has the same terms
-    torch.testing.assert_close(mesh.vertices.detach().cpu().double(), want.detach(), rtol=0, atol=5e-7)
-    true = torch.autograd.grad((want * cotangent.double()).sum(), list(double.values()))
+    torch.testing.assert_close(mesh.vertices.detach().cpu().double(), expected.detach(), rtol=0, atol=5e-7)
+    true = torch.autograd.grad((expected * cotangent.double()).sum(), list(double.values()))
     for name, a, b in zip(leaves, got, true, strict=True):
         size = 1.0 if name == "deformation" else leaves[name].double().abs().clamp(min=1e-30)
         assert agree(a, b, FLOOR[name] / size + 1e-37), name  # the least float32 number with all its digits
@@ -106,9 +106,9 @@ def test_gradients_of_the_deviation(device, reach):
     ours = [v.to(device).requires_grad_() for v in leaves]
     spread = vertex_deviation(ours[0], radius=0.5, **dict(zip(("deformation", "alpha", "beta"), ours[1:], strict=True)))
     assert len(spread) > N and finite(spread, *torch.autograd.grad(spread.sum(), ours))
-    want = reference_surface.flexicubes_deviation(*(v.double() for v in leaves), 1.0)
+    expected = reference_surface.flexicubes_deviation(*(v.double() for v in leaves), 1.0)
     # differences of positions in the box of 1; their absolute values have kinks, so that no twin has all the gradients
-    torch.testing.assert_close(spread.detach().cpu().double(), want, rtol=0, atol=3e-7)
+    torch.testing.assert_close(spread.detach().cpu().double(), expected, rtol=0, atol=3e-7)
 
 
 EDGE = (1.0, -1.0, 1.0 + 1e-7, -1.0 - 1e-7, 0.0, -0.0, 1e-40, 2.0, -1e30, 3e38)
@@ -144,10 +144,10 @@ def test_gradients_of_the_triplane(device, dtype, channels, height, width):
         coordinate = (q.detach()[:, axes] + 1) * torch.tensor([width, height]) / 2 - 0.5
         distance = (coordinate - coordinate.round()).abs()
         smooth[:, axes] &= (distance > 1e-4) | (distance.isnan())
-    want = torch.cat(parts, 1)
+    expected = torch.cat(parts, 1)
     # a coordinate of up to 64 texels rounds by 4e-6 of one; values differ by up to 8 from texel to texel
-    torch.testing.assert_close(out.detach().cpu()[0].double(), want.detach(), rtol=0, atol=8 * 4e-6)
-    t_planes, t_points = torch.autograd.grad((want * weights[0].double()).sum(), (p, q))
+    torch.testing.assert_close(out.detach().cpu()[0].double(), expected.detach(), rtol=0, atol=8 * 4e-6)
+    t_planes, t_points = torch.autograd.grad((expected * weights[0].double()).sum(), (p, q))
     assert agree(
         g_planes, t_planes, within={torch.float32: 1e-4, torch.float16: 2.0**-10, torch.bfloat16: 2.0**-7}[dtype]
     )
@@ -183,13 +183,15 @@ def test_gradients_of_normals(device):
     double = corners.view(-1, 3).double().requires_grad_()
     a, b, c = double.view(-1, 3, 3).unbind(1)
     cross = torch.linalg.cross(b - a, c - a)
-    (want,) = torch.autograd.grad((normalize(cross, dim=1).repeat_interleave(3, 0) * cotangent.double()).sum(), double)
+    (expected,) = torch.autograd.grad(
+        (normalize(cross, dim=1).repeat_interleave(3, 0) * cotangent.double()).sum(), double
+    )
     length = (b - a).norm(dim=1) * (c - a).norm(dim=1)
     # a float32 cross product errs by 1e-7 of its sides' product: by 1e-5 of one that is a hundred times smaller
     plain = (sound & (cross.norm(dim=1) > 0.01 * length)).detach()
     plain &= corners.abs().amax((1, 2)) < 1e5  # above it the inverse cube of a squared length leaves float32
     assert plain.sum() > N // 3
-    row = (got.cpu().double() - want).view(N, 9).norm(dim=1) / want.view(N, 9).norm(dim=1)
+    row = (got.cpu().double() - expected).view(N, 9).norm(dim=1) / expected.view(N, 9).norm(dim=1)
     assert float((row[plain] < 1e-4).double().mean()) > 0.999
     # smoothing is linear: an edge of no length or a face of no area changes nothing about it
     moved = taubin_smooth(Mesh(leaf, faces.to(device)), iterations=1).vertices
@@ -256,9 +258,9 @@ def test_interpolation_of_texels(device):
     torch.testing.assert_close(normal.norm(dim=1).cpu(), ones, rtol=0, atol=1e-6)
     torch.testing.assert_close(along[:, :3].norm(dim=1).cpu(), ones, rtol=0, atol=1e-6)
     w = torch.cat([1 - bary.double().sum(1, keepdim=True), bary.double()], 1)[..., None]
-    want = (corners[: size * size].double() * w).sum(1)
+    expected = (corners[: size * size].double() * w).sum(1)
     reach = corners[: size * size].abs().amax((1, 2))[:, None]
-    assert bool(((position.cpu() - want).abs() <= 3e-7 * reach).all())  # a float32 sum of three terms
+    assert bool(((position.cpu() - expected).abs() <= 3e-7 * reach).all())  # a float32 sum of three terms
     total = (opposite[: size * size].double() * w).sum(1)
     clear = total.norm(dim=1) > 0.01
     torch.testing.assert_close(normal.cpu().double()[clear], normalize(total[clear], dim=1), rtol=0, atol=2e-5)
@@ -292,9 +294,9 @@ def test_distance_to_the_hull_of_points_anywhere(device):
         padding_mode="border",
         align_corners=False,
     )[:, 0, 0].T
-    want = (seen * depth * 2 / (k[0, 0] + k[0, 1])).amin(1)
+    expected = (seen * depth * 2 / (k[0, 0] + k[0, 1])).amin(1)
     plain = (depth > 1e-3).all(1) & (points.abs() < 1e6).all(1)
     assert plain.sum() > N // 3
     # a pixel coordinate errs by 1e-7 of itself, and the map changes by 60 from pixel to pixel
-    error = (got.double() - want).abs() / (depth.amax(1) * (1 + pixel.abs().amax((1, 2)).clamp(max=1e3)))
+    error = (got.double() - expected).abs() / (depth.amax(1) * (1 + pixel.abs().amax((1, 2)).clamp(max=1e3)))
     assert float(error[plain].max()) < 1e-5

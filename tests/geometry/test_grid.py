@@ -23,15 +23,15 @@ def test_values_and_gradients(device):
     grid, points = random_case(device)
     grid.requires_grad_(), points.requires_grad_()
     weight = torch.randn(5000, 11, generator=torch.Generator().manual_seed(1)).to(device)
-    got, want = sample_grid(grid, points), twin(grid, points)
+    got, expected = sample_grid(grid, points), twin(grid, points)
     # float32 place between points: 2^-24 of a coordinate of up to 8 cells, times differences of up to 6
-    torch.testing.assert_close(got, want.float(), rtol=0, atol=1e-5)
+    torch.testing.assert_close(got, expected.float(), rtol=0, atol=1e-5)
     gradients = torch.autograd.grad((got * weight).sum(), (grid, points))
-    wanted = torch.autograd.grad((want * weight.double()).sum(), (grid, points))
-    torch.testing.assert_close(gradients[0], wanted[0].float(), rtol=1e-4, atol=1e-3)  # sums of a hundred products
+    exact = torch.autograd.grad((expected * weight.double()).sum(), (grid, points))
+    torch.testing.assert_close(gradients[0], exact[0].float(), rtol=1e-4, atol=1e-3)  # sums of a hundred products
     inside = points.detach().abs().amax(-1) < 1
     # gradients jump where a coordinate is a grid point's: a few in 5000 are nearer to one than float32 can tell
-    close = ((gradients[1] - wanted[1]).abs().amax(-1) < 1e-3)[inside]
+    close = ((gradients[1] - exact[1]).abs().amax(-1) < 1e-3)[inside]
     assert float(close.double().mean()) > 0.999
 
 
@@ -70,9 +70,9 @@ def test_the_squared_laplacian_is_that_of_a_convolution(device, shape):
     field = torch.randn(shape, generator=generator).to(device).requires_grad_()
     weight = torch.rand(shape, generator=generator)
     weight = (weight * (torch.rand(shape, generator=generator) < 0.5)).to(device)  # borders are not 0
-    got, want = squared_laplacian(field, weight), laplacian_twin(field, weight)
-    torch.testing.assert_close(got.double(), want, rtol=1e-5, atol=1e-6)  # sums of 1e4 squares in float32
-    gradients = [torch.autograd.grad(3.0 * value, field)[0] for value in (got, want)]
+    got, expected = squared_laplacian(field, weight), laplacian_twin(field, weight)
+    torch.testing.assert_close(got.double(), expected, rtol=1e-5, atol=1e-6)  # sums of 1e4 squares in float32
+    gradients = [torch.autograd.grad(3.0 * value, field)[0] for value in (got, expected)]
     torch.testing.assert_close(*gradients, rtol=1e-5, atol=1e-3)  # of 7 products of up to 100
 
 

@@ -170,12 +170,12 @@ def test_how_far_mirrored_rays_miss_the_hull(device):
     flat, n = points.cpu().double().reshape(-1, 3), normal.cpu().double()[:, None]
     mirrored = flat - 2.0 * ((flat * n).sum(-1) - offset.cpu().double()[:, None])[..., None] * n
     inside = cone_distance(mirrored.reshape(-1, 3), camera.c2w.cpu()).view(30, 60, 5)
-    want = (-torch.where(known.cpu(), inside, -math.inf).amax(-1)).clamp(0.0, 0.2)
+    expected = (-torch.where(known.cpu(), inside, -math.inf).amax(-1)).clamp(0.0, 0.2)
     assert bool((got[:, 0] == torch.tensor(0.2).double()).all())  # a ray of which nothing is known
-    shown = want < 0.05  # as in test_sphere_seen_by_eight_cameras: farther off the axis distances stretch
-    assert shown[:, 1:].sum() > 200 and int((want == 0).sum()) > 100
-    assert float((got - want)[shown].abs().max()) < 0.001 + 0.05 * 0.06
-    assert bool((got[want > 0.19] > 0.18).all())
+    shown = expected < 0.05  # as in test_sphere_seen_by_eight_cameras: farther off the axis distances stretch
+    assert shown[:, 1:].sum() > 200 and int((expected == 0).sum()) > 100
+    assert float((got - expected)[shown].abs().max()) < 0.001 + 0.05 * 0.06
+    assert bool((got[expected > 0.19] > 0.18).all())
 
 
 @pytest.mark.parametrize(

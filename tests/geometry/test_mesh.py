@@ -56,8 +56,10 @@ def test_normal_gradient_matches_float64(device):
     cross = torch.linalg.cross(double[f[:, 1]] - double[f[:, 0]], double[f[:, 2]] - double[f[:, 0]])
     total = sum(torch.zeros_like(double).index_add(0, f[:, k], cross) for k in range(3))
     unit = total / total.norm(dim=-1, keepdim=True)
-    (want,) = torch.autograd.grad((unit * weights.double()).sum(), double)
-    torch.testing.assert_close(got.double(), want, rtol=1e-4, atol=1e-4)  # gradients up to 20, float32 sums of 6 faces
+    (expected,) = torch.autograd.grad((unit * weights.double()).sum(), double)
+    torch.testing.assert_close(
+        got.double(), expected, rtol=1e-4, atol=1e-4
+    )  # gradients up to 20, float32 sums of 6 faces
 
 
 def test_unused_and_flat_vertices_get_a_unit_normal_without_gradient():

@@ -211,7 +211,7 @@ def test_reevaluated_hits_and_their_gradients_equal_float64(device):
     a, b, c = (twin[0][f.cpu().long()[hits.face.cpu().long(), k]] for k in range(3))
     uvt = solved(a, b, c, twin[1], twin[2])
     spot = twin[1] + uvt[:, 2:] * twin[2]
-    want = {
+    expected = {
         "t": uvt[:, 2:],
         "bary": uvt[:, :2],
         "position": spot,
@@ -228,10 +228,10 @@ def test_reevaluated_hits_and_their_gradients_equal_float64(device):
     assert len(sine) > 10_000 and float(sine.min()) < 2e-3
     weight = torch.randn(len(sine), 3, generator=torch.Generator().manual_seed(1))
     for name, value in own.items():
-        assert reference.share_within(value, want[name]) >= 0.999, name
+        assert reference.share_within(value, expected[name]) >= 0.999, name
         w = weight[:, : value.shape[1]]
         grads = torch.autograd.grad((value * w.to(device)).sum(), ins, retain_graph=True, allow_unused=True)
-        truth = torch.autograd.grad((want[name] * w.double()).sum(), twin, retain_graph=True, allow_unused=True)
+        truth = torch.autograd.grad((expected[name] * w.double()).sum(), twin, retain_graph=True, allow_unused=True)
         assert (grads[1] is None) == (name == "normal")
         for k, (g, t) in enumerate(zip(grads, truth, strict=True)):
             assert g is None or reference.share_within(g, t) >= 0.999, (name, k)
@@ -306,9 +306,11 @@ def test_intersect_is_closest_with_gradients_in_rays_and_vertices(device):
     assert bool((hits.t[~hits.valid] == torch.inf).all())
     seen = hits.valid
     got = torch.autograd.grad(hits.t[seen].sum(), leaves)
-    want_hits = evaluate_hits(leaves[0], f, first, leaves[1], leaves[2])
-    want = torch.autograd.grad(want_hits.t[seen].sum(), leaves)
-    assert all(torch.equal(a, b) for a, b in zip(got, want, strict=True)) and float(got[1][~seen].abs().sum()) == 0.0
+    expected_hits = evaluate_hits(leaves[0], f, first, leaves[1], leaves[2])
+    expected = torch.autograd.grad(expected_hits.t[seen].sum(), leaves)
+    assert (
+        all(torch.equal(a, b) for a, b in zip(got, expected, strict=True)) and float(got[1][~seen].abs().sum()) == 0.0
+    )
     with pytest.raises(ValueError, match="vertices: expected the positions of the scene"):
         scene.intersect(o, d, vertices=v + 1.0)
     with pytest.raises(TypeError, match="mesh: expected"):

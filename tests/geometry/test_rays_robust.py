@@ -160,10 +160,10 @@ def test_a_moved_mesh_is_hit_as_if_built_anew(device, backend):
         fresh = make(moved, faces, backend, device)
         assert scene.scale == fresh.scale and (scene.mesh_id == 0) == (backend == "embree")
         start = o + place - 0.2
-        got, want = scene.closest(start, d), fresh.closest(start, d)
+        got, expected = scene.closest(start, d), fresh.closest(start, d)
         # two faces at one edge may be found in another order, at the same distance
-        assert float((got.face != want.face).float().mean()) <= 1e-4
-        torch.testing.assert_close(got.t, want.t, rtol=0, atol=1e-5)
+        assert float((got.face != expected.face).float().mean()) <= 1e-4
+        torch.testing.assert_close(got.t, expected.t, rtol=0, atol=1e-5)
         for limit in (float("inf"), far):
             blocked = scene.occluded(start, d, t_max=limit)
             assert torch.equal(blocked, fresh.occluded(start, d, t_max=limit)) and float(blocked.float().mean()) > 0.1
@@ -177,7 +177,7 @@ from reli3d.geometry.rays import RayScene
 o, d = torch.tensor([[0.2, 0.2, 1.0]]), torch.tensor([[0.0, 0.0, -1.0]])
 corners, one = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), torch.tensor([[0, 1, 2]], dtype=torch.int32)
 
-def ask(scene):
+def properties(scene):
     many = o.expand(20_000, 3), d.expand(20_000, 3)
     t = round(float(scene.closest(o, d).t), 5)  # Embree's reciprocal is approximate: two units in the last place
     return (t, bool(scene.occluded(o, d)), int((scene.closest(*many).face >= 0).sum()),
@@ -197,20 +197,20 @@ for backend in ("embree", "warp"):
         refused("faces", lambda: RayScene(corners, wrong, backend=backend))
     refused("faces", lambda: RayScene(corners[:0], one, backend=backend))
     single = RayScene(corners, one, backend=backend)
-    assert ask(single) == (1.0, True, 20_000, False)
+    assert properties(single) == (1.0, True, 20_000, False)
     for value in (float("nan"), float("inf")):
         broken = corners.clone()
         broken[1, 1] = value
         refused("vertices", lambda: RayScene(broken, one, backend=backend))
         refused("vertices", lambda: single.refit(broken))
-        assert ask(single) == (1.0, True, 20_000, False) and single.scale == 1.0  # as it was
+        assert properties(single) == (1.0, True, 20_000, False) and single.scale == 1.0  # as it was
     refused("vertices", lambda: single.refit(corners[:2]))
     single.refit(corners - torch.tensor([0.0, 0.0, 1.0]))
-    assert ask(single) == (2.0, True, 20_000, False)
+    assert properties(single) == (2.0, True, 20_000, False)
     for vertices in (corners, corners[:0]):
         empty = RayScene(vertices, one[:0], backend=backend)
         for _ in range(2):
-            assert ask(empty) == (float("inf"), False, 0, True) and empty.mesh_id == 0
+            assert properties(empty) == (float("inf"), False, 0, True) and empty.mesh_id == 0
             empty.refit(vertices.clone())
 print("all refused or answered")
 """
@@ -286,21 +286,21 @@ def test_tiny_huge_and_invalid_rays_come_to_an_end(device, backend, count):
     scene = make(vertices, faces, backend, device)
     o, d = rays(count, 2, 0.2)
     o, d = o.to(device), torch.nn.functional.normalize(d, dim=-1).to(device)
-    want = scene.closest(o, d)
+    expected = scene.closest(o, d)
     for length in (1e-45, 1e-40, 1e-30, 1e-17, 1e-10, 1e10, 1e30, 3e37):
         hits = scene.closest(o, d * length)
         hit = hits.face >= 0
         assert bool(hit.all()) if length > 1e-38 else not bool(hit.any())
-        assert float((hits.face == want.face)[hit].float().sum()) >= 0.999 * float(hit.sum())
-        torch.testing.assert_close(hits.t[hit].double() * length, want.t[hit].double(), rtol=1e-4, atol=0)
+        assert float((hits.face == expected.face)[hit].float().sum()) >= 0.999 * float(hit.sum())
+        torch.testing.assert_close(hits.t[hit].double() * length, expected.t[hit].double(), rtol=1e-4, atol=0)
         assert bool(torch.isinf(hits.t[~hit]).all()) and torch.equal(scene.occluded(o, d * length), hit)
-        far = torch.full((len(o),), float(want.t.median()) / length if hit.any() else 1e38, device=device)
-        near = want.t < float(want.t.median()) * (1 - 1e-5)
+        far = torch.full((len(o),), float(expected.t.median()) / length if hit.any() else 1e38, device=device)
+        near = expected.t < float(expected.t.median()) * (1 - 1e-5)
         assert not hit.any() or bool(scene.occluded(o, d * length, t_max=far)[near].all())
     for value in (float("nan"), float("inf"), -float("inf")):
         for part in (0, 1):
             mixed = [o.clone(), d.clone()]
             mixed[part][1::2, 1] = value
             hits = scene.closest(*mixed)
-            assert bool((hits.face[1::2] == -1).all()) and torch.equal(hits.face[::2], want.face[::2])
+            assert bool((hits.face[1::2] == -1).all()) and torch.equal(hits.face[::2], expected.face[::2])
             assert torch.equal(scene.occluded(*mixed), hits.face >= 0)

@@ -27,14 +27,16 @@ def test_deviation_and_gradients_match_the_float64_formulation(device):
     spread = vertex_deviation(ours["sdf"], radius=0.8, **arguments)
     mesh = extract_surface(ours["sdf"], radius=0.8, **arguments)
     plain, _ = reference_surface.flexicubes_vertices(**double, scale=1.6)
-    want = reference_surface.flexicubes_deviation(**double, scale=1.6)
+    expected = reference_surface.flexicubes_deviation(**double, scale=1.6)
     _, match = cKDTree(mesh.vertices.detach().cpu().numpy()).query(plain.detach().numpy())
-    assert len(spread) == len(want) == len(set(match.tolist()))
+    assert len(spread) == len(expected) == len(set(match.tolist()))
     got = spread[torch.from_numpy(match).to(device)]
-    torch.testing.assert_close(got.cpu().double(), want, rtol=0, atol=1e-6)  # float32 differences of positions below 1
-    cotangent = torch.rand(len(want), generator=rng)
+    torch.testing.assert_close(
+        got.cpu().double(), expected, rtol=0, atol=1e-6
+    )  # float32 differences of positions below 1
+    cotangent = torch.rand(len(expected), generator=rng)
     got = torch.autograd.grad((got * cotangent.to(device)).sum(), list(ours.values()))
-    true = torch.autograd.grad((want * cotangent.double()).sum(), list(double.values()))
+    true = torch.autograd.grad((expected * cotangent.double()).sum(), list(double.values()))
     for name, a, b in zip(ours, got, true, strict=True):
         assert b.abs().max() > 0, name
         # float64 inside, so what is left is float32 sums over eight cubes
@@ -83,10 +85,10 @@ def test_entropy_matches_cross_entropy_in_float64(device):
             F.binary_cross_entropy_with_logits(a, (b > 0).double(), reduction="none")
             + F.binary_cross_entropy_with_logits(b, (a > 0).double(), reduction="none")
         )
-    want, got = torch.cat(terms).mean(), sign_entropy(ours)
-    torch.testing.assert_close(got.cpu().double(), want, rtol=1e-6, atol=0)  # a float32 sum of 300 like terms
+    expected, got = torch.cat(terms).mean(), sign_entropy(ours)
+    torch.testing.assert_close(got.cpu().double(), expected, rtol=1e-6, atol=0)  # a float32 sum of 300 like terms
     torch.testing.assert_close(
-        torch.autograd.grad(got, ours)[0].cpu().double(), torch.autograd.grad(want, double)[0], rtol=1e-5, atol=1e-9
+        torch.autograd.grad(got, ours)[0].cpu().double(), torch.autograd.grad(expected, double)[0], rtol=1e-5, atol=1e-9
     )
 
 

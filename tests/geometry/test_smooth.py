@@ -32,15 +32,15 @@ def test_values_and_gradients_match_the_dense_operator_in_float64(device):
     steps = [0.6, 1 / (0.1 - 1 / 0.6)] * 4
     matrix = umbrella_matrix(mesh)
     double = mesh.vertices.double().requires_grad_()
-    want = double
+    expected = double
     for step in steps:
-        want = want + step * (matrix @ want)
+        expected = expected + step * (matrix @ expected)
     single = mesh.vertices.to(device).requires_grad_()
     got = taubin_smooth(Mesh(single, mesh.faces.to(device)), iterations=4, step=0.6).vertices
-    torch.testing.assert_close(got.cpu().double(), want, rtol=0, atol=2e-6)  # eight float32 steps of unit positions
-    cotangent = torch.randn(want.shape, generator=torch.Generator().manual_seed(1))
+    torch.testing.assert_close(got.cpu().double(), expected, rtol=0, atol=2e-6)  # eight float32 steps of unit positions
+    cotangent = torch.randn(expected.shape, generator=torch.Generator().manual_seed(1))
     a = torch.autograd.grad((got * cotangent.to(device)).sum(), single)[0]
-    b = torch.autograd.grad((want * cotangent.double()).sum(), double)[0]
+    b = torch.autograd.grad((expected * cotangent.double()).sum(), double)[0]
     torch.testing.assert_close(a.cpu().double(), b, rtol=0, atol=1e-5)  # the same, of gradients up to 3
 
 
@@ -90,10 +90,10 @@ def test_copies_of_a_vertex_move_together_and_uv_stay():
         torch.arange(whole.faces.numel(), dtype=torch.int32).view(-1, 3),
         uv=torch.rand(whole.faces.numel(), 2),
     )
-    got, want = taubin_smooth(split), taubin_smooth(whole)
+    got, expected = taubin_smooth(split), taubin_smooth(whole)
     assert got.uv is split.uv and got.normals is None
     # a mean over copies rounds once more than the vertex alone
-    torch.testing.assert_close(got.vertices, want.vertices[whole.faces.long().view(-1)], rtol=0, atol=2e-6)
+    torch.testing.assert_close(got.vertices, expected.vertices[whole.faces.long().view(-1)], rtol=0, atol=2e-6)
 
 
 @pytest.mark.parametrize(

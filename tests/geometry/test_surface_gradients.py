@@ -25,34 +25,34 @@ def test_gradients_match_the_float64_formulation(device):
     ours = {k: v.to(device).requires_grad_() for k, v in leaves.items()}
     mesh = extract_surface(ours["sdf"], radius=0.8, gamma=gamma.to(device), **{k: ours[k] for k in weights})
     double = {k: v.double().requires_grad_() for k, v in leaves.items()}
-    want, _ = reference_surface.flexicubes_vertices(
+    expected, _ = reference_surface.flexicubes_vertices(
         double["sdf"], double["deformation"], double["alpha"], double["beta"], 1.6
     )
     tree = cKDTree(mesh.vertices.detach().cpu().numpy())
-    distance, match = tree.query(want.detach().numpy())
-    assert len(want) == len(mesh.vertices) == len(set(match.tolist()))
+    distance, match = tree.query(expected.detach().numpy())
+    assert len(expected) == len(mesh.vertices) == len(set(match.tolist()))
     assert distance.max() < 1e-6  # float32 quotients of coordinates below 1
-    cotangent = torch.randn(len(want), 3, generator=rng)
+    cotangent = torch.randn(len(expected), 3, generator=rng)
     placed = torch.empty_like(cotangent)
     placed[torch.from_numpy(match)] = cotangent
     got = torch.autograd.grad((mesh.vertices * placed.to(device)).sum(), list(ours.values()))
-    true = torch.autograd.grad((want * cotangent.double()).sum(), list(double.values()))
+    true = torch.autograd.grad((expected * cotangent.double()).sum(), list(double.values()))
     for name, a, b in zip(ours, got, true, strict=True):
         # float64 inside, so what is left is float32 sums over eight cubes
         torch.testing.assert_close(a.cpu().double(), b, rtol=1e-5, atol=1e-7 * float(b.abs().max()), msg=name)
 
 
-def test_layout_of_the_inputs_does_not_matter_and_gradients_stop_where_none_is_asked(device):
+def test_layout_of_the_inputs_does_not_matter_and_gradients_stop_where_none_is_required(device):
     sdf = torus(10, device)
     weights = random_weights(sdf.shape, 4, device)
     weights["alpha"] = weights["alpha"][:1].expand(1000, 8)
-    want = extract_surface(sdf, radius=1.0, **weights)
+    expected = extract_surface(sdf, radius=1.0, **weights)
     strided = {name: torch.stack([value, value], -1)[..., 1] for name, value in weights.items()}
     beta = strided["beta"] = strided["beta"].requires_grad_()
     turned = sdf.permute(2, 0, 1).contiguous().permute(1, 2, 0)
     assert not turned.is_contiguous() and not beta.is_contiguous()
     got = extract_surface(turned, radius=1.0, **strided)
-    assert torch.equal(got.vertices.detach(), want.vertices) and torch.equal(got.faces, want.faces)
+    assert torch.equal(got.vertices.detach(), expected.vertices) and torch.equal(got.faces, expected.faces)
     loss = got.vertices.square().sum()
     (first,) = torch.autograd.grad(loss, beta, retain_graph=True)
     assert torch.equal(first, torch.autograd.grad(loss, beta, retain_graph=True)[0]) and first.shape == beta.shape

@@ -73,8 +73,8 @@ def test_the_plane_of_two_equal_balls_is_found_in_any_frame(up, center, unit, de
     distance = distances(TWIN, camera, turn, center, unit)
     plane = mirror_plane(distance.to(device), camera.to(device))
     normal = plane.normal.cpu()
-    want = turn[:, 0]
-    cosine = float((normal @ want).abs())
+    expected = turn[:, 0]
+    cosine = float((normal @ expected).abs())
     # a pixel of the silhouettes is 0.015 units, over the object's 0.9 units: 1 degree
     assert math.degrees(math.acos(min(cosine, 1.0))) < 1.0
     assert abs(plane.offset - float(torch.tensor(center) @ normal)) < 0.008 * unit

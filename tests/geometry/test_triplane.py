@@ -22,13 +22,15 @@ def test_values_and_gradients_match_grid_sample_in_float64(device, channels, hei
     planes, points = planes.requires_grad_(), points.requires_grad_()
     got = sample_triplane(planes, points)
     reference = [planes.detach().double().requires_grad_(), points.detach().double().requires_grad_()]
-    want = grid_samples(*reference)
-    torch.testing.assert_close(got.double(), want, rtol=0, atol=5e-6)  # float32 sums of four values of up to 5
+    expected = grid_samples(*reference)
+    torch.testing.assert_close(got.double(), expected, rtol=0, atol=5e-6)  # float32 sums of four values of up to 5
     g_got = torch.autograd.grad((got * weights).sum(), (planes, points))
-    g_want = torch.autograd.grad((want * weights.double()).sum(), reference)
-    torch.testing.assert_close(g_got[0].double(), g_want[0], rtol=0, atol=4e-5)  # of 600 points where there is 1 texel
+    g_expected = torch.autograd.grad((expected * weights.double()).sum(), reference)
+    torch.testing.assert_close(
+        g_got[0].double(), g_expected[0], rtol=0, atol=4e-5
+    )  # of 600 points where there is 1 texel
     # the gradient jumps at a texel centre, which rounding may move a point across: none of these 600 points lies there
-    for a, b in zip((got, *g_got), (want, *g_want), strict=True):
+    for a, b in zip((got, *g_got), (expected, *g_expected), strict=True):
         assert share_within(a, b) >= 0.999
 
 
@@ -67,21 +69,21 @@ def test_half_storage_is_summed_in_float32(device, dtype):
     torch.testing.assert_close(got, sample_triplane(stored.detach().float(), points), rtol=0, atol=0)
     grad = torch.autograd.grad((got * weights).sum(), stored)[0]
     full = stored.detach().float().requires_grad_()
-    want = torch.autograd.grad((sample_triplane(full, points) * weights).sum(), full)[0]
+    expected = torch.autograd.grad((sample_triplane(full, points) * weights).sum(), full)[0]
     assert grad.dtype == dtype
-    assert torch.equal(grad, want.to(dtype))  # rounded once, after the sum over 4000 points
+    assert torch.equal(grad, expected.to(dtype))  # rounded once, after the sum over 4000 points
 
 
 def test_layouts_give_the_same_bits(device):
     planes, points, _ = inputs(2, 16, 10, 12, 500, device)
-    want = sample_triplane(planes, points)
+    expected = sample_triplane(planes, points)
     channel_last = planes.movedim(2, -1).contiguous().movedim(-1, 2)
-    assert torch.equal(sample_triplane(channel_last, points), want)
-    assert torch.equal(sample_triplane(planes.repeat(1, 2, 1, 1, 1)[:, :3], points.flip(1).flip(1)), want)
+    assert torch.equal(sample_triplane(channel_last, points), expected)
+    assert torch.equal(sample_triplane(planes.repeat(1, 2, 1, 1, 1)[:, :3], points.flip(1).flip(1)), expected)
     strided = torch.stack([points, points], -1)[..., 0]
     assert not strided.is_contiguous()
-    assert torch.equal(sample_triplane(planes, strided), want)
-    assert torch.equal(sample_triplane(planes[:1].expand(2, -1, -1, -1, -1), points)[0], want[0])
+    assert torch.equal(sample_triplane(planes, strided), expected)
+    assert torch.equal(sample_triplane(planes[:1].expand(2, -1, -1, -1, -1), points)[0], expected[0])
 
 
 def test_a_walk_is_read_as_it_comes_and_shuffled_points_by_row_with_the_same_bits():
@@ -102,10 +104,10 @@ def test_channel_first_planes_are_read_by_rows_with_the_same_bits(channels, heig
     assert planes[0, 0].numel() > CACHED
     channel_last = planes.movedim(2, -1).contiguous().movedim(-1, 2)
     p, q = planes.requires_grad_(), channel_last.requires_grad_()
-    got, want = sample_triplane(p, points), sample_triplane(q, points)
-    assert torch.equal(got, want)
-    assert torch.equal(*(torch.autograd.grad(f, x, weights)[0] for f, x in ((got, p), (want, q))))
-    assert torch.equal(sample_triplane(planes.detach(), points), want)
+    got, expected = sample_triplane(p, points), sample_triplane(q, points)
+    assert torch.equal(got, expected)
+    assert torch.equal(*(torch.autograd.grad(f, x, weights)[0] for f, x in ((got, p), (expected, q))))
+    assert torch.equal(sample_triplane(planes.detach(), points), expected)
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -1e30, 3e38])

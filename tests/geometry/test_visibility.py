@@ -50,10 +50,10 @@ def test_a_ball_is_seen_where_it_faces_the_camera_and_lies_in_the_image(device, 
     )
     camera, p = rig(device, *size), points(device)
     got = visible_from(scene, p * 1.001, p, camera)
-    want, unsure = closed_form(p * 1.001, p, camera)
-    assert got.dtype == torch.bool and got.shape == want.shape
-    assert torch.equal(got[~unsure], want[~unsure])
-    assert unsure.float().mean() < 0.05 and 0.05 < want.float().mean() < 0.6
+    expected, unsure = closed_form(p * 1.001, p, camera)
+    assert got.dtype == torch.bool and got.shape == expected.shape
+    assert torch.equal(got[~unsure], expected[~unsure])
+    assert unsure.float().mean() < 0.05 and 0.05 < expected.float().mean() < 0.6
 
 
 def test_what_stands_between_hides(device):
@@ -62,10 +62,10 @@ def test_what_stands_between_hides(device):
     plate = torch.tensor([[-4.0, -4.0, 2.0], [4.0, -4.0, 2.0], [4.0, 4.0, 2.0], [-4.0, 4.0, 2.0]], device=device)
     scene = RayScene(plate, torch.tensor([[0, 1, 2], [0, 2, 3]], dtype=torch.int32, device=device))
     p = points(device, 500)
-    got, want = visible_from(scene, p, p, camera), closed_form(p, p, camera)[0]
-    assert not got[:, 0].any() and want[:, 0].any()
+    got, expected = visible_from(scene, p, p, camera), closed_form(p, p, camera)[0]
+    assert not got[:, 0].any() and expected[:, 0].any()
     behind = p[:, 2] < 0.4  # rays to the other cameras stay below the plate
-    assert torch.equal(got[behind, 1:], want[behind, 1:])
+    assert torch.equal(got[behind, 1:], expected[behind, 1:])
 
 
 @pytest.mark.parametrize("fraction", [0.0, 0.1, 1.0])

@@ -207,8 +207,8 @@ def test_node_transforms_reach_positions_normals_and_mirrors(asset, tmp_path):
     (tmp_path / "a.glb").write_bytes(packed(document, binary))
     (part,) = read_glb(tmp_path / "a.glb")
     p = asset.mesh.vertices
-    want = torch.stack([1 - p[:, 1], 2 - 2 * p[:, 0], 3 + p[:, 2]], 1)  # mirrored, then a quarter turn about z
-    torch.testing.assert_close(part.mesh.vertices, want, rtol=0, atol=1e-5)
+    expected = torch.stack([1 - p[:, 1], 2 - 2 * p[:, 0], 3 + p[:, 2]], 1)  # mirrored, then a quarter turn about z
+    torch.testing.assert_close(part.mesh.vertices, expected, rtol=0, atol=1e-5)
     a, b, c = (part.mesh.vertices[part.mesh.faces[:, k].long()] for k in range(3))
     outward = torch.linalg.cross(b - a, c - a)
     center = (a + b + c) / 3 - torch.tensor([1.0, 2, 3])

@@ -106,8 +106,8 @@ def linear(pixels: np.ndarray) -> torch.Tensor:
     return srgb_to_linear(torch.from_numpy(pixels / np.float32(np.iinfo(pixels.dtype).max)).float())
 
 
-def near(got: torch.Tensor, want, atol: float = 1e-5) -> None:
-    torch.testing.assert_close(got, torch.as_tensor(want).to(got), rtol=0, atol=atol)
+def near(got: torch.Tensor, expected, atol: float = 1e-5) -> None:
+    torch.testing.assert_close(got, torch.as_tensor(expected).to(got), rtol=0, atol=atol)
 
 
 def test_16_bit_gray_textures(tmp_path):
@@ -165,8 +165,8 @@ def test_wrap_modes(tmp_path, wrap_s, wrap_t):
     asset, _ = quad.read(tmp_path)
     ks = [(i, j) for i in range(-5, 9) for j in range(-5, 9)]  # texel centers
     places = [((((i + 0.5) / 4 + 1.5) / 4) * 2 - 1, 1 - (((j + 0.5) / 4 + 1.5) / 4) * 2) for i, j in ks]
-    want = linear(pixels)[[texel(j, 4, wrap_t) for _, j in ks], [texel(i, 4, wrap_s) for i, _ in ks]]
-    near(at(asset, *places).base_color, want, 1e-4)
+    expected = linear(pixels)[[texel(j, 4, wrap_t) for _, j in ks], [texel(i, 4, wrap_s) for i, _ in ks]]
+    near(at(asset, *places).base_color, expected, 1e-4)
     write_glb(tmp_path / "b.glb", asset)
     (back,) = read_glb(tmp_path / "b.glb")
     assert back.textures.wrap == asset.textures.wrap

@@ -230,8 +230,8 @@ def test_the_display_window_is_the_image(tmp_path, display):
     for y in range(top, bottom + 1):
         for x in range(left, right + 1):
             inside = 2 <= x <= 9 and 3 <= y <= 6
-            want = [planes[c][y - 3, x - 2] for c in "RGB"] if inside else [0.0] * 3
-            assert got[y - top, x - left].tolist() == want
+            expected = [planes[c][y - 3, x - 2] for c in "RGB"] if inside else [0.0] * 3
+            assert got[y - top, x - left].tolist() == expected
     assert [("dataWindow" in note) for note in notes] == ([True] if display != (2, 3, 9, 6) else [])
 
 
@@ -263,8 +263,8 @@ def test_primaries_of_an_exr_are_converted(tmp_path, header, primaries):
     exr(tmp_path / "a.exr", {c: np.ascontiguousarray(image[..., k]) for k, c in enumerate("RGB")}, **header)
     notes: list[str] = []
     got = read_hdr_image(tmp_path / "a.exr", notes=notes).numpy()
-    want = image @ np.array(TO_REC709[primaries] if primaries else np.eye(3)).T
-    np.testing.assert_allclose(got, want, rtol=0, atol=2e-4)  # the recommendation has four digits
+    expected = image @ np.array(TO_REC709[primaries] if primaries else np.eye(3)).T
+    np.testing.assert_allclose(got, expected, rtol=0, atol=2e-4)  # the recommendation has four digits
     assert len(notes) == bool(primaries) and all("Rec. 709" in note for note in notes)
 
 
@@ -368,8 +368,8 @@ def test_flat_pixels_that_begin_like_run_lengths(tmp_path, first):
     quads = QUADS.copy()
     quads[0, 0] = quads[3, 0] = first
     got = picture(tmp_path / "a.hdr", "-Y 6 +X 12", quads.tobytes())
-    want = quads[..., :3] * 2.0 ** (quads[..., 3:].astype(float) - 128)
-    assert np.array_equal(got, np.rint(want))
+    expected = quads[..., :3] * 2.0 ** (quads[..., 3:].astype(float) - 128)
+    assert np.array_equal(got, np.rint(expected))
 
 
 def test_run_lengths_of_before_1991(tmp_path):
@@ -383,8 +383,8 @@ def test_run_lengths_of_before_1991(tmp_path):
     lines += b + again(44) + again(1)  # 1 + 44 + 256 pixels
     lines += c * 300 + again(200)  # more than the scanline has
     got = picture(tmp_path / "a.hdr", "-Y 3 +X 301", lines)
-    want = [[a] * 257 + [b] * 2 + [c] * 42, [b] * 301, [c] * 301]
-    assert np.array_equal(got, np.frombuffer(b"".join(sum(want, [])), np.uint8).reshape(3, 301, 4)[..., :3])
+    expected = [[a] * 257 + [b] * 2 + [c] * 42, [b] * 301, [c] * 301]
+    assert np.array_equal(got, np.frombuffer(b"".join(sum(expected, [])), np.uint8).reshape(3, 301, 4)[..., :3])
     for broken in (a * 200, a + again(10)):
         with pytest.raises(InputError, match="pixels: expected all scanlines"):
             picture(tmp_path / "b.hdr", "-Y 1 +X 301", broken)

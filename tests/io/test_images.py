@@ -107,7 +107,7 @@ def srgb(linear: np.ndarray) -> np.ndarray:
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
 
 
-def test_a_linear_image_is_encoded_as_its_suffix_asks(tmp_path):
+def test_a_linear_image_is_encoded_by_its_suffix(tmp_path):
     image = torch.rand(6, 9, 4, generator=torch.Generator().manual_seed(0)) * 1.5
     alpha = image[..., 3] = image[..., 3].clamp(0.1, 1.0)
     alpha[0, 0] = image[0, 0] = 0.0

@@ -249,7 +249,7 @@ def test_presets_of_absurd_size_or_depth_are_refused():
 
 
 def test_a_chunk_that_claims_more_than_the_file_takes_no_memory(tmp_path):
-    """Found by the campaign: Pillow asks for the rest of the chunk after the last row, 4 GiB."""
+    """Found by the campaign: Pillow reads the rest of the chunk after the last row, 4 GiB."""
     path = tmp_path / "a.png"
     Image.fromarray(np.full((32, 32, 4), 255, np.uint8)).save(path)
     data = path.read_bytes()

@@ -28,7 +28,7 @@ def test_one_thread_does_it_at_once(threads):
     assert done[0][0] == threading.current_thread().name and not done[0][2] and result() is None
 
 
-def test_an_error_reaches_who_asks_for_the_value(threads):
+def test_an_error_is_raised_when_the_value_is_read(threads):
     threads(2)
 
     def fail():

@@ -131,8 +131,8 @@ def test_mirror_images_have_the_mirrored_maps(model):
     local = torch.stack([x, y, -torch.ones_like(x)], -1) * depth[..., None]
     point = torch.einsum("vij,vxyj->vxyi", camera.c2w[:, :3, :3], local) + camera.c2w[:, None, None, :3, 3]
     for values, offset in ((pixels.normal, 0.0), (point, plane.offset)):
-        want = values - 2.0 * ((values @ plane.normal) - offset)[..., None] * plane.normal
-        torch.testing.assert_close(values[3:], want[:3].flip(2), rtol=0, atol=1e-5)  # rounding of the rotations
+        expected = values - 2.0 * ((values @ plane.normal) - offset)[..., None] * plane.normal
+        torch.testing.assert_close(values[3:], expected[:3].flip(2), rtol=0, atol=1e-5)  # rounding of the rotations
     assert pixels.gain.std() > 0.01 and pixels.normal.std() > 0.1
 
 
@@ -217,8 +217,8 @@ def test_pixels_know_their_place():
     c2w = look_at(eye, target, torch.tensor([0.0, 1.0, 0.0]))
     intrinsics = torch.tensor([[SIZE * 1.7, SIZE * 1.9, SIZE / 2 + 3, SIZE / 2 - 5]])
     place = pixel_positions(Camera(c2w, intrinsics, SIZE, SIZE))
-    want = place[0, 10, 40]
-    point = want[0] * c2w[0, :3, 0] + want[1] * c2w[0, :3, 1]
+    expected = place[0, 10, 40]
+    point = expected[0] * c2w[0, :3, 0] + expected[1] * c2w[0, :3, 1]
     xy, _ = project(point[None], c2w[0], intrinsics[0])
     torch.testing.assert_close(xy, torch.tensor([[40.5, 10.5]]), rtol=0, atol=1e-3)
 
@@ -281,27 +281,27 @@ def test_the_fused_pass_is_the_one_that_trains(model):
     position, normal = surface_of_ball(3000)
     inputs = sphere(5)
     visible = (torch.rand(3000, 5, generator=torch.Generator().manual_seed(2)) > 0.5).float()
-    want = encoded(model, *inputs).fused(position, normal, visible)
+    expected = encoded(model, *inputs).fused(position, normal, visible)
     got = encoded(model, *inputs, inference=True).fused(position, normal, visible)
-    assert want.logit.requires_grad and not got.logit.requires_grad
+    assert expected.logit.requires_grad and not got.logit.requires_grad
     # sums of five float32 terms in another order; logits of up to 4, and exp of the confidence
-    torch.testing.assert_close(got.logit, want.logit.detach(), rtol=0, atol=2e-5)
-    torch.testing.assert_close(got.normal, want.normal.detach(), rtol=0, atol=2e-5)
-    torch.testing.assert_close(got.numbers[:, :9], want.numbers[:, :9].detach(), rtol=0, atol=5e-5)
+    torch.testing.assert_close(got.logit, expected.logit.detach(), rtol=0, atol=2e-5)
+    torch.testing.assert_close(got.normal, expected.normal.detach(), rtol=0, atol=2e-5)
+    torch.testing.assert_close(got.numbers[:, :9], expected.numbers[:, :9].detach(), rtol=0, atol=5e-5)
     # the root of a difference of squares: 1e-3 where the views agree
-    torch.testing.assert_close(got.numbers[:, 9], want.numbers[:, 9].detach(), rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(got.numbers[:, 9], expected.numbers[:, 9].detach(), rtol=1e-3, atol=1e-3)
 
 
 @pytest.mark.parametrize("views", [1, 5])
 def test_the_volume_of_inference_is_the_one_that_trains(model, views):
     """Two layers and their spread over the views in one kernel, against torch's operations, which have the gradient."""
     inputs = sphere(views)
-    want, got = encoded(model, *inputs), encoded(model, *inputs, inference=True)
-    assert want.volume.requires_grad and not got.volume.requires_grad
-    wanted = want.volume.detach()
-    assert wanted.std() > 0.05
+    expected, got = encoded(model, *inputs), encoded(model, *inputs, inference=True)
+    assert expected.volume.requires_grad and not got.volume.requires_grad
+    exact = expected.volume.detach()
+    assert exact.std() > 0.05
     # sums of 32 float32 terms in another order, through six convolutions
-    torch.testing.assert_close(got.volume, wanted, rtol=0, atol=1e-4 * float(wanted.abs().max()))
+    torch.testing.assert_close(got.volume, exact, rtol=0, atol=1e-4 * float(exact.abs().max()))
 
 
 def test_layers_of_other_widths_than_the_kernel_has_are_refused():
@@ -345,9 +345,9 @@ def test_points_know_whether_they_lie_before_a_surface():
     surface.requires_grad_()
     points = torch.tensor([[0.0, 0.0, 0.03], [0.1, 0.0, -0.03], [0.1, 0.1, 0.5]])
     got = ahead_of_surface(surface, maps, points)
-    want = torch.tensor([math.tanh(0.6), math.tanh(-0.6), math.tanh(10.0)])
-    torch.testing.assert_close(got[:, 0], want, rtol=0, atol=1e-4)
-    torch.testing.assert_close(got[:, 1], want, rtol=0, atol=1e-4)
+    expected = torch.tensor([math.tanh(0.6), math.tanh(-0.6), math.tanh(10.0)])
+    torch.testing.assert_close(got[:, 0], expected, rtol=0, atol=1e-4)
+    torch.testing.assert_close(got[:, 1], expected, rtol=0, atol=1e-4)
     assert torch.equal(got[:, 3], torch.full((3,), 0.5))
     got[0, 0].backward()
     assert float(surface.grad[0, ..., 0].sum()) > 0 and float(surface.grad[1].abs().max()) == 0.0

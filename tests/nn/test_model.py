@@ -62,7 +62,7 @@ def test_tiny_system_matches_published_end_to_end(tiny):
 
 
 @torch.no_grad()
-def test_background_is_hidden_unless_asked_for():
+def test_background_is_hidden_unless_requested():
     torch.manual_seed(0)
     model = Reconstructor(NANO).eval()
     images, masks, c2w, intrinsics = views(2, 2, 32)

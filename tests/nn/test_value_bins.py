@@ -20,9 +20,9 @@ def test_multiples_of_a_logit_are_the_binomial_distribution(bins):
     log_bins, expected = binned(raw)
     for k, zero in enumerate((0.0, METALLIC_LOGIT)):
         p = (logit + zero).sigmoid().numpy()
-        want = binom.logpmf(np.arange(bins), bins - 1, p[:, None])
+        exact = binom.logpmf(np.arange(bins), bins - 1, p[:, None])
         # float32 logits of up to 35
-        np.testing.assert_allclose(log_bins[:, k].numpy(), want, atol=2e-5)
+        np.testing.assert_allclose(log_bins[:, k].numpy(), exact, atol=2e-5)
         np.testing.assert_allclose(expected[:, k].sigmoid().numpy(), p, atol=1e-6)
 
 
@@ -38,8 +38,8 @@ def test_the_loss_is_the_excess_cross_entropy_and_zero_at_the_value():
     logits = torch.randn(64, 8, generator=generator, dtype=torch.float64)
     least = cross_entropy((target + 1e-300).log(), target)
     error = (logits.softmax(-1) @ steps - value).abs().mean()
-    want = (cross_entropy(logits, target) - least) / np.log(8) + L1_WEIGHT * error
-    torch.testing.assert_close(bin_loss(logits.log_softmax(-1), value), want)
+    expected = (cross_entropy(logits, target) - least) / np.log(8) + L1_WEIGHT * error
+    torch.testing.assert_close(bin_loss(logits.log_softmax(-1), value), expected)
     assert float(bin_loss((target + 1e-300).log(), value)) == pytest.approx(0.0, abs=1e-12)
 
 
@@ -58,12 +58,12 @@ def test_a_converted_network_predicts_the_same(tmp_path):
     detail = torch.cat([images, 20.0 * (0.7 - (x.square() + y.square()).sqrt())[..., None].expand(4, -1, -1, 1)], -1)
     with torch.no_grad():
         views = images, masks, c2w, camera.intrinsics, detail.contiguous(), camera.intrinsics
-        (_, want, _), (_, got, _) = (m.read_pixels(*views, mirrored=2) for m in (unlit, made))
+        (_, expected, _), (_, got, _) = (m.read_pixels(*views, mirrored=2) for m in (unlit, made))
     assert got.bins.shape == (4, 32, 32, 2, 8)
-    assert float(want.roughness.std()) > 0.1 and float(want.normal[2:].std()) > 0.1
+    assert float(expected.roughness.std()) > 0.1 and float(expected.normal[2:].std()) > 0.1
     for name in ("gain", "shift", "confidence", "roughness", "metallic", "chroma", "normal", "depth"):
         # weights of bin 7 are 7 times those of the logit: 7 times float32's error
-        torch.testing.assert_close(getattr(got, name), getattr(want, name), rtol=1e-4, atol=1e-4, msg=name)
+        torch.testing.assert_close(getattr(got, name), getattr(expected, name), rtol=1e-4, atol=1e-4, msg=name)
     with pytest.raises(InputError, match="expected 8, as the weights have, got 4"):
         with_bins(made, 4)
 

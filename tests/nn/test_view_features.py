@@ -74,11 +74,11 @@ def test_the_kernel_matches_torch(device, views, on_surface):
     points, visible, normal = surface(700, views, device)
     if not on_surface:
         visible = normal = None
-    got, want = (
+    got, expected = (
         summarize_views(maps.images, maps.camera, points, visible, normal),
         unlit(maps, points, visible, normal),
     )
-    for g, w in zip(got, want, strict=True):
+    for g, w in zip(got, expected, strict=True):
         # projection in float32: errors of 1e-5 pixel on values that change by up to 12 per pixel; 0.2 % of them are
         # divided by EDGE_WIDTH * SIZE
         torch.testing.assert_close(g.double(), w, rtol=1e-4, atol=5e-4)
@@ -103,11 +103,11 @@ def test_gathered_values_and_gradients_equal_their_float64_reference(device):
         grid = torch.stack([x / 20 * 2 - 1, y / 24 * 2 - 1], -1)[None, None]
         image = grid_sample(twin[0][v].permute(2, 0, 1)[None], grid, align_corners=False, padding_mode="border")
         rows.append(torch.cat([image[0, :, 0].T, torch.stack([x, y, -local[:, 2]], -1)], -1))
-    got, want = torch.cat([values, pixels], -1), torch.stack(rows, 1)
-    assert reference.share_within(got, want) >= 0.999
-    weight = torch.rand(want.shape, generator=g)  # of one sign: sums that cancel have no digits left
+    got, expected = torch.cat([values, pixels], -1), torch.stack(rows, 1)
+    assert reference.share_within(got, expected) >= 0.999
+    weight = torch.rand(expected.shape, generator=g)  # of one sign: sums that cancel have no digits left
     grads = torch.autograd.grad((got * weight.to(device)).sum(), ins)
-    truth = torch.autograd.grad((want * weight.double()).sum(), twin)
+    truth = torch.autograd.grad((expected * weight.double()).sum(), twin)
     assert reference.share_within(grads[0], truth[0]) >= 0.999
     assert reference.rows_within(grads[1], truth[1]) >= 0.999
 
@@ -170,8 +170,8 @@ def test_the_layer_saturates_as_silu_does(device):
         tokens = torch.full((2, GRID, GRID, 8), value, device=device)
         layer = torch.zeros(9, 8, device=device)
         pooled, _ = pool_views(maps.images, tokens, layer, maps.camera, points, None, None)
-        want = torch.nn.functional.silu(torch.tensor(value, dtype=torch.float64)).item()
-        assert pooled.cpu().double().sub(want).abs().max() < 5e-7 * max(1.0, abs(value))  # bilinear weights: 2 ulp
+        expected = torch.nn.functional.silu(torch.tensor(value, dtype=torch.float64)).item()
+        assert pooled.cpu().double().sub(expected).abs().max() < 5e-7 * max(1.0, abs(value))  # bilinear weights: 2 ulp
 
 
 def test_a_layer_that_is_no_whole_number_of_registers_is_an_error(device):

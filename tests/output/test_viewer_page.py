@@ -123,9 +123,9 @@ def test_the_page_shows_the_asset_as_the_renderer_does(tmp_path, asset, views):
         tab.open((tmp_path / "viewer.html").as_uri(), size=(WIDE, SIZE)).wait("document.body.dataset.ready")
 
         def picture(**values) -> np.ndarray:
-            return pixels(tab.ask(choose(**values) + "picture()"))
+            return pixels(tab.evaluate(choose(**values) + "picture()"))
 
-        tab.ask("take(0)")
+        tab.evaluate("take(0)")
         first = ours(asset, views, 0, asset.environment)
         own = psnr(picture(), shown(first), first.alpha)
         layers = {
@@ -136,16 +136,16 @@ def test_the_page_shows_the_asset_as_the_renderer_does(tmp_path, asset, views):
         }
         found = {name: psnr(picture(layer=name), color, first.alpha) for name, color in layers.items()}
         wires = picture(layer="wireframe")
-        tab.ask("take(1)")
+        tab.evaluate("take(1)")
         turned = ours(asset, views, 1, Environment(sky().radiance).rotated(math.pi / 2))
         relit = psnr(picture(layer="lit", light="sky", turn=90, stopsof=-1), shown(turned, 0.5), turned.alpha)
         still = psnr(picture(turn=0), shown(turned, 0.5), turned.alpha)
         behind = picture(behind=True)
-        tab.ask(choose(blend=1.0))
+        tab.evaluate(choose(blend=1.0))
         covered = tab.picture()
-        tab.ask("leave()")
-        free = tab.ask("photograph.hidden")
-        title, choices = tab.ask("document.title"), tab.ask("get('mesh').parentElement.hidden")
+        tab.evaluate("leave()")
+        free = tab.evaluate("photograph.hidden")
+        title, choices = tab.evaluate("document.title"), tab.evaluate("get('mesh').parentElement.hidden")
         assert tab.problems == []
     assert own > DECIBELS, own
     assert relit > DECIBELS, relit
@@ -166,9 +166,9 @@ def test_the_page_shows_what_a_surface_hides_from_itself(tmp_path, waisted, view
     with chromium() as tab:
         tab.open((tmp_path / "viewer.html").as_uri(), size=(WIDE, SIZE)).wait("document.body.dataset.ready")
         for i in range(len(views)):
-            tab.ask(f"take({i})")
+            tab.evaluate(f"take({i})")
             for name, turn, stops, light in (("estimated light", 30, 0, studio()), ("sky", -60, -1, sky())):
-                picture = pixels(tab.ask(choose(light=name, turn=turn, stopsof=stops) + "picture()"))
+                picture = pixels(tab.evaluate(choose(light=name, turn=turn, stopsof=stops) + "picture()"))
                 turned = light.rotated(math.radians(turn))
                 for shadows in (True, False):
                     image = ours(waisted, views, i, turned, shadows=shadows)
@@ -203,7 +203,9 @@ def test_a_half_hidden_everywhere_is_a_stop_less(tmp_path, asset, views, monkeyp
             page = one_page(asset, views, sky())
             (tmp_path / f"{stops}.html").write_text(page)
             tab.open((tmp_path / f"{stops}.html").as_uri(), size=(WIDE, SIZE)).wait("document.body.dataset.ready")
-            pictures.append(pixels(tab.ask("take(0); " + choose(turn=40, stopsof=stops) + "picture()")).astype(int))
+            pictures.append(
+                pixels(tab.evaluate("take(0); " + choose(turn=40, stopsof=stops) + "picture()")).astype(int)
+            )
         assert tab.problems == []
     assert np.abs(pictures[0] - pictures[1]).max() <= 4  # of 255: coefficients have 8 bits
 
@@ -215,8 +217,8 @@ def test_the_page_of_the_example_looks_as_its_image_by_the_renderer(tmp_path):
     light = read_environment(tmp_path / "example" / "environment.exr")
     with chromium() as tab:
         tab.open((tmp_path / "example" / "viewer.html").as_uri(), size=(SIZE, SIZE)).wait("document.body.dataset.ready")
-        (view, *_) = tab.ask("data.views")
-        picture = pixels(tab.ask("take(0); picture()"))
+        (view, *_) = tab.evaluate("data.views")
+        picture = pixels(tab.evaluate("take(0); picture()"))
         assert tab.problems == []
     camera = torch.tensor(view["intrinsics"]) * (SIZE / view["width"])
     image = render_asset(part, Camera(torch.tensor(view["c2w"]), camera, SIZE, SIZE), light, supersampling=2)

@@ -63,11 +63,11 @@ def rendered(glb: Path, light: Environment) -> Seen:
     return of_rgba(clients.ours(glb, light, SHOT, MIRROR))
 
 
-def agree(got: Seen, want: Seen) -> None:
-    union, both = (got.mask | want.mask).sum(), (got.mask & want.mask).sum()
+def agree(got: Seen, expected: Seen) -> None:
+    union, both = (got.mask | expected.mask).sum(), (got.mask & expected.mask).sum()
     assert both / union > 0.99  # the rim of a disc of 170 pixels is 1 % of it
     for channel in LAMPS:
-        off = np.abs(got.highlight(channel) - want.highlight(channel))
+        off = np.abs(got.highlight(channel) - expected.highlight(channel))
         assert off.max() < 2.0, f"highlight of channel {channel}: off by {off} pixels"
 
 

@@ -46,7 +46,7 @@ def tiny():
 
 
 @torch.no_grad()
-def test_weights_asked_for_near_the_surface_give_the_published_mesh(goldens):
+def test_weights_evaluated_near_the_surface_give_the_published_mesh(goldens):
     data = np.load(goldens / "object_representation_mesh16.npz")
     heads = np.load(goldens / "object_representation_heads.npz")
     state = {our_key("object_representation." + k[6:]): torch.from_numpy(heads[k]) for k in heads if k[:6] == "param."}
@@ -77,7 +77,7 @@ def test_weights_near_the_surface_are_those_of_the_whole_grid(tiny, half_space):
     corner = raw["flexicubes"][0].view(13, 13, 13, 16)
     eight = [corner[i : i + n, j : j + n, k : k + n] for k in (0, 1) for j in (0, 1) for i in (0, 1)]
     dense = tiny.merger(torch.stack(eight, -2).view(n**3, 8, 16))
-    want = extract_surface(
+    expected = extract_surface(
         sdf,
         radius=0.87,
         deformation=deformation(raw["deformation"][0], n).view(13, 13, 13, 3),
@@ -88,9 +88,9 @@ def test_weights_near_the_surface_are_those_of_the_whole_grid(tiny, half_space):
     weights = field.TriplaneField(None, tiny, code).cube_weights(flat, sdf)
     assert len(weights["alpha"]) == len(surface_cubes(sdf))
     got = extract_surface(sdf, radius=0.87, **weights)
-    assert torch.equal(got.faces, want.faces)
+    assert torch.equal(got.faces, expected.faces)
     # products of other shapes sum in another order: a few units in the last place of 0.87
-    torch.testing.assert_close(got.vertices, want.vertices, rtol=0, atol=2e-6)
+    torch.testing.assert_close(got.vertices, expected.vertices, rtol=0, atol=2e-6)
 
 
 @torch.no_grad()
@@ -99,19 +99,19 @@ def test_grid_sdf_equals_free_sdf_at_the_grid_points(tiny):
     code, maps = tiny.encode(*views(1, 2, 76)), SimpleNamespace(c2w=torch.zeros(2, 4, 4))
     axis = torch.linspace(-0.8, 0.6, 61)  # points of more than one tile of the kernel
     own = field.TriplaneField(maps, tiny, code)
-    want = own.free_sdf(torch.cartesian_prod(axis, axis, axis)).view(61, 61, 61)
-    assert float(want.min()) < 0 < float(want.max())
+    expected = own.free_sdf(torch.cartesian_prod(axis, axis, axis)).view(61, 61, 61)
+    assert float(expected.min()) < 0 < float(expected.max())
     # sums of 24 float32 products in another order, behind exp
-    torch.testing.assert_close(own.grid_sdf(axis), want, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(own.grid_sdf(axis), expected, rtol=1e-4, atol=1e-4)
 
 
 @torch.no_grad()
 def test_the_release_s_preparation_is_a_switch_of_the_preset(tiny):
     prepared = prepare(tiny, EXAMPLE, Similarity.identity())
-    want = published_views(EXAMPLE, 76)
-    assert torch.equal(prepared.batch.images, want.images) and torch.equal(prepared.batch.masks, want.masks)
+    expected = published_views(EXAMPLE, 76)
+    assert torch.equal(prepared.batch.images, expected.images) and torch.equal(prepared.batch.masks, expected.masks)
     assert torch.equal(prepared.batch.c2w, EXAMPLE.c2w)
-    torch.testing.assert_close(prepared.batch.intrinsics, want.intrinsics)
+    torch.testing.assert_close(prepared.batch.intrinsics, expected.intrinsics)
     own = prepare(Reconstructor(NANO), EXAMPLE, Similarity.identity()).batch
     cropped = EXAMPLE.resampled(NANO.image_size, crop=True)
     assert torch.equal(own.images, cropped.images) and torch.equal(own.intrinsics, cropped.intrinsics)
@@ -147,7 +147,7 @@ def test_reference_view_and_background_reach_the_network(tiny, monkeypatch):
 @pytest.fixture(scope="module")
 def asset(tiny):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pipeline.ViewMaps, "visibility", None)  # nothing asks which view sees a point
+        patch.setattr(pipeline.ViewMaps, "visibility", None)  # visibility is not evaluated
         patch.setattr(pipeline, "RayScene", None)
         return reconstruct(EXAMPLE, weights=tiny, options=ReconstructOptions(256, 16))
 

@@ -100,11 +100,11 @@ def test_a_mirror_image_shows_a_point_only_where_no_photograph_does():
     cosine = (away * normal[:, None]).sum(-1) / away.norm(dim=-1)  # from outside a ball hides what faces away
     visible = (cosine > 0.0).float()
     own, other = visible.split(2, 1)
-    want = torch.cat([own, other * (1.0 - own.amax(1, keepdim=True))], 1)
+    expected = torch.cat([own, other * (1.0 - own.amax(1, keepdim=True))], 1)
     sure = ((cosine - MIN_COSINE).abs() > 0.06).all(1)
     got = maps.visibility(RayScene(mesh.vertices, mesh.faces), mesh.vertices, normal)
-    assert torch.equal(got[sure], want[sure])
-    assert bool(want[sure, 2:].any()) and bool((visible[sure] != want[sure]).any())
+    assert torch.equal(got[sure], expected[sure])
+    assert bool(expected[sure, 2:].any()) and bool((visible[sure] != expected[sure]).any())
     assert torch.equal(maps.inputs.visibility(RayScene(mesh.vertices, mesh.faces), mesh.vertices, normal), got[:, :2])
 
 
@@ -129,9 +129,9 @@ def test_rays_only_where_the_corners_of_a_face_differ():
     outward = middle / middle.norm(dim=1, keepdim=True)
     same = (at_vertices == at_vertices[:, :1]).all(1).all(1)
     assert 0.5 < float(same.float().mean()) < 0.95
-    got, want = maps.visibility_within(scene, middle, outward, corners), maps.visibility(scene, middle, outward)
-    assert torch.equal(got[~same], want[~same]) and torch.equal(got[same], at_vertices[same, 0])
-    assert torch.equal(got, want), "a ball has no shadow inside a face"
+    got, expected = maps.visibility_within(scene, middle, outward, corners), maps.visibility(scene, middle, outward)
+    assert torch.equal(got[~same], expected[~same]) and torch.equal(got[same], at_vertices[same, 0])
+    assert torch.equal(got, expected), "a ball has no shadow inside a face"
     none = RayScene(mesh.vertices + 9.0, mesh.faces)  # would hide nothing
     assert torch.equal(maps.visibility_within(none, middle[same], outward[same], corners[same]), got[same])
     same_corners = (at_vertices == at_vertices[:, :1]).all(1)  # of a view

@@ -88,8 +88,10 @@ def test_the_snippets_of_the_library_page_are_short_and_find_what_they_look_for(
     slope = (2.0 * (rays["depth"].detach() - 2.5) / len(rays["depth"])).double()
     along = rays["directions"][hits.valid].double()
     normal = torch.nn.functional.normalize(face_normals(rays["mesh"], hits), dim=-1)
-    want = (slope * (normal @ forward.double()) / (normal * along).sum(-1)).sum()
-    assert float((gradient.double() @ forward.double()).sum()) == pytest.approx(float(want), rel=1e-3)  # float32 sum
+    expected = (slope * (normal @ forward.double()) / (normal * along).sum(-1)).sum()
+    assert float((gradient.double() @ forward.double()).sum()) == pytest.approx(
+        float(expected), rel=1e-3
+    )  # float32 sum
     truth = [albedo_by_quadrature(0.25 + step) for step in (0.0, -1e-3, 1e-3)]
     assert normals["albedo"].tolist() == pytest.approx([truth[0]] * 3, abs=0.01)  # 4096 samples of a nearly even weight
     assert float(pairs["derivative"]) == pytest.approx((truth[2] - truth[1]) / 2e-3, abs=0.05)

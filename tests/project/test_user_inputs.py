@@ -61,9 +61,9 @@ def test_a_grid_from_numpy_gives_the_same_surface():
 
 
 def test_look_at_takes_lists_and_has_defaults(device):
-    want = look_at(*(torch.tensor(v, device=device) for v in ([1.0, 2.0, 3.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0])))
-    assert torch.equal(want.cpu(), look_at([1, 2, 3]))
-    assert torch.equal(want, look_at(torch.tensor([1.0, 2.0, 3.0], device=device), (0, 0, 0), [0, 1, 0]))
+    expected = look_at(*(torch.tensor(v, device=device) for v in ([1.0, 2.0, 3.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0])))
+    assert torch.equal(expected.cpu(), look_at([1, 2, 3]))
+    assert torch.equal(expected, look_at(torch.tensor([1.0, 2.0, 3.0], device=device), (0, 0, 0), [0, 1, 0]))
     with pytest.raises(ValueError, match="up: expected"):
         look_at([0, 1, 0])
 
@@ -127,12 +127,12 @@ def test_an_image_is_written_as_it_is_displayed(tmp_path, device):
 def test_points_take_numbers_of_any_kind_and_numpy_arrays():
     position = np.random.default_rng(0).random((5, 3), dtype=np.float32)
     normal = np.array([0.0, 0.0, 1.0], np.float32)
-    want = SurfacePoints(*map(torch.from_numpy, (position, normal, normal)), torch.full((5, 3), 0.5), 0.25, 0.0)
+    expected = SurfacePoints(*map(torch.from_numpy, (position, normal, normal)), torch.full((5, 3), 0.5), 0.25, 0.0)
     for gray in (0.5, np.float32(0.5), torch.tensor(0.5), torch.tensor([0.5]), np.array([[0.5]], np.float32)):
         got = SurfacePoints(position, normal, normal, gray, np.float32(0.25), torch.tensor([0.0]))
-        assert all(torch.equal(getattr(got, f), getattr(want, f)) for f in vars(want))
+        assert all(torch.equal(getattr(got, f), getattr(expected, f)) for f in vars(expected))
     light = Environment(torch.ones(4, 8, 3))
-    assert torch.equal(shade(want, normal, light), shade(want, torch.from_numpy(normal), light))
+    assert torch.equal(shade(expected, normal, light), shade(expected, torch.from_numpy(normal), light))
     mesh = ball(torch.device("cpu")).mesh
     hits = RayScene(mesh.vertices, mesh.faces).closest(position + np.float32(3.0), -position - np.float32(3.0))
     assert bool((hits.face >= 0).all())

@@ -33,6 +33,6 @@ def test_gradients_equal_finite_differences(f):
     assert torch.autograd.gradcheck(f, torch.cat([above, toe]).requires_grad_(), eps=1e-6, atol=1e-5, rtol=1e-3)
 
 
-def test_agx_wants_three_channels():
+def test_agx_requires_three_channels():
     with pytest.raises(ValueError, match="radiance: expected shape"):
         agx(torch.rand(4, 2))

@@ -154,8 +154,8 @@ def test_partly_metallic_white_loses_no_more_than_its_parts(device):
         return float((value[:, 0].double().cpu() * share).sum() * torch.pi)
 
     got = [sent(m) for m in METALLIC]
-    for m, value, want in zip(METALLIC, got, BLENDED):
-        assert abs(value - want) < 1e-3  # the table's digits
+    for m, value, expected in zip(METALLIC, got, BLENDED):
+        assert abs(value - expected) < 1e-3  # the table's digits
         assert abs(value - ((1.0 - m) * got[0] + m * got[-1])) < 1e-5  # float32 values
     assert abs(got[-1] - directional_albedo(0.09, 0.8)) < 1e-4  # another quadrature: of normals, not of directions
 
@@ -172,9 +172,9 @@ def test_a_white_surface_in_the_furnace_of_the_shader(device):
             points, wo = at(normal, normal, normal, wo, torch.ones_like(wo), one * roughness, one * 0.0)
             lit = shade(points, wo, light)[:, 0].double()
             u = halton(1 << 16, device=device)
-            want = albedo(view(cos_o, device), one[0] * roughness**2, one[:3], one[0] * 0, u)[0]
+            expected = albedo(view(cos_o, device), one[0] * roughness**2, one[:3], one[0] * 0, u)[0]
             got, noise = lit.mean(), lit.std() / n**0.5
-            assert abs(got - want) < 4 * noise + 2e-4 and got < 1.0 + 1e-3  # 2e-4: of the points in the quadrature
+            assert abs(got - expected) < 4 * noise + 2e-4 and got < 1.0 + 1e-3  # 2e-4: of the points in the quadrature
             assert (
                 cos_o > 0.1
                 or shade(points, wo, light, options=ShadeOptions(diffuse_model="published"))[:, 0].mean() > got + 0.02

@@ -43,8 +43,8 @@ def test_axes_are_those_of_the_convention(device):
     marks[0, :, 2] = 1.0  # first row: +Y
     env = Environment(marks)
     axes = torch.tensor([[1.0, 0, 0], [0, 0, 1], [-1, 0, 0], [0, 0, -1], [0, 1, 0], [0, -1, 0]], device=device)
-    want = torch.tensor([[1.0, 0, 0], [0, 1, 0], [0, 0, 0], [0, 0, 0], [1, 0, 1], [1, 0, 0]], device=device)
-    torch.testing.assert_close(env.lookup(axes), want, atol=1e-5, rtol=0)  # at a pole u is 0.5
+    expected = torch.tensor([[1.0, 0, 0], [0, 1, 0], [0, 0, 0], [0, 0, 0], [1, 0, 1], [1, 0, 0]], device=device)
+    torch.testing.assert_close(env.lookup(axes), expected, atol=1e-5, rtol=0)  # at a pole u is 0.5
 
 
 def test_texels_are_found_from_their_directions_and_looked_up_there(device):
@@ -59,11 +59,11 @@ def test_texels_are_found_from_their_directions_and_looked_up_there(device):
 
 def test_directions_of_the_published_parametrization(goldens):
     data = np.load(goldens / "env_parametrisation.npz")
-    uv, want = data["uv"].reshape(-1, 2), torch.from_numpy(data["uv_direction"].reshape(-1, 3))
+    uv, expected = data["uv"].reshape(-1, 2), torch.from_numpy(data["uv_direction"].reshape(-1, 3))
     ramp = torch.zeros(64, 128, 3)
     ramp[..., 0] = (torch.arange(128) + 0.5) / 128
     ramp[..., 1] = ((torch.arange(64) + 0.5) / 64)[:, None]
-    got = Environment(from_published(ramp)).lookup(want)[:, :2].numpy()
+    got = Environment(from_published(ramp)).lookup(expected)[:, :2].numpy()
     inside = (uv[:, 0] > 0.01) & (uv[:, 0] < 0.99) & (uv[:, 1] > 0.01) & (uv[:, 1] < 0.99)
     assert np.abs(got - uv)[inside].max() < 1e-5
 
@@ -75,11 +75,13 @@ def test_lookup_and_its_gradient_equal_the_float64_reference(device):
     ins = [radiance.to(device).requires_grad_(), d.to(device).requires_grad_()]
     got = Environment(ins[0]).lookup(ins[1])
     twin = [radiance.double().requires_grad_(), d.double().requires_grad_()]
-    want = reference.lookup_envmap(*twin)
-    torch.testing.assert_close(got.cpu().double(), want, rtol=0, atol=2e-5)  # 1e-7 of u times 18 texels, with margin
-    assert reference.share_within(got, want) >= 0.999
+    expected = reference.lookup_envmap(*twin)
+    torch.testing.assert_close(
+        got.cpu().double(), expected, rtol=0, atol=2e-5
+    )  # 1e-7 of u times 18 texels, with margin
+    assert reference.share_within(got, expected) >= 0.999
     grads = torch.autograd.grad((got * weight.to(device)).sum(), ins)
-    truth = torch.autograd.grad((want * weight.double()).sum(), twin)
+    truth = torch.autograd.grad((expected * weight.double()).sum(), twin)
     assert reference.share_within(grads[0], truth[0]) >= 0.999
     # a direction may sit on a kink between texels
     assert reference.rows_within(*(reference.across(v, d) for v in (grads[1], truth[1]))) >= 0.999

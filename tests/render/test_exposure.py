@@ -132,6 +132,6 @@ def test_the_estimated_asset_shows_the_photographs_color(device, scene):
     found = photograph_ratio(after, images, inside, camera, rays).cpu()
     # same seed and samples, so only the tint that the light may not take, and BLACK, are left
     torch.testing.assert_close(found, torch.ones(3), rtol=0.1, atol=0)
-    want = factor(asset, images, inside, camera) * torch.tensor([0.03, 0.1, 0.15])
+    expected = factor(asset, images, inside, camera) * torch.tensor([0.03, 0.1, 0.15])
     got = after.textures.base_color[0, 0].cpu()
-    torch.testing.assert_close(got, want, rtol=1e-3, atol=0)
+    torch.testing.assert_close(got, expected, rtol=1e-3, atol=0)

@@ -36,20 +36,20 @@ def light_at(d, axis, sharpness, amplitude):
     return torch.exp(sharpness * (d @ axis.T - 1.0)) @ amplitude
 
 
-def ask(tensors):
+def leaves(tensors):
     return [t.clone().requires_grad_() for t in tensors]
 
 
 def test_value_and_gradients_match_the_definition(device):
-    own, rng = ask(lobes(device)), torch.Generator().manual_seed(1)
+    own, rng = leaves(lobes(device)), torch.Generator().manual_seed(1)
     d = normalize(torch.randn(300, 3, generator=rng), dim=-1).to(device).requires_grad_()
-    twin, at = ask([t.detach().double() for t in own]), d.detach().double().requires_grad_()
+    twin, at = leaves([t.detach().double() for t in own]), d.detach().double().requires_grad_()
     weight = torch.rand(300, 3, generator=rng).to(device)
     got = SphericalGaussians(*own).lookup(d)
-    want = light_at(at, *twin)
-    torch.testing.assert_close(got.double(), want, rtol=2e-5, atol=1e-6)  # sharpness 150 times float32 noise
+    expected = light_at(at, *twin)
+    torch.testing.assert_close(got.double(), expected, rtol=2e-5, atol=1e-6)  # sharpness 150 times float32 noise
     grads = torch.autograd.grad((got * weight).sum(), [*own, d])
-    truth = torch.autograd.grad((want * weight.double()).sum(), [*twin, at])
+    truth = torch.autograd.grad((expected * weight.double()).sum(), [*twin, at])
     # the squared chord and the cosine differ in derivative by multiples of the unit vectors: compare across them
     for k, v in ((0, own[0]), (3, d)):
         assert reference.rows_within(*(reference.across(g[k], v) for g in (grads, truth))) >= 0.999, k
@@ -60,16 +60,16 @@ def test_value_and_gradients_match_the_definition(device):
 def test_irradiance_and_gradients_match_quadrature(device):
     """Every sharpness from nearly constant to 150 and normals all around, behind the lobe too."""
     d, solid = sphere()
-    own, rng = ask(lobes(device, 24)), torch.Generator().manual_seed(2)
+    own, rng = leaves(lobes(device, 24)), torch.Generator().manual_seed(2)
     normals = normalize(torch.randn(48, 3, generator=rng), dim=-1).to(device).requires_grad_()
-    twin, at = ask([t.detach().cpu().double() for t in own]), normals.detach().cpu().double().requires_grad_()
-    want = ((at @ d.T).clamp(min=0.0) * solid) @ light_at(d, *twin)
+    twin, at = leaves([t.detach().cpu().double() for t in own]), normals.detach().cpu().double().requires_grad_()
+    expected = ((at @ d.T).clamp(min=0.0) * solid) @ light_at(d, *twin)
     got = SphericalGaussians(*own).irradiance(normals)
     # the fit errs by 0.2 % of a lobe's maximum each, here with random signs over 24 lobes
-    assert float((got.detach().cpu().double() - want.detach()).abs().max()) < 3e-3 * float(want.detach().max())
+    assert float((got.detach().cpu().double() - expected.detach()).abs().max()) < 3e-3 * float(expected.detach().max())
     weight = torch.rand(48, 3, generator=rng)
     grads = torch.autograd.grad((got * weight.to(device)).sum(), [*own, normals])
-    truth = torch.autograd.grad((want * weight.double()).sum(), [*twin, at])
+    truth = torch.autograd.grad((expected * weight.double()).sum(), [*twin, at])
     for g, t, v in zip(grads, truth, [*own, normals], strict=True):
         g = g.cpu().double()
         if v.shape[-1] == 3 and v is not own[2]:
@@ -81,14 +81,14 @@ def test_irradiance_and_gradients_match_quadrature(device):
 @pytest.mark.parametrize("sharpness", [0.02, 0.29, 0.49, 0.51, 1.0, 10.0, 300.0])
 def test_irradiance_is_exact_along_the_axis(device, sharpness):
     s = torch.tensor([sharpness], dtype=torch.float64, requires_grad=True)
-    want = (
+    expected = (
         2 * torch.pi * (s - 1 + torch.exp(-s)) / s**2,
         2 * torch.pi * torch.exp(-s) * (1 - torch.exp(-s) * (1 + s)) / s**2,
     )
     axis = torch.tensor([[0.0, 0, 1]], device=device)
     own = s.detach().float().to(device).requires_grad_()
     light = SphericalGaussians(axis, own, torch.ones(1, 3, device=device))
-    for sign, value in zip((1.0, -1.0), want, strict=True):
+    for sign, value in zip((1.0, -1.0), expected, strict=True):
         got = light.irradiance(sign * axis)
         # float32, and at 300 the far side is 1e-131: 0
         torch.testing.assert_close(got.cpu().double(), value.expand(1, 3), rtol=2e-5, atol=1e-6)
@@ -125,7 +125,7 @@ def test_shading_matches_quadrature(device):
         angle = torch.deg2rad(torch.tensor(float(deg), dtype=torch.float64))
         wo = torch.stack([angle.sin(), torch.zeros_like(angle), angle.cos()])
         axis = normalize(wo * torch.tensor([-1.0, 1.0, 1.0]) + torch.tensor([0.05, 0.1, 0.0]), dim=-1)  # by the mirror
-        want = reflected(wo, base, torch.tensor(roughness**2, dtype=torch.float64), metallic, axis, sharpness)
+        expected = reflected(wo, base, torch.tensor(roughness**2, dtype=torch.float64), metallic, axis, sharpness)
         rows = [t.float().to(device)[None] for t in (torch.tensor([0.0, 0, 1]), wo, base)]
         light = SphericalGaussians(
             axis.float().to(device)[None], torch.tensor([sharpness], device=device), torch.ones(1, 3, device=device)
@@ -133,7 +133,7 @@ def test_shading_matches_quadrature(device):
         got = shade_gaussians(*on_ball(*rows, roughness, metallic), light)[0]
         # round lobes and one Fresnel factor: the method's own error as the docstring states it
         limit = 0.065 if roughness < 0.4 else 0.12 if roughness < 0.6 else 0.18
-        error = (got.cpu().double() / want - 1.0).abs().max()
+        error = (got.cpu().double() / expected - 1.0).abs().max()
         assert float(error) < limit, (roughness, deg, sharpness, metallic)
 
 
@@ -159,10 +159,14 @@ def test_gradients_stay_finite_at_the_edges(device):
     axis, sharpness, amplitude = lobes("cpu", 12, 1e-4, 1e6)
     axis[:6] = torch.stack([-normal[4], wo[4], -wo[5], wo[7], 2.0 * normal[0] * (normal[0] @ wo[0]) - wo[0], -wo[0]])
     sharpness[3:5], amplitude[5] = torch.tensor([0.01, 0.5]), 0.0
-    asked = ask(t.to(device) for t in (normal, wo, base, rough, metal, axis, sharpness, amplitude))
-    light = SphericalGaussians(*asked[5:])
-    for out in (shade_gaussians(*on_ball(*asked[:5]), light), light.irradiance(asked[0]), light.lookup(asked[1])):
-        grads = torch.autograd.grad(out.sum(), asked, allow_unused=True)
+    inputs = leaves(t.to(device) for t in (normal, wo, base, rough, metal, axis, sharpness, amplitude))
+    light = SphericalGaussians(*inputs[5:])
+    for out in (
+        shade_gaussians(*on_ball(*inputs[:5]), light),
+        light.irradiance(inputs[0]),
+        light.lookup(inputs[1]),
+    ):
+        grads = torch.autograd.grad(out.sum(), inputs, allow_unused=True)
         assert bool(torch.isfinite(out).all()) and float(out.detach().min()) >= 0.0
         assert all(g is None or bool(torch.isfinite(g).all()) for g in grads)
         assert float(grads[6].abs().max()) > 0.0

@@ -58,10 +58,10 @@ def frame(n):
     )
 
 
-def close(got, want, share, within=2e-3):
-    """Whether ``share`` of the rows of ``got`` lie ``within`` that part of their length of ``want``."""
-    got, want = (v.reshape(len(v), -1).cpu().double() for v in (got, want))
-    off = (got - want).norm(dim=-1) / (want.norm(dim=-1) + 1e-5)
+def close(got, expected, share, within=2e-3):
+    """Whether ``share`` of the rows of ``got`` differ by at most ``within`` of their length from ``expected``."""
+    got, expected = (v.reshape(len(v), -1).cpu().double() for v in (got, expected))
+    off = (got - expected).norm(dim=-1) / (expected.norm(dim=-1) + 1e-5)
     return float((off < within).double().mean()) > share
 
 
@@ -82,9 +82,9 @@ def test_gradients_of_the_material(device, diffuse_model):
     keep = (local[0][:, 2] > 1e-2) & (local[1][:, 2] > 1e-2) & (alpha >= 0.01)
     assert keep.sum() > 10_000
     twin = [v.detach()[keep].cpu().double().requires_grad_() for v in leaves]
-    want = reference.eval_bsdf(*twin, diffuse_model)
-    truth = torch.autograd.grad((want * weight[keep].double()).sum(), twin)
-    assert close(value.detach()[keep], want.detach(), 0.999, 1e-5)
+    expected = reference.eval_bsdf(*twin, diffuse_model)
+    truth = torch.autograd.grad((expected * weight[keep].double()).sum(), twin)
+    assert close(value.detach()[keep], expected.detach(), 0.999, 1e-5)
     for k, (g, t) in enumerate(zip(grads, truth, strict=True)):
         g = g.cpu()[keep].double()
         if k < 2:  # only the tangent part of a direction's gradient is defined
@@ -182,7 +182,7 @@ def test_gradients_of_the_estimator(device, strategy, diffuse_model):
     part = [v.detach().cpu().double()[smooth].requires_grad_() for v in leaves[:4]]
     radiance = texels.double().requires_grad_()
     light = [reference.lookup_envmap(radiance, d[smooth]) for d in draws]
-    want = twin(
+    expected = twin(
         part,
         *(v[smooth] for v in exact),
         [d[smooth] for d in draws],
@@ -190,8 +190,8 @@ def test_gradients_of_the_estimator(device, strategy, diffuse_model):
         light,
         diffuse_model,
     )
-    *truth, g_texels = torch.autograd.grad((want * weight.double()[smooth]).sum(), [*part, radiance])
-    assert reference.share_within(value[smooth], want) >= 0.999
+    *truth, g_texels = torch.autograd.grad((expected * weight.double()[smooth]).sum(), [*part, radiance])
+    assert reference.share_within(value[smooth], expected) >= 0.999
     wide = alpha[smooth] > 0.3
     for k, (g, t) in enumerate(zip(got, truth)):
         g = g.cpu()[smooth].double()

@@ -32,12 +32,12 @@ def test_value_and_gradients_equal_the_float64_reference(device, diffuse_model):
     leaf = [v.to(device).requires_grad_() for v in ins]
     twin = [v.double().requires_grad_() for v in ins]
     wo, wi, *material = leaf
-    got, want = eval_bsdf(wo, *material, wi, diffuse_model=diffuse_model), reference.eval_bsdf(*twin, diffuse_model)
-    off = (got.detach().cpu().double() / want.detach() - 1).abs().amax(-1)
+    got, expected = eval_bsdf(wo, *material, wi, diffuse_model=diffuse_model), reference.eval_bsdf(*twin, diffuse_model)
+    off = (got.detach().cpu().double() / expected.detach() - 1).abs().amax(-1)
     assert float(off.max()) < 2e-5  # rounding of cosines of 0.02; measured 8e-6, from widths of 0.01 to 1
     weight = torch.randn(got.shape, generator=torch.Generator().manual_seed(1))
     grads = torch.autograd.grad((got * weight.to(device)).sum(), leaf)
-    truth = torch.autograd.grad((want * weight.double()).sum(), twin)
+    truth = torch.autograd.grad((expected * weight.double()).sum(), twin)
     for k, (g, t) in enumerate(zip(grads, truth, strict=True)):
         if k < 2:  # the two write cosines differently off the unit sphere: only the tangent part is defined
             g, t = (reference.across(v, twin[k]) for v in (g, t))
@@ -179,11 +179,11 @@ def test_value_equals_mitsubas_materials(device, alpha):
         (gold, 0.0, "published", below * (1 - facet) + coat * to_ours * correlated),
         (gold, 0.0, "conserving", below * (1 - in_and_out[0]) * (1 - in_and_out[1]) + coat * to_ours * correlated),
     ]
-    for base, metallic, name, want in cases:
+    for base, metallic, name, expected in cases:
         values = (wo, wi, torch.tensor(base), torch.tensor(alpha), torch.tensor(metallic))
         got = eval_bsdf(*(v.to(device) for v in values), diffuse_model=name).cpu().double()
         # Mitsuba's own float32, too: measured 6e-6 at width 0.01, 2e-6 at width 1
-        assert float((got / want - 1).abs().max()) < 1e-5, (base, metallic, name)
+        assert float((got / expected - 1).abs().max()) < 1e-5, (base, metallic, name)
 
 
 def test_frames_are_rotations_to_the_normal(device):

@@ -18,12 +18,12 @@ def test_one_row_and_plain_numbers_hold_for_all_points(device):
     color = torch.tensor([0.8, 0.5, 0.2], device=device)
     one = torch.full((300,), 0.3, device=device)
     full = [v.requires_grad_() for v in (color.expand(300, 3).contiguous(), one, one.clone())]
-    want = shade(SurfacePoints(normal, normal, normal, *full), wo, light)
-    assert torch.equal(want, shade(SurfacePoints(normal, normal, normal, color, 0.3, one[:1]), wo, light))
+    expected = shade(SurfacePoints(normal, normal, normal, *full), wo, light)
+    assert torch.equal(expected, shade(SurfacePoints(normal, normal, normal, color, 0.3, one[:1]), wo, light))
     few = [v.clone().requires_grad_() for v in (color[None], one.detach()[0], one.detach()[:1])]
     got = shade(SurfacePoints(normal, normal, normal, *few), wo, light)
-    assert torch.equal(got, want)
-    many, sums = torch.autograd.grad(want.sum(), full), torch.autograd.grad(got.sum(), few)
+    assert torch.equal(got, expected)
+    many, sums = torch.autograd.grad(expected.sum(), full), torch.autograd.grad(got.sum(), few)
     for a, b in zip(many, sums):
         torch.testing.assert_close(a.sum(0), b.reshape(a.shape[1:]), rtol=1e-5, atol=1e-5)  # 300 float32 numbers
     flat = shade(SurfacePoints(normal, normal[0], normal[:1], 0.5, 0.3, 0), wo[0], light)
@@ -61,19 +61,21 @@ def test_what_is_not_finite_gives_nan_and_its_neighbors_stay(device, name, value
     if name not in ("position", "ng"):  # which play no part in it
         calls += [lambda p, wo: shade_gaussians(p, wo, lobe)]
     for call in calls:
-        want, got = (
+        expected, got = (
             call(SurfacePoints(**{k: v for k, v in rows.items() if k != "wo"}), rows["wo"]) for rows in (values, broken)
         )
-        assert bool(want.isfinite().all()) and bool(got[7].isnan().all())
+        assert bool(expected.isfinite().all()) and bool(got[7].isnan().all())
         rest = torch.arange(40, device=device) != 7
-        assert torch.equal(got[rest], want[rest])
+        assert torch.equal(got[rest], expected[rest])
 
 
 def test_directions_and_ranges_are_checked_on_request(device):
     normal, wo = (v.to(device) for v in points(30))
-    light, asked = Environment(sky().radiance.to(device)), ShadeOptions(check_inputs=True)
+    light, requested = Environment(sky().radiance.to(device)), ShadeOptions(check_inputs=True)
     good = dict(position=normal, ng=normal, normal=normal, base_color=normal.abs(), roughness=0.5, metallic=1.0)
-    assert torch.equal(shade(SurfacePoints(**good), wo, light, options=asked), shade(SurfacePoints(**good), wo, light))
+    assert torch.equal(
+        shade(SurfacePoints(**good), wo, light, options=requested), shade(SurfacePoints(**good), wo, light)
+    )
     for name, value in (
         ("normal", 1.01 * normal),
         ("ng", 0.0 * normal),
@@ -84,12 +86,12 @@ def test_directions_and_ranges_are_checked_on_request(device):
     ):
         wrong = SurfacePoints(**{**good, name: value})
         with pytest.raises(ValueError, match=f"^{name}: expected .* in row 0$"):
-            shade(wrong, wo, light, options=asked)
+            shade(wrong, wo, light, options=requested)
         shade(wrong, wo, light)  # else it goes into the formulas as it is
     with pytest.raises(ValueError, match="^wo: expected unit vectors, got .* in row 3$"):
         shade(
             SurfacePoints(**good),
             torch.where(torch.arange(30, device=device)[:, None] == 3, 2.0, 1.0) * wo,
             light,
-            options=asked,
+            options=requested,
         )

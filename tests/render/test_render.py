@@ -57,15 +57,15 @@ def test_texture_lookup_is_bilinear_and_repeats(device):
     torch.testing.assert_close(sample_texture(t, grid + torch.tensor([3.0, -2.0], device=device)), t, rtol=0, atol=1e-5)
     uv = torch.rand(5000, 2, generator=torch.Generator().manual_seed(1)).to(device).requires_grad_()
     padded = torch.nn.functional.pad(t.double().permute(2, 0, 1)[None], (1, 1, 1, 1), mode="circular")
-    want = torch.nn.functional.grid_sample(
+    expected = torch.nn.functional.grid_sample(
         padded, ((uv.double() * 8 + 1) / 10 * 2 - 1)[None, None], align_corners=False
     )
     got = sample_texture(t, uv)
-    torch.testing.assert_close(got.double(), want[0, :, 0].T, rtol=0, atol=1e-5)
+    torch.testing.assert_close(got.double(), expected[0, :, 0].T, rtol=0, atol=1e-5)
     weight = torch.randn(5000, 3, generator=torch.Generator().manual_seed(2)).to(device)
     for a, b in zip(
         torch.autograd.grad((got * weight).sum(), (t, uv)),
-        torch.autograd.grad((want[0, :, 0].T * weight.double()).sum(), (t, uv)),
+        torch.autograd.grad((expected[0, :, 0].T * weight.double()).sum(), (t, uv)),
         strict=True,
     ):
         assert reference.share_within(a, b) >= 0.999
@@ -85,9 +85,12 @@ def test_normal_map_points_right_and_up_as_gltf_says(device, explicit):
         )
     face, bary = torch.tensor([0, 1], dtype=torch.int32, device=device), torch.full((2, 2), 0.3, device=device)
     s = math.sqrt(0.5)
-    for color, want in (((0.5 + s / 2, 0.5, 0.5 + s / 2), (s, 0.0, s)), ((0.5, 0.5 + s / 2, 0.5 + s / 2), (0.0, s, s))):
+    for color, expected in (
+        ((0.5 + s / 2, 0.5, 0.5 + s / 2), (s, 0.0, s)),
+        ((0.5, 0.5 + s / 2, 0.5 + s / 2), (0.0, s, s)),
+    ):
         points = surface_points(mesh, textures(4, device, normal=color), face, bary)
-        torch.testing.assert_close(points.normal.cpu(), torch.tensor([want, want]), rtol=0, atol=1e-5)
+        torch.testing.assert_close(points.normal.cpu(), torch.tensor([expected, expected]), rtol=0, atol=1e-5)
 
 
 def test_picture_on_a_square_is_upright_and_resolved(device):

@@ -109,12 +109,12 @@ def test_pairs_of_the_shader_are_those_of_the_samplers(device, points, pairs):
     pair = ("visible", u), ("mirrored", u)
     if pairs == "opposite":
         pair = ("visible", u), ("visible", antithetic(u))
-    want = torch.zeros(n, 3, device=device)
+    expected = torch.zeros(n, 3, device=device)
     for lobe, numbers in pair:
         wi = sample_bsdf(wo, rough**2, numbers, lobe=lobe)
         lobes = pdf_lobes(wo, rough**2, wi)
         density = sum(lobes[:, int(name == "mirrored"), None] for name, _ in pair)
-        want += torch.where(wi[:, 2:] > 1e-6, eval_bsdf(wo, base, rough**2, metal, wi) * wi[:, 2:] / density, 0.0)
+        expected += torch.where(wi[:, 2:] > 1e-6, eval_bsdf(wo, base, rough**2, metal, wi) * wi[:, 2:] / density, 0.0)
     env = Environment(torch.full((4, 8, 3), 0.7, device=device))
     got = shade(
         *at(up, up, up, wo, base, rough, metal),
@@ -122,7 +122,7 @@ def test_pairs_of_the_shader_are_those_of_the_samplers(device, points, pairs):
         options=ShadeOptions(samples=(0, 2, 0), seed=seed, sequence=points, antithetic=pairs),
     )
     # sharp lobes have few digits of the half vector
-    assert reference.share_within(got.cpu(), 0.7 * want.cpu()) > 0.999
+    assert reference.share_within(got.cpu(), 0.7 * expected.cpu()) > 0.999
 
 
 @pytest.mark.parametrize("pairs", ["opposite", "mirrored"])
@@ -217,12 +217,12 @@ def test_visible_normals_equal_their_float64_reference(device):
     ins = [wo.to(device).requires_grad_(), alpha.to(device).requires_grad_()]
     got = sample_ggx_vndf(*ins, u.to(device))
     twin = [wo.double().requires_grad_(), alpha.double().requires_grad_()]
-    want = reference.sample_ggx_vndf(*twin, u.double())
+    expected = reference.sample_ggx_vndf(*twin, u.double())
     # float32: 1e-7 grows by 1 / alpha where the lobe is stretched
-    torch.testing.assert_close(got.cpu().double(), want, rtol=0, atol=2e-5)
+    torch.testing.assert_close(got.cpu().double(), expected, rtol=0, atol=2e-5)
     weight = torch.randn(n, 3, generator=g)
     grads = torch.autograd.grad((got * weight.to(device)).sum(), ins)
-    truth = torch.autograd.grad((want * weight.double()).sum(), twin)
+    truth = torch.autograd.grad((expected * weight.double()).sum(), twin)
     assert all(reference.share_within(a, b) >= 0.999 for a, b in zip(grads, truth, strict=True))
 
 
@@ -232,8 +232,8 @@ def test_density_equals_its_float64_reference(device):
     wo, wm = (torch.nn.functional.normalize(torch.rand(n, 3, generator=g) + 0.02, dim=-1) for _ in range(2))
     alpha = 0.02 + 0.98 * torch.rand(n, generator=g)
     got = pdf_ggx_vndf(wo.to(device), alpha.to(device), wm.to(device)).cpu().double()
-    want = reference.pdf_ggx_vndf(wo.double(), alpha.double(), wm.double())
-    assert ((got / want - 1).abs() < 1e-4).all()  # relative, from 1e-7 in the cosine of wm against alpha^2 = 4e-4
+    expected = reference.pdf_ggx_vndf(wo.double(), alpha.double(), wm.double())
+    assert ((got / expected - 1).abs() < 1e-4).all()  # relative, from 1e-7 in the cosine of wm against alpha^2 = 4e-4
 
 
 def test_random_pairs_are_uniform_independent_and_addressed(device):
@@ -268,8 +268,8 @@ def test_no_two_streams_share_a_state(device):
 
 
 def test_halton_points_are_the_radical_inverses(device):
-    want = [[1 / 2, 1 / 3], [1 / 4, 2 / 3], [3 / 4, 1 / 9], [1 / 8, 4 / 9], [5 / 8, 7 / 9], [3 / 8, 2 / 9]]
-    torch.testing.assert_close(halton(6, device=device).cpu(), torch.tensor(want), rtol=0, atol=1e-7)
+    expected = [[1 / 2, 1 / 3], [1 / 4, 2 / 3], [3 / 4, 1 / 9], [1 / 8, 4 / 9], [5 / 8, 7 / 9], [3 / 8, 2 / 9]]
+    torch.testing.assert_close(halton(6, device=device).cpu(), torch.tensor(expected), rtol=0, atol=1e-7)
 
 
 def test_bad_input_is_named(device):

@@ -330,9 +330,11 @@ def test_mean_gradient_is_that_of_the_integral(device, counts, options):
             )
             slopes.append(torch.autograd.grad(part.sum() / 100, light)[0].cpu().double())
         slopes = torch.einsum("bhwc,phwc->bp", torch.stack(slopes), probes.double())
-        want = torch.einsum("hwc,phwc->p", truth[4], probes.double())
+        expected = torch.einsum("hwc,phwc->p", truth[4], probes.double())
         error = slopes.std(0) / 60**0.5 + 5e-4 * truth[4].norm()  # second term: the quadrature's
-        assert ((slopes.mean(0) - want) / error).abs().max() < 4.5  # t of 59 degrees: 3e-5 a number, 128 in the family
+        assert (
+            (slopes.mean(0) - expected) / error
+        ).abs().max() < 4.5  # t of 59 degrees: 3e-5 a number, 128 in the family
 
 
 def test_clamped_samples_have_no_gradient(device):

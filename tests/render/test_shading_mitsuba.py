@@ -95,7 +95,7 @@ def test_image_with_shadows_equals_mitsubas(device, material, sky):
 
 @pytest.mark.parametrize("material, sky", [("diffuse", "sun"), ("glossy", "sky")])
 def test_image_with_warps_shadows_equals_mitsubas(device, material, sky):
-    """The fused kernel, which asks for shadows inside; Embree's are asked for between two kernels."""
+    """The fused kernel, which traces shadow rays itself; Embree traces them between two kernels."""
     compare_image(material, sky, Stage(48, device=device, backend="warp"))
 
 
@@ -112,12 +112,12 @@ FLOOR = 1e-4  # of the variance of a sample, as there
 ACCEPT, LEVEL = 0.9975, 0.01
 
 
-def rejected(got, want, variance, samples):
+def rejected(got, expected, variance, samples):
     """Pixels and channels that a z-test at ``LEVEL`` over all of them (Sidak) tells from the reference.
 
     ``variance``: of one sample of the reference; ``samples``: how many ``got`` is the mean of.
     """
-    z = np.abs(got - want) * np.sqrt(samples / np.maximum(variance, FLOOR))
+    z = np.abs(got - expected) * np.sqrt(samples / np.maximum(variance, FLOOR))
     return erfc(z / 2**0.5) < 1.0 - (1.0 - LEVEL) ** (1.0 / z.size)  # erfc(z / sqrt 2) = 2 (1 - Phi(z))
 
 
@@ -128,10 +128,10 @@ def compare_image(material, sky, stage):
     world = stage.world(mi, environment, mitsuba_material.material(mi, BASE, alpha, metallic))
     count = runs_for(len(stage.position))
     draws, passes = 64, count * (16 if sky == "sun" else 4)  # its own noise counts where few samples find the sun
-    want, variance = mitsuba_scene.radiance(mi, world, stage.origins, stage.directions, draws, passes)
+    expected, variance = mitsuba_scene.radiance(mi, world, stage.origins, stage.directions, draws, passes)
     base, rough = torch.tensor(BASE), torch.tensor(alpha**0.5)
     runs = torch.stack([stage.shade(base, rough, metallic, environment, k) for k in range(count)]).double().numpy()
-    compare(runs, want, 2.0 * variance, 2 * draws * passes)
+    compare(runs, expected, 2.0 * variance, 2 * draws * passes)
 
 
 def runs_for(rays):
@@ -139,7 +139,7 @@ def runs_for(rays):
     return -(-BUDGET // (rays * sum(Samples())))
 
 
-def compare(runs, want, variance, theirs):
+def compare(runs, expected, variance, theirs):
     """The z-test of pixels ``(P, 3)``; one of all of them with the noise of both sides; and one of their mean.  In the
     last two an error of 2 % must show: of every pixel, and up and down in turn, so that the mean stays.
 
@@ -147,17 +147,17 @@ def compare(runs, want, variance, theirs):
     of Mitsuba's path draws two, one by the light and one by the material.
     """
     got = runs.mean(0)
-    assert 1.0 - rejected(got, want, variance, len(runs) * sum(Samples())).mean() >= ACCEPT
+    assert 1.0 - rejected(got, expected, variance, len(runs) * sum(Samples())).mean() >= ACCEPT
     own = runs.mean((1, 2)).var(ddof=1) / len(runs)
     sigma = np.sqrt(own + variance.sum() / theirs / got.size**2)
     stripes = 1.0 + 0.02 * np.where(np.arange(len(got)) % 2, 1.0, -1.0)[:, None]
     error = np.sqrt(runs.var(0, ddof=1) / len(runs) + variance / theirs)
-    square = lambda v: (((v - want) / error) ** 2).mean() * (len(runs) - 3) / (len(runs) - 1)  # noqa: E731
+    square = lambda v: (((v - expected) / error) ** 2).mean() * (len(runs) - 3) / (len(runs) - 1)  # noqa: E731
     # the square of Student's t with K - 1 degrees is (K - 1) / (K - 3) in the mean; measured 0.93 to 1.04, stripes 1.24
     assert square(got) < 1.15 < square(got * stripes)
-    assert abs(got.mean() - want.mean()) < 3.0 * sigma
-    assert sigma < 0.005 * want.mean()  # so that the mean tells 1.5 % from none; measured 0.03 to 0.25 %
-    assert min(abs(k * got.mean() - want.mean()) for k in (0.98, 1.02)) > 3.0 * sigma
+    assert abs(got.mean() - expected.mean()) < 3.0 * sigma
+    assert sigma < 0.005 * expected.mean()  # so that the mean tells 1.5 % from none; measured 0.03 to 0.25 %
+    assert min(abs(k * got.mean() - expected.mean()) for k in (0.98, 1.02)) > 3.0 * sigma
 
 
 def mapped_ball_in_ring():
@@ -198,7 +198,7 @@ def test_render_equals_mitsubas_sensor_textures_and_light(device):
     bent = pixels(hit & (cos < 0.05)).any((2, 3))  # Mitsuba bends no normals
     kept = pixels(hit).any((2, 3)) & ~bent
     assert kept.sum() > 600
-    want, variance = (pixels(v)[kept].mean(1) for v in values)
+    expected, variance = (pixels(v)[kept].mean(1) for v in values)
     variance = 2.0 * variance / fine**2  # as in compare_image; a pixel is the mean of its subpixels
 
     sky = Environment(environment.radiance.to(device))
@@ -215,13 +215,15 @@ def test_render_equals_mitsubas_sensor_textures_and_light(device):
         )
         return np.stack([v.cpu().double().numpy()[kept] for v in images])
 
-    compare(runs(asset, camera), want, variance, 2 * draws * passes)
+    compare(runs(asset, camera), expected, variance, 2 * draws * passes)
     samples = count * sum(Samples())
     aside = replace(camera, intrinsics=camera.intrinsics + torch.tensor([0.0, 0.0, 0.05, 0.0], device=device))
     raw = replace(asset, textures=replace(asset.textures, base_color=srgb_to_linear(asset.textures.base_color)))
     turned = replace(asset, textures=asset.textures._changed(lambda v: v.flip(0)))
     for wrong in ((asset, aside), (raw, camera), (turned, camera)):  # what the z-test is there to see
-        assert rejected(runs(*wrong).mean(0), want, variance, samples).mean() > 4 * (1.0 - ACCEPT)  # measured 3 to 98 %
+        assert rejected(runs(*wrong).mean(0), expected, variance, samples).mean() > 4 * (
+            1.0 - ACCEPT
+        )  # measured 3 to 98 %
 
     full = partial(render_asset, asset, camera, sky, options=ShadeOptions(samples=(1, 0, 0)), shadows=False)
     off = full(supersampling=fine).alpha.cpu().numpy() - pixels(hit).mean((2, 3))
@@ -255,7 +257,7 @@ def test_gradients_with_shadows_equal_mitsubas(device, material):
     nodes = mi.TensorXf(params["light.data"])
     integrator = mi.load_dict({"type": "direct", "emitter_samples": 32, "bsdf_samples": 32, "hide_emitters": True})
     ray = mi.RayDifferential3f(mi.Point3f(stage.origins.numpy().T), mi.Vector3f(stage.directions.numpy().T))
-    want = []
+    expected = []
     for k in range(runs):
         dr.enable_grad(nodes)
         params["light.data"] = nodes
@@ -273,7 +275,7 @@ def test_gradients_with_shadows_equal_mitsubas(device, material):
         leaf = environment.radiance.clone().requires_grad_()
         (texels,) = torch.autograd.grad(mitsuba_scene.node_rows(leaf), leaf, folded)
         row = [*np.array(dr.grad(base)).ravel(), float(np.array(dr.grad(width))[0])]
-        want.append(row + [float((texels * p).sum()) for p in probes])
+        expected.append(row + [float((texels * p).sum()) for p in probes])
     got = []
     for k in range(runs):
         paint, rough = torch.tensor(BASE).requires_grad_(), torch.tensor(math.sqrt(alpha)).requires_grad_()
@@ -282,9 +284,9 @@ def test_gradients_with_shadows_equal_mitsubas(device, material):
         grads = torch.autograd.grad((out * weight).sum(), (paint, rough, map_))
         to_alpha = float(grads[1]) / (2.0 * math.sqrt(alpha))
         got.append([*grads[0].tolist(), to_alpha, *((grads[2] * p).sum().item() for p in probes)])
-    got, want = np.array(got), np.array(want)
-    error = np.sqrt((got.var(0, ddof=1) + want.var(0, ddof=1)) / runs) + 2e-4 * np.abs(want.mean(0))
+    got, expected = np.array(got), np.array(expected)
+    error = np.sqrt((got.var(0, ddof=1) + expected.var(0, ddof=1)) / runs) + 2e-4 * np.abs(expected.mean(0))
     # second term: shadow edges of float32 geometry, and the half floats of Mitsuba's map
-    z = (got.mean(0) - want.mean(0)) / error
-    assert np.abs(z).max() < 4.0, (z, got.mean(0), want.mean(0))  # 30 numbers in the family, t with 40 degrees
-    assert (np.abs(want.mean(0)) > 5 * error)[:5].all()  # the noise is far below what is compared
+    z = (got.mean(0) - expected.mean(0)) / error
+    assert np.abs(z).max() < 4.0, (z, got.mean(0), expected.mean(0))  # 30 numbers in the family, t with 40 degrees
+    assert (np.abs(expected.mean(0)) > 5 * error)[:5].all()  # the noise is far below what is compared

@@ -92,11 +92,11 @@ def test_area_and_its_gradient_are_those_of_the_projected_outline(device, name):
     for move in MOVES.values():
         d = move(vertices.detach()).double().numpy()
         h = 1e-4
-        want = (outline(points + h * d, camera)[1] - outline(points - h * d, camera)[1]) / (2 * h)
+        expected = (outline(points + h * d, camera)[1] - outline(points - h * d, camera)[1]) / (2 * h)
         got = float((g.cpu().double().numpy() * d).sum())
         # edges near 45 degrees take turns in rows and columns, which adds or drops part of a pixel of the 90 at each
         limit = 0.01 if name == "fine sphere" else 0.025
-        assert abs(got - want) < limit * float((g * vertices.detach()).sum())
+        assert abs(got - expected) < limit * float((g * vertices.detach()).sum())
 
 
 @pytest.mark.parametrize("name", ["sphere", "cube"])
@@ -115,10 +115,10 @@ def test_mask_loss_gradient_matches_differences_of_sampled_coverage(device, name
         d = MOVES[key](vertices.detach()).double().numpy()
         h = 0.02  # half a pixel: the sampled coverage is smooth over that
         up, down = (((coverage(points + s * h * d, camera) - target) ** 2).sum() for s in (1, -1))
-        got, want = float((g.cpu().double().numpy() * d).sum()), (up - down) / (2 * h)
-        largest = max(largest, abs(want))
+        got, expected = float((g.cpu().double().numpy() * d).sum()), (up - down) / (2 * h)
+        largest = max(largest, abs(expected))
         # an oblique edge changes two pixels of a row, its crossing one, so squares of pixels weigh more: 8 to 14 %
-        assert abs(got - want) < 0.15 * largest, key
+        assert abs(got - expected) < 0.15 * largest, key
 
 
 def picture_of(vertices, faces, camera, colors, background):
@@ -156,11 +156,11 @@ def test_descent_moves_a_sphere_onto_its_target(device, layer):
         optimizer.step()
         losses.append(float(loss.detach()))
     assert losses[-1] < 0.01 * losses[0]
-    wanted, got = (
+    expected, got = (
         outline((vertices * s + o).detach().cpu().double().numpy(), camera)[0]
         for s, o in ((0.8, aim), (log_scale.exp(), offset))
     )
-    assert np.abs(wanted.mean(0) - got.mean(0)).max() < 0.3  # pixels, of 5 at the start
+    assert np.abs(expected.mean(0) - got.mean(0)).max() < 0.3  # pixels, of 5 at the start
 
 
 def test_hidden_outlines_do_not_move_and_colours_blend_between_neighbours(device):
@@ -196,8 +196,11 @@ def test_hidden_outlines_do_not_move_and_colours_blend_between_neighbours(device
             step = torch.zeros_like(vertices)
             step[k, axis] = 0.03
             with torch.no_grad():
-                want = float(((sampled(vertices + step) - sampled(vertices - step)) * weight).sum()) / 0.06
-            assert abs(float(g[k, axis].sum()) - want) < 30.0, (k, axis)  # of 730; a row at the end of an edge is 20
+                expected = float(((sampled(vertices + step) - sampled(vertices - step)) * weight).sum()) / 0.06
+            assert abs(float(g[k, axis].sum()) - expected) < 30.0, (
+                k,
+                axis,
+            )  # of 730; a row at the end of an edge is 20
 
 
 def test_edges_of_split_vertices_and_open_borders(device):

@@ -88,9 +88,9 @@ def test_a_wall_hides_half_of_what_a_floor_sees(device):
     found = blocked_transfer(mesh, directions=20000)[:3].cpu().double()
     d, weight = quadrature(256)
     hidden = weight * d[:, 1].clamp(min=0.0) * (d[:, 2] < 0.0)
-    want = hidden @ spherical_harmonics(d)
-    assert abs(float(want[0]) - math.pi / 2 * math.sqrt(1 / (4 * math.pi))) < 1e-4  # by hand
-    torch.testing.assert_close(found, want.expand(3, -1), rtol=0, atol=6e-3)  # rim of the wall, 20,000 directions
+    expected = hidden @ spherical_harmonics(d)
+    assert abs(float(expected[0]) - math.pi / 2 * math.sqrt(1 / (4 * math.pi))) < 1e-4  # by hand
+    torch.testing.assert_close(found, expected.expand(3, -1), rtol=0, atol=6e-3)  # rim of the wall, 20,000 directions
 
 
 def test_missing_irradiance_is_that_of_a_monte_carlo_estimate(device):
@@ -109,10 +109,12 @@ def test_missing_irradiance_is_that_of_a_monte_carlo_estimate(device):
     cosine = (mesh.normals[chosen] @ d.T).clamp(min=0.0) * (4 * math.pi / rays)
     hidden = scene.occluded((mesh.vertices[chosen] + 2e-3 * mesh.normals[chosen])[:, None], d[None])
     radiance = light.lookup(d)
-    want, whole = (cosine * hidden) @ radiance, cosine @ radiance
-    assert float((want / whole).min()) < 0.1 and float((want / whole).max()) > 0.9
+    expected, whole = (cosine * hidden) @ radiance, cosine @ radiance
+    assert float((expected / whole).min()) < 0.1 and float((expected / whole).max()) > 0.9
     for directions, mean, most in ((64, 0.04, 0.2), (4096, 0.006, 0.03)):
-        error = ((blocked_transfer(mesh, directions=directions)[chosen] @ light_harmonics(light) - want) / whole).abs()
+        error = (
+            (blocked_transfer(mesh, directions=directions)[chosen] @ light_harmonics(light) - expected) / whole
+        ).abs()
         assert error.mean() < mean and error.max() < most, (directions, error.mean(), error.max())
 
 
@@ -123,7 +125,7 @@ def test_the_spiral_sums_as_an_integral_does():
     )
 
 
-def test_what_cannot_be_asked_is_refused():
+def test_invalid_inputs_are_refused():
     box = mesh_of(trimesh.creation.box())
     with pytest.raises(ValueError, match="directions: expected at least 1, got 0"):
         blocked_transfer(box, directions=0)

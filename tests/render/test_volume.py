@@ -59,13 +59,15 @@ def test_samples_are_the_steps_in_occupied_cells(device):
         p = ((o + t[:, None] * d + 0.8) * (size / 1.6)).clamp(0, size - 1e-9)
         clear = ((p - p.round()).abs() > 1e-4).all(1)
         index = p.long()
-        want = t[cells[index[:, 0], index[:, 1], index[:, 2]] & clear]
+        expected = t[cells[index[:, 0], index[:, 1], index[:, 2]] & clear]
         own = samples.t[samples.first[i] : samples.first[i + 1]].cpu().double()
         assert bool((samples.ray[samples.first[i] : samples.first[i + 1]] == i).all())
         assert len(own) < 2 or float(own.diff().min()) > 0.99 * step
-        missing += int(((want[:, None] - own[None]).abs().min(1).values > 1e-5).sum()) if len(own) else len(want)
+        missing += (
+            int(((expected[:, None] - own[None]).abs().min(1).values > 1e-5).sum()) if len(own) else len(expected)
+        )
         sure = t[clear]
-        empty = sure[~torch.isin(sure, want)]
+        empty = sure[~torch.isin(sure, expected)]
         extra += int(((own[:, None] - empty[None]).abs() < 1e-5).sum())
     assert missing == 0 and extra == 0 and len(samples.t) > 1000
 
@@ -89,10 +91,12 @@ def test_uniform_fog_follows_beer_and_lambert(device):
     samples = march_rays(o, d, grid, 1.0 / 512)
     n = len(samples.t)
     out = composite(torch.full((n,), density, device=device), torch.full((n, 3), 0.4, device=device), samples)
-    want = 1.0 - math.exp(-density * 2.0)
-    assert abs(float(out.opacity[0]) - want) < 1e-5  # sum of 1024 float32 thicknesses
-    torch.testing.assert_close(out.color.cpu(), torch.full((1, 3), 0.4 * want), rtol=2e-5, atol=0)
-    mean = (1.0 - math.exp(-density * 2.0) * (1.0 + density * 2.0)) / density + 2.0 * want  # int t sigma e^(-sigma t)
+    expected = 1.0 - math.exp(-density * 2.0)
+    assert abs(float(out.opacity[0]) - expected) < 1e-5  # sum of 1024 float32 thicknesses
+    torch.testing.assert_close(out.color.cpu(), torch.full((1, 3), 0.4 * expected), rtol=2e-5, atol=0)
+    mean = (
+        1.0 - math.exp(-density * 2.0) * (1.0 + density * 2.0)
+    ) / density + 2.0 * expected  # int t sigma e^(-sigma t)
     assert abs(float(out.depth[0]) - mean) < 1e-4 * mean  # midpoint rule
 
 
@@ -103,10 +107,10 @@ def test_composite_and_gradients_match_the_float64_reference(device):
     samples, density, color = packed(COUNTS, device)
     own = [v.clone().requires_grad_() for v in (density, color)]
     far = [v.detach().cpu().double().requires_grad_() for v in (density, color)]
-    out, want = composite(*own, samples), twin(samples, *far)
+    out, expected = composite(*own, samples), twin(samples, *far)
     rng = torch.Generator().manual_seed(4)
     loss = ref = 0.0
-    for got, truth in zip((out.color, out.opacity, out.depth), want, strict=True):
+    for got, truth in zip((out.color, out.opacity, out.depth), expected, strict=True):
         torch.testing.assert_close(got.detach().cpu().double(), truth.detach(), rtol=1e-5, atol=1e-6)
         weight = torch.randn(truth.shape, generator=rng)
         loss, ref = loss + (got * weight.to(device)).sum(), ref + (truth * weight.double()).sum()
@@ -145,10 +149,10 @@ def test_a_triplane_is_marched_and_composited_as_in_float64(device):
     out = composite(*field(samples.positions(origins, directions), planes, heads, read), samples)
     far = [v.double().requires_grad_() for v in leaves]
     o, d, t, ray = (v.cpu() for v in (origins.double(), directions.double(), samples.t.double(), samples.ray.long()))
-    want = twin(samples, *field(o[ray] + t[:, None] * d[ray], *far, planes_read))
-    weight = [torch.rand(v.shape, generator=rng) for v in want[:2]]
+    expected = twin(samples, *field(o[ray] + t[:, None] * d[ray], *far, planes_read))
+    weight = [torch.rand(v.shape, generator=rng) for v in expected[:2]]
     loss = ref = 0.0
-    for got, truth, w in zip((out.color, out.opacity), want, weight):
+    for got, truth, w in zip((out.color, out.opacity), expected, weight):
         torch.testing.assert_close(got.detach().cpu().double(), truth.detach(), rtol=1e-4, atol=1e-6)
         loss, ref = loss + (got * w.to(device)).sum(), ref + (truth * w.double()).sum()
     opacity = out.opacity.detach()
@@ -168,10 +172,10 @@ def test_faint_and_opaque_media_keep_their_digits(device):
         samples, density, color = packed([40, 3], device)
         density = density.abs() * scale
         own, far = density.clone().requires_grad_(), density.cpu().double().clamp(max=1e35).requires_grad_()
-        got, want = composite(own, color, samples), twin(samples, far, color.cpu().double())
-        torch.testing.assert_close(got.opacity.detach().cpu().double(), want[1].detach(), rtol=2e-6, atol=0)
+        got, expected = composite(own, color, samples), twin(samples, far, color.cpu().double())
+        torch.testing.assert_close(got.opacity.detach().cpu().double(), expected[1].detach(), rtol=2e-6, atol=0)
         (g,) = torch.autograd.grad(got.color.sum() + got.depth.sum(), own)
-        (t,) = torch.autograd.grad(want[0].sum() + want[2].sum(), far)
+        (t,) = torch.autograd.grad(expected[0].sum() + expected[2].sum(), far)
         assert bool(torch.isfinite(g).all())
         torch.testing.assert_close(g.cpu().double(), t, rtol=1e-4, atol=1e-5 * float(t.abs().max()) + 1e-30)
 

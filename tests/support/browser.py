@@ -1,4 +1,4 @@
-"""Headless Chromium by its debugging pipe: pages are opened, asked by JavaScript and photographed.
+"""Headless Chromium by its debugging pipe: opens pages, evaluates JavaScript and captures images.
 
 Chromium is ``RELI3D_CHROMIUM`` or the first of chromium, chromium-browser and google-chrome on the path.  WebGL is
 drawn by its software renderer, so no GPU is needed.
@@ -45,7 +45,7 @@ TIMEOUT = 240.0  # seconds; the software renderer needs some for a page on a bus
 
 
 def find_chromium() -> str:
-    """Path of Chromium; the test that asks skips visibly where there is none."""
+    """Path of Chromium; the calling test is skipped visibly where there is none."""
     named = os.environ.get("RELI3D_CHROMIUM")
     found = named or next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
     if found is None:
@@ -74,7 +74,7 @@ class Page:
         self.wait("document.readyState === 'complete' && location.href !== 'about:blank'")
         return self
 
-    def ask(self, code: str):
+    def evaluate(self, code: str):
         """Value of the JavaScript expression ``code``; a promise is awaited.  Its exception fails the test."""
         result = self._call("Runtime.evaluate", expression=code, awaitPromise=True, returnByValue=True)
         if "exceptionDetails" in result:
@@ -84,7 +84,7 @@ class Page:
     def wait(self, code: str) -> None:
         """Return once ``code`` is true."""
         end = time.monotonic() + TIMEOUT
-        while not self.ask(f"Boolean({code})"):
+        while not self.evaluate(f"Boolean({code})"):
             if time.monotonic() > end:
                 raise AssertionError(f"{code}: not true after {TIMEOUT:g} s; the page said {self.problems}")
             time.sleep(0.1)

@@ -93,7 +93,7 @@ def _shown(folder: Path, page: str, shot: Shot) -> np.ndarray:
     (folder / "index.html").write_text(page % values)
     with chromium() as tab, served(folder) as url:
         tab.open(f"{url}/index.html", size=(shot.size, shot.size)).wait("window.picture")
-        return pixels(tab.ask("window.picture")).astype(np.float64)
+        return pixels(tab.evaluate("window.picture")).astype(np.float64)
 
 
 def three_js(folder: Path, shot: Shot) -> np.ndarray:

@@ -507,10 +507,10 @@ def torch_states(rng: Random) -> Case:
     name, state, seed = rng.choice(PARTS), rng.choice(STATES), rng.getrandbits(16)
 
     def read(folder: Path) -> None:
-        want = operation(name, seed)
+        expected = operation(name, seed)
         with torch_state(state):
             got = operation(name, seed)
-        for a, b in zip(got, want, strict=True):
+        for a, b in zip(got, expected, strict=True):
             same = a.dtype == b.dtype and a.device == b.device and torch.equal(a, b)
             check(same, f"{name} under {state}: {a.dtype} on {a.device}, another result")
 

@@ -201,8 +201,11 @@ def compare(parts: list[Asset], look: Look, notes: list[str]) -> None:
     check(len(parts) == 1, f"{len(parts)} parts")
     (asset,) = parts
     vertices = asset.mesh.vertices.numpy()
-    for name, got, want in (("low", vertices.min(0), look.low), ("high", vertices.max(0), look.high)):
-        check(np.abs(got - want).max() < 1e-4, f"bounds: {name} {got.tolist()}, not {want.tolist()}; notes {notes}")
+    for name, got, expected in (("low", vertices.min(0), look.low), ("high", vertices.max(0), look.high)):
+        check(
+            np.abs(got - expected).max() < 1e-4,
+            f"bounds: {name} {got.tolist()}, not {expected.tolist()}; notes {notes}",
+        )
     middle, grow = (look.low + look.high) / 2, (look.high[0] - look.low[0]) / 2
     eye = middle + np.array([0.0, 0.0, 4.0 * grow])
     pose = look_at(eye.tolist(), middle.tolist())
@@ -211,8 +214,8 @@ def compare(parts: list[Asset], look: Look, notes: list[str]) -> None:
     check(bool((image.alpha > 0.999).all()), "the quad does not fill the view")
     pixel = (np.arange(SIZE) + 0.5 - SIZE / 2) * 4.0 / float(camera.intrinsics[0])
     x, y = np.meshgrid(pixel, -pixel)
-    want, clear = look.color(x, y)
-    off = np.abs(image.base_color.numpy() - want)[clear]
+    expected, clear = look.color(x, y)
+    off = np.abs(image.base_color.numpy() - expected)[clear]
     check(
         clear.sum() > 20 and off.max() < 0.02, f"base color differs by {off.max():.3f}; notes {notes}"
     )  # 8 bits, sRGB

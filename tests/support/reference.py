@@ -9,28 +9,28 @@ import torch
 from torch import Tensor
 
 
-def share_within(got: Tensor, want: Tensor, relative: float = 1e-4) -> float:
-    """Share of the entries of ``got`` that lie within ``relative`` of ``want``.
+def share_within(got: Tensor, expected: Tensor, relative: float = 1e-4) -> float:
+    """Fraction of the entries of ``got`` within ``relative`` of ``expected``.
 
     Entries below 1e-3, the floor of Mitsuba's own gradient tests, or below a hundredth of the median of those that are
     not 0, are judged as if they were as large: sums of float32 keep no more digits.
     """
-    got, want = (v.detach().cpu().double().reshape(-1) for v in (got, want))
-    if want.numel() == 0:
+    got, expected = (v.detach().cpu().double().reshape(-1) for v in (got, expected))
+    if expected.numel() == 0:
         return 1.0
-    finite = want[want.isfinite() & (want != 0.0)].abs()
+    finite = expected[expected.isfinite() & (expected != 0.0)].abs()
     floor = max(1e-3, 1e-2 * float(finite.median()) if finite.numel() else 0.0)
-    near = (got == want) | ((got - want).abs() <= relative * want.abs().clamp(min=floor))
-    return float(torch.where(want.isfinite(), near, got == want).double().mean())
+    near = (got == expected) | ((got - expected).abs() <= relative * expected.abs().clamp(min=floor))
+    return float(torch.where(expected.isfinite(), near, got == expected).double().mean())
 
 
-def rows_within(got: Tensor, want: Tensor, relative: float = 1e-4) -> float:
+def rows_within(got: Tensor, expected: Tensor, relative: float = 1e-4) -> float:
     """The same of vectors ``(N, ...)``, by their lengths: for slopes on a sphere or in a plane, of which only the
     vector means something and single components vanish."""
-    got, want = (v.detach().cpu().double().reshape(len(v), -1) for v in (got, want))
-    length = want.norm(dim=-1)
+    got, expected = (v.detach().cpu().double().reshape(len(v), -1) for v in (got, expected))
+    length = expected.norm(dim=-1)
     floor = max(1e-3, 1e-2 * float(length.median()))
-    return float(((got - want).norm(dim=-1) <= relative * length.clamp(min=floor)).double().mean())
+    return float(((got - expected).norm(dim=-1) <= relative * length.clamp(min=floor)).double().mean())
 
 
 def across(slope: Tensor, direction: Tensor) -> Tensor:

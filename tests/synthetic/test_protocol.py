@@ -42,12 +42,12 @@ def many():
 
 
 def test_fields_of_view_follow_the_cut_normal_distribution(many):
-    want = stats.truncnorm(-3.0, 3.0, loc=29.5, scale=2.5)
+    expected = stats.truncnorm(-3.0, 3.0, loc=29.5, scale=2.5)
     found = degrees(many)
     assert found.min() >= 22.0 - 1e-3 and found.max() <= 37.0 + 1e-3  # float32 intrinsics
-    assert stats.kstest(found, want.cdf).pvalue > LEVEL
+    assert stats.kstest(found, expected.cdf).pvalue > LEVEL
     found = fields_of_view(np.random.default_rng(5).random(1_000_000))  # so many tell a deviation of 2.5 from 2.55
-    assert stats.kstest(found, want.cdf).pvalue > LEVEL
+    assert stats.kstest(found, expected.cdf).pvalue > LEVEL
     np.testing.assert_allclose(fields_of_view(np.array([0.0, 0.5, 1.0])), [22.0, 29.5, 37.0], rtol=1e-9)
 
 

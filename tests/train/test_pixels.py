@@ -46,9 +46,12 @@ def learned(finest: int = 0) -> LocalReconstructor:
 
 
 def test_images_of_the_full_size_are_those_of_a_sample(files):
-    got, want = read_views_reduced(files[0], 1), load_sample(files[0], 6, 64, np.random.default_rng(0), augment=False)
+    got, expected = (
+        read_views_reduced(files[0], 1),
+        load_sample(files[0], 6, 64, np.random.default_rng(0), augment=False),
+    )
     for field in dataclasses.fields(TrainingViews):
-        a, b = getattr(got, field.name), getattr(want, field.name)
+        a, b = getattr(got, field.name), getattr(expected, field.name)
         torch.testing.assert_close(a, b, rtol=0, atol=1e-5, msg=field.name)
 
 
@@ -114,12 +117,12 @@ def test_a_finer_level_begins_by_adding_nothing(finest):
     with torch.no_grad():
         _, small = coarse._convolved(avg_pool2d(x, 2), [2])
         _, got = fine._convolved(x, [2])
-    want = interpolate(small, scale_factor=2, mode="bilinear", align_corners=False)
-    torch.testing.assert_close(got, want, rtol=0, atol=1e-4)
-    assert float(want.std()) > 0.1
+    expected = interpolate(small, scale_factor=2, mode="bilinear", align_corners=False)
+    torch.testing.assert_close(got, expected, rtol=0, atol=1e-4)
+    assert float(expected.std()) > 0.1
 
 
-def test_the_pixels_alone_are_asked_as_with_all_else(files):
+def test_pixels_alone_are_evaluated_as_with_the_rest(files):
     model = learned()
     sample = load_sample(files[0], 3, 512, np.random.default_rng(0), augment=False)
     whole = losses(model, sample)
@@ -130,7 +133,7 @@ def test_the_pixels_alone_are_asked_as_with_all_else(files):
 
 
 def test_an_object_without_a_whole_pixel_has_no_terms(files):
-    """A thin object in a small picture: the others are asked as they are without it."""
+    """A thin object in a small image: the others are evaluated as without it."""
     model = learned(2)
     objects = [read_views_reduced(f, 4).of_views(slice(0, 2)) for f in files]
     empty = dataclasses.replace(objects[1], view_valid=torch.zeros_like(objects[1].view_valid))
@@ -191,9 +194,9 @@ def test_training_of_pixels_teaches_the_2d_u_net_alone(folder, tmp_path):
 def test_samples_of_views_alone_teach_the_2d_u_net_and_nothing_else(tmp_path, capsys):
     light = np.random.default_rng(0).random((6, 8, 16, 3), dtype=np.float32)
     np.savez(tmp_path / "maps.npz", env=light, names=np.array([f"map{k}" for k in range(6)]))
-    wanted = ["--maps", str(tmp_path / "maps.npz"), "--count", "2", "--views", "3", "--size", "64", "--workers", "1"]
-    assert data(["render", str(tmp_path / "views"), "--views-only", *wanted]) == 0
-    assert data(["render", str(tmp_path / "whole"), *wanted]) == 0
+    expected = ["--maps", str(tmp_path / "maps.npz"), "--count", "2", "--views", "3", "--size", "64", "--workers", "1"]
+    assert data(["render", str(tmp_path / "views"), "--views-only", *expected]) == 0
+    assert data(["render", str(tmp_path / "whole"), *expected]) == 0
     for path in (tmp_path / "views").glob("*"):
         views, whole = read_views_reduced(path, 1), read_views_reduced(tmp_path / "whole" / path.name, 1)
         assert torch.equal(views.c2w, whole.c2w)

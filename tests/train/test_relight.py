@@ -69,13 +69,13 @@ def test_the_same_light_gives_the_same_photographs(sample, sky):
     got, light = relight_views(images, *maps, sky, np.random.default_rng(3))
     ratio = float(sample["environment"].float().mean() / light.mean())  # the exposures differ
     linear = lambda x: torch.where(x < 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)  # noqa: E731  IEC 61966-2-1
-    want, got_linear = linear(images[..., :3]), linear(got[..., :3]) * ratio
-    bright = (want < 0.95).all(-1) & (got[..., :3] < 0.97).all(-1) & maps[2]  # neither is cut off
+    expected, got_linear = linear(images[..., :3]), linear(got[..., :3]) * ratio
+    bright = (expected < 0.95).all(-1) & (got[..., :3] < 0.97).all(-1) & maps[2]  # neither is cut off
     assert int(bright.sum()) > 3000
     # means over the pixels: noise of 22 samples falls away, 8 bits of three maps err by 1 % at most
     for select in (bright, bright & (maps[0][..., 4] > 0.9), bright & (maps[0][..., 4] < 0.1)):
-        torch.testing.assert_close(got_linear[select].mean(0), want[select].mean(0), rtol=0.02, atol=0)
-    assert float((got_linear - want)[bright].abs().mean()) < 0.05  # the noise, 0.032 measured
+        torch.testing.assert_close(got_linear[select].mean(0), expected[select].mean(0), rtol=0.02, atol=0)
+    assert float((got_linear - expected)[bright].abs().mean()) < 0.05  # the noise, 0.032 measured
     assert torch.equal(got[..., 3], images[..., 3])
     torch.testing.assert_close(
         light * ratio,

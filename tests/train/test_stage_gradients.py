@@ -1,10 +1,10 @@
 """The gradient of each stage's whole loss on one object against central differences.
 
 The random numbers are the same on both sides.  What is a constant backwards by design is left alone: materials are
-asked at detached points, the frames of bumps have no slope, densities of samples are detached.  So light samples
+evaluated at detached points, the frames of bumps have no gradient, densities of samples are detached.  So light samples
 are taken where the material moves, cosine samples alone where the light does, and where the geometry moves the
 materials are even and the bumps are flat.  Colours at outlines go from pixel to pixel by jumps, which only a wide step
-averages, and a normal is not asked where a moved surface would have it: the slope of a surface is one to 15 per cent.
+averages, and a normal is not evaluated at the moved surface: the gradient of a surface agrees to 15 percent.
 """
 
 from dataclasses import replace
@@ -62,7 +62,7 @@ def test_the_whole_loss_has_the_gradient_of_central_differences(case, one, monke
         model.heads[head][-1].weight.data.zero_()
     model.heads["normal"][-1].bias.data.zero_()
     if names is SHAPE:
-        grid = stage_step.occupied  # which cells are asked is no part of the slope
+        grid = stage_step.occupied  # the choice of cells is not differentiated
         full = []
         monkeypatch.setattr(stage_step, "occupied", lambda *a: (full or full.append(grid(*a)) or full)[0])
     moved = [p for name, p in model.named_parameters() if name.startswith(names)]
@@ -90,11 +90,11 @@ MATERIAL_HEADS = ("base_color", "roughness", "metallic")
 def test_all_terms_are_in_the_gradient(one):
     """Every weight of the paper changes the total of some stage: no term is computed and forgotten."""
     model = ball_model()
-    asked = set()
+    requested = set()
     for stage in (VOLUME, GAUSSIANS):
         for drawn in (one, replace(one, inputs=replace(one.inputs, latent=None, strength=None))):
-            asked |= set(object_losses(model, drawn, stage, gradients))
-    assert asked == set(vars(Weights()))
+            requested |= set(object_losses(model, drawn, stage, gradients))
+    assert requested == set(vars(Weights()))
 
 
 def difference(f, value: torch.Tensor, direction: torch.Tensor, size: float) -> float:

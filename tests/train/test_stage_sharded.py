@@ -67,8 +67,8 @@ x = torch.randn(4, 5)
 for model in (whole, cut):
     model(x).square().sum().backward()
 for limit in (1e3, 0.1):  # not reached, reached
-    want = nn.utils.clip_grad_norm_(whole.parameters(), limit)
-    torch.testing.assert_close(clip_gradients(list(cut.parameters()), limit), want)
+    expected = nn.utils.clip_grad_norm_(whole.parameters(), limit)
+    torch.testing.assert_close(clip_gradients(list(cut.parameters()), limit), expected)
     for a, b in zip(whole.parameters(), cut.parameters()):
         torch.testing.assert_close(gathered(b.grad, True), a.grad)
 for a, b in zip(whole.parameters(), cut.parameters()):

@@ -1,4 +1,4 @@
-"""Stages of the paper's training: what they draw, what they show, what they ask for."""
+"""Stages of the paper's training: sampling, validation images, requested terms."""
 
 import math
 from dataclasses import replace
@@ -177,7 +177,7 @@ def test_a_stage_without_samples_is_refused(samples):
         replace(MONTE_CARLO, samples=samples)
 
 
-def test_what_is_not_known_is_not_asked(one):
+def test_terms_without_ground_truth_are_not_computed(one):
     model = ball_model()
     bare = replace(one.targets, material=None, normal=None, shown=None)
     known = object_losses(model, replace(one, targets=one.targets), GAUSSIANS, gradients)
@@ -202,8 +202,8 @@ def test_pixels_outside_the_photograph_say_nothing(one):
 def test_what_is_cut_off_at_white_may_be_brighter(one):
     views = replace(one.targets, images=torch.ones_like(one.targets.images), masks=torch.ones_like(one.targets.masks))
     color = torch.full((24, 24, 3), 1.7)
-    got, want = compared_colors(Rendering(color, color[..., 0], color[..., 0], color, color, color[0]), views, 0)
-    assert torch.equal(got, want)
+    got, expected = compared_colors(Rendering(color, color[..., 0], color[..., 0], color, color, color[0]), views, 0)
+    assert torch.equal(got, expected)
 
 
 def test_the_multi_scale_gradients_forgive_what_is_even_and_see_edges():

@@ -27,7 +27,7 @@ def crowd() -> torch.Tensor:
 def test_of_sixty_views_of_which_57_are_near_identical_the_four_distinct_are_taken():
     assert choose_views(crowd(), 4) == [0, 17, 33, 51]
     assert choose_views(crowd(), 16, min_distance=DUPLICATE_DISTANCE_RAD) == [0, 17, 33, 51]
-    assert len(choose_views(crowd(), 16)) == 16  # as many as asked for
+    assert len(choose_views(crowd(), 16)) == 16  # as many as requested
 
 
 def test_the_choice_covers_within_twice_the_best():
@@ -84,8 +84,8 @@ def folder(path, cameras) -> None:
 def test_a_folder_of_sixty_is_read_as_its_four_distinct_views(tmp_path):
     cameras = crowd()
     folder(tmp_path, cameras)
-    for asked in ({}, {"views": 4}):
-        views = load_views(tmp_path, **asked)
+    for requested in ({}, {"views": 4}):
+        views = load_views(tmp_path, **requested)
         assert views.in_folder == 60 and torch.allclose(views.c2w, cameras[[0, 17, 33, 51]], atol=1e-5)
         (note,) = views.notes
         assert note.startswith("4 of 60 views taken by farthest-point sampling: 0, 17, 33, 51")
@@ -121,7 +121,7 @@ def test_views_that_cut_the_object_off_are_left_out_while_eight_remain(tmp_path)
     every = load_views(tmp_path / "twelve", every=True)
     assert len(every) == 12 and every.taken().names == others
     assert set(load_views(tmp_path / "twelve", views=4).names) <= set(others)
-    first = load_views(tmp_path / "twelve", first_views=4)  # as asked for
+    first = load_views(tmp_path / "twelve", first_views=4)  # as requested
     assert len(first) == 4 and any(n.endswith("; used all the same") for n in first.notes)
     cut_off(tmp_path / "ten", 10, (0, 3, 7))  # seven others
     views = load_views(tmp_path / "ten")

@@ -85,8 +85,8 @@ def test_what_is_accepted_comes_out_as_stored(tmp_path, name):
     write(tmp_path / "a.png")
     (path,) = tmp_path.iterdir()
     color_of, alpha = read_image(path)
-    want = torch.from_numpy(np.ascontiguousarray(expected(SHADES))).float().expand(SIZE[1], SIZE[0], 3)
-    assert float((color_of * 255 - want).abs().max()) <= levels + 1e-4  # a few ulp of float32 at 255
+    exact = torch.from_numpy(np.ascontiguousarray(expected(SHADES))).float().expand(SIZE[1], SIZE[0], 3)
+    assert float((color_of * 255 - exact).abs().max()) <= levels + 1e-4  # a few ulp of float32 at 255
     assert (alpha is not None) == ("alpha" in name)
     if alpha is not None:
         assert torch.equal((alpha * 255).round().byte(), torch.from_numpy(SHADES[..., 3].copy()))
@@ -260,19 +260,19 @@ def test_backgrounds_are_removed_on_request_alone(tmp_path, monkeypatch):
     folder = without_masks(tmp_path / "object")
     with pytest.raises(InputError, match="expected alpha or a foreground mask.*--remove-background"):
         load_views(folder)
-    asked = []
+    requested = []
     box = Image.new("L", (400, 300))
     box.paste(255, (110, 60, 290, 240))
     fake = types.SimpleNamespace(
-        new_session=lambda name: asked.append(name) or "session", remove=lambda image, *, session, only_mask: box
+        new_session=lambda name: requested.append(name) or "session", remove=lambda image, *, session, only_mask: box
     )
     monkeypatch.setitem(sys.modules, "rembg", fake)
     views = load_views(folder, remove_background=True)
-    assert int(views.masks[0].sum()) == 180 * 180 and asked == ["isnet-general-use"]
+    assert int(views.masks[0].sum()) == 180 * 180 and requested == ["isnet-general-use"]
     assert any(re.match("1 of 1 masks made by rembg", n) for n in views.notes)
     Image.fromarray(np.asarray(box)).save(folder / "masks/a.png")
     load_views(folder, remove_background=True)
-    assert len(asked) == 1  # a mask that is there goes first, and no network is loaded
+    assert len(requested) == 1  # a mask that is there goes first, and no network is loaded
     (folder / "masks/a.png").unlink()
     fake.new_session = lambda name: (_ for _ in ()).throw(OSError("no route to\nhost"))
     with pytest.raises(InputError, match="expected the network isnet-general-use of rembg, got no route to"):
