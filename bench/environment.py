@@ -46,7 +46,7 @@ def torch_lookup(device, n, height, backward):
 
 
 def sample(device, n, height):
-    """Directions and densities of ``n`` uniform pairs from the importance table."""
+    """Directions and densities of ``n`` uniform pairs, by importance sampling."""
     environment = Environment(inputs(device, 1, height)[0])
     u = torch.rand(n, 2, generator=torch.Generator(device).manual_seed(1), device=device)
     return lambda: environment.sample(u), {"samples": n}

@@ -54,7 +54,7 @@ def direct(device, size, roughness, backward, samples=SAMPLES, subdivisions=6):
     base = torch.tensor([0.7, 0.4, 0.2], device=device).requires_grad_(backward)
     light = sky(device).requires_grad_(backward)
     environment = Environment(light)
-    _ = environment.table  # Mitsuba's is made when its scene loads
+    _ = environment.cdf  # Mitsuba's is made when its scene loads
 
     def step(seed=0):
         found = scene.closest(origins, directions)

@@ -30,8 +30,8 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--light",
         type=Path,
-        help="lat-long .hdr or .exr, its center column +X (as three.js, "
-        "model-viewer and Blender have it); default uniform white",
+        help="environment: lat-long .hdr or .exr, upper edge +Y, horizontal center +X, +Z right of it, as in three.js, "
+        "model-viewer and Blender; default uniform white",
     )
     p.add_argument(
         "--output",

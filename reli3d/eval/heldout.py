@@ -112,7 +112,7 @@ def evaluate(
         result_all.append(result[both])
         reference_all.append(reference[both])
     result, reference = torch.cat(result_all), torch.cat(reference_all)
-    target = quarter_turn(sample["environment"].float(), -1)  # stored with -Z in the center column
+    target = quarter_turn(sample["environment"].float(), -1)  # stored with -Z at the horizontal center
     predicted = asset.light.resized(len(target)).radiance
     exposure = target.mean() / mean_light.mean()
     found = {

@@ -1,9 +1,9 @@
 """FlexiCubes isosurface extraction (Shen et al. 2023, Flexible Isosurface Extraction, SIGGRAPH).
 
-A grid of X * Y * Z cubes fills the box [-radius, radius]^3.  Its vertices are ``(X + 1, Y + 1, Z + 1)``, x first and z
-fastest, its cubes ``(X, Y, Z)`` in the same order.  Corners of a cube are numbered x first: (0,0,0), (1,0,0), (0,1,0),
-(1,1,0), (0,0,1), ...; edges as in ``kernels.flexicubes_tables.EDGES``.  Vertices and faces come in the order of the
-published release.  After one pass over the grid the cost is proportional to the number of surface cubes.  Not
+A grid of X * Y * Z cubes fills the box [-radius, radius]^3.  Grid vertices ``(X + 1, Y + 1, Z + 1)`` and cubes ``(X, Y,
+Z)`` are in C order (x slowest, z fastest).  Corners of a cube are numbered with x fastest: corner = x + 2y + 4z for x,
+y, z in {0, 1}; edges as in ``kernels.flexicubes_tables.EDGES``.  Vertices and faces are in the order of the authors'
+code.  After one pass over the grid the cost is proportional to the number of surface cubes.  Not
 implemented: the tetrahedra of the paper's section 4.5, and dual vertices placed by the field's gradient.
 """
 
@@ -94,12 +94,13 @@ def extract_surface(
 ) -> Mesh:
     """Extracts the isosurface ``sdf == 0`` in the box ``[-radius, radius]^3`` by FlexiCubes; the mesh has no normals.
 
-    sdf: ``(X + 1, Y + 1, Z + 1)`` float32 at the grid vertices, x first, finite: a signed distance or any other field
-    that is negative inside.  radius: half extent of the box, one or three numbers.  deformation: ``(*sdf.shape, 3)``
-    offsets of the grid vertices as fractions of the box.  alpha ``(cubes, 8)``, beta ``(cubes, 12)``, gamma
-    ``(cubes,)``: positive weights of cube corners, cube edges and the splitting of quads; None: 1.  cubes: from
-    :func:`~reli3d.geometry.surface.surface_cubes` if the weights have rows only for these cubes.  closed: cap the
-    surface at the box.  center: split quads into four triangles around a center vertex instead of two.
+    sdf: ``(X + 1, Y + 1, Z + 1)`` float32 at the grid vertices (C order: x slowest, z fastest), finite: a signed
+    distance or any other field that is negative inside.  radius: half extent of the box, one or three numbers.
+    deformation: ``(*sdf.shape, 3)`` offsets of the grid vertices, as fractions of the sides ``2 * radius`` of the box.
+    alpha ``(K, 8)``, beta ``(K, 12)``, gamma ``(K,)``: positive weights of cube corners, of cube edges and of the
+    splitting of quads; None: 1.  Without ``cubes``, K is the number of all cubes, X * Y * Z.  cubes: ``(K,)`` int64
+    from :func:`~reli3d.geometry.surface.surface_cubes`: the weights have rows for these cubes only.  closed: cap the
+    surface at the box.  center: split each quad into four triangles around an additional vertex, instead of into two.
 
     Faces are counter-clockwise seen from the positive side.  A field of one sign is valid: a positive one gives an
     empty mesh, a negative one the box if ``closed``.  Gradients reach sdf, deformation, alpha, beta and, with

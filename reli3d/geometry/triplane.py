@@ -103,7 +103,7 @@ def sizes_of(points: int, height: int, width: int, blocks: int) -> kernels.Sizes
 
 
 def packed_planes(planes: Tensor) -> Tensor:
-    """``(B, 3, H, W, C')`` float32, C' the next multiple of 8; no copy where float32 planes lie in memory so."""
+    """``(B, 3, H, W, C')`` float32, C' the next multiple of 8; no copy if the planes are in this format already."""
     packed = planes.detach().permute(0, 1, 3, 4, 2)
     packed = (
         torch.nn.functional.pad(packed, (0, -planes.shape[2] % BLOCK_CHANNELS))
@@ -198,13 +198,15 @@ def _planes_adjoint(points: Tensor, g: Tensor, order: Tensor, edges: Tensor, sha
 def sample_triplane(planes: Tensor, points: Tensor) -> Tensor:
     """Features of ``points``, ``(B, N, 3 * C)`` float32: bilinear from the planes XY, XZ, YZ, in that order.
 
-    planes: ``(B, 3, C, H, W)`` float32, or bfloat16, float16 (float32 sums).  The first coordinate of a plane runs
-    along W, the second along H.  [-1, 1] spans the outer borders of the texels; outside, texels are zero, so a point on
-    the border gets half.  Channel-last strides, float32, C a multiple of 8, are read in place; other planes are
-    copied.  points: ``(B, N, 3)`` float32; NaN gives zeros.
+    planes: ``(B, 3, C, H, W)`` float32, bfloat16 or float16; interpolated in float32.  The first coordinate of a plane
+    runs along W, the second along H.  Borders are as in ``grid_sample`` with ``align_corners=False`` and
+    ``padding_mode="zeros"``: -1 and 1 are the outer edges of the border texels, and texels outside are zero.  Planes
+    are read without a copy if they are float32, C is a multiple of 8 and channels are last in memory; others are
+    converted to that format.  points: ``(B, N, 3)`` float32 in [-1, 1]; NaN gives zeros.
 
     Gradients reach ``planes`` (in their dtype) and ``points`` (one-sided at texel centers), bitwise identical for any
-    number of threads.  Raises TypeError or ValueError, also for sizes beyond 32-bit indices.
+    number of threads.  Raises TypeError for a wrong dtype, ValueError for a wrong shape or device, or for sizes beyond
+    32-bit indices.
 
     >>> planes = torch.rand(1, 3, 8, 16, 16, requires_grad=True)
     >>> features = reli3d.sample_triplane(planes, torch.zeros(1, 100, 3))  # (1, 100, 24)

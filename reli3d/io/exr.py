@@ -102,7 +102,7 @@ def _header(path, notes: list[str], max_pixels: int) -> tuple[dict, list[str]]:
     if header.get("envmap") == OpenEXR.ENVMAP_CUBE:
         raise InputError(path, "envmap: expected a lat-long map, got cube faces; convert it with exrenvmap")
     if header.get("envmap") == OpenEXR.ENVMAP_LATLONG:
-        notes.append(f"{os.path.basename(path)}: envmap: its orientation (+Z in the center column) is not applied")
+        notes.append(f"{os.path.basename(path)}: envmap: its orientation (+Z at the horizontal center) is not applied")
     if abs(header.get("pixelAspectRatio", 1.0) - 1.0) > 1e-3:
         notes.append(f"{os.path.basename(path)}: pixelAspectRatio {header['pixelAspectRatio']:g} is not applied")
     return header, names

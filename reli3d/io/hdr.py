@@ -1,10 +1,10 @@
 """Environment maps and other linear images, in OpenEXR (``exr.py``) or Radiance RGBE (``rgbe.py``).
 
-Pixels are linear Rec. 709 radiance.  Row 0 of an environment is +Y, its center column +X with +Z right of it, in files
-and in memory, the convention of three.js, model-viewer and Blender.
+Pixels are linear Rec. 709 radiance.  The upper edge of an environment is +Y, the horizontal center +X, and +Z is right
+of it, in files and in memory: the convention of three.js, model-viewer and Blender.
 
-Writing refuses NaN and negative values; infinity and, in half precision, values above 65504 are clamped to 65504.
-Reading refuses NaN, sets negative values to 0 and infinity to 65504.
+Writing raises an error for NaN and negative values; infinity and, in half precision, values above 65504 are clamped to
+65504.  Reading raises an error for NaN, sets negative values to 0 and infinity to 65504.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ MAX_PIXELS = 1 << 25  # 8192 x 4096
 def read_environment(path: str | os.PathLike, *, notes: list[str] | None = None) -> Environment:
     """Reads a lat-long environment ``(H, 2H, 3)``, linear radiance, from an ``.hdr`` or ``.exr`` file.
 
-    The format is detected by content.  Row 0 is +Y, the center column +X, +Z right of it.  notes: receives one line for
-    every conversion, clamping or ignored header field.  Raises InputError for a broken file, NaN, a shape other than
-    2:1, or more than 8192 x 4096 pixels.
+    The format is detected by content.  The upper edge is +Y, the horizontal center +X, and +Z is right of it.  notes:
+    receives one line for every conversion, clamping or ignored header field.  Raises InputError for a broken file, NaN,
+    a shape other than 2:1, or more than 8192 x 4096 pixels.
 
     >>> light = reli3d.read_environment("studio.hdr").rotated(math.pi / 2)
     >>> image = reli3d.render_asset(asset, camera, light)

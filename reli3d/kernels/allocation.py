@@ -24,7 +24,7 @@ def pilot_kernel(
     values: wp.array2d[wp.vec3],
     densities: wp.array2d[wp.vec3],
 ):
-    """Each sample's shadow ray, its value over q, and the densities of table, visible normals and cosine over q.
+    """Each sample's shadow ray, its value over q, and the densities of environment, visible normals and cosine over q.
 
     q is the sum of counts times densities of the plan, whose visible normals are not in pairs.  Values and densities
     are 0 for a sample below the horizon, whose ray is along the normal.

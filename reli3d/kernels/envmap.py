@@ -1,9 +1,9 @@
-"""Lat-long environment maps: lookup, importance table, sampling.
+"""Lat-long environment maps: lookup, importance sampling.
 
-Row 0 is +Y, the center column +X, +Z right of it: with phi = 2 pi u - pi and theta = pi v the direction is
-(cos phi sin theta, cos theta, sin phi sin theta).  A texel has its center at ((column + .5) / W, (row + .5) / H).
-Radiance is bilinear between centers, periodic in u, constant beyond the first and last row.  Sampling is piecewise
-constant over texels with respect to solid angle; densities are per steradian.
+The upper edge is +Y, the horizontal center +X, and +Z is right of it: with phi = 2 pi u - pi and theta = pi v the
+direction is (cos phi sin theta, cos theta, sin phi sin theta).  A texel has its center at ((column + .5) / W, (row +
+.5) / H). Radiance is bilinear between centers, periodic in u, constant beyond the first and last row.  Sampling is
+piecewise constant over texels with respect to solid angle; densities are per steradian.
 """
 
 import warp as wp
@@ -22,7 +22,7 @@ def direction_to_uv(d: wp.vec3) -> wp.vec2:
 
 @wp.struct
 class Texels:
-    """The four texels about a point of the map: rows, columns, and the point's place between them in [0, 1]."""
+    """The four texels about a point of the map: rows, columns, and the position of the point between them in [0, 1]."""
 
     r0: int
     r1: int
@@ -94,7 +94,7 @@ def upper_cell(cdf: wp.array2d[float], guide: wp.array2d[wp.int32], row: int, u:
 
 @wp.struct
 class MapSample:
-    """A drawn point of the map and its unit direction."""
+    """A sampled point of the map and its unit direction."""
 
     uv: wp.vec2
     direction: wp.vec3
@@ -136,7 +136,7 @@ def sample_envmap(
 
 @wp.func
 def pdf_envmap_uv(density: wp.array2d[float], uv: wp.vec2) -> float:
-    """Density [1/sr] of the table at map coordinates."""
+    """Density [1/sr] of :func:`sample_envmap` at map coordinates."""
     height = density.shape[0]
     width = density.shape[1]
     r = wp.clamp(int(uv[1] * float(height)), 0, height - 1)

@@ -1,17 +1,21 @@
-"""FlexiCubes (Shen et al. 2023), forward: classify the grid, resolve ambiguous cubes, place dual vertices, emit
-quads.
+"""FlexiCubes (Shen et al. 2023), forward: classifies the cubes, resolves ambiguous ones, places the dual vertices and
+emits the quads.
 
-The grid has ``nx * ny * nz`` vertices with index ``(i * ny + j) * nz + k``; a cube has the index of its lowest vertex,
-so the last index along each axis is no cube.  Inside is sdf < 0.  ``pad`` is 1 if the grid was padded by one layer of
-outside vertices at the positions of the border vertices: cubes of zero thickness that close the surface flat on the
-box.
+The grid has ``nx * ny * nz`` vertices; vertex (i, j, k) has the index ``(i * ny + j) * nz + k``.  A cube has the index
+of its lowest corner, so there is no cube at the last index of an axis.  Inside is sdf < 0.  If ``pad`` is 1, the grid
+was padded by one layer of vertices with a positive value, which lie at the positions of the border vertices.  The cubes
+of this layer have zero thickness and cap the surface flat at the box.
+
+Dual marching cubes is ambiguous where two cubes share a face with four crossed edges (cases C16 and C19 of Wenger 2013,
+Isosurfaces): four quads would meet in one edge and make the surface non-manifold.  :func:`resolve_kernel` changes these
+cases.
 """
 
 import warp as wp
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
 
-SDF_MIN = wp.constant(1.0e-20)  # gradients scale with 1 / sdf: an edge with both ends below this magnitude passes none
+SDF_MIN = wp.constant(1.0e-20)  # gradients scale with 1 / sdf: 0 for an edge with both ends below this magnitude
 
 
 @wp.struct
@@ -31,8 +35,11 @@ class Grid:
 
 @wp.struct
 class SurfaceCubes:
-    """A row for each cube with a sign change: its lowest vertex, its resolved case, its row in the weights (-1 in the
-    padding), the number of its dual vertices and the index of the first; ``slot`` maps a vertex to its row.
+    """Arrays with one entry for each cube with a sign change.
+
+    cells: index of the cube.  resolved: its case after :func:`resolve_kernel`.  rows: its row in the weights, -1 in the
+    padding.  counts: number of its dual vertices.  base: index of the first of these.  ``slot`` has an entry for each
+    grid vertex: the position in the other arrays of the cube of that index.
     """
 
     cells: wp.array[wp.int32]
@@ -45,7 +52,7 @@ class SurfaceCubes:
 
 @wp.struct
 class Tables:
-    """Of :mod:`reli3d.kernels.flexicubes_tables`, flat."""
+    """The tables ``group``, ``ends`` and ``around`` of :mod:`reli3d.kernels.flexicubes_tables`, flattened."""
 
     group: wp.array[wp.int32]
     ends: wp.array[wp.int32]
@@ -54,7 +61,7 @@ class Tables:
 
 @wp.struct
 class Weights:
-    """Of the surface cubes; empty arrays stand for 1."""
+    """FlexiCubes weights: ``alpha``, 8 for each surface cube, and ``beta``, 12 for each; an empty array means 1."""
 
     alpha: wp.array[float]
     beta: wp.array[float]
@@ -151,10 +158,12 @@ def classify_kernel(
     codes: wp.array[wp.uint8],
     crossed: wp.array[wp.uint8],
 ):
-    """Case of every cube (0 if all inside), and the edges of every vertex that have a quad: bit 0 y, 1 z, 2 x.
+    """Case of each cube, and the crossed edges of each vertex.
 
-    An edge belongs to the end that comes first in EDGES: the low end along x and z, the high end along y.  One thread
-    per column of vertices along z, so that neighboring cubes reuse four corners.
+    codes: the case, a bit for each inside corner; 0 for all cubes without a sign change.  crossed: which edges of the
+    vertex get a quad: bit 0 the edge along y, bit 1 along z, bit 2 along x.  An edge belongs to the end that comes
+    first in EDGES: the low end along x and z, the high end along y.  One thread per column of vertices along z, so that
+    neighboring cubes reuse four corners.
     """
     i = start + wp.tid()
     base = i * nz
@@ -203,7 +212,9 @@ def resolve_kernel(
     counts: wp.array[wp.int32],
     slot: wp.array[wp.int32],
 ):
-    """Case of a surface cube: inverted if both cubes at its ambiguous face would otherwise connect through it."""
+    """Resolved case of a surface cube: the complement of its case if it shares its ambiguous face with a cube that is
+    ambiguous at the same face (C16 and C19 of Wenger 2013), else the case itself.
+    """
     s = start + wp.tid()
     cell = cells[s]
     code = int(codes[cell])
@@ -240,8 +251,10 @@ def dual_vertex_kernel(
     # out
     vertices: wp.array[wp.vec3],
 ):
-    """Mean, weighted by beta, of the zero crossings of edge ``group`` of surface cube ``cube``; NaN if a weight that it
-    uses is not positive.
+    """Dual vertex ``group`` of surface cube ``cube``: the mean, weighted by beta, of the zero crossings on its edges.
+
+    A group is a set of crossed edges of a cube that share one dual vertex.  NaN if a weight of these edges is not
+    positive.
     """
     v = start + wp.tid()
     s = cube[v]
@@ -284,9 +297,10 @@ def quad_kernel(
     quads: wp.array[wp.int32],
     split: wp.array[float],
 ):
-    """Dual vertices around a crossed edge, counter-clockwise seen from outside, and the gammas of their cubes.
+    """The quad of a crossed edge: the dual vertices of its four cubes, counter-clockwise seen from outside.
 
-    ``direction``: 0 y (downwards), 1 z, 2 x, the bits of :func:`classify_kernel`.
+    origin: the vertex to which the edge belongs.  direction: 0 for the edge along -y, 1 along z, 2 along x, the bits of
+    :func:`classify_kernel`.  split: gamma of each of the four cubes.
     """
     q = start + wp.tid()
     v = origin[q]

@@ -10,7 +10,10 @@ wp.set_module_options({"enable_backward": True, "cpu_compiler_flags": "-march=na
 
 @wp.func
 def sample_cosine(u: wp.vec2) -> wp.vec3:
-    """Direction for uniform ``u`` in [0, 1)^2; density :func:`pdf_cosine`.  Malley: a lifted disk point."""
+    """Direction for uniform ``u`` in [0, 1)^2; density :func:`pdf_cosine`.
+
+    Malley's method: a uniform point of the unit disk, projected up to the hemisphere.
+    """
     r = wp.sqrt(u[0])
     a = turn_cos_sin(u[1])
     return wp.vec3(r * a[0], r * a[1], wp.sqrt(1.0 - u[0]))
@@ -33,10 +36,11 @@ def sample_cap(w: wp.vec3, u: wp.vec2) -> wp.vec3:
 
 @wp.func
 def opposite(u: wp.vec2) -> wp.vec2:
-    """Numbers of the antithetic partner of the visible normal drawn with ``u``: its point of the cap is across the
-    normal, and as many points of the cap are lower as are higher than the original's.
+    """Random numbers of the antithetic partner of a visible normal sampled with ``u``.
 
-    Exact for multiples of 2^-24, the grid of the random numbers, so the result is uniform too.
+    On the spherical cap (:func:`sample_cap`) the azimuth is rotated by pi and the height is reversed: a point at the
+    fraction u[1] of the cap's height goes to 1 - u[1] - 2^-24.  Exact for multiples of 2^-24, the grid of the random
+    numbers, so the result is uniform too.
     """
     turned = u[0] + 0.5
     if u[0] >= 0.5:
@@ -46,13 +50,13 @@ def opposite(u: wp.vec2) -> wp.vec2:
 
 @wp.func
 def mirror(wm: wp.vec3) -> wp.vec3:
-    """``wm`` turned by pi about the surface normal."""
+    """``wm`` rotated by pi about the surface normal."""
     return wp.vec3(-wm[0], -wm[1], wm[2])
 
 
 @wp.func
 def reflect(wo: wp.vec3, wm: wp.vec3) -> wp.vec3:
-    """``wo`` mirrored at the microfacet normal ``wm``."""
+    """``wo`` reflected about the microfacet normal ``wm``."""
     return wm * (2.0 * wp.dot(wo, wm)) - wo
 
 

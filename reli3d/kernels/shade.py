@@ -1,11 +1,12 @@
 """Direct lighting of a hit by multiple importance sampling: all strategies in one loop, no per-sample arrays.
 
-Strategies in the order of the sample index: environment table, visible normals (in antithetic pairs: even index the
-original, odd its partner), cosine.  Every sample contributes ``f L cos w / (n p)`` with the densities of all strategies
-in the MIS weight ``w``.  Back faces are shaded two-sided.
+Strategies in the order of the sample index: environment map, visible normals (with antithetic pairs, an even index is
+the original sample and the next odd one its partner), cosine.  A sample contributes ``f L cos w / (n p)``: f is the
+BSDF, L the radiance of the environment, cos the cosine of the sampled direction with the shading normal, w the MIS
+weight, n the sample count of the strategy and p its density [1/sr].  Back faces are shaded two-sided.
 
-``visible`` stores one bit per sample for the adjoint: unoccluded and above the horizon.  With no columns nothing is
-stored.
+``visible`` stores one bit per sample for the adjoint: 1 if the direction is unoccluded and above the horizon.  If it
+has no columns, nothing is stored.
 """
 
 import warp as wp
@@ -31,7 +32,7 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=n
 
 OPPOSITE = wp.constant(1)  # pairing of visible normals; 0 for none
 MIRRORED = wp.constant(2)
-COS_VIEW_MIN = wp.constant(1.0e-3)  # interpolated normals are bent until their cosine with the view is at least this
+COS_VIEW_MIN = wp.constant(1.0e-3)  # cosine with the view to which shading normals are adjusted if it is lower
 
 
 @wp.struct
@@ -50,7 +51,9 @@ class Points:
 
 @wp.struct
 class Light:
-    """Texels of the map, its sampling table, and the low-discrepancy points, which each hit shifts."""
+    """Texels of the environment map, its importance-sampling CDF and density, and the low-discrepancy points, to which
+    each hit applies a Cranley-Patterson rotation.
+    """
 
     radiance: wp.array2d[wp.vec3]
     rows: wp.array2d[float]
@@ -75,7 +78,7 @@ class Surface:
     frame: wp.mat33
     ng: wp.vec3
     wo: wp.vec3
-    stretched: wp.vec3  # the view as visible normals are drawn from it
+    stretched: wp.vec3  # ``wo`` in the space in which the GGX microsurface is a hemisphere: stretch_view
     root_o: float
     base_color: wp.vec3
     alpha: float
@@ -84,7 +87,7 @@ class Surface:
 
 @wp.struct
 class Plan:
-    """How to sample: counts of the strategies, generator, options."""
+    """Sample counts of the strategies, seed and options; ``rotate``: 1 for Halton points, 0 for random numbers."""
 
     n_environment: int
     n_visible: int
@@ -100,8 +103,11 @@ class Plan:
 
 @wp.struct
 class Draw:
-    """One sample: its direction in world space, in the local frame and on the map; ``factor`` is w / (n p), 0 for
-    none, which then has no facet."""
+    """One sample: its direction in the world frame (``direction``), in the local frame (``wi``) and in coordinates of
+    the environment map (``uv``).
+
+    ``factor`` is w / (n p).  It is 0 for a rejected sample, whose ``facet`` is then undefined.  ``count`` is n.
+    """
 
     direction: wp.vec3
     wi: wp.vec3
@@ -112,8 +118,8 @@ class Draw:
 
 
 @wp.func
-def bend_normal(n: wp.vec3, wo: wp.vec3) -> wp.vec3:
-    """``n``, or the nearest normal on the way to ``wo`` that has the view above its horizon."""
+def adjust_normal(n: wp.vec3, wo: wp.vec3) -> wp.vec3:
+    """Shading normal ``n``, adjusted toward the viewer if its cosine with ``wo`` is below ``COS_VIEW_MIN``."""
     out = n
     cos_o = wp.dot(n, wo)
     if cos_o < COS_VIEW_MIN:
@@ -123,7 +129,7 @@ def bend_normal(n: wp.vec3, wo: wp.vec3) -> wp.vec3:
 
 @wp.func
 def make_surface(plan: Plan, points: Points, i: int) -> Surface:
-    """Local frame of hit ``i``, on the side of the viewer, and its random numbers."""
+    """Material and local frame of hit ``i``, its normals on the viewer's side, and the shifts of its sample points."""
     normal = points.normal[i]
     ng = points.ng[i]
     wo = points.wo[i]
@@ -132,7 +138,7 @@ def make_surface(plan: Plan, points: Points, i: int) -> Surface:
     if wp.dot(ng, wo) < 0.0:
         side = -1.0
     surface = Surface()
-    surface.frame = tangent_frame(bend_normal(normal * side, wo))
+    surface.frame = tangent_frame(adjust_normal(normal * side, wo))
     surface.ng = ng * side
     surface.wo = surface.frame * wo
     surface.base_color = points.base_color[i]
@@ -149,7 +155,7 @@ def make_surface(plan: Plan, points: Points, i: int) -> Surface:
 
 @wp.func
 def draw_pair(plan: Plan, points: wp.array[wp.vec2], shift: wp.vec2, pixel: int, index: int, strategy: int) -> wp.vec2:
-    """Uniform pair of a sample: independent, or a shifted point of the low-discrepancy set."""
+    """Uniform pair of a sample: random, or a low-discrepancy point after a Cranley-Patterson rotation by ``shift``."""
     u = rotate_point(points[index], shift)
     if plan.rotate == 0:
         u = random_pair(plan.seed, pixel, index, strategy)
@@ -176,7 +182,7 @@ def visible_normal(surface: Surface, plan: Plan, points: wp.array[wp.vec2], k: i
 
 @wp.func
 def draw_sample(surface: Surface, plan: Plan, light: Light, sample: int) -> Draw:
-    """Sample ``sample`` of a hit; a direction below the horizon has factor 0."""
+    """The sample of index ``sample`` of a hit.  A direction below the horizon has factor 0."""
     out = Draw()
     wi = wp.vec3(0.0, 0.0, 0.0)
     uv = wp.vec2(0.0, 0.0)
@@ -210,7 +216,7 @@ def draw_sample(surface: Surface, plan: Plan, light: Light, sample: int) -> Draw
     if wi[2] > COS_MIN:
         out.facet = facet_between(surface.wo, wi, surface.alpha, surface.root_o)
         lobes = pdf_lobes(out.facet, surface.wo, wi)
-        mirrored = wp.float32(0.0)  # only their density is another one
+        mirrored = wp.float32(0.0)  # number of mirrored samples: only these have a density of their own
         if plan.antithetic == MIRRORED:
             mirrored = float(plan.n_visible // 2)
         all = wp.vec4(
@@ -236,7 +242,7 @@ def draw_sample(surface: Surface, plan: Plan, light: Light, sample: int) -> Draw
 
 @wp.func
 def sample_value(surface: Surface, plan: Plan, draw: Draw, light: wp.vec3) -> wp.vec3:
-    """Contribution of an unoccluded sample, clamped to the plan's clamp divided by the sample count of its strategy."""
+    """Contribution f L cos w / (n p) of an unoccluded sample, at most ``plan.clamp`` / n per channel."""
     value = eval_bsdf(
         draw.facet, surface.wo, draw.wi, surface.base_color, surface.alpha, surface.metallic, plan.conserving
     )
@@ -258,7 +264,7 @@ def shade_kernel(
     out: wp.array[wp.vec3],
     visible: wp.array2d[wp.int32],
 ):
-    """The fused estimator; shadow rays through Warp's BVH."""
+    """Radiance of each hit; traces shadow rays through Warp's BVH."""
     i = start + wp.tid()
     surface = make_surface(plan, points, i)
     total = wp.vec3(0.0, 0.0, 0.0)

@@ -3,7 +3,7 @@
 Detached sampling: directions, densities, weights and visibility are those of the forward pass and constants, which
 leaves the gradient unbiased because the integrand's domain, the sphere, does not depend on the parameters (Zeltner et
 al. 2021, Monte Carlo Estimators for Differential Light Transport, detached sampling).  The samples are drawn again
-from their counters, so nothing per sample is in memory but the visibility bits.
+from seed and indices, so nothing per sample is in memory but the visibility bits.
 """
 
 import warp as wp
@@ -19,7 +19,7 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": f"-march=
 
 @wp.struct
 class SurfaceGradient:
-    """Adjoints of one hit; ``n`` in the local frame, of the bent normal."""
+    """Adjoints of one hit; ``n`` in the local frame, of the adjusted normal."""
 
     n: wp.vec3
     base_color: wp.vec3

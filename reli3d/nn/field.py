@@ -72,7 +72,7 @@ class Field(ABC):
 
     @abstractmethod
     def radiance_map(self, height: int | None = None) -> Tensor:
-        """Linear radiance ``(H, 2H, 3)``, row 0 at +Y, the center column at +X; default height: the preset's."""
+        """Linear radiance ``(H, 2H, 3)``, upper edge +Y, horizontal center +X; default height: the preset's."""
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,8 @@
 
 Glossy pixels reflect the light from their mirror direction, diffuse ones the light around their normal.  Both are
 splatted into lat-long maps.  The convolutions, which wrap in azimuth, complete unobserved directions; the result is
-equivariant to rotation about +Y.  The network was trained on maps with -Z in the center column and +X to its right; the
-result has the layout of :mod:`reli3d.render.latlong`.
+equivariant to rotation about +Y.  The network was trained on maps with -Z at the horizontal center and +X to its right;
+the result has the layout of :mod:`reli3d.render.latlong`.
 """
 
 from __future__ import annotations
@@ -93,4 +93,4 @@ class LightMap(nn.Module):
             coarse = functional.interpolate(across(x), size=finer.shape[-2:], mode="bilinear", align_corners=False)
             x = up(finer + coarse)
         log = (self.out(x)[0] + mean[:, None, None]).clamp(max=MAX_LOG_RADIANCE)
-        return log.roll(-(self.height // 2), 2)  # by a quarter of the width: +X in the center column
+        return log.roll(-(self.height // 2), 2)  # by a quarter of the width: +X at the horizontal center

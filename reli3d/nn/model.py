@@ -119,7 +119,7 @@ class Reconstructor(nn.Module):
         return Code(triplane, patch_grid(tokens), latent, rotation, strength)
 
     def decode_environment(self, code: Code, height: int | None = None) -> Tensor:
-        """Linear radiance ``(B, H, 2H, 3)``, row 0 is +Y, the center column +X; default height the preset's."""
+        """Linear radiance ``(B, H, 2H, 3)``, upper edge +Y, horizontal center +X; default height the preset's."""
         return self.environment(code.latent, code.rotation, code.strength, height)
 
     def radiance(self, code: Code, directions: Tensor) -> Tensor:

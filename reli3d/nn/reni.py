@@ -4,7 +4,7 @@ Source: Gardner, Egger and Smith 2023, "RENI++", arXiv 2311.09361, in the form a
 published with ReLi3D.  An environment is a set of latent 3-vectors; rotating them about the vertical rotates the map.
 The decoder uses a z-up frame, D = (z, x, y) of the y-up world direction (x, y, z).  It is evaluated in float32.
 
-The published maps have -Z in the center column and +X right of it; :func:`from_published` and :func:`to_published`
+The published maps have -Z at the horizontal center and +X right of it; :func:`from_published` and :func:`to_published`
 convert.  Maps of this package are those of :mod:`reli3d.render.latlong`.
 """
 
@@ -26,7 +26,7 @@ NORM2_MIN = 1.0e-20  # squared length: keeps the gradient of the square root fin
 
 
 def from_published(maps: Tensor) -> Tensor:
-    """Lat-long maps ``(..., H, 2H, C)`` with -Z in the center column, as published, in our mapping; H even."""
+    """Lat-long maps ``(..., H, 2H, C)`` with -Z at the horizontal center, as published, in our mapping; H even."""
     return quarter_turn(maps, -1)
 
 
@@ -180,7 +180,7 @@ class EnvironmentDecoder(nn.Module):
         *,
         z_rotation: Tensor | None = None,
     ) -> Tensor:
-        """Linear radiance ``(B, H, 2H, 3)``, row 0 +Y, the center column +X.
+        """Linear radiance ``(B, H, 2H, 3)``, upper edge +Y, horizontal center +X.
 
         latent: ``(B, L, 3)``.  rotation: ``(B, 3, 3)`` applied to every latent.  strength: ``(B,)``, natural logarithm
         of a factor.  z_rotation: ``(B,)`` radians; rotates the map by twice this angle, as published.

@@ -134,7 +134,7 @@ def _draw(
         DEFAULT, samples=(each,) * 3, seed=options.seed, antithetic="none", diffuse_model=options.diffuse_model
     )
     plan, offsets = sampling_plan(options, scene)
-    light = struct_of_light(environment.radiance.contiguous(), environment.table, offsets.to(device))
+    light = struct_of_light(environment.radiance.contiguous(), environment.cdf, offsets.to(device))
     pixels = torch.arange(n, dtype=torch.int32, device=device)
     ins = [struct_of_points([v.contiguous() for v in values], pixels), light, plan]
     origins, directions, value, density = (

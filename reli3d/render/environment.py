@@ -1,6 +1,6 @@
-"""Distant light as a lat-long map: lookup with gradients, importance table, sampling.
+"""Distant lighting as a lat-long map: lookup with gradients, importance sampling by a piecewise-constant CDF.
 
-The mapping is that of :mod:`reli3d.render.latlong`: row 0 is +Y, the center column +X, right of it +Z.
+The mapping is that of :mod:`reli3d.render.latlong`: upper edge +Y, horizontal center +X, +Z right of it.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ _LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709
 
 
 @dataclass(frozen=True)
-class EnvironmentTable:
-    """Piecewise-constant density over the texels.
+class EnvironmentCDF:
+    """Importance-sampling CDF of an environment: a density that is constant over each texel.
 
-    rows: ``(2, H + 1)``, CDF over rows and the height (cosine with +Y) of their edges.  columns: ``(H, W + 1)`` CDF
-    within each row.  row_guide ``(1, H)`` and column_guide ``(H, W)``: int32, where to start the search.  density:
-    ``(H, W)`` [1/sr].
+    rows: ``(2, H + 1)``, the CDF over rows, and y = cos(theta) of their edges.  columns: ``(H, W + 1)``, the CDF within
+    each row.  row_guide ``(1, H)`` and column_guide ``(H, W)``: int32, where to start the search.  density: ``(H, W)``
+    [1/sr].
     """
 
     rows: Tensor
@@ -60,11 +60,11 @@ class EnvironmentTable:
 class Environment:
     """Distant lighting as a lat-long map ``radiance (H, W, 3)``, normally W = 2 H, linear Rec. 709 radiance.
 
-    Row 0 is +Y, the center column +X, +Z right of it.  Methods: ``.lookup(directions)``, ``.rotated(yaw)`` [rad],
-    ``.resized(height)``, ``.sample(u)``, ``.pdf(directions)``, ``.irradiance()``.  Gradients reach the texels.  The
-    importance sampling table is built on first use, so ``radiance`` must not be modified in place afterwards: in
-    optimization construct a new Environment in every step.  Negative values are rejected only when a file is written:
-    optimize the logarithm, or clamp.  Raises
+    The upper edge is +Y, the horizontal center (the border of columns W/2 - 1 and W/2) is +X, and +Z is right of it.
+    Methods: ``.lookup(directions)``, ``.rotated(yaw)`` [rad], ``.resized(height)``, ``.sample(u)``,
+    ``.pdf(directions)``, ``.irradiance()``.  Gradients reach the texels.  The importance-sampling CDF is computed on
+    first use, so ``radiance`` must not be modified in place afterwards: in optimization construct a new Environment in
+    every step.  Negative values are rejected only when a file is written: optimize the logarithm, or clamp.  Raises
     TypeError for a dtype, ValueError for a shape.
 
     >>> light = reli3d.Environment(torch.rand(16, 32, 3))
@@ -86,7 +86,7 @@ class Environment:
         return cls(rgb.expand(height, 2 * height, 3).contiguous())
 
     def to(self, device: torch.device | str) -> Environment:
-        """The environment on ``device``; ``self``, with its table, if it is already there."""
+        """The environment on ``device``; ``self``, with its CDF, if it is already there."""
         return self if torch.device(device) == self.radiance.device else Environment(self.radiance.to(device))
 
     def detach(self) -> Environment:
@@ -141,11 +141,11 @@ class Environment:
 
     @cached_property
     @full_precision
-    def table(self) -> EnvironmentTable:
-        """Importance table; a texel's weight is the integral of the bilinear luminance over it.
+    def cdf(self) -> EnvironmentCDF:
+        """Importance-sampling CDF; the weight of a texel is the integral of the bilinear luminance over it.
 
-        That integral is the map filtered by (1/8, 3/4, 1/8) along each axis, so wherever the lookup is positive the
-        density is too.  A black map gives the uniform sphere.  Raises ValueError for a texel that is not finite.
+        That integral is the luminance filtered by (1/8, 3/4, 1/8) along each axis, so wherever the lookup is positive
+        the density is too.  A black map gives the uniform sphere.  Raises ValueError for a texel that is not finite.
         """
         radiance = self.radiance.detach().double()
         if not bool(torch.isfinite(radiance).all()):
@@ -163,19 +163,19 @@ class Environment:
         weight = torch.where(per_row[:, None] > 0.0, weight, torch.ones_like(weight))  # an empty row is never chosen
         columns, rows = _cdf(weight), _cdf(per_row[None])
         heights = torch.cos(torch.linspace(0.0, torch.pi, height + 1, dtype=torch.float64, device=value.device))
-        # from the rounded tables, so that density and samples agree to the last bit
+        # from the rounded CDFs, so that density and samples agree to the last bit
         density = rows.double().diff()[0][:, None] * columns.double().diff() / angle[:, None]
-        return EnvironmentTable(
+        return EnvironmentCDF(
             torch.cat([rows, heights[None].float()]), columns, _guide(rows), _guide(columns), density.float()
         )
 
     def sample(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """Directions ``(..., 3)`` and density ``(...)`` [1/sr] for uniform ``u (..., 2)`` in [0, 1).  No gradient."""
         check("u", u, last=2, like=self.radiance)
-        flat, table = u.detach().reshape(-1, 2).contiguous(), self.table
+        flat, cdf = u.detach().reshape(-1, 2).contiguous(), self.cdf
         n = flat.shape[0]
         directions, pdf = empty((n,), wp.vec3, flat.device), empty((n,), wp.float32, flat.device)
-        args = [*table.sampler, (table.density, wp.float32), (flat, wp.vec2), (directions, wp.vec3), (pdf, wp.float32)]
+        args = [*cdf.sampler, (cdf.density, wp.float32), (flat, wp.vec2), (directions, wp.vec3), (pdf, wp.float32)]
         launch(kernels.sample_envmap_kernel, n, args, flat.device)
         return directions.reshape(*u.shape[:-1], 3), pdf.reshape(u.shape[:-1])
 
@@ -184,7 +184,7 @@ class Environment:
         check("directions", directions, last=3, like=self.radiance)
         flat = directions.detach().reshape(-1, 3).contiguous()
         pdf = empty((flat.shape[0],), wp.float32, flat.device)
-        args = [(self.table.density, wp.float32), (flat, wp.vec3), (pdf, wp.float32)]
+        args = [(self.cdf.density, wp.float32), (flat, wp.vec3), (pdf, wp.float32)]
         launch(kernels.pdf_envmap_kernel, flat.shape[0], args, flat.device)
         return pdf.reshape(directions.shape[:-1])
 

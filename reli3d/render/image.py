@@ -34,8 +34,9 @@ class Render:
     radiance: ``(H, W, 3)`` linear Rec. 709, mean over all subpixels: premultiplied by alpha with a transparent
     background, composited with ``background="environment"``.  alpha: ``(H, W)`` coverage of the object in [0, 1], with
     either background.  The G-buffers are means over the covered subpixels: base_color ``(H, W, 3)`` linear; roughness,
-    metallic ``(H, W)``; normal ``(H, W, 3)`` shading normal, unit, world; position ``(H, W, 3)`` world; depth
-    ``(H, W)`` along the viewing axis.  Where alpha is 0, depth is inf and the others 0.
+    metallic ``(H, W)``; normal ``(H, W, 3)`` shading normal in the world frame, normalized after averaging; position
+    ``(H, W, 3)`` world; depth ``(H, W)`` along the viewing axis.  Where alpha is 0, depth is inf and the other
+    G-buffers are 0.
 
     >>> image = reli3d.render_asset(asset, camera, light)
     >>> reli3d.write_image("image.png", image.rgba)
@@ -93,16 +94,22 @@ def render_asset(
 ) -> Render:
     """Renders ``asset`` under an environment with direct lighting and shadows.
 
-    asset: an :class:`Asset`, or a list of assets that shadow each other; without textures a gray dielectric.  camera: a
-    single camera.  environment: None uses that of the asset.  options: sample counts, seed and material model.
-    supersampling: subpixels per side of a pixel; sample counts are per subpixel.  shadows: whether occlusion of the
-    environment is traced.  background: ``transparent``, or ``environment``, which composites the environment behind the
-    object; then write ``image.radiance``, not ``image.rgba``.  scene: ray tracing structure of the assets (a
-    :class:`RayScene` of the mesh), built if None.  progress: called with the completed fraction.
+    asset: an :class:`Asset`, or a list of assets that shadow each other; an asset without textures is rendered as a
+    dielectric of base color 0.5 and roughness 0.5.  camera: a single camera.  environment: None: that of the first
+    asset that has one.  options: sample counts, seed and material model.  supersampling: k for k x k camera rays per
+    pixel, each shaded with the full sample counts.  shadows: whether shadow rays are traced.  background:
+    ``transparent``, or ``environment``, which composites the environment behind the object; then write
+    ``image.radiance``, not ``image.rgba``.  scene: a :class:`RayScene` of the mesh, for several assets of their meshes
+    concatenated in order; built if None.  progress: called with the completed fraction.
 
-    Gradients reach textures, normals, UV and environment as in :func:`shade`; silhouettes and shadows have none (see
-    :func:`antialias`).  Raises TypeError for a wrong type; ValueError if neither argument nor asset has an environment,
-    for another ``background``, a batch of cameras, or textures without ``mesh.uv``.
+    Gradients are those of :func:`surface_points` and :func:`shade` with the hit points (face and barycentric
+    coordinates) and visibility constant.  Radiance has gradients to the textures, the vertex normals, tangents and UV,
+    the texels of the environment and, without vertex normals, through the geometric normals to the vertices; the
+    G-buffers have gradients to the textures and the mesh, depth also to the camera.  ``alpha`` has none: silhouettes
+    and shadow boundaries do not contribute (see :func:`antialias`).
+
+    Raises TypeError for a wrong type; ValueError if neither argument nor asset has an environment, for another
+    ``background``, a batch of cameras, or textures without ``mesh.uv``.
 
     >>> camera = reli3d.Camera.from_fov(reli3d.look_at([0.0, 0.5, 3.0]), 0.7, 512, 512)
     >>> image = reli3d.render_asset(asset, camera, reli3d.Environment.constant(torch.ones(3)), supersampling=2)

@@ -1,6 +1,7 @@
 """Lat-long maps: directions of texels, texels of directions, solid angles.
 
-A map has H rows and W columns, normally W = 2 H.  Row 0 is +Y, the center column +X, +Z right of it:
+A map has H rows and W columns, normally W = 2 H.  The upper edge is +Y, the horizontal center (u = 1/2, for even W the
+border of columns W/2 - 1 and W/2) is +X, and +Z is right of it:
 with phi = 2 pi (u - 1/2) and theta = pi v the direction is (cos phi sin theta, cos theta, sin phi sin theta).  Texel
 centers are at u = (column + 1/2) / W, v = (row + 1/2) / H.  ``reli3d.kernels.envmap`` has the same mapping for kernels.
 """
@@ -45,8 +46,8 @@ def texel_solid_angles(height: int, width: int, device: torch.device | str = "cp
 def quarter_turn(maps: Tensor, quarters: int) -> Tensor:
     """``maps (..., H, W, C)`` with columns moved right by ``quarters`` quarters of the width.
 
-    -1 converts a map with center column -Z, as published, to center column +X.  Raises ValueError unless W is a
-    multiple of 4.
+    -1 converts a map with -Z at the horizontal center, as published, to one with +X there.  Raises ValueError unless W
+    is a multiple of 4.
     """
     width = maps.shape[-2]
     if width % 4:

@@ -43,8 +43,8 @@ def eval_bsdf(
     wo, wi: ``(..., 3)`` unit, local frame.  base_color: ``(..., 3)`` linear in [0, 1].  alpha: ``(...)`` GGX width,
     ``roughness**2``.  metallic: ``(...)`` in [0, 1].  All are tensors; leading axes broadcast.  diffuse_model: energy
     transmitted to the diffuse layer, ``conserving`` (1 - F of the surface on the way in and out; the albedo is at most
-    1) or ``published`` (1 - F of the microfacet, the formula of the published model's shader and of glTF 2.0's appendix
-    B).  Gradients reach all five tensors; that of ``alpha`` is 0 below ``ALPHA_MIN`` = 1e-3.  Raises TypeError unless
+    1) or ``published`` (1 - F of the microfacet, the formula of ReLi3D's shader and of glTF 2.0's appendix B).
+    Gradients reach all five tensors; that of ``alpha`` is 0 below ``ALPHA_MIN`` = 1e-3.  Raises TypeError unless
     float32, ValueError for a shape, a device or another model.  Source: glTF 2.0, appendix B; GGX of Walter et al. 2007
     with Smith's height-correlated masking.
 

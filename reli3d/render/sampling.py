@@ -85,8 +85,8 @@ def antithetic(u: Tensor) -> Tensor:
     ``((u1 + 1/2) mod 1, 1 - 2^-24 - u2)``: the partner is on the opposite side of the lobe.  Uniform if ``u`` is.  For
     multiples of 2^-24 the map is exact and its own inverse.  The mean of both samples has less variance than that of
     two independent ones if the integrand is nearly odd about the center of the lobe, as are derivatives in ``alpha``
-    and the normal. Samplers treat ``u`` as a constant, so gradients are not needed.  Raises TypeError unless float32,
-    ValueError for a shape.
+    and the normal.  Samplers treat ``u`` as a constant, so gradients are not needed.  Raises TypeError unless float32,
+    ValueError for a wrong shape.
 
     >>> partners = reli3d.antithetic(u)
     >>> first, second = (reli3d.sample_bsdf(wo, alpha, v) for v in (u, partners))

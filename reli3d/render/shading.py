@@ -28,7 +28,7 @@ from reli3d.geometry import embree
 from reli3d.geometry.rays import RayScene
 from reli3d.kernels import shade as kernels
 from reli3d.kernels import shade_rays as halves
-from reli3d.render.environment import Environment, EnvironmentTable
+from reli3d.render.environment import Environment, EnvironmentCDF
 from reli3d.render.material import DIFFUSE_MODELS, choice
 from reli3d.render.points import SurfacePoints, check_values, nan_where_not_finite, of_rows
 from reli3d.render.sampling import halton
@@ -45,7 +45,7 @@ GROUP_RAYS = 64  # of neighboring hits, traced together: so packets of 16 are fu
 
 
 class Samples(NamedTuple):
-    """Sample counts per point and strategy; the defaults are those of the paper.
+    """Sample counts per point and strategy; the defaults are those of the ReLi3D paper.
 
     light: importance sampling of the environment.  bsdf: GGX visible normals.  cosine: cosine-weighted hemisphere.
 
@@ -66,12 +66,13 @@ class ShadeOptions:
     gives independent noise.  In optimization use another seed in every step; the gradient of a squared residual of one
     rendering is biased, because its value and its derivative share the noise: for an unbiased gradient multiply the
     residuals of two renderings with different seeds.  antithetic: pairing of visible-normal samples: ``opposite``
-    (across the lobe, see :func:`reli3d.antithetic`), ``mirrored`` (about the surface normal, as published) or
-    ``none``.  heuristic: MIS weights, ``balance`` or ``power``.  sequence: ``halton`` (rotated per point and strategy)
-    or ``random``.  alpha: GGX width from roughness, ``squared`` or, as published, ``linear``.  diffuse_model:
-    ``conserving`` or ``published``, see :func:`reli3d.eval_bsdf`.  clamp: upper limit of one sample times the count of
-    its strategy, per channel; None: no limit.  check_inputs: raise ValueError for directions that are not unit and
-    materials outside [0, 1].  Raises ValueError for an invalid count or choice.
+    (opposite side of the lobe, see :func:`reli3d.antithetic`), ``mirrored`` (about the surface normal, as in ReLi3D) or
+    ``none``.  heuristic: MIS weights, ``balance`` or ``power``.  sequence: ``halton``, with a Cranley-Patterson
+    rotation per point and strategy, or ``random``.  alpha: GGX width from roughness r, ``squared`` (r^2) or, as in
+    ReLi3D, ``linear`` (r).  diffuse_model: ``conserving`` or ``published``, see :func:`reli3d.eval_bsdf`.  clamp: upper
+    limit, per channel, of the value f L cos w / p of a sample, before division by the count n of its strategy (f: BSDF,
+    L: radiance, w: MIS weight, p: density); None: no limit.  check_inputs: raise ValueError for directions that are not
+    unit or materials outside [0, 1].  Raises ValueError for an invalid count or choice.
 
     >>> fast = reli3d.ShadeOptions(samples=reli3d.Samples(light=4, bsdf=4, cosine=2), seed=1)
     >>> image = reli3d.render_asset(asset, camera, light, options=fast)
@@ -117,14 +118,14 @@ def shade(
 
     points: N points with their material.  wo: ``(N, 3)`` unit, world frame, to the viewer, or one row for all points.
     Faces seen from behind are shaded two-sided.  scene: occluders for shadow rays; None: no shadows.  options: sample
-    counts, seed and material model.  pixels: ``(N,)`` int32 counters of the random numbers; None: the row index.
-    Non-finite inputs of a point give NaN.
+    counts, seed and material model.  pixels: ``(N,)`` int32, the index that, with ``options.seed``, seeds the samples
+    of each point; None: the row index.  Non-finite inputs of a point give NaN.
 
-    Gradients reach normal, base_color, roughness, metallic and the texels of ``environment``; the samples are detached,
-    and positions and shadows have no gradient.  Only the component of the normal's gradient orthogonal to the normal is
-    meaningful.  Once differentiable.  Bitwise identical for any number of threads.  Raises TypeError for a wrong type
-    or dtype, ValueError for a shape or device.  Estimator: multiple importance sampling (Veach and Guibas 1995) of
-    :func:`reli3d.eval_bsdf`.
+    Gradients reach normal, base_color, roughness, metallic and the texels of ``environment``.  Sampled directions,
+    densities, MIS weights and visibility are constants of the backward pass; ``wo``, ``ng`` and ``position`` have no
+    gradient.  Only the component of the normal's gradient orthogonal to the normal is meaningful.  Once differentiable.
+    Bitwise identical for any number of threads.  Raises TypeError for a wrong type or dtype, ValueError for a wrong
+    shape or device.  Estimator: multiple importance sampling (Veach and Guibas 1995) of :func:`reli3d.eval_bsdf`.
 
     >>> points = reli3d.SurfacePoints(position, normal, normal, base_color=0.8, roughness=0.4, metallic=0.0)
     >>> radiance = reli3d.shade(points, wo, reli3d.Environment.constant(torch.ones(3)))
@@ -159,7 +160,7 @@ def _task(points, wo, environment, scene, options, pixels) -> tuple:
     values = shaded_arrays(points, wo, environment, scene, options)
     plan, offsets = sampling_plan(options, scene)
     n, device = len(points), points.position.device
-    job = _Job(plan, sum(options.samples), scene, environment.table, offsets.to(device), _nothing_known(device))
+    job = _Job(plan, sum(options.samples), scene, environment.cdf, offsets.to(device), _nothing_known(device))
     if pixels is None:
         pixels = torch.arange(n, dtype=torch.int32, device=device)
     check("pixels", pixels, like=points.position, dtype=torch.int32)
@@ -176,7 +177,7 @@ class _Job:
     plan: kernels.Plan
     count: int
     scene: RayScene | None
-    table: EnvironmentTable
+    cdf: EnvironmentCDF
     offsets: Tensor
     known: Tensor  # ``visible`` of the same hits and samples under another light, without columns for none
 
@@ -252,19 +253,19 @@ class _Shade(torch.autograd.Function):
 def _inputs(tensors: Sequence[Tensor], job: _Job) -> list:
     """Points and light as the kernels take them."""
     *values, radiance, pixels = tensors
-    return [struct_of_points(values, pixels), struct_of_light(radiance, job.table, job.offsets)]
+    return [struct_of_points(values, pixels), struct_of_light(radiance, job.cdf, job.offsets)]
 
 
 def struct_of_points(values: Sequence[Tensor], pixels: Tensor) -> kernels.Points:
-    """Contiguous arrays in the order of :func:`shaded_arrays`, and the counters."""
+    """Contiguous arrays in the order of :func:`shaded_arrays`, and the sample index of each point."""
     names = ("position", "normal", "ng", "wo", "base_color", "alpha", "metallic")
     kinds = [wp.vec3] * 5 + [wp.float32] * 2
     return struct_of(kernels.Points, **dict(zip(names, zip(values, kinds), strict=True)), pixel=(pixels, wp.int32))
 
 
-def struct_of_light(radiance: Tensor, table: EnvironmentTable, offsets: Tensor) -> kernels.Light:
-    """Contiguous texels, their table, and the points that all hits turn."""
-    rows, columns, row_guide, column_guide = table.sampler
+def struct_of_light(radiance: Tensor, cdf: EnvironmentCDF, offsets: Tensor) -> kernels.Light:
+    """Contiguous texels, their sampling CDF, and the low-discrepancy points, which each hit rotates."""
+    rows, columns, row_guide, column_guide = cdf.sampler
     return struct_of(
         kernels.Light,
         radiance=(radiance, wp.vec3),
@@ -272,7 +273,7 @@ def struct_of_light(radiance: Tensor, table: EnvironmentTable, offsets: Tensor) 
         columns=columns,
         row_guide=row_guide,
         column_guide=column_guide,
-        density=(table.density, wp.float32),
+        density=(cdf.density, wp.float32),
         points=(offsets, wp.vec2),
     )
 
@@ -329,7 +330,7 @@ def shaded_arrays(
 
 
 def sampling_plan(options: ShadeOptions, scene: RayScene | None) -> tuple[kernels.Plan, Tensor]:
-    """``options`` as the kernels read them, and the points that they rotate."""
+    """``options`` as the kernels read them, and the low-discrepancy points."""
     plan = kernels.Plan()
     plan.n_environment, plan.n_visible, plan.n_cosine = (int(k) for k in options.samples)
     plan.antithetic = CHOICES["antithetic"].index(options.antithetic)

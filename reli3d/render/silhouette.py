@@ -1,12 +1,13 @@
 """Antialiasing of silhouettes, differentiable in the vertices, for images sampled at the pixel centers.
 
 After Laine et al. 2020, Modular Primitives for High-Performance Differentiable Rendering, section 3.4: two neighboring
-pixels are blended where a silhouette crosses the line between their centers.  They find the edge by the triangle of a
-pixel, which fails for small triangles; here all crossings of edges with rows or columns of pixel centers are listed,
-and a ray tests whether each is visible.
+pixels are blended where a silhouette crosses the line between their centers.  Laine et al. look for the silhouette
+edge among those of the triangle at a pixel center, which misses edges of triangles smaller than a pixel.  Here all
+crossings of edges with rows and columns of pixel centers are listed, and a ray tests whether each is visible.
 
-Sums over an image have the exact derivative of the area.  The error of single pixels is 0.02 on average, that of
-gradients of square differences about 10 %.
+The sum over an image has the exact derivative of the covered area.  Against exact area coverage in [0, 1], pixels that
+a silhouette crosses have a mean absolute error of 0.01 to 0.03; the relative error of gradients of a sum of squared
+differences is about 10 %.
 """
 
 from __future__ import annotations

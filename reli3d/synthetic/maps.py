@@ -19,8 +19,8 @@ HELD_OUT_EVERY = 6  # every sixth map is held out of all training
 def load_maps(path: Path) -> tuple[Tensor, list[str]]:
     """Reads maps ``(n, 64, 128, 3)``, linear radiance, and their names from an ``.npz``.
 
-    The file has ``names`` and ``env (n, H, 2H, 3)``, linear, row 0 +Y, center column -Z, +X right of it.  The result is
-    area-averaged, in the layout of :mod:`reli3d.render.latlong`.  Raises InputError for any other file.
+    The file has ``names`` and ``env (n, H, 2H, 3)``, linear, upper edge +Y, horizontal center -Z, +X right of it.  The
+    result is area-averaged, in the layout of :mod:`reli3d.render.latlong`.  Raises InputError for any other file.
     """
     file_size(path)
     try:
@@ -36,7 +36,7 @@ def load_maps(path: Path) -> tuple[Tensor, list[str]]:
         raise InputError(path, f"names: expected {len(env)}, one a map, got {len(names)}")
     maps = torch.as_tensor(env.astype(np.float32)).permute(0, 3, 1, 2)
     maps = torch.nn.functional.interpolate(maps, (ROWS, 2 * ROWS), mode="area").permute(0, 2, 3, 1)
-    return quarter_turn(maps, -1).contiguous(), names  # the file has -Z in the center column
+    return quarter_turn(maps, -1).contiguous(), names  # the file has -Z at the horizontal center
 
 
 def held_out(names: list[str]) -> list[bool]:

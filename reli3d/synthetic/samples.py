@@ -154,7 +154,7 @@ def render_sample(
     pooled = torch.nn.functional.interpolate(
         (environment.radiance * exposure).permute(2, 0, 1)[None], (32, 64), mode="area"
     )
-    # stored with -Z in the center column, the format of samples since version 0.1
+    # stored with -Z at the horizontal center, the format of samples since version 0.1
     sample["environment"] = quarter_turn(pooled[0].permute(1, 2, 0), 1).clamp(max=6e4).half()
     if not views_only:
         sample.update(pixels=torch.stack(pixels).half(), pixel_radiance=torch.stack(pixel_radiance).half())

@@ -108,7 +108,7 @@ def load_sample(
         known = finish_known(file)[chosen]
         of_pixels = of_views("view_material").float() / 255
         normal, depth = of_views("view_normal").float() / 127, of_views("view_depth").float()
-        light = quarter_turn(file.get_tensor("environment").float(), -1)  # stored with -Z in the center column
+        light = quarter_turn(file.get_tensor("environment").float(), -1)  # stored with -Z at the horizontal center
     valid = depth > 0
     if augment and lights is not None and rng.random() < RELIGHT_PROBABILITY:
         finish = Finish.draw(rng)

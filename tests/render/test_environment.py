@@ -1,4 +1,4 @@
-"""Environment maps: orientation, lookup with gradients, importance table."""
+"""Environment maps: orientation, lookup with gradients, importance sampling."""
 
 import math
 
@@ -23,7 +23,7 @@ def maps():
     sun = torch.rand(32, 64, 3, generator=g)
     sun[5, 9] = 1e6
     gap, line = torch.rand(32, 64, 3, generator=g), torch.rand(32, 64, 3, generator=g)
-    gap[10:14] = 0.0  # the filter of the table leaves two of them black
+    gap[10:14] = 0.0  # the filter of the CDF leaves two of them black
     line[11] = 0.0
     return {
         "one texel": one,
@@ -94,7 +94,7 @@ def test_samples_fall_on_texels_as_their_density_says(device, name):
     u = torch.rand(1_000_000, 2, generator=torch.Generator().manual_seed(chi2.MAPS.index(name))).to(device)
     density = env.pdf
     if name == "beside the sun":  # one sample in a thousand: numbers that leave out its row and both neighbours
-        rows, heights = env.table.rows.double()
+        rows, heights = env.cdf.rows.double()
         gap = float(rows[7] - rows[4])
         first = u[:, 0].double() * (1.0 - gap)
         u[:, 0] = torch.where(first < rows[4], first, first + gap).float().clamp(max=1.0 - 2.0**-24)
@@ -113,7 +113,7 @@ def test_samples_fall_on_texels_as_their_density_says(device, name):
         indexing="ij",
     )
     centers = grid.at(y.reshape(-1).double(), x.reshape(-1).double())[0].float()
-    assert torch.equal(env.pdf(centers).reshape(height, width), env.table.density)  # exactly 0 where nothing is lit
+    assert torch.equal(env.pdf(centers).reshape(height, width), env.cdf.density)  # exactly 0 where nothing is lit
 
 
 @pytest.mark.parametrize("name", maps())
@@ -150,7 +150,7 @@ def test_weights_are_bounded_so_no_sample_is_a_firefly(device, name):
     env = Environment(maps()[name].to(device))
     d, pdf = env.sample(torch.rand(50_000, 2, generator=torch.Generator().manual_seed(6)).to(device))
     weight = env.lookup(d) @ torch.tensor([0.2126, 0.7152, 0.0722], device=device) / pdf
-    # a bilinear value is at most its texel's four corners; the table holds at least (1/8)^2 of each
+    # a bilinear value is at most its texel's four corners; the CDF holds at least (1/8)^2 of each
     assert float(weight.max()) <= 16.5 * float(weight.mean())
 
 
@@ -160,7 +160,7 @@ def test_table_of_a_black_map_is_the_uniform_sphere_and_bad_texels_are_named(dev
     bad = torch.zeros(4, 8, 3, device=device)
     bad[1, 2, 0] = float("nan")
     with pytest.raises(ValueError, match="radiance: expected finite"):
-        _ = Environment(bad).table
+        _ = Environment(bad).cdf
     with pytest.raises(ValueError, match="radiance: expected"):
         Environment(torch.zeros(0, 8, 3, device=device))
     assert Environment(torch.ones(2, 4, 3, device=device)).lookup(torch.zeros(0, 3, device=device)).shape == (0, 3)

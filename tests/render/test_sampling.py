@@ -170,7 +170,7 @@ def test_map_samples_return_to_the_numbers_they_came_from(device):
     map_ = torch.rand(17, 33, 3, generator=torch.Generator().manual_seed(3)) ** 4
     env, u = Environment(map_.to(device)), uniform(20_000, device)
     d = env.sample(u)[0].double()
-    rows, columns = env.table.rows[0].double(), env.table.columns.double()
+    rows, columns = env.cdf.rows[0].double(), env.cdf.columns.double()
     across = (torch.atan2(d[:, 2], d[:, 0]) / (2 * math.pi) + 0.5) * 33
     down = torch.acos(d[:, 1].clamp(-1, 1)) / math.pi * 17
     r, c = down.long().clamp(0, 16), across.long().clamp(0, 32)

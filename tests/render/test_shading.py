@@ -237,7 +237,7 @@ def test_gradient_is_that_of_the_estimator_where_the_samples_stand_still(device,
 
     def loss(normal, base, roughness, metallic, radiance):
         env = Environment(radiance)
-        object.__setattr__(env, "table", table)  # the light's own change must not move the samples either
+        object.__setattr__(env, "cdf", cdf)  # the light's own change must not move the samples either
         got = shade(
             *at(normal, normal, normal, wo, base, roughness, metallic),
             env,
@@ -245,7 +245,7 @@ def test_gradient_is_that_of_the_estimator_where_the_samples_stand_still(device,
         )
         return (got * weight).double().sum()
 
-    table, clamp = Environment(inputs[4].detach()).table, None
+    cdf, clamp = Environment(inputs[4].detach()).cdf, None
     if clamped:  # the middle one of single samples
         normal, *rest = (v.detach() for v in inputs)
         single = shade(

@@ -59,7 +59,7 @@ def fitted(
     missing = [p for p in files if f"{p.stem}.latent" not in known]
     for done, path in enumerate(missing):
         with safe_open(path, "pt") as file:
-            light = quarter_turn(file.get_tensor("environment").float(), -1)  # stored with -Z in the center column
+            light = quarter_turn(file.get_tensor("environment").float(), -1)  # stored with -Z at the horizontal center
         found = fit_latent(decoder, light.to(decoder.sample_directions.device), steps=steps)
         known[f"{path.stem}.latent"], known[f"{path.stem}.strength"] = found.latent.cpu(), found.strength.cpu()
         if done % 16 == 15:
