@@ -52,6 +52,6 @@ for step in range(args.steps):
 
 side = reli3d.Camera.from_fov(reli3d.look_at([0.0, 3.0, 0.5]), 0.9, args.size, args.size)
 error = (image(asset.detach(), side, 1) - image(reference, side, 1)).square().mean().sqrt()
-print(f"root mean square error from a new side: {error:.4f}")
+print(f"root mean squared error from a new side: {error:.4f}")
 reli3d.write_image(args.output / "found.png", color.detach().sigmoid())
 reli3d.write_image(args.output / "true.png", checker)

@@ -279,16 +279,18 @@ def default_normalization(preset: Preset | LocalPreset) -> str:
 class ReconstructOptions:
     """Options of :func:`reconstruct`.
 
-    texture_size: texels per side, 256 to 4096.  resolution: cubes per side of the surface grid, 16 to 256; None: of the
-    preset.  normalization: how the object is placed in the model's cube: ``hull`` (centered and scaled by the visual
-    hull), ``none`` (poses as stored), ``auto`` (hull unless the object already fits), or a
-    :class:`~reli3d.views.similarity.Similarity` from the input to the model frame; None: ``auto``, for official weights
-    ``none``.  up: axis of the cameras' world frame that becomes +Y, ``x``, ``y``, ``z`` or one with a minus sign.  uv:
-    ``project`` or ``xatlas``.  hero: index of the reference view.  background: input of the lighting estimate:
-    ``masked`` (object only), ``visible`` or ``auto``.  seed: of torch's generator, and of the refinement of
-    ``reli3d-infer --refine``; the networks draw no random numbers, so it does not change a reconstruction.  symmetry:
-    ``auto`` completes objects with a detected mirror plane (small network only), or ``off``.  Raises InputError for a
-    value out of range.
+    texture_size: texels per side, 256 to 4096.  resolution: cubes per side of the FlexiCubes grid, 16 to 256; None: the
+    value of the network's preset.  normalization: how the object is placed in the cube of the network.  ``hull``: the
+    bounding box of the visual hull is centered and its longest side scaled to 1.  ``none``: poses as stored.  ``auto``:
+    by ``views.object_box`` if there is one; else poses as stored if the visual hull fits the cube; else ``hull``.  A
+    :class:`~reli3d.views.similarity.Similarity`: this map from the input to the model frame.  None: ``auto``, for the
+    published network ``none``.  up: axis of the cameras' world frame that becomes +Y, ``x``, ``y``, ``z`` or one with a
+    minus sign.  uv: method of unwrapping, ``project`` or ``xatlas``.  hero: index of the reference view.  background:
+    image region that the lighting estimate reads, ``masked`` (the object only), ``visible`` (the background too) or
+    ``auto`` (``visible`` if all views have a background and the weights were trained with it, else ``masked``).  seed:
+    of torch's generator, and of the refinement of ``reli3d-infer --refine``; the networks draw no random numbers, so it
+    does not change a reconstruction.  symmetry: ``auto`` completes objects with a detected mirror plane (bundled
+    network only), or ``off``.  Raises InputError for a value out of range.
 
     >>> options = reli3d.ReconstructOptions(texture_size=512, symmetry="off")
     >>> asset = reli3d.reconstruct(reli3d.load_views("photos/shoe"), options=options)
@@ -347,10 +349,10 @@ def reconstruct(views: Views, *, weights: str | Network = "small", device: str =
                 options: ReconstructOptions = DEFAULT, watch: Stopwatch | None = None) -> Asset:  # fmt: skip
     """Reconstructs a relightable asset from posed images of one object.
 
-    views: 1 to 16, see :func:`reli3d.load_views`.  weights: ``small`` (bundled), ``official`` (after ``reli3d
-    download``), the path of a safetensors file, or a loaded network.  device: ``cpu`` or ``cuda``, ignored for a loaded
-    network; the asset is on the device of the network.  options: see :class:`ReconstructOptions`.  watch: receives the
-    seconds of each stage.
+    views: 1 to 16, see :func:`reli3d.load_views`.  weights: ``small`` (the bundled network), ``official`` (the
+    published ReLi3D network, after ``reli3d download``), the path of a safetensors file, or a loaded network.  device:
+    ``cpu`` or ``cuda``, ignored for a loaded network; the asset is on the device of the network.  options: see
+    :class:`ReconstructOptions`.  watch: receives the seconds of each stage.
 
     The asset is in the frame of the cameras, in their units, with ``options.up`` as +Y.  Deterministic.  Runs under
     ``torch.no_grad``, so nothing has gradients; :func:`refine` optimizes the result.  Raises TypeError unless ``views``
@@ -407,15 +409,19 @@ def reconstruct_placed(placed: Placed, model: Network, options: ReconstructOptio
 def refine(asset: Asset, views: Views, *, seconds: float | None = None, steps: int | None = None, **options) -> Asset:
     """Refines mesh, maps and lighting of ``asset`` by inverse rendering of ``views``.
 
-    Some views are held out; parts of the fit that increase their error are discarded.
+    Of fewer than 3 views none is held out, of fewer than 12 one, else two.  Material (base color, roughness, metallic,
+    shading normals) and lighting get blend weights between start and fit, 1, 1/2 or 0, on the fitted surface: the first
+    combination, in a fixed order from the complete fit to the surface alone, whose mean PSNR in the fitted, the
+    held-out and all views is not lower than that of the start, within a small tolerance.  If there is none, the result
+    is ``asset``.
 
     views: any number, in the frame of ``asset``: that of the cameras unless ``ReconstructOptions.up`` changed it.
     seconds, steps: duration of the optimization, one of the two; ``steps`` is reproducible.  options: of
     :func:`reli3d.fit.refine.refine`.  Returns a new asset without gradients.  Raises TypeError for a wrong type,
     ValueError unless exactly one of ``seconds`` and ``steps`` is given.
 
-    >>> views = reli3d.load_views("photos/shoe")
-    >>> asset = reli3d.refine(reli3d.reconstruct(views), views, seconds=60)
+    >>> views = reli3d.load_views("photos/shoe", every=True)
+    >>> asset = reli3d.refine(reli3d.reconstruct(views.taken()), views, seconds=60)
     """
     return refined(asset, views, seconds=seconds, steps=steps, **options).asset
 

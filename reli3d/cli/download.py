@@ -1,4 +1,4 @@
-"""``reli3d download``: fetches and converts the official weights."""
+"""``reli3d download``: fetches and converts the published ReLi3D network."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ COMMANDS = {  # module of reli3d.cli, purpose
     "check": ("checking", "check the cameras and masks of a folder without reconstruction"),
     "render": ("render", "views and turntables of a GLB under any light (also reli3d-render)"),
     "export": ("export", "convert a GLB to OBJ, USDZ or GLB, with fewer triangles or smaller textures"),
-    "download": ("download", "fetch and convert the official weights"),
+    "download": ("download", "fetch and convert the published ReLi3D network"),
     "data": ("data", "render training samples (also reli3d-data)"),
     "train": ("train", "train the network (also reli3d-train)"),
     "eval": ("eval", "evaluate the network on held-out objects (also reli3d-eval)"),

@@ -20,27 +20,35 @@ def parser() -> argparse.ArgumentParser:
     )
     add_reading(p)
     p.add_argument(
-        "--weights", default="small", help="small (bundled), official (see reli3d download), or a safetensors file"
+        "--weights",
+        default="small",
+        help="small: the bundled network (default); official: the published ReLi3D network, after reli3d download; or "
+        "a safetensors file",
     )
     p.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="auto: cuda if available")
     p.add_argument(
         "--precision",
         choices=("float32", "bfloat16", "auto"),
-        help="compute dtype of the network's trunk; default float32, with official weights on CUDA bfloat16; auto: "
+        help="compute dtype of the network's trunk; default float32, for the published network on CUDA bfloat16; auto: "
         "bfloat16 if the processor has instructions for it",
     )
     p.add_argument("--texture-size", type=int, default=1024, help="texels per side, 256 to 4096 (default 1024)")
     p.add_argument(
-        "--resolution", type=int, help="cubes per side of the surface grid, 16 to 256 (default: of the preset)"
+        "--resolution", type=int, help="cubes per side of the FlexiCubes grid, 16 to 256 (default: of the preset)"
     )
     p.add_argument(
         "--normalize",
         choices=("auto", "hull", "none"),
-        help="hull: center and scale by the visual hull; none: camera poses as stored; auto: hull unless the object "
-        "already fits the model's cube; default auto, with official weights none",
+        help="hull: center and scale by the visual hull; none: camera poses as stored; auto: by object_box of "
+        "transforms.json, else none if the visual hull fits the network's cube, else hull; default auto, for the "
+        "published network none",
     )
     p.add_argument(
-        "--hero", type=int, default=0, metavar="N", help="reference view of the official network, counted from 0"
+        "--hero",
+        type=int,
+        default=0,
+        metavar="N",
+        help="index of the reference view of the published network (default 0)",
     )
     p.add_argument(
         "--background",
@@ -62,7 +70,8 @@ def parser() -> argparse.ArgumentParser:
         "--light",
         choices=("object", "camera", "per-group"),
         help="with --refine: the lighting is fixed to the object, moves with the camera (turntable, flash), or differs "
-        "between sub-folders of images; default: lighting in transforms.json, else object",
+        "between sub-folders of images; default: lighting in transforms.json, else object; --light of reli3d-render is "
+        "an environment file instead",
     )
     p.add_argument("--refine-cameras", action="store_true", help="with --refine: optimize the cameras as well")
     where = p.add_mutually_exclusive_group()
@@ -70,13 +79,13 @@ def parser() -> argparse.ArgumentParser:
         "--workers",
         type=int,
         metavar="N",
-        help="process N objects in parallel, each in a single-threaded process of 0.7 GiB with the bundled weights",
+        help="process N objects in parallel, each in a single-threaded process of 0.7 GiB with the bundled network",
     )
     where.add_argument(
         "--ray",
         metavar="ADDRESS",
-        help="process the objects on a Ray cluster: its address, auto for that of this machine, local to start one; "
-        "needs pip install 'reli3d[ray]'",
+        help="process the objects on a cluster of the framework Ray: auto for that of this machine, local to start "
+        "one, or an address; needs pip install 'reli3d[ray]'",
     )
     p.add_argument("--skip-existing", action="store_true", help="skip objects whose files are complete")
     return p

@@ -62,7 +62,7 @@ def asset_colors(asset, scene: RayScene, camera: Camera) -> tuple[Tensor, Tensor
 
 
 def square_error(color: Tensor, reference: Tensor) -> float:
-    """Mean square error of sRGB values ``(N, 3)`` in [0, 1], at least 1e-10."""
+    """Mean squared error of sRGB values ``(N, 3)`` in [0, 1], at least 1e-10."""
     return float((color - reference).square().mean().clamp(min=1e-10))
 
 
@@ -88,7 +88,7 @@ def evaluate(
 ) -> dict[str, float]:
     """Metrics of one object reconstructed from the first ``count`` views, compared in the last HELD_OUT_VIEWS.
 
-    ``*_mse``: mean square errors of the base color over the pixels that both silhouettes cover, absent if there are
+    ``*_mse``: mean squared errors of the base color over the pixels that both silhouettes cover, absent if there are
     none; ``single_*``: of the best constant color of the object.  ``empty``: 1 if the field has no surface; the IoU is
     then 0 and the other metrics are absent.  symmetry: as in :class:`~reli3d.pipeline.ReconstructOptions`.  Raises
     ValueError if the sample has too few views.
@@ -134,7 +134,7 @@ def evaluate(
 def summary(rows: list[dict[str, float]]) -> dict[str, float]:
     """Means over the objects that have the metric.
 
-    A mean square error gives two PSNRs [dB]: ``_psnr``, the mean over objects, which nearly uniform objects dominate;
+    A mean squared error gives two PSNRs [dB]: ``_psnr``, the mean over objects, which nearly uniform objects dominate;
     and ``_psnr_pooled``, that of the mean error, which colorful objects dominate.
     """
     out: dict[str, float] = {"objects": len(rows)}

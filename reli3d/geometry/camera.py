@@ -31,10 +31,10 @@ DEPTH_RATIO_MIN = (
 class Camera:
     """One pinhole camera, or a batch of cameras with the same image size.
 
-    c2w: ``(..., 4, 4)`` float32 camera-to-world, OpenGL axes: +X right, +Y up, looks along -Z.  intrinsics:
-    ``(..., 4)`` float32 as ``fx, fy, cx, cy`` in pixels, y down, pixel centers at +0.5.  width, height: pixels, at
-    least 1.  The batch axes are equal.  Gradients pass through.  Raises TypeError for a dtype, ValueError for a shape,
-    size or device.
+    c2w: ``(..., 4, 4)`` float32 camera-to-world, OpenGL axes: +X right, +Y up, looks along -Z.  intrinsics: ``(...,
+    4)`` float32 as ``fx, fy, cx, cy`` in pixels, y down, pixel centers at +0.5.  width, height: pixels, at least 1.
+    The batch axes are equal.  Gradients pass through.  Raises TypeError for a wrong dtype, ValueError for a wrong
+    shape, size or device.
 
     >>> camera = reli3d.Camera.from_fov(reli3d.look_at([0.0, 0.5, 3.0]), 0.7, 64, 48)  # fov_x in radians
     >>> origins, directions = reli3d.camera_rays(camera)
@@ -64,7 +64,8 @@ class Camera:
 
         c2w: ``(..., 4, 4)`` float32 camera-to-world, such as from :func:`look_at`.  fov_x: full horizontal field of
         view in radians, in (0, pi); ``fx = fy = width / (2 tan(fov_x / 2))``.  width, height: pixels.  Gradients reach
-        ``c2w``.  Raises TypeError for a dtype, ValueError for a shape, size or field of view out of range.
+        ``c2w``.  Raises TypeError for a wrong dtype, ValueError for a wrong shape, or a size or field of view out of
+        range.
         """
         c2w = tensor_of(c2w)
         check("c2w", c2w, last=4)
@@ -193,8 +194,8 @@ def look_at(
     """Camera-to-world matrix ``(..., 4, 4)`` of a camera at ``eye`` that looks at ``target``, with ``up`` upwards.
 
     eye, target, up: ``(..., 3)`` float32 tensors or lists of numbers; batch axes broadcast.  Lists go to the device of
-    the first tensor.  Gradients reach all three.  Raises TypeError for a dtype, ValueError for a shape or if ``up`` is
-    parallel to the viewing direction.
+    the first tensor.  Gradients reach all three.  Raises TypeError for a wrong dtype, ValueError for a wrong shape or
+    if ``up`` is parallel to the viewing direction.
 
     >>> pose = reli3d.look_at([0.0, 0.5, 3.0], [0.0, 0.0, 0.0])
     >>> camera = reli3d.Camera.from_fov(pose, 0.7, 64, 48)

@@ -46,12 +46,12 @@ def cover_silhouettes(sdf: Tensor, bound: Tensor, distance: Tensor, camera: Came
         return sdf.detach().clone()
     sdf, bound, distance = (v.detach().contiguous() for v in (sdf, bound, distance))
     lowest = _lowest(sdf)
-    lacking = sdf.new_empty(views, height // STRIDE, width // STRIDE)
+    residual = sdf.new_empty(views, height // STRIDE, width // STRIDE)
     posed = (camera.c2w, wp.mat44), (camera.intrinsics, wp.vec4)
     cameras = [(v.detach().contiguous(), kind) for v, kind in posed]
     launch(
-        kernels.lacking_kernel,
-        lacking.numel(),
+        kernels.residual_kernel,
+        residual.numel(),
         [
             *((v, wp.float32) for v in (sdf, lowest, distance)),
             *cameras,
@@ -59,11 +59,11 @@ def cover_silhouettes(sdf: Tensor, bound: Tensor, distance: Tensor, camera: Came
             DEPTH,
             FIELD_MAX,
             STRIDE,
-            (lacking, wp.float32),
+            (residual, wp.float32),
         ],
         sdf.device,
     )
-    lacking = max_pool2d(lacking, 3, 1, 1)  # dilated by a ray, so that interpolation reaches the silhouette's edge
+    residual = max_pool2d(residual, 3, 1, 1)  # dilated by a ray, so that interpolation reaches the silhouette's edge
     lowered = torch.empty_like(sdf)
     launch(
         kernels.lower_kernel,
@@ -71,7 +71,7 @@ def cover_silhouettes(sdf: Tensor, bound: Tensor, distance: Tensor, camera: Came
         [
             (sdf, wp.float32),
             (bound, wp.float32),
-            (lacking, wp.float32),
+            (residual, wp.float32),
             *cameras,
             radius,
             FIELD_MAX,

@@ -19,9 +19,10 @@ from reli3d.kernels import hits as kernels
 class Hits:
     """First hits of rays, from :meth:`reli3d.RayScene.intersect`.
 
-    face: ``(...)`` int32, -1 for a miss.  t: ``(...)`` in lengths of the ray direction, inf for a miss.  bary:
-    ``(..., 2)`` weights of the face's vertices 1 and 2, with ``1 - b1 - b2`` for vertex 0; 0 for a miss.  valid:
-    ``face >= 0``.  ``t`` and ``bary`` have gradients to the rays, and to the vertices passed to ``intersect``.
+    face: ``(...)`` int32, -1 for a miss.  t: ``(...)`` ray parameter, the hit being at ``origin + t * direction``; inf
+    for a miss.  bary: ``(..., 2)`` weights of the face's vertices 1 and 2, with ``1 - b1 - b2``
+    for vertex 0; 0 for a miss.  valid: ``face >= 0``.  ``t`` and ``bary`` have gradients to the rays, and to the
+    vertices passed to ``intersect``.
 
     >>> hits = reli3d.RayScene(mesh).intersect(origins, directions)
     >>> points = reli3d.surface_points(mesh, None, hits.face[hits.valid], hits.bary[hits.valid])

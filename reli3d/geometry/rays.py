@@ -31,8 +31,8 @@ class RayScene:
     Degenerate faces are never hit; without faces every ray misses.  backend: ``embree`` (CPU, robust mode), ``warp``
     (CPU and CUDA), or ``auto``: Embree on the CPU, where it is about 3 times faster than Warp on incoherent rays, and
     Warp on CUDA, where the BVH is built on the host.  :meth:`refit` updates moved vertices.  For gradients to the
-    vertices pass them to :meth:`intersect`.  Raises TypeError for a wrong type or dtype; ValueError for a shape, an
-    index out of range, vertices that are not finite, or ``embree`` on CUDA.
+    vertices pass them to :meth:`intersect`.  Raises TypeError for a wrong type or dtype; ValueError for a wrong shape,
+    an index out of range, vertices that are not finite, or ``embree`` on CUDA.
 
     >>> scene = reli3d.RayScene(mesh)
     >>> hits = scene.intersect(origins, directions, vertices=mesh.vertices)
@@ -102,8 +102,8 @@ class RayScene:
 
         Gradients of ``t`` and ``bary`` reach origins, directions and vertices.  The choice of the face has none, so
         silhouettes need :func:`reli3d.antialias`.  ``origins + t * directions`` is the most accurate hit position.
-        Raises TypeError for a dtype; ValueError for a shape or device, or if ``vertices`` differ from the scene's.
-        Source: Moller and Trumbore 1997, in float64.
+        Raises TypeError for a wrong dtype; ValueError for a wrong shape or device, or if ``vertices`` differ from the
+        scene's.  Source: Moller and Trumbore 1997, in float64.
 
         >>> hits = scene.intersect(origins, directions, vertices=v)
         >>> points = origins[hits.valid] + hits.t[hits.valid][:, None] * directions[hits.valid]

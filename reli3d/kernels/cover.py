@@ -49,7 +49,7 @@ def out_of_block(cell: wp.vec3, along: wp.vec3, block: wp.vec3i) -> float:
 
 
 @wp.kernel
-def lacking_kernel(
+def residual_kernel(
     start: int,
     # in
     sdf: wp.array3d[float],
@@ -62,20 +62,21 @@ def lacking_kernel(
     field_max: float,
     stride: int,
     # out
-    uncovered: wp.array3d[float],  # (V, H // stride, W // stride)
+    residual: wp.array3d[float],  # (V, H // stride, W // stride)
 ):
-    """Excess over ``-depth`` of the minimum along a pixel's ray; 0 outside the silhouette and for minima of at least
-    ``field_max``.
+    """Coverage residual of a pixel: the amount by which the minimum of the field along its ray exceeds ``-depth``.
+
+    0 outside the silhouette, and for minima of at least ``field_max``.
     """
     n = start + wp.tid()
-    rows = uncovered.shape[1]
-    columns = uncovered.shape[2]
+    rows = residual.shape[1]
+    columns = residual.shape[2]
     view = n // (rows * columns)
     i = (n // columns) % rows
     j = n % columns
     x = (float(j) + 0.5) * float(stride)
     y = (float(i) + 0.5) * float(stride)
-    uncovered[view, i, j] = 0.0
+    residual[view, i, j] = 0.0
     if look_up(distance, view, x, y) > INSET_PIXELS:
         k = intrinsics[view]
         pose = c2w[view]
@@ -103,7 +104,7 @@ def lacking_kernel(
                     t += step
             t += step
         if least < field_max:
-            uncovered[view, i, j] = wp.max(least + depth, 0.0)
+            residual[view, i, j] = wp.max(least + depth, 0.0)
 
 
 @wp.kernel
@@ -112,7 +113,7 @@ def lower_kernel(
     # in
     sdf: wp.array3d[float],
     bound: wp.array3d[float],
-    uncovered: wp.array3d[float],
+    residual: wp.array3d[float],
     c2w: wp.array[wp.mat44],
     intrinsics: wp.array[wp.vec4],
     radius: float,
@@ -121,7 +122,7 @@ def lower_kernel(
     # out
     lowered: wp.array3d[float],
 ):
-    """Field minus the largest excess of the rays through a point, clamped from below to ``bound``."""
+    """Field minus the largest coverage residual of the rays through a point, clamped from below to ``bound``."""
     n = start + wp.tid()
     z = n % sdf.shape[2]
     y = (n // sdf.shape[2]) % sdf.shape[1]
@@ -137,8 +138,8 @@ def lower_kernel(
         most = wp.float32(0.0)
         for view in range(c2w.shape[0]):
             q = project_point(p, c2w[view], intrinsics[view]) / float(stride)
-            inside = q[0] > 0.0 and q[0] < float(uncovered.shape[2]) and q[1] > 0.0 and q[1] < float(uncovered.shape[1])
+            inside = q[0] > 0.0 and q[0] < float(residual.shape[2]) and q[1] > 0.0 and q[1] < float(residual.shape[1])
             if inside and q[2] > 0.0:
-                most = wp.max(most, look_up(uncovered, view, q[0], q[1]))
+                most = wp.max(most, look_up(residual, view, q[0], q[1]))
         value = wp.max(value - most, bound[x, y, z])
     lowered[x, y, z] = value

@@ -11,11 +11,12 @@ NO_SITE_ROWS = wp.constant(65536.0)  # rows to the site of a column that has non
 def lower_envelope(row: wp.array[Any], y: int, apex: wp.array[wp.int32], begin: wp.array[float]) -> int:
     """Lower envelope of the parabolas ``(x - q)^2 + (row[q] - y)^2`` of the columns q of row ``y``.
 
-    Written: ``apex``, the columns whose parabola is lowest somewhere, ascending, and ``begin``, the x from which on it
-    is.  Returned: the index of the last one, -1 without any.  Felzenszwalb and Huttenlocher 2012, Distance Transforms
-    of Sampled Functions.
+    Writes to ``apex`` the columns of the parabolas of the envelope, ascending, and to ``begin`` the x at which each
+    becomes the lowest.  Returns the index of the last of them, -1 if there is none.  Felzenszwalb and Huttenlocher
+    2012, Distance Transforms of Sampled Functions.
 
-    row: that of the nearest site in each column; ``NO_SITE_ROWS`` or more from every row where there is none.
+    row: row of the nearest site in each column; in a column without a site, a value at least ``NO_SITE_ROWS`` from
+    every row.
     """
     top = wp.int32(-1)
     for q in range(row.shape[0]):

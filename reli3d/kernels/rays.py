@@ -1,8 +1,8 @@
 """Rays against a triangle mesh: closest face, occlusion, origins that leave their own face.
 
 ``bary`` are the weights of vertices 1 and 2 of a face.  Warp's u and v are those of vertices 0 and 1: converted here
-only.  A ray with a NaN, an infinity or no direction misses.  ``t`` counts in lengths of the direction; a hit at
-``t_max`` is none.
+only.  A ray with a NaN, an infinity or no direction misses.  ``t`` is the ray parameter; the
+direction is not normalized.  A hit at ``t_max`` counts as a miss.
 """
 
 import warp as wp

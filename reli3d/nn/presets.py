@@ -187,7 +187,7 @@ class LocalPreset(_Checked):
     light: LightMapSizes
     view_width: int  # pooled features of the views at a point
     head_width: int
-    resolution: int  # cubes along each side of the surface grid
+    resolution: int  # cubes along each side of the FlexiCubes grid
     radius: float = 0.87  # half side of the model's cube
     softness: float = 0.02  # unit of the signed distance: occupancy is sigmoid(-distance / softness)
     offset_one_view: float = 0.0  # outward offset of the surface, in units of softness; see reli3d.train.calibrate
@@ -213,7 +213,7 @@ class Preset(_Checked):
     head_width: int
     illumination: IlluminationSizes
     reni: ReniSizes
-    resolution: int  # cubes along each side of the surface grid
+    resolution: int  # cubes along each side of the FlexiCubes grid
     radius: float = 0.87  # half side of the model's cube
     density_threshold: float = 10.0  # the surface is where exp(raw + density_bias) has this value
     density_bias: float = -1.0

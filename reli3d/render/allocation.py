@@ -64,8 +64,8 @@ def plan_samples(
     relative: of the variances divided by the squared radiance.  The variance of any split is estimated from a pilot of
     PILOT_SAMPLES samples.  For images, not for optimization: a plan may omit a strategy that gradients need.
 
-    No gradient.  Deterministic for a given seed.  Raises TypeError for a dtype, ValueError for a shape, device, count,
-    choice or values that are not finite.
+    No gradient.  Deterministic for a given seed.  Raises TypeError for a wrong dtype, ValueError for a wrong shape,
+    device, count, choice or values that are not finite.
     """
     values = [v.detach() for v in shaded_arrays(points, wo, environment, scene, options)]
     if len(points) == 0:

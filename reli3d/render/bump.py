@@ -17,7 +17,7 @@ def radial_bump(position: Tensor, normal: Tensor, bump: Tensor) -> Tensor:
 
     position: ``(..., 3)`` model frame.  normal: ``(..., 3)`` unit, geometric.  The tangent is ``y x position``,
     orthogonalized to the normal, the bitangent ``normal x tangent``.  Gradients reach ``bump`` only, as published.
-    Raises ValueError for a shape or device.
+    Raises ValueError for a wrong shape or device.
     """
     position, normal = position.detach(), normal.detach()
     values = (position, normal, bump)

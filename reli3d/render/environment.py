@@ -65,7 +65,7 @@ class Environment:
     ``.pdf(directions)``, ``.irradiance()``.  Gradients reach the texels.  The importance-sampling CDF is computed on
     first use, so ``radiance`` must not be modified in place afterwards: in optimization construct a new Environment in
     every step.  Negative values are rejected only when a file is written: optimize the logarithm, or clamp.  Raises
-    TypeError for a dtype, ValueError for a shape.
+    TypeError for a wrong dtype, ValueError for a wrong shape.
 
     >>> light = reli3d.Environment(torch.rand(16, 32, 3))
     >>> radiance = light.rotated(0.5).lookup(torch.tensor([0.0, 1.0, 0.0]))

@@ -45,8 +45,8 @@ def eval_bsdf(
     transmitted to the diffuse layer, ``conserving`` (1 - F of the surface on the way in and out; the albedo is at most
     1) or ``published`` (1 - F of the microfacet, the formula of ReLi3D's shader and of glTF 2.0's appendix B).
     Gradients reach all five tensors; that of ``alpha`` is 0 below ``ALPHA_MIN`` = 1e-3.  Raises TypeError unless
-    float32, ValueError for a shape, a device or another model.  Source: glTF 2.0, appendix B; GGX of Walter et al. 2007
-    with Smith's height-correlated masking.
+    float32, ValueError for a wrong shape or device, or an unknown model.  Source: glTF 2.0, appendix B; GGX of Walter
+    et al. 2007 with Smith's height-correlated masking.
 
     >>> up, half = torch.tensor([0.0, 0.0, 1.0]), torch.tensor(0.5)
     >>> value = reli3d.eval_bsdf(up, torch.full((3,), 0.8), half, half, up)
@@ -72,7 +72,7 @@ def sample_bsdf(wo: Tensor, alpha: Tensor, u: Tensor, *, lobe: str = "visible") 
     ``visible`` and ``mirrored`` with the same ``u``, each sample weighted by the sum of both densities and the results
     added, because ``mirrored`` alone does not reach all directions.  Gradients reach ``wo`` and ``alpha``, but
     :func:`pdf_bsdf` has none: detach the directions to differentiate a Monte Carlo estimate.  Raises TypeError unless
-    float32, ValueError for a shape, a device or another lobe.  Source: Dupuy and Benyoub 2023.
+    float32, ValueError for a wrong shape or device, or an unknown lobe.  Source: Dupuy and Benyoub 2023.
 
     >>> wi = reli3d.sample_bsdf(wo, alpha, u).detach()
     >>> density = reli3d.pdf_bsdf(wo, alpha, wi).clamp(min=1e-12)  # 0 below the horizon, where the value is 0 too
@@ -95,7 +95,7 @@ def pdf_bsdf(wo: Tensor, alpha: Tensor, wi: Tensor, *, lobe: str = "visible") ->
     wo, wi: ``(..., 3)`` unit, local frame.  alpha: tensor ``(...)``, GGX width.  Leading axes broadcast.  lobe: as in
     :func:`sample_bsdf`.  No gradient, so detach ``wi`` to differentiate an estimate; :func:`pdf_ggx_vndf` has
     gradients.  The density is 0 where the value is 0: clamp it before dividing.  Raises TypeError unless float32,
-    ValueError for a shape, a device or another lobe.
+    ValueError for a wrong shape or device, or an unknown lobe.
 
     >>> wi = reli3d.sample_bsdf(wo, alpha, u)
     >>> density = reli3d.pdf_bsdf(wo, alpha, wi)

@@ -23,7 +23,8 @@ class SurfacePoints:
     position: ``(N, 3)``.  ng: ``(N, 3)`` geometric normal, unit, outward.  normal: ``(N, 3)`` shading normal, unit.
     base_color: ``(N, 3)`` linear, in [0, 1].  roughness: ``(N,)`` perceptual, in [0, 1].  metallic: ``(N,)`` in [0, 1].
     All but ``position`` may be a single row for all points, and the material a single number; fields have N rows after
-    construction.  Gradients pass through.  Raises TypeError for a type or dtype, ValueError for a shape or device.
+    construction.  Gradients pass through.  Raises TypeError for a wrong type or dtype, ValueError for a wrong shape or
+    device.
 
     >>> points = reli3d.SurfacePoints(position, normal, normal, base_color=0.8, roughness=0.4, metallic=0.0)
     >>> radiance = reli3d.shade(points, wo, light)

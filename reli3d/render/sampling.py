@@ -34,8 +34,8 @@ def sample_ggx_vndf(wo: Tensor, alpha: Tensor, u: Tensor) -> Tensor:
 
     wo: ``(..., 3)`` unit, z > 0; otherwise the samples are undefined, with density 0.  alpha: tensor ``(...)``, GGX
     width ``roughness**2`` in (0, 1], floored at 1e-3.  u: ``(..., 2)`` uniform in [0, 1).  Leading axes broadcast.
-    Gradients reach ``wo`` and ``alpha``; ``u`` is a constant.  Raises TypeError unless float32, ValueError for a shape
-    or device.  Source: Dupuy and Benyoub 2023, spherical caps.  Density: :func:`pdf_ggx_vndf`.
+    Gradients reach ``wo`` and ``alpha``; ``u`` is a constant.  Raises TypeError unless float32, ValueError for a wrong
+    shape or device.  Source: Dupuy and Benyoub 2023, spherical caps.  Density: :func:`pdf_ggx_vndf`.
 
     >>> wo, alpha = torch.tensor([0.6, 0.0, 0.8]), torch.tensor(0.25)
     >>> wm = reli3d.sample_ggx_vndf(wo, alpha, torch.rand(4096, 2))
@@ -60,7 +60,7 @@ def pdf_ggx_vndf(wo: Tensor, alpha: Tensor, wm: Tensor) -> Tensor:
     0 where ``wm`` faces away from ``wo``, and where either is below the surface.  wo, wm: ``(..., 3)`` unit, local
     frame.  alpha: tensor ``(...)``, GGX width ``roughness**2``.  Leading axes broadcast.  Gradients reach
     ``wo``, ``alpha`` and ``wm``.  Divide by ``4 wo.wm`` for the density of the reflected direction.  Raises TypeError
-    unless float32, ValueError for a shape or device.
+    unless float32, ValueError for a wrong shape or device.
 
     >>> wm = reli3d.sample_ggx_vndf(wo, alpha, u)
     >>> density = reli3d.pdf_ggx_vndf(wo, alpha, wm)
@@ -100,8 +100,8 @@ def tangent_frame(normal: Tensor) -> Tensor:
     """Rotations ``(..., 3, 3)`` to the local frame: rows tangent, bitangent, normal; ``local = frame @ world``.
 
     normal: ``(..., 3)`` unit.  Right-handed.  Continuous except at z = 0 from below.  Gradients reach ``normal``.
-    Raises TypeError unless float32, ValueError for a shape.  Source: Duff et al. 2017, Building an Orthonormal Basis,
-    Revisited.
+    Raises TypeError unless float32, ValueError for a wrong shape.  Source: Duff et al. 2017, Building an Orthonormal
+    Basis, Revisited.
 
     >>> frame = reli3d.tangent_frame(normal)
     >>> local, world = (frame @ wo[..., None])[..., 0], (frame.mT @ wi[..., None])[..., 0]
@@ -125,7 +125,7 @@ def reflect(wo: Tensor, wm: Tensor) -> Tensor:
     """Mirror reflection of ``wo`` about the microfacet normal ``wm``: ``2 (wo.wm) wm - wo``, ``(..., 3)``.
 
     wo, wm: ``(..., 3)`` unit, any common frame.  Gradients reach both.  Raises TypeError unless float32, ValueError for
-    a shape or device.
+    a wrong shape or device.
 
     >>> wm = reli3d.sample_ggx_vndf(wo, alpha, u)
     >>> wi = reli3d.reflect(wo, wm)

@@ -67,7 +67,7 @@ def blocked_transfer(mesh: Mesh, *, directions: int = 64, scene: RayScene | None
     Row i times the coefficients of a light (:func:`light_harmonics`) is the irradiance that is occluded at vertex i.
     mesh: with normals.  directions: over the whole sphere, on a spiral of equal areas and the same for all vertices, so
     that neighbors differ by their geometry alone.  scene: rays against the mesh, made here if None.  Exactly 0 where no
-    ray is hidden.  Raises TypeError, ValueError.
+    ray is hidden.  Raises TypeError for a wrong dtype, ValueError for a wrong shape or device.
     """
     normals = present("normals", mesh.normals).detach()
     check("vertices", mesh.vertices, last=3, like=normals)

@@ -69,8 +69,8 @@ class OccupancyGrid:
 class RaySamples:
     """Concatenated samples of N rays; ``first[i]`` to ``first[i + 1]`` are those of ray ``i``, in ascending ``t``.
 
-    ray: ``(S,)`` int32 index.  t: ``(S,)`` in lengths of the direction.  first: ``(N + 1,)`` int32.  step: spacing of
-    the samples.
+    ray: ``(S,)`` int32 index.  t: ``(S,)`` ray parameter; the direction is not normalized.  first: ``(N + 1,)`` int32.
+    step: spacing of the samples.
     """
 
     ray: Tensor
@@ -104,7 +104,7 @@ def march_rays(
     far: float = float("inf"),
     shift: Tensor | None = None,
 ) -> RaySamples:
-    """Samples in the occupied cells along N rays, at a spacing of ``step`` lengths of the direction.
+    """Samples in the occupied cells along N rays, at a spacing of ``step`` in the ray parameter t.
 
     origins, directions: ``(N, 3)``, directions usually unit.  near, far: limits of t.  shift: ``(N,)`` in [0, 1),
     position of the samples within their steps; None: 0.5; random numbers give an unbiased integral.  Rays that are not

@@ -106,7 +106,7 @@ def silhouette_scores(mesh: Mesh, sample: dict[str, Tensor], views: range) -> tu
 def mismatch(both: int, filled: int, masked: int) -> float:
     """``log(1 / recall - precision)`` of silhouettes of ``filled`` and ``masked`` pixels with ``both`` in common.
 
-    Equals the logarithm of the square error per common pixel of an image of constant color at its optimal brightness.
+    Equals the logarithm of the squared error per common pixel of an image of constant color at its optimal brightness.
     Unlike IoU it penalizes missing area more than excess area.  At most MAX_MISMATCH.
     """
     if both == 0:

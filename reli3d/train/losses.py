@@ -37,7 +37,7 @@ MAX_PERTURBATION = (
     0.3,
 )  # greatest deviation of position [model's cube] and normal [radian] of an extracted surface
 GRADIENT_POINTS, GRADIENT_STEP = 384, 0.012  # surface points with a gradient loss; finite-difference step, a grid cell
-PATTERN_FLOOR = 0.002  # mean square error added to that of a pattern: 27 dB
+PATTERN_FLOOR = 0.002  # mean squared error added to that of a pattern: 27 dB
 DEPTH_UNIT = 0.1  # of the object's longest side
 NORMALS = 192  # directions at which the irradiance is compared
 
@@ -129,7 +129,7 @@ def perturbed(position: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
 def excess_entropy(value: Tensor, target: Tensor) -> Tensor:
     """Cross-entropy of values in [0, 1] minus its minimum, the entropy of ``target``: 0 if they are equal.
 
-    The gradient of the mean square error vanishes where a sigmoid is near 0 or 1; that of the cross-entropy does not.
+    The gradient of the mean squared error vanishes where a sigmoid is near 0 or 1; that of the cross-entropy does not.
     """
     least = functional.binary_cross_entropy(target, target)
     return functional.binary_cross_entropy(value, target) - least
@@ -138,7 +138,7 @@ def excess_entropy(value: Tensor, target: Tensor) -> Tensor:
 def pattern_loss(color: Tensor, target: Tensor) -> Tensor:
     """Scale-invariant difference of base colors ``(N, 3)``, sRGB: ``log(1 + mse / PATTERN_FLOOR)``.
 
-    The mean square error is that of sRGB values after the best factor per channel in linear light, because exposure
+    The mean squared error is that of sRGB values after the best factor per channel in linear light, because exposure
     makes the absolute albedo ambiguous, but not its variation over the surface.  Gradients also flow through the
     factor.  The logarithm balances objects with weak and with strong patterns.
     """

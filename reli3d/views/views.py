@@ -47,11 +47,11 @@ class ViewBatch:
 
 @dataclass(frozen=True)
 class Views:
-    """``V`` posed images, which may have different sizes; view 0 is the reference view of the official network.
+    """``V`` posed images, which may have different sizes; view 0 is the reference view of the published network.
 
     images: V tensors ``(H, W, 3)``, float32 sRGB in [0, 1].  masks: V tensors ``(H, W)``, float32 alpha in [0, 1].
     c2w: ``(V, 4, 4)`` float32 rigid camera-to-world matrices, OpenGL axes.  intrinsics: ``(V, 4)`` as ``fx, fy, cx,
-    cy`` in pixels.  names: V file stems.  All on one device, without gradient.  Raises TypeError for a dtype,
+    cy`` in pixels.  names: V file stems.  All on one device, without gradient.  Raises TypeError for a wrong dtype,
     ValueError for shapes or devices that do not match.
 
     >>> views = reli3d.load_views("photos/shoe")

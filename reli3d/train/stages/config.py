@@ -18,13 +18,13 @@ RENDERERS = ("volume", "gaussians", "monte_carlo")
 class Weights:
     """Weights of the terms of :mod:`reli3d.train.stages.losses`; from the paper unless noted."""
 
-    image: float = 10.0  # mean square difference of display values
+    image: float = 10.0  # mean squared difference of display values
     perceptual: float = 2.0  # LPIPS, or its substitute
-    mask: float = 10.0  # cross-entropy of the volume's opacity; of a surface: mean square difference, not in the paper
-    material: float = 10.0  # mean square difference of base color, roughness, metallic
+    mask: float = 10.0  # cross-entropy of the volume's opacity; of a surface: mean squared difference, not in the paper
+    material: float = 10.0  # mean squared difference of base color, roughness, metallic
     normal: float = 4.0  # one minus the cosine
     flat: float = 0.05  # deviation of bump-mapped normals from the surface normal
-    latent: float = 0.1  # mean square difference of RENI++ latents
+    latent: float = 0.1  # mean squared difference of RENI++ latents
     neutral: float = 0.02  # saturation of the lighting, if its latents are not known
     deviation: float = 0.5  # from FlexiCubes' example: distances of a dual vertex from its edge crossings
     sign: float = 0.2  # from FlexiCubes' example: entropy of sign changes
@@ -41,7 +41,7 @@ class StageConfig:
     patch: int = 0  # side of the random square of a target view that is rendered, pixels; 0: the whole view
     targets: int = 1  # target views per object and step; not given in the paper
     lobes: int = 128  # spherical Gaussians of the light
-    resolution: int = 0  # cubes along each side of the surface grid; 0: the preset's
+    resolution: int = 0  # cubes along each side of the FlexiCubes grid; 0: the preset's
     grid: int = 16  # cells along each side of the volume's occupancy grid
     samples_along: int = 64  # samples of a ray across the model's cube
     samples: tuple[int, int, int] = (20, 40, 4)  # light, visible-normal and cosine samples; 0: strategy not used

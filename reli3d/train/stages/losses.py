@@ -90,7 +90,7 @@ def opacity_entropy(rendering: Rendering, target: ObjectViews, view: int) -> Ten
 
 
 def coverage_error(rendering: Rendering, target: ObjectViews, view: int) -> Tensor:
-    """Mean square error of antialiased coverage against the mask, over the valid pixels."""
+    """Mean squared error of antialiased coverage against the mask, over the valid pixels."""
     return _mean((rendering.coverage - target.masks[view]).square(), target, view)
 
 
@@ -122,8 +122,8 @@ def map_terms(rendering: Rendering, target: ObjectViews, view: int) -> dict[str,
 
 
 def light_terms(latent: Tensor, rotation: Tensor, strength: Tensor, radiance: Tensor, target: ObjectViews) -> dict:
-    """``latent``: mean square error of the rotated latents and the strength; without ground truth ``neutral``, the mean
-    relative saturation of the lighting.
+    """``latent``: mean squared error of the rotated latents and the strength; without ground truth ``neutral``, the
+    mean relative saturation of the lighting.
 
     latent: ``(L, 3)``.  rotation: ``(3, 3)``.  strength: ``()``.  radiance: ``(K, 3)`` in directions uniform over the
     sphere.  The prior is equivariant to rotation, so latents with a rotation equal the rotated latents.
