@@ -85,7 +85,7 @@ def same_picture(got, expected):
 
 
 def straight(image):
-    """Colour before its premultiplication by alpha; the transforms to 8 bits take this."""
+    """Color before its premultiplication by alpha; the transforms to 8 bits take this."""
     return image.radiance / image.alpha[..., None].clamp(min=1e-6)
 
 
@@ -125,7 +125,7 @@ def test_images_are_the_display_transform_of_the_exposed_radiance(scene, tone, t
 
 
 def test_environment_is_the_background_if_requested(scene):
-    image, camera, light = expected(scene, azimuth=5.0, background="environment")  # the centre of the map is in view
+    image, camera, light = expected(scene, azimuth=5.0, background="environment")  # the center of the map is in view
     picture = pixels(run(scene, "--background", "environment", "--azimuth", "5")["ball.png"])
     assert same_picture(picture, bytes_of(linear_to_srgb(image.radiance)))
     behind = bytes_of(linear_to_srgb(light.lookup(camera_rays(camera)[1])))
@@ -235,7 +235,7 @@ def test_the_name_of_the_output_makes_an_animation(scene, tmp_path, ending):
     middle = [v[20:28, 20:28].mean() for v in shown]
     assert max(middle) > 1.3 * min(middle)  # the light turns
     red = shown[0][24, 24]
-    assert red[0] > 2 * red[1]  # in its colours: 4:2:0, 256 colours and lossy WebP keep a red ball red
+    assert red[0] > 2 * red[1]  # in its colors: 4:2:0, 256 colors and lossy WebP keep a red ball red
     corner = np.asarray(frames[0])[1, 1]
     assert (corner[:3] > 250).all() if ending == "mp4" else corner[3] == 0
 

@@ -24,7 +24,7 @@ STAGE = maps.MapsStage("maps", until=1.0)
 
 @pytest.fixture(scope="module")
 def start():
-    """A grey ball under the true light."""
+    """A gray ball under the true light."""
     return replace(small_scene.ball(), environment=small_scene.sky())
 
 

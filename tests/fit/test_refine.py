@@ -54,7 +54,7 @@ def test_a_small_scene_is_recovered(refined, start):
     expected = srgb_to_linear(torch.tensor([[0.8, 0.25, 0.2], [0.25, 0.6, 0.3]]))
     # a factor per channel is ambiguous between base color and light; the ratio of the halves is not
     error = ((got[0] / got[1]).log() - (expected[0] / expected[1]).log()).abs()
-    # measured 0.63 of what grey is off: 60 steps are few, and the palette draws colors together at first
+    # measured 0.63 of what gray is off: 60 steps are few, and the palette draws colors together at first
     assert float(error.max()) < 0.65 * float((expected[0] / expected[1]).log().abs().max())
 
 

@@ -116,7 +116,7 @@ def test_positions_and_normals_interpolate_linearly(sphere, device):
     torch.testing.assert_close(normal.double(), n, rtol=0, atol=1e-6)
 
 
-def test_known_colour_reads_back(sphere):
+def test_known_color_reads_back(sphere):
     image = bake(sphere, SIZE, lambda p, n: color(p))["value"].numpy()
     position, uv = surface_samples(sphere, 50_000)
     expected = color(torch.from_numpy(position)).numpy()
@@ -126,7 +126,7 @@ def test_known_colour_reads_back(sphere):
     assert error.max() < 1.2 * 1.5 * 0.022 * 1.8
 
 
-def test_known_colour_reads_back_through_the_file_at_every_mip(sphere, tmp_path):
+def test_known_color_reads_back_through_the_file_at_every_mip(sphere, tmp_path):
     def material(p, n, t):
         one = torch.ones_like(p[:, :1])
         return {
@@ -145,7 +145,7 @@ def test_known_colour_reads_back_through_the_file_at_every_mip(sphere, tmp_path)
     expected = color(torch.from_numpy((np.asarray(read.vertices)[face] * w).sum(1))).numpy()
     # 8 bit: a quarter of a step on average; the bake itself stays under a fifth (see above)
     assert np.abs(bilinear(image, uv) - expected).mean() < 0.5 / 255
-    while image.shape[0] >= 64:  # colours are at least 0.1: whatever is darker was never written
+    while image.shape[0] >= 64:  # colors are at least 0.1: whatever is darker was never written
         assert image.min() > 0.1 - 0.6 / 255
         image = 0.25 * (image[::2, ::2] + image[1::2, ::2] + image[::2, 1::2] + image[1::2, 1::2])
 
@@ -318,7 +318,7 @@ def test_the_kernel_that_encodes_normals_is_the_formula_that_has_gradients(devic
     t = torch.cat([t, torch.where(torch.rand(30, 40, 1, generator=g) < 0.5, -1.0, 1.0)], -1)
     world, n, t = (v.to(device) for v in (world, n, t))
     got = encode_normals(world, n, t)
-    # float32 sums of three products in another order, and a normalisation; frames nearly without area magnify them
+    # float32 sums of three products in another order, and a normalization; frames nearly without area magnify them
     torch.testing.assert_close(got, encode_normals(world.clone().requires_grad_(), n, t).detach(), rtol=0, atol=2e-5)
     above = got[..., 2] > 0.5 + 0.02  # not bent up; where the frame has little area rounding is magnified
     torch.testing.assert_close(decode_normals(got, n, t)[above], world[above], rtol=0, atol=1e-4)

@@ -1,4 +1,4 @@
-"""A known colour baked on real meshes and extracted surfaces, written as GLB and read back as a viewer samples it."""
+"""A known color baked on real meshes and extracted surfaces, written as GLB and read back as a viewer samples it."""
 
 import io
 import json
@@ -22,7 +22,7 @@ from tests.support.meshes import QUICK, SLOW, loaded
 from tests.support.texels import bilinear, color
 
 STEP = 1 / 255
-DARKEST = 0.1  # of the colour's values: a darker texel was never written
+DARKEST = 0.1  # of the color's values: a darker texel was never written
 FIELDS = {5126: ("<f4", 4), 5125: ("<u4", 4)}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 
@@ -71,7 +71,7 @@ def read(path) -> tuple[dict[str, np.ndarray], list[np.ndarray]]:
 
 
 def check_file(path, source: Mesh) -> float:
-    """Mean error of the base colour over the surface; everything else is asserted."""
+    """Mean error of the base color over the surface; everything else is asserted."""
     arrays, (image, orm, normal_map) = read(path)
     p, n, t, uv = (arrays[k].astype(np.float64) for k in ("POSITION", "NORMAL", "TANGENT", "TEXCOORD_0"))
     faces = arrays["faces"]

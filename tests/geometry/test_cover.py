@@ -34,7 +34,7 @@ def far_camera(size=128, height=0.9):
 
 
 def disk(size, radius):
-    """Signed distance in pixels to a centred disc, positive inside."""
+    """Signed distance in pixels to a centered disc, positive inside."""
     y, x = torch.meshgrid(torch.arange(size) + 0.5, torch.arange(size) + 0.5, indexing="ij")
     return (radius - torch.hypot(x - size / 2, y - size / 2))[None]
 

@@ -44,7 +44,7 @@ def test_a_field_without_a_change_of_sign_has_no_faces_and_gradients_of_zero(dev
 
 
 def test_a_full_field_is_the_box_with_its_edges_cut_off(device):
-    """Dual vertices stand at the centres of the border's squares: the convex hull of those is the whole surface."""
+    """Dual vertices stand at the centers of the border's squares: the convex hull of those is the whole surface."""
     sdf = -torch.ones(SHAPE, device=device)
     mesh = extract_surface(sdf, radius=(1.0, 1.5, 2.0))
     found = report(mesh)

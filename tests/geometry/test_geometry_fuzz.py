@@ -22,7 +22,7 @@ from tests.support import reference_surface
 N = 100_000
 CUBES = 47  # a side: 103,823 cubes
 # Of the change by a relative step of an input, where an edge of 0.02 and a random fraction of 1 give up to 0.02: digits
-# that float32 lacks where terms of that size cancel, and float64 in the twin's differences of fractions.  Centres are
+# that float32 lacks where terms of that size cancel, and float64 in the twin's differences of fractions.  Centers are
 # means of vertices that are rounded in the box of 1, not in a cube.
 FLOOR = {"sdf": 3e-9, "deformation": 1e-9, "alpha": 3e-9, "beta": 3e-9, "gamma": 1e-7}
 
@@ -125,7 +125,7 @@ def test_gradients_of_the_triplane(device, dtype, channels, height, width):
     step = size[torch.randint(4, (N, 3), generator=g)]
     texel = torch.floor(torch.rand(N, 3, generator=g) * (step + 2)) - 1
     points = torch.where(kind == 0, (2 * texel / step - 1).float(), points)  # borders of texels
-    points = torch.where(kind == 1, (2 * (texel + 0.5) / step - 1).float(), points)  # their centres
+    points = torch.where(kind == 1, (2 * (texel + 0.5) / step - 1).float(), points)  # their centers
     points = torch.where(kind == 2, torch.tensor(EDGE)[torch.randint(len(EDGE), (N, 3), generator=g)], points)
     points[: N // 50, 0], points[N // 50 : N // 25, 1], points[N // 25 : N // 20, 2] = math.nan, math.inf, -math.inf
     weights = torch.rand(1, N, 3 * channels, generator=g)  # of one sign: sums that cancel have no digits to compare
@@ -140,7 +140,7 @@ def test_gradients_of_the_triplane(device, dtype, channels, height, width):
     for k, axes in enumerate(([0, 1], [0, 2], [1, 2])):
         got = torch.nn.functional.grid_sample(p[:, k], q[None, None, :, axes], align_corners=False)
         parts.append(got[0, :, 0].T)
-        # at a texel's centre the gradient jumps, and float32 decides on which side a point is
+        # at a texel's center the gradient jumps, and float32 decides on which side a point is
         coordinate = (q.detach()[:, axes] + 1) * torch.tensor([width, height]) / 2 - 0.5
         distance = (coordinate - coordinate.round()).abs()
         smooth[:, axes] &= (distance > 1e-4) | (distance.isnan())

@@ -239,7 +239,7 @@ def test_reevaluated_hits_and_their_gradients_equal_float64(device):
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_a_far_closed_mesh_is_watertight(device, backend):
-    """After Embree's verification: a sphere at (148376, 1234, -223423), rays from near its centre, 2e-5 may leak."""
+    """After Embree's verification: a sphere at (148376, 1234, -223423), rays from near its center, 2e-5 may leak."""
     mesh = trimesh.creation.icosphere(subdivisions=4, radius=100.0)
     center = np.array([148376.0, 1234.0, -223423.0])
     scene = make(mesh.vertices + center, mesh.faces, backend, device)

@@ -1,4 +1,4 @@
-"""FlexiCubes regularisers against float64 formulations and closed forms; fields in batches."""
+"""FlexiCubes regularizers against float64 formulations and closed forms; fields in batches."""
 
 import math
 

@@ -18,7 +18,7 @@ def ball(device="cpu", subdivisions=3, noise=0.0):
 
 
 def umbrella_matrix(mesh):
-    """Mean of the neighbours - own value, dense float64."""
+    """Mean of the neighbors - own value, dense float64."""
     n = len(mesh.vertices)
     link = torch.zeros(n, n, dtype=torch.float64)
     for a, b in ((0, 1), (1, 2), (2, 0)):
@@ -45,7 +45,7 @@ def test_values_and_gradients_match_the_dense_operator_in_float64(device):
 
 
 def test_a_wave_on_a_closed_strip_is_scaled_by_its_eigenvalue():
-    n = 24  # a prism of three rings: every vertex sees the same neighbours, so cos(k phi) is an eigenvector
+    n = 24  # a prism of three rings: every vertex sees the same neighbors, so cos(k phi) is an eigenvector
     phi = 2 * math.pi * torch.arange(n) / n
     rings = torch.stack([torch.stack([torch.zeros(n), torch.zeros(n), torch.cos(3 * phi)], -1)] * 3)
     at = rings.clone()
@@ -56,7 +56,7 @@ def test_a_wave_on_a_closed_strip_is_scaled_by_its_eigenvalue():
         a, b, c, d = r * n + i, r * n + (i + 1) % n, (r + 1) % 3 * n + i, (r + 1) % 3 * n + (i + 1) % n
         faces += [torch.stack([a, b, d], -1), torch.stack([a, d, c], -1)]
     mesh = Mesh(at.view(-1, 3), torch.cat(faces).to(torch.int32))
-    # six neighbours: two along the ring, one straight and one a step on in each neighbour ring
+    # six neighbors: two along the ring, one straight and one a step on in each neighbor ring
     eigenvalue = (2 + 4 * math.cos(3 * 2 * math.pi / n)) / 6 - 1
     got = taubin_smooth(mesh, iterations=1, step=1.0, pass_band=0.1).vertices.view(3, n, 3)[..., 2]
     mean = got.mean(0) @ torch.cos(3 * phi) / (n / 2)

@@ -85,7 +85,7 @@ def test_fields_and_weights_of_any_size_give_finite_vertices_and_gradients(devic
 
 
 def test_gradients_behind_the_mesh_are_bitwise_identical_for_any_number_of_threads(threads):
-    """Centre vertices, deviation, normals, smoothing, atlas: torch's own scatters add up in any order."""
+    """Center vertices, deviation, normals, smoothing, atlas: torch's own scatters add up in any order."""
     sdf = torus(40) + 0.01 * torch.randn(41, 41, 41, generator=torch.Generator().manual_seed(0))
     weights = {"sdf": sdf, **random_weights(sdf.shape, 0, spread=0.5)}
     results = []

@@ -52,7 +52,7 @@ def slopes(errors):
 
 
 def samples_of(mesh):
-    """Corners and centres of the faces: no point of a face is further from one than half a cube."""
+    """Corners and centers of the faces: no point of a face is further from one than half a cube."""
     corners = mesh.vertices[mesh.faces.long()].cpu()
     return torch.cat([corners.reshape(-1, 3), corners.mean(1)]).numpy()
 

@@ -17,7 +17,7 @@ EYES = [(0.3, 0.9, 2.4), (2.3, 0.4, -0.8), (-1.4, 1.2, -1.7), (-2.1, 0.2, 1.2)]
 
 
 def cameras(eyes=EYES, up=(0.0, 1.0, 0.0), center=(0.0, 0.0, 0.0), unit=1.0):
-    """Cameras about ``centre``; the world's up and unit are free."""
+    """Cameras about ``center``; the world's up and unit are free."""
     up, center = torch.tensor(up), torch.tensor(center)
     turn = turned(up)
     c2w = [look_at(center + unit * turn @ torch.tensor(eye), center, up) for eye in eyes]
@@ -32,7 +32,7 @@ def turned(up):
 
 
 def distances(balls, camera, turn=None, center=(0.0, 0.0, 0.0), unit=1.0):
-    """Silhouettes of balls: a ray hits one where its distance to the centre is below the radius, in float64."""
+    """Silhouettes of balls: a ray hits one where its distance to the center is below the radius, in float64."""
     origin, direction = (t.double() for t in camera_rays(camera))
     turn = torch.eye(3) if turn is None else turn
     clear = torch.full(origin.shape[:-1], -1e9, dtype=torch.float64)
@@ -54,7 +54,7 @@ def test_a_mirrored_camera_sees_the_reflected_point_at_the_mirrored_pixel():
     other = plane.mirrored(camera)
     here, depth = project(points, camera.c2w[:, None], camera.intrinsics[:, None])
     there, other_depth = project(reflected, other.c2w[:, None], other.intrinsics[:, None])
-    # float32 of coordinates of a few metres and of some hundred pixels
+    # float32 of coordinates of a few meters and of some hundred pixels
     torch.testing.assert_close(there[..., 0], SIZE - here[..., 0], rtol=0, atol=1e-3)
     torch.testing.assert_close(there[..., 1], here[..., 1], rtol=0, atol=1e-3)
     torch.testing.assert_close(other_depth, depth, rtol=0, atol=1e-5)
@@ -88,7 +88,7 @@ def test_an_object_without_a_mirror_plane_has_none(device):
 def test_one_ball_has_a_plane_through_its_center():
     camera = cameras()
     plane = mirror_plane(distances([((0.1, 0.0, 0.05), 0.4)], camera), camera)
-    # the centre of the visual hull is that of the ball within some pixels
+    # the center of the visual hull is that of the ball within some pixels
     assert abs(float(plane.normal @ torch.tensor([0.1, 0.0, 0.05])) - plane.offset) < 0.03
 
 

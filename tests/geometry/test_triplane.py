@@ -29,7 +29,7 @@ def test_values_and_gradients_match_grid_sample_in_float64(device, channels, hei
     torch.testing.assert_close(
         g_got[0].double(), g_expected[0], rtol=0, atol=4e-5
     )  # of 600 points where there is 1 texel
-    # the gradient jumps at a texel centre, which rounding may move a point across: none of these 600 points lies there
+    # the gradient jumps at a texel center, which rounding may move a point across: none of these 600 points lies there
     for a, b in zip((got, *g_got), (expected, *g_expected), strict=True):
         assert share_within(a, b) >= 0.999
 
@@ -47,7 +47,7 @@ def test_features_match_the_published_release(goldens, device):
     torch.testing.assert_close(got, torch.from_numpy(data["features"]), rtol=0, atol=2e-5)  # float32 of values up to 4
 
 
-def test_a_texel_centre_gives_the_texel_and_a_face_of_the_cube_half(device):
+def test_a_texel_center_gives_the_texel_and_a_face_of_the_cube_half(device):
     planes = torch.zeros(1, 3, 2, 4, 8, device=device)
     planes[0, :, :, 1, 6] = 1.0
     planes[0, 0, 1] *= 3.0

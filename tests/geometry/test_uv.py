@@ -138,7 +138,7 @@ def test_charts_keep_the_guard_band(size):
         )
         _, square = nearest_valid(coverage(own, size * fine) > 0)
         gap = float(square[coverage(others, size * fine) > 0].min()) ** 0.5 / fine
-        assert gap >= guard_band(size) - 2.0 / fine  # sample centres lie up to a sample inside on both sides
+        assert gap >= guard_band(size) - 2.0 / fine  # sample centers lie up to a sample inside on both sides
         corner = result.uv[own.faces.long()]
         assert float(torch.minimum(corner, 1 - corner).min()) * size >= 0.5 * guard_band(size) - 1e-3  # float32 uv
 

@@ -116,7 +116,7 @@ def test_real_maps_read_as_mitsuba_reads_them(shared_data):
 
 @pytest.mark.parametrize("suffix", ["exr", "hdr"])
 def test_mitsuba_sees_the_sun_where_we_put_it(tmp_path, suffix):
-    """Here the centre column is +X, right of it +Z; Mitsuba's centre column is +Z, right of it -X."""
+    """Here the center column is +X, right of it +Z; Mitsuba's center column is +Z, right of it -X."""
     mi = pytest.importorskip("mitsuba")
     mi.set_variant("scalar_rgb")
     height = 32

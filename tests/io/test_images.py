@@ -30,20 +30,20 @@ def test_straight_alpha_and_the_color_under_it_are_kept(tmp_path, name, options)
 
 
 def test_gray_palette_and_cmyk_come_out_as_color(tmp_path):
-    gray, alpha = read_image(saved(tmp_path, Image.fromarray(NOISE[..., 0]), "grey.png"))
+    gray, alpha = read_image(saved(tmp_path, Image.fromarray(NOISE[..., 0]), "gray.png"))
     assert alpha is None
     assert torch.equal((gray * 255).round().byte(), torch.from_numpy(NOISE[..., :1]).expand(-1, -1, 3))
     flat = Image.fromarray(np.repeat(NOISE[:1, :5, :3], 7, 0))
     palette, alpha = read_image(saved(tmp_path, flat.quantize(8), "palette.png"))
     assert alpha is None
-    # 5 colours in 8 slots: the palette is exact up to the quantiser's averaging in 5-bit bins
+    # 5 colors in 8 slots: the palette is exact up to the quantizer's averaging in 5-bit bins
     assert float((palette * 255 - torch.from_numpy(np.array(flat)).float()).abs().max()) <= 8
     indexed = flat.quantize(8)
     _, alpha = read_image(saved(tmp_path, indexed, "key.png", transparency=indexed.getpixel((0, 0))))
     assert float(alpha[0, 0]) == 0.0
     assert float(alpha.max()) == 1.0
     cmyk, _ = read_image(saved(tmp_path, Image.new("CMYK", (16, 16), (0, 255, 255, 0)), "ink.jpg", quality=95))
-    assert (cmyk[8, 8] - torch.tensor([1.0, 0.0, 0.0])).abs().max() < 0.03  # JPEG of a flat colour: a few levels
+    assert (cmyk[8, 8] - torch.tensor([1.0, 0.0, 0.0])).abs().max() < 0.03  # JPEG of a flat color: a few levels
 
 
 def test_16_bit_gray_keeps_its_precision(tmp_path):

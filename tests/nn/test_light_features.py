@@ -15,7 +15,7 @@ def normals(n: int, seed: int = 0) -> torch.Tensor:
 
 
 def spherical(n: torch.Tensor) -> torch.Tensor:
-    """Unnormalised spherical harmonics up to order two from the angles, float64: an independent way to their span."""
+    """Unnormalized spherical harmonics up to order two from the angles, float64: an independent way to their span."""
     n = n.double()
     theta, phi = torch.acos(n[:, 2].clamp(-1, 1)), torch.atan2(n[:, 1], n[:, 0])
     s, c = theta.sin(), theta.cos()
@@ -80,7 +80,7 @@ def test_the_palette_is_weighted_by_what_is_seen():
     got = palette_of(color, color.sqrt(), visible)
     torch.testing.assert_close(got[:3], torch.full((3,), 0.25).logit(), rtol=0, atol=1e-4)
     torch.testing.assert_close(got[3:6], torch.full((3,), 0.5).logit(), rtol=0, atol=1e-4)
-    assert float(got[6:].max()) < 1e-2  # all visible points have one colour
+    assert float(got[6:].max()) < 1e-2  # all visible points have one color
     both = palette_of(color, color, torch.ones(40))
     values = color.logit()[:, 0]
     assert float(both[6]) == pytest.approx(float(values.std(correction=0)), rel=1e-4)

@@ -43,7 +43,7 @@ def model():
 
 
 def sphere(count: int, seed: int = 0, turn: torch.Tensor | None = None):
-    """Views of a ball of radius 0.4 whose colour is a function of the normal: images, masks, c2w, intrinsics."""
+    """Views of a ball of radius 0.4 whose color is a function of the normal: images, masks, c2w, intrinsics."""
     generator = torch.Generator().manual_seed(seed)
     eye = normalize(torch.randn(count, 3, generator=generator), dim=-1) * 2.2
     c2w = look_at(eye, torch.zeros(count, 3), torch.tensor([0.0, 1.0, 0.0]))
@@ -117,7 +117,7 @@ def test_any_number_of_views_in_any_order(model, views):
 def test_mirror_images_have_the_mirrored_maps(model):
     """The 2D U-Net does not read them; normals and points that they show are the photographs' ones, mirrored."""
     images, masks, c2w, intrinsics = sphere(3)
-    intrinsics = intrinsics + torch.tensor([0.0, 0.0, 1.5, -0.5])  # principal point off the image centre
+    intrinsics = intrinsics + torch.tensor([0.0, 0.0, 1.5, -0.5])  # principal point off the image center
     plane = MirrorPlane(normalize(torch.tensor([2.0, 0.3, 1.0]), dim=0), 0.07)
     other = plane.mirrored(Camera(c2w, intrinsics, SIZE, SIZE))
     views = [torch.cat([t, t.flip(2)]) for t in (images, masks)]
@@ -153,7 +153,7 @@ def test_a_turn_of_the_world_turns_the_light(model):
     yaw = 2 * math.pi * 4 / 32
     with torch.no_grad():
         other = encoded(model, images, masks, turned(c2w, yaw), intrinsics).log_light
-        expected = torch.roll(field.log_light, -4, 2)  # from +X, the centre, towards -Z, which lies to the left
+        expected = torch.roll(field.log_light, -4, 2)  # from +X, the center, towards -Z, which lies to the left
         wrong = torch.roll(field.log_light, 4, 2)
         # pixels at the border of a texel may fall on the other side: 2 to 4 % with four seeds of the weights
         assert float((other - expected).abs().mean()) < 0.06 * float((wrong - expected).abs().mean())
@@ -183,7 +183,7 @@ def test_a_mirror_shows_the_light_where_it_reflects_it():
 
 
 def test_pixels_start_as_what_they_show(model):
-    """Of zeros: the normal looks at the camera, nothing is added to the colour."""
+    """Of zeros: the normal looks at the camera, nothing is added to the color."""
     _, _, c2w, intrinsics = sphere(4)
     camera = Camera(c2w, intrinsics / 2, 32, 32)
     maps = PixelMaps.of(torch.zeros(4, 32, 32, 12), torch.zeros(4, 16, 16, 2), camera, torch.tensor(0.0))
@@ -237,7 +237,7 @@ def test_pixels_know_where_their_rays_meet_the_hull():
 
 
 def test_the_view_that_sees_a_point_has_the_weight(model):
-    """A point that one view sees and another does not has the first one's colour, not the mean of both."""
+    """A point that one view sees and another does not has the first one's color, not the mean of both."""
     images, masks, c2w, intrinsics = sphere(2, seed=3)
     images[0], images[1] = 0.8, 0.2
     field = encoded(model, images, masks, c2w, intrinsics)

@@ -182,7 +182,7 @@ def test_heads_match_published(golden):
             shift = -1.0 if name == "density" else 0.0  # the published raw density has its bias added
             torch.testing.assert_close(value + shift, g["out." + PUBLISHED_HEADS.get(name, name)], **SHALLOW)
     with pytest.raises(ValueError, match="heads: expected some of density"):
-        heads(g["features"], ["colour"])
+        heads(g["features"], ["color"])
 
 
 @torch.no_grad()

@@ -54,7 +54,7 @@ def test_the_sheet_holds_the_inputs_unseen_views_maps_and_a_small_light(asset):
     for light in (1, 2):
         assert all(r > 2 * b for r, _, b in middle[light])  # the red ball
     assert middle[1] != middle[2]
-    assert middle[3][1][0] == middle[3][1][1] and middle[3][2][0] == 0  # grey roughness, no metal
+    assert middle[3][1][0] == middle[3][1][1] and middle[3][2][0] == 0  # gray roughness, no metal
     light = sheet[4 * row + preview.TITLE :, :tile]
     blue, red = (light[: tile // 8, :, k].float().mean() for k in (2, 0))
     assert float(blue) > 1.3 * float(red)  # a sky above

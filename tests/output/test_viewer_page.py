@@ -55,7 +55,7 @@ def stored(folder: Path, asset: Asset) -> Asset:
 
 @pytest.fixture(scope="module")
 def waisted(tmp_path_factory) -> Asset:
-    """A grey body with a deep groove about it, in which little of the light arrives."""
+    """A gray body with a deep groove about it, in which little of the light arrives."""
     ball = ball_mesh(5, 1.0)
     away = torch.linalg.cross(ball.vertices, torch.tensor([0.36, 0.8, 0.48]).expand_as(ball.vertices)).square().sum(-1)
     vertices = ball.vertices * (0.7 - 0.45 * torch.exp(-12.0 * (1.0 - away)))[:, None]

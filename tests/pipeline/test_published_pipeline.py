@@ -141,7 +141,7 @@ def test_reference_view_and_background_reach_the_network(tiny, monkeypatch):
     with pytest.raises(ValueError, match="hero: expected"):
         reconstruct(EXAMPLE, weights=tiny, options=ReconstructOptions(hero=2))
     with pytest.raises(ValueError, match="background: expected"):
-        reconstruct(EXAMPLE, weights=tiny, options=ReconstructOptions(background="grey"))
+        reconstruct(EXAMPLE, weights=tiny, options=ReconstructOptions(background="gray"))
 
 
 @pytest.fixture(scope="module")

@@ -57,7 +57,7 @@ def test_texels_are_baked_at_their_centers(goldens):
         return np.abs(baked - bar["position_bake"])[both].max(-1)
 
     assert offset(0.5).max() < 1e-5  # the same points: corners of texels
-    assert np.median(offset(0.0)) > 1e-3  # centres lie elsewhere
+    assert np.median(offset(0.0)) > 1e-3  # centers lie elsewhere
 
 
 def test_normal_maps_are_relative_to_the_normals_they_are_shown_with(ball):
@@ -144,8 +144,8 @@ def test_light_samples_point_at_the_light():
     environment = Environment(radiance)
     d, _ = environment.sample(torch.rand(2000, 2, generator=torch.Generator().manual_seed(0)))
     light = lat_long_directions(32)[6, 45]
-    assert (degrees(d, light.expand_as(d)) < 12).float().mean() > 0.9  # two texels: a lookup mixes neighbours
-    # the centre of the bright texel, whose column is 45 + 16 in the published mapping
+    assert (degrees(d, light.expand_as(d)) < 12).float().mean() > 0.9  # two texels: a lookup mixes neighbors
+    # the center of the bright texel, whose column is 45 + 16 in the published mapping
     theta, phi = math.pi * 6.5 / 32, 2 * math.pi * 61.5 / 64
     release = torch.tensor([[math.sin(theta) * math.cos(phi), math.sin(theta) * math.sin(phi), math.cos(theta)]])
     assert degrees(release, light[None]) > 60 and float(environment.lookup(release).max()) < 0.02

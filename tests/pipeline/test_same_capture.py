@@ -107,7 +107,7 @@ def distance(a: torch.Tensor, b: torch.Tensor) -> float:
 
 
 def mean_base_color(asset) -> torch.Tensor:
-    """Mean base colour at the vertices."""
+    """Mean base color at the vertices."""
     at = (asset.mesh.uv * asset.textures.size).long().clamp(0, asset.textures.size - 1)
     return asset.textures.base_color[at[:, 1], at[:, 0]].mean()
 

@@ -34,7 +34,7 @@ MIXED = {
 
 
 def surface(device, roughness, metallic, points=24):
-    """Arguments of ``shade`` up to the light: points with their own colours, one finish."""
+    """Arguments of ``shade`` up to the light: points with their own colors, one finish."""
     normal, wo, base, *_ = inputs(points, device)
     flat = torch.ones(points, device=device)
     return normal, normal, normal, wo, base, flat * roughness, flat * metallic

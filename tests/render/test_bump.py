@@ -10,7 +10,7 @@ def test_radial_bump_matches_the_published_frame(goldens):
     data = np.load(goldens / "radial_bump.npz")
     keys = {k: torch.as_tensor(data[k]) for k in data.files}
     got = radial_bump(keys["position"], keys["geometry_normal"], keys["surface_normal"])
-    torch.testing.assert_close(got, keys["shading_normal"], rtol=1e-5, atol=2e-6)  # four float32 normalisations
+    torch.testing.assert_close(got, keys["shading_normal"], rtol=1e-5, atol=2e-6)  # four float32 normalizations
 
 
 def test_the_kernel_of_the_radial_bump_is_its_formula_in_float64():
@@ -23,7 +23,7 @@ def test_the_kernel_of_the_radial_bump_is_its_formula_in_float64():
     got = radial_bump(position.view(40, 50, 3), normal.view(40, 50, 3), bump.view(40, 50, 3)).view(2000, 3)
     near = (expected.norm(dim=-1) > 0.5) & (bump.norm(dim=-1) > 0.1)  # elsewhere rounding is divided by something small
     assert float(near.double().mean()) > 0.95
-    torch.testing.assert_close(got[near].double(), expected[near], rtol=0, atol=2e-5)  # five float32 normalisations
+    torch.testing.assert_close(got[near].double(), expected[near], rtol=0, atol=2e-5)  # five float32 normalizations
     leaf = bump.clone().requires_grad_()
     torch.testing.assert_close(radial_bump(position, normal, leaf).detach()[near], got[near], rtol=0, atol=2e-5)
 

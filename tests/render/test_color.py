@@ -1,4 +1,4 @@
-"""Colour transfer against the published values and closed forms."""
+"""Color transfer against the published values and closed forms."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The white furnace: what a surface of any colour sends out under unit light, never more than comes in."""
+"""The white furnace: what a surface of any color sends out under unit light, never more than comes in."""
 
 import numpy as np
 import pytest
@@ -98,7 +98,7 @@ def test_neither_specular_nor_diffuse_nor_metal_gains_energy(device, alpha):
 
 
 def test_no_surface_sends_out_more_than_comes_in(device):
-    """By default: three base colours at once, of any metallic, from a mirror to the roughest, down to the horizon."""
+    """By default: three base colors at once, of any metallic, from a mirror to the roughest, down to the horizon."""
     n = 1 << 14  # Halton points
     u = halton(n, device=device)
     number = lambda v: torch.tensor(float(v), device=device)  # noqa: E731
@@ -111,7 +111,7 @@ def test_no_surface_sends_out_more_than_comes_in(device):
                 highest = max(highest, float(sent.max()))
                 dielectric += [float(sent[0])] if metallic == 0.0 else []
     assert highest <= 1.0 + 1e-3
-    assert min(dielectric) > 0.75 and max(dielectric) > 0.97  # and it does so without making white paint grey
+    assert min(dielectric) > 0.75 and max(dielectric) > 0.97  # and it does so without making white paint gray
     published = albedo(view(0.05, device), number(0.1), base, number(0.0), u, diffuse_model="published")
     assert float(published[0]) > 1.2  # what the test is there to see: 1.30
 

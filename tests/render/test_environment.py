@@ -38,7 +38,7 @@ def maps():
 
 def test_axes_are_those_of_the_convention(device):
     marks = torch.zeros(4, 8, 3, device=device)
-    marks[:, 3:5, 0] = 1.0  # centre: +X
+    marks[:, 3:5, 0] = 1.0  # center: +X
     marks[:, 5:7, 1] = 1.0  # right of it: +Z
     marks[0, :, 2] = 1.0  # first row: +Y
     env = Environment(marks)
@@ -93,7 +93,7 @@ def test_samples_fall_on_texels_as_their_density_says(device, name):
     height, width = env.radiance.shape[:2]
     u = torch.rand(1_000_000, 2, generator=torch.Generator().manual_seed(chi2.MAPS.index(name))).to(device)
     density = env.pdf
-    if name == "beside the sun":  # one sample in a thousand: numbers that leave out its row and both neighbours
+    if name == "beside the sun":  # one sample in a thousand: numbers that leave out its row and both neighbors
         rows, heights = env.cdf.rows.double()
         gap = float(rows[7] - rows[4])
         first = u[:, 0].double() * (1.0 - gap)

@@ -142,7 +142,7 @@ def test_torch_sees_an_ordinary_function(device):
         out.sum().backward()
 
 
-COLUMNS = "value", "roughness", "normal", "base colour", "texels"
+COLUMNS = "value", "roughness", "normal", "base color", "texels"
 
 
 def spread(roughness, metallic, environment, runs=256, base=None, **options):
@@ -258,7 +258,7 @@ def test_pairs_are_never_noisier_than_as_many_independent_samples(device, name, 
 @pytest.mark.parametrize("metallic", [0.0, 1.0])
 def test_pairs_as_shipped_are_less_noisy_than_as_many_independent_samples(device, name, metallic):
     """The published counts with pairs from rotated Halton points: measured 0.0001 to 0.66, and 0.79 to 0.85 in value
-    and base colour of metal of 0.05; slopes in single texels, in whose few samples the points are not even, 0.31 to
+    and base color of metal of 0.05; slopes in single texels, in whose few samples the points are not even, 0.31 to
     1.00."""
     env = light(name, device)
     for roughness in (0.05, 0.1, 0.3, 1.0):

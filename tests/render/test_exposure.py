@@ -28,7 +28,7 @@ def scene(device):
 
 
 def photographs(device, *radiance):
-    """Of three cameras, in one linear colour."""
+    """Of three cameras, in one linear color."""
     return linear_to_srgb(torch.tensor(radiance, device=device)).expand(3, *SIZE, 3).contiguous()
 
 
@@ -116,7 +116,7 @@ def test_the_most_likely_base_color_is_the_mean_of_three_normal_distributions(de
 
 
 def test_a_base_color_more_saturated_than_the_images_is_reduced(device, scene):
-    """A dark grey thing, guessed blue: the photographs are nearly grey."""
+    """A dark gray thing, guessed blue: the photographs are nearly gray."""
     asset, camera, inside = painted(device, scene, 0.03, 0.1, 0.15)
     images = photographs(device, 0.010, 0.013, 0.018)
     paint = torch.tensor([0.03, 0.1, 0.15]) * factor(asset, images, inside, camera)

@@ -10,7 +10,7 @@ from tests.support import mitsuba_scene, reference
 
 
 def pairs(n, seed=0, low=0.02, alpha=None):
-    """Directions, base colour, GGX width and metallic: every other ``wi`` drawn from the lobe of ``wo`` by the float64
+    """Directions, base color, GGX width and metallic: every other ``wi`` drawn from the lobe of ``wo`` by the float64
     twin, since directions drawn apart from each other miss a narrow lobe; the rest, and those below ``low``, anyhow."""
     g = torch.Generator().manual_seed(seed)
     d = torch.nn.functional.normalize(torch.randn(2, n, 3, generator=g), dim=-1)
@@ -87,7 +87,7 @@ def test_energy_is_never_created(device):
 
 @pytest.mark.parametrize("diffuse_model", DIFFUSE_MODELS)
 def test_directions_in_and_below_the_horizon_and_extreme_parameters(device, diffuse_model):
-    """Both cosines 1e-3, 0 and -0.1 with any other; metallic, base colour and width at both ends, and width 0.
+    """Both cosines 1e-3, 0 and -0.1 with any other; metallic, base color and width at both ends, and width 0.
 
     Densities too, and draws for the corners of the unit square.
     """

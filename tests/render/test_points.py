@@ -39,7 +39,7 @@ def test_one_row_and_plain_numbers_hold_for_all_points(device):
 @pytest.mark.parametrize("name", ["normal", "ng", "base_color", "roughness", "metallic", "position", "wo"])
 @pytest.mark.parametrize("value", [torch.nan, torch.inf])
 def test_what_is_not_finite_gives_nan_and_its_neighbors_stay(device, name, value):
-    """Minima and maxima of the formulas would make a plausible colour of it."""
+    """Minima and maxima of the formulas would make a plausible color of it."""
     normal, wo = (v.to(device) for v in points(40))
     light = Environment(sky().radiance.to(device))
     lobe = SphericalGaussians(normal[:1], normal.new_tensor([3.0]), normal.new_ones(1, 3))

@@ -249,7 +249,7 @@ def test_random_pairs_are_uniform_independent_and_addressed(device):
 
 
 def test_no_two_streams_share_a_state(device):
-    """A million pairs of 48 bits from ten streams of neighbouring counters; by chance 0.002 would be equal."""
+    """A million pairs of 48 bits from ten streams of neighboring counters; by chance 0.002 would be equal."""
     streams = [
         {},
         {"seed": 1},

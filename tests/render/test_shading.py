@@ -153,7 +153,7 @@ def test_embree_and_warp_cast_the_same_shadows_in_values_and_gradients():
     a, b, free = results
     changed = ((a[0] - b[0]).abs() > 1e-5).any(-1).float().mean()
     assert changed < 2e-3  # 64 rays a point: a silhouette ray differs with probability of about 1e-5
-    for one, other, unshadowed in zip(a, b, free, strict=True):  # normal, base colour, roughness, metallic, texels
+    for one, other, unshadowed in zip(a, b, free, strict=True):  # normal, base color, roughness, metallic, texels
         assert reference.share_within(one, other) >= 0.998  # those points; where no ray differs all are the same bits
         assert reference.share_within(one, unshadowed) < 0.9  # the shadow is there
 

@@ -239,7 +239,7 @@ def test_render_equals_mitsubas_sensor_textures_and_light(device):
 
 @pytest.mark.parametrize("material", MATERIALS)
 def test_gradients_with_shadows_equal_mitsubas(device, material):
-    """Base colour, GGX width and texels: means of 24 runs against means of 24 of Mitsuba's reverse mode."""
+    """Base color, GGX width and texels: means of 24 runs against means of 24 of Mitsuba's reverse mode."""
     import math
 
     mi = mitsuba_scene.load()

@@ -122,7 +122,7 @@ def test_mask_loss_gradient_matches_differences_of_sampled_coverage(device, name
 
 
 def picture_of(vertices, faces, camera, colors, background):
-    """Colours ``(F, 3)`` of faces before ``background (H, W, 3)``: none of them moves, but the outline."""
+    """Colors ``(F, 3)`` of faces before ``background (H, W, 3)``: none of them moves, but the outline."""
     scene = RayScene(vertices.detach(), faces)
     seen = layer_of_hits(scene, camera)
     image = layer_of_hits(scene, camera, colors) + (1.0 - seen) * background
@@ -131,7 +131,7 @@ def picture_of(vertices, faces, camera, colors, background):
 
 @pytest.mark.parametrize("layer", ["mask", "picture"])
 def test_descent_moves_a_sphere_onto_its_target(device, layer):
-    """By its mask, and by its colours alone, some of them darker and some brighter than what is behind them."""
+    """By its mask, and by its colors alone, some of them darker and some brighter than what is behind them."""
     vertices, faces = shape("sphere", device)
     camera = camera_of(device)
     ramp = torch.linspace(0.0, 1.0, SIZE, device=device)
@@ -163,7 +163,7 @@ def test_descent_moves_a_sphere_onto_its_target(device, layer):
     assert np.abs(expected.mean(0) - got.mean(0)).max() < 0.3  # pixels, of 5 at the start
 
 
-def test_hidden_outlines_do_not_move_and_colours_blend_between_neighbours(device):
+def test_hidden_outlines_do_not_move_and_colors_blend_between_neighbors(device):
     """A red square before a larger green one before nothing: against images of 8 x 8 rays a pixel."""
     square = torch.tensor([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], device=device)
     c, s = math.cos(0.3), math.sin(0.3)

@@ -129,7 +129,7 @@ def planes_read(planes, points):
 
 
 def test_a_triplane_is_marched_and_composited_as_in_float64(device):
-    """The first training stage: occupancy of the field, samples, features, heads, colour and opacity of rays; values
+    """The first training stage: occupancy of the field, samples, features, heads, color and opacity of rays; values
     and gradients to planes and heads, as docs/library.md joins them."""
     rng = torch.Generator().manual_seed(8)
     radius = 0.8
@@ -181,7 +181,7 @@ def test_faint_and_opaque_media_keep_their_digits(device):
 
 
 def test_descent_through_a_field_recovers_a_ball(device):
-    """Density and colour on a small voxel field from opacity and colour of 400 rays."""
+    """Density and color on a small voxel field from opacity and color of 400 rays."""
     grid, truth_color = OccupancyGrid.full(8, 0.8, device), torch.tensor([0.9, 0.3, 0.1], device=device)
     origins, directions = rays(device, 400, 5)
     samples = march_rays(origins, directions, grid, 0.05)

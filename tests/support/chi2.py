@@ -79,7 +79,7 @@ class Window:
     """Cells that resolve what GGX of width ``alpha`` reflects from a grazing ``wo (3,)``.
 
     Such a lobe is less than a degree high and narrower yet across, thinner than the cells of any affordable grid on the
-    sphere, and the horizon cuts it.  Here the sphere is projected from its centre onto the plane that touches the
+    sphere, and the horizon cuts it.  Here the sphere is projected from its center onto the plane that touches the
     horizon opposite ``wo``; cells are steps of the height ``v`` there and of ``s = u / (v + v_o)``, ``v_o`` the height
     of ``wo``: nearly the half vector's slope across, so the lobe is as wide at every height.  The horizon is the
     window's border.

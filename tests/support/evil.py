@@ -25,7 +25,7 @@ def pose(yaw: float, distance: float = 2.0) -> list[list[float]]:
 
 
 def picture(side: int = SIDE, alpha: bool = True) -> np.ndarray:
-    """A grey disk of a third of the side on black."""
+    """A gray disk of a third of the side on black."""
     y, x = np.mgrid[:side, :side] + 0.5 - side / 2
     inside = ((x * x + y * y) < (side / 3) ** 2).astype(np.uint8)
     return np.stack([inside * 120] * 3 + [inside * 255] * alpha, -1)

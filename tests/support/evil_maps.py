@@ -71,7 +71,7 @@ def cases() -> list[tuple[str, bytes]]:
         ("exr_bomb_overflow", exr_bytes(window=(-(2**31), -(2**31), 2**31 - 1, 2**31 - 1))),
         ("exr_inverted_window", exr_bytes(window=(31, 15, 0, 0))),
         ("exr_many_channels", exr_bytes(channels=[f"c{i}" for i in range(4000)])),
-        ("exr_no_colour", exr_bytes(channels=("U", "V"))),
+        ("exr_no_color", exr_bytes(channels=("U", "V"))),
         ("exr_unsigned", exr_bytes(pixel_type=7)),
         ("exr_idmanifest", exr_bytes(extra=_idmanifest())),
         ("exr_attribute_size", exr_bytes(extra=b"a\0string\0" + struct.pack("<i", 2**31 - 1))),

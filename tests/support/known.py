@@ -86,8 +86,8 @@ def check_masks(folder: Path, truth: dict[str, np.ndarray], tolerance: float) ->
 
 
 def masks(rng: Random) -> Case:
-    """Masks with labels: grey, palette, one bit, a color, alpha, soft edges, two labels."""
-    kind = rng.choice(["white", "grey", "palette", "bit", "color", "soft", "alpha", "two labels"])
+    """Masks with labels: gray, palette, one bit, a color, alpha, soft edges, two labels."""
+    kind = rng.choice(["white", "gray", "palette", "bit", "color", "soft", "alpha", "two labels"])
     label = rng.randrange(1, 256)
     color = [rng.randrange(256) for _ in range(3)]
     color[rng.randrange(3)] = rng.randrange(40, 256)
@@ -118,7 +118,7 @@ def masks(rng: Random) -> Case:
         truth[name] = soft if kind == "soft" else hard
         frames.append(frame_of(name, pose))
     files["transforms.json"] = transforms(frames, camera_angle_x=0.8)
-    return Case(files, lambda f: check_masks(f, truth, 0.003), must_read=kind in ("white", "soft", "bit", "grey"))
+    return Case(files, lambda f: check_masks(f, truth, 0.003), must_read=kind in ("white", "soft", "bit", "gray"))
 
 
 def names(rng: Random) -> Case:

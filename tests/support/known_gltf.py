@@ -105,7 +105,7 @@ def quad(rng: Random) -> tuple[bytes, Look]:
     factor = np.array([rng.uniform(0.2, 1.0) for _ in range(3)])
     roughness, metallic = rng.uniform(0.1, 1.0), rng.uniform(0.0, 1.0)
     pbr: dict = {"baseColorTexture": base, "baseColorFactor": [*factor, 1.0]}
-    packed = rng.choice(["factor", "8 bits", "16 bits grey"])
+    packed = rng.choice(["factor", "8 bits", "16 bits gray"])
     if packed == "factor":
         pbr |= {"roughnessFactor": roughness, "metallicFactor": metallic}
     elif packed == "8 bits":

@@ -26,8 +26,8 @@ def load():
 def environment(mi, radiance: torch.Tensor) -> dict:
     """Mitsuba's envmap with the same bilinear function.
 
-    Its rows are nodes at v = r / (H' - 1), ours texel centres: with H' = 2 H + 1 all our kinks fall on its nodes.
-    Its columns are texel centres as ours.  Its centre column looks to +Z, ours to +X: a quarter turn.
+    Its rows are nodes at v = r / (H' - 1), ours texel centers: with H' = 2 H + 1 all our kinks fall on its nodes.
+    Its columns are texel centers as ours.  Its center column looks to +Z, ours to +X: a quarter turn.
     """
     bitmap = mi.Bitmap(np.ascontiguousarray(node_rows(radiance).numpy(), np.float32))
     return {"type": "envmap", "bitmap": bitmap, "to_world": mi.ScalarTransform4f().rotate([0, 1, 0], 90)}

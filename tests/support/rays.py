@@ -57,7 +57,7 @@ def placed(vertices, o, d, stretch, shift):
 
 
 def packed(counts, device, step=0.05, seed=2):
-    """Samples of rays with these counts, random densities (some negative) and colours."""
+    """Samples of rays with these counts, random densities (some negative) and colors."""
     rng = torch.Generator().manual_seed(seed)
     first = torch.nn.functional.pad(torch.tensor(counts).cumsum(0), (1, 0)).int()
     ray = torch.repeat_interleave(torch.arange(len(counts)), torch.tensor(counts)).int()

@@ -173,7 +173,7 @@ def sphere_grid(height: int) -> tuple[Tensor, Tensor]:
 
 
 def lookup_envmap(radiance: Tensor, d: Tensor) -> Tensor:
-    """Bilinear lat-long lookup by grid_sample on a map padded by its own wrap; row 0 +Y, centre column +X."""
+    """Bilinear lat-long lookup by grid_sample on a map padded by its own wrap; row 0 +Y, center column +X."""
     height, width = radiance.shape[:2]
     u = (torch.atan2(d[..., 2], d[..., 0]) / (2 * torch.pi) + 0.5) * width + 1.0
     v = torch.acos(d[..., 1].clamp(-1, 1)) / torch.pi * height

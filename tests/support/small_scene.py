@@ -20,7 +20,7 @@ TEXELS = 64
 
 
 def ball(radius: float = 0.8, cells: int = 24, squeeze: float = 1.0) -> Asset:
-    """A closed ball with an atlas, grey maps and an even light; ``squeeze`` scales its height."""
+    """A closed ball with an atlas, gray maps and an even light; ``squeeze`` scales its height."""
     axis = torch.linspace(-1.0, 1.0, cells + 1)
     points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
     sdf = (points / torch.tensor([1.0, squeeze, 1.0])).norm(dim=-1) - radius

@@ -1,11 +1,11 @@
-"""A known colour in space, and images read as a viewer reads them."""
+"""A known color in space, and images read as a viewer reads them."""
 
 import numpy as np
 import torch
 
 
 def color(p):
-    """Smooth colours in [0.1, 0.9] of positions; their second derivative is at most 3.6."""
+    """Smooth colors in [0.1, 0.9] of positions; their second derivative is at most 3.6."""
     return 0.5 + 0.4 * torch.sin(3.0 * p + torch.tensor([0.0, 1.0, 2.0], device=p.device, dtype=p.dtype))
 
 

@@ -245,7 +245,7 @@ def test_cameras_follow_the_protocol():
         np.testing.assert_allclose(rotation @ rotation.transpose(0, 2, 1), np.eye(3)[None].repeat(8, 0), atol=1e-5)
         assert (np.linalg.det(rotation) > 0.99).all() and (rotation[:, 1, 1] > 0).all()  # upright
         across = np.linalg.norm(np.cross(eye, rotation[:, :, 2]), axis=1)
-        assert across.max() < 0.15  # the axis passes the centre within five deviations of the jitter
+        assert across.max() < 0.15  # the axis passes the center within five deviations of the jitter
         fields.append(fov)
         elevations.append(np.arcsin(eye[:, 1] / np.linalg.norm(eye, axis=1)))
         distances.append(np.linalg.norm(eye, axis=1) * np.sin(fov / 2) / FRAME_RADIUS)

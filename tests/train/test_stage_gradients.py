@@ -3,7 +3,7 @@
 The random numbers are the same on both sides.  What is a constant backwards by design is left alone: materials are
 evaluated at detached points, the frames of bumps have no gradient, densities of samples are detached.  So light samples
 are taken where the material moves, cosine samples alone where the light does, and where the geometry moves the
-materials are even and the bumps are flat.  Colours at outlines go from pixel to pixel by jumps, which only a wide step
+materials are even and the bumps are flat.  Colors at outlines go from pixel to pixel by jumps, which only a wide step
 averages, and a normal is not evaluated at the moved surface: the gradient of a surface agrees to 15 percent.
 """
 
@@ -40,7 +40,7 @@ CASES = {  # stage, what moves, step, tolerance
     "gaussians, material": (GAUSSIANS, MATERIAL, 3e-3, 0.01),
     "gaussians, light": (GAUSSIANS, LATENT, 1e-3, 0.01),
     "gaussians, shape": (MOVING, SHAPE, 1e-2, 0.15),
-    "gaussians, outline and regularisers": (OUTLINE, SHAPE, 1e-3, 0.01),
+    "gaussians, outline and regularizers": (OUTLINE, SHAPE, 1e-3, 0.01),
     "monte carlo, material": (LIGHT, MATERIAL, 3e-3, 0.01),
     "monte carlo, light": (COSINE, LATENT, 1e-3, 0.01),
 }
@@ -104,7 +104,7 @@ def difference(f, value: torch.Tensor, direction: torch.Tensor, size: float) -> 
 
 
 def test_the_weight_of_quads_moves_their_centers(one, monkeypatch):
-    """gamma decides where a quad's centre lies.  Its last layer alone moves, by which no other weight changes."""
+    """gamma decides where a quad's center lies.  Its last layer alone moves, by which no other weight changes."""
     model = ball_model()
     code = stage_step.encode(model, one)
     last = model.merger.mlp[-1]
@@ -145,5 +145,5 @@ def test_the_normals_of_the_mesh_have_a_gradient_in_the_image(one):
     noise = torch.randn(24, 24, 3, generator=generator)
     leaf = normals.clone().requires_grad_()
     (slope,) = torch.autograd.grad(shown(leaf), leaf)
-    # float32 sums of 576 pixels; the curvature of a normalisation over a step of 1e-2 is 1e-4
+    # float32 sums of 576 pixels; the curvature of a normalization over a step of 1e-2 is 1e-4
     assert float((slope * direction).sum()) == pytest.approx(difference(shown, normals, direction, 1e-2), rel=0.01)

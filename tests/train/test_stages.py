@@ -123,7 +123,7 @@ def test_a_ball_is_shown_as_a_ball(stage, one):
     code = encode(model, one)
     origins, directions = camera_rays(view)
     along = (origins * directions).sum(-1)
-    miss = origins.square().sum(-1) - along**2  # squared distance of a ray from the centre
+    miss = origins.square().sum(-1) - along**2  # squared distance of a ray from the center
     core = miss < RADIUS**2 - 0.1
     if stage is VOLUME:
         rendering = render_volume(model, code, view, lobes(model, code, 16), occupied(model, code, stage), stage, 0)

@@ -108,7 +108,7 @@ def test_the_pattern_loss_forgives_exposure_and_nothing_else():
 
 
 def test_half_an_error_counts_as_much_on_a_plain_object_as_on_a_patterned_one():
-    for amount in (0.1, 0.2):  # of stripes without a factor, on grey
+    for amount in (0.1, 0.2):  # of stripes without a factor, on gray
         stripes = amount * torch.tensor([1.0, -1.0]).repeat(250)[:, None].expand(-1, 3)
         gray = torch.full((500, 3), 0.5)
         whole, half = (float(pattern_loss(gray + k * stripes, gray)) for k in (1.0, 0.5))
@@ -121,7 +121,7 @@ def test_the_excess_entropy_is_least_at_the_target_and_pulls_from_black_and_whit
     assert float(excess_entropy((target + 0.01).clamp(max=1.0), target)) > 0.0
     logit = torch.tensor([-9.0, 9.0]).repeat(3, 1).T.requires_grad_()
     excess_entropy(logit.sigmoid(), torch.full((2, 3), 0.5)).backward()
-    # the slope of the cross-entropy in the logit is the difference of the colours, by the mean over 6 numbers
+    # the slope of the cross-entropy in the logit is the difference of the colors, by the mean over 6 numbers
     torch.testing.assert_close(logit.grad, torch.tensor([-0.5, 0.5]).repeat(3, 1).T / 6, rtol=1e-3, atol=0)
 
 

@@ -38,7 +38,7 @@ MISTAKES = {
 
 def rig(count=4):
     views = sphere_views(count=count, size=(120, 120))
-    return replace(views, intrinsics=views.intrinsics - torch.tensor([0.0, 0.0, 3.0, -2.0]))  # a turn keeps the centre
+    return replace(views, intrinsics=views.intrinsics - torch.tensor([0.0, 0.0, 3.0, -2.0]))  # a turn keeps the center
 
 
 @pytest.mark.parametrize("count", [2, 4, 16])

@@ -61,7 +61,7 @@ def test_blender_folder(tmp_path):
     focal = 0.5 * 40 / math.tan(0.5 * 0.6911112070083618)  # the focal length of x serves y: square pixels
     torch.testing.assert_close(views.intrinsics, torch.tensor([[focal, focal, 20.0, 15.0]]))
     assert views.images[0].shape == (30, 40, 3)
-    assert float(views.images[0][0, 0, 0]) == pytest.approx(90 / 255)  # the colour under alpha 0
+    assert float(views.images[0][0, 0, 0]) == pytest.approx(90 / 255)  # the color under alpha 0
 
 
 def test_nerfstudio_folder(tmp_path):
@@ -134,7 +134,7 @@ def test_colmap_folder_agrees_with_colmaps_own_projection(tmp_path):
         camera = turned + t[i]
         expected = camera[:, :2] / camera[:, 2:] * k[:2] + k[2:]
         pixels, depth = project(torch.from_numpy(points).float(), views.c2w[ours], views.intrinsics[ours])
-        np.testing.assert_allclose(pixels, expected, atol=2e-4)  # float32 poses, some 50 pixels from the centre
+        np.testing.assert_allclose(pixels, expected, atol=2e-4)  # float32 poses, some 50 pixels from the center
         np.testing.assert_allclose(depth, camera[:, 2], rtol=1e-5)
     with pytest.raises(InputError, match="masks: expected a folder"):
         load_views(tmp_path, masks=tmp_path / "none")
@@ -247,7 +247,7 @@ def test_real_captures(shared_data, name):
 
 
 def test_premultiplied_alpha_is_noted(tmp_path):
-    """A bright disk with a soft edge on black, its colour multiplied by alpha or not."""
+    """A bright disk with a soft edge on black, its color multiplied by alpha or not."""
     y, x = np.mgrid[:64, :64] - 31.5
     alpha = np.clip((24 - np.hypot(x, y)) / 6, 0, 1)
     frame = {"file_path": "a.png", "transform_matrix": evil.pose(0), "camera_fov": 0.6}

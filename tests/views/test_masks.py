@@ -61,7 +61,7 @@ TWO_VALUES = {
     "DAVIS entry 3": lambda: palette(np.where(DISK, 3, 0), DAVIS),
     "palette, white first": lambda: palette(np.where(DISK, 0, 1), [(255, 255, 255), (0, 0, 0)]),
     "RGB, one color": lambda: np.where(DISK[..., None], (20, 90, 200), 0).astype(np.uint8),
-    "grey and alpha": lambda: Image.merge(
+    "gray and alpha": lambda: Image.merge(
         "LA", [Image.new("L", (SIDE, SIDE), 77), Image.fromarray(np.where(DISK, 255, 0).astype(np.uint8))]
     ),
     "white on black, opaque": lambda: Image.fromarray(np.where(DISK, 255, 0).astype(np.uint8)).convert("RGBA"),
@@ -73,7 +73,7 @@ TWO_VALUES = {
 def test_of_two_values_nonzero_is_the_object(tmp_path, name):
     mask, notes = mask_of(tmp_path, TWO_VALUES[name]())
     np.testing.assert_array_equal(mask, DISK.astype(np.float32))
-    plain = name in ("white", "1 bit", "16 bit, white", "palette, white first", "grey and alpha")
+    plain = name in ("white", "1 bit", "16 bit, white", "palette, white first", "gray and alpha")
     assert any("nonzero pixels are taken as the object" in n for n in notes) != (plain or "opaque" in name)
 
 
@@ -156,7 +156,7 @@ def test_labels_in_the_alpha_of_an_image(tmp_path):
     assert any("the value 1 instead of white" in n for n in views.notes)
 
 
-@pytest.mark.parametrize("where", ["alpha", "mask", "grey alpha of a mask"])
+@pytest.mark.parametrize("where", ["alpha", "mask", "gray alpha of a mask"])
 @pytest.mark.parametrize("spread", [2, 4, 9])
 def test_values_about_one_level_are_opaque(tmp_path, where, spread):
     """Few or many values about 200, as of a lossy codec."""

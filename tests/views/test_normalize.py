@@ -177,7 +177,7 @@ def test_cameras_that_agree_on_nothing_are_an_error():
         normalize(wrong)
     assert normalize(wrong, "none").is_identity()
     with pytest.raises(ValueError, match="mode"):
-        normalize(views, "centre")
+        normalize(views, "center")
 
 
 @pytest.mark.parametrize("name", ["Camera_01", "Lantern_01", "UCO3D_217-72983-41010", "UCO3D_639-13622-90739"])

@@ -26,7 +26,7 @@ PALETTE = Image.fromarray(SHADES[..., :3]).quantize(16)
 
 
 def deep_png(path, values):
-    """16-bit PNG of ``(H, W, C)`` values; Pillow writes none but grey."""
+    """16-bit PNG of ``(H, W, C)`` values; Pillow writes none but gray."""
     import struct
     import zlib
 
@@ -52,15 +52,15 @@ def gray(k):
 
 # kind of image: how a file of it is written, expected color, tolerance [levels of 255]
 ACCEPTED = {
-    "8-bit colour": (saver("RGB", ".png"), lambda v: v[..., :3], 0),
-    "8-bit colour, TIFF": (saver("RGB", ".tif"), lambda v: v[..., :3], 0),
-    "8-bit colour with alpha": (saver("RGBA", ".png"), lambda v: v[..., :3], 0),
-    "8-bit colour with alpha, WebP": (saver("RGBA", ".webp", lossless=True, exact=True), lambda v: v[..., :3], 0),
-    "8-bit grey": (lambda p: Image.fromarray(SHADES[..., 0]).save(p), gray(0), 0),
+    "8-bit color": (saver("RGB", ".png"), lambda v: v[..., :3], 0),
+    "8-bit color, TIFF": (saver("RGB", ".tif"), lambda v: v[..., :3], 0),
+    "8-bit color with alpha": (saver("RGBA", ".png"), lambda v: v[..., :3], 0),
+    "8-bit color with alpha, WebP": (saver("RGBA", ".webp", lossless=True, exact=True), lambda v: v[..., :3], 0),
+    "8-bit gray": (lambda p: Image.fromarray(SHADES[..., 0]).save(p), gray(0), 0),
     "1-bit": (lambda p: Image.fromarray(SHADES[..., 0] > 99).save(p), lambda v: (gray(0)(v) > 99) * 255, 0),
-    "16-bit grey": (lambda p: Image.fromarray(DEEP[..., 0]).save(p), lambda v: DEEP[..., :1] / 257.0, 0),
-    "16-bit colour": (lambda p: deep_png(p, DEEP[..., :3]), lambda v: v[..., :3], 1),  # the low byte is dropped
-    "16-bit colour with alpha": (lambda p: deep_png(p, DEEP), lambda v: v[..., :3], 1),
+    "16-bit gray": (lambda p: Image.fromarray(DEEP[..., 0]).save(p), lambda v: DEEP[..., :1] / 257.0, 0),
+    "16-bit color": (lambda p: deep_png(p, DEEP[..., :3]), lambda v: v[..., :3], 1),  # the low byte is dropped
+    "16-bit color with alpha": (lambda p: deep_png(p, DEEP), lambda v: v[..., :3], 1),
     "palette": (lambda p: PALETTE.save(p), lambda v: np.array(PALETTE.convert("RGB")), 0),
     # Pillow's plain conversion to ink and back: each of the two rounds to a level
     "CMYK": (
@@ -118,7 +118,7 @@ def capture(folder, width, height, box, *, exif=None, mask_at=None, **lens):
 
 @pytest.mark.parametrize("whole", [False, True])
 def test_a_large_photograph_keeps_its_object_and_its_camera(tmp_path, whole):
-    """A point of the world falls on the same colour, whatever is kept of the picture."""
+    """A point of the world falls on the same color, whatever is kept of the picture."""
     width, height, box = 3001, 2000, (1200, 300, 2703, 1500)
     capture(tmp_path / "large", width, height, box, cx=1400.0, cy=1100.0)
     views = load_views(tmp_path / "large", whole=whole)

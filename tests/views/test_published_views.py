@@ -66,7 +66,7 @@ def test_a_capture_is_prepared_as_published(goldens, shared_data):
     np.testing.assert_allclose(batch.intrinsics.numpy(), matrix[:, [0, 1, 0, 1], [0, 1, 2, 2]], rtol=1e-6)
 
 
-def test_jpeg_keeps_flat_colour_and_halves_the_resolution_of_chroma():
+def test_jpeg_keeps_flat_color_and_halves_the_resolution_of_chroma():
     flat = torch.tensor([120.0, 60, 200]).expand(32, 32, 3) / 255
     assert (jpeg_round_trip(flat) - flat).abs().max() <= 2.5 / 255  # YCbCr and back, in 8 bits
     checker = torch.zeros(32, 32, 3)

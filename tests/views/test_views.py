@@ -19,7 +19,7 @@ def ramp_views(width: int = 90, height: int = 70, box=(20, 12, 50, 60)) -> Views
 
 @pytest.mark.parametrize("crop, size", [(True, 32), (True, 100), (False, 32), (False, 40)])
 def test_intrinsics_follow_the_pixels(crop, size):
-    """The colour under a projected point tells its pixel in the original: there the original camera must see it."""
+    """The color under a projected point tells its pixel in the original: there the original camera must see it."""
     views = ramp_views()
     batch = views.resampled(size, crop=crop)
     across = (torch.rand(200, 2, generator=torch.Generator().manual_seed(2)) - 0.5) * 0.3
@@ -31,7 +31,7 @@ def test_intrinsics_follow_the_pixels(crop, size):
     grid = (after[inside] / size * 2 - 1)[None, None]
     pixels = batch.images[0].permute(2, 0, 1)[None]
     found = torch.nn.functional.grid_sample(pixels, grid, align_corners=False)[0, :2, 0].T * 100
-    # a triangle sampled at whole pixels is off centre by up to 0.045 pixels; half a pixel would be a wrong convention
+    # a triangle sampled at whole pixels is off center by up to 0.045 pixels; half a pixel would be a wrong convention
     torch.testing.assert_close(found, before[inside], rtol=0, atol=0.05)
 
 
@@ -49,7 +49,7 @@ def test_a_crop_over_the_border_has_no_mask_and_the_edge_color():
     left = batch.masks[0][:, :20]
     assert float(left.max()) == 0.0
     row = batch.images[0][35, :, 0]
-    torch.testing.assert_close(row[:20], torch.full((20,), 0.005), rtol=0, atol=1e-4)  # the first column's colour
+    torch.testing.assert_close(row[:20], torch.full((20,), 0.005), rtol=0, atol=1e-4)  # the first column's color
     assert float(row[30]) > 0.02
 
 
