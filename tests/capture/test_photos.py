@@ -144,5 +144,5 @@ def test_what_is_no_capture_is_refused_in_one_line(tmp_path):
     with pytest.raises(InputError, match=r"3\.jpg: cannot be decoded"):
         read_photos(few, quiet)
     (tmp_path / "broken.mp4").write_bytes(b"\0\0\0\x18ftypmp42" + bytes(400))
-    with pytest.raises(InputError, match="cannot be decoded|without a picture stream"):
+    with pytest.raises(InputError, match="cannot be decoded|without a video stream"):
         read_photos(tmp_path / "broken.mp4", quiet)
