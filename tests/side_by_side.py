@@ -1,4 +1,4 @@
-"""One picture of a reconstruction in our renderer and in three clients: ``python -m tests.side_by_side FOLDER OUT``.
+"""A reconstruction in our renderer and in three clients, in one image: ``python -m tests.side_by_side FOLDER OUT``.
 
 FOLDER is what reli3d-infer wrote for an object.  What the clients are and where they lie: ``tests/support/clients.py``.
 """
@@ -41,7 +41,7 @@ def main(argv: list[str] | None = None) -> int:
                 write_environment(folder / name, studio(256))
         light = read_environment(folder / "environment.exr")
         try:
-            pictures = {
+            images = {
                 "reli3d-render": clients.ours(folder / "mesh.glb", light, shot, SAMPLES),
                 "three.js": clients.three_js(folder, shot),
                 "model-viewer": clients.model_viewer(folder, shot),
@@ -51,7 +51,7 @@ def main(argv: list[str] | None = None) -> int:
             print(missing, file=sys.stderr)
             return 2
     tiles = []
-    for name, rgba in pictures.items():
+    for name, rgba in images.items():
         cover = rgba[..., 3:] / 255.0
         tile = Image.fromarray((rgba[..., :3] * cover + BACKGROUND * (1.0 - cover)).round().astype(np.uint8))
         ImageDraw.Draw(tile).text((6, 4), name, fill="black")

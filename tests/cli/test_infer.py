@@ -62,11 +62,11 @@ def test_its_light_shows_it_as_bright_as_the_photographs(example):
     seen, shown = [], []
     for image, mask, c2w, intrinsics in zip(views.images, views.masks, views.c2w, views.intrinsics, strict=True):
         height, width = mask.shape
-        picture = render_asset(asset, Camera(c2w, intrinsics / 8, width // 8, height // 8), light)
+        rendering = render_asset(asset, Camera(c2w, intrinsics / 8, width // 8, height // 8), light)
         image = torch.nn.functional.avg_pool2d(srgb_to_linear(image).movedim(-1, 0), 8).movedim(0, -1)
         inside = torch.nn.functional.avg_pool2d(mask[None], 8)[0] > 0.999
-        both = inside & (picture.alpha > 0) & (image.amax(-1) < 0.97)
-        seen.append(image[both]), shown.append(picture.radiance[both])
+        both = inside & (rendering.alpha > 0) & (image.amax(-1) < 0.97)
+        seen.append(image[both]), shown.append(rendering.radiance[both])
     # without the correction it is half as bright; 10 %: other pixels, of which others are overexposed
     assert float(torch.cat(shown).mean() / torch.cat(seen).mean()) == pytest.approx(1.0, abs=0.1)
 
@@ -176,7 +176,7 @@ def test_a_negative_axis_may_be_a_word_of_its_own(tmp_path):
     assert joined(["--up", "z", "-z", "--up"], "--up", infer.AXES) == ["--up=z", "-z", "--up"]
 
 
-def test_a_refinement_writes_its_picture_and_its_curve(tmp_path):
+def test_refinement_writes_refine_png_and_its_loss_curve(tmp_path):
     assert command(tmp_path, "--refine", "6steps", "--views", "3") == 0
     folder = tmp_path / "out" / "example"
     assert sorted(p.name for p in folder.iterdir()) == sorted((*results.FILES, results.COMPARISON))

@@ -78,7 +78,7 @@ def bytes_of(display):
     return (display.clamp(0.0, 1.0) * 255.0 + 0.5).to(torch.uint8)
 
 
-def same_picture(got, expected):
+def same_image(got, expected):
     """8 bits; a value beside a rounding step may fall on its other side."""
     off = (got.int() - expected.int()).abs()
     return got.shape == expected.shape and int(off.max()) <= 1 and float((off > 0).float().mean()) < 0.01
@@ -118,19 +118,19 @@ def test_linear_files_and_layers_are_those_of_render(scene):
 def test_images_are_the_display_transform_of_the_exposed_radiance(scene, tone, transform):
     image = expected(scene)[0]
     for stops in (0, 1):
-        picture = pixels(run(scene, "--tone", tone, "--exposure", str(stops))["ball.png"])
+        rendering = pixels(run(scene, "--tone", tone, "--exposure", str(stops))["ball.png"])
         shown = torch.cat([transform(2.0**stops * straight(image)), image.alpha[..., None]], -1)
-        assert same_picture(picture, bytes_of(shown))
-    assert int(picture[SIZE // 2, SIZE // 2, 0]) > int(picture[SIZE // 2, SIZE // 2, 1])  # the red ball
+        assert same_image(rendering, bytes_of(shown))
+    assert int(rendering[SIZE // 2, SIZE // 2, 0]) > int(rendering[SIZE // 2, SIZE // 2, 1])  # the red ball
 
 
 def test_environment_is_the_background_if_requested(scene):
     image, camera, light = expected(scene, azimuth=5.0, background="environment")  # the center of the map is in view
-    picture = pixels(run(scene, "--background", "environment", "--azimuth", "5")["ball.png"])
-    assert same_picture(picture, bytes_of(linear_to_srgb(image.radiance)))
+    rendering = pixels(run(scene, "--background", "environment", "--azimuth", "5")["ball.png"])
+    assert same_image(rendering, bytes_of(linear_to_srgb(image.radiance)))
     behind = bytes_of(linear_to_srgb(light.lookup(camera_rays(camera)[1])))
     free = image.alpha == 0.0
-    assert same_picture(picture[free], behind[free])
+    assert same_image(rendering[free], behind[free])
     assert int(behind[free].int().amax()) - int(behind[free].int().amin()) > 100  # both halves of the light
 
 
@@ -149,7 +149,7 @@ def test_turntables_are_their_frames(scene, turn, monkeypatch):
     assert list(files) == [f"ball_{k:04d}.png" for k in range(3)]
     assert "3/3" in terminal.getvalue() and "frame" in terminal.getvalue()
     shown = [torch.cat([linear_to_srgb(straight(image)), image.alpha[..., None]], -1) for image in frames]
-    assert all(same_picture(pixels(path), bytes_of(image)) for path, image in zip(files.values(), shown, strict=True))
+    assert all(same_image(pixels(path), bytes_of(image)) for path, image in zip(files.values(), shown, strict=True))
     for path, image in zip(run(scene, *options, "--format", "exr").values(), frames, strict=True):
         torch.testing.assert_close(read_hdr_image(path), image.radiance, rtol=2**-10, atol=1e-6)
     (path,) = run(scene, *options, "--format", "webp").values()
@@ -164,10 +164,9 @@ def test_turntables_are_their_frames(scene, turn, monkeypatch):
 
 
 def test_diffuse_model_and_wrong_options(scene, capsys):
-    picture = pixels(run(scene, light=None)["ball.png"])
+    image = pixels(run(scene, light=None)["ball.png"])
     changed = (
-        pixels(run(scene, "--diffuse-model", "published", light=None)["ball.png"])[..., :3].int()
-        - picture[..., :3].int()
+        pixels(run(scene, "--diffuse-model", "published", light=None)["ball.png"])[..., :3].int() - image[..., :3].int()
     )
     assert int(changed.max()) > 3 and int(changed.min()) >= -1  # more light at the rim, the same noise
     common = [str(scene / "ball.glb"), "--output", str(scene / "none")]
@@ -189,7 +188,7 @@ def test_diffuse_model_and_wrong_options(scene, capsys):
 
 @pytest.mark.parametrize("ending", ["webp", "gif", "mp4"])
 def test_the_name_of_the_output_makes_an_animation(scene, tmp_path, ending):
-    """Four frames of a turning light; the first shows what a single picture does."""
+    """Four frames of a turning light; the first shows the same as a single image."""
     if ending == "mp4":
         av = pytest.importorskip("av")
     path = tmp_path / f"turn.{ending}"

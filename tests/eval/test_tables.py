@@ -47,13 +47,13 @@ def test_surface_samples_lie_on_the_surface_evenly():
 
 
 def test_psnr_and_ssim_of_known_images():
-    picture = torch.rand(40, 40, 3, generator=torch.Generator().manual_seed(0)) * 0.5
-    assert psnr(picture + 0.1, picture) == pytest.approx(20.0, abs=1e-4) and psnr(picture, picture) == 100.0
-    assert ssim(picture, picture) == pytest.approx(1.0, abs=1e-12)
+    image = torch.rand(40, 40, 3, generator=torch.Generator().manual_seed(0)) * 0.5
+    assert psnr(image + 0.1, image) == pytest.approx(20.0, abs=1e-4) and psnr(image, image) == 100.0
+    assert ssim(image, image) == pytest.approx(1.0, abs=1e-12)
     even = torch.full((20, 20, 3), 0.4)  # no variance: the luminance term alone
     luminance = (2 * 0.4 * 0.6 + 1e-4) / (0.4**2 + 0.6**2 + 1e-4)
     assert ssim(even, even + 0.2) == pytest.approx(luminance, rel=1e-5)
-    assert ssim(picture, picture.flip(0)) < 0.2
+    assert ssim(image, image.flip(0)) < 0.2
     with pytest.raises(ValueError, match="11 pixels"):
         ssim(even[:5], even[:5])
 
@@ -85,8 +85,8 @@ def test_the_reference_reconstructed_perfectly_has_perfect_figures(place, monkey
         return replace(truth.parts[0], environment=Environment(light.radiance * exposure))
 
     monkeypatch.setattr(objects, "reconstruct", perfect)
-    found, pictures = objects.evaluate(None, truth, 2)
-    assert len(given[0]) == 2 and len(pictures) == 7
+    found, images = objects.evaluate(None, truth, 2)
+    assert len(given[0]) == 2 and len(images) == 7
     for name in objects.MAPS:
         assert found[f"{name}_psnr"] == 100.0
     assert found["image_psnr"] > 60 and found["relit_psnr"] == 100.0  # the light's product rounds

@@ -339,7 +339,7 @@ QUADS[..., 3] = 128  # value: mantissa over 256
 HEAD = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n"
 
 
-def picture(path, resolution: str, pixels: bytes, head: bytes = HEAD) -> np.ndarray:
+def round_trip(path, resolution: str, pixels: bytes, head: bytes = HEAD) -> np.ndarray:
     """Mantissas that are read from a file of ``pixels``."""
     path.write_bytes(head + resolution.encode() + b"\n" + pixels)
     return np.rint(read_hdr_image(path).numpy() * 256)
@@ -347,7 +347,7 @@ def picture(path, resolution: str, pixels: bytes, head: bytes = HEAD) -> np.ndar
 
 @pytest.mark.parametrize(
     "resolution, placed",
-    [  # how the rows of a picture lie in the file: Radiance's "File Formats", resolution string
+    [  # the order of rows in the file: Radiance's "File Formats", resolution string
         ("-Y 6 +X 12", lambda q: q),
         ("-Y 6 -X 12", lambda q: q[:, ::-1]),
         ("+Y 6 -X 12", lambda q: q[::-1, ::-1]),
@@ -359,7 +359,7 @@ def picture(path, resolution: str, pixels: bytes, head: bytes = HEAD) -> np.ndar
     ],
 )
 def test_images_of_all_orientations(tmp_path, resolution, placed):
-    got = picture(tmp_path / "a.hdr", resolution, placed(QUADS).tobytes())
+    got = round_trip(tmp_path / "a.hdr", resolution, placed(QUADS).tobytes())
     assert np.array_equal(got, QUADS[..., :3])
 
 
@@ -367,7 +367,7 @@ def test_images_of_all_orientations(tmp_path, resolution, placed):
 def test_flat_pixels_that_begin_like_run_lengths(tmp_path, first):
     quads = QUADS.copy()
     quads[0, 0] = quads[3, 0] = first
-    got = picture(tmp_path / "a.hdr", "-Y 6 +X 12", quads.tobytes())
+    got = round_trip(tmp_path / "a.hdr", "-Y 6 +X 12", quads.tobytes())
     expected = quads[..., :3] * 2.0 ** (quads[..., 3:].astype(float) - 128)
     assert np.array_equal(got, np.rint(expected))
 
@@ -382,12 +382,12 @@ def test_run_lengths_of_before_1991(tmp_path):
     lines = a + again(0) + again(1) + b * 2 + c + again(41)  # 1 + 256 + 2 + 1 + 41 pixels
     lines += b + again(44) + again(1)  # 1 + 44 + 256 pixels
     lines += c * 300 + again(200)  # more than the scanline has
-    got = picture(tmp_path / "a.hdr", "-Y 3 +X 301", lines)
+    got = round_trip(tmp_path / "a.hdr", "-Y 3 +X 301", lines)
     expected = [[a] * 257 + [b] * 2 + [c] * 42, [b] * 301, [c] * 301]
     assert np.array_equal(got, np.frombuffer(b"".join(sum(expected, [])), np.uint8).reshape(3, 301, 4)[..., :3])
     for broken in (a * 200, a + again(10)):
         with pytest.raises(InputError, match="pixels: expected all scanlines"):
-            picture(tmp_path / "b.hdr", "-Y 1 +X 301", broken)
+            round_trip(tmp_path / "b.hdr", "-Y 1 +X 301", broken)
 
 
 def test_scanlines_of_several_kinds_in_one_image(tmp_path):
@@ -395,7 +395,7 @@ def test_scanlines_of_several_kinds_in_one_image(tmp_path):
     old = QUADS[2].copy()
     old[5:] = old[4]
     pixels = QUADS[0].tobytes() + rle + old[:5].tobytes() + bytes((1, 1, 1, 7))
-    got = picture(tmp_path / "a.hdr", "-Y 3 +X 12", pixels)
+    got = round_trip(tmp_path / "a.hdr", "-Y 3 +X 12", pixels)
     assert np.array_equal(got, np.stack([*QUADS[:2], old])[..., :3])
 
 
@@ -427,7 +427,7 @@ def test_exposure_and_color_correction_are_divided_out(tmp_path, head, factor):
 )
 def test_header_lines_that_cannot_be_applied_are_refused(tmp_path, line, said):
     with pytest.raises(InputError, match=said):
-        picture(tmp_path / "a.hdr", "-Y 6 +X 12", QUADS.tobytes(), b"#?RADIANCE\n" + line + b"\n\n")
+        round_trip(tmp_path / "a.hdr", "-Y 6 +X 12", QUADS.tobytes(), b"#?RADIANCE\n" + line + b"\n\n")
 
 
 @pytest.mark.parametrize(
@@ -435,7 +435,7 @@ def test_header_lines_that_cannot_be_applied_are_refused(tmp_path, line, said):
 )
 def test_resolutions_that_are_none_are_refused(tmp_path, resolution):
     with pytest.raises(InputError, match="resolution: expected"):
-        picture(tmp_path / "a.hdr", resolution, QUADS.tobytes())
+        round_trip(tmp_path / "a.hdr", resolution, QUADS.tobytes())
 
 
 def test_writing_to_a_place_that_is_not_there_is_an_oserror(tmp_path):

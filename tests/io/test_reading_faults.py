@@ -129,8 +129,8 @@ def test_many_frames_are_not_counted(tmp_path):
 
 
 def test_a_thousand_scans_are_refused_and_ten_are_not(tmp_path):
-    picture = Image.fromarray(np.random.default_rng(0).integers(0, 255, (64, 64, 3), dtype=np.uint8))
-    picture.save(tmp_path / "a.jpg", progressive=True)
+    image = Image.fromarray(np.random.default_rng(0).integers(0, 255, (64, 64, 3), dtype=np.uint8))
+    image.save(tmp_path / "a.jpg", progressive=True)
     assert read_image(tmp_path / "a.jpg")[0].shape == (64, 64, 3)
     data = (tmp_path / "a.jpg").read_bytes()
     last = data.rindex(b"\xff\xda")
@@ -258,6 +258,6 @@ def test_a_chunk_that_claims_more_than_the_file_takes_no_memory(tmp_path):
     tracemalloc.start()
     try:
         assert read_image(path)[0].shape == (32, 32, 3)
-        assert tracemalloc.get_traced_memory()[1] < 1 << 24  # 16 MiB; the picture has 4 KiB
+        assert tracemalloc.get_traced_memory()[1] < 1 << 24  # 16 MiB; the image has 4 KiB
     finally:
         tracemalloc.stop()

@@ -17,7 +17,7 @@ from reli3d.views.views import Views
 from tests.support.scenes import ball_mesh, textures
 
 RECORD = {"output_from_input": [1], "model_from_input": [2], "weights": {"file": "x"}}
-PICTURE = np.zeros((8, 8, 3), np.uint8)
+PREVIEW = np.zeros((8, 8, 3), np.uint8)
 MOVED = (1.0, 2.0, 3.0)
 
 
@@ -34,7 +34,7 @@ def views():
 
 def written(folder, encoded):
     with results.claim(folder) as replacing:
-        results.write_results(replacing, encoded, PICTURE, {**RECORD, "object": "ball"})
+        results.write_results(replacing, encoded, PREVIEW, {**RECORD, "object": "ball"})
 
 
 @pytest.mark.parametrize("count", [1, 2])

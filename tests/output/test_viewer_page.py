@@ -79,12 +79,12 @@ def ours(asset: Asset, views: Views, i: int, light: Environment, **options) -> R
     return render_asset(asset, Camera(views.c2w[i], camera, WIDE, SIZE), light, supersampling=2, **options)
 
 
-def psnr(picture: np.ndarray, color: torch.Tensor, alpha: torch.Tensor, *, shared: float = 0.99) -> float:
+def psnr(image: np.ndarray, color: torch.Tensor, alpha: torch.Tensor, *, shared: float = 0.99) -> float:
     """Decibels on the pixels that both have; also checks that they share more than ``shared`` of their pixels."""
-    mask = picture[..., 3] > 127
+    mask = image[..., 3] > 127
     assert (mask & (alpha.numpy() > 0.5)).sum() / (mask | (alpha.numpy() > 0.5)).sum() > shared
-    both = (picture[..., 3] == 255) & (alpha.numpy() > 0.999)
-    error = (picture[..., :3][both] / 255.0 - color.numpy()[both]).astype(np.float64)
+    both = (image[..., 3] == 255) & (alpha.numpy() > 0.999)
+    error = (image[..., :3][both] / 255.0 - color.numpy()[both]).astype(np.float64)
     return float(-10 * np.log10(np.mean(error**2)))
 
 
@@ -122,27 +122,27 @@ def test_the_page_shows_the_asset_as_the_renderer_does(tmp_path, asset, views):
     with chromium() as tab:
         tab.open((tmp_path / "viewer.html").as_uri(), size=(WIDE, SIZE)).wait("document.body.dataset.ready")
 
-        def picture(**values) -> np.ndarray:
-            return pixels(tab.evaluate(choose(**values) + "picture()"))
+        def rendered(**values) -> np.ndarray:
+            return pixels(tab.evaluate(choose(**values) + "imageURL()"))
 
         tab.evaluate("take(0)")
         first = ours(asset, views, 0, asset.environment)
-        own = psnr(picture(), shown(first), first.alpha)
+        own = psnr(rendered(), shown(first), first.alpha)
         layers = {
             "base color": linear_to_srgb(first.base_color / first.alpha[..., None].clamp(min=1e-6)),
             "roughness": (first.roughness / first.alpha.clamp(min=1e-6))[..., None].expand(-1, -1, 3),
             "metallic": (first.metallic / first.alpha.clamp(min=1e-6))[..., None].expand(-1, -1, 3),
             "normal": torch.nn.functional.normalize(first.normal, dim=-1) / 2 + 0.5,
         }
-        found = {name: psnr(picture(layer=name), color, first.alpha) for name, color in layers.items()}
-        wires = picture(layer="wireframe")
+        found = {name: psnr(rendered(layer=name), color, first.alpha) for name, color in layers.items()}
+        wires = rendered(layer="wireframe")
         tab.evaluate("take(1)")
         turned = ours(asset, views, 1, Environment(sky().radiance).rotated(math.pi / 2))
-        relit = psnr(picture(layer="lit", light="sky", turn=90, stopsof=-1), shown(turned, 0.5), turned.alpha)
-        still = psnr(picture(turn=0), shown(turned, 0.5), turned.alpha)
-        behind = picture(behind=True)
+        relit = psnr(rendered(layer="lit", light="sky", turn=90, stopsof=-1), shown(turned, 0.5), turned.alpha)
+        still = psnr(rendered(turn=0), shown(turned, 0.5), turned.alpha)
+        behind = rendered(behind=True)
         tab.evaluate(choose(blend=1.0))
-        covered = tab.picture()
+        covered = tab.screenshot()
         tab.evaluate("leave()")
         free = tab.evaluate("photograph.hidden")
         title, choices = tab.evaluate("document.title"), tab.evaluate("get('mesh').parentElement.hidden")
@@ -168,11 +168,11 @@ def test_the_page_shows_what_a_surface_hides_from_itself(tmp_path, waisted, view
         for i in range(len(views)):
             tab.evaluate(f"take({i})")
             for name, turn, stops, light in (("estimated light", 30, 0, studio()), ("sky", -60, -1, sky())):
-                picture = pixels(tab.evaluate(choose(light=name, turn=turn, stopsof=stops) + "picture()"))
+                rendering = pixels(tab.evaluate(choose(light=name, turn=turn, stopsof=stops) + "imageURL()"))
                 turned = light.rotated(math.radians(turn))
                 for shadows in (True, False):
                     image = ours(waisted, views, i, turned, shadows=shadows)
-                    found[i, name, shadows] = psnr(picture, shown(image, 2.0**stops), image.alpha)
+                    found[i, name, shadows] = psnr(rendering, shown(image, 2.0**stops), image.alpha)
         assert tab.problems == []
     for (i, name, shadows), decibels in found.items():
         if shadows:
@@ -194,7 +194,7 @@ def test_the_harmonics_of_the_page_are_ours():
 def test_a_half_hidden_everywhere_is_a_stop_less(tmp_path, asset, views, monkeypatch):
     """Half of an open surface's transfer as what is hidden; harmonics other than ours would leave something else."""
     cosine = torch.tensor([math.pi] + [2 * math.pi / 3] * 3 + [math.pi / 4] * 5 + [0.0] * 7)  # of the harmonics
-    pictures = []
+    images = []
     with chromium() as tab:
         for hidden, stops in ((0.5, 0), (0.0, -1)):
             monkeypatch.setattr(
@@ -203,11 +203,9 @@ def test_a_half_hidden_everywhere_is_a_stop_less(tmp_path, asset, views, monkeyp
             page = one_page(asset, views, sky())
             (tmp_path / f"{stops}.html").write_text(page)
             tab.open((tmp_path / f"{stops}.html").as_uri(), size=(WIDE, SIZE)).wait("document.body.dataset.ready")
-            pictures.append(
-                pixels(tab.evaluate("take(0); " + choose(turn=40, stopsof=stops) + "picture()")).astype(int)
-            )
+            images.append(pixels(tab.evaluate("take(0); " + choose(turn=40, stopsof=stops) + "imageURL()")).astype(int))
         assert tab.problems == []
-    assert np.abs(pictures[0] - pictures[1]).max() <= 4  # of 255: coefficients have 8 bits
+    assert np.abs(images[0] - images[1]).max() <= 4  # of 255: coefficients have 8 bits
 
 
 def test_the_page_of_the_example_looks_as_its_image_by_the_renderer(tmp_path):
@@ -218,11 +216,11 @@ def test_the_page_of_the_example_looks_as_its_image_by_the_renderer(tmp_path):
     with chromium() as tab:
         tab.open((tmp_path / "example" / "viewer.html").as_uri(), size=(SIZE, SIZE)).wait("document.body.dataset.ready")
         (view, *_) = tab.evaluate("data.views")
-        picture = pixels(tab.evaluate("take(0); picture()"))
+        rendering = pixels(tab.evaluate("take(0); imageURL()"))
         assert tab.problems == []
     camera = torch.tensor(view["intrinsics"]) * (SIZE / view["width"])
     image = render_asset(part, Camera(torch.tensor(view["c2w"]), camera, SIZE, SIZE), light, supersampling=2)
-    assert psnr(picture, shown(image), image.alpha, shared=0.98) > 30.0  # its handle is thin
+    assert psnr(rendering, shown(image), image.alpha, shared=0.98) > 30.0  # its handle is thin
 
 
 def test_the_page_of_a_reconstruction_holds_all_it_needs(asset, views):

@@ -97,7 +97,7 @@ def test_a_client_shows_the_light_where_we_do(client, folder, ours):
 @pytest.mark.slow  # bpy is a third of a gigabyte, for one version of Python
 def test_blender_shows_the_exports_as_the_glb(folder, tmp_path):
     """A ball of four colors, of which a half is rough and another half is metal: a map that is lost, flipped or taken
-    for another gives another picture, as the halves exchanged show.
+    for another changes the image, as the exchanged halves show.
     """
     light = read_environment(folder / "environment.exr").radiance
     light = Environment(light + torch.linspace(1.0, 0.0, len(light))[:, None, None])

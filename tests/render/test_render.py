@@ -23,7 +23,7 @@ from tests.support.surfaces import inputs, on_ball
 
 
 def square(device, normals=True):
-    """Unit square facing +Z, its picture upright: u along +X, v = 0 at the top."""
+    """Unit square facing +Z, its texture upright: u along +X, v = 0 at the top."""
     v = torch.tensor([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], device=device)
     uv = torch.tensor([[0.0, 1], [1, 1], [1, 0], [0, 0]], device=device)
     n = torch.tensor([[0.0, 0, 1]], device=device).expand(4, 3).contiguous() if normals else None
@@ -73,7 +73,7 @@ def test_texture_lookup_is_bilinear_and_repeats(device):
 
 @pytest.mark.parametrize("explicit", [True, False])
 def test_normal_map_points_right_and_up_as_gltf_says(device, explicit):
-    """Red bends the normal towards u (right), green towards the top of the picture."""
+    """Red bends the normal towards u (right), green towards the top of the texture."""
     mesh = square(device)
     if explicit:
         mesh = Mesh(
@@ -93,14 +93,14 @@ def test_normal_map_points_right_and_up_as_gltf_says(device, explicit):
         torch.testing.assert_close(points.normal.cpu(), torch.tensor([expected, expected]), rtol=0, atol=1e-5)
 
 
-def test_picture_on_a_square_is_upright_and_resolved(device):
-    picture = torch.rand(8, 8, 3, generator=torch.Generator().manual_seed(0)).to(device)
-    asset = Asset(square(device), replace(textures(8, device), base_color=picture))
+def test_texture_on_a_square_is_upright_and_resolved(device):
+    rendering = torch.rand(8, 8, 3, generator=torch.Generator().manual_seed(0)).to(device)
+    asset = Asset(square(device), replace(textures(8, device), base_color=rendering))
     camera = Camera(eye(device, 0.0, 0.0, 4.0), torch.tensor([16.0, 16.0, 4.0, 4.0], device=device), 8, 8)
     env = Environment.constant(torch.ones(3, device=device))
     image = render_asset(asset, camera, env)
 
-    torch.testing.assert_close(image.base_color, picture, rtol=0, atol=1e-4)  # one texel a pixel
+    torch.testing.assert_close(image.base_color, rendering, rtol=0, atol=1e-4)  # one texel a pixel
     assert float(image.alpha.min()) == 1.0
     torch.testing.assert_close(image.depth, torch.full_like(image.depth, 4.0), rtol=1e-5, atol=0)
     wide = Camera(camera.c2w, torch.tensor([16.0, 16.0, 6.0, 4.0], device=device), 12, 8)
@@ -162,7 +162,7 @@ def test_box_of_points_holds_their_pixels_and_is_no_larger_than_it_must_be(devic
 
 
 def test_rays_beside_the_asset_are_left_out_without_a_trace_in_the_image(device, monkeypatch):
-    """A box on the border, one beside the picture and the whole one, the eye within the asset's reach."""
+    """A box on the border, one next to the image and the whole image, the eye within the asset's reach."""
     asset, env = ball(device), Environment(torch.rand(8, 16, 3, generator=torch.Generator().manual_seed(2)).to(device))
     rays, closest = [], RayScene.closest
 

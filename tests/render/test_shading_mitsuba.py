@@ -161,7 +161,7 @@ def compare(runs, expected, variance, theirs):
 
 
 def mapped_ball_in_ring():
-    """With maps of 8 texels a side that differ in every channel; their picture lies flat in x and -y."""
+    """With maps of 8 texels a side that differ in every channel; they are mapped to x and -y."""
     mesh = ball_in_ring()
     vertices, faces = torch.tensor(mesh.vertices).float(), torch.tensor(mesh.faces).int()
     normals = torch.tensor(np.array(mesh.vertex_normals)).float()

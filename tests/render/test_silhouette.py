@@ -121,7 +121,7 @@ def test_mask_loss_gradient_matches_differences_of_sampled_coverage(device, name
         assert abs(got - expected) < 0.15 * largest, key
 
 
-def picture_of(vertices, faces, camera, colors, background):
+def rendering_of(vertices, faces, camera, colors, background):
     """Colors ``(F, 3)`` of faces before ``background (H, W, 3)``: none of them moves, but the outline."""
     scene = RayScene(vertices.detach(), faces)
     seen = layer_of_hits(scene, camera)
@@ -129,7 +129,7 @@ def picture_of(vertices, faces, camera, colors, background):
     return antialias(image, vertices, faces, camera, scene)
 
 
-@pytest.mark.parametrize("layer", ["mask", "picture"])
+@pytest.mark.parametrize("layer", ["mask", "image"])
 def test_descent_moves_a_sphere_onto_its_target(device, layer):
     """By its mask, and by its colors alone, some of them darker and some brighter than what is behind them."""
     vertices, faces = shape("sphere", device)
@@ -142,7 +142,7 @@ def test_descent_moves_a_sphere_onto_its_target(device, layer):
     def draw(moved):
         if layer == "mask":
             return mask_of(moved, faces, camera)
-        return picture_of(moved, faces, camera, colors, background)
+        return rendering_of(moved, faces, camera, colors, background)
 
     aim = torch.tensor([0.15, -0.1, 0.05], device=device)
     target = draw(vertices * 0.8 + aim)

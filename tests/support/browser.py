@@ -89,7 +89,7 @@ class Page:
                 raise AssertionError(f"{code}: not true after {TIMEOUT:g} s; the page said {self.problems}")
             time.sleep(0.1)
 
-    def picture(self) -> np.ndarray:
+    def screenshot(self) -> np.ndarray:
         """What the window shows, ``(H, W, 3)`` uint8."""
         return pixels(self._call("Page.captureScreenshot", format="png")["data"])[..., :3]
 
@@ -127,7 +127,7 @@ class Page:
             self.problems.append(" ".join(str(a.get("value", a.get("description"))) for a in params["args"]))
         elif event == "Log.entryAdded" and params["entry"]["level"] in ("error", "warning"):
             if "GL Driver Message (OpenGL, Performance" in params["entry"]["text"]:
-                return  # reading a picture back waits for the software renderer
+                return  # reading an image back waits for the software renderer
             self.problems.append(f"{params['entry']['text']} {params['entry'].get('url', '')}")
 
 

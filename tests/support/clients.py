@@ -34,7 +34,7 @@ THREE = Path(reli3d.__file__).parent / "assets" / "viewer" / "three.min.js"
 
 @dataclass(frozen=True)
 class Shot:
-    """A square picture of the origin; angles in degrees."""
+    """A square image of the origin; angles in degrees."""
 
     size: int = 256
     fov: float = 32.0
@@ -70,7 +70,7 @@ Promise.all(files).then(([gltf, map]) => {
   scene.environment = map
   scene.add(gltf.scene)
   renderer.render(scene, camera)
-  window.picture = renderer.domElement.toDataURL()
+  window.rendering = renderer.domElement.toDataURL()
 })
 </script>"""
 
@@ -84,7 +84,7 @@ MODEL_VIEWER_PAGE = """<!doctype html><link rel="icon" href="data:,">
  shadow-intensity="0" interpolation-decay="1"></model-viewer>
 <script>
 const viewer = document.querySelector('model-viewer')
-viewer.addEventListener('load', () => setTimeout(() => { window.picture = viewer.toDataURL('image/png') }, 1000))
+viewer.addEventListener('load', () => setTimeout(() => { window.rendering = viewer.toDataURL('image/png') }, 1000))
 </script>"""
 
 
@@ -92,8 +92,8 @@ def _shown(folder: Path, page: str, shot: Shot) -> np.ndarray:
     values = {**vars(shot), "polar": 90.0 - shot.elevation, "eye": ", ".join(f"{v:.6f}" for v in shot.eye)}
     (folder / "index.html").write_text(page % values)
     with chromium() as tab, served(folder) as url:
-        tab.open(f"{url}/index.html", size=(shot.size, shot.size)).wait("window.picture")
-        return pixels(tab.evaluate("window.picture")).astype(np.float64)
+        tab.open(f"{url}/index.html", size=(shot.size, shot.size)).wait("window.rendering")
+        return pixels(tab.evaluate("window.rendering")).astype(np.float64)
 
 
 def three_js(folder: Path, shot: Shot) -> np.ndarray:

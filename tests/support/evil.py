@@ -24,7 +24,7 @@ def pose(yaw: float, distance: float = 2.0) -> list[list[float]]:
     return [[c, 0.0, s, distance * s], [0.0, 1.0, 0.0, 0.0], [-s, 0.0, c, distance * c], [0.0, 0.0, 0.0, 1.0]]
 
 
-def picture(side: int = SIDE, alpha: bool = True) -> np.ndarray:
+def random_image(side: int = SIDE, alpha: bool = True) -> np.ndarray:
     """A gray disk of a third of the side on black."""
     y, x = np.mgrid[:side, :side] + 0.5 - side / 2
     inside = ((x * x + y * y) < (side / 3) ** 2).astype(np.uint8)
@@ -36,7 +36,7 @@ def good(folder: Path, views: int = 3) -> dict:
     (folder / "rgba").mkdir(parents=True, exist_ok=True)
     frames = []
     for i in range(views):
-        Image.fromarray(picture()).save(folder / f"rgba/{i}.png")
+        Image.fromarray(random_image()).save(folder / f"rgba/{i}.png")
         frames.append(
             {
                 "view_index": i,
@@ -125,7 +125,7 @@ def png_claiming(width: int, height: int, depth: int = 8, color: int = 6) -> byt
 
 def _animated() -> bytes:
     buffer = io.BytesIO()
-    frames = [Image.fromarray(np.roll(picture(), k, 0)) for k in range(3)]
+    frames = [Image.fromarray(np.roll(random_image(), k, 0)) for k in range(3)]
     frames[0].save(buffer, "WEBP", save_all=True, append_images=frames[1:], lossless=True)
     return buffer.getvalue()
 
@@ -156,7 +156,7 @@ def _mask(pixels: np.ndarray | bytes | None) -> Callable[[Path], None]:
         data = good(folder)
         (folder / "masks").mkdir()
         for i in range(len(data["frames"])):
-            Image.fromarray(picture(alpha=False)).save(folder / f"rgba/{i}.png")
+            Image.fromarray(random_image(alpha=False)).save(folder / f"rgba/{i}.png")
             if isinstance(pixels, bytes):
                 (folder / f"masks/{i}.png").write_bytes(pixels)
             elif pixels is not None:
@@ -171,7 +171,7 @@ def colmap(folder: Path) -> tuple[str, str]:
     (folder / "sparse/0").mkdir(parents=True)
     lines = []
     for i in range(3):
-        Image.fromarray(picture()).save(folder / f"images/{i}.png")
+        Image.fromarray(random_image()).save(folder / f"images/{i}.png")
         half = 2.1 * i / 2  # OpenGL world to OpenCV camera: half a turn about x after the turn by -yaw about y
         lines += [f"{i + 1} 0 {math.cos(half)!r} 0 {math.sin(half)!r} 0 0 2 1 {i}.png", "1.5 2.5 -1"]
     cameras = f"# Camera list\n1 PINHOLE {SIDE} {SIDE} 51.7 51.7 {SIDE / 2} {SIDE / 2}\n"
@@ -204,7 +204,7 @@ def _scaled(factor: float):
 
 def cases() -> list[tuple[str, Callable[[Path], None]]]:
     """``(name, make)``: ``make(folder)`` fills a new folder that no command may accept."""
-    full = picture()
+    full = random_image()
     full[..., 3] = 255
     noise = np.random.default_rng(0).integers(0, 255, (SIDE, SIDE, 4), np.uint8)
     big = "9" * 5000

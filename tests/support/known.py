@@ -47,7 +47,7 @@ def png(pixels: np.ndarray | Image.Image) -> bytes:
     return data.getvalue()
 
 
-def picture(rng: Random, width: int = SIDE, height: int = SIDE) -> bytes:
+def random_image(rng: Random, width: int = SIDE, height: int = SIDE) -> bytes:
     return png(np.random.default_rng(rng.getrandbits(32)).integers(30, 220, (height, width, 3), dtype=np.uint8))
 
 
@@ -96,7 +96,7 @@ def masks(rng: Random) -> Case:
     for k, pose in enumerate(rotations(rng, 3)):
         soft = disk(rng)
         hard = soft > 0.5
-        name, image = f"images/{k:03d}.png", picture(rng)
+        name, image = f"images/{k:03d}.png", random_image(rng)
         gray = {"white": 255 * hard, "soft": np.rint(255 * soft), "two labels": np.where(hard, label, 0)}
         mask: np.ndarray | Image.Image = gray.get(kind, label * hard).astype(np.uint8)
         if kind == "two labels":
@@ -131,7 +131,7 @@ def names(rng: Random) -> Case:
         part = f"{folders[k % len(folders)]}/{stem}"
         mask = disk(rng) > 0.5
         name = f"images/{part}.jpg" if layout == "below images" else f"{part}.png"
-        image = Image.open(io.BytesIO(picture(rng)))
+        image = Image.open(io.BytesIO(random_image(rng)))
         data = io.BytesIO()
         image.save(data, "JPEG" if name.endswith("jpg") else "PNG")
         files[name], truth[name] = data.getvalue(), mask
@@ -198,7 +198,7 @@ def check_cameras(folder: Path, truth: dict[str, tuple], tolerance: float = 1e-3
 
 
 def rgba(rng: Random, width: int, height: int) -> bytes:
-    rgb = np.asarray(Image.open(io.BytesIO(picture(rng, width, height))))
+    rgb = np.asarray(Image.open(io.BytesIO(random_image(rng, width, height))))
     alpha = np.zeros((height, width, 1), np.uint8)
     alpha[8:-8, 8:-8] = 255
     return png(np.concatenate([rgb, alpha], -1))

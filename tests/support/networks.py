@@ -57,7 +57,7 @@ NANO = replace(  # the paper's network at sizes that run in milliseconds, withou
 
 
 def views(objects, count, size, seed=0):
-    """Random pictures from cameras at distance 2 on circles about the vertical, all looking at the origin."""
+    """Random images from cameras at distance 2 on circles about the vertical, all looking at the origin."""
     generator = torch.Generator().manual_seed(seed)
     angle = torch.rand(objects, count, generator=generator) * 6.28
     zero, one = torch.zeros_like(angle), torch.ones_like(angle)

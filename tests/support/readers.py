@@ -44,9 +44,9 @@ def _folder(make: Callable[[Path], object], root: Path) -> dict[str, bytes]:
     return {str(p.relative_to(root)): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
 
 
-def _picture(form: str, **options) -> bytes:
+def _encoded(form: str, **options) -> bytes:
     data = io.BytesIO()
-    Image.fromarray(evil.picture(alpha=form != "JPEG")).save(data, form, **options)
+    Image.fromarray(evil.random_image(alpha=form != "JPEG")).save(data, form, **options)
     return data.getvalue()
 
 
@@ -61,20 +61,20 @@ def targets(root: Path) -> list[Target]:
         Target("colmap", _folder(evil.colmap, root / "colmap"), load_views),
     ]
     cameras = {"transforms.json": found[0].files["transforms.json"]}
-    found.append(Target("rigs", cameras, _with_pictures))
-    pictures = [
+    found.append(Target("rigs", cameras, _with_images))
+    images = [
         ("png", {}),
         ("jpeg", {"progressive": True}),
         ("webp", {}),
         ("tiff", {}),
         ("tiff", {"compression": "tiff_lzw"}),
     ]
-    for k, (form, options) in enumerate(pictures):
+    for k, (form, options) in enumerate(images):
         name = f"a.{form}"
         found.append(
             Target(
                 f"{form} {k}" if form == "tiff" else form,
-                {name: _picture(form.upper(), **options)},
+                {name: _encoded(form.upper(), **options)},
                 lambda folder, name=name: read_image(folder / name),
             )
         )
@@ -97,10 +97,10 @@ def _nothing(folder: Path) -> None:
     """A target with a truth reads by itself."""
 
 
-def _with_pictures(folder: Path) -> None:
-    """Cameras alone are changed: the pictures are good."""
+def _with_images(folder: Path) -> None:
+    """Only the cameras are changed; the images are valid."""
     (folder / "rgba").mkdir(exist_ok=True)
-    data = _picture("PNG")
+    data = _encoded("PNG")
     for k in range(3):
         (folder / "rgba" / f"{k}.png").write_bytes(data)
     explain_cameras(load_views(folder))

@@ -38,7 +38,7 @@ def ball_model(seed: int = 0) -> BallModel:
 
 
 def camera(size: int) -> Camera:
-    """From the side, far enough for the ball to stay in the picture."""
+    """From the side, far enough for the ball to stay in the image."""
     return Camera.from_fov(look_at([0.4, 0.5, 2.0], [0.0, 0.0, 0.0]), 0.75, size, size)
 
 

@@ -1,4 +1,4 @@
-"""Training of the 2D U-Net alone: pictures of any size, objects side by side, levels that grow."""
+"""Training of the 2D U-Net alone: images of any size, several objects, levels that are added."""
 
 import dataclasses
 
@@ -166,7 +166,7 @@ def test_every_view_of_a_drawn_object_is_read_once(folder):
 
 
 def test_levels_are_taught_one_after_the_other(folder, tmp_path):
-    """From pictures of 64 pixels to the whole network by the command; each stage keeps what the one before knew."""
+    """From images of 64 pixels to the whole network by the command; each stage keeps the weights of the one before."""
     start = ["--steps", "2", "--batch", "2", "--rate", "1e-9"]
     assert main([str(folder), str(tmp_path / "64"), "--stage", "pixels", "--image-size", "64", *start]) == 0
     from_64, from_128 = (["--weights", str(tmp_path / name / "state.pt")] for name in ("64", "128"))

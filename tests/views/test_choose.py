@@ -104,7 +104,7 @@ def cut_off(path, count, which) -> None:
     folder(path, rig(*[(360 * k / count, 20, 2) for k in range(count)]))
     data = json.loads((path / "transforms.json").read_text())
     for k, frame in enumerate(data["frames"]):
-        pixels = evil.picture()
+        pixels = evil.random_image()
         frame["file_path"] = f"rgba/{k:02d}.png"
         Image.fromarray(np.roll(pixels, evil.SIDE // 2, 1) if k in which else pixels).save(path / frame["file_path"])
     (path / "transforms.json").write_text(json.dumps(data))

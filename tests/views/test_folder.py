@@ -14,7 +14,7 @@ from tests.support import evil
 
 
 def photo(path, width=40, height=30, alpha=True):
-    """A picture of this size with a rectangle as object."""
+    """An image of this size with a rectangle as object."""
     pixels = np.zeros((height, width, 4), np.uint8)
     pixels[..., :3] = 90
     pixels[5:-5, 8:-8] = (200, 50, 20, 255)

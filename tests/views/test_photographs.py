@@ -118,7 +118,7 @@ def capture(folder, width, height, box, *, exif=None, mask_at=None, **lens):
 
 @pytest.mark.parametrize("whole", [False, True])
 def test_a_large_photograph_keeps_its_object_and_its_camera(tmp_path, whole):
-    """A point of the world falls on the same color, whatever is kept of the picture."""
+    """A point of the world falls on the same color, whatever part of the image is kept."""
     width, height, box = 3001, 2000, (1200, 300, 2703, 1500)
     capture(tmp_path / "large", width, height, box, cx=1400.0, cy=1100.0)
     views = load_views(tmp_path / "large", whole=whole)
@@ -202,11 +202,11 @@ def test_16_large_photographs_take_less_than_a_gibibyte(tmp_path):
 def plain(folder, masks=True, inner="images"):
     (folder / inner).mkdir(parents=True, exist_ok=True)
     for i in range(3):
-        Image.fromarray(evil.picture(alpha=False)).save(folder / inner / f"p {i}.jpg")
+        Image.fromarray(evil.random_image(alpha=False)).save(folder / inner / f"p {i}.jpg")
     if masks:
         (folder / "masks").mkdir()
         for i in range(3):
-            Image.fromarray(evil.picture()[..., 3]).save(folder / f"masks/p {i}.png")
+            Image.fromarray(evil.random_image()[..., 3]).save(folder / f"masks/p {i}.png")
     return folder
 
 

@@ -1,5 +1,5 @@
 'use strict'
-// The page beside mesh.glb.  Everything comes from the JSON in #data: meshes and lights as base64, photographs as data
+// The page next to mesh.glb.  Everything comes from the JSON in #data: meshes and lights as base64, photographs as data
 // URLs with their cameras: c2w by rows (OpenGL axes) and fx, fy, cx, cy in pixels.
 const T = THREE
 const get = id => document.getElementById(id)
@@ -15,10 +15,10 @@ stage.prepend(renderer.domElement)
 const scene = new T.Scene()
 const camera = new T.PerspectiveCamera(35, 1, 0.01, 100)
 const orbit = new T.OrbitControls(camera, renderer.domElement)
-let stop = null // the photograph whose camera is taken, or null
+let stop = null // the photograph whose camera is in use, or null
 let waiting = false
 
-// Layers that are no light: values of the maps as they are, normals in the world's axes.
+// Unlit layers: values of the maps, normals in world axes.
 const layers = { 'base color': 0, roughness: 1, metallic: 2, normal: 3 }
 const VERTEX = `
 attribute vec4 tangent;
@@ -44,8 +44,8 @@ void main() {
   } else gl_FragColor = vec4(vec3(layer == 1 ? texture2D(orm, at).g : texture2D(orm, at).b), 1.0);
 }`
 
-// Shadows: reli3d/render/transfer.py.  A vertex has the harmonics of what the mesh hides from it, weighed by the cosine.
-// Their product with those of the light is the irradiance that it misses.
+// Shadows: reli3d/render/transfer.py.  A vertex has the harmonics of the directions that the mesh occludes,
+// weighted by the cosine.  Their product with those of the light is the occluded irradiance.
 const HARMONICS = `
 mat4 harmonics(vec3 d) { // degree 0 is the first value, 1 the next three, 2 the next five, 3 the last seven
   float x = d.z, y = d.x, z = d.y, xx = x * x, yy = y * y, zz = z * z;
@@ -75,8 +75,8 @@ mat4 whole = cosine(harmonics(normal));
 for (int i = 0; i < 3; i++)
   open[i] = clamp(1.0 - product(hidden, lightHarmonics[i]) / max(product(whole, lightHarmonics[i]), 1e-6), 0.0, 1.0);
 `
-// What is mirrored is hidden as far as a lobe about its direction is, a Gaussian on the sphere as wide as GGX's (Wang et
-// al. 2009).  The lobe is reflected at the tangent plane, so that nothing is lost below it where nothing is hidden.
+// Occlusion of the specular lobe: of a spherical Gaussian about the mirror direction as wide as GGX's (Wang et al. 2009).
+// The part of the lobe below the tangent plane is reflected, so that an unoccluded point loses no light.
 const SHADOW_AT_FRAGMENT = `
 iblIrradiance *= open;
 vec3 facing = normalize(up), mirrored = reflect(-geometryViewDir, geometryNormal);
@@ -87,7 +87,7 @@ lobe = bands(lobe, 1.0, exp(-2.0 * wide), exp(-6.0 * wide), exp(-12.0 * wide));
 radiance *= clamp(1.0 - product(hidden, lobe) / product(cosine(lobe), harmonics(facing)), 0.0, 1.0);
 `
 
-// MeshStandardMaterial whose image-based light is hidden by the mesh; uniforms are shared by all that have them.
+// MeshStandardMaterial with image-based light occluded by the mesh; all materials use the same uniforms.
 function shadowed(material, uniforms) {
   material.onBeforeCompile = shader => {
     Object.assign(shader.uniforms, uniforms)
@@ -119,7 +119,7 @@ function later() {
   requestAnimationFrame(() => { waiting = false; draw() })
 }
 
-// A map of more columns, bilinear between texel centers as our renderer has it; half floats in and out.
+// A map of more columns, bilinear between texel centers as in reli3d's renderer; half floats in and out.
 function finer({ width, height, data: half }) {
   const scale = Math.max(1, Math.round(FINE / width)), w = width * scale, h = height * scale
   const linear = Float32Array.from(half, T.DataUtils.fromHalfFloat), out = new Uint16Array(4 * w * h)
@@ -187,7 +187,7 @@ async function load() {
   return parts
 }
 
-// The camera of a photograph in the middle of the window, as large as it fits; what lies beside it is seen as well.
+// Centers the photograph's camera in the window, as large as fits; the margins show the scene around it.
 function place() {
   const width = stage.clientWidth, height = stage.clientHeight
   renderer.setSize(width, height)
@@ -236,7 +236,7 @@ function leave() {
 }
 
 // A PNG of the window's view, as a data URL.
-function picture() {
+function imageURL() {
   draw()
   return renderer.domElement.toDataURL('image/png')
 }
@@ -258,7 +258,7 @@ async function start() {
     get('stops').append(button)
   }
   get('blend').addEventListener('input', blend)
-  get('save').onclick = () => Object.assign(document.createElement('a'), { href: picture(), download: `${data.name}.png` }).click()
+  get('save').onclick = () => Object.assign(document.createElement('a'), { href: imageURL(), download: `${data.name}.png` }).click()
   addEventListener('resize', place)
   if (data.views.length) take(0)
   else {
