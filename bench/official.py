@@ -155,7 +155,7 @@ def table(preset: Preset, count: int) -> str:
 
 def write_random(path: Path, preset: Preset) -> None:
     torch.manual_seed(0)
-    weights.save(path, Reconstructor(preset), licence="none: random numbers", dtype=torch.float32)
+    weights.save(path, Reconstructor(preset), license="none: random numbers", dtype=torch.float32)
 
 
 def matrix_rate(device: torch.device, dtype: torch.dtype, seconds: float = 2.0) -> float:

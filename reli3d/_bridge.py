@@ -352,7 +352,7 @@ def call(kernel, n: int, ins: Sequence, outs: Sequence, *, device: torch.device,
 
 def tensor_of(value, dtype: torch.dtype = torch.float32):
     """``value`` as a tensor of ``dtype`` if that is lossless: numpy arrays, and for int32 and int64 any integers.
-    Other values are returned unchanged, for :func:`check` to refuse."""
+    Other values are returned unchanged, for :func:`check` to reject."""
     if isinstance(value, np.ndarray):
         if value.dtype.name not in ("float32", "float64", "int64", "int32", "int16", "uint8", "uint16", "uint32"):
             return value

@@ -176,7 +176,7 @@ def pack(args: argparse.Namespace) -> int:
     if not isinstance(found, Samples | Captures):
         raise InputError(args.input, "expected samples or captures, got tar files")
     if isinstance(found, Captures):
-        for name, reason in found.refused.items():
+        for name, reason in found.rejected.items():
             report(f"{name}: left out, {reason}")
     shards.pack(found, args.output, each=args.each, progress=report)
     return 0

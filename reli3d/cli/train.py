@@ -21,7 +21,7 @@ SMALL_STAGES = ("pixels", "small")
 SIDES = 64, 128, 256  # of the images of stage pixels
 CALIBRATED = 5  # least views of a sample for calibration: four are input, one is compared
 OF_LOOP = ("steps", "minutes", "batch", "rate", "seed", "save_every", "tensorboard")
-OF_ALL = (*OF_LOOP, "weights", "validation", "export", "licence", "max_views", "bfloat16")
+OF_ALL = (*OF_LOOP, "weights", "validation", "export", "license", "max_views", "bfloat16")
 OF_SMALL = ("points", "pyramid_rate", "maps", "material_bins")
 OF_CONFIG = ("image_size", "patch", "targets", "lobes", "resolution", "samples", "shadows")  # of a StageConfig
 OF_PAPER = (*OF_CONFIG, "preset", "prior", "perceptual", "checkpointing", "shard", "device")
@@ -56,7 +56,7 @@ def parser() -> argparse.ArgumentParser:
     )
     p.add_argument("--validation", type=Path, help="folder of held-out objects, reconstructed at every checkpoint")
     p.add_argument("--export", type=Path, help="write the averaged weights of the checkpoint to this file and exit")
-    p.add_argument("--licence", help="license of the exported weights, stored in the file")
+    p.add_argument("--license", help="license of the exported weights, stored in the file")
     loop = p.add_argument_group("schedule (default: of the stage)")
     loop.add_argument("--steps", type=int)
     loop.add_argument("--minutes", type=float, help="end training after this time, if before --steps")
@@ -287,7 +287,7 @@ def main(argv: list[str] | None = None) -> int:
     torch.manual_seed(getattr(args, "seed", 0))
     stage = (small_stage if args.stage in SMALL_STAGES else paper_stage)(args)
     if "export" in args:
-        print(weights.save(args.export, export(args, stage), licence=getattr(args, "licence", "not stated")).path)
+        print(weights.save(args.export, export(args, stage), license=getattr(args, "license", "not stated")).path)
         return 0
     settings = given(args, *OF_LOOP, "shard")
     if "tensorboard" in settings:

@@ -33,7 +33,7 @@ def parser() -> argparse.ArgumentParser:
 class Handler(http.server.SimpleHTTPRequestHandler):
     """Serves the files of one folder to this machine only.
 
-    Refuses requests whose ``Host`` is not the server's own address, against DNS rebinding.
+    Rejects requests whose ``Host`` is not the server's own address, against DNS rebinding.
     """
 
     def parse_request(self) -> bool:

@@ -26,7 +26,7 @@ CHECK_SAMPLES = (16, 16, 4)
 LIGHT_SCALES = tuple(math.exp(0.05 * k) for k in range(-12, 13))
 PSNR_TOLERANCE_DB = 0.02  # the noise of a comparison
 # Tolerances of the mean PSNR over input views, held-out views and all views when only the surface is kept: the masks of
-# all views have bounded the surface, while the start's material and light contain shading of the start's surface.
+# all views have bounded the surface, while the start's material and lighting contain shading of the start's surface.
 SURFACE_TOLERANCES_DB = (0.1, 0.3, 0.05)
 
 
@@ -48,8 +48,8 @@ class Parts:
 
 
 UNCHANGED = Parts(0.0, 0.0, 0.0)
-# Weights of material and light in the order of trial.  Relighting shows surface and material but not the estimated
-# light, so the light is reduced first.  Fitted material without any of the light fitted with it is not tried.
+# Weights of material and lighting in the order of trial.  Relighting shows surface and material but not the estimated
+# lighting, so the lighting is reduced first.  Fitted material without any of the lighting fitted with it is not tried.
 CANDIDATES = ((1.0, 1.0), (1.0, 0.5), (0.5, 1.0), (0.5, 0.5), (0.0, 1.0), (0.0, 0.5), (0.0, 0.0))
 MIN_VIEWS_FULL_WEIGHT = (
     4  # with fewer input views the material's weight, and with a held-out view the light's, is <= 0.5
@@ -60,9 +60,9 @@ MIN_VIEWS_FULL_WEIGHT = (
 class Fitted:
     """A start and the result of a fit.
 
-    first: the start.  surface: the new surface with the maps and light of the start; ``first`` where it did not move.
-    received: ``(V, 3)``, of :func:`~reli3d.fit.bounce.gathered` at the vertices of ``surface``.
-    images: with corrected cameras.
+    first: the start.  surface: the new surface with the maps and lighting of the start; ``first`` where it did not
+    move.  received: ``(V, 3)``, of :func:`~reli3d.fit.bounce.gathered` at the vertices of ``surface``. images: with
+    corrected cameras.
     """
 
     first: Asset
@@ -74,7 +74,7 @@ class Fitted:
 
     @torch.no_grad()
     def blended(self, material: float, light: float) -> Asset:
-        """The fitted surface with the changes of material and light scaled by these weights."""
+        """The fitted surface with the changes of material and lighting scaled by these weights."""
         asset, unknowns = self.surface, self.unknowns
         if material:
             grids, bend = ([material * grid for grid in grids] for grids in (unknowns.material, unknowns.bend))

@@ -59,7 +59,7 @@ class Lights:
         view: Tensor,
         radiance: Callable[[SurfacePoints, Tensor, Environment], Tensor],
     ) -> Tensor:
-        """``radiance(points, wo, environment)`` of each row under the light of its ``view (N,)``, ``(N, 3)``."""
+        """``radiance(points, wo, environment)`` of each row under the lighting of its ``view (N,)``, ``(N, 3)``."""
         views = self.distinct()
         if len(views) == 1:
             return radiance(points, wo, self.of_view(views[0][0]))

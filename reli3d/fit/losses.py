@@ -28,15 +28,15 @@ class Weights:
     shading: float = 30.0  # of :func:`display_error` while the surface is fitted
     curvature: float = 0.5  # of :func:`curvature`
     sdf_change: float = 2e-3  # of the squared change of the signed distance, over the number of views
-    image: float = 1.0  # of :func:`display_error` in the fit of the maps and the light
+    image: float = 1.0  # of :func:`display_error` in the fit of the maps and the lighting
     palette: float = 0.01  # of :func:`palette`
     hue: float = 0.1  # of :func:`hue_drift`
     base_coarse: float = 0.02  # prior of the base color's coarse field towards the start, over the number of views
     base_color: float = 20.0  # of :func:`near_base_color`, over the 4th power of the number of views with used colors
     finish: float = 0.05  # prior of roughness and metallic towards the start, over the number of views
-    light: float = 2e-3  # prior of the light's maps towards the start
-    light_variation: float = 2e-3  # of :func:`total_variation` of the light
-    exposure: float = 0.1  # of squared log exposures; their mean is ambiguous with the light's scale
+    light: float = 2e-3  # prior of the lighting towards the start
+    light_variation: float = 2e-3  # of :func:`total_variation` of the lighting
+    exposure: float = 0.1  # of squared log exposures; their mean is ambiguous with the scale of the lighting
     demodulation: float = 0.3  # of :func:`shared_pattern`
     free_bend: float = 2e-3  # of the squared bend of the normals while the material is fitted, times the views
     bend: float = 20.0  # of the squared bend of the normals that is kept, over the square of the number of views
@@ -113,7 +113,7 @@ def near_start(grids: Sequence[Tensor]) -> Tensor:
 def near_base_color(change: Tensor, weights: Weights, views: int) -> Tensor:
     """Robust prior of the base color towards the start, mean over points; change: ``(N, 3)``, of its logits.
 
-    Few views constrain normals and light poorly, and the residual shading would be baked into the base color as a
+    Few views constrain normals and lighting poorly, and the residual shading would be baked into the base color as a
     small change of most points.  A wrong base color of the start needs a large change; above ``BASE_COLOR_SCALE`` the
     gradient decreases.  The weight is divided by ``views**4``: 0.25 at 3 views and 5e-4 at 14.
     """
@@ -126,7 +126,7 @@ def palette(color: Tensor, tint: Tensor) -> Tensor:
 
     color: ``(N, 3)`` logarithms of base color at points in random order, each paired with the next.  tint: ``(N, 3)``
     linear color in the input images, of any scale; pairs of different chromaticity count less.  Variation within one
-    material is reduced, so that the light explains it; pairs that differ by much more than ``PALETTE_SCALE`` have
+    material is reduced, so that the lighting explains it; pairs that differ by much more than ``PALETTE_SCALE`` have
     almost no gradient (the global sparsity of reflectances of Barron and Malik 2015, Shape, Illumination, and
     Reflectance from Shading, section 4.1.2, on pairs).
     """
@@ -141,7 +141,7 @@ def hue_drift(color: Tensor, start: Tensor) -> Tensor:
     """Squared change of the object's mean chromaticity, in log base color.
 
     color, start: ``(N, 3)`` logarithms of base color at the same points.  A factor per channel is ambiguous between
-    base color and light: a red object under white light looks like a white one under red light.  The start, a
+    base color and lighting: a red object under white light looks like a white one under red light.  The start, a
     prediction from learned priors, resolves it.  The brightness is not constrained, as that of a start is often wrong.
     """
     drift = (color - start).mean(0)
@@ -160,8 +160,8 @@ def priors(unknowns: Unknowns, weights: Weights, views: int) -> Tensor:
 def shared_pattern(change: Tensor, shading: Tensor) -> Tensor:
     """Squared correlation, over points, of the change of log base color ``(N,)`` and log shading ``(N,)``.
 
-    Base color and shading are independent.  A change of the base color that correlates with the shading, positively
-    or negatively, bakes an error of the light into it (after Hasselgren, Hofmann and Munkberg 2022, Shape, Light, and
+    Base color and shading are independent.  A change of the base color that correlates with the shading, positively or
+    negatively, bakes an error of the lighting into it (after Hasselgren, Hofmann and Munkberg 2022, Shape, Light, and
     Material Decomposition, section 3: demodulation).
     """
     a, b = change - change.mean(), (shading - shading.mean()).detach()

@@ -33,7 +33,7 @@ MATERIAL_UNTIL = 0.7  # progress at which the material is frozen, and the bend i
 
 @dataclass(frozen=True)
 class FixedSurface:
-    """Constants of a fit of maps and light.
+    """Constants of a fit of maps and lighting.
 
     asset: the surface with the start's maps.  received: ``(vertices, 3)``, of :func:`~reli3d.fit.bounce.gathered`.
     used: indices of the views whose colors are used.

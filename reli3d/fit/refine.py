@@ -1,4 +1,4 @@
-"""Refinement of an asset by inverse rendering: fits surface, material and light to posed images."""
+"""Refinement of an asset by inverse rendering: fits surface, material and lighting to posed images."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from reli3d.geometry.mesh import watertight
 from reli3d.render.asset import Asset
 
 RESOLUTION = 128  # cells along the longest side
-LIGHT = MapsStage("light", until=0.12, detail=False)  # first the light, then the surface, then all maps
+LIGHT = MapsStage("light", until=0.12, detail=False)  # first the lighting, then the surface, then all maps
 SHAPE_UNTIL = 0.5  # fraction of the budget
 MAPS = MapsStage("maps", until=1.0)
 MAX_DETAIL_TEXELS = 512  # along a side of the base color's detail map
@@ -93,7 +93,7 @@ def refine(
     bar: bool = False,
     interrupt: Callable[[], bool] | None = None,
 ) -> Refinement:
-    """Fits surface, material and light of ``asset`` to posed images by inverse rendering.
+    """Fits surface, material and lighting of ``asset`` to posed images by inverse rendering.
 
     views: images, masks and cameras in the frame of ``asset``.  seconds, steps: the budget, one of the two; with
     ``steps`` the result is deterministic on one machine.  resolution: cells of the surface's grid along the longest
@@ -171,14 +171,14 @@ def _fitted(data: FixedSurface, options: _Options, budget: Budget, notes: list[s
         received = gathered(surface.mesh, images.select(used), seed=seed)
         data = FixedSurface(start, surface, received, images, used)
     else:
-        notes.append("refinement: the surface is not closed, so only maps and light are fitted")
+        notes.append("refinement: the surface is not closed, so only maps and lighting are fitted")
     fit_maps(unknowns, data, weights, budget, MAPS, seed=seed)
     return Fitted(first, data.asset, data.received, start, unknowns, images)
 
 
 def _check_asset(asset: Asset, images: InputImages) -> None:
     if asset.environment is None:
-        raise ValueError("asset.environment: expected a light to start from, got None")
+        raise ValueError("asset.environment: expected an environment to start from, got None")
     if asset.mesh.uv is None or asset.mesh.normals is None or asset.mesh.tangents is None or not len(asset.mesh.faces):
         raise ValueError("asset.mesh: expected faces with normals, uv and tangents, got none")
     if asset.mesh.vertices.device != images.color.device:

@@ -1,7 +1,7 @@
 """Variables of a fit and the quantities that they parameterize.
 
-Material and light are changes relative to the start in unbounded spaces (logits of base color, roughness and metallic;
-logarithms of radiance): zero is the start, and every value is valid.
+Material and lighting are changes relative to the start in unbounded spaces (logits of base color, roughness and
+metallic; logarithms of radiance): zero is the start, and every value is valid.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from reli3d.render.gbuffer import surface_points
 from reli3d.render.points import SurfacePoints
 
 LOGIT_MARGIN = 0.005  # from 0 and 1 at which values are clamped before the logit
-MAX_ROUGHNESS, MIN_ROUGHNESS = 1.0, 0.05  # below, a lobe is narrower than the light's texels
+MAX_ROUGHNESS, MIN_ROUGHNESS = 1.0, 0.05  # below, a lobe is narrower than the environment's texels
 MATERIAL_GRIDS = (4, 8, 16, 32)  # points along a side of the box
 FINISH_GRIDS = 2  # number of them that roughness and metallic have: images constrain these poorly
 START_GRID = 32  # points along a side of the box
@@ -127,7 +127,8 @@ def material_change(unknowns: Unknowns, position: Tensor) -> Tensor:
 def bent(unknowns: Unknowns, position: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
     """Unit shading normals ``(N, 3)``, ``normal`` plus the bend at ``position``, and the bend ``(N, 3)``.
 
-    The bend is shorter than ``MAX_BEND``: a normal turned away from the light would explain a black base color.
+    The bend is shorter than ``MAX_BEND``: a normal turned away from the incident light would explain a black base
+    color.
     """
     bend = space_field(unknowns.bend, position)
     bend = bend / (1.0 + (bend.square().sum(1, keepdim=True) / MAX_BEND**2)).sqrt()

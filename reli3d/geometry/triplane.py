@@ -76,7 +76,7 @@ class _SampleTriplane(torch.autograd.Function):
                 planes.device,
             )
         sorted_points = (order, edges) if ctx.needs_input_grad[0] else (None, None)
-        source = planes if all(ctx.needs_input_grad) else None  # refuses a second derivative: packed is a copy
+        source = planes if all(ctx.needs_input_grad) else None  # makes a second derivative an error: packed is a copy
         ctx.save_for_backward(points, packed if ctx.needs_input_grad[1] else None, *sorted_points, source)
         ctx.shape, ctx.dtype = planes.shape, planes.dtype
         return features[..., :channels].reshape(batch, n, 3 * channels)

@@ -1,7 +1,7 @@
 """OpenEXR images in, through the OpenEXR package.
 
 Reads one flat part of scanlines or of single-level tiles, with channels R, G, B, or Y as gray.  Deep, multi-part,
-multi-level and luminance-chroma files are refused.  Source: https://openexr.com/en/latest/TechnicalIntroduction.html.
+multi-level and luminance-chroma files are errors.  Source: https://openexr.com/en/latest/TechnicalIntroduction.html.
 """
 
 from __future__ import annotations

@@ -236,7 +236,7 @@ def read_glb(path: str | os.PathLike, *, notes: list[str] | None = None, **limit
     MikkTSpace.  Specular-glossiness materials are converted.
 
     notes: receives one line for every feature that is ignored (animation, emission, occlusion, alpha, points, lines,
-    extensions such as clearcoat).  Compressed data (Draco, meshopt, KTX2) is refused.  limits: see
+    extensions such as clearcoat).  Compressed data (Draco, meshopt, KTX2) is an error.  limits: see
     :func:`reli3d.io.gltf_parts.read_parts`.  Raises InputError, a ValueError, naming field, value and fix.
 
     >>> reli3d.write_glb("object.glb", asset)

@@ -93,7 +93,7 @@ class Document:
         self.note(f"{what[:80]} is left out")
 
     def extensions(self, node: dict, field: str, *quiet: str) -> dict:
-        """Extensions of ``node``.  Those that are neither supported nor in ``quiet`` are noted as left out."""
+        """Extensions of ``node``; a note reports those that are left out: neither supported nor in ``quiet``."""
         found = self.get(node, "extensions", dict, f"{field}.extensions", {})
         for name in found:
             if name not in SUPPORTED and name not in quiet:
@@ -155,11 +155,11 @@ class Document:
         if b"JSON" not in chunks:
             self.fail("chunks", "expected a JSON chunk", [str(k) for k in chunks])
 
-        def refuse(text):
+        def reject(text):
             raise ValueError(f"number {text}")
 
         try:
-            document = json.loads(chunks[b"JSON"].decode("utf-8"), parse_constant=refuse)
+            document = json.loads(chunks[b"JSON"].decode("utf-8"), parse_constant=reject)
         except (ValueError, RecursionError) as error:
             self.fail("JSON", "expected valid JSON", str(error))
         if not isinstance(document, dict):
@@ -167,7 +167,7 @@ class Document:
         return document, chunks.get(b"BIN\0")
 
     def data_uri(self, uri: str, field: str) -> bytes:
-        """Bytes of a ``data:`` URI; any other URI is refused."""
+        """Bytes of a ``data:`` URI; any other URI is an error."""
         head, comma, body = uri.partition(",")
         if not head.startswith("data:") or not comma or not head.endswith(";base64"):
             self.fail(field, "expected data inside the file", uri, "export as one GLB with everything embedded")

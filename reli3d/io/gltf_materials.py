@@ -119,7 +119,7 @@ class Materials:
 
     def _resampled(self, material: _Material, low: np.ndarray, span: np.ndarray, field: str) -> TextureSet:
         """Textures of different layouts, looked up at the texel centers of the box ``low``, ``span`` of the uv."""
-        with np.errstate(all="ignore"):  # overflow is refused below
+        with np.errstate(all="ignore"):  # overflow is an error below
             sides = [
                 np.abs(np.array(s.layout.transform).reshape(2, 3)[:, :2] * span).sum(1) * s.image.shape[1::-1]
                 for s in material.slots

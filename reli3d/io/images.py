@@ -1,8 +1,8 @@
 """Reads images and masks, writes PNG, OpenEXR and Radiance HDR images.
 
 Color is sRGB in [0, 1] as stored; alpha is straight (not premultiplied), and the color under alpha 0 is kept.  Pixels
-are used as stored: an EXIF orientation is noted and not applied, because calibrated cameras refer to the stored pixels,
-unless the size in the camera file shows that they refer to the turned ones.
+are used as stored: an EXIF orientation is reported in a note and not applied, because calibrated cameras refer to the
+stored pixels, unless the size in the camera file shows that they refer to the turned ones.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": f"-march=
 
 @wp.func
 def is_known(known: wp.array2d[wp.int32], n_environment: int, sample: int) -> bool:
-    """Whether ``known`` has a bit of this sample: its direction does not depend on the light."""
+    """Whether ``known`` has a bit of this sample: its direction does not depend on the environment."""
     return known.shape[1] > 0 and sample >= n_environment
 
 
@@ -34,8 +34,8 @@ def shade_rays_kernel(
 ):
     """First half of the estimator for a chunk of hits: shadow rays (``t_max`` < 0 where none is needed) and values.
 
-    known: ``visible`` of :func:`accumulate_kernel` under another light.  It holds for all samples but those drawn from
-    the light.
+    known: ``visible`` of :func:`accumulate_kernel` under another environment.  It is valid for all samples but those of
+    the environment.
     """
     j = start + wp.tid()
     i = first + j

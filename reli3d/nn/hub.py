@@ -18,9 +18,9 @@ from reli3d.nn.weights import WeightsError, convert_checkpoint, official_path
 
 REPOSITORY = "StabilityLabs/ReLi3D"
 CHECKPOINT = "reli3d_final.ckpt"
-LICENCE = "Stability AI Community License, https://stability.ai/license"
+LICENSE = "Stability AI Community License, https://stability.ai/license"
 NOTICE = (
-    f"The weights of {REPOSITORY} are not part of this package: they come under the {LICENCE}; "
+    f"The weights of {REPOSITORY} are not part of this package: they come under the {LICENSE}; "
     "using them is accepting it."
 )
 
@@ -38,12 +38,12 @@ def fetch_official(*, preset: Preset = OFFICIAL) -> Path:
     print(NOTICE, file=sys.stderr)
     placed = target.with_name(CHECKPOINT)
     if placed.is_file():
-        convert_checkpoint(placed, target, licence=LICENCE, preset=preset)
+        convert_checkpoint(placed, target, license=LICENSE, preset=preset)
         return target
     folder = target.with_name("download")
     try:
         checkpoint, etag = _download(folder)
-        digest = convert_checkpoint(checkpoint, target, licence=LICENCE, preset=preset).metadata["converted_from"]
+        digest = convert_checkpoint(checkpoint, target, license=LICENSE, preset=preset).metadata["converted_from"]
         shutil.rmtree(folder)
     except WeightsError:
         if not any(folder.rglob("*.incomplete")):
@@ -73,7 +73,7 @@ def _download(folder: Path) -> tuple[Path, str]:
         text = " ".join(f"{status or ''} {cause}".split())[:160]
         reason = f"cannot be fetched ({text}); check the network and run it again"
         if status in (401, 403):
-            reason = f"access refused ({status}): accept the licence at {page} and set HF_TOKEN to your token"
+            reason = f"access refused ({status}): accept the license at {page} and set HF_TOKEN to your token"
         elif status == 404:
             reason = "no such file (404); check HF_ENDPOINT"
         elif isinstance(cause, errors.OfflineModeIsEnabled):

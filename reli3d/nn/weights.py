@@ -1,6 +1,6 @@
 """Weights in files: safetensors whose manifest is checked before anything is allocated; published files converted.
 
-A file of ours carries its preset, its licence and what else the writer states in the header, so it loads by itself.  A
+A file of ours carries its preset, its license and what else the writer states in the header, so it loads by itself.  A
 pickle checkpoint is only ever read by torch's restricted reader and turned into such a file.
 """
 
@@ -61,10 +61,10 @@ class Manifest:
 
     path: str
     tensors: dict[str, Stored]
-    metadata: dict[str, str]  # of files in our format: format, preset, licence and additional entries
+    metadata: dict[str, str]  # of files in our format: format, preset, licence (spelled so in files) and other entries
 
     @property
-    def licence(self) -> str:
+    def license(self) -> str:
         return self.metadata.get("licence", "not stated")
 
     def preset(self) -> AnyPreset:
@@ -260,11 +260,11 @@ def save(
     path: str | os.PathLike,
     model: Network,
     *,
-    licence: str,
+    license: str,
     dtype: torch.dtype = torch.float16,
     metadata: Mapping[str, str] | None = None,
 ) -> Manifest:
-    """Write the network's parameters as ``dtype`` (buffers as they are), its preset and licence; whole or not at all.
+    """Write the network's parameters as ``dtype`` (buffers as they are), its preset and license; whole or not at all.
 
     Raises WeightsError where a value is not finite in ``dtype``: such a file would only fail later.
     """
@@ -273,7 +273,7 @@ def save(
     for name, value in state.items():
         if not torch.isfinite(value).all():
             raise WeightsError(path, f"{name}: expected finite values in {dtype}; nothing was written")
-    header = {"format": FORMAT, "preset": to_json(model.preset), "licence": licence, **(metadata or {})}
+    header = {"format": FORMAT, "preset": to_json(model.preset), "licence": license, **(metadata or {})}
     write(path, state, header)
     return read_manifest(path)
 
@@ -285,17 +285,17 @@ def write(path: str | os.PathLike, state: Mapping[str, Tensor], metadata: Mappin
 
 
 def convert_checkpoint(
-    source: str | os.PathLike, target: str | os.PathLike, *, licence: str, preset: Preset = OFFICIAL
+    source: str | os.PathLike, target: str | os.PathLike, *, license: str, preset: Preset = OFFICIAL
 ) -> Manifest:
     """Turn a published training checkpoint into a safetensors file of ours, float32 as it is.
 
     The checkpoint's tensors stay mapped; names go through :mod:`reli3d.nn.published`; a parameter that is stored under
     two names must be the same under both.  Only torch's restricted reader touches the pickle: anything that would run
-    code is refused.  Raises WeightsError, and then leaves no file.
+    code is rejected.  Raises WeightsError, and then leaves no file.
     """
     state = published_state(read_checkpoint(source), source)
     check_keys(source, {name: tuple(value.shape) for name, value in state.items()}, shapes(preset))
-    header = {"format": FORMAT, "preset": to_json(preset), "licence": licence, "converted_from": sha256(source)}
+    header = {"format": FORMAT, "preset": to_json(preset), "licence": license, "converted_from": sha256(source)}
     write(target, state, header)
     return read_manifest(target)
 
@@ -307,7 +307,7 @@ def read_checkpoint(path: str | os.PathLike) -> dict[str, Tensor]:
         content = torch.load(path, weights_only=True, mmap=True, map_location="cpu")
     except pickle.UnpicklingError as error:
         reason = " ".join(str(error).split()).split(". ")[-1][:160]
-        raise WeightsError(path, f"holds more than tensors and is refused, nothing was run ({reason})") from None
+        raise WeightsError(path, f"holds more than tensors and is rejected, nothing was run ({reason})") from None
     except (RuntimeError, ValueError, EOFError, KeyError, OSError) as error:
         reason = str(error).splitlines()[0][:160] if str(error) else type(error).__name__
         raise WeightsError(path, f"is not a torch checkpoint, or it is cut off ({reason}); fetch it again") from None

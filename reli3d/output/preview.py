@@ -176,7 +176,7 @@ def _maps(rendering: Render) -> list[Tensor]:
 
 
 def _map(light: Environment) -> Tensor:
-    """The light as a tile of half the height."""
+    """The environment as a tile of half the height."""
     radiance = light.radiance
     exposed = (radiance * (ENVIRONMENT_MEAN / radiance.mean().clamp(min=1e-6))).clamp(0, 1)
     shown = linear_to_srgb(exposed).permute(2, 0, 1)[None]

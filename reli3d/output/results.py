@@ -143,7 +143,7 @@ def write_results(
     """Writes :data:`FILES`; on an error the folder is unchanged.  Raises OSError, ValueError.
 
     replacing: of :func:`claim`.  sheet: of the asset, from :func:`~reli3d.output.preview.preview`.  info: content of
-    ``run_info.json``, to which the convention of the light is added. comparison: sheet of a refinement.
+    ``run_info.json``, to which the convention of the environment is added. comparison: sheet of a refinement.
     """
     light = encoded.asset.light
     info = {**info, "environment_center": "+X"}
@@ -177,8 +177,8 @@ def frame_record(
 
 
 def weights_record(manifest: Manifest, digest: str) -> dict:
-    """Name, hash and licence of the weights."""
-    return {"file": Path(manifest.path).name, "sha256": digest, "licence": manifest.licence}
+    """Name, hash and license of the weights."""
+    return {"file": Path(manifest.path).name, "sha256": digest, "license": manifest.license}
 
 
 def versions() -> dict[str, str]:

@@ -145,7 +145,7 @@ def _draw(
     if scene is not None and scene.faces.shape[0]:
         value[scene.occluded(origins, directions)] = 0.0
     if not bool(torch.isfinite(value).all()):
-        raise ValueError("points: expected finite positions, directions, materials and light, got NaN or infinity")
+        raise ValueError("points: expected finite positions, directions, materials and radiance, got NaN or infinity")
     density = density.double()
     lost = (density == 0.0).all(2).unflatten(1, (3, each)).double().mean(2)
     return value.double(), density, density / (density.sum(1) + lost)[:, None]

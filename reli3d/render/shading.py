@@ -251,7 +251,7 @@ class _Shade(torch.autograd.Function):
 
 
 def _inputs(tensors: Sequence[Tensor], job: _Job) -> list:
-    """Points and light as the kernels take them."""
+    """Points and environment as the kernels take them."""
     *values, radiance, pixels = tensors
     return [struct_of_points(values, pixels), struct_of_light(radiance, job.cdf, job.offsets)]
 

@@ -1,8 +1,8 @@
 """Self-occlusion of irradiance in spherical harmonics: precomputed radiance transfer.
 
 Sloan, Kautz and Snyder 2002, "Precomputed Radiance Transfer for Real-Time Rendering in Dynamic, Low-Frequency Lighting
-Environments".  The harmonics are real, orthonormal, up to degree 3, with +Y as the polar axis, so that a light turned
-about +Y turns pairs of its coefficients.
+Environments".  The harmonics are real, orthonormal, up to degree 3, with +Y as the polar axis, so that an environment
+rotated about +Y turns pairs of its coefficients.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def spherical_harmonics(directions: Tensor) -> Tensor:
 
 @full_precision
 def light_harmonics(light: Environment) -> Tensor:
-    """Coefficients ``(16, 3)`` of a light: its texels' solid angles times their values, summed in float64."""
+    """Coefficients ``(16, 3)`` of an environment: its texels' solid angles times their values, summed in float64."""
     height, width = light.radiance.shape[:2]
     d = lat_long_directions(height, width, dtype=torch.float64)
     weight = spherical_harmonics(d) * texel_solid_angles(height, width)[:, None, None]
@@ -64,10 +64,10 @@ def light_harmonics(light: Environment) -> Tensor:
 def blocked_transfer(mesh: Mesh, *, directions: int = 64, scene: RayScene | None = None) -> Tensor:
     """Blocked transfer ``(V, 16)``: integrals of the occluded cosine times harmonics at each vertex; no gradient.
 
-    Row i times the coefficients of a light (:func:`light_harmonics`) is the irradiance that is occluded at vertex i.
-    mesh: with normals.  directions: over the whole sphere, on a spiral of equal areas and the same for all vertices, so
-    that neighbors differ by their geometry alone.  scene: rays against the mesh, made here if None.  Exactly 0 where no
-    ray is hidden.  Raises TypeError for a wrong dtype, ValueError for a wrong shape or device.
+    Row i times the coefficients of an environment (:func:`light_harmonics`) is the irradiance that is occluded at
+    vertex i.  mesh: with normals.  directions: over the whole sphere, on a spiral of equal areas and the same for all
+    vertices, so that neighbors differ by their geometry alone.  scene: rays against the mesh, made here if None.
+    Exactly 0 where no ray is hidden.  Raises TypeError for a wrong dtype, ValueError for a wrong shape or device.
     """
     normals = present("normals", mesh.normals).detach()
     check("vertices", mesh.vertices, last=3, like=normals)

@@ -73,7 +73,7 @@ def relight_views(
     light: Tensor,
     rng: np.random.Generator,
 ) -> tuple[Tensor, Tensor]:
-    """Views ``(V, S, S, 4)`` under ``light (H, 2H, 3)``, and that light as ``(32, 64, 3)`` at the views' exposure.
+    """Views ``(V, S, S, 4)`` under ``light (H, 2H, 3)``, and that map as ``(32, 64, 3)`` at the views' exposure.
 
     images: ``(V, S, S, 4)``, of which only alpha is used.  material, normal: of the pixels ``valid (V, S, S)``, as in
     :mod:`reli3d.synthetic.samples`.  Without shadows: the G-buffers have no geometry behind other surfaces.

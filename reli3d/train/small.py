@@ -30,7 +30,7 @@ LIST_EVERY = 50  # steps after which the folders are listed again: samples may b
 
 
 class SmallStage(Stage):
-    """The whole network, on points, pixels and light of the samples in ``folders``."""
+    """The whole network, on points, pixels and lighting of the samples in ``folders``."""
 
     name = "small"
     weights: dict[str, float] = WEIGHTS

@@ -1,4 +1,4 @@
-"""The lens of a frame of ``transforms.json``: the spellings that are read, and keys that are refused.
+"""The lens of a frame of ``transforms.json``: the spellings that are read, and keys that are errors.
 
 Read, in this order, from the frame, else from the file:
 
@@ -10,7 +10,7 @@ Read, in this order, from the frame, else from the file:
 - ``focal_length`` and ``sensor_width`` in the same unit
 
 0.7 radians, as in the published release, only where neither the frame nor the file has a key of a lens.  A key that
-looks like one and is none of these is refused, as are lenses that are no pinhole.
+looks like one and is none of these is an error, as is a lens that is no pinhole.
 """
 
 from __future__ import annotations

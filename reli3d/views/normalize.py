@@ -49,9 +49,9 @@ class Hull:
 def normalize(views: Views, mode: str = "auto") -> Similarity:
     """The map from the frame of the input cameras to the network's frame (no rotation).
 
-    mode ``none``: identity.  ``hull``: the box of the visual hull is centered and its longest side becomes 1, as in
-    training.  ``auto``: so the ``object_box`` of the views, where they have one; else identity where the hull already
-    sits well in the network's cube of half side 0.87, else ``hull``.
+    mode ``none``: identity.  ``hull``: the bounding box of the visual hull is centered and its longest side scaled to
+    1, as in training.  ``auto``: the same with ``views.object_box`` if there is one; else the identity if the visual
+    hull fits the network's cube of half side 0.87; else ``hull``.
 
     Captures from one side, all eyes within 90 degrees seen from the object, leave its depth open: it is at most 1.3
     widths of the masks, where the hull is cut, and the box is aligned with the mean viewing direction, so that the

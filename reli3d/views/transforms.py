@@ -22,7 +22,7 @@ def read_json(path: Path) -> dict:
     """The object in a JSON file; stricter than Python: no NaN, no infinity, no key twice, 16 MB.  Raises InputError."""
     try:
         text = read_bytes(path, MAX_BYTES).decode("utf-8-sig")
-        value = json.loads(text, parse_constant=_refuse, object_pairs_hook=_unique)
+        value = json.loads(text, parse_constant=_reject, object_pairs_hook=_unique)
     except InputError:
         raise
     except UnicodeDecodeError as error:
@@ -31,7 +31,7 @@ def read_json(path: Path) -> dict:
         raise InputError(path, "expected a flat JSON file, got one nested too deep; export the cameras again") from None
     except json.JSONDecodeError as error:
         raise InputError(path, f"line {error.lineno}: expected JSON ({error.msg}); correct the file") from None
-    except _Refused as error:
+    except _Rejected as error:
         raise InputError(path, f"{error}; correct the file") from None
     except ValueError:
         raise InputError(path, "expected numbers, got an integer of thousands of digits; correct the file") from None
@@ -42,12 +42,12 @@ def read_json(path: Path) -> dict:
     return value
 
 
-class _Refused(ValueError):
+class _Rejected(ValueError):
     """JSON that Python would read and we do not."""
 
 
-def _refuse(word: str):
-    raise _Refused(f"expected finite numbers, got {word}")
+def _reject(word: str):
+    raise _Rejected(f"expected finite numbers, got {word}")
 
 
 def _unique(pairs: list) -> dict:
@@ -56,7 +56,7 @@ def _unique(pairs: list) -> dict:
         seen: set[str] = set()
         for key, _ in pairs:
             if key in seen:
-                raise _Refused(f"expected every key once, got {shown(key)} twice")
+                raise _Rejected(f"expected every key once, got {shown(key)} twice")
             seen.add(key)
     return result
 

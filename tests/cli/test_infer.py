@@ -39,7 +39,7 @@ def test_the_example_gives_every_file_and_a_closed_mesh(example):
     assert info["mesh"]["watertight"] and info["mesh"]["manifold"]
     assert info["mesh"]["faces"] > 1000
     assert set(info["seconds"]) >= {"reading", "network", "surface", "textures", "light"}
-    assert len(info["weights"]["sha256"]) == 64 and "Apache-2.0" in info["weights"]["licence"]
+    assert len(info["weights"]["sha256"]) == 64 and "Apache-2.0" in info["weights"]["license"]
 
 
 def test_peak_memory_is_none_where_python_has_no_count(monkeypatch):

@@ -100,7 +100,7 @@ def test_the_command_names_an_empty_field_in_one_line_and_writes_nothing(tmp_pat
     model, manifest = load(locate("small"))
     with torch.no_grad():
         model.level[-1].bias.fill_(6e4)  # outside everywhere
-    save(tmp_path / "blind.safetensors", model, licence=manifest.licence)
+    save(tmp_path / "blind.safetensors", model, license=manifest.license)
     options = ["--weights", str(tmp_path / "blind.safetensors"), "--texture-size", "256", "--resolution", "24"]
     assert infer.main(["--output", str(tmp_path / "out"), "--device", "cpu", *options]) == 2
     out, err = capsys.readouterr()

@@ -80,7 +80,7 @@ def judged(path) -> dict:
 
 
 def test_khronos_validator_finds_nothing(asset, tmp_path):
-    write_glb(tmp_path / "a.glb", asset, extras={"licence": "CC0-1.0", "world_from_model": np.eye(4).tolist()})
+    write_glb(tmp_path / "a.glb", asset, extras={"license": "CC0-1.0", "world_from_model": np.eye(4).tolist()})
     issues = judged(tmp_path / "a.glb")
     assert issues["numErrors"] == issues["numWarnings"] == 0, issues["messages"]
 

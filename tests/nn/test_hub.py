@@ -112,13 +112,13 @@ def fails(message: str) -> None:
     assert "\n" not in str(caught.value) and "secret" not in str(caught.value)
 
 
-def test_the_checkpoint_arrives_converted_with_its_licence_and_nothing_else(server, checkpoint, capsys, monkeypatch):
+def test_the_checkpoint_arrives_converted_with_its_license_and_nothing_else(server, checkpoint, capsys, monkeypatch):
     server.content, state = checkpoint
     monkeypatch.setenv("HF_TOKEN", "hf_secret")
     path = hub.fetch_official(preset=TINY)
     assert left() == ["official.safetensors"]
     model, manifest = load(path)
-    assert manifest.licence.startswith("Stability AI Community License")
+    assert manifest.license.startswith("Stability AI Community License")
     assert all(torch.equal(value, state[name]) for name, value in model.state_dict().items())
     assert capsys.readouterr().err.count("Stability AI Community License") == 1
     by_path = {path: headers for _, path, headers in server.requests}
@@ -142,7 +142,7 @@ def test_a_transfer_that_breaks_off_is_resumed_and_wrong_bytes_are_refused(serve
 @pytest.mark.parametrize(
     "status, code, message",
     [
-        (401, "", "access refused .401.: accept the licence at http.*/StabilityLabs/ReLi3D and set HF_TOKEN"),
+        (401, "", "access refused .401.: accept the license at http.*/StabilityLabs/ReLi3D and set HF_TOKEN"),
         (403, "GatedRepo", "access refused .403."),
         (404, "EntryNotFound", "no such file .404.; check HF_ENDPOINT"),
         (404, "RepoNotFound", "no such file .404."),

@@ -21,6 +21,6 @@ from tests.support.networks import NANO
 def test_automatic_precision_is_bfloat16_where_the_processor_multiplies_it(tmp_path, monkeypatch, instructions, has):
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: instructions, raising=False)
     expected = torch.bfloat16 if has else torch.float32
-    save(tmp_path / "nano.safetensors", Reconstructor(NANO), licence="none")
+    save(tmp_path / "nano.safetensors", Reconstructor(NANO), license="none")
     assert load_model(tmp_path / "nano.safetensors", trunk="auto").dtype == expected
     assert load_model("small", trunk="auto").dtype == expected

@@ -47,7 +47,7 @@ def test_a_converted_network_predicts_the_same(tmp_path):
     """Also from its file, and for mirror images; a network is not converted twice."""
     unlit = load_model("small", "cpu")
     made = with_bins(unlit, 8)
-    made, _ = load(save(tmp_path / "bins.safetensors", made, licence="test", dtype=torch.float32).path)
+    made, _ = load(save(tmp_path / "bins.safetensors", made, license="test", dtype=torch.float32).path)
     assert made.preset.pyramid.material_bins == 8
     eyes = [look_at((0.0, 0.0, 2.4)), look_at((2.0, 0.4, 1.2))]
     c2w = torch.stack([*eyes, *eyes])

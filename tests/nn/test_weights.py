@@ -30,7 +30,7 @@ from reli3d.nn.weights import (
 from tests.support.evil import Bomb
 from tests.support.networks import NANO, TINY, views
 
-LICENCE = "Apache-2.0"
+LICENSE = "Apache-2.0"
 
 
 @pytest.fixture
@@ -77,8 +77,8 @@ def checkpoint(published, tmp_path):
 def test_a_published_checkpoint_converts_and_loads_strictly(checkpoint, tmp_path):
     path, model = checkpoint
     target = tmp_path / "converted.safetensors"
-    manifest = convert_checkpoint(path, target, licence="of the model's authors", preset=TINY)
-    assert manifest.licence == "of the model's authors" and manifest.metadata["converted_from"] == sha256(path)
+    manifest = convert_checkpoint(path, target, license="of the model's authors", preset=TINY)
+    assert manifest.license == "of the model's authors" and manifest.metadata["converted_from"] == sha256(path)
     loaded, _ = load(target, expected_sha256=sha256(target))
     assert loaded.preset == TINY and not loaded.training
     for name, value in model.state_dict().items():
@@ -119,7 +119,7 @@ def test_a_wrong_checkpoint_is_one_line_and_no_file(checkpoint, tmp_path, edit, 
 def refused(path, folder, message):
     before = set(folder.iterdir())
     with pytest.raises(WeightsError, match=message) as caught:
-        convert_checkpoint(path, folder / "out.safetensors", licence=LICENCE, preset=TINY)
+        convert_checkpoint(path, folder / "out.safetensors", license=LICENSE, preset=TINY)
     assert "\n" not in str(caught.value) and str(path) in str(caught.value)
     assert set(folder.iterdir()) == before
 
@@ -153,15 +153,15 @@ def saved(tmp_path):
     torch.manual_seed(0)
     model = Reconstructor(NANO).eval()
     path = tmp_path / "nano.safetensors"
-    save(path, model, licence=LICENCE, metadata={"steps": "12"})
+    save(path, model, license=LICENSE, metadata={"steps": "12"})
     return path, model
 
 
 @torch.no_grad()
-def test_saved_weights_carry_their_preset_and_licence(saved):
+def test_saved_weights_carry_their_preset_and_license(saved):
     path, model = saved
     loaded, manifest = load(path)
-    assert loaded.preset == NANO and manifest.licence == LICENCE and manifest.metadata["steps"] == "12"
+    assert loaded.preset == NANO and manifest.license == LICENSE and manifest.metadata["steps"] == "12"
     assert all(p.dtype == torch.float32 and p.requires_grad for p in loaded.parameters())
     assert manifest.tensors["environment.sample_directions"].dtype == torch.float32  # float16 would bend the map
     inputs = views(1, 2, 32)
@@ -179,7 +179,7 @@ def test_saved_weights_carry_their_preset_and_licence(saved):
 def test_tensors_of_the_stored_dtype_are_mapped_and_not_copied(saved, tmp_path):
     _, model = saved
     path = tmp_path / "single.safetensors"
-    save(path, model, licence=LICENCE, dtype=torch.float32)
+    save(path, model, license=LICENSE, dtype=torch.float32)
     loaded, _ = load(path)
     lines = [line.split()[0] for line in Path("/proc/self/maps").read_text().splitlines() if line.endswith(str(path))]
     ranges = [tuple(int(end, 16) for end in line.split("-")) for line in lines]
@@ -191,7 +191,7 @@ def test_a_failed_save_leaves_the_old_file(saved):
     before = path.read_bytes()
     model.backbone.latent_init.data[0, 0, 0] = 1e6  # beyond float16
     with pytest.raises(WeightsError, match="backbone.latent_init: expected finite values"):
-        save(path, model, licence=LICENCE)
+        save(path, model, license=LICENSE)
     assert path.read_bytes() == before and len(list(path.parent.iterdir())) == 1
 
 

@@ -182,7 +182,7 @@ def test_exported_roughness_is_the_root_of_the_published_number(tiny, asset):
 
 def test_the_command_takes_published_weights_and_reports_how_it_used_them(tiny, tmp_path, capsys):
     weights = tmp_path / "tiny.safetensors"
-    save(weights, tiny, licence="of the test", dtype=torch.float32)
+    save(weights, tiny, license="of the test", dtype=torch.float32)
     arguments = [
         str(infer.EXAMPLE),
         "--weights",

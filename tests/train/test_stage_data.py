@@ -71,7 +71,7 @@ def captures(tmp_path_factory):
 def test_captures_are_filtered_by_both_scores(captures):
     found = Captures(captures, 32)
     assert [f.name for f in found.folders] == ["good", "own", "side"]
-    assert "gaussian_splats_quality_score 0.99" in found.refused["blurred"] and "broken" in found.refused["broken"]
+    assert "gaussian_splats_quality_score 0.99" in found.rejected["blurred"] and "broken" in found.rejected["broken"]
 
 
 def test_a_capture_is_cropped_centered_and_scaled(captures):

@@ -27,20 +27,20 @@ CACHED_CAPTURES = 64  # preprocessed captures in memory: 50 MB at 4 views
 class Captures:
     """The object folders in a folder; those of UCO3D must have both quality scores of at least MIN_SCORE.
 
-    ``refused``: reason by the name of each folder that is left out.  Raises InputError if no folder remains.
+    ``rejected``: reason by the name of each folder that is left out.  Raises InputError if no folder remains.
     """
 
     def __init__(self, folder: Path, size: int = SIZE):
-        self.size, self.refused, self.folders = size, {}, []
+        self.size, self.rejected, self.folders = size, {}, []
         candidates = sorted(p.parent for p in folder.glob("*/transforms.json"))
         for one in candidates:
             reason = unfit(one)
             if reason:
-                self.refused[one.name] = reason
+                self.rejected[one.name] = reason
             else:
                 self.folders.append(one)
         if not self.folders:
-            reasons = "; ".join(f"{k}: {v}" for k, v in list(self.refused.items())[:3]) or "no */transforms.json"
+            reasons = "; ".join(f"{k}: {v}" for k, v in list(self.rejected.items())[:3]) or "no */transforms.json"
             raise InputError(folder, f"expected captures of good quality, got none ({reasons})")
         self._prepared = lru_cache(CACHED_CAPTURES)(self._prepare)
 

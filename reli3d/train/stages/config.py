@@ -40,7 +40,7 @@ class StageConfig:
     image_size: int  # of the target views, pixels
     patch: int = 0  # side of the random square of a target view that is rendered, pixels; 0: the whole view
     targets: int = 1  # target views per object and step; not given in the paper
-    lobes: int = 128  # spherical Gaussians of the light
+    lobes: int = 128  # spherical Gaussians of the environment
     resolution: int = 0  # cubes along each side of the FlexiCubes grid; 0: the preset's
     grid: int = 16  # cells along each side of the volume's occupancy grid
     samples_along: int = 64  # samples of a ray across the model's cube

@@ -35,8 +35,8 @@ class ObjectViews:
     material: Tensor | None = None  # (V, S, S, 5) base color (sRGB), roughness, metallic
     normal: Tensor | None = None  # (V, S, S, 3) world, unit
     shown: Tensor | None = None  # (V, S, S) 1 where material and normal are known
-    latent: Tensor | None = None  # (L, 3) RENI++ latents of the light
-    strength: Tensor | None = None  # () logarithm of the light's factor
+    latent: Tensor | None = None  # (L, 3) RENI++ latents of the environment
+    strength: Tensor | None = None  # () logarithm of the environment's factor
 
     def __len__(self) -> int:
         return len(self.images)
