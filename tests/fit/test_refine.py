@@ -134,7 +134,7 @@ def test_an_open_surface_keeps_its_shape(start, views):
 
 
 def test_what_does_not_fit_together_is_refused(start, views):
-    with pytest.raises(ValueError, match="environment: expected a light"):
+    with pytest.raises(ValueError, match="environment: expected an environment"):
         fit.refine(replace(start, environment=None), views, steps=1)
     with pytest.raises(ValueError, match="masks: expected"):
         InputImages.of(replace(views, masks=views.masks[:, 1:]))

@@ -176,7 +176,7 @@ def test_a_pickle_that_runs_code_does_not_run_and_does_not_stay(server, tmp_path
     crater, bomb = tmp_path / "crater", tmp_path / "bomb.ckpt"
     torch.save({"state_dict": {"system.x": torch.ones(1)}, "hook": Bomb(crater)}, bomb)
     server.content = bomb.read_bytes()
-    fails("refused, nothing was run")
+    fails("rejected, nothing was run")
     assert not crater.exists() and left() == []
 
 

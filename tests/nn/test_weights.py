@@ -130,8 +130,8 @@ def test_a_pickle_that_runs_code_is_refused_and_does_not_run(tmp_path):
     zipped, unlit = tmp_path / "files" / "bomb.ckpt", tmp_path / "files" / "plain.ckpt"
     torch.save({"state_dict": {"system.x": torch.ones(1)}, "hook": Bomb(crater)}, zipped)
     unlit.write_bytes(pickle.dumps(Bomb(crater)))
-    refused(zipped, tmp_path / "files", "refused, nothing was run")
-    refused(unlit, tmp_path / "files", "is not a torch checkpoint|refused, nothing was run")
+    refused(zipped, tmp_path / "files", "rejected, nothing was run")
+    refused(unlit, tmp_path / "files", "is not a torch checkpoint|rejected, nothing was run")
     assert not crater.exists()
 
 
