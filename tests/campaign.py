@@ -1,8 +1,8 @@
 """Hostile inputs without end: ``python -m tests.campaign --minutes M --seed S``.
 
-Every input is a good file with one to four changes that its number draws, or one that is made with the truth about it
+Every input is a good file with one to four changes drawn from its seed, or one that is made with its ground truth
 (``tests.support.known``).  A forked process reads it, with limits on memory and time.  Allowed are a result, the right
-one where the truth is known, and ValueError and OSError of one line.  What fails is saved with its changes made as few
+one with known ground truth, and ValueError and OSError of one line.  What fails is saved with its changes made as few
 as possible.  The same seed gives the same inputs.  Runs on Linux.
 """
 

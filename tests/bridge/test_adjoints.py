@@ -366,8 +366,8 @@ def test_the_adjoint_is_that_of_the_float64_reference(device, name):
     draw = torch.rand if op.one_sign else torch.randn
     cotangent = draw(expected.shape, generator=torch.Generator().manual_seed(8))
     grads = torch.autograd.grad((got * cotangent.to(device)).sum(), ours)
-    truth = torch.autograd.grad((expected * cotangent.double()).sum(), double)
-    for leaf, a, b in zip(op.leaves, grads, truth, strict=True):
+    expected_grads = torch.autograd.grad((expected * cotangent.double()).sum(), double)
+    for leaf, a, b in zip(op.leaves, grads, expected_grads, strict=True):
         if leaf in op.unit:
             a, b = (reference.across(v, op.leaves[leaf]) for v in (a, b))
             found = len(b), reference.rows_within(a, b)

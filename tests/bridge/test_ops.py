@@ -90,14 +90,14 @@ def test_one_gradient_alone_is_that_of_all_and_backward_can_be_repeated(device, 
     case = CASES[name]
     every = leaves_of(case, device)
     outs = case.run(**every)
-    truth = gradients(case, every, outs, retain_graph=True)
+    expected_grads = gradients(case, every, outs, retain_graph=True)
     again = gradients(case, every, outs)
-    assert all(same(truth[k], again[k]) for k in truth)
-    assert all(float(g.abs().max()) > 0.0 for g in truth.values())
+    assert all(same(expected_grads[k], again[k]) for k in expected_grads)
+    assert all(float(g.abs().max()) > 0.0 for g in expected_grads.values())
     for k in case.grads:
         alone = leaves_of(case, device, requires_grad=(k,))
         loss_of(case.run(**alone)).backward()
-        assert same(alone[k].grad, truth[k]), k
+        assert same(alone[k].grad, expected_grads[k]), k
         assert all(v.grad is None for other, v in alone.items() if other != k)
     none = case.run(**leaves_of(case, device, requires_grad=()))
     assert not any(out.requires_grad for out in none)
@@ -108,7 +108,7 @@ def test_an_edit_in_place_is_an_error_or_harmless(device, name):
     """Never a gradient at values that are no longer those of the forward pass."""
     case, refused = CASES[name], 0
     plain = leaves_of(case, device)
-    truth = gradients(case, plain, case.run(**plain))
+    expected_grads = gradients(case, plain, case.run(**plain))
     for k in case.grads:
         leaves = leaves_of(case, device)
         held = {other: v * 1.0 for other, v in leaves.items()}
@@ -122,7 +122,9 @@ def test_an_edit_in_place_is_an_error_or_harmless(device, name):
             refused += 1
             continue
         for a, other in zip(got, case.grads, strict=True):
-            torch.testing.assert_close(a, truth[other], rtol=1e-5, atol=1e-6 * float(truth[other].abs().max()))
+            torch.testing.assert_close(
+                a, expected_grads[other], rtol=1e-5, atol=1e-6 * float(expected_grads[other].abs().max())
+            )
     # plain torch may keep copies of what it needs
     assert refused or case.second == case.grads or name == "taubin_smooth"
 

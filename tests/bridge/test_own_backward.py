@@ -73,7 +73,9 @@ def watched(monkeypatch, module, kernel):
 @pytest.mark.parametrize("required", [*((name,) for name in NAMES), ("base_color", "radiance")])
 def test_shade_computes_only_required_gradients(device, monkeypatch, required):
     every = hits(device)
-    truth = dict(zip(NAMES, torch.autograd.grad(lit(every).square().sum(), [every[k] for k in NAMES]), strict=True))
+    expected_grads = dict(
+        zip(NAMES, torch.autograd.grad(lit(every).square().sum(), [every[k] for k in NAMES]), strict=True)
+    )
     rows = watched(monkeypatch, shading, "shade_adjoint_kernel")
     leaves = hits(device, required)
     lit(leaves).square().sum().backward()
@@ -81,17 +83,19 @@ def test_shade_computes_only_required_gradients(device, monkeypatch, required):
         [k for k, count in zip(NAMES, row[-5:], strict=True) if count] == list(required) for row in rows
     )
     for k in required:
-        torch.testing.assert_close(leaves[k].grad, truth[k], rtol=1e-5, atol=1e-6 * float(truth[k].abs().max()))
+        torch.testing.assert_close(
+            leaves[k].grad, expected_grads[k], rtol=1e-5, atol=1e-6 * float(expected_grads[k].abs().max())
+        )
 
 
 @pytest.mark.parametrize("required", [(True, False), (False, True)])
 def test_composite_computes_only_required_gradients(device, monkeypatch, required):
     samples, density, color = packed([3, 0, 40], device)
     both = [v.clone().requires_grad_() for v in (density, color)]
-    truth = torch.autograd.grad(composite(*both, samples).color.square().sum(), both)
+    expected_grads = torch.autograd.grad(composite(*both, samples).color.square().sum(), both)
     rows = watched(monkeypatch, volume, "composite_adjoint_kernel")
     leaves = [v.requires_grad_(a) for v, a in zip((density, color), required, strict=True)]
     composite(*leaves, samples).color.square().sum().backward()
     assert rows and all([bool(count) for count in row[-2:]] == list(required) for row in rows)
-    for leaf, a, expected in zip(leaves, required, truth, strict=True):
+    for leaf, a, expected in zip(leaves, required, expected_grads, strict=True):
         assert torch.equal(leaf.grad, expected) if a else leaf.grad is None

@@ -19,14 +19,14 @@ from tests.support.rigs import eyes_around, sphere_views
 
 
 @pytest.fixture(scope="module")
-def truth():
+def ground_truth():
     return render_capture(views=20)
 
 
 @pytest.fixture(scope="module")
-def captured(truth, tmp_path_factory):
+def captured(ground_truth, tmp_path_factory):
     folder = tmp_path_factory.mktemp("capture")
-    report = capture(truth.write(folder / "photographs"), folder / "object")
+    report = capture(ground_truth.write(folder / "photographs"), folder / "object")
     return report, folder / "object"
 
 
@@ -40,23 +40,23 @@ def similarity(a: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray, np.ndar
     return scale, turn, b0 - scale * turn @ a0
 
 
-def camera_errors(truth, folder) -> tuple[float, float, float]:
+def camera_errors(ground_truth, folder) -> tuple[float, float, float]:
     """Largest position error over the distance, largest rotation error in degrees, relative focal length error."""
     frames = json.loads((folder / "transforms.json").read_text())["frames"]
     index = [int(f["file_path"][7:10]) for f in frames]
-    got, expected = np.array([f["transform_matrix"] for f in frames]), truth.c2w[index]
+    got, expected = np.array([f["transform_matrix"] for f in frames]), ground_truth.c2w[index]
     scale, turn, shift = similarity(got[:, :3, 3], expected[:, :3, 3])
     away = np.linalg.norm(scale * got[:, :3, 3] @ turn.T + shift - expected[:, :3, 3], axis=1)
     relative = turn @ got[:, :3, :3] @ expected[:, :3, :3].transpose(0, 2, 1)
     angle = np.degrees(np.arccos(np.clip((np.trace(relative, axis1=1, axis2=2) - 1) / 2, -1, 1)))
     distance = np.linalg.norm(expected[:, :3, 3], axis=1).mean()
-    return away.max() / distance, angle.max(), abs(frames[0]["fl_x"] / truth.focal - 1)
+    return away.max() / distance, angle.max(), abs(frames[0]["fl_x"] / ground_truth.focal - 1)
 
 
-def test_cameras_are_those_of_the_scene(truth, captured):
+def test_cameras_are_those_of_the_scene(ground_truth, captured):
     report, folder = captured
-    assert report.registered == len(truth.images) and not report.lost
-    position, angle, focal = camera_errors(truth, folder)
+    assert report.registered == len(ground_truth.images) and not report.lost
+    position, angle, focal = camera_errors(ground_truth, folder)
     assert position < 0.005 and angle < 0.3 and focal < 0.01
 
 
@@ -69,28 +69,28 @@ def test_cameras_of_a_turntable(tmp_path):
     assert position < 0.005 and angle < 0.3 and focal < 0.01
 
 
-def test_masks_are_those_of_the_scene_and_views_agree(truth, captured):
+def test_masks_are_those_of_the_scene_and_views_agree(ground_truth, captured):
     report, folder = captured
     views = load_views(folder, every=True)
     for name, mask in zip(views.names, views.masks, strict=True):
-        expected = truth.masks[int(name.split("/")[-1][:3])]
+        expected = ground_truth.masks[int(name.split("/")[-1][:3])]
         got = mask.numpy() > 0.5
         if got.shape == expected.shape:  # views of more than two megapixels are cut
             assert (got & expected).sum() / (got | expected).sum() > 0.93
     assert report.agreement > 0.9 and not report.failed
 
 
-def test_the_frame_is_upright_with_the_ground_at_zero(truth, captured):
+def test_the_frame_is_upright_with_the_ground_at_zero(ground_truth, captured):
     _, folder = captured
     frames = json.loads((folder / "transforms.json").read_text())["frames"]
     index = [int(f["file_path"][7:10]) for f in frames]
-    got, expected = np.array([f["transform_matrix"] for f in frames])[:, :3, 3], truth.c2w[index, :3, 3]
+    got, expected = np.array([f["transform_matrix"] for f in frames])[:, :3, 3], ground_truth.c2w[index, :3, 3]
     scale, turn, shift = similarity(expected, got)
     assert (turn @ [0, 1, 0])[1] > np.cos(np.radians(1.0))
     assert abs(scale - 1.0) < 0.1  # the object's longest side is 1; a hull is larger than its object
 
 
-def test_a_capture_is_placed_by_the_box_of_its_object(truth, captured):
+def test_a_capture_is_placed_by_the_box_of_its_object(ground_truth, captured):
     """The network's frame has the object's center at the origin although the capture's has the ground there."""
     _, folder = captured
     frames = json.loads((folder / "transforms.json").read_text())["frames"]
@@ -98,7 +98,7 @@ def test_a_capture_is_placed_by_the_box_of_its_object(truth, captured):
     views = load_views(folder, every=True)
     placed = normalize(views)
     got = placed.apply(views.c2w[:, :3, 3].double()).numpy()
-    scale, turn, shift = similarity(truth.c2w[index, :3, 3], got)
+    scale, turn, shift = similarity(ground_truth.c2w[index, :3, 3], got)
     vertices = make_object(3).vertices
     center = (vertices.min(0) + vertices.max(0)) / 2
     assert np.abs(scale * turn @ center + shift).max() < 0.06  # a hull of views from above reaches beyond its object
@@ -122,7 +122,7 @@ def test_an_object_box_that_is_none_is_refused(captured, tmp_path, box):
         read_transforms(tmp_path / "transforms.json")
 
 
-def test_the_folder_is_whole_and_is_replaced_only_if_it_is_a_capture(truth, captured, tmp_path):
+def test_the_folder_is_whole_and_is_replaced_only_if_it_is_a_capture(ground_truth, captured, tmp_path):
     _, folder = captured
     assert {p.name for p in folder.iterdir()} == {"images", "masks", "transforms.json", "capture.json", "capture.png"}
     (tmp_path / "full").mkdir()

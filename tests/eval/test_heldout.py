@@ -20,11 +20,13 @@ from reli3d.synthetic.samples import ObjectSurface, synthesize
 
 
 def test_a_factor_a_channel_is_forgiven_and_a_pattern_is_not():
-    truth = torch.rand(400, 3) * 0.6 + 0.2
-    dimmed = linear_to_srgb(srgb_to_linear(truth) * torch.tensor([0.5, 0.9, 0.7]))
-    assert square_error(dimmed, truth) > 1e-3
-    assert scaled_square_error(dimmed, truth) < 1e-9
-    assert scaled_square_error(torch.ones_like(truth), truth) == pytest.approx(float(truth.var(0).mean()), rel=0.05)
+    ground_truth = torch.rand(400, 3) * 0.6 + 0.2
+    dimmed = linear_to_srgb(srgb_to_linear(ground_truth) * torch.tensor([0.5, 0.9, 0.7]))
+    assert square_error(dimmed, ground_truth) > 1e-3
+    assert scaled_square_error(dimmed, ground_truth) < 1e-9
+    assert scaled_square_error(torch.ones_like(ground_truth), ground_truth) == pytest.approx(
+        float(ground_truth.var(0).mean()), rel=0.05
+    )
 
 
 def test_light_error_forgives_exposure_alone():
@@ -41,7 +43,7 @@ def test_two_ways_to_average():
 
 
 def test_an_empty_field_counts_as_nothing_found_and_spoils_no_mean(monkeypatch):
-    """A network without surface, then one whose object no camera sees where the truth is."""
+    """A network without surface, then one whose object is outside all cameras' views of the reference."""
     seed = 1_000_000_002
     sample = synthesize(ObjectSurface(make_object(seed)), torch.ones(32, 64, 3), np.random.default_rng(seed), views=12)
 
@@ -58,9 +60,9 @@ def test_an_empty_field_counts_as_nothing_found_and_spoils_no_mean(monkeypatch):
     away = SimpleNamespace(mesh=mesh, textures=None, environment=light, light=light)
     monkeypatch.setattr(heldout, "reconstruct", lambda *args, **kwargs: away)
     looked = []
-    truth = heldout.reference_colors
+    ground_truth = heldout.reference_colors
     monkeypatch.setattr(
-        heldout, "reference_colors", lambda seed, cameras: looked.extend(cameras) or truth(seed, cameras)
+        heldout, "reference_colors", lambda seed, cameras: looked.extend(cameras) or ground_truth(seed, cameras)
     )
     row = evaluate(None, sample, seed, 4, torch.ones(32, 64, 3))
     assert torch.equal(torch.stack([c.c2w for c in looked]), sample["c2w"][-8:])  # none of the views that are input

@@ -76,16 +76,16 @@ def test_the_pipeline_takes_what_it_is_given():
 def test_the_reference_reconstructed_perfectly_has_perfect_figures(place, monkeypatch):
     """The pipeline replaced by one that gives the object itself, in its own light at the photographs' exposure."""
     light = Environment(torch.rand(16, 32, 3, generator=torch.Generator().manual_seed(0)) + 0.2)
-    truth = objects.load_reference(place / "ball.glb", light, light, inputs=2, size=32, seed=0)
-    exposure = objects.exposure_of(truth, light)
+    ground_truth = objects.load_reference(place / "ball.glb", light, light, inputs=2, size=32, seed=0)
+    exposure = objects.exposure_of(ground_truth, light)
     given = []
 
     def perfect(views, *, weights, options):
         given.append(views)
-        return replace(truth.parts[0], environment=Environment(light.radiance * exposure))
+        return replace(ground_truth.parts[0], environment=Environment(light.radiance * exposure))
 
     monkeypatch.setattr(objects, "reconstruct", perfect)
-    found, images = objects.evaluate(None, truth, 2)
+    found, images = objects.evaluate(None, ground_truth, 2)
     assert len(given[0]) == 2 and len(images) == 7
     for name in objects.MAPS:
         assert found[f"{name}_psnr"] == 100.0

@@ -215,7 +215,7 @@ def test_rays_enter_and_leave_the_cones_of_sight(device):
     assert hit.sum() > 150 and missed.sum() > 20
     first = torch.stack([t[k, true[k] > 0][0] for k in hit.nonzero()[:, 0]])
     last = torch.stack([t[k, true[k] > 0][-1] for k in hit.nonzero()[:, 0]])
-    # a step of the truth, one of the tracing, and the cones' error, longer where the ray meets them at a slant
+    # a step of the reference, one of the tracing, and the cones' error, longer where the ray meets them at a slant
     error = torch.stack([got[hit, 0] - first, got[hit, 1] - last]).abs() * length[hit]
     assert error.quantile(0.9) < 0.006 and error.max() < 0.05
     assert torch.equal(got[missed, 0], got[missed, 1])

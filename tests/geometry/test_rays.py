@@ -231,9 +231,11 @@ def test_reevaluated_hits_and_their_gradients_equal_float64(device):
         assert reference.share_within(value, expected[name]) >= 0.999, name
         w = weight[:, : value.shape[1]]
         grads = torch.autograd.grad((value * w.to(device)).sum(), ins, retain_graph=True, allow_unused=True)
-        truth = torch.autograd.grad((expected[name] * w.double()).sum(), twin, retain_graph=True, allow_unused=True)
+        expected_grads = torch.autograd.grad(
+            (expected[name] * w.double()).sum(), twin, retain_graph=True, allow_unused=True
+        )
         assert (grads[1] is None) == (name == "normal")
-        for k, (g, t) in enumerate(zip(grads, truth, strict=True)):
+        for k, (g, t) in enumerate(zip(grads, expected_grads, strict=True)):
             assert g is None or reference.share_within(g, t) >= 0.999, (name, k)
 
 

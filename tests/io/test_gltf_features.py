@@ -1,4 +1,4 @@
-"""What glTF 2.0 and its extensions say of a file, on quads whose truth is known by construction."""
+"""glTF 2.0 and its extensions, on quads with ground truth by construction."""
 
 import io
 import json

@@ -219,7 +219,7 @@ def test_cube_weights_are_bounded_around_neutral():
 
 
 def test_gradients_of_a_shared_bank_are_those_of_its_copies_added_up(golden):
-    """The stem and the first keys and values are computed once for a batch; float64 copies are the truth."""
+    """The stem and the first keys and values are computed once for a batch; float64 copies are the reference."""
     g = golden("two_stream_small")
     sizes = BackboneSizes(heads=4, latents=12, blocks=3, basic_blocks=2, experts=3, experts_from=1, groups=8)
     module = g.load(TwoStreamTransformer(sizes, 32), "backbone.", "backbone.")

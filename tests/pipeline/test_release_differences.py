@@ -157,8 +157,8 @@ def test_points_of_a_half_precision_triplane_keep_their_place():
     ramp = torch.arange(float(size)).expand(1, 3, 1, size, size).contiguous().half()  # whole numbers: exact in half
     x = torch.linspace(0.9, 0.99, 2001)
     points = torch.stack([x, torch.zeros_like(x), torch.zeros_like(x)], -1)[None]
-    truth = (x.double() + 1) * size / 2 - 0.5
+    exact = (x.double() + 1) * size / 2 - 0.5
     ours = sample_triplane(ramp, points)[0, :, 0].double()
     release = sample_triplane(ramp, points.half().float())[0, :, 0].double()
-    assert (ours - truth).abs().max() < 1e-3  # float32 of 384
-    assert (release - truth).abs().max() > 0.04
+    assert (ours - exact).abs().max() < 1e-3  # float32 of 384
+    assert (release - exact).abs().max() > 0.04

@@ -87,10 +87,10 @@ def test_the_plan_is_the_best_split_and_its_variance_that_of_quadrature(device, 
     splits = [(8 * a, 8 * b, 64 - 8 * a - 8 * b) for a in range(9) for b in range(9 - a)]
     plans = [plan_samples(*at(*arguments), env, options=ShadeOptions(seed=seed)) for seed in range(3)]
     counts = torch.tensor([p.samples for p in plans] + splits, dtype=torch.float64)
-    truth = quadrature(arguments, env, counts).mean(0).tolist()
-    for plan, true in zip(plans, truth):
+    exact = quadrature(arguments, env, counts).mean(0).tolist()
+    for plan, true in zip(plans, exact):
         assert sum(plan.samples) == 64
-        assert true < 1.05 * min(truth[3:])  # measured 1.00: the variance is flat about its minimum
+        assert true < 1.05 * min(exact[3:])  # measured 1.00: the variance is flat about its minimum
         assert abs(plan.variance / true - 1.0) < error
 
 

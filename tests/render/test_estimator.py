@@ -88,10 +88,10 @@ def test_black_texels_get_a_gradient_only_where_a_strategy_reaches_them(device):
             options=ShadeOptions(samples=counts),
         )
         grads[counts] = torch.autograd.grad(out.mean(0).sum(), leaf)[0][0].sum()  # the black row about the zenith
-    truth = grads[(0, 0, 64)]
+    exact = grads[(0, 0, 64)]
     # 4 of 64 samples by the cosine and 40 by visible normals reach it: their noise over 40000 points is below 1 %
-    assert abs(grads[(20, 40, 4)] / truth - 1.0) < 0.03
-    assert float(grads[(64, 0, 0)]) == 0.0 < truth
+    assert abs(grads[(20, 40, 4)] / exact - 1.0) < 0.03
+    assert float(grads[(64, 0, 0)]) == 0.0 < exact
 
 
 def test_gradients_stay_finite_at_the_edges_of_every_input(device):
@@ -201,7 +201,7 @@ def test_variance_is_that_of_the_closed_form(device, counts):
     p = torch.stack([torch.full_like(f, 0.25), 0.5 / (1.0 + o).expand_as(f), c.expand_as(f)]) / torch.pi
     q = sum(n * row for n, row in zip(counts, p))
     ring = 0.7 * 2.0 * torch.pi / 20000
-    truth = 0.7 * ring * (f * f / q).sum(1) - sum(n * (ring * (f * r / q).sum(1)) ** 2 for n, r in zip(counts, p))
+    exact = 0.7 * ring * (f * f / q).sum(1) - sum(n * (ring * (f * r / q).sum(1)) ** 2 for n, r in zip(counts, p))
     moved = got - got.mean(0)
     square = moved.square().mean(0)
     error = ((moved**4).mean(0) - square**2).clamp(min=0.0).div(len(got)).sum().sqrt() / 24  # its own fourth moment
@@ -210,9 +210,9 @@ def test_variance_is_that_of_the_closed_form(device, counts):
         even = 1.0 - 2.0 * o * log + rest
         square = (2.0 * even, (1.0 + o) * even, 0.5 * (log + rest - 1.0))[counts.index(64)]
         closed = 0.49 * (square - (1.0 - o * log) ** 2)[:, 0] / 64
-        assert torch.allclose(truth, closed, rtol=1e-6)
-    assert abs(got.var(0).mean() - truth.mean()) < 3.0 * error
-    assert error < 0.04 * truth.mean()  # measured 0.02 to 0.03
+        assert torch.allclose(exact, closed, rtol=1e-6)
+    assert abs(got.var(0).mean() - exact.mean()) < 3.0 * error
+    assert error < 0.04 * exact.mean()  # measured 0.02 to 0.03
 
 
 @pytest.mark.parametrize("name", SKIES[:2])

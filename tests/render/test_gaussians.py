@@ -49,12 +49,12 @@ def test_value_and_gradients_match_the_definition(device):
     expected = light_at(at, *twin)
     torch.testing.assert_close(got.double(), expected, rtol=2e-5, atol=1e-6)  # sharpness 150 times float32 noise
     grads = torch.autograd.grad((got * weight).sum(), [*own, d])
-    truth = torch.autograd.grad((expected * weight.double()).sum(), [*twin, at])
+    expected_grads = torch.autograd.grad((expected * weight.double()).sum(), [*twin, at])
     # the squared chord and the cosine differ in derivative by multiples of the unit vectors: compare across them
     for k, v in ((0, own[0]), (3, d)):
-        assert reference.rows_within(*(reference.across(g[k], v) for g in (grads, truth))) >= 0.999, k
+        assert reference.rows_within(*(reference.across(g[k], v) for g in (grads, expected_grads))) >= 0.999, k
     for k in (1, 2):
-        assert reference.share_within(grads[k], truth[k]) >= 0.999, k
+        assert reference.share_within(grads[k], expected_grads[k]) >= 0.999, k
 
 
 def test_irradiance_and_gradients_match_quadrature(device):
@@ -69,8 +69,8 @@ def test_irradiance_and_gradients_match_quadrature(device):
     assert float((got.detach().cpu().double() - expected.detach()).abs().max()) < 3e-3 * float(expected.detach().max())
     weight = torch.rand(48, 3, generator=rng)
     grads = torch.autograd.grad((got * weight.to(device)).sum(), [*own, normals])
-    truth = torch.autograd.grad((expected * weight.double()).sum(), [*twin, at])
-    for g, t, v in zip(grads, truth, [*own, normals], strict=True):
+    expected_grads = torch.autograd.grad((expected * weight.double()).sum(), [*twin, at])
+    for g, t, v in zip(grads, expected_grads, [*own, normals], strict=True):
         g = g.cpu().double()
         if v.shape[-1] == 3 and v is not own[2]:
             unit = v.detach().cpu().double()

@@ -83,9 +83,9 @@ def test_gradients_of_the_material(device, diffuse_model):
     assert keep.sum() > 10_000
     twin = [v.detach()[keep].cpu().double().requires_grad_() for v in leaves]
     expected = reference.eval_bsdf(*twin, diffuse_model)
-    truth = torch.autograd.grad((expected * weight[keep].double()).sum(), twin)
+    expected_grads = torch.autograd.grad((expected * weight[keep].double()).sum(), twin)
     assert close(value.detach()[keep], expected.detach(), 0.999, 1e-5)
-    for k, (g, t) in enumerate(zip(grads, truth, strict=True)):
+    for k, (g, t) in enumerate(zip(grads, expected_grads, strict=True)):
         g = g.cpu()[keep].double()
         if k < 2:  # only the tangent part of a direction's gradient is defined
             g, t = (reference.across(v, twin[k]) for v in (g, t))
@@ -190,10 +190,10 @@ def test_gradients_of_the_estimator(device, strategy, diffuse_model):
         light,
         diffuse_model,
     )
-    *truth, g_texels = torch.autograd.grad((expected * weight.double()[smooth]).sum(), [*part, radiance])
+    *expected_grads, g_texels = torch.autograd.grad((expected * weight.double()[smooth]).sum(), [*part, radiance])
     assert reference.share_within(value[smooth], expected) >= 0.999
     wide = alpha[smooth] > 0.3
-    for k, (g, t) in enumerate(zip(got, truth)):
+    for k, (g, t) in enumerate(zip(got, expected_grads)):
         g = g.cpu()[smooth].double()
         if k == 0:
             g, t = (reference.across(v, part[0]) for v in (g, t))

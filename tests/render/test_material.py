@@ -37,8 +37,8 @@ def test_value_and_gradients_equal_the_float64_reference(device, diffuse_model):
     assert float(off.max()) < 2e-5  # rounding of cosines of 0.02; measured 8e-6, from widths of 0.01 to 1
     weight = torch.randn(got.shape, generator=torch.Generator().manual_seed(1))
     grads = torch.autograd.grad((got * weight.to(device)).sum(), leaf)
-    truth = torch.autograd.grad((expected * weight.double()).sum(), twin)
-    for k, (g, t) in enumerate(zip(grads, truth, strict=True)):
+    expected_grads = torch.autograd.grad((expected * weight.double()).sum(), twin)
+    for k, (g, t) in enumerate(zip(grads, expected_grads, strict=True)):
         if k < 2:  # the two write cosines differently off the unit sphere: only the tangent part is defined
             g, t = (reference.across(v, twin[k]) for v in (g, t))
         assert reference.share_within(g, t) >= 0.999, k

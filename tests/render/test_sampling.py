@@ -222,8 +222,8 @@ def test_visible_normals_equal_their_float64_reference(device):
     torch.testing.assert_close(got.cpu().double(), expected, rtol=0, atol=2e-5)
     weight = torch.randn(n, 3, generator=g)
     grads = torch.autograd.grad((got * weight.to(device)).sum(), ins)
-    truth = torch.autograd.grad((expected * weight.double()).sum(), twin)
-    assert all(reference.share_within(a, b) >= 0.999 for a, b in zip(grads, truth, strict=True))
+    expected_grads = torch.autograd.grad((expected * weight.double()).sum(), twin)
+    assert all(reference.share_within(a, b) >= 0.999 for a, b in zip(grads, expected_grads, strict=True))
 
 
 def test_density_equals_its_float64_reference(device):

@@ -32,7 +32,7 @@ def test_every_strategy_and_mix_converges_to_the_quadrature(device, counts, roug
     env, (normal, wo) = sky(), points(3)
     for k in range(2):
         base = torch.tensor([0.8, 0.5, 0.2])
-        truth = reference.direct_light(
+        exact = reference.direct_light(
             normal[k].double(),
             wo[k].double(),
             base.double(),
@@ -56,9 +56,9 @@ def test_every_strategy_and_mix_converges_to_the_quadrature(device, counts, roug
                 light,
                 options=ShadeOptions(samples=counts, **extra),
             )
-            error = got.std(0) / n**0.5 + 2e-4 * truth.float().to(device)  # second term: quadrature error, 256 rows
-            z = ((got.mean(0) - truth.to(device)) / error).abs().max()
-            assert z < 4.5, (extra, got.mean(0), truth)  # 6e-6 a number, about 300 numbers in the family
+            error = got.std(0) / n**0.5 + 2e-4 * exact.float().to(device)  # second term: quadrature error, 256 rows
+            z = ((got.mean(0) - exact.to(device)) / error).abs().max()
+            assert z < 4.5, (extra, got.mean(0), exact)  # 6e-6 a number, about 300 numbers in the family
 
 
 @pytest.mark.parametrize("diffuse_model", DIFFUSE_MODELS)
@@ -83,10 +83,10 @@ def test_lambert_under_constant_light_is_its_closed_form(device, diffuse_model, 
     left = (1 - schlick((1 + d[:, 1]) / 2)) * (1 - schlick((1 + cos_o) / 2))
     if diffuse_model == "published":
         left = 1 - schlick((d + view.double()).norm(dim=-1) / 2)
-    truth = kd * c * float((left * d[:, 1]).sum() * angle / torch.pi)
+    exact = kd * c * float((left * d[:, 1]).sum() * angle / torch.pi)
     error = got.std(0) / n**0.5
-    assert bool(((got.mean(0) - truth).abs() < 4 * error + 2e-6 * truth).all())  # 2e-6: float32, and the midpoint rule
-    assert bool((error < 1e-3 * truth).all())
+    assert bool(((got.mean(0) - exact).abs() < 4 * error + 2e-6 * exact).all())  # 2e-6: float32, and the midpoint rule
+    assert bool((error < 1e-3 * exact).all())
 
 
 def test_edge_inputs_are_finite_and_not_negative(device):
@@ -296,16 +296,16 @@ def test_mean_gradient_is_that_of_the_integral(device, counts, options):
     metallic = 1.0 if counts == (0, 64, 0) else 0.4
     probes = torch.randn(8, 8, 16, 3, generator=torch.Generator().manual_seed(12))  # directions in the space of maps
     for k in range(2):
-        truth_in = [normal[k].double(), torch.tensor([0.7, 0.4, 0.2]).double(), torch.tensor(0.6).double(),
+        inputs = [normal[k].double(), torch.tensor([0.7, 0.4, 0.2]).double(), torch.tensor(0.6).double(),
                     torch.tensor(metallic).double(), env.radiance.double()]  # fmt: skip
-        truth_in = [v.requires_grad_() for v in truth_in]
+        inputs = [v.requires_grad_() for v in inputs]
         value = reference.direct_light(
-            truth_in[0] / truth_in[0].norm(), wo[k].double(), truth_in[1], truth_in[2] ** 2, truth_in[3], truth_in[4],
+            inputs[0] / inputs[0].norm(), wo[k].double(), inputs[1], inputs[2] ** 2, inputs[3], inputs[4],
             192, options.get("diffuse_model", "conserving"),
         )  # fmt: skip
-        truth = torch.autograd.grad(value.sum(), truth_in)
+        exact = torch.autograd.grad(value.sum(), inputs)
         rows = repeat(
-            n, normal[k : k + 1], truth_in[1][None].detach().float(), torch.tensor([0.6]), torch.tensor([metallic])
+            n, normal[k : k + 1], inputs[1][None].detach().float(), torch.tensor([0.6]), torch.tensor([metallic])
         )
         rows = [r.to(device).requires_grad_() for r in rows]
         light = env.radiance.to(device).requires_grad_()
@@ -318,7 +318,7 @@ def test_mean_gradient_is_that_of_the_integral(device, counts, options):
         assert ((got.detach().mean(0) - value.detach().to(device)) / error).abs().max() < 4.5
         grads = torch.autograd.grad(got.sum(), rows)
         tangent = grads[0] - (grads[0] * rows[0]).sum(-1, keepdim=True) * rows[0]
-        for g, t in zip([tangent, *grads[1:]], truth[:4], strict=True):
+        for g, t in zip([tangent, *grads[1:]], exact[:4], strict=True):
             error = g.std(0) / n**0.5 + 1e-3 * t.abs().max().float().to(device)  # second term: the quadrature's
             assert ((g.mean(0) - t.to(device)) / error).abs().max() < 4.5
         fixed, slopes = [r[:100].detach() for r in rows], []
@@ -330,8 +330,8 @@ def test_mean_gradient_is_that_of_the_integral(device, counts, options):
             )
             slopes.append(torch.autograd.grad(part.sum() / 100, light)[0].cpu().double())
         slopes = torch.einsum("bhwc,phwc->bp", torch.stack(slopes), probes.double())
-        expected = torch.einsum("hwc,phwc->p", truth[4], probes.double())
-        error = slopes.std(0) / 60**0.5 + 5e-4 * truth[4].norm()  # second term: the quadrature's
+        expected = torch.einsum("hwc,phwc->p", exact[4], probes.double())
+        error = slopes.std(0) / 60**0.5 + 5e-4 * exact[4].norm()  # second term: the quadrature's
         assert (
             (slopes.mean(0) - expected) / error
         ).abs().max() < 4.5  # t of 59 degrees: 3e-5 a number, 128 in the family

@@ -110,10 +110,10 @@ def test_composite_and_gradients_match_the_float64_reference(device):
     out, expected = composite(*own, samples), twin(samples, *far)
     rng = torch.Generator().manual_seed(4)
     loss = ref = 0.0
-    for got, truth in zip((out.color, out.opacity, out.depth), expected, strict=True):
-        torch.testing.assert_close(got.detach().cpu().double(), truth.detach(), rtol=1e-5, atol=1e-6)
-        weight = torch.randn(truth.shape, generator=rng)
-        loss, ref = loss + (got * weight.to(device)).sum(), ref + (truth * weight.double()).sum()
+    for got, exact in zip((out.color, out.opacity, out.depth), expected, strict=True):
+        torch.testing.assert_close(got.detach().cpu().double(), exact.detach(), rtol=1e-5, atol=1e-6)
+        weight = torch.randn(exact.shape, generator=rng)
+        loss, ref = loss + (got * weight.to(device)).sum(), ref + (exact * weight.double()).sum()
     for g, t in zip(torch.autograd.grad(loss, own), torch.autograd.grad(ref, far), strict=True):
         # float32 exponentials of sums of up to 200 terms
         torch.testing.assert_close(g.cpu().double(), t, rtol=1e-4, atol=2e-6)
@@ -152,9 +152,9 @@ def test_a_triplane_is_marched_and_composited_as_in_float64(device):
     expected = twin(samples, *field(o[ray] + t[:, None] * d[ray], *far, planes_read))
     weight = [torch.rand(v.shape, generator=rng) for v in expected[:2]]
     loss = ref = 0.0
-    for got, truth, w in zip((out.color, out.opacity), expected, weight):
-        torch.testing.assert_close(got.detach().cpu().double(), truth.detach(), rtol=1e-4, atol=1e-6)
-        loss, ref = loss + (got * w.to(device)).sum(), ref + (truth * w.double()).sum()
+    for got, exact, w in zip((out.color, out.opacity), expected, weight):
+        torch.testing.assert_close(got.detach().cpu().double(), exact.detach(), rtol=1e-4, atol=1e-6)
+        loss, ref = loss + (got * w.to(device)).sum(), ref + (exact * w.double()).sum()
     opacity = out.opacity.detach()
     assert float(opacity.max()) > 0.9 and float(opacity.std()) > 0.1
     for g, t in zip(torch.autograd.grad(loss, (planes, heads)), torch.autograd.grad(ref, far), strict=True):
@@ -182,13 +182,13 @@ def test_faint_and_opaque_media_keep_their_digits(device):
 
 def test_descent_through_a_field_recovers_a_ball(device):
     """Density and color on a small voxel field from opacity and color of 400 rays."""
-    grid, truth_color = OccupancyGrid.full(8, 0.8, device), torch.tensor([0.9, 0.3, 0.1], device=device)
+    grid, true_color = OccupancyGrid.full(8, 0.8, device), torch.tensor([0.9, 0.3, 0.1], device=device)
     origins, directions = rays(device, 400, 5)
     samples = march_rays(origins, directions, grid, 0.05)
     p = samples.positions(origins, directions)
     with torch.no_grad():
         inside = (p.norm(dim=-1) < 0.5).float()
-        target = composite(20.0 * inside, truth_color.expand(len(p), 3).contiguous(), samples)
+        target = composite(20.0 * inside, true_color.expand(len(p), 3).contiguous(), samples)
     field = torch.zeros(1, 4, 9, 9, 9, device=device, requires_grad=True)
     optimizer = torch.optim.Adam([field], lr=0.15)
     for _ in range(60):

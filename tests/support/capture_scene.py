@@ -1,4 +1,4 @@
-"""A synthetic capture: a textured object on a textured table, photographed along a hand-held path, with its truth."""
+"""A synthetic capture: a textured object on a textured table, photographed along a free path, with ground truth."""
 
 from __future__ import annotations
 

@@ -76,11 +76,13 @@ def by_name(views) -> dict[str, int]:
     return {name: i for i, name in enumerate(views.names)}
 
 
-def check_masks(folder: Path, truth: dict[str, np.ndarray], tolerance: float) -> None:
+def check_masks(folder: Path, ground_truth: dict[str, np.ndarray], tolerance: float) -> None:
     views = load_views(folder)
-    check(len(views.names) == len(truth), f"{len(views.names)} of {len(truth)} views, notes {views.notes}")
+    check(
+        len(views.names) == len(ground_truth), f"{len(views.names)} of {len(ground_truth)} views, notes {views.notes}"
+    )
     at = by_name(views)
-    for name, mask in truth.items():
+    for name, mask in ground_truth.items():
         error = float(np.abs(views.masks[at[name]].numpy() - mask).max())
         check(error <= tolerance, f"the mask of {name} differs by {error:.3f}, notes {views.notes}")
 
@@ -92,7 +94,7 @@ def masks(rng: Random) -> Case:
     color = [rng.randrange(256) for _ in range(3)]
     color[rng.randrange(3)] = rng.randrange(40, 256)
     suffix = rng.choice([".png", ".png.png"])
-    files, truth, frames = {}, {}, []
+    files, ground_truth, frames = {}, {}, []
     for k, pose in enumerate(rotations(rng, 3)):
         soft = disk(rng)
         hard = soft > 0.5
@@ -115,17 +117,19 @@ def masks(rng: Random) -> Case:
             files[name] = png(np.concatenate([rgb, mask[..., None]], -1))
         else:
             files[name], files[f"masks/{k:03d}{suffix}"] = image, png(mask)
-        truth[name] = soft if kind == "soft" else hard
+        ground_truth[name] = soft if kind == "soft" else hard
         frames.append(frame_of(name, pose))
     files["transforms.json"] = transforms(frames, camera_angle_x=0.8)
-    return Case(files, lambda f: check_masks(f, truth, 0.003), must_read=kind in ("white", "soft", "bit", "gray"))
+    return Case(
+        files, lambda f: check_masks(f, ground_truth, 0.003), must_read=kind in ("white", "soft", "bit", "gray")
+    )
 
 
 def names(rng: Random) -> Case:
     """Images with one bare name in several folders; masks in the same folders, flat, or shared."""
     layout = rng.choice(["mirrored", "suffixed", "below images", "flat and unique", "shared"])
     folders = rng.sample(["front", "back", "left/near", "left/far", "cam 1", "ü"], rng.choice((2, 3)))
-    files, truth, frames = {}, {}, []
+    files, ground_truth, frames = {}, {}, []
     for k, pose in enumerate(rotations(rng, 2 * len(folders))):
         stem = f"{k:06d}" if layout == "flat and unique" else f"{k // len(folders):06d}"
         part = f"{folders[k % len(folders)]}/{stem}"
@@ -134,12 +138,12 @@ def names(rng: Random) -> Case:
         image = Image.open(io.BytesIO(random_image(rng)))
         data = io.BytesIO()
         image.save(data, "JPEG" if name.endswith("jpg") else "PNG")
-        files[name], truth[name] = data.getvalue(), mask
+        files[name], ground_truth[name] = data.getvalue(), mask
         place = {"suffixed": f"{part}.png.png", "flat and unique": f"{stem}.png", "shared": f"{stem}.png"}
         files[f"masks/{place.get(layout, f'{part}.png')}"] = png((255 * mask).astype(np.uint8))
         frames.append(frame_of(name, pose))
     files["transforms.json"] = transforms(frames, camera_angle_x=0.8)
-    return Case(files, lambda f: check_masks(f, truth, 0.003), must_read=layout != "shared")
+    return Case(files, lambda f: check_masks(f, ground_truth, 0.003), must_read=layout != "shared")
 
 
 UNKNOWN = (
@@ -183,13 +187,18 @@ def spelled(rng: Random, width: int, height: int) -> tuple[dict, list[float]]:
     return rng.choice(lenses), [fx, fy, cx, cy]
 
 
-def check_cameras(folder: Path, truth: dict[str, tuple], tolerance: float = 1e-3, least: int | None = None) -> None:
-    """truth: intrinsics in pixels and the camera's center by the image's name."""
+def check_cameras(
+    folder: Path, ground_truth: dict[str, tuple], tolerance: float = 1e-3, least: int | None = None
+) -> None:
+    """ground_truth: intrinsics in pixels and the camera's center by the image's name."""
     views = load_views(folder, every=True)
-    check(len(views.names) >= (least or len(truth)), f"{len(views.names)} of {len(truth)} views, notes {views.notes}")
+    check(
+        len(views.names) >= (least or len(ground_truth)),
+        f"{len(views.names)} of {len(ground_truth)} views, notes {views.notes}",
+    )
     for i, name in enumerate(views.names):
-        check(name in truth, f"the name {name!r}, notes {views.notes}")
-        intrinsics, pose = truth[name]
+        check(name in ground_truth, f"the name {name!r}, notes {views.notes}")
+        intrinsics, pose = ground_truth[name]
         off = np.abs(views.intrinsics[i].numpy() - intrinsics).max()
         check(off < 1e-2, f"{name}: intrinsics {views.intrinsics[i].tolist()}, not {intrinsics}; notes {views.notes}")
         got = views.c2w[i].numpy().astype(np.float64)
@@ -207,7 +216,7 @@ def rgba(rng: Random, width: int, height: int) -> bytes:
 def lens(rng: Random) -> Case:
     """Spellings of a lens in the file or in each frame; unknown keys and fisheye lenses must be refused."""
     width, height = 64, 48
-    files, truth, frames, shared = {}, {}, [], {}
+    files, ground_truth, frames, shared = {}, {}, [], {}
     unknown = rng.choice(UNKNOWN) if rng.random() < 0.4 else {}
     everywhere = rng.random() < 0.5
     if everywhere:
@@ -217,7 +226,7 @@ def lens(rng: Random) -> Case:
         if not everywhere:
             fields, values = spelled(rng, width, height)
         name = f"rgba/{k}.png"
-        files[name], truth[name] = rgba(rng, width, height), (values, pose)
+        files[name], ground_truth[name] = rgba(rng, width, height), (values, pose)
         frames.append(frame_of(name, pose, **fields))
     (shared if rng.random() < 0.5 else frames[rng.randrange(3)]).update(unknown)
     bent = bool({"is_fisheye", "fisheye", "camera_model", "camera_type", "lens_type", "ftheta_p0"} & set(unknown))
@@ -227,7 +236,7 @@ def lens(rng: Random) -> Case:
                 del part[key]
         bent = True
     files["transforms.json"] = transforms(frames, **shared)
-    return Case(files, lambda f: check_cameras(f, truth), must_read=not unknown, must_refuse=bent)
+    return Case(files, lambda f: check_cameras(f, ground_truth), must_read=not unknown, must_refuse=bent)
 
 
 def quaternion(rotation: np.ndarray) -> np.ndarray:
@@ -247,7 +256,7 @@ def quaternion(rotation: np.ndarray) -> np.ndarray:
 def colmap(rng: Random) -> Case:
     """COLMAP text models: without lines of points, with blank lines, CRLF, a BOM, comments, and two models."""
     width, height, count = 64, 48, rng.choice((4, 6, 7))
-    files, truth, rows, cameras = {}, {}, [], []
+    files, ground_truth, rows, cameras = {}, {}, [], []
     for k, pose in enumerate(rotations(rng, count)):
         fx, cx, cy = rng.uniform(50, 120), width / 2 + rng.uniform(-3, 3), height / 2 + rng.uniform(-3, 3)
         fy = fx * rng.uniform(0.95, 1.05)
@@ -262,7 +271,7 @@ def colmap(rng: Random) -> Case:
         numbers = " ".join(f"{v:.15g}" for v in (*quaternion(view[:3, :3]), *view[:3, 3]))
         rows.append(f"{k + 1} {numbers} {k + 1} {name}")
         files[f"images/{name}"] = rgba(rng, width, height)
-        truth[name] = ([fx, fy, cx, cy], pose)
+        ground_truth[name] = ([fx, fy, cx, cy], pose)
     points = rng.choice(["empty", "some", "none"])
     line = {"empty": [""], "some": ["10.5 11.25 7 20 21 -1"], "none": []}[points]
     end, bom = rng.choice(["\n", "\r\n"]), rng.choice(["", "\ufeff"])
@@ -277,7 +286,7 @@ def colmap(rng: Random) -> Case:
         files[f"sparse/{place}/cameras.txt"] = text(cameras)
         files[f"sparse/{place}/images.txt"] = text([part for row in kept for part in (row, *line)])
         files[f"sparse/{place}/points3D.txt"] = b""
-    return Case(files, lambda f: check_cameras(f, truth), must_read=True)
+    return Case(files, lambda f: check_cameras(f, ground_truth), must_read=True)
 
 
 def benchmarks(rng: Random) -> Case:
@@ -285,7 +294,7 @@ def benchmarks(rng: Random) -> Case:
     width, height, count = 64, 48, 5
     fx = rng.uniform(50, 120)
     values, poses = [fx, fx, width / 2, height / 2], rotations(rng, count)
-    files, truth, least = {}, {}, count
+    files, ground_truth, least = {}, {}, count
     form = rng.choice(["splits", "llff", "neus"])
     if form == "splits":
         for split, some in (("train", poses[:3]), ("val", poses[3:4]), ("test", poses[4:])):
@@ -294,13 +303,13 @@ def benchmarks(rng: Random) -> Case:
                 files[f"{split}/r_{k}.png"] = rgba(rng, width, height)
                 frames.append(frame_of(f"./{split}/r_{k}", pose))
                 for name in (f"{split}/r_{k}", f"./{split}/r_{k}", f"{split}/r_{k}.png"):
-                    truth[name] = (values, pose)
+                    ground_truth[name] = (values, pose)
             files[f"transforms_{split}.json"] = transforms(frames, camera_angle_x=2 * math.atan(0.5 * width / fx))
         least = 3
     elif form == "llff":
         rows = []
         for k, pose in enumerate(poses):
-            files[f"images/{k:03d}.png"], truth[f"images/{k:03d}.png"] = rgba(rng, width, height), (values, pose)
+            files[f"images/{k:03d}.png"], ground_truth[f"images/{k:03d}.png"] = rgba(rng, width, height), (values, pose)
             axes = np.stack([-pose[:3, 1], pose[:3, 0], pose[:3, 2], pose[:3, 3], [height, width, fx]], -1)
             rows.append([*axes.ravel(), 1.0, 4.0])
         files["poses_bounds.npy"] = saved(np.save, np.array(rows))
@@ -317,9 +326,9 @@ def benchmarks(rng: Random) -> Case:
             projection[:3] = k3 @ view[:3]
             arrays[f"world_mat_{k}"] = rng.uniform(0.5, 2.0) * projection @ np.linalg.inv(scale)
             arrays[f"scale_mat_{k}"] = scale
-            truth[name] = (values, pose)
+            ground_truth[name] = (values, pose)
         files["cameras_sphere.npz"] = saved(np.savez, **arrays)
-    return Case(files, lambda f: check_cameras(f, truth, 1e-3, least), must_read=True)
+    return Case(files, lambda f: check_cameras(f, ground_truth, 1e-3, least), must_read=True)
 
 
 def saved(write: Callable, *values, **named) -> bytes:
@@ -369,19 +378,19 @@ def exr(rng: Random) -> Case:
         OpenEXR.File(header, channels).write(str(path))
         content = path.read_bytes()
     matrix = np.linalg.solve(to_xyz(REC709), to_xyz(PRIMARIES[space] or REC709))
-    truth = np.zeros((height + pad[1] + pad[3], width + pad[0] + pad[2], 3))
-    truth[pad[1] : pad[1] + height, pad[0] : pad[0] + width] = pixels.astype(np.float64) @ matrix.T
-    truth = truth.clip(min=0.0)
+    ground_truth = np.zeros((height + pad[1] + pad[3], width + pad[0] + pad[2], 3))
+    ground_truth[pad[1] : pad[1] + height, pad[0] : pad[0] + width] = pixels.astype(np.float64) @ matrix.T
+    ground_truth = ground_truth.clip(min=0.0)
 
     def read(folder: Path) -> None:
-        compare_image(read_hdr_image(folder / "a.exr").numpy(), truth, 2e-4)
+        compare_image(read_hdr_image(folder / "a.exr").numpy(), ground_truth, 2e-4)
 
     return Case({"a.exr": content}, read)
 
 
-def compare_image(got: np.ndarray, truth: np.ndarray, relative: float) -> None:
-    check(got.shape == truth.shape, f"shape {got.shape}, not {truth.shape}")
-    error = np.abs(got - truth).max() / truth.max()
+def compare_image(got: np.ndarray, ground_truth: np.ndarray, relative: float) -> None:
+    check(got.shape == ground_truth.shape, f"shape {got.shape}, not {ground_truth.shape}")
+    error = np.abs(got - ground_truth).max() / ground_truth.max()
     check(error <= relative, f"values differ by {error:.2g} of the largest")
 
 
@@ -410,10 +419,10 @@ def rgbe(rng: Random) -> Case:
     lines = ["#?RADIANCE", "# made by a test", "FORMAT=32-bit_rle_rgbe", *(f"EXPOSURE={v}" for v in exposures), "", ""]
     content = "\n".join(lines).encode() + f"-Y {height} +X {width}\n".encode() + body
     exponent = np.exp2(pixels[..., 3:].astype(np.float64) - 136)
-    truth = (pixels[..., :3] + 0.5) * exponent / math.prod(exposures)
+    ground_truth = (pixels[..., :3] + 0.5) * exponent / math.prod(exposures)
 
     def read(folder: Path) -> None:  # readers add one half to the mantissa or none: half of 1/128 of the largest
-        compare_image(read_hdr_image(folder / "a.hdr").numpy(), truth, 0.5 / 128)
+        compare_image(read_hdr_image(folder / "a.hdr").numpy(), ground_truth, 0.5 / 128)
 
     return Case({"a.hdr": content}, read, must_read=form in ("flat", "new", "marker"))
 

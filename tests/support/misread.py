@@ -1,4 +1,4 @@
-"""An input with the truth about it."""
+"""An input with its ground truth."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def check(condition: bool, text: str) -> None:
 @dataclass(frozen=True)
 class Case:
     """files: by name.  compare: reads the folder that they are in and raises :class:`Misread` unless it finds the
-    truth.  must_read: a refusal is a fault; must_refuse: an acceptance is.
+    ground truth.  must_read: a refusal is a fault; must_refuse: an acceptance is.
     """
 
     files: dict[str, bytes]

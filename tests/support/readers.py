@@ -31,7 +31,7 @@ from tests.support.scenes import ball_mesh, textures
 
 @dataclass(frozen=True)
 class Target:
-    """files: by their names in the folder that ``read`` is called with.  known: makes an input with its truth."""
+    """files: by their names in the folder that ``read`` is called with.  known: makes one with ground truth."""
 
     name: str
     files: dict[str, bytes]
@@ -94,7 +94,7 @@ def targets(root: Path) -> list[Target]:
 
 
 def _nothing(folder: Path) -> None:
-    """A target with a truth reads by itself."""
+    """A target with ground truth reads by itself."""
 
 
 def _with_images(folder: Path) -> None:

@@ -1,6 +1,6 @@
 """Straightforward FlexiCubes in plain torch, any dtype, after the paper's equations, and fields to try it on.
 
-The truth for gradients: every cube listed, every edge gathered.  Its grouping of edges walks the
+The reference for gradients: every cube listed, every edge gathered.  Its grouping of edges walks the
 loops on the cube's faces here, independent of the generated tables.
 """
 

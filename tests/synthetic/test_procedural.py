@@ -1,4 +1,4 @@
-"""Procedural objects: closed solids, materials in range, equal from equal seeds; distances against other truths."""
+"""Procedural objects: closed solids, materials in range, equal from equal seeds; distances against other references."""
 
 import numpy as np
 import pytest

@@ -57,7 +57,7 @@ def test_images_of_the_full_size_are_those_of_a_sample(files):
 
 @pytest.mark.parametrize("factor", [2, 4])
 def test_small_images_show_the_same_object(files, factor):
-    """Points of the true surface lie in all silhouettes, and the pixels' truth is the mean of the finer ones."""
+    """Points of the true surface lie in all silhouettes, and the maps of small images are means of the finer ones."""
     small, fine = read_views_reduced(files[0], factor), read_views_reduced(files[0], 1)
     size = fine.masks.shape[1] // factor
     assert small.images.shape[1:] == (size, size, 3) and small.view_normal.shape[1:] == (size // 2, size // 2, 3)

@@ -64,7 +64,7 @@ def maps_of(sample):
 
 
 def test_the_same_light_gives_the_same_photographs(sample, sky):
-    """Nothing on a ball hides the light, so the path traced images, with shadow rays, are the truth."""
+    """A ball has no self-shadowing, so the path traced images, with shadow rays, are the reference."""
     images, *maps = maps_of(sample)
     got, light = relight_views(images, *maps, sky, np.random.default_rng(3))
     ratio = float(sample["environment"].float().mean() / light.mean())  # the exposures differ
