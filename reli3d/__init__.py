@@ -1,7 +1,8 @@
 """Relightable 3D assets from posed photographs, and the differentiable operations they are made of.
 
-The public names are those of ``reli3d.__all__``; ``help(reli3d.shade)`` documents one.  Each is loaded from its module
-on first use: ``import reli3d`` alone loads neither torch nor Warp.
+Public are the names of ``reli3d.__all__`` (``help(reli3d.shade)`` documents one), the packages ``geometry``,
+``render``, ``io`` and ``fit``, and the module ``errors``.  Each name of ``__all__`` is loaded from its module on first
+use: ``import reli3d`` alone loads neither torch nor Warp.
 """
 
 from importlib import import_module

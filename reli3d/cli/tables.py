@@ -1,4 +1,4 @@
-"""``reli3d-tables``: the paper's tables on a folder of textured GLB files."""
+"""``reli3d-tables``: the tables of the ReLi3D paper on a folder of textured GLB files."""
 
 from __future__ import annotations
 

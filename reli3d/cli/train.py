@@ -39,7 +39,7 @@ def parser() -> argparse.ArgumentParser:
         type=Path,
         nargs="*",
         default=[],
-        help="folders of samples; for the paper's stages also captures, shards",
+        help="folders of samples; for the stages of the ReLi3D paper also captures, shards",
     )
     p.add_argument("output", type=Path, help="folder of the checkpoint, the log, the curves and validation images")
     p.add_argument(
@@ -82,7 +82,7 @@ def parser() -> argparse.ArgumentParser:
         help="roughness and metallic of pixels are distributions over N values (8); default as in the weights",
     )
     small.add_argument("--maps", type=Path, help="environment maps, .npz: half of the draws are relit under them")
-    paper = p.add_argument_group("stages of the paper's network, and --image-size of pixels")
+    paper = p.add_argument_group("stages of the ReLi3D paper's network, and --image-size of pixels")
     paper.add_argument("--image-size", type=int, help="pixels per side; for stage pixels 64 (default), 128 or 256")
     paper.add_argument("--preset", choices=("tiny", "official"))
     paper.add_argument(

@@ -1,4 +1,4 @@
-"""The paper's metrics with their definitions.
+"""The metrics of the ReLi3D paper with their definitions.
 
 Geometry is compared in the frame of the reference, scaled so that its longest side is 2.  Images are compared as
 display values (sRGB in [0, 1]) over black, including the background.

@@ -17,7 +17,7 @@ from reli3d._bridge import check, tensor_of
 from reli3d.geometry.tangents import vertex_tangents
 from reli3d.geometry.topology import edges_of, graph_components, weld_rows
 
-NORMAL_MIN = 1.0e-20  # squared length of an area-weighted normal sum below which it counts as zero (published release)
+NORMAL_MIN = 1.0e-20  # squared length of an area-weighted normal sum below which it counts as zero (ReLi3D release)
 
 
 @dataclass(frozen=True)

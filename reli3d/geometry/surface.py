@@ -4,7 +4,7 @@ A grid of X * Y * Z cubes fills the box [-radius, radius]^3.  Grid vertices ``(X
 Z)`` are in C order (x slowest, z fastest).  Corners of a cube are numbered with x fastest: corner = x + 2y + 4z for x,
 y, z in {0, 1}; edges as in ``kernels.flexicubes_tables.EDGES``.  Vertices and faces are in the order of the authors'
 code.  After one pass over the grid the cost is proportional to the number of surface cubes.  Not
-implemented: the tetrahedra of the paper's section 4.5, and dual vertices placed by the field's gradient.
+implemented: the tetrahedra of their section 4.5, and dual vertices placed by the field's gradient.
 """
 
 from __future__ import annotations

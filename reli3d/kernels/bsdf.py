@@ -23,7 +23,7 @@ from reli3d.kernels.sampling import pdf_cosine
 
 wp.set_module_options({"enable_backward": True, "cpu_compiler_flags": "-march=native"})
 
-F0_DIELECTRIC = wp.constant(0.04)  # refractive index 1.5; glTF 2.0 appendix B and the published model
+F0_DIELECTRIC = wp.constant(0.04)  # refractive index 1.5; glTF 2.0 appendix B and ReLi3D
 
 
 @wp.func

@@ -1,5 +1,6 @@
 """Counter-based random numbers: a pure function of (seed, pixel, sample, dimension), so results do not depend on
-chunking, on threads or on order.  Also Halton points for rotation per pixel."""
+chunking, on threads or on order.  Also Halton points and their Cranley-Patterson rotation.
+"""
 
 import warp as wp
 

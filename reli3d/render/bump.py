@@ -1,4 +1,4 @@
-"""Shading normals from tangent-space bump normals, in the frame of the published model."""
+"""Shading normals from tangent-space bump normals, in the frame of ReLi3D."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def radial_bump(position: Tensor, normal: Tensor, bump: Tensor) -> Tensor:
     """Unit shading normal ``(..., 3)`` of a tangent-space ``bump (..., 3)``, with tangents around the +Y axis.
 
     position: ``(..., 3)`` model frame.  normal: ``(..., 3)`` unit, geometric.  The tangent is ``y x position``,
-    orthogonalized to the normal, the bitangent ``normal x tangent``.  Gradients reach ``bump`` only, as published.
+    orthogonalized to the normal, the bitangent ``normal x tangent``.  Gradients reach ``bump`` only, as in ReLi3D.
     Raises ValueError for a wrong shape or device.
     """
     position, normal = position.detach(), normal.detach()

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from reli3d._bridge import full_precision
 
-# AgX with Rec. 709 primaries as the published model was trained with: rows of the inset matrix and its inverse
+# AgX with Rec. 709 primaries as ReLi3D was trained with: rows of the inset matrix and its inverse
 _AGX_IN = (
     (0.842479062253094, 0.0784335999999992, 0.0792237451477643),
     (0.0423282422610123, 0.878468636469772, 0.0791661274605434),
@@ -59,7 +59,7 @@ def agx(radiance: Tensor) -> Tensor:
 
     Inset matrix, log2 between -12.47 and 4.03 stops, sigmoid contrast, outset matrix, power 2.2, then the sRGB
     transfer.  Gradients to ``radiance``, exactly 0 where a clamp holds.  Source: AgX (T. Sobotka) with the constants
-    of the published model's display transform.
+    of ReLi3D's display transform.
     """
     if radiance.ndim == 0 or radiance.shape[-1] != 3:
         raise ValueError(f"radiance: expected shape (..., 3), got {tuple(radiance.shape)}")

@@ -46,7 +46,7 @@ def texel_solid_angles(height: int, width: int, device: torch.device | str = "cp
 def quarter_turn(maps: Tensor, quarters: int) -> Tensor:
     """``maps (..., H, W, C)`` with columns moved right by ``quarters`` quarters of the width.
 
-    -1 converts a map with -Z at the horizontal center, as published, to one with +X there.  Raises ValueError unless W
+    -1 converts a map with -Z at the horizontal center, as in ReLi3D, to one with +X there.  Raises ValueError unless W
     is a multiple of 4.
     """
     width = maps.shape[-2]

@@ -2,7 +2,7 @@
 
 Sloan, Kautz and Snyder 2002, "Precomputed Radiance Transfer for Real-Time Rendering in Dynamic, Low-Frequency Lighting
 Environments".  The harmonics are real, orthonormal, up to degree 3, with +Y as the polar axis, so that an environment
-rotated about +Y turns pairs of its coefficients.
+rotated about +Y rotates pairs of its coefficients.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Samples by the rendering protocol of the paper (its section B.1).
+"""Samples by the rendering protocol of the ReLi3D paper (its section B.1).
 
 The protocol: three environments per object, each rotated at random about the vertical axis; a field of view from a
 scaled normal distribution between 22 and 37 degrees; centered objects of unit scale; cameras that fill the frame with

@@ -9,7 +9,7 @@ Read, in this order, from the frame, else from the file:
 - ``camera_fov``, ``fov_rad`` in radians, one number or two (the published object folders)
 - ``focal_length`` and ``sensor_width`` in the same unit
 
-0.7 radians, as in the published release, only where neither the frame nor the file has a key of a lens.  A key that
+0.7 radians, as in the ReLi3D release, only where neither the frame nor the file has a key of a lens.  A key that
 looks like one and is none of these is an error, as is a lens that is no pinhole.
 """
 
@@ -25,7 +25,7 @@ import numpy as np
 from reli3d.errors import InputError, shown
 from reli3d.views.frames import Lens, number
 
-DEFAULT_FOV = 0.7  # radians, of the published release
+DEFAULT_FOV = 0.7  # radians, of the ReLi3D release
 MIN_FOV = 1e-6  # radians: the tangent of a much smaller angle is 0
 AGREE = 0.02  # relative difference up to which two spellings of one focal length agree
 MAX_SKEW = 1e-3  # of the focal length: half a pixel across an image
@@ -190,7 +190,7 @@ def lens_of(where: str, frame: dict, data: dict, notes: list[str]) -> Lens:
     if lens is None:
         _check_inner(where, frame)
         _check_inner(where, data)
-        notes.append(f"{where}: no field of view given, {DEFAULT_FOV} radians assumed as in the published release")
+        notes.append(f"{where}: no field of view given, {DEFAULT_FOV} radians assumed as in the ReLi3D release")
         lens = Lens(fov=(DEFAULT_FOV, DEFAULT_FOV), center=center)
     radial, tangential = (tuple(found(k) or 0.0 for k in keys) for keys in (_RADIAL, _TANGENTIAL))
     model = frame.get("camera_model", data.get("camera_model"))

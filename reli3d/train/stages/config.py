@@ -1,4 +1,4 @@
-"""Configuration of the stages of the paper's training (its sections B and C).
+"""Configuration of the training stages of the ReLi3D paper (its sections B and C).
 
 Held-out views are compared with renderings of the predicted object: first volume rendering, then its surface under
 spherical Gaussians at increasing resolution, last its surface by Monte Carlo integration with shadows.  Comments mark

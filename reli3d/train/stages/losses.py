@@ -1,4 +1,4 @@
-"""Loss terms of the paper's stages, weighted by :class:`~reli3d.train.stages.config.Weights`.
+"""Loss terms of the stages of the ReLi3D paper, weighted by :class:`~reli3d.train.stages.config.Weights`.
 
 A term whose ground truth a sample lacks is absent from the result instead of zero.
 """

@@ -1,4 +1,4 @@
-"""The training stages of the paper's network."""
+"""The training stages of the ReLi3D paper's network."""
 
 from __future__ import annotations
 
