@@ -1,4 +1,4 @@
-"""Fixtures of all tests: device, threads, the folder of real data beside the checkout.  In CI few reasons may skip."""
+"""Fixtures of all tests: device, threads, the folder of real data next to the checkout.  In CI few reasons may skip."""
 
 import os
 import re
@@ -14,7 +14,7 @@ DEVICES = ["cpu"] + (["cuda"] if torch.cuda.is_available() else [])
 
 
 # Where CI is set, a test that skips for another reason fails: the machine lacks what .ci/run installs.
-ALLOWED_SKIPS = re.compile(r"CUDA|Embree runs on|\.\./shared|beside the checkout")
+ALLOWED_SKIPS = re.compile(r"CUDA|Embree runs on|\.\./shared|next to the checkout")
 
 
 def skip_is_failure(report) -> None:
@@ -47,7 +47,7 @@ def device(request) -> torch.device:
 
 @pytest.fixture
 def threads():
-    """Sets the number of torch threads and of those that share a launch; both are restored after the test."""
+    """Sets the number of torch threads and of threads of a launch; both are restored after the test."""
     before = torch.get_num_threads()
 
     def use(n):
@@ -62,7 +62,7 @@ def threads():
 def shared_data() -> Path:
     """Folder of real meshes, maps and captures; a test that needs it skips visibly where it is absent."""
     if not (SHARED / "data").is_dir():
-        pytest.skip("needs the data folder ../shared/data beside the checkout")
+        pytest.skip("needs the data folder ../shared/data next to the checkout")
     return SHARED / "data"
 
 
@@ -70,5 +70,5 @@ def shared_data() -> Path:
 def goldens() -> Path:
     """Folder of reference inputs and outputs of the published model's modules."""
     if not (SHARED / "reference" / "goldens").is_dir():
-        pytest.skip("needs the folder ../shared/reference/goldens beside the checkout")
+        pytest.skip("needs the folder ../shared/reference/goldens next to the checkout")
     return SHARED / "reference" / "goldens"

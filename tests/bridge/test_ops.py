@@ -47,7 +47,7 @@ def gradients(case: Case, leaves: dict, outs, **options) -> dict:
 
 def same(a: torch.Tensor, b: torch.Tensor) -> bool:
     """Equal bits; on CUDA, whose sums take any order, 1e-4."""
-    return torch.equal(a, b) if a.device.type == "cpu" else reference.share_within(a, b) >= 0.999
+    return torch.equal(a, b) if a.device.type == "cpu" else reference.fraction_within(a, b) >= 0.999
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -244,7 +244,7 @@ def fractions_within(case: Case, first, second) -> dict[str, float]:
         if got.shape != expected.shape:
             found[key] = 0.0
         elif expected.is_floating_point():
-            found[key] = reference.share_within(got, expected)
+            found[key] = reference.fraction_within(got, expected)
         else:
             found[key] = float((got == expected.cpu()).double().mean())
     return found

@@ -79,7 +79,7 @@ def bytes_of(display):
 
 
 def same_image(got, expected):
-    """8 bits; a value beside a rounding step may fall on its other side."""
+    """8 bits; a value next to a rounding step may fall on its other side."""
     off = (got.int() - expected.int()).abs()
     return got.shape == expected.shape and int(off.max()) <= 1 and float((off > 0).float().mean()) < 0.01
 

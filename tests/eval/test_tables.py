@@ -26,7 +26,7 @@ def sphere(radius, count=20_000, seed=0):
 def test_chamfer_and_f_score_of_two_spheres():
     """Spheres of radius 1 and 1.15: every point is 0.15 from the other, in a frame whose half side is 1."""
     found = geometry(sphere(1.15), sphere(1.0, seed=1))
-    # the nearest of 20,000 points lies beside the foot: sqrt(4 pi / 20000) / 2, far less than 0.15 in quadrature
+    # the nearest of 20,000 points differs from the foot: sqrt(4 pi / 20000) / 2, far less than 0.15 in quadrature
     assert found["cd"] == pytest.approx(0.15, rel=0.01)
     assert found["fs@0.1"] == 0.0 and found["fs@0.2"] == 1.0 and found["fs@0.5"] == 1.0
     scaled = geometry(7.0 * sphere(1.15), 7.0 * sphere(1.0, seed=1))

@@ -153,7 +153,7 @@ def test_gradients_of_the_triplane(device, dtype, channels, height, width):
     )
     smooth &= ~nowhere
     assert smooth.sum() > N
-    # slopes change from texel to texel by as much as they are, and the coordinate errs by 4e-6 of one
+    # gradients change from texel to texel by their own size, and the coordinate errs by 4e-6 of one
     assert agree(g_points.cpu()[0][smooth], t_points[smooth], 4e-6 * t_points[smooth].abs().mean())
 
 

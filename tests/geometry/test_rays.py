@@ -190,7 +190,7 @@ def test_the_reference_of_hits_has_the_gradients_of_finite_differences():
 
 
 def test_reevaluated_hits_and_their_gradients_equal_float64(device):
-    """Any hit, grazing ones too, to 1e-4 in 99.9 % of the entries of values and of slopes in vertices, origins and
+    """Any hit, grazing ones too, to 1e-4 in 99.9 % of the entries of values and of gradients in vertices, origins and
     directions; judged each for itself, because a sum of several lets an error hide behind another's size."""
     vertices, faces = soup(7, 400)
     o, d = rays(40_000, 4)
@@ -228,7 +228,7 @@ def test_reevaluated_hits_and_their_gradients_equal_float64(device):
     assert len(sine) > 10_000 and float(sine.min()) < 2e-3
     weight = torch.randn(len(sine), 3, generator=torch.Generator().manual_seed(1))
     for name, value in own.items():
-        assert reference.share_within(value, expected[name]) >= 0.999, name
+        assert reference.fraction_within(value, expected[name]) >= 0.999, name
         w = weight[:, : value.shape[1]]
         grads = torch.autograd.grad((value * w.to(device)).sum(), ins, retain_graph=True, allow_unused=True)
         expected_grads = torch.autograd.grad(
@@ -236,7 +236,7 @@ def test_reevaluated_hits_and_their_gradients_equal_float64(device):
         )
         assert (grads[1] is None) == (name == "normal")
         for k, (g, t) in enumerate(zip(grads, expected_grads, strict=True)):
-            assert g is None or reference.share_within(g, t) >= 0.999, (name, k)
+            assert g is None or reference.fraction_within(g, t) >= 0.999, (name, k)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

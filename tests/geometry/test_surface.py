@@ -63,7 +63,7 @@ def test_mesh_of_the_published_heads(goldens):
         gamma=0.25 + 0.5 * merged[:, 20].sigmoid(),
     )
     assert np.array_equal(got.faces.numpy(), data["faces"])
-    # density is exp of a sum of 64 products: 1e-5 relative, over slopes of about 1 a cell of 0.1
+    # density is exp of a sum of 64 products: 1e-5 relative, over gradients of about 1 a cell of 0.1
     np.testing.assert_allclose(got.vertices.numpy(), data["v_pos"], rtol=0, atol=1e-5)
     difference = (vertex_normals(got.vertices, got.faces) - torch.from_numpy(data["v_nrm"])).abs()
     assert difference.quantile(0.999) < 1e-3  # slivers turn with the last digits of their corners

@@ -31,7 +31,7 @@ def gyroid(p):
     return sdf, c * c.roll(-1, -1) - s * s.roll(1, -1)
 
 
-def share_below(offset, n):
+def fraction_below(offset, n):
     """Volume fraction in which the gyroid is below ``offset``, float64: exact along x, ``n * n`` midpoints in y, z.
 
     Along x the gyroid is ``hypot(cos y, sin z)`` times a sine, plus ``sin y cos z``.
@@ -47,7 +47,7 @@ def volume64(mesh):
     return float((a * torch.linalg.cross(b, c)).sum() / 6)
 
 
-def slopes(errors):
+def orders(errors):
     return [np.log(a / b) / np.log(2) for a, b in zip(errors[:-1], errors[1:])]
 
 
@@ -69,7 +69,7 @@ def test_volume_converges_with_second_order_and_the_genus_is_right(device, shape
         if shape == "sphere":
             outward = (face_normals(mesh.vertices, mesh.faces) * mesh.vertices[mesh.faces[:, 0].long()]).sum(-1)
             assert bool((outward > 0).all())
-    assert min(slopes(errors)) >= 1.8, errors
+    assert min(orders(errors)) >= 1.8, errors
 
 
 @pytest.mark.parametrize("offset", [0.0, -0.5, 0.5])
@@ -78,7 +78,7 @@ def test_volume_of_the_gyroid_converges_with_second_order(device, offset):
     the chance by which the grid meets its edges is averaged out.  Without offset inversion swaps inside and outside:
     exactly half.
     """
-    exact = [8 * share_below(offset, n) for n in (1000, 2000)]
+    exact = [8 * fraction_below(offset, n) for n in (1000, 2000)]
     assert abs(exact[1] - exact[0]) < (1e-12 if offset == 0 else 1e-5)  # a hundredth of the least error below
     begins = torch.rand(6, 3, generator=torch.Generator().manual_seed(0)) * 2 * np.pi
     errors = []
@@ -86,7 +86,7 @@ def test_volume_of_the_gyroid_converges_with_second_order(device, offset):
         fields = [gyroid(np.pi * grid(n, device=device) + at.to(device))[0] - offset for at in begins]
         off = [volume64(extract_surface(sdf, radius=1.0)) - exact[1] for sdf in fields]
         errors.append(float(np.sqrt(np.mean(np.square(off)))))
-    assert errors[-1] > 1e-3 and min(slopes(errors)) >= 1.8, errors
+    assert errors[-1] > 1e-3 and min(orders(errors)) >= 1.8, errors
 
 
 @pytest.mark.parametrize("cells", RESOLUTIONS)

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from reli3d.geometry.triplane import CACHED, sample_triplane
-from tests.support.reference import grid_samples, share_within
+from tests.support.reference import fraction_within, grid_samples
 
 
 def inputs(batch=2, channels=13, height=9, width=11, n=300, device="cpu", seed=0):
@@ -31,7 +31,7 @@ def test_values_and_gradients_match_grid_sample_in_float64(device, channels, hei
     )  # of 600 points where there is 1 texel
     # the gradient jumps at a texel center, which rounding may move a point across: none of these 600 points lies there
     for a, b in zip((got, *g_got), (expected, *g_expected), strict=True):
-        assert share_within(a, b) >= 0.999
+        assert fraction_within(a, b) >= 0.999
 
 
 def test_the_twin_has_the_gradients_of_finite_differences():

@@ -151,7 +151,7 @@ def test_stacked_sheets_are_distinguished():
 
 
 def test_a_slab_folded_over_itself_is_distinguished():
-    # an S of gentle slope: every face looks up, the sheets lie over each other and cross in projection
+    # a flat S: every face points up, the sheets overlap and cross in projection
     t = np.linspace(0, 1, 60)
     path = np.stack([np.cos(4 * np.pi * t) * (1 + t), 0.5 * t, np.sin(4 * np.pi * t) * (1 + t)], 1)
     side = path * [1.5, 1.0, 1.5]

@@ -1,4 +1,4 @@
-"""Files that are encoded beside the preview: those of the functions themselves, and errors that leave an old result."""
+"""Files encoded while the preview renders equal those of the functions; after an error the old result remains."""
 
 import base64
 import re

@@ -1,4 +1,4 @@
-"""``viewer.html`` in headless Chromium, opened as a file: what it shows beside what our renderer shows."""
+"""``viewer.html`` in headless Chromium, opened as a file: its images against those of our renderer."""
 
 import base64
 import json
@@ -80,7 +80,7 @@ def ours(asset: Asset, views: Views, i: int, light: Environment, **options) -> R
 
 
 def psnr(image: np.ndarray, color: torch.Tensor, alpha: torch.Tensor, *, shared: float = 0.99) -> float:
-    """Decibels on the pixels that both have; also checks that they share more than ``shared`` of their pixels."""
+    """Decibels on the pixels of both masks; also checks that more than ``shared`` of their pixels coincide."""
     mask = image[..., 3] > 127
     assert (mask & (alpha.numpy() > 0.5)).sum() / (mask | (alpha.numpy() > 0.5)).sum() > shared
     both = (image[..., 3] == 255) & (alpha.numpy() > 0.999)

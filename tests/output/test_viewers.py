@@ -1,4 +1,4 @@
-"""A mirror ball under two lamps, as three.js, model-viewer and Blender load our files, beside our renderer."""
+"""A mirror ball under two lamps, as three.js, model-viewer and Blender load our files, against our renderer."""
 
 import math
 from dataclasses import dataclass

@@ -60,7 +60,7 @@ def test_weights_evaluated_near_the_surface_give_the_published_mesh(goldens):
     weights = field.TriplaneField(None, model, code).cube_weights(flat, sdf)
     got = extract_surface(sdf, radius=0.87, closed=False, **weights)
     assert np.array_equal(got.faces.numpy(), data["faces"])
-    # density is exp of a sum of 64 products: 1e-5 relative, over slopes of about 1 a cell of 0.1
+    # density is exp of a sum of 64 products: 1e-5 relative, over gradients of about 1 a cell of 0.1
     np.testing.assert_allclose(got.vertices.numpy(), data["v_pos"], rtol=0, atol=1e-5)
 
 

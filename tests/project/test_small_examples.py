@@ -85,10 +85,10 @@ def test_the_snippets_of_the_library_page_are_short_and_find_what_they_look_for(
     # closed form: moving all vertices by e along the viewing axis f moves t by e (n . f) / (n . d)
     gradient, hits = rays["vertices"].grad, rays["hits"]
     forward = -rays["camera"].c2w[:3, 2]
-    slope = (2.0 * (rays["depth"].detach() - 2.5) / len(rays["depth"])).double()
+    derivative = (2.0 * (rays["depth"].detach() - 2.5) / len(rays["depth"])).double()
     along = rays["directions"][hits.valid].double()
     normal = torch.nn.functional.normalize(face_normals(rays["mesh"], hits), dim=-1)
-    expected = (slope * (normal @ forward.double()) / (normal * along).sum(-1)).sum()
+    expected = (derivative * (normal @ forward.double()) / (normal * along).sum(-1)).sum()
     assert float((gradient.double() @ forward.double()).sum()) == pytest.approx(
         float(expected), rel=1e-3
     )  # float32 sum

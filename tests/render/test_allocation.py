@@ -201,7 +201,7 @@ def test_a_mirror_under_even_light_has_no_variance(device):
 
 
 def test_the_relative_plan_is_for_what_is_seen(device):
-    """Metal beside white paint in the sun: the paint is brighter, the metal needs its visible normals."""
+    """Metal next to a white diffuse surface in the sun: the latter is brighter, the metal needs its visible normals."""
     arguments, env = surface(device, 0.3, 1.0), light("sun", device)
     metallic = torch.arange(24, device=device) % 2 * 1.0
     arguments = (*arguments[:5], 1.0 - 0.7 * metallic, metallic)

@@ -27,7 +27,7 @@ def test_srgb_round_trip_and_finite_gradients(device):
 
 @pytest.mark.parametrize("f", [agx, srgb_to_linear, linear_to_srgb])
 def test_gradients_equal_finite_differences(f):
-    """Both sides of the knees at 0.0031 and 0.0405, where toe and power meet with two slopes; agx clamps below 0."""
+    """Both sides of the knees at 0.0031 and 0.0405, where the derivative jumps; agx clamps below 0."""
     above = torch.rand(20, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) * 1.5 + 0.05
     toe = torch.linspace(1e-4 if f is agx else -0.2, 0.003, 15, dtype=torch.float64).reshape(5, 3)
     assert torch.autograd.gradcheck(f, torch.cat([above, toe]).requires_grad_(), eps=1e-6, atol=1e-5, rtol=1e-3)

@@ -117,18 +117,18 @@ def test_no_surface_sends_out_more_than_comes_in(device):
 
 
 def hemisphere(side=600):
-    """Directions ``(M, 3)`` float64 and their share ``(M,)`` of the cosine's integral over pi; midpoints of the squared
-    sine, denser by its square towards the mirror direction of cos 0.8, and of the azimuth."""
+    """Directions ``(M, 3)`` float64 and their fraction ``(M,)`` of the cosine's integral over pi; midpoints of the
+    squared sine, denser by its square towards the mirror direction of cos 0.8, and of the azimuth."""
     cut = 0.6**2  # the mirror direction's squared sine
     t = (torch.arange(side, dtype=torch.float64) + 0.5) / side
     below, above = cut * (1.0 - t**2), cut + (1.0 - cut) * t**2
     square = torch.cat([below, above])
     weight = torch.cat([cut * 2.0 * t, (1.0 - cut) * 2.0 * t]) / side
     turn = torch.pi * t**2  # half a turn, denser about the mirror direction; the other half mirrors it
-    share = weight[:, None] * (2.0 * t / side)
+    fraction = weight[:, None] * (2.0 * t / side)
     x, y = (square.sqrt()[:, None] * f(turn + torch.pi) for f in (torch.cos, torch.sin))
     z = (1.0 - square).sqrt()[:, None].expand_as(x)
-    return torch.stack([x, y, z], -1).reshape(-1, 3), share.reshape(-1)
+    return torch.stack([x, y, z], -1).reshape(-1, 3), fraction.reshape(-1)
 
 
 METALLIC = (0.0, 0.25, 0.5, 0.75, 1.0)
@@ -139,9 +139,9 @@ BLENDED = (0.933, 0.947, 0.960, 0.974, 0.988)
 
 def test_partly_metallic_white_loses_no_more_than_its_parts(device):
     """Directional albedo over metallic by quadrature in float64: the blend of the dielectric and the metal."""
-    wi, share = hemisphere()
+    wi, fraction = hemisphere()
     wo = torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
-    assert abs(float(share.sum()) - 1.0) < 1e-6
+    assert abs(float(fraction.sum()) - 1.0) < 1e-6
 
     def sent(metallic):
         value = eval_bsdf(
@@ -151,7 +151,7 @@ def test_partly_metallic_white_loses_no_more_than_its_parts(device):
             torch.tensor(metallic, device=device),
             wi.float().to(device),
         )
-        return float((value[:, 0].double().cpu() * share).sum() * torch.pi)
+        return float((value[:, 0].double().cpu() * fraction).sum() * torch.pi)
 
     got = [sent(m) for m in METALLIC]
     for m, value, expected in zip(METALLIC, got, BLENDED):

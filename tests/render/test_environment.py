@@ -79,21 +79,21 @@ def test_lookup_and_its_gradient_equal_the_float64_reference(device):
     torch.testing.assert_close(
         got.cpu().double(), expected, rtol=0, atol=2e-5
     )  # 1e-7 of u times 18 texels, with margin
-    assert reference.share_within(got, expected) >= 0.999
+    assert reference.fraction_within(got, expected) >= 0.999
     grads = torch.autograd.grad((got * weight.to(device)).sum(), ins)
     expected_grads = torch.autograd.grad((expected * weight.double()).sum(), twin)
-    assert reference.share_within(grads[0], expected_grads[0]) >= 0.999
+    assert reference.fraction_within(grads[0], expected_grads[0]) >= 0.999
     # a direction may sit on a kink between texels
     assert reference.rows_within(*(reference.across(v, d) for v in (grads[1], expected_grads[1]))) >= 0.999
 
 
 @pytest.mark.parametrize("name", chi2.MAPS)
 def test_samples_fall_on_texels_as_their_density_says(device, name):
-    env = Environment(maps()["sun" if name == "beside the sun" else name].to(device))
+    env = Environment(maps()["sun" if name == "next to the sun" else name].to(device))
     height, width = env.radiance.shape[:2]
     u = torch.rand(1_000_000, 2, generator=torch.Generator().manual_seed(chi2.MAPS.index(name))).to(device)
     density = env.pdf
-    if name == "beside the sun":  # one sample in a thousand: numbers that leave out its row and both neighbors
+    if name == "next to the sun":  # one sample in a thousand: numbers that leave out its row and both neighbors
         rows, heights = env.cdf.rows.double()
         gap = float(rows[7] - rows[4])
         first = u[:, 0].double() * (1.0 - gap)

@@ -46,7 +46,7 @@ def test_mean_gradient_with_shadows_is_the_difference_of_means(device):
     assert n / 8 < int(shadow.sum()) < n  # the case has shadows
     ways = [torch.randn(v.shape, generator=g).to(device) for v in leaves]
     ways[0] = torch.linalg.cross(ways[0], normal)
-    ways[3] = ways[3].abs()  # with either sign the points' slopes in metallic cancel, but for noise
+    ways[3] = ways[3].abs()  # with either sign the points' derivatives by metallic cancel except for noise
     ways[4] = ways[4].clamp(-1.0, 1.0) * map_  # the radiance is linear in the texels, which stay positive
     runs = []
     for k in range(seeds):
@@ -54,7 +54,7 @@ def test_mean_gradient_with_shadows_is_the_difference_of_means(device):
         runs.append([float((a * b).double().sum()) for a, b in zip(grads, ways, strict=True)])
     runs = torch.tensor(runs, dtype=torch.float64)
     for k, eps in enumerate((0.01, 0.01, 0.005, 0.02, 0.5)):
-        slopes, still = [], (4096, 0, 0) if k in (0, 4) else (2048, 0, 2048)
+        gradients, still = [], (4096, 0, 0) if k in (0, 4) else (2048, 0, 2048)
         for seed in range(1000, 1016):
             ends = []
             for sign in (1, -1):
@@ -63,12 +63,12 @@ def test_mean_gradient_with_shadows_is_the_difference_of_means(device):
                 if k == 0:
                     moved[k] = torch.nn.functional.normalize(moved[k], dim=-1)
                 ends.append(float((image(*moved, seed, still).double() * weight).sum()))
-            slopes.append((ends[0] - ends[1]) / (2 * eps))
-        slopes = torch.tensor(slopes, dtype=torch.float64)
-        error = (runs[:, k].var() / seeds + slopes.var() / len(slopes)).sqrt()
-        t = (runs[:, k].mean() - slopes.mean()) / error
+            gradients.append((ends[0] - ends[1]) / (2 * eps))
+        gradients = torch.tensor(gradients, dtype=torch.float64)
+        error = (runs[:, k].var() / seeds + gradients.var() / len(gradients)).sqrt()
+        t = (runs[:, k].mean() - gradients.mean()) / error
         assert abs(t) < 3.3, (k, t)  # 0.1 % a number, 0.5 % over the five
-        assert error < 0.015 * abs(slopes.mean())  # so that 5 % are told from none; measured 0.001 to 0.011
+        assert error < 0.015 * abs(gradients.mean())  # so that 5 % are distinguished from none; measured 0.001 to 0.011
 
 
 def test_black_texels_get_a_gradient_only_where_a_strategy_reaches_them(device):
@@ -146,7 +146,7 @@ COLUMNS = "value", "roughness", "normal", "base color", "texels"
 
 
 def spread(roughness, metallic, environment, runs=256, base=None, **options):
-    """Runs ``(runs, points, k)`` of each of the :data:`COLUMNS` but the last at 24 points: value, then its slopes."""
+    """Runs ``(runs, points, k)`` of the :data:`COLUMNS` except the last at 24 points: value, then its gradients."""
     normal, wo, own, *_ = inputs(24, environment.radiance.device)
     base = own if base is None else base
     n = 24 * runs
@@ -158,13 +158,13 @@ def spread(roughness, metallic, environment, runs=256, base=None, **options):
         environment,
         options=ShadeOptions(**{"sequence": "random", **options}),
     ).mean(1)
-    slope, turn, tint = torch.autograd.grad(out.sum(), (rough, facing, paint))
+    gradient, turn, tint = torch.autograd.grad(out.sum(), (rough, facing, paint))
     turn = turn - (turn * fixed).sum(-1, keepdim=True) * fixed
-    return [v.detach().double().reshape(runs, 24, -1) for v in (out, slope, turn, tint)]
+    return [v.detach().double().reshape(runs, 24, -1) for v in (out, gradient, turn, tint)]
 
 
 def texel_spread(roughness, metallic, environment, runs=256, **options):
-    """Runs ``(runs, 1, texels)`` of the slope in the map of the mean over :func:`spread`'s points."""
+    """Runs ``(runs, 1, texels)`` of the gradient in the map of the mean over :func:`spread`'s points."""
     normal, wo, base, *_ = inputs(24, environment.radiance.device)
     texels = environment.radiance.clone().requires_grad_()
     env, flat, rows = Environment(texels), torch.ones(24, device=normal.device), []
@@ -219,7 +219,7 @@ def test_variance_is_that_of_the_closed_form(device, counts):
 def test_pairs_cancel_the_gradients_of_the_lobe(device, name):
     """A lobe seen from above has d log D = (4 u - 2) / alpha d alpha for the second of its numbers, and 4 sqrt(u (1 -
     u)) cos(2 pi phi) / alpha where the normal turns: half a turn and 1 - u change the sign of both.  Mirrored alone
-    (Zhang et al. 2021) keeps u and tells the slope in roughness twice: 20 draws instead of 40."""
+    (Zhang et al. 2021) keeps u and estimates the derivative by roughness twice: 20 draws instead of 40."""
     env, spent = light(name, device), {"samples": (0, 40, 0), "seed": 3}
     mirrored, pair, alone = (
         [variance(v) for v in spread(0.1, 1.0, env, antithetic=a, **spent)] for a in ("mirrored", "opposite", "none")
@@ -234,7 +234,7 @@ def test_pairs_cancel_the_gradients_of_the_lobe(device, name):
 def test_pairs_are_never_noisier_than_as_many_independent_samples(device, name, metallic):
     """The published counts with independent numbers on either side, 4096 runs: 1.05 at most, and less than 1 where the
     light is smooth and the surface too.  Measured 0.0001 to 1.00 without the sun, in it up to 1.04 with an interval of
-    1.00 to 1.09; slopes in single texels, of 1024 runs, 0.61 to 1.00."""
+    1.00 to 1.09; gradients of single texels, of 1024 runs, 0.61 to 1.00."""
     env = light(name, device)
     for roughness in (0.05, 0.1, 0.3, 0.6, 1.0):
         pairs, alone = (
@@ -258,7 +258,7 @@ def test_pairs_are_never_noisier_than_as_many_independent_samples(device, name, 
 @pytest.mark.parametrize("metallic", [0.0, 1.0])
 def test_pairs_as_shipped_are_less_noisy_than_as_many_independent_samples(device, name, metallic):
     """The published counts with pairs from rotated Halton points: measured 0.0001 to 0.66, and 0.79 to 0.85 in value
-    and base color of metal of 0.05; slopes in single texels, in whose few samples the points are not even, 0.31 to
+    and base color of metal of 0.05; gradients of single texels, in whose few samples the points are not even, 0.31 to
     1.00."""
     env = light(name, device)
     for roughness in (0.05, 0.1, 0.3, 1.0):

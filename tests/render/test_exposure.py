@@ -1,4 +1,4 @@
-"""Photographs beside an asset in its own light: a white mirror-like ball under constant light shows that light."""
+"""Exposure of photographs of an asset under estimated lighting: a white, mirror-like ball shows constant lighting."""
 
 import pytest
 import torch
@@ -104,15 +104,15 @@ def test_the_most_likely_base_color_is_the_mean_of_three_normal_distributions(de
     # two conversions to sRGB and back in float32
     plain = factor(asset, photographs(device, lit, lit, lit), inside, camera)
     torch.testing.assert_close(plain, torch.ones(3), rtol=1e-4, atol=0)
-    shares = torch.tensor(
+    weights = torch.tensor(
         [s**-2.0 for s in (exposure.ALBEDO_SPREAD, exposure.LIGHT_SPREAD, exposure.PREDICTION_SPREAD)]
     )
-    shares = shares / shares.sum()
+    weights = weights / weights.sum()
     dark = factor(asset, photographs(device, *3 * [lit / 3]), inside, camera)
-    torch.testing.assert_close(dark, torch.full((3,), float((1 / 3) ** shares[1])), rtol=1e-4, atol=0)
+    torch.testing.assert_close(dark, torch.full((3,), float((1 / 3) ** weights[1])), rtol=1e-4, atol=0)
     bright, *_ = painted(device, scene, *3 * [prior * 2])
     again = factor(bright, photographs(device, lit, lit, lit), inside, camera)
-    torch.testing.assert_close(again, torch.full((3,), float(2.0 ** (shares[2] - 1))), rtol=1e-4, atol=0)
+    torch.testing.assert_close(again, torch.full((3,), float(2.0 ** (weights[2] - 1))), rtol=1e-4, atol=0)
 
 
 def test_a_base_color_more_saturated_than_the_images_is_reduced(device, scene):

@@ -1,6 +1,6 @@
 """Spherical Gaussians against quadrature over the sphere in float64.
 
-Slopes of irradiance and of shading are held against float64 twins in ``tests/bridge/test_adjoints.py``.
+Gradients of irradiance and shading are compared with float64 references in ``tests/bridge/test_adjoints.py``.
 """
 
 import pytest
@@ -54,7 +54,7 @@ def test_value_and_gradients_match_the_definition(device):
     for k, v in ((0, own[0]), (3, d)):
         assert reference.rows_within(*(reference.across(g[k], v) for g in (grads, expected_grads))) >= 0.999, k
     for k in (1, 2):
-        assert reference.share_within(grads[k], expected_grads[k]) >= 0.999, k
+        assert reference.fraction_within(grads[k], expected_grads[k]) >= 0.999, k
 
 
 def test_irradiance_and_gradients_match_quadrature(device):
@@ -75,7 +75,7 @@ def test_irradiance_and_gradients_match_quadrature(device):
         if v.shape[-1] == 3 and v is not own[2]:
             unit = v.detach().cpu().double()
             g, t = (x - (x * unit).sum(-1, keepdim=True) * unit for x in (g, t))
-        assert float((g - t).norm() / t.norm()) < 0.02  # slope of the fit: a few times its error of 0.2 %
+        assert float((g - t).norm() / t.norm()) < 0.02  # gradient of the fit: a few times its error of 0.2 %
 
 
 @pytest.mark.parametrize("sharpness", [0.02, 0.29, 0.49, 0.51, 1.0, 10.0, 300.0])
@@ -92,9 +92,9 @@ def test_irradiance_is_exact_along_the_axis(device, sharpness):
         got = light.irradiance(sign * axis)
         # float32, and at 300 the far side is 1e-131: 0
         torch.testing.assert_close(got.cpu().double(), value.expand(1, 3), rtol=2e-5, atol=1e-6)
-        slopes = torch.autograd.grad(got.sum() / 3.0, own), torch.autograd.grad(value, s, retain_graph=True)
-        # 1e-5 of the closed forms' cancellation and of the series' end; the slope of the far side at 10 is 1e-5
-        torch.testing.assert_close(slopes[0][0].cpu().double(), slopes[1][0], rtol=3e-5, atol=2e-8)
+        gradients = torch.autograd.grad(got.sum() / 3.0, own), torch.autograd.grad(value, s, retain_graph=True)
+        # 1e-5 of the closed forms' cancellation and of the series' end; the derivative of the far side at 10 is 1e-5
+        torch.testing.assert_close(gradients[0][0].cpu().double(), gradients[1][0], rtol=3e-5, atol=2e-8)
 
 
 def reflected(wo, base, alpha, metallic, axis, sharpness):

@@ -58,11 +58,11 @@ def frame(n):
     )
 
 
-def close(got, expected, share, within=2e-3):
-    """Whether ``share`` of the rows of ``got`` differ by at most ``within`` of their length from ``expected``."""
+def close(got, expected, fraction, within=2e-3):
+    """Whether ``fraction`` of the rows of ``got`` differ by at most ``within`` of their length from ``expected``."""
     got, expected = (v.reshape(len(v), -1).cpu().double() for v in (got, expected))
     off = (got - expected).norm(dim=-1) / (expected.norm(dim=-1) + 1e-5)
-    return float((off < within).double().mean()) > share
+    return float((off < within).double().mean()) > fraction
 
 
 @pytest.mark.parametrize("diffuse_model", DIFFUSE_MODELS)
@@ -89,7 +89,7 @@ def test_gradients_of_the_material(device, diffuse_model):
         g = g.cpu()[keep].double()
         if k < 2:  # only the tangent part of a direction's gradient is defined
             g, t = (reference.across(v, twin[k]) for v in (g, t))
-        assert reference.share_within(g, t) >= 0.999, k
+        assert reference.fraction_within(g, t) >= 0.999, k
 
 
 def bent(normal, ng, wo):
@@ -109,7 +109,7 @@ def twin(leaves, ng, wo, draws, density, light, diffuse_model):
     turn, out = frame(n.detach())[:, :2], 0.0
     for d, p, radiance in zip(draws, density, light, strict=True):
         d = normalize(d, dim=-1)
-        # coordinates of the turning frame: their slope is that of a rotation that takes the normal along
+        # coordinates of the turning frame: their gradient is that of a rotation that takes the normal along
         cos = [(v * n).sum(-1, keepdim=True) for v in (wo, d)]
         o, i = (torch.cat([(turn @ (v - n * c)[..., None])[..., 0], c], -1) for v, c in zip((wo, d), cos))
         above = i[:, 2:] > COS_MIN
@@ -191,18 +191,18 @@ def test_gradients_of_the_estimator(device, strategy, diffuse_model):
         diffuse_model,
     )
     *expected_grads, g_texels = torch.autograd.grad((expected * weight.double()[smooth]).sum(), [*part, radiance])
-    assert reference.share_within(value[smooth], expected) >= 0.999
+    assert reference.fraction_within(value[smooth], expected) >= 0.999
     wide = alpha[smooth] > 0.3
     for k, (g, t) in enumerate(zip(got, expected_grads)):
         g = g.cpu()[smooth].double()
         if k == 0:
             g, t = (reference.across(v, part[0]) for v in (g, t))
         if strategy == "visible" and k in (0, 2):
-            # a lobe's own sample rounds by 1e-7, which its slopes in normal and width see over alpha^2
+            # a lobe's own sample rounds by 1e-7, which its gradients by normal and width divide by alpha^2
             assert close(g, t, 0.99)
             g, t = g[wide], t[wide]
         assert reference.rows_within(g, t) >= 0.999, k
-    assert reference.share_within(got[4], g_texels) >= 0.999
+    assert reference.fraction_within(got[4], g_texels) >= 0.999
 
 
 @pytest.mark.parametrize(
@@ -228,7 +228,9 @@ def test_all_strategies_together_keep_their_gradients_finite(device, light, opti
     )
     grads = torch.autograd.grad(out.sum(), leaves)
     assert all(bool(torch.isfinite(v).all()) for v in (out, *grads))
-    assert light == "sun" or all(float(g.abs().max()) == 0.0 for g in grads[:4])  # no light, no slope but the light's
+    assert light == "sun" or all(
+        float(g.abs().max()) == 0.0 for g in grads[:4]
+    )  # no light, no gradient except the light's
     assert float(grads[4].abs().max()) > 0.0
 
 
@@ -253,7 +255,7 @@ def weighed(outs, seed=0):
 
 def test_hits_of_slivers_and_of_faces_without_area_have_finite_gradients(device):
     """A hundred thousand rays at points of any face.  A ray query never gives faces without area: these hits are made
-    by hand.  There the evaluation keeps what it is given, and nothing has a slope."""
+    by hand.  There the evaluation keeps what it is given, and every gradient is 0."""
     g = torch.Generator().manual_seed(6)
     corners = slivers(g)
     faces = torch.arange(corners.numel() // 3, dtype=torch.int32, device=device).reshape(-1, 3)

@@ -41,7 +41,7 @@ def test_value_and_gradients_equal_the_float64_reference(device, diffuse_model):
     for k, (g, t) in enumerate(zip(grads, expected_grads, strict=True)):
         if k < 2:  # the two write cosines differently off the unit sphere: only the tangent part is defined
             g, t = (reference.across(v, twin[k]) for v in (g, t))
-        assert reference.share_within(g, t) >= 0.999, k
+        assert reference.fraction_within(g, t) >= 0.999, k
 
 
 @pytest.mark.parametrize("diffuse_model", DIFFUSE_MODELS)

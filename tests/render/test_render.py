@@ -68,7 +68,7 @@ def test_texture_lookup_is_bilinear_and_repeats(device):
         torch.autograd.grad((expected[0, :, 0].T * weight.double()).sum(), (t, uv)),
         strict=True,
     ):
-        assert reference.share_within(a, b) >= 0.999
+        assert reference.fraction_within(a, b) >= 0.999
 
 
 @pytest.mark.parametrize("explicit", [True, False])
@@ -161,7 +161,7 @@ def test_box_of_points_holds_their_pixels_and_is_no_larger_than_it_must_be(devic
     assert box_of(points[:0], camera) == (0, 0, 60, 40)
 
 
-def test_rays_beside_the_asset_are_left_out_without_a_trace_in_the_image(device, monkeypatch):
+def test_rays_that_miss_the_asset_are_skipped_without_effect_on_the_image(device, monkeypatch):
     """A box on the border, one next to the image and the whole image, the eye within the asset's reach."""
     asset, env = ball(device), Environment(torch.rand(8, 16, 3, generator=torch.Generator().manual_seed(2)).to(device))
     rays, closest = [], RayScene.closest

@@ -63,7 +63,7 @@ def test_lobes_follow_their_densities(device, alpha, deg, phi, drawn, seed):
     wrong = {"width": lambda d: pdf_lobes(wo, 1.02 * a, d)[:, k]}
     if deg >= 45:  # near the normal mirrored ones have almost the density of their originals
         wrong["the other's"] = lambda d: pdf_lobes(wo, a, d)[:, 1 - k]
-    if deg == 89 and (drawn == "mirrored" or alpha < 0.05):  # a degree or less beside the horizon
+    if deg == 89 and (drawn == "mirrored" or alpha < 0.05):  # a degree or less from the horizon
         whole = chi2.masses(chi2.Sphere(141), pdf, device).sum()
         assert not chi2.lost(sum(map(len, valid)), whole, total)
         grid = chi2.Window(wo, alpha, drawn == "mirrored")
@@ -122,13 +122,13 @@ def test_pairs_of_the_shader_are_those_of_the_samplers(device, points, pairs):
         options=ShadeOptions(samples=(0, 2, 0), seed=seed, sequence=points, antithetic=pairs),
     )
     # sharp lobes have few digits of the half vector
-    assert reference.share_within(got.cpu(), 0.7 * expected.cpu()) > 0.999
+    assert reference.fraction_within(got.cpu(), 0.7 * expected.cpu()) > 0.999
 
 
 @pytest.mark.parametrize("pairs", ["opposite", "mirrored"])
 @pytest.mark.parametrize("alpha, deg", chi2.MIXTURES)
 def test_the_mixture_of_all_strategies_follows_the_sum_of_their_densities(device, alpha, deg, pairs):
-    """What the balance heuristic divides by: draws of every strategy in its share, invalid ones counted."""
+    """The denominator of the balance heuristic: draws of every strategy by its fraction, invalid ones counted."""
     map_ = torch.rand(16, 32, 3, generator=torch.Generator().manual_seed(3)) ** 4
     wo, a, env = view(deg, device), torch.tensor(alpha, device=device), Environment(map_.to(device))
     per, seed = N // 64, 10 * chi2.MIXTURES.index((alpha, deg))
@@ -137,7 +137,7 @@ def test_the_mixture_of_all_strategies_follows_the_sum_of_their_densities(device
     drawn = [sample_bsdf(wo, a, v, lobe=lobe) for lobe, v in (("visible", u[1]), partner, ("cosine", u[3]))]
     draws = [env.sample(u[0])[0], *drawn]
     wi = torch.cat(draws)
-    # below the horizon the map's own samples count too: the whole sphere is the domain, the lobes' share there is lost
+    # below the horizon the map's samples count too: the domain is the sphere, and the lobes' fraction there is lost
     kept = torch.cat([torch.ones(len(draws[0]), dtype=torch.bool, device=device), torch.cat(draws[1:])[:, 2] > 1e-6])
 
     def mixture(d, table=20):
@@ -213,7 +213,7 @@ def test_visible_normals_equal_their_float64_reference(device):
     wo[:, 2] = wo[:, 2].abs().clamp(min=0.01)
     wo = torch.nn.functional.normalize(wo, dim=-1)
     alpha, u = 0.02 + 0.98 * torch.rand(n, generator=g), torch.rand(n, 2, generator=g)
-    u[:, 1] = u[:, 1] * 0.98  # the rim of the cap, where a root has infinite slope, is left out of the gradient
+    u[:, 1] = u[:, 1] * 0.98  # the rim of the cap, where a root has an infinite derivative, is left out of the gradient
     ins = [wo.to(device).requires_grad_(), alpha.to(device).requires_grad_()]
     got = sample_ggx_vndf(*ins, u.to(device))
     twin = [wo.double().requires_grad_(), alpha.double().requires_grad_()]
@@ -223,7 +223,7 @@ def test_visible_normals_equal_their_float64_reference(device):
     weight = torch.randn(n, 3, generator=g)
     grads = torch.autograd.grad((got * weight.to(device)).sum(), ins)
     expected_grads = torch.autograd.grad((expected * weight.double()).sum(), twin)
-    assert all(reference.share_within(a, b) >= 0.999 for a, b in zip(grads, expected_grads, strict=True))
+    assert all(reference.fraction_within(a, b) >= 0.999 for a, b in zip(grads, expected_grads, strict=True))
 
 
 def test_density_equals_its_float64_reference(device):
@@ -248,7 +248,7 @@ def test_random_pairs_are_uniform_independent_and_addressed(device):
     assert np.array_equal(u[:100], random_pairs(100, seed=3, sample=5, dimension=1, device=device).cpu().numpy())
 
 
-def test_no_two_streams_share_a_state(device):
+def test_streams_have_distinct_states(device):
     """A million pairs of 48 bits from ten streams of neighboring counters; by chance 0.002 would be equal."""
     streams = [
         {},

@@ -154,8 +154,10 @@ def test_embree_and_warp_cast_the_same_shadows_in_values_and_gradients():
     changed = ((a[0] - b[0]).abs() > 1e-5).any(-1).float().mean()
     assert changed < 2e-3  # 64 rays a point: a silhouette ray differs with probability of about 1e-5
     for one, other, unshadowed in zip(a, b, free, strict=True):  # normal, base color, roughness, metallic, texels
-        assert reference.share_within(one, other) >= 0.998  # those points; where no ray differs all are the same bits
-        assert reference.share_within(one, unshadowed) < 0.9  # the shadow is there
+        assert (
+            reference.fraction_within(one, other) >= 0.998
+        )  # those points; where no ray differs all are the same bits
+        assert reference.fraction_within(one, unshadowed) < 0.9  # the shadow is there
 
 
 @pytest.mark.parametrize("shadows", [False, True])
@@ -268,11 +270,11 @@ def test_gradient_is_that_of_the_estimator_where_the_samples_stand_still(device,
             if k == 0:
                 moved[k] = torch.nn.functional.normalize(moved[k], dim=-1)
             shifted.append(loss(*moved))
-        slope = (shifted[0] - shifted[1]) / (2 * eps)
+        gradient = (shifted[0] - shifted[1]) / (2 * eps)
         got = (grad.double() * direction).sum()
         scale = (grad.double() * direction).abs().sum()
         # central difference of float32 sums: 1e-7 of the loss over eps, and eps^2 of the curvature
-        assert abs(got - slope) < 2e-3 * scale, (k, got, slope, scale)
+        assert abs(got - gradient) < 2e-3 * scale, (k, got, gradient, scale)
 
 
 MEANS = [
@@ -321,19 +323,19 @@ def test_mean_gradient_is_that_of_the_integral(device, counts, options):
         for g, t in zip([tangent, *grads[1:]], exact[:4], strict=True):
             error = g.std(0) / n**0.5 + 1e-3 * t.abs().max().float().to(device)  # second term: the quadrature's
             assert ((g.mean(0) - t.to(device)) / error).abs().max() < 4.5
-        fixed, slopes = [r[:100].detach() for r in rows], []
-        for seed in range(60):  # means of 100 rows, for the error of a map's slope
+        fixed, gradients = [r[:100].detach() for r in rows], []
+        for seed in range(60):  # means of 100 rows, for the error of a map's gradient
             part = shade(
                 *at(*[fixed[0]] * 3, view[:100], *fixed[1:]),
                 lit,
                 options=ShadeOptions(samples=counts, seed=seed, **options),
             )
-            slopes.append(torch.autograd.grad(part.sum() / 100, light)[0].cpu().double())
-        slopes = torch.einsum("bhwc,phwc->bp", torch.stack(slopes), probes.double())
+            gradients.append(torch.autograd.grad(part.sum() / 100, light)[0].cpu().double())
+        gradients = torch.einsum("bhwc,phwc->bp", torch.stack(gradients), probes.double())
         expected = torch.einsum("hwc,phwc->p", exact[4], probes.double())
-        error = slopes.std(0) / 60**0.5 + 5e-4 * exact[4].norm()  # second term: the quadrature's
+        error = gradients.std(0) / 60**0.5 + 5e-4 * exact[4].norm()  # second term: the quadrature's
         assert (
-            (slopes.mean(0) - expected) / error
+            (gradients.mean(0) - expected) / error
         ).abs().max() < 4.5  # t of 59 degrees: 3e-5 a number, 128 in the family
 
 

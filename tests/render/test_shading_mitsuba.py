@@ -44,7 +44,7 @@ def ball_in_ring():
 
 
 class Stage:
-    """A mesh that shadows itself, and the primary hits of one camera that both sides share."""
+    """A mesh that shadows itself, and the primary hits of one camera, for both renderers."""
 
     def __init__(self, size, mesh=None, device="cpu", backend="auto"):
         """backend: of our shadows; on ``device``, where only ``shade`` computes."""
@@ -268,10 +268,10 @@ def test_gradients_with_shadows_equal_mitsubas(device, material):
         sampler.seed(k + 1, len(weight))
         color = integrator.sample(world, sampler, ray)[0]
         dr.backward(dr.sum(dr.sum(color * mi.Color3f(weight.numpy().T))))
-        slopes = torch.from_numpy(np.array(dr.grad(nodes)))
-        folded = slopes[:, 1:-1].clone()  # a column of the other end is repeated on either side
-        folded[:, -1] += slopes[:, 0]
-        folded[:, 0] += slopes[:, -1]
+        gradients = torch.from_numpy(np.array(dr.grad(nodes)))
+        folded = gradients[:, 1:-1].clone()  # a column of the other end is repeated on either side
+        folded[:, -1] += gradients[:, 0]
+        folded[:, 0] += gradients[:, -1]
         leaf = environment.radiance.clone().requires_grad_()
         (texels,) = torch.autograd.grad(mitsuba_scene.node_rows(leaf), leaf, folded)
         row = [*np.array(dr.grad(base)).ravel(), float(np.array(dr.grad(width))[0])]

@@ -61,7 +61,7 @@ def outline(points, camera):
 
 
 def coverage(points, camera, factor=12):
-    """Share of every pixel inside the convex outline, from ``factor`` x ``factor`` subpixels, float64."""
+    """Fraction of every pixel inside the convex outline, from ``factor`` x ``factor`` subpixels, float64."""
     polygon, _ = outline(points, camera)
     k = (np.arange(camera.width * factor) + 0.5) / factor
     x, y = np.meshgrid(k, k)

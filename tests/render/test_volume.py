@@ -9,7 +9,7 @@ from torch.nn.functional import normalize
 from reli3d.geometry.triplane import sample_triplane
 from reli3d.render.volume import OccupancyGrid, composite, march_rays
 from tests.support.rays import packed
-from tests.support.reference import share_within
+from tests.support.reference import fraction_within
 
 
 def rays(device, n=64, seed=0, radius=0.8):
@@ -20,8 +20,8 @@ def rays(device, n=64, seed=0, radius=0.8):
     return origins.to(device), normalize(aim - origins, dim=-1).to(device)
 
 
-def random_grid(device, resolution=12, share=0.3, seed=1):
-    cells = torch.rand(resolution, resolution, resolution, generator=torch.Generator().manual_seed(seed)) < share
+def random_grid(device, resolution=12, fraction=0.3, seed=1):
+    cells = torch.rand(resolution, resolution, resolution, generator=torch.Generator().manual_seed(seed)) < fraction
     return OccupancyGrid(cells.to(device), 0.8)
 
 
@@ -158,7 +158,7 @@ def test_a_triplane_is_marched_and_composited_as_in_float64(device):
     opacity = out.opacity.detach()
     assert float(opacity.max()) > 0.9 and float(opacity.std()) > 0.1
     for g, t in zip(torch.autograd.grad(loss, (planes, heads)), torch.autograd.grad(ref, far), strict=True):
-        assert share_within(g, t) >= 0.999
+        assert fraction_within(g, t) >= 0.999
 
 
 def test_the_reference_has_the_gradients_of_finite_differences():

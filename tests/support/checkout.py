@@ -1,4 +1,4 @@
-"""The checkout: its folder, the folder of real data beside it, and a copy whose files may be changed."""
+"""The checkout: its folder, the folder of real data next to it, and a copy whose files may be changed."""
 
 import shutil
 from pathlib import Path

@@ -17,11 +17,11 @@ ALPHAS, DEGREES, AZIMUTHS = (0.02, 0.05, 0.1, 0.25, 0.5, 1.0), (0, 15, 45, 80, 8
 DRAWS = ("half vector", "visible", "opposite", "mirrored")
 LOBES = [(alpha, deg, phi) for alpha in ALPHAS for deg in DEGREES for phi in (AZIMUTHS if deg else AZIMUTHS[:1])]
 MIXTURES = [(0.1, 45), (0.5, 80), (1.0, 0)]
-MAPS = ("one texel", "constant", "3 x 2", "sun", "beside the sun", "four black rows", "one black row", "odd")
-# of the suite: share, fine and coarse pass of each case and one for the cosine, on both devices
+MAPS = ("one texel", "constant", "3 x 2", "sun", "next to the sun", "four black rows", "one black row", "odd")
+# of the suite: fraction, fine and coarse pass of each case and one for the cosine, on both devices
 TESTS = 2 * 3 * (len(LOBES) * len(DRAWS) + 2 * len(MIXTURES) + len(MAPS) + 1)
 LEVEL = 1.0 - 0.99 ** (1.0 / TESTS)  # Sidak: 1 % for the family
-SHARE = float(-ndtri(LEVEL / 2))  # standard deviations
+MAX_Z = float(-ndtri(LEVEL / 2))  # standard deviations
 
 EXPECTED_MIN = 5.0  # below this count the normal limit behind chi-square fails (Cochran 1954)
 CELLS_MIN = 90  # of the fine pass
@@ -182,22 +182,22 @@ def quantiles(mass: np.ndarray, q: int) -> np.ndarray:
 
 
 def _below(mass: np.ndarray) -> np.ndarray:
-    """Share of ``mass`` before the middle of each cell along the last axis."""
+    """Fraction of ``mass`` before the middle of each cell along the last axis."""
     return (np.cumsum(mass, -1) - 0.5 * mass) / np.maximum(mass.sum(-1, keepdims=True), 1e-300)
 
 
 def lost(valid: float, mass: float, total: int) -> str:
-    """Why ``valid`` of ``total`` draws are not the share ``mass`` of a density; empty where they may be."""
+    """Why ``valid`` of ``total`` draws are not the fraction ``mass`` of a density; empty where they may be."""
     noise = (max(mass * (1.0 - mass), 0.0) / total) ** 0.5
-    if abs(valid / total - mass) <= QUADRATURE * mass + SHARE * noise:
+    if abs(valid / total - mass) <= QUADRATURE * mass + MAX_Z * noise:
         return ""
-    return f"share of valid samples {valid / total:.6f}, mass {mass:.6f}"
+    return f"fraction of valid samples {valid / total:.6f}, mass {mass:.6f}"
 
 
 def refusal(observed: np.ndarray, mass: np.ndarray, total: int) -> str:
     """Why counts of ``total`` draws are not of a density with these masses; empty where they may be.
 
-    The share of the draws that is counted must be the mass; given that, chi-square holds the shape, once on all cells
+    The fraction of counted draws must be the mass; given that, chi-square holds the shape, once on all cells
     and once on few: an error of 2 % has noncentrality 4e-4 n, which many cells' own noise sqrt(2 cells) drowns.
     """
     valid = observed.sum()
@@ -232,9 +232,9 @@ def check(
     why = refusal(observed, mass, total)
     assert not why, why
     planted = {f"scale {s}": mass * s for s in (0.98, 1.02)}
-    slopes = {"rows": 2.0 * _below(mass.sum(1))[:, None] - 1.0, "columns": 2.0 * _below(mass.sum(0)) - 1.0}
-    for name, slope in slopes.items():  # from -1 to 1 over the mass, 1 / sqrt(3) in the root mean square
-        planted |= {f"tilt {t} along {name}": mass * (1.0 + t * 3.0**0.5 * slope) for t in (-0.03, 0.03)}
+    ramps = {"rows": 2.0 * _below(mass.sum(1))[:, None] - 1.0, "columns": 2.0 * _below(mass.sum(0)) - 1.0}
+    for name, ramp in ramps.items():  # from -1 to 1 over the mass, 1 / sqrt(3) in the root mean square
+        planted |= {f"tilt {t} along {name}": mass * (1.0 + t * 3.0**0.5 * ramp) for t in (-0.03, 0.03)}
     planted |= {name: masses(grid, other, drawn.device, finest) for name, other in (wrong or {}).items()}
     for name, other in planted.items():
         assert refusal(observed, other, total), f"planted error passes: {name}"

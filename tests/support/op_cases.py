@@ -79,7 +79,7 @@ def above(n: int, seed: int = 0) -> Tensor:
 
 
 def numbers(n: int) -> Tensor:
-    """For samplers: not at the rims, where slopes have no bound."""
+    """For samplers: not at the rims, where gradients are unbounded."""
     return uniform(n, 2, seed=8, low=0.02, high=0.95)
 
 
@@ -191,7 +191,7 @@ def outlines(image, vertices):
 
 def grid_inputs(_, shape=(7, 6, 8), seed: int = 3) -> dict[str, Tensor]:
     sdf = torch.nn.functional.pad(torch.randn(shape, generator=rng(seed), **HOST), (1,) * 6, value=0.7)
-    sdf = sdf + 0.2 * sdf.sign()  # no crossing beside a grid point, where slopes have no bound
+    sdf = sdf + 0.2 * sdf.sign()  # no crossing next to a grid point, where gradients are unbounded
     cubes = (sdf.shape[0] - 1) * (sdf.shape[1] - 1) * (sdf.shape[2] - 1)
     return {
         "sdf": sdf,

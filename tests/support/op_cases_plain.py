@@ -81,7 +81,7 @@ def seen_from(points, normal):
     scene = RayScene(*ball(points.device, radius=0.3), backend="warp")
     images = uniform(3, 24, 24, 4, seed=2).to(points)
     visible = visible_from(scene, points, normal, camera)
-    own, share, total = view_lookup.summarize_views(images, camera, points, visible.float(), normal)
+    own, fraction, total = view_lookup.summarize_views(images, camera, points, visible.float(), normal)
     tokens, mix = uniform(3, 4, 4, 8, seed=4).to(points), uniform(9, 8, seed=5).to(points)
     pooled, _ = view_lookup.pool_views(images, tokens, mix, camera, points, visible.float(), normal)
     pixels = uniform(3, 3, 8, 8, 4, seed=6).to(points)
@@ -90,7 +90,7 @@ def seen_from(points, normal):
         uniform(*shape, seed=7 + k).to(points) for k, shape in enumerate([(3, 8, 8, 32), (9, 32), (32, 24), (24,)])
     ]
     spread, _ = view_lookup.spread_views(images, *layers, camera, points)
-    return visible, own, share, total, pooled, *fused, spread
+    return visible, own, fraction, total, pooled, *fused, spread
 
 
 def hulls(masks, points):

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 
-def share_within(got: Tensor, expected: Tensor, relative: float = 1e-4) -> float:
+def fraction_within(got: Tensor, expected: Tensor, relative: float = 1e-4) -> float:
     """Fraction of the entries of ``got`` within ``relative`` of ``expected``.
 
     Entries below 1e-3, the floor of Mitsuba's own gradient tests, or below a hundredth of the median of those that are
@@ -25,7 +25,7 @@ def share_within(got: Tensor, expected: Tensor, relative: float = 1e-4) -> float
 
 
 def rows_within(got: Tensor, expected: Tensor, relative: float = 1e-4) -> float:
-    """The same of vectors ``(N, ...)``, by their lengths: for slopes on a sphere or in a plane, of which only the
+    """The same of vectors ``(N, ...)``, by their lengths: for gradients on a sphere or in a plane, of which only the
     vector means something and single components vanish."""
     got, expected = (v.detach().cpu().double().reshape(len(v), -1) for v in (got, expected))
     length = expected.norm(dim=-1)
@@ -33,11 +33,11 @@ def rows_within(got: Tensor, expected: Tensor, relative: float = 1e-4) -> float:
     return float(((got - expected).norm(dim=-1) <= relative * length.clamp(min=floor)).double().mean())
 
 
-def across(slope: Tensor, direction: Tensor) -> Tensor:
-    """The part of ``slope (N, 3)`` that turns ``direction``; the other has no meaning for a unit vector.  float64."""
-    slope, d = (v.detach().cpu().double() for v in (slope, direction))
+def across(gradient: Tensor, direction: Tensor) -> Tensor:
+    """The part of ``gradient (N, 3)`` that turns ``direction``; the rest is undefined for a unit vector.  float64."""
+    gradient, d = (v.detach().cpu().double() for v in (gradient, direction))
     d = torch.nn.functional.normalize(d, dim=-1)
-    return slope - (slope * d).sum(-1, keepdim=True) * d
+    return gradient - (gradient * d).sum(-1, keepdim=True) * d
 
 
 def ggx_ndf(wm: Tensor, alpha: Tensor) -> Tensor:

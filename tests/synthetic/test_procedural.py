@@ -72,7 +72,7 @@ def test_materials_are_finite_and_in_range(objects):
         assert color.min() >= 0.02 - 1e-6 and color.max() <= 0.9 + 1e-6
         assert roughness.min() >= 0.08 - 1e-6 and roughness.max() <= 1 and metallic.min() >= 0 and metallic.max() <= 1
         np.testing.assert_allclose(np.linalg.norm(bumped, axis=1), 1, atol=1e-5)
-        assert (bumped * normals).sum(1).min() > 0.8  # slopes are at most 0.6: 31 degrees
+        assert (bumped * normals).sum(1).min() > 0.8  # height gradients are at most 0.6: 31 degrees
 
 
 def test_an_object_is_the_same_from_the_same_seed():

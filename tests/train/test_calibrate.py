@@ -49,9 +49,9 @@ def test_calibration_gives_back_what_is_missing(folder, tmp_path):
 
 def test_mismatch_is_the_error_of_an_image_in_one_color_at_its_best_brightness():
     rng = np.random.default_rng(0)
-    for share in (0.1, 0.5, 0.9):
+    for fraction in (0.1, 0.5, 0.9):
         expected = rng.random(5000) < 0.4
-        got = np.where(rng.random(5000) < share, expected, rng.random(5000) < 0.5)
+        got = np.where(rng.random(5000) < fraction, expected, rng.random(5000) < 0.5)
         both = (expected & got).sum()
         _, residual, _, _ = np.linalg.lstsq(got[:, None].astype(float), expected.astype(float), rcond=None)
         value = mismatch(int(both), int(got.sum()), int(expected.sum()))

@@ -106,8 +106,8 @@ def test_a_finish_is_the_same_for_pixels_and_points():
 
 def test_samples_are_relit_where_lights_are_given(sample, sky, tmp_path, monkeypatch):
     save_file(sample, tmp_path / "0.safetensors")
-    draw = lambda share, lights: (  # noqa: E731
-        monkeypatch.setattr(batches, "RELIGHT_PROBABILITY", share),
+    draw = lambda probability, lights: (  # noqa: E731
+        monkeypatch.setattr(batches, "RELIGHT_PROBABILITY", probability),
         batches.load_sample(tmp_path / "0.safetensors", 2, 64, np.random.default_rng(5), lights=lights),
     )[1]
     lights = sky[None]

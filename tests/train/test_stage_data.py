@@ -109,7 +109,7 @@ def test_a_capture_takes_part_without_ground_truth(captures):
     assert {"image", "mask", "neutral"} <= set(terms) and not {"material", "normal", "latent"} & set(terms)
 
 
-@pytest.mark.skipif(not REAL.exists(), reason="needs the captures beside the checkout; set RELI3D_CAPTURES")
+@pytest.mark.skipif(not REAL.exists(), reason="needs the captures next to the checkout; set RELI3D_CAPTURES")
 def test_uco3d_objects_are_read():
     found = Captures(REAL, 64)
     names = [f.name for f in found.folders]

@@ -24,7 +24,7 @@ VOLUME = StageConfig("volume", "volume", 24, lobes=16, grid=8, samples_along=32)
 GAUSSIANS = StageConfig("gaussians", "gaussians", 24, lobes=16)
 NONE = dict.fromkeys(vars(Weights()), 0.0)
 OUTLINE = replace(GAUSSIANS, weights=Weights(**{**NONE, "mask": 10.0, "deviation": 0.5, "sign": 0.2, "spread": 0.1}))
-# where maps are compared follows the surface pixel by pixel, and has no slope: it would let a surface flee its material
+# the pixels whose maps are compared follow the surface without a gradient; with one, a surface could flee its material
 MOVING = replace(GAUSSIANS, weights=replace(Weights(), material=0.0, normal=0.0))
 NORMALS = replace(VOLUME, weights=Weights(**{**NONE, "normal": 4.0}))
 LIGHT = StageConfig("monte_carlo", "monte_carlo", 24, samples=(32, 0, 0))
@@ -48,7 +48,7 @@ CASES = {  # stage, what moves, step, tolerance
 
 @pytest.fixture(scope="module")
 def one(tmp_path_factory):
-    source = Samples(write_samples(tmp_path_factory.mktemp("slopes"), seeds=(3,)))
+    source = Samples(write_samples(tmp_path_factory.mktemp("gradients"), seeds=(3,)))
     drawn = draw([source], (0, 0), inputs=2, targets=1, background=0.5, input_size=32, target_size=24, patch=0)
     lit = replace(drawn.inputs, latent=0.3 * torch.ones(9, 3), strength=torch.tensor(0.2))
     return replace(drawn, inputs=lit)
@@ -73,8 +73,8 @@ def test_the_whole_loss_has_the_gradient_of_central_differences(case, one, monke
     def loss() -> torch.Tensor:
         return total(object_losses(model, one, stage, gradients), stage)
 
-    slopes = torch.autograd.grad(loss(), moved, allow_unused=True)
-    got = sum(float((g.double() * d).sum()) for g, d in zip(slopes, directions, strict=True) if g is not None)
+    derivatives = torch.autograd.grad(loss(), moved, allow_unused=True)
+    got = sum(float((g.double() * d).sum()) for g, d in zip(derivatives, directions, strict=True) if g is not None)
     ends = []
     with torch.no_grad():
         for sign in (1.0, -2.0):
@@ -117,10 +117,10 @@ def test_the_weight_of_quads_moves_their_centers(one, monkeypatch):
         return (vertices * torch.randn(vertices.shape, generator=torch.Generator().manual_seed(1))).sum()
 
     row, direction = weight[20].clone().requires_grad_(), torch.ones(weight.shape[1])
-    (slope,) = torch.autograd.grad(centers(row), row)
+    (gradient,) = torch.autograd.grad(centers(row), row)
     # float32 positions summed: 1e-6, of a difference of 2e-3; gamma is far from where its sigmoid bends
-    assert float(slope @ direction) == pytest.approx(difference(centers, row.detach(), direction, 100.0), rel=0.02)
-    assert float(slope @ direction) != 0.0
+    assert float(gradient @ direction) == pytest.approx(difference(centers, row.detach(), direction, 100.0), rel=0.02)
+    assert float(gradient @ direction) != 0.0
 
 
 def test_the_normals_of_the_mesh_have_a_gradient_in_the_image(one):
@@ -144,6 +144,6 @@ def test_the_normals_of_the_mesh_have_a_gradient_in_the_image(one):
 
     noise = torch.randn(24, 24, 3, generator=generator)
     leaf = normals.clone().requires_grad_()
-    (slope,) = torch.autograd.grad(shown(leaf), leaf)
+    (gradient,) = torch.autograd.grad(shown(leaf), leaf)
     # float32 sums of 576 pixels; the curvature of a normalization over a step of 1e-2 is 1e-4
-    assert float((slope * direction).sum()) == pytest.approx(difference(shown, normals, direction, 1e-2), rel=0.01)
+    assert float((gradient * direction).sum()) == pytest.approx(difference(shown, normals, direction, 1e-2), rel=0.01)

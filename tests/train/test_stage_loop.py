@@ -85,7 +85,7 @@ def test_stopped_and_continued_is_the_same_run(folder, tmp_path):
     assert numbers(tmp_path / "whole") == numbers(tmp_path / "parts")
 
 
-def test_two_shares_of_a_batch_add_up_to_the_whole(folder):
+def test_two_parts_of_a_batch_add_up_to_the_whole(folder):
     """What the processes of a group have, one after the other here: their mean is the gradient of one process."""
     grads = []
     for parts in ([range(4)], [range(0, 4, 2), range(1, 4, 2)]):

@@ -35,16 +35,16 @@ folder, out, stop = sys.argv[1:]
 class Stops(PaperStage):
     def batch(self, step, objects):
         if step == int(stop) - 1:
-            share()
+            record_shards()
         if step == int(stop):
             workers.leave()
         return super().batch(step, objects)
-def share():
+def record_shards():
     optimizer = next(o for o in gc.get_objects() if isinstance(o, torch.optim.AdamW))
     cut = [p for p in stage.model.parameters() if isinstance(p, DTensor)]
     moments = [v for s in optimizer.state.values() for v in s.values() if isinstance(v, DTensor)]
     here = [sum(t.to_local().numel() for t in ts) / sum(t.numel() for t in ts) for ts in (cut, moments)]
-    Path(out, f"share.{workers.rank}").write_text(json.dumps([len(cut), *here]))
+    Path(out, f"shards.{workers.rank}").write_text(json.dumps([len(cut), *here]))
 config = StageConfig("gaussians", "gaussians", 16, lobes=16, batch=2, steps=4, rate=1e-3)
 workers = Workers.join()
 stage = Stops(ball_model(), config, [Samples(Path(folder))], checkpointing=True)
@@ -151,7 +151,7 @@ def test_each_process_has_half_of_the_layers_and_of_their_moments(runs):
     count = sum(len(list(layer.parameters())) for layer in trunk_layers(ball_model()))
     for name in ("first", "last"):
         for rank in range(2):
-            found, parameters, moments = json.loads((root / name / f"share.{rank}").read_text())
+            found, parameters, moments = json.loads((root / name / f"shards.{rank}").read_text())
             assert found == count and 0.49 < parameters < 0.51 and 0.49 < moments < 0.51  # odd rows are rounded up
 
 
@@ -161,6 +161,6 @@ def test_one_process_alone_is_refused(folder, tmp_path, capsys):
 
 
 def test_norms_and_parts_are_those_of_whole_gradients(tmp_path):
-    """Beside torch's own clipping of a module that is whole, on the same input on both processes."""
+    """Against torch's own clipping of the whole module, on the same input on both processes."""
     (tmp_path / "clip.py").write_text(CLIP)
     on_two(tmp_path / "clip.py")

@@ -94,8 +94,8 @@ def test_display_values_continue_beyond_white():
     radiance = torch.tensor([0.1, 0.9, 1.0, 1.5, 3.0], requires_grad=True)
     shown = display(radiance)
     torch.testing.assert_close(shown[:3], linear_to_srgb(radiance[:3]))
-    (slope,) = torch.autograd.grad(shown.sum(), radiance)
-    assert float(slope.min()) > 0.4 and bool((shown.diff() > 0).all())
+    (gradient,) = torch.autograd.grad(shown.sum(), radiance)
+    assert float(gradient.min()) > 0.4 and bool((shown.diff() > 0).all())
 
 
 def test_even_lobes_keep_constant_light_and_the_total():
@@ -130,7 +130,7 @@ def test_a_ball_is_shown_as_a_ball(stage, one):
         t = torch.linspace(-0.87, 0.87, 1001)
         far = (miss[..., None] + t * t).sqrt()
         depth = 10.0 * (model.steep * (RADIUS - far)).exp().sum(-1) * (t[1] - t[0])
-        # a step of 0.036 and a slope of 30: single rays err by the share of a step, their mean does not
+        # a step of 0.036 and a gradient of 30: single rays err by a fraction of a step, their mean does not
         assert float((rendering.coverage - (1.0 - (-depth).exp())).abs().mean()) < 0.02
         assert float((rendering.coverage - (1.0 - (-depth).exp())).mean()) == pytest.approx(0.0, abs=0.005)
     else:
@@ -273,8 +273,8 @@ def test_a_field_of_one_sign_is_pulled_across_zero(one):
     code = encode(model, one)
     shown, terms = renderings(model, code, one, GAUSSIANS)
     assert shown == [] and float(terms["sign"]) > 0.5
-    (slope,) = torch.autograd.grad(terms["sign"], model.heads["density"][-1].bias, retain_graph=True)
-    assert bool(torch.isfinite(slope).all())
+    (gradient,) = torch.autograd.grad(terms["sign"], model.heads["density"][-1].bias, retain_graph=True)
+    assert bool(torch.isfinite(gradient).all())
 
 
 def test_the_shipped_stages_are_named_by_their_keys():

@@ -121,7 +121,7 @@ def test_the_excess_entropy_is_least_at_the_target_and_pulls_from_black_and_whit
     assert float(excess_entropy((target + 0.01).clamp(max=1.0), target)) > 0.0
     logit = torch.tensor([-9.0, 9.0]).repeat(3, 1).T.requires_grad_()
     excess_entropy(logit.sigmoid(), torch.full((2, 3), 0.5)).backward()
-    # the slope of the cross-entropy in the logit is the difference of the colors, by the mean over 6 numbers
+    # the derivative of the cross-entropy by the logit is the difference of the colors, by the mean over 6 numbers
     torch.testing.assert_close(logit.grad, torch.tensor([-0.5, 0.5]).repeat(3, 1).T / 6, rtol=1e-3, atol=0)
 
 
@@ -291,7 +291,7 @@ def test_the_light_prior_fits_a_map():
 
 
 def test_points_go_astray_along_their_normals_as_far_as_stated():
-    """Over many draws the mean squares are a third of the greatest deviation's: its share is uniform in [0, 1]."""
+    """Over many draws the mean squares are a third of the greatest deviation's: its fraction is uniform in [0, 1]."""
     torch.manual_seed(0)
     normal = torch.nn.functional.normalize(torch.randn(256, 3), dim=-1)
     position = torch.rand(256, 3) - 0.5

@@ -35,7 +35,9 @@ def test_text_and_binary_of_one_model_are_the_same(tmp_path):
         n.split(": ", 1)[-1] for n in b.notes if "distortion" not in n
     ]
     colmap_model.write_binary(tmp_path / "text/sparse/1")
-    (tmp_path / "text/sparse/1/images.bin").rename(tmp_path / "text/sparse/0/images.bin")  # beside the text: not read
+    (tmp_path / "text/sparse/1/images.bin").rename(
+        tmp_path / "text/sparse/0/images.bin"
+    )  # next to the text files: not read
     assert load_views(tmp_path / "text").names == NAMES
 
 

@@ -106,7 +106,7 @@ def test_the_mesh_of_far_cameras_is_closed_and_in_its_place(tmp_path, options):
     assert record["watertight"] and record["manifold"] and record["degenerate_faces"] == 0
     x, y, z = FARTHEST
     there = (x, z, -y) if "z" in options else (x, y, z)
-    # the meeting point of the axes is some 1e-7 beside the cameras' own origin, and the hull's grid begins elsewhere
+    # the meeting point of the axes is about 1e-7 from the cameras' own origin, and the hull's grid begins elsewhere
     for near, far in zip(*boxes):
         np.testing.assert_allclose(far - there, near, rtol=0, atol=0.02)
     # both matrices lead from the folder's frame: the same point of the object goes to the same place

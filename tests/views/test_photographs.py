@@ -101,7 +101,7 @@ def test_what_is_refused_ends_in_one_line(tmp_path, name):
 
 
 def capture(folder, width, height, box, *, exif=None, mask_at=None, **lens):
-    """One photograph with a gradient, an object in ``box`` (x0, y0, x1, y1), its mask beside it."""
+    """One photograph with a gradient, an object in ``box`` (x0, y0, x1, y1), and its mask."""
     pixels = np.full((height, width, 3), 60, np.uint8)
     pixels[..., 0] = np.arange(width) * 255 // width
     pixels[..., 1] = (np.arange(height) * 255 // height)[:, None]
@@ -180,7 +180,7 @@ def test_exif_orientation_counts_where_the_cameras_were_calibrated_on_turned_ima
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the peak of a process is read from Linux' /proc")
 def test_16_large_photographs_take_less_than_a_gibibyte(tmp_path):
-    """Peak of a process that reads 16 photographs of 24 megapixels, their masks beside them."""
+    """Peak of a process that reads 16 photographs of 24 megapixels, and their masks."""
     folder = capture(tmp_path / "large", 6000, 4000, (1500, 800, 4500, 3200))
     data = json.loads((folder / "transforms.json").read_text())
     for i in range(16):

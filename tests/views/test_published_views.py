@@ -1,4 +1,4 @@
-"""The published network's inputs against the release's own tensors, and the choices that a user has beside."""
+"""The published network's inputs against the release's own tensors, and the options of the user."""
 
 from pathlib import Path
 
