@@ -26,7 +26,8 @@ def cover_silhouettes(sdf: Tensor, bound: Tensor, distance: Tensor, camera: Came
 
     Predicted fields often stay slightly above 0 along rays through thin parts.  One ray is traced for every
     ``STRIDE``-th pixel of each axis; if the minimum m along it is in (-DEPTH, FIELD_MAX), m + DEPTH is subtracted along
-    the ray.  Source: own.  Raises TypeError or ValueError.
+    the ray.  Source: own.  Raises TypeError for a wrong dtype, ValueError for a wrong shape or device, or a
+    radius that is not positive.
     """
     check("sdf", sdf)
     if sdf.ndim != 3 or min(sdf.shape) < 2:

@@ -14,9 +14,9 @@ def signed_distance(vertices: Tensor, faces: Tensor, points: Tensor) -> Tensor:
     """Distance ``(N,)`` from ``points`` ``(N, 3)`` to a closed, outward oriented mesh, negative inside, in the units
     of the mesh.
 
-    vertices: ``(V, 3)`` float32; faces: ``(F, 3)`` int32.  No autograd.  On a mesh with holes the sign has no
-    meaning; a NaN point gives NaN.  Raises TypeError on a wrong dtype, ValueError on an empty mesh, an index out of
-    range, a wrong shape or device.
+    vertices: ``(V, 3)`` float32; faces: ``(F, 3)`` int32.  No autograd.  On a mesh with holes the sign has no meaning;
+    a NaN point gives NaN.  Raises TypeError for a wrong dtype, ValueError for a wrong shape or device, an empty mesh or
+    an index out of range.
     """
     _bridge.check("vertices", vertices, last=3)
     _bridge.check("faces", faces, last=3, like=vertices, dtype=torch.int32)

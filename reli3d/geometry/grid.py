@@ -16,8 +16,8 @@ def sample_grid(grid: Tensor, points: Tensor) -> Tensor:
     """Trilinear interpolation ``(N, C)`` of ``grid (X, Y, Z, C)``, which spans [-1, 1]^3, at ``points (N, 3)``.
 
     The outermost grid points lie at -1 and 1; points outside are clamped to the border.  At least 2 grid points along
-    each axis.  Gradients reach both arguments.  Raises TypeError unless float32, ValueError on wrong shapes or mixed
-    devices.
+    each axis.  Gradients reach both arguments.  Raises TypeError unless float32, ValueError for a wrong shape or
+    device.
     """
     check("grid", grid)
     check("points", points, last=3, like=grid)
@@ -35,7 +35,8 @@ def squared_laplacian(field: Tensor, weight: Tensor) -> Tensor:
     """Weighted sum ``()`` of the squared 7-point Laplacian over the inner points of a grid.
 
     field, weight: ``(X, Y, Z)`` float32.  Border points, and points whose ``weight`` is 0, enter as neighbors only.
-    First-order gradients reach ``field``; ``weight`` is a constant.  Raises TypeError or ValueError.
+    First-order gradients reach ``field``; ``weight`` is a constant.  Raises TypeError for a
+    wrong dtype, ValueError for a wrong shape or device.
     """
     check("field", field)
     check("weight", weight, like=field)

@@ -16,7 +16,7 @@ def gather_views(maps: Tensor, points: Tensor, camera: Camera) -> tuple[Tensor, 
     maps: ``(V, H, W, C)``, at least 2 by 2 pixels.  points: ``(N, 3)`` world.  camera: of V views; the maps show its
     whole image in any resolution, and the pixels are those of the maps.  Outside a map its border value is taken.
     Gradients reach ``maps`` and ``points``; the pixels carry the gradient of the points too.  Raises TypeError unless
-    float32, ValueError on wrong shapes or mixed devices.
+    float32, ValueError for a wrong shape or device.
     """
     check("maps", maps)
     check("points", points, last=3, like=maps)

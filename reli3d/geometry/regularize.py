@@ -91,8 +91,8 @@ def sign_entropy(sdf: Tensor) -> Tensor:
     ``H(sigmoid(a), [b > 0]) + H(sigmoid(b), [a > 0])``, averaged over the grid edges (a, b) with a sign change: each
     end is pulled towards the sign of the other, so sign changes that no other loss supports vanish.  0, without
     gradient, if there is no sign change.  sdf: ``(X + 1, Y + 1, Z + 1)`` or with leading batch axes, float32, negative
-    inside, logits.  Raises TypeError or ValueError on a wrong dtype or shape and on values that
-    are not finite.  Source: Munkberg et al. 2022; L_sign of FlexiCubes.
+    inside, logits.  Raises TypeError for a wrong dtype, ValueError for a wrong shape or values
+    that are not finite.  Source: Munkberg et al. 2022; L_sign of FlexiCubes.
     """
     check("sdf", sdf)
     if sdf.ndim < 3 or min(sdf.shape[-3:]) < 2:

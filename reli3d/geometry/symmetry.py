@@ -66,8 +66,8 @@ def mirror_plane(distance: Tensor, camera: Camera) -> MirrorPlane | None:
     distance: ``(V, H, W)`` from :func:`~reli3d.geometry.hull.mask_distance`, of silhouettes that do not touch the image
     border.  camera: of these views, in any frame and unit.  None for one or two views; for cameras that are rolled, at
     one position or all on one side; if no plane is consistent with the silhouettes; and if many are, unless nearly all
-    are (a solid of revolution).  Asymmetry that no silhouette shows is not detected.  No gradient.  Raises TypeError or
-    ValueError if shapes or devices disagree.
+    are (a solid of revolution).  Asymmetry that no silhouette shows is not detected.  No gradient.  Raises TypeError
+    for a wrong dtype, ValueError for a wrong shape or device.
     """
     check("distance", distance)
     check_camera(camera, like=distance, views=len(distance), size=distance.shape[1:])

@@ -20,7 +20,8 @@ def visible_from(
     """``(N, V)`` bool, true where the point faces the camera, projects into its image and is not occluded.
 
     position, normal: ``(N, 3)`` world, the normal unit.  camera: of V views.  active: ``(N, V)`` bool, the pairs to
-    test; all others are False.  No gradient.  Raises TypeError, ValueError.
+    test; all others are False.  No gradient.  Raises TypeError for a wrong dtype, ValueError for a
+    wrong shape or device.
     """
     check("position", position, last=3)
     check("normal", normal, last=3, like=position)

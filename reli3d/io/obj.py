@@ -27,9 +27,11 @@ norm {name}_normal.png
 
 
 def obj_files(asset: Asset, name: str) -> dict[str, bytes]:
-    """Files by name: ``NAME.obj``, ``NAME.mtl`` and four PNG textures.  Raises TypeError, ValueError as glTF does.
+    """Files by name: ``NAME.obj``, ``NAME.mtl`` and four PNG textures.
 
     A corner uses one index for position, normal and texture coordinate.  v is flipped, since it points up in OBJ.
+    Raises TypeError or ValueError as :func:`reli3d.write_glb`, and ValueError for vertex colors or UV outside [0, 1]
+    that do not repeat.
     """
     check_asset(asset)
     if not portable(asset):

@@ -33,7 +33,7 @@ def summarize_views(
     images: ``(V, S, S, 4)``, sRGB and signed distance to the silhouette in pixels.  camera: of these images.
     visible: ``(N, V)``, 1 where a surface point is visible, 0 where it is occluded.  normal: ``(N, 3)`` unit.  Both are
     None for points in free space.  :mod:`reli3d.kernels.view_features` lists the features.  No gradient.  Raises
-    TypeError unless float32, ValueError on wrong shapes or mixed devices.
+    TypeError unless float32, ValueError for a wrong shape or device.
     """
     n, out, viewed = _summary(images, camera, points, visible, normal)
     numbers, weight = points.new_empty(n, len(images), NUMBERS), points.new_empty(n, len(images))

@@ -67,7 +67,8 @@ def blocked_transfer(mesh: Mesh, *, directions: int = 64, scene: RayScene | None
     Row i times the coefficients of an environment (:func:`light_harmonics`) is the irradiance that is occluded at
     vertex i.  mesh: with normals.  directions: over the whole sphere, on a spiral of equal areas and the same for all
     vertices, so that neighbors differ by their geometry alone.  scene: rays against the mesh, made here if None.
-    Exactly 0 where no ray is hidden.  Raises TypeError for a wrong dtype, ValueError for a wrong shape or device.
+    Exactly 0 where no ray is hidden.  Raises TypeError for a wrong dtype, ValueError for a wrong shape or device, or
+    for less than one direction.
     """
     normals = present("normals", mesh.normals).detach()
     check("vertices", mesh.vertices, last=3, like=normals)
