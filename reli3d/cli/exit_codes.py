@@ -162,10 +162,12 @@ def log_of(target: Path) -> Path:
 
 @contextlib.contextmanager
 def extra(option: str) -> Iterator[None]:
-    """Turns an ImportError in the block into an InputError of ``option``."""
+    """Turns the ImportError of a missing package in the block into an InputError of ``option``."""
     try:
         yield
     except ImportError as error:
+        if (error.name or "reli3d").split(".")[0] == "reli3d":  # an error of this package
+            raise
         raise InputError(option, str(error)) from None
 
 

@@ -28,6 +28,8 @@ from reli3d.nn.model import Reconstructor
 from reli3d.nn.presets import OFFICIAL, LocalPreset, Preset, from_json, to_json
 from reli3d.nn.published import CHECKPOINT_PREFIX, UNUSED, our_key
 
+# of torch.load for a cut, changed or other file, beside pickle.UnpicklingError
+BROKEN_TORCH_FILE = (RuntimeError, ValueError, EOFError, KeyError, OSError)
 FORMAT = "reli3d 1"
 SMALL = Path(__file__).parents[1] / "assets" / "weights" / "small.safetensors"
 LARGE = 1 << 30  # bytes; hashing less takes about a second
@@ -308,7 +310,7 @@ def read_checkpoint(path: str | os.PathLike) -> dict[str, Tensor]:
     except pickle.UnpicklingError as error:
         reason = " ".join(str(error).split()).split(". ")[-1][:160]
         raise WeightsError(path, f"holds more than tensors and is rejected, nothing was run ({reason})") from None
-    except (RuntimeError, ValueError, EOFError, KeyError, OSError) as error:
+    except BROKEN_TORCH_FILE as error:
         reason = str(error).splitlines()[0][:160] if str(error) else type(error).__name__
         raise WeightsError(path, f"is not a torch checkpoint, or it is cut off ({reason}); fetch it again") from None
     state = content.get("state_dict") if isinstance(content, dict) else None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import zipfile
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +15,8 @@ from reli3d.io.files import file_size
 from reli3d.render.latlong import lat_long_directions, quarter_turn, texel_solid_angles
 
 ROWS = 64
+# of numpy, zipfile and zlib for a cut, changed, encrypted or unknown file
+BROKEN_ARCHIVE = (ValueError, OSError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error)
 HELD_OUT_EVERY = 6  # every sixth map is held out of all training
 
 
@@ -28,7 +32,7 @@ def load_maps(path: Path) -> tuple[Tensor, list[str]]:
             env, names = data["env"], [str(n) for n in data["names"]]
     except KeyError as error:
         raise InputError(path, f"expected an .npz of env and names, got none of {error}") from None
-    except Exception as error:  # on a broken file numpy and zipfile raise almost anything
+    except BROKEN_ARCHIVE as error:
         raise InputError(path, f"expected an .npz of env and names, got a broken file ({shown(str(error))})") from None
     if env.dtype.kind != "f" or env.ndim != 4 or env.shape[3] != 3 or env.shape[2] != 2 * env.shape[1] or not env.size:
         raise InputError(path, f"env: expected floats of shape (n, H, 2H, 3), got {env.dtype} {env.shape}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from torch import Tensor, nn
 from reli3d.errors import InputError, shown
 from reli3d.io.files import file_size
 from reli3d.nn.presets import SMALL, LocalPreset, from_json, to_json
-from reli3d.nn.weights import check_keys
+from reli3d.nn.weights import BROKEN_TORCH_FILE, check_keys
 from reli3d.train.sharded import gathered, scattered
 from reli3d.train.stage import Stage
 from reli3d.train.workers import Workers
@@ -73,13 +74,18 @@ def load(path: Path, **options: Any) -> dict[str, Any]:
     file_size(path)
     try:
         state = torch.load(path, weights_only=True, **options)
-        state["model"], state["average"], state["optimizer"]["param_groups"]
-        whole = isinstance(state["step"], int) and state["step"] >= 0
-    except Exception as error:  # of a broken file torch, pickle and zipfile raise almost anything
+    except (pickle.UnpicklingError, *BROKEN_TORCH_FILE) as error:
         reason = shown(" ".join(str(error).split()))
         raise InputError(path, f"expected a checkpoint of reli3d-train, got a broken file ({reason})") from None
-    if not whole:
-        raise InputError(path, f"step: expected a count, got {shown(state['step'])}; remove the file to start again")
+    parts = ("model", "average", "optimizer")
+    if not isinstance(state, dict) or not all(isinstance(state.get(part), dict) for part in parts):
+        raise InputError(path, f"expected a checkpoint of reli3d-train with {', '.join(parts)}, got another file")
+    if "param_groups" not in state["optimizer"]:
+        raise InputError(path, "optimizer: expected param_groups, got none; remove the file to start again")
+    if not isinstance(state.get("step"), int) or state["step"] < 0:
+        raise InputError(
+            path, f"step: expected a count, got {shown(state.get('step'))}; remove the file to start again"
+        )
     return {"stage": "", "seconds": 0.0, "measures": {}, **state}
 
 

@@ -44,7 +44,7 @@ def _loaded(network: str, option: str) -> Callable[[Image.Image], Image.Image]:
         raise InputError(option, f"expected rembg installed, got none ({error}); pip install 'reli3d[masks]'") from None
     try:
         session = rembg.new_session(network)
-    except Exception as error:  # downloads raise almost anything
+    except (OSError, ValueError) as error:  # no network, a full disk; another file than the published one
         raise InputError(
             option,
             f"expected the network {network} of rembg, got {error}; it is fetched once, or give masks",

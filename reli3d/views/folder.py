@@ -170,7 +170,7 @@ def _origin(frames: list[Frame], folder) -> tuple[tuple[float, float, float], li
     """Where the frame of the views begins, in the folder's, and a note where that is elsewhere."""
     try:
         at = tuple(near_origin(torch.from_numpy(np.stack([f.c2w for f in frames]))).tolist())
-    except ValueError as error:
+    except InputError as error:
         raise InputError(folder, str(error)) from None
     place = ", ".join(f"{v:.6g}" for v in at)
     return at, [f"the cameras are far from their origin: work is done about ({place})"] if any(at) else []

@@ -99,7 +99,7 @@ def placement_notes(views: Views) -> tuple[str, ...]:
     """The notes for poses that are left as stored: nothing where the object fills the network's cube, else one line."""
     try:
         placed = normalize(views, "auto").is_identity()
-    except ValueError:  # masks that do not meet
+    except InputError:  # masks that do not meet
         placed = False
     return (
         ()

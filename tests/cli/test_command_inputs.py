@@ -145,7 +145,7 @@ CASES = [
         ]
     ),
     (train, ["good", "file"], "a file"),
-    (train, ["good", "run_list"], "broken file"),
+    (train, ["good", "run_list"], "another file"),
     (train, ["good", "run_noise"], "broken file"),
     (train, ["good", "run_other"], "run_other/state.pt"),
     (train, ["good", "run_noise", "--export", "x.safetensors"], "broken file"),

@@ -6,16 +6,17 @@ import hashlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from safetensors import safe_open
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from reli3d.errors import InputError
-from reli3d.io.files import replacing
+from reli3d.errors import InputError, shown
+from reli3d.io.files import file_size, replacing
 from reli3d.nn.model import Reconstructor
 from reli3d.nn.reni import EnvironmentDecoder
 from reli3d.nn.reni_fit import fit_latent
 from reli3d.render.latlong import quarter_turn
+from reli3d.train.checkpoint import check_shapes
 
 Latents = dict[str, tuple[Tensor, Tensor]]  # of a file's stem: (L, 3) and ()
 
@@ -25,14 +26,13 @@ def load_prior(model: Reconstructor, path: Path) -> None:
 
     Raises InputError if the file has no decoder of the preset's sizes.
     """
+    file_size(path)
     try:
         stored = {k: v for k, v in load_file(path).items() if k != "latents"}
-        model.environment.load_state_dict(stored)
-    except Exception as error:  # a broken file, other names, other shapes
-        reason = " ".join(str(error).split())[:100]
-        raise InputError(
-            path, f"expected a light prior of preset {model.preset.name}, got another file ({reason})"
-        ) from None
+    except SafetensorError as error:
+        raise InputError(path, f"expected a light prior, got a broken file ({shown(str(error))})") from None
+    check_shapes(path, stored, model.environment)
+    model.environment.load_state_dict(stored)
     model.environment.requires_grad_(False)
 
 
