@@ -69,7 +69,6 @@ class CaptureReport:
     mask_fraction: float = 0.0  # median fraction of an image that the mask covers
     mask_method: str = ""
     plane: bool = False
-    second_map: bool = False  # cameras are those of features inside the masks
     lighting: str = "object"  # frame in which the lighting is fixed: object or camera
     unit: str = "longest side"
     failed: list[str] = field(default_factory=list)
@@ -254,7 +253,6 @@ def _refined(segmented: _Segmented, scene: Scene, known, report: CaptureReport, 
     again = [v for v in second.views if v.photo.name in segmented.masks]
     if len(second.views) < KEPT_FRACTION * len(first.views) or _agreement(again, segmented.masks) <= before:
         return segmented, up, ground
-    report.second_map = True
     by_name = {v.photo.name: v for v in first.views}
     pairs = [(by_name[v.photo.name], v) for v in second.views]
     directions = np.stack([b.rotation.T @ a.rotation @ up for a, b in pairs])

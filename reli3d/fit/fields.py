@@ -52,14 +52,14 @@ class EvenAdam:
     the others (Nicolet, Jacobson and Jakob 2021, Large Steps in Inverse Rendering of Geometry, section 3.5).
     """
 
-    def __init__(self, value: Tensor, betas: tuple[float, float] = (0.9, 0.99)):
-        self.value, self.betas = value, betas
+    def __init__(self, value: Tensor):
+        self.value = value
         self.mean, self.square, self.count = torch.zeros_like(value), 0.0, 0
 
     @torch.no_grad()
     def step(self, gradient: Tensor, rate: float) -> None:
         """Move the value by at most about ``rate`` against ``gradient``."""
-        one, two = self.betas
+        one, two = 0.9, 0.99
         self.count += 1
         self.mean.mul_(one).add_(gradient, alpha=1.0 - one)
         self.square = two * self.square + (1.0 - two) * float(gradient.abs().max()) ** 2

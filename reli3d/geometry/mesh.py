@@ -84,16 +84,16 @@ class MeshReport:
 
     vertices: int
     faces: int
-    welded_vertices: int  # different positions that a face uses
-    components: int  # connected through shared vertices
-    euler: int  # welded vertices - edges + faces
-    boundary_edges: int  # with one face
-    nonmanifold_edges: int  # with three or more faces
-    flipped_edges: int  # with two faces that run through it in the same direction
-    nonmanifold_vertices: int  # whose faces form several fans
     degenerate_faces: int  # with two corners at one position; left out of every other count
-    watertight: bool  # faces present, every edge has two or more faces, an even number
-    manifold: bool  # no non-manifold edge or vertex and no flipped edge; a border is allowed
+    welded_vertices: int = 0  # different positions that a face uses
+    components: int = 0  # connected through shared vertices
+    euler: int = 0  # welded vertices - edges + faces
+    boundary_edges: int = 0  # with one face
+    nonmanifold_edges: int = 0  # with three or more faces
+    flipped_edges: int = 0  # with two faces that run through it in the same direction
+    nonmanifold_vertices: int = 0  # whose faces form several fans
+    watertight: bool = False  # faces present, every edge has two or more faces, an even number
+    manifold: bool = True  # no non-manifold edge or vertex and no flipped edge; a border is allowed
 
 
 def _check_topology(vertices: Tensor, faces: Tensor) -> None:
@@ -206,20 +206,9 @@ def report(mesh: Mesh) -> MeshReport:
     faces, sound = welded_faces(mesh)
     degenerate = int((~sound).sum())
     faces = faces[sound]
-    size = {"vertices": len(mesh.vertices), "faces": len(mesh.faces), "degenerate_faces": degenerate}
+    size = len(mesh.vertices), len(mesh.faces), degenerate
     if not len(faces):
-        return MeshReport(
-            **size,
-            welded_vertices=0,
-            components=0,
-            euler=0,
-            boundary_edges=0,
-            nonmanifold_edges=0,
-            flipped_edges=0,
-            nonmanifold_vertices=0,
-            watertight=False,
-            manifold=True,
-        )
+        return MeshReport(*size)
     n = int(faces.max()) + 1
     edges = edges_of(faces)
     tail, head, valence = edges.tail, edges.head, edges.valence
@@ -247,7 +236,7 @@ def report(mesh: Mesh) -> MeshReport:
         "nonmanifold_vertices": int((fans > 1).sum()),
     }
     manifold = not (counts["nonmanifold_edges"] or counts["flipped_edges"] or counts["nonmanifold_vertices"])
-    return MeshReport(**size, **counts, watertight=bool((valence % 2 == 0).all()), manifold=manifold)
+    return MeshReport(*size, **counts, watertight=bool((valence % 2 == 0).all()), manifold=manifold)
 
 
 def watertight(mesh: Mesh) -> bool:

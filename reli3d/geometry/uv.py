@@ -12,7 +12,6 @@ import os
 import subprocess
 import sys
 import tempfile
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -22,7 +21,7 @@ from torch import Tensor
 from reli3d import _bridge
 from reli3d.geometry import charts as parts
 from reli3d.geometry.mesh import Mesh, vertex_normals, weld
-from reli3d.geometry.topology import face_neighbors, group
+from reli3d.geometry.topology import group
 from reli3d.kernels import charts as kernels
 
 FILL = 0.62  # expected fraction of the atlas covered by charts; sets only the length unit of the chart step
@@ -43,20 +42,6 @@ atlas.generate(pack_options=pack)
 source, faces, uv = atlas[0]
 numpy.savez(sys.argv[2], source=source, faces=faces, uv=uv)
 """
-
-
-@dataclass(frozen=True)
-class AtlasReport:
-    """Result of :func:`atlas_report`; areas are fractions of the UV unit square."""
-
-    charts: int  # connected through equal UV vertices
-    utilization: float  # fraction of the square that faces cover, overlap counted once
-    overlap: float  # fraction of the covered samples with more than one face
-    stretch: float  # L2 of Sander et al. 2001 over the surface, 1 where lengths are kept; scale of the atlas removed
-    # largest length on the surface per UV length of any face, relative to the mean; slivers left out
-    stretch_max: float
-    smallest_area: float  # of a face, in UV units
-    texels_per_unit: float  # square root of UV area over surface area, times the texture size
 
 
 def guard_band(texture_size: int) -> int:
@@ -240,45 +225,11 @@ def _place(charts: parts.Charts, faces: np.ndarray, size: int, guard: float, res
     return inside + (best_place[:, :2] * cell)[chart][:, None]
 
 
-def atlas_report(mesh: Mesh, *, texture_size: int = 1024) -> AtlasReport:
-    """Quality of the UV of a mesh.  Overlap and utilization are sampled at 16 points a texel, 4096 x 4096 at most."""
-    from reli3d.geometry.bake import coverage
-
-    if mesh.uv is None:
-        raise ValueError("mesh.uv: expected UV coordinates, got None (see unwrap)")
-    _check(mesh, texture_size)
-    hits = coverage(mesh, min(4 * texture_size, 4096))
-    faces = mesh.faces.cpu().numpy()
-    p, q = (t.detach().cpu().numpy().astype(np.float64)[faces] for t in (mesh.vertices, mesh.uv))
-    e1, e2, d1, d2 = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0], q[:, 1] - q[:, 0], q[:, 2] - q[:, 0]
-    twice = d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0]
-    area = 0.5 * np.linalg.norm(np.cross(e1, e2), axis=1)
-    solid = (np.abs(twice) > 0) & (area > 1e-9 * area.sum() / len(area))
-    e1, e2, d1, d2, t = e1[solid], e2[solid], d1[solid], d2[solid], twice[solid, None]
-    du, dv = (e1 * d2[:, 1:] - e2 * d1[:, 1:]) / t, (e2 * d1[:, :1] - e1 * d2[:, :1]) / t
-    a, b, c = (du * du).sum(1), (du * dv).sum(1), (dv * dv).sum(1)
-    square = area[solid] @ (0.5 * (a + c)) / max(area[solid].sum(), 1e-300)
-    longest = np.sqrt(0.5 * (a + c + np.sqrt((a - c) ** 2 + 4 * b * b)))
-    mean = np.sqrt(area.sum() / max(0.5 * np.abs(twice).sum(), 1e-300))
-    joined = weld(torch.nn.functional.pad(mesh.uv.detach(), (0, 1)))[1].cpu().numpy()[faces]  # equal UV, split or not
-    _, chart_count = parts.components(face_neighbors(joined), np.zeros(len(faces), np.int32))
-    covered = max(int((hits > 0).sum()), 1)
-    return AtlasReport(
-        charts=chart_count,
-        utilization=float((hits > 0).float().mean()),
-        overlap=int((hits > 1).sum()) / covered,
-        stretch=float(np.sqrt(square) / mean),
-        stretch_max=float(longest.max() / mean) if len(longest) else 1.0,
-        smallest_area=float(0.5 * np.abs(twice).min()),
-        texels_per_unit=texture_size / float(mean),
-    )
-
-
 def unwrap_xatlas(mesh: Mesh, *, texture_size: int = 1024, timeout_s: float = 120.0) -> Mesh:
     """As :func:`unwrap` with the charts of xatlas (Young 2018), in a process of its own that ends after ``timeout_s``.
 
     Its time grows with the square of the number of charts and it can crash; here that is a TimeoutError or RuntimeError
-    instead of a hang.  Faces that xatlas could not chart may overlap in UV; :func:`atlas_report` counts them.
+    instead of a hang.  Faces that xatlas could not chart may overlap in UV.
     """
     _check(mesh, texture_size)
     with tempfile.TemporaryDirectory() as folder:

@@ -58,13 +58,13 @@ def read_parts(
     return parts
 
 
-def has_material_maps(path: str | os.PathLike, *, max_bytes: int = 1 << 29, max_vertices: int = 20_000_000) -> bool:
+def has_material_maps(path: str | os.PathLike) -> bool:
     """Whether a material of the file has a metallic-roughness texture.
 
     Without one its roughness and metallic are two numbers, which exporters write as defaults.  Raises
     InputError as :func:`read_parts` does.
     """
-    document = Document(path, max_bytes=max_bytes, max_vertices=max_vertices)
+    document = Document(path, max_bytes=1 << 29, max_vertices=20_000_000)
     for k in range(len(document.get(document.json, "materials", list, "materials", []))):
         material = document.item("materials", k, f"materials[{k}]")
         pbr = document.get(material, "pbrMetallicRoughness", dict, f"materials[{k}].pbrMetallicRoughness", {})

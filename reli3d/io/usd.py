@@ -13,7 +13,7 @@ from reli3d.io.glb import addressing, check_asset, portable, texture_images
 from reli3d.render.asset import Asset
 
 
-def usdz_bytes(asset: Asset, name: str = "object") -> bytes:
+def usdz_bytes(asset: Asset) -> bytes:
     """A USDZ package: +Y up, meters, textures as PNG.  Raises ImportError without ``usd-core``, else as glTF does.
 
     Roughness and metallic are channels of one texture, as in glTF; texture coordinates have v up, as USD has them.
@@ -29,7 +29,7 @@ def usdz_bytes(asset: Asset, name: str = "object") -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         for k, data in texture_images(asset).items():
             (Path(folder) / f"{k}.png").write_bytes(data)
-        stage = Usd.Stage.CreateNew(str(Path(folder) / f"{name}.usdc"))
+        stage = Usd.Stage.CreateNew(str(Path(folder) / "object.usdc"))
         UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
         UsdGeom.SetStageMetersPerUnit(stage, 1.0)
         root = UsdGeom.Xform.Define(stage, "/object")
@@ -70,7 +70,7 @@ def usdz_bytes(asset: Asset, name: str = "object") -> bytes:
         material.CreateSurfaceOutput().ConnectToSource(surface.ConnectableAPI(), "surface")
         UsdShade.MaterialBindingAPI.Apply(shape.GetPrim()).Bind(material)
         stage.Save()
-        package = Path(folder) / f"{name}.usdz"
+        package = Path(folder) / "object.usdz"
         if not UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(stage.GetRootLayer().realPath), str(package)):
             raise OSError(f"{package.name}: USD could not write the package")
         return package.read_bytes()

@@ -63,13 +63,10 @@ class Assembly:
         """Maps the vertices ``(N, 3)`` of the union by ``move`` after splitting edges longer than ``edge``."""
         self._solids = [self.joined().refine_to_length(edge).warp_batch(move)]
 
-    def copy_turned(self, solid: Manifold, part: int, count: int, *, about: str = "y") -> None:
-        """Adds ``count`` copies of ``solid``, rotated by multiples of ``360 / count`` degrees about an axis."""
-        axis = "xyz".index(about)
+    def copy_turned(self, solid: Manifold, part: int, count: int) -> None:
+        """Adds ``count`` copies of ``solid``, rotated by multiples of ``360 / count`` degrees about +Y."""
         for k in range(count):
-            angles = [0.0, 0.0, 0.0]
-            angles[axis] = 360.0 * k / count
-            self.add(solid.rotate(tuple(angles)), part)
+            self.add(solid.rotate((0.0, 360.0 * k / count, 0.0)), part)
 
     def joined(self) -> Manifold:
         """Union of everything."""

@@ -29,7 +29,7 @@ def _leg(a: Assembly, part: int, foot: np.ndarray, top: np.ndarray, thick: float
         a.add(p.tube(foot + t * (top - foot), thick * swell * (1 if rng.random() < 2 else 0), segments=14), part)
 
 
-def _legs(a: Assembly, part: int, w: float, d: float, h: float, *, thick: float, bars: bool = True) -> None:
+def _legs(a: Assembly, part: int, w: float, d: float, h: float, *, thick: float) -> None:
     """Four legs below a seat or a top of ``w`` by ``d`` at height ``h``, optionally splayed, with stretchers."""
     rng = a.rng
     style, splay = int(rng.choice(4, p=[0.5, 0.2, 0.2, 0.1])), rng.uniform(0, 0.18) * (rng.random() < 0.4)
@@ -38,7 +38,7 @@ def _legs(a: Assembly, part: int, w: float, d: float, h: float, *, thick: float,
         for sz in (-1, 1):
             foot = np.array([sx * (x + splay * h), 0.0, sz * (z + splay * h)])
             _leg(a, part, foot, np.array([sx * x, h, sz * z]), thick, style)
-    if bars and rng.random() < 0.5:
+    if rng.random() < 0.5:
         y, t = rng.uniform(0.15, 0.5) * h, thick * 0.55
         out = splay * (h - y)
         for s in (-1, 1):

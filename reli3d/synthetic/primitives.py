@@ -63,40 +63,30 @@ def ellipsoid(radii: Sequence[float] | np.ndarray, segments: int = 32) -> Manifo
     return Manifold.sphere(1.0, segments).scale(tuple(float(r) for r in radii))
 
 
-def capsule(
-    start: Sequence[float], end: Sequence[float], radius: float, *, tip: float | None = None, segments: int = 20
-) -> Manifold:
+def capsule(start: Sequence[float], end: Sequence[float], radius: float, *, tip: float | None = None) -> Manifold:
     """Convex hull of two balls, of ``radius`` at ``start`` and ``tip`` (default the same) at ``end``."""
     ends = [
-        Manifold.sphere(r, segments).translate(tuple(map(float, p)))
+        Manifold.sphere(r, 20).translate(tuple(map(float, p)))
         for p, r in ((start, radius), (end, radius if tip is None else tip))
     ]
     return Manifold.batch_hull(ends)
 
 
-def torus(ring: float, tube: float, *, segments: int = 40, degrees: float = 360.0) -> Manifold:
-    """Torus about +Y with major radius ``ring`` and minor radius ``tube``, or a sector of ``degrees``."""
+def torus(ring: float, tube: float, *, segments: int = 40) -> Manifold:
+    """Torus about +Y with major radius ``ring`` and minor radius ``tube``."""
     turn = np.linspace(0, 2 * np.pi, 17)[:-1]
-    return lathe(np.stack([ring + tube * np.cos(turn), tube * np.sin(turn)], -1), segments, degrees)
+    return lathe(np.stack([ring + tube * np.cos(turn), tube * np.sin(turn)], -1), segments)
 
 
-def prism(
-    outline: np.ndarray | Sequence[np.ndarray],
-    height: float,
-    *,
-    bevel: float = 0.0,
-    taper: float = 1.0,
-    twist: float = 0.0,
-) -> Manifold:
+def prism(outline: np.ndarray | Sequence[np.ndarray], height: float, *, bevel: float = 0.0) -> Manifold:
     """Extrudes a polygon ``(K, 2)`` in x, z, or a list of contours, by ``height``, centered at the origin.
 
-    bevel: inset of the top and bottom rims.  taper: scale of the top.  twist: rotation of the top, degrees.
+    bevel: inset of the top and bottom rims.
     """
     contours = [outline] if isinstance(outline, np.ndarray) else list(outline)
     section = CrossSection([np.ascontiguousarray(c, dtype=float) for c in contours])
-    steps = int(abs(twist) / 6) + (1 if taper != 1.0 else 0)
-    body = Manifold.extrude(section, height, steps, twist, (taper, taper)).translate((0, 0, -height / 2))
-    inner = section.offset(-bevel) if bevel > 0 and taper == 1.0 and twist == 0.0 else None
+    body = Manifold.extrude(section, height).translate((0, 0, -height / 2))
+    inner = section.offset(-bevel) if bevel > 0 else None
     if inner is not None and not inner.is_empty() and bevel < 0.4 * height:
         middle = Manifold.extrude(section, height - 2 * bevel).translate((0, 0, bevel - height / 2))
         body = middle + Manifold.extrude(inner, height).translate((0, 0, -height / 2))
@@ -116,12 +106,11 @@ def tube(
     radius: np.ndarray | float,
     *,
     closed: bool = False,
-    outline: np.ndarray | None = None,
     segments: int = 12,
 ) -> Manifold:
     """Sweeps a circle along ``path (K, 3)`` with ``radius`` at each point.
 
-    outline: ``(M, 2)``, replaces the unit circle.  Frames are rotation minimizing (parallel transport, Hanson and Ma
+    Frames are rotation minimizing (parallel transport, Hanson and Ma
     1995); along a closed path the residual rotation is distributed evenly.
     """
     path = np.asarray(path, dtype=float)
@@ -139,9 +128,8 @@ def tube(
         angle = left * np.arange(count) / count
         side = np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * np.cross(tangent, side)
     other = np.cross(tangent, side)
-    if outline is None:
-        turn = np.linspace(0, 2 * np.pi, segments + 1)[:-1]
-        outline = np.stack([np.cos(turn), np.sin(turn)], -1)
+    turn = np.linspace(0, 2 * np.pi, segments + 1)[:-1]
+    outline = np.stack([np.cos(turn), np.sin(turn)], -1)
     size = np.broadcast_to(np.asarray(radius, dtype=float), (count,))[:, None, None]
     rings = path[:, None] + size * (outline[None, :, :1] * side[:, None] + outline[None, :, 1:] * other[:, None])
     m = len(outline)

@@ -131,10 +131,10 @@ def _draw_region(base: Surface, rng: np.random.Generator, count: int) -> Region:
     return by_cuts
 
 
-def _cluster(colors: Tensor, count: int, rng: np.random.Generator, steps: int = 12) -> Tensor:
+def _cluster(colors: Tensor, count: int, rng: np.random.Generator) -> Tensor:
     """Centers ``(K, 3)`` of k-means, K at most ``count``; clusters of less than 3 % of the points are removed."""
     centers = colors[torch.as_tensor(rng.choice(len(colors), count, replace=False))]
-    for _ in range(steps):
+    for _ in range(12):
         nearest = torch.cdist(colors, centers).argmin(1)
         size = torch.bincount(nearest, minlength=len(centers))
         sums = torch.zeros_like(centers).index_add_(0, nearest, colors)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 import reli3d
 from reli3d.cli.infer import EXAMPLE
-from reli3d.geometry import distance, hull, mesh, symmetry, uv, visibility
+from reli3d.geometry import distance, hull, mesh, symmetry, visibility
 from reli3d.geometry.camera import Camera, camera_rays, look_at
 from reli3d.io.hdr import write_environment
 from reli3d.io.images import read_image
@@ -198,7 +198,6 @@ def planned():
 
 OPERATIONS = {
     "unwrap": lambda folder: reli3d.unwrap(ball(), texture_size=64),
-    "atlas_report": lambda folder: uv.atlas_report(reli3d.unwrap(ball(), texture_size=64), texture_size=64),
     "render": lambda folder: render_asset([asset()], camera(), lights.LIGHTS["studio"](16)),
     "reconstruct": lambda folder: reconstructed(),
     "refine": lambda folder: refined(),

@@ -12,7 +12,7 @@ from reli3d.geometry.mesh import Mesh, report, vertex_normals, volume
 from reli3d.geometry.regularize import sign_entropy, vertex_deviation
 from reli3d.geometry.smooth import taubin_smooth
 from reli3d.geometry.surface import extract_surface, surface_cubes
-from reli3d.geometry.uv import atlas_report, unwrap, unwrap_xatlas
+from reli3d.geometry.uv import unwrap, unwrap_xatlas
 from reli3d.io.glb import glb_bytes
 from reli3d.nn.weights import load, locate, save
 from reli3d.render.asset import Asset, TextureSet
@@ -84,7 +84,6 @@ def test_what_can_be_said_of_no_faces_is_said():
         (lambda m: decimate(m, 10), "fast_simplification"),
         (lambda m: unwrap(m), "numpy"),
         (lambda m: unwrap_xatlas(m), "xatlas"),
-        (lambda m: atlas_report(m), "numpy"),
         (lambda m: bake(m, 8, lambda p, n: p), "numpy"),
         (lambda m: glb_bytes(Asset(m, TextureSet(torch.zeros(4, 4, 3), 0.0, 0.0))), "numpy"),
     ],

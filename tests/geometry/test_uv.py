@@ -11,7 +11,7 @@ from reli3d.geometry.bake import coverage, nearest_valid
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.surface import extract_surface
 from reli3d.geometry.topology import face_neighbors
-from reli3d.geometry.uv import atlas_report, guard_band, source_vertices, unwrap, unwrap_xatlas
+from reli3d.geometry.uv import guard_band, source_vertices, unwrap, unwrap_xatlas
 from tests.support.meshes import QUICK, SLOW, loaded, mesh_of
 
 slow = pytest.mark.slow
@@ -62,6 +62,27 @@ def areas(mesh: Mesh) -> np.ndarray:
     return -0.5 * (d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0])
 
 
+def chart_count(mesh: Mesh) -> int:
+    """Charts, connected through equal UV."""
+    labels = np.unique(mesh.uv.numpy(), axis=0, return_inverse=True)[1].reshape(-1)[mesh.faces.numpy()]
+    return charts.components(face_neighbors(labels), np.zeros(len(labels), np.int32))[1]
+
+
+def utilization(mesh: Mesh) -> float:
+    """Fraction of the UV square that faces cover."""
+    return float((coverage(mesh, 2048) > 0).float().mean())
+
+
+def stretches(mesh: Mesh) -> tuple[float, float]:
+    """L2 stretch of Sander et al. 2001 and the largest length on the surface per UV length, over the mean scale."""
+    p, q = (v.double()[mesh.faces.long()] for v in (mesh.vertices, mesh.uv))
+    edges, moves = (torch.stack([v[:, 1] - v[:, 0], v[:, 2] - v[:, 0]], -1) for v in (p, q))
+    lengths = torch.linalg.svdvals(edges @ torch.linalg.inv(moves))
+    area = torch.linalg.cross(edges[..., 0], edges[..., 1]).norm(dim=-1) / 2
+    mean = (area.sum() / (torch.linalg.det(moves).abs().sum() / 2)).sqrt()
+    return float(((area @ lengths.square().mean(-1)) / area.sum()).sqrt() / mean), float(lengths.max() / mean)
+
+
 def check_atlas(source: Mesh, result: Mesh, size: int = 2048, rel: float = 3e-3) -> None:
     area = areas(result)
     assert (area > 0).all()
@@ -85,11 +106,10 @@ def test_sphere_fills_the_atlas_with_little_stretch():
     mesh = icosphere(5)
     result = unwrap(mesh, texture_size=1024)
     check_atlas(mesh, result)
-    found = atlas_report(result, texture_size=512)
-    assert found.charts == 6
-    assert found.utilization > 0.55
+    assert chart_count(result) == 6 and utilization(result) > 0.55
     # a cap of 54.7 degrees seen along its axis: stretch at the tip 1 / cos = 1.73, less the common scale
-    assert found.stretch < 1.05 and found.stretch_max < 1.74
+    mean, largest = stretches(result)
+    assert mean < 1.05 and largest < 1.74
 
 
 @pytest.mark.parametrize("n", [32, pytest.param(80, marks=slow), pytest.param(160, marks=slow)])
@@ -105,24 +125,7 @@ def test_a_long_part_does_not_hold_down_the_scale():
     result = unwrap(mesh, texture_size=512)
     check_atlas(mesh, result)
     # 122 units of area; uncut, the longest chart's 30 units would span the side and use 122 / 900 of it
-    assert atlas_report(result, texture_size=512).utilization > 0.5
-
-
-def test_charts_are_counted_by_their_uv_whether_vertices_are_split_or_not():
-    mesh = icosphere(3)
-    loose = Mesh(mesh.vertices[mesh.faces.reshape(-1).long()], torch.arange(3 * len(mesh.faces)).reshape(-1, 3).int())
-    assert atlas_report(unwrap(loose, texture_size=256), texture_size=256).charts == 6
-
-
-def test_stretch_of_a_plane_is_one_and_of_a_squeezed_one_is_known():
-    corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
-    square = Mesh(
-        corners, torch.tensor([[0, 1, 2], [0, 2, 3]]).int(), uv=torch.tensor([[0.0, 1], [1, 1], [1, 0], [0, 0]])
-    )
-    assert atlas_report(square, texture_size=64).stretch == pytest.approx(1.0, abs=1e-6)  # float32 coordinates
-    half = Mesh(square.vertices, square.faces, uv=square.uv * torch.tensor([1.0, 0.25]))
-    # singular values 1 and 4, mean scale 2: sqrt((1 + 16) / 2) / 2
-    assert atlas_report(half, texture_size=64).stretch == pytest.approx(np.sqrt(8.5) / 2, rel=1e-5)
+    assert utilization(result) > 0.5
 
 
 @pytest.mark.parametrize("size", [256, 512])
@@ -147,7 +150,7 @@ def test_stacked_sheets_are_distinguished():
     mesh = ramp(5)
     result = unwrap(mesh, texture_size=512)
     check_atlas(mesh, result)
-    assert atlas_report(result, texture_size=512).charts <= 10  # five turns: each one chart, or cut once
+    assert chart_count(result) <= 10  # five turns: each one chart, or cut once
 
 
 def test_a_slab_folded_over_itself_is_distinguished():
@@ -248,8 +251,6 @@ def test_faults_are_named():
         unwrap(mesh, texture_size=4)
     with pytest.raises(TypeError, match="mesh: expected Mesh"):
         unwrap(mesh.vertices)
-    with pytest.raises(ValueError, match="mesh.uv"):
-        atlas_report(mesh)
 
 
 def test_xatlas_gives_an_atlas_or_a_named_end():
@@ -271,8 +272,8 @@ def test_xatlas_takes_meshes_of_any_size(radius, center):
     ball = trimesh.creation.icosphere(3)
     result = unwrap_xatlas(mesh_of(ball.vertices * radius + center, ball.faces), texture_size=256)
     assert bool(torch.isfinite(result.uv).all())
-    report = atlas_report(result, texture_size=256)
-    assert report.utilization > 0.4 and report.overlap < 0.01
+    hits = coverage(result, 1024)
+    assert int((hits > 0).sum()) > 0.4 * 1024**2 and int((hits > 1).sum()) < 0.01 * int((hits > 0).sum())
 
 
 def test_an_atlas_of_xatlas_with_nan_is_refused(monkeypatch):
