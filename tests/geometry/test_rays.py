@@ -6,51 +6,13 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-import warp as wp
 
 from reli3d import kernels
 from reli3d.geometry.hits import Hits, evaluate_hits, hit_normals, interpolate
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene, offset_origin
 from tests.support import reference
-from tests.support.rays import BACKENDS, PLACES, make, placed, rays, soup
-
-
-def brute_force(vertices, faces, o, d):
-    """Closest t of every ray in float64, over all faces; inf for a miss."""
-    a, b, c = (np.asarray(vertices, np.float64)[np.asarray(faces)[:, k]] for k in range(3))
-    o, d = o.double().numpy()[:, None], d.double().numpy()[:, None]
-    p = np.cross(d, c - a)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = 1 / ((b - a) * p).sum(-1)
-        s = o - a
-        q = np.cross(s, b - a)
-        u, v, t = (s * p).sum(-1) * inverse, (d * q).sum(-1) * inverse, ((c - a) * q).sum(-1) * inverse
-        hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (t >= 0)
-    return np.where(hit, t, np.inf), np.stack([u, v], -1)
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("stretch, shift", PLACES)
-def test_hits_are_those_of_float64_brute_force(device, backend, stretch, shift):
-    """Directions are stretched as the mesh is, so that ``t`` has the same size everywhere."""
-    for seed in range(3):
-        vertices, faces = soup(seed)
-        vertices, o, d = placed(vertices, *rays(3000, seed), stretch, shift)
-        scene = make(vertices, faces, backend, device)
-        hits = scene.closest(o.to(device), d.to(device))
-        t, bary = brute_force(vertices, faces, o, d)
-        first = t.argmin(1)
-        best = np.where(np.isinf(t.min(1)), 1e30, t.min(1))
-        face, got = hits.face.cpu().numpy(), hits.t.cpu().double().clamp(max=1e30).numpy()
-        same = face == np.where(best < 1e30, first, -1)
-        assert (same | (np.abs(got - best) <= 1e-5)).mean() >= 0.999  # a ray may pass an edge within rounding
-        sure = same & (face >= 0)
-        assert np.quantile(np.abs(got - best)[sure], 0.999) <= 1e-5  # the rest: grazing rays stretch the error
-        off = np.abs(hits.bary.cpu().numpy() - bary[np.arange(len(o)), first])[sure]
-        assert np.quantile(off, 0.999) < 1e-5
-        assert np.isinf(hits.t.cpu().numpy()[face < 0]).all() and (hits.bary.cpu().numpy()[face < 0] == 0).all()
-        assert np.array_equal(scene.occluded(o.to(device), d.to(device)).cpu().numpy(), face >= 0)
+from tests.support.rays import BACKENDS, make, rays, soup
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -78,14 +40,6 @@ def test_rays_at_edges_and_vertices_of_a_closed_mesh_do_not_leak(device, backend
         assert float(torch.stack([u, w, 1 - u - w]).min()) > -1e-5  # 1e-7 of a position over faces of 0.07
         assert float((exact - t[hit]).abs().max()) < 1e-5
         torch.testing.assert_close(torch.stack([u, w], -1).float(), bary[hit], rtol=0, atol=1e-4)
-
-
-def test_warps_tree_is_split_by_surface_area(device, monkeypatch):
-    """On CUDA too, where Warp's own choice is another: the leak rates above are those of this tree."""
-    made, plain = [], wp.Mesh
-    monkeypatch.setattr(wp, "Mesh", lambda **options: made.append(options["bvh_constructor"]) or plain(**options))
-    make(*soup(0), "warp", device)
-    assert made == ["sah"]
 
 
 def test_backends_agree_on_a_million_ray_queries(device):
@@ -181,12 +135,6 @@ def test_offset_rays_do_not_hit_their_own_face(device, backend, scale, shift):
 def solved(a, b, c, o, d):
     """u, v, t of ``a + u (b - a) + v (c - a) = o + t d``."""
     return torch.linalg.solve(torch.stack([b - a, c - a, -d], -1), o - a)
-
-
-def test_the_reference_of_hits_has_the_gradients_of_finite_differences():
-    rng = torch.Generator().manual_seed(3)
-    leaves = [torch.randn(6, 3, generator=rng, dtype=torch.float64).requires_grad_() for _ in range(5)]
-    assert torch.autograd.gradcheck(solved, leaves, eps=1e-6, atol=1e-5, rtol=1e-3)
 
 
 def test_reevaluated_hits_and_their_gradients_equal_float64(device):

@@ -36,23 +36,25 @@ def oracle(vertices, faces, o, d):
     return torch.where((inside >= 0) & (t >= 0), t, torch.inf), torch.where(t >= 0, inside, -torch.inf)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("stretch, shift", PLACES)
-def test_twenty_meshes_and_twenty_thousand_rays_against_every_face(device, backend, stretch, shift):
-    """The same face, or a distance within 1e-5 of the mesh's size; any other ray passes an edge within
-    rounding.  Five meshes where they are stretched or far."""
-    different, meshes = 0, 20 if (stretch, shift) == PLACES[0] else 5
+@pytest.mark.parametrize("meshes, calls", [(2, 2), pytest.param(20, 20, marks=pytest.mark.slow)])
+def test_hits_are_those_of_float64_brute_force(device, backend, stretch, shift, meshes, calls):
+    """The same face, or a distance within 1e-5 of the mesh's size; any other ray passes an edge within rounding.
+    Directions are stretched as the mesh is, so that ``t`` has the same size everywhere."""
+    different = 0
     for seed in range(meshes):
         mesh, faces = bumpy(seed) if seed % 2 else soup(seed, 40 + 10 * seed)
         vertices = placed(mesh, *rays(1), stretch, shift)[0]
         scene = make(vertices, faces, backend, device)
-        for k in range(20):
+        for k in range(calls):
             plain = rays(1000, 100 * seed + k, 1.5)
             _, o, d = placed(mesh, *plain, stretch, shift)
             hits = scene.closest(o.to(device), d.to(device))
             t, inside = oracle(vertices, faces, o, d)
             best, first = t.min(1)
+            assert torch.equal(scene.occluded(o.to(device), d.to(device)), hits.face >= 0)
+            assert bool((hits.t[hits.face < 0].isinf()).all()) and not bool(hits.bary[hits.face < 0].any())
             face, got = hits.face.cpu().long(), hits.t.cpu().double()
             same = face == torch.where(best.isinf(), -1, first)
             # t counts in lengths of d, which is stretched as the mesh is; the mesh was 3 across
@@ -62,7 +64,7 @@ def test_twenty_meshes_and_twenty_thousand_rays_against_every_face(device, backe
             for i in odd.tolist():  # both faces in question: an edge of either is within 1e-5 of its size
                 margins = [float(inside[i, f]) for f in (int(face[i]), int(first[i])) if f >= 0 and not best[i].isinf()]
                 assert min(abs(m) for m in margins) < 1e-5, (seed, k, i)
-    assert different <= 1e-5 * meshes * 20_000
+    assert different <= max(1, 1e-5 * meshes * calls * 1000)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -80,27 +82,6 @@ def test_any_hit_is_the_closest_hit_before_the_limit(device, backend):
     assert float(found[::3].float().mean()) > 0.1 and float(found[2::3].float().mean()) > 0.3
     limited = scene.closest(o, d, t_max=far)
     assert torch.equal(limited.t, torch.where(found, first, torch.inf)) and torch.equal(limited.face >= 0, found)
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_a_bumpy_closed_mesh_holds_rays_at_random_at_edges_and_at_vertices(device, backend):
-    """pbrt's watertight test; and where such a ray hits, it hits what it was aimed at."""
-    vertices, faces = bumpy(3, subdivisions=3)
-    scene, rng, n = make(vertices, faces, backend, device), np.random.default_rng(4), 100_000
-    o = torch.tensor(rng.uniform(-0.1, 0.1, (n, 3)), dtype=torch.float32)
-    anywhere = torch.tensor(rng.normal(size=(n, 3)), dtype=torch.float32)
-    assert int((scene.closest(o.to(device), anywhere.to(device)).face < 0).sum()) == 0
-    v = torch.from_numpy(vertices)
-    corner = v[torch.from_numpy(rng.integers(0, len(v), n))]
-    f = torch.from_numpy(faces[rng.integers(0, len(faces), n)]).long()
-    edge = torch.lerp(v[f[:, 0]], v[f[:, 1]], torch.tensor(rng.random((n, 1)), dtype=torch.float32))
-    for target, limit in ((corner, 5e-3), (edge, 2e-4)):  # measured: 0.4 % of vertices on either backend; edges 6e-5
-        hits = scene.closest(o.to(device), (target - o).to(device))
-        missed = hits.face < 0
-        assert float(missed.float().mean()) <= limit
-        # the origin sees all of the surface only where no bump hides it: nearer is allowed, farther is a leak
-        assert float(hits.t[~missed].max()) <= 1.0 + 1e-4
-        assert torch.equal(scene.occluded(o.to(device), (target - o).to(device)), ~missed)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -255,26 +236,6 @@ def test_no_light_comes_into_a_closed_box_nor_through_a_gap_of_1e_5(device, back
     up = up[up[:, 2] > 0.1]
     o, ng = o[: len(up)], torch.tensor([0.0, 0, 1], device=device).expand(len(up), 3)
     assert bool(scene.occluded(offset_origin(o, ng, up, scale=scene.scale), up).all())
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_a_million_spawned_rays_never_meet_their_triangle(device, backend):
-    """pbrt's Triangle.Reintersect at its own size: 1000 triangles of coordinates 1e-8 to 1e8, 1000 rays each.
-
-    Magnitudes differ by coordinate, as pbrt draws them.  Where they differ by corner, one triangle in 40 is so thin
-    that its float32 edges are parallel: it has no normal to leave along, and 0.08 % of the rays meet it again.
-    """
-    rng, again = np.random.default_rng(9), 0
-    for _ in range(1000):
-        corners = (rng.uniform(-1, 1, (3, 3)) * 10.0 ** rng.uniform(-8, 8, (3, 3))).astype(np.float32)
-        scene = make(corners, [[0, 1, 2]], backend, device)
-        b = torch.tensor(rng.dirichlet((1, 1, 1), 1000)[:, 1:], dtype=torch.float32, device=device)
-        face = torch.zeros(1000, dtype=torch.int32, device=device)
-        position, ng = interpolate(scene.vertices, scene.faces, face, b), hit_normals(scene.vertices, scene.faces, face)
-        d = torch.nn.functional.normalize(torch.tensor(rng.normal(size=(1000, 3)), dtype=torch.float32, device=device))
-        again += int(scene.occluded(offset_origin(position, ng, d, scale=scene.scale), d).sum())
-    assert again == 0
 
 
 @pytest.mark.parametrize("count", [500, 10_000])  # Embree's are ordered where they are many

@@ -167,18 +167,6 @@ def test_inputs_that_do_not_belong_together_are_named():
         model.encode(images, masks, c2w.double(), intrinsics)
 
 
-@torch.no_grad()
-def test_the_trunk_in_bfloat16_stays_near():
-    torch.manual_seed(0)
-    model = Reconstructor(NANO).eval().requires_grad_(False)
-    inputs = views(1, 4, NANO.image_size)
-    code = model.encode(*inputs)
-    low = model.to_compute(torch.bfloat16).encode(*inputs)
-    assert low.triplane.dtype == torch.float32 and low.latent.dtype == torch.float32
-    # bfloat16 has 8 bits; the triplane is a sum of many branches with independent roundings, measured 0.006
-    assert (low.triplane - code.triplane).norm() < 0.03 * code.triplane.norm()
-
-
 def test_presets_return_from_their_text():
     for preset in (SMALL, OFFICIAL, NANO):
         assert from_json(to_json(preset)) == preset

@@ -112,32 +112,6 @@ def test_gathered_values_and_gradients_equal_their_float64_reference(device):
     assert reference.rows_within(grads[1], expected_grads[1]) >= 0.999
 
 
-def test_the_order_of_the_views_does_not_matter(device):
-    torch.manual_seed(0)
-    maps, module = rig(4, device), ViewFeatures(WIDTH).to(device)
-    points, visible, normal = surface(200, 4, device)
-    order = torch.tensor([2, 0, 3, 1], device=device)
-    turned = ViewMaps(maps.tokens[order], maps.images[order], maps.camera[order])
-    first, color = module(maps, points, visible, normal)
-    second, again = module(turned, points, visible[:, order], normal)
-    torch.testing.assert_close(first, second, rtol=1e-5, atol=1e-5)  # sums of four in another order
-    torch.testing.assert_close(color, again, rtol=1e-5, atol=1e-5)
-
-
-def test_gradients_reach_the_tokens_and_match_finite_differences(device):
-    torch.manual_seed(0)
-    maps, module = rig(2, device), ViewFeatures(WIDTH).to(device)
-    points, visible, normal = surface(64, 2, device)
-    tokens = maps.tokens.clone().requires_grad_()
-    loss = lambda t: module(ViewMaps(t, maps.images, maps.camera), points, visible, normal)[0].sum()  # noqa: E731
-    (grad,) = torch.autograd.grad(loss(tokens), tokens)
-    step = torch.randn(tokens.shape, generator=torch.Generator().manual_seed(1)).to(device)
-    derivative = (loss(tokens + 1e-2 * step) - loss(tokens - 1e-2 * step)) / 2e-2
-    assert float((grad * step).sum()) == pytest.approx(
-        float(derivative.detach()), rel=1e-2
-    )  # float32 sums of 64 x 48 terms
-
-
 def test_half_of_the_arguments_of_a_surface_is_an_error(device):
     maps = rig(2, device)
     points, visible, _ = surface(8, 2, device)

@@ -94,54 +94,6 @@ def test_black_texels_get_a_gradient_only_where_a_strategy_reaches_them(device):
     assert float(grads[(64, 0, 0)]) == 0.0 < exact
 
 
-def test_gradients_stay_finite_at_the_edges_of_every_input(device):
-    g = torch.Generator().manual_seed(5)
-    n = 20000
-    unit = lambda v: torch.nn.functional.normalize(v, dim=-1)  # noqa: E731
-    normal, ng, wo = (unit(torch.randn(n, 3, generator=g)) for _ in range(3))
-    wo[: n // 4] = unit(torch.linalg.cross(normal, wo))[: n // 4]  # in the surface
-    wo[n // 4 : n // 2] = normal[n // 4 : n // 2]
-    pick = lambda *v: torch.tensor(v)[torch.randint(len(v), (n,), generator=g)]  # noqa: E731
-    for texels in (sky(power=30.0).radiance * 1e4, torch.zeros(4, 8, 3)):
-        leaves = [
-            normal,
-            pick(0.0, 1.0, 0.5)[:, None].expand(n, 3).contiguous(),
-            pick(0.0, 1e-3, 0.02, 1.0),
-            pick(0.0, 1.0, 0.3),
-            texels,
-        ]
-        leaves = [v.to(device).requires_grad_() for v in leaves]
-        out = shade(
-            *at(leaves[0].detach(), leaves[0], ng.to(device), wo.to(device), *leaves[1:4]), Environment(leaves[4])
-        )
-        assert all(bool(torch.isfinite(v).all()) for v in (out, *torch.autograd.grad(out.sum(), leaves)))
-
-
-def test_torch_sees_an_ordinary_function(device):
-    """Strided and expanded inputs, one gradient alone, backward twice, edits in place, second derivatives."""
-    n = 300
-    normal, wo, base, rough, metal = inputs(n, device)
-    env = Environment(sky(8).radiance.to(device))
-    plain = shade(*at(normal, normal, normal, wo, base, rough, metal), env)
-    wide = torch.stack([normal, wo, base], 0).permute(1, 0, 2)
-    same = shade(*at(wide[:, 0], wide[:, 0], wide[:, 0], wide[:, 1], wide[:, 2], rough, metal), env)
-    assert torch.equal(plain, same)
-    one = base[:1].clone().requires_grad_()
-    out = shade(*at(normal, normal, normal, wo, one.expand(n, 3), rough, metal), env)
-    (g,) = torch.autograd.grad(out.sum(), one, retain_graph=True)
-    assert g.shape == (1, 3) and torch.equal(g, torch.autograd.grad(out.sum(), one, retain_graph=True)[0])
-    leaf = rough.clone().requires_grad_()
-    out = shade(*at(normal, normal, normal, wo, base, leaf, metal), env)
-    (g,) = torch.autograd.grad(out.sum(), leaf, create_graph=True)
-    with pytest.raises(RuntimeError, match="once_differentiable"):
-        torch.autograd.grad(g.sum(), leaf)
-    moved = base.clone()
-    out = shade(*at(normal, normal, normal, wo, moved, leaf, metal), env)
-    moved.add_(0.1)
-    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
-        out.sum().backward()
-
-
 COLUMNS = "value", "roughness", "normal", "base color", "texels"
 
 

@@ -161,12 +161,6 @@ def test_a_triplane_is_marched_and_composited_as_in_float64(device):
         assert fraction_within(g, t) >= 0.999
 
 
-def test_the_reference_has_the_gradients_of_finite_differences():
-    samples, density, color = packed([0, 3, 5], torch.device("cpu"))
-    leaves = [v.double().requires_grad_() for v in (density, color)]
-    assert torch.autograd.gradcheck(lambda *v: twin(samples, *v), leaves, eps=1e-6, atol=1e-5, rtol=1e-3)
-
-
 def test_faint_and_opaque_media_keep_their_digits(device):
     for scale in (1e-6, 1e-3, 30.0, 1e4, 1e30, math.inf):
         samples, density, color = packed([40, 3], device)

@@ -1,8 +1,6 @@
 """The loop of the stages: it learns, stops and goes on with the same bits, alone or with others."""
 
 import json
-import os
-import random
 import signal
 import subprocess
 import sys
@@ -27,6 +25,7 @@ from reli3d.train.stages.losses import gradients
 from reli3d.train.stages.stage import PaperStage, averaged
 from reli3d.train.stages.step import checkpointed, object_losses, total
 from reli3d.train.stages.views import Samples, draw
+from tests.support.processes import ENVIRONMENT
 from tests.support.stages import SMALL, BallModel, ball_model, write_samples
 
 GAUSSIANS = StageConfig("gaussians", "gaussians", 16, lobes=16, batch=2, steps=6, rate=1e-3)
@@ -55,6 +54,26 @@ def numbers(folder):
     return [{k: v for k, v in row.items() if k != "seconds"} for row in rows(folder) if "config" not in row]
 
 
+@pytest.fixture(scope="module")
+def whole(folder, tmp_path_factory):
+    """The folder of a run of six steps by one thread that is never stopped."""
+    out, before = tmp_path_factory.mktemp("whole"), torch.get_num_threads()
+    torch.set_num_threads(1)
+    stage = stage_of(folder)
+    train(stage, options_of(stage, out))
+    torch.set_num_threads(before)
+    return out
+
+
+def assert_same_run(one, other):
+    """Equal bits in the checkpoint, equal numbers in the log."""
+    a, b = (torch.load(folder / "state.pt", weights_only=True) for folder in (one, other))
+    for part in ("model", "average"):
+        for name, value in a[part].items():
+            assert torch.equal(value, b[part][name]), name
+    assert numbers(one) == numbers(other)
+
+
 def test_a_run_learns_logs_and_draws(folder, tmp_path):
     stage = stage_of(folder, validation=Samples(folder))
     draws = [stage.drawn(0, k) for k in range(2)]
@@ -70,19 +89,15 @@ def test_a_run_learns_logs_and_draws(folder, tmp_path):
     assert json.loads(state["about"]) == found[0]["config"] and state["measures"] == {"surface": 1.0}
 
 
-def test_stopped_and_continued_is_the_same_run(folder, tmp_path):
-    whole, part, other = stage_of(folder), stage_of(folder), stage_of(folder, ball_model(7))
-    train(whole, options_of(whole, tmp_path / "whole"))
+def test_stopped_and_continued_is_the_same_run(folder, whole, tmp_path, threads):
+    threads(1)
+    part, other = stage_of(folder), stage_of(folder, ball_model(7))
     batch = part.batch
     part.batch = lambda step, objects: batch(step, objects) if step < 3 else 1 / 0  # a checkpoint is of step 2
     with pytest.raises(ZeroDivisionError):
         train(part, options_of(part, tmp_path / "parts"))
     train(other, options_of(other, tmp_path / "parts"))  # other parameters, which the checkpoint replaces
-    of = {name: torch.load(tmp_path / name / "state.pt", weights_only=True) for name in ("whole", "parts")}
-    for key in ("model", "average"):
-        for name, value in of["whole"][key].items():
-            assert torch.equal(value, of["parts"][key][name]), name
-    assert numbers(tmp_path / "whole") == numbers(tmp_path / "parts")
+    assert_same_run(whole, tmp_path / "parts")
 
 
 def test_two_parts_of_a_batch_add_up_to_the_whole(folder):
@@ -123,10 +138,11 @@ workers.leave()
 def test_two_processes_have_the_losses_of_one(folder, tmp_path):
     script = tmp_path / "worker.py"
     script.write_text(WORKER)
-    env = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
     group = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", script]
-    for name, start in (("one", [sys.executable, script]), ("two", group)):
-        subprocess.run([*start, folder, tmp_path / name, "3"], env=env, check=True, capture_output=True, timeout=300)
+    call = [*group, folder, tmp_path / "two", "3"]
+    subprocess.run(call, env=ENVIRONMENT, check=True, capture_output=True, timeout=300)
+    stage = stage_of(folder)
+    train(stage, options_of(stage, tmp_path / "one", steps=3))
     one, two = (numbers(tmp_path / n) for n in ("one", "two"))
     assert len(one) == len(two) == 3
     for a, b in zip(one, two, strict=True):
@@ -134,52 +150,21 @@ def test_two_processes_have_the_losses_of_one(folder, tmp_path):
             assert b[name] == pytest.approx(a[name], rel=1e-3, abs=2e-6), name  # float32 sums in another order
 
 
-def test_killed_at_any_moment_a_run_goes_on_as_if_never_stopped(folder, tmp_path):
-    script = tmp_path / "worker.py"
-    script.write_text(WORKER)
-    env = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
-    call = [sys.executable, script, folder]
-    subprocess.run([*call, tmp_path / "whole", "6"], env=env, check=True, capture_output=True, timeout=300)
-    state = tmp_path / "killed" / "state.pt"
-    with subprocess.Popen([*call, state.parent, "6"], env=env, stderr=subprocess.DEVNULL) as process:
+def test_killed_at_any_moment_a_run_goes_on_as_if_never_stopped(folder, whole, tmp_path, threads):
+    (tmp_path / "worker.py").write_text(WORKER)
+    log = tmp_path / "killed" / "log.jsonl"
+    call = [sys.executable, tmp_path / "worker.py", folder, log.parent, "6"]
+    with subprocess.Popen(call, env=ENVIRONMENT, stderr=subprocess.DEVNULL) as process:
         end = time.monotonic() + 240
         while process.poll() is None and time.monotonic() < end:
-            log = state.parent / "log.jsonl"
             if log.exists() and len(log.read_text().splitlines()) > 3:  # between two checkpoints
                 process.send_signal(signal.SIGKILL)
                 break
             time.sleep(0.01)
-    subprocess.run([*call, state.parent, "6"], env=env, check=True, capture_output=True, timeout=300)
-    a, b = (torch.load(tmp_path / n / "state.pt", weights_only=True) for n in ("whole", "killed"))
-    assert all(torch.equal(v, b["model"][k]) for k, v in a["model"].items())
-    assert numbers(tmp_path / "whole") == numbers(tmp_path / "killed")
-
-
-@pytest.mark.slow
-def test_killed_twenty_times_a_run_has_the_curve_of_one_that_never_was(folder, tmp_path):
-    (tmp_path / "worker.py").write_text(WORKER)
-    env = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
-    call = [sys.executable, tmp_path / "worker.py", folder]
-    subprocess.run([*call, tmp_path / "whole", "300"], env=env, check=True, capture_output=True, timeout=300)
-    out, rng = tmp_path / "killed", random.Random(0)
-    for _ in range(20):
-        log = out / "log.jsonl"
-        until = rng.randrange(5) + (log.read_bytes().count(b"\n") if log.exists() else 0)
-        with subprocess.Popen([*call, out, "300"], env=env, stderr=subprocess.DEVNULL) as process:
-            end = time.monotonic() + 120
-            while process.poll() is None and time.monotonic() < end:
-                if log.exists() and log.read_bytes().count(b"\n") >= until:
-                    break
-                time.sleep(0.005)
-            time.sleep(rng.uniform(0.0, 0.5))  # also while a checkpoint is written
-            assert process.poll() is None
-            process.send_signal(signal.SIGKILL)
-        if (out / "state.pt").exists():
-            checkpoint.load(out / "state.pt")  # whole
-    subprocess.run([*call, out, "300"], env=env, check=True, capture_output=True, timeout=300)
-    a, b = (torch.load(tmp_path / n / "state.pt", weights_only=True) for n in ("whole", "killed"))
-    assert all(torch.equal(v, b["model"][k]) for k, v in a["model"].items())
-    assert numbers(tmp_path / "whole") == numbers(tmp_path / "killed")
+    threads(1)
+    stage = stage_of(folder, ball_model(7))
+    train(stage, options_of(stage, log.parent))
+    assert_same_run(whole, log.parent)
 
 
 def test_a_log_loses_what_was_half_written_and_what_comes_again(tmp_path):
