@@ -27,11 +27,11 @@ def main(argv: list[str] | None = None) -> int:
     p = argparse.ArgumentParser(prog="python -m tests.side_by_side", description=__doc__.splitlines()[0])
     p.add_argument("folder", type=Path)
     p.add_argument("output", type=Path)
-    for name, value in vars(clients.Shot()).items():
+    for name, value in vars(clients.Viewpoint()).items():
         p.add_argument(f"--{name}", type=type(value), default=value)
-    p.add_argument("--studio", action="store_true", help="under the package's studio instead of its own light")
+    p.add_argument("--studio", action="store_true", help="under the package's studio instead of the estimated lighting")
     args = p.parse_args(argv)
-    shot = clients.Shot(args.size, args.fov, args.azimuth, args.elevation, args.distance)
+    viewpoint = clients.Viewpoint(args.size, args.fov, args.azimuth, args.elevation, args.distance)
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         for name in ("mesh.glb", "environment.hdr", "environment.exr"):
@@ -42,10 +42,10 @@ def main(argv: list[str] | None = None) -> int:
         light = read_environment(folder / "environment.exr")
         try:
             images = {
-                "reli3d-render": clients.ours(folder / "mesh.glb", light, shot, SAMPLES),
-                "three.js": clients.three_js(folder, shot),
-                "model-viewer": clients.model_viewer(folder, shot),
-                "Blender Cycles": clients.blender(folder, shot),
+                "reli3d-render": clients.ours(folder / "mesh.glb", light, viewpoint, SAMPLES),
+                "three.js": clients.three_js(folder, viewpoint),
+                "model-viewer": clients.model_viewer(folder, viewpoint),
+                "Blender Cycles": clients.blender(folder, viewpoint),
             }
         except pytest.skip.Exception as missing:  # a client is not there
             print(missing, file=sys.stderr)

@@ -152,7 +152,7 @@ def test_nothing_given_is_written_to_and_nothing_of_it_is_given_back(device, nam
 
 @pytest.mark.slow  # 20 s of tracing
 @pytest.mark.parametrize("held_out", [True, False])
-def test_a_compiled_function_around_an_operation_gives_the_same_bits(device, held_out):
+def test_a_compiled_function_around_an_operation_is_bitwise_equal(device, held_out):
     case = CASES["shade"]
     run = torch.compiler.disable(case.run) if held_out else case.run
 

@@ -88,7 +88,7 @@ def test_the_work_of_a_killed_process_is_done_again(where, maps, alone, tmp_path
 
 
 def test_what_cannot_be_made_is_reported_and_the_rest_is_made(maps, tmp_path, monkeypatch, capsys):
-    """A refused object and a process that died twice cost their own sample; a full disk ends the command."""
+    """A refused object and a worker that crashed twice cost only their own sample; a full disk ends the command."""
     ends = [
         objects.Row("0000000000", "refused", notes=("mesh: expected a surface, got none",)),
         objects.Row("0000000001", "failed", notes=(objects.CRASHED,)),

@@ -18,7 +18,7 @@ from reli3d.render.asset import Asset, TextureSet
 
 @pytest.fixture(scope="module")
 def glb(tmp_path_factory):
-    """A ball of 1280 triangles whose paint is a function of the place, at 128 texels."""
+    """A ball of 1280 triangles whose base color is a function of the position, at 128 texels."""
     from reli3d.geometry.bake import bake
 
     ball = trimesh.creation.icosphere(3)
@@ -59,9 +59,9 @@ def test_fewer_triangles_keep_the_shape_and_the_base_color(glb, tmp_path, capsys
     # 400 triangles on a unit ball: sagitta of an edge of 0.27 is 0.009
     assert float((asset.mesh.vertices.norm(dim=1) - 1).abs().max()) < 0.03
     uv = (asset.mesh.uv * 128).long().clamp(0, 127)
-    paint = asset.textures.base_color[uv[:, 1], uv[:, 0]]
-    # a texel is 0.03 of the ball, where the paint changes by 0.012; borders of charts are a texel off
-    assert float((paint - (0.5 + 0.4 * asset.mesh.vertices)).abs().mean()) < 0.03
+    base_color = asset.textures.base_color[uv[:, 1], uv[:, 0]]
+    # a texel is 0.03 of the ball, where the base color changes by 0.012; borders of charts are a texel off
+    assert float((base_color - (0.5 + 0.4 * asset.mesh.vertices)).abs().mean()) < 0.03
 
 
 def test_vertex_colors_are_baked_where_the_format_has_none_and_notes_are_printed(glb, tmp_path, capsys):

@@ -101,7 +101,7 @@ def test_an_evil_folder_ends_with_2_one_line_and_no_file(tmp_path, capsys, name,
     assert not (tmp_path / "out").exists()
 
 
-def test_one_bad_object_does_not_stop_the_rest_which_has_the_same_bits(example, tmp_path, capsys):
+def test_one_bad_object_leaves_the_others_bitwise_equal(example, tmp_path, capsys):
     (tmp_path / "bad").mkdir()
     assert command(tmp_path, tmp_path / "bad", infer.EXAMPLE) == 1
     assert results.complete(tmp_path / "out" / "example")

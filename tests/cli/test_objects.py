@@ -1,4 +1,4 @@
-"""Many objects: in one process, in several, on Ray; nothing is lost and nothing done twice where processes die."""
+"""Many objects: in one process, in several, on Ray; nothing is lost and nothing done twice where workers crash."""
 
 import csv
 import json
@@ -16,7 +16,7 @@ from reli3d.errors import InputError
 from tests.support.checkout import ROOT
 from tests.support.jobs import Start, WordJob
 
-WORDS = ["one", "die once", "three", "refuse", "die", "six", "fail", "eight", "nine", "die once"]
+WORDS = ["one", "crash once", "three", "refuse", "crash", "six", "fail", "eight", "nine", "crash once"]
 WITH_RAY = pytest.param("ray", marks=pytest.mark.slow)  # its cluster takes half a minute to start
 
 
@@ -44,7 +44,7 @@ def rows(where: str, start: Start, items: list[objects.Item], count: int = 2):
 
 @pytest.mark.parametrize("where", ["here", "processes", WITH_RAY])
 def test_every_object_has_one_row_and_one_result(tmp_path, where):
-    words = [w for w in WORDS if "die" not in w]
+    words = [w for w in WORDS if "crash" not in w]
     items = folders(tmp_path, words)
     found = {row.object: row for row in rows(where, Start(tmp_path / "log"), items)}
     assert list(sorted(found)) == [item.name for item in items]
@@ -72,13 +72,13 @@ def test_a_worker_that_crashes_loses_nothing_and_its_object_is_made_once_more(tm
     found = rows(where, Start(tmp_path / "log"), items)
     assert sorted(row.object for row in found) == [item.name for item in items]  # one row each
     retried = {row.object for row in found if row.retried}
-    assert retried >= {item.name for item, word in zip(items, WORDS, strict=True) if "die" in word}
+    assert retried >= {item.name for item, word in zip(items, WORDS, strict=True) if "crash" in word}
     said = capsys.readouterr().err.splitlines()
     assert sorted(said) == sorted(f"{name}: its worker crashed; retrying" for name in retried)
     result = {row.object: row.result for row in found}
     finished = sorted((tmp_path / "log").read_text().split())
     for item, word in zip(items, WORDS, strict=True):
-        expected = {"refuse": "refused", "fail": "failed", "die": "failed"}.get(word, "done")
+        expected = {"refuse": "refused", "fail": "failed", "crash": "failed"}.get(word, "done")
         assert result[item.name] == expected, (word, found)
         assert (expected == "done") == item.target.exists()
         assert (item.name in finished) == (expected == "done") or item.name in retried  # its last line may be missing

@@ -84,7 +84,7 @@ def same_image(got, expected):
     return got.shape == expected.shape and int(off.max()) <= 1 and float((off > 0).float().mean()) < 0.01
 
 
-def straight(image):
+def unpremultiplied(image):
     """Color before its premultiplication by alpha; the transforms to 8 bits take this."""
     return image.radiance / image.alpha[..., None].clamp(min=1e-6)
 
@@ -119,7 +119,7 @@ def test_images_are_the_display_transform_of_the_exposed_radiance(scene, tone, t
     image = expected(scene)[0]
     for stops in (0, 1):
         rendering = pixels(run(scene, "--tone", tone, "--exposure", str(stops))["ball.png"])
-        shown = torch.cat([transform(2.0**stops * straight(image)), image.alpha[..., None]], -1)
+        shown = torch.cat([transform(2.0**stops * unpremultiplied(image)), image.alpha[..., None]], -1)
         assert same_image(rendering, bytes_of(shown))
     assert int(rendering[SIZE // 2, SIZE // 2, 0]) > int(rendering[SIZE // 2, SIZE // 2, 1])  # the red ball
 
@@ -148,7 +148,7 @@ def test_turntables_are_their_frames(scene, turn, monkeypatch):
     files = run(scene, *options)
     assert list(files) == [f"ball_{k:04d}.png" for k in range(3)]
     assert "3/3" in terminal.getvalue() and "frame" in terminal.getvalue()
-    shown = [torch.cat([linear_to_srgb(straight(image)), image.alpha[..., None]], -1) for image in frames]
+    shown = [torch.cat([linear_to_srgb(unpremultiplied(image)), image.alpha[..., None]], -1) for image in frames]
     assert all(same_image(pixels(path), bytes_of(image)) for path, image in zip(files.values(), shown, strict=True))
     for path, image in zip(run(scene, *options, "--format", "exr").values(), frames, strict=True):
         torch.testing.assert_close(read_hdr_image(path), image.radiance, rtol=2**-10, atol=1e-6)

@@ -74,7 +74,7 @@ def test_the_pipeline_takes_what_it_is_given():
 
 
 def test_the_reference_reconstructed_perfectly_has_perfect_figures(place, monkeypatch):
-    """The pipeline replaced by one that gives the object itself, in its own light at the photographs' exposure."""
+    """The pipeline replaced by one that gives the object itself, under its lighting at the photographs' exposure."""
     light = Environment(torch.rand(16, 32, 3, generator=torch.Generator().manual_seed(0)) + 0.2)
     ground_truth = objects.load_reference(place / "ball.glb", light, light, inputs=2, size=32, seed=0)
     exposure = objects.exposure_of(ground_truth, light)

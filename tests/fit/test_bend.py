@@ -57,11 +57,11 @@ def patches(asset) -> float:
 
 def test_waves_of_the_normals_are_baked_into_the_base_color_less(start, images):
     # the true base color is uniform; the large weights disable the bend
-    free, straight = (
+    free, unbent = (
         patches(changed(start, fitted(start, images, weights)))
         for weights in (Weights(palette=0.0), Weights(palette=0.0, free_bend=1e6, bend=1e6))
     )
-    assert free < 0.9 * straight
+    assert free < 0.9 * unbent
 
 
 def hue(asset) -> torch.Tensor:

@@ -27,7 +27,7 @@ OPTIONS = ShadeOptions(samples=(24, 8, 8), diffuse_model="published")
 
 
 def input_views(lights):
-    """The two-colored ball from all around, each view under its own light of ``lights(rotation of the camera)``."""
+    """The two-colored ball from all around, each view under the lighting ``lights(rotation of the camera)``."""
     true, views = small_scene.two_colored(small_scene.ball()), []
     batch = small_scene.input_views(small_scene.ball(), VIEWS, SIZE)
     for k in range(VIEWS):

@@ -200,10 +200,10 @@ def test_the_shared_pattern_sees_baked_shading():
 
 
 def test_maps_move_to_another_surface():
-    painted = small_scene.two_colored(small_scene.ball())
-    moved = transfer_textures(small_scene.ball(squeeze=0.96).mesh, painted, small_scene.TEXELS)
+    colored = small_scene.two_colored(small_scene.ball())
+    moved = transfer_textures(small_scene.ball(squeeze=0.96).mesh, colored, small_scene.TEXELS)
     # texels blend over the seam of the two colors, a small part of each half
-    assert torch.allclose(half_colors(moved), half_colors(painted), atol=0.02)
+    assert torch.allclose(half_colors(moved), half_colors(colored), atol=0.02)
 
 
 def test_weights_name_every_term_once():

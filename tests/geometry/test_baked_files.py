@@ -89,7 +89,7 @@ def check_file(path, source: Mesh) -> float:
     # roughness is green, metallic blue: 8 bit and a bilinear lookup of linear ramps, clipped at charts' borders
     ramps = np.clip(0.5 + 0.4 * position[:, 1:], 0, 1)
     assert np.abs(bilinear(orm, at)[:, 1:] - ramps).mean() < STEP
-    flat = bilinear(normal_map, at) * 2 - 1  # the baked normal is the mesh's own: straight up in its frame
+    flat = bilinear(normal_map, at) * 2 - 1  # the baked normal is the mesh's own: +Z of its frame
     assert np.median(flat[:, 2]) > 0.9999 and np.abs(flat[:, :2]).mean() < 1.5 * STEP
     expected, half = color(torch.from_numpy(position)).numpy(), 0.5 / len(image)
     shifts = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]]) * half

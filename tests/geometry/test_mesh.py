@@ -38,7 +38,7 @@ def test_normals_of_a_sphere_are_radial_and_unit(device):
 
 
 def test_normals_are_weighted_by_area():
-    # two faces at a right angle along x = 0, one three times as large
+    # two faces at a right angle along x = 0, one 3 times as large
     vertices = torch.tensor([[0.0, 0, 0], [0, 1, 0], [-3, 0, 0], [0, 0, 1]])
     faces = torch.tensor([[0, 1, 2], [0, 3, 1]], dtype=torch.int32)
     got = vertex_normals(vertices, faces)

@@ -29,7 +29,7 @@ def test_a_wave_on_a_closed_strip_is_scaled_by_its_eigenvalue():
         a, b, c, d = r * n + i, r * n + (i + 1) % n, (r + 1) % 3 * n + i, (r + 1) % 3 * n + (i + 1) % n
         faces += [torch.stack([a, b, d], -1), torch.stack([a, d, c], -1)]
     mesh = Mesh(at.view(-1, 3), torch.cat(faces).to(torch.int32))
-    # six neighbors: two along the ring, one straight and one a step on in each neighbor ring
+    # six neighbors: two along the ring, one opposite and one a step on in each neighbor ring
     eigenvalue = (2 + 4 * math.cos(3 * 2 * math.pi / n)) / 6 - 1
     got = taubin_smooth(mesh, iterations=1, step=1.0, pass_band=0.1).vertices.view(3, n, 3)[..., 2]
     mean = got.mean(0) @ torch.cos(3 * phi) / (n / 2)

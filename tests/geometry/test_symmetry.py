@@ -143,7 +143,7 @@ def test_few_views_and_rolled_cameras_are_ambiguous():
     assert mirror_plane(distances(TWIN, rolled), rolled) is None
 
 
-def test_upright_is_a_right_angle_to_what_is_level():
+def test_upright_is_perpendicular_to_horizontal_edges():
     up = torch.tensor([0.48, 0.6, -0.64])
     torch.testing.assert_close(upright(cameras(up=tuple(up.tolist()))), up, rtol=0, atol=1e-5)
     low = cameras(eyes=[(0.0, -1.0, 2.0), (2.0, -1.0, 0.1), (-2.0, -0.5, 0.0)])  # from below

@@ -157,10 +157,10 @@ def test_trimesh_reads_the_same_surface_and_colors(asset, tmp_path):
     assert np.abs(error - color(torch.from_numpy(p)).numpy()).mean() < STEP
 
 
-@pytest.mark.parametrize("level", [0, 1, 37, 128, 254, 255])
-def test_pygltflib_reads_constants_back_exactly(asset, tmp_path, level):
+@pytest.mark.parametrize("byte", [0, 1, 37, 128, 254, 255])
+def test_pygltflib_reads_constants_back_exactly(asset, tmp_path, byte):
     pygltflib = pytest.importorskip("pygltflib")
-    flat = torch.full((8, 8, 3), level * STEP)
+    flat = torch.full((8, 8, 3), byte * STEP)
     write_glb(tmp_path / "a.glb", Asset(asset.mesh, TextureSet(srgb_to_linear(flat), 0.2, 0.6, flat)))
     document = pygltflib.GLTF2().load(str(tmp_path / "a.glb"))
 
@@ -170,9 +170,9 @@ def test_pygltflib_reads_constants_back_exactly(asset, tmp_path, level):
         return np.asarray(Image.open(io.BytesIO(blob)))
 
     material = document.materials[0]
-    assert (pixels(material.pbrMetallicRoughness.baseColorTexture) == level).all()
+    assert (pixels(material.pbrMetallicRoughness.baseColorTexture) == byte).all()
     assert (pixels(material.pbrMetallicRoughness.metallicRoughnessTexture) == [255, 51, 153]).all()  # G rough, B metal
-    assert (pixels(material.normalTexture) == level).all()
+    assert (pixels(material.normalTexture) == byte).all()
 
 
 def test_own_reader_gives_the_asset_back(asset, tmp_path):

@@ -43,7 +43,7 @@ def test_gray_palette_and_cmyk_come_out_as_color(tmp_path):
     assert float(alpha[0, 0]) == 0.0
     assert float(alpha.max()) == 1.0
     cmyk, _ = read_image(saved(tmp_path, Image.new("CMYK", (16, 16), (0, 255, 255, 0)), "ink.jpg", quality=95))
-    assert (cmyk[8, 8] - torch.tensor([1.0, 0.0, 0.0])).abs().max() < 0.03  # JPEG of a flat color: a few levels
+    assert (cmyk[8, 8] - torch.tensor([1.0, 0.0, 0.0])).abs().max() < 0.03  # JPEG of a flat color: a few 8-bit steps
 
 
 def test_16_bit_gray_keeps_its_precision(tmp_path):
@@ -117,8 +117,8 @@ def test_a_linear_image_is_encoded_by_its_suffix(tmp_path):
         np.testing.assert_allclose(got, 255 * srgb(linear.numpy()).clip(0, 1), atol=0.5 + 1e-3)  # 8 bits
     write_image(tmp_path / "a.PNG", image)
     got = np.asarray(Image.open(tmp_path / "a.PNG"))
-    straight = image[..., :3] / alpha[..., None].clamp(min=1e-6)
-    np.testing.assert_allclose(got[..., :3], 255 * srgb(straight.numpy()).clip(0, 1), atol=0.5 + 1e-3)
+    unmultiplied = image[..., :3] / alpha[..., None].clamp(min=1e-6)
+    np.testing.assert_allclose(got[..., :3], 255 * srgb(unmultiplied.numpy()).clip(0, 1), atol=0.5 + 1e-3)
     np.testing.assert_allclose(got[..., 3], 255 * alpha.numpy(), atol=0.5 + 1e-3)
     for channels, name in ((image, "RGBA"), (image[..., :3], "RGB"), (image[..., 0], "Y")):
         write_image(tmp_path / "a.exr", channels)

@@ -140,7 +140,7 @@ def test_a_thousand_scans_are_refused_and_ten_are_not(tmp_path):
 
 
 def glb(path, **document):
-    """A GLB of one triangle at the origin; ``document`` takes the place of top-level fields."""
+    """A GLB of one triangle at the origin; ``document`` replaces fields of the root object."""
     binary = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32).tobytes()
     document = {
         "asset": {"version": "2.0"},

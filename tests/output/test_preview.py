@@ -33,8 +33,8 @@ def test_unseen_views_are_far_from_those_taken_and_show_all(asset, azimuths, lea
     assert len(unseen) == 4
     to = torch.nn.functional.normalize(torch.stack([c.c2w[:3, 3] for c in unseen]) - 2.0, dim=-1)
     given = torch.nn.functional.normalize(cameras[:, :3, 3] - 2.0, dim=-1)
-    apart = torch.rad2deg(torch.acos((to @ given.T).clamp(-1, 1)))
-    assert float(apart.min()) > least, apart.amin(1)  # places 15 degrees apart
+    angle = torch.rad2deg(torch.acos((to @ given.T).clamp(-1, 1)))
+    assert float(angle.min()) > least, angle.amin(1)  # places 15 degrees apart
     assert float((to @ to.T - 2 * torch.eye(4)).max()) < math.cos(math.radians(29.0))  # and from each other
     for camera in unseen:
         pixels, depth = project(asset.mesh.vertices, camera.c2w, camera.intrinsics)
@@ -61,7 +61,7 @@ def test_the_sheet_holds_the_inputs_unseen_views_maps_and_a_small_light(asset):
 
 
 def test_the_filter_takes_noise_and_leaves_edges(asset):
-    """Against 500 samples a subpixel; a checkered ball, so that what blurs the paint shows."""
+    """Against 500 samples a subpixel; a checkered ball, so that blur of the base color shows."""
     checks = torch.where(((torch.arange(32)[:, None] // 4 + torch.arange(32) // 4) % 2 == 0)[..., None], 0.8, 0.1)
     maps = replace(textures(32, "cpu"), base_color=checks.expand(-1, -1, 3).contiguous())
     checkered = replace(asset, textures=maps)

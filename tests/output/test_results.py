@@ -78,7 +78,7 @@ def test_a_kill_at_any_operation_leaves_one_whole_result_and_every_foreign_file(
         assert done.returncode in (0, -signal.SIGKILL), done.stderr
         if before and how == "exchange" and sys.platform == "linux":
             assert folder.exists()  # at every moment
-        if folder.exists():  # what anybody else sees now: never a mixture
+        if folder.exists():  # the state for other processes: never a mixture
             assert len(words(folder)) == 1
         with claimed(folder, OURS):  # the next start
             found = words(folder) if folder.exists() else {"none"}

@@ -37,7 +37,7 @@ DECIBELS = 26.0
 
 @pytest.fixture(scope="module")
 def asset(tmp_path_factory) -> Asset:
-    """A ball: convex, painted, with a metal edge, rough enough for prefiltered light."""
+    """A ball: convex, textured, with a metal edge, rough enough for prefiltered light."""
     mesh = ball_mesh(4, 0.7)
     rows, columns = torch.meshgrid(torch.arange(64), torch.arange(64), indexing="ij")
     color = torch.stack([0.3 + rows / 128, 0.9 - columns / 96, (0.4 + (rows + columns) / 256)], -1)
@@ -89,8 +89,8 @@ def psnr(image: np.ndarray, color: torch.Tensor, alpha: torch.Tensor, *, shared:
 
 
 def shown(image: Render, brightness: float = 1.0) -> torch.Tensor:
-    straight = brightness * image.radiance / image.alpha[..., None].clamp(min=1e-6)
-    return linear_to_srgb(straight.clamp(0, 1))
+    unmultiplied = brightness * image.radiance / image.alpha[..., None].clamp(min=1e-6)
+    return linear_to_srgb(unmultiplied.clamp(0, 1))
 
 
 def choose(**values) -> str:

@@ -15,10 +15,10 @@ from reli3d.io.usd import usdz_bytes
 from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.environment import Environment
 from tests.support import clients
-from tests.support.clients import Shot
+from tests.support.clients import Viewpoint
 from tests.support.scenes import ball_mesh
 
-SHOT = Shot()
+VIEWPOINT = Viewpoint()
 MIRROR = (0, 12, 0)  # samples by visible normals alone
 LAMPS = {0: (0.55, 0.45, 0.7), 1: (0.9, 0.1, -0.25)}  # red and green: channel and direction
 
@@ -33,7 +33,7 @@ class Seen:
         weight = self.color[..., channel] - self.color[..., 1 - channel] - 30.0  # above the blur of either lamp
         weight = weight.clip(min=0.0) * self.mask
         assert weight.sum() > 0, "no highlight"
-        y, x = np.mgrid[0 : SHOT.size, 0 : SHOT.size] + 0.5
+        y, x = np.mgrid[0 : VIEWPOINT.size, 0 : VIEWPOINT.size] + 0.5
         return np.array([(x * weight).sum(), (y * weight).sum()]) / weight.sum()
 
 
@@ -60,7 +60,7 @@ def ours(folder) -> Seen:
 
 
 def rendered(glb: Path, light: Environment) -> Seen:
-    return of_rgba(clients.ours(glb, light, SHOT, MIRROR))
+    return of_rgba(clients.ours(glb, light, VIEWPOINT, MIRROR))
 
 
 def agree(got: Seen, expected: Seen) -> None:
@@ -91,7 +91,7 @@ def of_rgba(rgba: np.ndarray) -> Seen:
     "client", [clients.three_js, clients.model_viewer, pytest.param(clients.blender, marks=pytest.mark.slow)]
 )
 def test_a_client_shows_the_light_where_we_do(client, folder, ours):
-    agree(of_rgba(client(folder, SHOT)), ours)
+    agree(of_rgba(client(folder, VIEWPOINT)), ours)
 
 
 @pytest.mark.slow  # bpy is a third of a gigabyte, for one version of Python
@@ -114,7 +114,7 @@ def test_blender_shows_the_exports_as_the_glb(folder, tmp_path):
     for file, data in obj_files(asset, "mesh").items():
         (tmp_path / file).write_bytes(data)
     glb, usdz, obj, exchanged = (
-        clients.blender(tmp_path, SHOT, file) for file in ("mesh.glb", "mesh.usdz", "mesh.obj", "exchanged.glb")
+        clients.blender(tmp_path, VIEWPOINT, file) for file in ("mesh.glb", "mesh.usdz", "mesh.obj", "exchanged.glb")
     )
 
     def off(image):

@@ -115,7 +115,7 @@ def faded(views: Views) -> Views:
 
 @pytest.mark.parametrize("kills", [10, pytest.param(200, marks=pytest.mark.slow)])
 def test_kills_at_random_moments_leave_one_whole_result(tmp_path, kills):
-    """A process that exchanges results as fast as it can; what it is killed in, nobody chooses."""
+    """A process that exchanges results as fast as it can, killed at random moments."""
     folder, rng, seen = tmp_path / "out" / "name", Random(7), set()
     for k in range(kills):
         pid = os.fork()
@@ -132,7 +132,7 @@ def test_kills_at_random_moments_leave_one_whole_result(tmp_path, kills):
         time.sleep(rng.uniform(0.0, 0.05))
         os.kill(pid, signal.SIGKILL)
         os.waitpid(pid, 0)
-        if folder.exists():  # what anybody else sees now
+        if folder.exists():  # the state for other processes
             assert len({(folder / name).read_text() for name in NAMES}) == 1
         with claimed(folder, NAMES):  # the next start
             words = {(folder / name).read_text() for name in NAMES} if folder.exists() else {"none"}

@@ -20,7 +20,7 @@ PACKAGE = ROOT / "reli3d"
 SOURCES = sorted(PACKAGE.rglob("*.py"))
 
 
-LEVEL = {part: level for level, layer in enumerate(LAYERS) for part in layer}
+POSITION = {part: position for position, layer in enumerate(LAYERS) for part in layer}
 STARTERS = {"torch", "warp"}  # what ``import reli3d`` alone must not load
 
 
@@ -69,7 +69,12 @@ def violations(source: str, module: str, is_package: bool = False) -> list[str]:
             bad.append(f"{module} imports warp; what launches kernels is a public operation of its own")
         if top in ("tests", "bench"):
             bad.append(f"{module} imports {target}, which is not shipped")
-        if top == "reli3d" and part and part_of(target) not in ("", part) and LEVEL[part_of(target)] >= LEVEL[part]:
+        if (
+            top == "reli3d"
+            and part
+            and part_of(target) not in ("", part)
+            and POSITION[part_of(target)] >= POSITION[part]
+        ):
             bad.append(f"{module} imports {target}, which does not lie below it")
     return bad
 
@@ -78,7 +83,7 @@ def violations(source: str, module: str, is_package: bool = False) -> list[str]:
 def test_imports_point_down(path):
     module = name_of(path)
     part = part_of(module)
-    assert not part or part in LEVEL, f"{part}: give the new part its place in LAYERS"
+    assert not part or part in POSITION, f"{part}: give the new part its place in LAYERS"
     assert violations(path.read_text(), module, path.name == "__init__.py") == []
 
 

@@ -54,9 +54,9 @@ def test_what_would_lose_digits_is_refused():
 
 
 def test_a_grid_from_numpy_gives_the_same_surface():
-    level = np.random.default_rng(0).normal(size=(5, 6, 7)).astype(np.float32)
+    sdf = np.random.default_rng(0).normal(size=(5, 6, 7)).astype(np.float32)
     alpha = np.ones((4 * 5 * 6, 8), np.float32)
-    a, b = extract_surface(level, radius=1.0, alpha=alpha), extract_surface(torch.from_numpy(level), radius=1.0)
+    a, b = extract_surface(sdf, radius=1.0, alpha=alpha), extract_surface(torch.from_numpy(sdf), radius=1.0)
     assert torch.equal(a.vertices, b.vertices) and torch.equal(a.faces, b.faces)
 
 

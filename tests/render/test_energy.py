@@ -85,8 +85,8 @@ def view(cos_o, device):
 
 @pytest.mark.parametrize("alpha", [1e-3, 0.01, 0.1, 0.5, 1.0])
 def test_neither_specular_nor_diffuse_nor_metal_gains_energy(device, alpha):
-    """Each alone, the published paint too.  Coat and published paint of a white dielectric together may: the paint
-    loses what the microfacets reflect, not what the coat does (docs/results.md)."""
+    """Each alone, the published diffuse model too.  Coat and published diffuse lobe of a white dielectric together may:
+    the lobe loses the energy of the microfacets, not that of the coat (docs/results.md)."""
     u = halton(1 << 16, device=device)
     width, one = torch.tensor(alpha, device=device), torch.ones((), device=device)
     for cos_o in (0.02, *COSINES):
@@ -111,7 +111,7 @@ def test_no_surface_sends_out_more_than_comes_in(device):
                 highest = max(highest, float(sent.max()))
                 dielectric += [float(sent[0])] if metallic == 0.0 else []
     assert highest <= 1.0 + 1e-3
-    assert min(dielectric) > 0.75 and max(dielectric) > 0.97  # and it does so without making white paint gray
+    assert min(dielectric) > 0.75 and max(dielectric) > 0.97  # without making a white diffuse surface gray
     published = albedo(view(0.05, device), number(0.1), base, number(0.0), u, diffuse_model="published")
     assert float(published[0]) > 1.2  # what the test is there to see: 1.30
 

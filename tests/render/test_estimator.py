@@ -104,13 +104,13 @@ def spread(roughness, metallic, environment, runs=256, base=None, **options):
     n = 24 * runs
     rough = torch.full((n,), roughness, device=normal.device).requires_grad_()
     facing, view = normal.repeat(runs, 1).requires_grad_(), wo.repeat(runs, 1)
-    paint, fixed = base.repeat(runs, 1).requires_grad_(), facing.detach()
+    base_color, fixed = base.repeat(runs, 1).requires_grad_(), facing.detach()
     out = shade(
-        *at(fixed, facing, fixed, view, paint, rough, torch.full_like(rough, metallic).detach()),
+        *at(fixed, facing, fixed, view, base_color, rough, torch.full_like(rough, metallic).detach()),
         environment,
         options=ShadeOptions(**{"sequence": "random", **options}),
     ).mean(1)
-    gradient, turn, tint = torch.autograd.grad(out.sum(), (rough, facing, paint))
+    gradient, turn, tint = torch.autograd.grad(out.sum(), (rough, facing, base_color))
     turn = turn - (turn * fixed).sum(-1, keepdim=True) * fixed
     return [v.detach().double().reshape(runs, 24, -1) for v in (out, gradient, turn, tint)]
 
@@ -258,5 +258,5 @@ def test_the_mixture_wins_mixed_cases_and_its_worst_case_is_a_hundred_times_bett
                 best = 1 + min(range(3), key=lambda k: found[1 + k])
                 if interval(runs[0], runs[best])[1] < 1.0:
                     wins.add((name, roughness, metallic))
-    assert wins >= {("sky", 0.05, 0.0), ("sky", 0.3, 0.0), ("sun", 0.3, 1.0)}  # coat over paint; glossy metal and sun
+    assert wins >= {("sky", 0.05, 0.0), ("sky", 0.3, 0.0), ("sun", 0.3, 1.0)}  # coat over diffuse; glossy metal and sun
     assert worst[0] * 100.0 < min(worst[1:]), worst

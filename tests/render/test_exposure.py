@@ -72,8 +72,8 @@ def test_where_nothing_is_seen_nothing_changes(device, scene):
     assert ratio(asset, images, torch.zeros_like(inside), camera) == 1.0
 
 
-def painted(device, scene, *color):
-    """The ball of ``scene`` in a paint of linear ``color``."""
+def colored(device, scene, *color):
+    """The ball of ``scene`` with the linear base ``color``."""
     asset, camera, inside = scene
     maps = textures(4, device, color, roughness=0.6, metallic=0.0)
     return Asset(asset.mesh, maps, asset.environment), camera, inside
@@ -97,10 +97,10 @@ def test_the_tint_of_photographs_goes_to_the_light(device, scene):
 
 
 def test_the_most_likely_base_color_is_the_mean_of_three_normal_distributions(device, scene):
-    """Where paint, light and guess are at the prior means nothing changes; else each pulls by its weight."""
+    """Where base color, light and prediction are at the prior means nothing changes; else each pulls by its weight."""
     prior = float(torch.tensor(exposure.ALBEDO).exp())
     lit = prior * float(torch.tensor(exposure.LIGHT).exp())
-    asset, camera, inside = painted(device, scene, prior, prior, prior)
+    asset, camera, inside = colored(device, scene, prior, prior, prior)
     # two conversions to sRGB and back in float32
     plain = factor(asset, photographs(device, lit, lit, lit), inside, camera)
     torch.testing.assert_close(plain, torch.ones(3), rtol=1e-4, atol=0)
@@ -110,22 +110,22 @@ def test_the_most_likely_base_color_is_the_mean_of_three_normal_distributions(de
     weights = weights / weights.sum()
     dark = factor(asset, photographs(device, *3 * [lit / 3]), inside, camera)
     torch.testing.assert_close(dark, torch.full((3,), float((1 / 3) ** weights[1])), rtol=1e-4, atol=0)
-    bright, *_ = painted(device, scene, *3 * [prior * 2])
+    bright, *_ = colored(device, scene, *3 * [prior * 2])
     again = factor(bright, photographs(device, lit, lit, lit), inside, camera)
     torch.testing.assert_close(again, torch.full((3,), float(2.0 ** (weights[2] - 1))), rtol=1e-4, atol=0)
 
 
 def test_a_base_color_more_saturated_than_the_images_is_reduced(device, scene):
     """A dark gray thing, guessed blue: the photographs are nearly gray."""
-    asset, camera, inside = painted(device, scene, 0.03, 0.1, 0.15)
+    asset, camera, inside = colored(device, scene, 0.03, 0.1, 0.15)
     images = photographs(device, 0.010, 0.013, 0.018)
-    paint = torch.tensor([0.03, 0.1, 0.15]) * factor(asset, images, inside, camera)
-    assert 1.5 < float(paint[2] / paint[0]) < 3.5 and float(paint.mean()) < 0.08
+    base_color = torch.tensor([0.03, 0.1, 0.15]) * factor(asset, images, inside, camera)
+    assert 1.5 < float(base_color[2] / base_color[0]) < 3.5 and float(base_color.mean()) < 0.08
     assert torch.equal(factor(asset, images, torch.zeros_like(inside), camera), torch.ones(3))
 
 
 def test_the_estimated_asset_shows_the_photographs_color(device, scene):
-    asset, camera, inside = painted(device, scene, 0.03, 0.1, 0.15)
+    asset, camera, inside = colored(device, scene, 0.03, 0.1, 0.15)
     images = photographs(device, 0.010, 0.013, 0.018)
     rays = RayScene(asset.mesh.vertices, asset.mesh.faces)
     after = estimate_base_color_and_light(asset, images, inside, camera, rays)

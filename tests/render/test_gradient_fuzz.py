@@ -26,8 +26,8 @@ FLOOR = float(ALPHA_MIN)
 def drawn(n, seed=0):
     """Unit normal, geometric normal, view, light ``(n, 3)``; base ``(n, 3)``, alpha, metallic ``(n,)``.
 
-    A quarter of the views, and of the lights, lies in the surface, an eighth near it, an eighth straight above, an
-    eighth straight behind, the rest anywhere above or below; of the parameters half are at an edge, half anywhere.
+    A quarter of the views, and of the lights, lies in the surface, an eighth near it, an eighth exactly above, an
+    eighth exactly behind, the rest anywhere above or below; of the parameters half are at an edge, half anywhere.
     """
     g = torch.Generator().manual_seed(seed)
     unit = lambda: normalize(torch.randn(n, 3, generator=g), dim=-1)  # noqa: E731

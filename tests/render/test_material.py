@@ -11,7 +11,7 @@ from tests.support import mitsuba_scene, reference
 
 def pairs(n, seed=0, low=0.02, alpha=None):
     """Directions, base color, GGX width and metallic: every other ``wi`` drawn from the lobe of ``wo`` by the float64
-    twin, since directions drawn apart from each other miss a narrow lobe; the rest, and those below ``low``, anyhow."""
+    twin, since independent directions miss a narrow lobe; the rest, and those below ``low``, anyhow."""
     g = torch.Generator().manual_seed(seed)
     d = torch.nn.functional.normalize(torch.randn(2, n, 3, generator=g), dim=-1)
     d[..., 2] = d[..., 2].abs().clamp(min=low)
@@ -49,7 +49,7 @@ def test_reciprocity(device, diffuse_model):
     for alpha in (None, 0.01):  # within so narrow a lobe, and at grazing angles, the facet's cosine must not cancel
         wo, wi, *rest = (v.to(device) for v in pairs(100_000, 1, alpha=alpha))
         a, b = (eval_bsdf(o, *rest, i, diffuse_model=diffuse_model) for o, i in ((wo, wi), (wi, wo)))
-        torch.testing.assert_close(a, b, rtol=1e-5, atol=0)  # the same bits on a CPU
+        torch.testing.assert_close(a, b, rtol=1e-5, atol=0)  # equal bit for bit on a CPU
 
 
 def test_energy_is_never_created(device):
@@ -124,8 +124,8 @@ def test_value_equals_mitsubas_materials(device, alpha):
     that coat ``diffuse``, times what Mitsuba's own coat leaves of it (coat over white metal is its reflectance).
 
     Mitsuba masks with the product of both G1, which float64 turns into the height-correlated G2, and its coat reflects
-    by Fresnel's equations where ours has Schlick's.  Else they are the same formula.  The paint of ``principled``
-    itself is another one (Burley's, with retro-reflection).
+    by Fresnel's equations where ours has Schlick's.  Else they are the same formula.  The diffuse lobe
+    of ``principled`` is another one (Burley's, with retro-reflection).
     """
     mi = mitsuba_scene.load()
     wo, wi, *_ = pairs(4000, 5, low=0.05, alpha=alpha)

@@ -12,7 +12,7 @@ from tests.support.surfaces import points
 
 
 def test_one_row_and_plain_numbers_hold_for_all_points(device):
-    """The same bits as written out, and gradients that are the rows' sums."""
+    """Equal bit for bit to the expanded values, and gradients that are the rows' sums."""
     normal, wo = (v.to(device) for v in points(300))
     light = Environment(sky().radiance.to(device))
     color = torch.tensor([0.8, 0.5, 0.2], device=device)

@@ -216,10 +216,12 @@ def test_image_gradient_reaches_textures_and_light(device):
     )
     grads = torch.autograd.grad(image.radiance.sum(), [*maps, light])
     assert all(bool(torch.isfinite(g).all()) and float(g.abs().max()) > 0 for g in grads)
-    assert float(grads[0].min()) >= 0.0 and float(grads[4].min()) >= 0.0  # more paint and more light are brighter
+    assert (
+        float(grads[0].min()) >= 0.0 and float(grads[4].min()) >= 0.0
+    )  # a larger base color and more light are brighter
 
 
-def test_no_light_is_gained_at_the_rim_but_with_the_published_paint(device):
+def test_no_light_is_gained_at_the_rim_except_by_the_published_diffuse_model(device):
     """A smooth white ball in a furnace.  Rays from below the horizon never hit it, so it shadows nothing itself."""
     asset = ball(device, (1.0, 1.0, 1.0))
     camera, white = (
@@ -268,7 +270,7 @@ def test_bad_input_is_named(device):
         sample_texture(asset.textures.normal, torch.tensor([[np.nan, 0.0]], dtype=torch.float32, device=device))
 
 
-def test_parts_shadow_each_other_and_keep_their_paint(device):
+def test_parts_shadow_each_other_and_keep_their_base_color(device):
     floor = square(device)
     flat = floor.vertices[:, [0, 2, 1]] * torch.tensor([2.0, 1.0, -2.0], device=device)
     floor = Mesh(flat + torch.tensor([0, -0.6, 0], device=device), floor.faces, None, floor.uv)

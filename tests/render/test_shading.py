@@ -156,7 +156,7 @@ def test_embree_and_warp_cast_the_same_shadows_in_values_and_gradients():
     for one, other, unshadowed in zip(a, b, free, strict=True):  # normal, base color, roughness, metallic, texels
         assert (
             reference.fraction_within(one, other) >= 0.998
-        )  # those points; where no ray differs all are the same bits
+        )  # those points; where no ray differs all are equal bit for bit
         assert reference.fraction_within(one, unshadowed) < 0.9  # the shadow is there
 
 

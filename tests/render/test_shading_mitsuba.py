@@ -109,16 +109,16 @@ def test_image_of_a_cow_equals_mitsubas(device, material, shared_data):
 
 BUDGET = 2_000_000  # light samples of our image; Mitsuba's own image tests spend as many
 FLOOR = 1e-4  # of the variance of a sample, as there
-ACCEPT, LEVEL = 0.9975, 0.01
+ACCEPT, SIGNIFICANCE = 0.9975, 0.01
 
 
 def rejected(got, expected, variance, samples):
-    """Pixels and channels that a z-test at ``LEVEL`` over all of them (Sidak) tells from the reference.
+    """Pixels and channels that a z-test at ``SIGNIFICANCE`` over all of them (Sidak) tells from the reference.
 
     ``variance``: of one sample of the reference; ``samples``: how many ``got`` is the mean of.
     """
     z = np.abs(got - expected) * np.sqrt(samples / np.maximum(variance, FLOOR))
-    return erfc(z / 2**0.5) < 1.0 - (1.0 - LEVEL) ** (1.0 / z.size)  # erfc(z / sqrt 2) = 2 (1 - Phi(z))
+    return erfc(z / 2**0.5) < 1.0 - (1.0 - SIGNIFICANCE) ** (1.0 / z.size)  # erfc(z / sqrt 2) = 2 (1 - Phi(z))
 
 
 def compare_image(material, sky, stage):
@@ -278,10 +278,10 @@ def test_gradients_with_shadows_equal_mitsubas(device, material):
         expected.append(row + [float((texels * p).sum()) for p in probes])
     got = []
     for k in range(runs):
-        paint, rough = torch.tensor(BASE).requires_grad_(), torch.tensor(math.sqrt(alpha)).requires_grad_()
+        base_color, rough = torch.tensor(BASE).requires_grad_(), torch.tensor(math.sqrt(alpha)).requires_grad_()
         map_ = environment.radiance.clone().requires_grad_()
-        out = stage.shade(paint, rough, metallic, Environment(map_), k)
-        grads = torch.autograd.grad((out * weight).sum(), (paint, rough, map_))
+        out = stage.shade(base_color, rough, metallic, Environment(map_), k)
+        grads = torch.autograd.grad((out * weight).sum(), (base_color, rough, map_))
         to_alpha = float(grads[1]) / (2.0 * math.sqrt(alpha))
         got.append([*grads[0].tolist(), to_alpha, *((grads[2] * p).sum().item() for p in probes)])
     got, expected = np.array(got), np.array(expected)

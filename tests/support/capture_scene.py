@@ -98,8 +98,8 @@ def render_capture(
     target, roll = rng.normal(0, 0.03, (views, 3)), rng.normal(0, 0.04, (views, 3))
     if turntable:
         elevation[:], distance[:], target[:], roll[:] = np.radians(30), 2.9, 0.0, 0.0
-    level = np.cos(elevation) * distance
-    eye = np.stack([level * np.sin(azimuth), np.sin(elevation) * distance, level * np.cos(azimuth)], -1)
+    horizontal = np.cos(elevation) * distance
+    eye = np.stack([horizontal * np.sin(azimuth), np.sin(elevation) * distance, horizontal * np.cos(azimuth)], -1)
     rows = torch.linspace(1.2, 0.5, 32)[:, None, None].expand(32, 64, 3)
     light = rows * torch.tensor(rng.uniform(0.5, 1.5, (32, 64, 1)), dtype=torch.float32) if turntable else rows.clone()
     light[4:8, 10:18] = 6.0

@@ -20,8 +20,8 @@ MIXTURES = [(0.1, 45), (0.5, 80), (1.0, 0)]
 MAPS = ("one texel", "constant", "3 x 2", "sun", "next to the sun", "four black rows", "one black row", "odd")
 # of the suite: fraction, fine and coarse pass of each case and one for the cosine, on both devices
 TESTS = 2 * 3 * (len(LOBES) * len(DRAWS) + 2 * len(MIXTURES) + len(MAPS) + 1)
-LEVEL = 1.0 - 0.99 ** (1.0 / TESTS)  # Sidak: 1 % for the family
-MAX_Z = float(-ndtri(LEVEL / 2))  # standard deviations
+SIGNIFICANCE = 1.0 - 0.99 ** (1.0 / TESTS)  # Sidak: 1 % for the family
+MAX_Z = float(-ndtri(SIGNIFICANCE / 2))  # standard deviations
 
 EXPECTED_MIN = 5.0  # below this count the normal limit behind chi-square fails (Cochran 1954)
 CELLS_MIN = 90  # of the fine pass
@@ -94,22 +94,22 @@ class Window:
         x, y, z = self.wo.double().tolist()
         flat = math.hypot(x, y)
         axes = torch.tensor([[-x, -y, 0.0], [y, -x, 0.0]], dtype=torch.float64, device=self.wo.device) / flat
-        high = 3.1 * z / flat  # a mirrored normal faces wo, so wi is at most three times as high
+        high = 3.1 * z / flat  # a mirrored normal faces wo, so wi is at most 3 times as high
         if not self.mirrored:
             high = math.tan(12.0 * self.alpha + math.atan(z / flat))  # a slope of 6 alpha of the half vector
         return *axes, z / flat, high, 6.0 * self.alpha
 
     def places(self, d: Tensor) -> tuple[Tensor, Tensor]:
-        level, across, own, high, wide = self.frame()
-        ahead = d.double() @ level
+        horizontal, across, own, high, wide = self.frame()
+        ahead = d.double() @ horizontal
         v = torch.where(ahead > 0.0, d[:, 2] / ahead, -1.0)
         return v / high, (d.double() @ across) / ahead / (v + own) / wide * 0.5 + 0.5
 
     def at(self, y: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
-        level, across, own, high, wide = self.frame()
+        horizontal, across, own, high, wide = self.frame()
         v, s = y * high, (2.0 * x - 1.0) * wide
-        up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64, device=level.device)
-        d = level + (s * (v + own))[:, None] * across + v[:, None] * up
+        up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64, device=horizontal.device)
+        d = horizontal + (s * (v + own))[:, None] * across + v[:, None] * up
         length = d.norm(dim=-1)
         return d / length[:, None], (v + own) / length**3 * (2.0 * wide * high)
 
@@ -208,11 +208,11 @@ def refusal(observed: np.ndarray, mass: np.ndarray, total: int) -> str:
         return "samples where the density is 0"
     expected = mass * (valid / mass.sum())
     p, cells = pooled(observed, expected)
-    if cells < CELLS_MIN or p < LEVEL:
+    if cells < CELLS_MIN or p < SIGNIFICANCE:
         return f"{cells} cells, p = {p:.2g}"
     label = quantiles(mass, max(3, int(valid**0.5 / 80))).ravel()  # 2 % is 7 times the noise at 1e5 samples, 22 at 1e6
     p, cells = pooled(np.bincount(label, observed.ravel()), np.bincount(label, expected.ravel()))
-    return f"{cells} coarse cells, p = {p:.2g}" if p < LEVEL else ""
+    return f"{cells} coarse cells, p = {p:.2g}" if p < SIGNIFICANCE else ""
 
 
 def check(

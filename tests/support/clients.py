@@ -33,7 +33,7 @@ THREE = Path(reli3d.__file__).parent / "assets" / "viewer" / "three.min.js"
 
 
 @dataclass(frozen=True)
-class Shot:
+class Viewpoint:
     """A square image of the origin; angles in degrees."""
 
     size: int = 256
@@ -48,10 +48,10 @@ class Shot:
         return self.distance * np.array([math.sin(a) * math.cos(e), math.sin(e), math.cos(a) * math.cos(e)])
 
 
-def ours(glb: Path, light: Environment, shot: Shot, samples: tuple[int, int, int]) -> np.ndarray:
+def ours(glb: Path, light: Environment, viewpoint: Viewpoint, samples: tuple[int, int, int]) -> np.ndarray:
     """RGBA ``(H, W, 4)`` in [0, 255], sRGB, as all others are."""
-    pose = look_at(torch.tensor(shot.eye, dtype=torch.float32), torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))
-    camera = Camera.from_fov(pose, math.radians(shot.fov), shot.size, shot.size)
+    pose = look_at(torch.tensor(viewpoint.eye, dtype=torch.float32), torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))
+    camera = Camera.from_fov(pose, math.radians(viewpoint.fov), viewpoint.size, viewpoint.size)
     image = render_asset(read_glb(glb), camera, light, options=ShadeOptions(samples=samples), supersampling=2)
     color = linear_to_srgb((image.radiance / image.alpha[..., None].clamp(min=1e-6)).clamp(0, 1))
     return 255.0 * torch.cat([color, image.alpha[..., None]], -1).numpy()
@@ -88,26 +88,30 @@ viewer.addEventListener('load', () => setTimeout(() => { window.rendering = view
 </script>"""
 
 
-def _shown(folder: Path, page: str, shot: Shot) -> np.ndarray:
-    values = {**vars(shot), "polar": 90.0 - shot.elevation, "eye": ", ".join(f"{v:.6f}" for v in shot.eye)}
+def _shown(folder: Path, page: str, viewpoint: Viewpoint) -> np.ndarray:
+    values = {
+        **vars(viewpoint),
+        "polar": 90.0 - viewpoint.elevation,
+        "eye": ", ".join(f"{v:.6f}" for v in viewpoint.eye),
+    }
     (folder / "index.html").write_text(page % values)
     with chromium() as tab, served(folder) as url:
-        tab.open(f"{url}/index.html", size=(shot.size, shot.size)).wait("window.rendering")
+        tab.open(f"{url}/index.html", size=(viewpoint.size, viewpoint.size)).wait("window.rendering")
         return pixels(tab.evaluate("window.rendering")).astype(np.float64)
 
 
-def three_js(folder: Path, shot: Shot) -> np.ndarray:
+def three_js(folder: Path, viewpoint: Viewpoint) -> np.ndarray:
     """``folder`` holds ``mesh.glb``, ``environment.hdr`` and ``.exr``, and takes what the client needs."""
     shutil.copy(THREE, folder)
-    return _shown(folder, THREE_PAGE, shot)
+    return _shown(folder, THREE_PAGE, viewpoint)
 
 
-def model_viewer(folder: Path, shot: Shot) -> np.ndarray:
+def model_viewer(folder: Path, viewpoint: Viewpoint) -> np.ndarray:
     modules = os.environ.get("RELI3D_MODEL_VIEWER")
     if modules is None:
         pytest.skip("needs npm's @google/model-viewer in the folder RELI3D_MODEL_VIEWER")
     shutil.copy(Path(modules) / "@google" / "model-viewer" / "dist" / "model-viewer.min.js", folder)
-    return _shown(folder, MODEL_VIEWER_PAGE, shot)
+    return _shown(folder, MODEL_VIEWER_PAGE, viewpoint)
 
 
 BLENDER = """
@@ -147,12 +151,12 @@ bpy.ops.render.render(write_still=True)
 """
 
 
-def blender(folder: Path, shot: Shot, mesh: str = "mesh.glb") -> np.ndarray:
+def blender(folder: Path, viewpoint: Viewpoint, mesh: str = "mesh.glb") -> np.ndarray:
     """``mesh``: the file of ``folder`` that is loaded, ``.glb``, ``.usdz`` or ``.obj``."""
     place = os.environ.get("RELI3D_BPY")
     if place is None:
         pytest.skip("needs PyPI's bpy in the folder RELI3D_BPY")
-    options = [str(folder), str(shot.eye.tolist()), str(shot.fov), str(shot.size), mesh]
+    options = [str(folder), str(viewpoint.eye.tolist()), str(viewpoint.fov), str(viewpoint.size), mesh]
     command = [sys.executable, "-c", BLENDER, *options]
     environment = {**os.environ, "PYTHONPATH": place}
     done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=600)

@@ -19,7 +19,7 @@ FILES = ("mesh.glb", "environment.exr", "environment.hdr", "preview.png", "viewe
 class WordJob:
     """Writes the word of ``folder/word`` in ``target``, and a line in ``log`` for every result that it finishes.
 
-    The words ``die`` and ``die once`` kill the process in the middle of the work, ``wait`` waits there for a file
+    The words ``crash`` and ``crash once`` kill the process in the middle of the work, ``wait`` waits there for a file
       ``go``; ``refuse`` and ``fail`` are errors.  What they leave stands in ``folder``.
     """
 
@@ -36,8 +36,8 @@ class WordJob:
         with claimed(target, FILES) as replacing, replacing() as new:
             for file in FILES:
                 (new / file).write_text(word)
-            if word == "die" or (word == "die once" and not (folder / "died").exists()):
-                (folder / "died").touch()
+            if word == "crash" or (word == "crash once" and not (folder / "crashed").exists()):
+                (folder / "crashed").touch()
                 os.kill(os.getpid(), signal.SIGKILL)
             if word == "wait":
                 (folder / "waits").touch()

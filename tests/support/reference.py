@@ -74,8 +74,8 @@ def eval_bsdf(
 ) -> Tensor:
     """Lambert below Schlick, GGX with height-correlated Smith; directions above the horizon.
 
-    The paint loses what the surface reflects on the way in and out, with 1 - cos divided by 1 + alpha, or,
-    ``published``, what the microfacet does.
+    The diffuse lobe loses the energy that the surface reflects on the way in and out, with 1 - cos divided by
+    1 + alpha, or, ``published``, that of the microfacet.
     """
     wm = torch.nn.functional.normalize(wo + wi, dim=-1)
     f0 = 0.04 * (1.0 - metallic[..., None]) + base_color * metallic[..., None]

@@ -14,8 +14,8 @@ FACES = [[k for k in range(8) if CORNERS[k][axis] == side] for axis in range(3) 
 
 
 @lru_cache(None)
-def loops(case, apart=True):
-    """Sets of edges that one dual vertex averages; on an ambiguous face inside (else outside) corners stay apart."""
+def loops(case, separate=True):
+    """Sets of edges that one dual vertex averages; on an ambiguous face inside (else outside) corners stay separate."""
     inside = [bool(case >> k & 1) for k in range(8)]
     links = {e: set() for e, (a, b) in enumerate(EDGES) if inside[a] != inside[b]}
     for face in FACES:
@@ -23,7 +23,7 @@ def loops(case, apart=True):
         for e in on:
             for f in on:
                 shared = set(EDGES[e]) & set(EDGES[f])
-                if e != f and (len(on) == 2 or (shared and inside[min(shared)] == apart)):
+                if e != f and (len(on) == 2 or (shared and inside[min(shared)] == separate)):
                     links[e].add(f)
     found, left = [], set(links)
     while left:
@@ -48,16 +48,18 @@ def joined_face(case):
 
 @lru_cache(None)
 def loop_tables():
-    """``(2, 256, 12)`` loop of every crossed edge, -1 elsewhere, outside corners apart and inside ones; and the joined
+    """``(2, 256, 12)`` loop of every crossed edge, -1 elsewhere, outside, then inside corners separate; and the joined
     face of every case or -1.  Loops are numbered as the release does: by their first edge, edges by higher, then lower
     corner.
     """
     table = torch.full((2, 256, 12), -1)
-    for apart in (0, 1):
+    for separate in (0, 1):
         for case in range(256):
-            found = sorted(loops(case, bool(apart)), key=lambda loop: min(sorted(EDGES[e], reverse=True) for e in loop))
+            found = sorted(
+                loops(case, bool(separate)), key=lambda loop: min(sorted(EDGES[e], reverse=True) for e in loop)
+            )
             for n, loop in enumerate(found):
-                table[apart, case, list(loop)] = n
+                table[separate, case, list(loop)] = n
     faces = [joined_face(case) for case in range(256)]
     return table, torch.tensor([-1 if face is None else face for face in faces])
 

@@ -20,7 +20,7 @@ from reli3d.train.stages.step import object_losses
 from reli3d.train.stages.views import Samples, draw
 from tests.support.stages import ball_model
 
-LEVEL = 0.01 / 8  # eight tests of distributions, 1 per cent for all together
+SIGNIFICANCE = 0.01 / 8  # eight tests of distributions, 1 per cent for all together
 BOX = torch.as_tensor(trimesh.creation.box((1.0, 0.4, 0.15)).vertices, dtype=torch.float32)
 SWORD = torch.tensor([[0.0, -0.5, 0.0], [0.0, 0.5, 0.0], [0.03, 0.4, 0.01], [-0.03, 0.4, -0.01]])
 
@@ -45,20 +45,20 @@ def test_fields_of_view_follow_the_cut_normal_distribution(many):
     expected = stats.truncnorm(-3.0, 3.0, loc=29.5, scale=2.5)
     found = degrees(many)
     assert found.min() >= 22.0 - 1e-3 and found.max() <= 37.0 + 1e-3  # float32 intrinsics
-    assert stats.kstest(found, expected.cdf).pvalue > LEVEL
+    assert stats.kstest(found, expected.cdf).pvalue > SIGNIFICANCE
     found = fields_of_view(np.random.default_rng(5).random(1_000_000))  # so many tell a deviation of 2.5 from 2.55
-    assert stats.kstest(found, expected.cdf).pvalue > LEVEL
+    assert stats.kstest(found, expected.cdf).pvalue > SIGNIFICANCE
     np.testing.assert_allclose(fields_of_view(np.array([0.0, 0.5, 1.0])), [22.0, 29.5, 37.0], rtol=1e-9)
 
 
 def test_eyes_lie_evenly_over_their_zone_of_the_sphere(many):
     back = many.c2w[:, :3, 2].double().numpy()
     low, high = np.sin(np.radians([-20.0, 70.0]))
-    assert stats.kstest(back[:, 1], stats.uniform(low, high - low).cdf).pvalue > LEVEL
+    assert stats.kstest(back[:, 1], stats.uniform(low, high - low).cdf).pvalue > SIGNIFICANCE
     # the ends: of 4000 even numbers the outermost is further in than 0.3 per cent of the range once in 160,000 times
     assert low - 1e-6 < back[:, 1].min() < low + 0.004 and high - 0.004 < back[:, 1].max() < high + 1e-6
     turn = np.arctan2(back[:, 0], back[:, 2])
-    assert stats.kstest(turn, stats.uniform(-np.pi, 2 * np.pi).cdf).pvalue > LEVEL
+    assert stats.kstest(turn, stats.uniform(-np.pi, 2 * np.pi).cdf).pvalue > SIGNIFICANCE
     assert float(many.c2w[:, 1, 1].min()) > 0  # upright
 
 
@@ -74,7 +74,7 @@ def test_the_object_fills_the_frame_up_to_its_padding(points, monkeypatch):
         assert float(depth.min()) > 0 and float(inside.min()) > 0 and float(inside.max()) < 100
         inside, _ = project(points, still.c2w[k], still.intrinsics[k])
         free.append(float(torch.minimum(inside, 100 - inside).min()) / 100)
-    assert stats.kstest(free, stats.uniform(0.05, 0.05).cdf).pvalue > LEVEL
+    assert stats.kstest(free, stats.uniform(0.05, 0.05).cdf).pvalue > SIGNIFICANCE
     assert 0.05 - 1e-5 < min(free) < 0.0503 and 0.0997 < max(free) < 0.1 + 1e-5  # the ends, as above
     moved = (shifted.c2w[:, :3, 3] - still.c2w[:, :3, 3]).abs()
     assert 0.0 < float(moved.max()) < 0.05  # slight
@@ -88,7 +88,7 @@ def test_lights_are_three_different_ones_turned_evenly():
         chosen += numbers.tolist()
         turned += turns.tolist()
     for found, count in ((chosen, 10), (turned, 16)):
-        assert stats.chisquare(np.bincount(found, minlength=count)).pvalue > LEVEL
+        assert stats.chisquare(np.bincount(found, minlength=count)).pvalue > SIGNIFICANCE
     with pytest.raises(ValueError, match="maps: expected at least 3"):
         lights_of(2, 16, np.random.default_rng(0))
 

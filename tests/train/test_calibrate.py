@@ -62,9 +62,9 @@ def test_mismatch_is_the_error_of_an_image_in_one_color_at_its_best_brightness()
 
 def test_the_first_choice_within_a_standard_error_of_the_best_is_taken():
     rng = np.random.default_rng(0)
-    level = rng.normal(0, 5, (32, 1))  # objects differ far more than choices do: differences count, not means
+    offset = rng.normal(0, 5, (32, 1))  # objects differ far more than choices do: differences count, not means
     noise = rng.normal(0, 1, (32, 4))
-    errors = level + np.array([1.0, 0.02, 0.0, 0.4]) + 0.3 * (noise - noise.mean(0))
+    errors = offset + np.array([1.0, 0.02, 0.0, 0.4]) + 0.3 * (noise - noise.mean(0))
     assert one_standard_error_choice(errors) == 1  # 0.02 is within 0.3 sqrt(2 / 32) = 0.075, 1.0 is not
-    assert one_standard_error_choice(level + np.array([0.2, 0.1, 0.0, 0.4])) == 2  # no noise, no tie
+    assert one_standard_error_choice(offset + np.array([0.2, 0.1, 0.0, 0.4])) == 2  # no noise, no tie
     assert one_standard_error_choice(np.array([[3.0, 1.0, 2.0]])) == 1

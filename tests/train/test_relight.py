@@ -17,7 +17,7 @@ from reli3d.train.relight import Finish, draw_light, relight_views
 
 
 class Ball:
-    """A ball of one paint, rough on the one side and glossy metal on the other."""
+    """A ball of one base color, rough on the one side and glossy metal on the other."""
 
     def __init__(self):
         ball = trimesh.creation.icosphere(subdivisions=5, radius=0.5)

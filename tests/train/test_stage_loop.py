@@ -1,4 +1,4 @@
-"""The loop of the stages: it learns, stops and goes on with the same bits, alone or with others."""
+"""The loop of the stages: it learns, stops and resumes bitwise equal, in one process or several."""
 
 import json
 import signal

@@ -1,6 +1,6 @@
-"""Cameras far from their origin, or next to nothing apart: float64 where the poses are read, float32 about the object.
+"""Cameras far from their origin, or at nearly one position: float64 where the poses are read, float32 about the object.
 
-Float32 is 0.06 apart at 900,000: poses and vertices that went there lost their shape.
+The spacing of float32 is 0.06 at 900,000: poses and vertices that went there lost their shape.
 """
 
 import json

@@ -66,8 +66,8 @@ def test_the_frame_goes_before_the_file(tmp_path):
 )
 def test_one_axis_in_the_frame_and_the_other_in_the_file(tmp_path, x, y, low):
     together = load(tmp_path / "a", **{x: low, y: 1.3 * low})
-    apart = load(tmp_path / "b", {x: low}, **{y: 1.3 * low})
-    assert together.intrinsics.tolist() == apart.intrinsics.tolist()
+    separate = load(tmp_path / "b", {x: low}, **{y: 1.3 * low})
+    assert together.intrinsics.tolist() == separate.intrinsics.tolist()
     assert together.intrinsics[0, 0] != together.intrinsics[0, 1]
 
 

@@ -77,10 +77,10 @@ def test_of_two_values_nonzero_is_the_object(tmp_path, name):
     assert any("nonzero pixels are taken as the object" in n for n in notes) != (plain or "opaque" in name)
 
 
-@pytest.mark.parametrize("levels", [255, 16, 4])
-def test_gray_edges_are_coverage(tmp_path, levels):
+@pytest.mark.parametrize("steps", [255, 16, 4])
+def test_gray_edges_are_coverage(tmp_path, steps):
     """Antialiased in many or in few steps."""
-    stored = np.rint(np.rint(antialiased() * levels) / levels * 255).astype(np.uint8)
+    stored = np.rint(np.rint(antialiased() * steps) / steps * 255).astype(np.uint8)
     mask, notes = mask_of(tmp_path, stored)
     np.testing.assert_array_equal(mask, stored / np.float32(255))
     assert not any("mask" in n for n in notes)
@@ -158,14 +158,14 @@ def test_labels_in_the_alpha_of_an_image(tmp_path):
 
 @pytest.mark.parametrize("where", ["alpha", "mask", "gray alpha of a mask"])
 @pytest.mark.parametrize("spread", [2, 4, 9])
-def test_values_about_one_level_are_opaque(tmp_path, where, spread):
+def test_values_about_one_gray_are_opaque(tmp_path, where, spread):
     """Few or many values about 200, as of a lossy codec."""
     noise = np.random.default_rng(0).integers(200 - spread, 201 + spread, (SIDE, SIDE))
-    level = np.where(DISK, noise, 0).astype(np.uint8)
+    gray = np.where(DISK, noise, 0).astype(np.uint8)
     if where == "mask":
-        mask, notes = mask_of(tmp_path, level)
+        mask, notes = mask_of(tmp_path, gray)
     else:
-        pixels = np.dstack([np.full((SIDE, SIDE, 3), 90, np.uint8), level])
+        pixels = np.dstack([np.full((SIDE, SIDE, 3), 90, np.uint8), gray])
         if where == "alpha":
             folder(tmp_path, ["a.png"])
             Image.fromarray(pixels).save(tmp_path / "a.png")

@@ -50,7 +50,7 @@ def gray(k):
     return lambda v: np.repeat(v[..., k : k + 1], 3, -1)
 
 
-# kind of image: how a file of it is written, expected color, tolerance [levels of 255]
+# kind of image: how a file of it is written, expected color, tolerance [of 255]
 ACCEPTED = {
     "8-bit color": (saver("RGB", ".png"), lambda v: v[..., :3], 0),
     "8-bit color, TIFF": (saver("RGB", ".tif"), lambda v: v[..., :3], 0),
@@ -62,7 +62,7 @@ ACCEPTED = {
     "16-bit color": (lambda p: deep_png(p, DEEP[..., :3]), lambda v: v[..., :3], 1),  # the low byte is dropped
     "16-bit color with alpha": (lambda p: deep_png(p, DEEP), lambda v: v[..., :3], 1),
     "palette": (lambda p: PALETTE.save(p), lambda v: np.array(PALETTE.convert("RGB")), 0),
-    # Pillow's plain conversion to ink and back: each of the two rounds to a level
+    # Pillow's plain conversion to ink and back: each of the two rounds to 8 bits
     "CMYK": (
         lambda p: Image.fromarray(SHADES[..., :3]).convert("CMYK").save(p.with_suffix(".tif")),
         lambda v: v[..., :3],
@@ -81,12 +81,12 @@ REFUSED = {
 
 @pytest.mark.parametrize("name", ACCEPTED)
 def test_what_is_accepted_comes_out_as_stored(tmp_path, name):
-    write, expected, levels = ACCEPTED[name]
+    write, expected, tolerance = ACCEPTED[name]
     write(tmp_path / "a.png")
     (path,) = tmp_path.iterdir()
     color_of, alpha = read_image(path)
     exact = torch.from_numpy(np.ascontiguousarray(expected(SHADES))).float().expand(SIZE[1], SIZE[0], 3)
-    assert float((color_of * 255 - exact).abs().max()) <= levels + 1e-4  # a few ulp of float32 at 255
+    assert float((color_of * 255 - exact).abs().max()) <= tolerance + 1e-4  # a few ulp of float32 at 255
     assert (alpha is not None) == ("alpha" in name)
     if alpha is not None:
         assert torch.equal((alpha * 255).round().byte(), torch.from_numpy(SHADES[..., 3].copy()))
@@ -138,7 +138,7 @@ def test_a_large_photograph_keeps_its_object_and_its_camera(tmp_path, whole):
     for (x, y), (u, v) in zip(at.tolist(), now.tolist()):
         assert box[0] < x < box[2] and box[1] < y < box[3]
         color_of = image[int(v), int(u)] * 255
-        # the gradient moves by a level in 8 rows; JPEG and rounding cost two
+        # the gradient moves by 1/255 in 8 rows; JPEG and rounding cost two
         assert abs(float(color_of[0]) - x * 255 / width) < 3 and abs(float(color_of[1]) - y * 255 / height) < 3
         assert float(mask[int(v), int(u)]) == 1.0
     assert views.masks[0].dtype == torch.float32
