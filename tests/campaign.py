@@ -2,7 +2,7 @@
 
 Every input is a good file with one to four changes drawn from its seed, or one that is made with its ground truth
 (``tests.support.known``).  A forked process reads it, with limits on memory and time.  Allowed are a result, the right
-one with known ground truth, and ValueError and OSError of one line.  What fails is saved with its changes made as few
+one with known ground truth, and ValueError and OSError of one line.  Failing inputs are saved with as few changes
 as possible.  The same seed gives the same inputs.  Runs on Linux.
 """
 
@@ -34,7 +34,7 @@ from tests.support.mutators import edited
 from tests.support.readers import Target, targets
 
 SECONDS = 5.0  # of the processor, of one input
-MEMORY = 1 << 30  # bytes, of one input, above what the libraries take
+MEMORY = 1 << 30  # bytes, of one input, above the use of the libraries
 WALL = 120.0  # seconds after which a process that uses no processor hangs
 OWN_FAULT = 70  # exit code
 BATCH = 200  # inputs of one process
@@ -198,7 +198,7 @@ def _asleep(pid: int) -> bool:
 
 def _read_all(inputs: Sequence[tuple[int, Target, list[int]]], pipe: int, root: Path) -> None:
     """In the fork: each input in a folder of its own under ``root``."""
-    faulthandler.disable()  # pytest's; a crash is told by the parent
+    faulthandler.disable()  # pytest's; the parent reports a crash
     for stream in (1, 2):
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
     limit = _kilobytes("VmSize") * 1024 + 3 * MEMORY  # threads and their heaps take addresses, not memory

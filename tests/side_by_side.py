@@ -1,6 +1,6 @@
 """A reconstruction in our renderer and in three clients, in one image: ``python -m tests.side_by_side FOLDER OUT``.
 
-FOLDER is what reli3d-infer wrote for an object.  What the clients are and where they lie: ``tests/support/clients.py``.
+FOLDER is the output of reli3d-infer for an object.  For the clients see ``tests/support/clients.py``.
 """
 
 from __future__ import annotations

@@ -181,7 +181,7 @@ def points_of_a_mesh(g, tangents) -> Op:
         "normal": 0.5 + 0.5 * op_cases.above(size * size, 13).reshape(size, size, 3),
         "bary": op_cases.weights(rows),
     }
-    # few digits, so that the texture coordinates of points, which are float32, come out exactly
+    # few digits, so that the texture coordinates of points, which are float32, are exact
     leaves |= {k: (leaves[k] * digits).round() / digits for k, digits in (("uv", 4096.0), ("bary", 64.0))}
     if not tangents:
         leaves.pop("tangents")

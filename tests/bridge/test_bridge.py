@@ -112,7 +112,7 @@ def test_values_and_gradients_match_torch_in_float64(device, n):
 
 
 def test_every_slice_adds_into_its_own_buffer(monkeypatch, threads):
-    """Two threads that add into one buffer lose additions, seldom enough that a comparison of sums would miss it."""
+    """Two threads that add into one buffer lose additions, rarely enough that a comparison of sums would miss it."""
     threads(2)
     buffers, launch = [], wp.launch
 
@@ -160,7 +160,7 @@ def test_slices_within_slices_come_to_an_end(threads):
         (torch.ones(3), {"like": torch.ones(3, device="meta")}, ValueError, "x: expected device meta, got cpu"),
     ],
 )
-def test_check_says_what_it_expected(value, options, error, message):
+def test_check_reports_the_expected_value(value, options, error, message):
     with pytest.raises(error, match=message):
         _bridge.check("x", value, **options)
 
@@ -180,7 +180,7 @@ def run(code, **environment):
                           env={**os.environ, **environment}, cwd=ROOT)  # fmt: skip
 
 
-def test_unwritable_kernel_cache_falls_back_and_says_so(tmp_path):
+def test_unwritable_kernel_cache_falls_back_with_a_message(tmp_path):
     (tmp_path / "file").write_text("a file where the folder should be")
     done = run(LAUNCH.format(root=str(ROOT)), WARP_CACHE_PATH=str(tmp_path / "file"), TMPDIR=str(tmp_path))
     assert done.returncode == 0, done.stderr

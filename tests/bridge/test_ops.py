@@ -125,14 +125,14 @@ def test_an_edit_in_place_is_an_error_or_harmless(device, name):
             torch.testing.assert_close(
                 a, expected_grads[other], rtol=1e-5, atol=1e-6 * float(expected_grads[other].abs().max())
             )
-    # plain torch may keep copies of what it needs
+    # torch may keep copies of inputs
     assert refused or case.second == case.grads or name == "taubin_smooth"
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_nothing_given_is_written_to_and_nothing_of_it_is_given_back(device, name):
+def test_inputs_are_not_modified_and_outputs_do_not_alias_them(device, name):
     """What ``torch.library.opcheck`` requires of a schema: no input and no incoming gradient has other bits or another
-    version afterwards, and no output lies in the memory of an input."""
+    version afterwards, and no output uses the memory of an input."""
     case = CASES[name]
     given = leaves_of(case, device)
     before = {k: (v.detach().clone(), v._version) for k, v in given.items()}

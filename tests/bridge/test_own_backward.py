@@ -1,4 +1,4 @@
-"""What backward passes written by hand owe torch beyond the table of operations: inputs without a gradient, and
+"""Own backward passes, beyond the table of operations: inputs without a gradient, and
 gradients that are not required."""
 
 import pytest

@@ -43,7 +43,7 @@ def float64():
 
 @contextlib.contextmanager
 def other_device():
-    """``meta`` stands for any device whose memory a CPU cannot read."""
+    """``meta`` represents any device whose memory a CPU cannot read."""
     torch.set_default_device("meta")
     try:
         yield
@@ -90,7 +90,7 @@ def test_the_table_of_operations(name, state):
     expected = [g.detach() for g in gradients(leaves, plain)]
     with state():
         leaves, got = run()
-        if state is not autocast:  # a backward pass belongs outside, as torch's documentation says
+        if state is not autocast:  # a backward pass belongs outside, by torch's documentation
             found = gradients(leaves, got)
     if state is autocast:
         found = gradients(leaves, got)
@@ -225,7 +225,7 @@ def unchanged(tmp_path_factory):
 
 @pytest.mark.parametrize("state", [*STATES, torch.inference_mode])
 @pytest.mark.parametrize("name", OPERATIONS)
-def test_what_is_made_of_them(name, state, tmp_path, unchanged):
+def test_functions_built_on_operations(name, state, tmp_path, unchanged):
     expected = unchanged(name)
     with state():
         got = OPERATIONS[name](tmp_path)

@@ -105,10 +105,10 @@ def test_a_capture_is_placed_by_the_box_of_its_object(ground_truth, captured):
     assert abs(scale * np.ptp(vertices, axis=0).max() - 1.0) < 0.1
 
 
-def test_a_low_object_that_stands_on_the_ground_is_not_taken_for_normalized():
+def test_a_low_object_on_the_ground_is_not_taken_for_normalized():
     flat = tuple((0.1 * x, 0.1, 0.1 * z, 0.1) for x in range(-4, 5) for z in (-1, 0, 1))
     views = sphere_views(flat, eyes=eyes_around(8, 2.2))
-    assert normalize(views).is_identity()  # within what a hull of few views leaves open
+    assert normalize(views).is_identity()  # within the uncertainty of a hull of few views
     placed = normalize(replace(views, object_box=((-0.5, 0.0, -0.2), (0.5, 0.2, 0.2))))
     assert placed.scale == 1.0 and placed.translation.tolist() == [0.0, -0.1, 0.0]
 

@@ -1,4 +1,4 @@
-"""``reli3d capture``: exit codes, lines on stderr and what is left on the disk."""
+"""``reli3d capture``: exit codes, lines on stderr and files left on the disk."""
 
 from __future__ import annotations
 

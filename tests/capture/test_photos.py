@@ -128,7 +128,7 @@ def test_the_sharpest_frame_of_each_window_of_a_video_is_taken(tmp_path):
         read_photos(path, quiet)
 
 
-def test_what_is_no_capture_is_refused_in_one_line(tmp_path):
+def test_inputs_that_are_no_capture_are_refused_in_one_line(tmp_path):
     with pytest.raises(InputError, match="file not found"):
         read_photos(tmp_path / "nothing.jpg", quiet)
     (tmp_path / "notes.txt").write_text("no photograph")

@@ -12,7 +12,7 @@ from reli3d.capture.scene import find_plane
 
 
 def test_the_support_plane_is_the_largest_area_and_not_the_most_points():
-    """A cube of 6,000 points stands on a table of 800: the plane is the table, not a face of the cube."""
+    """A cube of 6,000 points on a table of 800: the plane is the table, not a face of the cube."""
     rng = np.random.default_rng(0)
     table = np.concatenate([rng.uniform(-1, 1, (800, 2)), rng.normal(0, 0.002, (800, 1))], 1)
     faces = []
@@ -102,6 +102,6 @@ def test_the_widest_gap_of_rings_of_cameras():
     assert widest_gap(ring(12, 0.0)) == pytest.approx(30.0, abs=1.0)
     slant = 2 * np.degrees(np.arcsin(np.cos(np.radians(30)) * np.sin(np.radians(15))))
     assert widest_gap(ring(12, 30.0)) == pytest.approx(slant, abs=1.0)
-    assert widest_gap(ring(8, 0.0, 240.0)) == pytest.approx(360 - 210, abs=1.0)  # the last stands at 210 degrees
+    assert widest_gap(ring(8, 0.0, 240.0)) == pytest.approx(360 - 210, abs=1.0)  # the last is at 210 degrees
     assert widest_gap(ring(60, 85.0)) == pytest.approx(2 * (85 - 45), abs=1.0)  # from above no side is seen
     assert widest_gap(np.concatenate([ring(12, 30.0), ring(12, -40.0)])) < 30

@@ -101,9 +101,9 @@ def test_view_refuses_in_one_line(tmp_path, monkeypatch, capsys, arguments):
     monkeypatch.chdir(tmp_path)
     (tmp_path / view.PAGE).touch()
     assert view.main(arguments) == 2
-    said = capsys.readouterr()
-    assert said.out == "" and said.err.startswith("reli3d view: ") and said.err.count("\n") == 1
-    assert "expected" in said.err
+    output = capsys.readouterr()
+    assert output.out == "" and output.err.startswith("reli3d view: ") and output.err.count("\n") == 1
+    assert "expected" in output.err
 
 
 def test_view_of_the_folder_above_names_the_one_below(tmp_path, capsys):

@@ -109,9 +109,9 @@ def test_closed_streams_change_nothing(tmp_path, streams):
 def test_full_streams_change_nothing(tmp_path, name):
     with open("/dev/full", "w") as full:
         process = start(["--output", tmp_path / "out"], **{name: full})
-        said = process.communicate(timeout=60)
-    assert process.returncode == 0, said
-    assert "Exception" not in "".join(s or "" for s in said)
+        output = process.communicate(timeout=60)
+    assert process.returncode == 0, output
+    assert "Exception" not in "".join(s or "" for s in output)
 
 
 def test_a_reader_that_goes_away_changes_nothing(tmp_path):
@@ -123,7 +123,7 @@ def test_a_reader_that_goes_away_changes_nothing(tmp_path):
 
 
 def test_a_full_disk_is_one_line_and_leaves_the_old_result(tmp_path):
-    """A limit on the size of a file stands for the disk: both raise OSError in the middle of a write."""
+    """A limit on the size of a file instead of a full disk: both raise OSError in the middle of a write."""
     (tmp_path / "out/example").mkdir(parents=True)
     (tmp_path / "out/example/mesh.glb").write_text("old")
     body = """import resource
@@ -141,7 +141,7 @@ def test_a_full_disk_is_one_line_and_leaves_the_old_result(tmp_path):
 @pytest.mark.skipif(os.name == "nt", reason="needs signals")
 @pytest.mark.parametrize("number, code", [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_while_the_interpreter_ends_is_one_line_too(tmp_path, number, code):
-    """After the path is printed the process waits for a thread, then for what is registered at exit."""
+    """After the path is printed the process waits for a thread, then for functions registered at exit."""
     codes = []
     for k in range(6):
         process = start(["--output", tmp_path / "out"], body=ENDS_LATE)
@@ -161,7 +161,7 @@ def test_a_signal_while_the_interpreter_ends_is_one_line_too(tmp_path, number, c
 
 @pytest.mark.parametrize("fails, code", [("", 0), ("; 1 / 0", 1)])
 def test_the_process_ends_before_python_frees_objects_and_ignores_signals(tmp_path, fails, code):
-    """Objects of torch take 1.6 s, in which no handler runs; one that takes a minute stands for them."""
+    """Objects of torch take 1.6 s, in which no handler runs; here one takes a minute."""
     kept = f"""atexit.register(print, "at exit")
             sys.kept = type("Kept", (), {{"__del__": lambda self, sleep=time.sleep: sleep(60)}})(){fails}"""
     process = start(["--output", tmp_path / "out"], body=f"{WRITES}\n            {kept}")
@@ -170,7 +170,7 @@ def test_the_process_ends_before_python_frees_objects_and_ignores_signals(tmp_pa
 
 
 @pytest.mark.parametrize("error", ["TypeError", "ValueError", "ImportError", "KeyError", "OSError"])
-def test_what_no_input_explains_is_one_line_exit_code_1_and_a_log(tmp_path, error):
+def test_an_internal_error_is_one_line_exit_code_1_and_a_log(tmp_path, error):
     body = f"raise {error}('spoon')"
     for options, traces in ([], 0), (["--traceback"], 1):
         process = start(["--output", tmp_path / "out", *options], body=body)

@@ -63,7 +63,7 @@ def at_work(of: int) -> list[int]:
             line = Path(f"/proc/{pid}/cmdline").read_bytes()
         except OSError:
             continue
-        if b"ray::_made" in line or b"spawn_main" in line:  # Ray writes there what a worker does
+        if b"ray::_made" in line or b"spawn_main" in line:  # Ray writes a worker's task there
             found.append(pid)
     return found
 
@@ -82,8 +82,8 @@ def test_the_work_of_a_killed_process_is_done_again(where, maps, alone, tmp_path
                 killed = found[0]
                 os.kill(killed, signal.SIGKILL)
             time.sleep(0.02)
-        _, told = process.communicate(timeout=300)
-    assert killed and process.returncode == 0, told
+        _, output = process.communicate(timeout=300)
+    assert killed and process.returncode == 0, output
     assert {p.name: p.read_bytes() for p in out.glob("*.safetensors")} == alone
 
 
@@ -96,8 +96,8 @@ def test_what_cannot_be_made_is_reported_and_the_rest_is_made(maps, tmp_path, mo
     ]
     monkeypatch.setattr(objects, "in_processes", lambda *_: (row for row in ends))
     assert data.main(call(maps, tmp_path)) == 1
-    told = capsys.readouterr().err
-    assert "0000000000: mesh: expected a surface" in told and "0000000001: its worker crashed twice" in told
+    output = capsys.readouterr().err
+    assert "0000000000: mesh: expected a surface" in output and "0000000001: its worker crashed twice" in output
     ends.append(objects.Row("0000000003", "failed", notes=("no space left",)))
     assert data.main(call(maps, tmp_path)) == 1
     assert "0000000003: no space left" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""``reli3d doctor``: says what is there, what is missing, and whether the package can work."""
+"""``reli3d doctor``: reports present and missing parts, and whether the package can work."""
 
 import hashlib
 import json

@@ -1,4 +1,4 @@
-"""The command from folders to files: what it writes, what it refuses, and how it ends."""
+"""The command from folders to files: outputs, refusals and exit codes."""
 
 import json
 import re

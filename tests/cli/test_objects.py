@@ -73,8 +73,8 @@ def test_a_worker_that_crashes_loses_nothing_and_its_object_is_made_once_more(tm
     assert sorted(row.object for row in found) == [item.name for item in items]  # one row each
     retried = {row.object for row in found if row.retried}
     assert retried >= {item.name for item, word in zip(items, WORDS, strict=True) if "crash" in word}
-    said = capsys.readouterr().err.splitlines()
-    assert sorted(said) == sorted(f"{name}: its worker crashed; retrying" for name in retried)
+    output = capsys.readouterr().err.splitlines()
+    assert sorted(output) == sorted(f"{name}: its worker crashed; retrying" for name in retried)
     result = {row.object: row.result for row in found}
     finished = sorted((tmp_path / "log").read_text().split())
     for item, word in zip(items, WORDS, strict=True):
@@ -167,7 +167,7 @@ def test_processes_end_when_the_command_is_killed(tmp_path):
     process.kill()
     assert process.wait() == -signal.SIGKILL
     process.communicate(timeout=30)  # the streams are open in all processes
-    assert not (tmp_path / "log").exists() and list(tmp_path.glob("out/*")) == []  # they removed what they had begun
+    assert not (tmp_path / "log").exists() and list(tmp_path.glob("out/*")) == []  # they removed partial results
 
 
 def test_the_summary_is_in_the_order_of_the_call_and_survives_every_name(tmp_path):
@@ -228,7 +228,7 @@ def test_wrong_options_end_with_2_before_the_work(tmp_path, capsys, monkeypatch,
     assert out == "" and err.count("\n") == 1 and word in err and not (tmp_path / "out").exists()
 
 
-def test_a_folder_in_the_place_of_the_summary_is_reported_at_once(tmp_path, capsys, monkeypatch):
+def test_a_folder_instead_of_the_summary_is_reported_at_once(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(job, "FolderJob", None)
     (tmp_path / "summary.csv").mkdir()
     assert infer.main(["a", "b", "--output", str(tmp_path)]) == 2

@@ -52,14 +52,14 @@ def run(folder, *options, light="half.hdr"):
     out = folder / "out"
     common = ["--output", str(out), "--size", str(SIZE), "--distance", str(DISTANCE), "--supersampling", "1"]
     lit = [] if light is None else ["--light", str(folder / light)]
-    said = io.StringIO()
-    with contextlib.redirect_stdout(said):
+    output = io.StringIO()
+    with contextlib.redirect_stdout(output):
         assert main([str(folder / "ball.glb"), *common, *lit, *options]) == 0
-    return {Path(name).name: Path(name) for name in said.getvalue().splitlines()}
+    return {Path(name).name: Path(name) for name in output.getvalue().splitlines()}
 
 
 def expected(folder, *, azimuth=30.0, yaw=0.0, seed=0, **options):
-    """What the view should be: the eye stands ``azimuth`` degrees from +Z towards +X and 20 above the horizon."""
+    """The expected view: the eye is ``azimuth`` degrees from +Z towards +X and 20 above the horizon."""
     parts = read_glb(folder / "ball.glb")
     low, high = parts[0].mesh.vertices.amin(0), parts[0].mesh.vertices.amax(0)
     a, lift = math.radians(azimuth), math.radians(20.0)
@@ -181,8 +181,8 @@ def test_diffuse_model_and_wrong_options(scene, capsys):
         ["--light", str(scene / "none.hdr")],
     ):
         assert main([*common, *wrong]) == 2
-        said = capsys.readouterr()
-        assert said.err.startswith("reli3d-render: ") and said.err.count("\n") == 1 and said.out == ""
+        output = capsys.readouterr()
+        assert output.err.startswith("reli3d-render: ") and output.err.count("\n") == 1 and output.out == ""
     assert not (scene / "none").exists()
 
 
@@ -192,8 +192,8 @@ def test_the_name_of_the_output_makes_an_animation(scene, tmp_path, ending):
     if ending == "mp4":
         av = pytest.importorskip("av")
     path = tmp_path / f"turn.{ending}"
-    said = io.StringIO()
-    with contextlib.redirect_stdout(said):
+    output = io.StringIO()
+    with contextlib.redirect_stdout(output):
         assert (
             main(
                 [
@@ -214,7 +214,7 @@ def test_the_name_of_the_output_makes_an_animation(scene, tmp_path, ending):
             )
             == 0
         )
-    assert json.loads(said.getvalue()) == {
+    assert json.loads(output.getvalue()) == {
         "files": [str(path)],
         "frames": 4,
         "size": 48,

@@ -68,7 +68,7 @@ def place(tmp_path_factory):
     return folder
 
 
-def test_the_pipeline_takes_what_it_is_given():
+def test_the_pipeline_takes_the_passed_arguments():
     requested = {"weights", "options"}
     assert requested <= set(inspect.signature(objects.reconstruct).parameters)
 

@@ -141,7 +141,7 @@ def test_a_fit_of_the_surface_includes_interreflection(monkeypatch):
 
 
 @pytest.mark.parametrize("metallic, weight", [(0.0, 1.0), (0.25, 0.75), (1.0, 0.0)])
-def test_lambertian_points_reflect_their_diffuse_albedo_times_what_they_receive(metallic, weight):
+def test_lambertian_points_reflect_their_diffuse_albedo_times_their_irradiance(metallic, weight):
     n = torch.tensor([[0.0, 0.0, 1.0]])
     base_color = torch.tensor([[0.8, 0.5, 0.1]])
     points = SurfacePoints(0.0 * n, n, n, base_color, torch.tensor([0.5]), torch.tensor([metallic]))

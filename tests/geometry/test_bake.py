@@ -239,7 +239,7 @@ def test_tangents_of_a_cylinder_follow_u(device):
 
 
 def test_tangents_weigh_faces_by_their_angle(device):
-    """At the origin a face of 90 degrees has +u along (1, 0), one of 45 degrees along (1, 1), solved by hand."""
+    """At the origin a face of 90 degrees has +u along (1, 0), one of 45 degrees along (1, 1), solved analytically."""
     p = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [-1, 1, 0]], device=device)
     uv = torch.tensor([[0.0, 0], [1, 0], [0, -1], [-1, -2]], device=device)
     faces = torch.tensor([[0, 1, 2], [0, 2, 3]], device=device).int()

@@ -140,8 +140,8 @@ def covered_fractions(model, views):
 
 @torch.no_grad()
 @pytest.mark.parametrize("count, least", [(1, 0.95), (4, 0.975)])
-def test_the_mesh_shows_what_the_photographs_show(count, least, monkeypatch):
-    """What is left lies at the outline, where smoothing takes a fraction of a cell: more of it bulges from one view."""
+def test_the_mesh_has_the_silhouettes_of_the_photographs(count, least, monkeypatch):
+    """The error is at the outline, where smoothing takes a fraction of a cell: more of it bulges from one view."""
     model = load_model("small", "cpu")
     views = load_views(Path(reli3d.__file__).parent / "assets/example", views=count)
     covered, exact = covered_fractions(model, views)

@@ -53,7 +53,7 @@ def test_the_order_brings_like_rays_together_and_loses_none(device, odd):
         assert scene._order(o[order], d[order]) is None
 
 
-def test_scenes_in_many_threads_answer_as_alone_and_are_given_back(device):
+def test_scenes_in_many_threads_answer_as_alone_and_are_freed(device):
     if device.type != "cpu":
         pytest.skip("Embree runs on CPU only")
     o, d = rays(3000, 6, 1.5)
@@ -74,10 +74,10 @@ def test_scenes_in_many_threads_answer_as_alone_and_are_given_back(device):
         thread.join()
     assert not failed
     tree = embree.Tree(*meshes[0])
-    held, given_back = weakref.ref(tree), []
-    weakref.finalize(tree, given_back.append, tree.scene)
+    held, freed = weakref.ref(tree), []
+    weakref.finalize(tree, freed.append, tree.scene)
     del tree
-    assert held() is None and len(given_back) == 1
+    assert held() is None and len(freed) == 1
 
 
 def test_embree_is_found_in_the_wheel_and_its_absence_is_reported(monkeypatch, tmp_path):

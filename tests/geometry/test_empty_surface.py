@@ -1,4 +1,4 @@
-"""Fields of one sign: no faces and gradients of zero, a closed box; and what every mesh operation makes of no faces."""
+"""Fields of one sign: no faces and gradients of zero, a closed box; and mesh operations on no faces."""
 
 import pytest
 import torch
@@ -58,7 +58,7 @@ def test_a_full_field_is_the_box_with_its_edges_cut_off(device):
         assert float(torch.autograd.grad(moved.vertices.square().sum(), leaf)[0].abs().max()) == 0.0
 
 
-def test_what_can_be_said_of_no_faces_is_said():
+def test_mesh_operations_accept_no_faces():
     with_all = Mesh(NOTHING.vertices, NOTHING.faces, torch.zeros(0, 3), torch.zeros(0, 2), torch.zeros(0, 4))
     loose = Mesh(torch.rand(4, 3), NOTHING.faces)  # vertices that no face uses
     for mesh in (NOTHING, with_all, loose):

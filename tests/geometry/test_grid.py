@@ -30,7 +30,7 @@ def test_values_and_gradients(device):
     exact = torch.autograd.grad((expected * weight.double()).sum(), (grid, points))
     torch.testing.assert_close(gradients[0], exact[0].float(), rtol=1e-4, atol=1e-3)  # sums of a hundred products
     inside = points.detach().abs().amax(-1) < 1
-    # gradients jump where a coordinate is a grid point's: a few in 5000 are nearer to one than float32 can tell
+    # gradients jump where a coordinate is a grid point's: a few in 5000 are nearer to one than float32 resolves
     close = ((gradients[1] - exact[1]).abs().amax(-1) < 1e-3)[inside]
     assert float(close.double().mean()) > 0.999
 

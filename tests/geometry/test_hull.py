@@ -124,7 +124,7 @@ def test_sphere_seen_by_eight_cameras(device):
     assert bool((got[true < -0.002] < 0).all())
 
 
-def test_only_what_is_far_outside_may_differ_where_far_is_given(device):
+def test_with_far_only_points_far_outside_differ(device):
     masks, camera = sphere_views(device)
     distance = mask_distance(masks)
     points = (torch.rand(4000, 3, generator=torch.Generator().manual_seed(2)) * 3.0 - 1.5).to(device)

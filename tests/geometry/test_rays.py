@@ -216,8 +216,8 @@ def test_rays_that_leave_any_triangle_never_meet_it_again(device, backend):
         assert int((hits.face >= 0).sum()) == 0
 
 
-def test_ordered_rays_give_what_each_gives_alone(device):
-    """Embree gets a large call's rays in another order: limits, misses and invalid rays must come back in place."""
+def test_ordered_rays_equal_each_alone(device):
+    """Embree gets a large call's rays in another order: limits, misses and invalid rays must keep their places."""
     mesh = trimesh.creation.icosphere(subdivisions=3)
     scene = make(mesh.vertices, mesh.faces, "embree" if device.type == "cpu" else "warp", device)
     o, d = (v.to(device) for v in rays(40_000, 6, 1.5))

@@ -48,7 +48,7 @@ def test_gradients_behind_the_mesh_are_bitwise_identical_for_any_number_of_threa
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
 
 
-def test_gradients_in_the_padding_reach_what_they_stand_at(device):
+def test_gradients_in_the_padding_reach_their_vertices(device):
     sdf = grid(5, device=device)[..., 0] + 0.1
     leaf = sdf.clone().requires_grad_()
     shift = torch.zeros(6, 6, 6, 3, device=device).requires_grad_()

@@ -1,4 +1,4 @@
-"""Components of graphs: SciPy's, of random graphs, chains and what has no links."""
+"""Components of graphs: against SciPy, of random graphs, chains and isolated nodes."""
 
 import numpy as np
 import pytest

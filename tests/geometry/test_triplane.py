@@ -29,7 +29,7 @@ def test_values_and_gradients_match_grid_sample_in_float64(device, channels, hei
     torch.testing.assert_close(
         g_got[0].double(), g_expected[0], rtol=0, atol=4e-5
     )  # of 600 points where there is 1 texel
-    # the gradient jumps at a texel center, which rounding may move a point across: none of these 600 points lies there
+    # the gradient jumps at a texel center, which rounding may move a point across: none of these 600 points is there
     for a, b in zip((got, *g_got), (expected, *g_expected), strict=True):
         assert fraction_within(a, b) >= 0.999
 

@@ -227,7 +227,7 @@ def test_normals_are_taken_over_and_gradients_reach_the_vertices():
 
 
 @pytest.mark.parametrize("atlas", [unwrap, unwrap_xatlas])
-def test_split_vertices_know_what_they_were(atlas):
+def test_split_vertices_refer_to_their_originals(atlas):
     whole = icosphere(2)
     mesh = atlas(whole)
     assert len(mesh.vertices) > len(whole.vertices)

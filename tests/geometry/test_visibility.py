@@ -24,7 +24,7 @@ def points(device, n=3000):
 
 
 def closed_form(p, n, camera):
-    """Facing and in the image; on a convex body nothing else stands between.  Also how near a point is to changing."""
+    """Facing and in the image; a convex body has no other occluder.  Also how near a point is to changing."""
     c2w = camera.c2w
     away = c2w[None, :, :3, 3].double() - p[:, None].double()
     cosine = (normalize(away, dim=-1) * n[:, None].double()).sum(-1)
@@ -38,7 +38,7 @@ def closed_form(p, n, camera):
 
 @pytest.mark.parametrize("backend", ["embree", "warp"])
 @pytest.mark.parametrize("size", [(SIZE, SIZE), (SIZE // 2, SIZE // 2), (SIZE, SIZE // 2)])
-def test_a_ball_is_seen_where_it_faces_the_camera_and_lies_in_the_image(device, backend, size):
+def test_a_ball_is_seen_where_it_faces_the_camera_within_the_image(device, backend, size):
     if backend == "embree" and device.type != "cpu":
         pytest.skip("Embree runs on the CPU")
     ball = trimesh.creation.icosphere(5)
@@ -56,8 +56,8 @@ def test_a_ball_is_seen_where_it_faces_the_camera_and_lies_in_the_image(device, 
     assert unsure.float().mean() < 0.05 and 0.05 < expected.float().mean() < 0.6
 
 
-def test_what_stands_between_hides(device):
-    """A plate between ball and first camera hides from it alone what lies behind."""
+def test_occluders_hide(device):
+    """A plate between ball and first camera occludes the points behind it from that camera only."""
     camera = rig(device)
     plate = torch.tensor([[-4.0, -4.0, 2.0], [4.0, -4.0, 2.0], [4.0, 4.0, 2.0], [-4.0, 4.0, 2.0]], device=device)
     scene = RayScene(plate, torch.tensor([[0, 1, 2], [0, 2, 3]], dtype=torch.int32, device=device))

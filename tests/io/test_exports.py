@@ -24,7 +24,7 @@ def asset() -> Asset:
     ball = trimesh.creation.icosphere(2)
     mesh = Mesh(torch.tensor(ball.vertices, dtype=torch.float32), torch.tensor(ball.faces, dtype=torch.int32))
     row, column = torch.meshgrid(torch.linspace(0, 1, SIZE), torch.linspace(0, 1, SIZE), indexing="ij")
-    color = torch.stack([row, column, torch.full_like(row, 0.2)], -1)  # tells up from down
+    color = torch.stack([row, column, torch.full_like(row, 0.2)], -1)  # different at top and bottom
     flat = torch.tensor([0.5, 0.5, 1.0]).expand(SIZE, SIZE, 3).contiguous()
     return Asset(unwrap(mesh, texture_size=SIZE).with_tangents(), TextureSet(color, row, column, flat))
 

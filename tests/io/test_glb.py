@@ -313,7 +313,7 @@ def test_limits_are_kept(asset, tmp_path):
         read_glb(tmp_path / "a.glb", max_vertices=100)
 
 
-def test_what_an_asset_lacks_is_named(asset, tmp_path):
+def test_missing_parts_of_an_asset_are_named(asset, tmp_path):
     m = asset.mesh
     with pytest.raises(ValueError, match="asset.mesh.tangents: expected a tensor, got None"):
         write_glb(tmp_path / "a.glb", Asset(Mesh(m.vertices, m.faces, m.normals, m.uv), asset.textures))

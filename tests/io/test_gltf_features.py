@@ -231,7 +231,7 @@ def test_morph_targets_sparse_and_quantized_accessors(tmp_path):
 
 
 def test_specular_glossiness_is_converted_for_each_texel(tmp_path):
-    """Gray materials of the metallic-roughness model, written in the other one, come back."""
+    """Gray materials of the metallic-roughness model, written in the other one, are read back."""
     base, metal, gloss = (np.random.default_rng(k).uniform(low, 1, (8, 8)) for k, low in enumerate((0.3, 0, 0)))
     metal[:, ::2] = np.rint(metal[:, ::2])
     specular = 0.04 * (1 - metal) + base * metal
@@ -342,7 +342,7 @@ def test_compressed_data_without_a_fallback_are_refused(tmp_path):
         quad.read(tmp_path)
 
 
-def test_what_is_left_out_is_noted_once(tmp_path):
+def test_omissions_are_noted_once(tmp_path):
     quad = Quad(alphaMode="BLEND", emissiveFactor=[0, 0, 1])
     quad.material()["occlusionTexture"] = quad.texture(noise(4, 4, 3))
     quad.document["materials"].append({"alphaMode": "MASK"})

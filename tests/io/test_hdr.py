@@ -79,7 +79,7 @@ def test_rgbe_edges_of_the_format(tmp_path):
     image = values[:, None].expand(8, 16)[..., None].expand(8, 16, 3).contiguous()
     write_hdr(tmp_path / "a.hdr", image)
     back = read_hdr_image(tmp_path / "a.hdr")[:, 0, 0]
-    torch.testing.assert_close(back, values, rtol=1 / 256, atol=1e-38)  # 1e-39 lies below the smallest exponent
+    torch.testing.assert_close(back, values, rtol=1 / 256, atol=1e-38)  # 1e-39 is below the smallest exponent
     assert float(back[0]) == 0.0
 
 
@@ -136,7 +136,7 @@ def test_mitsuba_sees_the_sun_where_we_put_it(tmp_path, suffix):
         )
         it = mi.SurfaceInteraction3f()
         it.wi = mi.Vector3f([-v for v in d])
-        assert abs(float(light.eval(it)[0]) - 100.0) < 0.1  # Mitsuba's texels lie up to half a texel off: hence 3 x 3
+        assert abs(float(light.eval(it)[0]) - 100.0) < 0.1  # Mitsuba's texels lie up to half a texel off, so 3 x 3
         it.wi = mi.Vector3f(d)
         assert float(light.eval(it)[0]) < 0.1
 
@@ -153,11 +153,11 @@ def test_an_environment_is_read_back(tmp_path):
 
 
 def test_an_environment_is_refused_by_name_and_shape(tmp_path):
-    for path, image, said in (
+    for path, image, message in (
         ("a.png", sky(), "path: expected"),
         ("a.exr", sky()[:8], "environment: expected a map"),
     ):
-        with pytest.raises(ValueError, match=said):
+        with pytest.raises(ValueError, match=message):
             write_environment(tmp_path / path, Environment(image))
     assert list(tmp_path.iterdir()) == []
 
@@ -289,7 +289,7 @@ PLANE = np.ones((4, 8), np.float32)
 
 
 @pytest.mark.parametrize(
-    "planes, header, said",
+    "planes, header, message",
     [
         ({"Y": PLANE, "RY": PLANE, "BY": PLANE}, {}, "channels: expected R, G, B or Y, got"),
         ({"X": PLANE, "Y": PLANE, "Z": PLANE}, {}, "channels: expected R, G, B or Y, got"),
@@ -301,9 +301,9 @@ PLANE = np.ones((4, 8), np.float32)
         ({"Y": PLANE}, {"colorInteropID": "srgb_rec709_scene"}, "colorInteropID: expected a linear RGB space"),
     ],
 )
-def test_an_exr_that_would_be_misread_is_refused(tmp_path, planes, header, said):
+def test_an_exr_that_would_be_misread_is_refused(tmp_path, planes, header, message):
     exr(tmp_path / "a.exr", planes, **header)
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(InputError, match=message):
         read_hdr_image(tmp_path / "a.exr")
 
 
@@ -323,7 +323,7 @@ def test_several_parts_are_refused(tmp_path):
         read_hdr_image(tmp_path / "a.exr")
 
 
-def test_what_is_not_applied_is_noted(tmp_path):
+def test_header_fields_that_are_not_applied_are_noted(tmp_path):
     exr(tmp_path / "a.exr", {"Y": PLANE}, envmap=OpenEXR.ENVMAP_LATLONG, pixelAspectRatio=2.0)
     write_hdr(tmp_path / "b.hdr", torch.ones(4, 8, 3))
     data = (tmp_path / "b.hdr").read_bytes().replace(b"\n\n", b"\nPIXASPECT=0.5\nGAMMA=2.2\n\n", 1)
@@ -416,7 +416,7 @@ def test_exposure_and_color_correction_are_divided_out(tmp_path, head, factor):
 
 
 @pytest.mark.parametrize(
-    "line, said",
+    "line, message",
     [
         (b"FORMAT=32-bit_rle_xyze", "FORMAT: expected 32-bit_rle_rgbe"),
         (b"COLORCORR=1 2", "COLORCORR: expected 3 positive numbers"),
@@ -425,8 +425,8 @@ def test_exposure_and_color_correction_are_divided_out(tmp_path, head, factor):
         (b"PRIMARIES=0.64 0.33", "PRIMARIES: expected"),
     ],
 )
-def test_header_lines_that_cannot_be_applied_are_refused(tmp_path, line, said):
-    with pytest.raises(InputError, match=said):
+def test_header_lines_that_cannot_be_applied_are_refused(tmp_path, line, message):
+    with pytest.raises(InputError, match=message):
         round_trip(tmp_path / "a.hdr", "-Y 6 +X 12", QUADS.tobytes(), b"#?RADIANCE\n" + line + b"\n\n")
 
 

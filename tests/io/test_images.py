@@ -29,7 +29,7 @@ def test_straight_alpha_and_the_color_under_it_are_kept(tmp_path, name, options)
     torch.testing.assert_close(alpha, torch.from_numpy(NOISE[..., 3] / 255).float(), rtol=0, atol=6e-8)
 
 
-def test_gray_palette_and_cmyk_come_out_as_color(tmp_path):
+def test_gray_palette_and_cmyk_are_read_as_color(tmp_path):
     gray, alpha = read_image(saved(tmp_path, Image.fromarray(NOISE[..., 0]), "gray.png"))
     assert alpha is None
     assert torch.equal((gray * 255).round().byte(), torch.from_numpy(NOISE[..., :1]).expand(-1, -1, 3))
@@ -141,7 +141,7 @@ def test_a_linear_image_is_encoded_by_its_suffix(tmp_path):
         ("a.exr", torch.full((4, 4, 3), math.inf), "image: expected finite"),
     ],
 )
-def test_what_is_no_linear_image_is_not_written(tmp_path, name, image, error):
+def test_invalid_linear_images_are_not_written(tmp_path, name, image, error):
     with pytest.raises(ValueError, match=error):
         write_image(tmp_path / name, image)
     with pytest.raises(TypeError, match="image: expected a float32 tensor"):

@@ -1,4 +1,4 @@
-"""Reading what a file must not hold: an error that names the field, at once, and nothing but ValueError and OSError."""
+"""Reading invalid files: an error that names the field, at once, and only ValueError and OSError."""
 
 import dataclasses
 import json
@@ -22,7 +22,7 @@ from reli3d.views.folder import intrinsics_of
 from reli3d.views.frames import Lens, nearest_rigid
 from reli3d.views.transforms import read_json, read_transforms
 
-AT_ONCE = 5.0  # seconds of the processor: what is meant is less than one, against minutes
+AT_ONCE = 5.0  # seconds of the processor: expected is less than one, against minutes
 
 
 @pytest.fixture(autouse=True)
@@ -70,7 +70,7 @@ def test_a_skew_is_not_called_a_scale():
         nearest_rigid("here", "transform_matrix", np.diag([1.01, 1.01, 1.01, 1.0]))
 
 
-def test_many_keys_of_which_one_stands_twice(tmp_path):
+def test_many_keys_with_one_duplicate(tmp_path):
     path = tmp_path / "many.json"
     path.write_text("{" + ",".join(f'"{k}":0' for k in range(200_000)) + ',"199999":0}')
     with pytest.raises(InputError, match="'199999' twice"):
@@ -92,7 +92,7 @@ def test_pipes_and_devices_are_not_opened(tmp_path, read):
             read(path)
 
 
-def test_a_file_without_permission_is_told_so(tmp_path, monkeypatch):
+def test_a_file_without_permission_is_reported(tmp_path, monkeypatch):
     Image.new("RGB", (9, 9)).save(tmp_path / "a.png")
 
     def refuse(*_, **__):

@@ -1,4 +1,4 @@
-"""Fetching the published checkpoint from a hub on this machine: what arrives, what is refused, what stays behind."""
+"""Fetching the published checkpoint from a hub on this machine: results, refusals, leftovers."""
 
 import errno
 import hashlib
@@ -180,7 +180,7 @@ def test_a_pickle_that_runs_code_does_not_run_and_does_not_stay(server, tmp_path
     assert not crater.exists() and left() == []
 
 
-def test_a_checkpoint_put_there_by_hand_needs_no_network_and_stays(server, checkpoint):
+def test_a_manually_copied_checkpoint_needs_no_network_and_stays(server, checkpoint):
     official_path().parent.mkdir(parents=True)
     official_path().with_name(hub.CHECKPOINT).write_bytes(checkpoint[0])
     hub.fetch_official(preset=TINY)

@@ -74,7 +74,7 @@ def test_nothing_seen_and_black_give_one():
     assert torch.isfinite(brightness_over_normal(torch.rand(3, 3), torch.ones(3), normals(3))).all()
 
 
-def test_the_palette_is_weighted_by_what_is_seen():
+def test_the_palette_is_weighted_by_visibility():
     color = torch.cat([torch.full((30, 3), 0.25), torch.full((10, 3), 0.9)])
     visible = (torch.arange(40) < 30).float()
     got = palette_of(color, color.sqrt(), visible)

@@ -153,7 +153,7 @@ def test_a_turn_of_the_world_turns_the_light(model):
     yaw = 2 * math.pi * 4 / 32
     with torch.no_grad():
         other = encoded(model, images, masks, turned(c2w, yaw), intrinsics).log_light
-        expected = torch.roll(field.log_light, -4, 2)  # from +X, the center, towards -Z, which lies to the left
+        expected = torch.roll(field.log_light, -4, 2)  # from +X, the center, towards -Z, which is to the left
         wrong = torch.roll(field.log_light, 4, 2)
         # pixels at the border of a texel may fall on the other side: 2 to 4 % with four seeds of the weights
         assert float((other - expected).abs().mean()) < 0.06 * float((wrong - expected).abs().mean())
@@ -169,7 +169,7 @@ def test_directions_fall_into_their_own_texels():
 
 
 def test_a_mirror_shows_the_light_where_it_reflects_it():
-    """What enters the U-Net of a glossy pixel lies in the mirror direction."""
+    """The U-Net's input of a glossy pixel is in the mirror direction."""
     torch.manual_seed(0)
     light, seen = LightMap(LightMapSizes(16, (8, 16))), []
     light.first.register_forward_pre_hook(lambda module, inputs: seen.append(inputs[0][0]))
@@ -182,7 +182,7 @@ def test_a_mirror_shows_the_light_where_it_reflects_it():
     assert int(weight.argmax()) == int(trained_texels(mirror, 16))  # the view from +Y goes towards +Z
 
 
-def test_pixels_start_as_what_they_show(model):
+def test_pixels_start_as_observed(model):
     """Of zeros: the normal looks at the camera, nothing is added to the color."""
     _, _, c2w, intrinsics = sphere(4)
     camera = Camera(c2w, intrinsics / 2, 32, 32)

@@ -36,7 +36,7 @@ def tiny(goldens):
 
 @torch.no_grad()
 def test_tiny_system_matches_published_end_to_end(tiny):
-    """The golden's intrinsics are a random 3x3 matrix, which no camera has: the 25 numbers are put in by hand."""
+    """The golden's intrinsics are a random 3x3 matrix, which no camera has: the 25 numbers are set directly."""
     model, g = tiny
     numbers = torch.cat([g["c2w"].flatten(-2), g["intrinsics_normed"].flatten(-2)], dim=-1)
     raw = []

@@ -121,7 +121,7 @@ def test_half_of_the_arguments_of_a_surface_is_an_error(device):
 
 @pytest.mark.parametrize("views", [1, 3, 16])
 @pytest.mark.parametrize("on_surface", [False, True])
-def test_the_fused_pass_gives_what_the_differentiable_one_gives(device, views, on_surface):
+def test_the_fused_pass_equals_the_differentiable_one(device, views, on_surface):
     torch.manual_seed(0)
     maps, module = rig(views, device), ViewFeatures(WIDTH).to(device)
     points, visible, normal = surface(700, views, device)

@@ -38,7 +38,7 @@ def written(folder, encoded):
 
 
 @pytest.mark.parametrize("count", [1, 2])
-def test_the_mesh_lies_where_it_is_moved_to_and_the_page_has_it_where_it_is(tmp_path, asset, views, threads, count):
+def test_the_mesh_is_moved_and_the_page_shows_it_in_place(tmp_path, asset, views, threads, count):
     threads(count)
     written(tmp_path / "ball", results.encode(asset, views, RECORD, name="ball", translation=MOVED))
     extras = {k: RECORD[k] for k in ("output_from_input", "model_from_input", "weights")}

@@ -15,7 +15,7 @@ from reli3d.output.folder import check_place, claimed, exchanged
 
 OURS = ("a", "b", "c")
 
-# One result whose files all say the same word; killed at the N-th file operation that Python announces.
+# One result whose files all have the same word; killed at the N-th audited file operation.
 WRITER = """
 import os, signal, sys
 from pathlib import Path
@@ -93,7 +93,7 @@ def test_a_kill_at_any_operation_leaves_one_whole_result_and_every_foreign_file(
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="Linux alone exchanges two folders in one step")
-def test_two_folders_are_exchanged_and_what_is_missing_is_an_error(tmp_path):
+def test_two_folders_are_exchanged_and_a_missing_one_is_an_error(tmp_path):
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "word").write_text(name)
@@ -170,14 +170,14 @@ def test_many_processes_at_one_result_leave_one_of_theirs(tmp_path):
         )
         for k in range(6)
     ]
-    said = [process.communicate()[1] for process in running]
+    output = [process.communicate()[1] for process in running]
     assert any(process.returncode == 0 for process in running)
-    for process, text in zip(running, said, strict=True):
+    for process, text in zip(running, output, strict=True):
         assert process.returncode == 0 or "got one at work" in text.splitlines()[-1]
     assert len(words(folder)) == 1 and [p.name for p in tmp_path.iterdir()] == ["name"]
 
 
-def test_what_a_dead_process_left_does_not_block(tmp_path):
+def test_leftovers_of_a_killed_process_do_not_block(tmp_path):
     left = tmp_path / ".name.partial" / "new"
     left.mkdir(parents=True)
     (left / "a").write_text("half")

@@ -30,7 +30,7 @@ from tests.support.scenes import ball_mesh, textures
 
 SIZE, WIDE = 256, 320  # the page's window is wider than the photographs
 EYES = ((0.9, 0.6, 2.0), (-2.0, 0.5, -0.6))
-# What a light must reach.  What limits it on a ball, which hides nothing from itself, is three.js' light prefiltered by
+# Minimum PSNR of each lighting.  On a ball, which has no self-occlusion, the limit is three.js' light prefiltered by
 # roughness, whose lobes are narrower than GGX: a ball half of rough metal reaches 24.9.
 DECIBELS = 26.0
 
@@ -94,7 +94,7 @@ def shown(image: Render, brightness: float = 1.0) -> torch.Tensor:
 
 
 def choose(**values) -> str:
-    """JavaScript that sets the page's controls and tells it."""
+    """JavaScript that sets the page's controls and fires their events."""
     code = ""
     for name, value in values.items():
         field = "checked" if isinstance(value, bool) else "value"
@@ -158,7 +158,7 @@ def test_the_page_shows_the_asset_as_the_renderer_does(tmp_path, asset, views):
     assert free and not choices and title == "a <ball>"
 
 
-def test_the_page_shows_what_a_surface_hides_from_itself(tmp_path, waisted, views):
+def test_the_page_shows_self_occlusion(tmp_path, waisted, views):
     """In each light, turned and brightened: nearer to our renderer than without, and near."""
     page = one_page(waisted, views, studio())
     (tmp_path / "viewer.html").write_text(page)
@@ -192,7 +192,7 @@ def test_the_harmonics_of_the_page_are_ours():
 
 
 def test_a_half_hidden_everywhere_is_a_stop_less(tmp_path, asset, views, monkeypatch):
-    """Half of an open surface's transfer as what is hidden; harmonics other than ours would leave something else."""
+    """Half of an open surface's transfer as occlusion; other harmonics would leave a remainder."""
     cosine = torch.tensor([math.pi] + [2 * math.pi / 3] * 3 + [math.pi / 4] * 5 + [0.0] * 7)  # of the harmonics
     images = []
     with chromium() as tab:

@@ -67,7 +67,7 @@ def test_weights_evaluated_near_the_surface_give_the_published_mesh(goldens):
 @torch.no_grad()
 @pytest.mark.parametrize("half_space", [False, True])
 def test_weights_near_the_surface_are_those_of_the_whole_grid(tiny, half_space):
-    """Also where the cap stands on the box, away from every cube that the surface crosses inside."""
+    """Also where the cap touches the box, away from every cube that the surface crosses inside."""
     code, n = tiny.encode(*views(1, 2, 76)), 12
     flat = pipeline._grid(n, 0.87, torch.device("cpu")).reshape(-1, 3)
     raw = tiny.query(code, flat[None], ("density", "deformation", "flexicubes"))

@@ -1,6 +1,6 @@
 """Where the published release is wrong and this package is not, each with the size of the difference.
 
-What the release does comes from its own values where there are some, else from its formula.  Other such differences
+The release's results are its own values where there are some, else those of its formula.  Other such differences
 are shown where their part is tested; docs/model.md lists them all.
 """
 
@@ -123,7 +123,7 @@ def test_environment_lookups_meet_texel_centers_and_wrap(goldens):
     radiance = torch.from_numpy(np.load(goldens / "reni_decoder.npz")["env_map"][1])
     stored = torch.from_numpy(data["sampled"])
     twin = release_lookup(radiance, torch.from_numpy(data["direction"]))
-    torch.testing.assert_close(twin, stored, rtol=1e-4, atol=1e-5)  # this is what the release does
+    torch.testing.assert_close(twin, stored, rtol=1e-4, atol=1e-5)  # the release's mapping
     ours = from_published(radiance)
     environment, centers = Environment(ours), lat_long_directions(64).reshape(-1, 3).contiguous()
     texels = ours.reshape(-1, 3)

@@ -48,7 +48,7 @@ def test_a_piece_that_fails_or_hangs_is_reported(code, seconds, end, tmp_path):
 
 
 def test_a_second_call_repeats_only_what_did_not_end_well(tmp_path):
-    """Into a folder that is not there yet; the limits of what is left take the whole time."""
+    """Into a new folder; the limits of the remaining pieces take the whole time."""
     out, trace = tmp_path / "new" / "folder", tmp_path / "trace"
     write = f"open({str(trace)!r}, 'a').write"
     plan = [Piece("a", ("-c", f"{write}('a')"), 1), Piece("b", ("-c", f"{write}('b'); import sys; sys.exit(1)"), 1)]

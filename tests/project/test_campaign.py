@@ -1,4 +1,4 @@
-"""The campaign finds what it looks for, and finds nothing in the readers."""
+"""The campaign finds planted faults, and none in the readers."""
 
 import dataclasses
 import os

@@ -17,12 +17,12 @@ from tests.support.checkout import ROOT, copied
 from tests.support.layers import LAYERS
 
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
-NOT_RUN = "<!-- not run:"  # stands on a line of its own before a block
+NOT_RUN = "<!-- not run:"  # on a line of its own before a block
 FILE = re.compile(r"# ([\w/]+\.py)\n")  # first line of a block that is a file of the repository
 
 
 def blocks(page: Path, language: str = "python") -> list[str]:
-    """Code of the fenced blocks of a page, each moved down to the line where it stands there."""
+    """Code of the fenced blocks of a page, each moved down to its line in the page."""
     text, found = page.read_text(), []
     for block in re.finditer(rf"^```{language}\n(.*?)^```", text, re.MULTILINE | re.DOTALL):
         above = text[: block.start(1)]
@@ -40,7 +40,7 @@ WITH_CODE = [page for page in PAGES if any(not FILE.match(code.lstrip("\n")) for
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch) -> Path:
-    """Working folder with what a reader has: an object folder ``photos/shoe`` and a light ``studio.hdr``."""
+    """Working folder with the files of a reader: an object folder ``photos/shoe`` and a light ``studio.hdr``."""
     shutil.copytree(Path(reli3d.__file__).parent / "assets" / "example", tmp_path / "photos" / "shoe")
     write_environment(
         tmp_path / "studio.hdr", Environment(torch.rand(16, 32, 3, generator=torch.Generator().manual_seed(0)))
@@ -62,7 +62,7 @@ def test_a_block_that_is_not_to_run_is_left_out(tmp_path):
     page = tmp_path / "page.md"
     page.write_text("a\n```python\none\n```\n<!-- not run: no GPU -->\n```python\ntwo\n```\n\n```python\nthree\n```\n")
     assert [code.strip() for code in blocks(page)] == ["one", "three"]
-    assert blocks(page)[1].index("three") == 10  # on the line where it stands
+    assert blocks(page)[1].index("three") == 10  # on its line in the page
 
 
 def test_the_kernel_of_the_contributors_page_works_in_the_package(tmp_path):
@@ -95,7 +95,7 @@ def test_links_and_paths_of_a_page_lead_somewhere(page):
     text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
     for target in re.findall(r"\]\(([^)#\s]+)", text):
         assert target.startswith("https://") or (page.parent / target).exists(), target
-    if page.name == "CHANGELOG.md":  # names what is gone
+    if page.name == "CHANGELOG.md":  # names removed things
         return
     for path in re.findall(r"`((?:reli3d|tests|bench|examples|tools|docs)/[\w/.-]*\w)`", text):
         assert (ROOT / path).exists(), path

@@ -1,4 +1,4 @@
-"""The examples and the library page's snippets run with nothing but the package, and find what they look for."""
+"""The examples and the library page's snippets run with nothing but the package, and reach their goal."""
 
 import math
 import re
@@ -64,7 +64,7 @@ def test_object_and_light_turn(run, tmp_path):
     assert (tmp_path / "turntable.webp").stat().st_size > 500
 
 
-def test_the_snippets_of_the_library_page_are_short_and_find_what_they_look_for(tmp_path, monkeypatch):
+def test_the_snippets_of_the_library_page_are_short_and_correct(tmp_path, monkeypatch):
     scene, *snippets = SNIPPETS[:7]  # the parts of the renderer follow
     assert len(snippets) == 6 and max(len(code.splitlines()) for code in snippets) <= 12
     monkeypatch.chdir(tmp_path)

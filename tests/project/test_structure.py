@@ -126,7 +126,7 @@ def test_kernels_geometry_and_render_contain_no_constant_of_a_preset():
 
 
 def of_other_tests(source: str, folder: str) -> list[str]:
-    """What a file of ``tests`` imports from test modules, or one of ``bench`` from ``tests``."""
+    """The imports of a file of ``tests`` from test modules, or one of ``bench`` from ``tests``."""
     found = []
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, (ast.Import, ast.ImportFrom)):

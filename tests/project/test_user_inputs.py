@@ -1,4 +1,4 @@
-"""What a user may hand over: numpy arrays and other integers where nothing is lost, lists, numbers; assets moved,
+"""Inputs of a user: numpy arrays and other integers if the conversion is lossless, lists, numbers; assets moved,
 shown and saved."""
 
 import numpy as np
@@ -86,7 +86,7 @@ def test_a_texture_set_has_named_maps(device):
             TextureSet(**{"base_color": base, "roughness": 0.5, "metallic": 0.5, **change})
 
 
-def test_an_asset_moves_detaches_and_reports_what_it_is(device):
+def test_an_asset_moves_detaches_and_prints_a_summary(device):
     asset = ball(torch.device("cpu"))
     maps = asset.textures
     leaf = maps.base_color.clone().requires_grad_()

@@ -1,4 +1,4 @@
-"""Counts planned for the scene: their variance against quadrature, and against what each strategy alone has."""
+"""Counts planned for the scene: their variance against quadrature, and against each strategy alone."""
 
 import pytest
 import torch
@@ -113,7 +113,7 @@ def deviation(a, b):
 
 
 def sun_part(arguments, environment):
-    """What the sun's part of the sphere adds to each point's variance by each single strategy, by quadrature."""
+    """The sun's contribution to each point's variance by each single strategy, by quadrature."""
     d, _ = reference.sphere_grid(512)
     bright = reference.lookup_envmap(environment.radiance.double().cpu(), d).amax(1) > 10.0
     alone = torch.tensor(SINGLE, dtype=torch.float64)
@@ -123,7 +123,7 @@ def sun_part(arguments, environment):
 def compare(case, points, device, runs=256):
     """Variance of the plan over that of the best single strategy, its 95 % interval, and the plan.
 
-    Runs that never drew the sun say nothing of it: a strategy whose variance is below a hundredth of what the sun alone
+    Runs that never drew the sun do not count: a strategy whose variance is below a hundredth of what the sun alone
     makes by quadrature has that, and the ratio no interval.
     """
     name, roughness, metallic = case
@@ -186,7 +186,7 @@ def test_a_mirror_under_even_light_has_no_variance(device):
         assert plan.samples == (0, 64, 0) and 0.0 < plan.variance < 3e-6  # of values about 1; 2e-8 but for rare facets
 
 
-def test_the_relative_plan_is_for_what_is_seen(device):
+def test_the_relative_plan_is_for_visible_points(device):
     """Metal next to a white diffuse surface in the sun: the latter is brighter, the metal needs its visible normals."""
     arguments, env = surface(device, 0.3, 1.0), light("sun", device)
     metallic = torch.arange(24, device=device) % 2 * 1.0
@@ -268,8 +268,8 @@ def test_the_command_plans_its_first_view(tmp_path, capsys):
     write_glb(tmp_path / "ball.glb", Asset(asset.mesh.with_tangents(), asset.textures))
     common = [str(tmp_path / "ball.glb"), "--output", str(tmp_path), "--size", "16", "--supersampling", "1"]
     assert main([*common, "--plan", "16", "--frames", "2", "--format", "webp"]) == 0
-    said = capsys.readouterr().err.strip().splitlines()
-    assert len(said) == 1 and said[0].startswith("reli3d-render: samples by strategy ")
-    assert sum(int(word) for word in said[0].split()[-3:]) == 16
+    output = capsys.readouterr().err.strip().splitlines()
+    assert len(output) == 1 and output[0].startswith("reli3d-render: samples by strategy ")
+    assert sum(int(word) for word in output[0].split()[-3:]) == 16
     assert main([*common, "--plan", "0"]) == 2
     assert main([*common, "--plan", "16", "--samples", "1", "2", "3"]) == 2

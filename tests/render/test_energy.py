@@ -1,4 +1,4 @@
-"""The white furnace: what a surface of any color sends out under unit light, never more than comes in."""
+"""The white furnace: a surface of any color under unit light never reflects more than it receives."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from reli3d.render.shading import ShadeOptions, shade
 from tests.support.surfaces import at
 
 ROUGHNESS = np.linspace(0.05, 1.0, 8)
-QUADRATURE = 2e-5  # what the last halving of its step moves the albedo by
+QUADRATURE = 2e-5  # change of the albedo by the last halving of its step
 ERROR = 3e-4  # standard error of a measured albedo: a third of the 1e-3 that it may exceed 1 by
 COSINES = np.linspace(0.05, 1.0, 8)
 
@@ -58,7 +58,7 @@ def test_white_metal_sends_out_its_directional_albedo_and_never_more_than_comes_
             n = max(500, round((spread / ERROR) ** 2))
             out = sent(n, roughness, cos_o, 8 * i + k)
             error = float(out.std()) / n**0.5
-            assert error < 1.3 * ERROR  # the first 500 tell it to 10 % or so
+            assert error < 1.3 * ERROR  # the first 500 estimate it to 10 % or so
             assert float(out.mean()) <= 1.0 + 1e-3, (roughness, cos_o)
             z.append((float(out.mean()) - directional_albedo(roughness**2, cos_o)) / (error + QUADRATURE))
     z = np.array(z)
@@ -113,7 +113,7 @@ def test_no_surface_sends_out_more_than_comes_in(device):
     assert highest <= 1.0 + 1e-3
     assert min(dielectric) > 0.75 and max(dielectric) > 0.97  # without making a white diffuse surface gray
     published = albedo(view(0.05, device), number(0.1), base, number(0.0), u, diffuse_model="published")
-    assert float(published[0]) > 1.2  # what the test is there to see: 1.30
+    assert float(published[0]) > 1.2  # the gain that the test must detect: 1.30
 
 
 def hemisphere(side=600):

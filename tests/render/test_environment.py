@@ -88,7 +88,7 @@ def test_lookup_and_its_gradient_equal_the_float64_reference(device):
 
 
 @pytest.mark.parametrize("name", chi2.MAPS)
-def test_samples_fall_on_texels_as_their_density_says(device, name):
+def test_samples_fall_on_texels_by_their_density(device, name):
     env = Environment(maps()["sun" if name == "next to the sun" else name].to(device))
     height, width = env.radiance.shape[:2]
     u = torch.rand(1_000_000, 2, generator=torch.Generator().manual_seed(chi2.MAPS.index(name))).to(device)
@@ -190,7 +190,7 @@ def test_lookup_equals_mitsubas_map():
 
 
 def test_irradiance_of_a_constant_and_of_a_gradient(device):
-    """pi L of a constant; of radiance a + b y, integrated by hand: pi a + 2 pi b n_y / 3.
+    """pi L of a constant; of radiance a + b y, integrated analytically: pi a + 2 pi b n_y / 3.
 
     Texels of 16 rows integrate to 0.3 % of the largest value (their solid angles are exact, the cosine is taken in
     the middle).

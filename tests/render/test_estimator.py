@@ -1,4 +1,4 @@
-"""What is claimed of the estimator's gradients and variance: support, differences, odd inputs, pairs, strategies."""
+"""Properties of the estimator's gradients and variance: support, differences, odd inputs, pairs, strategies."""
 
 import pytest
 import torch

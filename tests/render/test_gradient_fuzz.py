@@ -26,7 +26,7 @@ FLOOR = float(ALPHA_MIN)
 def drawn(n, seed=0):
     """Unit normal, geometric normal, view, light ``(n, 3)``; base ``(n, 3)``, alpha, metallic ``(n,)``.
 
-    A quarter of the views, and of the lights, lies in the surface, an eighth near it, an eighth exactly above, an
+    A quarter of the views, and of the lights, is in the surface, an eighth near it, an eighth exactly above, an
     eighth exactly behind, the rest anywhere above or below; of the parameters half are at an edge, half anywhere.
     """
     g = torch.Generator().manual_seed(seed)
@@ -255,7 +255,7 @@ def weighed(outs, seed=0):
 
 def test_hits_of_slivers_and_of_faces_without_area_have_finite_gradients(device):
     """A hundred thousand rays at points of any face.  A ray query never gives faces without area: these hits are made
-    by hand.  There the evaluation keeps what it is given, and every gradient is 0."""
+    by hand.  There the evaluation keeps its inputs, and every gradient is 0."""
     g = torch.Generator().manual_seed(6)
     corners = slivers(g)
     faces = torch.arange(corners.numel() // 3, dtype=torch.int32, device=device).reshape(-1, 3)

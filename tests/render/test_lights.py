@@ -1,4 +1,4 @@
-"""The lights of the package: laid out as every other map, of mean radiance 1, and where their docstrings say."""
+"""The lights of the package: laid out as every other map, of mean radiance 1, and placed as documented."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""What a user may hand to the shader: rows, numbers, parts of points."""
+"""Inputs of the shader: rows, numbers, parts of points."""
 
 import pytest
 import torch
@@ -38,7 +38,7 @@ def test_one_row_and_plain_numbers_hold_for_all_points(device):
 
 @pytest.mark.parametrize("name", ["normal", "ng", "base_color", "roughness", "metallic", "position", "wo"])
 @pytest.mark.parametrize("value", [torch.nan, torch.inf])
-def test_what_is_not_finite_gives_nan_and_its_neighbors_stay(device, name, value):
+def test_values_that_are_not_finite_give_nan_in_their_row_only(device, name, value):
     """Minima and maxima of the formulas would make a plausible color of it."""
     normal, wo = (v.to(device) for v in points(40))
     light = Environment(sky().radiance.to(device))

@@ -72,7 +72,7 @@ def test_texture_lookup_is_bilinear_and_repeats(device):
 
 
 @pytest.mark.parametrize("explicit", [True, False])
-def test_normal_map_points_right_and_up_as_gltf_says(device, explicit):
+def test_normal_map_points_right_and_up_as_in_gltf(device, explicit):
     """Red bends the normal towards u (right), green towards the top of the texture."""
     mesh = square(device)
     if explicit:
@@ -285,7 +285,7 @@ def test_parts_shadow_each_other_and_keep_their_base_color(device):
     assert float(image.radiance[near].mean()) < 0.9 * float(alone.radiance[near].mean())
 
 
-def test_what_is_looked_up_follows_the_maps(device):
+def test_lookups_follow_the_maps(device):
     maps = textures(8, device, (0.5, 0.2, 0.1), roughness=0.3)
     first = maps.rough_metal()
     assert maps.rough_metal() is first  # kept

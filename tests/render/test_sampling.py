@@ -83,7 +83,7 @@ def test_cosine_follows_its_density(device):
 
 
 def test_opposite_numbers_are_each_of_them_once(device):
-    """Of the 2^24 there are, on either axis: what is uniform stays so.  Twice the same is where it began."""
+    """Of all 2^24 values, on either axis: uniform numbers stay uniform, and twice the map is the identity."""
     every = torch.arange(2**24, dtype=torch.float64, device=device) / 2**24
     u = torch.stack([every.float(), every.float().flip(0)], -1)
     got = antithetic(u)

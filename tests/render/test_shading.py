@@ -382,7 +382,7 @@ def test_memory_does_not_grow_with_samples(device, shadows):
             )
             torch.autograd.grad(out.sum(), inputs)
 
-        step()  # what is made once
+        step()  # creates cached values
         return most_held(step, device)
 
     threads, words = torch.get_num_threads(), 2048 * (1024 - 64) // 32 * 4

@@ -113,7 +113,7 @@ ACCEPT, SIGNIFICANCE = 0.9975, 0.01
 
 
 def rejected(got, expected, variance, samples):
-    """Pixels and channels that a z-test at ``SIGNIFICANCE`` over all of them (Sidak) tells from the reference.
+    """Pixels and channels that a z-test at ``SIGNIFICANCE`` over all of them (Sidak) distinguishes from the reference.
 
     ``variance``: of one sample of the reference; ``samples``: how many ``got`` is the mean of.
     """
@@ -156,7 +156,7 @@ def compare(runs, expected, variance, theirs):
     # the square of Student's t with K - 1 degrees is (K - 1) / (K - 3) in the mean; measured 0.93 to 1.04, stripes 1.24
     assert square(got) < 1.15 < square(got * stripes)
     assert abs(got.mean() - expected.mean()) < 3.0 * sigma
-    assert sigma < 0.005 * expected.mean()  # so that the mean tells 1.5 % from none; measured 0.03 to 0.25 %
+    assert sigma < 0.005 * expected.mean()  # so that the mean distinguishes 1.5 % from none; measured 0.03 to 0.25 %
     assert min(abs(k * got.mean() - expected.mean()) for k in (0.98, 1.02)) > 3.0 * sigma
 
 
@@ -173,7 +173,7 @@ def mapped_ball_in_ring():
 
 
 def test_render_equals_mitsubas_sensor_textures_and_light(device):
-    """All of ``render``: camera, rows of the image, subpixels, what is hit, maps, shadows; seen by Mitsuba's own
+    """All of ``render``: camera, rows of the image, subpixels, hits, maps, shadows; seen by Mitsuba's own
     ``perspective``, whose rays through the same subpixels give the reference, and whose film the coverage."""
     mi = mitsuba_scene.load()
     asset, environment, (width, height, fine, fov) = mapped_ball_in_ring(), light("sky"), (40, 32, 2, 0.75)
@@ -220,7 +220,7 @@ def test_render_equals_mitsubas_sensor_textures_and_light(device):
     aside = replace(camera, intrinsics=camera.intrinsics + torch.tensor([0.0, 0.0, 0.05, 0.0], device=device))
     raw = replace(asset, textures=replace(asset.textures, base_color=srgb_to_linear(asset.textures.base_color)))
     turned = replace(asset, textures=asset.textures._changed(lambda v: v.flip(0)))
-    for wrong in ((asset, aside), (raw, camera), (turned, camera)):  # what the z-test is there to see
+    for wrong in ((asset, aside), (raw, camera), (turned, camera)):  # errors that the z-test must detect
         assert rejected(runs(*wrong).mean(0), expected, variance, samples).mean() > 4 * (
             1.0 - ACCEPT
         )  # measured 3 to 98 %
@@ -289,4 +289,4 @@ def test_gradients_with_shadows_equal_mitsubas(device, material):
     # second term: shadow edges of float32 geometry, and the half floats of Mitsuba's map
     z = (got.mean(0) - expected.mean(0)) / error
     assert np.abs(z).max() < 4.0, (z, got.mean(0), expected.mean(0))  # 30 numbers in the family, t with 40 degrees
-    assert (np.abs(expected.mean(0)) > 5 * error)[:5].all()  # the noise is far below what is compared
+    assert (np.abs(expected.mean(0)) > 5 * error)[:5].all()  # the noise is far below the compared values

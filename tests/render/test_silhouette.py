@@ -131,7 +131,7 @@ def rendering_of(vertices, faces, camera, colors, background):
 
 @pytest.mark.parametrize("layer", ["mask", "image"])
 def test_descent_moves_a_sphere_onto_its_target(device, layer):
-    """By its mask, and by its colors alone, some of them darker and some brighter than what is behind them."""
+    """By its mask, and by its colors alone, some of them darker and some brighter than the background."""
     vertices, faces = shape("sphere", device)
     camera = camera_of(device)
     ramp = torch.linspace(0.0, 1.0, SIZE, device=device)

@@ -73,7 +73,7 @@ def test_a_convex_surface_hides_nothing_from_itself(device):
         assert blocked_transfer(mesh_of(shape, device)).abs().max() == 0.0
 
 
-def test_a_wall_hides_half_of_what_a_floor_sees(device):
+def test_a_wall_occludes_half_of_the_hemisphere_of_a_floor(device):
     """Of a small floor at the foot of a tall wall, in the wall's middle: the integral over a quarter of the sphere."""
     small, large = 0.01, 1000.0
     floor = [
@@ -89,7 +89,7 @@ def test_a_wall_hides_half_of_what_a_floor_sees(device):
     d, weight = quadrature(256)
     hidden = weight * d[:, 1].clamp(min=0.0) * (d[:, 2] < 0.0)
     expected = hidden @ spherical_harmonics(d)
-    assert abs(float(expected[0]) - math.pi / 2 * math.sqrt(1 / (4 * math.pi))) < 1e-4  # by hand
+    assert abs(float(expected[0]) - math.pi / 2 * math.sqrt(1 / (4 * math.pi))) < 1e-4  # closed form
     torch.testing.assert_close(found, expected.expand(3, -1), rtol=0, atol=6e-3)  # rim of the wall, 20,000 directions
 
 

@@ -54,7 +54,7 @@ def find_chromium() -> str:
 
 
 class Page:
-    """One page; ``problems`` gathers what it writes to its console as errors or warnings, and exceptions."""
+    """One page; ``problems`` gathers errors and warnings of its console, and exceptions."""
 
     def __init__(self, process: subprocess.Popen, read: int, write: int):
         self._process, self._read, self._write = process, read, write
@@ -86,11 +86,11 @@ class Page:
         end = time.monotonic() + TIMEOUT
         while not self.evaluate(f"Boolean({code})"):
             if time.monotonic() > end:
-                raise AssertionError(f"{code}: not true after {TIMEOUT:g} s; the page said {self.problems}")
+                raise AssertionError(f"{code}: not true after {TIMEOUT:g} s; problems {self.problems}")
             time.sleep(0.1)
 
     def screenshot(self) -> np.ndarray:
-        """What the window shows, ``(H, W, 3)`` uint8."""
+        """The window's image, ``(H, W, 3)`` uint8."""
         return pixels(self._call("Page.captureScreenshot", format="png")["data"])[..., :3]
 
     def _call(self, method: str, **params) -> dict:

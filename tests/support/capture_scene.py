@@ -85,7 +85,7 @@ def render_capture(
 ) -> TrueCapture:
     """A ring of hand-held views at two heights under a sky; cameras are relative to the object.
 
-    moved_after: from this view on the object stands otherwise on the table.  turntable: the camera is fixed, the object
+    moved_after: from this view on the object is elsewhere on the table.  turntable: the camera is fixed, the object
     turns with a small table in front of a textured background.
     """
     rng = np.random.default_rng(0)

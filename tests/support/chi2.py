@@ -30,7 +30,7 @@ QUADRATURE = 1e-3  # of a mass
 
 @dataclass(frozen=True)
 class Sphere:
-    """Cells in (cos theta, phi) about the axis x, ``res`` by ``2 res``: no lobe sits in the fan around the pole, and
+    """Cells in (cos theta, phi) about the axis x, ``res`` by ``2 res``: no lobe is in the fan around the pole, and
     the horizon z = 0 is a border."""
 
     res: int
@@ -159,7 +159,7 @@ def _midpoints(grid: Grid, pdf: Density, where: Tensor, side: int) -> Tensor:
 
 def pooled(observed: np.ndarray, expected: np.ndarray) -> tuple[float, int]:
     """Probability of counts as uneven as these where ``expected`` are due (both of one sum), and the number of cells:
-    those of less than :data:`EXPECTED_MIN` are put together, the smallest first.  A single cell tells nothing: 0."""
+    those of less than :data:`EXPECTED_MIN` are put together, the smallest first.  A single cell decides nothing: 0."""
     order = np.argsort(expected, axis=None)
     o, e = observed.ravel()[order], expected.ravel()[order]
     small = int(np.searchsorted(e, EXPECTED_MIN))

@@ -101,7 +101,7 @@ def _shown(folder: Path, page: str, viewpoint: Viewpoint) -> np.ndarray:
 
 
 def three_js(folder: Path, viewpoint: Viewpoint) -> np.ndarray:
-    """``folder`` holds ``mesh.glb``, ``environment.hdr`` and ``.exr``, and takes what the client needs."""
+    """``folder`` holds ``mesh.glb``, ``environment.hdr`` and ``.exr``, and receives the client's files."""
     shutil.copy(THREE, folder)
     return _shown(folder, THREE_PAGE, viewpoint)
 
@@ -125,7 +125,7 @@ load = {"glb": bpy.ops.import_scene.gltf, "usdz": bpy.ops.wm.usd_import, "obj": 
 load[path.rsplit(".", 1)[1]](filepath=path)
 for image in bpy.data.images:
     if path.endswith("obj") and ("roughness" in image.name or "metallic" in image.name):
-        image.colorspace_settings.name = "Non-Color"  # as docs/guide.md says
+        image.colorspace_settings.name = "Non-Color"  # as in docs/guide.md
 scene = bpy.context.scene
 scene.world = bpy.data.worlds.new("light")
 scene.world.use_nodes = True

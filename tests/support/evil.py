@@ -1,4 +1,4 @@
-"""Hostile and broken inputs, made by code.  Each must end in one line that says what is wrong, with nothing written.
+"""Hostile and broken inputs, made by code.  Each must end in one line that names the fault, with nothing written.
 
 ``cases()`` are object folders for anything that takes one; environment files stand in ``evil_maps``.
 """

@@ -6,7 +6,7 @@ import struct
 def exr_bytes(
     window=(0, 0, 31, 15), version=2, channels=("B", "G", "R"), extra=b"", chunks=None, pixel_type=1
 ) -> bytes:
-    """An uncompressed EXR of zeros by hand, with any lie in its header."""
+    """An uncompressed EXR of zeros, with any false value in its header."""
 
     def attribute(name: str, kind: str, data: bytes) -> bytes:
         return name.encode() + b"\0" + kind.encode() + b"\0" + struct.pack("<i", len(data)) + data

@@ -1,4 +1,4 @@
-"""A job without a network: objects are small files that say what shall happen to them."""
+"""A job without a network: objects are small files that contain their outcome."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class WordJob:
     """Writes the word of ``folder/word`` in ``target``, and a line in ``log`` for every result that it finishes.
 
     The words ``crash`` and ``crash once`` kill the process in the middle of the work, ``wait`` waits there for a file
-      ``go``; ``refuse`` and ``fail`` are errors.  What they leave stands in ``folder``.
+      ``go``; ``refuse`` and ``fail`` are errors.  Their files are in ``folder``.
     """
 
     log: Path

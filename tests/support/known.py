@@ -230,7 +230,7 @@ def lens(rng: Random) -> Case:
         frames.append(frame_of(name, pose, **fields))
     (shared if rng.random() < 0.5 else frames[rng.randrange(3)]).update(unknown)
     bent = bool({"is_fisheye", "fisheye", "camera_model", "camera_type", "lens_type", "ftheta_p0"} & set(unknown))
-    if unknown and not bent and rng.random() < 0.5:  # nothing else says what the lens is
+    if unknown and not bent and rng.random() < 0.5:  # no other field has the lens
         for part in (shared, *frames):
             for key in [key for key in part if key not in ("file_path", "transform_matrix", *unknown)]:
                 del part[key]
@@ -497,7 +497,7 @@ STATES = ("autocast", "dtype", "device")
 
 @contextlib.contextmanager
 def torch_state(name: str):
-    """A global state of torch that another program may have set; meta stands for a GPU."""
+    """A global state of torch that another program may have set; meta represents a GPU."""
     dtype = torch.get_default_dtype()
     try:
         if name == "dtype":

@@ -1,4 +1,4 @@
-"""GLB files of one quad with random features of glTF 2.0, and what they look like by the standard."""
+"""GLB files of one quad with random features of glTF 2.0, and their appearance by the standard."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def quad(rng: Random) -> tuple[bytes, Look]:
         material = {"extensions": {SPEC_GLOSS: {"diffuseTexture": base, "diffuseFactor": [*factor, 1.0]}}}
         material["extensions"][SPEC_GLOSS] |= {"specularFactor": [0.03] * 3, "glossinessFactor": 1.0 - roughness}
         metallic = 0.0
-        vertex = vertex * 0.97 / 0.96  # what the specular layer transmits, theirs and the dielectric's
+        vertex = vertex * 0.97 / 0.96  # transmission of the specular layer, theirs and the dielectric's
         used.append(SPEC_GLOSS)
         plain = False
     if rng.random() < 0.15:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 class Misread(AssertionError):
-    """A file was accepted and its content is not what it says; or it was refused and should not be, or the reverse."""
+    """A file was accepted and its content was misread; or it was refused and should not be, or the reverse."""
 
 
 def check(condition: bool, text: str) -> None:
@@ -33,4 +33,4 @@ class Case:
         except (ValueError, OSError) as error:
             check(not self.must_read, f"refused: {error}")
             raise
-        check(not self.must_refuse, "accepted what no reader should take")
+        check(not self.must_refuse, "accepted an input that must be refused")

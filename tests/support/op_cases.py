@@ -1,8 +1,8 @@
 """Every public operation of geometry and renderer that has a gradient, once: inputs, which of them have it, the call.
 
 ``tests/bridge/test_ops.py`` tests all of them, and those in ``tests/support/op_cases_plain.py``, for the properties of
-any (layouts, one gradient alone, edits in place, dtypes, no rows, second derivatives, CPU against CUDA); what each
-computes is the matter of its own tests.
+any (layouts, one gradient alone, edits in place, dtypes, no rows, second derivatives, CPU against CUDA); each
+operation has tests of its values elsewhere.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Rays, what they are traced through, and samples along them."""
+"""Rays, the meshes that they are traced through, and samples along them."""
 
 import numpy as np
 import pytest

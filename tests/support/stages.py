@@ -19,7 +19,7 @@ SMALL = replace(TINY, name="smaller", image_size=32, plane_size=4, resolution=16
 
 
 class BallModel(Reconstructor):
-    """``SMALL`` whose raw density is that of a ball plus what the head says."""
+    """``SMALL`` whose raw density is that of a ball plus the head's output."""
 
     steep = 12.0  # of the raw density, per model unit
 

@@ -160,7 +160,7 @@ def test_surface_nets_follow_a_ball():
     vertices, faces = surface_nets(distance.astype(np.float32))
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     assert mesh.is_watertight and mesh.euler_number == 2
-    # a net lies inside by about h^2 / (8 r): 0.01 cells a crossing, and the mean of four crossings twice that
+    # a dual surface is inside by about h^2 / (8 r): 0.01 cells a crossing, and the mean of four crossings twice that
     assert np.abs(np.linalg.norm(vertices - 19.5, axis=1) - 12).max() < 0.1
     assert abs(mesh.volume / (4 / 3 * np.pi * 12**3) - 1) < 0.01
 

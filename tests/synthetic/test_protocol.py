@@ -46,7 +46,9 @@ def test_fields_of_view_follow_the_cut_normal_distribution(many):
     found = degrees(many)
     assert found.min() >= 22.0 - 1e-3 and found.max() <= 37.0 + 1e-3  # float32 intrinsics
     assert stats.kstest(found, expected.cdf).pvalue > SIGNIFICANCE
-    found = fields_of_view(np.random.default_rng(5).random(1_000_000))  # so many tell a deviation of 2.5 from 2.55
+    found = fields_of_view(
+        np.random.default_rng(5).random(1_000_000)
+    )  # enough to distinguish a deviation of 2.5 from 2.55
     assert stats.kstest(found, expected.cdf).pvalue > SIGNIFICANCE
     np.testing.assert_allclose(fields_of_view(np.array([0.0, 0.5, 1.0])), [22.0, 29.5, 37.0], rtol=1e-9)
 
@@ -134,7 +136,7 @@ def test_the_command_writes_a_file_for_each_light(rendered):
     assert set(load_file(rendered / "rgb" / "0000000000_0.safetensors")) == set(protocol.RGB_TENSORS)
 
 
-def test_what_is_not_known_is_none_and_takes_part_in_no_loss(rendered):
+def test_missing_ground_truth_is_none_and_takes_part_in_no_loss(rendered):
     stage = StageConfig("gaussians", "gaussians", 16, lobes=16)
     sizes = dict(inputs=2, targets=1, background=1.0, input_size=32, target_size=16, patch=0)
     for name, known in (("rgb", False), ("pbr", True)):

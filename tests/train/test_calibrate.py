@@ -1,4 +1,4 @@
-"""Calibration gives back what training takes from a surface."""
+"""Calibration restores the part of a surface that training removes."""
 
 import dataclasses
 
@@ -28,7 +28,7 @@ class _ThinField(LocalField):
         return distance / self.model.preset.softness + 1.5 - self._offset()
 
 
-def test_calibration_gives_back_what_is_missing(folder, tmp_path):
+def test_calibration_restores_the_missing_part(folder, tmp_path):
     """The best offset is the one that was taken away, from one view and from many, to a step of the offsets."""
     seed = SEEDS[0]
     (tmp_path / f"{seed}.safetensors").write_bytes((folder / f"{seed:010d}.safetensors").read_bytes())

@@ -83,7 +83,7 @@ def test_mirrored_images_are_those_of_the_mirrored_object(files):
         assert float(hull_distance(points.contiguous(), got.silhouette, camera).min()) > -0.03  # two pixels
         toward = got.c2w[:, None, None, :3, 3] / got.c2w[:, None, None, :3, 3].norm(dim=-1, keepdim=True)
         facing = (got.view_normal * toward).sum(-1)[got.view_valid]
-        assert float((facing > -0.3).float().mean()) > 0.99  # what is seen faces the camera; normals are bumped
+        assert float((facing > -0.3).float().mean()) > 0.99  # visible points face the camera; normals are bumped
         if side == "left":
             return
     raise AssertionError("expected a mirrored object among 20")
@@ -202,7 +202,7 @@ def test_samples_of_views_alone_teach_the_2d_u_net_and_nothing_else(tmp_path, ca
         assert torch.equal(views.c2w, whole.c2w)
         both = views.view_valid & whole.view_valid
         assert float(both.sum() / whole.view_valid.sum()) > 0.9
-        # one ray of four: pixels differ by noise and by what is smaller than they are, not by a shift
+        # one ray of four: pixels differ by noise and by detail below a pixel, not by a shift
         assert float((views.view_depth - whole.view_depth)[both].abs().mean()) < 0.005
         one, other = (avg_pool2d(v.images.permute(0, 3, 1, 2), 8) for v in (views, whole))
         assert float((one - other).abs().mean()) < 0.03

@@ -83,7 +83,7 @@ def test_a_capture_is_cropped_centered_and_scaled(captures):
             rows, columns = (views.masks[v] > 0.5).nonzero().unbind(1)
             assert abs(float(rows.float().mean()) + 0.5 - 16) < 1.5 and abs(float(columns.float().mean()) - 15.5) < 1.5
             center, depth = project(torch.zeros(1, 3), views.c2w[v], views.intrinsics[v])
-            assert float((center - 16).abs().max()) < 2.5  # the hull of three views lies about the object
+            assert float((center - 16).abs().max()) < 2.5  # the hull of three views encloses the object
             width = float((views.masks[v] > 0.5).any(0).sum()) / float(views.intrinsics[v, 0]) * float(depth)
             assert 0.7 < width < 1.1  # longest side of the hull 1, the ball in it a little less
 
@@ -118,7 +118,7 @@ def test_uco3d_objects_are_read():
     assert views.images.shape[1:] == (64, 64, 3) and float(views.masks.mean()) > 0.1
 
 
-def test_shards_hold_what_the_samples_held_and_any_reader_reads_them(samples, tmp_path):
+def test_shards_contain_the_samples_and_any_reader_reads_them(samples, tmp_path):
     import webdataset
 
     assert data(["pack", str(samples), str(tmp_path), "--each", "2"]) == 0

@@ -1,6 +1,6 @@
 """The gradient of each stage's whole loss on one object against central differences.
 
-The random numbers are the same on both sides.  What is a constant backwards by design is left alone: materials are
+The random numbers are the same on both sides.  Values that are detached by design are fixed: materials are
 evaluated at detached points, the frames of bumps have no gradient, densities of samples are detached.  So light samples
 are taken where the material moves, cosine samples alone where the light does, and where the geometry moves the
 materials are even and the bumps are flat.  Colors at outlines go from pixel to pixel by jumps, which only a wide step
@@ -104,7 +104,7 @@ def difference(f, value: torch.Tensor, direction: torch.Tensor, size: float) -> 
 
 
 def test_the_weight_of_quads_moves_their_centers(one, monkeypatch):
-    """gamma decides where a quad's center lies.  Its last layer alone moves, by which no other weight changes."""
+    """gamma decides the position of a quad's center.  Its last layer alone moves, by which no other weight changes."""
     model = ball_model()
     code = stage_step.encode(model, one)
     last = model.merger.mlp[-1]
@@ -124,7 +124,7 @@ def test_the_weight_of_quads_moves_their_centers(one, monkeypatch):
 
 
 def test_the_normals_of_the_mesh_have_a_gradient_in_the_image(one):
-    """The shading normal of a flat bump is that of the mesh; what a light shows of it follows."""
+    """The shading normal of a flat bump is that of the mesh; so is its shading."""
     model = ball_model()
     model.heads["normal"][-1].weight.data.zero_()
     model.heads["normal"][-1].bias.data.zero_()

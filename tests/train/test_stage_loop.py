@@ -101,7 +101,7 @@ def test_stopped_and_continued_is_the_same_run(folder, whole, tmp_path, threads)
 
 
 def test_two_parts_of_a_batch_add_up_to_the_whole(folder):
-    """What the processes of a group have, one after the other here: their mean is the gradient of one process."""
+    """Gradients of the processes of a group, one after the other here: their mean is the gradient of one process."""
     grads = []
     for parts in ([range(4)], [range(0, 4, 2), range(1, 4, 2)]):
         means = 0.0
@@ -150,7 +150,7 @@ def test_two_processes_have_the_losses_of_one(folder, tmp_path):
             assert b[name] == pytest.approx(a[name], rel=1e-3, abs=2e-6), name  # float32 sums in another order
 
 
-def test_killed_at_any_moment_a_run_goes_on_as_if_never_stopped(folder, whole, tmp_path, threads):
+def test_killed_at_any_moment_a_run_resumes_as_if_never_stopped(folder, whole, tmp_path, threads):
     (tmp_path / "worker.py").write_text(WORKER)
     log = tmp_path / "killed" / "log.jsonl"
     call = [sys.executable, tmp_path / "worker.py", folder, log.parent, "6"]
@@ -167,7 +167,7 @@ def test_killed_at_any_moment_a_run_goes_on_as_if_never_stopped(folder, whole, t
     assert_same_run(whole, log.parent)
 
 
-def test_a_log_loses_what_was_half_written_and_what_comes_again(tmp_path):
+def test_a_log_drops_half_written_and_repeated_lines(tmp_path):
     path = tmp_path / "log.jsonl"
     path.write_text('{"step": 1, "loss": 1.0}\n{"step": 2, "loss": 1.0}\n{"step": 3, "lo')
     Log(path, 1, {}).close()
@@ -255,7 +255,7 @@ def test_tensorboard_has_the_numbers_of_the_log_and_the_images(folder, tmp_path)
     pytest.importorskip("tensorboard")
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    for steps in (2, 4):  # the second run goes on at step 2
+    for steps in (2, 4):  # the second run resumes at step 2
         stage = stage_of(folder, validation=Samples(folder))
         train(stage, options_of(stage, tmp_path / "run", steps=steps, tensorboard=str(tmp_path / "board")))
     found = EventAccumulator(str(tmp_path / "board"), {"images": 0, "scalars": 0})
@@ -293,7 +293,7 @@ def test_the_strategies_of_a_stage_can_be_chosen(folder, tmp_path):
     assert plain.samples == (6, 8, 2) and plain.shadows
 
 
-def test_curves_leave_out_what_is_nowhere_finite(tmp_path):
+def test_curves_omit_terms_without_finite_values(tmp_path):
     rows = [{"step": k, "loss": 1.0 / k, "norm": float("nan"), "rate": 0.1, "image": k - 1.0} for k in (1, 2, 3)]
     (tmp_path / "log").write_text("".join(json.dumps(r) + "\n" for r in rows))
     with warnings.catch_warnings():

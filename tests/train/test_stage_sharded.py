@@ -116,7 +116,7 @@ def runs(folder, tmp_path_factory):
     return root, state
 
 
-def test_losses_and_parameters_are_those_of_one_process_and_either_goes_on(runs):
+def test_losses_and_parameters_are_those_of_one_process_and_either_resumes(runs):
     root, _ = runs
     one = rows(root / "one")
     end = torch.load(root / "one" / "state.pt", weights_only=True)
@@ -129,7 +129,7 @@ def test_losses_and_parameters_are_those_of_one_process_and_either_goes_on(runs)
         state = torch.load(root / name / "state.pt", weights_only=True)
         for part in ("model", "average"):
             for key, value in end[part].items():
-                # Adam moves what has nearly no gradient by up to the rate, either way: two steps of 1e-3
+                # Adam moves parameters with nearly no gradient by up to the rate, either way: two steps of 1e-3
                 torch.testing.assert_close(state[part][key], value, rtol=0, atol=2e-3)
                 assert float((state[part][key] - value).abs().mean()) < 5e-5, key
 

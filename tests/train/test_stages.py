@@ -62,7 +62,7 @@ def test_the_papers_numbers():
     assert PAPER["monte_carlo"].samples == (20, 40, 4) and PAPER["monte_carlo"].shadows
 
 
-def test_a_draw_is_a_function_of_its_seed_and_compares_what_was_not_read(source):
+def test_a_draw_is_a_function_of_its_seed_and_compares_unread_views(source):
     counts, shown, heroes = set(), set(), set()
     for step in range(24):
         a, b = (draw([source], (1, step), **SIZES) for _ in range(2))
@@ -190,7 +190,7 @@ def test_terms_without_ground_truth_are_not_computed(one):
     assert "latent" in object_losses(model, replace(one, inputs=lit), GAUSSIANS, gradients)
 
 
-def test_pixels_outside_the_photograph_say_nothing(one):
+def test_pixels_outside_the_photograph_have_no_weight(one):
     valid = torch.ones_like(one.targets.masks)
     valid[:, :, :10] = 0.0
     part = replace(one.targets, valid=valid)
@@ -201,14 +201,14 @@ def test_pixels_outside_the_photograph_say_nothing(one):
         assert float(a[name]) == float(b[name])
 
 
-def test_what_is_cut_off_at_white_may_be_brighter(one):
+def test_clipped_pixels_may_be_brighter(one):
     views = replace(one.targets, images=torch.ones_like(one.targets.images), masks=torch.ones_like(one.targets.masks))
     color = torch.full((24, 24, 3), 1.7)
     got, expected = compared_colors(Rendering(color, color[..., 0], color[..., 0], color, color, color[0]), views, 0)
     assert torch.equal(got, expected)
 
 
-def test_the_multi_scale_gradients_forgive_what_is_even_and_see_edges():
+def test_the_multi_scale_gradients_ignore_constant_regions_and_penalize_edges():
     rendering = torch.rand(32, 32, 3, generator=torch.Generator().manual_seed(0))
     assert float(gradients(rendering + 0.2, rendering)) < 1e-6
     assert float(gradients(rendering.roll(3, 1), rendering)) > 0.1
@@ -251,7 +251,7 @@ def test_every_stage_reaches_the_whole_network(stage, one):
     model = ball_model()
     lit = replace(one.inputs, latent=torch.zeros(9, 3), strength=torch.zeros(()))
     torch.manual_seed(1)
-    for name, p in model.named_parameters():  # what starts at zero would hide what lies before it
+    for name, p in model.named_parameters():  # layers that start at zero would block the gradients of earlier ones
         if "modulation" in name or "normal" in name:
             torch.nn.init.normal_(p, std=0.02)
     terms = object_losses(model, replace(one, inputs=lit), stage, gradients)
@@ -285,6 +285,6 @@ def test_the_shipped_stages_are_named_by_their_keys():
 
 
 @pytest.mark.parametrize("wrong", [{"renderer": "mesh"}, {"patch": 25}])
-def test_a_stage_refuses_what_it_cannot_be(wrong):
+def test_a_stage_refuses_invalid_options(wrong):
     with pytest.raises(ValueError, match="expected .*, got"):
         replace(GAUSSIANS, **wrong)

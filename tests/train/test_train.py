@@ -1,4 +1,4 @@
-"""Training: samples are what they say, losses reach the network, a run resumes where it stopped."""
+"""Training: samples are consistent, losses reach the network, a run resumes where it stopped."""
 
 import dataclasses
 import json
@@ -148,7 +148,7 @@ def test_a_batch_is_a_function_of_seed_step_and_places_however_it_is_shared(fold
 def test_every_parameter_gets_a_gradient(samples):
     torch.manual_seed(0)
     model = LocalReconstructor(SMALL)
-    for _ in range(2):  # the last layers start at zero, so what lies before them learns from the second step on
+    for _ in range(2):  # the last layers start at zero, so earlier layers learn from the second step on
         terms = losses(model, samples[0])
         assert all(bool(torch.isfinite(v)) for v in terms.values())
         model.zero_grad()
@@ -243,7 +243,7 @@ def test_convolutions_in_bfloat16_change_the_losses_by_their_rounding(samples):
     assert float(torch.nn.functional.cosine_similarity(found[0][1], found[1][1], 0)) > 0.999
 
 
-def test_a_checkpoint_of_another_stage_does_not_go_on_and_gives_its_weights(folder, tmp_path, capsys):
+def test_a_checkpoint_of_another_stage_is_not_resumed_but_gives_its_weights(folder, tmp_path, capsys):
     stage = PixelStage(LocalReconstructor(SMALL), [folder])
     train(stage, stage.options(str(tmp_path), steps=1, batch=1))
     assert main([str(folder), str(tmp_path), "--steps", "2", "--batch", "1"]) == 2

@@ -78,7 +78,7 @@ def test_unrelated_cameras_are_suspect():
     assert explain_cameras(replace(views, c2w=c2w))[-1].startswith("suspect: ")
 
 
-def test_one_view_reports_what_is_ambiguous():
+def test_one_view_reports_its_ambiguities():
     views = rig(1)
     assert explain_cameras(views)[-1].startswith("one view: nothing to compare")
     assert "looks away from the origin" in explain_cameras(replace(views, c2w=views.c2w @ FLIP))[-1]
@@ -142,7 +142,7 @@ def test_the_up_axis_is_estimated_from_upright_cameras(axis):
     assert up_axis(turned(c2w, halfway @ TURNS[axis])) is None  # 40 degrees from every axis
 
 
-def test_cameras_that_do_not_tell_up_suggest_nothing():
+def test_cameras_without_a_common_up_axis_suggest_nothing():
     assert up_axis(cameras((0, 20, 2))) is None  # one
     assert up_axis(cameras((0, 20, 2), (4, 20, 2), (8, 25, 2))) is None  # from one side: up or towards us
     rolls = torch.randn(24, 3, 3, generator=torch.Generator().manual_seed(1))

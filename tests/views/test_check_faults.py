@@ -1,4 +1,4 @@
-"""The check of cameras says what is wrong and never ends in a traceback, wherever the eyes are."""
+"""The check of cameras names the fault and never ends in a traceback, wherever the eyes are."""
 
 import json
 from dataclasses import replace
@@ -54,7 +54,7 @@ def test_rigs_of_any_size(tmp_path, scale):
 
 
 def test_lenses_of_all_widths_have_a_verdict(tmp_path):
-    """Found by the campaign: most of the hull lies behind the camera of the second view, so that no footprint ends."""
+    """Found by the campaign: most of the hull is behind the camera of the second view, so that no footprint ends."""
     data = evil.good(tmp_path)
     for frame, fov in zip(data["frames"], (0.011823446300047972, 2.780726955605057, 0.7154630259161558), strict=True):
         frame["camera_fov"] = [fov, fov]

@@ -1,4 +1,4 @@
-"""The choice among many views: distinct ones first, and what is said of near-duplicates and narrow baselines."""
+"""The choice among many views: distinct ones first, and the notes about near-duplicates and narrow baselines."""
 
 import itertools
 import json
@@ -42,7 +42,7 @@ def test_the_choice_covers_within_twice_the_best():
 
 def test_distance_counts_in_addition_to_direction():
     cameras = rig((0, 0, 2), (4, 0, 2), (0, 0, 0.5), (0, 5, 2))
-    assert choose_views(cameras, 2) == [0, 2]  # a close-up tells more than four degrees
+    assert choose_views(cameras, 2) == [0, 2]  # a close-up adds more than four degrees
     angle, distance = view_distances(cameras)
     # axes within 5 degrees: the prior on the point where they meet still weighs a little
     assert float(angle[0, 1]) == pytest.approx(math.radians(4), rel=0.05) and float(angle[0, 2]) < 0.01

@@ -37,7 +37,7 @@ def test_a_malformed_folder_gives_one_line(tmp_path, capfd, name, make):
         load_views(tmp_path / "object")
     one_clear_line(caught.value)
     assert listing(tmp_path) == before
-    assert capfd.readouterr() == ("", "")  # the error is all there is to say
+    assert capfd.readouterr() == ("", "")  # nothing but the error
 
 
 @pytest.mark.parametrize("name, content", evil_maps.cases(), ids=[name for name, _ in evil_maps.cases()])

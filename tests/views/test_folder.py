@@ -183,7 +183,7 @@ def test_files_outside_are_refused(tmp_path):
     with pytest.raises(InputError, match="leads out of it"):
         load_views(tmp_path / "object")
     transforms(tmp_path / "object", [frame | {"file_path": str(tmp_path / "elsewhere/a.png")}])
-    transforms(tmp_path / "object", [frame | {"file_path": "../object/../object/b"}])  # comes back in: fine
+    transforms(tmp_path / "object", [frame | {"file_path": "../object/../object/b"}])  # inside again: accepted
     photo(tmp_path / "object/b.png")
     assert len(load_views(tmp_path / "object")) == 1
 
@@ -203,7 +203,7 @@ def test_an_image_with_two_poses_is_refused(tmp_path, name):
 def test_number_of_views(tmp_path):
     frames = evil.good(tmp_path)["frames"] * 7
     transforms(tmp_path, frames)
-    assert len(load_views(tmp_path)) == 3  # what is there seven times is taken once
+    assert len(load_views(tmp_path)) == 3  # an image listed seven times is used once
     for options in ({"views": MAX_VIEWS}, {"first_views": MAX_VIEWS}):
         assert len(load_views(tmp_path, **options)) == MAX_VIEWS
     for name in ("views", "first_views"):

@@ -174,7 +174,7 @@ REFUSED = [
 
 @pytest.mark.parametrize("per_frame", [False, True])
 @pytest.mark.parametrize("keys", REFUSED, ids=str)
-def test_what_is_not_understood_is_refused(tmp_path, keys, per_frame):
+def test_unknown_lens_keys_are_refused(tmp_path, keys, per_frame):
     """By a line that names a key, its value or that of another, and a fix; never a default."""
     with pytest.raises(InputError) as caught:
         load(tmp_path, keys) if per_frame else load(tmp_path, **keys)

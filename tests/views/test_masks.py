@@ -187,7 +187,7 @@ def test_soft_alpha_is_coverage(tmp_path):
 
 
 def disk(k):
-    """Disks that tell masks from each other by their areas."""
+    """Disks of different areas, one for each mask."""
     return np.where(np.hypot(*(np.mgrid[:SIDE, :SIDE] - 23.5)) < 8 + k, 255, 0).astype(np.uint8)
 
 

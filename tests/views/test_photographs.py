@@ -80,7 +80,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", ACCEPTED)
-def test_what_is_accepted_comes_out_as_stored(tmp_path, name):
+def test_accepted_images_are_read_as_stored(tmp_path, name):
     write, expected, tolerance = ACCEPTED[name]
     write(tmp_path / "a.png")
     (path,) = tmp_path.iterdir()
@@ -93,7 +93,7 @@ def test_what_is_accepted_comes_out_as_stored(tmp_path, name):
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_is_refused_ends_in_one_line(tmp_path, name):
+def test_refused_images_end_in_one_line(tmp_path, name):
     REFUSED[name](tmp_path / "a.png")
     (path,) = tmp_path.iterdir()
     with pytest.raises(InputError, match=r"a\.\w+: expected .*; "):
@@ -166,7 +166,7 @@ def test_color_under_alpha_survives_the_reduction(tmp_path):
 @pytest.mark.parametrize("w, h, turned", [(300, 400, True), (600, 800, True), (400, 300, False), (None, None, False)])
 def test_exif_orientation_counts_where_the_cameras_were_calibrated_on_turned_images(tmp_path, w, h, turned):
     exif = Image.Exif()
-    exif[0x0112] = 6  # the camera was turned: the first row of the file is the right side of what is shown
+    exif[0x0112] = 6  # the camera was turned: the first row of the file is the right side of the upright image
     lens = {} if w is None else {"w": w, "h": h, "cx": 140.0 * w / 300, "cy": 0.5 * h}
     upright = lambda mask: np.rot90(mask, -1) if turned else mask  # noqa: E731
     capture(tmp_path / "phone", 400, 300, (100, 50, 300, 250), exif=exif, mask_at=upright, **lens)

@@ -19,7 +19,7 @@ def ramp_views(width: int = 90, height: int = 70, box=(20, 12, 50, 60)) -> Views
 
 @pytest.mark.parametrize("crop, size", [(True, 32), (True, 100), (False, 32), (False, 40)])
 def test_intrinsics_follow_the_pixels(crop, size):
-    """The color under a projected point tells its pixel in the original: there the original camera must see it."""
+    """The color under a projected point encodes its pixel in the original: there the original camera must see it."""
     views = ramp_views()
     batch = views.resampled(size, crop=crop)
     across = (torch.rand(200, 2, generator=torch.Generator().manual_seed(2)) - 0.5) * 0.3
