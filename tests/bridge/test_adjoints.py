@@ -1,4 +1,4 @@
-"""Float32 adjoints against float64 twins, 999 entries in a thousand to 1e-4, and the twins against differences.
+"""Float32 adjoints against float64 references, 99.9 % of the entries to 1e-4, and these against differences.
 
 Those of the estimator of light, of compositing and of light's lookups are in the tests of these operations.
 """
@@ -34,7 +34,7 @@ ORDER = ("sdf", "deformation", "alpha", "beta")
 
 @dataclass
 class Op:
-    """``ours`` and ``twin`` take the ``leaves`` in order; the twin takes and gives float64 on the CPU.
+    """``ours`` and ``in_float64`` take the ``leaves`` in order; the latter takes and gives float64 on the CPU.
 
     unit: leaves that are unit vectors, of whose gradient only the part across them means something.  one_sign: sums of
     thousands of points, of which some would otherwise cancel.
@@ -42,7 +42,7 @@ class Op:
 
     leaves: dict[str, Tensor]
     ours: Callable[..., Tensor]
-    twin: Callable[..., Tensor]
+    in_float64: Callable[..., Tensor]
     unit: tuple[str, ...] = ()
     one_sign: bool = False
 
@@ -77,10 +77,10 @@ def flexicubes(g) -> Op:
             sdf, radius=0.8, alpha=alpha, beta=beta, deformation=deformation, gamma=gamma.to(sdf)
         ).vertices
 
-    def twin(sdf, alpha, beta, deformation):
+    def in_float64(sdf, alpha, beta, deformation):
         return reference_surface.flexicubes_vertices(sdf, deformation, alpha, beta, 1.6)[0]
 
-    return Op(leaves, ours, twin)
+    return Op(leaves, ours, in_float64)
 
 
 def centers(g) -> Op:
@@ -94,7 +94,7 @@ def centers(g) -> Op:
         fields = {k: v.to(gamma) for k, v in leaves.items()}
         return extract_surface(fields.pop("sdf"), radius=0.8, gamma=gamma, center=True, **fields).vertices[count:]
 
-    def twin(gamma):
+    def in_float64(gamma):
         fields = {k: v for k, v in leaves.items() if k != "sdf"}
         mesh = extract_surface(leaves["sdf"], radius=0.8, center=True, **fields)
         quads = mesh.faces.long().view(-1, 4, 3)[:, :, 0]
@@ -104,7 +104,7 @@ def centers(g) -> Op:
         weight = (one / (one + other))[:, None]
         return 0.5 * (weight * (corner[:, 0] + corner[:, 2]) + (1 - weight) * (corner[:, 1] + corner[:, 3]))
 
-    return Op({"gamma": gamma}, ours, twin)
+    return Op({"gamma": gamma}, ours, in_float64)
 
 
 def deviation(g) -> Op:
@@ -114,10 +114,10 @@ def deviation(g) -> Op:
     def ours(sdf, alpha, beta, deformation):
         return vertex_deviation(sdf, radius=0.8, alpha=alpha, beta=beta, deformation=deformation)
 
-    def twin(sdf, alpha, beta, deformation):
+    def in_float64(sdf, alpha, beta, deformation):
         return reference_surface.flexicubes_deviation(sdf, deformation, alpha, beta, 1.6)
 
-    return Op(leaves, ours, twin)
+    return Op(leaves, ours, in_float64)
 
 
 def on_faces(values, faces, face, bary):
@@ -195,7 +195,7 @@ def points_of_a_mesh(g, tangents) -> Op:
         found = vars(surface_points(mesh, maps, face.to(on), v["bary"])).values()
         return torch.cat([part.reshape(rows, -1) for part in found], 1)
 
-    def twin(*values):
+    def in_float64(*values):
         v = dict(zip(leaves, values, strict=True))
         at = lambda name: on_faces(v[name], faces, face, v["bary"])  # noqa: E731
         a, b, c = v["vertices"][faces[face.long()].long()].unbind(1)
@@ -224,7 +224,7 @@ def points_of_a_mesh(g, tangents) -> Op:
             1,
         )
 
-    return Op(leaves, ours, twin)
+    return Op(leaves, ours, in_float64)
 
 
 def density(g) -> Op:
@@ -286,24 +286,24 @@ def gaussians(g) -> Op:
 def normals(g) -> Op:
     mesh = sheet(150)[0]
 
-    def twin(vertices):
+    def in_float64(vertices):
         a, b, c = (vertices[mesh.faces[:, k].long()] for k in range(3))
         total = torch.zeros_like(vertices)
         for k in range(3):
             total = total.index_add(0, mesh.faces[:, k].long(), torch.linalg.cross(b - a, c - a))
         return F.normalize(total, dim=1)
 
-    return Op({"vertices": mesh.vertices}, lambda v: vertex_normals(v, mesh.faces.to(v.device)), twin)
+    return Op({"vertices": mesh.vertices}, lambda v: vertex_normals(v, mesh.faces.to(v.device)), in_float64)
 
 
 def flat_normals(g) -> Op:
     mesh = sheet(150)[0]
 
-    def twin(vertices):
+    def in_float64(vertices):
         a, b, c = (vertices[mesh.faces[:, k].long()] for k in range(3))
         return torch.linalg.cross(b - a, c - a)
 
-    return Op({"vertices": mesh.vertices}, lambda v: face_normals(v, mesh.faces.to(v.device)), twin)
+    return Op({"vertices": mesh.vertices}, lambda v: face_normals(v, mesh.faces.to(v.device)), in_float64)
 
 
 def smoothing(g) -> Op:
@@ -315,7 +315,7 @@ def smoothing(g) -> Op:
     link = torch.sparse_coo_tensor(ends.T, torch.ones(len(ends), dtype=torch.float64), (n, n), check_invariants=True)
     degree = torch.bincount(ends[:, 0], minlength=n)[:, None]
 
-    def twin(vertices):
+    def in_float64(vertices):
         for step in (0.5, 1 / (0.1 - 2)) * 3:
             vertices = vertices + step * torch.where(inner, link @ vertices / degree - vertices, 0.0)
         return vertices
@@ -323,7 +323,7 @@ def smoothing(g) -> Op:
     def ours(vertices):
         return taubin_smooth(type(mesh)(vertices, mesh.faces.to(vertices.device)), iterations=3).vertices
 
-    return Op({"vertices": mesh.vertices}, ours, twin)
+    return Op({"vertices": mesh.vertices}, ours, in_float64)
 
 
 OPS = {
@@ -356,7 +356,7 @@ def test_the_adjoint_is_that_of_the_float64_reference(device, name):
     """
     op = OPS[name](torch.Generator().manual_seed(7))
     double = op.double()
-    expected = op.twin(*double)
+    expected = op.in_float64(*double)
     ours = [v.to(device).requires_grad_() for v in op.leaves.values()]
     got = op.ours(*ours)
     most = max(1.0, 0.1 * float(expected.detach().abs().max()))  # densities go up to hundreds

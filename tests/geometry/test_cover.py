@@ -77,7 +77,7 @@ def test_the_bound_holds_and_hopeless_rays_are_left(device):
     assert torch.equal(cover_silhouettes(high, high - 5.0, mask, camera, radius=RADIUS), high)
 
 
-def twin(sdf, bound, distance, cameras):
+def in_float64(sdf, bound, distance, cameras):
     """Rays by ``camera_rays``, trilinear and bilinear values by ``grid_sample``, all steps of a ray at once."""
     rows, columns = (k // STRIDE for k in distance.shape[1:])
     step = RADIUS / (max(sdf.shape) - 1)  # half a cell
@@ -110,7 +110,7 @@ def twin(sdf, bound, distance, cameras):
     return torch.where(flat.abs() < FIELD_MAX, torch.maximum(flat - most, bound.reshape(-1)), flat).view_as(sdf)
 
 
-def test_equals_its_twin_on_a_rough_field(device):
+def test_equals_the_float64_reference_on_a_rough_field(device):
     g = torch.Generator().manual_seed(3)
     coarse = torch.randn(1, 1, 6, 6, 6, generator=g)
     sdf = torch.nn.functional.interpolate(coarse, (25, 23, 27), mode="trilinear", align_corners=True)[0, 0] * 2 + 1.0
@@ -122,7 +122,7 @@ def test_equals_its_twin_on_a_rough_field(device):
     distance = mask_distance(masks)
     args = [v.to(device) for v in (sdf, bound, distance, camera)]
     got = cover_silhouettes(*args, radius=RADIUS).cpu()
-    expected = twin(sdf.double(), bound.double(), distance.double(), camera)
+    expected = in_float64(sdf.double(), bound.double(), distance.double(), camera)
     assert float((expected != sdf).double().mean()) > 0.2
     # float32 has rays enter the cube 1e-5 of a step aside; one whose least sdf is FIELD_MAX falls to either side
     assert float(((got - expected).abs() < 2e-4).double().mean()) > 0.999

@@ -1,5 +1,5 @@
 """A hundred thousand cubes, points and faces at the edges of every input of the geometry kernels: values and gradients
-finite everywhere, and equal to a float64 twin wherever that has one answer."""
+finite everywhere, and equal to a float64 reference wherever that is unique."""
 
 import math
 
@@ -22,7 +22,7 @@ from tests.support import reference_surface
 N = 100_000
 CUBES = 47  # a side: 103,823 cubes
 # Of the change by a relative step of an input, where an edge of 0.02 and a random fraction of 1 give up to 0.02: digits
-# that float32 lacks where terms of that size cancel, and float64 in the twin's differences of fractions.  Centers are
+# that float32 lacks where terms of that size cancel, and float64 in differences of fractions.  Centers are
 # means of vertices that are rounded in the box of 1, not in a cube.
 FLOOR = {"sdf": 3e-9, "deformation": 1e-9, "alpha": 3e-9, "beta": 3e-9, "gamma": 1e-7}
 
@@ -59,7 +59,7 @@ def test_gradients_of_flexicubes(device, reach):
     """``reach``: the published activations' range, then all that is allowed."""
     g, n = torch.Generator().manual_seed(reach), CUBES**3
     sdf = wild((CUBES + 1,) * 3, g)
-    for axis in range(3):  # outside at the border: no padding, which the twin has not
+    for axis in range(3):  # outside at the border: no padding, which the reference lacks
         sdf.select(axis, 0).abs_(), sdf.select(axis, -1).abs_()
     leaves = {
         "sdf": sdf,
@@ -107,7 +107,7 @@ def test_gradients_of_the_deviation(device, reach):
     spread = vertex_deviation(ours[0], radius=0.5, **dict(zip(("deformation", "alpha", "beta"), ours[1:], strict=True)))
     assert len(spread) > N and finite(spread, *torch.autograd.grad(spread.sum(), ours))
     expected = reference_surface.flexicubes_deviation(*(v.double() for v in leaves), 1.0)
-    # differences of positions in the box of 1; their absolute values have kinks, so that no twin has all the gradients
+    # differences of positions in the box of 1; their absolute values have kinks, so no reference has all gradients
     torch.testing.assert_close(spread.detach().cpu().double(), expected, rtol=0, atol=3e-7)
 
 

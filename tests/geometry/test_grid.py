@@ -7,7 +7,7 @@ from torch.nn.functional import conv3d, grid_sample
 from reli3d.geometry.grid import sample_grid, squared_laplacian
 
 
-def twin(grid, points):
+def in_float64(grid, points):
     at = points.double()[None, None, None, :, [2, 1, 0]]
     value = grid_sample(grid.double().permute(3, 0, 1, 2)[None], at, align_corners=True, padding_mode="border")
     return value[0, :, 0, 0].T
@@ -23,7 +23,7 @@ def test_values_and_gradients(device):
     grid, points = random_case(device)
     grid.requires_grad_(), points.requires_grad_()
     weight = torch.randn(5000, 11, generator=torch.Generator().manual_seed(1)).to(device)
-    got, expected = sample_grid(grid, points), twin(grid, points)
+    got, expected = sample_grid(grid, points), in_float64(grid, points)
     # float32 place between points: 2^-24 of a coordinate of up to 8 cells, times differences of up to 6
     torch.testing.assert_close(got, expected.float(), rtol=0, atol=1e-5)
     gradients = torch.autograd.grad((got * weight).sum(), (grid, points))
@@ -56,7 +56,7 @@ def test_bad_input_is_named():
     assert sample_grid(grid, points[:0]).shape == (0, 11)
 
 
-def laplacian_twin(field, weight):
+def laplacian_in_float64(field, weight):
     stencil = torch.zeros(3, 3, 3, dtype=torch.float64, device=field.device)
     stencil[1, 1, [0, 2]] = stencil[1, [0, 2], 1] = stencil[[0, 2], 1, 1] = 1.0
     stencil[1, 1, 1] = -6.0
@@ -70,7 +70,7 @@ def test_the_squared_laplacian_is_that_of_a_convolution(device, shape):
     field = torch.randn(shape, generator=generator).to(device).requires_grad_()
     weight = torch.rand(shape, generator=generator)
     weight = (weight * (torch.rand(shape, generator=generator) < 0.5)).to(device)  # borders are not 0
-    got, expected = squared_laplacian(field, weight), laplacian_twin(field, weight)
+    got, expected = squared_laplacian(field, weight), laplacian_in_float64(field, weight)
     torch.testing.assert_close(got.double(), expected, rtol=1e-5, atol=1e-6)  # sums of 1e4 squares in float32
     gradients = [torch.autograd.grad(3.0 * value, field)[0] for value in (got, expected)]
     torch.testing.assert_close(*gradients, rtol=1e-5, atol=1e-3)  # of 7 products of up to 100

@@ -155,10 +155,10 @@ def test_reevaluated_hits_and_their_gradients_equal_float64(device):
         "interpolated": interpolate(ins[0], f, hits.face, got.bary),
         "normal": hit_normals(ins[0], f, hits.face),
     }
-    twin = [t.detach().cpu().double().requires_grad_() for t in ins]
-    a, b, c = (twin[0][f.cpu().long()[hits.face.cpu().long(), k]] for k in range(3))
-    uvt = solved(a, b, c, twin[1], twin[2])
-    spot = twin[1] + uvt[:, 2:] * twin[2]
+    doubles = [t.detach().cpu().double().requires_grad_() for t in ins]
+    a, b, c = (doubles[0][f.cpu().long()[hits.face.cpu().long(), k]] for k in range(3))
+    uvt = solved(a, b, c, doubles[1], doubles[2])
+    spot = doubles[1] + uvt[:, 2:] * doubles[2]
     expected = {
         "t": uvt[:, 2:],
         "bary": uvt[:, :2],
@@ -167,8 +167,8 @@ def test_reevaluated_hits_and_their_gradients_equal_float64(device):
         "normal": torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1),
     }
     sine = (
-        torch.linalg.det(torch.stack([b - a, c - a, twin[2]], -1)).abs()
-        / ((b - a).norm(dim=-1) * (c - a).norm(dim=-1) * twin[2].norm(dim=-1))
+        torch.linalg.det(torch.stack([b - a, c - a, doubles[2]], -1)).abs()
+        / ((b - a).norm(dim=-1) * (c - a).norm(dim=-1) * doubles[2].norm(dim=-1))
     ).detach()
     steep = sine > 0.01  # t and bary of the ray query have an error of 1e-7 over that
     torch.testing.assert_close(got.t.cpu()[steep], hits.t.cpu()[steep], rtol=1e-4, atol=1e-5)
@@ -180,7 +180,7 @@ def test_reevaluated_hits_and_their_gradients_equal_float64(device):
         w = weight[:, : value.shape[1]]
         grads = torch.autograd.grad((value * w.to(device)).sum(), ins, retain_graph=True, allow_unused=True)
         expected_grads = torch.autograd.grad(
-            (expected[name] * w.double()).sum(), twin, retain_graph=True, allow_unused=True
+            (expected[name] * w.double()).sum(), doubles, retain_graph=True, allow_unused=True
         )
         assert (grads[1] is None) == (name == "normal")
         for k, (g, t) in enumerate(zip(grads, expected_grads, strict=True)):

@@ -11,7 +11,7 @@ from reli3d.geometry.hull import hull_distance, mask_distance
 from reli3d.geometry.symmetry import MirrorPlane, mirror_plane, upright
 
 SIZE = 128
-TWIN = [((0.0, 0.0, 0.0), 0.3), ((0.3, 0.1, 0.25), 0.14), ((-0.3, 0.1, 0.25), 0.14), ((0.0, 0.3, -0.2), 0.12)]
+ROTATIONAL = [((0.0, 0.0, 0.0), 0.3), ((0.3, 0.1, 0.25), 0.14), ((-0.3, 0.1, 0.25), 0.14), ((0.0, 0.3, -0.2), 0.12)]
 ODD = [((0.0, 0.0, 0.0), 0.25), ((0.4, 0.1, 0.1), 0.14), ((-0.1, 0.35, 0.3), 0.12), ((-0.2, -0.3, -0.2), 0.1)]
 EYES = [(0.3, 0.9, 2.4), (2.3, 0.4, -0.8), (-1.4, 1.2, -1.7), (-2.1, 0.2, 1.2)]
 
@@ -70,7 +70,7 @@ def test_a_mirrored_camera_sees_the_reflected_point_at_the_mirrored_pixel():
 def test_the_plane_of_two_equal_balls_is_found_in_any_frame(up, center, unit, device):
     camera = cameras(up=up, center=center, unit=unit)
     turn = turned(torch.tensor(up))
-    distance = distances(TWIN, camera, turn, center, unit)
+    distance = distances(ROTATIONAL, camera, turn, center, unit)
     plane = mirror_plane(distance.to(device), camera.to(device))
     normal = plane.normal.cpu()
     expected = turn[:, 0]
@@ -102,7 +102,7 @@ def around(count, arc):
 def test_from_one_side_the_plane_is_ambiguous(count, arc):
     camera = around(count, arc)
     assert mirror_plane(distances(ODD, camera), camera) is None
-    assert mirror_plane(distances(TWIN, camera), camera) is None
+    assert mirror_plane(distances(ROTATIONAL, camera), camera) is None
 
 
 @pytest.mark.parametrize("count, arc", [(4, 270), (8, 315)])
@@ -131,7 +131,7 @@ def test_a_plane_cuts_little_of_an_object_that_has_none(count, arc):
 
 def test_few_views_and_rolled_cameras_are_ambiguous():
     camera = cameras()
-    distance = distances(TWIN, camera)
+    distance = distances(ROTATIONAL, camera)
     for count in (1, 2):
         assert mirror_plane(distance[:count], camera[:count]) is None
     angles = torch.tensor([0.5, -0.6, 0.7, -0.4])
@@ -140,7 +140,7 @@ def test_few_views_and_rolled_cameras_are_ambiguous():
     roll[:, 1, 0], roll[:, 0, 1] = angles.sin(), -angles.sin()
     rolled = replace(camera, c2w=camera.c2w @ roll)
     assert upright(rolled) is None
-    assert mirror_plane(distances(TWIN, rolled), rolled) is None
+    assert mirror_plane(distances(ROTATIONAL, rolled), rolled) is None
 
 
 def test_upright_is_perpendicular_to_horizontal_edges():
@@ -154,7 +154,7 @@ def test_cameras_in_one_place_are_ambiguous():
     eye = look_at((0.3, 0.9, 2.4))
     turned_on_the_spot = torch.stack([eye @ yawed(angle) for angle in (-0.6, 0.0, 0.6)])
     camera = Camera.from_fov(turned_on_the_spot, 2.2, SIZE, SIZE)
-    assert mirror_plane(distances(TWIN, camera), camera) is None
+    assert mirror_plane(distances(ROTATIONAL, camera), camera) is None
 
 
 def yawed(angle):

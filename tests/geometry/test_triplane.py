@@ -68,7 +68,7 @@ def test_half_storage_is_summed_in_float32(device, dtype):
     assert torch.equal(grad, expected.to(dtype))  # rounded once, after the sum over 4000 points
 
 
-def test_a_walk_is_read_as_it_comes_and_shuffled_points_by_row_with_the_same_bits():
+def test_coherent_points_in_order_and_shuffled_ones_by_row_are_bitwise_equal():
     planes, _, _ = inputs(1, 8, 100, 100)
     assert planes[0, 0].numel() > CACHED
     t = torch.linspace(0, 300, 6000)
@@ -78,7 +78,7 @@ def test_a_walk_is_read_as_it_comes_and_shuffled_points_by_row_with_the_same_bit
 
 
 @pytest.mark.parametrize("channels, height, width", [(40, 120, 90), (13, 64, 200)])
-def test_channel_first_planes_are_read_by_rows_with_the_same_bits(channels, height, width):
+def test_channel_first_planes_read_by_rows_are_bitwise_equal(channels, height, width):
     """Scattered points, some outside; rows of cells without any, whole bands of them, and a batch."""
     planes, points, weights = inputs(2, channels, height, width, 3000)
     points[1, :, 1] = points[1, :, 1].abs() * 0.3 + 0.4

@@ -94,20 +94,20 @@ def test_gathered_values_and_gradients_equal_their_float64_reference(device):
     values, pixels = gather_views(*ins, camera)
     finer, shown = gather_views(*ins, camera.scaled(2))  # the maps show the same image in half of its resolution
     assert torch.equal(finer, values) and torch.equal(shown, pixels)
-    twin, rows = [v.double().requires_grad_() for v in (maps, points)], []
+    doubles, rows = [v.double().requires_grad_() for v in (maps, points)], []
     for v in range(3):
         c2w, intrinsics = poses.c2w[v].cpu().double(), poses.intrinsics[v].cpu().double()
-        local = (twin[1] - c2w[:3, 3]) @ c2w[:3, :3]
+        local = (doubles[1] - c2w[:3, 3]) @ c2w[:3, :3]
         fx, fy, cx, cy = intrinsics
         x, y = fx * local[:, 0] / -local[:, 2] + cx, fy * local[:, 1] / local[:, 2] + cy
         grid = torch.stack([x / 20 * 2 - 1, y / 24 * 2 - 1], -1)[None, None]
-        image = grid_sample(twin[0][v].permute(2, 0, 1)[None], grid, align_corners=False, padding_mode="border")
+        image = grid_sample(doubles[0][v].permute(2, 0, 1)[None], grid, align_corners=False, padding_mode="border")
         rows.append(torch.cat([image[0, :, 0].T, torch.stack([x, y, -local[:, 2]], -1)], -1))
     got, expected = torch.cat([values, pixels], -1), torch.stack(rows, 1)
     assert reference.fraction_within(got, expected) >= 0.999
     weight = torch.rand(expected.shape, generator=g)  # of one sign: sums that cancel have no digits left
     grads = torch.autograd.grad((got * weight.to(device)).sum(), ins)
-    expected_grads = torch.autograd.grad((expected * weight.double()).sum(), twin)
+    expected_grads = torch.autograd.grad((expected * weight.double()).sum(), doubles)
     assert reference.fraction_within(grads[0], expected_grads[0]) >= 0.999
     assert reference.rows_within(grads[1], expected_grads[1]) >= 0.999
 

@@ -61,7 +61,7 @@ def test_texels_are_baked_at_their_centers(goldens):
 
 
 def test_normal_maps_are_relative_to_the_normals_they_are_shown_with(ball):
-    """The release encodes in flat frames and exports smooth normals: a smooth surface comes out faceted."""
+    """The release encodes in flat frames and exports smooth normals: a smooth surface becomes faceted."""
     texels = rasterize_texels(ball, SIZE)
     flat = ball.vertices[ball.faces.long()]
     flat = normalize(torch.linalg.cross(flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0]), dim=-1)
@@ -122,8 +122,8 @@ def test_environment_lookups_meet_texel_centers_and_wrap(goldens):
     data = np.load(goldens / "env_parametrisation.npz")
     radiance = torch.from_numpy(np.load(goldens / "reni_decoder.npz")["env_map"][1])
     stored = torch.from_numpy(data["sampled"])
-    twin = release_lookup(radiance, torch.from_numpy(data["direction"]))
-    torch.testing.assert_close(twin, stored, rtol=1e-4, atol=1e-5)  # the release's mapping
+    computed = release_lookup(radiance, torch.from_numpy(data["direction"]))
+    torch.testing.assert_close(computed, stored, rtol=1e-4, atol=1e-5)  # the release's mapping
     ours = from_published(radiance)
     environment, centers = Environment(ours), lat_long_directions(64).reshape(-1, 3).contiguous()
     texels = ours.reshape(-1, 3)

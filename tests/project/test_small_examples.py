@@ -105,7 +105,7 @@ def face_normals(mesh, hits):
 
 
 def albedo_by_quadrature(alpha: float) -> float:
-    """Of a white mirror of GGX width ``alpha`` seen at a cosine of 0.8: the float64 twin summed over the sphere."""
+    """Of a white mirror of GGX width ``alpha`` seen at a cosine of 0.8: a float64 reference summed over the sphere."""
     wi, angle = reference.sphere_grid(600)
     wi = wi.roll(1, -1)  # its pole is y, here z
     wi = wi[wi[:, 2] > 1e-6]

@@ -74,14 +74,14 @@ def test_lookup_and_its_gradient_equal_the_float64_reference(device):
     weight = torch.rand(20_000, 3, generator=g)  # of one sign: sums that cancel have no digits left
     ins = [radiance.to(device).requires_grad_(), d.to(device).requires_grad_()]
     got = Environment(ins[0]).lookup(ins[1])
-    twin = [radiance.double().requires_grad_(), d.double().requires_grad_()]
-    expected = reference.lookup_envmap(*twin)
+    doubles = [radiance.double().requires_grad_(), d.double().requires_grad_()]
+    expected = reference.lookup_envmap(*doubles)
     torch.testing.assert_close(
         got.cpu().double(), expected, rtol=0, atol=2e-5
     )  # 1e-7 of u times 18 texels, with margin
     assert reference.fraction_within(got, expected) >= 0.999
     grads = torch.autograd.grad((got * weight.to(device)).sum(), ins)
-    expected_grads = torch.autograd.grad((expected * weight.double()).sum(), twin)
+    expected_grads = torch.autograd.grad((expected * weight.double()).sum(), doubles)
     assert reference.fraction_within(grads[0], expected_grads[0]) >= 0.999
     # a direction may sit on a kink between texels
     assert reference.rows_within(*(reference.across(v, d) for v in (grads[1], expected_grads[1]))) >= 0.999

@@ -43,13 +43,13 @@ def leaves(tensors):
 def test_value_and_gradients_match_the_definition(device):
     own, rng = leaves(lobes(device)), torch.Generator().manual_seed(1)
     d = normalize(torch.randn(300, 3, generator=rng), dim=-1).to(device).requires_grad_()
-    twin, at = leaves([t.detach().double() for t in own]), d.detach().double().requires_grad_()
+    doubles, at = leaves([t.detach().double() for t in own]), d.detach().double().requires_grad_()
     weight = torch.rand(300, 3, generator=rng).to(device)
     got = SphericalGaussians(*own).lookup(d)
-    expected = light_at(at, *twin)
+    expected = light_at(at, *doubles)
     torch.testing.assert_close(got.double(), expected, rtol=2e-5, atol=1e-6)  # sharpness 150 times float32 noise
     grads = torch.autograd.grad((got * weight).sum(), [*own, d])
-    expected_grads = torch.autograd.grad((expected * weight.double()).sum(), [*twin, at])
+    expected_grads = torch.autograd.grad((expected * weight.double()).sum(), [*doubles, at])
     # the squared chord and the cosine differ in derivative by multiples of the unit vectors: compare across them
     for k, v in ((0, own[0]), (3, d)):
         assert reference.rows_within(*(reference.across(g[k], v) for g in (grads, expected_grads))) >= 0.999, k
@@ -62,14 +62,14 @@ def test_irradiance_and_gradients_match_quadrature(device):
     d, solid = sphere()
     own, rng = leaves(lobes(device, 24)), torch.Generator().manual_seed(2)
     normals = normalize(torch.randn(48, 3, generator=rng), dim=-1).to(device).requires_grad_()
-    twin, at = leaves([t.detach().cpu().double() for t in own]), normals.detach().cpu().double().requires_grad_()
-    expected = ((at @ d.T).clamp(min=0.0) * solid) @ light_at(d, *twin)
+    doubles, at = leaves([t.detach().cpu().double() for t in own]), normals.detach().cpu().double().requires_grad_()
+    expected = ((at @ d.T).clamp(min=0.0) * solid) @ light_at(d, *doubles)
     got = SphericalGaussians(*own).irradiance(normals)
     # the fit errs by 0.2 % of a lobe's maximum each, here with random signs over 24 lobes
     assert float((got.detach().cpu().double() - expected.detach()).abs().max()) < 3e-3 * float(expected.detach().max())
     weight = torch.rand(48, 3, generator=rng)
     grads = torch.autograd.grad((got * weight.to(device)).sum(), [*own, normals])
-    expected_grads = torch.autograd.grad((expected * weight.double()).sum(), [*twin, at])
+    expected_grads = torch.autograd.grad((expected * weight.double()).sum(), [*doubles, at])
     for g, t, v in zip(grads, expected_grads, [*own, normals], strict=True):
         g = g.cpu().double()
         if v.shape[-1] == 3 and v is not own[2]:

@@ -1,5 +1,5 @@
 """A hundred thousand points at the edges of every input: gradients finite everywhere, and where the value is smooth
-those of a float64 twin that adds the same samples by the papers' formulas."""
+those of a float64 reference that adds the same samples by the papers' formulas."""
 
 import pytest
 import torch
@@ -81,14 +81,14 @@ def test_gradients_of_the_material(device, diffuse_model):
     # smooth: away from the horizon and above the width's floor
     keep = (local[0][:, 2] > 1e-2) & (local[1][:, 2] > 1e-2) & (alpha >= 0.01)
     assert keep.sum() > 10_000
-    twin = [v.detach()[keep].cpu().double().requires_grad_() for v in leaves]
-    expected = reference.eval_bsdf(*twin, diffuse_model)
-    expected_grads = torch.autograd.grad((expected * weight[keep].double()).sum(), twin)
+    in_float64 = [v.detach()[keep].cpu().double().requires_grad_() for v in leaves]
+    expected = reference.eval_bsdf(*in_float64, diffuse_model)
+    expected_grads = torch.autograd.grad((expected * weight[keep].double()).sum(), in_float64)
     assert close(value.detach()[keep], expected.detach(), 0.999, 1e-5)
     for k, (g, t) in enumerate(zip(grads, expected_grads, strict=True)):
         g = g.cpu()[keep].double()
         if k < 2:  # only the tangent part of a direction's gradient is defined
-            g, t = (reference.across(v, twin[k]) for v in (g, t))
+            g, t = (reference.across(v, in_float64[k]) for v in (g, t))
         assert reference.fraction_within(g, t) >= 0.999, k
 
 
@@ -99,7 +99,7 @@ def bent(normal, ng, wo):
     return torch.where(cos < COS_VIEW_MIN, normalize(facing + wo * (COS_VIEW_MIN - cos), dim=-1), facing)
 
 
-def twin(leaves, ng, wo, draws, density, light, diffuse_model):
+def in_float64(leaves, ng, wo, draws, density, light, diffuse_model):
     """Radiance ``(N, 3)``: mean over constant directions ``draws`` of value, cosine and ``light`` over ``density``."""
     normal, base, alpha, metallic = leaves
     wo, n = (
@@ -134,7 +134,7 @@ def world_directions(normal, ng, wo, alpha, u):
 @pytest.mark.parametrize("diffuse_model", DIFFUSE_MODELS)
 @pytest.mark.parametrize("strategy", ["map", "visible"])
 def test_gradients_of_the_estimator(device, strategy, diffuse_model):
-    """Two samples a point of one strategy, so that the twin can draw them too."""
+    """Two samples a point of one strategy, so that the reference can draw them too."""
     normal, ng, wo, _, base, alpha, metallic = drawn(N, 2)
     generator = torch.Generator().manual_seed(3)
     texels = torch.rand(8, 16, 3, generator=generator) ** 3 * 2.0
@@ -146,7 +146,7 @@ def test_gradients_of_the_estimator(device, strategy, diffuse_model):
         draws.append(d.double()), density.append(p.double())
     exact = [v.double() for v in (ng, wo)]
     n = bent(normal.double(), *exact)
-    # no twin where rounding decides: which side is seen, whether the normal is bent, or where to if it points away from
+    # no reference where rounding decides which side is seen, if the normal is bent, or where to if it points away from
     # the view, whether a sample is above
     toward = (exact[0] * exact[1]).sum(-1)
     facing = (toward.abs() > 1e-5) & ((normal.double() * exact[1]).sum(-1) * toward.sign() > -0.9)
@@ -182,7 +182,7 @@ def test_gradients_of_the_estimator(device, strategy, diffuse_model):
     part = [v.detach().cpu().double()[smooth].requires_grad_() for v in leaves[:4]]
     radiance = texels.double().requires_grad_()
     light = [reference.lookup_envmap(radiance, d[smooth]) for d in draws]
-    expected = twin(
+    expected = in_float64(
         part,
         *(v[smooth] for v in exact),
         [d[smooth] for d in draws],
@@ -255,7 +255,7 @@ def weighed(outs, seed=0):
 
 def test_hits_of_slivers_and_of_faces_without_area_have_finite_gradients(device):
     """A hundred thousand rays at points of any face.  A ray query never gives faces without area: these hits are made
-    by hand.  There the evaluation keeps its inputs, and every gradient is 0."""
+    explicitly.  There the evaluation keeps its inputs, and every gradient is 0."""
     g = torch.Generator().manual_seed(6)
     corners = slivers(g)
     faces = torch.arange(corners.numel() // 3, dtype=torch.int32, device=device).reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""The material's value against a float64 twin, Mitsuba's distribution, reciprocity and energy."""
+"""The material's value against a float64 reference, Mitsuba's distribution, reciprocity and energy."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from tests.support import mitsuba_scene, reference
 
 def pairs(n, seed=0, low=0.02, alpha=None):
     """Directions, base color, GGX width and metallic: every other ``wi`` drawn from the lobe of ``wo`` by the float64
-    twin, since independent directions miss a narrow lobe; the rest, and those below ``low``, anyhow."""
+    reference, since independent directions miss a narrow lobe; the rest, and those below ``low``, anyhow."""
     g = torch.Generator().manual_seed(seed)
     d = torch.nn.functional.normalize(torch.randn(2, n, 3, generator=g), dim=-1)
     d[..., 2] = d[..., 2].abs().clamp(min=low)
@@ -30,17 +30,20 @@ def pairs(n, seed=0, low=0.02, alpha=None):
 def test_value_and_gradients_equal_the_float64_reference(device, diffuse_model):
     ins = pairs(4000)
     leaf = [v.to(device).requires_grad_() for v in ins]
-    twin = [v.double().requires_grad_() for v in ins]
+    doubles = [v.double().requires_grad_() for v in ins]
     wo, wi, *material = leaf
-    got, expected = eval_bsdf(wo, *material, wi, diffuse_model=diffuse_model), reference.eval_bsdf(*twin, diffuse_model)
+    got, expected = (
+        eval_bsdf(wo, *material, wi, diffuse_model=diffuse_model),
+        reference.eval_bsdf(*doubles, diffuse_model),
+    )
     off = (got.detach().cpu().double() / expected.detach() - 1).abs().amax(-1)
     assert float(off.max()) < 2e-5  # rounding of cosines of 0.02; measured 8e-6, from widths of 0.01 to 1
     weight = torch.randn(got.shape, generator=torch.Generator().manual_seed(1))
     grads = torch.autograd.grad((got * weight.to(device)).sum(), leaf)
-    expected_grads = torch.autograd.grad((expected * weight.double()).sum(), twin)
+    expected_grads = torch.autograd.grad((expected * weight.double()).sum(), doubles)
     for k, (g, t) in enumerate(zip(grads, expected_grads, strict=True)):
         if k < 2:  # the two write cosines differently off the unit sphere: only the tangent part is defined
-            g, t = (reference.across(v, twin[k]) for v in (g, t))
+            g, t = (reference.across(v, doubles[k]) for v in (g, t))
         assert reference.fraction_within(g, t) >= 0.999, k
 
 

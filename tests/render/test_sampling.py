@@ -187,7 +187,7 @@ def test_directions_return_to_the_numbers_they_came_from(device):
         second = 1.0 - (cap[:, 2] + w[2]) / (1.0 + w[2])
         sure = (cap[:, 2].abs() < 0.999) & (wm[:, 2] > 1e-3)  # off the poles and off the floor of the normal's height
         off = torch.stack([(first - u[:, 0] + 0.5) % 1.0 - 0.5, second - u[:, 1]], -1)[sure]
-        # 1e-7 of a unit normal, some ten times that where it is far from the view and stretched
+        # 1e-7 of a unit normal, about 10 times that where it is far from the view and stretched
         assert float(off.abs().max()) < 1e-4 and float(sure.double().mean()) > 0.95, (alpha, deg)
 
 

@@ -1,4 +1,4 @@
-"""Ray marching against a plain loop over steps, compositing against a float64 twin, closed forms and a descent."""
+"""Ray marching against a plain loop over steps, compositing against a float64 reference, closed forms and a descent."""
 
 import math
 
@@ -25,7 +25,7 @@ def random_grid(device, resolution=12, fraction=0.3, seed=1):
     return OccupancyGrid(cells.to(device), 0.8)
 
 
-def twin(samples, density, color):
+def in_float64(samples, density, color):
     """The transmittance product in float64, padded to rays x samples, by autograd."""
     counts = samples.first.long().diff().cpu()
     n, longest = len(counts), int(counts.max()) if len(counts) else 0
@@ -107,7 +107,7 @@ def test_composite_and_gradients_match_the_float64_reference(device):
     samples, density, color = packed(COUNTS, device)
     own = [v.clone().requires_grad_() for v in (density, color)]
     far = [v.detach().cpu().double().requires_grad_() for v in (density, color)]
-    out, expected = composite(*own, samples), twin(samples, *far)
+    out, expected = composite(*own, samples), in_float64(samples, *far)
     rng = torch.Generator().manual_seed(4)
     loss = ref = 0.0
     for got, exact in zip((out.color, out.opacity, out.depth), expected, strict=True):
@@ -120,7 +120,7 @@ def test_composite_and_gradients_match_the_float64_reference(device):
 
 
 def planes_read(planes, points):
-    """Float64 twin of :func:`reli3d.geometry.triplane.sample_triplane`, ``(S, 3 C)``."""
+    """Float64 reference of :func:`reli3d.geometry.triplane.sample_triplane`, ``(S, 3 C)``."""
     out = []
     for plane, axes in zip(planes[0], ((0, 1), (0, 2), (1, 2)), strict=True):
         grid = points[:, axes][None, None]
@@ -149,7 +149,7 @@ def test_a_triplane_is_marched_and_composited_as_in_float64(device):
     out = composite(*field(samples.positions(origins, directions), planes, heads, read), samples)
     far = [v.double().requires_grad_() for v in leaves]
     o, d, t, ray = (v.cpu() for v in (origins.double(), directions.double(), samples.t.double(), samples.ray.long()))
-    expected = twin(samples, *field(o[ray] + t[:, None] * d[ray], *far, planes_read))
+    expected = in_float64(samples, *field(o[ray] + t[:, None] * d[ray], *far, planes_read))
     weight = [torch.rand(v.shape, generator=rng) for v in expected[:2]]
     loss = ref = 0.0
     for got, exact, w in zip((out.color, out.opacity), expected, weight):
@@ -166,7 +166,7 @@ def test_faint_and_opaque_media_keep_their_digits(device):
         samples, density, color = packed([40, 3], device)
         density = density.abs() * scale
         own, far = density.clone().requires_grad_(), density.cpu().double().clamp(max=1e35).requires_grad_()
-        got, expected = composite(own, color, samples), twin(samples, far, color.cpu().double())
+        got, expected = composite(own, color, samples), in_float64(samples, far, color.cpu().double())
         torch.testing.assert_close(got.opacity.detach().cpu().double(), expected[1].detach(), rtol=2e-6, atol=0)
         (g,) = torch.autograd.grad(got.color.sum() + got.depth.sum(), own)
         (t,) = torch.autograd.grad(expected[0].sum() + expected[2].sum(), far)

@@ -1,4 +1,4 @@
-"""Float64 twins of the renderer's formulas in plain torch, written from the papers, differentiable by autograd.
+"""The renderer's formulas in float64 and plain torch, written from the papers, differentiable by autograd.
 
 Directions are in the local frame, normal +z.  Shapes ``(..., 3)`` and ``(...)``; everything float64.
 """

@@ -51,14 +51,14 @@ def sets(tmp_path):
     return material_sets(tmp_path / "sets")
 
 
-def dressed(sets, seed, *, measured):
+def refinished(sets, seed, *, measured):
     rng = np.random.default_rng(seed)
     surface = RefinishedSurface(Ball(), sets, rng, measured=measured, texels=256)
     return surface.points_at(*random_faces(surface, 400, np.random.default_rng(0)))
 
 
 def test_the_same_seed_gives_the_same_materials(sets):
-    first, second, other = (dressed(sets, seed, measured=False) for seed in (5, 5, 6))
+    first, second, other = (refinished(sets, seed, measured=False) for seed in (5, 5, 6))
     for name in ("base_color", "roughness", "metallic", "normal"):
         assert torch.equal(getattr(first, name), getattr(second, name))
     assert not torch.equal(first.roughness, other.roughness)
@@ -66,7 +66,7 @@ def test_the_same_seed_gives_the_same_materials(sets):
 
 def test_values_are_materials(sets):
     for seed in range(20):
-        points = dressed(sets, seed, measured=bool(seed % 2))
+        points = refinished(sets, seed, measured=bool(seed % 2))
         assert bool((points.base_color >= 0).all() and (points.base_color <= 1).all())
         assert bool((points.roughness >= 0.03).all() and (points.roughness <= 1).all())
         assert bool((points.metallic >= 0).all() and (points.metallic <= 1).all())
@@ -77,7 +77,7 @@ def test_placeholders_of_a_scan_are_never_kept_and_measured_values_are(sets):
     kept = {measured: 0 for measured in (False, True)}
     for seed in range(30):
         for measured in kept:
-            roughness = dressed(sets, seed, measured=measured).roughness
+            roughness = refinished(sets, seed, measured=measured).roughness
             kept[measured] += int((roughness == PLACEHOLDER).float().mean() > 0.05)
     assert kept[False] == 0
     assert kept[True] > 5  # a finish is kept with probability 0.32, and there are one to four
@@ -87,7 +87,7 @@ def test_a_set_of_one_color_gives_that_material(sets):
     """sRGB 188 is 0.503 linear; the gain of a channel is log-normal with a deviation of 0.21: within 0.4 to 2."""
     found = 0
     for seed in range(30):
-        points = dressed(sets, seed, measured=False)
+        points = refinished(sets, seed, measured=False)
         steel = (points.metallic == 1.0) & ((points.roughness - 0.2).abs() < 0.2)  # the shift's deviation is 0.06
         gray = srgb_to_linear(torch.tensor(188 / 255))
         if int(steel.sum()) > 1:
@@ -102,7 +102,7 @@ def test_borders_are_sharp(sets):
     """A point takes the finish of one region: of a set and something else no mixtures appear."""
     mixed = 0
     for seed in range(20):
-        metallic = dressed(sets, seed, measured=False).metallic
+        metallic = refinished(sets, seed, measured=False).metallic
         mixed += int(((metallic > 0.02) & (metallic < 0.98)).float().mean() > 0.2)
     assert mixed <= 4  # layers of procedural materials may blend
 
@@ -118,5 +118,5 @@ def test_a_folder_without_sets_or_with_a_missing_map_is_refused(tmp_path, sets):
 
 def test_two_objects_of_five_keep_their_base_color(sets):
     base = Ball().points_at(*random_faces(Ball(), 400, np.random.default_rng(0))).base_color
-    kept = sum(torch.equal(dressed(sets, seed, measured=True).base_color, base) for seed in range(60))
+    kept = sum(torch.equal(refinished(sets, seed, measured=True).base_color, base) for seed in range(60))
     assert 24 <= kept <= 48  # 0.4, and a quarter of the rest; three standard deviations are 11

@@ -34,7 +34,7 @@ def scans(tmp_path_factory):
     call = ["--maps", str(root / "maps.npz"), "--meshes", str(root / "box.glb"), "--count", "1", "--views", "2"]
     call += ["--size", "32", "--workers", "1"]
     assert data(["render", str(root / "plain"), *call]) == 0
-    assert data(["render", str(root / "dressed"), *call, "--materials", str(root / "sets")]) == 0
+    assert data(["render", str(root / "refinished"), *call, "--materials", str(root / "sets")]) == 0
     return root
 
 
@@ -43,7 +43,7 @@ def path_of(scans, name):
 
 
 def test_a_sample_stores_whether_its_finish_is_ground_truth(scans, folder):
-    for name, known in (("plain", 0), ("dressed", 1)):
+    for name, known in (("plain", 0), ("refinished", 1)):
         assert load_file(path_of(scans, name))["finish_known"].tolist() == [known, known]
         assert read_views_reduced(path_of(scans, name), 1).finish_known.tolist() == [bool(known)] * 2
     procedural = next(folder.glob("*.safetensors"))
@@ -64,13 +64,13 @@ def test_an_unknown_finish_takes_part_in_no_loss(scans, bins):
     for head in model.pyramid.says.values():
         torch.nn.init.normal_(head[1].weight, std=0.3)
     model = with_bins(model, bins)
-    plain, dressed = (read_views_reduced(path_of(scans, name), 1) for name in ("plain", "dressed"))
+    plain, refinished = (read_views_reduced(path_of(scans, name), 1) for name in ("plain", "refinished"))
     alone = pixel_losses(model, Group.of([plain]))
     assert set(alone) == {"pixel_color", "pixel_pattern", "pixel_normal", "pixel_depth"}
-    both, known = (pixel_losses(model, Group.of(parts)) for parts in ([plain, dressed], [dressed]))
+    both, known = (pixel_losses(model, Group.of(parts)) for parts in ([plain, refinished], [refinished]))
     for name in FINISH:
         torch.testing.assert_close(both[f"pixel_{name}"], known[f"pixel_{name}"], rtol=1e-3, atol=1e-5)
-    for name, parts in (("plain", set()), ("dressed", FINISH)):
+    for name, parts in (("plain", set()), ("refinished", FINISH)):
         sample = load_sample(path_of(scans, name), 2, 256, np.random.default_rng(0), augment=False)
         assert set(losses(model, sample)) & {*FINISH, "pixel_roughness", "pixel_metallic"} == {
             *parts,
@@ -79,13 +79,13 @@ def test_an_unknown_finish_takes_part_in_no_loss(scans, bins):
 
 
 def test_the_papers_stages_have_no_material_of_an_unknown_finish(scans):
-    for name, known in (("plain", False), ("dressed", True)):
+    for name, known in (("plain", False), ("refinished", True)):
         views = Samples(scans / name).load(0, range)
         assert (views.material is not None) == known and views.normal is not None
 
 
 def test_a_run_over_bins_resumes_and_starts_the_next_one(scans, tmp_path, capsys):
-    call = [str(scans / "dressed"), str(tmp_path / "run"), "--batch", "1"]
+    call = [str(scans / "refinished"), str(tmp_path / "run"), "--batch", "1"]
     pixels = ["--stage", "pixels", "--image-size", "64"]
     assert main([*call, *pixels, "--steps", "1", "--material-bins", "8"]) == 0
     assert main([*call, *pixels, "--steps", "2"]) == 0  # without the option the checkpoint's preset is used

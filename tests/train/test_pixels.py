@@ -165,7 +165,7 @@ def test_every_view_of_a_drawn_object_is_read_once(folder):
     assert not torch.equal(other.views.c2w, group.views.c2w)
 
 
-def test_levels_are_taught_one_after_the_other(folder, tmp_path):
+def test_levels_are_trained_one_after_the_other(folder, tmp_path):
     """From images of 64 pixels to the whole network by the command; each stage keeps the weights of the one before."""
     start = ["--steps", "2", "--batch", "2", "--rate", "1e-9"]
     assert main([str(folder), str(tmp_path / "64"), "--stage", "pixels", "--image-size", "64", *start]) == 0
