@@ -18,13 +18,14 @@ if TYPE_CHECKING:
     from reli3d.train.stage import Stage
 
 SMALL_STAGES = ("pixels", "small")
+LIGHT_PRIOR = "light_prior"
 SIDES = 64, 128, 256  # of the images of stage pixels
 CALIBRATED = 5  # least views of a sample for calibration: four are input, one is compared
 OF_LOOP = ("steps", "minutes", "batch", "rate", "seed", "save_every", "tensorboard")
-OF_ALL = (*OF_LOOP, "weights", "validation", "export", "license", "max_views", "bfloat16")
-OF_SMALL = ("points", "pyramid_rate", "maps", "material_bins")
+OF_NETWORK = ("weights", "validation", "export", "licence", "max_views", "bfloat16")
+OF_SMALL = (*OF_NETWORK, "points", "pyramid_rate", "maps", "material_bins")
 OF_CONFIG = ("image_size", "patch", "targets", "lobes", "resolution", "samples", "shadows")  # of a StageConfig
-OF_PAPER = (*OF_CONFIG, "preset", "prior", "perceptual", "checkpointing", "shard", "device")
+OF_PAPER = (*OF_NETWORK, *OF_CONFIG, "preset", "prior", "perceptual", "checkpointing", "shard", "device")
 
 
 def parser() -> argparse.ArgumentParser:
@@ -39,7 +40,8 @@ def parser() -> argparse.ArgumentParser:
         type=Path,
         nargs="*",
         default=[],
-        help="folders of samples; for the stages of the ReLi3D paper also captures, shards",
+        help="folders of samples; for the stages of the ReLi3D paper also captures, shards; for light_prior "
+        "environment maps, .npz",
     )
     p.add_argument("output", type=Path, help="folder of the checkpoint, the log, the curves and validation images")
     p.add_argument(
@@ -47,7 +49,7 @@ def parser() -> argparse.ArgumentParser:
         default="small",
         help="pixels, small: the small network, its 2D U-Net alone or all of it; volume, gaussians, surface, "
         "monte_carlo: the paper's network of preset tiny; volume, gaussians128, gaussians256, gaussians512, "
-        "monte_carlo: of preset official",
+        "monte_carlo: of preset official; light_prior: the environment decoder alone",
     )
     p.add_argument(
         "--weights",
@@ -86,7 +88,7 @@ def parser() -> argparse.ArgumentParser:
     paper.add_argument("--image-size", type=int, help="pixels per side; for stage pixels 64 (default), 128 or 256")
     paper.add_argument("--preset", choices=("tiny", "official"))
     paper.add_argument(
-        "--prior", type=Path, help="environment decoder from reli3d.train.light_prior, frozen; adds a loss"
+        "--prior", type=Path, help="checkpoint of stage light_prior: its environment decoder, frozen; adds a loss"
     )
     paper.add_argument("--perceptual", choices=("gradients", "lpips"))
     paper.add_argument("--checkpointing", action="store_true", help="recompute the trunk's layers in the backward pass")
@@ -105,10 +107,10 @@ def parsed(argv: list[str] | None) -> argparse.Namespace:
     from reli3d.train.log import summary_writer
 
     args = parser().parse_intermixed_args(argv)
-    own = OF_SMALL if args.stage in SMALL_STAGES else OF_PAPER
+    own = ("preset",) if args.stage == LIGHT_PRIOR else OF_SMALL if args.stage in SMALL_STAGES else OF_PAPER
     own = (*own, "image_size") if args.stage == "pixels" else own
     for name in vars(args):
-        if name not in ("data", "output", "stage", "traceback", *OF_ALL, *own):
+        if name not in ("data", "output", "stage", "traceback", *OF_LOOP, *own):
             raise InputError(f"--{name.replace('_', '-')}", f"expected none for stage {args.stage}; leave it out")
     check_ranges(args, steps=(0, 10**9), minutes=(1e-3, math.inf), batch=(1, 4096), rate=(1e-9, 10.0), seed=(0, 10**9))
     check_ranges(args, save_every=(1, 10**9), max_views=(1, 16), points=(2, 16384), pyramid_rate=(1e-6, 10.0))
@@ -183,6 +185,17 @@ def small_network(start: str | None, resumed: Path) -> LocalReconstructor:
     return found.train().requires_grad_(True)
 
 
+def light_prior_stage(args: argparse.Namespace) -> Stage:
+    """Training of the environment decoder alone."""
+    from reli3d.nn.presets import OFFICIAL, TINY
+    from reli3d.train.light_prior import LightPriorStage
+
+    if len(args.data) != 1:
+        raise InputError("data", f"expected one .npz of environment maps, got {len(args.data)} paths")
+    preset = OFFICIAL if getattr(args, "preset", "") == "official" else TINY
+    return LightPriorStage(preset, args.data[0], **given(args, "seed"))
+
+
 def paper_stage(args: argparse.Namespace) -> Stage:
     """A stage of the paper's network."""
     import torch
@@ -197,7 +210,7 @@ def paper_stage(args: argparse.Namespace) -> Stage:
 
     preset, stages = (OFFICIAL, config.PAPER) if getattr(args, "preset", "") == "official" else (TINY, config.TINY)
     if args.stage not in stages:
-        known = ", ".join((*SMALL_STAGES, *stages))
+        known = ", ".join((*SMALL_STAGES, LIGHT_PRIOR, *stages))
         raise InputError("--stage", f"expected {known} for preset {preset.name}, got {args.stage}")
     if not args.data and "export" not in args:
         raise InputError("data", "expected folders of samples, captures or shards, got none")
@@ -285,7 +298,8 @@ def main(argv: list[str] | None = None) -> int:
     from reli3d.train.workers import Workers
 
     torch.manual_seed(getattr(args, "seed", 0))
-    stage = (small_stage if args.stage in SMALL_STAGES else paper_stage)(args)
+    makers = {LIGHT_PRIOR: light_prior_stage, **dict.fromkeys(SMALL_STAGES, small_stage)}
+    stage = makers.get(args.stage, paper_stage)(args)
     if "export" in args:
         print(weights.save(args.export, export(args, stage), license=getattr(args, "license", "not stated")).path)
         return 0

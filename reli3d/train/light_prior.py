@@ -7,24 +7,26 @@ exposure is a separate output of the network.  Source: Gardner et al. 2023, RENI
 
 from __future__ import annotations
 
-import argparse
-import sys
-import time
+import math
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
-from safetensors.torch import save_file
-from torch import Tensor
+from torch import Tensor, nn
+from torch.nn.functional import cosine_similarity
 
-from reli3d.nn.presets import OFFICIAL, TINY
+from reli3d.nn.presets import Preset
 from reli3d.nn.reni import EnvironmentDecoder, reni_frame
-from reli3d.nn.reni_fit import fit_latent
+from reli3d.nn.reni_fit import COSINE, FLOOR, PRIOR
 from reli3d.render.latlong import lat_long_directions
-from reli3d.synthetic.maps import ROWS, held_out, load_maps
+from reli3d.synthetic.maps import ROWS, training_maps
+from reli3d.train.stage import Stage
 
-FLOOR = 1e-2  # of the geometric mean, added before the logarithm
 PEAK = 2e3  # of the geometric mean, clipped above: a smooth decoder cannot represent the sun, 1e4 to 1e5
+BLENDS = 400  # added to the maps
+RAYS = 512  # per map and step
 
 
 def scale_free(maps: Tensor) -> Tensor:
@@ -44,88 +46,52 @@ def blends(maps: Tensor, count: int, rng: np.random.Generator) -> Tensor:
         t = rng.beta(0.5, 0.5)
         tint = torch.as_tensor(np.exp(rng.normal(0, 0.15, 3)), dtype=torch.float32)
         out.append((a ** (1 - t) * b**t if rng.random() < 0.5 else a * (1 - t) + b * t) * tint)
-    return torch.stack(out)
+    return torch.stack(out) if out else maps[:0]
 
 
-def fit(
-    decoder: EnvironmentDecoder,
-    maps: Tensor,
-    *,
-    steps: int,
-    minutes: float,
-    rays: int = 512,
-    batch: int = 16,
-    seed: int = 0,
-    log=sys.stderr,
-) -> Tensor:
-    """Fits ``decoder`` in place and returns the latents ``(n, L, 3)`` of ``maps (n, H, 2H, 3)``."""
-    generator = torch.Generator().manual_seed(seed)
-    latents = torch.nn.Parameter(
-        0.1 * torch.randn(len(maps), decoder.field.network.layers[0].mha.key.in_features // 3, 3, generator=generator)
-    )
-    base = [1e-2, 1e-3]
-    groups = zip(([latents], list(decoder.field.parameters())), base, strict=True)
-    optimizer = torch.optim.Adam([{"params": values, "lr": rate} for values, rate in groups])
-    directions, flat = reni_frame(lat_long_directions(ROWS)).reshape(-1, 3), maps.reshape(len(maps), -1, 3)
-    height = torch.sin((torch.arange(ROWS) + 0.5) * torch.pi / ROWS).repeat_interleave(2 * ROWS)
-    began, mean = time.monotonic(), 0.0
-    for step in range(steps):
-        done = max(step / steps, (time.monotonic() - began) / (60 * minutes))
-        if done >= 1:
-            break
-        for group, rate in zip(optimizer.param_groups, base, strict=True):
-            group["lr"] = rate * min(1, (step + 1) / 100) * 0.5 * (1 + np.cos(np.pi * done)) + 1e-6
-        pick = torch.randint(len(maps), (min(batch, len(maps)),), generator=generator)
-        ray = torch.multinomial(height, rays, generator=generator)  # uniform over the sphere
-        log_radiance = decoder.field(latents[pick], directions[ray][None])
-        target = (flat[pick][:, ray] + FLOOR).log()
-        predicted = torch.logaddexp(log_radiance, torch.full_like(log_radiance, float(np.log(FLOOR))))
-        cosine = (
-            1
-            - torch.nn.functional.cosine_similarity(
-                log_radiance.exp() + FLOOR, flat[pick][:, ray] + FLOOR, dim=-1
-            ).mean()
-        )
-        loss = (predicted - target).abs().mean() + 0.3 * cosine + 1e-4 * latents[pick].square().mean()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        mean += float(loss.detach()) / 200
-        if step % 200 == 199:
-            print(
-                f"light prior: step {step + 1}, {time.monotonic() - began:.0f} s, loss {mean:.4f}", file=log, flush=True
-            )
-            mean = 0.0
-    return latents.detach()
+class LightPrior(nn.Module):
+    """The decoder and the latents ``(n, L, 3)`` of ``count`` maps."""
+
+    def __init__(self, preset: Preset, count: int):
+        super().__init__()
+        self.preset, self.decoder = preset, EnvironmentDecoder(preset.reni)
+        self.latents = nn.Parameter(0.1 * torch.randn(count, preset.reni.latents, 3))
 
 
-def main() -> None:
-    """Fits the prior and writes the decoder and the latents; prints the error on held-out maps."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("maps", type=Path, help=".npz with env (n, H, 2H, 3) and names")
-    parser.add_argument("output", type=Path, help="safetensors file to write")
-    parser.add_argument("--steps", type=int, default=8000)
-    parser.add_argument("--minutes", type=float, default=12.0)
-    parser.add_argument("--blends", type=int, default=400)
-    parser.add_argument("--preset", choices=("tiny", "official"), default="official", help="whose decoder it is")
-    args = parser.parse_args()
-    torch.manual_seed(0)
-    maps, names = load_maps(args.maps)
-    kept = scale_free(maps[[not h for h in held_out(names)]])
-    decoder = EnvironmentDecoder((TINY if args.preset == "tiny" else OFFICIAL).reni)
-    every = torch.cat([kept, scale_free(blends(kept, args.blends, np.random.default_rng(0)))])
-    latents = fit(decoder, every, steps=args.steps, minutes=args.minutes)
-    state = {k: v.contiguous() for k, v in decoder.state_dict().items()}
-    save_file({**state, "latents": latents}, args.output)
-    test = scale_free(maps[held_out(names)])
-    fitted = [fit_latent(decoder, radiance) for radiance in test]
-    with torch.no_grad():
-        radiance = torch.cat([decoder(f.latent[None], f.rotation[None], f.strength[None], ROWS) for f in fitted])
-    error = ((radiance + FLOOR).log() - (test + FLOOR).log()).abs().mean((1, 2, 3))
-    mean_map = every[: len(kept)].log1p().mean(0).expm1()
-    base = ((mean_map + FLOOR).log() - (test + FLOOR).log()).abs().mean((1, 2, 3))
-    print(f"held-out maps: log error {error.mean():.3f}, of the mean map {base.mean():.3f}", file=sys.stderr)
+class LightPriorStage(Stage):
+    """The decoder of ``preset``, on the maps of :func:`~reli3d.synthetic.maps.load_maps` that are not held out."""
 
+    name = "light_prior"
+    weights = {"radiance": 1.0, "color": COSINE, "latents": PRIOR}
+    settings = {"steps": 8000, "batch": 16, "rate": 1e-2, "final_rate": 1e-4, "weight_decay": 0.0}
 
-if __name__ == "__main__":
-    main()
+    def __init__(self, preset: Preset, maps: Path, *, seed: int = 0, added: int = BLENDS):
+        """maps: ``.npz``.  added: number of blends that are added to the maps."""
+        own = scale_free(training_maps(maps))
+        every = torch.cat([own, scale_free(blends(own, added, np.random.default_rng(seed)))])
+        self.seed, self.model, self._numbers = seed, LightPrior(preset, len(every)), {"maps": str(maps), "added": added}
+        self.texels, self.directions = every.flatten(1, 2), reni_frame(lat_long_directions(ROWS)).reshape(-1, 3)
+        self.area = torch.sin((torch.arange(ROWS) + 0.5) * torch.pi / ROWS).repeat_interleave(2 * ROWS)
+
+    def batch(self, step: int, objects: range) -> Sequence[Any]:
+        """A single item: indices of maps and of texels, which are uniform over the sphere."""
+        generator = torch.Generator().manual_seed((self.seed << 32) + step)
+        texel = torch.multinomial(self.area, RAYS, generator=generator)
+        return [(torch.randint(len(self.texels), (objects.stop,), generator=generator)[list(objects)], texel)]
+
+    def losses(self, item: Any) -> dict[str, Tensor]:
+        picked, texel = item
+        latents, target = self.model.latents[picked], self.texels[picked][:, texel] + FLOOR
+        log_radiance = self.model.decoder.field(latents, self.directions[texel][None])
+        floored = torch.logaddexp(log_radiance, torch.full_like(log_radiance, math.log(FLOOR)))
+        return {
+            "radiance": (floored - target.log()).abs().mean(),
+            "color": 1 - cosine_similarity(log_radiance.exp() + FLOOR, target, dim=-1).mean(),
+            "latents": latents.square().mean(),
+        }
+
+    def rate_factor(self, parameter: str) -> float:
+        return 1.0 if parameter == "latents" else 0.1
+
+    def configuration(self) -> dict[str, Any]:
+        return self._numbers

@@ -112,7 +112,9 @@ CASES = [
             (["volume", "--rate", "nan"], "--rate"),
             (["volume", "--max-views", "17"], "--max-views"),
             (["volume", "--weights", "none.pt"], "none.pt: file not found"),
-            (["volume", "--prior", "file"], "light prior"),
+            (["volume", "--prior", "file"], "broken file"),
+            (["light_prior"], "good: "),
+            (["light_prior", "--patch", "8"], "--patch"),
             (["volume", "--patch", "999"], "patch"),
             (["pixels", "--image-size", "32"], "--image-size"),
         ]

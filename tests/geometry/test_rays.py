@@ -263,5 +263,5 @@ def test_intersect_is_closest_with_gradients_in_rays_and_vertices(device):
     )
     with pytest.raises(ValueError, match="vertices: expected the positions of the scene"):
         scene.intersect(o, d, vertices=v + 1.0)
-    with pytest.raises(TypeError, match="mesh: expected"):
+    with pytest.raises(TypeError, match="faces: expected a tensor"):
         RayScene(v)

@@ -2,7 +2,6 @@
 
 import json
 import os
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,7 @@ from reli3d.nn.presets import TINY
 from reli3d.render.latlong import lat_long_directions
 from reli3d.train.stages.captures import Captures
 from reli3d.train.stages.config import StageConfig
-from reli3d.train.stages.latents import fitted, load_prior
+from reli3d.train.stages.latents import fitted
 from reli3d.train.stages.losses import gradients
 from reli3d.train.stages.shards import Shards, pack
 from reli3d.train.stages.sources import source
@@ -175,18 +174,3 @@ def test_latents_decode_to_the_light_and_are_kept(samples, tmp_path):
     assert float(bright.max()) > 1.3 * float(bright.min())  # by a decoder that nothing was taught
     other = fitted(model.environment, files[:1], tmp_path / "cache", steps=40)
     assert not torch.equal(other[files[0].stem][0], latent)  # another number of steps is another fit
-
-
-def test_a_prior_is_loaded_and_left_alone(tmp_path):
-    from safetensors.torch import save_file
-
-    torch.manual_seed(1)
-    model, other = Reconstructor(TINY), Reconstructor(TINY)
-    save_file({k: v.contiguous() for k, v in other.environment.state_dict().items()}, tmp_path / "prior.safetensors")
-    load_prior(model, tmp_path / "prior.safetensors")
-    assert torch.equal(model.environment.field.network.fc.weight, other.environment.field.network.fc.weight)
-    assert not any(p.requires_grad for p in model.environment.parameters())
-    shutil.copy(tmp_path / "prior.safetensors", tmp_path / "cut.safetensors")
-    (tmp_path / "cut.safetensors").write_bytes((tmp_path / "cut.safetensors").read_bytes()[:500])
-    with pytest.raises(InputError, match="light prior"):
-        load_prior(model, tmp_path / "cut.safetensors")

@@ -9,16 +9,18 @@ import pytest
 import torch
 
 from reli3d.cli.train import main
+from reli3d.errors import InputError
 from reli3d.geometry.camera import Camera, project
 from reli3d.geometry.hull import hull_distance
 from reli3d.nn.local import LocalReconstructor
-from reli3d.nn.presets import OFFICIAL, SMALL
+from reli3d.nn.model import Reconstructor
+from reli3d.nn.presets import OFFICIAL, SMALL, TINY
 from reli3d.nn.weights import load_model
 from reli3d.render.color import linear_to_srgb, srgb_to_linear
 from reli3d.render.latlong import lat_long_directions
 from reli3d.train import checkpoint
 from reli3d.train.batches import draw_samples, random_turn
-from reli3d.train.light_prior import fit, scale_free
+from reli3d.train.light_prior import LightPriorStage
 from reli3d.train.loop import parameter_groups, progress, rate_at, train
 from reli3d.train.losses import (
     MAX_PERTURBATION,
@@ -32,6 +34,7 @@ from reli3d.train.losses import (
 )
 from reli3d.train.small import LAST_RATE, PixelStage, SmallStage
 from reli3d.train.stage import Options
+from reli3d.train.stages.latents import load_prior
 
 
 def drawn(folder, seeds, *, points, max_views):
@@ -276,18 +279,25 @@ def test_the_rate_warms_up_and_ends_low():
     assert progress(dataclasses.replace(options, minutes=10.0), 1, 600.0) == 1.0
 
 
-def test_the_light_prior_fits_a_map():
+def test_the_light_prior_fits_a_map_and_is_loaded(tmp_path):
     torch.manual_seed(0)
-    from reli3d.nn.reni import EnvironmentDecoder
-
-    maps = scale_free(0.3 + lat_long_directions(64)[None, ..., 1:2].clamp(min=0).expand(-1, -1, -1, 3) * 2.0)
-    decoder = EnvironmentDecoder(OFFICIAL.reni)
-    latents = fit(decoder, maps, steps=60, minutes=5.0, rays=256, batch=1)
+    up = 0.3 + 2.0 * lat_long_directions(64)[None, ..., 1:2].clamp(min=0).expand(2, -1, -1, 3)
+    np.savez(tmp_path / "maps.npz", env=up.numpy(), names=["a", "b"])
+    stage = LightPriorStage(OFFICIAL, tmp_path / "maps.npz", added=0)
+    train(stage, stage.options(str(tmp_path), steps=60, batch=1, warmup=1))
     with torch.no_grad():
-        got = decoder.radiance(latents, torch.eye(3)[None], torch.zeros(1), decoder.sample_directions[None])
-    error = (got.log() - maps.reshape(1, -1, 3).log()).abs().mean()
-    spread = (maps.log() - maps.log().mean()).abs().mean()
+        field = stage.model.decoder.field(stage.model.latents, stage.directions[None])
+    error, spread = ((v - stage.texels.log()).abs().mean() for v in (field, stage.texels.log().mean()))
     assert float(error) < 0.5 * float(spread)  # 60 steps are enough to know up from down
+    model = Reconstructor(TINY)
+    with pytest.raises(InputError, match="state.pt"):  # of preset official
+        load_prior(model, tmp_path / "state.pt")
+    stage = LightPriorStage(TINY, tmp_path / "maps.npz", added=3)
+    train(stage, stage.options(str(tmp_path / "tiny"), steps=1))
+    load_prior(model, tmp_path / "tiny" / "state.pt")
+    average = checkpoint.load(tmp_path / "tiny" / "state.pt")["average"]
+    assert torch.equal(model.environment.field.network.fc.weight, average["decoder.field.network.fc.weight"])
+    assert not any(p.requires_grad for p in model.environment.parameters())
 
 
 def test_points_go_astray_along_their_normals_as_far_as_stated():

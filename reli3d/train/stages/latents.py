@@ -6,33 +6,33 @@ import hashlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import load_file, save_file
+from safetensors import safe_open
+from safetensors.torch import save_file
 from torch import Tensor
 
 from reli3d.errors import InputError, shown
-from reli3d.io.files import file_size, replacing
+from reli3d.io.files import replacing
 from reli3d.nn.model import Reconstructor
 from reli3d.nn.reni import EnvironmentDecoder
 from reli3d.nn.reni_fit import fit_latent
 from reli3d.render.latlong import quarter_turn
-from reli3d.train.checkpoint import check_shapes
+from reli3d.train.checkpoint import check_shapes, load
+from reli3d.train.light_prior import LightPriorStage
 
 Latents = dict[str, tuple[Tensor, Tensor]]  # of a file's stem: (L, 3) and ()
 
 
 def load_prior(model: Reconstructor, path: Path) -> None:
-    """Loads the environment decoder from :mod:`reli3d.train.light_prior` into ``model`` and freezes it.
+    """Loads the environment decoder of a checkpoint of stage ``light_prior`` into ``model`` and freezes it.
 
-    Raises InputError if the file has no decoder of the preset's sizes.
+    Raises InputError for another file, and if the decoder has other sizes.
     """
-    file_size(path)
-    try:
-        stored = {k: v for k, v in load_file(path).items() if k != "latents"}
-    except SafetensorError as error:
-        raise InputError(path, f"expected a light prior, got a broken file ({shown(str(error))})") from None
-    check_shapes(path, stored, model.environment)
-    model.environment.load_state_dict(stored)
+    state = load(path)
+    if state["stage"] != LightPriorStage.name:
+        raise InputError(path, f"expected a checkpoint of stage light_prior, got one of stage {shown(state['stage'])}")
+    decoder = {k.removeprefix("decoder."): v for k, v in state["average"].items() if k != "latents"}
+    check_shapes(path, decoder, model.environment)
+    model.environment.load_state_dict(decoder)
     model.environment.requires_grad_(False)
 
 
