@@ -80,9 +80,8 @@ def test_an_expanded_row_is_as_good_as_its_copies(device, name):
         first, second = gradients(case, one, outs), gradients(case, copies, others)
         for k, g in first.items():
             expected = second[k].sum(0, keepdim=True) if k in case.rows else second[k]
-            torch.testing.assert_close(
-                g, expected, rtol=1e-4, atol=1e-5 * float(expected.abs().max())
-            )  # 40 float32 terms
+            # 40 float32 terms
+            torch.testing.assert_close(g, expected, rtol=1e-4, atol=1e-5 * float(expected.abs().max()))
 
 
 @pytest.mark.parametrize("name", DIFFERENTIABLE)

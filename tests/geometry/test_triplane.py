@@ -26,9 +26,8 @@ def test_values_and_gradients_match_grid_sample_in_float64(device, channels, hei
     torch.testing.assert_close(got.double(), expected, rtol=0, atol=5e-6)  # float32 sums of four values of up to 5
     g_got = torch.autograd.grad((got * weights).sum(), (planes, points))
     g_expected = torch.autograd.grad((expected * weights.double()).sum(), reference)
-    torch.testing.assert_close(
-        g_got[0].double(), g_expected[0], rtol=0, atol=4e-5
-    )  # of 600 points where there is 1 texel
+    # of 600 points where there is 1 texel
+    torch.testing.assert_close(g_got[0].double(), g_expected[0], rtol=0, atol=4e-5)
     # the gradient jumps at a texel center, which rounding may move a point across: none of these 600 points is there
     for a, b in zip((got, *g_got), (expected, *g_expected), strict=True):
         assert fraction_within(a, b) >= 0.999

@@ -17,9 +17,8 @@ from reli3d.nn.transformer import TwoStreamTransformer
 from reli3d.nn.upsample import PixelShuffleUpsampler
 
 SHALLOW = dict(rtol=1e-5, atol=1e-5)  # one to four float32 layers with sums of at most a few hundred terms
-DEEP = dict(
-    rtol=1e-4, atol=2e-5
-)  # blocks of attention and norms; the goldens differ by about 1e-5 of the largest value
+# blocks of attention and norms; the goldens differ by about 1e-5 of the largest value
+DEEP = dict(rtol=1e-4, atol=2e-5)
 
 
 class Golden:

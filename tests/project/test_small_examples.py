@@ -89,9 +89,8 @@ def test_the_snippets_of_the_library_page_are_short_and_correct(tmp_path, monkey
     along = rays["directions"][hits.valid].double()
     normal = torch.nn.functional.normalize(face_normals(rays["mesh"], hits), dim=-1)
     expected = (derivative * (normal @ forward.double()) / (normal * along).sum(-1)).sum()
-    assert float((gradient.double() @ forward.double()).sum()) == pytest.approx(
-        float(expected), rel=1e-3
-    )  # float32 sum
+    # float32 sum
+    assert float((gradient.double() @ forward.double()).sum()) == pytest.approx(float(expected), rel=1e-3)
     exact = [albedo_by_quadrature(0.25 + step) for step in (0.0, -1e-3, 1e-3)]
     assert normals["albedo"].tolist() == pytest.approx([exact[0]] * 3, abs=0.01)  # 4096 samples of a nearly even weight
     assert float(pairs["derivative"]) == pytest.approx((exact[2] - exact[1]) / 2e-3, abs=0.05)

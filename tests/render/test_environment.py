@@ -76,9 +76,8 @@ def test_lookup_and_its_gradient_equal_the_float64_reference(device):
     got = Environment(ins[0]).lookup(ins[1])
     doubles = [radiance.double().requires_grad_(), d.double().requires_grad_()]
     expected = reference.lookup_envmap(*doubles)
-    torch.testing.assert_close(
-        got.cpu().double(), expected, rtol=0, atol=2e-5
-    )  # 1e-7 of u times 18 texels, with margin
+    # 1e-7 of u times 18 texels, with margin
+    torch.testing.assert_close(got.cpu().double(), expected, rtol=0, atol=2e-5)
     assert reference.fraction_within(got, expected) >= 0.999
     grads = torch.autograd.grad((got * weight.to(device)).sum(), ins)
     expected_grads = torch.autograd.grad((expected * weight.double()).sum(), doubles)

@@ -228,9 +228,8 @@ def test_all_strategies_together_keep_their_gradients_finite(device, light, opti
     )
     grads = torch.autograd.grad(out.sum(), leaves)
     assert all(bool(torch.isfinite(v).all()) for v in (out, *grads))
-    assert light == "sun" or all(
-        float(g.abs().max()) == 0.0 for g in grads[:4]
-    )  # no light, no gradient except the light's
+    # no light, no gradient except the light's
+    assert light == "sun" or all(float(g.abs().max()) == 0.0 for g in grads[:4])
     assert float(grads[4].abs().max()) > 0.0
 
 

@@ -216,9 +216,8 @@ def test_image_gradient_reaches_textures_and_light(device):
     )
     grads = torch.autograd.grad(image.radiance.sum(), [*maps, light])
     assert all(bool(torch.isfinite(g).all()) and float(g.abs().max()) > 0 for g in grads)
-    assert (
-        float(grads[0].min()) >= 0.0 and float(grads[4].min()) >= 0.0
-    )  # a larger base color and more light are brighter
+    # a larger base color and more light are brighter
+    assert float(grads[0].min()) >= 0.0 and float(grads[4].min()) >= 0.0
 
 
 def test_no_light_is_gained_at_the_rim_except_by_the_published_diffuse_model(device):

@@ -154,9 +154,8 @@ def test_embree_and_warp_cast_the_same_shadows_in_values_and_gradients():
     changed = ((a[0] - b[0]).abs() > 1e-5).any(-1).float().mean()
     assert changed < 2e-3  # 64 rays a point: a silhouette ray differs with probability of about 1e-5
     for one, other, unshadowed in zip(a, b, free, strict=True):  # normal, base color, roughness, metallic, texels
-        assert (
-            reference.fraction_within(one, other) >= 0.998
-        )  # those points; where no ray differs all are equal bit for bit
+        # those points; where no ray differs all are equal bit for bit
+        assert reference.fraction_within(one, other) >= 0.998
         assert reference.fraction_within(one, unshadowed) < 0.9  # the shadow is there
 
 

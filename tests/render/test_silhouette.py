@@ -197,10 +197,11 @@ def test_hidden_outlines_do_not_move_and_colors_blend_between_neighbors(device):
             step[k, axis] = 0.03
             with torch.no_grad():
                 expected = float(((sampled(vertices + step) - sampled(vertices - step)) * weight).sum()) / 0.06
+            # of 730; a row at the end of an edge is 20
             assert abs(float(g[k, axis].sum()) - expected) < 30.0, (
                 k,
                 axis,
-            )  # of 730; a row at the end of an edge is 20
+            )
 
 
 def test_edges_of_split_vertices_and_open_borders(device):

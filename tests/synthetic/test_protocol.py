@@ -46,9 +46,8 @@ def test_fields_of_view_follow_the_cut_normal_distribution(many):
     found = degrees(many)
     assert found.min() >= 22.0 - 1e-3 and found.max() <= 37.0 + 1e-3  # float32 intrinsics
     assert stats.kstest(found, expected.cdf).pvalue > SIGNIFICANCE
-    found = fields_of_view(
-        np.random.default_rng(5).random(1_000_000)
-    )  # enough to distinguish a deviation of 2.5 from 2.55
+    # enough to distinguish a deviation of 2.5 from 2.55
+    found = fields_of_view(np.random.default_rng(5).random(1_000_000))
     assert stats.kstest(found, expected.cdf).pvalue > SIGNIFICANCE
     np.testing.assert_allclose(fields_of_view(np.array([0.0, 0.5, 1.0])), [22.0, 29.5, 37.0], rtol=1e-9)
 

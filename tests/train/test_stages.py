@@ -138,9 +138,8 @@ def test_a_ball_is_shown_as_a_ball(stage, one):
         light = lobes(model, code, 16)
         rendering = render_surface(model, code, found, view, lambda p, wo, scene: shade_gaussians(p, wo, light))
         area = float(rendering.coverage.sum() / (miss < RADIUS**2).sum())
-        assert area == pytest.approx(
-            1.0, abs=0.05
-        )  # the iso-surface is curved, so a crossing on a cube of 0.07 lies inside
+        # the iso-surface is curved, so a crossing on a cube of 0.07 lies inside
+        assert area == pytest.approx(1.0, abs=0.05)
     nearest = (along + (RADIUS**2 - miss).clamp(min=0).sqrt())[..., None]
     true = torch.nn.functional.normalize(origins - nearest * directions, dim=-1)
     cosine = (rendering.normal * true).sum(-1)[core]

@@ -35,9 +35,8 @@ def test_text_and_binary_of_one_model_are_the_same(tmp_path):
         n.split(": ", 1)[-1] for n in b.notes if "distortion" not in n
     ]
     colmap_model.write_binary(tmp_path / "text/sparse/1")
-    (tmp_path / "text/sparse/1/images.bin").rename(
-        tmp_path / "text/sparse/0/images.bin"
-    )  # next to the text files: not read
+    # next to the text files: not read
+    (tmp_path / "text/sparse/1/images.bin").rename(tmp_path / "text/sparse/0/images.bin")
     assert load_views(tmp_path / "text").names == NAMES
 
 
