@@ -186,11 +186,12 @@ def _read_video(path: Path, progress: Progress) -> tuple[list[Photo], list[str]]
         raise
     except Exception as error:  # FFmpeg's errors have many classes
         reason = shown(str(error))
-    if len(best) < FEWEST and reason:
-        raise InputError(path, f"cannot be decoded ({reason}); record it again")
     notes = [f"{len(best)} sharp frames taken of {count} of the video"]
     if count < WHOLE_VIDEO * total:  # FFmpeg ends without an error where a file is cut off
         notes.append(f"only {count} of the {total} frames of the video can be decoded: the file is cut off or broken")
+        reason = reason or f"{count} of {total} frames: the file is cut off"
+    if len(best) < FEWEST and reason:
+        raise InputError(path, f"cannot be decoded ({reason}); record it again")
     return [Photo(f"frame_{k:04d}", best[k][1], None, (best[k][1].shape,)) for k in sorted(best)], notes
 
 

@@ -124,7 +124,7 @@ def test_the_sharpest_frame_of_each_window_of_a_video_is_taken(tmp_path):
     photos, notes = read_photos(path, quiet)
     assert 20 < len(photos) < 40 and re.match(r"only \d+ of the 180 frames", notes[1])
     path.write_bytes(data[: len(data) // 20])
-    with pytest.raises(InputError, match=r"cannot be decoded|at least 8 photographs, got [0-7]\b"):
+    with pytest.raises(InputError, match=r"cannot be decoded \("):
         read_photos(path, quiet)
 
 
