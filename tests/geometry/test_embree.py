@@ -37,22 +37,6 @@ def test_packets_leave_no_closed_mesh(device):
     assert int(scene.unoccluded(o, d, torch.full((len(o),), torch.inf)).sum()) <= 2e-5 * len(o)
 
 
-@pytest.mark.parametrize("odd", [None, float("nan"), float("inf"), 0.0])
-def test_the_order_brings_like_rays_together_and_loses_none(device, odd):
-    """Cells of 32 x 32 directions are some 5 degrees wide; in unsorted rays neighbors differ by 90 degrees."""
-    scene = make(*bumpy(1), "embree", device)
-    o, d = rays(300_000, 7, 1.0)
-    if odd is not None:
-        o[::3, 1], d[1::3] = odd, odd
-    order = scene._order(o, d)
-    assert np.array_equal(np.sort(order), np.arange(len(o)))
-    if odd is None:
-        near = torch.nn.functional.normalize(d[order], dim=-1)
-        angle = torch.rad2deg(torch.acos((near[1:] * near[:-1]).sum(-1).clamp(-1, 1)))
-        assert float(angle.mean()) < 8.0  # 3.7 measured
-        assert scene._order(o[order], d[order]) is None
-
-
 def test_scenes_in_many_threads_answer_as_alone_and_are_freed(device):
     if device.type != "cpu":
         pytest.skip("Embree runs on CPU only")

@@ -58,13 +58,6 @@ def test_code_of_a_page_runs_from_top_to_bottom(page, folder):
             exec(compile(code, str(page), "exec"), names)
 
 
-def test_a_block_that_is_not_to_run_is_left_out(tmp_path):
-    page = tmp_path / "page.md"
-    page.write_text("a\n```python\none\n```\n<!-- not run: no GPU -->\n```python\ntwo\n```\n\n```python\nthree\n```\n")
-    assert [code.strip() for code in blocks(page)] == ["one", "three"]
-    assert blocks(page)[1].index("three") == 10  # on its line in the page
-
-
 def test_the_kernel_of_the_contributors_page_works_in_the_package(tmp_path):
     """Its files are written into a copy: test, layout and bench case."""
     copied(tmp_path)
