@@ -15,6 +15,7 @@ from reli3d.fit.bounce import gathered
 from reli3d.fit.budget import Budget, progress_bar
 from reli3d.fit.choice import UNCHANGED, Fitted, Parts, chosen, mean_psnr, view_errors
 from reli3d.fit.input_images import InputImages, PosedImages
+from reli3d.fit.light_frame import light_follows_camera
 from reli3d.fit.maps import FixedSurface, MapsStage, fit_maps
 from reli3d.fit.shape import ShapeData, finished, fit_shape, start_grid
 from reli3d.fit.transfer import transfer_textures
@@ -126,6 +127,11 @@ def refine(
         notes.append("refinement: the lighting moves with the camera; the environment is that of view 0")
     elif len(set(images.light_group)) > 1:
         notes.append(f"refinement: {len(set(images.light_group))} lightings; the environment is that of view 0")
+    elif light_follows_camera(first.mesh, near):
+        notes.append(
+            "refinement: brightness varies with the camera; if the lighting moves with it (turntable, flash), "
+            "set light to camera"
+        )
     with torch.random.fork_rng(devices=[]):
         data = FixedSurface(Start.of(first), first, received, near, used)
         fitted = _fitted(data, _Options(resolution, weights, cameras, seed), budget, notes)

@@ -4,21 +4,27 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch.nn.functional import normalize
 
 from reli3d.fit import maps
 from reli3d.fit.bounce import gathered
 from reli3d.fit.budget import Budget
 from reli3d.fit.input_images import InputImages
+from reli3d.fit.light_frame import explained_deviations, light_follows_camera
 from reli3d.fit.lighting import Lights
 from reli3d.fit.losses import Weights
 from reli3d.fit.maps import FixedSurface
+from reli3d.fit.refine import refine
 from reli3d.fit.transfer import changed
 from reli3d.fit.unknowns import Start, Unknowns
 from reli3d.geometry.camera import Camera
+from reli3d.geometry.rays import RayScene
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
+from reli3d.render.gbuffer import primary_hits
 from reli3d.render.image import render_asset
 from reli3d.render.shading import ShadeOptions
+from reli3d.views.views import ViewBatch
 from tests.support import small_scene
 
 VIEWS, SIZE, STEPS = 6, 28, 30
@@ -123,3 +129,35 @@ def test_another_light_is_refused(moving_views):
         InputImages.of(moving_views, "sun")
     with pytest.raises(ValueError, match="light: expected the lighting of 6 views, got 2"):
         InputImages.of(moving_views, [0, 1])
+
+
+def shaded(moves: bool, exposure=1.0):
+    """A diffuse ball of two colors in 16 views, under a light from above and the side of the camera or the object."""
+    batch = small_scene.input_views(small_scene.ball(), 16, 32)
+    images = InputImages.of(batch)
+    mesh, color = small_scene.ball().mesh, torch.zeros_like(images.color)
+    scene, toward = RayScene(mesh.vertices, mesh.faces), torch.tensor([0.48, 0.8, 0.36])
+    for k in range(16):
+        hits, origins, directions = primary_hits(scene, images.camera[k])
+        hit = hits.face >= 0
+        normal = normalize((origins + hits.t[..., None] * directions)[hit], dim=-1)
+        albedo = torch.where(normal[:, :1] > 0.0, torch.tensor([0.8, 0.2, 0.2]), torch.tensor([0.2, 0.5, 0.2]))
+        axis = images.camera.c2w[k, :3, :3] @ toward if moves else toward
+        color[k][hit] = albedo * (0.52 + 0.46 * (normal @ axis))[:, None]
+    return replace(images, color=exposure * color)
+
+
+def test_light_that_moves_with_the_camera_is_detected():
+    mesh = small_scene.ball().mesh
+    moving, fixed = (explained_deviations(mesh, shaded(moves)) for moves in (True, False))
+    assert moving[0] > 3.0 * moving[1] and light_follows_camera(mesh, shaded(True))
+    assert fixed[0] < 0.05 and not light_follows_camera(mesh, shaded(False))
+    exposure = torch.linspace(0.4, 1.0, 16)[:, None, None, None]  # is a constant of each view
+    assert explained_deviations(mesh, shaded(False, exposure))[0] == pytest.approx(fixed[0], abs=0.03)
+
+
+def test_light_that_moves_with_the_camera_is_reported():
+    images = shaded(True)
+    views = ViewBatch(linear_to_srgb(images.color), images.mask, images.camera.c2w, images.camera.intrinsics)
+    notes = refine(small_scene.ball(), views, steps=1, resolution=16).notes
+    assert any("set light to camera" in note for note in notes)
