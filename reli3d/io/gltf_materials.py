@@ -173,10 +173,10 @@ class Materials:
             color, metal = metallic_from_specular(color, specular)
         normal = None if maps[2] is None else maps[2][..., :3]
         if normal is not None and material.normal_scale != 1.0:
-            bent = (normal * 2.0 - 1.0) * torch.tensor(
+            mapped = (normal * 2.0 - 1.0) * torch.tensor(
                 [material.normal_scale, material.normal_scale, 1.0], dtype=torch.float32, device="cpu"
             )
-            normal = torch.nn.functional.normalize(bent, dim=-1, eps=1e-6) * 0.5 + 0.5
+            normal = torch.nn.functional.normalize(mapped, dim=-1, eps=1e-6) * 0.5 + 0.5
         return TextureSet(color.clamp(0.0, 1.0), rough.contiguous(), metal.contiguous(), normal, wrap=wrap)
 
     def _parse(self, material: dict, field: str) -> _Material:

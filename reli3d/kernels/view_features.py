@@ -335,10 +335,11 @@ def fuse_views_kernel(
     viewed: Viewed,  # surface points
     base: wp.array3d[wp.vec4],  # (V, P, P) gain of the mean color logit, shift of the logits
     rough_metal: wp.array3d[wp.vec4],  # (V, P, P) confidence, roughness, metallic, gain of the logits minus their mean
-    bent: wp.array3d[wp.vec4],  # (V, P, P) normal; 0
+    normals: wp.array3d[wp.vec4],  # (V, P, P) normal; 0
     # out
     logit: wp.array[wp.vec3],  # (N,) of the base color
-    numbers: wp.array2d[float],  # (N, 10): roughness, metallic, gain, bend (3), cosine, max weight, confidence, spread
+    numbers: wp.array2d[float],  # (N, 10): roughness, metallic, gain, normal - mesh normal (3), cosine, max weight,
+    #                              confidence, spread
     shading: wp.array[wp.vec3],  # (N,) unit normal
 ):
     """Blends the views' predictions, weighted by view_weight**2 * exp(confidence).
@@ -389,7 +390,7 @@ def fuse_views_kernel(
             spread += weight * wp.dot(away, color - mean)
             gain += weight * base_of_view[0]
             surface += of_view * weight
-            direction += mix_four(bent, v, int(at[0]), int(at[1]), four) * weight
+            direction += mix_four(normals, v, int(at[0]), int(at[1]), four) * weight
     unit = wp.vec3(direction[0], direction[1], direction[2]) / total + 1.0e-3 * normal
     unit = unit / wp.max(wp.length(unit), 1.0e-12)
     logit[n] = mean

@@ -359,18 +359,18 @@ class LocalField(Field):
         pixels = self.pixels.stacked()
         got, _ = gather_views(pixels, position, maps.camera)
         shown, view_weight, summary = summarize_views(maps.images, maps.camera, position, visible, normal)
-        gain, shift, confidence, rough, metal, chroma, bent = got.split([1, 3, 1, 1, 1, 1, 3], -1)
+        gain, shift, confidence, rough, metal, chroma, fused = got.split([1, 3, 1, 1, 1, 1, 3], -1)
         hidden = (visible <= 0.0) & (summary[:, 5:6] >= CONFIDENT_WEIGHT)  # occluded, and another view is confident
         log_weight = VIEW_WEIGHT_POWER * view_weight.log() + confidence[..., 0]
         weight = log_weight.masked_fill(hidden, -math.inf).softmax(-1)[..., None]
         each = base_color_logit(shown[..., :3], gain, chroma, shift)
         logit = (each * weight).sum(1)
         spread = ((each - logit[:, None]).square() * weight).sum((1, 2), keepdim=True)[..., 0].clamp(min=1e-6).sqrt()
-        bent = functional.normalize((bent * weight).sum(1) + 1e-3 * normal, dim=-1)
-        facing = (bent * normal).sum(-1, keepdim=True)
+        fused = functional.normalize((fused * weight).sum(1) + 1e-3 * normal, dim=-1)
+        facing = (fused * normal).sum(-1, keepdim=True)
         mean = [(rough * weight).sum(1), (metal * weight).sum(1), (gain * weight).sum(1)]
-        numbers = torch.cat([*mean, bent - normal, facing, summary[:, 5:6], (confidence * weight).sum(1), spread], -1)
-        return Fused(logit, numbers, bent)
+        numbers = torch.cat([*mean, fused - normal, facing, summary[:, 5:6], (confidence * weight).sum(1), spread], -1)
+        return Fused(logit, numbers, fused)
 
     def _fused_by_kernel(self, position: Tensor, normal: Tensor, visible: Tensor) -> Fused:
         """:meth:`fused` by one kernel, equal to float32 rounding; no gradient."""

@@ -114,8 +114,8 @@ def _denoised(*renderings: Render) -> list[Tensor]:
         for column in range(2 * FILTER_RADIUS + 1):
             near = padded[:, row : row + height, column : column + width]
             distance = ((row - FILTER_RADIUS) ** 2 + (column - FILTER_RADIUS) ** 2) / (2 * FILTER_RADIUS)
-            bent = (near[count:-1] - normal).square().sum(0) / NORMAL_SIGMA**2
-            weight = torch.exp(-distance - bent) * near[-1]
+            difference = (near[count:-1] - normal).square().sum(0) / NORMAL_SIGMA**2
+            weight = torch.exp(-distance - difference) * near[-1]
             total += weight * near[:count]
             weights += weight
     means = (total / weights.clamp(min=1e-6)).permute(1, 2, 0).contiguous()

@@ -226,7 +226,7 @@ def test_tangents_and_normal_maps(device):
     code = encoded.detach().requires_grad_()
     decoded = decode_normals(code, normal.to(device), frame)
     assert finite(decoded, *torch.autograd.grad(decoded.sum(), code))
-    # not below the surface, where a normal is bent to it, and a frame that is one
+    # not below the surface, where a normal is adjusted to it, and a frame that is one
     plain = (encoded.detach().cpu()[:, 2] > 0.51) & (torch.linalg.cross(normal, direction).norm(dim=1) > 0.1)
     assert plain.sum() > N // 5
     torch.testing.assert_close(decoded.detach().cpu()[plain], world[plain], rtol=0, atol=1e-4)

@@ -92,8 +92,8 @@ def test_gradients_of_the_material(device, diffuse_model):
         assert reference.fraction_within(g, t) >= 0.999, k
 
 
-def bent(normal, ng, wo):
-    """The shader's normal: on the viewer's side of the face, bent until the view is above its horizon."""
+def adjusted(normal, ng, wo):
+    """The shader's normal: on the viewer's side of the face, adjusted until the view is above its horizon."""
     facing = normal * torch.where((ng * wo).sum(-1, keepdim=True) < 0.0, -1.0, 1.0).to(normal)
     cos = (facing * wo).sum(-1, keepdim=True)
     return torch.where(cos < COS_VIEW_MIN, normalize(facing + wo * (COS_VIEW_MIN - cos), dim=-1), facing)
@@ -104,7 +104,7 @@ def in_float64(leaves, ng, wo, draws, density, light, diffuse_model):
     normal, base, alpha, metallic = leaves
     wo, n = (
         normalize(wo, dim=-1),
-        normalize(bent(normal, ng, wo), dim=-1),
+        normalize(adjusted(normal, ng, wo), dim=-1),
     )  # a float32 length errs by 1e-7, alpha^2 is 1e-6
     turn, out = frame(n.detach())[:, :2], 0.0
     for d, p, radiance in zip(draws, density, light, strict=True):
@@ -121,10 +121,10 @@ def in_float64(leaves, ng, wo, draws, density, light, diffuse_model):
 
 def world_directions(normal, ng, wo, alpha, u):
     """Reflections at visible normals for ``u``, drawn in the shader's frame, and their float64 density."""
-    turn = frame(bent(normal, ng, wo))
+    turn = frame(adjusted(normal, ng, wo))
     local, width = (turn @ wo[..., None])[..., 0], alpha.clamp(min=FLOOR)
     d = (turn.mT @ sample_bsdf(local, width, u)[..., None])[..., 0]
-    turn = frame(normalize(bent(normal.double(), ng.double(), wo.double()), dim=-1))
+    turn = frame(normalize(adjusted(normal.double(), ng.double(), wo.double()), dim=-1))
     o, i = ((turn @ normalize(v.double(), dim=-1)[..., None])[..., 0] for v in (wo, d))
     wm = normalize(o + i, dim=-1)
     pdf = reference.pdf_ggx_vndf(o, width.double(), wm) / (4.0 * (o * wm).sum(-1))
@@ -145,8 +145,8 @@ def test_gradients_of_the_estimator(device, strategy, diffuse_model):
         d, p = Environment(texels).sample(u) if strategy == "map" else world_directions(normal, ng, wo, alpha, u)
         draws.append(d.double()), density.append(p.double())
     exact = [v.double() for v in (ng, wo)]
-    n = bent(normal.double(), *exact)
-    # no reference where rounding decides which side is seen, if the normal is bent, or where to if it points away from
+    n = adjusted(normal.double(), *exact)
+    # no reference where rounding decides which side is seen, if the normal is adjusted, or where to if it points from
     # the view, whether a sample is above
     toward = (exact[0] * exact[1]).sum(-1)
     facing = (toward.abs() > 1e-5) & ((normal.double() * exact[1]).sum(-1) * toward.sign() > -0.9)

@@ -58,7 +58,7 @@ class Stage:
         hits = RayScene(self.vertices, self.faces).closest(origins, directions)
         normal = interpolate(self.normals, self.faces, hits.face, hits.bary)
         normal = torch.nn.functional.normalize(normal, dim=-1)
-        # Mitsuba bends no normals
+        # Mitsuba adjusts no normals
         index = torch.nonzero((hits.face >= 0) & ((normal * -directions).sum(-1) > 0.05))[:, 0]
         self.origins, self.directions, self.normal = origins[index], directions[index], normal[index]
         self.position = interpolate(self.vertices, self.faces, hits.face[index], hits.bary[index])
@@ -195,8 +195,8 @@ def test_render_equals_mitsubas_sensor_textures_and_light(device):
         """The subpixels of every pixel: ``(height, width, fine^2, C)``."""
         return v.reshape(height, fine, width, fine, -1).swapaxes(1, 2).reshape(height, width, fine**2, -1)
 
-    bent = pixels(hit & (cos < 0.05)).any((2, 3))  # Mitsuba bends no normals
-    kept = pixels(hit).any((2, 3)) & ~bent
+    adjusted = pixels(hit & (cos < 0.05)).any((2, 3))  # Mitsuba adjusts no normals
+    kept = pixels(hit).any((2, 3)) & ~adjusted
     assert kept.sum() > 600
     expected, variance = (pixels(v)[kept].mean(1) for v in values)
     variance = 2.0 * variance / fine**2  # as in compare_image; a pixel is the mean of its subpixels

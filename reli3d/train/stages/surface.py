@@ -141,20 +141,20 @@ def render_surface(model: Reconstructor, code: Code, found: Surface, camera: Cam
     position = interpolate(mesh.vertices.detach(), mesh.faces, face, bary)
     normal = normalize(interpolate(present("normals", mesh.normals), mesh.faces, face, bary), dim=-1)
     values = query_heads(model, code, position, MATERIAL)
-    bent = radial_bump(position, normal, values["normal"])
-    bent = normalize(bent + normal - normal.detach(), dim=-1)  # gradient to the normal: the frame has none
+    bumped = radial_bump(position, normal, values["normal"])
+    bumped = normalize(bumped + normal - normal.detach(), dim=-1)  # gradient to the normal: the frame has none
     wo = -directions.reshape(-1, 3)[seen]
     material = torch.cat([values["base_color"], values["roughness"], values["metallic"]], -1)
     points = SurfacePoints(
         position,
         normal.detach(),
-        bent,
+        bumped,
         srgb_to_linear(values["base_color"]),
         values["roughness"][:, 0],
         values["metallic"][:, 0],
     )
     color = display(shader(points, wo, found.scene))
-    layers = torch.cat([color, torch.ones_like(color[:, :1]), material, bent], -1)
+    layers = torch.cat([color, torch.ones_like(color[:, :1]), material, bumped], -1)
     full = layers.new_zeros(camera.height * camera.width, layers.shape[1]).index_copy(0, seen, layers)
     full = full.reshape(camera.height, camera.width, -1)
     shown = antialias(full[..., :4].contiguous(), mesh.vertices, mesh.faces, camera, found.scene, edges=found.edges)

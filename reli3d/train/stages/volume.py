@@ -84,14 +84,14 @@ def render_volume(
     position = origins[at] + directions[at] * depth
     normal = density_normals(model, code, position)
     bump = model.query(code, position[None], ("normal",))["normal"][0]
-    bent = radial_bump(position, normal, bump)
-    bent = normalize(bent + normal - normal.detach(), dim=-1)  # gradient to the normal: the frame has none
+    bumped = radial_bump(position, normal, bump)
+    bumped = normalize(bumped + normal - normal.detach(), dim=-1)  # gradient to the normal: the frame has none
     of_ray = (material.index_select(0, at) / whole).clamp(0.0, 1.0)  # clamps rounding errors
     points = SurfacePoints(
-        position.detach(), normal.detach(), bent, srgb_to_linear(of_ray[:, :3]), of_ray[:, 3], of_ray[:, 4]
+        position.detach(), normal.detach(), bumped, srgb_to_linear(of_ray[:, :3]), of_ray[:, 3], of_ray[:, 4]
     )
     lit = display(shade_gaussians(points, -directions[at], light))
     shape = (camera.height, camera.width)
-    values = torch.cat([lit * whole, torch.ones_like(whole), of_ray, bent], -1)
+    values = torch.cat([lit * whole, torch.ones_like(whole), of_ray, bumped], -1)
     full = values.new_zeros(len(origins), values.shape[1]).index_copy(0, at, values).reshape(*shape, -1)
     return Rendering(full[..., :3], opacity.reshape(shape), full[..., 3], full[..., 4:9], full[..., 9:], bump)
