@@ -36,7 +36,7 @@ class Render:
     either background.  The G-buffers are means over the covered subpixels: base_color ``(H, W, 3)`` linear; roughness,
     metallic ``(H, W)``; normal ``(H, W, 3)`` shading normal in the world frame, normalized after averaging; position
     ``(H, W, 3)`` world; depth ``(H, W)`` along the viewing axis.  Where alpha is 0, depth is inf and the other
-    G-buffers are 0.  All have the gradients described in :func:`render_asset`.
+    G-buffers are 0.  Gradients: see :func:`render_asset`.
 
     >>> image = reli3d.render_asset(asset, camera, light)
     >>> reli3d.write_image("image.png", image.rgba)

@@ -158,14 +158,14 @@ def test_the_verdict_alone_is_the_last_line():
 
 @pytest.mark.parametrize("offset", [0.0, 0.25, 3.0])
 @pytest.mark.parametrize("axes, words", [(torch.eye(4), "world-to-camera; store"), (FLIP, "in OpenCV axes")])
-def test_world_to_camera_matrices_of_a_folder_are_named(tmp_path, separate, axes, words):
+def test_world_to_camera_matrices_of_a_folder_are_named(tmp_path, offset, axes, words):
     """Read as poses, those of a rig about the origin put all eyes in one point, and others move the origin."""
     folder = tmp_path / "object"
     shutil.copytree(EXAMPLE, folder)
     data = json.loads((folder / "transforms.json").read_text())
     for frame in data["frames"]:
         pose = torch.tensor(frame["transform_matrix"], dtype=torch.float64)
-        pose[0, 3] += separate
+        pose[0, 3] += offset
         frame["transform_matrix"] = torch.linalg.inv(pose @ axes.double()).tolist()
     (folder / "transforms.json").write_text(json.dumps(data))
     line = verdict(load_views(folder))
