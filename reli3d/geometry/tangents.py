@@ -11,7 +11,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from reli3d._bridge import check, launch
+from reli3d._bridge import call, check, launch
 from reli3d.geometry.topology import weld_rows
 from reli3d.kernels.bump import ENCODE_EPS, encode_normals_kernel
 from reli3d.kernels.tangents import corner_tangents_kernel
@@ -65,12 +65,6 @@ def _any_orthogonal(n: Tensor) -> Tensor:
     return _unit(_flat(axis, n))[0]
 
 
-def _dot(a: Tensor, b: Tensor) -> Tensor:
-    """Dot products along the last axis, ``(...)``; ``sum`` over an axis of 3 is about 3 times slower."""
-    product = a * b
-    return product[..., 0] + product[..., 1] + product[..., 2]
-
-
 def _check_frame(normal: Tensor, tangent: Tensor) -> None:
     check("normal", normal, last=3)
     check("tangent", tangent, last=4, like=normal)
@@ -91,23 +85,12 @@ def encode_normals(world: Tensor, normal: Tensor, tangent: Tensor) -> Tensor:
     """
     _check_frame(normal, tangent)
     check("world", world, last=3, like=normal)
-    same = world.shape[:-1] == normal.shape[:-1] == tangent.shape[:-1]
-    differentiable = torch.is_grad_enabled() and any(v.requires_grad for v in (world, normal, tangent))
-    if same and not differentiable:
-        rows = [v.detach().reshape(-1, v.shape[-1]).contiguous() for v in (world, normal, tangent)]
-        out = torch.empty_like(rows[1])
-        arrays = list(zip((*rows, out), (wp.vec3, wp.vec3, wp.vec4, wp.vec3), strict=True))
-        launch(encode_normals_kernel, len(out), arrays, out.device)
-        return out.view(normal.shape)
-    t, b, n = _frame(normal, tangent)
-    tt, tn, nn = _dot(t, t), _dot(t, n), _dot(n, n)
-    wt, wn = _dot(world, t), _dot(world, n)
-    determinant = (tt * nn - tn * tn).clamp(min=EPS)  # b is orthogonal to both: a 2x2 system remains
-    x = (nn * wt - tn * wn) / determinant
-    z = (tt * wn - tn * wt) / determinant
-    y = _dot(world, b) / _dot(b, b).clamp(min=EPS)
-    local = torch.stack([x, y, z.clamp(min=0.0)], -1)
-    return torch.nn.functional.normalize(local, dim=-1, eps=EPS) * 0.5 + 0.5
+    batch = torch.broadcast_shapes(world.shape[:-1], normal.shape[:-1], tangent.shape[:-1])
+    parts = ((world, wp.vec3), (normal.detach(), wp.vec3), (tangent.detach(), wp.vec4))
+    ins = [(v.expand(*batch, v.shape[-1]).reshape(-1, v.shape[-1]), kind) for v, kind in parts]
+    n = len(ins[0][0])
+    (out,) = call(encode_normals_kernel, n, ins, [((n,), wp.vec3)], device=normal.device)
+    return out.view(*batch, 3)
 
 
 def decode_normals(encoded: Tensor, normal: Tensor, tangent: Tensor) -> Tensor:

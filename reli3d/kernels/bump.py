@@ -1,11 +1,8 @@
-"""Bump-mapped normals in a tangent frame, and their encoding in a normal map, without gradient.
-
-The formulas are those of :mod:`reli3d.render.bump` and :mod:`reli3d.geometry.tangents`, which have gradients.
-"""
+"""Bump-mapped normals in a tangent frame, and their encoding in a normal map."""
 
 import warp as wp
 
-wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
+wp.set_module_options({"enable_backward": True, "cpu_compiler_flags": "-march=native"})
 
 BUMP_EPS = wp.constant(1.0e-7)
 ENCODE_EPS = wp.constant(1.0e-6)
@@ -14,9 +11,10 @@ ENCODE_EPS = wp.constant(1.0e-6)
 @wp.func
 def at_least(value: float, limit: float) -> float:
     """The larger one; NaN stays NaN, which ``wp.max`` does not promise."""
+    result = value
     if value < limit:
-        return limit
-    return value
+        result = limit
+    return result
 
 
 @wp.func

@@ -277,14 +277,20 @@ def test_encoding_bends_normals_up_and_gives_exact_ones_back():
     torch.testing.assert_close(encode_normals(world, n, t), expected)
 
 
-def test_the_kernel_that_encodes_normals_is_the_formula_that_has_gradients(device):
+def test_decoding_and_its_gradient_are_the_inverse_of_encoding(device):
+    """Together the two only normalize: the gradient is the part of a weight that is orthogonal to the normal."""
     g = torch.Generator().manual_seed(2)
-    world, n, t = (torch.nn.functional.normalize(torch.randn(30, 40, 3, generator=g), dim=-1) for _ in range(3))
+    world, n, t, weight = (
+        torch.nn.functional.normalize(torch.randn(30, 40, 3, generator=g), dim=-1).to(device) for _ in range(4)
+    )
     t = torch.nn.functional.normalize(t - 0.9 * (t * n).sum(-1, keepdim=True) * n, dim=-1)  # not quite orthogonal
-    t = torch.cat([t, torch.where(torch.rand(30, 40, 1, generator=g) < 0.5, -1.0, 1.0)], -1)
-    world, n, t = (v.to(device) for v in (world, n, t))
-    got = encode_normals(world, n, t)
-    # float32 sums of three products in another order, and a normalization; frames nearly without area magnify them
-    torch.testing.assert_close(got, encode_normals(world.clone().requires_grad_(), n, t).detach(), rtol=0, atol=2e-5)
-    above = got[..., 2] > 0.5 + 0.02  # not bent up; where the frame has little area rounding is magnified
-    torch.testing.assert_close(decode_normals(got, n, t)[above], world[above], rtol=0, atol=1e-4)
+    t = torch.cat([t, torch.where(torch.rand(30, 40, 1, generator=g) < 0.5, -1.0, 1.0).to(device)], -1)
+    leaf = world.clone().requires_grad_()
+    got = encode_normals(leaf, n, t)
+    above = got.detach()[..., 2] > 0.5 + 0.02  # not bent up; where the frame has little area rounding is magnified
+    decoded = decode_normals(got, n, t)
+    torch.testing.assert_close(decoded[above].detach(), world[above], rtol=0, atol=1e-4)
+    (gradient,) = torch.autograd.grad((decoded[above] * weight[above]).sum(), leaf)
+    across = weight - (weight * world).sum(-1, keepdim=True) * world
+    torch.testing.assert_close(gradient[above], across[above], rtol=0, atol=2e-3)  # 1e-4, over a cosine of 0.04
+    assert not bool(gradient[~above].any())
