@@ -331,7 +331,7 @@ class Placed:
 def place(views: Views, preset: Preset | LocalPreset, options: ReconstructOptions = DEFAULT) -> Placed:
     """The views with the reference view first, and the transforms to the frames of model and asset.
 
-    If poses are used as stored by default and the object does not fit the model's cube, ``notes`` of the views say so.
+    If poses are used as stored by default and the object does not fit the model's cube, the views get a note.
     """
     normalization = options.normalization
     if normalization is None:
@@ -452,7 +452,7 @@ class FolderOptions:
     views, masks, remove_background: as in :func:`~reli3d.views.folder.load_views`.  budget: ``seconds`` or ``steps`` of
     a refinement with all images; empty: none.  cameras: also optimize the cameras.  interrupt: as in
     :func:`reli3d.fit.refine.refine`.  light: ``object``, ``camera`` or ``per-group``, a lighting for each sub-folder of
-    images; None: as the folder says.
+    images; None: from the folder.
     """
 
     views: int | None = None

@@ -407,12 +407,12 @@ def widest_gap(eyes: np.ndarray) -> float:
     """Degrees of the widest gap between the cameras ``eyes (V, 3)`` around an object at the origin, +Y up.
 
     Twice the largest angle, over all azimuths, between a camera and the nearest direction of that azimuth at most
-    SIDE_ELEVATION up or down: for a level ring the angle between neighbors, up to 180; cameras that look down from
-    higher up see more of the sides, and from straight above none.
+    SIDE_ELEVATION up or down: for a horizontal ring the angle between neighbors, up to 180; cameras that look down from
+    higher up see more of the sides, and from directly above none.
     """
     azimuth, elevation = np.radians(np.arange(360.0)), np.radians(np.linspace(-SIDE_ELEVATION, SIDE_ELEVATION, 31))
-    level, height = np.cos(elevation), np.broadcast_to(np.sin(elevation), (360, 31))
-    sides = np.stack([np.sin(azimuth)[:, None] * level, height, np.cos(azimuth)[:, None] * level], -1)
+    radius, height = np.cos(elevation), np.broadcast_to(np.sin(elevation), (360, 31))
+    sides = np.stack([np.sin(azimuth)[:, None] * radius, height, np.cos(azimuth)[:, None] * radius], -1)
     cosine = (sides @ (eyes / np.linalg.norm(eyes, axis=1, keepdims=True)).T).max((1, 2))
     return float(2 * np.degrees(np.arccos(np.clip(cosine.min(), -1, 1))))
 

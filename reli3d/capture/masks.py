@@ -19,9 +19,9 @@ ROUNDS = 5  # of GrabCut
 FEWEST_SEEDS = 6  # keypoints of the object: fewer do not show its colors
 HOLE = 0.002  # of the mask's area: smaller holes and islands are noise
 REGION_SIDE = 160  # pixels along the width at which images of a turntable are compared
-STILL = 3.0  # gray levels of standard deviation between images up to which a pixel does not change: noise and JPEG
+STILL = 3.0  # of 255: standard deviation between images up to which a pixel does not change: noise and JPEG
 LEAST_STILL = 0.1  # fraction of such pixels from which the camera is fixed; hand-held images have none
-CLIPPED = 8  # gray levels from black and white
+CLIPPED = 8  # of 255: distance from black and white
 KEY_SIGMAS = 4.0  # standard deviations of the border's color beyond which a pixel is the object
 
 
@@ -149,8 +149,8 @@ def cleaned(mask: np.ndarray, seeds: np.ndarray | None) -> np.ndarray:
 
 
 def moving_region(pixels: list[np.ndarray], *, fixed: bool = False) -> np.ndarray | None:
-    """Mask of where images of a fixed camera differ from each other: the turntable and what stands on it; None where
-    the cameras move, or nothing does.
+    """Mask of where images of a fixed camera differ from each other: the turntable with the object; None where the
+    cameras move, or nothing does.
 
     A camera is fixed where LEAST_STILL of the pixels do not change, or nearly all of the image's border does not.
     fixed: True where that is known.
@@ -163,8 +163,8 @@ def moving_region(pixels: list[np.ndarray], *, fixed: bool = False) -> np.ndarra
     noise = float(np.quantile(spread, 0.05))
     if float(np.quantile(spread, 0.97)) < max(12.0, 4.0 * noise):
         return None
-    level = small.mean((0, 3))
-    still = (spread < STILL) & (level > CLIPPED) & (level < 255 - CLIPPED)  # an overexposed sky does not change either
+    brightness = small.mean((0, 3))
+    still = (spread < STILL) & (brightness > CLIPPED) & (brightness < 255 - CLIPPED)  # not overexposed sky
     ring = np.concatenate([spread[:4].ravel(), spread[-4:].ravel(), spread[:, :4].ravel(), spread[:, -4:].ravel()])
     if not fixed and still.mean() < LEAST_STILL and float(np.quantile(ring, 0.8)) > 5.0:
         return None

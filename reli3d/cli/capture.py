@@ -29,7 +29,7 @@ def parser() -> Parser:
         "--mask-method",
         choices=("grabcut", "key", "rembg"),
         default="grabcut",
-        help="grabcut: from the points of the object and of what it stands on; key: what differs from a uniform "
+        help="grabcut: from the points of the object and of its support; key: pixels that differ from a uniform "
         "background; rembg: a network (pip install 'reli3d[masks]'), fetched once",
     )
     p.add_argument(
@@ -40,7 +40,7 @@ def parser() -> Parser:
     p.add_argument(
         "--size", type=float, metavar="MM", help="longest side of the object in millimeters: units are meters"
     )
-    p.add_argument("--infer", action="store_true", help="go on to the asset, in OUTPUT/asset")
+    p.add_argument("--infer", action="store_true", help="also reconstruct the asset, in OUTPUT/asset")
     return p
 
 

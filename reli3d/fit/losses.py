@@ -72,8 +72,8 @@ def display_error(image: Tensor, other: Tensor, target: Tensor, bright: Tensor) 
 def agreement(color: Tensor, weight: Tensor) -> Tensor:
     """Photo-consistency: weighted variance of a point's color over the views, robust, mean over points.
 
-    color: ``(N, V, 3)`` display values where the point projects.  weight: ``(N, V)``, 0 where it is occluded.  Apart
-    from highlights, a point on the true surface has the same color in all views.  The term needs neither light nor
+    color: ``(N, V, 3)`` display values where the point projects.  weight: ``(N, V)``, 0 where it is occluded.  Except
+    in highlights, a point on the true surface has the same color in all views.  The term needs neither light nor
     material, so it is used before they are fitted.  Points that fewer than two views see do not count.
     """
     total = weight.sum(1)

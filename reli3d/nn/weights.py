@@ -28,7 +28,7 @@ from reli3d.nn.model import Reconstructor
 from reli3d.nn.presets import OFFICIAL, LocalPreset, Preset, from_json, to_json
 from reli3d.nn.published import CHECKPOINT_PREFIX, UNUSED, our_key
 
-# of torch.load for a cut, changed or other file, beside pickle.UnpicklingError
+# of torch.load for a cut, changed or other file, and pickle.UnpicklingError
 BROKEN_TORCH_FILE = (RuntimeError, ValueError, EOFError, KeyError, OSError)
 FORMAT = "reli3d 1"
 SMALL = Path(__file__).parents[1] / "assets" / "weights" / "small.safetensors"

@@ -64,7 +64,7 @@ class ShadeOptions:
 
     samples: :class:`Samples`, or three counts in its order, each at least 0.  seed: of the random numbers; another seed
     gives independent noise.  In optimization use another seed in every step; the gradient of a squared residual of one
-    rendering is biased, because its value and its derivative share the noise: for an unbiased gradient multiply the
+    rendering is biased, because its value and its derivative have the same noise: for an unbiased gradient multiply the
     residuals of two renderings with different seeds.  antithetic: pairing of visible-normal samples: ``opposite``
     (opposite side of the lobe, see :func:`reli3d.antithetic`), ``mirrored`` (about the surface normal, as in ReLi3D) or
     ``none``.  heuristic: MIS weights, ``balance`` or ``power``.  sequence: ``halton``, with a Cranley-Patterson

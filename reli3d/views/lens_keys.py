@@ -10,7 +10,7 @@ Read, in this order, from the frame, else from the file:
 - ``focal_length`` and ``sensor_width`` in the same unit
 
 0.7 radians, as in the ReLi3D release, only where neither the frame nor the file has a key of a lens.  A key that
-looks like one and is none of these is an error, as is a lens that is no pinhole.
+resembles one and is none of these is an error, as is a lens that is no pinhole.
 """
 
 from __future__ import annotations
