@@ -83,14 +83,14 @@ def test_view_answers_its_own_address_alone(tmp_path):
         for name in ("localhost", "127.0.0.1", "[::1]"):
             assert status(f"{name}:{port}") == 200
         for host in (
-            "evil.example",
-            f"evil.example:{port}",
+            "hostile.example",
+            f"hostile.example:{port}",
             "localhost",
             f"127.0.0.1:{port + 1}",
             f"127.0.0.1.x:{port}",
         ):
             assert status(host) == 403, host
-        assert status() == 403 and status(f"localhost:{port}", "evil.example") == 403
+        assert status() == 403 and status(f"localhost:{port}", "hostile.example") == 403
     finally:
         server.shutdown()
         server.server_close()

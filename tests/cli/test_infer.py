@@ -18,7 +18,7 @@ from reli3d.output import results
 from reli3d.render.color import srgb_to_linear
 from reli3d.render.image import render_asset
 from reli3d.views.folder import load_views
-from tests.support import evil
+from tests.support import hostile
 from tests.support.example import QUICK, moved_example
 
 
@@ -90,8 +90,8 @@ def test_up_turns_mesh_and_light(example, tmp_path):
     torch.testing.assert_close(there, torch.stack([here[:, 0], here[:, 2], -here[:, 1]], -1), rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize("name, make", evil.cases(), ids=[name for name, _ in evil.cases()])
-def test_an_evil_folder_ends_with_2_one_line_and_no_file(tmp_path, capsys, name, make):
+@pytest.mark.parametrize("name, make", hostile.cases(), ids=[name for name, _ in hostile.cases()])
+def test_a_hostile_folder_ends_with_2_one_line_and_no_file(tmp_path, capsys, name, make):
     make(tmp_path / "object")
     assert command(tmp_path, tmp_path / "object") == 2
     out, err = capsys.readouterr()

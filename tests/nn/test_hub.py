@@ -16,7 +16,7 @@ from reli3d.nn import hub
 from reli3d.nn.model import Reconstructor
 from reli3d.nn.published import KEY_MAP
 from reli3d.nn.weights import WeightsError, load, official_path
-from tests.support.evil import Bomb
+from tests.support.hostile import Bomb
 from tests.support.networks import TINY
 
 huggingface_hub = pytest.importorskip("huggingface_hub")

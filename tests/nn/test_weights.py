@@ -27,7 +27,7 @@ from reli3d.nn.weights import (
     shapes,
     write,
 )
-from tests.support.evil import Bomb
+from tests.support.hostile import Bomb
 from tests.support.networks import NANO, TINY, views
 
 LICENSE = "Apache-2.0"

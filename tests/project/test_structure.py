@@ -53,8 +53,8 @@ def imports(source: str, module: str, is_package: bool) -> list[str]:
                 above = module.split(".")[: len(module.split(".")) - node.level + is_package]
                 base = ".".join([*above, base] if base else above)
             for name in (f"{base}.{alias.name}" for alias in node.names):
-                lent = base == "reli3d" and name not in MODULES and getattr(reli3d, name.split(".")[1], None)
-                found.append(name if name in MODULES else getattr(lent, "__module__", None) or base)
+                public = base == "reli3d" and name not in MODULES and getattr(reli3d, name.split(".")[1], None)
+                found.append(name if name in MODULES else getattr(public, "__module__", None) or base)
     return found
 
 

@@ -23,7 +23,7 @@ from reli3d.render.asset import Asset
 from reli3d.synthetic.maps import load_maps
 from reli3d.views.check import explain_cameras
 from reli3d.views.folder import load_views
-from tests.support import evil, evil_maps
+from tests.support import hostile, hostile_maps
 from tests.support.known import KINDS
 from tests.support.misread import Case
 from tests.support.scenes import ball_mesh, textures
@@ -46,7 +46,7 @@ def _folder(make: Callable[[Path], object], root: Path) -> dict[str, bytes]:
 
 def _encoded(form: str, **options) -> bytes:
     data = io.BytesIO()
-    Image.fromarray(evil.random_image(alpha=form != "JPEG")).save(data, form, **options)
+    Image.fromarray(hostile.random_image(alpha=form != "JPEG")).save(data, form, **options)
     return data.getvalue()
 
 
@@ -57,8 +57,8 @@ def _weights() -> bytes:
 def targets(root: Path) -> list[Target]:
     """root: an empty folder to make the accepted ones in."""
     found = [
-        Target("transforms", _folder(evil.good, root / "json"), load_views),
-        Target("colmap", _folder(evil.colmap, root / "colmap"), load_views),
+        Target("transforms", _folder(hostile.good, root / "json"), load_views),
+        Target("colmap", _folder(hostile.colmap, root / "colmap"), load_views),
     ]
     cameras = {"transforms.json": found[0].files["transforms.json"]}
     found.append(Target("rigs", cameras, _with_images))
@@ -84,7 +84,7 @@ def targets(root: Path) -> list[Target]:
     np.savez(maps, env=np.ones((2, 4, 8, 3), np.float32), names=["a", "b"])
     found += [
         Target("hdr", {"a.hdr": environment_bytes(radiance)}, lambda f: read_environment(f / "a.hdr")),
-        Target("exr", {"a.exr": evil_maps.exr_bytes()}, lambda f: read_environment(f / "a.exr")),
+        Target("exr", {"a.exr": hostile_maps.exr_bytes()}, lambda f: read_environment(f / "a.exr")),
         Target("glb", {"a.glb": glb_bytes(asset)}, lambda f: read_glb(f / "a.glb")),
         Target("weights", {"a.safetensors": _weights()}, lambda f: read_manifest(f / "a.safetensors").preset()),
         Target("maps", {"a.npz": maps.getvalue()}, lambda f: load_maps(f / "a.npz")),

@@ -9,7 +9,7 @@ from PIL import Image
 
 from reli3d.views.check import draw_rig, explain_cameras
 from reli3d.views.folder import load_views
-from tests.support import evil
+from tests.support import hostile
 from tests.support.rigs import sphere_views
 
 
@@ -55,7 +55,7 @@ def test_rigs_of_any_size(tmp_path, scale):
 
 def test_lenses_of_all_widths_have_a_verdict(tmp_path):
     """Found by the campaign: most of the hull is behind the camera of the second view, so that no footprint ends."""
-    data = evil.good(tmp_path)
+    data = hostile.good(tmp_path)
     for frame, fov in zip(data["frames"], (0.011823446300047972, 2.780726955605057, 0.7154630259161558), strict=True):
         frame["camera_fov"] = [fov, fov]
     (tmp_path / "transforms.json").write_text(json.dumps(data))

@@ -12,7 +12,7 @@ from PIL import Image
 from reli3d.errors import InputError
 from reli3d.views.choose import DUPLICATE_DISTANCE_RAD, choose_views, spread_notes, view_distances
 from reli3d.views.folder import MAX_VIEWS, load_views
-from tests.support import evil
+from tests.support import hostile
 from tests.support.rigs import rig
 
 
@@ -76,7 +76,7 @@ def test_near_duplicates_and_a_narrow_baseline_are_reported():
 
 
 def folder(path, cameras) -> None:
-    data = evil.good(path, len(cameras))
+    data = hostile.good(path, len(cameras))
     frames = [frame | {"transform_matrix": c.tolist()} for frame, c in zip(data["frames"], cameras, strict=True)]
     (path / "transforms.json").write_text(json.dumps({**data, "frames": frames}))
 
@@ -104,9 +104,9 @@ def cut_off(path, count, which) -> None:
     folder(path, rig(*[(360 * k / count, 20, 2) for k in range(count)]))
     data = json.loads((path / "transforms.json").read_text())
     for k, frame in enumerate(data["frames"]):
-        pixels = evil.random_image()
+        pixels = hostile.random_image()
         frame["file_path"] = f"rgba/{k:02d}.png"
-        Image.fromarray(np.roll(pixels, evil.SIDE // 2, 1) if k in which else pixels).save(path / frame["file_path"])
+        Image.fromarray(np.roll(pixels, hostile.SIDE // 2, 1) if k in which else pixels).save(path / frame["file_path"])
     (path / "transforms.json").write_text(json.dumps(data))
 
 

@@ -8,7 +8,7 @@ from PIL import Image
 
 from reli3d.errors import InputError
 from reli3d.views.folder import load_views
-from tests.support import evil
+from tests.support import hostile
 from tests.support.colmap_model import write_binary, write_text
 
 NAMES = ("0.png", "1.png", "2.png")
@@ -17,7 +17,7 @@ NAMES = ("0.png", "1.png", "2.png")
 @pytest.fixture
 def model(tmp_path):
     """A folder of three images, and the lines of its images.txt: poses with points in between."""
-    _, images = evil.colmap(tmp_path)
+    _, images = hostile.colmap(tmp_path)
     return tmp_path, images.splitlines()[1:]
 
 

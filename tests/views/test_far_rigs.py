@@ -17,7 +17,7 @@ from reli3d.pipeline import ReconstructOptions, reconstruct
 from reli3d.views.folder import load_views
 from reli3d.views.normalize import FAR, near_origin
 from reli3d.views.similarity import Similarity
-from tests.support import evil
+from tests.support import hostile
 from tests.support.example import QUICK, moved_example
 from tests.support.rigs import sphere_views
 
@@ -67,7 +67,7 @@ def test_cameras_in_one_point_are_left_to_the_check():
 
 @pytest.mark.parametrize("scale", [1e-7, 1e-20, 1e-44, 1e-300])
 def test_a_rig_of_no_size_is_refused(tmp_path, scale):
-    data = evil.good(tmp_path)
+    data = hostile.good(tmp_path)
     for frame in data["frames"]:
         for row in frame["transform_matrix"][:3]:
             row[3] *= scale

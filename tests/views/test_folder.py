@@ -10,7 +10,7 @@ from reli3d.errors import InputError
 from reli3d.geometry.camera import project
 from reli3d.views.folder import MAX_VIEWS, load_views
 from reli3d.views.frames import distortion_pixels
-from tests.support import evil
+from tests.support import hostile
 
 
 def photo(path, width=40, height=30, alpha=True):
@@ -28,7 +28,7 @@ def transforms(folder, frames, **top):
 
 
 def test_object_folder_as_published(tmp_path):
-    data = evil.good(tmp_path)
+    data = hostile.good(tmp_path)
     frames = data["frames"]
     frames[0].update(view_index=7, camera_fov=0.5)  # scalar: both sides
     frames[1].update(view_index=3, camera_fov=[0.6, 0.4], camera_principal_point=[10.0, 20.5])
@@ -37,14 +37,14 @@ def test_object_folder_as_published(tmp_path):
     transforms(tmp_path, frames, coordinate_system="blender")
     views = load_views(tmp_path)
     assert views.names == ("rgba/2.png", "rgba/1.png", "rgba/0.png")
-    s = evil.SIDE / 2
+    s = hostile.SIDE / 2
     expected = [
         [s / math.tan(0.35), s / math.tan(0.35), s, s],
         [s / math.tan(0.3), s / math.tan(0.2), 10.0, 20.5],
         [s / math.tan(0.25), s / math.tan(0.25), s, s],
     ]
     torch.testing.assert_close(views.intrinsics, torch.tensor(expected), rtol=1e-6, atol=0)
-    torch.testing.assert_close(views.c2w, torch.tensor([evil.pose(2.1 * i) for i in (2, 1, 0)]), rtol=0, atol=1e-6)
+    torch.testing.assert_close(views.c2w, torch.tensor([hostile.pose(2.1 * i) for i in (2, 1, 0)]), rtol=0, atol=1e-6)
     assert len(views.notes) == 1
     assert "0.7 radians" in views.notes[0]
     assert load_views(tmp_path, first_views=2).names == views.names[:2]
@@ -54,7 +54,7 @@ def test_blender_folder(tmp_path):
     photo(tmp_path / "train/r_0.png")
     transforms(
         tmp_path,
-        [{"file_path": "./train/r_0", "rotation": 0.1, "transform_matrix": evil.pose(0.3)}],
+        [{"file_path": "./train/r_0", "rotation": 0.1, "transform_matrix": hostile.pose(0.3)}],
         camera_angle_x=0.6911112070083618,
     )
     views = load_views(tmp_path)
@@ -73,10 +73,10 @@ def test_nerfstudio_folder(tmp_path):
         (tmp_path / "masks").mkdir(exist_ok=True)
         Image.fromarray(mask).save(tmp_path / f"masks/{name}.png")
     frames = [
-        {"file_path": "images/a.jpg", "mask_path": "masks/a.png", "transform_matrix": evil.pose(0.0)},
+        {"file_path": "images/a.jpg", "mask_path": "masks/a.png", "transform_matrix": hostile.pose(0.0)},
         {
             "file_path": "images/b.jpg",
-            "transform_matrix": evil.pose(1.0),
+            "transform_matrix": hostile.pose(1.0),
             "fl_x": 70.0,
             "w": 40,
             "h": 30,
@@ -141,7 +141,7 @@ def test_colmap_folder_agrees_with_colmaps_own_projection(tmp_path):
 
 
 def test_small_distortion_is_ignored_with_a_note_and_large_refused(tmp_path):
-    evil.colmap(tmp_path)
+    hostile.colmap(tmp_path)
     cameras = tmp_path / "sparse/0/cameras.txt"
     cameras.write_text("1 RADIAL 32 32 51.7 16 16 0.001 0\n")
     assert any("distortion" in n for n in load_views(tmp_path).notes)
@@ -162,7 +162,7 @@ def test_which_mask_counts(tmp_path):
         shapes[name] = int(mask.sum() / 255)
         (tmp_path / name).mkdir()
         Image.fromarray(mask).save(tmp_path / name / "a.png")
-    frame = {"file_path": "a.png", "transform_matrix": evil.pose(0), "camera_fov": 0.6}
+    frame = {"file_path": "a.png", "transform_matrix": hostile.pose(0), "camera_fov": 0.6}
     transforms(tmp_path, [frame])
     alpha = 20 * 24
     assert int(load_views(tmp_path).masks[0].sum()) == alpha
@@ -178,7 +178,7 @@ def test_which_mask_counts(tmp_path):
 
 def test_files_outside_are_refused(tmp_path):
     photo(tmp_path / "elsewhere/a.png")
-    frame = {"file_path": "../elsewhere/a.png", "transform_matrix": evil.pose(0), "camera_fov": 0.6}
+    frame = {"file_path": "../elsewhere/a.png", "transform_matrix": hostile.pose(0), "camera_fov": 0.6}
     transforms(tmp_path / "object", [frame])
     with pytest.raises(InputError, match="leads out of it"):
         load_views(tmp_path / "object")
@@ -190,18 +190,18 @@ def test_files_outside_are_refused(tmp_path):
 
 @pytest.mark.parametrize("name", ["rgba/0.png", "./rgba/0.png", "RGBA/0.PNG", "rgba/0"])
 def test_an_image_with_two_poses_is_refused(tmp_path, name):
-    data = evil.good(tmp_path)
+    data = hostile.good(tmp_path)
     data["frames"].append(data["frames"][0] | {"file_path": name, "view_index": 3})
     (tmp_path / "transforms.json").write_text(json.dumps(data))
     assert len(load_views(tmp_path)) == 4  # the same pose again
-    data["frames"][3]["transform_matrix"] = evil.pose(1.0)
+    data["frames"][3]["transform_matrix"] = hostile.pose(1.0)
     (tmp_path / "transforms.json").write_text(json.dumps(data))
     with pytest.raises(InputError, match=r"frames\[3\]: pose: expected one for each image, got another .*frames\[0\]"):
         load_views(tmp_path)
 
 
 def test_number_of_views(tmp_path):
-    frames = evil.good(tmp_path)["frames"] * 7
+    frames = hostile.good(tmp_path)["frames"] * 7
     transforms(tmp_path, frames)
     assert len(load_views(tmp_path)) == 3  # an image listed seven times is used once
     for options in ({"views": MAX_VIEWS}, {"first_views": MAX_VIEWS}):
@@ -213,19 +213,19 @@ def test_number_of_views(tmp_path):
 
 
 def test_rounding_in_the_matrix_is_cleaned_up(tmp_path):
-    data = evil.good(tmp_path, views=1)
-    matrix = [[round(v, 4) for v in row] for row in evil.pose(0.7)]
+    data = hostile.good(tmp_path, views=1)
+    matrix = [[round(v, 4) for v in row] for row in hostile.pose(0.7)]
     transforms(tmp_path, [data["frames"][0] | {"transform_matrix": matrix}])
     rotation = load_views(tmp_path).c2w[0, :3, :3].double()
     assert float((rotation.T @ rotation - torch.eye(3)).abs().max()) < 3e-7  # float32
-    exact = torch.tensor(evil.pose(0.7), dtype=torch.float64)[:3, :3]
+    exact = torch.tensor(hostile.pose(0.7), dtype=torch.float64)[:3, :3]
     assert float((rotation - exact).abs().max()) < 1e-4  # four digits
 
 
 def test_paths_with_spaces_and_other_letters(tmp_path):
     folder = tmp_path / "mein Objekt ñ"
     photo(folder / "im ages/é 1.png")
-    transforms(folder, [{"file_path": "im ages/é 1.png", "transform_matrix": evil.pose(0), "camera_fov": 0.6}])
+    transforms(folder, [{"file_path": "im ages/é 1.png", "transform_matrix": hostile.pose(0), "camera_fov": 0.6}])
     assert load_views(str(folder)).names == ("im ages/é 1.png",)
 
 
@@ -250,7 +250,7 @@ def test_premultiplied_alpha_is_noted(tmp_path):
     """A bright disk with a soft edge on black, its color multiplied by alpha or not."""
     y, x = np.mgrid[:64, :64] - 31.5
     alpha = np.clip((24 - np.hypot(x, y)) / 6, 0, 1)
-    frame = {"file_path": "a.png", "transform_matrix": evil.pose(0), "camera_fov": 0.6}
+    frame = {"file_path": "a.png", "transform_matrix": hostile.pose(0), "camera_fov": 0.6}
     transforms(tmp_path, [frame])
     flat = np.full_like(alpha, 0.8)
     for color_of, noted in ((np.where(alpha > 0, flat, 0.0), False), (flat * alpha, True), (flat, False)):
@@ -260,7 +260,7 @@ def test_premultiplied_alpha_is_noted(tmp_path):
 
 
 def test_the_lighting_of_a_capture_is_read(tmp_path):
-    frames = evil.good(tmp_path)["frames"]
+    frames = hostile.good(tmp_path)["frames"]
     assert load_views(tmp_path).lighting == "object"
     transforms(tmp_path, frames, lighting="camera")
     assert load_views(tmp_path).lighting == "camera"

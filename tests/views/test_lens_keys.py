@@ -8,9 +8,9 @@ import pytest
 
 from reli3d.errors import InputError
 from reli3d.views.folder import load_views
-from tests.support import evil
+from tests.support import hostile
 
-S = evil.SIDE
+S = hostile.SIDE
 F, CX, CY = 51.7, 15.0, 17.5
 FOV = 2 * math.atan(0.5 * S / F)
 K = [[F, 0, CX], [0, F, CY], [0, 0, 1]]
@@ -19,7 +19,7 @@ MIDDLE = [F, F, S / 2, S / 2]
 
 def load(folder, frame=None, **top):
     """Views of a folder whose lens is given by keys of the file, and of each frame."""
-    data = evil.good(folder)
+    data = hostile.good(folder)
     for entry in data["frames"]:
         entry.pop("camera_fov", None), entry.pop("camera_principal_point", None)
         entry.update(frame or {})

@@ -8,7 +8,7 @@ from PIL import Image
 
 from reli3d.errors import InputError
 from reli3d.views.folder import load_views
-from tests.support import evil
+from tests.support import hostile
 
 SIDE = 48
 DISK = np.hypot(*(np.mgrid[:SIDE, :SIDE] - 23.5)) < 15
@@ -26,7 +26,7 @@ def folder(root, images, **top):
     for k, name in enumerate(images):
         (root / name).parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(np.full((SIDE, SIDE, 3), 90 + k, np.uint8)).save(root / name)
-        frames.append({"file_path": name, "transform_matrix": evil.pose(2.1 * k), "camera_fov": 0.6})
+        frames.append({"file_path": name, "transform_matrix": hostile.pose(2.1 * k), "camera_fov": 0.6})
     (root / "transforms.json").write_text(json.dumps({**top, "frames": frames}))
 
 

@@ -16,8 +16,8 @@ from reli3d.geometry.camera import project
 from reli3d.io.images import read_image
 from reli3d.views.folder import load_views
 from reli3d.views.reduce import MAX_FULL_PIXELS, MAX_OBJECT_PIXELS, cut
-from tests.support import evil
-from tests.support.evil import pose
+from tests.support import hostile
+from tests.support.hostile import pose
 
 SIZE = (40, 24)  # width, height
 SHADES = np.random.default_rng(1).integers(0, 256, (SIZE[1], SIZE[0], 4), np.uint8)
@@ -202,11 +202,11 @@ def test_16_large_photographs_take_less_than_a_gibibyte(tmp_path):
 def plain(folder, masks=True, inner="images"):
     (folder / inner).mkdir(parents=True, exist_ok=True)
     for i in range(3):
-        Image.fromarray(evil.random_image(alpha=False)).save(folder / inner / f"p {i}.jpg")
+        Image.fromarray(hostile.random_image(alpha=False)).save(folder / inner / f"p {i}.jpg")
     if masks:
         (folder / "masks").mkdir()
         for i in range(3):
-            Image.fromarray(evil.random_image()[..., 3]).save(folder / f"masks/p {i}.png")
+            Image.fromarray(hostile.random_image()[..., 3]).save(folder / f"masks/p {i}.png")
     return folder
 
 

@@ -1,6 +1,6 @@
 """Hostile and broken inputs, made by code.  Each must end in one line that names the fault, with nothing written.
 
-``cases()`` are object folders for anything that takes one; environment files stand in ``evil_maps``.
+``cases()`` are object folders for anything that takes one; environment files stand in ``hostile_maps``.
 """
 
 import io

@@ -7,7 +7,7 @@ import pytest
 from reli3d.errors import InputError
 from reli3d.io.hdr import read_environment
 from reli3d.views.folder import load_views
-from tests.support import evil, evil_maps
+from tests.support import hostile, hostile_maps
 
 
 def listing(folder: Path) -> list:
@@ -22,14 +22,14 @@ def one_clear_line(error: BaseException) -> None:
 
 
 def test_the_untouched_folders_load(tmp_path):
-    evil.good(tmp_path / "json")
-    evil.colmap(tmp_path / "colmap")
+    hostile.good(tmp_path / "json")
+    hostile.colmap(tmp_path / "colmap")
     assert len(load_views(tmp_path / "json")) == len(load_views(tmp_path / "colmap")) == 3
-    (tmp_path / "good.exr").write_bytes(evil_maps.exr_bytes())
+    (tmp_path / "good.exr").write_bytes(hostile_maps.exr_bytes())
     assert read_environment(tmp_path / "good.exr").radiance.shape == (16, 32, 3)
 
 
-@pytest.mark.parametrize("name, make", evil.cases(), ids=[name for name, _ in evil.cases()])
+@pytest.mark.parametrize("name, make", hostile.cases(), ids=[name for name, _ in hostile.cases()])
 def test_a_malformed_folder_gives_one_line(tmp_path, capfd, name, make):
     make(tmp_path / "object")
     before = listing(tmp_path)
@@ -40,7 +40,7 @@ def test_a_malformed_folder_gives_one_line(tmp_path, capfd, name, make):
     assert capfd.readouterr() == ("", "")  # nothing but the error
 
 
-@pytest.mark.parametrize("name, content", evil_maps.cases(), ids=[name for name, _ in evil_maps.cases()])
+@pytest.mark.parametrize("name, content", hostile_maps.cases(), ids=[name for name, _ in hostile_maps.cases()])
 def test_a_malformed_map_gives_one_line(tmp_path, capfd, name, content):
     path = tmp_path / "map.hdr"
     path.write_bytes(content)
