@@ -41,7 +41,7 @@ from reli3d.render.exposure import estimate_base_color_and_light
 from reli3d.render.latlong import lat_long_directions
 from reli3d.views.check import up_axis, verdict
 from reli3d.views.folder import load_views
-from reli3d.views.normalize import FAR, normalize
+from reli3d.views.normalize import FAR_DISTANCES, normalize
 from reli3d.views.published_views import background_shown, hero_first, placement_notes
 from reli3d.views.similarity import Similarity, output_frame
 from reli3d.views.views import Views
@@ -54,7 +54,7 @@ INSIDE = 2.0  # pixels from the silhouette within which colors may be mixed with
 MIN_PART_FRACTION = 0.01  # of the faces; smaller components are removed
 TEXELS = 1 << 19  # evaluated at once on a CPU: 100 bytes each
 SHADING_POINTS = 4096  # vertices from which the lighting on the object is estimated
-OUTSIDE = 1.0  # field value of grid points outside the visual hull
+OUTSIDE_FIELD = 1.0  # field value of grid points outside the visual hull
 MARGIN_CELLS = 2.5  # cells around the silhouettes' hull in which the field is still evaluated
 
 
@@ -128,7 +128,7 @@ def _bounded_surface(field: LocalField, resolution: int) -> Mesh:
         parts = [(_grid_points(axis, k), bound.view(-1)[k]) for k in index.split(CHUNK)]
         return torch.cat([torch.maximum(field.sdf_within(*part), part[1]) for part in parts])
 
-    sdf = torch.maximum(sparse_sdf(bound.clamp(min=OUTSIDE), near, evaluate), bound)
+    sdf = torch.maximum(sparse_sdf(bound.clamp(min=OUTSIDE_FIELD), near, evaluate), bound)
     sdf = cover_silhouettes(sdf, bound, maps.silhouette, maps.camera, radius=radius)
     _check_signs(sdf)
     return extract_surface(sdf, radius=radius)
@@ -243,7 +243,7 @@ def _check_place(near: Mesh, mesh: Mesh) -> None:
     """
     low, high = mesh.vertices.aminmax(dim=0)
     far, size = float(torch.maximum(-low, high).max()), float((high - low).max())
-    if far > FAR * size and len(weld(mesh.vertices)[0]) < len(weld(near.vertices)[0]):
+    if far > FAR_DISTANCES * size and len(weld(mesh.vertices)[0]) < len(weld(near.vertices)[0]):
         raise InputError(
             "views",
             f"expected an object near the origin, got one of size {size:.3g} at {far:.3g}; "

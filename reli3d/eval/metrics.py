@@ -15,14 +15,14 @@ from torch.nn.functional import conv2d
 
 from reli3d.geometry.mesh import Mesh
 
-POINTS = 30_000  # of each surface, uniform by area
+SURFACE_SAMPLES = 30_000  # of each surface, uniform by area
 THRESHOLDS = (0.1, 0.2, 0.5)  # of the F-score
 WINDOW, SIGMA = 11, 1.5  # of SSIM's Gaussian (Wang et al. 2004)
 K1, K2 = 0.01, 0.03
 MAX_PSNR = 100.0  # dB, of equal images
 
 
-def surface_samples(mesh: Mesh, count: int = POINTS, seed: int = 0) -> np.ndarray:
+def surface_samples(mesh: Mesh, count: int = SURFACE_SAMPLES, seed: int = 0) -> np.ndarray:
     """Points ``(count, 3)`` on the surface, uniform by area."""
     corners = mesh.vertices.detach().cpu().double().numpy()[mesh.faces.cpu().numpy()]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1)

@@ -15,7 +15,7 @@ from reli3d.geometry.rays import RayScene
 from reli3d.render.color import srgb_to_linear
 from reli3d.render.transfer import spherical_harmonics
 
-POINTS = 4096  # vertices whose brightness is compared
+COMPARED_POINTS = 4096  # vertices whose brightness is compared
 SATURATED_DISPLAY = 0.98  # a brighter value may be clipped
 HARMONICS = slice(1, 9)  # of degree 1 and 2; with degree 0 they hold 99 % of a light's irradiance
 # From these the lighting is taken to move with the camera.  Measured on four metallic and painted objects with 12 or 14
@@ -42,7 +42,7 @@ def explained_deviations(mesh: Mesh, images: InputImages) -> tuple[float, float]
 
     mesh: with normals.  No gradient.
     """
-    step = max(1, len(mesh.vertices) // POINTS)
+    step = max(1, len(mesh.vertices) // COMPARED_POINTS)
     position, normal = mesh.vertices[::step], present("mesh.normals", mesh.normals)[::step]
     color, cover = view_colors(display_planes(images), position, images.camera)
     weight = view_weights(RayScene(mesh.vertices, mesh.faces), position, normal, images.camera)

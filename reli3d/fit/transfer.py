@@ -20,14 +20,14 @@ from reli3d.render.asset import Asset, TextureSet
 from reli3d.render.gbuffer import sample_texture, surface_points
 from reli3d.render.points import SurfacePoints
 
-MAX_DISTANCE = 0.08  # of the surfaces along the new one's normal, in the box [-1, 1]^3
+MAX_SURFACE_DISTANCE = 0.08  # of the surfaces along the new one's normal, in the box [-1, 1]^3
 
 
 def nearest_hits(mesh: Mesh, position: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
     """Face ``(N,)`` and barycentrics ``(N, 2)`` of ``mesh`` that correspond to points of another surface: the first hit
-    from outside along the normal within ``MAX_DISTANCE``, else the nearest vertex."""
+    from outside along the normal within ``MAX_SURFACE_DISTANCE``, else the nearest vertex."""
     scene = RayScene(mesh.vertices, mesh.faces)
-    hits = scene.closest(position + MAX_DISTANCE * normal, -normal, t_max=2.0 * MAX_DISTANCE)
+    hits = scene.closest(position + MAX_SURFACE_DISTANCE * normal, -normal, t_max=2.0 * MAX_SURFACE_DISTANCE)
     face, bary = hits.face.clone(), hits.bary.clone()
     missed = torch.nonzero(face < 0)[:, 0]
     if len(missed):

@@ -22,7 +22,7 @@ from reli3d.geometry.topology import edges_of
 from reli3d.kernels import bake as kernels
 
 BORDER_TEXELS = 1.5  # texels: a bilinear tap of a point of the surface has its center within sqrt(2)
-TILE = {"cpu": 16, "cuda": 4}  # side of a thread's tile in texels: large amortizes setup, small fills a GPU
+TILE_TEXELS = {"cpu": 16, "cuda": 4}  # side of a thread's tile in texels: large amortizes setup, small fills a GPU
 STRIP = 64  # columns a thread sweeps in the column pass: one cache line of the mask
 ROWS_MIN = 16  # rows of texels a CPU slice of the row pass
 TILES_MIN = 16  # tiles a CPU slice: each of them walks its list of faces for 256 texels
@@ -101,7 +101,7 @@ def rasterize_texels(mesh: Mesh, size: int) -> Texels:
     distance = torch.empty(size, size, device=device, dtype=torch.float32)
     if len(mesh.faces) == 0:
         return Texels(face.fill_(-1), bary.zero_(), torch.zeros_like(face, dtype=torch.bool))
-    tile = TILE[device.type]
+    tile = TILE_TEXELS[device.type]
     lower, upper = torch.aminmax(corners, dim=1)
     tiles = _tiles(corners, lower, upper, size, tile)
     segments = _border_segments(mesh.faces)
@@ -124,7 +124,7 @@ def coverage(mesh: Mesh, size: int) -> Tensor:
     corners = _corners(mesh, size)
     hits = torch.zeros(size, size, dtype=torch.uint8, device=corners.device)
     if len(mesh.faces):
-        tile = TILE[corners.device.type]
+        tile = TILE_TEXELS[corners.device.type]
         lower, upper = torch.aminmax(corners, dim=1)
         tiles = _tiles(corners, lower, upper, size, tile)
         _bridge.launch(

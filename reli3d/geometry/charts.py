@@ -35,7 +35,7 @@ CUT_ANGLES = 8  # directions in [0, 180) degrees of the cut, and of the boxes th
 ANGLES = 24  # directions in [0, 90) degrees tried for the smallest bounding box of a chart: within 2 degrees of it
 LIGHT = 8192  # faces a CPU slice of the steps that take a few nanoseconds a face: less costs more to launch than to run
 GROW_MAX = 2.0  # a chart seen obliquely is enlarged to its area on the surface, up to this factor
-SLACK = 2.0e-3  # texels: overlap below this width is rounding
+OVERLAP_TEXELS = 2.0e-3  # texels: overlap below this width is rounding
 PAIRS_MAX = 1 << 24  # overlapping pairs listed at once (64 MB); charts above are halved first
 AXES = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, -1, 0], [0, 0, -1]], np.float64)
 
@@ -271,7 +271,7 @@ def _overlaps(charts: Charts, boxes: np.ndarray, query: np.ndarray):
     ins = _ints(boxes), _ints(query), (corners, wp.vec2)
 
     def find(emit: int = 0, offset: torch.Tensor = none[0], partner: torch.Tensor = none[1]) -> torch.Tensor:
-        _bridge.launch(kernels.overlaps_kernel, len(query), [bvh.id, *ins, _ints(charts.chart), SLACK,
+        _bridge.launch(kernels.overlaps_kernel, len(query), [bvh.id, *ins, _ints(charts.chart), OVERLAP_TEXELS,
                        (offset, wp.int64), emit, (count, wp.int32), (partner, wp.int32)], CPU)  # fmt: skip
         return count
 

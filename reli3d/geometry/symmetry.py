@@ -33,7 +33,7 @@ MAX_MEAN_DIRECTION = 0.75  # length of the mean horizontal view direction: one-s
 MAX_UNKNOWN_FRACTION = 0.05  # of rays without a point in the hull: more means inconsistent masks and cameras
 REVOLUTION_FRACTION = 0.95  # of planes that are candidates, from which the object is a solid of revolution
 MIN_VIEWS = 3  # two silhouettes are consistent with many planes
-MAX_DISTANCE = 50.0  # of the object from the cameras' centroid, in their greatest distance from it
+MAX_OBJECT_DISTANCE = 50.0  # of the object from the cameras' centroid, in their greatest distance from it
 MAX_RESIDUAL = 0.1  # clamp on the residual of a ray
 MAX_ROLL = 0.17  # rms roll of the cameras about their axes [rad]: more leaves the vertical undefined
 MIN_AXIS_SINE = 0.2  # rms sine between the cameras' horizontal axes: less leaves the vertical undefined
@@ -179,7 +179,7 @@ def _hull_points(distance: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
     local = torch.stack([(x - cx) / fx, -(y - cy) / fy, -torch.ones_like(fx)], 1)
     direction = functional.normalize((camera.c2w[view, :3, :3] @ local[..., None])[..., 0], dim=1)
     origin = camera.position[view].contiguous()
-    span = hull_span(origin, direction, MAX_DISTANCE, distance, camera)
+    span = hull_span(origin, direction, MAX_OBJECT_DISTANCE, distance, camera)
     fraction = (torch.arange(DEPTHS, device=origin.device, dtype=torch.float32) + 0.5) / DEPTHS
     depth = torch.lerp(span[:, :1], span[:, 1:], fraction)
     points = origin[:, None] + direction[:, None] * depth[..., None]

@@ -17,13 +17,13 @@ from reli3d.kernels.bump import ENCODE_EPS, encode_normals_kernel
 from reli3d.kernels.tangents import corner_tangents_kernel
 
 EPS = float(ENCODE_EPS)
-PARALLEL = 1.0e-12  # projected directions shorter than this are treated as zero, in float64
+MIN_TANGENT_LENGTH = 1.0e-12  # projected directions shorter than this are treated as zero, in float64
 
 
 def _unit(v: Tensor) -> tuple[Tensor, Tensor]:
-    """Normalized columns of ``v (3, N)``, 0 if shorter than PARALLEL, and their lengths ``(N,)``."""
+    """Normalized columns of ``v (3, N)``, 0 if shorter than MIN_TANGENT_LENGTH, and their lengths ``(N,)``."""
     length = (v * v).sum(0).sqrt()
-    return v * torch.where(length > PARALLEL, 1.0 / length.clamp(min=1e-300), 0.0), length
+    return v * torch.where(length > MIN_TANGENT_LENGTH, 1.0 / length.clamp(min=1e-300), 0.0), length
 
 
 def _flat(v: Tensor, n: Tensor) -> Tensor:
@@ -56,7 +56,7 @@ def vertex_tangents(vertices: Tensor, faces: Tensor, normals: Tensor, uv: Tensor
     upright, mirrored = total[:, :count][:, same], total[:, count:][:, same]
     flip = mirrored[3] > upright[3]
     tangent, length = _unit(torch.where(flip, mirrored, upright)[:3])
-    tangent = torch.where(length > PARALLEL, _unit(_flat(tangent, n))[0], _any_orthogonal(n))
+    tangent = torch.where(length > MIN_TANGENT_LENGTH, _unit(_flat(tangent, n))[0], _any_orthogonal(n))
     return torch.cat([tangent, torch.where(flip, -1.0, 1.0).to(tangent)[None]]).T.to(torch.float32).contiguous()
 
 

@@ -11,7 +11,7 @@ from reli3d.kernels import triplane as kernels
 
 BLOCK_CHANNELS = 8  # channels of a kernels.vec8
 ROWS_MIN = 8  # rows of cells a CPU slice of the planes' adjoint: each adds all the points that fall in it
-CACHED = 1 << 16  # floats of a plane that stay in a core's second-level cache whatever the order of the points
+CACHED_FLOATS = 1 << 16  # floats of a plane that stay in a core's second-level cache whatever the order of the points
 BANDS = 16  # of the rows of a plane, a CPU thread each: more copy more rows twice
 PROBED = 4096  # consecutive points tested for coherence
 STEP_TEXELS_MAX = 8.0  # distance of coherent consecutive points
@@ -33,7 +33,7 @@ class _SampleTriplane(torch.autograd.Function):
         order = edges = points.new_empty(0, dtype=torch.int32)
         scattered = (
             not planes.is_cuda
-            and height * width * blocks * BLOCK_CHANNELS > CACHED
+            and height * width * blocks * BLOCK_CHANNELS > CACHED_FLOATS
             and not _is_walk(points, max(height, width))
         )
         by_rows = (

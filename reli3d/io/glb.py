@@ -26,7 +26,7 @@ from reli3d.io.images import png_bytes
 from reli3d.render.asset import Asset
 from reli3d.render.color import linear_to_srgb
 
-UNIT = 1.0e-3  # deviation from length 1 that readers accept
+UNIT_TOLERANCE = 1.0e-3  # deviation from length 1 that readers accept
 KINDS = ("png", "webp")  # of textures
 WEBP = "EXT_texture_webp"
 FLOAT, UINT = 5126, 5125
@@ -85,7 +85,7 @@ def check_asset(asset: Asset) -> None:
     for name, value in (("normals", normals), ("tangents", tangents[:, :3])):
         length = value.detach().norm(dim=1)
         worst = float((length - 1.0).abs().max())
-        if worst > UNIT:
+        if worst > UNIT_TOLERANCE:
             raise ValueError(f"asset.mesh.{name}: expected unit length, got a length off by {worst:.3g}")
     if not bool((tangents[:, 3].abs() == 1.0).all()):
         raise ValueError("asset.mesh.tangents: expected w = +1 or -1, got another value")

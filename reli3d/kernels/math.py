@@ -11,7 +11,7 @@ CONTRACT = "-ffp-contract=fast"
 PI = wp.constant(3.14159265358979)
 INV_PI = wp.constant(0.318309886183791)
 TINY = wp.constant(1.0e-12)  # floor of a squared length: its root, 1e-6, is above float32 noise of a unit vector
-PARALLEL = wp.constant(1.0e-12)  # a direction's component below it never leaves its slab
+MIN_DIRECTION = wp.constant(1.0e-12)  # a direction's component below it never leaves its slab
 
 
 @wp.func
@@ -31,10 +31,10 @@ def cube_range(origin: wp.vec3, direction: wp.vec3, radius: float, near: float, 
     """Entry and exit of a ray in the cube, within [near, far]; entry >= exit for none.  Kay and Kajiya 1986."""
     low = wp.float32(near)
     high = wp.float32(far)
-    if not (wp.isfinite(origin) and wp.isfinite(direction)) or wp.length_sq(direction) < PARALLEL * PARALLEL:
+    if not (wp.isfinite(origin) and wp.isfinite(direction)) or wp.length_sq(direction) < MIN_DIRECTION * MIN_DIRECTION:
         high = -1.0
     for k in range(3):
-        if wp.abs(direction[k]) > PARALLEL:
+        if wp.abs(direction[k]) > MIN_DIRECTION:
             a = (-radius - origin[k]) / direction[k]
             b = (radius - origin[k]) / direction[k]
             low = wp.max(low, wp.min(a, b))

@@ -4,16 +4,16 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
 
-PARALLEL = wp.constant(wp.float64(1.0e-12))  # as in geometry.tangents
+MIN_TANGENT_LENGTH = wp.constant(wp.float64(1.0e-12))  # as in geometry.tangents
 ZERO = wp.constant(wp.float64(0.0))
 ONE = wp.constant(wp.float64(1.0))
 
 
 @wp.func
 def unit(v: wp.vec3d) -> wp.vec3d:
-    """``v`` normalized, 0 if it is shorter than PARALLEL."""
+    """``v`` normalized, 0 if it is shorter than MIN_TANGENT_LENGTH."""
     length = wp.length(v)
-    if length > PARALLEL:
+    if length > MIN_TANGENT_LENGTH:
         return v / length
     return wp.vec3d()
 

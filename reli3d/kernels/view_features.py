@@ -17,7 +17,7 @@ HIDDEN_WEIGHT = wp.constant(0.02)  # fallback weight of a view in which the poin
 MIN_WEIGHT = wp.constant(1.0e-4)  # keeps the mean defined for a point outside every image
 EDGE_WIDTH = wp.constant(0.01)  # in image widths: colors closer to the silhouette may mix with the background
 MIN_EDGE_WEIGHT = wp.constant(0.05)  # factor on the weight of pixels on and outside the silhouette
-MAX_DISTANCE = wp.constant(0.15)  # in image widths: silhouette distances are clamped to this
+MAX_SILHOUETTE_DISTANCE = wp.constant(0.15)  # in image widths: silhouette distances are clamped to this
 TANH_SATURATION = wp.constant(8.3)  # tanh is 1 to within 1.2e-7, a float32 rounding
 
 
@@ -65,7 +65,7 @@ def view_numbers(
         view_weight = inside * (HIDDEN_WEIGHT + visible * facing * facing)
     edge = value[3] / (EDGE_WIDTH * size)
     view_weight = view_weight * wp.clamp(edge, MIN_EDGE_WEIGHT, 1.0) + MIN_WEIGHT
-    distance = wp.clamp(value[3] / size, -MAX_DISTANCE, MAX_DISTANCE) / MAX_DISTANCE
+    distance = wp.clamp(value[3] / size, -MAX_SILHOUETTE_DISTANCE, MAX_SILHOUETTE_DISTANCE) / MAX_SILHOUETTE_DISTANCE
     depth = q[2] - wp.dot(eye, axis)  # the depth of the origin is 0
     edge = wp.clamp(edge, -1.0, 1.0)
     return vec9(value[0], value[1], value[2], distance, depth, inside, seen, facing, edge), view_weight

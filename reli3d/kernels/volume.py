@@ -9,12 +9,12 @@ Transmittance is ``T = exp(-sum)`` of the accumulated optical depth.  The adjoin
 
 import warp as wp
 
-from reli3d.kernels.math import PARALLEL, cube_range
+from reli3d.kernels.math import MIN_DIRECTION, cube_range
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
 
 STEPS_MAX = wp.constant(1 << 24)  # float32 counts steps exactly up to here
-OPAQUE = wp.constant(80.0)  # optical depth at which marching ends: exp(-80) is 2e-35
+MAX_OPTICAL_DEPTH = wp.constant(80.0)  # optical depth at which marching ends: exp(-80) is 2e-35
 
 
 @wp.func
@@ -30,7 +30,7 @@ def cell_exit(origin: wp.vec3, direction: wp.vec3, radius: float, size: int, x: 
     cell = wp.vec3(float(x), float(y), float(z))
     t = wp.float32(3.0e38)
     for k in range(3):
-        if wp.abs(direction[k]) > PARALLEL:
+        if wp.abs(direction[k]) > MIN_DIRECTION:
             face = cell[k]
             if direction[k] > 0.0:
                 face = face + 1.0
@@ -82,8 +82,8 @@ def absorbed(thickness: float) -> float:
 
 @wp.func
 def step_thickness(density: float, step: float) -> float:
-    """Optical depth of one step, in [0, OPAQUE]."""
-    return wp.clamp(density * step, 0.0, OPAQUE)
+    """Optical depth of one step, in [0, MAX_OPTICAL_DEPTH]."""
+    return wp.clamp(density * step, 0.0, MAX_OPTICAL_DEPTH)
 
 
 @wp.kernel
@@ -167,7 +167,7 @@ def composite_kernel(
     total = wp.vec3(0.0, 0.0, 0.0)
     distance = wp.float32(0.0)
     k = first[i]
-    while k < first[i + 1] and thickness < OPAQUE:
+    while k < first[i + 1] and thickness < MAX_OPTICAL_DEPTH:
         layer = step_thickness(density[k], step)
         weight = wp.exp(-thickness) * absorbed(layer)
         total = total + color[k] * weight
@@ -197,7 +197,7 @@ def composite_adjoint_kernel(
 ):
     """Back to front: with e the adjoint of a sample's weight, d loss / d own thickness = T_after e - sum behind of w e.
 
-    The thickness before a sample comes from the whole one by taking samples away; that one is below 2 OPAQUE, so the
+    The thickness before a sample is the whole one less the samples; that one is below 2 MAX_OPTICAL_DEPTH, so the
     rounding of it is below 1e-5.  Samples that no light passes keep the zeros that the gradients hold before; an output
     without rows is left out.
     """
@@ -205,7 +205,7 @@ def composite_adjoint_kernel(
     begin = first[i]
     end = begin
     thickness = wp.float32(0.0)
-    while end < first[i + 1] and thickness < OPAQUE:
+    while end < first[i + 1] and thickness < MAX_OPTICAL_DEPTH:
         thickness = thickness + step_thickness(density[end], step)
         end = end + 1
     last = wp.exp(-thickness)

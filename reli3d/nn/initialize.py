@@ -13,7 +13,7 @@ from reli3d.nn.transformer import TwoStreamTransformer
 from reli3d.nn.upsample import PixelShuffleUpsampler
 
 STD = 0.02  # truncated normal of transformer weights
-OUTSIDE = 2.0  # raw density below the surface's at the start: every point outside, probability about 0.12
+START_DENSITY_OFFSET = 2.0  # raw density below the surface's at the start: every point outside, probability about 0.12
 
 
 def initialize(model: nn.Module) -> None:
@@ -44,7 +44,7 @@ def initialize(model: nn.Module) -> None:
         elif isinstance(module, TwoStreamTransformer):
             nn.init.trunc_normal_(module.latent_init, std=STD)
         elif isinstance(module, Heads):
-            _initialize_heads(module, model.surface_density - OUTSIDE)
+            _initialize_heads(module, model.surface_density - START_DENSITY_OFFSET)
         elif isinstance(module, WeightMerger):
             _normal(module.mlp, 0.05)
         elif isinstance(module, PixelShuffleUpsampler):

@@ -25,7 +25,7 @@ from reli3d.render.shading import ShadeOptions
 from reli3d.views.choose import choose_views
 from reli3d.views.views import Views
 
-TILE = 256  # pixels
+TILE_PIXELS = 256  # pixels
 COLUMNS = 4
 TITLE = 14  # pixels of a line of text
 SUBPIXELS = 2  # a side of a pixel
@@ -63,7 +63,7 @@ def preview(asset: Asset, views: Views, scene: RayScene | None = None) -> Callab
     begun = [submit(partial(tiles, camera, k == 0), mesh.vertices.device) for k, camera in enumerate(cameras)]
 
     def sheet() -> np.ndarray:
-        taken = views.select(choose_views(views.c2w, COLUMNS)).resampled(TILE, crop=True)
+        taken = views.select(choose_views(views.c2w, COLUMNS)).resampled(TILE_PIXELS, crop=True)
         inputs = [_image(_on_background(i, m)) for i, m in zip(taken.images, taken.masks, strict=True)]
         light = _image(_map(asset.light))
         found = [result() for result in begun]
@@ -74,7 +74,7 @@ def preview(asset: Asset, views: Views, scene: RayScene | None = None) -> Callab
             ("base color, roughness, metallic, normal", found[0][2:]),
             ("estimated environment, scaled to a mean of 0.25", [light]),
         ]
-        return _sheet(rows, COLUMNS, last=TILE // 2)
+        return _sheet(rows, COLUMNS, last=TILE_PIXELS // 2)
 
     return sheet
 
@@ -82,7 +82,7 @@ def preview(asset: Asset, views: Views, scene: RayScene | None = None) -> Callab
 def comparison(before: Asset, after: Asset, views: Views) -> np.ndarray:
     """Contact sheet ``(H, W, 3)`` uint8 of three views: input images, ``before``, ``after``, in their own lighting."""
     count = min(len(views), 3)
-    batch = views.select([k * len(views) // count for k in range(count)]).resampled(TILE, crop=True)
+    batch = views.select([k * len(views) // count for k in range(count)]).resampled(TILE_PIXELS, crop=True)
     rows = [("input", [_image(_on_background(i, m)) for i, m in zip(batch.images, batch.masks, strict=True)])]
     for title, asset in (("before", before), ("after refinement", after)):
         scene = RayScene(asset.mesh.vertices, asset.mesh.faces)
@@ -122,20 +122,20 @@ def _denoised(*renderings: Render) -> list[Tensor]:
     return [mean * albedo for mean in means.split(3, -1)]
 
 
-def _sheet(rows: list[tuple[str, list[Image.Image]]], columns: int, *, last: int = TILE) -> np.ndarray:
+def _sheet(rows: list[tuple[str, list[Image.Image]]], columns: int, *, last: int = TILE_PIXELS) -> np.ndarray:
     """Rows of tiles under their titles, ``(H, W, 3)`` uint8; last: height of the last row's tiles."""
-    height = TITLE + TILE
-    sheet = Image.new("RGB", (columns * TILE, len(rows) * height - TILE + last), "white")
+    height = TITLE + TILE_PIXELS
+    sheet = Image.new("RGB", (columns * TILE_PIXELS, len(rows) * height - TILE_PIXELS + last), "white")
     draw = ImageDraw.Draw(sheet)
     for r, (title, tiles) in enumerate(rows):
         draw.text((3, r * height + 1), title, fill="black")
         for c, tile in enumerate(tiles):
-            sheet.paste(tile, (c * TILE, r * height + TITLE))
+            sheet.paste(tile, (c * TILE_PIXELS, r * height + TITLE))
     return np.asarray(sheet)
 
 
 def unseen_cameras(mesh: Mesh, c2w: Tensor) -> list[Camera]:
-    """Selects ``COLUMNS`` cameras of ``TILE`` pixels around ``mesh``, each farthest in direction from the
+    """Selects ``COLUMNS`` cameras of ``TILE_PIXELS`` pixels around ``mesh``, each farthest in direction from the
     cameras ``c2w`` and the selected ones; ordered by azimuth.
 
     Their elevations above the horizon are ``ELEVATIONS`` (+Y is up), and the whole mesh is in view.
@@ -156,7 +156,7 @@ def unseen_cameras(mesh: Mesh, c2w: Tensor) -> list[Camera]:
         nearest = torch.maximum(nearest, offered @ offered[chosen[-1]])
     eyes = center + offered[sorted(chosen, key=lambda k: k % AZIMUTHS)] * (radius / math.sin(FOV / 2))
     up = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float32, device="cpu").to(center)
-    return [Camera.from_fov(look_at(eye, center, up), FOV, TILE, TILE) for eye in eyes]
+    return [Camera.from_fov(look_at(eye, center, up), FOV, TILE_PIXELS, TILE_PIXELS) for eye in eyes]
 
 
 def _lit(radiance: Tensor, alpha: Tensor) -> Tensor:
@@ -180,7 +180,7 @@ def _map(light: Environment) -> Tensor:
     radiance = light.radiance
     exposed = (radiance * (ENVIRONMENT_MEAN / radiance.mean().clamp(min=1e-6))).clamp(0, 1)
     shown = linear_to_srgb(exposed).permute(2, 0, 1)[None]
-    return interpolate(shown, (TILE // 2, TILE), mode="bilinear", align_corners=False)[0].permute(1, 2, 0)
+    return interpolate(shown, (TILE_PIXELS // 2, TILE_PIXELS), mode="bilinear", align_corners=False)[0].permute(1, 2, 0)
 
 
 def _image(pixels: Tensor) -> Image.Image:

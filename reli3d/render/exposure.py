@@ -24,9 +24,9 @@ from reli3d.render.shading import ShadeOptions, shade
 
 STEP = 16  # pixel stride: about a thousand pixels in four images of 512 pixels per side
 SAMPLES = (8, 8, 2)  # per pixel; the noise of the mean over several hundred pixels is below a percent
-WHITE = 0.97  # linear; brighter pixels may be clipped
+MIN_CLIPPED_LINEAR = 0.97  # linear; brighter pixels may be clipped
 BLACK = 1e-3  # added to both means: without a visible pixel the ratio is 1
-TINT = 1.5  # largest change of the color of the lighting, as a factor of a channel
+MAX_TINT = 1.5  # largest change of the color of the lighting, as a factor of a channel
 
 # Prior mean and standard deviation of the logarithms of mean linear base color and of the lighting (observed color over
 # base color); last the standard deviation of a prediction.  Chosen on 20 meshes, original and darkened.
@@ -64,7 +64,7 @@ def photograph_ratio(asset: Asset, images: Tensor, inside: Tensor, camera: Camer
     shown = shade(at, -directions, asset.light, scene=scene, options=ShadeOptions(samples=SAMPLES))
     count = max(1, len(shown))
     photograph, rendered = seen.sum(0) / count + BLACK, shown.sum(0) / count + BLACK
-    tint = (photograph / rendered * (rendered.sum() / photograph.sum())).clamp(1.0 / TINT, TINT)
+    tint = (photograph / rendered * (rendered.sum() / photograph.sum())).clamp(1.0 / MAX_TINT, MAX_TINT)
     return tint * (photograph.sum() / (rendered * tint).sum())
 
 
@@ -100,5 +100,5 @@ def _seen(
     corner = camera.intrinsics.new_tensor([0.0, 0.0, 0.5, 0.5])  # centers of coarse pixels on those read
     coarse = Camera(camera.c2w, (camera.intrinsics - corner) / STEP, seen.shape[2], seen.shape[1])
     hits, _, directions = primary_hits(scene, coarse)
-    both = inside & (hits.face >= 0) & (seen.amax(-1) < WHITE)
+    both = inside & (hits.face >= 0) & (seen.amax(-1) < MIN_CLIPPED_LINEAR)
     return seen[both], surface_points(asset.mesh, asset.textures, hits.face[both], hits.bary[both]), directions[both]

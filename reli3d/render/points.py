@@ -12,8 +12,8 @@ from torch import Tensor
 
 from reli3d._bridge import check, tensor_of
 
-UNIT = 1e-4  # of a length from 1: float32 interpolation and rotation err by 1e-6
-NUMBERS = ("base_color", "roughness", "metallic")  # may be a plain number: gray, or the same everywhere
+UNIT_TOLERANCE = 1e-4  # of a length from 1: float32 interpolation and rotation err by 1e-6
+SCALAR_VALUES = ("base_color", "roughness", "metallic")  # may be a plain number: gray, or the same everywhere
 
 
 @dataclass(frozen=True)
@@ -91,12 +91,12 @@ def check_values(points: SurfacePoints, wo: Tensor) -> None:
     """Raise ValueError for directions that are not unit, materials outside [0, 1] and values that are not finite."""
     given = {f.name: getattr(points, f.name).detach() for f in fields(points)} | {"wo": wo.detach()}
     for name, value in given.items():
-        if name in NUMBERS:
+        if name in SCALAR_VALUES:
             bad, expected = ~((value >= 0.0) & (value <= 1.0)), "values in [0, 1]"
         elif name == "position":
             bad, expected = ~torch.isfinite(value), "finite values"
         else:
-            bad, expected = ~((value.norm(dim=1) - 1.0).abs() <= UNIT), "unit vectors"
+            bad, expected = ~((value.norm(dim=1) - 1.0).abs() <= UNIT_TOLERANCE), "unit vectors"
         rows = bad.reshape(len(value), -1).any(1).nonzero()
         if len(rows):
             raise ValueError(f"{name}: expected {expected}, got {value[rows[0, 0]].tolist()} in row {int(rows[0, 0])}")
@@ -105,11 +105,11 @@ def check_values(points: SurfacePoints, wo: Tensor) -> None:
 def of_rows(name: str, value: Tensor | float, position: Tensor, last: int) -> Tensor:
     """``value`` as ``(N, last)``, or ``(N,)`` for ``last`` 0, for the N rows of ``position``; one row is repeated."""
     shape = (len(position), last) if last else (len(position),)
-    if isinstance(value, Real) and name in NUMBERS:
+    if isinstance(value, Real) and name in SCALAR_VALUES:
         return position.new_tensor(float(value)).expand(shape)
     rows: Tensor = tensor_of(value)
     check(name, rows, like=position)
-    if name in NUMBERS and rows.numel() == 1:
+    if name in SCALAR_VALUES and rows.numel() == 1:
         return rows.reshape(()).expand(shape)
     check(name, rows, last=last or None)
     if rows.shape == shape:

@@ -26,7 +26,7 @@ from reli3d.geometry.rays import RayScene
 from reli3d.geometry.topology import edges_of
 from reli3d.kernels import silhouette as kernels
 
-OUTSIDE = 0.01  # pixels from the edge to the visibility ray, so that it does not graze the edge's own faces
+RAY_OFFSET_PIXELS = 0.01  # pixels from the edge to the visibility ray, so that it does not graze the edge's own faces
 IN_FRONT = 1e-3  # fraction of the distance by which an occluder must be nearer; above float32 rounding at folds
 
 
@@ -101,7 +101,7 @@ def outline_crossings(vertices: Tensor, edges: Tensor, camera: Camera, scene: Ra
     place = (across - inner_at - 0.5) * outward
     keep = (low >= 0.0) & (low < size - 1)
     depth = 1.0 / ((1.0 - part) / za + part / zb)
-    offset = torch.stack([center, across + OUTSIDE * outward], 1).detach()
+    offset = torch.stack([center, across + RAY_OFFSET_PIXELS * outward], 1).detach()
     keep &= _seen(torch.where(steep[:, None], offset.flip(1), offset), depth.detach(), camera, scene)
     stride = torch.where(steep, 1, camera.width)
     inner = torch.where(steep, line * camera.width + inner_at.long(), inner_at.long() * camera.width + line)

@@ -19,7 +19,7 @@ from reli3d.render.gbuffer import surface_points
 from reli3d.render.points import SurfacePoints
 
 SKY_DIRECTIONS = 48  # tested rays to the outside: they find an opening of a tenth of the sphere
-STRETCH = 0.18  # standard deviation of the logarithm of the scale along each axis
+STRETCH_SIGMA = 0.18  # standard deviation of the logarithm of the scale along each axis
 GAIN = 0.2  # standard deviation of the logarithm of the factor of the base color
 
 
@@ -54,7 +54,7 @@ class ScannedSurface:
     def __init__(self, path: Path, rng: np.random.Generator | None):
         self.assets = _read(path)
         points = torch.cat([a.mesh.vertices for a in self.assets])
-        stretch = torch.ones(3) if rng is None else _factors(rng.normal(0, STRETCH, 3))
+        stretch = torch.ones(3) if rng is None else _factors(rng.normal(0, STRETCH_SIGMA, 3))
         low, high = (points * stretch).amin(0), (points * stretch).amax(0)
         size = float((high - low).max())
         self.gain = torch.ones(3) if rng is None else _factors(rng.normal(0, GAIN, 3) + rng.normal(0, GAIN))

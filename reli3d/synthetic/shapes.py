@@ -19,7 +19,7 @@ from reli3d.synthetic.samples import ObjectSurface
 from reli3d.synthetic.scanned import outside_distance
 
 ROLES = ("any", "any", "any", "wood", "metal", "plastic", "paint", "fabric", "leather", "ceramic", "stone", "accent")
-STRETCH = 0.22  # standard deviation of the logarithm of the scale along each axis
+STRETCH_SIGMA = 0.22  # standard deviation of the logarithm of the scale along each axis
 COMBINED_PROBABILITY = 0.3  # of combining two or three shapes
 ROUNDED_PROBABILITY = 0.65  # of subdividing and smoothing a coarse shape
 COARSE_FACES = 3000  # meshes with more faces are scans and not smoothed
@@ -68,7 +68,7 @@ def combine(paths: Sequence[Path], rng: np.random.Generator) -> ProceduralObject
         v, f, p = _read(path)
         if len(f) < COARSE_FACES and rng.random() < ROUNDED_PROBABILITY:
             v, f, p = rounded(v, f, p, int(rng.integers(1, 3)), float(rng.uniform(0.2, 1.0)))
-        v = v * np.exp(rng.normal(0, STRETCH, 3))
+        v = v * np.exp(rng.normal(0, STRETCH_SIGMA, 3))
         yaw = rng.uniform(0, 2 * np.pi) if rng.random() < 0.5 else np.pi / 2 * rng.integers(4)
         turn = _yaw(yaw)
         if rng.random() < 0.12:

@@ -20,7 +20,7 @@ from reli3d.synthetic.samples import DIFFUSE_MODEL, EXPOSURE_TARGET
 SAMPLES = (12, 5, 5)  # light, GGX and cosine samples per pixel: the remaining noise is that of a photograph
 LAMP_PROBABILITY = 0.6  # of lamps added to an environment
 SATURATES = 4.0  # a pixel's radiance, as in reli3d.synthetic.samples
-TINT = 0.1  # standard deviation of the logarithm of the color of the lighting
+TINT_SIGMA = 0.1  # standard deviation of the logarithm of the color of the lighting
 EXPOSURE = 0.35  # standard deviation of the logarithm of the exposure
 METAL_PROBABILITY, NONMETAL_PROBABILITY = 0.08, 0.05  # of metallic set to 1, and to 0, everywhere
 
@@ -59,7 +59,7 @@ def draw_light(lights: Tensor, rng: np.random.Generator) -> Tensor:
     light = torch.roll(light, int(rng.integers(light.shape[1])), 1)
     if rng.random() < 0.5:
         light = light.flip(1)
-    light = light * torch.as_tensor(np.exp(rng.normal(0, TINT, 3)), dtype=torch.float32)
+    light = light * torch.as_tensor(np.exp(rng.normal(0, TINT_SIGMA, 3)), dtype=torch.float32)
     return with_lamps(light, rng) if rng.random() < LAMP_PROBABILITY else light
 
 

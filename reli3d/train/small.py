@@ -25,7 +25,7 @@ from reli3d.train.stage import Stage
 # Last layers start near zero and Adam's step is about the learning rate, so they train at a multiple of it
 LAST_LAYERS = (*(f"pyramid.says.{k}.1." for k in range(SMALL.pyramid.reading)), "color.4.", "surface.4.", "light.out.")
 LAST_RATE = 10.0
-SHOWN = 3  # validation objects in the image, reconstructed from one and from four views
+VALIDATION_OBJECTS = 3  # validation objects in the image, reconstructed from one and from four views
 LIST_EVERY = 50  # steps after which the folders are listed again: samples may be added during training
 
 
@@ -58,7 +58,7 @@ class SmallStage(Stage):
         self.model, self.folders, self.seed = model, tuple(folders), seed
         self.max_views, self.points, self.pyramid_rate = max_views, points, pyramid_rate
         self.lights = training_maps(maps) if maps else None
-        self.held_out = sorted(validation.glob("*.safetensors"))[:SHOWN] if validation else []
+        self.held_out = sorted(validation.glob("*.safetensors"))[:VALIDATION_OBJECTS] if validation else []
         self._files: list[Path] = []
         self._numbers = {
             "folders": [str(f) for f in folders],

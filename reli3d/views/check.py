@@ -20,7 +20,7 @@ from reli3d._bridge import full_precision
 from reli3d.errors import printable
 from reli3d.geometry.camera import project
 from reli3d.io.images import write_png
-from reli3d.views.normalize import AT_EYE, RADIUS, Hull, center_rays, meeting_point, normalize, visual_hull
+from reli3d.views.normalize import EYE_RESOLUTION, RADIUS, Hull, center_rays, meeting_point, normalize, visual_hull
 from reli3d.views.views import Views
 
 MIN_FILLED = 0.8  # fraction of every mask that the hull of right cameras fills; masks a few pixels off still reach 0.9
@@ -189,7 +189,7 @@ def _verdict(views: Views, hull: Hull, filled: list[float]) -> str:
                 "it; check its camera and mask, or leave it out"
             )
     eyes = views.c2w[:, :3, 3].double()
-    if float((eyes - eyes[0]).norm(dim=-1).max()) <= AT_EYE * float(eyes.norm(dim=-1).max()):
+    if float((eyes - eyes[0]).norm(dim=-1).max()) <= EYE_RESOLUTION * float(eyes.norm(dim=-1).max()):
         return (
             "suspect: all cameras stand in one point: the views show one side of the object, and no depth; give the "
             "positions of the cameras, or one view"

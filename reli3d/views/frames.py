@@ -13,7 +13,7 @@ from reli3d.errors import InputError, shown
 
 MAX_PATH = 1024
 ORTHONORMAL = 1e-3  # largest entry of R^T R - 1: four digits in a text file; beyond it is a shear or a scale
-MAX_DISTANCE = 1e6  # float32 poses keep a tenth of a unit there
+MAX_POSE_DISTANCE = 1e6  # float32 poses keep a tenth of a unit there
 MAX_DISTORTION_PIXELS = 1.0  # displacement of a pixel up to which a lens is used as a pinhole
 RADII = 32  # of an image's diagonal at which distortion is evaluated
 
@@ -100,10 +100,10 @@ def nearest_rigid(where: str, field: str, matrix: np.ndarray) -> np.ndarray:
             f"{field}: expected a rotation, got axes that are not at right angles or not of length "
             "1; export rotation and translation only",
         )
-    if np.abs(matrix[:3, 3]).max() > MAX_DISTANCE:
+    if np.abs(matrix[:3, 3]).max() > MAX_POSE_DISTANCE:
         raise InputError(
             where,
-            f"{field}: expected a position within {MAX_DISTANCE:g} of the origin, got "
+            f"{field}: expected a position within {MAX_POSE_DISTANCE:g} of the origin, got "
             f"{shown(matrix[:3, 3].tolist())}; shift or scale the cameras",
         )
     u, _, vt = np.linalg.svd(block)

@@ -14,11 +14,11 @@ from reli3d.views.file_names import ENDINGS, FolderIndex, images_below, named
 from reli3d.views.frames import Frame
 
 FOLDERS = ("masks", "mask")
-OPAQUE = 250 / 255  # from here on a value counts as white: networks and JPEG rarely reach 1
+MIN_OPAQUE = 250 / 255  # from here on a value counts as white: networks and JPEG rarely reach 1
 FEW_VALUES = 16  # up to which a mask has no noise of a codec, so that every value counts
-NOISE = 16 / 255  # of values near black and white where there are more
-PLATEAU = 0.2  # fraction of the pixels between black and white in flat 3x3 blocks, above which these are labels
-SOLID = 0.3  # fraction of the object at the highest value, from which that value is its opaque part
+NOISE_MARGIN = 16 / 255  # of values near black and white where there are more
+MAX_FLAT_FRACTION = 0.2  # of the pixels between black and white, in flat 3x3 blocks; above it these are labels
+MIN_PEAK_FRACTION = 0.3  # fraction of the object at the highest value, from which that value is its opaque part
 GRAY_SPREAD = 16  # of 255: difference of channels up to which a pixel is gray; JPEG's chroma
 MAX_COLORS = 4096
 LABEL = "masks: the object has "
@@ -69,7 +69,7 @@ def _gray_values(channel: Image.Image) -> list[int]:
 
 def _nonzero(channel: Image.Image, value: int, notes: list[str]) -> Image.Image:
     """``channel``, of which ``value`` is the only value above 0, as 0 and 255."""
-    if value >= OPAQUE * _TOP[channel.mode]:
+    if value >= MIN_OPAQUE * _TOP[channel.mode]:
         return channel
     return _labeled(channel, f"the value {value}", notes)
 
@@ -90,17 +90,17 @@ def check_one_label(folder: os.PathLike, notes: Sequence[str]) -> None:
 
 def _coverage(path: os.PathLike, channel: Image.Image, notes: list[str]) -> Image.Image:
     grays, top = _gray_values(channel), _TOP[channel.mode]
-    if len(grays) == 1 and 0 < grays[0] < OPAQUE * top or len(grays) == 2 and grays[0] > 0:
+    if len(grays) == 1 and 0 < grays[0] < MIN_OPAQUE * top or len(grays) == 2 and grays[0] > 0:
         raise _not_a_mask(path, f"the values {', '.join(map(str, grays))} without 0")
     if len(grays) == 2:
         return _nonzero(channel, grays[1], notes)
     if len(grays) == 1:
         return channel
     values, peak, few = np.asarray(channel), grays[-1], len(grays) <= FEW_VALUES
-    high = min(peak, OPAQUE * top) if few else (1 - NOISE) * min(peak, top)
-    between = (values > (0 if few else NOISE * top)) & (values < high)
+    high = min(peak, MIN_OPAQUE * top) if few else (1 - NOISE_MARGIN) * min(peak, top)
+    between = (values > (0 if few else NOISE_MARGIN * top)) & (values < high)
     flat = _flat(values)
-    if int((between[1:-1, 1:-1] & flat).sum()) > PLATEAU * int(between.sum()):
+    if int((between[1:-1, 1:-1] & flat).sum()) > MAX_FLAT_FRACTION * int(between.sum()):
         some = ", ".join(map(str, grays[:8])) + (", ..." if len(grays) > 8 else "")
         raise _not_a_mask(path, f"{len(grays)} values in flat areas ({some}), as of several labels")
     return _scaled(channel, grays, notes)
@@ -111,11 +111,11 @@ def _scaled(channel: Image.Image, grays: list[int], notes: list[str]) -> Image.I
     most of its values lie near it, as those of a codec about a label do.
     """
     peak, top = grays[-1], _TOP[channel.mode]
-    if not 0 < peak < OPAQUE * top:
+    if not 0 < peak < MIN_OPAQUE * top:
         return channel
     values = np.asarray(channel)
     upper, between = (int((values > part * peak).sum()) for part in (0.75, 0.25))
-    if int(((values == peak)[1:-1, 1:-1] & _flat(values)).sum()) > SOLID * int((values > 0).sum()):
+    if int(((values == peak)[1:-1, 1:-1] & _flat(values)).sum()) > MIN_PEAK_FRACTION * int((values > 0).sum()):
         white, which = peak, f"the highest value, {peak}, is"
     elif between - upper < 0.5 * upper:
         white = int(np.median(values[values > 0.5 * peak]))

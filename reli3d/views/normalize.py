@@ -15,18 +15,18 @@ from reli3d.views.similarity import Similarity
 from reli3d.views.views import LEAST_WHOLE, Views, mask_box, touches_border
 
 RADIUS = 0.87  # half side of the network's cube
-SLACK = 1.1  # a hull of few views exceeds its object by about a tenth, so it may exceed the cube by as much
+HULL_SLACK = 1.1  # a hull of few views exceeds its object by about a tenth, so it may exceed the cube by as much
 LONGEST = 0.55  # longest side from which an object in the cube needs no rescaling; in training it is 1
 OFF_CENTER = 0.3  # as far as the hull's center of such an object may lie from the origin
 GRIDS = (24, 44)  # cells a side, coarse and refined: the last is 2 to 3 % of the object
 BALL = 1.3  # diameter of the ball that limits the hull, in mask widths: a generic view shows 0.8 of the longest side
 ONE_SIDED = math.radians(90.0)  # between eyes: beyond it the views bound each other's depth
-PARALLEL = 0.01  # mean squared sine between the axes (6 degrees) below which depth is guessed, not triangulated
-FAR = 10.0  # distances to the object from which the origin is moved to it: float32 then loses a digit of each position
-SMALLEST = 1e-6  # distance to the object below which squares of areas of a mesh's faces leave float32
-WRITTEN = 1e-6  # of a position: matrices are often written with seven digits
-ONE_POINT = 1e-12  # of the eyes' distance from the origin: nearer together, they differ by float64's rounding alone
-AT_EYE = 1e-6  # of an eye's distance from the origin: float32 does not resolve a smaller distance to the eye
+PARALLEL_AXES_SINE2 = 0.01  # mean squared sine between axes (6 degrees) below which depth is not triangulated
+FAR_DISTANCES = 10.0  # to the object, from which the origin is moved to it: float32 would lose a digit of positions
+MIN_OBJECT_DISTANCE = 1e-6  # distance to the object below which squares of areas of a mesh's faces leave float32
+POSITION_PRECISION = 1e-6  # of a position: matrices are often written with seven digits
+COINCIDENT_EYES = 1e-12  # of the eyes' distance from the origin: nearer ones differ by float64's rounding alone
+EYE_RESOLUTION = 1e-6  # of an eye's distance from the origin: float32 does not resolve a smaller distance to the eye
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ def normalize(views: Views, mode: str = "auto") -> Similarity:
         return Similarity(1.0 / longest, torch.eye(3, dtype=torch.float64, device="cpu"), -(low + high) / (2 * longest))
     hull = visual_hull(views)
     low, high = hull.box()
-    inside = float(torch.maximum(-low, high).max()) <= SLACK * RADIUS
+    inside = float(torch.maximum(-low, high).max()) <= HULL_SLACK * RADIUS
     basis = _one_sided_basis(views, hull)
     points = hull.points @ basis
     low, high = points.amin(0), points.amax(0)
@@ -90,7 +90,7 @@ def _one_sided_basis(views: Views, hull: Hull) -> Tensor:
     away = torch.nn.functional.normalize(c2w[:, :3, 3] - hull.aim, dim=-1)
     axis = torch.nn.functional.normalize(away.mean(0), dim=-1)
     across = torch.linalg.cross(c2w[0, :3, 1], axis)
-    parallel = meeting_point(c2w[:, :3, 3], -away)[1] < PARALLEL
+    parallel = meeting_point(c2w[:, :3, 3], -away)[1] < PARALLEL_AXES_SINE2
     if parallel or float((away @ away.T).min()) < math.cos(ONE_SIDED) or float(across.norm()) < 1e-3:
         return torch.eye(3, dtype=torch.float64, device="cpu")
     right = torch.nn.functional.normalize(across, dim=-1)
@@ -114,12 +114,12 @@ def visual_hull(views: Views) -> Hull:
     origins, rays = c2w[:, :3, 3], center_rays(masks, c2w, intrinsics)
     aim, spread = meeting_point(origins, rays)
     depth = ((aim - origins)[:, None] @ -c2w[:, :3, 2:3])[:, 0, 0]  # along the viewing axes
-    if not bool((depth > AT_EYE * origins.norm(dim=-1).max()).all()):
+    if not bool((depth > EYE_RESOLUTION * origins.norm(dim=-1).max()).all()):
         return Hull(origins.new_zeros(0, 3), 0.0, aim, 0.0)
     boxes = torch.tensor([mask_box(m) for m in masks], dtype=torch.float64, device="cpu")
     sides = (boxes[:, 2:] - boxes[:, :2]) / intrinsics[:, :2] * depth[:, None]
     extent = float(sides.max())
-    ball = 0.5 * extent * (BALL if spread >= PARALLEL else 1.0)  # views from one side: as deep as wide
+    ball = 0.5 * extent * (BALL if spread >= PARALLEL_AXES_SINE2 else 1.0)  # views from one side: as deep as wide
     low, high = aim - ball, aim + ball
     for grid in GRIDS:
         cell = float((high - low).max()) / grid
@@ -150,13 +150,13 @@ def center_rays(masks: list[Tensor], c2w: Tensor, intrinsics: Tensor) -> Tensor:
 def meeting_point(origins: Tensor, rays: Tensor) -> tuple[Tensor, float]:
     """The point ``(3,)`` nearest to all rays, and how well they fix it: the smallest mean squared sine, 0 if parallel.
 
-    Below PARALLEL it is, along the mean ray, the point nearest to the world origin, or at unit distance if that lies
+    Below PARALLEL_AXES_SINE2 it is the point of the mean ray nearest to the origin, or at unit distance if that lies
     behind a camera.
     """
     across = torch.eye(3, dtype=rays.dtype, device=rays.device) - rays[:, :, None] * rays[:, None]
     system = across.mean(0)
     spread = float(torch.linalg.eigvalsh(system)[0])
-    if spread >= PARALLEL:
+    if spread >= PARALLEL_AXES_SINE2:
         return torch.linalg.solve(system, (across @ origins[..., None]).mean(0)[:, 0]), spread
     eye, ray = origins.mean(0), torch.nn.functional.normalize(rays.mean(0), dim=-1)
     distance = float(-(eye @ ray))
@@ -165,22 +165,23 @@ def meeting_point(origins: Tensor, rays: Tensor) -> tuple[Tensor, float]:
 
 def near_origin(c2w: Tensor) -> Tensor:
     """The point ``(3,)`` float64 that shall be the origin of cameras ``c2w (V, 4, 4)`` float64: where they look, if
-    the origin of their frame is more than FAR times as far from there as they are; else zero.
+    the origin of their frame is more than FAR_DISTANCES times as far from there as they are; else zero.
 
-    Raises InputError where they are nearer to it than SMALLEST, unless all stand in one point, as the eyes of a rig
-    about the origin do where its matrices are world-to-camera.
+    Raises InputError where they are nearer to it than MIN_OBJECT_DISTANCE, unless all are one point, as the eyes of a
+    rig about the origin are if its matrices are world-to-camera.
     """
     eyes = c2w[:, :3, 3]
-    if len(eyes) > 1 and float((eyes - eyes[0]).abs().max()) <= ONE_POINT * float(eyes.abs().max()):
+    if len(eyes) > 1 and float((eyes - eyes[0]).abs().max()) <= COINCIDENT_EYES * float(eyes.abs().max()):
         return torch.zeros_like(eyes[0])
     aim = meeting_point(eyes, -c2w[:, :3, 2])[0]
     reach = float((eyes - aim).norm(dim=-1).median())
-    if reach < SMALLEST and float((eyes - aim).abs().max()) > WRITTEN * float(eyes.abs().max()):
+    if reach < MIN_OBJECT_DISTANCE and float((eyes - aim).abs().max()) > POSITION_PRECISION * float(eyes.abs().max()):
         raise InputError(
             "cameras",
-            f"expected a distance of {SMALLEST:g} or more to the object, got {reach:.3g}; scale the positions up",
+            f"expected a distance of {MIN_OBJECT_DISTANCE:g} or more to the object, got {reach:.3g}; scale poses up",
         )
-    return aim if float(aim.norm()) > FAR * reach and reach >= SMALLEST else torch.zeros_like(aim)
+    far = float(aim.norm()) > FAR_DISTANCES * reach and reach >= MIN_OBJECT_DISTANCE
+    return aim if far else torch.zeros_like(aim)
 
 
 def _covered(points: Tensor, mask: Tensor, pose: Tensor, camera: Tensor, cell: float) -> Tensor:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from reli3d.geometry.triplane import CACHED, sample_triplane
+from reli3d.geometry.triplane import CACHED_FLOATS, sample_triplane
 from tests.support.reference import fraction_within, grid_samples
 
 
@@ -69,7 +69,7 @@ def test_half_storage_is_summed_in_float32(device, dtype):
 
 def test_coherent_points_in_order_and_shuffled_ones_by_row_are_bitwise_equal():
     planes, _, _ = inputs(1, 8, 100, 100)
-    assert planes[0, 0].numel() > CACHED
+    assert planes[0, 0].numel() > CACHED_FLOATS
     t = torch.linspace(0, 300, 6000)
     walk = torch.stack([0.9 * (0.11 * t).sin(), t / 160 - 0.9, 0.9 * (0.13 * t).cos()], -1)[None]
     shuffled = torch.randperm(6000, generator=torch.Generator().manual_seed(0))
@@ -82,7 +82,7 @@ def test_channel_first_planes_read_by_rows_are_bitwise_equal(channels, height, w
     planes, points, weights = inputs(2, channels, height, width, 3000)
     points[1, :, 1] = points[1, :, 1].abs() * 0.3 + 0.4
     points[0, 5] = float("nan")
-    assert planes[0, 0].numel() > CACHED
+    assert planes[0, 0].numel() > CACHED_FLOATS
     channel_last = planes.movedim(2, -1).contiguous().movedim(-1, 2)
     p, q = planes.requires_grad_(), channel_last.requires_grad_()
     got, expected = sample_triplane(p, points), sample_triplane(q, points)

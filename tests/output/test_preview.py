@@ -38,7 +38,7 @@ def test_unseen_views_are_far_from_those_taken_and_show_all(asset, azimuths, lea
     assert float((to @ to.T - 2 * torch.eye(4)).max()) < math.cos(math.radians(29.0))  # and from each other
     for camera in unseen:
         pixels, depth = project(asset.mesh.vertices, camera.c2w, camera.intrinsics)
-        assert bool((pixels > 0).all() and (pixels < preview.TILE).all() and (depth > 0).all())
+        assert bool((pixels > 0).all() and (pixels < preview.TILE_PIXELS).all() and (depth > 0).all())
 
 
 def test_the_sheet_holds_the_inputs_unseen_views_maps_and_a_small_light(asset):
@@ -47,7 +47,7 @@ def test_the_sheet_holds_the_inputs_unseen_views_maps_and_a_small_light(asset):
     intrinsics = torch.tensor([[120.0, 120.0, 32.0, 32.0]] * 2)
     views = Views((blue,) * 2, (torch.ones(64, 64),) * 2, cameras, intrinsics, ("a", "b"))
     sheet = torch.from_numpy(preview.preview(asset, views)().copy())
-    tile, row = preview.TILE, preview.TILE + preview.TITLE
+    tile, row = preview.TILE_PIXELS, preview.TILE_PIXELS + preview.TITLE
     assert tile >= 256 and sheet.shape == (4 * row + preview.TITLE + tile // 2, 4 * tile, 3)
     middle = [[sheet[r * row + row // 2, c * tile + tile // 2].tolist() for c in range(4)] for r in range(4)]
     assert middle[0][:2] == [[0, 0, 255]] * 2 and middle[0][2] == [255] * 3  # two photographs, then nothing

@@ -9,7 +9,7 @@ from reli3d.render import exposure
 from reli3d.render.asset import Asset
 from reli3d.render.color import linear_to_srgb
 from reli3d.render.environment import Environment
-from reli3d.render.exposure import TINT, base_color_factor, estimate_base_color_and_light, photograph_ratio
+from reli3d.render.exposure import MAX_TINT, base_color_factor, estimate_base_color_and_light, photograph_ratio
 from tests.support.scenes import ball, textures
 
 SIZE = (160, 224)
@@ -91,8 +91,8 @@ def test_the_tint_of_photographs_goes_to_the_light(device, scene):
     # one percent from single scattering and the rim, as above
     torch.testing.assert_close(found, torch.tensor([0.9, 1.0, 1.1]), rtol=0.03, atol=0)
     strong = photograph_ratio(asset, photographs(device, 0.1, 0.4, 0.4), inside, camera, rays).cpu()
-    # the red of 0.25 over the mean of 0.75 is cut off at 1 / TINT, the others have 1 / 0.75; the brightness stays
-    assert float(strong[1] / strong[0]) == pytest.approx(TINT / 0.75, rel=0.03)
+    # the red of 0.25 over the mean of 0.75 is cut off at 1 / MAX_TINT, the others have 1 / 0.75; the brightness stays
+    assert float(strong[1] / strong[0]) == pytest.approx(MAX_TINT / 0.75, rel=0.03)
     assert float(strong.mean()) == pytest.approx(0.75, rel=0.03)
 
 

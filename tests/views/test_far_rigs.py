@@ -15,7 +15,7 @@ from reli3d.io.glb import glb_bytes, read_glb
 from reli3d.nn.weights import load_model
 from reli3d.pipeline import ReconstructOptions, reconstruct
 from reli3d.views.folder import load_views
-from reli3d.views.normalize import FAR, near_origin
+from reli3d.views.normalize import FAR_DISTANCES, near_origin
 from reli3d.views.similarity import Similarity
 from tests.support import hostile
 from tests.support.example import QUICK, moved_example
@@ -46,7 +46,12 @@ def test_the_origin_of_a_far_rig_is_where_it_looks(shift, scale):
 
 
 def test_a_rig_that_is_not_far_stays():
-    for shift, scale in (((0, 0, 0), 1.0), ((0.9 * FAR * 2.2, 0, 0), 1.0), ((300, -20, 5), 40.0), ((0, 0, 0), 4e5)):
+    for shift, scale in (
+        ((0, 0, 0), 1.0),
+        ((0.9 * FAR_DISTANCES * 2.2, 0, 0), 1.0),
+        ((300, -20, 5), 40.0),
+        ((0, 0, 0), 4e5),
+    ):
         assert not bool(near_origin(poses(shift, scale)).any())
 
 

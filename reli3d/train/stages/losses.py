@@ -16,7 +16,7 @@ from reli3d.errors import InputError
 from reli3d.train.stages.rendering import Rendering
 from reli3d.train.stages.views import ObjectViews
 
-WHITE = 0.99  # sRGB; above it an input image may be clipped, so a brighter rendering is no error
+MIN_CLIPPED_SRGB = 0.99  # sRGB; above it an input image may be clipped, so a brighter rendering is no error
 SCALES = 4  # of the multi-scale gradients: 1, 2, 4, 8 pixels
 MIN_OPACITY = 1e-4  # opacities are kept this far from 0 and 1: the cross-entropy of a wrong pixel is 9 at most
 
@@ -27,7 +27,7 @@ def compared_colors(rendering: Rendering, target: ObjectViews, view: int) -> tup
     """Rendering and target ``(H, W, 3)`` over black, display values, zero where the target is not valid."""
     observed = target.images[view] * target.masks[view][..., None]
     rendered = rendering.color
-    rendered = torch.where(target.images[view] > WHITE, torch.minimum(rendered, observed), rendered)
+    rendered = torch.where(target.images[view] > MIN_CLIPPED_SRGB, torch.minimum(rendered, observed), rendered)
     if target.valid is not None:
         rendered, observed = (x * target.valid[view][..., None] for x in (rendered, observed))
     return rendered, observed

@@ -20,8 +20,8 @@ from reli3d.train.stages.surface import surface
 from reli3d.train.stages.views import Draw, Source, draw
 
 CHECKED = 4  # objects whose surface is extracted at every checkpoint
-SHOWN = 3  # validation objects in the image
-TILE = 96  # pixels of a side of a tile of the image
+VALIDATION_OBJECTS = 3  # validation objects in the image
+TILE_PIXELS = 96  # pixels of a side of a tile of the image
 
 
 class PaperStage(Stage):
@@ -70,7 +70,9 @@ class PaperStage(Stage):
         }
         if checkpointing:
             checkpointed(model)
-        self.held_out = [self.drawn(0, k, [validation], patch=0) for k in range(SHOWN)] if validation else []
+        self.held_out = (
+            [self.drawn(0, k, [validation], patch=0) for k in range(VALIDATION_OBJECTS)] if validation else []
+        )
 
     def drawn(self, step: int, place: int, sources: Sequence[Source] | None = None, patch: int | None = None) -> Draw:
         """The object at position ``place`` of the batch of ``step``; a function of the seed, the step and ``place``."""
@@ -154,7 +156,7 @@ def averaged(model: Reconstructor, average: dict[str, Tensor]) -> Reconstructor:
 
 
 def _tile(values: np.ndarray) -> np.ndarray:
-    """``values`` resized to TILE by TILE pixels, nearest neighbor, uint8."""
-    at = (np.arange(TILE) * values.shape[0]) // TILE
-    across = (np.arange(TILE) * values.shape[1]) // TILE
+    """``values`` resized to TILE_PIXELS by TILE_PIXELS pixels, nearest neighbor, uint8."""
+    at = (np.arange(TILE_PIXELS) * values.shape[0]) // TILE_PIXELS
+    across = (np.arange(TILE_PIXELS) * values.shape[1]) // TILE_PIXELS
     return (values[at][:, across] * 255 + 0.5).astype(np.uint8)
