@@ -343,10 +343,15 @@ def _whole_views(source: Path, final: _Segmented, report: CaptureReport) -> list
         report.left_out[views[worst].photo.name] = "its mask does not agree with the others"
         views = [v for k, v in enumerate(views) if k != worst]
     if len(views) < FEWEST:
-        cut = sum("border" in reason for reason in report.left_out.values())
-        fix = "step back: the whole object must be in the image" if cut else "take sharper images, or give --masks"
+        fix = "take sharper images, or give --masks"
+        if any("border" in reason for reason in report.left_out.values()):
+            fix = "step back: the whole object must be in the image"
+        elif report.registered < LEAST_REGISTERED * report.images:
+            fix = "take sharp images of one object in small steps around it"
         raise InputError(
-            source, f"expected at least {FEWEST} views that show the whole object, got {len(views)}; {fix}"
+            source,
+            f"expected at least {FEWEST} views that show the whole object, got {len(views)} of {report.images} images "
+            f"({report.registered} registered); {fix}",
         )
     return views
 
@@ -430,7 +435,8 @@ def _check(report: CaptureReport) -> None:
         (report.object_points >= LEAST_POINTS, f"{report.object_points} points on the object, at least 200 expected"),
         (
             report.agreement >= LEAST_AGREEMENT,
-            f"the visual hull fills {100 * report.agreement:.0f} % of a mask, at least 85 % expected",
+            f"the visual hull fills {100 * report.agreement:.0f} % of a mask, at least 85 % expected: masks lack "
+            "a part of the object; give --masks or --mask-method rembg",
         ),
         (
             report.mask_fraction >= LEAST_MASK,

@@ -7,11 +7,9 @@ from __future__ import annotations
 
 import math
 import signal
-import sqlite3
 import tempfile
 import threading
-from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -124,27 +122,6 @@ def _pycolmap() -> ModuleType:
     return module
 
 
-@contextmanager
-def _counted(progress: Progress, database: Path, pairs: int) -> Iterator[None]:
-    """Reports the pairs of images that ``database`` has while the block runs: the matching has no callback."""
-    ended = threading.Event()
-
-    def watch() -> None:
-        while not ended.wait(0.5):
-            with suppress(sqlite3.Error), closing(sqlite3.connect(f"file:{database}?mode=ro", uri=True)) as file:
-                done = file.execute("SELECT COUNT(*) FROM two_view_geometries").fetchone()[0]
-                progress("matching", min(done, pairs), pairs)
-
-    progress("matching", 0, pairs)
-    thread = threading.Thread(target=watch, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        thread.join()
-
-
 def _mapped(photos, masks, work: Path, side: int, relaxed: bool, progress: Progress) -> Map | None:
     pycolmap = _pycolmap()
     pycolmap.set_random_seed(SEED)
@@ -180,15 +157,17 @@ def _mapped(photos, masks, work: Path, side: int, relaxed: bool, progress: Progr
                 database, images, group, camera_mode=mode, reader_options=reader, extraction_options=extraction
             )
             done += len(group)
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = SEED  # else that of a pair depends on the thread that it meets
+    progress("matching", 0, 1)
     if len(photos) <= EXHAUSTIVE:
-        with _counted(progress, database, len(photos) * (len(photos) - 1) // 2):
-            pycolmap.match_exhaustive(database)
+        pycolmap.match_exhaustive(database, verification_options=verification)
     else:
         pairing = pycolmap.SequentialPairingOptions()
         pairing.overlap, pairing.quadratic_overlap = 15, True  # offsets of 1 to 15, 16, 32, ...: these close loops
-        with _counted(progress, database, 17 * len(photos)):
-            pycolmap.match_sequential(database, pairing_options=pairing)
+        pycolmap.match_sequential(database, pairing_options=pairing, verification_options=verification)
     options = pycolmap.IncrementalPipelineOptions(min_model_size=3, random_seed=SEED, extract_colors=False)
+    options.num_threads = 1  # bundle adjustment on several threads rounds differently from run to run
     if relaxed:
         options.mapper.init_min_num_inliers = 50
         options.mapper.init_min_tri_angle = 8.0
