@@ -1,7 +1,7 @@
 """Builds the site into a folder, ``python .ci/site.py site``; needs the extra ``docs``.  A warning fails.
 
-The pages are those of ``docs`` and README, CONTRIBUTING and CHANGELOG.  A link stands in the repository as it must be
-there: one to a file of the root becomes its page, one to code, which is not on the site, becomes its text.  In
+The pages are those of ``docs`` and README, CONTRIBUTING and CHANGELOG.  Links are those of the
+repository: one to a file of the root becomes its page, one to code, which is not on the site, becomes its text.  In
 ``reference.md`` the line ``<!-- names -->`` becomes the documentation of each of ``reli3d.__all__``.
 """
 
@@ -22,7 +22,7 @@ CODE = re.compile(r"(^```.*?^```|`[^`\n]*`)", re.MULTILINE | re.DOTALL)
 
 
 def linked(text: str, source: str, page: str) -> str:
-    """``text`` of the file ``source`` of the repository with its links made those of ``page``, code apart."""
+    """``text`` of the file ``source`` of the repository with its links made those of ``page``, except in code."""
 
     def link(found: re.Match) -> str:
         mark, words, target, anchor = found.groups()

@@ -281,8 +281,10 @@ def test_primaries_of_a_radiance_image_are_converted(tmp_path):
 def test_primaries_of_zero_are_none(tmp_path):
     """Photoshop's header, as of Poly Haven's studio_small_03_1k.hdr."""
     header = b"#?RADIANCE\n# Made with Adobe Photoshop\nGAMMA=1\nPRIMARIES=0 0 0 0 0 0 0 0\nFORMAT=32-bit_rle_rgbe\n\n"
-    got, want = (round_trip(tmp_path / "a.hdr", "-Y 6 +X 12", QUADS.tobytes(), h) for h in (header, b"#?RADIANCE\n\n"))
-    np.testing.assert_array_equal(got, want)
+    got, expected = (
+        round_trip(tmp_path / "a.hdr", "-Y 6 +X 12", QUADS.tobytes(), h) for h in (header, b"#?RADIANCE\n\n")
+    )
+    np.testing.assert_array_equal(got, expected)
 
 
 def test_colors_outside_rec709_are_clamped_and_counted(tmp_path):
