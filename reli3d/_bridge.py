@@ -380,14 +380,28 @@ def expect(name: str, value: object, kind: type) -> None:
 
 
 def check(
-    name: str, value: object, *, last: int | None = None, like: Tensor | None = None, dtype: torch.dtype = torch.float32
+    name: str,
+    value: object,
+    *,
+    last: int | None = None,
+    shape: Sequence[int | str] | None = None,
+    like: Tensor | None = None,
+    dtype: torch.dtype = torch.float32,
 ) -> None:
-    """Raises TypeError or ValueError, ``name: expected X, got Y``, for a wrong type, dtype, last axis or device."""
+    """Raises TypeError or ValueError, ``name: expected X, got Y``, for a wrong type, dtype, shape or device.
+
+    last: length of the last axis.  shape: of all axes; a letter stands for any length.
+    """
     if not isinstance(value, Tensor):
         raise TypeError(f"{name}: expected a tensor, got {type(value).__name__}")
     if value.dtype != dtype:
         raise TypeError(f"{name}: expected {dtype}, got {value.dtype}")
     if last is not None and (value.ndim == 0 or value.shape[-1] != last):
         raise ValueError(f"{name}: expected shape (..., {last}), got {tuple(value.shape)}")
+    if shape is not None:
+        pairs = zip(value.shape, shape, strict=False)
+        if value.ndim != len(shape) or any(n != k for n, k in pairs if not isinstance(k, str)):
+            axes = ", ".join(map(str, shape)) + "," * (len(shape) == 1)
+            raise ValueError(f"{name}: expected shape ({axes}), got {tuple(value.shape)}")
     if like is not None and value.device != like.device:
         raise ValueError(f"{name}: expected device {like.device}, got {value.device}")

@@ -257,9 +257,7 @@ def nearest_valid(valid: Tensor) -> tuple[Tensor, Tensor]:
 
     Without a valid texel the index is -1, the distance inf.  Equal distances: the upper row, then the left column.
     """
-    check("valid", valid, dtype=torch.bool)
-    if valid.ndim != 2:
-        raise ValueError(f"valid: expected shape (H, W), got {tuple(valid.shape)}")
+    check("valid", valid, shape=("H", "W"), dtype=torch.bool)
     (h, w), device = valid.shape, valid.device
     row, site, source = (torch.empty(h, w, dtype=torch.int32, device=device) for _ in range(3))
     border, square = (torch.empty(h, w, device=device, dtype=torch.float32) for _ in range(2))

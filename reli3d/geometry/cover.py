@@ -32,10 +32,8 @@ def cover_silhouettes(sdf: Tensor, bound: Tensor, distance: Tensor, camera: Came
     check("sdf", sdf)
     if sdf.ndim != 3 or min(sdf.shape) < 2:
         raise ValueError(f"sdf: expected shape (X, Y, Z) of at least 2 points a side, got {tuple(sdf.shape)}")
-    check("bound", bound, like=sdf)
+    check("bound", bound, like=sdf, shape=sdf.shape)
     check("distance", distance, like=sdf)
-    if bound.shape != sdf.shape:
-        raise ValueError(f"bound: expected shape {tuple(sdf.shape)}, got {tuple(bound.shape)}")
     if distance.ndim != 3 or min(distance.shape[1:]) < 2 * STRIDE:
         expected = f"(V, H, W) with H and W of at least {2 * STRIDE}"
         raise ValueError(f"distance: expected shape {expected}, got {tuple(distance.shape)}")

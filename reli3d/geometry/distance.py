@@ -18,12 +18,9 @@ def signed_distance(vertices: Tensor, faces: Tensor, points: Tensor) -> Tensor:
     a NaN point gives NaN.  Raises TypeError for a wrong dtype, ValueError for a wrong shape or device, an empty mesh or
     an index out of range.
     """
-    _bridge.check("vertices", vertices, last=3)
-    _bridge.check("faces", faces, last=3, like=vertices, dtype=torch.int32)
-    _bridge.check("points", points, last=3, like=vertices)
-    for name, value in (("vertices", vertices), ("faces", faces), ("points", points)):
-        if value.ndim != 2:
-            raise ValueError(f"{name}: expected shape (N, 3), got {tuple(value.shape)}")
+    _bridge.check("vertices", vertices, shape=("V", 3))
+    _bridge.check("faces", faces, shape=("F", 3), like=vertices, dtype=torch.int32)
+    _bridge.check("points", points, shape=("N", 3), like=vertices)
     if len(faces) == 0:
         raise ValueError("faces: expected at least one, got none")
     if int(faces.min()) < 0 or int(faces.max()) >= len(vertices):

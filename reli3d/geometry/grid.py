@@ -20,11 +20,9 @@ def sample_grid(grid: Tensor, points: Tensor) -> Tensor:
     device.
     """
     check("grid", grid)
-    check("points", points, last=3, like=grid)
+    check("points", points, shape=("N", 3), like=grid)
     if grid.ndim != 4 or min(grid.shape[:3]) < 2:
         raise ValueError(f"grid: expected (X, Y, Z, C) of at least 2 points along each axis, got {tuple(grid.shape)}")
-    if points.ndim != 2:
-        raise ValueError(f"points: expected (N, 3), got {tuple(points.shape)}")
     n = len(points)
     outs = [((n, grid.shape[3]), wp.float32)]
     (out,) = call(sample_grid_kernel, n, [(grid, wp.float32), (points, wp.vec3)], outs, device=grid.device, shared=(0,))

@@ -71,9 +71,7 @@ def hull_distance(points: Tensor, distance: Tensor, camera: Camera, *, far: floa
     is unbounded.  Points at or behind a camera's plane get -1000.  Without views every point gets +1000.  far: at least
     0, world units, else ValueError; points farther outside get any value below ``-far``, to save time.  No gradient.
     """
-    check("points", points, last=3)
-    if points.ndim != 2:
-        raise ValueError(f"points: expected shape (N, 3), got {tuple(points.shape)}")
+    check("points", points, shape=("N", 3))
     _check_views(points, distance, camera)
     if not far >= 0.0:
         raise ValueError(f"far: expected at least 0, got {far}")
@@ -89,9 +87,7 @@ def hull_grid(axis: Tensor, distance: Tensor, camera: Camera, *, far: float = ma
     axis: ``(n,)`` ascending, world units.  distance: ``(V, H, W)`` from :func:`mask_distance`, or any map that changes
     by at most 1 between adjacent pixels.  camera, far: as in :func:`hull_distance`.
     """
-    check("axis", axis)
-    if axis.ndim != 1:
-        raise ValueError(f"axis: expected shape (n,), got {tuple(axis.shape)}")
+    check("axis", axis, shape=("n",))
     _check_views(axis, distance, camera)
     if not far >= 0.0:
         raise ValueError(f"far: expected at least 0, got {far}")

@@ -49,9 +49,7 @@ class Mesh:
         for name, last in (("normals", 3), ("uv", 2), ("tangents", 4), ("colors", 3)):
             value = getattr(self, name)
             if value is not None:
-                check(name, value, last=last, like=self.vertices)
-                if value.shape != (self.vertices.shape[0], last):
-                    raise ValueError(f"{name}: expected shape ({len(self.vertices)}, {last}), got {tuple(value.shape)}")
+                check(name, value, shape=(len(self.vertices), last), like=self.vertices)
 
     def to(self, device: torch.device | str) -> Mesh:
         """The same mesh on another device."""
@@ -97,11 +95,8 @@ class MeshReport:
 
 
 def _check_topology(vertices: Tensor, faces: Tensor) -> None:
-    check("vertices", vertices, last=3)
-    check("faces", faces, last=3, like=vertices, dtype=torch.int32)
-    for name, value in (("vertices", vertices), ("faces", faces)):
-        if value.ndim != 2:
-            raise ValueError(f"{name}: expected shape (N, 3), got {tuple(value.shape)}")
+    check("vertices", vertices, shape=("V", 3))
+    check("faces", faces, shape=("F", 3), like=vertices, dtype=torch.int32)
     if faces.numel():
         low, high = (int(v) for v in torch.aminmax(faces))
         if low < 0 or high >= len(vertices):
@@ -174,9 +169,7 @@ def select_faces(mesh: Mesh, keep: Tensor) -> Mesh:
 
     Gradients of the vertex attributes flow through.
     """
-    check("keep", keep, like=mesh.faces, dtype=torch.bool)
-    if keep.shape != mesh.faces.shape[:1]:
-        raise ValueError(f"keep: expected shape ({len(mesh.faces)},), got {tuple(keep.shape)}")
+    check("keep", keep, shape=(len(mesh.faces),), like=mesh.faces, dtype=torch.bool)
     faces = mesh.faces[keep]
     used = torch.zeros(len(mesh.vertices), dtype=torch.bool, device=faces.device)
     used[faces.reshape(-1).long()] = True

@@ -51,9 +51,7 @@ class RayScene:
             expect("mesh", mesh, Mesh)
         vertices, faces = (mesh.vertices, mesh.faces) if isinstance(mesh, Mesh) else (mesh, faces)
         vertices, faces = tensor_of(vertices), tensor_of(faces, torch.int32)
-        check("faces", faces, last=3, dtype=torch.int32)
-        if faces.ndim != 2:
-            raise ValueError(f"faces: expected shape (F, 3), got {tuple(faces.shape)}")
+        check("faces", faces, shape=("F", 3), dtype=torch.int32)
         self.faces = faces.detach().clone().contiguous()
         self.device = faces.device
         if backend == "auto":
@@ -174,9 +172,7 @@ class RayScene:
 
     def _set_vertices(self, vertices: Tensor) -> None:
         """Keep a copy, once all checks have passed."""
-        check("vertices", vertices, last=3, like=self.faces)
-        if vertices.ndim != 2:
-            raise ValueError(f"vertices: expected shape (V, 3), got {tuple(vertices.shape)}")
+        check("vertices", vertices, shape=("V", 3), like=self.faces)
         cells, scale = (wp.vec3(), wp.vec3()), 0.0
         if vertices.numel():
             low, high = vertices.detach().amin(0), vertices.detach().amax(0)

@@ -29,9 +29,7 @@ def visible_from(
     n, views = len(position), len(camera.c2w)
     pair = torch.empty(0, dtype=torch.int32, device=position.device)  # all
     if active is not None:
-        check("active", active, last=views, like=position, dtype=torch.bool)
-        if active.shape != (n, views):
-            raise ValueError(f"active: expected shape {(n, views)}, got {tuple(active.shape)}")
+        check("active", active, shape=(n, views), like=position, dtype=torch.bool)
         pair = active.T.reshape(-1).nonzero()[:, 0].int()
     count = n * views if active is None else len(pair)
     origin, direction = (position.new_empty(count, 3) for _ in range(2))

@@ -60,15 +60,13 @@ def pool_views(
     """
     n, out, viewed = _summary(images, camera, points, visible, normal)
     check("tokens", tokens, like=images)
-    check("mix", mix, like=images)
     hidden = tokens.shape[-1]
     if tokens.ndim != 4 or tokens.shape[0] != len(images) or min(tokens.shape[1:3]) < 2 or hidden % BLOCK_CHANNELS:
         raise ValueError(
             f"tokens: expected ({len(images)}, P, P, H), P at least 2 and H a multiple of {BLOCK_CHANNELS}, "
             f"got {tuple(tokens.shape)}"
         )
-    if tuple(mix.shape) != (NUMBERS, hidden):
-        raise ValueError(f"mix: expected shape {(NUMBERS, hidden)}, got {tuple(mix.shape)}")
+    check("mix", mix, shape=(NUMBERS, hidden), like=images)
     pooled = points.new_empty(n, hidden)
     layer = [(t.detach().contiguous().unflatten(-1, (-1, BLOCK_CHANNELS)), vec8) for t in (tokens, mix)]
     outs = [(pooled.unflatten(-1, (-1, BLOCK_CHANNELS)), vec8), (out, wp.float32)]

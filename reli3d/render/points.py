@@ -51,9 +51,7 @@ class SurfacePoints:
 
     def __post_init__(self):
         object.__setattr__(self, "position", tensor_of(self.position))
-        check("position", self.position, last=3)
-        if self.position.ndim != 2:
-            raise ValueError(f"position: expected shape (N, 3), got {tuple(self.position.shape)}")
+        check("position", self.position, shape=("N", 3))
         for name, last in (("ng", 3), ("normal", 3), ("base_color", 3), ("roughness", 0), ("metallic", 0)):
             object.__setattr__(self, name, of_rows(name, getattr(self, name), self.position, last))
 

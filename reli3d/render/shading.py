@@ -163,9 +163,7 @@ def _task(points, wo, environment, scene, options, pixels) -> tuple:
     job = _Job(plan, sum(options.samples), scene, environment.cdf, offsets.to(device), _nothing_known(device))
     if pixels is None:
         pixels = torch.arange(n, dtype=torch.int32, device=device)
-    check("pixels", pixels, like=points.position, dtype=torch.int32)
-    if pixels.shape != (n,):
-        raise ValueError(f"pixels: expected shape ({n},), got {tuple(pixels.shape)}")
+    check("pixels", pixels, shape=(n,), like=points.position, dtype=torch.int32)
     values = (*values, environment.radiance, pixels)
     return job, *(v.contiguous() for v in values)
 

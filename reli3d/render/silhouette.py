@@ -116,9 +116,7 @@ def blend_outlines(image: Tensor, crossings: Crossings) -> Tensor:
     The outline's side of a pixel border decides which of the two changes; several pairs add up, their weights scaled
     down where they exceed 1, so a value stays between its neighbors'.  Gradients reach the image and the crossings.
     """
-    check("image", image, like=crossings.place)
-    if image.ndim != 3:
-        raise ValueError(f"image: expected shape (H, W, C), got {tuple(image.shape)}")
+    check("image", image, shape=("H", "W", "C"), like=crossings.place)
     flat = image.reshape(-1, image.shape[2])
     grows = crossings.place.detach() > 0.5  # the surface spills into the outer pixel
     into = torch.where(grows, crossings.outer, crossings.inner)

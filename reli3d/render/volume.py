@@ -110,12 +110,9 @@ def march_rays(
     position of the samples within their steps; None: 0.5; random numbers give an unbiased integral.  Rays that are not
     finite or miss the cube have no samples.  No gradient.  Raises ValueError above 2^31 samples.
     """
-    check("origins", origins, last=3)
-    check("directions", directions, last=3, like=origins)
-    n = origins.shape[0] if origins.ndim else 0
-    if origins.shape != (n, 3) or directions.shape != (n, 3):
-        got = f"{tuple(origins.shape)}, {tuple(directions.shape)}"
-        raise ValueError(f"origins, directions: expected shape (N, 3) twice, got {got}")
+    check("origins", origins, shape=("N", 3))
+    n = len(origins)
+    check("directions", directions, shape=(n, 3), like=origins)
     if grid.occupied.device != origins.device:
         raise ValueError(f"grid: expected device {origins.device}, got {grid.occupied.device}")
     if not (0.0 < step < float("inf") and 0.0 <= near <= far):
@@ -153,16 +150,12 @@ def composite(density: Tensor, color: Tensor, samples: RaySamples) -> Composite:
     threads.  Max 1995, Optical Models for Direct Volume Rendering.
     """
     _check_samples(density, samples)
-    check("color", color, last=3, like=density)
-    if color.shape != (len(density), 3):
-        raise ValueError(f"color: expected shape ({len(density)}, 3), got {tuple(color.shape)}")
+    check("color", color, shape=(len(density), 3), like=density)
     return Composite(*_Composite.apply(samples, density.contiguous(), color.contiguous()))
 
 
 def _check_samples(density: Tensor, samples: RaySamples) -> None:
-    check("density", density, like=samples.t)
-    if density.shape != samples.t.shape:
-        raise ValueError(f"density: expected shape {tuple(samples.t.shape)}, got {tuple(density.shape)}")
+    check("density", density, shape=samples.t.shape, like=samples.t)
 
 
 class _Composite(torch.autograd.Function):

@@ -53,7 +53,5 @@ def cells(points: Tensor, *, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _points(points: Tensor) -> Tensor:
-    _bridge.check("points", points, last=3)
-    if points.ndim != 2:
-        raise ValueError(f"points: expected shape (N, 3), got {tuple(points.shape)}")
+    _bridge.check("points", points, shape=("N", 3))
     return points.contiguous()

@@ -47,7 +47,7 @@ def test_bad_input_is_named():
     for change, message in (
         ({"grid": grid[0]}, r"grid: expected \(X, Y, Z, C\)"),
         ({"grid": grid[:1]}, "at least 2"),
-        ({"points": points[None]}, r"points: expected \(N, 3\)"),
+        ({"points": points[None]}, r"points: expected shape \(N, 3\)"),
     ):
         with pytest.raises(ValueError, match=message):
             sample_grid(**{"grid": grid, "points": points, **change})
