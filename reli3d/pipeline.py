@@ -42,7 +42,7 @@ from reli3d.render.latlong import lat_long_directions
 from reli3d.views.check import up_axis, verdict
 from reli3d.views.folder import load_views
 from reli3d.views.normalize import FAR_DISTANCES, normalize
-from reli3d.views.published_views import background_shown, hero_first, placement_notes
+from reli3d.views.published_views import BACKGROUNDS, background_shown, hero_first, placement_notes
 from reli3d.views.similarity import Similarity, output_frame
 from reli3d.views.views import Views
 
@@ -170,8 +170,6 @@ def texture(
     scene: rays against ``mesh``, for a network that uses the visibility of points in the views; otherwise None.  uv:
     ``project`` or ``xatlas``.
     """
-    if uv not in ("project", "xatlas"):
-        raise InputError("uv", f"expected project or xatlas, got {uv}")
     maps = field.maps
 
     def at_vertices(field: LocalField, mesh: Mesh) -> tuple[LocalField, Tensor]:
@@ -282,15 +280,15 @@ class ReconstructOptions:
     texture_size: texels per side, 256 to 4096.  resolution: cubes per side of the FlexiCubes grid, 16 to 256; None: the
     value of the network's preset.  normalization: how the object is placed in the cube of the network.  ``hull``: the
     bounding box of the visual hull is centered and its longest side scaled to 1.  ``none``: poses as stored.  ``auto``:
-    by ``views.object_box`` if there is one; else poses as stored if the visual hull fits the cube; else ``hull``.  A
-    :class:`~reli3d.views.similarity.Similarity`: this map from the input to the model frame.  None: ``auto``, for the
-    published network ``none``.  up: axis of the cameras' world frame that becomes +Y, ``x``, ``y``, ``z`` or one with a
-    minus sign.  uv: method of unwrapping, ``project`` or ``xatlas``.  hero: index of the reference view.  background:
-    image region that the lighting estimate reads, ``masked`` (the object only), ``visible`` (the background too) or
-    ``auto`` (``visible`` if all views have a background and the weights were trained with it, else ``masked``).  seed:
-    of torch's generator, and of the refinement of ``reli3d-infer --refine``; the networks draw no random numbers, so it
-    does not change a reconstruction.  symmetry: ``auto`` completes objects with a detected mirror plane (bundled
-    network only), or ``off``.  Raises InputError for a value out of range.
+    by ``views.object_box`` if there is one; else poses as stored if the visual hull lies in the cube, near its center
+    and not much smaller (:func:`~reli3d.views.normalize.normalize`); else ``hull``.  A
+    :class:`~reli3d.views.similarity.Similarity` is used as the map from the input to the model frame.  None: ``auto``,
+    for the published network ``none``.  up: axis of the cameras' world frame that becomes +Y, ``x``, ``y``, ``z`` or
+    one with a minus sign.  uv: method of unwrapping, ``project`` or ``xatlas``.  hero: index of the reference view.
+    background: image region that the lighting estimate reads, ``masked`` (the object only), ``visible`` (the background
+    too) or ``auto`` (``visible`` if all views have a background and the weights were trained with it, else
+    ``masked``).  symmetry: ``auto`` completes objects with a detected mirror plane (bundled network only), or ``off``.
+    Raises InputError for a wrong value; ``hero`` is checked when views are given.
 
     >>> options = reli3d.ReconstructOptions(texture_size=512, symmetry="off")
     >>> asset = reli3d.reconstruct(reli3d.load_views("photos/shoe"), options=options)
@@ -303,12 +301,16 @@ class ReconstructOptions:
     uv: str = "project"
     hero: int = 0
     background: str = "masked"
-    seed: int = 0
     symmetry: str = "auto"
 
     def __post_init__(self):
-        if self.symmetry not in ("auto", "off"):
-            raise InputError("symmetry", f"expected auto or off, got {self.symmetry}")
+        output_frame(self.up)
+        words = {"symmetry": ("auto", "off"), "uv": ("project", "xatlas"), "background": BACKGROUNDS}
+        if not isinstance(self.normalization, Similarity | None):
+            words["normalization"] = ("auto", "hull", "none")
+        for name, allowed in words.items():
+            if getattr(self, name) not in allowed:
+                raise InputError(name, f"expected {', '.join(allowed)}, got {getattr(self, name)}")
         if not 256 <= self.texture_size <= 4096:
             raise InputError("texture_size", f"expected 256 to 4096 texels, got {self.texture_size}")
         if self.resolution is not None and not 16 <= self.resolution <= 256:
@@ -377,7 +379,6 @@ def reconstruct_placed(placed: Placed, model: Network, options: ReconstructOptio
     shown = background_shown(
         placed.views, options.background, readable=getattr(model.preset, "reads_background", False)
     )
-    torch.manual_seed(options.seed)
     with watch.stage("prepare"):
         prepared = prepare(model, placed.views, placed.model_from_input)
     if options.symmetry == "auto" and isinstance(model, LocalReconstructor):
@@ -525,7 +526,7 @@ def reconstruct_folder(
     if reading.budget:
         with watch.stage("refine"):
             photographs = photographs.transformed(output)
-            fit: dict[str, Any] = {"seed": options.seed, "cameras": reading.cameras, "interrupt": reading.interrupt}
+            fit: dict[str, Any] = {"cameras": reading.cameras, "interrupt": reading.interrupt}
             fit["light"] = reading.lighting(photographs)
             result = refined(asset, photographs, bar=True, **fit, **reading.budget)
             compared = comparison(asset, result.asset, shown.to(model.device))
@@ -553,7 +554,6 @@ def reconstruct_folder(
         "resolution": options.resolution or model.preset.resolution,
         "background": options.background,
         "symmetry": options.symmetry,
-        "seed": options.seed,
         "device": model.device.type,
         **measures,
         **record,

@@ -40,8 +40,8 @@ def parser() -> argparse.ArgumentParser:
         "--normalize",
         choices=("auto", "hull", "none"),
         help="hull: center and scale by the visual hull; none: camera poses as stored; auto: by object_box of "
-        "transforms.json, else none if the visual hull fits the network's cube, else hull; default auto, for the "
-        "published network none",
+        "transforms.json, else none if the visual hull fits the network's cube in size and position, else hull; "
+        "default auto, for the published network none",
     )
     p.add_argument(
         "--hero",

@@ -174,7 +174,7 @@ def select_faces(mesh: Mesh, keep: Tensor) -> Mesh:
     used = torch.zeros(len(mesh.vertices), dtype=torch.bool, device=faces.device)
     used[faces.reshape(-1).long()] = True
     new_index = torch.cumsum(used, 0, dtype=torch.int32) - 1
-    rest = (None if value is None else value[used] for value in (mesh.normals, mesh.uv, mesh.tangents))
+    rest = (None if v is None else v[used] for v in (mesh.normals, mesh.uv, mesh.tangents, mesh.colors))
     return Mesh(mesh.vertices[used], new_index[faces.long()].reshape(-1, 3), *rest)
 
 

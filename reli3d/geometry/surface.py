@@ -106,9 +106,9 @@ def extract_surface(
     empty mesh, a negative one the box if ``closed``.  Gradients reach sdf, deformation, alpha, beta and, with
     ``center``, gamma.  Bitwise identical for any number of threads.
 
-    Raises TypeError for a wrong dtype; ValueError for a wrong shape, NaN or infinity in ``sdf``, a radius or ``gamma``
-    that is not positive, alpha, beta or deformation that give non-finite vertices, ``cubes`` other than those of
-    ``sdf``, and 2^31 grid vertices or more.  Source: Shen et al. 2023.
+    Raises TypeError for a wrong dtype, and ValueError in these cases: a wrong shape; NaN or infinity in ``sdf``;
+    ``radius`` or ``gamma`` not positive; ``alpha``, ``beta`` or ``deformation`` that lead to non-finite vertices;
+    ``cubes`` that are not those of ``sdf``; 2^31 or more grid vertices.  Source: Shen et al. 2023.
 
     >>> x = torch.linspace(-1, 1, 17)
     >>> ball = reli3d.extract_surface((x**2 + x[:, None] ** 2 + x[:, None, None] ** 2).sqrt() - 0.5, radius=1.0)

@@ -47,8 +47,9 @@ def read_environment(path: str | os.PathLike, *, notes: list[str] | None = None)
 def write_environment(path: str | os.PathLike, environment: Environment) -> int:
     """Writes ``environment (H, 2H, 3)`` as ``.exr`` (half precision) or ``.hdr`` (RGBE), by the suffix of ``path``.
 
-    Returns the number of clamped values.  The file is written completely or not at all.  Raises TypeError for a wrong
-    type; ValueError for NaN, negative values, another shape or suffix; OSError if writing fails.
+    Returns the number of values that were clamped to the largest of the format (65504 in ``.exr``).  The file is
+    written completely or not at all.  Raises TypeError for a wrong type; ValueError for NaN, negative values, another
+    shape or suffix; OSError if writing fails.
 
     >>> reli3d.write_environment("light.exr", asset.environment)
     >>> again = reli3d.read_environment("light.exr")

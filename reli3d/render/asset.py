@@ -26,12 +26,13 @@ class TextureSet:
     """Metallic-roughness textures of one mesh: square float32 maps of one size, values in [0, 1].
 
     Row 0 is v = 0 (glTF: v down), texel centers at +0.5.  base_color: ``(T, T, 3)``, linear; files hold sRGB.
-    roughness, metallic: ``(T, T)``, ``(T, T, 1)`` or a Python number; roughness is perceptual (to fit one value, pass a
-    scalar tensor expanded to ``(T, T)``).  normal: ``(T, T, 3)``, tangent-space unit normal as ``n * 0.5 + 0.5``, green
-    along the bitangent; None: flat.  wrap: addressing of UV outside [0, 1] along u and v, each ``repeat``, ``mirror``
-    or ``clamp``.  Fields are tensors after construction.  Gradients pass through.  Raises TypeError for a wrong type or
-    dtype, ValueError for a wrong shape, device or mode.  The range is checked only when a file is written: in
-    optimization clamp the maps after each step, or use a sigmoid.
+    roughness, metallic: ``(T, T)``, ``(T, T, 1)`` or a Python number, which has no gradient; to optimize one value for
+    the whole map, pass a scalar tensor expanded to ``(T, T)``.  Roughness is perceptual.  normal: ``(T, T, 3)``,
+    tangent-space unit normal as ``n * 0.5 + 0.5``, green along the bitangent; None: flat.  wrap: addressing of UV
+    outside [0, 1] along u and v, each ``repeat``, ``mirror`` or ``clamp``.  Fields are tensors after construction.
+    Gradients pass through.  Raises TypeError for a wrong type or dtype, ValueError for a wrong shape, device or wrap
+    mode.  The range is checked only when a file is written: in optimization clamp the maps after each step, or use a
+    sigmoid.
 
     >>> textures = reli3d.TextureSet(torch.full((64, 64, 3), 0.5), roughness=0.4, metallic=0.0)
     >>> asset = reli3d.Asset(mesh, textures)

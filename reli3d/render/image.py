@@ -99,14 +99,14 @@ def render_asset(
     asset that has one.  options: sample counts, seed and material model.  supersampling: k for k x k camera rays per
     pixel, each shaded with the full sample counts.  shadows: whether shadow rays are traced.  background:
     ``transparent``, or ``environment``, which composites the environment behind the object; then write
-    ``image.radiance``, not ``image.rgba``.  scene: a :class:`RayScene` of the mesh, for several assets of their meshes
-    concatenated in order; built if None.  progress: called with the completed fraction.
+    ``image.radiance``, not ``image.rgba``.  scene: a :class:`RayScene` of the mesh or, for several assets, of all their
+    meshes concatenated in the order of the list; None: it is built.  progress: called with the completed fraction.
 
     Gradients are those of :func:`surface_points` and :func:`shade` with the hit points (face and barycentric
-    coordinates) and visibility constant.  Radiance has gradients to the textures, the vertex normals, tangents and UV,
-    the texels of the environment and, without vertex normals, through the geometric normals to the vertices; the
-    G-buffers have gradients to the textures and the mesh, depth also to the camera.  ``alpha`` has none: silhouettes
-    and shadow boundaries do not contribute (see :func:`antialias`).
+    coordinates) and visibility constant.  Radiance has gradients to the textures, the vertex normals, tangents, colors
+    and UV, the texels of the environment and, without vertex normals, through the geometric normals to the vertices;
+    the G-buffers have gradients to the textures and the mesh, depth also to the camera.  ``alpha`` has none:
+    silhouettes and shadow boundaries do not contribute (see :func:`antialias`).
 
     Raises TypeError for a wrong type; ValueError if neither argument nor asset has an environment, for another
     ``background``, a batch of cameras, or textures without ``mesh.uv``.

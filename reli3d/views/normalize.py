@@ -51,7 +51,8 @@ def normalize(views: Views, mode: str = "auto") -> Similarity:
 
     mode ``none``: identity.  ``hull``: the bounding box of the visual hull is centered and its longest side scaled to
     1, as in training.  ``auto``: the same with ``views.object_box`` if there is one; else the identity if the visual
-    hull fits the network's cube of half side 0.87; else ``hull``.
+    hull lies in the network's cube of half side 0.87, is at least 0.55 long and centered within 0.3 of the origin; else
+    ``hull``.
 
     Captures from one side, all eyes within 90 degrees seen from the object, leave its depth open: it is at most 1.3
     widths of the masks, where the hull is cut, and the box is aligned with the mean viewing direction, so that the
