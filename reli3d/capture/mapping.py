@@ -137,6 +137,7 @@ def _mapped(photos, masks, work: Path, side: int, relaxed: bool, progress: Progr
     extraction.sift.max_num_features = FEATURES
     if relaxed:
         extraction.sift.peak_threshold = LOW_PEAK
+    pycolmap.Database.open(database).close()
     done = 0
     for k in range(len(lenses)):
         names = [path for path in by_path if path.startswith(f"{k}/")]
@@ -147,15 +148,12 @@ def _mapped(photos, masks, work: Path, side: int, relaxed: bool, progress: Progr
         if photo.focal:
             width, height = (round(s * scales[names[0]]) for s in photo.size)
             reader.camera_params = f"{photo.focal * scales[names[0]]},{width / 2},{height / 2},0"
+        # Numbers the images in order: the extraction would number them in the order in which its threads finish.
+        pycolmap.import_images(database, images, pycolmap.CameraMode.PER_FOLDER, names, reader)
         for first in range(0, len(names), 4):  # a few at a time: the bar moves
             progress("features", done, len(photos))
-            if first:
-                reader.existing_camera_id = k + 1
-            mode = pycolmap.CameraMode.PER_FOLDER if first == 0 else pycolmap.CameraMode.AUTO
             group = names[first : first + 4]
-            pycolmap.extract_features(
-                database, images, group, camera_mode=mode, reader_options=reader, extraction_options=extraction
-            )
+            pycolmap.extract_features(database, images, group, reader_options=reader, extraction_options=extraction)
             done += len(group)
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = SEED  # else that of a pair depends on the thread that it meets
@@ -167,7 +165,6 @@ def _mapped(photos, masks, work: Path, side: int, relaxed: bool, progress: Progr
         pairing.overlap, pairing.quadratic_overlap = 15, True  # offsets of 1 to 15, 16, 32, ...: these close loops
         pycolmap.match_sequential(database, pairing_options=pairing, verification_options=verification)
     options = pycolmap.IncrementalPipelineOptions(min_model_size=3, random_seed=SEED, extract_colors=False)
-    options.num_threads = 1  # bundle adjustment on several threads rounds differently from run to run
     if relaxed:
         options.mapper.init_min_num_inliers = 50
         options.mapper.init_min_tri_angle = 8.0

@@ -60,6 +60,15 @@ def test_cameras_are_those_of_the_scene(ground_truth, captured):
     assert position < 0.005 and angle < 0.3 and focal < 0.01
 
 
+def test_two_runs_write_equal_files(ground_truth, captured, tmp_path):
+    """Neither numbers of images nor random numbers depend on the threads of COLMAP."""
+    _, folder = captured
+    capture(ground_truth.write(tmp_path / "photographs"), tmp_path / "object")
+    files = [p.relative_to(folder) for p in sorted(folder.rglob("*")) if p.is_file()]
+    assert len(files) > 40
+    assert all((folder / p).read_bytes() == (tmp_path / "object" / p).read_bytes() for p in files)
+
+
 @pytest.mark.slow
 def test_cameras_of_a_turntable(tmp_path):
     turning = render_capture(views=24, turntable=True)
