@@ -109,7 +109,7 @@ def test_a_mirror_image_shows_a_point_only_where_no_photograph_does():
 
 
 def test_many_views_and_other_words_are_left_alone(views):
-    with pytest.raises(ValueError, match="symmetry: expected auto or off, got yes"):
+    with pytest.raises(ValueError, match="symmetry: expected auto, off, got yes"):
         ReconstructOptions(symmetry="yes")
     model = load_model("small", "cpu")
     many = views.select([0, 1, 2, 3, 0, 1, 2, 3, 0])
