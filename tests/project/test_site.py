@@ -17,6 +17,7 @@ def test_the_site_builds_without_a_warning_and_documents_every_public_name(tmp_p
     assert done.returncode == 0, done.stdout + done.stderr
     start, reference = ((tmp_path / "site" / name).read_text() for name in ("index.html", "reference/index.html"))
     assert 'href="./changelog/"' in start and 'href="./reference/"' in start
+    assert "<blockquote>" not in reference  # of ">>>" that is not a code block
     documented = set(re.findall(r'id="reli3d\.[\w.]*\.(\w+)"', reference))
     assert set(reli3d.__all__) - {"__version__"} <= documented
 
