@@ -410,11 +410,11 @@ def reconstruct_placed(placed: Placed, model: Network, options: ReconstructOptio
 def refine(asset: Asset, views: Views, *, seconds: float | None = None, steps: int | None = None, **options) -> Asset:
     """Refines mesh, maps and lighting of ``asset`` by inverse rendering of ``views``.
 
-    Of fewer than 3 views none is held out, of fewer than 12 one, else two.  Material (base color, roughness, metallic,
-    shading normals) and lighting get blend weights between start and fit, 1, 1/2 or 0, on the fitted surface: the first
-    combination, in a fixed order from the complete fit to the surface alone, whose mean PSNR in the fitted, the
-    held-out and all views is not lower than that of the start, within a small tolerance.  If there is none, the result
-    is ``asset``.
+    Some views are held out to judge the fit: none of fewer than 3, one of fewer than 12, else two.  On the fitted
+    surface, material (base color, roughness, metallic, shading normals) and lighting are each blended with their start
+    values: weight 1 is the fit, 0 the start, 1/2 halfway.  Combinations are tried in a fixed order, from the complete
+    fit to the surface alone.  The first one is returned whose mean PSNR in the fitted, the held-out and all views is
+    not lower than that of the start, within a small tolerance.  If there is none, ``asset`` is returned.
 
     views: any number, in the frame of ``asset``: that of the cameras unless ``ReconstructOptions.up`` changed it.
     seconds, steps: duration of the optimization, one of the two; ``steps`` is reproducible.  options: of

@@ -204,10 +204,10 @@ def bake(
 
     mesh: with ``uv``, of which the part in [0, 1] is baked.  size: texels per side, 1 to 16384; row 0 is v = 0.  fn:
     called as ``fn(position (N, 3), normal (N, 3))`` with at most ``chunk`` surface points at a time, under
-    ``torch.no_grad``; returns ``{name: (N, C)}``, or one tensor, which is named "value".  Values are stored unchanged,
-    in any range; :class:`~reli3d.render.asset.TextureSet` expects [0, 1].  texels: from
+    ``torch.no_grad``; returns ``{name: (N, C)}``, or one tensor, which is named "value".  Results are stored
+    unchanged, in any range; :class:`~reli3d.render.asset.TextureSet` expects [0, 1].  texels: from
     :func:`~reli3d.geometry.bake.rasterize_texels`, for reuse.  tangents: pass the tangents ``(N, 4)`` as third
-    argument.  values: vertex attributes ``(V, C)``, interpolated and passed as last argument.  fill: extend the values
+    argument.  values: vertex attributes ``(V, C)``, interpolated and passed as last argument.  fill: extend the results
     to all other texels from the nearest valid one; otherwise they are 0.
 
     No gradient.  Raises TypeError for a wrong type or dtype; ValueError without ``uv``, if the surface covers no texel,
