@@ -410,7 +410,7 @@ def reconstruct_placed(placed: Placed, model: Network, options: ReconstructOptio
 def refine(asset: Asset, views: Views, *, seconds: float | None = None, steps: int | None = None, **options) -> Asset:
     """Refines mesh, maps and lighting of ``asset`` by inverse rendering of ``views``.
 
-    Some views are held out to judge the fit: none of fewer than 3, one of fewer than 12, else two.  On the fitted
+    Some views are held out to judge the fit: none of 1 or 2 views, one of 3 to 11, two of 12 or more.  On the fitted
     surface, material (base color, roughness, metallic, shading normals) and lighting are each blended with their start
     values: weight 1 is the fit, 0 the start, 1/2 halfway.  Combinations are tried in a fixed order, from the complete
     fit to the surface alone.  The first one is returned whose mean PSNR in the fitted, the held-out and all views is

@@ -33,8 +33,8 @@ class Camera:
 
     c2w: ``(..., 4, 4)`` float32 camera-to-world, OpenGL axes: +X right, +Y up, looks along -Z.  intrinsics: ``(...,
     4)`` float32 as ``fx, fy, cx, cy`` in pixels, y down, pixel centers at +0.5.  width, height: pixels, at least 1.
-    Both have the same batch axes.  Gradients pass through.  Raises TypeError for a wrong dtype, ValueError for a wrong
-    shape, size or device.
+    ``c2w`` and ``intrinsics`` have the same batch axes.  Gradients pass through.  Raises TypeError for a wrong dtype,
+    ValueError for a wrong shape, size or device.
 
     >>> camera = reli3d.Camera.from_fov(reli3d.look_at([0.0, 0.5, 3.0]), 0.7, 64, 48)  # fov_x in radians
     >>> origins, directions = reli3d.camera_rays(camera)

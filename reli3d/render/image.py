@@ -105,8 +105,9 @@ def render_asset(
     Gradients are those of :func:`surface_points` and :func:`shade` with the hit points (face and barycentric
     coordinates) and visibility constant.  Radiance has gradients to the textures, the texels of the environment, and
     the mesh's normals, tangents, colors and UV; to the vertex positions only if the mesh has no vertex normals, through
-    the geometric normals.  The G-buffers have gradients to the textures and the mesh, depth also to the camera.
-    ``alpha`` has none: silhouettes and shadow boundaries do not contribute (see :func:`antialias`).
+    the face normals that then are the shading normals.  The G-buffers have gradients to the textures and the mesh,
+    depth also to the camera.  ``alpha`` has none: silhouettes and shadow boundaries do not contribute (see
+    :func:`antialias`).
 
     Raises TypeError for a wrong type; ValueError if neither argument nor asset has an environment, for another
     ``background``, a batch of cameras, or textures without ``mesh.uv``.

@@ -41,12 +41,12 @@ def eval_bsdf(
     """Value of the metallic-roughness BSDF ``(..., 3)`` [1/sr], without the cosine; 0 below the horizon on either side.
 
     wo, wi: ``(..., 3)`` unit, local frame.  base_color: ``(..., 3)`` linear in [0, 1].  alpha: ``(...)`` GGX width,
-    ``roughness**2``.  metallic: ``(...)`` in [0, 1].  All are tensors; leading axes broadcast.  diffuse_model: energy
-    transmitted to the diffuse layer, ``conserving`` (1 - F of the surface on the way in and out; the albedo is at most
-    1) or ``published`` (1 - F of the microfacet, the formula of ReLi3D's shader and of glTF 2.0's appendix B).
-    Gradients reach all five tensors; that of ``alpha`` is 0 below ``ALPHA_MIN`` = 1e-3.  Raises TypeError unless
-    float32, ValueError for a wrong shape or device, or an unknown model.  Source: glTF 2.0, appendix B; GGX of Walter
-    et al. 2007 with Smith's height-correlated masking.
+    ``roughness**2``.  metallic: ``(...)`` in [0, 1].  All are tensors; leading axes broadcast.  diffuse_model: factor
+    of the diffuse term.  ``conserving``: product of 1 - F on the way in and on the way out, with F at the angles to the
+    surface normal, reduced for rough surfaces; the albedo is at most 1.  ``published``: 1 - F at the half vector, the
+    formula of ReLi3D's shader and of glTF 2.0's appendix B.  Gradients reach all five tensors; that of ``alpha`` is 0
+    below ``ALPHA_MIN`` = 1e-3.  Raises TypeError unless float32, ValueError for a wrong shape or device, or an unknown
+    model.  Source: glTF 2.0, appendix B; GGX of Walter et al. 2007 with Smith's height-correlated masking.
 
     >>> up, half = torch.tensor([0.0, 0.0, 1.0]), torch.tensor(0.5)
     >>> value = reli3d.eval_bsdf(up, torch.full((3,), 0.8), half, half, up)

@@ -70,9 +70,10 @@ class ShadeOptions:
     ``none``.  heuristic: MIS weights, ``balance`` or ``power``.  sequence: ``halton``, with a Cranley-Patterson
     rotation per point and strategy, or ``random``.  alpha: GGX width from roughness r, ``squared`` (r^2) or, as in
     ReLi3D, ``linear`` (r).  diffuse_model: ``conserving`` or ``published``, see :func:`reli3d.eval_bsdf`.  clamp: upper
-    limit, per channel, of the value f L cos w / p of a sample, before division by the count n of its strategy (f: BSDF,
-    L: radiance, w: MIS weight, p: density); None: no limit.  check_inputs: raise ValueError for directions that are not
-    unit or materials outside [0, 1].  Raises ValueError for an invalid count or choice.
+    limit, per channel, of a sample's contribution ``w * f * L * cos(theta) / p`` before the division by the sample
+    count of its strategy (w: MIS weight, f: BSDF, L: radiance, theta: angle between the direction and the shading
+    normal, p: density); None: no limit.  check_inputs: raise ValueError for directions that are not unit or materials
+    outside [0, 1].  Raises ValueError for an invalid count or choice.
 
     >>> fast = reli3d.ShadeOptions(samples=reli3d.Samples(light=4, bsdf=4, cosine=2), seed=1)
     >>> image = reli3d.render_asset(asset, camera, light, options=fast)
