@@ -95,22 +95,22 @@ def render_asset(
     """Renders ``asset`` under an environment with direct lighting and shadows.
 
     asset: an :class:`Asset`, or a list of assets that shadow each other; an asset without textures is rendered as a
-    dielectric of base color 0.5 and roughness 0.5.  camera: a single camera.  environment: None: that of the first
-    asset that has one.  options: sample counts, seed and material model.  supersampling: k for k x k camera rays per
-    pixel, each shaded with the full sample counts.  shadows: whether shadow rays are traced.  background:
-    ``transparent``, or ``environment``, which composites the environment behind the object; then write
+    dielectric of base color 0.5 and roughness 0.5.  camera: a single camera.  environment: the lighting; if None, the
+    environment of the first asset that has one.  options: sample counts, seed and material model.  supersampling: k for
+    k x k camera rays per pixel, each shaded with the full sample counts.  shadows: whether shadow rays are traced.
+    background: ``transparent``, or ``environment``, which composites the environment behind the object; then write
     ``image.radiance``, not ``image.rgba``.  scene: a :class:`RayScene` of the mesh or, for several assets, of all their
     meshes concatenated in the order of the list; None: it is built.  progress: called with the completed fraction.
 
     Gradients are those of :func:`surface_points` and :func:`shade` with the hit points (face and barycentric
     coordinates) and visibility constant.  Radiance has gradients to the textures, the texels of the environment, and
-    the mesh's normals, tangents, colors and UV; to the vertex positions only if the mesh has no vertex normals, through
-    the face normals that then are the shading normals.  The G-buffers have gradients to the textures and the mesh,
-    depth also to the camera.  ``alpha`` has none: silhouettes and shadow boundaries do not contribute (see
+    the mesh's normals, tangents, colors and UV; to the vertex positions only if the mesh has no vertex normals: shading
+    then uses the face normals, which depend on the positions.  The G-buffers have gradients to the textures and the
+    mesh, depth also to the camera.  ``alpha`` has none: silhouettes and shadow boundaries do not contribute (see
     :func:`antialias`).
 
-    Raises TypeError for a wrong type; ValueError if neither argument nor asset has an environment, for another
-    ``background``, a batch of cameras, or textures without ``mesh.uv``.
+    Raises TypeError for a wrong type; ValueError if no environment is given and no asset has one, if ``background``
+    is not one of the two values, if ``camera`` is a batch, or if there are textures without ``mesh.uv``.
 
     >>> camera = reli3d.Camera.from_fov(reli3d.look_at([0.0, 0.5, 3.0]), 0.7, 512, 512)
     >>> image = reli3d.render_asset(asset, camera, reli3d.Environment.constant(torch.ones(3)), supersampling=2)

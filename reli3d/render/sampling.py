@@ -99,9 +99,9 @@ def antithetic(u: Tensor) -> Tensor:
 def tangent_frame(normal: Tensor) -> Tensor:
     """Rotations ``(..., 3, 3)`` to the local frame: rows tangent, bitangent, normal; ``local = frame @ world``.
 
-    normal: ``(..., 3)`` unit.  Right-handed.  Continuous except at z = 0 from below.  Gradients reach ``normal``.
-    Raises TypeError unless float32, ValueError for a wrong shape.  Source: Duff et al. 2017, Building an Orthonormal
-    Basis, Revisited.
+    normal: ``(..., 3)`` unit.  Right-handed.  Continuous except where ``z`` of the normal changes sign.  Gradients
+    reach ``normal``. Raises TypeError unless float32, ValueError for a wrong shape.  Source: Duff et al. 2017, Building
+    an Orthonormal Basis, Revisited.
 
     >>> frame = reli3d.tangent_frame(normal)
     >>> local, world = (frame @ wo[..., None])[..., 0], (frame.mT @ wi[..., None])[..., 0]

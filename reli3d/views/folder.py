@@ -56,11 +56,12 @@ def load_views(
 
     folder: with cameras in ``transforms.json`` (also ``transforms_train.json`` and the other splits), a COLMAP model,
     ``cameras_sphere.npz`` or ``poses_bounds.npy``; :mod:`reli3d.capture` finds missing cameras.  views: number of
-    views, 1 to 16, selected by farthest-point sampling.  first_views: number of views from the beginning.  Neither: all
-    views, at most 16.  every: all views without limit; :meth:`Views.taken` selects 16.  masks: folder of masks;
-    otherwise ``mask_path`` of a frame, alpha, or a folder ``masks`` or ``mask``, in this order.  whole: images of more
-    than two megapixels are scaled to two instead of cropped to the object.  remove_background: segment images without a
-    mask by ``rembg`` (extra ``masks``), which may download its network.
+    views, 1 to 16, selected by farthest-point sampling.  first_views: number of views from the beginning.  If neither
+    is given: all views, or 16 selected in the same way if there are more.  every: all views without limit;
+    :meth:`Views.taken` selects 16.  masks: folder of masks; otherwise ``mask_path`` of a frame, alpha, or a folder
+    ``masks`` or ``mask``, in this order.  whole: images of more than two megapixels are scaled to two instead of
+    cropped to the object.  remove_background: segment images without a mask by ``rembg`` (extra ``masks``), which may
+    download its network.
 
     Cameras far from the world origin are translated by ``-Views.origin``.  Raises InputError with one line that names
     file, field, value and fix.

@@ -134,10 +134,10 @@ class Views:
     def resampled(self, size: int, *, crop: bool = True, padding: float = 0.08) -> ViewBatch:
         """All views at ``size`` x ``size`` pixels, with the intrinsics of the new pixels.
 
-        crop: cut a square around the mask, ``padding`` of its side left free on each side; it may reach over the
-        border, where the mask is 0 and the color that of the nearest edge.  Otherwise the whole image is stretched to
-        the square.  Pixels are filtered over the area they cover (triangle filter of its width); where the new pixels
-        are smaller, bilinear.  Raises ValueError on a size below 1 or, with ``crop``, an empty mask.
+        crop: cut a square around the mask, with a margin of ``padding`` times its side on each side; it may reach over
+        the border, where the mask is 0 and the color that of the nearest edge.  Otherwise the whole image is stretched
+        to the square.  Pixels are filtered over the area they cover (triangle filter); where the new pixels are
+        smaller, bilinear.  Raises ValueError on a size below 1 or, with ``crop``, an empty mask.
         """
         if size < 1:
             raise ValueError(f"size: expected at least 1, got {size}")
