@@ -181,18 +181,18 @@ def test_every_parameter_is_in_one_group_and_last_layers_learn_faster():
 def test_training_learns_logs_and_resumes(folder, tmp_path):
     torch.manual_seed(0)
     stage = SmallStage(LocalReconstructor(SMALL), [folder], seed=3, points=256, max_views=1)
-    options = stage.options(str(tmp_path), steps=50, batch=1, warmup=5, seed=3)
+    options = stage.options(str(tmp_path), steps=12, batch=1, warmup=5, seed=3)
     (sample,) = drawn(folder, (3,), points=256, max_views=1)
     before = losses(stage.model, sample)
     train(stage, options)
     rows = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
-    assert rows[0]["config"]["stage"] == "small" and rows[-1]["step"] == 50 and set(WEIGHTS) < set(rows[-1])
+    assert rows[0]["config"]["stage"] == "small" and rows[-1]["step"] == 12 and set(WEIGHTS) < set(rows[-1])
     after = losses(stage.model, sample)
     whole = [float(sum(WEIGHTS[k] * v for k, v in terms.items())) for terms in (before, after)]
-    assert whole[1] < 0.9 * whole[0]  # 50 steps on two objects
+    assert whole[1] < 0.7 * whole[0]  # 12 steps on two objects
     again = SmallStage(LocalReconstructor(SMALL), [folder], seed=3, points=256, max_views=1)
-    train(again, dataclasses.replace(options, steps=52))
-    assert checkpoint.load(tmp_path / "state.pt")["step"] == 52
+    train(again, dataclasses.replace(options, steps=14))
+    assert checkpoint.load(tmp_path / "state.pt")["step"] == 14
 
 
 def test_a_new_stage_is_a_subclass_with_its_terms(folder, tmp_path):
