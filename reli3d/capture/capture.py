@@ -376,6 +376,9 @@ class _Frame:
     def apply(self, points: np.ndarray) -> np.ndarray:
         return self.scale * points @ self.turn.T + self.shift
 
+    def inverse(self, points: np.ndarray) -> np.ndarray:
+        return (points - self.shift) @ self.turn / self.scale
+
 
 def _frame(hull: np.ndarray, up: np.ndarray, ground: float | None, size: float | None) -> tuple[_Frame, np.ndarray]:
     """``up`` to +Y, the ground at 0, the middle of the ``hull (N, 3)`` above the origin, its longest side 1 or
@@ -488,8 +491,7 @@ def _write(output: Path, views, masks, frame: _Frame, box: np.ndarray, report: C
         (work / "capture.json").write_text(json.dumps(asdict(report), indent=1))
         eyes = np.stack([frame.apply(v.eye) for v in views])
         lines = [summary(report), *(f"check failed: {text}" for text in report.failed[:1])]
-        back = lambda p: (p - frame.shift) @ frame.turn / frame.scale  # noqa: E731
-        contact_sheet(thumbnails, points, eyes, back, lines).save(work / "capture.png")
+        contact_sheet(thumbnails, points, eyes, frame.inverse, lines).save(work / "capture.png")
     progress("writing", len(views), len(views))
 
 

@@ -13,13 +13,14 @@ from reli3d.fit.view_colors import MIN_COVERAGE, display_planes, view_colors, vi
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.rays import RayScene
 from reli3d.render.color import srgb_to_linear
+from reli3d.render.sampling import reflect
 from reli3d.render.transfer import spherical_harmonics
 
 COMPARED_POINTS = 4096  # vertices whose brightness is compared
 SATURATED_DISPLAY = 0.98  # a brighter value may be clipped
 HARMONICS = slice(1, 9)  # of degree 1 and 2; with degree 0 they hold 99 % of a light's irradiance
-# From these the lighting is taken to move with the camera.  Measured on four metallic and painted objects with 12 or 14
-# views: fixed lighting 0.06 to 0.16 and ratio 0.6 to 1.4; three moving ones each 0.13 to 0.85 and ratio 1.0 to 3.8.
+# Above both limits the lighting counts as moving with the camera.  Measured on four metallic and painted objects with
+# 12 or 14 views: fixed lighting 0.06 to 0.16 and ratio 0.6 to 1.4; moving lighting 0.13 to 0.85 and ratio 1.0 to 3.8.
 MIN_DEVIATION, MIN_RATIO = 0.15, 1.5
 
 
@@ -34,11 +35,11 @@ def explained_deviations(mesh: Mesh, images: InputImages) -> tuple[float, float]
     """Standard deviations of log brightness over the views of a point that lighting fixed to the camera and lighting
     fixed to the object explain.
 
-    Under lighting fixed to the camera, the log radiance of a diffuse point is about a constant plus one function of the
-    normal in the camera's axes.  Under lighting fixed to the object it is constant, and a specular lobe adds a function
-    of the reflected direction in the object's axes.  Either function is a sum of spherical harmonics of degree 1 and 2,
-    fitted by weighted least squares together with a constant for each point and each view (albedo, exposure); its
-    deviation is that of the residual without it and with it.  Weights: visibility and viewing angle.
+    Under lighting fixed to the camera, the log radiance of a diffuse point varies by a function of the normal in the
+    camera's axes; under lighting fixed to the object, that of a glossy point by a function of the reflected direction
+    in the object's axes.  Each function is a sum of spherical harmonics of degree 1 and 2, fitted by weighted least
+    squares (visibility, viewing angle) together with a constant for each point and each view (albedo, exposure).  Its
+    deviation is the root of the variance that it removes.
 
     mesh: with normals.  No gradient.
     """
@@ -50,7 +51,7 @@ def explained_deviations(mesh: Mesh, images: InputImages) -> tuple[float, float]
     bright = srgb_to_linear(color.clamp(0.0, 1.0)).mean(-1).clamp(min=MIN_LINEAR).log()
     turned = torch.einsum("vij,ni->nvj", images.camera.c2w[:, :3, :3], normal)
     wo, n = unit(images.camera.c2w[None, :, :3, 3] - position[:, None]), normal[:, None]
-    reflected = 2.0 * (wo * n).sum(-1, keepdim=True) * n - wo
+    reflected = reflect(wo, n)
     views = torch.eye(len(images), device=normal.device, dtype=torch.float32).expand(len(normal), -1, -1)
     harmonics = [spherical_harmonics(d)[..., HARMONICS] for d in (turned, reflected)]
     constant = _residual(bright, [views], weight)

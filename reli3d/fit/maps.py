@@ -112,23 +112,24 @@ def traced(data: FixedSurface, scene: RayScene, seed: int) -> Pixels:
     return Pixels(which, position, normal, ng, wo, uv, logits, target, received, order)
 
 
-def maps_loss(
-    unknowns: Unknowns,
-    data: FixedSurface,
-    pixels: Pixels,
-    rows: Tensor,
-    weights: losses.Weights,
-    *,
-    scene: RayScene | None,
-    samples: tuple[int, int, int],
-    seed: int,
-    independent: bool = True,
-) -> Tensor:
-    """Loss of one step over ``rows`` of the pixels, with gradients to material, detail, bend, light and exposure.
+@dataclass(frozen=True)
+class Estimate:
+    """Estimate of the shading in one step.
 
-    scene: casts shadows, None for none.  samples: of light, BSDF and cosine.  independent: use two independent
-    estimates of the shading; with False the gradient is that of the returned value, for tests.
+    scene: casts shadows, None for none.  samples: of light, BSDF and cosine.  seed: of the random numbers.
+    independent: two independent estimates, so that the gradient is unbiased; with False it is that of the loss's value.
     """
+
+    scene: RayScene | None
+    samples: tuple[int, int, int]
+    seed: int
+    independent: bool = True
+
+
+def maps_loss(
+    unknowns: Unknowns, data: FixedSurface, pixels: Pixels, rows: Tensor, weights: losses.Weights, estimate: Estimate
+) -> Tensor:
+    """Loss of one step over ``rows`` of the pixels, with gradients to material, detail, bend, light and exposure."""
     position, view, target = pixels.position[rows], pixels.view[rows], pixels.target[rows]
     detail = sample_texture(unknowns.detail, pixels.uv[rows])
     change = material_change(unknowns, position)
@@ -138,15 +139,15 @@ def maps_loss(
     lights, exposure = Lights.of(unknowns, data.start, data.images), unknowns.exposure.exp()[view, None]
 
     def lit(seed: int) -> Tensor:
-        shading = partial(radiance, samples=samples, scene=scene, seed=seed)
+        shading = partial(radiance, samples=estimate.samples, scene=estimate.scene, seed=seed)
         return lights.evaluate(points, pixels.wo[rows], view, shading)
 
     bounced = reflected(points, pixels.received[rows])
-    image = (bounced + lit(2 * seed)) * exposure
+    image = (bounced + lit(2 * estimate.seed)) * exposure
     other = image
-    if independent:
+    if estimate.independent:
         with torch.no_grad():
-            other = (bounced + lit(2 * seed + 1)) * exposure
+            other = (bounced + lit(2 * estimate.seed + 1)) * exposure
     loss = weights.image * losses.display_error(image, other, target, target > SATURATED_LINEAR)
     color, was = (
         c.clamp(min=losses.MIN_LINEAR).log() for c in (points.base_color, material_of(pixels.logits[rows])[0])
@@ -208,16 +209,8 @@ def fit_maps(
         ]
         first = (first + PIXELS_PER_STEP) % count
         samples = SHADING_SAMPLES[0] if progress < 0.5 else SHADING_SAMPLES[1]
-        loss = maps_loss(
-            unknowns,
-            data,
-            pixels,
-            rows,
-            replace(weights, bend=kept if settled else free),
-            scene=scene,
-            samples=samples,
-            seed=seed * 1_000_003 + step,
-        )
+        estimate = Estimate(scene, samples, seed * 1_000_003 + step)
+        loss = maps_loss(unknowns, data, pixels, rows, replace(weights, bend=kept if settled else free), estimate)
         optimizer.zero_grad()  # to None: Adam skips frozen tensors
         loss.backward()
         optimizer.step()

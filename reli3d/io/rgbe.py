@@ -67,9 +67,10 @@ def _variables(path, data: bytes, notes: list[str]) -> tuple[np.ndarray, np.ndar
             factor = factor * _positive(path, key.decode(), value, 1 if key == b"EXPOSURE" else 3)
         elif key in (b"PIXASPECT", b"GAMMA") and _positive(path, key.decode(), value, 1) != [1.0]:
             notes.append(f"{os.path.basename(path)}: {key.decode()} {shown(value.decode('latin-1'))} is not applied")
-        elif key == b"PRIMARIES" and value.strip(b" 0"):  # Photoshop writes zeros
+        elif key == b"PRIMARIES":
             try:
-                matrix = rec709_from_primaries([float(word) for word in value.split()])
+                numbers = [float(word) for word in value.split()]
+                matrix = None if numbers == [0.0] * 8 else rec709_from_primaries(numbers)  # Photoshop writes zeros
             except ValueError:
                 got = shown(value.decode("latin-1"))
                 raise InputError(path, f"PRIMARIES: expected those of a color space, got {got}; resave it") from None

@@ -16,6 +16,7 @@ from reli3d.geometry.mesh import Mesh, face_normals, vertex_normals
 from reli3d.geometry.regularize import vertex_deviation
 from reli3d.geometry.smooth import taubin_smooth
 from reli3d.geometry.surface import extract_surface
+from reli3d.geometry.triplane import sample_triplane
 from reli3d.render.asset import TextureSet
 from reli3d.render.gaussians import SphericalGaussians, shade_gaussians
 from reli3d.render.gbuffer import sample_texture, surface_points
@@ -23,6 +24,7 @@ from reli3d.render.material import sample_bsdf
 from reli3d.render.sampling import pdf_ggx_vndf
 from tests.support import op_cases, reference, reference_surface
 from tests.support.meshes import sheet
+from tests.support.reference import grid_samples
 from tests.support.reference_surface import random_weights, torus
 from tests.support.surfaces import on_ball
 
@@ -48,6 +50,16 @@ class Op:
         """Unit vectors made so again: a float32 length errs by 1e-7, which a lobe 0.05 wide sees over its square."""
         exact = {k: F.normalize(v.double(), dim=-1) if k in self.unit else v.double() for k, v in self.leaves.items()}
         return [v.requires_grad_() for v in exact.values()]
+
+
+def triplane(g) -> Op:
+    batch, channels, height, width, count = 2, 40, 96, 128, 20_000
+    planes = torch.randn(batch, 3, channels, height, width, generator=g)
+    return Op(
+        {"planes": planes, "points": torch.rand(batch, count, 3, generator=g) * 2.1 - 1.05},
+        sample_triplane,
+        grid_samples,
+    )
 
 
 def surface_leaves(g):
@@ -318,6 +330,7 @@ OPS = {
     **{
         f.__name__: f
         for f in (
+            triplane,
             flexicubes,
             centers,
             deviation,

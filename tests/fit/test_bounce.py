@@ -109,11 +109,11 @@ def test_a_fit_of_maps_includes_interreflection(monkeypatch):
     weights = Weights(**{**dict.fromkeys(vars(Weights()), 0.0), "image": 1.0})
     unknowns = Unknowns.zero(torch.ones(2, 2, 2), 3, 8)
     unknowns.exposure += math.log(1.5)
-    options = {"scene": None, "samples": (1, 0, 0), "seed": 0}
 
     def loss(weight: float, independent: bool) -> float:
         rows = replace(shown, received=weight * pixels.received)
-        return float(maps.maps_loss(unknowns, data, rows, pixels.order, weights, independent=independent, **options))
+        estimate = maps.Estimate(None, (1, 0, 0), seed=0, independent=independent)
+        return float(maps.maps_loss(unknowns, data, rows, pixels.order, weights, estimate))
 
     assert loss(1.0, False) < 1e-10 < 1e-4 < loss(0.5, False)
     assert loss(0.5, True) == loss(0.5, False)  # both estimates include it, and there is no noise

@@ -115,11 +115,11 @@ def test_the_gradient_of_the_bend_matches_central_differences(terms, monkeypatch
     for grid in unknowns.bend:
         grid += 0.1 * torch.randn(grid.shape, generator=rng)
     directions = towards("all", unknowns.bend)
-    options = {"scene": None, "samples": LIGHT, "seed": 1, "independent": False}
+    estimate = maps.Estimate(None, LIGHT, seed=1, independent=False)
 
     def loss() -> Tensor:
         weights = Weights(**{**NONE, **terms})
-        return maps.maps_loss(unknowns, surface, pixels, pixels.order[:400], weights, **options)
+        return maps.maps_loss(unknowns, surface, pixels, pixels.order[:400], weights, estimate)
 
     for grid in unknowns.bend:
         grid.requires_grad_(True)

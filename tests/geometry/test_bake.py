@@ -14,6 +14,9 @@ from reli3d.geometry.bake import bake, coverage, dilate, interpolate, nearest_va
 from reli3d.geometry.mesh import Mesh
 from reli3d.geometry.tangents import decode_normals, encode_normals
 from reli3d.geometry.uv import unwrap
+from reli3d.io.glb import write_glb
+from reli3d.render.asset import Asset, TextureSet
+from reli3d.render.color import srgb_to_linear
 from tests.support.texels import bilinear, color
 
 SIZE = 256
@@ -121,6 +124,37 @@ def test_known_color_reads_back(sphere):
     # a texel is 0.022 long here: bilinear errs by 3.6 * h^2 / 8 = 2e-4 inside, border texels hold a point up to h away
     assert error.mean() < 0.2 / 255
     assert error.max() < 1.2 * 1.5 * 0.022 * 1.8
+
+
+def test_known_color_reads_back_through_the_file_at_every_mip(sphere, tmp_path):
+    def material(p, n, t):
+        one = torch.ones_like(p[:, :1])
+        return {
+            "base_color": srgb_to_linear(color(p)),
+            "roughness": one,
+            "metallic": one,
+            "normal": encode_normals(n, n, t),
+        }
+
+    write_glb(tmp_path / "ball.glb", Asset(sphere, TextureSet(**bake(sphere, SIZE, material, tangents=True))))
+    read = trimesh.load(tmp_path / "ball.glb", force="mesh", process=False)
+    image = np.asarray(read.visual.material.baseColorTexture.convert("RGB")) / 255.0
+    rng = np.random.default_rng(2)
+    w, face = rng.dirichlet((1, 1, 1), 50_000)[:, :, None], read.faces[rng.integers(0, len(read.faces), 50_000)]
+    uv = (read.visual.uv[face] * w).sum(1) * [1, -1] + [0, 1]  # trimesh turns v up
+    expected = color(torch.from_numpy((np.asarray(read.vertices)[face] * w).sum(1))).numpy()
+    # 8 bit: a quarter of a step on average; the bake itself stays under a fifth (see above)
+    assert np.abs(bilinear(image, uv) - expected).mean() < 0.5 / 255
+    while image.shape[0] >= 64:  # colors are at least 0.1: whatever is darker was never written
+        assert image.min() > 0.1 - 0.6 / 255
+        image = 0.25 * (image[::2, ::2] + image[1::2, ::2] + image[::2, 1::2] + image[1::2, 1::2])
+
+
+def test_constant_survives_every_mip_down_to_64(sphere):
+    image = bake(sphere, SIZE, lambda p, n: torch.full_like(p, 0.25))["value"].permute(2, 0, 1)[None]
+    while image.shape[-1] >= 64:
+        assert float(image.min()) == float(image.max()) == 0.25  # no texel was left black, so no mean mixes one in
+        image = torch.nn.functional.avg_pool2d(image, 2)
 
 
 def test_chunks_and_reused_texels_do_not_matter(sphere):

@@ -278,9 +278,11 @@ def test_primaries_of_a_radiance_image_are_converted(tmp_path):
     np.testing.assert_allclose(got, stored @ np.array(TO_REC709[REC2020]).T, rtol=0, atol=2e-4)
 
 
-def test_primaries_of_zero_are_none(tmp_path):
+@pytest.mark.parametrize("zero", [b"0", b"0.0000"])
+def test_primaries_of_zero_are_none(tmp_path, zero):
     """Photoshop's header, as of Poly Haven's studio_small_03_1k.hdr."""
-    header = b"#?RADIANCE\n# Made with Adobe Photoshop\nGAMMA=1\nPRIMARIES=0 0 0 0 0 0 0 0\nFORMAT=32-bit_rle_rgbe\n\n"
+    header = b"#?RADIANCE\n# Made with Adobe Photoshop\nGAMMA=1\nPRIMARIES=%s\nFORMAT=32-bit_rle_rgbe\n\n"
+    header %= b" ".join([zero] * 8)
     got, expected = (
         round_trip(tmp_path / "a.hdr", "-Y 6 +X 12", QUADS.tobytes(), h) for h in (header, b"#?RADIANCE\n\n")
     )

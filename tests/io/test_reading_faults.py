@@ -17,7 +17,7 @@ from reli3d.io.glb import read_glb
 from reli3d.io.hdr import read_environment, read_hdr_image
 from reli3d.io.images import read_image
 from reli3d.nn.presets import OFFICIAL, SMALL, from_json, to_json
-from reli3d.nn.weights import read_manifest
+from reli3d.nn.weights import WeightsError, read_manifest
 from reli3d.views.folder import intrinsics_of
 from reli3d.views.frames import Lens, nearest_rigid
 from reli3d.views.transforms import read_json, read_transforms
@@ -207,6 +207,25 @@ def test_glb_fields(tmp_path, fields, word):
     assert len(read_glb(glb(tmp_path / "good.glb"))) == 1
     with pytest.raises(InputError, match=word):
         read_glb(glb(tmp_path / "bad.glb", **fields))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"shape": [1.0]},
+        {"shape": ["1"]},
+        {"shape": [True]},
+        {"data_offsets": [0.0, 4]},
+        {"data_offsets": ["0", "4"]},
+        {"data_offsets": [0, 1e400]},
+        {"data_offsets": [0]},
+    ],
+)
+def test_headers_of_weights_hold_integers(tmp_path, change):
+    header = json.dumps({"x": {"dtype": "F32", "shape": [1], "data_offsets": [0, 4], **change}}).encode()
+    (tmp_path / "w").write_bytes(len(header).to_bytes(8, "little") + header + bytes(4))
+    with pytest.raises(WeightsError):
+        read_manifest(tmp_path / "w")
 
 
 def test_presets_of_absurd_size_or_depth_are_refused():

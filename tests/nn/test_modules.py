@@ -1,4 +1,4 @@
-"""What official sizes add to the published system of tests/nn/test_model.py: positions, heads, cube weights."""
+"""Modules of the network against inputs, parameters and outputs of the published model's modules."""
 
 import numpy as np
 import pytest
@@ -6,13 +6,15 @@ import torch
 
 from reli3d.geometry.triplane import sample_triplane
 from reli3d.nn import transformer
-from reli3d.nn.camera import camera_vector
+from reli3d.nn.camera import CameraEmbedder, camera_vector
 from reli3d.nn.heads import HEADS, Heads, WeightMerger
-from reli3d.nn.presets import BackboneSizes
+from reli3d.nn.illumination import Illumination, Transformer1D
+from reli3d.nn.presets import BackboneSizes, EncoderSizes, IlluminationSizes, UpsamplerSizes
 from reli3d.nn.published import our_key
 from reli3d.nn.reni import rotation_from_6d
-from reli3d.nn.tokenizers import resample_positions
+from reli3d.nn.tokenizers import ImageTokenizer, patch_grid, resample_positions
 from reli3d.nn.transformer import TwoStreamTransformer
+from reli3d.nn.upsample import PixelShuffleUpsampler
 
 SHALLOW = dict(rtol=1e-5, atol=1e-5)  # one to four float32 layers with sums of at most a few hundred terms
 # blocks of attention and norms; the goldens differ by about 1e-5 of the largest value
@@ -48,11 +50,32 @@ def assert_relative(got, expected, bound):
     assert error < bound, f"relative error {error:.2e}, bound {bound:.0e}"
 
 
+@torch.no_grad()
+def test_camera_embedding_matches_published(golden):
+    g = golden("camera_embedder")
+    module = g.load(CameraEmbedder(64), "preprocessor.1.", "camera.")
+    numbers = torch.cat([g["c2w"].flatten(-2), g["intrinsics_normed"].flatten(-2)], dim=-1)
+    torch.testing.assert_close(module(numbers), g["out"], **SHALLOW)
+
+
 def test_camera_vector_holds_both_matrices_row_by_row():
     c2w = torch.arange(16.0).reshape(1, 1, 4, 4)
     vector = camera_vector(c2w, torch.tensor([[[512.0, 256.0, 250.0, 260.0]]]), 500)[0, 0]
     expected = [1.024, 0, 0.5, 0, 0.512, 0.52, 0, 0, 1]
     torch.testing.assert_close(vector, torch.cat([torch.arange(16.0), torch.tensor(expected)]))
+
+
+DINO = EncoderSizes(hidden=48, layers=2, heads=3, patch=14, grid=7, mask_channel=False)
+
+
+@torch.no_grad()
+def test_image_tokens_match_published(golden):
+    g = golden("dinov2_tokenizer_small")
+    module = g.load(ImageTokenizer(DINO, 48), "tokenizer.0.", "encoder.")
+    tokens = module(g["image"], g["camera_embedding"])
+    assert_relative(tokens, g["out"], 1e-5)
+    assert patch_grid(tokens).shape == (1, 2, 5, 5, 48)
+    torch.testing.assert_close(patch_grid(tokens)[0, 1, 2, 3], tokens[0, 1, 1 + 2 * 5 + 3])
 
 
 @torch.no_grad()
@@ -64,6 +87,22 @@ def test_position_resampling_uses_the_published_factor(golden):
 
 
 @torch.no_grad()
+def test_two_streams_match_published(golden):
+    g = golden("two_stream_small")
+    sizes = BackboneSizes(heads=4, latents=12, blocks=3, basic_blocks=2, experts=3, experts_from=1, groups=8)
+    module = g.load(TwoStreamTransformer(sizes, 32), "backbone.", "backbone.")
+    logits = []
+    router = module.main_blocks[1].transformer_block[0].ff.routing_network
+    router.register_forward_hook(lambda _module, _inputs, output: logits.append(output))
+    out = module(g["input"].squeeze(1), g["cross"])
+    assert_relative(out, g["out"].squeeze(1), 1e-5)
+    assert_relative(logits[0], g["router_logits_block1_basic0"], 1e-5)
+    shared = module(g["input"][:1].squeeze(1), g["cross"])  # one bank for the whole batch: the same as repeating it
+    repeated = module(g["input"][:1].squeeze(1).repeat(2, 1, 1), g["cross"])
+    torch.testing.assert_close(shared, repeated, **SHALLOW)
+
+
+@torch.no_grad()
 def test_feed_forward_in_chunks_is_the_same(golden, monkeypatch):
     g = golden("two_stream_small")
     sizes = BackboneSizes(heads=4, latents=12, blocks=3, basic_blocks=2, experts=3, experts_from=1, groups=8)
@@ -71,6 +110,39 @@ def test_feed_forward_in_chunks_is_the_same(golden, monkeypatch):
     monkeypatch.setattr(transformer, "CHUNK_NUMBERS", 5 * 2 * 4 * 32)  # five tokens of 32 numbers at a time
     monkeypatch.setattr(transformer, "CONFLICT", 32)
     assert_relative(module(g["input"].squeeze(1), g["cross"]), g["out"].squeeze(1), 1e-5)
+
+
+def illumination_sizes(**changes):
+    encoder = EncoderSizes(hidden=24, layers=2, heads=2, patch=14, grid=7, mask_channel=True)
+    values = dict(encoder=encoder, tokens=78, token_width=32, width=32, heads=4, layers=2, groups=4)
+    return IlluminationSizes(**{**values, **changes})
+
+
+@torch.no_grad()
+def test_token_transformer_matches_published(golden):
+    g = golden("transformer1d_small")
+    module = Transformer1D(illumination_sizes(layers=3))
+    g.load(module, "postprocessor.1.backbone.", "illumination.transformer.")
+    assert_relative(module(g["input"], g["cross"]), g["out"], 1e-5)
+
+
+@torch.no_grad()
+def test_illumination_path_matches_published(golden):
+    g = golden("env_postprocessor_small")
+    module = g.load(Illumination(illumination_sizes(groups=16), 49, 40, 16), "postprocessor.1.", "illumination.")
+    images, mask = g["image"] * g["mask"], g["mask"].movedim(-1, 2)
+    latent, rotation, strength = module(images, mask, g["camera_embedding"], g["triplane_raw"])
+    assert_relative(latent, g["reni_latent"], 1e-5)
+    torch.testing.assert_close(rotation, g["rotation"], **DEEP)
+    torch.testing.assert_close(strength, g["strength"].squeeze(1), **DEEP)
+
+
+@torch.no_grad()
+def test_upsampling_matches_published(golden):
+    g = golden("pixel_shuffle_small")
+    module = PixelShuffleUpsampler(UpsamplerSizes(convolutions=4, scale=4, channels=5), 16)
+    g.load(module, "postprocessor.0.", "upsampler.")
+    assert_relative(module(g["triplane"]), g["out"], 1e-5)
 
 
 def test_rotations_match_published_and_return(golden):

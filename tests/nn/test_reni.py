@@ -40,6 +40,17 @@ def test_maps_match_published(decoder, golden):
 
 
 @torch.no_grad()
+def test_intermediate_features_match_published(decoder, golden):
+    g = golden("reni_decoder")
+    # the published angles are float32
+    torch.testing.assert_close(decoder.sample_directions, g["sample_directions"], rtol=0, atol=5e-7)
+    turned = g["latent"] @ g["rotation"].mT
+    torch.testing.assert_close(decoder.field.conditioning(turned), g["conditioning"], rtol=1e-5, atol=1e-6)
+    features = decoder.field.directional(turned, g["sample_directions"][None, ::512])
+    torch.testing.assert_close(features, g["directional_first16"], rtol=1e-5, atol=2e-6)
+
+
+@torch.no_grad()
 def test_map_turned_about_the_vertical_matches_published(decoder, golden):
     g = golden("reni_decoder_zrot")
     out = decoder(g["latent"], g["rotation"], g["strength"], z_rotation=g["z_rotation_rads"].reshape(1))

@@ -34,7 +34,7 @@ def test_unseen_views_are_far_from_those_taken_and_show_all(asset, azimuths, lea
     to = torch.nn.functional.normalize(torch.stack([c.c2w[:3, 3] for c in unseen]) - 2.0, dim=-1)
     given = torch.nn.functional.normalize(cameras[:, :3, 3] - 2.0, dim=-1)
     angle = torch.rad2deg(torch.acos((to @ given.T).clamp(-1, 1)))
-    assert float(angle.min()) > least, angle.amin(1)  # places 15 degrees apart
+    assert float(angle.min()) > least, angle.amin(1)  # 15 degrees between places
     assert float((to @ to.T - 2 * torch.eye(4)).max()) < math.cos(math.radians(29.0))  # and from each other
     for camera in unseen:
         pixels, depth = project(asset.mesh.vertices, camera.c2w, camera.intrinsics)

@@ -1,4 +1,4 @@
-"""One capture in the forms of several programs."""
+"""One capture in the words of several programs, and a capture of many photographs from one place."""
 
 import json
 import math
@@ -6,11 +6,18 @@ import shutil
 import struct
 from pathlib import Path
 
+import numpy as np
+import pytest
 import torch
+import trimesh
+from PIL import Image
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 import reli3d
+from reli3d.pipeline import ReconstructOptions, reconstruct
 from reli3d.views.folder import load_views
+from tests.support.rigs import sphere_views
 
 EXAMPLE = Path(reli3d.__file__).parent / "assets/example"
 FORMS = ("release", "nerfstudio", "instant-ngp", "colmap_text", "colmap_binary")
@@ -91,3 +98,63 @@ def test_every_form_gives_the_same_cameras_and_images(tmp_path):
         torch.testing.assert_close(views.intrinsics, first.intrinsics, rtol=1e-6, atol=0)
         assert all(torch.equal(a, b) for a, b in zip(views.images, first.images))
         assert all(torch.equal(a, b) for a, b in zip(views.masks, first.masks))
+
+
+def distance(a: torch.Tensor, b: torch.Tensor) -> float:
+    """Mean distance of points to the nearest of the others, both ways."""
+    ways = cKDTree(b.numpy()).query(a.numpy())[0].mean(), cKDTree(a.numpy()).query(b.numpy())[0].mean()
+    return float(np.mean(ways))
+
+
+def mean_base_color(asset) -> torch.Tensor:
+    """Mean base color at the vertices."""
+    at = (asset.mesh.uv * asset.textures.size).long().clamp(0, asset.textures.size - 1)
+    return asset.textures.base_color[at[:, 1], at[:, 0]].mean()
+
+
+@pytest.mark.slow
+def test_every_form_gives_the_same_asset(tmp_path):
+    options = ReconstructOptions(texture_size=256, resolution=40)
+    first, *others = (reconstruct(load_views(write_form(tmp_path / form, form)), options=options) for form in FORMS)
+    for asset in others:
+        # cameras differ in the last bit of float32, which a network and a surface carry on
+        assert distance(asset.mesh.vertices, first.mesh.vertices) < 1e-4
+        # the mean over the vertices: where charts end, the next texel may be another
+        assert float(mean_base_color(asset)) == pytest.approx(float(mean_base_color(first)), rel=1e-2)
+        light = float(first.environment.radiance.mean())
+        assert float(asset.environment.radiance.mean()) == pytest.approx(light, rel=1e-2)
+
+
+@pytest.mark.slow
+def test_many_photographs_from_one_place_do_not_hide_the_others(tmp_path):
+    """60 views, 57 of them within 2 degrees, give the surface of the four that differ: mean distance below 0.01."""
+    four = torch.tensor([[0.0, 0.6, 2.1], [2.1, 0.5, -0.3], [-0.4, 0.9, -2.0], [-2.0, 0.2, 0.6]], dtype=torch.float64)
+    near = four[0] + 0.03 * torch.randn(56, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    meshes = {}
+    for name, eyes in (("four", four), ("sixty", torch.cat([four[:1], near, four[1:]]))):
+        views = sphere_views(eyes=eyes, size=(128, 128))
+        (tmp_path / name).mkdir()
+        frames = []
+        for k, (image, mask) in enumerate(zip(views.images, views.masks)):
+            pixels = torch.cat([image, mask[..., None]], -1).mul(255).round().byte().numpy()
+            Image.fromarray(pixels).save(tmp_path / name / f"{k}.png")
+            fx, fy, cx, cy = views.intrinsics[k].double().tolist()
+            frames.append(
+                {
+                    "file_path": f"{k}.png",
+                    "transform_matrix": views.c2w[k].double().tolist(),
+                    "fl_x": fx,
+                    "fl_y": fy,
+                    "cx": cx,
+                    "cy": cy,
+                    "w": 128,
+                    "h": 128,
+                }
+            )
+        (tmp_path / name / "transforms.json").write_text(json.dumps({"frames": frames}))
+        loaded = load_views(tmp_path / name)
+        assert len(loaded) <= 16 and loaded.in_folder == len(eyes)
+        mesh = reconstruct(loaded, options=ReconstructOptions(texture_size=256, resolution=48)).mesh
+        solid = trimesh.Trimesh(mesh.vertices.numpy(), mesh.faces.numpy(), process=False)
+        meshes[name] = torch.from_numpy(trimesh.sample.sample_surface(solid, 20000, seed=0)[0])
+    assert distance(meshes["four"], meshes["sixty"]) < 0.01  # the sampling alone gives 0.004

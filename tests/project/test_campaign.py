@@ -12,6 +12,7 @@ import pytest
 
 from reli3d.io.glb import read_glb
 from reli3d.io.hdr import read_hdr_image
+from reli3d.output.folder import claimed
 from reli3d.views.folder import load_views
 from reli3d.views.views import Views
 from tests import campaign
@@ -21,6 +22,7 @@ from tests.support.misread import Misread
 from tests.support.readers import Target, targets
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="needs fork and /proc")
+NAMES = ("a", "b", "c")
 
 
 @pytest.fixture
@@ -109,3 +111,32 @@ def test_an_input_read_as_another_fails(tmp_path, small_threads, monkeypatch):
 def faded(views: Views) -> Views:
     masks = tuple(mask / 2 for mask in views.masks)
     return dataclasses.replace(views, masks=masks, c2w=views.c2w.roll(1, 0))
+
+
+@pytest.mark.parametrize("kills", [10, pytest.param(200, marks=pytest.mark.slow)])
+def test_kills_at_random_moments_leave_one_whole_result(tmp_path, kills):
+    """A process that exchanges results as fast as it can, killed at random moments."""
+    folder, rng, seen = tmp_path / "out" / "name", Random(7), set()
+    for k in range(kills):
+        pid = os.fork()
+        if pid == 0:
+            try:
+                for word in range(10**9):
+                    with claimed(folder, NAMES) as replacing, replacing() as new:
+                        for name in NAMES:
+                            (new / name).write_text(f"{os.getpid()} {word}")
+            finally:
+                os._exit(1)
+        while k % 2 and not (folder.exists() and (folder / NAMES[0]).read_text().startswith(f"{pid} ")):
+            time.sleep(0.001)  # until it wrote a result
+        time.sleep(rng.uniform(0.0, 0.05))
+        os.kill(pid, signal.SIGKILL)
+        os.waitpid(pid, 0)
+        if folder.exists():  # the state for other processes
+            assert len({(folder / name).read_text() for name in NAMES}) == 1
+        with claimed(folder, NAMES):  # the next start
+            words = {(folder / name).read_text() for name in NAMES} if folder.exists() else {"none"}
+        assert len(words) == 1
+        seen |= words
+        assert not folder.parent.exists() or {p.name for p in folder.parent.iterdir()} <= {"name"}
+    assert len(seen) >= kills // 2

@@ -35,6 +35,13 @@ def directional_albedo(alpha, cos_o, side=1000):
     return float(np.where(seen, 2 * s * dot / (cos_o * cos_m) / (1 + lam[0] + lam[1]), 0.0).mean())
 
 
+def test_the_albedo_of_the_quadrature_has_converged():
+    for roughness, cos_o in ((0.05, 0.05), (0.3, 0.05), (1.0, 0.05), (1.0, 1.0)):
+        coarse, fine = (directional_albedo(roughness**2, cos_o, side) for side in (1000, 2000))
+        assert abs(coarse - fine) < QUADRATURE
+    assert abs(directional_albedo(1e-3, 1.0) - 1.0) < 1e-5  # a mirror
+
+
 def test_white_metal_sends_out_its_directional_albedo_and_never_more_than_comes_in(device):
     light, z = Environment.constant(torch.ones(3, device=device)), []
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from reli3d.render.material import DIFFUSE_MODELS, eval_bsdf, pdf_lobes, sample_bsdf
+from reli3d.render.material import DIFFUSE_MODELS, eval_bsdf, pdf_bsdf, pdf_lobes, sample_bsdf
 from reli3d.render.sampling import pdf_ggx_vndf, sample_ggx_vndf, tangent_frame
 from tests.support import mitsuba_scene, reference
 
@@ -53,6 +53,21 @@ def test_reciprocity(device, diffuse_model):
         wo, wi, *rest = (v.to(device) for v in pairs(100_000, 1, alpha=alpha))
         a, b = (eval_bsdf(o, *rest, i, diffuse_model=diffuse_model) for o, i in ((wo, wi), (wi, wo)))
         torch.testing.assert_close(a, b, rtol=1e-5, atol=0)  # equal bit for bit on a CPU
+
+
+def test_energy_is_never_created(device):
+    g = torch.Generator().manual_seed(2)
+    n = 40_000
+    for alpha in (1e-3, 0.05, 0.3, 1.0):
+        for cos_o in (1e-3, 0.3, 1.0):
+            wo = torch.tensor([(1 - cos_o**2) ** 0.5, 0.0, cos_o], device=device)
+            a, one = torch.tensor(alpha, device=device), torch.ones((), device=device)
+            wi = sample_bsdf(wo, a, torch.rand(n, 2, generator=g).to(device))
+            pdf = pdf_bsdf(wo, a, wi)
+            value = eval_bsdf(wo, torch.ones(3, device=device), a, one, wi)[:, 0] * wi[:, 2] / pdf.clamp(min=1e-20)
+            weight = torch.where(pdf > 0, value, 0.0)
+            assert float(weight.max()) <= 1.0 + 1e-3  # G2 / G1 of a metal of reflectance 1
+            assert float(weight.mean()) <= 1.0
 
 
 @pytest.mark.parametrize("diffuse_model", DIFFUSE_MODELS)

@@ -17,6 +17,7 @@ from reli3d.render.gbuffer import sample_texture, surface_points
 from reli3d.render.image import render_asset, render_lights
 from reli3d.render.material import DIFFUSE_MODELS
 from reli3d.render.shading import ShadeOptions, shade, shade_lights
+from tests.support import reference
 from tests.support.scenes import ball, eye, shadow_caster, sky, textures
 from tests.support.surfaces import inputs, on_ball
 
@@ -46,6 +47,28 @@ def test_rays_and_projection_are_inverse(device):
         Camera(torch.zeros(7, 4, 4), torch.zeros(8, 4), 4, 4)
     with pytest.raises(ValueError, match="up: expected"):
         look_at(*(torch.tensor([0.0, k, 0.0], device=device) for k in (1.0, 0.0, 1.0)))
+
+
+def test_texture_lookup_is_bilinear_and_repeats(device):
+    t = torch.rand(8, 8, 3, generator=torch.Generator().manual_seed(0)).to(device).requires_grad_()
+    k = (torch.arange(8, device=device) + 0.5) / 8
+    grid = torch.stack(torch.meshgrid(k, k, indexing="ij")[::-1], -1)
+    torch.testing.assert_close(sample_texture(t, grid), t, rtol=0, atol=1e-6)
+    torch.testing.assert_close(sample_texture(t, grid + torch.tensor([3.0, -2.0], device=device)), t, rtol=0, atol=1e-5)
+    uv = torch.rand(5000, 2, generator=torch.Generator().manual_seed(1)).to(device).requires_grad_()
+    padded = torch.nn.functional.pad(t.double().permute(2, 0, 1)[None], (1, 1, 1, 1), mode="circular")
+    expected = torch.nn.functional.grid_sample(
+        padded, ((uv.double() * 8 + 1) / 10 * 2 - 1)[None, None], align_corners=False
+    )
+    got = sample_texture(t, uv)
+    torch.testing.assert_close(got.double(), expected[0, :, 0].T, rtol=0, atol=1e-5)
+    weight = torch.randn(5000, 3, generator=torch.Generator().manual_seed(2)).to(device)
+    for a, b in zip(
+        torch.autograd.grad((got * weight).sum(), (t, uv)),
+        torch.autograd.grad((expected[0, :, 0].T * weight.double()).sum(), (t, uv)),
+        strict=True,
+    ):
+        assert reference.fraction_within(a, b) >= 0.999
 
 
 @pytest.mark.parametrize("explicit", [True, False])
