@@ -282,13 +282,14 @@ class ReconstructOptions:
     bounding box of the visual hull is centered and its longest side scaled to 1.  ``none``: poses as stored.  ``auto``:
     by ``views.object_box`` if there is one; else poses as stored if the visual hull lies in the cube, near its center
     and not much smaller (:func:`~reli3d.views.normalize.normalize`); else ``hull``.  A
-    :class:`~reli3d.views.similarity.Similarity` is used as the map from the input to the model frame.  None: ``auto``,
-    for the published network ``none``.  up: axis of the cameras' world frame that becomes +Y, ``x``, ``y``, ``z`` or
-    one with a minus sign.  uv: method of unwrapping, ``project`` or ``xatlas``.  hero: index of the reference view.
-    background: image region that the lighting estimate reads, ``masked`` (the object only), ``visible`` (the background
-    too) or ``auto`` (``visible`` if all views have a background and the weights were trained with it, else
-    ``masked``).  symmetry: ``auto`` completes objects with a detected mirror plane (bundled network only), or ``off``.
-    Raises InputError for a wrong value; ``hero`` is checked when views are given.
+    :class:`~reli3d.views.similarity.Similarity` is used as the map from the input to the model frame.  If it is not
+    given (Python None): ``auto`` for the bundled network, ``none`` for the published one.  up: axis of the cameras'
+    world frame that becomes +Y, ``x``, ``y``, ``z`` or one with a minus sign.  uv: method of unwrapping, ``project`` or
+    ``xatlas``.  hero: index of the reference view. background: image region that the lighting estimate reads,
+    ``masked`` (the object only), ``visible`` (the background too) or ``auto`` (``visible`` if all views have a
+    background and the weights were trained with it, else ``masked``).  symmetry: ``auto`` completes objects with a
+    detected mirror plane (bundled network only), or ``off``. Raises InputError for a wrong value; ``hero`` is checked
+    when views are given.
 
     >>> options = reli3d.ReconstructOptions(texture_size=512, symmetry="off")
     >>> asset = reli3d.reconstruct(reli3d.load_views("photos/shoe"), options=options)

@@ -102,12 +102,12 @@ def render_asset(
     ``image.radiance``, not ``image.rgba``.  scene: a :class:`RayScene` of the mesh or, for several assets, of all their
     meshes concatenated in the order of the list; None: it is built.  progress: called with the completed fraction.
 
-    Gradients are those of :func:`surface_points` and :func:`shade` with the hit points (face and barycentric
-    coordinates) and visibility constant.  Radiance has gradients to the textures, the texels of the environment, and
-    the mesh's normals, tangents, colors and UV; to the vertex positions only if the mesh has no vertex normals: shading
-    then uses the face normals, which depend on the positions.  The G-buffers have gradients to the textures and the
-    mesh, depth also to the camera.  ``alpha`` has none: silhouettes and shadow boundaries do not contribute (see
-    :func:`antialias`).
+    Hit points (face and barycentric coordinates) and visibility are treated as constant; otherwise the gradients are
+    those of :func:`surface_points` and :func:`shade`.  Radiance has gradients to the textures, the texels of the
+    environment, and the mesh's normals, tangents, colors and UV; to the vertex positions only if the mesh has no vertex
+    normals: shading then uses the face normals, which depend on the positions.  The G-buffers have gradients to the
+    textures and the mesh, depth also to the camera.  ``alpha`` has none: silhouettes and shadow boundaries do not
+    contribute (see :func:`antialias`).
 
     Raises TypeError for a wrong type; ValueError if no environment is given and no asset has one, if ``background``
     is not one of the two values, if ``camera`` is a batch, or if there are textures without ``mesh.uv``.

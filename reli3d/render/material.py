@@ -67,13 +67,13 @@ def sample_bsdf(wo: Tensor, alpha: Tensor, u: Tensor, *, lobe: str = "visible") 
     wo: ``(..., 3)`` unit, local frame, z > 0; otherwise all directions have density 0.  alpha: tensor ``(...)``, GGX
     width ``roughness**2``.  u: ``(..., 2)`` uniform in [0, 1).  Leading axes broadcast.  lobe: ``visible`` (reflection
     at a visible normal), ``mirrored`` (at that normal rotated by pi about the surface normal) or ``cosine``. Directions
-    below the horizon, and those of a mirrored normal that faces away from ``wo``, have value and density 0. Antithetic
-    pairs: ``visible`` with ``u`` and :func:`reli3d.antithetic` of ``u``, averaged; or, as in ReLi3D, ``visible`` and
-    ``mirrored`` with the same ``u``: divide the value times cosine of each sample by the sum of both lobes' densities
-    at its direction, and add the two quotients; ``mirrored`` alone does not reach all directions.  Gradients reach
-    ``wo`` and ``alpha``, but :func:`pdf_bsdf` has none: detach the directions to differentiate a Monte Carlo estimate.
-    Raises TypeError unless float32, ValueError for a wrong shape or device, or an unknown lobe.  Source: Dupuy and
-    Benyoub 2023.
+    below the horizon, and those of a mirrored normal that faces away from ``wo``, have value and density 0. There are
+    two antithetic pairs.  (1) ``visible`` with ``u`` and with ``antithetic(u)``: average the two estimates.  (2) As in
+    ReLi3D, ``visible`` and ``mirrored`` with the same ``u``: for each sample divide the value times cosine by the sum
+    of both lobes' densities at its direction, then add the two quotients.  Do not use ``mirrored`` alone: it does not
+    reach all directions.  Gradients reach ``wo`` and ``alpha``, but :func:`pdf_bsdf` has none: detach the directions to
+    differentiate a Monte Carlo estimate. Raises TypeError unless float32, ValueError for a wrong shape or device, or an
+    unknown lobe.  Source: Dupuy and Benyoub 2023.
 
     >>> wi = reli3d.sample_bsdf(wo, alpha, u).detach()
     >>> density = reli3d.pdf_bsdf(wo, alpha, wi).clamp(min=1e-12)  # 0 below the horizon, where the value is 0 too
@@ -96,8 +96,8 @@ def pdf_bsdf(wo: Tensor, alpha: Tensor, wi: Tensor, *, lobe: str = "visible") ->
     wo, wi: ``(..., 3)`` unit, local frame.  alpha: tensor ``(...)``, GGX width.  Leading axes broadcast.  lobe: as in
     :func:`sample_bsdf`.  No gradient, so detach ``wi`` to differentiate an estimate; :func:`pdf_ggx_vndf` has
     gradients.  The density can be 0: clamp it before dividing.  For ``visible`` and ``cosine`` this adds no bias,
-    because the BSDF is 0 there too; ``mirrored`` does not reach all directions.  Raises TypeError unless float32,
-    ValueError for a wrong shape or device, or an unknown lobe.
+    because the BSDF is 0 there too.  With ``mirrored`` alone an estimate is biased: combine it with ``visible``.
+    Raises TypeError unless float32, ValueError for a wrong shape or device, or an unknown lobe.
 
     >>> wi = reli3d.sample_bsdf(wo, alpha, u)
     >>> density = reli3d.pdf_bsdf(wo, alpha, wi)

@@ -80,13 +80,13 @@ def pdf_ggx_vndf(wo: Tensor, alpha: Tensor, wm: Tensor) -> Tensor:
 
 
 def antithetic(u: Tensor) -> Tensor:
-    """Random numbers ``(..., 2)`` of the antithetic partners of visible-normal samples with ``u (..., 2)``.
+    """Maps the random numbers ``u (..., 2)`` of visible-normal samples to those of their antithetic partners.
 
     ``((u1 + 1/2) mod 1, 1 - 2^-24 - u2)``: the partner is on the opposite side of the lobe.  Uniform if ``u`` is.  For
     multiples of 2^-24 the map is exact and its own inverse.  The mean of both samples has less variance than that of
-    two independent ones if the integrand is nearly odd about the center of the lobe, as are derivatives in ``alpha``
-    and the normal.  Samplers treat ``u`` as a constant, so gradients are not needed.  Raises TypeError unless float32,
-    ValueError for a wrong shape.
+    two independent ones if the integrand nearly changes sign between the partners, as derivatives with respect to
+    ``alpha`` or the normal do.  Samplers treat ``u`` as a constant, so gradients are not needed.  Raises TypeError
+    unless float32, ValueError for a wrong shape.
 
     >>> partners = reli3d.antithetic(u)
     >>> first, second = (reli3d.sample_bsdf(wo, alpha, v) for v in (u, partners))
