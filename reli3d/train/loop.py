@@ -104,7 +104,7 @@ def train(stage: Stage, options: Options, workers: Workers | None = None) -> Non
     trained = [p for group in groups for p in group["params"]]
     # torch's kernels for many tensors at once do not mix sharded and whole tensors
     kernels = {"foreach": False} if options.shard else {"fused": True}
-    optimizer = torch.optim.AdamW(groups, lr=options.rate, betas=(0.9, 0.98), **kernels)
+    optimizer = stage.optimizer(groups, lr=options.rate, betas=(0.9, 0.98), **kernels)
     step, seconds, average = 0, 0.0, {k: v.detach().clone() for k, v in model.state_dict().items()}
     if state:
         step, seconds = state["step"], state["seconds"]

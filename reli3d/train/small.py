@@ -19,6 +19,7 @@ from reli3d.pipeline import NoSurface, ReconstructOptions, reconstruct
 from reli3d.synthetic.maps import training_maps
 from reli3d.train.batches import draw_samples, stored_views
 from reli3d.train.losses import PIXEL_TERMS, WEIGHTS, losses, pixel_losses
+from reli3d.train.muon import Muon
 from reli3d.train.pixels import ViewCache, draw_group, is_pixel_parameter
 from reli3d.train.stage import Stage
 
@@ -35,6 +36,7 @@ class SmallStage(Stage):
     name = "small"
     weights: dict[str, float] = WEIGHTS
     settings: dict[str, Any] = {}
+    optimizer = Muon
     model: LocalReconstructor
 
     def __init__(

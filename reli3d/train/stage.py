@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor, nn
 
 
@@ -44,6 +45,7 @@ class Stage(ABC):
     model: Any  # torch.nn.Module with ``preset``
     weights: Mapping[str, float]  # of the terms of ``losses``
     settings: Mapping[str, Any]  # defaults of :class:`Options` for this stage
+    optimizer: type[torch.optim.AdamW] = torch.optim.AdamW
 
     @abstractmethod
     def batch(self, step: int, objects: range) -> Sequence[Any]:
