@@ -146,7 +146,7 @@ def write_results(
     ``run_info.json``, to which the convention of the environment is added. comparison: sheet of a refinement.
     """
     light = encoded.asset.light
-    info = {**info, "environment_center": "+X"}
+    info = {**info, "environment_centre": "+X"}  # a key that other programs read
     with replacing() as new:
         (new / "preview.png").write_bytes(png_bytes(sheet))
         (new / "mesh.glb").write_bytes(encoded.placed())
