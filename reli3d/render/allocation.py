@@ -1,4 +1,4 @@
-"""Allocation of samples to the strategies of direct lighting by the variances of a pilot."""
+"""Allocates samples to the strategies of direct lighting by variances estimated in a pilot run."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ BLOCK_VALUES = 1 << 17  # samples times candidates evaluated at once: arrays of 
 class SamplePlan:
     """Sample counts for :func:`reli3d.render.shading.shade` with ``antithetic="none"``, and the expected variance.
 
-    variance: of the radiance with independent samples, summed over the channels, mean over the points; relative to the
-    squared radiance if the plan is ``relative``.
+    samples: counts of light, BSDF and cosine samples.  variance: variance of the radiance with independent samples,
+    summed over the channels and averaged over the points; relative to the squared radiance if the plan is ``relative``.
     """
 
     samples: tuple[int, int, int]
@@ -59,13 +59,13 @@ def plan_samples(
 ) -> SamplePlan:
     """Divides ``total`` samples among the three strategies to minimize the variance at ``points``.
 
-    Arguments are those of :func:`reli3d.render.shading.shade`, with at least one point; of ``options`` only ``seed``,
-    ``sequence``, ``alpha`` and ``diffuse_model`` are used.  One plan minimizes the sum of the variances of all points;
-    relative: of the variances divided by the squared radiance.  The variance of any split is estimated from a pilot of
-    PILOT_SAMPLES samples.  For images, not for optimization: a plan may omit a strategy that gradients need.
+    points (at least one), wo, environment, scene: as in :func:`reli3d.render.shading.shade`.  options: only ``seed``,
+    ``sequence``, ``alpha`` and ``diffuse_model`` are used.  relative: False minimizes the variances summed over all
+    points; True first divides each variance by the squared radiance.  Variances are estimated in a pilot run of
+    PILOT_SAMPLES samples.  Use plans for images, not for optimization: a plan may omit a strategy that gradients need.
 
-    No gradient.  Deterministic for a given seed.  Raises TypeError for a wrong dtype, ValueError for a wrong shape,
-    device, count, choice or values that are not finite.
+    No gradient.  Deterministic for a given seed.  Raises TypeError for a wrong dtype; ValueError for a wrong shape,
+    device, count or choice, or for non-finite values.
     """
     values = [v.detach() for v in shaded_arrays(points, wo, environment, scene, options)]
     if len(points) == 0:
@@ -94,7 +94,7 @@ def plan_samples(
 
 
 def spread_rows(n: int, count: int, seed: int) -> Tensor:
-    """Stratified row indices: one random row in each of ``count`` equal intervals of ``n`` rows; int64."""
+    """Stratified int64 row indices: one random row from each of ``count`` equal intervals of ``n`` rows."""
     return (_spread(count, seed) * n).long().clamp(max=n - 1)
 
 

@@ -1,4 +1,4 @@
-"""Asset: a mesh with textures and an environment."""
+"""Assets: a mesh with textures and an environment."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ KEPT = 2048  # texels a side up to which lookups are kept: 50 MB
 
 @dataclass(frozen=True, repr=False)
 class TextureSet:
-    """Metallic-roughness textures of one mesh: square float32 maps of one size, values in [0, 1].
+    """Metallic-roughness textures of one mesh: square float32 maps of equal size, with values in [0, 1].
 
     Row 0 is v = 0 (glTF: v down), texel centers at +0.5.  base_color: ``(T, T, 3)``, linear; files hold sRGB.
-    roughness, metallic: ``(T, T)``, ``(T, T, 1)`` or a Python number, which has no gradient; to optimize one value for
-    the whole map, pass a scalar tensor expanded to ``(T, T)``.  Roughness is perceptual.  normal: ``(T, T, 3)``,
-    tangent-space unit normal as ``n * 0.5 + 0.5``, green along the bitangent; None: flat.  wrap: addressing of UV
-    outside [0, 1] along u and v, each ``repeat``, ``mirror`` or ``clamp``.  Fields are tensors after construction.
+    roughness (perceptual), metallic: ``(T, T)``, ``(T, T, 1)``, or a Python number, without gradient; to optimize one
+    value for the whole map, pass a scalar tensor expanded to ``(T, T)``.  normal: ``(T, T, 3)``, tangent-space unit
+    normals ``n`` encoded as ``n * 0.5 + 0.5``, green along the bitangent; None: flat.  wrap: wrap modes along u and v
+    for UV outside [0, 1], each ``repeat``, ``mirror`` or ``clamp``.  After construction all maps are tensors.
     Gradients pass through.  Raises TypeError for a wrong type or dtype, ValueError for a wrong shape, device or wrap
-    mode.  The range is checked only when a file is written: in optimization clamp the maps after each step, or use a
-    sigmoid.
+    mode.  Values are range-checked only when a file is written: in optimization, clamp the maps after each step or use
+    a sigmoid.
 
     >>> textures = reli3d.TextureSet(torch.full((64, 64, 3), 0.5), roughness=0.4, metallic=0.0)
     >>> asset = reli3d.Asset(mesh, textures)
@@ -82,13 +82,13 @@ class TextureSet:
 
     @property
     def size(self) -> int:
-        """Texels along a side."""
+        """Texels per side."""
         return self.base_color.shape[0]
 
     def rough_metal(self) -> Tensor:
         """Roughness, metallic and metallic again, ``(T, T, 3)``, for one lookup of both.
 
-        Computed once for maps of at most ``KEPT`` texels a side, without gradient, that nothing has written to since.
+        Cached for gradient-free maps of at most ``KEPT`` texels per side until they are modified.
         """
         sources = self.roughness, self.metallic
         changing = any(s.is_inference() or (s.requires_grad and torch.is_grad_enabled()) for s in sources)
@@ -122,9 +122,8 @@ class Asset:
     """A relightable object: mesh, textures and the estimated input lighting, if known.
 
     mesh: a :class:`~reli3d.geometry.mesh.Mesh`, with ``uv`` if there are textures (:func:`reli3d.unwrap`).  textures: a
-    :class:`TextureSet`; None renders as a gray dielectric.  environment: an
-    :class:`~reli3d.render.environment.Environment` or None.  ``.to(device)`` and ``.detach()`` return copies.
-    Gradients pass through.  Raises TypeError for a wrong type.
+    :class:`TextureSet`; None: a gray dielectric.  environment: an :class:`~reli3d.render.environment.Environment` or
+    None.  ``.to(device)`` and ``.detach()`` return copies.  Gradients pass through.  Raises TypeError for a wrong type.
 
     >>> asset = reli3d.Asset(mesh, reli3d.TextureSet(torch.full((64, 64, 3), 0.5), roughness=0.4, metallic=0.0))
     >>> image = reli3d.render_asset(asset, camera, light)

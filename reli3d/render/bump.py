@@ -11,11 +11,11 @@ from reli3d.kernels.bump import radial_bump_kernel
 
 
 def radial_bump(position: Tensor, normal: Tensor, bump: Tensor) -> Tensor:
-    """Unit shading normal ``(..., 3)`` of a tangent-space ``bump (..., 3)``, with tangents around the +Y axis.
+    """Unit shading normals ``(..., 3)`` from tangent-space ``bump (..., 3)``, with tangents that circle the +Y axis.
 
-    position: ``(..., 3)`` model frame.  normal: ``(..., 3)`` unit, geometric.  The tangent is ``y x position``,
-    orthogonalized to the normal, the bitangent ``normal x tangent``.  Gradients reach ``bump`` only, as in ReLi3D.
-    Computed in float32; on the vertical axis there is no frame and no bump.  Raises ValueError for a wrong shape or
+    position: ``(..., 3)``, model frame.  normal: ``(..., 3)``, unit geometric normals.  The tangent is ``y x position``
+    orthogonalized to the normal, the bitangent ``normal x tangent``; on the +Y axis neither exists, and the bump is
+    ignored.  Computed in float32.  Gradients reach ``bump`` only, as in ReLi3D.  Raises ValueError for a wrong shape or
     device.
     """
     values = (position.detach(), normal.detach(), bump)

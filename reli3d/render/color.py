@@ -1,4 +1,4 @@
-"""Color transfer: sRGB both ways and the AgX display transform.  Linear values are Rec. 709."""
+"""Color transforms: sRGB encoding and decoding, and the AgX display transform.  Linear values are Rec. 709."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ _AGX_EV = (-12.47393, 4.026069)  # log2 range mapped to [0, 1]
 
 
 def srgb_to_linear(value: Tensor) -> Tensor:
-    """Linear value of an sRGB-encoded one, any shape.
+    """Linear values of sRGB-encoded ``value``, any shape.
 
-    Not clamped: values above 1 follow the power, negative ones the toe.  Gradients everywhere.  Source: IEC 61966-2-1,
-    the toe below 0.04045.
+    Not clamped: values above 1 follow the power law, negative values the linear toe, which ends at 0.04045.  Gradients
+    everywhere.  Source: IEC 61966-2-1.
 
     >>> base_color = reli3d.srgb_to_linear(torch.full((64, 64, 3), 0.5))
     >>> textures = reli3d.TextureSet(base_color, roughness=0.5, metallic=0.0)
@@ -55,11 +55,11 @@ def linear_to_srgb(value: Tensor) -> Tensor:
 
 @full_precision
 def agx(radiance: Tensor) -> Tensor:
-    """Display value in [0, 1], sRGB-encoded, of linear radiance ``(..., 3)``: AgX, default look.
+    """sRGB-encoded display values in [0, 1] of linear radiance ``(..., 3)``: AgX, default look.
 
     Inset matrix, log2 between -12.47 and 4.03 stops, sigmoid contrast, outset matrix, power 2.2, then the sRGB
-    transfer.  Gradients to ``radiance``, exactly 0 where a clamp holds.  Source: AgX (T. Sobotka) with the constants
-    of ReLi3D's display transform.
+    transfer.  Gradients reach ``radiance`` and are exactly 0 where a value is clamped.  Source: AgX (T. Sobotka) with
+    the constants of ReLi3D's display transform.
     """
     if radiance.ndim == 0 or radiance.shape[-1] != 3:
         raise ValueError(f"radiance: expected shape (..., 3), got {tuple(radiance.shape)}")
@@ -73,11 +73,11 @@ def agx(radiance: Tensor) -> Tensor:
 
 
 def rec709_from_primaries(primaries: Sequence[float]) -> np.ndarray | None:
-    """Matrix ``(3, 3)`` float64 that takes linear RGB of other primaries to Rec. 709; None where they are the same.
+    """Matrix ``(3, 3)`` float64 from linear RGB in other primaries to Rec. 709; None if the primaries are Rec. 709's.
 
-    primaries: CIE 1931 x, y of red, green, blue and white, eight numbers.  White is adapted by the Bradford transform
-    (Lam 1985), so that equal RGB stays equal.  Up to a difference of 1e-3 primaries are the same.  Raises ValueError
-    unless they span a space with positive white.
+    primaries: CIE 1931 x, y of red, green, blue and white, eight numbers; differences up to 1e-3 are ignored.  White is
+    adapted by the Bradford transform (Lam 1985), so equal RGB stays equal.  Raises ValueError unless the primaries span
+    a color space with positive white.
     """
     xy = np.array(primaries, np.float64)
     if xy.shape != (8,) or not np.isfinite(xy).all() or np.abs(xy).max() > 10.0:

@@ -1,6 +1,6 @@
 """Distant lighting as a lat-long map: lookup with gradients, importance sampling by a piecewise-constant CDF.
 
-The mapping is that of :mod:`reli3d.render.latlong`: upper edge +Y, horizontal center +X, +Z right of it.
+Mapping as in :mod:`reli3d.render.latlong`: upper edge +Y, horizontal center +X, +Z right of the center.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ _LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709
 
 @dataclass(frozen=True)
 class EnvironmentCDF:
-    """Importance-sampling CDF of an environment: a density that is constant over each texel.
+    """Importance-sampling CDF of an environment, with constant density over each texel.
 
-    rows: ``(2, H + 1)``, the CDF over rows, and y = cos(theta) of their edges.  columns: ``(H, W + 1)``, the CDF within
-    each row.  row_guide ``(1, H)`` and column_guide ``(H, W)``: int32, where to start the search.  density: ``(H, W)``
-    [1/sr].
+    rows: ``(2, H + 1)``, the CDF over rows, and y = cos(theta) of the row edges.  columns: ``(H, W + 1)``, the CDF
+    within each row.  row_guide ``(1, H)`` and column_guide ``(H, W)``: int32, where to start the search.  density:
+    ``(H, W)`` [1/sr].
     """
 
     rows: Tensor
@@ -60,11 +60,11 @@ class EnvironmentCDF:
 class Environment:
     """Distant lighting as a lat-long map ``radiance (H, W, 3)``, normally W = 2 H, linear Rec. 709 radiance.
 
-    The upper edge is +Y, the horizontal center (the border of columns W/2 - 1 and W/2) is +X, and +Z is right of it.
-    Methods: ``.lookup(directions)``, ``.rotated(yaw)`` [rad], ``.resized(height)``, ``.sample(u)``,
+    The upper edge is +Y, the horizontal center (the border of columns W/2 - 1 and W/2) is +X, and +Z is right of the
+    center.  Methods: ``.lookup(directions)``, ``.rotated(yaw)`` [rad], ``.resized(height)``, ``.sample(u)``,
     ``.pdf(directions)``, ``.irradiance()``.  Gradients reach the texels.  The importance-sampling CDF is computed on
-    first use, so ``radiance`` must not be modified in place afterwards: in optimization construct a new Environment in
-    every step.  Negative values are rejected only when a file is written: optimize the logarithm, or clamp.  Raises
+    first use, so ``radiance`` must not be modified in place afterwards: in optimization, construct a new Environment in
+    every step.  Negative values are rejected only when a file is written: optimize log radiance, or clamp.  Raises
     TypeError for a wrong dtype, ValueError for a wrong shape.
 
     >>> light = reli3d.Environment(torch.rand(16, 32, 3))
@@ -81,7 +81,7 @@ class Environment:
 
     @classmethod
     def constant(cls, rgb: Tensor, height: int = 16) -> Environment:
-        """Uniform lighting of radiance ``rgb (3,)``."""
+        """Uniform lighting with radiance ``rgb (3,)``."""
         check("rgb", rgb, last=3)
         return cls(rgb.expand(height, 2 * height, 3).contiguous())
 
@@ -96,7 +96,7 @@ class Environment:
     def lookup(self, directions: Tensor) -> Tensor:
         """Radiance ``(..., 3)`` from unit ``directions (..., 3)``: bilinear between texel centers, periodic in azimuth.
 
-        Gradients reach the texels and the directions (not at a pole, where the azimuth has none).
+        Gradients reach the texels and the directions, except at the poles, where the azimuth is undefined.
         """
         check("directions", directions, last=3, like=self.radiance)
         flat = directions.reshape(-1, 3).contiguous()
@@ -106,8 +106,8 @@ class Environment:
     def irradiance(self) -> Environment:
         """Irradiance [radiance times sr] for every surface normal, as a lat-long map of the same size.
 
-        A sum over all texels by solid angle: n^2 terms for n texels, intended for maps of at most 32 rows.  Uniform
-        radiance L gives pi L.  Gradients reach the texels.
+        Sums all n texels, weighted by cosine and solid angle, for each normal: n^2 terms, so use maps of at most 32
+        rows.  Uniform radiance L gives pi L.  Gradients reach the texels.
         """
         height, width = self.radiance.shape[:2]
         directions = lat_long_directions(height, width, dtype=torch.float64).reshape(-1, 3)
@@ -118,8 +118,8 @@ class Environment:
     def rotated(self, yaw: float) -> Environment:
         """The environment rotated by ``yaw`` [rad] about +Y, counter-clockwise seen from above: -Z moves towards -X.
 
-        yaw: a Python number, no gradient.  Raises TypeError for another type.
-        Columns are interpolated linearly; a multiple of 2 pi / W is an exact shift.
+        yaw: a Python number, without gradient.  Columns are interpolated linearly; multiples of 2 pi / W shift exactly.
+        Raises TypeError if ``yaw`` is not a number.
         """
         if not isinstance(yaw, Real):
             raise TypeError(f"yaw: expected a number, got {type(yaw).__name__}")
@@ -133,7 +133,7 @@ class Environment:
         return Environment(radiance)
 
     def resized(self, height: int) -> Environment:
-        """The environment at ``height`` x 2 ``height`` texels, by area averaging, or bilinear when enlarging."""
+        """The environment at ``height`` x 2 ``height`` texels: area-averaged when reduced, bilinear when enlarged."""
         planes = self.radiance.permute(2, 0, 1)[None]
         mode = "area" if height <= self.radiance.shape[0] else "bilinear"
         out = torch.nn.functional.interpolate(planes, size=(height, 2 * height), mode=mode)
@@ -144,8 +144,9 @@ class Environment:
     def cdf(self) -> EnvironmentCDF:
         """Importance-sampling CDF; the weight of a texel is the integral of the bilinear luminance over it.
 
-        That integral is the luminance filtered by (1/8, 3/4, 1/8) along each axis, so wherever the lookup is positive
-        the density is too.  A black map gives the uniform sphere.  Raises ValueError for a texel that is not finite.
+        This integral equals the luminance filtered by (1/8, 3/4, 1/8) along each axis, so the density is positive
+        wherever the lookup is.  A black map is sampled uniformly over the sphere.  Raises ValueError for a non-finite
+        texel.
         """
         radiance = self.radiance.detach().double()
         if not bool(torch.isfinite(radiance).all()):

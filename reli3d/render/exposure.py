@@ -1,8 +1,8 @@
-"""Scale of base color and lighting of an asset, of which images determine only the product.
+"""Scale of an asset's base color and lighting, whose product alone the images determine.
 
-The log brightness of the base color is the precision-weighted mean of three normal distributions: a prior of albedo,
-the observed colors under a prior of lighting, and the prediction of the network.  The lighting is then scaled so that
-the rendering has the mean color of the images.
+The log brightness of the base color is the precision-weighted mean of three normal distributions: an albedo prior, the
+observed colors under a lighting prior, and the network's prediction.  The lighting is then scaled to match the mean
+color of the rendering to that of the images.
 """
 
 from __future__ import annotations
@@ -54,11 +54,12 @@ def estimate_base_color_and_light(
 @torch.no_grad()
 @full_precision
 def photograph_ratio(asset: Asset, images: Tensor, inside: Tensor, camera: Camera, scene: RayScene) -> Tensor:
-    """Mean linear color of the images over that of ``asset`` under its environment with shadows, ``(3,)``.
+    """Ratio ``(3,)`` of mean linear colors: the images over renderings of ``asset`` in its environment, with shadows.
 
-    images: ``(V, H, W, 3)`` sRGB, at least ``STEP`` pixels a side.  inside: ``(V, H, W)`` bool, pixels inside the
-    silhouette.  camera: of all V.  scene: ray tracing structure of the mesh.  Means over a regular grid of pixels at
-    which the asset is hit and the image is not overexposed.  No gradient.  Raises ValueError for fewer pixels.
+    images: ``(V, H, W, 3)`` sRGB, at least ``STEP`` pixels per side.  inside: ``(V, H, W)`` bool, pixels inside the
+    silhouette.  camera: a batch of V.  scene: rays against the asset's mesh.  The means are over a regular grid of
+    pixels at which the asset is hit and the image is not overexposed.  No gradient.  Raises ValueError for smaller
+    images.
     """
     seen, at, directions = _seen(asset, images, inside, camera, scene)
     shown = shade(at, -directions, asset.light, scene=scene, options=ShadeOptions(samples=SAMPLES))
@@ -70,10 +71,10 @@ def photograph_ratio(asset: Asset, images: Tensor, inside: Tensor, camera: Camer
 
 @torch.no_grad()
 def base_color_factor(asset: Asset, images: Tensor, inside: Tensor, camera: Camera, scene: RayScene) -> Tensor:
-    """Maximum a posteriori factor ``(3,)`` on the linear base color of ``asset``; 1 without a visible pixel.
+    """Maximum a posteriori factor ``(3,)`` on the linear base color of ``asset``; 1 if no pixel is visible.
 
-    The log brightness combines the prior of albedo, the observed colors under the prior of lighting, and the base color
-    of ``asset`` as three normal distributions.  The chromaticity is a weighted mean of observation and prediction.
+    The log brightness combines three normal distributions: the albedo prior, the observed colors under the lighting
+    prior, and the base color of ``asset``.  The chromaticity is a weighted mean of the observed one and the asset's.
     Arguments as in :func:`photograph_ratio`; the environment of ``asset`` is not used.
     """
     seen, at, _ = _seen(asset, images, inside, camera, scene)

@@ -1,7 +1,8 @@
 """Lighting as a mixture of spherical Gaussians: value, irradiance and shading in closed form.
 
-A lobe is ``amplitude exp(sharpness (axis . w - 1))``; formulas in ``reli3d.kernels.sg``.  Shading has no shadows and no
-Monte Carlo noise: it is a smooth function of lighting, normal and material for the early stages of an optimization.
+A lobe is ``amplitude exp(sharpness (axis . w - 1))``; formulas in ``reli3d.kernels.sg``.  Shading has neither shadows
+nor Monte Carlo noise: for the early stages of an optimization, it is a smooth function of lighting, normal and
+material.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ OVERLAP = 3.5  # sharpness times the solid angle [sr] per lobe, which minimizes 
 
 @dataclass(frozen=True)
 class SphericalGaussians:
-    """axis ``(K, 3)`` unit, sharpness ``(K,)`` positive (below 0.01 counts as 0.01), amplitude ``(K, 3)`` linear."""
+    """axis ``(K, 3)`` unit, sharpness ``(K,)`` positive, clamped to at least 0.01, amplitude ``(K, 3)`` linear."""
 
     axis: Tensor
     sharpness: Tensor
@@ -41,9 +42,9 @@ class SphericalGaussians:
         return self._sum(kernels.eval_sg_kernel, "directions", directions)
 
     def irradiance(self, normals: Tensor) -> Tensor:
-        """Irradiance ``(..., 3)`` [radiance sr] at unit ``normals (..., 3)``; error below 0.2 % of a lobe's maximum.
+        """Irradiance ``(..., 3)`` [radiance times sr] at unit ``normals (..., 3)``.
 
-        Gradients reach all lobes and the normals.
+        Gradients reach all lobes and the normals.  The error is below 0.2 % of a lobe's maximum.
         """
         return self._sum(kernels.irradiance_sg_kernel, "normals", normals)
 
@@ -64,13 +65,13 @@ class SphericalGaussians:
 def shade_gaussians(points: SurfacePoints, wo: Tensor, light: SphericalGaussians) -> Tensor:
     """Reflected radiance ``(N, 3)`` of ``points`` towards ``wo`` under ``light``, without shadows; linear Rec. 709.
 
-    wo: ``(N, 3)`` unit, or one row for all points.  Non-finite inputs of a point give NaN.  Position and geometric
-    normal are not used.  Material of ``reli3d.kernels.bsdf``.  Diffuse: closed-form cosine integral.  Specular: Wang et
-    al. 2009 with GGX as four Gaussians.
+    wo: ``(N, 3)`` unit, or one row for all points.  A point with non-finite inputs gives NaN.  Position and geometric
+    normal are not used.  The material is that of ``reli3d.kernels.bsdf``.  Diffuse term: closed-form cosine integral.
+    Specular term: Wang et al. 2009, with GGX approximated by four Gaussians.
 
-    Error against quadrature for lighting around the mirror direction and viewing angles up to 45 degrees: 6 % at
-    roughness 0.3, 12 % at 0.5; at roughness 1 or 70 degrees 20 to 35 % at the peak and up to a factor of 2 off the
-    peak.  Gradients reach all arguments that are used.
+    Error against quadrature, for lighting around the mirror direction and viewing angles up to 45 degrees: 6 % at
+    roughness 0.3, 12 % at roughness 0.5.  At roughness 1 or a viewing angle of 70 degrees: 20 to 35 % at the peak and
+    up to a factor of 2 off the peak.  Gradients reach all inputs that are used.
     """
     expect("points", points, SurfacePoints)
     normal, n = points.normal, len(points)

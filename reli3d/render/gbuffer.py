@@ -1,4 +1,4 @@
-"""Primary visibility: hits of a camera, textures and materials at hits, with gradients."""
+"""Primary visibility: camera-ray hits, and textures and materials at hits, with gradients."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from reli3d.render.points import SurfacePoints
 
 
 def primary_hits(scene: RayScene, camera: Camera) -> tuple[Hits, Tensor, Tensor]:
-    """Closest hits ``(..., H, W)`` through the pixel centers, and the rays' origins and unit directions."""
+    """Closest hits ``(..., H, W)`` of the rays through the pixel centers, and their origins and unit directions."""
     origins, directions = camera_rays(camera)
     return scene.closest(origins, directions), origins, directions
 
@@ -26,7 +26,7 @@ def primary_hits(scene: RayScene, camera: Camera) -> tuple[Hits, Tensor, Tensor]
 def sample_texture(texture: Tensor, uv: Tensor) -> Tensor:
     """Bilinear values ``(..., 3)`` of ``texture (H, W, 3)`` at ``uv (..., 2)``, repeating; v counts rows downwards.
 
-    Gradients reach the texels and ``uv``.  A coordinate that is not finite, or beyond a million, raises ValueError.
+    Gradients reach the texels and ``uv``.  Raises ValueError for a coordinate that is non-finite or beyond a million.
     """
     check("texture", texture, last=3)
     check("uv", uv, last=2, like=texture)
@@ -42,9 +42,9 @@ def sample_texture(texture: Tensor, uv: Tensor) -> Tensor:
 
 
 def wrap_uv(uv: Tensor, wrap: tuple[str, str], size: tuple[int, int]) -> Tensor:
-    """``uv (..., 2)`` such that :func:`sample_texture`, which repeats, gives the addressing ``wrap`` along u and v.
+    """``uv (..., 2)`` remapped so that the repeating :func:`sample_texture` has the wrap modes ``wrap`` (u, v).
 
-    size: texels along u and v.  Gradients pass, 0 where clamped.
+    size: texels along u and v.  Gradients pass through; they are 0 where ``uv`` is clamped.
     """
     if wrap == ("repeat", "repeat"):
         return uv
@@ -59,9 +59,9 @@ def wrap_uv(uv: Tensor, wrap: tuple[str, str], size: tuple[int, int]) -> Tensor:
 
 
 def tangent_normals(mesh: Mesh, face: Tensor, bary: Tensor, normal: Tensor, mapped: Tensor) -> Tensor:
-    """World normals ``(N, 3)`` of tangent-space normals ``mapped (N, 3)`` around ``normal (N, 3)``.
+    """World-space normals ``(N, 3)`` from tangent-space normals ``mapped (N, 3)`` around ``normal (N, 3)``.
 
-    Takes the mesh's tangents; without them those of the face's uv, made orthogonal to ``normal``.  The bitangent
+    Uses the mesh's tangents if present, otherwise the face's UV tangents, orthogonalized to ``normal``.  The bitangent
     points up in the texture (glTF 2.0, 3.7.2.1: v is down, +Y is up).
     """
     if mesh.tangents is not None:
@@ -80,11 +80,11 @@ def surface_points(mesh: Mesh, textures: TextureSet | None, face: Tensor, bary: 
 
     mesh: with ``uv`` if textured.  textures: None gives a gray dielectric of base color 0.5, roughness 0.5, metallic 0.
     face: ``(N,)`` int32, without misses.  bary: ``(N, 2)`` weights of vertices 1 and 2.  The shading normal is the
-    interpolated vertex normal, or the geometric one if ``mesh.normals`` is None, perturbed by the normal map in the
-    frame of ``mesh.tangents``, or of the UV gradients if these are None.
+    interpolated vertex normal (the geometric normal if ``mesh.normals`` is None), perturbed by the normal map in the
+    frame of ``mesh.tangents`` (of the UV gradients if ``mesh.tangents`` is None).
 
-    Gradients reach the arrays of the mesh, the textures and ``bary``.  Raises TypeError for a wrong type or dtype;
-    ValueError for textures without ``mesh.uv``, a face index out of range, a wrong shape or another device.
+    Gradients reach the mesh's arrays, the textures and ``bary``.  Raises TypeError for a wrong type or dtype;
+    ValueError for a wrong shape or device, a face index out of range, or textures without ``mesh.uv``.
 
     >>> hits = reli3d.RayScene(mesh).intersect(*reli3d.camera_rays(camera))
     >>> points = reli3d.surface_points(mesh, asset.textures, hits.face[hits.valid], hits.bary[hits.valid])

@@ -1,4 +1,4 @@
-"""Rendering of an asset: primary visibility, materials, direct lighting with shadows, background, resolve."""
+"""Renders assets: primary visibility, materials, direct lighting with shadows, background, subpixel averaging."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ BAND_RAYS = 1 << 18  # rays of one band of rows: bounds memory at about 40 MB wh
 class Render:
     """Result of :func:`render_asset`: radiance, coverage and G-buffers of one image.
 
-    radiance: ``(H, W, 3)`` linear Rec. 709, mean over all subpixels: premultiplied by alpha with a transparent
-    background, composited with ``background="environment"``.  alpha: ``(H, W)`` coverage of the object in [0, 1], with
-    either background.  The G-buffers are means over the covered subpixels: base_color ``(H, W, 3)`` linear; roughness,
-    metallic ``(H, W)``; normal ``(H, W, 3)`` shading normal in the world frame, normalized after averaging; position
-    ``(H, W, 3)`` world; depth ``(H, W)`` along the viewing axis.  Where alpha is 0, depth is inf and the other
-    G-buffers are 0.  Gradients: see :func:`render_asset`.
+    radiance: ``(H, W, 3)`` linear Rec. 709, mean over all subpixels: premultiplied by alpha with
+    ``background="transparent"``, composited with ``background="environment"``.  alpha: ``(H, W)`` coverage of the
+    object in [0, 1], for both backgrounds.  The G-buffers are means over the covered subpixels: base_color ``(H, W,
+    3)`` linear; roughness, metallic ``(H, W)``; normal ``(H, W, 3)`` shading normal in the world frame, normalized
+    after averaging; position ``(H, W, 3)`` world; depth ``(H, W)`` along the viewing axis.  Where alpha is 0, depth is
+    inf and the other G-buffers are 0.  Gradients: see :func:`render_asset`.
 
     >>> image = reli3d.render_asset(asset, camera, light)
     >>> reli3d.write_image("image.png", image.rgba)
@@ -55,8 +55,8 @@ class Render:
     def rgba(self) -> Tensor:
         """``(H, W, 4)``: premultiplied radiance and alpha, for :func:`reli3d.write_image`.
 
-        Only valid with ``background="transparent"``.  With ``background="environment"`` radiance is already composited,
-        and dividing it by alpha would brighten the background: use ``radiance`` instead.
+        Only valid with ``background="transparent"``.  With ``background="environment"``, use ``radiance`` instead: it
+        is already composited, and dividing by alpha would brighten the background.
         """
         return torch.cat([self.radiance, self.alpha[..., None]], -1)
 
@@ -69,8 +69,8 @@ class Render:
     ) -> Tensor:
         """Display values in [0, 1]: ``(H, W, 4)`` with straight alpha, or ``(H, W, 3)`` if not ``transparent``.
 
-        exposure: in stops.  tone: transform of linear radiance to display values.  transparent: False for an image with
-        ``background="environment"``.
+        exposure: in stops.  tone: transform from linear radiance to display values.  transparent: use False for images
+        rendered with ``background="environment"``.
         """
         radiance = self.radiance * 2.0**exposure
         if transparent:  # tone mapping is nonlinear and needs straight color
@@ -95,22 +95,22 @@ def render_asset(
     """Renders ``asset`` under an environment with direct lighting and shadows.
 
     asset: an :class:`Asset`, or a list of assets that shadow each other; an asset without textures is rendered as a
-    dielectric of base color 0.5 and roughness 0.5.  camera: a single camera.  environment: the lighting; if None, the
+    dielectric with base color 0.5 and roughness 0.5.  camera: a single camera.  environment: the lighting; if None, the
     environment of the first asset that has one.  options: sample counts, seed and material model.  supersampling: k for
     k x k camera rays per pixel, each shaded with the full sample counts.  shadows: whether shadow rays are traced.
-    background: ``transparent``, or ``environment``, which composites the environment behind the object; then write
-    ``image.radiance``, not ``image.rgba``.  scene: a :class:`RayScene` of the mesh or, for several assets, of all their
-    meshes concatenated in the order of the list; None: it is built.  progress: called with the completed fraction.
+    background: ``transparent``, or ``environment``: composited behind the object; in that case save ``image.radiance``,
+    not ``image.rgba``.  scene: a :class:`RayScene` of the mesh or, for several assets, of all meshes concatenated in
+    list order; None: built here.  progress: called with the completed fraction.
 
     Hit points (face and barycentric coordinates) and visibility are treated as constant; otherwise the gradients are
-    those of :func:`surface_points` and :func:`shade`.  Radiance has gradients to the textures, the texels of the
-    environment, and the mesh's normals, tangents, colors and UV; to the vertex positions only if the mesh has no vertex
-    normals: shading then uses the face normals, which depend on the positions.  The G-buffers have gradients to the
-    textures and the mesh, depth also to the camera.  ``alpha`` has none: silhouettes and shadow boundaries do not
-    contribute (see :func:`antialias`).
+    those of :func:`surface_points` and :func:`shade`.  Radiance gradients reach the textures, the environment texels,
+    and the mesh's normals, tangents, colors and UV; they reach the vertices only if the mesh has no vertex normals,
+    because shading then uses the face normals.  G-buffer gradients reach the textures and the mesh; depth gradients
+    also reach the camera.  ``alpha`` has no gradient: silhouettes and shadow boundaries do not contribute (see
+    :func:`antialias`).
 
-    Raises TypeError for a wrong type; ValueError if no environment is given and no asset has one, if ``background``
-    is not one of the two values, if ``camera`` is a batch, or if there are textures without ``mesh.uv``.
+    Raises TypeError for a wrong type; ValueError if neither ``environment`` nor an asset's environment is given, for an
+    unknown ``background``, if ``camera`` is a batch, or for textures without ``mesh.uv``.
 
     >>> camera = reli3d.Camera.from_fov(reli3d.look_at([0.0, 0.5, 3.0]), 0.7, 512, 512)
     >>> image = reli3d.render_asset(asset, camera, reli3d.Environment.constant(torch.ones(3)), supersampling=2)
@@ -144,7 +144,7 @@ def render_lights(
 ) -> list[Render]:
     """:func:`render_asset` under each of ``environments``, with bitwise identical results.
 
-    Primary hits and materials are evaluated once; the images have all layers but ``radiance`` in common.  The other
+    Primary hits and materials are evaluated once; all images share every field except ``radiance``.  The other
     arguments are those of :func:`render_asset`.
     """
     parts, lights = _checked(asset, camera, environments)
@@ -192,9 +192,9 @@ def plan_render(
 ) -> SamplePlan:
     """Divides ``total`` samples among the strategies to minimize the noise of :func:`render_asset` for this view.
 
-    Pass the counts with ``antithetic="none"``.  Arguments as for :func:`render_asset`; total, relative: as for
-    :func:`reli3d.render.allocation.plan_samples`, which is applied to hits of 32768 camera rays.  No gradient.  Raises
-    ValueError without an environment or if no ray hits the asset.
+    Use the plan's counts with ``antithetic="none"``.  Arguments as in :func:`render_asset`; total, relative: as in
+    :func:`reli3d.render.allocation.plan_samples`, which is applied to the hits of 32768 camera rays.  No gradient.
+    Raises ValueError without an environment or if no ray hits the asset.
     """
     from reli3d.render.allocation import plan_samples, spread_rows  # lazily: few images have a plan
 
@@ -238,7 +238,7 @@ def _checked(
 
 
 def joined_scene(parts: Sequence[Asset]) -> RayScene:
-    """Ray tracing structure of all ``parts``; face indices continue from one part to the next."""
+    """Acceleration structure over all ``parts``; face indices continue from one part to the next."""
     if not parts:
         raise ValueError("parts: expected at least one asset, got none")
     first = [0]

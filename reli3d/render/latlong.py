@@ -1,9 +1,9 @@
-"""Lat-long maps: directions of texels, texels of directions, solid angles.
+"""Lat-long maps: texel directions, texels of given directions, solid angles.
 
 A map has H rows and W columns, normally W = 2 H.  The upper edge is +Y, the horizontal center (u = 1/2, for even W the
-border of columns W/2 - 1 and W/2) is +X, and +Z is right of it:
-with phi = 2 pi (u - 1/2) and theta = pi v the direction is (cos phi sin theta, cos theta, sin phi sin theta).  Texel
-centers are at u = (column + 1/2) / W, v = (row + 1/2) / H.  ``reli3d.kernels.envmap`` has the same mapping for kernels.
+border of columns W/2 - 1 and W/2) is +X, and +Z is right of the center.  With phi = 2 pi (u - 1/2) and theta = pi v the
+direction is (cos phi sin theta, cos theta, sin phi sin theta).  Texel centers are at u = (column + 1/2) / W, v = (row +
+1/2) / H.  ``reli3d.kernels.envmap`` implements the same mapping for kernels.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ def lat_long_directions(
     device: torch.device | str = "cpu",
     dtype: torch.dtype = torch.float32,
 ) -> Tensor:
-    """Unit directions ``(height, width, 3)`` of the texel centers, rounded from float64; ``width`` is 2 ``height``."""
+    """Unit directions ``(height, width, 3)`` of the texel centers, computed in float64; default width: 2 ``height``."""
     width = 2 * height if width is None else width
     phi = (torch.arange(width, dtype=torch.float64, device=device) + 0.5) * (2.0 * math.pi / width) - math.pi
     theta = ((torch.arange(height, dtype=torch.float64, device=device) + 0.5) * (math.pi / height))[:, None]
@@ -30,7 +30,7 @@ def lat_long_directions(
 
 
 def lat_long_texels(directions: Tensor, height: int) -> Tensor:
-    """Texel indices ``(...)``, int64, of unit ``directions (..., 3)`` in a flattened ``(height, 2 height)`` map."""
+    """Flat int64 texel indices ``(...)`` of unit ``directions (..., 3)`` in a ``(height, 2 height)`` map."""
     x, y, z = directions.unbind(-1)
     row = (y.clamp(-1.0, 1.0).acos() * (height / math.pi)).long().clamp(0, height - 1)
     column = ((torch.atan2(z, x) + math.pi) * (height / math.pi)).long() % (2 * height)
@@ -38,7 +38,7 @@ def lat_long_texels(directions: Tensor, height: int) -> Tensor:
 
 
 def texel_solid_angles(height: int, width: int, device: torch.device | str = "cpu") -> Tensor:
-    """Solid angle [sr] of a texel in each row, ``(height,)`` float64; times ``width`` they sum to 4 pi."""
+    """Solid angle [sr] of one texel in each row, ``(height,)`` float64; the sum over all texels is 4 pi."""
     edges = torch.cos(torch.linspace(0.0, math.pi, height + 1, dtype=torch.float64, device=device))
     return (edges[:-1] - edges[1:]) * (2.0 * math.pi / width)
 
@@ -46,8 +46,8 @@ def texel_solid_angles(height: int, width: int, device: torch.device | str = "cp
 def quarter_turn(maps: Tensor, quarters: int) -> Tensor:
     """``maps (..., H, W, C)`` with columns moved right by ``quarters`` quarters of the width.
 
-    -1 converts a map with -Z at the horizontal center, as in ReLi3D, to one with +X there.  Raises ValueError unless W
-    is a multiple of 4.
+    ``quarters = -1`` converts a map with -Z at the horizontal center, as in ReLi3D, to a map with +X there.  Raises
+    ValueError unless W is a multiple of 4.
     """
     width = maps.shape[-2]
     if width % 4:

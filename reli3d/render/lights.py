@@ -1,6 +1,6 @@
 """Two procedural environments: a studio and a clear sky.
 
-Both have a mean radiance of 1 over the sphere, so that the radiance of a diffuse surface is about its albedo.
+Both have mean radiance 1 over the sphere, so the radiance of a diffuse surface approximately equals its albedo.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def _vector(values: Sequence[float]) -> Tensor:
 
 @full_precision
 def studio(height: int = 64) -> Environment:
-    """Gray surroundings with four softboxes: key light at the left, strip at the right, one behind and one above."""
+    """Gray surroundings with four softboxes: key light on the left, strip on the right, one behind and one above."""
     d = lat_long_directions(height)
     y = d[..., 1:2]
     light = (0.22 + 0.12 * y).expand(-1, -1, 3)
@@ -50,7 +50,7 @@ def studio(height: int = 64) -> Environment:
 
 @full_precision
 def sky(height: int = 64) -> Environment:
-    """Clear sky over brown ground, with the sun at an elevation of 40 degrees, in front at the right."""
+    """Clear sky over brown ground, with the sun at 40 degrees elevation, in front on the right."""
     d = lat_long_directions(height)
     y = d[..., 1:2]
     up = torch.lerp(

@@ -1,7 +1,7 @@
 """Metallic-roughness material in the local frame: normal +z, ``wo`` to the viewer, ``wi`` to the light, both unit.
 
-Order of arguments: ``wo``, the material, then ``wi`` to evaluate or ``u`` to sample.  ``alpha`` is the GGX width,
-``roughness**2``.  Formulas in ``reli3d.kernels.bsdf``.
+Argument order: ``wo``, the material, then ``wi`` (to evaluate) or ``u`` (to sample ``wi``).  ``alpha`` is the GGX
+width, ``roughness**2``.  The formulas are in ``reli3d.kernels.bsdf``.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def _flat(items: list[tuple[str, Tensor, int]]) -> tuple[torch.Size, list[Tensor
 
 
 def choice(name: str, value: str, allowed: tuple[str, ...]) -> int:
-    """Index of ``value`` in ``allowed``; raises ValueError if it is not in it."""
+    """Index of ``value`` in ``allowed``; raises ValueError for other values."""
     if value not in allowed:
         raise ValueError(f"{name}: expected one of {', '.join(allowed)}, got {value}")
     return allowed.index(value)
@@ -38,15 +38,16 @@ def choice(name: str, value: str, allowed: tuple[str, ...]) -> int:
 def eval_bsdf(
     wo: Tensor, base_color: Tensor, alpha: Tensor, metallic: Tensor, wi: Tensor, *, diffuse_model: str = "conserving"
 ) -> Tensor:
-    """Value of the metallic-roughness BSDF ``(..., 3)`` [1/sr], without the cosine; 0 below the horizon on either side.
+    """Metallic-roughness BSDF ``(..., 3)`` [1/sr], without the cosine; 0 if ``wo`` or ``wi`` is below the horizon.
 
     wo, wi: ``(..., 3)`` unit, local frame.  base_color: ``(..., 3)`` linear in [0, 1].  alpha: ``(...)`` GGX width,
-    ``roughness**2``.  metallic: ``(...)`` in [0, 1].  All are tensors; leading axes broadcast.  diffuse_model: factor
-    of the diffuse term.  ``conserving``: product of 1 - F on the way in and on the way out, with F at the angles to the
-    surface normal, reduced for rough surfaces; the albedo is at most 1.  ``published``: 1 - F at the half vector, the
-    formula of ReLi3D's shader and of glTF 2.0's appendix B.  Gradients reach all five tensors; that of ``alpha`` is 0
-    below ``ALPHA_MIN`` = 1e-3.  Raises TypeError unless float32, ValueError for a wrong shape or device, or an unknown
-    model.  Source: glTF 2.0, appendix B; GGX of Walter et al. 2007 with Smith's height-correlated masking.
+    ``roughness**2``.  metallic: ``(...)`` in [0, 1].  All are tensors; leading axes broadcast.  diffuse_model: Fresnel
+    factor of the diffuse term.  ``conserving``: the transmission in and out, (1 - F)(1 - F), with F evaluated at the
+    angles to the surface normal and reduced for rough surfaces; the albedo is at most 1.  ``published``: 1 - F at the
+    half vector, the formula of ReLi3D's shader and of glTF 2.0's appendix B.  Gradients reach all five tensors; the
+    gradient of ``alpha`` is 0 below ``ALPHA_MIN`` = 1e-3.  Raises TypeError unless float32, ValueError for a wrong
+    shape or device, or an unknown model.  Source: glTF 2.0, appendix B; GGX of Walter et al. 2007 with Smith's
+    height-correlated masking.
 
     >>> up, half = torch.tensor([0.0, 0.0, 1.0]), torch.tensor(0.5)
     >>> value = reli3d.eval_bsdf(up, torch.full((3,), 0.8), half, half, up)
@@ -62,18 +63,18 @@ def eval_bsdf(
 
 
 def sample_bsdf(wo: Tensor, alpha: Tensor, u: Tensor, *, lobe: str = "visible") -> Tensor:
-    """Samples directions to the light ``(..., 3)``, unit, from one lobe; density :func:`pdf_bsdf` of the same ``lobe``.
+    """Samples unit directions ``(..., 3)`` to the light from one lobe; density: :func:`pdf_bsdf` of the same ``lobe``.
 
     wo: ``(..., 3)`` unit, local frame, z > 0; otherwise all directions have density 0.  alpha: tensor ``(...)``, GGX
     width ``roughness**2``.  u: ``(..., 2)`` uniform in [0, 1).  Leading axes broadcast.  lobe: ``visible`` (reflection
-    at a visible normal), ``mirrored`` (at that normal rotated by pi about the surface normal) or ``cosine``. Directions
-    below the horizon, and those of a mirrored normal that faces away from ``wo``, have value and density 0. There are
-    two antithetic pairs.  (1) ``visible`` with ``u`` and with ``antithetic(u)``: average the two estimates.  (2) As in
-    ReLi3D, ``visible`` and ``mirrored`` with the same ``u``: for each sample divide the value times cosine by the sum
-    of both lobes' densities at its direction, then add the two quotients.  Do not use ``mirrored`` alone: it does not
-    reach all directions.  Gradients reach ``wo`` and ``alpha``, but :func:`pdf_bsdf` has none: detach the directions to
-    differentiate a Monte Carlo estimate. Raises TypeError unless float32, ValueError for a wrong shape or device, or an
-    unknown lobe.  Source: Dupuy and Benyoub 2023.
+    about a sampled visible normal), ``mirrored`` (reflection about this normal rotated by pi about the surface normal)
+    or ``cosine``.  Directions below the horizon, and reflections about a mirrored normal that faces away from ``wo``,
+    have value and density 0.  Two antithetic pairings exist.  (1) ``visible`` with ``u`` and with ``antithetic(u)``:
+    average the two estimates.  (2) As in ReLi3D, ``visible`` and ``mirrored`` with the same ``u``: divide each sample's
+    value times cosine by the sum of both lobes' densities at its direction, then add the two quotients.  Do not use
+    ``mirrored`` alone: it does not reach all directions.  Gradients reach ``wo`` and ``alpha``, but :func:`pdf_bsdf`
+    has none: detach the directions to differentiate a Monte Carlo estimate.  Raises TypeError unless float32,
+    ValueError for a wrong shape or device, or an unknown lobe.  Source: Dupuy and Benyoub 2023.
 
     >>> wi = reli3d.sample_bsdf(wo, alpha, u).detach()
     >>> density = reli3d.pdf_bsdf(wo, alpha, wi).clamp(min=1e-12)  # 0 below the horizon, where the value is 0 too
@@ -95,9 +96,9 @@ def pdf_bsdf(wo: Tensor, alpha: Tensor, wi: Tensor, *, lobe: str = "visible") ->
 
     wo, wi: ``(..., 3)`` unit, local frame.  alpha: tensor ``(...)``, GGX width.  Leading axes broadcast.  lobe: as in
     :func:`sample_bsdf`.  No gradient, so detach ``wi`` to differentiate an estimate; :func:`pdf_ggx_vndf` has
-    gradients.  The density can be 0: clamp it before dividing.  For ``visible`` and ``cosine`` this adds no bias,
-    because the BSDF is 0 there too.  With ``mirrored`` alone an estimate is biased: combine it with ``visible``.
-    Raises TypeError unless float32, ValueError for a wrong shape or device, or an unknown lobe.
+    gradients.  The density can be 0: clamp it before dividing.  For ``visible`` and ``cosine`` clamping adds no bias,
+    because the BSDF is 0 wherever the density is.  An estimate with ``mirrored`` alone is biased: combine it with
+    ``visible``.  Raises TypeError unless float32, ValueError for a wrong shape or device, or an unknown lobe.
 
     >>> wi = reli3d.sample_bsdf(wo, alpha, u)
     >>> density = reli3d.pdf_bsdf(wo, alpha, wi)
@@ -106,7 +107,7 @@ def pdf_bsdf(wo: Tensor, alpha: Tensor, wi: Tensor, *, lobe: str = "visible") ->
 
 
 def pdf_lobes(wo: Tensor, alpha: Tensor, wi: Tensor) -> Tensor:
-    """:func:`pdf_bsdf` of all :data:`LOBES`, ``(..., 3)``."""
+    """:func:`pdf_bsdf` for each of :data:`LOBES`, ``(..., 3)``."""
     batch, flat = _flat([("wo", wo, 3), ("wi", wi, 3), ("alpha", alpha, 0)])
     ins = [(t.detach().contiguous(), kind) for t, kind in zip(flat, (wp.vec3, wp.vec3, wp.float32))]
     out = empty((flat[0].shape[0],), wp.vec3, wo.device)

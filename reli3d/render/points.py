@@ -22,9 +22,9 @@ class SurfacePoints:
 
     position: ``(N, 3)``.  ng: ``(N, 3)`` geometric normal, unit, outward.  normal: ``(N, 3)`` shading normal, unit.
     base_color: ``(N, 3)`` linear, in [0, 1].  roughness: ``(N,)`` perceptual, in [0, 1].  metallic: ``(N,)`` in [0, 1].
-    All but ``position`` may be a single row for all points, and the material a single number; fields have N rows after
-    construction.  Gradients pass through.  Raises TypeError for a wrong type or dtype, ValueError for a wrong shape or
-    device.
+    All but ``position`` may be a single row for all points, and base_color, roughness and metallic also a single
+    number; after construction all fields have N rows.  Gradients pass through.  Raises TypeError for a wrong type or
+    dtype, ValueError for a wrong shape or device.
 
     >>> points = reli3d.SurfacePoints(position, normal, normal, base_color=0.8, roughness=0.4, metallic=0.0)
     >>> radiance = reli3d.shade(points, wo, light)
@@ -63,7 +63,7 @@ class SurfacePoints:
         return SurfacePoints(*(getattr(self, f.name)[rows] for f in fields(self)))
 
     def detach(self) -> SurfacePoints:
-        """The same numbers without gradient."""
+        """The same points without gradient."""
         return SurfacePoints(*(getattr(self, f.name).detach() for f in fields(self)))
 
     def to(self, device: torch.device | str) -> SurfacePoints:
@@ -73,7 +73,7 @@ class SurfacePoints:
 
 @torch.no_grad()
 def nan_where_not_finite(values: Sequence[Tensor]) -> Tensor:
-    """``(N, 1)``: 0, or NaN where one of ``values (N, 3)`` or ``(N,)`` is not finite, which a minimum would hide."""
+    """``(N, 1)``: 0, or NaN if any of ``values (N, 3)`` or ``(N,)`` is non-finite, which a minimum would hide."""
     rows = torch.zeros_like(values[0])
     for value in values:  # a sum over columns would take 5 times as long
         if value.ndim == 2:
@@ -86,7 +86,7 @@ def nan_where_not_finite(values: Sequence[Tensor]) -> Tensor:
 
 
 def check_values(points: SurfacePoints, wo: Tensor) -> None:
-    """Raise ValueError for directions that are not unit, materials outside [0, 1] and values that are not finite."""
+    """Raise ValueError for unnormalized directions, materials outside [0, 1] and non-finite values."""
     given = {f.name: getattr(points, f.name).detach() for f in fields(points)} | {"wo": wo.detach()}
     for name, value in given.items():
         if name in SCALAR_VALUES:
@@ -101,7 +101,7 @@ def check_values(points: SurfacePoints, wo: Tensor) -> None:
 
 
 def of_rows(name: str, value: Tensor | float, position: Tensor, last: int) -> Tensor:
-    """``value`` as ``(N, last)``, or ``(N,)`` for ``last`` 0, for the N rows of ``position``; one row is repeated."""
+    """``value`` as ``(N, last)``, or ``(N,)`` if ``last`` is 0, for N rows of ``position``; one row is repeated."""
     shape = (len(position), last) if last else (len(position),)
     if isinstance(value, Real) and name in SCALAR_VALUES:
         return position.new_tensor(float(value)).expand(shape)

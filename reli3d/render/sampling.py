@@ -1,6 +1,6 @@
 """Sampling of directions in the local frame (normal +z), their densities, and random numbers.
 
-``u`` is uniform in [0, 1)^2, an argument.  Leading axes broadcast; tensors are float32 on one device.
+Samplers take ``u``, uniform in [0, 1)^2.  Leading axes broadcast; tensors are float32 on one device.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from reli3d.kernels import sampling as kernels
 
 
 def sample_cosine(u: Tensor) -> Tensor:
-    """Directions ``(..., 3)`` for ``u (..., 2)``; density cos / pi (:func:`pdf_cosine`).  No gradient."""
+    """Cosine-weighted directions ``(..., 3)`` for ``u (..., 2)``; density: :func:`pdf_cosine`.  No gradient."""
     check("u", u, last=2)
     flat = u.detach().reshape(-1, 2).contiguous()
     out = empty((flat.shape[0],), wp.vec3, u.device)
@@ -24,13 +24,13 @@ def sample_cosine(u: Tensor) -> Tensor:
 
 
 def pdf_cosine(wi: Tensor) -> Tensor:
-    """Density ``(...)`` [1/sr] of :func:`sample_cosine` at ``wi (..., 3)``; 0 below the horizon."""
+    """Density cos / pi ``(...)`` [1/sr] of :func:`sample_cosine` at ``wi (..., 3)``; 0 below the horizon."""
     check("wi", wi, last=3)
     return wi[..., 2].clamp(min=0.0) / torch.pi
 
 
 def sample_ggx_vndf(wo: Tensor, alpha: Tensor, u: Tensor) -> Tensor:
-    """GGX microfacet normals visible from ``wo``, ``(..., 3)`` unit, local frame (+z the surface normal).
+    """Samples unit GGX microfacet normals ``(..., 3)`` visible from ``wo``, local frame (+z is the surface normal).
 
     wo: ``(..., 3)`` unit, z > 0; otherwise the samples are undefined, with density 0.  alpha: tensor ``(...)``, GGX
     width ``roughness**2`` in (0, 1], floored at 1e-3.  u: ``(..., 2)`` uniform in [0, 1).  Leading axes broadcast.
@@ -55,12 +55,12 @@ def sample_ggx_vndf(wo: Tensor, alpha: Tensor, u: Tensor) -> Tensor:
 
 
 def pdf_ggx_vndf(wo: Tensor, alpha: Tensor, wm: Tensor) -> Tensor:
-    """Density ``(...)`` [1/sr of ``wm``] of :func:`sample_ggx_vndf`.
+    """Density ``(...)`` [1/sr, in ``wm``] of :func:`sample_ggx_vndf`.
 
     0 where ``wm`` faces away from ``wo``, and where either is below the surface.  wo, wm: ``(..., 3)`` unit, local
-    frame.  alpha: tensor ``(...)``, GGX width ``roughness**2``.  Leading axes broadcast.  Gradients reach
-    ``wo``, ``alpha`` and ``wm``.  Divide by ``4 wo.wm`` for the density of the reflected direction.  Raises TypeError
-    unless float32, ValueError for a wrong shape or device.
+    frame.  alpha: tensor ``(...)``, GGX width ``roughness**2``.  Leading axes broadcast.  Gradients reach ``wo``,
+    ``alpha`` and ``wm``.  Divide by ``4 wo.wm`` for the density of the reflected direction.  Raises TypeError unless
+    float32, ValueError for a wrong shape or device.
 
     >>> wm = reli3d.sample_ggx_vndf(wo, alpha, u)
     >>> density = reli3d.pdf_ggx_vndf(wo, alpha, wm)
@@ -80,13 +80,13 @@ def pdf_ggx_vndf(wo: Tensor, alpha: Tensor, wm: Tensor) -> Tensor:
 
 
 def antithetic(u: Tensor) -> Tensor:
-    """Maps the random numbers ``u (..., 2)`` of visible-normal samples to those of their antithetic partners.
+    """Random numbers ``(..., 2)`` of the antithetic partners of visible-normal samples drawn with ``u (..., 2)``.
 
     ``((u1 + 1/2) mod 1, 1 - 2^-24 - u2)``: the partner is on the opposite side of the lobe.  Uniform if ``u`` is.  For
-    multiples of 2^-24 the map is exact and its own inverse.  The mean of both samples has less variance than that of
-    two independent ones if the integrand nearly changes sign between the partners, as derivatives with respect to
-    ``alpha`` or the normal do.  Samplers treat ``u`` as a constant, so gradients are not needed.  Raises TypeError
-    unless float32, ValueError for a wrong shape.
+    multiples of 2^-24 the map is exact and its own inverse.  Averaging the pair reduces variance compared with two
+    independent samples if the integrand nearly changes sign between the partners, as do derivatives with respect to
+    ``alpha`` or the normal.  Samplers treat ``u`` as a constant, so gradients are not needed.  Raises TypeError unless
+    float32, ValueError for a wrong shape.
 
     >>> partners = reli3d.antithetic(u)
     >>> first, second = (reli3d.sample_bsdf(wo, alpha, v) for v in (u, partners))
@@ -100,8 +100,8 @@ def tangent_frame(normal: Tensor) -> Tensor:
     """Rotations ``(..., 3, 3)`` to the local frame: rows tangent, bitangent, normal; ``local = frame @ world``.
 
     normal: ``(..., 3)`` unit.  Right-handed.  Continuous except where ``z`` of the normal changes sign.  Gradients
-    reach ``normal``. Raises TypeError unless float32, ValueError for a wrong shape.  Source: Duff et al. 2017, Building
-    an Orthonormal Basis, Revisited.
+    reach ``normal``.  Raises TypeError unless float32, ValueError for a wrong shape.  Source: Duff et al. 2017,
+    Building an Orthonormal Basis, Revisited.
 
     >>> frame = reli3d.tangent_frame(normal)
     >>> local, world = (frame @ wo[..., None])[..., 0], (frame.mT @ wi[..., None])[..., 0]
@@ -122,7 +122,7 @@ def mirror(wm: Tensor) -> Tensor:
 
 
 def reflect(wo: Tensor, wm: Tensor) -> Tensor:
-    """Mirror reflection of ``wo`` about the microfacet normal ``wm``: ``2 (wo.wm) wm - wo``, ``(..., 3)``.
+    """Mirror reflection ``(..., 3)`` of ``wo`` about the microfacet normal ``wm``: ``2 (wo.wm) wm - wo``.
 
     wo, wm: ``(..., 3)`` unit, any common frame.  Gradients reach both.  Raises TypeError unless float32, ValueError for
     a wrong shape or device.
@@ -138,9 +138,9 @@ def reflect(wo: Tensor, wm: Tensor) -> Tensor:
 def random_pairs(
     count: int, *, seed: int = 0, sample: int = 0, dimension: int = 0, device: torch.device | str = "cpu"
 ) -> Tensor:
-    """Uniform ``u (count, 2)`` in [0, 1): row i is a hash of (i, sample, dimension, seed) alone.
+    """Uniform ``u (count, 2)`` in [0, 1): row i is a hash of only (i, sample, dimension, seed).
 
-    pcg4d, Jarzynski and Olano 2020.  The first two of its four words, 24 bits each.
+    Source: pcg4d of Jarzynski and Olano 2020, the first two of its four words, 24 bits each.
     """
     out = empty((count,), wp.vec2, torch.device(device))
     args = [int(seed) & 0x7FFFFFFF, int(sample), int(dimension), (out, wp.vec2)]

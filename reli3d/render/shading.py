@@ -45,7 +45,7 @@ GROUP_RAYS = 64  # of neighboring hits, traced together: so packets of 16 are fu
 
 
 class Samples(NamedTuple):
-    """Sample counts per point and strategy; the defaults are those of the ReLi3D paper.
+    """Sample counts per point and strategy; the defaults follow the ReLi3D paper.
 
     light: importance sampling of the environment.  bsdf: GGX visible normals.  cosine: cosine-weighted hemisphere.
 
@@ -62,18 +62,18 @@ class Samples(NamedTuple):
 class ShadeOptions:
     """Options of :func:`shade`: sampling and material model.
 
-    samples: :class:`Samples`, or three counts in its order, each at least 0.  seed: of the random numbers; another seed
-    gives independent noise.  In optimization use another seed in every step; the gradient of a squared residual of one
-    rendering is biased, because its value and its derivative have the same noise: for an unbiased gradient multiply the
-    residuals of two renderings with different seeds.  antithetic: pairing of visible-normal samples: ``opposite``
-    (opposite side of the lobe, see :func:`reli3d.antithetic`), ``mirrored`` (about the surface normal, as in ReLi3D) or
-    ``none``.  heuristic: MIS weights, ``balance`` or ``power``.  sequence: ``halton``, with a Cranley-Patterson
-    rotation per point and strategy, or ``random``.  alpha: GGX width from roughness r, ``squared`` (r^2) or, as in
-    ReLi3D, ``linear`` (r).  diffuse_model: ``conserving`` or ``published``, see :func:`reli3d.eval_bsdf`.  clamp: upper
-    limit, per channel, of a sample's contribution ``w * f * L * cos(theta) / p`` before the division by the sample
-    count of its strategy (w: MIS weight, f: BSDF, L: radiance, theta: angle between the direction and the shading
-    normal, p: density); None: no limit.  check_inputs: raise ValueError for directions that are not unit or materials
-    outside [0, 1].  Raises ValueError for an invalid count or choice.
+    samples: :class:`Samples`, or three counts in the same order, each at least 0.  seed: of the random numbers;
+    different seeds give independent noise.  In optimization, change the seed every step.  The gradient of one
+    rendering's squared residual is biased, because value and derivative share the same noise; for an unbiased gradient,
+    multiply the residuals of two renderings with different seeds.  antithetic: pairing of visible-normal samples:
+    ``opposite`` (opposite side of the lobe, see :func:`reli3d.antithetic`), ``mirrored`` (about the surface normal, as
+    in ReLi3D) or ``none``.  heuristic: MIS weights, ``balance`` or ``power``.  sequence: ``halton``, with a
+    Cranley-Patterson rotation per point and strategy, or ``random``.  alpha: GGX width of roughness r: ``squared``
+    (r^2) or, as in ReLi3D, ``linear`` (r).  diffuse_model: ``conserving`` or ``published``, see
+    :func:`reli3d.eval_bsdf`.  clamp: upper limit, per channel, of a sample's contribution ``w * f * L * cos(theta) /
+    p`` before division by its strategy's sample count (w: MIS weight, f: BSDF, L: radiance, theta: angle between the
+    direction and the shading normal, p: density); None: no limit.  check_inputs: raise ValueError for unnormalized
+    directions, materials outside [0, 1] or non-finite values.  Raises ValueError for an invalid count or choice.
 
     >>> fast = reli3d.ShadeOptions(samples=reli3d.Samples(light=4, bsdf=4, cosine=2), seed=1)
     >>> image = reli3d.render_asset(asset, camera, light, options=fast)
@@ -118,15 +118,16 @@ def shade(
     """Reflected radiance ``(N, 3)`` of surface points towards ``wo`` under ``environment``; linear Rec. 709.
 
     points: N points with their material.  wo: ``(N, 3)`` unit, world frame, to the viewer, or one row for all points.
-    Faces seen from behind are shaded two-sided.  scene: occluders for shadow rays; None: no shadows.  options: sample
-    counts, seed and material model.  pixels: ``(N,)`` int32, the index that, with ``options.seed``, seeds the samples
-    of each point; None: the row index.  Non-finite inputs of a point give NaN.
+    Back faces are shaded like front faces.  scene: occluders for shadow rays; None: no shadows.  options: sample
+    counts, seed and material model.  pixels: ``(N,)`` int32, index that seeds each point's samples together with
+    ``options.seed``; None: the row index.  A point with non-finite inputs gives NaN.
 
     Gradients reach normal, base_color, roughness, metallic and the texels of ``environment``.  Sampled directions,
-    densities, MIS weights and visibility are constants of the backward pass; ``wo``, ``ng`` and ``position`` have no
-    gradient.  Only the component of the normal's gradient orthogonal to the normal is meaningful.  Once differentiable.
-    Bitwise identical for any number of threads.  Raises TypeError for a wrong type or dtype, ValueError for a wrong
-    shape or device.  Estimator: multiple importance sampling (Veach and Guibas 1995) of :func:`reli3d.eval_bsdf`.
+    densities, MIS weights and visibility are constants in the backward pass; ``wo``, ``ng`` and ``position`` have no
+    gradient.  Only the component of the normal's gradient that is orthogonal to the normal is meaningful.  Once
+    differentiable.  Bitwise identical for any number of threads.  Raises TypeError for a wrong type or dtype,
+    ValueError for a wrong shape or device.  Source: multiple importance sampling of Veach and Guibas 1995; BSDF:
+    :func:`reli3d.eval_bsdf`.
 
     >>> points = reli3d.SurfacePoints(position, normal, normal, base_color=0.8, roughness=0.4, metallic=0.0)
     >>> radiance = reli3d.shade(points, wo, reli3d.Environment.constant(torch.ones(3)))
@@ -145,7 +146,7 @@ def shade_lights(
 ) -> list[Tensor]:
     """:func:`shade` under each of ``environments``, with bitwise identical results.
 
-    Without gradients, shadow rays that do not depend on the environment are traced once.
+    If no gradients are needed, shadow rays that do not depend on the environment are traced only once.
     """
     tasks = [_task(points, wo, light, scene, options, pixels) for light in environments]
     recorded = torch.is_grad_enabled() and any(v.requires_grad for _, *tensors in tasks for v in tensors)
@@ -263,7 +264,7 @@ def struct_of_points(values: Sequence[Tensor], pixels: Tensor) -> kernels.Points
 
 
 def struct_of_light(radiance: Tensor, cdf: EnvironmentCDF, offsets: Tensor) -> kernels.Light:
-    """Contiguous texels, their sampling CDF, and the low-discrepancy points, which each hit rotates."""
+    """Contiguous texels, their sampling CDF, and the low-discrepancy points, rotated per hit."""
     rows, columns, row_guide, column_guide = cdf.sampler
     return struct_of(
         kernels.Light,
@@ -311,7 +312,7 @@ def _shade_embree(n: int, ins: list, job: _Job, outs: list) -> None:
 def shaded_arrays(
     points: SurfacePoints, wo: Tensor, environment: Environment, scene: RayScene | None, options: ShadeOptions
 ) -> tuple[Tensor, ...]:
-    """The seven arrays of points in the order of the kernels, with the GGX width for the roughness; all checked."""
+    """The seven point arrays in kernel argument order, checked, with GGX width instead of roughness."""
     for name, value, kind in (
         ("points", points, SurfacePoints),
         ("environment", environment, Environment),
@@ -329,7 +330,7 @@ def shaded_arrays(
 
 
 def sampling_plan(options: ShadeOptions, scene: RayScene | None) -> tuple[kernels.Plan, Tensor]:
-    """``options`` as the kernels read them, and the low-discrepancy points."""
+    """``options`` as a kernel struct, and the low-discrepancy points."""
     plan = kernels.Plan()
     plan.n_environment, plan.n_visible, plan.n_cosine = (int(k) for k in options.samples)
     plan.antithetic = CHOICES["antithetic"].index(options.antithetic)

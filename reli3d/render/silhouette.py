@@ -1,13 +1,13 @@
-"""Antialiasing of silhouettes, differentiable in the vertices, for images sampled at the pixel centers.
+"""Silhouette antialiasing, differentiable in the vertices, for images sampled at pixel centers.
 
 After Laine et al. 2020, Modular Primitives for High-Performance Differentiable Rendering, section 3.4: two neighboring
-pixels are blended where a silhouette crosses the line between their centers.  Laine et al. look for the silhouette
-edge among those of the triangle at a pixel center, which misses edges of triangles smaller than a pixel.  Here all
-crossings of edges with rows and columns of pixel centers are listed, and a ray tests whether each is visible.
+pixels are blended where a silhouette crosses the line between their centers.  Laine et al. search for the silhouette
+edge among the edges of the triangle at a pixel center, which misses edges of triangles smaller than a pixel.  Here all
+crossings of edges with rows and columns of pixel centers are listed, and each is tested for visibility with a ray.
 
-The sum over an image has the exact derivative of the covered area.  Against exact area coverage in [0, 1], pixels that
-a silhouette crosses have a mean absolute error of 0.01 to 0.03; the relative error of gradients of a sum of squared
-differences is about 10 %.
+The sum over an antialiased mask has the exact derivative of the covered area.  Compared with exact area coverage in [0,
+1], pixels crossed by a silhouette have a mean absolute error of 0.01 to 0.03; gradients of a sum of squared differences
+have a relative error of about 10 %.
 """
 
 from __future__ import annotations
@@ -32,10 +32,11 @@ IN_FRONT = 1e-3  # fraction of the distance by which an occluder must be nearer;
 
 @dataclass(frozen=True)
 class Crossings:
-    """Where visible silhouettes pass between pixel centers; M pairs of neighbors, each at most once a direction.
+    """Crossings of visible silhouettes with the lines between neighboring pixel centers; M pairs of neighbors.
 
-    inner, outer: ``(M,)`` int64 pixel (row * W + column) on the surface's side and beyond.  place: ``(M,)`` in [0, 1],
-    distance of the crossing from the inner center in pixels.  Gradients reach the vertices and the camera.
+    Each pair is listed at most once per direction.  inner, outer: ``(M,)`` int64 pixel index (row * W + column) on the
+    surface side and on the other side.  place: ``(M,)`` in [0, 1], distance from the inner center to the crossing in
+    pixels.  Gradients reach the vertices and the camera.
     """
 
     inner: Tensor
@@ -44,10 +45,10 @@ class Crossings:
 
 
 def mesh_edges(vertices: Tensor, faces: Tensor) -> Tensor:
-    """Edges ``(E, 4)`` int32: two ends and the opposite vertices of the two faces, -1 where there is only one.
+    """Edges ``(E, 4)`` int32: two end vertices, then the opposite vertices of the two faces, -1 for a missing face.
 
     vertices: ``(V, 3)`` float32.  faces: ``(F, 3)`` int32.  Vertices at identical positions (split by an atlas) are
-    merged: the first is listed and receives the gradient.  An edge of three or more faces is listed once per face.
+    merged: the first is listed and receives the gradient.  An edge with three or more faces is listed once per face.
     """
     check("vertices", vertices, last=3)
     check("faces", faces, last=3, like=vertices, dtype=torch.int32)
@@ -76,9 +77,9 @@ def mesh_edges(vertices: Tensor, faces: Tensor) -> Tensor:
 def outline_crossings(vertices: Tensor, edges: Tensor, camera: Camera, scene: RayScene) -> Crossings:
     """Crossings of visible silhouettes with the lines between pixel centers.
 
-    vertices: ``(V, 3)``.  edges: of :func:`mesh_edges`.  camera: one, no batch.  scene: the occluders, normally the
-    mesh itself and the rest of the scene.  An edge with an end behind the eye is left out.  Of several
-    crossings of one pair in one direction the outermost stays.
+    vertices: ``(V, 3)``.  edges: from :func:`mesh_edges`.  camera: a single camera.  scene: the occluders, normally the
+    mesh and everything else in view.  Edges with an end behind the camera are omitted.  If several crossings of a pair
+    have the same direction, the outermost is kept.
     """
     check("vertices", vertices, last=3)
     check("edges", edges, last=4, like=vertices, dtype=torch.int32)
@@ -111,10 +112,11 @@ def outline_crossings(vertices: Tensor, edges: Tensor, camera: Camera, scene: Ra
 
 
 def blend_outlines(image: Tensor, crossings: Crossings) -> Tensor:
-    """``image (H, W, C)`` with each pair of pixels at an outline blended by where the outline passes.
+    """``image (H, W, C)`` with the pixels of each crossing blended according to the position of the silhouette.
 
-    The outline's side of a pixel border decides which of the two changes; several pairs add up, their weights scaled
-    down where they exceed 1, so a value stays between its neighbors'.  Gradients reach the image and the crossings.
+    The pixel that the silhouette crosses is the one that changes.  The blends of several pairs add up; weights are
+    scaled down where their sum exceeds 1, so values stay between those of the neighbors.  Gradients reach the image and
+    the crossings.
     """
     check("image", image, shape=("H", "W", "C"), like=crossings.place)
     flat = image.reshape(-1, image.shape[2])
@@ -143,12 +145,12 @@ def antialias(
 
     image: float32, any number of channels, sampled at the pixel centers, for instance shaded first hits or a mask.
     vertices: ``(V, 3)`` float32.  faces: ``(F, 3)`` int32.  camera: a single camera of the image's size.  scene:
-    occluders of the edges, built from the mesh if None.  edges: from :func:`reli3d.render.silhouette.mesh_edges`, for
-    reuse while the faces do not change; built if None.
+    occluders of the edges; None: built from the mesh.  edges: from :func:`reli3d.render.silhouette.mesh_edges`, for
+    reuse while the faces do not change; None: built here.
 
     Gradients reach image, vertices and camera, and are bitwise identical for any number of CPU threads.  Only
     visibility silhouettes are handled, not texture edges or intersections of faces.  Raises TypeError for a wrong
-    dtype, ValueError for a wrong shape, an image that does not have the camera's size, or a face index out of range.
+    dtype, ValueError for a wrong shape, an image size that differs from the camera's, or a face index out of range.
     Source: Laine et al. 2020, section 3.4.
 
     >>> mask = reli3d.RayScene(mesh).intersect(*reli3d.camera_rays(camera)).valid[..., None].float()

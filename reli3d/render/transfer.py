@@ -1,8 +1,8 @@
 """Self-occlusion of irradiance in spherical harmonics: precomputed radiance transfer.
 
 Sloan, Kautz and Snyder 2002, "Precomputed Radiance Transfer for Real-Time Rendering in Dynamic, Low-Frequency Lighting
-Environments".  The harmonics are real, orthonormal, up to degree 3, with +Y as the polar axis, so that an environment
-rotated about +Y rotates pairs of its coefficients.
+Environments".  The harmonics are real, orthonormal, up to degree 3, with polar axis +Y, so that rotating an environment
+about +Y rotates its coefficients in pairs.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def spherical_harmonics(directions: Tensor) -> Tensor:
 
 @full_precision
 def light_harmonics(light: Environment) -> Tensor:
-    """Coefficients ``(16, 3)`` of an environment: its texels' solid angles times their values, summed in float64."""
+    """Coefficients ``(16, 3)`` of an environment: a sum over texels weighted by solid angle, computed in float64."""
     height, width = light.radiance.shape[:2]
     d = lat_long_directions(height, width, dtype=torch.float64)
     weight = spherical_harmonics(d) * texel_solid_angles(height, width)[:, None, None]
@@ -62,12 +62,12 @@ def light_harmonics(light: Environment) -> Tensor:
 
 @full_precision
 def blocked_transfer(mesh: Mesh, *, directions: int = 64, scene: RayScene | None = None) -> Tensor:
-    """Blocked transfer ``(V, 16)``: integrals of the occluded cosine times harmonics at each vertex; no gradient.
+    """Blocked transfer ``(V, 16)``: cosine times harmonics, integrated over occluded directions; no gradient.
 
-    Row i times the coefficients of an environment (:func:`light_harmonics`) is the irradiance that is occluded at
-    vertex i.  mesh: with normals.  directions: over the whole sphere, on a spiral of equal areas and the same for all
-    vertices, so that neighbors differ by their geometry alone.  scene: rays against the mesh, made here if None.
-    Exactly 0 where no ray is hidden.  Raises TypeError for a wrong dtype, ValueError for a wrong shape or device, or
+    Row i times the coefficients of an environment (:func:`light_harmonics`) is the irradiance that occlusion removes at
+    vertex i; the row is exactly 0 if no ray is blocked.  mesh: with normals.  directions: number of directions over the
+    whole sphere, on an equal-area spiral; all vertices use the same, so neighbors differ only by geometry.  scene: rays
+    against the mesh; None: built here.  Raises TypeError for a wrong dtype; ValueError for a wrong shape or device, or
     for less than one direction.
     """
     normals = present("normals", mesh.normals).detach()
@@ -93,7 +93,7 @@ def blocked_transfer(mesh: Mesh, *, directions: int = 64, scene: RayScene | None
 
 
 def sphere_spiral(count: int) -> Tensor:
-    """``(count, 3)`` unit directions, each in the middle of an equal area of the sphere (a Fibonacci spiral)."""
+    """Unit directions ``(count, 3)`` on a Fibonacci spiral, each centered in an equal area of the sphere."""
     k = torch.arange(count, dtype=torch.float64, device="cpu") + 0.5
     height, turn = 1.0 - 2.0 * k / count, k * (math.pi * (3.0 - math.sqrt(5.0)))
     across = (1.0 - height * height).sqrt()

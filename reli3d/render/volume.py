@@ -1,8 +1,8 @@
-"""Volume rendering for the first training stage: samples along rays through an occupancy grid, and their compositing.
+"""Volume rendering for the first training stage: ray marching through an occupancy grid, and compositing.
 
-Density is per world unit, so a sample of a step ``s`` lets ``exp(-density s)`` of the light through.  The grid does
-the purpose of that of Li et al. 2023, NerfAcc: empty cells cost no query of the field.  The field is the
-caller's: march, query at ``positions``, composite.
+Density is per world unit, so a step of length ``s`` transmits ``exp(-density s)`` of the light.  As in NerfAcc (Li et
+al. 2023), empty cells of the grid need no field queries.  The caller queries the field: march, query at ``positions``,
+composite.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class OccupancyGrid:
 
     @classmethod
     def full(cls, resolution: int, radius: float, device: torch.device | None = None) -> OccupancyGrid:
-        """Every cell occupied."""
+        """Grid with every cell occupied."""
         return cls(torch.ones(resolution, resolution, resolution, dtype=torch.bool, device=device), radius)
 
     @classmethod
@@ -51,8 +51,8 @@ class OccupancyGrid:
     ) -> OccupancyGrid:
         """Cells where ``field`` exceeds ``threshold`` at the center or a corner, grown by one cell on every side.
 
-        field: densities ``(N,)`` of points ``(N, 3)``; evaluated without gradient, in chunks.  Detail of less than half
-        a cell between those points may be missed.
+        field: maps points ``(N, 3)`` to densities ``(N,)``; evaluated without gradient, in chunks.  Detail smaller than
+        half a cell may be missed between center and corners.
         """
         k = (torch.arange(2 * resolution + 1, device=device, dtype=torch.float32) / resolution - 1.0) * radius
         values = []
@@ -67,10 +67,10 @@ class OccupancyGrid:
 
 @dataclass(frozen=True)
 class RaySamples:
-    """Concatenated samples of N rays; ``first[i]`` to ``first[i + 1]`` are those of ray ``i``, in ascending ``t``.
+    """Concatenated samples of N rays; ray ``i`` has samples ``first[i]`` to ``first[i + 1] - 1``, in ascending ``t``.
 
-    ray: ``(S,)`` int32 index.  t: ``(S,)`` ray parameter; the direction is not normalized.  first: ``(N + 1,)`` int32.
-    step: spacing of the samples.
+    ray: ``(S,)`` int32 ray index.  t: ``(S,)`` ray parameter, in units of the direction's length.  first: ``(N + 1,)``
+    int32.  step: sample spacing in t.
     """
 
     ray: Tensor
@@ -79,15 +79,14 @@ class RaySamples:
     step: float
 
     def positions(self, origins: Tensor, directions: Tensor) -> Tensor:
-        """World points ``(S, 3)`` of the samples on rays ``(N, 3)``.  Gradients reach both."""
+        """World positions ``(S, 3)`` of the samples along rays ``(N, 3)``.  Gradients reach origins and directions."""
         ray = self.ray.long()
         return origins.index_select(0, ray) + directions.index_select(0, ray) * self.t[:, None]
 
 
 @dataclass(frozen=True)
 class Composite:
-    """color ``(N, 3)`` premultiplied; opacity ``(N,)`` in [0, 1]; depth ``(N,)`` premultiplied: mean t times
-    opacity."""
+    """color ``(N, 3)`` and depth ``(N,)`` premultiplied by opacity, depth as the mean t; opacity ``(N,)`` in [0, 1]."""
 
     color: Tensor
     opacity: Tensor
@@ -104,11 +103,11 @@ def march_rays(
     far: float = float("inf"),
     shift: Tensor | None = None,
 ) -> RaySamples:
-    """Samples in the occupied cells along N rays, at a spacing of ``step`` in the ray parameter t.
+    """Samples at a spacing of ``step`` in the ray parameter t along N rays, in the occupied cells only.
 
-    origins, directions: ``(N, 3)``, directions usually unit.  near, far: limits of t.  shift: ``(N,)`` in [0, 1),
-    position of the samples within their steps; None: 0.5; random numbers give an unbiased integral.  Rays that are not
-    finite or miss the cube have no samples.  No gradient.  Raises ValueError above 2^31 samples.
+    origins, directions: ``(N, 3)``; directions are usually unit.  near, far: limits of t.  shift: ``(N,)`` in [0, 1),
+    position of each ray's samples within their steps; random values give an unbiased integral; None: 0.5.  Non-finite
+    rays and rays that miss the cube have no samples.  No gradient.  Raises ValueError above 2^31 samples.
     """
     check("origins", origins, shape=("N", 3))
     n = len(origins)
@@ -145,9 +144,9 @@ def march_rays(
 def composite(density: Tensor, color: Tensor, samples: RaySamples) -> Composite:
     """Color, opacity and depth of every ray; add ``(1 - opacity) * background`` for a background.
 
-    density: ``(S,)`` per length of the direction, negative counts as 0.  color: ``(S, 3)`` linear.  Gradients reach
-    both, exactly 0 for a density that is not positive; once differentiable; bitwise identical for any number of
-    threads.  Max 1995, Optical Models for Direct Volume Rendering.
+    density: ``(S,)`` per unit of t; negative values count as 0.  color: ``(S, 3)`` linear.  Gradients reach both and
+    are exactly 0 for a density that is not positive.  Once differentiable.  Bitwise identical for any number of
+    threads.  Source: Max 1995, Optical Models for Direct Volume Rendering.
     """
     _check_samples(density, samples)
     check("color", color, shape=(len(density), 3), like=density)
